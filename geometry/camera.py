@@ -1,0 +1,105 @@
+"""A calibrated camera: world points to distorted pixels and back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from geometry import lens
+from geometry.arrays import Array, Bools
+from geometry.pose import Pose
+
+
+@dataclass(frozen=True, slots=True)
+class SensorNoise:
+    """What turns photo-electrons into grey values."""
+
+    gain_e_per_dn: float  # electrons per DN
+    read_noise_e: float  # electrons, 1 sigma
+    black_dn: float = 0.0  # DN that no light gives
+
+
+@dataclass(frozen=True, slots=True)
+class Camera:
+    """A calibrated camera bolted to the lab."""
+
+    name: str
+    screen: str  # the screen that it observes
+    image_size_px: tuple[int, int]  # width, height
+    matrix: Array  # (3, 3), px: fx, fy, cx, cy; no skew
+    distortion: tuple[float, ...]  # OpenCV order; 0, 4, 5, 8, 12 or 14 numbers
+    camera_from_world: Pose
+    noise: SensorNoise | None = None
+    fold_r2: float = field(init=False)  # squared normalised radius beyond which the lens model folds
+
+    def __post_init__(self) -> None:
+        if len(self.distortion) not in lens.ALLOWED_LENGTHS:
+            raise ValueError(
+                f"camera {self.name!r}: {len(self.distortion)} distortion numbers,"
+                " OpenCV's models have 0, 4, 5, 8, 12 or 14"
+            )
+        object.__setattr__(self, "fold_r2", lens.fold_limit(self.distortion))
+
+    def project(self, points_world: Array) -> Array:
+        """Distorted pixels (..., 2) of world points (..., 3), m; nan behind the camera or beyond the fold limit."""
+        return project_points(
+            self.camera_from_world.apply(np.asarray(points_world, dtype=float)),
+            pinhole_numbers(self),
+            lens.padded(self.distortion),
+            np.asarray(self.fold_r2),
+        )[0]
+
+    def rays(self, pixels: Array) -> tuple[Array, Array]:
+        """Origins (3,), m, and unit directions (..., 3), both in world, of distorted pixels (..., 2)."""
+        pixels = np.asarray(pixels, dtype=float)
+        fx, fy, cx, cy = pinhole_numbers(self)
+        distorted = (pixels - [cx, cy]) / [fx, fy]
+        flat = lens.undistort(distorted.reshape(-1, 2), lens.padded(self.distortion), self.fold_r2)
+        xyz = np.concatenate([flat, np.ones((len(flat), 1))], axis=1)
+        world = xyz @ self.camera_from_world.rotation  # rows times R = R^T x
+        world /= np.linalg.norm(world, axis=1, keepdims=True)
+        return self.camera_from_world.inverse().translation, world.reshape(*pixels.shape[:-1], 3)
+
+    def sees(self, pixels: Array, margin_px: float = 0.0) -> Bools:
+        """Whether pixels (..., 2) lie in the picture, or at most `margin_px` outside it. nan does not."""
+        return in_picture(np.asarray(pixels, dtype=float), np.asarray(self.image_size_px), margin_px)
+
+
+def in_picture(pixels: Array, sizes_px: Array, margin_px: float | Array = 0.0) -> Bools:
+    """-0.5 <= u < width - 0.5 and likewise for v, widened by the margin. sizes_px (..., 2): width, height."""
+    shifted = pixels + 0.5
+    margin = np.asarray(margin_px)[..., None]
+    return np.all((shifted >= -margin) & (shifted < sizes_px + margin), axis=-1)
+
+
+def pinhole_numbers(camera: Camera) -> Array:
+    """fx, fy, cx, cy (4,), px."""
+    return np.array([camera.matrix[0, 0], camera.matrix[1, 1], camera.matrix[0, 2], camera.matrix[1, 2]])
+
+
+def project_points(
+    points_camera: Array, pinhole: Array, distortion: Array, fold_r2: Array
+) -> tuple[Array, Array]:
+    """Pixels (..., 2) and d(pixel)/d(point) (..., 2, 3), px/m, of points (..., 3), m, in the camera frame.
+
+    pinhole (..., 4): fx, fy, cx, cy; distortion (..., 14); fold_r2 (...): all broadcast against the points, so that
+    points of different cameras go in one call. nan behind the camera (z <= 0) or beyond the fold limit.
+    """
+    z = points_camera[..., 2]
+    in_front = z > 1e-9
+    z = np.where(in_front, z, 1.0)
+    xy = points_camera[..., :2] / z[..., None]
+    focal, centre = pinhole[..., :2], pinhole[..., 2:]
+    if distortion.any():
+        bent, J_lens = lens.distort(xy, distortion)
+        good = in_front & lens.holds(xy, J_lens, fold_r2)
+        J_xy = focal[..., :, None] * J_lens
+    else:
+        bent, good = xy, in_front
+        J_xy = np.broadcast_to(focal[..., :, None] * np.eye(2), (*xy.shape, 2))
+    pixels = np.where(good[..., None], focal * bent + centre, np.nan)
+    J = np.empty((*xy.shape, 3))
+    J[..., :2] = J_xy / z[..., None, None]
+    J[..., 2] = -np.einsum("...ij,...j->...i", J[..., :2], xy)
+    return pixels, J

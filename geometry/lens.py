@@ -1,0 +1,160 @@
+"""The lens model: OpenCV's distortion of normalised image points, its Jacobian, and how far out it holds.
+
+Twelve polynomial numbers and two tilt angles, in OpenCV's order: k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4,
+tau_x, tau_y. Source: OpenCV, calib3d, "Detailed description"; the test compares with cv2.projectPoints.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.polynomial import polynomial as poly
+
+from geometry.arrays import Array, Bools
+
+N_DISTORTION = 14
+ALLOWED_LENGTHS = (0, 4, 5, 8, 12, 14)
+
+
+def padded(distortion: tuple[float, ...]) -> Array:
+    """All fourteen numbers of a model given by its first 0, 4, 5, 8, 12 or 14."""
+    out = np.zeros(N_DISTORTION)
+    out[: len(distortion)] = distortion
+    return out
+
+
+def distort(xy: Array, coefficients: Array) -> tuple[Array, Array]:
+    """Distorted normalised points (..., 2) and d(distorted)/d(xy) (..., 2, 2).
+
+    xy (..., 2): X/Z and Y/Z in the camera frame. coefficients (..., 14), broadcast against the points' leading axes.
+    """
+    k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4, tau_x, tau_y = np.moveaxis(coefficients, -1, 0)
+    x, y = xy[..., 0], xy[..., 1]
+    r2 = x * x + y * y
+    numerator = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    denominator = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+    radial = numerator / denominator
+    # derivatives with respect to r2
+    d_numerator = k1 + r2 * (2 * k2 + 3 * r2 * k3)
+    d_denominator = k4 + r2 * (2 * k5 + 3 * r2 * k6)
+    d_radial = (d_numerator - radial * d_denominator) / denominator
+    prism_x, prism_y = r2 * (s1 + r2 * s2), r2 * (s3 + r2 * s4)
+    d_prism_x, d_prism_y = s1 + 2 * r2 * s2, s3 + 2 * r2 * s4
+
+    out = np.empty(np.broadcast_shapes(xy.shape, (*np.shape(k1), 2)))
+    out[..., 0] = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x) + prism_x
+    out[..., 1] = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y + prism_y
+    J = np.empty((*out.shape, 2))
+    mixed = 2 * x * y * d_radial + 2 * p1 * x + 2 * p2 * y
+    J[..., 0, 0] = radial + 2 * x * x * d_radial + 2 * p1 * y + 6 * p2 * x + 2 * x * d_prism_x
+    J[..., 0, 1] = mixed + 2 * y * d_prism_x
+    J[..., 1, 0] = mixed + 2 * x * d_prism_y
+    J[..., 1, 1] = radial + 2 * y * y * d_radial + 6 * p1 * y + 2 * p2 * x + 2 * y * d_prism_y
+    if np.any(tau_x) or np.any(tau_y):
+        return _tilt(out, J, tau_x, tau_y)
+    return out, J
+
+
+def _tilt(xy: Array, J: Array, tau_x: Array, tau_y: Array) -> tuple[Array, Array]:
+    """The Scheimpflug tilt of the sensor, applied last."""
+    T = tilt_matrix(np.asarray(tau_x), np.asarray(tau_y))
+    h = T[..., :2] @ xy[..., None]
+    h = h[..., 0] + T[..., 2]
+    out = h[..., :2] / h[..., 2:]
+    D = (T[..., :2, :2] - out[..., :, None] * T[..., 2:, :2]) / h[..., 2:, None]
+    return out, D @ J
+
+
+def tilt_matrix(tau_x: Array, tau_y: Array) -> Array:
+    """OpenCV's tilt homography (..., 3, 3) of the two angles (...), rad."""
+    cx, sx, cy, sy = np.cos(tau_x), np.sin(tau_x), np.cos(tau_y), np.sin(tau_y)
+    zero, one = np.zeros_like(cx), np.ones_like(cx)
+    about_x = np.stack(
+        [np.stack([one, zero, zero], -1), np.stack([zero, cx, sx], -1), np.stack([zero, -sx, cx], -1)], -2
+    )
+    about_y = np.stack(
+        [np.stack([cy, zero, -sy], -1), np.stack([zero, one, zero], -1), np.stack([sy, zero, cy], -1)], -2
+    )
+    R = about_y @ about_x
+    along = np.stack(
+        [
+            np.stack([R[..., 2, 2], zero, -R[..., 0, 2]], -1),
+            np.stack([zero, R[..., 2, 2], -R[..., 1, 2]], -1),
+            np.stack([zero, zero, one], -1),
+        ],
+        -2,
+    )
+    return along @ R
+
+
+def fold_limit(distortion: tuple[float, ...]) -> float:
+    """The squared normalised radius at which the radial polynomial stops growing; inf where it always grows.
+
+    Beyond it two directions share one pixel: a point far outside the picture would seem to lie in it. The limit is
+    the first positive root of d(r N/D)/dr = 0, or of D = 0, with N, D the model's numerator and denominator.
+    Source: ours.
+    """
+    c = padded(distortion)
+    N = np.array([1.0, c[0], c[1], c[4]])
+    D = np.array([1.0, c[5], c[6], c[7]])
+    slope = poly.polysub(
+        poly.polymul(poly.polyadd(N, 2 * poly.polymulx(poly.polyder(N))), D),
+        2 * poly.polymul(poly.polymulx(N), poly.polyder(D)),
+    )
+    limits = [np.inf]
+    for p in (slope, D):
+        roots = poly.polyroots(poly.polytrim(p, tol=1e-300))
+        real = roots.real[(np.abs(roots.imag) <= 1e-9 * np.abs(roots.real)) & (roots.real > 0)]
+        limits.extend(real)
+    return float(min(limits))
+
+
+def holds(xy: Array, jacobian: Array, fold_r2: Array) -> Bools:
+    """Where (..., 2) the model is one to one: inside the radial limit, and orientation kept (det > 0)."""
+    r2 = np.sum(xy * xy, axis=-1)
+    det = jacobian[..., 0, 0] * jacobian[..., 1, 1] - jacobian[..., 0, 1] * jacobian[..., 1, 0]
+    return (r2 < fold_r2) & (det > 0)
+
+
+def undistort(target: Array, coefficients: Array, fold_r2: float) -> Array:
+    """Normalised points (n, 2) whose distortion is `target` (n, 2); nan where there is none within the fold limit.
+
+    Newton's method from the target itself, each step cut so that the point stays inside the limit and the
+    residual shrinks.
+    """
+    target = np.asarray(target, dtype=float)
+    coefficients = np.asarray(coefficients, dtype=float)
+    if not np.any(coefficients):
+        return target.copy()
+    r_limit = np.sqrt(fold_r2) * (1 - 1e-9)
+    radius = np.linalg.norm(target, axis=-1, keepdims=True)
+    x = target * np.minimum(1.0, 0.7 * r_limit / np.maximum(radius, 1e-300))
+    out, J = distort(x, coefficients)
+    residual = target - out
+    for _ in range(60):
+        det = J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0]
+        det = np.where(np.abs(det) < 1e-12, 1e-12, det)
+        step = np.stack(
+            [
+                (J[..., 1, 1] * residual[..., 0] - J[..., 0, 1] * residual[..., 1]) / det,
+                (J[..., 0, 0] * residual[..., 1] - J[..., 1, 0] * residual[..., 0]) / det,
+            ],
+            -1,
+        )
+        size = np.sum(residual * residual, axis=-1)
+        share = np.ones(len(x))
+        for _ in range(12):
+            trial = x + share[:, None] * step
+            t_out, t_J = distort(trial, coefficients)
+            t_residual = target - t_out
+            worse = (np.sum(t_residual * t_residual, -1) > size) | ~(np.linalg.norm(trial, axis=-1) < r_limit)
+            if not worse.any():
+                break
+            share = np.where(worse, share / 2, share)
+        keep = ~worse
+        x = np.where(keep[:, None], trial, x)
+        residual = np.where(keep[:, None], t_residual, residual)
+        J = np.where(keep[:, None, None], t_J, J)
+        if not np.any(keep & (np.abs(share[:, None] * step) > 1e-15).any(-1)):
+            break
+    good = (np.linalg.norm(residual, axis=-1) < 1e-9) & holds(x, J, np.asarray(fold_r2))
+    return np.where(good[:, None], x, np.nan)

@@ -1,0 +1,89 @@
+"""Rigid transforms between two frames, and the small errors in them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from geometry import rotations
+from geometry.arrays import Array
+
+
+@dataclass(frozen=True, slots=True)
+class Pose:
+    """a_from_b: takes coordinates in b to coordinates in a, x_a = rotation x_b + translation.
+
+    Also a stack of transforms: any leading axes, the same for both fields.
+    """
+
+    rotation: Array  # (..., 3, 3), proper and orthogonal
+    translation: Array  # (..., 3), m
+
+    @staticmethod
+    def identity() -> Pose:
+        """The transform that changes nothing."""
+        return Pose(np.eye(3), np.zeros(3))
+
+    @staticmethod
+    def from_quaternion(quaternion_wxyz: Array, translation_m: Array) -> Pose:
+        """From a quaternion (..., 4) in the order w, x, y, z and a translation (..., 3), m."""
+        rotation = rotations.matrix_from_quaternion(np.asarray(quaternion_wxyz, dtype=float))
+        return Pose(rotation, np.asarray(translation_m, dtype=float))
+
+    @staticmethod
+    def from_ypr(yaw_pitch_roll: Array, translation_m: Array) -> Pose:
+        """From yaw, pitch, roll (..., 3), rad, and a translation (..., 3), m."""
+        return Pose(rotations.matrix_from_ypr(yaw_pitch_roll), np.asarray(translation_m, dtype=float))
+
+    @property
+    def quaternion_wxyz(self) -> Array:
+        """(..., 4), unit, w >= 0."""
+        return rotations.quaternion_from_matrix(self.rotation)
+
+    @property
+    def ypr(self) -> Array:
+        """Yaw, pitch, roll (..., 3), rad."""
+        return rotations.ypr_from_matrix(self.rotation)
+
+    def apply(self, points: Array) -> Array:
+        """Coordinates in a, (..., 3), of points given in b, (..., 3)."""
+        return self.turn(points) + self.translation
+
+    def turn(self, vectors: Array) -> Array:
+        """Directions in a, (..., 3), of directions given in b, (..., 3)."""
+        return (self.rotation @ np.asarray(vectors, dtype=float)[..., None])[..., 0]
+
+    def inverse(self) -> Pose:
+        """b_from_a."""
+        R_t = np.swapaxes(self.rotation, -1, -2)
+        return Pose(R_t, -(R_t @ self.translation[..., None])[..., 0])
+
+    def __matmul__(self, other: Pose) -> Pose:
+        """a_from_c = a_from_b @ b_from_c."""
+        return Pose(self.rotation @ other.rotation, self.apply(other.translation))
+
+    def __getitem__(self, index: object) -> Pose:
+        """One or some of a stack of transforms."""
+        return Pose(self.rotation[index], self.translation[index])  # type: ignore[index]
+
+    def plus(self, delta: Array) -> Pose:
+        """The transform that is `delta` (..., 6) away: [dt (m, in a), dtheta (rad, in b)].
+
+        t + dt and R Exp(dtheta): the pose error of the files' contract.
+        """
+        delta = np.asarray(delta, dtype=float)
+        return Pose(self.rotation @ rotations.exp(delta[..., 3:]), self.translation + delta[..., :3])
+
+    def minus(self, other: Pose) -> Array:
+        """The delta (..., 6) with other.plus(delta) = self."""
+        turn = np.swapaxes(other.rotation, -1, -2) @ self.rotation
+        return np.concatenate([self.translation - other.translation, rotations.log(turn)], axis=-1)
+
+
+def ypr_sigmas(pose: Pose, covariance: Array) -> Array:
+    """Standard deviations of yaw, pitch, roll (3,), rad, from a pose covariance (6, 6), to first order."""
+    J = rotations.ypr_jacobian(pose.rotation)
+    return np.sqrt(np.maximum(np.diagonal(J @ covariance[3:, 3:] @ J.T), 0.0))
+
+

@@ -1,0 +1,1 @@
+"""The lab's files and jobs: runs in, tables and reports out."""

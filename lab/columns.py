@@ -1,0 +1,22 @@
+"""The columns of every table that a run reads or writes, in order. Writers, readers and documentation use this place."""
+
+from __future__ import annotations
+
+DETECTIONS = (
+    "frame", "camera", "u_px", "v_px", "sigma_u_px", "sigma_v_px", "flux", "peak", "major_px", "minor_px",
+    "angle_deg", "cov_uv_px2",
+)  # fmt: skip
+SPOTS = (
+    "frame", "t_s", "camera", "spot", "u_px", "v_px", "sigma_u_px", "sigma_v_px", "status", "predicted_u_px",
+    "predicted_v_px", "gain", "cov_uv_px2",
+)  # fmt: skip
+BEAMS = ("frame", "t_s", "beam", "dx", "dy", "dz", "px_m", "py_m", "pz_m", "status")
+ATTITUDE = (
+    "frame", "t_s", "x_m", "y_m", "z_m", "qw", "qx", "qy", "qz", "yaw_deg", "pitch_deg", "roll_deg",
+    "sigma_x_m", "sigma_y_m", "sigma_z_m", "sigma_yaw_deg", "sigma_pitch_deg", "sigma_roll_deg",
+    "spots_used", "rms_px", "status",
+)  # fmt: skip
+COVARIANCE = ("frame", *(f"c{i}{j}" for i in range(6) for j in range(i, 6)))
+TRUTH_POSE = ("frame", "t_s", "x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
+TRUTH_SPOTS = ("frame", "camera", "spot", "u_px", "v_px", "in_view")
+TIMES = ("frame", "t_s")

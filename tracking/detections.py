@@ -1,0 +1,46 @@
+"""The points of light that were found in one picture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from geometry.arrays import Array, Bools, Ints
+
+
+@dataclass(frozen=True, slots=True)
+class Detections:
+    """n points of light of one picture, brightest first. All arrays have n rows.
+
+    Centres are in distorted pixels, (0, 0) the centre of the top-left pixel.
+    """
+
+    uv_px: Array  # (n, 2)
+    cov_px2: Array  # (n, 2, 2), covariance of uv
+    flux: Array  # (n,) sum above the local background, DN
+    peak: Array  # (n,) maximum above the local background, DN
+    major_px: Array  # (n,) 1-sigma half axes of the fitted Gaussian
+    minor_px: Array  # (n,)
+    angle_deg: Array  # (n,) of the major axis, from +u towards +v, in (-90, 90]
+
+    def __len__(self) -> int:
+        return len(self.uv_px)
+
+    def __getitem__(self, rows: Ints | Bools | slice) -> Detections:
+        """Some of the points, in the given order."""
+        return Detections(*(getattr(self, name)[rows] for name in Detections.__slots__))
+
+    @staticmethod
+    def none() -> Detections:
+        """No points."""
+        return Detections.at(np.zeros((0, 2)), np.zeros((0, 2, 2)))
+
+    @staticmethod
+    def at(uv_px: Array, cov_px2: Array) -> Detections:
+        """Points of which only position (n, 2) and covariance (n, 2, 2) are known; the rest is nan."""
+        n = len(uv_px)
+        unknown = np.full(n, np.nan)
+        return Detections(
+            np.asarray(uv_px, dtype=float), np.asarray(cov_px2, dtype=float), *(unknown.copy() for _ in range(5))
+        )
