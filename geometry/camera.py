@@ -78,9 +78,7 @@ def pinhole_numbers(camera: Camera) -> Array:
     return np.array([camera.matrix[0, 0], camera.matrix[1, 1], camera.matrix[0, 2], camera.matrix[1, 2]])
 
 
-def project_points(
-    points_camera: Array, pinhole: Array, distortion: Array, fold_r2: Array
-) -> tuple[Array, Array]:
+def project_points(points_camera: Array, pinhole: Array, distortion: Array, fold_r2: Array) -> tuple[Array, Array]:
     """Pixels (..., 2) and d(pixel)/d(point) (..., 2, 3), px/m, of points (..., 3), m, in the camera frame.
 
     pinhole (..., 4): fx, fy, cx, cy; distortion (..., 14); fold_r2 (...): all broadcast against the points, so that

@@ -7,9 +7,7 @@ import numpy as np
 from geometry.arrays import Array, cross, normalised
 
 
-def common_perpendicular(
-    point_a: Array, direction_a: Array, point_b: Array, direction_b: Array
-) -> tuple[Array, Array]:
+def common_perpendicular(point_a: Array, direction_a: Array, point_b: Array, direction_b: Array) -> tuple[Array, Array]:
     """The two points (..., 3), m, at which lines a and b are closest: one on each.
 
     Points (..., 3), m; directions (..., 3), any length. nan for parallel lines.

@@ -26,6 +26,4 @@ def meet_plane(origin: Array, direction: Array, world_from_screen: Pose) -> Arra
 
 def screen_to_world(points: Array, world_from_screen: Pose) -> Array:
     """World coordinates (..., 3), m, of points (..., 2), m, of the screen's plane."""
-    return np.einsum(
-        "...i,ji->...j", points, world_from_screen.rotation[:, :2]
-    ) + world_from_screen.translation
+    return np.einsum("...i,ji->...j", points, world_from_screen.rotation[:, :2]) + world_from_screen.translation

@@ -85,5 +85,3 @@ def ypr_sigmas(pose: Pose, covariance: Array) -> Array:
     """Standard deviations of yaw, pitch, roll (3,), rad, from a pose covariance (6, 6), to first order."""
     J = rotations.ypr_jacobian(pose.rotation)
     return np.sqrt(np.maximum(np.diagonal(J @ covariance[3:, 3:] @ J.T), 0.0))
-
-

@@ -69,9 +69,7 @@ class SpotModel:
             ray=rows([s.sign * b.direction for s, b in zip(spots, beams, strict=True)], 3),
             screen_rotation=matrices([s.world_from_screen.rotation for s in screens]),
             screen_origin=rows([s.world_from_screen.translation for s in screens], 3),
-            half_size=rows(
-                [np.full(2, np.inf) if s.size_m is None else np.asarray(s.size_m) / 2 for s in screens], 2
-            ),
+            half_size=rows([np.full(2, np.inf) if s.size_m is None else np.asarray(s.size_m) / 2 for s in screens], 2),
             camera_rotation=matrices([c.camera_from_world.rotation for c in cameras]),
             camera_translation=rows([c.camera_from_world.translation for c in cameras], 3),
             pinhole=rows([pinhole_numbers(c) for c in cameras], 4),
