@@ -1,0 +1,93 @@
+# The chores of beampose. `make help` lists them.
+#
+# PYTHON=python3.12 chooses the Python of a new environment, VENV=elsewhere its place.
+
+PYTHON ?= python3
+VENV ?= .venv
+WORKERS ?= 2
+BIN := $(VENV)/bin
+READY := $(VENV)/.ready
+SAMPLE_RUNS := $(patsubst %/run.yaml,%,$(wildcard sample_runs/*/run.yaml))
+DEMO := results/demo
+
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test test-all check format bench-tracking bench-detection lock wheel pointcloud clean
+
+help:  ## List the chores
+	@sed -n 's/^\([a-z-]*\):.*##  */\1|/p' $(MAKEFILE_LIST) | while IFS='|' read -r name what; do \
+		printf '  make %-16s %s\n' "$$name" "$$what"; done
+
+setup: $(READY)  ## Build the environment (.venv) from requirements.lock; once
+
+# The stamp is removed first: an installation that was broken off is not taken for a finished one.
+$(READY): requirements.lock pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || { \
+		echo "beampose needs Python 3.11 or newer; found: $$($(PYTHON) --version 2>&1 || true)." >&2; \
+		echo "Name another one: make PYTHON=python3.12 $(MAKECMDGOALS)" >&2; exit 2; }
+	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || { \
+		echo "$(PYTHON) comes without venv or ensurepip, which build the environment." >&2; \
+		echo "On Debian or Ubuntu: apt-get install python3-venv" >&2; exit 2; }
+	@rm -f $(READY)
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --require-virtualenv --requirement requirements.lock
+	$(BIN)/python -m pip install --quiet --require-virtualenv --no-deps --no-build-isolation --editable .
+	@touch $(READY)
+
+# The batch's exit status is the demo's, but the paths are shown in any case.
+demo: setup  ## Process the sample runs and show where the results are
+	@test -n "$(SAMPLE_RUNS)" || { echo "sample_runs/ holds no run (a folder with a run.yaml)." >&2; exit 2; }
+	@status=0; $(BIN)/beampose batch $(SAMPLE_RUNS) --out $(DEMO) || status=$$?; \
+	echo; echo "Tables and reports:"; \
+	find $(DEMO) \( -name '*.csv' -o -name '*.html' \) | sort | sed 's/^/  /'; \
+	exit $$status
+
+check: setup  ## Lint, formatting and types
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+test: check  ## The checks and the fast tests
+	$(BIN)/python -m pytest -n $(WORKERS)
+
+test-all: check  ## The checks and all tests, the slow ones too
+	$(BIN)/python -m pytest -n $(WORKERS) -m 'slow or not slow'
+
+format: setup  ## Format the code and mend what the linter can mend
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+bench-tracking: setup  ## The tracking figures, on fresh seeds
+	$(BIN)/python -m bench.tracking
+
+bench-detection: setup  ## The detection figures, on fresh seeds
+	$(BIN)/python -m bench.detection
+
+# In an environment of its own, so that the lock file depends on pyproject.toml alone. Versions that are already
+# locked stay, unless pyproject.toml forbids them; `make lock LOCK_FLAGS=--upgrade` takes the newest. With the
+# oldest Python that we support the list also serves the newer ones.
+lock:  ## Write requirements.lock anew from pyproject.toml
+	$(PYTHON) -m venv --clear build/lock
+	build/lock/bin/python -m pip install --quiet pip-tools
+	build/lock/bin/pip-compile --quiet --extra dev --strip-extras --no-header --no-emit-options \
+		--no-emit-index-url --no-emit-find-links --no-emit-trusted-host $(LOCK_FLAGS) \
+		--output-file requirements.lock pyproject.toml
+
+wheel: setup  ## Build dist/beampose-*.whl
+	$(BIN)/python -m build --no-isolation --outdir dist .
+
+# open3d's library needs libusb even to be imported, and pip cannot install that.
+pointcloud: setup  ## Add open3d, for calibrating screens from point clouds
+	@$(BIN)/python -c 'import ctypes.util, sys; sys.exit(not ctypes.util.find_library("usb-1.0"))' || { \
+		if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
+			apt-get update -qq && apt-get install -y -qq --no-install-recommends libusb-1.0-0; \
+		else \
+			echo "open3d needs the system package libusb-1.0-0, which is not installed." >&2; \
+			echo "On Debian or Ubuntu: sudo apt-get install libusb-1.0-0, then make pointcloud again." >&2; exit 2; \
+		fi; }
+	$(BIN)/python -m pip install --quiet --require-virtualenv --no-build-isolation \
+		--constraint requirements.lock --editable '.[pointcloud]'
+	$(BIN)/python -c 'import open3d; print("open3d", open3d.__version__)'
+
+clean:  ## Remove the environment, builds, results and caches
+	rm -rf .venv build dist results .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
