@@ -1,0 +1,196 @@
+"""Arrows between the folders point down only: cli -> lab -> tracking, calibration -> geometry -> numpy, scipy.
+
+The imports are read with `ast`, wherever they stand in a module: one that hides in a function is an arrow too.
+"""
+
+from __future__ import annotations
+
+import ast
+import sys
+import tomllib
+from collections.abc import Iterator
+from graphlib import CycleError, TopologicalSorter
+from importlib.metadata import packages_distributions
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+FLOORS = ("geometry", "tracking", "calibration", "lab", "cli")
+MAY_USE = {
+    "geometry": set(),
+    "tracking": {"geometry"},
+    "calibration": {"geometry"},
+    "lab": {"geometry", "tracking", "calibration"},
+    "cli": {"lab"},
+}
+# lab and cli may use whatever pyproject.toml declares; the floors of formulas need no files, tables or plots.
+MAY_USE_FROM_OUTSIDE = {
+    "geometry": {"numpy", "scipy"},
+    "tracking": {"numpy", "scipy", "cv2"},
+    "calibration": {"numpy", "scipy", "cv2", "open3d"},
+}
+
+
+def modules(root: Path) -> dict[str, Path]:
+    """Dotted name and file of every module of the program."""
+    found = {}
+    for floor in FLOORS:
+        for path in [*sorted((root / floor).rglob("*.py")), root / f"{floor}.py"]:
+            if path.is_file():
+                parts = path.relative_to(root).with_suffix("").parts
+                found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+    return found
+
+
+def statements(tree: ast.AST, into_functions: bool) -> Iterator[ast.AST]:
+    """All nodes below, with or without those that run only when a function is called."""
+    for node in ast.iter_child_nodes(tree):
+        if into_functions or not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
+            yield node
+            yield from statements(node, into_functions)
+
+
+def imports(name: str, path: Path, into_functions: bool = True) -> set[str]:
+    """Dotted names that a module imports; `from a import b` gives a and a.b, since b may be a module."""
+    package = name.split(".") if path.name == "__init__.py" else name.split(".")[:-1]
+    names = set()
+    for node in statements(ast.parse(path.read_text(encoding="utf-8")), into_functions):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            base = package[: len(package) + 1 - node.level] if node.level else []
+            source = ".".join([*base, *([node.module] if node.module else [])])
+            names |= {source, *(f"{source}.{alias.name}" for alias in node.names)}
+    return names
+
+
+def floor_of(name: str) -> str:
+    return name.split(".")[0]
+
+
+def wrong_arrows(root: Path) -> list[str]:
+    """Imports from one floor to another that MAY_USE does not allow."""
+    return sorted(
+        f"{name} imports {target}"
+        for name, path in modules(root).items()
+        for target in imports(name, path)
+        if floor_of(target) in FLOORS and floor_of(target) not in MAY_USE[floor_of(name)] | {floor_of(name)}
+    )
+
+
+def foreign_packages(root: Path, floor: str) -> set[str]:
+    """Top-level names from neither the standard library nor the program that a floor imports."""
+    used = {
+        floor_of(target)
+        for name, path in modules(root).items()
+        if floor_of(name) == floor
+        for target in imports(name, path)
+    }
+    return used - set(sys.stdlib_module_names) - set(FLOORS)
+
+
+def circle(root: Path) -> list[str]:
+    """A circle of modules that import each other, or an empty list."""
+    known = modules(root)
+    # A package's __init__ is a neighbour of its modules, not a user of them, when they name the package.
+    graph = {name: (imports(name, path) & set(known)) - {name} for name, path in known.items()}
+    for name in graph:
+        graph[name] -= {target for target in graph[name] if name.startswith(target + ".")}
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        return list(error.args[1])
+    return []
+
+
+@pytest.fixture
+def small_program(tmp_path: Path) -> Path:
+    """A program that keeps the rules, for a test to break."""
+    for floor in FLOORS[:-1]:
+        (tmp_path / floor).mkdir()
+        (tmp_path / floor / "__init__.py").write_text("")
+    (tmp_path / "geometry" / "pose.py").write_text("import numpy as np\n")
+    (tmp_path / "geometry" / "rig.py").write_text("from geometry import pose\n")
+    (tmp_path / "lab" / "run.py").write_text("import pandas\nfrom geometry.rig import Rig\n")
+    (tmp_path / "cli.py").write_text("from lab.run import run\n")
+    return tmp_path
+
+
+def test_the_walk_sees_the_whole_program():
+    found = modules(ROOT)
+    geometry = {name for name in found if name.startswith("geometry.")}
+    assert len(found) >= 20
+    assert {"geometry.lens", "geometry.spots", "geometry.rotations", "tracking.statuses", "lab.errors"} <= set(found)
+    assert sum(len(imports(name, found[name])) for name in geometry) >= 30
+
+
+@pytest.mark.parametrize("floor", FLOORS)
+def test_each_floor_stands_only_on_the_floors_below_it(floor):
+    assert [line for line in wrong_arrows(ROOT) if floor_of(line) == floor] == []
+
+
+def test_nobody_imports_the_command_line():
+    users = [n for n, path in modules(ROOT).items() if n != "cli" and "cli" in map(floor_of, imports(n, path))]
+    assert users == []
+
+
+def test_modules_do_not_import_each_other_in_a_circle():
+    assert circle(ROOT) == []
+
+
+@pytest.mark.parametrize("floor", MAY_USE_FROM_OUTSIDE)
+def test_formulas_use_only_numerical_packages(floor):
+    assert foreign_packages(ROOT, floor) <= MAY_USE_FROM_OUTSIDE[floor]
+
+
+def test_what_the_program_imports_is_declared_in_pyproject():
+    declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    required = [*declared["dependencies"], *declared["optional-dependencies"]["pointcloud"]]
+    names = {requirement.split(">=")[0].lower() for requirement in required}
+    distributions = packages_distributions() | {"open3d": ["open3d"]}  # seldom installed
+    used = set().union(*(foreign_packages(ROOT, floor) for floor in FLOORS))
+    assert {"numpy", "scipy"} <= used
+    missing = {p for p in used if not names & {d.lower() for d in distributions.get(p, [])}}
+    assert missing == set()
+
+
+def test_open3d_is_not_needed_to_import_anything():
+    hungry = [n for n, p in modules(ROOT).items() if "open3d" in map(floor_of, imports(n, p, into_functions=False))]
+    assert hungry == []
+
+
+@pytest.mark.parametrize(
+    ("module", "line", "complaint"),
+    [
+        ("geometry/pose.py", "from tracking import match", "geometry.pose imports tracking"),
+        ("geometry/pose.py", "def f():\n    import lab.run", "geometry.pose imports lab.run"),
+        ("tracking/match.py", "from ..lab import run", "tracking.match imports lab.run"),
+        ("tracking/match.py", "import calibration", "tracking.match imports calibration"),
+        ("lab/run.py", "from cli import main", "lab.run imports cli"),
+        ("cli.py", "from geometry.pose import Pose", "cli imports geometry.pose"),
+    ],
+)
+def test_an_arrow_that_points_up_is_seen(small_program, module, line, complaint):
+    assert wrong_arrows(small_program) == []
+    (small_program / module).write_text(line + "\n")
+    assert complaint in wrong_arrows(small_program)
+
+
+def test_a_circle_is_seen(small_program):
+    assert circle(small_program) == []
+    (small_program / "geometry" / "pose.py").write_text("def late():\n    from geometry.rig import Rig\n")
+    assert {"geometry.pose", "geometry.rig"} <= set(circle(small_program))
+
+
+def test_a_package_from_outside_is_seen(small_program):
+    assert foreign_packages(small_program, "geometry") == {"numpy"}
+    (small_program / "geometry" / "rig.py").write_text("import json\nfrom cv2 import norm\n")
+    assert foreign_packages(small_program, "geometry") == {"numpy", "cv2"}
+
+
+def test_an_import_at_the_top_is_told_from_one_in_a_function(small_program):
+    path = small_program / "lab" / "run.py"
+    path.write_text("try:\n    import cv2\nexcept ImportError:\n    pass\ndef f():\n    import open3d\n")
+    assert imports("lab.run", path, into_functions=False) == {"cv2"}
+    assert imports("lab.run", path) == {"cv2", "open3d"}
