@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 
 @dataclass(frozen=True, slots=True)
@@ -12,3 +13,70 @@ class DetectParameters:
     threshold_sigma: float = 6.0  # detection threshold over the local background, in sigmas of its noise
     max_detections: int = 400  # keep the brightest so many of one picture
     saturation_dn: float | None = None  # grey value at which the sensor clips; None: the largest of the picture's type
+
+
+@dataclass(frozen=True, slots=True)
+class LabelParameters:
+    """Labels without a track: the first frame and after a blackout (tracking/labels.py)."""
+
+    gate_px: float = (
+        12.0  # px: a point this near a predicted spot may be it; three noisy spots predict a fourth to a few px
+    )
+    model_sigma_px: float = 0.3  # px: what calibration may be off, added to every point's own sigma
+    p_detect: float = 0.95  # probability that a spot in the picture is found
+    clutter_per_px2: float = (
+        2e-5  # false points per px^2; a picture with more raises it (20 % clutter near spots: 1e-5 to 2e-4)
+    )
+    lead_nats: float = 3.0  # a pose must be exp(3) = 20 times as likely as the next, else it is a tie
+    min_spots: int = 4  # three spots fit any labels exactly: the fourth is the first that can contradict
+    max_points: int = 30  # per camera: the brightest
+    max_refined: int = 40  # label sets that are fitted; enough for 30 points per camera
+    max_triples: int = 4000  # three-spot sets tried per start where no whole beam is seen
+
+
+@dataclass(frozen=True, slots=True)
+class TrackerParameters:
+    """Tracking (tracking/spot_tracker.py). Symbols: Huo, Yang & Yang 2015, sections 3 and 4.1."""
+
+    method: Literal["spots"] = "spots"  # spots: the paper's, one filter per spot
+    detect: DetectParameters = field(default_factory=DetectParameters)
+    labels: LabelParameters = field(default_factory=LabelParameters)
+
+    # Matching, section 4.1
+    r1_px: float = 10.0  # r1, px: radius of the first search, around the prediction (flat from 4 to 30 on bends)
+    r2_px: float = 30.0  # r2, px: radius of the second search, around the last position (flat from 15 to 45)
+    eps1: float = 0.4  # epsilon1: least g3 of the first search
+    eps2: float = 0.3  # epsilon2: least g3 of the second; a full reversal scores about 0.5 there, so it must be lower
+    omega1: float = 0.6  # omega1: weight of nearness to the prediction, g1
+    omega2: float = 0.2  # omega2: weight of the direction, first half of g2
+    omega3: float = 0.2  # omega3: weight of the speed, second half of g2
+    p_norm: float = 2.0  # p: the norm of eqs. (7) and (9)
+    g1_scale: Literal["search radius", "paper"] = (
+        "search radius"  # what g1 is divided by; the paper's diagonal makes it inert
+    )
+    min_vector_px: float = 1.0  # px: floor of vector lengths in g2, g3, whose direction is noise below it (0/0 at rest)
+    radius_sigmas: float = 5.0  # r1 grows to so many sigmas of the predicted position (0: stays r1) ...
+    max_radius_px: float = 120.0  # px: ... but not beyond this; r2 grows with the last displacement, as far
+
+    # Prediction, section 3
+    sigma_a_px_s2: float = 5000.0  # px/s^2: white acceleration of a spot, at the start where it is learnt
+    learn_sigma_a: bool = True  # learn it from the innovations, per spot
+    sigma_model_px: float = 0.02  # px: added to every detection's own sigma
+    curve_switch: bool = True  # eq. (6): restart the filter at a bend; off: the conventional filter
+    image_margin_px: float = 4.0  # px: spots predicted this far outside the picture are searched for as well
+
+    # What one rigid body adds (ours)
+    rigid_check: bool = True  # a spot that contradicts the others is dropped, and looked for where they say
+    estimate: Literal["rigid", "prediction"] = (
+        "rigid"  # of a hidden spot: from the other spots | its own filter (the paper)
+    )
+    out_of_view: Literal["rigid", "quadratic"] = (
+        "rigid"  # position outside the picture: pose of all spots | eqs. (10) to (14)
+    )
+    max_coast_s: float = 1.0  # s: after so long without any pose a track that is not seen is lost
+    reacquire_deg_s: float = 60.0  # deg/s: how fast the search for a lost vehicle widens ...
+    reacquire_m_s: float = 1.5  # m/s: ... and in position
+    pose_sigma_a_m_s2: float = 3.0  # m/s^2: white acceleration of the vehicle while the pose is predicted, at the start
+    pose_sigma_a_rad_s2: float = 6.0  # rad/s^2: the same of its rotation
+    max_sigma_m: float = 0.25  # m: a pose vaguer than this in any direction is not `measured` ...
+    max_sigma_deg: float = 5.0  # deg: ... nor one vaguer than this

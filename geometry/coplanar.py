@@ -1,0 +1,106 @@
+"""The paper's closed forms for a spot out of view: coplanar beams through one point.
+
+Source: Huo, Yang & Yang, Optics and Precision Engineering 23(8), 2015, section 4.2, eqs. (10) to (14), with its misprints
+mended: (11) C = B + k (B - A) is right and (14)'s coefficients belong to it; (12) must end in X_B, Y_B; l begins with
+(X_B - X_O)^2. Written with vectors, so the screen may be any plane, and with two angles, which need not be equal.
+
+O is the point where the beams meet; A, B, C are the spots of three beams on one screen, in this order; alpha is the angle
+AOB and beta the angle BOC.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from geometry.arrays import Array, normalised
+from geometry.lines import common_perpendicular
+from geometry.pose import Pose
+
+# How far the angle AOC may differ from alpha + beta at the root that is taken, rad. With noise the root that is wrong
+# (it returns A, or a point behind O) is off by at least the smaller of 2 alpha and 180 deg - 2 alpha.
+ANGLE_TOLERANCE = np.deg2rad(3.0)
+
+
+def meeting_point(point_a: Array, direction_a: Array, point_b: Array, direction_b: Array) -> Array:
+    """O (..., 3), m: the middle of the common perpendicular of two beams, points (..., 3) and directions (..., 3)."""
+    on_a, on_b = common_perpendicular(point_a, direction_a, point_b, direction_b)
+    return 0.5 * (on_a + on_b)
+
+
+def quadratic_coefficients(O: Array, A: Array, B: Array, beta: float) -> tuple[Array, Array, Array]:
+    """a, b, c (...) of the paper's a k^2 + b k + c = 0, eq. (14), for C = B + k (B - A) and the angle BOC = beta.
+
+    O, A, B (..., 3), m; beta in rad.
+    """
+    OB, AB = B - O, B - A
+    l = np.sum(OB * OB, axis=-1)  # noqa: E741 - the paper's letter
+    m = np.sum(OB * AB, axis=-1)
+    cos2 = np.cos(beta) ** 2
+    m1 = l * np.sum(AB * AB, axis=-1) * cos2
+    m2 = 2 * cos2 * l * m
+    m3 = cos2 * l * l
+    return m1 - m * m, m2 - 2 * m * l, m3 - l * l
+
+
+def outer_spot(
+    O: Array, A: Array, B: Array, alpha: float, beta: float, tolerance: float = ANGLE_TOLERANCE
+) -> Array:
+    """C (..., 3), m: the spot beyond B, of a beam at the angle `beta` (rad) from B's; nan where that beam misses the plane.
+
+    O, A, B (..., 3), m, in world; alpha, the angle AOB by calibration, and beta are in (0, pi/2). Of the two roots the one with k > 0 and
+    angle AOC = alpha + beta within the tolerance. The paper's rule, "the root whose angle AOC is 2 alpha", has no such root
+    when the beam leaves the plane behind (8 % of geometries for alpha of 10 to 30 deg, 90 % for 60 to 89 deg), and its nearest is A itself.
+    """
+    a, b, c = quadratic_coefficients(O, A, B, beta)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        # b^2 - 4ac = 4 l^2 sin^2(beta) cos^2(beta) |OB x AB|^2 >= 0; rounding may take it below.
+        root = np.sqrt(np.maximum(b * b - 4 * a * c, 0.0))
+        # The form without cancellation: one root by division with a, the other with q; a = 0 (OC parallel to AB) gives inf.
+        q = -0.5 * (b + np.where(b >= 0, root, -root))
+        k = np.stack([q / a, c / q], axis=-1)  # (..., 2)
+        C = B[..., None, :] + k[..., None] * (B - A)[..., None, :]
+        OA, OC = normalised(A - O)[..., None, :], normalised(C - O[..., None, :])
+        off = np.abs(_angle(OA, OC) - (alpha + beta))
+        fits = np.isfinite(k) & (k > 0) & (off < tolerance)
+        best = np.argmin(np.where(fits, off, np.inf), axis=-1)
+    chosen = np.take_along_axis(C, best[..., None, None], axis=-2)[..., 0, :]
+    return np.where(fits.any(axis=-1)[..., None], chosen, np.nan)
+
+
+def middle_spot(O: Array, A: Array, C: Array, alpha: float, beta: float, world_from_screen: Pose) -> Array:
+    """B (..., 3), m: the spot between A and C, of a beam at `alpha` from A's and `beta` from C's (rad). nan if it misses.
+
+    The middle beam has no form like eq. (14): OA is turned towards OC by the share alpha / (alpha + beta) of the
+    angle AOC as measured, then met with the screen. Source: ours.
+    """
+    OA, OC = normalised(A - O), normalised(C - O)
+    return _turned_to_plane(O, OA, OC, alpha / (alpha + beta), world_from_screen)
+
+
+def rotated_spot(O: Array, A: Array, B: Array, alpha: float, beta: float, world_from_screen: Pose) -> Array:
+    """C (..., 3), m, by turning OA towards and beyond OB: the second way to `outer_spot`, the same to rounding.
+
+    The turn is measured from B by exactly beta, so an error in alpha does not enter, as in eq. (14).
+    """
+    OA, OB = normalised(A - O), normalised(B - O)
+    share = 1 + beta / _angle(OA, OB)
+    return _turned_to_plane(O, OA, OB, share, world_from_screen)
+
+
+def _turned_to_plane(O: Array, start: Array, towards: Array, share: Array | float, screen: Pose) -> Array:
+    """Where the ray from O, turned from `start` by a share of the angle to `towards`, meets a screen; nan if behind."""
+    angle = _angle(start, towards)
+    across = normalised(towards - np.sum(start * towards, axis=-1)[..., None] * start)
+    turn = angle * share
+    ray = np.cos(turn)[..., None] * start + np.sin(turn)[..., None] * across
+    normal = screen.rotation[:, 2]
+    facing = ray @ normal
+    height = (screen.translation - O) @ normal
+    with np.errstate(invalid="ignore", divide="ignore"):
+        t = height / facing
+        return np.where(((t > 0) & np.isfinite(t))[..., None], O + t[..., None] * ray, np.nan)
+
+
+def _angle(a: Array, b: Array) -> Array:
+    """Angle (...) between unit vectors, rad; accurate at 0 and pi too."""
+    return 2 * np.arctan2(np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1))

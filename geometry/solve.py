@@ -1,0 +1,210 @@
+"""The pose from labelled spots: weighted Gauss-Newton on pixel residuals, its covariance, and what cannot be seen.
+
+Source: ours; Gauss-Newton on the error state [dt, dtheta] of section 1 of the files' contract, with the one forward
+model of geometry/spots.py and its analytic Jacobian.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2 as chi2_distribution
+
+from geometry.arrays import Array, Ints, symmetric
+from geometry.pose import Pose
+from geometry.spots import SpotModel
+
+# Relative size under which a singular value of the whitened, scaled Jacobian is zero. Exact degeneracies (three spots
+# of one screen are collinear whatever the pose) give 1e-13 and less; the worst usable geometry about 1e-4.
+RANK_TOLERANCE = 1e-7
+
+
+@dataclass(frozen=True, slots=True)
+class SolveLimits:
+    """When a pose of one frame counts as measured."""
+
+    max_sigma_m: float = 0.25  # m: a larger sigma of any direction is no measurement ...
+    max_sigma_rad: float = np.deg2rad(5.0)  # ... nor is this: beyond it first-order covariances mean little
+    p_false_alarm: float = 1e-5  # of the chi-square test that a right set of spots must pass
+    min_outlier_px: float = 0.5  # a spot is wrong only if it also lies this far off: small misfits are model error
+
+
+@dataclass(frozen=True, slots=True)
+class PoseFit:
+    """A pose fitted to m labelled spots."""
+
+    world_from_body: Pose
+    covariance: Array  # (6, 6) of [dt (m, world), dtheta (rad, body)]; inf where not observable
+    observable: bool
+    rows: Ints  # (m,) the views used
+    residuals_px: Array  # (m, 2) measured minus fitted
+    chi2: float  # of the whitened residuals
+    dof: int  # 2 m - 6
+
+    @property
+    def rms_px(self) -> float:
+        """Root mean square of the residuals, per axis, px; nan without spots."""
+        return float(np.sqrt(np.mean(self.residuals_px**2))) if len(self.rows) else float("nan")
+
+    def consistent(self, p_false_alarm: float) -> bool:
+        """Whether the misfit is what the spots' covariances allow."""
+        return self.dof <= 0 or self.chi2 <= chi2_distribution.isf(p_false_alarm, self.dof)
+
+
+def whiten(covariances: Array) -> Array:
+    """Matrices W (..., 2, 2) with W C W^T = I, of covariances C (..., 2, 2): the inverse of the Cholesky factor."""
+    a, b, c = covariances[..., 0, 0], covariances[..., 0, 1], covariances[..., 1, 1]
+    l11 = np.sqrt(a)
+    l21 = b / l11
+    l22 = np.sqrt(np.maximum(c - l21 * l21, 1e-300))
+    W = np.zeros_like(covariances)
+    W[..., 0, 0] = 1 / l11
+    W[..., 1, 0] = -l21 / (l11 * l22)
+    W[..., 1, 1] = 1 / l22
+    return W
+
+
+def fit_pose(
+    model: SpotModel,
+    rows: Ints,
+    pixels: Array,
+    covariances: Array,
+    start: Pose,
+    *,
+    prior: tuple[Pose, Array] | None = None,
+    max_iterations: int = 25,
+) -> PoseFit | None:
+    """The pose that puts the spots of views `rows` (m,) at `pixels` (m, 2), px, with covariances (m, 2, 2), px^2.
+
+    start: where to begin; within some ten degrees it need not be good. prior: a pose and its information matrix
+    (6, 6), added as six more measurements. Levenberg's damping keeps a far start from running away. None where
+    it does not converge (a spot without projection on the way, or a singular start).
+    """
+    if len(rows) == 0:
+        return None
+    W = whiten(covariances)
+    pose, damping = start, 0.0
+    terms = _terms(model, rows, pixels, W, pose, prior)
+    if terms is None:
+        return None
+    H, g, cost, residuals = terms
+    for _ in range(max_iterations):
+        scale = np.maximum(np.diagonal(H), 1e-12 * np.trace(H))
+        # The smallest damping only steadies directions that no spot sees; elsewhere it is far below rounding.
+        step = np.linalg.solve(H + np.diag((damping + 1e-14) * scale), g)
+        gain = float(step @ g)
+        if not np.isfinite(gain):
+            return None
+        trial = pose.plus(step)
+        trial_terms = _terms(model, rows, pixels, W, trial, prior)
+        if trial_terms is None or trial_terms[2] > cost * (1 + 1e-9) + 1e-12:
+            damping = max(10 * damping, 1e-3)
+            if damping > 1e8:
+                break
+            continue
+        pose, (H, g, cost, residuals) = trial, trial_terms
+        damping = damping / 10 if damping > 1e-6 else 0.0
+        if gain < 1e-12:  # in squared sigmas: the step was a millionth of what the noise resolves
+            break
+    else:
+        return None
+    covariance, observable = covariance_of(H)
+    dof = 2 * len(rows) - 6 + (6 if prior is not None else 0)
+    return PoseFit(pose, covariance, observable, np.asarray(rows), residuals, cost, dof)
+
+
+def _terms(
+    model: SpotModel, rows: Ints, pixels: Array, W: Array, pose: Pose, prior: tuple[Pose, Array] | None
+) -> tuple[Array, Array, float, Array] | None:
+    """Normal matrix (6, 6), right-hand side (6,), cost and residuals (m, 2) px at a pose; None without projection."""
+    projected, J = model.project(pose)
+    residuals = pixels - projected[rows]
+    if np.isnan(residuals).any():
+        return None
+    r = (W @ residuals[..., None])[..., 0].ravel()
+    A = (W @ J[rows]).reshape(-1, 6)
+    H, g, cost = A.T @ A, A.T @ r, float(r @ r)
+    if prior is not None:
+        # d(minus)/d(step) is the identity to first order in the distance, which is what a prior is good for.
+        gap = prior[0].minus(pose)
+        H, g, cost = H + prior[1], g + prior[1] @ gap, cost + float(gap @ prior[1] @ gap)
+    return H, g, cost, residuals
+
+
+def covariance_of(H: Array) -> tuple[Array, bool]:
+    """Covariance (6, 6) of a normal matrix (6, 6), and whether it has full rank; without it all entries are inf."""
+    eigenvalues, vectors = np.linalg.eigh(symmetric(H))
+    if eigenvalues[0] <= (RANK_TOLERANCE**2) * eigenvalues[-1]:
+        return np.full((6, 6), np.inf), False
+    return (vectors / eigenvalues) @ vectors.T, True
+
+
+def good_enough(fit: PoseFit, limits: SolveLimits) -> bool:
+    """Whether a fit is a measurement of the pose: full rank, and no direction vaguer than the limits."""
+    if not fit.observable:
+        return False
+    worst_m = np.sqrt(np.linalg.eigvalsh(fit.covariance[:3, :3])[-1])
+    worst_rad = np.sqrt(np.linalg.eigvalsh(fit.covariance[3:, 3:])[-1])
+    return bool(worst_m <= limits.max_sigma_m and worst_rad <= limits.max_sigma_rad)
+
+
+def fit_pose_robust(
+    model: SpotModel,
+    rows: Ints,
+    pixels: Array,
+    covariances: Array,
+    start: Pose,
+    *,
+    expected: tuple[Pose, Array] | None = None,
+    limits: SolveLimits | None = None,
+    noise_scale: float = 1.0,
+) -> PoseFit | None:
+    """As `fit_pose`, but one spot may be wrong; it is then left out (it is missing from the result's rows).
+
+    Where the chi-square test fails, each spot is left out in turn. A set of four or more spots is chosen by its own misfit;
+    three spots fit any labels, so there `expected`, a pose and its covariance (6, 6), must decide, and without it
+    nothing is returned. noise_scale: how much larger than claimed the misfit is known to be (model error): the test
+    is widened by it. None where no consistent set exists.
+    """
+    limits = SolveLimits() if limits is None else limits
+    fit = fit_pose(model, rows, pixels, covariances, start)
+    if fit is not None and _acceptable(fit, limits, noise_scale):
+        return fit
+    if len(rows) < 4:
+        return None
+    best: PoseFit | None = None
+    best_score, runner_up = np.inf, np.inf
+    for leave in range(len(rows)):
+        keep = np.arange(len(rows)) != leave
+        trial = fit_pose(model, rows[keep], pixels[keep], covariances[keep], start)
+        if trial is None or not trial.observable or not _acceptable(trial, limits, noise_scale):
+            continue
+        left_at = model.project(trial.world_from_body)[0][rows[leave]]
+        if np.linalg.norm(left_at - pixels[leave]) < limits.min_outlier_px:
+            continue
+        score = trial.chi2 / noise_scale**2
+        if expected is not None:
+            gap = trial.world_from_body.minus(expected[0])
+            score += float(gap @ np.linalg.solve(expected[1] + trial.covariance, gap))
+        elif trial.dof <= 0:
+            continue
+        if score < best_score:
+            best, best_score, runner_up = trial, score, best_score
+        else:
+            runner_up = min(runner_up, score)
+    if best is None or runner_up - best_score < 6.0:  # 3 nats: below that it is a guess which spot is wrong
+        return None
+    return best
+
+
+def _acceptable(fit: PoseFit, limits: SolveLimits, noise_scale: float) -> bool:
+    """Passes the chi-square test, or misfits by less than anyone calls an outlier."""
+    if fit.dof <= 0 or fit.chi2 <= noise_scale**2 * chi2_distribution.isf(limits.p_false_alarm, fit.dof):
+        return True
+    return bool(np.all(np.linalg.norm(fit.residuals_px, axis=-1) < 0.5 * limits.min_outlier_px))
+
+
+def point_covariance(J: Array, covariance: Array) -> Array:
+    """What a pose covariance (6, 6) means for pixels: J C J^T (..., 2, 2), px^2, of Jacobians (..., 2, 6)."""
+    return J @ covariance @ np.swapaxes(J, -1, -2)
