@@ -1,0 +1,193 @@
+"""YAML in and out: read safely and strictly, each mistake told in one line, written whole or not at all.
+
+Only YAML 1.2's core types are read (null, true/false, integers, decimal and exponent floats): `on`, `no`, `1:30` and
+dates stay words, and `1e-3` is a number, unlike in YAML 1.1. Every key is the text that the file shows, so that the
+spots `1` and `"1"` are the same spot.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+import os
+import re
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from lab.errors import InputError
+
+
+class FileError(InputError):
+    """What is wrong in one file: a line for each mistake. The message shows the first and counts the rest."""
+
+    def __init__(self, lines: Iterable[str]) -> None:
+        self.lines = tuple(lines)
+        more = len(self.lines) - 1
+        tail = f"\n(and {more} more in this file: `beampose check` lists them)" if more else ""
+        super().__init__(self.lines[0] + tail)
+
+
+def did_you_mean(word: object, known: Iterable[str]) -> str:
+    """`; did you mean 'frames'?` or, where nothing is near, `; known: ...`; empty where nothing is known."""
+    known = [str(k) for k in known]
+    near = difflib.get_close_matches(str(word), known, n=1, cutoff=0.6)
+    if not near:
+        lowered = {k.lower(): k for k in known}
+        near = [lowered[str(word).lower()]] if str(word).lower() in lowered else []
+    if near:
+        return f"; did you mean {near[0]!r}?"
+    return f"; known: {', '.join(known)}" if known else ""
+
+
+def shown(value: object) -> str:
+    """A value as an error line shows it: short, and in the file's terms."""
+    if value is None:
+        return "nothing"
+    if isinstance(value, Mapping):
+        return f"a mapping with {', '.join(map(str, value)) or 'no keys'}"[:70]
+    if isinstance(value, bool):
+        return str(value).lower()
+    text = repr(value)
+    if len(text) > 50 and isinstance(value, list):
+        return f"a list of {len(value)}"
+    return text if len(text) <= 50 else text[:46] + " ..."
+
+
+class _StrictLoader(yaml.SafeLoader):
+    """Safe YAML with YAML 1.2's core types only, keys as written, no key twice."""
+
+    yaml_implicit_resolvers: dict[str, list[tuple[str, re.Pattern[str]]]] = {}  # noqa: RUF012 - replaces the base's
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        own = [key for key, _ in node.value if key.tag != "tag:yaml.org,2002:merge"]
+        seen: set[str] = set()
+        for key in own:
+            if not isinstance(key, yaml.ScalarNode):
+                raise yaml.constructor.ConstructorError(None, None, "a key that is not a word", key.start_mark)
+            if key.value in seen:
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"the key {key.value!r} a second time", key.start_mark
+                )
+            seen.add(key.value)
+        self.flatten_mapping(node)
+        return {key.value: self.construct_object(value, deep=True) for key, value in node.value}
+
+
+def _construct_map(loader: _StrictLoader, node: yaml.MappingNode) -> dict[Any, Any]:
+    return loader.construct_mapping(node, deep=True)
+
+
+_StrictLoader.add_constructor("tag:yaml.org,2002:map", _construct_map)
+for _tag, _pattern, _first in (
+    ("null", r"~|null|Null|NULL|", ["~", "n", "N", ""]),
+    ("bool", r"true|True|TRUE|false|False|FALSE", list("tTfF")),
+    ("int", r"[-+]?(0|[1-9][0-9]*)", list("-+0123456789")),
+    (
+        "float",
+        r"[-+]?((\.[0-9]+|[0-9]+\.[0-9]*)([eE][-+]?[0-9]+)?|[0-9]+[eE][-+]?[0-9]+|\.(inf|Inf|INF))|\.(nan|NaN|NAN)",
+        list("-+.0123456789"),
+    ),
+    ("merge", r"<<", ["<"]),
+):
+    _StrictLoader.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(rf"^(?:{_pattern})$"), _first)
+
+
+def _construct_int(loader: _StrictLoader, node: yaml.ScalarNode) -> int:
+    return int(loader.construct_scalar(node))
+
+
+def _construct_float(loader: _StrictLoader, node: yaml.ScalarNode) -> float:
+    text = str(loader.construct_scalar(node)).lower()
+    if text.lstrip("+-") in (".inf", ".nan"):
+        return math.copysign(math.inf, -1 if text[0] == "-" else 1) if "inf" in text else math.nan
+    return float(text)
+
+
+_StrictLoader.add_constructor("tag:yaml.org,2002:int", _construct_int)
+_StrictLoader.add_constructor("tag:yaml.org,2002:float", _construct_float)
+
+
+def read_text(path: Path) -> str:
+    """The text of a file, UTF-8 with or without a byte order mark. Raises InputError in one line."""
+    try:
+        return path.read_bytes().decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(
+            f"{path}: expected UTF-8 text, got a byte that is none at position {error.start}; save it as UTF-8"
+        ) from None
+    except FileNotFoundError:
+        raise InputError(f"{path}: expected a file, found none; check the path") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+
+
+def read_mapping(path: Path) -> dict[str, Any]:
+    """The mapping that a YAML file holds; keys are words. Raises InputError in one line, with the line's number."""
+    text = read_text(path)
+    try:
+        content = yaml.load(text, Loader=_StrictLoader)
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        where = f"line {mark.line + 1}" if mark else "the text"
+        problem = error.problem or "a mistake"
+        if "'\\t'" in problem:
+            problem = "a tab; indent with spaces"
+        elif "sequence entries are not allowed" in problem:
+            problem = 'a lone minus; quote it: "-"'
+        elif "mapping values are not allowed" in problem:
+            problem = "a second colon; quote the text that holds it"
+        raise InputError(f"{path}: {where}: expected YAML, found {problem.removeprefix('but found ')}") from None
+    except yaml.YAMLError as error:
+        raise InputError(f"{path}: expected YAML, found {str(error).splitlines()[0]}") from None
+    except RecursionError:
+        raise InputError(f"{path}: expected YAML, found a nesting too deep to read") from None
+    if not isinstance(content, dict):
+        raise InputError(f"{path}: expected `key: value` lines, got {shown(content)}")
+    return content
+
+
+class _Writer(yaml.SafeDumper):
+    """Short lists on one line, keys in the given order, no aliases."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
+
+
+def _represent_list(writer: _Writer, values: list[Any]) -> yaml.Node:
+    flow = all(not isinstance(v, dict | list) for v in values)
+    return writer.represent_sequence("tag:yaml.org,2002:seq", values, flow_style=flow)
+
+
+def _represent_dict(writer: _Writer, values: dict[Any, Any]) -> yaml.Node:
+    flow = all(not isinstance(v, dict | list) for v in values.values())
+    return writer.represent_mapping("tag:yaml.org,2002:map", values.items(), flow_style=flow and len(values) > 1)
+
+
+# What YAML 1.1 reads as a word but this reader as a number must be quoted as well.
+_Writer.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(r"^[-+]?[0-9]+[eE][-+]?[0-9]+$"), list("-+0123456789")
+)
+_Writer.add_representer(list, _represent_list)
+_Writer.add_representer(dict, _represent_dict)
+
+
+def write_mapping(content: Mapping[str, Any], path: Path) -> None:
+    """Write plain values as YAML: floats to the last bit, complete or not at all."""
+    write_whole(yaml.dump(dict(content), Dumper=_Writer, sort_keys=False, allow_unicode=True, width=120), path)
+
+
+def write_whole(text: str, path: Path) -> None:
+    """Write a text file so that `path` is either the whole new file or what it was before."""
+    beside = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        with beside.open("w", encoding="utf-8", newline="\n") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        beside.replace(path)
+    except OSError as error:
+        beside.unlink(missing_ok=True)
+        raise InputError(f"{path}: cannot be written: {error.strerror}") from None
