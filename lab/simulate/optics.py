@@ -1,0 +1,112 @@
+"""The shape and brightness of a laser spot in a picture, and its light summed over pixels and over the exposure."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from geometry.arrays import Array
+from geometry.camera import project_points
+from geometry.pose import Pose
+from geometry.spots import SpotModel
+
+_REACH = 5.0  # sigmas that are drawn: a 150 DN spot ends below 0.001 DN
+# Gauss-Legendre nodes within a pixel, per axis. With four, the sum over a pixel of a Gaussian with sigma 0.5 px is
+# right to 1e-6 of its peak; three would do from 0.8 px on.
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(4)
+
+
+@dataclass(frozen=True, slots=True)
+class Spots:
+    """How n spots look at one instant. `lab.simulate.optics.appearance` makes it."""
+
+    uv_px: Array  # (n, 2) centre: the image of the beam's axis
+    covariance_px2: Array  # (n, 2, 2) of the Gaussian in the picture, before the sum over pixels
+    light: Array  # (n,) what the camera gathers, relative: inverse square of the distance times cosine at the screen
+
+
+def on_screen_covariance(direction: Array, axes: Array, sigma_m: float) -> Array:
+    """The Gaussian (..., 2, 2), m^2, that a beam leaves on a screen which cuts it obliquely.
+
+    direction (..., 3): unit, of the beam; axes (..., 3, 2): the screen's x and y axes, in the same frame. Across the
+    beam the light falls as exp(-r^2 / 2 sigma^2), r the distance from the axis; for a point s of the screen, r^2 =
+    s^T B^T (I - d d^T) B s = s^T (I - b b^T) s with b = B^T d, so the covariance is the inverse of that times sigma^2:
+    I + b b^T / (1 - b^T b), by Sherman and Morrison. The beam's divergence across the spot is neglected.
+    """
+    b = np.einsum("...ij,...i->...j", axes, direction)
+    slack = np.maximum(1.0 - np.sum(b * b, axis=-1), 1e-4)  # cos^2 of the incidence; a grazing beam stays finite
+    return sigma_m**2 * (np.eye(2) + b[..., :, None] * b[..., None, :] / slack[..., None, None])
+
+
+def appearance(model: SpotModel, world_from_body: Pose, sigma_m: float, blur_px: float) -> Spots:
+    """The spots of all views for one pose: each an ellipse on its screen, taken to the picture by the lens' local
+    affine map. nan where there is no projection.
+
+    sigma_m: of the beam's light across it, half its 1/e^2 radius. blur_px: sigma of the lens' blur.
+    """
+    hit = model.hits(world_from_body)[0]
+    uv = model.project(world_from_body)[0]
+    direction = (world_from_body.rotation @ model.ray[..., None])[..., 0]
+    axes = model.screen_rotation[..., :2]
+    in_camera = (model.camera_rotation @ hit[..., None])[..., 0] + model.camera_translation
+    seen = np.isfinite(uv[:, 0])
+    in_camera = np.where(seen[:, None], in_camera, [0.0, 0.0, 1.0])
+    J = project_points(in_camera, model.pinhole, model.distortion, model.fold_r2)[1]
+    A = J @ (model.camera_rotation @ axes)  # (n, 2, 2) px per m of the screen
+    covariance = A @ on_screen_covariance(direction, axes, sigma_m) @ np.swapaxes(A, -1, -2) + blur_px**2 * np.eye(2)
+    # A matt screen: the camera gathers the lit spot's power times cosine over square of the distance.
+    distance = np.linalg.norm(in_camera, axis=-1)
+    normal = (model.camera_rotation @ model.screen_rotation[..., 2:])[..., 0]
+    cosine = np.abs(np.sum(normal * in_camera, axis=-1)) / distance
+    light = np.where(seen, cosine / distance**2, np.nan)
+    return Spots(uv, np.where(seen[:, None, None], covariance, np.nan), light)
+
+
+@dataclass(frozen=True, slots=True)
+class Patch:
+    """A small piece of a picture: light per pixel."""
+
+    row: int  # of its first pixel
+    column: int
+    values: Array  # (h, w)
+
+
+def spot_patch(path_px: Array, weights: Array, covariance_px2: Array, size_px: tuple[int, int]) -> Patch | None:
+    """A Gaussian spot of flux 1 that moves during the exposure, summed over each pixel; None outside the picture.
+
+    path_px (m, 2): centres at m instants; weights (m,): the shares of the exposure that they stand for.
+    covariance_px2 (2, 2): kept during the exposure. size_px: width, height.
+    """
+    reach = _REACH * np.sqrt(np.diagonal(covariance_px2)) + 1.0
+    first = np.maximum(np.floor(path_px.min(axis=0) - reach), 0).astype(int)
+    last = np.minimum(np.ceil(path_px.max(axis=0) + reach), np.array(size_px) - 1).astype(int)
+    if np.any(last < first):
+        return None
+    precision = np.linalg.inv(covariance_px2)
+    norm = np.sqrt(np.linalg.det(precision)) / (2 * np.pi)
+    u = (np.arange(first[0], last[0] + 1)[:, None] + _NODES / 2).ravel()
+    v = (np.arange(first[1], last[1] + 1)[:, None] + _NODES / 2).ravel()
+    light = np.zeros((len(v), len(u)))
+    for centre, weight in zip(path_px, weights, strict=True):
+        du, dv = u - centre[0], v - centre[1]
+        exponent = precision[0, 1] * dv[:, None] * du
+        exponent += 0.5 * precision[0, 0] * du**2
+        exponent += 0.5 * precision[1, 1] * (dv**2)[:, None]
+        light += weight * np.exp(-exponent)
+    k = len(_NODES)
+    blocks = light.reshape(len(v) // k, k, len(u) // k, k)
+    values = norm * np.einsum("ijkl,j,l->ik", blocks, _WEIGHTS / 2, _WEIGHTS / 2)
+    return Patch(int(first[1]), int(first[0]), values)
+
+
+def exposure_instants(length_px: float, sigma_px: float) -> tuple[Array, Array]:
+    """Instants (m,) in [-0.5, 0.5] of the exposure and their weights (m,), enough for a streak of this length.
+
+    Gauss-Legendre, with nodes about one sigma of the spot apart: then the sum differs from the integral by less than
+    1e-6 of the peak. A still spot needs one.
+    """
+    if length_px < 1e-3 * sigma_px:
+        return np.zeros(1), np.ones(1)
+    nodes, weights = np.polynomial.legendre.leggauss(int(np.clip(3 + np.ceil(length_px / sigma_px), 4, 200)))
+    return nodes / 2, weights / 2

@@ -1,0 +1,96 @@
+"""A recording as points only: truth and noisy detections without pictures. For studies with many runs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from geometry.arrays import Array, Bools, Ints
+from geometry.pose import Pose
+from geometry.rig import Rig
+from geometry.spots import SpotModel
+from lab.simulate.scenarios import Prior, Scenario
+from lab.simulate.scene import POINT_NOISE, SHINING, compose, with_overrides
+from tracking.detections import Detections
+
+CLUTTER = -1  # the origin of a detection that is no spot
+_LEAST_SIGMA_PX = 1e-3  # the covariance that noise-free detections claim: a weight must stay finite
+
+
+@dataclass(frozen=True, slots=True)
+class PointRun:
+    """T frames, n views (camera and spot, in the order of model.views), c cameras."""
+
+    name: str
+    seed: int
+    rig: Rig
+    model: SpotModel
+    prior: Prior
+    noise_px: float  # 1 sigma per axis of each detection
+    frame_rate_hz: float
+    frame: Ints  # (T,) 0, 1, ...
+    t_s: Array  # (T,)
+    poses: Pose  # (T,) true world_from_body
+    uv_px: Array  # (T, n, 2) true, also outside the picture; nan where there is none
+    in_view: Ints  # (T, n) 1 in the picture and shining, 2 in the picture but hidden, 0 outside
+    has_image: Bools  # (T, c); where not, there are no detections
+    turned: Bools  # (T,) the motion bent abruptly between the frame before and this one
+    detections: tuple[tuple[Detections, ...], ...]  # [frame][camera], in random order
+    origin: tuple[tuple[Ints, ...], ...]  # [frame][camera] (rows,): the view that each detection is of, or CLUTTER
+
+
+def simulate_points(
+    scenario: str | Scenario,
+    seed: int,
+    *,
+    frames: int | None = None,
+    noise_px: float = 0.1,
+    clutter: float | None = None,
+    miss_probability: float | None = None,
+    picture_scale: float = 1.0,
+) -> PointRun:
+    """One recording of a scenario as points.
+
+    noise_px: 1 sigma per axis, also of clutter. clutter: probability of a false spot near each spot in the picture
+    (default: the scenario's). miss_probability: of each spot in each frame. The motion depends on scenario and seed
+    only; the clutter of a lower probability is part of that of a higher one. picture_scale: as in lab.simulate.write.
+    """
+    overridden = with_overrides(scenario, clutter=clutter, miss_probability=miss_probability)
+    scene = compose(overridden, seed, frames, picture_scale)
+    model, false = scene.model, scene.false_spots
+    n, cameras = len(model), range(len(model.camera_names))
+    first_false = np.searchsorted(false.frame, np.arange(len(scene.frame) + 1))
+    covariance = max(noise_px, _LEAST_SIGMA_PX) ** 2 * np.eye(2)
+    detections, origins = [], []
+    for k in range(len(scene.frame)):
+        some = slice(first_false[k], first_false[k + 1])
+        rng = np.random.default_rng([seed, POINT_NOISE, k])
+        # Noise is drawn for all views, seen or not, so that hiding one spot leaves the others as they were.
+        uv = np.concatenate([scene.uv_px[k], false.uv_px[some]])
+        uv = uv + noise_px * rng.standard_normal(uv.shape)
+        of = np.concatenate([np.arange(n), np.full(len(uv) - n, CLUTTER)])
+        camera = np.concatenate([model.camera_of, false.camera[some]])
+        there = np.concatenate([scene.in_view[k] == SHINING, np.ones(len(uv) - n, dtype=bool)])
+        shuffled = rng.permutation(len(uv))
+        rows = [shuffled[(there & (camera == c) & scene.has_image[k, c])[shuffled]] for c in cameras]
+        detections.append(tuple(Detections.at(uv[r], np.tile(covariance, (len(r), 1, 1))) for r in rows))
+        origins.append(tuple(of[r] for r in rows))
+    return PointRun(
+        name=scene.scenario.name,
+        seed=seed,
+        rig=scene.rig,
+        model=model,
+        prior=scene.scenario.prior,
+        noise_px=noise_px,
+        frame_rate_hz=scene.scenario.frame_rate_hz,
+        frame=scene.frame,
+        t_s=scene.t_s,
+        poses=scene.poses,
+        uv_px=scene.uv_px,
+        in_view=scene.in_view,
+        has_image=scene.has_image,
+        turned=scene.turned,
+        detections=tuple(detections),
+        origin=tuple(origins),
+    )

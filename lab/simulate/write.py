@@ -1,0 +1,241 @@
+"""A scenario as a run folder on disk: rig.yaml, run.yaml, pictures (or a video, or points) and truth."""
+
+from __future__ import annotations
+
+import csv
+import os
+import shutil
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from lab import columns
+from lab.errors import InputError
+from lab.rig_file import save_rig
+from lab.run_file import save_run
+from lab.simulate.picture import Picture, Powers, Sensor, laser_powers, make_sensor, take
+from lab.simulate.points import simulate_points
+from lab.simulate.scenarios import LIGHTS, Scenario
+from lab.simulate.scene import Scene, compose, with_overrides
+
+# Noise leaves nothing to predict a pixel from, so that looking for repetitions only costs time: of a 1280x1024 picture
+# with 1 DN of noise, entropy coding alone makes 384 kB in 19 ms, zlib's level 1 501 kB in 24 ms, level 6 447 kB in
+# 175 ms. Where most pixels are equal (light "quiet") it is the other way round.
+_FAST_PNG = (cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY)
+_SMALL_PNG = (cv2.IMWRITE_PNG_COMPRESSION, 9, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_FILTERED)
+_VIDEO_CODEC = "FFV1"  # lossless
+_BATCH = 8  # pictures that wait to be written into the videos
+
+Progress = Callable[[int, int], None]  # pictures done, pictures in all
+
+
+def simulate(
+    scenario: str | Scenario,
+    out_folder: Path,
+    *,
+    seed: int = 0,
+    frames: int | None = None,
+    video: bool = False,
+    detections_only: bool = False,
+    light: str | None = None,
+    clutter: float | None = None,
+    miss_probability: float | None = None,
+    noise_px: float = 0.1,
+    picture_scale: float = 1.0,
+    noisy: bool = True,
+    small_files: bool = False,
+    threads: int | None = None,
+    progress: Progress | None = None,
+) -> Path:
+    """Write one recording of a scenario into a new folder; returns the folder, complete.
+
+    The same arguments give the same bytes (with the same versions of numpy and OpenCV), and the first frames do not
+    depend on how many follow.
+
+    scenario: a name of SCENARIOS, or a value. frames: default the scenario's. video: one lossless video per camera in
+    place of PNG files. detections_only: no pictures, but a detections.csv with `noise_px` (1 sigma per axis). light: a
+    name of LIGHTS in place of the scenario's. clutter, miss_probability: as in simulate_points. picture_scale: 0.5 gives
+    pictures half as wide and high. noisy: False leaves out shot and read noise (rounding stays). small_files: compress
+    longer. Raises InputError where an argument does not fit, or the folder exists.
+    """
+    scenario = with_overrides(scenario, clutter=clutter, miss_probability=miss_probability)
+    if light is not None:
+        if light not in LIGHTS:
+            raise InputError(f"light: expected one of {', '.join(LIGHTS)}, got {light!r}")
+        scenario = replace(scenario, light=LIGHTS[light])
+    if video and detections_only:
+        raise InputError("a recording is a video or points, not both; choose one")
+    if video and scenario.faults:
+        raise InputError(
+            f"scenario {scenario.name!r} drops or damages pictures, which a video cannot; write it as PNG files"
+        )
+    if video and scenario.light.bits > 8:
+        raise InputError("a video holds 8-bit pictures; write deeper ones as PNG files")
+    if not 0.05 <= picture_scale <= 4.0:
+        raise InputError(f"picture_scale: expected 0.05 to 4, got {picture_scale:g}")
+    out_folder = Path(out_folder)
+    if out_folder.exists() and (not out_folder.is_dir() or any(out_folder.iterdir())):
+        raise InputError(f"{out_folder}: expected a folder that does not exist yet; choose another or remove it")
+
+    scene = compose(scenario, seed, frames, picture_scale)
+    part = out_folder.with_name(f".{out_folder.name}.{os.getpid()}.part")
+    part.mkdir(parents=True)
+    try:
+        save_rig(scene.rig, part / "rig.yaml")
+        write_truth(scene, part / "truth")
+        if detections_only:
+            _write_detections(scene, noise_px, picture_scale, part / "detections.csv")
+            sources = dict.fromkeys(scene.model.camera_names, {"detections": "detections.csv"})
+        elif video:
+            sources = _write_videos(scene, part, noisy, threads, progress)
+        else:
+            sources = _write_pictures(scene, part, noisy, small_files, threads, progress)
+        save_run(_run_mapping(scene, sources), part)
+        if out_folder.is_dir():
+            out_folder.rmdir()  # empty; os.replace onto it works on POSIX only
+        os.replace(part, out_folder)
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+    return out_folder
+
+
+def _run_mapping(scene: Scene, sources: dict[str, dict[str, str]]) -> dict[str, object]:
+    prior = scene.scenario.prior
+    return {
+        "name": f"{scene.scenario.name}-{scene.seed}",
+        "rig": "rig.yaml",
+        "frame_rate_hz": scene.scenario.frame_rate_hz,
+        "exposure_s": scene.scenario.light.exposure_s,
+        "cameras": {name: dict(source) for name, source in sources.items()},
+        "prior": {
+            "position_m": list(prior.position_m),
+            "yaw_pitch_roll_deg": list(prior.yaw_pitch_roll_deg),
+            "within_m": prior.within_m,
+            "within_deg": prior.within_deg,
+        },
+        "notes": f"Simulated, seed {scene.seed}. {scene.scenario.summary}",
+    }
+
+
+def write_truth(scene: Scene, folder: Path) -> None:
+    """truth/pose.csv and truth/spots.csv: every frame, also those whose pictures are missing."""
+    folder.mkdir(parents=True)
+    quaternions = scene.poses.quaternion_wxyz
+    _write_table(
+        folder / "pose.csv",
+        columns.TRUTH_POSE,
+        (
+            (k, f"{t:.9g}", *(f"{x:.12g}" for x in (*p, *q)))
+            for k, t, p, q in zip(scene.frame, scene.t_s, scene.poses.translation, quaternions, strict=True)
+        ),
+    )
+    _write_table(
+        folder / "spots.csv",
+        columns.TRUTH_SPOTS,
+        (
+            (k, camera, spot, *("" if np.isnan(x) else f"{x:.7f}" for x in scene.uv_px[k, i]), scene.in_view[k, i])
+            for k in scene.frame
+            for i, (camera, spot) in enumerate(scene.model.views)
+        ),
+    )
+
+
+def _write_table(path: Path, header: Iterable[str], rows: Iterable[tuple[object, ...]]) -> None:
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(header)
+        writer.writerows(rows)
+
+
+def _write_detections(scene: Scene, noise_px: float, picture_scale: float, path: Path) -> None:
+    run = simulate_points(
+        scene.scenario, scene.seed, frames=len(scene.frame), noise_px=noise_px, picture_scale=picture_scale
+    )
+
+    def rows() -> Iterator[tuple[object, ...]]:
+        for k, pictures in enumerate(run.detections):
+            for camera, found in zip(run.model.camera_names, pictures, strict=True):
+                for uv, cov in zip(found.uv_px, found.cov_px2, strict=True):
+                    sigmas = np.sqrt(np.diagonal(cov))
+                    numbers = (f"{uv[0]:.5f}", f"{uv[1]:.5f}", f"{sigmas[0]:.5g}", f"{sigmas[1]:.5g}")
+                    yield (k, camera, *numbers, "", "", "", "", "", f"{cov[0, 1]:.5g}")
+
+    _write_table(path, columns.DETECTIONS, rows())
+
+
+def _workers(threads: int | None) -> int:
+    return threads if threads is not None else min(4, os.cpu_count() or 1)
+
+
+def _sensors(scene: Scene) -> tuple[list[Sensor], Powers]:
+    return [make_sensor(scene, c) for c in range(len(scene.model.camera_names))], laser_powers(scene)
+
+
+def _write_pictures(
+    scene: Scene, folder: Path, noisy: bool, small_files: bool, threads: int | None, progress: Progress | None
+) -> dict[str, dict[str, str]]:
+    """frames/CAMERA/NNNNNN.png, with the scenario's faults."""
+    sensors, powers = _sensors(scene)
+    names = scene.model.camera_names
+    for name in names:
+        (folder / "frames" / name).mkdir(parents=True)
+    faults = {(f.frame, f.camera or name): f.kind for f in scene.scenario.faults for name in names}
+    options = _SMALL_PNG if small_files else _FAST_PNG
+
+    def one(job: tuple[int, Sensor]) -> None:
+        k, sensor = job
+        name = names[sensor.camera]
+        fault = faults.get((k, name))
+        if fault == "dropped":
+            return
+        picture = take(scene, sensor, powers, k, noisy=noisy)
+        if fault == "wrong size":
+            picture = picture[: picture.shape[0] // 2, : picture.shape[1] // 2]
+        data = cv2.imencode(".png", picture, options)[1].tobytes()
+        if fault == "truncated":
+            data = data[: len(data) // 2]
+        (folder / "frames" / name / f"{k:06d}.png").write_bytes(data)
+
+    jobs = [(int(k), sensor) for k in scene.frame for sensor in sensors]
+    with ThreadPoolExecutor(_workers(threads)) as pool:
+        try:
+            for done, _ in enumerate(pool.map(one, jobs), start=1):
+                if progress is not None:
+                    progress(done, len(jobs))
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+    return {name: {"frames": f"frames/{name}"} for name in names}
+
+
+def _write_videos(
+    scene: Scene, folder: Path, noisy: bool, threads: int | None, progress: Progress | None
+) -> dict[str, dict[str, str]]:
+    """CAMERA.avi, frame n being its n-th picture."""
+    sensors, powers = _sensors(scene)
+    names = scene.model.camera_names
+    done = 0
+    with ThreadPoolExecutor(_workers(threads)) as pool:
+        for sensor in sensors:
+            path = folder / f"{names[sensor.camera]}.avi"
+            writer = cv2.VideoWriter(
+                str(path), cv2.VideoWriter.fourcc(*_VIDEO_CODEC), scene.scenario.frame_rate_hz, sensor.size_px, False
+            )
+            if not writer.isOpened():
+                raise InputError(f"{path.name}: this OpenCV cannot write {_VIDEO_CODEC} video; write PNG files instead")
+
+            def picture(k: int, sensor: Sensor = sensor) -> Picture:
+                return take(scene, sensor, powers, k, noisy=noisy)
+
+            for first in range(0, len(scene.frame), _BATCH):
+                for image in pool.map(picture, range(first, min(first + _BATCH, len(scene.frame)))):
+                    writer.write(image)
+                    done += 1
+                    if progress is not None:
+                        progress(done, len(sensors) * len(scene.frame))
+            writer.release()
+    return {name: {"frames": f"{name}.avi"} for name in names}
