@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.polynomial import polynomial as poly
+from scipy.optimize import brentq
 
 from geometry.arrays import Array, Bools
 
@@ -87,25 +88,38 @@ def tilt_matrix(tau_x: Array, tau_y: Array) -> Array:
 
 
 def fold_limit(distortion: tuple[float, ...]) -> float:
-    """The squared normalised radius at which the radial polynomial stops growing; inf where it always grows.
+    """The squared normalised radius up to which the distorted image grows in every direction; inf if it always does.
 
     Beyond it two directions share one pixel: a point far outside the picture would seem to lie in it. The limit is
-    the first positive root of d(r N/D)/dr = 0, or of D = 0, with N, D the model's numerator and denominator.
-    Source: ours.
+    the first root of d(r N/D)/dr = 0 or of D = 0, with N, D the model's numerator and denominator. From that slope
+    goes what the tangential and prism terms take away in their worst direction, r^2 (3 p1 sin + 3 p2 cos) and so on:
+    where the slope comes near to zero without reaching it, they alone can fold the image. Source: ours.
     """
-    c = padded(distortion)
-    N = np.array([1.0, c[0], c[1], c[4]])
-    D = np.array([1.0, c[5], c[6], c[7]])
+    k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 = padded(distortion)[:12]
+    N = np.array([1.0, 0, k1, 0, k2, 0, k3])  # polynomials in r, lowest power first
+    D = np.array([1.0, 0, k4, 0, k5, 0, k6])
     slope = poly.polysub(
-        poly.polymul(poly.polyadd(N, 2 * poly.polymulx(poly.polyder(N))), D),
-        2 * poly.polymul(poly.polymulx(N), poly.polyder(D)),
+        poly.polymul(poly.polyadd(N, poly.polymulx(poly.polyder(N))), D),
+        poly.polymul(poly.polymulx(N), poly.polyder(D)),
     )
-    limits = [np.inf]
-    for p in (slope, D):
-        roots = poly.polyroots(poly.polytrim(p, tol=1e-300))
-        real = roots.real[(np.abs(roots.imag) <= 1e-9 * np.abs(roots.real)) & (roots.real > 0)]
-        limits.extend(real)
-    return float(min(limits))
+    worst = np.array([0.0, 6 * np.hypot(p1, p2) + 2 * np.hypot(s1, s3), 0, 4 * np.hypot(s2, s4)])
+    growth = poly.polysub(slope, poly.polymul(worst, poly.polymul(D, D)))
+    return min(_first_sign_change(growth), _first_sign_change(D)) ** 2
+
+
+def _first_sign_change(p: Array) -> float:
+    """The smallest r in (0, 1e6) at which a polynomial (n,), lowest power first, p[0] = 1, turns negative; else inf.
+
+    The roots are sought in 1/r, in which the polynomial begins with the coefficient 1: a highest power that is there
+    by rounding only (a calibration's k3 of 1e-20) then does no harm. Each is verified and refined by a bisection.
+    """
+    inverse = np.roots(p)
+    near_real = (inverse.real > 1e-6) & (np.abs(inverse.imag) <= 1e-5 * np.abs(inverse))
+    for r in sorted(1 / w for w in inverse.real[near_real]):
+        below, above = r * (1 - 1e-5), r * (1 + 1e-5)
+        if poly.polyval(below, p) > 0 > poly.polyval(above, p):
+            return float(brentq(lambda x: float(poly.polyval(x, p)), below, above, rtol=1e-14))
+    return np.inf
 
 
 def holds(xy: Array, jacobian: Array, fold_r2: Array) -> Bools:
