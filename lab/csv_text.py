@@ -24,7 +24,8 @@ def read_table(path: Path, required: Sequence[str], numbers: Sequence[str] | Non
     """A CSV file with at least the required columns; further ones are kept.
 
     The columns `numbers` (all required ones that are no names, where not given) come as floats, with nan for a field
-    that is empty or no number. Lines with too many fields are left out; `attrs["malformed"]` counts them. Raises InputError.
+    that is empty or no number. Lines with too many fields are left out; `attrs["malformed"]` counts them.
+    Raises InputError.
     """
     import pandas as pd  # 0.4 s: only for those who read a table
 

@@ -27,6 +27,7 @@ from lab.fields import (
     validated,
     wrong,
 )
+from lab.pictures import SUFFIXES
 from lab.rig_file import load_rig
 from lab.times import Times, load_times
 from lab.yaml_text import FileError, did_you_mean, read_mapping, write_mapping
@@ -214,6 +215,10 @@ def _source_of(block: _SourceBlock, folder: Path, where: str) -> Source:
     path = folder / str(block.frames)
     if path.is_dir():
         return FramesFolder(path)
+    if path.suffix.lower() in SUFFIXES and path.is_file():
+        raise InputError(
+            f"{where}.frames: expected a folder or a video, got the single picture {path}; name its folder"
+        )
     if path.is_file():
         return VideoFile(path)
     raise InputError(f"{where}.frames: expected a folder of pictures or a video, found nothing at {path}")

@@ -1,0 +1,187 @@
+"""Where one camera's pictures come from: a folder, a video, or a table of points found already."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol, TypeAlias
+
+import cv2
+import numpy as np
+
+from geometry.arrays import Ints
+from lab.detections_file import CameraPoints
+from lab.errors import InputError
+from lab.pictures import DROPPED, SUFFIXES, UNREADABLE, Grey, Missing, checked, read_picture
+from tracking.detections import Detections
+
+Picture: TypeAlias = Grey | Detections | Missing
+Asked: TypeAlias = Picture | Future[Grey | Missing] | Future[Grey | Missing | None]
+_LAST_NUMBER = re.compile(r"([0-9]+)[^0-9]*$")
+
+
+@contextmanager
+def quiet_opencv() -> Iterator[None]:
+    """No remarks of OpenCV and FFmpeg on standard error about pictures whose damage we report ourselves."""
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # read by OpenCV when the first video is opened
+    before = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        yield
+    finally:
+        cv2.utils.logging.setLogLevel(before)
+
+
+def arrived(asked: Asked) -> Picture | None:
+    """The picture that was asked for, waited for; None: the pictures have ended."""
+    return asked.result() if isinstance(asked, Future) else asked
+
+
+class Source(Protocol):
+    """Gives one camera's pictures; asked for every frame number, rising."""
+
+    def ask(self, frame: int, pool: ThreadPoolExecutor) -> Asked:
+        """This frame's picture, now or later; a future of None: the pictures have ended."""
+
+    def close(self) -> None:
+        """Give back files and threads."""
+
+
+@dataclass(frozen=True, slots=True)
+class FolderListing:
+    """The pictures of a folder by their number, and the files that are none."""
+
+    folder: Path
+    names: dict[int, str]  # rising numbers
+    ignored: tuple[str, ...]
+
+    @property
+    def numbers(self) -> Ints:
+        """(n,) rising."""
+        return np.fromiter(self.names, dtype=np.int64, count=len(self.names))
+
+
+def list_folder(folder: Path) -> FolderListing:
+    """Find the pictures in a folder: the number is the last group of digits of the name, without its ending.
+
+    Raises InputError for two pictures of one number, and for a folder without any.
+    """
+    names: dict[int, str] = {}
+    ignored = []
+    try:
+        with os.scandir(folder) as entries:
+            found = sorted(e.name for e in entries if e.is_file())
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be read: {error.strerror}") from None
+    for name in found:
+        stem, suffix = os.path.splitext(name)
+        match = _LAST_NUMBER.search(stem)
+        if name.startswith(".") or suffix.lower() not in SUFFIXES or match is None or len(match[1].lstrip("0")) > 15:
+            ignored.append(name)
+            continue
+        number = int(match[1])
+        if number in names:
+            raise InputError(
+                f"{folder}: expected one picture per frame, got {names[number]} and {name} for frame {number};"
+                " take one away"
+            )
+        names[number] = name
+    if not names:
+        others = f" among {len(ignored)} files" if ignored else ""
+        raise InputError(f"{folder}: expected pictures with a number ({', '.join(SUFFIXES)}), found none{others}")
+    return FolderListing(folder, dict(sorted(names.items())), tuple(ignored))
+
+
+@dataclass(frozen=True, slots=True)
+class FolderSource:
+    """Pictures by number."""
+
+    listing: FolderListing
+    size_px: tuple[int, int]
+
+    def ask(self, frame: int, pool: ThreadPoolExecutor) -> Asked:
+        name = self.listing.names.get(frame)
+        if name is None:
+            return Missing(DROPPED)
+        return pool.submit(read_picture, self.listing.folder / name, self.size_px)
+
+    def close(self) -> None: ...
+
+
+@dataclass(frozen=True, slots=True)
+class TableSource:
+    """Points found already. Within the file's range a frame without a row is a picture in which nothing was found."""
+
+    points: CameraPoints | None  # None: no row of this camera
+    first: int
+    last: int
+
+    def ask(self, frame: int, pool: ThreadPoolExecutor) -> Asked:
+        if not self.first <= frame <= self.last:
+            return Missing(DROPPED)
+        return Detections.none() if self.points is None else self.points.at(frame)
+
+    def close(self) -> None: ...
+
+
+class VideoSource:
+    """A video, decoded one picture after the other in a thread of its own."""
+
+    def __init__(self, path: Path, size_px: tuple[int, int]) -> None:
+        self._capture = open_video(path)
+        self._size_px = size_px
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="video")
+        self.pictures = 0  # read so far
+
+    def ask(self, frame: int, pool: ThreadPoolExecutor) -> Asked:
+        return self._thread.submit(self._next) if frame >= 0 else Missing(DROPPED)
+
+    def _next(self) -> Grey | Missing | None:
+        if not self._capture.grab():
+            return None
+        self.pictures += 1
+        return self._decoded()
+
+    def _decoded(self) -> Grey | Missing:
+        good, picture = self._capture.retrieve()
+        if not good or picture is None:
+            return Missing(f"{UNREADABLE}: damaged")
+        if picture.ndim == 3:
+            picture = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY) if picture.shape[2] == 3 else picture[..., 0]
+        return checked(picture, self._size_px)
+
+    def skip(self) -> bool:
+        """Pass over one picture; False at the end."""
+        return bool(self._capture.grab())
+
+    def next_picture(self) -> Grey | Missing | None:
+        """The next picture, now; None at the end. Not to be mixed with `ask`."""
+        return self._next()
+
+    def close(self) -> None:
+        self._thread.shutdown(cancel_futures=True)
+        self._capture.release()
+
+
+def open_video(path: Path) -> cv2.VideoCapture:
+    """An opened video. Raises InputError where OpenCV cannot read it."""
+    capture = cv2.VideoCapture(str(path))
+    if not capture.isOpened():
+        raise InputError(
+            f"{path}: expected a video that OpenCV can read; it cannot open this file (damaged, no video?)"
+        )
+    capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)  # grey videos stay as they are, with 16 bits too; others still come as BGR
+    capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)  # pixels where the sensor has them
+    return capture
+
+
+def promised_pictures(path: Path) -> int | None:
+    """How many pictures the video's header promises; it may be wrong. None where it says nothing."""
+    capture = open_video(path)
+    count = capture.get(cv2.CAP_PROP_FRAME_COUNT)
+    capture.release()
+    return int(count) if 0 < count < 2**40 else None
