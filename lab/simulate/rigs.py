@@ -21,7 +21,7 @@ SCREEN_X_M = 2.5  # distance of either screen from the world's origin
 
 
 def look_at(position_m: Array, target_m: Array) -> Pose:
-    """camera_from_world of a camera at `position_m` (3,) that looks at `target_m` (3,), world z upwards in its picture."""
+    """camera_from_world of a camera at `position_m` (3,) that looks at `target_m` (3,), world z up in its picture."""
     z = normalised(np.asarray(target_m, dtype=float) - position_m)
     x = normalised(cross(z, np.array([0.0, 0.0, 1.0])))
     R = np.stack([x, cross(z, x), z])

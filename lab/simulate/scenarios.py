@@ -122,9 +122,11 @@ LIGHTS: MappingProxyType[str, Light] = MappingProxyType(
         "clean": Light(
             texture=0.0, hot_pixels=0, reflections=0, speckle_contrast=0.0, gradient_dn=3.0, power_spread=0.1
         ),
-        # A dark room and a quiet sensor: most pixels show one grey value, so that the files are small.
+        # A dark room, a filter for the lasers' colour, a quiet sensor: nearly all pixels show the black level, so that
+        # the files are small.
         "quiet": Light(
-            read_noise_e=8.0, black_dn=4.0, background_dn=0.5, gradient_dn=1.0, texture=0.005, reflection_dn=4.0
+            read_noise_e=6.0, black_dn=4.0, background_dn=0.0, gradient_dn=0.0, texture=0.01, reflections=1,
+            reflection_dn=6.0,
         ),
         # A 12-bit sensor in 16-bit files.
         "deep": Light(bits=12),
@@ -238,8 +240,8 @@ _ALL = (
     replace(
         _SMOOTH_SCENARIO,
         name="damaged",
-        summary="As smooth, with dropped frames (20 in both cameras, 31 to 33 in the left one), cut-off files (40 right, 41"
-        " left) and a picture of the wrong size (55 left).",
+        summary="As smooth, with dropped frames (20 in both cameras, 31 to 33 in the left one), cut-off files (40"
+        " right, 41 left) and a picture of the wrong size (55 left).",
         faults=(
             Fault(20, "dropped"),
             *(Fault(n, "dropped", "left") for n in (31, 32, 33)),
