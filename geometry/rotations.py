@@ -108,13 +108,17 @@ def matrix_from_ypr(yaw_pitch_roll: Array) -> Array:
 
 
 def ypr_from_matrix(rotation: Array) -> Array:
-    """Yaw, pitch, roll (..., 3), rad, of rotation matrices (..., 3, 3). At pitch +-90 deg roll is taken as 0."""
+    """Yaw, pitch, roll (..., 3), rad, of rotation matrices (..., 3, 3). At pitch +-90 deg roll is taken as 0.
+
+    Roll is read from Rz(-yaw) R, so that the three make R again however little yaw is determined near +-90 deg.
+    """
     R = np.asarray(rotation, dtype=float)
     cos_pitch = np.hypot(R[..., 0, 0], R[..., 1, 0])
     pitch = np.arctan2(-R[..., 2, 0], cos_pitch)
     locked = cos_pitch < 1e-9
     yaw = np.where(locked, np.arctan2(-R[..., 0, 1], R[..., 1, 1]), np.arctan2(R[..., 1, 0], R[..., 0, 0]))
-    roll = np.where(locked, 0.0, np.arctan2(R[..., 2, 1], R[..., 2, 2]))
+    c, s = np.cos(yaw), np.sin(yaw)
+    roll = np.arctan2(s * R[..., 0, 2] - c * R[..., 1, 2], c * R[..., 1, 1] - s * R[..., 0, 1])
     return np.stack([yaw, pitch, roll], -1)
 
 
