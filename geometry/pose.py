@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from geometry import rotations
-from geometry.arrays import Array
+from geometry.arrays import Array, Bools, Ints
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,9 +63,9 @@ class Pose:
         """a_from_c = a_from_b @ b_from_c."""
         return Pose(self.rotation @ other.rotation, self.apply(other.translation))
 
-    def __getitem__(self, index: object) -> Pose:
+    def __getitem__(self, index: int | slice | tuple[int, ...] | Ints | Bools) -> Pose:
         """One or some of a stack of transforms."""
-        return Pose(self.rotation[index], self.translation[index])  # type: ignore[index]
+        return Pose(self.rotation[index], self.translation[index])
 
     def plus(self, delta: Array) -> Pose:
         """The transform that is `delta` (..., 6) away: [dt (m, in a), dtheta (rad, in b)].

@@ -100,8 +100,8 @@ class SpotModel:
         """Where the rays meet their screens: world points (..., n, 3), m, and their Jacobian (..., n, 3, 6).
 
         The pose may be a stack (...). The Jacobian is with respect to the pose error [dt (m, world), dtheta (rad,
-        body)], section 1 of the files' contract. A ray that is parallel to its screen, points away from it or falls beside its
-        extent gives nan.
+        body)], section 1 of the files' contract. A ray that is parallel to its screen, points away from it or falls
+        beside its extent gives nan.
         """
         R = world_from_body.rotation[..., None, :, :]
         p = (R @ self.point[..., None])[..., 0] + world_from_body.translation[..., None, :]
