@@ -13,6 +13,9 @@ class DetectParameters:
     threshold_sigma: float = 6.0  # detection threshold over the local background, in sigmas of its noise
     max_detections: int = 400  # keep the brightest so many of one picture
     saturation_dn: float | None = None  # grey value at which the sensor clips; None: the largest of the picture's type
+    min_sigma_px: float = 0.25  # narrower (minor half axis) is a hot pixel: a spot one pixel wide has 0.42
+    max_sigma_px: float = 20.0  # wider (major half axis) is a reflection or lit screen: a spot 30 px wide has 13
+    min_explained: float = 0.5  # least share of a candidate's light, about its background, that a Gaussian explains
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +64,7 @@ class TrackerParameters:
     # Prediction, section 3
     sigma_a_px_s2: float = 5000.0  # px/s^2: white acceleration of a spot, at the start where it is learnt
     learn_sigma_a: bool = True  # learn it from the innovations, per spot
-    sigma_model_px: float = 0.02  # px: added to every detection's own sigma
+    sigma_model_px: float = 0.005  # px: added to every detection's own sigma
     curve_switch: bool = True  # eq. (6): restart the filter at a bend; off: the conventional filter
     image_margin_px: float = 4.0  # px: spots predicted this far outside the picture are searched for as well
 
