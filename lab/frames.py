@@ -162,8 +162,8 @@ class FrameReader:
         if span > MANY and span > SPARSEST * pictures:
             raise InputError(
                 f"{self._run.path}: cameras: expected frame numbers without gaps of many thousands, got {pictures}"
-                f" pictures between frame {self.first} and frame {self.last}; is a stray file among them, or do the names"
-                " hold a time?"
+                f" pictures between frame {self.first} and frame {self.last}; is a stray file among them, or do the"
+                " names hold a time?"
             )
 
     def _check_times(self) -> None:

@@ -1,0 +1,115 @@
+"""What really happened, where a run folder says so: truth/pose.csv and truth/spots.csv, checked."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from geometry.arrays import Array, Ints
+from geometry.pose import Pose
+from geometry.rig import Rig
+from geometry.spots import SpotModel
+from lab import columns
+from lab.csv_text import read_table, whole_numbers
+from lab.errors import InputError
+from lab.rig_file import QUATERNION_TOLERANCE
+from lab.yaml_text import did_you_mean
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+COMPARED = 500  # frames at most that `largest_disagreement_px` looks at, spread evenly: enough to show a wrong rig
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """The tables of a truth folder, columns as in lab/columns.py; one of them may be missing."""
+
+    pose: pd.DataFrame | None  # TRUTH_POSE, rising frames, every field a number
+    spots: pd.DataFrame | None  # TRUTH_SPOTS; u_px, v_px are nan where no projection exists
+
+
+def load_truth(run_folder: Path, rig: Rig | None = None) -> Truth | None:
+    """The truth of a run folder; None where it has none. With a rig, names that it does not have are mistakes.
+
+    Raises InputError in one line: file, line, column, what was expected and what was found.
+    """
+    folder = Path(run_folder) / "truth"
+    pose, spots = folder / "pose.csv", folder / "spots.csv"
+    if not pose.exists() and not spots.exists():
+        return None
+    return Truth(_load_pose(pose) if pose.exists() else None, _load_spots(spots, rig) if spots.exists() else None)
+
+
+def _load_pose(path: Path) -> pd.DataFrame:
+    table = read_table(path, columns.TRUTH_POSE)
+    frames = whole_numbers(table, "frame", path)
+    _refuse(path, np.diff(frames, prepend=frames[:1] - 1) <= 0, "frame: expected rising numbers", frames)
+    for name in columns.TRUTH_POSE[1:]:
+        _refuse(path, ~np.isfinite(table[name].to_numpy()), f"{name}: expected a number", table[name].to_numpy())
+    length = np.linalg.norm(table[["qw", "qx", "qy", "qz"]].to_numpy(), axis=1)
+    wrong = np.abs(length - 1) > QUATERNION_TOLERANCE
+    _refuse(path, wrong, "qw,qx,qy,qz: expected a quaternion of length 1, one of length", length)
+    return table.assign(frame=frames)
+
+
+def _load_spots(path: Path, rig: Rig | None) -> pd.DataFrame:
+    table = read_table(path, columns.TRUTH_SPOTS)
+    frames = whole_numbers(table, "frame", path)
+    in_view = table["in_view"].to_numpy()
+    _refuse(path, ~np.isin(in_view, (0, 1, 2)), "in_view: expected 0, 1 or 2", in_view)
+    uv = table[["u_px", "v_px"]].to_numpy()
+    where_none = np.any(~np.isfinite(uv), axis=1) & (in_view > 0)
+    _refuse(path, where_none, "u_px, v_px: expected numbers where in_view is 1 or 2", uv)
+    if rig is not None:
+        for name, known in (("camera", rig.cameras), ("spot", rig.spots)):
+            for word in table[name].unique():
+                if word not in known:
+                    raise InputError(
+                        f"{path}: {name}: expected a {name} of the rig, got {word!r}{did_you_mean(word, known)}"
+                    )
+    twice = table.duplicated(["frame", "camera", "spot"]).to_numpy()
+    _refuse(path, twice, "expected one row per frame, camera and spot, a second one for frame", frames)
+    return table.assign(frame=frames, in_view=in_view.astype(np.int64))
+
+
+def _refuse(path: Path, wrong: np.ndarray, expected: str, found: np.ndarray) -> None:
+    """Raises InputError for the first row that is wrong."""
+    bad = np.flatnonzero(wrong)
+    if bad.size:
+        raise InputError(f"{path}: line {bad[0] + 2}: {expected}, got {found[bad[0]]}")
+
+
+def largest_disagreement_px(truth: Truth, rig: Rig) -> tuple[float, int] | None:
+    """How far, px, the true spots lie from where the true poses put them through the rig, and in which frame.
+
+    None where the two tables share nothing. Zero but for rounding if the truth was made with this rig.
+    """
+    if truth.pose is None or truth.spots is None:
+        return None
+    shared = np.intersect1d(truth.pose["frame"], truth.spots["frame"])
+    if not shared.size:
+        return None
+    frames: Ints = shared[np.unique(np.linspace(0, len(shared) - 1, COMPARED).astype(np.int64))]
+    poses = truth.pose.set_index("frame").loc[frames]
+    model = SpotModel.of(rig)
+    pixels, _ = model.project(
+        Pose.from_quaternion(
+            poses[["qw", "qx", "qy", "qz"]].to_numpy(dtype=float), poses[["x_m", "y_m", "z_m"]].to_numpy(dtype=float)
+        )
+    )
+    given: Array = np.full_like(pixels, np.nan)
+    places = {view: i for i, view in enumerate(model.views)}
+    rows = truth.spots[truth.spots["frame"].isin(frames)]
+    at = [places.get(view, -1) for view in zip(rows["camera"], rows["spot"], strict=True)]
+    known = np.array(at) >= 0
+    frame_at = np.searchsorted(frames, rows["frame"].to_numpy())
+    given[frame_at[known], np.array(at)[known]] = rows[["u_px", "v_px"]].to_numpy()[known]
+    distance = np.linalg.norm(pixels - given, axis=-1)
+    if not np.isfinite(distance).any():
+        return None
+    worst = np.nanargmax(distance)
+    return float(distance.flat[worst]), int(frames[np.unravel_index(worst, distance.shape)[0]])
