@@ -1,0 +1,139 @@
+"""What is in the repository can be given away, installed again, and named by one version."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import tomllib
+from functools import cache
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+from packaging.version import Version
+
+ROOT = Path(__file__).resolve().parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+LOCK = (ROOT / "requirements.lock").read_text(encoding="utf-8")
+SAMPLE_RUNS_LIMIT = 25_000_000  # bytes: what a clone may be asked to carry
+
+# Written so that this file does not match itself.
+MACHINE_PATH = re.compile(r"(?<![\w./])/(?:wor[k]|hom[e]|roo[t]|Users|opt|tm[p])/\w")
+PRIVATE_HOST = re.compile(
+    r"https?://(?:\d+\.\d+\.\d+\.\d+|localhos[t]|[\w-]+[:/]|[\w.-]+\.(?:internal|local|lan|corp|intra)\b)"
+)
+UNFINISHED = re.compile(r"\b(?:TOD[O]|FIXM[E]|XX[X])\b")
+PACKAGE_INDEX = re.compile(r"--(?:extra-)?index-url|--find-links|--trusted-host|@ (?:file|https?):|https?://")
+
+
+@cache
+def tracked_files() -> list[Path]:
+    """What git would give to a clone; where there is no git (a source distribution) there is nothing to check."""
+    try:
+        listing = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, check=True).stdout
+    except (OSError, subprocess.CalledProcessError):
+        pytest.skip("not a git checkout")
+    return [path for name in listing.decode().split("\0") if name and (path := ROOT / name).is_file()]
+
+
+@cache
+def tracked_texts() -> dict[str, str]:
+    """Contents of the tracked files that are text, by name."""
+    texts = {}
+    for path in tracked_files():
+        data = path.read_bytes()
+        if b"\0" not in data[:8192]:
+            texts[str(path.relative_to(ROOT))] = data.decode("utf-8")
+    return texts
+
+
+def places(pattern: re.Pattern[str], texts: dict[str, str]) -> list[str]:
+    """name:line: text of every line that has the pattern."""
+    return [
+        f"{name}:{i}: {line.strip()[:100]}"
+        for name, text in texts.items()
+        for i, line in enumerate(text.splitlines(), 1)
+        if pattern.search(line)
+    ]
+
+
+def locked() -> dict[str, str]:
+    """Versions by name."""
+    pins = re.findall(r"^([A-Za-z0-9_.-]+)==(\S+)$", LOCK, flags=re.MULTILINE)
+    return {canonicalize_name(name): version for name, version in pins}
+
+
+def test_the_checks_see_the_repository():
+    assert len(tracked_texts()) >= 40
+    assert {"pyproject.toml", "geometry/spots.py", ".ci/run"} <= set(tracked_texts())
+
+
+@pytest.mark.parametrize("pattern", [MACHINE_PATH, PRIVATE_HOST, UNFINISHED], ids=["path", "host", "unfinished"])
+def test_no_file_names_somebodys_machine_or_is_unfinished(pattern):
+    assert places(pattern, tracked_texts()) == []
+
+
+@pytest.mark.parametrize(
+    ("pattern", "line"),
+    [
+        (MACHINE_PATH, "data = '/hom" + "e/ann/data'"),
+        (MACHINE_PATH, "see /wor" + "k/main"),
+        (PRIVATE_HOST, "http" + "://10.0.0.7/simple"),
+        (PRIVATE_HOST, "https" + "://mirror/simple"),
+        (PRIVATE_HOST, "https" + "://packages.lab.internal/simple"),
+        (UNFINISHED, "# TOD" + "O: later"),
+    ],
+)
+def test_such_a_line_would_be_seen(pattern, line):
+    assert places(pattern, {"a": line}) == [f"a:1: {line}"]
+    assert not places(pattern, {"a": "https://doi.org/10.1109/7.1 and results/demo/a.csv, /tmpl/, fixed later"})
+
+
+def test_the_lock_file_says_versions_and_nothing_of_where_they_come_from():
+    assert places(PACKAGE_INDEX, {"requirements.lock": LOCK}) == []
+    lines = [line for line in LOCK.splitlines() if line.strip() and not line.lstrip().startswith("#")]
+    assert len(lines) == len(locked()) >= 30  # each line that is not a comment is a pin
+
+
+@pytest.mark.parametrize("group", ["dependencies", "dev"])
+def test_the_lock_file_has_a_fitting_version_of_every_dependency(group):
+    wanted = PROJECT["dependencies"] if group == "dependencies" else PROJECT["optional-dependencies"][group]
+    assert len(wanted) >= 5
+    for requirement in map(Requirement, wanted):
+        version = locked().get(canonicalize_name(requirement.name))
+        assert version is not None, f"{requirement.name} is not locked: make lock"
+        assert requirement.specifier.contains(Version(version)), f"{requirement} is locked at {version}: make lock"
+
+
+def test_the_version_is_written_in_one_place():
+    version = PROJECT["version"]
+    code = {name: text for name, text in tracked_texts().items() if name.endswith(".py") and name[:6] != "tests/"}
+    assert places(re.compile(rf"""["']{re.escape(version)}["']"""), code) == []
+
+
+def test_the_changelog_begins_with_this_version():
+    headings = re.findall(r"^## (\S+)", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), flags=re.MULTILINE)
+    assert headings[0] == PROJECT["version"]
+
+
+def test_every_folder_of_tests_is_a_package():
+    """With an __init__.py in tests/geometry alone, pytest would take that folder for the real geometry."""
+    folders = {path.parent for path in (ROOT / "tests").rglob("*.py")}
+    assert len(folders) >= 3
+    assert [str(folder) for folder in folders if not (folder / "__init__.py").is_file()] == []
+
+
+def test_the_sample_runs_are_small():
+    samples = [path for path in tracked_files() if path.is_relative_to(ROOT / "sample_runs")]
+    assert sum(path.stat().st_size for path in samples) <= SAMPLE_RUNS_LIMIT
+
+
+@pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
+def test_every_chore_is_listed_by_make_help():
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    chores = re.search(r"^\.PHONY: (.*)$", makefile, flags=re.MULTILINE)
+    assert chores is not None
+    listed = subprocess.run(["make", "help"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    assert sorted(re.findall(r"^  make (\S+)", listed, flags=re.MULTILINE)) == sorted(chores[1].split())
