@@ -18,6 +18,7 @@ help:  ## List the chores
 		printf '  make %-16s %s\n' "$$name" "$$what"; done
 
 setup: $(READY)  ## Build the environment (.venv) from requirements.lock; once
+	@echo "The environment $(VENV) is ready."
 
 # The stamp is removed first: an installation that was broken off is not taken for a finished one.
 $(READY): requirements.lock pyproject.toml
