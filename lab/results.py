@@ -17,6 +17,7 @@ import numpy as np
 
 from geometry.arrays import Array, Bools, Ints
 from geometry.pose import Pose
+from lab import columns
 from lab.errors import InputError
 from tracking.statuses import PoseStatus, SpotStatus
 
@@ -135,12 +136,12 @@ class PoseTrack:
 
     def has(self, status: PoseStatus) -> Bools:
         """(F,): the pose's status is this one."""
-        return self.status == POSE_STATUSES.index(status)
+        return np.equal(self.status, POSE_STATUSES.index(status))
 
     @property
     def known(self) -> Bools:
         """(F,): there is a pose."""
-        return np.isfinite(self.world_from_body.translation).all(axis=-1)
+        return np.all(np.isfinite(self.world_from_body.translation), axis=-1)
 
 
 def on_grid(
@@ -165,9 +166,7 @@ def on_grid(
 
 def read_spots(results: Path) -> SpotGrid:
     """spots.csv of a results folder."""
-    numbers = (
-        "frame t_s u_px v_px sigma_u_px sigma_v_px predicted_u_px predicted_v_px gain"
-    ).split()  # fmt: skip
+    numbers = [c for c in columns.SPOTS if c not in ("camera", "spot", "status", "cov_uv_px2")]
     table = read_table(results / "spots.csv", numbers, ("camera", "spot", "status"))
     frame, camera, spot = table.numbers["frame"], table.texts["camera"], table.texts["spot"]
     frames = np.unique(frame).astype(np.int64)
@@ -198,17 +197,14 @@ def read_spots(results: Path) -> SpotGrid:
 
 def pose_stack(position_m: Array, quaternion_wxyz: Array) -> Pose:
     """A stack of poses (n,) from (n, 3) and (n, 4); where a number is missing: nan translation, identity rotation."""
-    known = np.isfinite(position_m).all(-1) & np.isfinite(quaternion_wxyz).all(-1)
+    known = np.all(np.isfinite(position_m), axis=-1) & np.all(np.isfinite(quaternion_wxyz), axis=-1)
     quaternion = np.where(known[:, None], quaternion_wxyz, [1.0, 0.0, 0.0, 0.0])
     return Pose.from_quaternion(quaternion, np.where(known[:, None], position_m, np.nan))
 
 
 def read_poses(results: Path) -> PoseTrack:
     """attitude.csv, and covariance.csv where there is one, of a results folder."""
-    numbers = (
-        "frame t_s x_m y_m z_m qw qx qy qz yaw_deg pitch_deg roll_deg sigma_x_m sigma_y_m sigma_z_m"
-        " sigma_yaw_deg sigma_pitch_deg sigma_roll_deg spots_used rms_px"
-    ).split()
+    numbers = [c for c in columns.ATTITUDE if c != "status"]
     table = read_table(results / "attitude.csv", numbers, ("status",))
     frames = table.numbers["frame"].astype(np.int64)
     return PoseTrack(
@@ -229,12 +225,12 @@ def _read_covariance(path: Path, frames: Ints) -> Array:
     out = np.full((len(frames), 6, 6), np.nan)
     if not path.exists() or not len(frames):
         return out
-    upper = [(i, j) for i in range(6) for j in range(i, 6)]
-    table = read_table(path, ("frame", *(f"c{i}{j}" for i, j in upper)))
+    table = read_table(path, columns.COVARIANCE)
     at = np.searchsorted(frames, table.numbers["frame"])
     here = (at < len(frames)) & (frames[np.minimum(at, len(frames) - 1)] == table.numbers["frame"])
-    for i, j in upper:
-        out[at[here], i, j] = out[at[here], j, i] = table.numbers[f"c{i}{j}"][here]
+    for name in columns.COVARIANCE[1:]:
+        i, j = int(name[1]), int(name[2])
+        out[at[here], i, j] = out[at[here], j, i] = table.numbers[name][here]
     return out
 
 

@@ -221,7 +221,7 @@ def _returns(in_view: Ints, after: int, measured: Bools, right: Bools, pictured:
 
 
 def _pose_scores(poses: PoseTrack, truth: Pose) -> dict[str, Any]:
-    known = poses.known & np.isfinite(truth.translation).all(axis=-1)
+    known: Bools = poses.known & np.all(np.isfinite(truth.translation), axis=-1)
     delta = pose_errors(poses, truth)
     measured = known & poses.has(PoseStatus.MEASURED)
     predicted = known & poses.has(PoseStatus.PREDICTED)
@@ -247,10 +247,10 @@ def normalised_squares(delta: Array, covariance: Array) -> Array:
     Metres and radians differ in scale, so each C is brought to unit diagonal first.
     """
     variance = np.diagonal(covariance, axis1=-2, axis2=-1)
-    good = np.isfinite(covariance).all(axis=(-2, -1)) & (variance > 0).all(axis=-1)
+    good: Bools = np.all(np.isfinite(covariance), axis=(-2, -1)) & np.all(variance > 0, axis=-1)
     scale = np.sqrt(np.where(good[:, None], variance, 1.0))
     C = np.where(good[:, None, None], covariance, np.eye(6)) / (scale[:, :, None] * scale[:, None, :])
-    good &= np.linalg.eigvalsh(C)[:, 0] > 1e-12
+    good = good & (np.linalg.eigvalsh(C)[:, 0] > 1e-12)
     C = np.where(good[:, None, None], C, np.eye(6))
     x = delta / scale
     return np.where(good, np.sum(x * np.linalg.solve(C, x[..., None])[..., 0], axis=-1), np.nan)

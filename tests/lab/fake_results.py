@@ -21,6 +21,8 @@ from geometry.pose import Pose
 from geometry.rig import Beam, Rig, Screen, Spot
 from geometry.spots import SpotModel
 from lab import columns
+from lab.rig_file import save_rig
+from lab.run_file import save_run
 
 NOISE_PX = 0.1
 RATE_HZ = 100.0
@@ -70,7 +72,8 @@ def make(
 ) -> Fake:
     """Write folder/run and folder/results."""
     rng = np.random.default_rng(seed)
-    model = SpotModel.of(fake_rig(n_cameras))
+    rig = fake_rig(n_cameras)
+    model = SpotModel.of(rig)
     V = len(model)
     frame = np.arange(n_frames)
     t = frame / RATE_HZ
@@ -209,6 +212,11 @@ def make(
     (results / "summary.json").write_text(json.dumps(_summary(run_folder, status, word, model)), encoding="utf-8")
     if pictures:
         _pictures(run_folder, model, true_uv, in_view, rng)
+    (run_folder / "detections.csv").write_bytes((results / "detections.csv").read_bytes())
+    save_rig(rig, run_folder / "rig.yaml")
+    sources = {n: {"frames": f"frames/{n}"} if pictures else {"detections": "detections.csv"} for n in rig.cameras}
+    content = {"name": "fake <yaw & bend>", "rig": "rig.yaml", "frame_rate_hz": RATE_HZ, "cameras": sources}
+    save_run({"schema": "beampose/run/1", **content, "notes": "Notes of the run & more."}, run_folder)
     return Fake(results, run_folder, model, true_uv)
 
 
@@ -267,7 +275,3 @@ def _pictures(run_folder: Path, model: SpotModel, true_uv: Array, in_view: Array
             cv2.imwrite(str(path), np.clip(picture, 0, 255).astype(np.uint8))
             if c == 0 and k == 8:
                 path.write_bytes(path.read_bytes()[:2000])
-    cameras = "".join(f"  {n}: {{frames: frames/{n}}}\n" for n in dict.fromkeys(c for c, _ in model.views))
-    (run_folder / "run.yaml").write_text(
-        f"schema: beampose/run/1\nname: fake\nrig: rig.yaml\nframe_rate_hz: 100.0\ncameras:\n{cameras}"
-    )

@@ -1,0 +1,135 @@
+"""The report of one run: a single HTML file that needs nothing else."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import jinja2
+from markupsafe import Markup
+
+from lab.report import figures, tables
+from lab.report.material import Material, gather
+from lab.report.pictures import Event, chosen, events, pictures
+from lab.report.tracks import POSE_COLOURS, SPOT_COLOURS, timeline_figure, tracks_figure
+from lab.report.verdict import verdict_of
+from lab.yaml_text import write_whole
+from tracking.statuses import PoseStatus, SpotStatus
+
+FILE_NAME = "report.html"
+_MOST_EVENTS = 200
+
+
+@cache
+def environment() -> jinja2.Environment:
+    """The templates of this folder; everything that is not drawn here is escaped."""
+    return jinja2.Environment(
+        loader=jinja2.FileSystemLoader(Path(__file__).parent),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+
+
+def write_report(results: Path, run_folder: Path | None = None) -> Path:
+    """Write report.html into a results folder, from its tables alone; returns its path.
+
+    Where the run folder can be reached (the one given, or the one that summary.json names), pictures, residuals and
+    errors against truth are added. Raises InputError if the tables cannot be read.
+    """
+    material = gather(results, run_folder)
+    path = results / FILE_NAME
+    write_whole(page(material, results), path)
+    return path
+
+
+def page(m: Material, results: Path) -> str:
+    """The HTML text of a report."""
+    found = events(m)
+    heads, rows = tables.spot_rows(m)
+    context: dict[str, Any] = {
+        "name": m.name,
+        "verdict": verdict_of(m.summary),
+        "keys": tables.key_figures(m),
+        "truth_keys": tables.truth_figures(m.errors),
+        "pixel_rows": tables.pixel_rows(m.errors),
+        "run_line": _run_line(m),
+        "pose_figure": Markup(figures.pose_figure(m)),
+        "tracks": [Markup(t) for c in m.spots.cameras if (t := tracks_figure(m, c))],
+        "timeline": Markup(timeline_figure(m)) if len(m.spots.frames) and m.spots.views else "",
+        "spot_legend": [(str(s), SPOT_COLOURS[s], s.meaning) for s in SpotStatus],
+        "pose_legend": [(str(s), POSE_COLOURS[s], s.meaning) for s in PoseStatus],
+        "truth_grid": Markup(figures.error_grid(m, columns)) if (columns := figures.truth_columns(m)) else "",
+        "nees_figure": Markup(figures.nees_figure(m)),
+        "rms_figure": Markup(figures.rms_figure(m)),
+        "residual_grid": Markup(figures.error_grid(m, figures.residual_columns(m))),
+        "residual_known": m.residual_px is not None,
+        "error_rows": tables.error_rows(m.errors),
+        "has_truth": m.errors is not None,
+        "spot_heads": heads,
+        "spot_rows": rows,
+        "pictures": [Markup(p) for p in pictures(m, results, chosen(m, found))],
+        "events": _event_rows(m, found)[:_MOST_EVENTS],
+        "n_events": len(found),
+        "no_image": tables.no_image_ranges(m),
+        "notes": [str(n) for n in _listed(m.summary.get("notes"))],
+        "run_notes": "" if m.run is None else m.run.notes,
+        "missing": _missing(m),
+        "parameters": tables.flattened(m.summary.get("parameters") or {}),
+        "timings": tables.flattened(m.summary.get("timings") or {}),
+        "rates": tables.flattened(m.summary.get("rates") or {}),
+        "versions": tables.flattened(m.summary.get("versions") or {}),
+        "inputs": [i for i in _listed(m.summary.get("inputs")) if isinstance(i, dict)],
+    }
+    return environment().get_template("report.html.j2").render(context)
+
+
+def _listed(value: Any) -> list[Any]:
+    if value is None:
+        return []
+    return value if isinstance(value, list) else [value]
+
+
+def _run_line(m: Material) -> str:
+    parts = []
+    if len(m.spots.frames):
+        parts.append(f"frames {m.spots.frames[0]} to {m.spots.frames[-1]}")
+    if m.run is not None:
+        parts.append(f"{m.run.frame_rate_hz:g} Hz")
+    cameras = m.spots.cameras
+    parts.append(f"{len(cameras)} camera{'s' if len(cameras) != 1 else ''} ({', '.join(cameras)})" if cameras else "")
+    parts.append(f"{len(dict.fromkeys(s for _, s in m.spots.views))} spots")
+    method = tables.at(m.summary, "parameters", "tracker", "method") or tables.at(m.summary, "parameters", "method")
+    if method:
+        parts.append(f"tracker: {method}")
+    return " · ".join(p for p in parts if p)
+
+
+def _event_rows(m: Material, found: list[Event]) -> list[tuple[str, str, str, str]]:
+    """Frame, time, camera and what happened: what the run itself noted, and what its tables show."""
+    rows: list[tuple[int, str, str]] = []
+    for noted in _listed(m.summary.get("events")):
+        if isinstance(noted, dict) and isinstance(noted.get("frame"), int):
+            spot = f"spot {noted['spot']}: " if noted.get("spot") else ""
+            words = str(noted.get("text") or noted.get("kind") or "")
+            rows.append((noted["frame"], str(noted.get("camera") or ""), spot + words))
+    if not rows:
+        rows = [(int(m.spots.frames[e.index]), e.camera, e.text) for e in found if e.kind != "hidden"]
+    times = dict(zip(m.spots.frames.tolist(), m.t_s.tolist(), strict=True)) if m.time_name != "frame" else {}
+    return [(str(f), f"{times[f]:.3f}" if f in times else "", c, w) for f, c, w in sorted(rows)]
+
+
+def _missing(m: Material) -> list[str]:
+    """What this report could not show, and why."""
+    out = []
+    if not m.summary:
+        out.append("summary.json is missing: no verdict, parameters, versions or fingerprints.")
+    if m.run_folder is None:
+        out.append("The run folder could not be reached: no pictures, no residuals per spot, no errors against truth.")
+    elif m.run is None:
+        out.append("The run folder's run.yaml or its rig cannot be read: no pictures and no residuals per spot.")
+    if m.run_folder is not None and m.errors is None:
+        out.append("The run has no truth: no errors against it.")
+    return out

@@ -1,0 +1,43 @@
+"""The verdict of a run in words. The status is decided where the run is processed; here it is only read out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+WORDS = {
+    "pass": ("PASS", "The run was processed and every quality gate passed."),
+    "check": ("CHECK", "The run was processed and its gates passed, but look at the points below before using it."),
+    "fail": ("FAIL", "The run was processed, but a quality gate failed: do not use it unseen."),
+}
+UNKNOWN = ("NO VERDICT", "The results hold no verdict: summary.json is missing or was written by another program.")
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What to think of a run, and why."""
+
+    status: str  # pass, check, fail or unknown
+    word: str
+    sentence: str
+    reasons: tuple[str, ...]
+    exit_status: int | None
+
+
+def verdict_of(summary: dict[str, Any]) -> Verdict:
+    """The verdict that summary.json holds, whatever of it is there."""
+    block = summary.get("verdict")
+    block = block if isinstance(block, dict) else {}
+    status = str(block.get("status", "unknown")).lower()
+    word, sentence = WORDS.get(status, UNKNOWN)
+    reasons = block.get("reasons") or ()
+    if isinstance(reasons, str):
+        reasons = (reasons,)
+    code = block.get("exit_status")
+    return Verdict(
+        status=status if status in WORDS else "unknown",
+        word=word,
+        sentence=sentence,
+        reasons=tuple(str(r) for r in reasons),
+        exit_status=code if isinstance(code, int) else None,
+    )
