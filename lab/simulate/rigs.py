@@ -126,7 +126,7 @@ def four_skew_beams() -> Rig:
         "A": Beam("A", np.array([1.0, -0.32, 0.02]), np.array([0.05, -0.08, 0.03])),
         "B": Beam("B", np.array([1.0, 0.03, 0.12]), np.array([-0.04, 0.02, 0.10])),
         "C": Beam("C", np.array([1.0, 0.27, -0.03]), np.array([0.02, 0.09, -0.05])),
-        "D": Beam("D", np.array([1.0, -0.10, -0.21]), np.array([0.10, 0.00, -0.06])),
+        "D": Beam("D", np.array([1.0, -0.10, -0.21]), np.array([0.10, -0.03, -0.10])),
     }
     ends = (
         ("1", "A", -1, "left"), ("2", "B", -1, "left"), ("3", "C", -1, "left"),

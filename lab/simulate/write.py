@@ -61,7 +61,9 @@ def simulate(
     scenario: a name of SCENARIOS, or a value. frames: default the scenario's. video: one lossless video per camera in
     place of PNG files. detections_only: no pictures, but a detections.csv with `noise_px` (1 sigma per axis). light: a
     name of LIGHTS in place of the scenario's. clutter, miss_probability: as in simulate_points. picture_scale: 0.5
-    gives pictures half as wide and high. noisy: False leaves out shot and read noise (rounding stays). Raises InputError where an argument does not fit, or the folder exists.
+    gives pictures half as wide and high. noisy: False leaves out shot and read noise (rounding stays). threads: that
+    make and write pictures. progress: called after each picture. Raises InputError where an argument does not fit, or
+    the folder exists.
     """
     scenario = with_overrides(scenario, clutter=clutter, miss_probability=miss_probability)
     if light is not None:
