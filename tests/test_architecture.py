@@ -14,6 +14,8 @@ from importlib.metadata import packages_distributions
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parents[1]
 FLOORS = ("geometry", "tracking", "calibration", "lab", "cli")
@@ -147,11 +149,11 @@ def test_formulas_use_only_numerical_packages(floor):
 def test_what_the_program_imports_is_declared_in_pyproject():
     declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     required = [*declared["dependencies"], *declared["optional-dependencies"]["pointcloud"]]
-    names = {requirement.split(">=")[0].lower() for requirement in required}
+    names = {canonicalize_name(Requirement(requirement).name) for requirement in required}
     distributions = packages_distributions() | {"open3d": ["open3d"]}  # seldom installed
     used = set().union(*(foreign_packages(ROOT, floor) for floor in FLOORS))
     assert {"numpy", "scipy"} <= used
-    missing = {p for p in used if not names & {d.lower() for d in distributions.get(p, [])}}
+    missing = {p for p in used if not names & set(map(canonicalize_name, distributions.get(p, [])))}
     assert missing == set()
 
 
