@@ -18,6 +18,8 @@ from geometry.spots import SpotModel
 # Relative size under which a singular value of the whitened, scaled Jacobian is zero. Exact degeneracies (three spots
 # of one screen are collinear whatever the pose) give 1e-13 and less; the worst usable geometry about 1e-4.
 RANK_TOLERANCE = 1e-7
+# Squared sigmas by which a pose from three spots may differ from the expected one (p = 1e-3 for six numbers).
+EXPECTED_GATE = 22.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,7 +188,10 @@ def fit_pose_robust(
         score = trial.chi2 / noise_scale**2
         if expected is not None:
             gap = trial.world_from_body.minus(expected[0])
-            score += float(gap @ np.linalg.solve(expected[1] + trial.covariance, gap))
+            distance = float(gap @ np.linalg.solve(expected[1] + trial.covariance, gap))
+            if trial.dof <= 0 and distance > EXPECTED_GATE:
+                continue  # three spots fit any labels: at a bend, where the motion is no witness, nothing is chosen
+            score += distance
         elif trial.dof <= 0:
             continue
         if score < best_score:

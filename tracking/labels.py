@@ -23,12 +23,14 @@ from geometry.closed_form import poses_from_line_and_spot
 from geometry.planes import meet_plane, screen_to_world
 from geometry.pose import Pose
 from geometry.rig import Rig
-from geometry.solve import PoseFit, fit_pose
+from geometry.solve import PoseFit, SolveLimits, fit_pose, fit_pose_robust
 from geometry.spots import SpotModel
 from tracking.detections import Detections
 from tracking.parameters import LabelParameters
 
 NO_POINT = -1
+# Chance that a right set of labels is refused by its misfit: the points' sigmas already hold the model's error.
+P_MISFIT = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +87,9 @@ def find_labels(
     parameters = LabelParameters() if parameters is None else parameters
     scene = _Scene.of(rig, model, detections, parameters)
     if len(scene.camera) < parameters.min_spots:
-        return LabelResult(None, (), f"only {len(scene.camera)} points of light, at least {parameters.min_spots} needed")
+        return LabelResult(
+            None, (), f"only {len(scene.camera)} points of light, at least {parameters.min_spots} needed"
+        )
     best: list[Labelling] = []
     for poses in _hypotheses(scene, prior):
         best = _refined(scene, poses, prior, best)
@@ -317,7 +321,18 @@ def _fitted(scene: _Scene, pose: Pose, prior: PosePrior) -> Labelling | None:
         labels, pose = new, fit.world_from_body
     assert labels is not None
     assert fit is not None
-    if not bool(prior.holds(pose)) or not fit.consistent(1e-6):
+    if not fit.consistent(P_MISFIT):
+        # A false point beside a spot that was not found: it goes, the others stay.
+        rows = fit.rows
+        limits = SolveLimits(p_false_alarm=P_MISFIT)
+        fit = fit_pose_robust(
+            model, rows, scene.pixels[labels[rows]], scene.covariances[labels[rows]], pose, limits=limits
+        )
+        if fit is None or len({int(model.spot_of[r]) for r in fit.rows}) < p.min_spots:
+            return None
+        labels[np.setdiff1d(rows, fit.rows)] = NO_POINT
+        pose = fit.world_from_body
+    if not bool(prior.holds(pose)):
         return None
     projected = model.project(pose)[0]
     expected = model.in_picture(projected) & scene.seen
