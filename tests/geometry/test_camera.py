@@ -23,7 +23,6 @@ def camera(lens: tuple[float, ...] = (), camera_from_world: Pose | None = None) 
     return Camera("left", "screen", (1280, 1024), K, lens, camera_from_world or Pose.identity())
 
 
-@settings(deadline=None)
 @given(seed=seeds, n_numbers=st.sampled_from(list(LENSES)))
 def test_world_points_fall_on_opencvs_pixels(seed, n_numbers):
     rng = np.random.default_rng(seed)
@@ -36,7 +35,6 @@ def test_world_points_fall_on_opencvs_pixels(seed, n_numbers):
     np.testing.assert_allclose(c.project(points), expected[:, 0], rtol=0, atol=1e-9)
 
 
-@settings(deadline=None)
 @given(seed=seeds, n_numbers=st.sampled_from(list(LENSES)))
 def test_the_ray_of_a_pixel_falls_on_that_pixel_from_any_distance(seed, n_numbers):
     rng = np.random.default_rng(seed)
@@ -93,7 +91,7 @@ def test_a_margin_widens_the_picture_on_every_side():
     assert not camera().sees(pixels).any()
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(seed=seeds)
 def test_points_of_different_cameras_go_in_one_call_with_the_jacobian_of_differences(seed):
     rng = np.random.default_rng(seed)

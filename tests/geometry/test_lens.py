@@ -110,7 +110,7 @@ def test_a_highest_power_that_is_there_by_rounding_only_does_not_move_the_fold(n
 coefficient = st.floats(-0.6, 0.6)
 
 
-@settings(max_examples=120, deadline=None)
+@settings(max_examples=120)
 @given(k=st.tuples(coefficient, coefficient, coefficient), rational=st.tuples(coefficient, coefficient, coefficient))
 def test_the_fold_is_the_first_place_where_a_dense_walk_comes_back(k, rational):
     for denominators in ((0.0, 0.0, 0.0), rational):
@@ -134,7 +134,7 @@ def _turns_clearly(radius: float, numbers: tuple[float, ...]) -> bool:
     return (at - before) > 1e-9 and ((at - after) > 1e-9 or after < 0) and np.abs(numerator).min() > 1e-3
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(k=st.tuples(coefficient, coefficient, coefficient), rational=st.tuples(coefficient, coefficient, coefficient))
 def test_inside_the_fold_radius_grows_with_radius(k, rational):
     numbers = (k[0], k[1], 0.0, 0.0, k[2], *rational)
@@ -143,7 +143,7 @@ def test_inside_the_fold_radius_grows_with_radius(k, rational):
     assert (np.diff(radial(r, numbers)) > 0).all()
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     k=st.tuples(st.floats(-0.5, -0.05), st.floats(-0.1, 0.1), st.floats(-0.05, 0.05)),
     tangential=st.tuples(st.floats(-3e-3, 3e-3), st.floats(-3e-3, 3e-3)),

@@ -44,7 +44,7 @@ def plain_pixel(rig: Rig, camera_name: str, spot_name: str, turn: Rotation, shif
     return pixel.ravel()
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(seed=seeds)
 def test_the_model_agrees_with_a_plain_one_made_of_other_parts(seed):
     rng = np.random.default_rng(seed)
@@ -78,7 +78,7 @@ def test_the_papers_spots_fall_where_a_pencil_puts_them():
     np.testing.assert_allclose(pixels[:, 1], 511.5, atol=ROUNDING_PX)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(seed=seeds)
 def test_the_jacobian_of_the_pixels_is_that_of_differences(seed):
     rng = np.random.default_rng(seed)
@@ -91,7 +91,7 @@ def test_the_jacobian_of_the_pixels_is_that_of_differences(seed):
     np.testing.assert_allclose(J[seen] / scale, differences[seen] / scale, rtol=0, atol=2e-6)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(seed=seeds)
 def test_the_jacobian_of_the_lit_points_is_that_of_differences(seed):
     rng = np.random.default_rng(seed)
@@ -103,7 +103,7 @@ def test_the_jacobian_of_the_lit_points_is_that_of_differences(seed):
     np.testing.assert_allclose(J[near] / scale, differences[near] / scale, rtol=0, atol=2e-7)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(seed=seeds)
 def test_a_stack_of_poses_gives_what_each_pose_gives_alone(seed):
     rng = np.random.default_rng(seed)
@@ -123,7 +123,7 @@ def test_a_stack_of_poses_gives_what_each_pose_gives_alone(seed):
         np.testing.assert_allclose(J[divmod(i, 3)][exists], J_alone[exists], rtol=1e-9, atol=1e-6)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(seed=seeds)
 def test_pixels_do_not_depend_on_the_labs_choice_of_world(seed):
     rng = np.random.default_rng(seed)
@@ -149,7 +149,7 @@ def test_pixels_do_not_depend_on_the_labs_choice_of_world(seed):
     np.testing.assert_allclose(J_after[near], J_expected[near], rtol=1e-7, atol=1e-5)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(seed=seeds)
 def test_a_subset_is_those_rows_of_the_whole(seed):
     rng = np.random.default_rng(seed)
