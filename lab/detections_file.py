@@ -84,7 +84,9 @@ def read_detections(path: Path) -> DetectionsFile | None:
         leave_out(~(np.isfinite(sigma) & (sigma > 0)).all(-1), "a sigma is not above 0")
         leave_out(~(np.abs(shared) < sigma[:, 0] * sigma[:, 1]), "cov_uv_px2 is not below the product of the sigmas")
     keys = table.assign(camera=camera)[["frame", "camera", "u_px", "v_px"]]
-    leave_out((~bad) & keys.where(~bad[:, None]).duplicated().to_numpy(), "the same point a second time")
+    repeated = np.zeros(n, dtype=bool)
+    repeated[~bad] = keys[~bad].duplicated().to_numpy()
+    leave_out(repeated, "the same point a second time")
     if table.attrs["malformed"]:
         notes.append(f"{path}: {table.attrs['malformed']} lines left out: more fields than the header has")
     if bad.all():
