@@ -20,12 +20,13 @@ from lab.report import svg
 from lab.report.material import Material
 from lab.report.tracks import SPOT_COLOURS
 from lab.results import SPOT_STATUSES, read_table
-from lab.run_file import DetectionsTable
+from lab.run_file import DetectionsTable, VideoFile
 from tracking.detections import Detections
 from tracking.statuses import PoseStatus, SpotStatus
 
 Bytes: TypeAlias = NDArray[np.uint8]
 MOST_PICTURES = 8
+_VIDEO_REACH = 1000  # a video is decoded from its start: look no farther than so many frames
 _SHOWN_WIDTH = 400.0  # drawing units that a picture takes
 _ZOOM_PX, _ZOOM_SHOWN = 64, 130.0  # side of the enlarged part, px, and what it takes
 
@@ -85,7 +86,9 @@ def _for_frames(what: str, start: int, stop: int) -> str:
 
 
 def chosen(m: Material, found: list[Event]) -> list[Event]:
-    """At most MOST_PICTURES events, every kind before any second one, a kind's longest texts no more than its first."""
+    """At most MOST_PICTURES events, every kind before any second one."""
+    if m.run is not None and any(isinstance(s, VideoFile) for s in m.run.cameras.values()):
+        found = [e for e in found if e.index < _VIDEO_REACH]
     cameras = m.spots.cameras
     if not cameras:
         return []
@@ -153,7 +156,7 @@ def _drawing(m: Material, event: Event, picture: Array | str, points: dict[tuple
     views = [j for j, (c, _) in enumerate(m.spots.views) if c == event.camera]
     focus = _focus(m, event, views, (w, h))
     height = max(tall, _ZOOM_SHOWN + 96) + 36
-    when = f"t = {svg.short(float(m.t_s[event.index]), 4)} s" if m.time_name != "frame" else ""
+    when = f"t = {m.t_s[event.index]:.3f} s" if m.time_name != "frame" else ""
     head = f"frame {frame}" + (f", {when}" if when else "") + f", camera {event.camera}"
     out = [
         f'<svg class="plot shot" viewBox="0 0 540 {height:.0f}" role="img">'
@@ -165,7 +168,8 @@ def _drawing(m: Material, event: Event, picture: Array | str, points: dict[tuple
         out.append(f'<rect class="nopicture" x="-0.5" y="-0.5" width="{w}" height="{h}"/>')
         out.append(svg.text(w / 2, h / 2, picture, "halo mid", f"fill:#fff;font-size:{14 / scale:.0f}px"))
     else:
-        half = np.asarray(cv2.resize(_stretched(picture), None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), np.uint8)
+        shown = _stretched(picture, *_limits(picture))
+        half = np.asarray(cv2.resize(shown, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), np.uint8)
         out.append(
             f'<image x="-0.5" y="-0.5" width="{w}" height="{h}" preserveAspectRatio="none"'
             f' href="{_data_uri(half, ".jpg")}"/>'
@@ -174,6 +178,7 @@ def _drawing(m: Material, event: Event, picture: Array | str, points: dict[tuple
     out.append("</svg>")
     if not isinstance(picture, str) and focus is not None:
         out.append(_zoom(m, event, picture, focus, views, points.get((frame, event.camera))))
+    out.append(_statuses(m, event.index, views, tall))
     return "".join(out) + "</svg>"
 
 
@@ -187,10 +192,13 @@ def _focus(m: Material, event: Event, views: list[int], size: tuple[int, int]) -
     return None
 
 
-def _stretched(picture: Array) -> Bytes:
+def _limits(picture: Array) -> tuple[float, float]:
+    """The grey values to show as black and as white."""
+    return float(np.percentile(picture[::4, ::4], 1)), float(picture.max())
+
+
+def _stretched(picture: Array, low: float, high: float) -> Bytes:
     """Eight bits, so that the background is just seen and the spots do not all clip."""
-    sample = picture[::4, ::4]
-    low, high = float(np.percentile(sample, 1)), float(picture.max())
     shares = np.clip((picture - low) / max(high - low, 1.0), 0.0, 1.0)
     return (255 * np.sqrt(shares)).astype(np.uint8)
 
@@ -202,14 +210,21 @@ def _data_uri(picture: Bytes, kind: str) -> str:
 
 
 def _overlay(
-    m: Material, k: int, views: list[int], size: tuple[int, int], unit: float, points: Array | None, names: bool = True
+    m: Material,
+    k: int,
+    views: list[int],
+    size: tuple[int, int],
+    unit: float,
+    points: Array | None,
+    enlarged: bool = False,
 ) -> str:
-    """Markers and names in picture pixels; `unit`: pixels that one drawing unit takes."""
+    """Markers, and names where not enlarged, in picture pixels; `unit`: pixels that one drawing unit takes."""
+    ring = (14 if enlarged else 8) * unit
     w, h = size
     out: list[str] = []
     taken: list[tuple[float, float]] = []
     if points is not None and len(points):
-        r = 4 * unit
+        r = (9 if enlarged else 4) * unit
         d = "".join(f"M{u - r:.1f} {v - r:.1f}h{2 * r:.1f}v{2 * r:.1f}h{-2 * r:.1f}z" for u, v in points.tolist())
         out.append(
             f'<path d="{d}" fill="none" stroke="#c8ccd2" stroke-width="{unit:.2f}"><title>detection</title></path>'
@@ -235,7 +250,7 @@ def _overlay(
         if inside:
             dash = "" if status.measured else f' stroke-dasharray="{3 * unit:.1f} {2 * unit:.1f}"'
             out.append(
-                f'<circle cx="{uv[0]:.2f}" cy="{uv[1]:.2f}" r="{8 * unit:.2f}" fill="none" stroke="{colour}"'
+                f'<circle cx="{uv[0]:.2f}" cy="{uv[1]:.2f}" r="{ring:.2f}" fill="none" stroke="{colour}"'
                 f' stroke-width="{1.8 * unit:.2f}"{dash}><title>{escape(f"spot {spot}: {status}")}</title></circle>'
             )
             name, x, y = spot, uv[0] + 11 * unit, uv[1] - 7 * unit
@@ -244,7 +259,7 @@ def _overlay(
             out.append(f'<path d="{arrow}" fill="{colour}"><title>{escape(f"spot {spot}: {status}")}</title></path>')
             gap = float(np.linalg.norm(uv - np.clip(uv, -0.5, np.array(size) - 0.5)))
             name = f"{spot}: {gap:.0f} px out"
-        if names:
+        if not enlarged:
             x = min(max(x, 4 * unit), w - (8 * len(name) + 4) * unit)
             y = min(max(y, 14 * unit), h - 5 * unit)
             while any(abs(x - tx) < 8 * len(name) * unit and abs(y - ty) < 14 * unit for tx, ty in taken):
@@ -274,11 +289,30 @@ def _zoom(m: Material, event: Event, picture: Array, focus: Array, views: list[i
     part = picture[corner[1] : corner[1] + side, corner[0] : corner[0] + side]
     unit = side / _ZOOM_SHOWN
     x0, y0 = corner - 0.5
-    marks = _overlay(m, event.index, views, (w, h), unit, points, names=False)
+    marks = _overlay(m, event.index, views, (w, h), unit, points, enlarged=True)
     frame = f'x="{x0}" y="{y0}" width="{side}" height="{side}"'
+    data = _data_uri(_stretched(part, *_limits(picture)), ".png")
     inner = (
         f'<svg x="408" y="34" width="{_ZOOM_SHOWN}" height="{_ZOOM_SHOWN}" viewBox="{x0} {y0} {side} {side}">'
-        f'<image {frame} style="image-rendering:pixelated" href="{_data_uri(_stretched(part), ".png")}"/>{marks}</svg>'
+        f'<image {frame} style="image-rendering:pixelated" href="{data}"/>{marks}</svg>'
     )
     words = (f"enlarged: {side} × {side} px", f"from u = {corner[0]}, v = {corner[1]}")
     return inner + "".join(svg.text(408, 34 + _ZOOM_SHOWN + 15 + 14 * i, line, "tick") for i, line in enumerate(words))
+
+
+def _statuses(m: Material, k: int, views: list[int], tall: float) -> str:
+    """The spots' statuses in words, beside the foot of the picture."""
+    lines = []
+    for j in views:
+        code = int(m.spots.status[k, j])
+        if code >= 0:
+            status = SPOT_STATUSES[code]
+            lines.append((f"{m.spots.views[j][1]}: {str(status).replace('_', ' ')}", SPOT_COLOURS[status]))
+    fits = max(int((tall - _ZOOM_SHOWN - 40) / 15), 0)
+    foot = 34 + tall - 4
+    shown = lines[:fits]
+    return "".join(
+        f'<circle cx="413" cy="{foot - 15 * (len(shown) - 1 - i) - 4:.1f}" r="4" fill="{colour}"/>'
+        + svg.text(422, foot - 15 * (len(shown) - 1 - i), words, "tick")
+        for i, (words, colour) in enumerate(shown)
+    )

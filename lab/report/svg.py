@@ -263,10 +263,8 @@ def _marks_beyond(x: Array, y: Array, lo: float, hi: float, top: float, bottom: 
     return f'<path d="{"".join(out)}" fill="{colour}"/>' if out else ""
 
 
-def histogram(
-    values: Array, title: str, unit: str, *, colour: str = BLUE, curve: bool = False, width: int = 540
-) -> str:
-    """Counts of values; with `curve` the standard normal curve of the same area is drawn over them."""
+def histogram(values: Array, title: str, unit: str, *, curve: float = 0.0, width: int = 540) -> str:
+    """Counts of values; with `curve` the normal curve of that sigma and the same area is drawn over them."""
     height, left, right, top, bottom = 150, 54.0, width - 10.0, 20.0, 120.0
     values = values[np.isfinite(values)]
     if not values.size:
@@ -275,7 +273,9 @@ def histogram(
     edges = np.linspace(lo, hi, 51)
     counts: Ints = np.histogram(np.clip(values, lo, hi), edges)[0]
     centre, wide = (edges[1:] + edges[:-1]) / 2, edges[1] - edges[0]
-    normal = len(values) * wide * np.exp(-(centre**2) / 2) / np.sqrt(2 * np.pi) if curve else np.zeros(50)
+    normal = np.zeros(50)
+    if curve:
+        normal = len(values) * wide * np.exp(-((centre / curve) ** 2) / 2) / (curve * np.sqrt(2 * np.pi))
     X, Y = Scale(lo, hi, left, right), Scale(0, max(float(max(counts.max(), normal.max())), 1.0) * 1.05, bottom, top)
     bars = "".join(
         f"M{x0:.1f} {bottom}V{y:.1f}H{x1:.1f}V{bottom}z"
@@ -287,7 +287,7 @@ def histogram(
         y = float(Y(value))
         out.append(f'<path class="grid" d="M{left} {y:.1f}H{right}"/>')
         out.append(text(left - 5, y + 3.5, f"{abs(value):.0f}", "tick end"))
-    out.append(f'<path d="{bars}" fill="{colour}" opacity="0.75"><title>{len(values)} values</title></path>')
+    out.append(f'<path d="{bars}" fill="{BLUE}" opacity="0.75"><title>{len(values)} values</title></path>')
     if curve:
         out.append(f'<path class="line ink" d="{line_path(X(centre), Y(normal))}" stroke-dasharray="4 3"/>')
     x_ticks = ticks(lo, hi, 8)

@@ -195,10 +195,11 @@ def make(
     ]  # fmt: skip
     write(results / "detections.csv", columns.DETECTIONS, detected)
     if truth:
+        true_q = pose.quaternion_wxyz
         write(
             run_folder / "truth" / "pose.csv",
             columns.TRUTH_POSE,
-            [[frame[k], t[k], *pose.translation[k], *pose.quaternion_wxyz[k]] for k in range(n_frames)],
+            [[frame[k], t[k], *pose.translation[k], *true_q[k]] for k in range(n_frames)],
         )
         write(
             run_folder / "truth" / "spots.csv",
