@@ -139,7 +139,8 @@ def read_mapping(path: Path) -> dict[str, Any]:
             problem = 'a lone minus; quote it: "-"'
         elif "mapping values are not allowed" in problem:
             problem = "a second colon; quote the text that holds it"
-        raise InputError(f"{path}: {where}: expected YAML, found {problem.removeprefix('but ').removeprefix('found ')}") from None
+        problem = problem.removeprefix("but ").removeprefix("found ")
+        raise InputError(f"{path}: {where}: expected YAML, found {problem}") from None
     except yaml.YAMLError as error:
         raise InputError(f"{path}: expected YAML, found {str(error).splitlines()[0]}") from None
     except RecursionError:
