@@ -50,7 +50,10 @@ def pose_figure(m: Material) -> str:
                 lines=(Line(value, svg.BLUE, name, 1.3),),
                 bands=(Band(value - 3 * sigma, value + 3 * sigma, svg.SKY, "\u00b13\u03c3", 0.45),),
                 shades=shades,
-                y_range=svg.plain_range(value),
+                # Of the bands only those of measured poses count: a long prediction would flatten the rest.
+                y_range=svg.plain_range(
+                    np.concatenate([value, (value - 3 * sigma)[measured], (value + 3 * sigma)[measured]])
+                ),
                 height=height,
                 with_time=last,
                 time_name=m.time_name,

@@ -38,7 +38,7 @@ def ticks(lo: float, hi: float, about: int) -> Array:
     power = 10.0 ** np.floor(np.log10(raw))
     step = power * min((m for m in (1, 2, 5, 10) if m * power >= raw * 0.999), default=10)
     first = np.ceil(lo / step - 1e-9)
-    return step * np.arange(first, np.floor(hi / step + 1e-9) + 1)
+    return step * np.arange(first, np.floor(hi / step + 1e-9) + 1) + 0.0  # and no minus nought
 
 
 def tick_texts(values: Array) -> list[str]:
@@ -212,7 +212,7 @@ def time_panel(
                 f'<rect class="{shade.css}" x="{x0:.1f}" y="{top}" width="{max(x1 - x0, 1.0):.1f}"'
                 f' height="{bottom - top:.1f}"><title>{escape(shade.name)}</title></rect>'
             )
-    y_ticks = ticks(lo, hi, max(4, int((bottom - top) / 22)))
+    y_ticks = ticks(lo, hi, max(5, int((bottom - top) / 22)))
     for value, words in zip(y_ticks, tick_texts(y_ticks), strict=True):
         at = float(Y(value))
         out.append(f'<path class="grid" d="M{left} {at:.1f}H{right}"/>{text(left - 5, at + 3.5, words, "tick end")}')
