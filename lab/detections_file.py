@@ -82,7 +82,8 @@ def read_detections(path: Path) -> DetectionsFile | None:
         leave_out((camera == "").to_numpy(), "no camera is named")
         leave_out(~np.isfinite(uv).all(-1), "u_px or v_px is no finite number")
         leave_out(~(np.isfinite(sigma) & (sigma > 0)).all(-1), "a sigma is not above 0")
-        leave_out(~(np.abs(shared) < sigma[:, 0] * sigma[:, 1]), "cov_uv_px2 is not below the product of the sigmas")
+        largest = (1 - 1e-9) * sigma[:, 0] * sigma[:, 1]  # beyond it rounding makes the covariance singular
+        leave_out(~(np.abs(shared) < largest), "cov_uv_px2 is not below the product of the sigmas")
     keys = table.assign(camera=camera)[["frame", "camera", "u_px", "v_px"]]
     repeated = np.zeros(n, dtype=bool)
     repeated[~bad] = keys[~bad].duplicated().to_numpy()
