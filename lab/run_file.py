@@ -72,6 +72,7 @@ class Run:
     frame_rate_hz: float
     exposure_s: float | None
     times: Times
+    times_path: Path | None  # the timestamps file, where the run has one
     cameras: Mapping[str, Source]  # in the rig's order
     left_out: tuple[str, ...]  # cameras of the rig that this run has nothing of
     prior: PosePrior | None  # where the vehicle is at the first frame
@@ -129,6 +130,7 @@ def load_run(run_folder: Path) -> Run:
         frame_rate_hz=content.frame_rate_hz,
         exposure_s=content.exposure_s,
         times=Times(content.frame_rate_hz) if times_path is None else load_times(times_path, content.frame_rate_hz),
+        times_path=times_path,
         cameras=sources,
         left_out=tuple(n for n in rig.cameras if n not in sources),
         prior=None if content.prior is None else _prior_of(content.prior),

@@ -1,0 +1,115 @@
+"""From a run to records, one per frame: pictures in, detection, tracking, pose. A generator: nothing piles up."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from geometry.camera import SensorNoise
+from lab.errors import InputError
+from lab.frames import FrameReader, FrameSet, open_frames, pictures_at
+from lab.pictures import Missing
+from lab.run_file import FramesFolder, Run
+from tracking.detect import find_spots
+from tracking.detections import Detections
+from tracking.noise import NoiseModel, estimate_noise
+from tracking.spot_tracker import SpotTracker, TrackedFrame
+
+NOISE_PICTURES = 3  # per camera, where the rig states no noise: enough for the slope, and read in an instant
+
+
+@dataclass(frozen=True, slots=True)
+class FrameRecord:
+    """All that is known of one frame."""
+
+    frame: int
+    t_s: float
+    detections: tuple[Detections | None, ...]  # per camera of the run; None without a usable picture
+    missing: tuple[str, ...]  # per camera: why there is no picture; "" where there is one
+    tracked: TrackedFrame
+
+
+@dataclass(slots=True)
+class Timings:
+    """Seconds spent, wall clock of the thread that works."""
+
+    waiting: float = 0.0  # for pictures
+    detection: float = 0.0
+    tracking: float = 0.0
+
+
+@dataclass(slots=True)
+class Pipeline:
+    """One run in work. Iterate over `records()` once; `notes`, `noise` and `timings` are complete afterwards."""
+
+    run: Run
+    reader: FrameReader
+    tracker: SpotTracker
+    noise: dict[str, SensorNoise | NoiseModel]
+    timings: Timings = field(default_factory=Timings)
+
+    @staticmethod
+    def of(run: Run) -> Pipeline:
+        """Open a run. Raises InputError where it has no prior, or its pictures cannot be found."""
+        if run.prior is None:
+            raise InputError(
+                f"{run.path}: prior: expected where the vehicle is at the first frame, found none; the first labels need it."
+                " Add: prior: {position_m: [0, 0, 0], yaw_pitch_roll_deg: [0, 0, 0], within_m: 0.5, within_deg: 30}"
+            )
+        reader = open_frames(run)
+        noise: dict[str, SensorNoise | NoiseModel] = {}
+        for name, camera in run.rig.cameras.items():
+            model = camera.noise or _noise_of_pictures(run, reader, name)
+            if model is not None:
+                noise[name] = model
+        return Pipeline(run, reader, SpotTracker(run.rig, run.tracker, run.prior), noise)
+
+    def records(self) -> Iterator[FrameRecord]:
+        """One record per frame number, from the first to the last."""
+        before: float | None = None
+        clock = time.perf_counter()
+        for frames in self.reader:
+            clock = self._spent("waiting", clock)
+            t_s = float(self.run.times.t_s(frames.frame))
+            found, missing = self._detect(frames)
+            clock = self._spent("detection", clock)
+            tracked = self.tracker.step(0.0 if before is None else t_s - before, found)
+            before = t_s
+            self._spent("tracking", clock)
+            yield FrameRecord(frames.frame, t_s, found, missing, tracked)
+            clock = time.perf_counter()
+
+    def _spent(self, on: str, since: float) -> float:
+        now = time.perf_counter()
+        setattr(self.timings, on, getattr(self.timings, on) + now - since)
+        return now
+
+    def _detect(self, frames: FrameSet) -> tuple[tuple[Detections | None, ...], tuple[str, ...]]:
+        found: list[Detections | None] = []
+        missing: list[str] = []
+        for name in self.run.rig.cameras:
+            picture = frames.images[name]
+            if isinstance(picture, Missing):
+                found.append(None)
+                missing.append(picture.reason)
+                continue
+            if isinstance(picture, np.ndarray):
+                if name not in self.noise:
+                    self.noise[name] = estimate_noise([picture])
+                picture = find_spots(picture, self.run.tracker.detect, self.noise[name])
+            found.append(picture)
+            missing.append("")
+        return tuple(found), tuple(missing)
+
+
+def _noise_of_pictures(run: Run, reader: FrameReader, camera: str) -> NoiseModel | None:
+    """From the first readable pictures of a folder; videos and tables: None (a video's first picture will do)."""
+    if not isinstance(run.cameras[camera], FramesFolder):
+        return None
+    numbers = reader.listings[camera].numbers[:NOISE_PICTURES]
+    pictures = pictures_at(run, camera, [int(n) for n in numbers]).values()
+    usable = [p for p in pictures if isinstance(p, np.ndarray)]
+    return estimate_noise(usable) if usable else None

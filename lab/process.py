@@ -1,0 +1,276 @@
+"""The main job: a run folder in, a result folder out."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import platform
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from geometry.spots import SpotModel
+from lab import quality
+from lab.fields import dataclass_from_yaml
+from lab.fingerprints import fingerprints
+from lab.pipeline import FrameRecord, Pipeline
+from lab.run_file import Run, load_run
+from lab.tables import TableWriter
+from lab.whole_folder import whole_folder
+from tracking.parameters import TrackerParameters
+
+SUMMARY_SCHEMA = "beampose/summary/1"
+MOST_EVENTS = 500  # told one by one; of the rest the number
+
+Progress = Callable[[int, int | None], None]  # frames done, frames in all where known
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What became of one run."""
+
+    name: str
+    out: Path
+    verdict: quality.Verdict
+    frames: int
+    measured: int
+    seconds: float
+    errors: Mapping[str, Any] | None  # against truth, where there is one
+
+    @property
+    def exit_status(self) -> int:
+        """0, or 4 where a quality gate failed."""
+        return self.verdict.exit_status
+
+    def line(self) -> str:
+        """One line for the command line."""
+        return (
+            f"{self.name}: {self.verdict.status.upper()}: {self.measured} of {self.frames} frames measured"
+            f" ({'; '.join(self.verdict.reasons)}) -> {self.out}"
+        )
+
+
+@dataclass(slots=True)
+class _Tally:
+    """Counts over a run; its size does not grow with the number of frames (gaps are kept as ranges)."""
+
+    cameras: tuple[str, ...]
+    views: tuple[str, ...]
+    frames: int = 0
+    spot_status: list[Counter[str]] = field(default_factory=list)
+    pose_status: Counter[str] = field(default_factory=Counter)
+    detections: Counter[str] = field(default_factory=Counter)
+    no_image: dict[str, list[list[int]]] = field(default_factory=dict)
+    reasons: dict[str, Counter[str]] = field(default_factory=dict)
+    events: list[dict[str, Any]] = field(default_factory=list)
+    event_kinds: Counter[str] = field(default_factory=Counter)
+
+    def add(self, record: FrameRecord) -> None:
+        self.frames += 1
+        if not self.spot_status:
+            self.spot_status = [Counter() for _ in self.views]
+        for counter, status in zip(self.spot_status, record.tracked.status, strict=True):
+            counter[status.value] += 1
+        self.pose_status[record.tracked.pose_status.value] += 1
+        for camera, found, reason in zip(self.cameras, record.detections, record.missing, strict=True):
+            if found is None:
+                self._missed(camera, record.frame, reason)
+            else:
+                self.detections[camera] += len(found)
+        for event in record.tracked.events:
+            self.event_kinds[event.kind] += 1
+            if len(self.events) < MOST_EVENTS:
+                camera, spot = (None, None) if event.view is None else self.views[event.view].split("/", 1)
+                self.events.append(
+                    {"frame": record.frame, "kind": event.kind, "camera": camera, "spot": spot, "text": event.text}
+                )
+
+    def _missed(self, camera: str, frame: int, reason: str) -> None:
+        ranges = self.no_image.setdefault(camera, [])
+        if ranges and ranges[-1][1] == frame - 1:
+            ranges[-1][1] = frame
+        else:
+            ranges.append([frame, frame])
+        self.reasons.setdefault(camera, Counter())[reason] += 1
+
+
+def process_run(
+    run_folder: Path,
+    out: Path,
+    *,
+    overrides: Mapping[str, Any] | None = None,
+    progress: Progress | None = None,
+) -> Outcome:
+    """Process one run folder into the folder `out`: the tables, summary.json and report.html.
+
+    overrides: tracker parameters that replace those of run.yaml. Raises a BeamposeError where the run cannot be
+    processed; `out` is then as it was before.
+    """
+    started = time.perf_counter()
+    run = load_run(run_folder)
+    if overrides:
+        run = dataclasses.replace(run, tracker=_overridden(run.tracker, overrides))
+    with whole_folder(out, may_replace=are_results) as work:
+        pipeline = Pipeline.of(run)
+        tally = _Tally(tuple(run.rig.cameras), tuple(f"{c}/{s}" for c, s in SpotModel.of(run.rig).views))
+        total = pipeline.reader.expected_frames
+        with TableWriter(work, run.rig) as tables:
+            for record in pipeline.records():
+                tables.write(record)
+                tally.add(record)
+                if progress is not None:
+                    progress(tally.frames, total)
+        verdict = _verdict(pipeline, tally)
+        errors = _errors(work, run)
+        seconds = {
+            "waiting_for_pictures_s": pipeline.timings.waiting,
+            "detection_s": pipeline.timings.detection,
+            "tracking_s": pipeline.timings.tracking,
+        }
+        content = _summary(run, pipeline, tally, verdict, errors, seconds, time.perf_counter() - started)
+        _write_json(content, work / "summary.json")
+        from lab.report import write_report  # the template engine: only for those who write a report
+
+        write_report(work, run.folder)
+    return Outcome(
+        run.name, Path(out), verdict, tally.frames, tally.pose_status["measured"], time.perf_counter() - started, errors
+    )
+
+
+def are_results(folder: Path) -> bool:
+    """Whether a folder holds a run's results, which a new run may replace."""
+    try:
+        return bool(json.loads((folder / "summary.json").read_text("utf-8")).get("schema") == SUMMARY_SCHEMA)
+    except (OSError, ValueError, AttributeError):
+        return False
+
+
+def _overridden(parameters: TrackerParameters, overrides: Mapping[str, Any]) -> TrackerParameters:
+    """Parameters with some replaced, checked like those of a file; dotted names reach the inner blocks."""
+    content = dataclasses.asdict(parameters)
+    for name, value in overrides.items():
+        *blocks, last = name.split(".")
+        inner = content
+        for block in blocks:
+            inner = inner.setdefault(block, {})
+            if not isinstance(inner, dict):
+                break
+        else:
+            inner[last] = value
+            continue
+        content[name] = value  # no such block: the checker says so
+    return dataclass_from_yaml(TrackerParameters, content, "--set")
+
+
+def _verdict(pipeline: Pipeline, tally: _Tally) -> quality.Verdict:
+    return quality.judge(
+        frames=tally.frames,
+        measured=tally.pose_status["measured"],
+        lost=tally.pose_status["lost"],
+        misfit=pipeline.tracker.noise_scale,
+        no_image={c: sum(b - a + 1 for a, b in ranges) for c, ranges in tally.no_image.items()},
+        ties=tally.event_kinds["tie"],
+        measured_before_lost_again=tally.event_kinds["reacquired"],
+    )
+
+
+def _errors(results: Path, run: Run) -> dict[str, Any] | None:
+    from lab.score import score
+
+    return score(results, run.folder)
+
+
+def _summary(
+    run: Run,
+    pipeline: Pipeline,
+    tally: _Tally,
+    verdict: quality.Verdict,
+    errors: Mapping[str, Any] | None,
+    seconds: Mapping[str, float],
+    wall_s: float,
+) -> dict[str, Any]:
+    frames = max(tally.frames, 1)
+    notes = list(pipeline.reader.notes)
+    if run.left_out:
+        notes.append(f"cameras of the rig that this run has nothing of: {', '.join(run.left_out)}")
+    if len(tally.events) < sum(tally.event_kinds.values()):
+        notes.append(f"events: the first {MOST_EVENTS} of {sum(tally.event_kinds.values())} are listed")
+    return {
+        "schema": SUMMARY_SCHEMA,
+        "name": run.name,
+        "run_folder": str(run.folder.resolve()),
+        "rig": str(run.rig_path.resolve()),
+        "notes_of_run": run.notes,
+        "verdict": {"status": verdict.status, "reasons": list(verdict.reasons), "exit_status": verdict.exit_status},
+        "counts": {
+            "frames": tally.frames,
+            "spot_status": {v: dict(c) for v, c in zip(tally.views, tally.spot_status, strict=False)},
+            "pose_status": dict(tally.pose_status),
+            "detections_per_frame": {c: tally.detections[c] / frames for c in tally.cameras},
+            "no_image": tally.no_image,
+            "no_image_reasons": {c: dict(r) for c, r in tally.reasons.items()},
+            "events": dict(tally.event_kinds),
+        },
+        "rates": {
+            "measured_share": tally.pose_status["measured"] / frames,
+            "frame_rate_hz": run.frame_rate_hz,
+            "processed_frames_per_s": tally.frames / wall_s if wall_s > 0 else None,
+            "misfit": pipeline.tracker.noise_scale,
+        },
+        "errors": errors,
+        "timings": {**seconds, "wall_s": wall_s},
+        "versions": versions(),
+        "parameters": {
+            "tracker": dataclasses.asdict(run.tracker),
+            "noise": {name: dataclasses.asdict(model) for name, model in pipeline.noise.items()},
+            "prior": _prior_numbers(run),
+        },
+        "inputs": fingerprints(run),
+        "notes": notes,
+        "events": tally.events,
+    }
+
+
+def _prior_numbers(run: Run) -> dict[str, Any] | None:
+    if run.prior is None:
+        return None
+    return {
+        "position_m": run.prior.centre.translation.tolist(),
+        "yaw_pitch_roll_deg": np.rad2deg(run.prior.centre.ypr).tolist(),
+        "within_m": run.prior.within_m,
+        "within_deg": float(np.rad2deg(run.prior.within_rad)),
+    }
+
+
+def versions() -> dict[str, str]:
+    """Of this program, Python, and the libraries that numbers depend on."""
+    out = {"python": platform.python_version()}
+    for name in ("beampose", "numpy", "scipy", "opencv-python-headless", "pandas"):
+        try:
+            out[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            out[name] = "not installed as a package"
+    return out
+
+
+def _write_json(content: Any, path: Path) -> None:
+    path.write_text(json.dumps(_plain(content), indent=1, ensure_ascii=False, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def _plain(value: Any) -> Any:
+    """JSON knows no nan and no numpy."""
+    if isinstance(value, Mapping):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float) and not np.isfinite(value):
+        return None
+    return value
