@@ -12,6 +12,7 @@ from scipy.special import gammaincinv
 from geometry.arrays import Array, Bools, Ints
 from geometry.pose import Pose
 from lab.results import (
+    ABSENT,
     POSE_STATUSES,
     SPOT_STATUSES,
     PoseTrack,
@@ -122,6 +123,7 @@ def _spot_scores(spots: SpotGrid, true_uv: Array, in_view: Ints) -> dict[str, An
     error = spots.uv_px - true_uv
     early = spots.predicted_px - true_uv
     bent = _bends(spots.frames, true_uv)
+    starting = _starting(spots)
     close = np.linalg.norm(error, axis=-1) <= SAME_SPOT_PX
 
     per_spot = []
@@ -148,14 +150,16 @@ def _spot_scores(spots: SpotGrid, true_uv: Array, in_view: Ints) -> dict[str, An
         "in_view_rows": int(visible.sum()),
         "wrong_labels": int(wrong.sum()),
         "wrong_label_share": _share(wrong, measured & told),
-        # Step 2 of the paper's matching marks a bend; the paper leaves such frames out of its figure, and so does
-        # `straight`. `bends` goes by the true path instead, whatever the tracker called it.
+        # `straight` leaves out the rows that step 2 found, as the paper does; `smooth` goes by the true path instead,
+        # whatever the tracker called it. Both leave out a track's first frames, in which nothing can know its speed;
+        # `all_measured` leaves out nothing.
         "prediction_px": {
-            "straight": _spread(early[visible & spots.has(SpotStatus.MATCHED)]),
+            "smooth": _spread(early[visible & measured & ~bent & ~starting]),
+            "straight": _spread(early[visible & spots.has(SpotStatus.MATCHED) & ~starting]),
             "turned": _spread(early[visible & spots.has(SpotStatus.TURNED)]),
-            "all_measured": _spread(early[visible & measured]),
             "bends": _spread(early[visible & bent]),
-            "smooth": _spread(early[visible & measured & ~bent]),
+            "start": _spread(early[visible & starting]),
+            "all_measured": _spread(early[visible & measured]),
         },
         "measured_px": _spread(error[found]),
         "out_of_view_px": _spread(error[outside_said & (in_view == OUTSIDE)]),
@@ -187,6 +191,14 @@ def _bends(frames: Ints, true_uv: Array) -> Bools:
         consecutive = (np.diff(frames)[1:] == 1) & (np.diff(frames)[:-1] == 1)
         out[2:] = consecutive[:, None] & (np.linalg.norm(step, axis=-1) > BEND_PX)
     return out
+
+
+def _starting(spots: SpotGrid) -> Bools:
+    """(F, V): fewer than two frames lie between this one and the start of the view's track."""
+    known = (spots.status != ABSENT) & ~spots.has(SpotStatus.LOST)
+    out = np.ones(known.shape, dtype=bool)
+    out[2:] = ~(known[1:-1] & known[:-2])
+    return out & known
 
 
 def _returns(in_view: Ints, after: int, measured: Bools, right: Bools, pictured: Bools) -> dict[str, Any]:

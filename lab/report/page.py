@@ -48,6 +48,7 @@ def write_report(results: Path, run_folder: Path | None = None) -> Path:
 def page(m: Material, results: Path) -> str:
     """The HTML text of a report."""
     found = events(m)
+    listed = _event_rows(m, found)
     heads, rows = tables.spot_rows(m)
     context: dict[str, Any] = {
         "name": m.name,
@@ -71,8 +72,8 @@ def page(m: Material, results: Path) -> str:
         "spot_heads": heads,
         "spot_rows": rows,
         "pictures": [Markup(p) for p in pictures(m, results, chosen(m, found))],
-        "events": _event_rows(m, found)[:_MOST_EVENTS],
-        "n_events": len(found),
+        "events": listed[:_MOST_EVENTS],
+        "more_events": max(len(listed) - _MOST_EVENTS, 0),
         "no_image": tables.no_image_ranges(m),
         "notes": [str(n) for n in _listed(m.summary.get("notes"))],
         "run_notes": "" if m.run is None else m.run.notes,
@@ -108,17 +109,13 @@ def _run_line(m: Material) -> str:
 
 
 def _event_rows(m: Material, found: list[Event]) -> list[tuple[str, str, str, str]]:
-    """Frame, time, camera and what happened: what the run itself noted, and what its tables show."""
-    rows: list[tuple[int, str, str]] = []
-    for noted in _listed(m.summary.get("events")):
-        if isinstance(noted, dict) and isinstance(noted.get("frame"), int):
-            spot = f"spot {noted['spot']}: " if noted.get("spot") else ""
-            words = str(noted.get("text") or noted.get("kind") or "")
-            rows.append((noted["frame"], str(noted.get("camera") or ""), spot + words))
-    if not rows:
-        rows = [(int(m.spots.frames[e.index]), e.camera, e.text) for e in found if e.kind != "hidden"]
-    times = dict(zip(m.spots.frames.tolist(), m.t_s.tolist(), strict=True)) if m.time_name != "frame" else {}
-    return [(str(f), f"{times[f]:.3f}" if f in times else "", c, w) for f, c, w in sorted(rows)]
+    """Frame, time, camera and what happened. Hidden spots are in the status figure; they would bury the rest here."""
+    clock = m.time_name != "frame"
+    return [
+        (str(m.spots.frames[e.index]), f"{m.t_s[e.index]:.3f}" if clock else "", e.camera, e.text)
+        for e in found
+        if e.kind != "hidden"
+    ]
 
 
 def _missing(m: Material) -> list[str]:

@@ -99,7 +99,7 @@ def truth_figures(e: dict[str, Any] | None) -> list[Key]:
         keys += [
             Key("right in view", percent(at(e, "spots", "in_view_identity")), "of visible spots"),
             Key("wrong labels", _count(at(e, "spots", "wrong_labels")), "measured rows"),
-            Key("prediction error", pixels(at(e, "spots", "prediction_px", "straight", "rms")), "RMS, bends apart"),
+            Key("prediction error", pixels(at(e, "spots", "prediction_px", "smooth", "rms")), "RMS, true bends apart"),
             Key(
                 "out-of-view error",
                 pixels(at(outside, "rms")),
@@ -153,9 +153,11 @@ def spot_rows(m: Material) -> tuple[list[str], list[list[str]]]:
 def pixel_rows(errors: dict[str, Any] | None) -> list[tuple[str, ...]]:
     """Errors in the picture: what, rows, RMS u, RMS v, 99th percentile and largest distance (px), meaning."""
     kinds = (
-        ("prediction", ("prediction_px", "straight"), "one frame ahead, before the picture was looked at; turns apart"),
+        ("prediction", ("prediction_px", "smooth"), "one frame ahead; starts and true bends apart"),
+        ("prediction, matched", ("prediction_px", "straight"), "rows that the first search found; starts apart"),
         ("prediction at turns", ("prediction_px", "turned"), "rows that the second search found"),
         ("prediction at true bends", ("prediction_px", "bends"), "where the true path bends by more than 2 px"),
+        ("prediction at the start", ("prediction_px", "start"), "the first two frames of a track: no speed is known"),
         ("measured place", ("measured_px",), "of the spots that were found right"),
         ("out of view", ("out_of_view_px",), "solved from the other beams"),
         ("occluded", ("occluded_px",), "the estimate while no detection was accepted"),

@@ -14,7 +14,7 @@ import pytest
 from lab.report import svg, tables, write_report
 from lab.report.index import write_index
 from lab.report.material import gather
-from lab.report.pictures import MOST_PICTURES, chosen, events
+from lab.report.pictures import MOST_PICTURES, _arrow, _limits, _stretched, chosen, events
 from lab.report.verdict import verdict_of
 from tests.lab.fake_results import Fake, make
 from tracking.statuses import PoseStatus, SpotStatus
@@ -183,9 +183,29 @@ def test_at_most_eight_pictures_with_every_kind_of_event_among_them(fake):
     assert {e.kind for e in found} <= {e.kind for e in selection}
 
 
-def test_a_spot_far_outside_is_named_with_its_distance_and_an_arrow_at_the_border():
-    from lab.report.pictures import _arrow
+def test_what_the_run_itself_noted_is_listed_and_pictured(fake, tmp_path):
+    shutil.copytree(fake.results, tmp_path / "results")
+    path = tmp_path / "results" / "summary.json"
+    noted = {"frame": 33, "kind": "tie", "camera": None, "spot": None, "text": "two labels fit <equally>"}
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"events": [noted, {"frame": 10**9}, "odd"]}))
+    assert "<td>33</td><td>0.330</td><td>left</td><td>two labels fit &lt;equally&gt;</td>" in write_report(
+        tmp_path / "results"
+    ).read_text(encoding="utf-8")
+    material = gather(tmp_path / "results", fake.run_folder)
+    assert "tie" in {e.kind for e in chosen(material, events(material))}
 
+
+def test_a_faint_spot_on_a_dark_picture_is_shown_bright_and_a_dark_picture_stays_dark():
+    rng = np.random.default_rng(1)
+    dark = 8 + rng.normal(scale=1, size=(512, 640))
+    faint = dark.copy()
+    faint[250:256, 300:306] += 30
+    faint[10, 10] = 255.0  # a hot pixel
+    assert _stretched(faint, *_limits(faint))[253, 303] > 200
+    assert np.median(_stretched(dark, *_limits(dark))) < 128
+
+
+def test_a_spot_far_outside_is_named_with_its_distance_and_an_arrow_at_the_border():
     x, y, d = _arrow(np.array([1500.0, 300.0]), (1280, 1024), 2.0)
     tip = [float(v) for v in d[1:].split("L")[0].split()]
     assert tip == pytest.approx([1275, 300])  # two units inside the border

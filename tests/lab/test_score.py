@@ -164,6 +164,32 @@ def test_turned_frames_do_not_enter_the_straight_prediction_error_but_stay_in_th
     assert s["all_measured"]["max"] == s["turned"]["max"]
 
 
+def test_bends_of_the_true_path_are_set_apart_whatever_the_tracker_called_them(eventful, tmp_path):
+    def change(row: dict[str, str]) -> dict[str, str]:
+        row["status"] = "matched" if row["status"] == "turned" else row["status"]
+        return row
+
+    s = score(rewritten(eventful, tmp_path / "results", change), eventful.run_folder)["spots"]["prediction_px"]
+    assert s["turned"] is None
+    assert s["straight"]["max"] > 8
+    assert s["smooth"]["max"] < 2
+    assert s["bends"]["rms"] == pytest.approx(8 * np.sqrt(2), rel=0.05)
+
+
+def test_the_first_two_frames_of_a_track_are_set_apart_and_not_lost(quiet, tmp_path):
+    def change(row: dict[str, str]) -> dict[str, str]:
+        if row["frame"] in ("0", "1"):  # no speed is known yet: the prediction is far behind
+            row["predicted_u_px"] = str(float(row["predicted_u_px"]) + 50.0)
+        return row
+
+    s = score(rewritten(quiet, tmp_path / "results", change), quiet.run_folder)["spots"]["prediction_px"]
+    assert s["start"]["rows"] == 12
+    assert s["start"]["rms_u"] == pytest.approx(50, abs=1)
+    assert s["smooth"]["max"] < 2
+    assert s["straight"]["max"] < 2
+    assert s["all_measured"]["max"] > 49
+
+
 def test_the_out_of_view_error_is_that_put_in_and_takes_only_what_truly_is_outside(eventful):
     s = score(eventful.results, eventful.run_folder)["spots"]
     block = s["out_of_view_px"]
