@@ -111,9 +111,9 @@ _StrictLoader.add_constructor("tag:yaml.org,2002:float", _construct_float)
 
 
 def read_text(path: Path) -> str:
-    """The text of a file, UTF-8 with or without a byte order mark. Raises InputError in one line."""
+    """The text of a UTF-8 file. Raises InputError in one line."""
     try:
-        return path.read_bytes().decode("utf-8-sig")
+        return path.read_bytes().decode("utf-8")
     except UnicodeDecodeError as error:
         raise InputError(
             f"{path}: expected UTF-8 text, got a byte that is none at position {error.start}; save it as UTF-8"

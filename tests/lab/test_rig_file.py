@@ -151,6 +151,14 @@ def test_a_file_that_cannot_be_finished_leaves_the_old_one(tmp_path, monkeypatch
     assert [p.name for p in tmp_path.iterdir()] == ["rig.yaml"]
 
 
+def test_a_rig_that_could_not_be_loaded_is_not_saved(tmp_path):
+    rig = load_rig(written(tmp_path, RIG))
+    nowhere = Screen("left", Pose(np.eye(3), np.array([np.nan, 0, 0])))
+    with pytest.raises(InputError, match=r"screens\.left\.world_from_screen\.translation_m: expected a finite number"):
+        save_rig(Rig({**rig.screens, "left": nowhere}, rig.cameras, rig.beams, rig.spots), tmp_path / "rig.yaml")
+    assert (tmp_path / "rig.yaml").read_text() == RIG
+
+
 @pytest.mark.parametrize(
     ("old", "new"),
     [
