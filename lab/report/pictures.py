@@ -286,7 +286,15 @@ def _overlay(
         if not enlarged:
             x = min(max(x, 4 * unit), w - (8 * len(name) + 4) * unit)
             y = min(max(y, 14 * unit), h - 5 * unit)
-            while any(abs(x - tx) < 8 * len(name) * unit and abs(y - ty) < 14 * unit for tx, ty in taken):
+            wide = 8 * len(name) * unit
+            crossed = [c for i in views if i != j and np.isfinite(c := m.spots.uv_px[k, i]).all()]
+            for _ in range(2 * len(views)):
+                over_name = any(abs(x - tx) < wide and abs(y - ty) < 14 * unit for tx, ty in taken)
+                over_ring = any(
+                    x - ring < u < x + wide + ring and y - 12 * unit - ring < v < y + ring for u, v in crossed
+                )
+                if not (over_name or over_ring):
+                    break
                 y = y + 14 * unit if y < h / 2 else y - 14 * unit
             taken.append((x, y))
             out.append(svg.text(x, y, name, "halo", f"fill:#fff;font-size:{13 * unit:.1f}px"))

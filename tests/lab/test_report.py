@@ -133,8 +133,9 @@ def test_a_report_is_made_of_poor_results_too(tmp_path, kind, words):
 def test_a_report_is_made_from_the_tables_alone_and_says_what_is_missing(tmp_path):
     fake = make(tmp_path, 50)
     shutil.rmtree(fake.run_folder)
-    html = write_report(fake.results).read_text(encoding="utf-8")
-    assert "The run folder could not be reached" in html
+    for told in (None, fake.run_folder):
+        html = write_report(fake.results, told).read_text(encoding="utf-8")
+        assert "The run folder could not be reached" in html
     (fake.results / "summary.json").unlink()
     html = write_report(fake.results).read_text(encoding="utf-8")
     assert "NO VERDICT" in html
@@ -160,7 +161,8 @@ def test_the_verdict_is_that_of_the_summary_with_all_its_reasons(tmp_path, statu
 
 @pytest.mark.parametrize("summary", [{}, {"verdict": None}, {"verdict": "good"}, {"verdict": {"status": "splendid"}}])
 def test_a_verdict_that_is_not_there_is_not_made_up(summary):
-    assert verdict_of(summary).word == "NO VERDICT"
+    verdict = verdict_of(summary)
+    assert (verdict.word, verdict.status) == ("NO VERDICT", "unknown")
 
 
 def test_pictures_show_the_spot_where_it_was_measured(filmed):

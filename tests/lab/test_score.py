@@ -14,7 +14,7 @@ import pytest
 from geometry.pose import Pose
 from lab.errors import InputError
 from lab.results import ABSENT, SPOT_STATUSES, SpotGrid, read_poses, read_spots
-from lab.score import Truth, _returns, read_truth, right_spot, score, score_against
+from lab.score import Truth, _returns, normalised_squares, read_truth, right_spot, score, score_against
 from tests.lab.fake_results import NOISE_PX, Fake, make
 from tracking.statuses import PoseStatus, SpotStatus
 
@@ -72,6 +72,19 @@ def test_half_the_stated_covariance_doubles_the_nees(quiet):
         "nees_mean"
     ]
     assert twice == pytest.approx(2 * once, rel=1e-9)
+
+
+def test_nees_weighs_an_error_by_the_whole_covariance_with_its_correlations():
+    rng = np.random.default_rng(3)
+    A = rng.normal(size=(50, 6, 6)) * np.array([1e-3, 1e-3, 1e-3, 1e-5, 1e-5, 1e-5])[:, None]  # metres beside radians
+    C, delta = A @ np.swapaxes(A, 1, 2), rng.normal(size=(50, 6)) * 1e-4
+    plain = np.einsum("ni,nij,nj->n", delta, np.linalg.inv(C), delta)
+    np.testing.assert_allclose(normalised_squares(delta, C), plain, rtol=1e-6)
+
+
+def test_a_covariance_that_cannot_be_inverted_gives_no_nees():
+    C = np.stack([np.zeros((6, 6)), np.ones((6, 6)), np.full((6, 6), np.nan)])
+    assert np.isnan(normalised_squares(np.ones((3, 6)), C)).all()
 
 
 def test_a_pose_off_by_a_known_turn_and_shift_is_reported_in_body_and_world_axes(quiet):
