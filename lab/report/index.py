@@ -21,15 +21,16 @@ _LINK = ("report", "results")
 def write_index(rows: list[dict[str, Any]], out: Path) -> Path:
     """Write index.html into the batch's folder `out`; returns its path.
 
-    rows: those of batch.csv, a mapping per run. Known keys: `name` (or `run`), `verdict` (or `status`: pass, check,
+    rows: those of batch.csv, a mapping per run. Known keys: `name`, `run` (its folder), `verdict` (or `status`: pass, check,
     fail, error), `report` or `results` (a path relative to `out`; otherwise the folder of the run's name); every other
     key is a column.
     """
-    known = {*_FIRST[:1], *_VERDICT, *_LINK}
+    known = {*_FIRST, *_VERDICT, *_LINK}
     heads = list(dict.fromkeys(key for row in rows for key in row if key not in known))
     lines = [
         {
             "name": _first(row, _FIRST) or "unnamed",
+            "folder": _first(row, _FIRST[1:]),
             "href": _href(row, out),
             "status": (status := _status(row)),
             "word": WORDS[status][0] if status in WORDS else status.upper(),
