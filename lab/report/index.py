@@ -21,9 +21,9 @@ _LINK = ("report", "results")
 def write_index(rows: list[dict[str, Any]], out: Path) -> Path:
     """Write index.html into the batch's folder `out`; returns its path.
 
-    rows: those of batch.csv, a mapping per run. Known keys: `name`, `run` (its folder), `verdict` (or `status`: pass, check,
-    fail, error), `report` or `results` (a path relative to `out`; otherwise the folder of the run's name); every other
-    key is a column.
+    rows: those of batch.csv, a mapping per run. Known keys: `name`, `run` (its folder), `verdict` (or `status`): pass,
+    check, fail or error, `report` or `results` (a path relative to `out`; without it, the folder of the run's name).
+    Every other key is a column.
     """
     known = {*_FIRST, *_VERDICT, *_LINK}
     heads = list(dict.fromkeys(key for row in rows for key in row if key not in known))
