@@ -58,8 +58,8 @@ class Table:
 def read_table(path: Path, numbers: Iterable[str], texts: Iterable[str] = ()) -> Table:
     """The named columns of a CSV file.
 
-    Other columns are ignored. The csv module, not pandas: at the length of a usual run it is done before pandas is
-    imported (0.4 s), and a run of 100,000 frames takes 1.5 s instead of 1.
+    Other columns are ignored. The csv module, not pandas: spots.csv of 600 frames takes 14 ms against 5, but importing
+    pandas takes 400. (Of 100,000 frames: 4.6 s against 0.3, beside the many minutes that such a run takes.)
     """
     numbers, texts = tuple(numbers), tuple(texts)
     pieces: dict[str, list[Array]] = {n: [] for n in numbers}
