@@ -42,9 +42,7 @@ def quadratic_coefficients(O: Array, A: Array, B: Array, beta: float) -> tuple[A
     return m1 - m * m, m2 - 2 * m * l, m3 - l * l
 
 
-def outer_spot(
-    O: Array, A: Array, B: Array, alpha: float, beta: float, tolerance: float = ANGLE_TOLERANCE
-) -> Array:
+def outer_spot(O: Array, A: Array, B: Array, alpha: float, beta: float, tolerance: float = ANGLE_TOLERANCE) -> Array:
     """C (..., 3), m: the spot beyond B, of a beam at the angle `beta` (rad) from B's; nan where that beam misses the plane.
 
     O, A, B (..., 3), m, in world; alpha, the angle AOB by calibration, and beta are in (0, pi/2). Of the two roots the one with k > 0 and

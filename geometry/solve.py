@@ -7,6 +7,8 @@ model of geometry/spots.py and its analytic Jacobian.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
+from itertools import combinations
 
 import numpy as np
 from scipy.stats import chi2 as chi2_distribution
@@ -29,7 +31,7 @@ class SolveLimits:
     max_sigma_m: float = 0.25  # m: a larger sigma of any direction is no measurement ...
     max_sigma_rad: float = np.deg2rad(5.0)  # ... nor is this: beyond it first-order covariances mean little
     p_false_alarm: float = 1e-5  # of the chi-square test that a right set of spots must pass
-    min_outlier_px: float = 0.5  # a spot is wrong only if it also lies this far off: small misfits are model error
+    min_outlier_px: float = 0.1  # a spot is left out only if it also lies this far off: smaller misfits are model error
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +53,13 @@ class PoseFit:
 
     def consistent(self, p_false_alarm: float) -> bool:
         """Whether the misfit is what the spots' covariances allow."""
-        return self.dof <= 0 or self.chi2 <= chi2_distribution.isf(p_false_alarm, self.dof)
+        return self.dof <= 0 or self.chi2 <= largest_chi2(p_false_alarm, self.dof)
+
+
+@cache
+def largest_chi2(p_false_alarm: float, dof: int) -> float:
+    """The chi-square that a right fit exceeds with this probability. Kept: scipy takes 0.1 ms for each."""
+    return float(chi2_distribution.isf(p_false_alarm, dof))
 
 
 def whiten(covariances: Array) -> Array:
@@ -162,50 +170,70 @@ def fit_pose_robust(
     limits: SolveLimits | None = None,
     noise_scale: float = 1.0,
 ) -> PoseFit | None:
-    """As `fit_pose`, but one spot may be wrong; it is then left out (it is missing from the result's rows).
+    """As `fit_pose`, but one or two spots may be wrong; they are then left out (missing from the result's rows).
 
-    Where the chi-square test fails, each spot is left out in turn. A set of four or more spots is chosen by its own misfit;
-    three spots fit any labels, so there `expected`, a pose and its covariance (6, 6), must decide, and without it
-    nothing is returned. noise_scale: how much larger than claimed the misfit is known to be (model error): the test
-    is widened by it. None where no consistent set exists.
+    Where the chi-square test fails, each spot is left out in turn, and where that does not help and six are there, each
+    pair. A set of four or more is chosen by its own misfit; three spots fit any labels, so there `expected`, a pose and
+    its covariance (6, 6), must decide, and without it nothing is returned. noise_scale: how much larger than claimed
+    the misfit is known to be (model error): the test is widened by it. None where no consistent set exists, or two
+    sets are about equally good.
     """
     limits = SolveLimits() if limits is None else limits
     fit = fit_pose(model, rows, pixels, covariances, start)
     if fit is not None and _acceptable(fit, limits, noise_scale):
         return fit
-    if len(rows) < 4:
+    for left_out in (1, 2):
+        if len(rows) - left_out < (3 if left_out == 1 else 4):
+            return None
+        best: PoseFit | None = None
+        best_score, runner_up = np.inf, np.inf
+        for leave in combinations(range(len(rows)), left_out):
+            found = _without(model, rows, pixels, covariances, start, list(leave), limits, noise_scale, expected)
+            if found is None:
+                continue
+            if found[1] < best_score:
+                best, best_score, runner_up = found[0], found[1], best_score
+            else:
+                runner_up = min(runner_up, found[1])
+        if best is not None:
+            # 3 nats: below that it is a guess which spot is wrong.
+            return best if runner_up - best_score >= 6.0 else None
+    return None
+
+
+def _without(
+    model: SpotModel,
+    rows: Ints,
+    pixels: Array,
+    covariances: Array,
+    start: Pose,
+    leave: list[int],
+    limits: SolveLimits,
+    noise_scale: float,
+    expected: tuple[Pose, Array] | None,
+) -> tuple[PoseFit, float] | None:
+    """The fit without some spots and its score (the less the better), if it is consistent and they lie off it."""
+    keep = np.ones(len(rows), dtype=bool)
+    keep[leave] = False
+    fit = fit_pose(model, rows[keep], pixels[keep], covariances[keep], start)
+    if fit is None or not fit.observable or not _acceptable(fit, limits, noise_scale):
         return None
-    best: PoseFit | None = None
-    best_score, runner_up = np.inf, np.inf
-    for leave in range(len(rows)):
-        keep = np.arange(len(rows)) != leave
-        trial = fit_pose(model, rows[keep], pixels[keep], covariances[keep], start)
-        if trial is None or not trial.observable or not _acceptable(trial, limits, noise_scale):
-            continue
-        left_at = model.project(trial.world_from_body)[0][rows[leave]]
-        if np.linalg.norm(left_at - pixels[leave]) < limits.min_outlier_px:
-            continue
-        score = trial.chi2 / noise_scale**2
-        if expected is not None:
-            gap = trial.world_from_body.minus(expected[0])
-            distance = float(gap @ np.linalg.solve(expected[1] + trial.covariance, gap))
-            if trial.dof <= 0 and distance > EXPECTED_GATE:
-                continue  # three spots fit any labels: at a bend, where the motion is no witness, nothing is chosen
-            score += distance
-        elif trial.dof <= 0:
-            continue
-        if score < best_score:
-            best, best_score, runner_up = trial, score, best_score
-        else:
-            runner_up = min(runner_up, score)
-    if best is None or runner_up - best_score < 6.0:  # 3 nats: below that it is a guess which spot is wrong
+    left_at = model.project(fit.world_from_body)[0][rows[leave]]
+    if np.any(np.linalg.norm(left_at - pixels[leave], axis=-1) < limits.min_outlier_px):
         return None
-    return best
+    score = fit.chi2 / noise_scale**2
+    if expected is None:
+        return (fit, score) if fit.dof > 0 else None
+    gap = fit.world_from_body.minus(expected[0])
+    distance = float(gap @ np.linalg.solve(expected[1] + fit.covariance, gap))
+    if (fit.dof <= 0 or len(leave) > 1) and distance > EXPECTED_GATE:
+        return None  # three spots fit any labels, four of six many: at a bend the motion is no witness, nothing is chosen
+    return fit, score + distance
 
 
 def _acceptable(fit: PoseFit, limits: SolveLimits, noise_scale: float) -> bool:
     """Passes the chi-square test, or misfits by less than anyone calls an outlier."""
-    if fit.dof <= 0 or fit.chi2 <= noise_scale**2 * chi2_distribution.isf(limits.p_false_alarm, fit.dof):
+    if fit.dof <= 0 or fit.chi2 <= noise_scale**2 * largest_chi2(limits.p_false_alarm, fit.dof):
         return True
     return bool(np.all(np.linalg.norm(fit.residuals_px, axis=-1) < 0.5 * limits.min_outlier_px))
 

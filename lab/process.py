@@ -86,9 +86,15 @@ class _Tally:
         for event in record.tracked.events:
             self.event_kinds[event.kind] += 1
             if len(self.events) < MOST_EVENTS:
-                camera, spot = (None, None) if event.view is None else self.views[event.view].split("/", 1)
+                camera, spot = ("", "") if event.view is None else self.views[event.view].split("/", 1)
                 self.events.append(
-                    {"frame": record.frame, "kind": event.kind, "camera": camera, "spot": spot, "text": event.text}
+                    {
+                        "frame": record.frame,
+                        "kind": event.kind,
+                        "camera": camera or None,
+                        "spot": spot or None,
+                        "text": event.text,
+                    }
                 )
 
     def _missed(self, camera: str, frame: int, reason: str) -> None:

@@ -171,7 +171,7 @@ def _from_whole_beams(scene: _Scene, prior: PosePrior) -> Iterator[Pose]:
         # ray_j = -ray_i: the two ends of one beam; i < j, as the other order is the same line
         if i > j or model.beam_of[i] != model.beam_of[j] or model.ray[i] @ model.ray[j] > 0:
             continue
-        a, b = (m.ravel() for m in np.meshgrid(scene.points_of(i), scene.points_of(j), indexing="ij"))
+        a, b = (m.ravel() for m in np.meshgrid(scene.points_of(int(i)), scene.points_of(int(j)), indexing="ij"))
         if not len(a):
             continue
         start, direction = scene.world[a], normalised(scene.world[b] - scene.world[a])

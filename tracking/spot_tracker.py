@@ -7,6 +7,7 @@ matching missed are looked for where the pose puts them (`rigid_check`).
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -27,12 +28,14 @@ from tracking.pose_filter import Motion
 from tracking.statuses import PoseStatus, SpotStatus
 
 RIGID_GATE = 20.0  # squared sigmas: a detection this near to where the pose puts a spot is that spot (p = 5e-5)
-TRUSTED_NIS = 25.0  # squared sigmas: a spot beyond this says nothing about a pose that is only predicted
+BENT_NIS = 25.0  # squared sigmas: an estimate outside the picture this far from its track means a bend
+CLUTTER_NEAR_SPOTS = 2e-4  # 1/px^2: the paper's 20 % of false points within 15 px of a spot
 SCALE_MEMORY = 100  # frames: memory of the misfit that scales claimed covariances ...
 SCALE_DEADBAND = 1.3  # ... once it exceeds this: with honest sigmas it scatters by 0.06 about 1
 SIGMA_A_RANGE = (50.0, 2e6)  # px/s^2
 SIGMA_A_RATE = 0.03  # share by which one innovation may move the learnt acceleration
 DARK_FACTOR = 3.0  # accelerations while nothing is seen: a reversal in the dark leaves no trace
+RATE_KNOWN = 1.0  # m/s, rad/s: the sigma of the vehicle's rates under which they predict anything
 LOST_SIGMA_M, LOST_SIGMA_RAD = 1.0, np.deg2rad(60.0)  # a predicted pose vaguer than this is `lost`
 
 
@@ -40,7 +43,7 @@ LOST_SIGMA_M, LOST_SIGMA_RAD = 1.0, np.deg2rad(60.0)  # a predicted pose vaguer 
 class Event:
     """Something that the report should tell: labels found, a tie, a re-acquisition, a spot dropped."""
 
-    kind: str  # labelled | tie | reacquired | dropped | lost
+    kind: str  # labelled | tie | relabelled (matching failed at a bend) | reacquired (after frames without) | dropped
     text: str
     view: int | None = None
 
@@ -70,8 +73,9 @@ class _Tracks:
     x: Array  # (n, 4)
     P: Array  # (n, 4, 4)
     alive: Bools  # (n,)
+    rate_known: Bools  # (n,) a velocity stands behind the prediction: without one there is none to publish
     last: Array  # (n, 2) position at the frame before
-    last_R: Array  # (n, 2, 2) its covariance
+    last_cov: Array  # (n, 2, 2) its covariance
     last_age_s: Array  # (n,) how long ago that was
     unseen_s: Array  # (n,) time since a detection or a measured pose stood behind it
     sigma_a: Array  # (n,) px/s^2
@@ -92,6 +96,7 @@ class SpotTracker:
             np.zeros((n, 4)),
             np.tile(np.eye(4), (n, 1, 1)),
             np.zeros(n, dtype=bool),
+            np.zeros(n, dtype=bool),
             np.full((n, 2), np.nan),
             np.tile(np.eye(2), (n, 1, 1)),
             np.zeros(n),
@@ -100,6 +105,7 @@ class SpotTracker:
         )
         self.limits = SolveLimits(parameters.max_sigma_m, np.deg2rad(parameters.max_sigma_deg))
         self._misfit = 1.0  # running mean of chi2 / dof
+        self._recent: deque[float] = deque(maxlen=9)  # the last ones
         self._accelerations = np.array([parameters.pose_sigma_a_m_s2, parameters.pose_sigma_a_rad_s2])
         self._anchor: tuple[Pose, float] | None = None  # last measured pose and its age, s
         self._labelled = False
@@ -115,7 +121,8 @@ class SpotTracker:
         """One frame. dt_s: time since the frame before (0 for the first); found: per camera, None without a picture."""
         self._predict(dt_s)
         events: list[Event] = []
-        predicted = np.where(self.tracks.alive[:, None], self.tracks.x[:, :2], np.nan)
+        known = self.tracks.alive & self.tracks.rate_known
+        predicted = np.where(known[:, None], self.tracks.x[:, :2], np.nan)
         n = len(self.model)
         point, gain = np.full(n, UNMATCHED), np.full(n, np.nan)
         turned = np.zeros(n, dtype=bool)
@@ -128,7 +135,9 @@ class SpotTracker:
             point, turned, gain = self._match(found)
             fit, point, turned = self._pose(found, point, turned, events)
             if fit is None and self._should_search(found, point):
-                again, points = self._acquire(found, self._wide_prior(), events, "reacquired")
+                recent = self._anchor is not None and self._anchor[1] <= 1.5 * dt_s
+                kind = "relabelled" if recent else "reacquired"
+                again, points = self._acquire(found, self._wide_prior(), events, kind)
                 if again is not None:
                     fit, point = again, points
                     turned = self._far_from_prediction(found, point)
@@ -170,9 +179,7 @@ class SpotTracker:
             rows = np.flatnonzero(in_view & (model.camera_of == c))
             if points is None or not len(rows):
                 continue
-            m = match(
-                t.last[rows], t.x[rows, :2], r1[rows], r2[rows], points.uv_px, model.image_size_px[rows[0]], p
-            )
+            m = match(t.last[rows], t.x[rows, :2], r1[rows], r2[rows], points.uv_px, model.image_size_px[rows[0]], p)
             point[rows], turned[rows], gain[rows] = m.point, m.step == 2, m.gain
         return point, turned, gain
 
@@ -218,20 +225,24 @@ class SpotTracker:
             limits=self.limits,
             noise_scale=self.noise_scale,
         )
+        if fit is None:
+            fit = self._blended_fit(rows, uv, cov)
         if fit is None or not good_enough(fit, self.limits):
             return None, point, turned
         if len(rows) < 4 and not self._plausible(fit):
             return None, point, turned
         if not self.parameters.rigid_check:
             return fit, point, turned
-        dropped = np.setdiff1d(rows, fit.rows)
+        left_out = np.setdiff1d(rows, fit.rows)
+        away = np.linalg.norm(uv[left_out] - self.model.project(fit.world_from_body)[0][left_out], axis=-1)
+        # A neighbour that melts into a spot pulls its centre by a pixel or two: still this spot, but no witness.
+        dropped = left_out[~(away < self.parameters.blend_px)]
         point = point.copy()
         point[dropped] = UNMATCHED
-        for view in dropped:
-            events.append(Event("dropped", "contradicts the other spots: not this spot", int(view)))
+        events += [Event("dropped", "contradicts the other spots: not this spot", int(view)) for view in dropped]
         point, new = self._add_missed(found, point, fit)
         if new:
-            rows = np.flatnonzero(point != UNMATCHED)
+            rows = np.union1d(fit.rows, new)
             uv, cov = self._pixels(found, point)
             wider = fit_pose(self.model, rows, uv[rows], cov[rows], fit.world_from_body)
             if wider is not None and wider.consistent(self.limits.p_false_alarm):
@@ -241,6 +252,13 @@ class SpotTracker:
                 point[new] = UNMATCHED
         return fit, point, turned & (point != UNMATCHED)
 
+    def _blended_fit(self, rows: Ints, uv: Array, cov: Array) -> PoseFit | None:
+        """All spots, where none can be singled out but all lie near their places; the frame's own misfit widens it."""
+        fit = fit_pose(self.model, rows, uv[rows], cov[rows], self._start())
+        if fit is None or fit.dof <= 0 or np.linalg.norm(fit.residuals_px, axis=-1).max() > self.parameters.blend_px:
+            return None
+        return replace(fit, covariance=fit.covariance * max(1.0, fit.chi2 / fit.dof / self.noise_scale**2))
+
     def _plausible(self, fit: PoseFit) -> bool:
         """Whether three spots, which fit any labels, give a pose that the motion allows."""
         expected = self._expected()
@@ -249,9 +267,7 @@ class SpotTracker:
         gap = fit.world_from_body.minus(expected[0])
         return float(gap @ np.linalg.solve(expected[1] + fit.covariance, gap)) < EXPECTED_GATE
 
-    def _add_missed(
-        self, found: Sequence[Detections | None], point: Ints, fit: PoseFit
-    ) -> tuple[Ints, list[int]]:
+    def _add_missed(self, found: Sequence[Detections | None], point: Ints, fit: PoseFit) -> tuple[Ints, list[int]]:
         """Detections where the pose puts spots that have none yet."""
         uv, J = self.model.project(fit.world_from_body)
         reach = point_covariance(J, fit.covariance)
@@ -310,12 +326,18 @@ class SpotTracker:
         point = np.where(result.chosen.point_of == NO_POINT, UNMATCHED, result.chosen.point_of)
         rows = np.flatnonzero(point != UNMATCHED)
         uv, cov = self._pixels(found, point)
-        fit = fit_pose(self.model, rows, uv[rows], cov[rows], result.chosen.fit.world_from_body)
+        start = result.chosen.fit.world_from_body
+        fit = fit_pose_robust(
+            self.model, rows, uv[rows], cov[rows], start, limits=self.limits, noise_scale=self.noise_scale
+        )
+        if fit is None:
+            # The labels hold within the model's error, the claimed sigmas do not: this frame's own misfit widens it.
+            fit = fit_pose(self.model, rows, uv[rows], cov[rows], start)
+            if fit is not None and fit.dof > 0:
+                scale = max(1.0, fit.chi2 / fit.dof / self.noise_scale**2)
+                fit = replace(fit, covariance=fit.covariance * scale)
         if fit is None or not good_enough(fit, self.limits):
             return nothing
-        if fit.dof > 0 and not fit.consistent(self.limits.p_false_alarm):
-            # The labels hold within the model's error; the claimed sigmas do not: believe the misfit.
-            self._misfit = max(self._misfit, fit.chi2 / fit.dof)
         names = ", ".join(self.model.views[v][1] for v in rows)
         events.append(Event(kind, f"spots {names} found from the prior alone"))
         self._told_tie = False
@@ -359,6 +381,7 @@ class SpotTracker:
 
         uv, cov = self._pixels(found, point)
         seen = point != UNMATCHED
+        cov = self._with_blends(fit, uv, cov, seen)
         estimate, estimate_cov, exists = self._estimates(fit, uv, cov)
         self._update_tracks(uv, cov, seen, turned, estimate, estimate_cov, exists, measured_pose)
         t = self.tracks
@@ -370,7 +393,7 @@ class SpotTracker:
         uv = np.where(unknown[:, None], np.nan, uv)
         t.alive = t.alive & ~unknown
         t.last = np.where(t.alive[:, None], uv, np.nan)
-        t.last_R = np.where(t.alive[:, None, None], cov, np.eye(2))
+        t.last_cov = np.where(t.alive[:, None, None], cov, np.eye(2))
         t.last_age_s = np.zeros(n)
         pose_status, pose, covariance = self._pose_result(fit)
         return TrackedFrame(
@@ -383,7 +406,7 @@ class SpotTracker:
             pose_status=pose_status,
             pose=pose,
             pose_covariance=covariance,
-            spots_used=int(np.count_nonzero(seen)) if pose is not None else 0,
+            spots_used=len(fit.rows) if fit is not None else (int(np.count_nonzero(seen)) if pose is not None else 0),
             rms_px=fit.rms_px if fit is not None else float("nan"),
             events=tuple(events),
         )
@@ -392,7 +415,7 @@ class SpotTracker:
         """The pose filter takes a measured pose, learns its accelerations, and the misfit is remembered."""
         covariance = fit.covariance * self.noise_scale**2
         if fit.dof > 0:
-            self._misfit += (min(fit.chi2 / fit.dof, 100.0) - self._misfit) / SCALE_MEMORY
+            self._learn_misfit(fit.chi2 / fit.dof)
         if self.motion is None:
             self.motion = pose_filter.begin(fit.world_from_body, covariance)
             return
@@ -404,6 +427,15 @@ class SpotTracker:
         if nis.max() > 100.0:  # a bend or a return: the old velocities say nothing
             after = pose_filter.begin(fit.world_from_body, covariance)
         self.motion = after
+
+    def _learn_misfit(self, misfit: float) -> None:
+        """The slow mean; a blended spot now and then counts at most threefold, but when most fits misfit it jumps."""
+        self._recent.append(misfit)
+        usual = float(np.median(self._recent))
+        if len(self._recent) == self._recent.maxlen and usual > 3 * max(self._misfit, 1.0):
+            self._misfit = usual
+        self._misfit *= 1 + (min(misfit / self._misfit, 3.0) - 1) / SCALE_MEMORY
+        self._misfit = max(self._misfit, 0.1)
 
     def _update_motion_partly(self, found: Sequence[Detections | None], point: Ints) -> Ints:
         """Where the spots do not give the pose they still narrow its prediction; those beyond belief are let go."""
@@ -422,7 +454,10 @@ class SpotTracker:
             y = uv[rows] - projected[rows]
             S = point_covariance(J[rows], motion.covariance) + cov[rows] * self.noise_scale**2
             nis = np.sum(y * np.linalg.solve(S, y[..., None])[..., 0], axis=-1)
-            good = nis < TRUSTED_NIS
+            # With few spots a false point is as likely as a true one: it must be much more likely under the prediction.
+            logdet = np.log(np.linalg.det(2 * np.pi * S))
+            clutter = np.log(max(self.parameters.labels.clutter_per_px2, CLUTTER_NEAR_SPOTS))
+            good = -0.5 * nis - 0.5 * logdet - clutter > self.parameters.labels.lead_nats
             point = point.copy()
             point[rows[~good]] = UNMATCHED
             rows, y = rows[good], y[good]
@@ -433,6 +468,18 @@ class SpotTracker:
                 motion, _ = pose_filter.corrected(motion, y.ravel(), J[rows].reshape(-1, 6), R)
         self.motion = motion
         return point
+
+    def _with_blends(self, fit: PoseFit | None, uv: Array, cov: Array, seen: Bools) -> Array:
+        """Covariances, those of matched spots that the pose fit left out grown by how far they lie from it."""
+        if fit is None:
+            return cov
+        blended = np.setdiff1d(np.flatnonzero(seen), fit.rows)
+        if not len(blended):
+            return cov
+        gap2 = np.sum((uv[blended] - self.model.project(fit.world_from_body)[0][blended]) ** 2, axis=-1)
+        cov = cov.copy()
+        cov[blended] += gap2[:, None, None] * np.eye(2)
+        return cov
 
     def _estimates(self, fit: PoseFit | None, uv: Array, cov: Array) -> tuple[Array, Array, Bools]:
         """Positions (n, 2) and covariances of all views from the others, and whether they exist."""
@@ -479,17 +526,18 @@ class SpotTracker:
         new = use & ~t.alive
         old = np.flatnonzero(use & t.alive)
         if len(old):
+            t.rate_known[old] = True
             _, _, nis = kalman.innovation(t.x[old], t.P[old], z[old], R[old])
             bent = turned[old] & p.curve_switch
             # Outside the picture nobody matches in two steps; an estimate far off is the bend there.
-            bent |= ~seen[old] & (nis > TRUSTED_NIS) & p.curve_switch
+            bent |= ~seen[old] & (nis > BENT_NIS) & p.curve_switch
             bent &= ~np.isnan(t.last[old, 0]) & (t.last_age_s[old] > 0)
             go, restart = old[~bent], old[bent]
             if len(go):
                 t.x[go], t.P[go] = kalman.update(t.x[go], t.P[go], z[go], R[go])
             if len(restart):
                 t.x[restart], t.P[restart] = kalman.restart(
-                    z[restart], R[restart], t.last[restart], t.last_R[restart], t.last_age_s[restart]
+                    z[restart], R[restart], t.last[restart], t.last_cov[restart], t.last_age_s[restart]
                 )
             if p.learn_sigma_a:
                 learn = seen[old] & ~turned[old]
@@ -506,6 +554,7 @@ class SpotTracker:
             t.x[seed, :2] = np.where(use[seed, None], z[seed], estimate[seed])
             t.x[seed, 2:] = J[seed] @ motion.twist
             t.alive[seed] = True
+            t.rate_known[seed] = bool(np.sqrt(np.max(np.diagonal(motion.P)[6:])) < RATE_KNOWN)
         t.unseen_s[use] = 0.0
 
     def _statuses(
