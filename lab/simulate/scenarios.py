@@ -23,11 +23,13 @@ class Light:
     power_spread: float = 0.15  # relative 1-sigma spread of the lasers' powers
     background_dn: float = 6.0  # above black, at its mean
     gradient_dn: float = 6.0  # by how much the background differs between two opposite sides or corners
-    texture: float = 0.01  # relative 1-sigma unevenness of the screen's paint: it modulates background and spots
+    texture: float = 0.005  # relative 1-sigma unevenness of the screen's paint: it modulates background and spots
     hot_pixels: int = 12  # per camera, at the same places all along
     reflections: int = 2  # diffuse, 15 to 40 px wide, per camera, at the same places all along
     reflection_dn: float = 12.0
-    speckle_contrast: float = 0.03  # relative 1-sigma of a spot's speckle, new in every frame
+    # Relative 1-sigma of a spot's speckle, new in every frame. It moves a centroid by contrast * sqrt(A / 8 pi), A =
+    # 4 pi grain^2 its correlation area: 0.007 px here, as much as the photons of a bright spot do.
+    speckle_contrast: float = 0.01
     speckle_grain_px: float = 1.0  # sigma of the speckle's correlation
 
 
@@ -125,7 +127,7 @@ LIGHTS: MappingProxyType[str, Light] = MappingProxyType(
         # A dark room, a filter for the lasers' colour, a quiet sensor: nearly all pixels show the black level, so that
         # the files are small.
         "quiet": Light(
-            read_noise_e=6.0, black_dn=4.0, background_dn=0.0, gradient_dn=0.0, texture=0.01, reflections=1,
+            read_noise_e=6.0, black_dn=4.0, background_dn=0.0, gradient_dn=0.0, reflections=1,
             reflection_dn=6.0,
         ),
         # A 12-bit sensor in 16-bit files.

@@ -233,11 +233,13 @@ def _write_videos(
             def picture(k: int, sensor: Sensor = sensor) -> Picture:
                 return take(scene, sensor, powers, k, noisy=noisy)
 
-            for first in range(0, len(scene.frame), _BATCH):
-                for image in pool.map(picture, range(first, min(first + _BATCH, len(scene.frame)))):
-                    writer.write(image)
-                    done += 1
-                    if progress is not None:
-                        progress(done, len(sensors) * len(scene.frame))
-            writer.release()
+            try:
+                for first in range(0, len(scene.frame), _BATCH):
+                    for image in pool.map(picture, range(first, min(first + _BATCH, len(scene.frame)))):
+                        writer.write(image)
+                        done += 1
+                        if progress is not None:
+                            progress(done, len(sensors) * len(scene.frame))
+            finally:
+                writer.release()
     return {name: {"frames": f"{name}.avi"} for name in names}

@@ -1,0 +1,47 @@
+"""Makes the sample runs anew: `python sample_runs/make.py [NAME ...] --out FOLDER`.
+
+Each is one call of the simulator, as `beampose simulate` makes it. With the versions of numpy and OpenCV in
+requirements.lock the bytes are those of this folder.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from lab.simulate.write import simulate
+
+# Light "quiet" (a dark room and a quiet sensor) keeps the files small: most pixels show the black level. A picture of
+# the light "lab" is thirty times as large, so of that kind there are few, and at half the size.
+SAMPLES: dict[str, dict[str, Any]] = {
+    "huo2015": {"scenario": "huo2015", "seed": 19, "frames": 220, "light": "quiet"},
+    "sharp-turns": {"scenario": "sharp-turns", "seed": 1, "frames": 30, "picture_scale": 0.5},
+    "damaged": {"scenario": "damaged", "seed": 2, "frames": 80, "light": "quiet", "picture_scale": 0.5},
+    "turntable-video": {
+        "scenario": "turntable", "seed": 3, "frames": 240, "light": "quiet", "picture_scale": 0.5, "video": True,
+    },
+    "four-skew-beams": {"scenario": "four-skew-beams", "seed": 4, "frames": 300, "detections_only": True},
+}  # fmt: skip
+
+
+def make(name: str, folder: Path) -> Path:
+    """Write one sample run into a new folder."""
+    return simulate(out_folder=folder, **SAMPLES[name])
+
+
+def main() -> None:
+    """Make the samples that are named, or all."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(SAMPLES)}; all where none is given")
+    parser.add_argument("--out", type=Path, required=True, help="folder that gets a new folder for each sample")
+    arguments = parser.parse_args()
+    unknown = [name for name in arguments.names if name not in SAMPLES]
+    if unknown:
+        parser.error(f"expected one of {', '.join(SAMPLES)}, got {unknown[0]!r}")
+    for name in arguments.names or SAMPLES:
+        print(make(name, arguments.out / name))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,74 @@
+"""The sample runs are what their script makes and what their README says."""
+
+import importlib.util
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from lab.check import check
+from lab.simulate.scene import compose
+
+FOLDER = Path(__file__).resolve().parents[1] / "sample_runs"
+if not FOLDER.is_dir():
+    pytest.skip("a source distribution has no sample runs", allow_module_level=True)
+_SPEC = importlib.util.spec_from_file_location("sample_runs_make", FOLDER / "make.py")
+make = importlib.util.module_from_spec(_SPEC)
+_SPEC.loader.exec_module(make)
+
+README = (FOLDER / "README.md").read_text(encoding="utf-8")
+
+
+def test_every_sample_is_made_by_the_script_and_described():
+    runs = {p.parent.name for p in FOLDER.glob("*/run.yaml")}
+    assert runs == set(make.SAMPLES)
+    for name in runs:
+        assert f"| `{name}` |" in README
+
+
+@pytest.mark.parametrize("name", make.SAMPLES)
+def test_the_readme_shows_the_command_that_the_script_runs(name):
+    command = re.search(rf"beampose simulate (\S+) (.*)--out sample_runs/{name}$", README, re.MULTILINE)
+    words = command[2].replace("--video", "--video True").replace("--points", "--points True").split()
+    options = dict(zip(words[::2], words[1::2], strict=True))
+    sample = dict(make.SAMPLES[name])
+    assert command[1] == sample.pop("scenario")
+    called = {"picture_scale": "scale", "detections_only": "points"}
+    assert options == {f"--{called.get(key, key)}": str(value) for key, value in sample.items()}
+
+
+@pytest.mark.parametrize("name", make.SAMPLES)
+def test_every_sample_is_a_run_that_can_be_processed(name):
+    assert check(FOLDER / name).exit_status == 0
+
+
+def test_the_points_come_out_the_same_byte_for_byte(tmp_path):
+    made = make.make("four-skew-beams", tmp_path / "again")
+    for path in ("detections.csv", "rig.yaml", "run.yaml", "truth/pose.csv", "truth/spots.csv"):
+        assert (made / path).read_bytes() == (FOLDER / "four-skew-beams" / path).read_bytes()
+
+
+@pytest.mark.parametrize("name", ["huo2015", "sharp-turns", "damaged"])
+def test_the_pictures_come_out_the_same(name, tmp_path, monkeypatch):
+    monkeypatch.setitem(make.SAMPLES[name], "frames", 2)
+    made = make.make(name, tmp_path / "again")
+    for path in sorted((made / "frames").glob("*/*.png")):
+        again, kept = (cv2.imread(str(p), -1).astype(int) for p in (path, FOLDER / name / path.relative_to(made)))
+        # Another processor may round a few pixels the other way.
+        assert np.abs(again - kept).max() <= 1
+        assert (again != kept).mean() < 1e-4
+
+
+def test_the_papers_run_shows_what_its_readme_line_says():
+    sample = make.SAMPLES["huo2015"]
+    scene = compose(sample["scenario"], sample["seed"], sample["frames"])
+    spots = [spot for _, spot in scene.model.views]
+    line = next(line for line in README.splitlines() if line.startswith("| `huo2015`"))
+    exits = re.findall(r"[Ss]pot (\d).*?in frames (\d+) to (\d+)", line)
+    assert {spot for spot, _, _ in exits} == {"3", "6"}
+    for spot, first, last in exits:
+        out = np.flatnonzero(scene.in_view[:, spots.index(spot)] == 0)
+        assert (out[0], out[-1]) == (int(first), int(last))
+    assert list(np.flatnonzero(scene.turned)) == [int(n) for n in re.findall(r"(\d+) \((?:pitch|yaw)\)", line)]
