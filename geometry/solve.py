@@ -11,7 +11,7 @@ from functools import cache
 from itertools import combinations
 
 import numpy as np
-from scipy.stats import chi2 as chi2_distribution
+from scipy.special import chdtri
 
 from geometry.arrays import Array, Ints, symmetric
 from geometry.pose import Pose
@@ -45,6 +45,8 @@ class PoseFit:
     residuals_px: Array  # (m, 2) measured minus fitted
     chi2: float  # of the whitened residuals
     dof: int  # 2 m - 6
+    projected_px: Array  # (n, 2) all views of the model from this pose, as SpotModel.project gives them ...
+    jacobian: Array  # (n, 2, 6) ... so that nobody projects the same pose again
 
     @property
     def rms_px(self) -> float:
@@ -58,8 +60,8 @@ class PoseFit:
 
 @cache
 def largest_chi2(p_false_alarm: float, dof: int) -> float:
-    """The chi-square that a right fit exceeds with this probability. Kept: scipy takes 0.1 ms for each."""
-    return float(chi2_distribution.isf(p_false_alarm, dof))
+    """The chi-square that a right fit exceeds with this probability. Kept, as it is asked for in every frame."""
+    return float(chdtri(dof, p_false_alarm))
 
 
 def whiten(covariances: Array) -> Array:
@@ -98,7 +100,7 @@ def fit_pose(
     terms = _terms(model, rows, pixels, W, pose, prior)
     if terms is None:
         return None
-    H, g, cost, residuals = terms
+    H, g, cost, residuals, projected, J = terms
     for _ in range(max_iterations):
         scale = np.maximum(np.diagonal(H), 1e-12 * np.trace(H))
         # The smallest damping only steadies directions that no spot sees; elsewhere it is far below rounding.
@@ -113,21 +115,21 @@ def fit_pose(
             if damping > 1e8:
                 break
             continue
-        pose, (H, g, cost, residuals) = trial, trial_terms
+        pose, (H, g, cost, residuals, projected, J) = trial, trial_terms
         damping = damping / 10 if damping > 1e-6 else 0.0
-        if gain < 1e-12:  # in squared sigmas: the step was a millionth of what the noise resolves
+        if gain < 1e-6:  # in squared sigmas; the step was a thousandth, and what is left is about its square
             break
     else:
         return None
     covariance, observable = covariance_of(H)
     dof = 2 * len(rows) - 6 + (6 if prior is not None else 0)
-    return PoseFit(pose, covariance, observable, np.asarray(rows), residuals, cost, dof)
+    return PoseFit(pose, covariance, observable, np.asarray(rows), residuals, cost, dof, projected, J)
 
 
 def _terms(
     model: SpotModel, rows: Ints, pixels: Array, W: Array, pose: Pose, prior: tuple[Pose, Array] | None
-) -> tuple[Array, Array, float, Array] | None:
-    """Normal matrix (6, 6), right-hand side (6,), cost and residuals (m, 2) px at a pose; None without projection."""
+) -> tuple[Array, Array, float, Array, Array, Array] | None:
+    """Normal matrix (6, 6), right-hand side (6,), cost, residuals (m, 2) px, and the projection; None where it fails."""
     projected, J = model.project(pose)
     residuals = pixels - projected[rows]
     if np.isnan(residuals).any():
@@ -139,7 +141,7 @@ def _terms(
         # d(minus)/d(step) is the identity to first order in the distance, which is what a prior is good for.
         gap = prior[0].minus(pose)
         H, g, cost = H + prior[1], g + prior[1] @ gap, cost + float(gap @ prior[1] @ gap)
-    return H, g, cost, residuals
+    return H, g, cost, residuals, projected, J
 
 
 def covariance_of(H: Array) -> tuple[Array, bool]:
@@ -218,7 +220,7 @@ def _without(
     fit = fit_pose(model, rows[keep], pixels[keep], covariances[keep], start)
     if fit is None or not fit.observable or not _acceptable(fit, limits, noise_scale):
         return None
-    left_at = model.project(fit.world_from_body)[0][rows[leave]]
+    left_at = fit.projected_px[rows[leave]]
     if np.any(np.linalg.norm(left_at - pixels[leave], axis=-1) < limits.min_outlier_px):
         return None
     score = fit.chi2 / noise_scale**2
@@ -227,7 +229,9 @@ def _without(
     gap = fit.world_from_body.minus(expected[0])
     distance = float(gap @ np.linalg.solve(expected[1] + fit.covariance, gap))
     if (fit.dof <= 0 or len(leave) > 1) and distance > EXPECTED_GATE:
-        return None  # three spots fit any labels, four of six many: at a bend the motion is no witness, nothing is chosen
+        return (
+            None  # three spots fit any labels, four of six many: at a bend the motion is no witness, nothing is chosen
+        )
     return fit, score + distance
 
 

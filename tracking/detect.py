@@ -6,8 +6,9 @@ import numpy as np
 
 from geometry.arrays import Array, Bools, Ints
 from geometry.camera import SensorNoise
+from tracking import ellipses
 from tracking.candidates import find_candidates
-from tracking.centroid import Fit, measure
+from tracking.centroid import Measurement, measure
 from tracking.detections import Detections
 from tracking.noise import NoiseModel, Picture, guess_noise
 from tracking.parameters import DetectParameters
@@ -42,27 +43,27 @@ def find_spots(
         return Detections.none()
     fit = measure(image, uv, ground, model, saturation)
     good = _is_spot(fit, image.shape, parameters)
-    good[good] = _is_first(fit.uv_px[good], fit.shape_px2[good], fit.flux[good])
+    good[good] = _is_first(fit.spots.uv[good], fit.spots.shape[good], fit.spots.flux[good])
     rows = np.flatnonzero(good)
-    return _detections(fit, rows[np.argsort(-fit.flux[rows], kind="stable")])
+    return _detections(fit, rows[np.argsort(-fit.spots.flux[rows], kind="stable")])
 
 
-def _is_spot(fit: Fit, shape: tuple[int, ...], parameters: DetectParameters) -> Bools:
-    major, minor, _ = axes(fit.shape_px2)
+def _is_spot(fit: Measurement, shape: tuple[int, ...], parameters: DetectParameters) -> Bools:
+    major, minor, _ = ellipses.axes(fit.spots.shape)
     sigma = np.sqrt(np.maximum(fit.cov_px2[:, [0, 1], [0, 1]], 0.0))
     size = np.array([shape[1], shape[0]])
     margin = 3 * sigma
     with np.errstate(invalid="ignore"):
         return (
             np.isfinite(fit.cov_px2).all(axis=(1, 2))
-            & (fit.flux > parameters.threshold_sigma * fit.sigma_flux)
+            & (fit.spots.flux > parameters.threshold_sigma * fit.sigma_flux)
             & (fit.peak > 0)
             & (major <= parameters.max_sigma_px)
             & (minor >= parameters.min_sigma_px)
             & (fit.explained >= parameters.min_explained)
             & (sigma.max(axis=1) < 0.5 * np.maximum(major, 0.5))
-            & (fit.uv_px > -0.5 - margin).all(axis=1)
-            & (fit.uv_px < size - 0.5 + margin).all(axis=1)
+            & (fit.spots.uv > -0.5 - margin).all(axis=1)
+            & (fit.spots.uv < size - 0.5 + margin).all(axis=1)
         )
 
 
@@ -83,18 +84,6 @@ def _is_first(uv: Array, shape: Array, flux: Array) -> Bools:
     return first
 
 
-def axes(shape_px2: Array) -> tuple[Array, Array, Array]:
-    """1-sigma half axes major and minor (n,), px, and the major one's angle (n,), degrees in (-90, 90] from +u to +v.
-
-    shape_px2 (n, 3): covariance as uu, uv, vv.
-    """
-    uu, uv, vv = shape_px2.T
-    middle, gap = 0.5 * (uu + vv), np.hypot(0.5 * (uu - vv), uv)
-    angle = np.degrees(0.5 * np.arctan2(2 * uv, uu - vv))
-    angle = np.where(angle <= -90, angle + 180, angle)
-    return np.sqrt(np.maximum(middle + gap, 0.0)), np.sqrt(np.maximum(middle - gap, 0.0)), angle
-
-
-def _detections(fit: Fit, rows: Ints) -> Detections:
-    major, minor, angle = axes(fit.shape_px2[rows])
-    return Detections(fit.uv_px[rows], fit.cov_px2[rows], fit.flux[rows], fit.peak[rows], major, minor, angle)
+def _detections(fit: Measurement, rows: Ints) -> Detections:
+    major, minor, angle = ellipses.axes(fit.spots.shape[rows])
+    return Detections(fit.spots.uv[rows], fit.cov_px2[rows], fit.spots.flux[rows], fit.peak[rows], major, minor, angle)

@@ -41,7 +41,9 @@ class LabelParameters:
 class TrackerParameters:
     """Tracking (tracking/spot_tracker.py). Symbols: Huo, Yang & Yang 2015, sections 3 and 4.1."""
 
-    method: Literal["spots"] = "spots"  # spots: the paper's, one filter per spot
+    method: Literal["spots", "rigid"] = (
+        "spots"  # spots: the paper's, a filter per spot | rigid: predicted by the vehicle's motion
+    )
     detect: DetectParameters = field(default_factory=DetectParameters)
     labels: LabelParameters = field(default_factory=LabelParameters)
 

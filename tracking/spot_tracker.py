@@ -156,6 +156,21 @@ class SpotTracker:
                 self.motion = pose_filter.predict(self.motion, dt_s, float(a[0]), float(a[1]))
             if self._anchor is not None:
                 self._anchor = (self._anchor[0], self._anchor[1] + dt_s)
+            if self.parameters.method == "rigid" and self.motion is not None and self._pose_known():
+                self._carry(np.ones(len(self.model), dtype=bool), self.motion)
+
+    def _carry(self, views: Bools, motion: Motion) -> None:
+        """Give tracks the position, the rate and their covariance that the vehicle's motion means for them."""
+        t = self.tracks
+        uv, J = self.model.project(motion.world_from_body)
+        exists = ~np.isnan(uv[:, 0])
+        rows = np.flatnonzero(views & exists)
+        G = np.zeros((len(rows), 4, 12))
+        G[:, :2, :6] = G[:, 2:, 6:] = J[rows]
+        t.x[rows, :2], t.x[rows, 2:] = uv[rows], J[rows] @ motion.twist
+        t.P[rows] = G @ motion.P @ np.swapaxes(G, -1, -2) + 1e-6 * np.eye(4)
+        t.rate_known[rows] = bool(np.sqrt(np.max(np.diagonal(motion.P)[6:])) < RATE_KNOWN)
+        t.alive = np.where(views, exists, t.alive)
 
     # -- matching -----------------------------------------------------------------------------------------------------
 
@@ -234,7 +249,7 @@ class SpotTracker:
         if not self.parameters.rigid_check:
             return fit, point, turned
         left_out = np.setdiff1d(rows, fit.rows)
-        away = np.linalg.norm(uv[left_out] - self.model.project(fit.world_from_body)[0][left_out], axis=-1)
+        away = np.linalg.norm(uv[left_out] - fit.projected_px[left_out], axis=-1)
         # A neighbour that melts into a spot pulls its centre by a pixel or two: still this spot, but no witness.
         dropped = left_out[~(away < self.parameters.blend_px)]
         point = point.copy()
@@ -269,7 +284,7 @@ class SpotTracker:
 
     def _add_missed(self, found: Sequence[Detections | None], point: Ints, fit: PoseFit) -> tuple[Ints, list[int]]:
         """Detections where the pose puts spots that have none yet."""
-        uv, J = self.model.project(fit.world_from_body)
+        uv, J = fit.projected_px, fit.jacobian
         reach = point_covariance(J, fit.covariance)
         new: list[int] = []
         open_views = np.flatnonzero((point == UNMATCHED) & self.model.in_picture(uv, self.parameters.image_margin_px))
@@ -388,7 +403,7 @@ class SpotTracker:
         rest = ~seen
         uv = np.where(rest[:, None], np.where(exists[:, None], estimate, t.x[:, :2]), uv)
         cov = np.where(rest[:, None, None], np.where(exists[:, None, None], estimate_cov, t.P[:, :2, :2]), cov)
-        status = self._statuses(found, seen, turned, uv, fit)
+        status = self._statuses(found, seen, turned, uv, exists, fit)
         unknown = np.array([s in (SpotStatus.LOST, SpotStatus.OFF_SCREEN) for s in status])
         uv = np.where(unknown[:, None], np.nan, uv)
         t.alive = t.alive & ~unknown
@@ -476,7 +491,7 @@ class SpotTracker:
         blended = np.setdiff1d(np.flatnonzero(seen), fit.rows)
         if not len(blended):
             return cov
-        gap2 = np.sum((uv[blended] - self.model.project(fit.world_from_body)[0][blended]) ** 2, axis=-1)
+        gap2 = np.sum((uv[blended] - fit.projected_px[blended]) ** 2, axis=-1)
         cov = cov.copy()
         cov[blended] += gap2[:, None, None] * np.eye(2)
         return cov
@@ -487,10 +502,10 @@ class SpotTracker:
         if self.motion is None:
             return np.full((n, 2), np.nan), np.full((n, 2, 2), np.nan), np.zeros(n, dtype=bool)
         if fit is not None:
-            pose, covariance = fit.world_from_body, fit.covariance * self.noise_scale**2
+            position, J, covariance = fit.projected_px, fit.jacobian, fit.covariance * self.noise_scale**2
         else:
-            pose, covariance = self.motion.world_from_body, self.motion.covariance
-        position, J = self.model.project(pose)
+            position, J = self.model.project(self.motion.world_from_body)
+            covariance = self.motion.covariance
         spread = point_covariance(J, covariance)
         exists = ~np.isnan(position[:, 0])
         if self.parameters.out_of_view == "quadratic":
@@ -545,29 +560,27 @@ class SpotTracker:
                 t.sigma_a[old] = np.where(learn, np.clip(t.sigma_a[old] * change, *SIGMA_A_RANGE), t.sigma_a[old])
         # New tracks, and all that the pose filter alone carries, take position and rate from the vehicle's motion.
         carried = ~seen & exists & t.alive & ~np.asarray(measured_pose) & (p.estimate == "rigid")
-        seed = np.flatnonzero(new | carried)
-        if len(seed) and motion is not None:
-            _, J = self.model.project(motion.world_from_body)
-            G = np.zeros((len(seed), 4, 12))
-            G[:, :2, :6] = G[:, 2:, 6:] = J[seed]
-            t.P[seed] = G @ motion.P @ np.swapaxes(G, -1, -2) + 1e-6 * np.eye(4)
-            t.x[seed, :2] = np.where(use[seed, None], z[seed], estimate[seed])
-            t.x[seed, 2:] = J[seed] @ motion.twist
-            t.alive[seed] = True
-            t.rate_known[seed] = bool(np.sqrt(np.max(np.diagonal(motion.P)[6:])) < RATE_KNOWN)
+        seed = new | carried
+        if seed.any() and motion is not None:
+            self._carry(seed, motion)
+            at = np.where(use[:, None], z, estimate)
+            here = seed & ~np.isnan(at[:, 0])
+            t.x[here, :2], t.alive[here] = at[here], True
         t.unseen_s[use] = 0.0
 
     def _statuses(
-        self, found: Sequence[Detections | None], seen: Bools, turned: Bools, uv: Array, fit: PoseFit | None
+        self,
+        found: Sequence[Detections | None],
+        seen: Bools,
+        turned: Bools,
+        uv: Array,
+        exists: Bools,
+        fit: PoseFit | None,
     ) -> list[SpotStatus]:
         """One word per view."""
         model, t = self.model, self.tracks
         inside = model.in_picture(uv)
         nothing = np.isnan(uv).any(axis=-1)
-        if self.motion is not None:
-            nothing_there = np.isnan(model.project(self.motion.world_from_body)[0]).any(axis=-1)
-        else:
-            nothing_there = np.zeros(len(model), dtype=bool)
         known_pose = fit is not None or self._pose_known()
         out: list[SpotStatus] = []
         for i in range(len(model)):
@@ -575,7 +588,7 @@ class SpotTracker:
                 out.append(SpotStatus.TURNED if turned[i] else SpotStatus.MATCHED)
             elif not self._labelled:
                 out.append(SpotStatus.LOST)
-            elif known_pose and nothing_there[i]:
+            elif known_pose and not exists[i]:
                 out.append(SpotStatus.OFF_SCREEN)
             elif nothing[i] or not (t.alive[i] and (known_pose or t.unseen_s[i] <= self.parameters.max_coast_s)):
                 out.append(SpotStatus.LOST)

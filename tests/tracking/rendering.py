@@ -27,7 +27,7 @@ class Spot:
 
     @property
     def flux(self) -> float:
-        return 2 * np.pi * self.major * self.minor * self.peak * (1.0 if not self.streak else 1.0)
+        return 2 * np.pi * self.major * self.minor * self.peak
 
     def covariance(self) -> NDArray:
         """(2, 2), px^2, of the light, motion included."""
@@ -78,9 +78,9 @@ def expected(scene: Scene, rng: np.random.Generator | None = None) -> NDArray:
     u, v = np.linspace(-0.5, 0.5, width), np.linspace(-0.5, 0.5, height)
     picture = scene.background + gu * u[None, :] + gv * v[:, None]
     shine = np.zeros((height, width))
-    for spot in [*scene.spots, *scene.reflections]:
+    for k, spot in enumerate([*scene.spots, *scene.reflections]):
         cells, where = light(spot, scene.size)
-        if scene.speckle and rng is not None and cells.size:
+        if scene.speckle and rng is not None and cells.size and k < len(scene.spots):
             cells = cells * grains(cells.shape, scene.speckle, rng)
         shine[where] += cells
     return picture + shine
