@@ -80,8 +80,8 @@ class TrackerParameters:
         "rigid"  # position outside the picture: pose of all spots | eqs. (10) to (14)
     )
     max_coast_s: float = 1.0  # s: after so long without any pose a track that is not seen is lost
-    reacquire_deg_s: float = 60.0  # deg/s: how fast the search for a lost vehicle widens ...
-    reacquire_m_s: float = 1.5  # m/s: ... and in position
+    reacquire_deg_s: float = 60.0  # deg/s: how much faster than ever seen a lost vehicle may turn ...
+    reacquire_m_s: float = 1.5  # m/s: ... and move
     pose_sigma_a_m_s2: float = 3.0  # m/s^2: white acceleration of the vehicle while the pose is predicted, at the start
     pose_sigma_a_rad_s2: float = 6.0  # rad/s^2: the same of its rotation
     max_sigma_m: float = 0.25  # m: a pose vaguer than this in any direction is not `measured` ...

@@ -108,6 +108,7 @@ class SpotTracker:
         self._recent: deque[float] = deque(maxlen=9)  # the last ones
         self._accelerations = np.array([parameters.pose_sigma_a_m_s2, parameters.pose_sigma_a_rad_s2])
         self._anchor: tuple[Pose, float] | None = None  # last measured pose and its age, s
+        self._fastest = np.zeros(2)  # m/s and rad/s: the fastest that the vehicle was seen to move
         self._labelled = False
         self._frames_since_try = 0
         self._told_tie = False
@@ -248,23 +249,26 @@ class SpotTracker:
             return None, point, turned
         if not self.parameters.rigid_check:
             return fit, point, turned
+        before, point = point, point.copy()
         left_out = np.setdiff1d(rows, fit.rows)
-        away = np.linalg.norm(uv[left_out] - fit.projected_px[left_out], axis=-1)
-        # A neighbour that melts into a spot pulls its centre by a pixel or two: still this spot, but no witness.
-        dropped = left_out[~(away < self.parameters.blend_px)]
-        point = point.copy()
-        point[dropped] = UNMATCHED
-        events += [Event("dropped", "contradicts the other spots: not this spot", int(view)) for view in dropped]
+        point[left_out] = UNMATCHED
         point, new = self._add_missed(found, point, fit)
         if new:
             rows = np.union1d(fit.rows, new)
-            uv, cov = self._pixels(found, point)
-            wider = fit_pose(self.model, rows, uv[rows], cov[rows], fit.world_from_body)
+            now, now_cov = self._pixels(found, point)
+            wider = fit_pose(self.model, rows, now[rows], now_cov[rows], fit.world_from_body)
             if wider is not None and wider.consistent(self.limits.p_false_alarm):
                 fit = wider
                 turned = np.where(np.isin(np.arange(len(point)), new), self._far_from_prediction(found, point), turned)
             else:
                 point[new] = UNMATCHED
+        for view in left_out[point[left_out] == UNMATCHED]:
+            taken = np.any((point == before[view]) & (self.model.camera_of == self.model.camera_of[view]))
+            if not taken and np.linalg.norm(uv[view] - fit.projected_px[view]) < self.parameters.blend_px:
+                # A neighbour that melts into a spot pulls its centre by a pixel or two: still it, but no witness.
+                point[view] = before[view]
+            else:
+                events.append(Event("dropped", "contradicts the other spots: not this spot", int(view)))
         return fit, point, turned & (point != UNMATCHED)
 
     def _blended_fit(self, rows: Ints, uv: Array, cov: Array) -> PoseFit | None:
@@ -320,10 +324,12 @@ class SpotTracker:
         assert self._anchor is not None
         pose, age = self._anchor
         p = self.parameters
+        speed = p.reacquire_m_s + self._fastest[0]
+        rate = np.deg2rad(p.reacquire_deg_s) + self._fastest[1]
         return PosePrior(
             pose,
-            min(0.05 + p.reacquire_m_s * age, max(1.0, self.prior.within_m)),
-            min(np.deg2rad(3.0 + p.reacquire_deg_s * age), max(np.deg2rad(45.0), self.prior.within_rad)),
+            min(0.05 + speed * age, max(1.0, self.prior.within_m)),
+            min(np.deg2rad(3.0) + rate * age, max(np.deg2rad(45.0), self.prior.within_rad)),
         )
 
     def _acquire(
@@ -389,6 +395,10 @@ class SpotTracker:
         if fit is not None:
             self._labelled, self._frames_since_try = True, 0
             self._update_motion(fit, dt_s)
+            if self._anchor is not None and self._anchor[1] > 0:
+                move = fit.world_from_body.minus(self._anchor[0])
+                moved = np.array([np.linalg.norm(move[:3]), np.linalg.norm(move[3:])]) / self._anchor[1]
+                self._fastest = np.maximum(self._fastest, moved)
             self._anchor = (fit.world_from_body, 0.0)
         elif self.motion is not None:
             point = self._update_motion_partly(found, point)

@@ -156,7 +156,7 @@ _SHARP_TURNS = Scenario(
 )
 _SMOOTH_SCENARIO = Scenario(
     name="smooth",
-    summary="Slow sinusoids about all axes, up to 18 px per frame; pair 3/6 leaves the picture and returns.",
+    summary="Slow sinusoids about all axes, up to 15 px per frame; pair 3/6 leaves the picture and returns.",
     motion=_SMOOTH,
     always_in_view=("1", "2", "4", "5"),
     leaves_and_returns=("3", "6"),
@@ -210,6 +210,12 @@ _ALL = (
         summary="Four beams that neither meet nor lie in one plane; beam D lights the right screen only.",
         rig="four-skew-beams",
         always_in_view=("1", "2", "4", "5"),
+    ),
+    replace(
+        _HUO2015,
+        name="unequal-fan",
+        summary="As huo2015, with 18 and 23 deg between the beams: two beams in view already tell which two they are.",
+        rig="unequal-fan",
     ),
     replace(
         _SMOOTH_SCENARIO,
