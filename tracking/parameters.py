@@ -72,7 +72,7 @@ class TrackerParameters:
 
     # What one rigid body adds (ours)
     rigid_check: bool = True  # a spot that contradicts the others is dropped, and looked for where they say
-    blend_px: float = 2.0  # px: a detection this near to its spot's place keeps the label, though not a say in the pose
+    blend_px: float = 3.0  # px: a detection this near to its spot's place keeps the label, though not a say in the pose
     estimate: Literal["rigid", "prediction"] = (
         "rigid"  # of a hidden spot: from the other spots | its own filter (the paper)
     )

@@ -28,7 +28,7 @@ from tracking.pose_filter import Motion
 from tracking.statuses import PoseStatus, SpotStatus
 
 RIGID_GATE = 20.0  # squared sigmas: a detection this near to where the pose puts a spot is that spot (p = 5e-5)
-BENT_NIS = 25.0  # squared sigmas: an estimate outside the picture this far from its track means a bend
+BENT_NIS = 25.0  # squared sigmas: a spot this far from its prediction has turned (p = 4e-6)
 CLUTTER_NEAR_SPOTS = 2e-4  # 1/px^2: the paper's 20 % of false points within 15 px of a spot
 SCALE_MEMORY = 100  # frames: memory of the misfit that scales claimed covariances ...
 SCALE_DEADBAND = 1.3  # ... once it exceeds this: with honest sigmas it scatters by 0.06 about 1
@@ -408,7 +408,8 @@ class SpotTracker:
         seen = point != UNMATCHED
         cov = self._with_blends(fit, uv, cov, seen)
         estimate, estimate_cov, exists = self._estimates(fit, uv, cov)
-        self._update_tracks(uv, cov, seen, turned, estimate, estimate_cov, exists, measured_pose)
+        witness = seen if fit is None else np.isin(np.arange(n), fit.rows)
+        self._update_tracks(uv, cov, witness, turned, estimate, estimate_cov, exists, measured_pose)
         t = self.tracks
         rest = ~seen
         uv = np.where(rest[:, None], np.where(exists[:, None], estimate, t.x[:, :2]), uv)
@@ -553,9 +554,8 @@ class SpotTracker:
         if len(old):
             t.rate_known[old] = True
             _, _, nis = kalman.innovation(t.x[old], t.P[old], z[old], R[old])
-            bent = turned[old] & p.curve_switch
-            # Outside the picture nobody matches in two steps; an estimate far off is the bend there.
-            bent |= ~seen[old] & (nis > BENT_NIS) & p.curve_switch
+            # A bend too slight for the second search shows in the innovation, as it does outside the picture.
+            bent = (turned[old] | (nis > BENT_NIS)) & p.curve_switch
             bent &= ~np.isnan(t.last[old, 0]) & (t.last_age_s[old] > 0)
             go, restart = old[~bent], old[bent]
             if len(go):
