@@ -1,4 +1,4 @@
-"""The command line: reads arguments, calls one function of lab/, prints a line. Everything it does can be done from Python."""
+"""The command line: reads arguments, calls one function of lab/, prints a line. All of it can be done from Python."""
 
 from __future__ import annotations
 

@@ -140,7 +140,8 @@ def pooled(all_of: list[Tally]) -> str:
     nees = sum(t.nees for t in all_of) / max(sum(t.poses for t in all_of), 1)
     outside = np.sqrt(sum(t.outside2 for t in all_of) / max(sum(t.outsides for t in all_of), 1))
     return (
-        f"prediction {rms[0]:.3f} / {rms[1]:.3f} px; identity {right / seen:.5f}; wrong {wrong / max(right + wrong, 1):.1e};"
+        f"prediction {rms[0]:.3f} / {rms[1]:.3f} px; identity {right / seen:.5f};"
+        f" wrong {wrong / max(right + wrong, 1):.1e};"
         f" outside RMS {outside:.2f} max {max(t.outside_max for t in all_of):.2f} px; NEES {nees:.2f};"
         f" {np.median([t.ms for t in all_of]):.1f} ms/frame"
     )
@@ -179,7 +180,7 @@ def out_of_view_rows(poses: int) -> Iterator[Row]:
             between.append(np.abs(solved[[2, 5]] - there[[2, 5]]).max())
         q, r = np.array(quadratic), np.array(rigid)
         if noise == 0.0:
-            text = f"max {q.max():.1e} (quadratic), {r.max():.1e} (rigid), between them {max(between):.1e} px, {len(q)} poses"
+            text = f"max {q.max():.1e} (quadratic), {r.max():.1e} (rigid), between them {max(between):.1e} px"
             yield Row("out of view, noise-free", text, "<= 1e-6 px")
         else:
             text = f"RMS {np.sqrt(np.mean(q**2)):.2f} (quadratic), {np.sqrt(np.mean(r**2)):.2f} px (rigid)"

@@ -1,11 +1,12 @@
 """The paper's closed forms for a spot out of view: coplanar beams through one point.
 
-Source: Huo, Yang & Yang, Optics and Precision Engineering 23(8), 2015, section 4.2, eqs. (10) to (14), with its misprints
-mended: (11) C = B + k (B - A) is right and (14)'s coefficients belong to it; (12) must end in X_B, Y_B; l begins with
-(X_B - X_O)^2. Written with vectors, so the screen may be any plane, and with two angles, which need not be equal.
+Source: Huo, Yang & Yang, Optics and Precision Engineering 23(8), 2015, section 4.2, eqs. (10) to (14), with its
+misprints mended: (11) C = B + k (B - A) is right and (14)'s coefficients belong to it; (12) must end in X_B, Y_B; l
+begins with (X_B - X_O)^2. Written with vectors, so the screen may be any plane, and with two angles, which need not be
+equal.
 
-O is the point where the beams meet; A, B, C are the spots of three beams on one screen, in this order; alpha is the angle
-AOB and beta the angle BOC.
+O is the point where the beams meet; A, B, C are the spots of three beams on one screen, in this order; alpha is the
+angle AOB and beta the angle BOC.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ def quadratic_coefficients(O: Array, A: Array, B: Array, beta: float) -> tuple[A
     O, A, B (..., 3), m; beta in rad.
     """
     OB, AB = B - O, B - A
-    l = np.sum(OB * OB, axis=-1)  # noqa: E741 - the paper's letter
+    l = np.sum(OB * OB, axis=-1)
     m = np.sum(OB * AB, axis=-1)
     cos2 = np.cos(beta) ** 2
     m1 = l * np.sum(AB * AB, axis=-1) * cos2
@@ -43,17 +44,18 @@ def quadratic_coefficients(O: Array, A: Array, B: Array, beta: float) -> tuple[A
 
 
 def outer_spot(O: Array, A: Array, B: Array, alpha: float, beta: float, tolerance: float = ANGLE_TOLERANCE) -> Array:
-    """C (..., 3), m: the spot beyond B, of a beam at the angle `beta` (rad) from B's; nan where that beam misses the plane.
+    """C (..., 3), m: the spot beyond B, of a beam at the angle `beta` (rad) from B's; nan where it misses the plane.
 
-    O, A, B (..., 3), m, in world; alpha, the angle AOB by calibration, and beta are in (0, pi/2). Of the two roots the one with k > 0 and
-    angle AOC = alpha + beta within the tolerance. The paper's rule, "the root whose angle AOC is 2 alpha", has no such root
-    when the beam leaves the plane behind (8 % of geometries for alpha of 10 to 30 deg, 90 % for 60 to 89 deg), and its nearest is A itself.
+    O, A, B (..., 3), m, in world; alpha, the angle AOB by calibration, and beta are in (0, pi/2). Of the two roots the
+    one with k > 0 and angle AOC = alpha + beta within the tolerance. The paper's rule, "the root whose angle AOC is
+    2 alpha", has no such root when the beam leaves the plane behind (8 % of geometries for alpha of 10 to 30 deg, 90 %
+    for 60 to 89 deg), and its nearest is A itself.
     """
     a, b, c = quadratic_coefficients(O, A, B, beta)
     with np.errstate(invalid="ignore", divide="ignore"):
         # b^2 - 4ac = 4 l^2 sin^2(beta) cos^2(beta) |OB x AB|^2 >= 0; rounding may take it below.
         root = np.sqrt(np.maximum(b * b - 4 * a * c, 0.0))
-        # The form without cancellation: one root by division with a, the other with q; a = 0 (OC parallel to AB) gives inf.
+        # The form without cancellation: one root by division with a, the other with q; a = 0 (OC parallel to AB): inf.
         q = -0.5 * (b + np.where(b >= 0, root, -root))
         k = np.stack([q / a, c / q], axis=-1)  # (..., 2)
         C = B[..., None, :] + k[..., None] * (B - A)[..., None, :]
@@ -68,8 +70,8 @@ def outer_spot(O: Array, A: Array, B: Array, alpha: float, beta: float, toleranc
 def middle_spot(O: Array, A: Array, C: Array, alpha: float, beta: float, world_from_screen: Pose) -> Array:
     """B (..., 3), m: the spot between A and C, of a beam at `alpha` from A's and `beta` from C's (rad). nan if it misses.
 
-    The middle beam has no form like eq. (14): OA is turned towards OC by the share alpha / (alpha + beta) of the
-    angle AOC as measured, then met with the screen. Source: ours.
+    The middle beam has no form like eq. (14): OA is turned towards OC by the share alpha / (alpha + beta) of the angle
+    AOC as measured, then met with the screen. Source: ours.
     """
     OA, OC = normalised(A - O), normalised(C - O)
     return _turned_to_plane(O, OA, OC, alpha / (alpha + beta), world_from_screen)

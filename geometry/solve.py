@@ -129,7 +129,7 @@ def fit_pose(
 def _terms(
     model: SpotModel, rows: Ints, pixels: Array, W: Array, pose: Pose, prior: tuple[Pose, Array] | None
 ) -> tuple[Array, Array, float, Array, Array, Array] | None:
-    """Normal matrix (6, 6), right-hand side (6,), cost, residuals (m, 2) px, and the projection; None where it fails."""
+    """Normal matrix (6, 6), right-hand side (6,), cost, residuals (m, 2) px, and the projection; None if that fails."""
     projected, J = model.project(pose)
     residuals = pixels - projected[rows]
     if np.isnan(residuals).any():

@@ -45,8 +45,8 @@ def process_batch(
 ) -> BatchOutcome:
     """Process runs into out/<name of the run folder>; a run that fails costs only itself.
 
-    tell: gets a line per run. progress: gives, for a run's name, what is told of its frames. Raises InputError where the
-    command as a whole is wrong.
+    tell: gets a line per run. progress: gives, for a run's name, what is told of its frames. Raises InputError where
+    the command as a whole is wrong.
     """
     if not run_folders:
         raise InputError("batch: expected one or more run folders, got none")

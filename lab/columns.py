@@ -1,4 +1,4 @@
-"""The columns of every table that a run reads or writes, in order. Writers, readers and documentation use this place."""
+"""The columns of every table that a run reads or writes, in order; writers and readers take them from here."""
 
 from __future__ import annotations
 

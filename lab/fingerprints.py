@@ -15,8 +15,8 @@ _BLOCK = 2**20
 def fingerprints(run: Run) -> list[dict[str, Any]]:
     """Path, SHA-256 and size of every input.
 
-    A folder of pictures has one entry: its digest is over the names and sizes of its files, which costs no second reading of
-    gigabytes; `covers` says what each digest covers.
+    A folder of pictures has one entry: its digest is over the names and sizes of its files, which costs no second
+    reading of gigabytes; `covers` says what each digest covers.
     """
     files = [run.path, run.rig_path]
     if run.times_path is not None:

@@ -1,4 +1,4 @@
-"""The verdict on a run: what its numbers say of whether to trust it. The exit status and the report both follow from it."""
+"""The verdict on a run: whether its numbers can be trusted. Exit status and report both follow from it."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """The gains g1, g2, g3 that rate how well a detection continues a track.
 
-Source: Huo, Yang & Yang 2015, eqs. (7), (8), (9); g2 after Sethi & Jain 1987. The well-defined forms: vector lengths have a
-floor (at zero displacement (8) and (9) are 0/0), and g1 may be divided by the search radius (over the picture's diagonal
-it changes by 0.006 in 10 px and decides nothing).
+Source: Huo, Yang & Yang 2015, eqs. (7), (8), (9); g2 after Sethi & Jain 1987. The well-defined forms: vector lengths
+have a floor (at zero displacement (8) and (9) are 0/0), and g1 may be divided by the search radius (over the picture's
+diagonal it changes by 0.006 in 10 px and decides nothing).
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def combined(
     min_vector_px: float,
     p_norm: float = 2.0,
 ) -> Array:
-    """g3, eq. (9), (...), with the weights divided by their sum (step 2 sets the first to 0, and the paper's no longer add up).
+    """g3, eq. (9), (...), with the weights divided by their sum: step 2 sets the first to 0, then they do not add up.
 
     last, predicted, candidates (..., 2), px: where the spot was, should be, and might be.
     """

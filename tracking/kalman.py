@@ -33,7 +33,7 @@ def predict(x: Array, P: Array, dt_s: float, sigma_a_px_s2: Array) -> tuple[Arra
 
 
 def innovation(x: Array, P: Array, z: Array, R: Array) -> tuple[Array, Array, Array]:
-    """What positions z (..., 2), px, with covariances R (..., 2, 2) add: z - Hx, its covariance S, and y S^-1 y (...)."""
+    """What positions z (..., 2), px, with covariances R (..., 2, 2) add: y = z - Hx, its covariance S, y S^-1 y (...)."""
     y = z - x[..., :2]
     S = P[..., :2, :2] + R
     nis = np.sum(y * np.linalg.solve(S, y[..., None])[..., 0], axis=-1)
@@ -51,7 +51,7 @@ def update(x: Array, P: Array, z: Array, R: Array) -> tuple[Array, Array]:
 
 
 def restart(z: Array, R: Array, last: Array, R_last: Array, dt_s: Array | float) -> tuple[Array, Array]:
-    """Eq. (6) at a bend: the position z and the velocity from the last position, (..., 2), with covariances (..., 2, 2).
+    """Eq. (6) at a bend: position z and velocity from the last position, both (..., 2), with covariances (..., 2, 2).
 
     The paper leaves the rate and the covariance open; here the rate is (z - last) / dt, with dt the time between the
     two, and the covariance follows: R, R/dt, (R + R_last)/dt^2.

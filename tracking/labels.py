@@ -1,9 +1,10 @@
 """Which point of light is which spot, when nothing is known but a prior: the first frame, and after a blackout.
 
-Hypotheses come from whole beams (two spots of one beam are a line; one more spot then fixes the pose in closed form) and,
-for rigs or pictures without a whole beam, from three spots by Gauss-Newton. Each pose predicts all spots; the points near
-the predictions are its labels. The likelihood of the points given the labels decides, spots that should be seen but are
-not count against a pose, and where two poses explain the picture about equally well both are reported and none is chosen.
+Hypotheses come from whole beams (two spots of one beam are a line; one more spot then fixes the pose in closed form)
+and, for rigs or pictures without a whole beam, from three spots by Gauss-Newton. Each pose predicts all spots; the
+points near the predictions are its labels. The likelihood of the points given the labels decides, spots that should be
+seen but are not count against a pose, and where two poses explain the picture about equally well both are reported and
+none is chosen.
 
 Source: ours; the likelihood is the usual one of multi-target data association (Bar-Shalom & Li 1995, sec. 6.2).
 """
@@ -167,11 +168,11 @@ def _hypotheses(scene: _Scene, prior: PosePrior) -> Iterator[Pose]:
 def _from_whole_beams(scene: _Scene, prior: PosePrior) -> Iterator[Pose]:
     """Poses from a beam's two spots and one spot of another beam, all points in all roles."""
     model = scene.model
-    for i, j in permutations(np.flatnonzero(scene.seen), 2):
+    for i, j in permutations([int(v) for v in np.flatnonzero(scene.seen)], 2):
         # ray_j = -ray_i: the two ends of one beam; i < j, as the other order is the same line
         if i > j or model.beam_of[i] != model.beam_of[j] or model.ray[i] @ model.ray[j] > 0:
             continue
-        a, b = (m.ravel() for m in np.meshgrid(scene.points_of(int(i)), scene.points_of(int(j)), indexing="ij"))
+        a, b = (m.ravel() for m in np.meshgrid(scene.points_of(i), scene.points_of(j), indexing="ij"))
         if not len(a):
             continue
         start, direction = scene.world[a], normalised(scene.world[b] - scene.world[a])
@@ -182,7 +183,7 @@ def _from_whole_beams(scene: _Scene, prior: PosePrior) -> Iterator[Pose]:
         near = off <= np.sqrt(3) * prior.within_m * 1.02 + 0.01 + np.linalg.norm(model.point[i])
         lines = np.flatnonzero(turned & near)
         for k in np.flatnonzero(scene.seen & (model.beam_of != model.beam_of[i])):
-            points = scene.points_of(k)
+            points = scene.points_of(int(k))
             if not len(points) or not len(lines):
                 continue
             poses = poses_from_line_and_spot(
@@ -202,8 +203,8 @@ def _from_three_spots(scene: _Scene, prior: PosePrior) -> Iterator[Pose]:
     model, limit = scene.model, scene.parameters.max_triples
     views = np.flatnonzero(scene.seen)
     projected, J = model.project(prior.centre)
-    triples: list[tuple[float, tuple[int, ...]]] = []
-    for triple in combinations(views, 3):
+    triples: list[tuple[float, tuple[int, int, int]]] = []
+    for triple in combinations([int(v) for v in views], 3):
         if len({int(model.spot_of[v]) for v in triple}) < 3:
             continue
         A = J[list(triple)].reshape(6, 6)
@@ -211,10 +212,10 @@ def _from_three_spots(scene: _Scene, prior: PosePrior) -> Iterator[Pose]:
             continue
         s = np.linalg.svd(A, compute_uv=False)
         if s[-1] > 1e-6 * s[0]:
-            triples.append((-float(s[-1]), tuple(int(v) for v in triple)))
+            triples.append((-float(s[-1]), triple))
     starts = _starts(prior)
     for _, triple in sorted(triples)[:4]:
-        grids = np.meshgrid(*(scene.points_of(v) for v in triple), indexing="ij")
+        grids = np.meshgrid(*[scene.points_of(v) for v in triple], indexing="ij")
         points = np.stack([g.ravel() for g in grids], axis=-1)
         # One point serves one spot.
         points = points[(np.diff(np.sort(points, axis=1), axis=1) > 0).all(axis=1)][:limit]
@@ -241,7 +242,7 @@ def _gauss_newton(model: SpotModel, pixels: Array, poses: Pose, iterations: int 
         projected, J = model.project(poses)
         residual = (pixels - projected).reshape(-1, 6)
         A = J.reshape(-1, 6, 6)
-        dead = ~(np.isfinite(residual).all(-1) & np.isfinite(A).all((-1, -2)))
+        dead = np.asarray(~(np.isfinite(residual).all(-1) & np.isfinite(A).all((-1, -2))))
         A = np.where(dead[:, None, None], np.eye(6), A + 1e-9 * np.eye(6))
         residual = np.where(dead[:, None], np.nan, residual)
         try:

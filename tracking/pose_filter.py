@@ -1,7 +1,8 @@
 """The vehicle's motion: constant velocity on R3 x SO(3), used where single frames do not give the pose.
 
-Error state (12): [dt (m, world), dtheta (rad, body), dv (m/s, world), domega (rad/s, body)]. Source: ours; the error-state
-form of Sola (2017), "Quaternion kinematics for the error-state Kalman filter", sec. 5, without the inertial sensors.
+Error state (12): [dt (m, world), dtheta (rad, body), dv (m/s, world), domega (rad/s, body)]. Source: ours; the
+error-state form of Sola (2017), "Quaternion kinematics for the error-state Kalman filter", sec. 5, without the inertial
+sensors.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ def predict(motion: Motion, dt_s: float, sigma_a_m_s2: float, sigma_a_rad_s2: fl
 
 
 def corrected(motion: Motion, y: Array, H: Array, R: Array) -> tuple[Motion, Array]:
-    """After a measurement with innovation y (k,), Jacobian H (k, 6) of the pose and covariance R (k, k); and S (k, k)."""
+    """After a measurement: innovation y (k,), Jacobian H (k, 6) of the pose, covariance R (k, k). Also S (k, k)."""
     PH = motion.P[:, :6] @ H.T
     S = H @ PH[:6] + R
     K = np.linalg.solve(S, PH.T).T
