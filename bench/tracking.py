@@ -24,8 +24,9 @@ from tracking.detections import Detections
 from tracking.labels import NO_POINT, PosePrior, find_labels
 from tracking.out_of_view import CoplanarViews, quadratic_positions
 from tracking.parameters import TrackerParameters
-from tracking.spot_tracker import SpotTracker, TrackedFrame
+from tracking.spot_tracker import SpotTracker
 from tracking.statuses import PoseStatus, SpotStatus
+from tracking.tracked_frame import TrackedFrame
 
 FIRST_SEED = 9000
 START_FRAMES = 2  # no rate is known yet: there is no prediction to judge

@@ -98,7 +98,8 @@ def _turned_to_plane(O: Array, start: Array, towards: Array, share: Array | floa
     height = (screen.translation - O) @ normal
     with np.errstate(invalid="ignore", divide="ignore"):
         t = height / facing
-        return np.where(((t > 0) & np.isfinite(t))[..., None], O + t[..., None] * ray, np.nan)
+        ahead = np.asarray((t > 0) & np.isfinite(t))
+        return np.where(ahead[..., None], O + t[..., None] * ray, np.nan)
 
 
 def _angle(a: Array, b: Array) -> Array:

@@ -16,7 +16,8 @@ from lab.run_file import FramesFolder, Run
 from tracking.detect import find_spots
 from tracking.detections import Detections
 from tracking.noise import NoiseModel, estimate_noise
-from tracking.spot_tracker import SpotTracker, TrackedFrame
+from tracking.spot_tracker import SpotTracker
+from tracking.tracked_frame import TrackedFrame
 
 NOISE_PICTURES = 3  # per camera, where the rig states no noise: enough for the slope, and read in an instant
 
@@ -56,8 +57,8 @@ class Pipeline:
         """Open a run. Raises InputError where it has no prior, or its pictures cannot be found."""
         if run.prior is None:
             raise InputError(
-                f"{run.path}: prior: expected where the vehicle is at the first frame, found none; the first labels"
-                " need it. Add: prior: {position_m: [0, 0, 0], yaw_pitch_roll_deg: [0, 0, 0], within_m: 0.5, within_deg: 30}"
+                f"{run.path}: prior: expected where the vehicle is at the first frame, found none; the first labels need"
+                " it. Add: prior: {position_m: [0, 0, 0], yaw_pitch_roll_deg: [0, 0, 0], within_m: 0.5, within_deg: 30}"
             )
         reader = open_frames(run)
         noise: dict[str, SensorNoise | NoiseModel] = {}

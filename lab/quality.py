@@ -59,7 +59,7 @@ def judge(
     elif misfit > GOOD_MISFIT:
         doubts.append(
             f"the spots lie {misfit:.1f} times as far from the fitted pose as their sigmas allow: check the calibration"
-            " (the sigmas of the poses are widened by it)"
+            " and the light (speckle); the sigmas of the poses are widened by it"
         )
     for camera, count in no_image.items():
         if frames and count > (1 - GOOD_PICTURES) * frames:

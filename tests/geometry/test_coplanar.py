@@ -56,7 +56,7 @@ def seen_world_points(rig: Rig, model: SpotModel, pixels: np.ndarray) -> np.ndar
 def test_quadratic_direct_turn_and_rigid_body_put_a_spot_at_the_same_pixel():
     """2000 poses within 1 m and 30 deg in 200 set-ups: three ways to C, two to A, and one to the hidden middle B."""
     rng = np.random.default_rng(1)
-    worst, compared, outside = 0.0, 0, 0
+    off_px, compared, outside = [], 0, 0
     for _ in range(200):
         rig, alpha, beta = tilted_fan(rng)
         model = SpotModel.of(rig)
@@ -75,12 +75,12 @@ def test_quadratic_direct_turn_and_rigid_body_put_a_spot_at_the_same_pixel():
             (outer_spot(O, C, B, beta, alpha), "1"),
             (middle_spot(O, A, C, alpha, beta, screen), "2"),
         ):
-            worst = max(worst, float(np.abs(camera.project(found) - rigid[:, row[of]]).max(initial=0.0)))
+            off_px.append(np.abs(camera.project(found) - rigid[:, row[of]]).max(initial=0.0))
         compared += len(rigid)
         outside += np.count_nonzero(~camera.sees(rigid[:, row["3"]]))
     assert compared > 1500
     assert outside > 100  # it is about spots outside the picture
-    assert worst < EXACT_PX  # a nan fails as well
+    assert np.max(off_px) < EXACT_PX  # a nan fails as well
 
 
 def geometries(rng: np.random.Generator, count: int, low_deg: float, high_deg: float):

@@ -1,0 +1,36 @@
+"""What the tracker says of one frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from geometry.arrays import Array, Ints
+from geometry.pose import Pose
+from tracking.statuses import PoseStatus, SpotStatus
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """Something that the report should tell: labels found, a tie, a re-acquisition, a spot dropped."""
+
+    kind: str  # labelled | tie | relabelled (matching failed at a bend) | reacquired (after frames without) | dropped
+    text: str
+    view: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class TrackedFrame:
+    """What the tracker says of one frame. n views, in the order of the SpotModel."""
+
+    uv_px: Array  # (n, 2), nan where nothing is known
+    cov_px2: Array  # (n, 2, 2)
+    status: tuple[SpotStatus, ...]  # (n,)
+    predicted_px: Array  # (n, 2): before this frame's picture was looked at; nan without a track
+    gain: Array  # (n,): g3 of the match; nan without
+    point: Ints  # (n,): row of the detection in its camera's list, or UNMATCHED
+    pose_status: PoseStatus
+    pose: Pose | None
+    pose_covariance: Array | None  # (6, 6)
+    spots_used: int
+    rms_px: float
+    events: tuple[Event, ...]
