@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from geometry.arrays import Array, normalised
+from geometry.arrays import Array, Bools, normalised
 from geometry.lines import common_perpendicular
 from geometry.pose import Pose
 
@@ -98,7 +98,7 @@ def _turned_to_plane(O: Array, start: Array, towards: Array, share: Array | floa
     height = (screen.translation - O) @ normal
     with np.errstate(invalid="ignore", divide="ignore"):
         t = height / facing
-        ahead = np.asarray((t > 0) & np.isfinite(t))
+        ahead: Bools = np.asarray((t > 0) & np.isfinite(t))
         return np.where(ahead[..., None], O + t[..., None] * ray, np.nan)
 
 

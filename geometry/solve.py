@@ -104,7 +104,7 @@ def fit_pose(
     for _ in range(max_iterations):
         scale = np.maximum(np.diagonal(H), 1e-12 * np.trace(H))
         # The smallest damping only steadies directions that no spot sees; elsewhere it is far below rounding.
-        step: Array = np.linalg.solve(H + np.diag((damping + 1e-14) * scale), g)
+        step = np.asarray(np.linalg.solve(H + np.diag((damping + 1e-14) * scale), g), dtype=np.float64)
         gain = float(step @ g)
         if not np.isfinite(gain):
             return None
