@@ -64,7 +64,7 @@ def outer_spot(O: Array, A: Array, B: Array, alpha: float, beta: float, toleranc
         fits = np.isfinite(k) & (k > 0) & (off < tolerance)
         best = np.argmin(np.where(fits, off, np.inf), axis=-1)
     chosen = np.take_along_axis(C, best[..., None, None], axis=-2)[..., 0, :]
-    return np.where(fits.any(axis=-1)[..., None], chosen, np.nan)
+    return np.where(np.any(fits, axis=-1, keepdims=True), chosen, np.nan)
 
 
 def middle_spot(O: Array, A: Array, C: Array, alpha: float, beta: float, world_from_screen: Pose) -> Array:
