@@ -73,6 +73,9 @@ def test_parallel_beams_and_a_single_beam_are_no_pose():
     assert pose_from_lines(points, along, points, along) is None
     assert pose_from_lines(points, along * [[1], [-1], [1]], points, along * [[1], [-1], [1]]) is None
     assert pose_from_lines(points[:1], x, points[:1], x) is None
+    # Noise makes the lines meet somewhere; the beams still say nothing of the turn about them.
+    noisy = along + np.array([[0, 1e-3, 0], [0, 0, 1e-3], [0, 0, 0]])
+    assert pose_from_lines(points, along, points, noisy) is None
 
 
 def random_line_and_spot(rng: np.random.Generator):

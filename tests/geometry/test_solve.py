@@ -368,6 +368,24 @@ def test_two_wrong_spots_of_six_are_left_out_or_nothing_is_said(name):
     assert right > 40
 
 
+def test_which_of_five_spots_is_wrong_is_only_said_where_it_can_be_known():
+    """An error of 0.5 to 3 px: often two spots may be to blame. Without the required lead 8 % of the verdicts are wrong."""
+    model, rng = MODELS["skew"], np.random.default_rng(21)
+    rows = row_of(model, "1", "2", "4", "5", "6")
+    right = wrong = 0
+    for _ in range(200):
+        pose = seen_pose(model, rng, turn_deg=20, shift_m=0.5)
+        uv = model.project(pose)[0][rows] + rng.normal(0, NOISE_PX, (5, 2))
+        bad, angle = rng.integers(5), rng.uniform(0, 2 * np.pi)
+        uv[bad] += rng.uniform(0.5, 3) * np.array([np.cos(angle), np.sin(angle)])
+        fit = fit_pose_robust(model, rows, uv, isotropic(5), pose)
+        if fit is not None and len(fit.rows) == 4:
+            good = rows[bad] not in fit.rows
+            right, wrong = right + good, wrong + (not good)
+    assert right > 80
+    assert wrong <= 4
+
+
 @pytest.mark.parametrize("wrong", range(4))
 def test_with_four_spots_and_no_expectation_nothing_is_chosen(wrong):
     """Any three of them fit: which one is wrong cannot be known."""
