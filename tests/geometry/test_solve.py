@@ -369,7 +369,7 @@ def test_two_wrong_spots_of_six_are_left_out_or_nothing_is_said(name):
 
 
 def test_which_of_five_spots_is_wrong_is_only_said_where_it_can_be_known():
-    """An error of 0.5 to 3 px: often two spots may be to blame. Without the required lead 8 % of the verdicts are wrong."""
+    """An error of 0.5 to 3 px: often two spots may be to blame. Without the lead that is asked for, 8 % are wrong."""
     model, rng = MODELS["skew"], np.random.default_rng(21)
     rows = row_of(model, "1", "2", "4", "5", "6")
     right = wrong = 0
