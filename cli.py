@@ -17,7 +17,22 @@ _ANY_PATH = click.Path(path_type=Path)
 
 
 class _Commands(click.Group):
-    """Turns the lab's own exceptions into a plain line and an exit status, in one place."""
+    """Turns the lab's own exceptions and click's into a plain line or two and an exit status, in one place."""
+
+    def main(self, *args: Any, **kwargs: Any) -> Any:
+        try:
+            sys.exit(super().main(*args, **{**kwargs, "standalone_mode": False}))
+        except click.exceptions.NoArgsIsHelpError as error:
+            error.show()
+            sys.exit(error.exit_code)
+        except click.UsageError as error:
+            click.echo(f"beampose: {error.format_message()}", err=True)
+            if error.ctx:
+                click.echo(f"Help: {error.ctx.command_path} --help", err=True)
+            sys.exit(error.exit_code)
+        except click.Abort:
+            click.echo("beampose: stopped", err=True)
+            sys.exit(1)
 
     def invoke(self, ctx: click.Context) -> Any:
         try:
@@ -125,7 +140,7 @@ def batch(run_folders: tuple[Path, ...], out: Path, settings: dict[str, Any]) ->
 
 @main.command()
 @click.argument("scenario")
-@click.option("--out", required=True, type=_FOLDER, help="The run folder to write; it must not exist yet.")
+@click.option("--out", type=_FOLDER, help="The run folder to write; it must not exist yet.")
 @click.option("--seed", default=0, show_default=True, type=click.IntRange(min=0), help="The same seed, the same bytes.")
 @click.option("--frames", type=click.IntRange(min=1), help="How many; default: the scenario's own number.")
 @click.option("--video", is_flag=True, help="One lossless video per camera in place of PNG files.")
@@ -140,7 +155,7 @@ def batch(run_folders: tuple[Path, ...], out: Path, settings: dict[str, Any]) ->
 )
 def simulate(
     scenario: str,
-    out: Path,
+    out: Path | None,
     seed: int,
     frames: int | None,
     video: bool,
@@ -164,6 +179,8 @@ def simulate(
             click.echo(f"{one.name:24s}{one.summary}")
         click.echo(f"{'lights:':24s}{', '.join(LIGHTS)}")
         return
+    if out is None:
+        raise click.UsageError("Missing option '--out'.")
     with _progress(scenario) as progress:
         folder = write_run(
             scenario,

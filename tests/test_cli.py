@@ -1,0 +1,184 @@
+"""The command line as a user meets it: help whose examples work; plain words and an exit status for every mistake."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+import shlex
+import subprocess
+import sys
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import click
+import pytest
+
+from cli import main
+from lab.simulate.scenarios import SCENARIOS
+
+ROOT = Path(__file__).resolve().parents[1]
+SAMPLE = ROOT / "sample_runs" / "huo2015"
+EXAMPLE = re.compile(r"^\s*beampose (.+)$", flags=re.MULTILINE)
+
+pytestmark = pytest.mark.skipif(not SAMPLE.is_dir(), reason="a source distribution has no sample runs")
+
+
+def beampose(cwd: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """The program in a process of its own, without a terminal; `python -P` keeps cwd out of its modules."""
+    program = f"import sys; sys.path.insert(0, {str(ROOT)!r}); from cli import main; main(prog_name='beampose')"
+    return subprocess.run(
+        [sys.executable, "-P", "-c", program, *arguments], cwd=cwd, capture_output=True, text=True, check=False
+    )
+
+
+def help_of(name: str) -> str:
+    return main.commands[name].get_help(click.Context(main.commands[name], info_name=name))
+
+
+def example(name: str) -> list[str]:
+    """What the command's help tells the user to type, after `beampose`."""
+    return shlex.split(EXAMPLE.findall(help_of(name))[0])
+
+
+@pytest.fixture(scope="module")
+def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder that looks like a clone to the examples, in which the sample run has been processed."""
+    folder = tmp_path_factory.mktemp("desk")
+    (folder / "sample_runs").symlink_to(ROOT / "sample_runs")
+    done = beampose(folder, *example("run"))
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+def test_there_are_the_commands_of_the_contract():
+    assert set(main.commands) == {"run", "batch", "simulate", "check", "report", "study"}
+
+
+@pytest.mark.parametrize("name", main.commands)
+def test_every_command_says_what_it_does_and_shows_one_example_of_itself(name):
+    assert len(main.commands[name].get_short_help_str(200)) > 20
+    assert example(name)[0] == name
+
+
+@pytest.mark.parametrize("name", main.commands)
+def test_every_option_is_explained(name):
+    unexplained = [
+        option.name
+        for option in main.commands[name].params
+        if isinstance(option, click.Option) and not option.help and option.name != "seed"
+    ]
+    assert unexplained == []
+
+
+def test_help_names_every_exit_status():
+    text = main.get_help(click.Context(main))
+    assert [n for n in "01234" if not re.search(rf"\b{n}\b", text)] == []
+
+
+def test_the_example_of_run_leaves_the_files_of_the_contract(desk):
+    out = desk / example("run")[-1]
+    files = (
+        "detections.csv",
+        "spots.csv",
+        "beams.csv",
+        "attitude.csv",
+        "covariance.csv",
+        "summary.json",
+        "report.html",
+    )
+    assert [name for name in files if not (out / name).is_file()] == []
+    assert isinstance(json.loads((out / "summary.json").read_text()), dict)
+
+
+@pytest.mark.parametrize("name", ["check", "report"])
+def test_the_example_works(desk, name):
+    done = beampose(desk, *example(name))
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.strip()
+
+
+def test_the_example_of_simulate_makes_a_run_that_check_accepts(desk):
+    arguments = example("simulate")
+    done = beampose(desk, *arguments)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert beampose(desk, "check", arguments[arguments.index("--out") + 1]).returncode == 0
+
+
+@pytest.mark.slow
+def test_the_example_of_study_works(desk):
+    done = beampose(desk, *example("study"))
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_the_example_of_batch_has_a_row_for_every_run_and_an_index(desk):
+    arguments = example("batch")
+    done = beampose(desk, *arguments)
+    assert (done.returncode, done.stderr) == (0, "")
+    out = desk / arguments[-1]
+    with (out / "batch.csv").open() as table:
+        assert len(list(csv.DictReader(table))) == len(arguments) - 3
+    assert (out / "index.html").is_file()
+
+
+def test_a_run_that_fails_costs_the_batch_only_itself_and_the_status_says_so(desk):
+    done = beampose(desk, "batch", "nowhere", "sample_runs/four-skew-beams", "--out", "results/one-fails")
+    assert done.returncode == 1
+    assert (desk / "results/one-fails/four-skew-beams/attitude.csv").is_file()
+    assert "nowhere: expected a run folder, found nothing" in done.stdout + done.stderr
+
+
+def test_simulate_lists_every_scenario(desk):
+    done = beampose(desk, "simulate", "list")
+    assert done.returncode == 0
+    assert [name for name in SCENARIOS if not re.search(rf"^{name} ", done.stdout, flags=re.MULTILINE)] == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ("rnu x", "No such command 'rnu'. Did you mean 'run'?"),
+        ("run", "Missing argument 'RUN'"),
+        ("run sample_runs/huo2015", "Missing option '--out'"),
+        ("run sample_runs/huo2015 --out r --speed 3", "No such option '--speed'"),
+        ("run nowhere --out r", "nowhere: expected a run folder, found nothing"),
+        ("run sample_runs/README.md --out r", "sample_runs/README.md: expected a run folder, found a file"),
+        ("run sample_runs/huo2015 --out sample_runs/huo2015", "something other than earlier results"),
+        ("run sample_runs/huo2015 --out r --set r1_px", "expected NAME=VALUE, got 'r1_px'"),
+        ("run sample_runs/huo2015 --out r --set r1_pz=3", "unknown key 'r1_pz'"),
+        ("batch --out r", "Missing argument 'RUN...'"),
+        ("simulate clean", "Missing option '--out'"),
+        ("simulate nothing --out r", "got 'nothing'"),
+        ("simulate clean --out r --frames 0", "0 is not in the range"),
+        ("report sample_runs", "found no summary.json"),
+        ("study nothing --out r", "'nothing' is not"),
+    ],
+)
+def test_a_mistake_is_one_or_two_plain_lines_and_exit_status_2(desk, arguments, words):
+    done = beampose(desk, *arguments.split())
+    assert done.returncode == 2
+    assert words in done.stderr
+    assert 1 <= len(done.stderr.splitlines()) <= 2
+    assert "Traceback" not in done.stderr
+    assert done.stdout == ""
+    assert not (desk / "r").exists()
+
+
+def test_a_path_that_check_does_not_find_is_exit_status_2(desk):
+    done = beampose(desk, "check", "nowhere")
+    assert done.returncode == 2
+    assert "nowhere: expected a file, found none" in done.stdout + done.stderr
+
+
+def test_no_command_at_all_shows_the_help(desk):
+    done = beampose(desk)
+    assert done.returncode == 2
+    assert "Commands:" in done.stdout + done.stderr
+
+
+def test_the_version_is_that_of_the_installed_package(desk):
+    try:
+        installed = version("beampose")
+    except PackageNotFoundError:
+        pytest.skip("beampose is not installed: make setup")
+    assert installed in beampose(desk, "--version").stdout
