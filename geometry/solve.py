@@ -187,19 +187,21 @@ def fit_pose_robust(
     for left_out in (1, 2):
         if len(rows) - left_out < (3 if left_out == 1 else 4):
             return None
-        best: PoseFit | None = None
-        best_score, runner_up = np.inf, np.inf
-        for leave in combinations(range(len(rows)), left_out):
-            found = _without(model, rows, pixels, covariances, start, list(leave), limits, noise_scale, expected)
-            if found is None:
-                continue
-            if found[1] < best_score:
-                best, best_score, runner_up = found[0], found[1], best_score
-            else:
-                runner_up = min(runner_up, found[1])
-        if best is not None:
-            # 3 nats: below that it is a guess which spot is wrong.
-            return best if runner_up - best_score >= 6.0 else None
+        sets = [
+            found
+            for leave in combinations(range(len(rows)), left_out)
+            if (found := _without(model, rows, pixels, covariances, start, list(leave), limits, noise_scale, expected))
+        ]
+        if not sets:
+            continue
+        # At a bend the motion is far from every set, and says nothing about which is right.
+        witness = expected is not None and min(distance for _, _, distance in sets) < EXPECTED_GATE
+        scores = [misfit + (distance if witness else 0.0) for _, misfit, distance in sets]
+        first, *others = np.argsort(scores, kind="stable")
+        # 3 nats: below that it is a guess which spot is wrong.
+        if others and scores[others[0]] - scores[first] < 6.0:
+            return None
+        return sets[first][0]
     return None
 
 
@@ -213,8 +215,11 @@ def _without(
     limits: SolveLimits,
     noise_scale: float,
     expected: tuple[Pose, Array] | None,
-) -> tuple[PoseFit, float] | None:
-    """The fit without some spots and its score (the less the better), if it is consistent and they lie off it."""
+) -> tuple[PoseFit, float, float] | None:
+    """The fit without some spots, its misfit and its distance from the expected pose, both in squared sigmas.
+
+    None unless it is consistent and the spots left out lie off it.
+    """
     keep = np.ones(len(rows), dtype=bool)
     keep[leave] = False
     fit = fit_pose(model, rows[keep], pixels[keep], covariances[keep], start)
@@ -223,16 +228,14 @@ def _without(
     left_at = fit.projected_px[rows[leave]]
     if np.any(np.linalg.norm(left_at - pixels[leave], axis=-1) < limits.min_outlier_px):
         return None
-    score = fit.chi2 / noise_scale**2
+    misfit = fit.chi2 / noise_scale**2
     if expected is None:
-        return (fit, score) if fit.dof > 0 else None
+        return (fit, misfit, 0.0) if fit.dof > 0 else None
     gap = fit.world_from_body.minus(expected[0])
     distance = float(gap @ np.linalg.solve(expected[1] + fit.covariance, gap))
     if (fit.dof <= 0 or len(leave) > 1) and distance > EXPECTED_GATE:
-        return (
-            None  # three spots fit any labels, four of six many: at a bend the motion is no witness, nothing is chosen
-        )
-    return fit, score + distance
+        return None  # three spots fit any labels, four of six many: at a bend nothing is chosen from them
+    return fit, misfit, distance
 
 
 def _acceptable(fit: PoseFit, limits: SolveLimits, noise_scale: float) -> bool:

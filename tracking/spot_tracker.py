@@ -188,6 +188,8 @@ class SpotTracker:
         fit = fit_pose(self.model, rows, uv[rows], cov[rows], self._start())
         if fit is None or fit.dof <= 0 or np.linalg.norm(fit.residuals_px, axis=-1).max() > self.parameters.blend_px:
             return None
+        if not self._plausible(fit):
+            return None  # at a bend nothing vouches for such a set: all spots are searched anew
         return replace(fit, covariance=fit.covariance * max(1.0, fit.chi2 / fit.dof / self.vehicle.noise_scale**2))
 
     def _plausible(self, fit: PoseFit) -> bool:
