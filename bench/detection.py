@@ -95,8 +95,8 @@ def run_set(kind: str, frames: int, seed: int) -> str:
     rms = np.sqrt(np.mean(e**2))
     ratio = rms / np.sqrt(np.mean(B[:, [0, 1], [0, 1]]))
     honest = np.sqrt(np.mean(e**2 / C[:, [0, 1], [0, 1]]))
-    worst = np.abs(e).max()
-    return f"{kind:10} {frames:6} {total:8} {1 - missed / total:8.4f} {rms:8.4f} {worst:8.3f} {ratio:8.3f} {honest:8.3f} {tail}"
+    recall, worst = 1 - missed / total, np.abs(e).max()
+    return f"{kind:10} {frames:6} {total:8} {recall:8.4f} {rms:8.4f} {worst:8.3f} {ratio:8.3f} {honest:8.3f} {tail}"
 
 
 def main() -> None:

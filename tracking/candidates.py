@@ -12,15 +12,15 @@ _BLOCK = 8  # px; one look per block, one background sample per block
 _RADIUS = 48  # px: peaks further apart than this never belong to one spot of the largest size
 _NEAREST = 4  # brighter peaks that a peak is compared with
 _DIP = 0.12  # share of the fainter peak by which the light must fall between two spots: speckle falls by less
-_HOT = 0.08  # light of the four neighbours over that of the pixel: 0.15 for the sharpest spot (1 px wide), 0 for a hot pixel
+_HOT = 0.08  # light of the four neighbours over the pixel's: 0.15 for the sharpest spot (1 px wide), 0 for a hot pixel
 
 
 def find_candidates(image: Picture, noise: NoiseModel, threshold_sigma: float, most: int) -> tuple[Array, Array]:
     """Peaks (n, 2), px, and the background under them (n,), DN, of a picture (h, w); the most significant first.
 
     The picture is halved (so the noise is too, but a spot hardly), each 8x8 block's maximum is compared with the
-    median of the surrounding 5x5 blocks, and peaks are looked for in the blocks that stand out. At most `most` blocks are looked
-    at, which bounds the time in a picture full of light.
+    median of the surrounding 5x5 blocks, and peaks are looked for in the blocks that stand out. At most `most` blocks
+    are looked at, which bounds the time in a picture full of light.
     """
     height, width = image.shape
     if height < 5 or width < 5:
@@ -34,7 +34,7 @@ def find_candidates(image: Picture, noise: NoiseModel, threshold_sigma: float, m
     peaks, height_dn, level = _peaks_in_blocks(image, block_u, block_v, ground)
     sigma = np.sqrt(noise.variance(level))
     strong = height_dn > 0.4 * threshold_sigma * sigma  # a mean of 9 pixels: 1.2 times the threshold in its own sigmas
-    strong &= ~_is_hot(image, peaks)
+    strong &= ~_is_hot(image, peaks, np.sqrt(noise.variance(level + height_dn)))
     peaks, height_dn, level, sigma = peaks[strong], height_dn[strong], level[strong], sigma[strong]
     order = np.argsort(-height_dn, kind="stable")[: 2 * most]
     peaks, height_dn, level, sigma = peaks[order], height_dn[order], level[order], sigma[order]
@@ -43,12 +43,10 @@ def find_candidates(image: Picture, noise: NoiseModel, threshold_sigma: float, m
 
 
 def _bright_blocks(image: Picture, noise: NoiseModel, threshold_sigma: float) -> tuple[Ints, Ints, Array, Array]:
-    """Column and row (n,) of blocks with a maximum above threshold, px; their background and contrast, DN and sigmas."""
+    """Column and row (n,) of blocks with a maximum above threshold, px; their background, DN, and contrast, sigmas."""
     height, width = image.shape
     down, right = -height % _BLOCK, -width % _BLOCK
-    whole = image
-    if down or right:
-        whole = cv2.copyMakeBorder(image, 0, down, 0, right, cv2.BORDER_REPLICATE)
+    whole = cv2.copyMakeBorder(image, 0, down, 0, right, cv2.BORDER_REPLICATE) if down or right else image
     half = cv2.resize(whole, (whole.shape[1] // 2, whole.shape[0] // 2), interpolation=cv2.INTER_AREA)
     n = _BLOCK // 2
     rows = half.reshape(half.shape[0] // n, n, half.shape[1]).max(axis=1)
@@ -71,8 +69,8 @@ def _peaks_in_blocks(image: Picture, block_u: Ints, block_v: Ints, ground: Array
     """Maxima of the 3x3 mean over 5x5 pixels: positions (n, 2), heights above the background, background."""
     height, width = image.shape
     reach = np.arange(-3, _BLOCK + 3)
-    columns = np.clip(block_u[:, None] + reach, 0, width - 1)
-    rows = np.clip(block_v[:, None] + reach, 0, height - 1)
+    # Mirrored at the border: with repeated pixels the maximum of a spot at the edge would come to lie outside.
+    columns, rows = _mirrored(block_u[:, None] + reach, width), _mirrored(block_v[:, None] + reach, height)
     values = image[rows[:, :, None], columns[:, None, :]].astype(np.float32)
     across = values[:, :, :-2] + values[:, :, 1:-1] + values[:, :, 2:]
     mean = (across[:, :-2] + across[:, 1:-1] + across[:, 2:]) / 9
@@ -91,8 +89,11 @@ def _peaks_in_blocks(image: Picture, block_u: Ints, block_v: Ints, ground: Array
     return np.stack([u, v], axis=1), middle[which, row, column] - ground[which], ground[which]
 
 
-def _is_hot(image: Picture, peaks: Ints) -> Bools:
-    """Whether the brightest pixel at each peak (n, 2) stands alone, as no light does that came through a lens."""
+def _is_hot(image: Picture, peaks: Ints, sigma: Array) -> Bools:
+    """Whether the brightest pixel at each peak (n, 2) stands alone, as no light does that came through a lens.
+
+    sigma (n,), DN, is the noise there: on the broad top of a wide spot the highest pixel is the luckiest one.
+    """
     height, width = image.shape
     steps = np.arange(-1, 2)
     near_u = np.clip(peaks[:, :1] + steps, 0, width - 1)
@@ -101,13 +102,12 @@ def _is_hot(image: Picture, peaks: Ints) -> Bools:
     u = near_u[np.arange(len(peaks)), best % 3]
     v = near_v[np.arange(len(peaks)), best // 3]
     steps = np.arange(-2, 3)
-    # At the border the picture is mirrored, for a repeated pixel would be its own neighbour.
-    columns = _mirrored(u[:, None] + steps, width)
-    rows = _mirrored(v[:, None] + steps, height)
+    columns, rows = _mirrored(u[:, None] + steps, width), _mirrored(v[:, None] + steps, height)
     values = image[rows[:, :, None], columns[:, None, :]].reshape(len(peaks), 25).astype(np.float32)
     ring = np.median(values[:, _RING], axis=1)
     cross = values[:, _CROSS].mean(axis=1)
-    return cross - ring < _HOT * (values[:, 12] - ring)
+    above = values[:, 12] - ring
+    return (cross - ring < _HOT * above) & (above > 4 * sigma)
 
 
 _RING = np.array([i for i in range(25) if max(abs(i // 5 - 2), abs(i % 5 - 2)) == 2])
@@ -115,8 +115,9 @@ _CROSS = np.array([7, 11, 13, 17])
 
 
 def _mirrored(index: Ints, size: int) -> Ints:
+    """Indices of rows or columns outside a picture, reflected at its outermost ones."""
     index = np.abs(index)
-    return np.where(index > size - 1, 2 * (size - 1) - index, index)
+    return np.clip(np.where(index > size - 1, 2 * (size - 1) - index, index), 0, size - 1)
 
 
 def _stands_apart(image: Picture, peaks: Ints, height: Array, level: Array, sigma: Array) -> Bools:

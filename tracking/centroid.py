@@ -14,11 +14,12 @@ from tracking.noise import NoiseModel, Picture
 from tracking.patches import Patches, Window, chunks, cut, profile
 
 _STEPS = 12  # Gauss-Newton converges in three or four; a clipped spot, whose top must be guessed, takes up to ten
-_CONVERGED = 0.03  # of the centre's own sigma: what a further step would move is lost in the noise
+_CONVERGED = 0.15  # of the centre's own sigma. The next step would be some hundredths of this one
 _WINDOW = (
     3.2  # sigmas from centre to the window's side; 2.5 costs 8 % of the accuracy, for the plane is then badly known
 )
 _MOST_NEIGHBOURS = 8
+_MOST_CELLS = 36  # from a window's centre to its side
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,14 +67,15 @@ def refine(image: Picture, spots: Spots, noise: NoiseModel, saturation_dn: float
     )  # fmt: skip
     active: Ints = np.arange(n)
     for step in range(_STEPS):
-        near = _neighbours(state)
+        need = _half_widths(state.shape)
+        near = _neighbours(state, need)
         before = Spots(state.uv.copy(), state.shape.copy(), state.flux.copy(), state.plane)
         moved = np.zeros(n, dtype=bool)
-        for window, members in _windows(state.shape, active):
+        for window, members in _windows(state.shape, need, active):
             for rows in chunks(members, window):
                 patches = cut(image, before.uv[rows], window, saturation_dn)
                 here = before[rows]
-                solution = solve(patches, here, _light_of_neighbours(patches, rows, near, before), noise, step > 0)
+                solution = solve(patches, here, _light_of_neighbours(patches, rows, near, before), noise)
                 there = stepped(here, solution)
                 sigma = np.sqrt(np.maximum(solution.inverse[:, [0, 1], [0, 1]], 1e-12))
                 moved[rows] = (np.abs(there.uv - here.uv) > _CONVERGED * sigma).any(axis=1)
@@ -94,14 +96,19 @@ def refine(image: Picture, spots: Spots, noise: NoiseModel, saturation_dn: float
     return out
 
 
-def _neighbours(spots: Spots) -> Ints:
+def _half_widths(shape: Array) -> Array:
+    """Half width (n,), px, of the window that each spot needs: its wings and a ring of background."""
+    return _WINDOW * np.sqrt(np.maximum(shape[:, 0], shape[:, 2]) + 1 / 12) + 1.0
+
+
+def _neighbours(spots: Spots, need: Array) -> Ints:
     """Pairs (m, 2), by the first spot: the second one's light reaches into the first one's window."""
     n = len(spots.uv)
     if n < 2:
         return np.zeros((0, 2), dtype=np.int64)
-    longest = np.sqrt(np.maximum(spots.shape[:, 0], spots.shape[:, 2]) + 0.1)
-    reach, window = 4.0 * longest, _WINDOW * longest + 4.0
-    gap = np.abs(spots.uv[:, None, :] - spots.uv[None, :, :]).max(axis=2) - reach[None, :] - window[:, None]
+    # A window may be as large as that of the largest spot of its group (_windows).
+    window = np.where(need <= 12, 13.0, np.where(need <= 36, need + 18.0, need + 36.0))
+    gap = np.abs(spots.uv[:, None, :] - spots.uv[None, :, :]).max(axis=2) - 1.25 * need[None, :] - window[:, None]
     np.fill_diagonal(gap, np.inf)
     if n > _MOST_NEIGHBOURS + 1 and ((gap < 0).sum(axis=1) > _MOST_NEIGHBOURS).any():
         nearest = np.partition(gap, _MOST_NEIGHBOURS, axis=1)[:, _MOST_NEIGHBOURS]
@@ -128,17 +135,19 @@ def _light_of_neighbours(patches: Patches, rows: Ints, near: Ints, spots: Spots)
     return light
 
 
-def _windows(shape: Array, active: Ints) -> list[tuple[Window, Ints]]:
-    """Which window each active spot gets: wide enough for its wings and a ring of background."""
-    low, _ = ellipses.eigenvalues(shape[active])
-    need = _WINDOW * np.sqrt(np.maximum(shape[active, 0], shape[active, 2]) + 1 / 12) + 1.0
-    small = need <= 12
-    half = int(np.ceil(max(need[small].max(), 7.0))) if small.any() else 0
+def _windows(shape: Array, need: Array, active: Ints) -> list[tuple[Window, Ints]]:
+    """Groups of the active spots that share a window: few, since every group costs a round of numpy calls."""
+    slim = ellipses.eigenvalues(shape[active])[0] < 9.0
+    half = need[active]
     groups = [
-        (Window(half, 1), small),
-        (Window(18, 1), ~small & (need <= 18)),
-        (Window(18, 2), (need > 18) & (need <= 36)),
-        (Window(36, 2), (need > 36) & (low < 9.0)),  # a long streak: cells of four would blur its narrow side
-        (Window(18, 4), (need > 36) & (low >= 9.0)),
+        (1, half <= 12),
+        (1, (half > 12) & (half <= 18)),
+        (2, (half > 18) & ((half <= 36) | slim)),  # a long streak too: cells of four would blur its narrow side
+        (4, (half > 36) & ~slim),
     ]
-    return [(window, active[members]) for window, members in groups if members.any()]
+    out = []
+    for cell, members in groups:
+        if members.any():
+            cells = np.clip(half[members].max() / cell, 7.0, _MOST_CELLS)
+            out.append((Window(int(np.ceil(cells)), cell), active[members]))
+    return out

@@ -13,6 +13,8 @@ from tracking.detections import Detections
 from tracking.noise import NoiseModel, Picture, guess_noise
 from tracking.parameters import DetectParameters
 
+NARROWER = 0.5  # a spot narrower than so much of another one is not that one found again
+
 
 def find_spots(
     image: Picture,
@@ -30,7 +32,8 @@ def find_spots(
         raise ValueError(f"picture: expected grey (h, w) of uint8 or uint16, got shape {image.shape} of {image.dtype}")
     if not image.size:
         return Detections.none()
-    image = np.ascontiguousarray(image)
+    if not image.flags.c_contiguous:
+        image = image.copy()
     if isinstance(noise, SensorNoise):
         noise = NoiseModel.of(noise)
     model = noise or guess_noise(image)
@@ -68,7 +71,10 @@ def _is_spot(fit: Measurement, shape: tuple[int, ...], parameters: DetectParamet
 
 
 def _is_first(uv: Array, shape: Array, flux: Array) -> Bools:
-    """False where a brighter spot's middle (1.5 sigma) holds the point: one light, found twice."""
+    """False where the middle (1.5 sigma) of a brighter spot of about its width holds the point: one light, found twice.
+
+    Width matters: a laser spot on a wide diffuse reflection has less flux than that, and is no part of it.
+    """
     n = len(uv)
     first = np.ones(n, dtype=bool)
     if n < 2:
@@ -77,6 +83,8 @@ def _is_first(uv: Array, shape: Array, flux: Array) -> Bools:
     d = uv[:, None, :] - uv[None, :, :]
     uu, uvs, vv = shape[:, 0] + 1 / 12, shape[:, 1], shape[:, 2] + 1 / 12
     inside = (vv * d[..., 0] ** 2 - 2 * uvs * d[..., 0] * d[..., 1] + uu * d[..., 1] ** 2) < 1.5**2 * (uu * vv - uvs**2)
+    area = uu * vv - uvs**2  # sigma^4, px^4
+    inside &= area[:, None] > NARROWER**4 * area[None, :]
     for place, i in enumerate(order):
         if first[i]:
             later = order[place + 1 :]

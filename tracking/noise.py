@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import TypeAlias
 
 import cv2
@@ -17,8 +18,8 @@ Picture: TypeAlias = NDArray[np.uint8] | NDArray[np.uint16]
 
 ROUNDING_DN2 = 1.0 / 12.0  # variance of rounding to whole DN
 
-# Where nothing is known of the gain: a full scale of 10 000 electrons, as small industrial sensors have in one grey scale.
-# 8 bit: 39 electrons per DN.
+# Where nothing is known of the gain: a full scale of 10 000 electrons, as small industrial sensors have. 8 bit: 39
+# electrons per DN.
 _FULL_SCALE_E = 10_000.0
 
 # Binomial coefficients of a fourth difference: blind to anything cubic, and all but blind to a spot of sigma >= 1.5 px,
@@ -31,7 +32,7 @@ _LEVELS, _LEAST_PIXELS = 12, 60
 
 @dataclass(frozen=True, slots=True)
 class NoiseModel:
-    """Variance of one pixel: floor_dn2 + slope_dn (v - black_dn), v its expected grey value; the floor below black_dn."""
+    """Variance of one pixel of expected grey value v: floor_dn2 + slope_dn (v - black_dn), the floor below black_dn."""
 
     floor_dn2: float  # read noise and rounding, DN^2 (estimated: all noise at the background's level)
     slope_dn: float  # DN^2 per DN: 1 / (electrons per DN)
@@ -55,13 +56,13 @@ class NoiseModel:
 
 
 def guess_noise(image: Picture) -> NoiseModel:
-    """A quick model from one picture's background (0.2 ms at 1280x1024); the slope is that of a usual sensor.
+    """A quick model from one picture's background (0.3 ms at 1280x1024); the slope is that of a usual sensor.
 
     The floor comes from differences of neighbours in a sparse sample, so texture counts as noise, as it should: it
     shifts a spot just as noise does. Both the 68 % and the 95 % quantile are asked and the larger believed, for in a
     picture that is black-clipped most differences are zero.
     """
-    sample = image[2:-2:9, :].astype(np.float32) if min(image.shape) > 8 else image.astype(np.float32)
+    sample = image[2:-2:17, ::2].astype(np.float32) if min(image.shape) > 40 else image.astype(np.float32)
     jump = np.abs(sample[:, 1::4][:, : sample[:, ::4].shape[1]] - sample[:, ::4][:, : sample[:, 1::4].shape[1]])
     level = float(np.median(sample[:, ::4])) if sample.size else 0.0
     floor = _robust_variance(jump / np.sqrt(2.0)) if jump.size else 0.0
@@ -114,7 +115,7 @@ def _line(level: Array, scatter: Array, usual_slope: float) -> NoiseModel:
         return NoiseModel(floor, usual_slope, background)
     edges = np.geomspace(first - background, top - background + 1e-6, _LEVELS + 1) + background
     slopes, weights = [], []
-    for low, high in zip(edges[:-1], edges[1:], strict=True):
+    for low, high in pairwise(edges):
         here = (level >= low) & (level < high)
         count = int(here.sum())
         if count < _LEAST_PIXELS:

@@ -50,15 +50,16 @@ def cut(image: Picture, uv_px: Array, window: Window, saturation_dn: float) -> P
     columns, rows = np.clip(columns, 0, width - 1), np.clip(rows, 0, height - 1)
     raw = image.reshape(-1)[rows[:, :, None] * width + columns[:, None, :]]
     valid = (raw < saturation_dn) & inside
-    values = raw.astype(np.float64)
+    values: Array = raw.astype(np.float64)
     if cell > 1:
         cells = (n, side, cell, side, cell)
-        values = values.reshape(cells).sum(axis=(2, 4)) / cell**2
+        values = np.asarray(values.reshape(cells).sum(axis=(2, 4)) / cell**2, dtype=np.float64)
         inside, valid = (x.reshape(cells).all(axis=(2, 4)) for x in (inside, valid))
     along = (np.arange(side) - window.half) * float(cell)
     dv, du = np.repeat(along, side), np.tile(along, side)
-    origin = first + 0.5 * (side * cell - 1)
-    return Patches(origin, *(x.reshape(n, -1) for x in (values, inside, valid)), du, dv, cell, side)
+    origin = np.asarray(first + 0.5 * (side * cell - 1), dtype=np.float64)
+    flat = (n, side * side)
+    return Patches(origin, values.reshape(flat), inside.reshape(flat), valid.reshape(flat), du, dv, cell, side)
 
 
 def chunks(rows: Ints, window: Window) -> list[Ints]:

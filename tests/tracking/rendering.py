@@ -15,7 +15,7 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(4)
 
 @dataclass(frozen=True)
 class Spot:
-    """Centre (px), 1-sigma axes (px), angle of the major one (degrees, +u to +v), peak of the unintegrated profile (DN)."""
+    """Centre (px), peak before pixels integrate it (DN), 1-sigma axes (px), the major one's angle (deg, +u to +v)."""
 
     u: float
     v: float
@@ -129,12 +129,11 @@ def bound(spot: Spot, scene: Scene, saturation: float = np.inf, step: float = 1e
         return whole[where]
 
     rows = [(moved(**{k: step}) - moved(**{k: -step})) / (2 * step) for k in ("u", "v", "major", "minor")]
-    tilted = Spot(**{**spot.__dict__, "angle": spot.angle})
     a = np.radians(spot.angle)
     vv, uu = np.mgrid[where]
     p = (uu - spot.u) * np.cos(a) + (vv - spot.v) * np.sin(a)
     q = -(uu - spot.u) * np.sin(a) + (vv - spot.v) * np.cos(a)
-    rows += [base * p * q, base, np.ones_like(base), uu - tilted.u, vv - tilted.v]
+    rows += [base * p * q, base, np.ones_like(base), uu - spot.u, vv - spot.v]
     J = np.stack([r.reshape(-1) for r in rows])
     d = np.sqrt(np.einsum("kp,p,kp->k", J, weight.reshape(-1), J)) + 1e-300
     J = J / d[:, None]
