@@ -57,8 +57,9 @@ format: setup  ## Format the code and mend what the linter can mend
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-bench-tracking: setup  ## The tracking figures, on fresh seeds
+bench-tracking: setup  ## The tracking figures on fresh seeds, and the cost of a whole run
 	$(BIN)/python -m bench.tracking
+	$(BIN)/python -m bench.whole_run
 
 bench-detection: setup  ## The detection figures, on fresh seeds
 	$(BIN)/python -m bench.detection
