@@ -68,7 +68,7 @@ def outer_spot(O: Array, A: Array, B: Array, alpha: float, beta: float, toleranc
 
 
 def middle_spot(O: Array, A: Array, C: Array, alpha: float, beta: float, world_from_screen: Pose) -> Array:
-    """B (..., 3), m: the spot between A and C, of a beam at `alpha` from A's and `beta` from C's (rad). nan if it misses.
+    """B (..., 3), m: the spot between A and C, of a beam `alpha` from A's and `beta` from C's (rad); nan if it misses.
 
     The middle beam has no form like eq. (14): OA is turned towards OC by the share alpha / (alpha + beta) of the angle
     AOC as measured, then met with the screen. Source: ours.

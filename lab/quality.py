@@ -53,8 +53,8 @@ def judge(
         doubts.append(f"{share:.1%} of the frames have a measured pose (usual: {GOOD_MEASURED:.0%} and more)")
     if misfit > MOST_MISFIT:
         failures.append(
-            f"the spots lie {misfit:.1f} times as far from the fitted pose as their sigmas allow (gate: {MOST_MISFIT:g}):"
-            " the rig file does not describe this set-up"
+            f"the spots lie {misfit:.1f} times as far from the fitted pose as their sigmas allow (gate:"
+            f" {MOST_MISFIT:g}): the rig file does not describe this set-up"
         )
     elif misfit > GOOD_MISFIT:
         doubts.append(

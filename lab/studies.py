@@ -146,8 +146,8 @@ def _bends(run: PointRun) -> Bools:
 def same_spots(run: PointRun, sigma_a_px_s2: float, switch: bool) -> Array:
     """(T, n, 2): prediction error, px, of filters that are given each spot's own noisy position, without clutter.
 
-    So nothing but the filter differs. With `switch` a spot beyond r1 from its prediction, or beyond
-    what its covariance allows, restarts its filter by eq. (6). A spot out of the picture is not given; its filter starts anew when it returns.
+    So nothing but the filter differs. With `switch` a spot beyond r1 from its prediction, or beyond what its covariance
+    allows, restarts its filter by eq. (6). A spot out of the picture is not given; its filter starts anew on return.
     """
     rng = np.random.default_rng([run.seed, 51])
     z = run.uv_px + run.noise_px * rng.standard_normal(run.uv_px.shape)

@@ -33,7 +33,7 @@ def predict(x: Array, P: Array, dt_s: float, sigma_a_px_s2: Array) -> tuple[Arra
 
 
 def innovation(x: Array, P: Array, z: Array, R: Array) -> tuple[Array, Array, Array]:
-    """What positions z (..., 2), px, with covariances R (..., 2, 2) add: y = z - Hx, its covariance S, y S^-1 y (...)."""
+    """What positions z (..., 2), px, with covariances R (..., 2, 2) add: y = z - Hx, its covariance S, and y S^-1 y."""
     y = z - x[..., :2]
     S = P[..., :2, :2] + R
     nis = np.sum(y * np.linalg.solve(S, y[..., None])[..., 0], axis=-1)

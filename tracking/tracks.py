@@ -73,7 +73,7 @@ class Tracks:
     def update(
         self, z: Array, R: Array, use: Bools, measured: Bools, turned: Bools, parameters: TrackerParameters
     ) -> None:
-        """Take positions z (n, 2), px, covariances R (n, 2, 2), where `use` (n,): Kalman's update, or eq. (6) at a bend.
+        """Take positions z (n, 2), px, covariances R (n, 2, 2) where `use` (n,): Kalman's update or eq. (6) at a bend.
 
         measured (n,): they are detections, from which the acceleration is learnt; turned (n,): found by the second
         search.
