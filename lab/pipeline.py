@@ -58,7 +58,8 @@ class Pipeline:
         if run.prior is None:
             raise InputError(
                 f"{run.path}: prior: expected where the vehicle is at the first frame, found none: the first labels"
-                " need it. Add prior: {position_m: [0, 0, 0], yaw_pitch_roll_deg: [0, 0, 0], within_m: 0.5, within_deg: 30}"
+                " need it. Add prior: {position_m: [0, 0, 0], yaw_pitch_roll_deg: [0, 0, 0], within_m: 0.5,"
+                " within_deg: 30}"
             )
         reader = open_frames(run)
         noise: dict[str, SensorNoise | NoiseModel] = {}
