@@ -86,7 +86,7 @@ class TableWriter:
         t, head = record.tracked, f"{record.frame},{_number(record.t_s)}"
         status = t.pose_status.value
         if t.pose is None or t.pose_covariance is None:
-            empty = "," * (len(columns.ATTITUDE) - 4)
+            empty = "," * len(columns.ATTITUDE[2:-3])  # the pose itself
             self._open["attitude.csv"].write(f"{head}{empty},{t.spots_used},,{status}\n")
             self._open["beams.csv"].writelines(f"{head},{b},,,,,,,{status}\n" for b in self._beams)
             return
