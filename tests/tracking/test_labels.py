@@ -108,9 +108,9 @@ def test_labels_are_right_from_a_wide_prior_among_clutter(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["fan", "four-skew-beams"])
-def test_labels_are_right_from_a_wide_prior_among_clutter_over_400_poses(name):
-    right, wrong = rates(RIGS[name](), 400, seed=2)
+@pytest.mark.parametrize(("name", "poses"), [("fan", 400), ("four-skew-beams", 150)])
+def test_labels_are_right_from_a_wide_prior_among_clutter_over_hundreds_of_poses(name, poses):
+    right, wrong = rates(RIGS[name](), poses, seed=2)
     assert right >= 0.97
     assert wrong <= 0.01
 
@@ -271,11 +271,11 @@ def test_points_that_are_no_spots_are_no_vehicle(name):
 
 @pytest.mark.slow
 def test_points_that_are_no_spots_are_hardly_ever_a_vehicle():
-    """Eight false points per picture, a hundred times."""
+    """Eight false points per picture, sixty times."""
     rig = RIGS["fan"]()
     model, rng = SpotModel.of(rig), np.random.default_rng(16)
     chosen = 0
-    for _ in range(100):
+    for _ in range(60):
         picture = photograph(model, Pose.identity(), rng, hidden=tuple(rig.spots), false_points=8)
         chosen += find_labels(rig, model, picture.detections, WIDE).chosen is not None
     assert chosen <= 1

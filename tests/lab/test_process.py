@@ -1,0 +1,395 @@
+"""From a run folder to its results: every file, every row, honest numbers; complete or absent."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from lab import columns, process
+from lab.batch import process_batch
+from lab.errors import InputError, RunError
+from lab.pipeline import Pipeline
+from lab.process import are_results, process_run
+from lab.quality import LEAST_MEASURED
+from lab.run_file import load_run
+from lab.simulate.scenarios import SCENARIOS, Fault
+from lab.simulate.write import simulate
+from tests.lab.run_folders import write_run
+
+FILES = ("attitude.csv", "beams.csv", "covariance.csv", "detections.csv", "report.html", "spots.csv", "summary.json")
+HEADERS = {"attitude.csv": columns.ATTITUDE, "beams.csv": columns.BEAMS, "covariance.csv": columns.COVARIANCE,
+           "detections.csv": columns.DETECTIONS, "spots.csv": columns.SPOTS}  # fmt: skip
+FRAMES = 14
+# Frame 4 in no camera; 6 and 7 only in the right one; 9 damaged in the right one.
+DAMAGED = replace(
+    SCENARIOS["smooth"],
+    faults=(
+        Fault(4, "dropped"),
+        Fault(6, "dropped", "left"),
+        Fault(7, "dropped", "left"),
+        Fault(9, "truncated", "right"),
+    ),
+)
+
+
+def rows_of(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(p.name for p in folder.iterdir())
+
+
+def points_run(folder: Path, frames: int = 12, seed: int = 5) -> Path:
+    return simulate("smooth", folder, seed=seed, frames=frames, detections_only=True)
+
+
+@pytest.fixture(scope="module")
+def run_folder(tmp_path_factory) -> Path:
+    """Half-size pictures with missing and damaged ones."""
+    return simulate(DAMAGED, tmp_path_factory.mktemp("process") / "run", seed=5, frames=FRAMES, picture_scale=0.5)
+
+
+@pytest.fixture(scope="module")
+def results(run_folder) -> Path:
+    out = run_folder.parent / "results"
+    process_run(run_folder, out)
+    return out
+
+
+@pytest.fixture(scope="module")
+def tables(results) -> dict[str, list[dict[str, str]]]:
+    return {name: rows_of(results / name) for name in HEADERS}
+
+
+# -- files and rows ---------------------------------------------------------------------------------------------------
+
+
+def test_all_files_of_the_contract_are_there_and_no_other(results):
+    assert names(results) == sorted(FILES)
+
+
+def test_no_half_written_folder_is_left_beside_the_results(results, run_folder):
+    assert names(results.parent) == ["results", "run"]
+
+
+@pytest.mark.parametrize("name", HEADERS)
+def test_every_line_has_exactly_the_columns_in_their_order(results, name):
+    with (results / name).open(newline="", encoding="utf-8") as file:
+        lines = list(csv.reader(file))
+    assert tuple(lines[0]) == HEADERS[name]
+    assert {len(line) for line in lines} == {len(HEADERS[name])}
+
+
+def test_attitude_has_a_row_for_every_frame_number_dropped_ones_too(tables):
+    assert [int(r["frame"]) for r in tables["attitude.csv"]] == list(range(FRAMES))
+    np.testing.assert_allclose([float(r["t_s"]) for r in tables["attitude.csv"]], np.arange(FRAMES) / 100)
+
+
+def test_spots_has_a_row_for_every_frame_camera_and_spot(tables, run_folder):
+    views = load_run(run_folder).rig.views()
+    assert [(int(r["frame"]), r["camera"], r["spot"]) for r in tables["spots.csv"]] == [
+        (k, c, s) for k in range(FRAMES) for c, s in views
+    ]
+
+
+def test_beams_has_a_row_for_every_frame_and_beam(tables, run_folder):
+    beams = load_run(run_folder).rig.beams
+    assert [(int(r["frame"]), r["beam"]) for r in tables["beams.csv"]] == [(k, b) for k in range(FRAMES) for b in beams]
+
+
+def test_covariance_has_a_row_for_every_frame_with_a_pose(tables):
+    with_pose = [r["frame"] for r in tables["attitude.csv"] if r["status"] != "lost"]
+    assert [r["frame"] for r in tables["covariance.csv"]] == with_pose
+
+
+def test_a_picture_that_is_missing_or_damaged_is_no_image(tables):
+    gone = {(4, "left"), (4, "right"), (6, "left"), (7, "left"), (9, "right")}
+    found = {(int(r["frame"]), r["camera"]) for r in tables["spots.csv"] if r["status"] == "no_image"}
+    assert found == gone
+    assert gone.isdisjoint({(int(r["frame"]), r["camera"]) for r in tables["detections.csv"]})
+
+
+def test_quaternions_are_unit_and_have_w_not_negative(tables):
+    q = np.array([[float(r[n]) for n in ("qw", "qx", "qy", "qz")] for r in tables["attitude.csv"] if r["qw"]])
+    assert np.all(q[:, 0] >= 0)
+    np.testing.assert_allclose(np.linalg.norm(q, axis=1), 1.0, atol=1e-9)
+
+
+def test_statuses_and_numbers_go_together(tables):
+    for r in tables["spots.csv"]:
+        empty = r["status"] in ("off_screen", "lost")
+        assert (r["u_px"] == "") == (r["v_px"] == "") == (r["sigma_u_px"] == "") == empty
+        assert (r["gain"] == "") or r["status"] in ("matched", "turned")
+    for r in tables["attitude.csv"]:
+        assert (r["x_m"] == "") == (r["status"] == "lost")
+    text = {v.lower() for name in HEADERS for r in tables[name] for v in r.values()}
+    assert text.isdisjoint({"nan", "inf", "-inf", "none"})
+
+
+def test_measured_poses_lie_within_their_sigmas_of_the_truth(tables, run_folder):
+    truth = {r["frame"]: r for r in rows_of(run_folder / "truth/pose.csv")}
+    squares = [
+        ((float(r[f"{axis}_m"]) - float(truth[r["frame"]][f"{axis}_m"])) / float(r[f"sigma_{axis}_m"])) ** 2
+        for r in tables["attitude.csv"]
+        if r["status"] == "measured"
+        for axis in "xyz"
+    ]
+    assert len(squares) >= 3 * 9
+    assert 0.3 < np.mean(squares) < 3.0
+
+
+# -- summary ----------------------------------------------------------------------------------------------------------
+
+
+def test_the_summary_counts_what_the_tables_hold(results, tables):
+    summary = json.loads((results / "summary.json").read_text("utf-8"))
+    counts = summary["counts"]
+    assert counts["frames"] == FRAMES
+    assert counts["pose_status"] == dict(Counter(r["status"] for r in tables["attitude.csv"]))
+    for view, statuses in counts["spot_status"].items():
+        camera, spot = view.split("/")
+        here = Counter(r["status"] for r in tables["spots.csv"] if (r["camera"], r["spot"]) == (camera, spot))
+        assert statuses == dict(here)
+    assert counts["no_image"] == {"left": [[4, 4], [6, 7]], "right": [[4, 4], [9, 9]]}
+    found = Counter(r["camera"] for r in tables["detections.csv"])
+    assert counts["detections_per_frame"] == pytest.approx({c: n / FRAMES for c, n in found.items()})
+    assert summary["rates"]["measured_share"] == counts["pose_status"]["measured"] / FRAMES
+
+
+def test_the_summary_says_what_went_in_and_what_was_done(results, run_folder):
+    summary = json.loads((results / "summary.json").read_text("utf-8"))
+    assert {Path(e["path"]).name for e in summary["inputs"]} == {"run.yaml", "rig.yaml", "left", "right"}
+    assert summary["parameters"]["tracker"]["r1_px"] == 10.0
+    assert summary["parameters"]["prior"]["within_m"] == pytest.approx(1.0)
+    assert summary["parameters"]["prior"]["within_deg"] == pytest.approx(30.0)
+    assert {"python", "numpy", "beampose"} <= set(summary["versions"])
+    assert summary["errors"] is not None  # there is truth
+    assert summary["verdict"]["exit_status"] in (0, 4)
+    assert all(s >= 0 for s in summary["timings"].values())
+
+
+def test_the_summary_is_strict_json(results):
+    def refuse(word):
+        raise AssertionError(f"{word} is no JSON")
+
+    json.loads((results / "summary.json").read_text("utf-8"), parse_constant=refuse)
+
+
+def test_without_truth_there_are_no_errors(tmp_path):
+    folder = points_run(tmp_path / "run")
+    for file in (folder / "truth").iterdir():
+        file.unlink()
+    (folder / "truth").rmdir()
+    outcome = process_run(folder, tmp_path / "out")
+    assert outcome.errors is None
+    assert json.loads((tmp_path / "out/summary.json").read_text())["errors"] is None
+
+
+# -- the outcome ------------------------------------------------------------------------------------------------------
+
+
+def test_the_outcome_its_line_and_the_summary_agree(tmp_path):
+    folder = points_run(tmp_path / "run")
+    outcome = process_run(folder, tmp_path / "out")
+    summary = json.loads((tmp_path / "out/summary.json").read_text())
+    assert (outcome.frames, outcome.measured) == (12, summary["counts"]["pose_status"]["measured"])
+    assert outcome.verdict.status == summary["verdict"]["status"] == "pass"
+    assert outcome.exit_status == summary["verdict"]["exit_status"] == 0
+    assert outcome.line() == (
+        f"smooth-5: PASS: 12 of 12 frames measured ({outcome.verdict.reasons[0]}) -> {tmp_path / 'out'}"
+    )
+
+
+def test_a_run_in_which_the_vehicle_is_never_found_is_a_failed_gate_with_all_its_files(tmp_path):
+    """Grey pictures without any spot: processed, and exit status 4."""
+    folder = write_run(tmp_path / "run")
+    outcome = process_run(folder, tmp_path / "out")
+    assert outcome.exit_status == 4
+    assert outcome.measured == 0
+    assert "never found" in outcome.line()
+    assert names(tmp_path / "out") == sorted(FILES)
+    attitude = rows_of(tmp_path / "out/attitude.csv")
+    assert [r["status"] for r in attitude] == ["lost"] * 5
+    assert {r["status"] for r in rows_of(tmp_path / "out/spots.csv")} == {"lost"}
+    assert rows_of(tmp_path / "out/covariance.csv") == []
+
+
+def test_a_run_that_is_dark_for_most_of_its_frames_fails_the_gate(tmp_path):
+    folder = points_run(tmp_path / "run", frames=40)
+    table = folder / "detections.csv"
+    lines = table.read_text().splitlines(keepends=True)
+    few = int(40 * LEAST_MEASURED) - 2
+    table.write_text(
+        "".join(ln for i, ln in enumerate(lines) if i == 0 or int(ln.split(",")[0]) < few or ln.startswith("39,"))
+    )
+    outcome = process_run(folder, tmp_path / "out")
+    assert outcome.frames == 40
+    assert outcome.exit_status == 4
+
+
+def test_the_same_run_gives_the_same_tables(tmp_path, run_folder, results):
+    process_run(run_folder, tmp_path / "again")
+    for name in HEADERS:
+        assert (tmp_path / "again" / name).read_bytes() == (results / name).read_bytes()
+
+
+def test_detections_that_were_written_can_be_the_input(tmp_path, run_folder, results):
+    """A run from its own detections.csv: the same poses without the pictures, to the digits written."""
+    run = yaml.safe_load((run_folder / "run.yaml").read_text())
+    other = tmp_path / "run"
+    other.mkdir()
+    (other / "rig.yaml").write_bytes((run_folder / "rig.yaml").read_bytes())
+    (other / "detections.csv").write_bytes((results / "detections.csv").read_bytes())
+    run["cameras"] = {name: {"detections": "detections.csv"} for name in run["cameras"]}
+    (other / "run.yaml").write_text(yaml.safe_dump(run))
+    process_run(other, tmp_path / "out")
+    for a, b in zip(rows_of(tmp_path / "out/attitude.csv"), rows_of(results / "attitude.csv"), strict=True):
+        if a["status"] == b["status"] == "measured" and a["spots_used"] == b["spots_used"]:
+            assert float(a["yaw_deg"]) == pytest.approx(float(b["yaw_deg"]), abs=1e-5)
+
+
+def test_overrides_replace_parameters_of_the_run_and_reach_inner_blocks(tmp_path):
+    folder = points_run(tmp_path / "run")
+    process_run(folder, tmp_path / "out", overrides={"r1_px": 12.0, "labels.p_detect": 0.9, "method": "rigid"})
+    tracker = json.loads((tmp_path / "out/summary.json").read_text())["parameters"]["tracker"]
+    assert (tracker["r1_px"], tracker["labels"]["p_detect"], tracker["method"]) == (12.0, 0.9, "rigid")
+    assert tracker["r2_px"] == 30.0
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        ({"r1_pz": 3}, r"--set: unknown key 'r1_pz'.*did you mean 'r1_px'"),
+        ({"labels.p_detct": 3}, r"--set: labels.*'p_detct'.*did you mean 'p_detect'"),
+        ({"lables.p_detect": 3}, r"'lables'.*did you mean 'labels'"),
+        ({"r1_px.x": 3}, r"--set: .*r1_px\.x"),
+        ({"r1_px": "wide"}, r"--set: r1_px: expected a finite number, got 'wide'"),
+        ({"method": "magic"}, r"--set: method: expected .*spots.*rigid.*'magic'"),
+    ],
+)
+def test_a_wrong_override_is_a_plain_error_and_nothing_is_written(tmp_path, overrides, words):
+    folder = points_run(tmp_path / "run", frames=3)
+    with pytest.raises(InputError, match=words):
+        process_run(folder, tmp_path / "out", overrides=overrides)
+    assert names(tmp_path) == ["run"]
+
+
+def test_a_run_without_a_prior_says_what_to_add(tmp_path):
+    folder = points_run(tmp_path / "run", frames=3)
+    content = yaml.safe_load((folder / "run.yaml").read_text())
+    del content["prior"]
+    (folder / "run.yaml").write_text(yaml.safe_dump(content))
+    with pytest.raises(InputError, match=r"run\.yaml: prior: expected where the vehicle is .*Add prior: \{position_m"):
+        Pipeline.of(load_run(folder))
+    with pytest.raises(InputError, match="prior"):
+        process_run(folder, tmp_path / "out")
+    assert names(tmp_path) == ["run"]
+
+
+def test_what_the_error_says_to_add_is_what_makes_it_work(tmp_path):
+    folder = points_run(tmp_path / "run", frames=3)
+    content = yaml.safe_load((folder / "run.yaml").read_text())
+    del content["prior"]
+    (folder / "run.yaml").write_text(yaml.safe_dump(content))
+    with pytest.raises(InputError) as caught:
+        process_run(folder, tmp_path / "out")
+    advice = str(caught.value).split("Add ")[1]
+    with (folder / "run.yaml").open("a") as file:
+        file.write(advice + "\n")
+    assert process_run(folder, tmp_path / "out").frames == 3
+
+
+# -- complete or absent -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("error", [RunError("the disk is full"), KeyboardInterrupt(), RuntimeError("a bug")])
+def test_a_run_that_breaks_in_the_middle_leaves_nothing(tmp_path, monkeypatch, error):
+    folder = points_run(tmp_path / "run")
+    write = process.TableWriter.write
+
+    def break_at_frame_6(self, record):
+        if record.frame == 6:
+            raise error
+        write(self, record)
+
+    monkeypatch.setattr(process.TableWriter, "write", break_at_frame_6)
+    with pytest.raises(type(error)):
+        process_run(folder, tmp_path / "out")
+    assert names(tmp_path) == ["run"]
+
+
+def test_a_run_that_breaks_leaves_earlier_results_as_they_were(tmp_path, monkeypatch):
+    folder = points_run(tmp_path / "run", frames=4)
+    out = tmp_path / "out"
+    process_run(folder, out)
+    before = {p.name: p.read_bytes() for p in out.iterdir()}
+
+    def fail(*_):
+        raise RunError("the disk is full")
+
+    monkeypatch.setattr(process, "_write_json", fail)
+    with pytest.raises(RunError):
+        process_run(folder, out)
+    assert {p.name: p.read_bytes() for p in out.iterdir()} == before
+    assert names(tmp_path) == ["out", "run"]
+
+
+def test_earlier_results_are_replaced_as_a_whole(tmp_path):
+    out = tmp_path / "out"
+    process_run(points_run(tmp_path / "long", frames=6), out)
+    (out / "left-over.txt").write_text("from an older version")
+    process_run(points_run(tmp_path / "short", frames=4), out)
+    assert names(out) == sorted(FILES)
+    assert len(rows_of(out / "attitude.csv")) == 4
+
+
+def test_a_foreign_folder_is_not_deleted(tmp_path):
+    folder = points_run(tmp_path / "run", frames=3)
+    foreign = tmp_path / "photos"
+    foreign.mkdir()
+    (foreign / "summary.json").write_text('{"schema": "another program"}')
+    with pytest.raises(InputError, match="something other than earlier results"):
+        process_run(folder, foreign)
+    assert names(foreign) == ["summary.json"]
+    with pytest.raises(InputError, match="something other than earlier results"):
+        process_run(folder, folder)  # the run folder itself
+    assert (folder / "run.yaml").is_file()
+
+
+@pytest.mark.parametrize("content", [None, "", "[]", "3", "{}", '{"schema": "beampose/run/1"}', "\xff"])
+def test_what_is_no_summary_of_ours_is_no_result(tmp_path, content):
+    if content is not None:
+        (tmp_path / "summary.json").write_bytes(content.encode("latin-1"))
+    assert not are_results(tmp_path)
+
+
+def test_results_are_results(results):
+    assert are_results(results)
+
+
+def test_progress_counts_every_frame(tmp_path):
+    told = []
+    process_run(
+        points_run(tmp_path / "run", frames=7),
+        tmp_path / "out",
+        progress=lambda done, total: told.append((done, total)),
+    )
+    assert [done for done, _ in told] == list(range(1, 8))
+    assert {total for _, total in told} <= {7, None}
+
+
+def test_a_batch_of_one_is_the_run(tmp_path):
+    folder = points_run(tmp_path / "run", frames=4)
+    process_run(folder, tmp_path / "one")
+    process_batch([folder], tmp_path / "many")
+    for name in HEADERS:
+        assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "many/run" / name).read_bytes()
