@@ -1,8 +1,8 @@
 """What a whole `run` costs: `python -m bench.whole_run` prints process time against reading the files, and peak memory.
 
 Time: `beampose run` on simulated 1280x1024 PNG files against plain cv2.imread over the same files, each in a process of
-its own, in turn, user + system time of all threads. Memory: peak resident size of runs of 300 and of 3000 frames (points;
-and pictures with --pictures-memory, which takes some minutes and gigabytes of disk).
+its own, in turn, user + system time of all threads. Memory: peak resident size of runs of 300 and of 3000 frames
+(points; and pictures with --pictures-memory, which takes some minutes and gigabytes of disk).
 """
 
 from __future__ import annotations
