@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from lab.errors import QUALITY_GATE_FAILED, BeamposeError, CalibrationError, InputError, RunError
-from lab.process import Outcome, Progress, process_run
+from lab.process import Outcome, Progress, overridden, process_run
+from tracking.parameters import TrackerParameters
 
 COLUMNS = (
     "run", "name", "status", "exit_status", "frames", "measured_frames", "measured_share", "seconds", "results",
@@ -50,6 +51,7 @@ def process_batch(
     """
     if not run_folders:
         raise InputError("batch: expected one or more run folders, got none")
+    overridden(TrackerParameters(), overrides or {})  # a misspelt parameter is the command's mistake, not each run's
     names = _names(run_folders)
     out = Path(out)
     if out.exists() and not out.is_dir():

@@ -121,7 +121,7 @@ def process_run(
     started = time.perf_counter()
     run = load_run(run_folder)
     if overrides:
-        run = dataclasses.replace(run, tracker=_overridden(run.tracker, overrides))
+        run = dataclasses.replace(run, tracker=overridden(run.tracker, overrides))
     with whole_folder(out, may_replace=are_results) as work:
         pipeline = Pipeline.of(run)
         tally = _Tally(tuple(run.rig.cameras), tuple(f"{c}/{s}" for c, s in SpotModel.of(run.rig).views))
@@ -157,7 +157,7 @@ def are_results(folder: Path) -> bool:
         return False
 
 
-def _overridden(parameters: TrackerParameters, overrides: Mapping[str, Any]) -> TrackerParameters:
+def overridden(parameters: TrackerParameters, overrides: Mapping[str, Any]) -> TrackerParameters:
     """Parameters with some replaced, checked like those of a file; dotted names reach the inner blocks."""
     content = dataclasses.asdict(parameters)
     for name, value in overrides.items():

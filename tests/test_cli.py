@@ -13,9 +13,15 @@ from pathlib import Path
 
 import click
 import pytest
+import yaml
+from click.testing import CliRunner, Result
 
 from cli import main
+from lab import batch, process
+from lab.errors import CalibrationError, InputError, RunError
 from lab.simulate.scenarios import SCENARIOS
+from lab.simulate.write import simulate
+from tests.lab.run_folders import write_run
 
 ROOT = Path(__file__).resolve().parents[1]
 SAMPLE = ROOT / "sample_runs" / "huo2015"
@@ -182,3 +188,124 @@ def test_the_version_is_that_of_the_installed_package(desk):
     except PackageNotFoundError:
         pytest.skip("beampose is not installed: make setup")
     assert installed in beampose(desk, "--version").stdout
+
+
+# -- in this process: what can go wrong inside a command --------------------------------------------------------------
+
+
+def typed(*arguments: str | Path) -> Result:
+    return CliRunner().invoke(main, [str(a) for a in arguments])
+
+
+def points_run(folder: Path) -> Path:
+    return simulate("smooth", folder, seed=5, frames=5, detections_only=True)
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "words"),
+    [
+        (RunError("frames/left: the disk went away"), 1, "beampose: frames/left: the disk went away"),
+        (InputError("rig.yaml: cameras: expected some"), 2, "beampose: rig.yaml: cameras: expected some"),
+        (CalibrationError("rig.yaml: out of date"), 3, "beampose: rig.yaml: out of date"),
+        (
+            OSError(28, "No space left on device", "out/spots.csv"),
+            1,
+            "beampose: out/spots.csv: No space left on device",
+        ),
+        (OSError("odd"), 1, "beampose: odd"),
+        (MemoryError(), 1, "beampose: out of memory"),
+        (KeyboardInterrupt(), 1, "beampose: stopped"),
+    ],
+)
+def test_every_kind_of_error_is_a_plain_line_with_its_exit_status(tmp_path, monkeypatch, error, status, words):
+    def fail(*_, **__):
+        raise error
+
+    monkeypatch.setattr(process, "process_run", fail)
+    done = typed("run", tmp_path, "--out", tmp_path / "out")
+    assert done.exit_code == status
+    assert done.stderr.strip() == words
+    assert done.stdout.strip() == ""
+
+
+def test_a_failed_quality_gate_is_exit_status_4_and_the_report_says_the_same(tmp_path):
+    done = typed("run", write_run(tmp_path / "grey"), "--out", tmp_path / "out")
+    assert done.exit_code == 4
+    assert done.stdout.startswith("small: FAIL: 0 of 5 frames measured (the vehicle was never found")
+    assert done.stderr == ""
+    assert json.loads((tmp_path / "out/summary.json").read_text())["verdict"]["exit_status"] == 4
+    assert "never found" in (tmp_path / "out/report.html").read_text("utf-8")
+
+
+def test_a_run_that_passes_is_exit_status_0_and_one_line(tmp_path):
+    done = typed("run", points_run(tmp_path / "run"), "--out", tmp_path / "out")
+    assert (done.exit_code, done.stderr) == (0, "")
+    (line,) = done.stdout.splitlines()
+    assert line.startswith("smooth-5: PASS: 5 of 5 frames measured")
+    assert line.endswith(f"-> {tmp_path / 'out'}")
+
+
+def test_a_misspelt_parameter_gets_a_suggestion(tmp_path):
+    done = typed("run", points_run(tmp_path / "run"), "--out", tmp_path / "out", "--set", "omega_1=0.5")
+    assert done.exit_code == 2
+    assert "unknown key 'omega_1'" in done.stderr
+    assert "did you mean 'omega1'" in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_parameters_are_read_as_yaml_and_reach_the_run(tmp_path):
+    settings = ("r1_px=12", "detect.threshold_sigma=5.5", "curve_switch=false", "g1_scale=paper")
+    options = [o for s in settings for o in ("--set", s)]
+    done = typed("run", points_run(tmp_path / "run"), "--out", tmp_path / "out", *options)
+    assert done.exit_code == 0, done.stderr
+    tracker = json.loads((tmp_path / "out/summary.json").read_text())["parameters"]["tracker"]
+    assert (tracker["r1_px"], tracker["detect"]["threshold_sigma"]) == (12, 5.5)
+    assert (tracker["curve_switch"], tracker["g1_scale"]) == (False, "paper")
+
+
+def test_a_run_without_a_prior_is_told_what_to_add(tmp_path):
+    folder = points_run(tmp_path / "run")
+    content = yaml.safe_load((folder / "run.yaml").read_text())
+    del content["prior"]
+    (folder / "run.yaml").write_text(yaml.safe_dump(content))
+    done = typed("run", folder, "--out", tmp_path / "out")
+    assert done.exit_code == 2
+    assert "run.yaml: prior: expected" in done.stderr
+    assert "position_m: [0, 0, 0]" in done.stderr
+    assert len(done.stderr.splitlines()) <= 2
+
+
+def test_a_batch_says_what_became_of_each_and_ends_with_the_worst(tmp_path):
+    good, grey = points_run(tmp_path / "good"), write_run(tmp_path / "grey")
+    for runs, status in (([good], 0), ([good, grey], 4), ([grey, tmp_path / "nowhere", good], 1)):
+        done = typed("batch", *runs, "--out", tmp_path / f"out{status}")
+        assert done.exit_code == status
+        with (tmp_path / f"out{status}" / "batch.csv").open() as table:
+            assert [Path(r["run"]) for r in csv.DictReader(table)] == runs
+        assert [line.split(":")[0] for line in done.stdout.splitlines()] == [*(r.name for r in runs), "table", "index"]
+
+
+def test_a_misspelt_parameter_stops_a_batch_before_its_first_run(tmp_path):
+    done = typed("batch", points_run(tmp_path / "a"), "--out", tmp_path / "out", "--set", "r1_pz=3")
+    assert done.exit_code == 2
+    assert "did you mean 'r1_px'" in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_batch_that_is_stopped_says_so(tmp_path, monkeypatch):
+    def stop(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(batch, "process_run", stop)
+    done = typed("batch", tmp_path / "a", "--out", tmp_path / "out")
+    assert done.exit_code == 1
+    assert done.stderr.strip() == "beampose: stopped"
+
+
+def test_a_foreign_folder_is_not_replaced(tmp_path):
+    (tmp_path / "thesis").mkdir()
+    (tmp_path / "thesis/chapter.tex").write_text("years")
+    done = typed("run", points_run(tmp_path / "run"), "--out", tmp_path / "thesis")
+    assert done.exit_code == 2
+    assert "something other than earlier results" in done.stderr
+    assert (tmp_path / "thesis/chapter.tex").read_text() == "years"

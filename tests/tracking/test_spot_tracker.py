@@ -15,6 +15,7 @@ from lab.simulate.scenarios import SCENARIOS, Clutter, Hiding
 from tracking.detections import Detections
 from tracking.labels import PosePrior
 from tracking.match import UNMATCHED
+from tracking.out_of_view import CoplanarViews, quadratic_positions
 from tracking.parameters import TrackerParameters
 from tracking.spot_tracker import SpotTracker
 from tracking.statuses import PoseStatus, SpotStatus
@@ -430,6 +431,49 @@ def test_no_detection_serves_two_spots():
             for c in range(2):
                 taken = point[(t.run.model.camera_of == c) & (point != UNMATCHED)]
                 assert len(set(taken.tolist())) == len(taken)
+
+
+def test_one_point_of_light_is_one_spot_even_where_two_lie_on_top_of_each_other():
+    """A fourth beam a tenth of a millimetre beside A: their spots melt, and one detection is there for two."""
+    run = simulate_points("static", 42, frames=30, clutter=0.0)
+    rig, a = run.rig, run.rig.beams["A"]
+    beams = {**rig.beams, "D": replace(a, name="D", point=a.point + np.array([0.0, 0.0, 1e-4]))}
+    more = {"7": replace(rig.spots["1"], name="7", beam="D"), "8": replace(rig.spots["4"], name="8", beam="D")}
+    tracker = SpotTracker(replace(rig, beams=beams, spots={**rig.spots, **more}), TrackerParameters(),
+                          PosePrior(run.poses[0], 0.1, 0.1))  # fmt: skip
+    camera_of = tracker.model.camera_of
+    for k in range(30):
+        f = tracker.step(0.01 if k else 0.0, run.detections[k])
+        assert f.pose_status is PoseStatus.MEASURED
+        for c in range(2):
+            taken = f.point[(camera_of == c) & (f.point != UNMATCHED)].tolist()
+            assert sorted(taken) == [0, 1, 2]  # each point once, though four spots are there
+
+
+def test_the_papers_way_puts_spots_outside_the_picture_where_its_quadratic_does():
+    run = simulate_points("smooth", 21, frames=120, clutter=0.0)
+    t = Tracked(run, track(run, PAPERS_OWN))
+    recipes = CoplanarViews.of(run.rig, run.model)
+    compared = 0
+    for f in t.frames:
+        seen = np.where(np.array([s.measured for s in f.status])[:, None], f.uv_px, np.nan)
+        solved = quadratic_positions(run.rig, run.model, recipes, seen)
+        for v in np.flatnonzero([s is SpotStatus.OUT_OF_VIEW for s in f.status]):
+            if np.isfinite(solved[v]).all():
+                np.testing.assert_allclose(f.uv_px[v], solved[v], atol=1e-9)
+                compared += 1
+    assert compared > 10
+
+
+def test_what_is_learnt_of_the_accelerations_makes_predictions_of_a_still_spot_better():
+    """Not 5000 px/s^2 as assumed at the start, but none: after two seconds the prediction is better than one point."""
+    run = simulate_points("static", 43, frames=300, clutter=0.0)
+    late = slice(200, 300)
+    rms = []
+    for learn in (True, False):
+        t = Tracked(run, track(run, TrackerParameters(learn_sigma_a=learn)))
+        rms.append(np.sqrt(np.mean((t.predicted_px - run.uv_px)[late] ** 2)))
+    assert rms[0] < run.noise_px < rms[1]
 
 
 def test_times_between_frames_may_vary():
