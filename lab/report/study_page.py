@@ -4,19 +4,16 @@ from __future__ import annotations
 
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from markupsafe import Markup
 
 from geometry.arrays import Array
+from lab.experiment_huo2015 import Study
 from lab.report import svg
 from lab.report.page import environment
 from lab.report.svg import Line, Scale, Shade
 from lab.yaml_text import write_whole
-
-if TYPE_CHECKING:
-    from lab.studies import Study
 
 U_COLOUR, V_COLOUR = "#0072b2", "#d55e00"
 _TRACK_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")  # told apart by all eyes

@@ -7,7 +7,8 @@ import csv
 import numpy as np
 import pytest
 
-from lab.studies import COLUMNS, NOISE_PX, repeat_huo2015, same_spots, study_huo2015
+from lab.experiment_huo2015 import NOISE_PX, repeat_huo2015, same_spots
+from lab.studies import COLUMNS, study_huo2015
 
 
 @pytest.fixture(scope="module")
