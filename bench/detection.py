@@ -13,7 +13,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from geometry.camera import SensorNoise
-from tests.tracking.rendering import Scene, Spot, bound, photograph
+from tests.tracking.rendering import Scene, Spot, bound, expected, expose
 from tracking.detect import find_spots
 
 SETS = ("main", "faint", "saturated", "near", "edge", "streak", "wide", "small", "speckle", "blank")
@@ -66,7 +66,8 @@ def run_set(kind: str, frames: int, seed: int) -> str:
     folder = Path(tempfile.mkdtemp())
     for _ in range(frames):
         scene = scene_of(kind, rng)
-        image = photograph(scene, rng)
+        mean = expected(scene, rng)
+        image = expose(mean, scene, rng)
         cv2.imwrite(str(folder / "frame.png"), image)
         start = time.process_time()
         image = cv2.imread(str(folder / "frame.png"), cv2.IMREAD_UNCHANGED)
@@ -85,7 +86,7 @@ def run_set(kind: str, frames: int, seed: int) -> str:
             taken.add(best)
             errors.append(found.uv_px[best] - [spot.u, spot.v])
             claimed.append(found.cov_px2[best])
-            crlb.append(bound(spot, scene, saturation=255))
+            crlb.append(bound(spot, scene, mean, saturation=255))
         false += len(found) - len(taken)
     time_ms, read_ms = spent / frames * 1e3, reading / frames * 1e3
     tail = f"{false / frames:9.3f} {time_ms:8.2f} {time_ms / read_ms:8.2f}"

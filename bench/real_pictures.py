@@ -39,7 +39,7 @@ def overlay(image: np.ndarray, found: Detections, zoom: int) -> np.ndarray:
     for rank, ((u, v), major, minor, angle) in enumerate(
         zip(found.uv_px, found.major_px, found.minor_px, found.angle_deg, strict=True)
     ):
-        centre = (int(round((u + 0.5) * zoom)), int(round((v + 0.5) * zoom)))
+        centre = (round(float(u + 0.5) * zoom), round(float(v + 0.5) * zoom))
         size = (max(int(2 * zoom * major), 3), max(int(2 * zoom * minor), 3))
         cv2.ellipse(canvas, centre, size, float(angle), 0, 360, (0, 255, 255), 1, cv2.LINE_AA)
         if rank < 40:

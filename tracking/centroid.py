@@ -6,10 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from geometry.arrays import Array, Bools, Ints
+from geometry.arrays import Array, Ints
 from tracking import ellipses
 from tracking.gaussian_fit import Spots, judged, solve, stepped
-from tracking.moments import adaptive_moments
 from tracking.noise import NoiseModel, Picture
 from tracking.patches import Patches, Window, chunks, cut, profile
 
@@ -18,8 +17,8 @@ _CONVERGED = 0.15  # of the centre's own sigma. The next step would be some hund
 _WINDOW = (
     3.2  # sigmas from centre to the window's side; 2.5 costs 8 % of the accuracy, for the plane is then badly known
 )
-_MOST_NEIGHBOURS = 8
-_MOST_CELLS = 36  # from a window's centre to its side
+_MOST_NEIGHBOURS = 6
+_MOST_CELLS = {1: 18, 2: 36, 4: 24}  # from a window's centre to its side, by the cells' size
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,20 +30,20 @@ class Measurement:
     sigma_flux: Array  # (n,), DN
     peak: Array  # (n,), DN above the plane, of the pixels
     chi2: Array  # (n,) per degree of freedom
-    explained: Array  # (n,) share of the light about the plane that the Gaussian explains
-    converged: Bools  # (n,)
+    explained: Array  # (n,) share of what stands out of the plane, beyond noise, that the Gaussian explains
 
 
 def measure(
-    image: Picture, start_uv_px: Array, background_dn: Array, noise: NoiseModel, saturation_dn: float
-) -> Measurement:
-    """Fit all candidates (n, 2), px, of a picture (h, w) together; background_dn (n,) is a first idea of theirs.
+    image: Picture, uv: Array, shape: Array, background_dn: Array, noise: NoiseModel, saturation_dn: float,
+    widest_px: float,
+) -> Measurement:  # fmt: skip
+    """Fit all candidates of a picture (h, w) together, from moments (uv (n, 2), px; shape (n, 3), px^2).
 
-    Adaptive elliptical moments give the start, Gauss-Newton steps follow. Clipped pixels, pixels outside and
-    hot pixels are left out; the light of the neighbours, as of the step before, is taken off.
+    background_dn (n,) is a first idea of theirs. Gauss-Newton steps from there; clipped pixels, pixels outside and hot
+    pixels are left out; the light of the neighbours, as of the step before, is taken off. A candidate that grows
+    beyond widest_px or walks away is given up: its cov_px2 stays nan.
     """
-    uv, shape = adaptive_moments(image, start_uv_px, background_dn)
-    return refine(image, first_guess(image, uv, shape, background_dn), noise, saturation_dn)
+    return refine(image, first_guess(image, uv, shape, background_dn), noise, saturation_dn, widest_px)
 
 
 def first_guess(image: Picture, uv: Array, shape: Array, background: Array) -> Spots:
@@ -57,15 +56,17 @@ def first_guess(image: Picture, uv: Array, shape: Array, background: Array) -> S
     return Spots(uv, shape, size * np.maximum(image[v, u] - background, 1.0), plane)
 
 
-def refine(image: Picture, spots: Spots, noise: NoiseModel, saturation_dn: float) -> Measurement:
+def refine(image: Picture, spots: Spots, noise: NoiseModel, saturation_dn: float, widest_px: float) -> Measurement:
     """Gauss-Newton from given spots, as long as their centres move."""
     n = len(spots.uv)
     state = Spots(spots.uv.copy(), spots.shape.copy(), spots.flux.copy(), spots.plane.copy())
     out = Measurement(
-        state, np.full((n, 2, 2), np.nan), np.full(n, np.nan), np.zeros(n), np.full(n, np.inf), np.zeros(n),
-        np.zeros(n, dtype=bool),
-    )  # fmt: skip
-    active: Ints = np.arange(n)
+        state, np.full((n, 2, 2), np.nan), np.full(n, np.nan), np.zeros(n), np.full(n, np.inf), np.zeros(n)
+    )
+    far = 3.0 + 2.0 * ellipses.axes(spots.shape)[0]
+    lost = ellipses.axes(spots.shape)[0] > 1.5 * widest_px  # moments see a spot too wide rather than too narrow
+    state.flux[lost] = 0.0
+    active: Ints = np.flatnonzero(~lost)
     for step in range(_STEPS):
         need = _half_widths(state.shape)
         near = _neighbours(state, need)
@@ -87,12 +88,18 @@ def refine(image: Picture, spots: Spots, noise: NoiseModel, saturation_dn: float
                     at = rows[done]
                     out.cov_px2[at], out.sigma_flux[at], out.peak[at] = quality.cov, quality.sigma_flux, quality.peak
                     out.chi2[at], out.explained[at] = quality.chi2, quality.explained
-        out.converged[active] = ~moved[active]
+        lost = (ellipses.axes(state.shape)[0] > 1.5 * widest_px) | (np.hypot(*(state.uv - spots.uv).T) > far)
+        state.flux[lost] = 0.0
+        moved &= ~lost
+        if step == _STEPS - 1:  # a centre that still moves is known no better than by that
+            last = (state.uv - before.uv)[active]
+            out.cov_px2[active] += last[:, :, None] * last[:, None, :]
         if len(near):
             moved[near[moved[near[:, 1]], 0]] = True
         active = np.flatnonzero(moved)
         if not len(active):
             break
+    out.cov_px2[state.flux <= 0] = np.nan
     return out
 
 
@@ -109,6 +116,7 @@ def _neighbours(spots: Spots, need: Array) -> Ints:
     # A window may be as large as that of the largest spot of its group (_windows).
     window = np.where(need <= 12, 13.0, np.where(need <= 36, need + 18.0, need + 36.0))
     gap = np.abs(spots.uv[:, None, :] - spots.uv[None, :, :]).max(axis=2) - 1.25 * need[None, :] - window[:, None]
+    gap[:, spots.flux <= 0] = np.inf
     np.fill_diagonal(gap, np.inf)
     if n > _MOST_NEIGHBOURS + 1 and ((gap < 0).sum(axis=1) > _MOST_NEIGHBOURS).any():
         nearest = np.partition(gap, _MOST_NEIGHBOURS, axis=1)[:, _MOST_NEIGHBOURS]
@@ -148,6 +156,6 @@ def _windows(shape: Array, need: Array, active: Ints) -> list[tuple[Window, Ints
     out = []
     for cell, members in groups:
         if members.any():
-            cells = np.clip(half[members].max() / cell, 7.0, _MOST_CELLS)
+            cells = np.clip(half[members].max() / cell, 7.0, _MOST_CELLS[cell])
             out.append((Window(int(np.ceil(cells)), cell), active[members]))
     return out

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from geometry.arrays import Array, Bools, Ints
@@ -9,7 +11,10 @@ from geometry.camera import SensorNoise
 from tracking import ellipses
 from tracking.candidates import find_candidates
 from tracking.centroid import Measurement, measure
+from tracking.compact import compact
 from tracking.detections import Detections
+from tracking.gaussian_fit import Spots
+from tracking.moments import adaptive_moments
 from tracking.noise import NoiseModel, Picture, guess_noise
 from tracking.parameters import DetectParameters
 
@@ -40,15 +45,21 @@ def find_spots(
     saturation = parameters.saturation_dn
     if saturation is None:
         saturation = float(np.iinfo(image.dtype).max)
-    uv, ground = find_candidates(image, model, parameters.threshold_sigma, 4 * parameters.max_detections)
-    uv, ground = uv[: parameters.max_detections], ground[: parameters.max_detections]
+    uv, ground = find_candidates(image, model, parameters.threshold_sigma, 2 * parameters.max_detections)
     if not len(uv):
         return Detections.none()
-    fit = measure(image, uv, ground, model, saturation)
+    uv, shape = adaptive_moments(image, uv, ground)
+    fit = measure(image, uv, shape, ground, model, saturation, parameters.max_sigma_px)
     good = _is_spot(fit, image.shape, parameters)
+    if not good.all():
+        poor = np.flatnonzero(~good)
+        bright, cov, height = compact(image, uv[poor], shape[poor], model, parameters.threshold_sigma)
+        fit = _with(fit, poor[bright], uv[poor[bright]], shape[poor[bright]], cov[bright], height[bright])
+        good[poor[bright]] = ellipses.axes(shape[poor[bright]])[0] <= parameters.max_sigma_px
     good[good] = _is_first(fit.spots.uv[good], fit.spots.shape[good], fit.spots.flux[good])
     rows = np.flatnonzero(good)
-    return _detections(fit, rows[np.argsort(-fit.spots.flux[rows], kind="stable")])
+    brightest = rows[np.argsort(-fit.spots.flux[rows], kind="stable")]
+    return _detections(fit, brightest[: parameters.max_detections])
 
 
 def _is_spot(fit: Measurement, shape: tuple[int, ...], parameters: DetectParameters) -> Bools:
@@ -68,6 +79,19 @@ def _is_spot(fit: Measurement, shape: tuple[int, ...], parameters: DetectParamet
             & (fit.spots.uv > -0.5 - margin).all(axis=1)
             & (fit.spots.uv < size - 0.5 + margin).all(axis=1)
         )
+
+
+def _with(fit: Measurement, rows: Ints, uv: Array, shape: Array, cov: Array, height: Array) -> Measurement:
+    """The measurement with rows for which there are moments only."""
+
+    def put(a: Array, b: Array) -> Array:
+        a = a.copy()
+        a[rows] = b
+        return a
+
+    flux = 2 * np.pi * np.sqrt(ellipses.determinant(shape)) * height
+    spots = Spots(put(fit.spots.uv, uv), put(fit.spots.shape, shape), put(fit.spots.flux, flux), fit.spots.plane)
+    return replace(fit, spots=spots, cov_px2=put(fit.cov_px2, cov), peak=put(fit.peak, height))
 
 
 def _is_first(uv: Array, shape: Array, flux: Array) -> Bools:

@@ -112,7 +112,7 @@ class Quality:
     cov: Array  # (n, 2, 2), px^2
     sigma_flux: Array  # (n,), DN
     chi2: Array  # (n,) per degree of freedom
-    explained: Array  # (n,) share of the light about the plane that the Gaussian explains
+    explained: Array  # (n,) share of what stands out of the plane, beyond noise, that the Gaussian explains
     peak: Array  # (n,), DN above plane and neighbours; of a clipped spot the clipping level's
 
 
@@ -123,8 +123,7 @@ def judged(solution: Solution, rows: Bools) -> Quality:
     """
     patches, y, weight = solution.patches, solution.y[rows], solution.weight[rows]
     z, x, inverse = solution.z[rows], solution.x[rows], solution.inverse[rows]
-    squares = (z * z).sum(axis=1)
-    chi2 = squares / np.maximum((weight > 0).sum(axis=1) - 9, 1)
+    squares, free = (z * z).sum(axis=1), np.maximum((weight > 0).sum(axis=1) - 9, 1)
     # What is left without the Gaussian: the plane's part of the same normal equations.
     N, rhs = solution.normal[rows, 6:, 6:], solution.rhs[rows, 6:, None]
     N = N + 1e-9 * np.eye(3) * np.maximum(np.trace(N, axis1=1, axis2=2), 1e-12)[:, None, None]
@@ -136,8 +135,8 @@ def judged(solution: Solution, rows: Bools) -> Quality:
     return Quality(
         inverse[:, :2, :2] * factor[:, None, None],
         np.sqrt(inverse[:, 5, 5] * factor),
-        chi2,
-        1 - squares / np.maximum(flat, 1e-9),
+        squares / free,
+        (flat - squares) / np.maximum(flat - np.minimum(free, squares), 1e-9),
         np.where(core & patches.inside[rows], above, -np.inf).max(axis=1),
     )
 

@@ -9,9 +9,8 @@ from tracking import ellipses
 from tracking.noise import Picture
 from tracking.patches import Patches, Window, chunks, cut
 
-_ROUNDS = 3
-# Growing windows, each with the 1-sigma half axis (px) up to which it serves.
-_WINDOWS = ((Window(9, 1), 3.5), (Window(18, 2), 9.0), (Window(18, 4), np.inf))
+# Growing windows, each with its rounds and the 1-sigma half axis (px) up to which it serves.
+_WINDOWS = ((Window(9, 1), 3, 3.5), (Window(18, 2), 5, 9.0), (Window(18, 4), 5, np.inf))
 
 
 def adaptive_moments(image: Picture, start_uv_px: Array, background_dn: Array) -> tuple[Array, Array]:
@@ -23,7 +22,7 @@ def adaptive_moments(image: Picture, start_uv_px: Array, background_dn: Array) -
     uv = start_uv_px.copy()
     shape = np.tile([2.0, 0.0, 2.0], (len(uv), 1))
     left: Ints = np.arange(len(uv))
-    for window, limit in _WINDOWS:
+    for window, rounds, limit in _WINDOWS:
         for rows in chunks(left, window):
             # Clipped pixels stay in: for a first width and centre a cut top is better than a hole.
             patches = cut(image, uv[rows], window, np.inf)
@@ -31,7 +30,7 @@ def adaptive_moments(image: Picture, start_uv_px: Array, background_dn: Array) -
             if window.cell_px > 1:  # the given background is a median over 40 px: too near to a wide spot
                 level = np.median(patches.values[:, _border(patches.side)], axis=1)
             light = np.where(patches.valid & _nearest(patches, rows, uv), patches.values - level[:, None], 0.0)
-            for _ in range(_ROUNDS):
+            for _ in range(rounds):
                 uv[rows], shape[rows] = _one_round(patches, light, uv[rows], shape[rows])
         left = left[ellipses.eigenvalues(shape[left])[1] > limit**2]
         if not len(left):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TypeAlias
+from typing import TypeAlias, cast
 
 import cv2
 import numpy as np
@@ -80,6 +80,20 @@ def estimate_noise(images: Iterable[Picture]) -> NoiseModel:
 
     Errors: ValueError without a picture.
     """
+    images = list(images)
+    model = _from_differences(images)
+    large = [image for image in images if min(image.shape) >= 18]
+    halves = [cast(Picture, cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)) for image in large]
+    if not halves:
+        return model
+    # White noise falls to a quarter in the mean of four pixels. That of JPEG pictures, of demosaiced ones and of a
+    # screen's texture falls by less: then all of it weighs so much more in a spot.
+    grain = 4 * (_from_differences(halves).floor_dn2 - ROUNDING_DN2) / model.floor_dn2
+    grain = max(grain, 1.0) if grain > 1.2 else 1.0
+    return NoiseModel(model.floor_dn2 * grain, model.slope_dn * grain, model.black_dn)
+
+
+def _from_differences(images: Iterable[Picture]) -> NoiseModel:
     levels: list[NDArray[np.float32]] = []
     scatters: list[NDArray[np.float32]] = []
     slope, full_scale = None, 255.0

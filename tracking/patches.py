@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from geometry.arrays import Array, Bools, Ints
 from tracking import ellipses
@@ -52,14 +53,24 @@ def cut(image: Picture, uv_px: Array, window: Window, saturation_dn: float) -> P
     valid = (raw < saturation_dn) & inside
     values: Array = raw.astype(np.float64)
     if cell > 1:
-        cells = (n, side, cell, side, cell)
-        values = np.asarray(values.reshape(cells).sum(axis=(2, 4)) / cell**2, dtype=np.float64)
-        inside, valid = (x.reshape(cells).all(axis=(2, 4)) for x in (inside, valid))
+        values = _binned(values, cell, np.add) / cell**2
+        inside, valid = _binned(inside, cell, np.logical_and), _binned(valid, cell, np.logical_and)
     along = (np.arange(side) - window.half) * float(cell)
     dv, du = np.repeat(along, side), np.tile(along, side)
     origin = np.asarray(first + 0.5 * (side * cell - 1), dtype=np.float64)
     flat = (n, side * side)
     return Patches(origin, values.reshape(flat), inside.reshape(flat), valid.reshape(flat), du, dv, cell, side)
+
+
+def _binned(pixels: NDArray, cell: int, fold: np.ufunc) -> NDArray:
+    """(n, s c, s c) to (n, s, s). By slices: numpy's own reduction of short axes takes ten times as long."""
+    rows = pixels[:, 0::cell]
+    for i in range(1, cell):
+        rows = fold(rows, pixels[:, i::cell])
+    out = rows[:, :, 0::cell]
+    for i in range(1, cell):
+        out = fold(out, rows[:, :, i::cell])
+    return out
 
 
 def chunks(rows: Ints, window: Window) -> list[Ints]:

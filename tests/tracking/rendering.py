@@ -110,14 +110,14 @@ def expose(mean: NDArray, scene: Scene, rng: np.random.Generator, bits: int = 8)
     return np.clip(np.rint(picture), 0, top).astype(np.uint8 if bits == 8 else np.uint16)
 
 
-def bound(spot: Spot, scene: Scene, saturation: float = np.inf, step: float = 1e-3) -> NDArray:
+def bound(spot: Spot, scene: Scene, mean: NDArray, saturation: float = np.inf, step: float = 1e-3) -> NDArray:
     """Cramer-Rao bound (2, 2), px^2, for the centre: flux, shape and background plane unknown too, noise known.
 
-    Numerical derivatives of the rendered spot itself; variance per pixel = level/gain + read^2 + 1/12; pixels whose
+    `mean` is expected(scene). Numerical derivatives of the rendered spot; variance per pixel = level/gain + read^2 + 1/12; pixels whose
     expected value clips tell nothing.
     """
     base, where = light(spot, scene.size)
-    level = expected(scene)[where]
+    level = mean[where]
     variance = np.maximum(level, 0) / scene.gain + scene.read**2 + 1 / 12
     weight = np.where(level < saturation, 1 / variance, 0.0)
 
