@@ -32,6 +32,7 @@ from tracking.parameters import LabelParameters
 NO_POINT = -1
 # Chance that a right set of labels is refused by its misfit: the points' sigmas already hold the model's error.
 P_MISFIT = 1e-6
+MOST_REPEATS = 4  # more starts than this are tried only where none has led to any pose
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,10 +93,10 @@ def find_labels(
             None, (), f"only {len(scene.camera)} points of light, at least {parameters.min_spots} needed"
         )
     best: list[Labelling] = []
-    for poses in _hypotheses(scene, prior):
+    for tried, poses in enumerate(_hypotheses(scene, prior), start=1):
         best = _refined(scene, poses, prior, best)
-        if best and best[0].fit.rows.size == best[0].expected:
-            break  # everything is explained: the slower ways could only repeat it
+        if best and (tried > MOST_REPEATS or best[0].fit.rows.size == best[0].expected):
+            break  # everything is explained, or hardly anything new can come: the rest could only repeat it
     if not best:
         return LabelResult(None, (), "no pose within the prior explains enough of the points")
     return _decided(scene, best)
@@ -214,7 +215,7 @@ def _from_three_spots(scene: _Scene, prior: PosePrior) -> Iterator[Pose]:
         if s[-1] > 1e-6 * s[0]:
             triples.append((-float(s[-1]), triple))
     starts = _starts(prior)
-    for _, triple in sorted(triples)[:4]:
+    for triple in _that_leave_out_every_pair([t for _, t in sorted(triples)]):
         grids = np.meshgrid(*[scene.points_of(v) for v in triple], indexing="ij")
         points = np.stack([g.ravel() for g in grids], axis=-1)
         # One point serves one spot.
@@ -225,6 +226,20 @@ def _from_three_spots(scene: _Scene, prior: PosePrior) -> Iterator[Pose]:
         targets = np.tile(points, (len(starts.translation), 1))
         poses = _gauss_newton(model.subset(np.array(triple)), scene.pixels[targets], starts[many])
         yield poses[prior.holds(poses)]
+
+
+def _that_leave_out_every_pair(triples: Sequence[tuple[int, int, int]]) -> Iterator[tuple[int, int, int]]:
+    """The first few triples of views, then each that avoids two views together which none before it did.
+
+    Any two spots may be hidden, and often a beam's pair is out of the picture: a start that needs one of them is none.
+    """
+    views = sorted({v for t in triples for v in t})
+    avoided: set[tuple[int, int]] = set()
+    for i, triple in enumerate(triples):
+        new = set(combinations([v for v in views if v not in triple], 2)) - avoided
+        if i < 4 or new:
+            avoided |= new
+            yield triple
 
 
 def _starts(prior: PosePrior) -> Pose:

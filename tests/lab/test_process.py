@@ -184,6 +184,11 @@ def test_the_summary_is_strict_json(results):
     json.loads((results / "summary.json").read_text("utf-8"), parse_constant=refuse)
 
 
+def test_a_number_that_does_not_exist_is_null_in_the_summary():
+    content = {"a": float("nan"), "b": [np.float64("inf"), np.int64(3)], "c": (np.float32(0.5), True, None, "text")}
+    assert process._plain(content) == {"a": None, "b": [None, 3], "c": [0.5, True, None, "text"]}
+
+
 def test_without_truth_there_are_no_errors(tmp_path):
     folder = points_run(tmp_path / "run")
     for file in (folder / "truth").iterdir():

@@ -330,7 +330,7 @@ def test_a_camera_without_a_picture_is_no_evidence_against_its_spots():
     assert np.all(result.chosen.point_of[~blind] != NO_POINT)
 
 
-@pytest.mark.parametrize("hidden", [(), ("1",), ("5",)])
+@pytest.mark.parametrize("hidden", [(), ("1",), ("5",), ("3", "6"), ("1", "4"), ("2", "6")])
 def test_opposed_lasers_that_are_not_one_line_are_labelled_from_three_spots(hidden):
     """Six beams with one spot each, as the contract has them: there is no whole beam to start from."""
     fan, rng = RIGS["fan"](), np.random.default_rng(13)
