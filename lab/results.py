@@ -24,7 +24,7 @@ from tracking.statuses import PoseStatus, SpotStatus
 SPOT_STATUSES = tuple(SpotStatus)
 POSE_STATUSES = tuple(PoseStatus)
 ABSENT = -1  # the status code of a row that the file does not have
-_ROWS_AT_ONCE = 20_000  # bounds the memory that text takes: a long table is read in such pieces
+_ROWS_AT_ONCE = 1_500  # bounds the memory that text takes (1 MB): a long table is read in such pieces
 
 
 @dataclass(frozen=True, slots=True)

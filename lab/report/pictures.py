@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from geometry.arrays import Array
 from lab.errors import BeamposeError
 from lab.frames import pictures_at
-from lab.pictures import Missing
+from lab.pictures import Grey, Missing
 from lab.report import svg
 from lab.report.material import Material
 from lab.report.tracks import SPOT_COLOURS
@@ -130,7 +130,7 @@ def pictures(m: Material, results: Path, selection: list[Event]) -> list[str]:
     if m.run is None:
         return []
     points = _detections(results / "detections.csv", {int(m.spots.frames[e.index]) for e in selection})
-    read: dict[tuple[str, int], Array | str] = {}
+    read: dict[tuple[str, int], Grey | str] = {}
     for camera, source in m.run.cameras.items():
         frames = [int(m.spots.frames[e.index]) for e in selection if e.camera == camera]
         if not frames or isinstance(source, DetectionsTable):
@@ -143,12 +143,13 @@ def pictures(m: Material, results: Path, selection: list[Event]) -> list[str]:
             if isinstance(picture, Missing):
                 read[camera, frame] = picture.reason
             elif not isinstance(picture, Detections):
-                read[camera, frame] = np.asarray(picture, dtype=float)
+                read[camera, frame] = picture  # as they come: eight as floats would be 80 MB
     drawings = []
     for event in selection:
         picture_or_reason = read.get((event.camera, int(m.spots.frames[event.index])))
         if picture_or_reason is not None:
-            drawings.append(_drawing(m, event, picture_or_reason, points))
+            shown = picture_or_reason if isinstance(picture_or_reason, str) else picture_or_reason.astype(float)
+            drawings.append(_drawing(m, event, shown, points))
     return drawings
 
 
