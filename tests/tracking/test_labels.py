@@ -101,9 +101,9 @@ def rates(rig: Rig, count: int, seed: int, least_visible: int = 4) -> tuple[floa
 
 @pytest.mark.parametrize("name", ["fan", "four-skew-beams"])
 def test_labels_are_right_from_a_wide_prior_among_clutter(name):
-    """30 poses: one may stay open, none may be wrong."""
-    right, wrong = rates(RIGS[name](), 30, seed=1)
-    assert right >= 0.96
+    """20 poses: one may stay open, none may be wrong."""
+    right, wrong = rates(RIGS[name](), 20, seed=1)
+    assert right >= 0.95
     assert wrong == 0
 
 
@@ -260,11 +260,11 @@ def test_no_camera_with_a_picture_is_no_label():
 
 @pytest.mark.parametrize("name", ["fan", "four-skew-beams"])
 def test_points_that_are_no_spots_are_no_vehicle(name):
-    """Six false points per picture, eight times: a confident pose of nothing would be the worst of all."""
+    """Six false points per picture, five times: a confident pose of nothing would be the worst of all."""
     rig = RIGS[name]()
     model, rng = SpotModel.of(rig), np.random.default_rng(10)
     everything = tuple(rig.spots)
-    for _ in range(8):
+    for _ in range(5):
         picture = photograph(model, Pose.identity(), rng, hidden=everything, false_points=6)
         assert find_labels(rig, model, picture.detections, WIDE).chosen is None
 
