@@ -5,6 +5,8 @@ from __future__ import annotations
 import sys
 import tempfile
 import time
+import warnings
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -58,10 +60,34 @@ def scene_of(kind: str, rng: np.random.Generator) -> Scene:
     )  # fmt: skip
 
 
-def run_set(kind: str, frames: int, seed: int) -> str:
+@dataclass(frozen=True)
+class Row:
+    """What one set gave."""
+
+    kind: str
+    frames: int
+    spots: int
+    recall: float
+    rms_px: float
+    worst_px: float
+    bound_px: float
+    honesty: float  # rms of error over claimed sigma
+    false_per_frame: float
+    time_ms: float
+    read_ms: float
+
+    def line(self) -> str:
+        return (
+            f"{self.kind:10} {self.frames:6} {self.spots:8} {self.recall:8.4f} {self.rms_px:8.4f} {self.worst_px:8.3f}"
+            f" {self.rms_px / self.bound_px:8.3f} {self.honesty:8.3f} {self.false_per_frame:9.3f} {self.time_ms:8.2f}"
+            f" {self.time_ms / self.read_ms:8.2f}"
+        )
+
+
+def measured(kind: str, frames: int, seed: int) -> Row:
     """One line of the table."""
     rng = np.random.default_rng([seed, SETS.index(kind)])
-    errors, crlb, claimed, missed, false, total, worst = [], [], [], 0, 0, 0, 0.0
+    errors, crlb, claimed, missed, false, total = [], [], [], 0, 0, 0
     spent, reading = 0.0, 0.0
     folder = Path(tempfile.mkdtemp())
     for _ in range(frames):
@@ -88,16 +114,22 @@ def run_set(kind: str, frames: int, seed: int) -> str:
             claimed.append(found.cov_px2[best])
             crlb.append(bound(spot, scene, mean, saturation=255))
         false += len(found) - len(taken)
-    time_ms, read_ms = spent / frames * 1e3, reading / frames * 1e3
-    tail = f"{false / frames:9.3f} {time_ms:8.2f} {time_ms / read_ms:8.2f}"
-    if not errors:
-        return f"{kind:10} {frames:6} {'-':>8} {'-':>8} {'-':>8} {'-':>8} {'-':>8} {'-':>8} {tail}"
-    e, C, B = np.array(errors), np.array(claimed), np.array(crlb)
-    rms = np.sqrt(np.mean(e**2))
-    ratio = rms / np.sqrt(np.mean(B[:, [0, 1], [0, 1]]))
-    honest = np.sqrt(np.mean(e**2 / C[:, [0, 1], [0, 1]]))
-    recall, worst = 1 - missed / total, np.abs(e).max()
-    return f"{kind:10} {frames:6} {total:8} {recall:8.4f} {rms:8.4f} {worst:8.3f} {ratio:8.3f} {honest:8.3f} {tail}"
+    e, C, B = np.array(errors).reshape(-1, 2), np.array(claimed).reshape(-1, 2, 2), np.array(crlb).reshape(-1, 2, 2)
+    with np.errstate(invalid="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # a set without spots has no errors to average
+        return Row(
+            kind,
+            frames,
+            total,
+            1 - missed / total if total else np.nan,
+            float(np.sqrt(np.mean(e**2))),
+            float(np.abs(e).max(initial=0.0)),
+            float(np.sqrt(np.mean(B[:, [0, 1], [0, 1]]))),
+            float(np.sqrt(np.mean(e**2 / C[:, [0, 1], [0, 1]]))),
+            false / frames,
+            spent / frames * 1e3,
+            reading / frames * 1e3,
+        )
 
 
 def main() -> None:
@@ -107,7 +139,7 @@ def main() -> None:
     print(f"seed {seed}; 1280x1024, 8 bit; ms are process time of one core; 'read' is cv2.imread of the same PNG")
     print("set        frames    spots   recall   rms px    worst rms/crlb  err/sig  FP/frame      ms   x read")
     for kind in sys.argv[3:] or SETS:
-        print(run_set(kind, frames, seed), flush=True)
+        print(measured(kind, frames, seed).line(), flush=True)
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ _OCTANTS = np.arange(8) * (np.pi / 4)
 _CORE, _RING = np.array([0.4, 0.8]), np.array([2.4, 2.8, 3.2])  # sigmas of the moments' ellipse
 _CENTRE_SHARE = 0.15  # of the ellipse's sigma: how far such a thing's moments may lie from the beam's centre. On the
 # three burnt-out laser spots of the real pictures the moments and the middle of the core differ by 0.05 to 0.15
-_STANDS_OUT = 3.0  # times the detection threshold: the fit's second opinion is missing
+_STANDS_OUT = 1.5  # times the detection threshold: the second opinion of a fit is missing
 
 
 def compact(

@@ -45,7 +45,7 @@ def find_spots(
     saturation = parameters.saturation_dn
     if saturation is None:
         saturation = float(np.iinfo(image.dtype).max)
-    uv, ground = find_candidates(image, model, parameters.threshold_sigma, 2 * parameters.max_detections)
+    uv, ground = find_candidates(image, model, parameters.threshold_sigma, parameters.max_detections)
     if not len(uv):
         return Detections.none()
     uv, shape = adaptive_moments(image, uv, ground)

@@ -30,30 +30,37 @@ def adaptive_moments(image: Picture, start_uv_px: Array, background_dn: Array) -
             if window.cell_px > 1:  # the given background is a median over 40 px: too near to a wide spot
                 level = np.median(patches.values[:, _border(patches.side)], axis=1)
             light = np.where(patches.valid & _nearest(patches, rows, uv), patches.values - level[:, None], 0.0)
+            du, dv = patches.du, patches.dv
+            powers = np.stack([np.ones_like(du), du, dv, du * du, du * dv, dv * dv])
             for _ in range(rounds):
-                uv[rows], shape[rows] = _one_round(patches, light, uv[rows], shape[rows])
+                uv[rows], shape[rows] = _one_round(patches, light, powers, uv[rows], shape[rows])
         left = left[ellipses.eigenvalues(shape[left])[1] > limit**2]
         if not len(left):
             break
     return uv, shape
 
 
-def _one_round(patches: Patches, light: Array, uv: Array, shape: Array) -> tuple[Array, Array]:
-    """Under a window W a Gaussian S has covariance (1/S + 1/W)^-1; if they are equal, half its offset is seen."""
+def _one_round(patches: Patches, light: Array, powers: Array, uv: Array, shape: Array) -> tuple[Array, Array]:
+    """Under a window W a Gaussian S has covariance (1/S + 1/W)^-1; if they are equal, half its offset is seen.
+
+    powers (6, cells): 1, du, dv, du^2, du dv, dv^2 from the patches' origins. The window's exponent is a sum of them,
+    and so are the moments: two products of matrices instead of many passes over the cells.
+    """
     pixel = patches.cell_px**2 / 12 * np.array([1.0, 0.0, 1.0])
     window = shape + pixel
     narrow = ellipses.inverse(window)
-    offset = patches.origin - uv
-    du, dv = patches.du + offset[:, :1], patches.dv + offset[:, 1:]
-    uu, u_v, vv = du * du, du * dv, dv * dv
-    weight = light * np.exp(-0.5 * narrow[:, :1] * uu - narrow[:, 1:2] * u_v - 0.5 * narrow[:, 2:] * vv)
-    total = np.maximum(weight.sum(axis=1), 1e-9)[:, None]
-    mean = np.stack([(weight * du).sum(axis=1), (weight * dv).sum(axis=1)], axis=1) / total
-    seen = np.stack([(weight * x).sum(axis=1) for x in (uu, u_v, vv)], axis=1) / total
-    seen -= np.stack([mean[:, 0] ** 2, mean[:, 0] * mean[:, 1], mean[:, 1] ** 2], axis=1)
+    a, b, c = narrow.T
+    u, v = (uv - patches.origin).T
+    exponent = np.stack(
+        [-0.5 * (a * u * u + 2 * b * u * v + c * v * v), a * u + b * v, b * u + c * v, -0.5 * a, -b, -0.5 * c], axis=1
+    )
+    sums = (light * np.exp(exponent @ powers)) @ powers.T
+    mean = sums[:, 1:] / np.maximum(sums[:, :1], 1e-9)
+    mu, mv = mean[:, 0], mean[:, 1]
+    seen = mean[:, 2:] - np.stack([mu * mu, mu * mv, mv * mv], axis=1)
     seen = ellipses.kept_within(seen, window, 0.15, 0.75)
     found = ellipses.inverse(ellipses.inverse(seen) - narrow)
-    step = 2.0 * mean
+    step = 2.0 * np.stack([mu - u, mv - v], axis=1)
     step = step / np.maximum(ellipses.length(step, window), 1.0)[:, None]
     return uv + step, ellipses.at_least(found - pixel, 0.1)
 

@@ -87,9 +87,11 @@ def estimate_noise(images: Iterable[Picture]) -> NoiseModel:
     if not halves:
         return model
     # White noise falls to a quarter in the mean of four pixels. That of JPEG pictures, of demosaiced ones and of a
-    # screen's texture falls by less: then all of it weighs so much more in a spot.
-    grain = 4 * (_from_differences(halves).floor_dn2 - ROUNDING_DN2) / model.floor_dn2
-    grain = max(grain, 1.0) if grain > 1.2 else 1.0
+    # screen's texture falls by less, and shows between pixels two apart: then all noise weighs so much more in a spot.
+    coarse = 4 * (_from_differences(halves).floor_dn2 - ROUNDING_DN2)
+    apart = float(np.median([guess_noise(image).floor_dn2 for image in large]))
+    grain = max(coarse, apart) / model.floor_dn2
+    grain = grain if grain > 1.25 else 1.0
     return NoiseModel(model.floor_dn2 * grain, model.slope_dn * grain, model.black_dn)
 
 

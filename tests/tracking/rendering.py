@@ -113,8 +113,8 @@ def expose(mean: NDArray, scene: Scene, rng: np.random.Generator, bits: int = 8)
 def bound(spot: Spot, scene: Scene, mean: NDArray, saturation: float = np.inf, step: float = 1e-3) -> NDArray:
     """Cramer-Rao bound (2, 2), px^2, for the centre: flux, shape and background plane unknown too, noise known.
 
-    `mean` is expected(scene). Numerical derivatives of the rendered spot; variance per pixel = level/gain + read^2 + 1/12; pixels whose
-    expected value clips tell nothing.
+    `mean` is expected(scene). Numerical derivatives of the rendered spot; variance per pixel = level/gain + read^2 +
+    1/12; pixels whose expected value clips tell nothing.
     """
     base, where = light(spot, scene.size)
     level = mean[where]
