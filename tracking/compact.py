@@ -32,7 +32,7 @@ def compact(
     inside = ((at >= 0) & (at < [width, height])).all(axis=-1)
     at = np.clip(at, 0, [width - 1, height - 1])
     values = image[at[..., 1], at[..., 0]].astype(np.float64)
-    core = np.median(values[:, : len(_CORE)].reshape(len(uv), -1), axis=1)
+    core = np.median(values[:, : len(_CORE)].reshape(len(uv), len(_CORE) * len(_OCTANTS)), axis=1)
     rings = np.median(values[:, len(_CORE) :], axis=1)
     ground = np.median(rings, axis=1)
     above = core - ground

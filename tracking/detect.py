@@ -52,10 +52,15 @@ def find_spots(
     fit = measure(image, uv, shape, ground, model, saturation, parameters.max_sigma_px)
     good = _is_spot(fit, image.shape, parameters)
     if not good.all():
-        poor = np.flatnonzero(~good)
+        # What the fit found to be narrow stays out: a hot pixel is compact and bright, too.
+        major, minor, _ = ellipses.axes(shape)
+        fits = (minor >= parameters.min_sigma_px) & (major <= parameters.max_sigma_px)
+        fits &= ellipses.axes(fit.spots.shape)[1] >= parameters.min_sigma_px
+        poor = np.flatnonzero(~good & fits)
         bright, cov, height = compact(image, uv[poor], shape[poor], model, parameters.threshold_sigma)
-        fit = _with(fit, poor[bright], uv[poor[bright]], shape[poor[bright]], cov[bright], height[bright])
-        good[poor[bright]] = ellipses.axes(shape[poor[bright]])[0] <= parameters.max_sigma_px
+        rows = poor[bright]
+        fit = _with(fit, rows, uv[rows], shape[rows], cov[bright], height[bright])
+        good[rows] = True
     good[good] = _is_first(fit.spots.uv[good], fit.spots.shape[good], fit.spots.flux[good])
     rows = np.flatnonzero(good)
     brightest = rows[np.argsort(-fit.spots.flux[rows], kind="stable")]
