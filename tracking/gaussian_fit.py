@@ -128,7 +128,8 @@ def judged(solution: Solution, rows: Bools) -> Quality:
     N, rhs = solution.normal[rows, 6:, 6:], solution.rhs[rows, 6:, None]
     N = N + 1e-9 * np.eye(3) * np.maximum(np.trace(N, axis1=1, axis2=2), 1e-12)[:, None, None]
     flat = (weight * y * y).sum(axis=1) - (rhs * np.linalg.solve(N, rhs)).sum(axis=(1, 2))
-    factor = _misfit(z, weight, patches.side)
+    information = weight * (solution.J[rows, 0] ** 2 + solution.J[rows, 1] ** 2)
+    factor = _misfit(z, weight, information, patches.side)
     above = y - (x[:, 6:] @ solution.J[0, 6:])  # the plane's columns are the same for all
     light = solution.J[rows, 5]
     core = light > 0.2 * light.max(axis=1, keepdims=True)  # clipped cells count, hot pixels in the wings do not
@@ -141,13 +142,14 @@ def judged(solution: Solution, rows: Bools) -> Quality:
     )
 
 
-def _misfit(z: Array, weight: Array, side: int) -> Array:
+def _misfit(z: Array, weight: Array, information: Array, side: int) -> Array:
     """Factors (n,) >= 1 by which the model's faults raise the covariance of the centre, from residuals (n, cells).
 
     Only the part of the residuals that is odd about the centre can move it: a flat top, a ring or a streak is a bad
-    Gaussian with a good centre. Where the odd part is significantly larger than noise, the factor is its chi2 per
-    degree of freedom times the number of cells over which it goes together. Spots with few cells to mirror (at the
-    border) are judged by all residuals. Ours; measured in bench/detection.py (sets streak, speckle).
+    Gaussian with a good centre. Where the odd part is significantly larger than noise, the factor is its mean square,
+    taken where the centre is read (`information`, (n, cells): the slopes), times the number of cells over which it
+    goes together. Spots with few cells to mirror (at the border) are judged by all residuals. Ours, after the
+    sandwich covariance of misspecified models; measured in bench/detection.py (sets streak, speckle).
     """
     mirrored = (weight > 0) & (weight[:, ::-1] > 0)
     pairs = 0.5 * mirrored.sum(axis=1)
@@ -159,9 +161,15 @@ def _misfit(z: Array, weight: Array, side: int) -> Array:
         free[whole] = np.maximum((weight[whole] > 0).sum(axis=1) - 9, 1)
     chi2 = 0.5 * (r * r).sum(axis=1) / free
     bad = chi2 > 1 + 3 * np.sqrt(2.0 / free)
-    factor = np.where(bad, chi2, 1.0)
+    factor = np.ones(len(z))
     if bad.any():
-        factor[bad] *= _grain(r[bad], side)
+        r, share = r[bad], information[bad] / np.maximum(information[bad].sum(axis=1, keepdims=True), 1e-300)
+        share = np.where(r != 0, share, 0.0)
+        grain = _grain(r * np.sqrt(share), side)
+        grains = 1 / np.maximum((share * share).sum(axis=1) * grain, 1e-12)  # independent ones in the slopes
+        square = (r * r * share).sum(axis=1) / np.where(whole[bad], 2.0, 1.0)
+        # The fit has bent four parameters to the odd part, so that less of it is left than was.
+        factor[bad] = np.maximum(square * grain * np.minimum(grains / np.maximum(grains - 4, 1e-9), 3.0), 1.0)
     return factor
 
 
