@@ -222,14 +222,17 @@ def test_an_empty_picture_holds_nothing():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("kind", "limit"), [("main", 1.10), ("faint", 1.2), ("saturated", 1.15), ("near", 1.2), ("edge", 1.2)]
+    ("kind", "limit"), [("main", 1.1), ("faint", 1.15), ("saturated", 1.15), ("near", 1.15), ("edge", 1.15)]
 )
 def test_centres_reach_the_cramer_rao_bound_and_their_sigma_is_honest(kind, limit):
-    """bench/detection.py's sets: 60 frames each, about 350 spots, so ratios are known to 4 %."""
+    """bench/detection.py's sets: 60 frames each, about 350 spots, so ratios are known to 3 %.
+
+    Each error is taken over its own spot's bound: in px a few spots half outside the picture would decide alone.
+    """
     from bench.detection import measured
 
     row = measured(kind, 60, 11)
-    assert row.rms_px / row.bound_px < limit
+    assert row.of_bound < limit
     assert 0.9 < row.honesty < 1.1
     assert row.recall > (0.93 if kind == "faint" else 0.999)
     assert row.false_per_frame <= 0.02
