@@ -11,6 +11,10 @@ from geometry.arrays import Array, Bools
 from geometry.pose import Pose
 
 
+PERSPECTIVE, FISHEYE = "perspective", "fisheye"
+LENSES = (PERSPECTIVE, FISHEYE)
+
+
 @dataclass(frozen=True, slots=True)
 class SensorNoise:
     """What turns photo-electrons into grey values."""
@@ -31,6 +35,7 @@ class Camera:
     distortion: tuple[float, ...]  # OpenCV order; 0, 4, 5, 8, 12 or 14 numbers
     camera_from_world: Pose
     noise: SensorNoise | None = None
+    lens: str = PERSPECTIVE  # or FISHEYE: what the distortion numbers mean
     fold_r2: float = field(init=False)  # squared normalised radius beyond which the lens model folds
 
     def __post_init__(self) -> None:
@@ -39,7 +44,14 @@ class Camera:
                 f"camera {self.name!r}: {len(self.distortion)} distortion numbers,"
                 " OpenCV's models have 0, 4, 5, 8, 12 or 14"
             )
-        object.__setattr__(self, "fold_r2", lens.fold_limit(self.distortion))
+        if self.lens not in LENSES:
+            raise ValueError(f"camera {self.name!r}: expected lens {' or '.join(LENSES)}, got {self.lens!r}")
+        if self.lens == FISHEYE and len(self.distortion) not in (0, 4):
+            raise ValueError(
+                f"camera {self.name!r}: {len(self.distortion)} distortion numbers, the fisheye model has 4 (or none)"
+            )
+        limit = lens.fisheye_fold_limit if self.lens == FISHEYE else lens.fold_limit
+        object.__setattr__(self, "fold_r2", limit(self.distortion))
 
     def project(self, points_world: Array) -> Array:
         """Distorted pixels (..., 2) of world points (..., 3), m; nan behind the camera or beyond the fold limit."""
@@ -48,6 +60,7 @@ class Camera:
             pinhole_numbers(self),
             lens.padded(self.distortion),
             np.asarray(self.fold_r2),
+            np.asarray(self.lens == FISHEYE),
         )[0]
 
     def rays(self, pixels: Array) -> tuple[Array, Array]:
@@ -55,7 +68,9 @@ class Camera:
         pixels = np.asarray(pixels, dtype=float)
         fx, fy, cx, cy = pinhole_numbers(self)
         distorted = (pixels - [cx, cy]) / [fx, fy]
-        flat = lens.undistort(distorted.reshape(-1, 2), lens.padded(self.distortion), self.fold_r2)
+        flat = lens.undistort(
+            distorted.reshape(-1, 2), lens.padded(self.distortion), self.fold_r2, self.lens == FISHEYE
+        )
         xyz = np.concatenate([flat, np.ones((len(flat), 1))], axis=1)
         world = xyz @ self.camera_from_world.rotation  # rows times R = R^T x
         world /= np.linalg.norm(world, axis=1, keepdims=True)
@@ -78,19 +93,19 @@ def pinhole_numbers(camera: Camera) -> Array:
     return np.array([camera.matrix[0, 0], camera.matrix[1, 1], camera.matrix[0, 2], camera.matrix[1, 2]])
 
 
-def project_points(points_camera: Array, pinhole: Array, distortion: Array, fold_r2: Array) -> tuple[Array, Array]:
+def project_points(
+    points_camera: Array, pinhole: Array, distortion: Array, fold_r2: Array, fisheye: Bools | None = None
+) -> tuple[Array, Array]:
     """Pixels (..., 2) and d(pixel)/d(point) (..., 2, 3), px/m, of points (..., 3), m, in the camera frame.
 
-    pinhole (..., 4): fx, fy, cx, cy; distortion (..., 14); fold_r2 (...): all broadcast against the points, so that
-    points of different cameras go in one call. nan behind the camera (z <= 0) or beyond the fold limit.
+    pinhole (..., 4): fx, fy, cx, cy; distortion (..., 14); fold_r2 (...); fisheye (...), None for none: all broadcast
+    against the points, so that points of different cameras go in one call. nan behind the camera (z <= 0) or beyond
+    the fold limit.
     """
-    z = points_camera[..., 2]
-    in_front = z > 1e-9
-    z = np.where(in_front, z, 1.0)
-    xy = points_camera[..., :2] / z[..., None]
+    xy, z, in_front = _on_image_plane(points_camera)
     focal, centre = pinhole[..., :2], pinhole[..., 2:]
-    if distortion.any():
-        bent, J_lens = lens.distort(xy, distortion)
+    if distortion.any() or (fisheye is not None and np.any(fisheye)):
+        bent, J_lens = _bent(xy, distortion, fisheye)
         good = in_front & lens.holds(xy, J_lens, fold_r2)
         J_xy = focal[..., :, None] * J_lens
     else:
@@ -101,3 +116,50 @@ def project_points(points_camera: Array, pinhole: Array, distortion: Array, fold
     J[..., :2] = J_xy / z[..., None, None]
     J[..., 2] = -np.einsum("...ij,...j->...i", J[..., :2], xy)
     return pixels, J
+
+
+@dataclass(frozen=True, slots=True)
+class Projected:
+    """Pixels of points and what every number of the camera does to them."""
+
+    pixels: Array  # (..., 2), distorted; nan as in `project_points`
+    d_point: Array  # (..., 2, 3), px/m
+    d_pinhole: Array  # (..., 2, 4), px per px of fx, fy, cx, cy
+    d_distortion: Array  # (..., 2, 14), px
+
+
+def project_points_full(
+    points_camera: Array, pinhole: Array, distortion: Array, fold_r2: Array, fisheye: Bools | None = None
+) -> Projected:
+    """As `project_points`, with the derivatives with respect to the camera's own numbers: for calibrations."""
+    pixels, d_point = project_points(points_camera, pinhole, distortion, fold_r2, fisheye)
+    xy, _, _ = _on_image_plane(points_camera)
+    bent, _ = _bent(xy, distortion, fisheye)
+    d_coefficients = lens.coefficient_jacobian(xy, distortion)
+    if fisheye is not None and np.any(fisheye):
+        wide = lens.fisheye_coefficient_jacobian(xy, distortion)
+        d_coefficients = np.where(np.asarray(fisheye)[..., None, None], wide, d_coefficients)
+    d_pinhole = np.zeros((*pixels.shape, 4))
+    d_pinhole[..., 0, 0], d_pinhole[..., 1, 1] = bent[..., 0], bent[..., 1]
+    d_pinhole[..., 0, 2] = d_pinhole[..., 1, 3] = 1.0
+    return Projected(pixels, d_point, d_pinhole, pinhole[..., :2, None] * d_coefficients)
+
+
+def _on_image_plane(points_camera: Array) -> tuple[Array, Array, Bools]:
+    """Normalised image points (..., 2), depths with 1 for points behind the camera, and which lie in front."""
+    z = points_camera[..., 2]
+    in_front = z > 1e-9
+    z = np.where(in_front, z, 1.0)
+    return points_camera[..., :2] / z[..., None], z, in_front
+
+
+def _bent(xy: Array, distortion: Array, fisheye: Bools | None) -> tuple[Array, Array]:
+    """Distorted normalised points and their Jacobian, each by its camera's model."""
+    if fisheye is None or not np.any(fisheye):
+        return lens.distort(xy, distortion)
+    wide, J_wide = lens.distort_fisheye(xy, distortion)
+    if np.all(fisheye):
+        return wide, J_wide
+    bent, J = lens.distort(xy, distortion)
+    which = np.asarray(fisheye)[..., None]
+    return np.where(which, wide, bent), np.where(which[..., None], J_wide, J)

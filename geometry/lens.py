@@ -1,7 +1,7 @@
-"""The lens model: OpenCV's distortion of normalised image points, its Jacobian, and how far out it holds.
+"""The lens models: OpenCV's distortions of normalised image points, their Jacobians, and how far out they hold.
 
 Twelve polynomial numbers and two tilt angles, in OpenCV's order: k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4,
-tau_x, tau_y. Source: OpenCV, calib3d, "Detailed description"; the test compares with cv2.projectPoints.
+tau_x, tau_y; or OpenCV's fisheye model with four. Source: OpenCV, calib3d, "Detailed description"; the test compares with cv2.projectPoints.
 """
 
 from __future__ import annotations
@@ -65,9 +65,60 @@ def _tilt(xy: Array, J: Array, tau_x: Array, tau_y: Array) -> tuple[Array, Array
     return out, D @ J
 
 
-def tilt_matrix(tau_x: Array, tau_y: Array) -> Array:
-    """OpenCV's tilt homography (..., 3, 3) of the two angles (...), rad."""
+def coefficient_jacobian(xy: Array, coefficients: Array) -> Array:
+    """d(distorted)/d(coefficients) (..., 2, 14) of `distort`: what a calibration's error in a number does to a point.
+
+    xy (..., 2) and coefficients (..., 14) as in `distort`.
+    """
+    k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4, tau_x, tau_y = np.moveaxis(coefficients, -1, 0)
+    x, y = xy[..., 0], xy[..., 1]
+    r2 = x * x + y * y
+    r4, r6 = r2 * r2, r2 * r2 * r2
+    denominator = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+    radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / denominator
+    J = np.zeros((*np.broadcast_shapes(xy.shape[:-1], np.shape(k1)), 2, N_DISTORTION))
+    for column, power in ((0, r2), (1, r4), (4, r6)):
+        J[..., 0, column], J[..., 1, column] = x * power / denominator, y * power / denominator
+    for column, power in ((5, r2), (6, r4), (7, r6)):
+        change = -radial * power / denominator
+        J[..., 0, column], J[..., 1, column] = x * change, y * change
+    J[..., 0, 2], J[..., 1, 2] = 2 * x * y, r2 + 2 * y * y
+    J[..., 0, 3], J[..., 1, 3] = r2 + 2 * x * x, 2 * x * y
+    J[..., 0, 8], J[..., 0, 9] = r2, r4
+    J[..., 1, 10], J[..., 1, 11] = r2, r4
+    T, dT = tilt_matrix(np.asarray(tau_x), np.asarray(tau_y)), _tilt_derivatives(np.asarray(tau_x), np.asarray(tau_y))
+    untilted = np.array(coefficients, dtype=float)
+    untilted[..., 12:] = 0
+    bent, _ = distort(xy, untilted)
+    h = (T[..., :2] @ bent[..., None])[..., 0] + T[..., 2]
+    out = h[..., :2] / h[..., 2:]
+    if np.any(tau_x) or np.any(tau_y):
+        D = (T[..., :2, :2] - out[..., :, None] * T[..., 2:, :2]) / h[..., 2:, None]
+        J[..., :12] = D @ J[..., :12]
+    for column in (0, 1):
+        dh = (dT[column][..., :2] @ bent[..., None])[..., 0] + dT[column][..., 2]
+        J[..., 12 + column] = (dh[..., :2] - out * dh[..., 2:]) / h[..., 2:]
+    return J
+
+
+def _tilt_derivatives(tau_x: Array, tau_y: Array) -> tuple[Array, Array]:
+    """d(tilt_matrix)/d(tau_x) and /d(tau_y), each (..., 3, 3): the product rule on T = along(R) R.
+
+    Entries of the factors that do not depend on the angles cancel in the differences.
+    """
     cx, sx, cy, sy = np.cos(tau_x), np.sin(tau_x), np.cos(tau_y), np.sin(tau_y)
+    R = _tilt_rotation(cx, sx, cy, sy)
+    by_x = _tilt_rotation(-sx, cx, cy, sy) - _tilt_rotation(0 * cx, 0 * sx, cy, sy)
+    by_y = _tilt_rotation(cx, sx, -sy, cy) - _tilt_rotation(cx, sx, 0 * cy, 0 * sy)
+    along = _along_axis(R)
+    return (
+        (_along_axis(by_x) - _along_axis(0 * by_x)) @ R + along @ by_x,
+        (_along_axis(by_y) - _along_axis(0 * by_y)) @ R + along @ by_y,
+    )
+
+
+def _tilt_rotation(cx: Array, sx: Array, cy: Array, sy: Array) -> Array:
+    """R_y R_x (..., 3, 3) of OpenCV's tilt from the angles' cosines and sines."""
     zero, one = np.zeros_like(cx), np.ones_like(cx)
     about_x = np.stack(
         [np.stack([one, zero, zero], -1), np.stack([zero, cx, sx], -1), np.stack([zero, -sx, cx], -1)], -2
@@ -75,8 +126,13 @@ def tilt_matrix(tau_x: Array, tau_y: Array) -> Array:
     about_y = np.stack(
         [np.stack([cy, zero, -sy], -1), np.stack([zero, one, zero], -1), np.stack([sy, zero, cy], -1)], -2
     )
-    R = about_y @ about_x
-    along = np.stack(
+    return about_y @ about_x
+
+
+def _along_axis(R: Array) -> Array:
+    """The projection (..., 3, 3) onto the sensor along the optical axis, of the tilt's rotation (..., 3, 3)."""
+    zero, one = np.zeros_like(R[..., 0, 0]), np.ones_like(R[..., 0, 0])
+    return np.stack(
         [
             np.stack([R[..., 2, 2], zero, -R[..., 0, 2]], -1),
             np.stack([zero, R[..., 2, 2], -R[..., 1, 2]], -1),
@@ -84,7 +140,12 @@ def tilt_matrix(tau_x: Array, tau_y: Array) -> Array:
         ],
         -2,
     )
-    return along @ R
+
+
+def tilt_matrix(tau_x: Array, tau_y: Array) -> Array:
+    """OpenCV's tilt homography (..., 3, 3) of the two angles (...), rad."""
+    R = _tilt_rotation(np.cos(tau_x), np.sin(tau_x), np.cos(tau_y), np.sin(tau_y))
+    return _along_axis(R) @ R
 
 
 def fold_limit(distortion: tuple[float, ...]) -> float:
@@ -129,7 +190,46 @@ def holds(xy: Array, jacobian: Array, fold_r2: Array) -> Bools:
     return (r2 < fold_r2) & (det > 0)
 
 
-def undistort(target: Array, coefficients: Array, fold_r2: float) -> Array:
+def distort_fisheye(xy: Array, coefficients: Array) -> tuple[Array, Array]:
+    """As `distort`, by OpenCV's fisheye model: an angle t off the axis is drawn at t (1 + k1 t^2 + k2 t^4 + ...).
+
+    coefficients (..., 14): k1, k2, k3, k4 and zeros. Source: OpenCV, calib3d, "Fisheye camera model".
+    """
+    k = coefficients
+    r2 = np.sum(xy * xy, axis=-1)
+    on_axis = r2 < 1e-16
+    r = np.sqrt(np.where(on_axis, 1.0, r2))
+    t = np.arctan(r)
+    t2 = t * t
+    td = t * (1 + t2 * (k[..., 0] + t2 * (k[..., 1] + t2 * (k[..., 2] + t2 * k[..., 3]))))
+    d_td = 1 + t2 * (3 * k[..., 0] + t2 * (5 * k[..., 1] + t2 * (7 * k[..., 2] + t2 * 9 * k[..., 3])))
+    scale = np.where(on_axis, 1.0, td / r)
+    # d(scale)/dr / r, by which the outer product of xy is multiplied
+    growth = np.where(on_axis, 0.0, (d_td / (1 + r * r) - td / r) / (r * r))
+    J = scale[..., None, None] * np.eye(2) + growth[..., None, None] * xy[..., :, None] * xy[..., None, :]
+    return scale[..., None] * xy, J
+
+
+def fisheye_coefficient_jacobian(xy: Array, coefficients: Array) -> Array:
+    """d(distorted)/d(coefficients) (..., 2, 14) of `distort_fisheye`."""
+    r = np.linalg.norm(xy, axis=-1)
+    t = np.arctan(r)
+    unit = xy / np.where(r > 1e-8, r, 1.0)[..., None]
+    J = np.zeros((*np.broadcast_shapes(xy.shape[:-1], np.shape(coefficients)[:-1]), 2, N_DISTORTION))
+    for column, power in enumerate((3, 5, 7, 9)):
+        J[..., column] = unit * (t**power)[..., None]
+    return J
+
+
+def fisheye_fold_limit(distortion: tuple[float, ...]) -> float:
+    """As `fold_limit`, for the fisheye model: inf where the drawn radius grows up to 90 deg off the axis."""
+    k1, k2, k3, k4 = padded(distortion)[:4]
+    slope = np.array([1.0, 0, 3 * k1, 0, 5 * k2, 0, 7 * k3, 0, 9 * k4])
+    limit = _first_sign_change(slope)
+    return float(np.tan(limit) ** 2) if limit < np.pi / 2 else np.inf
+
+
+def undistort(target: Array, coefficients: Array, fold_r2: float, fisheye: bool = False) -> Array:
     """Normalised points (n, 2) whose distortion is `target` (n, 2); nan where there is none within the fold limit.
 
     Newton's method from the target itself, each step cut so that the point stays inside the limit and the
@@ -137,8 +237,10 @@ def undistort(target: Array, coefficients: Array, fold_r2: float) -> Array:
     """
     target = np.asarray(target, dtype=float)
     coefficients = np.asarray(coefficients, dtype=float)
-    if not np.any(coefficients):
+    if not np.any(coefficients) and not fisheye:
         return target.copy()
+    if fisheye:
+        return _undistort_fisheye(target, coefficients, fold_r2)
     r_limit = np.sqrt(fold_r2) * (1 - 1e-9)
     radius = np.linalg.norm(target, axis=-1, keepdims=True)
     x = target * np.minimum(1.0, 0.7 * r_limit / np.maximum(radius, 1e-300))
@@ -172,3 +274,26 @@ def undistort(target: Array, coefficients: Array, fold_r2: float) -> Array:
             break
     good = (np.linalg.norm(residual, axis=-1) < 1e-9) & holds(x, J, np.asarray(fold_r2))
     return np.where(good[:, None], x, np.nan)
+
+
+def _undistort_fisheye(target: Array, coefficients: Array, fold_r2: float) -> Array:
+    """`undistort` for the fisheye model: one angle per point, by Newton's method kept within the growing stretch."""
+    k1, k2, k3, k4 = coefficients[:4]
+    limit = np.arctan(np.sqrt(fold_r2)) * (1 - 1e-9)
+    td = np.linalg.norm(target, axis=-1)
+    below, above = np.zeros_like(td), np.full_like(td, limit)
+    t = np.minimum(td, limit)
+    for _ in range(60):
+        t2 = t * t
+        value = t * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4)))) - td
+        slope = 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
+        below, above = np.where(value < 0, t, below), np.where(value > 0, t, above)
+        step = t - value / np.where(slope > 1e-12, slope, 1e-12)
+        new = np.where((step >= below) & (step <= above), step, (below + above) / 2)
+        if np.all(np.abs(new - t) < 1e-16):
+            break
+        t = new
+    t2 = t * t
+    good = np.abs(t * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4)))) - td) < 1e-9
+    scale = np.where(td > 1e-12, np.tan(t) / np.where(td > 1e-12, td, 1.0), 1.0)
+    return np.where(good[..., None], scale[..., None] * target, np.nan)

@@ -14,11 +14,12 @@ from geometry.pose import Pose
 
 @dataclass(frozen=True, slots=True)
 class Screen:
-    """A flat receiving screen."""
+    """A receiving screen: flat, or bent a little."""
 
     name: str
     world_from_screen: Pose  # the screen's z axis is its normal
     size_m: tuple[float, float] | None = None  # extent along x and y, centred on the origin; None: without end
+    bow: tuple[float, float, float] = (0.0, 0.0, 0.0)  # a, b, c, 1/m: the surface is z = a x^2 + b x y + c y^2
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,30 @@
+"""What a calibration concludes about itself: findings with a level, a reason and a cure, and the verdict they make."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from enum import IntEnum
+
+
+class Level(IntEnum):
+    """How grave a finding is. The order is the gravity."""
+
+    PASS = 0
+    WARN = 1  # usable; the user should know
+    FAIL = 2  # must not be used
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing that was tested, and how it came out, in words for the person who can act on it."""
+
+    level: Level
+    what: str  # what was tested and what came out, with figures
+    why: str = ""  # what it means for a measurement
+    cure: str = ""  # what to do; empty for PASS
+
+
+def verdict(findings: Iterable[Finding]) -> Level:
+    """The gravest level among the findings; PASS where there are none."""
+    return max((f.level for f in findings), default=Level.PASS)
