@@ -80,7 +80,8 @@ class Row:
     def line(self) -> str:
         return (
             f"{self.kind:10} {self.frames:6} {self.spots:8} {self.recall:8.4f} {self.rms_px:8.4f} {self.worst_px:8.3f}"
-            f" {self.rms_px / self.bound_px:8.3f} {self.of_bound:8.3f} {self.honesty:8.3f} {self.false_per_frame:9.3f} {self.time_ms:8.2f}"
+            f" {self.rms_px / self.bound_px:8.3f} {self.of_bound:8.3f} {self.honesty:8.3f}"
+            f" {self.false_per_frame:9.3f} {self.time_ms:8.2f}"
             f" {self.time_ms / self.read_ms:8.2f}"
         )
 

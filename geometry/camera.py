@@ -10,7 +10,6 @@ from geometry import lens
 from geometry.arrays import Array, Bools
 from geometry.pose import Pose
 
-
 PERSPECTIVE, FISHEYE = "perspective", "fisheye"
 LENSES = (PERSPECTIVE, FISHEYE)
 

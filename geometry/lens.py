@@ -1,7 +1,8 @@
 """The lens models: OpenCV's distortions of normalised image points, their Jacobians, and how far out they hold.
 
 Twelve polynomial numbers and two tilt angles, in OpenCV's order: k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4,
-tau_x, tau_y; or OpenCV's fisheye model with four. Source: OpenCV, calib3d, "Detailed description"; the test compares with cv2.projectPoints.
+tau_x, tau_y; or OpenCV's fisheye model with four. Source: OpenCV, calib3d, "Detailed description"; the tests compare
+with cv2.projectPoints and cv2.fisheye.projectPoints.
 """
 
 from __future__ import annotations
@@ -70,7 +71,7 @@ def coefficient_jacobian(xy: Array, coefficients: Array) -> Array:
 
     xy (..., 2) and coefficients (..., 14) as in `distort`.
     """
-    k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4, tau_x, tau_y = np.moveaxis(coefficients, -1, 0)
+    k1, k2, _, _, k3, k4, k5, k6, *_, tau_x, tau_y = np.moveaxis(coefficients, -1, 0)
     x, y = xy[..., 0], xy[..., 1]
     r2 = x * x + y * y
     r4, r6 = r2 * r2, r2 * r2 * r2
