@@ -1,0 +1,349 @@
+"""The boards that cameras are calibrated with: what is printed on them, and the short text that names one.
+
+All boards share one frame: the origin is the first point, x runs along the columns to the last point of the first row,
+y down the rows, z = x cross y INTO the board, away from who looks at its printed side (OpenCV's convention). All points
+have z = 0. Seen from the front with the first point at the top left, x points right and y down.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+import re
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import cv2
+import numpy as np
+
+from geometry.arrays import Array, Ints
+
+EXAMPLES = {
+    "chessboard": "chessboard:9x6:25mm (inner corners, side of a square)",
+    "circles": "circles:10x10:12mm (circles, distance of neighbours)",
+    "acircles": "acircles:4x11:20mm (circles in a row, rows, distance of two rows)",
+    "charuco": "charuco:5x7:40mm:20mm:DICT_4X4_50 (squares, side of a square, side of a marker, dictionary;"
+    " then :inverted for white markers, :legacy for OpenCV's pattern before 4.6)",
+}
+_FEWEST = 3  # points along each side: with two, a board's outline cannot be told from its neighbourhood
+_MOST = 200
+# Of two circles that touch nothing: half of the distance to the nearest neighbour is ink. Thinner rings of white between
+# the circles let blur run them together; smaller circles have fewer edge pixels to measure.
+_INK = 0.5
+
+
+def _dictionaries() -> dict[str, int]:
+    """OpenCV's predefined dictionaries by name. Of names for one dictionary (36H11, 36h11) the printed one stays."""
+    by_number: dict[int, str] = {}
+    for name in sorted(n for n in dir(cv2.aruco) if n.startswith("DICT_")):  # upper case sorts first
+        by_number[int(getattr(cv2.aruco, name))] = name
+    return {by_number[number]: number for number in sorted(by_number)}
+
+
+DICTIONARIES = _dictionaries()  # name -> OpenCV's number, in OpenCV's order
+
+
+@dataclass(frozen=True, slots=True)
+class Chessboard:
+    """A plain chessboard. The square above and left of the first inner corner is dark.
+
+    That fixes the first corner where columns + rows is odd. Where it is even, the board looks the same after half a
+    turn (`symmetry` 2), and after a quarter turn if it is square with even sides (4).
+    """
+
+    columns: int  # inner corners
+    rows: int
+    square_m: float
+
+    def __post_init__(self) -> None:
+        _check_count("chessboard", "inner corners", self.columns, self.rows)
+        _check_length("chessboard", "square", self.square_m)
+
+    @property
+    def points(self) -> Array:
+        """Inner corners (columns * rows, 3), m, in the board's frame, row by row."""
+        return _lattice(self.columns, self.rows, self.square_m)
+
+    @property
+    def ids(self) -> Ints:
+        """(N,): 0, 1, ... row by row."""
+        return np.arange(self.columns * self.rows)
+
+    @property
+    def middle(self) -> Array:
+        """(3,), m: about which a bent board is described."""
+        return _middle(self.points)
+
+    @property
+    def size_m(self) -> tuple[float, float]:
+        """Width and height of the printed squares."""
+        return (self.columns + 1) * self.square_m, (self.rows + 1) * self.square_m
+
+    @property
+    def spacing_m(self) -> float:
+        """Distance of neighbouring points."""
+        return self.square_m
+
+    @property
+    def symmetry(self) -> int:
+        """In how many ways the board can be turned in its plane and look the same: 1, 2 or 4."""
+        if self.columns == self.rows and self.columns % 2 == 0:
+            return 4
+        return 1 if (self.columns + self.rows) % 2 else 2
+
+    def describe(self) -> str:
+        """The text that `parse` reads."""
+        return f"chessboard:{self.columns}x{self.rows}:{_mm(self.square_m)}"
+
+
+@dataclass(frozen=True, slots=True)
+class CircleGrid:
+    """Dark circles on white, in rows and columns, or asymmetric: every other row shifted by half a step.
+
+    spacing_m is the distance of neighbours, or for an asymmetric grid that of two ROWS; circles of one row are then
+    2 spacing_m apart and neighbours sqrt(2) spacing_m (OpenCV's convention: x = (2 j + i % 2) spacing, y = i spacing).
+    """
+
+    columns: int  # circles in a row
+    rows: int
+    spacing_m: float
+    asymmetric: bool = False
+
+    def __post_init__(self) -> None:
+        _check_count(self.kind, "circles", self.columns, self.rows)
+        _check_length(self.kind, "spacing", self.spacing_m)
+
+    @property
+    def kind(self) -> str:
+        """The first word of its text."""
+        return "acircles" if self.asymmetric else "circles"
+
+    @property
+    def points(self) -> Array:
+        """Centres (columns * rows, 3), m, in the board's frame, row by row."""
+        points = _lattice(self.columns, self.rows, self.spacing_m)
+        if self.asymmetric:
+            row = np.arange(len(points)) // self.columns
+            points[:, 0] = 2 * points[:, 0] + (row % 2) * self.spacing_m
+        return points
+
+    @property
+    def ids(self) -> Ints:
+        """(N,): 0, 1, ... row by row."""
+        return np.arange(self.columns * self.rows)
+
+    @property
+    def middle(self) -> Array:
+        """(3,), m: about which a bent board is described."""
+        return _middle(self.points)
+
+    @property
+    def neighbours_m(self) -> float:
+        """Distance of the nearest centres."""
+        return self.spacing_m * (math.sqrt(2) if self.asymmetric else 1.0)
+
+    @property
+    def diameter_m(self) -> float:
+        """Of the circles as beampose prints them. Detection measures it and does not rely on it."""
+        return _INK * self.neighbours_m
+
+    @property
+    def size_m(self) -> tuple[float, float]:
+        """Width and height of the ink."""
+        span = np.ptp(self.points, axis=0)
+        return float(span[0]) + self.diameter_m, float(span[1]) + self.diameter_m
+
+    @property
+    def symmetry(self) -> int:
+        """In how many ways the board can be turned in its plane and look the same: 1, 2 or 4."""
+        if self.asymmetric:
+            return 2 if self.rows % 2 == 0 else 1
+        return 4 if self.columns == self.rows else 2
+
+    def describe(self) -> str:
+        """The text that `parse` reads."""
+        return f"{self.kind}:{self.columns}x{self.rows}:{_mm(self.spacing_m)}"
+
+
+@dataclass(frozen=True, slots=True)
+class Charuco:
+    """A chessboard with an ArUco marker in each light square; its points are the inner chessboard corners.
+
+    Marker numbers tell where a corner is, so that a part of the board is enough and no symmetry is left.
+    """
+
+    columns: int  # SQUARES, as in OpenCV
+    rows: int
+    square_m: float
+    marker_m: float
+    dictionary: str  # OpenCV's name
+    inverted: bool = False  # printed with dark and light exchanged
+    legacy: bool = False  # OpenCV's pattern before 4.6: it differs where the rows are even
+
+    def __post_init__(self) -> None:
+        _check_count("charuco", "squares", self.columns, self.rows)
+        _check_length("charuco", "square", self.square_m)
+        _check_length("charuco", "marker", self.marker_m)
+        if self.marker_m >= self.square_m:
+            raise ValueError(
+                f"charuco: expected markers smaller than the squares, got {_mm(self.marker_m)} in"
+                f" {_mm(self.square_m)}; the square comes first: {EXAMPLES['charuco']}"
+            )
+        object.__setattr__(self, "dictionary", dictionary_name(self.dictionary))
+        kept = dictionary_size(self.dictionary)
+        if self.markers > kept:
+            raise ValueError(
+                f"charuco: {self.columns}x{self.rows} squares need {self.markers} markers, {self.dictionary} has"
+                f" {kept}; take a larger dictionary"
+            )
+
+    @property
+    def markers(self) -> int:
+        """How many markers there are: numbers 0 to markers - 1."""
+        return self.columns * self.rows // 2  # an odd board begins and ends with a dark square
+
+    @property
+    def light_first(self) -> bool:
+        """Whether the top left square holds a marker (before inversion)."""
+        return self.legacy and self.rows % 2 == 0
+
+    @property
+    def points(self) -> Array:
+        """Inner corners ((columns - 1) * (rows - 1), 3), m, in the board's frame, row by row."""
+        return _lattice(self.columns - 1, self.rows - 1, self.square_m)
+
+    @property
+    def ids(self) -> Ints:
+        """(N,): OpenCV's numbers of the corners, row by row."""
+        return np.arange((self.columns - 1) * (self.rows - 1))
+
+    @property
+    def middle(self) -> Array:
+        """(3,), m: about which a bent board is described."""
+        return _middle(self.points)
+
+    @property
+    def size_m(self) -> tuple[float, float]:
+        """Width and height of the printed squares."""
+        return self.columns * self.square_m, self.rows * self.square_m
+
+    @property
+    def spacing_m(self) -> float:
+        """Distance of neighbouring points."""
+        return self.square_m
+
+    @property
+    def symmetry(self) -> int:
+        """1: markers leave no doubt."""
+        return 1
+
+    def describe(self) -> str:
+        """The text that `parse` reads."""
+        text = f"charuco:{self.columns}x{self.rows}:{_mm(self.square_m)}:{_mm(self.marker_m)}:{self.dictionary}"
+        return text + (":inverted" if self.inverted else "") + (":legacy" if self.legacy else "")
+
+
+Board: TypeAlias = Chessboard | CircleGrid | Charuco
+
+
+def parse(text: str) -> Board:
+    """The board that a text names. Raises ValueError: one line with an example.
+
+    chessboard:9x6:25mm, circles:10x10:12mm, acircles:4x11:20mm, charuco:5x7:40mm:20mm:DICT_4X4_50[:inverted][:legacy];
+    lengths in mm, cm or m.
+    """
+    kind, *parts = [part.strip() for part in text.strip().split(":")]
+    kind = kind.lower()
+    if kind not in EXAMPLES:
+        near = difflib.get_close_matches(kind, EXAMPLES, n=1, cutoff=0.6)
+        hint = f"did you mean {near[0]!r}? " if near else ""
+        raise ValueError(
+            f"board {text!r}: expected one of {', '.join(EXAMPLES)} first, got {kind!r}; {hint}"
+            f"example: {EXAMPLES[near[0] if near else 'chessboard']}"
+        )
+    try:
+        return _board_of(kind, parts)
+    except ValueError as error:
+        hint = "" if EXAMPLES[kind] in str(error) else f"; example: {EXAMPLES[kind]}"
+        raise ValueError(f"board {text!r}: {error}{hint}") from None
+
+
+def _board_of(kind: str, parts: list[str]) -> Board:
+    wanted = 4 if kind == "charuco" else 2
+    if len(parts) < wanted or (kind != "charuco" and len(parts) > wanted):
+        raise ValueError(f"expected {wanted} parts after {kind!r}, got {len(parts)}")
+    columns, rows = _read_count(parts[0])
+    if kind == "chessboard":
+        return Chessboard(columns, rows, _read_length(parts[1]))
+    if kind != "charuco":
+        return CircleGrid(columns, rows, _read_length(parts[1]), asymmetric=kind == "acircles")
+    words = [word.lower() for word in parts[4:]]
+    for word in words:
+        if word not in ("inverted", "legacy"):
+            raise ValueError(f"expected 'inverted' or 'legacy' at the end, got {word!r}")
+    return Charuco(
+        columns,
+        rows,
+        _read_length(parts[1]),
+        _read_length(parts[2]),
+        parts[3],
+        inverted="inverted" in words,
+        legacy="legacy" in words,
+    )
+
+
+def _read_count(text: str) -> tuple[int, int]:
+    found = re.fullmatch(r"(\d{1,4})\s*[xX×]\s*(\d{1,4})", text)
+    if found is None:
+        raise ValueError(f"expected columns x rows such as 9x6, got {text!r}")
+    return int(found[1]), int(found[2])
+
+
+def _read_length(text: str) -> float:
+    found = re.fullmatch(r"(\d+\.?\d*|\.\d+)\s*(mm|cm|m)", text, flags=re.IGNORECASE)
+    if found is None:
+        raise ValueError(f"expected a length with its unit such as 25mm, got {text!r}")
+    # Division, since 25 / 1000 is the double nearest to 0.025 and 25 * 0.001 is not.
+    return float(found[1]) / {"mm": 1000.0, "cm": 100.0, "m": 1.0}[found[2].lower()]
+
+
+def dictionary_name(text: str) -> str:
+    """OpenCV's name of a dictionary of ArUco markers, whatever the case. Raises ValueError with what is near."""
+    by_lower = {name.lower(): name for name in DICTIONARIES}
+    if text.lower() in by_lower:
+        return by_lower[text.lower()]
+    if f"dict_{text.lower()}" in by_lower:
+        return by_lower[f"dict_{text.lower()}"]
+    near = difflib.get_close_matches(text.lower(), by_lower, n=3, cutoff=0.6)
+    hint = f"did you mean {' or '.join(by_lower[n] for n in near)}?" if near else f"known: {', '.join(DICTIONARIES)}"
+    raise ValueError(f"expected one of OpenCV's dictionaries, got {text!r}; {hint}")
+
+
+def dictionary_size(name: str) -> int:
+    """How many markers a dictionary has."""
+    return len(cv2.aruco.getPredefinedDictionary(DICTIONARIES[name]).bytesList)
+
+
+def _check_count(kind: str, what: str, columns: int, rows: int) -> None:
+    if min(columns, rows) < _FEWEST or max(columns, rows) > _MOST:
+        raise ValueError(f"expected {_FEWEST} to {_MOST} {what} along each side, got {columns}x{rows}")
+
+
+def _check_length(kind: str, what: str, length_m: float) -> None:
+    if not (math.isfinite(length_m) and 1e-4 <= length_m <= 10):
+        raise ValueError(
+            f"{kind}: expected a {what} of 0.1 mm to 10 m, got {length_m:g} m; give the unit as in {EXAMPLES[kind]}"
+        )
+
+
+def _lattice(columns: int, rows: int, step: float) -> Array:
+    j, i = np.meshgrid(np.arange(columns), np.arange(rows))
+    return np.stack([j.ravel() * step, i.ravel() * step, np.zeros(columns * rows)], axis=1)
+
+
+def _middle(points: Array) -> Array:
+    return (points.min(axis=0) + points.max(axis=0)) / 2
+
+
+def _mm(length_m: float) -> str:
+    return f"{round(length_m * 1000, 9):.12g}mm"
