@@ -10,12 +10,12 @@ from typing import Annotated, Any
 import numpy as np
 import pydantic
 
-from geometry import lens
 from geometry.arrays import Array
 from geometry.camera import Camera, SensorNoise
 from geometry.pose import Pose
 from geometry.rig import Beam, Rig, Screen, Spot
 from geometry.rotations import matrix_from_quaternion, quaternion_from_matrix
+from lab.camera_block import Covariance, CovarianceBlock, LensBlock, covariance_mapping, floats, lens_mapping
 from lab.fields import (
     Block,
     FromZero,
@@ -23,8 +23,6 @@ from lab.fields import (
     Positive,
     Vector3,
     Word,
-    a_number,
-    an_integer,
     numbers,
     one_of,
     positive_numbers,
@@ -36,14 +34,6 @@ from lab.yaml_text import FileError, did_you_mean, read_mapping, write_mapping
 
 SCHEMA = "beampose/rig/1"
 QUATERNION_TOLERANCE = 1e-6  # what a quaternion written with seven digits may miss of length 1
-
-
-@dataclass(frozen=True, slots=True)
-class Covariance:
-    """What a calibration knows of the errors of one camera, one screen or the target."""
-
-    parameters: tuple[str, ...]  # n names
-    matrix: Array  # (n, n), symmetric, in the parameters' units
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,10 +56,7 @@ def load_rig_file(path: Path) -> RigFile:
     mistakes = _broken_references(content)
     if mistakes:
         raise FileError(f"{path}: {m}" for m in mistakes)
-    covariances = {
-        where: Covariance(tuple(block.parameters), np.array(block.matrix, dtype=float).reshape(len(block.matrix), -1))
-        for where, block in _covariance_blocks(content)
-    }
+    covariances = {where: block.value() for where, block in _covariance_blocks(content)}
     return RigFile(_rig_of(content), covariances)
 
 
@@ -96,40 +83,11 @@ def _unit_quaternion(value: Any) -> list[float]:
     return q
 
 
-def _image_size(value: Any) -> list[int]:
-    numbers(2)(value)
-    size = [an_integer(v) for v in value]
-    if min(size) < 1:
-        raise unexpected("a width and a height of at least 1 pixel", value)
-    return size
-
-
-def _distortion(value: Any) -> list[float]:
-    words = "0, 4, 5, 8, 12 or 14 numbers"
-    if not isinstance(value, list):
-        raise unexpected(f"a list of {words}", value)
-    if len(value) not in lens.ALLOWED_LENGTHS:
-        raise wrong(f"expected {words}, got {len(value)}")
-    return [a_number(v) for v in value]
-
-
 def _direction(value: Any) -> list[float]:
     d = numbers(3)(value)
     if np.linalg.norm(d) < 1e-9:
         raise unexpected("a direction, which has a length", value)
     return d
-
-
-def _parameter_names(value: Any) -> list[str]:
-    if not isinstance(value, list) or not all(isinstance(v, str) for v in value):
-        raise unexpected("a list of parameter names", value)
-    return value
-
-
-def _matrix(value: Any) -> list[list[float]]:
-    if not isinstance(value, list) or not all(isinstance(row, list) and len(row) == len(value) for row in value):
-        raise unexpected("a square matrix, as a list of rows", value)
-    return [[a_number(v) for v in row] for row in value]
 
 
 class _PoseBlock(Block):
@@ -140,28 +98,10 @@ class _PoseBlock(Block):
         return Pose.from_quaternion(np.array(self.quaternion_wxyz), np.array(self.translation_m))
 
 
-class _CovarianceBlock(Block):
-    parameters: Annotated[list[str], pydantic.PlainValidator(_parameter_names)]
-    matrix: Annotated[list[list[float]], pydantic.PlainValidator(_matrix)]
-
-    @pydantic.model_validator(mode="after")
-    def _same_size(self) -> _CovarianceBlock:
-        if len(self.matrix) != len(self.parameters):
-            raise wrong(f"expected a matrix row for each of {len(self.parameters)} parameters, got {len(self.matrix)}")
-        return self
-
-
 class _ScreenBlock(Block):
     world_from_screen: _PoseBlock
     size_m: Annotated[list[float] | None, pydantic.PlainValidator(positive_numbers(2))] = None
-    covariance: _CovarianceBlock | None = None
-
-
-class _MatrixBlock(Block):
-    fx: Positive
-    fy: Positive
-    cx: Number
-    cy: Number
+    covariance: CovarianceBlock | None = None
 
 
 class _NoiseBlock(Block):
@@ -170,14 +110,11 @@ class _NoiseBlock(Block):
     black_dn: Number = 0.0
 
 
-class _CameraBlock(Block):
+class _CameraBlock(LensBlock):
     screen: Word
-    image_size_px: Annotated[list[int], pydantic.PlainValidator(_image_size)]
-    camera_matrix: _MatrixBlock
-    distortion: Annotated[list[float], pydantic.PlainValidator(_distortion)] = []  # noqa: RUF012 - frozen
     camera_from_world: _PoseBlock
     noise: _NoiseBlock | None = None
-    covariance: _CovarianceBlock | None = None
+    covariance: CovarianceBlock | None = None
 
 
 class _BeamBlock(Block):
@@ -194,7 +131,7 @@ class _SpotBlock(Block):
 class _TargetBlock(Block):
     beams: dict[str, _BeamBlock]
     spots: dict[str, _SpotBlock]
-    covariance: _CovarianceBlock | None = None
+    covariance: CovarianceBlock | None = None
 
 
 class _RigBlock(Block):
@@ -237,7 +174,7 @@ def _no_such(kind: str, name: str, where: str, known: Mapping[str, Any]) -> str:
     return f"{where}: expected a {kind} of this file, got {name!r}{did_you_mean(name, known)}"
 
 
-def _covariance_blocks(content: _RigBlock) -> list[tuple[str, _CovarianceBlock]]:
+def _covariance_blocks(content: _RigBlock) -> list[tuple[str, CovarianceBlock]]:
     blocks = [(f"screens.{n}", s.covariance) for n, s in content.screens.items()]
     blocks += [(f"cameras.{n}", c.covariance) for n, c in content.cameras.items()]
     blocks += [("target", content.target.covariance)]
@@ -261,15 +198,15 @@ def _rig_of(content: _RigBlock) -> Rig:
 
 
 def _camera_of(name: str, c: _CameraBlock) -> Camera:
-    m = c.camera_matrix
     return Camera(
         name=name,
         screen=c.screen,
-        image_size_px=(c.image_size_px[0], c.image_size_px[1]),
-        matrix=np.array([[m.fx, 0, m.cx], [0, m.fy, m.cy], [0, 0, 1]]),
+        image_size_px=c.size(),
+        matrix=c.matrix(),
         distortion=tuple(c.distortion),
         camera_from_world=c.camera_from_world.pose(),
         noise=None if c.noise is None else SensorNoise(c.noise.gain_e_per_dn, c.noise.read_noise_e, c.noise.black_dn),
+        lens=c.lens,
     )
 
 
@@ -287,7 +224,7 @@ def as_mapping(file: RigFile) -> dict[str, Any]:
     cameras = {name: _camera_mapping(camera) for name, camera in rig.cameras.items()}
     target = {
         "beams": {
-            name: {"direction": _same_when_read(b.direction), "point_m": _floats(b.point)}
+            name: {"direction": _same_when_read(b.direction), "point_m": floats(b.point)}
             for name, b in rig.beams.items()
         },
         "spots": {
@@ -300,25 +237,14 @@ def as_mapping(file: RigFile) -> dict[str, Any]:
         block = content
         for key in where.split(".", 1):
             block = block[key]
-        block["covariance"] = {
-            "parameters": list(covariance.parameters),
-            "matrix": [_floats(row) for row in covariance.matrix],
-        }
+        block["covariance"] = covariance_mapping(covariance)
     return content
 
 
 def _camera_mapping(camera: Camera) -> dict[str, Any]:
-    K = camera.matrix
     out: dict[str, Any] = {
         "screen": camera.screen,
-        "image_size_px": [int(v) for v in camera.image_size_px],
-        "camera_matrix": {
-            "fx": float(K[0, 0]),
-            "fy": float(K[1, 1]),
-            "cx": float(K[0, 2]),
-            "cy": float(K[1, 2]),
-        },
-        "distortion": [float(v) for v in camera.distortion],
+        **lens_mapping(camera.image_size_px, camera.matrix, camera.distortion, camera.lens),
         "camera_from_world": _pose_mapping(camera.camera_from_world),
     }
     if camera.noise is not None:
@@ -331,14 +257,10 @@ def _camera_mapping(camera: Camera) -> dict[str, Any]:
     return out
 
 
-def _floats(values: Array) -> list[float]:
-    return [float(v) + 0.0 for v in values]  # + 0.0: no "-0.0" in the file
-
-
 def _pose_mapping(pose: Pose) -> dict[str, Any]:
     return {
-        "quaternion_wxyz": _floats(_quaternion_of(pose.rotation)),
-        "translation_m": _floats(pose.translation),
+        "quaternion_wxyz": floats(_quaternion_of(pose.rotation)),
+        "translation_m": floats(pose.translation),
     }
 
 
@@ -369,6 +291,6 @@ def _same_when_read(direction: Array) -> list[float]:
     trial, rng = direction, np.random.default_rng(0)
     for _ in range(3000):
         if np.array_equal(trial / np.linalg.norm(trial), direction):
-            return _floats(trial)
+            return floats(trial)
         trial = direction * (1 + rng.uniform(0, 1e-9))
-    return _floats(direction)
+    return floats(direction)

@@ -1,0 +1,1 @@
+"""The calibration workflow: files in, calibrations and their reports out."""
