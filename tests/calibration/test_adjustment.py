@@ -1,0 +1,186 @@
+"""The least-squares engine: against dense algebra, in its limits, and its claims of covariance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from calibration.adjustment import AdjustmentError, Cauchy, Linearised, Loss, Part, Values, solve
+from calibration.priors import Prior, independent
+from calibration.stacks import Lines, Poses, Vectors
+from geometry.arrays import normalised, numeric_jacobian
+from geometry.pose import Pose
+from tests.geometry.scenes import random_pose
+
+seeds = st.integers(0, 2**32 - 1)
+
+
+@dataclass(frozen=True)
+class Linear:
+    """a_i x[index_i] + b_i y = z_i + noise of 1: two stacks, x of many unknowns and y of one."""
+
+    index: np.ndarray
+    a: np.ndarray  # (N, 2, 2)
+    b: np.ndarray  # (N, 2, 3)
+    z: np.ndarray  # (N, 2)
+    loss: Loss | None = None
+
+    def linearise(self, values: Values) -> Linearised:
+        x, y = values["x"].array, values["y"].array
+        r = (self.a @ x[self.index][..., None])[..., 0] + self.b @ y[0] - self.z
+        zero = np.zeros(len(r), dtype=int)
+        return Linearised(r, [Part("x", self.index, self.a), Part("y", zero, self.b)])
+
+
+def linear_problem(rng: np.random.Generator, loss: Loss | None = None, count: int = 60) -> tuple[dict, Linear]:
+    index = np.concatenate([np.arange(7), rng.integers(0, 7, count - 7)])
+    a, b = rng.normal(size=(count, 2, 2)), rng.normal(size=(count, 2, 3))
+    truth = {"x": Vectors(rng.normal(size=(7, 2))), "y": Vectors(rng.normal(size=(1, 3)))}
+    z = (a @ truth["x"].array[index][..., None])[..., 0] + b @ truth["y"].array[0] + rng.normal(size=(count, 2))
+    return truth, Linear(index, a, b, z, loss)
+
+
+def dense(term: Linear, at: np.ndarray) -> np.ndarray:
+    J = np.zeros((len(term.z), 2, 17))
+    for n, i in enumerate(term.index):
+        J[n, :, 2 * i : 2 * i + 2] = term.a[n]
+    J[..., 14:] = term.b
+    return J.reshape(-1, 17)[:, at]
+
+
+START = {"x": Vectors(np.zeros((7, 2))), "y": Vectors(np.zeros((1, 3)))}
+
+
+@settings(max_examples=30)
+@given(seed=seeds)
+def test_sparse_and_dense_algebra_agree_in_values_and_covariance(seed):
+    _, term = linear_problem(np.random.default_rng(seed))
+    J = dense(term, np.arange(17))
+    best = np.linalg.lstsq(J, term.z.ravel(), rcond=None)[0]
+    found = solve(START, [term], {"x": True, "y": True})
+    covariance = np.linalg.inv(J.T @ J)
+    sigmas = np.sqrt(np.diagonal(covariance))
+    away = np.concatenate([found.values["x"].array.ravel(), found.values["y"].array.ravel()]) - best
+    assert np.all(np.abs(away) < 1e-3 * sigmas)  # the engine's own stop
+    got = found.covariance([("y", 0), ("x", 3), ("x", 0)])
+    order = [14, 15, 16, 6, 7, 0, 1]
+    np.testing.assert_allclose(got, covariance[np.ix_(order, order)], rtol=1e-8, atol=1e-10)
+    information = found.reduced_normal([("y", 0)])
+    np.testing.assert_allclose(information, np.linalg.inv(covariance[14:, 14:]), rtol=1e-8, atol=1e-10)
+    assert found.dof == 2 * 60 - 17
+
+
+def test_what_is_held_fixed_stays_and_has_no_variance():
+    _, term = linear_problem(np.random.default_rng(1))
+    mask = np.array([[True, False, True]])
+    found = solve(START, [term], {"x": True, "y": mask})
+    assert found.values["y"].array[0, 1] == 0.0
+    covariance = found.covariance([("y", 0)])
+    assert np.all(covariance[1] == 0)
+    J = dense(term, np.delete(np.arange(17), 15))
+    np.testing.assert_allclose(covariance[np.ix_([0, 2], [0, 2])], np.linalg.inv(J.T @ J)[14:, 14:], rtol=1e-8)
+
+
+def test_a_direction_that_nothing_determines_is_named_and_has_no_covariance():
+    _, term = linear_problem(np.random.default_rng(2))
+    b = term.b.copy()
+    b[..., 2] = 2 * b[..., 0]  # y0 + 2 y2 is all that acts
+    found = solve(START, [Linear(term.index, term.a, b, term.z)], {"x": True, "y": True})
+    with pytest.raises(AdjustmentError, match="undetermined"):
+        found.covariance([("y", 0)])
+    (direction,) = found.undetermined([("y", 0)])
+    np.testing.assert_allclose(direction / direction[0], [1, 0, -0.5], atol=1e-6)
+
+
+def test_a_prior_on_an_undetermined_direction_determines_it():
+    _, term = linear_problem(np.random.default_rng(3))
+    b = term.b.copy()
+    b[..., 2] = 0
+    known = Vectors(np.array([[0.0, 0.0, 4.0]]))
+    prior = Prior((("y", 0),), (known,), np.diag([np.inf, np.inf, 0.25]))
+    found = solve(START, [Linear(term.index, term.a, b, term.z), prior], {"x": True, "y": True})
+    assert found.values["y"].array[0, 2] == pytest.approx(4.0)
+    assert found.covariance([("y", 0)])[2, 2] == pytest.approx(0.25)
+
+
+def test_outliers_hardly_pull_with_a_robust_loss():
+    truth, term = linear_problem(np.random.default_rng(4), Cauchy(), count=300)
+    z = term.z.copy()
+    z[10:20] += 200.0
+    clean = solve(START, [term], {"x": True, "y": True})
+    found = solve(START, [Linear(term.index, term.a, term.b, z, Cauchy())], {"x": True, "y": True})
+    sigmas = np.sqrt(np.diagonal(clean.covariance([("y", 0)])))
+    assert np.all(np.abs(found.values["y"].array - clean.values["y"].array) < 0.5 * sigmas)
+    assert np.all(found.weights[0][10:20] < 0.01)
+    least_squares = solve(START, [Linear(term.index, term.a, term.b, z)], {"x": True, "y": True})
+    assert np.any(np.abs(least_squares.values["y"].array - truth["y"].array) > 5 * sigmas)
+
+
+def test_start_values_that_predict_nothing_are_refused():
+    _, term = linear_problem(np.random.default_rng(5))
+    broken = Linear(term.index, term.a, term.b, np.full_like(term.z, np.nan))
+    with pytest.raises(AdjustmentError, match="start values"):
+        solve(START, [broken], {"x": True})
+
+
+@settings(max_examples=40)
+@given(seed=seeds)
+def test_plus_and_minus_are_there_and_back_for_each_kind_of_unknown(seed):
+    rng = np.random.default_rng(seed)
+    delta = rng.normal(scale=1e-4, size=(2, 6))
+    poses = Poses.of([random_pose(rng), random_pose(rng)])
+    np.testing.assert_allclose(poses.plus(delta).minus(poses), delta, atol=1e-12)
+    lines = Lines(rng.normal(size=(2, 3)), normalised(rng.normal(size=(2, 3))))
+    # A line's direction is normalised, and where it passes the old point across moves along: both of second order.
+    np.testing.assert_allclose(lines.plus(delta[:, :4]).minus(lines), delta[:, :4], atol=1e-6)
+
+
+@settings(max_examples=40)
+@given(seed=seeds)
+def test_a_lines_point_may_slide_along_it_without_any_difference(seed):
+    rng = np.random.default_rng(seed)
+    lines = Lines(rng.normal(size=(3, 3)), normalised(rng.normal(size=(3, 3))))
+    slid = Lines(lines.points + 0.7 * lines.directions, lines.directions)
+    np.testing.assert_allclose(slid.minus(lines), 0, atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["poses", "lines", "vectors"])
+def test_a_priors_derivatives_are_those_of_its_residuals(kind):
+    rng = np.random.default_rng(6)
+    if kind == "poses":
+        known = Poses.of([random_pose(rng)])
+        now = known.plus(np.array([[0.1, 0.2, -0.1, 0.3, -0.2, 0.1]]))
+    elif kind == "lines":
+        known = Lines(rng.normal(size=(1, 3)), normalised(rng.normal(size=(1, 3))))
+        now = known
+    else:
+        known = Vectors(rng.normal(size=(1, 4)))
+        now = Vectors(rng.normal(size=(1, 4)))
+    root = rng.normal(size=(known.dof, known.dof))
+    prior = Prior((("it", 0),), (known,), root @ root.T)
+    line = prior.linearise({"it": now})
+    expected = numeric_jacobian(
+        lambda d: prior.linearise({"it": now.plus(d[None])}).residuals[0], np.zeros(known.dof), 1e-5
+    )
+    np.testing.assert_allclose(line.parts[0].jacobian[0], expected, rtol=1e-5, atol=1e-4)
+
+
+def test_poses_that_are_measured_twice_come_out_between_with_the_covariance_of_the_mean():
+    rng = np.random.default_rng(7)
+    first = random_pose(rng)
+    second = first.plus(np.full(6, 0.02))
+    terms = [
+        *independent("p", Poses.of([first]), np.full((1, 6), 0.1)),
+        *independent("p", Poses.of([second]), np.full((1, 6), 0.1)),
+    ]
+    found = solve({"p": Poses.of([Pose.identity()])}, terms, {"p": True})
+    np.testing.assert_allclose(found.values["p"].minus(Poses.of([first])), 0.01, atol=1e-5)
+    np.testing.assert_allclose(found.covariance([("p", 0)]), np.eye(6) * 0.005, atol=1e-6)
+
+
+def test_priors_of_unknowns_about_which_nothing_is_known_are_none():
+    assert independent("p", Vectors(np.zeros((2, 3))), np.full((2, 3), np.inf)) == []
