@@ -15,6 +15,7 @@ from geometry.camera import Camera, SensorNoise
 from geometry.pose import Pose
 from geometry.rig import Beam, Rig, Screen, Spot
 from geometry.rotations import matrix_from_quaternion, quaternion_from_matrix
+from lab.calibration_state import CalibrationState, CalibrationStateBlock, state_mapping
 from lab.camera_block import Covariance, CovarianceBlock, LensBlock, covariance_mapping, floats, lens_mapping
 from lab.fields import (
     Block,
@@ -38,10 +39,14 @@ QUATERNION_TOLERANCE = 1e-6  # what a quaternion written with seven digits may m
 
 @dataclass(frozen=True, slots=True)
 class RigFile:
-    """A rig and what else its file holds. The keys of `covariances` are `cameras.NAME`, `screens.NAME`, `target`."""
+    """A rig and what else its file holds. The keys of `covariances` are `cameras.NAME`, `screens.NAME`, `target`.
+
+    lab/rig_covariance.py makes one covariance of them.
+    """
 
     rig: Rig
     covariances: Mapping[str, Covariance] = field(default_factory=dict)
+    calibration: CalibrationState | None = None  # None: nobody says when and how well it was calibrated
 
 
 def load_rig(path: Path) -> Rig:
@@ -57,7 +62,8 @@ def load_rig_file(path: Path) -> RigFile:
     if mistakes:
         raise FileError(f"{path}: {m}" for m in mistakes)
     covariances = {where: block.value() for where, block in _covariance_blocks(content)}
-    return RigFile(_rig_of(content), covariances)
+    state = None if content.calibration is None else content.calibration.value()
+    return RigFile(_rig_of(content), covariances, state)
 
 
 def save_rig(rig: Rig | RigFile, path: Path) -> None:
@@ -101,7 +107,14 @@ class _PoseBlock(Block):
 class _ScreenBlock(Block):
     world_from_screen: _PoseBlock
     size_m: Annotated[list[float] | None, pydantic.PlainValidator(positive_numbers(2))] = None
+    bow_per_m: Vector3 = [0.0, 0.0, 0.0]  # noqa: RUF012 - frozen
     covariance: CovarianceBlock | None = None
+
+    def value(self, name: str) -> Screen:
+        """The screen."""
+        a, b, c = self.bow_per_m
+        size = None if self.size_m is None else (self.size_m[0], self.size_m[1])
+        return Screen(name, self.world_from_screen.pose(), size, (a, b, c))
 
 
 class _NoiseBlock(Block):
@@ -139,6 +152,7 @@ class _RigBlock(Block):
     screens: dict[str, _ScreenBlock]
     cameras: dict[str, _CameraBlock]
     target: _TargetBlock
+    calibration: CalibrationStateBlock | None = None
 
 
 def _broken_references(content: _RigBlock) -> list[str]:
@@ -183,10 +197,7 @@ def _covariance_blocks(content: _RigBlock) -> list[tuple[str, CovarianceBlock]]:
 
 def _rig_of(content: _RigBlock) -> Rig:
     return Rig(
-        screens={
-            name: Screen(name, s.world_from_screen.pose(), None if s.size_m is None else (s.size_m[0], s.size_m[1]))
-            for name, s in content.screens.items()
-        },
+        screens={name: s.value(name) for name, s in content.screens.items()},
         cameras={name: _camera_of(name, c) for name, c in content.cameras.items()},
         beams={
             name: Beam(name, np.array(b.direction), np.array(b.point_m)) for name, b in content.target.beams.items()
@@ -221,6 +232,8 @@ def as_mapping(file: RigFile) -> dict[str, Any]:
         screens[name] = {"world_from_screen": _pose_mapping(screen.world_from_screen)}
         if screen.size_m is not None:
             screens[name]["size_m"] = [float(v) for v in screen.size_m]
+        if any(screen.bow):
+            screens[name]["bow_per_m"] = [float(v) for v in screen.bow]
     cameras = {name: _camera_mapping(camera) for name, camera in rig.cameras.items()}
     target = {
         "beams": {
@@ -238,6 +251,8 @@ def as_mapping(file: RigFile) -> dict[str, Any]:
         for key in where.split(".", 1):
             block = block[key]
         block["covariance"] = covariance_mapping(covariance)
+    if file.calibration is not None:
+        content["calibration"] = state_mapping(file.calibration)
     return content
 
 

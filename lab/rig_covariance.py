@@ -1,0 +1,63 @@
+"""The covariance blocks of a rig.yaml as one joint covariance of the rig's numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from geometry.arrays import Array, symmetric
+from geometry.rig import Rig
+from geometry.rig_parameters import RigCovariance, is_known
+from lab.camera_block import Covariance
+from lab.errors import InputError
+
+TARGET = "target"
+# Against the diagonal: what sums in double precision, written with all digits, may miss.
+_TOLERANCE = 1e-6
+
+
+def joint_covariance(rig: Rig, blocks: Mapping[str, Covariance], path: Path | str) -> RigCovariance | None:
+    """All that the blocks say of numbers which this rig has; None where they say nothing.
+
+    blocks: by `cameras.NAME`, `screens.NAME`, `target`. The target's block may name cameras' and screens' numbers too
+    (a joint solve writes it so): it is then the whole truth, and the other blocks are excerpts of it. Names that are
+    not ours are passed over, as the files' contract has it. Raises InputError for a matrix that is no covariance.
+    """
+    target = blocks.get(TARGET)
+    if target is not None and any(n.startswith(("cameras.", "screens.")) for n in target.parameters):
+        used = {TARGET: target}
+    else:
+        used = dict(blocks)
+    names: list[str] = []
+    pieces: list[Array] = []
+    for where, block in used.items():
+        full = [n if where == TARGET else f"{where}.{n}" for n in block.parameters]
+        known = [i for i, n in enumerate(full) if is_known(rig, n)]
+        if not known:
+            continue
+        matrix = block.matrix[np.ix_(known, known)]
+        _refuse_what_is_none(matrix, f"{path}: {where}.covariance")
+        names += [full[i] for i in known]
+        pieces.append(symmetric(matrix))
+    if not names:
+        return None
+    joint = np.zeros((len(names), len(names)))
+    at = 0
+    for piece in pieces:
+        joint[at : at + len(piece), at : at + len(piece)] = piece
+        at += len(piece)
+    return RigCovariance(tuple(names), joint)
+
+
+def _refuse_what_is_none(matrix: Array, where: str) -> None:
+    variances = np.diagonal(matrix)
+    if np.any(variances < 0):
+        raise InputError(f"{where}.matrix: expected variances from zero up on the diagonal, got {variances.min():.3g}")
+    unit = np.sqrt(np.where(variances > 0, variances, 1.0))
+    scaled = matrix / np.outer(unit, unit)
+    if np.abs(scaled - scaled.T).max() > _TOLERANCE:
+        raise InputError(f"{where}.matrix: expected a symmetric matrix; its halves differ")
+    if np.linalg.eigvalsh(symmetric(scaled))[0] < -_TOLERANCE * len(matrix):
+        raise InputError(f"{where}.matrix: expected a covariance, got a matrix with a negative eigenvalue")
