@@ -11,6 +11,7 @@ import numpy as np
 
 from geometry.arrays import Array, Ints
 from lab.report.plane import Plane, axes, dots, frame, number, plane, polyline, svg_of
+from lab.report.plane import note as foot
 from lab.report.svg import BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION, Scale, line_path, text, tick_texts, ticks
 
 SERIES = (BLUE, ORANGE, GREEN, PURPLE, SKY, VERMILLION)
@@ -48,13 +49,11 @@ def residual_histogram(
     )
     beyond = int((np.abs(values) > reach).sum())
     expected = 5.7e-7 * len(values)
-    left, top, across, _ = p.box
-    notes = [
-        f"{len(values)} values, RMS {number(float(np.sqrt(np.mean(values**2)))) if values.size else '–'} {unit}",
-        f"curve: sigma {number(spread)} {unit}" + ("" if sigma is None else f" (robust spread {number(robust)})"),
-        f"beyond 5 sigma: {beyond}" + (f" (normal: {expected:.1g})" if beyond else ""),
-    ]
-    out += [text(left + across - 6, top + 14 + 14 * i, words, "end") for i, words in enumerate(notes)]
+    rms = number(float(np.sqrt(np.mean(values**2)))) if values.size else "–"
+    told = f"{len(values)} values, RMS {rms} {unit}; curve: sigma {number(float(spread))} {unit}"
+    told += "" if sigma is None else f" (robust spread {number(robust)})"
+    told += f"; beyond 5 sigma: {beyond}" + (f" (normal: {expected:.1g})" if beyond else "")
+    out.append(foot(p, told))
     return svg_of(p, title, [*out, frame(p)])
 
 
@@ -167,7 +166,7 @@ def error_ellipses(
             out.append(text(x + 6, y - 6, label))
     note = f"ellipses of {sigmas:g} sigma" + (f", drawn {magnify:,.0f} times too large" if magnify != 1 else "")
     note += f"; largest half-axis {number(float(axes_long.max()))} {unit}"
-    out.append(text(p.X.a, p.height - 4, note))
+    out.append(foot(p, note))
     return svg_of(p, title, [*out, frame(p)])
 
 

@@ -11,9 +11,20 @@ import cv2
 import numpy as np
 
 from geometry.arrays import Array, Bools
-from lab.report.calibration_charts import drift_chart, error_ellipses, lens_ladder, residual_histogram
+from lab.report.calibration_charts import DriftLine, drift_chart, error_ellipses, lens_ladder, residual_histogram
 from lab.report.calibration_maps import correlation_matrix, flatness_map, heat_map
-from lab.report.calibration_scene import Dot, Frustum, Ray, Rectangle, rig_things, scene_view, scene_views
+from lab.report.calibration_scene import (
+    CAMERA_VIEWS,
+    LAB_VIEWS,
+    Dot,
+    Frustum,
+    Ray,
+    Rectangle,
+    frustum_of,
+    rig_things,
+    scene_view,
+    scene_views,
+)
 from lab.report.plane import (
     INK,
     Plane,
@@ -28,10 +39,16 @@ from lab.report.plane import (
     segments,
     svg_of,
 )
+from lab.report.plane import (
+    note as foot,
+)
 from lab.report.svg import BLUE, ORANGE, VERMILLION, Scale, text
 
 __all__ = [
+    "CAMERA_VIEWS",
+    "LAB_VIEWS",
     "Dot",
+    "DriftLine",
     "Frustum",
     "Ray",
     "Rectangle",
@@ -41,6 +58,7 @@ __all__ = [
     "drift_chart",
     "error_ellipses",
     "flatness_map",
+    "frustum_of",
     "heat_map",
     "lens_ladder",
     "residual_field",
@@ -53,6 +71,7 @@ __all__ = [
 
 _MOST_VECTORS = 2000  # of a residual field: more only make ink
 _ARROW = 24.0  # drawing units: how long the 95th percentile of the residuals is drawn
+_LONGEST = 70.0  # drawing units: longer vectors are cut
 _PICTURE_WIDTH = 720  # px of an embedded photograph
 _JPEG_QUALITY = 72
 
@@ -79,8 +98,7 @@ def corners_overlay(
     bad = np.zeros(len(found), dtype=bool) if rejected is None else np.asarray(rejected, dtype=bool)
     stretch, bar = _magnification(residual[~bad])
     starts = p.at(found)
-    with np.errstate(invalid="ignore"):
-        ends = starts + residual * stretch
+    ends = starts + _capped(residual * stretch)
     for colour, some, radius in ((BLUE, ~bad, 2.2), (VERMILLION, bad, 3.0)):
         vectors, places = segments(starts[some], ends[some]), dots(starts[some], radius)
         # A light line beneath the coloured one keeps it visible on any photograph.
@@ -89,7 +107,7 @@ def corners_overlay(
         out.append(f'<path d="{places}" fill="{colour}" stroke="#fff" stroke-width="0.7"/>')
     out.append(_scale_bar(p, stretch, bar))
     if bad.any():
-        out.append(text(p.box[0], p.height - 4, f"{bad.sum()} corners not used (red)", ""))
+        out.append(foot(p, f"{bad.sum()} corners not used (red); their vectors are cut"))
     return svg_of(p, title, [*out, frame(p)])
 
 
@@ -120,7 +138,7 @@ def residual_field(
         largest = np.argsort(np.linalg.norm(residual, axis=1))[-_MOST_VECTORS // 10 :]
         kept = np.union1d(np.linspace(0, len(found) - 1, _MOST_VECTORS).astype(np.int64), largest)
     starts = p.at(found)
-    d = segments(starts[kept], starts[kept] + residual[kept] * stretch)
+    d = segments(starts[kept], starts[kept] + _capped(residual[kept] * stretch))
     out.append(f'<path d="{d}" stroke="{BLUE}" stroke-width="0.7" stroke-opacity="0.55" fill="none"/>')
     middle, mean, _ = cell_means(size_px, found, residual, cells)
     tips = p.at(middle) + mean * stretch * 2
@@ -131,7 +149,7 @@ def residual_field(
     out.append(_scale_bar(p, stretch, bar))
     counted = f"{len(found)} corners" + (f", {len(kept)} drawn" if len(kept) < len(found) else "")
     note = f"blue: {counted}; red: mean of a cell, twice as long"
-    out.append(text(p.X.a, p.height - 4, note, ""))
+    out.append(foot(p, note))
     return svg_of(p, title, [*out, frame(p)])
 
 
@@ -190,7 +208,7 @@ def coverage_map(
         out.append(f'<path d="{d}" fill="none" stroke="{ORANGE}" stroke-width="0.8" stroke-opacity="0.7"/>')
     share = float((count > 0).mean())
     note = f"{len(corners)} corners; {100 * share:.0f} % of the sensor's cells have some; crossed out: none"
-    out.append(text(p.X.a, p.height - 4, note, ""))
+    out.append(foot(p, note))
     return svg_of(p, title, [*out, frame(p)])
 
 
@@ -235,6 +253,12 @@ def _magnification(residual: Array) -> tuple[float, float]:
     size = size[np.isfinite(size)]
     usual = max(float(np.percentile(size, 95)) if size.size else 0.0, 1e-6)
     return _ARROW / usual, round_size(usual * 1.5)
+
+
+def _capped(vectors: Array) -> Array:
+    """Vectors (n, 2), drawing units, of at most the longest length: an outlier must not cross the whole page."""
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return vectors * np.minimum(1.0, _LONGEST / np.maximum(length, 1e-9))
 
 
 def _scale_bar(p: Plane, stretch: float, bar: float) -> str:

@@ -10,6 +10,7 @@ import numpy as np
 
 from geometry.arrays import Array
 from lab.report.plane import Plane, axes, dots, frame, number, picture_uri, plane, segments, svg_of
+from lab.report.plane import note as foot
 from lab.report.svg import Scale, text, tick_texts, ticks
 
 # Anchors of the colours, light to dark so that print and all eyes keep the order. Sequential: cividis (Nunez, Anderton
@@ -96,25 +97,37 @@ def heat_map(
         raise ValueError(f"a map of shape {values.shape} cannot be written as PNG")
     box = f'x="{left:.1f}" y="{top:.1f}" width="{wide:.1f}" height="{high:.1f}"'
     out.append(f'<image {box} preserveAspectRatio="none" href="{picture_uri(data.tobytes(), "png")}"/>')
-    marks = np.asarray(levels, dtype=float) if levels is not None else ticks(lo, hi, 5)
+    marks = np.asarray(levels, dtype=float) if levels is not None else contour_levels(lo, hi)
     grid_x, grid_y = np.linspace(x0, x1, values.shape[1]), np.linspace(y0, y1, values.shape[0])
-    for level, words in zip(marks, tick_texts(marks) if levels is None else [number(m) for m in marks], strict=True):
+    for level, words in zip(marks, [number(m) for m in marks.tolist()], strict=True):
         starts, ends = contour(values, grid_x, grid_y, float(level))
         if not len(starts):
             continue
         d = segments(p.at(starts), p.at(ends))
         out.append(f'<path d="{d}" stroke="#000" stroke-opacity="0.35" stroke-width="2.4" fill="none"/>')
         out.append(f'<path d="{d}" stroke="#fff" stroke-width="1.1" fill="none"/>')
-        x, y = _label_place(p, starts)
-        style = "fill:#fff;font-weight:600;paint-order:stroke;stroke:#000a;stroke-width:2.6px"
-        out.append(text(x, y + 3.5, words, "mid", style))
+        if place := _label_place(p, starts):
+            style = "fill:#fff;font-weight:600;paint-order:stroke;stroke:#000a;stroke-width:2.6px"
+            out.append(text(place[0], place[1] + 3.5, words, "mid", style))
     finite = values[np.isfinite(values)]
     out.append(colour_bar(p, lo, hi, unit, diverging))
     if finite.size:
         spread = f"{number(float(finite.min()))} to {number(float(finite.max()))} {unit},"
         note = f"{spread} median {number(float(np.median(finite)))}"
-        out.append(text(p.X.a, p.height - 4, note, ""))
+        out.append(foot(p, note))
     return svg_of(p, title, [*out, frame(p)])
+
+
+def contour_levels(lo: float, hi: float) -> Array:
+    """Round levels: evenly spaced, or 1, 2, 5, 10 ... where the values span more than a factor of 6.
+
+    An uncertainty grows steeply towards the corners: with even levels the whole usable part would lie inside the first.
+    """
+    if lo > 0 and hi > 6 * lo:
+        powers = 10.0 ** np.arange(np.floor(np.log10(lo)), np.ceil(np.log10(hi)) + 1)
+        steps = (powers[:, None] * [1, 2, 5]).ravel()
+        return steps[(steps > lo) & (steps < hi)]
+    return ticks(lo, hi, 5)
 
 
 def contour(values: Array, x: Array, y: Array, level: float) -> tuple[Array, Array]:
@@ -197,8 +210,8 @@ def flatness_map(
             if len(starts):
                 d = segments(p.at(starts), p.at(ends))
                 out.append(f'<path d="{d}" stroke="var(--soft)" stroke-width="1" stroke-dasharray="4 3" fill="none"/>')
-                x, y = _label_place(p, starts)
-                out.append(text(x, y - 2, f"{number(float(level))}", "mid"))
+                if place := _label_place(p, starts):
+                    out.append(text(place[0], place[1] - 2, number(float(level)), "mid"))
     if size_m is not None:
         corner, opposite = p.at(-half).tolist(), p.at(half).tolist()
         x, y = corner[0], opposite[1]
@@ -221,7 +234,7 @@ def flatness_map(
             note += f"; sigma of one point {number(1e3 * sigma_m)} mm"
         if bow is not None:
             note += "; dashed: the bow"
-        out.append(text(p.X.a, p.height - 4, note, ""))
+        out.append(foot(p, note))
     return svg_of(p, title, [*out, frame(p)])
 
 
@@ -310,14 +323,17 @@ def _hatched(left: float, top: float, wide: float, high: float) -> str:
     return f'<path class="grid" d="{"".join(out)}"/>'
 
 
-def _label_place(p: Plane, places: Array) -> tuple[float, float]:
-    """A place on a contour for its number: the one nearest the drawing's diagonal, so that the labels spread."""
+def _label_place(p: Plane, places: Array) -> tuple[float, float] | None:
+    """A place on a contour for its number: the one nearest the drawing's diagonal, so that the labels spread.
+
+    None where all of it lies at the edge: a number there would stand outside.
+    """
     at = p.at(places)
     left, top, wide, high = p.box
-    inside = (
-        (at[:, 0] > left + 16) & (at[:, 0] < left + wide - 16) & (at[:, 1] > top + 10) & (at[:, 1] < top + high - 10)
-    )
-    at = at[inside] if inside.any() else at
+    middle, room = np.array([left + wide / 2, top + high / 2]), np.array([wide / 2 - 16, high / 2 - 9])
+    at = at[(np.abs(at - middle) < room).all(axis=1)]
+    if not len(at):
+        return None
     off = np.abs((at[:, 0] - left) / wide - (at[:, 1] - top) / high)
     x, y = at[int(np.argmin(off))].tolist()
     return x, y

@@ -60,14 +60,18 @@ class Dot:
 
 Thing = Frustum | Rectangle | Ray | Dot
 
-# world to drawing: right, up; and which way is near. World z is up in the first two, as most labs choose it.
-_OBLIQUE = "seen obliquely"
+# World to drawing: which way is right, which is up. z is up in a lab's world; in a camera's own frame y is down.
 VIEWS: dict[str, tuple[Array, Array]] = {
-    _OBLIQUE: (np.array([0.82, 0.57, 0.0]), np.array([-0.285, 0.41, 0.866])),
+    "seen obliquely": (np.array([0.82, 0.57, 0.0]), np.array([-0.285, 0.41, 0.866])),
     "from above (along −z)": (np.array([1.0, 0, 0]), np.array([0, 1.0, 0])),
     "from the front (along +y)": (np.array([1.0, 0, 0]), np.array([0, 0, 1.0])),
     "from the side (along −x)": (np.array([0, 1.0, 0]), np.array([0, 0, 1.0])),
+    "obliquely from behind the camera": (np.array([0.82, 0.0, 0.57]), np.array([-0.285, -0.866, 0.41])),
+    "from above the camera": (np.array([1.0, 0, 0]), np.array([0, 0, 1.0])),
+    "from beside the camera": (np.array([0, 0, 1.0]), np.array([0, -1.0, 0])),
 }
+LAB_VIEWS = tuple(VIEWS)[:3]
+CAMERA_VIEWS = tuple(VIEWS)[4:]  # for things in a camera's own frame
 
 
 def frustum_of(camera: Camera, colour: str = BLUE) -> Frustum:
@@ -107,12 +111,14 @@ def rig_things(rig: Rig, world_from_body: Pose | None = None) -> list[Thing]:
     return things
 
 
-def scene_views(things: Sequence[Thing], title: str = "Cameras, screens and beams") -> list[str]:
-    """The same things obliquely, from above and from the front."""
-    return [scene_view(things, f"{title}, {name}", name) for name in list(VIEWS)[:3]]
+def scene_views(
+    things: Sequence[Thing], title: str = "Cameras, screens and beams", views: Sequence[str] = LAB_VIEWS
+) -> list[str]:
+    """The same things from several directions: LAB_VIEWS, or CAMERA_VIEWS for boards before a single camera."""
+    return [scene_view(things, f"{title}, {name}", name) for name in views]
 
 
-def scene_view(things: Sequence[Thing], title: str, view: str = _OBLIQUE) -> str:
+def scene_view(things: Sequence[Thing], title: str, view: str = LAB_VIEWS[0]) -> str:
     """Things in space by parallel projection. view: one of VIEWS. Metres keep their length along the drawing's axes."""
     right, up = VIEWS[view]
     to_drawing = np.stack([right / np.linalg.norm(right), up / np.linalg.norm(up)])

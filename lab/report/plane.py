@@ -45,12 +45,12 @@ def plane(
     height: float = 300,
     left: float = 58,
     right: float = 12,
-    bottom: float = 36,
+    bottom: float = 52,
     tallest: float = 440,
 ) -> Plane:
     """A plane for values in these ranges. equal: one unit is as long in x as in y, and the height follows.
 
-    y_down: y grows downwards, as in pictures.
+    y_down: y grows downwards, as in pictures. Below the axes is room for their numbers, the name and a `note`.
     """
     top = 24.0
     wide = width - left - right
@@ -98,6 +98,11 @@ def axes(plane: Plane, title: str, x_name: str, y_name: str, *, grid: bool = Tru
         f"{escape(y_name)}</text>"
     )
     return out
+
+
+def note(plane: Plane, words: str) -> str:
+    """A line of words at the foot of a drawing, clear of the axis' name."""
+    return text(plane.box[0], plane.height - 5, words, "", "font-size:10.5px")
 
 
 def frame(plane: Plane) -> str:
