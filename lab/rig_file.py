@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -96,16 +96,21 @@ def _direction(value: Any) -> list[float]:
     return d
 
 
-class _PoseBlock(Block):
+class PoseBlock(Block):
+    """A transform a_from_b."""
+
     quaternion_wxyz: Annotated[list[float], pydantic.PlainValidator(_unit_quaternion)]
     translation_m: Vector3
 
     def pose(self) -> Pose:
+        """The transform."""
         return Pose.from_quaternion(np.array(self.quaternion_wxyz), np.array(self.translation_m))
 
 
-class _ScreenBlock(Block):
-    world_from_screen: _PoseBlock
+class ScreenBlock(Block):
+    """A screen of a rig."""
+
+    world_from_screen: PoseBlock
     size_m: Annotated[list[float] | None, pydantic.PlainValidator(positive_numbers(2))] = None
     bow_per_m: Vector3 = [0.0, 0.0, 0.0]  # noqa: RUF012 - frozen
     covariance: CovarianceBlock | None = None
@@ -123,11 +128,27 @@ class _NoiseBlock(Block):
     black_dn: Number = 0.0
 
 
-class _CameraBlock(LensBlock):
+class CameraBlock(LensBlock):
+    """A camera of a rig."""
+
     screen: Word
-    camera_from_world: _PoseBlock
+    camera_from_world: PoseBlock
     noise: _NoiseBlock | None = None
     covariance: CovarianceBlock | None = None
+
+    def value(self, name: str) -> Camera:
+        """The camera."""
+        n = self.noise
+        return Camera(
+            name=name,
+            screen=self.screen,
+            image_size_px=self.size(),
+            matrix=self.matrix(),
+            distortion=tuple(self.distortion),
+            camera_from_world=self.camera_from_world.pose(),
+            noise=None if n is None else SensorNoise(n.gain_e_per_dn, n.read_noise_e, n.black_dn),
+            lens=self.lens,
+        )
 
 
 class _BeamBlock(Block):
@@ -141,17 +162,48 @@ class _SpotBlock(Block):
     screen: Word
 
 
-class _TargetBlock(Block):
+class TargetBlock(Block):
+    """The vehicle's beams and spots."""
+
     beams: dict[str, _BeamBlock]
     spots: dict[str, _SpotBlock]
     covariance: CovarianceBlock | None = None
 
+    def beam_values(self) -> dict[str, Beam]:
+        """The beams by name."""
+        return {name: Beam(name, np.array(b.direction), np.array(b.point_m)) for name, b in self.beams.items()}
+
+    def spot_values(self) -> dict[str, Spot]:
+        """The spots by name."""
+        return {name: Spot(name, s.beam, 1 if s.end == "+" else -1, s.screen) for name, s in self.spots.items()}
+
+    def mistakes(self, screens: Collection[str]) -> list[str]:
+        """What no field alone can tell: too few things, and names that nothing bears."""
+        out = []
+        if len(self.beams) < 2:
+            out.append(f"target.beams: expected two or more, got {len(self.beams)}; one line cannot fix an attitude")
+        if not self.spots:
+            out.append("target.spots: expected one or more, got none")
+        ends: dict[tuple[str, str], str] = {}
+        for name, spot in self.spots.items():
+            if spot.beam not in self.beams:
+                out.append(no_such("beam", spot.beam, f"target.spots.{name}.beam", self.beams))
+            if spot.screen not in screens:
+                out.append(no_such("screen", spot.screen, f"target.spots.{name}.screen", screens))
+            other = ends.setdefault((spot.beam, spot.end), name)
+            if other != name:
+                out.append(
+                    f"target.spots.{name}: expected one spot per beam end, got beam {spot.beam!r} end {spot.end!r}"
+                    f" a second time (spot {other!r} has it)"
+                )
+        return out
+
 
 class _RigBlock(Block):
     schema_: Annotated[str, pydantic.PlainValidator(one_of((SCHEMA,)))] = pydantic.Field(alias="schema")
-    screens: dict[str, _ScreenBlock]
-    cameras: dict[str, _CameraBlock]
-    target: _TargetBlock
+    screens: dict[str, ScreenBlock]
+    cameras: dict[str, CameraBlock]
+    target: TargetBlock
     calibration: CalibrationStateBlock | None = None
 
 
@@ -161,30 +213,14 @@ def _broken_references(content: _RigBlock) -> list[str]:
     for name, block in (("screens", content.screens), ("cameras", content.cameras)):
         if not block:
             out.append(f"{name}: expected one or more, got none")
-    beams, spots = content.target.beams, content.target.spots
-    if len(beams) < 2:
-        out.append(f"target.beams: expected two or more, got {len(beams)}; one line cannot fix an attitude")
-    if not spots:
-        out.append("target.spots: expected one or more, got none")
     for name, camera in content.cameras.items():
         if camera.screen not in content.screens:
-            out.append(_no_such("screen", camera.screen, f"cameras.{name}.screen", content.screens))
-    ends: dict[tuple[str, str], str] = {}
-    for name, spot in spots.items():
-        if spot.beam not in beams:
-            out.append(_no_such("beam", spot.beam, f"target.spots.{name}.beam", beams))
-        if spot.screen not in content.screens:
-            out.append(_no_such("screen", spot.screen, f"target.spots.{name}.screen", content.screens))
-        other = ends.setdefault((spot.beam, spot.end), name)
-        if other != name:
-            out.append(
-                f"target.spots.{name}: expected one spot per beam end, got beam {spot.beam!r} end {spot.end!r}"
-                f" a second time (spot {other!r} has it)"
-            )
-    return out
+            out.append(no_such("screen", camera.screen, f"cameras.{name}.screen", content.screens))
+    return out + content.target.mistakes(content.screens)
 
 
-def _no_such(kind: str, name: str, where: str, known: Mapping[str, Any]) -> str:
+def no_such(kind: str, name: str, where: str, known: Collection[str]) -> str:
+    """The mistake of a name that nothing in the file bears."""
     return f"{where}: expected a {kind} of this file, got {name!r}{did_you_mean(name, known)}"
 
 
@@ -198,26 +234,9 @@ def _covariance_blocks(content: _RigBlock) -> list[tuple[str, CovarianceBlock]]:
 def _rig_of(content: _RigBlock) -> Rig:
     return Rig(
         screens={name: s.value(name) for name, s in content.screens.items()},
-        cameras={name: _camera_of(name, c) for name, c in content.cameras.items()},
-        beams={
-            name: Beam(name, np.array(b.direction), np.array(b.point_m)) for name, b in content.target.beams.items()
-        },
-        spots={
-            name: Spot(name, s.beam, 1 if s.end == "+" else -1, s.screen) for name, s in content.target.spots.items()
-        },
-    )
-
-
-def _camera_of(name: str, c: _CameraBlock) -> Camera:
-    return Camera(
-        name=name,
-        screen=c.screen,
-        image_size_px=c.size(),
-        matrix=c.matrix(),
-        distortion=tuple(c.distortion),
-        camera_from_world=c.camera_from_world.pose(),
-        noise=None if c.noise is None else SensorNoise(c.noise.gain_e_per_dn, c.noise.read_noise_e, c.noise.black_dn),
-        lens=c.lens,
+        cameras={name: c.value(name) for name, c in content.cameras.items()},
+        beams=content.target.beam_values(),
+        spots=content.target.spot_values(),
     )
 
 
@@ -227,14 +246,8 @@ def _camera_of(name: str, c: _CameraBlock) -> Camera:
 def as_mapping(file: RigFile) -> dict[str, Any]:
     """The plain mapping that rig.yaml holds."""
     rig = file.rig
-    screens: dict[str, dict[str, Any]] = {}
-    for name, screen in rig.screens.items():
-        screens[name] = {"world_from_screen": _pose_mapping(screen.world_from_screen)}
-        if screen.size_m is not None:
-            screens[name]["size_m"] = [float(v) for v in screen.size_m]
-        if any(screen.bow):
-            screens[name]["bow_per_m"] = [float(v) for v in screen.bow]
-    cameras = {name: _camera_mapping(camera) for name, camera in rig.cameras.items()}
+    screens = {name: screen_mapping(screen) for name, screen in rig.screens.items()}
+    cameras = {name: camera_mapping(camera) for name, camera in rig.cameras.items()}
     target = {
         "beams": {
             name: {"direction": _same_when_read(b.direction), "point_m": floats(b.point)}
@@ -256,11 +269,22 @@ def as_mapping(file: RigFile) -> dict[str, Any]:
     return content
 
 
-def _camera_mapping(camera: Camera) -> dict[str, Any]:
+def screen_mapping(screen: Screen) -> dict[str, Any]:
+    """The plain mapping that a `ScreenBlock` reads back to the same numbers."""
+    out: dict[str, Any] = {"world_from_screen": pose_mapping(screen.world_from_screen)}
+    if screen.size_m is not None:
+        out["size_m"] = [float(v) for v in screen.size_m]
+    if any(screen.bow):
+        out["bow_per_m"] = [float(v) for v in screen.bow]
+    return out
+
+
+def camera_mapping(camera: Camera) -> dict[str, Any]:
+    """The plain mapping that a `CameraBlock` reads back to the same numbers."""
     out: dict[str, Any] = {
         "screen": camera.screen,
         **lens_mapping(camera.image_size_px, camera.matrix, camera.distortion, camera.lens),
-        "camera_from_world": _pose_mapping(camera.camera_from_world),
+        "camera_from_world": pose_mapping(camera.camera_from_world),
     }
     if camera.noise is not None:
         n = camera.noise
@@ -272,7 +296,8 @@ def _camera_mapping(camera: Camera) -> dict[str, Any]:
     return out
 
 
-def _pose_mapping(pose: Pose) -> dict[str, Any]:
+def pose_mapping(pose: Pose) -> dict[str, Any]:
+    """The plain mapping that a `PoseBlock` reads back to the same transform."""
     return {
         "quaternion_wxyz": floats(_quaternion_of(pose.rotation)),
         "translation_m": floats(pose.translation),
