@@ -110,6 +110,17 @@ _StrictLoader.add_constructor("tag:yaml.org,2002:int", _construct_int)
 _StrictLoader.add_constructor("tag:yaml.org,2002:float", _construct_float)
 
 
+class _OpenCVLoader(_StrictLoader):
+    """As the strict loader, with OpenCV's matrices as the mappings that they are."""
+
+
+def _construct_tagged(loader: _OpenCVLoader, _suffix: str, node: yaml.MappingNode) -> dict[Any, Any]:
+    return loader.construct_mapping(node, deep=True)
+
+
+_OpenCVLoader.add_multi_constructor("tag:yaml.org,2002:opencv-", _construct_tagged)
+
+
 def read_text(path: Path) -> str:
     """The text of a UTF-8 file. Raises InputError in one line."""
     try:
@@ -126,9 +137,15 @@ def read_text(path: Path) -> str:
 
 def read_mapping(path: Path) -> dict[str, Any]:
     """The mapping that a YAML file holds; keys are words. Raises InputError in one line, with the line's number."""
-    text = read_text(path)
+    return parse_mapping(read_text(path), path)
+
+
+def parse_mapping(text: str, path: Path | str, opencv: bool = False) -> dict[str, Any]:
+    """As `read_mapping`, of a text that is there already; with `opencv`, OpenCV's own head and tags are read too."""
+    if opencv:
+        text = re.sub(r"\A\ufeff?%YAML:1\.0[^\n]*", "", text)
     try:
-        content = yaml.load(text, Loader=_StrictLoader)
+        content = yaml.load(text, Loader=_OpenCVLoader if opencv else _StrictLoader)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         where = f"line {mark.line + 1}" if mark else "the text"

@@ -1,0 +1,105 @@
+"""OpenCV's FileStorage YAML with one camera, as its calibration samples write it.
+
+Both heads are read, `%YAML:1.0` (OpenCV up to 4) and `%YAML 1.2` (5), and matrices as `opencv-matrix` and, as OpenCV 5
+writes one-dimensional arrays, `opencv-nd-matrix`. Written is the old head with distortion as 1 x N, which all releases
+read. Source: OpenCV, samples/cpp/tutorial_code/calib3d/camera_calibration (the keys), core/persistence (the syntax).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from calibration.formats.model import (
+    CameraModel,
+    FormatError,
+    Read,
+    Written,
+    exact,
+    fitted,
+    lost_poses,
+    matrix,
+    number,
+    picture_size,
+    pinhole_of,
+    quoted,
+    shown,
+)
+from geometry.camera import FISHEYE, PERSPECTIVE
+
+NAME = "opencv"
+HOLDS_MANY = False
+_MATRIX = ("camera_matrix", "Camera_Matrix", "cameraMatrix", "K")
+_DISTORTION = ("distortion_coefficients", "Distortion_Coefficients", "distCoeffs", "dist_coeffs", "D")
+_WIDTH = ("image_width", "image_Width", "width")
+_LENS_WORDS = {"plumb_bob": PERSPECTIVE, "rational_polynomial": PERSPECTIVE, "equidistant": FISHEYE}
+_HEIGHT = ("image_height", "image_Height", "height")
+
+
+def read(content: Mapping[str, Any], name: str) -> Read:
+    """The camera of a parsed file; `name` where the file gives none. Raises FormatError."""
+    K = matrix(_first(content, _MATRIX), _MATRIX[0])
+    distortion = tuple(matrix(_first(content, _DISTORTION), _DISTORTION[0]).ravel().tolist())
+    size = picture_size(_first(content, _WIDTH), _first(content, _HEIGHT), "image_width, image_height")
+    return Read(
+        (
+            CameraModel(
+                name=str(content.get("camera_name", name)),
+                image_size_px=size,
+                pinhole=pinhole_of(K, _MATRIX[0]),
+                distortion=distortion,
+                lens=_lens(content),
+            ),
+        )
+    )
+
+
+def _lens(content: Mapping[str, Any]) -> str:
+    """The lens model: OpenCV's own flag, or ROS's word in a file that mixes both styles."""
+    if number(content.get("fisheye_model", 0), "fisheye_model"):
+        return FISHEYE
+    word = content.get("distortion_model", "plumb_bob")
+    if word not in _LENS_WORDS:
+        raise FormatError(f"distortion_model: expected {', '.join(_LENS_WORDS)}, got {shown(word)}")
+    return _LENS_WORDS[word]
+
+
+def _first(content: Mapping[str, Any], keys: Sequence[str]) -> Any:
+    """The value of the first of some spellings of a key that is there."""
+    for key in keys:
+        if key in content:
+            return content[key]
+    raise FormatError(f"{keys[0]}: expected a value, got nothing; add it")
+
+
+def write(cameras: Sequence[CameraModel]) -> Written:
+    """The file of one camera. Raises FormatError."""
+    (camera,) = cameras
+    fx, fy, cx, cy = camera.pinhole
+    distortion = fitted(camera, NAME)
+    lines = [
+        "%YAML:1.0",
+        "---",
+        f"camera_name: {quoted(camera.name)}",
+        f"image_width: {camera.image_size_px[0]}",
+        f"image_height: {camera.image_size_px[1]}",
+        *_matrix("camera_matrix", 3, (fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0)),
+        *_matrix("distortion_coefficients", 1, distortion),
+    ]
+    if camera.lens == FISHEYE:
+        lines.append("fisheye_model: 1")
+    return Written("\n".join(lines) + "\n", lost_poses(cameras, NAME))
+
+
+def _matrix(key: str, rows: int, values: Sequence[float]) -> list[str]:
+    columns = len(values) // rows
+    # FileStorage reads lines of any length, but people do not.
+    rows_of_text = [", ".join(exact(v) for v in values[i : i + 4]) for i in range(0, len(values), 4)]
+    data = ",\n       ".join(rows_of_text)
+    return [
+        f"{key}: !!opencv-matrix",
+        f"   rows: {rows}",
+        f"   cols: {columns}",
+        "   dt: d",
+        f"   data: [ {data} ]",
+    ]
