@@ -16,7 +16,7 @@ from lab.yaml_text import did_you_mean
 if TYPE_CHECKING:
     import pandas as pd
 
-WORDS = ("camera", "spot", "beam", "status")  # every other column holds numbers
+WORDS = ("camera", "spot", "beam", "status", "point", "screen")  # every other column holds numbers
 LARGEST_FRAME = 2**53  # beyond it a number read as float is no longer exact
 
 
