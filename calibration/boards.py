@@ -27,8 +27,8 @@ EXAMPLES = {
 }
 _FEWEST = 3  # points along each side: with two, a board's outline cannot be told from its neighbourhood
 _MOST = 200
-# Of two circles that touch nothing: half of the distance to the nearest neighbour is ink. Thinner rings of white between
-# the circles let blur run them together; smaller circles have fewer edge pixels to measure.
+# Share of the distance to the nearest neighbour that is ink. With less white between them blur runs circles together;
+# smaller circles have fewer edge pixels to measure.
 _INK = 0.5
 
 

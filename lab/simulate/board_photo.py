@@ -1,0 +1,122 @@
+"""Photographs of a calibration board through our own camera model, with the true places of its points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.board_drawing import ink_at
+from calibration.boards import Board
+from geometry.arrays import Array, Ints
+from geometry.camera import Camera
+from geometry.pose import Pose
+
+_MARGIN = 1.0  # spacings of white paper around the points' outermost squares or circles
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """How a board is lit and how the camera draws it."""
+
+    light_dn: float = 205.0  # paper
+    dark_dn: float = 35.0  # ink
+    background_dn: float = 110.0  # what is not paper
+    gradient: float = 0.0  # share by which the light falls from left to right
+    blur_px: float = 0.7  # sigma of the lens' blur; the sum over each pixel's area comes on top
+    noise_dn: float = 0.0  # 1 sigma
+    samples: int = 64  # rays per pixel
+
+
+@dataclass(frozen=True, slots=True)
+class BoardPhoto:
+    """A picture and its truth."""
+
+    image: NDArray[np.uint8]  # (h, w)
+    ids: Ints  # (N,)
+    pixels: Array  # (N, 2), where the board's points truly are; nan where there is no projection
+
+
+def warped(board: Board, warp: Array, xy: Array) -> Array:
+    """Points (..., 3), m, of the bent board at (..., 2) of its frame: z = a dx^2 + b dx dy + c dy^2 about its middle.
+
+    warp (3,): a, b, c, 1/m.
+    """
+    d = xy - board.middle[:2]
+    z = warp[0] * d[..., 0] ** 2 + warp[1] * d[..., 0] * d[..., 1] + warp[2] * d[..., 1] ** 2
+    return np.concatenate([xy, z[..., None]], axis=-1)
+
+
+def photograph(
+    board: Board,
+    camera: Camera,
+    world_from_board: Pose,
+    warp: Array | None = None,
+    look: Look | None = None,
+    seed: int = 0,
+) -> BoardPhoto:
+    """A picture of a board, which lies where `world_from_board` says and is bent by `warp` (3,), 1/m."""
+    bend = np.zeros(3) if warp is None else np.asarray(warp, dtype=float)
+    look = Look() if look is None else look
+    width, height = camera.image_size_px
+    board_xy = _board_coordinates(board, camera, world_from_board, bend)
+    light = np.zeros((height, width))
+    for shift in _lattice(look.samples):
+        light += _shade(board, _between(board_xy, shift), look)
+    light /= look.samples
+    light *= 1 - look.gradient * np.linspace(0, 1, width)
+    if look.blur_px > 0:
+        blurred = cv2.GaussianBlur(light, (0, 0), look.blur_px, borderType=cv2.BORDER_REPLICATE)
+        light = np.asarray(blurred, dtype=float)
+    if look.noise_dn > 0:
+        light = light + np.random.default_rng(seed).normal(0, look.noise_dn, light.shape)
+    truth = camera.project(world_from_board.apply(warped(board, bend, board.points[:, :2])))
+    return BoardPhoto(np.clip(np.round(light), 0, 255).astype(np.uint8), board.ids, truth)
+
+
+def _board_coordinates(board: Board, camera: Camera, world_from_board: Pose, warp: Array) -> Array:
+    """Where the rays through the CORNERS of all pixels meet the board: (h + 1, w + 1, 2), m; nan where they do not."""
+    width, height = camera.image_size_px
+    u, v = np.meshgrid(np.arange(width + 1) - 0.5, np.arange(height + 1) - 0.5)
+    origin, direction = camera.rays(np.stack([u, v], axis=-1))
+    board_from_world = world_from_board.inverse()
+    o, d = board_from_world.apply(origin), direction @ board_from_world.rotation.T
+    middle = board.middle[:2]
+    a, b, c = warp
+    with np.errstate(invalid="ignore", divide="ignore"):
+        t = -o[2] / d[..., 2]
+        for _ in range(0 if not warp.any() else 6):  # Newton's method for the bent surface
+            x, y = o[0] + t * d[..., 0] - middle[0], o[1] + t * d[..., 1] - middle[1]
+            f = o[2] + t * d[..., 2] - (a * x * x + b * x * y + c * y * y)
+            slope = d[..., 2] - (2 * a * x + b * y) * d[..., 0] - (b * x + 2 * c * y) * d[..., 1]
+            t = t - f / slope
+        xy = o[:2] + t[..., None] * d[..., :2]
+    # Seen from behind or behind the camera: nothing.
+    return np.where(((t > 0) & (d[..., 2] > 0))[..., None], xy, np.nan)
+
+
+def _between(corners: Array, shift: Array) -> Array:
+    """Values (h, w, 2) within each pixel at (x, y) in [0, 1], bilinear: the map bends by less than 1e-3 px in one."""
+    x, y = shift
+    top = (1 - x) * corners[:-1, :-1] + x * corners[:-1, 1:]
+    bottom = (1 - x) * corners[1:, :-1] + x * corners[1:, 1:]
+    return (1 - y) * top + y * bottom
+
+
+def _lattice(n: int) -> Array:
+    """n points (n, 2) in the unit square of which no two share an x or a y, so that edges along the rows of pixels
+    are drawn as finely as others: Fibonacci's lattice, centred."""
+    k = np.arange(n)
+    return np.stack([(k + 0.5) / n, ((k * 0.6180339887498949) % 1 + 0.5 / n) % 1], axis=-1)
+
+
+def _shade(board: Board, xy: Array, look: Look) -> Array:
+    low = board.points[:, :2].min(axis=0) - (1 + _MARGIN) * board.spacing_m
+    high = board.points[:, :2].max(axis=0) + (1 + _MARGIN) * board.spacing_m
+    with np.errstate(invalid="ignore"):
+        paper = np.all((xy > low) & (xy < high), axis=-1)
+    shade = np.where(paper, look.light_dn, look.background_dn)
+    shade[paper] -= (look.light_dn - look.dark_dn) * ink_at(board, xy[paper])
+    return shade
