@@ -134,8 +134,10 @@ class Sensitivity:
         cameras, screens, beams = list(rig.cameras), list(rig.screens), list(rig.beams)
         camera_of = model.camera_of
         screen_of = np.array([screens.index(rig.spots[s].screen) for _, s in model.views], dtype=np.int64)
-        self._moves: list[tuple[str, int, Array]] = []  # field of SpotDerivatives, its column, which views (n,) 0 or 1
-        for name in self.names:
+        # By field of SpotDerivatives: the parameters' places, their columns there, and which views (n, .) they move.
+        self._moves: dict[str, tuple[list[int], list[int], Array]] = {}
+        masks: dict[str, list[Array]] = {}
+        for i, name in enumerate(self.names):
             if not is_known(rig, name):
                 raise KeyError(name)
             kind, thing, parameter = split(name)
@@ -150,13 +152,18 @@ class Sensitivity:
                 field = "direction" if is_direction else "point"
                 column = (DIRECTION if is_direction else POINT).index(parameter)
                 views = model.beam_of == beams.index(thing)
-            self._moves.append((field, column, views.astype(float)))
+            places, columns, _ = self._moves.setdefault(field, ([], [], np.empty(0)))
+            places.append(i)
+            columns.append(column)
+            masks.setdefault(field, []).append(views.astype(float))
+        for field, (places, columns, _) in self._moves.items():
+            self._moves[field] = places, columns, np.stack(masks[field], axis=-1)
 
     def of(self, derivatives: SpotDerivatives) -> Array:
         """d(pixels)/d(parameters) (..., n, 2, p), px per unit."""
         out = np.zeros((*derivatives.pixels.shape, len(self.names)))
-        for i, (field, column, views) in enumerate(self._moves):
-            out[..., i] = getattr(derivatives, field)[..., column] * views[:, None]
+        for field, (places, columns, views) in self._moves.items():
+            out[..., places] = getattr(derivatives, field)[..., columns] * views[:, None, :]
         return out
 
 

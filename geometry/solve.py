@@ -6,7 +6,7 @@ model of geometry/spots.py and its analytic Jacobian.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from itertools import combinations
 
@@ -14,6 +14,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from geometry.arrays import Array, Ints, symmetric
+from geometry.calibration_spread import CalibrationSpread
 from geometry.pose import Pose
 from geometry.spots import SpotModel
 
@@ -40,6 +41,8 @@ class PoseFit:
 
     world_from_body: Pose
     covariance: Array  # (6, 6) of [dt (m, world), dtheta (rad, body)]; inf where not observable
+    systematic: Array  # (6, 6) the part of it that the calibration's errors make; 0 where nothing is known of them
+    systematic_share: float  # of the misfit to expect, 0 ... 1: how much of it is the same in every frame
     observable: bool
     rows: Ints  # (m,) the views used
     residuals_px: Array  # (m, 2) measured minus fitted
@@ -47,6 +50,32 @@ class PoseFit:
     dof: int  # 2 m - 6
     projected_px: Array  # (n, 2) all views of the model from this pose, as SpotModel.project gives them ...
     jacobian: Array  # (n, 2, 6) ... so that nobody projects the same pose again
+    log_det: float  # of the covariance (2m, 2m), px^2, that the residuals were weighed with
+    _gain: Array  # (6, 2m) what the pose makes of the residuals ...
+    _common: Array | None  # (2n, 2n) ... and the calibration's share of the pixels' covariance
+
+    @property
+    def noise(self) -> Array:
+        """(6, 6) the part of the covariance that differs from frame to frame."""
+        return self.covariance if self._common is None else self.covariance - self.systematic
+
+    def widened(self, factor: float) -> PoseFit:
+        """The same fit with all its covariance that many times larger."""
+        return replace(self, covariance=self.covariance * factor, systematic=self.systematic * factor)
+
+    def spot_covariances(self) -> Array:
+        """What this fit leaves open of each view's pixel: (n, 2, 2), px^2; of where the spot is, not of a measurement.
+
+        Errors of the calibration move a spot and, through the pose, what is expected of it; what is common cancels.
+        """
+        spread = point_covariance(self.jacobian, self.noise)
+        if self._common is None:
+            return spread
+        n = len(self.jacobian)
+        left = np.eye(2 * n)
+        left[:, _both(self.rows)] -= np.nan_to_num(self.jacobian.reshape(2 * n, 6)) @ self._gain
+        joint = (left @ self._common @ left.T).reshape(n, 2, n, 2)
+        return spread + joint[np.arange(n), :, np.arange(n)]
 
     @property
     def rms_px(self) -> float:
@@ -85,17 +114,47 @@ def fit_pose(
     start: Pose,
     *,
     prior: tuple[Pose, Array] | None = None,
+    calibration: CalibrationSpread | None = None,
     max_iterations: int = 25,
 ) -> PoseFit | None:
     """The pose that puts the spots of views `rows` (m,) at `pixels` (m, 2), px, with covariances (m, 2, 2), px^2.
 
     start: where to begin; within some ten degrees it need not be good. prior: a pose and its information matrix
-    (6, 6), added as six more measurements. Levenberg's damping keeps a far start from running away. None where
-    it does not converge (a spot without projection on the way, or a singular start).
+    (6, 6), added as six more measurements. calibration: its errors are weighed in beside the spots' own and come out
+    as the systematic part. Levenberg's damping keeps a far start from running away. None where it does not converge
+    (a spot without projection on the way, or a singular start).
     """
     if len(rows) == 0:
         return None
-    W = whiten(covariances)
+    rows = np.asarray(rows)
+    common = None if calibration is None else calibration.at(start)
+    fit = _fit(model, rows, pixels, covariances, start, prior, common, max_iterations)
+    if fit is None or calibration is None:
+        return fit
+    now = calibration.at(fit.world_from_body)
+    if now is common:
+        return fit
+    # The start was so far off that the calibration's errors act differently here.
+    return _fit(model, rows, pixels, covariances, fit.world_from_body, prior, now, max_iterations)
+
+
+def _fit(
+    model: SpotModel,
+    rows: Ints,
+    pixels: Array,
+    covariances: Array,
+    start: Pose,
+    prior: tuple[Pose, Array] | None,
+    common: Array | None,
+    max_iterations: int,
+) -> PoseFit | None:
+    if common is None:
+        W = whiten(covariances)
+        log_det = -2 * float(np.sum(np.log(W[:, [0, 1], [0, 1]])))
+    else:
+        root = np.linalg.cholesky(_blocks(covariances) + common[np.ix_(_both(rows), _both(rows))])
+        W = np.linalg.inv(root)
+        log_det = 2 * float(np.sum(np.log(np.diagonal(root))))
     pose, damping = start, 0.0
     terms = _terms(model, rows, pixels, W, pose, prior)
     if terms is None:
@@ -123,19 +182,62 @@ def fit_pose(
         return None
     covariance, observable = covariance_of(H)
     dof = 2 * len(rows) - 6 + (6 if prior is not None else 0)
-    return PoseFit(pose, covariance, observable, np.asarray(rows), residuals, cost, dof, projected, J)
+    K, systematic, share = np.zeros((6, 2 * len(rows))), np.zeros((6, 6)), 0.0
+    if common is not None and observable:
+        S = common[np.ix_(_both(rows), _both(rows))]
+        A = W @ J[rows].reshape(-1, 6)
+        K = covariance @ A.T @ W
+        systematic = symmetric(K @ S @ K.T)
+        left = W @ S @ W.T
+        share = float(np.trace(left) - np.trace(covariance @ A.T @ left @ A)) / dof if dof > 0 else 0.0
+    return PoseFit(
+        world_from_body=pose,
+        covariance=covariance,
+        systematic=systematic,
+        systematic_share=share,
+        observable=observable,
+        rows=rows,
+        residuals_px=residuals,
+        chi2=cost,
+        dof=dof,
+        projected_px=projected,
+        jacobian=J,
+        log_det=log_det,
+        _gain=K,
+        _common=common if observable else None,
+    )
+
+
+def _both(rows: Ints) -> Ints:
+    """Where u and v of some views stand among the pixels of all, (2m,)."""
+    return np.ravel(2 * rows[:, None] + np.arange(2))
+
+
+def _blocks(covariances: Array) -> Array:
+    """Covariances (m, 2, 2) as one block-diagonal matrix (2m, 2m)."""
+    m = len(covariances)
+    out = np.zeros((m, 2, m, 2))
+    out[np.arange(m), :, np.arange(m)] = covariances
+    return out.reshape(2 * m, 2 * m)
 
 
 def _terms(
     model: SpotModel, rows: Ints, pixels: Array, W: Array, pose: Pose, prior: tuple[Pose, Array] | None
 ) -> tuple[Array, Array, float, Array, Array, Array] | None:
-    """Normal matrix (6, 6), right-hand side (6,), cost, residuals (m, 2) px, and the projection; None if that fails."""
+    """Normal matrix (6, 6), right-hand side (6,), cost, residuals (m, 2) px, and the projection; None if that fails.
+
+    W: (m, 2, 2) for each spot, or (2m, 2m) where their errors go together.
+    """
     projected, J = model.project(pose)
     residuals = pixels - projected[rows]
     if np.isnan(residuals).any():
         return None
-    r = (W @ residuals[..., None])[..., 0].ravel()
-    A = (W @ J[rows]).reshape(-1, 6)
+    if W.ndim == 3:
+        r = (W @ residuals[..., None])[..., 0].ravel()
+        A = (W @ J[rows]).reshape(-1, 6)
+    else:
+        r = W @ residuals.ravel()
+        A = W @ J[rows].reshape(-1, 6)
     H, g, cost = A.T @ A, A.T @ r, float(r @ r)
     if prior is not None:
         # d(minus)/d(step) is the identity to first order in the distance, which is what a prior is good for.
@@ -171,6 +273,7 @@ def fit_pose_robust(
     expected: tuple[Pose, Array] | None = None,
     limits: SolveLimits | None = None,
     noise_scale: float = 1.0,
+    calibration: CalibrationSpread | None = None,
 ) -> PoseFit | None:
     """As `fit_pose`, but one or two spots may be wrong; they are then left out (missing from the result's rows).
 
@@ -181,7 +284,7 @@ def fit_pose_robust(
     sets are about equally good.
     """
     limits = SolveLimits() if limits is None else limits
-    fit = fit_pose(model, rows, pixels, covariances, start)
+    fit = fit_pose(model, rows, pixels, covariances, start, calibration=calibration)
     if fit is not None and _acceptable(fit, limits, noise_scale):
         return fit
     for left_out in (1, 2):
@@ -190,7 +293,11 @@ def fit_pose_robust(
         sets = [
             found
             for leave in combinations(range(len(rows)), left_out)
-            if (found := _without(model, rows, pixels, covariances, start, list(leave), limits, noise_scale, expected))
+            if (
+                found := _without(
+                    model, rows, pixels, covariances, start, list(leave), limits, noise_scale, expected, calibration
+                )
+            )
         ]
         if not sets:
             continue
@@ -215,6 +322,7 @@ def _without(
     limits: SolveLimits,
     noise_scale: float,
     expected: tuple[Pose, Array] | None,
+    calibration: CalibrationSpread | None,
 ) -> tuple[PoseFit, float, float] | None:
     """The fit without some spots, its misfit and its distance from the expected pose, both in squared sigmas.
 
@@ -222,7 +330,7 @@ def _without(
     """
     keep = np.ones(len(rows), dtype=bool)
     keep[leave] = False
-    fit = fit_pose(model, rows[keep], pixels[keep], covariances[keep], start)
+    fit = fit_pose(model, rows[keep], pixels[keep], covariances[keep], start, calibration=calibration)
     if fit is None or not fit.observable or not _acceptable(fit, limits, noise_scale):
         return None
     left_at = fit.projected_px[rows[leave]]

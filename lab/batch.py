@@ -29,10 +29,11 @@ class BatchOutcome:
 
     @property
     def exit_status(self) -> int:
-        """1 if some run could not be processed, else 4 if a quality gate failed, else 0."""
+        """1 if some run could not be processed, 3 if for no other reason than its calibration; else 4 or 0."""
         found = {row["exit_status"] for row in self.rows}
-        if found - {0, QUALITY_GATE_FAILED}:
-            return RunError.exit_status
+        failed = found - {0, QUALITY_GATE_FAILED}
+        if failed:
+            return CalibrationError.exit_status if failed == {CalibrationError.exit_status} else RunError.exit_status
         return QUALITY_GATE_FAILED if QUALITY_GATE_FAILED in found else 0
 
 

@@ -36,11 +36,12 @@ def iso_date(value: Any) -> datetime.date:
     raise unexpected("a date such as 2026-03-14", value)
 
 
-Day = Annotated[datetime.date, pydantic.PlainValidator(iso_date)]
-
-
 def _day_or_none(value: Any) -> datetime.date | None:
     return None if value in (None, "") else iso_date(value)
+
+
+Day = Annotated[datetime.date, pydantic.PlainValidator(iso_date)]
+OptionalDay = Annotated[datetime.date | None, pydantic.PlainValidator(_day_or_none)]
 
 
 def _lines(value: Any) -> list[str]:
@@ -54,7 +55,7 @@ class CalibrationStateBlock(Block):
 
     date: Day
     verdict: Annotated[str, pydantic.PlainValidator(one_of(VERDICTS))]
-    valid_until: Annotated[datetime.date | None, pydantic.PlainValidator(_day_or_none)] = None
+    valid_until: OptionalDay = None
     reasons: Annotated[list[str], pydantic.PlainValidator(_lines)] = []  # noqa: RUF012 - frozen
     notes: Text = ""
 

@@ -67,7 +67,7 @@ class Pipeline:
             model = camera.noise or _noise_of_pictures(run, reader, name)
             if model is not None:
                 noise[name] = model
-        return Pipeline(run, reader, SpotTracker(run.rig, run.tracker, run.prior), noise)
+        return Pipeline(run, reader, SpotTracker(run.rig, run.tracker, run.prior, run.covariance), noise)
 
     def records(self) -> Iterator[FrameRecord]:
         """One record per frame number, from the first to the last."""

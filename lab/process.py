@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import datetime
 import json
 import platform
 import time
@@ -17,6 +18,7 @@ import numpy as np
 
 from geometry.spots import SpotModel
 from lab import quality
+from lab.calibration_state import require_usable, state_mapping
 from lab.fields import dataclass_from_yaml
 from lab.fingerprints import fingerprints
 from lab.pipeline import FrameRecord, Pipeline
@@ -116,17 +118,19 @@ def process_run(
     """Process one run folder into the folder `out`: the tables, summary.json and report.html.
 
     overrides: tracker parameters that replace those of run.yaml. Raises a BeamposeError where the run cannot be
-    processed; `out` is then as it was before.
+    processed (CalibrationError where its rig's calibration must not be used); `out` is then as it was before.
     """
     started = time.perf_counter()
     run = load_run(run_folder)
     if overrides:
         run = dataclasses.replace(run, tracker=overridden(run.tracker, overrides))
+    recorded = datetime.date.today() if run.recorded is None else run.recorded
+    require_usable(run.calibration, run.rig_path, recorded, "today" if run.recorded is None else "the recording's day")
     with whole_folder(out, may_replace=are_results) as work:
         pipeline = Pipeline.of(run)
         tally = _Tally(tuple(run.rig.cameras), tuple(f"{c}/{s}" for c, s in SpotModel.of(run.rig).views))
         total = pipeline.reader.expected_frames
-        with TableWriter(work, run.rig) as tables:
+        with TableWriter(work, run.rig, run.covariance is not None) as tables:
             for record in pipeline.records():
                 tables.write(record)
                 tally.add(record)
@@ -212,6 +216,7 @@ def _summary(
         "name": run.name,
         "run_folder": str(run.folder.resolve()),
         "rig": str(run.rig_path.resolve()),
+        "calibration": None if run.calibration is None else state_mapping(run.calibration),
         "notes_of_run": run.notes,
         "verdict": {"status": verdict.status, "reasons": list(verdict.reasons), "exit_status": verdict.exit_status},
         "counts": {

@@ -121,7 +121,7 @@ class SpotGrid:
 
 @dataclass(frozen=True, slots=True)
 class PoseTrack:
-    """attitude.csv and covariance.csv by frame: F frames."""
+    """attitude.csv, covariance.csv and systematic.csv by frame: F frames."""
 
     frames: Ints  # (F,), rising
     t_s: Array  # (F,)
@@ -133,6 +133,7 @@ class PoseTrack:
     rms_px: Array  # (F,)
     status: Ints  # (F,) index into POSE_STATUSES, or ABSENT
     covariance: Array  # (F, 6, 6), of [dt (m, world), dtheta (rad, body)]; nan where the file has none
+    systematic: Array  # (F, 6, 6), the calibration's share of it; nan where there is none
 
     def has(self, status: PoseStatus) -> Bools:
         """(F,): the pose's status is this one."""
@@ -203,7 +204,7 @@ def pose_stack(position_m: Array, quaternion_wxyz: Array) -> Pose:
 
 
 def read_poses(results: Path) -> PoseTrack:
-    """attitude.csv, and covariance.csv where there is one, of a results folder."""
+    """attitude.csv, and covariance.csv and systematic.csv where there are such, of a results folder."""
     numbers = [c for c in columns.ATTITUDE if c != "status"]
     table = read_table(results / "attitude.csv", numbers, ("status",))
     frames = table.numbers["frame"].astype(np.int64)
@@ -218,6 +219,7 @@ def read_poses(results: Path) -> PoseTrack:
         rms_px=table.numbers["rms_px"],
         status=table.texts["status"].recoded(POSE_STATUSES),
         covariance=_read_covariance(results / "covariance.csv", frames),
+        systematic=_read_covariance(results / "systematic.csv", frames),
     )
 
 

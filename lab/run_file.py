@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import datetime
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +14,8 @@ import pydantic
 
 from geometry.pose import Pose
 from geometry.rig import Rig
+from geometry.rig_parameters import RigCovariance
+from lab.calibration_state import CalibrationState, OptionalDay
 from lab.errors import InputError
 from lab.fields import (
     Block,
@@ -28,7 +31,8 @@ from lab.fields import (
     wrong,
 )
 from lab.pictures import SUFFIXES
-from lab.rig_file import load_rig
+from lab.rig_covariance import joint_covariance
+from lab.rig_file import load_rig_file
 from lab.times import Times, load_times
 from lab.yaml_text import FileError, did_you_mean, read_mapping, write_mapping
 from tracking.labels import PosePrior
@@ -78,6 +82,9 @@ class Run:
     prior: PosePrior | None  # where the vehicle is at the first frame
     tracker: TrackerParameters
     notes: str
+    covariance: RigCovariance | None = None  # of the rig's calibration
+    calibration: CalibrationState | None = None  # when it was made, and how good it is
+    recorded: datetime.date | None = None  # the day of the recording
 
     @property
     def path(self) -> Path:
@@ -104,7 +111,8 @@ def load_run(run_folder: Path) -> Run:
         raise InputError(
             f"{path}: rig: expected a rig file, found none at {rig_path}; paths start at run.yaml's folder"
         )
-    rig = load_rig(rig_path)
+    rig_file = load_rig_file(rig_path)
+    rig = rig_file.rig
     mistakes = [
         f"{path}: cameras.{name}: expected a camera of {rig_path.name}, got {name!r}{did_you_mean(name, rig.cameras)}"
         for name in content.cameras
@@ -122,10 +130,11 @@ def load_run(run_folder: Path) -> Run:
         raise FileError(mistakes)
 
     times_path = None if content.timestamps is None else folder / content.timestamps
+    in_use = dataclasses.replace(rig, cameras={n: c for n, c in rig.cameras.items() if n in sources})
     return Run(
         folder=folder,
         name=content.name or folder.resolve().name,
-        rig=dataclasses.replace(rig, cameras={n: c for n, c in rig.cameras.items() if n in sources}),
+        rig=in_use,
         rig_path=rig_path,
         frame_rate_hz=content.frame_rate_hz,
         exposure_s=content.exposure_s,
@@ -136,6 +145,9 @@ def load_run(run_folder: Path) -> Run:
         prior=None if content.prior is None else _prior_of(content.prior),
         tracker=tracker,
         notes=content.notes,
+        covariance=joint_covariance(in_use, rig_file.covariances, rig_path),
+        calibration=rig_file.calibration,
+        recorded=content.recorded,
     )
 
 
@@ -197,6 +209,7 @@ class _RunBlock(Block):
     cameras: Annotated[dict[str, _SourceBlock], pydantic.BeforeValidator(_some_cameras)]
     prior: _PriorBlock | None = None
     tracker: Any = None
+    recorded: OptionalDay = None
     notes: Text = ""
 
 

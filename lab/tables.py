@@ -27,9 +27,12 @@ _FILES = {
 
 
 class TableWriter:
-    """Writes all tables of one run into an existing folder. Use it as a context."""
+    """Writes all tables of one run into an existing folder. Use it as a context.
 
-    def __init__(self, folder: Path, rig: Rig) -> None:
+    with_systematic: also systematic.csv, the part of covariance.csv that the calibration's errors make.
+    """
+
+    def __init__(self, folder: Path, rig: Rig, with_systematic: bool = False) -> None:
         self._folder = folder
         self._rig = rig
         self._model = SpotModel.of(rig)
@@ -38,10 +41,11 @@ class TableWriter:
         self._beams = [csv_word(b) for b in rig.beams]
         self._directions = np.array([b.direction for b in rig.beams.values()])
         self._points = np.array([b.point for b in rig.beams.values()])
+        self._files = {**_FILES, "systematic.csv": columns.COVARIANCE} if with_systematic else _FILES
         self._open: dict[str, TextIO] = {}
 
     def __enter__(self) -> TableWriter:
-        for name, header in _FILES.items():
+        for name, header in self._files.items():
             self._open[name] = (self._folder / name).open("w", encoding="utf-8", newline="")
             self._open[name].write(",".join(header) + "\n")
         return self
@@ -94,6 +98,8 @@ class TableWriter:
             f"{head},{_joined(pose_numbers(t.pose, t.pose_covariance))},{t.spots_used},{_number(t.rms_px)},{status}\n"
         )
         self._open["covariance.csv"].write(f"{record.frame},{_joined(t.pose_covariance[_UPPER])}\n")
+        if "systematic.csv" in self._open and t.pose_systematic is not None:
+            self._open["systematic.csv"].write(f"{record.frame},{_joined(t.pose_systematic[_UPPER])}\n")
         direction, point = t.pose.turn(self._directions), t.pose.apply(self._points)
         self._open["beams.csv"].writelines(
             f"{head},{b},{_joined(direction[i])},{_joined(point[i])},{status}\n" for i, b in enumerate(self._beams)

@@ -20,6 +20,7 @@ from scipy.optimize import linear_sum_assignment
 
 from geometry import rotations
 from geometry.arrays import Array, Bools, Ints, normalised
+from geometry.calibration_spread import CalibrationSpread
 from geometry.closed_form import poses_from_line_and_spot
 from geometry.planes import meet_plane, screen_to_world
 from geometry.pose import Pose
@@ -81,13 +82,15 @@ def find_labels(
     detections: Mapping[str, Detections],
     prior: PosePrior,
     parameters: LabelParameters | None = None,
+    calibration: CalibrationSpread | None = None,
 ) -> LabelResult:
     """Label the points of all cameras of one frame from a prior alone.
 
     detections: by camera name; a camera without a picture is absent. The rig is the one that `model` was made of.
+    calibration: what its errors do to the spots, where that is known.
     """
     parameters = LabelParameters() if parameters is None else parameters
-    scene = _Scene.of(rig, model, detections, parameters)
+    scene = _Scene.of(rig, model, detections, parameters, calibration)
     if len(scene.camera) < parameters.min_spots:
         return LabelResult(
             None, (), f"only {len(scene.camera)} points of light, at least {parameters.min_spots} needed"
@@ -115,9 +118,16 @@ class _Scene:
     world: Array  # (m, 3), m: where on the screen it is
     seen: Bools  # (n,) views whose camera has a picture
     log_clutter: Array  # (cameras,) log density of false points, 1/px^2
+    calibration: CalibrationSpread | None
 
     @staticmethod
-    def of(rig: Rig, model: SpotModel, detections: Mapping[str, Detections], parameters: LabelParameters) -> _Scene:
+    def of(
+        rig: Rig,
+        model: SpotModel,
+        detections: Mapping[str, Detections],
+        parameters: LabelParameters,
+        calibration: CalibrationSpread | None,
+    ) -> _Scene:
         camera, row, pixels, covariances, world = [], [], [], [], []
         log_clutter = np.zeros(len(model.camera_names))
         for c, name in enumerate(model.camera_names):
@@ -151,6 +161,7 @@ class _Scene:
             np.concatenate(world),
             np.array([model.camera_names[c] in detections for c in model.camera_of]),
             log_clutter,
+            calibration,
         )
 
     def points_of(self, view: int) -> Ints:
@@ -331,7 +342,9 @@ def _fitted(scene: _Scene, pose: Pose, prior: PosePrior) -> Labelling | None:
         if len({int(model.spot_of[r]) for r in rows}) < p.min_spots:
             return None
         if labels is None or np.any(new != labels):
-            fit = fit_pose(model, rows, scene.pixels[new[rows]], scene.covariances[new[rows]], pose)
+            fit = fit_pose(
+                model, rows, scene.pixels[new[rows]], scene.covariances[new[rows]], pose, calibration=scene.calibration
+            )
         if fit is None or not fit.observable:
             return None
         labels, pose = new, fit.world_from_body
@@ -342,7 +355,13 @@ def _fitted(scene: _Scene, pose: Pose, prior: PosePrior) -> Labelling | None:
         rows = fit.rows
         limits = SolveLimits(p_false_alarm=P_MISFIT)
         fit = fit_pose_robust(
-            model, rows, scene.pixels[labels[rows]], scene.covariances[labels[rows]], pose, limits=limits
+            model,
+            rows,
+            scene.pixels[labels[rows]],
+            scene.covariances[labels[rows]],
+            pose,
+            limits=limits,
+            calibration=scene.calibration,
         )
         if fit is None or len({int(model.spot_of[r]) for r in fit.rows}) < p.min_spots:
             return None
@@ -353,10 +372,10 @@ def _fitted(scene: _Scene, pose: Pose, prior: PosePrior) -> Labelling | None:
     projected = model.project(pose)[0]
     expected = model.in_picture(projected) & scene.seen
     used = labels != NO_POINT
-    points = labels[used]
-    C = scene.covariances[points]
-    logdet = np.log((2 * np.pi) ** 2 * (C[:, 0, 0] * C[:, 1, 1] - C[:, 0, 1] ** 2))
-    score = np.sum(np.log(p.p_detect) - 0.5 * logdet - scene.log_clutter[scene.camera[points]]) - 0.5 * fit.chi2
+    clutter = scene.log_clutter[scene.camera[labels[used]]]
+    # The likelihood of the used points, against that of as many false ones.
+    score = len(clutter) * (np.log(p.p_detect) - np.log(2 * np.pi)) - float(np.sum(clutter))
+    score -= 0.5 * (fit.log_det + fit.chi2)
     score += np.log(1 - p.p_detect) * np.count_nonzero(expected & ~used)
     return Labelling(fit, labels, float(score), int(np.count_nonzero(expected | used)))
 

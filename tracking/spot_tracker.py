@@ -13,8 +13,10 @@ from dataclasses import replace
 import numpy as np
 
 from geometry.arrays import Array, Bools, Ints
+from geometry.calibration_spread import CalibrationSpread
 from geometry.pose import Pose
 from geometry.rig import Rig
+from geometry.rig_parameters import RigCovariance
 from geometry.solve import (
     EXPECTED_GATE,
     PoseFit,
@@ -41,9 +43,13 @@ RIGID_GATE = 20.0  # squared sigmas: a detection this near to where the pose put
 class SpotTracker:
     """Feed it the detections of one frame after the other."""
 
-    def __init__(self, rig: Rig, parameters: TrackerParameters, prior: PosePrior) -> None:
+    def __init__(
+        self, rig: Rig, parameters: TrackerParameters, prior: PosePrior, covariance: RigCovariance | None = None
+    ) -> None:
+        """covariance: of the rig's calibration, where it is known; poses then carry its share."""
         self.rig = rig
         self.model = SpotModel.of(rig)
+        self.calibration = None if covariance is None else CalibrationSpread(rig, self.model, covariance)
         self.parameters = parameters
         self.prior = prior
         self.coplanar = CoplanarViews.of(rig, self.model)
@@ -152,6 +158,7 @@ class SpotTracker:
             expected=self.vehicle.expected,
             limits=self.limits,
             noise_scale=self.vehicle.noise_scale,
+            calibration=self.calibration,
         )
         if fit is None:
             fit = self._blended_fit(rows, uv, cov)
@@ -168,7 +175,9 @@ class SpotTracker:
         if new:
             rows = np.union1d(fit.rows, new)
             now, now_cov = self._pixels(found, point)
-            wider = fit_pose(self.model, rows, now[rows], now_cov[rows], fit.world_from_body)
+            wider = fit_pose(
+                self.model, rows, now[rows], now_cov[rows], fit.world_from_body, calibration=self.calibration
+            )
             if wider is not None and wider.consistent(self.limits.p_false_alarm):
                 fit = wider
                 turned = np.where(np.isin(np.arange(len(point)), new), self._far_from_prediction(found, point), turned)
@@ -185,12 +194,12 @@ class SpotTracker:
 
     def _blended_fit(self, rows: Ints, uv: Array, cov: Array) -> PoseFit | None:
         """All spots, where none can be singled out but all lie near their places; the frame's own misfit widens it."""
-        fit = fit_pose(self.model, rows, uv[rows], cov[rows], self._start())
+        fit = fit_pose(self.model, rows, uv[rows], cov[rows], self._start(), calibration=self.calibration)
         if fit is None or fit.dof <= 0 or np.linalg.norm(fit.residuals_px, axis=-1).max() > self.parameters.blend_px:
             return None
         if not self._plausible(fit):
             return None  # at a bend nothing vouches for such a set: all spots are searched anew
-        return replace(fit, covariance=fit.covariance * max(1.0, fit.chi2 / fit.dof / self.vehicle.noise_scale**2))
+        return fit.widened(max(1.0, fit.chi2 / fit.dof / self.vehicle.noise_scale**2))
 
     def _plausible(self, fit: PoseFit) -> bool:
         """Whether three spots, which fit any labels, give a pose that the motion allows."""
@@ -202,8 +211,7 @@ class SpotTracker:
 
     def _add_missed(self, found: Sequence[Detections | None], point: Ints, fit: PoseFit) -> tuple[Ints, list[int]]:
         """Detections where the pose puts spots that have none yet."""
-        uv, J = fit.projected_px, fit.jacobian
-        reach = point_covariance(J, fit.covariance)
+        uv, reach = fit.projected_px, fit.spot_covariances()
         new: list[int] = []
         open_views = np.flatnonzero((point == UNMATCHED) & self.model.in_picture(uv, self.parameters.image_margin_px))
         for view in open_views:
@@ -242,7 +250,7 @@ class SpotTracker:
         """Labels from a prior alone; the pose is refitted with the points' own covariances."""
         nothing = None, np.full(len(self.model), UNMATCHED)
         by_camera = {name: f for name, f in zip(self.model.camera_names, found, strict=True) if f is not None}
-        result = find_labels(self.rig, self.model, by_camera, prior, self.parameters.labels)
+        result = find_labels(self.rig, self.model, by_camera, prior, self.parameters.labels, self.calibration)
         if result.chosen is None:
             if result.tie and not self._told_tie:
                 events.append(Event("tie", self._tie_text(result)))
@@ -253,14 +261,20 @@ class SpotTracker:
         uv, cov = self._pixels(found, point)
         start = result.chosen.fit.world_from_body
         fit = fit_pose_robust(
-            self.model, rows, uv[rows], cov[rows], start, limits=self.limits, noise_scale=self.vehicle.noise_scale
+            self.model,
+            rows,
+            uv[rows],
+            cov[rows],
+            start,
+            limits=self.limits,
+            noise_scale=self.vehicle.noise_scale,
+            calibration=self.calibration,
         )
         if fit is None:
             # The labels hold within the model's error, the claimed sigmas do not: this frame's own misfit widens it.
-            fit = fit_pose(self.model, rows, uv[rows], cov[rows], start)
+            fit = fit_pose(self.model, rows, uv[rows], cov[rows], start, calibration=self.calibration)
             if fit is not None and fit.dof > 0:
-                scale = max(1.0, fit.chi2 / fit.dof / self.vehicle.noise_scale**2)
-                fit = replace(fit, covariance=fit.covariance * scale)
+                fit = fit.widened(max(1.0, fit.chi2 / fit.dof / self.vehicle.noise_scale**2))
         if fit is None or not good_enough(fit, self.limits):
             return nothing
         names = ", ".join(self.model.views[v][1] for v in rows)
@@ -328,6 +342,7 @@ class SpotTracker:
             pose_status=pose_status,
             pose=pose,
             pose_covariance=covariance,
+            pose_systematic=None if pose is None else self.vehicle.systematic(fit),
             spots_used=len(fit.rows) if fit is not None else (int(np.count_nonzero(seen)) if pose is not None else 0),
             rms_px=fit.rms_px if fit is not None else float("nan"),
             events=tuple(events),
@@ -361,11 +376,10 @@ class SpotTracker:
         if motion is None:
             return np.full((n, 2), np.nan), np.full((n, 2, 2), np.nan), np.zeros(n, dtype=bool)
         if fit is not None:
-            position, J, covariance = fit.projected_px, fit.jacobian, fit.covariance * self.vehicle.noise_scale**2
+            position, spread = fit.projected_px, fit.spot_covariances() * self.vehicle.noise_scale**2
         else:
             position, J = self.model.project(motion.world_from_body)
-            covariance = motion.covariance
-        spread = point_covariance(J, covariance)
+            spread = point_covariance(J, motion.covariance) + self.vehicle.calibration_px(n)
         exists = ~np.isnan(position[:, 0])
         if self.parameters.out_of_view == "quadratic":
             solved = quadratic_positions(self.rig, self.model, self.coplanar, uv)

@@ -34,3 +34,4 @@ class TrackedFrame:
     spots_used: int
     rms_px: float
     events: tuple[Event, ...]
+    pose_systematic: Array | None = None  # (6, 6) the calibration's share of the covariance, the same in every frame

@@ -39,11 +39,16 @@ class Vehicle:
         self._fastest = np.zeros(2)  # m/s and rad/s: the fastest that the vehicle was seen to move
         self._misfit = 1.0  # running mean of chi2 / dof
         self._recent: deque[float] = deque(maxlen=9)  # the last ones
+        self._deadband = MISFIT_DEADBAND
+        # Of the calibration's errors, from the last measured pose: what they do to the pose and the expected pixels.
+        self._systematic = np.zeros((6, 6))
+        self._systematic_px: Array | float = 0.0  # (n, 2, 2)
+        self._rows: Ints = np.zeros(0, dtype=np.int64)  # the views that it was measured from
 
     @property
     def noise_scale(self) -> float:
         """How much larger than claimed the spots' errors are; 1 while the misfit does not say otherwise."""
-        return float(np.sqrt(self._misfit)) if self._misfit > MISFIT_DEADBAND else 1.0
+        return float(np.sqrt(self._misfit)) if self._misfit > self._deadband else 1.0
 
     @property
     def known(self) -> bool:
@@ -78,10 +83,19 @@ class Vehicle:
         )
 
     def measured(self, fit: PoseFit, dt_s: float) -> None:
-        """Take a measured pose: the filter's update, and what there is to learn from it."""
-        covariance = fit.covariance * self.noise_scale**2
+        """Take a measured pose: the filter's update, and what there is to learn from it.
+
+        The filter follows the vehicle as the calibration shows it: errors of the calibration are the same from frame
+        to frame, and count as noise only where other spots carry the pose than before.
+        """
+        same_spots = np.array_equal(fit.rows, self._rows)
+        covariance = (fit.noise if same_spots else fit.covariance) * self.noise_scale**2
+        self._rows, self._systematic = fit.rows, fit.systematic * self.noise_scale**2
+        self._systematic_px = fit.spot_covariances() - point_covariance(fit.jacobian, fit.noise)
         if fit.dof > 0:
             self._learn_misfit(fit.chi2 / fit.dof)
+            # One calibration has one set of errors: its share of the misfit is drawn once, and no mean evens it out.
+            self._deadband = MISFIT_DEADBAND + 3 * fit.systematic_share * np.sqrt(2 / fit.dof)
         if self.motion is None:
             self.motion = pose_filter.begin(fit.world_from_body, covariance)
         else:
@@ -109,7 +123,7 @@ class Vehicle:
         if len(rows):
             projected, J = model.project(motion.world_from_body)
             y = uv_px - projected[rows]
-            C = cov_px2 * self.noise_scale**2
+            C = (cov_px2 + self.calibration_px(len(model))[rows]) * self.noise_scale**2
             S = point_covariance(J[rows], motion.covariance) + C
             nis = np.sum(y * np.linalg.solve(S, y[..., None])[..., 0], axis=-1)
             log_clutter = np.log(max(self.parameters.labels.clutter_per_px2, CLUTTER_NEAR_SPOTS))
@@ -128,8 +142,16 @@ class Vehicle:
         if fit is not None:
             return PoseStatus.MEASURED, fit.world_from_body, fit.covariance * self.noise_scale**2
         if self.motion is not None and self.known:
-            return PoseStatus.PREDICTED, self.motion.world_from_body, self.motion.covariance
+            return PoseStatus.PREDICTED, self.motion.world_from_body, self.motion.covariance + self._systematic
         return PoseStatus.LOST, None, None
+
+    def systematic(self, fit: PoseFit | None) -> Array:
+        """The part of the pose's covariance (6, 6) that the calibration's errors make."""
+        return self._systematic if fit is None else fit.systematic * self.noise_scale**2
+
+    def calibration_px(self, count: int) -> Array:
+        """What the calibration's errors leave open of each view's expected pixel, (count, 2, 2), px^2."""
+        return np.zeros((count, 2, 2)) + self._systematic_px
 
     def _darkened(self, motion: Motion) -> Motion:
         """More process noise than the ordinary prediction has already added."""

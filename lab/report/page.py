@@ -9,7 +9,7 @@ from typing import Any
 import jinja2
 from markupsafe import Markup
 
-from lab.report import figures, tables
+from lab.report import figures, tables, uncertainty
 from lab.report.material import Material, gather
 from lab.report.pictures import Event, chosen, events, pictures
 from lab.report.tracks import POSE_COLOURS, SPOT_COLOURS, timeline_figure, tracks_figure
@@ -58,6 +58,9 @@ def page(m: Material, results: Path) -> str:
         "pixel_rows": tables.pixel_rows(m.errors),
         "run_line": _run_line(m),
         "pose_figure": Markup(figures.pose_figure(m)),
+        "budget_heads": uncertainty.HEADS,
+        "budget_rows": uncertainty.budget_rows(m),
+        "budget_words": uncertainty.words(m),
         "tracks": [Markup(t) for c in m.spots.cameras if (t := tracks_figure(m, c))],
         "timeline": Markup(timeline_figure(m)) if len(m.spots.frames) and m.spots.views else "",
         "spot_legend": [(str(s), SPOT_COLOURS[s], s.meaning) for s in SpotStatus],

@@ -252,3 +252,28 @@ def test_a_tilted_screen_is_hit_where_its_plane_is():
     # Beam A at y = 0.3 meets the plane x cos 40 + y sin 40 = 2.5 cos 40.
     expected = 2.5 - 0.3 * np.tan(np.radians(40))
     np.testing.assert_allclose(hit[model.views.index(("right", "4"))], [expected, 0.3, 0], atol=1e-12)
+
+
+@settings(max_examples=50)
+@given(seed=seeds)
+def test_rays_meet_a_bent_screen_on_its_surface(seed):
+    rng = np.random.default_rng(seed)
+    flat = random_rig(rng)
+    bows = {n: tuple(rng.normal(0, 0.01, 3)) for n in flat.screens}
+    rig = dataclasses.replace(flat, screens={n: dataclasses.replace(s, bow=bows[n]) for n, s in flat.screens.items()})
+    pose = random_pose(rng, 0.3, 0.3)
+    hits, J = SpotModel.of(rig).hits(pose)
+    model = SpotModel.of(rig)
+    for i, (_, spot) in enumerate(model.views):
+        if np.isnan(hits[i, 0]):
+            continue
+        screen = rig.screens[rig.spots[spot].screen]
+        x, y, z = screen.world_from_screen.inverse().apply(hits[i])
+        a, b, c = screen.bow
+        assert z == pytest.approx(a * x * x + b * x * y + c * y * y, abs=1e-9)
+        beam = rig.beams[rig.spots[spot].beam]
+        off = np.cross(hits[i] - pose.apply(beam.point), pose.turn(beam.direction))
+        np.testing.assert_allclose(off, 0, atol=1e-9)
+    good = np.isfinite(hits[:, 0])
+    expected = numeric_jacobian(lambda d: model.hits(pose.plus(d))[0], np.zeros(6))
+    np.testing.assert_allclose(J[good], expected[good], rtol=1e-4, atol=1e-5)
