@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from calibration.board_on_screen import BoardOnScreenTerm
 from calibration.stacks import Poses, Vectors
 from calibration.surveyed import FrameTerm, PointTerm, SurfaceTerm, SurveyTerm, whitening
 from geometry.arrays import numeric_jacobian
@@ -121,3 +122,44 @@ def test_the_frame_is_held_only_within_the_plane():
     along_normal = np.concatenate([R[:, :, 2] * 0.01, np.tile([1e-3, -2e-3, 0], (2, 1))], axis=1)
     line = term.linearise({**values, "screens": Poses(chosen.plus(along_normal))})
     np.testing.assert_allclose(line.residuals * term.sigma, 0, atol=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_derivatives_of_a_board_on_a_screen_are_those_of_its_residuals(seed):
+    rng = np.random.default_rng(seed)
+    values = scene(seed)
+    screens = values["screens"].pose
+    lying = screens.plus(0.1 * rng.normal(size=(2, 6))) @ Pose(np.diag([1.0, -1, -1]), np.array([0.3, -0.2, 0.01]))
+    values = {**values, "boards": Poses(lying)}
+    term = BoardOnScreenTerm(
+        np.array([1, 0]),
+        np.array([1, 0]),
+        rng.uniform(0, 0.3, (2, 3)),
+        np.array([0.003, 0.004]),
+        np.array([1.0, 0.5]),
+        np.array([1.0, 2.0]),
+    )
+    line = term.linearise(values)
+    for part in line.parts:
+        stack = values[part.stack]
+        for element in range(2):
+
+            def residuals(delta, part=part, stack=stack, element=element):
+                move = np.zeros((2, stack.dof))
+                move[element] = delta
+                return term.linearise({**values, part.stack: stack.plus(move)}).residuals
+
+            expected = numeric_jacobian(residuals, np.zeros(stack.dof), 1e-5)
+            mine = np.where((part.index == element)[:, None, None], part.jacobian, 0.0)
+            np.testing.assert_allclose(mine, expected, atol=1e-8, err_msg=part.stack)
+
+
+def test_a_board_laid_flat_on_a_screen_at_its_thickness_has_no_residual():
+    values = {**scene(), "bow": Vectors(np.zeros((2, 3)))}
+    middle = np.array([0.15, 0.1, 0.0])
+    screen_from_board = Pose(np.diag([1.0, -1, -1]), np.array([0.4, 0.2, 0.003]))
+    boards = values["screens"].pose[np.array([1])] @ screen_from_board
+    term = BoardOnScreenTerm(
+        np.array([1]), np.array([0]), middle[None], np.array([0.003]), np.array([1e-3]), np.array([1e-3])
+    )
+    np.testing.assert_allclose(term.linearise({**values, "boards": Poses(boards)}).residuals, 0, atol=1e-9)
