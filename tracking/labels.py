@@ -22,10 +22,11 @@ from geometry import rotations
 from geometry.arrays import Array, Bools, Ints, normalised
 from geometry.calibration_spread import CalibrationSpread
 from geometry.closed_form import poses_from_line_and_spot
+from geometry.outliers import fit_pose_robust
 from geometry.planes import meet_plane, screen_to_world
 from geometry.pose import Pose
 from geometry.rig import Rig
-from geometry.solve import PoseFit, SolveLimits, fit_pose, fit_pose_robust
+from geometry.solve import PoseFit, SolveLimits, fit_pose
 from geometry.spots import SpotModel
 from tracking.detections import Detections
 from tracking.parameters import LabelParameters

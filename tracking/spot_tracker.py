@@ -14,15 +14,14 @@ import numpy as np
 
 from geometry.arrays import Array, Bools, Ints
 from geometry.calibration_spread import CalibrationSpread
+from geometry.outliers import EXPECTED_GATE, fit_pose_robust
 from geometry.pose import Pose
 from geometry.rig import Rig
 from geometry.rig_parameters import RigCovariance
 from geometry.solve import (
-    EXPECTED_GATE,
     PoseFit,
     SolveLimits,
     fit_pose,
-    fit_pose_robust,
     good_enough,
     point_covariance,
 )

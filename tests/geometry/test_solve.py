@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from geometry import rotations
+from geometry.outliers import fit_pose_robust
 from geometry.pose import Pose
 from geometry.rig import Beam, Rig
 from geometry.solve import (
     SolveLimits,
     covariance_of,
     fit_pose,
-    fit_pose_robust,
     good_enough,
     largest_chi2,
     point_covariance,
