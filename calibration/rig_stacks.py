@@ -13,10 +13,10 @@ import numpy as np
 from calibration.adjustment import At, Values
 from calibration.priors import Prior
 from calibration.stacks import Lines, Poses, Stack, Vectors
+from calibration.surveyed import array_of, pose_of
 from geometry.arrays import Array, Bools
 from geometry.camera import Camera, pinhole_numbers
 from geometry.lens import padded
-from geometry.pose import Pose
 from geometry.rig import Beam, Rig
 from geometry.rig_parameters import BOW, DIRECTION, PINHOLE, POINT, POSE, RigCovariance, distortion_names
 
@@ -49,27 +49,13 @@ def rig_of(rig: Rig, values: Values) -> Rig:
     for i, (name, c) in enumerate(rig.cameras.items()):
         cameras[name] = _camera(c, i, values)
     for i, (name, s) in enumerate(rig.screens.items()):
-        world_from_screen = poses_in(values, SCREENS)[i] if SCREENS in values else s.world_from_screen
-        a, b, c_ = vectors_in(values, BOWS)[i].tolist() if BOWS in values else s.bow
+        world_from_screen = pose_of(values, SCREENS)[i] if SCREENS in values else s.world_from_screen
+        a, b, c_ = array_of(values, BOWS)[i].tolist() if BOWS in values else s.bow
         screens[name] = replace(s, world_from_screen=world_from_screen, bow=(a, b, c_))
     if BEAMS in values:
         lines = lines_in(values)
         beams = {n: Beam(n, lines.directions[i], lines.points[i]) for i, n in enumerate(beams)}
     return Rig(screens, cameras, beams, rig.spots)
-
-
-def poses_in(values: Values, name: str) -> Pose:
-    """The transforms of a stack of poses."""
-    stack = values[name]
-    assert isinstance(stack, Poses)
-    return stack.pose
-
-
-def vectors_in(values: Values, name: str) -> Array:
-    """The numbers (k, d) of a stack of vectors."""
-    stack = values[name]
-    assert isinstance(stack, Vectors)
-    return stack.array
 
 
 def lines_in(values: Values) -> Lines:
@@ -140,10 +126,10 @@ def prior_of(rig: Rig, covariance: RigCovariance) -> tuple[Prior | None, dict[st
 
 
 def _camera(c: Camera, i: int, values: Values) -> Camera:
-    pose = poses_in(values, CAMERAS)[i] if CAMERAS in values else c.camera_from_world
+    pose = pose_of(values, CAMERAS)[i] if CAMERAS in values else c.camera_from_world
     if INTRINSICS not in values:
         return replace(c, camera_from_world=pose)
-    fx, fy, cx, cy, *lens = vectors_in(values, INTRINSICS)[i].tolist()
+    fx, fy, cx, cy, *lens = array_of(values, INTRINSICS)[i].tolist()
     matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
     return replace(c, matrix=matrix, distortion=tuple(lens[: len(c.distortion)]), camera_from_world=pose)
 

@@ -7,19 +7,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from calibration.adjustment import Linearised, Loss, Part, Values
-from calibration.rig_stacks import (
-    BEAMS,
-    BOWS,
-    CAMERAS,
-    INTRINSICS,
-    POSES,
-    SCREENS,
-    STAND,
-    lines_in,
-    poses_in,
-    vectors_in,
-)
-from geometry.arrays import Array, Ints, skew
+from calibration.rig_stacks import BEAMS, BOWS, CAMERAS, INTRINSICS, POSES, SCREENS, STAND, lines_in
+from calibration.surveyed import array_of, pose_of
+from geometry.arrays import Array, Bools, Ints, skew
 from geometry.camera import FISHEYE
 from geometry.lens import fisheye_fold_limit, fold_limit
 from geometry.pose import Pose
@@ -40,7 +30,7 @@ class SpotPixels:
     def __len__(self) -> int:
         return len(self.position)
 
-    def pick(self, rows: Array | Ints) -> SpotPixels:
+    def pick(self, rows: Bools | Ints) -> SpotPixels:
         """Some of the spots."""
         return SpotPixels(self.position[rows], self.view[rows], self.pixels[rows], self.covariance[rows])
 
@@ -78,7 +68,7 @@ class SpotTerm:
         """N residuals of 2, and their derivatives by all seven stacks."""
         model = self._at(values)
         beam, camera, screen = model.beam_of[:, 0], model.camera_of[:, 0], self._screen_of
-        world_from_stand, stand_from_body = poses_in(values, STAND)[0], poses_in(values, POSES)[self.spots.position]
+        world_from_stand, stand_from_body = pose_of(values, STAND)[0], pose_of(values, POSES)[self.spots.position]
         d = model.derivatives(world_from_stand @ stand_from_body)
         residuals = self._W @ (d.pixels[:, 0] - self.spots.pixels)[..., None]
         by_stand, by_pose = _chain(d.pose[:, 0], world_from_stand, stand_from_body)
@@ -99,8 +89,8 @@ class SpotTerm:
     def _at(self, values: Values) -> SpotModel:
         """The forward model with the stacks' numbers."""
         m = self._model
-        lens, lines = vectors_in(values, INTRINSICS), lines_in(values)
-        cameras, screens = poses_in(values, CAMERAS), poses_in(values, SCREENS)
+        lens, lines = array_of(values, INTRINSICS), lines_in(values)
+        cameras, screens = pose_of(values, CAMERAS), pose_of(values, SCREENS)
         fold = self._folds(lens)
         screen = self._screen_of[:, None]
         return replace(
@@ -109,7 +99,7 @@ class SpotTerm:
             ray=m.sign[..., None] * lines.directions[m.beam_of],
             screen_rotation=screens.rotation[screen],
             screen_origin=screens.translation[screen],
-            bow=vectors_in(values, BOWS)[screen],
+            bow=array_of(values, BOWS)[screen],
             camera_rotation=cameras.rotation[m.camera_of],
             camera_translation=cameras.translation[m.camera_of],
             pinhole=lens[m.camera_of][..., :4],

@@ -119,7 +119,8 @@ def test_a_prior_from_a_covariance_weighs_errors_by_it_and_fixes_what_it_does_no
     assert prior is not None
     left = list(rig.screens).index("left")
     assert free["screens"][left].tolist() == [True, False, True, False, False, False]
-    assert free["screens"].sum() == 2 and not free["beams"].any()
+    assert free["screens"].sum() == 2
+    assert not free["beams"].any()
     assert free["intrinsics"].sum() == 1
     delta = np.array([1e-3, -2e-3, 4e-3])
     step = np.zeros((len(values["screens"]), 6))
