@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,12 +11,15 @@ import numpy as np
 
 from geometry.arrays import Ints
 from geometry.rig import Rig
+from geometry.rig_parameters import RigCovariance
 from geometry.solve import SolveLimits
 from lab import sight
-from lab.errors import InputError
+from lab.calibration_state import CalibrationState, require_usable
+from lab.errors import CalibrationError, InputError
 from lab.frames import FrameReader, open_frames
 from lab.pictures import DROPPED, UNREADABLE, Missing
-from lab.rig_file import load_rig
+from lab.rig_covariance import joint_covariance
+from lab.rig_file import load_rig_file
 from lab.run_file import Run, load_run
 from lab.truth import largest_disagreement_px, load_truth
 from lab.yaml_text import FileError
@@ -33,7 +37,7 @@ class CheckResult:
     """What `beampose check` says."""
 
     lines: tuple[str, ...]
-    exit_status: int  # 0: can be processed; 2: something must be put right first
+    exit_status: int  # 0: can be processed; 2: something must be put right first; 3: that is the calibration alone
 
 
 @dataclass(slots=True)
@@ -44,21 +48,23 @@ class _Findings:
     problems: list[str] = field(default_factory=list)  # a run would stop, or be wrong
     remarks: list[str] = field(default_factory=list)  # a run goes on
     facts: list[str] = field(default_factory=list)
+    unusable: list[str] = field(default_factory=list)  # what stops a run is the calibration
 
     def result(self) -> CheckResult:
         counts = [
             f"{len(lines)} {word}{'s' if len(lines) > 1 else ''}"
-            for word, lines in (("problem", self.problems), ("remark", self.remarks))
+            for word, lines in (("problem", self.problems + self.unusable), ("remark", self.remarks))
             if lines
         ]
         lines = [f"{self.subject}: {', '.join(counts) or 'fine'}"]
-        if self.problems:
-            lines += ["", "Problems, to be put right first:", *(f"  {p}" for p in self.problems)]
+        if self.problems or self.unusable:
+            lines += ["", "Problems, to be put right first:", *(f"  {p}" for p in self.problems + self.unusable)]
         if self.remarks:
             lines += ["", "Remarks, with which a run goes on:", *(f"  {r}" for r in self.remarks)]
         if self.facts:
             lines += ["", *self.facts]
-        return CheckResult(tuple(lines), 2 if self.problems else 0)
+        status = InputError.exit_status if self.problems else CalibrationError.exit_status if self.unusable else 0
+        return CheckResult(tuple(lines), status)
 
 
 def check(path: Path, progress: Progress | None = None) -> CheckResult:
@@ -68,11 +74,13 @@ def check(path: Path, progress: Progress | None = None) -> CheckResult:
         return _check_run(path, progress)
     findings = _Findings(str(path))
     try:
-        rig = load_rig(path)
+        file = load_rig_file(path)
+        rig, covariance = file.rig, joint_covariance(file.rig, file.covariances, path)
     except InputError as error:
         findings.problems += _lines_of(error)
     else:
         _describe_rig(findings, rig)
+        _describe_calibration(findings, file.calibration, covariance, path, None)
         _look(findings, rig, None, SolveLimits(), str(path))
     return findings.result()
 
@@ -90,6 +98,7 @@ def _check_run(folder: Path, progress: Progress | None) -> CheckResult:
         return findings.result()
     findings.subject = f"{folder} ({run.name})"
     _describe_rig(findings, run.rig)
+    _describe_calibration(findings, run.calibration, run.covariance, run.rig_path, run.recorded)
     for name in run.left_out:
         findings.remarks.append(f"{run.path}: cameras: camera {name!r} of the rig is left out; the run does without it")
     if run.prior is None:
@@ -106,6 +115,29 @@ def _check_run(folder: Path, progress: Progress | None) -> CheckResult:
     limits = SolveLimits(run.tracker.max_sigma_m, float(np.deg2rad(run.tracker.max_sigma_deg)))
     _look(findings, run.rig, run.prior, limits, str(run.rig_path))
     return findings.result()
+
+
+def _describe_calibration(
+    findings: _Findings,
+    state: CalibrationState | None,
+    covariance: RigCovariance | None,
+    path: Path,
+    recorded: datetime.date | None,
+) -> None:
+    """What is known of the calibration, and whether it may still be used on the day of the recording (or today)."""
+    try:
+        day = datetime.date.today() if recorded is None else recorded
+        require_usable(state, path, day, "today" if recorded is None else "the recording's day")
+    except CalibrationError as error:
+        findings.unusable += str(error).splitlines()
+    words = "the rig file does not say when it was calibrated"
+    if state is not None:
+        until = "" if state.valid_until is None else f", valid until {state.valid_until.isoformat()}"
+        words = f"calibrated {state.date.isoformat()}: {state.verdict}{until}"
+    known = "no covariance: sigmas will hold the noise alone"
+    if covariance is not None:
+        known = f"covariance of {len(covariance.names)} numbers: sigmas will hold the calibration's errors too"
+    findings.facts += ["", "Calibration", f"  {words}", f"  {known}"]
 
 
 def _describe_rig(findings: _Findings, rig: Rig) -> None:

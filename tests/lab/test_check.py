@@ -239,3 +239,25 @@ def test_the_message_of_many_mistakes_shows_the_first_and_counts_the_rest():
     error = FileError(["a: one", "a: two", "a: three"])
     assert str(error) == "a: one\n(and 2 more in this file: `beampose check` lists them)"
     assert str(FileError(["a: one"])) == "a: one"
+
+
+def test_the_calibrations_age_and_covariance_are_told_and_an_expired_one_is_exit_status_3(folder):
+    text, status = said(folder)
+    assert status == 0
+    assert "does not say when it was calibrated" in text
+    assert "no covariance: sigmas will hold the noise alone" in text
+    block = "    covariance: {parameters: [fx, fy], matrix: [[1.0, 0.1], [0.1, 2.0]]}\n"
+    rig = (folder / "rig.yaml").read_text()
+    first = rig.index("camera_from_world")
+    rig = rig[:first].rstrip(" ") + block + rig[rig.rindex("\n", 0, first) + 1 :]
+    dated = rig + "calibration: {date: 2025-01-02, verdict: PASS, valid_until: 2025-07-02}\n"
+    (folder / "rig.yaml").write_text(dated)
+    for path in (folder, folder / "rig.yaml"):
+        text, status = said(path)
+        assert status == 3
+        assert "calibrated 2025-01-02: PASS, valid until 2025-07-02" in text
+        assert "the calibration is out of date" in text
+        assert "covariance of 2 numbers" in text
+    with (folder / "run.yaml").open("a") as file:
+        file.write("recorded: 2025-07-02\n")
+    assert said(folder)[1] == 0
