@@ -41,10 +41,11 @@ def load_truth(run_folder: Path, rig: Rig | None = None) -> Truth | None:
     pose, spots = folder / "pose.csv", folder / "spots.csv"
     if not pose.exists() and not spots.exists():
         return None
-    return Truth(_load_pose(pose) if pose.exists() else None, _load_spots(spots, rig) if spots.exists() else None)
+    return Truth(load_pose_table(pose) if pose.exists() else None, _load_spots(spots, rig) if spots.exists() else None)
 
 
-def _load_pose(path: Path) -> pd.DataFrame:
+def load_pose_table(path: Path) -> pd.DataFrame:
+    """A table of poses, columns TRUTH_POSE. Raises InputError in one line."""
     table = read_table(path, columns.TRUTH_POSE)
     frames = whole_numbers(table, "frame", path)
     _refuse(path, np.diff(frames, prepend=frames[:1] - 1) <= 0, "frame: expected rising numbers", frames)
