@@ -29,8 +29,11 @@ class Missing:
     reason: str  # "dropped", "unreadable: ...", "wrong size ..."
 
 
-def read_picture(path: Path, size_px: tuple[int, int]) -> Grey | Missing:
-    """The picture in a file as grey (h, w), 8 or 16 bit; Missing where it is damaged or not of this (width, height)."""
+def read_picture(path: Path, size_px: tuple[int, int] | None) -> Grey | Missing:
+    """The picture in a file as grey (h, w), 8 or 16 bit; Missing where it is damaged or not of this (width, height).
+
+    size_px None: of any size.
+    """
     try:
         data = path.read_bytes()
     except OSError as error:
@@ -38,7 +41,7 @@ def read_picture(path: Path, size_px: tuple[int, int]) -> Grey | Missing:
     return decode(data, size_px)
 
 
-def decode(data: bytes, size_px: tuple[int, int]) -> Grey | Missing:
+def decode(data: bytes, size_px: tuple[int, int] | None) -> Grey | Missing:
     """As `read_picture`, from the bytes of a file."""
     if not data:
         return Missing(f"{UNREADABLE}: the file is empty")
@@ -54,10 +57,10 @@ def decode(data: bytes, size_px: tuple[int, int]) -> Grey | Missing:
     return checked(picture, size_px)
 
 
-def checked(picture: NDArray[np.generic], size_px: tuple[int, int]) -> Grey | Missing:
+def checked(picture: NDArray[np.generic], size_px: tuple[int, int] | None) -> Grey | Missing:
     """The picture itself, if it has this width and height and 8 or 16 bits."""
     height, width = picture.shape[:2]
-    if (width, height) != size_px:
+    if size_px is not None and (width, height) != size_px:
         return Missing(f"wrong size {width}x{height}, the rig says {size_px[0]}x{size_px[1]}")
     if picture.dtype not in (np.uint8, np.uint16):
         return Missing(f"{UNREADABLE}: {picture.dtype} numbers, expected 8 or 16 bits without sign")
