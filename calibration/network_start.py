@@ -55,11 +55,13 @@ def chain(
     boards: Mapping[tuple[int, int], Pose],
     held_screen: int | None = None,
     held_camera: int | None = None,
+    problems: Mapping[int, str] | None = None,
 ) -> Chained:
     """Walk from the world to every camera and board.
 
     on_dots: camera -> camera_from_world by surveyed dots; boards: (camera, placement) -> camera_from_board. Where there
-    is no survey the world is held_screen's frame or else held_camera's. Raises NotConnectedError: what shares nothing.
+    is no survey the world is held_screen's frame or else held_camera's. problems: camera -> why its dots give no place.
+    Raises NotConnectedError: what shares nothing.
     """
     cameras: dict[int, Pose] = dict(on_dots)
     if not cameras and held_camera is not None:
@@ -94,7 +96,8 @@ def chain(
     lost = [n for i, n in enumerate(names) if i not in cameras]
     if lost:
         reached = [n for i, n in enumerate(names) if i in cameras]
-        raise NotConnectedError(_apart_in_words(lost, reached, boards, names))
+        why = [f"camera {names[c]!r} {words}" for c, words in (problems or {}).items() if c not in cameras and words]
+        raise NotConnectedError("; ".join([_apart_in_words(lost, reached, boards, names), *why]))
     return Chained(cameras, placed, screens)
 
 
@@ -182,7 +185,7 @@ def _apart_in_words(
     words = "; ".join(f"{_listed(p)} share{'s' if len(p) == 1 else ''} nothing with the others" for p in parts)
     rest = f" ({_listed(tuple(reached))} have a place)" if reached else ""
     return (
-        f"cameras {words}{rest}: give each of them four surveyed dots, or a photograph of a board that another camera"
+        f"camera {words}{rest}: give each of them four surveyed dots, or a photograph of a board that another camera"
         " sees in the same place"
     )
 

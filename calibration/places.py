@@ -98,8 +98,9 @@ def _solutions(points: Array, xy: Array) -> list[Pose]:
     s = np.linalg.svd(points - middle, compute_uv=False)
     flat = len(s) < 3 or s[2] < _COPLANAR * s[1]
     method = cv2.SOLVEPNP_IPPE if flat else cv2.SOLVEPNP_SQPNP
-    # About their middle: coordinates of a survey can be kilometres.
-    args = ((points - middle).reshape(-1, 1, 3), xy.reshape(-1, 1, 2), np.eye(3), None)
+    # About their middle and by their size: a survey's coordinates can be kilometres, and the solvers' limits are absolute.
+    size = s[0] / np.sqrt(len(points))
+    args = (((points - middle) / size).reshape(-1, 1, 3), xy.reshape(-1, 1, 2), np.eye(3), None)
     try:
         answer = cv2.solvePnPGeneric(*args, flags=method)
     except cv2.error:
@@ -107,7 +108,7 @@ def _solutions(points: Array, xy: Array) -> list[Pose]:
     out = []
     for rvec, tvec in zip(answer[1], answer[2], strict=True):
         R = np.asarray(cv2.Rodrigues(np.asarray(rvec, dtype=float))[0], dtype=float)
-        t = np.asarray(tvec, dtype=float).ravel() - R @ middle
+        t = np.asarray(tvec, dtype=float).ravel() * size - R @ middle
         if np.isfinite(R).all() and np.isfinite(t).all():
             out.append(Pose(R, t))
     return out
@@ -131,22 +132,23 @@ def _polished(camera: Camera, start: Place, points: Array, pixels: Array, xy: Ar
         if len(some) < FEWEST:
             break
         middle = points[some].mean(axis=0)
+        size = float(np.max(np.abs(points[some] - middle)))
         R0, t0 = best.camera_from_world.rotation, best.camera_from_world.apply(middle)
         try:
             rvec, tvec = cv2.solvePnPRefineLM(
-                (points[some] - middle).reshape(-1, 1, 3),
+                ((points[some] - middle) / size).reshape(-1, 1, 3),
                 xy[some].reshape(-1, 1, 2),
                 np.eye(3),
                 None,
                 cv2.Rodrigues(R0)[0].astype(float),
-                t0.reshape(3, 1).astype(float),
+                (t0 / size).reshape(3, 1).astype(float),
             )
         except cv2.error:
             break
         R = np.asarray(cv2.Rodrigues(rvec)[0], dtype=float)
         if not (np.isfinite(R).all() and np.isfinite(tvec).all()):
             break
-        new = _judged(camera, Pose(R, tvec.ravel() - R @ middle), points, pixels, within_px)
+        new = _judged(camera, Pose(R, tvec.ravel() * size - R @ middle), points, pixels, within_px)
         if _rank(new) >= _rank(best):
             break
         best = new

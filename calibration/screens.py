@@ -92,7 +92,9 @@ def calibrate(
     chosen = {c: _choose(found, near.get(c)) for c, found in on_dots.items() if found.places}
     boards = boards_seen(network, WITHIN_PX)
     surveyed = bool(chosen) or (bool(np.any(network.dots.screen_of >= 0)) and not boards)
-    chained = chain(network, {c: p.camera_from_world for c, p in chosen.items()}, boards, held_screen, held_camera)
+    problems = {c: found.problem for c, found in on_dots.items()}
+    placed = {c: p.camera_from_world for c, p in chosen.items()}
+    chained = chain(network, placed, boards, held_screen, held_camera, problems)
     observed = [c.screen for c in network.rig.cameras.values()]
     frames: dict[int, Pose] = {}
     results: list[ScreenResult] = []
