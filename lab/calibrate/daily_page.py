@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from geometry.arrays import Array
 from lab.calibrate.daily_expected import Compared
 from lab.calibrate.daily_history import HistoryRow
 from lab.calibrate.daily_result import CameraDrift, DailyLimits, OtherChange, Outcome
@@ -39,7 +40,7 @@ def write_page(
     folder: Path,
 ) -> Path:
     """Write report.html of a check. history: all checks so far, this one included."""
-    sections = [_drift_section(outcome.cameras, limits, file)]
+    sections = [_drift_section(outcome.cameras, compared, limits, file)]
     if len({r.date for r in history}) > 1:
         sections.append(_history_section(history, limits, file))
     sections += [_points_section(compared, others, outcome.cameras), _scene_section(file, compared)]
@@ -65,27 +66,31 @@ def _key_figures(
         out.append((f"drift of camera {c.camera}", value, state))
     if file.calibration is not None:
         until = file.calibration.valid_until
-        left = "no expiry date" if until is None else f"valid until {until}, {(until - today).days} days left"
+        left = "no expiry date" if until is None else f"valid until {until}"
+        if until is not None:
+            days = (until - today).days
+            left += f", {days} days left" if days >= 0 else f", expired {-days} days ago"
         out.append(("calibrated on", file.calibration.date.isoformat(), left))
     out.append(("limits", f"{limits.warn_mm:g} / {limits.fail_mm:g} mm", "warning / not to be used, at the screen"))
     return out
 
 
-def _drift_section(cameras: Sequence[CameraDrift], limits: DailyLimits, file: RigFile) -> Section:
+def _drift_section(
+    cameras: Sequence[CameraDrift], compared: Sequence[Compared], limits: DailyLimits, file: RigFile
+) -> Section:
+    labels = {name: [one.label[i] for i in one.rows_of(name)] for one in compared for name in one.columns}
     heads = (
-        "camera", "points", "drift (px)", "drift (mm)", "noise alone (px)", "shift u, v (px)", "turn x, y, z (deg)",
-        "scale (ppm)", "p", "found at (px)", "found at (mm)", "verdict",
+        "camera", "verdict", "points", "drift (px)", "drift (mm)", "noise alone (px)", "p", "found at (px)",
+        "found at (mm)", "shift u, v (px)", "turn x, y, z (deg)", "scale (ppm)",
     )  # fmt: skip
-    rows = []
-    for c in cameras:
-        pairs = [_plus_minus(c.shift_px, c.sigma_shift_px), _plus_minus(c.turn_deg, c.sigma_turn_deg)]
-        rows.append(
-            (
-                c.camera, len(c.pixels), c.drift_px, c.drift_mm, c.noise_px, *pairs,
-                f"{short(c.scale_ppm)} ± {short(c.sigma_scale_ppm, 2)}", f"{c.p_value:.1g}", c.detectable_px,
-                c.detectable_mm, c.level.name,
-            )
-        )  # fmt: skip
+    rows = [
+        (
+            c.camera, c.level.name, len(c.pixels), c.drift_px, c.drift_mm, c.noise_px, f"{c.p_value:.1g}",
+            c.detectable_px, c.detectable_mm, _plus_minus(c.shift_px, c.sigma_shift_px),
+            _plus_minus(c.turn_deg, c.sigma_turn_deg), f"{short(c.scale_ppm)} ± {short(c.sigma_scale_ppm, 2)}",
+        )
+        for c in cameras
+    ]  # fmt: skip
     drawings = [
         Drawing(
             corners_overlay(
@@ -93,6 +98,7 @@ def _drift_section(cameras: Sequence[CameraDrift], limits: DailyLimits, file: Ri
                 c.pixels,
                 c.residual_px,
                 f"Camera {c.camera}: measured − foretold",
+                labels=labels[c.camera],
             ),
             "Arrows that all point one way: the camera turned. Round a middle: it rolled. From a middle: focus or"
             " zoom. One alone: that point is wrong."
@@ -111,8 +117,12 @@ def _drift_section(cameras: Sequence[CameraDrift], limits: DailyLimits, file: Ri
     return Section("Drift per camera", words, drawings, Table(heads, rows))
 
 
-def _plus_minus(values: np.ndarray, sigmas: np.ndarray) -> str:
-    return ", ".join(f"{short(float(v), 2)} ± {short(float(s), 2)}" for v, s in zip(values, sigmas, strict=True))
+def _plus_minus(values: Array, sigmas: Array) -> str:
+    """Values to the place that the largest of their sigmas reaches, and that sigma."""
+    sigma = float(np.max(sigmas))
+    decimals = int(np.clip(1 - np.floor(np.log10(sigma)), 0, 6)) if sigma > 0 else 3
+    words = ", ".join(f"{v:.{decimals}f}" for v in values.tolist())
+    return f"{words} ± {short(sigma, 2)}".replace("-", "−")
 
 
 def _history_section(history: Sequence[HistoryRow], limits: DailyLimits, file: RigFile) -> Section:
@@ -139,7 +149,7 @@ def _points_section(
 ) -> Section:
     by_camera = {c.camera: c for c in cameras}
     heads = (
-        "camera", "point", "u (px)", "v (px)", "measured − foretold u (px)", "v (px)", "left when explained (px)",
+        "camera", "point", "u (px)", "v (px)", "measured − foretold u (px)", "v (px)", "after the camera's change (px)",
         "sigma of the pixel (px)", "sigma of the calibration (px)",
     )  # fmt: skip
     rows = []

@@ -217,7 +217,9 @@ def drift_chart(
                 f'<path d="M{left:.1f} {y:.1f}h{wide:.1f}" stroke="{colour}"'
                 ' stroke-width="1.3" stroke-dasharray="6 3"/>'
             )
-            out.append(text(left + wide - 4, y - 4, f"{words} {number(limit)}", "end"))
+            # One label at each end: limits are often too close for two lines of text.
+            x, side = (left + 4, "") if limit == warn else (left + wide - 4, "end")
+            out.append(text(x, y - 4, f"{words} {number(limit)}", side))
     if expires is not None and expires.toordinal() <= last:
         x = float(p.X(np.array(float(expires.toordinal()))))
         out.append(f'<path d="M{x:.1f} {over:.1f}v{high:.1f}" stroke="{VERMILLION}" stroke-width="1.3"/>')

@@ -7,6 +7,8 @@ of the top-left pixel.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 
@@ -84,11 +86,13 @@ def corners_overlay(
     *,
     picture: Array | np.ndarray | None = None,
     rejected: Bools | None = None,
+    labels: Sequence[str] | None = None,
 ) -> str:
     """One view: its corners and how far the model misses each, magnified.
 
     found_px, residual_px (n, 2), px: where each corner was found, and found minus model. picture (height, width) or
     (height, width, 3): the photograph, drawn under it smaller and as JPEG. rejected (n,): corners that were not used.
+    labels (n,): names of the corners, where they have some.
     """
     p = image_plane(size_px)
     out = axes(p, title, "u (px)", "v (px)", grid=picture is None)
@@ -105,6 +109,8 @@ def corners_overlay(
         out.append(f'<path d="{vectors}" stroke="#fff" stroke-width="3.4" stroke-opacity="0.75" fill="none"/>')
         out.append(f'<path d="{vectors}" stroke="{ORANGE}" stroke-width="1.6" fill="none"/>')
         out.append(f'<path d="{places}" fill="{colour}" stroke="#fff" stroke-width="0.7"/>')
+    for place, label in zip(starts.tolist(), labels or (), strict=labels is not None):
+        out.append(text(place[0] - 5, place[1] + 13, label, "end"))
     out.append(_scale_bar(p, stretch, bar))
     if bad.any():
         out.append(foot(p, f"{bad.sum()} corners not used (red); their vectors are cut"))

@@ -75,17 +75,18 @@ def heat_map(
     diverging: bool = False,
     levels: Sequence[float] | None = None,
     limits: tuple[float, float] | None = None,
+    equal: bool = True,
 ) -> str:
     """A quantity over a plane, with contour lines and a colour bar.
 
     values (rows, columns): at evenly spaced places from the first to the last of extent = (x_first, x_last, y_first,
     y_last), row 0 at y_first; nan where there is none (hatched). levels: of the contours; None: round ones. limits:
-    of the colours; None: of the values.
+    of the colours; None: of the values. equal: one unit is as long in x as in y.
     """
     values = np.asarray(values, dtype=float)
     lo, hi = limits or value_range(values, diverging)
     x0, x1, y0, y1 = extent
-    p = plane((x0, x1), (y0, y1), equal=True, y_down=y_down, right=_RIGHT)
+    p = plane((x0, x1), (y0, y1), equal=equal, y_down=y_down, right=_RIGHT)
     out = axes(p, title, x_name, y_name, grid=False)
     left, top, wide, high = p.box
     out.append(_hatched(left, top, wide, high))

@@ -32,6 +32,11 @@ _SENTENCE = {
     Level.WARN: "This may be used; know the warnings below.",
     Level.FAIL: "This must not be used as it is.",
 }
+_PLAN_SENTENCE = {
+    Level.PASS: "This rig suits the range of poses.",
+    Level.WARN: "This rig can be built; know the warnings below.",
+    Level.FAIL: "This rig does not suit the range of poses.",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,7 +173,7 @@ def _rendered(report: CalibrationReport, drawn: list[list[Drawing]]) -> str:
         "name": report.name,
         "word": report.verdict.name,
         "css": _CSS[report.verdict],
-        "sentence": _SENTENCE[report.verdict],
+        "sentence": (_PLAN_SENTENCE if report.kind == "Plan" else _SENTENCE)[report.verdict],
         "made": report.made,
         "made_line": f"{report.made.date} · {_counted(report.findings)}",
         "findings": [
