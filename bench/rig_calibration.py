@@ -1,0 +1,201 @@
+"""How good calibrated rigs are, and whether they know it: campaigns with truth, calibrated, then measured with.
+
+    python -m bench.rig_calibration [campaigns] [first seed]
+
+Each campaign is drawn anew (mounting, lens calibrations, survey, stand, spots), calibrated by the joint adjustment, and
+a new recording of the true rig is processed with the result: one frame at each of some poses. Printed: errors of
+attitude and position, their NEES (normalised error squared, 1 per number where the covariance is honest), and how often
+parameters lie within one sigma.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from calibration.beams import Stand
+from calibration.joint import Joint
+from calibration.network import Dots, Network, Sightings
+from calibration.rig_stacks import prior_of, stacks_of
+from calibration.rig_steps import RigSteps, calibrate_in_steps
+from calibration.screens import ScreenSetup
+from geometry.arrays import Array
+from geometry.calibration_spread import CalibrationSpread
+from geometry.pose import Pose
+from geometry.rig import Rig
+from geometry.rig_parameters import RigCovariance
+from geometry.solve import fit_pose
+from geometry.spots import SpotModel
+from lab.simulate.calibration_campaign import Campaign, Quality, draw_campaign, spots_at
+
+POSES_PER_CAMPAIGN = 5  # of the new recording; they share the calibration's errors
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """One campaign and what its calibration made of it."""
+
+    seed: int
+    errors: Array  # (k, 6): [dt (m, world), dtheta (rad, body)] of the poses measured with it
+    nees: Array  # (k,): e^T C^-1 e / 6
+    noise_nees: Array  # (k,): the same with the noise's covariance alone, as if the calibration were exact
+    normalised: dict[str, float]  # error of each rig parameter that is determined by more than a definition, in sigmas
+    joint_nees: float  # of all of the rig's independent errors together, per number
+    scales: dict[str, float]
+    seconds: float
+
+
+def as_measured(c: Campaign) -> tuple[Network, list[ScreenSetup], Stand]:
+    """What a campaign hands to a calibration, as arrays: without the way over files."""
+    rig = replace(
+        c.nominal,
+        cameras={
+            n: replace(d.camera, camera_from_world=c.nominal.cameras[n].camera_from_world) for n, d in c.lenses.items()
+        },
+    )
+    names = tuple(f"cameras.{n}.{p}" for n, d in c.lenses.items() for p in d.names)
+    prior, free = prior_of(rig, RigCovariance(names, block_diag(*(d.covariance for d in c.lenses.values()))))
+    survey = np.broadcast_to(np.eye(3) * c.quality.survey_m**2, (len(c.dot_names), 3, 3))
+    network = Network(
+        rig,
+        Dots(c.dot_names, c.dots_surveyed, survey, c.dot_screen),
+        Sightings(c.seen_camera, c.seen_dot, c.seen_pixels, np.full(len(c.seen_dot), c.quality.dot_px)),
+        lens_priors=() if prior is None else (prior,),
+        lens_free=free["intrinsics"],
+    )
+    known = c.quality.place_known
+    stand = Stand(
+        c.stand_recorded, c.record_sigmas, c.stand_surveyed if known else None, c.place_covariance if known else None
+    )
+    return network, [ScreenSetup() for _ in rig.screens], stand
+
+
+def calibrated(c: Campaign) -> RigSteps:
+    """The campaign's rig by the joint adjustment."""
+    network, setups, stand = as_measured(c)
+    return calibrate_in_steps(network, setups, c.spots, stand)
+
+
+def trial(seed: int, rig: str = "fan", quality: Quality | None = None) -> Trial:
+    """Draw, calibrate, measure with it."""
+    c = draw_campaign(seed, rig, quality)
+    start = time.perf_counter()
+    joint = calibrated(c).joint
+    seconds = time.perf_counter() - start
+    rng = np.random.default_rng([seed, 99])
+    turns = np.deg2rad(rng.uniform(-15, 15, (POSES_PER_CAMPAIGN, 3)))
+    poses = Pose.from_ypr(turns, rng.uniform(-0.15, 0.15, (POSES_PER_CAMPAIGN, 3)))
+    errors, nees, alone = measured_with(joint.rig, joint.covariance, c.truth, poses, c.quality.spot_px, rng)
+    normalised, joint_nees = parameter_errors(joint, c.truth)
+    return Trial(seed, errors, nees, alone, normalised, joint_nees, dict(joint.scales), seconds)
+
+
+def measured_with(
+    rig: Rig, covariance: RigCovariance, truth: Rig, poses: Pose, spot_px: float, rng: np.random.Generator
+) -> tuple[Array, Array, Array]:
+    """Errors (k, 6) of poses measured with a calibrated rig, NEES/6 (k,), and NEES/6 by the noise alone (k,)."""
+    model = SpotModel.of(rig)
+    spread = CalibrationSpread(rig, model, covariance)
+    spots = spots_at(truth, poses, spot_px, rng)
+    errors, nees, alone = [], [], []
+    for k in range(len(poses.translation)):
+        here = spots.pick(spots.position == k)
+        fit = fit_pose(model, here.view, here.pixels, here.covariance, poses[k], calibration=spread)
+        if fit is None or not fit.observable:
+            continue
+        e = poses[k].minus(fit.world_from_body)
+        errors.append(e)
+        nees.append(e @ np.linalg.solve(fit.covariance, e) / 6)
+        alone.append(e @ np.linalg.solve(fit.noise, e) / 6)
+    return np.array(errors), np.array(nees), np.array(alone)
+
+
+def parameter_errors(joint: Joint, truth: Rig) -> tuple[dict[str, float], float]:
+    """Errors of the rig's numbers in sigmas, by name; and NEES of all independent ones together, per number.
+
+    A screen's axes within its plane are a choice, and so is the point of a beam along it: the truth is described with
+    the same choice before it is compared.
+    """
+    same = _described_alike(truth, joint.rig)
+    true, found = stacks_of(same), joint.values
+    at = joint.rig_at
+    error = np.concatenate([true[s].minus(found[s])[i] for s, i in at])
+    rows = joint.unknowns.of_several(at)
+    C = joint.all_covariance[np.ix_(rows, rows)]
+    names = [f"{s}.{i}.{k}" for s, i in at for k in range(found[s].dof)]
+    sigma = np.sqrt(np.diagonal(C))
+    gauge = np.array([n.split(".")[0] == "screens" and s < 3e-6 for n, s in zip(names, sigma, strict=True)])
+    real = (sigma > 0) & ~gauge
+    normalised = {n: float(e / s) for n, e, s, r in zip(names, error, sigma, real, strict=True) if r}
+    free = sigma > 0
+    scaled = C[np.ix_(free, free)] / np.outer(sigma[free], sigma[free])
+    e = error[free] / sigma[free]
+    return normalised, float(e @ np.linalg.solve(scaled, e) / np.sum(real))
+
+
+def _described_alike(truth: Rig, found: Rig) -> Rig:
+    """The true rig with its screens' axes laid where the found ones are."""
+    screens = {}
+    for name, s in truth.screens.items():
+        now = found.screens[name].world_from_screen
+        normal = s.world_from_screen.rotation[:, 2]
+        # The found origin moved along the true normal into the true plane, the found axes turned into it.
+        origin = now.translation + normal * (normal @ (s.world_from_screen.translation - now.translation))
+        z = normal if normal @ now.rotation[:, 2] > 0 else -normal
+        x = now.rotation[:, 0] - (now.rotation[:, 0] @ z) * z
+        x = x / np.linalg.norm(x)
+        screens[name] = replace(s, world_from_screen=Pose(np.stack([x, np.cross(z, x), z], axis=1), origin))
+    return replace(truth, screens=screens)
+
+
+def bench_figures(seeds: Iterable[int], rig: str = "fan", quality: Quality | None = None) -> dict[str, float]:
+    """The figures of issue 3 over some campaigns."""
+    return figures([trial(s, rig, quality) for s in seeds])
+
+
+def figures(trials: Sequence[Trial]) -> dict[str, float]:
+    """What some trials say together."""
+    errors = np.concatenate([t.errors for t in trials])
+    inside = np.array([abs(v) <= 1 for t in trials for v in t.normalised.values()])
+    per_axis = np.sqrt(np.mean(errors**2, axis=0))
+    return {
+        "campaigns": float(len(trials)),
+        "attitude_rms_deg": float(np.rad2deg(np.sqrt(np.mean(errors[:, 3:] ** 2)))),
+        "attitude_worst_axis_rms_deg": float(np.rad2deg(per_axis[3:].max())),
+        "position_rms_mm": float(1e3 * np.sqrt(np.mean(errors[:, :3] ** 2))),
+        "position_worst_axis_rms_mm": float(1e3 * per_axis[:3].max()),
+        "nees_per_number": float(np.mean([t.nees.mean() for t in trials])),
+        "nees_noise_alone": float(np.mean([t.noise_nees.mean() for t in trials])),
+        "joint_nees_per_number": float(np.mean([t.joint_nees for t in trials])),
+        "coverage_percent": float(100 * inside.mean()),
+        "rescaled_campaigns": float(sum(bool(t.scales) for t in trials)),
+        "seconds_per_calibration": float(np.mean([t.seconds for t in trials])),
+    }
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Print the figures."""
+    count = int(arguments[0]) if arguments else 10
+    first = int(arguments[1]) if len(arguments) > 1 else 0
+    trials = []
+    for seed in range(first, first + count):
+        trials.append(trial(seed))
+        t = trials[-1]
+        deg, mm = np.rad2deg(np.sqrt(np.mean(t.errors[:, 3:] ** 2))), 1e3 * np.sqrt(np.mean(t.errors[:, :3] ** 2))
+        print(
+            f"seed {seed:4d}: {deg:.4f} deg, {mm:.3f} mm, NEES/6 {t.nees.mean():.2f}"
+            f" ({t.noise_nees.mean():.2f} by noise alone),"
+            f" joint {t.joint_nees:.2f}, {t.seconds:.1f} s {t.scales or ''}",
+            flush=True,
+        )
+    for name, value in figures(trials).items():
+        print(f"{name:32s} {value:.4g}")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,45 @@
+"""A whole rig from its measurements: the single steps one after the other, then the joint adjustment from there."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from calibration.beams import BeamCalibration, Stand, calibrate_beams
+from calibration.joint import Joint, Measured, calibrate_jointly
+from calibration.network import Network
+from calibration.rig_stacks import BEAMS, POSES, STAND
+from calibration.screens import Near, ScreenSetup, ScreensResult, calibrate
+from calibration.spot_term import SpotPixels
+
+
+@dataclass(frozen=True, slots=True)
+class RigSteps:
+    """What each step found."""
+
+    screens: ScreensResult  # lenses, cameras, screens, dots and boards: all but the spots
+    beams: BeamCalibration  # the spots, with what the first step knew
+    measured: Measured
+    joint: Joint  # everything at once
+
+
+def calibrate_in_steps(
+    network: Network,
+    setups: Sequence[ScreenSetup],
+    spots: SpotPixels,
+    stand: Stand,
+    near: Mapping[int, Near] | None = None,
+    held_screen: int | None = None,
+    *,
+    nominal: bool = True,
+) -> RigSteps:
+    """Screens, beams, then all together.
+
+    The network's rig holds the lenses, nominal beams and the spots. setups, near, held_screen: as in
+    calibration/screens.py; nominal: as in calibration/beams.py. Raises what these raise: AdjustmentError, ValueError.
+    """
+    screens = calibrate(network, setups, near, held_screen)
+    beams = calibrate_beams(screens.fit.rig, spots, stand, screens.fit.covariance, nominal=nominal)
+    found = beams.fit.adjusted.values
+    measured = Measured(screens.network, screens.fit, spots, stand, {n: found[n] for n in (BEAMS, STAND, POSES)})
+    return RigSteps(screens, beams, measured, calibrate_jointly(measured))

@@ -1,0 +1,281 @@
+"""A calibration campaign with truth: a rig as it was really mounted, and everything that a lab would measure of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calibration.adjustment import solve
+from calibration.corners import single_camera
+from calibration.spot_term import SpotPixels
+from calibration.stacks import Poses, Stack, Vectors
+from geometry.arrays import Array, Bools, Ints
+from geometry.camera import FISHEYE, Camera, in_picture, pinhole_numbers
+from geometry.lens import padded
+from geometry.pose import Pose
+from geometry.rig import Beam, Rig, Screen
+from geometry.rig_parameters import PINHOLE, distortion_names
+from geometry.spots import SpotModel
+from lab.errors import InputError
+from lab.simulate.rigs import RIGS
+from lab.yaml_text import did_you_mean
+
+# One stream of random numbers per subject, so that more dots do not change the stand's positions.
+_MOUNTING, _LENSES, _DOTS, _PIXELS, _STAND, _SPOTS, _WRONG = range(7)
+_EDGE_PX = 12.0  # a spot or dot nearer to the picture's edge is not taken
+
+
+@dataclass(frozen=True, slots=True)
+class Quality:
+    """How rough the mounting is and how good the measurements are; sigmas, per coordinate."""
+
+    camera_m: float = 0.004  # mounting: how far cameras stand from the drawing ...
+    camera_deg: float = 0.3
+    screen_m: float = 0.004
+    screen_deg: float = 0.2
+    beam_deg: float = 0.3
+    beam_m: float = 0.003
+    focal_px: float = 8.0  # lenses: how far they are from the data sheet
+    centre_px: float = 5.0
+    bow_per_m: float = 0.0  # how bent screens are
+    lens_corner_px: float = 0.08  # of a board corner, in the lens calibration that came before
+    dots: tuple[int, int] = (6, 5)  # surveyed dots per screen: columns, rows; those that no camera sees are left out
+    survey_m: float = 0.0003  # total station on good targets
+    dot_px: float = 0.07  # of a dot's centre in the picture
+    positions: int = 40  # of the stand
+    turn_deg: float = 25.0  # it turns by up to this about each axis ...
+    shift_m: float = 0.2  # ... and shifts by up to this along each
+    stand_m: float = 2e-5  # its own error, per position
+    stand_deg: float = 0.002
+    place_known: bool = False  # whether the survey measured the stand's place
+    place_m: float = 0.0003
+    place_deg: float = 0.01
+    spot_px: float = 0.054  # 0.2 mm on the screen, 4.4 m from a camera of 1180 px focal length
+    wrong: float = 0.0  # share of dots' pixels and of spots that are far off
+
+
+@dataclass(frozen=True, slots=True)
+class LensDraw:
+    """What a lens calibration would have said of one camera."""
+
+    camera: Camera  # its lens numbers; the pose is not used
+    names: tuple[str, ...]
+    covariance: Array  # (p, p)
+
+
+@dataclass(frozen=True, slots=True)
+class Campaign:
+    """The truth and everything measured."""
+
+    name: str
+    seed: int
+    quality: Quality
+    nominal: Rig  # as drawn
+    truth: Rig  # as mounted
+    lenses: dict[str, LensDraw]
+    dot_names: tuple[str, ...]  # n dots
+    dot_screen: Ints  # (n,): index into the screens
+    dots_true: Array  # (n, 3), m, world
+    dots_surveyed: Array  # (n, 3)
+    seen_camera: Ints  # (k,)
+    seen_dot: Ints  # (k,)
+    seen_pixels: Array  # (k, 2)
+    world_from_stand: Pose  # truth
+    stand_surveyed: Pose  # what the survey says of it
+    stand_from_body: Pose  # (p,) truth
+    stand_recorded: Pose  # (p,) what the stand says
+    spots: SpotPixels
+    wrong_dots: Bools  # (k,): pixels that were put far off
+    wrong_spots: Bools  # (n spots,)
+
+    @property
+    def record_sigmas(self) -> Array:
+        """(6,): m, rad of each recorded position."""
+        return np.repeat([self.quality.stand_m, np.deg2rad(self.quality.stand_deg)], 3)
+
+    @property
+    def place_covariance(self) -> Array:
+        """(6, 6) of stand_surveyed."""
+        return np.diag(np.repeat([self.quality.place_m, np.deg2rad(self.quality.place_deg)], 3) ** 2)
+
+
+def draw_campaign(seed: int, rig: str | Rig = "fan", quality: Quality | None = None) -> Campaign:
+    """Everything that happens in one campaign, from a seed.
+
+    rig: a name of RIGS, or a rig. Raises InputError for other names.
+    """
+    q = Quality() if quality is None else quality
+    if isinstance(rig, str) and rig not in RIGS:
+        raise InputError(f"rig: expected a rig's name, got {rig!r}{did_you_mean(rig, RIGS)}")
+    nominal = RIGS[rig]() if isinstance(rig, str) else rig
+    truth = as_mounted(nominal, q, np.random.default_rng([seed, _MOUNTING]))
+    lenses = {
+        n: _lens(c, q, np.random.default_rng([seed, _LENSES, i])) for i, (n, c) in enumerate(truth.cameras.items())
+    }
+    names, of_screen, dots = _dots(truth, q)
+    rng = np.random.default_rng([seed, _DOTS])
+    surveyed = dots + rng.normal(0, q.survey_m, dots.shape)
+    camera, dot, pixels = _sightings(truth, of_screen, dots)
+    pixels = pixels + np.random.default_rng([seed, _PIXELS]).normal(0, q.dot_px, pixels.shape)
+    rng = np.random.default_rng([seed, _STAND])
+    world_from_stand = Pose.from_ypr(np.deg2rad(rng.normal(0, 2.0, 3)), rng.normal(0, 0.03, 3))
+    turns = rng.uniform(-1, 1, (q.positions, 3)) * np.deg2rad(q.turn_deg)
+    stand_from_body = Pose.from_ypr(turns, rng.uniform(-q.shift_m, q.shift_m, (q.positions, 3)))
+    sigmas = np.repeat([q.stand_m, np.deg2rad(q.stand_deg)], 3)
+    recorded = stand_from_body.plus(rng.normal(size=(q.positions, 6)) * sigmas)
+    place = np.repeat([q.place_m, np.deg2rad(q.place_deg)], 3)
+    stand_surveyed = world_from_stand.plus(rng.normal(size=6) * place)
+    spots = spots_at(truth, world_from_stand @ stand_from_body, q.spot_px, np.random.default_rng([seed, _SPOTS]))
+    rng = np.random.default_rng([seed, _WRONG])
+    wrong_dots, pixels = _some_wrong(pixels, q.wrong, rng)
+    wrong_spots, spot_pixels = _some_wrong(spots.pixels, q.wrong, rng)
+    return Campaign(
+        name=rig if isinstance(rig, str) else "rig",
+        seed=seed,
+        quality=q,
+        nominal=nominal,
+        truth=truth,
+        lenses=lenses,
+        dot_names=names,
+        dot_screen=of_screen,
+        dots_true=dots,
+        dots_surveyed=surveyed,
+        seen_camera=camera,
+        seen_dot=dot,
+        seen_pixels=pixels,
+        world_from_stand=world_from_stand,
+        stand_surveyed=stand_surveyed,
+        stand_from_body=stand_from_body,
+        stand_recorded=recorded,
+        spots=replace(spots, pixels=spot_pixels),
+        wrong_dots=wrong_dots,
+        wrong_spots=wrong_spots,
+    )
+
+
+def as_mounted(nominal: Rig, q: Quality, rng: np.random.Generator) -> Rig:
+    """The rig as it would really stand: every pose, lens, beam and screen a little off the drawing."""
+
+    def off(m: float, deg: float) -> Array:
+        return rng.normal(size=6) * np.repeat([m, np.deg2rad(deg)], 3)
+
+    cameras, screens, beams = {}, {}, {}
+    for name, c in nominal.cameras.items():
+        # Errors of the body's place and attitude, not of camera_from_world, whose lever arm would be metres long.
+        stands = c.camera_from_world.inverse().plus(off(q.camera_m, q.camera_deg))
+        focal, dx, dy = rng.normal(0, [q.focal_px, q.centre_px, q.centre_px])
+        matrix = c.matrix + np.array([[focal, 0, dx], [0, focal * (1 + 1e-4 * rng.normal()), dy], [0, 0, 0]])
+        distortion = tuple((np.array(c.distortion) * (1 + 0.03 * rng.normal(size=len(c.distortion)))).tolist())
+        cameras[name] = replace(c, matrix=matrix, distortion=distortion, camera_from_world=stands.inverse())
+    for name, s in nominal.screens.items():
+        a, b, c2 = (np.array(s.bow) + rng.normal(0, 1, 3) * q.bow_per_m).tolist()
+        pose = s.world_from_screen.plus(off(q.screen_m, q.screen_deg))
+        screens[name] = Screen(name, pose, s.size_m, (a, b, c2))
+    for name, beam in nominal.beams.items():
+        turn, shift = rng.normal(0, np.deg2rad(q.beam_deg), 3), rng.normal(0, q.beam_m, 3)
+        beams[name] = Beam(name, beam.direction + turn, beam.point + shift)
+    return Rig(screens, cameras, beams, nominal.spots)
+
+
+def spots_at(rig: Rig, world_from_body: Pose, sigma_px: float, rng: np.random.Generator) -> SpotPixels:
+    """The spots in the pictures at poses (p,), with noise. The noise is drawn for all views, seen or not."""
+    model = SpotModel.of(rig)
+    pixels, _ = model.project(world_from_body)
+    noise = rng.normal(0, sigma_px, pixels.shape)
+    position, view = np.nonzero(model.in_picture(pixels, -_EDGE_PX))
+    covariance = np.broadcast_to(np.eye(2) * sigma_px**2, (len(position), 2, 2)).copy()
+    return SpotPixels(position, view, (pixels + noise)[position, view], covariance)
+
+
+def board_poses(count: int, seed: int = 5) -> Pose:
+    """camera_from_board (count,) of a board of 0.4 m x 0.3 m held before a camera: all over the picture, tilted."""
+    rng = np.random.default_rng(seed)
+    turns = np.deg2rad(rng.uniform([-20, -35, -35], [20, 35, 35], (count, 3)))
+    z = rng.uniform(0.9, 1.6, count)
+    middle = np.stack([rng.uniform(-0.42, 0.42, count) * z, rng.uniform(-0.33, 0.33, count) * z, z], axis=-1)
+    poses = Pose.from_ypr(turns, middle)
+    return Pose(poses.rotation, middle - poses.turn(np.array([0.2, 0.15, 0.0])))
+
+
+def lens_covariance(camera: Camera, corner_px: float, views: int = 30) -> Array:
+    """What a lens calibration of so many board photographs would know: (p, p), fx, fy, cx, cy and the distortion."""
+    x, y = np.meshgrid(np.linspace(0, 0.4, 9), np.linspace(0, 0.3, 7))
+    board = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=-1)
+    poses = board_poses(views)
+    alone = replace(camera, camera_from_world=Pose.identity())
+    points = np.tile(board, (views, 1))
+    placement = np.repeat(np.arange(views), len(board))
+    pixels = alone.project(poses[placement].apply(points))
+    seen = in_picture(pixels, np.array([camera.image_size_px], dtype=float), -3.0)
+    term = single_camera(
+        pixels[seen], points[seen], board.mean(axis=0), placement[seen], corner_px, camera.lens == FISHEYE
+    )
+    numbers = np.concatenate([pinhole_numbers(camera), padded(camera.distortion)])
+    values: dict[str, Stack] = {
+        "intrinsics": Vectors(numbers[None]),
+        "cameras": Poses.of([Pose.identity()]),
+        "boards": Poses(poses),
+        "warp": Vectors(np.zeros((1, 3))),
+    }
+    used = 4 + len(camera.distortion)
+    free: dict[str, bool | Bools] = {"intrinsics": np.arange(18)[None] < used, "boards": True}
+    return solve(values, [term], free).covariance([("intrinsics", 0)])[:used, :used]
+
+
+def _lens(true: Camera, q: Quality, rng: np.random.Generator) -> LensDraw:
+    C = lens_covariance(true, q.lens_corner_px)
+    fx, fy, cx, cy, *distortion = np.concatenate([pinhole_numbers(true), true.distortion]) + (
+        np.linalg.cholesky(C) @ rng.normal(size=len(C))
+    )
+    matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    drawn = replace(true, matrix=matrix, distortion=tuple(float(d) for d in distortion))
+    return LensDraw(drawn, (*PINHOLE, *distortion_names(true)), C)
+
+
+def _dots(rig: Rig, q: Quality) -> tuple[tuple[str, ...], Ints, Array]:
+    """Names, screens and true places of the dots that some camera sees."""
+    names, of_screen, xyz = [], [], []
+    columns, rows = q.dots
+    for k, screen in enumerate(rig.screens.values()):
+        half = np.array([2.2, 1.7]) if screen.size_m is None else np.minimum(np.array(screen.size_m) * 0.45, [2.2, 1.7])
+        x, y = np.meshgrid(np.linspace(-half[0], half[0], columns), np.linspace(-half[1], half[1], rows))
+        a, b, c = screen.bow
+        on_screen = np.stack([x, y, a * x * x + b * x * y + c * y * y], axis=-1).reshape(-1, 3)
+        world = screen.world_from_screen.apply(on_screen)
+        seen = np.zeros(len(world), dtype=bool)
+        for camera in rig.cameras.values():
+            if camera.screen == screen.name:
+                seen |= _in(camera, camera.project(world))
+        for i in np.flatnonzero(seen):
+            names.append(f"{screen.name}-{i + 1:02d}")
+            of_screen.append(k)
+            xyz.append(world[i])
+    return tuple(names), np.array(of_screen, dtype=np.int64), np.array(xyz)
+
+
+def _sightings(rig: Rig, of_screen: Ints, dots: Array) -> tuple[Ints, Ints, Array]:
+    """Which camera sees which dot, and where: only dots of the screen that it observes."""
+    camera_of, dot_of, pixels = [], [], []
+    screens = list(rig.screens)
+    for c, camera in enumerate(rig.cameras.values()):
+        uv = camera.project(dots)
+        for d in np.flatnonzero(_in(camera, uv) & (of_screen == screens.index(camera.screen))):
+            camera_of.append(c)
+            dot_of.append(int(d))
+            pixels.append(uv[d])
+    return np.array(camera_of, dtype=np.int64), np.array(dot_of, dtype=np.int64), np.array(pixels).reshape(-1, 2)
+
+
+def _in(camera: Camera, pixels: Array) -> Bools:
+    size = np.array([camera.image_size_px], dtype=float)
+    inside: Bools = in_picture(pixels, size, -_EDGE_PX)
+    return inside
+
+
+def _some_wrong(pixels: Array, share: float, rng: np.random.Generator) -> tuple[Bools, Array]:
+    """Some of the pixels put 4 to 40 px off."""
+    wrong = rng.uniform(size=len(pixels)) < share
+    angle, far = rng.uniform(0, 2 * np.pi, len(pixels)), rng.uniform(4, 40, len(pixels))
+    off = far[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    return wrong, pixels + wrong[:, None] * off

@@ -1,0 +1,181 @@
+"""A simulated calibration campaign as a folder: all that `beampose calibrate rig` reads, and the truth beside it."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+
+from calibration import boards
+from geometry.arrays import Array
+from geometry.pose import Pose
+from lab import columns
+from lab.calibrate.camera_file import CameraCalibration, CameraFile, save_camera
+from lab.calibrate.point_files import POINTS, POSE_SIGMAS, SURVEY, SURVEY_SIGMAS
+from lab.calibrate.project import SCHEMA
+from lab.camera_block import Covariance
+from lab.errors import InputError
+from lab.rig_file import RigFile, as_mapping, pose_mapping, save_rig
+from lab.simulate.board_photo import Look, photograph
+from lab.simulate.calibration_campaign import Campaign, LensDraw, Quality, board_poses, draw_campaign
+from lab.whole_folder import whole_folder
+from lab.yaml_text import write_mapping
+
+PROJECT = "calibration.yaml"
+BOARD = "chessboard:10x8:40mm"
+PHOTOS = 24  # per camera
+_PHOTO_POSES = 11  # seed of the board's places: not those that the lens covariance is made with
+_DATE = "2026-01-15"  # of the lens calibrations; a fixed day, so that the same seed gives the same bytes
+
+
+def simulate_calibration(
+    out: Path,
+    *,
+    seed: int = 0,
+    rig: str = "fan",
+    positions: int = 40,
+    wrong: float = 0.0,
+    photos: bool = False,
+    quality: Quality | None = None,
+) -> Path:
+    """Write a whole calibration campaign into a new folder; returns the folder, complete.
+
+    calibration.yaml, a camera.yaml per camera, survey.csv, points.csv, poses.csv, spots.csv, and truth/: rig.yaml (as
+    mounted), poses.csv (world_from_body at the positions). The same arguments give the same bytes.
+
+    rig: a name of RIGS. positions: of the stand. wrong: share of dots' pixels and of spots that are far off. photos:
+    board photographs of each camera too, for `beampose calibrate camera`. quality: sigmas of mounting and measurement.
+    Raises InputError where an argument does not fit, or the folder exists.
+    """
+    if not 0 <= wrong < 0.3:
+        raise InputError(f"wrong: expected a share from 0 up to 0.3, got {wrong:g}")
+    if positions < 3:
+        raise InputError(f"positions: expected 3 or more, got {positions}")
+    q = replace(Quality() if quality is None else quality, positions=positions, wrong=wrong)
+    campaign = draw_campaign(seed, rig, q)
+    with whole_folder(Path(out), lambda _: False) as folder:
+        write_campaign(campaign, folder)
+        if photos:
+            _write_photos(campaign, folder)
+    return Path(out)
+
+
+def write_campaign(c: Campaign, folder: Path) -> None:
+    """The files of a campaign, into an existing folder."""
+    for name, lens in c.lenses.items():
+        save_camera(_camera_file(name, lens), folder / f"camera-{name}.yaml")
+    screens = list(c.truth.screens)
+    survey = [
+        (name, *_metres(xyz), *[_short(c.quality.survey_m)] * 3, screens[k])
+        for name, xyz, k in zip(c.dot_names, c.dots_surveyed, c.dot_screen, strict=True)
+    ]
+    _table(folder / "survey.csv", (*SURVEY, *SURVEY_SIGMAS, "screen"), survey)
+    cameras = list(c.truth.cameras)
+    points = [
+        (cameras[k], c.dot_names[d], *_pixels(uv), _short(c.quality.dot_px))
+        for k, d, uv in zip(c.seen_camera, c.seen_dot, c.seen_pixels, strict=True)
+    ]
+    _table(folder / "points.csv", (*POINTS, "sigma_px"), points)
+    sigmas = [*[_short(c.quality.stand_m)] * 3, *[_short(c.quality.stand_deg)] * 3]
+    _table(
+        folder / "poses.csv",
+        (*columns.TRUTH_POSE, *POSE_SIGMAS),
+        [(*row, *sigmas) for row in _pose_rows(c.stand_recorded)],
+    )
+    views = c.truth.views()
+    spots = [
+        (k, *views[v], *_pixels(uv), _short(c.quality.spot_px))
+        for k, v, uv in zip(c.spots.position, c.spots.view, c.spots.pixels, strict=True)
+    ]
+    _table(folder / "spots.csv", ("frame", "camera", "spot", "u_px", "v_px", "sigma_px"), spots)
+    (folder / "truth").mkdir()
+    save_rig(c.truth, folder / "truth" / "rig.yaml")
+    in_world = c.world_from_stand @ c.stand_from_body
+    _table(folder / "truth" / "poses.csv", columns.TRUTH_POSE, _pose_rows(in_world))
+    write_mapping(_project(c), folder / PROJECT)
+
+
+def _project(c: Campaign) -> dict[str, Any]:
+    out: dict[str, Any] = {
+        "schema": SCHEMA,
+        "name": f"{c.name}-{c.seed}",
+        "valid_days": 365,
+        "cameras": {
+            n: {
+                "intrinsics": f"camera-{n}.yaml",
+                "screen": cam.screen,
+                "near_m": _rounded(c.nominal.cameras[n].camera_from_world.inverse().translation),
+            }
+            for n, cam in c.truth.cameras.items()
+        },
+        "screens": {n: {} if s.size_m is None else {"size_m": list(s.size_m)} for n, s in c.truth.screens.items()},
+        "survey": "survey.csv",
+        "points": "points.csv",
+        "target": as_mapping(RigFile(c.nominal))["target"],
+    }
+    stand: dict[str, Any] = {}
+    if c.quality.place_known:
+        stand |= {
+            "world_from_stand": pose_mapping(c.stand_surveyed),
+            "sigma_m": c.quality.place_m,
+            "sigma_deg": c.quality.place_deg,
+        }
+    out["stand"] = stand | {"pose_sigma_m": c.quality.stand_m, "pose_sigma_deg": c.quality.stand_deg}
+    out["recordings"] = [{"spots": "spots.csv", "poses": "poses.csv"}]
+    out["notes"] = f"simulated: seed {c.seed}; the truth is in truth/"
+    return out
+
+
+def _camera_file(name: str, lens: LensDraw) -> CameraFile:
+    c = lens.camera
+    covariance = Covariance(lens.names, lens.covariance)
+    state = CameraCalibration(date=_DATE, verdict="PASS", notes="simulated")
+    return CameraFile(name, c.image_size_px, c.matrix, c.distortion, c.lens, covariance, state)
+
+
+def _write_photos(c: Campaign, folder: Path) -> None:
+    """Pictures of a board before each camera, and the board's name in a file beside them."""
+    board = boards.parse(BOARD)
+    (folder / "board.txt").write_text(f"{BOARD}\n", encoding="utf-8")
+    for i, (name, camera) in enumerate(c.truth.cameras.items()):
+        (folder / "photos" / name).mkdir(parents=True)
+        alone = replace(camera, camera_from_world=Pose.identity())
+        poses = board_poses(PHOTOS, seed=_PHOTO_POSES + i)
+        for k in range(PHOTOS):
+            photo = photograph(board, alone, poses[k], look=Look(noise_dn=2.0, samples=16), seed=c.seed * 1000 + k)
+            if not cv2.imwrite(str(folder / "photos" / name / f"{k:02d}.png"), photo.image):
+                raise InputError(f"{folder / 'photos' / name}: a photograph cannot be written")
+
+
+def _pose_rows(poses: Pose) -> list[tuple[object, ...]]:
+    return [
+        (k, k, *_metres(t), *(f"{v:.12f}" for v in q))
+        for k, (t, q) in enumerate(zip(poses.translation, poses.quaternion_wxyz, strict=True))
+    ]
+
+
+def _table(path: Path, header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(header)
+        writer.writerows(rows)
+
+
+def _metres(xyz: Array) -> list[str]:
+    return [f"{v:.7f}" for v in xyz]
+
+
+def _pixels(uv: Array) -> list[str]:
+    return [f"{v:.5f}" for v in uv]
+
+
+def _short(value: float) -> str:
+    return f"{value:.9g}"
+
+
+def _rounded(xyz: Array) -> list[float]:
+    return [round(float(v), 3) for v in xyz]
