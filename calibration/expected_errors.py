@@ -8,6 +8,7 @@ cameras err independently. Source: ours; propagation to first order.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +19,7 @@ from geometry.camera import FISHEYE, Camera, Projected, pinhole_numbers, project
 from geometry.lens import padded
 from geometry.planes import meet_plane
 from geometry.rig import Rig, Screen
-from geometry.rig_parameters import DIRECTION, PINHOLE, POINT, POSE, RigCovariance, distortion_names, rig_names
+from geometry.rig_parameters import DIRECTION, PINHOLE, POINT, POSE, RigCovariance, distortion_names, rig_names, split
 
 _FEWEST_DOTS = 4  # below it the resection is not tried: three dots fix a pose four ways
 
@@ -79,6 +80,7 @@ def expected_errors(
                 follow[np.ix_(pose_at, lens_at)] = by_lens
                 groups[CAMERA_POSES][np.ix_(pose_at, pose_at)] = noise
     sigmas = np.sqrt(np.maximum(np.diagonal(sum(groups.values(), np.zeros((p, p)))), 0.0))
+    things = _things(names, groups, follow)
     groups[INTRINSICS] = symmetric(follow @ groups[INTRINSICS] @ follow.T)
     kept = {g: C for g, C in groups.items() if C.any()}
     errors = RigErrors(
@@ -88,8 +90,22 @@ def expected_errors(
         moves=follow * sigmas,
         move_names=names,
         move_sigmas=sigmas,
+        things=things,
     )
     return errors, {g: "rig file" if g in told else "assumed" for g in kept}
+
+
+def _things(names: Sequence[str], groups: dict[str, Array], follow: Array) -> list[tuple[str, str, Array]]:
+    """The groups' covariances cut up by camera, screen and beam; lenses take their cameras' poses along."""
+    owner = np.array([".".join(split(n)[:2]) for n in names])
+    out = []
+    for group, C in groups.items():
+        for thing in dict.fromkeys(owner.tolist()):
+            own = owner == thing
+            part = np.where(own[:, None] & own[None, :], C, 0.0)
+            if part.any():
+                out.append((thing, group, follow @ part @ follow.T if group == INTRINSICS else part))
+    return out
 
 
 def _joint(stated: RigCovariance, at: dict[str, int], p: int) -> Array:

@@ -8,7 +8,7 @@ pose errs by G of whatever the pixels err by. Source: ours; generalised least sq
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -45,6 +45,7 @@ class RigErrors:
     moves: Array  # (p, q) how the numbers move together when one of q errors is one sigma
     move_names: tuple[str, ...]  # (q,)
     move_sigmas: Array  # (q,) in the units of the names
+    things: Sequence[tuple[str, str, Array]]  # `cameras.left`, its group, (p, p): the groups' shares thing by thing
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +60,7 @@ class Budget:
     noise: Array  # (k, 6, 6) from the spots' noise
     groups: Array  # (k, g, 6, 6) from each group alone; what joins groups is in the total only
     effects: Array  # (k, 6, q) what one sigma of each error alone does
+    things: Array  # (k, t, 6, 6) from each thing's errors of one group alone
 
 
 class PoseBudget:
@@ -92,7 +94,8 @@ class PoseBudget:
         total: Array = np.asarray(np.linalg.inv(H), dtype=np.float64)
         G: Array = total @ np.swapaxes(weighted, -1, -2)  # (k, 6, 2n), of pixels in units of sigma_px
         K = G @ S  # (k, 6, p)
-        parts = [K @ C @ np.swapaxes(K, -1, -2) for C in self._errors.groups.values()]
+        parts = _carried(K, list(self._errors.groups.values()))
+        things = _carried(K, [C for _, _, C in self._errors.things])
         blank = np.where(observable, 1.0, np.nan)[:, None, None]
         return Budget(
             pixels=pixels,
@@ -101,9 +104,20 @@ class PoseBudget:
             condition=condition,
             total=symmetric(total) * blank,
             noise=G @ np.swapaxes(G, -1, -2) * blank,
-            groups=(np.stack(parts, axis=1) if parts else np.zeros((k, 0, 6, 6))) * blank[:, None],
+            groups=parts * blank[:, None],
             effects=K @ self._errors.moves * blank,
+            things=things * blank[:, None],
         )
+
+
+def _carried(K: Array, covariances: Sequence[Array]) -> Array:
+    """K C K^T (k, c, 6, 6) of Jacobians (k, 6, p) and covariances (p, p), which are mostly empty."""
+    out = np.zeros((len(K), len(covariances), 6, 6))
+    for i, C in enumerate(covariances):
+        used = np.flatnonzero(C.any(axis=0))
+        part = K[..., used]
+        out[:, i] = part @ C[np.ix_(used, used)] @ np.swapaxes(part, -1, -2)
+    return out
 
 
 def _rank(J: Array) -> tuple[Bools, Array]:

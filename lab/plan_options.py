@@ -12,7 +12,7 @@ from geometry.arrays import Array
 from geometry.pose import Pose
 from lab.errors import InputError
 
-MOST_POSES = 200_000  # 1 GB of derivatives' results and a table of 100 MB
+MOST_POSES = 100_000  # some 300 MB of memory and a table of 70 MB
 
 
 @dataclass(frozen=True, slots=True)
