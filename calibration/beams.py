@@ -37,7 +37,7 @@ class Stand:
     """What is known of the stand that carried the vehicle."""
 
     stand_from_body: Pose  # (P,) as recorded: the carriage, which is the body frame
-    pose_sigmas: Array  # (6,) of each record: m along the stand's axes, rad about the body's; 0: exact, inf: unknown
+    pose_sigmas: Array  # (6,) or (P, 6) of each record: m along the stand's axes, rad about the body's; 0: exact
     world_from_stand: Pose | None  # None: found from the nominal beams
     stand_covariance: Array | None  # (6, 6) of the error of world_from_stand; None: solved for, nothing known
 
@@ -85,12 +85,11 @@ def calibrate_beams(
     elif np.any(stand.stand_covariance):
         others.append(Prior(((STAND, 0),), (Poses.of([start[1]]),), stand.stand_covariance))
         free[STAND] = np.diagonal(stand.stand_covariance)[None] > 0
-    sigmas = np.asarray(stand.pose_sigmas, dtype=float)
+    known = Poses(stand.stand_from_body)
+    sigmas = np.broadcast_to(np.asarray(stand.pose_sigmas, dtype=float), (len(known), 6))
     if np.any(sigmas):
-        known = Poses(stand.stand_from_body)
-        finite = np.where(sigmas > 0, sigmas, np.inf)  # a number that is exact is held fixed, not weighed
-        others.extend(independent(POSES, known, np.broadcast_to(finite, (len(known), 6))))
-        free[POSES] = np.broadcast_to(sigmas > 0, (len(known), 6))
+        others.extend(independent(POSES, known, np.where(sigmas > 0, sigmas, np.inf)))  # exact ones are held fixed
+        free[POSES] = sigmas > 0
     return _finished(start[0], spots, values, others, free, stand, ())
 
 

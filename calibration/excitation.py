@@ -70,7 +70,7 @@ def body_motion(lines: Lines) -> Array:
 
 
 def without_frame(directions: Array, lines: Lines) -> Array:
-    """What is left (m - 6, 4 k) of undetermined directions (m, 4 k) when the motions of the body frame are taken out."""
+    """What is left (m - 6, 4 k) of undetermined directions (m, 4 k) without the motions of the body frame."""
     frame = np.linalg.qr(body_motion(lines))[0]
     rest = directions - directions @ frame @ frame.T
     return np.linalg.svd(rest)[2][: max(len(directions) - 6, 0)]
@@ -99,8 +99,9 @@ def in_words(directions: Array, beam_names: Sequence[str], lines: Lines, world_f
     for direction in directions[~rigid]:
         each = direction[:beams].reshape(-1, 4)
         size = np.linalg.norm(each, axis=1)
-        moved = np.flatnonzero(size > 0.2 * np.max(size))
-        out.append("; ".join(f"beam {beam_names[i]}: {_of_beam(each[i])}" for i in moved))
+        most = 0.2 * float(np.max(size))
+        told = [f"beam {n}: {_of_beam(e)}" for n, e, s in zip(beam_names, each, size, strict=True) if s > most]
+        out.append("; ".join(told))
     return out
 
 

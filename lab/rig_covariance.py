@@ -9,7 +9,7 @@ import numpy as np
 
 from geometry.arrays import Array, symmetric
 from geometry.rig import Rig
-from geometry.rig_parameters import RigCovariance, is_known
+from geometry.rig_parameters import RigCovariance, is_known, split
 from lab.camera_block import Covariance
 from lab.errors import InputError
 
@@ -61,3 +61,18 @@ def _refuse_what_is_none(matrix: Array, where: str) -> None:
         raise InputError(f"{where}.matrix: expected a symmetric matrix; its halves differ")
     if np.linalg.eigvalsh(symmetric(scaled))[0] < -_TOLERANCE * len(matrix):
         raise InputError(f"{where}.matrix: expected a covariance, got a matrix with a negative eigenvalue")
+
+
+def blocks_of(covariance: RigCovariance) -> dict[str, Covariance]:
+    """A joint covariance as the blocks of a rig.yaml: whole in the target's, an excerpt for each camera and screen."""
+    out: dict[str, Covariance] = {}
+    of: dict[str, list[int]] = {}
+    for i, name in enumerate(covariance.names):
+        kind, thing, _ = split(name)
+        if kind in ("cameras", "screens"):
+            of.setdefault(f"{kind}.{thing}", []).append(i)
+    for where, rows in of.items():
+        names = tuple(split(covariance.names[i])[2] for i in rows)
+        out[where] = Covariance(names, symmetric(covariance.matrix[np.ix_(rows, rows)]))
+    out[TARGET] = Covariance(covariance.names, symmetric(covariance.matrix))
+    return out

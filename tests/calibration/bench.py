@@ -74,5 +74,8 @@ def drawn(rig: Rig, rng: np.random.Generator, turn_rad: float = 0.02, shift_m: f
 
 
 def errors(rig: Rig, found: Rig) -> np.ndarray:
-    """Errors (beams, 4) of the beams found: direction (rad) and point (m), across each."""
-    return lines_in(stacks_of(found)).minus(lines_in(stacks_of(rig)))
+    """Errors (beams, 4) of the beams found: direction (rad) and point (m), across each, in the basis of those found.
+
+    The covariance is in that basis too. Two directions that are nearly the same may have bases a right angle apart.
+    """
+    return -lines_in(stacks_of(rig)).minus(lines_in(stacks_of(found)))

@@ -1,0 +1,177 @@
+"""`beampose calibrate beams`: each laser's own direction and offset, from recordings at positions of a stand."""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from calibration.adjustment import AdjustmentError
+from calibration.beam_findings import ARCSEC, BeamGoals, beam_findings, direction_sigmas
+from calibration.beams import BeamCalibration, Stand, self_calibrate
+from calibration.beams import calibrate_beams as find_beams
+from calibration.findings import Finding, Level, verdict
+from lab.calibrate.beam_tables import BEAMS, write_tables
+from lab.calibrate.project import Project, load_project
+from lab.calibrate.recordings import Recordings, read_recordings
+from lab.calibration_state import CalibrationState
+from lab.errors import CalibrationError, InputError
+from lab.rig_covariance import blocks_of, joint_covariance
+from lab.rig_file import RigFile, load_rig_file, save_rig
+from lab.whole_folder import whole_folder
+from lab.yaml_text import did_you_mean
+
+RIG = "rig.yaml"
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """How a calibration of beams ended."""
+
+    name: str
+    out: Path
+    level: Level
+    findings: tuple[Finding, ...]
+    calibration: BeamCalibration
+    rig: Path | None  # the rig.yaml written; None where the verdict is FAIL
+
+    @property
+    def exit_status(self) -> int:
+        """0, or 3 where the calibration must not be used."""
+        return CalibrationError.exit_status if self.level == Level.FAIL else 0
+
+    def line(self) -> str:
+        """One line for the terminal."""
+        c = self.calibration
+        sigma = float(np.sqrt(np.mean(direction_sigmas(c) ** 2))) / ARCSEC
+        worst = max(self.findings, key=lambda f: f.level)
+        what = f"{len(c.lines)} beams from {len(c.world_from_body.translation)} positions"
+        if not c.undetermined:
+            what += f", directions to {sigma:.2g} arcsec RMS"
+        reason = "" if self.level == Level.PASS else f": {worst.what}"
+        return f"{self.name}: {self.level.name}: {what}{reason} -> {self.out}"
+
+
+def calibrate_beams(
+    project_path: Path, out: Path, rig: Path | None = None, today: datetime.date | None = None
+) -> Outcome:
+    """Calibrate the beams of a project; writes rig.yaml (not where it fails), three tables and report.html into `out`.
+
+    rig: the rig.yaml with cameras and screens as calibrated and their covariances (None: `rig.yaml` beside the
+    project). Its target is replaced by the project's, if that has one. Raises InputError for what is wrong with the
+    files, CalibrationError where the spots give no calibration at all; `out` is then as it was.
+    """
+    project = load_project(Path(project_path))
+    rig_path = Path(rig) if rig is not None else project.path.parent / RIG
+    file = _calibrated_lab(project, rig_path)
+    recordings = read_recordings(project, file.rig)
+    knowledge = joint_covariance(file.rig, file.covariances, rig_path)
+    try:
+        if recordings.stand_from_body is None:
+            found = self_calibrate(file.rig, recordings.spots, len(recordings.names), knowledge)
+        else:
+            found = find_beams(file.rig, recordings.spots, _stand(project, recordings), knowledge)
+    except AdjustmentError as error:
+        raise CalibrationError(f"{project.path}: the beams cannot be calibrated: {error}") from None
+    findings = [
+        *beam_findings(found, file.rig, recordings.names, BeamGoals()),
+        *_findings_of_inputs(project, recordings, knowledge is not None, rig_path),
+    ]
+    level = verdict(findings)
+    day = today or project.date or datetime.date.today()
+    outcome = Outcome(
+        project.name, Path(out), level, tuple(findings), found, None if level == Level.FAIL else Path(out) / RIG
+    )
+    with whole_folder(Path(out), may_replace=lambda folder: (folder / BEAMS).is_file()) as work:
+        write_tables(found, file.rig, recordings.names, work)
+        if level != Level.FAIL:
+            save_rig(_rig_file(file, found, project, findings, day), work / RIG)
+        from lab.calibrate.beams_page import write_page  # the template engine: only for those who write a report
+
+        inputs = [rig_path, *project.inputs]
+        write_page(project.name, found, findings, file.rig, recordings.names, inputs, day, work)
+    return outcome
+
+
+def _calibrated_lab(project: Project, rig_path: Path) -> RigFile:
+    """Cameras and screens as calibrated, with the project's target."""
+    if not rig_path.is_file():
+        raise InputError(
+            f"{rig_path}: expected a rig.yaml with cameras and screens as calibrated, found none; run"
+            f" `beampose calibrate screen {project.path}` first and give its rig.yaml with --rig"
+        )
+    file = load_rig_file(rig_path)
+    for kind, asked, there in (
+        ("camera", project.cameras, file.rig.cameras),
+        ("screen", project.screens, file.rig.screens),
+    ):
+        for name in asked:
+            if name not in there:
+                raise InputError(
+                    f"{rig_path}: expected {kind} {name!r} of {project.path.name}, got {', '.join(there)}"
+                    f"{did_you_mean(name, there)}; calibrate it first (`beampose calibrate screen`)"[:300]
+                )
+    if not project.beams:
+        return file
+    for name, spot in project.spots.items():
+        if spot.screen not in file.rig.screens:
+            raise InputError(
+                f"{project.path}: target.spots.{name}.screen: expected a screen of {rig_path}, got {spot.screen!r}"
+            )
+    return replace(file, rig=replace(file.rig, beams=project.beams, spots=project.spots))
+
+
+def _stand(project: Project, recordings: Recordings) -> Stand:
+    assert recordings.stand_from_body is not None
+    stand = project.stand
+    if stand is None or stand.world_from_stand is None:
+        return Stand(recordings.stand_from_body, recordings.pose_sigmas, None, None)
+    covariance = np.diag([stand.sigma_m**2] * 3 + [stand.sigma_rad**2] * 3)
+    return Stand(recordings.stand_from_body, recordings.pose_sigmas, stand.world_from_stand, covariance)
+
+
+def _findings_of_inputs(
+    project: Project, recordings: Recordings, with_covariance: bool, rig_path: Path
+) -> list[Finding]:
+    out = [Finding(Level.PASS, note) for note in recordings.notes]
+    if not with_covariance:
+        out.append(
+            Finding(
+                Level.WARN,
+                f"{rig_path.name} holds no covariance of cameras and screens: they are taken as exact",
+                "the sigmas of the beams are of the spots' noise alone, too small",
+                "calibrate cameras and screens with beampose, which writes their covariance",
+            )
+        )
+    stand = project.stand
+    placed = recordings.stand_from_body is not None and stand is not None and stand.world_from_stand is not None
+    if placed and stand is not None and stand.sigma_m == stand.sigma_rad == 0:
+        out.append(
+            Finding(
+                Level.WARN,
+                "stand.world_from_stand has no sigma: it is taken as exact",
+                "its error goes into the boresight of all beams unseen",
+                "give stand.sigma_m and stand.sigma_deg, or leave world_from_stand out and let it be found",
+            )
+        )
+    if recordings.stand_from_body is not None and not np.any(recordings.pose_sigmas):
+        out.append(
+            Finding(
+                Level.PASS,
+                "the stand's positions are taken as exact; give stand.pose_sigma_m and pose_sigma_deg where their"
+                " encoders are not much better than the spots",
+            )
+        )
+    return out
+
+
+def _rig_file(
+    file: RigFile, c: BeamCalibration, project: Project, findings: Sequence[Finding], day: datetime.date
+) -> RigFile:
+    until = None if project.valid_days is None else day + datetime.timedelta(days=project.valid_days)
+    reasons = tuple(f.what for f in findings if f.level > Level.PASS)
+    state = CalibrationState(day, verdict(findings).name, until, reasons, project.notes)
+    return RigFile(c.rig, blocks_of(c.covariance), state)
