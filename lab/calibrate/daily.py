@@ -31,7 +31,7 @@ from lab.calibrate.daily_expected import Compared, compare_points, compare_still
 from lab.calibrate.daily_history import HistoryRow, quoted, read_history, write_history
 from lab.calibrate.daily_inputs import read_points, read_still, read_still_pose
 from lab.calibrate.daily_page import write_page
-from lab.calibrate.daily_result import CameraDrift, DailyLimits, OtherChange, Outcome, level_of
+from lab.calibrate.daily_result import CameraDrift, DailyLimits, OtherChange, Outcome, is_weak, level_of
 from lab.calibrate.daily_words import camera_findings, other_findings, state_findings
 from lab.errors import InputError
 from lab.rig_covariance import joint_covariance
@@ -185,7 +185,7 @@ def _camera_drift(
         level = level_of(px, mm, limits)
     if verdicts.unexplained:
         level = max(level, level_of(left_px, left_mm, limits))
-    elif own is None and not detectable * mm_per_px <= limits.weak_mm:
+    elif own is None and is_weak(detectable * mm_per_px, limits):
         level = Level.WARN
     return CameraDrift(
         camera=name,

@@ -110,6 +110,11 @@ def _number(value: float) -> str:
     return "?" if not np.isfinite(value) else f"{value:.2f}"
 
 
+def is_weak(detectable_mm: float, limits: DailyLimits) -> bool:
+    """Whether a check could miss so much that finding nothing proves nothing."""
+    return not detectable_mm <= limits.weak_mm  # so that nan counts as weak
+
+
 def level_of(px: float, mm: float, limits: DailyLimits) -> Level:
     """How grave a significant change of this size is. Where no mm can be told, pixels decide."""
     if np.isfinite(mm):

@@ -9,7 +9,7 @@ import numpy as np
 
 from calibration.drift import ALL_CHANGED, LASER_MOVED, MOVED, TURNED, TURNED_ZOOMED, ZOOMED
 from calibration.findings import Finding, Level
-from lab.calibrate.daily_result import CameraDrift, DailyLimits, OtherChange, level_of
+from lab.calibrate.daily_result import CameraDrift, DailyLimits, OtherChange, is_weak, level_of
 from lab.calibration_state import CalibrationState
 from lab.report.svg import short
 
@@ -118,7 +118,7 @@ def camera_findings(c: CameraDrift, limits: DailyLimits, pose_free: bool) -> lis
         )
     if out:
         return out
-    weak = not c.detectable_mm <= limits.weak_mm
+    weak = is_weak(c.detectable_mm, limits)
     seen = "a common shift of its picture could not have been found"
     if np.isfinite(c.detectable_px):
         seen = f"a shift of {size(c.detectable_px, c.detectable_mm)} would have been found"

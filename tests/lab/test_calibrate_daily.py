@@ -118,6 +118,22 @@ def test_the_calibrations_own_uncertainty_is_no_drift(tmp_path):
     assert any("no covariance" in f.what for f in unknown.findings)
 
 
+def test_a_poor_survey_is_no_drift_as_long_as_it_says_so(tmp_path):
+    rig = scenes.write_rig(tmp_path, RIG, COVARIANCE)
+    pixels, survey = scenes.write_points(tmp_path, TRUE, np.random.default_rng(0))
+    off = np.random.default_rng(1).normal(0, 3e-3, (99, 3))
+    lines = survey.read_text().splitlines()
+    for sigma, alarm in ((1e-4, True), (3e-3, False)):
+        rows = [lines[0]]
+        for i, line in enumerate(lines[1:]):
+            name, x, y, z, *_ = line.split(",")
+            place = np.array([float(x), float(y), float(z)]) + off[i]
+            rows.append(f"{name},{place[0]},{place[1]},{place[2]},{sigma},{sigma},{sigma}")
+        survey.write_text("\n".join(rows))
+        outcome = daily_check(rig, tmp_path / "out", pixels, today=scenes.DAY, survey=survey)
+        assert any("p = " in f.what or f.level == Level.FAIL for f in outcome.findings) == alarm
+
+
 def test_a_camera_without_points_is_said_to_be_unchecked(tmp_path):
     rig = scenes.write_rig(tmp_path, RIG, COVARIANCE)
     pixels, survey = scenes.write_points(tmp_path, TRUE, np.random.default_rng(0))
@@ -182,7 +198,20 @@ def test_nothing_is_found_where_nothing_changed_and_an_unknown_pose_is_a_weak_ch
     assert still(tmp_path, TRUE).level == Level.PASS
     weak = still(tmp_path, TRUE, with_pose=False)
     assert weak.level == Level.WARN
+    assert {c.level for c in weak.cameras} == {Level.WARN}
     assert any("this check is weak" in f.what and "--pose" in f.cure for f in weak.findings)
+
+
+def test_a_stand_is_believed_only_as_far_as_its_sigma_goes(tmp_path):
+    """Half a millimetre beside its stated place: ten sigma of a good seat, half a sigma of a poor one."""
+    rig = scenes.write_rig(tmp_path, RIG, COVARIANCE)
+    beside = Pose(AT_REST.rotation, AT_REST.translation + np.array([0, 5e-4, 0]))
+    run = scenes.write_still(tmp_path / "run", TRUE, beside, np.random.default_rng(5))
+    stated = scenes.write_still(tmp_path / "stated", TRUE, AT_REST, np.random.default_rng(5)) / "pose.csv"
+    for sigma_m, alarm in ((5e-5, True), (1e-3, False)):
+        limits = DailyLimits(pose_sigma_m=sigma_m)
+        outcome = daily_check(rig, tmp_path / "out", run=run, today=scenes.DAY, pose=stated, limits=limits)
+        assert any(f.level == Level.FAIL or "p = " in f.what for f in outcome.findings) == alarm
 
 
 def test_a_vehicle_that_moves_is_refused(tmp_path):

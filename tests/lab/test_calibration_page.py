@@ -36,6 +36,7 @@ SIZE = (640, 480)
 RNG = np.random.default_rng(4)
 CORNERS = RNG.uniform([0, 0], SIZE, (300, 2))
 RESIDUALS = RNG.normal(0, 0.2, (300, 2))
+HOLED = np.where(np.arange(300)[:, None] % 7 == 0, np.nan, CORNERS)
 MAP = 0.02 + np.hypot(*np.meshgrid(np.linspace(-1, 1, 17), np.linspace(-1, 1, 13))) ** 3
 
 
@@ -57,8 +58,10 @@ def all_drawings() -> dict[str, str]:
         ),
         "overlay without picture": draw.corners_overlay(SIZE, CORNERS[:2], RESIDUALS[:2], "v", labels=["<a>", "b"]),
         "field": draw.residual_field(SIZE, CORNERS, RESIDUALS),
+        "field with holes": draw.residual_field(SIZE, HOLED, RESIDUALS),
         "field of none": draw.residual_field(SIZE, CORNERS[:0], RESIDUALS[:0]),
         "coverage": draw.coverage_map(SIZE, CORNERS, outlines_px=[CORNERS[:4]]),
+        "coverage with holes": draw.coverage_map(SIZE, HOLED),
         "coverage of none": draw.coverage_map(SIZE, CORNERS[:0]),
         "tilt": draw.tilt_polar(np.array([10.0, 40, np.nan]), np.array([0.0, 90, 10])),
         "map": draw.heat_map(holed, (0, 640, 0, 480), "uncertainty <px>", "px"),
