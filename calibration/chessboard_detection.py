@@ -22,14 +22,29 @@ _SECTORS = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
 
 def find_chessboard(image: GreyImage, board: Chessboard) -> BoardView | NotFound:
     """All inner corners of a chessboard, or the reason why they cannot be had. A part of it is not enough."""
+    pale = low_contrast(image)
+    if pale is not None:
+        return pale
     for grid in _grids(image, board.columns, board.rows):
-        fine = corner_refinement.refined(image, grid)
-        if not np.isfinite(fine).all() or not _is_sheet(fine):
-            continue
-        ordered = oriented(image, fine)
-        if ordered is not None:
-            return _checked(image, ordered, board)
-    return _why_not(image, board)
+        found = _measured(image, grid, board)
+        if found is not None:
+            return found
+    largest = _largest_grid(image)
+    if largest is not None and sorted(largest.shape[:2]) == sorted((board.columns, board.rows)):
+        turned = largest.shape[:2] != (board.rows, board.columns)
+        found = _measured(image, np.swapaxes(largest, 0, 1) if turned else largest, board)
+        if found is not None:
+            return found
+    return _other_size(largest, board)
+
+
+def _measured(image: GreyImage, grid: Array, board: Chessboard) -> BoardView | NotFound | None:
+    """The view that rough corners (rows, columns, 2) lead to; None where they are no chessboard after all."""
+    fine = corner_refinement.refined(image, grid)
+    if not np.isfinite(fine).all() or not _is_sheet(fine):
+        return None
+    ordered = oriented(image, fine)
+    return None if ordered is None else _checked(image, ordered, board)
 
 
 def _grids(image: GreyImage, columns: int, rows: int) -> Iterator[Array]:
@@ -133,48 +148,69 @@ def _checked(image: GreyImage, grid: Array, board: Chessboard) -> BoardView | No
 
 
 def _goes_on(image: GreyImage, grid: Array) -> str:
-    """On which side squares follow beyond the outermost ones: 'to the right', ...; empty where the board ends.
+    """On which side more corners follow: 'to the right', ...; empty where the board ends.
 
-    Beyond the outermost square lies its margin. The two squares further out are read at half a square's distance,
-    where an honest margin is even and a chessboard alternates as within.
+    Where the next corner would be, told by the homography of the three outer rows, four squares must meet again: the
+    two on one diagonal are darker than the others by the board's contrast. At the end of a board two of the four are
+    its margin, which gives half of that; outermost squares that are cut narrower give nothing.
     """
     sides = {"above": grid, "below": grid[::-1], "to the left": np.swapaxes(grid, 0, 1)}
     sides["to the right"] = np.swapaxes(grid[:, ::-1], 0, 1)
     names = []
-    h, w = image.shape
     for side, g in sides.items():
-        corner = 3 * g[0] - 3 * g[1] + g[2]  # the next row outside, by its parabola
-        further = 6 * g[0] - 8 * g[1] + 3 * g[2]  # and the one after
-        inner = (g[0, :-1] + g[0, 1:] + g[1, :-1] + g[1, 1:]) / 4
-        outer = (corner[:-1] + corner[1:] + further[:-1] + further[1:]) / 4
-        seen = np.all((outer >= 0) & (outer < [w, h]), axis=1)
-        if seen.sum() < 2:
+        n = g.shape[1]
+        j, i = np.meshgrid(np.arange(n), np.arange(3))
+        found, _ = cv2.findHomography(np.stack([j, i], axis=-1).reshape(-1, 2).astype(float), g[:3].reshape(-1, 2), 0)
+        if found is None:
             continue
-        sign = np.where(np.arange(len(inner)) % 2 == 0, 1, -1)
-        inside = corner_refinement.sampled(image, inner)
-        outside = corner_refinement.sampled(image, outer)
-        a = np.mean((inside - np.median(inside)) * sign)
-        steps = np.diff(outside[seen]) * sign[:-1][: seen.sum() - 1]
-        if np.median(steps * np.sign(-a)) > abs(a) and np.all(steps * np.sign(-a) > 0.5 * abs(a)):
+        H = np.asarray(found, dtype=float)
+        within, beyond = _crossing(image, H, n, 1), _crossing(image, H, n, -1)
+        like = beyond * np.sign(within) / np.median(np.abs(within[np.isfinite(within)]))
+        if np.isfinite(like).sum() >= 3 and np.nanmedian(like) > 0.75 and np.nanmin(like) > 0.3:
             names.append(side)
     return " and ".join(names)
 
 
-def _why_not(image: GreyImage, board: Chessboard) -> NotFound:
-    pale = low_contrast(image)
-    if pale is not None:
-        return pale
-    scale = min(1.0, _QUICK_PX / max(image.shape))
-    flags = _SECTORS | cv2.CALIB_CB_LARGER
-    found, corners, meta = cv2.findChessboardCornersSBWithMeta(scaled(image, scale), (3, 3), flags)
-    nothing = NotFound("no chessboard seen: it must lie wholly in the picture, with a light margin and no glare on it")
-    if not found or meta is None or meta.ndim < 2 or meta.size * 2 != corners.size:
-        return nothing
-    rows, columns = meta.shape[:2]
-    grid = at_full_size(corners.reshape(rows, columns, 2).astype(float), scale)
-    if min(rows, columns) < 4 or abs(alternation(image, grid)) < _ALTERNATING:
-        return nothing  # 3x3 corners are found in many a room
-    columns, rows = sorted((columns, rows), reverse=board.columns >= board.rows)
+def _crossing(image: GreyImage, H: Array, n: int, row: int) -> Array:
+    """By how much (n,) one diagonal of the four squares at each corner of a row is darker, DN; nan outside."""
+    total = np.zeros(n)
+    for dj, di in ((-1, -1), (1, 1), (-1, 1), (1, -1)):
+        places = np.column_stack([np.arange(n) + 0.22 * dj, np.full(n, row + 0.22 * di), np.ones(n)]) @ H.T
+        pixels = places[:, :2] / places[:, 2:]
+        grey = corner_refinement.sampled(image, pixels)
+        outside = np.any((pixels < 0) | (pixels > np.array(image.shape[::-1]) - 1), axis=1)
+        total += np.where(outside, np.nan, grey) * (-dj * di) / 2
+    return total
+
+
+def _largest_grid(image: GreyImage) -> Array | None:
+    """The chessboard (rows, columns, 2), px, of whatever size with the most corners; None where there is none.
+
+    Neither way of searching nor size of picture always sees a whole board: of nine pictures each of the four finds the
+    whole in six or seven, and together in all.
+    """
+    best: Array | None = None
+    small = [s for s in scales(image) if s * max(image.shape) <= _QUICK_PX][:2]
+    for scale in small or [scales(image)[-1]]:
+        for flags in (_SECTORS, cv2.CALIB_CB_NORMALIZE_IMAGE):
+            found, corners, meta = cv2.findChessboardCornersSBWithMeta(
+                scaled(image, scale), (3, 3), flags | cv2.CALIB_CB_LARGER
+            )
+            if not found or meta is None or meta.ndim < 2 or meta.size * 2 != corners.size:
+                continue
+            grid = at_full_size(corners.reshape(*meta.shape[:2], 2).astype(float), scale)
+            if min(grid.shape[:2]) < 4 or abs(alternation(image, grid)) < _ALTERNATING:
+                continue  # 3x3 corners are found in many a room
+            if best is None or grid.size > best.size:
+                best = grid
+    return best
+
+
+def _other_size(grid: Array | None, board: Chessboard) -> NotFound:
+    """What to say of a chessboard that is not the one wanted."""
+    if grid is None:
+        return NotFound("no chessboard seen: it must lie wholly in the picture, with a light margin and no glare on it")
+    columns, rows = sorted(grid.shape[:2], reverse=board.columns >= board.rows)
     wide, high = sorted((board.columns, board.rows), reverse=board.columns >= board.rows)
     if columns <= wide and rows <= high:
         return NotFound(

@@ -1,0 +1,97 @@
+"""`calibrate board`: a calibration board to print, with its description."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from calibration.boards import Board
+from lab.calibrate.board_file import board_of, load_board, save_board
+from lab.calibrate.board_page import as_pdf, as_png, as_svg, lay_out
+from lab.errors import InputError
+from lab.whole_folder import whole_folder
+from lab.yaml_text import did_you_mean
+
+FORMATS = ("pdf", "svg", "png")
+DESCRIPTION = "board.yaml"
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What was written."""
+
+    board: Board
+    files: tuple[Path, ...]
+    page: str
+
+    def line(self) -> str:
+        """One line for the user."""
+        names = ", ".join(path.name for path in self.files)
+        return (
+            f"{self.board.describe()} on {self.page}: {names} in {self.files[0].parent};"
+            " print at 100 % and measure the bar of 100 mm"
+        )
+
+    @property
+    def exit_status(self) -> int:
+        """0: a board that could not be written is an error."""
+        return 0
+
+
+def write_board(
+    board: Board | str | Path,
+    out: Path,
+    formats: Sequence[str] = FORMATS,
+    page: str = "A4",
+    dpi: float = 300.0,
+) -> Outcome:
+    """Write a board as board.pdf, .svg, .png and board.yaml into the folder `out`, or as the one file that it names.
+
+    board: a value, its text, or the path of a board.yaml. Everything is written or nothing. Raises InputError.
+    """
+    if isinstance(board, str | Path):
+        board = board_of(board)
+    out = Path(out)
+    single = out.suffix.lower()[1:]
+    if single in FORMATS and not out.is_dir():
+        formats = (single,)
+    for name in formats:
+        if name not in FORMATS:
+            raise InputError(f"format: expected {', '.join(FORMATS)}, got {name!r}{did_you_mean(name, FORMATS)}")
+    layout = lay_out(board, page)
+    writers = {
+        "pdf": lambda: as_pdf(layout),
+        "svg": lambda: as_svg(layout).encode("utf-8"),
+        "png": lambda: as_png(layout, dpi),
+    }
+    contents = {name: writers[name]() for name in dict.fromkeys(formats)}
+    if single in FORMATS and not out.is_dir():
+        description = out.with_suffix(".yaml")
+        if description.exists() and load_board(description) != board:
+            raise InputError(f"{description}: describes another board; choose another name")
+        _write_bytes(contents[single], out)
+        save_board(board, description)
+        return Outcome(board, (out, description), layout.name)
+    with whole_folder(out, _holds_boards_only) as work:
+        for name, data in contents.items():
+            (work / f"board.{name}").write_bytes(data)
+        save_board(board, work / DESCRIPTION)
+    return Outcome(board, (*(out / f"board.{name}" for name in contents), out / DESCRIPTION), layout.name)
+
+
+def _holds_boards_only(folder: Path) -> bool:
+    known = {DESCRIPTION, *(f"board.{name}" for name in FORMATS)}
+    return {path.name for path in folder.iterdir()} <= known
+
+
+def _write_bytes(data: bytes, path: Path) -> None:
+    beside = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        beside.write_bytes(data)
+        beside.replace(path)
+    except OSError as error:
+        beside.unlink(missing_ok=True)
+        raise InputError(f"{path}: cannot be written: {error.strerror}") from None
