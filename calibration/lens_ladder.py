@@ -10,11 +10,11 @@ from scipy.stats import chi2
 
 from calibration.adjustment import AdjustmentError
 from calibration.corner_table import CornerTable
-from calibration.hold_out import BRIEF, HeldOut, hold_out
+from calibration.hold_out import BRIEF, HeldOut, hold_out, scatter
 from calibration.lens_fit import LensFit, Values, fit, robust_fit
 from calibration.lens_models import LADDER, LensModel, folds_in_picture
 from calibration.stacks import Vectors
-from geometry.arrays import Bools
+from geometry.arrays import Array, Bools
 
 WARP_SIGNIFICANT = 1e-3  # of a flat board's chance to look this bent
 
@@ -41,20 +41,32 @@ class Ladder:
 
 
 def climb(
-    table: CornerTable, used: Bools, starts: Sequence[Values], warp_free: bool, folds: int | None = None
+    table: CornerTable,
+    used: Bools,
+    starts: Sequence[Values | None],
+    warp_free: bool,
+    folds: int | None = None,
+    only: LensModel | None = None,
 ) -> Ladder:
-    """Solve every model on the same corners (N,) and hold out. starts: of perspective lenses and of a fisheye.
+    """Solve every model (or only one) on the same corners (N,) and hold out.
 
-    Each rung starts from the one below of its own kind. AdjustmentError where no model can be used.
+    starts: of perspective lenses and of a fisheye, None where there is none. Each rung starts from the one below of
+    its own kind. AdjustmentError where no model can be used.
     """
     perspective, fisheye = starts
     rungs = []
     below = perspective
-    for model in LADDER:
-        rung = _tried(table, used, model, fisheye if model.fisheye else below, warp_free, folds)
-        if rung.fit is not None and not model.fisheye:
+    for model in LADDER if only is None else (only,):
+        first = fisheye if model.fisheye else below
+        if first is None:
+            rungs.append(Rung(model, None, None, "no focal length and no position of the board explain the corners"))
+            continue
+        rung = _tried(table, used, model, first, warp_free, folds)
+        if rung.fit is not None and not model.fisheye and model.coefficients:
             below = rung.fit.values
         rungs.append(rung)
+    if only is not None and rungs[0].held is not None:
+        return Ladder(rungs, rungs[0], "it was asked for")
     return choose(rungs)
 
 
@@ -133,17 +145,21 @@ def warp_test(table: CornerTable, found: LensFit, folds: int | None = None, forc
     size = np.sqrt(np.diagonal(C))
     if not np.all(size > 0):
         raise AdjustmentError("the views do not determine the board's bend")
-    statistic = float(bent.warp @ np.linalg.solve(C, bent.warp))
+    held = hold_out(table, bent, folds)
+    # Corners of one photograph err together: against their noise alone nearly every board on real photographs is bent.
+    size = size * max(1.0, scatter(bent, held).factor)
+    statistic = float((bent.warp / size) @ np.linalg.solve(_correlation(C), bent.warp / size))
     p = float(chi2.sf(statistic, 3))
-    gain, _ = hold_out(table, bent, folds).better_than(hold_out(table, flat, folds))
+    gain, error = held.better_than(hold_out(table, flat, folds))
     if force is not None:
         corrected, why = force, "as asked for"
     elif p >= WARP_SIGNIFICANT:
-        corrected, why = False, "within its sigma of a flat board"
-    elif gain <= 0:
-        corrected, why = False, "significant against the corners' noise, but held-out views are not predicted better"
+        corrected, why = False, "not significantly different from a flat board"
+    elif gain < -error:
+        corrected, why = False, "significant, but held-out views are predicted worse"
     else:
-        corrected, why = True, "significant, and held-out views are predicted better"
+        better = "better" if gain > error else "as well"
+        corrected, why = True, f"significant, and held-out views are predicted {better}"
     return WarpTest(
         tuple(bent.warp),
         tuple(size),
@@ -153,6 +169,11 @@ def warp_test(table: CornerTable, found: LensFit, folds: int | None = None, forc
         corrected,
         why,
     )
+
+
+def _correlation(C: Array) -> Array:
+    size = np.sqrt(np.diagonal(C))
+    return C / np.outer(size, size)
 
 
 def rise(table: CornerTable, found: LensFit) -> float:
