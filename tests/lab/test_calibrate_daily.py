@@ -16,6 +16,7 @@ from calibration.findings import Level
 from geometry.pose import Pose
 from geometry.rig_parameters import moved
 from geometry.rotations import exp
+from geometry.spots import SpotModel
 from lab.calibrate.daily import COLUMNS, DailyLimits, daily_check
 from lab.calibrate.daily_expected import compare_points
 from lab.calibrate.daily_history import read_history
@@ -366,3 +367,30 @@ def test_the_wrong_one_of_five_points_is_named(tmp_path):
     one = compare_points(RIG, read_points(pixels, survey, RIG, 0.1), covariance, pixels)[1]
     changes = find_changes(one.misfit, one.columns, one.others, 0.002).changes
     assert [(c.kind, c.subject) for c in changes] == [(WRONG_POINT, "R3")]
+
+
+def test_a_run_folder_is_processed_first(tmp_path):
+    """Detections of a vehicle at rest, labelled and tracked by the program itself."""
+    rig = scenes.write_rig(tmp_path, RIG, COVARIANCE, replace(scenes.STATE, valid_until=None))
+    rng = np.random.default_rng(8)
+    run = tmp_path / "run"
+    run.mkdir()
+    (run / "rig.yaml").write_text(rig.read_text())
+    model = SpotModel.of(scenes.turned(TRUE, "left", 0.05))
+    uv = model.derivatives(AT_REST).pixels
+    rows = ["frame,camera,u_px,v_px,sigma_u_px,sigma_v_px,flux,peak,major_px,minor_px,angle_deg,cov_uv_px2"]
+    for frame in range(12):
+        for (camera, _), (u, v) in zip(model.views, (uv + rng.normal(0, 0.05, uv.shape)).tolist(), strict=True):
+            rows.append(f"{frame},{camera},{u:.4f},{v:.4f},0.05,0.05,1000,100,2,2,0,0")
+    (run / "detections.csv").write_text("\n".join(rows) + "\n")
+    yaw, pitch, roll = np.rad2deg(AT_REST.ypr).tolist()
+    (run / "run.yaml").write_text(
+        "schema: beampose/run/1\nname: at rest\nrig: rig.yaml\nframe_rate_hz: 100.0\n"
+        "cameras:\n  left: {detections: detections.csv}\n  right: {detections: detections.csv}\n"
+        f"prior:\n  position_m: [0.05, 0.02, -0.03]\n  yaw_pitch_roll_deg: [{yaw:.3f}, {pitch:.3f}, {roll:.3f}]\n"
+        "  within_m: 0.2\n  within_deg: 10.0\n"
+    )
+    pose = scenes.write_still(tmp_path / "stated", TRUE, AT_REST, rng) / "pose.csv"
+    outcome = daily_check(rig, tmp_path / "out", run=run, today=scenes.DAY, pose=pose)
+    assert of(outcome, "left").change.kind == TURNED
+    assert of(outcome, "right").level == Level.PASS
