@@ -18,6 +18,7 @@ from geometry.arrays import Array, Bools
 SIGNIFICANT = 0.01  # chance at which a flat screen is called bent, or a good survey worse than its sigmas
 OUTLIER_SIGMAS = 5.0  # a point farther off, of its own sigma and the surface's, was not on the screen
 _MOST_OUTLIERS = 0.3  # of all points; with more there is no telling what is the screen
+_MANY = 60  # points beyond which a wrong one hardly bends the surface, and judging each by the others takes long
 _SMALLEST_SIGMA_M = 2e-5  # m: no painted screen is smoother
 
 
@@ -147,6 +148,8 @@ def _on_surface(xyz: Array, sigma_m: Array, bent: bool, scatter_m: float | None)
     Each is judged by the surface through the others, since one wrong point of six bends the surface through all.
     """
     used = np.ones(len(xyz), dtype=bool)
+    if len(xyz) > _MANY:
+        return _near_most(xyz, sigma_m, bent)
     fewest = 8 if bent else 5
     while np.sum(used) > max(fewest, (1 - _MOST_OUTLIERS) * len(xyz)):
         worst, largest = -1, OUTLIER_SIGMAS
@@ -167,4 +170,18 @@ def _on_surface(xyz: Array, sigma_m: Array, bent: bool, scatter_m: float | None)
         if worst < 0:
             break
         used[worst] = False
+    return used
+
+
+def _near_most(xyz: Array, sigma_m: Array, bent: bool) -> Bools:
+    """Which of many points lie within five of their common scatter, as their median distance shows it."""
+    used = np.ones(len(xyz), dtype=bool)
+    for _ in range(10):
+        surface = fit_surface(xyz, sigma_m, bent, 0.0, used)
+        # The median distance of a Gaussian is 0.6745 sigmas.
+        scatter = float(np.median(np.abs(surface.heights_m))) / 0.6745
+        now = np.abs(surface.heights_m) < OUTLIER_SIGMAS * np.maximum(scatter, sigma_m)
+        if np.array_equal(now, used) or np.mean(now) < 0.5:
+            break
+        used = now
     return used

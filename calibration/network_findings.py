@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy as np
 from calibration.findings import Finding, Level
 from calibration.network import Network, NetworkFit
 from calibration.network_sigmas import pointing_sigmas_m, spot_sigmas
-from calibration.screens import ScreensResult
+from calibration.screens import Near, ScreensResult
 from geometry.arrays import Array
 from geometry.camera import Camera
 from geometry.planes import meet_plane
@@ -250,3 +251,18 @@ def _rivals(result: ScreensResult) -> list[Finding]:
         )
         for c, rival in result.rivals.items()
     ]
+
+
+def near_findings(result: ScreensResult, near: Mapping[int, Near]) -> list[Finding]:
+    """Whether cameras stand where a tape measure says."""
+    out = []
+    for c, n in near.items():
+        name, camera = list(result.fit.rig.cameras.items())[c]
+        away = float(np.linalg.norm(camera.camera_from_world.inverse().translation - n.position_m))
+        what = f"camera {name!r} stands {away:.2f} m from its `near_m`, {n.within_m:g} m were allowed"
+        if away <= n.within_m:
+            out.append(Finding(Level.PASS, what))
+        else:
+            why = "the survey may have swapped axes or another unit, or the camera's name is another one's"
+            out.append(Finding(Level.FAIL, what, why, "check near_m, the survey's columns and the cameras' names"))
+    return out

@@ -98,7 +98,7 @@ def _solutions(points: Array, xy: Array) -> list[Pose]:
     s = np.linalg.svd(points - middle, compute_uv=False)
     flat = len(s) < 3 or s[2] < _COPLANAR * s[1]
     method = cv2.SOLVEPNP_IPPE if flat else cv2.SOLVEPNP_SQPNP
-    # About their middle and by their size: a survey's coordinates can be kilometres, and the solvers' limits are absolute.
+    # About their middle and by their size: a survey's coordinates can be kilometres, the solvers' limits are absolute.
     size = s[0] / np.sqrt(len(points))
     args = (((points - middle) / size).reshape(-1, 1, 3), xy.reshape(-1, 1, 2), np.eye(3), None)
     try:

@@ -107,7 +107,7 @@ def calibrate(
         eyes = [chained.camera_from_world[c].inverse().translation for c, s in enumerate(observed) if s == name]
         seen_from = np.mean(eyes, axis=0) if eyes else None
         if setup.scan is not None:
-            scan = setup.scan
+            scan = facing(setup.scan, seen_from)
             frames[k] = scan.world_from_screen
             bows[k] = scan.flatness.chosen.coefficients[3:]
             if scan.flatness.chosen.bent:
@@ -171,6 +171,32 @@ def screen_of_dots(
     flatness = judge_flatness(*_heights(frame, xyz, C), setup.bow, setup.scatter_m)
     frame = laid_on(frame, flatness.chosen)
     return frame, judge_flatness(*_heights(frame, xyz, C), setup.bow, setup.scatter_m)
+
+
+def facing(scan: Scan, seen_from: Array | None) -> Scan:
+    """The scan with its z axis towards a point (3,), world: turned by half a turn about its y axis where need be."""
+    pose = scan.world_from_screen
+    if seen_from is None or pose.rotation[:, 2] @ (seen_from - pose.translation) >= 0:
+        return scan
+    half = np.array([-1.0, 1.0, -1.0])
+    # z' = -z and x' = -x: h, p, q, a, b, c become -h, p, -q, -a, b, -c.
+    signs = np.array([-1.0, 1.0, -1.0, -1.0, 1.0, -1.0])
+    of_errors = np.concatenate([np.ones(3), half, half])
+
+    def turned(surface: Surface) -> Surface:
+        C = surface.covariance * np.outer(signs, signs)
+        return replace(surface, coefficients=signs * surface.coefficients, covariance=C, heights_m=-surface.heights_m)
+
+    f = scan.flatness
+    return replace(
+        scan,
+        world_from_screen=Pose(pose.rotation * half, pose.translation),
+        flatness=replace(
+            f, flat=turned(f.flat), bent=None if f.bent is None else turned(f.bent), chosen=turned(f.chosen)
+        ),
+        covariance=scan.covariance * np.outer(of_errors, of_errors),
+        xyz=scan.xyz * half,
+    )
 
 
 def laid_on(frame: Pose, surface: Surface) -> Pose:

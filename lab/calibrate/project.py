@@ -34,6 +34,7 @@ from lab.fields import (
     Vector3,
     Word,
     a_truth_value,
+    numbers,
     one_of,
     positive_numbers,
     unexpected,
@@ -89,6 +90,7 @@ class ScreenFrame:
     origin: str
     x: str
     y: str
+    origin_at_m: tuple[float, float] = (0.0, 0.0)  # where the first dot lies in the screen's frame
 
 
 @dataclass(frozen=True, slots=True)
@@ -262,6 +264,10 @@ class _FrameBlock(Block):
     origin: Word
     x: Word
     y: Word
+    origin_at_m: Annotated[list[float], pydantic.PlainValidator(numbers(2))] = [0.0, 0.0]  # noqa: RUF012 - frozen
+
+    def value(self) -> ScreenFrame:
+        return ScreenFrame(self.origin, self.x, self.y, (self.origin_at_m[0], self.origin_at_m[1]))
 
 
 class _ScreenBlock(Block):
@@ -395,7 +401,7 @@ class _Reader:
         return ScreenEntry(
             name=name,
             size_m=None if block.size_m is None else (block.size_m[0], block.size_m[1]),
-            frame=None if block.frame is None else ScreenFrame(block.frame.origin, block.frame.x, block.frame.y),
+            frame=None if block.frame is None else block.frame.value(),
             surface_sigma_m=block.surface_sigma_m,
             bow=block.bow,
             boards=tuple(b for b in boards if b is not None),

@@ -1,0 +1,197 @@
+"""`beampose calibrate screen`: where screens and cameras are, how flat screens are, and how well all that is known."""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from calibration.adjustment import AdjustmentError
+from calibration.findings import Finding, Level, verdict
+from calibration.network_findings import findings as network_findings
+from calibration.network_findings import near_findings
+from calibration.network_sigmas import pointing_sigmas_m, spot_sigmas
+from calibration.network_start import NotConnectedError
+from calibration.screens import ScreensResult, calibrate
+from calibration.survey_suspects import Suspect, misfit_of, suspects
+from geometry.rig import Rig
+from lab.calibrate.project import Project, load_project
+from lab.calibrate.screen_inputs import ScreenInputs, screen_inputs
+from lab.calibrate.screen_tables import DOTS, RESIDUALS, write_tables
+from lab.calibrate.screens_file import ScreensFile, save_screens
+from lab.calibration_state import CalibrationState
+from lab.errors import CalibrationError, InputError
+from lab.rig_covariance import blocks_of
+from lab.rig_file import RigFile, save_rig
+from lab.whole_folder import whole_folder
+
+SCREENS, RIG = "screens.yaml", "rig.yaml"
+SUSPICIOUS = 4.0  # misfit (see calibration/survey_suspects.py) from which swapped axes and wrong units are looked for
+_CURED = 2.0  # misfit up to which a change to the survey counts as what was wrong
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """How a calibration of screens ended."""
+
+    name: str
+    out: Path
+    level: Level
+    findings: tuple[Finding, ...]
+    result: ScreensResult
+
+    @property
+    def exit_status(self) -> int:
+        """0, or 3 where the calibration must not be used."""
+        return CalibrationError.exit_status if self.level == Level.FAIL else 0
+
+    def line(self) -> str:
+        """One line for the terminal."""
+        rig = self.result.fit.rig
+        surface = 1e3 * max(float(np.max(spot_sigmas(self.result, k))) for k in range(len(rig.screens)))
+        place = 1e3 * max(pointing_sigmas_m(self.result).values())
+        worst = max(self.findings, key=lambda f: f.level)
+        reason = "" if self.level == Level.PASS else f": {worst.what}"
+        return (
+            f"{self.name}: {self.level.name}: {_counted(len(rig.cameras), 'camera')}, "
+            f"{_counted(len(rig.screens), 'screen')}, surfaces to {surface:.2g} mm, cameras to {place:.2g} mm on them"
+            f"{reason} -> {self.out}"
+        )
+
+
+def _counted(n: int, what: str) -> str:
+    return f"{n} {what}{'' if n == 1 else 's'}"
+
+
+def calibrate_screen(project_path: Path, out: Path, today: datetime.date | None = None) -> Outcome:
+    """Calibrate the screens and the cameras' places of a project.
+
+    Writes into `out`: screens.yaml; rig.yaml with the beams as drawn, where the project has a target; residuals.csv,
+    dots.csv and report.html. Neither YAML is written where the verdict is FAIL. Raises InputError for what is wrong
+    with the files, CalibrationError where they give no calibration at all; `out` is then as it was.
+    """
+    project = load_project(Path(project_path))
+    inputs = screen_inputs(project)
+    result = _adjusted(project, inputs)
+    found = [
+        *network_findings(result),
+        *near_findings(result, inputs.near),
+        *_coverage(project, result),
+        *(Finding(Level.WARN, note) for note in inputs.notes),
+    ]
+    level = verdict(found)
+    day = today or project.date or datetime.date.today()
+    outcome = Outcome(project.name, Path(out), level, tuple(found), result)
+    with whole_folder(Path(out), may_replace=_is_ours) as work:
+        if level != Level.FAIL:
+            _save(project, outcome, day, work)
+        write_tables(result, work)
+        from lab.calibrate.screen_page import write_page  # the template engine: only for those who write a report
+
+        write_page(outcome, project, inputs, day, work)
+    return outcome
+
+
+def _is_ours(folder: Path) -> bool:
+    return (folder / DOTS).is_file() and (folder / RESIDUALS).is_file()
+
+
+def _adjusted(project: Project, inputs: ScreenInputs) -> ScreensResult:
+    """The adjustment; where nothing fits, what about the survey may be wrong."""
+    where = ", ".join(str(p) for p in project.survey) or str(project.path)
+    problem: Exception | None = None
+    miss = float("inf")
+    try:
+        result = calibrate(inputs.network, inputs.setups, inputs.near, inputs.held_screen)
+        miss = misfit_of(result, inputs.near)
+    except (NotConnectedError, AdjustmentError, ValueError) as error:
+        problem = error
+    enough = len(inputs.network.sightings) >= 4
+    if enough and miss > SUSPICIOUS and not _plainly_missing(inputs, problem):
+        changes = suspects(inputs.network, inputs.setups, inputs.near, inputs.held_screen, miss)
+        cures = [c for c in changes if c.factor < _CURED]
+        if cures:
+            raise InputError(_suspicion(where, cures))
+    if isinstance(problem, AdjustmentError):
+        raise CalibrationError(f"{project.path}: the measurements give no calibration: {problem}") from None
+    if problem is not None:
+        raise InputError(f"{where}: {problem}") from None
+    return result
+
+
+def _plainly_missing(inputs: ScreenInputs, problem: Exception | None) -> bool:
+    """Whether a camera has too few dots, or a screen: no other axes or unit would mend that."""
+    text = str(problem or "")
+    return any(words in text for words in ("expected 4 or more", "expected 3 or more", "on one line", "found none"))
+
+
+def _suspicion(where: str, cures: Sequence[Suspect]) -> str:
+    """What the survey's columns seem to hold."""
+    best = cures[0]
+    others = [c for c in cures[1:] if c.factor < 1.2 * best.factor]
+    text = f"{where}: does not fit the pixels as it is, but {best.words} does"
+    if others:
+        text += (
+            f" (so do {len(others)} other changes, such as {others[0].words}: a mirrored survey looks the same"
+            " whichever axes are swapped; give a camera's place as `near_m` to tell)"
+        )
+    return f"{text}; mend the file"
+
+
+def _coverage(project: Project, result: ScreensResult) -> list[Finding]:
+    """Whether the dots reach over the screens, and lie on them."""
+    out = []
+    for (name, entry), screen in zip(project.screens.items(), result.screens, strict=True):
+        if entry.size_m is None or not screen.dots:
+            continue
+        half = np.array(entry.size_m) / 2
+        reach = np.abs(screen.xyz[:, :2])
+        beyond = np.flatnonzero((reach > half + 0.01).any(axis=1))
+        if beyond.size:
+            dot = result.network.dots.names[screen.dots[int(beyond[0])]]
+            out.append(
+                Finding(
+                    Level.WARN,
+                    f"screen {name!r}: dot {dot!r} lies outside its size_m ({_counted(len(beyond), 'dot')} do)",
+                    "spots beyond size_m count as off the screen",
+                    "correct size_m, or fix the screen's frame by named dots (`frame`)",
+                )
+            )
+        share = np.ptp(screen.xyz[screen.used, :2], axis=0) / np.array(entry.size_m)
+        if share.min() < 0.6:
+            out.append(
+                Finding(
+                    Level.WARN,
+                    f"screen {name!r}: its dots reach over {100 * share[0]:.0f} % of its width and"
+                    f" {100 * share[1]:.0f} % of its height",
+                    "beyond the dots its shape is a guess"
+                    + ("" if entry.frame else ", and the middle of the dots is taken for the screen's middle"),
+                    "survey dots near its corners" + ("" if entry.frame else ", or name three dots in `frame`"),
+                )
+            )
+    return out
+
+
+# Files ------------------------------------------------------------------------------------------------------------
+
+
+def _save(project: Project, outcome: Outcome, day: datetime.date, folder: Path) -> None:
+    until = None if project.valid_days is None else day + datetime.timedelta(days=project.valid_days)
+    reasons = tuple(f.what for f in outcome.findings if f.level > Level.PASS)
+    state = CalibrationState(day, outcome.level.name, until, reasons, project.notes)
+    fit = outcome.result.fit
+    rig = fit.rig
+    for k, (name, screen) in enumerate(rig.screens.items()):
+        scan = None if project.screens[name].cloud is None else outcome.result.screens[k]
+        if screen.size_m is None and scan is not None:
+            width, height = (2 * np.abs(scan.xyz[:, :2]).max(axis=0)).tolist()
+            rig = replace(rig, screens={**rig.screens, name: replace(screen, size_m=(width, height))})
+    save_screens(ScreensFile(project.name, rig, fit.covariance, state), folder / SCREENS)
+    if project.beams:
+        note = "the beams are as drawn, not calibrated: run `beampose calibrate beams`"
+        state = replace(state, verdict=max(outcome.level, Level.WARN).name, reasons=(note, *reasons))
+        whole = Rig(rig.screens, rig.cameras, project.beams, project.spots)
+        save_rig(RigFile(whole, blocks_of(fit.covariance), state), folder / RIG)
