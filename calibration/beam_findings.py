@@ -162,18 +162,29 @@ def _sigmas(c: BeamCalibration, goals: BeamGoals) -> Finding:
     rms, worst = float(np.sqrt(np.mean(each**2))), int(np.argmax(each))
     name = list(c.rig.beams)[worst]
     words = (
-        f"directions known to {rms / ARCSEC:.2g} arcsec RMS per axis, the worst, beam {name}, to"
-        f" {each[worst] / ARCSEC:.2g} arcsec; offsets to {1e3 * float(np.sqrt(np.mean(offset_sigmas(c) ** 2))):.2g} mm"
+        f"directions known to {rms / ARCSEC:.3g} arcsec RMS per axis, the worst, beam {name}, to"
+        f" {each[worst] / ARCSEC:.3g} arcsec; offsets to {1e3 * float(np.sqrt(np.mean(offset_sigmas(c) ** 2))):.2g} mm"
     )
-    if rms <= goals.direction:
+    if rms <= 1.003 * goals.direction:  # as far as the figures in words go
         return Finding(Level.PASS, words)
-    cure = "add positions, " + c.motion.cure().removeprefix("add positions ").removeprefix("that differ more from ")
-    if c.world_from_stand is not None and c.angles and c.angles[0].sigma < 0.5 * rms:
-        cure = "the stand's own place is what is least known: measure world_from_stand better"
+    between = np.sqrt(np.mean([a.sigma**2 for a in c.angles])) if c.angles else rms
+    times = int(np.ceil((rms / goals.direction) ** 2))
+    why = "direction and offset errors that go together cancel near the distances of the calibration, no farther"
+    cure = (
+        "a beam's direction is told by spots at different distances along it: shift the vehicle farther along its"
+        f" beams, or record {times} times as many positions"
+    )
+    if c.world_from_stand is not None and between < 0.5 * rms:
+        why = (
+            f"the angles between beams are known to {between / ARCSEC:.3g} arcsec: it is the whole target against the"
+            f" stand that is not; the stand's positions: {c.motion}"
+        )
+        cure = "measure world_from_stand better"
+        cure = f"{c.motion.cure()}, or {cure}" if c.motion.flat else cure
     return Finding(
         Level.FAIL if each[worst] > goals.direction_unusable else Level.WARN,
         f"{words} (goal {goals.direction / ARCSEC:.3g} arcsec)",
-        "direction and offset errors that go together cancel near the distances of the calibration, no farther",
+        why,
         cure,
     )
 
@@ -213,16 +224,16 @@ def _against_the_drawing(c: BeamCalibration, drawing: Rig, goals: BeamGoals) -> 
 
 def _one_line(pair: OneLine) -> Finding:
     words = (
-        f"{pair.first} and {pair.second}: {pair.turn / ARCSEC:.3g} ± {pair.turn_sigma / ARCSEC:.2g} arcsec and"
+        f"{pair.first} and {pair.second} are {pair.turn / ARCSEC:.3g} ± {pair.turn_sigma / ARCSEC:.2g} arcsec and"
         f" {1e3 * pair.gap:.2g} ± {1e3 * pair.gap_sigma:.1g} mm apart"
     )
     if pair.p >= _P_TWO_LINES:
-        return Finding(Level.PASS, f"opposed beams {words}: one line fits both (p = {pair.p:.2g})")
+        return Finding(Level.PASS, f"{words}: one line fits both (p = {pair.p:.2g})")
     if " end " in pair.first:
         return Finding(
             Level.WARN,
-            f"the two ends of a beam, {words}: they are not one line (p = {pair.p:.1g})",
+            f"{words}: the two ends are not one line (p = {pair.p:.1g})",
             "as one beam, each end is wrong by half of that",
             "describe them in target.beams as two beams with one spot each, and calibrate again",
         )
-    return Finding(Level.PASS, f"opposed beams {words}: two beams, as described (p = {pair.p:.1g})")
+    return Finding(Level.PASS, f"{words}: two beams, as described (p = {pair.p:.1g})")

@@ -210,6 +210,8 @@ def _finished(
     else:
         at = asked + [(s, i) for s in _of_the_lab(free) for i in range(len(values[s]))]
         joint = fit.adjusted.covariance(at)
+    for t in gauge:
+        slide = slide @ t.held_exactly(lines_in(values))
     K = block_diag(slide, np.eye(len(joint) - len(slide)))
     joint = K @ joint @ K.T
     values = {**values, BEAMS: lines}

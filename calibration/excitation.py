@@ -44,11 +44,15 @@ class Motion:
         shifts = ", ".join(f"{a} {s * 1e3:.0f} mm" for a, s in zip("xyz", self.shifts, strict=True))
         return f"RMS turns about {turns}; RMS shifts along {shifts}"
 
+    @property
+    def flat(self) -> list[str]:
+        """The axes about which the positions hardly turn."""
+        return [a for a, t in zip("xyz", self.turns, strict=True) if t < _TURN_RMS]
+
     def cure(self) -> str:
         """Which positions to add."""
-        flat = [a for a, t in zip("xyz", self.turns, strict=True) if t < _TURN_RMS]
-        if flat:
-            return f"add positions turned by 10 deg or more about the stand's {_and(flat)}"
+        if self.flat:
+            return f"add positions turned by 10 deg or more about the stand's {_and(self.flat)}"
         still = [a for a, s in zip("xyz", self.shifts, strict=True) if s < _SHIFT_RMS]
         if still:
             return f"add positions shifted by 100 mm or more along the stand's {_and(still)}"

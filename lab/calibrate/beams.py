@@ -50,8 +50,11 @@ class Outcome:
         worst = max(self.findings, key=lambda f: f.level)
         what = f"{len(c.lines)} beams from {len(c.world_from_body.translation)} positions"
         if not c.undetermined:
-            what += f", directions to {sigma:.2g} arcsec RMS"
-        reason = "" if self.level == Level.PASS else f": {worst.what}"
+            what += f", directions to {sigma:.3g} arcsec RMS"
+        warnings = sum(f.level == Level.WARN for f in self.findings)
+        reason = f"; {warnings} warning{'s' if warnings > 1 else ''}, see report.html" if warnings else ""
+        if self.level == Level.FAIL:
+            reason = f"; {worst.what.split(' (')[0]}: {worst.cure}"
         return f"{self.name}: {self.level.name}: {what}{reason} -> {self.out}"
 
 
