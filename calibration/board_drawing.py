@@ -47,13 +47,12 @@ def draw(board: Board) -> Drawing:
     start = np.array([s, s])
     j, i = np.meshgrid(np.arange(columns), np.arange(rows))
     dark = is_dark_square(board, j, i)
-    layers = [Layer(True, _cells(j[dark], i[dark], s, np.zeros(2)), np.empty((0, 3)))]
+    ink = ~dark if isinstance(board, Charuco) and board.inverted else dark
+    layers = [Layer(True, _cells(j[ink], i[ink], s, np.zeros(2)), np.empty((0, 3)))]
     if isinstance(board, Charuco):
-        black, white = _marker_cells(board, j[~dark], i[~dark])
-        layers += [Layer(True, black, np.empty((0, 3))), Layer(False, white, np.empty((0, 3)))]
-        if board.inverted:
-            paper = Layer(False, np.array([[0.0, 0.0, *board.size_m]]), np.empty((0, 3)))
-            layers = [Layer(not layer.dark, layer.rectangles, layer.circles) for layer in (paper, *layers)]
+        markers, cells = _marker_cells(board, j[~dark], i[~dark])
+        layers.append(Layer(not board.inverted, markers, np.empty((0, 3))))
+        layers.append(Layer(board.inverted, cells, np.empty((0, 3))))
     return Drawing(board.size_m, start, tuple(layers))
 
 

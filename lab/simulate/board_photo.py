@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from calibration.board_drawing import ink_at
 from calibration.boards import Board
-from geometry.arrays import Array, Ints
+from geometry.arrays import Array, Bools, Ints
 from geometry.camera import Camera
 from geometry.pose import Pose
 
@@ -62,10 +62,13 @@ def photograph(
     look = Look() if look is None else look
     width, height = camera.image_size_px
     board_xy = _board_coordinates(board, camera, world_from_board, bend)
-    light = np.zeros((height, width))
-    for shift in _lattice(look.samples):
-        light += _shade(board, _between(board_xy, shift), look)
-    light /= look.samples
+    light = np.full((height, width), look.background_dn)
+    piece = _piece_with_paper(board, board_xy)
+    if piece is not None:
+        rows, columns = piece
+        corners = board_xy[rows.start : rows.stop + 1, columns.start : columns.stop + 1]
+        shades = [_shade(board, _between(corners, shift), look) for shift in _lattice(look.samples)]
+        light[piece] = np.mean(shades, axis=0)
     light *= 1 - look.gradient * np.linspace(0, 1, width)
     if look.blur_px > 0:
         blurred = cv2.GaussianBlur(light, (0, 0), look.blur_px, borderType=cv2.BORDER_REPLICATE)
@@ -112,11 +115,27 @@ def _lattice(n: int) -> Array:
     return np.stack([(k + 0.5) / n, ((k * 0.6180339887498949) % 1 + 0.5 / n) % 1], axis=-1)
 
 
-def _shade(board: Board, xy: Array, look: Look) -> Array:
+def _on_paper(board: Board, xy: Array) -> Bools:
     low = board.points[:, :2].min(axis=0) - (1 + _MARGIN) * board.spacing_m
     high = board.points[:, :2].max(axis=0) + (1 + _MARGIN) * board.spacing_m
     with np.errstate(invalid="ignore"):
-        paper = np.all((xy > low) & (xy < high), axis=-1)
+        return np.all((xy > low) & (xy < high), axis=-1)
+
+
+def _piece_with_paper(board: Board, corners: Array) -> tuple[slice, slice] | None:
+    """The rows and columns of pixels that may show paper; None where none does. corners (h + 1, w + 1, 2)."""
+    rows, columns = np.nonzero(_on_paper(board, corners))
+    if len(rows) == 0:
+        return None
+    height, width = corners.shape[0] - 1, corners.shape[1] - 1
+    return (
+        slice(max(int(rows.min()) - 1, 0), min(int(rows.max()) + 1, height)),
+        slice(max(int(columns.min()) - 1, 0), min(int(columns.max()) + 1, width)),
+    )
+
+
+def _shade(board: Board, xy: Array, look: Look) -> Array:
+    paper = _on_paper(board, xy)
     shade = np.where(paper, look.light_dn, look.background_dn)
     shade[paper] -= (look.light_dn - look.dark_dn) * ink_at(board, xy[paper])
     return shade
