@@ -14,7 +14,8 @@ from scipy.stats import binom
 from calibration.drift import TURNED, WRONG_POINT, ZOOMED, find_changes
 from calibration.findings import Level
 from geometry.pose import Pose
-from geometry.rig_parameters import moved
+from geometry.rig import Rig
+from geometry.rig_parameters import RigCovariance, moved, rig_names
 from geometry.rotations import exp
 from geometry.spots import SpotModel
 from lab.calibrate.daily import COLUMNS, DailyLimits, daily_check
@@ -394,3 +395,34 @@ def test_a_run_folder_is_processed_first(tmp_path):
     outcome = daily_check(rig, tmp_path / "out", run=run, today=scenes.DAY, pose=pose)
     assert of(outcome, "left").change.kind == TURNED
     assert of(outcome, "right").level == Level.PASS
+
+
+@pytest.mark.parametrize("on_screens", [False, True], ids=["surveyed", "screen coordinates"])
+def test_the_calibrations_share_is_that_of_numeric_derivatives(tmp_path, on_screens):
+    """Every number of a camera and a bent screen, moved one by one; dots given on a screen move with it."""
+    bent = replace(RIG.screens["left"], bow=(2e-3, -1e-3, 1e-3))
+    rig = Rig({**RIG.screens, "left": bent}, RIG.cameras, RIG.beams, RIG.spots)
+    names = tuple(n for n in rig_names(rig, bow=True) if n.startswith(("cameras.left.", "screens.left.")))
+    sigma = np.array([0.5 if n.endswith((".fx", ".fy", ".cx", ".cy")) else 3e-4 for n in names])
+    pixels, survey = scenes.write_points(tmp_path, rig, np.random.default_rng(0), on_screens=on_screens)
+    known = read_points(pixels, survey, rig, 0.1)
+    one = compare_points(rig, known, RigCovariance(names, np.diag(sigma**2)), pixels)[0]
+    mine = [i for i, c in enumerate(known.camera) if c == "left"]
+
+    def foretold(delta: np.ndarray) -> np.ndarray:
+        lab = moved(rig, names, delta)
+        screen, out = lab.screens["left"], []
+        for i in mine:
+            x, y, z = known.place[i]
+            a, b, c = screen.bow
+            local = np.array([x, y, a * x * x + b * x * y + c * y * y])
+            world = screen.world_from_screen.apply(local) if on_screens else np.array([x, y, z])
+            out.append(lab.cameras["left"].project(world))
+        return np.array(out)
+
+    J = np.stack(
+        [(foretold(e) - foretold(-e)) / 2e-3 for e in 1e-3 * np.diag(sigma)], axis=-1
+    )  # per sigma of each number
+    expected = np.sqrt(np.sum(J**2, axis=-1).mean(axis=1))
+    np.testing.assert_allclose(one.calibration_sigma_px, expected, rtol=1e-5)
+    np.testing.assert_allclose(one.foretold, foretold(np.zeros(len(names))), atol=1e-9)
