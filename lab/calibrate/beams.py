@@ -14,15 +14,17 @@ from calibration.beam_findings import ARCSEC, BeamGoals, beam_findings, directio
 from calibration.beams import BeamCalibration, Stand, self_calibrate
 from calibration.beams import calibrate_beams as find_beams
 from calibration.findings import Finding, Level, verdict
+from geometry.rig_parameters import RigCovariance
 from lab.calibrate.beam_tables import BEAMS, write_tables
 from lab.calibrate.project import Project, load_project
 from lab.calibrate.recordings import Recordings, read_recordings
+from lab.calibrate.screens_file import load_screens
 from lab.calibration_state import CalibrationState
 from lab.errors import CalibrationError, InputError
 from lab.rig_covariance import blocks_of, joint_covariance
 from lab.rig_file import RigFile, load_rig_file, save_rig
 from lab.whole_folder import whole_folder
-from lab.yaml_text import did_you_mean
+from lab.yaml_text import did_you_mean, read_mapping
 
 RIG = "rig.yaml"
 
@@ -63,15 +65,14 @@ def calibrate_beams(
 ) -> Outcome:
     """Calibrate the beams of a project; writes rig.yaml (not where it fails), three tables and report.html into `out`.
 
-    rig: the rig.yaml with cameras and screens as calibrated and their covariances (None: `rig.yaml` beside the
-    project). Its target is replaced by the project's, if that has one. Raises InputError for what is wrong with the
-    files, CalibrationError where the spots give no calibration at all; `out` is then as it was.
+    rig: the rig.yaml or screens.yaml with cameras and screens as calibrated and their covariances (None: `rig.yaml`
+    beside the project). A target in it is replaced by the project's, if that has one. Raises InputError for what is
+    wrong with the files, CalibrationError where the spots give no calibration at all; `out` is then as it was.
     """
     project = load_project(Path(project_path))
     rig_path = Path(rig) if rig is not None else project.path.parent / RIG
-    file = _calibrated_lab(project, rig_path)
+    file, knowledge = _calibrated_lab(project, rig_path)
     recordings = read_recordings(project, file.rig)
-    knowledge = joint_covariance(file.rig, file.covariances, rig_path)
     try:
         if recordings.stand_from_body is None:
             found = self_calibrate(file.rig, recordings.spots, len(recordings.names), knowledge)
@@ -81,7 +82,7 @@ def calibrate_beams(
         raise CalibrationError(f"{project.path}: the beams cannot be calibrated: {error}") from None
     findings = [
         *beam_findings(found, file.rig, recordings.names, BeamGoals()),
-        *_findings_of_inputs(project, recordings, knowledge is not None, rig_path),
+        *_findings_of_inputs(project, recordings, knowledge is not None, file.calibration, rig_path),
     ]
     level = verdict(findings)
     day = today or project.date or datetime.date.today()
@@ -99,14 +100,14 @@ def calibrate_beams(
     return outcome
 
 
-def _calibrated_lab(project: Project, rig_path: Path) -> RigFile:
-    """Cameras and screens as calibrated, with the project's target."""
+def _calibrated_lab(project: Project, rig_path: Path) -> tuple[RigFile, RigCovariance | None]:
+    """Cameras and screens as calibrated, with the project's target, and what is known of their errors."""
     if not rig_path.is_file():
         raise InputError(
             f"{rig_path}: expected a rig.yaml with cameras and screens as calibrated, found none; run"
             f" `beampose calibrate screen {project.path}` first and give its rig.yaml with --rig"
         )
-    file = load_rig_file(rig_path)
+    file, knowledge = _lab_file(rig_path)
     for kind, asked, there in (
         ("camera", project.cameras, file.rig.cameras),
         ("screen", project.screens, file.rig.screens),
@@ -117,14 +118,28 @@ def _calibrated_lab(project: Project, rig_path: Path) -> RigFile:
                     f"{rig_path}: expected {kind} {name!r} of {project.path.name}, got {', '.join(there)}"
                     f"{did_you_mean(name, there)}; calibrate it first (`beampose calibrate screen`)"[:300]
                 )
+    if not project.beams and not file.rig.beams:
+        raise InputError(
+            f"{project.path}: target: expected beams and spots as drawn, got none; add them: their names, ends and"
+            " screens are needed, directions and points only roughly"
+        )
     if not project.beams:
-        return file
+        return file, knowledge
     for name, spot in project.spots.items():
         if spot.screen not in file.rig.screens:
             raise InputError(
                 f"{project.path}: target.spots.{name}.screen: expected a screen of {rig_path}, got {spot.screen!r}"
             )
-    return replace(file, rig=replace(file.rig, beams=project.beams, spots=project.spots))
+    return replace(file, rig=replace(file.rig, beams=project.beams, spots=project.spots)), knowledge
+
+
+def _lab_file(path: Path) -> tuple[RigFile, RigCovariance | None]:
+    """Cameras and screens of a rig.yaml or a screens.yaml, and what is known of their errors."""
+    if str(read_mapping(path).get("schema", "")).startswith("beampose/screens/"):
+        screens = load_screens(path)
+        return RigFile(screens.rig, {}, screens.calibration), screens.covariance
+    file = load_rig_file(path)
+    return file, joint_covariance(file.rig, file.covariances, path)
 
 
 def _stand(project: Project, recordings: Recordings) -> Stand:
@@ -137,9 +152,18 @@ def _stand(project: Project, recordings: Recordings) -> Stand:
 
 
 def _findings_of_inputs(
-    project: Project, recordings: Recordings, with_covariance: bool, rig_path: Path
+    project: Project, recordings: Recordings, with_covariance: bool, of_lab: CalibrationState | None, rig_path: Path
 ) -> list[Finding]:
     out = [Finding(Level.PASS, note) for note in recordings.notes]
+    if of_lab is not None and of_lab.verdict != Level.PASS.name:
+        out.append(
+            Finding(
+                Level[of_lab.verdict],
+                f"{rig_path.name} ends in {of_lab.verdict}: {'; '.join(of_lab.reasons) or 'no reason given'}",
+                "what is wrong with cameras and screens is wrong with the beams found by them",
+                "see the report beside it",
+            )
+        )
     if not with_covariance:
         out.append(
             Finding(
@@ -174,7 +198,9 @@ def _findings_of_inputs(
 def _rig_file(
     file: RigFile, c: BeamCalibration, project: Project, findings: Sequence[Finding], day: datetime.date
 ) -> RigFile:
-    until = None if project.valid_days is None else day + datetime.timedelta(days=project.valid_days)
-    reasons = tuple(f.what for f in findings if f.level > Level.PASS)
-    state = CalibrationState(day, verdict(findings).name, until, reasons, project.notes)
+    lab = file.calibration  # of cameras and screens: what they warn of, and when they end, holds for the whole
+    ends = [] if lab is None or lab.valid_until is None else [lab.valid_until]
+    ends += [] if project.valid_days is None else [day + datetime.timedelta(days=project.valid_days)]
+    reasons = [f.what for f in findings if f.level > Level.PASS]
+    state = CalibrationState(day, verdict(findings).name, min(ends, default=None), tuple(reasons), project.notes)
     return RigFile(c.rig, blocks_of(c.covariance), state)

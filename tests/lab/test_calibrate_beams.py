@@ -6,6 +6,7 @@ import csv
 import re
 import shutil
 from dataclasses import replace
+from datetime import date
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,9 @@ from geometry.rig_parameters import RigCovariance, rig_names
 from geometry.spots import SpotModel
 from lab.calibrate.beams import calibrate_beams
 from lab.calibrate.camera_file import CameraFile, save_camera
+from lab.calibrate.screens_file import ScreensFile, save_screens
 from lab.calibrate.still_frames import SpotRows, average, mean_of_frames, positions_at_rest
+from lab.calibration_state import CalibrationState
 from lab.errors import CalibrationError, InputError
 from lab.rig_covariance import blocks_of, joint_covariance
 from lab.rig_file import RigFile, as_mapping, load_rig_file, save_rig
@@ -348,3 +351,24 @@ def test_averages_keep_positions_and_views_apart():
     assert spots.position.tolist() == [0, 0, 1]
     assert spots.view.tolist() == [0, 3, 0]
     np.testing.assert_allclose(spots.pixels[:, 0], [2, 6, 9])
+
+
+def test_screens_alone_with_their_warnings_and_last_day_go_into_the_rig(campaign, tmp_path):
+    rig, project = campaign
+    lab = replace(rig, beams={}, spots={})
+    state = CalibrationState(date(2026, 3, 1), "WARN", date(2026, 4, 1), ("the left screen is bent by 2 mm",))
+    save_screens(ScreensFile("the lab", lab, lab_covariance(rig), state), tmp_path / "screens.yaml")
+    outcome = calibrate_beams(project, tmp_path / "out", tmp_path / "screens.yaml", date(2026, 3, 14))
+    assert outcome.level == Level.WARN
+    written = load_rig_file(tmp_path / "out" / "rig.yaml").calibration
+    assert (written.verdict, written.valid_until) == ("WARN", date(2026, 4, 1))  # sooner than the beams' own 90 days
+    assert "the left screen is bent by 2 mm" in written.reasons[0]
+
+
+def test_a_lab_and_a_project_without_beams_are_asked_for_them(campaign, tmp_path):
+    rig, project = campaign
+    save_screens(ScreensFile("the lab", replace(rig, beams={}, spots={}), None, None), tmp_path / "screens.yaml")
+    text = project.read_text()
+    project.write_text(text[: text.index("target:")] + text[text.index("recordings:") :])
+    with pytest.raises(InputError, match="target: expected beams and spots as drawn, got none; add them"):
+        calibrate_beams(project, tmp_path / "out", tmp_path / "screens.yaml")
