@@ -119,12 +119,10 @@ def _plane(plan: Plan, across: int, up: int) -> Section:
     short = [n.split("_")[0] for n in names]
     axis_names = [f"{s} ({n.split('_')[1]})" for s, n in zip(short, names, strict=True)]
     x_name, y_name = axis_names[across], axis_names[up]
-    fine = _slice(plan, names[across], names[up])
+    fine = fine_map(plan, across, up)
 
     def smooth(k: int, what: str, unit: str) -> Drawing:
-        values = 1e3 * fine.worst[:, k].reshape(_FINE, _FINE)
-        # The fine grid runs fastest in the later of the two coordinates.
-        values = values.T if across < up else values
+        values = 1e3 * fine[..., k]
         extent = (a.first, a.last, b.first, b.last)
         title = f"{what} sigma ({unit}), the others in the middle of their ranges"
         return Drawing(
@@ -169,13 +167,18 @@ def _limits(values: Array) -> tuple[float, float] | None:
     return float(finite.min()), 1.25 * float(finite.min())
 
 
-def _slice(plan: Plan, *free: str) -> Plan:
-    """The plan on a fine grid of two coordinates, the others at the middle of their ranges."""
+def fine_map(plan: Plan, across: int, up: int) -> Array:
+    """Position (m) and attitude (deg) sigma (rows, columns, 2) over two coordinates, the others in the middle.
+
+    Rows run over coordinate `up`, columns over `across`.
+    """
     fixed: dict[str, Any] = {
-        name: replace(r, count=_FINE) if name in free else Range(r.middle, r.middle, 1)
-        for name, r in plan.options.ranges.items()
+        name: replace(r, count=_FINE) if i in (across, up) else Range(r.middle, r.middle, 1)
+        for i, (name, r) in enumerate(plan.options.ranges.items())
     }
-    return plan_grid(plan.rig, plan.errors, plan.sources, replace(plan.options, **fixed))
+    fine = plan_grid(plan.rig, plan.errors, plan.sources, replace(plan.options, **fixed))
+    values = fine.worst.reshape(_FINE, _FINE, 2)  # the later of the two coordinates runs along the second axis
+    return np.swapaxes(values, 0, 1) if across < up else values
 
 
 def _gathered(plan: Plan, values: Array, across: int, up: int, how: str) -> Array:

@@ -163,6 +163,25 @@ def test_a_pose_counts_as_observable_where_the_solver_says_so(rig, errors):
         assert np.isfinite(b.condition[i]) == b.observable[i]
 
 
+def test_the_plan_is_the_covariance_that_the_solver_will_state(rig, errors):
+    """Also where some spots are out of the picture: their rows must say nothing, and neither must their errors."""
+    rng = np.random.default_rng(7)
+    model = SpotModel.of(rig)
+    poses = Pose.from_ypr(np.deg2rad(rng.uniform(-25, 25, (30, 3))), rng.uniform(-0.5, 0.5, (30, 3)))
+    b = budget_of(rig, errors).of(poses)
+    partly = [i for i in range(30) if b.observable[i] and not b.seen[i].all() and b.condition[i] < 30]
+    assert len(partly) >= 5
+    for i in partly:
+        rows = np.flatnonzero(b.seen[i])
+        covariances = np.broadcast_to(SIGMA_PX**2 * np.eye(2), (len(rows), 2, 2))
+        spread = CalibrationSpread(rig, model, RigCovariance(errors.names, errors.covariance))
+        fit = fit_pose(model, rows, b.pixels[i][rows], covariances, poses[i], calibration=spread)
+        np.testing.assert_allclose(b.total[i], fit.covariance, rtol=1e-4, atol=1e-4 * np.abs(fit.covariance).max())
+        np.testing.assert_allclose(
+            b.groups[i].sum(axis=0), fit.systematic, rtol=1e-3, atol=1e-4 * np.abs(fit.covariance).max()
+        )
+
+
 def test_a_spot_near_the_edge_is_not_counted(rig, errors):
     wide, near = (budget_of(rig, errors, edge).of(stacked(Pose.identity())) for edge in (0.0, 250.0))
     gap = np.min(np.minimum(wide.pixels + 0.5, SpotModel.of(rig).image_size_px - 0.5 - wide.pixels), axis=-1)
@@ -242,3 +261,13 @@ def test_what_the_rig_file_states_of_a_group_stands_in_place_of_what_is_assumed(
     whole, sources = expected_errors(rig, ExpectedErrors(), stated, whole=True)
     assert set(sources) == {BEAM_DIRECTIONS}
     assert np.count_nonzero(whole.covariance) == 9
+
+
+def test_a_beam_is_not_said_to_err_along_itself(rig):
+    errors, _ = expected_errors(rig, ExpectedErrors())
+    for name, beam in rig.beams.items():
+        for kind in ("direction_", "point_"):
+            place = [errors.names.index(f"beams.{name}.{kind}{a}{'_m' if kind == 'point_' else ''}") for a in "xyz"]
+            C = errors.covariance[np.ix_(place, place)]
+            assert beam.direction @ C @ beam.direction == pytest.approx(0, abs=1e-12 * np.trace(C))
+            assert np.linalg.matrix_rank(C / np.trace(C), tol=1e-9) == 2

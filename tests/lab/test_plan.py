@@ -21,6 +21,7 @@ from lab.plan_grid import AXES, NOISE, STATUS, plan_grid
 from lab.plan_options import PlanOptions, Range, poses_of
 from lab.plan_tables import effect_columns, plan_columns
 from lab.report.plan_drawings import cell_map, share_bars
+from lab.report.plan_page import fine_map
 from lab.rig_file import RigFile, load_rig_file, save_rig
 from tests.geometry.scenes import LENSES, paper_rig
 
@@ -222,6 +223,30 @@ def test_the_same_plan_in_pieces_of_any_size(rig_path, monkeypatch):
     for name in ("sigma", "parts", "worst_parts", "effect_median", "thing_largest", "margin_px"):
         np.testing.assert_allclose(getattr(pieces, name), getattr(whole, name), rtol=1e-5, atol=1e-12)
     assert len(AXES) == whole.sigma.shape[1]
+
+
+@pytest.mark.parametrize(("across", "up"), [(3, 4), (4, 3), (0, 3)])
+def test_a_smooth_map_has_its_coordinates_where_the_axes_say(across, up, rig_path):
+    plan = plan_of(rig_path, SMALL)
+    values = fine_map(plan, across, up)
+    ranges = list(SMALL.ranges.items())
+    for row, column in ((0, -1), (-1, 0)):
+        place = {name: Range(r.middle, r.middle, 1) for name, r in ranges}
+        for i, end in ((across, column), (up, row)):
+            name, r = ranges[i]
+            place[name] = Range(*2 * (r.values()[end],), 1)
+        alone = plan_of(rig_path, replace(SMALL, **place))
+        np.testing.assert_allclose(values[row, column], alone.worst[0], rtol=1e-9)
+    assert abs(values[0, -1, 1] / values[-1, 0, 1] - 1) > 1e-4  # so that a swap would show
+
+
+def test_a_pose_too_vague_for_a_run_is_not_called_measured(rig_path):
+    plan = plan_of(rig_path, replace(SMALL, sigma_px=200.0))
+    assert {STATUS[i] for i in plan.status} == {"vague"}
+    assert plan.observable.all()
+    first = findings(plan)[0]
+    assert "0 are not observable, 162 too vague to count as measured" in first.what
+    assert first.level is Level.FAIL
 
 
 def test_directions_read_as_words():
