@@ -11,7 +11,7 @@ import numpy as np
 from geometry.arrays import Array
 from lab.calibrate.daily_expected import Compared
 from lab.calibrate.daily_history import HistoryRow
-from lab.calibrate.daily_result import CameraDrift, DailyLimits, OtherChange, Outcome
+from lab.calibrate.daily_result import CameraDrift, DailyLimits, OtherChange, Outcome, is_weak
 from lab.calibrate.daily_words import size, told
 from lab.report.calibration_charts import DriftLine, drift_chart
 from lab.report.calibration_drawings import corners_overlay
@@ -63,6 +63,8 @@ def _key_figures(
     for c in cameras:
         value = f"{short(c.drift_px)} px · {short(c.drift_mm)} mm"
         state = told(c) if c.change is not None else f"by noise alone {short(c.noise_px, 2)} px"
+        if c.change is None and is_weak(c.detectable_mm, limits):
+            state = f"a weak check: shifts below {short(c.detectable_px, 2)} px can hide"
         out.append((f"drift of camera {c.camera}", value, state))
     if file.calibration is not None:
         until = file.calibration.valid_until

@@ -105,7 +105,7 @@ def provenance(inputs: Iterable[Path] = (), made: date | None = None) -> Provena
     try:
         version = metadata.version("beampose")
     except metadata.PackageNotFoundError:  # run from a checkout that was never installed
-        version = "not installed"
+        version = "not installed as a package"
     lines = []
     for path in inputs:
         try:
