@@ -50,6 +50,7 @@ class Measured:
     spots: SpotPixels
     stand: Stand
     beams: Values  # of the single step: "beams", "stand", "poses"
+    held_screen: int | None = None  # whose frame is the world's, where there is no survey
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,13 +138,16 @@ def free_of(measured: Measured) -> dict[str, bool | Bools]:
     bow[sorted(network.bent)] = True
     lens = np.zeros((len(network.rig.cameras), 18), dtype=bool) if network.lens_free is None else network.lens_free
     count = len(stand.stand_from_body.translation)
+    screens = np.ones((len(network.rig.screens), 6), dtype=bool)
+    if measured.held_screen is not None:
+        screens[measured.held_screen] = False
     place: bool | Bools = True
     if stand.stand_covariance is not None:
         place = np.diagonal(stand.stand_covariance)[None] > 0
     return {
         INTRINSICS: lens,
         CAMERAS: True,
-        SCREENS: True,
+        SCREENS: screens,
         BOWS: bow,
         "points": True,
         "boards": True,

@@ -2,7 +2,7 @@
 
 For a group g of whitened residuals v with Jacobian J and the covariance C of all unknowns, A_g = J^T J is what the
 group knows. v spreads as Q = I - J C J^T: its squared length is tr(Q) on average, the group's redundancy, with a
-variance of 2 tr(Q^2). Of C itself the group makes C A_g C, and over all groups these sum up to C, since C is the inverse of
+variance of 2 tr(Q^2). Of C itself the group makes C A_g C, and over all groups these sum up to C, the inverse of
 the sum of all A_g. Source: Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sections 4.2.4 and 4.6.2;
 the test by a scaled chi-square of the same two moments is Satterthwaite's (1946), Biometrics Bulletin 2(6).
 """

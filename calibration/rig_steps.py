@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from calibration.adjustment import AdjustmentError
 from calibration.beams import BeamCalibration, Stand, calibrate_beams
 from calibration.joint import Joint, Measured, calibrate_jointly
 from calibration.network import Network
@@ -40,6 +41,12 @@ def calibrate_in_steps(
     """
     screens = calibrate(network, setups, near, held_screen)
     beams = calibrate_beams(screens.fit.rig, spots, stand, screens.fit.covariance, nominal=nominal)
+    if beams.undetermined:
+        raise AdjustmentError(
+            f"the stand's positions leave undetermined: {'; '.join(beams.undetermined)} ({beams.motion}):"
+            f" {beams.motion.cure()}"
+        )
     found = beams.fit.adjusted.values
-    measured = Measured(screens.network, screens.fit, spots, stand, {n: found[n] for n in (BEAMS, STAND, POSES)})
+    starts = {n: found[n] for n in (BEAMS, STAND, POSES)}
+    measured = Measured(screens.network, screens.fit, spots, stand, starts, held_screen)
     return RigSteps(screens, beams, measured, calibrate_jointly(measured))

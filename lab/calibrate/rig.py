@@ -1,0 +1,222 @@
+"""`beampose calibrate rig`: lenses, cameras, screens and beams together, from everything that a project measured."""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from calibration.adjustment import AdjustmentError
+from calibration.beam_findings import BeamGoals, beam_findings
+from calibration.beams import Stand
+from calibration.findings import Finding, Level, verdict
+from calibration.joint_findings import RigLimits, in_degrees, in_mm, joint_findings
+from calibration.network_findings import ScreenLimits
+from calibration.network_findings import findings as network_findings
+from calibration.rig_figures import ExpectedPose, HoldOut, central_pose, expected_pose, hold_out, spot_sigma
+from calibration.rig_steps import RigSteps, calibrate_in_steps
+from geometry.rig import Rig
+from lab.calibrate.project import Project, load_project
+from lab.calibrate.recordings import Recordings, read_recordings
+from lab.calibrate.rig_tables import RESIDUALS, write_residuals
+from lab.calibrate.screen_inputs import ScreenInputs, screen_inputs
+from lab.calibration_state import CalibrationState
+from lab.errors import CalibrationError, InputError
+from lab.rig_covariance import blocks_of
+from lab.rig_file import RigFile, save_rig
+from lab.whole_folder import whole_folder
+
+RIG = "rig.yaml"
+_ANY_FIT = ScreenLimits(np.inf, np.inf, factor_warn=np.inf, factor_fail=np.inf)
+_ANY_SIGMA = BeamGoals(direction=np.inf, direction_unusable=np.inf, wrong_share=np.inf, noise_scale=np.inf)
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """How the calibration of a rig ended."""
+
+    name: str
+    out: Path  # where the results are; beside the folder asked for where a FAIL would have replaced a good one
+    level: Level
+    findings: tuple[Finding, ...]
+    steps: RigSteps
+    expected: ExpectedPose | None
+    held_out: HoldOut | None
+
+    @property
+    def exit_status(self) -> int:
+        """0, or 3 where the calibration must not be used."""
+        return CalibrationError.exit_status if self.level == Level.FAIL else 0
+
+    def line(self) -> str:
+        """One line for the terminal."""
+        rig = self.steps.joint.rig
+        what = f"{len(rig.cameras)} cameras, {len(rig.screens)} screens, {len(rig.beams)} beams"
+        if self.expected is not None:
+            what += f"; one frame: {in_degrees(self.expected.total):.2g} deg, {in_mm(self.expected.total):.2g} mm"
+        if self.held_out is not None:
+            deg, mm = np.rad2deg(self.held_out.attitude_rms), 1e3 * self.held_out.position_rms
+            what += f"; held out: {deg:.2g} deg, {mm:.2g} mm"
+        worst = max(self.findings, key=lambda f: f.level)
+        reason = "" if self.level == Level.PASS else f": {worst.what}"
+        return f"{self.name}: {self.level.name}: {what}{reason} -> {self.out}"
+
+
+def calibrate_rig(
+    project_path: Path, out: Path, today: datetime.date | None = None, limits: RigLimits | None = None
+) -> Outcome:
+    """Calibrate a whole rig; writes rig.yaml, residuals.csv and report.html into the folder `out`.
+
+    rig.yaml carries the joint covariance of everything (in the target's block; excerpts at cameras and screens) and the
+    verdict, so that a run refuses a FAIL. A FAIL does not replace an earlier calibration: it goes to `OUT-failed`.
+    Raises InputError for what is wrong with the files, CalibrationError where the measurements give no calibration at
+    all; nothing is then written.
+    """
+    project = load_project(Path(project_path))
+    if not project.beams or not project.spots:
+        raise InputError(
+            f"{project.path}: target: expected beams and spots as designed, got none; add them, or calibrate the"
+            " screens alone (`beampose calibrate screen`)"
+        )
+    inputs = screen_inputs(project)
+    rig = replace(inputs.network.rig, beams=project.beams, spots=project.spots)
+    recordings = _recordings(project, rig, inputs)
+    steps = _solved(project, replace(inputs, network=replace(inputs.network, rig=rig)), recordings)
+    joint = steps.joint
+    expected = expected_pose(joint, central_pose(joint), spot_sigma(joint))
+    try:
+        held_out = hold_out(steps.measured, joint)
+    except AdjustmentError:
+        held_out = None
+    day = today or project.date or datetime.date.today()
+    findings = [
+        *joint_findings(steps, recordings.names, expected, held_out, limits or RigLimits()),
+        *_of_the_steps(steps, rig, recordings.names),
+        *_of_the_inputs(project, recordings, inputs, day),
+    ]
+    level = verdict(findings)
+    folder = Path(out)
+    if level == Level.FAIL and (folder / RIG).is_file():
+        folder = folder.with_name(f"{folder.name}-failed")
+    outcome = Outcome(project.name, folder, level, tuple(findings), steps, expected, held_out)
+    with whole_folder(folder, may_replace=lambda f: (f / RESIDUALS).is_file()) as work:
+        save_rig(_rig_file(outcome, project, day), work / RIG)
+        write_residuals(steps, recordings.names, work / RESIDUALS)
+        from lab.calibrate.rig_page import write_page  # the template engine: only for those who write a report
+
+        write_page(outcome, rig, recordings, project.inputs, day, work)
+    return outcome
+
+
+def _recordings(project: Project, rig: Rig, inputs: ScreenInputs) -> Recordings:
+    """The recordings with their positions. Frames of runs are labelled by cameras as they stand after a first look."""
+    lab = rig
+    if any(r.run is not None for r in project.recordings):
+        from calibration.screens import calibrate
+
+        try:
+            found = calibrate(inputs.network, inputs.setups, inputs.near, inputs.held_screen).fit.rig
+        except (AdjustmentError, ValueError) as error:
+            raise CalibrationError(f"{project.path}: cameras and screens cannot be calibrated: {error}") from None
+        lab = replace(found, beams=rig.beams, spots=rig.spots)
+    recordings = read_recordings(project, lab)
+    if recordings.stand_from_body is None:
+        raise InputError(
+            f"{project.path}: recordings: expected poses of the stand, got none; add `poses` to each recording, or find"
+            " the angles between the beams alone (`beampose calibrate beams`)"
+        )
+    return recordings
+
+
+def _solved(project: Project, inputs: ScreenInputs, recordings: Recordings) -> RigSteps:
+    try:
+        return calibrate_in_steps(
+            inputs.network,
+            inputs.setups,
+            recordings.spots,
+            _stand(project, recordings),
+            inputs.near,
+            inputs.held_screen,
+        )
+    except (AdjustmentError, ValueError) as error:
+        raise CalibrationError(f"{project.path}: the rig cannot be calibrated: {error}") from None
+
+
+def _stand(project: Project, recordings: Recordings) -> Stand:
+    assert recordings.stand_from_body is not None
+    stand = project.stand
+    if stand is None or stand.world_from_stand is None:
+        return Stand(recordings.stand_from_body, recordings.pose_sigmas, None, None)
+    covariance = np.diag([stand.sigma_m**2] * 3 + [stand.sigma_rad**2] * 3)
+    return Stand(recordings.stand_from_body, recordings.pose_sigmas, stand.world_from_stand, covariance)
+
+
+def _of_the_steps(steps: RigSteps, drawing: Rig, positions: Sequence[str]) -> list[Finding]:
+    """What the single steps warn of in the measurements; how well they fit is the joint adjustment's to say."""
+    out = network_findings(steps.screens, _ANY_FIT) + beam_findings(steps.beams, drawing, positions, _ANY_SIGMA)
+    return [f for f in out if f.level > Level.PASS]
+
+
+def _of_the_inputs(project: Project, recordings: Recordings, inputs: ScreenInputs, day: datetime.date) -> list[Finding]:
+    out = [Finding(Level.PASS, note) for note in (*inputs.notes, *recordings.notes)]
+    for name, camera in project.cameras.items():
+        state = camera.lens.calibration
+        if state is not None and state.verdict == "FAIL":
+            why = f": {state.reasons[0]}" if state.reasons else ""
+            out.append(
+                Finding(
+                    Level.FAIL,
+                    f"camera {name!r}: {camera.lens_path.name} says FAIL of its lens{why}",
+                    "a lens that is wrong bends every measurement",
+                    "calibrate the lens again (`beampose calibrate camera`)",
+                )
+            )
+        if state is not None and state.valid_until and state.valid_until < day.isoformat():
+            out.append(
+                Finding(
+                    Level.WARN,
+                    f"camera {name!r}: {camera.lens_path.name} held until {state.valid_until}",
+                    "lenses move with time and temperature",
+                    "calibrate the lens again (`beampose calibrate camera`)",
+                )
+            )
+        if camera.lens.covariance is None:
+            out.append(
+                Finding(
+                    Level.WARN,
+                    f"camera {name!r}: {camera.lens_path.name} holds no covariance: its lens is taken as exact",
+                    "the sigmas of everything are too small by what the lens is wrong",
+                    "calibrate the lens with beampose, which writes its covariance",
+                )
+            )
+    stand = project.stand
+    if stand is not None and stand.world_from_stand is not None and stand.sigma_m == 0 and stand.sigma_rad == 0:
+        out.append(
+            Finding(
+                Level.WARN,
+                "stand.world_from_stand has no sigma: it is taken as exact",
+                "its error goes into the boresight of all beams unseen",
+                "give stand.sigma_m and stand.sigma_deg, or leave world_from_stand out and let it be found",
+            )
+        )
+    if not np.any(recordings.pose_sigmas):
+        out.append(
+            Finding(
+                Level.PASS,
+                "the stand's positions are taken as exact; give stand.pose_sigma_m and pose_sigma_deg where its"
+                " encoders are not much better than the spots",
+            )
+        )
+    return out
+
+
+def _rig_file(outcome: Outcome, project: Project, day: datetime.date) -> RigFile:
+    joint = outcome.steps.joint
+    until = None if project.valid_days is None else day + datetime.timedelta(days=project.valid_days)
+    worst_first = sorted(outcome.findings, key=lambda f: -f.level)
+    reasons = tuple(f.what for f in worst_first if f.level > Level.PASS)
+    state = CalibrationState(day, outcome.level.name, until, reasons, project.notes)
+    return RigFile(joint.rig, blocks_of(joint.covariance), state)
