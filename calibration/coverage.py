@@ -22,7 +22,7 @@ class Coverage:
 
     filled: float  # share of the picture's area within the corners of some view
     gaps: tuple[str, ...]  # sides and corners of the picture that no board came near
-    tilt_deg: Array  # (V,): of the board's normal against the line of sight to it; nan where not used
+    tilt_deg: Array  # (V,): of the board's normal against the optical axis; nan where not used
     azimuth_deg: Array  # (V,): towards which it leaned
     spread_deg: float  # the largest angle between two boards' normals
 
@@ -31,9 +31,7 @@ def coverage_of(table: CornerTable, used: Bools, camera_from_board: Pose) -> Cov
     """Of the used corners (N,), with the V poses of the board."""
     in_use = table.counts(used) > 0
     normals = camera_from_board.rotation[..., 2]
-    middles = camera_from_board.apply(table.middle)
-    sight = middles / np.linalg.norm(middles, axis=-1, keepdims=True)
-    tilt = np.degrees(np.arccos(np.clip(np.sum(normals * sight, axis=-1), -1, 1)))
+    tilt = np.degrees(np.arccos(np.clip(normals[:, 2], -1, 1)))
     azimuth = np.degrees(np.arctan2(normals[:, 1], normals[:, 0]))
     return Coverage(
         filled=_filled(table, used),

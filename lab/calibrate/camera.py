@@ -1,0 +1,188 @@
+"""`calibrate camera`: photographs of a board in, camera.yaml with its covariance and a report out."""
+
+from __future__ import annotations
+
+import csv
+import datetime
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from calibration.boards import Board
+from calibration.corner_table import CornerTable
+from calibration.findings import Level
+from calibration.intrinsics import FEWEST_VIEWS, IntrinsicsError, IntrinsicsOptions, calibrate_intrinsics
+from calibration.intrinsics_result import Intrinsics
+from calibration.lens_models import LADDER, named
+from geometry.camera import FISHEYE, PERSPECTIVE
+from lab.calibrate.board_file import board_of
+from lab.calibrate.camera_file import CameraCalibration, CameraFile, save_camera
+from lab.calibrate.photos import PhotoSet, Progress, find_in_photos
+from lab.camera_block import Covariance
+from lab.errors import CalibrationError, InputError
+from lab.whole_folder import whole_folder
+from lab.yaml_text import did_you_mean
+
+CAMERA, FAILED, CORNERS = "camera.yaml", "camera.failed.yaml", "corners.csv"
+CORNER_COLUMNS = ("view", "id", "u_px", "v_px", "residual_u_px", "residual_v_px", "used")  # residual: found less model
+LENSES = ("auto", *(m.title for m in LADDER))
+WARPS = {"auto": None, "on": True, "off": False}
+
+
+@dataclass(frozen=True, slots=True)
+class CameraOptions:
+    """What the user may decide."""
+
+    name: str = "camera"
+    distance_m: float | None = None  # of the screen, for figures in mm; None: the median distance of the boards
+    valid_days: int | None = 365  # after that a run warns; None: for ever. A year: mounts and lenses creep
+    folds: int | None = None  # of the hold-out; None: five, or one view each up to ten views
+    lens: str = "auto"  # or 0, 4, 5, 8, 12, fisheye: the model, whatever the hold-out says
+    warp: str = "auto"  # or on, off: whether the board's bend is solved for
+
+    def __post_init__(self) -> None:
+        if self.lens not in LENSES:
+            raise InputError(f"lens: expected {', '.join(LENSES)}, got {self.lens!r}{did_you_mean(self.lens, LENSES)}")
+        if self.warp not in WARPS:
+            raise InputError(f"warp: expected {', '.join(WARPS)}, got {self.warp!r}{did_you_mean(self.warp, WARPS)}")
+        if self.distance_m is not None and not (np.isfinite(self.distance_m) and self.distance_m > 0):
+            raise InputError(f"distance: expected metres above 0, got {self.distance_m:g}")
+        if self.folds is not None and self.folds < 2:
+            raise InputError(f"folds: expected 2 or more, got {self.folds}")
+        if self.valid_days is not None and self.valid_days < 1:
+            raise InputError(f"valid days: expected 1 or more, got {self.valid_days}")
+
+    def intrinsics(self) -> IntrinsicsOptions:
+        """The same for the solve."""
+        lens = None if self.lens == "auto" else named(self.lens)
+        return IntrinsicsOptions(self.distance_m, lens, WARPS[self.warp], self.folds)
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """How a camera's calibration ended."""
+
+    name: str
+    out: Path
+    result: Intrinsics
+    photos: PhotoSet
+
+    @property
+    def level(self) -> Level:
+        """The verdict."""
+        return self.result.verdict
+
+    @property
+    def exit_status(self) -> int:
+        """0, or 3 where the calibration must not be used."""
+        return CalibrationError.exit_status if self.level == Level.FAIL else 0
+
+    def line(self) -> str:
+        """One line for the terminal."""
+        r = self.result
+        worst = max(r.findings, key=lambda f: f.level)
+        reason = "" if self.level == Level.PASS else f": {worst.what.rstrip('.')}"
+        px, mm = (np.nanmedian(m) for m in (r.map.sigma_px(r.covariance), r.map.sigma_mm(r.covariance)))
+        return (
+            f"{self.name}: {self.level.name}: fx {r.fit.lens[0]:.2f} ± {r.sigmas[0]:.2g} px, {r.model.words}, RMS"
+            f" {r.rms_px:.3f} px, directions to {px:.2g} px / {mm:.2g} mm at {r.distance_m:.3g} m{reason} -> {self.out}"
+        )
+
+
+def calibrate_camera(
+    photos: Iterable[Path | str],
+    board: Board | str | Path,
+    out: Path,
+    options: CameraOptions | None = None,
+    today: datetime.date | None = None,
+    progress: Progress | None = None,
+) -> Outcome:
+    """Calibrate a camera from photographs (files, folders, patterns, videos) of a board (value, text or board.yaml).
+
+    Writes camera.yaml (camera.failed.yaml where the verdict is FAIL, so that nothing reads it by mistake), corners.csv
+    and report.html into the folder `out`, whole or not at all. Raises InputError for pictures or a board that cannot
+    be used, CalibrationError where the photographs do not determine the camera.
+    """
+    options = options or CameraOptions()
+    day = today or datetime.date.today()
+    known = board_of(board) if isinstance(board, str | Path) else board
+    found = find_in_photos(photos, known, progress, fewest=FEWEST_VIEWS)
+    table = CornerTable.of([(v.ids, v.pixels) for _, v in found.views], known.points, known.middle, found.image_size_px)
+    try:
+        result = calibrate_intrinsics(table, options.intrinsics())
+    except IntrinsicsError as error:
+        raise CalibrationError(f"{options.name} ({found.line()}): {error}") from None
+    outcome = Outcome(options.name, Path(out), result, found)
+    file = camera_file(outcome, options, day)
+    with whole_folder(Path(out), may_replace=lambda folder: (folder / CORNERS).is_file()) as work:
+        save_camera(file, work / (FAILED if outcome.level == Level.FAIL else CAMERA))
+        _write_corners(outcome, work / CORNERS)
+        from lab.calibrate.camera_page import write_page  # the template engine: only for those who write a report
+
+        write_page(outcome, file, day, work)
+    return outcome
+
+
+def camera_file(outcome: Outcome, options: CameraOptions, day: datetime.date) -> CameraFile:
+    """What camera.yaml holds."""
+    r = outcome.result
+    until = "" if options.valid_days is None else (day + datetime.timedelta(days=options.valid_days)).isoformat()
+    calibration = CameraCalibration(
+        date=day.isoformat(),
+        verdict=outcome.level.name,
+        rms_px=r.rms_px,
+        sigma_px=r.fit.sigma_px,
+        hold_out_rms_px=r.held.rms_px,
+        views=int(np.sum(r.table.counts(r.fit.used) > 0)),
+        corners=int(r.fit.used.sum()),
+        board=outcome.photos.board.describe(),
+        distance_m=r.distance_m,
+        valid_until=until,
+        reasons=tuple(f"{f.level.name}: {f.what}" for f in r.findings if f.level > Level.PASS),
+        figures=figures_of(r),
+    )
+    return CameraFile(
+        name=outcome.name,
+        image_size_px=r.table.image_size_px,
+        camera_matrix=r.matrix,
+        distortion=r.distortion,
+        lens=FISHEYE if r.model.fisheye else PERSPECTIVE,
+        covariance=Covariance(r.parameters, r.covariance),
+        calibration=calibration,
+    )
+
+
+def figures_of(r: Intrinsics) -> dict[str, float]:
+    """Further key figures of camera.yaml, by name with unit."""
+    px, mm = r.map.sigma_px(r.covariance), r.map.sigma_mm(r.covariance)
+    out = {
+        "uncertainty_median_px": float(np.nanmedian(px)),
+        "uncertainty_worst_px": float(np.nanmax(px)),
+        "uncertainty_median_mm": float(np.nanmedian(mm)),
+        "uncertainty_worst_mm": float(np.nanmax(mm)),
+        "scatter_between_photographs": r.scatter.factor,
+        "sigmas_raised_by": r.correlated_noise,
+        "picture_covered": r.coverage.filled,
+        "tilts_differ_by_deg": r.coverage.spread_deg,
+    }
+    if r.halves is not None:
+        out |= {"halves_differ_px": r.halves.rms_px, "halves_expected_px": r.halves.expected_rms_px}
+    if r.warp is not None:
+        out |= {"board_bend_mm": 1000 * r.warp.rise_m, "board_bend_corrected": float(r.warp.corrected)}
+    return out
+
+
+def _write_corners(outcome: Outcome, path: Path) -> None:
+    """A row per corner; residuals are empty in views that were left out."""
+    r, names = outcome.result, [name for name, _ in outcome.photos.views]
+    ids = outcome.photos.board.ids
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(CORNER_COLUMNS)
+        for k in range(len(r.table)):
+            miss = ["" if np.isnan(v) else f"{-v:.4f}" for v in r.fit.residuals[k].tolist()]
+            u, v = r.table.pixels[k].tolist()
+            point = int(ids[r.table.point[k]])
+            writer.writerow([names[r.table.view[k]], point, f"{u:.4f}", f"{v:.4f}", *miss, int(r.fit.used[k])])
