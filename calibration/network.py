@@ -17,7 +17,7 @@ from calibration.adjustment import Adjusted, At, Cauchy, Term, Values, solve
 from calibration.board_on_screen import BoardOnScreenTerm
 from calibration.corners import CornerTerm
 from calibration.flatness import smallest_scatter
-from calibration.priors import Prior
+from calibration.priors import Prior, independent
 from calibration.rig_stacks import named_errors, rig_of, stacks_of
 from calibration.stacks import Poses, Vectors
 from calibration.surveyed import FrameTerm, PointTerm, SurfaceTerm, SurveyTerm, array_of, whitening
@@ -28,6 +28,7 @@ from geometry.rig import Rig
 from geometry.rig_parameters import RigCovariance
 
 OUTLIER_SIGMAS = 5.0  # in two dimensions one right point of 270 000 lies farther off
+WARP_SIGMA_M = 1e-3  # by how much a board may be bent at its edge
 SIGNIFICANT = 0.001  # chance at which measurements that fit their sigmas are called worse than these
 
 
@@ -83,8 +84,9 @@ class Start:
     world_from_screen: Pose  # a stack, one per screen: its axes within the plane stay as they are here
     world_from_board: Pose  # a stack, one per placement
     bow: Array  # (screens, 3), 1/m
-    held_camera: int | None = None  # the camera or the screen whose pose is the world's, where no survey is
-    held_screen: int | None = None
+    # Where no survey gives the world: the camera, or the place of the board fixed to a screen, that stays where it is.
+    held_camera: int | None = None
+    held_board: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,25 +103,20 @@ class NetworkFit:
     sighting_sigmas: Array  # (n,): their length in sigmas
     used: Bools  # (n,) sightings
     dot_shifts_m: Array  # (p, 3): adjusted less surveyed
+    corners: CornerTerm | None  # those that were used, with the sigma that their residuals show
     corner_errors_px: Array  # (corners, 2): measured less predicted
-    corner_sigma_px: float  # of one coordinate of a corner, as its residuals say; nan without corners
     adjusted: Adjusted
 
 
-def adjust(network: Network, start: Start, corner_sigma_px: float | None = None) -> NetworkFit:
+def adjust(network: Network, start: Start) -> NetworkFit:
     """The one adjustment of everything.
 
-    Sightings that lie more than 5 sigmas off what the others say are left out; corners weigh by what their residuals
-    show (corner_sigma_px where given). Raises AdjustmentError where the start is too far off or something is not
+    Sightings and corners that lie more than 5 sigmas off what the others say are left out; corners weigh by what their
+    residuals show. Raises AdjustmentError where the start is too far off or something is not
     determined.
     """
-    corners = network.corners
     values, free, at = _unknowns(network, start)
-    sigma = corner_sigma_px
-    if corners is not None and sigma is None:
-        sigma = _corner_sigma(network, start, values, free)
-    if corners is not None and sigma is not None:
-        corners = replace(corners, sigma_px=np.full(len(corners), sigma))
+    corners = None if network.corners is None else _weighed_corners(network, start, values, free)
     rest = _terms_but_sightings(network, start, corners)
     used = np.ones(len(network.sightings), dtype=bool)
     robust = solve(values, [_point_term(network, used, Cauchy()), *rest], free)
@@ -131,7 +128,7 @@ def adjust(network: Network, start: Start, corner_sigma_px: float | None = None)
             break
         used = now
         found = solve(found.values, [_point_term(network, used), *rest], free)
-    return _fit(network, found, at, used, corners, sigma)
+    return _fit(network, found, at, used, corners)
 
 
 def _unknowns(network: Network, start: Start) -> tuple[Values, dict[str, bool | Bools], list[At]]:
@@ -145,20 +142,21 @@ def _unknowns(network: Network, start: Start) -> tuple[Values, dict[str, bool | 
     values["warp"] = Vectors(np.zeros((count, 3)))
     n_cameras, n_screens = len(rig.cameras), len(rig.screens)
     cameras = np.ones((n_cameras, 6), dtype=bool)
-    screens = np.ones((n_screens, 6), dtype=bool)
     bow = np.zeros((n_screens, 3), dtype=bool)
     bow[sorted(network.bent)] = True
     if start.held_camera is not None:
         cameras[start.held_camera] = False
-    if start.held_screen is not None:
-        screens[start.held_screen] = False
+    boards = np.ones((len(start.world_from_board.translation), 6), dtype=bool)
+    if start.held_board is not None:
+        boards[start.held_board] = False
     lens = np.zeros((n_cameras, 18), dtype=bool) if network.lens_free is None else network.lens_free
     free: dict[str, bool | Bools] = {
         "cameras": cameras,
-        "screens": screens,
+        "screens": True,
         "bow": bow,
         "points": True,
-        "boards": True,
+        "boards": boards,
+        "warp": True,
         "intrinsics": lens,
     }
     at: list[At] = [(s, i) for i in range(n_cameras) for s in ("intrinsics", "cameras")]
@@ -182,10 +180,18 @@ def _terms_but_sightings(network: Network, start: Start, corners: CornerTerm | N
     if len(network.rig.screens):
         out.append(FrameTerm(np.arange(len(network.rig.screens)), start.world_from_screen))
     if corners is not None:
-        out.append(corners)
+        out += [corners, *_flat_boards(corners)]
     if network.fixed is not None:
         out.append(network.fixed)
     return out
+
+
+def _flat_boards(corners: CornerTerm) -> Sequence[Prior]:
+    """That boards are flat to a millimetre or so; how they are bent is found with the rest."""
+    count = int(corners.board.max(initial=-1)) + 1
+    half = np.array([np.max(np.abs(corners.from_middle[corners.board == b]), initial=1e-2) for b in range(count)])
+    sigmas = np.repeat((WARP_SIGMA_M / half**2)[:, None], 3, axis=1)
+    return independent("warp", Vectors(np.zeros((count, 3))), sigmas)
 
 
 def _point_term(network: Network, used: Bools, loss: Cauchy | None = None) -> PointTerm:
@@ -240,23 +246,33 @@ def _inliers(network: Network, values: Values, used: Bools) -> Bools:
     return off < OUTLIER_SIGMAS * scale
 
 
-def _corner_sigma(network: Network, start: Start, values: Values, free: Mapping[str, bool | Bools]) -> float:
-    """Sigma of a corner's coordinate, px, that makes its residuals as large as they should be."""
-    corners = network.corners
-    assert corners is not None
-    term = replace(corners, loss=Cauchy())
+def _weighed_corners(network: Network, start: Start, values: Values, free: Mapping[str, bool | Bools]) -> CornerTerm:
+    """The corners that agree with the others, each with the sigma that their residuals show."""
+    term = replace(network.corners, loss=Cauchy()) if network.corners is not None else None
+    assert term is not None
     everything = [
         _point_term(network, np.ones(len(network.sightings), dtype=bool), Cauchy()),
         *_terms_but_sightings(network, start, term),
     ]
     found = solve(values, everything, free)
-    index = next(i for i, t in enumerate(everything) if t is term)
-    residuals, weights = found.residuals[index], found.weights[index]
+    residuals = found.residuals[next(i for i, t in enumerate(everything) if t is term)]
+    length = np.linalg.norm(residuals, axis=1)
+    # The median of a two-dimensional Gaussian's length is 1.177 sigmas.
+    good = length < OUTLIER_SIGMAS * float(np.median(length)) / 1.177
     # Each placement takes six numbers of the corners, each camera of a chain six more.
     spent = 6 * (len(network.placements) + len(network.rig.cameras) - 1)
-    dof = max(residuals.size - spent, residuals.size // 4)
-    chi2 = float(np.sum(weights[:, None] * residuals**2))
-    return float(np.median(corners.sigma_px)) * max(np.sqrt(chi2 / dof), 0.1)
+    dof = max(2 * int(good.sum()) - spent, int(good.sum()) // 2)
+    factor = max(float(np.sqrt(np.sum(residuals[good] ** 2) / dof)), 0.1)
+    return CornerTerm(
+        term.pixels[good],
+        term.points[good],
+        term.from_middle[good],
+        term.camera[good],
+        term.placement[good],
+        term.board[good],
+        term.sigma_px[good] * factor,
+        term.fisheye,
+    )
 
 
 def _fit(
@@ -265,7 +281,6 @@ def _fit(
     at: Sequence[At],
     used: Bools,
     corners: CornerTerm | None,
-    corner_sigma: float | None,
 ) -> NetworkFit:
     rig = rig_of(network.rig, found.values)
     chi2, dof = found.chi2, found.dof
@@ -286,6 +301,6 @@ def _fit(
         used=used,
         dot_shifts_m=array_of(found.values, "points") - network.dots.xyz,
         corner_errors_px=corner_errors,
-        corner_sigma_px=float("nan") if corner_sigma is None else corner_sigma,
+        corners=corners,
         adjusted=found,
     )

@@ -107,11 +107,11 @@ def start_of(
     frames: Mapping[int, Pose],
     bow: Array,
     held_camera: int | None = None,
-    held_screen: int | None = None,
+    held_board: int | None = None,
 ) -> Start:
     """The chained poses as an adjustment's start. frames: screen -> world_from_screen by its dots or its scan.
 
-    held_camera, held_screen: whose pose is the world's, where there is no survey. Raises NotConnectedError for a
+    held_camera, held_board: which of them stays where it is, where there is no survey. Raises NotConnectedError for a
     screen that nothing was measured of.
     """
     screens = {**chained.world_from_screen, **frames}
@@ -132,7 +132,7 @@ def start_of(
         world_from_board=_stack([chained.world_from_board[i] for i in order]),
         bow=bow,
         held_camera=held_camera,
-        held_screen=held_screen,
+        held_board=held_board,
     )
 
 

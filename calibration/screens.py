@@ -83,9 +83,9 @@ def calibrate(
 ) -> ScreensResult:
     """Poses of all cameras and screens, their bows where needed, and the joint covariance.
 
-    setups: one per screen. near: camera -> where it stands roughly, which chooses between two poses. held_screen,
-    held_camera: whose frame is the world's where there is no survey. Raises NotConnectedError, AdjustmentError, or
-    ValueError where dots cannot tell a screen's plane.
+    setups: one per screen. near: camera -> where it stands roughly, which chooses between two poses. Where there is no
+    survey, the world is the frame that held_screen gets from the board fixed to it, or held_camera's. Raises
+    NotConnectedError, AdjustmentError, or ValueError where dots cannot tell a screen's plane.
     """
     near = {} if near is None else near
     on_dots = {c: camera_on_dots(network, c, WITHIN_PX) for c in range(len(network.rig.cameras))}
@@ -139,7 +139,7 @@ def calibrate(
         frames,
         bows,
         None if surveyed or held_screen is not None else held_camera,
-        None if surveyed else held_screen,
+        None if surveyed else _board_on(network, held_screen),
     )
     fit = adjust(complete, start)
     results = [_in_final_frame(r, complete, fit, k) for k, r in enumerate(results)]
@@ -147,6 +147,14 @@ def calibrate(
         c: r for c, found in on_dots.items() for r in [_rival(found, chosen.get(c), near.get(c))] if r is not None
     }
     return ScreensResult(complete, fit, tuple(results), on_dots, rivals)
+
+
+def _board_on(network: Network, screen: int | None) -> int | None:
+    """The place of the first board that is fixed to a screen; its frame, laid on the screen, is then the world's."""
+    if screen is None or network.fixed is None:
+        return None
+    mine = np.flatnonzero(network.fixed.screen_of == screen)
+    return int(network.fixed.placement_of[mine[0]]) if mine.size else None
 
 
 def screen_of_dots(

@@ -99,9 +99,7 @@ def _places(result: ScreensResult) -> Section:
     for i, (name, c) in enumerate(fit.rig.cameras.items()):
         x, y, z = c.camera_from_world.inverse().translation.tolist()
         mine = network.sightings.camera_of == i
-        boards = (
-            0 if network.corners is None else len(set(network.corners.placement[network.corners.camera == i].tolist()))
-        )
+        boards = 0 if fit.corners is None else len(set(fit.corners.placement[fit.corners.camera == i].tolist()))
         position, attitude = sigmas[name]
         place = [name, c.screen, f"{x:.4f}, {y:.4f}, {z:.4f}", 1e3 * position, float(np.degrees(attitude))]
         rows.append([*place, 1e3 * pointing[name], f"{int(np.sum(fit.used & mine))} of {int(mine.sum())}", boards])
@@ -133,7 +131,7 @@ def _screen(outcome: Outcome, project: Project, k: int) -> Section:
         words.append("Known from a board fixed to it alone: nothing tells how flat it is.")
     else:
         f = about.flatness
-        sigma = float(np.median(f.flat.sigma_m))
+        sigma = float(np.median(np.sqrt(np.maximum(f.flat.sigma_m**2 - f.flat.scatter_m**2, 0))))  # the points' own
         over = "its dots" if about.dots else "patches of the scan (medians of their points)"
         words.append(
             f"As a plane it misses {over} by {short(1e3 * f.flat.rms_m, 3)} mm RMS"
@@ -144,15 +142,13 @@ def _screen(outcome: Outcome, project: Project, k: int) -> Section:
                 f" it look so bent with a probability of {f.p_flat:.2g}."
             )
         )
-        deviation = _over_plane(f.chosen.coefficients[3:], about.xyz) if f.chosen.bent else f.chosen.heights_m
-        deviation = deviation + f.chosen.heights_m if f.chosen.bent else deviation
         a, b, c = screen.bow
         drawings.append(
             Drawing(
                 flatness_map(
                     about.xyz[:, :2],
-                    deviation,
-                    f"Screen {name}: height over its plane",
+                    f.flat.heights_m,
+                    f"Screen {name}: height over the best plane",
                     size_m=screen.size_m,
                     bow=(a, b, c) if f.chosen.bent else None,
                     sigma_m=sigma,
@@ -164,20 +160,15 @@ def _screen(outcome: Outcome, project: Project, k: int) -> Section:
             drawings.append(
                 Drawing(
                     flatness_map(about.xyz[:, :2], f.chosen.heights_m, f"Screen {name}: what the bow leaves",
-                                 size_m=screen.size_m, sigma_m=float(np.median(f.chosen.sigma_m))),
+                                 size_m=screen.size_m, sigma_m=sigma),
                     "The same after the bow: this should be noise.",
                 )
             )  # fmt: skip
     return Section(f"Screen {name}", words, drawings)
 
 
-def _over_plane(bow: np.ndarray, xyz: np.ndarray) -> np.ndarray:
-    x, y = xyz[:, 0], xyz[:, 1]
-    return np.asarray(bow[0] * x * x + bow[1] * x * y + bow[2] * y * y)
-
-
 def _vector(v: np.ndarray, digits: int) -> str:
-    return "(" + ", ".join(f"{float(x) + 0.0:.{digits}f}" for x in v) + ")"
+    return "(" + ", ".join(f"{round(float(x), digits) + 0.0:.{digits}f}" for x in v) + ")"
 
 
 def _pixels(result: ScreensResult) -> Section:
@@ -187,13 +178,13 @@ def _pixels(result: ScreensResult) -> Section:
         mine = network.sightings.camera_of == i
         found, error = network.sightings.pixels[mine], fit.sighting_errors_px[mine]
         rejected = ~fit.used[mine]
-        if network.corners is not None:
-            its = network.corners.camera == i
-            found = np.concatenate([found, network.corners.pixels[its]])
+        if fit.corners is not None:
+            its = fit.corners.camera == i
+            found = np.concatenate([found, fit.corners.pixels[its]])
             error = np.concatenate([error, fit.corner_errors_px[its]])
             rejected = np.concatenate([rejected, np.zeros(int(its.sum()), dtype=bool)])
         if len(found):
-            title = f"Camera {name}: dots and corners, measured less predicted"
+            title = f"Camera {name}: measured less predicted"
             drawings.append(Drawing(corners_overlay(c.image_size_px, found, error, title, rejected=rejected)))
     words = "Arrows that all point one way in a part of a picture show a lens that changed since its calibration."
     return Section("Pixels", words, drawings)
@@ -207,12 +198,10 @@ def _dots(result: ScreensResult) -> Section:
     for i in range(len(s)):
         d = int(s.dot_of[i])
         k = int(network.dots.screen_of[d])
-        rows.append(
-            [list(fit.rig.cameras)[s.camera_of[i]], network.dots.names[d], screens[k] if k >= 0 else "",
-             *s.pixels[i].round(2).tolist(), *fit.sighting_errors_px[i].round(3).tolist(),
-             round(float(fit.sighting_sigmas[i]), 2), bool(fit.used[i])]
-        )  # fmt: skip
-    rows.sort(key=lambda r: -float(str(r[7])))
+        names = [list(fit.rig.cameras)[s.camera_of[i]], network.dots.names[d], screens[k] if k >= 0 else ""]
+        pixel, miss = [f"{v:.2f}" for v in s.pixels[i]], [f"{v:+.3f}" for v in fit.sighting_errors_px[i]]
+        rows.append([*names, *pixel, *miss, f"{fit.sighting_sigmas[i]:.2f}", bool(fit.used[i])])
+    rows = [rows[int(i)] for i in np.argsort(-fit.sighting_sigmas, kind="stable")]
     heads = ["camera", "dot", "screen", "u (px)", "v (px)", "misses u (px)", "misses v (px)", "in sigmas", "used"]
     words = "The worst first. Sigmas hold the pixel's and the survey's errors together; beyond 5 a pixel is left out."
     return Section("Dots", words, table=Table(heads, rows[:_MOST_DOTS]))

@@ -29,9 +29,9 @@ def write_tables(result: ScreensResult, folder: Path) -> None:
         names = [cameras[s.camera_of[i]], network.dots.names[s.dot_of[i]]]
         sigmas = round(float(fit.sighting_sigmas[i]), 3)
         rows.append([*names, *s.pixels[i].round(4), *fit.sighting_errors_px[i].round(4), sigmas, int(fit.used[i])])
-    if network.corners is not None:
-        c = network.corners
-        off = np.linalg.norm(fit.corner_errors_px, axis=1) / fit.corner_sigma_px
+    if fit.corners is not None:
+        c = fit.corners
+        off = np.linalg.norm(fit.corner_errors_px, axis=1) / c.sigma_px
         for i in range(len(c)):
             names = [cameras[c.camera[i]], network.placements[c.placement[i]]]
             rows.append([*names, *c.pixels[i].round(4), *fit.corner_errors_px[i].round(4), round(float(off[i]), 3), 1])
