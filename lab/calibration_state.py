@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import pydantic
 
 from lab.errors import CalibrationError
-from lab.fields import Block, Text, one_of, unexpected
+from lab.fields import Block, Lines, Text, one_of, unexpected
 
 VERDICTS = ("PASS", "WARN", "FAIL")
 
@@ -44,19 +44,13 @@ Day = Annotated[datetime.date, pydantic.PlainValidator(iso_date)]
 OptionalDay = Annotated[datetime.date | None, pydantic.PlainValidator(_day_or_none)]
 
 
-def _lines(value: Any) -> list[str]:
-    if not isinstance(value, list) or not all(isinstance(v, str) for v in value):
-        raise unexpected("a list of lines of text", value)
-    return value
-
-
 class CalibrationStateBlock(Block):
     """The block `calibration:` of a rig.yaml."""
 
     date: Day
     verdict: Annotated[str, pydantic.PlainValidator(one_of(VERDICTS))]
     valid_until: OptionalDay = None
-    reasons: Annotated[list[str], pydantic.PlainValidator(_lines)] = []  # noqa: RUF012 - frozen
+    reasons: Lines = []  # noqa: RUF012 - frozen
     notes: Text = ""
 
     def value(self) -> CalibrationState:

@@ -9,9 +9,12 @@ import numpy as np
 import pydantic
 
 from geometry import lens
-from geometry.arrays import Array
+from geometry.arrays import Array, symmetric
 from geometry.camera import FISHEYE, LENSES, PERSPECTIVE
 from lab.fields import Block, Number, Positive, a_number, an_integer, numbers, one_of, unexpected, wrong
+
+# Against the diagonal: what sums in double precision, written with all digits, may miss.
+COVARIANCE_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +69,29 @@ class CovarianceBlock(Block):
     def value(self) -> Covariance:
         """The block as a value."""
         return Covariance(tuple(self.parameters), np.array(self.matrix, dtype=float).reshape(len(self.matrix), -1))
+
+
+def covariance_mistake(covariance: Covariance) -> str:
+    """What is wrong with a matrix that is no covariance, in a line's words; empty where nothing is."""
+    C, names = covariance.matrix, covariance.parameters
+    variances = np.diagonal(C)
+    if not len(C):
+        return ""
+    if np.any(variances < 0):
+        worst = int(np.argmin(variances))
+        return f"expected variances from zero up on the diagonal, got {variances[worst]:.6g} for {names[worst]}"
+    unit = np.sqrt(np.where(variances > 0, variances, 1.0))
+    scaled = C / np.outer(unit, unit)
+    apart = np.abs(scaled - scaled.T)
+    if apart.max() > COVARIANCE_TOLERANCE:
+        i, j = np.unravel_index(int(np.argmax(apart)), C.shape)
+        return (
+            f"expected a symmetric matrix, got {C[i, j]:.6g} for {names[i]}, {names[j]} and {C[j, i]:.6g}"
+            f" for {names[j]}, {names[i]}"
+        )
+    if np.linalg.eigvalsh(symmetric(scaled))[0] < -COVARIANCE_TOLERANCE * len(C):
+        return "expected a covariance, got a matrix with a negative eigenvalue: correlations that no errors can have"
+    return ""
 
 
 class _MatrixBlock(Block):

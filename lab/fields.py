@@ -85,6 +85,13 @@ def free_text(value: Any) -> str:
     return "" if value is None else value if value == "" else a_word(value)
 
 
+def lines_of_text(value: Any) -> list[str]:
+    """A list of texts, a line each."""
+    if not isinstance(value, list) or not all(isinstance(v, str) for v in value):
+        raise unexpected("a list of lines of text", value)
+    return value
+
+
 def numbers(count: int) -> Callable[[Any], list[float]]:
     """A validator of lists of so many finite numbers."""
 
@@ -133,6 +140,7 @@ Integer = Annotated[int, _plain(an_integer)]
 Word = Annotated[str, _plain(a_word)]
 Text = Annotated[str, _plain(free_text)]
 Vector3 = Annotated[list[float], _plain(numbers(3))]
+Lines = Annotated[list[str], _plain(lines_of_text)]
 
 
 class Block(pydantic.BaseModel):

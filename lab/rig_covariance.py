@@ -10,12 +10,10 @@ import numpy as np
 from geometry.arrays import Array, symmetric
 from geometry.rig import Rig
 from geometry.rig_parameters import RigCovariance, is_known, split
-from lab.camera_block import Covariance
+from lab.camera_block import Covariance, covariance_mistake
 from lab.errors import InputError
 
 TARGET = "target"
-# Against the diagonal: what sums in double precision, written with all digits, may miss.
-_TOLERANCE = 1e-6
 
 
 def joint_covariance(rig: Rig, blocks: Mapping[str, Covariance], path: Path | str) -> RigCovariance | None:
@@ -38,7 +36,9 @@ def joint_covariance(rig: Rig, blocks: Mapping[str, Covariance], path: Path | st
         if not known:
             continue
         matrix = block.matrix[np.ix_(known, known)]
-        _refuse_what_is_none(matrix, f"{path}: {where}.covariance")
+        mistake = covariance_mistake(Covariance(tuple(block.parameters[i] for i in known), matrix))
+        if mistake:
+            raise InputError(f"{path}: {where}.covariance.matrix: {mistake}")
         names += [full[i] for i in known]
         pieces.append(symmetric(matrix))
     if not names:
@@ -49,18 +49,6 @@ def joint_covariance(rig: Rig, blocks: Mapping[str, Covariance], path: Path | st
         joint[at : at + len(piece), at : at + len(piece)] = piece
         at += len(piece)
     return RigCovariance(tuple(names), joint)
-
-
-def _refuse_what_is_none(matrix: Array, where: str) -> None:
-    variances = np.diagonal(matrix)
-    if np.any(variances < 0):
-        raise InputError(f"{where}.matrix: expected variances from zero up on the diagonal, got {variances.min():.3g}")
-    unit = np.sqrt(np.where(variances > 0, variances, 1.0))
-    scaled = matrix / np.outer(unit, unit)
-    if np.abs(scaled - scaled.T).max() > _TOLERANCE:
-        raise InputError(f"{where}.matrix: expected a symmetric matrix; its halves differ")
-    if np.linalg.eigvalsh(symmetric(scaled))[0] < -_TOLERANCE * len(matrix):
-        raise InputError(f"{where}.matrix: expected a covariance, got a matrix with a negative eigenvalue")
 
 
 def blocks_of(covariance: RigCovariance) -> dict[str, Covariance]:

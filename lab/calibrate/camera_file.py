@@ -7,33 +7,37 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 import pydantic
 
 from geometry.arrays import Array
 from geometry.camera import PERSPECTIVE, Camera
 from geometry.pose import Pose
 from geometry.rig_parameters import PINHOLE, distortion_names
-from lab.camera_block import Covariance, CovarianceBlock, LensBlock, covariance_mapping, lens_mapping
+from lab.calibration_state import VERDICTS
+from lab.camera_block import (
+    Covariance,
+    CovarianceBlock,
+    LensBlock,
+    covariance_mapping,
+    covariance_mistake,
+    lens_mapping,
+)
 from lab.fields import (
     Block,
     FromZero,
     Integer,
+    Lines,
     Number,
     Positive,
     Text,
     Word,
     one_of,
-    unexpected,
     validated,
     wrong,
 )
 from lab.yaml_text import did_you_mean, read_mapping, write_mapping
 
 SCHEMA = "beampose/camera/1"
-VERDICTS = ("PASS", "WARN", "FAIL")
-# Rounding of a matrix that was summed in double precision, relative to its largest entries.
-SYMMETRY_TOLERANCE = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,12 +144,6 @@ def _calibration_mapping(calibration: CameraCalibration) -> dict[str, Any]:
 # What the file may hold -----------------------------------------------------------------------------------------
 
 
-def _words(value: Any) -> list[str]:
-    if not isinstance(value, list) or not all(isinstance(v, str) for v in value):
-        raise unexpected("a list of lines of text", value)
-    return value
-
-
 class _CalibrationBlock(Block):
     date: Text = ""
     verdict: Annotated[str, pydantic.PlainValidator(one_of((*VERDICTS, "")))] = ""
@@ -157,7 +155,7 @@ class _CalibrationBlock(Block):
     board: Text = ""
     distance_m: Positive | None = None
     valid_until: Text = ""
-    reasons: Annotated[list[str], pydantic.PlainValidator(_words)] = []  # noqa: RUF012 - frozen
+    reasons: Lines = []  # noqa: RUF012 - frozen
     figures: dict[str, Number] = {}  # noqa: RUF012 - frozen
     notes: Text = ""
 
@@ -186,28 +184,7 @@ class _CameraFileBlock(LensBlock):
             if name in seen:
                 raise wrong(f"covariance.parameters: expected each name once, got {name!r} a second time")
             seen.add(name)
-        _check_covariance(self.covariance.value())
+        mistake = covariance_mistake(self.covariance.value())
+        if mistake:
+            raise wrong(f"covariance.matrix: {mistake}")
         return self
-
-
-def _check_covariance(covariance: Covariance) -> None:
-    """Raises the mistake of a matrix that is no covariance: not symmetric, or with a negative variance."""
-    C = covariance.matrix
-    sigma = np.sqrt(np.abs(np.diagonal(C)))
-    size = np.outer(sigma, sigma)
-    if np.any(np.abs(C - C.T) > SYMMETRY_TOLERANCE * np.maximum(size, 1e-300)):
-        i, j = np.unravel_index(int(np.argmax(np.abs(C - C.T) / np.maximum(size, 1e-300))), C.shape)
-        names = covariance.parameters
-        raise wrong(
-            f"covariance.matrix: expected a symmetric matrix, got {C[i, j]:.6g} for {names[i]}, {names[j]}"
-            f" and {C[j, i]:.6g} for {names[j]}, {names[i]}"
-        )
-    if np.any(np.diagonal(C) < 0):
-        worst = int(np.argmin(np.diagonal(C)))
-        raise wrong(
-            f"covariance.matrix: expected variances of 0 or more, got {C[worst, worst]:.6g}"
-            f" for {covariance.parameters[worst]}"
-        )
-    safe = np.where(sigma > 0, sigma, 1.0)
-    if len(C) and np.linalg.eigvalsh(C / np.outer(safe, safe))[0] < -1e-6:
-        raise wrong("covariance.matrix: expected a covariance, got a matrix with correlations that no errors can have")

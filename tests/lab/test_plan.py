@@ -264,7 +264,7 @@ def test_drawings_show_every_number_and_cross_out_what_is_not_there():
 
 @pytest.mark.slow
 def test_ten_thousand_poses_take_seconds(rig_path, tmp_path):
-    """2.6 s on two slow cores; the limit leaves room for a machine that is busy."""
+    """2.6 s on two slow cores that are idle; the limit leaves room for others' work."""
     start = time.perf_counter()
     assert plan_rig(rig_path, tmp_path / "plan").poses == 11025
-    assert time.perf_counter() - start < 15
+    assert time.perf_counter() - start < 40
