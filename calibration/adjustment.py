@@ -99,6 +99,11 @@ class Adjusted:
     _columns: _Columns
     _normal: sparse.csc_array
 
+    def is_free(self, stack: str) -> Bools:
+        """Which numbers (k, dof) of a stack could move."""
+        free: Bools = self._columns.column[stack] >= 0
+        return free
+
     def covariance(self, at: Sequence[At]) -> Array:
         """Joint covariance (p, p) of the errors of some unknowns, stacked in order; 0 for what was held fixed.
 

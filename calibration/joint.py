@@ -17,7 +17,7 @@ from calibration.beams import Stand
 from calibration.corners import CornerTerm
 from calibration.flatness import smallest_scatter
 from calibration.measurement_groups import GroupFit, Unknowns, group_fit, information
-from calibration.network import Network, NetworkFit, sighting_sigmas
+from calibration.network import Network, NetworkFit, flat_boards, sighting_sigmas
 from calibration.pose_records import RecordTerm
 from calibration.priors import Prior
 from calibration.rig_stacks import BEAMS, BOWS, CAMERAS, INTRINSICS, POSES, SCREENS, STAND, named_errors, rig_of
@@ -32,6 +32,7 @@ from geometry.rig_parameters import RigCovariance
 # The kinds of measurement, in words that a report can use.
 LENSES, SURVEY, DOTS, SURFACES = "lens calibrations", "survey", "pixels of dots", "screen surfaces"
 CORNERS, FIXED, SCANS = "board corners", "boards on screens", "scans"
+FLAT_BOARDS = "flatness of boards"
 SPOTS, RECORDS, PLACE, FRAMES = "spots", "stand positions", "place of the stand", "screen axes"
 P_OUTLIER = 1e-4  # of a good measurement to be left out: one in 10 000
 P_MISFIT = 1e-3  # of a right fit to be called a misfit
@@ -50,7 +51,6 @@ class Measured:
     spots: SpotPixels
     stand: Stand
     beams: Values  # of the single step: "beams", "stand", "poses"
-    held_screen: int | None = None  # whose frame is the world's, where there is no survey
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,24 +133,15 @@ def calibrate_jointly(measured: Measured, *, without: Bools | None = None, start
 
 def free_of(measured: Measured) -> dict[str, bool | Bools]:
     """Which numbers may move."""
-    network, stand = measured.network, measured.stand
-    bow = np.zeros((len(network.rig.screens), 3), dtype=bool)
-    bow[sorted(network.bent)] = True
-    lens = np.zeros((len(network.rig.cameras), 18), dtype=bool) if network.lens_free is None else network.lens_free
+    stand = measured.stand
     count = len(stand.stand_from_body.translation)
-    screens = np.ones((len(network.rig.screens), 6), dtype=bool)
-    if measured.held_screen is not None:
-        screens[measured.held_screen] = False
     place: bool | Bools = True
     if stand.stand_covariance is not None:
         place = np.diagonal(stand.stand_covariance)[None] > 0
+    # Of the lab what was free in its own step: that also holds the world's frame where no survey does.
+    of_the_lab = {n: measured.screens.adjusted.is_free(n) for n in measured.screens.values if n != BEAMS}
     return {
-        INTRINSICS: lens,
-        CAMERAS: True,
-        SCREENS: screens,
-        BOWS: bow,
-        "points": True,
-        "boards": True,
+        **of_the_lab,
         BEAMS: True,
         STAND: place,
         POSES: np.broadcast_to(np.asarray(stand.pose_sigmas) > 0, (count, 6)),
@@ -175,9 +166,9 @@ def _kinds(measured: Measured) -> tuple[dict[str, Term], dict[str, tuple[Term, .
         if on.any():
             scatter = np.array([smallest_scatter(network.surface_scatter_m.get(int(k), 0.0)) for k in dots.screen_of])
             fixed[SURFACES] = (SurfaceTerm(dots.screen_of[on], index[on], scatter[on]),)
-    if network.corners is not None:
-        sigma = measured.screens.corner_sigma_px
-        every[CORNERS] = replace(network.corners, sigma_px=np.full(len(network.corners), sigma))
+    if measured.screens.corners is not None:
+        every[CORNERS] = measured.screens.corners
+        fixed[FLAT_BOARDS] = tuple(flat_boards(measured.screens.corners))
     if network.fixed is not None:
         fixed[FIXED] = (network.fixed,)
     if network.screen_priors:

@@ -180,13 +180,13 @@ def _terms_but_sightings(network: Network, start: Start, corners: CornerTerm | N
     if len(network.rig.screens):
         out.append(FrameTerm(np.arange(len(network.rig.screens)), start.world_from_screen))
     if corners is not None:
-        out += [corners, *_flat_boards(corners)]
+        out += [corners, *flat_boards(corners)]
     if network.fixed is not None:
         out.append(network.fixed)
     return out
 
 
-def _flat_boards(corners: CornerTerm) -> Sequence[Prior]:
+def flat_boards(corners: CornerTerm) -> Sequence[Prior]:
     """That boards are flat to a millimetre or so; how they are bent is found with the rest."""
     count = int(corners.board.max(initial=-1)) + 1
     half = np.array([np.max(np.abs(corners.from_middle[corners.board == b]), initial=1e-2) for b in range(count)])

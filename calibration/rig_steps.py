@@ -48,5 +48,5 @@ def calibrate_in_steps(
         )
     found = beams.fit.adjusted.values
     starts = {n: found[n] for n in (BEAMS, STAND, POSES)}
-    measured = Measured(screens.network, screens.fit, spots, stand, starts, held_screen)
+    measured = Measured(screens.network, screens.fit, spots, stand, starts)
     return RigSteps(screens, beams, measured, calibrate_jointly(measured))
