@@ -253,5 +253,253 @@ def study(name: str, out: Path, seed: int) -> None:
     click.echo(f"report: {outcome.report}")
 
 
+def _concluded(outcome: Any) -> None:
+    """What came out, in a line or more, and its exit status."""
+    click.echo(outcome.line())
+    sys.exit(outcome.exit_status)
+
+
+@main.group(cls=_Commands)
+def calibrate() -> None:
+    """Calibrate cameras, screens and beams, and check that they still hold.
+
+    Each step writes its numbers with their covariance, and a report that ends in PASS, WARN or FAIL with the reason and
+    the cure. Exit status: 0 for PASS and WARN, 3 for FAIL.
+
+    \b
+    Example:
+        beampose calibrate board chessboard:9x6:25mm --out board
+    """
+
+
+@calibrate.command()
+@click.argument("board")
+@click.option("--out", required=True, type=_ANY_PATH, help="A folder, or one file ending in .pdf, .svg or .png.")
+@click.option("--page", default="A4", show_default=True, help="A4, A3 ... or fit: as large as the board.")
+@click.option("--dpi", default=300.0, show_default=True, type=click.FloatRange(50, 2400), help="Of the PNG.")
+def board(board: str, out: Path, page: str, dpi: float) -> None:
+    """Write a printable board to exact scale, and board.yaml.
+
+    BOARD: chessboard:9x6:25mm (inner corners), circles:10x10:12mm, acircles:4x11:20mm,
+    charuco:5x7:40mm:20mm:DICT_4X4_50 (with :inverted for white on black), or a board.yaml.
+
+    \b
+    Example:
+        beampose calibrate board charuco:5x7:36mm:18mm:DICT_4X4_50 --out board
+    """
+    from lab.calibrate.board import write_board
+
+    _concluded(write_board(board, out, page=page, dpi=dpi))
+
+
+@calibrate.command()
+@click.argument("photos", nargs=-1, required=True, type=_ANY_PATH)
+@click.option("--board", required=True, help="What is on the photos: as for `calibrate board`, or a board.yaml.")
+@click.option("--out", required=True, type=_FOLDER, help="Gets camera.yaml, corners.csv and report.html.")
+@click.option("--name", help="The camera's name; default: that of the folder --out.")
+@click.option(
+    "--distance-m", type=click.FloatRange(min=0, min_open=True), help="To the screen: figures in mm hold there."
+)
+@click.option("--lens", help="0, 4, 5, 8, 12 or fisheye; default: the one that foretells views it has not seen best.")
+@click.option("--valid-days", type=click.IntRange(min=1), help="How long it may be used.")
+def camera(
+    photos: tuple[Path, ...],
+    board: str,
+    out: Path,
+    name: str | None,
+    distance_m: float | None,
+    lens: str | None,
+    valid_days: int | None,
+) -> None:
+    """Calibrate a camera's lens from photos of a board: files, folders, patterns or a video.
+
+    \b
+    Example:
+        beampose calibrate camera campaign/photos/left --board chessboard:9x6:25mm --out results/left
+    """
+    from lab.calibrate.camera import CameraOptions, calibrate_camera
+
+    options = CameraOptions(name=name or out.resolve().name, distance_m=distance_m, lens=lens, valid_days=valid_days)
+    _concluded(calibrate_camera(photos, board, out, options))
+
+
+_project = click.argument("project", type=_ANY_PATH)
+
+
+@calibrate.command()
+@_project
+@click.option("--out", required=True, type=_FOLDER, help="Gets screens.yaml, tables and report.html.")
+def screen(project: Path, out: Path) -> None:
+    """Find where screens and cameras stand: surveyed dots, boards, scanned clouds. PROJECT: a calibration.yaml.
+
+    \b
+    Example:
+        beampose calibrate screen campaign/calibration.yaml --out results/screens
+    """
+    from lab.calibrate.screen import calibrate_screen
+
+    _concluded(calibrate_screen(project, out))
+
+
+@calibrate.command()
+@_project
+@click.option("--out", required=True, type=_FOLDER, help="Gets rig.yaml, beams.csv, tables and report.html.")
+@click.option("--rig", type=_ANY_PATH, help="With cameras and screens as calibrated; default: rig.yaml by the project.")
+def beams(project: Path, out: Path, rig: Path | None) -> None:
+    """Find the beams in the vehicle from recordings at known (or unknown) stand positions.
+
+    \b
+    Example:
+        beampose calibrate beams campaign/calibration.yaml --rig results/screens/rig.yaml --out results/beams
+    """
+    from lab.calibrate.beams import calibrate_beams
+
+    _concluded(calibrate_beams(project, out, rig))
+
+
+@calibrate.command()
+@_project
+@click.option("--out", required=True, type=_FOLDER, help="Gets rig.yaml with its joint covariance, and report.html.")
+def rig(project: Path, out: Path) -> None:
+    """Solve cameras, screens and beams together, and write the rig.yaml that runs use.
+
+    \b
+    Example:
+        beampose calibrate rig campaign/calibration.yaml --out results/rig
+    """
+    from lab.calibrate.rig import calibrate_rig
+
+    _concluded(calibrate_rig(project, out))
+
+
+@calibrate.command("check")
+@click.argument("rig", type=_ANY_PATH)
+@click.option("--out", required=True, type=_FOLDER, help="Gets drift.csv and report.html.")
+@click.option("--points", type=_ANY_PATH, help="Known points: camera,point,u_px,v_px[,sigma_px].")
+@click.option("--survey", type=_ANY_PATH, help="Where they are: point,x_m,y_m,z_m[,sigmas].")
+@click.option(
+    "--run", "run_folder", type=_ANY_PATH, help="Or a recording (or its results) of a vehicle that stands still ..."
+)
+@click.option("--pose", type=_ANY_PATH, help="... at a pose that is known: a CSV like truth/pose.csv.")
+@click.option("--history", type=_ANY_PATH, help="A CSV that this check is added to, for the trend.")
+def daily(
+    rig: Path,
+    out: Path,
+    points: Path | None,
+    survey: Path | None,
+    run_folder: Path | None,
+    pose: Path | None,
+    history: Path | None,
+) -> None:
+    """Does the stored calibration still hold today? Drift per camera in px and mm; exit status 3: do not use it.
+
+    \b
+    Example:
+        beampose calibrate check results/rig/rig.yaml --points points.csv --survey survey.csv --out results/today
+    """
+    from lab.calibrate.daily import daily_check
+
+    _concluded(daily_check(rig, out, points, run_folder, survey=survey, pose=pose, history=history))
+
+
+@calibrate.command()
+@click.argument("source", type=_ANY_PATH)
+@click.argument("destination", type=_ANY_PATH)
+@click.option("--from", "origin", help="The source's format, where its content does not tell.")
+@click.option("--to", "target", help="opencv, kalibr, ros, colmap, mrcal or beampose, where the name does not tell.")
+@click.option("--camera", help="One of several.")
+def convert(source: Path, destination: Path, origin: str | None, target: str | None, camera: str | None) -> None:
+    """Convert cameras between formats: OpenCV YAML, Kalibr, ROS, COLMAP, mrcal, camera.yaml; a rig.yaml as source.
+
+    \b
+    Example:
+        beampose calibrate convert sample_runs/huo2015/rig.yaml camchain.yaml --to kalibr
+    """
+    from lab.calibrate.interchange import convert as convert_file
+
+    _concluded(convert_file(source, destination, origin, target, camera))
+
+
+@calibrate.command("simulate")
+@click.option("--out", required=True, type=_FOLDER, help="The folder to write; it must not exist yet.")
+@click.option("--rig", default="fan", show_default=True, help="One of lab/simulate/rigs.py.")
+@click.option("--seed", default=0, show_default=True, type=click.IntRange(min=0), help="The same seed, the same bytes.")
+@click.option("--positions", default=40, show_default=True, type=click.IntRange(min=3), help="Of the stand.")
+@click.option("--photos", is_flag=True, help="Board photographs for `calibrate camera` too.")
+def simulate_campaign(out: Path, rig: str, seed: int, positions: int, photos: bool) -> None:
+    """Write a simulated calibration campaign with its truth, to try all this on.
+
+    \b
+    Example:
+        beampose calibrate simulate --out campaign
+    """
+    from lab.simulate.campaign_files import simulate_calibration
+
+    folder = simulate_calibration(out, seed=seed, rig=rig, positions=positions, photos=photos)
+    click.echo(f"project: {folder / 'calibration.yaml'}")
+
+
+def _ranges(
+    ctx: click.Context, parameter: click.Parameter, values: Sequence[str]
+) -> dict[str, tuple[float, float, int]]:
+    """--range name=first:last:count."""
+    out: dict[str, tuple[float, float, int]] = {}
+    for text in values:
+        name, _, value = text.partition("=")
+        try:
+            first, last, count = value.split(":")
+            out[name.strip()] = float(first), float(last), int(count)
+        except ValueError:
+            raise click.BadParameter(
+                f"expected NAME=FIRST:LAST:COUNT, got {text!r}", ctx=ctx, param=parameter
+            ) from None
+    return out
+
+
+@main.command()
+@click.argument("rig", type=_ANY_PATH)
+@click.option("--out", required=True, type=_FOLDER, help="Gets plan.csv, effects.csv and report.html.")
+@click.option(
+    "--range",
+    "ranges",
+    multiple=True,
+    metavar="NAME=FIRST:LAST:COUNT",
+    callback=_ranges,
+    help="Of x_m, y_m, z_m, yaw_deg, pitch_deg, roll_deg; e.g. --range yaw_deg=-30:30:13.",
+)
+@click.option("--sigma-px", type=click.FloatRange(min=0, min_open=True), help="Noise of a spot, 1 sigma.")
+@click.option("--goal-deg", type=click.FloatRange(min=0, min_open=True), help="The attitude sigma to reach.")
+@click.option("--goal-mm", type=click.FloatRange(min=0, min_open=True), help="The position sigma to reach.")
+@click.option(
+    "--expect",
+    "settings",
+    multiple=True,
+    metavar="NAME=VALUE",
+    callback=_settings,
+    help="A calibration sigma to expect, where the rig file states none; e.g. --expect beam_direction_arcsec=10.",
+)
+def plan(
+    rig: Path,
+    out: Path,
+    ranges: dict[str, tuple[float, float, int]],
+    sigma_px: float | None,
+    goal_deg: float | None,
+    goal_mm: float | None,
+    settings: dict[str, Any],
+) -> None:
+    """Before a rig is built: which spots are seen from where, and how well it will measure.
+
+    \b
+    Example:
+        beampose plan sample_runs/huo2015/rig.yaml --out results/plan
+    """
+    from lab.plan import plan_rig
+    from lab.plan_options import options_of
+
+    goal_m = None if goal_mm is None else goal_mm / 1000
+    options = options_of(ranges, sigma_px=sigma_px, goal_deg=goal_deg, goal_m=goal_m, expected=settings)
+    _concluded(plan_rig(rig, out, options))
+
+
 if __name__ == "__main__":
     main()

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from itertools import product
+from typing import Any
 
 import numpy as np
 
@@ -11,6 +13,8 @@ from calibration.expected_errors import ExpectedErrors
 from geometry.arrays import Array
 from geometry.pose import Pose
 from lab.errors import InputError
+from lab.fields import dataclass_from_yaml
+from lab.yaml_text import did_you_mean
 
 MOST_POSES = 100_000  # some 300 MB of memory and a table of 70 MB
 
@@ -96,3 +100,28 @@ def _check_range(name: str, r: Range) -> None:
 def poses_of(coordinates: Array) -> Pose:
     """world_from_body (k,) of coordinates (k, 6): x, y, z (m), yaw, pitch, roll (deg)."""
     return Pose.from_ypr(np.deg2rad(coordinates[:, 3:]), coordinates[:, :3])
+
+
+def options_of(
+    ranges: Mapping[str, tuple[float, float, int]],
+    *,
+    sigma_px: float | None = None,
+    goal_deg: float | None = None,
+    goal_m: float | None = None,
+    expected: Mapping[str, Any] | None = None,
+) -> PlanOptions:
+    """Options from what a command gives: ranges (first, last, count) by name, the rest where it is not None.
+
+    Raises InputError for a name or a number that does not fit.
+    """
+    usual = PlanOptions()
+    for name in ranges:
+        if name not in usual.ranges:
+            raise InputError(f"--range: expected a coordinate, got {name!r}{did_you_mean(name, usual.ranges)}")
+    return PlanOptions(
+        **{**usual.ranges, **{name: Range(*r) for name, r in ranges.items()}},
+        sigma_px=usual.sigma_px if sigma_px is None else sigma_px,
+        goal_deg=goal_deg,
+        goal_m=goal_m,
+        expected=dataclass_from_yaml(ExpectedErrors, dict(expected or {}), "--expect"),
+    )

@@ -38,8 +38,21 @@ def beampose(cwd: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     )
 
 
+def walk(group: click.Group, before: str = "") -> dict[str, click.Command]:
+    """All commands by the words that call them, those of groups too."""
+    out: dict[str, click.Command] = {}
+    for name, command in group.commands.items():
+        out[before + name] = command
+        if isinstance(command, click.Group):
+            out |= walk(command, f"{before}{name} ")
+    return out
+
+
+COMMANDS = walk(main)
+
+
 def help_of(name: str) -> str:
-    return main.commands[name].get_help(click.Context(main.commands[name], info_name=name))
+    return COMMANDS[name].get_help(click.Context(COMMANDS[name], info_name=name))
 
 
 def example(name: str) -> list[str]:
@@ -58,20 +71,22 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_there_are_the_commands_of_the_contract():
-    assert set(main.commands) == {"run", "batch", "simulate", "check", "report", "study"}
+    assert set(main.commands) == {"run", "batch", "simulate", "check", "report", "study", "calibrate", "plan"}
+    steps = {"board", "camera", "screen", "beams", "rig", "check", "convert", "simulate"}
+    assert {name for name in COMMANDS if name.startswith("calibrate ")} == {f"calibrate {step}" for step in steps}
 
 
-@pytest.mark.parametrize("name", main.commands)
+@pytest.mark.parametrize("name", COMMANDS)
 def test_every_command_says_what_it_does_and_shows_one_example_of_itself(name):
-    assert len(main.commands[name].get_short_help_str(200)) > 20
-    assert example(name)[0] == name
+    assert len(COMMANDS[name].get_short_help_str(200)) > 20
+    assert " ".join(example(name)).startswith(name)
 
 
-@pytest.mark.parametrize("name", main.commands)
+@pytest.mark.parametrize("name", COMMANDS)
 def test_every_option_is_explained(name):
     unexplained = [
         option.name
-        for option in main.commands[name].params
+        for option in COMMANDS[name].params
         if isinstance(option, click.Option) and not option.help and option.name != "seed"
     ]
     assert unexplained == []
@@ -117,6 +132,28 @@ def test_the_example_of_study_works(desk):
     assert (done.returncode, done.stderr) == (0, "")
 
 
+def test_the_examples_of_calibrate_lead_from_a_campaign_to_a_rig_that_is_checked(desk):
+    for name in ("simulate", "screen", "beams", "rig"):
+        done = beampose(desk, *example(f"calibrate {name}"))
+        assert (done.returncode, done.stderr) == (0, "")
+    for name in ("points.csv", "survey.csv"):
+        (desk / name).write_bytes((desk / "campaign" / name).read_bytes())
+    done = beampose(desk, *example("calibrate check"))
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith("PASS")
+    assert beampose(desk, "check", "results/rig/rig.yaml").returncode == 0
+
+
+@pytest.mark.parametrize("name", ["calibrate board", "calibrate convert", "plan"])
+def test_the_example_works_without_anything_before_it(desk, name):
+    arguments = example(name)
+    if name == "plan":
+        arguments += ["--range", "yaw_deg=-10:10:3", "--range", "roll_deg=0:0:1", "--range", "x_m=0:0:1"]
+    done = beampose(desk, *arguments)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.strip()
+
+
 def test_the_example_of_batch_has_a_row_for_every_run_and_an_index(desk):
     arguments = example("batch")
     done = beampose(desk, *arguments)
@@ -158,11 +195,22 @@ def test_simulate_lists_every_scenario(desk):
         ("simulate clean --out r --frames 0", "0 is not in the range"),
         ("report sample_runs", "found no summary.json"),
         ("study nothing --out r", "'nothing' is not"),
+        ("calibrate sreen x --out r", "No such command 'sreen'. Did you mean 'screen'?"),
+        ("calibrate board chess:9x6 --out r", "chess"),
+        ("calibrate screen nowhere.yaml --out r", "nowhere.yaml: expected a file, found none"),
+        ("calibrate beams nowhere.yaml --out r", "nowhere.yaml: expected a file, found none"),
+        ("calibrate rig sample_runs/huo2015/rig.yaml --out r", "schema: expected 'beampose/calibration/1'"),
+        ("calibrate check sample_runs/huo2015/rig.yaml --out r", "either known points (--points) or a static run"),
+        ("calibrate convert sample_runs/README.md r --to ros", "sample_runs/README.md"),
+        ("plan sample_runs/huo2015/rig.yaml --out r --range yaw=1:2:3", "did you mean 'yaw_deg'?"),
+        ("plan sample_runs/huo2015/rig.yaml --out r --range yaw_deg=1", "expected NAME=FIRST:LAST:COUNT"),
+        ("plan sample_runs/huo2015/rig.yaml --out r --expect dot_pixels=1", "unknown key 'dot_pixels'"),
     ],
 )
-def test_a_mistake_is_one_or_two_plain_lines_and_exit_status_2(desk, arguments, words):
-    done = beampose(desk, *arguments.split())
-    assert done.returncode == 2
+def test_a_mistake_is_one_or_two_plain_lines_and_exit_status_2(desk, arguments, words, monkeypatch):
+    monkeypatch.chdir(desk)
+    done = CliRunner().invoke(main, arguments.split())
+    assert done.exit_code == 2
     assert words in done.stderr
     assert 1 <= len(done.stderr.splitlines()) <= 2
     assert "Traceback" not in done.stderr
