@@ -223,17 +223,19 @@ def _against_the_drawing(c: BeamCalibration, drawing: Rig, goals: BeamGoals) -> 
 
 
 def _one_line(pair: OneLine) -> Finding:
+    turn, turn_sigma = pair.turn / ARCSEC, pair.turn_sigma / ARCSEC
     words = (
-        f"{pair.first} and {pair.second} are {pair.turn / ARCSEC:.3g} ± {pair.turn_sigma / ARCSEC:.2g} arcsec and"
-        f" {1e3 * pair.gap:.2g} ± {1e3 * pair.gap_sigma:.1g} mm apart"
+        f"{pair.first} and {pair.second} are {turn:.0f} ± {turn_sigma:.0f} arcsec and {1e3 * pair.gap:.2f} ±"
+        f" {1e3 * pair.gap_sigma:.2f} mm apart"
     )
+    p = f"p = {pair.p:.2g}" if pair.p > 1e-6 else "p < 1e-6"
     if pair.p >= _P_TWO_LINES:
-        return Finding(Level.PASS, f"{words}: one line fits both (p = {pair.p:.2g})")
+        return Finding(Level.PASS, f"{words}: one line fits both ({p})")
     if " end " in pair.first:
         return Finding(
             Level.WARN,
-            f"{words}: the two ends are not one line (p = {pair.p:.1g})",
+            f"{words}: the two ends are not one line ({p})",
             "as one beam, each end is wrong by half of that",
             "describe them in target.beams as two beams with one spot each, and calibrate again",
         )
-    return Finding(Level.PASS, f"{words}: two beams, as described (p = {pair.p:.1g})")
+    return Finding(Level.PASS, f"{words}: two beams, as described ({p})")

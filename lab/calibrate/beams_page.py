@@ -11,6 +11,7 @@ import numpy as np
 from calibration.beam_findings import ARCSEC, direction_sigmas, offset_sigmas
 from calibration.beams import BeamCalibration
 from calibration.findings import Finding, verdict
+from geometry.arrays import Array, Bools
 from geometry.pose import ypr_sigmas
 from geometry.rig import Rig
 from lab.calibrate.beam_tables import from_drawing, residuals_mm, used_positions
@@ -99,8 +100,8 @@ def _beams(c: BeamCalibration, drawing: Rig) -> Section:
         (
             name,
             ends[name],
-            ", ".join(f"{v:.6f}" for v in c.lines.directions[i]),
-            ", ".join(f"{1e3 * v:.2f}" for v in c.lines.points[i]),
+            _three(c.lines.directions[i], 6),
+            _three(1e3 * c.lines.points[i], 2),
             float(direction[i]),
             float(offset[i]),
             float(np.rad2deg(away[i, 0]) * 60),
@@ -115,22 +116,21 @@ def _beams(c: BeamCalibration, drawing: Rig) -> Section:
     words = [
         "Each laser in the body frame. The offset is the beam's point nearest to the body's origin; sigmas are RMS of"
         " the two axes across the beam.",
-        "rig.yaml holds the joint covariance of all these numbers. Direction and offset errors go together (a beam is"
-        " best known where its spots fell), so the sigmas alone tell less than the covariance.",
+        "Direction and offset errors go together, since a beam is best known where its spots fell: rig.yaml holds their"
+        " joint covariance, which tells more than the sigmas alone.",
     ]
+    if c.undetermined:
+        words[1] = "These numbers are not determined by the recordings: no rig.yaml was written."
     return Section("Beams", words, (), Table(heads, rows))
+
+
+def _three(vector: Array, digits: int) -> str:
+    return ", ".join(f"{v:.{digits}f}".replace("-", "−") for v in vector)
 
 
 def _between(c: BeamCalibration) -> Section:
     rows = [(a.first, a.second, f"{np.rad2deg(a.angle):.5f}", a.sigma / ARCSEC) for a in c.angles]
     words = ["What a turn or shift of the body frame does not change."]
-    for pair in c.one_line:
-        one = "one line fits" if pair.p >= 1e-3 else "not one line"
-        words.append(
-            f"{pair.first} against {pair.second}: {short(pair.turn / ARCSEC, 3)} ±"
-            f" {short(pair.turn_sigma / ARCSEC, 2)} arcsec, {short(1e3 * pair.gap, 3)} ±"
-            f" {short(1e3 * pair.gap_sigma, 2)} mm, p = {pair.p:.2g}: {one}."
-        )
     return Section("Angles between beams", words, (), Table(("first", "second", "angle (deg)", "sigma (arcsec)"), rows))
 
 
@@ -160,7 +160,7 @@ def _body_frame(c: BeamCalibration) -> Section:
         ("roll (deg)", float(roll), float(turns[2])),
     ]
     words = [
-        "The body frame is the stand's carriage, as its positions were recorded. Where the stand stands in the world:",
+        "The body frame is the stand's carriage, as its positions were recorded. The stand's place in the world:",
     ]
     if c.undetermined:
         words.append(f"Not determined: {'; '.join(c.undetermined)}. {c.motion.cure().capitalize()}.")
@@ -186,7 +186,7 @@ def _positions(c: BeamCalibration, positions: Sequence[str]) -> Section:
         "RMS (px)",
     )  # fmt: skip
     coverage = [
-        Drawing(coverage_map(c.rig.cameras[n].image_size_px, pixels, f"Camera {n}: where spots were"))
+        Drawing(coverage_map(c.rig.cameras[n].image_size_px, pixels, f"Camera {n}: where spots were", things="spots"))
         for n, pixels in _by_camera(c, c.spots.pixels).items()
     ]
     words = [
@@ -205,6 +205,7 @@ def _residuals(c: BeamCalibration) -> Section:
                 pixels,
                 _by_camera(c, c.fit.residuals_px, kept)[n],
                 f"Camera {n}: found − predicted",
+                things="spots",
             ),
             "Arrows that turn slowly with the place: lens or screen. All of one position alike: the stand."
             if i == 0
@@ -231,7 +232,7 @@ def _residuals(c: BeamCalibration) -> Section:
     return Section("Residuals", words, drawings, Table(heads, rows))
 
 
-def _by_camera(c: BeamCalibration, values: np.ndarray, rows: np.ndarray | None = None) -> dict[str, np.ndarray]:
+def _by_camera(c: BeamCalibration, values: Array, rows: Bools | None = None) -> dict[str, Array]:
     """Rows of values (N, 2) by camera, cameras without any left out."""
     camera = np.array([name for name, _ in c.rig.views()])[c.spots.view]
     used = np.ones(len(c.spots), dtype=bool) if rows is None else rows

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 SPOTS = ("camera", "spot", "u_px", "v_px")
 DEFAULT_SPOT_SIGMA_PX = 0.1  # px: where the table gives none; a laser spot on a matt screen, speckle included
+MOST_FREE = 200  # positions of which nothing is known: more say little and cost six unknowns each
 _USED = ("matched", "turned")  # statuses of a spots.csv that are measurements
 
 
@@ -63,6 +64,8 @@ def read_recordings(project: Project, rig: Rig) -> Recordings:
     for recording in project.recordings:
         known = None if recording.poses is None else read_poses(recording.poses)
         rows = _rows(recording, known, project, rig, notes)
+        if known is None:
+            rows = spread(rows, notes)
         frames = np.unique(rows.frame)
         first: Pose | None = None
         if known is not None:
@@ -197,6 +200,16 @@ def _pose_sigmas(known: StandPoses, project: Project) -> Array:
     stand = project.stand
     general = [0.0] * 6 if stand is None else [stand.pose_sigma_m] * 3 + [stand.pose_sigma_rad] * 3
     return np.where(np.isnan(known.sigmas), np.array(general), known.sigmas)
+
+
+def spread(rows: SpotRows, notes: list[str]) -> SpotRows:
+    """At most MOST_FREE frames, evenly spread."""
+    frames = np.unique(rows.frame)
+    if len(frames) <= MOST_FREE:
+        return rows
+    notes.append(f"of {len(frames)} frames without a pose {MOST_FREE} were used, evenly spread")
+    used = np.isin(rows.frame, frames[np.linspace(0, len(frames) - 1, MOST_FREE).round().astype(np.int64)])
+    return SpotRows(rows.frame[used], rows.view[used], rows.pixels[used], rows.covariance[used])
 
 
 def _names(recording: Recording, frames: Ints, position_of: Ints, several: bool) -> list[str]:

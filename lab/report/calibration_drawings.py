@@ -124,11 +124,13 @@ def residual_field(
     title: str = "Residuals over the sensor, all views",
     *,
     cells: int = 16,
+    things: str = "corners",
 ) -> str:
     """The residuals of all views over the sensor: single ones faint, the mean of each cell bold.
 
     found_px, residual_px (n, 2), px. A good lens model leaves means about nought; means that turn with the place show
     what it cannot bend. A mean is drawn where its cell has 5 or more corners. `cells` over the width.
+    things: what they are called.
     """
     found, residual = np.asarray(found_px, dtype=float), np.asarray(residual_px, dtype=float)
     good = np.isfinite(found).all(axis=1) & np.isfinite(residual).all(axis=1)
@@ -136,7 +138,7 @@ def residual_field(
     p = image_plane(size_px)
     out = axes(p, title, "u (px)", "v (px)")
     if not len(found):
-        return svg_of(p, title, [*out, frame(p), _in_the_middle(p, "no corners")])
+        return svg_of(p, title, [*out, frame(p), _in_the_middle(p, f"no {things}")])
     stretch, bar = _magnification(residual)
     kept = np.arange(len(found))
     if len(found) > _MOST_VECTORS:
@@ -153,7 +155,7 @@ def residual_field(
     out.append(f'<path d="{d}" stroke="{VERMILLION}" stroke-width="2" stroke-linecap="round" fill="none"/>')
     out.append(f'<path d="{dots(p.at(middle), 1.7)}" fill="{VERMILLION}"/>')
     out.append(_scale_bar(p, stretch, bar))
-    counted = f"{len(found)} corners" + (f", {len(kept)} drawn" if len(kept) < len(found) else "")
+    counted = f"{len(found)} {things}" + (f", {len(kept)} drawn" if len(kept) < len(found) else "")
     note = f"blue: {counted}; red: mean of a cell, twice as long"
     out.append(foot(p, note))
     return svg_of(p, title, [*out, frame(p)])
@@ -181,11 +183,13 @@ def coverage_map(
     title: str = "Where the sensor had corners",
     *,
     cells: int = 12,
+    things: str = "corners",
     outlines_px: list[Array] | None = None,
 ) -> str:
     """How many corners each part of the sensor had; parts with none are hatched.
 
     corners_px (n, 2), px, of all views. outlines_px: a closed outline (k, 2) per view, drawn thin (60 at most).
+    things: what they are called.
     """
     corners = np.asarray(corners_px, dtype=float)
     corners = corners[np.isfinite(corners).all(axis=1)]
@@ -213,7 +217,7 @@ def coverage_map(
         d = polyline(p.at(outline), closed=True)
         out.append(f'<path d="{d}" fill="none" stroke="{ORANGE}" stroke-width="0.8" stroke-opacity="0.7"/>')
     share = float((count > 0).mean())
-    note = f"{len(corners)} corners; {100 * share:.0f} % of the sensor's cells have some; crossed out: none"
+    note = f"{len(corners)} {things}; {100 * share:.0f} % of the sensor's cells have some; crossed out: none"
     out.append(foot(p, note))
     return svg_of(p, title, [*out, frame(p)])
 

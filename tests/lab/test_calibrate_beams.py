@@ -20,6 +20,7 @@ from geometry.rig_parameters import RigCovariance, rig_names
 from geometry.spots import SpotModel
 from lab.calibrate.beams import calibrate_beams
 from lab.calibrate.camera_file import CameraFile, save_camera
+from lab.calibrate.recordings import spread
 from lab.calibrate.screens_file import ScreensFile, save_screens
 from lab.calibrate.still_frames import SpotRows, average, mean_of_frames, positions_at_rest
 from lab.calibration_state import CalibrationState
@@ -314,6 +315,34 @@ def test_an_unlabelled_run_is_labelled_by_the_drawing_and_its_frames_at_rest_are
     assert c.fit.kept.mean() > 0.97
     assert c.fit.scale < 1.3  # the speckle that frames share was in the sigmas
     assert np.abs(errors(rig, c.rig)[:, :2]).max() < 60 * ARCSEC
+
+
+def test_a_run_of_which_no_pose_is_known_is_labelled_by_the_tracker_and_gives_the_shape(tmp_path):
+    rng = np.random.default_rng(8)
+    rig = RIGS["unequal-fan"]()
+    t = np.arange(60) / 50.0
+    turns = np.deg2rad(np.stack([15 * np.sin(5 * t), 9 * np.sin(7 * t), 12 * np.sin(3 * t)], axis=1))
+    shifts = 0.1 * np.stack([np.sin(4 * t), np.sin(2 * t), np.cos(5 * t)], axis=1)
+    nominal = drawn(rig, rng, 2e-4, 2e-4)  # the tracker needs a drawing that fits the spots
+    detections_run(tmp_path / "recorded", rig, nominal, Pose.from_ypr(turns, shifts), rng, 1)
+    at_start = {"position_m": [0, 0, 0], "yaw_pitch_roll_deg": [0, 0, 0], "within_m": 0.3, "within_deg": 10.0}
+    cameras = {c: {"detections": "detections.csv"} for c in rig.cameras}
+    save_run({"rig": "rig.yaml", "frame_rate_hz": 50.0, "cameras": cameras, "prior": at_start}, tmp_path / "recorded")
+    project = write_project(tmp_path, rig, nominal, None, [{"run": "recorded"}])
+    outcome = calibrate_beams(project, tmp_path / "out")
+    c = outcome.calibration
+    assert len(c.world_from_body.translation) == 60
+    off = np.array([a.angle for a in c.angles]) - np.deg2rad([18.0, 41.0, 23.0])
+    assert np.all(np.abs(off) < 5 * np.array([a.sigma for a in c.angles]))
+
+
+def test_of_very_many_frames_without_a_pose_some_are_used_and_that_is_noted():
+    frames = np.repeat(np.arange(500), 6)
+    rows = SpotRows(frames, np.tile(np.arange(6), 500), np.zeros((3000, 2)), np.zeros((3000, 2, 2)))
+    notes: list[str] = []
+    used = np.unique(spread(rows, notes).frame)
+    assert (len(used), used[0], used[-1]) == (200, 0, 499)
+    assert notes == ["of 500 frames without a pose 200 were used, evenly spread"]
 
 
 def test_frames_with_the_same_record_are_one_position():
