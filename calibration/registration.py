@@ -51,7 +51,7 @@ def register(names: Sequence[str], cloud: Array, world: Array, covariances: Arra
     if rms > 10 * typical and rms_mirrored < 0.2 * rms:
         raise ValueError("scan and survey are mirror images of each other: one of them has two axes swapped")
     for _ in range(5):
-        J = np.concatenate([np.broadcast_to(np.eye(3), C.shape), -pose.rotation @ skew(cloud)], axis=2)
+        J = _derivatives(pose, cloud)
         W = np.linalg.inv(C)
         N = np.einsum("nij,nik,nkl->jl", J, W, J)
         r = world - pose.apply(cloud)
@@ -68,21 +68,31 @@ def _refuse_outlier(names: Sequence[str], cloud: Array, world: Array, C: Array) 
     """Raises ValueError for a target without which the others fit and from which it is far off."""
     if len(names) < 5:
         return  # without one of four, three fit nearly anything
-    sigma = np.sqrt(np.trace(C, axis1=1, axis2=2) / 3)
-    off = []
+    off, away = [], []
     for i in range(len(names)):
         rest = np.arange(len(names)) != i
         pose = _kabsch(cloud[rest], world[rest])
         left = pose.apply(cloud[rest]) - world[rest]
-        scale = max(float(np.sqrt(np.mean((left / sigma[rest, None]) ** 2))), 1.0)
-        off.append(float(np.linalg.norm(pose.apply(cloud[i]) - world[i])) / (sigma[i] * scale))
+        sigma = np.sqrt(np.trace(C[rest], axis1=1, axis2=2) / 3)
+        scale = max(float(np.sqrt(np.mean((left / sigma[:, None]) ** 2))), 1.0)
+        # The others leave the transform uncertain, most so where they lie nearly on a line.
+        J = _derivatives(pose, cloud)
+        N = np.einsum("nij,nik,nkl->jl", J[rest], np.linalg.inv(C[rest]), J[rest])
+        expected = C[i] + J[i] @ np.linalg.inv(N) @ J[i].T
+        miss = pose.apply(cloud[i]) - world[i]
+        off.append(float(np.sqrt(miss @ np.linalg.solve(expected, miss))) / scale)
+        away.append(float(np.linalg.norm(miss)))
     worst = int(np.argmax(off))
     if off[worst] > OUTLIER_SIGMAS:
-        away = 1e3 * off[worst] * sigma[worst]
         raise ValueError(
-            f"target {names[worst]!r} does not fit the others ({away:.0f} mm off): its name or its coordinates are"
-            " wrong in the scan or in the survey"
+            f"target {names[worst]!r} does not fit the others ({1e3 * away[worst]:.0f} mm off): its name or its"
+            " coordinates are wrong in the scan or in the survey"
         )
+
+
+def _derivatives(pose: Pose, cloud: Array) -> Array:
+    """d(world point)/d(error of the pose) (n, 3, 6)."""
+    return np.concatenate([np.broadcast_to(np.eye(3), (len(cloud), 3, 3)), -pose.rotation @ skew(cloud)], axis=2)
 
 
 def _spread(points: Array) -> Array:
