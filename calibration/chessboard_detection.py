@@ -33,8 +33,9 @@ def find_chessboard(image: GreyImage, board: Chessboard) -> BoardView | NotFound
     if largest is not None and sorted(largest.shape[:2]) == sorted((board.columns, board.rows)):
         turned = largest.shape[:2] != (board.rows, board.columns)
         found = _measured(image, np.swapaxes(largest, 0, 1) if turned else largest, board)
-        if found is not None:
-            return found
+        return found or NotFound(
+            "too blurred or noisy: the board is there, but its corners cannot be measured; focus, hold it still"
+        )
     return _other_size(largest, board)
 
 

@@ -15,6 +15,7 @@ from calibration.smaller_pictures import at_full_size, scaled, scales
 from geometry.arrays import Array
 
 _BIG_DOT = 1.35  # area of a corner's circle over what its neighbours have, from which it marks the origin
+_STRAY = 100  # blobs beside three times the board's: among thousands OpenCV searches for many minutes
 _INK = 0.5  # diameter over distance of neighbours where no blob tells it
 _FIT_PX = 0.08  # of the spacing: how well a grid must follow a homography (strong lenses bend it by less than that)
 
@@ -65,6 +66,9 @@ def _blobs(image: GreyImage) -> Array:
 def _grid(image: GreyImage, board: CircleGrid, size: tuple[int, int] | None = None) -> Array | None:
     """Rough centres (rows, columns, 2), px, in OpenCV's order, or None."""
     columns, rows = size or (board.columns, board.rows)
+    count = len(_blobs(image))
+    if not columns * rows <= count <= 3 * columns * rows + _STRAY:
+        return None
     kind = cv2.CALIB_CB_ASYMMETRIC_GRID if board.asymmetric else cv2.CALIB_CB_SYMMETRIC_GRID
     for how in (0, cv2.CALIB_CB_CLUSTERING):
         found, centres = cv2.findCirclesGrid(image, (columns, rows), flags=kind | how, blobDetector=_detector(image))
@@ -302,8 +306,9 @@ def _why_not(image: GreyImage, board: CircleGrid, blobs: Array) -> NotFound:
     for count in range(len(blobs), max(len(blobs) - 3, 8), -1):
         for columns in range(3, count // 3 + 1):
             if count % columns == 0 and _grid(image, board, (columns, count // columns)) is not None:
+                wide, high = sorted((columns, count // columns), reverse=board.columns >= board.rows)
                 return NotFound(
-                    f"a grid of {columns}x{count // columns} circles, not {board.columns}x{board.rows}: part of the"
+                    f"a grid of {wide}x{high} circles, not {board.columns}x{board.rows}: part of the"
                     " board is outside the picture, or count again (circles in a row, then rows)"
                 )
     if len(blobs) < 0.5 * wanted:

@@ -112,7 +112,8 @@ def _lattice(n: int) -> Array:
     """n points (n, 2) in the unit square of which no two share an x or a y, so that edges along the rows of pixels
     are drawn as finely as others: Fibonacci's lattice, centred."""
     k = np.arange(n)
-    return np.stack([(k + 0.5) / n, ((k * 0.6180339887498949) % 1 + 0.5 / n) % 1], axis=-1)
+    rank = np.argsort(np.argsort((k * 0.6180339887498949) % 1))
+    return np.stack([(k + 0.5) / n, (rank + 0.5) / n], axis=-1)
 
 
 def _on_paper(board: Board, xy: Array) -> Bools:

@@ -1,0 +1,75 @@
+"""Photographs of a board: which files are read, and what is said of those that are of no use."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from calibration.boards import parse
+from geometry.camera import Camera
+from geometry.pose import Pose
+from lab.calibrate.photos import find_in_photos, load_photos
+from lab.errors import CalibrationError, InputError
+from lab.simulate.board_photo import Look, photograph
+
+BOARD = parse("chessboard:9x6:25mm")
+
+
+@pytest.fixture(scope="module")
+def picture() -> np.ndarray:
+    camera = Camera("c", "s", (400, 300), np.array([[500.0, 0, 200], [0, 500, 150], [0, 0, 1]]), (), Pose.identity())
+    at = Pose(np.eye(3), np.array([0, 0, 0.5]) - BOARD.middle)
+    return photograph(BOARD, camera, at, look=Look(samples=16)).image
+
+
+def test_pictures_of_every_kind_are_read_in_natural_order(tmp_path, picture):
+    for k in (1, 2, 10):
+        cv2.imwrite(str(tmp_path / f"shot-{k}.png"), np.clip(picture.astype(int) + k, 0, 255).astype(np.uint8))
+    cv2.imwrite(str(tmp_path / "shot-11.png"), 100 + picture.astype(np.uint16) * 7)  # 16 bits, of which 11 are used
+    cv2.imwrite(str(tmp_path / "shot-12.jpg"), cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR))
+    (tmp_path / "shot-13.png").write_bytes(b"")
+    steps = []
+    photos = find_in_photos([tmp_path, tmp_path / "shot-1.png"], BOARD, lambda *step: steps.append(step))
+    assert [name for name, _ in photos.views] == [f"shot-{k}" for k in ("1.png", "2.png", "10.png", "11.png", "12.jpg")]
+    assert photos.refused == (("shot-13.png", "unreadable: the file is empty"),)
+    assert photos.image_size_px == (400, 300)
+    assert steps[-1] == (6, 6, "shot-13.png")
+    first = photos.views[0][1].pixels
+    for _, view in photos.views:
+        np.testing.assert_allclose(view.pixels, first, atol=0.05)
+
+
+def test_the_same_picture_twice_counts_once(tmp_path, picture):
+    for name in "abc":
+        cv2.imwrite(str(tmp_path / f"{name}.png"), picture)
+    with pytest.raises(
+        CalibrationError, match=r"found in 1 of 3 pictures, 3 or more .*\(2 of 2.*the same picture as a"
+    ):
+        find_in_photos([tmp_path], BOARD)
+
+
+def test_mixed_sizes_name_the_pictures(tmp_path, picture):
+    for k in range(3):
+        cv2.imwrite(str(tmp_path / f"a{k}.png"), picture + np.uint8(k))
+    cv2.imwrite(str(tmp_path / "b.png"), picture[:, ::2])
+    with pytest.raises(InputError, match=r"different sizes: 400x300 \(a0.png, a1.png, a2.png\), 200x300 \(b.png\)"):
+        find_in_photos([tmp_path / "*.png"], BOARD)
+
+
+def test_what_names_no_picture_is_said(tmp_path):
+    for given, words in (
+        ([], "no pictures given"),
+        ([tmp_path], "holds no pictures"),
+        ([tmp_path / "x.png"], "found nothing; check the path"),
+        ([tmp_path / "*.png"], "no picture matches"),
+    ):
+        with pytest.raises(InputError, match=words):
+            load_photos(given)
+
+
+def test_the_commonest_reason_is_told(tmp_path, picture):
+    for k in range(3):
+        cv2.imwrite(str(tmp_path / f"a{k}.png"), picture + np.uint8(k))
+    with pytest.raises(InputError, match=r"found in none of 3 pictures; .*\(3 of 3, first a0.png\): .*9x6"):
+        find_in_photos([tmp_path], parse("chessboard:7x7:25mm"))
