@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import chdtri
 
-from calibration.adjustment import Adjusted, At, Cauchy, Free, Loss, Term, Values, solve
+from calibration.adjustment import Adjusted, At, Cauchy, Free, Limits, Loss, Term, Values, solve
 from calibration.beams import Stand
 from calibration.corners import CornerTerm
 from calibration.flatness import smallest_scatter
@@ -34,9 +34,13 @@ LENSES, SURVEY, DOTS, SURFACES = "lens calibrations", "survey", "pixels of dots"
 CORNERS, FIXED, SCANS = "board corners", "boards on screens", "scans"
 FLAT_BOARDS = "flatness of boards"
 SPOTS, RECORDS, PLACE, FRAMES = "spots", "stand positions", "place of the stand", "screen axes"
+LOST = "positions without a record"
 P_OUTLIER = 1e-4  # of a good measurement to be left out: one in 10 000
 P_MISFIT = 1e-3  # of a right fit to be called a misfit
 _ROUNDS = 8
+# With weights that change from step to step the last digits settle slowly, and it is only a start.
+_ROUGHLY = Limits(steps=120, small_step_sigmas=0.1)
+_ANYWHERE = 0.1  # m, rad: about where a position is whose record was left out
 _SETTLED = 0.02  # relative: a scale is found when the next round changes it by less
 _MOST_SCALE = 10.0  # told sigmas may be so much too small; what scatters more was not measured of this rig
 _RESCALED = (SPOTS, DOTS, CORNERS, SURVEY, RECORDS, SURFACES)  # kinds whose sigmas may be widened
@@ -198,10 +202,11 @@ def _robust(
     """Outliers fade, then are left out until the same ones stay out; the rest is adjusted with full weights."""
     rest = [t for ts in fixed.values() for t in ts]
     first = [_picked(t, allowed[n], Cauchy()) for n, t in every.items()]
-    found = solve(values, [*first, *rest], free)
+    found = solve(values, [*first, *rest], free, _ROUGHLY)
     kept = _near(measured, every, found.values, allowed)
     for _ in range(_ROUNDS):
-        found = solve(found.values, [*(_picked(t, kept[n]) for n, t in every.items()), *rest], free)
+        terms = [t for ts in _told(every, fixed, kept).values() for t in ts]
+        found = solve(found.values, terms, free)
         again = _near(measured, every, found.values, allowed)
         if all(np.array_equal(again[n], kept[n]) for n in kept):
             break
@@ -233,7 +238,13 @@ def _told(
     every: Mapping[str, Term], fixed: Mapping[str, tuple[Term, ...]], kept: Mapping[str, Bools]
 ) -> dict[str, tuple[Term, ...]]:
     """The kept measurements with the sigmas that came with them."""
-    return {n: (_picked(t, kept[n]),) for n, t in every.items()} | dict(fixed)
+    out = {n: (_picked(t, kept[n]),) for n, t in every.items()} | dict(fixed)
+    if RECORDS in every and not kept[RECORDS].all():
+        # A position without its record must not run away where its spots do not determine it.
+        lost = _picked(every[RECORDS], ~kept[RECORDS])
+        assert isinstance(lost, RecordTerm)
+        out[LOST] = (replace(lost, sigmas=np.where(lost.sigmas > 0, _ANYWHERE, 0.0)),)
+    return out
 
 
 def _fits(

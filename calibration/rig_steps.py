@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from calibration.adjustment import AdjustmentError
 from calibration.beams import BeamCalibration, Stand, calibrate_beams
+from calibration.excitation import Motion
 from calibration.joint import Joint, Measured, calibrate_jointly
 from calibration.network import Network
 from calibration.rig_stacks import BEAMS, POSES, STAND
@@ -40,7 +41,14 @@ def calibrate_in_steps(
     calibration/screens.py; nominal: as in calibration/beams.py. Raises what these raise: AdjustmentError, ValueError.
     """
     screens = calibrate(network, setups, near, held_screen)
-    beams = calibrate_beams(screens.fit.rig, spots, stand, screens.fit.covariance, nominal=nominal)
+    try:
+        beams = calibrate_beams(screens.fit.rig, spots, stand, screens.fit.covariance, nominal=nominal)
+    except AdjustmentError as error:
+        # Along a direction that nothing determines the steps may wander instead of ending.
+        motion = Motion.of(stand.stand_from_body)
+        if not motion.flat:
+            raise
+        raise AdjustmentError(f"{error}; the stand's positions do not tell all ({motion}): {motion.cure()}") from None
     if beams.undetermined:
         raise AdjustmentError(
             f"the stand's positions leave undetermined: {'; '.join(beams.undetermined)} ({beams.motion}):"

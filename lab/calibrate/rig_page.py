@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calibration.joint import DOTS, FRAMES, SPOTS, Joint
+from calibration.joint import DOTS, FRAMES, LOST, SPOTS, Joint
 from calibration.joint_findings import in_degrees, in_mm
 from calibration.measurement_groups import LEAST_REDUNDANCY
 from calibration.rig_stacks import POSES, STAND, lines_in, stacks_of
@@ -133,7 +133,7 @@ def _shares(o: Outcome) -> Section | None:
             f"{100 * float(np.trace(C[:3, :3])) / total[1]:.1f}",
         )
         for name, C in e.shares.items()
-        if name != FRAMES
+        if name not in (FRAMES, LOST)
     ]
     rows.sort(key=lambda r: -float(r[3]))
     heads = ("errors of", "attitude (deg)", "position (mm)", "% of attitude variance", "% of position variance")
@@ -175,7 +175,7 @@ def _groups(o: Outcome) -> Section:
     joint = o.steps.joint
     rows = []
     for name, g in joint.groups.items():
-        if name == FRAMES:
+        if name in (FRAMES, LOST):
             continue
         kept = joint.kept.get(name)
         left_out = 0 if kept is None else int(np.sum(~kept))

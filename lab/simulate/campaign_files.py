@@ -26,7 +26,7 @@ from lab.whole_folder import whole_folder
 from lab.yaml_text import write_mapping
 
 PROJECT = "calibration.yaml"
-BOARD = "chessboard:10x8:40mm"
+BOARD = "charuco:11x9:36mm:27mm:DICT_4X4_100"  # its corners count also where the board leaves the picture
 PHOTOS = 24  # per camera
 _PHOTO_POSES = 11  # seed of the board's places: not those that the lens covariance is made with
 _DATE = "2026-01-15"  # of the lens calibrations; a fixed day, so that the same seed gives the same bytes
