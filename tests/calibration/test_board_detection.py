@@ -198,7 +198,8 @@ def test_an_inverted_or_older_charuco_board_is_found_all_the_same_and_said_to_be
 def test_markers_of_another_size_than_said_are_measured():
     _, photo = shot("charuco:7x5:35mm:24mm:DICT_5X5_100")
     (note,) = seen(photo.image, parse("charuco:7x5:35mm:17mm:DICT_5X5_100")).notes
-    assert note.startswith("markers measure 0.6") and note.endswith("of a square, the board's text says 0.49")
+    assert note.startswith("markers measure 0.6")
+    assert note.endswith("of a square, the board's text says 0.49")
 
 
 @pytest.mark.parametrize("text", [CHARUCO, CHARUCO + ":inverted"])
@@ -218,7 +219,7 @@ def test_a_mirrored_chessboard_is_its_own_mirror_image_but_its_order_is_not_mirr
 def test_a_picture_out_of_focus_says_so():
     board, photo = shot(CHESS)
     blurred = cv2.GaussianBlur(photo.image, (0, 0), 9)
-    assert "too blurred: edges are smeared" in refused(blurred, board)
+    assert "too blurred" in refused(blurred, board)
     board, photo = shot(CHARUCO)
     assert "blurred" in refused(cv2.GaussianBlur(photo.image, (0, 0), 5), board)
 

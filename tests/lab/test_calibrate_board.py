@@ -71,5 +71,5 @@ def test_a_file_with_mistakes_is_answered_with_its_field(tmp_path):
     path.write_text("schema: beampose/board/1\nkind: chessboard\ncolumns: 9\nrows: 6\nspacing_m: 0.025\n")
     with pytest.raises(InputError, match=r"board\.yaml: expected square_m for a board of kind 'chessboard'"):
         board_of(path)
-    with pytest.raises(InputError, match="expected a length with its unit .* or name a board.yaml"):
+    with pytest.raises(InputError, match=r"expected a length with its unit .* or name a board\.yaml"):
         board_of("chessboard:9x6:25")
