@@ -56,7 +56,9 @@ def hold_out(table: CornerTable, found: LensFit, folds: int | None = None) -> He
     kept = []
     for group in folds_of(used_views(found, table), folds):
         held = np.isin(table.view, group)
-        without = fit(table, found.used & ~held, found.model, found.values, found.warp_free, limits=BRIEF)
+        without = fit(
+            table, found.used & ~held, found.model, found.values, found.warp_free, limits=BRIEF, sigma_px=found.sigma_px
+        )
         kept.append(without)
         error[group] = _errors(table, found.used & held, without, found.values)[group]
     return HeldOut(error, kept, float(np.sqrt(np.nanmean(error))))
@@ -66,9 +68,9 @@ def _errors(table: CornerTable, held: Bools, without: LensFit, values: Values) -
     """(V,): squared error per coordinate and degree of freedom of the held corners (N,), their poses refitted."""
     start = {**without.values, "boards": _at(values)}
     nothing = np.zeros(18, dtype=bool)
-    refitted = adjust(table, held, without.model, start, lens_free=nothing, limits=BRIEF)
+    refitted = adjust(table, held, without.model, start, sigma_px=without.sigma_px, lens_free=nothing, limits=BRIEF)
     squared = np.zeros(len(table))
-    squared[held] = np.sum(refitted.residuals[0] ** 2, axis=1)
+    squared[held] = np.sum(refitted.residuals[0] ** 2, axis=1) * without.sigma_px**2
     total = np.bincount(table.view, weights=squared, minlength=table.views)
     return total / np.maximum(2 * table.counts(held) - 6, 1)
 

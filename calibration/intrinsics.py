@@ -10,7 +10,7 @@ import numpy as np
 from calibration.adjustment import AdjustmentError
 from calibration.corner_table import CornerTable
 from calibration.coverage import coverage_of, spread_deg
-from calibration.hold_out import hold_out, scatter
+from calibration.hold_out import HeldOut, Scatter, hold_out, scatter
 from calibration.intrinsics_findings import findings_of
 from calibration.intrinsics_result import Intrinsics
 from calibration.lens_fit import FEWEST_CORNERS, LensFit, Values, fit, robust_fit, used_views
@@ -63,9 +63,7 @@ def _calibrated(table: CornerTable, options: IntrinsicsOptions) -> Intrinsics:
     warp_free = bend is not None and bend.corrected
     values = [_start_of(rich, fisheye, warp_free) for fisheye in (False, True)]
     ladder = climb(table, used, values, warp_free, options.folds, options.lens)
-    found = _final(table, ladder.chosen, warp_free)
-    held = hold_out(table, found, options.folds)
-    spread = scatter(found, held)
+    found, held, spread = _final(table, ladder.chosen, warp_free, options.folds)
     noise = max(1.0, spread.factor) if spread.p_value < SCATTER_SIGNIFICANT else 1.0
     distance = options.distance_m or _typical_depth(table, found)
     pixel_map = projection_map(found.model, found.lens, table.image_size_px, distance)
@@ -146,15 +144,17 @@ def _start_of(fits: Sequence[LensFit], fisheye: bool, warp_free: bool) -> Values
     return None
 
 
-def _final(table: CornerTable, chosen: Rung, warp_free: bool) -> LensFit:
+def _final(table: CornerTable, chosen: Rung, warp_free: bool, folds: int | None) -> tuple[LensFit, HeldOut, Scatter]:
     """The chosen model once more from all corners: what is no corner is judged by the lens that stays."""
     assert chosen.fit is not None
+    assert chosen.held is not None
+    assert chosen.scatter is not None
     try:
         found = robust_fit(table, chosen.model, chosen.fit.values, warp_free)
-        found.covariance  # noqa: B018 - asked whether there is one
+        held = hold_out(table, found, folds)
+        return found, held, scatter(found, held)
     except AdjustmentError:
-        return chosen.fit
-    return found
+        return chosen.fit, chosen.held, chosen.scatter
 
 
 def _typical_depth(table: CornerTable, found: LensFit) -> float:

@@ -167,7 +167,7 @@ def _aspect(c: Intrinsics, limits: Limits) -> Finding:
         level = Level.PASS
     return _unless_pass(
         level,
-        f"fx / fy = {fx / fy:.4f} ± {sigma:.4f}.",
+        f"fx / fy = {fx / fy:.4f} ± {sigma:.1g}.",
         "Pixels are square on nearly every sensor: two focal lengths mean that the board's rows and columns are not as"
         " far apart as was said, that the pictures were stretched, or that the views do not determine them.",
         "Measure the board along both directions; photograph it turned by 90 deg as well; check the pictures' scaling.",
@@ -253,7 +253,7 @@ def _warp(c: Intrinsics, limits: Limits) -> Finding | None:
     w = c.warp
     if w is None:
         return None
-    text = f"The board is bent by {1000 * w.rise_m:.2f} mm (p = {w.p_value:.1g} if it were flat): {w.why}"
+    text = f"The board looks bent by {1000 * w.rise_m:.2f} mm (p = {w.p_value:.1g} if it were flat): {w.why}"
     if not w.corrected:
         return Finding(Level.PASS, text + "; taken as flat.")
     return _unless_pass(

@@ -32,10 +32,11 @@ class LensFit:
 
     model: LensModel
     values: Values  # the engine's stacks; world is the camera
-    adjusted: Adjusted  # solved with sigma_px = 1
+    adjusted: Adjusted
     used: Bools  # (N,)
     residuals: Array  # (N, 2), px, of ALL corners: projected less measured; nan for those of views without a pose
     sigma_px: float  # of a corner's coordinate, from the used residuals and their degrees of freedom
+    relative_sigma: float  # the same in the sigmas that the adjustment was solved with
     warp_free: bool
     dropped: Mapping[int, str] = field(default_factory=dict)  # view -> why it was not used
 
@@ -63,12 +64,12 @@ class LensFit:
         """Joint covariance (p, p) of the model's parameters, from the corners' own scatter. AdjustmentError."""
         whole = self.adjusted.covariance([("intrinsics", 0)])
         free = self.model.free
-        return whole[np.ix_(free, free)] * self.sigma_px**2
+        return whole[np.ix_(free, free)] * self.relative_sigma**2
 
     @property
     def warp_covariance(self) -> Array:
         """(3, 3), 1/m^2; 0 where the warp was held. AdjustmentError."""
-        return self.adjusted.covariance([("warp", 0)]) * self.sigma_px**2
+        return self.adjusted.covariance([("warp", 0)]) * self.relative_sigma**2
 
 
 def values_of(lens: Array, camera_from_board: Pose, warp: Array | None = None) -> Values:
@@ -130,14 +131,22 @@ def fit(
     warp_free: bool,
     dropped: Mapping[int, str] = {},
     limits: Limits = SETTLED,
+    sigma_px: float | None = None,
 ) -> LensFit:
-    """Plain least squares over the used corners (N,). AdjustmentError."""
-    adjusted = adjust(table, used, model, values, warp_free, limits=limits)
+    """Plain least squares over the used corners (N,). AdjustmentError.
+
+    sigma_px: about what a corner will miss by, None: as at the start. It sets how small a last step must be, no more: a
+    model that misses by pixels then need not settle to a thousandth of one.
+    """
+    scale = sigma_px or _spread(_residuals(table, used, model, values)[used])
+    adjusted = adjust(table, used, model, values, warp_free, scale, limits=limits)
     everything = term_of(table, np.ones(len(table), dtype=bool), model.fisheye)
     residuals = everything.project(adjusted.values) - table.pixels
     residuals[~(table.counts(used) > 0)[table.view]] = np.nan
-    sigma = float(np.sqrt(adjusted.chi2 / max(adjusted.dof, 1)))
-    return LensFit(model, adjusted.values, adjusted, used, residuals, sigma, warp_free, dict(dropped))
+    relative = float(np.sqrt(adjusted.chi2 / max(adjusted.dof, 1)))
+    return LensFit(
+        model, adjusted.values, adjusted, used, residuals, relative * scale, relative, warp_free, dict(dropped)
+    )
 
 
 def robust_fit(table: CornerTable, model: LensModel, values: Values, warp_free: bool) -> LensFit:
@@ -173,6 +182,7 @@ def _residuals(table: CornerTable, candidates: Bools, model: LensModel, values: 
     """(N, 2), px; nan for other than candidates."""
     out = np.full((len(table), 2), np.nan)
     term = term_of(table, candidates, model.fisheye)
+    values = {**values, "intrinsics": Vectors(model.cut(lens_of(values))[None])}
     out[candidates] = term.project(values) - term.pixels
     return out
 

@@ -102,7 +102,7 @@ def _numbers(r: Intrinsics) -> Section:
 
 
 def _model(r: Intrinsics) -> Section:
-    rungs = r.ladder.rungs
+    rungs = [x for x in r.ladder.rungs if x.held is not None]
     held = np.array([np.nan if x.held is None else x.held.rms_px for x in rungs])
     fitted = np.array([np.nan if x.fit is None else x.fit.sigma_px for x in rungs])
     # Of the difference to the best, which is far better known than each error alone.
@@ -116,7 +116,7 @@ def _model(r: Intrinsics) -> Section:
             np.nan if x.held is None else x.held.rms_px,
             "chosen" if x.model == r.ladder.chosen.model else x.refused or "errs more, or gains nothing",
         )
-        for x in rungs
+        for x in r.ladder.rungs
     ]
     words = [
         f"Each model was solved {len(r.held.folds)} times more, each time without some of the photographs, and then"
