@@ -10,8 +10,11 @@ from scipy.stats import chi2
 
 from calibration.adjustment import AdjustmentError
 from calibration.beams import calibrate_beams, self_calibrate
-from calibration.excitation import body_motion
+from calibration.body_gauge import BodyGauge
+from calibration.excitation import body_motion, without_frame
 from calibration.rig_stacks import lines_in, stacks_of
+from calibration.stacks import Lines
+from geometry.arrays import numeric_jacobian
 from geometry.pose import Pose
 from geometry.rig import Beam, Rig
 from lab.simulate.rigs import RIGS
@@ -45,6 +48,43 @@ def test_the_frame_is_laid_nearest_to_the_drawing():
     away = lines_in(stacks_of(found.rig)).minus(lines_in(stacks_of(nominal))).ravel()
     assert np.linalg.norm(away) > 1e-3  # the drawing was off
     np.testing.assert_allclose(np.linalg.qr(G)[0].T @ away, 0, atol=1e-6)
+
+
+def test_what_only_the_choice_of_frame_decides_has_no_variance():
+    rng = np.random.default_rng(7)
+    rig = RIGS["four-skew-beams"]()
+    found = self_calibrate(rig, recorded(rng, rig, positions(rng, 20)), 20)
+    frame = np.linalg.qr(body_motion(lines_in(stacks_of(rig))))[0]
+    # Against the drawing's lines, with their points where the drawing has them: to first order the same.
+    assert (
+        np.diagonal(frame.T @ found.lines_covariance @ frame).max() < 1e-3 * np.diagonal(found.lines_covariance).max()
+    )
+
+
+def test_derivatives_of_the_frame_are_differences_also_where_points_lie_elsewhere_along_their_beams():
+    rng = np.random.default_rng(8)
+    nominal = lines_in(stacks_of(RIGS["four-skew-beams"]()))
+    turned = nominal.plus(rng.normal(0, 1e-5, (4, 4)))
+    lines = Lines(turned.points + 0.6 * turned.directions, turned.directions)
+    gauge = BodyGauge(nominal)
+    parts = gauge.linearise({"beams": lines}).parts
+    got = np.concatenate([p.jacobian[0] for p in parts], axis=1)
+    expected = numeric_jacobian(
+        lambda d: gauge.linearise({"beams": lines.plus(d.reshape(4, 4))}).residuals[0], np.zeros(16), 1e-6
+    )
+    np.testing.assert_allclose(got, expected, rtol=1e-3, atol=1e-4 * np.abs(expected).max())
+
+
+def test_more_than_the_frame_is_told_apart_from_the_frame():
+    rng = np.random.default_rng(9)
+    lines = lines_in(stacks_of(RIGS["four-skew-beams"]()))
+    loose = np.zeros(16)
+    loose[6] = 1.0  # an offset of beam B
+    mixed = rng.normal(size=(7, 7)) @ np.vstack([body_motion(lines).T, loose])
+    (rest,) = without_frame(mixed, lines)
+    frame = np.linalg.qr(body_motion(lines))[0]
+    expected = loose - frame @ (frame.T @ loose)
+    assert abs(rest @ expected) / np.linalg.norm(expected) > 1 - 1e-9
 
 
 def test_a_drawing_in_another_frame_turns_the_result_and_no_angle():

@@ -137,3 +137,20 @@ def test_a_beam_that_misses_gives_nan_and_so_ends_a_solve():
     away = Pose.from_ypr(np.array([np.pi / 2, 0, 0]), np.zeros(3))
     turned = {**values, "stand": Poses.of([away @ values["stand"].pose[0]])}
     assert np.isnan(SpotTerm(rig, spots).linearise(turned).residuals).any()
+
+
+def test_a_covariance_of_less_than_full_rank_holds_what_it_says_cannot_vary():
+    rig, values, _ = scene(6)
+    together = np.array([1.0, 2.0])  # two numbers that err as one: y twice as much as x
+    prior, _ = prior_of(
+        rig, RigCovariance(("screens.left.x_m", "screens.left.y_m"), 1e-6 * np.outer(together, together))
+    )
+    left = list(rig.screens).index("left")
+
+    def sigmas(dx: float, dy: float) -> float:
+        step = np.zeros((len(values["screens"]), 6))
+        step[left, :2] = dx, dy
+        return float(np.linalg.norm(prior.linearise({**values, "screens": values["screens"].plus(step)}).residuals))
+
+    assert sigmas(1e-3, 2e-3) == pytest.approx(1.0, rel=1e-3)
+    assert sigmas(2e-3, -1e-3) > 1e3

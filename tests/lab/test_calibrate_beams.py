@@ -20,7 +20,8 @@ from geometry.rig_parameters import RigCovariance, rig_names
 from geometry.spots import SpotModel
 from lab.calibrate.beams import calibrate_beams
 from lab.calibrate.camera_file import CameraFile, save_camera
-from lab.calibrate.recordings import spread
+from lab.calibrate.project import load_project
+from lab.calibrate.recordings import read_recordings, spread
 from lab.calibrate.screens_file import ScreensFile, save_screens
 from lab.calibrate.still_frames import SpotRows, average, mean_of_frames, positions_at_rest
 from lab.calibration_state import CalibrationState
@@ -188,7 +189,29 @@ def test_a_stand_that_only_yaws_fails_with_the_cure_and_writes_no_rig(tmp_path):
     assert "a turn about z, with all beams the other way" in bad.what
     assert bad.cure.startswith("add positions turned by 10 deg or more about the stand's x and y")
     assert not (tmp_path / "out" / "rig.yaml").exists()
+    assert {b["sigma_direction_arcsec"] for b in table(tmp_path / "out" / "beams.csv")} == {""}
     assert "add positions turned" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8").lower()
+
+
+def test_recordings_are_joined_position_by_position_each_with_its_own_sigma(campaign, tmp_path):
+    rig, project = campaign
+    lines = (tmp_path / "spots.csv").read_text().splitlines()
+    second = [s for s in lines[1:] if int(s.split(",")[0]) >= 30]
+    (tmp_path / "late.csv").write_text("\n".join([lines[0], *second]) + "\n")
+    (tmp_path / "spots.csv").write_text("\n".join(s for s in lines if s not in second) + "\n")
+    poses = (tmp_path / "poses.csv").read_text().splitlines()
+    told = [f"{poses[0]},sigma_x_m,sigma_rot_z_deg", *(f"{p},0.001,0.5" for p in poses[1:])]
+    (tmp_path / "worse.csv").write_text("\n".join(told) + "\n")
+    head = project.read_text().split("recordings:")[0]
+    both = "[{spots: spots.csv, poses: poses.csv}, {spots: late.csv, poses: worse.csv}]"
+    stand = project.read_text()[project.read_text().index("stand:") :] if "stand:" not in head else ""
+    project.write_text(f"{head}recordings: {both}\n{stand}")
+    found = read_recordings(load_project(project), rig)
+    assert found.names[29:31] == ("spots 29", "late 30")
+    assert np.unique(found.spots.position).tolist() == list(range(40))
+    general = [2e-5, 2e-5, 2e-5, *np.radians([0.001] * 3)]
+    np.testing.assert_allclose(found.pose_sigmas[:30], np.tile(general, (30, 1)))
+    np.testing.assert_allclose(found.pose_sigmas[30:], np.tile([1e-3, *general[1:5], np.radians(0.5)], (10, 1)))
 
 
 def test_a_wrong_stand_record_is_named(campaign, tmp_path):
