@@ -15,6 +15,7 @@ from scipy import ndimage
 from calibration.flatness import judge_flatness
 from calibration.screen_frame import frame_of_extent
 from calibration.screens import Scan, laid_on, pose_covariance
+from calibration.survey_suspects import wrong_unit
 from geometry.arrays import Array, Bools, skew
 from geometry.pose import Pose
 
@@ -103,7 +104,8 @@ def planes(points: Array) -> list[Candidate]:
     rest = points
     out: list[Candidate] = []
     extent = float(np.linalg.norm(np.ptp(points, axis=0)))
-    within = float(np.clip(0.003 * extent, 0.002, 0.02))
+    # Of a screen and its surroundings; a cloud far beyond that is in another unit, which its planes' sizes then tell.
+    within = 0.003 * extent if extent > 100 else float(np.clip(0.003 * extent, 0.002, 0.02))
     rng = np.random.default_rng(0)
     o3d.utility.random.seed(0)
     for _ in range(_PLANES):
@@ -166,7 +168,10 @@ def _like(found: list[Candidate], size_m: tuple[float, float] | None) -> Candida
     best = min(found, key=lambda c: float(np.max(np.abs(np.log(c.extent_m / wanted)))))
     if np.max(np.abs(np.log(best.extent_m / wanted))) > np.log(1.3):
         seen = "; ".join(f"{c.extent_m[0]:.2f} m x {c.extent_m[1]:.2f} m" for c in found)
-        raise ValueError(f"no plane of {wanted[0]:g} m x {wanted[1]:g} m was found; those in the cloud: {seen}")
+        units = [wrong_unit(float(np.linalg.norm(c.extent_m)), float(np.linalg.norm(wanted))) for c in found]
+        unit = next((u for u in units if u), "")
+        hint = f"; is the scan's unit another one ({unit})?" if unit else ""
+        raise ValueError(f"no plane of {wanted[0]:g} m x {wanted[1]:g} m was found; those in the cloud: {seen}{hint}")
     return best
 
 

@@ -288,6 +288,10 @@ def _fit(
     factor = chi2 / dof if dof > 0 and p_fits < SIGNIFICANT else 1.0
     names, T = named_errors(rig, found.values, list(at))
     covariance = T @ found.covariance(list(at)) @ T.T * factor
+    # Lens numbers that were held have no error here, and no place among those that do.
+    known = np.diagonal(covariance) > 0
+    names = tuple(n for n, k in zip(names, known, strict=True) if k)
+    covariance = covariance[np.ix_(known, known)]
     corner_errors = np.empty((0, 2)) if corners is None else corners.pixels - corners.project(found.values)
     return NetworkFit(
         rig=rig,

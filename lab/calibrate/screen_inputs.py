@@ -207,9 +207,5 @@ def _scan(cloud: Cloud, entry: ScreenEntry, survey: Survey, project: Project) ->
     except MissingOpen3DError as error:
         raise InputError(f"{cloud.path}: {error}") from None
     except ValueError as error:
-        unit = ""
-        if entry.size_m is not None:
-            unit = wrong_unit(float(np.linalg.norm(np.ptp(points, axis=0))), 1.5 * float(np.hypot(*entry.size_m)))
-        hint = f"; is the scan's `unit` right ({unit})?" if unit else ""
-        raise InputError(f"{cloud.path}: {error}{hint}") from None
+        raise InputError(f"{cloud.path}: {error}") from None
     return scan, [*words, f"{cloud.path.name}: {scan.words}"]

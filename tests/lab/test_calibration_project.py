@@ -1,0 +1,210 @@
+"""calibration.yaml and its tables: what is read, and how each mistake is told."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lab.calibrate.point_files import read_observations, read_poses, read_survey
+from lab.calibrate.project import load_project, placement_of
+from lab.errors import InputError
+from lab.yaml_text import read_mapping, write_mapping
+from tests.lab.screen_projects import write_project
+
+TARGET = {
+    "beams": {
+        "A": {"direction": [1.0, 0.0, 0.0], "point_m": [0, 0, 0]},
+        "B": {"direction": [1.0, 0.3, 0.0], "point_m": [0, 0, 0]},
+    },
+    "spots": {"1": {"beam": "A", "end": "-", "screen": "left"}, "2": {"beam": "B", "end": "+", "screen": "right"}},
+}
+POSE = {"quaternion_wxyz": [1.0, 0.0, 0.0, 0.0], "translation_m": [0.1, 0.2, 0.3]}
+
+
+def changed(path, **changes):
+    """The project with some keys changed: `a__b=value` for nested ones."""
+    content = read_mapping(path)
+    for place, value in changes.items():
+        block = content
+        *inner, last = place.split("__")
+        for key in inner:
+            block = block[key]
+        block[last] = value
+    write_mapping(content, path)
+    return path
+
+
+def test_a_project_says_what_it_holds(tmp_path):
+    (tmp_path / "poses.csv").write_text("frame,t_s,x_m,y_m,z_m,qw,qx,qy,qz\n0,0,0,0,0,1,0,0,0\n")
+    (tmp_path / "spots.csv").write_text("frame,camera,spot,u_px,v_px\n")
+    path = write_project(
+        tmp_path,
+        target=TARGET,
+        valid_days=90,
+        stand={"world_from_stand": POSE, "sigma_m": 0.001, "sigma_deg": 0.1, "pose_sigma_deg": 0.01},
+        recordings=[{"spots": "spots.csv", "poses": "poses.csv"}],
+    )
+    project = load_project(path)
+    assert (project.name, str(project.date), project.valid_days) == ("bay 3", "2026-03-14", 90)
+    assert list(project.cameras) == list(project.screens) == ["left", "right"]
+    assert project.cameras["left"].lens.image_size_px == (1280, 1024)
+    assert project.screens["right"].size_m == (2.4, 2.0)
+    assert list(project.beams) == ["A", "B"]
+    assert project.spots["1"].sign == -1
+    assert project.stand.sigma_rad == pytest.approx(np.radians(0.1))
+    np.testing.assert_array_equal(project.stand.world_from_stand.translation, [0.1, 0.2, 0.3])
+    assert project.recordings[0].poses == tmp_path / "poses.csv"
+    tables = {"survey.csv", "points.csv", "spots.csv", "poses.csv"}
+    lenses = {"left-camera.yaml", "right-camera.yaml"}
+    assert {p.name for p in project.inputs} == {"calibration.yaml"} | lenses | tables
+    assert load_project(tmp_path).path == path
+
+
+def board(photos):
+    return {"boards": [{"board": "chessboard:9x6:25mm", "photos": photos}]}
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"schema": "beampose/calibraton/1"}, "schema: expected 'beampose/calibration/1'"),
+        ({"survay": "survey.csv"}, "unknown key 'survay'; did you mean 'survey'?"),
+        (
+            {"cameras__left__screen": "lft"},
+            "cameras.left.screen: expected a screen of this file, got 'lft'; did you mean",
+        ),
+        (
+            {"cameras__left__intrinsics": "left-camra.yaml"},
+            "cameras.left.intrinsics: .* did you mean 'left-camera.yaml'",
+        ),
+        ({"survey": "survey2.csv"}, "survey.0: expected a file, found none"),
+        ({"screens__left__size_m": [4.0, -3.0]}, "screens.left.size_m: expected a number above 0, got -3.0"),
+        ({"screens__left__bow": "maybe"}, "screens.left.bow: expected 'auto', 'always' or 'never', got 'maybe'"),
+        ({"screens": {}}, "screens: expected one or more, got none"),
+        ({"world": "ceiling"}, "world: expected a screen of this file, got 'ceiling'"),
+        ({"valid_days": 0}, "valid_days: expected a whole number of days"),
+        ({"date": "14 March"}, "date: expected a date such as 2026-03-14"),
+        ({"stand": {"sigma_m": 0.1}}, "stand: sigma_m, sigma_deg: expected world_from_stand"),
+        ({"recordings": [{"poses": "p.csv"}]}, "recordings.0: expected run or spots, got neither"),
+        ({"recordings": [{"run": "nowhere"}]}, "recordings.0.run: expected a run folder, found no run.yaml"),
+        ({"boards": [{"board": "chesboard:9x6:25mm", "photos": {}}]}, r"boards.0.board: .*did you mean 'chessboard'"),
+        (board({"left": "l/*.png"}), r"boards.0.photos.left: expected photographs, found none for 'l/\*.png'"),
+        (board({"top": "survey.csv"}), "boards.0.photos.top: expected a camera of this file"),
+        ({"screens__left__cloud": {"file": "survey.csv", "unit": "yd"}}, "screens.left.cloud.unit: expected 'm', 'cm'"),
+        (
+            {"target": {**TARGET, "spots": {"1": {"beam": "C", "end": "-", "screen": "left"}}}},
+            "target.spots.1.beam: expected a beam",
+        ),
+    ],
+)
+def test_mistakes_name_file_and_field_and_what_to_do(tmp_path, changes, words):
+    path = changed(write_project(tmp_path), **changes)
+    with pytest.raises(InputError, match=words) as caught:
+        load_project(path)
+    assert str(caught.value).startswith(str(path))
+
+
+def test_lenses_come_from_exchange_formats_too(tmp_path):
+    path = write_project(tmp_path)
+    (tmp_path / "left.yaml").write_text(
+        "cam0:\n  camera_model: pinhole\n  intrinsics: [1180.0, 1181.0, 639.5, 511.5]\n  distortion_model: radtan\n"
+        "  distortion_coeffs: [-0.1, 0.02, 0.0, 0.0]\n  resolution: [1280, 1024]\n  rostopic: /cam0\n"
+    )
+    lens = load_project(changed(path, cameras__left__intrinsics="left.yaml")).cameras["left"].lens
+    assert lens.camera_matrix[1, 1] == 1181.0
+    assert lens.distortion[:2] == (-0.1, 0.02)
+
+
+@pytest.mark.parametrize(
+    ("name", "placement"), [("left07.jpg", "000007"), ("cam1-shot12.png", "000012"), ("a.png", "a")]
+)
+def test_the_last_number_of_a_name_tells_the_placement(tmp_path, name, placement):
+    assert placement_of(tmp_path / name) == placement
+
+
+SURVEY = "point,x_m,y_m,z_m,sigma_x_m,sigma_y_m,sigma_z_m,screen\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "got an empty file"),
+        (SURVEY, "expected rows .* below the header, got none"),
+        ("point,x,y,z\nP1,0,0,0\n", r"expected a column 'x_m', got point,x,y,z"),
+        (SURVEY + "P1,0,0,nan,,,,\n", "line 2: z_m: expected a number, got nan"),
+        (SURVEY + "P1,0,0,a lot,,,,\n", "line 2: z_m: expected a number, got nan"),
+        (
+            SURVEY + "P1,0,0,0,,,,\nP1,1,0,0,,,,\n",
+            r"line 3: .* each point once, got 'P1' again \(first in survey.csv, line 2\)",
+        ),
+        (SURVEY + "P1,0,0,0,0,1,1,\n", "line 2: sigma_x_m: expected a number above 0, got 0"),
+        (SURVEY + "P1,0,0,0,,,,lefd\n", "line 2: screen: .* got 'lefd'; did you mean 'left'"),
+        (SURVEY + ",0,0,0,,,,\n", "line 2: point: expected a name"),
+        (SURVEY + "P1,0,0,0,,,,\nP2,1,5,0,0,1,1,1,left,9\n", "more fields than the header"),
+    ],
+)
+def test_surveys_that_cannot_be_used_say_which_line_and_why(tmp_path, text, words):
+    path = tmp_path / "survey.csv"
+    path.write_text(text)
+    with pytest.raises(InputError, match=words):
+        read_survey([path], ["left", "right"])
+
+
+def test_a_survey_without_sigmas_is_given_a_millimetre_and_says_so(tmp_path):
+    path = tmp_path / "survey.csv"
+    path.write_text("point,x_m,y_m,z_m\n1,0,0,0\n2,1,0,0\n")
+    survey = read_survey([path], [])
+    assert survey.names == ("1", "2")
+    np.testing.assert_allclose(survey.covariance[0], np.eye(3) * 1e-6)
+    assert "1 mm is assumed" in survey.notes[0]
+
+
+POINTS = "camera,point,u_px,v_px,sigma_px\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (
+            POINTS + "lft,P1,1,2,0.1\n",
+            "line 2: camera: expected a camera of the project, got 'lft'; did you mean 'left'",
+        ),
+        (POINTS + "left,P9,1,2,0.1\n", "line 2: point: expected a point of the survey, got 'P9'; known: P1, P2"),
+        (POINTS + "left,P1,1,2,0.1\nleft,P1,1,2,0.1\n", "line 3: expected each point once per camera"),
+        (POINTS + "left,P1,,2,0.1\n", "line 2: u_px: expected a number"),
+        (POINTS + "left,P1,1,2,-1\n", "line 2: sigma_px: expected a number above 0, got -1"),
+    ],
+)
+def test_points_that_cannot_be_used_say_which_line_and_why(tmp_path, text, words):
+    path = tmp_path / "points.csv"
+    path.write_text(text)
+    with pytest.raises(InputError, match=words):
+        read_observations([path], ["left"], ["P1", "P2"])
+
+
+POSES = "frame,t_s,x_m,y_m,z_m,qw,qx,qy,qz"
+
+
+def test_poses_of_a_stand_are_read_with_the_sigmas_that_they_have(tmp_path):
+    path = tmp_path / "poses.csv"
+    path.write_text(f"{POSES},sigma_rot_z_deg\n3,0,1,2,3,1,0,0,0,0.1\n5,1,1,2,3,0,0,0,1,\n")
+    poses = read_poses(path)
+    np.testing.assert_array_equal(poses.frames, [3, 5])
+    np.testing.assert_allclose(poses.stand_from_body.rotation[1], np.diag([-1, -1, 1]))
+    assert poses.sigmas[0, 5] == pytest.approx(np.radians(0.1))
+    assert np.isnan(poses.sigmas[1]).all()
+
+
+@pytest.mark.parametrize(
+    ("rows", "words"),
+    [
+        ("0,0,0,0,0,1,0,0,0\n0,1,0,0,0,1,0,0,0\n", "line 3: frame: expected rising numbers"),
+        ("0,0,0,0,0,1,1,0,0\n", "line 2: .*quaternion of length 1"),
+        ("0,0,0,inf,0,1,0,0,0\n", "line 2: y_m: expected a number"),
+    ],
+)
+def test_poses_that_are_none_are_refused(tmp_path, rows, words):
+    path = tmp_path / "poses.csv"
+    path.write_text(f"{POSES}\n{rows}")
+    with pytest.raises(InputError, match=words):
+        read_poses(path)
