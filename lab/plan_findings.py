@@ -24,6 +24,10 @@ FEWEST_MEASURED = 0.5  # share of the grid below which the rig is not fit for it
 FEWEST_IN_VIEW = 0.8  # share of the grid in which a spot should be in its picture
 CLOSE_PX = 10.0  # two spots of some 8 px across begin to merge
 JOINED = "what joins them"  # covariance between groups: below zero where errors cancel
+TOGETHER = "calibration, all together"
+# Share of the variance that joins the groups beyond which their single shares say nothing: after a joint solve they
+# come out near 100 % each and cancel.
+MOST_JOINED = 0.05
 
 _UNITS = {"x_m": "m", "y_m": "m", "z_m": "m", "yaw_deg": "°", "pitch_deg": "°", "roll_deg": "°"}
 _CURES = {
@@ -37,6 +41,7 @@ _CURES = {
     BEAM_DIRECTIONS: "Calibrate the beams at more stand attitudes over a wider range; let the lasers warm up, and mount"
     " them so that they do not drift.",
     BEAM_POINTS: "Calibrate the beams at more stand poses, with shifts as well as turns.",
+    TOGETHER: "The report of the joint calibration tells which of its measurements contributes most.",
 }
 
 
@@ -59,7 +64,10 @@ class BudgetLine:
 
 
 def budget_lines(plan: Plan) -> list[BudgetLine]:
-    """The error budget, the largest part of the attitude first; empty where no pose can be solved."""
+    """The error budget, the largest part of the attitude first; empty where no pose can be solved.
+
+    Where the rig file's covariance joins the groups of errors firmly, they make one line together.
+    """
     solved = plan.observable
     if not solved.any():
         return []
@@ -67,7 +75,10 @@ def budget_lines(plan: Plan) -> list[BudgetLine]:
     shares = (plan.worst_parts[solved] / plan.worst[solved][:, None] ** 2).mean(axis=0)  # (c, 2)
     rows = [(name, _source(plan, name), *shares[i].tolist()) for i, name in enumerate(plan.contributors)]
     rest = (1 - shares.sum(axis=0)).tolist()
-    if max(map(abs, rest)) > 1e-3:
+    if max(map(abs, rest)) > MOST_JOINED:
+        noise = next(row for row in rows if row[0] == NOISE)
+        rows = [noise, (TOGETHER, "rig file", 1 - noise[2], 1 - noise[3])]
+    elif max(map(abs, rest)) > 1e-3:
         rows.append((JOINED, "rig file", *rest))
     lines = [
         BudgetLine(

@@ -11,7 +11,7 @@ import numpy as np
 
 from calibration.findings import Finding, verdict
 from geometry.arrays import Array
-from lab.plan_findings import JOINED, advice, axis_words, budget_lines, median_sigma, worst_first
+from lab.plan_findings import JOINED, TOGETHER, advice, axis_words, budget_lines, median_sigma, worst_first
 from lab.plan_grid import AXES, STATUS, Plan, plan_grid
 from lab.plan_options import Range, poses_of
 from lab.report import svg
@@ -94,6 +94,11 @@ def _budget(plan: Plan) -> Section:
     ]
     if any(line.name == JOINED for line in lines):
         words.append(f"{JOINED[0].upper()}{JOINED[1:]}: covariance between groups, below zero where errors cancel.")
+    if any(line.name == TOGETHER for line in lines):
+        words.append(
+            "The rig file comes from a joint calibration: its errors of lenses, places and beams cancel each other in"
+            " large part, so that single shares would say nothing."
+        )
     drawings = [
         Drawing(share_bars([(x.name, x.share_deg) for x in lines], "Attitude: shares of the variance")),
         Drawing(share_bars([(x.name, x.share_m) for x in lines], "Position: shares of the variance")),

@@ -16,7 +16,7 @@ from geometry.spots import SpotModel
 from lab.camera_block import Covariance
 from lab.errors import InputError
 from lab.plan import plan_of, plan_rig
-from lab.plan_findings import JOINED, advice, axis_words, budget_lines, findings, worst_first
+from lab.plan_findings import JOINED, TOGETHER, advice, axis_words, budget_lines, findings, worst_first
 from lab.plan_grid import AXES, NOISE, STATUS, plan_grid
 from lab.plan_options import PlanOptions, Range, poses_of
 from lab.plan_tables import effect_columns, plan_columns
@@ -131,7 +131,7 @@ def test_a_rigs_own_covariance_is_planned_with(rig_path):
     names = tuple(f"beams.{b}.direction_{a}" for b in "ABC" for a in "xyz")
     joint = (*names, "cameras.left.cx", "cameras.left.rot_y_rad")
     C = np.diag([1e-8] * 9 + [0.09, 6.25e-8])
-    C[9, 10] = C[10, 9] = -0.9 * 0.3 * 2.5e-4
+    C[9, 10] = C[10, 9] = -0.1 * 0.3 * 2.5e-4
     save_rig(RigFile(file.rig, {"target": Covariance(joint, C)}), rig_path)
     plan = plan_of(rig_path, SMALL)
     assert set(plan.sources.values()) == {"rig file"}
@@ -141,6 +141,17 @@ def test_a_rigs_own_covariance_is_planned_with(rig_path):
     save_rig(RigFile(file.rig, {"target": Covariance(names, C[:9, :9])}), rig_path)
     assert plan_of(rig_path, SMALL).sources["beam directions"] == "rig file"
     assert plan_of(rig_path, SMALL).sources["camera poses"] == "assumed"
+
+
+def test_groups_that_a_joint_calibration_ties_together_make_one_line(rig_path):
+    file = load_rig_file(rig_path)
+    joint = tuple(f"cameras.{c}.{p}" for c in ("left", "right") for p in ("cx", "rot_y_rad"))
+    one = np.array([[9.0, 0.999 * 3.0 * 2.5e-3], [0.999 * 3.0 * 2.5e-3, 6.25e-6]])  # px and rad that cancel
+    save_rig(RigFile(file.rig, {"target": Covariance(joint, np.kron(np.eye(2), one))}), rig_path)
+    lines = {line.name: line for line in budget_lines(plan_of(rig_path, SMALL))}
+    assert set(lines) == {NOISE, TOGETHER}
+    assert sum(line.share_deg for line in lines.values()) == pytest.approx(1)
+    assert lines[TOGETHER].share_deg > 0.05
 
 
 def test_poses_out_of_sight_are_said_plainly(rig_path, tmp_path):
