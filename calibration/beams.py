@@ -99,7 +99,7 @@ def self_calibrate(
     """The shape of the rig of beams from spots at positions of which nothing is known.
 
     rig: its beams are the start, and the body frame is laid so that the beams found are, together, as near to them as
-    can be (see BodyGauge): that is a choice, no measurement. Positions whose pose the spots do not determine are left
+    can be (see BodyGauge; points are compared where either is nearest to the origin): a choice, no measurement. Positions whose pose the spots do not determine are left
     out. Raises AdjustmentError where fewer than two remain.
     """
     fits = body_poses(rig, spots, positions)
@@ -116,7 +116,7 @@ def self_calibrate(
     poses = Poses.of([f.world_from_body for f in fits if f is not None])
     values = {**stacks_of(rig), STAND: Poses.of([Pose.identity()]), POSES: poses}
     others, free = _known(rig, knowledge)
-    others.append(BodyGauge(lines_in(values)))
+    others.append(BodyGauge(at_feet(lines_in(values))[0]))
     free |= {BEAMS: True, POSES: True}
     dropped = [k for k in range(positions) if place[k] < 0]
     return _finished(rig, used, values, others, free, None, dropped)
@@ -193,7 +193,7 @@ def _finished(
     kept = spots.pick(np.flatnonzero(fit.kept))
     kept = replace(kept, covariance=kept.covariance * fit.scale**2)
     values = fit.adjusted.values
-    lines, slide = _at_feet(lines_in(values))
+    lines, slide = at_feet(lines_in(values))
     beams: list[At] = [(BEAMS, i) for i in range(len(lines))]
     asked = beams + ([(STAND, 0)] if STAND in free else [])
     gauge = [t for t in others if isinstance(t, BodyGauge)]
@@ -245,7 +245,7 @@ def _of_the_lab(free: dict[str, bool | Bools]) -> list[str]:
     return [s for s in free if s not in (BEAMS, STAND, POSES)]
 
 
-def _at_feet(lines: Lines) -> tuple[Lines, Array]:
+def at_feet(lines: Lines) -> tuple[Lines, Array]:
     """The lines with their points nearest to the origin, and what that does to their errors, (4 k, 4 k)."""
     along = -np.sum(lines.points * lines.directions, axis=1)
     blocks = []
@@ -286,12 +286,12 @@ def _ends(
     apart = {n: Spot(n, of_end[s.beam, s.sign], 1, s.screen) if s.beam in both else s for n, s in rig.spots.items()}
     split = replace(rig, beams=beams, spots=apart)
     its = {**values, BEAMS: stacks_of(split)[BEAMS]}
-    terms = [BodyGauge(lines_in(its)) if isinstance(t, BodyGauge) else t for t in others]
+    terms = [BodyGauge(at_feet(lines_in(its))[0]) if isinstance(t, BodyGauge) else t for t in others]
     try:
         found = solve(its, [SpotTerm(split, spots), *terms], free)
         covariance = found.covariance([(BEAMS, i) for i in range(len(beams))])
     except AdjustmentError:
         return []
-    lines, slide = _at_feet(lines_in(found.values))
+    lines, slide = at_feet(lines_in(found.values))
     pairs = opposed_pairs(list(beams), lines, slide @ covariance @ slide.T)
     return [p for p in pairs if any(p.first == of_end[b, 1] and p.second == of_end[b, -1] for b in both)]

@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import chi2
 
 from calibration.adjustment import AdjustmentError
-from calibration.beams import calibrate_beams, self_calibrate
+from calibration.beams import at_feet, calibrate_beams, self_calibrate
 from calibration.body_gauge import BodyGauge
 from calibration.excitation import body_motion, without_frame
 from calibration.rig_stacks import lines_in, stacks_of
@@ -44,10 +44,22 @@ def test_the_frame_is_laid_nearest_to_the_drawing():
     rig = RIGS["four-skew-beams"]()
     nominal = drawn(rig, rng)
     found = self_calibrate(nominal, recorded(rng, rig, positions(rng, 20)), 20)
-    G = body_motion(lines_in(stacks_of(nominal)))
-    away = lines_in(stacks_of(found.rig)).minus(lines_in(stacks_of(nominal))).ravel()
+    as_drawn = at_feet(lines_in(stacks_of(nominal)))[0]
+    G = body_motion(as_drawn)
+    away = lines_in(stacks_of(found.rig)).minus(as_drawn).ravel()
     assert np.linalg.norm(away) > 1e-3  # the drawing was off
     np.testing.assert_allclose(np.linalg.qr(G)[0].T @ away, 0, atol=1e-6)
+
+
+def test_where_along_a_beam_its_drawing_puts_the_point_changes_neither_frame_nor_sigmas():
+    rng = np.random.default_rng(10)
+    rig = RIGS["four-skew-beams"]()
+    spots = recorded(rng, rig, positions(rng, 20))
+    slid = replace(rig, beams={n: replace(b, point=b.point + 2.0 * b.direction) for n, b in rig.beams.items()})
+    one, other = (self_calibrate(r, spots, 20) for r in (rig, slid))
+    np.testing.assert_allclose(one.lines.points, other.lines.points, atol=1e-6)
+    sigmas = [np.sqrt(np.diagonal(c.lines_covariance)) for c in (one, other)]
+    np.testing.assert_allclose(sigmas[0], sigmas[1], rtol=1e-3)
 
 
 def test_what_only_the_choice_of_frame_decides_has_no_variance():
@@ -55,7 +67,6 @@ def test_what_only_the_choice_of_frame_decides_has_no_variance():
     rig = RIGS["four-skew-beams"]()
     found = self_calibrate(rig, recorded(rng, rig, positions(rng, 20)), 20)
     frame = np.linalg.qr(body_motion(lines_in(stacks_of(rig))))[0]
-    # Against the drawing's lines, with their points where the drawing has them: to first order the same.
     assert (
         np.diagonal(frame.T @ found.lines_covariance @ frame).max() < 1e-3 * np.diagonal(found.lines_covariance).max()
     )
