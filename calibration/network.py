@@ -73,6 +73,7 @@ class Network:
     bent: frozenset[int] = frozenset()  # screens whose bow is asked for
     screen_priors: tuple[Prior, ...] = ()  # what scans say of screens
     lens_priors: tuple[Prior, ...] = ()
+    warp_sigma_m: float = WARP_SIGMA_M  # by how much a board may be bent at its edge; 0: not at all
     lens_free: Bools | None = None  # (cameras, 18): which lens numbers may move; None: none
 
 
@@ -156,7 +157,7 @@ def _unknowns(network: Network, start: Start) -> tuple[Values, dict[str, bool | 
         "bow": bow,
         "points": True,
         "boards": boards,
-        "warp": True,
+        "warp": network.warp_sigma_m > 0,
         "intrinsics": lens,
     }
     at: list[At] = [(s, i) for i in range(n_cameras) for s in ("intrinsics", "cameras")]
@@ -180,17 +181,19 @@ def _terms_but_sightings(network: Network, start: Start, corners: CornerTerm | N
     if len(network.rig.screens):
         out.append(FrameTerm(np.arange(len(network.rig.screens)), start.world_from_screen))
     if corners is not None:
-        out += [corners, *flat_boards(corners)]
+        out += [corners, *flat_boards(corners, network.warp_sigma_m)]
     if network.fixed is not None:
         out.append(network.fixed)
     return out
 
 
-def flat_boards(corners: CornerTerm) -> Sequence[Prior]:
-    """That boards are flat to a millimetre or so; how they are bent is found with the rest."""
+def flat_boards(corners: CornerTerm, sigma_m: float = WARP_SIGMA_M) -> Sequence[Prior]:
+    """That boards are flat to about so much at their edges; how they are bent is found with the rest."""
+    if sigma_m == 0:
+        return []
     count = int(corners.board.max(initial=-1)) + 1
     half = np.array([np.max(np.abs(corners.from_middle[corners.board == b]), initial=1e-2) for b in range(count)])
-    sigmas = np.repeat((WARP_SIGMA_M / half**2)[:, None], 3, axis=1)
+    sigmas = np.repeat((sigma_m / half**2)[:, None], 3, axis=1)
     return independent("warp", Vectors(np.zeros((count, 3))), sigmas)
 
 
