@@ -91,7 +91,7 @@ def calibrate_screen(project_path: Path, out: Path, today: datetime.date | None 
         write_tables(result, work)
         from lab.calibrate.screen_page import write_page  # the template engine: only for those who write a report
 
-        write_page(outcome, project, inputs, day, work)
+        write_page(result, found, project, inputs, day, work)
     return outcome
 
 

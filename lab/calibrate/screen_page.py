@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import datetime
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from calibration.findings import Finding, verdict
 from calibration.network_sigmas import camera_sigmas, pointing_sigmas_m, spot_sigmas
 from calibration.screens import ScreensResult
 from geometry.camera import pinhole_numbers
@@ -20,18 +21,21 @@ from lab.report.calibration_scene import LAB_VIEWS, Dot, Frustum, Rectangle, Thi
 from lab.report.svg import short
 from lab.rig_covariance import blocks_of
 
-if TYPE_CHECKING:
-    from lab.calibrate.screen import Outcome
-
 _MOST_DOTS = 400  # rows of the table of dots; dots.csv has all
 
 
-def write_page(outcome: Outcome, project: Project, inputs: ScreenInputs, day: datetime.date, folder: Path) -> Path:
+def write_page(
+    result: ScreensResult,
+    findings: Sequence[Finding],
+    project: Project,
+    inputs: ScreenInputs,
+    day: datetime.date,
+    folder: Path,
+) -> Path:
     """Write report.html."""
-    result = outcome.result
     sections = [
         _places(result),
-        *(_screen(outcome, project, k) for k in range(len(result.screens))),
+        *(_screen(result, project, k) for k in range(len(result.screens))),
         _pixels(result),
         _dots(result),
         Section("The lab", "Cameras, screens and surveyed dots in the world's frame.", _scene(result)),
@@ -41,9 +45,9 @@ def write_page(outcome: Outcome, project: Project, inputs: ScreenInputs, day: da
         sections.append(Section("Scans", inputs.remarks))
     report = CalibrationReport(
         kind="Screens",
-        name=outcome.name,
-        verdict=outcome.level,
-        findings=outcome.findings,
+        name=project.name,
+        verdict=verdict(findings),
+        findings=findings,
         key_figures=_key_figures(result),
         sections=sections,
         made=provenance(project.inputs, day),
@@ -114,8 +118,7 @@ def _places(result: ScreensResult) -> Section:
     return Section("Cameras", words, table=Table(heads, rows))
 
 
-def _screen(outcome: Outcome, project: Project, k: int) -> Section:
-    result = outcome.result
+def _screen(result: ScreensResult, project: Project, k: int) -> Section:
     name, screen = list(result.fit.rig.screens.items())[k]
     about = result.screens[k]
     normal, origin = screen.world_from_screen.rotation[:, 2], screen.world_from_screen.translation
