@@ -30,6 +30,7 @@ from lab.rig_file import RigFile, save_rig
 from lab.whole_folder import whole_folder
 
 RIG = "rig.yaml"
+FAILED_RIG = "rig.failed.yaml"  # its name where the verdict is FAIL, so that nothing reads it by mistake
 _ANY_FIT = ScreenLimits(np.inf, np.inf, factor_warn=np.inf, factor_fail=np.inf)
 _ANY_SIGMA = BeamGoals(direction=np.inf, direction_unusable=np.inf, wrong_share=np.inf, noise_scale=np.inf)
 
@@ -71,7 +72,7 @@ def calibrate_rig(
     """Calibrate a whole rig; writes rig.yaml, residuals.csv and report.html into the folder `out`.
 
     rig.yaml carries the joint covariance of everything (in the target's block; excerpts at cameras and screens) and the
-    verdict, so that a run refuses a FAIL. A FAIL does not replace an earlier calibration: it goes to `OUT-failed`.
+    verdict. A FAIL is named rig.failed.yaml and does not replace an earlier calibration: it then goes to `OUT-failed`.
     Raises InputError for what is wrong with the files, CalibrationError where the measurements give no calibration at
     all; nothing is then written.
     """
@@ -103,7 +104,7 @@ def calibrate_rig(
         folder = folder.with_name(f"{folder.name}-failed")
     outcome = Outcome(project.name, folder, level, tuple(findings), steps, expected, held_out)
     with whole_folder(folder, may_replace=lambda f: (f / RESIDUALS).is_file()) as work:
-        save_rig(_rig_file(outcome, project, day), work / RIG)
+        save_rig(_rig_file(outcome, project, day), work / (FAILED_RIG if level == Level.FAIL else RIG))
         write_residuals(steps, recordings.names, work / RESIDUALS)
         from lab.calibrate.rig_page import write_page  # the template engine: only for those who write a report
 

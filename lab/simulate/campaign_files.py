@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import csv
+import os
 from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +15,7 @@ import cv2
 
 from calibration import boards
 from geometry.arrays import Array
+from geometry.camera import Camera
 from geometry.pose import Pose
 from lab import columns
 from lab.calibrate.camera_file import CameraCalibration, CameraFile, save_camera
@@ -142,13 +146,18 @@ def _write_photos(c: Campaign, folder: Path) -> None:
     board = boards.parse(BOARD)
     (folder / "board.txt").write_text(f"{BOARD}\n", encoding="utf-8")
     for i, (name, camera) in enumerate(c.truth.cameras.items()):
-        (folder / "photos" / name).mkdir(parents=True)
+        into = folder / "photos" / name
+        into.mkdir(parents=True)
         alone = replace(camera, camera_from_world=Pose.identity())
-        poses = board_poses(PHOTOS, seed=_PHOTO_POSES + i)
-        for k in range(PHOTOS):
-            photo = photograph(board, alone, poses[k], look=Look(noise_dn=2.0, samples=16), seed=c.seed * 1000 + k)
-            if not cv2.imwrite(str(folder / "photos" / name / f"{k:02d}.png"), photo.image):
-                raise InputError(f"{folder / 'photos' / name}: a photograph cannot be written")
+        shoot = partial(_photograph, board, alone, board_poses(PHOTOS, seed=_PHOTO_POSES + i), c.seed, into)
+        with ThreadPoolExecutor(max_workers=min(4, os.cpu_count() or 1)) as pool:
+            list(pool.map(shoot, range(PHOTOS)))
+
+
+def _photograph(board: boards.Board, camera: Camera, poses: Pose, seed: int, into: Path, k: int) -> None:
+    photo = photograph(board, camera, poses[k], look=Look(noise_dn=2.0, samples=16), seed=seed * 1000 + k)
+    if not cv2.imwrite(str(into / f"{k:02d}.png"), photo.image):
+        raise InputError(f"{into}: a photograph cannot be written")
 
 
 def _pose_rows(poses: Pose) -> list[tuple[object, ...]]:

@@ -156,7 +156,8 @@ def test_a_fail_keeps_the_earlier_calibration_and_ends_with_status_3(project, tm
     assert ended.out == tmp_path / "out-failed"
     assert "camera 'left': camera-left.yaml says FAIL of its lens" in ended.line()
     assert (out / "rig.yaml").read_bytes() == before
-    assert load_rig_file(ended.out / "rig.yaml").calibration.verdict == "FAIL"
+    assert not (ended.out / "rig.yaml").exists()
+    assert load_rig_file(ended.out / "rig.failed.yaml").calibration.verdict == "FAIL"
 
 
 def test_dots_in_millimetres_are_refused_and_nothing_is_written(project, tmp_path):
