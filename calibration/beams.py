@@ -99,8 +99,8 @@ def self_calibrate(
     """The shape of the rig of beams from spots at positions of which nothing is known.
 
     rig: its beams are the start, and the body frame is laid so that the beams found are, together, as near to them as
-    can be (see BodyGauge; points are compared where either is nearest to the origin): a choice, no measurement. Positions whose pose the spots do not determine are left
-    out. Raises AdjustmentError where fewer than two remain.
+    can be (see BodyGauge; points are compared where either is nearest to the origin): a choice, no measurement.
+    Positions whose pose the spots do not determine are left out. Raises AdjustmentError where fewer than two remain.
     """
     fits = body_poses(rig, spots, positions)
     usable = [k for k, f in enumerate(fits) if f is not None]
