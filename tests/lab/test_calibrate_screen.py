@@ -7,12 +7,14 @@ import importlib.util
 import os
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from calibration.boards import Charuco
+from calibration.board_detection import find_board
+from calibration.boards import Charuco, parse
 from calibration.findings import Level
 from geometry.pose import Pose
 from lab.calibrate.camera_file import CameraFile, load_camera, save_camera
@@ -308,3 +310,39 @@ def test_without_open3d_a_ply_file_says_how_to_get_it(tmp_path, monkeypatch):
     write_ply(tmp_path / "scan.ply", np.eye(3))
     with pytest.raises(InputError, match=r"scan.ply: point clouds need Open3D.*make pointcloud"):
         read_cloud(tmp_path / "scan.ply", 1.0)
+
+
+# Real photographs ---------------------------------------------------------------------------------------------------
+
+STEREO = Path(__file__).parents[3] / "shared" / "data" / "chessboard_stereo_opencv"
+
+
+@pytest.mark.skipif(not STEREO.is_dir(), reason="the stereo photographs are not at hand")
+def test_real_photographs_of_a_carried_board_tie_two_cameras(tmp_path):
+    board = "chessboard:9x6:25mm"
+    # The left camera's lens is read from the set's own file; for the right one it has none that fits its photographs.
+    seen = [find_board(cv2.imread(str(STEREO / f"right{n:02d}.jpg"), 0), parse(board)) for n in range(1, 8)]
+    flat = [parse(board).points.astype(np.float32)] * 7
+    _, K, lens, _, _ = cv2.calibrateCamera(flat, [v.pixels.astype(np.float32) for v in seen], (640, 480), None, None)
+    save_camera(CameraFile("right", (640, 480), K, tuple(np.ravel(lens).tolist())), tmp_path / "right.yaml")
+    photos = {side: [str(STEREO / f"{side}{n:02d}.jpg") for n in range(2, 8)] for side in ("left", "right")}
+    on_screen = {"board": board, "photos": {side: str(STEREO / f"{side}01.jpg") for side in photos}}
+    write_mapping(
+        {
+            "schema": "beampose/calibration/1",
+            "name": "stereo",
+            "cameras": {
+                "left": {"intrinsics": str(STEREO / "left_intrinsics.yml"), "screen": "wall"},
+                "right": {"intrinsics": "right.yaml", "screen": "wall"},
+            },
+            "screens": {"wall": {"boards": [on_screen]}},
+            "boards": [{"board": board, "photos": photos}],
+        },
+        tmp_path / "calibration.yaml",
+    )
+    outcome = calibrate_screen(tmp_path, tmp_path / "out")
+    left, right = (c.camera_from_world for c in outcome.result.fit.rig.cameras.values())
+    # OpenCV's own stereoCalibrate of these photographs: 83.2 mm.
+    assert np.linalg.norm((right @ left.inverse()).translation) == pytest.approx(0.0832, abs=0.001)
+    assert len(outcome.result.network.placements) == 7
+    assert (tmp_path / "out" / "residuals.csv").read_text().count("\n") > 600
