@@ -165,6 +165,8 @@ def _sigmas(c: BeamCalibration, goals: BeamGoals) -> Finding:
         f"directions known to {rms / ARCSEC:.3g} arcsec RMS per axis, the worst, beam {name}, to"
         f" {each[worst] / ARCSEC:.3g} arcsec; offsets to {1e3 * float(np.sqrt(np.mean(offset_sigmas(c) ** 2))):.2g} mm"
     )
+    if c.world_from_stand is None:
+        words += ", both against the body frame that was laid by the drawing"
     if rms <= 1.003 * goals.direction:  # as far as the figures in words go
         return Finding(Level.PASS, words)
     between = np.sqrt(np.mean([a.sigma**2 for a in c.angles])) if c.angles else rms

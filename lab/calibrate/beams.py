@@ -51,7 +51,10 @@ class Outcome:
         sigma = float(np.sqrt(np.mean(direction_sigmas(c) ** 2))) / ARCSEC
         worst = max(self.findings, key=lambda f: f.level)
         what = f"{len(c.lines)} beams from {len(c.world_from_body.translation)} positions"
-        if not c.undetermined:
+        if c.world_from_stand is None and c.angles:
+            between = float(np.sqrt(np.mean([a.sigma**2 for a in c.angles]))) / ARCSEC
+            what += f" of which nothing is known, angles between beams to {between:.3g} arcsec RMS"
+        elif not c.undetermined:
             what += f", directions to {sigma:.3g} arcsec RMS"
         warnings = sum(f.level == Level.WARN for f in self.findings)
         reason = f"; {warnings} warning{'s' if warnings > 1 else ''}, see report.html" if warnings else ""

@@ -74,6 +74,7 @@ def _key_figures(c: BeamCalibration) -> list[tuple[str, str, str]]:
         worst = list(c.rig.beams)[int(np.argmax(direction))]
         rms = float(np.sqrt(np.mean(direction**2))) / ARCSEC
         note = f"1 sigma per axis, RMS over beams; worst: {worst} with {short(float(direction.max()) / ARCSEC, 3)}"
+        note += "; in the frame of the drawing" if c.world_from_stand is None else ""
         out.append(("directions known to", f"{short(rms, 3)} arcsec", note))
         rms = 1e3 * float(np.sqrt(np.mean(offset**2)))
         out.append(("offsets known to", f"{short(rms, 3)} mm", "1 sigma per axis, nearest to the body's origin"))

@@ -168,6 +168,7 @@ def test_without_poses_only_the_shape_is_found_and_that_is_said(campaign, tmp_pa
     project.write_text(re.sub(r", poses: poses.csv|\n\s+poses: poses.csv", "", text))
     outcome = calibrate_beams(project, tmp_path / "out")
     assert outcome.level == Level.WARN
+    assert "3 beams from 40 positions of which nothing is known, angles between beams to" in outcome.line()
     words = " ".join(f.what for f in outcome.findings)
     assert "6 numbers stay undetermined, the place (3) and the attitude (3) of the body frame" in words
     angles = table(tmp_path / "out" / "angles.csv")
