@@ -135,6 +135,9 @@ def _screen(result: ScreensResult, project: Project, k: int) -> Section:
     else:
         f = about.flatness
         sigma = float(np.median(np.sqrt(np.maximum(f.flat.sigma_m**2 - f.flat.scatter_m**2, 0))))  # the points' own
+        on = f.chosen.used
+        if not on.all():
+            words.append(f"{int(np.sum(~on))} of {len(on)} points lie far off it and are not drawn: see the warnings.")
         over = "its dots" if about.dots else "patches of the scan (medians of their points)"
         words.append(
             f"As a plane it misses {over} by {short(1e3 * f.flat.rms_m, 3)} mm RMS"
@@ -149,20 +152,20 @@ def _screen(result: ScreensResult, project: Project, k: int) -> Section:
         drawings.append(
             Drawing(
                 flatness_map(
-                    about.xyz[:, :2],
-                    f.flat.heights_m,
+                    about.xyz[on, :2],
+                    f.flat.heights_m[on],
                     f"Screen {name}: height over the best plane",
                     size_m=screen.size_m,
                     bow=(a, b, c) if f.chosen.bent else None,
                     sigma_m=sigma,
                 ),
-                "Height along the normal. A single point that stands out is a wrong dot; a smooth pattern is a bow.",
+                "Height along the normal. A smooth pattern is a bow; one without order, a rough screen or a poor survey.",
             )
         )
         if f.chosen.bent:
             drawings.append(
                 Drawing(
-                    flatness_map(about.xyz[:, :2], f.chosen.heights_m, f"Screen {name}: what the bow leaves",
+                    flatness_map(about.xyz[on, :2], f.chosen.heights_m[on], f"Screen {name}: what the bow leaves",
                                  size_m=screen.size_m, sigma_m=sigma),
                     "The same after the bow: this should be noise.",
                 )
