@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from scipy.spatial import cKDTree
 
 from calibration import corner_refinement
 from calibration.board_view import BLUR_LIMIT, BoardView, GreyImage, NotFound, low_contrast, too_blurred
@@ -16,6 +17,7 @@ from geometry.arrays import Array
 
 _BIG_DOT = 1.35  # area of a corner's circle over what its neighbours have, from which it marks the origin
 _STRAY = 100  # blobs beside three times the board's: among thousands OpenCV searches for many minutes
+_LATTICE = 0.25  # share of blobs that must lie as in a lattice: a board among twice as many strays still does
 _INK = 0.5  # diameter over distance of neighbours where no blob tells it
 _FIT_PX = 0.08  # of the spacing: how well a grid must follow a homography (strong lenses bend it by less than that)
 
@@ -66,8 +68,8 @@ def _blobs(image: GreyImage) -> Array:
 def _grid(image: GreyImage, board: CircleGrid, size: tuple[int, int] | None = None) -> Array | None:
     """Rough centres (rows, columns, 2), px, in OpenCV's order, or None."""
     columns, rows = size or (board.columns, board.rows)
-    count = len(_blobs(image))
-    if not columns * rows <= count <= 3 * columns * rows + _STRAY:
+    blobs = _blobs(image)
+    if not columns * rows <= len(blobs) <= 3 * columns * rows + _STRAY or _lattice_share(blobs) < _LATTICE:
         return None
     kind = cv2.CALIB_CB_ASYMMETRIC_GRID if board.asymmetric else cv2.CALIB_CB_SYMMETRIC_GRID
     for how in (0, cv2.CALIB_CB_CLUSTERING):
@@ -75,6 +77,19 @@ def _grid(image: GreyImage, board: CircleGrid, size: tuple[int, int] | None = No
         if found and centres is not None and centres.size == 2 * columns * rows:
             return np.asarray(centres, dtype=float).reshape(rows, columns, 2)
     return None
+
+
+def _lattice_share(blobs: Array) -> float:
+    """Share of blobs (n, 3) that have another one opposite to their nearest neighbour, as points of a lattice have.
+
+    About 0.1 for blobs at random, in which OpenCV's search for a grid does not end; 0.7 and more for boards alone.
+    """
+    if len(blobs) < 3:
+        return 0.0
+    tree = cKDTree(blobs[:, :2])
+    distance, index = (np.asarray(found)[:, 1] for found in tree.query(blobs[:, :2], k=2))
+    opposite = 2 * blobs[:, :2] - blobs[index.astype(int), :2]
+    return float(np.mean(np.asarray(tree.query(opposite)[0]) < 0.25 * distance))
 
 
 def _measured(image: GreyImage, grid: Array, board: CircleGrid, light: bool) -> BoardView | NotFound:
@@ -229,6 +244,10 @@ def _jacobian_determinants(H: Array, xy: Array) -> Array:
 def _ordered(grid: Array, board: CircleGrid) -> Array | NotFound:
     """The grid in the board's order: as it fits, not mirrored, rows to the right where several orders fit."""
     ways = [grid, grid[::-1], grid[:, ::-1], grid[::-1, ::-1]]
+    if board.asymmetric and board.rows % 2 == 0:
+        # OpenCV gives the two rows of each pair in the wrong order where the rows are even.
+        paired = grid.reshape(board.rows // 2, 2, board.columns, 2)[:, ::-1].reshape(grid.shape)
+        ways += [paired, paired[::-1], paired[:, ::-1], paired[::-1, ::-1]]
     if board.columns == board.rows and not board.asymmetric:
         ways += [np.swapaxes(way, 0, 1) for way in ways]
     fitting: list[Array] = []
@@ -297,6 +316,11 @@ def _why_not(image: GreyImage, board: CircleGrid, blobs: Array) -> NotFound:
     if pale is not None:
         return pale
     wanted = board.columns * board.rows
+    if len(blobs) > 3 * wanted + _STRAY or (len(blobs) >= wanted and _lattice_share(blobs) < _LATTICE):
+        return NotFound(
+            f"no grid of circles: {len(blobs)} round dark blobs lie about without order; the board must lie wholly in"
+            " the picture, before a plain ground"
+        )
     other = CircleGrid(board.columns, board.rows, board.spacing_m, not board.asymmetric)
     if _grid(image, other) is not None:
         return NotFound(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from pathlib import Path
 
@@ -66,6 +67,7 @@ def rms(view: BoardView, photo: BoardPhoto) -> float:
         (CHESS, 0.03),
         ("circles:9x7:25mm", 0.02),
         ("acircles:4x11:20mm", 0.03),
+        ("acircles:5x8:25mm", 0.03),
         (CHARUCO, 0.04),
         ("charuco:5x8:40mm:20mm:DICT_4X4_50:inverted:legacy", 0.04),
     ],
@@ -283,7 +285,7 @@ def test_real_boards_are_found(pattern, text, found, all_):
     ("pattern", "text", "words"),
     [
         ("chessboard_stereo_opencv/left*.jpg", "chessboard:8x6:25mm", "the chessboard goes on"),
-        ("chessboard_webcam_c920/*[4-6].jpg", "chessboard:9x6:25mm", "a chessboard of 9x7 inner corners, not 9x6"),
+        ("chessboard_webcam_c920/*[4-6].jpg", "chessboard:9x6:25mm", "9x7 inner corners, not 9x6|beyond 9x6 inner"),
         ("charuco_aruco_stills/ch*.jpg", "charuco:5x7:40mm:20mm:DICT_5X5_100", "of DICT_6X6_50 with numbers up to"),
         ("charuco_aruco_stills/ch*.jpg", "charuco:7x5:40mm:20mm:DICT_6X6_250", "they do on 5x7 squares"),
         ("charuco_aruco_stills/single*.jpg", "charuco:5x7:40mm:20mm:DICT_6X6_250", "another board"),
@@ -293,7 +295,7 @@ def test_real_boards_are_found(pattern, text, found, all_):
 )
 def test_what_is_wrong_with_real_pictures_is_said(pattern, text, words):
     said = counts(pattern, text)
-    assert all(words in reason for reason in said), said
+    assert all(re.search(words, reason) for reason in said), said
 
 
 def test_the_large_dot_of_the_robots_target_is_first_in_all_its_pictures():

@@ -66,7 +66,8 @@ def test_charuco_corners_and_markers_lie_where_opencv_has_them(columns, rows, le
     )
     theirs.setLegacyPattern(legacy)
     corners = np.array(theirs.getChessboardCorners()).reshape(-1, 3)
-    np.testing.assert_allclose(board.points + [0.04, 0.04, 0], corners, atol=1e-8)
+    first = np.array([0.04, 0.04, 0])  # theirs starts at the outer corner
+    np.testing.assert_allclose(board.points + first, corners, atol=1e-8)
     assert board.markers == len(theirs.getIds())
     # The picture that OpenCV prints, 40 px a square, against ours at the pixels' centres.
     picture = theirs.generateImage((40 * columns, 40 * rows), marginSize=0) < 128
