@@ -28,6 +28,7 @@ class Scene:
     warp: tuple[float, float, float] = (0.0, 0.0, 0.0)  # 1/m
     tilt_rad: float = 0.5  # the largest about x and y
     lean_rad: tuple[float, float] = (0.0, 0.0)  # about x and y, added to all
+    roll_rad: float = 0.3  # the largest about z
     distance_m: tuple[float, float] = (0.35, 0.7)
     columns: int = 9
     rows: int = 6
@@ -55,7 +56,7 @@ def photographs(scene: Scene, seed: int) -> CornerTable:
     width, height = scene.size_px
     views: list[tuple[np.ndarray, np.ndarray]] = []
     while len(views) < scene.views:
-        R = exp(rng.uniform(-1, 1, 3) * [scene.tilt_rad, scene.tilt_rad, 0.3] + [*scene.lean_rad, 0.0])
+        R = exp(rng.uniform(-1, 1, 3) * [scene.tilt_rad, scene.tilt_rad, scene.roll_rad] + [*scene.lean_rad, 0.0])
         z = rng.uniform(*scene.distance_m)
         at = np.array([rng.uniform(-0.45, 0.45) * width / fx * z, rng.uniform(-0.45, 0.45) * height / fy * z, z])
         t = at - R @ middle
