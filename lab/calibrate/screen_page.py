@@ -159,7 +159,7 @@ def _screen(result: ScreensResult, project: Project, k: int) -> Section:
                     bow=(a, b, c) if f.chosen.bent else None,
                     sigma_m=sigma,
                 ),
-                "Height along the normal. A smooth pattern is a bow; one without order, a rough screen or a poor survey.",
+                "Height along the normal. A smooth pattern is a bow; one without order, a rough screen or survey.",
             )
         )
         if f.chosen.bent:
