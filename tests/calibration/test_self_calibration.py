@@ -168,8 +168,8 @@ def _nees_in_shape(rig: Rig, found, shape: np.ndarray, e: np.ndarray) -> float:
 
 
 def test_errors_of_the_shape_are_as_large_as_claimed():
-    within, nees, size = shape_scatter(range(4))
-    lo, hi = chi2.ppf([0.001, 0.999], 4 * 10) / (4 * 10)
+    within, nees, size = shape_scatter(range(3))
+    lo, hi = chi2.ppf([0.001, 0.999], 3 * 10) / (3 * 10)
     assert lo < nees < hi
     assert 0.4 < within < 0.95
     assert size < 60 * ARCSEC
