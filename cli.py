@@ -300,16 +300,18 @@ def board(board: str, out: Path, page: str, dpi: float) -> None:
 @click.option(
     "--distance-m", type=click.FloatRange(min=0, min_open=True), help="To the screen: figures in mm hold there."
 )
-@click.option("--lens", help="0, 4, 5, 8, 12 or fisheye; default: the one that foretells views it has not seen best.")
-@click.option("--valid-days", type=click.IntRange(min=1), help="How long it may be used.")
+@click.option("--lens", default="auto", show_default=True, help="0, 4, 5, 8, 12, fisheye; auto: by views held out.")
+@click.option("--warp", default="auto", show_default=True, help="auto, on, off: is the board's bend solved for.")
+@click.option("--valid-days", default=365, show_default=True, type=click.IntRange(min=1), help="How long it holds.")
 def camera(
     photos: tuple[Path, ...],
     board: str,
     out: Path,
     name: str | None,
     distance_m: float | None,
-    lens: str | None,
-    valid_days: int | None,
+    lens: str,
+    warp: str,
+    valid_days: int,
 ) -> None:
     """Calibrate a camera's lens from photos of a board: files, folders, patterns or a video.
 
@@ -319,7 +321,9 @@ def camera(
     """
     from lab.calibrate.camera import CameraOptions, calibrate_camera
 
-    options = CameraOptions(name=name or out.resolve().name, distance_m=distance_m, lens=lens, valid_days=valid_days)
+    options = CameraOptions(
+        name=name or out.resolve().name, distance_m=distance_m, lens=lens, warp=warp, valid_days=valid_days
+    )
     _concluded(calibrate_camera(photos, board, out, options))
 
 
