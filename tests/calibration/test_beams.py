@@ -253,10 +253,10 @@ def tally(cases) -> tuple[float, float, float]:
 
 @pytest.mark.parametrize("known", ["known", "unknown"])
 def test_errors_are_as_large_as_claimed(known):
-    within, nees, _ = tally(simulated(s, known) for s in range(3))
+    # Shares within a sigma need many seeds, as the 24 errors of one go together; the slow test has them.
+    _, nees, _ = tally(simulated(s, known) for s in range(3))
     lo, hi = chi2.ppf([0.001, 0.999], 3 * 24) / (3 * 24)
     assert lo < nees < hi
-    assert 0.5 < within < 0.85
 
 
 @pytest.mark.slow
