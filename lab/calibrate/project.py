@@ -21,6 +21,7 @@ from calibration.boards import Board
 from geometry.arrays import Array
 from geometry.pose import Pose
 from geometry.rig import Beam, Spot
+from lab.calibrate.board_file import load_board
 from lab.calibrate.camera_file import CameraFile, load_camera
 from lab.calibrate.interchange import read_cameras
 from lab.calibration_state import Day
@@ -453,6 +454,12 @@ class _Reader:
         return out
 
     def _board(self, text: str, where: str) -> Board | None:
+        if text.lower().endswith((".yaml", ".yml")):
+            try:
+                return load_board(self.folder / text)
+            except InputError as error:
+                self.mistakes.append(f"{where}.board: {error}")
+                return None
         try:
             return board_kinds.parse(text)
         except ValueError as error:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from calibration.boards import Chessboard
+from lab.calibrate.board_file import save_board
 from lab.calibrate.point_files import read_observations, read_poses, read_survey
 from lab.calibrate.project import load_project, placement_of
 from lab.errors import InputError
@@ -102,6 +104,16 @@ def test_mistakes_name_file_and_field_and_what_to_do(tmp_path, changes, words):
     with pytest.raises(InputError, match=words) as caught:
         load_project(path)
     assert str(caught.value).startswith(str(path))
+
+
+def test_a_board_may_be_named_by_its_file(tmp_path):
+    path = write_project(tmp_path)
+    save_board(Chessboard(9, 6, 0.025), tmp_path / "board.yaml")
+    (tmp_path / "left-1.png").write_bytes(b"")
+    project = load_project(changed(path, boards=[{"board": "board.yaml", "photos": {"left": "left-*.png"}}]))
+    assert project.boards[0].board == Chessboard(9, 6, 0.025)
+    with pytest.raises(InputError, match=r"boards.0.board: .*other.yaml"):
+        load_project(changed(path, boards=[{"board": "other.yaml", "photos": {"left": "left-*.png"}}]))
 
 
 def test_lenses_come_from_exchange_formats_too(tmp_path):
