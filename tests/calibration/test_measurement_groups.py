@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from calibration.adjustment import Linearised, Part, solve
 from calibration.measurement_groups import Unknowns, group_fit, information, shares
@@ -56,6 +57,15 @@ def test_the_test_of_a_kind_is_fair_where_sigmas_are_right_and_sees_where_they_a
     # Uniform: the share below 0.1 is 0.1 give or take sqrt(0.09 / 300) = 0.017.
     assert 0.05 < np.mean(np.array(right) < 0.1) < 0.16
     assert np.mean(np.array(wrong) < 0.1) > 0.9
+
+
+def test_the_chance_of_a_misfit_follows_from_the_residuals_own_covariance():
+    terms, found, unknowns, C = adjusted(np.random.default_rng(4), counts=(4, 5))
+    fit = group_fit("", *information([terms[1]], found.values, unknowns), C)
+    Q = np.eye(5) - terms[1].A @ C @ terms[1].A.T
+    mean, variance = np.trace(Q), 2 * np.trace(Q @ Q)
+    assert fit.redundancy == pytest.approx(mean)
+    assert fit.p == pytest.approx(chi2.sf(2 * mean / variance * fit.chi2, 2 * mean**2 / variance))
 
 
 def test_what_is_measured_just_once_has_no_redundancy_and_no_verdict():
