@@ -153,6 +153,8 @@ def batch(run_folders: tuple[Path, ...], out: Path, settings: dict[str, Any]) ->
 @click.option(
     "--scale", default=1.0, show_default=True, type=click.FloatRange(0.1, 1), help="0.5: pictures half as wide."
 )
+@click.option("--rig", type=_ANY_PATH, help="A rig.yaml in place of the scenario's rig: as it truly is.")
+@click.option("--known-rig", type=_ANY_PATH, help="The rig.yaml that the run gets, such as a calibration of that rig.")
 def simulate(
     scenario: str,
     out: Path | None,
@@ -164,6 +166,8 @@ def simulate(
     clutter: float | None,
     light: str | None,
     scale: float,
+    rig: Path | None,
+    known_rig: Path | None,
 ) -> None:
     """Write a simulated recording with its truth; SCENARIO `list` names them all.
 
@@ -193,6 +197,8 @@ def simulate(
             clutter=clutter,
             noise_px=noise_px,
             picture_scale=scale,
+            rig=rig,
+            known_rig=known_rig,
             progress=None if progress is None else lambda done, total: progress(done, total),
         )
     click.echo(f"run: {folder}")

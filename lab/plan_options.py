@@ -118,8 +118,9 @@ def options_of(
     for name in ranges:
         if name not in usual.ranges:
             raise InputError(f"--range: expected a coordinate, got {name!r}{did_you_mean(name, usual.ranges)}")
+    chosen: dict[str, Any] = {**usual.ranges, **{name: Range(*r) for name, r in ranges.items()}}
     return PlanOptions(
-        **{**usual.ranges, **{name: Range(*r) for name, r in ranges.items()}},
+        **chosen,
         sigma_px=usual.sigma_px if sigma_px is None else sigma_px,
         goal_deg=goal_deg,
         goal_m=goal_m,

@@ -49,15 +49,16 @@ def simulate_points(
     clutter: float | None = None,
     miss_probability: float | None = None,
     picture_scale: float = 1.0,
+    rig: Rig | None = None,
 ) -> PointRun:
     """One recording of a scenario as points.
 
     noise_px: 1 sigma per axis, also of clutter. clutter: probability of a false spot near each spot in the picture
     (default: the scenario's). miss_probability: of each spot in each frame. The motion depends on scenario and seed
-    only; the clutter of a lower probability is part of that of a higher one. picture_scale: as in lab.simulate.write.
+    only; the clutter of a lower probability is part of that of a higher one. picture_scale, rig: as in `compose`.
     """
     overridden = with_overrides(scenario, clutter=clutter, miss_probability=miss_probability)
-    scene = compose(overridden, seed, frames, picture_scale)
+    scene = compose(overridden, seed, frames, picture_scale, rig)
     model, false = scene.model, scene.false_spots
     n, cameras = len(model), range(len(model.camera_names))
     first_false = np.searchsorted(false.frame, np.arange(len(scene.frame) + 1))

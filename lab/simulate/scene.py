@@ -71,13 +71,22 @@ def named(scenario: str | Scenario) -> Scenario:
     return SCENARIOS[scenario]
 
 
-def compose(scenario: str | Scenario, seed: int, frames: int | None = None, picture_scale: float = 1.0) -> Scene:
-    """One recording of a scenario: everything that happens in `frames` frames (default: the scenario's own)."""
+def compose(
+    scenario: str | Scenario,
+    seed: int,
+    frames: int | None = None,
+    picture_scale: float = 1.0,
+    rig: Rig | None = None,
+) -> Scene:
+    """One recording of a scenario: everything that happens in `frames` frames (default: the scenario's own).
+
+    rig: in place of the scenario's.
+    """
     scenario = named(scenario)
     count = scenario.frames if frames is None else frames
     if count < 1:
         raise InputError(f"frames: expected at least 1, got {count}")
-    rig = RIGS[scenario.rig]()
+    rig = RIGS[scenario.rig]() if rig is None else rig
     motion = draw_motion(scenario, SpotModel.of(rig), seed)
     if picture_scale != 1.0:
         rig = scaled(rig, picture_scale)

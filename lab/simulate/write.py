@@ -13,9 +13,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from geometry.rig import Rig
+from geometry.spots import SpotModel
 from lab import columns
 from lab.errors import InputError
-from lab.rig_file import save_rig
+from lab.rig_file import load_rig_file, save_rig
 from lab.run_file import save_run
 from lab.simulate.picture import Picture, Powers, Sensor, laser_powers, make_sensor, take
 from lab.simulate.points import simulate_points
@@ -52,6 +54,8 @@ def simulate(
     noisy: bool = True,
     threads: int | None = None,
     progress: Progress | None = None,
+    rig: Path | None = None,
+    known_rig: Path | None = None,
 ) -> Path:
     """Write one recording of a scenario into a new folder; returns the folder, complete.
 
@@ -62,9 +66,14 @@ def simulate(
     place of PNG files. detections_only: no pictures, but a detections.csv with `noise_px` (1 sigma per axis). light: a
     name of LIGHTS in place of the scenario's. clutter, miss_probability: as in simulate_points. picture_scale: 0.5
     gives pictures half as wide and high. noisy: False leaves out shot and read noise (rounding stays). threads: that
-    make and write pictures. progress: called after each picture. Raises InputError where an argument does not fit, or
-    the folder exists.
+    make and write pictures. progress: called after each picture. rig: a rig.yaml in place of the scenario's rig.
+    known_rig: the rig.yaml that the run gets, such as a calibration of that rig; default: the true one. Raises
+    InputError where an argument does not fit, or the folder exists.
     """
+    if picture_scale != 1.0 and (rig is not None or known_rig is not None):
+        raise InputError("the pictures of a rig file keep its size: leave out the scale, or the rig")
+    true_rig = None if rig is None else load_rig_file(rig).rig
+    known = None if known_rig is None else load_rig_file(known_rig)
     scenario = with_overrides(scenario, clutter=clutter, miss_probability=miss_probability)
     if light is not None:
         if light not in LIGHTS:
@@ -84,14 +93,16 @@ def simulate(
     if out_folder.exists() and (not out_folder.is_dir() or any(out_folder.iterdir())):
         raise InputError(f"{out_folder}: expected a folder that does not exist yet; choose another or remove it")
 
-    scene = compose(scenario, seed, frames, picture_scale)
+    scene = compose(scenario, seed, frames, picture_scale, true_rig)
+    if known is not None and SpotModel.of(known.rig).views != scene.model.views:
+        raise InputError(f"{known_rig}: expected the cameras and spots of the rig that is recorded, got others")
     part = out_folder.with_name(f".{out_folder.name}.{os.getpid()}.part")
     part.mkdir(parents=True)
     try:
-        save_rig(scene.rig, part / "rig.yaml")
+        save_rig(scene.rig if known is None else known, part / "rig.yaml")
         write_truth(scene, part / "truth")
         if detections_only:
-            _write_detections(scene, noise_px, picture_scale, part / "detections.csv")
+            _write_detections(scene, noise_px, picture_scale, true_rig, part / "detections.csv")
             sources = {name: {"detections": "detections.csv"} for name in scene.model.camera_names}
         elif video:
             sources = _write_videos(scene, part, noisy, threads, progress)
@@ -154,9 +165,9 @@ def _write_table(path: Path, header: Iterable[str], rows: Iterable[tuple[object,
         writer.writerows(rows)
 
 
-def _write_detections(scene: Scene, noise_px: float, picture_scale: float, path: Path) -> None:
+def _write_detections(scene: Scene, noise_px: float, picture_scale: float, rig: Rig | None, path: Path) -> None:
     run = simulate_points(
-        scene.scenario, scene.seed, frames=len(scene.frame), noise_px=noise_px, picture_scale=picture_scale
+        scene.scenario, scene.seed, frames=len(scene.frame), noise_px=noise_px, picture_scale=picture_scale, rig=rig
     )
 
     def rows() -> Iterator[tuple[object, ...]]:

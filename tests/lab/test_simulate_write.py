@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 import yaml
 
+from geometry.rig_parameters import moved
 from lab.check import check
 from lab.detections_file import read_detections
 from lab.errors import InputError
-from lab.rig_file import load_rig
+from lab.rig_file import load_rig, save_rig
 from lab.simulate.picture import expose, laser_powers, make_sensor, take
 from lab.simulate.points import simulate_points
 from lab.simulate.scenarios import LIGHTS, SCENARIOS, Clutter, Hiding, Light
@@ -224,3 +225,24 @@ def test_the_run_file_says_where_the_vehicle_starts_and_what_to_see(tmp_path):
     assert content["exposure_s"] == 0.0005
     assert "seed 6" in content["notes"]
     assert "leaves the picture and returns" in content["notes"]
+
+
+def test_a_recording_of_another_rig_is_given_what_is_known_of_it(tmp_path):
+    """The true rig makes the spots, its calibration lies in the run folder; only the simulation knows both."""
+    true = simulate("clean", tmp_path / "first", seed=1, frames=2, detections_only=True) / "rig.yaml"
+    rig = load_rig(true)
+    off = moved(rig, ["cameras.left.fx", "beams.A.direction_y"], np.array([3.0, 1e-3]))
+    save_rig(off, tmp_path / "true.yaml")
+    folder = simulate(
+        "clean", tmp_path / "run", seed=1, frames=4, detections_only=True, noise_px=0.0, clutter=0.0,
+        rig=tmp_path / "true.yaml", known_rig=true,
+    )  # fmt: skip
+    assert load_rig(folder / "rig.yaml").cameras["left"].matrix[0, 0] == rig.cameras["left"].matrix[0, 0]
+    (line,) = [line for line in check(folder).lines if "poses and spots agree" in line]
+    assert float(line.split()[-2]) > 0.1  # px: the rig that is known is not the one that was recorded
+    with pytest.raises(InputError, match="keep its size"):
+        simulate("clean", tmp_path / "no", rig=true, picture_scale=0.5)
+    save_rig(load_rig(simulate("four-skew-beams", tmp_path / "x", frames=1) / "rig.yaml"), tmp_path / "four.yaml")
+    with pytest.raises(InputError, match=r"four.yaml: expected the cameras and spots of the rig that is recorded"):
+        simulate("clean", tmp_path / "no", rig=true, known_rig=tmp_path / "four.yaml")
+    assert not (tmp_path / "no").exists()
