@@ -193,7 +193,7 @@ def board_poses(count: int, seed: int = 5) -> Pose:
     rng = np.random.default_rng(seed)
     turns = np.deg2rad(rng.uniform([-20, -35, -35], [20, 35, 35], (count, 3)))
     z = rng.uniform(0.9, 1.6, count)
-    middle = np.stack([rng.uniform(-0.42, 0.42, count) * z, rng.uniform(-0.33, 0.33, count) * z, z], axis=-1)
+    middle = np.stack([rng.uniform(-0.5, 0.5, count) * z, rng.uniform(-0.4, 0.4, count) * z, z], axis=-1)
     poses = Pose.from_ypr(turns, middle)
     return Pose(poses.rotation, middle - poses.turn(np.array([0.2, 0.15, 0.0])))
 
