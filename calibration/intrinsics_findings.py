@@ -68,10 +68,18 @@ def _unless_pass(level: Level, what: str, why: str, cure: str) -> Finding:
     return Finding(level, what) if level is Level.PASS else Finding(level, what, why, cure)
 
 
+def _two(value: float) -> str:
+    """Two significant digits, never with an exponent: 0.29, 3.9, 240."""
+    if not np.isfinite(value) or value == 0:
+        return f"{value:g}"
+    digits = 1 - int(np.floor(np.log10(abs(value))))
+    return f"{round(value, digits):.{max(digits, 0)}f}"
+
+
 def _mm(c: Intrinsics, px: float) -> str:
     """px and what it is on the screen."""
     per_px = float(np.nanmedian(np.abs(np.linalg.det(c.map.mm_per_px))) ** 0.5)
-    return f"{px:.3g} px ({px * per_px:.2g} mm at {c.distance_m:.3g} m)"
+    return f"{px:.3g} px ({_two(px * per_px)} mm at {c.distance_m:.3g} m)"
 
 
 def _lens(c: Intrinsics) -> Finding:
@@ -151,8 +159,9 @@ def _focal(c: Intrinsics, limits: Limits) -> Finding:
     share = float(c.sigmas[0] / c.fit.lens[0])
     return _unless_pass(
         _level(share, limits.focal),
-        f"Focal length {c.fit.lens[0]:.2f} ± {c.sigmas[0]:.2g} px ({share:.2%}).",
-        f"A pose's distance is uncertain by that share: {1000 * share * c.distance_m:.2g} mm at {c.distance_m:.3g} m.",
+        f"Focal length {c.fit.lens[0]:.2f} ± {_two(c.sigmas[0])} px ({share:.2%}).",
+        "A pose's distance is uncertain by that share:"
+        f" {_two(1000 * share * c.distance_m)} mm at {c.distance_m:.3g} m.",
         f"Take more photographs; {_TILTED}.",
     )
 
@@ -182,7 +191,8 @@ def _principal_point(c: Intrinsics, limits: Limits) -> Finding:
     level = _level(share, limits.off_centre)
     return _unless_pass(
         level,
-        f"Principal point {away[0]:+.1f}, {away[1]:+.1f} px (± {c.sigmas[2]:.2g}, {c.sigmas[3]:.2g}) from the middle.",
+        f"Principal point {away[0]:+.1f}, {away[1]:+.1f} px from the middle"
+        f" (± {_two(c.sigmas[2])}, {_two(c.sigmas[3])}).",
         "Far off the middle it is that of a cropped or shifted picture"
         + (" (the uncertainty does not explain it)." if sure else "; here the views hardly determine it."),
         "Check that the pictures are not cropped; photograph the board turned by 90 deg in its plane as well.",
@@ -212,7 +222,7 @@ def _halves(c: Intrinsics, limits: Limits) -> Finding:
     level = Level.PASS if agree else Level.FAIL if d.rms_px > limits.halves_px else Level.WARN
     return _unless_pass(
         level,
-        f"Two halves of the photographs differ by {d.rms_px:.3g} px ({d.rms_mm:.2g} mm at {c.distance_m:.3g} m), RMS"
+        f"Two halves of the photographs differ by {d.rms_px:.3g} px ({_two(d.rms_mm)} mm at {c.distance_m:.3g} m), RMS"
         f" over the picture; their sigmas let expect {d.expected_rms_px:.3g} px (p = {d.p_value:.2g}).",
         "They should differ by their sigmas only. More means that the lens model, the board or the corners are wrong in"
         " a way that noise does not explain.",
@@ -241,9 +251,9 @@ def _map(c: Intrinsics, limits: Limits) -> Finding:
     (half, most, worst), (half_mm, most_mm, worst_mm) = (np.nanquantile(m, [0.5, 0.9, 1.0]) for m in (px, mm))
     return _unless_pass(
         _level(float(most), limits.map_px),
-        f"A pixel's direction is known to {half:.2g} px ({half_mm:.2g} mm at {c.distance_m:.3g} m) or better in half of"
-        f" the picture, to {most:.2g} px ({most_mm:.2g} mm) in nine tenths, to {worst:.2g} px ({worst_mm:.2g} mm) at"
-        " its worst place (1 sigma).",
+        f"A pixel's direction is known to {_two(half)} px ({_two(half_mm)} mm at {c.distance_m:.3g} m) or better in"
+        f" half of the picture, to {_two(most)} px ({_two(most_mm)} mm) in nine tenths, to {_two(worst)} px"
+        f" ({_two(worst_mm)} mm) at its worst place (1 sigma).",
         "Every spot there carries this error, the same in all frames: averaging does not remove it.",
         "Add photographs with the board where the uncertainty map is worst.",
     )

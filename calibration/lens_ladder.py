@@ -93,9 +93,8 @@ def choose(rungs: Sequence[Rung]) -> Ladder:
         why = f"it predicts held-out views best ({_rms(best):.3f} px)"
         smaller = [r for r in out if r.held is not None and not r.refused][: [r.model for r in able].index(best.model)]
         if smaller:
-            why += (
-                f", and every smaller model errs more by over one standard error ({_rms(smaller[-1]):.3f} px at best)"
-            )
+            least = min(_rms(r) for r in smaller)
+            why += f", and every smaller usable model errs more by over one standard error ({least:.3f} px at best)"
     else:
         why = (
             f"its held-out error ({_rms(chosen):.3f} px) is within one standard error of the best model's"

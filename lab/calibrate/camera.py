@@ -22,6 +22,7 @@ from lab.calibrate.camera_file import CameraCalibration, CameraFile, save_camera
 from lab.calibrate.photos import PhotoSet, Progress, find_in_photos
 from lab.camera_block import Covariance
 from lab.errors import CalibrationError, InputError
+from lab.report.svg import short
 from lab.whole_folder import whole_folder
 from lab.yaml_text import did_you_mean
 
@@ -86,8 +87,9 @@ class Outcome:
         reason = "" if self.level == Level.PASS else f": {worst.what.rstrip('.')}"
         px, mm = (np.nanmedian(m) for m in (r.map.sigma_px(r.covariance), r.map.sigma_mm(r.covariance)))
         return (
-            f"{self.name}: {self.level.name}: fx {r.fit.lens[0]:.2f} ± {r.sigmas[0]:.2g} px, {r.model.words}, RMS"
-            f" {r.rms_px:.3f} px, directions to {px:.2g} px / {mm:.2g} mm at {r.distance_m:.3g} m{reason} -> {self.out}"
+            f"{self.name}: {self.level.name}: fx {r.fit.lens[0]:.2f} ± {short(r.sigmas[0], 2)} px, {r.model.words}, RMS"
+            f" {r.rms_px:.3f} px, directions to {short(px, 2)} px / {short(mm, 2)} mm at"
+            f" {r.distance_m:.3g} m{reason} -> {self.out}"
         )
 
 
@@ -128,7 +130,8 @@ def calibrate_camera(
 def camera_file(outcome: Outcome, options: CameraOptions, day: datetime.date) -> CameraFile:
     """What camera.yaml holds."""
     r = outcome.result
-    until = "" if options.valid_days is None else (day + datetime.timedelta(days=options.valid_days)).isoformat()
+    failed = outcome.level == Level.FAIL
+    until = "" if options.valid_days is None or failed else (day + datetime.timedelta(options.valid_days)).isoformat()
     calibration = CameraCalibration(
         date=day.isoformat(),
         verdict=outcome.level.name,

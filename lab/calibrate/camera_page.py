@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.findings import Level
 from calibration.intrinsics_result import Intrinsics
 from calibration.lens_models import LensModel
 from geometry.arrays import Array
@@ -61,6 +62,7 @@ def _key_figures(r: Intrinsics, file: CameraFile) -> list[tuple[str, str, str]]:
     at = f"at {short(r.distance_m)} m"
     held = r.held.rms_px * _mm_per_px(r)
     until = file.calibration.valid_until if file.calibration else ""
+    failed = r.verdict is Level.FAIL
     return [
         ("focal length fx", f"{r.fit.lens[0]:.2f} ± {short(r.sigmas[0], 2)} px", f"{r.sigmas[0] / r.fit.lens[0]:.2%}"),
         ("lens", r.model.words, "smallest that predicts new photographs as well as the best"),
@@ -72,7 +74,7 @@ def _key_figures(r: Intrinsics, file: CameraFile) -> list[tuple[str, str, str]]:
         ("at the worst place", f"{short(np.nanmax(px), 2)} px · {short(np.nanmax(mm), 2)} mm", f"1 sigma, {at}"),
         ("corners' RMS", f"{r.rms_px:.3f} px", f"per coordinate; {r.rms_2d_px:.3f} px per corner, as OpenCV counts"),
         ("in photographs held out", f"{r.held.rms_px:.3f} px · {short(held, 2)} mm", f"per coordinate, {at}"),
-        ("valid until", until or "no expiry date", ""),
+        ("valid until", "must not be used" if failed else until or "no expiry date", ""),
     ]
 
 
