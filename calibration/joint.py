@@ -70,6 +70,7 @@ class Joint:
     terms: Mapping[str, tuple[Term, ...]]  # as adjusted at last: kept ones, sigmas widened
     informations: Mapping[str, Array]  # (size, size) what each kind knows
     groups: Mapping[str, GroupFit]  # how each kind fitted with the sigmas that were told
+    settled: Mapping[str, GroupFit]  # and how with the widened ones
     scales: Mapping[str, float]  # what sigmas of a kind were multiplied with; kinds not named: 1
     kept: Mapping[str, Bools]  # of the kinds that may be left out, row by row
     every: Mapping[str, Term]  # the same kinds with all rows and the told sigmas
@@ -129,6 +130,7 @@ def calibrate_jointly(measured: Measured, *, without: Bools | None = None, start
         terms=final,
         informations=informations,
         groups=groups,
+        settled=_fits(found, final, {}, unknowns) if scales and start is None else groups,
         scales=scales,
         kept=kept,
         every=every,

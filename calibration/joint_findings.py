@@ -141,14 +141,14 @@ def _fit_of(joint: Joint, name: str, limits: RigLimits) -> Finding:
             Level.PASS, f"{name}: fit all the others within their sigmas (factor {fit.scale:.2f}; {counted})"
         )
     if scale == 1.0:
-        # Widening another kind took the misfit away, or this one's sigmas are not ours to widen.
-        widened = list(joint.scales)
-        if widened and name not in (LENSES, PLACE, FIXED, SCANS):
+        now = joint.settled[name]
+        if not now.p < P_MISFIT:
             return Finding(
                 Level.PASS,
-                f"{name}: misfit with the sigmas told (factor {fit.scale:.2f}), explained by {', '.join(widened)}",
+                f"{name}: misfit at first (factor {fit.scale:.2f}), explained by {', '.join(joint.scales)}"
+                f" (factor {now.scale:.2f} with their sigmas widened)",
             )
-        scale = fit.scale
+        scale = now.scale
     level = Level.FAIL if scale > limits.scale_fail else Level.WARN if scale > limits.scale_warn else Level.PASS
     done = "all their sigmas were widened by that" if name in joint.scales else "their sigmas were left as told"
     why, cure = _WHY[name]
@@ -188,14 +188,23 @@ def _left_out(steps: RigSteps, positions: Sequence[str], limits: RigLimits) -> l
         elif name == DOTS:
             s = measured.network.sightings
             which = [f"{dots[s.dot_of[i]]} in camera {cameras[s.camera_of[i]]}" for i in wrong]
-        elif name == RECORDS:
-            which = [f"position {positions[i]}" for i in wrong]
         else:
             which = []
         share = len(wrong) / len(kept)
         if name == DOTS and share <= limits.wrong_warn and not steps.screens.fit.used[wrong].any():
             continue  # the step before names each, and what it may be
         level = Level.FAIL if share > limits.wrong_fail else Level.WARN if share > limits.wrong_warn else Level.PASS
+        if name == RECORDS:
+            out.append(
+                Finding(
+                    max(level, Level.WARN),
+                    f"{name}: the recorded pose does not fit the spots at {len(wrong)} of {len(kept)}"
+                    f" ({', '.join(positions[i] for i in wrong[:_NAMED])}{' …' if len(wrong) > _NAMED else ''})",
+                    "these records took no part",
+                    "check the stand's record there: a missed step, or frame numbers that are off by one",
+                )
+            )
+            continue
         named = f": {'; '.join(which[:_NAMED])}{' …' if len(which) > _NAMED else ''}" if which else ""
         out.append(
             Finding(
@@ -207,15 +216,6 @@ def _left_out(steps: RigSteps, positions: Sequence[str], limits: RigLimits) -> l
         )
         if name == SPOTS:
             out += _bad_positions(measured.spots.position, wrong, positions)
-        if name == RECORDS:
-            out.append(
-                Finding(
-                    Level.WARN,
-                    f"the recorded pose of {', '.join(which[:_NAMED])} does not fit its spots",
-                    "it took no part",
-                    "check the stand's record there: a missed step, or frame numbers that are off by one",
-                )
-            )
     return out
 
 

@@ -230,7 +230,7 @@ def _fields(o: Outcome, what: str, pixels: Array, residuals: Array, camera_of: I
         here = (camera_of == c) & kept
         if here.any():
             title = f"Camera {name}: {what}, found − predicted"
-            out.append(Drawing(residual_field(camera.image_size_px, pixels[here], residuals[here], title)))
+            out.append(Drawing(residual_field(camera.image_size_px, pixels[here], residuals[here], title, things=what)))
     return out
 
 
@@ -358,6 +358,7 @@ def _correlations(o: Outcome) -> Section:
         for i, n in enumerate(C.names)
         if split(n)[0] == "beams" or (sigma[i] > _GAUGE and not split(n)[2].startswith(("k", "p1", "p2", "s", "tau")))
     ]
+    shown.sort(key=lambda i: ("beams", "screens", "cameras").index(split(C.names[i])[0]))
     names = [_short_name(C.names[i]) for i in shown]
     picture = correlation_matrix(names, C.matrix[np.ix_(shown, shown)], "Correlations of the rig's numbers")
     words = "Errors that go together. Taken one by one they would promise a worse attitude than the rig gives."
