@@ -10,8 +10,9 @@ import pytest
 
 from bench.rig_calibration import as_measured, bench_figures, calibrated, measured_with, parameter_errors
 from calibration.adjustment import AdjustmentError
+from calibration.corners import CornerTerm
 from calibration.findings import Level
-from calibration.joint import DOTS, FRAMES, LENSES, RECORDS, SPOTS, calibrate_jointly
+from calibration.joint import CORNERS, DOTS, FRAMES, LENSES, RECORDS, SPOTS, calibrate_jointly
 from calibration.joint_findings import joint_findings
 from calibration.rig_figures import central_pose, expected_pose, hold_out, spot_sigma
 from calibration.rig_steps import calibrate_in_steps
@@ -165,6 +166,40 @@ def test_a_calibration_without_some_positions_keeps_its_outliers_and_sigmas():
     assert not part.kept[SPOTS][without].any()
     at = joint.unknowns.of_several([("beams", 0)])
     assert np.trace(part.all_covariance[np.ix_(at, at)]) > np.trace(joint.all_covariance[np.ix_(at, at)])
+
+
+def boards_before(c: Campaign, sigma_px=0.08):
+    """Corners of a board that was held before the left camera at four places."""
+    camera = c.truth.cameras["left"]
+    x, y = np.meshgrid(np.arange(7) * 0.1, np.arange(5) * 0.1)
+    board = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=-1)
+    middle = board.mean(axis=0)
+    turns = np.deg2rad([[0, 25, 0], [10, -25, 5], [0, 5, 30], [-10, 10, -30]])
+    at = Pose.from_ypr(turns, np.array([[-0.5, -0.3, 2.2], [0.3, -0.4, 2.4], [-0.4, 0.1, 2.3], [0.2, 0.2, 2.5]]))
+    placement = np.repeat(np.arange(4), len(board))
+    world = (camera.camera_from_world.inverse() @ at)[placement].apply(np.tile(board - middle, (4, 1)))
+    pixels = camera.project(world) + np.random.default_rng(3).normal(0, sigma_px, (len(world), 2))
+    n = len(pixels)
+    none = np.zeros(n, dtype=np.int64)
+    return CornerTerm(
+        pixels, np.tile(board, (4, 1)), np.tile((board - middle)[:, :2], (4, 1)), none, placement, none,
+        np.full(n, 0.2), np.array([False, False]),
+    )  # fmt: skip
+
+
+def test_boards_that_were_photographed_too_take_part_and_make_the_lens_better_known():
+    c = campaign()
+    network, setups, stand = as_measured(c)
+    with_boards = replace(network, corners=boards_before(c), placements=("1", "2", "3", "4"))
+    found = calibrate_in_steps(with_boards, setups, c.spots, stand).joint
+    assert found.groups[CORNERS].p > 1e-3
+    assert found.kept[CORNERS].mean() > 0.98
+    alone = steps().joint
+    at = [("intrinsics", 0)]
+    lens, before = (np.diagonal(j.all_covariance)[j.unknowns.of_several(at)][:4] for j in (found, alone))
+    assert np.all(lens < before)
+    _, nees = parameter_errors(found, c.truth)
+    assert 0.3 < nees < 1.8
 
 
 @pytest.mark.slow
