@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import datetime
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,14 +13,15 @@ from calibration.adjustment import AdjustmentError
 from calibration.beam_findings import BeamGoals, beam_findings
 from calibration.beams import Stand
 from calibration.findings import Finding, Level, verdict
-from calibration.joint_findings import RigLimits, in_degrees, in_mm, joint_findings
+from calibration.joint_findings import RigLimits, joint_findings
 from calibration.network_findings import ScreenLimits
 from calibration.network_findings import findings as network_findings
-from calibration.rig_figures import ExpectedPose, HoldOut, central_pose, expected_pose, hold_out, spot_sigma
+from calibration.rig_figures import central_pose, expected_pose, hold_out, spot_sigma
 from calibration.rig_steps import RigSteps, calibrate_in_steps
 from geometry.rig import Rig
 from lab.calibrate.project import Project, load_project
 from lab.calibrate.recordings import Recordings, read_recordings
+from lab.calibrate.rig_outcome import Outcome
 from lab.calibrate.rig_tables import RESIDUALS, write_residuals
 from lab.calibrate.screen_inputs import ScreenInputs, screen_inputs
 from lab.calibration_state import CalibrationState
@@ -33,37 +34,6 @@ RIG = "rig.yaml"
 FAILED_RIG = "rig.failed.yaml"  # its name where the verdict is FAIL, so that nothing reads it by mistake
 _ANY_FIT = ScreenLimits(np.inf, np.inf, factor_warn=np.inf, factor_fail=np.inf)
 _ANY_SIGMA = BeamGoals(direction=np.inf, direction_unusable=np.inf, wrong_share=np.inf, noise_scale=np.inf)
-
-
-@dataclass(frozen=True, slots=True)
-class Outcome:
-    """How the calibration of a rig ended."""
-
-    name: str
-    out: Path  # where the results are; beside the folder asked for where a FAIL would have replaced a good one
-    level: Level
-    findings: tuple[Finding, ...]
-    steps: RigSteps
-    expected: ExpectedPose | None
-    held_out: HoldOut | None
-
-    @property
-    def exit_status(self) -> int:
-        """0, or 3 where the calibration must not be used."""
-        return CalibrationError.exit_status if self.level == Level.FAIL else 0
-
-    def line(self) -> str:
-        """One line for the terminal."""
-        rig = self.steps.joint.rig
-        what = f"{len(rig.cameras)} cameras, {len(rig.screens)} screens, {len(rig.beams)} beams"
-        if self.expected is not None:
-            what += f"; one frame: {in_degrees(self.expected.total):.2g} deg, {in_mm(self.expected.total):.2g} mm"
-        if self.held_out is not None:
-            deg, mm = np.rad2deg(self.held_out.attitude_rms), 1e3 * self.held_out.position_rms
-            what += f"; held out: {deg:.2g} deg, {mm:.2g} mm"
-        worst = max(self.findings, key=lambda f: f.level)
-        reason = "" if self.level == Level.PASS else f": {worst.what}"
-        return f"{self.name}: {self.level.name}: {what}{reason} -> {self.out}"
 
 
 def calibrate_rig(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import datetime
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,6 +18,7 @@ from geometry.pose import ypr_sigmas
 from geometry.rig import Rig
 from geometry.rig_parameters import split
 from lab.calibrate.recordings import Recordings
+from lab.calibrate.rig_outcome import Outcome
 from lab.report.calibration_charts import residual_histogram
 from lab.report.calibration_drawings import residual_field
 from lab.report.calibration_maps import correlation_matrix, flatness_map
@@ -32,9 +32,6 @@ from lab.report.calibration_page import (
 )
 from lab.report.calibration_scene import rig_things, scene_views
 from lab.report.svg import short
-
-if TYPE_CHECKING:
-    from lab.calibrate.rig import Outcome
 
 _ARCSEC = np.deg2rad(1 / 3600)
 _WORST = 10  # held-out positions in the table

@@ -38,6 +38,7 @@ class Quality:
     beam_m: float = 0.003
     focal_px: float = 8.0  # lenses: how far they are from the data sheet
     centre_px: float = 5.0
+    distortion_share: float = 0.03  # of each distortion number
     bow_per_m: float = 0.0  # how bent screens are
     lens_corner_px: float = 0.08  # of a board corner, in the lens calibration that came before
     dots: tuple[int, int] = (6, 5)  # surveyed dots per screen: columns, rows; those that no camera sees are left out
@@ -166,7 +167,9 @@ def as_mounted(nominal: Rig, q: Quality, rng: np.random.Generator) -> Rig:
         stands = c.camera_from_world.inverse().plus(off(q.camera_m, q.camera_deg))
         focal, dx, dy = rng.normal(0, [q.focal_px, q.centre_px, q.centre_px])
         matrix = c.matrix + np.array([[focal, 0, dx], [0, focal * (1 + 1e-4 * rng.normal()), dy], [0, 0, 0]])
-        distortion = tuple((np.array(c.distortion) * (1 + 0.03 * rng.normal(size=len(c.distortion)))).tolist())
+        distortion = tuple(
+            (np.array(c.distortion) * (1 + q.distortion_share * rng.normal(size=len(c.distortion)))).tolist()
+        )
         cameras[name] = replace(c, matrix=matrix, distortion=distortion, camera_from_world=stands.inverse())
     for name, s in nominal.screens.items():
         a, b, c2 = (np.array(s.bow) + rng.normal(0, 1, 3) * q.bow_per_m).tolist()

@@ -219,6 +219,22 @@ def test_a_lens_without_a_covariance_is_taken_as_exact_with_a_warning(project, t
 
 
 @pytest.mark.slow
+def test_recordings_can_be_run_folders_whose_spots_are_found_and_named_first(tmp_path):
+    nothing = dict.fromkeys(("camera_m", "camera_deg", "screen_m", "screen_deg", "beam_deg", "beam_m"), 0.0)
+    as_drawn = Quality(**nothing, focal_px=0.0, centre_px=0.0, distortion_share=0.0)
+    project = simulate_calibration(tmp_path / "lab", seed=5, quality=as_drawn)
+    simulate("smooth", project / "run", seed=2, frames=60, detections_only=True, noise_px=0.054)
+    path = project / "calibration.yaml"
+    text, count = re.subn(r"recordings:\n- .*\n", "recordings:\n- {run: run, use_truth: true}\n", path.read_text())
+    assert count == 1
+    path.write_text(text)
+    ended = calibrate_rig(project, tmp_path / "out", today=DAY)
+    assert len(ended.steps.beams.world_from_body.translation) == 60
+    assert np.rad2deg(ended.held_out.attitude_rms) < 0.01
+    assert ended.held_out.ratio < 1.1
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("rig", ["two-cameras-per-screen", "four-skew-beams", "unequal-fan"])
 def test_other_rigs_are_calibrated_to_a_hundredth_of_a_degree_too(tmp_path, rig):
     project = simulate_calibration(tmp_path / "lab", seed=2, rig=rig, wrong=0.02)

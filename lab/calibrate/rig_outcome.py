@@ -1,0 +1,45 @@
+"""How the calibration of a rig ended."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from calibration.findings import Finding, Level
+from calibration.joint_findings import in_degrees, in_mm
+from calibration.rig_figures import ExpectedPose, HoldOut
+from calibration.rig_steps import RigSteps
+from lab.errors import CalibrationError
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """How the calibration of a rig ended."""
+
+    name: str
+    out: Path  # where the results are; beside the folder asked for where a FAIL would have replaced a good one
+    level: Level
+    findings: tuple[Finding, ...]
+    steps: RigSteps
+    expected: ExpectedPose | None
+    held_out: HoldOut | None
+
+    @property
+    def exit_status(self) -> int:
+        """0, or 3 where the calibration must not be used."""
+        return CalibrationError.exit_status if self.level == Level.FAIL else 0
+
+    def line(self) -> str:
+        """One line for the terminal."""
+        rig = self.steps.joint.rig
+        what = f"{len(rig.cameras)} cameras, {len(rig.screens)} screens, {len(rig.beams)} beams"
+        if self.expected is not None:
+            what += f"; one frame: {in_degrees(self.expected.total):.2g} deg, {in_mm(self.expected.total):.2g} mm"
+        if self.held_out is not None:
+            deg, mm = np.rad2deg(self.held_out.attitude_rms), 1e3 * self.held_out.position_rms
+            what += f"; held out: {deg:.2g} deg, {mm:.2g} mm"
+        worst = max(self.findings, key=lambda f: f.level)
+        reason = "" if self.level == Level.PASS else f": {worst.what}"
+        return f"{self.name}: {self.level.name}: {what}{reason} -> {self.out}"
