@@ -82,9 +82,9 @@ def mean_nees(scenario: str, seeds: range, stated: bool = True, frames: int = 6)
 
 @pytest.mark.parametrize("scenario", ["clean", "four-skew-beams"])
 def test_the_stated_covariance_holds_the_calibrations_errors(scenario):
-    # 40 rigs, and frames of a rig share its errors: the mean of NEES / 6 scatters by 0.09.
-    mean, measured, drops = mean_nees(scenario, range(40))
-    assert 0.7 < mean < 1.3
+    # 16 rigs, and frames of a rig share its errors: the mean of NEES / 6 scatters by 0.14.
+    mean, measured, drops = mean_nees(scenario, range(16), frames=4)
+    assert 0.55 < mean < 1.45
     assert measured == 1.0
     assert drops == 0
 
