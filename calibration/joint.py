@@ -12,15 +12,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import chdtri
 
-from calibration.adjustment import Adjusted, At, Cauchy, Free, Limits, Loss, Term, Values, solve
+from calibration.adjustment import Adjusted, At, Cauchy, Free, Limits, Term, Values, solve
 from calibration.beams import Stand
-from calibration.corners import CornerTerm
 from calibration.flatness import smallest_scatter
 from calibration.measurement_groups import GroupFit, Unknowns, group_fit, information
 from calibration.network import Network, NetworkFit, flat_boards, sighting_sigmas
 from calibration.pose_records import RecordTerm
 from calibration.priors import Prior
 from calibration.rig_stacks import BEAMS, BOWS, CAMERAS, INTRINSICS, POSES, SCREENS, STAND, named_errors, rig_of
+from calibration.some_rows import picked, rows_of, widened
 from calibration.spot_term import SpotPixels, SpotTerm
 from calibration.stacks import Poses
 from calibration.surveyed import FrameTerm, PointTerm, SurfaceTerm, SurveyTerm, pose_of, whitening
@@ -96,7 +96,7 @@ def calibrate_jointly(measured: Measured, *, without: Bools | None = None, start
     values: Values = {**measured.screens.values, **measured.beams} if start is None else start.values
     free = free_of(measured)
     every, fixed = _kinds(measured)
-    kept = {name: np.ones(_rows(term), dtype=bool) for name, term in every.items()}
+    kept = {name: np.ones(rows_of(term), dtype=bool) for name, term in every.items()}
     if without is not None:
         kept[SPOTS] &= ~without
     unknowns = Unknowns.of(values, free)
@@ -109,7 +109,7 @@ def calibrate_jointly(measured: Measured, *, without: Bools | None = None, start
     else:
         kept = {name: rows & start.kept[name] for name, rows in kept.items()}
         found, told, scales = start.adjusted, _told(every, fixed, kept), dict(start.scales)
-    final = {n: tuple(_widened(t, scales.get(n, 1.0)) for t in ts) for n, ts in told.items()}
+    final = {n: tuple(widened(t, scales.get(n, 1.0)) for t in ts) for n, ts in told.items()}
     if start is not None or scales:
         found = solve(found.values, [t for ts in final.values() for t in ts], free)
     C = found.covariance(unknowns.at)
@@ -203,7 +203,7 @@ def _robust(
 ) -> tuple[Adjusted, dict[str, Bools]]:
     """Outliers fade, then are left out until the same ones stay out; the rest is adjusted with full weights."""
     rest = [t for ts in fixed.values() for t in ts]
-    first = [_picked(t, allowed[n], Cauchy()) for n, t in every.items()]
+    first = [picked(t, allowed[n], Cauchy()) for n, t in every.items()]
     found = solve(values, [*first, *rest], free, _ROUGHLY)
     kept = _near(measured, every, found.values, allowed)
     for _ in range(_ROUNDS):
@@ -240,10 +240,10 @@ def _told(
     every: Mapping[str, Term], fixed: Mapping[str, tuple[Term, ...]], kept: Mapping[str, Bools]
 ) -> dict[str, tuple[Term, ...]]:
     """The kept measurements with the sigmas that came with them."""
-    out = {n: (_picked(t, kept[n]),) for n, t in every.items()} | dict(fixed)
+    out = {n: (picked(t, kept[n]),) for n, t in every.items()} | dict(fixed)
     if RECORDS in every and not kept[RECORDS].all():
         # A position without its record must not run away where its spots do not determine it.
-        lost = _picked(every[RECORDS], ~kept[RECORDS])
+        lost = picked(every[RECORDS], ~kept[RECORDS])
         assert isinstance(lost, RecordTerm)
         out[LOST] = (replace(lost, sigmas=np.where(lost.sigmas > 0, _ANYWHERE, 0.0)),)
     return out
@@ -256,8 +256,8 @@ def _fits(
     C = found.covariance(unknowns.at)
     out = {}
     for name, terms in told.items():
-        widened = [_widened(t, scales.get(name, 1.0)) for t in terms]
-        out[name] = group_fit(name, *information(widened, found.values, unknowns), C)
+        these = [widened(t, scales.get(name, 1.0)) for t in terms]
+        out[name] = group_fit(name, *information(these, found.values, unknowns), C)
     return out
 
 
@@ -279,48 +279,6 @@ def _scales(found: Adjusted, told: Mapping[str, tuple[Term, ...]], unknowns: Unk
             break
         worst = max(loose, key=lambda n: abs(np.log(loose[n].scale)))
         scales[worst] = max(scales.get(worst, 1.0) * loose[worst].scale, 1.0)
-        terms = [_widened(t, scales.get(n, 1.0)) for n, ts in told.items() for t in ts]
+        terms = [widened(t, scales.get(n, 1.0)) for n, ts in told.items() for t in ts]
         found = solve(found.values, terms, free)
     return {n: s for n, s in scales.items() if s > 1.0}
-
-
-def _rows(term: Term) -> int:
-    if isinstance(term, SpotTerm):
-        return len(term.spots)
-    if isinstance(term, CornerTerm):
-        return len(term)
-    if isinstance(term, PointTerm):
-        return len(term.pixels)
-    assert isinstance(term, RecordTerm)
-    return len(term.index)
-
-
-def _picked(term: Term, rows: Bools, loss: Loss | None = None) -> Term:
-    """Some rows of a term."""
-    if isinstance(term, SpotTerm):
-        return SpotTerm(term.rig, term.spots.pick(rows), loss)
-    if isinstance(term, PointTerm):
-        return PointTerm(
-            term.camera_of[rows], term.point_of[rows], term.pixels[rows], term.whiten[rows], term.fisheye, loss
-        )
-    if isinstance(term, RecordTerm):
-        return RecordTerm(term.stack, term.index[rows], term.recorded[rows], term.sigmas[rows], loss)
-    assert isinstance(term, CornerTerm)
-    per_row = ("pixels", "points", "from_middle", "camera", "placement", "board", "sigma_px")
-    return replace(term, **{n: getattr(term, n)[rows] for n in per_row}, loss=loss)
-
-
-def _widened(term: Term, scale: float) -> Term:
-    """A term with all its sigmas multiplied."""
-    if scale == 1.0:
-        return term
-    if isinstance(term, SpotTerm):
-        return SpotTerm(term.rig, replace(term.spots, covariance=term.spots.covariance * scale**2), term.loss)
-    if isinstance(term, PointTerm | SurveyTerm):
-        return replace(term, whiten=term.whiten / scale)
-    if isinstance(term, SurfaceTerm):
-        return replace(term, sigma_m=term.sigma_m * scale)
-    if isinstance(term, CornerTerm):
-        return replace(term, sigma_px=term.sigma_px * scale)
-    assert isinstance(term, RecordTerm)
-    return replace(term, sigmas=term.sigmas * scale)

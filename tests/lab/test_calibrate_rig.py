@@ -142,11 +142,10 @@ def test_the_report_shows_the_figures_and_needs_nothing_from_outside(outcome):
     assert "nan" not in re.sub(r"<[^>]*>", " ", page).split()
 
 
-def test_a_fail_keeps_the_earlier_calibration_and_ends_with_status_3(project, tmp_path):
+def test_a_fail_keeps_the_earlier_calibration_and_ends_with_status_3(project, outcome, tmp_path):
     out = tmp_path / "out"
     out.mkdir()
-    good = load_rig_file(calibrate_rig(project, tmp_path / "good", today=DAY).out / "rig.yaml")
-    save_rig(good, out / "rig.yaml")
+    shutil.copy(outcome.out / "rig.yaml", out)
     (out / "residuals.csv").write_text("kind\n")
     before = (out / "rig.yaml").read_bytes()
     # The lens calibration says of itself that it must not be used.
