@@ -51,3 +51,9 @@ def _replace(work: Path, target: Path) -> None:
         old.rename(target)
         raise
     shutil.rmtree(old, ignore_errors=True)
+
+
+def beside_a_good_one(target: Path, failed: bool, good: str) -> Path:
+    """Where results go: `target`, or `target-failed` where they failed and `target` holds good ones (a file `good`)."""
+    target = Path(target)
+    return target.with_name(f"{target.name}-failed") if failed and (target / good).is_file() else target

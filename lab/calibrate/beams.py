@@ -23,7 +23,7 @@ from lab.calibration_state import CalibrationState
 from lab.errors import CalibrationError, InputError
 from lab.rig_covariance import blocks_of, joint_covariance
 from lab.rig_file import RigFile, load_rig_file, save_rig
-from lab.whole_folder import whole_folder
+from lab.whole_folder import beside_a_good_one, whole_folder
 from lab.yaml_text import did_you_mean, read_mapping
 
 RIG = "rig.yaml"
@@ -69,8 +69,9 @@ def calibrate_beams(
     """Calibrate the beams of a project; writes rig.yaml (not where it fails), three tables and report.html into `out`.
 
     rig: the rig.yaml or screens.yaml with cameras and screens as calibrated and their covariances (None: `rig.yaml`
-    beside the project). A target in it is replaced by the project's, if that has one. Raises InputError for what is
-    wrong with the files, CalibrationError where the spots give no calibration at all; `out` is then as it was.
+    beside the project). A target in it is replaced by the project's, if that has one. A FAIL does not replace an earlier
+    calibration: it then goes to `OUT-failed`. Raises InputError for what is wrong with the files, CalibrationError where
+    the spots give no calibration at all; `out` is then as it was.
     """
     project = load_project(Path(project_path))
     rig_path = Path(rig) if rig is not None else project.path.parent / RIG
@@ -89,10 +90,11 @@ def calibrate_beams(
     ]
     level = verdict(findings)
     day = today or project.date or datetime.date.today()
+    folder = beside_a_good_one(out, level == Level.FAIL, RIG)
     outcome = Outcome(
-        project.name, Path(out), level, tuple(findings), found, None if level == Level.FAIL else Path(out) / RIG
+        project.name, folder, level, tuple(findings), found, None if level == Level.FAIL else folder / RIG
     )
-    with whole_folder(Path(out), may_replace=lambda folder: (folder / BEAMS).is_file()) as work:
+    with whole_folder(folder, may_replace=lambda folder: (folder / BEAMS).is_file()) as work:
         write_tables(found, file.rig, recordings.names, work)
         if level != Level.FAIL:
             save_rig(_rig_file(file, found, project, findings, day), work / RIG)

@@ -19,11 +19,11 @@ from calibration.lens_models import LADDER, named
 from geometry.camera import FISHEYE, PERSPECTIVE
 from lab.calibrate.board_file import board_of
 from lab.calibrate.camera_file import CameraCalibration, CameraFile, save_camera
-from lab.calibrate.photos import PhotoSet, Progress, find_in_photos
+from lab.calibrate.camera_outcome import Outcome
+from lab.calibrate.photos import Progress, find_in_photos
 from lab.camera_block import Covariance
 from lab.errors import CalibrationError, InputError
-from lab.report.svg import short
-from lab.whole_folder import whole_folder
+from lab.whole_folder import beside_a_good_one, whole_folder
 from lab.yaml_text import did_you_mean
 
 CAMERA, FAILED, CORNERS = "camera.yaml", "camera.failed.yaml", "corners.csv"
@@ -61,38 +61,6 @@ class CameraOptions:
         return IntrinsicsOptions(self.distance_m, lens, WARPS[self.warp], self.folds)
 
 
-@dataclass(frozen=True, slots=True)
-class Outcome:
-    """How a camera's calibration ended."""
-
-    name: str
-    out: Path
-    result: Intrinsics
-    photos: PhotoSet
-
-    @property
-    def level(self) -> Level:
-        """The verdict."""
-        return self.result.verdict
-
-    @property
-    def exit_status(self) -> int:
-        """0, or 3 where the calibration must not be used."""
-        return CalibrationError.exit_status if self.level == Level.FAIL else 0
-
-    def line(self) -> str:
-        """One line for the terminal."""
-        r = self.result
-        worst = max(r.findings, key=lambda f: f.level)
-        reason = "" if self.level == Level.PASS else f": {worst.what.rstrip('.')}"
-        px, mm = (np.nanmedian(m) for m in (r.map.sigma_px(r.covariance), r.map.sigma_mm(r.covariance)))
-        return (
-            f"{self.name}: {self.level.name}: fx {r.fit.lens[0]:.2f} ± {short(r.sigmas[0], 2)} px, {r.model.words}, RMS"
-            f" {r.rms_px:.3f} px, directions to {short(px, 2)} px / {short(mm, 2)} mm at"
-            f" {r.distance_m:.3g} m{reason} -> {self.out}"
-        )
-
-
 def calibrate_camera(
     photos: Iterable[Path | str],
     board: Board | str | Path,
@@ -104,8 +72,9 @@ def calibrate_camera(
     """Calibrate a camera from photographs (files, folders, patterns, videos) of a board (value, text or board.yaml).
 
     Writes camera.yaml (camera.failed.yaml where the verdict is FAIL, so that nothing reads it by mistake), corners.csv
-    and report.html into the folder `out`, whole or not at all. Raises InputError for pictures or a board that cannot
-    be used, CalibrationError where the photographs do not determine the camera.
+    and report.html into the folder `out`, whole or not at all; a FAIL does not replace an earlier calibration, it then
+    goes to `OUT-failed`. Raises InputError for pictures or a board that cannot be used, CalibrationError where the
+    photographs do not determine the camera.
     """
     options = options or CameraOptions()
     day = today or datetime.date.today()
@@ -116,9 +85,10 @@ def calibrate_camera(
         result = calibrate_intrinsics(table, options.intrinsics())
     except IntrinsicsError as error:
         raise CalibrationError(f"{options.name} ({found.line()}): {error}") from None
-    outcome = Outcome(options.name, Path(out), result, found)
+    folder = beside_a_good_one(out, result.verdict == Level.FAIL, CAMERA)
+    outcome = Outcome(options.name, folder, result, found)
     file = camera_file(outcome, options, day)
-    with whole_folder(Path(out), may_replace=lambda folder: (folder / CORNERS).is_file()) as work:
+    with whole_folder(folder, may_replace=lambda folder: (folder / CORNERS).is_file()) as work:
         save_camera(file, work / (FAILED if outcome.level == Level.FAIL else CAMERA))
         _write_corners(outcome, work / CORNERS)
         from lab.calibrate.camera_page import write_page  # the template engine: only for those who write a report

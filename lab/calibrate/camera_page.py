@@ -13,8 +13,8 @@ from calibration.findings import Level
 from calibration.intrinsics_result import Intrinsics
 from calibration.lens_models import LensModel
 from geometry.arrays import Array
-from lab.calibrate.camera import Outcome
 from lab.calibrate.camera_file import CameraFile
+from lab.calibrate.camera_outcome import Outcome
 from lab.calibrate.photos import VIDEO_SUFFIXES
 from lab.pictures import Missing, decode
 from lab.report.calibration_charts import lens_ladder, residual_histogram

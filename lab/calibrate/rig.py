@@ -28,7 +28,7 @@ from lab.calibration_state import CalibrationState
 from lab.errors import CalibrationError, InputError
 from lab.rig_covariance import blocks_of
 from lab.rig_file import RigFile, save_rig
-from lab.whole_folder import whole_folder
+from lab.whole_folder import beside_a_good_one, whole_folder
 
 RIG = "rig.yaml"
 FAILED_RIG = "rig.failed.yaml"  # its name where the verdict is FAIL, so that nothing reads it by mistake
@@ -69,9 +69,7 @@ def calibrate_rig(
         *_of_the_inputs(project, recordings, inputs, day),
     ]
     level = verdict(findings)
-    folder = Path(out)
-    if level == Level.FAIL and (folder / RIG).is_file():
-        folder = folder.with_name(f"{folder.name}-failed")
+    folder = beside_a_good_one(out, level == Level.FAIL, RIG)
     outcome = Outcome(project.name, folder, level, tuple(findings), steps, expected, held_out)
     with whole_folder(folder, may_replace=lambda f: (f / RESIDUALS).is_file()) as work:
         save_rig(_rig_file(outcome, project, day), work / (FAILED_RIG if level == Level.FAIL else RIG))

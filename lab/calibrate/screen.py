@@ -26,7 +26,7 @@ from lab.calibration_state import CalibrationState
 from lab.errors import CalibrationError, InputError
 from lab.rig_covariance import blocks_of
 from lab.rig_file import RigFile, save_rig
-from lab.whole_folder import whole_folder
+from lab.whole_folder import beside_a_good_one, whole_folder
 
 SCREENS, RIG = "screens.yaml", "rig.yaml"
 SUSPICIOUS = 4.0  # misfit (see calibration/survey_suspects.py) from which swapped axes and wrong units are looked for
@@ -70,8 +70,9 @@ def calibrate_screen(project_path: Path, out: Path, today: datetime.date | None 
     """Calibrate the screens and the cameras' places of a project.
 
     Writes into `out`: screens.yaml; rig.yaml with the beams as drawn, where the project has a target; residuals.csv,
-    dots.csv and report.html. Neither YAML is written where the verdict is FAIL. Raises InputError for what is wrong
-    with the files, CalibrationError where they give no calibration at all; `out` is then as it was.
+    dots.csv and report.html. Neither YAML is written where the verdict is FAIL, which does not replace an earlier
+    calibration: it then goes to `OUT-failed`. Raises InputError for what is wrong with the files, CalibrationError where
+    they give no calibration at all; `out` is then as it was.
     """
     project = load_project(Path(project_path))
     inputs = screen_inputs(project)
@@ -84,8 +85,9 @@ def calibrate_screen(project_path: Path, out: Path, today: datetime.date | None 
     ]
     level = verdict(found)
     day = today or project.date or datetime.date.today()
-    outcome = Outcome(project.name, Path(out), level, tuple(found), result)
-    with whole_folder(Path(out), may_replace=_is_ours) as work:
+    folder = beside_a_good_one(out, level == Level.FAIL, SCREENS)
+    outcome = Outcome(project.name, folder, level, tuple(found), result)
+    with whole_folder(folder, may_replace=_is_ours) as work:
         if level != Level.FAIL:
             _save(project, outcome, day, work)
         write_tables(result, work)

@@ -1,0 +1,134 @@
+"""How good calibrations are, and whether they know it: `python -m bench.calibration [seeds] [first seed]` prints the table.
+
+Each figure on fresh seeds, with the goal beside it. 200 seeds take about a quarter of an hour on one core; the real
+photographs are used where they are at hand.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from bench.rig_calibration import bench_figures
+from calibration.intrinsics import calibrate_intrinsics
+from calibration.lens_fit import robust_fit
+from calibration.lens_start import start
+from lab.simulate.rigs import RIGS
+from tests.calibration.bench import ARCSEC, exact, unknown_place
+from tests.calibration.lens_scenes import TRUTH, Scene, photographs
+from tests.calibration.test_beams import bench_case, tally
+from tests.calibration.test_intrinsics import FIVE, bowed, coverage_and_nees
+from tests.tracking.test_calibration_errors import mean_nees
+
+
+def lenses(seeds: range) -> Iterator[tuple[str, str, str]]:
+    """Coverage and NEES of single calibrations; five coefficients, 12 photographs, corners to 0.2 px."""
+    z, nees = coverage_and_nees(seeds, FIVE)
+    inside = 100 * (np.abs(z) < 1).mean(axis=0)
+    band = 1.96 * np.sqrt(2 / z.size)
+    yield "lens: each parameter within 1 sigma", f"{inside.min():.1f} to {inside.max():.1f} %", "62 to 75 %"
+    yield "lens: NEES per parameter", f"{nees.mean():.3f}", f"{1 - band:.3f} to {1 + band:.3f}"
+
+
+def bent_boards(seeds: range) -> Iterator[tuple[str, str, str]]:
+    """A board that is bowed by 1.5 mm over 0.33 m, and OpenCV's plain solve beside ours."""
+    ours, plain = [], []
+    for seed in seeds:
+        scene = Scene(views=10, warp=bowed(0.0015, 0.33), columns=12, rows=8, distance_m=(0.45, 0.9))
+        table = photographs(scene, seed)
+        found = calibrate_intrinsics(table, FIVE)
+        ours.append((found.fit.lens[0] - TRUTH[0]) / found.sigmas[0])
+        views = [np.flatnonzero(table.view == v) for v in np.unique(table.view)]
+        answer = cv2.calibrateCameraExtended(
+            [table.points[v].astype(np.float32) for v in views],
+            [table.pixels[v].astype(np.float32) for v in views],
+            table.image_size_px,
+            None,
+            None,
+        )
+        plain.append(((answer[1][0, 0] - TRUTH[0]), float(np.ravel(answer[5])[0])))
+    off, claimed = np.mean(plain, axis=0)
+    yield "bowed board: focal error, worst", f"{np.abs(ours).max():.2f} sigma", "2 sigma"
+    yield "bowed board: plain OpenCV", f"{off:+.0f} px at a claimed {claimed:.1f} px", ""
+
+
+def wrong_corners(seeds: range) -> Iterator[tuple[str, str, str]]:
+    """Four corners of one view off by 8 px."""
+    worst = 0.0
+    for seed in seeds:
+        table = photographs(Scene(), seed)
+        model, values = start(table, False)
+        clean = robust_fit(table, model, values, False)
+        pixels = table.pixels.copy()
+        pixels[np.flatnonzero(table.view == 3)[[0, 1, 9, 10]]] += 8 / np.sqrt(2)
+        model, values = start(replace(table, pixels=pixels), False)
+        found = robust_fit(replace(table, pixels=pixels), model, values, False)
+        moved = (found.lens - clean.lens)[:9] / np.sqrt(np.diagonal(clean.covariance))
+        worst = max(worst, float(np.abs(moved).max()))
+    yield "four corners off by 8 px: largest move", f"{worst:.2f} sigma", "0.5 sigma"
+
+
+def many_views() -> Iterator[tuple[str, str, str]]:
+    """400 photographs, everything but finding the corners: process time."""
+    table = photographs(Scene(views=400), 5)
+    clock = time.process_time()
+    calibrate_intrinsics(table)
+    ours = time.process_time() - clock
+    yield "400 views, ladder, hold-out and halves", f"{ours:.1f} s", "20 s"
+
+
+def beams(seeds: range) -> Iterator[tuple[str, str, str]]:
+    """40 stand positions, spots to 0.2 mm."""
+    for name, known in (("known", exact), ("unknown", unknown_place)):
+        within, nees, size = tally(bench_case(s, known, RIGS["unequal-fan"]()) for s in seeds)
+        text = f"{size / ARCSEC:.1f} arcsec; {100 * within:.0f} % within 1 sigma, NEES {nees:.2f}"
+        yield f"beam directions, stand's place {name}", text, "15 arcsec"
+
+
+def rigs(seeds: range) -> Iterator[tuple[str, str, str]]:
+    """Whole campaigns calibrated jointly, then new frames measured with the result."""
+    f = bench_figures(seeds)
+    yield (
+        "attitude and position with a calibrated rig, one frame",
+        (f"{f['attitude_rms_deg']:.4f} deg, {f['position_rms_mm']:.2f} mm RMS"),
+        "0.01 deg, 0.5 mm",
+    )
+    yield (
+        "NEES/6 of those poses; by the noise alone",
+        (f"{f['nees_per_number']:.2f}; {f['nees_noise_alone']:.2f}"),
+        "0.85 to 1.15",
+    )
+
+
+def runs(seeds: range) -> Iterator[tuple[str, str, str]]:
+    """The tracker with rigs whose calibration errors are drawn from their stated covariance."""
+    for scenario in ("clean", "four-skew-beams"):
+        mean, _, _ = mean_nees(scenario, seeds)
+        yield f"NEES/6 through the tracker, {scenario}", f"{mean:.2f}", "0.85 to 1.15"
+
+
+def main(arguments: list[str]) -> None:
+    """Print the table."""
+    count = int(arguments[0]) if arguments else 200
+    first = int(arguments[1]) if len(arguments) > 1 else 5000
+    few = range(first, first + min(count, 10))
+    seeds = range(first, first + count)
+    parts: list[Callable[[], Iterator[tuple[str, str, str]]]] = [
+        lambda: lenses(seeds), lambda: bent_boards(few), lambda: wrong_corners(few), many_views,
+        lambda: beams(seeds), lambda: rigs(seeds), lambda: runs(seeds),
+    ]  # fmt: skip
+    for part in parts:
+        for what, found, goal in part():
+            print(f"{what:56s} {found:42s} {goal}", flush=True)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
