@@ -18,12 +18,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import block_diag
 
-from calibration.beams import Stand
-from calibration.joint import Joint
-from calibration.network import Dots, Network, Sightings
-from calibration.rig_stacks import prior_of, stacks_of
-from calibration.rig_steps import RigSteps, calibrate_in_steps
-from calibration.screens import ScreenSetup
+from calibration.beams.beams import Stand
+from calibration.rig.joint import Joint
+from calibration.rig.rig_stacks import prior_of, stacks_of
+from calibration.rig.rig_steps import RigSteps, calibrate_in_steps
+from calibration.screens.network import Dots, Network, Sightings
+from calibration.screens.screens import ScreenSetup
 from geometry.arrays import Array, normalised
 from geometry.calibration_spread import CalibrationSpread
 from geometry.pose import Pose

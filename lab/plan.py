@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from calibration.expected_errors import expected_errors
+from calibration.budget.expected_errors import expected_errors
 from calibration.findings import Level, verdict
 from lab.errors import QUALITY_GATE_FAILED
 from lab.plan_findings import findings, median_sigma

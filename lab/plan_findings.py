@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.findings import Finding, Level
-from calibration.pose_budget import (
+from calibration.budget.pose_budget import (
     BEAM_DIRECTIONS,
     BEAM_POINTS,
     CAMERA_POSES,
@@ -16,6 +15,7 @@ from calibration.pose_budget import (
     SCREEN_POSES,
     SCREEN_SHAPES,
 )
+from calibration.findings import Finding, Level
 from geometry.arrays import Array, Bools
 from lab.plan_grid import NOISE, Plan
 from lab.report.tables import angle, length, percent

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.pose_budget import Budget, PoseBudget, RigErrors, along, worst_direction
+from calibration.budget.pose_budget import Budget, PoseBudget, RigErrors, along, worst_direction
 from geometry.arrays import Array, Bools, Ints
 from geometry.rig import Rig
 from geometry.rig_parameters import Sensitivity

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from calibration.expected_errors import ExpectedErrors
+from calibration.budget.expected_errors import ExpectedErrors
 from geometry.arrays import Array
 from geometry.pose import Pose
 from lab.errors import InputError

@@ -23,7 +23,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.pose_budget import group_of
+from calibration.budget.pose_budget import group_of
 from lab.plan_grid import AXES, STATUS, Plan
 from lab.yaml_text import write_whole
 

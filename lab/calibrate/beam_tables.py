@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.beam_findings import ARCSEC, direction_sigmas, offset_sigmas
-from calibration.beam_start import world_points
-from calibration.beams import BeamCalibration
+from calibration.beams.beam_findings import ARCSEC, direction_sigmas, offset_sigmas
+from calibration.beams.beam_start import world_points
+from calibration.beams.beams import BeamCalibration
 from geometry.arrays import Array
 from geometry.rig import Rig
 from lab.yaml_text import write_whole

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.adjustment import AdjustmentError
-from calibration.beam_findings import ARCSEC, BeamGoals, beam_findings, direction_sigmas
-from calibration.beams import BeamCalibration, Stand, self_calibrate
-from calibration.beams import calibrate_beams as find_beams
+from calibration.beams.beam_findings import ARCSEC, BeamGoals, beam_findings, direction_sigmas
+from calibration.beams.beams import BeamCalibration, Stand, self_calibrate
+from calibration.beams.beams import calibrate_beams as find_beams
 from calibration.findings import Finding, Level, verdict
+from calibration.least_squares.adjustment import AdjustmentError
 from geometry.rig_parameters import RigCovariance
 from lab.calibrate.beam_tables import BEAMS, write_tables
 from lab.calibrate.project import Project, load_project
@@ -69,9 +69,9 @@ def calibrate_beams(
     """Calibrate the beams of a project; writes rig.yaml (not where it fails), three tables and report.html into `out`.
 
     rig: the rig.yaml or screens.yaml with cameras and screens as calibrated and their covariances (None: `rig.yaml`
-    beside the project). A target in it is replaced by the project's, if that has one. A FAIL does not replace an earlier
-    calibration: it then goes to `OUT-failed`. Raises InputError for what is wrong with the files, CalibrationError where
-    the spots give no calibration at all; `out` is then as it was.
+    beside the project). A target in it is replaced by the project's, if that has one. A FAIL does not replace an
+    earlier calibration: it then goes to `OUT-failed`. Raises InputError for what is wrong with the files,
+    CalibrationError where the spots give no calibration at all; `out` is then as it was.
     """
     project = load_project(Path(project_path))
     rig_path = Path(rig) if rig is not None else project.path.parent / RIG

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.beam_findings import ARCSEC, direction_sigmas, offset_sigmas
-from calibration.beams import BeamCalibration
+from calibration.beams.beam_findings import ARCSEC, direction_sigmas, offset_sigmas
+from calibration.beams.beams import BeamCalibration
 from calibration.findings import Finding, verdict
 from geometry.arrays import Array, Bools
 from geometry.pose import ypr_sigmas

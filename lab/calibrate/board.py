@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from calibration.boards import Board
+from calibration.boards.kinds import Board
 from lab.calibrate.board_file import board_of, load_board, save_board
 from lab.calibrate.board_page import as_pdf, as_png, as_svg, lay_out
 from lab.errors import InputError

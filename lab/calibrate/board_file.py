@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import pydantic
 
-from calibration.boards import Board, Charuco, Chessboard, CircleGrid, parse
+from calibration.boards.kinds import Board, Charuco, Chessboard, CircleGrid, parse
 from lab.errors import InputError
 from lab.fields import Block, Integer, Positive, Word, a_truth_value, one_of, validated, wrong
 from lab.yaml_text import read_mapping, write_mapping

@@ -10,8 +10,8 @@ from xml.sax.saxutils import escape
 import cv2
 import numpy as np
 
-from calibration.board_drawing import Drawing, Layer, draw
-from calibration.boards import Board
+from calibration.boards.board_drawing import Drawing, Layer, draw
+from calibration.boards.kinds import Board
 from geometry.arrays import Array
 from lab.errors import InputError
 

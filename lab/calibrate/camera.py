@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.boards import Board
-from calibration.corner_table import CornerTable
+from calibration.boards.kinds import Board
 from calibration.findings import Level
-from calibration.intrinsics import FEWEST_VIEWS, IntrinsicsError, IntrinsicsOptions, calibrate_intrinsics
-from calibration.intrinsics_result import Intrinsics
-from calibration.lens_models import LADDER, named
+from calibration.lens.corner_table import CornerTable
+from calibration.lens.intrinsics import FEWEST_VIEWS, IntrinsicsError, IntrinsicsOptions, calibrate_intrinsics
+from calibration.lens.intrinsics_result import Intrinsics
+from calibration.lens.lens_models import LADDER, named
 from geometry.camera import FISHEYE, PERSPECTIVE
 from lab.calibrate.board_file import board_of
 from lab.calibrate.camera_file import CameraCalibration, CameraFile, save_camera

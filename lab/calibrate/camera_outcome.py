@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from calibration.findings import Level
-from calibration.intrinsics_result import Intrinsics
+from calibration.lens.intrinsics_result import Intrinsics
 from lab.calibrate.photos import PhotoSet
 from lab.errors import CalibrationError
 from lab.report.svg import short

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.findings import Level
-from calibration.intrinsics_result import Intrinsics
-from calibration.lens_models import LensModel
+from calibration.lens.intrinsics_result import Intrinsics
+from calibration.lens.lens_models import LensModel
 from geometry.arrays import Array
 from lab.calibrate.camera_file import CameraFile
 from lab.calibrate.camera_outcome import Outcome

@@ -13,9 +13,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from calibration.board_detection import BoardView, NotFound, find_board
-from calibration.board_view import GreyImage
-from calibration.boards import Board
+from calibration.boards.board_detection import BoardView, NotFound, find_board
+from calibration.boards.board_view import GreyImage
+from calibration.boards.kinds import Board
 from lab.errors import CalibrationError, InputError
 from lab.pictures import SUFFIXES, Grey, Missing, checked, decode
 

@@ -16,8 +16,8 @@ from typing import Annotated, Any
 import numpy as np
 import pydantic
 
-from calibration import boards as board_kinds
-from calibration.boards import Board
+from calibration.boards import kinds as board_kinds
+from calibration.boards.kinds import Board
 from geometry.arrays import Array
 from geometry.pose import Pose
 from geometry.rig import Beam, Spot
@@ -100,7 +100,7 @@ class ScreenEntry:
 
     name: str
     size_m: tuple[float, float] | None = None  # extent along x and y, about the origin
-    frame: ScreenFrame | None = None  # None: from the dots' own extent, see calibration/screen_frame.py
+    frame: ScreenFrame | None = None  # None: from the dots' own extent, see calibration/screens/screen_frame.py
     surface_sigma_m: float | None = None  # how far the surface may lie off its shape; None: as the survey shows
     bow: str = "auto"  # of BOW: whether the surface is described as bent
     boards: tuple[FixedBoard, ...] = ()

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calibration.spot_term import SpotPixels
+from calibration.beams.spot_term import SpotPixels
 from geometry.arrays import Array, Ints
 from geometry.pose import Pose
 from geometry.rig import Rig

@@ -9,15 +9,15 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.adjustment import AdjustmentError
-from calibration.beam_findings import BeamGoals, beam_findings
-from calibration.beams import Stand
+from calibration.beams.beam_findings import BeamGoals, beam_findings
+from calibration.beams.beams import Stand
 from calibration.findings import Finding, Level, verdict
-from calibration.joint_findings import RigLimits, joint_findings
-from calibration.network_findings import ScreenLimits
-from calibration.network_findings import findings as network_findings
-from calibration.rig_figures import central_pose, expected_pose, hold_out, spot_sigma
-from calibration.rig_steps import RigSteps, calibrate_in_steps
+from calibration.least_squares.adjustment import AdjustmentError
+from calibration.rig.joint_findings import RigLimits, joint_findings
+from calibration.rig.rig_figures import central_pose, expected_pose, hold_out, spot_sigma
+from calibration.rig.rig_steps import RigSteps, calibrate_in_steps
+from calibration.screens.network_findings import ScreenLimits
+from calibration.screens.network_findings import findings as network_findings
 from geometry.rig import Rig
 from lab.calibrate.project import Project, load_project
 from lab.calibrate.recordings import Recordings, read_recordings
@@ -84,7 +84,7 @@ def _recordings(project: Project, rig: Rig, inputs: ScreenInputs) -> Recordings:
     """The recordings with their positions. Frames of runs are labelled by cameras as they stand after a first look."""
     lab = rig
     if any(r.run is not None for r in project.recordings):
-        from calibration.screens import calibrate
+        from calibration.screens.screens import calibrate
 
         try:
             found = calibrate(inputs.network, inputs.setups, inputs.near, inputs.held_screen).fit.rig

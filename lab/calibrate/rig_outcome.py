@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from calibration.findings import Finding, Level
-from calibration.joint_findings import in_degrees, in_mm
-from calibration.rig_figures import ExpectedPose, HoldOut
-from calibration.rig_steps import RigSteps
+from calibration.rig.joint_findings import in_degrees, in_mm
+from calibration.rig.rig_figures import ExpectedPose, HoldOut
+from calibration.rig.rig_steps import RigSteps
 from lab.errors import CalibrationError
 
 

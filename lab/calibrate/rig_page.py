@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.joint import DOTS, FRAMES, LOST, SPOTS
-from calibration.joint_findings import in_degrees, in_mm
-from calibration.measurement_groups import LEAST_REDUNDANCY
+from calibration.rig.joint import DOTS, FRAMES, LOST, SPOTS
+from calibration.rig.joint_findings import in_degrees, in_mm
+from calibration.rig.measurement_groups import LEAST_REDUNDANCY
 from geometry.arrays import Array, Bools, Ints
 from geometry.pose import ypr_sigmas
 from geometry.rig import Rig

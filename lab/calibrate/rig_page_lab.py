@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from calibration.joint import Joint
-from calibration.rig_stacks import POSES, STAND, lines_in, stacks_of
-from calibration.surveyed import pose_of
+from calibration.rig.joint import Joint
+from calibration.rig.rig_stacks import POSES, STAND, lines_in, stacks_of
+from calibration.screens.surveyed import pose_of
 from geometry.arrays import Array
 from geometry.pose import ypr_sigmas
 from geometry.rig import Rig

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.joint import CORNERS, DOTS, RECORDS, SPOTS, Joint
-from calibration.rig_steps import RigSteps
-from calibration.surveyed import array_of
+from calibration.rig.joint import CORNERS, DOTS, RECORDS, SPOTS, Joint
+from calibration.rig.rig_steps import RigSteps
+from calibration.screens.surveyed import array_of
 from geometry.arrays import Array
 from lab.yaml_text import write_whole
 

@@ -9,14 +9,14 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.adjustment import AdjustmentError
 from calibration.findings import Finding, Level, verdict
-from calibration.network_findings import findings as network_findings
-from calibration.network_findings import near_findings
-from calibration.network_sigmas import pointing_sigmas_m, spot_sigmas
-from calibration.network_start import NotConnectedError
-from calibration.screens import ScreensResult, calibrate
-from calibration.survey_suspects import Suspect, misfit_of, suspects
+from calibration.least_squares.adjustment import AdjustmentError
+from calibration.screens.network_findings import findings as network_findings
+from calibration.screens.network_findings import near_findings
+from calibration.screens.network_sigmas import pointing_sigmas_m, spot_sigmas
+from calibration.screens.network_start import NotConnectedError
+from calibration.screens.screens import ScreensResult, calibrate
+from calibration.screens.survey_suspects import Suspect, misfit_of, suspects
 from geometry.rig import Rig
 from lab.calibrate.project import Project, load_project
 from lab.calibrate.screen_inputs import ScreenInputs, screen_inputs
@@ -29,7 +29,7 @@ from lab.rig_file import RigFile, save_rig
 from lab.whole_folder import beside_a_good_one, whole_folder
 
 SCREENS, RIG = "screens.yaml", "rig.yaml"
-SUSPICIOUS = 4.0  # misfit (see calibration/survey_suspects.py) from which swapped axes and wrong units are looked for
+SUSPICIOUS = 4.0  # misfit (see survey_suspects.py) from which swapped axes and wrong units are looked for
 _CURED = 2.0  # misfit up to which a change to the survey counts as what was wrong
 
 
@@ -71,8 +71,8 @@ def calibrate_screen(project_path: Path, out: Path, today: datetime.date | None 
 
     Writes into `out`: screens.yaml; rig.yaml with the beams as drawn, where the project has a target; residuals.csv,
     dots.csv and report.html. Neither YAML is written where the verdict is FAIL, which does not replace an earlier
-    calibration: it then goes to `OUT-failed`. Raises InputError for what is wrong with the files, CalibrationError where
-    they give no calibration at all; `out` is then as it was.
+    calibration: it then goes to `OUT-failed`. Raises InputError for what is wrong with the files, CalibrationError
+    where they give no calibration at all; `out` is then as it was.
     """
     project = load_project(Path(project_path))
     inputs = screen_inputs(project)

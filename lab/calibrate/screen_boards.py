@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.board_detection import NotFound, find_board
-from calibration.board_on_screen import BoardOnScreenTerm
-from calibration.boards import Board
-from calibration.corners import CornerTerm
+from calibration.boards.board_detection import NotFound, find_board
+from calibration.boards.kinds import Board
+from calibration.lens.corners import CornerTerm
+from calibration.screens.board_on_screen import BoardOnScreenTerm
 from geometry.arrays import Array, Bools, Ints
 from geometry.camera import FISHEYE
 from geometry.rig import Rig

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.clouds import MissingOpen3DError, scan_of
-from calibration.network import Dots, Network, Sightings
-from calibration.priors import Prior
-from calibration.registration import register
-from calibration.rig_stacks import prior_of
-from calibration.screens import Near, Scan, ScreenSetup
-from calibration.survey_suspects import wrong_unit
+from calibration.least_squares.priors import Prior
+from calibration.rig.rig_stacks import prior_of
+from calibration.screens.clouds import MissingOpen3DError, scan_of
+from calibration.screens.network import Dots, Network, Sightings
+from calibration.screens.registration import register
+from calibration.screens.screens import Near, Scan, ScreenSetup
+from calibration.screens.survey_suspects import wrong_unit
 from geometry.arrays import Array, Bools, Ints
 from geometry.pose import Pose
 from geometry.rig import Rig, Screen

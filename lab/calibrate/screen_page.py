@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from calibration.findings import Finding, verdict
-from calibration.network_sigmas import camera_sigmas, pointing_sigmas_m, spot_sigmas
-from calibration.screens import ScreensResult
+from calibration.screens.network_sigmas import camera_sigmas, pointing_sigmas_m, spot_sigmas
+from calibration.screens.screens import ScreensResult
 from geometry.camera import pinhole_numbers
 from lab.calibrate.project import Project
 from lab.calibrate.screen_inputs import ScreenInputs

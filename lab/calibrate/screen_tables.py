@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.screens import ScreensResult
+from calibration.screens.screens import ScreensResult
 
 RESIDUALS, DOTS = "residuals.csv", "dots.csv"
 RESIDUAL_COLUMNS = ("camera", "point", "u_px", "v_px", "residual_u_px", "residual_v_px", "sigmas", "used")

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.spot_term import SpotPixels
+from calibration.beams.spot_term import SpotPixels
 from geometry.arrays import Array, Ints
 from geometry.pose import Pose
 

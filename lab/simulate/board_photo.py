@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.board_drawing import ink_at
-from calibration.boards import Board
+from calibration.boards.board_drawing import ink_at
+from calibration.boards.kinds import Board
 from geometry.arrays import Array, Bools, Ints
 from geometry.camera import Camera
 from geometry.pose import Pose

@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibration.adjustment import solve
-from calibration.corners import single_camera
-from calibration.spot_term import SpotPixels
-from calibration.stacks import Poses, Stack, Vectors
+from calibration.beams.spot_term import SpotPixels
+from calibration.least_squares.adjustment import solve
+from calibration.least_squares.stacks import Poses, Stack, Vectors
+from calibration.lens.corners import single_camera
 from geometry.arrays import Array, Bools, Ints
 from geometry.camera import FISHEYE, Camera, in_picture, pinhole_numbers
 from geometry.lens import padded

@@ -13,7 +13,7 @@ from typing import Any
 
 import cv2
 
-from calibration import boards
+from calibration.boards import kinds as boards
 from geometry.arrays import Array
 from geometry.camera import Camera
 from geometry.pose import Pose

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from calibration.beams import Stand
-from calibration.rig_stacks import lines_in, stacks_of
-from calibration.spot_term import SpotPixels
+from calibration.beams.beams import Stand
+from calibration.beams.spot_term import SpotPixels
+from calibration.rig.rig_stacks import lines_in, stacks_of
 from geometry.pose import Pose
 from geometry.rig import Beam, Rig, Spot
 from geometry.spots import SpotModel

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from calibration.corner_table import CornerTable
+from calibration.lens.corner_table import CornerTable
 from geometry.arrays import Array
 from geometry.rotations import exp
 

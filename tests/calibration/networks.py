@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from calibration.board_on_screen import BoardOnScreenTerm
-from calibration.boards import Charuco
-from calibration.corners import CornerTerm
-from calibration.network import Dots, Network, Sightings
+from calibration.boards.kinds import Charuco
+from calibration.lens.corners import CornerTerm
+from calibration.screens.board_on_screen import BoardOnScreenTerm
+from calibration.screens.network import Dots, Network, Sightings
 from geometry.camera import Camera
 from geometry.pose import Pose
 from geometry.rig import Rig, Screen

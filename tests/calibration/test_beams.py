@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from calibration.adjustment import AdjustmentError
-from calibration.beam_findings import beam_findings, direction_sigmas
-from calibration.beam_start import line_through
-from calibration.beams import Stand, calibrate_beams
+from calibration.beams.beam_findings import beam_findings, direction_sigmas
+from calibration.beams.beam_start import line_through
+from calibration.beams.beams import Stand, calibrate_beams
 from calibration.findings import Level
+from calibration.least_squares.adjustment import AdjustmentError
 from geometry.pose import Pose
 from geometry.rig import Rig
 from geometry.rig_parameters import RigCovariance, moved

@@ -10,9 +10,8 @@ import cv2
 import numpy as np
 import pytest
 
-from calibration import chessboard_detection, circle_detection, corner_refinement
-from calibration.board_detection import BoardView, NotFound, find_board
-from calibration.boards import Board, parse
+from calibration.boards.board_detection import BoardView, NotFound, find_board
+from calibration.boards.kinds import Board, chessboard_detection, circle_detection, corner_refinement, parse
 from geometry import rotations
 from geometry.camera import FISHEYE, PERSPECTIVE, Camera
 from geometry.pose import Pose

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from calibration.board_drawing import draw, ink_at
-from calibration.boards import DICTIONARIES, Charuco, Chessboard, CircleGrid, parse
+from calibration.boards.board_drawing import draw, ink_at
+from calibration.boards.kinds import DICTIONARIES, Charuco, Chessboard, CircleGrid, parse
 
 mm = 1e-3
 TEXTS = [

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from calibration.corners import CornerTerm
-from calibration.stacks import Poses, Vectors
+from calibration.least_squares.stacks import Poses, Vectors
+from calibration.lens.corners import CornerTerm
 from geometry.arrays import numeric_jacobian
 from geometry.pose import Pose
 from geometry.rotations import exp

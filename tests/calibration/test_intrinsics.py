@@ -9,11 +9,11 @@ from functools import cache
 import numpy as np
 import pytest
 
-from calibration.corner_table import CornerTable
 from calibration.findings import Level
-from calibration.intrinsics import IntrinsicsError, IntrinsicsOptions, calibrate_intrinsics
-from calibration.intrinsics_result import Intrinsics
-from calibration.lens_models import LADDER, LensModel, named
+from calibration.lens.corner_table import CornerTable
+from calibration.lens.intrinsics import IntrinsicsError, IntrinsicsOptions, calibrate_intrinsics
+from calibration.lens.intrinsics_result import Intrinsics
+from calibration.lens.lens_models import LADDER, LensModel, named
 from geometry.camera import FISHEYE
 from tests.calibration.lens_scenes import SIZE, TRUTH, WIDE, Scene, board_points, photographs
 

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from bench.rig_calibration import as_measured, bench_figures, calibrated, measured_with, parameter_errors
-from calibration.adjustment import AdjustmentError
-from calibration.corners import CornerTerm
 from calibration.findings import Level
-from calibration.joint import CORNERS, DOTS, FRAMES, LENSES, RECORDS, SPOTS, calibrate_jointly
-from calibration.joint_findings import joint_findings
-from calibration.rig_figures import central_pose, expected_pose, hold_out, spot_sigma
-from calibration.rig_steps import calibrate_in_steps
+from calibration.least_squares.adjustment import AdjustmentError
+from calibration.lens.corners import CornerTerm
+from calibration.rig.joint import CORNERS, DOTS, FRAMES, LENSES, RECORDS, SPOTS, calibrate_jointly
+from calibration.rig.joint_findings import joint_findings
+from calibration.rig.rig_figures import central_pose, expected_pose, hold_out, spot_sigma
+from calibration.rig.rig_steps import calibrate_in_steps
 from geometry.pose import Pose
 from lab.simulate.calibration_campaign import Campaign, Quality, draw_campaign, spots_at
 

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibration.corner_table import CornerTable
-from calibration.lens_fit import robust_fit
-from calibration.lens_start import StartError, start
+from calibration.lens.corner_table import CornerTable
+from calibration.lens.lens_fit import robust_fit
+from calibration.lens.lens_start import StartError, start
 from tests.calibration.lens_scenes import SIZE, TRUTH, WIDE, Scene, board_points, photographs
 
 

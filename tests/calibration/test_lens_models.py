@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibration.hold_out import HeldOut, folds_of
-from calibration.lens_fit import robust_fit
-from calibration.lens_ladder import Rung, choose
-from calibration.lens_models import LADDER, LensModel, folds_in_picture, named
-from calibration.lens_start import start
-from calibration.projection_map import difference, projection_map
+from calibration.lens.hold_out import HeldOut, folds_of
+from calibration.lens.lens_fit import robust_fit
+from calibration.lens.lens_ladder import Rung, choose
+from calibration.lens.lens_models import LADDER, LensModel, folds_in_picture, named
+from calibration.lens.lens_start import start
+from calibration.lens.projection_map import difference, projection_map
 from geometry.arrays import Array
 from geometry.rotations import exp
 from tests.calibration.lens_scenes import SIZE, TRUTH, WIDE, Scene, photographs

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from calibration.adjustment import Linearised, Part, solve
-from calibration.measurement_groups import Unknowns, group_fit, information, shares
-from calibration.stacks import Vectors
+from calibration.least_squares.adjustment import Linearised, Part, solve
+from calibration.least_squares.stacks import Vectors
+from calibration.rig.measurement_groups import Unknowns, group_fit, information, shares
 
 
 class Lines:

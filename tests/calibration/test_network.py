@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from calibration.findings import Level
-from calibration.network import Dots, Sightings
-from calibration.network_findings import findings, misplaced, near_findings
-from calibration.network_sigmas import pointing_sigmas_m, spot_sigmas
-from calibration.network_start import NotConnectedError
-from calibration.screens import Near, ScreenSetup, calibrate
-from calibration.survey_suspects import misfit_of, suspects, wrong_unit
+from calibration.screens.network import Dots, Sightings
+from calibration.screens.network_findings import findings, misplaced, near_findings
+from calibration.screens.network_sigmas import pointing_sigmas_m, spot_sigmas
+from calibration.screens.network_start import NotConnectedError
+from calibration.screens.screens import Near, ScreenSetup, calibrate
+from calibration.screens.survey_suspects import misfit_of, suspects, wrong_unit
 from geometry.pose import Pose
 from geometry.rig import Rig
 from tests.calibration.networks import (

@@ -10,9 +10,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from calibration import expected_errors as module
-from calibration.expected_errors import ExpectedErrors, expected_errors
-from calibration.pose_budget import (
+from calibration.budget import expected_errors as module
+from calibration.budget.expected_errors import ExpectedErrors, expected_errors
+from calibration.budget.pose_budget import (
     BEAM_DIRECTIONS,
     CAMERA_POSES,
     INTRINSICS,

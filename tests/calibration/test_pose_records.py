@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from calibration.pose_records import RecordTerm
-from calibration.stacks import Poses
+from calibration.least_squares.stacks import Poses
+from calibration.rig.pose_records import RecordTerm
 from geometry.arrays import numeric_jacobian
 from geometry.pose import Pose
 

@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 import pytest
 
-from calibration.board_detection import BoardView, find_board
-from calibration.board_on_screen import BoardOnScreenTerm
-from calibration.boards import Chessboard
-from calibration.corners import CornerTerm
-from calibration.network import Dots, Network, Sightings
-from calibration.screens import ScreenSetup, calibrate
+from calibration.boards.board_detection import BoardView, find_board
+from calibration.boards.kinds import Chessboard
+from calibration.lens.corners import CornerTerm
+from calibration.screens.board_on_screen import BoardOnScreenTerm
+from calibration.screens.network import Dots, Network, Sightings
+from calibration.screens.screens import ScreenSetup, calibrate
 from geometry.camera import Camera
 from geometry.pose import Pose
 from geometry.rig import Rig, Screen

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from calibration.adjustment import AdjustmentError
-from calibration.beams import at_feet, calibrate_beams, self_calibrate
-from calibration.body_gauge import BodyGauge
-from calibration.excitation import body_motion, without_frame
-from calibration.rig_stacks import lines_in, stacks_of
-from calibration.stacks import Lines
+from calibration.beams.beams import at_feet, calibrate_beams, self_calibrate
+from calibration.beams.body_gauge import BodyGauge
+from calibration.beams.excitation import body_motion, without_frame
+from calibration.least_squares.adjustment import AdjustmentError
+from calibration.least_squares.stacks import Lines
+from calibration.rig.rig_stacks import lines_in, stacks_of
 from geometry.arrays import numeric_jacobian
 from geometry.pose import Pose
 from geometry.rig import Beam, Rig

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calibration.rig_stacks import named_errors, prior_of, rig_of, stacks_of
-from calibration.spot_term import SpotPixels, SpotTerm
-from calibration.stacks import Poses
+from calibration.beams.spot_term import SpotPixels, SpotTerm
+from calibration.least_squares.stacks import Poses
+from calibration.rig.rig_stacks import named_errors, prior_of, rig_of, stacks_of
 from geometry.arrays import numeric_jacobian
 from geometry.pose import Pose
 from geometry.rig import Rig

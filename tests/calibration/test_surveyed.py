@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calibration.board_on_screen import BoardOnScreenTerm
-from calibration.stacks import Poses, Vectors
-from calibration.surveyed import FrameTerm, PointTerm, SurfaceTerm, SurveyTerm, whitening
+from calibration.least_squares.stacks import Poses, Vectors
+from calibration.screens.board_on_screen import BoardOnScreenTerm
+from calibration.screens.surveyed import FrameTerm, PointTerm, SurfaceTerm, SurveyTerm, whitening
 from geometry.arrays import numeric_jacobian
 from geometry.camera import Camera
 from geometry.pose import Pose

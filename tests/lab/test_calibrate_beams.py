@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from calibration.beams.spot_term import SpotPixels
 from calibration.findings import Level
-from calibration.spot_term import SpotPixels
 from geometry.pose import Pose
 from geometry.rig import Rig
 from geometry.rig_parameters import RigCovariance, rig_names

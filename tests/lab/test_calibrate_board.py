@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 import pytest
 
-from calibration.board_detection import BoardView, find_board
-from calibration.boards import parse
+from calibration.boards.board_detection import BoardView, find_board
+from calibration.boards.kinds import parse
 from lab.calibrate.board import write_board
 from lab.calibrate.board_file import board_of, load_board
 from lab.calibrate.board_page import as_pdf, lay_out

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from calibration.boards import parse
+from calibration.boards.kinds import parse
 from geometry.camera import Camera
 from geometry.pose import Pose
 from lab.calibrate.photos import find_in_photos, load_photos

@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 import pytest
 
-from calibration.board_detection import find_board
-from calibration.boards import Charuco, parse
+from calibration.boards.board_detection import find_board
+from calibration.boards.kinds import Charuco, parse
 from calibration.findings import Level
 from geometry.pose import Pose
 from lab.calibrate.camera_file import CameraFile, load_camera, save_camera

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calibration.boards import Chessboard
+from calibration.boards.kinds import Chessboard
 from lab.calibrate.board_file import save_board
 from lab.calibrate.point_files import read_observations, read_poses, read_survey
 from lab.calibrate.project import load_project, placement_of

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibration.expected_errors import ExpectedErrors
+from calibration.budget.expected_errors import ExpectedErrors
 from calibration.findings import Level
 from geometry.pose import Pose, ypr_sigmas
 from geometry.spots import SpotModel

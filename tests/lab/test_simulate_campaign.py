@@ -121,8 +121,8 @@ def test_every_example_rig_can_be_calibrated_by_its_campaign(rig):
 
 @pytest.mark.slow
 def test_board_photographs_show_the_board_that_the_folder_names(tmp_path, monkeypatch):
-    from calibration import boards
-    from calibration.board_detection import NotFound, find_board
+    from calibration.boards import kinds as boards
+    from calibration.boards.board_detection import NotFound, find_board
     from lab.pictures import read_picture
     from lab.simulate import campaign_files
 

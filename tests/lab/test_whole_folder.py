@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from lab.errors import InputError
-from lab.whole_folder import whole_folder
+from lab.whole_folder import beside_a_good_one, whole_folder
 
 
 def never(folder: Path) -> bool:
@@ -150,3 +150,13 @@ def test_the_old_results_come_back_when_the_last_rename_fails(tmp_path, monkeypa
         replace_it()
     assert names(target) == ["old"]
     assert names(tmp_path) == ["results"]
+
+
+def test_failed_results_go_beside_good_ones_and_anywhere_else_where_asked(tmp_path):
+    good = tmp_path / "left"
+    assert beside_a_good_one(good, True, "camera.yaml") == good
+    good.mkdir()
+    (good / "camera.yaml").write_text("good")
+    assert beside_a_good_one(good, False, "camera.yaml") == good
+    assert beside_a_good_one(good, True, "camera.yaml") == tmp_path / "left-failed"
+    assert beside_a_good_one(good, True, "rig.yaml") == good

@@ -1,0 +1,1 @@
+"""The lasers' lines in the vehicle."""

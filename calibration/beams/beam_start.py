@@ -1,0 +1,146 @@
+"""Where an adjustment of beams may start: lines through spots, poses of a nominal rig, the stand's place."""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from calibration.beams.spot_term import SpotPixels
+from geometry.arrays import Array, Ints, normalised
+from geometry.closed_form import pose_from_lines
+from geometry.planes import meet_plane, screen_to_world
+from geometry.pose import Pose
+from geometry.rig import Beam, Rig
+from geometry.solve import PoseFit, fit_pose
+from geometry.spots import SpotModel
+
+_MOST_FOR_PAIRS = 60  # spots of a beam whose pairs are all tried
+_NEAR_M = 0.02  # m from the line, at least: spots that take part in it
+# Turns of the vehicle to try where nothing is known: the 24 of a cube leave no attitude farther than 63 deg.
+_CUBE = Rotation.create_group("O")
+
+
+def world_points(rig: Rig, spots: SpotPixels) -> Array:
+    """Where on their screens the spots lie, (N, 3), m, in world, by the calibrated cameras; flat screens."""
+    out = np.full((len(spots), 3), np.nan)
+    for v, (camera, spot) in enumerate(rig.views()):
+        rows = spots.view == v
+        if rows.any():
+            screen = rig.screens[rig.spots[spot].screen].world_from_screen
+            origin, direction = rig.cameras[camera].rays(spots.pixels[rows])
+            out[rows] = screen_to_world(meet_plane(np.broadcast_to(origin, direction.shape), direction, screen), screen)
+    return out
+
+
+def beams_through_spots(rig: Rig, spots: SpotPixels, world_from_body: Pose) -> dict[str, Beam]:
+    """Each beam as the line through its spots, brought into the body; beams whose spots give none are left out.
+
+    world_from_body: (P,) of the stand's positions. A line needs two spots at two places along it: at positions of
+    different distance from the screen, or at both ends.
+    """
+    points = world_from_body[spots.position].inverse().apply(world_points(rig, spots))
+    model = SpotModel.of(rig)
+    out = {}
+    for b, name in enumerate(rig.beams):
+        rows = (model.beam_of[spots.view] == b) & np.isfinite(points).all(axis=1)
+        line = line_through(points[rows])
+        if line is not None:
+            point, direction = line
+            foot = point - (point @ direction) * direction
+            # Spots of the end "+" lie ahead of the point, the others behind.
+            ahead = np.sum(model.sign[spots.view[rows]] * ((points[rows] - foot) @ direction))
+            out[name] = Beam(name, direction if ahead >= 0 else -direction, foot)
+    return out
+
+
+def line_through(points: Array) -> tuple[Array, Array] | None:
+    """A point and the direction of the line near most of the points (m, 3); None where they lie in one place.
+
+    The pair of points with the least median distance of the others gives the line; those near it refine it. Up to half
+    of the points may be wrong.
+    """
+    few = points[:: max(1, -(-len(points) // _MOST_FOR_PAIRS))]
+    if len(few) < 2:
+        return None
+    i, j = np.array(list(combinations(range(len(few)), 2))).T
+    direction = few[j] - few[i]
+    long = np.linalg.norm(direction, axis=1) > 1e-3
+    if not long.any():
+        return None
+    i, direction = i[long], normalised(direction[long])
+    away = np.linalg.norm(np.cross(few[None] - few[i][:, None], direction[:, None]), axis=2)
+    middle = np.median(away, axis=1)
+    best = int(np.argmin(middle))
+    far = np.linalg.norm(np.cross(points - few[i[best]], direction[best]), axis=1)
+    near = points[far <= max(3 * float(middle[best]), _NEAR_M)]
+    centre = near.mean(axis=0)
+    return centre, np.linalg.svd(near - centre)[2][0]
+
+
+def body_poses(rig: Rig, spots: SpotPixels, count: int, world_from_body: Pose | None = None) -> list[PoseFit | None]:
+    """world_from_body at each of the stand's `count` positions, fitted with the rig's beams; None where it fails.
+
+    world_from_body: starts (P,), where something is known. Spots are taken as they come; wrong ones spoil their
+    position.
+    """
+    model = SpotModel.of(rig)
+    points = world_points(rig, spots)
+    out: list[PoseFit | None] = []
+    last: Pose | None = None
+    for k in range(count):
+        rows = np.flatnonzero(spots.position == k)
+        here = spots.pick(rows)
+        starts = [] if world_from_body is None else [world_from_body[k]]
+        starts += [p for p in (_of_whole_beams(rig, here, points[rows]), last) if p is not None]
+        fit = _best(model, here, starts)
+        if fit is None or not fit.observable or (last is None and fit.dof > 0 and fit.chi2 > 1e3 * fit.dof):
+            middle = np.mean([s.world_from_screen.translation for s in rig.screens.values()], axis=0)
+            turned = _best(model, here, [Pose(R, middle) for R in _CUBE.as_matrix()])
+            if turned is not None and (fit is None or not fit.observable or turned.chi2 < fit.chi2):
+                fit = turned
+        good = fit is not None and fit.observable
+        out.append(fit if good else None)
+        if fit is not None and good:
+            last = fit.world_from_body
+    return out
+
+
+def stand_of(world_from_body: Pose, stand_from_body: Pose) -> Pose:
+    """world_from_stand that most of the positions (m,) agree on: the one nearest to the others by the median."""
+    each = world_from_body @ stand_from_body.inverse()
+    gaps = np.array([np.linalg.norm(each.minus(each[i]), axis=-1) for i in range(len(each.translation))])
+    return each[int(np.argmin(np.median(gaps, axis=1)))]
+
+
+def _best(model: SpotModel, spots: SpotPixels, starts: list[Pose]) -> PoseFit | None:
+    """The fit of least misfit; two of the same misfit are told apart by nothing here."""
+    if len(spots) < 3:
+        return None
+    fits = [_fit(model, spots.view, spots, s) for s in starts]
+    usable = [f for f in fits if f is not None]
+    return min(usable, key=lambda f: (not f.observable, f.chi2), default=None)
+
+
+def _fit(model: SpotModel, rows: Ints, spots: SpotPixels, start: Pose) -> PoseFit | None:
+    return fit_pose(model, rows, spots.pixels, spots.covariance, start)
+
+
+def _of_whole_beams(rig: Rig, spots: SpotPixels, points: Array) -> Pose | None:
+    """The pose from the beams both of whose ends are seen; None for fewer than two. points (N, 3) in world."""
+    views = rig.views()
+    ends: dict[str, dict[int, Array]] = {}
+    for v, p in zip(spots.view, points, strict=True):
+        spot = rig.spots[views[v][1]]
+        if np.isfinite(p).all():
+            ends.setdefault(spot.beam, {})[spot.sign] = p
+    whole = {b: (e[-1], e[1]) for b, e in ends.items() if len(e) == 2}
+    if len(whole) < 2:
+        return None
+    return pose_from_lines(
+        np.array([rig.beams[b].point for b in whole]),
+        np.array([rig.beams[b].direction for b in whole]),
+        np.array([start for start, _ in whole.values()]),
+        np.array([end - start for start, end in whole.values()]),
+    )

@@ -1,0 +1,297 @@
+"""Each laser's own direction and offset in the vehicle, from spots at known positions of a stand, or from none.
+
+The body frame is the stand's carriage: `stand_from_body` as it was recorded. Where no position is known, only the shape
+of the rig of beams can be found, and the body frame is laid as near as possible to the nominal one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from calibration.beams.beam_figures import Between, OneLine, angles_between, opposed_pairs
+from calibration.beams.beam_start import beams_through_spots, body_poses, stand_of
+from calibration.beams.body_gauge import BodyGauge
+from calibration.beams.excitation import Motion, in_words, without_frame
+from calibration.beams.spot_fit import SpotFit, fit_spots
+from calibration.beams.spot_term import SpotPixels, SpotTerm
+from calibration.least_squares.adjustment import Adjusted, AdjustmentError, At, Cauchy, Term, Values, solve
+from calibration.least_squares.priors import Prior, independent
+from calibration.least_squares.stacks import Lines, Poses
+from calibration.rig.rig_stacks import BEAMS, POSES, STAND, lines_in, named_errors, prior_of, rig_of, stacks_of
+from calibration.screens.surveyed import pose_of
+from geometry.arrays import Array, Bools
+from geometry.pose import Pose
+from geometry.rig import Beam, Rig, Spot
+from geometry.rig_parameters import RigCovariance
+from geometry.spots import SpotModel
+
+_FOR_THE_STAND = 15  # positions from which its place is first guessed
+
+
+@dataclass(frozen=True, slots=True)
+class Stand:
+    """What is known of the stand that carried the vehicle."""
+
+    stand_from_body: Pose  # (P,) as recorded: the carriage, which is the body frame
+    pose_sigmas: Array  # (6,) or (P, 6) of each record: m along the stand's axes, rad about the body's; 0: exact
+    world_from_stand: Pose | None  # None: found from the nominal beams
+    stand_covariance: Array | None  # (6, 6) of the error of world_from_stand; None: solved for, nothing known
+
+
+@dataclass(frozen=True, slots=True)
+class BeamCalibration:
+    """Beams as found, with all that their errors depend on."""
+
+    rig: Rig  # with the beams found, and cameras and screens as the spots moved them within their priors
+    covariance: RigCovariance  # joint: beams, and cameras and screens where they came with errors
+    lines: Lines  # the beams, points nearest to the body's origin
+    lines_covariance: Array  # (4 k, 4 k) of their errors
+    angles: Sequence[Between]
+    one_line: Sequence[OneLine]  # opposed beams, and the two ends of a beam that has both
+    world_from_stand: Pose | None  # None where no position is known
+    stand_covariance: Array | None  # (6, 6)
+    world_from_body: Pose  # (P,) at the positions, as found
+    spots: SpotPixels  # the ones given
+    fit: SpotFit
+    motion: Motion
+    undetermined: Sequence[str]  # empty, or what no spot tells, in words; sigmas are then those of the rest
+    frame_free: int  # undetermined directions that are motions of the body frame: 6 where no position is known
+    dropped: Sequence[int]  # positions with too few spots to find their pose
+
+
+def calibrate_beams(
+    rig: Rig, spots: SpotPixels, stand: Stand, knowledge: RigCovariance | None = None, *, nominal: bool = True
+) -> BeamCalibration:
+    """Beams from spots at recorded positions of a stand.
+
+    rig: cameras and screens as calibrated, beams as drawn (nominal; False: their numbers mean nothing and the start
+    comes from the spots alone). knowledge: joint errors of cameras and screens; None: taken as exact. Raises
+    AdjustmentError where the spots do not agree, or no start is found.
+    """
+    start = _start(rig, spots, stand, nominal)
+    values = {
+        **stacks_of(start[0]),
+        STAND: Poses.of([start[1]]),
+        POSES: Poses(stand.stand_from_body),
+    }
+    others, free = _known(rig, knowledge)
+    free[BEAMS] = True
+    if stand.stand_covariance is None:
+        free[STAND] = True
+    elif np.any(stand.stand_covariance):
+        others.append(Prior(((STAND, 0),), (Poses.of([start[1]]),), stand.stand_covariance))
+        free[STAND] = np.diagonal(stand.stand_covariance)[None] > 0
+    known = Poses(stand.stand_from_body)
+    sigmas = np.broadcast_to(np.asarray(stand.pose_sigmas, dtype=float), (len(known), 6))
+    if np.any(sigmas):
+        others.extend(independent(POSES, known, np.where(sigmas > 0, sigmas, np.inf)))  # exact ones are held fixed
+        free[POSES] = sigmas > 0
+    return _finished(start[0], spots, values, others, free, stand, ())
+
+
+def self_calibrate(
+    rig: Rig, spots: SpotPixels, positions: int, knowledge: RigCovariance | None = None
+) -> BeamCalibration:
+    """The shape of the rig of beams from spots at positions of which nothing is known.
+
+    rig: its beams are the start, and the body frame is laid so that the beams found are, together, as near to them as
+    can be (see BodyGauge; points are compared where either is nearest to the origin): a choice, no measurement.
+    Positions whose pose the spots do not determine are left out. Raises AdjustmentError where fewer than two remain.
+    """
+    fits = body_poses(rig, spots, positions)
+    usable = [k for k, f in enumerate(fits) if f is not None]
+    if len(usable) < 2:
+        raise AdjustmentError(
+            f"the vehicle's pose can be found at {len(usable)} of {positions} positions, two or more are needed: each"
+            " needs spots of two or more beams, and nominal beams to start from"
+        )
+    place = np.full(positions, -1, dtype=np.int64)
+    place[usable] = np.arange(len(usable))
+    used = spots.pick(np.flatnonzero(place[spots.position] >= 0))
+    used = replace(used, position=place[used.position])
+    poses = Poses.of([f.world_from_body for f in fits if f is not None])
+    values = {**stacks_of(rig), STAND: Poses.of([Pose.identity()]), POSES: poses}
+    others, free = _known(rig, knowledge)
+    others.append(BodyGauge(at_feet(lines_in(values))[0]))
+    free |= {BEAMS: True, POSES: True}
+    dropped = [k for k in range(positions) if place[k] < 0]
+    return _finished(rig, used, values, others, free, None, dropped)
+
+
+def _start(rig: Rig, spots: SpotPixels, stand: Stand, nominal: bool) -> tuple[Rig, Pose]:
+    """The rig with beams to start from, and world_from_stand."""
+    world_from_stand = stand.world_from_stand
+    if world_from_stand is None:
+        if not nominal:
+            raise AdjustmentError(
+                "neither the stand's place in the world nor nominal beams are known: give one of the two to start from"
+            )
+        count = len(stand.stand_from_body.translation)
+        few = np.unique(np.linspace(0, count - 1, min(count, _FOR_THE_STAND)).round().astype(np.int64))
+        place = np.full(count, -1, dtype=np.int64)
+        place[few] = np.arange(len(few))
+        there = spots.pick(place[spots.position] >= 0)
+        fits = body_poses(rig, replace(there, position=place[there.position]), len(few))
+        usable = [int(few[i]) for i, f in enumerate(fits) if f is not None]
+        if not usable:
+            raise AdjustmentError(
+                "the stand's place cannot be found: at no position do the spots fit the nominal beams; check the spots'"
+                " labels, or give world_from_stand"
+            )
+        bodies = Poses.of([f.world_from_body for f in fits if f is not None]).pose
+        world_from_stand = stand_of(bodies, stand.stand_from_body[np.array(usable)])
+    found = beams_through_spots(rig, spots, world_from_stand @ stand.stand_from_body)
+    if not nominal:
+        without = [b for b in rig.beams if b not in found]
+        if without:
+            raise AdjustmentError(
+                f"beam {without[0]}: its spots lie in one place of it, so that they give no direction to start from;"
+                " add nominal beams, or positions at which the screen cuts it elsewhere"
+            )
+        return replace(rig, beams={b: found[b] for b in rig.beams}), world_from_stand
+    from_spots = replace(rig, beams={**rig.beams, **found})
+    at = {STAND: Poses.of([world_from_stand]), POSES: Poses(stand.stand_from_body)}
+    costs = [_cost_per_beam(r, spots, at) for r in (rig, from_spots)]
+    better = {
+        b: found[b] if b in found and costs[1][i] < costs[0][i] else rig.beams[b] for i, b in enumerate(rig.beams)
+    }
+    return replace(rig, beams=better), world_from_stand
+
+
+def _cost_per_beam(rig: Rig, spots: SpotPixels, at: dict[str, Poses]) -> Array:
+    """How badly the spots fit, (beams,), wrong ones fading; spots that cannot be predicted count most."""
+    r = SpotTerm(rig, spots).linearise({**stacks_of(rig), **at}).residuals
+    s = np.nan_to_num(np.sum(r**2, axis=1), nan=1e12)
+    return np.bincount(SpotModel.of(rig).beam_of[spots.view], Cauchy().cost(s), len(rig.beams)).astype(float)
+
+
+def _known(rig: Rig, knowledge: RigCovariance | None) -> tuple[list[Term], dict[str, bool | Bools]]:
+    """What is known of cameras and screens, as terms, and what of them is free."""
+    if knowledge is None:
+        return [], {}
+    of_the_lab = np.array([not n.startswith("beams.") for n in knowledge.names], dtype=bool)
+    names = tuple(n for n in knowledge.names if not n.startswith("beams."))
+    prior, free = prior_of(rig, RigCovariance(names, knowledge.matrix[np.ix_(of_the_lab, of_the_lab)]))
+    return ([] if prior is None else [prior]), dict(free)
+
+
+def _finished(
+    rig: Rig,
+    spots: SpotPixels,
+    values: Values,
+    others: list[Term],
+    free: dict[str, bool | Bools],
+    stand: Stand | None,
+    dropped: Sequence[int],
+) -> BeamCalibration:
+    """Adjust, and say how well."""
+    fit = fit_spots(rig, spots, values, others, free)
+    kept = spots.pick(np.flatnonzero(fit.kept))
+    kept = replace(kept, covariance=kept.covariance * fit.scale**2)
+    values = fit.adjusted.values
+    lines, slide = at_feet(lines_in(values))
+    beams: list[At] = [(BEAMS, i) for i in range(len(lines))]
+    asked = beams + ([(STAND, 0)] if STAND in free else [])
+    gauge = [t for t in others if isinstance(t, BodyGauge)]
+    loose = fit.adjusted
+    if gauge:
+        loose = solve(values, [SpotTerm(rig, kept), *(t for t in others if t not in gauge)], free)
+    directions = loose.undetermined(asked)
+    undetermined: list[str] = []
+    if len(directions) > (6 if gauge else 0):
+        world_from_stand = pose_of(values, STAND)[0] if STAND in free else None
+        told = without_frame(directions, lines_in(values)) if gauge else directions
+        undetermined = in_words(told, list(rig.beams), lines_in(values), world_from_stand)
+        at, joint = asked, _of_the_rest(loose, asked)
+    else:
+        at = asked + [(s, i) for s in _of_the_lab(free) for i in range(len(values[s]))]
+        joint = fit.adjusted.covariance(at)
+    for t in gauge:
+        slide = slide @ t.held_exactly(lines_in(values))
+    K = block_diag(slide, np.eye(len(joint) - len(slide)))
+    joint = K @ joint @ K.T
+    values = {**values, BEAMS: lines}
+    in_rig = np.concatenate([np.full(values[s].dof, s != STAND) for s, _ in at])
+    names, T = named_errors(rig, values, [a for a in at if a[0] != STAND])
+    matrix = T @ joint[np.ix_(in_rig, in_rig)] @ T.T
+    of_lines = joint[: len(slide), : len(slide)]
+    poses = pose_of(values, STAND)[0] @ pose_of(values, POSES)
+    one_line = opposed_pairs(list(rig.beams), lines, of_lines) + _ends(rig, kept, values, others, free)
+    named = np.diagonal(matrix) > 0
+    return BeamCalibration(
+        rig=rig_of(rig, values),
+        covariance=RigCovariance(tuple(np.array(names)[named].tolist()), matrix[np.ix_(named, named)]),
+        lines=lines,
+        lines_covariance=of_lines,
+        angles=angles_between(list(rig.beams), lines, of_lines),
+        one_line=one_line,
+        world_from_stand=None if stand is None else pose_of(values, STAND)[0],
+        stand_covariance=None if stand is None else (joint[~in_rig][:, ~in_rig] if STAND in free else np.zeros((6, 6))),
+        world_from_body=poses,
+        spots=spots,
+        fit=fit,
+        motion=Motion.of(poses if stand is None else stand.stand_from_body),
+        undetermined=undetermined,
+        frame_free=len(directions) if gauge else 0,
+        dropped=dropped,
+    )
+
+
+def _of_the_lab(free: dict[str, bool | Bools]) -> list[str]:
+    return [s for s in free if s not in (BEAMS, STAND, POSES)]
+
+
+def at_feet(lines: Lines) -> tuple[Lines, Array]:
+    """The lines with their points nearest to the origin, and what that does to their errors, (4 k, 4 k)."""
+    along = -np.sum(lines.points * lines.directions, axis=1)
+    blocks = []
+    for s in along:
+        block = np.eye(4)
+        block[2:, :2] = s * np.eye(2)  # a point farther along moves with the direction
+        blocks.append(block)
+    return Lines(lines.points + along[:, None] * lines.directions, lines.directions), block_diag(*blocks)
+
+
+def _of_the_rest(adjusted: Adjusted, asked: Sequence[At]) -> Array:
+    """Covariance of the determined part of some unknowns: 0 along the directions that are not."""
+    S = adjusted.reduced_normal(asked)
+    scale = 1.0 / np.sqrt(np.maximum(np.diagonal(S), 1e-300))
+    return np.linalg.pinv(S * np.outer(scale, scale), rcond=1e-8, hermitian=True) * np.outer(scale, scale)
+
+
+def _ends(
+    rig: Rig, spots: SpotPixels, values: Values, others: list[Term], free: dict[str, bool | Bools]
+) -> list[OneLine]:
+    """Whether each beam with spots at both ends is one line: adjusted again with every end as a beam of its own.
+
+    Empty where there are none, or where the ends alone are not determined.
+    """
+    seen = {rig.views()[v][1] for v in spots.view}
+    ends = {(s.beam, s.sign) for n, s in rig.spots.items() if n in seen}
+    both = [b for b in rig.beams if {(b, 1), (b, -1)} <= ends]
+    if not both:
+        return []
+    beams: dict[str, Beam] = {}
+    of_end: dict[tuple[str, int], str] = {}
+    for i, b in enumerate(rig.beams):
+        lines = lines_in(values)
+        for sign in (1, -1) if b in both else (1,):
+            name = f"{b} end {'+' if sign > 0 else '-'}" if b in both else b
+            beams[name] = Beam(name, sign * lines.directions[i], lines.points[i])
+            of_end[b, sign] = name
+    apart = {n: Spot(n, of_end[s.beam, s.sign], 1, s.screen) if s.beam in both else s for n, s in rig.spots.items()}
+    split = replace(rig, beams=beams, spots=apart)
+    its = {**values, BEAMS: stacks_of(split)[BEAMS]}
+    terms = [BodyGauge(at_feet(lines_in(its))[0]) if isinstance(t, BodyGauge) else t for t in others]
+    try:
+        found = solve(its, [SpotTerm(split, spots), *terms], free)
+        covariance = found.covariance([(BEAMS, i) for i in range(len(beams))])
+    except AdjustmentError:
+        return []
+    lines, slide = at_feet(lines_in(found.values))
+    pairs = opposed_pairs(list(beams), lines, slide @ covariance @ slide.T)
+    return [p for p in pairs if any(p.first == of_end[b, 1] and p.second == of_end[b, -1] for b in both)]

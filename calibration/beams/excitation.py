@@ -1,0 +1,140 @@
+"""What a stand's positions tell and what they do not: how they move the vehicle, and names for undetermined directions.
+
+A direction of the unknowns along which nothing changes any spot is an eigenvector of eigenvalue 0 of the information
+matrix. As numbers it says nothing to a person; here it becomes a motion: of the whole target against the stand, or of
+one beam.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from calibration.least_squares.stacks import Lines
+from geometry import rotations
+from geometry.arrays import Array, cross, normalised
+from geometry.pose import Pose
+
+_SHARE = 0.98  # of a direction's length that a motion of the whole target must explain to be called one
+_TURN_RMS = np.deg2rad(2.0)  # about an axis: less does not excite it
+_SHIFT_RMS = 0.02  # m
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """How much a stand's positions differ: root mean square about their mean, along and about its three axes."""
+
+    turns: Array  # (3,) rad, about x, y, z of the stand
+    shifts: Array  # (3,) m, along them
+
+    @staticmethod
+    def of(stand_from_body: Pose) -> Motion:
+        """Of positions (P,)."""
+        shifts = np.sqrt(np.mean((stand_from_body.translation - stand_from_body.translation.mean(axis=0)) ** 2, axis=0))
+        mean = stand_from_body.rotation.mean(axis=0)
+        U, _, V = np.linalg.svd(mean)
+        middle = U @ np.diag([1.0, 1.0, np.linalg.det(U @ V)]) @ V
+        turns = rotations.log(stand_from_body.rotation @ middle.T)
+        return Motion(np.sqrt(np.mean(turns**2, axis=0)), shifts)
+
+    def __str__(self) -> str:
+        turns = ", ".join(f"{a} {np.rad2deg(t):.1f} deg" for a, t in zip("xyz", self.turns, strict=True))
+        shifts = ", ".join(f"{a} {s * 1e3:.0f} mm" for a, s in zip("xyz", self.shifts, strict=True))
+        return f"RMS turns about {turns}; RMS shifts along {shifts}"
+
+    @property
+    def flat(self) -> list[str]:
+        """The axes about which the positions hardly turn."""
+        return [a for a, t in zip("xyz", self.turns, strict=True) if t < _TURN_RMS]
+
+    def cure(self) -> str:
+        """Which positions to add."""
+        if self.flat:
+            return f"add positions turned by 10 deg or more about the stand's {_and(self.flat)}"
+        still = [a for a, s in zip("xyz", self.shifts, strict=True) if s < _SHIFT_RMS]
+        if still:
+            return f"add positions shifted by 100 mm or more along the stand's {_and(still)}"
+        return "add positions that differ more from each other"
+
+
+def body_motion(lines: Lines) -> Array:
+    """What a small motion of the body frame [shift (m), turn (rad)] does to the errors of k lines: (4 k, 6).
+
+    The lines stay in place and the frame moves against them, or the other way round: the sign is of no account here.
+    """
+    G = np.zeros((len(lines), 4, 6))
+    B_t = np.swapaxes(lines.basis, 1, 2)
+    axes = np.eye(3)
+    G[:, :2, 3:] = B_t @ np.swapaxes(cross(axes[None], lines.directions[:, None]), 1, 2)
+    G[:, 2:, :3] = B_t
+    G[:, 2:, 3:] = B_t @ np.swapaxes(cross(axes[None], lines.points[:, None]), 1, 2)
+    return G.reshape(-1, 6)
+
+
+def without_frame(directions: Array, lines: Lines) -> Array:
+    """What is left (m - 6, 4 k) of undetermined directions (m, 4 k) without the motions of the body frame."""
+    frame = np.linalg.qr(body_motion(lines))[0]
+    rest = directions - directions @ frame @ frame.T
+    return np.linalg.svd(rest)[2][: max(len(directions) - 6, 0)]
+
+
+def in_words(directions: Array, beam_names: Sequence[str], lines: Lines, world_from_stand: Pose | None) -> list[str]:
+    """Undetermined directions (m, 4 k) or, with the stand's six at the end, (m, 4 k + 6), each as a motion.
+
+    world_from_stand: None where the stand was not asked for. Pure shifts are told apart from turns.
+    """
+    if not len(directions):
+        return []
+    beams = 4 * len(beam_names)
+    G = body_motion(lines)
+    if world_from_stand is not None and directions.shape[1] > beams:
+        stand = directions[:, beams:]
+        if np.all(np.linalg.norm(stand, axis=1) > 0.05 * np.linalg.norm(directions, axis=1)):
+            shifts = stand[:, :3] @ world_from_stand.rotation
+            return [
+                f"{w}, with all beams the other way" for w in _motions(np.concatenate([shifts, stand[:, 3:]], axis=1))
+            ]
+    motions = np.linalg.lstsq(G, directions[:, :beams].T, rcond=None)[0].T
+    explained = motions @ G.T
+    rigid = np.linalg.norm(explained, axis=1) > _SHARE * np.linalg.norm(directions[:, :beams], axis=1)
+    out = [f"all beams together: {w}" for w in _motions(motions[rigid])] if rigid.any() else []
+    for direction in directions[~rigid]:
+        each = direction[:beams].reshape(-1, 4)
+        size = np.linalg.norm(each, axis=1)
+        most = 0.2 * float(np.max(size))
+        told = [f"beam {n}: {_of_beam(e)}" for n, e, s in zip(beam_names, each, size, strict=True) if s > most]
+        out.append("; ".join(told))
+    return out
+
+
+def _motions(motions: Array) -> list[str]:
+    """Shifts and turns (m, 6) as words, recombined so that as few as possible are turns."""
+    out = []
+    for row in np.linalg.svd(motions[:, 3:], full_matrices=True)[0].T @ motions:
+        is_turn = np.linalg.norm(row[3:]) > 1e-3 * np.linalg.norm(row)
+        out.append(f"a turn about {_axis(row[3:])}" if is_turn else f"a shift along {_axis(row[:3])}")
+    return sorted(set(out))
+
+
+def _axis(vector: Array) -> str:
+    u = normalised(vector)
+    k = int(np.argmax(np.abs(u)))
+    if abs(u[k]) > 0.98:
+        return "xyz"[k]
+    u = -u if u[k] < 0 else u
+    return f"({u[0]:.2f}, {u[1]:.2f}, {u[2]:.2f})"
+
+
+def _of_beam(four: Array) -> str:
+    turn, shift = np.linalg.norm(four[:2]), np.linalg.norm(four[2:])
+    if shift < 0.02 * turn:
+        return "its direction"
+    if turn < 0.02 * shift:
+        return "its offset"
+    return "direction and offset, one against the other"
+
+
+def _and(words: Sequence[str]) -> str:
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"

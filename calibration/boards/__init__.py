@@ -1,0 +1,1 @@
+"""Calibration boards: what they are, and how they are drawn and found."""

@@ -1,0 +1,140 @@
+"""What is ink on a board and what is paper: as shapes for a printer, and as a shade at any point.
+
+Drawings have their own frame: the top left corner of the printed area, x right, y down, m. `Drawing.first_point` says
+where the board's frame begins in it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from calibration.boards.kinds import DICTIONARIES, Board, Charuco, CircleGrid
+from geometry.arrays import Array, Bools, Ints
+
+
+@dataclass(frozen=True, slots=True)
+class Layer:
+    """Shapes of one shade, painted over the layers before. Shapes of one layer may touch: paint them as ONE path.
+
+    Squares painted one by one leave hair lines between them in most programs that show a PDF.
+    """
+
+    dark: bool
+    rectangles: Array  # (n, 4), m: left, top, width, height
+    circles: Array  # (n, 3), m: centre x, y, radius
+
+
+@dataclass(frozen=True, slots=True)
+class Drawing:
+    """A board as layers from the bottom up, on white paper."""
+
+    size_m: tuple[float, float]  # width, height of the printed area
+    first_point: Array  # (2,), m: the origin of the board's frame
+    layers: tuple[Layer, ...]
+
+
+def draw(board: Board) -> Drawing:
+    """The shapes of a board, at their size in the world."""
+    none = np.empty((0, 4))
+    if isinstance(board, CircleGrid):
+        start = np.full(2, board.diameter_m / 2)
+        circles = np.column_stack([board.points[:, :2] + start, np.full(len(board.ids), board.diameter_m / 2)])
+        return Drawing(board.size_m, start, (Layer(True, none, circles),))
+    s, (columns, rows) = board.square_m, squares(board)
+    start = np.array([s, s])
+    j, i = np.meshgrid(np.arange(columns), np.arange(rows))
+    dark = is_dark_square(board, j, i)
+    ink = ~dark if isinstance(board, Charuco) and board.inverted else dark
+    layers = [Layer(True, _cells(j[ink], i[ink], s, np.zeros(2)), np.empty((0, 3)))]
+    if isinstance(board, Charuco):
+        markers, cells = _marker_cells(board, j[~dark], i[~dark])
+        layers.append(Layer(not board.inverted, markers, np.empty((0, 3))))
+        layers.append(Layer(board.inverted, cells, np.empty((0, 3))))
+    return Drawing(board.size_m, start, tuple(layers))
+
+
+def squares(board: Board) -> tuple[int, int]:
+    """Columns and rows of squares of a chessboard or ChArUco board."""
+    if isinstance(board, Charuco):
+        return board.columns, board.rows
+    return board.columns + 1, board.rows + 1
+
+
+def is_dark_square(board: Board, column: Ints, row: Ints) -> Bools:
+    """Whether squares (...), counted from the outer top left one, are dark (before inversion)."""
+    light_first = isinstance(board, Charuco) and board.light_first
+    return (column + row + light_first) % 2 == 0
+
+
+def marker_bits(dictionary: str, number: int) -> Bools:
+    """The cells (n + 2, n + 2) of a marker with its border: True where it is black."""
+    known = cv2.aruco.getPredefinedDictionary(DICTIONARIES[dictionary])
+    return np.asarray(cv2.aruco.generateImageMarker(known, number, int(known.markerSize) + 2)) < 128
+
+
+def ink_at(board: Board, xy: Array) -> Array:
+    """How dark a board is at points (..., 2), m, of its frame: 1 ink, 0 paper; paper outside the printed area."""
+    if isinstance(board, CircleGrid):
+        return _circle_ink(board, xy)
+    s, (columns, rows) = board.square_m, squares(board)
+    place = xy / s + 1.0
+    square = np.floor(np.where(np.isfinite(place), place, -1.0)).astype(np.int64)
+    j, i = square[..., 0], square[..., 1]
+    on_board = (j >= 0) & (i >= 0) & (j < columns) & (i < rows)
+    ink = is_dark_square(board, j, i) & on_board
+    if isinstance(board, Charuco):
+        ink |= _marker_ink(board, place, j, i, on_board & ~ink)
+        if board.inverted:
+            ink = on_board & ~ink
+    return ink.astype(float)
+
+
+def _circle_ink(board: CircleGrid, xy: Array) -> Array:
+    """The nearest centre is one of the rows on either side; within a row, the nearest column."""
+    x, y = np.nan_to_num(xy[..., 0], nan=-1e9), np.nan_to_num(xy[..., 1], nan=-1e9)
+    ink = np.zeros(x.shape, dtype=bool)
+    pitch = board.spacing_m * (2 if board.asymmetric else 1)
+    for side in (0, 1):
+        i = np.clip(np.floor(y / board.spacing_m) + side, 0, board.rows - 1)
+        shift = (i % 2) * board.spacing_m if board.asymmetric else 0.0
+        j = np.clip(np.round((x - shift) / pitch), 0, board.columns - 1)
+        ink |= np.hypot(x - j * pitch - shift, y - i * board.spacing_m) < board.diameter_m / 2
+    return ink.astype(float)
+
+
+def _marker_ink(board: Charuco, place: Array, j: Ints, i: Ints, light: Bools) -> Bools:
+    numbers = np.full((board.rows, board.columns), -1)
+    jj, ii = np.meshgrid(np.arange(board.columns), np.arange(board.rows))
+    numbers[~is_dark_square(board, jj, ii)] = np.arange(board.markers)
+    bits = np.stack([marker_bits(board.dictionary, k) for k in range(board.markers)])
+    cells = bits.shape[-1]
+    share = board.marker_m / board.square_m
+    out = np.zeros(j.shape, dtype=bool)
+    within = (place[light] - np.stack([j[light], i[light]], axis=-1) - (1 - share) / 2) / share * cells
+    cell = np.floor(within).astype(np.int64)
+    inside = np.all((cell >= 0) & (cell < cells), axis=-1)
+    cell = np.clip(cell, 0, cells - 1)
+    number = numbers[i[light], j[light]]
+    out[light] = inside & bits[number, cell[..., 1], cell[..., 0]]
+    return out
+
+
+def _cells(j: Ints, i: Ints, step: float, start: Array) -> Array:
+    side = np.full(len(j), step)
+    return np.column_stack([start[0] + j * step, start[1] + i * step, side, side])
+
+
+def _marker_cells(board: Charuco, j: Ints, i: Ints) -> tuple[Array, Array]:
+    """Whole markers in black, and what is white within them. OpenCV numbers markers row by row, as here."""
+    margin = (board.square_m - board.marker_m) / 2
+    corners = np.column_stack([j, i]) * board.square_m + margin
+    black = np.column_stack([corners, np.full((len(j), 2), board.marker_m)])
+    white = []
+    for number, corner in enumerate(corners):
+        bits = marker_bits(board.dictionary, number)
+        y, x = np.nonzero(~bits)
+        white.append(_cells(x, y, board.marker_m / len(bits), corner))
+    return black, np.concatenate(white)

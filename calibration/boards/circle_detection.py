@@ -1,0 +1,345 @@
+"""Grids of circles in pictures: ellipse centres, corrected for what perspective does to them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy.spatial import cKDTree
+
+from calibration.boards import corner_refinement
+from calibration.boards.board_view import BLUR_LIMIT, BoardView, GreyImage, NotFound, low_contrast, too_blurred
+from calibration.boards.chessboard_detection import upright
+from calibration.boards.kinds import CircleGrid
+from calibration.boards.smaller_pictures import at_full_size, scaled, scales
+from geometry.arrays import Array
+
+_BIG_DOT = 1.35  # area of a corner's circle over what its neighbours have, from which it marks the origin
+_STRAY = 100  # blobs beside three times the board's: among thousands OpenCV searches for many minutes
+_LATTICE = 0.25  # share of blobs that must lie as in a lattice: a board among twice as many strays still does
+_INK = 0.5  # diameter over distance of neighbours where no blob tells it
+_FIT_PX = 0.08  # of the spacing: how well a grid must follow a homography (strong lenses bend it by less than that)
+
+
+@dataclass(frozen=True, slots=True)
+class Ellipses:
+    """Fitted images of circles; nan where no ellipse fits."""
+
+    centres: Array  # (n, 2), px
+    areas: Array  # (n,), px^2
+    slopes: Array  # (n,), DN/px: the steepest
+    contrasts: Array  # (n,), DN
+
+
+def find_circles(image: GreyImage, board: CircleGrid) -> BoardView | NotFound:
+    """All centres of a grid of circles, or the reason why they cannot be had."""
+    blobs = np.empty((0, 3))
+    for scale in scales(image):
+        for light in (False, True):
+            small = scaled(image, scale)
+            found = _grid(small if not light else 255 - small, board)
+            if found is not None:
+                return _measured(image if not light else 255 - image, at_full_size(found, scale), board, light)
+        if scale == 1.0:
+            blobs = _blobs(image)
+    return _why_not(image, board, blobs)
+
+
+def _detector(image: GreyImage) -> cv2.SimpleBlobDetector:
+    """Dark blobs, round to within a tilt of 75 deg, from 3 px across to a quarter of the picture."""
+    p = cv2.SimpleBlobDetector.Params()
+    p.filterByColor, p.blobColor = True, 0
+    p.filterByArea, p.minArea, p.maxArea = True, 7.0, image.size / 16
+    p.filterByCircularity = False  # a tilted circle is none
+    p.filterByInertia, p.minInertiaRatio = True, 0.05
+    p.filterByConvexity, p.minConvexity = True, 0.8
+    p.minDistBetweenBlobs = 3.0
+    p.minThreshold, p.maxThreshold, p.thresholdStep = 10.0, 245.0, 10.0
+    p.minRepeatability = 2
+    return cv2.SimpleBlobDetector.create(p)
+
+
+def _blobs(image: GreyImage) -> Array:
+    """Centres and diameters (n, 3), px."""
+    return np.array([[*k.pt, k.size] for k in _detector(image).detect(image)]).reshape(-1, 3)
+
+
+def _grid(image: GreyImage, board: CircleGrid, size: tuple[int, int] | None = None) -> Array | None:
+    """Rough centres (rows, columns, 2), px, in OpenCV's order, or None."""
+    columns, rows = size or (board.columns, board.rows)
+    blobs = _blobs(image)
+    if not columns * rows <= len(blobs) <= 3 * columns * rows + _STRAY or _lattice_share(blobs) < _LATTICE:
+        return None
+    kind = cv2.CALIB_CB_ASYMMETRIC_GRID if board.asymmetric else cv2.CALIB_CB_SYMMETRIC_GRID
+    for how in (0, cv2.CALIB_CB_CLUSTERING):
+        found, centres = cv2.findCirclesGrid(image, (columns, rows), flags=kind | how, blobDetector=_detector(image))
+        if found and centres is not None and centres.size == 2 * columns * rows:
+            return np.asarray(centres, dtype=float).reshape(rows, columns, 2)
+    return None
+
+
+def _lattice_share(blobs: Array) -> float:
+    """Share of blobs (n, 3) that have another one opposite to their nearest neighbour, as points of a lattice have.
+
+    About 0.1 for blobs at random, in which OpenCV's search for a grid does not end; 0.7 and more for boards alone.
+    """
+    if len(blobs) < 3:
+        return 0.0
+    tree = cKDTree(blobs[:, :2])
+    distance, index = (np.asarray(found)[:, 1] for found in tree.query(blobs[:, :2], k=2))
+    opposite = 2 * blobs[:, :2] - blobs[index.astype(int), :2]
+    return float(np.mean(np.asarray(tree.query(opposite)[0]) < 0.25 * distance))
+
+
+def _measured(image: GreyImage, grid: Array, board: CircleGrid, light: bool) -> BoardView | NotFound:
+    ordered = _ordered(grid, board)
+    if isinstance(ordered, NotFound):
+        return ordered
+    blobs = _blobs(image)
+    more = _goes_on(ordered, board, blobs)
+    if more:
+        return NotFound(
+            f"the grid goes on {more} beyond {board.columns}x{board.rows} circles; count again (circles in a row, rows)"
+        )
+    ellipses = fit_ellipses(image, ordered.reshape(-1, 2), _radii(ordered, board, blobs))
+    lost = np.isnan(ellipses.areas)
+    if lost.any():
+        return NotFound(f"{lost.sum()} of {len(lost)} circles have no clean outline: hidden, in glare or blurred")
+    turned = _by_big_dot(ordered, ellipses.areas, board)
+    if turned is not None:
+        ordered = turned
+        ellipses = fit_ellipses(image, ordered.reshape(-1, 2), _radii(ordered, board, blobs))
+    centres = ellipses.centres - perspective_shift(ellipses, board)
+    contrast = float(np.median(ellipses.contrasts))
+    sigma = np.median(ellipses.contrasts / ellipses.slopes) / np.sqrt(2 * np.pi)
+    blur = float(sigma)
+    apart = corner_refinement.spacing(centres.reshape(ordered.shape))
+    if blur > BLUR_LIMIT * apart:
+        return too_blurred(blur, apart)
+    notes = ("light circles on a dark ground",) if light else ()
+    return BoardView(board.ids, centres, apart, blur, contrast, notes)
+
+
+def _radii(grid: Array, board: CircleGrid, blobs: Array) -> Array:
+    """Radii (n,), px, at rough centres (rows, columns, 2) from the blobs (m, 3) there.
+
+    All circles of a board are alike, so that one radius serves them all; only a blob that is markedly larger keeps its
+    own: the dot that marks an origin. Single blobs can be far too small where the ink is lighter within.
+    """
+    centres = grid.reshape(-1, 2)
+    H = homography(board.points[:, :2], centres)
+    enlarged = np.sqrt(np.abs(_jacobian_determinants(H, board.points[:, :2])))
+    nearest = enlarged * board.neighbours_m
+    radii = nearest * _INK / 2
+    if len(blobs):
+        distance = np.linalg.norm(centres[:, None] - blobs[None, :, :2], axis=-1)
+        best = distance.argmin(axis=1)
+        hit = distance[np.arange(len(centres)), best] < nearest / 3
+        if hit.any():
+            own = blobs[best, 2] / 2
+            radii = enlarged * float(np.median(own[hit] / enlarged[hit]))
+            radii = np.where(hit & (own > 1.3 * radii), own, radii)
+    return np.clip(radii, 1.5, 0.6 * nearest)
+
+
+def fit_ellipses(image: GreyImage, centres: Array, radii: Array) -> Ellipses:
+    """The ellipse around each rough centre (n, 2) of a dark circle of about this radius (n,), px.
+
+    Every pixel on the outline gives a tangent l = (g_x, g_y, -g . p) by its gradient g; the tangents of an ellipse
+    satisfy l^T D l = 0 with its dual conic D, which is solved for by least squares with the weight |g|^2. A blur alike
+    in all directions does not move the centre. Source: Ouellet and Hebert (2009), "Precise ellipse estimation without
+    contour point extraction", Machine Vision and Applications 21.
+    """
+    out = np.full((len(centres), 5), np.nan)
+    smooth = np.asarray(cv2.GaussianBlur(image.astype(np.float64), (0, 0), 0.7), dtype=float)
+    gx, gy = (np.asarray(cv2.Scharr(smooth, cv2.CV_64F, *d) / 32, dtype=float) for d in ((1, 0), (0, 1)))
+    height, width = image.shape
+    for n, (centre, radius) in enumerate(zip(centres, radii, strict=True)):
+        for _ in range(2):  # the second time about the first fit's centre
+            reach = 1.5 * radius + 1.5
+            first = np.maximum(np.floor(centre - reach), 0).astype(int)
+            last = np.minimum(np.ceil(centre + reach), [width - 1, height - 1]).astype(int)
+            if np.any(last - first < radius):
+                break
+            piece = np.s_[first[1] : last[1] + 1, first[0] : last[0] + 1]
+            fit = _ellipse(gx[piece], gy[piece], smooth[piece], centre - first, reach)
+            if fit is None or np.linalg.norm(fit[:2] + first - centre) > 0.7 * radius + 1:
+                out[n] = np.nan
+                break
+            out[n] = [*(fit[:2] + first), *fit[2:]]
+            centre = out[n, :2]
+    return Ellipses(out[:, :2], out[:, 2], out[:, 3], out[:, 4])
+
+
+def _ellipse(gx: Array, gy: Array, grey: Array, centre: Array, reach: float) -> Array | None:
+    """Centre x, y, area, steepest slope, contrast (5,) in a patch; None if it is no ellipse."""
+    v, u = np.indices(gx.shape)
+    x, y = u - centre[0], v - centre[1]
+    strength = np.hypot(gx, gy)
+    # Only slopes that rise outwards, as those of a dark circle do; a neighbour's do not.
+    edge = (gx * x + gy * y > 0) & (strength > 0.2 * strength.max())
+    edge &= np.hypot(x, y) < reach
+    if edge.sum() < 8:
+        return None
+    a, b = gx[edge], gy[edge]
+    c = -(a * x[edge] + b * y[edge])
+    # D = [[A, B/2, D/2], [B/2, C, E/2], [D/2, E/2, 1]], |l| = |g| already weighs each row by |g|^2.
+    rows = np.column_stack([a * a, a * b, b * b, a * c, b * c])
+    (A, B, C, D, E), *_ = np.linalg.lstsq(rows, -c * c, rcond=None)
+    place = np.array([D / 2, E / 2])
+    # With the centre taken off, D's upper block is -1 times the ellipse's shape matrix.
+    shape = np.outer(place, place) - np.array([[A, B / 2], [B / 2, C]])
+    det = np.linalg.det(shape)
+    if not (det > 0 and np.trace(shape) > 0):
+        return None
+    inside = np.hypot(x - place[0], y - place[1]) < 1.2
+    outside = np.hypot(x, y) > 0.85 * reach
+    contrast = float(np.median(grey[outside]) - np.min(grey[inside])) if inside.any() and outside.any() else np.nan
+    return np.array([*(place + centre), np.pi * np.sqrt(det), float(np.percentile(strength[edge], 90)), contrast])
+
+
+def perspective_shift(ellipses: Ellipses, board: CircleGrid) -> Array:
+    """How far (n, 2), px, the centre of each ellipse lies from the image of its circle's centre.
+
+    The dual conic of a circle, moved by the homography H of the board, is H D H^T; its centre is the ellipse's, and
+    H c the circle's. The radius is the one that gives the areas measured. A lens' own bend over one circle, which adds
+    a few thousandths of a pixel, is not taken off.
+    """
+    H = homography(board.points[:, :2], ellipses.centres)
+    shares = _jacobian_determinants(H, board.points[:, :2])
+    r2 = float(np.median(ellipses.areas / np.abs(shares))) / np.pi
+    x, y = board.points[:, 0], board.points[:, 1]
+    one = np.ones(len(x))
+    dual = np.empty((len(x), 3, 3))
+    dual[:, 0, 0], dual[:, 1, 1], dual[:, 2, 2] = x * x - r2, y * y - r2, one
+    dual[:, 0, 1] = dual[:, 1, 0] = x * y
+    dual[:, 0, 2] = dual[:, 2, 0] = x
+    dual[:, 1, 2] = dual[:, 2, 1] = y
+    moved = H @ dual @ H.T
+    return moved[:, :2, 2] / moved[:, 2:, 2] - mapped(H, board.points[:, :2])
+
+
+def homography(from_xy: Array, to_xy: Array) -> Array:
+    """H (3, 3) with to = H from, least squares over points (n, 2). Raises ValueError if there is none."""
+    scale = 1.0 / max(float(np.ptp(from_xy)), 1e-12)
+    H, _ = cv2.findHomography(from_xy * scale, to_xy, 0)
+    if H is None:
+        raise ValueError("these points have no homography")
+    return np.asarray(H, dtype=float) @ np.diag([scale, scale, 1.0])
+
+
+def mapped(H: Array, xy: Array) -> Array:
+    """H applied to points (..., 2)."""
+    p = xy @ H[:, :2].T + H[:, 2]
+    return p[..., :2] / p[..., 2:]
+
+
+def _jacobian_determinants(H: Array, xy: Array) -> Array:
+    """By how much H enlarges areas at points (n, 2): det H / w^3."""
+    w = xy @ H[2, :2] + H[2, 2]
+    return np.linalg.det(H) / w**3
+
+
+def _ordered(grid: Array, board: CircleGrid) -> Array | NotFound:
+    """The grid in the board's order: as it fits, not mirrored, rows to the right where several orders fit."""
+    ways = [grid, grid[::-1], grid[:, ::-1], grid[::-1, ::-1]]
+    if board.asymmetric and board.rows % 2 == 0:
+        # OpenCV gives the two rows of each pair in the wrong order where the rows are even.
+        paired = grid.reshape(board.rows // 2, 2, board.columns, 2)[:, ::-1].reshape(grid.shape)
+        ways += [paired, paired[::-1], paired[:, ::-1], paired[::-1, ::-1]]
+    if board.columns == board.rows and not board.asymmetric:
+        ways += [np.swapaxes(way, 0, 1) for way in ways]
+    fitting: list[Array] = []
+    mirrored: list[Array] = []
+    limit = _FIT_PX * corner_refinement.spacing(grid) + 1.0
+    for way in ways:
+        H = homography(board.points[:, :2], way.reshape(-1, 2))
+        residual = mapped(H, board.points[:, :2]) - way.reshape(-1, 2)
+        if np.sqrt(np.mean(np.sum(residual**2, axis=1))) < limit:
+            turns = _jacobian_determinants(H, board.middle[None, :2])[0]
+            (fitting if turns > 0 else mirrored).append(way)
+    if fitting:
+        return upright(fitting)
+    if mirrored:
+        return NotFound("the board is seen as in a mirror: switch off the mirroring of the camera or its software")
+    return NotFound("circles are there, but do not lie as on this board; check circles or acircles, columns and rows")
+
+
+def _goes_on(grid: Array, board: CircleGrid, blobs: Array) -> str:
+    """On which side more circles of the pattern follow: 'above', ...; empty where the grid ends."""
+    if len(blobs) == 0:
+        return ""
+    step = 2 if board.asymmetric else 1  # rows of the same kind
+    sides = {
+        "above": 2 * grid[0] - grid[step] if board.rows > step else grid[:0, 0],
+        "below": 2 * grid[-1] - grid[-1 - step] if board.rows > step else grid[:0, 0],
+        "to the left": 2 * grid[:, 0] - grid[:, 1],
+        "to the right": 2 * grid[:, -1] - grid[:, -2],
+    }
+    if board.asymmetric:  # the row next to the last one, not the next of its kind
+        sides["above"], sides["below"] = grid[1] + grid[0] - grid[2], grid[-2] + grid[-1] - grid[-3]
+    limit = 0.25 * corner_refinement.spacing(grid)
+    names = []
+    for side, outside in sides.items():
+        distance = np.linalg.norm(outside[:, None] - blobs[None, :, :2], axis=-1).min(axis=1)
+        if np.mean(distance < limit) > 0.7:
+            names.append(side)
+    return " and ".join(names)
+
+
+def _by_big_dot(grid: Array, areas: Array, board: CircleGrid) -> Array | None:
+    """The grid turned so that a markedly larger corner circle comes first; None where there is no such circle.
+
+    On boards with unlike sides a large dot that only a mirror could bring to the first place comes last in the first
+    row.
+    """
+    if board.asymmetric:
+        return None
+    H = homography(board.points[:, :2], grid.reshape(-1, 2))
+    size = (areas / _jacobian_determinants(H, board.points[:, :2])).reshape(grid.shape[:2])
+    size = size / np.median(size)
+    corners = {(0, 0): size[0, 0], (0, -1): size[0, -1], (-1, 0): size[-1, 0], (-1, -1): size[-1, -1]}
+    big = [where for where, share in corners.items() if share > _BIG_DOT]
+    if len(big) != 1:
+        return None
+    dot = grid[big[0]]
+    ways = [grid, grid[::-1, ::-1]]
+    if board.columns == board.rows:
+        ways += [np.swapaxes(grid[::-1], 0, 1), np.swapaxes(grid[:, ::-1], 0, 1)]
+    first = [way for way in ways if np.array_equal(way[0, 0], dot)]
+    return first[0] if first else next(way for way in ways if np.array_equal(way[0, -1], dot))
+
+
+def _why_not(image: GreyImage, board: CircleGrid, blobs: Array) -> NotFound:
+    pale = low_contrast(image)
+    if pale is not None:
+        return pale
+    wanted = board.columns * board.rows
+    if len(blobs) > 3 * wanted + _STRAY or (len(blobs) >= wanted and _lattice_share(blobs) < _LATTICE):
+        return NotFound(
+            f"no grid of circles: {len(blobs)} round dark blobs lie about without order; the board must lie wholly in"
+            " the picture, before a plain ground"
+        )
+    other = CircleGrid(board.columns, board.rows, board.spacing_m, not board.asymmetric)
+    if _grid(image, other) is not None:
+        return NotFound(
+            f"the circles lie {'in shifted rows' if other.asymmetric else 'in straight columns'}: write {other.kind}"
+            f" instead of {board.kind}"
+        )
+    for count in range(len(blobs), max(len(blobs) - 3, 8), -1):
+        for columns in range(3, count // 3 + 1):
+            if count % columns == 0 and _grid(image, board, (columns, count // columns)) is not None:
+                wide, high = sorted((columns, count // columns), reverse=board.columns >= board.rows)
+                return NotFound(
+                    f"a grid of {wide}x{high} circles, not {board.columns}x{board.rows}: part of the"
+                    " board is outside the picture, or count again (circles in a row, then rows)"
+                )
+    if len(blobs) < 0.5 * wanted:
+        return NotFound(
+            f"no grid of circles: {len(blobs)} round dark blobs of {wanted}; the board must lie wholly in the picture"
+        )
+    return NotFound(
+        f"no {board.columns}x{board.rows} grid among {len(blobs)} round dark blobs: a circle is hidden, in glare or"
+        " outside the picture, or the numbers of columns and rows are others"
+    )

@@ -1,0 +1,1 @@
+"""What errors to expect before a rig is built."""

@@ -1,0 +1,1 @@
+"""The sparse least-squares engine of all calibrations."""

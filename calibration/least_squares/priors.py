@@ -1,0 +1,71 @@
+"""What is known of unknowns before the measurements: surveys, data sheets, earlier calibrations."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from calibration.least_squares.adjustment import At, Linearised, Loss, Part, Values
+from calibration.least_squares.stacks import Poses, Stack
+from geometry import rotations
+from geometry.arrays import Array
+
+
+@dataclass(frozen=True, slots=True)
+class Prior:
+    """Values with a joint covariance of their errors, over any unknowns of any stacks.
+
+    Numbers of infinite variance (on the diagonal) are not known and give no residual; nor do directions of zero
+    variance, which the caller holds fixed.
+    """
+
+    at: tuple[At, ...]
+    values: tuple[Stack, ...]  # of one unknown each
+    covariance: Array  # (p, p) of the errors, stacked in that order
+    loss: Loss | None = None
+    _root: Array = field(init=False)  # (m, p): whitens
+
+    def __post_init__(self) -> None:
+        sizes = sum(v.dof for v in self.values)
+        if self.covariance.shape != (sizes, sizes):
+            raise ValueError(f"a prior of {sizes} numbers has a covariance of shape {self.covariance.shape}")
+        known = np.flatnonzero(np.isfinite(np.diagonal(self.covariance)))
+        finite = self.covariance[np.ix_(known, known)]
+        spread = np.sqrt(np.maximum(np.diagonal(finite), 0.0))
+        unit = np.where(spread > 0, spread, 1.0)
+        eigenvalues, vectors = np.linalg.eigh(finite / np.outer(unit, unit))
+        real = eigenvalues > 1e-12
+        root = np.zeros((int(real.sum()), sizes))
+        root[:, known] = (vectors[:, real] / np.sqrt(eigenvalues[real])).T / unit
+        object.__setattr__(self, "_root", root)
+
+    def linearise(self, values: Values) -> Linearised:
+        """One residual of m numbers."""
+        away, parts, start = [], [], 0
+        for (stack, element), known in zip(self.at, self.values, strict=True):
+            one = np.array([element])
+            delta = values[stack].pick(one).minus(known)[0]
+            away.append(delta)
+            J = self._root[:, start : start + known.dof] @ _slope(known, delta)
+            parts.append(Part(stack, one, J[None]))
+            start += known.dof
+        return Linearised((self._root @ np.concatenate(away))[None], parts)
+
+
+def _slope(known: Stack, delta: Array) -> Array:
+    """d(value.minus(known)) / d(error of value), (dof, dof)."""
+    J = np.eye(known.dof)
+    if isinstance(known, Poses):
+        J[3:, 3:] = np.linalg.inv(rotations.right_jacobian(delta[3:]))
+    return J
+
+
+def independent(stack: str, values: Stack, sigmas: Array, first: int = 0) -> Sequence[Prior]:
+    """A prior for each unknown of a stack, sigmas (k, dof), inf where nothing is known; first: of them in the stack."""
+    return [
+        Prior(((stack, first + i),), (values.pick(np.array([i])),), np.diag(sigmas[i] ** 2))
+        for i in range(len(values))
+        if np.isfinite(sigmas[i]).any()
+    ]

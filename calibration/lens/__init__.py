@@ -1,0 +1,1 @@
+"""The lens of one camera from photographs of a board."""

@@ -1,0 +1,175 @@
+"""A camera's own numbers from photographs of a board: lens model, parameters with their covariance, and how good."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calibration.least_squares.adjustment import AdjustmentError
+from calibration.least_squares.stacks import Poses, Vectors
+from calibration.lens.corner_table import CornerTable
+from calibration.lens.coverage import coverage_of, spread_deg
+from calibration.lens.hold_out import HeldOut, Scatter, hold_out, scatter
+from calibration.lens.intrinsics_findings import findings_of
+from calibration.lens.intrinsics_result import Intrinsics
+from calibration.lens.lens_fit import FEWEST_CORNERS, LensFit, Values, fit, robust_fit, used_views
+from calibration.lens.lens_ladder import Rung, WarpTest, climb, union_of_used, warp_test
+from calibration.lens.lens_models import LensModel
+from calibration.lens.lens_start import StartError, start
+from calibration.lens.projection_map import Difference, ProjectionMap, difference, projection_map
+
+FEWEST_VIEWS = 4
+# Boards whose normals all lie within this of one another fix the focal length only together with the distance.
+LEAST_TILT_DEG = 5.0
+# Scatter between photographs this unlikely raises the covariance. Of right models one in a hundred does.
+SCATTER_SIGNIFICANT = 0.01
+
+
+class IntrinsicsError(ValueError):
+    """These photographs cannot give a calibration: what is wrong with them, and what to do."""
+
+
+@dataclass(frozen=True, slots=True)
+class IntrinsicsOptions:
+    """What the user may decide."""
+
+    distance_m: float | None = None  # of the screen, for figures in mm; None: the median distance of the boards
+    lens: LensModel | None = None  # None: chosen by hold-out error
+    warp: bool | None = None  # whether to correct a bent board; None: where it is significant
+    folds: int | None = None  # of the hold-out; None: five, or one view each up to ten views
+
+
+def calibrate_intrinsics(table: CornerTable, options: IntrinsicsOptions | None = None) -> Intrinsics:
+    """The whole calibration of one camera. Raises IntrinsicsError where the photographs cannot give one."""
+    options = IntrinsicsOptions() if options is None else options
+    _check_enough(table)
+    try:
+        return _calibrated(table, options)
+    except StartError as error:
+        raise IntrinsicsError(str(error)) from None
+    except AdjustmentError as error:
+        raise IntrinsicsError(
+            f"the photographs do not determine the lens: {error}; take more of them, the board tilted by 20 to 45 deg"
+            " to all sides and moved into the picture's corners"
+        ) from None
+
+
+def _calibrated(table: CornerTable, options: IntrinsicsOptions) -> Intrinsics:
+    starts = _starts(table, options.lens)
+    used, rich = union_of_used(table, starts)
+    bend = _bend(table, rich[0], options)
+    warp_free = bend is not None and bend.corrected
+    values = [_start_of(rich, fisheye, warp_free) for fisheye in (False, True)]
+    ladder = climb(table, used, values, warp_free, options.folds, options.lens)
+    found, held, spread = _final(table, ladder.chosen, warp_free, options.folds)
+    noise = max(1.0, spread.factor) if spread.p_value < SCATTER_SIGNIFICANT else 1.0
+    distance = options.distance_m or _typical_depth(table, found)
+    pixel_map = projection_map(found.model, found.lens, table.image_size_px, distance)
+    out = Intrinsics(
+        table=table,
+        model=found.model,
+        fit=found,
+        parameters=found.model.parameters,
+        covariance=found.covariance * noise**2,
+        correlated_noise=noise,
+        scatter=spread,
+        held=held,
+        ladder=ladder,
+        warp=bend,
+        halves=_halves(table, found, pixel_map),
+        map=pixel_map,
+        distance_m=distance,
+        coverage=coverage_of(table, found.used, found.poses),
+    )
+    return replace(out, findings=findings_of(out))
+
+
+def _check_enough(table: CornerTable) -> None:
+    able = int(np.sum(table.counts() >= FEWEST_CORNERS))
+    if able < FEWEST_VIEWS:
+        raise IntrinsicsError(
+            f"expected {FEWEST_VIEWS} photographs or more with a board in them, got {able}; take 15 to 30, the board"
+            " tilted by 20 to 45 deg to all sides and moved into the picture's corners"
+        )
+
+
+def _starts(table: CornerTable, lens: LensModel | None) -> list[tuple[LensModel, Values]]:
+    """A start for each kind of lens that is asked for."""
+    kinds = (False, True) if lens is None else (lens.fisheye,)
+    out: list[tuple[LensModel, Values]] = []
+    errors = []
+    for fisheye in kinds:
+        try:
+            out.append(start(table, fisheye))
+        except StartError as error:
+            errors.append(error)
+    if not out:
+        raise errors[0]
+    for _, values in out:
+        _check_tilts(values)
+    return out
+
+
+def _check_tilts(values: Values) -> None:
+    """Raises IntrinsicsError where all boards lie parallel: that holds whatever the focal length."""
+    boards = values["boards"]
+    assert isinstance(boards, Poses)
+    normals = boards.pose.rotation[..., 2]
+    normals = normals[np.isfinite(normals).all(axis=1)]
+    spread = spread_deg(normals)
+    if spread < LEAST_TILT_DEG:
+        raise IntrinsicsError(
+            f"the board lies parallel to itself in all {len(normals)} photographs (within {spread:.1f} deg), so that"
+            " the focal length is not determined: a longer lens farther away gives the same pictures; tilt the board"
+            " by 20 to 45 deg to all sides"
+        )
+
+
+def _bend(table: CornerTable, rich: LensFit, options: IntrinsicsOptions) -> WarpTest | None:
+    try:
+        return warp_test(table, rich, options.folds, options.warp)
+    except AdjustmentError:
+        if options.warp:
+            raise
+        return None
+
+
+def _start_of(fits: Sequence[LensFit], fisheye: bool, warp_free: bool) -> Values | None:
+    """Where the ladder starts with one kind of lens; None where none was solved."""
+    for found in fits:
+        if found.model.fisheye == fisheye:
+            return found.values if warp_free else {**found.values, "warp": Vectors(np.zeros((1, 3)))}
+    return None
+
+
+def _final(table: CornerTable, chosen: Rung, warp_free: bool, folds: int | None) -> tuple[LensFit, HeldOut, Scatter]:
+    """The chosen model once more from all corners: what is no corner is judged by the lens that stays."""
+    assert chosen.fit is not None
+    assert chosen.held is not None
+    assert chosen.scatter is not None
+    try:
+        found = robust_fit(table, chosen.model, chosen.fit.values, warp_free)
+        held = hold_out(table, found, folds)
+        return found, held, scatter(found, held)
+    except AdjustmentError:
+        return chosen.fit, chosen.held, chosen.scatter
+
+
+def _typical_depth(table: CornerTable, found: LensFit) -> float:
+    """The median distance of the boards along the optical axis, m."""
+    depths = found.poses.apply(table.middle)[used_views(found, table), 2]
+    return float(np.median(depths))
+
+
+def _halves(table: CornerTable, found: LensFit, at: ProjectionMap) -> Difference | None:
+    """Every other view against the rest, the board's bend as found from all: it is one board."""
+    views = used_views(found, table)
+    try:
+        first, second = (
+            fit(table, found.used & np.isin(table.view, views[k::2]), found.model, found.values, False) for k in (0, 1)
+        )
+        return difference(at, first, second)
+    except AdjustmentError:
+        return None

@@ -1,0 +1,275 @@
+"""What a camera's calibration says of itself: each test with its figures, what they mean, and the cure."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from calibration.findings import Finding, Level
+from calibration.lens.intrinsics_result import Intrinsics
+from calibration.lens.lens_models import folds_in_picture
+
+_TILTED = "tilt the board by 20 to 45 deg to all sides and photograph it at two or three distances"
+_MORE = "take more photographs, the board tilted by 20 to 45 deg to all sides and moved into the picture's corners"
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """From where on a figure earns a warning, and a failure."""
+
+    noise_px: tuple[float, float] = (0.35, 1.0)  # of a corner; sharp photographs of flat boards give 0.03 to 0.25
+    rejected: tuple[float, float] = (0.05, 0.3)  # share of the corners
+    spread_deg: tuple[float, float] = (25.0, 8.0)  # largest angle between two boards
+    filled: tuple[float, float] = (0.6, 0.25)  # share of the picture within some board
+    aspect: tuple[float, float] = (0.005, 0.03)  # |fx/fy - 1|: pixels of today's sensors are square to 0.1 %
+    off_centre: tuple[float, float] = (0.08, 0.2)  # principal point from the middle, share of the width or height
+    focal: tuple[float, float] = (0.003, 0.02)  # sigma of the focal length over itself
+    overfit: tuple[float, float] = (1.5, 3.0)  # held-out error over the noise
+    views: int = 8
+    p_value: float = 0.01  # of the halves' difference, and of the scatter between photographs
+    halves_px: float = 1.0  # a significant difference larger than this fails
+    map_px: tuple[float, float] = (0.5, 3.0)  # projection uncertainty that a tenth of the picture exceeds
+    warp_m: float = 0.002  # a board this bent is more than a quadratic surface
+
+
+LIMITS = Limits()
+
+
+def findings_of(c: Intrinsics, limits: Limits = LIMITS) -> tuple[Finding, ...]:
+    """All tests, in the order in which a reader asks."""
+    found = [
+        _lens(c),
+        _noise(c, limits),
+        _rejected(c, limits),
+        _views(c, limits),
+        _tilts(c, limits),
+        _coverage(c, limits),
+        _focal(c, limits),
+        _aspect(c, limits),
+        _principal_point(c, limits),
+        _overfit(c, limits),
+        _halves(c, limits),
+        _scatter(c),
+        _map(c, limits),
+        _warp(c, limits),
+    ]
+    return tuple(f for f in found if f is not None)
+
+
+def _level(value: float, limits: tuple[float, float]) -> Level:
+    """By two limits: rising ones for what should be small, falling ones for what should be large."""
+    warn, fail = limits
+    sign = 1.0 if fail > warn else -1.0
+    return Level.FAIL if sign * value > sign * fail else Level.WARN if sign * value > sign * warn else Level.PASS
+
+
+def _unless_pass(level: Level, what: str, why: str, cure: str) -> Finding:
+    return Finding(level, what) if level is Level.PASS else Finding(level, what, why, cure)
+
+
+def _two(value: float) -> str:
+    """Two significant digits, never with an exponent: 0.29, 3.9, 240."""
+    if not np.isfinite(value) or value == 0:
+        return f"{value:g}"
+    digits = 1 - int(np.floor(np.log10(abs(value))))
+    return f"{round(value, digits):.{max(digits, 0)}f}"
+
+
+def _mm(c: Intrinsics, px: float) -> str:
+    """px and what it is on the screen."""
+    per_px = float(np.nanmedian(np.abs(np.linalg.det(c.map.mm_per_px))) ** 0.5)
+    return f"{px:.3g} px ({_two(px * per_px)} mm at {c.distance_m:.3g} m)"
+
+
+def _lens(c: Intrinsics) -> Finding:
+    if folds_in_picture(c.fit.lens, c.model.fisheye, c.table.image_size_px):
+        return Finding(
+            Level.FAIL,
+            f"{c.model.words}: it folds inside the picture",
+            "Two directions would share a pixel.",
+            _MORE,
+        )
+    return Finding(Level.PASS, f"Lens: {c.model.words}: {c.ladder.why}.")
+
+
+def _noise(c: Intrinsics, limits: Limits) -> Finding:
+    return _unless_pass(
+        _level(c.fit.sigma_px, limits.noise_px),
+        f"Corners miss the model by {_mm(c, c.fit.sigma_px)} per coordinate (1 sigma; RMS {c.rms_px:.3g} px).",
+        "Sharp photographs of a flat board give 0.03 to 0.25 px. Larger residuals mean blur, a board that is not flat"
+        " or not what was said, or a lens that no model here follows.",
+        "Look at the residuals below; fix the board to glass or a thick plate, hold it still, light it well, and check"
+        " its measures.",
+    )
+
+
+def _rejected(c: Intrinsics, limits: Limits) -> Finding:
+    lost = int(np.sum(~c.fit.used))
+    share = lost / len(c.table)
+    dropped = len(c.fit.dropped)
+    text = f"{lost} of {len(c.table)} corners left out ({share:.1%})"
+    if dropped:
+        text += f", among them {dropped} whole view{'s' if dropped > 1 else ''}"
+    return _unless_pass(
+        _level(share, limits.rejected),
+        text + ".",
+        "What lies off the model by more than 4.5 sigmas is taken for a false corner; so many false ones leave a doubt"
+        " about the others.",
+        "Look at the views that are marked below; take them again, sharp and without glare.",
+    )
+
+
+def _views(c: Intrinsics, limits: Limits) -> Finding:
+    count = int(np.sum(c.table.counts(c.fit.used) > 0))
+    return _unless_pass(
+        Level.WARN if count < limits.views else Level.PASS,
+        f"{count} photographs used, {int(c.fit.used.sum())} corners.",
+        "With few photographs neither the lens model nor its errors can be checked against others.",
+        "Take 15 to 30 photographs.",
+    )
+
+
+def _tilts(c: Intrinsics, limits: Limits) -> Finding:
+    return _unless_pass(
+        _level(c.coverage.spread_deg, limits.spread_deg),
+        f"The boards' directions differ by up to {c.coverage.spread_deg:.0f} deg.",
+        "Without tilted boards the focal length can hardly be told from the distance.",
+        _TILTED[0].upper() + _TILTED[1:] + ".",
+    )
+
+
+def _coverage(c: Intrinsics, limits: Limits) -> Finding:
+    gaps = c.coverage.gaps
+    level = max(_level(c.coverage.filled, limits.filled), Level.WARN if gaps else Level.PASS)
+    where = f"; none came near the {_listed(gaps)} of it" if gaps else ""
+    return _unless_pass(
+        level,
+        f"Boards covered {c.coverage.filled:.0%} of the picture{where}.",
+        "Where no corner was, the lens is extrapolated, and its uncertainty map holds only if the model does.",
+        "Add photographs with the board there, cut off by the picture's border if the board allows that.",
+    )
+
+
+def _listed(words: tuple[str, ...]) -> str:
+    return words[0] if len(words) == 1 else ", ".join(words[:-1]) + " and " + words[-1]
+
+
+def _focal(c: Intrinsics, limits: Limits) -> Finding:
+    share = float(c.sigmas[0] / c.fit.lens[0])
+    return _unless_pass(
+        _level(share, limits.focal),
+        f"Focal length {c.fit.lens[0]:.2f} ± {_two(c.sigmas[0])} px ({share:.2%}).",
+        "A pose's distance is uncertain by that share:"
+        f" {_two(1000 * share * c.distance_m)} mm at {c.distance_m:.3g} m.",
+        f"Take more photographs; {_TILTED}.",
+    )
+
+
+def _aspect(c: Intrinsics, limits: Limits) -> Finding:
+    fx, fy = c.fit.lens[:2]
+    away = fx / fy - 1
+    C = c.covariance[:2, :2] / np.outer([fx, fy], [fx, fy])
+    sigma = float(np.sqrt(C[0, 0] + C[1, 1] - 2 * C[0, 1]))
+    level = _level(abs(away), limits.aspect)
+    if level is not Level.FAIL and abs(away) < 2 * sigma:
+        level = Level.PASS
+    return _unless_pass(
+        level,
+        f"fx / fy = {fx / fy:.4f} ± {sigma:.1g}.",
+        "Pixels are square on nearly every sensor: two focal lengths mean that the board's rows and columns are not as"
+        " far apart as was said, that the pictures were stretched, or that the views do not determine them.",
+        "Measure the board along both directions; photograph it turned by 90 deg as well; check the pictures' scaling.",
+    )
+
+
+def _principal_point(c: Intrinsics, limits: Limits) -> Finding:
+    size = np.array(c.table.image_size_px)
+    away = c.fit.lens[2:4] - (size - 1) / 2
+    share = float(np.max(np.abs(away) / size))
+    sure = bool(np.any(np.abs(away) > 2 * c.sigmas[2:4] + limits.off_centre[0] * size))
+    level = _level(share, limits.off_centre)
+    return _unless_pass(
+        level,
+        f"Principal point {away[0]:+.1f}, {away[1]:+.1f} px from the middle"
+        f" (± {_two(c.sigmas[2])}, {_two(c.sigmas[3])}).",
+        "Far off the middle it is that of a cropped or shifted picture"
+        + (" (the uncertainty does not explain it)." if sure else "; here the views hardly determine it."),
+        "Check that the pictures are not cropped; photograph the board turned by 90 deg in its plane as well.",
+    )
+
+
+def _overfit(c: Intrinsics, limits: Limits) -> Finding:
+    ratio = c.held.rms_px / c.fit.sigma_px
+    return _unless_pass(
+        _level(ratio, limits.overfit),
+        f"Held-out photographs are predicted to {_mm(c, c.held.rms_px)}, {ratio:.2f} times the corners' own noise.",
+        "The lens follows the photographs that it was made from, not others.",
+        _MORE[0].upper() + _MORE[1:] + ".",
+    )
+
+
+def _halves(c: Intrinsics, limits: Limits) -> Finding:
+    d = c.halves
+    if d is None:
+        return Finding(
+            Level.WARN,
+            "Halves of the photographs do not determine the lens, so that they cannot be compared.",
+            "Nothing then tells of errors of the model, which no covariance knows.",
+            _MORE[0].upper() + _MORE[1:] + ".",
+        )
+    agree = d.p_value >= limits.p_value
+    level = Level.PASS if agree else Level.FAIL if d.rms_px > limits.halves_px else Level.WARN
+    return _unless_pass(
+        level,
+        f"Two halves of the photographs differ by {d.rms_px:.3g} px ({_two(d.rms_mm)} mm at {c.distance_m:.3g} m), RMS"
+        f" over the picture; their sigmas let expect {d.expected_rms_px:.3g} px (p = {d.p_value:.2g}).",
+        "They should differ by their sigmas only. More means that the lens model, the board or the corners are wrong in"
+        " a way that noise does not explain.",
+        "Use a stiffer board, check its measures, take more and more varied photographs.",
+    )
+
+
+def _scatter(c: Intrinsics) -> Finding:
+    if c.correlated_noise == 1:
+        return Finding(
+            Level.PASS,
+            f"From photograph to photograph the lens scatters {c.scatter.factor:.2f} times what the corners' noise"
+            f" explains (p = {c.scatter.p_value:.2g}).",
+        )
+    return Finding(
+        Level.WARN,
+        f"From photograph to photograph the lens scatters {c.scatter.factor:.2f} times what the corners' noise explains"
+        f" (p = {c.scatter.p_value:.1g}); all sigmas have been raised by that.",
+        "Corners of one photograph err together: a bending board, blur, glare, or a lens that no model here follows.",
+        "Use a stiffer board, hold it still, and take more photographs.",
+    )
+
+
+def _map(c: Intrinsics, limits: Limits) -> Finding:
+    px, mm = c.map.sigma_px(c.covariance), c.map.sigma_mm(c.covariance)
+    (half, most, worst), (half_mm, most_mm, worst_mm) = (np.nanquantile(m, [0.5, 0.9, 1.0]) for m in (px, mm))
+    return _unless_pass(
+        _level(float(most), limits.map_px),
+        f"A pixel's direction is known to {_two(half)} px ({_two(half_mm)} mm at {c.distance_m:.3g} m) or better in"
+        f" half of the picture, to {_two(most)} px ({_two(most_mm)} mm) in nine tenths, to {_two(worst)} px"
+        f" ({_two(worst_mm)} mm) at its worst place (1 sigma).",
+        "Every spot there carries this error, the same in all frames: averaging does not remove it.",
+        "Add photographs with the board where the uncertainty map is worst.",
+    )
+
+
+def _warp(c: Intrinsics, limits: Limits) -> Finding | None:
+    w = c.warp
+    if w is None:
+        return None
+    text = f"The board looks bent by {1000 * w.rise_m:.2f} mm (p = {w.p_value:.1g} if it were flat): {w.why}"
+    if not w.corrected:
+        return Finding(Level.PASS, text + "; taken as flat.")
+    return _unless_pass(
+        Level.WARN if w.rise_m > limits.warp_m else Level.PASS,
+        text + "; corrected.",
+        "A board bent so much is no longer the smooth surface that the correction assumes, and may bend differently"
+        " each time it is held.",
+        "Glue it to glass or a thick plate.",
+    )

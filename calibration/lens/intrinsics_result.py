@@ -1,0 +1,69 @@
+"""What a camera's calibration results in: the lens, its covariance, and the evidence of how good they are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from calibration.findings import Finding, Level, verdict
+from calibration.lens.corner_table import CornerTable
+from calibration.lens.coverage import Coverage
+from calibration.lens.hold_out import HeldOut, Scatter
+from calibration.lens.lens_fit import LensFit
+from calibration.lens.lens_ladder import Ladder, WarpTest
+from calibration.lens.lens_models import LensModel
+from calibration.lens.projection_map import Difference, ProjectionMap
+from geometry.arrays import Array
+
+
+@dataclass(frozen=True, slots=True)
+class Intrinsics:
+    """A calibrated lens and what is known of its quality."""
+
+    table: CornerTable
+    model: LensModel
+    fit: LensFit
+    parameters: tuple[str, ...]  # fx, fy, cx, cy, k1 ...
+    covariance: Array  # (p, p) in that order, scatter between photographs included
+    correlated_noise: float  # factor on the sigmas from that scatter; 1 where it is not significant
+    scatter: Scatter
+    held: HeldOut
+    ladder: Ladder
+    warp: WarpTest | None  # None where the views do not determine a bend
+    halves: Difference | None  # None where a half does not determine the lens
+    map: ProjectionMap
+    distance_m: float
+    coverage: Coverage
+    findings: tuple[Finding, ...] = ()
+
+    @property
+    def verdict(self) -> Level:
+        """The gravest finding."""
+        return verdict(self.findings)
+
+    @property
+    def matrix(self) -> Array:
+        """(3, 3), px."""
+        fx, fy, cx, cy = self.fit.lens[:4]
+        return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+
+    @property
+    def distortion(self) -> tuple[float, ...]:
+        """OpenCV's order, as many as the model has."""
+        return tuple(float(v) for v in self.fit.lens[4 : 4 + self.model.coefficients])
+
+    @property
+    def sigmas(self) -> Array:
+        """(p,): 1 sigma of each parameter."""
+        return np.sqrt(np.diagonal(self.covariance))
+
+    @property
+    def rms_px(self) -> float:
+        """Of the used corners' residuals, per coordinate."""
+        return float(np.sqrt(np.mean(self.fit.residuals[self.fit.used] ** 2)))
+
+    @property
+    def rms_2d_px(self) -> float:
+        """The same per corner, as OpenCV reports it: sqrt(2) larger."""
+        return self.rms_px * float(np.sqrt(2))

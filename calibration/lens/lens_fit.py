@@ -1,0 +1,235 @@
+"""One lens model fitted to one camera's corners: the least squares, and what is thrown out as not being the board."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from calibration.least_squares.adjustment import Adjusted, Cauchy, Limits, Loss, solve
+from calibration.least_squares.stacks import Poses, Stack, Vectors
+from calibration.lens.corner_table import CornerTable
+from calibration.lens.corners import CornerTerm, single_camera
+from calibration.lens.lens_models import LensModel
+from geometry.arrays import Array, Bools, Ints
+from geometry.pose import Pose
+
+Values = Mapping[str, Stack]
+FEWEST_CORNERS = 6  # of a view: four fix its pose, the rest must say something of the lens
+# Distance of a corner from where it should be, in sigmas of one coordinate, beyond which it is no corner: of normal
+# errors one in 25 000 lies there, so what is cut from a clean set changes its sigma by less than 0.1 %.
+CORNER_GATE = 4.5
+# A view whose corners miss by this many times what those of the median view do was blurred, or its board moved.
+VIEW_GATE = 3.0
+SETTLED = Limits()
+_ROUNDS = 6  # of solving and rejecting; sets seen so far settle within three
+
+
+@dataclass(frozen=True, slots=True)
+class LensFit:
+    """A lens, the board's poses and its warp, where the used corners' residuals are smallest."""
+
+    model: LensModel
+    values: Values  # the engine's stacks; world is the camera
+    adjusted: Adjusted
+    used: Bools  # (N,)
+    residuals: Array  # (N, 2), px, of ALL corners: projected less measured; nan for those of views without a pose
+    sigma_px: float  # of a corner's coordinate, from the used residuals and their degrees of freedom
+    relative_sigma: float  # the same in the sigmas that the adjustment was solved with
+    warp_free: bool
+    dropped: Mapping[int, str] = field(default_factory=dict)  # view -> why it was not used
+
+    @property
+    def lens(self) -> Array:
+        """(18,)."""
+        return lens_of(self.values)
+
+    @property
+    def warp(self) -> Array:
+        """(3,), 1/m."""
+        stack = self.values["warp"]
+        assert isinstance(stack, Vectors)
+        return stack.array[0]
+
+    @property
+    def poses(self) -> Pose:
+        """camera_from_board of all V views."""
+        stack = self.values["boards"]
+        assert isinstance(stack, Poses)
+        return stack.pose
+
+    @property
+    def covariance(self) -> Array:
+        """Joint covariance (p, p) of the model's parameters, from the corners' own scatter. AdjustmentError."""
+        whole = self.adjusted.covariance([("intrinsics", 0)])
+        free = self.model.free
+        return whole[np.ix_(free, free)] * self.relative_sigma**2
+
+    @property
+    def warp_covariance(self) -> Array:
+        """(3, 3), 1/m^2; 0 where the warp was held. AdjustmentError."""
+        return self.adjusted.covariance([("warp", 0)]) * self.relative_sigma**2
+
+
+def values_of(lens: Array, camera_from_board: Pose, warp: Array | None = None) -> Values:
+    """The engine's stacks for one camera, which is the world: lens (18,), V poses, warp (3,), 1/m."""
+    return {
+        "intrinsics": Vectors(np.asarray(lens, dtype=float)[None]),
+        "cameras": Poses.of([Pose.identity()]),
+        "boards": Poses(camera_from_board),
+        "warp": Vectors(np.zeros((1, 3)) if warp is None else np.asarray(warp, dtype=float)[None]),
+    }
+
+
+def lens_of(values: Values) -> Array:
+    """(18,): the camera's numbers."""
+    stack = values["intrinsics"]
+    assert isinstance(stack, Vectors)
+    return stack.array[0]
+
+
+def term_of(
+    table: CornerTable, used: Bools, fisheye: bool, sigma_px: float = 1.0, loss: Loss | None = None
+) -> CornerTerm:
+    """The used corners (N,) as a term of the cost."""
+    return single_camera(
+        table.pixels[used], table.points[used], table.middle, table.view[used], sigma_px, fisheye, loss
+    )
+
+
+def adjust(
+    table: CornerTable,
+    used: Bools,
+    model: LensModel,
+    values: Values,
+    warp_free: bool = False,
+    sigma_px: float = 1.0,
+    loss: Loss | None = None,
+    lens_free: Bools | None = None,
+    limits: Limits = SETTLED,
+) -> Adjusted:
+    """The least squares alone. lens_free (18,): which numbers may move, the model's own if None. AdjustmentError.
+
+    Distortion numbers that the model does not have are set to 0; a warp that is not free stays.
+    """
+    values = {**values, "intrinsics": Vectors(model.cut(lens_of(values))[None])}
+    in_use = table.counts(used) > 0
+    free: dict[str, bool | Bools] = {
+        "intrinsics": (model.free if lens_free is None else lens_free)[None],
+        "boards": np.repeat(in_use[:, None], 6, axis=1),
+        "warp": warp_free,
+    }
+    return solve(values, [term_of(table, used, model.fisheye, sigma_px, loss)], free, limits)
+
+
+def fit(
+    table: CornerTable,
+    used: Bools,
+    model: LensModel,
+    values: Values,
+    warp_free: bool,
+    dropped: Mapping[int, str] = {},
+    limits: Limits = SETTLED,
+    sigma_px: float | None = None,
+) -> LensFit:
+    """Plain least squares over the used corners (N,). AdjustmentError.
+
+    sigma_px: about what a corner will miss by, None: as at the start. It sets how small a last step must be, no more: a
+    model that misses by pixels then need not settle to a thousandth of one.
+    """
+    scale = sigma_px or _spread(_residuals(table, used, model, values)[used])
+    adjusted = adjust(table, used, model, values, warp_free, scale, limits=limits)
+    everything = term_of(table, np.ones(len(table), dtype=bool), model.fisheye)
+    residuals = everything.project(adjusted.values) - table.pixels
+    residuals[~(table.counts(used) > 0)[table.view]] = np.nan
+    relative = float(np.sqrt(adjusted.chi2 / max(adjusted.dof, 1)))
+    return LensFit(
+        model, adjusted.values, adjusted, used, residuals, relative * scale, relative, warp_free, dict(dropped)
+    )
+
+
+def robust_fit(table: CornerTable, model: LensModel, values: Values, warp_free: bool) -> LensFit:
+    """The fit without what is no corner of the board: found under a Cauchy loss, then left out for good.
+
+    values must hold a pose for each view; a view whose pose is nan is left out. AdjustmentError where too little stays.
+    """
+    dropped = _without_pose(table, values)
+    candidates = ~np.isin(table.view, list(dropped))
+    sigma = _spread(_residuals(table, candidates, model, values)[candidates])
+    for _ in range(2):  # the scale of the loss comes from residuals that the first round has made smaller
+        adjusted = adjust(table, candidates, model, values, warp_free, sigma, Cauchy())
+        values = adjusted.values
+        residuals = _residuals(table, candidates, model, values)
+        smaller = _spread(residuals[candidates])
+        if smaller > 0.8 * sigma:
+            break
+        sigma = smaller
+    sigma = smaller
+    dropped |= _bad_views(table, residuals, candidates, sigma, dropped)
+    used = _used(table, residuals, sigma, dropped)
+    for _ in range(_ROUNDS):
+        found = fit(table, used, model, values, warp_free, dropped)
+        values = found.values
+        again = _used(table, found.residuals, found.sigma_px, dropped)
+        if np.array_equal(again, used):
+            break
+        used = again
+    return found
+
+
+def _residuals(table: CornerTable, candidates: Bools, model: LensModel, values: Values) -> Array:
+    """(N, 2), px; nan for other than candidates."""
+    out = np.full((len(table), 2), np.nan)
+    term = term_of(table, candidates, model.fisheye)
+    values = {**values, "intrinsics": Vectors(model.cut(lens_of(values))[None])}
+    out[candidates] = term.project(values) - term.pixels
+    return out
+
+
+def _spread(residuals: Array) -> float:
+    """Sigma of a coordinate by the median of residuals (n, 2): half of them may be wrong; at least 1e-6 px."""
+    return max(1.4826 * float(np.median(np.abs(residuals))), 1e-6)
+
+
+def _without_pose(table: CornerTable, values: Values) -> dict[int, str]:
+    boards = values["boards"]
+    assert isinstance(boards, Poses)
+    lost = ~np.isfinite(boards.pose.translation).all(axis=1)
+    few = table.counts() < FEWEST_CORNERS
+    out = {int(v): "no board position explains its corners" for v in np.flatnonzero(lost)}
+    return out | {int(v): f"fewer than {FEWEST_CORNERS} corners" for v in np.flatnonzero(few)}
+
+
+def _bad_views(
+    table: CornerTable, residuals: Array, candidates: Bools, sigma: float, dropped: Mapping[int, str]
+) -> dict[int, str]:
+    """Views of which most corners lie off, or which as a whole are much worse than the others, and why."""
+    length = np.linalg.norm(residuals, axis=1)
+    typical = np.full(table.views, np.nan)
+    for v in set(range(table.views)) - set(dropped):
+        typical[v] = np.median(length[(table.view == v) & candidates])
+    median = float(np.nanmedian(typical))
+    good = table.mean_per_view((length < CORNER_GATE * sigma).astype(float), candidates)
+    out = {}
+    for v in np.flatnonzero(np.isfinite(typical)).tolist():
+        if typical[v] > VIEW_GATE * median:
+            out[v] = (
+                f"its corners miss by {typical[v]:.2f} px, {typical[v] / median:.1f} times those of the median view:"
+                " blurred, or the board or the camera moved"
+            )
+        elif good[v] * table.counts()[v] < FEWEST_CORNERS or good[v] < 0.5:
+            out[v] = f"only {good[v]:.0%} of its corners fit the board"
+    return out
+
+
+def _used(table: CornerTable, residuals: Array, sigma: float, dropped: Mapping[int, str]) -> Bools:
+    """(N,): corners within the gate, in views that are not dropped."""
+    with np.errstate(invalid="ignore"):
+        near = np.linalg.norm(residuals, axis=1) < CORNER_GATE * sigma
+    return near & ~np.isin(table.view, list(dropped))
+
+
+def used_views(fit: LensFit, table: CornerTable) -> Ints:
+    """Which of the V views have used corners."""
+    return np.flatnonzero(table.counts(fit.used) > 0)

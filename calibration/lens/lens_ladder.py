@@ -1,0 +1,243 @@
+"""Which lens model: the smallest that predicts held-out photographs as well as the best one does."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.stats import chi2
+
+from calibration.least_squares.adjustment import AdjustmentError
+from calibration.least_squares.stacks import Vectors
+from calibration.lens.corner_table import CornerTable
+from calibration.lens.hold_out import BRIEF, HeldOut, Scatter, hold_out, scatter
+from calibration.lens.lens_fit import LensFit, Values, fit, robust_fit
+from calibration.lens.lens_models import LADDER, LensModel, folds_in_picture
+from geometry.arrays import Bools
+
+# With so many corners time counts: models that cannot be chosen any more are not solved another five times. 400 views
+# took 25 s without this, 11 s with it; the choice is the same.
+MANY_CORNERS = 4000
+WARP_SIGNIFICANT = 1e-3  # of a flat board's chance to look this bent
+
+
+@dataclass(frozen=True, slots=True)
+class Rung:
+    """One model tried."""
+
+    model: LensModel
+    fit: LensFit | None  # None where it could not be solved
+    held: HeldOut | None  # None where it was not worth the time, or some fold could not be solved
+    scatter: Scatter | None = None
+    refused: str = ""  # why it cannot be chosen, however well it fits
+    behind_px2: float = np.nan  # mean squared error that it has more than the best one, held out
+    standard_error_px2: float = np.nan  # of that
+
+
+@dataclass(frozen=True, slots=True)
+class Ladder:
+    """All rungs, and the one to stand on."""
+
+    rungs: Sequence[Rung]
+    chosen: Rung
+    why: str
+
+
+def climb(
+    table: CornerTable,
+    used: Bools,
+    starts: Sequence[Values | None],
+    warp_free: bool,
+    folds: int | None = None,
+    only: LensModel | None = None,
+) -> Ladder:
+    """Solve every model (or only one) on the same corners (N,) and hold out.
+
+    starts: of perspective lenses and of a fisheye, None where there is none. Each rung starts from the one below of
+    its own kind. AdjustmentError where no model can be used.
+    """
+    perspective, fisheye = starts
+    fitted: list[Rung] = []
+    below = perspective
+    for model in LADDER if only is None else (only,):
+        rung = _fitted(table, used, model, fisheye if model.fisheye else below, warp_free)
+        if rung.fit is not None and not model.fisheye and model.coefficients:
+            below = rung.fit.values
+        fitted.append(rung)
+    rungs = []
+    for rung in fitted:
+        hopeless = _hopeless(rung, fitted) if int(used.sum()) > MANY_CORNERS else ""
+        rungs.append(replace(rung, refused=hopeless) if hopeless else _held_out(table, rung, folds))
+    if only is not None and rungs[0].held is not None:
+        return Ladder(rungs, rungs[0], "it was asked for")
+    return choose(rungs)
+
+
+def choose(rungs: Sequence[Rung]) -> Ladder:
+    """Of rungs in ascending order: the first whose held-out error is within one standard error of the smallest."""
+    able = [r for r in rungs if not r.refused and r.held is not None]
+    if not able:
+        reasons = "; ".join(f"{r.model.title}: {r.refused}" for r in rungs)
+        raise AdjustmentError(f"no lens model can be used ({reasons})")
+    best = min(able, key=lambda r: _rms(r))
+    out = []
+    for r in rungs:
+        if r.held is None or best.held is None:
+            out.append(r)
+            continue
+        gain, error = best.held.better_than(r.held)
+        out.append(replace(r, behind_px2=gain, standard_error_px2=error))
+    chosen = next(r for r in out if not r.refused and r.held is not None and r.behind_px2 <= r.standard_error_px2)
+    if chosen.model == best.model:
+        why = f"it predicts held-out views best ({_rms(best):.3f} px)"
+        smaller = [r for r in out if r.held is not None and not r.refused][: [r.model for r in able].index(best.model)]
+        if smaller:
+            least = min(_rms(r) for r in smaller)
+            why += f", and every smaller usable model errs more by over one standard error ({least:.3f} px at best)"
+    else:
+        why = (
+            f"its held-out error ({_rms(chosen):.3f} px) is within one standard error of the best model's"
+            f" ({best.model.words}: {_rms(best):.3f} px), and it has fewer numbers to determine"
+        )
+    return Ladder(out, chosen, why)
+
+
+def _rms(rung: Rung) -> float:
+    return np.inf if rung.held is None else rung.held.rms_px
+
+
+def _fitted(table: CornerTable, used: Bools, model: LensModel, start: Values | None, warp_free: bool) -> Rung:
+    """A model solved on all views."""
+    if start is None:
+        return Rung(model, None, None, refused="no focal length and no position of the board explain the corners")
+    try:
+        found = fit(table, used, model, start, warp_free, limits=BRIEF)
+    except AdjustmentError as error:
+        return Rung(model, None, None, refused=f"it cannot be solved: {error}")
+    return Rung(model, found, None)
+
+
+def _hopeless(rung: Rung, others: Sequence[Rung]) -> str:
+    """Why a model cannot be chosen whatever its held-out error may be; empty where it can."""
+    solved = [r for r in others if r.fit is not None]
+    if rung.fit is None or not solved:
+        return ""
+    best = min(solved, key=lambda r: np.inf if r.fit is None else r.fit.sigma_px)
+    assert best.fit is not None
+    if rung.fit.sigma_px > 1.2 * best.fit.sigma_px:
+        return f"it misses its own photographs {rung.fit.sigma_px / best.fit.sigma_px:.1f} times as far as the best"
+    smaller = [r for r in solved if not r.model.fisheye and r.model.coefficients < rung.model.coefficients]
+    if rung.model.fisheye or not smaller or smaller[-1].fit is None:
+        return ""
+    less = smaller[-1].fit
+    before, after = (f.sigma_px**2 * f.adjusted.dof for f in (less, rung.fit))
+    more = rung.model.coefficients - less.model.coefficients
+    if chi2.sf((before - after) / rung.fit.sigma_px**2, more) > 0.01:
+        return f"it fits its own photographs no better than {less.model.coefficients} coefficients do"
+    return ""
+
+
+def _held_out(table: CornerTable, rung: Rung, folds: int | None) -> Rung:
+    """The rung with its held-out error, or with why it is refused."""
+    found = rung.fit
+    if found is None:
+        return rung
+    try:
+        held = hold_out(table, found, folds)
+        spread = scatter(found, held)
+    except AdjustmentError as error:
+        return replace(rung, refused=f"the views do not determine it: {error}")
+    folded = folds_in_picture(found.lens, rung.model.fisheye, table.image_size_px)
+    return replace(
+        rung,
+        held=held,
+        scatter=spread,
+        refused="it folds inside the picture: two directions would share a pixel" if folded else "",
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class WarpTest:
+    """Whether the board is bent, as the corners see it."""
+
+    warp: tuple[float, float, float]  # 1/m, as found when free
+    sigma: tuple[float, float, float]
+    rise_m: float  # from its lowest to its highest point
+    p_value: float  # of a flat board looking bent as much
+    gain_px2: float  # mean squared error that held-out views lose with the bend; nan where p is too large to ask
+    corrected: bool
+    why: str
+
+
+def warp_test(table: CornerTable, found: LensFit, folds: int | None = None, force: bool | None = None) -> WarpTest:
+    """Solve with the board free to bend and without; force: True or False decide whatever is found.
+
+    AdjustmentError where the bend cannot be determined.
+    """
+    flat = fit(table, found.used, found.model, {**found.values, "warp": Vectors(np.zeros((1, 3)))}, False)
+    bent = fit(table, found.used, found.model, flat.values, True)
+    C = bent.warp_covariance
+    size = np.sqrt(np.diagonal(C))
+    if not np.all(size > 0):
+        raise AdjustmentError("the views do not determine the board's bend")
+    flatness = float(bent.warp @ np.linalg.solve(C, bent.warp))
+    p, gain, error = float(chi2.sf(flatness, 3)), np.nan, np.nan
+    if p < WARP_SIGNIFICANT:
+        held = hold_out(table, bent, folds)
+        # Corners of one photograph err together: against noise alone nearly every board on real photographs is bent.
+        factor = max(1.0, scatter(bent, held).factor)
+        size = size * factor
+        p = float(chi2.sf(flatness / factor**2, 3))
+        gain, error = held.better_than(hold_out(table, flat, folds))
+    if force is not None:
+        corrected, why = force, "as asked for"
+    elif p >= WARP_SIGNIFICANT:
+        corrected, why = False, "not significantly different from a flat board"
+    elif gain < -error:
+        corrected, why = False, "significant, but held-out views are predicted worse"
+    else:
+        better = "better" if gain > error else "as well"
+        corrected, why = True, f"significant, and held-out views are predicted {better}"
+    return WarpTest(
+        tuple(bent.warp),
+        tuple(size),
+        rise(table, bent),
+        p,
+        gain,
+        corrected,
+        why,
+    )
+
+
+def rise(table: CornerTable, found: LensFit) -> float:
+    """How far the board's points lie apart across it, m, by its warp, after the best-fitting flat board."""
+    x, y = (table.board_points - table.middle)[:, :2].T
+    a, b, c = found.warp
+    z = a * x * x + b * x * y + c * y * y
+    plane = np.stack([np.ones_like(x), x, y], axis=1)
+    return float(np.ptp(z - plane @ np.linalg.lstsq(plane, z, rcond=None)[0]))
+
+
+def union_of_used(table: CornerTable, starts: Sequence[tuple[LensModel, Values]]) -> tuple[Bools, list[LensFit]]:
+    """Corners (N,) that some rich model takes for the board's, and the robust fits that say so, best first.
+
+    A model too small for the lens would throw out the corners of the picture's edge, which tell the models apart.
+    AdjustmentError where none can be solved.
+    """
+    fits: list[LensFit] = []
+    reasons = []
+    for model, values in starts:
+        for warp_free in (True, False):
+            try:
+                fits.append(robust_fit(table, model, values, warp_free))
+                break
+            except AdjustmentError as error:
+                reasons.append(str(error))
+    if not fits:
+        raise AdjustmentError(reasons[-1])
+    fits.sort(key=lambda f: float(np.nanmedian(np.abs(f.residuals))))
+    # A view's corners count only where the best fit has a use for the view at all.
+    views = table.counts(fits[0].used) > 0
+    used = np.any([f.used for f in fits], axis=0) & views[table.view]
+    return used, fits

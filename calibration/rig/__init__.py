@@ -1,0 +1,1 @@
+"""Cameras, screens and beams in one solve."""

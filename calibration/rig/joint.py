@@ -1,0 +1,284 @@
+"""One joint adjustment of a whole rig: lenses, cameras, screens, dots, boards, beams, the stand and its positions.
+
+The single steps (calibration/screens, calibration/beams) give the start. Here nothing is held that is not exact: what
+one kind of measurement says of another's unknowns is heard, and the covariance that comes out is the whole truth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.special import chdtri
+
+from calibration.beams.beams import Stand
+from calibration.beams.spot_term import SpotPixels, SpotTerm
+from calibration.least_squares.adjustment import Adjusted, At, Cauchy, Free, Limits, Term, Values, solve
+from calibration.least_squares.priors import Prior
+from calibration.least_squares.some_rows import picked, rows_of, widened
+from calibration.least_squares.stacks import Poses
+from calibration.rig.measurement_groups import GroupFit, Unknowns, group_fit, information
+from calibration.rig.pose_records import RecordTerm
+from calibration.rig.rig_stacks import BEAMS, BOWS, CAMERAS, INTRINSICS, POSES, SCREENS, STAND, named_errors, rig_of
+from calibration.screens.flatness import smallest_scatter
+from calibration.screens.network import Network, NetworkFit, flat_boards, sighting_sigmas
+from calibration.screens.surveyed import FrameTerm, PointTerm, SurfaceTerm, SurveyTerm, pose_of, whitening
+from geometry.arrays import Array, Bools
+from geometry.camera import FISHEYE
+from geometry.rig import Rig
+from geometry.rig_parameters import RigCovariance
+
+# The kinds of measurement, in words that a report can use.
+LENSES, SURVEY, DOTS, SURFACES = "lens calibrations", "survey", "pixels of dots", "screen surfaces"
+CORNERS, FIXED, SCANS = "board corners", "boards on screens", "scans"
+FLAT_BOARDS = "flatness of boards"
+SPOTS, RECORDS, PLACE, FRAMES = "spots", "stand positions", "place of the stand", "screen axes"
+LOST = "positions without a record"
+P_OUTLIER = 1e-4  # of a good measurement to be left out: one in 10 000
+P_MISFIT = 1e-3  # of a right fit to be called a misfit
+_ROUNDS = 8
+# With weights that change from step to step the last digits settle slowly, and it is only a start.
+_ROUGHLY = Limits(steps=120, small_step_sigmas=0.1)
+_ANYWHERE = 0.1  # m, rad: about where a position is whose record was left out
+_SETTLED = 0.02  # relative: a scale is found when the next round changes it by less
+_MOST_SCALE = 10.0  # told sigmas may be so much too small; what scatters more was not measured of this rig
+_RESCALED = (SPOTS, DOTS, CORNERS, SURVEY, RECORDS, SURFACES)  # kinds whose sigmas may be widened
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """All that was measured, and the starts of what is looked for."""
+
+    network: Network  # cameras, screens, dots, boards; its rig holds the nominal or found beams and the spots
+    screens: NetworkFit  # the single step: its values start the joint one
+    spots: SpotPixels
+    stand: Stand
+    beams: Values  # of the single step: "beams", "stand", "poses"
+
+
+@dataclass(frozen=True, slots=True)
+class Joint:
+    """A rig found by one adjustment of everything."""
+
+    rig: Rig
+    covariance: RigCovariance  # of everything in it that was free
+    values: Values
+    adjusted: Adjusted
+    unknowns: Unknowns
+    all_covariance: Array  # (size, size) of all unknowns
+    terms: Mapping[str, tuple[Term, ...]]  # as adjusted at last: kept ones, sigmas widened
+    informations: Mapping[str, Array]  # (size, size) what each kind knows
+    groups: Mapping[str, GroupFit]  # how each kind fitted with the sigmas that were told
+    settled: Mapping[str, GroupFit]  # and how with the widened ones
+    scales: Mapping[str, float]  # what sigmas of a kind were multiplied with; kinds not named: 1
+    kept: Mapping[str, Bools]  # of the kinds that may be left out, row by row
+    every: Mapping[str, Term]  # the same kinds with all rows and the told sigmas
+
+    def effect(self, at: Sequence[At], jacobian: Array) -> Array:
+        """d(result)/d(all unknowns) (k, size), from that by the unknowns `at`, stacked (k, p)."""
+        out = np.zeros((len(jacobian), self.unknowns.size))
+        out[:, self.unknowns.of_several(at)] = jacobian
+        return out
+
+    @property
+    def rig_at(self) -> tuple[At, ...]:
+        """The unknowns that are numbers of the rig."""
+        return tuple(a for a in self.unknowns.at if a[0] in (INTRINSICS, CAMERAS, SCREENS, BOWS, BEAMS))
+
+
+def calibrate_jointly(measured: Measured, *, without: Bools | None = None, start: Joint | None = None) -> Joint:
+    """The one adjustment. Raises AdjustmentError where it does not settle or leaves something undetermined.
+
+    without (spots): spots that take no part, for a hold-out. start: an earlier result of the same measurements, whose
+    outliers and sigmas are then kept.
+    """
+    values: Values = {**measured.screens.values, **measured.beams} if start is None else start.values
+    free = free_of(measured)
+    every, fixed = _kinds(measured)
+    kept = {name: np.ones(rows_of(term), dtype=bool) for name, term in every.items()}
+    if without is not None:
+        kept[SPOTS] &= ~without
+    unknowns = Unknowns.of(values, free)
+    groups: dict[str, GroupFit] = {}
+    if start is None:
+        found, kept = _robust(measured, values, free, every, fixed, kept)
+        told = _told(every, fixed, kept)
+        groups = _fits(found, told, {}, unknowns)
+        scales = _scales(found, told, unknowns, free)
+    else:
+        kept = {name: rows & start.kept[name] for name, rows in kept.items()}
+        found, told, scales = start.adjusted, _told(every, fixed, kept), dict(start.scales)
+    final = {n: tuple(widened(t, scales.get(n, 1.0)) for t in ts) for n, ts in told.items()}
+    if start is not None or scales:
+        found = solve(found.values, [t for ts in final.values() for t in ts], free)
+    C = found.covariance(unknowns.at)
+    informations = {n: information(ts, found.values, unknowns)[0] for n, ts in final.items()}
+    rig = rig_of(measured.network.rig, found.values)
+    at = [a for a in unknowns.at if a[0] in (INTRINSICS, CAMERAS, SCREENS, BOWS, BEAMS)]
+    rows = unknowns.of_several(at)
+    names, T = named_errors(rig, found.values, at)
+    matrix = T @ C[np.ix_(rows, rows)] @ T.T
+    named = np.diagonal(matrix) > 0
+    return Joint(
+        rig=rig,
+        covariance=RigCovariance(tuple(np.array(names)[named].tolist()), matrix[np.ix_(named, named)]),
+        values=found.values,
+        adjusted=found,
+        unknowns=unknowns,
+        all_covariance=C,
+        terms=final,
+        informations=informations,
+        groups=groups,
+        settled=_fits(found, final, {}, unknowns) if scales and start is None else groups,
+        scales=scales,
+        kept=kept,
+        every=every,
+    )
+
+
+def free_of(measured: Measured) -> dict[str, bool | Bools]:
+    """Which numbers may move."""
+    stand = measured.stand
+    count = len(stand.stand_from_body.translation)
+    place: bool | Bools = True
+    if stand.stand_covariance is not None:
+        place = np.diagonal(stand.stand_covariance)[None] > 0
+    # Of the lab what was free in its own step: that also holds the world's frame where no survey does.
+    of_the_lab = {n: measured.screens.adjusted.is_free(n) for n in measured.screens.values if n != BEAMS}
+    return {
+        **of_the_lab,
+        BEAMS: True,
+        STAND: place,
+        POSES: np.broadcast_to(np.asarray(stand.pose_sigmas) > 0, (count, 6)),
+    }
+
+
+def _kinds(measured: Measured) -> tuple[dict[str, Term], dict[str, tuple[Term, ...]]]:
+    """Terms of which rows may be left out, one per kind; and the others."""
+    network, stand = measured.network, measured.stand
+    dots, s = network.dots, network.sightings
+    fisheye = np.array([c.lens == FISHEYE for c in network.rig.cameras.values()], dtype=bool)
+    every: dict[str, Term] = {SPOTS: SpotTerm(network.rig, measured.spots)}
+    fixed: dict[str, tuple[Term, ...]] = {}
+    if len(s):
+        every[DOTS] = PointTerm(s.camera_of, s.dot_of, s.pixels, np.eye(2) / s.sigma_px[:, None, None], fisheye)
+    if len(dots):
+        index = np.arange(len(dots))
+        fixed[SURVEY] = (SurveyTerm(index, dots.xyz, whitening(dots.covariance)),)
+        on = dots.screen_of >= 0
+        if network.off_surface is not None:
+            on = on & ~network.off_surface
+        if on.any():
+            scatter = np.array([smallest_scatter(network.surface_scatter_m.get(int(k), 0.0)) for k in dots.screen_of])
+            fixed[SURFACES] = (SurfaceTerm(dots.screen_of[on], index[on], scatter[on]),)
+    if measured.screens.corners is not None:
+        every[CORNERS] = measured.screens.corners
+        fixed[FLAT_BOARDS] = tuple(flat_boards(measured.screens.corners))
+    if network.fixed is not None:
+        fixed[FIXED] = (network.fixed,)
+    if network.screen_priors:
+        fixed[SCANS] = tuple(network.screen_priors)
+    if network.lens_priors:
+        fixed[LENSES] = tuple(network.lens_priors)
+    count = len(stand.stand_from_body.translation)
+    sigmas = np.broadcast_to(np.asarray(stand.pose_sigmas, dtype=float), (count, 6))
+    if np.any((sigmas > 0) & np.isfinite(sigmas)):
+        every[RECORDS] = RecordTerm(POSES, np.arange(count), stand.stand_from_body, sigmas)
+    if stand.world_from_stand is not None and stand.stand_covariance is not None and np.any(stand.stand_covariance):
+        fixed[PLACE] = (Prior(((STAND, 0),), (Poses.of([stand.world_from_stand]),), stand.stand_covariance),)
+    screens = pose_of(measured.screens.values, SCREENS)
+    if len(screens.translation):
+        fixed[FRAMES] = (FrameTerm(np.arange(len(screens.translation)), screens),)
+    return every, fixed
+
+
+def _robust(
+    measured: Measured,
+    values: Values,
+    free: Free,
+    every: Mapping[str, Term],
+    fixed: Mapping[str, tuple[Term, ...]],
+    allowed: Mapping[str, Bools],
+) -> tuple[Adjusted, dict[str, Bools]]:
+    """Outliers fade, then are left out until the same ones stay out; the rest is adjusted with full weights."""
+    rest = [t for ts in fixed.values() for t in ts]
+    first = [picked(t, allowed[n], Cauchy()) for n, t in every.items()]
+    found = solve(values, [*first, *rest], free, _ROUGHLY)
+    kept = _near(measured, every, found.values, allowed)
+    for _ in range(_ROUNDS):
+        terms = [t for ts in _told(every, fixed, kept).values() for t in ts]
+        found = solve(found.values, terms, free)
+        again = _near(measured, every, found.values, allowed)
+        if all(np.array_equal(again[n], kept[n]) for n in kept):
+            break
+        kept = again
+    return found, kept
+
+
+def _near(
+    measured: Measured, every: Mapping[str, Term], values: Values, allowed: Mapping[str, Bools]
+) -> dict[str, Bools]:
+    """Which rows of each kind lie where good ones may, by the scatter of the better half."""
+    out = {}
+    for name, term in every.items():
+        if name == DOTS:
+            # Against the survey, not the adjusted dot: one that a single camera sees follows its wrong pixel.
+            s = sighting_sigmas(measured.network, values) ** 2
+            d = 2
+        else:
+            r = term.linearise(values).residuals
+            s, d = np.sum(r**2, axis=1), r.shape[1]
+        some = s[allowed[name] & np.isfinite(s)]
+        middle = float(np.median(some)) / chdtri(d, 0.5) if some.size else 1.0
+        unit = float(np.clip(middle, 1.0, _MOST_SCALE**2))
+        out[name] = allowed[name] & (s < unit * chdtri(d, P_OUTLIER))
+    return out
+
+
+def _told(
+    every: Mapping[str, Term], fixed: Mapping[str, tuple[Term, ...]], kept: Mapping[str, Bools]
+) -> dict[str, tuple[Term, ...]]:
+    """The kept measurements with the sigmas that came with them."""
+    out = {n: (picked(t, kept[n]),) for n, t in every.items()} | dict(fixed)
+    if RECORDS in every and not kept[RECORDS].all():
+        # A position without its record must not run away where its spots do not determine it.
+        lost = picked(every[RECORDS], ~kept[RECORDS])
+        assert isinstance(lost, RecordTerm)
+        out[LOST] = (replace(lost, sigmas=np.where(lost.sigmas > 0, _ANYWHERE, 0.0)),)
+    return out
+
+
+def _fits(
+    found: Adjusted, told: Mapping[str, tuple[Term, ...]], scales: Mapping[str, float], unknowns: Unknowns
+) -> dict[str, GroupFit]:
+    """How well each kind fits, its sigmas widened by `scales`."""
+    C = found.covariance(unknowns.at)
+    out = {}
+    for name, terms in told.items():
+        these = [widened(t, scales.get(name, 1.0)) for t in terms]
+        out[name] = group_fit(name, *information(these, found.values, unknowns), C)
+    return out
+
+
+def _scales(found: Adjusted, told: Mapping[str, tuple[Term, ...]], unknowns: Unknowns, free: Free) -> dict[str, float]:
+    """What the told sigmas of each kind are too small by, kind by kind (variance components, Foerstner 1979).
+
+    Only where the residuals say so beyond chance, never smaller: too large ones are a user's safety margin. A kind
+    that misfits drags others along, so the worst one is widened first, and the fit is looked at again.
+    """
+    scales: dict[str, float] = {}
+    for _ in range(3 * len(_RESCALED)):
+        fits = _fits(found, told, scales, unknowns)
+        loose = {
+            n: f
+            for n, f in fits.items()
+            if n in _RESCALED and (f.p < P_MISFIT or (n in scales and abs(f.scale - 1) > _SETTLED))
+        }
+        if not loose:
+            break
+        worst = max(loose, key=lambda n: abs(np.log(loose[n].scale)))
+        scales[worst] = max(scales.get(worst, 1.0) * loose[worst].scale, 1.0)
+        terms = [widened(t, scales.get(n, 1.0)) for n, ts in told.items() for t in ts]
+        found = solve(found.values, terms, free)
+    return {n: s for n, s in scales.items() if s > 1.0}

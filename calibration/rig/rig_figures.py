@@ -1,0 +1,152 @@
+"""What a jointly calibrated rig is worth: the pose to expect, whose errors make it, and positions held out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2 as chi2_distribution
+
+from calibration.beams.spot_term import SpotPixels, SpotTerm
+from calibration.rig.joint import SPOTS, Joint, Measured, calibrate_jointly
+from calibration.rig.measurement_groups import jacobian, shares
+from calibration.rig.rig_stacks import POSES, STAND, named_errors
+from calibration.screens.surveyed import pose_of
+from geometry.arrays import Array, Ints, symmetric
+from geometry.pose import Pose
+from geometry.rig_parameters import Sensitivity
+from geometry.solve import fit_pose
+from geometry.spots import SpotModel
+
+FOLDS = 5  # parts into which the positions are divided; each is predicted by the other four
+_FEWEST_HELD_OUT = 10  # positions: fewer leave too little to calibrate with, and too little to say
+
+
+@dataclass(frozen=True, slots=True)
+class ExpectedPose:
+    """What one frame would tell of the vehicle at one pose. Covariances are of [dt (m, world), dtheta (rad, body)]."""
+
+    world_from_body: Pose
+    views: int  # spots in the pictures there
+    total: Array  # (6, 6)
+    noise: Array  # (6, 6): of the spots in that frame; averaging lessens it
+    systematic: Array  # (6, 6): of the calibration; the same in every frame
+    shares: Mapping[str, Array]  # (6, 6) of the systematic part, by kind of measurement whose errors made it
+
+
+@dataclass(frozen=True, slots=True)
+class HoldOut:
+    """Positions predicted by a calibration that had not seen their spots."""
+
+    positions: Ints  # (n,)
+    errors: Array  # (n, 6): recorded pose less the one measured with the spots, [dt (m, world), dtheta (rad, body)]
+    sigmas: Array  # (n,): size of each position's misfit against what is expected, 1 where that is right
+    chi2: float  # of the held-out spots against their prediction, all errors counted
+    dof: int
+    p: float
+
+    @property
+    def attitude_rms(self) -> float:
+        """Rad, per axis."""
+        return float(np.sqrt(np.mean(self.errors[:, 3:] ** 2)))
+
+    @property
+    def position_rms(self) -> float:
+        """m, per axis."""
+        return float(np.sqrt(np.mean(self.errors[:, :3] ** 2)))
+
+    @property
+    def ratio(self) -> float:
+        """How many times larger the misfits are than expected."""
+        return float(np.sqrt(self.chi2 / self.dof))
+
+
+def central_pose(joint: Joint) -> Pose:
+    """world_from_body in the middle of the stand's positions."""
+    poses = pose_of(joint.values, POSES)
+    U, _, V = np.linalg.svd(poses.rotation.mean(axis=0))
+    middle = Pose(U @ np.diag([1.0, 1.0, np.linalg.det(U @ V)]) @ V, poses.translation.mean(axis=0))
+    return pose_of(joint.values, STAND)[0] @ middle
+
+
+def expected_pose(joint: Joint, world_from_body: Pose, spot_sigma_px: float) -> ExpectedPose | None:
+    """The covariance of a pose measured from one frame with the calibrated rig; None where too few spots are seen.
+
+    The solution weighs noise and calibration together as geometry/solve.py does.
+    """
+    model = SpotModel.of(joint.rig)
+    d = model.derivatives(world_from_body)
+    seen = model.in_picture(d.pixels)
+    J = d.pose[seen].reshape(-1, 6)
+    if len(J) < 6 or np.linalg.matrix_rank(J / np.linalg.norm(J, axis=0), tol=1e-7) < 6:
+        return None
+    names, T = named_errors(joint.rig, joint.values, joint.rig_at)
+    S = Sensitivity(joint.rig, model, names).of(d)[seen].reshape(len(J), -1) @ T
+    rows = joint.unknowns.of_several(joint.rig_at)
+    spread = S @ joint.all_covariance[np.ix_(rows, rows)] @ S.T
+    weighted = np.linalg.solve(spot_sigma_px**2 * np.eye(len(J)) + spread, J)
+    total = symmetric(np.linalg.inv(J.T @ weighted))
+    gain = total @ weighted.T
+    effect = joint.effect(joint.rig_at, gain @ S)
+    return ExpectedPose(
+        world_from_body=world_from_body,
+        views=int(seen.sum()),
+        total=total,
+        noise=spot_sigma_px**2 * symmetric(gain @ gain.T),
+        systematic=symmetric(gain @ spread @ gain.T),
+        shares=shares(joint.informations, joint.all_covariance, effect),
+    )
+
+
+def spot_sigma(joint: Joint) -> float:
+    """The usual sigma (px) of one coordinate of a spot, as widened."""
+    term = joint.terms[SPOTS][0]
+    assert isinstance(term, SpotTerm)
+    spots = term.spots
+    return float(np.sqrt(np.median((spots.covariance[:, 0, 0] + spots.covariance[:, 1, 1]) / 2)))
+
+
+def hold_out(measured: Measured, joint: Joint, seed: int = 0) -> HoldOut | None:
+    """Calibrate without a fifth of the positions' spots, predict them, and so for each fifth; None where too few.
+
+    The held-out spots are compared with where rig, stand and record put them; the expected size counts the errors of
+    all three. Raises AdjustmentError where a part is not determined by the others.
+    """
+    count = len(measured.stand.stand_from_body.translation)
+    if count < _FEWEST_HELD_OUT:
+        return None
+    fold_of = np.random.default_rng(seed).permutation(count) % FOLDS
+    scale = joint.scales.get(SPOTS, 1.0)
+    positions, errors, sigmas = [], [], []
+    chi2, dof = 0.0, 0
+    for fold in range(FOLDS):
+        without = fold_of[measured.spots.position] == fold
+        part = calibrate_jointly(measured, without=without, start=joint)
+        held = measured.spots.pick(without & joint.kept[SPOTS])
+        held = SpotPixels(held.position, held.view, held.pixels, held.covariance * scale**2)
+        model = SpotModel.of(part.rig)
+        bodies = pose_of(part.values, STAND)[0] @ pose_of(part.values, POSES)
+        for k in np.unique(held.position):
+            here = held.pick(held.position == k)
+            fit = fit_pose(model, here.view, here.pixels, here.covariance, bodies[int(k)])
+            if fit is None or not fit.observable:
+                continue
+            r, J = jacobian(SpotTerm(part.rig, here), part.values, part.unknowns)
+            spread = np.eye(len(r)) + J @ part.all_covariance @ J.T
+            of_position = float(r @ np.linalg.solve(spread, r))
+            chi2, dof = chi2 + of_position, dof + len(r)
+            positions.append(int(k))
+            errors.append(bodies[int(k)].minus(fit.world_from_body))
+            sigmas.append(np.sqrt(of_position / len(r)))
+    if not positions:
+        return None
+    order = np.argsort(positions)
+    return HoldOut(
+        np.array(positions)[order],
+        np.array(errors)[order],
+        np.array(sigmas)[order],
+        chi2,
+        dof,
+        float(chi2_distribution.sf(chi2, dof)),
+    )

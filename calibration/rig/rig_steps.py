@@ -1,0 +1,60 @@
+"""A whole rig from its measurements: the single steps one after the other, then the joint adjustment from there."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from calibration.beams.beams import BeamCalibration, Stand, calibrate_beams
+from calibration.beams.excitation import Motion
+from calibration.beams.spot_term import SpotPixels
+from calibration.least_squares.adjustment import AdjustmentError
+from calibration.rig.joint import Joint, Measured, calibrate_jointly
+from calibration.rig.rig_stacks import BEAMS, POSES, STAND
+from calibration.screens.network import Network
+from calibration.screens.screens import Near, ScreenSetup, ScreensResult, calibrate
+
+
+@dataclass(frozen=True, slots=True)
+class RigSteps:
+    """What each step found."""
+
+    screens: ScreensResult  # lenses, cameras, screens, dots and boards: all but the spots
+    beams: BeamCalibration  # the spots, with what the first step knew
+    measured: Measured
+    joint: Joint  # everything at once
+
+
+def calibrate_in_steps(
+    network: Network,
+    setups: Sequence[ScreenSetup],
+    spots: SpotPixels,
+    stand: Stand,
+    near: Mapping[int, Near] | None = None,
+    held_screen: int | None = None,
+    *,
+    nominal: bool = True,
+) -> RigSteps:
+    """Screens, beams, then all together.
+
+    The network's rig holds the lenses, nominal beams and the spots. setups, near, held_screen: as in
+    screens/screens.py; nominal: as in beams/beams.py. Raises what these raise: AdjustmentError, ValueError.
+    """
+    screens = calibrate(network, setups, near, held_screen)
+    try:
+        beams = calibrate_beams(screens.fit.rig, spots, stand, screens.fit.covariance, nominal=nominal)
+    except AdjustmentError as error:
+        # Along a direction that nothing determines the steps may wander instead of ending.
+        motion = Motion.of(stand.stand_from_body)
+        if not motion.flat:
+            raise
+        raise AdjustmentError(f"{error}; the stand's positions do not tell all ({motion}): {motion.cure()}") from None
+    if beams.undetermined:
+        raise AdjustmentError(
+            f"the stand's positions leave undetermined: {'; '.join(beams.undetermined)} ({beams.motion}):"
+            f" {beams.motion.cure()}"
+        )
+    found = beams.fit.adjusted.values
+    starts = {n: found[n] for n in (BEAMS, STAND, POSES)}
+    measured = Measured(screens.network, screens.fit, spots, stand, starts)
+    return RigSteps(screens, beams, measured, calibrate_jointly(measured))

@@ -1,0 +1,1 @@
+"""Where screens and cameras stand: surveyed dots, boards, scans."""

@@ -1,0 +1,313 @@
+"""Cameras and screens in one world: one bundle adjustment over surveyed dots, boards and the screens' surfaces.
+
+Source: Triggs et al. (2000), "Bundle adjustment: a modern synthesis"; the factor by which sigmas are widened where the
+measurements agree less well than they claim is geodesy's a-posteriori variance factor (Foerstner and Wrobel 2016,
+Photogrammetric Computer Vision, eq. 4.91).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.stats import chi2 as chi2_distribution
+
+from calibration.least_squares.adjustment import Adjusted, At, Cauchy, Term, Values, solve
+from calibration.least_squares.priors import Prior, independent
+from calibration.least_squares.stacks import Poses, Vectors
+from calibration.lens.corners import CornerTerm
+from calibration.rig.rig_stacks import named_errors, rig_of, stacks_of
+from calibration.screens.board_on_screen import BoardOnScreenTerm
+from calibration.screens.flatness import smallest_scatter
+from calibration.screens.surveyed import FrameTerm, PointTerm, SurfaceTerm, SurveyTerm, array_of, whitening
+from geometry.arrays import Array, Bools, Ints
+from geometry.camera import FISHEYE
+from geometry.pose import Pose
+from geometry.rig import Rig
+from geometry.rig_parameters import RigCovariance
+
+OUTLIER_SIGMAS = 5.0  # in two dimensions one right point of 270 000 lies farther off
+WARP_SIGMA_M = 1e-3  # by how much a board may be bent at its edge
+SIGNIFICANT = 0.001  # chance at which measurements that fit their sigmas are called worse than these
+
+
+@dataclass(frozen=True, slots=True)
+class Dots:
+    """Surveyed points: p of them."""
+
+    names: tuple[str, ...]
+    xyz: Array  # (p, 3), m, world
+    covariance: Array  # (p, 3, 3), m^2
+    screen_of: Ints  # (p,): index of the screen that a point lies on; -1: on none
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+
+@dataclass(frozen=True, slots=True)
+class Sightings:
+    """Where cameras see dots: n of them."""
+
+    camera_of: Ints  # (n,)
+    dot_of: Ints  # (n,)
+    pixels: Array  # (n, 2)
+    sigma_px: Array  # (n,), of each coordinate
+
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+
+@dataclass(frozen=True, slots=True)
+class Network:
+    """What was measured. The rig gives cameras with their lenses, and screens; its poses are not used."""
+
+    rig: Rig
+    dots: Dots
+    sightings: Sightings
+    corners: CornerTerm | None = None  # of boards that were carried about, and of boards fixed to screens
+    placements: tuple[str, ...] = ()  # names of the boards' places, as the corners count them
+    fixed: BoardOnScreenTerm | None = None
+    surface_scatter_m: Mapping[int, float] = field(default_factory=dict)  # screen -> its own scatter, where dots say
+    off_surface: Bools | None = None  # (p,): dots that do not lie on their screen, though named for it
+    bent: frozenset[int] = frozenset()  # screens whose bow is asked for
+    screen_priors: tuple[Prior, ...] = ()  # what scans say of screens
+    lens_priors: tuple[Prior, ...] = ()
+    warp_sigma_m: float = WARP_SIGMA_M  # by how much a board may be bent at its edge; 0: not at all
+    lens_free: Bools | None = None  # (cameras, 18): which lens numbers may move; None: none
+
+
+@dataclass(frozen=True, slots=True)
+class Start:
+    """Where the adjustment begins, and what holds its frame."""
+
+    camera_from_world: Pose  # a stack, one per camera
+    world_from_screen: Pose  # a stack, one per screen: its axes within the plane stay as they are here
+    world_from_board: Pose  # a stack, one per placement
+    bow: Array  # (screens, 3), 1/m
+    # Where no survey gives the world: the camera, or the place of the board fixed to a screen, that stays where it is.
+    held_camera: int | None = None
+    held_board: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class NetworkFit:
+    """Cameras and screens in the world, with the joint covariance of their errors."""
+
+    rig: Rig
+    values: Values
+    covariance: RigCovariance  # widened by the variance factor
+    variance_factor: float  # 1 where the measurements fit their sigmas
+    p_fits: float  # chance of a misfit as large as found if all sigmas are right
+    dof: int
+    sighting_errors_px: Array  # (n, 2): measured less predicted
+    sighting_sigmas: Array  # (n,): their length in sigmas
+    used: Bools  # (n,) sightings
+    dot_shifts_m: Array  # (p, 3): adjusted less surveyed
+    corners: CornerTerm | None  # those that were used, with the sigma that their residuals show
+    corner_errors_px: Array  # (corners, 2): measured less predicted
+    adjusted: Adjusted
+
+
+def adjust(network: Network, start: Start) -> NetworkFit:
+    """The one adjustment of everything.
+
+    Sightings and corners that lie more than 5 sigmas off what the others say are left out; corners weigh by what their
+    residuals show. Raises AdjustmentError where the start is too far off or something is not
+    determined.
+    """
+    values, free, at = _unknowns(network, start)
+    corners = None if network.corners is None else _weighed_corners(network, start, values, free)
+    rest = _terms_but_sightings(network, start, corners)
+    used = np.ones(len(network.sightings), dtype=bool)
+    robust = solve(values, [_point_term(network, used, Cauchy()), *rest], free)
+    used = _inliers(network, robust.values, used)
+    found = solve(robust.values, [_point_term(network, used), *rest], free)
+    for _ in range(5):
+        now = _inliers(network, found.values, used)
+        if np.array_equal(now, used):
+            break
+        used = now
+        found = solve(found.values, [_point_term(network, used), *rest], free)
+    return _fit(network, found, at, used, corners)
+
+
+def _unknowns(network: Network, start: Start) -> tuple[Values, dict[str, bool | Bools], list[At]]:
+    rig = network.rig
+    values: dict[str, object] = dict(stacks_of(rig))
+    values["cameras"], values["screens"] = Poses(start.camera_from_world), Poses(start.world_from_screen)
+    values["bow"] = Vectors(start.bow)
+    values["points"] = Vectors(network.dots.xyz)
+    values["boards"] = Poses(start.world_from_board)
+    count = 0 if network.corners is None else int(network.corners.board.max(initial=-1)) + 1
+    values["warp"] = Vectors(np.zeros((count, 3)))
+    n_cameras, n_screens = len(rig.cameras), len(rig.screens)
+    cameras = np.ones((n_cameras, 6), dtype=bool)
+    bow = np.zeros((n_screens, 3), dtype=bool)
+    bow[sorted(network.bent)] = True
+    if start.held_camera is not None:
+        cameras[start.held_camera] = False
+    boards = np.ones((len(start.world_from_board.translation), 6), dtype=bool)
+    if start.held_board is not None:
+        boards[start.held_board] = False
+    lens = np.zeros((n_cameras, 18), dtype=bool) if network.lens_free is None else network.lens_free
+    free: dict[str, bool | Bools] = {
+        "cameras": cameras,
+        "screens": True,
+        "bow": bow,
+        "points": True,
+        "boards": boards,
+        "warp": network.warp_sigma_m > 0,
+        "intrinsics": lens,
+    }
+    at: list[At] = [(s, i) for i in range(n_cameras) for s in ("intrinsics", "cameras")]
+    at = [a for a in at if a[0] == "cameras" or lens[a[1]].any()]
+    at += [(s, i) for i in range(n_screens) for s in ("screens", "bow") if s == "screens" or i in network.bent]
+    return values, free, at  # type: ignore[return-value]
+
+
+def _terms_but_sightings(network: Network, start: Start, corners: CornerTerm | None) -> list[Term]:
+    dots = network.dots
+    every = np.arange(len(dots))
+    out: list[Term] = [*network.lens_priors, *network.screen_priors]
+    if len(dots):
+        out.append(SurveyTerm(every, dots.xyz, whitening(dots.covariance)))
+        on = dots.screen_of >= 0
+        if network.off_surface is not None:
+            on &= ~network.off_surface
+        scatter = np.array([smallest_scatter(network.surface_scatter_m.get(int(s), 0.0)) for s in dots.screen_of])
+        if on.any():
+            out.append(SurfaceTerm(dots.screen_of[on], every[on], scatter[on]))
+    if len(network.rig.screens):
+        out.append(FrameTerm(np.arange(len(network.rig.screens)), start.world_from_screen))
+    if corners is not None:
+        out += [corners, *flat_boards(corners, network.warp_sigma_m)]
+    if network.fixed is not None:
+        out.append(network.fixed)
+    return out
+
+
+def flat_boards(corners: CornerTerm, sigma_m: float = WARP_SIGMA_M) -> Sequence[Prior]:
+    """That boards are flat to about so much at their edges; how they are bent is found with the rest."""
+    if sigma_m == 0:
+        return []
+    count = int(corners.board.max(initial=-1)) + 1
+    half = np.array([np.max(np.abs(corners.from_middle[corners.board == b]), initial=1e-2) for b in range(count)])
+    sigmas = np.repeat((sigma_m / half**2)[:, None], 3, axis=1)
+    return independent("warp", Vectors(np.zeros((count, 3))), sigmas)
+
+
+def _point_term(network: Network, used: Bools, loss: Cauchy | None = None) -> PointTerm:
+    s = network.sightings
+    whiten = np.eye(2) / s.sigma_px[used, None, None]
+    return PointTerm(s.camera_of[used], s.dot_of[used], s.pixels[used], whiten, _fisheye(network.rig), loss)
+
+
+def _fisheye(rig: Rig) -> Bools:
+    return np.array([c.lens == FISHEYE for c in rig.cameras.values()], dtype=bool)
+
+
+def sighting_errors(network: Network, values: Values) -> Array:
+    """Measured less predicted pixel (n, 2) of all sightings, the dots where the SURVEY has them.
+
+    Not where the adjustment moved them: a dot that only one camera sees follows a wrong pixel as far as its survey
+    lets it, and would hide it. inf where there is no projection.
+    """
+    s = network.sightings
+    cameras = list(rig_of(network.rig, values).cameras.values())
+    out = np.full((len(s), 2), np.inf)
+    for k, camera in enumerate(cameras):
+        mine = np.flatnonzero(s.camera_of == k)
+        away = s.pixels[mine] - camera.project(network.dots.xyz[s.dot_of[mine]])
+        out[mine] = np.where(np.isfinite(away), away, np.inf)
+    return out
+
+
+def sighting_sigmas(network: Network, values: Values) -> Array:
+    """How many sigmas each sighting is off (n,): of its pixel's and its survey's errors together."""
+    s = network.sightings
+    errors = sighting_errors(network, values)
+    term = _point_term(network, np.ones(len(s), dtype=bool))
+    at_survey = {**values, "points": Vectors(network.dots.xyz)}
+    line = term.linearise(at_survey)
+    J = next(p for p in line.parts if p.stack == "points").jacobian * s.sigma_px[:, None, None]
+    C = J @ network.dots.covariance[s.dot_of] @ np.swapaxes(J, -1, -2) + np.eye(2) * s.sigma_px[:, None, None] ** 2
+    safe = np.isfinite(errors).all(axis=1) & np.isfinite(C).all(axis=(1, 2))
+    out = np.full(len(s), np.inf)
+    out[safe] = np.linalg.norm((whitening(C[safe]) @ errors[safe, :, None])[..., 0], axis=1)
+    return out
+
+
+def _inliers(network: Network, values: Values, used: Bools) -> Bools:
+    """Which sightings agree with the others, by their own scatter where it is more than their sigmas say."""
+    if not len(network.sightings):
+        return used
+    off = sighting_sigmas(network, values)
+    # The median of a two-dimensional Gaussian's length is 1.177 sigmas.
+    finite = off[np.isfinite(off)]
+    scale = max(1.0, float(np.median(finite)) / 1.177) if finite.size else 1.0
+    return off < OUTLIER_SIGMAS * scale
+
+
+def _weighed_corners(network: Network, start: Start, values: Values, free: Mapping[str, bool | Bools]) -> CornerTerm:
+    """The corners that agree with the others, each with the sigma that their residuals show."""
+    term = replace(network.corners, loss=Cauchy()) if network.corners is not None else None
+    assert term is not None
+    everything = [
+        _point_term(network, np.ones(len(network.sightings), dtype=bool), Cauchy()),
+        *_terms_but_sightings(network, start, term),
+    ]
+    found = solve(values, everything, free)
+    residuals = found.residuals[next(i for i, t in enumerate(everything) if t is term)]
+    length = np.linalg.norm(residuals, axis=1)
+    # The median of a two-dimensional Gaussian's length is 1.177 sigmas.
+    good = length < OUTLIER_SIGMAS * float(np.median(length)) / 1.177
+    # Each placement takes six numbers of the corners, each camera of a chain six more.
+    spent = 6 * (len(network.placements) + len(network.rig.cameras) - 1)
+    dof = max(2 * int(good.sum()) - spent, int(good.sum()) // 2)
+    factor = max(float(np.sqrt(np.sum(residuals[good] ** 2) / dof)), 0.1)
+    return CornerTerm(
+        term.pixels[good],
+        term.points[good],
+        term.from_middle[good],
+        term.camera[good],
+        term.placement[good],
+        term.board[good],
+        term.sigma_px[good] * factor,
+        term.fisheye,
+    )
+
+
+def _fit(
+    network: Network,
+    found: Adjusted,
+    at: Sequence[At],
+    used: Bools,
+    corners: CornerTerm | None,
+) -> NetworkFit:
+    rig = rig_of(network.rig, found.values)
+    chi2, dof = found.chi2, found.dof
+    p_fits = float(chi2_distribution.sf(chi2, dof)) if dof > 0 else 1.0
+    factor = chi2 / dof if dof > 0 and p_fits < SIGNIFICANT else 1.0
+    names, T = named_errors(rig, found.values, list(at))
+    covariance = T @ found.covariance(list(at)) @ T.T * factor
+    # Lens numbers that were held have no error here, and no place among those that do.
+    known = np.diagonal(covariance) > 0
+    names = tuple(n for n, k in zip(names, known, strict=True) if k)
+    covariance = covariance[np.ix_(known, known)]
+    corner_errors = np.empty((0, 2)) if corners is None else corners.pixels - corners.project(found.values)
+    return NetworkFit(
+        rig=rig,
+        values=found.values,
+        covariance=RigCovariance(names, (covariance + covariance.T) / 2),
+        variance_factor=factor,
+        p_fits=p_fits,
+        dof=dof,
+        sighting_errors_px=sighting_errors(network, found.values),
+        sighting_sigmas=sighting_sigmas(network, found.values) if len(network.sightings) else np.empty(0),
+        used=used,
+        dot_shifts_m=array_of(found.values, "points") - network.dots.xyz,
+        corner_errors_px=corner_errors,
+        corners=corners,
+        adjusted=found,
+    )

@@ -1,0 +1,117 @@
+"""Surveys with swapped axes or a wrong unit: found by what makes everything fit.
+
+Pixels alone cannot tell everything. Dots of ONE plane look the same mirrored, from its other side; the scale of a
+survey shows only against boards, a screen's size or a camera's place by tape measure. And all mirrored surveys are the
+same one turned: which axes were swapped shows only where something else knows the world.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calibration.least_squares.adjustment import AdjustmentError
+from calibration.screens.network import Network
+from calibration.screens.network_start import NotConnectedError
+from calibration.screens.screens import Near, ScreenSetup, ScreensResult, calibrate
+from geometry.arrays import Array, Bools
+
+UNITS: Mapping[float, str] = {
+    1e-3: "metres were expected and millimetres written",
+    1e-2: "metres were expected and centimetres written",
+    0.0254: "metres were expected and inches written",
+    0.3048: "metres were expected and feet written",
+    1e3: "the numbers were divided by 1000 too often (kilometres, or metres taken for millimetres)",
+}
+_UNIT_MATCH = 0.2  # how near a ratio of sizes must come to a unit's
+
+
+def wrong_unit(extent_m: float, expected_m: float) -> str:
+    """Which unit explains that something is so large and not as expected; empty where none does."""
+    ratio = expected_m / extent_m
+    for factor, words in UNITS.items():
+        if abs(np.log(ratio / factor)) < _UNIT_MATCH:
+            return words
+    return ""
+
+
+@dataclass(frozen=True, slots=True)
+class Suspect:
+    """A change to the survey that makes everything fit."""
+
+    words: str  # what was done to the survey to mend it
+    factor: float  # by which the measurements then miss their sigmas
+
+
+def suspects(
+    network: Network,
+    setups: Sequence[ScreenSetup],
+    near: Mapping[int, Near],
+    held_screen: int | None,
+    current: float,
+) -> list[Suspect]:
+    """Changes to the survey with which everything fits much better than with the survey as it is, the best first.
+
+    current: by how much the measurements miss their sigmas now (inf where nothing was found at all).
+    """
+    out = []
+    for words, change in _changes(network):
+        trial = replace(network, dots=replace(network.dots, xyz=change(network.dots.xyz)))
+        miss = misfit(trial, setups, near, held_screen)
+        if miss < 0.3 * current:
+            out.append(Suspect(words, miss))
+    return sorted(out, key=lambda s: s.factor)
+
+
+def misfit(network: Network, setups: Sequence[ScreenSetup], near: Mapping[int, Near], held_screen: int | None) -> float:
+    """How badly a network fits together: sigmas, outliers, distances from where cameras stand; inf for not at all."""
+    try:
+        result = calibrate(network, setups, near, held_screen)
+    except (AdjustmentError, NotConnectedError, ValueError):
+        return float("inf")
+    return misfit_of(result, near)
+
+
+def misfit_of(result: ScreensResult, near: Mapping[int, Near]) -> float:
+    """The same of a result."""
+    out = float(np.sqrt(result.fit.variance_factor))
+    if len(result.fit.used):
+        out += 20.0 * float(np.mean(~result.fit.used))
+    for c, n in near.items():
+        centre = list(result.fit.rig.cameras.values())[c].camera_from_world.inverse().translation
+        out += 10.0 * max(float(np.linalg.norm(centre - n.position_m)) / n.within_m - 1.0, 0.0)
+    return out
+
+
+def _changes(network: Network) -> list[tuple[str, Callable[[Array], Array]]]:
+    """Ways in which a survey's columns get mixed up, of the whole survey and of the dots of one screen."""
+    axes = "xyz"
+    out: list[tuple[str, Callable[[Array], Array]]] = []
+    screens = list(network.rig.screens)
+    wholes: list[tuple[str, Bools]] = [("the survey", np.ones(len(network.dots), dtype=bool))]
+    if len(screens) > 1:
+        wholes += [(f"the dots of screen {n!r}", network.dots.screen_of == k) for k, n in enumerate(screens)]
+    for whose, some in wholes:
+        if not some.any():
+            continue
+        for order in itertools.permutations(range(3)):
+            if order == (0, 1, 2):
+                continue
+            words = f"{whose} with its columns in the order {', '.join(axes[o] for o in order)}"
+            if sum(a == b for a, b in enumerate(order)) == 1:
+                i, j = (k for k, o in enumerate(order) if k != o)
+                words = f"{whose} with its columns {axes[i]} and {axes[j]} swapped"
+            out.append((words, _changed(some, np.eye(3)[list(order)])))
+        for k in range(3):
+            turned = np.diag(np.where(np.arange(3) == k, -1.0, 1.0))
+            out.append((f"{whose} with the sign of {axes[k]} turned", _changed(some, turned)))
+        for factor, unit in UNITS.items():
+            out.append((f"{whose} times {factor:g} ({unit})", _changed(some, factor * np.eye(3))))
+    return out
+
+
+def _changed(some: Bools, matrix: Array) -> Callable[[Array], Array]:
+    return lambda xyz: np.where(some[:, None], xyz @ matrix.T, xyz)
