@@ -11,7 +11,7 @@ SAMPLE_RUNS := $(patsubst %/run.yaml,%,$(wildcard sample_runs/*/run.yaml))
 DEMO := results/demo
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all check format bench-tracking bench-detection lock wheel pointcloud clean
+.PHONY: help setup demo test test-all check format bench-tracking bench-detection bench-calibration lock wheel pointcloud clean
 
 help:  ## List the chores
 	@sed -n 's/^\([a-z-]*\):.*##  */\1|/p' $(MAKEFILE_LIST) | while IFS='|' read -r name what; do \
@@ -35,9 +35,10 @@ $(READY): requirements.lock pyproject.toml
 	@touch $(READY)
 
 # The batch's exit status is the demo's, but the paths are shown in any case.
-demo: setup  ## Process the sample runs and show where the results are
+demo: setup  ## Process the sample runs, calibrate the sample rig, show where the results are
 	@test -n "$(SAMPLE_RUNS)" || { echo "sample_runs/ holds no run (a folder with a run.yaml)." >&2; exit 2; }
 	@status=0; $(BIN)/beampose batch $(SAMPLE_RUNS) --out $(DEMO) || status=$$?; \
+	$(BIN)/beampose calibrate rig sample_runs/calibration --out $(DEMO)/calibration || status=$$?; \
 	echo; echo "Tables and reports:"; \
 	find $(DEMO) \( -name '*.csv' -o -name '*.html' \) | sort | sed 's/^/  /'; \
 	exit $$status
@@ -63,6 +64,9 @@ bench-tracking: setup  ## The tracking figures on fresh seeds, and the cost of a
 
 bench-detection: setup  ## The detection figures, on fresh seeds
 	$(BIN)/python -m bench.detection
+
+bench-calibration: setup  ## The calibration figures, on fresh seeds (a quarter of an hour)
+	$(BIN)/python -m bench.calibration
 
 # In an environment of its own, so that the lock file depends on pyproject.toml alone. Versions that are already
 # locked stay, unless pyproject.toml forbids them; `make lock LOCK_FLAGS=--upgrade` takes the newest. With the

@@ -323,7 +323,7 @@ def camera(
 
     \b
     Example:
-        beampose calibrate camera campaign/photos/left --board chessboard:9x6:25mm --out results/left
+        beampose calibrate camera campaign/photos/left --board campaign/board.yaml --out results/left
     """
     from lab.calibrate.camera import CameraOptions, calibrate_camera
 

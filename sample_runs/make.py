@@ -7,9 +7,12 @@ requirements.lock the bytes are those of this folder.
 from __future__ import annotations
 
 import argparse
+import tempfile
 from pathlib import Path
 from typing import Any
 
+from lab.calibrate.rig import RIG, calibrate_rig
+from lab.simulate.campaign_files import PROJECT, simulate_calibration
 from lab.simulate.write import simulate
 
 # Light "quiet" (a dark room and a quiet sensor) keeps the files small: most pixels show the black level. A picture of
@@ -22,12 +25,24 @@ SAMPLES: dict[str, dict[str, Any]] = {
         "scenario": "turntable", "seed": 3, "frames": 240, "light": "quiet", "picture_scale": 0.5, "video": True,
     },
     "four-skew-beams": {"scenario": "four-skew-beams", "seed": 4, "frames": 300, "detections_only": True},
+    "calibrated": {"scenario": "huo2015", "seed": 6, "frames": 300, "detections_only": True},
 }  # fmt: skip
+CALIBRATION, CALIBRATION_SEED = "calibration", 6  # the campaign; the run `calibrated` is of its true rig
+HERE = Path(__file__).resolve().parent
 
 
 def make(name: str, folder: Path) -> Path:
-    """Write one sample run into a new folder."""
-    return simulate(out_folder=folder, **SAMPLES[name])
+    """Write one sample run, or the calibration, into a new folder."""
+    if name == CALIBRATION:
+        return simulate_calibration(folder, seed=CALIBRATION_SEED)
+    if name != "calibrated":
+        return simulate(out_folder=folder, **SAMPLES[name])
+    # A recording of the rig as it truly is, given what the calibration knows of it.
+    with tempfile.TemporaryDirectory() as work:
+        campaign = HERE / CALIBRATION
+        calibrate_rig(campaign / PROJECT, Path(work) / "rig")
+        known = Path(work) / "rig" / RIG
+        return simulate(out_folder=folder, rig=campaign / "truth" / RIG, known_rig=known, **SAMPLES[name])
 
 
 def main() -> None:
@@ -36,10 +51,11 @@ def main() -> None:
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(SAMPLES)}; all where none is given")
     parser.add_argument("--out", type=Path, required=True, help="folder that gets a new folder for each sample")
     arguments = parser.parse_args()
-    unknown = [name for name in arguments.names if name not in SAMPLES]
+    known = (CALIBRATION, *SAMPLES)
+    unknown = [name for name in arguments.names if name not in known]
     if unknown:
-        parser.error(f"expected one of {', '.join(SAMPLES)}, got {unknown[0]!r}")
-    for name in arguments.names or SAMPLES:
+        parser.error(f"expected one of {', '.join(known)}, got {unknown[0]!r}")
+    for name in arguments.names or known:
         print(make(name, arguments.out / name))
 
 

@@ -8,7 +8,11 @@ import cv2
 import numpy as np
 import pytest
 
+from lab.calibrate.rig import calibrate_rig
 from lab.check import check
+from lab.process import process_run
+from lab.rig_covariance import joint_covariance
+from lab.rig_file import load_rig_file
 from lab.simulate.scene import compose
 
 FOLDER = Path(__file__).resolve().parents[1] / "sample_runs"
@@ -42,6 +46,30 @@ def test_the_readme_shows_the_command_that_the_script_runs(name):
 @pytest.mark.parametrize("name", make.SAMPLES)
 def test_every_sample_is_a_run_that_can_be_processed(name):
     assert check(FOLDER / name).exit_status == 0
+
+
+def test_the_calibration_comes_out_the_same_byte_for_byte(tmp_path):
+    made = make.make("calibration", tmp_path / "again")
+    kept = sorted(p.relative_to(FOLDER / "calibration") for p in (FOLDER / "calibration").rglob("*.*"))
+    assert [p.relative_to(made) for p in sorted(made.rglob("*.*"))] == kept
+    for path in kept:
+        assert (made / path).read_bytes() == (FOLDER / "calibration" / path).read_bytes()
+
+
+def test_the_calibrated_rig_is_what_the_calibration_gives_and_its_errors_are_as_it_says(tmp_path):
+    outcome = calibrate_rig(FOLDER / "calibration", tmp_path / "rig")
+    assert outcome.exit_status == 0
+    fresh, kept = (load_rig_file(p / "rig.yaml") for p in (tmp_path / "rig", FOLDER / "calibrated"))
+    again, known = (joint_covariance(f.rig, f.covariances, "") for f in (fresh, kept))
+    assert again.names == known.names
+    sigma = np.sqrt(np.diagonal(known.matrix))
+    np.testing.assert_allclose(np.sqrt(np.diagonal(again.matrix)), sigma, rtol=1e-3, atol=1e-12)
+    for name, camera in fresh.rig.cameras.items():  # another processor may end a thousandth of a sigma away
+        i = known.names.index(f"cameras.{name}.fx")
+        assert abs(camera.matrix[0, 0] - kept.rig.cameras[name].matrix[0, 0]) < 0.01 * sigma[i]
+    errors = process_run(FOLDER / "calibrated", tmp_path / "run").errors["pose"]["measured"]
+    # All frames share the calibration's errors, so that their mean NEES is that of a few frames: 2 to 12 in 98 of 100.
+    assert 2 < errors["nees_mean"] < 12
 
 
 def test_the_points_come_out_the_same_byte_for_byte(tmp_path):

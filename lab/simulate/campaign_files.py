@@ -18,6 +18,7 @@ from geometry.arrays import Array
 from geometry.camera import Camera
 from geometry.pose import Pose
 from lab import columns
+from lab.calibrate.board_file import save_board
 from lab.calibrate.camera_file import CameraCalibration, CameraFile, save_camera
 from lab.calibrate.point_files import POINTS, POSE_SIGMAS, SURVEY, SURVEY_SIGMAS
 from lab.calibrate.project import SCHEMA
@@ -33,7 +34,7 @@ PROJECT = "calibration.yaml"
 BOARD = "charuco:11x9:36mm:27mm:DICT_4X4_100"  # its corners count also where the board leaves the picture
 PHOTOS = 24  # per camera
 _PHOTO_POSES = 11  # seed of the board's places: not those that the lens covariance is made with
-_DATE = "2026-01-15"  # of the lens calibrations; a fixed day, so that the same seed gives the same bytes
+_DATE = "2026-01-15"  # of all that is measured; a fixed day, so that the same seed gives the same bytes
 
 
 def simulate_calibration(
@@ -107,6 +108,7 @@ def _project(c: Campaign) -> dict[str, Any]:
     out: dict[str, Any] = {
         "schema": SCHEMA,
         "name": f"{c.name}-{c.seed}",
+        "date": _DATE,
         "valid_days": 365,
         "cameras": {
             n: {
@@ -144,7 +146,7 @@ def _camera_file(name: str, lens: LensDraw) -> CameraFile:
 def _write_photos(c: Campaign, folder: Path) -> None:
     """Pictures of a board before each camera, and the board's name in a file beside them."""
     board = boards.parse(BOARD)
-    (folder / "board.txt").write_text(f"{BOARD}\n", encoding="utf-8")
+    save_board(board, folder / "board.yaml")
     for i, (name, camera) in enumerate(c.truth.cameras.items()):
         into = folder / "photos" / name
         into.mkdir(parents=True)

@@ -17,7 +17,7 @@ from geometry.rig import Rig
 from geometry.spots import SpotModel
 from lab import columns
 from lab.errors import InputError
-from lab.rig_file import load_rig_file, save_rig
+from lab.rig_file import RigFile, load_rig_file, save_rig
 from lab.run_file import save_run
 from lab.simulate.picture import Picture, Powers, Sensor, laser_powers, make_sensor, take
 from lab.simulate.points import simulate_points
@@ -108,7 +108,7 @@ def simulate(
             sources = _write_videos(scene, part, noisy, threads, progress)
         else:
             sources = _write_pictures(scene, part, noisy, threads, progress)
-        save_run(_run_mapping(scene, sources), part)
+        save_run(_run_mapping(scene, sources, known), part)
         if out_folder.is_dir():
             out_folder.rmdir()  # empty; os.replace onto it works on POSIX only
         os.replace(part, out_folder)
@@ -117,9 +117,13 @@ def simulate(
     return out_folder
 
 
-def _run_mapping(scene: Scene, sources: dict[str, dict[str, str]]) -> dict[str, object]:
+def _run_mapping(scene: Scene, sources: dict[str, dict[str, str]], known: RigFile | None) -> dict[str, object]:
     prior = scene.scenario.prior
+    # A simulation has no day of its own: it takes place when its rig was calibrated.
+    state = None if known is None else known.calibration
+    day = {} if state is None else {"recorded": state.date.isoformat()}
     return {
+        **day,
         "name": f"{scene.scenario.name}-{scene.seed}",
         "rig": "rig.yaml",
         "frame_rate_hz": scene.scenario.frame_rate_hz,

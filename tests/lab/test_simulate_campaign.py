@@ -121,14 +121,14 @@ def test_every_example_rig_can_be_calibrated_by_its_campaign(rig):
 
 @pytest.mark.slow
 def test_board_photographs_show_the_board_that_the_folder_names(tmp_path, monkeypatch):
-    from calibration.boards import kinds as boards
     from calibration.boards.board_detection import NotFound, find_board
+    from lab.calibrate.board_file import load_board
     from lab.pictures import read_picture
     from lab.simulate import campaign_files
 
     monkeypatch.setattr(campaign_files, "PHOTOS", 1)
     folder = simulate_calibration(tmp_path / "photos", seed=1, positions=3, photos=True)
-    board = boards.parse((folder / "board.txt").read_text())
+    board = load_board(folder / "board.yaml")
     picture = read_picture(folder / "photos" / "left" / "00.png", None)
     assert not isinstance(find_board(picture, board), NotFound)
 
