@@ -10,8 +10,9 @@ import cv2
 import numpy as np
 import pytest
 
+from calibration.boards import chessboard_detection, circle_detection, corner_refinement
 from calibration.boards.board_detection import BoardView, NotFound, find_board
-from calibration.boards.kinds import Board, chessboard_detection, circle_detection, corner_refinement, parse
+from calibration.boards.kinds import Board, parse
 from geometry import rotations
 from geometry.camera import FISHEYE, PERSPECTIVE, Camera
 from geometry.pose import Pose

@@ -11,11 +11,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from calibration.screens import clouds
 from calibration.screens.flatness import fit_surface, judge_flatness
 from calibration.screens.places import places
 from calibration.screens.registration import register
 from calibration.screens.screen_frame import frame_of_dots, frame_of_extent
-from calibration.screens.screens import ScreenSetup, clouds, facing, laid_on, pose_covariance, screen_of_dots
+from calibration.screens.screens import ScreenSetup, facing, laid_on, pose_covariance, screen_of_dots
 from geometry.arrays import numeric_jacobian
 from geometry.pose import Pose
 from geometry.rotations import exp
