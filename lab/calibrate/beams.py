@@ -10,14 +10,14 @@ from pathlib import Path
 import numpy as np
 
 from calibration.beams.beam_findings import ARCSEC, BeamGoals, beam_findings, direction_sigmas
-from calibration.beams.beams import BeamCalibration, Stand, self_calibrate
+from calibration.beams.beams import BeamCalibration, self_calibrate
 from calibration.beams.beams import calibrate_beams as find_beams
 from calibration.findings import Finding, Level, verdict
 from calibration.least_squares.adjustment import AdjustmentError
 from geometry.rig_parameters import RigCovariance
 from lab.calibrate.beam_tables import BEAMS, write_tables
 from lab.calibrate.project import Project, load_project
-from lab.calibrate.recordings import Recordings, read_recordings
+from lab.calibrate.recordings import Recordings, read_recordings, stand_of
 from lab.calibrate.screens_file import load_screens
 from lab.calibration_state import CalibrationState
 from lab.errors import CalibrationError, InputError
@@ -81,7 +81,7 @@ def calibrate_beams(
         if recordings.stand_from_body is None:
             found = self_calibrate(file.rig, recordings.spots, len(recordings.names), knowledge)
         else:
-            found = find_beams(file.rig, recordings.spots, _stand(project, recordings), knowledge)
+            found = find_beams(file.rig, recordings.spots, stand_of(project, recordings), knowledge)
     except AdjustmentError as error:
         raise CalibrationError(f"{project.path}: the beams cannot be calibrated: {error}") from None
     findings = [
@@ -145,15 +145,6 @@ def _lab_file(path: Path) -> tuple[RigFile, RigCovariance | None]:
         return RigFile(screens.rig, {}, screens.calibration), screens.covariance
     file = load_rig_file(path)
     return file, joint_covariance(file.rig, file.covariances, path)
-
-
-def _stand(project: Project, recordings: Recordings) -> Stand:
-    assert recordings.stand_from_body is not None
-    stand = project.stand
-    if stand is None or stand.world_from_stand is None:
-        return Stand(recordings.stand_from_body, recordings.pose_sigmas, None, None)
-    covariance = np.diag([stand.sigma_m**2] * 3 + [stand.sigma_rad**2] * 3)
-    return Stand(recordings.stand_from_body, recordings.pose_sigmas, stand.world_from_stand, covariance)
 
 
 def _findings_of_inputs(

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from calibration.beams.beams import Stand
 from calibration.beams.spot_term import SpotPixels
 from geometry.arrays import Array, Ints
 from geometry.pose import Pose
@@ -38,6 +39,16 @@ class Recordings:
     stand_from_body: Pose | None  # (P,); None where no position is known
     pose_sigmas: Array  # (P, 6): m, rad
     notes: tuple[str, ...]  # what was assumed
+
+
+def stand_of(project: Project, recordings: Recordings) -> Stand:
+    """The stand of recordings whose positions are known, for the solve."""
+    assert recordings.stand_from_body is not None
+    stand = project.stand
+    if stand is None or stand.world_from_stand is None:
+        return Stand(recordings.stand_from_body, recordings.pose_sigmas, None, None)
+    covariance = np.diag([stand.sigma_m**2] * 3 + [stand.sigma_rad**2] * 3)
+    return Stand(recordings.stand_from_body, recordings.pose_sigmas, stand.world_from_stand, covariance)
 
 
 def read_recordings(project: Project, rig: Rig) -> Recordings:

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 
 from calibration.beams.beam_findings import BeamGoals, beam_findings
-from calibration.beams.beams import Stand
 from calibration.findings import Finding, Level, verdict
 from calibration.least_squares.adjustment import AdjustmentError
 from calibration.rig.joint_findings import RigLimits, joint_findings
@@ -20,7 +19,7 @@ from calibration.screens.network_findings import ScreenLimits
 from calibration.screens.network_findings import findings as network_findings
 from geometry.rig import Rig
 from lab.calibrate.project import Project, load_project
-from lab.calibrate.recordings import Recordings, read_recordings
+from lab.calibrate.recordings import Recordings, read_recordings, stand_of
 from lab.calibrate.rig_outcome import Outcome
 from lab.calibrate.rig_tables import RESIDUALS, write_residuals
 from lab.calibrate.screen_inputs import ScreenInputs, screen_inputs
@@ -106,21 +105,12 @@ def _solved(project: Project, inputs: ScreenInputs, recordings: Recordings) -> R
             inputs.network,
             inputs.setups,
             recordings.spots,
-            _stand(project, recordings),
+            stand_of(project, recordings),
             inputs.near,
             inputs.held_screen,
         )
     except (AdjustmentError, ValueError) as error:
         raise CalibrationError(f"{project.path}: the rig cannot be calibrated: {error}") from None
-
-
-def _stand(project: Project, recordings: Recordings) -> Stand:
-    assert recordings.stand_from_body is not None
-    stand = project.stand
-    if stand is None or stand.world_from_stand is None:
-        return Stand(recordings.stand_from_body, recordings.pose_sigmas, None, None)
-    covariance = np.diag([stand.sigma_m**2] * 3 + [stand.sigma_rad**2] * 3)
-    return Stand(recordings.stand_from_body, recordings.pose_sigmas, stand.world_from_stand, covariance)
 
 
 def _of_the_steps(steps: RigSteps, drawing: Rig, positions: Sequence[str]) -> list[Finding]:
