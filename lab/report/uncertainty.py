@@ -49,8 +49,8 @@ def words(m: Material) -> str:
         return (
             "Noise differs from frame to frame, and a mean over frames lessens it. Errors of the calibration are the"
             " same in every frame at a pose: no mean lessens them, only a better calibration does. In differences"
-            " between two near poses most of them cancel. Covariance.csv holds both together, systematic.csv the"
-            " calibration's part."
+            " between two near poses most of them cancel. The table covariance.csv holds both together,"
+            " systematic.csv the calibration's part."
         )
     return (
         "The rig file states no covariance of its calibration: the sigmas hold the noise of the pictures alone. What"
