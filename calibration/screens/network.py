@@ -15,7 +15,7 @@ from scipy.stats import chi2 as chi2_distribution
 
 from calibration.least_squares.adjustment import Adjusted, At, Cauchy, Term, Values, solve
 from calibration.least_squares.priors import Prior, independent
-from calibration.least_squares.stacks import Poses, Vectors
+from calibration.least_squares.stacks import Poses, Stack, Vectors
 from calibration.lens.corners import CornerTerm
 from calibration.rig.rig_stacks import named_errors, rig_of, stacks_of
 from calibration.screens.board_on_screen import BoardOnScreenTerm
@@ -134,7 +134,7 @@ def adjust(network: Network, start: Start) -> NetworkFit:
 
 def _unknowns(network: Network, start: Start) -> tuple[Values, dict[str, bool | Bools], list[At]]:
     rig = network.rig
-    values: dict[str, object] = dict(stacks_of(rig))
+    values: dict[str, Stack] = dict(stacks_of(rig))
     values["cameras"], values["screens"] = Poses(start.camera_from_world), Poses(start.world_from_screen)
     values["bow"] = Vectors(start.bow)
     values["points"] = Vectors(network.dots.xyz)
@@ -163,7 +163,7 @@ def _unknowns(network: Network, start: Start) -> tuple[Values, dict[str, bool | 
     at: list[At] = [(s, i) for i in range(n_cameras) for s in ("intrinsics", "cameras")]
     at = [a for a in at if a[0] == "cameras" or lens[a[1]].any()]
     at += [(s, i) for i in range(n_screens) for s in ("screens", "bow") if s == "screens" or i in network.bent]
-    return values, free, at  # type: ignore[return-value]
+    return values, free, at
 
 
 def _terms_but_sightings(network: Network, start: Start, corners: CornerTerm | None) -> list[Term]:

@@ -13,6 +13,7 @@ from calibration.beams.beam_start import world_points
 from calibration.beams.beams import BeamCalibration
 from geometry.arrays import Array
 from geometry.rig import Rig
+from lab.tables import csv_word
 from lab.yaml_text import write_whole
 
 BEAMS, ANGLES, RESIDUALS = "beams.csv", "angles.csv", "residuals.csv"
@@ -41,13 +42,14 @@ def _beam_table(c: BeamCalibration, drawing: Rig) -> str:
         figures = [direction_sigmas(c)[i] / ARCSEC, 1e3 * offset_sigmas(c)[i], away[i, 0] / ARCSEC, 1e3 * away[i, 1]]
         if c.undetermined:
             figures[:2] = [np.nan, np.nan]
-        rows.append([_quoted(name), *(f"{v:.12g}" for v in numbers), *(_short(v) for v in figures)])
+        rows.append([csv_word(name), *(f"{v:.12g}" for v in numbers), *(_short(v) for v in figures)])
     return _csv(BEAM_COLUMNS, rows)
 
 
 def _angle_table(c: BeamCalibration) -> str:
     rows = [
-        [_quoted(a.first), _quoted(a.second), f"{np.rad2deg(a.angle):.9g}", _short(a.sigma / ARCSEC)] for a in c.angles
+        [csv_word(a.first), csv_word(a.second), f"{np.rad2deg(a.angle):.9g}", _short(a.sigma / ARCSEC)]
+        for a in c.angles
     ]
     return _csv(ANGLE_COLUMNS, rows)
 
@@ -60,7 +62,7 @@ def _residual_table(c: BeamCalibration, positions: Sequence[str]) -> str:
     for i in range(len(c.spots)):
         camera, spot = views[c.spots.view[i]]
         numbers = [*c.spots.pixels[i], *c.fit.residuals_px[i], mm[i], c.fit.sigmas[i]]
-        words = [_quoted(names[c.spots.position[i]]), _quoted(camera), _quoted(spot)]
+        words = [csv_word(names[c.spots.position[i]]), csv_word(camera), csv_word(spot)]
         rows.append([*words, *(_short(v) for v in numbers), "yes" if c.fit.kept[i] else "no"])
     return _csv(RESIDUAL_COLUMNS, rows)
 
@@ -92,7 +94,3 @@ def _csv(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 def _short(value: float) -> str:
     return f"{value:.6g}" if np.isfinite(value) else ""
-
-
-def _quoted(word: str) -> str:
-    return '"' + word.replace('"', '""') + '"' if any(c in word for c in ',"\n') else word

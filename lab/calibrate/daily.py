@@ -28,7 +28,7 @@ from geometry.camera import Camera
 from geometry.planes import meet_plane
 from geometry.rig import Rig
 from lab.calibrate.daily_expected import Compared, compare_points, compare_still, refuse_moving
-from lab.calibrate.daily_history import HistoryRow, quoted, read_history, write_history
+from lab.calibrate.daily_history import HistoryRow, read_history, write_history
 from lab.calibrate.daily_inputs import read_points, read_still, read_still_pose
 from lab.calibrate.daily_page import write_page
 from lab.calibrate.daily_result import CameraDrift, DailyLimits, OtherChange, Outcome, is_weak, level_of
@@ -36,6 +36,7 @@ from lab.calibrate.daily_words import camera_findings, other_findings, state_fin
 from lab.errors import InputError
 from lab.rig_covariance import joint_covariance
 from lab.rig_file import RigFile, load_rig_file
+from lab.tables import csv_word
 from lab.whole_folder import whole_folder
 
 TABLE = "drift.csv"
@@ -246,5 +247,5 @@ def write_drift_table(cameras: list[CameraDrift], path: Path) -> None:
         ]  # fmt: skip
         explanation = c.change.kind if c.change is not None else ""
         fields = ["" if not np.isfinite(v) else f"{v:.6g}" for v in numbers]
-        lines.append(",".join([quoted(c.camera), str(len(c.pixels)), *fields, quoted(explanation), c.level.name]))
+        lines.append(",".join([csv_word(c.camera), str(len(c.pixels)), *fields, csv_word(explanation), c.level.name]))
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from calibration.findings import Level
 from lab.errors import InputError
+from lab.tables import csv_word
 from lab.yaml_text import write_whole
 
 COLUMNS = ("date", "camera", "drift_px", "noise_px", "drift_mm", "verdict")
@@ -64,10 +65,5 @@ def write_history(rows: Sequence[HistoryRow], path: Path) -> None:
     lines = [",".join(COLUMNS)]
     for r in rows:
         numbers = ["" if math.isnan(v) else f"{v:.6g}" for v in (r.drift_px, r.noise_px, r.drift_mm)]
-        lines.append(",".join([r.date.isoformat(), quoted(r.camera), *numbers, r.verdict.name]))
+        lines.append(",".join([r.date.isoformat(), csv_word(r.camera), *numbers, r.verdict.name]))
     write_whole("\n".join(lines) + "\n", Path(path))
-
-
-def quoted(text: str) -> str:
-    """A field of a CSV row."""
-    return '"' + text.replace('"', '""') + '"' if any(c in text for c in ',"\n') else text

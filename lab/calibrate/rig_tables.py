@@ -7,10 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
+from calibration.lens.corners import CornerTerm
 from calibration.rig.joint import CORNERS, DOTS, RECORDS, SPOTS, Joint
+from calibration.rig.pose_records import RecordTerm
 from calibration.rig.rig_steps import RigSteps
 from calibration.screens.surveyed import array_of
 from geometry.arrays import Array
+from lab.tables import csv_word
 from lab.yaml_text import write_whole
 
 RESIDUALS = "residuals.csv"
@@ -22,7 +25,7 @@ def write_residuals(steps: RigSteps, positions: Sequence[str], path: Path) -> No
     """Write the table: measured less adjusted, one row per number. sigmas: against the sigma that was told."""
     lines = [",".join(COLUMNS)]
     for kind, name, camera, axis, residual, unit, sigmas, used in _rows(steps, positions):
-        lines.append(f"{kind},{_quoted(name)},{camera},{axis},{residual:.6g},{unit},{sigmas:.4g},{int(used)}")
+        lines.append(f"{kind},{csv_word(name)},{camera},{axis},{residual:.6g},{unit},{sigmas:.4g},{int(used)}")
     write_whole("\n".join(lines) + "\n", path)
 
 
@@ -53,17 +56,15 @@ def _rows(steps: RigSteps, positions: Sequence[str]) -> Iterator[_Row]:
         for name, e, s1 in zip(network.dots.names, away, sigma, strict=True):
             for k in range(3):
                 yield "survey", name, "", _AXES[k], float(1e3 * e[k]), "mm", float(e[k] / s1[k]), True
-    if RECORDS in joint.every:
-        yield from _records(joint, positions)
-    if CORNERS in joint.every:
-        term = joint.every[CORNERS]
-        whole = term.linearise(joint.values).residuals
-        of_camera = np.asarray(term.camera)  # type: ignore[attr-defined]
-        place = np.asarray(term.placement)  # type: ignore[attr-defined]
-        sigma_px = np.asarray(term.sigma_px)  # type: ignore[attr-defined]
-        for i, r in enumerate(whole):
-            name = f"{network.placements[place[i]]} corner {i}"
-            yield from _pixel("corner", name, cameras[of_camera[i]], -r * sigma_px[i], r, bool(joint.kept[CORNERS][i]))
+    records = joint.every.get(RECORDS)
+    if isinstance(records, RecordTerm):
+        yield from _records(records, joint, positions)
+    corners = joint.every.get(CORNERS)
+    if isinstance(corners, CornerTerm):
+        for i, r in enumerate(corners.linearise(joint.values).residuals):
+            name = f"{network.placements[corners.placement[i]]} corner {i}"
+            px = -r * corners.sigma_px[i]
+            yield from _pixel("corner", name, cameras[corners.camera[i]], px, r, bool(joint.kept[CORNERS][i]))
 
 
 def _pixel(kind: str, name: str, camera: str, px: Array, sigmas: Array, used: bool) -> Iterator[_Row]:
@@ -71,9 +72,8 @@ def _pixel(kind: str, name: str, camera: str, px: Array, sigmas: Array, used: bo
         yield kind, name, camera, axis, float(value), "px", float(-s), used
 
 
-def _records(joint: Joint, positions: Sequence[str]) -> Iterator[_Row]:
-    term = joint.every[RECORDS]
-    told = np.asarray(term.sigmas)  # type: ignore[attr-defined]
+def _records(term: RecordTerm, joint: Joint, positions: Sequence[str]) -> Iterator[_Row]:
+    told = term.sigmas
     for k, r in enumerate(term.linearise(joint.values).residuals):
         for axis in range(6):
             if np.isfinite(told[k, axis]) and told[k, axis] > 0:
@@ -81,7 +81,3 @@ def _records(joint: Joint, positions: Sequence[str]) -> Iterator[_Row]:
                 value, unit = (1e3 * value, "mm") if axis < 3 else (np.rad2deg(value), "deg")
                 name = f"position {positions[k]}"
                 yield "stand", name, "", _AXES[axis], float(value), unit, float(-r[axis]), bool(joint.kept[RECORDS][k])
-
-
-def _quoted(name: str) -> str:
-    return '"' + name.replace('"', '""') + '"' if "," in name or '"' in name else name
