@@ -16,7 +16,7 @@ from lab.report.plan_page import write_plan_page
 from lab.report.tables import angle, length, percent
 from lab.rig_covariance import TARGET, joint_covariance
 from lab.rig_file import load_rig_file
-from lab.whole_folder import whole_folder
+from lab.whole_folder import refuse_foreign, whole_folder
 
 TABLE, EFFECTS, REPORT = "plan.csv", "effects.csv", "report.html"
 
@@ -53,14 +53,19 @@ def plan_rig(rig_path: Path, out: Path, options: PlanOptions | None = None) -> P
     rig that cannot be read, options that make no sense, or a folder with something else in it.
     """
     options = PlanOptions() if options is None else options
+    refuse_foreign(out, _is_ours)
     plan = plan_of(rig_path, options)
     found = findings(plan)
-    with whole_folder(Path(out), may_replace=lambda folder: (folder / TABLE).is_file()) as work:
+    with whole_folder(Path(out), may_replace=_is_ours) as work:
         write_plan(plan, work / TABLE)
         write_effects(plan, work / EFFECTS)
         write_plan_page(plan, found, Path(rig_path), work)
     sigma_m, sigma_deg = median_sigma(plan)
     return PlanOutcome(verdict(found), len(plan.status), float(plan.measured.mean()), sigma_m, sigma_deg, Path(out))
+
+
+def _is_ours(folder: Path) -> bool:
+    return (folder / TABLE).is_file()
 
 
 def plan_of(rig_path: Path, options: PlanOptions) -> Plan:

@@ -11,6 +11,30 @@ from pathlib import Path
 from lab.errors import InputError
 
 
+def refuse_foreign(target: Path, may_replace: Callable[[Path], bool]) -> None:
+    """Raises InputError where no results could go to `target`; nothing is made.
+
+    For the beginning of what takes long: a mistake in --out then shows before the work and not after it.
+    """
+    target = Path(target)
+    if target.is_symlink() and not target.exists():
+        raise InputError(f"{target}: expected a folder for the results, found a broken link; choose another --out")
+    if target.exists() and not target.is_dir():
+        raise InputError(f"{target}: expected a folder for the results, found a file; choose another --out")
+    above = next(p for p in (target, *target.absolute().parents) if p.exists())
+    if not above.is_dir():
+        raise InputError(f"{target}: the folder cannot be made: {above} is a file; choose another --out")
+    # An existing target is replaced by a rename, for which its parent must allow writing.
+    place = target.absolute().parent if above == target else above
+    if not os.access(place, os.W_OK | os.X_OK):
+        raise InputError(
+            f"{target}: the folder cannot be made: {place} may not be written to; choose another --out, or ask for the"
+            " right to write there"
+        )
+    if target.is_dir() and any(target.iterdir()) and not may_replace(target):
+        raise InputError(f"{target}: the folder holds something other than earlier results; choose another --out")
+
+
 @contextmanager
 def whole_folder(target: Path, may_replace: Callable[[Path], bool]) -> Iterator[Path]:
     """Yields an empty folder beside `target`, which takes its place when the block ends well, and vanishes when not.
@@ -19,17 +43,14 @@ def whole_folder(target: Path, may_replace: Callable[[Path], bool]) -> Iterator[
     a folder with something else in it is never deleted.
     """
     target = Path(target)
-    if target.exists() and not target.is_dir():
-        raise InputError(f"{target}: expected a folder for the results, found a file; choose another --out")
-    if target.is_dir() and any(target.iterdir()) and not may_replace(target):
-        raise InputError(f"{target}: the folder holds something other than earlier results; choose another --out")
+    refuse_foreign(target, may_replace)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         work = target.parent / f".{target.name}.part-{os.getpid()}"
         shutil.rmtree(work, ignore_errors=True)
         work.mkdir()
     except OSError as error:
-        raise InputError(f"{target}: the folder cannot be made: {error.strerror}") from None
+        raise InputError(f"{target}: the folder cannot be made: {error.strerror}; choose another --out") from None
     try:
         yield work
         _replace(work, target)

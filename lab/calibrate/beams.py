@@ -23,7 +23,7 @@ from lab.calibration_state import CalibrationState
 from lab.errors import CalibrationError, InputError
 from lab.rig_covariance import blocks_of, joint_covariance
 from lab.rig_file import RigFile, load_rig_file, save_rig
-from lab.whole_folder import beside_a_good_one, whole_folder
+from lab.whole_folder import beside_a_good_one, refuse_foreign, whole_folder
 from lab.yaml_text import did_you_mean, read_mapping
 
 RIG = "rig.yaml"
@@ -73,6 +73,7 @@ def calibrate_beams(
     earlier calibration: it then goes to `OUT-failed`. Raises InputError for what is wrong with the files,
     CalibrationError where the spots give no calibration at all; `out` is then as it was.
     """
+    refuse_foreign(out, _is_ours)
     project = load_project(Path(project_path))
     rig_path = Path(rig) if rig is not None else project.path.parent / RIG
     file, knowledge = _calibrated_lab(project, rig_path)
@@ -94,7 +95,7 @@ def calibrate_beams(
     outcome = Outcome(
         project.name, folder, level, tuple(findings), found, None if level == Level.FAIL else folder / RIG
     )
-    with whole_folder(folder, may_replace=lambda folder: (folder / BEAMS).is_file()) as work:
+    with whole_folder(folder, may_replace=_is_ours) as work:
         write_tables(found, file.rig, recordings.names, work)
         if level != Level.FAIL:
             save_rig(_rig_file(file, found, project, findings, day), work / RIG)
@@ -103,6 +104,10 @@ def calibrate_beams(
         inputs = [rig_path, *project.inputs]
         write_page(project.name, found, findings, file.rig, recordings.names, inputs, day, work)
     return outcome
+
+
+def _is_ours(folder: Path) -> bool:
+    return (folder / BEAMS).is_file()
 
 
 def _calibrated_lab(project: Project, rig_path: Path) -> tuple[RigFile, RigCovariance | None]:

@@ -23,7 +23,7 @@ from lab.calibrate.camera_outcome import Outcome
 from lab.calibrate.photos import Progress, find_in_photos
 from lab.camera_block import Covariance
 from lab.errors import CalibrationError, InputError
-from lab.whole_folder import beside_a_good_one, whole_folder
+from lab.whole_folder import beside_a_good_one, refuse_foreign, whole_folder
 from lab.yaml_text import did_you_mean
 
 CAMERA, FAILED, CORNERS = "camera.yaml", "camera.failed.yaml", "corners.csv"
@@ -77,6 +77,7 @@ def calibrate_camera(
     photographs do not determine the camera.
     """
     options = options or CameraOptions()
+    refuse_foreign(out, _is_ours)
     day = today or datetime.date.today()
     known = board_of(board) if isinstance(board, str | Path) else board
     found = find_in_photos(photos, known, progress, fewest=FEWEST_VIEWS)
@@ -88,13 +89,17 @@ def calibrate_camera(
     folder = beside_a_good_one(out, result.verdict == Level.FAIL, CAMERA)
     outcome = Outcome(options.name, folder, result, found)
     file = camera_file(outcome, options, day)
-    with whole_folder(folder, may_replace=lambda folder: (folder / CORNERS).is_file()) as work:
+    with whole_folder(folder, may_replace=_is_ours) as work:
         save_camera(file, work / (FAILED if outcome.level == Level.FAIL else CAMERA))
         _write_corners(outcome, work / CORNERS)
         from lab.calibrate.camera_page import write_page  # the template engine: only for those who write a report
 
         write_page(outcome, file, day, work)
     return outcome
+
+
+def _is_ours(folder: Path) -> bool:
+    return (folder / CORNERS).is_file()
 
 
 def camera_file(outcome: Outcome, options: CameraOptions, day: datetime.date) -> CameraFile:

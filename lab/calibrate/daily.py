@@ -37,7 +37,7 @@ from lab.errors import InputError
 from lab.rig_covariance import joint_covariance
 from lab.rig_file import RigFile, load_rig_file
 from lab.tables import csv_word
-from lab.whole_folder import whole_folder
+from lab.whole_folder import refuse_foreign, whole_folder
 
 TABLE = "drift.csv"
 COLUMNS = (
@@ -66,6 +66,7 @@ def daily_check(
     folder, a folder of results or a spots.csv of a vehicle at rest, whose pose is free or read from `pose`. history: a
     CSV that this check's rows are added to. Raises InputError.
     """
+    refuse_foreign(out, _is_ours)
     limits = limits or DailyLimits()
     today = today or datetime.date.today()
     rig_path = Path(rig_path)
@@ -96,12 +97,16 @@ def daily_check(
     inputs = [rig_path, *(p for p in (points, survey, pose) if p is not None)]
     inputs += [Path(run)] if run is not None and Path(run).is_file() else []
     outcome = Outcome(Path(out), verdict(findings), tuple(cameras), tuple(findings))
-    with whole_folder(Path(out), may_replace=lambda folder: (folder / TABLE).is_file()) as work:
+    with whole_folder(Path(out), may_replace=_is_ours) as work:
         write_drift_table(cameras, work / TABLE)
         write_page(outcome, file, compared, others, [*earlier, *rows], limits, today, inputs, work)
     if history is not None:
         write_history([*earlier, *rows], history)
     return outcome
+
+
+def _is_ours(folder: Path) -> bool:
+    return (folder / TABLE).is_file()
 
 
 def _pose_covariance(limits: DailyLimits) -> Array:

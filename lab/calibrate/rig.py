@@ -27,7 +27,7 @@ from lab.calibration_state import CalibrationState
 from lab.errors import CalibrationError, InputError
 from lab.rig_covariance import blocks_of
 from lab.rig_file import RigFile, save_rig
-from lab.whole_folder import beside_a_good_one, whole_folder
+from lab.whole_folder import beside_a_good_one, refuse_foreign, whole_folder
 
 RIG = "rig.yaml"
 FAILED_RIG = "rig.failed.yaml"  # its name where the verdict is FAIL, so that nothing reads it by mistake
@@ -45,6 +45,7 @@ def calibrate_rig(
     Raises InputError for what is wrong with the files, CalibrationError where the measurements give no calibration at
     all; nothing is then written.
     """
+    refuse_foreign(out, _is_ours)
     project = load_project(Path(project_path))
     if not project.beams or not project.spots:
         raise InputError(
@@ -70,13 +71,17 @@ def calibrate_rig(
     level = verdict(findings)
     folder = beside_a_good_one(out, level == Level.FAIL, RIG)
     outcome = Outcome(project.name, folder, level, tuple(findings), steps, expected, held_out)
-    with whole_folder(folder, may_replace=lambda f: (f / RESIDUALS).is_file()) as work:
+    with whole_folder(folder, may_replace=_is_ours) as work:
         save_rig(_rig_file(outcome, project, day), work / (FAILED_RIG if level == Level.FAIL else RIG))
         write_residuals(steps, recordings.names, work / RESIDUALS)
         from lab.calibrate.rig_page import write_page  # the template engine: only for those who write a report
 
         write_page(outcome, rig, recordings, project.inputs, day, work)
     return outcome
+
+
+def _is_ours(folder: Path) -> bool:
+    return (folder / RESIDUALS).is_file()
 
 
 def _recordings(project: Project, rig: Rig, inputs: ScreenInputs) -> Recordings:

@@ -26,7 +26,7 @@ from lab.calibration_state import CalibrationState
 from lab.errors import CalibrationError, InputError
 from lab.rig_covariance import blocks_of
 from lab.rig_file import RigFile, save_rig
-from lab.whole_folder import beside_a_good_one, whole_folder
+from lab.whole_folder import beside_a_good_one, refuse_foreign, whole_folder
 
 SCREENS, RIG = "screens.yaml", "rig.yaml"
 SUSPICIOUS = 4.0  # misfit (see survey_suspects.py) from which swapped axes and wrong units are looked for
@@ -74,6 +74,7 @@ def calibrate_screen(project_path: Path, out: Path, today: datetime.date | None 
     calibration: it then goes to `OUT-failed`. Raises InputError for what is wrong with the files, CalibrationError
     where they give no calibration at all; `out` is then as it was.
     """
+    refuse_foreign(out, _is_ours)
     project = load_project(Path(project_path))
     inputs = screen_inputs(project)
     result = _adjusted(project, inputs)

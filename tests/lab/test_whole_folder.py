@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 from pathlib import Path
 
 import pytest
 
 from lab.errors import InputError
-from lab.whole_folder import beside_a_good_one, whole_folder
+from lab.whole_folder import beside_a_good_one, refuse_foreign, whole_folder
 
 
 def never(folder: Path) -> bool:
@@ -160,3 +161,46 @@ def test_failed_results_go_beside_good_ones_and_anywhere_else_where_asked(tmp_pa
     assert beside_a_good_one(good, False, "camera.yaml") == good
     assert beside_a_good_one(good, True, "camera.yaml") == tmp_path / "left-failed"
     assert beside_a_good_one(good, True, "rig.yaml") == good
+
+
+def test_a_wrong_place_is_told_before_any_work_and_with_a_cure(tmp_path):
+    foreign = tmp_path / "letters"
+    foreign.mkdir()
+    (foreign / "letter.txt").write_text("dear")
+    (tmp_path / "file").write_text("")
+    (tmp_path / "link").symlink_to(tmp_path / "nowhere")
+    for place, words in (
+        (foreign, "holds something other than earlier results"),
+        (tmp_path / "file", "found a file"),
+        (tmp_path / "file" / "sub" / "results", "file is a file"),
+        (tmp_path / "link", "a broken link"),
+    ):
+        with pytest.raises(InputError, match=f"{words}; choose another --out"):
+            refuse_foreign(place, never)
+    assert names(tmp_path) == ["file", "letters", "link"]
+
+
+def test_a_free_place_and_earlier_results_are_no_mistake_and_nothing_is_made(tmp_path):
+    (tmp_path / "old").mkdir()
+    (tmp_path / "old" / "a.csv").write_text("1")
+    refuse_foreign(tmp_path / "old", always)
+    refuse_foreign(tmp_path / "new" / "results", never)
+    assert names(tmp_path) == ["old"]
+
+
+@pytest.mark.parametrize(
+    "work",
+    [
+        lambda out: importlib.import_module("lab.calibrate.screen").calibrate_screen(Path("none.yaml"), out),
+        lambda out: importlib.import_module("lab.calibrate.beams").calibrate_beams(Path("none.yaml"), out),
+        lambda out: importlib.import_module("lab.calibrate.rig").calibrate_rig(Path("none.yaml"), out),
+        lambda out: importlib.import_module("lab.calibrate.camera").calibrate_camera([], "none", out),
+        lambda out: importlib.import_module("lab.calibrate.daily").daily_check(Path("none.yaml"), out),
+        lambda out: importlib.import_module("lab.plan").plan_rig(Path("none.yaml"), out),
+    ],
+    ids=["screen", "beams", "rig", "camera", "check", "plan"],
+)
+def test_every_long_work_looks_at_its_place_first(work, tmp_path):
+    (tmp_path / "letter.txt").write_text("dear")
+    with pytest.raises(InputError, match="choose another --out"):
+        work(tmp_path)
