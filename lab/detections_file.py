@@ -51,7 +51,7 @@ def read_detections(path: Path) -> DetectionsFile | None:
     frame, camera, u_px or v_px.
     """
     optional = ("sigma_u_px", "sigma_v_px", "cov_uv_px2", *SHAPE)
-    table = read_table(path, REQUIRED, numbers=("frame", "u_px", "v_px", *optional))
+    table = read_table(path, REQUIRED, numbers=("frame", "u_px", "v_px", *optional), damaged=True)
     n = len(table)
     notes = []
 

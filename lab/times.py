@@ -9,7 +9,7 @@ import numpy as np
 
 from geometry.arrays import Array, Ints
 from lab import columns
-from lab.csv_text import read_table, whole_numbers
+from lab.csv_text import numbers_in, read_table, whole_numbers
 from lab.errors import InputError
 
 
@@ -47,10 +47,7 @@ def load_times(path: Path, frame_rate_hz: float) -> Times:
     if table.empty:
         raise InputError(f"{path}: expected a row per frame, got none")
     frames = whole_numbers(table, "frame", path)
-    times_s = table["t_s"].to_numpy(dtype=float)
-    bad = np.flatnonzero(~np.isfinite(times_s))
-    if bad.size:
-        raise InputError(f"{path}: line {bad[0] + 2}: t_s: expected seconds, got {table['t_s'].iloc[bad[0]]}")
+    times_s = numbers_in(table, "t_s", path, "seconds")
     bad = np.flatnonzero(np.diff(frames) <= 0)
     if bad.size:
         raise InputError(

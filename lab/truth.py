@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,7 +14,7 @@ from geometry.pose import Pose
 from geometry.rig import Rig
 from geometry.spots import SpotModel
 from lab import columns
-from lab.csv_text import read_table, whole_numbers
+from lab.csv_text import found_at, numbers_in, read_table, whole_numbers
 from lab.errors import InputError
 from lab.rig_file import QUATERNION_TOLERANCE
 from lab.yaml_text import did_you_mean
@@ -50,21 +51,34 @@ def load_pose_table(path: Path) -> pd.DataFrame:
     frames = whole_numbers(table, "frame", path)
     _refuse(path, np.diff(frames, prepend=frames[:1] - 1) <= 0, "frame: expected rising numbers", frames)
     for name in columns.TRUTH_POSE[1:]:
-        _refuse(path, ~np.isfinite(table[name].to_numpy()), f"{name}: expected a number", table[name].to_numpy())
-    length = np.linalg.norm(table[["qw", "qx", "qy", "qz"]].to_numpy(), axis=1)
-    wrong = np.abs(length - 1) > QUATERNION_TOLERANCE
-    _refuse(path, wrong, "qw,qx,qy,qz: expected a quaternion of length 1, one of length", length)
+        numbers_in(table, name, path)
+    refuse_other_lengths(path, range(2, len(table) + 2), table[["qw", "qx", "qy", "qz"]].to_numpy())
     return table.assign(frame=frames)
+
+
+def refuse_other_lengths(path: Path, lines: Sequence[int], quaternions: Array) -> None:
+    """Raises InputError at the first of the quaternions (n, 4) whose length is not 1."""
+    length = np.linalg.norm(quaternions, axis=1)
+    bad = np.flatnonzero(~(np.abs(length - 1) <= QUATERNION_TOLERANCE))
+    if bad.size:
+        raise InputError(
+            f"{path}: line {lines[bad[0]]}: qw,qx,qy,qz: expected a quaternion of length 1, got one of length"
+            f" {length[bad[0]]:.7g}; give all digits, or divide each of the four numbers by that length"
+        )
 
 
 def _load_spots(path: Path, rig: Rig | None) -> pd.DataFrame:
     table = read_table(path, columns.TRUTH_SPOTS)
     frames = whole_numbers(table, "frame", path)
     in_view = table["in_view"].to_numpy()
-    _refuse(path, ~np.isin(in_view, (0, 1, 2)), "in_view: expected 0, 1 or 2", in_view)
-    uv = table[["u_px", "v_px"]].to_numpy()
-    where_none = np.any(~np.isfinite(uv), axis=1) & (in_view > 0)
-    _refuse(path, where_none, "u_px, v_px: expected numbers where in_view is 1 or 2", uv)
+    for i in np.flatnonzero(~np.isin(in_view, (0, 1, 2)))[:1]:
+        raise InputError(f"{path}: line {i + 2}: in_view: expected 0, 1 or 2, got {found_at(table, 'in_view', i)}")
+    for name in ("u_px", "v_px"):
+        for i in np.flatnonzero(~np.isfinite(table[name].to_numpy()) & (in_view > 0))[:1]:
+            raise InputError(
+                f"{path}: line {i + 2}: {name}: expected a number where in_view is 1 or 2, got"
+                f" {found_at(table, name, i)}"
+            )
     if rig is not None:
         for name, known in (("camera", rig.cameras), ("spot", rig.spots)):
             for word in table[name].unique():

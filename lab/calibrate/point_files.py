@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from geometry.arrays import Array, Bools, Ints
+from geometry.arrays import Array, Ints
 from geometry.pose import Pose
 from lab import columns
-from lab.csv_text import read_table, whole_numbers
+from lab.calibrate.plausible import (
+    SIGMAS_DEG,
+    SIGMAS_M,
+    SIGMAS_PX,
+    refuse_far_pixels,
+    refuse_far_places,
+    refuse_sigmas,
+)
+from lab.csv_text import numbers_in, read_table, whole_numbers
 from lab.errors import InputError
-from lab.rig_file import QUATERNION_TOLERANCE
+from lab.truth import refuse_other_lengths
 from lab.yaml_text import did_you_mean
 
 if TYPE_CHECKING:
@@ -81,6 +89,7 @@ def read_survey(paths: Sequence[Path], screens: Collection[str]) -> Survey:
                 )
             where[name] = f"{path.name}, line {i + 2}"
         coordinates = _finite(path, table, SURVEY[1:])
+        refuse_far_places(path, _lines(table), SURVEY[1:], coordinates)
         sigmas, note = _survey_sigmas(path, table)
         notes += note
         on = _names(path, table, "screen", empty=True) if "screen" in table else [""] * len(table)
@@ -105,8 +114,10 @@ def read_survey(paths: Sequence[Path], screens: Collection[str]) -> Survey:
     )
 
 
-def read_observations(paths: Sequence[Path], cameras: Collection[str], points: Collection[str]) -> Observations:
-    """Pixels of surveyed points. cameras, points: those of the project; other names are mistakes.
+def read_observations(
+    paths: Sequence[Path], cameras: Mapping[str, tuple[int, int]], points: Collection[str]
+) -> Observations:
+    """Pixels of surveyed points. cameras (with the size of their pictures), points: the project's; others are mistakes.
 
     Raises InputError in one line.
     """
@@ -134,11 +145,13 @@ def read_observations(paths: Sequence[Path], cameras: Collection[str], points: C
                 )
         camera += of_camera
         point += of_point
-        pixels.append(_finite(path, table, POINTS[2:]))
+        uv = _finite(path, table, POINTS[2:])
+        refuse_far_pixels(path, _lines(table), of_camera, uv, cameras)
+        pixels.append(uv)
         if "sigma_px" in table:
-            given = table["sigma_px"].to_numpy(dtype=float)
+            given = numbers_in(table, "sigma_px", path, "a number above 0", may_be_empty=True)
+            refuse_sigmas(path, _lines(table), "sigma_px", given, SIGMAS_PX, "px")
             sigma = np.where(np.isnan(given), DEFAULT_POINT_SIGMA_PX, given)
-            _refuse(path, ~(sigma > 0) | ~np.isfinite(sigma), "sigma_px: expected a number above 0", sigma)
         else:
             notes.append(f"{path}: no column sigma_px: {DEFAULT_POINT_SIGMA_PX} px is assumed")
             sigma = np.full(len(table), DEFAULT_POINT_SIGMA_PX)
@@ -162,17 +175,23 @@ def read_poses(path: Path) -> StandPoses:
     table = read_table(path, columns.TRUTH_POSE, numbers=(*columns.TRUTH_POSE, *POSE_SIGMAS))
     _some_rows(path, table, columns.TRUTH_POSE)
     frames = whole_numbers(table, "frame", path)
-    _refuse(path, np.diff(frames, prepend=frames[:1] - 1) <= 0, "frame: expected rising numbers", frames)
+    falling = np.flatnonzero(np.diff(frames) <= 0) + 1
+    if falling.size:
+        raise InputError(
+            f"{path}: line {falling[0] + 2}: frame: expected rising numbers, got {frames[falling[0]]} after"
+            f" {frames[falling[0] - 1]}; sort the rows, and give each frame once"
+        )
+    numbers_in(table, "t_s", path, "seconds", may_be_empty=True)
     xyz = _finite(path, table, ("x_m", "y_m", "z_m"))
+    refuse_far_places(path, _lines(table), ("x_m", "y_m", "z_m"), xyz)
     q = _finite(path, table, ("qw", "qx", "qy", "qz"))
-    length = np.linalg.norm(q, axis=1)
-    wrong = np.abs(length - 1) > QUATERNION_TOLERANCE
-    _refuse(path, wrong, "qw,qx,qy,qz: expected a quaternion of length 1, one of length", length)
+    refuse_other_lengths(path, _lines(table), q)
     sigmas = np.full((len(table), 6), np.nan)
     for k, name in enumerate(POSE_SIGMAS):
         if name in table:
-            value = table[name].to_numpy(dtype=float)
-            _refuse(path, value < 0, f"{name}: expected 0 or more", value)
+            value = numbers_in(table, name, path, "0 or more", may_be_empty=True)
+            allowed, unit = ((0.0, SIGMAS_M[1]), "m") if k < 3 else (SIGMAS_DEG, "deg")
+            refuse_sigmas(path, _lines(table), name, value, allowed, unit)
             sigmas[:, k] = value if k < 3 else np.radians(value)
     return StandPoses(frames, Pose.from_quaternion(q, xyz), sigmas)
 
@@ -196,12 +215,12 @@ def _names(path: Path, table: pd.DataFrame, column: str, empty: bool = False) ->
 
 
 def _finite(path: Path, table: pd.DataFrame, names: Sequence[str]) -> Array:
-    out = table[list(names)].to_numpy(dtype=float)
-    bad = np.argwhere(~np.isfinite(out))
-    if len(bad):
-        i, k = bad[0]
-        raise InputError(f"{path}: line {i + 2}: {names[k]}: expected a number, got {out[i, k]:g}")
-    return out
+    return np.stack([numbers_in(table, name, path) for name in names], axis=1)
+
+
+def _lines(table: pd.DataFrame) -> range:
+    """The line of the file of each row."""
+    return range(2, len(table) + 2)
 
 
 def _survey_sigmas(path: Path, table: pd.DataFrame) -> tuple[Array, list[str]]:
@@ -210,8 +229,8 @@ def _survey_sigmas(path: Path, table: pd.DataFrame) -> tuple[Array, list[str]]:
     sigmas = np.full((len(table), 3), np.nan)
     for k, name in enumerate(SURVEY_SIGMAS):
         if name in table:
-            sigmas[:, k] = table[name].to_numpy(dtype=float)
-            _refuse(path, sigmas[:, k] <= 0, f"{name}: expected a number above 0", sigmas[:, k])
+            sigmas[:, k] = numbers_in(table, name, path, "a number above 0", may_be_empty=True)
+            refuse_sigmas(path, _lines(table), name, sigmas[:, k], SIGMAS_M, "m")
     none = np.isnan(sigmas)
     if not none.any():
         return sigmas, []
@@ -219,9 +238,3 @@ def _survey_sigmas(path: Path, table: pd.DataFrame) -> tuple[Array, list[str]]:
     return np.where(none, DEFAULT_SURVEY_SIGMA_M, sigmas), [
         f"{path}: {what}: {1e3 * DEFAULT_SURVEY_SIGMA_M:g} mm is assumed; give the instrument's figure"
     ]
-
-
-def _refuse(path: Path, wrong: Bools, expected: str, found: np.ndarray) -> None:
-    bad = np.flatnonzero(wrong)
-    if bad.size:
-        raise InputError(f"{path}: line {bad[0] + 2}: {expected}, got {found[bad[0]]}")

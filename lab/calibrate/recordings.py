@@ -14,10 +14,11 @@ from calibration.beams.spot_term import SpotPixels
 from geometry.arrays import Array, Ints
 from geometry.pose import Pose
 from geometry.rig import Rig
+from lab.calibrate.plausible import SIGMAS_PX, refuse_far_pixels, refuse_sigmas
 from lab.calibrate.point_files import StandPoses, read_poses
 from lab.calibrate.project import Project, Recording
 from lab.calibrate.still_frames import SpotRows, average, positions_at_rest
-from lab.csv_text import read_table, whole_numbers
+from lab.csv_text import numbers_in, read_table, shown_line, whole_numbers
 from lab.errors import InputError
 from lab.yaml_text import did_you_mean
 
@@ -145,7 +146,9 @@ def read_spot_table(path: Path, rig: Rig, notes: list[str]) -> SpotRows:
         raise InputError(f"{path}: {table.attrs['malformed']} lines have more fields than the header; mend them")
     key = "position" if "position" in table else "frame"
     if key not in table:
-        raise InputError(f"{path}: expected a column 'position' (or 'frame'), got {','.join(table.columns)}")
+        raise InputError(
+            f"{path}: expected a column 'position' (or 'frame'), got {shown_line(','.join(table.columns))}"
+        )
     whole = whole_numbers(table, key, path)
     table = table.assign(**{key: whole}, line=np.arange(len(table)) + 2)
     if "status" in table:
@@ -155,11 +158,12 @@ def read_spot_table(path: Path, rig: Rig, notes: list[str]) -> SpotRows:
     views = {view: i for i, view in enumerate(rig.views())}
     view = np.empty(len(table), dtype=np.int64)
     lines = table["line"].to_numpy()
+    wanted = {"camera": "a calibrated camera", "spot": "a spot of the target"}
     for i, (camera, spot) in enumerate(zip(table["camera"], table["spot"], strict=True)):
         for kind, name, names in (("camera", camera, rig.cameras), ("spot", spot, rig.spots)):
             if name not in names:
                 raise InputError(
-                    f"{path}: line {lines[i]}: {kind}: expected a {kind} of the target and its lab, got {name!r}"
+                    f"{path}: line {lines[i]}: {kind}: expected {wanted[kind]}, got {name!r}"
                     f"{did_you_mean(name, names)}"[:240]
                 )
         if (camera, spot) not in views:
@@ -168,10 +172,9 @@ def read_spot_table(path: Path, rig: Rig, notes: list[str]) -> SpotRows:
                 f" {spot!r} falls on {rig.spots[spot].screen!r}; one of the two names is wrong"
             )
         view[i] = views[camera, spot]
-    pixels = table[["u_px", "v_px"]].to_numpy(dtype=float)
-    bad = np.flatnonzero(~np.isfinite(pixels).all(axis=1))
-    if len(bad):
-        raise InputError(f"{path}: line {lines[bad[0]]}: u_px, v_px: expected two numbers, got {pixels[bad[0]]}")
+    pixels = np.stack([numbers_in(table, name, path) for name in ("u_px", "v_px")], axis=1)
+    sizes = {name: c.image_size_px for name, c in rig.cameras.items()}
+    refuse_far_pixels(path, lines.tolist(), table["camera"].tolist(), pixels, sizes)
     pairs = np.stack([table[key].to_numpy(), view], axis=1)
     _, first, count = np.unique(pairs, axis=0, return_index=True, return_counts=True)
     if key == "frame" and np.any(count > 1):
@@ -193,14 +196,16 @@ def _covariances(path: Path, table: pd.DataFrame, notes: list[str]) -> Array:
                 notes.append(f"{path.name}: no column sigma_px: {DEFAULT_SPOT_SIGMA_PX:g} px is assumed")
             out[:, k, k] = DEFAULT_SPOT_SIGMA_PX**2
             continue
-        sigma = table[name].to_numpy(dtype=float)
-        bad = np.flatnonzero(~(sigma > 0) | ~np.isfinite(sigma))
-        if len(bad):
-            line = table["line"].iloc[bad[0]]
-            raise InputError(f"{path}: line {line}: {name}: expected a number above 0, got {sigma[bad[0]]}")
-        out[:, k, k] = sigma**2
+        given = numbers_in(table, name, path, "a number above 0", may_be_empty=True)
+        refuse_sigmas(path, table["line"].tolist(), name, given, SIGMAS_PX, "px")
+        out[:, k, k] = np.where(np.isnan(given), DEFAULT_SPOT_SIGMA_PX, given) ** 2
+        if k == 0 and np.isnan(given).any():
+            notes.append(
+                f"{path.name}: {int(np.isnan(given).sum())} spots without a sigma: {DEFAULT_SPOT_SIGMA_PX:g} px is"
+                " assumed"
+            )
     if "cov_uv_px2" in table and columns[0] != columns[1]:
-        cov = np.nan_to_num(table["cov_uv_px2"].to_numpy(dtype=float))
+        cov = np.nan_to_num(numbers_in(table, "cov_uv_px2", path, may_be_empty=True))
         bound = 0.99 * np.sqrt(out[:, 0, 0] * out[:, 1, 1])
         out[:, 0, 1] = out[:, 1, 0] = np.clip(cov, -bound, bound)
     return out

@@ -48,7 +48,9 @@ class ScreenInputs:
 def screen_inputs(project: Project) -> ScreenInputs:
     """Read everything that a project measured of its screens. Raises InputError, CalibrationError."""
     survey = read_survey(project.survey, project.screens)
-    observations = read_observations(project.points, project.cameras, survey.names)
+    observations = read_observations(
+        project.points, {n: c.lens.image_size_px for n, c in project.cameras.items()}, survey.names
+    )
     rig = Rig(
         screens={n: Screen(n, Pose.identity(), s.size_m) for n, s in project.screens.items()},
         cameras={n: replace(c.lens.camera(c.screen), name=n) for n, c in project.cameras.items()},

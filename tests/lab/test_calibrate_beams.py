@@ -245,7 +245,7 @@ def test_beams_that_are_swapped_against_the_drawing_are_told(campaign, tmp_path)
     [
         (
             lambda t: t.replace("0,left,1,", "0,lfet,1,", 1),
-            "line 2: camera: expected a camera of the target",
+            "line 2: camera: expected a calibrated camera, got",
         ),
         (lambda t: t.replace("0,left,1,", "0,left,4,", 1), "observes screen 'left', spot '4' falls on 'right'"),
         (
@@ -257,7 +257,7 @@ def test_beams_that_are_swapped_against_the_drawing_are_told(campaign, tmp_path)
             "expected rows position,camera,spot,u_px,v_px below",
         ),
         (lambda t: t.replace("position", "place"), "expected a column 'position' \\(or 'frame'\\)"),
-        (lambda t: t.replace(t.splitlines()[1], "0,left,1,nan,3,0.05"), "line 2: u_px, v_px: expected two numbers"),
+        (lambda t: t.replace(t.splitlines()[1], "0,left,1,nan,3,0.05"), "line 2: u_px: expected a number, got 'nan'"),
         (lambda t: t.replace(t.splitlines()[1], "0,left,1,1.0,3,-1"), "line 2: sigma_px: expected a number above 0"),
         (lambda t: t.replace(t.splitlines()[1], "0.5,left,1,1.0,3,1"), "line 2: position: expected a whole number"),
         (lambda t: "", "got an empty file"),

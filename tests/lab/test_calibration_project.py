@@ -143,8 +143,21 @@ SURVEY = "point,x_m,y_m,z_m,sigma_x_m,sigma_y_m,sigma_z_m,screen\n"
         ("", "got an empty file"),
         (SURVEY, "expected rows .* below the header, got none"),
         ("point,x,y,z\nP1,0,0,0\n", r"expected a column 'x_m', got point,x,y,z"),
-        (SURVEY + "P1,0,0,nan,,,,\n", "line 2: z_m: expected a number, got nan"),
-        (SURVEY + "P1,0,0,a lot,,,,\n", "line 2: z_m: expected a number, got nan"),
+        (SURVEY + "P1,0,0,nan,,,,\n", "line 2: z_m: expected a number, got 'nan'"),
+        (SURVEY + "P1,0,0,a lot,,,,\n", "line 2: z_m: expected a number, got 'a lot'"),
+        (SURVEY + "P1,0,0\n", "line 2: z_m: expected a number, got nothing"),
+        (
+            SURVEY + "P1,0,0,0,,,,\nP2,0,1e300,0,,,,\n",
+            "line 3: y_m: expected metres, within 10 km of .* got 1e\\+300; ",
+        ),
+        (SURVEY + "P1,0,0,0,0.3mm,,,\n", "line 2: sigma_x_m: expected a number above 0, got '0.3mm'; leave the field"),
+        (SURVEY + "P1,0,0,0,,nan,,\n", "line 2: sigma_y_m: expected a number above 0, got 'nan'"),
+        (SURVEY + "P1,0,0,0,,,1e300,\n", "line 2: sigma_z_m: expected .* up to 10000 m, got 1e\\+300"),
+        (SURVEY.replace("screen", "x_m") + "P1,0,0,0,,,,\n", "each column once, got 'x_m' twice in the header"),
+        (SURVEY.replace(",", ";"), "expected columns separated by commas, got semicolons; separate columns"),
+        (SURVEY.encode("utf-16"), "not text in UTF-8; save it as CSV"),
+        (b"\x89PNG\r\n\0\0", "not text in UTF-8; save it as CSV"),
+        (SURVEY.encode() + b"P\xfcnkt,0,0,0,,,,\n", "line 2: expected text in UTF-8, got a byte that is none; save"),
         (
             SURVEY + "P1,0,0,0,,,,\nP1,1,0,0,,,,\n",
             r"line 3: .* each point once, got 'P1' again \(first in survey.csv, line 2\)",
@@ -157,9 +170,19 @@ SURVEY = "point,x_m,y_m,z_m,sigma_x_m,sigma_y_m,sigma_z_m,screen\n"
 )
 def test_surveys_that_cannot_be_used_say_which_line_and_why(tmp_path, text, words):
     path = tmp_path / "survey.csv"
-    path.write_text(text)
-    with pytest.raises(InputError, match=words):
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    with pytest.raises(InputError, match=words) as caught:
         read_survey([path], ["left", "right"])
+    assert str(caught.value).isprintable()  # nothing of a binary file goes to the terminal
+
+
+def test_only_an_empty_sigma_means_that_none_is_known(tmp_path):
+    (tmp_path / "points.csv").write_text(POINTS + "left,P1,2560,1,\nleft,P2,-1280,1,0.3\n")
+    seen = read_observations([tmp_path / "points.csv"], {"left": (1280, 1024)}, ["P1", "P2"])
+    assert seen.sigma_px.tolist() == [0.2, 0.3]
+    (tmp_path / "poses.csv").write_text(f"{POSES},sigma_x_m\n0,,0,0,0,1,0,0,0,\n1,,0,0,0,1,0,0,0,0.1 mm\n")
+    with pytest.raises(InputError, match=r"line 3: sigma_x_m: expected 0 or more, got '0.1 mm'; leave the field empty"):
+        read_poses(tmp_path / "poses.csv")
 
 
 def test_a_survey_without_sigmas_is_given_a_millimetre_and_says_so(tmp_path):
@@ -185,13 +208,20 @@ POINTS = "camera,point,u_px,v_px,sigma_px\n"
         (POINTS + "left,P1,1,2,0.1\nleft,P1,1,2,0.1\n", "line 3: expected each point once per camera"),
         (POINTS + "left,P1,,2,0.1\n", "line 2: u_px: expected a number"),
         (POINTS + "left,P1,1,2,-1\n", "line 2: sigma_px: expected a number above 0, got -1"),
+        (POINTS + "left,P1,1,2,abc\n", "line 2: sigma_px: expected a number above 0, got 'abc'"),
+        (
+            POINTS + "left,P1,1e300,2,0.1\n",
+            "line 2: u_px: expected .* 'left' .1280 x 1024 px., got 1e\\+300; correct it",
+        ),
+        (POINTS + "left,P1,1,-5e6,0.1\n", "line 2: v_px: expected a pixel in or near the picture .* got -5000000; "),
+        (POINTS + "left,P1,2561,1,0.1\n", "line 2: u_px: expected a pixel in or near the picture"),
     ],
 )
 def test_points_that_cannot_be_used_say_which_line_and_why(tmp_path, text, words):
     path = tmp_path / "points.csv"
     path.write_text(text)
     with pytest.raises(InputError, match=words):
-        read_observations([path], ["left"], ["P1", "P2"])
+        read_observations([path], {"left": (1280, 1024)}, ["P1", "P2"])
 
 
 POSES = "frame,t_s,x_m,y_m,z_m,qw,qx,qy,qz"
@@ -211,8 +241,13 @@ def test_poses_of_a_stand_are_read_with_the_sigmas_that_they_have(tmp_path):
     ("rows", "words"),
     [
         ("0,0,0,0,0,1,0,0,0\n0,1,0,0,0,1,0,0,0\n", "line 3: frame: expected rising numbers"),
-        ("0,0,0,0,0,1,1,0,0\n", "line 2: .*quaternion of length 1"),
-        ("0,0,0,inf,0,1,0,0,0\n", "line 2: y_m: expected a number"),
+        (
+            "0,0,0,0,0,1,1,0,0\n",
+            "line 2: .*quaternion of length 1, got one of length 1.414214; give all digits, or divide",
+        ),
+        ("0,0,0,inf,0,1,0,0,0\n", "line 2: y_m: expected a number, got inf"),
+        ("0,0,0,1e300,0,1,0,0,0\n", "line 2: y_m: expected metres, within 10 km"),
+        ("0,later,0,0,0,1,0,0,0\n", "line 2: t_s: expected seconds, got 'later'"),
     ],
 )
 def test_poses_that_are_none_are_refused(tmp_path, rows, words):

@@ -102,16 +102,13 @@ def test_a_line_with_too_many_fields_is_left_out_and_said(tmp_path):
     [
         ("", "expected columns frame,camera,u_px,v_px, got an empty file"),
         ("frame,camera,u,v_px\n0,left,1,2\n", "expected a column 'u_px', got frame,camera,u,v_px"),
-        ("frame;camera;u_px;v_px\n0;left;1;2\n", "expected a column 'frame', got frame;camera;u_px;v_px"),
-        ("frame,camera,u_px,v_px,u_px\n0,left,1,2,3\n", ""),
+        ("frame;camera;u_px;v_px\n0;left;1;2\n", "expected columns separated by commas, got semicolons"),
+        ("frame,camera,u_px,v_px,u_px\n0,left,1,2,3\n", "expected each column once, got 'u_px' twice"),
     ],
 )
 def test_a_table_without_its_columns_is_told_so(text, words, tmp_path):
     path = tmp_path / "detections.csv"
     path.write_text(text)
-    if not words:  # pandas names the second one u_px.1, which is a column more
-        assert len(read_detections(path).cameras["left"].points) == 1
-        return
     with pytest.raises(InputError) as caught:
         read_detections(path)
     assert words in str(caught.value)

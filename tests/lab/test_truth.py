@@ -67,11 +67,15 @@ def test_the_frame_that_disagrees_is_named(tmp_path):
     [
         ("pose.csv", "frame,t,x_m\n", "truth/pose.csv: expected a column 't_s', got frame,t,x_m"),
         ("pose.csv", POSE + "0,0,0,0,0,1,0,0,0\n0,0,0,0,0,1,0,0,0\n", "line 3: frame: expected rising numbers, got 0"),
-        ("pose.csv", POSE + "0,0,0,0,0,1,0.1,0,0\n", "line 2: qw,qx,qy,qz: expected a quaternion of length 1"),
-        ("pose.csv", POSE + "0,0,0,,0,1,0,0,0\n", "line 2: y_m: expected a number, got nan"),
+        (
+            "pose.csv",
+            POSE + "0,0,0,0,0,1,0.1,0,0\n",
+            "line 2: qw,qx,qy,qz: expected a quaternion of length 1, got one of length 1.004988;",
+        ),
+        ("pose.csv", POSE + "0,0,0,,0,1,0,0,0\n", "line 2: y_m: expected a number, got nothing"),
         ("pose.csv", POSE + "0.5,0,0,0,0,1,0,0,0\n", "line 2: frame: expected a whole number, got 0.5"),
         ("spots.csv", SPOTS + "0,left,1,1,2,3\n", "line 2: in_view: expected 0, 1 or 2, got 3"),
-        ("spots.csv", SPOTS + "0,left,1,,,1\n", "line 2: u_px, v_px: expected numbers where in_view is 1 or 2"),
+        ("spots.csv", SPOTS + "0,left,1,,,1\n", "line 2: u_px: expected a number where in_view is 1 or 2, got nothing"),
         (
             "spots.csv",
             SPOTS + "0,lft,1,1,2,1\n",
