@@ -131,6 +131,8 @@ def read_text(path: Path) -> str:
         ) from None
     except FileNotFoundError:
         raise InputError(f"{path}: expected a file, found none; check the path") from None
+    except IsADirectoryError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}; name a file in it") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from None
 
@@ -197,6 +199,14 @@ def write_mapping(content: Mapping[str, Any], path: Path) -> None:
     write_whole(yaml.dump(dict(content), Dumper=_Writer, sort_keys=False, allow_unicode=True, width=120), path)
 
 
+_WRITE_CURES = {
+    IsADirectoryError: "; name a file in it",
+    FileNotFoundError: "; make its folder first",
+    NotADirectoryError: "; choose another place",
+    PermissionError: "; choose another place, or ask for the right to write there",
+}
+
+
 def write_whole(text: str, path: Path) -> None:
     """Write a text file so that `path` is either the whole new file or what it was before."""
     beside = path.with_name(f".{path.name}.{os.getpid()}.part")
@@ -208,4 +218,5 @@ def write_whole(text: str, path: Path) -> None:
         beside.replace(path)
     except OSError as error:
         beside.unlink(missing_ok=True)
-        raise InputError(f"{path}: cannot be written: {error.strerror}") from None
+        cure = next((text for kind, text in _WRITE_CURES.items() if isinstance(error, kind)), "")
+        raise InputError(f"{path}: cannot be written: {error.strerror}{cure}") from None

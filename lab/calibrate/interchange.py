@@ -76,7 +76,7 @@ def convert(
     target = _known(to_format, FORMATS, "--to") if to_format else _format_of_name(destination)
     found, covariances = _read(text, source, origin)
     models = _chosen(found.cameras, camera, source, target)
-    _check_destination(source, destination)
+    _check_destination(source, destination, target)
     try:
         notes = found.notes + _write(models, covariances, destination, target)
     except FormatError as error:
@@ -216,18 +216,29 @@ def _chosen(models: Sequence[CameraModel], camera: str | None, path: Path, targe
 # Out --------------------------------------------------------------------------------------------------------------
 
 
-def _check_destination(source: Path, destination: Path) -> None:
-    """Raises InputError where writing would destroy the source or a rig."""
+def _check_destination(source: Path, destination: Path, target: str) -> None:
+    """Raises InputError where writing would destroy the source or anything but cameras in the format to be written."""
     if not destination.exists():
         return
+    if destination.is_dir():
+        raise InputError(f"{destination}: expected a file to write, found a folder; name a file in it")
     if destination.samefile(source):
         raise InputError(f"{destination}: source and destination are the same file; choose another name")
+    if not destination.stat().st_size:
+        return
     try:
-        is_rig = recognise(read_text(destination), destination) == RIG
+        text = read_text(destination)
+        there = recognise(text, destination)
+        if there == target:
+            _read(text, destination, target)
     except InputError:
-        is_rig = False
-    if is_rig:
+        there = ""  # the format alone is not enough: a board.yaml is ours too, and OpenCV stores anything as YAML
+    if there == RIG:
         raise InputError(f"{destination}: is a rig, which one camera must not replace; choose another name")
+    if there != target:
+        raise InputError(
+            f"{destination}: exists and is no {_LABELS[target]}; choose another name, or remove that file first"
+        )
 
 
 def _write(

@@ -35,6 +35,7 @@ from lab.fields import (
     Vector3,
     Word,
     a_truth_value,
+    a_word,
     numbers,
     one_of,
     positive_numbers,
@@ -187,8 +188,8 @@ def load_project(path: Path) -> Project:
         valid_days=content.valid_days,
         cameras={name: c for name, c in cameras.items() if c is not None},
         screens={name: reader.screen(name, block) for name, block in content.screens.items()},
-        survey=tuple(reader.file(p, f"survey.{i}") for i, p in enumerate(content.survey)),
-        points=tuple(reader.file(p, f"points.{i}") for i, p in enumerate(content.points)),
+        survey=reader.files(content.survey, "survey"),
+        points=reader.files(content.points, "points"),
         boards=tuple(reader.shared_board(b, f"boards.{i}") for i, b in enumerate(content.boards)),
         world=content.world,
         beams={} if content.target is None else content.target.beam_values(),
@@ -227,6 +228,14 @@ def _days(value: Any) -> int | None:
     return value
 
 
+def _name(value: Any) -> str:
+    name = a_word(value)
+    if any(c in name for c in "/\\") or not name.isprintable():
+        raise unexpected("a name without / and \\", value)
+    return name
+
+
+_Name = Annotated[str, pydantic.PlainValidator(_name)]
 _Paths = Annotated[list[str], pydantic.PlainValidator(_paths)]
 _BoardText = Annotated[str, pydantic.PlainValidator(_board)]
 
@@ -326,11 +335,11 @@ class _RecordingBlock(Block):
 
 class _ProjectBlock(Block):
     schema_: Annotated[str, pydantic.PlainValidator(one_of((SCHEMA,)))] = pydantic.Field(alias="schema")
-    name: Word | None = None
+    name: Annotated[str | None, pydantic.PlainValidator(lambda v: None if v is None else _name(v))] = None
     date: Day | None = None
     valid_days: Annotated[int | None, pydantic.PlainValidator(_days)] = None
-    cameras: dict[str, _CameraBlock]
-    screens: dict[str, _ScreenBlock]
+    cameras: dict[_Name, _CameraBlock]
+    screens: dict[_Name, _ScreenBlock]
     survey: _Paths = []  # noqa: RUF012 - frozen
     points: _Paths = []  # noqa: RUF012 - frozen
     boards: list[_SharedBoardBlock] = []  # noqa: RUF012 - frozen
@@ -377,11 +386,17 @@ class _Reader:
 
     def file(self, name: str, where: str) -> Path:
         path = self.folder / name
-        if not path.is_file():
+        if path.is_dir():
+            self.mistakes.append(f"{where}: expected a file, found a folder at {path}; name a file in it")
+        elif not path.is_file():
             near = did_you_mean(path.name, [p.name for p in path.parent.glob("*")] if path.parent.is_dir() else [])
             hint = near if "did you mean" in near else "; paths start at this file's folder"
             self.mistakes.append(f"{where}: expected a file, found none at {path}{hint}")
         return path
+
+    def files(self, names: Sequence[str], where: str) -> tuple[Path, ...]:
+        """Several files, or the only one, which messages name without a number."""
+        return tuple(self.file(p, where if len(names) == 1 else f"{where}.{i}") for i, p in enumerate(names))
 
     def camera(self, name: str, block: _CameraBlock) -> CameraEntry | None:
         where = f"cameras.{name}.intrinsics"

@@ -123,10 +123,40 @@ def test_a_file_of_no_known_format_is_told_so(text, words, tmp_path):
 def test_a_failed_conversion_leaves_what_was_there(source, tmp_path):
     save_camera(CameraFile("left", (1280, 1024), K, (0.1,) * 12), source)
     old = tmp_path / "camchain.yaml"
-    old.write_text("mine")
+    save_camera(CameraFile("right", (1280, 1024), K, (0.1, 0.0, 0.0, 0.0)), tmp_path / "right.yaml")
+    convert(tmp_path / "right.yaml", old)
+    before = old.read_text()
     with pytest.raises(InputError, match="kalibr cannot hold this lens"):
         convert(source, old)
-    assert old.read_text() == "mine"
+    assert old.read_text() == before
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["my notes\n", "%YAML:1.0\n---\nbackground: 7\n", "schema: beampose/board/1\nboard: x\n", b"\x89PNG\0\xff"],
+)
+def test_only_cameras_of_the_same_format_are_written_over(source, tmp_path, text):
+    old = tmp_path / "existing.yml"
+    old.write_bytes(text if isinstance(text, bytes) else text.encode())
+    before = old.read_bytes()
+    for target in ("opencv", "beampose"):
+        with pytest.raises(InputError, match=r"exists and is no .*; choose another name, or remove that file first"):
+            convert(source, old, to_format=target)
+    assert old.read_bytes() == before
+    old.write_text("")
+    for _ in range(2):  # nothing is lost of an empty file, nor of what an earlier conversion wrote
+        convert(source, old)
+    assert "opencv-matrix" in old.read_text()
+
+
+def test_a_folder_is_no_place_for_a_conversion_and_that_is_said_with_the_cure(source, tmp_path):
+    (tmp_path / "a.yml").mkdir()
+    with pytest.raises(InputError, match="expected a file to write, found a folder; name a file in it"):
+        convert(source, tmp_path / "a.yml")
+    with pytest.raises(InputError, match="Is a directory; name a file in it"):
+        convert(tmp_path, tmp_path / "b.yml")
+    with pytest.raises(InputError, match="No such file or directory; make its folder first"):
+        convert(source, tmp_path / "none" / "b.yml")
 
 
 def test_neither_the_source_nor_a_rig_is_written_over(rig, source):
@@ -149,3 +179,4 @@ def test_every_format_is_recognised_by_its_content_alone(source, tmp_path):
     for name in FORMATS:
         convert(source, tmp_path / "anything.dat", to_format=name)
         assert recognise((tmp_path / "anything.dat").read_text(), tmp_path / "anything.dat") == name
+        (tmp_path / "anything.dat").unlink()
