@@ -81,9 +81,11 @@ def read_table(path: Path, numbers: Iterable[str], texts: Iterable[str] = ()) ->
                     known = words[name]
                     codes = [known.setdefault(field, len(known)) for field in columns[place[name]]]
                     code_pieces[name].append(np.array(codes, dtype=np.int64))
-    except (OSError, UnicodeDecodeError) as error:
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: cannot be read: it is not text in UTF-8; process the run again") from None
+    except OSError as error:
         raise InputError(f"{path}: cannot be read ({error})") from error
-    except ValueError as error:
+    except (ValueError, csv.Error) as error:
         raise InputError(f"{path}: expected rows of equal length and numbers in number columns ({error})") from error
     return Table(
         numbers={n: np.concatenate([np.zeros(0), *pieces[n]]) for n in numbers},

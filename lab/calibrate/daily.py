@@ -8,6 +8,7 @@ calibration was made from make the check milder than it says: their own errors a
 from __future__ import annotations
 
 import datetime
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +32,15 @@ from lab.calibrate.daily_expected import Compared, compare_points, compare_still
 from lab.calibrate.daily_history import HistoryRow, read_history, write_history
 from lab.calibrate.daily_inputs import read_points, read_still, read_still_pose
 from lab.calibrate.daily_page import write_page
-from lab.calibrate.daily_result import CameraDrift, DailyLimits, OtherChange, Outcome, is_weak, level_of
+from lab.calibrate.daily_result import (
+    CameraDrift,
+    DailyLimits,
+    OtherChange,
+    Outcome,
+    is_weak,
+    level_of,
+    not_checked,
+)
 from lab.calibrate.daily_words import camera_findings, other_findings, state_findings
 from lab.errors import InputError
 from lab.rig_covariance import joint_covariance
@@ -96,7 +105,7 @@ def daily_check(
     rows = [HistoryRow(today, c.camera, c.drift_px, c.noise_px, c.drift_mm, c.level) for c in cameras]
     inputs = [rig_path, *(p for p in (points, survey, pose) if p is not None)]
     inputs += [Path(run)] if run is not None and Path(run).is_file() else []
-    outcome = Outcome(Path(out), verdict(findings), tuple(cameras), tuple(findings))
+    outcome = Outcome(Path(out), verdict(findings), tuple(cameras), tuple(findings), _unchecked(file.rig, cameras))
     with whole_folder(Path(out), may_replace=_is_ours) as work:
         write_drift_table(cameras, work / TABLE)
         write_page(outcome, file, compared, others, [*earlier, *rows], limits, today, inputs, work)
@@ -135,12 +144,12 @@ def judge(
         others += apart
         findings += [f for c in found for f in camera_findings(c, limits, pose_free)]
     findings += other_findings(others, limits)
-    unseen = [name for name in file.rig.cameras if name not in {c.camera for c in cameras}]
+    unseen = _unchecked(file.rig, cameras)
     if unseen:
         findings.append(
             Finding(
                 Level.WARN,
-                f"not checked: camera {', '.join(unseen)} has no points",
+                not_checked(unseen),
                 "its drift, if any, is not known",
                 "measure known points in every camera",
             )
@@ -159,6 +168,11 @@ def judge(
             Finding(Level.PASS, f"the points' file gives no sigma_px: {limits.point_sigma_px:g} px is taken for each")
         )
     return cameras, others, findings
+
+
+def _unchecked(rig: Rig, cameras: Sequence[CameraDrift]) -> tuple[str, ...]:
+    checked = {c.camera for c in cameras}
+    return tuple(name for name in rig.cameras if name not in checked)
 
 
 def _camera_drift(

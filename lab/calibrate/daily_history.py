@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from calibration.findings import Level
+from lab.csv_text import shown_line
 from lab.errors import InputError
 from lab.tables import csv_word
 from lab.yaml_text import write_whole
@@ -36,10 +37,14 @@ def read_history(path: Path) -> list[HistoryRow]:
         return []
     try:
         lines = list(csv.reader(path.read_text(encoding="utf-8").splitlines()))
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read as text ({error})") from None
+    except UnicodeDecodeError:
+        raise InputError(
+            f"{path}: expected a history, got a file that is not text in UTF-8; name another --history"
+        ) from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}; name another --history") from None
     if not lines or tuple(lines[0]) != COLUMNS:
-        found = ",".join(lines[0])[:80] if lines else "an empty file"
+        found = shown_line(",".join(lines[0])[:80]) if lines else "an empty file"
         raise InputError(f"{path}: expected columns {','.join(COLUMNS)}, got {found}; name another --history")
     rows = []
     for number, fields in enumerate(lines[1:], 2):
@@ -50,7 +55,8 @@ def read_history(path: Path) -> list[HistoryRow]:
             )
         except (ValueError, KeyError):
             raise InputError(
-                f"{path}: line {number}: expected {','.join(COLUMNS)}, got {','.join(fields)[:80]}; mend or delete it"
+                f"{path}: line {number}: expected {','.join(COLUMNS)}, got {shown_line(','.join(fields)[:80])};"
+                " mend or delete it"
             ) from None
         rows.append(row)
     return rows

@@ -14,10 +14,12 @@ import numpy as np
 from geometry.arrays import Array
 from geometry.pose import Pose
 from geometry.rig import Rig
+from lab.calibrate.plausible import SIGMAS_PX, refuse_far_pixels, refuse_sigmas
+from lab.csv_text import check_header, table_bytes
 from lab.errors import InputError
 from lab.results import read_poses, read_spots
 from lab.truth import load_pose_table
-from lab.yaml_text import did_you_mean
+from lab.yaml_text import did_you_mean, shown
 
 PIXELS = ("camera", "point", "u_px", "v_px")
 _METRES = 500.0  # a coordinate beyond it is taken for millimetres: no lab is that large
@@ -93,13 +95,14 @@ def read_points(path: Path, survey: Path | None, rig: Rig, default_sigma_px: flo
         point.append(row["point"])
         pixels.append([_number(path, line, row, c) for c in ("u_px", "v_px")])
         one = _number(path, line, row, "sigma_px") if row.get("sigma_px") else default_sigma_px
-        if one <= 0:
-            raise InputError(f"{path}: line {line}: sigma_px: expected a number above 0, got {one:g}")
+        refuse_sigmas(path, [line], "sigma_px", np.array([one]), SIGMAS_PX, "px")
         sigma.append(one)
         p, s, on = places[row["point"]]
         place.append(p)
         sigma_m.append(s)
         screen.append(on)
+    sizes = {name: c.image_size_px for name, c in rig.cameras.items()}
+    refuse_far_pixels(path, [line for line, _ in rows], camera, np.array(pixels), sizes)
     return KnownPoints(
         tuple(camera), tuple(point), np.array(pixels), np.array(sigma), np.array(place), np.array(sigma_m),
         tuple(screen), "sigma_px" in rows[0][1],
@@ -127,21 +130,10 @@ def refuse_other_points(known: KnownPoints, foretold: Array, path: Path) -> None
 
 def _rows(path: Path, required: Sequence[str]) -> list[tuple[int, dict[str, str]]]:
     """Line number and fields, stripped, of each row of a CSV file; one or more. Raises InputError."""
-    try:
-        text = Path(path).read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        raise InputError(f"{path}: expected a table with columns {','.join(required)}, found no file") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read as text ({error})") from None
+    text = table_bytes(path, required).decode("utf-8-sig").lstrip("\r\n")
+    check_header(path, text.splitlines()[0], required)
     lines = list(csv.reader(text.splitlines(), skipinitialspace=True))
-    if not lines or not any(f.strip() for f in lines[0]):
-        raise InputError(f"{path}: expected columns {','.join(required)}, got an empty file")
     header = [f.strip() for f in lines[0]]
-    for name in required:
-        if name not in header:
-            near = did_you_mean(name, header)
-            meant = f"{near.removesuffix('?')} in the header?" if "did you mean" in near else ""
-            raise InputError(f"{path}: expected a column {name!r}, got {','.join(header)}{meant}"[:300])
     rows = []
     for number, fields in enumerate(lines[1:], 2):
         if not any(f.strip() for f in fields):
@@ -160,7 +152,7 @@ def _number(path: Path, line: int, row: Mapping[str, str], column: str) -> float
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise InputError(f"{path}: line {line}: {column}: expected a finite number, got {row[column]!r}")
+        raise InputError(f"{path}: line {line}: {column}: expected a finite number, got {shown(row[column] or None)}")
     return value
 
 
@@ -181,8 +173,11 @@ def _places(
                 " are these millimetres? divide by 1000"
             )
         sigma = [_number(path, line, row, f"sigma_{c}") if row.get(f"sigma_{c}") else 0.0 for c in names]
-        if min(sigma) < 0:
-            raise InputError(f"{path}: line {line}: expected sigmas of 0 or more, got {min(sigma):g}")
+        if not 0 <= min(sigma) <= max(sigma) <= _METRES:
+            raise InputError(
+                f"{path}: line {line}: expected sigmas in metres, 0 to {_METRES:g}, got"
+                f" {min(sigma) if min(sigma) < 0 else max(sigma):g}; correct it, or leave the field empty"
+            )
         screen = row["screen"] if on_screens else ""
         if on_screens and screen not in rig.screens:
             raise InputError(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -92,18 +93,27 @@ class Outcome:
     level: Level
     cameras: tuple[CameraDrift, ...]
     findings: tuple[Finding, ...]
+    unchecked: tuple[str, ...] = ()  # cameras of the rig of which nothing was measured
 
     def line(self) -> str:
         """One line for the terminal."""
         worst = max(self.findings, key=lambda f: f.level)
         drifts = ", ".join(f"{c.camera} {_number(c.drift_px)} px / {_number(c.drift_mm)} mm" for c in self.cameras)
         reason = f": {worst.what}" if worst.level > Level.PASS else ""
-        return f"{self.level.name}: drift {drifts}{reason}; report in {self.out}"
+        left_out = ""
+        if self.unchecked and worst.what != not_checked(self.unchecked):
+            left_out = f"; WARN: {not_checked(self.unchecked)}"
+        return f"{self.level.name}: drift {drifts}{reason}{left_out}; report in {self.out}"
 
     @property
     def exit_status(self) -> int:
         """0: may be used (PASS, WARN); 3: must not."""
         return 3 if self.level == Level.FAIL else 0
+
+
+def not_checked(cameras: Sequence[str]) -> str:
+    """That nothing is known of these cameras, as the line and the report say it."""
+    return f"camera {', '.join(cameras)} not checked: nothing was measured in {'it' if len(cameras) == 1 else 'them'}"
 
 
 def _number(value: float) -> str:

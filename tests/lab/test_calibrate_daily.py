@@ -142,7 +142,15 @@ def test_a_camera_without_points_is_said_to_be_unchecked(tmp_path):
     pixels.write_text("\n".join(line for line in pixels.read_text().splitlines() if not line.startswith("right")))
     outcome = daily_check(rig, tmp_path / "out", pixels, today=scenes.DAY, survey=survey)
     assert outcome.level == Level.WARN
-    assert any("camera right has no points" in f.what for f in outcome.findings)
+    words = "camera right not checked: nothing was measured in it"
+    assert any(words in f.what for f in outcome.findings)
+    assert words in outcome.line()
+    knocked = scenes.turned(TRUE, "left", 0.05)
+    pixels, survey = scenes.write_points(tmp_path, knocked, np.random.default_rng(0))
+    pixels.write_text("\n".join(line for line in pixels.read_text().splitlines() if not line.startswith("right")))
+    outcome = daily_check(rig, tmp_path / "out", pixels, today=scenes.DAY, survey=survey)
+    assert outcome.level == Level.FAIL  # a graver finding does not hide that the other camera is unknown
+    assert f"; WARN: {words}" in outcome.line()
 
 
 # Expiry ---------------------------------------------------------------------------------------------------------------
@@ -280,7 +288,11 @@ SURVEY = "point,x_m,y_m,z_m\nL1,-2.5,-1.0,-0.8\n"
         ("camera,point,u_px,v_px\n", SURVEY, "expected one or more points below the header, got none"),
         ("camera,point,u,v_px\nleft,L1,1,2\n", SURVEY, "expected a column 'u_px', got camera,point,u,v_px"),
         (POINTS.replace("300", "nan"), SURVEY, "line 2: u_px: expected a finite number, got 'nan'"),
-        (POINTS.replace("300", ""), SURVEY, "line 2: u_px: expected a finite number, got ''"),
+        (POINTS.replace("300", ""), SURVEY, "line 2: u_px: expected a finite number, got nothing"),
+        (POINTS.replace("300", "-1e300"), SURVEY, "line 2: u_px: expected a pixel in or near the picture"),
+        (POINTS.replace(",", ";"), SURVEY, "points.csv: .* got semicolons; separate columns with commas"),
+        (POINTS.replace("v_px", "u_px,v_px"), SURVEY, "points.csv: expected each column once, got 'u_px' twice"),
+        (POINTS.encode("utf-16").decode("latin-1"), SURVEY, "points.csv: .* not text in UTF-8; save it as CSV"),
         (POINTS.replace("250", "250,9"), SURVEY, "line 2: expected 4 fields, got 5"),
         (POINTS.replace("left", "lef"), SURVEY, "expected a camera of the rig, got 'lef'; did you mean 'left'?"),
         (POINTS.replace("L1", "L11"), SURVEY, "expected a place of point 'L11' .* got none; did you mean 'L1'?"),
@@ -300,7 +312,7 @@ def test_a_bad_table_is_named_with_its_line_and_what_to_do(tmp_path, points, sur
     rig = scenes.write_rig(tmp_path, RIG, COVARIANCE)
     for name, text in (("points.csv", points), ("survey.csv", survey)):
         if text is not None:
-            (tmp_path / name).write_text(text)
+            (tmp_path / name).write_bytes(text.encode("latin-1"))
     with pytest.raises(InputError, match=words) as caught:
         daily_check(rig, tmp_path / "out", tmp_path / "points.csv", survey=tmp_path / "survey.csv")
     assert len(str(caught.value).splitlines()) == 1
