@@ -61,9 +61,13 @@ def refuse_other_lengths(path: Path, lines: Sequence[int], quaternions: Array) -
     length = np.linalg.norm(quaternions, axis=1)
     bad = np.flatnonzero(~(np.abs(length - 1) <= QUATERNION_TOLERANCE))
     if bad.size:
+        found = length[bad[0]]
+        cure = "give all digits, or divide each of the four numbers by that length"
+        if found == 0:
+            cure = "where nothing is turned it is 1,0,0,0"
         raise InputError(
             f"{path}: line {lines[bad[0]]}: qw,qx,qy,qz: expected a quaternion of length 1, got one of length"
-            f" {length[bad[0]]:.7g}; give all digits, or divide each of the four numbers by that length"
+            f" {found:.7g}; {cure}"
         )
 
 

@@ -132,6 +132,11 @@ def read_observations(
             for i, name in enumerate(used):
                 if name not in known:
                     whose = "the project" if kind == "camera" else "the survey"
+                    if not known:
+                        raise InputError(
+                            f"{path}: line {i + 2}: {kind}: expected a {kind} of {whose}, which has none, got {name!r};"
+                            f" add {'`survey` with its points' if kind == 'point' else '`cameras`'} to the project"
+                        )
                     raise InputError(
                         f"{path}: line {i + 2}: {kind}: expected a {kind} of {whose}, got {name!r}"
                         f"{did_you_mean(name, known)}"[:240]

@@ -182,6 +182,8 @@ def test_surveys_that_cannot_be_used_say_which_line_and_why(tmp_path, text, word
 
 def test_only_an_empty_sigma_means_that_none_is_known(tmp_path):
     (tmp_path / "points.csv").write_text(POINTS + "left,P1,2560,1,\nleft,P2,-1280,1,0.3\n")
+    with pytest.raises(InputError, match="of the survey, which has none, got 'P1'; add `survey`"):
+        read_observations([tmp_path / "points.csv"], {"left": (1280, 1024)}, [])
     seen = read_observations([tmp_path / "points.csv"], {"left": (1280, 1024)}, ["P1", "P2"])
     assert seen.sigma_px.tolist() == [0.2, 0.3]
     (tmp_path / "poses.csv").write_text(f"{POSES},sigma_x_m\n0,,0,0,0,1,0,0,0,\n1,,0,0,0,1,0,0,0,0.1 mm\n")
@@ -249,6 +251,7 @@ def test_poses_of_a_stand_are_read_with_the_sigmas_that_they_have(tmp_path):
             "0,0,0,0,0,1,1,0,0\n",
             "line 2: .*quaternion of length 1, got one of length 1.414214; give all digits, or divide",
         ),
+        ("0,0,0,0,0,0,0,0,0\n", "line 2: .*got one of length 0; where nothing is turned it is 1,0,0,0"),
         ("0,0,0,inf,0,1,0,0,0\n", "line 2: y_m: expected a number, got inf"),
         ("0,0,0,1e300,0,1,0,0,0\n", "line 2: y_m: expected metres, within 10 km"),
         ("0,later,0,0,0,1,0,0,0\n", "line 2: t_s: expected seconds, got 'later'"),
