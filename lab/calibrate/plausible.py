@@ -11,19 +11,22 @@ from geometry.arrays import Array
 from lab.errors import InputError
 
 FARTHEST_M = 10_000.0  # m from the origin: surveys in national grids are carried over to a lab's own frame first
+FARTHEST_IN_SCAN = 1e8  # units of a scanned cloud, which may be millimetres and in a national grid
 BEYOND = 1.0  # pictures beyond the picture's edge: a spot outside it may be foretold there, but none is measured
 SIGMAS_M = (1e-9, FARTHEST_M)
 SIGMAS_PX = (1e-6, 1e5)
 SIGMAS_DEG = (0.0, 360.0)
 
 
-def refuse_far_places(path: Path, lines: Sequence[int], names: Sequence[str], xyz: Array) -> None:
+def refuse_far_places(
+    path: Path, lines: Sequence[int], names: Sequence[str], xyz: Array, farthest_m: float = FARTHEST_M
+) -> None:
     """Raises InputError at the first coordinate of xyz (n, k), m, that lies outside any lab. names: the k columns."""
-    bad = np.argwhere(~(np.abs(xyz) <= FARTHEST_M))
+    bad = np.argwhere(~(np.abs(xyz) <= farthest_m))
     if len(bad):
         i, k = bad[0]
         raise InputError(
-            f"{path}: line {lines[i]}: {names[k]}: expected metres, within {FARTHEST_M / 1e3:g} km of the origin, got"
+            f"{path}: line {lines[i]}: {names[k]}: expected metres, within {farthest_m / 1e3:g} km of the origin, got"
             f" {xyz[i, k]:.7g}; are these millimetres, or a national grid? give metres in the lab's own frame"
         )
 

@@ -13,6 +13,7 @@ from geometry.arrays import Array, Ints
 from geometry.pose import Pose
 from lab import columns
 from lab.calibrate.plausible import (
+    FARTHEST_M,
     SIGMAS_DEG,
     SIGMAS_M,
     SIGMAS_PX,
@@ -69,8 +70,10 @@ class StandPoses:
     sigmas: Array  # (n, 6): m along the stand's axes, rad about the body's; nan where the table gives none
 
 
-def read_survey(paths: Sequence[Path], screens: Collection[str]) -> Survey:
+def read_survey(paths: Sequence[Path], screens: Collection[str], farthest_m: float = FARTHEST_M) -> Survey:
     """The surveyed points of some files. screens: those of the project, for the column `screen`.
+
+    farthest_m: from the origin, beyond which a coordinate counts as a mistake.
 
     Raises InputError in one line: file, line, what was expected and what was found.
     """
@@ -89,7 +92,7 @@ def read_survey(paths: Sequence[Path], screens: Collection[str]) -> Survey:
                 )
             where[name] = f"{path.name}, line {i + 2}"
         coordinates = _finite(path, table, SURVEY[1:])
-        refuse_far_places(path, _lines(table), SURVEY[1:], coordinates)
+        refuse_far_places(path, _lines(table), SURVEY[1:], coordinates, farthest_m)
         sigmas, note = _survey_sigmas(path, table)
         notes += note
         on = _names(path, table, "screen", empty=True) if "screen" in table else [""] * len(table)

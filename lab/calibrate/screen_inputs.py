@@ -20,6 +20,7 @@ from geometry.pose import Pose
 from geometry.rig import Rig, Screen
 from geometry.rig_parameters import RigCovariance
 from lab.calibrate.cloud_file import read_cloud
+from lab.calibrate.plausible import FARTHEST_IN_SCAN
 from lab.calibrate.point_files import Observations, Survey, read_observations, read_survey
 from lab.calibrate.project import Cloud, Project, ScreenEntry
 from lab.calibrate.screen_boards import board_views
@@ -195,7 +196,7 @@ def _scan(cloud: Cloud, entry: ScreenEntry, survey: Survey, project: Project) ->
     pose, covariance, words = cloud.world_from_cloud, None, list(notes)
     try:
         if cloud.targets is not None:
-            targets = read_survey([cloud.targets], project.screens)
+            targets = read_survey([cloud.targets], project.screens, FARTHEST_IN_SCAN)
             both = [n for n in targets.names if n in survey.names]
             a = [targets.names.index(n) for n in both]
             b = [survey.names.index(n) for n in both]

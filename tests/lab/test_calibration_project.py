@@ -7,6 +7,7 @@ import pytest
 
 from calibration.boards.kinds import Chessboard
 from lab.calibrate.board_file import save_board
+from lab.calibrate.plausible import FARTHEST_IN_SCAN
 from lab.calibrate.point_files import read_observations, read_poses, read_survey
 from lab.calibrate.project import load_project, placement_of
 from lab.errors import InputError
@@ -189,6 +190,14 @@ def test_only_an_empty_sigma_means_that_none_is_known(tmp_path):
     (tmp_path / "poses.csv").write_text(f"{POSES},sigma_x_m\n0,,0,0,0,1,0,0,0,\n1,,0,0,0,1,0,0,0,0.1 mm\n")
     with pytest.raises(InputError, match=r"line 3: sigma_x_m: expected 0 or more, got '0.1 mm'; leave the field empty"):
         read_poses(tmp_path / "poses.csv")
+
+
+def test_targets_of_a_scan_may_be_millimetres_in_a_national_grid(tmp_path):
+    path = tmp_path / "targets.csv"
+    path.write_text("point,x_m,y_m,z_m\n1,3500000,5400000,21000\n")
+    assert read_survey([path], [], FARTHEST_IN_SCAN).xyz[0, 1] == 5.4e6
+    with pytest.raises(InputError, match="line 2: x_m: expected metres, within 10 km .*are these millimetres"):
+        read_survey([path], [])
 
 
 def test_a_survey_without_sigmas_is_given_a_millimetre_and_says_so(tmp_path):
