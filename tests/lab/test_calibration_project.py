@@ -196,7 +196,7 @@ def test_targets_of_a_scan_may_be_millimetres_in_a_national_grid(tmp_path):
     path = tmp_path / "targets.csv"
     path.write_text("point,x_m,y_m,z_m\n1,3500000,5400000,21000\n")
     assert read_survey([path], [], FARTHEST_IN_SCAN).xyz[0, 1] == 5.4e6
-    with pytest.raises(InputError, match="line 2: x_m: expected metres, within 10 km .*are these millimetres"):
+    with pytest.raises(InputError, match=r"line 2: x_m: expected metres, within 10 km .*are these millimetres"):
         read_survey([path], [])
 
 
