@@ -24,10 +24,14 @@ def folder(tmp_path_factory):
     return simulate_calibration(tmp_path_factory.mktemp("campaigns") / "one", seed=7, positions=8)
 
 
+def sizes(project):
+    return {name: camera.lens.image_size_px for name, camera in project.cameras.items()}
+
+
 def test_the_folder_is_a_project_that_reads_without_a_mistake(folder):
     project = load_project(folder)
     survey = read_survey(project.survey, project.screens)
-    seen = read_observations(project.points, project.cameras, survey.names)
+    seen = read_observations(project.points, sizes(project), survey.names)
     assert len(survey.names) > 20
     assert len(seen.pixels) >= len(survey.names)
     assert len(read_poses(project.recordings[0].poses).frames) == 8
@@ -38,7 +42,7 @@ def test_the_folder_is_a_project_that_reads_without_a_mistake(folder):
 def test_the_truth_beside_it_explains_every_spot_and_every_dot_to_their_sigmas(folder):
     truth, project = load_rig(folder / "truth" / "rig.yaml"), load_project(folder)
     survey = read_survey(project.survey, project.screens)
-    seen = read_observations(project.points, project.cameras, survey.names)
+    seen = read_observations(project.points, sizes(project), survey.names)
     for name, camera in truth.cameras.items():
         mine = np.array([c == name for c in seen.camera])
         at = survey.xyz[[survey.names.index(p) for p, m in zip(seen.point, mine, strict=True) if m]]
