@@ -23,7 +23,7 @@ from calibration.rig.joint import Joint
 from calibration.rig.rig_stacks import prior_of, stacks_of
 from calibration.rig.rig_steps import RigSteps, calibrate_in_steps
 from calibration.screens.network import Dots, Network, Sightings
-from calibration.screens.screens import ScreenSetup
+from calibration.screens.screens import ScreenSetup, calibrate
 from geometry.arrays import Array, normalised
 from geometry.calibration_spread import CalibrationSpread
 from geometry.pose import Pose
@@ -78,7 +78,7 @@ def as_measured(c: Campaign) -> tuple[Network, list[ScreenSetup], Stand]:
 def calibrated(c: Campaign) -> RigSteps:
     """The campaign's rig by the joint adjustment."""
     network, setups, stand = as_measured(c)
-    return calibrate_in_steps(network, setups, c.spots, stand)
+    return calibrate_in_steps(calibrate(network, setups), c.spots, stand)
 
 
 def trial(seed: int, rig: str = "fan", quality: Quality | None = None) -> Trial:

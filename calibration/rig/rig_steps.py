@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from calibration.beams.beams import BeamCalibration, Stand, calibrate_beams
@@ -11,8 +10,7 @@ from calibration.beams.spot_term import SpotPixels
 from calibration.least_squares.adjustment import AdjustmentError
 from calibration.rig.joint import Joint, Measured, calibrate_jointly
 from calibration.rig.rig_stacks import BEAMS, POSES, STAND
-from calibration.screens.network import Network
-from calibration.screens.screens import Near, ScreenSetup, ScreensResult, calibrate
+from calibration.screens.screens import ScreensResult
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,22 +23,12 @@ class RigSteps:
     joint: Joint  # everything at once
 
 
-def calibrate_in_steps(
-    network: Network,
-    setups: Sequence[ScreenSetup],
-    spots: SpotPixels,
-    stand: Stand,
-    near: Mapping[int, Near] | None = None,
-    held_screen: int | None = None,
-    *,
-    nominal: bool = True,
-) -> RigSteps:
+def calibrate_in_steps(screens: ScreensResult, spots: SpotPixels, stand: Stand, *, nominal: bool = True) -> RigSteps:
     """Screens, beams, then all together.
 
-    The network's rig holds the lenses, nominal beams and the spots. setups, near, held_screen: as in
-    screens/screens.py; nominal: as in beams/beams.py. Raises what these raise: AdjustmentError, ValueError.
+    screens: of screens/screens.py, the first step; its network's rig holds nominal beams and the spots too. nominal:
+    as in beams/beams.py. Raises what the others raise: AdjustmentError, ValueError.
     """
-    screens = calibrate(network, setups, near, held_screen)
     try:
         beams = calibrate_beams(screens.fit.rig, spots, stand, screens.fit.covariance, nominal=nominal)
     except AdjustmentError as error:

@@ -17,12 +17,14 @@ from calibration.rig.rig_figures import central_pose, expected_pose, hold_out, s
 from calibration.rig.rig_steps import RigSteps, calibrate_in_steps
 from calibration.screens.network_findings import ScreenLimits
 from calibration.screens.network_findings import findings as network_findings
+from calibration.screens.screens import ScreensResult
 from geometry.rig import Rig
 from lab.calibrate.project import Project, load_project
 from lab.calibrate.recordings import Recordings, read_recordings, stand_of
 from lab.calibrate.rig_outcome import Outcome
 from lab.calibrate.rig_tables import RESIDUALS, write_residuals
 from lab.calibrate.screen_inputs import ScreenInputs, screen_inputs
+from lab.calibrate.survey_check import adjusted_screens, survey_findings
 from lab.calibration_state import CalibrationState
 from lab.errors import CalibrationError, InputError
 from lab.rig_covariance import blocks_of
@@ -54,8 +56,10 @@ def calibrate_rig(
         )
     inputs = screen_inputs(project)
     rig = replace(inputs.network.rig, beams=project.beams, spots=project.spots)
-    recordings = _recordings(project, rig, inputs)
-    steps = _solved(project, replace(inputs, network=replace(inputs.network, rig=rig)), recordings)
+    inputs = replace(inputs, network=replace(inputs.network, rig=rig))
+    screens = adjusted_screens(project, inputs)
+    recordings = _recordings(project, screens.fit.rig)
+    steps = _solved(project, screens, recordings)
     joint = steps.joint
     expected = expected_pose(joint, central_pose(joint), spot_sigma(joint))
     try:
@@ -65,6 +69,7 @@ def calibrate_rig(
     day = today or project.date or datetime.date.today()
     findings = [
         *joint_findings(steps, recordings.names, expected, held_out, limits or RigLimits()),
+        *survey_findings(project, inputs, screens),
         *_of_the_steps(steps, rig, recordings.names),
         *_of_the_inputs(project, recordings, inputs, day),
     ]
@@ -84,17 +89,8 @@ def _is_ours(folder: Path) -> bool:
     return (folder / RESIDUALS).is_file()
 
 
-def _recordings(project: Project, rig: Rig, inputs: ScreenInputs) -> Recordings:
-    """The recordings with their positions. Frames of runs are labelled by cameras as they stand after a first look."""
-    lab = rig
-    if any(r.run is not None for r in project.recordings):
-        from calibration.screens.screens import calibrate
-
-        try:
-            found = calibrate(inputs.network, inputs.setups, inputs.near, inputs.held_screen).fit.rig
-        except (AdjustmentError, ValueError) as error:
-            raise CalibrationError(f"{project.path}: cameras and screens cannot be calibrated: {error}") from None
-        lab = replace(found, beams=rig.beams, spots=rig.spots)
+def _recordings(project: Project, lab: Rig) -> Recordings:
+    """The recordings with their positions. lab: cameras and screens as surveyed, which label frames of runs."""
     recordings = read_recordings(project, lab)
     if recordings.stand_from_body is None:
         raise InputError(
@@ -104,16 +100,9 @@ def _recordings(project: Project, rig: Rig, inputs: ScreenInputs) -> Recordings:
     return recordings
 
 
-def _solved(project: Project, inputs: ScreenInputs, recordings: Recordings) -> RigSteps:
+def _solved(project: Project, screens: ScreensResult, recordings: Recordings) -> RigSteps:
     try:
-        return calibrate_in_steps(
-            inputs.network,
-            inputs.setups,
-            recordings.spots,
-            stand_of(project, recordings),
-            inputs.near,
-            inputs.held_screen,
-        )
+        return calibrate_in_steps(screens, recordings.spots, stand_of(project, recordings))
     except (AdjustmentError, ValueError) as error:
         raise CalibrationError(f"{project.path}: the rig cannot be calibrated: {error}") from None
 

@@ -3,34 +3,28 @@
 from __future__ import annotations
 
 import datetime
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from calibration.findings import Finding, Level, verdict
-from calibration.least_squares.adjustment import AdjustmentError
 from calibration.screens.network_findings import findings as network_findings
-from calibration.screens.network_findings import near_findings
 from calibration.screens.network_sigmas import pointing_sigmas_m, spot_sigmas
-from calibration.screens.network_start import NotConnectedError
-from calibration.screens.screens import ScreensResult, calibrate
-from calibration.screens.survey_suspects import Suspect, misfit_of, suspects
+from calibration.screens.screens import ScreensResult
 from geometry.rig import Rig
 from lab.calibrate.project import Project, load_project
-from lab.calibrate.screen_inputs import ScreenInputs, screen_inputs
+from lab.calibrate.screen_inputs import screen_inputs
 from lab.calibrate.screen_tables import DOTS, RESIDUALS, write_tables
 from lab.calibrate.screens_file import ScreensFile, save_screens
+from lab.calibrate.survey_check import adjusted_screens, survey_findings
 from lab.calibration_state import CalibrationState
-from lab.errors import CalibrationError, InputError
+from lab.errors import CalibrationError
 from lab.rig_covariance import blocks_of
 from lab.rig_file import RigFile, save_rig
 from lab.whole_folder import beside_a_good_one, refuse_foreign, whole_folder
 
 SCREENS, RIG = "screens.yaml", "rig.yaml"
-SUSPICIOUS = 4.0  # misfit (see survey_suspects.py) from which swapped axes and wrong units are looked for
-_CURED = 2.0  # misfit up to which a change to the survey counts as what was wrong
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,11 +71,10 @@ def calibrate_screen(project_path: Path, out: Path, today: datetime.date | None 
     refuse_foreign(out, _is_ours)
     project = load_project(Path(project_path))
     inputs = screen_inputs(project)
-    result = _adjusted(project, inputs)
+    result = adjusted_screens(project, inputs)
     found = [
         *network_findings(result),
-        *near_findings(result, inputs.near),
-        *_coverage(project, result),
+        *survey_findings(project, inputs, result),
         *(Finding(Level.WARN, note) for note in inputs.notes),
     ]
     level = verdict(found)
@@ -100,82 +93,6 @@ def calibrate_screen(project_path: Path, out: Path, today: datetime.date | None 
 
 def _is_ours(folder: Path) -> bool:
     return (folder / DOTS).is_file() and (folder / RESIDUALS).is_file()
-
-
-def _adjusted(project: Project, inputs: ScreenInputs) -> ScreensResult:
-    """The adjustment; where nothing fits, what about the survey may be wrong."""
-    where = ", ".join(str(p) for p in project.survey) or str(project.path)
-    problem: Exception | None = None
-    miss = float("inf")
-    try:
-        result = calibrate(inputs.network, inputs.setups, inputs.near, inputs.held_screen)
-        miss = misfit_of(result, inputs.near)
-    except (NotConnectedError, AdjustmentError, ValueError) as error:
-        problem = error
-    enough = len(inputs.network.sightings) >= 4
-    if enough and miss > SUSPICIOUS and not _plainly_missing(inputs, problem):
-        changes = suspects(inputs.network, inputs.setups, inputs.near, inputs.held_screen, miss)
-        cures = [c for c in changes if c.factor < _CURED]
-        if cures:
-            raise InputError(_suspicion(where, cures))
-    if isinstance(problem, AdjustmentError):
-        raise CalibrationError(f"{project.path}: the measurements give no calibration: {problem}") from None
-    if problem is not None:
-        raise InputError(f"{where}: {problem}") from None
-    return result
-
-
-def _plainly_missing(inputs: ScreenInputs, problem: Exception | None) -> bool:
-    """Whether a camera has too few dots, or a screen: no other axes or unit would mend that."""
-    text = str(problem or "")
-    return any(words in text for words in ("expected 4 or more", "expected 3 or more", "on one line", "found none"))
-
-
-def _suspicion(where: str, cures: Sequence[Suspect]) -> str:
-    """What the survey's columns seem to hold."""
-    best = cures[0]
-    others = [c for c in cures[1:] if c.factor < 1.2 * best.factor]
-    text = f"{where}: does not fit the pixels as it is, but {best.words} does"
-    if others:
-        text += (
-            f" (so do {len(others)} other changes, such as {others[0].words}: a mirrored survey looks the same"
-            " whichever axes are swapped; give a camera's place as `near_m` to tell)"
-        )
-    return f"{text}; mend the file"
-
-
-def _coverage(project: Project, result: ScreensResult) -> list[Finding]:
-    """Whether the dots reach over the screens, and lie on them."""
-    out = []
-    for (name, entry), screen in zip(project.screens.items(), result.screens, strict=True):
-        if entry.size_m is None or not screen.dots:
-            continue
-        half = np.array(entry.size_m) / 2
-        reach = np.abs(screen.xyz[:, :2])
-        beyond = np.flatnonzero((reach > half + 0.01).any(axis=1))
-        if beyond.size:
-            dot = result.network.dots.names[screen.dots[int(beyond[0])]]
-            out.append(
-                Finding(
-                    Level.WARN,
-                    f"screen {name!r}: dot {dot!r} lies outside its size_m ({_counted(len(beyond), 'dot')} do)",
-                    "spots beyond size_m count as off the screen",
-                    "correct size_m, or fix the screen's frame by named dots (`frame`)",
-                )
-            )
-        share = np.ptp(screen.xyz[screen.used, :2], axis=0) / np.array(entry.size_m)
-        if share.min() < 0.6:
-            out.append(
-                Finding(
-                    Level.WARN,
-                    f"screen {name!r}: its dots reach over {100 * share[0]:.0f} % of its width and"
-                    f" {100 * share[1]:.0f} % of its height",
-                    "beyond the dots its shape is a guess"
-                    + ("" if entry.frame else ", and the middle of the dots is taken for the screen's middle"),
-                    "survey dots near its corners" + ("" if entry.frame else ", or name three dots in `frame`"),
-                )
-            )
-    return out
 
 
 # Files ------------------------------------------------------------------------------------------------------------

@@ -16,6 +16,7 @@ from calibration.rig.joint import CORNERS, DOTS, FRAMES, LENSES, RECORDS, SPOTS,
 from calibration.rig.joint_findings import joint_findings
 from calibration.rig.rig_figures import central_pose, expected_pose, hold_out, spot_sigma
 from calibration.rig.rig_steps import calibrate_in_steps
+from calibration.screens.screens import calibrate
 from geometry.pose import Pose
 from lab.simulate.calibration_campaign import Campaign, Quality, draw_campaign, spots_at
 
@@ -34,7 +35,7 @@ def steps():
 
 def calibrated_from(c: Campaign, **changed):
     network, setups, stand = as_measured(c)
-    return calibrate_in_steps(network, setups, c.spots, replace(stand, **changed))
+    return calibrate_in_steps(calibrate(network, setups), c.spots, replace(stand, **changed))
 
 
 def words(of):
@@ -93,7 +94,7 @@ def test_a_stand_that_is_ten_times_less_exact_than_told_is_found_out_and_named()
     q = replace(SMALL, positions=20, stand_m=3e-4, stand_deg=0.03)
     c = draw_campaign(2, "fan", q)
     network, setups, stand = as_measured(c)
-    found = calibrate_in_steps(network, setups, c.spots, replace(stand, pose_sigmas=stand.pose_sigmas / 10))
+    found = calibrate_in_steps(calibrate(network, setups), c.spots, replace(stand, pose_sigmas=stand.pose_sigmas / 10))
     assert 4 < found.joint.scales[RECORDS] < 20
     assert SPOTS not in found.joint.scales
     (told,) = [f for f in words(found) if f.what.startswith(RECORDS) and "sigmas" in f.what]
@@ -191,7 +192,7 @@ def test_boards_that_were_photographed_too_take_part_and_make_the_lens_better_kn
     c = campaign()
     network, setups, stand = as_measured(c)
     with_boards = replace(network, corners=boards_before(c), placements=("1", "2", "3", "4"))
-    found = calibrate_in_steps(with_boards, setups, c.spots, stand).joint
+    found = calibrate_in_steps(calibrate(with_boards, setups), c.spots, stand).joint
     assert found.groups[CORNERS].p > 1e-3
     assert found.kept[CORNERS].mean() > 0.98
     alone = steps().joint

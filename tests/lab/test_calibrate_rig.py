@@ -241,3 +241,32 @@ def test_other_rigs_are_calibrated_to_a_hundredth_of_a_degree_too(tmp_path, rig)
     assert ended.level <= Level.WARN
     assert np.rad2deg(ended.held_out.attitude_rms) < 0.01
     assert ended.held_out.position_rms < 0.5e-3
+
+
+def with_survey_columns(project, tmp_path, order):
+    """A copy of the project whose survey has its coordinates in another order."""
+    copy = tmp_path / "project"
+    shutil.copytree(project, copy)
+    with open(copy / "survey.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    names = ("x_m", "y_m", "z_m")
+    mixed = [{**row, **{n: row[names[k]] for n, k in zip(names, order, strict=True)}} for row in rows]
+    with open(copy / "survey.csv", "w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(mixed)
+    return copy
+
+
+def test_a_survey_that_turns_the_world_is_refused_with_what_would_mend_it(project, tmp_path):
+    copy = with_survey_columns(project, tmp_path, (1, 2, 0))
+    with pytest.raises(InputError, match=r"survey.csv: does not fit .* columns in the order z, x, y does") as caught:
+        calibrate_rig(copy, tmp_path / "out", today=DAY)
+    assert caught.value.exit_status == 2
+    assert not (tmp_path / "out").exists()
+
+
+def test_cameras_far_from_where_a_tape_measure_says_fail(project, tmp_path):
+    ended = calibrate_rig(changed(project, tmp_path, r"near_m: \[-1.6", "near_m: [1.6"), tmp_path / "out", today=DAY)
+    assert ended.exit_status == 3
+    assert "from its `near_m`, 0.5 m were allowed" in ended.line()
