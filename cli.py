@@ -330,7 +330,10 @@ def camera(
     options = CameraOptions(
         name=name or out.resolve().name, distance_m=distance_m, lens=lens, warp=warp, valid_days=valid_days
     )
-    _concluded(calibrate_camera(photos, board, out, options))
+    with _progress("photos") as progress:
+        tell = None if progress is None else lambda done, total, _: progress(done, total)
+        outcome = calibrate_camera(photos, board, out, options, progress=tell)
+    _concluded(outcome)
 
 
 _project = click.argument("project", type=_ANY_PATH)

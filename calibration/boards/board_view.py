@@ -38,6 +38,7 @@ class NotFound:
     reason: str
 
 
+NO_CLOSE_LOOK = NotFound("no board at a quick look")  # its cause was not looked for
 BLUR_LIMIT = 0.2  # sigma of the edges in spacings: beyond it neighbouring corners run together
 
 

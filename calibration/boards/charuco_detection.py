@@ -8,7 +8,15 @@ import cv2
 import numpy as np
 
 from calibration.boards import corner_refinement
-from calibration.boards.board_view import BLUR_LIMIT, BoardView, GreyImage, NotFound, low_contrast, too_blurred
+from calibration.boards.board_view import (
+    BLUR_LIMIT,
+    NO_CLOSE_LOOK,
+    BoardView,
+    GreyImage,
+    NotFound,
+    low_contrast,
+    too_blurred,
+)
 from calibration.boards.kinds import DICTIONARIES, Charuco, dictionary_size
 from calibration.boards.smaller_pictures import scaled, scales
 from geometry.arrays import Array, Ints
@@ -37,14 +45,17 @@ class Markers:
     corners: Array  # (n, 4, 2), px, clockwise from the marker's top left
 
 
-def find_charuco(image: GreyImage, board: Charuco) -> BoardView | NotFound:
-    """The inner corners that can be seen, or the reason why there are too few. A part of the board is enough."""
+def find_charuco(image: GreyImage, board: Charuco, closely: bool = True) -> BoardView | NotFound:
+    """The inner corners that can be seen, or the reason why there are too few. A part of the board is enough.
+
+    closely: else the cause is not looked for where no marker is seen.
+    """
     printed, markers = _as_printed(image, board)
     if len(markers.ids) == 0:
-        return _why_no_markers(image, board)
+        return _why_no_markers(image, board) if closely else NO_CLOSE_LOOK
     true, share = _fitting(board, markers)
     if isinstance(true, NotFound):
-        return true
+        return _mirrored(image, board, len(markers.ids)) or true
     notes = []
     if printed != board.inverted:
         notes.append("the board is inverted (white markers)" if printed else "the board is not inverted (dark markers)")
@@ -198,15 +209,26 @@ def _corners(image: GreyImage, board: Charuco, markers: Markers, notes: tuple[st
     return BoardView(board.ids[seen], fine.reshape(-1, 2)[seen], apart, blur, contrast, notes)
 
 
+def _mirrored(image: GreyImage, board: Charuco, seen: int) -> NotFound | None:
+    """The refusal of a mirrored picture: its mirror image shows far more of the board's markers than the `seen` ones.
+
+    Among 4x4 bits some mirrored markers look like others: of 37 to 49 markers up to 4 did in rendered photographs.
+    """
+    for inverted in (board.inverted, not board.inverted):
+        shown = 255 - image if inverted else image
+        flipped = np.ascontiguousarray(shown[:, ::-1])
+        if len(find_markers(flipped, board.dictionary, board.markers).ids) >= max(3, 3 * seen):
+            return NotFound("the board is seen as in a mirror: switch off the mirroring of the camera or its software")
+    return None
+
+
 def _why_no_markers(image: GreyImage, board: Charuco) -> NotFound:
     pale = low_contrast(image)
     if pale is not None:
         return pale
-    for inverted in (board.inverted, not board.inverted):
-        shown = 255 - image if inverted else image
-        flipped = np.ascontiguousarray(shown[:, ::-1])
-        if len(find_markers(flipped, board.dictionary, board.markers).ids) >= 3:
-            return NotFound("the board is seen as in a mirror: switch off the mirroring of the camera or its software")
+    mirrored = _mirrored(image, board, 0)
+    if mirrored is not None:
+        return mirrored
     best, name, most = 0, "", 0
     small = scaled(image, next((s for s in scales(image) if s * max(image.shape) <= 1000), 1.0))
     for inverted in (False, True):

@@ -9,7 +9,15 @@ import cv2
 import numpy as np
 
 from calibration.boards import corner_refinement
-from calibration.boards.board_view import BLUR_LIMIT, BoardView, GreyImage, NotFound, low_contrast, too_blurred
+from calibration.boards.board_view import (
+    BLUR_LIMIT,
+    NO_CLOSE_LOOK,
+    BoardView,
+    GreyImage,
+    NotFound,
+    low_contrast,
+    too_blurred,
+)
 from calibration.boards.kinds import Chessboard
 from calibration.boards.smaller_pictures import at_full_size, scaled, scales
 from geometry.arrays import Array
@@ -20,15 +28,20 @@ _CLASSIC = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
 _SECTORS = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
 
 
-def find_chessboard(image: GreyImage, board: Chessboard) -> BoardView | NotFound:
-    """All inner corners of a chessboard, or the reason why they cannot be had. A part of it is not enough."""
+def find_chessboard(image: GreyImage, board: Chessboard, closely: bool = True) -> BoardView | NotFound:
+    """All inner corners of a chessboard, or the reason why they cannot be had. A part of it is not enough.
+
+    closely: else only the classical finder looks, and no cause is looked for.
+    """
     pale = low_contrast(image)
     if pale is not None:
         return pale
-    for grid in _grids(image, board.columns, board.rows):
+    for grid in (_grids if closely else _quick_grids)(image, board.columns, board.rows):
         found = _measured(image, grid, board)
         if found is not None:
             return found
+    if not closely:
+        return NO_CLOSE_LOOK
     largest = _largest_grid(image)
     if largest is not None and sorted(largest.shape[:2]) == sorted((board.columns, board.rows)):
         turned = largest.shape[:2] != (board.rows, board.columns)
@@ -67,6 +80,19 @@ def _grids(image: GreyImage, columns: int, rows: int) -> Iterator[Array]:
             yield from _as_grid(
                 cv2.findChessboardCornersSB(scaled(image, scale), size, flags=_SECTORS), columns, rows, scale
             )
+
+
+def _quick_grids(image: GreyImage, columns: int, rows: int) -> Iterator[Array]:
+    """Candidates of the classical finder in copies of up to 1000 px, given up early where nothing is like a board.
+
+    0.01 s for 1280x1024 without the board, in which the ways above take 5 s; it sees 45 of 48 real boards, they 47.
+    """
+    sizes = scales(image)
+    for scale in [s for s in sizes if s * max(image.shape) <= _QUICK_PX] or sizes[-1:]:
+        answer = cv2.findChessboardCorners(
+            scaled(image, scale), (columns, rows), flags=_CLASSIC | cv2.CALIB_CB_FAST_CHECK
+        )
+        yield from _as_grid(answer, columns, rows, scale)
 
 
 def _as_grid(answer: Any, columns: int, rows: int, scale: float) -> Iterator[Array]:

@@ -9,7 +9,15 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from calibration.boards import corner_refinement
-from calibration.boards.board_view import BLUR_LIMIT, BoardView, GreyImage, NotFound, low_contrast, too_blurred
+from calibration.boards.board_view import (
+    BLUR_LIMIT,
+    NO_CLOSE_LOOK,
+    BoardView,
+    GreyImage,
+    NotFound,
+    low_contrast,
+    too_blurred,
+)
 from calibration.boards.chessboard_detection import upright
 from calibration.boards.kinds import CircleGrid
 from calibration.boards.smaller_pictures import at_full_size, scaled, scales
@@ -32,8 +40,11 @@ class Ellipses:
     contrasts: Array  # (n,), DN
 
 
-def find_circles(image: GreyImage, board: CircleGrid) -> BoardView | NotFound:
-    """All centres of a grid of circles, or the reason why they cannot be had."""
+def find_circles(image: GreyImage, board: CircleGrid, closely: bool = True) -> BoardView | NotFound:
+    """All centres of a grid of circles, or the reason why they cannot be had.
+
+    closely: else no cause is looked for.
+    """
     blobs = np.empty((0, 3))
     for scale in scales(image):
         for light in (False, True):
@@ -43,7 +54,7 @@ def find_circles(image: GreyImage, board: CircleGrid) -> BoardView | NotFound:
                 return _measured(image if not light else 255 - image, at_full_size(found, scale), board, light)
         if scale == 1.0:
             blobs = _blobs(image)
-    return _why_not(image, board, blobs)
+    return _why_not(image, board, blobs) if closely else NO_CLOSE_LOOK
 
 
 def _detector(image: GreyImage) -> cv2.SimpleBlobDetector:

@@ -31,6 +31,10 @@ class IntrinsicsError(ValueError):
     """These photographs cannot give a calibration: what is wrong with them, and what to do."""
 
 
+class TooFewViewsError(IntrinsicsError):
+    """Fewer photographs than a calibration needs."""
+
+
 @dataclass(frozen=True, slots=True)
 class IntrinsicsOptions:
     """What the user may decide."""
@@ -89,7 +93,7 @@ def _calibrated(table: CornerTable, options: IntrinsicsOptions) -> Intrinsics:
 def _check_enough(table: CornerTable) -> None:
     able = int(np.sum(table.counts() >= FEWEST_CORNERS))
     if able < FEWEST_VIEWS:
-        raise IntrinsicsError(
+        raise TooFewViewsError(
             f"expected {FEWEST_VIEWS} photographs or more with a board in them, got {able}; take 15 to 30, the board"
             " tilted by 20 to 45 deg to all sides and moved into the picture's corners"
         )

@@ -13,7 +13,13 @@ import numpy as np
 from calibration.boards.kinds import Board
 from calibration.findings import Level
 from calibration.lens.corner_table import CornerTable
-from calibration.lens.intrinsics import FEWEST_VIEWS, IntrinsicsError, IntrinsicsOptions, calibrate_intrinsics
+from calibration.lens.intrinsics import (
+    FEWEST_VIEWS,
+    IntrinsicsError,
+    IntrinsicsOptions,
+    TooFewViewsError,
+    calibrate_intrinsics,
+)
 from calibration.lens.intrinsics_result import Intrinsics
 from calibration.lens.lens_models import LADDER, named
 from geometry.camera import FISHEYE, PERSPECTIVE
@@ -84,6 +90,8 @@ def calibrate_camera(
     table = CornerTable.of([(v.ids, v.pixels) for _, v in found.views], known.points, known.middle, found.image_size_px)
     try:
         result = calibrate_intrinsics(table, options.intrinsics())
+    except TooFewViewsError as error:
+        raise InputError(f"{options.name} ({found.line()}): {error}") from None
     except IntrinsicsError as error:
         raise CalibrationError(f"{options.name} ({found.line()}): {error}") from None
     folder = beside_a_good_one(out, result.verdict == Level.FAIL, CAMERA)

@@ -13,15 +13,19 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from calibration.boards.board_detection import BoardView, NotFound, find_board
+from calibration.boards.board_detection import NO_CLOSE_LOOK, BoardView, NotFound, find_board
 from calibration.boards.board_view import GreyImage
 from calibration.boards.kinds import Board
-from lab.errors import CalibrationError, InputError
+from lab.errors import InputError
 from lab.pictures import SUFFIXES, Grey, Missing, checked, decode
 
 VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".webm")
 VIDEO_PICTURES = 120  # of one video at most, evenly spread: neighbouring frames show the same pose again
 _SHOWN = 3  # names in one line of an error
+# So many pictures without the board, and none with it, get a close look, that takes seconds; then a quick one must do
+# until a picture shows the board. A wrong kind of board or dictionary is wrong in all pictures.
+_CLOSE_LOOKS = 2
+_TWIN = "the same picture as "
 
 Progress = Callable[[int, int, str], None]  # pictures done, pictures in all, name of the last
 
@@ -91,14 +95,15 @@ def find_in_photos(
 ) -> PhotoSet:
     """Look for a board in every photograph. One picture at a time is held in memory.
 
-    Raises InputError where there is no readable picture, where sizes differ, and where no picture shows the board;
-    CalibrationError where fewer than `fewest` do.
+    Raises InputError where there is no readable picture, where sizes differ, and where fewer than `fewest` pictures
+    show the board.
     """
     files = load_photos(paths)
     names = _names(files)
     total = sum(_frame_count(path) for path in files)
     views: list[tuple[str, BoardView]] = []
     refused: list[tuple[str, str]] = []
+    quick: set[str] = set()
     where: dict[str, Path] = {}
     sizes: dict[tuple[int, int], list[str]] = {}
     seen: dict[bytes, str] = {}
@@ -110,10 +115,12 @@ def find_in_photos(
             sizes.setdefault((picture.shape[1], picture.shape[0]), []).append(name)
             twin = seen.setdefault(hashlib.sha256(picture.tobytes()).digest(), name)
             if twin != name:
-                refused.append((name, f"the same picture as {twin}: it would count twice"))
+                refused.append((name, f"{_TWIN}{twin}: it would count twice"))
             elif len(sizes) == 1:  # with two sizes there will be no calibration: only sizes are still collected
-                found = find_board(as_8_bit(picture), board)
-                if isinstance(found, NotFound):
+                found = find_board(as_8_bit(picture), board, bool(views) or _looked_closely(refused) < _CLOSE_LOOKS)
+                if found is NO_CLOSE_LOOK:
+                    quick.add(name)
+                elif isinstance(found, NotFound):
                     refused.append((name, found.reason))
                 else:
                     views.append((name, found))
@@ -123,6 +130,19 @@ def find_in_photos(
         raise InputError(f"none of {len(refused)} pictures can be read; {commonest(refused)}")
     if len(sizes) > 1:
         raise InputError(_mixed(sizes))
+    if views and quick:  # the board is in some: what was looked at quickly before is looked at closely
+        for name, _, picture in _pictures(files, names):
+            if name in quick and not isinstance(picture, Missing):
+                found = find_board(as_8_bit(picture), board)
+                if isinstance(found, NotFound):
+                    refused.append((name, found.reason))
+                else:
+                    views.append((name, found))
+        order = {name: k for k, name in enumerate(where)}
+        views.sort(key=lambda view: order[view[0]])
+        refused.sort(key=lambda item: order[item[0]])
+    elif quick:
+        refused += [(name, NO_CLOSE_LOOK.reason) for name in where if name in quick]
     _enough(views, refused, board, fewest)
     return PhotoSet(board, next(iter(sizes)), tuple(views), tuple(refused), where)
 
@@ -194,10 +214,28 @@ def commonest(refused: Sequence[tuple[str, str]]) -> str:
     """The commonest reason among (name, reason), how often it came, and where first. Numbers in it may differ."""
     if not refused:
         return "nothing was refused"
-    kinds = Counter(re.sub(r"\d+(\.\d+)?", "#", reason) for _, reason in refused)
+    twins = [item for item in refused if item[1].startswith(_TWIN)]
+    quick = [item for item in refused if item[1] == NO_CLOSE_LOOK.reason]
+    telling = [item for item in refused if item not in twins and item not in quick] or quick or twins
+    kinds = Counter(_kind(reason) for _, reason in telling)
     kind, count = kinds.most_common(1)[0]
-    name, reason = next((n, r) for n, r in refused if re.sub(r"\d+(\.\d+)?", "#", r) == kind)
-    return f"refused most often ({count} of {len(refused)}, first {name}): {reason}"
+    name, reason = next((n, r) for n, r in telling if _kind(r) == kind)
+    text = f"refused most often ({count} of {len(telling)}, first {name}): {reason}"
+    if quick and telling is not quick:
+        text += f"; in {len(quick)} more no board was seen at a quick look"
+    if twins and telling is not twins:
+        text += f"; {len(twins)} more are copies of others"
+    return text
+
+
+def _kind(reason: str) -> str:
+    """A reason without its numbers."""
+    return re.sub(r"\d+(\.\d+)?", "#", reason)
+
+
+def _looked_closely(refused: Sequence[tuple[str, str]]) -> int:
+    """In how many refused pictures the board was looked for."""
+    return sum(not reason.startswith((_TWIN, "unreadable")) for _, reason in refused)
 
 
 def _mixed(sizes: dict[tuple[int, int], list[str]]) -> str:
@@ -217,6 +255,6 @@ def _enough(views: Sequence[object], refused: Sequence[tuple[str, str]], board: 
         raise InputError(f"{board.describe()}: found in none of {total} pictures; {commonest(refused)}")
     if len(views) < fewest:
         tail = f"; {commonest(refused)}" if refused else "; take more pictures"
-        raise CalibrationError(
+        raise InputError(
             f"{board.describe()}: found in {len(views)} of {total} pictures, {fewest} or more are needed{tail}"
         )

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import re
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from calibration.boards import chessboard_detection, circle_detection, corner_refinement
-from calibration.boards.board_detection import BoardView, NotFound, find_board
+from calibration.boards import charuco_detection, chessboard_detection, circle_detection, corner_refinement
+from calibration.boards.board_detection import NO_CLOSE_LOOK, BoardView, NotFound, find_board
 from calibration.boards.kinds import Board, parse
 from geometry import rotations
 from geometry.camera import FISHEYE, PERSPECTIVE, Camera
@@ -209,6 +210,29 @@ def test_a_mirrored_picture_is_refused_where_the_pattern_can_tell(text):
     board, photo = shot(text)
     seen(photo.image, board)
     assert "mirror" in refused(np.ascontiguousarray(photo.image[:, ::-1]), board)
+
+
+def test_a_mirrored_board_of_4x4_bits_says_so_although_some_of_its_markers_look_like_others():
+    board = parse("charuco:11x9:36mm:27mm:DICT_4X4_100")
+    photo = photograph(
+        board,
+        replace(camera(), image_size_px=(960, 720), matrix=2 * camera().matrix),
+        held(board, (0.2, 0.1, 0.1), 1.6),
+        look=CLEAN,
+    )
+    mirrored = np.ascontiguousarray(photo.image[:, ::-1])
+    assert len(charuco_detection.find_markers(mirrored, board.dictionary, board.markers).ids) >= 2
+    assert "mirror" in refused(mirrored, board)
+
+
+@pytest.mark.parametrize("text", [CHESS, "circles:9x7:25mm", CHARUCO])
+def test_a_quick_look_sees_a_board_and_looks_for_no_cause(text):
+    board, photo = shot(text)
+    view = find_board(photo.image, board, closely=False)
+    assert isinstance(view, BoardView)
+    assert rms(view, photo) < 0.04 * px
+    wall = np.random.default_rng(0).integers(60, 190, (360, 480)).astype(np.uint8)
+    assert find_board(wall, board, closely=False) is NO_CLOSE_LOOK
 
 
 def test_a_mirrored_chessboard_is_its_own_mirror_image_but_its_order_is_not_mirrored():

@@ -6,11 +6,13 @@ import cv2
 import numpy as np
 import pytest
 
+from calibration.boards.board_detection import find_board
 from calibration.boards.kinds import parse
 from geometry.camera import Camera
 from geometry.pose import Pose
+from lab.calibrate import photos as photos_module
 from lab.calibrate.photos import find_in_photos, load_photos
-from lab.errors import CalibrationError, InputError
+from lab.errors import InputError
 from lab.simulate.board_photo import Look, photograph
 
 BOARD = parse("chessboard:9x6:25mm")
@@ -43,9 +45,7 @@ def test_pictures_of_every_kind_are_read_in_natural_order(tmp_path, picture):
 def test_the_same_picture_twice_counts_once(tmp_path, picture):
     for name in "abc":
         cv2.imwrite(str(tmp_path / f"{name}.png"), picture)
-    with pytest.raises(
-        CalibrationError, match=r"found in 1 of 3 pictures, 3 or more .*\(2 of 2.*the same picture as a"
-    ):
+    with pytest.raises(InputError, match=r"found in 1 of 3 pictures, 3 or more .*\(2 of 2.*the same picture as a"):
         find_in_photos([tmp_path], BOARD)
 
 
@@ -71,5 +71,41 @@ def test_what_names_no_picture_is_said(tmp_path):
 def test_the_commonest_reason_is_told(tmp_path, picture):
     for k in range(3):
         cv2.imwrite(str(tmp_path / f"a{k}.png"), picture + np.uint8(k))
-    with pytest.raises(InputError, match=r"found in none of 3 pictures; .*\(3 of 3, first a0.png\): .*9x6"):
+    with pytest.raises(
+        InputError, match=r"found in none of 3 pictures; .*\(2 of 2, first a0.png\): .*9x6.*in 1 more no board"
+    ):
         find_in_photos([tmp_path], parse("chessboard:7x7:25mm"))
+
+
+def test_copies_of_a_picture_without_a_board_do_not_hide_why_it_was_refused(tmp_path):
+    for name in "abcd":
+        cv2.imwrite(str(tmp_path / f"{name}.png"), np.full((300, 400), 90, dtype=np.uint8))
+    with pytest.raises(InputError, match=r"\(1 of 1, first a.png\): hardly any contrast.*; 3 more are copies"):
+        find_in_photos([tmp_path], BOARD)
+
+
+def test_only_the_first_pictures_without_a_board_are_looked_at_closely(tmp_path, picture, monkeypatch):
+    """And once a picture shows the board, the others after all: none is lost to a quick look."""
+    looks = []
+
+    def noted(image, board, closely=True):
+        looks.append(closely)
+        return find_board(image, board, closely)
+
+    monkeypatch.setattr(photos_module, "find_board", noted)
+    wall = np.random.default_rng(0).integers(60, 190, picture.shape).astype(np.uint8)
+    for k in range(4):
+        cv2.imwrite(str(tmp_path / f"a{k}.png"), np.roll(wall, k))
+    with pytest.raises(
+        InputError, match=r"none of 4 pictures; .*\(2 of 2, first a0.png\).*in 2 more no board was seen"
+    ):
+        find_in_photos([tmp_path], BOARD)
+    assert looks == [True, True, False, False]
+    for k in range(3):
+        cv2.imwrite(str(tmp_path / f"b{k}.png"), picture + np.uint8(k))
+    looks.clear()
+    found = find_in_photos([tmp_path], BOARD)
+    assert looks == [True, True, False, False, False, True, True, True, True]
+    assert [name for name, _ in found.views] == ["b0.png", "b1.png", "b2.png"]
+    assert [name for name, _ in found.refused] == ["a0.png", "a1.png", "a2.png", "a3.png"]
+    assert {reason for _, reason in found.refused} == {found.refused[0][1]}
