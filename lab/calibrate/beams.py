@@ -17,6 +17,7 @@ from calibration.least_squares.adjustment import AdjustmentError
 from geometry.rig_parameters import RigCovariance
 from lab.calibrate.beam_tables import BEAMS, write_tables
 from lab.calibrate.project import Project, load_project
+from lab.calibrate.recording_check import refuse_known_mistakes
 from lab.calibrate.recordings import Recordings, read_recordings, stand_of
 from lab.calibrate.screens_file import load_screens
 from lab.calibration_state import CalibrationState
@@ -84,6 +85,8 @@ def calibrate_beams(
         else:
             found = find_beams(file.rig, recordings.spots, stand_of(project, recordings), knowledge)
     except AdjustmentError as error:
+        if recordings.stand_from_body is not None:
+            refuse_known_mistakes(project, file.rig, recordings, knowledge)
         raise CalibrationError(f"{project.path}: the beams cannot be calibrated: {error}") from None
     findings = [
         *beam_findings(found, file.rig, recordings.names, BeamGoals()),

@@ -20,6 +20,7 @@ from calibration.screens.network_findings import findings as network_findings
 from calibration.screens.screens import ScreensResult
 from geometry.rig import Rig
 from lab.calibrate.project import Project, load_project
+from lab.calibrate.recording_check import refuse_known_mistakes
 from lab.calibrate.recordings import Recordings, read_recordings, stand_of
 from lab.calibrate.rig_outcome import Outcome
 from lab.calibrate.rig_tables import RESIDUALS, write_residuals
@@ -104,6 +105,7 @@ def _solved(project: Project, screens: ScreensResult, recordings: Recordings) ->
     try:
         return calibrate_in_steps(screens, recordings.spots, stand_of(project, recordings))
     except (AdjustmentError, ValueError) as error:
+        refuse_known_mistakes(project, screens.fit.rig, recordings, screens.fit.covariance)
         raise CalibrationError(f"{project.path}: the rig cannot be calibrated: {error}") from None
 
 

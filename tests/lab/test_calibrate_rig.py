@@ -270,3 +270,15 @@ def test_cameras_far_from_where_a_tape_measure_says_fail(project, tmp_path):
     ended = calibrate_rig(changed(project, tmp_path, r"near_m: \[-1.6", "near_m: [1.6"), tmp_path / "out", today=DAY)
     assert ended.exit_status == 3
     assert "from its `near_m`, 0.5 m were allowed" in ended.line()
+
+
+def test_poses_with_their_quaternions_in_another_order_are_refused_with_the_cure(project, tmp_path):
+    copy = tmp_path / "project"
+    shutil.copytree(project, copy)
+    lines = (copy / "poses.csv").read_text().splitlines()
+    rows = [line.split(",") for line in lines]
+    at = rows[0].index("qw")
+    mixed = [[*r[:at], *r[at + 1 : at + 4], r[at], *r[at + 4 :]] for r in rows[1:]]
+    (copy / "poses.csv").write_text("\n".join([lines[0], *(",".join(r) for r in mixed)]) + "\n")
+    with pytest.raises(InputError, match=r"poses.csv: .* order x, y, z, w; write them in the order qw, qx, qy, qz"):
+        calibrate_rig(copy, tmp_path / "out", today=DAY)

@@ -1,0 +1,26 @@
+"""Recordings whose spots do not agree: the usual mistake behind it, in words, or that there is no calibration."""
+
+from __future__ import annotations
+
+from calibration.beams.pose_suspects import suspect
+from geometry.rig import Rig
+from geometry.rig_parameters import RigCovariance
+from lab.calibrate.project import Project
+from lab.calibrate.recordings import Recordings, stand_of
+from lab.errors import InputError
+
+
+def refuse_known_mistakes(
+    project: Project, rig: Rig, recordings: Recordings, knowledge: RigCovariance | None = None
+) -> None:
+    """Where no calibration was found: InputError if one usual mistake in poses or labels explains it.
+
+    rig: cameras and screens as calibrated, beams as drawn; knowledge: of their errors. Positions must be known.
+    """
+    found = suspect(rig, recordings.spots, stand_of(project, recordings), knowledge)
+    if found is None:
+        return
+    files = [r.spots or r.run if found.in_labels else r.poses for r in project.recordings]
+    where = ", ".join(str(f) for f in files if f is not None)
+    subject = "the spots fit" if found.in_labels else "the spots fit these poses"
+    raise InputError(f"{where}: {subject} only {found.words}; {found.cure}")
