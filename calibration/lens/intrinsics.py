@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -13,12 +14,13 @@ from calibration.lens.corner_table import CornerTable
 from calibration.lens.coverage import coverage_of, spread_deg
 from calibration.lens.hold_out import HeldOut, Scatter, hold_out, scatter
 from calibration.lens.intrinsics_findings import findings_of
-from calibration.lens.intrinsics_result import Intrinsics
+from calibration.lens.intrinsics_result import Intrinsics, Origins
 from calibration.lens.lens_fit import FEWEST_CORNERS, LensFit, Values, fit, robust_fit, used_views
 from calibration.lens.lens_ladder import Rung, WarpTest, climb, union_of_used, warp_test
 from calibration.lens.lens_models import LensModel
 from calibration.lens.lens_start import StartError, start
 from calibration.lens.projection_map import Difference, ProjectionMap, difference, projection_map
+from geometry.arrays import Ints
 
 FEWEST_VIEWS = 4
 # Boards whose normals all lie within this of one another fix the focal length only together with the distance.
@@ -43,6 +45,7 @@ class IntrinsicsOptions:
     lens: LensModel | None = None  # None: chosen by hold-out error
     warp: bool | None = None  # whether to correct a bent board; None: where it is significant
     folds: int | None = None  # of the hold-out; None: five, or one view each up to ten views
+    origins: tuple[str, ...] = ()  # of each view: those of unlike origin may be of two cameras; empty: nothing known
 
 
 def calibrate_intrinsics(table: CornerTable, options: IntrinsicsOptions | None = None) -> Intrinsics:
@@ -83,6 +86,7 @@ def _calibrated(table: CornerTable, options: IntrinsicsOptions) -> Intrinsics:
         ladder=ladder,
         warp=bend,
         halves=_halves(table, found, pixel_map),
+        origins=_origins(table, found, pixel_map, options.origins),
         map=pixel_map,
         distance_m=distance,
         coverage=coverage_of(table, found.used, found.poses),
@@ -168,11 +172,28 @@ def _typical_depth(table: CornerTable, found: LensFit) -> float:
 
 
 def _halves(table: CornerTable, found: LensFit, at: ProjectionMap) -> Difference | None:
-    """Every other view against the rest, the board's bend as found from all: it is one board."""
+    """Every other view against the rest."""
     views = used_views(found, table)
+    return _apart(table, found, at, views[::2], views[1::2])
+
+
+def _origins(table: CornerTable, found: LensFit, at: ProjectionMap, origins: Sequence[str]) -> Origins | None:
+    """The views of the two commonest origins against each other; None where a second one has too few."""
+    views = used_views(found, table)
+    of_views = [origins[v] for v in views] if origins else []
+    common = [(name, count) for name, count in Counter(of_views).most_common(2) if count >= FEWEST_VIEWS]
+    if len(common) < 2:
+        return None
+    names = (common[0][0], common[1][0])
+    difference = _apart(table, found, at, *(views[[o == name for o in of_views]] for name in names))
+    return None if difference is None else Origins(names, difference)
+
+
+def _apart(table: CornerTable, found: LensFit, at: ProjectionMap, *views: Ints) -> Difference | None:
+    """How two sets of views differ, the board's bend as found from all: it is one board."""
     try:
         first, second = (
-            fit(table, found.used & np.isin(table.view, views[k::2]), found.model, found.values, False) for k in (0, 1)
+            fit(table, found.used & np.isin(table.view, some), found.model, found.values, False) for some in views
         )
         return difference(at, first, second)
     except AdjustmentError:

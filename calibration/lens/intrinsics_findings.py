@@ -9,6 +9,7 @@ import numpy as np
 from calibration.findings import Finding, Level
 from calibration.lens.intrinsics_result import Intrinsics
 from calibration.lens.lens_models import folds_in_picture
+from calibration.lens.projection_map import Difference
 
 _TILTED = "tilt the board by 20 to 45 deg to all sides and photograph it at two or three distances"
 _MORE = "take more photographs, the board tilted by 20 to 45 deg to all sides and moved into the picture's corners"
@@ -50,6 +51,7 @@ def findings_of(c: Intrinsics, limits: Limits = LIMITS) -> tuple[Finding, ...]:
         _principal_point(c, limits),
         _overfit(c, limits),
         _halves(c, limits),
+        _origins(c, limits),
         _scatter(c),
         _map(c, limits),
         _warp(c, limits),
@@ -218,15 +220,33 @@ def _halves(c: Intrinsics, limits: Limits) -> Finding:
             "Nothing then tells of errors of the model, which no covariance knows.",
             _MORE[0].upper() + _MORE[1:] + ".",
         )
-    agree = d.p_value >= limits.p_value
-    level = Level.PASS if agree else Level.FAIL if d.rms_px > limits.halves_px else Level.WARN
     return _unless_pass(
-        level,
+        _disagreement(d, limits),
         f"Two halves of the photographs differ by {d.rms_px:.3g} px ({_two(d.rms_mm)} mm at {c.distance_m:.3g} m), RMS"
         f" over the picture; their sigmas let expect {d.expected_rms_px:.3g} px (p = {d.p_value:.2g}).",
         "They should differ by their sigmas only. More means that the lens model, the board or the corners are wrong in"
         " a way that noise does not explain.",
-        "Use a stiffer board, check its measures, take more and more varied photographs.",
+        "Use a stiffer board, check its measures, take more and more varied photographs; where two cameras took them or"
+        " focus or zoom was changed between, calibrate each set by itself.",
+    )
+
+
+def _disagreement(d: Difference, limits: Limits) -> Level:
+    if d.p_value >= limits.p_value:
+        return Level.PASS
+    return Level.FAIL if d.rms_px > limits.halves_px else Level.WARN
+
+
+def _origins(c: Intrinsics, limits: Limits) -> Finding | None:
+    if c.origins is None:
+        return None
+    d, (first, second) = c.origins.difference, c.origins.names
+    return _unless_pass(
+        _disagreement(d, limits),
+        f"The photographs {first!r} and {second!r} give lenses that differ by {d.rms_px:.3g} px, RMS over the picture;"
+        f" their sigmas let expect {d.expected_rms_px:.3g} px (p = {d.p_value:.2g}).",
+        "They look like photographs of two cameras, or of one whose focus or zoom was changed between.",
+        "Calibrate each set by itself; fix focus and zoom before the first photograph.",
     )
 
 

@@ -18,6 +18,14 @@ from geometry.arrays import Array
 
 
 @dataclass(frozen=True, slots=True)
+class Origins:
+    """Photographs of two origins (folders, videos, first parts of names) against each other."""
+
+    names: tuple[str, str]
+    difference: Difference
+
+
+@dataclass(frozen=True, slots=True)
 class Intrinsics:
     """A calibrated lens and what is known of its quality."""
 
@@ -32,6 +40,7 @@ class Intrinsics:
     ladder: Ladder
     warp: WarpTest | None  # None where the views do not determine a bend
     halves: Difference | None  # None where a half does not determine the lens
+    origins: Origins | None  # None where all photographs are of one origin
     map: ProjectionMap
     distance_m: float
     coverage: Coverage

@@ -26,7 +26,7 @@ from geometry.camera import FISHEYE, PERSPECTIVE
 from lab.calibrate.board_file import board_of
 from lab.calibrate.camera_file import CameraCalibration, CameraFile, save_camera
 from lab.calibrate.camera_outcome import Outcome
-from lab.calibrate.photos import Progress, find_in_photos
+from lab.calibrate.photos import Progress, find_in_photos, origins_of
 from lab.camera_block import Covariance
 from lab.errors import CalibrationError, InputError
 from lab.whole_folder import beside_a_good_one, refuse_foreign, whole_folder
@@ -61,10 +61,10 @@ class CameraOptions:
         if self.valid_days is not None and self.valid_days < 1:
             raise InputError(f"valid days: expected 1 or more, got {self.valid_days}")
 
-    def intrinsics(self) -> IntrinsicsOptions:
-        """The same for the solve."""
+    def intrinsics(self, origins: tuple[str, ...] = ()) -> IntrinsicsOptions:
+        """The same for the solve, and where each view comes from."""
         lens = None if self.lens == "auto" else named(self.lens)
-        return IntrinsicsOptions(self.distance_m, lens, WARPS[self.warp], self.folds)
+        return IntrinsicsOptions(self.distance_m, lens, WARPS[self.warp], self.folds, origins)
 
 
 def calibrate_camera(
@@ -89,7 +89,7 @@ def calibrate_camera(
     found = find_in_photos(photos, known, progress, fewest=FEWEST_VIEWS)
     table = CornerTable.of([(v.ids, v.pixels) for _, v in found.views], known.points, known.middle, found.image_size_px)
     try:
-        result = calibrate_intrinsics(table, options.intrinsics())
+        result = calibrate_intrinsics(table, options.intrinsics(origins_of(found)))
     except TooFewViewsError as error:
         raise InputError(f"{options.name} ({found.line()}): {error}") from None
     except IntrinsicsError as error:

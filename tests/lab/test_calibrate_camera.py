@@ -155,6 +155,15 @@ def test_one_photograph_under_other_names_is_still_one(tmp_path):
 
 
 @needs_stereo
+def test_photographs_of_two_cameras_in_one_set_are_told_by_their_names(tmp_path):
+    outcome = calibrate_camera([STEREO / "*.jpg"], BOARD, tmp_path / "out", CameraOptions(lens="4", warp="off"))
+    (told,) = [f for f in outcome.result.findings if "'left' and 'right'" in f.what]
+    assert told.level > Level.PASS
+    assert "two cameras" in told.why
+    assert any("two cameras" in f.cure for f in outcome.result.findings if "Two halves" in f.what)
+
+
+@needs_stereo
 def test_boards_that_lie_parallel_are_told(tmp_path):
     """One photograph, shifted: the board is parallel to itself."""
     picture = cv2.imread(str(STEREO / "left03.jpg"), cv2.IMREAD_GRAYSCALE)

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
 
-from calibration.boards.board_detection import find_board
+from calibration.boards.board_detection import NO_CLOSE_LOOK, find_board
 from calibration.boards.kinds import parse
 from geometry.camera import Camera
 from geometry.pose import Pose
 from lab.calibrate import photos as photos_module
-from lab.calibrate.photos import find_in_photos, load_photos
+from lab.calibrate.photos import PhotoSet, find_in_photos, load_photos, origins_of
 from lab.errors import InputError
 from lab.simulate.board_photo import Look, photograph
 
@@ -109,3 +111,31 @@ def test_only_the_first_pictures_without_a_board_are_looked_at_closely(tmp_path,
     assert [name for name, _ in found.views] == ["b0.png", "b1.png", "b2.png"]
     assert [name for name, _ in found.refused] == ["a0.png", "a1.png", "a2.png", "a3.png"]
     assert {reason for _, reason in found.refused} == {found.refused[0][1]}
+
+
+def test_a_film_that_shows_a_charuco_board_now_and_then_has_the_cause_of_ten_frames_only(tmp_path, monkeypatch):
+    board = parse("charuco:5x4:40mm:30mm:DICT_4X4_50")
+    camera = Camera("c", "s", (400, 300), np.array([[500.0, 0, 200], [0, 500, 150], [0, 0, 1]]), (), Pose.identity())
+    seen = photograph(board, camera, Pose(np.eye(3), np.array([0, 0, 0.5]) - board.middle), look=Look(samples=9)).image
+    wall = np.random.default_rng(0).integers(60, 190, seen.shape).astype(np.uint8)
+    monkeypatch.setattr(photos_module, "_CAUSES", 3)
+    for k in range(12):
+        cv2.imwrite(str(tmp_path / f"{k}.png"), seen + np.uint8(k) if k % 4 == 3 else np.roll(wall, k))
+    found = find_in_photos([tmp_path], board)
+    assert [name for name, _ in found.views] == ["3.png", "7.png", "11.png"]
+    quick = [name for name, reason in found.refused if reason == NO_CLOSE_LOOK.reason]
+    assert quick == ["2.png", "5.png", "6.png", "8.png", "9.png", "10.png"]
+    assert "(3 of 3, first 0.png)" in found.line()
+
+
+def test_where_a_picture_comes_from_is_told_by_folder_video_or_name(picture):
+    def origins(*paths):
+        names = [str(k) for k in range(len(paths))]
+        where = {name: Path(path) for name, path in zip(names, paths, strict=True)}
+        return origins_of(PhotoSet(BOARD, (400, 300), tuple((n, picture) for n in names), (), where))
+
+    assert origins("left01.jpg", "left12.jpg", "right01.jpg") == ("left", "left", "right")
+    assert origins("IMG_0001_a.jpg", "IMG_0002_a.jpg", "IMG_0001_b.jpg") == ("IMG_a", "IMG_a", "IMG_b")
+    assert origins("cam0_001.png", "cam0_002.png", "cam1_001.png") == ("cam0", "cam0", "cam1")
+    assert origins("cam_0.mp4", "cam_0.mp4", "cam_1.mp4") == ("cam_0.mp4", "cam_0.mp4", "cam_1.mp4")
+    assert origins("l/01.png", "l/02.png", "r/01.png") == ("l/", "l/", "r/")
