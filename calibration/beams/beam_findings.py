@@ -10,6 +10,7 @@ import numpy as np
 
 from calibration.beams.beam_figures import OneLine
 from calibration.beams.beams import BeamCalibration
+from calibration.beams.exchanged_labels import exchanged_pairs
 from calibration.findings import Finding, Level
 from geometry.arrays import Array
 from geometry.rig import Rig
@@ -17,6 +18,9 @@ from geometry.rig import Rig
 ARCSEC = np.deg2rad(1 / 3600)
 _P_TWO_LINES = 1e-3  # of a straight pair to be told to be two lines
 _WORST_NAMED = 6
+# Positions below which nothing can be trusted: a fifth of them held out leaves six, as many as a pose has numbers; with
+# fewer, a single wrong record or label moves the beams as much as it misfits, and no residual shows it.
+FEWEST_POSITIONS = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,12 +75,21 @@ def _determined(c: BeamCalibration, positions: Sequence[str]) -> list[Finding]:
                 "keep spots of both screens in view",
             )
         )
+    if count < FEWEST_POSITIONS:
+        out.append(
+            Finding(
+                Level.FAIL,
+                f"only {count} position{'' if count == 1 else 's'}, expected {FEWEST_POSITIONS} or more",
+                "so few cannot show a wrong record or label: it would move the beams unseen",
+                "record 20 positions or more, turned about all axes",
+            )
+        )
     known = c.world_from_stand is not None
     if c.undetermined:
         out.append(
             Finding(
                 Level.FAIL,
-                f"the {count} positions leave undetermined: {'; '.join(c.undetermined)} ({c.motion})",
+                f"the positions leave undetermined: {'; '.join(c.undetermined)} ({c.motion})",
                 "along these motions no spot moves: what is written of them would be the start value",
                 c.motion.cure() + (", or give world_from_stand with its sigmas" if known else ""),
             )
@@ -123,6 +136,18 @@ def _wrong_spots(c: BeamCalibration, positions: Sequence[str], goals: BeamGoals)
             "look at these pictures; mend the labels or the light" if share > goals.wrong_share else "",
         )
     ]
+    cameras = list(c.rig.cameras)
+    camera_of = np.array([cameras.index(views[v][0]) for v in c.spots.view])
+    for i, j in exchanged_pairs(c.spots, c.fit.kept, c.fit.residuals_px, camera_of)[:_WORST_NAMED]:
+        (camera, first), (_, second) = views[c.spots.view[i]], views[c.spots.view[j]]
+        out.append(
+            Finding(
+                Level.WARN,
+                f"position {used[c.spots.position[i]]}: spots {first} and {second} of camera {camera!r} are exchanged",
+                "each lies where the other should be; both were left out",
+                "exchange the two names at this position in the table of spots",
+            )
+        )
     at = Counter(c.spots.position[wrong].tolist())
     in_all = Counter(c.spots.position.tolist())
     bad = [k for k, n in at.items() if n >= 2 and 2 * n > in_all[k]]

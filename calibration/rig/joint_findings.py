@@ -109,10 +109,10 @@ def joint_findings(
     else:
         out.append(
             Finding(
-                Level.WARN,
-                f"only {len(positions)} positions: none was held out",
+                Level.FAIL,
+                f"none of {len(positions)} positions could be held out: the others do not suffice to predict it",
                 "nothing tests the calibration with spots that it has not seen",
-                "record 20 positions or more",
+                "record 20 positions or more, turned about all axes",
             )
         )
     out.append(_expected(expected, limits))

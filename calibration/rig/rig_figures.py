@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import chi2 as chi2_distribution
 
+from calibration.beams.beam_findings import FEWEST_POSITIONS
 from calibration.beams.spot_term import SpotPixels, SpotTerm
 from calibration.rig.joint import SPOTS, Joint, Measured, calibrate_jointly
 from calibration.rig.measurement_groups import jacobian, shares
@@ -20,7 +21,6 @@ from geometry.solve import fit_pose
 from geometry.spots import SpotModel
 
 FOLDS = 5  # parts into which the positions are divided; each is predicted by the other four
-_FEWEST_HELD_OUT = 10  # positions: fewer leave too little to calibrate with, and too little to say
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,7 +114,7 @@ def hold_out(measured: Measured, joint: Joint, seed: int = 0) -> HoldOut | None:
     all three. Raises AdjustmentError where a part is not determined by the others.
     """
     count = len(measured.stand.stand_from_body.translation)
-    if count < _FEWEST_HELD_OUT:
+    if count < FEWEST_POSITIONS:
         return None
     fold_of = np.random.default_rng(seed).permutation(count) % FOLDS
     scale = joint.scales.get(SPOTS, 1.0)

@@ -57,6 +57,8 @@ class Outcome:
             what += f" of which nothing is known, angles between beams to {between:.3g} arcsec RMS"
         elif not c.undetermined:
             what += f", directions to {sigma:.3g} arcsec RMS"
+        if not c.fit.kept.all():
+            what += f", {int(np.sum(~c.fit.kept))} of {len(c.fit.kept)} spots left out"
         warnings = sum(f.level == Level.WARN for f in self.findings)
         reason = f"; {warnings} warning{'s' if warnings > 1 else ''}, see report.html" if warnings else ""
         if self.level == Level.FAIL:

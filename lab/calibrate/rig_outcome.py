@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from calibration.findings import Finding, Level
+from calibration.rig.joint import SPOTS
 from calibration.rig.joint_findings import in_degrees, in_mm
 from calibration.rig.rig_figures import ExpectedPose, HoldOut
 from calibration.rig.rig_steps import RigSteps
@@ -40,6 +41,9 @@ class Outcome:
         if self.held_out is not None:
             deg, mm = np.rad2deg(self.held_out.attitude_rms), 1e3 * self.held_out.position_rms
             what += f"; held out: {deg:.2g} deg, {mm:.2g} mm"
+        kept = self.steps.joint.kept[SPOTS]
+        if not kept.all():
+            what += f"; {int(np.sum(~kept))} of {len(kept)} spots left out"
         worst = max(self.findings, key=lambda f: f.level)
         reason = "" if self.level == Level.PASS else f": {worst.what}"
         return f"{self.name}: {self.level.name}: {what}{reason} -> {self.out}"
