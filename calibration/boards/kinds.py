@@ -203,6 +203,20 @@ class Charuco:
         return self.columns * self.rows // 2  # an odd board begins and ends with a dark square
 
     @property
+    def rim_modules(self) -> float:
+        """White rim between a marker and the dark squares about it, in modules (its dots)."""
+        return (self.square_m - self.marker_m) / 2 / (self.marker_m / self._modules)
+
+    def marker_with_rim_m(self, rim_modules: float) -> float:
+        """Side of the marker that leaves a rim of so many modules."""
+        return self.square_m / (1 + 2 * rim_modules / self._modules)
+
+    @property
+    def _modules(self) -> int:
+        """Of a marker's side, its dark border included."""
+        return int(cv2.aruco.getPredefinedDictionary(DICTIONARIES[self.dictionary]).markerSize) + 2
+
+    @property
     def light_first(self) -> bool:
         """Whether the top left square holds a marker (before inversion)."""
         return self.legacy and self.rows % 2 == 0
@@ -315,7 +329,11 @@ def dictionary_name(text: str) -> str:
     if f"dict_{text.lower()}" in by_lower:
         return by_lower[f"dict_{text.lower()}"]
     near = difflib.get_close_matches(text.lower(), by_lower, n=3, cutoff=0.6)
-    hint = f"did you mean {' or '.join(by_lower[n] for n in near)}?" if near else f"known: {', '.join(DICTIONARIES)}"
+    hint = (
+        f"did you mean {' or '.join(by_lower[n] for n in near)}?"
+        if near
+        else "the families are DICT_4X4_50 to _1000, DICT_5X5_, DICT_6X6_, DICT_7X7_ likewise and DICT_APRILTAG_36h11"
+    )
     raise ValueError(f"expected one of OpenCV's dictionaries, got {text!r}; {hint}")
 
 

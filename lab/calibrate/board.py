@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from calibration.boards.kinds import Board
+from calibration.boards.kinds import Board, Charuco
 from lab.calibrate.board_file import board_of, load_board, save_board
 from lab.calibrate.board_page import as_pdf, as_png, as_svg, lay_out
 from lab.errors import InputError
@@ -16,6 +17,9 @@ from lab.yaml_text import did_you_mean
 
 FORMATS = ("pdf", "svg", "png")
 DESCRIPTION = "board.yaml"
+# Rendered boards, 7x5 squares of 36 mm, 960x720 px, blur 0.7 and 1.2 px: with a rim of 0.05 modules no marker is seen,
+# with 0.2 corners err by 0.1 to 0.7 px, with 0.4 by 0.05 to 0.3, from 0.7 on by 0.03 to 0.06. OpenCV asks for 0.7 too.
+LEAST_RIM = 0.7
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +64,11 @@ def write_board(
     for name in formats:
         if name not in FORMATS:
             raise InputError(f"format: expected {', '.join(FORMATS)}, got {name!r}{did_you_mean(name, FORMATS)}")
+    if out.suffix and not out.is_dir() and not (single in FORMATS or _is_number(single)):
+        raise InputError(
+            f"{out}: expected a folder, or a file ending in .{', .'.join(FORMATS)}, got {out.suffix}; choose one of them"
+        )
+    _check_rim(board)
     layout = lay_out(board, page)
     writers = {
         "pdf": lambda: as_pdf(layout),
@@ -79,6 +88,24 @@ def write_board(
             (work / f"board.{name}").write_bytes(data)
         save_board(board, work / DESCRIPTION)
     return Outcome(board, (*(out / f"board.{name}" for name in contents), out / DESCRIPTION), layout.name)
+
+
+def _is_number(suffix: str) -> bool:
+    """Whether what follows the last dot belongs to a folder's name: boards-v1.2, 2026.11.21."""
+    return suffix[:1].isdigit()
+
+
+def _check_rim(board: Board) -> None:
+    """Raises InputError for a ChArUco board whose markers nearly touch the squares: such boards are not to be printed.
+
+    Boards that are there already are another matter: photographs of them show whether they can be read.
+    """
+    if isinstance(board, Charuco) and board.rim_modules < LEAST_RIM * (1 - 1e-9):
+        most = math.floor(10_000 * board.marker_with_rim_m(LEAST_RIM)) / 10
+        raise InputError(
+            f"{board.describe()}: the white rim about the markers is only {board.rim_modules:.2f} of a marker's dots"
+            f" wide, {LEAST_RIM:g} or more are needed to find its corners; make the markers {most:g} mm or smaller"
+        )
 
 
 def _holds_boards_only(folder: Path) -> bool:

@@ -129,6 +129,8 @@ def test_symmetry_counts_the_turns_after_which_the_ink_is_the_same(text, symmetr
         ("chessboard:9x6:25m", "expected a square of 0.1 mm to 10 m, got 25 m"),
         ("charuco:5x7:20mm:40mm:DICT_4X4_50", "expected markers smaller than the squares, got 40mm in 20mm"),
         ("charuco:5x7:40mm:20mm:DICT_4X5_50", "got 'DICT_4X5_50'; did you mean .*DICT_4X4_50"),
+        ("charuco:5x7:40mm:20mm:FOO", "^.{1,420}$"),
+        ("charuco:5x7:40mm:20mm:DICT_FOO", "did you mean|the families are DICT_4X4_50 to _1000"),
         ("charuco:20x20:40mm:20mm:DICT_4X4_50", "need 200 markers, DICT_4X4_50 has 50; take a larger dictionary"),
         ("charuco:5x7:40mm:20mm:DICT_4X4_50:invert", "expected 'inverted' or 'legacy' at the end, got 'invert'"),
     ],

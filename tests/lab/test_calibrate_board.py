@@ -73,3 +73,22 @@ def test_a_file_with_mistakes_is_answered_with_its_field(tmp_path):
         board_of(path)
     with pytest.raises(InputError, match=r"expected a length with its unit .* or name a board\.yaml"):
         board_of("chessboard:9x6:25")
+
+
+@pytest.mark.parametrize("name", ["x.jpg", "board.yaml", "board.PDF2"])
+def test_a_file_of_another_kind_is_refused_instead_of_becoming_a_folder(tmp_path, name):
+    with pytest.raises(InputError, match=r"expected a folder, or a file ending in \.pdf, \.svg, \.png, got \."):
+        write_board("chessboard:9x6:20mm", tmp_path / name)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_may_have_a_dot_in_its_name(tmp_path):
+    write_board("chessboard:9x6:20mm", tmp_path / "boards-v1.2", ["svg"])
+    assert (tmp_path / "boards-v1.2" / "board.svg").is_file()
+
+
+def test_a_marker_too_large_for_its_square_is_not_printed_and_the_largest_one_is_told(tmp_path):
+    with pytest.raises(InputError, match=r"only 0\.01 of a marker's dots .* make the markers 29\.1 mm or smaller"):
+        write_board("charuco:5x7:36mm:35.9mm:DICT_4X4_50", tmp_path / "b")
+    assert list(tmp_path.iterdir()) == []
+    write_board("charuco:5x7:36mm:29.1mm:DICT_4X4_50", tmp_path / "b", ["svg"])
