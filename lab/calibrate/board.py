@@ -66,7 +66,8 @@ def write_board(
             raise InputError(f"format: expected {', '.join(FORMATS)}, got {name!r}{did_you_mean(name, FORMATS)}")
     if out.suffix and not out.is_dir() and not (single in FORMATS or _is_number(single)):
         raise InputError(
-            f"{out}: expected a folder, or a file ending in .{', .'.join(FORMATS)}, got {out.suffix}; choose one of them"
+            f"{out}: expected a folder, or a file ending in .{', .'.join(FORMATS)}, got {out.suffix};"
+            " choose one of them"
         )
     _check_rim(board)
     layout = lay_out(board, page)
