@@ -18,6 +18,7 @@ from geometry.rig import Rig
 ARCSEC = np.deg2rad(1 / 3600)
 _P_TWO_LINES = 1e-3  # of a straight pair to be told to be two lines
 _WORST_NAMED = 6
+UNDETERMINED = "the positions leave undetermined"  # how that finding begins
 # Positions below which nothing can be trusted: a fifth of them held out leaves six, as many as a pose has numbers; with
 # fewer, a single wrong record or label moves the beams as much as it misfits, and no residual shows it.
 FEWEST_POSITIONS = 8
@@ -89,7 +90,7 @@ def _determined(c: BeamCalibration, positions: Sequence[str]) -> list[Finding]:
         out.append(
             Finding(
                 Level.FAIL,
-                f"the positions leave undetermined: {'; '.join(c.undetermined)} ({c.motion})",
+                f"{UNDETERMINED}: {'; '.join(c.undetermined)} ({c.motion})",
                 "along these motions no spot moves: what is written of them would be the start value",
                 c.motion.cure() + (", or give world_from_stand with its sigmas" if known else ""),
             )

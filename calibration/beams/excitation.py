@@ -93,9 +93,8 @@ def in_words(directions: Array, beam_names: Sequence[str], lines: Lines, world_f
         stand = directions[:, beams:]
         if np.all(np.linalg.norm(stand, axis=1) > 0.05 * np.linalg.norm(directions, axis=1)):
             shifts = stand[:, :3] @ world_from_stand.rotation
-            return [
-                f"{w}, with all beams the other way" for w in _motions(np.concatenate([shifts, stand[:, 3:]], axis=1))
-            ]
+            found = _motions(np.concatenate([shifts, stand[:, 3:]], axis=1))
+            return [f"all beams against the stand: {w}" for w in found]
     motions = np.linalg.lstsq(G, directions[:, :beams].T, rcond=None)[0].T
     explained = motions @ G.T
     rigid = np.linalg.norm(explained, axis=1) > _SHARE * np.linalg.norm(directions[:, :beams], axis=1)
@@ -107,6 +106,12 @@ def in_words(directions: Array, beam_names: Sequence[str], lines: Lines, world_f
         told = [f"beam {n}: {_of_beam(e)}" for n, e, s in zip(beam_names, each, size, strict=True) if s > most]
         out.append("; ".join(told))
     return out
+
+
+def briefly(undetermined: Sequence[str]) -> str:
+    """What is undetermined, short enough for a line: the first two, and how many more."""
+    more = len(undetermined) - 2
+    return "; ".join(undetermined[:2]) + (f"; and {more} more" if more > 0 else "")
 
 
 def _motions(motions: Array) -> list[str]:

@@ -55,7 +55,7 @@ _WHY: Mapping[str, tuple[str, str]] = {
     ),
     DOTS: (
         "dots were found less exactly than told, or the lenses are not as calibrated",
-        "give their sigma_px as large as it is; calibrate the lenses at the focus and aperture in use",
+        "give their sigma_px as large as it is; each camera needs its own lens calibration, at the focus in use",
     ),
     SURVEY: (
         "the survey is less exact than told, or a dot has moved since",

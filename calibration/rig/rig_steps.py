@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from calibration.beams.beams import BeamCalibration, Stand, calibrate_beams
-from calibration.beams.excitation import Motion
+from calibration.beams.excitation import Motion, briefly
 from calibration.beams.spot_term import SpotPixels
 from calibration.least_squares.adjustment import AdjustmentError
 from calibration.rig.joint import Joint, Measured, calibrate_jointly
@@ -39,8 +39,7 @@ def calibrate_in_steps(screens: ScreensResult, spots: SpotPixels, stand: Stand, 
         raise AdjustmentError(f"{error}; the stand's positions do not tell all ({motion}): {motion.cure()}") from None
     if beams.undetermined:
         raise AdjustmentError(
-            f"the stand's positions leave undetermined: {'; '.join(beams.undetermined)} ({beams.motion}):"
-            f" {beams.motion.cure()}"
+            f"the stand's positions leave undetermined: {briefly(beams.undetermined)}: {beams.motion.cure()}"
         )
     found = beams.fit.adjusted.values
     starts = {n: found[n] for n in (BEAMS, STAND, POSES)}

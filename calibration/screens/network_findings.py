@@ -76,17 +76,23 @@ def _on_screen(camera: Camera, screen: Screen, pixel: Array, dot: Array) -> Arra
     return meet_plane(origin, ray, screen.world_from_screen) - screen.world_from_screen.inverse().apply(dot)[:2]
 
 
-def findings(result: ScreensResult, limits: ScreenLimits = ScreenLimits()) -> list[Finding]:
-    """Everything that was tested, worst last to first as the report likes."""
-    out = [_agreement(result.fit, limits)]
-    out += _dots(result, limits)
+def findings(
+    result: ScreensResult, limits: ScreenLimits = ScreenLimits(), *, names_doubted: bool = False
+) -> list[Finding]:
+    """Everything that was tested; of equal level, causes before what they cause.
+
+    names_doubted: cameras stand far from where they should; that pixels fit their names is then not claimed.
+    """
+    out = [_agreement(result, limits)]
+    out += [f for f in _dots(result, limits) if not (names_doubted and f.level == Level.PASS)]
     out += _surfaces(result, limits)
     out += _sigmas(result, limits)
     out += _rivals(result)
     return out
 
 
-def _agreement(fit: NetworkFit, limits: ScreenLimits) -> Finding:
+def _agreement(result: ScreensResult, limits: ScreenLimits) -> Finding:
+    fit = result.fit
     factor = float(np.sqrt(fit.variance_factor))
     if fit.dof <= 0:
         return Finding(
@@ -102,8 +108,26 @@ def _agreement(fit: NetworkFit, limits: ScreenLimits) -> Finding:
         level,
         f"the measurements agree {factor:.2g} times worse than their sigmas say ({fit.dof} redundant numbers)",
         "all sigmas of the result were widened by that; what causes it may also shift the result",
-        "" if level is Level.PASS else "check the sigmas of survey and pixels, the cameras' lenses and the dots' names",
+        ""
+        if level is Level.PASS
+        else f"check the sigmas of survey and pixels and the dots' names{_lens_to_doubt(result)}",
     )
+
+
+def _lens_to_doubt(result: ScreensResult) -> str:
+    """Of which camera the lens calibration may be another's: the one whose dots misfit most."""
+    s, fit = result.network.sightings, result.fit
+    if not len(s):
+        return ""
+    names = list(result.network.rig.cameras)
+    misfit = {
+        name: float(np.sqrt(np.mean(fit.sighting_sigmas[rows] ** 2)))
+        for c, name in enumerate(names)
+        for rows in [(s.camera_of == c) & fit.used]
+        if rows.any()
+    }
+    worst = max(misfit, key=lambda n: misfit[n], default="")
+    return f"; the dots of camera {worst!r} misfit most: its lens calibration may be another camera's" if worst else ""
 
 
 def _dots(result: ScreensResult, limits: ScreenLimits) -> list[Finding]:
@@ -263,6 +287,14 @@ def near_findings(result: ScreensResult, near: Mapping[int, Near]) -> list[Findi
         if away <= n.within_m:
             out.append(Finding(Level.PASS, what))
         else:
-            why = "the survey may have swapped axes or another unit, or the camera's name is another one's"
-            out.append(Finding(Level.FAIL, what, why, "check near_m, the survey's columns and the cameras' names"))
+            cure = "check near_m, the survey's columns, the pixels' u and v, and the cameras' names"
+            why = "the survey may have swapped axes or another unit, pixels may be mirrored, or cameras exchanged"
+            out.append(
+                Finding(
+                    Level.FAIL,
+                    what,
+                    why,
+                    cure,
+                )
+            )
     return out

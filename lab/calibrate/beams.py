@@ -9,9 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.beams.beam_findings import ARCSEC, BeamGoals, beam_findings, direction_sigmas
+from calibration.beams.beam_findings import ARCSEC, UNDETERMINED, BeamGoals, beam_findings, direction_sigmas
 from calibration.beams.beams import BeamCalibration, self_calibrate
 from calibration.beams.beams import calibrate_beams as find_beams
+from calibration.beams.excitation import briefly
 from calibration.findings import Finding, Level, verdict
 from calibration.least_squares.adjustment import AdjustmentError
 from geometry.rig_parameters import RigCovariance
@@ -62,7 +63,10 @@ class Outcome:
         warnings = sum(f.level == Level.WARN for f in self.findings)
         reason = f"; {warnings} warning{'s' if warnings > 1 else ''}, see report.html" if warnings else ""
         if self.level == Level.FAIL:
-            reason = f"; {worst.what.split(' (')[0]}: {worst.cure}"
+            what_failed = worst.what.split(" (")[0]
+            if c.undetermined and worst.what.startswith(UNDETERMINED):
+                what_failed = f"{UNDETERMINED}: {briefly(c.undetermined)}"
+            reason = f"; {what_failed}: {worst.cure}"
         return f"{self.name}: {self.level.name}: {what}{reason} -> {self.out}"
 
 

@@ -15,7 +15,7 @@ from calibration.least_squares.adjustment import AdjustmentError
 from calibration.rig.joint_findings import RigLimits, joint_findings
 from calibration.rig.rig_figures import central_pose, expected_pose, hold_out, spot_sigma
 from calibration.rig.rig_steps import RigSteps, calibrate_in_steps
-from calibration.screens.network_findings import ScreenLimits
+from calibration.screens.network_findings import ScreenLimits, near_findings
 from calibration.screens.network_findings import findings as network_findings
 from calibration.screens.screens import ScreensResult
 from geometry.rig import Rig
@@ -69,8 +69,9 @@ def calibrate_rig(
         held_out = None
     day = today or project.date or datetime.date.today()
     findings = [
+        *near_findings(screens, inputs.near),
         *joint_findings(steps, recordings.names, expected, held_out, limits or RigLimits()),
-        *survey_findings(project, inputs, screens),
+        *survey_findings(project, screens),
         *_of_the_steps(steps, rig, recordings.names),
         *_of_the_inputs(project, recordings, inputs, day),
     ]

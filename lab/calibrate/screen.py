@@ -10,6 +10,7 @@ import numpy as np
 
 from calibration.findings import Finding, Level, verdict
 from calibration.screens.network_findings import findings as network_findings
+from calibration.screens.network_findings import near_findings
 from calibration.screens.network_sigmas import pointing_sigmas_m, spot_sigmas
 from calibration.screens.screens import ScreensResult
 from geometry.rig import Rig
@@ -72,9 +73,11 @@ def calibrate_screen(project_path: Path, out: Path, today: datetime.date | None 
     project = load_project(Path(project_path))
     inputs = screen_inputs(project)
     result = adjusted_screens(project, inputs)
+    placed = near_findings(result, inputs.near)
     found = [
-        *network_findings(result),
-        *survey_findings(project, inputs, result),
+        *placed,
+        *network_findings(result, names_doubted=verdict(placed) > Level.PASS),
+        *survey_findings(project, result),
         *(Finding(Level.WARN, note) for note in inputs.notes),
     ]
     level = verdict(found)

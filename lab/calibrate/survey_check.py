@@ -11,7 +11,6 @@ import numpy as np
 
 from calibration.findings import Finding, Level
 from calibration.least_squares.adjustment import AdjustmentError
-from calibration.screens.network_findings import near_findings
 from calibration.screens.network_start import NotConnectedError
 from calibration.screens.screens import ScreensResult, calibrate
 from calibration.screens.survey_suspects import Suspect, misfit_of, suspects
@@ -69,9 +68,29 @@ def _suspicion(where: str, cures: Sequence[Suspect]) -> str:
     return f"{text}; mend the file"
 
 
-def survey_findings(project: Project, inputs: ScreenInputs, result: ScreensResult) -> list[Finding]:
-    """Whether the cameras stand where a tape measure says, and the dots lie on their screens and reach over them."""
-    return [*near_findings(result, inputs.near), *_coverage(project, result)]
+def survey_findings(project: Project, result: ScreensResult) -> list[Finding]:
+    """Whether the dots lie on their screens and reach over them, and every camera has a lens calibration of its own."""
+    return [*_shared_lenses(project), *_coverage(project, result)]
+
+
+def _shared_lenses(project: Project) -> list[Finding]:
+    """Two cameras with one file of a lens: their lenses are never the same."""
+    out = []
+    names = list(project.cameras)
+    for i, first in enumerate(names):
+        for second in names[i + 1 :]:
+            a, b = project.cameras[first], project.cameras[second]
+            # A file may hold several cameras, each with its own numbers.
+            if a.lens_path == b.lens_path and np.array_equal(a.lens.camera_matrix, b.lens.camera_matrix):
+                out.append(
+                    Finding(
+                        Level.WARN,
+                        f"cameras {first!r} and {second!r} share the lens calibration {a.lens_path.name}",
+                        "lenses of one type differ by far more than their calibrations' errors",
+                        "give each camera the file of its own calibration",
+                    )
+                )
+    return out
 
 
 def _coverage(project: Project, result: ScreensResult) -> list[Finding]:

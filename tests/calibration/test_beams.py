@@ -154,8 +154,8 @@ def test_a_stand_that_only_yaws_leaves_its_turn_and_height_to_the_beams():
     spots = recorded(rng, rig, poses)
     found = calibrate_beams(drawn(rig, rng, 1e-3, 1e-3), spots, unknown_place(poses))
     assert list(found.undetermined) == [
-        "a shift along z, with all beams the other way",
-        "a turn about z, with all beams the other way",
+        "all beams against the stand: a shift along z",
+        "all beams against the stand: a turn about z",
     ]
     assert found.motion.cure() == "add positions turned by 10 deg or more about the stand's x and y"
     assert calibrate_beams(rig, spots, exact(poses)).undetermined == []  # what the stand's known place mends

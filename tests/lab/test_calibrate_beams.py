@@ -187,7 +187,7 @@ def test_a_stand_that_only_yaws_fails_with_the_cure_and_writes_no_rig(tmp_path):
     outcome = calibrate_beams(project, tmp_path / "out")
     assert (outcome.level, outcome.exit_status, outcome.rig) == (Level.FAIL, 3, None)
     (bad,) = [f for f in outcome.findings if f.level == Level.FAIL]
-    assert "a turn about z, with all beams the other way" in bad.what
+    assert "all beams against the stand: a turn about z" in bad.what
     assert bad.cure.startswith("add positions turned by 10 deg or more about the stand's x and y")
     assert not (tmp_path / "out" / "rig.yaml").exists()
     assert {b["sigma_direction_arcsec"] for b in table(tmp_path / "out" / "beams.csv")} == {""}

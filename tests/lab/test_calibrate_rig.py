@@ -282,3 +282,12 @@ def test_poses_with_their_quaternions_in_another_order_are_refused_with_the_cure
     (copy / "poses.csv").write_text("\n".join([lines[0], *(",".join(r) for r in mixed)]) + "\n")
     with pytest.raises(InputError, match=r"poses.csv: .* order x, y, z, w; write them in the order qw, qx, qy, qz"):
         calibrate_rig(copy, tmp_path / "out", today=DAY)
+
+
+def test_two_cameras_with_one_lens_file_are_told(project, tmp_path):
+    ended = calibrate_rig(
+        changed(project, tmp_path, "intrinsics: camera-right.yaml", "intrinsics: camera-left.yaml"),
+        tmp_path / "out",
+        today=DAY,
+    )
+    assert any("share the lens calibration camera-left.yaml" in f.what for f in ended.findings)

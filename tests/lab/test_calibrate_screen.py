@@ -346,3 +346,14 @@ def test_real_photographs_of_a_carried_board_tie_two_cameras(tmp_path):
     assert np.linalg.norm((right @ left.inverse()).translation) == pytest.approx(0.0832, abs=0.001)
     assert len(outcome.result.network.placements) == 7
     assert (tmp_path / "out" / "residuals.csv").read_text().count("\n") > 600
+
+
+def test_a_camera_far_from_its_place_is_told_first_and_no_name_is_called_right(tmp_path):
+    path = write_project(tmp_path / "p", dots=6)
+    for name, camera in truth().cameras.items():
+        place = camera.camera_from_world.inverse().translation
+        changed(path, **{f"cameras__{name}__near_m": [float(v) for v in place * [-1, -1, 1]]})
+    ended = calibrate_screen(path, tmp_path / "out")
+    assert ended.exit_status == 3
+    assert "from its `near_m`" in ended.line()
+    assert not any("fit their names" in f.what for f in ended.findings)
