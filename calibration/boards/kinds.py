@@ -32,6 +32,13 @@ _MOST = 200
 _INK = 0.5
 
 
+_FAMILIES = "DICT_4X4_50 (_100, _250, _1000), likewise DICT_5X5_, DICT_6X6_ and DICT_7X7_, and DICT_APRILTAG_36h11"
+
+
+class _DictionaryError(ValueError):
+    """A dictionary that is not there."""
+
+
 def _dictionaries() -> dict[str, int]:
     """OpenCV's predefined dictionaries by name. Of names for one dictionary (36H11, 36h11) the printed one stays."""
     by_number: dict[int, str] = {}
@@ -277,6 +284,8 @@ def parse(text: str) -> Board:
         )
     try:
         return _board_of(kind, parts)
+    except _DictionaryError as error:  # a whole example beside the families would only hide them
+        raise ValueError(f"board {text!r}: {error}") from None
     except ValueError as error:
         hint = "" if EXAMPLES[kind] in str(error) else f"; example: {EXAMPLES[kind]}"
         raise ValueError(f"board {text!r}: {error}{hint}") from None
@@ -328,13 +337,9 @@ def dictionary_name(text: str) -> str:
         return by_lower[text.lower()]
     if f"dict_{text.lower()}" in by_lower:
         return by_lower[f"dict_{text.lower()}"]
-    near = difflib.get_close_matches(text.lower(), by_lower, n=3, cutoff=0.6)
-    hint = (
-        f"did you mean {' or '.join(by_lower[n] for n in near)}?"
-        if near
-        else "the families are DICT_4X4_50 to _1000, DICT_5X5_, DICT_6X6_, DICT_7X7_ likewise and DICT_APRILTAG_36h11"
-    )
-    raise ValueError(f"expected one of OpenCV's dictionaries, got {text!r}; {hint}")
+    near = difflib.get_close_matches(text.lower(), by_lower, n=2, cutoff=0.6)
+    hint = f"did you mean {' or '.join(by_lower[n] for n in near)}? " if near else ""
+    raise _DictionaryError(f"expected one of OpenCV's dictionaries, got {text!r}; {hint}there are {_FAMILIES}")
 
 
 def dictionary_size(name: str) -> int:
