@@ -17,8 +17,9 @@ from calibration.findings import Finding, Level, verdict
 from calibration.least_squares.adjustment import AdjustmentError
 from geometry.rig_parameters import RigCovariance
 from lab.calibrate.beam_tables import BEAMS, write_tables
+from lab.calibrate.calibration_day import day_of, expired
 from lab.calibrate.project import Project, load_project
-from lab.calibrate.recording_check import refuse_known_mistakes
+from lab.calibrate.recording_check import refuse_known_mistakes, refuse_repeated
 from lab.calibrate.recordings import Recordings, read_recordings, stand_of
 from lab.calibrate.screens_file import load_screens
 from lab.calibration_state import CalibrationState
@@ -82,6 +83,8 @@ def calibrate_beams(
     """
     refuse_foreign(out, _is_ours)
     project = load_project(Path(project_path))
+    day = day_of(project, today)
+    refuse_repeated(project)
     rig_path = Path(rig) if rig is not None else project.path.parent / RIG
     file, knowledge = _calibrated_lab(project, rig_path)
     recordings = read_recordings(project, file.rig)
@@ -96,10 +99,10 @@ def calibrate_beams(
         raise CalibrationError(f"{project.path}: the beams cannot be calibrated: {error}") from None
     findings = [
         *beam_findings(found, file.rig, recordings.names, BeamGoals()),
+        *expired(project, day, today),
         *_findings_of_inputs(project, recordings, knowledge is not None, file.calibration, rig_path),
     ]
     level = verdict(findings)
-    day = today or project.date or datetime.date.today()
     folder = beside_a_good_one(out, level == Level.FAIL, RIG)
     outcome = Outcome(
         project.name, folder, level, tuple(findings), found, None if level == Level.FAIL else folder / RIG

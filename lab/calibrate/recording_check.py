@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from calibration.beams.pose_suspects import suspect
 from geometry.rig import Rig
 from geometry.rig_parameters import RigCovariance
@@ -24,3 +26,18 @@ def refuse_known_mistakes(
     where = ", ".join(str(f) for f in files if f is not None)
     subject = "the spots fit" if found.in_labels else "the spots fit these poses"
     raise InputError(f"{where}: {subject} only {found.words}; {found.cure}")
+
+
+def refuse_repeated(project: Project) -> None:
+    """InputError for a recording that is listed twice: its spots would count twice, and all sigmas be too small."""
+    seen: dict[Path, int] = {}
+    for k, recording in enumerate(project.recordings):
+        path = recording.spots or recording.run
+        if path is None:
+            continue
+        first = seen.setdefault(path.resolve(), k)
+        if first != k:
+            raise InputError(
+                f"{project.path}: recordings.{k}: expected another recording than recordings.{first}, got {path.name}"
+                " again; list each once, or its spots count twice"
+            )

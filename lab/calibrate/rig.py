@@ -19,8 +19,9 @@ from calibration.screens.network_findings import ScreenLimits, near_findings
 from calibration.screens.network_findings import findings as network_findings
 from calibration.screens.screens import ScreensResult
 from geometry.rig import Rig
+from lab.calibrate.calibration_day import day_of, expired, last_day
 from lab.calibrate.project import Project, load_project
-from lab.calibrate.recording_check import refuse_known_mistakes
+from lab.calibrate.recording_check import refuse_known_mistakes, refuse_repeated
 from lab.calibrate.recordings import Recordings, read_recordings, stand_of
 from lab.calibrate.rig_outcome import Outcome
 from lab.calibrate.rig_tables import RESIDUALS, write_residuals
@@ -50,6 +51,8 @@ def calibrate_rig(
     """
     refuse_foreign(out, _is_ours)
     project = load_project(Path(project_path))
+    day = day_of(project, today)
+    refuse_repeated(project)
     if not project.beams or not project.spots:
         raise InputError(
             f"{project.path}: target: expected beams and spots as designed, got none; add them, or calibrate the"
@@ -67,12 +70,12 @@ def calibrate_rig(
         held_out = hold_out(steps.measured, joint)
     except AdjustmentError:
         held_out = None
-    day = today or project.date or datetime.date.today()
     findings = [
         *near_findings(screens, inputs.near),
         *joint_findings(steps, recordings.names, expected, held_out, limits or RigLimits()),
         *survey_findings(project, screens),
         *_of_the_steps(steps, rig, recordings.names),
+        *expired(project, day, today),
         *_of_the_inputs(project, recordings, inputs, day),
     ]
     level = verdict(findings)
@@ -175,7 +178,7 @@ def _of_the_inputs(project: Project, recordings: Recordings, inputs: ScreenInput
 
 def _rig_file(outcome: Outcome, project: Project, day: datetime.date) -> RigFile:
     joint = outcome.steps.joint
-    until = None if project.valid_days is None else day + datetime.timedelta(days=project.valid_days)
+    until = last_day(project, day)
     worst_first = sorted(outcome.findings, key=lambda f: -f.level)
     reasons = tuple(f.what for f in worst_first if f.level > Level.PASS)
     state = CalibrationState(day, outcome.level.name, until, reasons, project.notes)

@@ -14,6 +14,7 @@ from calibration.screens.network_findings import near_findings
 from calibration.screens.network_sigmas import pointing_sigmas_m, spot_sigmas
 from calibration.screens.screens import ScreensResult
 from geometry.rig import Rig
+from lab.calibrate.calibration_day import day_of, expired, last_day
 from lab.calibrate.project import Project, load_project
 from lab.calibrate.screen_inputs import screen_inputs
 from lab.calibrate.screen_tables import DOTS, RESIDUALS, write_tables
@@ -71,6 +72,7 @@ def calibrate_screen(project_path: Path, out: Path, today: datetime.date | None 
     """
     refuse_foreign(out, _is_ours)
     project = load_project(Path(project_path))
+    day = day_of(project, today)
     inputs = screen_inputs(project)
     result = adjusted_screens(project, inputs)
     placed = near_findings(result, inputs.near)
@@ -78,10 +80,10 @@ def calibrate_screen(project_path: Path, out: Path, today: datetime.date | None 
         *placed,
         *network_findings(result, names_doubted=verdict(placed) > Level.PASS),
         *survey_findings(project, result),
+        *expired(project, day, today),
         *(Finding(Level.WARN, note) for note in inputs.notes),
     ]
     level = verdict(found)
-    day = today or project.date or datetime.date.today()
     folder = beside_a_good_one(out, level == Level.FAIL, SCREENS)
     outcome = Outcome(project.name, folder, level, tuple(found), result)
     with whole_folder(folder, may_replace=_is_ours) as work:
@@ -102,7 +104,7 @@ def _is_ours(folder: Path) -> bool:
 
 
 def _save(project: Project, outcome: Outcome, day: datetime.date, folder: Path) -> None:
-    until = None if project.valid_days is None else day + datetime.timedelta(days=project.valid_days)
+    until = last_day(project, day)
     reasons = tuple(f.what for f in outcome.findings if f.level > Level.PASS)
     state = CalibrationState(day, outcome.level.name, until, reasons, project.notes)
     fit = outcome.result.fit

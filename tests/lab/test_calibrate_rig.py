@@ -291,3 +291,23 @@ def test_two_cameras_with_one_lens_file_are_told(project, tmp_path):
         today=DAY,
     )
     assert any("share the lens calibration camera-left.yaml" in f.what for f in ended.findings)
+
+
+def test_measurements_of_the_future_are_refused(project, tmp_path):
+    copy = changed(project, tmp_path, r"date: \S+\nvalid_days: 365", "valid_days: 10\ndate: 2026-03-15")
+    with pytest.raises(InputError, match=r"date: .* got 2026-03-15, after today \(2026-03-14\)"):
+        calibrate_rig(copy, tmp_path / "out", today=DAY)
+
+
+def test_a_result_that_holds_no_more_when_it_is_written_is_told(project, tmp_path):
+    ended = calibrate_rig(
+        changed(project, tmp_path, r"date: \S+\nvalid_days: 365", "valid_days: 10\ndate: 2020-01-01"), tmp_path / "out"
+    )
+    assert ended.level == Level.WARN
+    assert "the calibration held until 2020-01-11" in ended.line()
+
+
+def test_a_recording_that_is_listed_twice_is_refused(project, tmp_path):
+    copy = changed(project, tmp_path, r"(- \{spots: spots.csv, poses: poses.csv\})", r"\1\n\1")
+    with pytest.raises(InputError, match=r"recordings.1: .* got spots.csv again"):
+        calibrate_rig(copy, tmp_path / "out", today=DAY)
