@@ -130,7 +130,7 @@ def test_symmetry_counts_the_turns_after_which_the_ink_is_the_same(text, symmetr
         ("charuco:5x7:20mm:40mm:DICT_4X4_50", "expected markers smaller than the squares, got 40mm in 20mm"),
         ("charuco:5x7:40mm:20mm:DICT_4X5_50", "got 'DICT_4X5_50'; did you mean .*DICT_4X4_50"),
         ("charuco:5x7:40mm:20mm:FOO", "^.{1,220}$"),
-        ("charuco:5x7:40mm:20mm:DICT_FOO", "there are DICT_4X4_50 .*DICT_7X7_ and DICT_APRILTAG_36h11$"),
+        ("charuco:5x7:40mm:20mm:DICT_FOO", "there are DICT_4X4_50 .*DICT_7X7_, and DICT_APRILTAG_36h11$"),
         ("charuco:20x20:40mm:20mm:DICT_4X4_50", "need 200 markers, DICT_4X4_50 has 50; take a larger dictionary"),
         ("charuco:5x7:40mm:20mm:DICT_4X4_50:invert", "expected 'inverted' or 'legacy' at the end, got 'invert'"),
     ],
