@@ -13,7 +13,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from calibration.beams.spot_term import SpotPixels, SpotTerm
-from calibration.least_squares.adjustment import Adjusted, AdjustmentError, Cauchy, Free, Term, Values, solve
+from calibration.least_squares.adjustment import Adjusted, AdjustmentError, Cauchy, Free, Limits, Term, Values, solve
 from geometry.arrays import Array, Bools
 from geometry.rig import Rig
 
@@ -21,6 +21,8 @@ P_OUTLIER = 1e-4  # of a good spot to be left out: one in 10 000
 _MEDIAN_CHI2 = 2 * np.log(2)  # of squared sigmas of two numbers
 _P_MISFIT = 1e-3  # of a right fit to be said to misfit
 _ROUNDS = 8
+# With weights that change from step to step the last digits settle slowly, and it is only a start.
+_ROUGHLY = Limits(steps=120, small_step_sigmas=0.1)
 _MOST_SCALE = 10.0  # told sigmas may be so much too small; what scatters more was not made by these beams
 
 
@@ -42,7 +44,7 @@ def fit_spots(rig: Rig, spots: SpotPixels, values: Values, others: Sequence[Term
     ones are a user's safety margin.
     """
     every = SpotTerm(rig, spots)
-    robust = solve(values, [SpotTerm(rig, spots, Cauchy()), *others], free)
+    robust = solve(values, [SpotTerm(rig, spots, Cauchy()), *others], free, _ROUGHLY)
     now = robust.values
     kept = _near(every, now)
     for _ in range(_ROUNDS):
