@@ -109,7 +109,6 @@ def _project(c: Campaign) -> dict[str, Any]:
         "schema": SCHEMA,
         "name": f"{c.name}-{c.seed}",
         "date": _DATE,
-        "valid_days": 365,
         "cameras": {
             n: {
                 "intrinsics": f"camera-{n}.yaml",

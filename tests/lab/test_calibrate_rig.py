@@ -61,9 +61,11 @@ def test_right_measurements_pass_and_the_line_says_how_good_the_rig_is(outcome):
     assert sorted(p.name for p in outcome.out.iterdir()) == ["report.html", "residuals.csv", "rig.yaml"]
 
 
-def test_the_rig_file_says_when_it_was_made_until_when_it_holds_and_that_it_passed(outcome):
+def test_the_rig_file_says_when_it_was_made_until_when_it_holds_and_that_it_passed(outcome, project, tmp_path):
     state = load_rig_file(outcome.out / "rig.yaml").calibration
-    assert (state.date, state.verdict, state.reasons) == (DAY, "PASS", ())
+    assert (state.date, state.verdict, state.reasons, state.valid_until) == (DAY, "PASS", (), None)
+    for_a_year = changed(project, tmp_path, r"date: (\S+)", r"date: \1\nvalid_days: 365")
+    state = load_rig_file(calibrate_rig(for_a_year, tmp_path / "out", today=DAY).out / "rig.yaml").calibration
     assert state.valid_until == DAY + datetime.timedelta(days=365)
 
 
@@ -294,14 +296,14 @@ def test_two_cameras_with_one_lens_file_are_told(project, tmp_path):
 
 
 def test_measurements_of_the_future_are_refused(project, tmp_path):
-    copy = changed(project, tmp_path, r"date: \S+\nvalid_days: 365", "valid_days: 10\ndate: 2026-03-15")
+    copy = changed(project, tmp_path, r"date: \S+", "valid_days: 10\ndate: 2026-03-15")
     with pytest.raises(InputError, match=r"date: .* got 2026-03-15, after today \(2026-03-14\)"):
         calibrate_rig(copy, tmp_path / "out", today=DAY)
 
 
 def test_a_result_that_holds_no_more_when_it_is_written_is_told(project, tmp_path):
     ended = calibrate_rig(
-        changed(project, tmp_path, r"date: \S+\nvalid_days: 365", "valid_days: 10\ndate: 2020-01-01"), tmp_path / "out"
+        changed(project, tmp_path, r"date: \S+", "valid_days: 10\ndate: 2020-01-01"), tmp_path / "out"
     )
     assert ended.level == Level.WARN
     assert "the calibration held until 2020-01-11" in ended.line()
