@@ -63,7 +63,9 @@ def good(tmp_path_factory):
 def test_a_good_survey_passes_and_says_how_good(good):
     out, outcome = good
     assert outcome.level in (Level.PASS, Level.WARN)
-    assert all("reach over" in f.what for f in outcome.findings if f.level == Level.WARN)
+    warned = [f.what for f in outcome.findings if f.level == Level.WARN]
+    # The made-up lab has one lens file for all its cameras, which a real one has not.
+    assert all("reach over" in w or "share the lens calibration" in w for w in warned), warned
     assert outcome.exit_status == 0
     assert outcome.line().startswith(f"bay 3: {outcome.level.name}: 2 cameras, 2 screens, surfaces to 0.")
     assert files_below(out) == ["dots.csv", "report.html", "residuals.csv", "rig.yaml", "screens.yaml"]
