@@ -65,14 +65,17 @@ class PoseFit:
 
         Errors of the calibration move a spot and, through the pose, what is expected of it; what is common cancels.
         """
-        spread = point_covariance(self.jacobian, self.noise)
+        return point_covariance(self.jacobian, self.noise) + self.calibration_px()
+
+    def calibration_px(self) -> Array | float:
+        """The calibration's part of `spot_covariances`: (n, 2, 2), px^2; 0 where nothing is known of its errors."""
         if self._common is None:
-            return spread
+            return 0.0
         n = len(self.jacobian)
         left = np.eye(2 * n)
         left[:, _both(self.rows)] -= np.nan_to_num(self.jacobian.reshape(2 * n, 6)) @ self._gain
         joint = (left @ self._common @ left.T).reshape(n, 2, n, 2)
-        return spread + joint[np.arange(n), :, np.arange(n)]
+        return np.asarray(joint[np.arange(n), :, np.arange(n)])
 
     @property
     def rms_px(self) -> float:

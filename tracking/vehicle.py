@@ -91,7 +91,7 @@ class Vehicle:
         same_spots = np.array_equal(fit.rows, self._rows)
         covariance = (fit.noise if same_spots else fit.covariance) * self.noise_scale**2
         self._rows, self._systematic = fit.rows, fit.systematic * self.noise_scale**2
-        self._systematic_px = fit.spot_covariances() - point_covariance(fit.jacobian, fit.noise)
+        self._systematic_px = fit.calibration_px()
         if fit.dof > 0:
             self._learn_misfit(fit.chi2 / fit.dof)
             # One calibration has one set of errors: its share of the misfit is drawn once, and no mean evens it out.
