@@ -1,0 +1,169 @@
+"""Does the rig file fit the recording? Statistics, culprits and findings of one run."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from calibration.findings import Finding, Level
+from geometry.arrays import Array, Ints
+from geometry.rig import Rig
+from geometry.rig_parameters import RigCovariance
+from geometry.spots import SpotModel
+from lab.model_check.culprit import Culprit, Inquest, inquire
+from lab.model_check.effect import Effect, effect_of
+from lab.model_check.faults import FaultColumns, possible_faults
+from lab.model_check.linear import Linearised, linearise
+from lab.model_check.recording import Recording, evenly, finite
+from lab.model_check.statistics import Statistics, group_key, statistics
+from lab.model_check.words import culprit_finding, unexplained_finding
+
+MOST_FRAMES = 2000  # for the statistics: their sigmas halve for four times as many only
+MOST_FRAMES_FOR_CULPRITS = 400  # for the normal equations; 0.02 deg of a camera show in these
+_MOST_NUMBERS = 12_000_000  # of one array of derivatives, 96 MB: large rigs make do with fewer frames ...
+_FEWEST_FRAMES = 30  # ... but not with fewer than these; and a recording of fewer is not tested
+_FEWEST_SPOTS = 3  # of a frame: fewer leave nothing for a test, whatever the pose
+
+
+@dataclass(frozen=True, slots=True)
+class ModelCheck:
+    """What a recording says of its rig file."""
+
+    frames_used: int  # for the statistics
+    frames_for_culprits: int
+    statistics: Statistics | None  # None where no frame has enough spots
+    inquest: Inquest | None  # None where there is too little to test
+    effects: tuple[Effect, ...]  # of the culprits, in their order
+    findings: tuple[Finding, ...]  # the gravest things first; empty where nothing was found
+    why_not: str = ""  # why nothing was tested; empty where it was
+
+    @property
+    def level(self) -> Level:
+        """The gravest finding's."""
+        return max((f.level for f in self.findings), default=Level.PASS)
+
+    def as_mapping(self) -> dict[str, Any]:
+        """For summary.json, plain values.
+
+        tested, why_not; frames_used, frames_for_culprits; findings: level (PASS, WARN, FAIL), what, why, cure;
+        misfit, noise, correlation_frames, p_before, p_after: see Inquest; culprits: thing, name, kind, delta and sigma
+        (in rad, m, px, s, or relative), explained (chi-square), p, rivals (thing, name, kind), off_px, off_sigmas,
+        attitude_deg, position_mm, pose_sigmas: see Effect; views, cameras, beams: see GroupStatistics.
+        """
+        out: dict[str, Any] = {
+            "tested": self.inquest is not None,
+            "why_not": self.why_not,
+            "frames_used": self.frames_used,
+            "frames_for_culprits": self.frames_for_culprits,
+            "findings": [{"level": f.level.name, "what": f.what, "why": f.why, "cure": f.cure} for f in self.findings],
+        }
+        if self.inquest is not None:
+            q = self.inquest
+            out |= {
+                "misfit": q.misfit,
+                "noise": q.noise,
+                "correlation_frames": q.correlation_frames,
+                "p_before": q.p_before,
+                "p_after": q.p_after,
+                "culprits": [_mapping(c, e) for c, e in zip(q.culprits, self.effects, strict=True)],
+            }
+        if self.statistics is not None:
+            out |= self.statistics.as_mapping()
+        return out
+
+
+def check_model(rig: Rig, recording: Recording, calibration: RigCovariance | None = None) -> ModelCheck:
+    """Test whether a recording fits the rig, and name the likely culprit where it does not.
+
+    calibration: what is claimed of the rig's numbers; a misfit that it allows is no fault. Work and memory are bounded
+    whatever the length: frames are thinned evenly. ValueError where the recording has other views than the rig.
+    """
+    model = SpotModel.of(rig)
+    if recording.seen.shape[1] != len(model):
+        raise ValueError(f"recording: expected {len(model)} views as the rig has, got {recording.seen.shape[1]}")
+    fit_for_it = np.flatnonzero(recording.usable.sum(axis=1) >= _FEWEST_SPOTS)
+    columns = FaultColumns.of(rig, model, calibration)
+    each = 2 * len(model) * len(columns.names)
+    most = min(MOST_FRAMES_FOR_CULPRITS, max(_FEWEST_FRAMES, _MOST_NUMBERS // max(each, 1)))
+    if len(fit_for_it) < _FEWEST_FRAMES:
+        why = f"{len(fit_for_it)} frames have {_FEWEST_SPOTS} and more spots measured; the test needs {_FEWEST_FRAMES}"
+        return ModelCheck(len(fit_for_it), 0, None, None, (), (), why)
+    lin = linearise(model, recording, evenly(fit_for_it, most))
+    moves = columns.at(recording, lin)
+    expected = _calibration_px(lin, moves, columns.covariance, model, tuple(rig.beams))
+    all_frames = linearise(model, recording, evenly(fit_for_it, MOST_FRAMES))
+    told = statistics(model, tuple(rig.beams), recording, all_frames, expected)
+    if lin.dof <= 0:
+        why = "in no frame are more spots measured than its pose takes"
+        return ModelCheck(len(all_frames.frames), len(lin.frames), told, None, (), (), why)
+    inquest = inquire(lin, moves, columns.covariance, possible_faults(rig, columns))
+    claimed = None if recording.pose_covariance is None else recording.pose_covariance[lin.frames]
+    effects = tuple(
+        effect_of(
+            lin,
+            moves,
+            c.best.fault.numbers @ c.best.change.delta,
+            c.best.fault.views,
+            columns.covariance,
+            claimed,
+        )
+        for c in inquest.culprits
+    )
+    frame_s = float(np.median(np.diff(recording.t_s)))
+    findings = [
+        culprit_finding(c, e, inquest, rig, model, frame_s) for c, e in zip(inquest.culprits, effects, strict=True)
+    ]
+    if inquest.unexplained:
+        findings.append(unexplained_finding(inquest))
+    findings.sort(key=lambda f: -f.level)
+    return ModelCheck(len(all_frames.frames), len(lin.frames), told, inquest, effects, tuple(findings))
+
+
+def _calibration_px(
+    lin: Linearised, moves: Array, covariance: Array, model: SpotModel, beams: tuple[str, ...]
+) -> Mapping[str, Array]:
+    """1 sigma (2,), px, that the calibration's errors make of each group's mean residual against the other spots."""
+    known = np.flatnonzero(np.diagonal(covariance) > 0)
+    if not known.size:
+        return {}
+    free = lin.weights() @ lin.pose_free(moves[..., known])
+    back = np.linalg.inv(np.where(lin.used[..., None, None], lin.W, np.eye(2)))
+    off = back @ free  # (K, n, 2, p)
+    there = finite(off, (-1, -2))
+    C = covariance[np.ix_(known, known)]
+
+    def sigma(views: Ints) -> Array:
+        some = there[:, views]
+        if not some.any():
+            return np.full(2, np.nan)
+        mean = off[:, views][some].mean(axis=0)
+        return np.sqrt(np.maximum(np.einsum("ip,pq,iq->i", mean, C, mean), 0.0))
+
+    out = {group_key("view", f"{c}/{s}"): sigma(np.array([i])) for i, (c, s) in enumerate(model.views)}
+    for i, c in enumerate(model.camera_names):
+        out[group_key("camera", c)] = sigma(np.flatnonzero(model.camera_of == i))
+    for i, b in enumerate(beams):
+        out[group_key("beam", b)] = sigma(np.flatnonzero(model.beam_of == i))
+    return out
+
+
+def _mapping(culprit: Culprit, effect: Effect) -> dict[str, Any]:
+    change, fault = culprit.best.change, culprit.best.fault
+    return {
+        "thing": fault.thing,
+        "name": fault.name,
+        "kind": fault.kind,
+        "delta": change.delta.tolist(),
+        "sigma": np.sqrt(np.maximum(np.diagonal(change.covariance), 0.0)).tolist(),
+        "explained": change.explained,
+        "p": change.p_value,
+        "rivals": [{"thing": r.fault.thing, "name": r.fault.name, "kind": r.fault.kind} for r in culprit.rivals],
+        "off_px": effect.off_px,
+        "off_sigmas": effect.off_sigmas,
+        "attitude_deg": effect.attitude_deg,
+        "position_mm": effect.position_mm,
+        "pose_sigmas": effect.pose_sigmas,
+    }

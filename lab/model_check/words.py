@@ -1,0 +1,157 @@
+"""The model check's findings in words: which thing, by how much, what it does to the pose, what to do."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from calibration.findings import Finding, Level
+from geometry.rig import Rig
+from geometry.spots import SpotModel
+from lab.model_check import faults as f
+from lab.model_check.culprit import Culprit, Explained, Inquest
+from lab.model_check.effect import Effect
+from lab.report.svg import short
+
+MATTERS_SIGMAS = 0.5  # of a pose's claimed sigmas, or of a spot's: a bias below it is lost in what is claimed anyway
+WRONG_SIGMAS = 5.0  # beyond it the run's claims are untrue; the misfit gate's limit is the same (lab/quality.py)
+_ONE_FRAME = 0.1  # of a frame interval: as near as this to a whole number of them, frames are counted wrong
+
+_CURES = {
+    f.CAMERA: "Look for a knocked or loose mount, focus or zoom ring of that camera; fix it, run `calibrate daily` to"
+    " make sure, then find its place anew (`calibrate rig`).",
+    f.SCREEN: "Measure where that screen is (`calibrate screen`), then calibrate the rig anew.",
+    f.BEAM: "Check that laser's mount on the vehicle, then calibrate the beams anew (`calibrate beams`).",
+    f.VIEW: "Look at that spot in the pictures: a reflection, an edge of the screen or a wrong label; then at its"
+    " laser.",
+    f.CLOCK: "Check trigger cable, exposure settings and frame numbers of the cameras: one number must be one instant.",
+}
+
+
+def level_of(inquest: Inquest, effect: Effect) -> Level:
+    """How grave a significant fault is."""
+    if inquest.misfit > WRONG_SIGMAS or effect.pose_sigmas > WRONG_SIGMAS or effect.off_sigmas > WRONG_SIGMAS:
+        return Level.FAIL
+    if effect.pose_sigmas > MATTERS_SIGMAS or effect.off_sigmas > MATTERS_SIGMAS:
+        return Level.WARN
+    return Level.PASS
+
+
+def culprit_finding(
+    culprit: Culprit, effect: Effect, inquest: Inquest, rig: Rig, model: SpotModel, frame_s: float
+) -> Finding:
+    """One finding for one culprit. effect: of its best explanation; frame_s: the usual time between frames."""
+    level = level_of(inquest, effect)
+    told = [_told(e, model, frame_s) for e in (culprit.best, *culprit.rivals)]
+    says = told[0]
+    if len(told) > 1:
+        also = f", or {culprit.more_rivals} others" if culprit.more_rivals else ""
+        says = f"{'; or '.join(told)}{also}: this recording cannot tell which"
+    where = ""
+    if effect.axis >= 0:
+        camera, spot = model.views[effect.view]
+        where = (
+            f"spot {spot} in camera `{camera}` lies {short(effect.off_sigmas, 2)} sigma ({short(effect.off_px, 2)} px)"
+            f" off in {'uv'[effect.axis]} against the other spots: "
+        )
+    what = f"{where}{says}, p {p_text(culprit.best.change.p_value)}"
+    things = list(dict.fromkeys(e.fault.thing for e in (culprit.best, *culprit.rivals)))
+    cure = " ".join(_CURES[t] for t in things) if level > Level.PASS else ""
+    if culprit.rivals and level > Level.PASS:
+        way = "A new calibration of the beams" if things == [f.BEAM] else "A `calibrate daily` with marked points"
+        cure += f" {way} tells the candidates apart."
+    return Finding(level, what, _consequence(effect, level), cure)
+
+
+def unexplained_finding(inquest: Inquest) -> Finding:
+    """What no single fault explains."""
+    level = Level.FAIL if inquest.misfit > WRONG_SIGMAS else Level.WARN
+    alone = "" if not inquest.culprits else " beyond what is named above"
+    return Finding(
+        level,
+        f"the residuals do not fit the rig file{alone}, and no single camera, screen, beam or clock explains it,"
+        f" p {p_text(inquest.p_after)}",
+        f"they are {short(inquest.misfit, 2)} times what the spots' sigmas allow; the stated sigmas of the poses leave"
+        " this out",
+        "Calibrate the rig anew; if that does not help, check lens models and the flatness of the screens.",
+    )
+
+
+def _consequence(effect: Effect, level: Level) -> str:
+    if not np.isfinite(effect.attitude_deg):
+        return "no frame alone has a pose, so what it does to them cannot be told"
+    bias = f"{short(effect.attitude_deg, 2)} deg and {short(effect.position_mm, 2)} mm"
+    of = f", up to {short(effect.pose_sigmas, 2)} of its claimed sigmas" if np.isfinite(effect.pose_sigmas) else ""
+    if level == Level.PASS:
+        return f"it is sure but small: it turns and moves the pose by {bias}{of}"
+    return f"it turns and moves the pose by about {bias}{of}; averaging over frames does not lessen it"
+
+
+def _told(e: Explained, model: SpotModel, frame_s: float) -> str:
+    """`camera `right` may have turned, by 0.35 ± 0.02 mrad`."""
+    fault, delta = e.fault, e.change.delta
+    sigma = np.sqrt(np.maximum(np.diagonal(e.change.covariance), 0.0))
+
+    def size(part: slice, unit: str, factor: float) -> str:
+        length = float(np.linalg.norm(delta[part]))
+        along = delta[part] / max(length, 1e-300)
+        of = float(np.sqrt(along**2 @ sigma[part] ** 2))
+        return f"{plus_minus(factor * length, factor * of)} {unit}"
+
+    every = slice(None)
+    thing = f"{fault.thing} `{fault.name}`"
+    match fault.kind:
+        case f.TURNED:
+            return f"{thing} may have turned, by {size(every, 'mrad', 1e3)}"
+        case f.SHIFTED:
+            return f"{thing} may have moved: its picture is shifted by {size(every, 'px', 1.0)}"
+        case f.ZOOMED:
+            return f"the focal length of {thing} may have changed, by {size(every, '%', 100.0)}"
+        case f.MOVED:
+            turn, move = size(slice(3), "mrad", 1e3), size(slice(3, 6), "mm", 1e3)
+            return f"{thing} may have moved, by {move} and {turn}"
+        case f.ALONG_NORMAL:
+            return f"{thing} may have moved, by {size(every, 'mm', 1e3)} along its normal"
+        case f.TILTED:
+            turn, move = size(slice(1, 3), "mrad", 1e3), size(slice(1), "mm", 1e3)
+            return f"{thing} may have moved, by {move} along its normal and tilted by {turn}"
+        case f.POINTS_ELSEWHERE:
+            return f"{thing} may point elsewhere, by {size(every, 'deg', float(np.rad2deg(1.0)))}"
+        case f.POINT_OFF:
+            return f"{thing} may have moved beside itself, by {size(every, 'mm', 1e3)}"
+        case f.LASER_MOVED:
+            turn, move = size(slice(2), "deg", float(np.rad2deg(1.0))), size(slice(2, 4), "mm", 1e3)
+            return f"{thing} may have moved, by {move} and {turn}"
+        case f.LATE:
+            return _late(fault.name, float(delta[0]), float(sigma[0]), model, frame_s)
+        case _:
+            camera, spot = fault.name.rsplit("/", 1)
+            return f"spot {spot} is seen beside its place in camera `{camera}`, by {size(every, 'px', 1.0)}"
+
+
+def _late(name: str, late_s: float, sigma_s: float, model: SpotModel, frame_s: float) -> str:
+    """Of two cameras the one whose pictures are the later; of more, late or early against the others."""
+    filming = [c for i, c in enumerate(model.camera_names) if (model.camera_of == i).any()]
+    others, word = "the others", "late" if late_s > 0 else "early"
+    if len(filming) == 2:
+        other = next(c for c in filming if c != name)
+        name, others, word = (name, f"camera `{other}`", "late") if late_s > 0 else (other, f"camera `{name}`", "late")
+    size = f"{plus_minus(1e3 * abs(late_s), 1e3 * sigma_s)} ms"
+    says = f"camera `{name}` is about {size} {word} against {others}"
+    count = round(abs(late_s) / frame_s) if frame_s > 0 else 0
+    if count and abs(abs(late_s) / frame_s - count) < _ONE_FRAME:
+        says += f" (that is {count} frame{'s' if count != 1 else ''}: its pictures may be numbered wrong)"
+    return says
+
+
+def plus_minus(value: float, sigma: float) -> str:
+    """`0.350 ± 0.012`: the sigma to one digit, to two where that is a 1, and the value to as many decimals."""
+    if not (np.isfinite(sigma) and sigma > 0):
+        return short(value, 2)
+    power = int(np.floor(np.log10(sigma)))
+    decimals = max(0, -power + (1 if sigma / 10.0**power < 2 else 0))
+    return f"{value:.{decimals}f} ± {sigma:.{decimals}f}"
+
+
+def p_text(p: float) -> str:
+    """`= 3e-09`, `below 1e-12`."""
+    return "below 1e-12" if p < 1e-12 else f"= {p:.0e}"
