@@ -6,14 +6,15 @@ trackers, the spots out of view and the simulator all use this and nothing else.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from geometry.arrays import Array, Bools, Ints, cross, skew
-from geometry.camera import FISHEYE, in_picture, pinhole_numbers, project_points, project_points_full
-from geometry.lens import padded
+from geometry.camera import FISHEYE, in_picture, pinhole_numbers, project_points_full
+from geometry.lens import padded, tilt_matrix
 from geometry.pose import Pose
+from geometry.projection import Views, lens_kinds, project_all
 from geometry.rig import Rig
 
 
@@ -77,6 +78,14 @@ class SpotModel:
     fisheye: Bools  # (n,)
     fold_r2: Array  # (n,)
     image_size_px: Array  # (n, 2): width, height
+    numbers: Views = field(init=False, repr=False, compare=False)  # the same for the compiled functions
+
+    def __post_init__(self) -> None:
+        lens = lens_kinds(self.distortion, self.fisheye)
+        tilt = tilt_matrix(self.distortion[:, 12], self.distortion[:, 13])
+        whole = {name: getattr(self, name) for name in Views._fields if name not in ("lens", "tilt")}
+        arrays = {name: np.ascontiguousarray(a) for name, a in {**whole, "lens": lens, "tilt": tilt}.items()}
+        object.__setattr__(self, "numbers", Views(**arrays))
 
     @staticmethod
     def of(rig: Rig) -> SpotModel:
@@ -126,7 +135,7 @@ class SpotModel:
         per_view = {
             name: getattr(self, name)[index]
             for name in SpotModel.__slots__
-            if name not in ("views", "camera_names", "spot_names")
+            if name not in ("views", "camera_names", "spot_names", "numbers")
         }
         return SpotModel(
             views=tuple(self.views[i] for i in index),
@@ -199,12 +208,15 @@ class SpotModel:
         nan where no projection exists: the beam misses its screen, or the point lies beyond what the lens model
         maps. Pixels outside the picture are given as well. Jacobian as in `hits`.
         """
-        hit, J_hit = self.hits(world_from_body)
-        in_camera = (self.camera_rotation @ hit[..., None])[..., 0] + self.camera_translation
-        missed = np.isnan(in_camera[..., 2])
-        in_camera = np.where(missed[..., None], [0.0, 0.0, 1.0], in_camera)
-        pixels, J_pixel = project_points(in_camera, self.pinhole, self.distortion, self.fold_r2, self.fisheye)
-        return np.where(missed[..., None], np.nan, pixels), J_pixel @ (self.camera_rotation @ J_hit)
+        R, t = world_from_body.rotation, world_from_body.translation
+        stack = np.broadcast_shapes(R.shape[:-2], t.shape[:-1])
+        uv, J = project_all(
+            self.numbers,
+            np.ascontiguousarray(np.broadcast_to(R, (*stack, 3, 3)), dtype=np.float64).reshape(-1, 3, 3),
+            np.ascontiguousarray(np.broadcast_to(t, (*stack, 3)), dtype=np.float64).reshape(-1, 3),
+        )
+        n = len(self)
+        return uv.reshape(*stack, n, 2), J.reshape(*stack, n, 2, 6)
 
     def derivatives(self, world_from_body: Pose) -> SpotDerivatives:
         """As `project`, with the derivatives with respect to everything in the rig that a calibration determines.

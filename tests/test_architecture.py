@@ -28,8 +28,8 @@ MAY_USE = {
 }
 # lab and cli may use whatever pyproject.toml declares; the floors of formulas need no files, tables or plots.
 MAY_USE_FROM_OUTSIDE = {
-    "geometry": {"numpy", "scipy"},
-    "tracking": {"numpy", "scipy", "cv2"},
+    "geometry": {"numpy", "scipy", "numba"},
+    "tracking": {"numpy", "scipy", "numba", "cv2"},
     "calibration": {"numpy", "scipy", "cv2", "open3d"},
 }
 

@@ -39,15 +39,24 @@ class LabelParameters:
 
 @dataclass(frozen=True, slots=True)
 class TrackerParameters:
-    """Tracking (tracking/spot_tracker.py). Symbols: Huo, Yang & Yang 2015, sections 3 and 4.1."""
+    """Tracking (tracking/rigid_tracker.py, tracking/spot_tracker.py). Symbols: Huo, Yang & Yang 2015, sections 3 and 4.1."""
 
-    method: Literal["spots", "rigid"] = (
-        "spots"  # spots: the paper's, a filter per spot | rigid: predicted by the vehicle's motion
+    method: Literal["rigid", "spots"] = (
+        "rigid"  # rigid: one filter for the vehicle that carries all spots | spots: the paper's, a filter per spot
     )
     detect: DetectParameters = field(default_factory=DetectParameters)
     labels: LabelParameters = field(default_factory=LabelParameters)
 
-    # Matching, section 4.1
+    # The rigid tracker (ours)
+    p_detect: float = 0.98  # probability that a spot which is in the picture and not hidden is found
+    p_blend: float = 0.01  # ... that it has melted into a neighbour; needs the detections' shapes
+    min_label_probability: float = 0.9  # a label less likely than this is not given: the row says occluded
+    learn_jerk: bool = True  # learn the strength of the steady motion's jerk from the innovations, from these on:
+    jerk_m_s3: float = 20.0  # m/s^3 per sqrt(Hz), of the translation
+    jerk_rad_s3: float = 60.0  # rad/s^3 per sqrt(Hz), of the rotation
+    p_manoeuvre: float = 0.02  # probability per frame that the velocities jump, at the start; learnt with the jerk
+
+    # Matching, section 4.1 (spots)
     r1_px: float = 10.0  # r1, px: radius of the first search, around the prediction (flat from 4 to 30 on bends)
     r2_px: float = 30.0  # r2, px: radius of the second search, around the last position (flat from 15 to 45)
     eps1: float = 0.4  # epsilon1: least g3 of the first search

@@ -19,6 +19,15 @@ class Event:
 
 
 @dataclass(frozen=True, slots=True)
+class MotionEstimate:
+    """How the vehicle moves at one instant."""
+
+    velocity: Array  # (3,), m/s, of the body origin, in world
+    rate: Array  # (3,), rad/s, about the body's axes
+    covariance: Array  # (6, 6) of both, (m/s)^2 and (rad/s)^2
+
+
+@dataclass(frozen=True, slots=True)
 class TrackedFrame:
     """What the tracker says of one frame. n views, in the order of the SpotModel."""
 
@@ -34,4 +43,6 @@ class TrackedFrame:
     spots_used: int
     rms_px: float
     events: tuple[Event, ...]
+    label_probability: Array | None = None  # (n,) that the label is right; nan without a label. None: not reckoned
+    motion: MotionEstimate | None = None  # velocity and rate; None: unknown, or the tracker does not have them
     pose_systematic: Array | None = None  # (6, 6) the calibration's share of the covariance, the same in every frame

@@ -1,0 +1,162 @@
+"""Small matrices and rotations, one at a time, compiled: for the loops that look at a frame after the other.
+
+The same formulas as geometry/rotations.py, which does stacks; the tests hold the two together. Matrices are C-ordered
+float64.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from geometry.arrays import Array
+from geometry.compiled import compiled
+
+
+@compiled
+def multiply(a: Array, b: Array) -> Array:
+    """a @ b of small matrices; for these a plain loop is faster than a library call."""
+    n, m, k = a.shape[0], b.shape[1], a.shape[1]
+    out = np.zeros((n, m))
+    for i in range(n):
+        for j in range(k):
+            s = a[i, j]
+            if s != 0.0:
+                for c in range(m):
+                    out[i, c] += s * b[j, c]
+    return out
+
+
+@compiled
+def apply(a: Array, x: Array) -> Array:
+    """a @ x of a small matrix and a vector."""
+    out = np.zeros(a.shape[0])
+    for i in range(a.shape[0]):
+        s = 0.0
+        for j in range(a.shape[1]):
+            s += a[i, j] * x[j]
+        out[i] = s
+    return out
+
+
+@compiled
+def solve(a: Array, b: Array) -> tuple[Array, float]:
+    """x (n, m) with a x = b, and log |det a|, by elimination with row pivots; not finite where det is 0."""
+    n, m = a.shape[0], b.shape[1]
+    lu, x = a.copy(), b.copy()
+    log_det = 0.0
+    for i in range(n):
+        p = i
+        for r in range(i + 1, n):
+            if abs(lu[r, i]) > abs(lu[p, i]):
+                p = r
+        if p != i:
+            for c in range(n):
+                lu[i, c], lu[p, c] = lu[p, c], lu[i, c]
+            for c in range(m):
+                x[i, c], x[p, c] = x[p, c], x[i, c]
+        log_det += np.log(abs(lu[i, i]))
+        for r in range(i + 1, n):
+            f = lu[r, i] / lu[i, i]
+            if f != 0.0:
+                for c in range(i + 1, n):
+                    lu[r, c] -= f * lu[i, c]
+                for c in range(m):
+                    x[r, c] -= f * x[i, c]
+    for i in range(n - 1, -1, -1):
+        for c in range(m):
+            s = x[i, c]
+            for r in range(i + 1, n):
+                s -= lu[i, r] * x[r, c]
+            x[i, c] = s / lu[i, i]
+    return x, log_det
+
+
+@compiled
+def symmetrise(a: Array) -> None:
+    """Take away what rounding did to a covariance's symmetry, in place."""
+    n = a.shape[0]
+    for i in range(n):
+        for j in range(i):
+            s = 0.5 * (a[i, j] + a[j, i])
+            a[i, j] = s
+            a[j, i] = s
+
+
+@compiled
+def exp(w: Array) -> Array:
+    """The rotation matrix (3, 3) of a rotation vector (3,), rad."""
+    angle2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
+    if angle2 < 1e-8:
+        a, b = 1.0 - angle2 / 6.0, 0.5 - angle2 / 24.0
+    else:
+        angle = np.sqrt(angle2)
+        a, b = np.sin(angle) / angle, (1.0 - np.cos(angle)) / angle2
+    out = np.empty((3, 3))
+    x, y, z = w[0], w[1], w[2]
+    out[0, 0], out[1, 1], out[2, 2] = 1 - b * (y * y + z * z), 1 - b * (x * x + z * z), 1 - b * (x * x + y * y)
+    out[0, 1], out[1, 0] = b * x * y - a * z, b * x * y + a * z
+    out[0, 2], out[2, 0] = b * x * z + a * y, b * x * z - a * y
+    out[1, 2], out[2, 1] = b * y * z - a * x, b * y * z + a * x
+    return out
+
+
+@compiled
+def log(R: Array) -> Array:
+    """The rotation vector (3,), rad, of a rotation matrix (3, 3), through the best conditioned quaternion."""
+    q = np.empty(4)
+    trace = R[0, 0] + R[1, 1] + R[2, 2]
+    i = 0
+    if R[1, 1] > R[0, 0]:
+        i = 1
+    if R[2, 2] > R[i, i]:
+        i = 2
+    if trace > R[i, i]:
+        q[0] = 1 + trace
+        q[1], q[2], q[3] = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
+    else:
+        j, k = (i + 1) % 3, (i + 2) % 3
+        q[0] = R[k, j] - R[j, k]
+        q[1 + i] = 1 + R[i, i] - R[j, j] - R[k, k]
+        q[1 + j] = R[j, i] + R[i, j]
+        q[1 + k] = R[k, i] + R[i, k]
+    length = np.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+    if q[0] < 0:
+        length = -length
+    for c in range(4):
+        q[c] /= length
+    s = np.sqrt(q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+    factor = 2.0 if s < 1e-8 else 2.0 * np.arctan2(s, q[0]) / s
+    return factor * q[1:]
+
+
+@compiled
+def right_jacobian(w: Array) -> Array:
+    """J_r (3, 3) with Exp(w + d) = Exp(w) Exp(J_r d) to first order."""
+    angle2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
+    if angle2 < 1e-8:
+        a, b = 0.5 - angle2 / 24.0, 1.0 / 6.0 - angle2 / 120.0
+    else:
+        angle = np.sqrt(angle2)
+        a, b = (1.0 - np.cos(angle)) / angle2, (angle - np.sin(angle)) / (angle2 * angle)
+    x, y, z = w[0], w[1], w[2]
+    out = np.empty((3, 3))
+    out[0, 0], out[1, 1], out[2, 2] = 1 - b * (y * y + z * z), 1 - b * (x * x + z * z), 1 - b * (x * x + y * y)
+    out[0, 1], out[1, 0] = b * x * y + a * z, b * x * y - a * z
+    out[0, 2], out[2, 0] = b * x * z - a * y, b * x * z + a * y
+    out[1, 2], out[2, 1] = b * y * z + a * x, b * y * z - a * x
+    return out
+
+
+@compiled
+def moved(R: Array, t: Array, d: Array) -> tuple[Array, Array]:
+    """The pose that is d (6,) away: R Exp(dtheta) and t + dt, as Pose.plus."""
+    return multiply(R, exp(d[3:6])), t + d[:3]
+
+
+@compiled
+def apart(R: Array, t: Array, R0: Array, t0: Array) -> Array:
+    """The delta (6,) from pose (R0, t0) to (R, t), as Pose.minus."""
+    out = np.empty(6)
+    out[:3] = t - t0
+    out[3:] = log(multiply(R0.T, R))
+    return out

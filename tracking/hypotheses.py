@@ -1,0 +1,297 @@
+"""Several answers to where the vehicle is, each with its own labels, until the evidence decides; compiled.
+
+Every hypothesis is moved on twice, steadily and with a jump of its velocities (a manoeuvre); each time the frame's
+detections are assigned jointly (tracking/association.py), and each assignment is a child with an exact update of its own.
+All children compete by likelihood. Source: ours; a multiple hypothesis tracker (Reid 1979) whose one target is the
+vehicle, with the two models of motion as a branch of the tree.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from geometry import small
+from geometry.arrays import Array, Bools, Ints
+from geometry.compiled import compiled
+from geometry.projection import Views
+from tracking.association import BLENDED, MISSED, Chances, Frame, Sights, associate
+from tracking.information import frame_information
+from tracking.motion import STATE, predicted, updated
+
+MOST_CHILDREN = 48  # of one frame, over all hypotheses
+MOST_KEPT = 8  # hypotheses from frame to frame
+FORGET = 12.0  # nats: a hypothesis so far behind is dropped
+SAME = 0.7  # two hypotheses with one assignment whose states differ by less than this in sigmas are one
+SURPRISE = 3.5  # sigmas of a misfit's own scatter: beyond it a manoeuvre is considered although every spot is found
+# Probabilities per frame that a spot becomes hidden and that a hidden one shows again: hidings last some frames.
+HIDES, SHOWS = 0.01, 0.15
+
+_apart, _apply, _moved = small.apart, small.apply, small.moved
+
+
+class Hypotheses(NamedTuple):
+    """h answers, in no order. Rotations, translations, motions as in tracking/motion.py."""
+
+    R: Array  # (h, 3, 3)
+    t: Array  # (h, 3), m
+    m: Array  # (h, 12)
+    P: Array  # (h, 18, 18)
+    weight: Array  # (h,) nats
+    shown: Array  # (h, n) probability that each view's spot is not hidden
+
+
+class Children(NamedTuple):
+    """The hypotheses after a frame, before they are sifted: c of room for MOST_CHILDREN."""
+
+    after: Hypotheses
+    assigned: Ints  # (c, n) as in associate
+    manoeuvre: Bools  # (c,)
+    parent: Ints  # (c,)
+
+
+class Dynamics(NamedTuple):
+    """How the vehicle may move; pairs are of translation and rotation."""
+
+    jerk: Array  # (2,) spectral densities of the steady motion's jerk
+    jump: Array  # (2,) variances of a manoeuvre's jump of the velocities
+    unsteady: Array  # (2,) and of the accelerations
+    p_manoeuvre: float  # per frame
+
+
+@compiled
+def no_children(n: int) -> Children:
+    """An empty list for n views."""
+    c = MOST_CHILDREN
+    after = Hypotheses(
+        np.empty((c, 3, 3)), np.empty((c, 3)), np.empty((c, 12)), np.empty((c, STATE, STATE)), np.empty(c), np.empty((c, n))
+    )
+    return Children(after, np.empty((c, n), np.int64), np.zeros(c, np.bool_), np.zeros(c, np.int64))
+
+
+@compiled
+def chosen_points(frame: Frame, assigned: Ints, extra: Array) -> tuple[Bools, Array, Array]:
+    """Which views take part in the pose, with pixels (n, 2) and covariances (n, 2, 2), of one assignment (n,)."""
+    n = assigned.shape[0]
+    use, uv, cov = np.zeros(n, np.bool_), np.empty((n, 2)), np.empty((n, 2, 2))
+    for i in range(n):
+        d = assigned[i]
+        if 0 <= d < BLENDED:
+            use[i] = True
+            uv[i], cov[i] = frame.uv[d], frame.cov[d] + extra[i]
+    return use, uv, cov
+
+
+@compiled
+def concluded(
+    views: Views,
+    frame: Frame,
+    extra: Array,
+    before: tuple[Array, Array, Array, Array],
+    assigned: Ints,
+    R: Array,
+    t: Array,
+) -> tuple[Array, Array, Array, Array, float, float, int]:
+    """The exact update of a predicted state by one assignment, linearised at its own optimum; start pose (R, t).
+
+    before: R, t, m, P. Returns the same after, the Gaussian part of the log-likelihood, the misfit (chi-square of as
+    many numbers as the spots have) and the number of spots.
+    """
+    R0, t0, m0, P0 = before
+    use, uv, cov = chosen_points(frame, assigned, extra)
+    out_R, out_t, out_m, out_P = R0, t0, m0, P0
+    gaussian = misfit = 0.0
+    count = 0
+    for _ in range(4):
+        L, g, chi2, count, log_norm = frame_information(views, R, t, use, uv, cov)
+        if count == 0:
+            return R0, t0, m0.copy(), P0.copy(), 0.0, 0.0, 0
+        delta = _apart(R, t, R0, t0)
+        r = g + _apply(L, delta)
+        out_R, out_t, out_m, out_P, log_det, w = updated(R0, t0, m0, P0, L, r)
+        step = _apply(np.ascontiguousarray(P0[:6, :6]), w)
+        misfit = chi2
+        for i in range(6):
+            misfit += g[i] * delta[i] + r[i] * (delta[i] - step[i])
+        gaussian = -0.5 * (log_norm + log_det + misfit)
+        moved = _apart(out_R, out_t, R, t)
+        R, t = out_R, out_t
+        # A thousandth of the pose's own sigma is good enough.
+        if np.sum(moved * _apply(L, moved)) < 1e-4:
+            break
+    return out_R, out_t, out_m, out_P, gaussian, misfit, count
+
+
+@compiled
+def grow(
+    views: Views, sights: Sights, frame: Frame, chances: Chances, dynamics: Dynamics, extra: Array, dt: float, old: Hypotheses
+) -> tuple[Children, int]:
+    """The children of all hypotheses after a frame that comes dt (s) later."""
+    n = sights.camera.shape[0]
+    out = no_children(n)
+    count = 0
+    nothing = np.zeros(2)
+    best = -np.inf
+    for h in range(old.t.shape[0]):
+        if old.weight[h] < -FORGET:
+            continue
+        shown = np.empty(n)
+        for i in range(n):
+            shown[i] = old.shown[h, i] * (1 - HIDES) + (1 - old.shown[h, i]) * SHOWS
+        turning = False
+        steady_P = old.P[h]
+        for mode in range(2):
+            if mode == 1 and not turning:
+                break
+            jump, unsteady = (nothing, nothing) if mode == 0 else (dynamics.jump, dynamics.unsteady)
+            if dt > 0.0:
+                R, t, m, P, _ = predicted(old.R[h], old.t[h], old.m[h], old.P[h], dt, dynamics.jerk, jump, unsteady)
+            else:
+                R, t, m, P = old.R[h], old.t[h], old.m[h], old.P[h]
+            if mode == 0:
+                steady_P = P
+            prior = old.weight[h] + np.log(1 - dynamics.p_manoeuvre if mode == 0 else dynamics.p_manoeuvre)
+            assigned, score, counted, R_b, t_b, b = associate(
+                views, sights, frame, chances, R, t, np.ascontiguousarray(P[:6, :6]), shown, extra
+            )
+            before = (R, t, m, P)
+            for k in range(b):
+                if prior + score[k] < best - FORGET or (k > 0 and score[k] < score[0] - FORGET):
+                    continue
+                R_k, t_k, m_k, P_k, gaussian, misfit, spots = concluded(
+                    views, frame, extra, before, assigned[k], R_b[k], t_b[k]
+                )
+                if mode == 0 and k == 0:
+                    dof = 2 * spots
+                    turning = dt > 0.0 and (
+                        misfit > dof + SURPRISE * np.sqrt(2.0 * max(dof, 1)) or _misses(assigned[k], shown)
+                    )
+                if spots == 0:
+                    if mode == 1:
+                        continue
+                    # Nothing tells the two motions apart: their mixture, which has one mean.
+                    if dt > 0.0:
+                        p = max(dynamics.p_manoeuvre, DARK_MANOEUVRE)
+                        _, _, _, P_jump, _ = predicted(
+                            old.R[h], old.t[h], old.m[h], old.P[h], dt, dynamics.jerk, dynamics.jump, dynamics.unsteady
+                        )
+                        P_k = (1 - p) * steady_P + p * P_jump
+                total = prior + counted[k] + gaussian
+                if not np.isfinite(total):
+                    continue
+                best = max(best, total)
+                count = add_child(out, count, R_k, t_k, m_k, P_k, total, shown, assigned[k], mode == 1, h, chances.detect)
+    return out, count
+
+
+DARK_MANOEUVRE = 0.05  # least chance of a manoeuvre per frame that nothing was seen in: what is hidden is often a bend
+
+
+@compiled
+def _misses(assigned: Ints, shown: Array) -> bool:
+    """Whether a spot that should be seen is not."""
+    for i in range(assigned.shape[0]):
+        if (assigned[i] == MISSED or assigned[i] >= BLENDED) and shown[i] > 0.5:
+            return True
+    return False
+
+
+@compiled
+def add_child(
+    children: Children,
+    count: int,
+    R: Array,
+    t: Array,
+    m: Array,
+    P: Array,
+    weight: float,
+    shown: Array,
+    assigned: Ints,
+    manoeuvre: bool,
+    parent: int,
+    p_detect: float,
+) -> int:
+    """Add a child, in place of the worst where there is no room; how many there are then."""
+    place = count
+    if count == MOST_CHILDREN:
+        place = int(np.argmin(children.after.weight[:count]))
+        if children.after.weight[place] >= weight:
+            return count
+    else:
+        count += 1
+    children.after.R[place], children.after.t[place], children.after.m[place] = R, t, m
+    children.after.P[place], children.after.weight[place] = P, weight
+    children.assigned[place], children.manoeuvre[place], children.parent[place] = assigned, manoeuvre, parent
+    for i in range(shown.shape[0]):
+        s = shown[i]
+        if assigned[i] >= 0:
+            s = 1.0
+        elif assigned[i] == MISSED:
+            s = s * (1 - p_detect) / (s * (1 - p_detect) + 1 - s)
+        children.after.shown[place, i] = s
+    return count
+
+
+@compiled
+def sift(children: Children, count: int) -> tuple[Hypotheses, Ints, Array, Array]:
+    """Weigh the children: those that stay, as hypotheses, best first.
+
+    Also their places (h,) among the children, how likely the best one's choice for each view is (n,), and the spread
+    (6, 6) of the other children's poses about the best's, to be added to its covariance.
+    """
+    w = children.after.weight[:count]
+    n = children.assigned.shape[1]
+    order = np.argsort(-w)
+    best = order[0]
+    share = np.exp(w - w[best])
+    total = np.sum(share)
+    certain, spread = np.zeros(n), np.zeros((6, 6))
+    for k in range(count):
+        p = share[k] / total
+        for i in range(n):
+            if children.assigned[k, i] % BLENDED == children.assigned[best, i] % BLENDED:
+                certain[i] += p
+        if k != best and p > 1e-6:
+            d = _apart(children.after.R[k], children.after.t[k], children.after.R[best], children.after.t[best])
+            for i in range(6):
+                for j in range(6):
+                    spread[i, j] += p * d[i] * d[j]
+    kept, weight = np.empty(MOST_KEPT, np.int64), np.empty(MOST_KEPT)
+    h = 0
+    for place in range(count):
+        k = order[place]
+        if w[k] < w[best] - FORGET:
+            break
+        twin = -1
+        for other in range(h):
+            if _alike(children, k, kept[other]):
+                twin = other
+                break
+        if twin >= 0:
+            weight[twin] = np.log(np.exp(weight[twin]) + share[k] / total)
+        elif h < MOST_KEPT:
+            kept[h], weight[h] = k, w[k] - w[best] - np.log(total)
+            h += 1
+    places = kept[:h]
+    a = children.after
+    staying = Hypotheses(
+        a.R[places], a.t[places], a.m[places], a.P[places], weight[:h] - np.max(weight[:h]), a.shown[places]
+    )
+    return staying, places, certain, spread
+
+
+@compiled
+def _alike(children: Children, k: int, o: int) -> bool:
+    """Whether two children chose the same points and have come to the same state."""
+    for i in range(children.assigned.shape[1]):
+        if children.assigned[k, i] != children.assigned[o, i]:
+            return False
+    a = children.after
+    d = _apart(a.R[k], a.t[k], a.R[o], a.t[o])
+    for i in range(6):
+        if abs(d[i]) > SAME * np.sqrt(a.P[o, i, i]):
+            return False
+        if abs(a.m[k, i] - a.m[o, i]) > SAME * np.sqrt(a.P[o, 6 + i, 6 + i]):
+            return False
+    return True
