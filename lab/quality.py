@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+from calibration.findings import Finding, Level
 from lab.errors import QUALITY_GATE_FAILED
 
 LEAST_MEASURED = 0.5  # share of frames with a measured pose, below which the run fails ...
@@ -35,10 +36,12 @@ def judge(
     no_image: Mapping[str, int],
     ties: int,
     measured_before_lost_again: int,
+    findings: Sequence[Finding] = (),
 ) -> Verdict:
     """The verdict from counts of frames, the misfit of the pose fits, frames without a picture by camera, and ties.
 
-    measured_before_lost_again: how often the vehicle was lost after it had been found.
+    measured_before_lost_again: how often the vehicle was lost after it had been found. findings: of the model check
+    (lab.model_check.check.check_model): what it warns of is a doubt, what it fails is a failure.
     """
     failures: list[str] = []
     doubts: list[str] = []
@@ -61,6 +64,8 @@ def judge(
             f"the spots lie {misfit:.1f} times as far from the fitted pose as their sigmas allow: check the calibration"
             " and the light (speckle); the sigmas of the poses are widened by it"
         )
+    failures += [f"{f.what}; {f.why}" for f in findings if f.level == Level.FAIL]
+    doubts += [f"{f.what}; {f.why}" for f in findings if f.level == Level.WARN]
     for camera, count in no_image.items():
         if frames and count > (1 - GOOD_PICTURES) * frames:
             doubts.append(f"camera {camera} has no usable picture in {count} of {frames} frames")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -39,6 +39,7 @@ class ModelCheck:
     effects: tuple[Effect, ...]  # of the culprits, in their order
     findings: tuple[Finding, ...]  # the gravest things first; empty where nothing was found
     why_not: str = ""  # why nothing was tested; empty where it was
+    image_sizes_px: Mapping[str, tuple[int, int]] = field(default_factory=dict)  # of each camera: width, height
 
     @property
     def level(self) -> Level:
@@ -51,7 +52,7 @@ class ModelCheck:
         tested, why_not; frames_used, frames_for_culprits; findings: level (PASS, WARN, FAIL), what, why, cure;
         misfit, noise, correlation_frames, p_before, p_after: see Inquest; culprits: thing, name, kind, delta and sigma
         (in rad, m, px, s, or relative), explained (chi-square), p, rivals (thing, name, kind), off_px, off_sigmas,
-        attitude_deg, position_mm, pose_sigmas: see Effect; views, cameras, beams: see GroupStatistics.
+        attitude_deg, position_mm, pose_sigmas: see Effect; views, cameras, beams: see GroupStatistics; image_sizes_px.
         """
         out: dict[str, Any] = {
             "tested": self.inquest is not None,
@@ -72,6 +73,7 @@ class ModelCheck:
             }
         if self.statistics is not None:
             out |= self.statistics.as_mapping()
+            out["image_sizes_px"] = {camera: list(size) for camera, size in self.image_sizes_px.items()}
         return out
 
 
@@ -95,10 +97,11 @@ def check_model(rig: Rig, recording: Recording, calibration: RigCovariance | Non
     moves = columns.at(recording, lin)
     expected = _calibration_px(lin, moves, columns.covariance, model, tuple(rig.beams))
     all_frames = linearise(model, recording, evenly(fit_for_it, MOST_FRAMES))
+    sizes = {name: camera.image_size_px for name, camera in rig.cameras.items()}
     told = statistics(model, tuple(rig.beams), recording, all_frames, expected)
     if lin.dof <= 0:
         why = "in no frame are more spots measured than its pose takes"
-        return ModelCheck(len(all_frames.frames), len(lin.frames), told, None, (), (), why)
+        return ModelCheck(len(all_frames.frames), len(lin.frames), told, None, (), (), why, sizes)
     inquest = inquire(lin, moves, columns.covariance, possible_faults(rig, columns))
     claimed = None if recording.pose_covariance is None else recording.pose_covariance[lin.frames]
     effects = tuple(
@@ -119,7 +122,9 @@ def check_model(rig: Rig, recording: Recording, calibration: RigCovariance | Non
     if inquest.unexplained:
         findings.append(unexplained_finding(inquest))
     findings.sort(key=lambda f: -f.level)
-    return ModelCheck(len(all_frames.frames), len(lin.frames), told, inquest, effects, tuple(findings))
+    return ModelCheck(
+        len(all_frames.frames), len(lin.frames), told, inquest, effects, tuple(findings), image_sizes_px=sizes
+    )
 
 
 def _calibration_px(

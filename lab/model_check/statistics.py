@@ -40,6 +40,7 @@ class GroupStatistics:
     scatter: float  # mean of squared residuals about their mean / 2, in claimed variances: 1 if the sigmas are true
     nis: NisMean | None  # None without predictions and their covariances
     outliers: float  # share of the measurements that lie grossly elsewhere
+    place_px: Array  # (2,) of one view: where its spot lies on average; nan for groups of views
 
     def as_mapping(self) -> dict[str, Any]:
         """For summary.json."""
@@ -54,6 +55,7 @@ class GroupStatistics:
             "scatter": self.scatter,
             "nis": nis,
             "outliers": self.outliers,
+            "place_px": self.place_px.tolist(),
         }
 
 
@@ -111,7 +113,8 @@ def statistics(
     """Of the linearised frames of a recording. calibration_px: by `group_key`; what is not there is 0."""
     residual, covariance = lin.against_others()
     nis = _nis(recording, lin)
-    arguments = (lin, residual, covariance, nis, calibration_px)
+    uv = np.where(lin.used[..., None], recording.uv_px[lin.frames], np.nan)
+    arguments = (lin, uv, residual, covariance, nis, calibration_px)
 
     def group(kind: str, name: str, views: Ints) -> GroupStatistics:
         return _group(group_key(kind, name), name, views, *arguments)
@@ -153,6 +156,7 @@ def _group(
     name: str,
     views: Ints,
     lin: Linearised,
+    uv_px: Array,
     residual: Array,
     covariance: Array,
     nis: Array | None,
@@ -184,6 +188,7 @@ def _group(
         values = nis[:, views][np.isfinite(nis[:, views])] / 2
         level = float(values.mean())
         told = NisMean(level, *nis_band(len(values) / correlation_time((series - np.nanmean(series))[:, None])))
+    place = uv_px[:, views[0]][lin.used[:, views[0]]] if len(views) == 1 else np.empty((0, 2))
     seen = int((lin.used | lin.outlier)[:, views].sum())
     return GroupStatistics(
         name=name,
@@ -194,5 +199,6 @@ def _group(
         calibration_px=calibration_px.get(key, np.zeros(2)),
         scatter=scatter,
         nis=told,
+        place_px=place.mean(axis=0) if len(place) else none,
         outliers=float(lin.outlier[:, views].sum() / seen) if seen else 0.0,
     )

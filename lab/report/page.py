@@ -11,6 +11,8 @@ from markupsafe import Markup
 
 from lab.report import figures, tables, uncertainty
 from lab.report.material import Material, gather
+from lab.report.model_fit import HEADS as MODEL_FIT_HEADS
+from lab.report.model_fit import model_fit
 from lab.report.pictures import Event, chosen, events, pictures
 from lab.report.tracks import POSE_COLOURS, SPOT_COLOURS, timeline_figure, tracks_figure
 from lab.report.verdict import verdict_of
@@ -50,6 +52,7 @@ def page(m: Material, results: Path) -> str:
     found = events(m)
     listed = _event_rows(m, found)
     heads, rows = tables.spot_rows(m)
+    fit = model_fit(m.summary)
     context: dict[str, Any] = {
         "name": m.name,
         "verdict": verdict_of(m.summary),
@@ -70,6 +73,9 @@ def page(m: Material, results: Path) -> str:
         "rms_figure": Markup(figures.rms_figure(m)),
         "residual_grid": Markup(figures.error_grid(m, figures.residual_columns(m))),
         "residual_known": m.residual_px is not None,
+        "model_fit": fit,
+        "model_fit_heads": MODEL_FIT_HEADS,
+        "model_fit_drawings": [] if fit is None else [Markup(d) for d in fit.drawings],
         "error_rows": tables.error_rows(m.errors),
         "has_truth": m.errors is not None,
         "spot_heads": heads,
