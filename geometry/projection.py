@@ -183,5 +183,5 @@ def _distorted(v: Views, i: int, x: float, y: float) -> tuple[float, float, floa
 def lens_kinds(distortion: Array, fisheye: Bools) -> Array:
     """(n,) of Views.lens from distortion numbers (n, 14) and which are the fisheye model's."""
     bent = np.any(distortion != 0, axis=-1)
-    tilted = np.any(distortion[:, 12:] != 0, axis=-1)
+    tilted = np.any(distortion[..., 12:] != 0, axis=-1)
     return np.where(fisheye, 3, np.where(tilted, 2, np.where(bent, 1, 0))).astype(np.int64)

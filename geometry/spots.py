@@ -82,7 +82,7 @@ class SpotModel:
 
     def __post_init__(self) -> None:
         lens = lens_kinds(self.distortion, self.fisheye)
-        tilt = tilt_matrix(self.distortion[:, 12], self.distortion[:, 13])
+        tilt = tilt_matrix(self.distortion[..., 12], self.distortion[..., 13])
         whole = {name: getattr(self, name) for name in Views._fields if name not in ("lens", "tilt")}
         arrays = {name: np.ascontiguousarray(a) for name, a in {**whole, "lens": lens, "tilt": tilt}.items()}
         object.__setattr__(self, "numbers", Views(**arrays))
