@@ -9,6 +9,7 @@ import ast
 import sys
 import tomllib
 from collections.abc import Iterator
+from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from importlib.metadata import packages_distributions
 from pathlib import Path
@@ -55,16 +56,22 @@ def statements(tree: ast.AST, into_functions: bool) -> Iterator[ast.AST]:
 
 def imports(name: str, path: Path, into_functions: bool = True) -> set[str]:
     """Dotted names that a module imports; `from a import b` gives a and a.b, since b may be a module."""
-    package = name.split(".") if path.name == "__init__.py" else name.split(".")[:-1]
+    package = name if path.name == "__init__.py" else ".".join(name.split(".")[:-1])
+    return set(imports_of_text(path.read_text(encoding="utf-8"), package, into_functions))
+
+
+@cache  # every test reads the whole program
+def imports_of_text(text: str, of_package: str, into_functions: bool) -> frozenset[str]:
+    package = of_package.split(".") if of_package else []
     names = set()
-    for node in statements(ast.parse(path.read_text(encoding="utf-8")), into_functions):
+    for node in statements(ast.parse(text), into_functions):
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
             base = package[: len(package) + 1 - node.level] if node.level else []
             source = ".".join([*base, *([node.module] if node.module else [])])
             names |= {source, *(f"{source}.{alias.name}" for alias in node.names)}
-    return names
+    return frozenset(names)
 
 
 def floor_of(name: str) -> str:
