@@ -17,8 +17,8 @@ from lab.model_check.culprit import Culprit, Inquest, inquire
 from lab.model_check.effect import Effect, effect_of
 from lab.model_check.faults import FaultColumns, possible_faults
 from lab.model_check.linear import Linearised, linearise
-from lab.model_check.recording import Recording, evenly, finite
-from lab.model_check.statistics import Statistics, group_key, statistics
+from lab.model_check.recording import Recording, evenly
+from lab.model_check.statistics import Statistics, group_key, residual_weights, statistics
 from lab.model_check.words import culprit_finding, unexplained_finding
 
 MOST_FRAMES = 2000  # for the statistics: their sigmas halve for four times as many only
@@ -134,17 +134,15 @@ def _calibration_px(
     known = np.flatnonzero(np.diagonal(covariance) > 0)
     if not known.size:
         return {}
-    free = lin.weights() @ lin.pose_free(moves[..., known])
-    back = np.linalg.inv(np.where(lin.used[..., None, None], lin.W, np.eye(2)))
-    off = back @ free  # (K, n, 2, p)
-    there = finite(off, (-1, -2))
     C = covariance[np.ix_(known, known)]
 
     def sigma(views: Ints) -> Array:
-        some = there[:, views]
-        if not some.any():
+        off, spread = lin.against_the_rest(views, moves[..., known])
+        weight = residual_weights(spread)  # as in the means that this is compared with
+        total = weight.sum(axis=(0, 1))
+        if not (total > 0).all():
             return np.full(2, np.nan)
-        mean = off[:, views][some].mean(axis=0)
+        mean = np.sum(weight[..., None] * np.where(weight[..., None] > 0, off, 0.0), axis=(0, 1)) / total[:, None]
         return np.sqrt(np.maximum(np.einsum("ip,pq,iq->i", mean, C, mean), 0.0))
 
     out = {group_key("view", f"{c}/{s}"): sigma(np.array([i])) for i, (c, s) in enumerate(model.views)}

@@ -74,6 +74,29 @@ class Linearised:
         back = np.linalg.inv(np.where(self.used[..., None, None], self.W, np.eye(2)))
         return (back @ whitened[..., None])[..., 0], back @ weights @ np.swapaxes(back, -1, -2)
 
+    def left_out(self, views: Ints) -> Array:
+        """(I - H_SS)^-1 (K, 2v, 2v) of v views left out together; nan where the others do not tell where they are."""
+        A = self.A[:, views].reshape(len(self.frames), -1, 6)
+        own = np.eye(A.shape[1]) - A @ self.gain @ np.swapaxes(A, -1, -2)
+        known = self.used[:, views].any(axis=1) & (np.linalg.eigvalsh(own)[:, 0] > _OWN)
+        inverse = np.linalg.inv(np.where(known[:, None, None], own, np.eye(A.shape[1])))
+        return np.where(known[:, None, None], inverse, np.nan)
+
+    def against_the_rest(self, views: Ints, rows: Array) -> tuple[Array, Array]:
+        """Whitened pixels (K, n, 2, ...) of v views against the pose of all other views: (K, v, 2, ...), px.
+
+        And their covariance (K, v, 2, 2), px^2. nan where the others do not tell, and where a view is not used.
+        """
+        K, v = len(self.frames), len(views)
+        inverse = self.left_out(views)
+        used = self.used[:, views]
+        back = np.linalg.inv(np.where(used[..., None, None], self.W[:, views], np.eye(2)))
+        off = (inverse @ self.pose_free(rows)[:, views].reshape(K, 2 * v, -1)).reshape(K, v, 2, -1)
+        off = np.where(used[..., None, None], back @ off, np.nan).reshape(K, v, 2, *rows.shape[3:])
+        blocks = inverse.reshape(K, v, 2, v, 2)[:, np.arange(v), :, np.arange(v)].swapaxes(0, 1)
+        covariance = back @ blocks @ np.swapaxes(back, -1, -2)
+        return off, np.where(used[..., None, None], covariance, np.nan)
+
 
 def linearise(model: SpotModel, recording: Recording, frames: Ints) -> Linearised:
     """The given frames (K,) of a recording; gross outliers left out of the fits, two spots of a frame at most."""

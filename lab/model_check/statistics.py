@@ -29,13 +29,13 @@ class NisMean:
 
 @dataclass(frozen=True, slots=True)
 class GroupStatistics:
-    """Residuals of one view, or of all views of a camera or a beam together, against the other spots' pose."""
+    """Residuals of one view, or of all views of a camera or a beam, against the pose of all other views."""
 
     name: str  # "right/5", "right", "B"
-    frames: int  # with such a residual
-    mean_px: Array  # (2,) u, v; nan without frames
+    frames: int  # with such a residual: the other views give a pose
+    mean_px: Array  # (2,) u, v, weighted by the claims; nan without frames
     sigma_of_mean_px: Array  # (2,) by the residuals' own scatter and how they go together in time
-    mean_sigmas: Array  # (2,) the mean in sigmas of one measurement, as claimed: what it does to a frame
+    mean_sigmas: Array  # (2,) the mean in claimed sigmas of one measurement: what it does to a frame
     calibration_px: Array  # (2,) 1 sigma of the mean that the calibration's claimed errors make; 0 where it claims none
     scatter: float  # mean of squared residuals about their mean / 2, in claimed variances: 1 if the sigmas are true
     nis: NisMean | None  # None without predictions and their covariances
@@ -111,10 +111,9 @@ def statistics(
     calibration_px: Mapping[str, Array],
 ) -> Statistics:
     """Of the linearised frames of a recording. calibration_px: by `group_key`; what is not there is 0."""
-    residual, covariance = lin.against_others()
     nis = _nis(recording, lin)
     uv = np.where(lin.used[..., None], recording.uv_px[lin.frames], np.nan)
-    arguments = (lin, uv, residual, covariance, nis, calibration_px)
+    arguments = (lin, uv, nis, calibration_px)
 
     def group(kind: str, name: str, views: Ints) -> GroupStatistics:
         return _group(group_key(kind, name), name, views, *arguments)
@@ -126,6 +125,13 @@ def statistics(
         ),
         beams=tuple(group("beam", b, np.flatnonzero(model.beam_of == i)) for i, b in enumerate(beam_names)),
     )
+
+
+def residual_weights(covariance: Array) -> Array:
+    """Of the axes of residuals, (..., 2), from their covariances (..., 2, 2): 1 / variance, 0 where that is nan."""
+    variance = np.diagonal(covariance, axis1=-2, axis2=-1)
+    good = finite(variance, -1)[..., None]
+    return np.where(good, 1.0 / np.where(good, variance, 1.0), 0.0)
 
 
 def group_key(kind: str, name: str) -> str:
@@ -157,31 +163,30 @@ def _group(
     views: Ints,
     lin: Linearised,
     uv_px: Array,
-    residual: Array,
-    covariance: Array,
     nis: Array | None,
     calibration_px: Mapping[str, Array],
 ) -> GroupStatistics:
-    r = _frame_means(residual[:, views])
+    r, spread = lin.against_the_rest(views, lin.residual)
     known = finite(r, -1)
-    count = int(known.sum())
+    frames = known.any(axis=1)
+    count = int(frames.sum())
     none = np.full(2, np.nan)
     mean, sigma_of_mean, mean_sigmas, scatter = none, none, none, float("nan")
     if count:
-        each, spread = residual[:, views], covariance[:, views]
-        good = finite(each, -1)
-        mean = r[known].mean(axis=0)
-        # One measurement's own claim, not that of its residual, which also holds the pose's.
-        back = np.linalg.inv(lin.W[:, views][good])
-        own = np.mean(np.diagonal(back @ np.swapaxes(back, -1, -2), axis1=-2, axis2=-1), axis=0)
-        mean_sigmas = mean / np.sqrt(own)
-        claimed = np.mean(np.diagonal(spread[good], axis1=-2, axis2=-1), axis=0)
-        own_means = each[good].reshape(-1, 2) - mean
-        z = whitening(spread[good], np.ones(int(good.sum()), dtype=bool)) @ own_means[..., None]
-        scatter = float(np.mean(np.sum(z[..., 0] ** 2, axis=-1)) / 2)
-        varies = np.var(r[known], axis=0, ddof=1) if count >= _FEWEST else claimed
-        together = np.array([correlation_time((r - mean)[:, [i]]) for i in (0, 1)])
-        sigma_of_mean = np.sqrt(varies * together / count)
+        # By their claims: sigmas differ tenfold where spots smear, and a few blurred ones would drown the rest.
+        weight = residual_weights(spread)
+        mean = np.sum(np.where(known[..., None], weight * r, 0.0), axis=(0, 1)) / weight.sum(axis=(0, 1))
+        gap = np.where(known[..., None], r - mean, 0.0)
+        pull = np.sum(weight * gap, axis=1)  # (K, 2): what goes together within a frame is summed before it is squared
+        squares = np.sum(pull**2, axis=0) if count >= _FEWEST else weight.sum(axis=(0, 1))
+        together = [correlation_time(np.where(frames, pull[:, i], np.nan)[:, None]) for i in (0, 1)]
+        sigma_of_mean = np.sqrt(squares * together) / weight.sum(axis=(0, 1))
+        # In sigmas of one measurement as claimed, not of its residual, which also holds the others' noise.
+        W = lin.W[:, views][known]
+        information = np.diagonal(np.swapaxes(W, -1, -2) @ W, axis1=-2, axis2=-1)
+        mean_sigmas = mean * np.sqrt(information.mean(axis=0))
+        z = (whitening(spread, known) @ gap[..., None])[known]
+        scatter = float(np.sum(z**2) / (2 * len(z)))
     told = None
     if nis is not None and np.isfinite(nis[:, views]).any():
         series = _frame_means(nis[:, views]) / 2
