@@ -11,7 +11,7 @@ chose that), as the two look alike there.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import cholesky, solve_triangular
@@ -123,6 +123,7 @@ class Misfit:
     factor: Array  # (m, m), lower Cholesky factor of C
     basis: Array  # (m, q), orthonormal: the whitened nuisances
     dof: int  # m - q
+    is_unit: bool = False  # C is 1: columns need no whitening, which is nearly all the work of a fit
 
     @staticmethod
     def of(residual: Array, covariance: Array, nuisance: Array | None = None) -> Misfit:
@@ -138,6 +139,11 @@ class Misfit:
         start = Misfit(white, factor, np.zeros((len(white), 0)), len(white))
         return start if nuisance is None else start.freed(nuisance)
 
+    @staticmethod
+    def of_white(residual: Array) -> Misfit:
+        """Of a residual (m,) whose errors are independent and of size 1; columns must be whitened in the same way."""
+        return Misfit(residual, np.eye(len(residual)), np.zeros((len(residual), 0)), len(residual), True)
+
     @property
     def chi2(self) -> float:
         """What is left to explain."""
@@ -148,13 +154,16 @@ class Misfit:
         """How probable so large a misfit is when nothing has changed."""
         return float(chdtrc(self.dof, self.chi2)) if self.dof > 0 else 1.0
 
+    def _whitened(self, columns: Array) -> Array:
+        return columns if self.is_unit else solve_triangular(self.factor, columns, lower=True)
+
     def _projected(self, columns: Array) -> Array:
-        white = solve_triangular(self.factor, columns, lower=True)
+        white = self._whitened(columns)
         return white - self.basis @ (self.basis.T @ white)
 
     def _basis_of(self, columns: Array) -> Array:
         """Orthonormal basis (m, r) of what columns (m, k) can still do."""
-        white = solve_triangular(self.factor, columns, lower=True)
+        white = self._whitened(columns)
         # Columns to one scale first: metres, radians and relative focal lengths have nothing to do with each other.
         scale = np.linalg.norm(white, axis=0)
         left = (white - self.basis @ (self.basis.T @ white)) / np.where(scale > 0, scale, 1.0)
@@ -165,7 +174,8 @@ class Misfit:
         """With these changes free: the misfit that they cannot explain."""
         U = self._basis_of(columns)
         white = self.white - U @ (U.T @ self.white)
-        return Misfit(white, self.factor, np.concatenate([self.basis, U], axis=1), self.dof - U.shape[1])
+        basis = np.concatenate([self.basis, U], axis=1)
+        return replace(self, white=white, basis=basis, dof=self.dof - U.shape[1])
 
     def without(self, changes: Iterable[Change]) -> Misfit:
         """With all these changes free."""

@@ -186,3 +186,18 @@ def test_a_laser_is_accused_before_two_cameras():
 def test_a_covariance_that_is_none_is_refused():
     with pytest.raises(ValueError, match="not positive definite"):
         Misfit.of(np.zeros(2), np.array([[1.0, 2.0], [2.0, 1.0]]))
+
+
+def test_a_misfit_whitened_beforehand_is_explained_just_the_same():
+    rng = np.random.default_rng(4)
+    root = np.tril(rng.standard_normal((12, 12))) + 5 * np.eye(12)
+    columns, nuisance, residual = rng.standard_normal((12, 3)), rng.standard_normal((12, 2)), rng.standard_normal(12)
+    plain = Misfit.of(residual, root @ root.T).freed(nuisance)
+    white = Misfit.of_white(np.linalg.solve(root, residual)).freed(np.linalg.solve(root, nuisance))
+    size = np.array([0.5, 1.0, 2.0])
+    a = plain.fit("turned", "left", Candidate(columns, size))
+    b = white.fit("turned", "left", Candidate(np.linalg.solve(root, columns), size))
+    assert white.p_value == pytest.approx(plain.p_value)
+    assert b.evidence == pytest.approx(a.evidence)
+    np.testing.assert_allclose(b.delta, a.delta)
+    np.testing.assert_allclose(b.covariance, a.covariance)
