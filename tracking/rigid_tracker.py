@@ -29,7 +29,7 @@ from tracking.match import UNMATCHED
 from tracking.misfit import Misfit
 from tracking.motion import STATE
 from tracking.parameters import TrackerParameters
-from tracking.statuses import PoseStatus, SpotStatus
+from tracking.statuses import PoseStatus, SpotStatus, view_statuses
 from tracking.surroundings import ClutterNearSpots
 from tracking.temper import Temper
 from tracking.tracked_frame import Event, MotionEstimate, TrackedFrame
@@ -310,7 +310,8 @@ class RigidTracker:
         out_uv = np.where(labelled[:, None], seen_uv, expected_px)
         out_cov = np.where(labelled[:, None, None], seen_cov, expected_cov)
         turned = labelled & bool(children.manoeuvre[best])
-        spot_status = self._statuses(found, labelled, turned, out_uv, exists, known)
+        inside = model.in_picture(out_uv)
+        spot_status = view_statuses(labelled, turned, exists, inside, frame.has_image[model.camera_of], known)
         hide = np.array([s in (SpotStatus.LOST, SpotStatus.OFF_SCREEN) for s in spot_status])
         out_uv[hide] = np.nan
         used = use & known
@@ -319,7 +320,7 @@ class RigidTracker:
         return TrackedFrame(
             uv_px=out_uv,
             cov_px2=out_cov,
-            status=tuple(spot_status),
+            status=spot_status,
             predicted_px=predicted,
             gain=np.full(len(model), np.nan),
             point=point,
@@ -377,25 +378,6 @@ class RigidTracker:
         blended = rows[assigned[rows] >= BLENDED]
         cov[blended] += (self.parameters.blend_px / 2) ** 2 * np.eye(2)
         return uv, cov
-
-    def _statuses(
-        self, found: Sequence[Detections | None], seen: Bools, turned: Bools, uv: Array, exists: Bools, known: bool
-    ) -> list[SpotStatus]:
-        """One word per view."""
-        inside = self.model.in_picture(uv)
-        out = []
-        for i in range(len(self.model)):
-            if seen[i]:
-                out.append(SpotStatus.TURNED if turned[i] else SpotStatus.MATCHED)
-            elif not known:
-                out.append(SpotStatus.LOST)
-            elif not exists[i]:
-                out.append(SpotStatus.OFF_SCREEN)
-            elif found[int(self.model.camera_of[i])] is None:
-                out.append(SpotStatus.NO_IMAGE)
-            else:
-                out.append(SpotStatus.OCCLUDED if inside[i] else SpotStatus.OUT_OF_VIEW)
-        return out
 
     def _nothing(
         self, found: Sequence[Detections | None], predicted: Array, events: list[Event]

@@ -59,6 +59,11 @@ class SpotTracker:
         self._frames_since_try = 0
         self._told_tie = False
 
+    @property
+    def noise_scale(self) -> float:
+        """How much larger than claimed the spots' errors are."""
+        return self.vehicle.noise_scale
+
     def step(self, dt_s: float, found: Sequence[Detections | None]) -> TrackedFrame:
         """One frame. dt_s: time since the frame before (0 for the first); found: per camera, None without a picture."""
         self._predict(dt_s)

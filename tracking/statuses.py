@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from enum import StrEnum
+
+from geometry.arrays import Bools
 
 
 class SpotStatus(StrEnum):
@@ -55,3 +58,24 @@ _POSE_MEANINGS = {
     PoseStatus.PREDICTED: "not observable in this frame: motion model, with a covariance that says so",
     PoseStatus.LOST: "nothing is known",
 }
+
+
+def view_statuses(
+    seen: Bools, turned: Bools, exists: Bools, inside: Bools, has_image: Sequence[bool] | Bools, known: bool
+) -> tuple[SpotStatus, ...]:
+    """One word per view, all (n,): a detection is labelled, at a bend; the pose projects it, into the picture; the
+    camera has a picture. known: there is a pose.
+    """
+    out = []
+    for i in range(len(seen)):
+        if seen[i]:
+            out.append(SpotStatus.TURNED if turned[i] else SpotStatus.MATCHED)
+        elif not known:
+            out.append(SpotStatus.LOST)
+        elif not exists[i]:
+            out.append(SpotStatus.OFF_SCREEN)
+        elif not has_image[i]:
+            out.append(SpotStatus.NO_IMAGE)
+        else:
+            out.append(SpotStatus.OCCLUDED if inside[i] else SpotStatus.OUT_OF_VIEW)
+    return tuple(out)

@@ -1,0 +1,179 @@
+"""The fixed-interval smoother, compiled: what a whole run says of the motion at each of its frames.
+
+Deviations (18) from a reference motion are filtered forward and smoothed backward; a new reference and again, which is
+Gauss-Newton on the whole run at the cost of a filter. Sources: the backward pass is the modified Bryson-Frazier form
+(Bierman 1973, "Fixed interval smoothing with discrete measurements"), which inverts nothing but the (6, 6) of the
+measurement; the iteration Bell (1994), "The iterated Kalman smoother as a Gauss-Newton method". On a manifold, and with
+measurements as information: ours.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from geometry import small
+from geometry.arrays import Array
+from geometry.compiled import compiled
+from tracking.motion import STATE, predicted
+
+CHUNK = 512  # frames whose covariances are in memory at once; the filter is run twice instead
+
+_apart, _multiply, _apply, _solve = small.apart, small.multiply, small.apply, small.solve
+_symmetrise, _moved = small.symmetrise, small.moved
+
+
+class Reference(NamedTuple):
+    """A motion, T frames, about which everything is linear; as in tracking/motion.py."""
+
+    R: Array  # (T, 3, 3)
+    t: Array  # (T, 3), m
+    m: Array  # (T, 12)
+
+
+class Evidence(NamedTuple):
+    """What the spots of each frame say of its pose at the reference, and how the vehicle may move before it."""
+
+    information: Array  # (T, 6, 6) J^T C^-1 J; 0 without spots
+    vector: Array  # (T, 6) J^T C^-1 (measured - expected)
+    dt: Array  # (T,) s since the frame before
+    jump: Array  # (T, 2) variances of jumps of the velocities, (m/s)^2 and (rad/s)^2, in that step
+    unsteady: Array  # (T, 2) and of the accelerations
+    first: Array  # (18,) variances of the first frame's deviation
+
+
+@compiled
+def _step(ref: Reference, ev: Evidence, jerk: Array, k: int, x: Array, P: Array) -> tuple[Array, Array, Array]:
+    """From frame k - 1 to frame k: deviation, covariance and transition matrix."""
+    R, t, m, P_new, F = predicted(
+        ref.R[k - 1], ref.t[k - 1], ref.m[k - 1], P, ev.dt[k], jerk, ev.jump[k], ev.unsteady[k]
+    )
+    x_new = _apply(F, x)
+    x_new[:6] += _apart(R, t, ref.R[k], ref.t[k])
+    x_new[6:] += m - ref.m[k]
+    return x_new, P_new, F
+
+
+@compiled
+def _update(ev: Evidence, k: int, x: Array, P: Array) -> tuple[Array, Array, Array, Array, float]:
+    """Frame k's measurement: deviation and covariance after it, w (6,) and M (6, 6), and its log-likelihood.
+
+    w = S^-1 innovation and M = S^-1 in pose space. The likelihood is up to what does not depend on the motion.
+    """
+    L, g = ev.information[k], ev.vector[k]
+    r = g - _apply(L, x[:6])
+    A = _multiply(L, np.ascontiguousarray(P[:6, :6]))
+    right = np.empty((6, 7))
+    for i in range(6):
+        A[i, i] += 1.0
+        right[i, :6] = L[i]
+        right[i, 6] = r[i]
+    y, log_det = _solve(A, right)
+    w, M = y[:, 6].copy(), np.ascontiguousarray(y[:, :6])
+    _symmetrise(M)
+    step = np.zeros(STATE)
+    half = np.zeros((STATE, 6))
+    for i in range(STATE):
+        for j in range(6):
+            step[i] += P[i, j] * w[j]
+            for c in range(6):
+                half[i, c] += P[i, j] * M[j, c]
+    out = P.copy()
+    for i in range(STATE):
+        for j in range(i + 1):
+            s = 0.0
+            for c in range(6):
+                s += half[i, c] * P[j, c]
+            out[i, j] -= s
+            out[j, i] = out[i, j]
+    misfit = 0.0
+    Lx = _apply(L, x[:6])
+    for i in range(6):
+        misfit += x[i] * (Lx[i] - 2 * g[i]) - r[i] * step[i]
+    return x + step, out, w, M, -0.5 * (log_det + misfit)
+
+
+@compiled
+def log_likelihood(ref: Reference, ev: Evidence, jerk: Array) -> float:
+    """How likely the evidence is for a motion with this jerk (2,), nats, up to a constant."""
+    x, P = np.zeros(STATE), np.diag(ev.first)
+    total = 0.0
+    for k in range(ev.dt.shape[0]):
+        if k > 0:
+            x, P, _ = _step(ref, ev, jerk, k, x, P)
+        x, P, _, _, gained = _update(ev, k, x, P)
+        total += gained
+    return total
+
+
+@compiled
+def smoothed(ref: Reference, ev: Evidence, jerk: Array) -> tuple[Array, Array, Array]:
+    """Deviations (T, 18) of all frames given the whole run; covariances (T, 6, 6) of pose and of velocities."""
+    frames = ev.dt.shape[0]
+    out_x = np.empty((frames, STATE))
+    pose_P, motion_P = np.empty((frames, 6, 6)), np.empty((frames, 6, 6))
+    chunks = (frames + CHUNK - 1) // CHUNK
+    start_x, start_P = np.zeros((chunks, STATE)), np.zeros((chunks, STATE, STATE))
+    x, P = np.zeros(STATE), np.diag(ev.first)
+    for k in range(frames):
+        if k > 0:
+            x, P, _ = _step(ref, ev, jerk, k, x, P)
+        if k % CHUNK == 0:
+            start_x[k // CHUNK], start_P[k // CHUNK] = x, P
+        x, P, _, _, _ = _update(ev, k, x, P)
+    later_x, later_L = np.zeros(STATE), np.zeros((STATE, STATE))  # what the frames after one say of it
+    room = min(CHUNK, frames)
+    xs, Ps, Fs = np.empty((room, STATE)), np.empty((room, STATE, STATE)), np.empty((room, STATE, STATE))
+    ws, Ms, heads = np.empty((room, 6)), np.empty((room, 6, 6)), np.empty((room, STATE, 6))
+    for chunk in range(chunks - 1, -1, -1):
+        begin, end = chunk * CHUNK, min((chunk + 1) * CHUNK, frames)
+        x, P = start_x[chunk].copy(), start_P[chunk].copy()
+        for k in range(begin, end):
+            if k > begin:
+                x, P, F = _step(ref, ev, jerk, k, x, P)
+                Fs[k - begin] = F
+            heads[k - begin] = P[:, :6]
+            x, P, w, M, _ = _update(ev, k, x, P)
+            xs[k - begin], Ps[k - begin], ws[k - begin], Ms[k - begin] = x, P, w, M
+        if begin > 0:  # the step into the chunk, for the one before
+            _, _, F = _step(ref, ev, jerk, begin, np.zeros(STATE), np.zeros((STATE, STATE)))
+            Fs[0] = F
+        for k in range(end - 1, begin - 1, -1):
+            j = k - begin
+            P = Ps[j]
+            out_x[k] = xs[j] - _apply(P, later_x)
+            S = _multiply(_multiply(P, later_L), P)
+            for a in range(6):
+                for b in range(6):
+                    pose_P[k, a, b] = P[a, b] - 0.5 * (S[a, b] + S[b, a])
+                    motion_P[k, a, b] = P[6 + a, 6 + b] - 0.5 * (S[6 + a, 6 + b] + S[6 + b, 6 + a])
+            if k == 0:
+                break
+            # Back over the measurement: C = I - P[:, :6] M.
+            C = np.zeros((STATE, STATE))
+            C[:, :6] = -_multiply(heads[j], Ms[j])
+            for a in range(STATE):
+                C[a, a] += 1.0
+            back_L = _multiply(np.ascontiguousarray(C.T), _multiply(later_L, C))
+            back_x = _apply(np.ascontiguousarray(C.T), later_x)
+            for a in range(6):
+                back_x[a] -= ws[j, a]
+                for b in range(6):
+                    back_L[a, b] += Ms[j, a, b]
+            # And over the step before it.
+            Ft = np.ascontiguousarray(Fs[j].T)
+            later_x = _apply(Ft, back_x)
+            later_L = _multiply(Ft, _multiply(back_L, Fs[j]))
+            _symmetrise(later_L)
+    return out_x, pose_P, motion_P
+
+
+@compiled
+def shifted(ref: Reference, x: Array) -> Reference:
+    """The reference moved by deviations (T, 18)."""
+    R, t, m = np.empty_like(ref.R), np.empty_like(ref.t), ref.m + x[:, 6:]
+    for k in range(ref.t.shape[0]):
+        R_k, t_k = _moved(ref.R[k], ref.t[k], x[k, :6])
+        R[k], t[k] = R_k, t_k
+    return Reference(R, t, m)

@@ -1,0 +1,165 @@
+"""Labels given the whole run: each frame's detections against where all other frames put the vehicle; compiled.
+
+Source: ours; the pose without a frame's own spots is the smoothed one with their information taken away again.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from geometry import small
+from geometry.arrays import Array, Bools, Ints
+from geometry.compiled import compiled
+from geometry.projection import Views, project_view
+from tracking.association import BLENDED, Chances, Frame, Sights, associate
+from tracking.fixed_interval import Reference
+from tracking.hypotheses import concluded
+from tracking.information import frame_information
+from tracking.motion import STATE
+
+USUALLY_SHOWN = 0.9  # probability that a spot in the picture is not hidden
+RIVAL = 9.0  # nats: assignments so far behind the best say nothing of its certainty
+VAGUE_M, VAGUE_RAD = 0.3, 0.5  # a frame of which the others say less than this is left as it is
+
+_apply, _multiply, _solve = small.apply, small.multiply, small.solve
+_moved, _symmetrise = small.moved, small.symmetrise
+
+
+class AllDetections(NamedTuple):
+    """A run's detections: m in all, T frames. Those of frame k are rows begin[k] to begin[k + 1], by camera."""
+
+    uv: Array  # (m, 2) px
+    cov: Array  # (m, 2, 2) px^2
+    blend_px: Array  # (m,) as in association.Frame
+    begin: Ints  # (T + 1,)
+    first: Ints  # (T, cameras + 1) within the frame
+    has_image: Bools  # (T, cameras)
+
+
+@compiled
+def labelled_points(all_of: AllDetections, k: int, assigned: Ints, extra: Array) -> tuple[Bools, Array, Array]:
+    """Of frame k: which views take part in the pose (n,), their pixels (n, 2) and covariances (n, 2, 2)."""
+    n = assigned.shape[0]
+    use, uv, cov = np.zeros(n, np.bool_), np.zeros((n, 2)), np.zeros((n, 2, 2))
+    for i in range(n):
+        if 0 <= assigned[i] < BLENDED:
+            d = all_of.begin[k] + assigned[i]
+            use[i] = True
+            uv[i], cov[i] = all_of.uv[d], all_of.cov[d] + extra[i]
+    return use, uv, cov
+
+
+@compiled
+def evidence_of(
+    views: Views, all_of: AllDetections, assigned: Ints, extra: Array, ref: Reference
+) -> tuple[Array, Array, Array, Ints]:
+    """Information matrices (T, 6, 6), vectors (T, 6), misfits (T,) and numbers of spots (T,) at a reference motion."""
+    frames = assigned.shape[0]
+    L, g = np.zeros((frames, 6, 6)), np.zeros((frames, 6))
+    chi2, spots = np.zeros(frames), np.zeros(frames, np.int64)
+    for k in range(frames):
+        use, uv, cov = labelled_points(all_of, k, assigned[k], extra)
+        L_k, g_k, chi2_k, count, _ = frame_information(views, ref.R[k], ref.t[k], use, uv, cov)
+        L[k], g[k], chi2[k], spots[k] = L_k, g_k, chi2_k, count
+    return L, g, chi2, spots
+
+
+@compiled
+def clutter_density(
+    views: Views, sights: Sights, all_of: AllDetections, assigned: Ints, ref: Reference, known: Bools, radius_px: float
+) -> Array:
+    """(cameras,) false points per px^2 within a radius of where spots are expected, over a whole run."""
+    cameras = all_of.has_image.shape[1]
+    count, discs = np.zeros(cameras), np.zeros(cameras)
+    uv, J = np.empty(2), np.empty((2, 6))
+    for k in range(assigned.shape[0]):
+        if not known[k]:
+            continue
+        for i in range(assigned.shape[1]):
+            c = sights.camera[i]
+            if not all_of.has_image[k, c] or not project_view(views, i, ref.R[k], ref.t[k], uv, J):
+                continue
+            if not (-0.5 <= uv[0] < sights.size[i, 0] - 0.5 and -0.5 <= uv[1] < sights.size[i, 1] - 0.5):
+                continue
+            discs[c] += 1
+            for d in range(all_of.first[k, c], all_of.first[k, c + 1]):
+                a, b = all_of.uv[all_of.begin[k] + d, 0] - uv[0], all_of.uv[all_of.begin[k] + d, 1] - uv[1]
+                taken = False
+                for j in range(assigned.shape[1]):
+                    taken |= assigned[k, j] == d or assigned[k, j] == d + BLENDED
+                if not taken and a * a + b * b < radius_px * radius_px:
+                    count[c] += 1
+    return count / (np.maximum(discs, 1.0) * np.pi * radius_px**2)
+
+
+@compiled
+def relabelled(
+    views: Views,
+    sights: Sights,
+    chances: Chances,
+    all_of: AllDetections,
+    assigned: Ints,
+    extra: Array,
+    ref: Reference,
+    pose_P: Array,
+    log_clutter: Array,
+) -> tuple[Ints, Array]:
+    """Assignments (T, n) and their probabilities (T, n), from the smoothed poses and their covariances (T, 6, 6).
+
+    assigned (T, n): those that the smoothing used. log_clutter (T, n). A frame of whose pose nothing is known keeps
+    its assignments.
+    """
+    frames, n = assigned.shape
+    out, certain = assigned.copy(), np.ones((frames, n))
+    shown = np.full(n, USUALLY_SHOWN)
+    nothing = np.zeros(12)
+    for k in range(frames):
+        use, uv, cov = labelled_points(all_of, k, assigned[k], extra)
+        L, g, _, _, _ = frame_information(views, ref.R[k], ref.t[k], use, uv, cov)
+        P = pose_P[k]
+        A = -_multiply(P, L)
+        right = np.empty((6, 7))
+        Pg = _apply(P, g)
+        for i in range(6):
+            A[i, i] += 1.0
+            right[i, :6] = P[i]
+            right[i, 6] = -Pg[i]
+        x, _ = _solve(A, right)
+        alone = np.ascontiguousarray(x[:, :6])
+        _symmetrise(alone)
+        vague = False
+        for i in range(6):
+            limit = VAGUE_M if i < 3 else VAGUE_RAD
+            vague |= not 0.0 < alone[i, i] < limit * limit
+        if vague:
+            continue
+        R, t = _moved(ref.R[k], ref.t[k], x[:, 6].copy())
+        a, b = all_of.begin[k], all_of.begin[k + 1]
+        frame = Frame(
+            all_of.uv[a:b], all_of.cov[a:b], all_of.blend_px[a:b], all_of.first[k], all_of.has_image[k], log_clutter[k]
+        )
+        found, score, counted, R_b, t_b, count = associate(views, sights, frame, chances, R, t, alone, shown, extra)
+        whole = np.zeros((STATE, STATE))
+        whole[:6, :6] = alone
+        exact = np.full(count, -np.inf)
+        before = (R, t, nothing, whole)
+        for j in range(count):
+            if score[j] > score[0] - 2 * RIVAL:
+                _, _, _, _, gaussian, _, _ = concluded(views, frame, extra, before, found[j], R_b[j], t_b[j])
+                exact[j] = counted[j] + gaussian
+        best = int(np.argmax(exact))
+        total = 0.0
+        share = np.zeros(n)
+        for j in range(count):
+            if exact[j] > exact[best] - RIVAL:
+                p = np.exp(exact[j] - exact[best])
+                total += p
+                for i in range(n):
+                    if found[j, i] % BLENDED == found[best, i] % BLENDED:
+                        share[i] += p
+        for i in range(n):
+            out[k, i] = found[best, i] if found[best, i] >= 0 else -1
+            certain[k, i] = share[i] / total
+    return out, certain

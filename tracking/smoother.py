@@ -1,0 +1,286 @@
+"""The second look at a run: labels anew from both sides, and the motion given all frames.
+
+Rounds of: evidence of the labelled spots; the jerk's strength by maximum likelihood; fixed-interval smoothing; and each
+frame's detections assigned anew from where all other frames say that the vehicle was. What the causal pass lost or left
+open is so found from the side on which it is known. Source: ours; see fixed_interval.py and relabel.py.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.optimize import minimize
+
+from geometry.arrays import Array, Bools, Ints
+from geometry.pose import Pose
+from geometry.projection import Views, project_all
+from geometry.solve import SolveLimits, covariance_of, fit_pose
+from tracking.association import BLENDED, Chances, Sights
+from tracking.fixed_interval import Evidence, Reference, log_likelihood, shifted, smoothed
+from tracking.information import fit_alone
+from tracking.misfit import DEADBAND
+from tracking.recording import Recording
+from tracking.relabel import AllDetections, clutter_density, evidence_of, labelled_points, relabelled
+from tracking.rigid_tracker import (
+    FIRST_ACCELERATION,
+    FIRST_ANGULAR,
+    FIRST_RATE,
+    FIRST_SPEED,
+    LOST_SIGMA_M,
+    LOST_SIGMA_RAD,
+)
+from tracking.smoothed import Smoothed
+from tracking.surroundings import RADIUS_PX
+from tracking.temper import JUMP_OF_SPEED, LEAST_JUMP, RANGE, STEADIES_WITHIN_S
+
+MOST_ROUNDS = 5
+MOST_STEPS = 6  # of Gauss-Newton per round
+SMALL_STEP = 0.02  # sigmas: a step of Gauss-Newton that is nothing any more
+LONGEST_STEP = 0.3  # m and rad, of the reference: beyond it nothing is linear
+MOST_FRAMES_FOR_JERK = 3000  # the likelihood is sharp enough by then
+P_DARK = 0.05  # probability of a bend in each frame that does not show the pose
+SPEED_WINDOW_S = 0.5  # a bend's size is judged by the fastest motion within this time of it
+
+
+def smooth(recording: Recording) -> Smoothed:
+    """A run's labels and motion, given all of it.
+
+    With `method: spots` the labels stay as that tracker gave them. Where nothing was measured nothing is known.
+    """
+    rec, model, parameters = recording, recording.model, recording.parameters
+    views = model.numbers
+    sights = Sights(np.ascontiguousarray(model.camera_of), np.ascontiguousarray(model.image_size_px))
+    chances = Chances(parameters.p_detect, parameters.p_blend)
+    causal, measured = rec.assigned, rec.measured
+    assigned, probability = causal.copy(), np.where(causal >= 0, 1.0, np.nan)
+    every = _all_detections(rec)
+    ref = _first_reference(rec)
+    extra, systematic = _calibration(rec, every, assigned, ref)
+    scale = _noise_scale(views, every, assigned, extra, ref, measured)
+    every = every._replace(cov=every.cov * scale**2 + parameters.sigma_model_px**2 * np.eye(2))
+    start = np.log([parameters.jerk_m_s3, parameters.jerk_rad_s3])
+    log_jerk: Array | None = None if parameters.learn_jerk else start
+    rounds, relabels = 0, parameters.method == "rigid"
+    while True:
+        rounds += 1
+        ref, pose_P, motion_P, log_jerk, known = _motion(
+            views, every, assigned, extra, ref, rec, measured, log_jerk, parameters.learn_jerk
+        )
+        if not relabels or rounds == MOST_ROUNDS:
+            break
+        log_clutter = _log_clutter(rec, views, sights, every, assigned, ref, known)
+        found, certain = relabelled(views, sights, chances, every, assigned, extra, ref, pose_P, log_clutter)
+        new = np.where((certain >= parameters.min_label_probability) & known[:, None], found, -1)
+        probability = np.where(found >= 0, certain, np.nan)
+        changed = int(np.count_nonzero(new != assigned))
+        assigned = new
+        measured, rms = _alone(rec, views, every, assigned, extra, ref)
+        if changed == 0:
+            break
+    measured, rms = _alone(rec, views, every, assigned, extra, ref)
+    differ = (assigned % BLENDED != causal) & ~((assigned < 0) & (causal < 0))
+    return Smoothed(
+        model=model,
+        parameters=parameters,
+        poses=Pose(ref.R, ref.t),
+        velocities=ref.m[:, :6],
+        covariance=pose_P,
+        systematic=systematic,
+        motion_covariance=motion_P,
+        known=known,
+        measured=measured & known,
+        assigned=assigned,
+        probability=probability,
+        first=every.first,
+        rms_px=rms,
+        jerk=np.exp(log_jerk),
+        iterations=rounds,
+        relabelled=int(np.count_nonzero(differ)),
+        noise_scale=scale,
+        extra=extra,
+    )
+
+
+def _all_detections(rec: Recording) -> AllDetections:
+    frames = [rec.detections(k) for k in range(len(rec))]
+    counts = [len(f[0]) for f in frames]
+    cameras = len(rec.model.camera_names)
+    blend = np.concatenate([np.zeros(0), *[np.where(f[2], rec.parameters.blend_px, 0.0) for f in frames]])
+    return AllDetections(
+        uv=np.concatenate([np.zeros((0, 2)), *[f[0] for f in frames]]),
+        cov=np.concatenate([np.zeros((0, 2, 2)), *[f[1] for f in frames]]),
+        blend_px=blend,
+        begin=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
+        first=np.array([f[3] for f in frames], dtype=np.int64).reshape(-1, cameras + 1),
+        has_image=np.array([f[4] for f in frames], dtype=bool).reshape(-1, cameras),
+    )
+
+
+def _first_reference(rec: Recording) -> Reference:
+    """The measured poses, what lies between two of them on the straight way, with the velocities of differences."""
+    poses, t_s = rec.poses, np.cumsum(rec.dt_s)
+    at = np.flatnonzero(rec.measured & np.isfinite(poses[:, 3, 0]))
+    frames = len(rec)
+    if not len(at):
+        centre = np.concatenate([np.eye(3), np.zeros((1, 3))])
+        return Reference(np.tile(centre[:3], (frames, 1, 1)), np.tile(centre[3], (frames, 1)), np.zeros((frames, 12)))
+    right = np.clip(np.searchsorted(at, np.arange(frames)), 0, len(at) - 1)
+    left = np.where(at[right] > np.arange(frames), np.maximum(right - 1, 0), right)
+    a, b = at[left], at[right]
+    length = t_s[b] - t_s[a]
+    share = np.where(length > 0, (t_s - t_s[a]) / np.where(length > 0, length, 1.0), 0.0)
+    share = np.clip(share, 0.0, 1.0)  # before the first and after the last: that pose
+    before, after = Pose(poses[a, :3], poses[a, 3]), Pose(poses[b, :3], poses[b, 3])
+    between = before.plus(after.minus(before) * share[:, None])
+    R, t = np.ascontiguousarray(between.rotation), np.ascontiguousarray(between.translation)
+    m = np.zeros((frames, 12))
+    if frames > 2:
+        step = Pose(R[2:], t[2:]).minus(Pose(R[:-2], t[:-2]))
+        time = (t_s[2:] - t_s[:-2])[:, None]
+        m[1:-1, :6] = step / np.where(time > 0, time, 1.0)
+        m[0], m[-1] = m[1], m[-2]
+    return Reference(R, t, m)
+
+
+def _calibration(rec: Recording, every: AllDetections, assigned: Ints, ref: Reference) -> tuple[Array, Array]:
+    """What the calibration's errors do: to the expected pixels (n, 2, 2), the mean over the run, and poses (T, 6, 6)."""
+    n = len(rec.model)
+    extra, systematic = np.zeros((n, 2, 2)), np.zeros((1, 6, 6))
+    if rec.calibration is None:
+        return extra, systematic
+    systematic = np.zeros((len(rec), 6, 6))
+    count, latest = 0, np.zeros((6, 6))
+    for k in range(len(rec)):
+        use, uv, cov = labelled_points(every, k, assigned[k], np.zeros_like(extra))
+        rows = np.flatnonzero(use)
+        if rec.measured[k]:
+            fit = fit_pose(rec.model, rows, uv[rows], cov[rows], Pose(ref.R[k], ref.t[k]), calibration=rec.calibration)
+            if fit is not None and fit.observable:
+                latest = fit.systematic
+                extra += fit.calibration_px()
+                count += 1
+        systematic[k] = latest
+    return extra / max(count, 1), systematic
+
+
+def _noise_scale(
+    views: Views, every: AllDetections, assigned: Ints, extra: Array, ref: Reference, measured: Bools
+) -> float:
+    """How much larger than claimed the spots' errors are: of the frames' own fits, deaf to the worst; 1 if honest."""
+    shares = []
+    for k in np.flatnonzero(measured):
+        use, uv, cov = labelled_points(every, k, assigned[k], extra)
+        _, _, _, chi2, count = fit_alone(views, ref.R[k], ref.t[k], use, uv, cov)
+        if count > 3:
+            shares.append(chi2 / (2 * count - 6))
+    if not shares:
+        return 1.0
+    mean = float(np.mean(np.minimum(shares, 3 * np.median(shares))))
+    return float(np.sqrt(mean)) if mean > DEADBAND else 1.0
+
+
+def _evidence(
+    views: Views, every: AllDetections, assigned: Ints, extra: Array, ref: Reference, rec: Recording, measured: Bools
+) -> Evidence:
+    """The frames' information at a reference, and where the motion may have bent."""
+    L, g, _, _ = evidence_of(views, every, assigned, extra, ref)
+    dt = rec.dt_s
+    window = max(1, int(round(SPEED_WINDOW_S / max(float(np.median(dt[dt > 0])) if np.any(dt > 0) else 0.01, 1e-6))))
+    speed = np.stack([np.linalg.norm(ref.m[:, :3], axis=1), np.linalg.norm(ref.m[:, 3:6], axis=1)], axis=1)
+    fastest = _running_maximum(np.where(measured[:, None], speed, 0.0), window)
+    size = (LEAST_JUMP + JUMP_OF_SPEED * fastest) ** 2
+    # After a dark stretch the first light does not tell when it bent.
+    dark = ~measured
+    dark[1:] |= ~measured[:-1]
+    chance = np.where(rec.bent, 1.0, np.where(dark, P_DARK, 0.0))
+    jump = chance[:, None] * size
+    sd = [1.0, 1.0, FIRST_SPEED, FIRST_RATE, FIRST_ACCELERATION, FIRST_ANGULAR]
+    return Evidence(L, g, dt, jump, jump / STEADIES_WITHIN_S**2, np.repeat(sd, 3) ** 2)
+
+
+def _running_maximum(values: Array, half: int) -> Array:
+    """The largest of values (T, k) within half frames of each."""
+    from scipy.ndimage import maximum_filter1d
+
+    return np.asarray(maximum_filter1d(values, 2 * half + 1, axis=0, mode="nearest"))
+
+
+def _motion(
+    views: Views,
+    every: AllDetections,
+    assigned: Ints,
+    extra: Array,
+    ref: Reference,
+    rec: Recording,
+    measured: Bools,
+    log_jerk: Array | None,
+    learn: bool,
+) -> tuple[Reference, Array, Array, Array, Bools]:
+    """Gauss-Newton on the whole run: the motion, covariances of poses and velocities, log jerk, and what is known."""
+    for step in range(MOST_STEPS):
+        ev = _evidence(views, every, assigned, extra, ref, rec, measured)
+        if log_jerk is None or (learn and step == 1):
+            log_jerk = _likeliest_jerk(ref, ev, log_jerk)
+        x, pose_P, motion_P = smoothed(ref, ev, np.exp(2 * log_jerk))
+        sd = np.sqrt(np.maximum(np.diagonal(pose_P, axis1=1, axis2=2), 1e-30))
+        known = (sd[:, :3].max(axis=1) < LOST_SIGMA_M) & (sd[:, 3:].max(axis=1) < LOST_SIGMA_RAD)
+        # A frame of which nothing is known stays where it is: far moves are not linear, and it has no say.
+        long = np.abs(x[:, :6]).max(axis=1) > LONGEST_STEP
+        x[~known & long] = 0.0
+        ref = shifted(ref, x)
+        if step > 0 and np.all(np.abs(x[known, :6]) < SMALL_STEP * sd[known]):
+            break
+    assert log_jerk is not None
+    return ref, pose_P, motion_P, log_jerk, known & bool(measured.any())
+
+
+def _likeliest_jerk(ref: Reference, ev: Evidence, before: Array | None) -> Array:
+    """Logarithms of the jerk of translation and rotation that make the evidence most likely."""
+    frames = len(ev.dt)
+    middle = slice(max(0, (frames - MOST_FRAMES_FOR_JERK) // 2), (frames + MOST_FRAMES_FOR_JERK) // 2)
+    ref = Reference(*(a[middle] for a in ref))
+    ev = Evidence(*(a[middle] for a in ev[:-1]), ev.first)
+
+    def cost(log_jerk: Array) -> float:
+        value = -log_likelihood(ref, ev, np.exp(2 * np.clip(log_jerk, np.log(RANGE[0]), np.log(RANGE[1]))))
+        return value if np.isfinite(value) else 1e300
+
+    if before is None:
+        steps = np.log(10.0) * np.arange(-2.0, 4.0)
+        grid = [np.array([a, a + b]) for a in steps for b in np.log([0.5, 3.0, 20.0])]
+        before = min(grid, key=cost)
+    simplex = before + 0.7 * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+    options = {"xatol": 0.05, "fatol": 0.05, "maxiter": 60, "initial_simplex": simplex}
+    found = minimize(cost, before, method="Nelder-Mead", options=options)
+    return np.clip(np.asarray(found.x, dtype=float), np.log(RANGE[0]), np.log(RANGE[1]))
+
+
+def _log_clutter(
+    rec: Recording, views: Views, sights: Sights, every: AllDetections, assigned: Ints, ref: Reference, known: Bools
+) -> Array:
+    """(T, n) log density of false points: as counted near spots over the run, or a frame's whole picture's if more."""
+    near = clutter_density(views, sights, every, assigned, ref, known, RADIUS_PX)
+    model = rec.model
+    area = np.array([np.prod(model.image_size_px[model.camera_of == c][:1]) for c in range(len(near))])
+    density = np.maximum(np.maximum(near, np.diff(every.first, axis=1) / area), rec.parameters.labels.clutter_per_px2)
+    return np.ascontiguousarray(np.log(density)[:, model.camera_of])
+
+
+def _alone(
+    rec: Recording, views: Views, every: AllDetections, assigned: Ints, extra: Array, ref: Reference
+) -> tuple[Bools, Array]:
+    """Of each frame by itself: whether its spots give the pose, and their root mean square residual, px."""
+    frames = len(rec)
+    limits = SolveLimits(rec.parameters.max_sigma_m, float(np.deg2rad(rec.parameters.max_sigma_deg)))
+    measured, rms = np.zeros(frames, dtype=bool), np.full(frames, np.nan)
+    for k in range(frames):
+        use, uv, cov = labelled_points(every, k, assigned[k], np.zeros_like(extra))
+        if np.count_nonzero(use) < 3:
+            continue
+        R, t, L, _, _ = fit_alone(views, ref.R[k], ref.t[k], use, uv, cov)
+        alone, full = covariance_of(L)
+        if full:
+            worst = [np.sqrt(np.linalg.eigvalsh(alone[i, i])[-1]) for i in (slice(0, 3), slice(3, 6))]
+            measured[k] = worst[0] <= limits.max_sigma_m and worst[1] <= limits.max_sigma_rad
+        residual = (uv - project_all(views, R[None], t[None])[0][0])[use]
+        rms[k] = np.sqrt(np.nanmean(residual**2))
+    return measured, rms
