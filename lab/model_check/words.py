@@ -10,7 +10,7 @@ from geometry.spots import SpotModel
 from lab.model_check import faults as f
 from lab.model_check.culprit import Culprit, Explained, Inquest
 from lab.model_check.effect import Effect
-from lab.report.svg import short
+from lab.report.svg import plus_minus, short
 
 MATTERS_SIGMAS = 0.5  # of a pose's claimed sigmas, or of a spot's: a bias below it is lost in what is claimed anyway
 WRONG_SIGMAS = 5.0  # beyond it the run's claims are untrue; the misfit gate's limit is the same (lab/quality.py)
@@ -141,15 +141,6 @@ def _late(name: str, late_s: float, sigma_s: float, model: SpotModel, frame_s: f
     if count and abs(abs(late_s) / frame_s - count) < _ONE_FRAME:
         says += f" (that is {count} frame{'s' if count != 1 else ''}: its pictures may be numbered wrong)"
     return says
-
-
-def plus_minus(value: float, sigma: float) -> str:
-    """`0.350 ± 0.012`: the sigma to one digit, to two where that is a 1, and the value to as many decimals."""
-    if not (np.isfinite(sigma) and sigma > 0):
-        return short(value, 2)
-    power = int(np.floor(np.log10(sigma)))
-    decimals = max(0, -power + (1 if sigma / 10.0**power < 2 else 0))
-    return f"{value:.{decimals}f} ± {sigma:.{decimals}f}"
 
 
 def p_text(p: float) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 
 from geometry.arrays import Array
 from lab.report.plane import dots, frame, image_plane, note, number, round_size, segments, svg_of
-from lab.report.svg import BLUE, VERMILLION, short, text
+from lab.report.svg import BLUE, VERMILLION, plus_minus, short, text
 
 HEADS = (
     "spot", "camera", "frames", "mean u (px)", "mean v (px)", "u, v in σ", "calibration allows (px)", "scatter",
@@ -74,7 +74,7 @@ def _sentence(block: Mapping[str, Any], findings: tuple[FindingRow, ...]) -> str
         return f"Yes: no camera, screen, beam or clock is found off ({used})."
     if all(f.level == "small" for f in findings):
         return f"Nearly: what is off is lost in the stated uncertainty ({used})."
-    return f"No ({used}):"
+    return f"No, or so it seems ({used}):"
 
 
 def _mappings(value: Any) -> list[Mapping[str, Any]]:
@@ -94,7 +94,7 @@ def _pair(group: Mapping[str, Any], name: str) -> Array:
 def _numbers(g: Mapping[str, Any]) -> tuple[str, ...]:
     mean, sigma, sigmas = _pair(g, "mean_px"), _pair(g, "sigma_of_mean_px"), _pair(g, "mean_sigmas")
     allowed = _pair(g, "calibration_px")
-    means = [f"{_signed(m)} ± {short(s, 2)}" if np.isfinite(m) else "–" for m, s in zip(mean, sigma, strict=True)]
+    means = [plus_minus(m, s, signed=True) for m, s in zip(mean.tolist(), sigma.tolist(), strict=True)]
     nis = g.get("nis")
     told = "–"
     if isinstance(nis, Mapping):
@@ -104,7 +104,7 @@ def _numbers(g: Mapping[str, Any]) -> tuple[str, ...]:
     return (
         str(g.get("frames")),
         *means,
-        f"{_signed(sigmas[0])}, {_signed(sigmas[1])}",
+        ", ".join(f"{s:+.2f}".replace("-", "\u2212") for s in sigmas) if np.isfinite(sigmas).all() else "–",
         f"{short(allowed[0], 2)}, {short(allowed[1], 2)}" if np.any(allowed > 0) else "–",
         short(_float(g.get("scatter"))),
         told,

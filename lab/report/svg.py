@@ -308,3 +308,15 @@ def short(value: float | None, digits: int = 3) -> str:
         return f"{mantissa} × 10^{int(exponent)}".replace("-", "\u2212")
     decimals = max(0, digits - 1 - int(np.floor(np.log10(abs(value)))))
     return f"{value:.{decimals}f}".replace("-", "\u2212")
+
+
+def plus_minus(value: float, sigma: float, signed: bool = False) -> str:
+    """`0.350 ± 0.012`: the sigma to one digit, to two where that is a 1, and the value to as many decimals."""
+    if not np.isfinite(value):
+        return "\u2013"
+    if not (np.isfinite(sigma) and sigma > 0):
+        return ("+" if signed and value > 0 else "") + short(value, 2)
+    power = int(np.floor(np.log10(sigma)))
+    decimals = max(0, -power + (1 if sigma / 10.0**power < 2 else 0))
+    text = f"{value:{'+' if signed else ''}.{decimals}f} ± {sigma:.{decimals}f}"
+    return text.replace("-", "\u2212")

@@ -22,6 +22,7 @@ from lab.model_check.keeper import FrameKeeper
 from lab.model_check.linear import linearise
 from lab.model_check.recording import evenly
 from lab.model_check.statistics import correlation_time, nis_band
+from lab.report.svg import plus_minus
 from tests.lab.model_scenes import NOISE_PX, SCENES, changed, one_camera, recorded, turned
 
 
@@ -387,7 +388,7 @@ def test_a_fault_that_is_sure_but_small_is_no_alarm():
     [(0.3501, 0.0123, "0.350 ± 0.012"), (2.93, 0.05, "2.93 ± 0.05"), (12.0, 3.0, "12 ± 3"), (0.5, 0.0, "0.50")],
 )
 def test_a_size_has_the_digits_that_its_sigma_allows(value, sigma, text):
-    assert words.plus_minus(value, sigma) == text
+    assert plus_minus(value, sigma) == text
 
 
 def test_the_threshold_is_kept():
