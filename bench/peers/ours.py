@@ -1,0 +1,46 @@
+"""beampose's own trackers on the bench's points. They know the rig and a prior, and get no labels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from time import process_time
+from typing import Literal
+
+import numpy as np
+
+from bench.peers.rows import Tracked
+from bench.peers.scenes import CAMERA_OF, FRAME_S, NOISE_PX, Scene, rig
+from geometry.pose import Pose
+from tracking.detections import Detections
+from tracking.labels import PosePrior
+from tracking.match import UNMATCHED
+from tracking.parameters import TrackerParameters
+from tracking.rigid_tracker import RigidTracker
+from tracking.spot_tracker import SpotTracker
+from tracking.tracked_frame import TrackedFrame
+
+PRIOR = PosePrior(Pose.identity(), within_m=1.0, within_rad=float(np.deg2rad(35.0)))
+
+
+def track(scene: Scene, method: Literal["rigid", "spots"]) -> Tracked:
+    """Frame after frame, as in a run of the lab."""
+    parameters = TrackerParameters(method=method)
+    tracker = RigidTracker(rig(), parameters, PRIOR) if method == "rigid" else SpotTracker(rig(), parameters, PRIOR)
+    frames = []
+    start = process_time()
+    for k, found in enumerate(scene.detections):
+        points = [Detections.at(p, np.broadcast_to(NOISE_PX**2 * np.eye(2), (len(p), 2, 2))) for p in found]
+        frames.append(tracker.step(FRAME_S if k else 0.0, points))
+    return named(scene, frames, process_time() - start)
+
+
+def named(scene: Scene, frames: Sequence[TrackedFrame], spent_s: float) -> Tracked:
+    """Rows of all spots: with their detection where there is one, else with the estimate, unless nothing is known."""
+    point = np.array([f.point for f in frames])
+    uv = np.array([f.uv_px for f in frames])
+    measured = point != UNMATCHED
+    for k, s in zip(*np.nonzero(measured), strict=True):
+        uv[k, s] = scene.detections[k][CAMERA_OF[s]][point[k, s]]
+    known = ~np.isnan(uv[..., 0])
+    frame, spot = np.nonzero(known)
+    return Tracked(frame, CAMERA_OF[spot], spot, uv[known], measured[known], spent_s)

@@ -1,0 +1,65 @@
+"""The trackers of the bench by name: ours, and other people's with the parameters that they do best with.
+
+The peers' parameters were chosen by IDF1 among two or three settings each, on 700 frames of standard, fast and reversal
+of seed 3, and then left alone. Slow ones take only the first seeds of a run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from importlib import import_module
+from importlib.metadata import PackageNotFoundError, version
+from importlib.util import find_spec
+
+from bench.peers.rows import Tracked
+from bench.peers.scenes import Scene
+
+OURS = ("rigid", "spots")
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """One tracker with its settings."""
+
+    name: str
+    module: str  # of bench.peers, with track(scene, **options)
+    library: str | None = None  # what must be installed; None: ours
+    options: Mapping[str, object] = field(default_factory=dict)
+    seeds: int | None = None  # at most so many of the seeds asked for; None: all
+
+    @property
+    def installed(self) -> bool:
+        """Whether the library is there; ours always are."""
+        return self.library is None or find_spec(self.library) is not None
+
+    @property
+    def library_version(self) -> str:
+        """As in `norfair 2.3.0`; for ours the program's own."""
+        name = self.library or "beampose"
+        try:
+            return f"{name} {version(name)}"
+        except PackageNotFoundError:  # beampose run from its folder
+            return name
+
+    def track(self, scene: Scene) -> Tracked:
+        """Its rows over one scene. Raises whatever the library raises."""
+        tracked: Tracked = import_module(f"bench.peers.{self.module}").track(scene, **self.options)
+        return tracked
+
+
+ENTRIES = {
+    entry.name: entry
+    for entry in (
+        Entry("rigid", "ours", options={"method": "rigid"}),
+        # On dense, `spots` looks for the vehicle anew in a third of the frames: 0.13 s each, minutes for a scene.
+        Entry("spots", "ours", options={"method": "spots"}, seeds=1),
+        Entry("pyrecest-jpda", "with_pyrecest", "pyrecest", {"association": "jpda", "q": 2.0}, seeds=2),
+        Entry("pyrecest-gnn", "with_pyrecest", "pyrecest", {"association": "gnn", "q": 2.0}, seeds=2),
+        Entry("stonesoup-gnn", "with_stonesoup", "stonesoup", {"q": 3.0}, seeds=1),
+        Entry("norfair", "with_norfair", "norfair", {"R": 4.0, "Q": 0.1}, seeds=2),
+        Entry("bytetrack", "with_bytetrack", "trackers", {"half_px": 40.0}, seeds=2),
+        Entry("laptrack", "with_laptrack", "laptrack", {"gate_px": 45.0, "gap_px": 150.0}, seeds=1),
+        Entry("trackpy", "with_trackpy", "trackpy", {"gate_px": 25.0, "frames_kept": 20}, seeds=1),
+    )
+}
