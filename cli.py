@@ -86,8 +86,8 @@ _set_option = click.option(
 
 
 @contextmanager
-def _progress(name: str) -> Iterator[Callable[[int, int | None], None] | None]:
-    """A bar on a terminal, nothing elsewhere."""
+def _progress(name: str) -> Iterator[Callable[..., None] | None]:
+    """A bar on a terminal, nothing elsewhere; it is told what is done, of how much, and the stage where there are any."""
     if not sys.stderr.isatty():
         yield None
         return
@@ -97,14 +97,24 @@ def _progress(name: str) -> Iterator[Callable[[int, int | None], None] | None]:
     parts = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*parts, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(name, total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)
+
+        def tell(done: int, total: int | None, stage: str = "") -> None:
+            bar.update(task, completed=done, total=total, description=f"{name}: {stage}" if stage else name)
+
+        yield tell
+
+
+_causal_option = click.option(
+    "--causal", is_flag=True, help="No second pass: attitude.csv says what was known at each instant."
+)
 
 
 @main.command()
 @click.argument("run_folder", metavar="RUN", type=_ANY_PATH)
 @click.option("--out", required=True, type=_FOLDER, help="Where the results go; earlier results there are replaced.")
+@_causal_option
 @_set_option
-def run(run_folder: Path, out: Path, settings: dict[str, Any]) -> None:
+def run(run_folder: Path, out: Path, causal: bool, settings: dict[str, Any]) -> None:
     """Process one run folder: tables, summary.json and report.html.
 
     \b
@@ -114,7 +124,7 @@ def run(run_folder: Path, out: Path, settings: dict[str, Any]) -> None:
     from lab.process import process_run
 
     with _progress(run_folder.name) as progress:
-        outcome = process_run(run_folder, out, overrides=settings, progress=progress)
+        outcome = process_run(run_folder, out, overrides=settings, causal=causal, progress=progress)
     click.echo(outcome.line())
     sys.exit(outcome.exit_status)
 
@@ -122,8 +132,9 @@ def run(run_folder: Path, out: Path, settings: dict[str, Any]) -> None:
 @main.command()
 @click.argument("run_folders", metavar="RUN...", nargs=-1, required=True, type=_ANY_PATH)
 @click.option("--out", required=True, type=_FOLDER, help="Gets one folder per run, batch.csv and index.html.")
+@_causal_option
 @_set_option
-def batch(run_folders: tuple[Path, ...], out: Path, settings: dict[str, Any]) -> None:
+def batch(run_folders: tuple[Path, ...], out: Path, causal: bool, settings: dict[str, Any]) -> None:
     """Process many run folders; one that fails costs only itself.
 
     \b
@@ -132,7 +143,7 @@ def batch(run_folders: tuple[Path, ...], out: Path, settings: dict[str, Any]) ->
     """
     from lab.batch import process_batch
 
-    outcome = process_batch(run_folders, out, overrides=settings, tell=click.echo)
+    outcome = process_batch(run_folders, out, overrides=settings, causal=causal, tell=click.echo)
     click.echo(f"table: {outcome.table}")
     click.echo(f"index: {outcome.index}")
     sys.exit(outcome.exit_status)

@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from lab.errors import QUALITY_GATE_FAILED, BeamposeError, CalibrationError, InputError, RunError
-from lab.process import Outcome, Progress, overridden, process_run
+from lab.process import Outcome, overridden, process_run
+from lab.two_passes import Progress
 from tracking.parameters import TrackerParameters
 
 COLUMNS = (
@@ -42,13 +43,14 @@ def process_batch(
     out: Path,
     *,
     overrides: Mapping[str, Any] | None = None,
+    causal: bool = False,
     tell: Callable[[str], None] = lambda line: None,
     progress: Callable[[str], Progress | None] = lambda name: None,
 ) -> BatchOutcome:
     """Process runs into out/<name of the run folder>; a run that fails costs only itself.
 
-    tell: gets a line per run. progress: gives, for a run's name, what is told of its frames. Raises InputError where
-    the command as a whole is wrong.
+    overrides, causal: as for process_run. tell: gets a line per run. progress: gives, for a run's name, what is told of
+    its frames. Raises InputError where the command as a whole is wrong.
     """
     if not run_folders:
         raise InputError("batch: expected one or more run folders, got none")
@@ -64,7 +66,8 @@ def process_batch(
     rows: list[dict[str, Any]] = []
     for folder, name in zip(run_folders, names, strict=True):
         try:
-            row = _row(folder, process_run(folder, out / name, overrides=overrides, progress=progress(name)))
+            outcome = process_run(folder, out / name, overrides=overrides, causal=causal, progress=progress(name))
+            row = _row(folder, outcome)
             tell(f"{name}: {row['status'].upper()}: {row['message']}")
         except BeamposeError as error:
             row = _failed(folder, name, error)

@@ -8,15 +8,22 @@ DETECTIONS = (
 )  # fmt: skip
 SPOTS = (
     "frame", "t_s", "camera", "spot", "u_px", "v_px", "sigma_u_px", "sigma_v_px", "status", "predicted_u_px",
-    "predicted_v_px", "gain", "cov_uv_px2",
+    "predicted_v_px", "gain", "cov_uv_px2", "label_probability",
 )  # fmt: skip
 BEAMS = ("frame", "t_s", "beam", "dx", "dy", "dz", "px_m", "py_m", "pz_m", "status")
 ATTITUDE = (
     "frame", "t_s", "x_m", "y_m", "z_m", "qw", "qx", "qy", "qz", "yaw_deg", "pitch_deg", "roll_deg",
     "sigma_x_m", "sigma_y_m", "sigma_z_m", "sigma_yaw_deg", "sigma_pitch_deg", "sigma_roll_deg",
     "spots_used", "rms_px", "status",
+    "velocity_x_m_s", "velocity_y_m_s", "velocity_z_m_s", "rate_x_rad_s", "rate_y_rad_s", "rate_z_rad_s",
+    "sigma_velocity_x_m_s", "sigma_velocity_y_m_s", "sigma_velocity_z_m_s",
+    "sigma_rate_x_rad_s", "sigma_rate_y_rad_s", "sigma_rate_z_rad_s",
 )  # fmt: skip
+POSE = ATTITUDE[2:18]  # of these the pose itself: position, quaternion, angles and the sigmas
+MOTION = ATTITUDE[21:]  # velocity of the body origin, in world; rate about the body's axes; their sigmas
 COVARIANCE = ("frame", *(f"c{i}{j}" for i in range(6) for j in range(i, 6)))
 TRUTH_POSE = ("frame", "t_s", "x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
 TRUTH_SPOTS = ("frame", "camera", "spot", "u_px", "v_px", "in_view")
 TIMES = ("frame", "t_s")
+CAUSAL = "_causal"  # in the names of tables of what was known at each instant, beside those of the whole run's view
+ADDED = ("label_probability", *MOTION)  # what results from before the rigid tracker do not have

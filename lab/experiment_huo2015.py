@@ -26,9 +26,15 @@ BEND_FRAMES = 2  # the bend and the frame after it, which the paper's RMS leaves
 START_FRAMES = 5
 
 PAPER = TrackerParameters(
-    rigid_check=False, estimate="prediction", out_of_view="quadratic", learn_sigma_a=False, sigma_a_px_s2=STIFF_PX_S2
+    method="spots",
+    rigid_check=False,
+    estimate="prediction",
+    out_of_view="quadratic",
+    learn_sigma_a=False,
+    sigma_a_px_s2=STIFF_PX_S2,
 )
 CONVENTIONAL = TrackerParameters(
+    method="spots",
     rigid_check=False,
     estimate="prediction",
     out_of_view="quadratic",
@@ -87,7 +93,7 @@ def repeat_huo2015(seed: int, frames: int) -> Study:
     trackers = {
         "conventional": track(run, CONVENTIONAL),
         "curve switching": track(run, PAPER),
-        "beampose": track(run, TrackerParameters()),
+        "beampose": track(run, TrackerParameters(method="spots")),
     }
     outside = {f"{way}, {noise:g} px": outside_error(run, way, noise) for noise in (0.0, NOISE_PX) for way in WAYS}
     rows = (*_filter_rows(run, same, bends), *_outside_rows(run, outside), *_tracker_rows(run, trackers, bends))

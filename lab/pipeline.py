@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 
@@ -15,11 +16,24 @@ from lab.pictures import Missing
 from lab.run_file import FramesFolder, Run
 from tracking.detect import find_spots
 from tracking.detections import Detections
+from tracking.labels import PosePrior
 from tracking.noise import NoiseModel, estimate_noise
+from tracking.rigid_tracker import RigidTracker
 from tracking.spot_tracker import SpotTracker
 from tracking.tracked_frame import TrackedFrame
 
 NOISE_PICTURES = 3  # per camera, where the rig states no noise: enough for the slope, and read in an instant
+
+
+class Tracker(Protocol):
+    """What is fed the detections of one frame after the other, whatever its method."""
+
+    @property
+    def noise_scale(self) -> float:
+        """How much larger than claimed the spots' errors are."""
+
+    def step(self, dt_s: float, found: Sequence[Detections | None]) -> TrackedFrame:
+        """One frame. dt_s: time since the frame before (0 for the first); found: per camera, None without a picture."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,9 +42,17 @@ class FrameRecord:
 
     frame: int
     t_s: float
+    dt_s: float  # since the record before; 0 for the first
     detections: tuple[Detections | None, ...]  # per camera of the run; None without a usable picture
     missing: tuple[str, ...]  # per camera: why there is no picture; "" where there is one
     tracked: TrackedFrame
+
+
+def tracker_of(run: Run, prior: PosePrior) -> Tracker:
+    """The tracker of the run's method, at its start."""
+    if run.tracker.method == "spots":
+        return SpotTracker(run.rig, run.tracker, prior, run.covariance)
+    return RigidTracker(run.rig, run.tracker, prior, run.covariance)
 
 
 @dataclass(slots=True)
@@ -40,6 +62,7 @@ class Timings:
     waiting: float = 0.0  # for pictures
     detection: float = 0.0
     tracking: float = 0.0
+    smoothing: float = 0.0
 
 
 @dataclass(slots=True)
@@ -48,7 +71,7 @@ class Pipeline:
 
     run: Run
     reader: FrameReader
-    tracker: SpotTracker
+    tracker: Tracker
     noise: dict[str, SensorNoise | NoiseModel]
     timings: Timings = field(default_factory=Timings)
 
@@ -67,7 +90,7 @@ class Pipeline:
             model = camera.noise or _noise_of_pictures(run, reader, name)
             if model is not None:
                 noise[name] = model
-        return Pipeline(run, reader, SpotTracker(run.rig, run.tracker, run.prior, run.covariance), noise)
+        return Pipeline(run, reader, tracker_of(run, run.prior), noise)
 
     def records(self) -> Iterator[FrameRecord]:
         """One record per frame number, from the first to the last."""
@@ -78,10 +101,11 @@ class Pipeline:
             t_s = float(self.run.times.t_s(frames.frame))
             found, missing = self._detect(frames)
             clock = self._spent("detection", clock)
-            tracked = self.tracker.step(0.0 if before is None else t_s - before, found)
+            dt_s = 0.0 if before is None else t_s - before
+            tracked = self.tracker.step(dt_s, found)
             before = t_s
             self._spent("tracking", clock)
-            yield FrameRecord(frames.frame, t_s, found, missing, tracked)
+            yield FrameRecord(frames.frame, t_s, dt_s, found, missing, tracked)
             clock = time.perf_counter()
 
     def detections(self) -> Iterator[tuple[int, tuple[Detections | None, ...]]]:

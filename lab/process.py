@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import datetime
 import json
 import platform
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
@@ -24,13 +25,12 @@ from lab.fingerprints import fingerprints
 from lab.pipeline import FrameRecord, Pipeline
 from lab.run_file import Run, load_run
 from lab.tables import TableWriter
+from lab.two_passes import Progress, TwoPasses
 from lab.whole_folder import whole_folder
 from tracking.parameters import TrackerParameters
 
 SUMMARY_SCHEMA = "beampose/summary/1"
 MOST_EVENTS = 500  # told one by one; of the rest the number
-
-Progress = Callable[[int, int | None], None]  # frames done, frames in all where known
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +72,7 @@ class _Tally:
     reasons: dict[str, Counter[str]] = field(default_factory=dict)
     events: list[dict[str, Any]] = field(default_factory=list)
     event_kinds: Counter[str] = field(default_factory=Counter)
+    left_open: int = 0  # rows of spots.csv with a detection whose label was too uncertain to be given
 
     def add(self, record: FrameRecord) -> None:
         self.frames += 1
@@ -85,6 +86,9 @@ class _Tally:
                 self._missed(camera, record.frame, reason)
             else:
                 self.detections[camera] += len(found)
+        if record.tracked.label_probability is not None:
+            given = np.array([s.measured for s in record.tracked.status])
+            self.left_open += int(np.count_nonzero(~given & ~np.isnan(record.tracked.label_probability)))
         for event in record.tracked.events:
             self.event_kinds[event.kind] += 1
             if len(self.events) < MOST_EVENTS:
@@ -113,12 +117,16 @@ def process_run(
     out: Path,
     *,
     overrides: Mapping[str, Any] | None = None,
+    causal: bool = False,
     progress: Progress | None = None,
 ) -> Outcome:
     """Process one run folder into the folder `out`: the tables, summary.json and report.html.
 
-    overrides: tracker parameters that replace those of run.yaml. Raises a BeamposeError where the run cannot be
-    processed (CalibrationError where its rig's calibration must not be used); `out` is then as it was before.
+    overrides: tracker parameters that replace those of run.yaml. causal: the tables say what was known at each instant,
+    and nothing is smoothed; otherwise they say what the whole run tells, and attitude_causal.csv the former.
+
+    Raises a BeamposeError where the run cannot be processed (CalibrationError where its rig's calibration must not be
+    used); `out` is then as it was before.
     """
     started = time.perf_counter()
     run = load_run(run_folder)
@@ -129,21 +137,23 @@ def process_run(
     with whole_folder(out, may_replace=are_results) as work:
         pipeline = Pipeline.of(run)
         tally = _Tally(tuple(run.rig.cameras), tuple(f"{c}/{s}" for c, s in SpotModel.of(run.rig).views))
-        total = pipeline.reader.expected_frames
-        with TableWriter(work, run.rig, run.covariance is not None) as tables:
-            for record in pipeline.records():
-                tables.write(record)
+        passes = TwoPasses(pipeline, work, progress)
+        with (
+            TableWriter(work, run.rig, run.covariance is not None, with_causal=not causal) as tables,
+            contextlib.closing(passes.causal_only() if causal else passes.records()) as records,
+        ):
+            for record, known_then in records:
+                tables.write(record, known_then)
                 tally.add(record)
-                if progress is not None:
-                    progress(tally.frames, total)
         verdict = _verdict(pipeline, tally)
         errors = _errors(work, run)
         seconds = {
             "waiting_for_pictures_s": pipeline.timings.waiting,
             "detection_s": pipeline.timings.detection,
             "tracking_s": pipeline.timings.tracking,
+            "smoothing_s": pipeline.timings.smoothing,
         }
-        content = _summary(run, pipeline, tally, verdict, errors, seconds, time.perf_counter() - started)
+        content = _summary(run, pipeline, passes, tally, verdict, errors, seconds, time.perf_counter() - started)
         _write_json(content, work / "summary.json")
         from lab.report import write_report  # the template engine: only for those who write a report
 
@@ -183,7 +193,7 @@ def _verdict(pipeline: Pipeline, tally: _Tally) -> quality.Verdict:
         frames=tally.frames,
         measured=tally.pose_status["measured"],
         lost=tally.pose_status["lost"],
-        misfit=pipeline.tracker.vehicle.noise_scale,
+        misfit=pipeline.tracker.noise_scale,
         no_image={c: sum(b - a + 1 for a, b in ranges) for c, ranges in tally.no_image.items()},
         ties=tally.event_kinds["tie"],
         measured_before_lost_again=tally.event_kinds["reacquired"],
@@ -199,6 +209,7 @@ def _errors(results: Path, run: Run) -> dict[str, Any] | None:
 def _summary(
     run: Run,
     pipeline: Pipeline,
+    passes: TwoPasses,
     tally: _Tally,
     verdict: quality.Verdict,
     errors: Mapping[str, Any] | None,
@@ -218,6 +229,8 @@ def _summary(
         "rig": str(run.rig_path.resolve()),
         "calibration": None if run.calibration is None else state_mapping(run.calibration),
         "notes_of_run": run.notes,
+        "attitude": "causal" if passes.smoothing is None else "smoothed",
+        "smoother": None if passes.smoothing is None else dataclasses.asdict(passes.smoothing),
         "verdict": {"status": verdict.status, "reasons": list(verdict.reasons), "exit_status": verdict.exit_status},
         "counts": {
             "frames": tally.frames,
@@ -227,12 +240,13 @@ def _summary(
             "no_image": tally.no_image,
             "no_image_reasons": {c: dict(r) for c, r in tally.reasons.items()},
             "events": dict(tally.event_kinds),
+            "labels_left_open": tally.left_open,
         },
         "rates": {
             "measured_share": tally.pose_status["measured"] / frames,
             "frame_rate_hz": run.frame_rate_hz,
             "processed_frames_per_s": tally.frames / wall_s if wall_s > 0 else None,
-            "misfit": pipeline.tracker.vehicle.noise_scale,
+            "misfit": pipeline.tracker.noise_scale,
         },
         "errors": errors,
         "timings": {**seconds, "wall_s": wall_s},

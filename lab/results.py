@@ -18,6 +18,7 @@ import numpy as np
 from geometry.arrays import Array, Bools, Ints
 from geometry.pose import Pose
 from lab import columns
+from lab.columns import CAUSAL
 from lab.errors import InputError
 from tracking.statuses import PoseStatus, SpotStatus
 
@@ -55,8 +56,8 @@ class Table:
         return np.stack([self.numbers[n] for n in names], axis=-1)
 
 
-def read_table(path: Path, numbers: Iterable[str], texts: Iterable[str] = ()) -> Table:
-    """The named columns of a CSV file.
+def read_table(path: Path, numbers: Iterable[str], texts: Iterable[str] = (), optional: Iterable[str] = ()) -> Table:
+    """The named columns of a CSV file; numbers that are `optional` are nan in a file without such a column.
 
     Other columns are ignored. The csv module, not pandas: spots.csv of 600 frames takes 14 ms against 5, but importing
     pandas takes 400. (Of 100,000 frames: 4.6 s against 0.3, beside the many minutes that such a run takes.)
@@ -69,12 +70,16 @@ def read_table(path: Path, numbers: Iterable[str], texts: Iterable[str] = ()) ->
         with path.open(newline="", encoding="utf-8") as file:
             reader = csv.reader(file)
             place = {name: i for i, name in enumerate(next(reader, []))}
+            absent = {name for name in optional if name not in place}
             for name in (*numbers, *texts):
-                if name not in place:
+                if name not in place and name not in absent:
                     raise InputError(f"{path}: expected a column {name!r}, found {', '.join(place) or 'an empty file'}")
             while rows := list(islice(reader, _ROWS_AT_ONCE)):
                 columns = list(zip(*rows, strict=True))
                 for name in numbers:
+                    if name in absent:
+                        pieces[name].append(np.full(len(rows), np.nan))
+                        continue
                     fields = [field or "nan" for field in columns[place[name]]]
                     pieces[name].append(np.array(list(map(float, fields))))
                 for name in texts:
@@ -104,6 +109,7 @@ class SpotGrid:
     sigma_px: Array  # (F, V, 2)
     predicted_px: Array  # (F, V, 2), before the picture was looked at
     gain: Array  # (F, V)
+    label_probability: Array  # (F, V) that the label is right; nan without a label, and in older results
     status: Ints  # (F, V) index into SPOT_STATUSES, or ABSENT
 
     @property
@@ -136,6 +142,10 @@ class PoseTrack:
     status: Ints  # (F,) index into POSE_STATUSES, or ABSENT
     covariance: Array  # (F, 6, 6), of [dt (m, world), dtheta (rad, body)]; nan where the file has none
     systematic: Array  # (F, 6, 6), the calibration's share of it; nan where there is none
+    velocity_m_s: Array  # (F, 3), of the body origin, in world; nan where unknown
+    rate_rad_s: Array  # (F, 3), about the body's axes
+    sigma_velocity_m_s: Array  # (F, 3)
+    sigma_rate_rad_s: Array  # (F, 3)
 
     def has(self, status: PoseStatus) -> Bools:
         """(F,): the pose's status is this one."""
@@ -170,7 +180,7 @@ def on_grid(
 def read_spots(results: Path) -> SpotGrid:
     """spots.csv of a results folder."""
     numbers = [c for c in columns.SPOTS if c not in ("camera", "spot", "status", "cov_uv_px2")]
-    table = read_table(results / "spots.csv", numbers, ("camera", "spot", "status"))
+    table = read_table(results / "spots.csv", numbers, ("camera", "spot", "status"), columns.ADDED)
     frame, camera, spot = table.numbers["frame"], table.texts["camera"], table.texts["spot"]
     frames = np.unique(frame).astype(np.int64)
     pairs = np.unique(np.stack([camera.codes, spot.codes], -1), axis=0) if len(table) else np.zeros((0, 2), np.int64)
@@ -194,6 +204,7 @@ def read_spots(results: Path) -> SpotGrid:
         sigma_px=grid("sigma_u_px", "sigma_v_px"),
         predicted_px=grid("predicted_u_px", "predicted_v_px"),
         gain=grid("gain")[..., 0],
+        label_probability=grid("label_probability")[..., 0],
         status=status,
     )
 
@@ -205,10 +216,14 @@ def pose_stack(position_m: Array, quaternion_wxyz: Array) -> Pose:
     return Pose.from_quaternion(quaternion, np.where(known[:, None], position_m, np.nan))
 
 
-def read_poses(results: Path) -> PoseTrack:
-    """attitude.csv, and covariance.csv and systematic.csv where there are such, of a results folder."""
+def read_poses(results: Path, causal: bool = False) -> PoseTrack:
+    """attitude.csv, and covariance.csv and systematic.csv where there are such, of a results folder.
+
+    causal: the tables of what was known at each instant, attitude_causal.csv and covariance_causal.csv, instead.
+    """
+    which = CAUSAL if causal else ""
     numbers = [c for c in columns.ATTITUDE if c != "status"]
-    table = read_table(results / "attitude.csv", numbers, ("status",))
+    table = read_table(results / f"attitude{which}.csv", numbers, ("status",), columns.ADDED)
     frames = table.numbers["frame"].astype(np.int64)
     return PoseTrack(
         frames=frames,
@@ -220,9 +235,18 @@ def read_poses(results: Path) -> PoseTrack:
         spots_used=table.numbers["spots_used"],
         rms_px=table.numbers["rms_px"],
         status=table.texts["status"].recoded(POSE_STATUSES),
-        covariance=_read_covariance(results / "covariance.csv", frames),
+        covariance=_read_covariance(results / f"covariance{which}.csv", frames),
         systematic=_read_covariance(results / "systematic.csv", frames),
+        velocity_m_s=table.stack(*columns.MOTION[0:3]),
+        rate_rad_s=table.stack(*columns.MOTION[3:6]),
+        sigma_velocity_m_s=table.stack(*columns.MOTION[6:9]),
+        sigma_rate_rad_s=table.stack(*columns.MOTION[9:12]),
     )
+
+
+def has_causal(results: Path) -> bool:
+    """Whether a results folder holds the causal filter's poses beside the smoothed ones."""
+    return (results / f"attitude{CAUSAL}.csv").is_file()
 
 
 def _read_covariance(path: Path, frames: Ints) -> Array:

@@ -11,12 +11,14 @@ from scipy.special import gammaincinv
 
 from geometry.arrays import Array, Bools, Ints
 from geometry.pose import Pose
+from lab.motion_score import motion_scores
 from lab.results import (
     ABSENT,
     POSE_STATUSES,
     SPOT_STATUSES,
     PoseTrack,
     SpotGrid,
+    has_causal,
     on_grid,
     pose_stack,
     read_poses,
@@ -80,16 +82,25 @@ def score(results: Path, run_folder: Path) -> dict[str, Any] | None:
         return None
     spots, poses = read_spots(results), read_poses(results)
     truth = read_truth(run_folder, spots, poses)
-    return None if truth is None else score_against(spots, poses, truth)
+    causal = read_poses(results, causal=True) if has_causal(results) else None
+    return None if truth is None else score_against(spots, poses, truth, causal)
 
 
-def score_against(spots: SpotGrid, poses: PoseTrack, truth: Truth) -> dict[str, Any]:
-    """The same, from tables that are already read."""
-    out: dict[str, Any] = {"spots": None, "pose": None}
+def score_against(spots: SpotGrid, poses: PoseTrack, truth: Truth, causal: PoseTrack | None = None) -> dict[str, Any]:
+    """The same, from tables that are already read.
+
+    causal: poses as they were known at each instant, where `poses` are smoothed; of the same frames.
+    """
+    blocks = ("spots", "pose", "pose_causal", "motion_vs_differences", "motion_causal_vs_differences")
+    out: dict[str, Any] = dict.fromkeys(blocks)
     if truth.uv_px is not None and truth.in_view is not None:
         out["spots"] = _spot_scores(spots, truth.uv_px, truth.in_view)
     if truth.world_from_body is not None:
-        out["pose"] = _pose_scores(poses, truth.world_from_body)
+        true = truth.world_from_body
+        out["pose"], out["motion_vs_differences"] = _pose_scores(poses, true), motion_scores(poses, true)
+        if causal is not None and np.array_equal(causal.frames, poses.frames):
+            out["pose_causal"] = _pose_scores(causal, true)
+            out["motion_causal_vs_differences"] = motion_scores(causal, true)
     return out
 
 

@@ -14,7 +14,9 @@ from geometry.pose import Pose, ypr_sigmas
 from geometry.rig import Rig
 from geometry.spots import SpotModel
 from lab import columns
+from lab.columns import CAUSAL
 from lab.pipeline import FrameRecord
+from tracking.tracked_frame import MotionEstimate
 
 _UPPER = np.triu_indices(6)
 _FILES = {
@@ -29,10 +31,11 @@ _FILES = {
 class TableWriter:
     """Writes all tables of one run into an existing folder. Use it as a context.
 
-    with_systematic: also systematic.csv, the part of covariance.csv that the calibration's errors make.
+    with_systematic: also systematic.csv, the part of covariance.csv that the calibration's errors make. with_causal:
+    also attitude_causal.csv and covariance_causal.csv, the poses as the causal filter had them.
     """
 
-    def __init__(self, folder: Path, rig: Rig, with_systematic: bool = False) -> None:
+    def __init__(self, folder: Path, rig: Rig, with_systematic: bool = False, with_causal: bool = False) -> None:
         self._folder = folder
         self._rig = rig
         self._model = SpotModel.of(rig)
@@ -41,7 +44,11 @@ class TableWriter:
         self._beams = [csv_word(b) for b in rig.beams]
         self._directions = np.array([b.direction for b in rig.beams.values()])
         self._points = np.array([b.point for b in rig.beams.values()])
-        self._files = {**_FILES, "systematic.csv": columns.COVARIANCE} if with_systematic else _FILES
+        self._files = dict(_FILES)
+        if with_systematic:
+            self._files["systematic.csv"] = columns.COVARIANCE
+        if with_causal:
+            self._files |= {f"{name}{CAUSAL}.csv": _FILES[f"{name}.csv"] for name in ("attitude", "covariance")}
         self._open: dict[str, TextIO] = {}
 
     def __enter__(self) -> TableWriter:
@@ -54,11 +61,14 @@ class TableWriter:
         for file in self._open.values():
             file.close()
 
-    def write(self, record: FrameRecord) -> None:
-        """The rows of one frame."""
+    def write(self, record: FrameRecord, causal: FrameRecord | None = None) -> None:
+        """The rows of one frame. causal: the same frame as the causal filter had it, where its tables are wanted."""
         self._detections(record)
         self._spots(record)
         self._pose(record)
+        self._beam_rows(record)
+        if causal is not None:
+            self._pose(causal, CAUSAL)
 
     def _detections(self, record: FrameRecord) -> None:
         rows = []
@@ -79,27 +89,36 @@ class TableWriter:
         with np.errstate(invalid="ignore"):
             sigma = np.sqrt(np.stack([t.cov_px2[:, 0, 0], t.cov_px2[:, 1, 1]], axis=-1))
         numbers = np.column_stack([t.uv_px, sigma])
-        after = np.column_stack([t.predicted_px, t.gain, t.cov_px2[:, 0, 1]])
+        probability = np.full(len(t.gain), np.nan) if t.label_probability is None else t.label_probability
+        after = np.column_stack([t.predicted_px, t.gain, t.cov_px2[:, 0, 1], probability])
         time = _number(record.t_s)
         self._open["spots.csv"].writelines(
             f"{record.frame},{time},{camera},{spot},{_joined(numbers[i])},{t.status[i].value},{_joined(after[i])}\n"
             for i, (camera, spot) in enumerate(self._views)
         )
 
-    def _pose(self, record: FrameRecord) -> None:
+    def _pose(self, record: FrameRecord, which: str = "") -> None:
+        """The rows of attitude and covariance; `which` is CAUSAL or nothing."""
+        t, attitude = record.tracked, self._open[f"attitude{which}.csv"]
+        head, status = f"{record.frame},{_number(record.t_s)}", t.pose_status.value
+        if t.pose is None or t.pose_covariance is None:
+            nothing, no_motion = "," * len(columns.POSE), "," * len(columns.MOTION)
+            attitude.write(f"{head}{nothing},{t.spots_used},,{status}{no_motion}\n")
+            return
+        attitude.write(
+            f"{head},{_joined(pose_numbers(t.pose, t.pose_covariance))},{t.spots_used},{_number(t.rms_px)},{status},"
+            f"{_joined(motion_numbers(t.motion))}\n"
+        )
+        self._open[f"covariance{which}.csv"].write(f"{record.frame},{_joined(t.pose_covariance[_UPPER])}\n")
+        if not which and "systematic.csv" in self._open and t.pose_systematic is not None:
+            self._open["systematic.csv"].write(f"{record.frame},{_joined(t.pose_systematic[_UPPER])}\n")
+
+    def _beam_rows(self, record: FrameRecord) -> None:
         t, head = record.tracked, f"{record.frame},{_number(record.t_s)}"
         status = t.pose_status.value
-        if t.pose is None or t.pose_covariance is None:
-            empty = "," * len(columns.ATTITUDE[2:-3])  # the pose itself
-            self._open["attitude.csv"].write(f"{head}{empty},{t.spots_used},,{status}\n")
+        if t.pose is None:
             self._open["beams.csv"].writelines(f"{head},{b},,,,,,,{status}\n" for b in self._beams)
             return
-        self._open["attitude.csv"].write(
-            f"{head},{_joined(pose_numbers(t.pose, t.pose_covariance))},{t.spots_used},{_number(t.rms_px)},{status}\n"
-        )
-        self._open["covariance.csv"].write(f"{record.frame},{_joined(t.pose_covariance[_UPPER])}\n")
-        if "systematic.csv" in self._open and t.pose_systematic is not None:
-            self._open["systematic.csv"].write(f"{record.frame},{_joined(t.pose_systematic[_UPPER])}\n")
         direction, point = t.pose.turn(self._directions), t.pose.apply(self._points)
         self._open["beams.csv"].writelines(
             f"{head},{b},{_joined(direction[i])},{_joined(point[i])},{status}\n" for i, b in enumerate(self._beams)
@@ -117,6 +136,13 @@ def pose_numbers(pose: Pose, covariance: Array) -> Array:
             np.rad2deg(ypr_sigmas(pose, covariance)),
         ]
     )
+
+
+def motion_numbers(motion: MotionEstimate | None) -> Array:
+    """The 12 numbers of attitude.csv from velocity_x_m_s to the end; nan where the motion is not known."""
+    if motion is None:
+        return np.full(len(columns.MOTION), np.nan)
+    return np.concatenate([motion.velocity, motion.rate, np.sqrt(np.diagonal(motion.covariance))])
 
 
 def _joined(values: Sequence[float] | Array) -> str:

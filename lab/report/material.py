@@ -11,7 +11,7 @@ import numpy as np
 from geometry.arrays import Array, Bools
 from geometry.spots import SpotModel
 from lab.errors import BeamposeError
-from lab.results import PoseTrack, SpotGrid, read_poses, read_spots, read_summary
+from lab.results import PoseTrack, SpotGrid, has_causal, read_poses, read_spots, read_summary
 from lab.run_file import Run, load_run
 from lab.score import Truth, pose_errors, read_truth, score_against
 from tracking.statuses import PoseStatus
@@ -27,6 +27,7 @@ class Material:
     summary: dict[str, Any]
     spots: SpotGrid
     poses: PoseTrack
+    causal: PoseTrack | None  # as they were known at each instant, where `poses` are smoothed; of the same frames
     t_s: Array  # (F,), of the spots' frames; frame numbers where times are missing
     time_name: str
     run: Run | None
@@ -52,6 +53,11 @@ class Material:
             return None
         return -pose_errors(self.poses, self.truth.world_from_body)
 
+    @property
+    def pose_times(self) -> Array:
+        """(F',): time, or the frame number where times are missing, of the poses' rows."""
+        return self.poses.t_s if self.time_name != "frame" else self.poses.frames.astype(float)
+
 
 def gather(results: Path, run_folder: Path | None) -> Material:
     """Read a results folder, and of its run folder what is there.
@@ -61,6 +67,9 @@ def gather(results: Path, run_folder: Path | None) -> Material:
     """
     summary = read_summary(results)
     spots, poses = read_spots(results), read_poses(results)
+    causal = read_poses(results, causal=True) if has_causal(results) else None
+    if causal is not None and not np.array_equal(causal.frames, poses.frames):
+        causal = None
     folder = _reachable(results, run_folder, summary)
     run = truth = None
     if folder is not None:
@@ -72,13 +81,14 @@ def gather(results: Path, run_folder: Path | None) -> Material:
             truth = read_truth(folder, spots, poses)
         except BeamposeError:
             truth = None
-    errors = score_against(spots, poses, truth) if truth is not None else summary.get("errors")
+    errors = score_against(spots, poses, truth, causal) if truth is not None else summary.get("errors")
     times_known = bool(len(spots.t_s)) and bool(np.isfinite(spots.t_s).all())
     return Material(
         name=str(summary.get("name") or results.resolve().name),
         summary=summary,
         spots=spots,
         poses=poses,
+        causal=causal,
         t_s=spots.t_s if times_known else spots.frames.astype(float),
         time_name="time (s)" if times_known else "frame",
         run=run,

@@ -26,6 +26,7 @@ from lab.run_file import save_run
 
 NOISE_PX = 0.1
 RATE_HZ = 100.0
+MOTION_SIGMA = np.array([0.004] * 3 + [0.002] * 3)  # m/s and rad/s
 
 
 def fake_rig(n_cameras: int = 2) -> Rig:
@@ -68,18 +69,19 @@ def make(
     pictures: bool = False,
     all_lost: bool = False,
     eventful: bool = True,
+    causal: bool = False,
     seed: int = 1,
 ) -> Fake:
-    """Write folder/run and folder/results."""
+    """Write folder/run and folder/results. causal: also the poses known at each instant, twice as uncertain."""
     rng = np.random.default_rng(seed)
     rig = fake_rig(n_cameras)
     model = SpotModel.of(rig)
     V = len(model)
     frame = np.arange(n_frames)
     t = frame / RATE_HZ
-    triangle = 2 / np.pi * np.arcsin(np.sin(2 * np.pi * t / 3.0))
-    ypr = np.radians(np.stack([19 * triangle, 6 * np.sin(1.3 * t), 8 * np.cos(0.9 * t)], -1))
-    pose = Pose.from_ypr(ypr, np.stack([0.3 * np.sin(t), 0.2 * np.cos(0.7 * t), 0.1 * np.sin(2 * t)], -1))
+    triangle, pose = _path(t)
+    moment = 1e-4
+    motion = _path(t + moment)[1].minus(_path(t - moment)[1]) / (2 * moment)
     true_uv = np.empty((n_frames, V, 2))
     J = np.empty((n_frames, V, 2, 6))
     for k in range(0, n_frames, 2000):
@@ -136,8 +138,6 @@ def make(
     cov[predicted] = np.eye(6) * grown[predicted][:, None, :]
     delta = (np.linalg.cholesky(cov) @ rng.normal(size=(n_frames, 6, 1)))[..., 0]
     delta[lost] = 0
-    # truth = estimate plus delta; the estimate is therefore the truth minus it
-    estimate = Pose(pose.rotation @ rotations.exp(-delta[:, 3:]), pose.translation - delta[:, :3])
 
     results, run_folder = folder / "results", folder / "run"
     results.mkdir(parents=True, exist_ok=True)
@@ -161,30 +161,45 @@ def make(
                 frame[k], number(t[k]), *model.views[j], *map(number, uv[k, j]), number(sigma[k, j]),
                 number(sigma[k, j]), status[k, j], *map(number, early[k, j]),
                 "0.97" if measured[k, j] else "", "0" if np.isfinite(sigma[k, j]) else "",
+                "0.999" if measured[k, j] else "",
             ]
             for k in range(n_frames)
             for j in range(V)
         ],
     )  # fmt: skip
-    q, angles = estimate.quaternion_wxyz, np.degrees(estimate.ypr)
-    Jypr = rotations.ypr_jacobian(estimate.rotation)
-    s_ypr = np.degrees(np.sqrt(np.einsum("fij,fjk,fik->fi", Jypr, cov[:, 3:, 3:], Jypr)))
-    s_xyz = np.sqrt(np.diagonal(cov, axis1=1, axis2=2)[:, :3])
     rms = np.abs(NOISE_PX * (1 + 0.2 * rng.normal(size=n_frames)))
     word = np.where(lost, "lost", np.where(predicted, "predicted", "measured"))
-    rows = []
-    for k in range(n_frames):
-        values = [*estimate.translation[k], *q[k], *angles[k], *s_xyz[k], *s_ypr[k]]
-        rms_text = number(rms[k]) if word[k] == "measured" else ""
-        fields = [""] * 16 if lost[k] else [f"{x:.9f}" for x in values]
-        rows.append([frame[k], number(t[k]), *fields, int(measured[k].sum()), rms_text, word[k]])
-    write(results / "attitude.csv", columns.ATTITUDE, rows)
-    upper = np.triu_indices(6)
-    write(
-        results / "covariance.csv",
-        columns.COVARIANCE,
-        [[frame[k], *(f"{x:.9e}" for x in cov[k][upper])] for k in np.flatnonzero(~lost)],
-    )
+    motion_error = MOTION_SIGMA * rng.normal(size=motion.shape)
+
+    def write_poses(which: str, times: float) -> None:
+        """Attitude and covariance with errors and sigmas so many times as large."""
+        wrong = times * delta  # truth = estimate plus delta; the estimate is therefore the truth minus it
+        estimate = Pose(pose.rotation @ rotations.exp(-wrong[:, 3:]), pose.translation - wrong[:, :3])
+        C = times**2 * cov
+        Jypr = rotations.ypr_jacobian(estimate.rotation)
+        s_ypr = np.degrees(np.sqrt(np.einsum("fij,fjk,fik->fi", Jypr, C[:, 3:, 3:], Jypr)))
+        s_xyz = np.sqrt(np.diagonal(C, axis1=1, axis2=2)[:, :3])
+        table = np.concatenate(
+            [estimate.translation, estimate.quaternion_wxyz, np.degrees(estimate.ypr), s_xyz, s_ypr], axis=1
+        )
+        moving = np.concatenate([motion - times * motion_error, np.full((n_frames, 6), times) * MOTION_SIGMA], axis=1)
+        rows = []
+        for k in range(n_frames):
+            rms_text = number(rms[k]) if word[k] == "measured" else ""
+            fields = [""] * 16 if lost[k] else [f"{x:.9f}" for x in table[k]]
+            last = [""] * 12 if lost[k] else [f"{x:.9f}" for x in moving[k]]
+            rows.append([frame[k], number(t[k]), *fields, int(measured[k].sum()), rms_text, word[k], *last])
+        write(results / f"attitude{which}.csv", columns.ATTITUDE, rows)
+        upper = np.triu_indices(6)
+        write(
+            results / f"covariance{which}.csv",
+            columns.COVARIANCE,
+            [[frame[k], *(f"{x:.9e}" for x in C[k][upper])] for k in np.flatnonzero(~lost)],
+        )
+
+    write_poses("", 1.0)
+    if causal:
+        write_poses(columns.CAUSAL, 2.0)
     detected = [
         [
             frame[k], model.views[j][0], *map(number, uv[k, j]), "0.1", "0.1", "5000", "300", "2.1", "1.8", "12", "0",
@@ -219,6 +234,13 @@ def make(
     content = {"name": "fake <yaw & bend>", "rig": "rig.yaml", "frame_rate_hz": RATE_HZ, "cameras": sources}
     save_run({"schema": "beampose/run/1", **content, "notes": "Notes of the run & more."}, run_folder)
     return Fake(results, run_folder, model, true_uv)
+
+
+def _path(t: Array) -> tuple[Array, Pose]:
+    """The vehicle's way: the triangle of its yaw, whose corners are bends, and the poses."""
+    triangle = 2 / np.pi * np.arcsin(np.sin(2 * np.pi * t / 3.0))
+    ypr = np.radians(np.stack([19 * triangle, 6 * np.sin(1.3 * t), 8 * np.cos(0.9 * t)], -1))
+    return triangle, Pose.from_ypr(ypr, np.stack([0.3 * np.sin(t), 0.2 * np.cos(0.7 * t), 0.1 * np.sin(2 * t)], -1))
 
 
 def _summary(run_folder: Path, status: Array, word: Array, model: SpotModel) -> dict[str, object]:

@@ -21,11 +21,16 @@ from lab.quality import LEAST_MEASURED
 from lab.run_file import load_run
 from lab.simulate.scenarios import SCENARIOS, Fault
 from lab.simulate.write import simulate
+from lab.two_passes import SMOOTHING, TRACKING, WRITING
 from tests.lab.run_folders import write_run
 
-FILES = ("attitude.csv", "beams.csv", "covariance.csv", "detections.csv", "report.html", "spots.csv", "summary.json")
+CAUSAL_FILES = (
+    "attitude.csv", "beams.csv", "covariance.csv", "detections.csv", "report.html", "spots.csv", "summary.json",
+)  # fmt: skip
+FILES = (*CAUSAL_FILES, "attitude_causal.csv", "covariance_causal.csv")
 HEADERS = {"attitude.csv": columns.ATTITUDE, "beams.csv": columns.BEAMS, "covariance.csv": columns.COVARIANCE,
-           "detections.csv": columns.DETECTIONS, "spots.csv": columns.SPOTS}  # fmt: skip
+           "detections.csv": columns.DETECTIONS, "spots.csv": columns.SPOTS,
+           "attitude_causal.csv": columns.ATTITUDE, "covariance_causal.csv": columns.COVARIANCE}  # fmt: skip
 FRAMES = 14
 # Frame 4 in no camera; 6 and 7 only in the right one; 9 damaged in the right one.
 DAMAGED = replace(
@@ -278,7 +283,7 @@ def test_overrides_replace_parameters_of_the_run_and_reach_inner_blocks(tmp_path
         ({"lables.p_detect": 3}, r"'lables'.*did you mean 'labels'"),
         ({"r1_px.x": 3}, r"--set: .*r1_px\.x"),
         ({"r1_px": "wide"}, r"--set: r1_px: expected a finite number, got 'wide'"),
-        ({"method": "magic"}, r"--set: method: expected .*spots.*rigid.*'magic'"),
+        ({"method": "magic"}, r"--set: method: expected .*rigid.*spots.*'magic'"),
     ],
 )
 def test_a_wrong_override_is_a_plain_error_and_nothing_is_written(tmp_path, overrides, words):
@@ -321,10 +326,10 @@ def test_a_run_that_breaks_in_the_middle_leaves_nothing(tmp_path, monkeypatch, e
     folder = points_run(tmp_path / "run")
     write = process.TableWriter.write
 
-    def break_at_frame_6(self, record):
+    def break_at_frame_6(self, record, causal):
         if record.frame == 6:
             raise error
-        write(self, record)
+        write(self, record, causal)
 
     monkeypatch.setattr(process.TableWriter, "write", break_at_frame_6)
     with pytest.raises(type(error)):
@@ -381,15 +386,18 @@ def test_results_are_results(results):
     assert are_results(results)
 
 
-def test_progress_counts_every_frame(tmp_path):
+@pytest.mark.parametrize("causal", [True, False])
+def test_progress_counts_every_frame_of_every_pass(tmp_path, causal):
     told = []
     process_run(
         points_run(tmp_path / "run", frames=7),
         tmp_path / "out",
-        progress=lambda done, total: told.append((done, total)),
+        causal=causal,
+        progress=lambda *what: told.append(what),
     )
-    assert [done for done, _ in told] == list(range(1, 8))
-    assert {total for _, total in told} <= {7, None}
+    tracked = [(done, 7, TRACKING) for done in range(1, 8)]
+    assert [(done, total or 7, stage) for done, total, stage in told[:7]] == tracked
+    assert told[7:] == ([] if causal else [(0, None, SMOOTHING), *((done, 7, WRITING) for done in range(1, 8))])
 
 
 def test_a_batch_of_one_is_the_run(tmp_path):

@@ -18,7 +18,7 @@ from lab.tables import TableWriter, csv_word, pose_numbers
 from tests.geometry.scenes import paper_rig, random_pose
 from tracking.detections import Detections
 from tracking.statuses import PoseStatus, SpotStatus
-from tracking.tracked_frame import TrackedFrame
+from tracking.tracked_frame import MotionEstimate, TrackedFrame
 
 HEADERS = {
     "detections.csv": columns.DETECTIONS,
@@ -47,14 +47,15 @@ def a_record(rng: np.random.Generator, frame: int = 7, n_points: int = 4) -> Fra
     )
     tracked = TrackedFrame(
         uv, cov, tuple(status), rng.uniform(0, 1000, (n, 2)), gain, np.arange(n), PoseStatus.MEASURED,
-        random_pose(rng), covariances(rng, 6, 6), 5, 0.123, (),
+        random_pose(rng), covariances(rng, 6, 6), 5, 0.123, (), np.where(np.isnan(gain), np.nan, 0.99),
+        MotionEstimate(rng.normal(size=3), rng.normal(size=3), covariances(rng, 6, 6)),
     )  # fmt: skip
-    return FrameRecord(frame, frame / 30, (found, None), ("", "gone"), tracked)
+    return FrameRecord(frame, frame / 30, 1 / 30, (found, None), ("", "gone"), tracked)
 
 
 def lost(record: FrameRecord) -> FrameRecord:
-    tracked = replace(record.tracked, pose=None, pose_covariance=None, pose_status=PoseStatus.LOST, spots_used=0,
-                      rms_px=float("nan"))  # fmt: skip
+    tracked = replace(record.tracked, pose=None, pose_covariance=None, motion=None, pose_status=PoseStatus.LOST,
+                      spots_used=0, rms_px=float("nan"))  # fmt: skip
     return replace(record, tracked=tracked)
 
 
@@ -76,10 +77,12 @@ def numbers(row: dict[str, str], *names: str) -> np.ndarray:
 CONTRACT = {
     "detections.csv": "frame,camera,u_px,v_px,sigma_u_px,sigma_v_px,flux,peak,major_px,minor_px,angle_deg,cov_uv_px2",
     "spots.csv": "frame,t_s,camera,spot,u_px,v_px,sigma_u_px,sigma_v_px,status,predicted_u_px,predicted_v_px,gain,"
-    "cov_uv_px2",
+    "cov_uv_px2,label_probability",
     "beams.csv": "frame,t_s,beam,dx,dy,dz,px_m,py_m,pz_m,status",
     "attitude.csv": "frame,t_s,x_m,y_m,z_m,qw,qx,qy,qz,yaw_deg,pitch_deg,roll_deg,sigma_x_m,sigma_y_m,sigma_z_m,"
-    "sigma_yaw_deg,sigma_pitch_deg,sigma_roll_deg,spots_used,rms_px,status",
+    "sigma_yaw_deg,sigma_pitch_deg,sigma_roll_deg,spots_used,rms_px,status,velocity_x_m_s,velocity_y_m_s,velocity_z_m_s,"
+    "rate_x_rad_s,rate_y_rad_s,rate_z_rad_s,sigma_velocity_x_m_s,sigma_velocity_y_m_s,sigma_velocity_z_m_s,"
+    "sigma_rate_x_rad_s,sigma_rate_y_rad_s,sigma_rate_z_rad_s",
     "covariance.csv": "frame,c00,c01,c02,c03,c04,c05,c11,c12,c13,c14,c15,c22,c23,c24,c25,c33,c34,c35,c44,c45,c55",
 }
 
@@ -112,6 +115,7 @@ def test_spots_come_back_as_they_were(tmp_path):
         np.testing.assert_allclose(number(r["gain"]), t.gain[i], rtol=1e-9)
         su, sv, cov = numbers(r, "sigma_u_px", "sigma_v_px", "cov_uv_px2")
         np.testing.assert_allclose([[su * su, cov], [cov, sv * sv]], t.cov_px2[i], rtol=1e-8)
+        np.testing.assert_allclose(number(r["label_probability"]), t.label_probability[i], rtol=1e-9)
     assert rows[2]["u_px"] == rows[2]["sigma_u_px"] == rows[2]["cov_uv_px2"] == ""
 
 
@@ -162,6 +166,12 @@ def test_poses_come_back_as_they_were(tmp_path):
             numbers(row, "sigma_yaw_deg", "sigma_pitch_deg", "sigma_roll_deg"), sigmas, rtol=1e-7
         )
         assert (row["spots_used"], row["rms_px"], row["status"]) == ("5", "0.123", "measured")
+        moving = numbers(row, "velocity_x_m_s", "velocity_y_m_s", "velocity_z_m_s", *columns.MOTION[3:6])
+        np.testing.assert_allclose(moving, [*t.motion.velocity, *t.motion.rate], rtol=1e-9)
+        assert columns.MOTION[3:6] == ("rate_x_rad_s", "rate_y_rad_s", "rate_z_rad_s")
+        np.testing.assert_allclose(
+            numbers(row, *(f"sigma_{n}" for n in columns.MOTION[:6])) ** 2, np.diagonal(t.motion.covariance), rtol=1e-8
+        )
 
 
 def test_beams_are_the_rigs_lines_moved_by_the_pose(tmp_path):
@@ -184,6 +194,32 @@ def test_a_lost_frame_has_a_row_with_empty_pose_fields_and_no_covariance(tmp_pat
     assert [r["frame"] for r in tables["covariance.csv"]] == ["0", "2"]
     beams = [r for r in tables["beams.csv"] if r["frame"] == "1"]
     assert [(r["beam"], r["dx"], r["pz_m"], r["status"]) for r in beams] == [(b, "", "", "lost") for b in RIG.beams]
+
+
+def test_a_tracker_that_has_no_velocities_and_no_label_probabilities_leaves_their_fields_empty(tmp_path):
+    record = a_record(np.random.default_rng(10))
+    record = replace(record, tracked=replace(record.tracked, motion=None, label_probability=None))
+    tables = written(tmp_path, record)
+    assert {tables["attitude.csv"][0][name] for name in columns.MOTION} == {""}
+    assert {row["label_probability"] for row in tables["spots.csv"]} == {""}
+    assert tables["attitude.csv"][0]["status"] == "measured"
+
+
+def test_what_was_known_at_the_instant_has_tables_of_its_own_with_the_same_columns(tmp_path):
+    rng = np.random.default_rng(11)
+    known_later, known_then = [a_record(rng, 0), a_record(rng, 1)], [a_record(rng, 0), lost(a_record(rng, 1))]
+    with TableWriter(tmp_path, RIG, with_causal=True) as tables:
+        for record, causal in zip(known_later, known_then, strict=True):
+            tables.write(record, causal)
+    for name in ("attitude", "covariance"):
+        plain, causal = ((tmp_path / f"{name}{which}.csv").read_text().splitlines() for which in ("", "_causal"))
+        assert plain[0] == causal[0]
+        assert {line.count(",") for line in plain + causal} == {plain[0].count(",")}
+    rows = list(csv.DictReader((tmp_path / "attitude_causal.csv").open(newline="")))
+    assert [r["status"] for r in rows] == ["measured", "lost"]
+    assert float(rows[0]["x_m"]) == pytest.approx(known_then[0].tracked.pose.translation[0], rel=1e-9)
+    (row,) = csv.DictReader((tmp_path / "covariance_causal.csv").open(newline=""))
+    assert float(row["c00"]) == pytest.approx(known_then[0].tracked.pose_covariance[0, 0], rel=1e-9)
 
 
 def test_the_sixteen_numbers_of_the_pose_are_in_the_order_of_the_columns():
