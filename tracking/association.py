@@ -19,9 +19,12 @@ from geometry import small
 from geometry.arrays import Array, Bools, Ints
 from geometry.compiled import compiled
 from geometry.projection import Views, project_view
+from geometry.rig import Rig
+from geometry.spots import SpotModel
+from tracking.hiding import MISSED
 from tracking.information import inverse2
 
-MISSED, NOT_LOOKED_FOR, BLENDED = -1, -2, 1 << 20
+NOT_LOOKED_FOR, BLENDED = -2, 1 << 20  # beside MISSED
 GATE = 25.0  # squared sigmas: beyond it a detection is not this spot (p = 4e-6)
 # A step of s px is off by about s^2 / 1500 px where the projection is taken as straight (lenses of 1000 to 1500 px).
 BEND_PX = 1500.0
@@ -50,6 +53,14 @@ class Sights(NamedTuple):
 
     camera: Ints  # (n,)
     size: Array  # (n, 2) px: width, height of the picture
+    group: Ints  # (n,) spots that may be hidden together: those of one screen
+
+    @staticmethod
+    def of(rig: Rig, model: SpotModel) -> Sights:
+        """Those of a rig."""
+        screens = list(dict.fromkeys(rig.spots[s].screen for _, s in model.views))
+        group = np.array([screens.index(rig.spots[s].screen) for _, s in model.views], dtype=np.int64)
+        return Sights(np.ascontiguousarray(model.camera_of), np.ascontiguousarray(model.image_size_px), group)
 
 
 class Chances(NamedTuple):
@@ -93,7 +104,7 @@ def associate(
 ) -> tuple[Ints, Array, Array, Array, Array, int]:
     """Assignments of a frame's detections to spots, best first, from a predicted pose (R, t) and its P (6, 6).
 
-    shown (n,): probability of each spot not being hidden. extra (n, 2, 2): covariance to add to what is expected of
+    shown (n,): probability of each spot to shine. extra (n, 2, 2): covariance to add to what is expected of
     each view's pixel (the calibration's errors), px^2. Returns assignments (b, n): a row of frame.uv, that plus BLENDED,
     MISSED or NOT_LOOKED_FOR; their scores (b,), nats, and these without the Gaussian terms; the poses R (b, 3, 3) and
     t (b, 3) they lead to; and b.

@@ -16,7 +16,8 @@ from geometry import small
 from geometry.arrays import Array, Bools, Ints
 from geometry.compiled import compiled
 from geometry.projection import Views
-from tracking.association import BLENDED, MISSED, Chances, Frame, Sights, associate
+from tracking.association import BLENDED, Chances, Frame, Sights, associate
+from tracking.hiding import MISSED, later, learnt, marginal, together
 from tracking.information import frame_information
 from tracking.motion import STATE, predicted, updated
 
@@ -25,9 +26,6 @@ MOST_KEPT = 8  # hypotheses from frame to frame
 FORGET = 12.0  # nats: a hypothesis so far behind is dropped
 SAME = 0.7  # two hypotheses with one assignment whose states differ by less than this in sigmas are one
 SURPRISE = 3.5  # sigmas of a misfit's own scatter: beyond it a manoeuvre is considered although every spot is found
-# Probabilities per frame that a spot becomes hidden and that a hidden one shows again: hidings last some frames.
-HIDES, SHOWS = 0.01, 0.15
-
 _apart, _apply, _moved = small.apart, small.apply, small.moved
 
 
@@ -39,7 +37,7 @@ class Hypotheses(NamedTuple):
     m: Array  # (h, 12)
     P: Array  # (h, 18, 18)
     weight: Array  # (h,) nats
-    shown: Array  # (h, n) probability that each view's spot is not hidden
+    shown: Array  # (h, n + groups) that each spot is not hidden, and that each screen is lit; tracking/hiding.py
 
 
 class Children(NamedTuple):
@@ -61,11 +59,12 @@ class Dynamics(NamedTuple):
 
 
 @compiled
-def no_children(n: int) -> Children:
-    """An empty list for n views."""
+def no_children(n: int, groups: int) -> Children:
+    """An empty list for n views in so many groups."""
     c = MOST_CHILDREN
     after = Hypotheses(
-        np.empty((c, 3, 3)), np.empty((c, 3)), np.empty((c, 12)), np.empty((c, STATE, STATE)), np.empty(c), np.empty((c, n))
+        np.empty((c, 3, 3)), np.empty((c, 3)), np.empty((c, 12)), np.empty((c, STATE, STATE)), np.empty(c),
+        np.empty((c, n + groups)),
     )
     return Children(after, np.empty((c, n), np.int64), np.zeros(c, np.bool_), np.zeros(c, np.int64))
 
@@ -129,16 +128,15 @@ def grow(
 ) -> tuple[Children, int]:
     """The children of all hypotheses after a frame that comes dt (s) later."""
     n = sights.camera.shape[0]
-    out = no_children(n)
+    out = no_children(n, old.shown.shape[1] - n)
     count = 0
     nothing = np.zeros(2)
     best = -np.inf
     for h in range(old.t.shape[0]):
         if old.weight[h] < -FORGET:
             continue
-        shown = np.empty(n)
-        for i in range(n):
-            shown[i] = old.shown[h, i] * (1 - HIDES) + (1 - old.shown[h, i]) * SHOWS
+        shown = later(old.shown[h], n) if dt > 0.0 else old.shown[h]
+        shining = marginal(shown, sights.group)
         turning = False
         steady_P = old.P[h]
         for mode in range(2):
@@ -153,7 +151,7 @@ def grow(
                 steady_P = P
             prior = old.weight[h] + np.log(1 - dynamics.p_manoeuvre if mode == 0 else dynamics.p_manoeuvre)
             assigned, score, counted, R_b, t_b, b = associate(
-                views, sights, frame, chances, R, t, np.ascontiguousarray(P[:6, :6]), shown, extra
+                views, sights, frame, chances, R, t, np.ascontiguousarray(P[:6, :6]), shining, extra
             )
             before = (R, t, m, P)
             for k in range(b):
@@ -165,7 +163,7 @@ def grow(
                 if mode == 0 and k == 0:
                     dof = 2 * spots
                     turning = dt > 0.0 and (
-                        misfit > dof + SURPRISE * np.sqrt(2.0 * max(dof, 1)) or _misses(assigned[k], shown)
+                        misfit > dof + SURPRISE * np.sqrt(2.0 * max(dof, 1)) or _misses(assigned[k], shining)
                     )
                 if spots == 0:
                     if mode == 1:
@@ -177,11 +175,12 @@ def grow(
                             old.R[h], old.t[h], old.m[h], old.P[h], dt, dynamics.jerk, dynamics.jump, dynamics.unsteady
                         )
                         P_k = (1 - p) * steady_P + p * P_jump
-                total = prior + counted[k] + gaussian
+                total = prior + counted[k] + gaussian + together(shown, sights.group, assigned[k], chances.detect)
                 if not np.isfinite(total):
                     continue
                 best = max(best, total)
-                count = add_child(out, count, R_k, t_k, m_k, P_k, total, shown, assigned[k], mode == 1, h, chances.detect)
+                after = learnt(shown, sights.group, assigned[k], chances.detect)
+                count = add_child(out, count, R_k, t_k, m_k, P_k, total, after, assigned[k], mode == 1, h)
     return out, count
 
 
@@ -210,7 +209,6 @@ def add_child(
     assigned: Ints,
     manoeuvre: bool,
     parent: int,
-    p_detect: float,
 ) -> int:
     """Add a child, in place of the worst where there is no room; how many there are then."""
     place = count
@@ -223,13 +221,7 @@ def add_child(
     children.after.R[place], children.after.t[place], children.after.m[place] = R, t, m
     children.after.P[place], children.after.weight[place] = P, weight
     children.assigned[place], children.manoeuvre[place], children.parent[place] = assigned, manoeuvre, parent
-    for i in range(shown.shape[0]):
-        s = shown[i]
-        if assigned[i] >= 0:
-            s = 1.0
-        elif assigned[i] == MISSED:
-            s = s * (1 - p_detect) / (s * (1 - p_detect) + 1 - s)
-        children.after.shown[place, i] = s
+    children.after.shown[place] = shown
     return count
 
 

@@ -15,11 +15,15 @@ from geometry.compiled import compiled
 from geometry.projection import Views, project_view
 from tracking.association import BLENDED, Chances, Frame, Sights, associate
 from tracking.fixed_interval import Reference
+from tracking.hiding import marginal, together
 from tracking.hypotheses import concluded
 from tracking.information import frame_information
 from tracking.motion import STATE
 
-USUALLY_SHOWN = 0.9  # probability that a spot in the picture is not hidden
+# Probability that a spot is not hidden where its screen is lit, by what the frames beside it (those in which the screen
+# was lit) show: it in none of them, in one of two, in all; and that a screen is lit, by how many of them show it so.
+SHOWN = np.array([0.2, 0.6, 0.98])
+LIT = np.array([0.03, 0.5, 0.995])
 RIVAL = 9.0  # nats: assignments so far behind the best say nothing of its certainty
 VAGUE_M, VAGUE_RAD = 0.3, 0.5  # a frame of which the others say less than this is left as it is
 
@@ -113,7 +117,7 @@ def relabelled(
     """
     frames, n = assigned.shape
     out, certain = assigned.copy(), np.ones((frames, n))
-    shown = np.full(n, USUALLY_SHOWN)
+    groups = int(sights.group.max()) + 1
     nothing = np.zeros(12)
     for k in range(frames):
         use, uv, cov = labelled_points(all_of, k, assigned[k], extra)
@@ -140,7 +144,9 @@ def relabelled(
         frame = Frame(
             all_of.uv[a:b], all_of.cov[a:b], all_of.blend_px[a:b], all_of.first[k], all_of.has_image[k], log_clutter[k]
         )
-        found, score, counted, R_b, t_b, count = associate(views, sights, frame, chances, R, t, alone, shown, extra)
+        hidden = _hiding(assigned, sights.group, groups, k)
+        shining = marginal(hidden, sights.group)
+        found, score, counted, R_b, t_b, count = associate(views, sights, frame, chances, R, t, alone, shining, extra)
         whole = np.zeros((STATE, STATE))
         whole[:6, :6] = alone
         exact = np.full(count, -np.inf)
@@ -148,7 +154,7 @@ def relabelled(
         for j in range(count):
             if score[j] > score[0] - 2 * RIVAL:
                 _, _, _, _, gaussian, _, _ = concluded(views, frame, extra, before, found[j], R_b[j], t_b[j])
-                exact[j] = counted[j] + gaussian
+                exact[j] = counted[j] + gaussian + together(hidden, sights.group, found[j], chances.detect)
         best = int(np.argmax(exact))
         total = 0.0
         share = np.zeros(n)
@@ -163,3 +169,29 @@ def relabelled(
             out[k, i] = found[best, i] if found[best, i] >= 0 else -1
             certain[k, i] = share[i] / total
     return out, certain
+
+
+@compiled
+def _hiding(assigned: Ints, group: Ints, groups: int, k: int) -> Array:
+    """Probabilities (n + groups,), as in hiding.py, of frame k from the labels (T, n) of the frames beside it."""
+    frames, n = assigned.shape
+    out = np.empty(n + groups)
+    asked, seen = np.zeros(n), np.zeros(n)
+    for g in range(groups):
+        lit_beside = 0
+        for other in (k - 1, k + 1):
+            if not 0 <= other < frames:
+                lit_beside += 1
+                continue
+            lit = False
+            for i in range(n):
+                lit |= group[i] == g and assigned[other, i] >= 0
+            lit_beside += 1 if lit else 0
+            for i in range(n):
+                if lit and group[i] == g:
+                    asked[i] += 1
+                    seen[i] += 1 if assigned[other, i] >= 0 else 0
+        out[n + g] = LIT[lit_beside]
+    for i in range(n):
+        out[i] = SHOWN[2] if seen[i] == asked[i] else SHOWN[1 if seen[i] > 0 else 0]
+    return out

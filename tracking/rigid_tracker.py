@@ -20,8 +20,9 @@ from geometry.rig import Rig
 from geometry.rig_parameters import RigCovariance
 from geometry.solve import SolveLimits, covariance_of, fit_pose
 from geometry.spots import SpotModel
-from tracking.association import BLENDED, MISSED, Chances, Frame, Sights
+from tracking.association import BLENDED, Chances, Frame, Sights
 from tracking.detections import Detections
+from tracking.hiding import MISSED, learnt, together
 from tracking.hypotheses import Children, Hypotheses, add_child, chosen_points, concluded, grow, no_children, sift
 from tracking.information import fit_alone
 from tracking.labels import NO_POINT, LabelResult, PosePrior, find_labels
@@ -59,7 +60,8 @@ class RigidTracker:
         self.misfit = Misfit()
         self.temper = Temper(parameters)
         n = len(self.model)
-        self._sights = Sights(np.ascontiguousarray(self.model.camera_of), np.ascontiguousarray(self.model.image_size_px))
+        self._sights = Sights.of(rig, self.model)
+        self._groups = int(self._sights.group.max(initial=-1)) + 1
         self._chances = Chances(parameters.p_detect, parameters.p_blend)
         self._clutter = ClutterNearSpots(self.model, parameters.labels.clutter_per_px2)
         self._hypotheses: Hypotheses | None = None
@@ -84,7 +86,7 @@ class RigidTracker:
         frame = self._frame(found)
         views = self.model.numbers
         if self._hypotheses is None:
-            children, count = no_children(n), 0
+            children, count = no_children(n, self._groups), 0
         else:
             children, count = grow(
                 views, self._sights, frame, self._chances, self.temper.dynamics, self._extra, dt_s, self._hypotheses
@@ -184,7 +186,7 @@ class RigidTracker:
             ) ** 2
         )  # fmt: skip
         n = len(self.model)
-        shown = np.full(n, 0.9)
+        shown = np.full(n + self._groups, 0.95)
         start = (np.ascontiguousarray(prior.centre.rotation), prior.centre.translation.copy(), np.zeros(12), P)
         for one in candidates:
             pose = one.fit.world_from_body
@@ -197,14 +199,16 @@ class RigidTracker:
             has_image = frame.has_image[self.model.camera_of]
             inside = self.model.in_picture(uv[0]) & has_image
             weight = np.log(P_FRESH) if self._hypotheses is not None else 0.0
-            p = self.parameters.p_detect * 0.9
+            p = self.parameters.p_detect * 0.9  # marginal(shown)
             weight += gaussian + spots * np.log(p) - float(np.sum(frame.log_clutter[assigned >= 0]))
             weight += np.count_nonzero(inside & (assigned < 0)) * np.log(1 - p)
             assigned = np.where((assigned < 0) & ~inside, -2, assigned)
             if not np.isfinite(weight):
                 continue
             before = count
-            count = add_child(children, count, R, t, m, P_after, weight, shown, assigned, False, -1, p)
+            weight += together(shown, self._sights.group, assigned, self.parameters.p_detect)
+            after = learnt(shown, self._sights.group, assigned, self.parameters.p_detect)
+            count = add_child(children, count, R, t, m, P_after, weight, after, assigned, False, -1)
             if count > before:
                 names = ", ".join(self.model.views[v][1] for v in np.flatnonzero(assigned >= 0))
                 fresh[count - 1] = names

@@ -48,7 +48,7 @@ def smooth(recording: Recording) -> Smoothed:
     """
     rec, model, parameters = recording, recording.model, recording.parameters
     views = model.numbers
-    sights = Sights(np.ascontiguousarray(model.camera_of), np.ascontiguousarray(model.image_size_px))
+    sights = Sights.of(rec.rig, model)
     chances = Chances(parameters.p_detect, parameters.p_blend)
     causal, measured = rec.assigned, rec.measured
     assigned, probability = causal.copy(), np.where(causal >= 0, 1.0, np.nan)
@@ -188,10 +188,17 @@ def _evidence(
     speed = np.stack([np.linalg.norm(ref.m[:, :3], axis=1), np.linalg.norm(ref.m[:, 3:6], axis=1)], axis=1)
     fastest = _running_maximum(np.where(measured[:, None], speed, 0.0), window)
     size = (LEAST_JUMP + JUMP_OF_SPEED * fastest) ** 2
-    # After a dark stretch the first light does not tell when it bent.
+    # After a dark stretch the first light does not tell when it bent, and the second not whether it did so between.
     dark = ~measured
     dark[1:] |= ~measured[:-1]
-    chance = np.where(rec.bent, 1.0, np.where(dark, P_DARK, 0.0))
+    dark[2:] |= ~measured[:-2]
+    chance = np.where(dark, P_DARK, 0.0)
+    for k in np.flatnonzero(rec.bent):
+        first = k
+        while first > 1 and not measured[first - 1]:
+            first -= 1
+        # In one of the steps since the frame that was last measured, nobody knows which.
+        chance[first : k + 1] = np.maximum(chance[first : k + 1], 1.0 / (k + 1 - first))
     jump = chance[:, None] * size
     sd = [1.0, 1.0, FIRST_SPEED, FIRST_RATE, FIRST_ACCELERATION, FIRST_ANGULAR]
     return Evidence(L, g, dt, jump, jump / STEADIES_WITHIN_S**2, np.repeat(sd, 3) ** 2)

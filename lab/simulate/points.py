@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from geometry.pose import Pose
 from geometry.rig import Rig
 from geometry.spots import SpotModel
 from lab.simulate.scenarios import Prior, Scenario
-from lab.simulate.scene import POINT_NOISE, SHINING, compose, with_overrides
+from lab.simulate.scene import HIDDEN, POINT_NOISE, SHINING, compose, with_overrides
 from tracking.detections import Detections
 
 CLUTTER = -1  # the origin of a detection that is no spot
@@ -95,3 +95,14 @@ def simulate_points(
         detections=tuple(detections),
         origin=tuple(origins),
     )
+
+
+def hidden(run: PointRun, hide: Bools) -> PointRun:
+    """The same recording with spots taken away: hide (T, n), those of a view in a frame. False points stay."""
+    detections, origins = [], []
+    for k in range(len(run.frame)):
+        keep = [np.array([o == CLUTTER or not hide[k, o] for o in of], dtype=bool) for of in run.origin[k]]
+        detections.append(tuple(d[rows] for d, rows in zip(run.detections[k], keep, strict=True)))
+        origins.append(tuple(of[rows] for of, rows in zip(run.origin[k], keep, strict=True)))
+    in_view = np.where(hide & (run.in_view == SHINING), HIDDEN, run.in_view)
+    return replace(run, in_view=in_view, detections=tuple(detections), origin=tuple(origins))
