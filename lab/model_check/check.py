@@ -1,4 +1,12 @@
-"""Does the rig file fit the recording? Statistics, culprits and findings of one run."""
+"""Does the rig file fit the recording? Statistics, culprits and findings of one run.
+
+Measured on simulated points (0.1 px noise, true labels; scenes smooth, sharp-turns, huo2015, two-cameras-per-screen,
+four-skew-beams): no finding in 200 right recordings of 250 frames, and p-values as uniform as they should be. Of 8
+recordings each of 600 frames: 0.05 deg of a beam, 3 ms of a camera and 2 mm of a screen are found in all; 0.02 deg of a
+camera in all sideways and rolled, in 38 of 40 up or down. In one of 280 the true culprit was not among the (at most
+three) accused; alone and wrongly accused was nothing. With one camera per screen, a camera that rolls is mostly named
+together with the opposite one, and a beam of a fan raised with the other beams: only marked points tell these apart.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +21,7 @@ from geometry.arrays import Array, Ints
 from geometry.rig import Rig
 from geometry.rig_parameters import RigCovariance
 from geometry.spots import SpotModel
-from lab.model_check.culprit import Culprit, Inquest, inquire
+from lab.model_check.culprit import Culprit, Explained, Inquest, inquire
 from lab.model_check.effect import Effect, effect_of
 from lab.model_check.faults import FaultColumns, possible_faults
 from lab.model_check.linear import Linearised, linearise
@@ -36,7 +44,7 @@ class ModelCheck:
     frames_for_culprits: int
     statistics: Statistics | None  # None where no frame has enough spots
     inquest: Inquest | None  # None where there is too little to test
-    effects: tuple[Effect, ...]  # of the culprits, in their order
+    effects: tuple[tuple[Effect, ...], ...]  # of each culprit: of its best explanation and of the rivals, in order
     findings: tuple[Finding, ...]  # the gravest things first; empty where nothing was found
     why_not: str = ""  # why nothing was tested; empty where it was
     image_sizes_px: Mapping[str, tuple[int, int]] = field(default_factory=dict)  # of each camera: width, height
@@ -51,8 +59,9 @@ class ModelCheck:
 
         tested, why_not; frames_used, frames_for_culprits; findings: level (PASS, WARN, FAIL), what, why, cure;
         misfit, noise, correlation_frames, p_before, p_after: see Inquest; culprits: thing, name, kind, delta and sigma
-        (in rad, m, px, s, or relative), explained (chi-square), p, rivals (thing, name, kind), off_px, off_sigmas,
-        attitude_deg, position_mm, pose_sigmas: see Effect; views, cameras, beams: see GroupStatistics; image_sizes_px.
+        (in rad, m, px, s, or relative), explained (chi-square), p, off_px, off_sigmas, attitude_deg, position_mm,
+        pose_sigmas: see Effect; and rivals, each with the same; views, cameras, beams: see GroupStatistics;
+        image_sizes_px.
         """
         out: dict[str, Any] = {
             "tested": self.inquest is not None,
@@ -105,20 +114,14 @@ def check_model(rig: Rig, recording: Recording, calibration: RigCovariance | Non
     inquest = inquire(lin, moves, columns.covariance, possible_faults(rig, columns))
     claimed = None if recording.pose_covariance is None else recording.pose_covariance[lin.frames]
     effects = tuple(
-        effect_of(
-            lin,
-            moves,
-            c.best.fault.numbers @ c.best.change.delta,
-            c.best.fault.views,
-            columns.covariance,
-            claimed,
+        tuple(
+            effect_of(lin, moves, e.fault.numbers @ e.change.delta, e.fault.views, columns.covariance, claimed)
+            for e in c.explanations
         )
         for c in inquest.culprits
     )
     frame_s = float(np.median(np.diff(recording.t_s)))
-    findings = [
-        culprit_finding(c, e, inquest, rig, model, frame_s) for c, e in zip(inquest.culprits, effects, strict=True)
-    ]
+    findings = [culprit_finding(c, e, inquest, model, frame_s) for c, e in zip(inquest.culprits, effects, strict=True)]
     if inquest.unexplained:
         findings.append(unexplained_finding(inquest))
     findings.sort(key=lambda f: -f.level)
@@ -153,8 +156,13 @@ def _calibration_px(
     return out
 
 
-def _mapping(culprit: Culprit, effect: Effect) -> dict[str, Any]:
-    change, fault = culprit.best.change, culprit.best.fault
+def _mapping(culprit: Culprit, effects: tuple[Effect, ...]) -> dict[str, Any]:
+    best, *rivals = (_explained(e, effect) for e, effect in zip(culprit.explanations, effects, strict=True))
+    return {**best, "rivals": rivals}
+
+
+def _explained(explained: Explained, effect: Effect) -> dict[str, Any]:
+    change, fault = explained.change, explained.fault
     return {
         "thing": fault.thing,
         "name": fault.name,
@@ -163,7 +171,6 @@ def _mapping(culprit: Culprit, effect: Effect) -> dict[str, Any]:
         "sigma": np.sqrt(np.maximum(np.diagonal(change.covariance), 0.0)).tolist(),
         "explained": change.explained,
         "p": change.p_value,
-        "rivals": [{"thing": r.fault.thing, "name": r.fault.name, "kind": r.fault.kind} for r in culprit.rivals],
         "off_px": effect.off_px,
         "off_sigmas": effect.off_sigmas,
         "attitude_deg": effect.attitude_deg,

@@ -46,6 +46,11 @@ class Culprit:
     rivals: tuple[Explained, ...]
     more_rivals: int  # beyond those listed
 
+    @property
+    def explanations(self) -> tuple[Explained, ...]:
+        """The best and its rivals."""
+        return (self.best, *self.rivals)
+
 
 @dataclass(frozen=True, slots=True)
 class Inquest:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from calibration.findings import Finding, Level
-from geometry.rig import Rig
 from geometry.spots import SpotModel
 from lab.model_check import faults as f
 from lab.model_check.culprit import Culprit, Explained, Inquest
@@ -27,24 +28,30 @@ _CURES = {
 }
 
 
-def level_of(inquest: Inquest, effect: Effect) -> Level:
-    """How grave a significant fault is."""
-    if inquest.misfit > WRONG_SIGMAS or effect.pose_sigmas > WRONG_SIGMAS or effect.off_sigmas > WRONG_SIGMAS:
+def level_of(inquest: Inquest, effects: Sequence[Effect]) -> Level:
+    """How grave a significant fault is; effects: of everything that it may be.
+
+    What cannot be told apart fails only if each of it would, and is small only if each of it is.
+    """
+
+    def worst(sigmas: float) -> list[bool]:
+        return [e.pose_sigmas > sigmas or e.off_sigmas > sigmas for e in effects]
+
+    if inquest.misfit > WRONG_SIGMAS or all(worst(WRONG_SIGMAS)):
         return Level.FAIL
-    if effect.pose_sigmas > MATTERS_SIGMAS or effect.off_sigmas > MATTERS_SIGMAS:
-        return Level.WARN
-    return Level.PASS
+    return Level.WARN if any(worst(MATTERS_SIGMAS)) else Level.PASS
 
 
 def culprit_finding(
-    culprit: Culprit, effect: Effect, inquest: Inquest, rig: Rig, model: SpotModel, frame_s: float
+    culprit: Culprit, effects: Sequence[Effect], inquest: Inquest, model: SpotModel, frame_s: float
 ) -> Finding:
-    """One finding for one culprit. effect: of its best explanation; frame_s: the usual time between frames."""
-    level = level_of(inquest, effect)
-    told = [_told(e, model, frame_s) for e in (culprit.best, *culprit.rivals)]
+    """One finding for one culprit. effects: of its explanations, in order; frame_s: the usual time between frames."""
+    level, effect = level_of(inquest, effects), effects[0]
+    told = [_told(e, model, frame_s) for e in culprit.explanations]
     says = told[0]
     if len(told) > 1:
-        also = f", or {culprit.more_rivals} others" if culprit.more_rivals else ""
+        count = culprit.more_rivals
+        also = f"; or one of {count} more" if count > 1 else "; or one more" if count else ""
         says = f"{'; or '.join(told)}{also}: this recording cannot tell which"
     where = ""
     if effect.axis >= 0:
@@ -54,12 +61,12 @@ def culprit_finding(
             f" off in {'uv'[effect.axis]} against the other spots: "
         )
     what = f"{where}{says}, p {p_text(culprit.best.change.p_value)}"
-    things = list(dict.fromkeys(e.fault.thing for e in (culprit.best, *culprit.rivals)))
+    things = list(dict.fromkeys(e.fault.thing for e in culprit.explanations))
     cure = " ".join(_CURES[t] for t in things) if level > Level.PASS else ""
     if culprit.rivals and level > Level.PASS:
         way = "A new calibration of the beams" if things == [f.BEAM] else "A `calibrate daily` with marked points"
         cure += f" {way} tells the candidates apart."
-    return Finding(level, what, _consequence(effect, level), cure)
+    return Finding(level, what, _consequence(effects, level), cure)
 
 
 def unexplained_finding(inquest: Inquest) -> Finding:
@@ -76,14 +83,22 @@ def unexplained_finding(inquest: Inquest) -> Finding:
     )
 
 
-def _consequence(effect: Effect, level: Level) -> str:
-    if not np.isfinite(effect.attitude_deg):
+def _consequence(effects: Sequence[Effect], level: Level) -> str:
+    known = [e for e in effects if np.isfinite(e.attitude_deg)]
+    if not known:
         return "no frame alone has a pose, so what it does to them cannot be told"
-    bias = f"{short(effect.attitude_deg, 2)} deg and {short(effect.position_mm, 2)} mm"
-    of = f", up to {short(effect.pose_sigmas, 2)} of its claimed sigmas" if np.isfinite(effect.pose_sigmas) else ""
+    bias = f"{_range([e.attitude_deg for e in known])} deg and {_range([e.position_mm for e in known])} mm"
+    sigmas = [e.pose_sigmas for e in known if np.isfinite(e.pose_sigmas)]
+    of = f", {_range(sigmas)} of its claimed sigmas" if sigmas else ""
     if level == Level.PASS:
         return f"it is sure but small: it turns and moves the pose by {bias}{of}"
     return f"it turns and moves the pose by about {bias}{of}; averaging over frames does not lessen it"
+
+
+def _range(values: Sequence[float]) -> str:
+    """`0.31`, or `0.31 to 0.64` where they differ by more than a tenth."""
+    low, high = min(values), max(values)
+    return short(high, 2) if high <= 1.1 * low else f"{short(low, 2)} to {short(high, 2)}"
 
 
 def _told(e: Explained, model: SpotModel, frame_s: float) -> str:

@@ -16,7 +16,8 @@ from geometry.spots import SpotModel
 from lab import quality
 from lab.model_check import words
 from lab.model_check.check import ModelCheck, check_model
-from lab.model_check.culprit import P_FALSE_ALARM
+from lab.model_check.culprit import P_FALSE_ALARM, Inquest
+from lab.model_check.effect import Effect
 from lab.model_check.faults import FaultColumns, possible_faults
 from lab.model_check.keeper import FrameKeeper
 from lab.model_check.linear import linearise
@@ -135,6 +136,16 @@ def test_what_a_recording_cannot_tell_apart_is_named_together():
     assert named(check_model(run.rig, recording)) == [("beam", "B")]
 
 
+def test_what_cannot_be_told_apart_fails_only_if_each_of_it_would_and_is_small_only_if_each_is():
+    small, middle, large = (Effect(0, 0, 0.0, 0.0, 0.1, 0.1, sigmas) for sigmas in (0.1, 2.0, 9.0))
+    inquest = Inquest((), 0.0, 1.0, 30, 1.0, 1.0, 1.0, False)
+    assert words.level_of(inquest, [small, small]) == Level.PASS
+    assert words.level_of(inquest, [small, middle]) == Level.WARN
+    assert words.level_of(inquest, [middle, large]) == Level.WARN
+    assert words.level_of(inquest, [large, large]) == Level.FAIL
+    assert words.level_of(dataclasses.replace(inquest, misfit=5.1), [small]) == Level.FAIL
+
+
 def test_two_faults_are_both_named():
     def both(rig):
         return changed("beams.D.direction_z", 1e-3)(turned("left", 0.1, 2)(rig))
@@ -228,6 +239,25 @@ def test_wrong_labels_in_a_few_frames_are_outliers_and_no_fault():
     assert shares["left/1"] == 0
 
 
+def test_wrong_labels_are_seen_as_such_in_a_set_up_that_is_wrong_too():
+    """The camera's turn sets its spots 60 sigma off; a wrong label differs from them, not from 0."""
+    run, recording = recorded("two-cameras-per-screen", 5, frames=300, really=turned("right-a", 0.3, 1))
+    uv = recording.uv_px.copy()
+    uv[100:105, 6] += [0.0, 12.0]
+    check = check_model(run.rig, dataclasses.replace(recording, uv_px=uv))
+    assert named(check) == [("camera", "right-a")]
+    assert check.statistics is not None
+    assert check.statistics.views[6].outliers >= 5 / 300
+    assert max(g.outliers for g in check.statistics.views) < 10 / 300
+
+
+def test_what_a_large_fault_leaves_by_not_being_linear_is_no_second_fault():
+    """46 sigma, in a motion with bends: 10 ms at the speed of one instant leave a little for others to explain."""
+    run, recording = recorded("two-cameras-per-screen", 5, late=("right-a", 10e-3))
+    (finding,) = check_model(run.rig, recording).findings
+    assert "camera `right-a` is about 9.92" in finding.what
+
+
 def test_sigmas_claimed_too_small_are_told_as_noise_and_accuse_nobody():
     run, recording = recorded("smooth", 5, frames=300, claimed_px=NOISE_PX / 3)
     check = check_model(run.rig, recording)
@@ -281,7 +311,7 @@ def test_the_correlation_time_of_a_first_order_process_is_the_known_one(rho, exp
 def test_the_pose_bias_that_is_told_is_the_one_that_the_fault_makes():
     run, recording = recorded("four-skew-beams", 5, frames=300, really=changed("beams.B.direction_z", 2e-3))
     check = check_model(run.rig, recording)
-    (effect,) = check.effects
+    ((effect,),) = check.effects
     other, bias = SpotModel.of(changed("beams.B.direction_z", 2e-3)(run.rig)), []
     for k in range(0, 300, 5):
         rows = np.flatnonzero(recording.usable[k])
@@ -296,7 +326,7 @@ def test_the_pose_bias_that_is_told_is_the_one_that_the_fault_makes():
 def test_a_run_that_claims_better_poses_is_judged_by_what_it_claims():
     run, recording = recorded("smooth", 5, frames=300, really=changed("screens.right.x_m", 2e-3))
     plain = check_model(run.rig, recording)
-    claims = np.broadcast_to(np.diag([1e-4**2] * 3 + [1e-5**2] * 3), (300, 6, 6))
+    claims = np.broadcast_to(np.diag([3e-5**2] * 3 + [3e-6**2] * 3), (300, 6, 6))
     bold = check_model(run.rig, dataclasses.replace(recording, pose_covariance=claims.copy()))
     assert plain.level == Level.WARN
     assert bold.level == Level.FAIL
@@ -339,6 +369,17 @@ def test_the_result_is_plain_json_and_complete():
     assert mapping["culprits"][0]["delta"][0] == pytest.approx(3e-3, rel=0.1)
     assert [v["name"] for v in mapping["views"]] == [f"{c}/{s}" for c, s in run.model.views]
     assert [v["name"] for v in mapping["beams"]] == list(run.rig.beams)
+
+
+def test_each_rival_is_told_with_its_own_size_and_effect():
+    run, recording = recorded("smooth", 5, frames=300, really=changed("screens.right.x_m", 2e-3))
+    check = check_model(run.rig, recording)
+    (best,) = check.as_mapping()["culprits"]
+    (rival,) = best["rivals"]
+    assert (best["thing"], best["name"], rival["thing"], rival["name"]) == ("screen", "right", "camera", "left")
+    assert rival["kind"] == "focal length changed"
+    assert rival["attitude_deg"] < 0.5 * best["attitude_deg"]
+    assert re.search(r"by about 0\.00\d+ to 0\.00\d+ deg and", check.findings[0].why)
 
 
 def test_frames_kept_one_by_one_tell_the_same_as_all_of_them_and_stay_few():
