@@ -87,7 +87,7 @@ _set_option = click.option(
 
 @contextmanager
 def _progress(name: str) -> Iterator[Callable[..., None] | None]:
-    """A bar on a terminal, nothing elsewhere; it is told what is done, of how much, and the stage where there are any."""
+    """A bar on a terminal, nothing elsewhere. It is told what is done, of how much, and in which stage."""
     if not sys.stderr.isatty():
         yield None
         return
