@@ -4,14 +4,18 @@
 
 PYTHON ?= python3
 VENV ?= .venv
+VENV_PEERS ?= .venv-peers
 WORKERS ?= 2
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
+READY_PEERS := $(VENV_PEERS)/.ready
+# Only the trackers that are there: ours, and the peers after `make peers`.
+BENCH_PEERS = $(if $(wildcard $(READY_PEERS)),$(VENV_PEERS)/bin/python -m bench.peers,$(BIN)/python -m bench.peers --trackers ours)
 SAMPLE_RUNS := $(patsubst %/run.yaml,%,$(wildcard sample_runs/*/run.yaml))
 DEMO := results/demo
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all check format bench-tracking bench-detection bench-calibration lock wheel pointcloud clean
+.PHONY: help setup demo test test-all check format bench-tracking bench-detection bench-calibration peers bench-peers lock wheel pointcloud clean
 
 help:  ## List the chores
 	@sed -n 's/^\([a-z-]*\):.*##  */\1|/p' $(MAKEFILE_LIST) | while IFS='|' read -r name what; do \
@@ -58,15 +62,31 @@ format: setup  ## Format the code and mend what the linter can mend
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-bench-tracking: setup  ## The tracking figures on fresh seeds, and the cost of a whole run
+bench-tracking: setup  ## The tracking figures on fresh seeds, the cost of a whole run, peers if installed
 	$(BIN)/python -m bench.tracking
 	$(BIN)/python -m bench.whole_run
+	$(BENCH_PEERS)
 
 bench-detection: setup  ## The detection figures, on fresh seeds
 	$(BIN)/python -m bench.detection
 
 bench-calibration: setup  ## The calibration figures, on fresh seeds (a quarter of an hour)
 	$(BIN)/python -m bench.calibration
+
+peers: $(READY_PEERS)  ## Build an environment with other people's trackers (.venv-peers), for bench-peers; once
+	@echo "The environment $(VENV_PEERS) is ready."
+
+# In an environment of its own: peers forbid numpy and scipy versions that the lock file may come to hold. norfair goes
+# without its dependencies, since its metadata contradict the others' (see pyproject.toml).
+$(READY_PEERS): pyproject.toml
+	@rm -f $(READY_PEERS)
+	$(PYTHON) -m venv $(VENV_PEERS)
+	$(VENV_PEERS)/bin/python -m pip install --quiet --require-virtualenv --editable '.[peers]'
+	$(VENV_PEERS)/bin/python -m pip install --quiet --require-virtualenv --no-deps 'norfair>=2.3' 'filterpy>=1.4.5'
+	@touch $(READY_PEERS)
+
+bench-peers: peers  ## Other people's trackers and ours on the same points (half an hour)
+	$(VENV_PEERS)/bin/python -m bench.peers
 
 # In an environment of its own, so that the lock file depends on pyproject.toml alone. Versions that are already
 # locked stay, unless pyproject.toml forbids them; `make lock LOCK_FLAGS=--upgrade` takes the newest. With the
@@ -95,5 +115,5 @@ pointcloud: setup  ## Add open3d, for calibrating screens from point clouds
 	$(BIN)/python -c 'import open3d; print("open3d", open3d.__version__)'
 
 clean:  ## Remove the environment, builds, results and caches
-	rm -rf .venv build dist results .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf .venv .venv-peers build dist results .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -12,7 +12,7 @@ from __future__ import annotations
 import argparse
 import math
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from datetime import UTC, datetime
 from importlib.util import find_spec
 from pathlib import Path
@@ -27,11 +27,10 @@ WARM_UP_FRAMES = 40  # tracked beforehand, untimed: imports and compilation are 
 
 
 def run(
-    entries: Sequence[Entry], scenes: Sequence[str], seeds: Sequence[int], frames: int
-) -> tuple[list[Result], list[str]]:
-    """All figures that could be had, and a line on each tracker that failed."""
+    entries: Sequence[Entry], scenes: Sequence[str], seeds: Sequence[int], frames: int, keep: Callable[[Result], None]
+) -> list[str]:
+    """Hands each result to `keep` as soon as it is there. Returns a line on each tracker that failed."""
     measured = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
-    results: list[Result] = []
     failures: list[str] = []
     # `rigid` comes first in every scene, so that the others are compared with what it took just before.
     ready = sorted((e for e in entries if e.installed), key=lambda e: e.name != "rigid")
@@ -53,9 +52,8 @@ def run(
                     continue
                 if entry.name == "rigid":
                     rigid_s = rows.spent_s
-                results.append(judged(entry, scene, rows, rigid_s, measured))
-                _tell(results[-1])
-    return results, failures
+                keep(judged(entry, scene, rows, rigid_s, measured))
+    return failures
 
 
 def notes(entries: Iterable[Entry], seeds: Sequence[int]) -> list[str]:
@@ -93,8 +91,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not seeds:
         parser.error(f"--seeds: the last, {a.seeds[1]}, comes before the first, {a.seeds[0]}")
     old = read_results(a.out)  # a file of another kind is told before the work
-    results, failures = run(entries, a.scenes, seeds, a.frames)
-    write_results(merged(old, results), a.out)
+    results: list[Result] = []
+
+    def keep(result: Result) -> None:
+        results.append(result)
+        write_results(merged(old, results), a.out)  # at once: half an hour's bench may be broken off
+        _tell(result)
+
+    failures = run(entries, a.scenes, seeds, a.frames, keep)
     print(markdown(results, names))
     for line in notes(entries, seeds):
         print(f"\n{line}")

@@ -15,22 +15,32 @@ from tracking.detections import Detections
 from tracking.labels import PosePrior
 from tracking.match import UNMATCHED
 from tracking.parameters import TrackerParameters
+from tracking.recording import Recording
 from tracking.rigid_tracker import RigidTracker
+from tracking.smoother import smooth
 from tracking.spot_tracker import SpotTracker
 from tracking.tracked_frame import TrackedFrame
 
 PRIOR = PosePrior(Pose.identity(), within_m=1.0, within_rad=float(np.deg2rad(35.0)))
 
 
-def track(scene: Scene, method: Literal["rigid", "spots"]) -> Tracked:
-    """Frame after frame, as in a run of the lab."""
+def track(scene: Scene, method: Literal["rigid", "spots"], smoothed: bool = False) -> Tracked:
+    """Frame after frame, as in a run of the lab; with the second look at the whole run, if smoothed."""
     parameters = TrackerParameters(method=method)
     tracker = RigidTracker(rig(), parameters, PRIOR) if method == "rigid" else SpotTracker(rig(), parameters, PRIOR)
-    frames = []
+    recording = Recording(rig(), parameters) if smoothed else None
+    frames, every = [], []
     start = process_time()
     for k, found in enumerate(scene.detections):
         points = [Detections.at(p, np.broadcast_to(NOISE_PX**2 * np.eye(2), (len(p), 2, 2))) for p in found]
-        frames.append(tracker.step(FRAME_S if k else 0.0, points))
+        dt_s = FRAME_S if k else 0.0
+        frames.append(tracker.step(dt_s, points))
+        if recording is not None:
+            every.append(points)
+            recording.append(dt_s, points, frames[-1])
+    if recording is not None:
+        second = smooth(recording)
+        frames = [second.frame(k, causal, every[k]) for k, causal in enumerate(frames)]
     return named(scene, frames, process_time() - start)
 
 

@@ -15,7 +15,7 @@ from importlib.util import find_spec
 from bench.peers.rows import Tracked
 from bench.peers.scenes import Scene
 
-OURS = ("rigid", "spots")
+OURS = ("rigid", "rigid-smoothed", "spots")
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +52,7 @@ ENTRIES = {
     entry.name: entry
     for entry in (
         Entry("rigid", "ours", options={"method": "rigid"}),
+        Entry("rigid-smoothed", "ours", options={"method": "rigid", "smoothed": True}),
         # On dense, `spots` looks for the vehicle anew in a third of the frames: 0.13 s each, minutes for a scene.
         Entry("spots", "ours", options={"method": "spots"}, seeds=1),
         Entry("pyrecest-jpda", "with_pyrecest", "pyrecest", {"association": "jpda", "q": 2.0}, seeds=2),
