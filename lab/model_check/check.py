@@ -24,6 +24,7 @@ from geometry.spots import SpotModel
 from lab.model_check.culprit import Culprit, Explained, Inquest, inquire
 from lab.model_check.effect import Effect, effect_of
 from lab.model_check.faults import FaultColumns, possible_faults
+from lab.model_check.keeper import FrameKeeper
 from lab.model_check.linear import Linearised, linearise
 from lab.model_check.recording import Recording, evenly
 from lab.model_check.statistics import Statistics, group_key, residual_weights, statistics
@@ -128,6 +129,14 @@ def check_model(rig: Rig, recording: Recording, calibration: RigCovariance | Non
     return ModelCheck(
         len(all_frames.frames), len(lin.frames), told, inquest, effects, tuple(findings), image_sizes_px=sizes
     )
+
+
+def check_kept(rig: Rig, kept: FrameKeeper, calibration: RigCovariance | None = None) -> ModelCheck:
+    """As `check_model`, of the frames that a run has kept."""
+    recording = kept.recording()
+    if recording is None:
+        return ModelCheck(0, 0, None, None, (), (), "there is no frame")
+    return check_model(rig, recording, calibration)
 
 
 def _calibration_px(

@@ -9,6 +9,7 @@ import numpy as np
 from geometry.arrays import Array, Bools
 from geometry.pose import Pose
 from lab.model_check.recording import Recording
+from tracking.tracked_frame import TrackedFrame
 
 MOST_KEPT = 2000  # frames; as many as the statistics use
 BLOCK = 3  # neighbouring frames are kept together: they tell how fast the spots move
@@ -63,6 +64,22 @@ class FrameKeeper:
             kept = [i for i, k in enumerate(self._numbers) if not (k // BLOCK) % self._stride]
             self._frames = [self._frames[i] for i in kept]
             self._numbers = [self._numbers[i] for i in kept]
+
+    def add_tracked(self, t_s: float, tracked: TrackedFrame, predicted_cov_px2: Array | None = None) -> None:
+        """The next frame as a tracker or a smoother tells it: seen is what it measured.
+
+        predicted_cov_px2 (n, 2, 2): what it claimed of its prediction; without it there is no NIS.
+        """
+        self.add(
+            t_s,
+            np.array([status.measured for status in tracked.status], dtype=np.bool_),
+            tracked.uv_px,
+            tracked.cov_px2,
+            tracked.pose,
+            tracked.predicted_px,
+            predicted_cov_px2,
+            tracked.pose_covariance,
+        )
 
     def recording(self) -> Recording | None:
         """What was kept; None where no frame came."""

@@ -15,7 +15,7 @@ from geometry.solve import fit_pose
 from geometry.spots import SpotModel
 from lab import quality
 from lab.model_check import words
-from lab.model_check.check import ModelCheck, check_model
+from lab.model_check.check import ModelCheck, check_kept, check_model
 from lab.model_check.culprit import P_FALSE_ALARM, Inquest
 from lab.model_check.effect import Effect
 from lab.model_check.faults import FaultColumns, possible_faults
@@ -24,7 +24,13 @@ from lab.model_check.linear import linearise
 from lab.model_check.recording import evenly
 from lab.model_check.statistics import correlation_time, nis_band
 from lab.report.svg import plus_minus
+from lab.simulate.points import simulate_points
 from tests.lab.model_scenes import NOISE_PX, SCENES, changed, one_camera, recorded, turned
+from tracking.labels import PosePrior
+from tracking.parameters import TrackerParameters
+from tracking.spot_tracker import SpotTracker
+from tracking.statuses import PoseStatus, SpotStatus
+from tracking.tracked_frame import TrackedFrame
 
 
 def named(check: ModelCheck) -> list[tuple[str, str]]:
@@ -399,8 +405,41 @@ def test_frames_kept_one_by_one_tell_the_same_as_all_of_them_and_stay_few():
     assert culprit.best.change.delta[0] == pytest.approx(3e-3, rel=0.1)
 
 
-def test_an_empty_keeper_has_no_recording():
+def test_a_run_without_frames_is_not_tested_and_says_so():
+    run, _ = recorded("smooth", 5, frames=40)
     assert FrameKeeper().recording() is None
+    assert check_kept(run.rig, FrameKeeper()).why_not == "there is no frame"
+
+
+def test_of_a_trackers_frames_only_what_it_measured_counts():
+    _, recording = recorded("smooth", 5, frames=40)
+    status = [SpotStatus.MATCHED, SpotStatus.TURNED, SpotStatus.OCCLUDED, SpotStatus.OUT_OF_VIEW, SpotStatus.LOST]
+    keeper, nowhere = FrameKeeper(), np.full((6, 2), np.nan)
+    for k, pose in enumerate((recording.poses[0], None)):
+        nothing = np.full(6, np.nan), np.full(6, -1)
+        words_of = (*status, SpotStatus.NO_IMAGE)
+        uv, cov = recording.uv_px[k], recording.cov_px2[k]
+        tracked = TrackedFrame(uv, cov, words_of, nowhere, *nothing, PoseStatus.MEASURED, pose, None, 2, 0.1, ())
+        keeper.add_tracked(0.01 * k, tracked)
+    kept = keeper.recording()
+    assert kept is not None
+    assert kept.seen.tolist() == [[True, True, False, False, False, False]] * 2
+    assert kept.usable.sum(axis=1).tolist() == [2, 0]
+    assert kept.pose_covariance is None
+
+
+@pytest.mark.slow
+def test_frames_of_a_tracker_are_checked_and_a_wrong_rig_is_told():
+    """By a real tracker on simulated detections; the second rig has the right screen 10 mm nearer than it is."""
+    run = simulate_points("four-skew-beams", 5, frames=45)
+    levels = []
+    for rig in (run.rig, changed("screens.right.x_m", -0.01)(run.rig)):
+        tracker = SpotTracker(rig, TrackerParameters(), PosePrior(run.poses[0], 0.3, 0.1))
+        keeper = FrameKeeper()
+        for t_s, found in zip(run.t_s, run.detections, strict=True):
+            keeper.add_tracked(float(t_s), tracker.step(0.01, found))
+        levels.append(check_kept(rig, keeper).level)
+    assert levels == [Level.PASS, Level.FAIL]
 
 
 def verdict_with(*findings: Finding) -> quality.Verdict:
