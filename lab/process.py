@@ -31,6 +31,7 @@ from tracking.parameters import TrackerParameters
 
 SUMMARY_SCHEMA = "beampose/summary/1"
 MOST_EVENTS = 500  # told one by one; of the rest the number
+LASTING = ("undecided", "changed")  # events of a spot that tell no more in the next frame: told once, with their length
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +73,8 @@ class _Tally:
     reasons: dict[str, Counter[str]] = field(default_factory=dict)
     events: list[dict[str, Any]] = field(default_factory=list)
     event_kinds: Counter[str] = field(default_factory=Counter)
+    lasting: dict[tuple[str, int | None], dict[str, Any]] = field(default_factory=dict)  # the latest of each kind
+    untold: int = 0
     left_open: int = 0  # rows of spots.csv with a detection whose label was too uncertain to be given
 
     def add(self, record: FrameRecord) -> None:
@@ -91,17 +94,24 @@ class _Tally:
             self.left_open += int(np.count_nonzero(~given & ~np.isnan(record.tracked.label_probability)))
         for event in record.tracked.events:
             self.event_kinds[event.kind] += 1
-            if len(self.events) < MOST_EVENTS:
+            same = self.lasting.get((event.kind, event.view))
+            if event.kind in LASTING and same is not None and same["last_frame"] == record.frame - 1:
+                same["last_frame"] = record.frame
+            elif len(self.events) < MOST_EVENTS:
                 camera, spot = ("", "") if event.view is None else self.views[event.view].split("/", 1)
                 self.events.append(
                     {
                         "frame": record.frame,
+                        "last_frame": record.frame,
                         "kind": event.kind,
                         "camera": camera or None,
                         "spot": spot or None,
                         "text": event.text,
                     }
                 )
+                self.lasting[event.kind, event.view] = self.events[-1]
+            else:
+                self.untold += 1
 
     def _missed(self, camera: str, frame: int, reason: str) -> None:
         ranges = self.no_image.setdefault(camera, [])
@@ -220,8 +230,8 @@ def _summary(
     notes = list(pipeline.reader.notes)
     if run.left_out:
         notes.append(f"cameras of the rig that this run has nothing of: {', '.join(run.left_out)}")
-    if len(tally.events) < sum(tally.event_kinds.values()):
-        notes.append(f"events: the first {MOST_EVENTS} of {sum(tally.event_kinds.values())} are listed")
+    if tally.untold:
+        notes.append(f"events: the first {MOST_EVENTS} of {MOST_EVENTS + tally.untold} are listed")
     return {
         "schema": SUMMARY_SCHEMA,
         "name": run.name,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from geometry import rotations
 from geometry.arrays import Array
 from lab.report import svg
 from lab.report.material import Material
@@ -23,82 +22,6 @@ def pose_shades(m: Material) -> tuple[Shade, ...]:
     )
 
 
-def pose_figure(m: Material) -> str:
-    """Attitude and position over time beside their uncertainty: a row for each of the six numbers."""
-    p = m.poses
-    if not p.known.any():
-        return ""
-    t = p.t_s if m.time_name != "frame" else p.frames.astype(float)
-    shades = pose_shades(m)
-    errors = _angle_and_position_errors(m)
-    out = []
-    names = ("yaw", "pitch", "roll", "x", "y", "z")
-    angles = np.degrees(np.unwrap(np.radians(p.yaw_pitch_roll_deg), axis=0)) if p.known.all() else p.yaw_pitch_roll_deg
-    values = np.concatenate([angles, p.world_from_body.translation], axis=1)
-    sigmas = np.concatenate([p.sigma_ypr_deg, p.sigma_position_m], axis=1)
-    measured = p.has(PoseStatus.MEASURED)
-    for i, name in enumerate(names):
-        big, small, factor = ("deg", "mdeg", 1000.0) if i < 3 else ("m", "mm", 1000.0)
-        value, sigma = values[:, i], sigmas[:, i]
-        last = i == len(names) - 1
-        height = 128 if last else 104
-        out.append(
-            svg.time_panel(
-                t,
-                name,
-                big,
-                lines=(Line(value, svg.BLUE, name, 1.3),),
-                bands=(Band(value - 3 * sigma, value + 3 * sigma, svg.SKY, "\u00b13\u03c3", 0.45),),
-                shades=shades,
-                # Of the bands only those of measured poses count: a long prediction would flatten the rest.
-                y_range=svg.plain_range(
-                    np.concatenate([value, (value - 3 * sigma)[measured], (value + 3 * sigma)[measured]])
-                ),
-                height=height,
-                with_time=last,
-                time_name=m.time_name,
-            )
-        )
-        shown = sigma[measured] if measured.any() else sigma
-        if np.nanmax(shown, initial=0.0) > (1.0 if i < 3 else 0.1):
-            small, factor = big, 1.0
-        limit = 1.25 * svg.robust_range(3 * factor * shown)[1]
-        lines: tuple[Line, ...] = ()
-        if errors is not None:
-            lines = (Line(factor * errors[:, i], svg.VERMILLION, f"{name}: estimate minus truth", 0.9),)
-            limit = max(limit, svg.robust_range(factor * errors[measured, i])[1]) if measured.any() else limit
-        s = factor * sigma
-        out.append(
-            svg.time_panel(
-                t,
-                f"{name}: \u00b1\u03c3, \u00b13\u03c3" + (" and error" if errors is not None else ""),
-                small,
-                lines=lines,
-                bands=(
-                    Band(-3 * s, 3 * s, svg.SKY, "\u00b13\u03c3", 0.35),
-                    Band(-s, s, svg.BLUE, "\u00b1\u03c3", 0.35),
-                ),
-                shades=shades,
-                y_range=(-limit, limit),
-                height=height,
-                with_time=last,
-                time_name=m.time_name,
-            )
-        )
-    return "".join(out)
-
-
-def _angle_and_position_errors(m: Material) -> Array | None:
-    """(F, 6): yaw, pitch, roll (deg, wrapped) and x, y, z (m), estimate minus truth."""
-    if m.truth is None or m.truth.world_from_body is None:
-        return None
-    true = m.truth.world_from_body
-    ypr = m.poses.yaw_pitch_roll_deg - np.degrees(rotations.ypr_from_matrix(true.rotation))
-    ypr = (ypr + 180.0) % 360.0 - 180.0
-    shift = m.poses.world_from_body.translation - true.translation
-    return np.concatenate([np.where(np.isfinite(shift[:, :1]), ypr, np.nan), shift], axis=1)
-
-
 def nees_figure(m: Material) -> str:
     """The squared pose error in units of its covariance, over time."""
     delta = m.pose_errors
@@ -107,7 +30,7 @@ def nees_figure(m: Material) -> str:
     nees = normalised_squares(delta, m.poses.covariance)
     if not np.isfinite(nees).any():
         return ""
-    t = m.poses.t_s if m.time_name != "frame" else m.poses.frames.astype(float)
+    t = m.pose_times
     n = np.ones(len(nees))
     usual = nees[np.isfinite(nees)]
     top = max(25.0, min(float(usual.max()) * 1.08, 2.0 * float(np.percentile(usual, 99))))
@@ -184,7 +107,7 @@ def rms_figure(m: Material) -> str:
     p = m.poses
     if not np.isfinite(p.rms_px).any():
         return ""
-    t = p.t_s if m.time_name != "frame" else p.frames.astype(float)
+    t = m.pose_times
     top = min(1.08 * float(np.nanmax(p.rms_px)), 4.0 * float(np.nanpercentile(p.rms_px, 99)))
     over_time = svg.time_panel(
         t,

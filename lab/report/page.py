@@ -9,7 +9,7 @@ from typing import Any
 import jinja2
 from markupsafe import Markup
 
-from lab.report import figures, tables, uncertainty
+from lab.report import figures, pose_curves, tables, uncertainty
 from lab.report.material import Material, gather
 from lab.report.model_fit import HEADS as MODEL_FIT_HEADS
 from lab.report.model_fit import model_fit
@@ -60,7 +60,10 @@ def page(m: Material, results: Path) -> str:
         "truth_keys": tables.truth_figures(m.errors),
         "pixel_rows": tables.pixel_rows(m.errors),
         "run_line": _run_line(m),
-        "pose_figure": Markup(figures.pose_figure(m)),
+        "pose_figure": Markup(pose_curves.pose_figure(m)),
+        "motion_figure": Markup(pose_curves.motion_figure(m)),
+        "smoothed": m.causal is not None,
+        "method": tables.at(m.summary, "parameters", "tracker", "method") or "spots",
         "budget_heads": uncertainty.HEADS,
         "budget_rows": uncertainty.budget_rows(m),
         "budget_words": uncertainty.words(m),
@@ -82,12 +85,14 @@ def page(m: Material, results: Path) -> str:
         "spot_rows": rows,
         "pictures": [Markup(p) for p in pictures(m, results, chosen(m, found))],
         "events": listed[:_MOST_EVENTS],
+        "label_words": tables.label_words(m),
         "more_events": max(len(listed) - _MOST_EVENTS, 0),
         "no_image": tables.no_image_ranges(m),
         "notes": [str(n) for n in _listed(m.summary.get("notes"))],
         "run_notes": "" if m.run is None else m.run.notes,
         "missing": _missing(m),
         "parameters": tables.flattened(m.summary.get("parameters") or {}),
+        "smoother": tables.flattened(m.summary.get("smoother") or {}),
         "timings": tables.flattened(m.summary.get("timings") or {}),
         "rates": tables.flattened(m.summary.get("rates") or {}),
         "versions": tables.flattened(m.summary.get("versions") or {}),

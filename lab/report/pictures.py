@@ -90,6 +90,9 @@ def _noted(m: Material) -> list[Event]:
             camera, spot = noted.get("camera"), noted.get("spot")
             kind = str(noted.get("kind") or "noted")
             words = (f"spot {spot}: " if spot else "") + str(noted.get("text") or kind)
+            last = noted.get("last_frame")
+            if isinstance(last, int) and last > noted["frame"]:
+                words = _for_frames(words, noted["frame"], last + 1)
             known = camera if camera in m.spots.cameras else m.spots.cameras[0]
             out.append(Event(place[noted["frame"]], known, None if spot is None else str(spot), kind, words))
     return out

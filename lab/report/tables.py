@@ -79,12 +79,19 @@ def key_figures(m: Material) -> list[Key]:
     wanted = m.spots.has(SpotStatus.MATCHED, SpotStatus.TURNED, SpotStatus.OCCLUDED)
     seen = m.spots.measured.sum() / wanted.sum() if wanted.any() else None
     sigma_m = _median(np.linalg.norm(p.sigma_position_m[measured], axis=1))
+    yaw_note, position_note = "median of measured poses", "median of √(σx²+σy²+σz²)"
+    if m.causal is not None:
+        then = m.causal.has(PoseStatus.MEASURED)
+        yaw_then = _median(m.causal.sigma_ypr_deg[then, 0])
+        position_then = _median(np.linalg.norm(m.causal.sigma_position_m[then], axis=1))
+        yaw_note = f"median, smoothed; causal {angle(yaw_then)}"
+        position_note = f"median, smoothed; causal {length(position_then)}"
     return [
         Key("frames", f"{n:,}".replace(",", "\u202f"), f"{short(span)} s" if m.time_name != "frame" else ""),
         Key("pose measured", percent(float(measured.mean()) if len(measured) else None), "of all frames"),
         Key("spots found", percent(None if seen is None else float(seen)), "of those that should be in view"),
-        Key("σ of yaw", angle(_median(p.sigma_ypr_deg[measured, 0])), "median of measured poses"),
-        Key("σ of position", length(sigma_m), "median of √(σx²+σy²+σz²)"),
+        Key("σ of yaw", angle(_median(p.sigma_ypr_deg[measured, 0])), yaw_note),
+        Key("σ of position", length(sigma_m), position_note),
         Key("residual", pixels(_median(p.rms_px[measured])), "median RMS of the pose"),
     ]
 
@@ -107,9 +114,14 @@ def truth_figures(e: dict[str, Any] | None) -> list[Key]:
             ),
         ]
     if at(e, "pose", "measured"):
+        notes = {"rotation_deg": "RMS, measured poses", "position_m": "RMS, measured poses"}
+        for name, shown in (("rotation_deg", angle), ("position_m", length)):
+            causal = at(e, "pose_causal", "measured", name, "rms")
+            if causal is not None:
+                notes[name] = f"RMS, smoothed; causal {shown(causal)}"
         keys += [
-            Key("rotation error", angle(at(e, "pose", "measured", "rotation_deg", "rms")), "RMS, measured poses"),
-            Key("position error", length(at(e, "pose", "measured", "position_m", "rms")), "RMS, measured poses"),
+            Key("rotation error", angle(at(e, "pose", "measured", "rotation_deg", "rms")), notes["rotation_deg"]),
+            Key("position error", length(at(e, "pose", "measured", "position_m", "rms")), notes["position_m"]),
             Key("NEES", short(at(e, "pose", "measured", "nees_mean")), "mean; 6 if σ is true"),
         ]
     return keys
@@ -124,6 +136,9 @@ def spot_rows(m: Material) -> tuple[list[str], list[list[str]]]:
     heads = ["camera", "spot", *(str(s).replace("_", " ") for s in SpotStatus), "median σ (px)", "innovation RMS (px)"]
     if m.residual_px is not None:
         heads += ["residual RMS (px)", "mean residual u, v (px)"]
+    doubtful = np.isfinite(m.spots.label_probability)
+    if doubtful.any():
+        heads.append("label left open")
     scored = {(r["camera"], r["spot"]): r for r in at(m.errors, "spots", "per_spot") or ()}
     if scored:
         heads += ["right in view", "wrong labels", "out-of-view RMS (px)"]
@@ -139,6 +154,8 @@ def spot_rows(m: Material) -> tuple[list[str], list[list[str]]]:
             r = r[np.isfinite(r).all(axis=1)]
             mean = ", ".join(f"{x:+.3f}".replace("-", "\u2212") for x in r.mean(axis=0)) if len(r) else "\u2013"
             row += [short(_rms(np.linalg.norm(r, axis=1))), mean]
+        if doubtful.any():
+            row.append(str(int((doubtful & ~m.spots.measured)[:, j].sum()) or "·"))
         if scored:
             own = scored.get((camera, spot), {})
             row += [
@@ -196,10 +213,12 @@ def error_rows(errors: dict[str, Any] | None) -> list[tuple[str, str, str]]:
             ("… in view only", percent(rate.get("in_view")), "of the rows with a visible spot"),
             ("… all, within 3 px", percent(rate.get("all_within_tolerance")), "seen or solved alike"),
         ]
-    for name in ("measured", "predicted"):
-        block = at(errors, "pose", name)
+    kinds = [("pose", "measured", ""), ("pose", "predicted", ""), ("pose_causal", "measured", ", causal")]
+    for which, name, causal in kinds:
+        block = at(errors, which, name)
         if not block:
             continue
+        name += causal
         turns = ", ".join(f"{k} {angle(v)}" for k, v in block["rotation_rms_deg"].items())
         shifts = ", ".join(f"{k} {length(v)}" for k, v in block["position_rms_m"].items())
         rows = f"{block['rows']} frames"
@@ -212,7 +231,38 @@ def error_rows(errors: dict[str, Any] | None) -> list[tuple[str, str, str]]:
             low, high = (short(x) for x in block["nees_mean_95"])
             meaning = f"6 expected; {low} to {high} in 95 % of runs of independent frames"
             out.append((f"NEES, {name} poses", short(block["nees_mean"]), meaning))
+    return out + _motion_rows(errors)
+
+
+def _motion_rows(errors: dict[str, Any] | None) -> list[tuple[str, str, str]]:
+    """Velocity and rate against differences of the true poses."""
+    out = []
+    for block_name, causal in (("motion_vs_differences", ""), ("motion_causal_vs_differences", ", causal")):
+        for name, what, unit in (("velocity_m_s", "velocity", "mm/s"), ("rate_rad_s", "angular rate", "mrad/s")):
+            block = at(errors, block_name, name)
+            if not block:
+                continue
+            axes = ", ".join(f"{k} {short(1000 * v)} {unit}" for k, v in block["rms_axes"].items())
+            bends = at(errors, block_name, "rows_at_bends_left_out")
+            meaning = "against differences of the true poses" + (f", {bends} frames at bends apart" if bends else "")
+            out.append((f"{what}{causal}", f"RMS {axes}; largest {short(1000 * block['max'])} {unit}", meaning))
     return out
+
+
+def label_words(m: Material) -> str:
+    """What became of doubtful labels, in one sentence; empty where there were none."""
+    left_open = int((np.isfinite(m.spots.label_probability) & ~m.spots.measured).sum())
+    counts = at(m.summary, "counts", "events")
+    kinds = counts if isinstance(counts, dict) else {}
+    said = [
+        (left_open, "left open: no label was likely enough to be given"),
+        (kinds.get("changed"), "changed by the second look, which knows what came after"),
+        (kinds.get("tie"), "ties, in which two labellings were as likely"),
+        (kinds.get("relabelled"), "times all spots were named anew in the midst of the track"),
+        (kinds.get("reacquired"), "times the vehicle was found again after it was lost"),
+    ]
+    parts = [f"{count} {words}" for count, words in said if isinstance(count, int) and count]
+    return f"Labels: {'; '.join(parts)}." if parts else ""
 
 
 def flattened(tree: Any, name: str = "") -> list[tuple[str, str]]:
