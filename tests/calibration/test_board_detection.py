@@ -86,7 +86,7 @@ def test_points_are_found_where_they_truly_are(text, within):
 
 @pytest.mark.parametrize("text", [CHESS, "circles:9x7:25mm", CHARUCO])
 def test_noise_and_blur_cost_less_than_a_tenth_of_a_pixel(text):
-    board, photo = shot(text, look=Look(blur_px=1.2, noise_dn=4, gradient=0.4, samples=25), seed=3)
+    board, photo = shot(text, look=Look(blur_px=1.2, noise_dn=4, gradient=0.4, samples=9), seed=3)
     view = seen(photo.image, board)
     assert len(view) >= 0.9 * len(board.ids)
     assert rms(view, photo) < 0.1 * px
@@ -111,7 +111,7 @@ def test_perspective_shift_of_circle_centres_is_taken_off():
 
 @pytest.mark.parametrize("blur", [0.6, 1.0, 1.8])
 def test_blur_is_measured(blur):
-    board, photo = shot(CHESS, look=Look(blur_px=blur, noise_dn=2, samples=25))
+    board, photo = shot(CHESS, look=Look(blur_px=blur, noise_dn=2, samples=9))
     assert seen(photo.image, board).blur_px == pytest.approx(np.hypot(blur, 12**-0.5), abs=0.1)
 
 
@@ -122,7 +122,7 @@ def test_blur_is_measured(blur):
 @pytest.mark.parametrize("roll", [0.0, -1.7, 3.0])
 def test_the_first_point_stays_the_first_however_the_camera_is_rolled(text, roll):
     """5x5 corners look the same after half a turn: there the rows point to the right."""
-    board, photo = shot(text, turn=(0.25, 0.2, roll), look=Look(samples=16))
+    board, photo = shot(text, turn=(0.25, 0.2, roll), look=Look(samples=9))
     view = seen(photo.image, board)
     miss = np.linalg.norm(view.pixels - photo.pixels[view.ids], axis=1).max()
     if board.symmetry == 1 or abs(roll) < 1.5:

@@ -227,9 +227,10 @@ def test_mistakes_are_told_in_words():
         Fault(3, "lost")
 
 
-def test_a_scenario_that_cannot_keep_its_promise_says_so():
+def test_a_scenario_that_cannot_keep_its_promise_says_so(monkeypatch):
+    monkeypatch.setattr("lab.simulate.scene._MAX_DRAWS", 20)
     impossible = replace(SCENARIOS["static"], leaves_and_returns=("3",))
-    with pytest.raises(InputError, match="'static': none of"):
+    with pytest.raises(InputError, match="'static': none of 20 motions"):
         simulate_points(impossible, 0, frames=2)
 
 
