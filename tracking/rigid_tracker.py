@@ -34,6 +34,7 @@ from tracking.statuses import PoseStatus, SpotStatus, view_statuses
 from tracking.surroundings import ClutterNearSpots
 from tracking.temper import Temper
 from tracking.tracked_frame import Event, MotionEstimate, TrackedFrame
+from tracking.usable_points import UsablePoints, check_step
 
 # What is known of the motion of a vehicle that has just been found: sigmas.
 FIRST_SPEED, FIRST_RATE = 4.0, 6.0  # m/s, rad/s
@@ -72,6 +73,7 @@ class RigidTracker:
         self._few = 0  # frames in a row with fewer than FEW spots
         self._searches = 0  # in a row without success
         self._told_tie = False
+        self._begun = False
 
     @property
     def noise_scale(self) -> float:
@@ -79,7 +81,18 @@ class RigidTracker:
         return self.misfit.noise_scale
 
     def step(self, dt_s: float, found: Sequence[Detections | None]) -> TrackedFrame:
-        """One frame. dt_s: time since the frame before (0 for the first); found: per camera, None without a picture."""
+        """One frame. dt_s: time since the frame before (0 for the first); found: per camera, None without a picture.
+
+        Points that are none (tracking/usable_points.py) are passed over. Raises ValueError for a step that is not
+        forward in time, and for cameras or shapes that do not fit.
+        """
+        check_step(dt_s, found, self.model.camera_names, not self._begun)
+        usable = UsablePoints.of(found)
+        self._begun = True
+        return usable.as_given(self._step(dt_s, usable.found), self.model.camera_of)
+
+    def _step(self, dt_s: float, found: Sequence[Detections | None]) -> TrackedFrame:
+        """The same, with points that can be used."""
         n = len(self.model)
         self._anchor_age_s += dt_s
         events: list[Event] = []
@@ -278,7 +291,10 @@ class RigidTracker:
         h = self._hypotheses
         assert h is not None
         assigned = children.assigned[best]
-        labelled = (assigned >= 0) & (certain >= p.min_label_probability)
+        # What was found from a prior alone must lead as it must in labels.py: a tie of 5 to 1 is still a tie.
+        unproven = self._anchor is None or best in fresh
+        least = max(p.min_label_probability, 1 / (1 + np.exp(-p.labels.lead_nats)) if unproven else 0.0)
+        labelled = (assigned >= 0) & (certain >= least)
         use, uv, cov = chosen_points(frame, np.where(labelled, assigned, MISSED), np.zeros_like(self._extra))
         R1, t1, L1, chi2, count = fit_alone(model.numbers, h.R[0], h.t[0], use, uv, cov)
         alone, observable = covariance_of(L1) if count >= 3 else (np.full((6, 6), np.inf), False)
