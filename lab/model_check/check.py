@@ -28,6 +28,7 @@ from lab.model_check.keeper import FrameKeeper
 from lab.model_check.linear import Linearised, linearise
 from lab.model_check.recording import Recording, evenly
 from lab.model_check.statistics import Statistics, group_key, residual_weights, statistics
+from lab.model_check.unseen import unseen_finding, unseen_views
 from lab.model_check.words import culprit_finding, unexplained_finding
 
 MOST_FRAMES = 2000  # for the statistics: their sigmas halve for four times as many only
@@ -109,9 +110,10 @@ def check_model(rig: Rig, recording: Recording, calibration: RigCovariance | Non
     all_frames = linearise(model, recording, evenly(fit_for_it, MOST_FRAMES))
     sizes = {name: camera.image_size_px for name, camera in rig.cameras.items()}
     told = statistics(model, tuple(rig.beams), recording, all_frames, expected)
+    unseen = [unseen_finding(u, model) for u in unseen_views(model, recording, all_frames.frames)]
     if lin.dof <= 0:
         why = "in no frame are more spots measured than its pose takes"
-        return ModelCheck(len(all_frames.frames), len(lin.frames), told, None, (), (), why, sizes)
+        return ModelCheck(len(all_frames.frames), len(lin.frames), told, None, (), tuple(unseen), why, sizes)
     inquest = inquire(lin, moves, columns.covariance, possible_faults(rig, columns))
     claimed = None if recording.pose_covariance is None else recording.pose_covariance[lin.frames]
     effects = tuple(
@@ -125,6 +127,7 @@ def check_model(rig: Rig, recording: Recording, calibration: RigCovariance | Non
     findings = [culprit_finding(c, e, inquest, model, frame_s) for c, e in zip(inquest.culprits, effects, strict=True)]
     if inquest.unexplained:
         findings.append(unexplained_finding(inquest))
+    findings += unseen
     findings.sort(key=lambda f: -f.level)
     return ModelCheck(
         len(all_frames.frames), len(lin.frames), told, inquest, effects, tuple(findings), image_sizes_px=sizes

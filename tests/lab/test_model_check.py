@@ -264,6 +264,18 @@ def test_what_a_large_fault_leaves_by_not_being_linear_is_no_second_fault():
     assert "camera `right-a` is about 9.92" in finding.what
 
 
+def test_a_spot_that_is_hardly_ever_measured_where_it_should_be_is_told():
+    run, recording = recorded("four-skew-beams", 5, frames=300)
+    seen = recording.seen.copy()
+    seen[40:, 6] = False
+    (finding,) = check_model(run.rig, dataclasses.replace(recording, seen=seen)).findings
+    assert finding.level == Level.WARN
+    assert finding.what.startswith("spot 7 in camera `right` was measured in 40 of 300 frames")
+    assert "points so far elsewhere" in finding.why
+    seen[40:200, 6] = recording.seen[40:200, 6]  # behind a post for the last 100 frames
+    assert check_model(run.rig, dataclasses.replace(recording, seen=seen)).findings == ()
+
+
 def test_sigmas_claimed_too_small_are_told_as_noise_and_accuse_nobody():
     run, recording = recorded("smooth", 5, frames=300, claimed_px=NOISE_PX / 3)
     check = check_model(run.rig, recording)
