@@ -118,10 +118,10 @@ def test_a_perfect_tracker_scores_one(scene):
     assert min(score.gaps, score.reentries) > 0
 
 
-def test_swapped_names_cost_exactly_the_frames_after_the_swap(scene):
-    half = FRAMES // 2
-    score = score_identity(scene, swapped(scene, half))
-    lost = np.count_nonzero(scene.state[half:, :2] == DETECTED)
+@pytest.mark.parametrize("first", [NAMING_FRAMES, FRAMES // 2])
+def test_swapped_names_cost_exactly_the_frames_after_the_swap(scene, first):
+    score = score_identity(scene, swapped(scene, first))
+    lost = np.count_nonzero(scene.state[first:, :2] == DETECTED)
     assert lost > 100
     assert score.detected - score.right == lost == score.wrong
 
@@ -144,6 +144,19 @@ def test_a_new_name_after_every_absence_keeps_no_gap(scene):
     assert 0.05 < score.share < 0.5
 
 
+@pytest.mark.parametrize("false_rows_first", [True, False])
+def test_false_rows_beside_the_spots_break_no_gap(scene, false_rows_first):
+    rows = perfect(scene)
+    real = rows.measured
+    beside = (rows.frame[real], rows.camera[real], 90 + np.arange(real.sum()), rows.uv_px[real] + [3.0, 0.0])
+    true = (rows.frame, rows.camera, rows.identity, rows.uv_px)
+    parts = (beside, true) if false_rows_first else (true, beside)
+    frame, camera, identity, uv = (np.concatenate(pair) for pair in zip(*parts, strict=True))
+    measured = np.concatenate([np.ones(len(p[0]), dtype=bool) if p is beside else real for p in parts])
+    score = score_identity(scene, Tracked(frame, camera, identity, uv, measured, 1.0))
+    assert score == score_identity(scene, rows)
+
+
 def test_clutter_taken_for_a_hidden_spot_is_wrong(scene):
     rows = perfect(scene)
     lured = replace(rows, measured=np.ones_like(rows.measured))
@@ -163,6 +176,10 @@ def test_errors_of_unseen_spots_are_those_that_were_made(scene):
         unseen = score_unseen(scene, moved, state)
         assert unseen.covered == 1.0
         np.testing.assert_allclose([unseen.rms_px, unseen.p95_px, unseen.max_px], 0.5, rtol=1e-9)
+        # A detection that is claimed for such a spot is no estimate, however wrong.
+        even = rows.frame % 2 == 0
+        claimed = score_unseen(scene, replace(moved, measured=moved.measured | even), state)
+        assert claimed.covered == np.mean(np.nonzero(scene.state == state)[0] % 2 == 1)
 
 
 def test_motmetrics_agrees_on_the_perfect_and_the_swapped(scene):
@@ -212,6 +229,10 @@ def test_a_slow_tracker_takes_the_first_seeds_and_says_so():
     slow = Entry("spots", "ours", seeds=1)
     assert command.notes([slow], [101, 102])[0] == "spots: slow, seeds 101 only"
     assert not any("slow" in line for line in command.notes([slow], [101]))
+    measured: list[results.Result] = []
+    slow = Entry("spots", "ours", options={"method": "spots"}, seeds=1)
+    assert command.run([slow], ["standard"], [101, 102], 40, measured.append) == []
+    assert [r.seed for r in measured] == [101]
 
 
 def test_results_read_back_as_written_and_newer_ones_replace_older(scene, tmp_path):
