@@ -120,13 +120,10 @@ def rms_figure(m: Material) -> str:
         time_name=m.time_name,
     )
     if m.residual_px is not None:
-        # Six numbers are fitted to the 2 n coordinates of a frame; of their noise a share 1 - 6 / 2n is left.
-        n = 2.0 * np.isfinite(m.residual_px[..., 0]).sum(axis=1)
-        left = np.sum(np.maximum(n - 6, 0)[n > 0]) / max(np.sum(n), 1.0)
         return over_time + svg.histogram(
             (m.residual_px / m.spots.sigma_px).ravel(),
-            "residual over its stated \u03c3; curve: what the fit of six numbers leaves",
+            "residual over its stated \u03c3; curve: what the pose leaves of it",
             "\u03c3",
-            curve=float(np.sqrt(left)),
+            curve=float(np.sqrt(m.residual_share or 0.0)),
         )
     return over_time + svg.histogram(p.rms_px, "residual of the pose, RMS", "px")

@@ -35,6 +35,7 @@ class Material:
     truth: Truth | None
     errors: dict[str, Any] | None  # lab.score.score
     residual_px: Array | None  # (F, V, 2), measured minus projected from the frame's pose; None without a rig
+    residual_share: float | None  # of a spot's variance that residuals should have: the pose has taken up the rest
 
     @property
     def picture_sizes(self) -> dict[str, tuple[int, int]]:
@@ -83,6 +84,7 @@ def gather(results: Path, run_folder: Path | None) -> Material:
             truth = None
     errors = score_against(spots, poses, truth, causal) if truth is not None else summary.get("errors")
     times_known = bool(len(spots.t_s)) and bool(np.isfinite(spots.t_s).all())
+    residual_px, residual_share = (None, None) if run is None else _residuals(spots, poses, run)
     return Material(
         name=str(summary.get("name") or results.resolve().name),
         summary=summary,
@@ -95,7 +97,8 @@ def gather(results: Path, run_folder: Path | None) -> Material:
         run_folder=folder,
         truth=truth,
         errors=errors if isinstance(errors, dict) else None,
-        residual_px=None if run is None else _residuals(spots, poses, run),
+        residual_px=residual_px,
+        residual_share=residual_share,
     )
 
 
@@ -108,18 +111,28 @@ def _reachable(results: Path, run_folder: Path | None, summary: dict[str, Any]) 
     return next((p for p in (Path(named), results / named) if p.is_dir()), None)
 
 
-def _residuals(spots: SpotGrid, poses: PoseTrack, run: Run) -> Array | None:
-    """(F, V, 2): measured pixel minus the pixel that the frame's measured pose gives; nan elsewhere."""
+def _residuals(spots: SpotGrid, poses: PoseTrack, run: Run) -> tuple[Array | None, float | None]:
+    """(F, V, 2): measured pixel minus the pixel that the frame's measured pose gives, nan elsewhere; and their share.
+
+    Of a measurement with covariance R in a pose of covariance P that was made with it, the residual has R - J P J^T,
+    be the pose of one frame, filtered or smoothed. The share is its mean over R; the calibration's part of P takes up
+    no noise.
+    """
     model = SpotModel.of(run.rig)
     place = {view: i for i, view in enumerate(model.views)}
     if not all(view in place for view in spots.views) or not np.array_equal(spots.frames, poses.frames):
-        return None
+        return None, None
     rows = model.subset(np.array([place[view] for view in spots.views], dtype=np.int64))
     out = np.full(spots.uv_px.shape, np.nan)
     use: Bools = poses.known & poses.has(PoseStatus.MEASURED)
+    noise = poses.covariance - np.nan_to_num(poses.systematic)
+    taken, count = 0.0, 0
     for start in range(0, len(spots.frames), _FRAMES_AT_ONCE):
         part = start + np.flatnonzero(use[start : start + _FRAMES_AT_ONCE])
         if len(part):
-            projected, _ = rows.project(poses.world_from_body[part])
+            projected, J = rows.project(poses.world_from_body[part])
             out[part] = np.where(spots.measured[part][..., None], spots.uv_px[part] - projected, np.nan)
-    return out
+            shares = np.einsum("fvij,fjk,fvik->fvi", J, noise[part], J) / spots.sigma_px[part] ** 2
+            shares = shares[np.isfinite(shares) & np.isfinite(out[part])]
+            taken, count = taken + float(np.minimum(shares, 1.0).sum()), count + len(shares)
+    return out, 1.0 - taken / count if count else None

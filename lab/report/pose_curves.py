@@ -65,12 +65,9 @@ def motion_figure(m: Material) -> str:
     values, sigmas = _motion(m.poses)
     if not np.isfinite(values).any():
         return ""
-    errors = causal = None
+    errors = None
     if m.truth is not None and m.truth.world_from_body is not None:
-        true, _ = differenced(m.truth.world_from_body, m.poses.t_s)
-        errors = values - true
-    if m.causal is not None:
-        causal = _motion(m.causal)[0] - (values if errors is None else values - errors)
+        errors = values - differenced(m.truth.world_from_body, m.poses.t_s)[0]
     names = [f"{what} {axis}" for what in ("velocity", "rate") for axis in "xyz"]
     return _rows(
         m,
@@ -81,7 +78,7 @@ def motion_figure(m: Material) -> str:
                 values[:, i],
                 sigmas[:, i],
                 None if errors is None else errors[:, i],
-                None if causal is None else causal[:, i],
+                None,  # ten times as uncertain: beside it nothing else could be seen
             )
             for i, name in enumerate(names)
         ],

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import csv
 import json
+import weakref
 from collections import Counter
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,14 +16,20 @@ import yaml
 from lab import columns, process
 from lab.batch import process_batch
 from lab.errors import InputError, RunError
-from lab.pipeline import Pipeline
+from lab.pipeline import FrameRecord, Pipeline
 from lab.process import are_results, process_run
 from lab.quality import LEAST_MEASURED
+from lab.results import read_poses
 from lab.run_file import load_run
+from lab.score import normalised_squares
 from lab.simulate.scenarios import SCENARIOS, Fault
 from lab.simulate.write import simulate
-from lab.two_passes import SMOOTHING, TRACKING, WRITING
+from lab.two_passes import SMOOTHING, TRACKING, WRITING, TwoPasses
 from tests.lab.run_folders import write_run
+from tracking.rigid_tracker import RigidTracker
+from tracking.spot_tracker import SpotTracker
+from tracking.statuses import PoseStatus, SpotStatus
+from tracking.tracked_frame import Event, TrackedFrame
 
 CAUSAL_FILES = (
     "attitude.csv", "beams.csv", "covariance.csv", "detections.csv", "report.html", "spots.csv", "summary.json",
@@ -55,6 +62,18 @@ def names(folder: Path) -> list[str]:
 
 def points_run(folder: Path, frames: int = 12, seed: int = 5) -> Path:
     return simulate("smooth", folder, seed=seed, frames=frames, detections_only=True)
+
+
+class WeakRecord(FrameRecord):
+    """A record that can be watched: the slots of the plain one leave no room for that."""
+
+
+def a_tracked_frame(n: int) -> TrackedFrame:
+    """A frame in which nothing is known of n views."""
+    return TrackedFrame(
+        np.full((n, 2), np.nan), np.full((n, 2, 2), np.nan), (SpotStatus.OCCLUDED,) * n, np.full((n, 2), np.nan),
+        np.full(n, np.nan), np.full(n, -1), PoseStatus.LOST, None, None, 0, float("nan"), (),
+    )  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -316,6 +335,134 @@ def test_what_the_error_says_to_add_is_what_makes_it_work(tmp_path):
     with (folder / "run.yaml").open("a") as file:
         file.write(advice + "\n")
     assert process_run(folder, tmp_path / "out").frames == 3
+
+
+# -- two passes -------------------------------------------------------------------------------------------------------
+
+
+def test_in_the_last_frame_the_whole_run_is_what_was_known_at_the_instant(tmp_path):
+    """Nothing comes after it. (The jerk is set: learnt from all frames it would differ from what was known then.)"""
+    known = {"learn_jerk": False, "jerk_m_s3": 2.0, "jerk_rad_s3": 5.0}
+    process_run(points_run(tmp_path / "run", frames=60), tmp_path / "out", overrides=known)
+    smoothed, causal = (read_poses(tmp_path / "out", causal=c) for c in (False, True))
+    assert np.array_equal(smoothed.frames, causal.frames)
+    away = normalised_squares(smoothed.world_from_body.minus(causal.world_from_body), causal.covariance)
+    assert away[-1] < 1e-3**2  # a thousandth of a sigma: about other references both are linear
+    assert np.median(away[:-5]) > 1.0
+    np.testing.assert_allclose(smoothed.sigma_position_m[-1], causal.sigma_position_m[-1], rtol=1e-3)
+    np.testing.assert_allclose(smoothed.sigma_ypr_deg[-1], causal.sigma_ypr_deg[-1], rtol=1e-3)
+    np.testing.assert_allclose(smoothed.sigma_velocity_m_s[-1], causal.sigma_velocity_m_s[-1], rtol=1e-2)
+    # In the midst the frames that follow tell as much as those before.
+    inner = [np.median(p.sigma_ypr_deg[10:-10, 0]) for p in (smoothed, causal)]
+    assert inner[0] < 0.75 * inner[1]
+
+
+def test_in_the_first_frame_the_whole_run_tells_more_than_the_instant(tmp_path):
+    process_run(points_run(tmp_path / "run", frames=30), tmp_path / "out")
+    smoothed, causal = (read_poses(tmp_path / "out", causal=c) for c in (False, True))
+    assert np.all(smoothed.sigma_position_m[0] < causal.sigma_position_m[0])
+    assert np.all(smoothed.sigma_velocity_m_s[0] < 0.1 * causal.sigma_velocity_m_s[0])
+
+
+def test_a_causal_run_is_what_a_smoothed_one_keeps_of_each_instant(tmp_path):
+    folder = points_run(tmp_path / "run")
+    process_run(folder, tmp_path / "smoothed")
+    process_run(folder, tmp_path / "causal", causal=True)
+    assert names(tmp_path / "causal") == sorted(CAUSAL_FILES)
+    for name in ("attitude", "covariance"):
+        kept, alone = tmp_path / "smoothed" / f"{name}_causal.csv", tmp_path / "causal" / f"{name}.csv"
+        assert kept.read_bytes() == alone.read_bytes()
+        assert kept.read_bytes() != (tmp_path / "smoothed" / f"{name}.csv").read_bytes()
+    told = [json.loads((tmp_path / which / "summary.json").read_text()) for which in ("smoothed", "causal")]
+    assert [t["attitude"] for t in told] == ["smoothed", "causal"]
+    assert [t["timings"]["smoothing_s"] > 0 for t in told] == [True, False]
+    assert set(told[0]["smoother"]) == {"jerk_m_s3", "jerk_rad_s3", "iterations", "relabelled", "seconds"}
+    assert told[1]["smoother"] is None
+    assert [t["errors"]["pose_causal"] is None for t in told] == [False, True]
+
+
+def test_what_was_predicted_before_a_frame_is_the_same_in_both_passes(tmp_path):
+    folder = points_run(tmp_path / "run")
+    process_run(folder, tmp_path / "smoothed")
+    process_run(folder, tmp_path / "causal", causal=True)
+    smoothed, causal = (rows_of(tmp_path / which / "spots.csv") for which in ("smoothed", "causal"))
+    for a, b in zip(smoothed, causal, strict=True):
+        assert (a["predicted_u_px"], a["predicted_v_px"]) == (b["predicted_u_px"], b["predicted_v_px"])
+    assert any(a["predicted_u_px"] for a in smoothed)
+
+
+def test_the_papers_tracker_is_smoothed_too_and_keeps_its_labels(tmp_path):
+    folder = points_run(tmp_path / "run")
+    process_run(folder, tmp_path / "smoothed", overrides={"method": "spots"})
+    process_run(folder, tmp_path / "causal", overrides={"method": "spots"}, causal=True)
+    summary = json.loads((tmp_path / "smoothed/summary.json").read_text())
+    assert (summary["attitude"], summary["smoother"]["relabelled"]) == ("smoothed", 0)
+    smoothed, causal = (rows_of(tmp_path / which / "spots.csv") for which in ("smoothed", "causal"))
+    assert [r["status"] for r in smoothed] == [r["status"] for r in causal]
+    assert {r["velocity_x_m_s"] for r in rows_of(tmp_path / "causal/attitude.csv")} == {""}  # it has none
+    assert "" not in {r["velocity_x_m_s"] for r in rows_of(tmp_path / "smoothed/attitude.csv")}
+
+
+def test_the_method_chooses_the_tracker(tmp_path):
+    run = load_run(points_run(tmp_path / "run", frames=3))
+    for method, kind in (("rigid", RigidTracker), ("spots", SpotTracker)):
+        chosen = replace(run, tracker=replace(run.tracker, method=method))
+        assert type(Pipeline.of(chosen).tracker) is kind
+    assert run.tracker.method == "rigid"  # unless the run says otherwise
+
+
+def test_frames_wait_on_disk_and_not_in_memory(tmp_path):
+    """Between the passes only the recording is held: no record of pass 1 is alive, and memory does not follow them."""
+    pipeline = Pipeline.of(load_run(points_run(tmp_path / "run", frames=40)))
+    alive = []
+
+    class Watched:
+        """A pipeline whose records are watched until they are gone."""
+
+        run, reader, timings = pipeline.run, pipeline.reader, pipeline.timings
+
+        @staticmethod
+        def records():
+            for record in pipeline.records():
+                copy = WeakRecord(*(getattr(record, f.name) for f in fields(record)))
+                alive.append(weakref.ref(copy))
+                yield copy
+
+    left = []
+    passes = TwoPasses(Watched(), tmp_path, lambda done, total, stage: left.append(stage == SMOOTHING and still()))
+
+    def still():
+        return sum(ref() is not None for ref in alive)
+
+    assert sum(1 for _ in passes.records()) == 40
+    assert len(alive) == 40
+    assert max(left) <= 1  # the one that the loop still holds
+    assert names(tmp_path) == ["run"]  # and no file stays
+
+
+def test_what_waits_between_the_passes_is_gone_when_nobody_reads_on(tmp_path):
+    pipeline = Pipeline.of(load_run(points_run(tmp_path / "run", frames=6)))
+    work = tmp_path / "work"
+    work.mkdir()
+    records = TwoPasses(pipeline, work).records()
+    next(records)
+    records.close()
+    assert names(work) == []
+
+
+def test_labels_that_stay_open_for_long_are_one_event():
+    tally = process._Tally(("left",), ("left/1", "left/2"))
+    nothing = replace(a_tracked_frame(2), label_probability=np.array([0.6, np.nan]))
+    for frame in (3, 4, 5, 9):
+        events = (Event("undecided", "label left open", 0), Event("dropped", "contradicts", 1))
+        tally.add(FrameRecord(frame, 0.0, 0.0, (None,), ("dark",), replace(nothing, events=events)))
+    told = [(e["frame"], e["last_frame"], e["kind"], e["spot"]) for e in tally.events]
+    assert told == [
+        (3, 5, "undecided", "1"), (3, 3, "dropped", "2"), (4, 4, "dropped", "2"), (5, 5, "dropped", "2"),
+        (9, 9, "undecided", "1"), (9, 9, "dropped", "2"),
+    ]  # fmt: skip
+    assert tally.event_kinds == {"undecided": 4, "dropped": 4}
+    assert tally.left_open == 4
 
 
 # -- complete or absent -----------------------------------------------------------------------------------------------
