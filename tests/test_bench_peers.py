@@ -249,9 +249,10 @@ def test_results_read_back_as_written_and_newer_ones_replace_older(scene, tmp_pa
     assert back[0].identity == pytest.approx(new.identity, rel=1e-5)
 
 
-def test_a_file_of_another_kind_is_not_overwritten(tmp_path):
+def test_a_file_of_another_kind_is_not_overwritten(tmp_path, capsys):
     path = tmp_path / "results.csv"
     path.write_text("tracker,fps\nnorfair,2000\n")
-    with pytest.raises(ValueError, match="the columns are not those of this bench"):
+    with pytest.raises(SystemExit, match="2"):
         command.main(["--trackers", "spots", "--frames", "30", "--out", str(path)])
+    assert "the columns are not those of this bench; choose another --out" in capsys.readouterr().err
     assert path.read_text().startswith("tracker,fps\n")

@@ -90,7 +90,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     seeds = range(a.seeds[0], a.seeds[1] + 1)
     if not seeds:
         parser.error(f"--seeds: the last, {a.seeds[1]}, comes before the first, {a.seeds[0]}")
-    old = read_results(a.out)  # a file of another kind is told before the work
+    try:
+        old = read_results(a.out)  # a file of another kind is told before the work
+    except ValueError as error:
+        parser.error(str(error))
     results: list[Result] = []
 
     def keep(result: Result) -> None:
