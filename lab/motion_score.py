@@ -75,6 +75,10 @@ def differenced(truth: Pose, t_s: Array) -> tuple[Array, Bools]:
     gaps = np.stack([np.linalg.norm((five - three)[:, part], axis=1) for part in (slice(0, 3), slice(3, 6))])
     usual = np.median(gaps[:, good], axis=1, keepdims=True)
     broken = good & np.any(gaps > np.maximum(BEND_TIMES * usual, BEND_LEAST), axis=0)
-    out[2:-2] = np.where((good & ~broken)[:, None], five, np.nan)
-    bent[2:-2] = broken
+    # In the very frame of a corner both differences are the mean of before and after, and agree: its neighbours tell.
+    beside = broken.copy()
+    beside[1:] |= broken[:-1]
+    beside[:-1] |= broken[1:]
+    out[2:-2] = np.where((good & ~beside)[:, None], five, np.nan)
+    bent[2:-2] = good & beside
     return out, bent

@@ -236,6 +236,21 @@ def make(
     return Fake(results, run_folder, model, true_uv)
 
 
+def without_added_columns(results: Path, folder: Path) -> Path:
+    """A copy of a results folder as it was written before tables had the columns of columns.ADDED."""
+    folder.mkdir()
+    for path in results.iterdir():
+        if path.suffix != ".csv":
+            (folder / path.name).write_bytes(path.read_bytes())
+            continue
+        with path.open(newline="") as file:
+            rows = list(csv.reader(file))
+        kept = [i for i, name in enumerate(rows[0]) if name not in columns.ADDED]
+        with (folder / path.name).open("w", newline="") as file:
+            csv.writer(file, lineterminator="\n").writerows([row[i] for i in kept] for row in rows)
+    return folder
+
+
 def _path(t: Array) -> tuple[Array, Pose]:
     """The vehicle's way: the triangle of its yaw, whose corners are bends, and the poses."""
     triangle = 2 / np.pi * np.arcsin(np.sin(2 * np.pi * t / 3.0))

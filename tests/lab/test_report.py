@@ -16,7 +16,7 @@ from lab.report.index import write_index
 from lab.report.material import gather
 from lab.report.pictures import MOST_PICTURES, _arrow, _limits, _stretched, chosen, events
 from lab.report.verdict import verdict_of
-from tests.lab.fake_results import Fake, make
+from tests.lab.fake_results import Fake, make, without_added_columns
 from tracking.statuses import PoseStatus, SpotStatus
 
 
@@ -140,6 +140,61 @@ def test_a_report_is_made_from_the_tables_alone_and_says_what_is_missing(tmp_pat
     html = write_report(fake.results).read_text(encoding="utf-8")
     assert "NO VERDICT" in html
     assert "summary.json is missing" in html
+
+
+def test_a_smoothed_run_shows_what_was_known_at_the_instant_as_a_thin_line_beside_it(tmp_path, page):
+    html = write_report(make(tmp_path, 120, causal=True).results).read_text(encoding="utf-8")
+    assert html.count("causal minus truth</title>") == 6
+    assert "median, smoothed; causal" in html
+    assert "RMS, smoothed; causal" in html
+    assert "Bierman (1973)" in html
+    assert_well_formed(html)
+    for words in ("causal minus", "median, smoothed", "Bierman"):  # of a run that was not smoothed
+        assert words not in page
+
+
+def test_velocity_and_rate_have_a_panel_and_a_band_each(fake, page):
+    for name in ("velocity x", "velocity y", "velocity z", "rate x", "rate y", "rate z"):
+        assert f"<title>{name}</title>" in page
+        assert f"<title>{name}: \u00b1\u03c3, \u00b13\u03c3 and error</title>" in page
+    assert "against differences of the true poses" in page
+
+
+def test_a_report_is_made_of_results_from_before_there_were_velocities(fake, tmp_path):
+    html = write_report(without_added_columns(fake.results, tmp_path / "older")).read_text(encoding="utf-8")
+    assert "Velocity and angular rate" not in html
+    assert "label left open" not in html.split("<h2>Residuals")[0].split("Status over time")[1]
+    assert "Attitude and position" in html
+    assert_well_formed(html)
+
+
+def test_what_became_of_doubtful_labels_is_told(fake, tmp_path):
+    shutil.copytree(fake.results, tmp_path / "results")
+    spots = tmp_path / "results" / "spots.csv"
+    lines = spots.read_text().splitlines()
+    doubtful = [i for i, line in enumerate(lines) if ",occluded," in line][:3]
+    for i in doubtful:
+        lines[i] += "0.6"  # a detection was there, but not likely enough to be this spot
+    spots.write_text("\n".join(lines) + "\n")
+    path = tmp_path / "results" / "summary.json"
+    summary = json.loads(path.read_text())
+    summary["counts"]["events"] = {"changed": 4, "tie": 1, "reacquired": 2, "labelled": 1}
+    open_for_long = {"frame": 20, "last_frame": 24, "kind": "undecided", "camera": "left", "spot": "1", "text": "open"}
+    path.write_text(json.dumps(summary | {"events": [open_for_long]}))
+    html = write_report(tmp_path / "results").read_text(encoding="utf-8")
+    assert len(doubtful) == 3
+    assert "Labels: 3 left open: no label was likely enough to be given; 4 changed by the second look" in html
+    assert "1 ties, in which" in html
+    assert "2 times the vehicle was found again" in html
+    assert "<td>spot 1: open, for 5 frames</td>" in html
+
+
+def test_residuals_are_judged_by_what_the_pose_leaves_of_them(fake):
+    material = gather(fake.results, None)
+    shares = (material.residual_px / material.spots.sigma_px) ** 2
+    # These poses were drawn without looking at the measured places: residuals are larger than a fit's.
+    assert np.nanmean(shares) > 1.0
+    assert material.residual_share == pytest.approx(1 - 6 / 12, abs=0.1)  # as a fit of six numbers to six spots leaves
 
 
 def test_frames_without_a_picture_are_listed_as_ranges(fake, page):

@@ -10,12 +10,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from geometry.pose import Pose
 from lab.errors import InputError
+from lab.motion_score import differenced
 from lab.results import ABSENT, SPOT_STATUSES, SpotGrid, read_poses, read_spots
 from lab.score import Truth, _returns, normalised_squares, read_truth, right_spot, score, score_against
-from tests.lab.fake_results import NOISE_PX, Fake, make
+from tests.lab.fake_results import MOTION_SIGMA, NOISE_PX, Fake, make, without_added_columns
 from tracking.statuses import PoseStatus, SpotStatus
 
 
@@ -291,3 +293,80 @@ def test_a_table_with_a_word_for_a_number_is_an_error_that_names_the_file(tmp_pa
     path.write_text(path.read_text().replace("0.01", "oh", 1))
     with pytest.raises(InputError, match=r"attitude\.csv: expected rows of equal length and numbers"):
         read_poses(fake.results)
+
+
+# -- velocity, rate, and what was known at each instant ---------------------------------------------------------------
+
+
+def test_velocities_and_rates_are_off_by_the_noise_put_in_and_bends_are_left_out(quiet):
+    s = score(quiet.results, quiet.run_folder)["motion_vs_differences"]
+    for name, sigma in (("velocity_m_s", MOTION_SIGMA[:3]), ("rate_rad_s", MOTION_SIGMA[3:])):
+        rms = np.array(list(s[name]["rms_axes"].values()))
+        np.testing.assert_allclose(rms, sigma, rtol=0.12)  # 600 rows: 3 % per sigma
+        assert s[name]["square_over_claimed_mean"] == pytest.approx(1.0, abs=0.12)
+    # The yaw's triangle has four corners in 6 s; of each the frame and the two to either side are left out.
+    assert s["rows_at_bends_left_out"] == 4 * 5
+    assert s["rows"] == 600 - 4 - 4 * 5
+
+
+def test_five_frames_tell_a_smooth_motion_to_a_millionth():
+    t = np.arange(200) / 100
+    a, b = 0.3 * np.sin(6 * t), 0.4 * np.cos(5 * t)
+    poses = Pose.from_ypr(np.stack([a, 0 * t, 0 * t], -1), np.stack([b, a, 0 * t], -1))
+    motion, bent = differenced(poses, t)
+    assert not bent.any()
+    assert np.isnan(motion[[0, 1, -2, -1]]).all()
+    true_a, true_b = 1.8 * np.cos(6 * t), -2.0 * np.sin(5 * t)
+    true = np.stack([true_b, true_a, 0 * t, 0 * t, 0 * t, true_a], -1)
+    np.testing.assert_allclose(motion[2:-2], true[2:-2], atol=1e-5)
+
+
+def test_a_rate_is_about_the_bodys_own_axes():
+    """A vehicle that is pitched by 90 degrees and turns about the world's z turns about its own -x."""
+    t = np.arange(20) / 100
+    turn = Rotation.from_rotvec(0.7 * t[:, None] * [0, 0, 1])
+    pitched = turn * Rotation.from_rotvec([0, np.pi / 2, 0])
+    motion, _ = differenced(Pose(pitched.as_matrix(), np.zeros((20, 3))), t)
+    np.testing.assert_allclose(motion[5], [0, 0, 0, -0.7, 0, 0], atol=1e-9)
+
+
+def test_across_a_gap_or_a_change_of_the_frame_rate_no_difference_is_taken():
+    t = np.concatenate([np.arange(20), np.arange(20, 40) * 2.0 - 20]) / 100
+    poses = Pose.from_ypr(np.zeros((40, 3)), np.stack([0.5 * t, 0 * t, 0 * t], -1))
+    gone = poses.translation.copy()
+    gone[10] = np.nan
+    motion, bent = differenced(Pose(poses.rotation, gone), t)
+    known = np.isfinite(motion[:, 0])
+    assert np.flatnonzero(~known).tolist() == [0, 1, 8, 9, 10, 11, 12, 19, 20, 21, 38, 39]
+    np.testing.assert_allclose(motion[known, 0], 0.5, atol=1e-9)
+    assert not bent.any()
+
+
+def test_poses_known_at_the_instant_are_scored_beside_the_smoothed_ones(tmp_path):
+    fake = make(tmp_path, 300, causal=True)
+    s = score(fake.results, fake.run_folder)
+    later, then = (s[name]["measured"] for name in ("pose", "pose_causal"))
+    assert then["position_m"]["rms"] == pytest.approx(2 * later["position_m"]["rms"], rel=1e-3)
+    assert then["nees_mean"] == pytest.approx(later["nees_mean"], rel=1e-2)
+    assert s["motion_causal_vs_differences"]["rows"] == s["motion_vs_differences"]["rows"]
+
+
+def test_results_from_before_there_were_velocities_are_read_and_have_none(quiet, tmp_path):
+    older = without_added_columns(quiet.results, tmp_path / "older")
+    poses, spots = read_poses(older), read_spots(older)
+    assert np.isnan(poses.velocity_m_s).all()
+    assert np.isnan(poses.sigma_rate_rad_s).all()
+    assert np.isnan(spots.label_probability).all()
+    now, before = score(quiet.results, quiet.run_folder), score(older, quiet.run_folder)
+    assert (before["spots"], before["pose"]) == (now["spots"], now["pose"])
+    assert before["motion_vs_differences"] is None
+    assert before["pose_causal"] is None
+
+
+def test_a_column_that_was_always_there_is_still_missed(quiet, tmp_path):
+    results = tmp_path / "results"
+    results.mkdir()
+    text = (quiet.results / "attitude.csv").read_text()
+    (results / "attitude.csv").write_text(text.replace("qw", "qq", 1))
+    with pytest.raises(InputError, match="expected a column 'qw'"):
+        read_poses(results)
