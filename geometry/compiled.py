@@ -1,8 +1,8 @@
 """Numerics compiled to machine code by numba, with the code kept on disk.
 
 The first call on a new machine compiles (about half a minute for a whole run); later processes load it. numba's own
-cache looks only at the file of the function asked for and not at those that it calls, so here the cache's folder is named
-by what all compiled sources of the package say: an edited or upgraded file never meets old code.
+cache looks only at the file of the function asked for and not at those that it calls, so here the cache's folder is
+named by what all compiled sources of the package say: an edited or upgraded file never meets old code.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import tempfile
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numba
 
@@ -24,14 +24,15 @@ _MARK = "@compiled"
 
 
 def compiled(function: Function) -> Function:
-    """numba.njit with numpy's division (x / 0 is inf, not an exception) and the cache on disk where there is a place."""
+    """numba.njit with numpy's division (x / 0 is inf, no exception) and the cache on disk where there is a place."""
     folder = _cache_folder(_sources(Path(function.__code__.co_filename).parent))
-    before = numba.config.CACHE_DIR
-    numba.config.CACHE_DIR = folder or before
+    settings: Any = numba.config  # numba looks there while it decorates
+    before = settings.CACHE_DIR
+    settings.CACHE_DIR = folder or before
     try:
         return numba.njit(function, cache=folder is not None, error_model="numpy")
     finally:
-        numba.config.CACHE_DIR = before
+        settings.CACHE_DIR = before
 
 
 @cache

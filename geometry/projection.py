@@ -86,15 +86,15 @@ def _project(v: Views, i: int, R: Array, t: Array, uv: Array, J: Array) -> bool:
     if not z > 1e-9:
         return False
     x, y = x / z, y / z
-    bx, by, a, b, c, e = _distorted(v, i, x, y)  # and the Jacobian [[a, b], [c, e]] of the distortion
-    if v.lens[i] != 0 and not (x * x + y * y < v.fold_r2[i] and a * e - b * c > 0.0):
+    bx, by, xx, xy, yx, yy = _distorted(v, i, x, y)  # and the Jacobian [[xx, xy], [yx, yy]] of the distortion
+    if v.lens[i] != 0 and not (x * x + y * y < v.fold_r2[i] and xx * yy - xy * yx > 0.0):
         return False
     fx, fy = v.pinhole[i, 0], v.pinhole[i, 1]
     uv[0], uv[1] = fx * bx + v.pinhole[i, 2], fy * by + v.pinhole[i, 3]
     # d(pixel)/d(hit), in world, row by row; along the ray a move of the vehicle changes nothing.
     lever = hit - t
     for row in range(2):
-        gx, gy = (fx * a / z, fx * b / z) if row == 0 else (fy * c / z, fy * e / z)
+        gx, gy = (fx * xx / z, fx * xy / z) if row == 0 else (fy * yx / z, fy * yy / z)
         gz = -(gx * x + gy * y)
         g0 = gx * C[0, 0] + gy * C[1, 0] + gz * C[2, 0]
         g1 = gx * C[0, 1] + gy * C[1, 1] + gz * C[2, 1]
@@ -159,7 +159,9 @@ def _distorted(v: Views, i: int, x: float, y: float) -> tuple[float, float, floa
     p1, p2 = k[2], k[3]
     denominator = 1 + r2 * (k[5] + r2 * (k[6] + r2 * k[7]))
     radial = (1 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))) / denominator
-    d_radial = (k[0] + r2 * (2 * k[1] + 3 * r2 * k[4]) - radial * (k[5] + r2 * (2 * k[6] + 3 * r2 * k[7]))) / denominator
+    d_radial = (
+        k[0] + r2 * (2 * k[1] + 3 * r2 * k[4]) - radial * (k[5] + r2 * (2 * k[6] + 3 * r2 * k[7]))
+    ) / denominator
     d_prism_x, d_prism_y = k[8] + 2 * r2 * k[9], k[10] + 2 * r2 * k[11]
     bx = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x) + r2 * (k[8] + r2 * k[9])
     by = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y + r2 * (k[10] + r2 * k[11])

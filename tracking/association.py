@@ -2,8 +2,8 @@
 
 Spots are decided one after the other, the best predicted first; each decision moves and narrows the pose, and so the
 regions in which the others are looked for shrink: after two or three spots they are about as wide as the noise. A beam
-of the best partial assignments is kept. The score is the logarithm of the likelihood of Bar-Shalom & Li (1995), sec. 6.2:
-detected or missed, a Gaussian about the prediction against the density of false points.
+of the best partial assignments is kept. The score is the logarithm of the likelihood of Bar-Shalom & Li (1995), sec.
+6.2: detected or missed, a Gaussian about the prediction against the density of false points.
 
 Source: ours (the search); the order is that of "most certain first".
 """
@@ -100,14 +100,22 @@ def expected_at(
 
 @compiled
 def associate(
-    views: Views, sights: Sights, frame: Frame, chances: Chances, R: Array, t: Array, P: Array, shown: Array, extra: Array
+    views: Views,
+    sights: Sights,
+    frame: Frame,
+    chances: Chances,
+    R: Array,
+    t: Array,
+    P: Array,
+    shown: Array,
+    extra: Array,
 ) -> tuple[Ints, Array, Array, Array, Array, int]:
     """Assignments of a frame's detections to spots, best first, from a predicted pose (R, t) and its P (6, 6).
 
     shown (n,): probability of each spot to shine. extra (n, 2, 2): covariance to add to what is expected of
-    each view's pixel (the calibration's errors), px^2. Returns assignments (b, n): a row of frame.uv, that plus BLENDED,
-    MISSED or NOT_LOOKED_FOR; their scores (b,), nats, and these without the Gaussian terms; the poses R (b, 3, 3) and
-    t (b, 3) they lead to; and b.
+    each view's pixel (the calibration's errors), px^2. Returns assignments (b, n): a row of frame.uv, that plus
+    BLENDED, MISSED or NOT_LOOKED_FOR; their scores (b,), nats, and these without the Gaussian terms; the poses
+    R (b, 3, 3) and t (b, 3) they lead to; and b.
     """
     n = sights.camera.shape[0]
     uv, J = np.empty(2), np.empty((2, 6))
@@ -279,8 +287,6 @@ def _take(views: Views, view: int, frame: Frame, d: int, extra: Array, R: Array,
     for i in range(6):
         step[i] = H[i, 0] * z0 + H[i, 1] * z1
         for j in range(6):
-            P[k, i, j] -= (
-                H[i, 0] * (sa * H[j, 0] + sb * H[j, 1]) + H[i, 1] * (sb * H[j, 0] + sc * H[j, 1])
-            )
+            P[k, i, j] -= H[i, 0] * (sa * H[j, 0] + sb * H[j, 1]) + H[i, 1] * (sb * H[j, 0] + sc * H[j, 1])
     R_k, t_k = _moved(R[k], t[k], step)
     R[k], t[k] = R_k, t_k

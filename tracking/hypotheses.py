@@ -1,8 +1,8 @@
 """Several answers to where the vehicle is, each with its own labels, until the evidence decides; compiled.
 
 Every hypothesis is moved on twice, steadily and with a jump of its velocities (a manoeuvre); each time the frame's
-detections are assigned jointly (tracking/association.py), and each assignment is a child with an exact update of its own.
-All children compete by likelihood. Source: ours; a multiple hypothesis tracker (Reid 1979) whose one target is the
+detections are assigned jointly (tracking/association.py), and each assignment is a child with an exact update of its
+own. All children compete by likelihood. Source: ours; a multiple hypothesis tracker (Reid 1979) whose one target is the
 vehicle, with the two models of motion as a branch of the tree.
 """
 
@@ -25,6 +25,8 @@ MOST_CHILDREN = 48  # of one frame, over all hypotheses
 MOST_KEPT = 8  # hypotheses from frame to frame
 FORGET = 12.0  # nats: a hypothesis so far behind is dropped
 SAME = 0.7  # two hypotheses with one assignment whose states differ by less than this in sigmas are one
+PROOF = 3  # spots: where so many lie in their narrow gates, the velocities have not jumped
+LEAST_TO_TURN = 6.0  # nats: a hypothesis so far behind is not tried with a manoeuvre as well
 SURPRISE = 3.5  # sigmas of a misfit's own scatter: beyond it a manoeuvre is considered although every spot is found
 _apart, _apply, _moved = small.apart, small.apply, small.moved
 
@@ -63,7 +65,11 @@ def no_children(n: int, groups: int) -> Children:
     """An empty list for n views in so many groups."""
     c = MOST_CHILDREN
     after = Hypotheses(
-        np.empty((c, 3, 3)), np.empty((c, 3)), np.empty((c, 12)), np.empty((c, STATE, STATE)), np.empty(c),
+        np.empty((c, 3, 3)),
+        np.empty((c, 3)),
+        np.empty((c, 12)),
+        np.empty((c, STATE, STATE)),
+        np.empty(c),
         np.empty((c, n + groups)),
     )
     return Children(after, np.empty((c, n), np.int64), np.zeros(c, np.bool_), np.zeros(c, np.int64))
@@ -124,7 +130,14 @@ def concluded(
 
 @compiled
 def grow(
-    views: Views, sights: Sights, frame: Frame, chances: Chances, dynamics: Dynamics, extra: Array, dt: float, old: Hypotheses
+    views: Views,
+    sights: Sights,
+    frame: Frame,
+    chances: Chances,
+    dynamics: Dynamics,
+    extra: Array,
+    dt: float,
+    old: Hypotheses,
 ) -> tuple[Children, int]:
     """The children of all hypotheses after a frame that comes dt (s) later."""
     n = sights.camera.shape[0]
@@ -162,8 +175,13 @@ def grow(
                 )
                 if mode == 0 and k == 0:
                     dof = 2 * spots
-                    turning = dt > 0.0 and (
-                        misfit > dof + SURPRISE * np.sqrt(2.0 * max(dof, 1)) or _misses(assigned[k], shining)
+                    turning = (
+                        dt > 0.0
+                        and old.weight[h] > -LEAST_TO_TURN
+                        and (
+                            misfit > dof + SURPRISE * np.sqrt(2.0 * max(dof, 1))
+                            or (spots < PROOF and _misses(assigned[k], shining))
+                        )
                     )
                 if spots == 0:
                     if mode == 1:
@@ -190,10 +208,7 @@ DARK_MANOEUVRE = 0.05  # least chance of a manoeuvre per frame that nothing was 
 @compiled
 def _misses(assigned: Ints, shown: Array) -> bool:
     """Whether a spot that should be seen is not."""
-    for i in range(assigned.shape[0]):
-        if (assigned[i] == MISSED or assigned[i] >= BLENDED) and shown[i] > 0.5:
-            return True
-    return False
+    return bool(np.any(((assigned == MISSED) | (assigned >= BLENDED)) & (shown > 0.5)))
 
 
 @compiled

@@ -33,7 +33,7 @@ class Misfit:
             return
         misfit = chi2 / dof
         self._recent.append(misfit)
-        usual = float(np.median(self._recent))
+        usual = sorted(self._recent)[len(self._recent) // 2]
         if len(self._recent) == self._recent.maxlen and usual > 3 * max(self._mean, 1.0):
             self._mean = usual
         self._mean *= 1 + (min(misfit / self._mean, 3.0) - 1) / MEMORY

@@ -39,7 +39,7 @@ class LabelParameters:
 
 @dataclass(frozen=True, slots=True)
 class TrackerParameters:
-    """Tracking (tracking/rigid_tracker.py, tracking/spot_tracker.py). Symbols: Huo, Yang & Yang 2015, sections 3 and 4.1."""
+    """Tracking (rigid_tracker.py, spot_tracker.py). Symbols: Huo, Yang & Yang 2015, sections 3 and 4.1."""
 
     method: Literal["rigid", "spots"] = (
         "rigid"  # rigid: one filter for the vehicle that carries all spots | spots: the paper's, a filter per spot

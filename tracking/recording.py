@@ -50,9 +50,7 @@ class Recording:
         self._dt.append(dt_s)
         self._uv.append(np.concatenate([f.uv_px for f in some]) if some else none2)
         self._cov.append(np.concatenate([f.cov_px2 for f in some]) if some else none4)
-        self._shaped.append(
-            np.concatenate([~np.isnan(f.major_px) for f in some]) if some else np.zeros(0, dtype=bool)
-        )
+        self._shaped.append(np.concatenate([~np.isnan(f.major_px) for f in some]) if some else np.zeros(0, dtype=bool))
         self._first.append(first)
         self._has_image.append(np.array([f is not None for f in found]))
         start = first[self.model.camera_of]

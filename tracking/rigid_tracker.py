@@ -12,26 +12,26 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from geometry.arrays import Array, Bools, Ints
+from geometry.arrays import Array, Ints
 from geometry.calibration_spread import CalibrationSpread
 from geometry.pose import Pose
 from geometry.projection import project_all
 from geometry.rig import Rig
 from geometry.rig_parameters import RigCovariance
-from geometry.solve import SolveLimits, covariance_of, fit_pose
+from geometry.solve import SolveLimits, fit_pose
 from geometry.spots import SpotModel
 from tracking.association import BLENDED, Chances, Frame, Sights
 from tracking.detections import Detections
+from tracking.digest import Digest, ahead, digest, surprise
 from tracking.hiding import MISSED, learnt, together
 from tracking.hypotheses import Children, Hypotheses, add_child, chosen_points, concluded, grow, no_children, sift
 from tracking.information import fit_alone
 from tracking.labels import NO_POINT, LabelResult, PosePrior, find_labels
 from tracking.match import UNMATCHED
 from tracking.misfit import Misfit
-from tracking.motion import STATE
 from tracking.parameters import TrackerParameters
 from tracking.statuses import PoseStatus, SpotStatus, view_statuses
-from tracking.surroundings import ClutterNearSpots
+from tracking.surroundings import RADIUS_PX, ClutterNearSpots
 from tracking.temper import Temper
 from tracking.tracked_frame import Event, MotionEstimate, TrackedFrame
 from tracking.usable_points import UsablePoints, check_step
@@ -42,6 +42,8 @@ FIRST_ACCELERATION, FIRST_ANGULAR = 30.0, 100.0  # m/s^2, rad/s^2
 P_FRESH = 1e-3  # probability per frame that the vehicle is not where any hypothesis has it
 LOST_SIGMA_M, LOST_SIGMA_RAD = 1.0, np.deg2rad(60.0)  # a predicted pose vaguer than this is `lost`
 FEW = 4  # spots: fewer do not tell a lost vehicle from one that is mostly hidden
+DOUBT_FRAMES = 50  # in a row with fewer: then they are doubted
+NOWHERE = (SpotStatus.LOST, SpotStatus.OFF_SCREEN)
 VAGUE_PX = 15.0  # 1 sigma of a predicted spot: beyond it the whole picture is searched at once
 
 
@@ -146,8 +148,9 @@ class RigidTracker:
                 self._few = 0
                 return False
             self._few += 1
-            if self._few < 3 and not self._vague(self._hypotheses):
-                return False
+            if not self._vague(self._hypotheses):
+                # Few spots where the motion is known are mostly hidden ones; seldom they are false points.
+                return self._few % DOUBT_FRAMES == 0
         # At once when light returns, then ever more rarely: what fails for long will fail in the next frame too.
         self._searches += 1
         return self._searches <= 10 or self._searches % 5 == 0
@@ -158,7 +161,7 @@ class RigidTracker:
         return bool(np.sqrt(np.max(spread[:, [0, 1], [0, 1]])) > VAGUE_PX)
 
     def _search_prior(self) -> PosePrior:
-        """Around the last measured pose, as far as the vehicle may have got since; the run's own before there is one."""
+        """Around the last measured pose, as far as the vehicle may have got since; before there is one, the run's."""
         if self._anchor is None:
             return self.prior
         p, age = self.parameters, self._anchor_age_s
@@ -258,18 +261,15 @@ class RigidTracker:
     def _predicted_px(self, dt_s: float) -> Array:
         """Where the best hypothesis expected each spot, (n, 2), before this frame's picture was looked at."""
         h = self._hypotheses
-        if h is None or self._lost(h.P[0, :6, :6]):
+        if h is None or self._lost(h.P[0]):
             return np.full((len(self.model), 2), np.nan)
-        turn = dt_s * h.m[0, 3:6] + 0.5 * dt_s**2 * h.m[0, 9:12]
-        move = dt_s * h.m[0, :3] + 0.5 * dt_s**2 * h.m[0, 6:9]
-        pose = Pose(h.R[0], h.t[0]).plus(np.concatenate([move, turn]))
-        return project_all(self.model.numbers, pose.rotation[None], pose.translation[None])[0][0]
+        return ahead(self.model.numbers, h, dt_s)
 
     @staticmethod
     def _lost(covariance: Array) -> bool:
-        """Whether a pose of this covariance (6, 6) says nothing any more."""
-        s = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
-        return bool(s[:3].max() >= LOST_SIGMA_M or s[3:].max() >= LOST_SIGMA_RAD)
+        """Whether a pose of this covariance (6 or more, square) says nothing any more."""
+        d = covariance.diagonal()
+        return bool(max(d[:3]) >= LOST_SIGMA_M**2 or max(d[3:6]) >= LOST_SIGMA_RAD**2)
 
     def _conclude(
         self,
@@ -291,66 +291,70 @@ class RigidTracker:
         h = self._hypotheses
         assert h is not None
         assigned = children.assigned[best]
-        # What was found from a prior alone must lead as it must in labels.py: a tie of 5 to 1 is still a tie.
-        unproven = self._anchor is None or best in fresh
-        least = max(p.min_label_probability, 1 / (1 + np.exp(-p.labels.lead_nats)) if unproven else 0.0)
-        labelled = (assigned >= 0) & (certain >= least)
-        use, uv, cov = chosen_points(frame, np.where(labelled, assigned, MISSED), np.zeros_like(self._extra))
-        R1, t1, L1, chi2, count = fit_alone(model.numbers, h.R[0], h.t[0], use, uv, cov)
-        alone, observable = covariance_of(L1) if count >= 3 else (np.full((6, 6), np.inf), False)
-        measured = observable and self._good(alone)
+        d = digest(
+            model.numbers, self._sights, frame, h.R[0], h.t[0], assigned, certain, p.min_label_probability, RADIUS_PX
+        )
+        count = int(np.count_nonzero(d.use))
+        measured = count >= 3 and self._good(d.alone)
         if measured:
-            self.misfit.take(chi2, 2 * count - 6)
-        systematic = self._calibrated(use, uv, cov, h) if measured else self._systematic
+            self.misfit.take(d.chi2, 2 * count - 6)
+        if measured and self.calibration is not None:
+            self._look_at_calibration(d, h)
+        systematic = self._systematic
         pose = Pose(h.R[0], h.t[0])
         covariance = h.P[0, :6, :6] + spread + systematic
-        if measured:
-            status = PoseStatus.MEASURED
-        else:
-            status = PoseStatus.LOST if self._lost(covariance) else PoseStatus.PREDICTED
-        known = status is not PoseStatus.LOST
-        # Fewer than three certain spots of a vehicle that was never found are no start.
-        if self._anchor is None and not measured:
-            known, status = False, PoseStatus.LOST
-        labelled = labelled & known
+        known = measured or (self._anchor is not None and not self._lost(covariance))
+        labelled = d.labelled if known else np.zeros_like(d.labelled)
         if measured:
             if best in fresh:
                 events.append(Event(self._kind_of_search(dt_s), f"spots {fresh[best]} found from the prior alone"))
+            elif before is not None and dt_s > 0:
+                slope = surprise(
+                    model.numbers,
+                    before,
+                    int(children.parent[best]),
+                    dt_s,
+                    self.temper.dynamics.jerk,
+                    d.use,
+                    d.uv,
+                    d.cov,
+                )
+                self.temper.learn(h.m[0, :6], bool(children.manoeuvre[best]), slope)
             self._anchor, self._anchor_age_s, self._told_tie = pose, 0.0, False
             if count >= FEW:
                 self._searches = 0
-        undecided = np.flatnonzero((assigned >= 0) & ~labelled)
-        events.extend(
-            Event("undecided", f"label left open: its probability is {certain[v]:.2f}", int(v)) for v in undecided if known
-        )
-        self.temper.learn(before, children, best, dt_s, measured and best not in fresh, use, uv, cov, model.numbers)
-        expected_px, expected_cov, exists = self._estimates(pose, covariance)
-        self._clutter.learn(frame, assigned % BLENDED, expected_px, known)
-        seen_uv, seen_cov = self._points(found, frame, assigned, labelled)
-        out_uv = np.where(labelled[:, None], seen_uv, expected_px)
-        out_cov = np.where(labelled[:, None, None], seen_cov, expected_cov)
-        turned = labelled & bool(children.manoeuvre[best])
-        inside = model.in_picture(out_uv)
-        spot_status = view_statuses(labelled, turned, exists, inside, frame.has_image[model.camera_of], known)
-        hide = np.array([s in (SpotStatus.LOST, SpotStatus.OFF_SCREEN) for s in spot_status])
-        out_uv[hide] = np.nan
-        used = use & known
-        residual = (uv - project_all(model.numbers, R1[None], t1[None])[0][0])[used]
-        point = np.where(labelled, assigned % BLENDED - frame.first[model.camera_of], UNMATCHED)
+        if known:
+            self._clutter.learn(d.near, d.discs)
+            events.extend(
+                Event("undecided", f"label left open: its probability is {certain[v]:.2f}", int(v))
+                for v in np.flatnonzero((assigned >= 0) & ~labelled)
+            )
+        seen = labelled[:, None]
+        uv_px = np.where(seen, d.uv, d.expected_px)
+        expected_cov = d.jacobian @ covariance @ d.jacobian.transpose(0, 2, 1) + self._extra
+        cov_px2 = np.where(seen[..., None], d.cov, expected_cov)
+        blended = labelled & (assigned >= BLENDED)
+        if blended.any():
+            cov_px2[blended] += (p.blend_px / 2) ** 2 * np.eye(2)  # a neighbour has pulled it, nobody knows how far
+        turned = labelled & children.manoeuvre[best]
+        exists = ~np.isnan(d.expected_px[:, 0])
+        status = view_statuses(labelled, turned, exists, d.inside, frame.has_image[model.camera_of], known)
+        uv_px[[s in NOWHERE for s in status]] = np.nan
+        pose_status = PoseStatus.MEASURED if measured else PoseStatus.PREDICTED if known else PoseStatus.LOST
         return TrackedFrame(
-            uv_px=out_uv,
-            cov_px2=out_cov,
-            status=spot_status,
+            uv_px=uv_px,
+            cov_px2=cov_px2,
+            status=status,
             predicted_px=predicted,
             gain=np.full(len(model), np.nan),
-            point=point,
-            pose_status=status,
+            point=np.where(labelled, assigned % BLENDED - frame.first[model.camera_of], UNMATCHED),
+            pose_status=pose_status,
             pose=pose if known else None,
             pose_covariance=covariance if known else None,
-            spots_used=int(np.count_nonzero(used)) if measured else 0,
-            rms_px=float(np.sqrt(np.mean(residual**2))) if len(residual) and measured else float("nan"),
+            spots_used=count if measured else 0,
+            rms_px=float(d.rms_px) if measured else float("nan"),
             events=tuple(events),
-            label_probability=np.where(labelled | (assigned >= 0), certain, np.nan),
+            label_probability=np.where(assigned >= 0, certain, np.nan),
             motion=MotionEstimate(h.m[0, :3], h.m[0, 3:6], h.P[0, 6:12, 6:12]) if known else None,
             pose_systematic=systematic if known else None,
         )
@@ -362,46 +366,24 @@ class RigidTracker:
 
     def _good(self, alone: Array) -> bool:
         """Whether a single frame's covariance (6, 6) makes it a measurement. The trace decides all but hard cases."""
-        d = np.diagonal(alone)
-        if np.sqrt(d[:3].sum()) <= self.limits.max_sigma_m and np.sqrt(d[3:].sum()) <= self.limits.max_sigma_rad:
+        d = alone.diagonal()
+        if sum(d[:3]) <= self.limits.max_sigma_m**2 and sum(d[3:]) <= self.limits.max_sigma_rad**2:
             return True
+        if not np.isfinite(d).all():
+            return False
         worst = [np.sqrt(np.linalg.eigvalsh(alone[i, i])[-1]) for i in (slice(0, 3), slice(3, 6))]
         return bool(worst[0] <= self.limits.max_sigma_m and worst[1] <= self.limits.max_sigma_rad)
 
-    def _calibrated(self, use: Bools, uv: Array, cov: Array, h: Hypotheses) -> Array:
-        """The calibration's share of this frame's pose covariance; what it does to the expected pixels is remembered."""
-        if self.calibration is None:
-            return self._systematic
-        rows = np.flatnonzero(use)
-        fit = fit_pose(self.model, rows, uv[rows], cov[rows], Pose(h.R[0], h.t[0]), calibration=self.calibration)
+    def _look_at_calibration(self, d: Digest, h: Hypotheses) -> None:
+        """What the calibration's errors do to this frame's pose and, through it, to the expected pixels."""
+        rows = np.flatnonzero(d.use)
+        start = Pose(h.R[0], h.t[0])
+        fit = fit_pose(self.model, rows, d.uv[rows], d.cov[rows], start, calibration=self.calibration)
         if fit is not None and fit.observable:
             self._extra = np.zeros_like(self._extra) + fit.calibration_px()
             self._systematic = fit.systematic
-        return self._systematic
 
-    def _estimates(self, pose: Pose, covariance: Array) -> tuple[Array, Array, Bools]:
-        """Where the pose puts all spots, (n, 2), with covariances (n, 2, 2), and which have a projection."""
-        uv, J = project_all(self.model.numbers, pose.rotation[None], pose.translation[None])
-        cov = J[0] @ covariance @ np.swapaxes(J[0], -1, -2) + self._extra
-        exists: Bools = ~np.isnan(uv[0, :, 0])
-        return uv[0], cov, exists
-
-    def _points(
-        self, found: Sequence[Detections | None], frame: Frame, assigned: Ints, labelled: Bools
-    ) -> tuple[Array, Array]:
-        """Positions (n, 2) and covariances (n, 2, 2) of the labelled detections; a blended one is as vague as it may be."""
-        n = len(self.model)
-        uv, cov = np.full((n, 2), np.nan), np.full((n, 2, 2), np.nan)
-        rows = np.flatnonzero(labelled)
-        d = assigned[rows] % BLENDED
-        uv[rows], cov[rows] = frame.uv[d], frame.cov[d]
-        blended = rows[assigned[rows] >= BLENDED]
-        cov[blended] += (self.parameters.blend_px / 2) ** 2 * np.eye(2)
-        return uv, cov
-
-    def _nothing(
-        self, found: Sequence[Detections | None], predicted: Array, events: list[Event]
-    ) -> TrackedFrame:
+    def _nothing(self, found: Sequence[Detections | None], predicted: Array, events: list[Event]) -> TrackedFrame:
         """A frame before the vehicle was ever found."""
         n = len(self.model)
         return TrackedFrame(

@@ -142,7 +142,7 @@ def _first_reference(rec: Recording) -> Reference:
 
 
 def _calibration(rec: Recording, every: AllDetections, assigned: Ints, ref: Reference) -> tuple[Array, Array]:
-    """What the calibration's errors do: to the expected pixels (n, 2, 2), the mean over the run, and poses (T, 6, 6)."""
+    """What the calibration's errors do: to expected pixels (n, 2, 2), mean over the run, and to poses (T, 6, 6)."""
     n = len(rec.model)
     extra, systematic = np.zeros((n, 2, 2)), np.zeros((1, 6, 6))
     if rec.calibration is None:
@@ -167,7 +167,7 @@ def _noise_scale(
 ) -> float:
     """How much larger than claimed the spots' errors are: of the frames' own fits, deaf to the worst; 1 if honest."""
     shares = []
-    for k in np.flatnonzero(measured):
+    for k in np.flatnonzero(measured).tolist():
         use, uv, cov = labelled_points(every, k, assigned[k], extra)
         _, _, _, chi2, count = fit_alone(views, ref.R[k], ref.t[k], use, uv, cov)
         if count > 3:
@@ -184,7 +184,8 @@ def _evidence(
     """The frames' information at a reference, and where the motion may have bent."""
     L, g, _, _ = evidence_of(views, every, assigned, extra, ref)
     dt = rec.dt_s
-    window = max(1, int(round(SPEED_WINDOW_S / max(float(np.median(dt[dt > 0])) if np.any(dt > 0) else 0.01, 1e-6))))
+    usual = float(np.median(dt[dt > 0])) if np.any(dt > 0) else SPEED_WINDOW_S
+    window = max(1, min(round(SPEED_WINDOW_S / usual), len(dt)))
     speed = np.stack([np.linalg.norm(ref.m[:, :3], axis=1), np.linalg.norm(ref.m[:, 3:6], axis=1)], axis=1)
     fastest = _running_maximum(np.where(measured[:, None], speed, 0.0), window)
     size = (LEAST_JUMP + JUMP_OF_SPEED * fastest) ** 2
@@ -245,7 +246,9 @@ def _likeliest_jerk(ref: Reference, ev: Evidence, before: Array | None) -> Array
     frames = len(ev.dt)
     middle = slice(max(0, (frames - MOST_FRAMES_FOR_JERK) // 2), (frames + MOST_FRAMES_FOR_JERK) // 2)
     ref = Reference(*(a[middle] for a in ref))
-    ev = Evidence(*(a[middle] for a in ev[:-1]), ev.first)
+    ev = Evidence(
+        ev.information[middle], ev.vector[middle], ev.dt[middle], ev.jump[middle], ev.unsteady[middle], ev.first
+    )
 
     def cost(log_jerk: Array) -> float:
         value = -log_likelihood(ref, ev, np.exp(2 * np.clip(log_jerk, np.log(RANGE[0]), np.log(RANGE[1]))))
@@ -256,8 +259,12 @@ def _likeliest_jerk(ref: Reference, ev: Evidence, before: Array | None) -> Array
         grid = [np.array([a, a + b]) for a in steps for b in np.log([0.5, 3.0, 20.0])]
         before = min(grid, key=cost)
     simplex = before + 0.7 * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
-    options = {"xatol": 0.05, "fatol": 0.05, "maxiter": 60, "initial_simplex": simplex}
-    found = minimize(cost, before, method="Nelder-Mead", options=options)
+    found = minimize(
+        cost,
+        before,
+        method="Nelder-Mead",
+        options={"xatol": 0.05, "fatol": 0.05, "maxiter": 60, "initial_simplex": simplex},
+    )
     return np.clip(np.asarray(found.x, dtype=float), np.log(RANGE[0]), np.log(RANGE[1]))
 
 

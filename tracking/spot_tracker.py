@@ -95,8 +95,6 @@ class SpotTracker:
             return
         self.tracks.predict(dt_s)
         self.vehicle.predict(dt_s)
-        if self.parameters.method == "rigid" and self.vehicle.motion is not None and self.vehicle.known:
-            self.tracks.carry(np.ones(len(self.model), dtype=bool), self.model, self.vehicle.motion)
 
     # -- matching -----------------------------------------------------------------------------------------------------
 

@@ -6,7 +6,6 @@ import numpy as np
 
 from geometry.arrays import Array, Ints
 from geometry.spots import SpotModel
-from tracking.association import Frame
 
 RADIUS_PX = 15.0  # of the discs around the expected spots in which false points are counted
 AREA_PX2 = np.pi * RADIUS_PX**2
@@ -32,18 +31,7 @@ class ClutterNearSpots:
         density = np.maximum(np.maximum(self._near, np.diff(first) / self._area), self._least)
         return np.log(density)[self._camera_of]
 
-    def learn(self, frame: Frame, assigned: Ints, expected_px: Array, known: bool) -> None:
-        """Count the points beside the expected spots (n, 2) that were not assigned (n,) to any."""
-        if not known or not len(frame.uv):
-            return
-        free = np.ones(len(frame.uv), dtype=bool)
-        free[assigned[(assigned >= 0) & (assigned < len(free))]] = False
-        for c in range(len(self._near)):
-            views = np.flatnonzero((self._camera_of == c) & ~np.isnan(expected_px[:, 0]))
-            if not frame.has_image[c] or not len(views):
-                continue
-            points = frame.uv[frame.first[c] : frame.first[c + 1]][free[frame.first[c] : frame.first[c + 1]]]
-            gap2 = np.sum((expected_px[views, None] - points[None]) ** 2, axis=-1)
-            rate = np.count_nonzero(gap2 < RADIUS_PX**2) / (len(views) * AREA_PX2)
-            share = len(views) / MEMORY
-            self._near[c] += share * (rate - self._near[c])
+    def learn(self, near: Array, discs: Array) -> None:
+        """Of one frame: how many false points (cameras,) lay within RADIUS_PX of how many expected spots (cameras,)."""
+        share = discs / MEMORY
+        self._near += share * (near / (np.maximum(discs, 1.0) * AREA_PX2) - self._near)

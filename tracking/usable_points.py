@@ -104,7 +104,7 @@ class UsablePoints:
 
     @staticmethod
     def of(found: Sequence[Detections | None]) -> UsablePoints:
-        """Leave out of each camera's detections what cannot be used. Raises ValueError for an array of a wrong shape."""
+        """Leave out of each camera's detections what cannot be used. ValueError for an array of a wrong shape."""
         kept: list[Detections | None] = []
         rows: list[Ints | None] = []
         for points in found:
