@@ -344,6 +344,15 @@ def test_parameters_are_read_as_yaml_and_reach_the_run(tmp_path):
     assert (tracker["curve_switch"], tracker["g1_scale"]) == (False, "paper")
 
 
+def test_causal_leaves_out_the_second_pass(tmp_path):
+    folder = points_run(tmp_path / "run")
+    assert typed("run", folder, "--out", tmp_path / "one", "--causal").exit_code == 0
+    assert typed("batch", folder, "--out", tmp_path / "many", "--causal").exit_code == 0
+    for out in (tmp_path / "one", tmp_path / "many/run"):
+        assert json.loads((out / "summary.json").read_text())["attitude"] == "causal"
+        assert not (out / "attitude_causal.csv").exists()
+
+
 def test_a_run_without_a_prior_is_told_what_to_add(tmp_path):
     folder = points_run(tmp_path / "run")
     content = yaml.safe_load((folder / "run.yaml").read_text())
