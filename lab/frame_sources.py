@@ -114,7 +114,11 @@ class FolderSource:
 
 @dataclass(frozen=True, slots=True)
 class TableSource:
-    """Points found already. Within the file's range a frame without a row is a picture in which nothing was found."""
+    """Points found already.
+
+    Within the file's range a frame without a row is a picture in which nothing was found; one of whose rows none can be
+    used is a picture that cannot be read.
+    """
 
     points: CameraPoints | None  # None: no row of this camera
     first: int
@@ -123,7 +127,11 @@ class TableSource:
     def ask(self, frame: int, pool: ThreadPoolExecutor) -> Asked:
         if not self.first <= frame <= self.last:
             return Missing(DROPPED)
-        return Detections.none() if self.points is None else self.points.at(frame)
+        if self.points is None:
+            return Detections.none()
+        if self.points.says_nothing_of(frame):
+            return Missing(f"{UNREADABLE}: no row of it can be used")
+        return self.points.at(frame)
 
     def close(self) -> None: ...
 

@@ -7,13 +7,13 @@ from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from geometry.arrays import Ints
-from lab.detections_file import DetectionsFile, read_detections
+from geometry.arrays import Bools, Ints
+from lab.detections_file import CameraPoints, DetectionsFile, read_detections, too_sparse
 from lab.errors import InputError
 from lab.frame_sources import (
     Asked,
@@ -30,13 +30,13 @@ from lab.frame_sources import (
 )
 from lab.pictures import DROPPED, Grey, Missing
 from lab.run_file import DetectionsTable, FramesFolder, Run, VideoFile
+from lab.yaml_text import did_you_mean
 
 __all__ = ["FrameReader", "FrameSet", "Grey", "Missing", "Picture", "open_frames", "pictures_at"]
 
 AHEAD = 8  # frames read before they are asked for: 21 MB of two 1280x1024 cameras, whatever the run's length
 THREADS = min(4, os.cpu_count() or 1)  # pictures decoded at once
-SPARSEST = 1000  # frame numbers per picture: more than that is a stray file or a name that holds a time
-MANY = 100_000  # frame numbers that a run may span however sparse it is
+BEYOND_PX = 32.0  # a fit may put the centre of a spot that the edge cuts outside the picture, but not so far
 NAMED = 5  # so many frames of each trouble are named in the notes
 
 
@@ -62,7 +62,7 @@ class FrameReader:
         self._trouble: dict[str, dict[str, tuple[int, list[int]]]] = {}  # camera, reason: count, first frames
         self._ended: dict[str, str] = {}
         self._promised: dict[str, int | None] = {}
-        opened: dict[Path, DetectionsFile | None] = {}
+        opened: dict[Path, DetectionsFile] = {}
         for name, source in run.cameras.items():
             if isinstance(source, FramesFolder):
                 self._listings[name] = list_folder(source.path)
@@ -158,12 +158,13 @@ class FrameReader:
             return
         pictures = sum(len(v.names) for v in self._listings.values())
         pictures += sum(len(c.frames) for t in self._tables.values() for c in t.cameras.values())
-        span = self.last - self.first + 1
-        if span > MANY and span > SPARSEST * pictures:
+        if too_sparse(self.last - self.first + 1, pictures):
+            stray = "file" if self._listings else "row"
+            holders = "names" if self._listings else "frame numbers"
             raise InputError(
                 f"{self._run.path}: cameras: expected frame numbers without gaps of many thousands, got {pictures}"
-                f" pictures between frame {self.first} and frame {self.last}; is a stray file among them, or do the"
-                " names hold a time?"
+                f" pictures between frame {self.first} and frame {self.last}; is a stray {stray} among them, or do the"
+                f" {holders} hold a time?"
             )
 
     def _check_times(self) -> None:
@@ -178,19 +179,64 @@ class FrameReader:
                 f" {untimed.size} of them (the first is frame {untimed[0]})"
             )
 
-    def _note_table(self, path: Path, table: DetectionsFile | None) -> None:
-        if table is None:
-            raise InputError(f"{path}: expected rows with frame, camera, u_px, v_px, got none that can be used")
+    def _note_table(self, path: Path, table: DetectionsFile) -> None:
         self._notes.extend(table.notes)
-        unknown = [c for c in table.cameras if c not in self._run.rig.cameras and c not in self._run.left_out]
+        unknown = self._unknown(table)
         if unknown:
             self._notes.append(f"{path}: rows of cameras that the rig does not have are not used: {', '.join(unknown)}")
 
-    def _note_camera(self, name: str, path: Path, table: DetectionsFile | None) -> None:
-        assert table is not None  # _note_table has raised
+    def _unknown(self, table: DetectionsFile) -> list[str]:
+        """Cameras of a table that the rig does not have."""
+        known = (*self._run.rig.cameras, *self._run.left_out)
+        return [c for c in (*table.cameras, *table.spoilt) if c not in known]
+
+    def _note_camera(self, name: str, path: Path, table: DetectionsFile) -> None:
+        points = table.cameras.get(name)
+        if points is not None:
+            points = self._in_picture(name, path, points)
+            self._tables[name] = replace(table, cameras={**table.cameras, name: points})
+            return
+        if name in table.spoilt:
+            raise InputError(
+                f"{path}: camera {name!r}: expected rows that can be used, got none: {table.spoilt[name]}; put them"
+                f" right, or leave {name!r} out of `cameras` in {self._run.path}"
+            )
+        unknown = self._unknown(table)
+        if unknown:
+            raise InputError(
+                f"{path}: camera: expected rows of {name!r}, got none, but rows of {', '.join(map(repr, unknown))},"
+                f" which the rig does not have{did_you_mean(unknown[0], self._run.rig.cameras)}"
+            )
         self._tables[name] = table
-        if name not in table.cameras:
-            self._notes.append(f"{path}: no rows of camera {name!r}; it is taken to have found nothing")
+        self._notes.append(f"{path}: no rows of camera {name!r}; it is taken to have found nothing")
+
+    def _in_picture(self, name: str, path: Path, points: CameraPoints) -> CameraPoints:
+        """A camera's points without those far outside its picture. Raises InputError where that is most of them."""
+        size = np.array(self._run.rig.cameras[name].image_size_px)
+        uv = points.points.uv_px
+        outside: Bools = np.any((uv < -0.5 - BEYOND_PX) | (uv > size - 0.5 + BEYOND_PX), axis=-1)
+        count = np.diff(points.starts)
+        fullest = int(np.argmax(count))
+        if count[fullest] > self._run.tracker.detect.max_detections:
+            self._notes.append(
+                f"{path}: camera {name!r}: up to {count[fullest]} points in one picture (frame"
+                f" {points.frames[fullest]}); few spots are sure to be told from so many, and it takes longer"
+            )
+        if not outside.any():
+            return points
+        row = int(np.flatnonzero(outside)[0])
+        frame = int(points.frames[np.searchsorted(points.starts, row, side="right") - 1])
+        told = (
+            f"{outside.sum()} of {len(uv)} points more than {BEYOND_PX:g} px outside its picture of"
+            f" {size[0]}x{size[1]} px (the first in frame {frame}, at {uv[row, 0]:.7g}, {uv[row, 1]:.7g})"
+        )
+        if outside.mean() > 0.5:
+            raise InputError(
+                f"{path}: camera {name!r}: expected points in the picture, got {told}; are u and v exchanged, or the"
+                " pictures of another size than the rig says?"
+            )
+        self._notes.append(f"{path}: camera {name!r}: left out: {told}")
+        return points.without(outside)
 
     def _note_ends(self, ended: Sequence[str], frame: int) -> None:
         for name in ended:

@@ -64,31 +64,42 @@ def test_without_sigmas_a_tenth_of_a_pixel_is_assumed_and_said(tmp_path):
     assert file.notes[0].endswith("no column sigma_u_px and sigma_v_px: 0.1 px is assumed")
 
 
-@pytest.mark.parametrize(
-    ("bad", "why"),
-    [
-        (row(1.5, "left", 1, 2), "the frame is no whole number"),
-        (row("", "left", 1, 2), "the frame is no whole number"),
-        (row("1e300", "left", 1, 2), "the frame is no whole number"),
-        (row("one", "left", 1, 2), "the frame is no whole number"),
-        (row(1, "", 1, 2), "no camera is named"),
-        (row(1, "left", "nan", 2), "u_px or v_px is no finite number"),
-        (row(1, "left", 1, "inf"), "u_px or v_px is no finite number"),
-        (row(1, "left", 1, "12;5"), "u_px or v_px is no finite number"),
-        (row(1, "left", 1, 2, sigma=0), "a sigma is not above 0"),
-        (row(1, "left", 1, 2, sigma=-0.1), "a sigma is not above 0"),
-        (row(1, "left", 1, 2, sigma="nan"), "a sigma is not above 0"),
-        (row(1, "left", 1, 2, cov=0.01), "cov_uv_px2 is not below the product of the sigmas"),
-        (row(0, " left", 5, 6), "the same point a second time"),
-        ("1,le", "u_px or v_px is no finite number"),  # the last line of a writer that was killed
-    ],
-)
-def test_a_row_that_cannot_be_used_is_left_out_and_said(bad, why, tmp_path):
+AGAIN = "the same point a second time, or one less than 0.05 px from it"
+BAD_ROWS = [
+    (row(1.5, "left", 1, 2), "the frame is no whole number", "frame 1.5"),
+    (row("", "left", 1, 2), "the frame is no whole number", "frame nothing"),
+    (row("1e300", "left", 1, 2), "the frame is no whole number", "frame 1e+300"),
+    (row("one", "left", 1, 2), "the frame is no whole number", "frame 'one'"),
+    (row(-1, "left", 1, 2), "the frame is negative; frames count from 0", "frame -1"),
+    (row(1, "", 1, 2), "no camera is named", ""),
+    (row(1, "left", "nan", 2), "u_px or v_px is no finite number", "u_px 'nan' and v_px 2"),
+    (row(1, "left", 1, "inf"), "u_px or v_px is no finite number", "u_px 1 and v_px inf"),
+    (row(1, "left", 1, "12;5"), "u_px or v_px is no finite number", "u_px 1 and v_px '12;5'"),
+    (row(1, "left", -1e12, 2), "u_px or v_px is beyond 1000000 px: no picture is so wide", "u_px -1e+12 and v_px 2"),
+    (row(1, "left", 1, 2, sigma=0), "a sigma is not above 0", "sigma_u_px 0 and sigma_v_px 0"),
+    (row(1, "left", 1, 2, sigma=-0.1), "a sigma is not above 0", "sigma_u_px -0.1 and sigma_v_px -0.1"),
+    (row(1, "left", 1, 2, sigma="nan"), "a sigma is not above 0", "sigma_u_px 'nan' and sigma_v_px 'nan'"),
+    (row(1, "left", 1, 2, sigma=""), "a sigma is not above 0", "sigma_u_px nothing and sigma_v_px nothing"),
+    (row(1, "left", 1, 2, sigma=1e-7),
+     "a sigma is below 0.0001 px: no camera measures so well; is it in another unit?",
+     "sigma_u_px 1e-07 and sigma_v_px 1e-07"),
+    (row(1, "left", 1, 2, sigma=1e200), "a sigma is beyond 1000000 px", "sigma_u_px 1e+200 and sigma_v_px 1e+200"),
+    (row(1, "left", 1, 2, cov=0.01), "cov_uv_px2 is not below the product of the sigmas", "cov_uv_px2 0.01"),
+    (row(0, " left", 5, 6), AGAIN, "u_px 5 and v_px 6"),
+    (row(0, "left", 5.02, 5.98), AGAIN, "u_px 5.02 and v_px 5.98"),
+    # the last line of a writer that was killed
+    ("1,le", "u_px or v_px is no finite number", "u_px nothing and v_px nothing"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("bad", "why", "found"), BAD_ROWS)
+def test_a_row_that_cannot_be_used_is_left_out_and_said(bad, why, found, tmp_path):
     file = read_detections(table(tmp_path, row(0, "left", 5, 6), bad))
     assert list(file.cameras) == ["left"]
     assert len(file.cameras["left"].points) == 1
     assert (file.first, file.last) == (0, 0)
-    assert [n.split(": ", 1)[1] for n in file.notes] == [f"1 of 2 rows left out: {why} (the first near line 3)"]
+    shown = f", with {found}" if found else ""
+    assert [n.split(": ", 1)[1] for n in file.notes] == [f"1 of 2 rows left out: {why} (the first near line 3{shown})"]
 
 
 def test_a_line_with_too_many_fields_is_left_out_and_said(tmp_path):
@@ -117,7 +128,7 @@ def test_a_table_without_its_columns_is_told_so(text, words, tmp_path):
 @pytest.mark.parametrize("rows", [[], [row("x", "left", 1, 2)]])
 def test_a_table_without_a_usable_row_stops_the_run_with_a_plain_line(rows, tmp_path):
     folder = write_run(tmp_path / "a")
-    assert read_detections(table(folder, *rows)) is None
+    table(folder, *rows)
     edit(folder / "run.yaml", "{frames: frames/right}", "{detections: detections.csv}")
     with pytest.raises(InputError, match=r"detections\.csv: expected rows with frame, camera, .* got none that can be"):
         open_frames(load_run(folder))
@@ -142,7 +153,7 @@ def test_a_million_rows_are_read_in_seconds(tmp_path):
     frames = np.repeat(np.arange(100_000), 10)
     with (tmp_path / "detections.csv").open("w") as file:
         file.write("frame,camera,u_px,v_px,sigma_u_px,sigma_v_px\n")
-        file.writelines(f"{f},left,{i % 640}.{i % 97},1.5,0.1,0.1\n" for i, f in enumerate(frames))
+        file.writelines(f"{f},left,{i % 640}.{i % 97},{i % 10}.5,0.1,0.1\n" for i, f in enumerate(frames))
     started = time.process_time()
     points = read_detections(tmp_path / "detections.csv").cameras["left"]
     found = sum(len(points.at(f)) for f in range(100_000))
