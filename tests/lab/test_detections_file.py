@@ -7,8 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from lab import columns
+from lab.check import check
 from lab.detections_file import read_detections
 from lab.errors import InputError
 from lab.frames import Missing, open_frames
@@ -130,7 +133,9 @@ def test_a_table_without_a_usable_row_stops_the_run_with_a_plain_line(rows, tmp_
     folder = write_run(tmp_path / "a")
     table(folder, *rows)
     edit(folder / "run.yaml", "{frames: frames/right}", "{detections: detections.csv}")
-    with pytest.raises(InputError, match=r"detections\.csv: expected rows with frame, camera, .* got none that can be"):
+    with pytest.raises(
+        InputError, match=r"detections\.csv: expected rows with frame, camera, .* got none that can be used"
+    ):
         open_frames(load_run(folder))
 
 
@@ -146,6 +151,137 @@ def test_pictures_of_one_camera_and_points_of_the_other_come_together(tmp_path):
     assert [type(got[f]["right"]) for f in range(5)] == [Missing, Detections, Detections, Detections, Missing]
     assert [len(got[f]["right"]) for f in (1, 2, 3)] == [1, 0, 2]
     assert any(n.endswith("rows of cameras that the rig does not have are not used: middle") for n in reader.notes)
+
+
+def points_for_right(folder: Path, *rows: str) -> Path:
+    """A run of which camera `right` has points, and `left` its five pictures."""
+    write_run(folder)
+    table(folder, *rows)
+    edit(folder / "run.yaml", "{frames: frames/right}", "{detections: detections.csv}")
+    return folder
+
+
+def test_columns_in_another_order_and_further_ones_change_nothing(tmp_path):
+    usual = read_detections(table(tmp_path, row(0, "left", 5, 6, sigma=0.2), row(2, "left", 7, 8)))
+    header = "v_px,quality,camera,sigma_v_px,u_px,frame,sigma_u_px"
+    other = read_detections(table(tmp_path, "8,good,left,0.1,7,2,0.1", "6,bad,left,0.2,5,0,0.2", header=header))
+    assert other.notes == ()
+    for frame in (0, 2):
+        np.testing.assert_array_equal(other.cameras["left"].at(frame).uv_px, usual.cameras["left"].at(frame).uv_px)
+        np.testing.assert_array_equal(other.cameras["left"].at(frame).cov_px2, usual.cameras["left"].at(frame).cov_px2)
+
+
+@given(
+    bad=st.lists(st.tuples(st.sampled_from(BAD_ROWS), st.integers(0, 12)), max_size=8),
+    seed=st.integers(0, 2**32 - 1),
+)
+@settings(max_examples=20, deadline=None, derandomize=True)
+def test_bad_rows_anywhere_never_touch_the_good_ones(bad, seed, tmp_path_factory):
+    rng = np.random.default_rng(seed)
+    # the frames 0 and 1 have other points than BAD_ROWS are beside
+    good = [row(f, "left", round(u, 3), 40.0 + k) for f in range(4) for k, u in enumerate(rng.uniform(9, 60, 3))]
+    lines = [*good, row(0, "left", 5, 6)]
+    for (text, _, _), place in bad:
+        lines.insert(place, text)
+    folder = tmp_path_factory.mktemp("bad")
+    expected = read_detections(table(folder, *good)).cameras["left"]
+    got = read_detections(table(folder, *lines)).cameras["left"]
+    for frame in range(4):
+        uv = got.at(frame).uv_px
+        beside = (uv[:, 1] < 7) if frame == 0 else np.zeros(len(uv), dtype=bool)  # of the twins one is kept
+        assert beside.sum() == (frame == 0)
+        np.testing.assert_array_equal(uv[~beside], expected.at(frame).uv_px)
+
+
+def test_of_two_points_of_one_spot_the_better_measured_stays(tmp_path):
+    rows = [
+        row(0, "left", 5, 6, sigma=0.3),
+        row(0, "left", 5.03, 6.03, sigma=0.1),
+        row(0, "left", 5.06, 6.0, sigma=0.2),
+    ]
+    file = read_detections(table(tmp_path, *rows, row(1, "left", 5, 6), row(1, "right", 5, 6)))
+    np.testing.assert_array_equal(file.cameras["left"].at(0).uv_px, [[5.03, 6.03]])
+    # in another frame, or to another camera, it is another point
+    assert (len(file.cameras["left"].at(1)), len(file.cameras["right"].at(1))) == (1, 1)
+
+
+def test_two_spots_a_tenth_of_a_pixel_apart_both_stay(tmp_path):
+    file = read_detections(table(tmp_path, row(0, "left", 5, 6), row(0, "left", 5.1, 6), row(0, "left", 5, 6.1)))
+    assert len(file.cameras["left"].at(0)) == 3
+
+
+def test_a_few_frames_far_from_all_others_are_left_out_and_the_run_is_kept(tmp_path):
+    rows = [row(f, "right", 5 + f % 50, 6) for f in range(600)]
+    rows.insert(300, row(10**9, "right", 9, 9))
+    folder = points_for_right(tmp_path / "a", *rows)
+    reader = open_frames(load_run(folder))
+    assert (reader.first, reader.last) == (0, 599)
+    far = "1 of 601 rows left out: the frame is more than 100000 numbers away from the others (the first near line 302,"
+    assert any(far in n and n.endswith("with frame 1e+09)") for n in reader.notes)
+
+
+def test_frame_numbers_that_hold_a_time_are_refused_before_a_thousand_million_rows_are_written(tmp_path):
+    folder = points_for_right(tmp_path / "a", *(row(f * 10_000_000, "right", 5, 6) for f in range(100)))
+    with pytest.raises(InputError, match="expected frame numbers without gaps of many thousands, got 105 pictures"):
+        open_frames(load_run(folder))
+
+
+def test_rows_of_a_misspelt_camera_are_refused_with_the_name_that_was_meant(tmp_path):
+    folder = points_for_right(tmp_path / "a", row(0, "rigth", 5, 6))
+    words = "camera: expected rows of 'right', got none, but rows of 'rigth', which the rig does not have; did you mean"
+    with pytest.raises(InputError, match=words + r" 'right'\?$"):
+        open_frames(load_run(folder))
+
+
+def test_a_camera_without_rows_in_a_table_that_both_share_has_found_nothing_and_it_is_said(tmp_path):
+    folder = points_for_right(tmp_path / "a", row(0, "right", 5, 6))
+    edit(folder / "run.yaml", "{frames: frames/left}", "{detections: detections.csv}")
+    reader = open_frames(load_run(folder))
+    assert any(n.endswith("no rows of camera 'left'; it is taken to have found nothing") for n in reader.notes)
+    assert [len(s.images["left"]) for s in reader] == [0]
+
+
+def test_a_camera_of_whose_rows_none_can_be_used_is_refused_with_the_reason(tmp_path):
+    rows = [row(f, "right", 5, 6, sigma=0) for f in range(3)]
+    folder = points_for_right(tmp_path / "a", *rows, row(0, "left", 5, 6))
+    words = (
+        r"camera 'right': expected rows that can be used, got none: a sigma is not above 0 \(the first near line 2,"
+        r" with sigma_u_px 0 and sigma_v_px 0\); put them right, or leave 'right' out of `cameras` in .*run\.yaml"
+    )
+    with pytest.raises(InputError, match=words):
+        open_frames(load_run(folder))
+
+
+def test_a_picture_of_which_no_row_can_be_used_is_unreadable_and_not_one_without_spots(tmp_path):
+    rows = [row(0, "right", 5, 6), row(1, "right", 5, 6, sigma="nan"), row(2, "right", 5, 6, sigma="nan")]
+    folder = points_for_right(tmp_path / "a", *rows, row(2, "right", 9, 9), row(4, "right", 5, 6))
+    reader = open_frames(load_run(folder))
+    images = [s.images["right"] for s in reader]
+    assert images[1] == Missing("unreadable: no row of it can be used")
+    assert [len(images[k]) for k in (0, 2, 3, 4)] == [1, 1, 0, 1]
+    assert "right: 1 frame unreadable: no row of it can be used (1)" in reader.notes
+    told = check(folder).lines
+    assert any("2 of 5 rows left out: a sigma is not above 0" in line for line in told)
+    assert any("right: 1 frame unreadable: no row of it can be used (1)" in line for line in told)
+
+
+def test_points_far_outside_the_picture_are_left_out_and_a_table_of_them_is_refused(tmp_path):
+    # 64x48 px
+    folder = points_for_right(tmp_path / "a", row(0, "right", 5, 6), row(1, "right", 7, 8), row(1, "right", 900, 8))
+    reader = open_frames(load_run(folder))
+    assert [len(s.images["right"]) for s in reader if s.frame < 2] == [1, 1]
+    told = "1 of 3 points more than 32 px outside its picture of 64x48 px (the first in frame 1, at 900, 8)"
+    assert any(n.endswith(told) for n in reader.notes)
+    folder = points_for_right(tmp_path / "b", row(0, "right", 5, 600), row(1, "right", 7, 800))
+    with pytest.raises(InputError, match=r"got 2 of 2 points more than 32 px outside .*; are u and v exchanged, or"):
+        open_frames(load_run(folder))
+
+
+def test_a_picture_full_of_points_is_kept_and_said(tmp_path):
+    many = [row(2, "right", 5 + i % 100 / 2, 1 + i // 100 / 4) for i in range(10_000)]
+    reader = open_frames(load_run(points_for_right(tmp_path / "a", row(0, "right", 5, 6), *many)))
+    assert [len(s.images["right"]) for s in reader if s.frame in (0, 2)] == [1, 10_000]
+    assert any("up to 10000 points in one picture (frame 2)" in n for n in reader.notes)
 
 
 @pytest.mark.slow
