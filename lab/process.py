@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -22,12 +22,16 @@ from lab import quality
 from lab.calibration_state import require_usable, state_mapping
 from lab.fields import dataclass_from_yaml
 from lab.fingerprints import fingerprints
+from lab.model_check.keeper import FrameKeeper
 from lab.pipeline import FrameRecord, Pipeline
 from lab.run_file import Run, load_run
 from lab.tables import TableWriter
 from lab.two_passes import Progress, TwoPasses
 from lab.whole_folder import whole_folder
 from tracking.parameters import TrackerParameters
+
+if TYPE_CHECKING:
+    from lab.model_check.check import ModelCheck
 
 SUMMARY_SCHEMA = "beampose/summary/1"
 MOST_EVENTS = 500  # told one by one; of the rest the number
@@ -148,14 +152,19 @@ def process_run(
         pipeline = Pipeline.of(run)
         tally = _Tally(tuple(run.rig.cameras), tuple(f"{c}/{s}" for c, s in SpotModel.of(run.rig).views))
         passes = TwoPasses(pipeline, work, progress)
+        keeper = FrameKeeper()
         with (
             TableWriter(work, run.rig, run.covariance is not None, with_causal=not causal) as tables,
             contextlib.closing(passes.causal_only() if causal else passes.records()) as records,
         ):
             for record, known_then in records:
                 tables.write(record, known_then)
+                keeper.add_tracked(record.t_s, record.tracked, record.tracked.predicted_cov_px2)
                 tally.add(record)
-        verdict = _verdict(pipeline, tally)
+        from lab.model_check.check import check_kept  # the words of its report: only for those who need them
+
+        model_check = check_kept(run.rig, keeper, run.covariance)
+        verdict = _verdict(pipeline, tally, model_check)
         errors = _errors(work, run)
         seconds = {
             "waiting_for_pictures_s": pipeline.timings.waiting,
@@ -163,7 +172,9 @@ def process_run(
             "tracking_s": pipeline.timings.tracking,
             "smoothing_s": pipeline.timings.smoothing,
         }
-        content = _summary(run, pipeline, passes, tally, verdict, errors, seconds, time.perf_counter() - started)
+        content = _summary(
+            run, pipeline, passes, tally, verdict, model_check, errors, seconds, time.perf_counter() - started
+        )
         _write_json(content, work / "summary.json")
         from lab.report import write_report  # the template engine: only for those who write a report
 
@@ -198,7 +209,7 @@ def overridden(parameters: TrackerParameters, overrides: Mapping[str, Any]) -> T
     return dataclass_from_yaml(TrackerParameters, content, "--set")
 
 
-def _verdict(pipeline: Pipeline, tally: _Tally) -> quality.Verdict:
+def _verdict(pipeline: Pipeline, tally: _Tally, model_check: ModelCheck) -> quality.Verdict:
     return quality.judge(
         frames=tally.frames,
         measured=tally.pose_status["measured"],
@@ -207,6 +218,7 @@ def _verdict(pipeline: Pipeline, tally: _Tally) -> quality.Verdict:
         no_image={c: sum(b - a + 1 for a, b in ranges) for c, ranges in tally.no_image.items()},
         ties=tally.event_kinds["tie"],
         measured_before_lost_again=tally.event_kinds["reacquired"],
+        findings=model_check.findings,
     )
 
 
@@ -222,6 +234,7 @@ def _summary(
     passes: TwoPasses,
     tally: _Tally,
     verdict: quality.Verdict,
+    model_check: ModelCheck,
     errors: Mapping[str, Any] | None,
     seconds: Mapping[str, float],
     wall_s: float,
@@ -258,6 +271,7 @@ def _summary(
             "processed_frames_per_s": tally.frames / wall_s if wall_s > 0 else None,
             "misfit": pipeline.tracker.noise_scale,
         },
+        "model_check": model_check.as_mapping(),
         "errors": errors,
         "timings": {**seconds, "wall_s": wall_s},
         "versions": versions(),

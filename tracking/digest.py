@@ -10,7 +10,7 @@ from geometry import small
 from geometry.arrays import Array, Bools, Ints
 from geometry.compiled import compiled
 from geometry.projection import Views, project_view
-from tracking.association import BLENDED, Frame, Sights
+from tracking.association import BLENDED, Frame, Sights, expected_at
 from tracking.hypotheses import Hypotheses
 from tracking.information import fit_alone, frame_information
 from tracking.motion import predicted
@@ -120,12 +120,13 @@ def inverse(L: Array) -> Array:
 @compiled
 def surprise(
     views: Views, before: Hypotheses, h: int, dt: float, jerk: Array, use: Bools, uv: Array, cov: Array
-) -> Array:
-    """(2,): how the likelihood of a frame grows with the share of the prediction's covariance that translation makes,
+) -> tuple[Array, Array]:
+    """(2,) and (n, 2, 2): how the likelihood of a frame grows with the share of the prediction's covariance that translation makes,
     and rotation, per unit of its size: what the steady motion's jerk is learnt from.
 
     With w = S^-1 y: (w^T P w - tr(S^-1 P)) / (1 + tr(S^-1 P)) / 2, taken for the two diagonal blocks of P. 0 on average
-    where the jerk is right. h: the hypothesis of the frame before.
+    where the jerk is right. h: the hypothesis of the frame before. Second: the covariance of each spot's predicted
+    place, px^2, without the detection's own.
     """
     none = np.zeros(2)
     R, t, _, P, _ = predicted(before.R[h], before.t[h], before.m[h], before.P[h], dt, jerk, none, none)
@@ -146,7 +147,14 @@ def surprise(
                 expected += x[i, j] * pose[i, j]
                 square += x[i, 6] * pose[i, j] * x[j, 6]
         out[block] = 0.5 * (square - expected) / (1.0 + expected)
-    return out
+    n = use.shape[0]
+    spread, at, J = np.empty((n, 2, 2)), np.empty(2), np.empty((2, 6))
+    for i in range(n):
+        there, a, b, c = expected_at(views, i, R, t, pose, at, J)
+        if not there:
+            a = b = c = np.nan
+        spread[i, 0, 0], spread[i, 0, 1], spread[i, 1, 0], spread[i, 1, 1] = a, b, b, c
+    return out, spread
 
 
 @compiled

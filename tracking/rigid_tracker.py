@@ -305,11 +305,12 @@ class RigidTracker:
         covariance = h.P[0, :6, :6] + spread + systematic
         known = measured or (self._anchor is not None and not self._lost(covariance))
         labelled = d.labelled if known else np.zeros_like(d.labelled)
+        predicted_cov: Array | None = None
         if measured:
             if best in fresh:
                 events.append(Event(self._kind_of_search(dt_s), f"spots {fresh[best]} found from the prior alone"))
             elif before is not None and dt_s > 0:
-                slope = surprise(
+                slope, spread_px = surprise(
                     model.numbers,
                     before,
                     int(children.parent[best]),
@@ -319,6 +320,8 @@ class RigidTracker:
                     d.uv,
                     d.cov,
                 )
+                if children.parent[best] == 0:  # the one that predicted_px is of
+                    predicted_cov = spread_px + self._extra
                 self.temper.learn(h.m[0, :6], bool(children.manoeuvre[best]), slope)
             self._anchor, self._anchor_age_s, self._told_tie = pose, 0.0, False
             if count >= FEW:
@@ -355,6 +358,7 @@ class RigidTracker:
             rms_px=float(d.rms_px) if measured else float("nan"),
             events=tuple(events),
             label_probability=np.where(assigned >= 0, certain, np.nan),
+            predicted_cov_px2=predicted_cov,
             motion=MotionEstimate(h.m[0, :3], h.m[0, 3:6], h.P[0, 6:12, 6:12]) if known else None,
             pose_systematic=systematic if known else None,
         )
