@@ -484,6 +484,19 @@ def test_a_run_that_breaks_in_the_middle_leaves_nothing(tmp_path, monkeypatch, e
     assert names(tmp_path) == ["run"]
 
 
+@pytest.mark.parametrize("stage", [TRACKING, SMOOTHING, WRITING])
+def test_a_run_that_is_stopped_in_either_pass_leaves_nothing(tmp_path, stage):
+    folder = points_run(tmp_path / "run")
+
+    def stop(done, total, now):
+        if now == stage and done in (0, 4):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        process_run(folder, tmp_path / "out", progress=stop)
+    assert names(tmp_path) == ["run"]
+
+
 def test_a_run_that_breaks_leaves_earlier_results_as_they_were(tmp_path, monkeypatch):
     folder = points_run(tmp_path / "run", frames=4)
     out = tmp_path / "out"
