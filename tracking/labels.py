@@ -34,6 +34,16 @@ from tracking.parameters import LabelParameters
 NO_POINT = -1
 # Chance that a right set of labels is refused by its misfit: the points' sigmas already hold the model's error.
 P_MISFIT = 1e-6
+# A camera with so many times `max_points` points of unknown brightness is not searched: the points looked at would be
+# anyone's, and such a search fails after 3 s (400 points per camera).
+HOPELESS = 2
+# nats: how much likelier a pose must be than that all points are false and the vehicle is not seen. Without it four of
+# thirty false points per picture made a pose by chance in the second of 40 frames. A likelihood ratio has the mean 1
+# where there is nothing, so that chance is below exp(-7) = 1e-3.
+OVER_NOTHING = 7.0
+# Of more than `max_points` only so many of the brightest take part in triples: 3 s become 0.8 s, and spots that are
+# brighter than nearly all else are found as before.
+BRIGHTEST_OF_MANY = 8
 MOST_REPEATS = 4  # more starts than this are tried only where none has led to any pose
 
 
@@ -91,6 +101,11 @@ def find_labels(
     calibration: what its errors do to the spots, where that is known.
     """
     parameters = LabelParameters() if parameters is None else parameters
+    for name, found in detections.items():
+        if len(found) > HOPELESS * parameters.max_points and not np.isfinite(found.flux).any():
+            return LabelResult(
+                None, (), f"{len(found)} points of light of camera {name!r}, and no flux that tells which may be spots"
+            )
     scene = _Scene.of(rig, model, detections, parameters, calibration)
     if len(scene.camera) < parameters.min_spots:
         return LabelResult(
@@ -103,6 +118,11 @@ def find_labels(
             break  # everything is explained, or hardly anything new can come: the rest could only repeat it
     if not best:
         return LabelResult(None, (), "no pose within the prior explains enough of the points")
+    lead = _over_nothing(scene, best[0], prior)
+    if lead < OVER_NOTHING:
+        return LabelResult(
+            None, (), f"false points alone would explain the best pose nearly as well (lead {lead:.1f} nats)"
+        )
     return _decided(scene, best)
 
 
@@ -119,6 +139,7 @@ class _Scene:
     world: Array  # (m, 3), m: where on the screen it is
     seen: Bools  # (n,) views whose camera has a picture
     log_clutter: Array  # (cameras,) log density of false points, 1/px^2
+    crowded: Bools  # (cameras,) there are more points than are looked at, and their brightness is known
     calibration: CalibrationSpread | None
 
     @staticmethod
@@ -131,12 +152,14 @@ class _Scene:
     ) -> _Scene:
         camera, row, pixels, covariances, world = [], [], [], [], []
         log_clutter = np.zeros(len(model.camera_names))
+        crowded = np.zeros(len(model.camera_names), dtype=bool)
         for c, name in enumerate(model.camera_names):
             found = detections.get(name)
             if found is None:
                 continue
             width, height = rig.cameras[name].image_size_px
             log_clutter[c] = np.log(max(parameters.clutter_per_px2, len(found) / (width * height)))
+            crowded[c] = len(found) > parameters.max_points and bool(np.isfinite(found.flux).any())
             brightest = np.argsort(-np.nan_to_num(found.flux, nan=0.0), kind="stable")[: parameters.max_points]
             screen = rig.screens[rig.cameras[name].screen].world_from_screen
             origin, rays = rig.cameras[name].rays(found.uv_px[brightest])
@@ -162,6 +185,7 @@ class _Scene:
             np.concatenate(world),
             np.array([model.camera_names[c] in detections for c in model.camera_of]),
             log_clutter,
+            crowded,
             calibration,
         )
 
@@ -228,7 +252,7 @@ def _from_three_spots(scene: _Scene, prior: PosePrior) -> Iterator[Pose]:
             triples.append((-float(s[-1]), triple))
     starts = _starts(prior)
     for triple in _that_leave_out_every_pair([t for _, t in sorted(triples)]):
-        grids = np.meshgrid(*[scene.points_of(v) for v in triple], indexing="ij")
+        grids = np.meshgrid(*[_for_triples(scene, v) for v in triple], indexing="ij")
         points = np.stack([g.ravel() for g in grids], axis=-1)
         # One point serves one spot.
         points = points[(np.diff(np.sort(points, axis=1), axis=1) > 0).all(axis=1)][:limit]
@@ -238,6 +262,12 @@ def _from_three_spots(scene: _Scene, prior: PosePrior) -> Iterator[Pose]:
         targets = np.tile(points, (len(starts.translation), 1))
         poses = _gauss_newton(model.subset(np.array(triple)), scene.pixels[targets], starts[many])
         yield poses[prior.holds(poses)]
+
+
+def _for_triples(scene: _Scene, view: int) -> Ints:
+    """The points of a view's camera that may be one of three spots: of a crowd its brightest."""
+    points = scene.points_of(view)
+    return points[:BRIGHTEST_OF_MANY] if scene.crowded[scene.model.camera_of[view]] else points
 
 
 def _that_leave_out_every_pair(triples: Sequence[tuple[int, int, int]]) -> Iterator[tuple[int, int, int]]:
@@ -395,6 +425,23 @@ def _assign(scene: _Scene, projected: Array, gate_px: float) -> Ints:
             if cost[v, q] < 0:
                 out[views[v]] = points[q]
     return out
+
+
+def _over_nothing(scene: _Scene, one: Labelling, prior: PosePrior) -> float:
+    """How much likelier a labelling is than that all points are false, nats.
+
+    The likelihood is averaged over the prior, not only taken at its best pose (Laplace's approximation), since many
+    poses were free to fit. The density of false points is that of the points looked at which are left over.
+    """
+    used = np.flatnonzero(one.point_of != NO_POINT)
+    camera = scene.camera[one.point_of[used]]
+    area = np.array([np.prod(scene.model.image_size_px[scene.model.camera_of == c][0]) for c in camera])
+    left = np.array([np.count_nonzero(scene.camera == c) - np.count_nonzero(camera == c) for c in camera])
+    density = np.log(np.maximum(left, 1) / area)
+    _, log_det = np.linalg.slogdet(one.fit.covariance)
+    volume = 3 * np.log(2 * prior.within_m) + np.log(4 / 3 * np.pi * prior.within_rad**3)
+    averaged = min(0.0, 3 * np.log(2 * np.pi) + 0.5 * float(log_det) - float(volume))
+    return one.score + averaged + float(np.sum(scene.log_clutter[camera] - density))
 
 
 def _decided(scene: _Scene, best: Sequence[Labelling]) -> LabelResult:
