@@ -132,7 +132,8 @@ def _residuals(spots: SpotGrid, poses: PoseTrack, run: Run) -> tuple[Array | Non
         if len(part):
             projected, J = rows.project(poses.world_from_body[part])
             out[part] = np.where(spots.measured[part][..., None], spots.uv_px[part] - projected, np.nan)
-            shares = np.einsum("fvij,fjk,fvik->fvi", J, noise[part], J) / spots.sigma_px[part] ** 2
+            with np.errstate(invalid="ignore"):  # a view without a projection has none of this either
+                shares = np.einsum("fvij,fjk,fvik->fvi", J, noise[part], J) / spots.sigma_px[part] ** 2
             shares = shares[np.isfinite(shares) & np.isfinite(out[part])]
             taken, count = taken + float(np.minimum(shares, 1.0).sum()), count + len(shares)
     return out, 1.0 - taken / count if count else None

@@ -48,7 +48,7 @@ def a_record(rng: np.random.Generator, frame: int = 7, n_points: int = 4) -> Fra
     tracked = TrackedFrame(
         uv, cov, tuple(status), rng.uniform(0, 1000, (n, 2)), gain, np.arange(n), PoseStatus.MEASURED,
         random_pose(rng), covariances(rng, 6, 6), 5, 0.123, (), np.where(np.isnan(gain), np.nan, 0.99),
-        MotionEstimate(rng.normal(size=3), rng.normal(size=3), covariances(rng, 6, 6)),
+        motion=MotionEstimate(rng.normal(size=3), rng.normal(size=3), covariances(rng, 6, 6)),
     )  # fmt: skip
     return FrameRecord(frame, frame / 30, 1 / 30, (found, None), ("", "gone"), tracked)
 
