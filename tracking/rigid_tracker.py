@@ -342,7 +342,8 @@ class RigidTracker:
         turned = labelled & children.manoeuvre[best]
         exists = ~np.isnan(d.expected_px[:, 0])
         status = view_statuses(labelled, turned, exists, d.inside, frame.has_image[model.camera_of], known)
-        uv_px[[s in NOWHERE for s in status]] = np.nan
+        nowhere = [s in NOWHERE for s in status]
+        uv_px[nowhere], cov_px2[nowhere] = np.nan, np.nan
         pose_status = PoseStatus.MEASURED if measured else PoseStatus.PREDICTED if known else PoseStatus.LOST
         return TrackedFrame(
             uv_px=uv_px,

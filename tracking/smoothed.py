@@ -76,7 +76,8 @@ class Smoothed:
         turned = np.array([s is SpotStatus.TURNED for s in causal.status]) & (point == causal.point)
         has_image = np.array([f is not None for f in found])[model.camera_of]
         status = view_statuses(labelled, turned, exists, model.in_picture(uv_px), has_image, known)
-        uv_px[[s in (SpotStatus.LOST, SpotStatus.OFF_SCREEN) for s in status]] = np.nan
+        nowhere = [s in (SpotStatus.LOST, SpotStatus.OFF_SCREEN) for s in status]
+        uv_px[nowhere], cov_px2[nowhere] = np.nan, np.nan
         measured = bool(self.measured[k])
         if not known:
             pose_status = PoseStatus.LOST

@@ -159,6 +159,15 @@ def test_statuses_and_numbers_go_together(tables):
     assert text.isdisjoint({"nan", "inf", "-inf", "none"})
 
 
+@pytest.mark.parametrize("causal", [True, False])
+def test_a_beam_that_misses_its_screen_has_neither_place_nor_sigma(tmp_path, causal):
+    process_run(Path(__file__).parents[2] / "sample_runs/four-skew-beams", tmp_path / "out", causal=causal)
+    rows = [r for r in rows_of(tmp_path / "out/spots.csv") if r["status"] == "off_screen"]
+    assert rows
+    for name in ("u_px", "v_px", "sigma_u_px", "sigma_v_px", "cov_uv_px2"):
+        assert {r[name] for r in rows} == {""}
+
+
 def test_measured_poses_lie_within_their_sigmas_of_the_truth(tables, run_folder):
     truth = {r["frame"]: r for r in rows_of(run_folder / "truth/pose.csv")}
     squares = [
