@@ -41,9 +41,9 @@ HOPELESS = 2
 # thirty false points per picture made a pose by chance in the second of 40 frames. A likelihood ratio has the mean 1
 # where there is nothing, so that chance is below exp(-7) = 1e-3.
 OVER_NOTHING = 7.0
-# Of more than `max_points` only so many of the brightest take part in triples: 3 s become 0.8 s, and spots that are
+# Of more than `max_points` only so many of the brightest take part in triples: 3 s become 0.5 s, and spots that are
 # brighter than nearly all else are found as before.
-BRIGHTEST_OF_MANY = 8
+BRIGHTEST_OF_MANY = 6
 MOST_REPEATS = 4  # more starts than this are tried only where none has led to any pose
 
 

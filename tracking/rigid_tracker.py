@@ -291,9 +291,10 @@ class RigidTracker:
         h = self._hypotheses
         assert h is not None
         assigned = children.assigned[best]
-        d = digest(
-            model.numbers, self._sights, frame, h.R[0], h.t[0], assigned, certain, p.min_label_probability, RADIUS_PX
-        )
+        # What was found from a prior alone must lead as it must in labels.py: a tie of 5 to 1 is still a tie.
+        unproven = self._anchor is None or best in fresh
+        least = max(p.min_label_probability, 1 / (1 + np.exp(-p.labels.lead_nats)) if unproven else 0.0)
+        d = digest(model.numbers, self._sights, frame, h.R[0], h.t[0], assigned, certain, least, RADIUS_PX)
         count = int(np.count_nonzero(d.use))
         measured = count >= 3 and self._good(d.alone)
         if measured:
