@@ -47,7 +47,7 @@ class Evidence(NamedTuple):
 def _step(ref: Reference, ev: Evidence, jerk: Array, k: int, x: Array, P: Array) -> tuple[Array, Array, Array]:
     """From frame k - 1 to frame k: deviation, covariance and transition matrix."""
     R, t, m, P_new, F = predicted(
-        ref.R[k - 1], ref.t[k - 1], ref.m[k - 1], P, ev.dt[k], jerk, ev.jump[k], ev.unsteady[k]
+        ref.R[k - 1], ref.t[k - 1], ref.m[k - 1], P, ev.dt[k], jerk[k], ev.jump[k], ev.unsteady[k]
     )
     x_new = _apply(F, x)
     x_new[:6] += _apart(R, t, ref.R[k], ref.t[k])
@@ -96,7 +96,7 @@ def _update(ev: Evidence, k: int, x: Array, P: Array) -> tuple[Array, Array, Arr
 
 @compiled
 def log_likelihood(ref: Reference, ev: Evidence, jerk: Array) -> float:
-    """How likely the evidence is for a motion with this jerk (2,), nats, up to a constant."""
+    """How likely the evidence is for a motion with this jerk (T, 2), nats, up to a constant."""
     x, P = np.zeros(STATE), np.diag(ev.first)
     total = 0.0
     for k in range(ev.dt.shape[0]):
@@ -108,11 +108,18 @@ def log_likelihood(ref: Reference, ev: Evidence, jerk: Array) -> float:
 
 
 @compiled
-def smoothed(ref: Reference, ev: Evidence, jerk: Array) -> tuple[Array, Array, Array]:
-    """Deviations (T, 18) of all frames given the whole run; covariances (T, 6, 6) of pose and of velocities."""
+def smoothed(ref: Reference, ev: Evidence, jerk: Array) -> tuple[Array, Array, Array, Array]:
+    """Of all frames given the whole run: deviations (T, 18), covariances (T, 6, 6) of pose and velocities, shocks (T,).
+
+    A shock is the chi-square (6 degrees) of a jump of the velocities in the step before a frame, beyond what the motion
+    allows there: de Jong & Penzer (1998), "Diagnosing shocks in time series".
+
+    jerk (T, 2): spectral densities, as in motion.py, of the step before each frame.
+    """
     frames = ev.dt.shape[0]
     out_x = np.empty((frames, STATE))
     pose_P, motion_P = np.empty((frames, 6, 6)), np.empty((frames, 6, 6))
+    shock = np.zeros(frames)
     chunks = (frames + CHUNK - 1) // CHUNK
     start_x, start_P = np.zeros((chunks, STATE)), np.zeros((chunks, STATE, STATE))
     x, P = np.zeros(STATE), np.diag(ev.first)
@@ -166,7 +173,65 @@ def smoothed(ref: Reference, ev: Evidence, jerk: Array) -> tuple[Array, Array, A
             later_x = _apply(Ft, back_x)
             later_L = _multiply(Ft, _multiply(back_L, Fs[j]))
             _symmetrise(later_L)
-    return out_x, pose_P, motion_P
+            shock[k] = _chi_square(later_L, later_x)
+    return out_x, pose_P, motion_P, shock
+
+
+@compiled
+def _chi_square(L: Array, x: Array) -> float:
+    """x^T L^-1 x of the velocities' part, in units that make L's diagonal 1; 0 where nothing later tells of them."""
+    A, b, scale = np.empty((6, 6)), np.empty((6, 1)), np.empty(6)
+    for i in range(6):
+        if not L[6 + i, 6 + i] > 1e-12:
+            return 0.0
+        scale[i] = np.sqrt(L[6 + i, 6 + i])
+    for i in range(6):
+        b[i, 0] = x[6 + i] / scale[i]
+        for j in range(6):
+            A[i, j] = L[6 + i, 6 + j] / (scale[i] * scale[j])
+        A[i, i] += 1e-9
+    y, _ = _solve(A, b)
+    total = 0.0
+    for i in range(6):
+        total += b[i, 0] * y[i, 0]
+    return total
+
+
+@compiled
+def told_by_the_others(ref: Reference, ev: Evidence, jerk: Array) -> float:
+    """How likely each frame's evidence is given that of all the others, summed, nats, up to a constant.
+
+    The leave-one-out predictive likelihood (Geisser & Eddy 1979): it asks how well the motion between frames is known,
+    which is what a smoother is for.
+    """
+    x, P, _, _ = smoothed(ref, ev, jerk)
+    total = 0.0
+    right = np.empty((6, 7))
+    for k in range(ev.dt.shape[0]):
+        L, g = ev.information[k], ev.vector[k]
+        if L[0, 0] == 0.0:
+            continue
+        # Take the frame's own evidence away again: (I - P L)^-1 of P and of the deviation.
+        A, Pg = _multiply(P[k], L), _apply(P[k], g)
+        for i in range(6):
+            for j in range(6):
+                A[i, j] = (1.0 if i == j else 0.0) - A[i, j]
+                right[i, j] = P[k, i, j]
+            right[i, 6] = x[k, i] - Pg[i]
+        alone, _ = _solve(A, right)
+        d = np.ascontiguousarray(alone[:, 6])
+        r = g - _apply(L, d)
+        B = _multiply(L, np.ascontiguousarray(alone[:, :6]))
+        for i in range(6):
+            B[i, i] += 1.0
+        w, log_det = _solve(B, np.ascontiguousarray(r.reshape(6, 1)))
+        step = _multiply(np.ascontiguousarray(alone[:, :6]), w)
+        Ld = _apply(L, d)
+        misfit = 0.0
+        for i in range(6):
+            misfit += d[i] * (Ld[i] - 2 * g[i]) - r[i] * step[i, 0]
+        total -= 0.5 * (log_det + misfit)
+    return total
 
 
 @compiled
