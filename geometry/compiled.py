@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numba
+from numba.core.types import unliteral
 
 Function = TypeVar("Function", bound=Callable)
 
@@ -30,9 +31,26 @@ def compiled(function: Function) -> Function:
     before = settings.CACHE_DIR
     settings.CACHE_DIR = folder or before
     try:
-        return numba.njit(function, cache=folder is not None, error_model="numpy")
+        dispatcher = numba.njit(function, cache=folder is not None, error_model="numpy")
     finally:
         settings.CACHE_DIR = before
+    _take_literals_for_plain(dispatcher)
+    return dispatcher
+
+
+def _take_literals_for_plain(dispatcher: Any) -> None:
+    """Let a compiled function that is called with a literal, `f(x, 0)`, be the same as for any other number.
+
+    numba would compile it once more for each literal; also for the first value of a variable that begins as one, as
+    in `count = 0`, and throw that away: a sixth of all compiling here.
+    """
+    of_types = dispatcher.get_call_template
+    plain: Any = unliteral
+
+    def of_plain_types(args: Any, kws: Any) -> Any:
+        return of_types([plain(a) for a in args], {name: plain(a) for name, a in kws.items()})
+
+    dispatcher.get_call_template = of_plain_types
 
 
 @cache

@@ -48,15 +48,17 @@ def project_view(v: Views, i: int, R: Array, t: Array, uv: Array, J: Array) -> b
     """One view's pixel into uv (2,) and its Jacobian into J (2, 6); whether there is one (else nan and 0)."""
     if _project(v, i, R, t, uv, J):
         return True
-    uv[:] = np.nan
-    J[:] = 0.0
+    for row in range(2):
+        uv[row] = np.nan
+        for k in range(6):
+            J[row, k] = 0.0
     return False
 
 
 @compiled
 def _project(v: Views, i: int, R: Array, t: Array, uv: Array, J: Array) -> bool:
     # The ray in world meets the screen.
-    origin, d, normal = np.empty(3), np.empty(3), np.empty(3)
+    origin, d, normal, hit, lever = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     S, s0 = v.screen_rotation[i], v.screen_origin[i]
     facing = height = 0.0
     for a in range(3):
@@ -73,7 +75,9 @@ def _project(v: Views, i: int, R: Array, t: Array, uv: Array, J: Array) -> bool:
         facing = normal[0] * d[0] + normal[1] * d[1] + normal[2] * d[2]
     if not length > 0.0:
         return False
-    hit = origin + length * d
+    for a in range(3):
+        hit[a] = origin[a] + length * d[a]
+        lever[a] = hit[a] - t[a]
     for a in range(2):
         along = S[0, a] * (hit[0] - s0[0]) + S[1, a] * (hit[1] - s0[1]) + S[2, a] * (hit[2] - s0[2])
         if not abs(along) <= v.half_size[i, a]:
@@ -92,7 +96,6 @@ def _project(v: Views, i: int, R: Array, t: Array, uv: Array, J: Array) -> bool:
     fx, fy = v.pinhole[i, 0], v.pinhole[i, 1]
     uv[0], uv[1] = fx * bx + v.pinhole[i, 2], fy * by + v.pinhole[i, 3]
     # d(pixel)/d(hit), in world, row by row; along the ray a move of the vehicle changes nothing.
-    lever = hit - t
     for row in range(2):
         gx, gy = (fx * xx / z, fx * xy / z) if row == 0 else (fy * yx / z, fy * yy / z)
         gz = -(gx * x + gy * y)

@@ -2,14 +2,86 @@
 
 The same formulas as geometry/rotations.py, which does stacks; the tests hold the two together. Matrices are C-ordered
 float64.
+
+Loops stand here where numpy has a word for it: each array expression, slice that is assigned to, sum or sort costs
+numba a kernel of its own, 0.1 to 3 s of compiling on the user's first run, and runs no faster.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from geometry.arrays import Array
+from geometry.arrays import Array, Ints
 from geometry.compiled import compiled
+
+
+@compiled
+def put(out: Array | Ints, x: Array | Ints) -> None:
+    """out[:] = x, vectors (n,)."""
+    for i in range(x.shape[0]):
+        out[i] = x[i]
+
+
+@compiled
+def put_matrix(out: Array, a: Array) -> None:
+    """out[:] = a, matrices (n, m)."""
+    for i in range(a.shape[0]):
+        for j in range(a.shape[1]):
+            out[i, j] = a[i, j]
+
+
+@compiled
+def block(a: Array, n: int) -> Array:
+    """The first n rows and columns of a matrix, as one of their own."""
+    out = np.empty((n, n))
+    for i in range(n):
+        for j in range(n):
+            out[i, j] = a[i, j]
+    return out
+
+
+@compiled
+def column(a: Array, j: int) -> Array:
+    """Column j of a matrix (n, m), as a vector (n,) of its own."""
+    out = np.empty(a.shape[0])
+    for i in range(a.shape[0]):
+        out[i] = a[i, j]
+    return out
+
+
+@compiled
+def beside(a: Array, x: Array) -> Array:
+    """[a, x] (n, m + 1): the right sides of one system."""
+    n, m = a.shape
+    out = np.empty((n, m + 1))
+    for i in range(n):
+        for j in range(m):
+            out[i, j] = a[i, j]
+        out[i, m] = x[i]
+    return out
+
+
+@compiled
+def best_first(score: Array) -> Ints:
+    """The order (n,) of scores from the highest to the lowest; of equals the earlier comes first."""
+    n = score.shape[0]
+    order = np.empty(n, np.int64)
+    for i in range(n):
+        place = i
+        while place > 0 and score[order[place - 1]] < score[i]:
+            order[place] = order[place - 1]
+            place -= 1
+        order[place] = i
+    return order
+
+
+@compiled
+def dot(x: Array, y: Array) -> float:
+    """The product of two vectors (n,)."""
+    s = 0.0
+    for i in range(x.shape[0]):
+        s += x[i] * y[i]
+    return s
 
 
 @compiled
@@ -20,6 +92,20 @@ def multiply(a: Array, b: Array) -> Array:
     for i in range(n):
         for j in range(k):
             s = a[i, j]
+            if s != 0.0:
+                for c in range(m):
+                    out[i, c] += s * b[j, c]
+    return out
+
+
+@compiled
+def transposed_multiply(a: Array, b: Array) -> Array:
+    """a^T @ b of small matrices."""
+    n, m, k = a.shape[1], b.shape[1], a.shape[0]
+    out = np.zeros((n, m))
+    for i in range(n):
+        for j in range(k):
+            s = a[j, i]
             if s != 0.0:
                 for c in range(m):
                     out[i, c] += s * b[j, c]
@@ -126,7 +212,10 @@ def log(R: Array) -> Array:
         q[c] /= length
     s = np.sqrt(q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
     factor = 2.0 if s < 1e-8 else 2.0 * np.arctan2(s, q[0]) / s
-    return factor * q[1:]
+    w = np.empty(3)
+    for c in range(3):
+        w[c] = factor * q[1 + c]
+    return w
 
 
 @compiled
@@ -150,13 +239,17 @@ def right_jacobian(w: Array) -> Array:
 @compiled
 def moved(R: Array, t: Array, d: Array) -> tuple[Array, Array]:
     """The pose that is d (6,) away: R Exp(dtheta) and t + dt, as Pose.plus."""
-    return multiply(R, exp(d[3:6])), t + d[:3]
+    t_new = np.empty(3)
+    for i in range(3):
+        t_new[i] = t[i] + d[i]
+    return multiply(R, exp(d[3:6])), t_new
 
 
 @compiled
 def apart(R: Array, t: Array, R0: Array, t0: Array) -> Array:
     """The delta (6,) from pose (R0, t0) to (R, t), as Pose.minus."""
     out = np.empty(6)
-    out[:3] = t - t0
-    out[3:] = log(multiply(R0.T, R))
+    turn = log(transposed_multiply(R0, R))
+    for i in range(3):
+        out[i], out[3 + i] = t[i] - t0[i], turn[i]
     return out

@@ -210,10 +210,11 @@ class SpotModel:
         """
         R, t = world_from_body.rotation, world_from_body.translation
         stack = np.broadcast_shapes(R.shape[:-2], t.shape[:-1])
+        # Copies, since numba takes arrays that must not be written to for another type and compiles anew for each.
         uv, J = project_all(
             self.numbers,
-            np.ascontiguousarray(np.broadcast_to(R, (*stack, 3, 3)), dtype=np.float64).reshape(-1, 3, 3),
-            np.ascontiguousarray(np.broadcast_to(t, (*stack, 3)), dtype=np.float64).reshape(-1, 3),
+            np.array(np.broadcast_to(R, (*stack, 3, 3)), dtype=np.float64, order="C").reshape(-1, 3, 3),
+            np.array(np.broadcast_to(t, (*stack, 3)), dtype=np.float64, order="C").reshape(-1, 3),
         )
         n = len(self)
         return uv.reshape(*stack, n, 2), J.reshape(*stack, n, 2, 6)

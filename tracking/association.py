@@ -34,7 +34,7 @@ BEHIND = 14.0  # nats: a partial assignment so far behind the best is dropped
 
 LOG_2PI = np.log(2 * np.pi)
 
-_moved, _multiply = small.moved, small.multiply
+_moved, _put, _put_matrix, _best_first = small.moved, small.put, small.put_matrix, small.best_first
 
 
 class Frame(NamedTuple):
@@ -128,15 +128,18 @@ def associate(
     width = 12 if vague < 30.0**2 else (48 if vague < 120.0**2 else 128)
 
     R_of, t_of, P_of = np.empty((width, 3, 3)), np.empty((width, 3)), np.empty((width, 6, 6))
-    assigned, score, counted = np.full((width, n), NOT_LOOKED_FOR), np.full(width, -np.inf), np.zeros(width)
-    R_of[0], t_of[0], P_of[0], score[0] = R, t, P, 0.0
+    assigned, score, counted = np.empty((width, n), np.int64), np.empty(width), np.empty(width)
+    score[0] = counted[0] = 0.0
+    for i in range(n):
+        assigned[0, i] = NOT_LOOKED_FOR
+    _put_pose(R_of[0], t_of[0], P_of[0], R, t, P)
     count = 1
     score_next = np.empty(width)
     R_next, t_next, P_next = np.empty((width, 3, 3)), np.empty((width, 3)), np.empty((width, 6, 6))
     assigned_next = np.empty((width, n), dtype=np.int64)
     child_score, child_counted, counted_next = np.empty(width), np.empty(width), np.empty(width)
     child_node, child_choice = np.empty(width, np.int64), np.empty(width, np.int64)
-    open_views = np.ones(n, dtype=np.bool_)
+    open_views = np.empty(n, dtype=np.bool_)
     for i in range(n):
         open_views[i] = frame.has_image[sights.camera[i]]
 
@@ -209,18 +212,18 @@ def associate(
                             score[b_node] + gain + apart, counted[b_node] + gain + apart, b_node, d + BLENDED,
                         )  # fmt: skip
         # The kept children become the nodes, best first.
-        order = np.argsort(-child_score[:children])
+        order = _best_first(child_score[:children])
         kept = 0
         for place in range(children):
             k = order[place]
             if child_score[k] < child_score[order[0]] - BEHIND:
                 break
             node, choice = child_node[k], child_choice[k]
-            assigned_next[kept] = assigned[node]
+            _put(assigned_next[kept], assigned[node])
             assigned_next[kept, view] = choice
-            R_next[kept], t_next[kept], P_next[kept] = R_of[node], t_of[node], P_of[node]
+            _put_pose(R_next[kept], t_next[kept], P_next[kept], R_of[node], t_of[node], P_of[node])
             if 0 <= choice < BLENDED:
-                _take(views, view, frame, choice, extra, R_next, t_next, P_next, kept)
+                _take(views, view, frame, choice, extra, R_next[kept], t_next[kept], P_next[kept])
             score_next[kept], counted_next[kept] = child_score[k], child_counted[k]
             kept += 1
         count = kept
@@ -231,6 +234,13 @@ def associate(
         score, score_next = score_next, score
         counted, counted_next = counted_next, counted
     return assigned[:count], score[:count], counted[:count], R_of[:count], t_of[:count], count
+
+
+@compiled
+def _put_pose(R_out: Array, t_out: Array, P_out: Array, R: Array, t: Array, P: Array) -> None:
+    _put_matrix(R_out, R)
+    _put(t_out, t)
+    _put_matrix(P_out, P)
 
 
 @compiled
@@ -268,10 +278,10 @@ def _kept(
 
 
 @compiled
-def _take(views: Views, view: int, frame: Frame, d: int, extra: Array, R: Array, t: Array, P: Array, k: int) -> None:
-    """Move and narrow pose k by the detection d of a view, in place."""
+def _take(views: Views, view: int, frame: Frame, d: int, extra: Array, R: Array, t: Array, P: Array) -> None:
+    """Move and narrow a pose by the detection d of a view, in place."""
     uv, J = np.empty(2), np.empty((2, 6))
-    _, a, b, c = expected_at(views, view, R[k], t[k], P[k], uv, J)
+    _, a, b, c = expected_at(views, view, R, t, P, uv, J)
     bend = ((a + c) / BEND_PX) ** 2 if a + c > 1.0 else 0.0
     a, b, c = a + frame.cov[d, 0, 0] + bend, b + frame.cov[d, 0, 1], c + frame.cov[d, 1, 1] + bend
     a, b, c = a + extra[view, 0, 0], b + extra[view, 0, 1], c + extra[view, 1, 1]
@@ -279,14 +289,15 @@ def _take(views: Views, view: int, frame: Frame, d: int, extra: Array, R: Array,
     H = np.zeros((6, 2))
     for i in range(6):
         for j in range(6):
-            H[i, 0] += P[k, i, j] * J[0, j]
-            H[i, 1] += P[k, i, j] * J[1, j]
+            H[i, 0] += P[i, j] * J[0, j]
+            H[i, 1] += P[i, j] * J[1, j]
     y0, y1 = frame.uv[d, 0] - uv[0], frame.uv[d, 1] - uv[1]
     z0, z1 = sa * y0 + sb * y1, sb * y0 + sc * y1
     step = np.empty(6)
     for i in range(6):
         step[i] = H[i, 0] * z0 + H[i, 1] * z1
         for j in range(6):
-            P[k, i, j] -= H[i, 0] * (sa * H[j, 0] + sb * H[j, 1]) + H[i, 1] * (sb * H[j, 0] + sc * H[j, 1])
-    R_k, t_k = _moved(R[k], t[k], step)
-    R[k], t[k] = R_k, t_k
+            P[i, j] -= H[i, 0] * (sa * H[j, 0] + sb * H[j, 1]) + H[i, 1] * (sb * H[j, 0] + sc * H[j, 1])
+    R_new, t_new = _moved(R, t, step)
+    _put_matrix(R, R_new)
+    _put(t, t_new)

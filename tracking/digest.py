@@ -18,6 +18,7 @@ from tracking.motion import predicted
 RANK = 1e-12  # pivot of a scaled normal matrix below which a pose is not observable; exact degeneracies give 1e-16
 
 _multiply, _solve, _moved = small.multiply, small.solve, small.moved
+_block, _beside = small.block, small.beside
 
 
 class Digest(NamedTuple):
@@ -52,16 +53,17 @@ def digest(
     """The best hypothesis' pose (R, t), assignment (n,) and its probabilities (n,) in numbers."""
     n, cameras = assigned.shape[0], frame.has_image.shape[0]
     labelled, use = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
-    uv, cov = np.full((n, 2), np.nan), np.full((n, 2, 2), np.nan)
+    uv, cov = np.empty((n, 2)), np.empty((n, 2, 2))
     for i in range(n):
-        if assigned[i] >= 0 and certain[i] >= least_probability:
-            d = assigned[i] % BLENDED
-            labelled[i], use[i] = True, assigned[i] < BLENDED
-            uv[i], cov[i] = frame.uv[d], frame.cov[d]
+        labelled[i] = assigned[i] >= 0 and certain[i] >= least_probability
+        use[i] = labelled[i] and assigned[i] < BLENDED
+        d = assigned[i] % BLENDED
+        for a in range(2):
+            uv[i, a] = frame.uv[d, a] if labelled[i] else np.nan
+            for b in range(2):
+                cov[i, a, b] = frame.cov[d, a, b] if labelled[i] else np.nan
     R1, t1, L, chi2, count = fit_alone(views, R, t, use, uv, cov)
-    alone = np.full((6, 6), np.inf)
-    if count >= 3:
-        alone = inverse(L)
+    alone = inverse(L) if count >= 3 else _unknown(6)
     expected, J, inside = np.empty((n, 2)), np.empty((n, 2, 6)), np.zeros(n, np.bool_)
     near, discs = np.zeros(cameras), np.zeros(cameras)
     square, at, J1 = 0.0, np.empty(2), np.empty((2, 6))
@@ -88,13 +90,23 @@ def digest(
 
 
 @compiled
+def _unknown(n: int) -> Array:
+    """The covariance (n, n) of what nothing is known of."""
+    out = np.empty((n, n))
+    for i in range(n):
+        for j in range(n):
+            out[i, j] = np.inf
+    return out
+
+
+@compiled
 def inverse(L: Array) -> Array:
     """The covariance (6, 6) of a normal matrix; inf where it lacks rank."""
     n = L.shape[0]
     scaled, eye = np.empty((n, n)), np.zeros((n, n))
     for i in range(n):
         if not L[i, i] > 0.0:
-            return np.full((n, n), np.inf)
+            return _unknown(n)
         for j in range(n):
             scaled[i, j] = L[i, j] / np.sqrt(L[i, i] * L[j, j])
         eye[i, i] = 1.0
@@ -104,7 +116,7 @@ def inverse(L: Array) -> Array:
         for k in range(j):
             root[j, j] -= root[j, k] * root[j, k]
         if not root[j, j] > RANK:
-            return np.full((n, n), np.inf)
+            return _unknown(n)
         root[j, j] = np.sqrt(root[j, j])
         for i in range(j + 1, n):
             for k in range(j):
@@ -121,8 +133,8 @@ def inverse(L: Array) -> Array:
 def surprise(
     views: Views, before: Hypotheses, h: int, dt: float, jerk: Array, use: Bools, uv: Array, cov: Array
 ) -> tuple[Array, Array]:
-    """(2,) and (n, 2, 2): how the likelihood of a frame grows with the share of the prediction's covariance that translation makes,
-    and rotation, per unit of its size: what the steady motion's jerk is learnt from.
+    """(2,) and (n, 2, 2). First: how the likelihood of a frame grows with the share of the prediction's covariance that
+    translation makes, and rotation, per unit of its size: what the steady motion's jerk is learnt from.
 
     With w = S^-1 y: (w^T P w - tr(S^-1 P)) / (1 + tr(S^-1 P)) / 2, taken for the two diagonal blocks of P. 0 on average
     where the jerk is right. h: the hypothesis of the frame before. Second: the covariance of each spot's predicted
@@ -131,14 +143,11 @@ def surprise(
     none = np.zeros(2)
     R, t, _, P, _ = predicted(before.R[h], before.t[h], before.m[h], before.P[h], dt, jerk, none, none)
     L, g, _, _, _ = frame_information(views, R, t, use, uv, cov)
-    pose = np.ascontiguousarray(P[:6, :6])
+    pose = _block(P, 6)
     A = _multiply(L, pose)
-    right = np.empty((6, 7))
     for i in range(6):
         A[i, i] += 1.0
-        right[i, :6] = L[i]
-        right[i, 6] = g[i]
-    x, _ = _solve(A, right)
+    x, _ = _solve(A, _beside(L, g))
     out = np.zeros(2)
     for block in range(2):
         expected = square = 0.0
@@ -160,13 +169,10 @@ def surprise(
 @compiled
 def ahead(views: Views, h: Hypotheses, dt: float) -> Array:
     """Where the best hypothesis expects each spot a time dt (s) later, (n, 2), px."""
-    R, t = _moved(
-        h.R[0],
-        h.t[0],
-        np.concatenate(
-            (dt * h.m[0, :3] + 0.5 * dt * dt * h.m[0, 6:9], dt * h.m[0, 3:6] + 0.5 * dt * dt * h.m[0, 9:12])
-        ),
-    )
+    step = np.empty(6)
+    for i in range(6):
+        step[i] = dt * h.m[0, i] + 0.5 * dt * dt * h.m[0, 6 + i]
+    R, t = _moved(h.R[0], h.t[0], step)
     n = views.point.shape[0]
     uv, J = np.empty((n, 2)), np.empty((2, 6))
     for i in range(n):

@@ -25,10 +25,12 @@ MOST_CHILDREN = 48  # of one frame, over all hypotheses
 MOST_KEPT = 8  # hypotheses from frame to frame
 FORGET = 12.0  # nats: a hypothesis so far behind is dropped
 SAME = 0.7  # two hypotheses with one assignment whose states differ by less than this in sigmas are one
+LEAST_SHARE = 1e-3  # of the probability: hypotheses below it, however far away, do not widen the covariance
 PROOF = 3  # spots: where so many lie in their narrow gates, the velocities have not jumped
 LEAST_TO_TURN = 6.0  # nats: a hypothesis so far behind is not tried with a manoeuvre as well
 SURPRISE = 3.5  # sigmas of a misfit's own scatter: beyond it a manoeuvre is considered although every spot is found
-_apart, _apply, _moved = small.apart, small.apply, small.moved
+_apart, _apply, _dot, _block = small.apart, small.apply, small.dot, small.block
+_put, _put_matrix, _best_first = small.put, small.put_matrix, small.best_first
 
 
 class Hypotheses(NamedTuple):
@@ -64,15 +66,33 @@ class Dynamics(NamedTuple):
 def no_children(n: int, groups: int) -> Children:
     """An empty list for n views in so many groups."""
     c = MOST_CHILDREN
-    after = Hypotheses(
-        np.empty((c, 3, 3)),
-        np.empty((c, 3)),
-        np.empty((c, 12)),
-        np.empty((c, STATE, STATE)),
-        np.empty(c),
-        np.empty((c, n + groups)),
+    return Children(_room_for(c, n + groups), np.empty((c, n), np.int64), np.zeros(c, np.bool_), np.zeros(c, np.int64))
+
+
+@compiled
+def _room_for(h: int, chances: int) -> Hypotheses:
+    """Room for h hypotheses with so many chances of being shown."""
+    return Hypotheses(
+        np.empty((h, 3, 3)),
+        np.empty((h, 3)),
+        np.empty((h, 12)),
+        np.empty((h, STATE, STATE)),
+        np.empty(h),
+        np.empty((h, chances)),
     )
-    return Children(after, np.empty((c, n), np.int64), np.zeros(c, np.bool_), np.zeros(c, np.int64))
+
+
+@compiled
+def _put_hypothesis(
+    out: Hypotheses, k: int, R: Array, t: Array, m: Array, P: Array, weight: float, shown: Array
+) -> None:
+    """Let hypothesis k of a list be this."""
+    _put_matrix(out.R[k], R)
+    _put(out.t[k], t)
+    _put(out.m[k], m)
+    _put_matrix(out.P[k], P)
+    out.weight[k] = weight
+    _put(out.shown[k], shown)
 
 
 @compiled
@@ -84,7 +104,10 @@ def chosen_points(frame: Frame, assigned: Ints, extra: Array) -> tuple[Bools, Ar
         d = assigned[i]
         if 0 <= d < BLENDED:
             use[i] = True
-            uv[i], cov[i] = frame.uv[d], frame.cov[d] + extra[i]
+            for a in range(2):
+                uv[i, a] = frame.uv[d, a]
+                for b in range(2):
+                    cov[i, a, b] = frame.cov[d, a, b] + extra[i, a, b]
     return use, uv, cov
 
 
@@ -113,9 +136,11 @@ def concluded(
         if count == 0:
             return R0, t0, m0.copy(), P0.copy(), 0.0, 0.0, 0
         delta = _apart(R, t, R0, t0)
-        r = g + _apply(L, delta)
+        r = _apply(L, delta)
+        for i in range(6):
+            r[i] += g[i]
         out_R, out_t, out_m, out_P, log_det, w = updated(R0, t0, m0, P0, L, r)
-        step = _apply(np.ascontiguousarray(P0[:6, :6]), w)
+        step = _apply(_block(P0, 6), w)
         misfit = chi2
         for i in range(6):
             misfit += g[i] * delta[i] + r[i] * (delta[i] - step[i])
@@ -123,7 +148,7 @@ def concluded(
         moved = _apart(out_R, out_t, R, t)
         R, t = out_R, out_t
         # A thousandth of the pose's own sigma is good enough.
-        if np.sum(moved * _apply(L, moved)) < 1e-4:
+        if _dot(moved, _apply(L, moved)) < 1e-4:
             break
     return out_R, out_t, out_m, out_P, gaussian, misfit, count
 
@@ -164,7 +189,7 @@ def grow(
                 steady_P = P
             prior = old.weight[h] + np.log(1 - dynamics.p_manoeuvre if mode == 0 else dynamics.p_manoeuvre)
             assigned, score, counted, R_b, t_b, b = associate(
-                views, sights, frame, chances, R, t, np.ascontiguousarray(P[:6, :6]), shining, extra
+                views, sights, frame, chances, R, t, _block(P, 6), shining, extra
             )
             before = (R, t, m, P)
             for k in range(b):
@@ -192,7 +217,7 @@ def grow(
                         _, _, _, P_jump, _ = predicted(
                             old.R[h], old.t[h], old.m[h], old.P[h], dt, dynamics.jerk, dynamics.jump, dynamics.unsteady
                         )
-                        P_k = (1 - p) * steady_P + p * P_jump
+                        P_k = _mixed(steady_P, P_jump, p)
                 total = prior + counted[k] + gaussian + together(shown, sights.group, assigned[k], chances.detect)
                 if not np.isfinite(total):
                     continue
@@ -208,7 +233,20 @@ DARK_MANOEUVRE = 0.05  # least chance of a manoeuvre per frame that nothing was 
 @compiled
 def _misses(assigned: Ints, shown: Array) -> bool:
     """Whether a spot that should be seen is not."""
-    return bool(np.any(((assigned == MISSED) | (assigned >= BLENDED)) & (shown > 0.5)))
+    misses = False
+    for i in range(assigned.shape[0]):
+        misses |= (assigned[i] == MISSED or assigned[i] >= BLENDED) and shown[i] > 0.5
+    return misses
+
+
+@compiled
+def _mixed(P: Array, other: Array, p: float) -> Array:
+    """(1 - p) P + p other, of matrices."""
+    out = np.empty_like(P)
+    for i in range(P.shape[0]):
+        for j in range(P.shape[1]):
+            out[i, j] = (1 - p) * P[i, j] + p * other[i, j]
+    return out
 
 
 @compiled
@@ -228,15 +266,17 @@ def add_child(
     """Add a child, in place of the worst where there is no room; how many there are then."""
     place = count
     if count == MOST_CHILDREN:
-        place = int(np.argmin(children.after.weight[:count]))
+        place = 0
+        for k in range(count):
+            if children.after.weight[k] < children.after.weight[place]:
+                place = k
         if children.after.weight[place] >= weight:
             return count
     else:
         count += 1
-    children.after.R[place], children.after.t[place], children.after.m[place] = R, t, m
-    children.after.P[place], children.after.weight[place] = P, weight
-    children.assigned[place], children.manoeuvre[place], children.parent[place] = assigned, manoeuvre, parent
-    children.after.shown[place] = shown
+    _put_hypothesis(children.after, place, R, t, m, P, weight, shown)
+    _put(children.assigned[place], assigned)
+    children.manoeuvre[place], children.parent[place] = manoeuvre, parent
     return count
 
 
@@ -249,17 +289,20 @@ def sift(children: Children, count: int) -> tuple[Hypotheses, Ints, Array, Array
     """
     w = children.after.weight[:count]
     n = children.assigned.shape[1]
-    order = np.argsort(-w)
+    order = _best_first(w)
     best = order[0]
-    share = np.exp(w - w[best])
-    total = np.sum(share)
+    share = np.empty(count)
+    total = 0.0
+    for k in range(count):
+        share[k] = np.exp(w[k] - w[best])
+        total += share[k]
     certain, spread = np.zeros(n), np.zeros((6, 6))
     for k in range(count):
         p = share[k] / total
         for i in range(n):
             if children.assigned[k, i] % BLENDED == children.assigned[best, i] % BLENDED:
                 certain[i] += p
-        if k != best and p > 1e-6:
+        if k != best and p > LEAST_SHARE:
             d = _apart(children.after.R[k], children.after.t[k], children.after.R[best], children.after.t[best])
             for i in range(6):
                 for j in range(6):
@@ -280,12 +323,15 @@ def sift(children: Children, count: int) -> tuple[Hypotheses, Ints, Array, Array
         elif h < MOST_KEPT:
             kept[h], weight[h] = k, w[k] - w[best] - np.log(total)
             h += 1
-    places = kept[:h]
+    heaviest = -np.inf
+    for i in range(h):
+        heaviest = max(heaviest, weight[i])
     a = children.after
-    staying = Hypotheses(
-        a.R[places], a.t[places], a.m[places], a.P[places], weight[:h] - np.max(weight[:h]), a.shown[places]
-    )
-    return staying, places, certain, spread
+    staying = _room_for(h, a.shown.shape[1])
+    for i in range(h):
+        k = kept[i]
+        _put_hypothesis(staying, i, a.R[k], a.t[k], a.m[k], a.P[k], weight[i] - heaviest, a.shown[k])
+    return staying, kept[:h], certain, spread
 
 
 @compiled

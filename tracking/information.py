@@ -12,7 +12,7 @@ from geometry.arrays import Array, Bools
 from geometry.compiled import compiled
 from geometry.projection import Views, project_view
 
-_apart, _moved, _apply, _solve, _multiply = small.apart, small.moved, small.apply, small.solve, small.multiply
+_moved, _solve, _column, _dot = small.moved, small.solve, small.column, small.dot
 
 
 @compiled
@@ -63,12 +63,13 @@ def fit_alone(
     """
     L, g, chi2, count, _ = frame_information(views, R, t, use, uv, cov)
     for _ in range(4):
-        A = L.copy()
+        A, right = L.copy(), np.empty((6, 1))
         for i in range(6):
             A[i, i] += 1e-9 * L[i, i] + 1e-12
-        x, _ = _solve(A, np.ascontiguousarray(g.reshape(6, 1)))
-        step = x[:, 0].copy()
-        size = np.sqrt(np.sum(step * step))
+            right[i, 0] = g[i]
+        x, _ = _solve(A, right)
+        step = _column(x, 0)
+        size = np.sqrt(_dot(step, step))
         if not size < 0.5:
             break
         R_new, t_new = _moved(R, t, step)

@@ -19,6 +19,7 @@ STATE = 18
 
 _multiply, _exp, _right_jacobian, _symmetrise = small.multiply, small.exp, small.right_jacobian, small.symmetrise
 _apply, _solve, _moved = small.apply, small.solve, small.moved
+_block, _column, _beside = small.block, small.column, small.beside
 
 
 @compiled
@@ -32,8 +33,11 @@ def predicted(
     unsteady (2,): the same of the accelerations.
     """
     h = 0.5 * dt * dt
-    turn = dt * m[3:6] + h * m[9:12]
-    E = _exp(-turn)
+    turn, back = np.empty(3), np.empty(3)
+    for i in range(3):
+        turn[i] = dt * m[3 + i] + h * m[9 + i]
+        back[i] = -turn[i]
+    E = _exp(back)
     G = _right_jacobian(turn)
     F = np.zeros((STATE, STATE))
     for i in range(STATE):
@@ -65,10 +69,12 @@ def predicted(
         out[i + 12, i + 6] += q * dt**2 / 2
         out[i + 12, i + 12] += q * dt
     _symmetrise(out)
-    m_new = m.copy()
+    t_new, m_new = t.copy(), m.copy()
+    for i in range(3):
+        t_new[i] = t[i] + dt * m[i] + h * m[6 + i]
     for i in range(6):
         m_new[i] += dt * m[6 + i]
-    return _multiply(R, _exp(turn)), t + dt * m[:3] + h * m[6:9], m_new, out, F
+    return _multiply(R, _exp(turn)), t_new, m_new, out, F
 
 
 @compiled
@@ -96,14 +102,11 @@ def updated(
     log det(I + P information), which with the whitened misfit makes the likelihood, and w (6,) = S^-1 (innovation) in
     pose space: w^T P w is the part of the misfit that the motion takes.
     """
-    A = _multiply(information, np.ascontiguousarray(P[:6, :6]))
-    right = np.empty((6, 7))
+    A = _multiply(information, _block(P, 6))
     for i in range(6):
         A[i, i] += 1.0
-        right[i, :6] = information[i]
-        right[i, 6] = r[i]
-    x, log_det = _solve(A, right)  # (I + L P)^-1 [L, r]
-    w = x[:, 6].copy()
+    x, log_det = _solve(A, _beside(information, r))  # (I + L P)^-1 [L, r]
+    w = _column(x, 6)
     half = np.zeros((STATE, 6))
     step = np.zeros(STATE)
     for i in range(STATE):
@@ -120,5 +123,8 @@ def updated(
                 s += half[i, k] * P[j, k]
             out[i, j] -= s
             out[j, i] = out[i, j]
-    R_new, t_new = _moved(R, t, step[:6])
-    return R_new, t_new, m + step[6:], out, log_det, w
+    R_new, t_new = _moved(R, t, step)
+    m_new = m.copy()
+    for i in range(12):
+        m_new[i] += step[6 + i]
+    return R_new, t_new, m_new, out, log_det, w

@@ -28,7 +28,8 @@ RIVAL = 9.0  # nats: assignments so far behind the best say nothing of its certa
 VAGUE_M, VAGUE_RAD = 0.3, 0.5  # a frame of which the others say less than this is left as it is
 
 _apply, _multiply, _solve = small.apply, small.multiply, small.solve
-_moved, _symmetrise = small.moved, small.symmetrise
+_moved, _symmetrise, _block, _column, _beside = small.moved, small.symmetrise, small.block, small.column, small.beside
+_put, _put_matrix = small.put, small.put_matrix
 
 
 class AllDetections(NamedTuple):
@@ -51,7 +52,10 @@ def labelled_points(all_of: AllDetections, k: int, assigned: Ints, extra: Array)
         if 0 <= assigned[i] < BLENDED:
             d = all_of.begin[k] + assigned[i]
             use[i] = True
-            uv[i], cov[i] = all_of.uv[d], all_of.cov[d] + extra[i]
+            for a in range(2):
+                uv[i, a] = all_of.uv[d, a]
+                for b in range(2):
+                    cov[i, a, b] = all_of.cov[d, a, b] + extra[i, a, b]
     return use, uv, cov
 
 
@@ -61,12 +65,13 @@ def evidence_of(
 ) -> tuple[Array, Array, Array, Ints]:
     """Information matrices (T, 6, 6), vectors (T, 6), misfits (T,) and numbers of spots (T,) at a reference motion."""
     frames = assigned.shape[0]
-    L, g = np.zeros((frames, 6, 6)), np.zeros((frames, 6))
-    chi2, spots = np.zeros(frames), np.zeros(frames, np.int64)
+    L, g = np.empty((frames, 6, 6)), np.empty((frames, 6))
+    chi2, spots = np.empty(frames), np.empty(frames, np.int64)
     for k in range(frames):
         use, uv, cov = labelled_points(all_of, k, assigned[k], extra)
-        L_k, g_k, chi2_k, count, _ = frame_information(views, ref.R[k], ref.t[k], use, uv, cov)
-        L[k], g[k], chi2[k], spots[k] = L_k, g_k, chi2_k, count
+        L_k, g_k, chi2[k], spots[k], _ = frame_information(views, ref.R[k], ref.t[k], use, uv, cov)
+        _put_matrix(L[k], L_k)
+        _put(g[k], g_k)
     return L, g, chi2, spots
 
 
@@ -95,7 +100,9 @@ def clutter_density(
                     taken |= assigned[k, j] == d or assigned[k, j] == d + BLENDED
                 if not taken and a * a + b * b < radius_px * radius_px:
                     count[c] += 1
-    return count / (np.maximum(discs, 1.0) * np.pi * radius_px**2)
+    for c in range(cameras):
+        count[c] /= max(discs[c], 1.0) * np.pi * radius_px**2
+    return count
 
 
 @compiled
@@ -117,21 +124,22 @@ def relabelled(
     """
     frames, n = assigned.shape
     out, certain = assigned.copy(), np.ones((frames, n))
-    groups = int(sights.group.max()) + 1
+    groups = 0
+    for i in range(n):
+        groups = max(groups, sights.group[i] + 1)
     nothing = np.zeros(12)
     for k in range(frames):
         use, uv, cov = labelled_points(all_of, k, assigned[k], extra)
         L, g, _, _, _ = frame_information(views, ref.R[k], ref.t[k], use, uv, cov)
         P = pose_P[k]
-        A = -_multiply(P, L)
-        right = np.empty((6, 7))
-        Pg = _apply(P, g)
+        A, step = _multiply(P, L), _apply(P, g)
         for i in range(6):
+            step[i] = -step[i]
+            for j in range(6):
+                A[i, j] = -A[i, j]
             A[i, i] += 1.0
-            right[i, :6] = P[i]
-            right[i, 6] = -Pg[i]
-        x, _ = _solve(A, right)
-        alone = np.ascontiguousarray(x[:, :6])
+        x, _ = _solve(A, _beside(P, step))
+        alone = _block(x, 6)
         _symmetrise(alone)
         vague = False
         for i in range(6):
@@ -139,7 +147,7 @@ def relabelled(
             vague |= not 0.0 < alone[i, i] < limit * limit
         if vague:
             continue
-        R, t = _moved(ref.R[k], ref.t[k], x[:, 6].copy())
+        R, t = _moved(ref.R[k], ref.t[k], _column(x, 6))
         a, b = all_of.begin[k], all_of.begin[k + 1]
         frame = Frame(
             all_of.uv[a:b], all_of.cov[a:b], all_of.blend_px[a:b], all_of.first[k], all_of.has_image[k], log_clutter[k]
@@ -148,14 +156,17 @@ def relabelled(
         shining = marginal(hidden, sights.group)
         found, score, counted, R_b, t_b, count = associate(views, sights, frame, chances, R, t, alone, shining, extra)
         whole = np.zeros((STATE, STATE))
-        whole[:6, :6] = alone
-        exact = np.full(count, -np.inf)
+        _put_matrix(whole, alone)
+        exact = np.empty(count)
         before = (R, t, nothing, whole)
+        best = 0
         for j in range(count):
+            exact[j] = -np.inf
             if score[j] > score[0] - 2 * RIVAL:
                 _, _, _, _, gaussian, _, _ = concluded(views, frame, extra, before, found[j], R_b[j], t_b[j])
                 exact[j] = counted[j] + gaussian + together(hidden, sights.group, found[j], chances.detect)
-        best = int(np.argmax(exact))
+            if exact[j] > exact[best]:
+                best = j
         total = 0.0
         share = np.zeros(n)
         for j in range(count):

@@ -72,9 +72,12 @@ def believable(uv_px: Array, cov_px2: Array) -> Bools:
 def _few_and_fine(uv_px: Array, cov_px2: Array) -> bool:
     """Whether all points (m, 2) can be used, said without sorting them; False of more than a few without a look."""
     m = len(uv_px)
-    if m > _FEW or not np.all(believable(uv_px, cov_px2)):
+    if m > _FEW:
         return False
+    good = believable(uv_px, cov_px2)
     for i in range(m):
+        if not good[i]:
+            return False
         for j in range(i):
             if (uv_px[i, 0] - uv_px[j, 0]) ** 2 + (uv_px[i, 1] - uv_px[j, 1]) ** 2 < TWIN_PX**2:
                 return False
