@@ -125,6 +125,18 @@ def apply(a: Array, x: Array) -> Array:
 
 
 @compiled
+def transposed_apply(a: Array, x: Array) -> Array:
+    """a^T @ x of a small matrix and a vector."""
+    out = np.zeros(a.shape[1])
+    for i in range(a.shape[1]):
+        s = 0.0
+        for j in range(a.shape[0]):
+            s += a[j, i] * x[j]
+        out[i] = s
+    return out
+
+
+@compiled
 def solve(a: Array, b: Array) -> tuple[Array, float]:
     """x (n, m) with a x = b, and log |det a|, by elimination with row pivots; not finite where det is 0."""
     n, m = a.shape[0], b.shape[1]

@@ -22,6 +22,9 @@ CHUNK = 512  # frames whose covariances are in memory at once; the filter is run
 
 _apart, _multiply, _apply, _solve = small.apart, small.multiply, small.apply, small.solve
 _symmetrise, _moved = small.symmetrise, small.moved
+_transposed_multiply, _transposed_apply = small.transposed_multiply, small.transposed_apply
+_block, _column, _beside = small.block, small.column, small.beside
+_put, _put_matrix = small.put, small.put_matrix
 
 
 class Reference(NamedTuple):
@@ -50,8 +53,11 @@ def _step(ref: Reference, ev: Evidence, jerk: Array, k: int, x: Array, P: Array)
         ref.R[k - 1], ref.t[k - 1], ref.m[k - 1], P, ev.dt[k], jerk[k], ev.jump[k], ev.unsteady[k]
     )
     x_new = _apply(F, x)
-    x_new[:6] += _apart(R, t, ref.R[k], ref.t[k])
-    x_new[6:] += m - ref.m[k]
+    d = _apart(R, t, ref.R[k], ref.t[k])
+    for i in range(6):
+        x_new[i] += d[i]
+    for i in range(12):
+        x_new[6 + i] += m[i] - ref.m[k, i]
     return x_new, P_new, F
 
 
@@ -62,15 +68,13 @@ def _update(ev: Evidence, k: int, x: Array, P: Array) -> tuple[Array, Array, Arr
     w = S^-1 innovation and M = S^-1 in pose space. The likelihood is up to what does not depend on the motion.
     """
     L, g = ev.information[k], ev.vector[k]
-    r = g - _apply(L, x[:6])
-    A = _multiply(L, np.ascontiguousarray(P[:6, :6]))
-    right = np.empty((6, 7))
+    Lx, r = _apply(L, x[:6]), np.empty(6)
+    A = _multiply(L, _block(P, 6))
     for i in range(6):
+        r[i] = g[i] - Lx[i]
         A[i, i] += 1.0
-        right[i, :6] = L[i]
-        right[i, 6] = r[i]
-    y, log_det = _solve(A, right)
-    w, M = y[:, 6].copy(), np.ascontiguousarray(y[:, :6])
+    y, log_det = _solve(A, _beside(L, r))
+    w, M = _column(y, 6), _block(y, 6)
     _symmetrise(M)
     step = np.zeros(STATE)
     half = np.zeros((STATE, 6))
@@ -88,16 +92,26 @@ def _update(ev: Evidence, k: int, x: Array, P: Array) -> tuple[Array, Array, Arr
             out[i, j] -= s
             out[j, i] = out[i, j]
     misfit = 0.0
-    Lx = _apply(L, x[:6])
     for i in range(6):
         misfit += x[i] * (Lx[i] - 2 * g[i]) - r[i] * step[i]
-    return x + step, out, w, M, -0.5 * (log_det + misfit)
+    for i in range(STATE):
+        step[i] += x[i]
+    return step, out, w, M, -0.5 * (log_det + misfit)
+
+
+@compiled
+def _before_all(ev: Evidence) -> tuple[Array, Array]:
+    """The first frame's deviation (18,) and its covariance (18, 18) before anything was seen."""
+    P = np.zeros((STATE, STATE))
+    for i in range(STATE):
+        P[i, i] = ev.first[i]
+    return np.zeros(STATE), P
 
 
 @compiled
 def log_likelihood(ref: Reference, ev: Evidence, jerk: Array) -> float:
     """How likely the evidence is for a motion with this jerk (T, 2), nats, up to a constant."""
-    x, P = np.zeros(STATE), np.diag(ev.first)
+    x, P = _before_all(ev)
     total = 0.0
     for k in range(ev.dt.shape[0]):
         if k > 0:
@@ -122,12 +136,13 @@ def smoothed(ref: Reference, ev: Evidence, jerk: Array) -> tuple[Array, Array, A
     shock = np.zeros(frames)
     chunks = (frames + CHUNK - 1) // CHUNK
     start_x, start_P = np.zeros((chunks, STATE)), np.zeros((chunks, STATE, STATE))
-    x, P = np.zeros(STATE), np.diag(ev.first)
+    x, P = _before_all(ev)
     for k in range(frames):
         if k > 0:
             x, P, _ = _step(ref, ev, jerk, k, x, P)
         if k % CHUNK == 0:
-            start_x[k // CHUNK], start_P[k // CHUNK] = x, P
+            _put(start_x[k // CHUNK], x)
+            _put_matrix(start_P[k // CHUNK], P)
         x, P, _, _, _ = _update(ev, k, x, P)
     later_x, later_L = np.zeros(STATE), np.zeros((STATE, STATE))  # what the frames after one say of it
     room = min(CHUNK, frames)
@@ -139,17 +154,24 @@ def smoothed(ref: Reference, ev: Evidence, jerk: Array) -> tuple[Array, Array, A
         for k in range(begin, end):
             if k > begin:
                 x, P, F = _step(ref, ev, jerk, k, x, P)
-                Fs[k - begin] = F
-            heads[k - begin] = P[:, :6]
+                _put_matrix(Fs[k - begin], F)
+            for a in range(STATE):
+                for b in range(6):
+                    heads[k - begin, a, b] = P[a, b]
             x, P, w, M, _ = _update(ev, k, x, P)
-            xs[k - begin], Ps[k - begin], ws[k - begin], Ms[k - begin] = x, P, w, M
+            _put(xs[k - begin], x)
+            _put_matrix(Ps[k - begin], P)
+            _put(ws[k - begin], w)
+            _put_matrix(Ms[k - begin], M)
         if begin > 0:  # the step into the chunk, for the one before
             _, _, F = _step(ref, ev, jerk, begin, np.zeros(STATE), np.zeros((STATE, STATE)))
-            Fs[0] = F
+            _put_matrix(Fs[0], F)
         for k in range(end - 1, begin - 1, -1):
             j = k - begin
             P = Ps[j]
-            out_x[k] = xs[j] - _apply(P, later_x)
+            change = _apply(P, later_x)
+            for a in range(STATE):
+                out_x[k, a] = xs[j, a] - change[a]
             S = _multiply(_multiply(P, later_L), P)
             for a in range(6):
                 for b in range(6):
@@ -159,19 +181,20 @@ def smoothed(ref: Reference, ev: Evidence, jerk: Array) -> tuple[Array, Array, A
                 break
             # Back over the measurement: C = I - P[:, :6] M.
             C = np.zeros((STATE, STATE))
-            C[:, :6] = -_multiply(heads[j], Ms[j])
+            gain = _multiply(heads[j], Ms[j])
             for a in range(STATE):
+                for b in range(6):
+                    C[a, b] = -gain[a, b]
                 C[a, a] += 1.0
-            back_L = _multiply(np.ascontiguousarray(C.T), _multiply(later_L, C))
-            back_x = _apply(np.ascontiguousarray(C.T), later_x)
+            back_L = _transposed_multiply(C, _multiply(later_L, C))
+            back_x = _transposed_apply(C, later_x)
             for a in range(6):
                 back_x[a] -= ws[j, a]
                 for b in range(6):
                     back_L[a, b] += Ms[j, a, b]
             # And over the step before it.
-            Ft = np.ascontiguousarray(Fs[j].T)
-            later_x = _apply(Ft, back_x)
-            later_L = _multiply(Ft, _multiply(back_L, Fs[j]))
+            later_x = _transposed_apply(Fs[j], back_x)
+            later_L = _transposed_multiply(Fs[j], _multiply(back_L, Fs[j]))
             _symmetrise(later_L)
             shock[k] = _chi_square(later_L, later_x)
     return out_x, pose_P, motion_P, shock
@@ -206,30 +229,28 @@ def told_by_the_others(ref: Reference, ev: Evidence, jerk: Array) -> float:
     """
     x, P, _, _ = smoothed(ref, ev, jerk)
     total = 0.0
-    right = np.empty((6, 7))
+    r = np.empty((6, 1))
     for k in range(ev.dt.shape[0]):
         L, g = ev.information[k], ev.vector[k]
         if L[0, 0] == 0.0:
             continue
         # Take the frame's own evidence away again: (I - P L)^-1 of P and of the deviation.
-        A, Pg = _multiply(P[k], L), _apply(P[k], g)
+        A, d = _multiply(P[k], L), _apply(P[k], g)
         for i in range(6):
             for j in range(6):
                 A[i, j] = (1.0 if i == j else 0.0) - A[i, j]
-                right[i, j] = P[k, i, j]
-            right[i, 6] = x[k, i] - Pg[i]
-        alone, _ = _solve(A, right)
-        d = np.ascontiguousarray(alone[:, 6])
-        r = g - _apply(L, d)
-        B = _multiply(L, np.ascontiguousarray(alone[:, :6]))
+            d[i] = x[k, i] - d[i]
+        alone, _ = _solve(A, _beside(P[k], d))
+        d, P_alone = _column(alone, 6), _block(alone, 6)
+        Ld, B = _apply(L, d), _multiply(L, P_alone)
         for i in range(6):
+            r[i, 0] = g[i] - Ld[i]
             B[i, i] += 1.0
-        w, log_det = _solve(B, np.ascontiguousarray(r.reshape(6, 1)))
-        step = _multiply(np.ascontiguousarray(alone[:, :6]), w)
-        Ld = _apply(L, d)
+        w, log_det = _solve(B, r)
+        step = _multiply(P_alone, w)
         misfit = 0.0
         for i in range(6):
-            misfit += d[i] * (Ld[i] - 2 * g[i]) - r[i] * step[i, 0]
+            misfit += d[i] * (Ld[i] - 2 * g[i]) - r[i, 0] * step[i, 0]
         total -= 0.5 * (log_det + misfit)
     return total
 
@@ -237,8 +258,11 @@ def told_by_the_others(ref: Reference, ev: Evidence, jerk: Array) -> float:
 @compiled
 def shifted(ref: Reference, x: Array) -> Reference:
     """The reference moved by deviations (T, 18)."""
-    R, t, m = np.empty_like(ref.R), np.empty_like(ref.t), ref.m + x[:, 6:]
+    R, t, m = ref.R.copy(), ref.t.copy(), ref.m.copy()
     for k in range(ref.t.shape[0]):
-        R_k, t_k = _moved(ref.R[k], ref.t[k], x[k, :6])
-        R[k], t[k] = R_k, t_k
+        R_k, t_k = _moved(ref.R[k], ref.t[k], x[k])
+        _put_matrix(R[k], R_k)
+        _put(t[k], t_k)
+        for i in range(12):
+            m[k, i] += x[k, 6 + i]
     return Reference(R, t, m)
