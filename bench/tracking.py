@@ -1,4 +1,6 @@
-"""The accuracy table of tracking: `python -m bench.tracking` (or `make bench-tracking`) prints it.
+"""The accuracy table of single frames and of the `spots` tracker: `python -m bench.tracking` prints it.
+
+bench/rigid.py has that of the rigid tracker and the smoother; `make bench-tracking` prints both.
 
 Every row is a Monte Carlo on simulated points (lab/simulate/points.py) with fresh seeds that no parameter was chosen on
 (parameters were looked at with seeds 100 to 103). Nothing here needs pictures; bench/whole_run.py has those rows.
@@ -24,6 +26,7 @@ from tracking.detections import Detections
 from tracking.labels import NO_POINT, PosePrior, find_labels
 from tracking.out_of_view import CoplanarViews, quadratic_positions
 from tracking.parameters import TrackerParameters
+from tracking.rigid_tracker import RigidTracker
 from tracking.spot_tracker import SpotTracker
 from tracking.statuses import PoseStatus, SpotStatus
 from tracking.tracked_frame import TrackedFrame
@@ -46,13 +49,18 @@ def track(run: PointRun, parameters: TrackerParameters) -> tuple[list[TrackedFra
     """The tracker over one recording, and its process time per frame, ms."""
     p = run.prior
     centre = Pose.from_ypr(np.deg2rad(p.yaw_pitch_roll_deg), np.array(p.position_m))
-    tracker = SpotTracker(run.rig, parameters, PosePrior(centre, p.within_m, float(np.deg2rad(p.within_deg))))
-    out = []
+    kind = RigidTracker if parameters.method == "rigid" else SpotTracker
+    tracker = kind(run.rig, parameters, PosePrior(centre, p.within_m, float(np.deg2rad(p.within_deg))))
     start = time.process_time()
-    for k in range(len(run.frame)):
-        found = [d if run.has_image[k, c] else None for c, d in enumerate(run.detections[k])]
-        out.append(tracker.step(float(run.t_s[k] - run.t_s[k - 1]) if k else 0.0, found))
+    out = [
+        tracker.step(float(run.t_s[k] - run.t_s[k - 1]) if k else 0.0, found_in(run, k)) for k in range(len(run.frame))
+    ]
     return out, (time.process_time() - start) / len(out) * 1e3
+
+
+def found_in(run: PointRun, k: int) -> list[Detections | None]:
+    """The detections of frame k by camera; None without a picture."""
+    return [d if run.has_image[k, c] else None for c, d in enumerate(run.detections[k])]
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,16 +120,17 @@ def tally(run: PointRun, out: list[TrackedFrame], ms: float) -> Tally:
 
 def tracker_rows(seeds: int, frames: int) -> Iterator[Row]:
     """Identity and prediction of the `spots` tracker; goals where the project has set one."""
-    paper = TrackerParameters(rigid_check=False, estimate="prediction", out_of_view="quadratic")
+    spots = TrackerParameters(method="spots")
+    paper = TrackerParameters(method="spots", rigid_check=False, estimate="prediction", out_of_view="quadratic")
     cases: list[tuple[str, str, TrackerParameters, dict[str, float], str]] = [
-        ("smooth, 20 % clutter", "smooth", TrackerParameters(), {}, "<= 0.30 px; >= 0.999"),
-        ("sharp turns, 20 % clutter", "sharp-turns", TrackerParameters(), {}, "<= 0.40 px; >= 0.995"),
-        ("sharp turns, 100 % clutter", "sharp-turns", TrackerParameters(), {"clutter": 1.0}, ""),
-        ("smooth, 0.3 px noise", "smooth", TrackerParameters(), {"noise_px": 0.3}, ""),
-        ("one spot hidden 10 frames in a turn", "hidden-in-turn", TrackerParameters(), {}, ""),
-        ("everything hidden 10 frames", "blackout", TrackerParameters(), {}, ""),
-        ("four times as fast", "fast", TrackerParameters(), {}, ""),
-        ("four skew beams", "four-skew-beams", TrackerParameters(), {}, ""),
+        ("smooth, 20 % clutter", "smooth", spots, {}, "<= 0.30 px; >= 0.999"),
+        ("sharp turns, 20 % clutter", "sharp-turns", spots, {}, "<= 0.40 px; >= 0.995"),
+        ("sharp turns, 100 % clutter", "sharp-turns", spots, {"clutter": 1.0}, ""),
+        ("smooth, 0.3 px noise", "smooth", spots, {"noise_px": 0.3}, ""),
+        ("one spot hidden 10 frames in a turn", "hidden-in-turn", spots, {}, ""),
+        ("everything hidden 10 frames", "blackout", spots, {}, ""),
+        ("four times as fast", "fast", spots, {}, ""),
+        ("four skew beams", "four-skew-beams", spots, {}, ""),
         ("the paper's way alone, smooth", "smooth", paper, {}, ""),
         ("the paper's way alone, sharp turns", "sharp-turns", paper, {}, ""),
     ]

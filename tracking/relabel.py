@@ -23,7 +23,7 @@ from tracking.motion import STATE
 # Probability that a spot is not hidden where its screen is lit, by what the frames beside it (those in which the screen
 # was lit) show: it in none of them, in one of two, in all; and that a screen is lit, by how many of them show it so.
 SHOWN = np.array([0.2, 0.6, 0.98])
-LIT = np.array([0.03, 0.5, 0.995])
+LIT = np.array([0.01, 0.3, 0.995])
 RIVAL = 9.0  # nats: assignments so far behind the best say nothing of its certainty
 VAGUE_M, VAGUE_RAD = 0.3, 0.5  # a frame of which the others say less than this is left as it is
 

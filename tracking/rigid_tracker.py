@@ -24,7 +24,17 @@ from tracking.association import BLENDED, Chances, Frame, Sights
 from tracking.detections import Detections
 from tracking.digest import Digest, ahead, digest, surprise
 from tracking.hiding import MISSED, learnt, together
-from tracking.hypotheses import Children, Hypotheses, add_child, chosen_points, concluded, grow, no_children, sift
+from tracking.hypotheses import (
+    PROOF,
+    Children,
+    Hypotheses,
+    add_child,
+    chosen_points,
+    concluded,
+    grow,
+    no_children,
+    sift,
+)
 from tracking.information import fit_alone
 from tracking.labels import NO_POINT, LabelResult, PosePrior, find_labels
 from tracking.match import UNMATCHED
@@ -72,6 +82,7 @@ class RigidTracker:
         self._systematic = np.zeros((6, 6))  # ... and on the pose
         self._anchor: Pose | None = None  # the last measured pose ...
         self._anchor_age_s = 0.0  # ... and its age
+        self._saw_any = False  # the frame before showed spots
         self._few = 0  # frames in a row with fewer than FEW spots
         self._searches = 0  # in a row without success
         self._told_tie = False
@@ -305,7 +316,10 @@ class RigidTracker:
         pose = Pose(h.R[0], h.t[0])
         covariance = h.P[0, :6, :6] + spread + systematic
         known = measured or (self._anchor is not None and not self._lost(covariance))
-        labelled = d.labelled if known else np.zeros_like(d.labelled)
+        # After a frame that showed nothing, one or two points may be false ones: a second such frame must follow.
+        alone = np.count_nonzero(d.labelled) < PROOF and not self._saw_any
+        self._saw_any = bool((assigned >= 0).any())
+        labelled = d.labelled if known and not alone else np.zeros_like(d.labelled)
         predicted_cov: Array | None = None
         if measured:
             if best in fresh:
@@ -330,7 +344,7 @@ class RigidTracker:
         if known:
             self._clutter.learn(d.near, d.discs)
             events.extend(
-                Event("undecided", f"label left open: its probability is {certain[v]:.2f}", int(v))
+                Event("undecided", _why_open(bool(d.labelled[v]), float(certain[v])), int(v))
                 for v in np.flatnonzero((assigned >= 0) & ~labelled)
             )
         seen = labelled[:, None]
@@ -407,3 +421,10 @@ class RigidTracker:
             events=tuple(events),
             label_probability=np.full(n, np.nan),
         )
+
+
+def _why_open(certain_enough: bool, probability: float) -> str:
+    """Why a label was not given, in words."""
+    if certain_enough:
+        return "label left open: one or two points of light after a dark frame may be false ones"
+    return f"label left open: its probability is {probability:.2f}"

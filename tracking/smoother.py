@@ -19,6 +19,7 @@ from geometry.projection import Views, project_all
 from geometry.solve import SolveLimits, covariance_of, fit_pose
 from tracking.association import BLENDED, Chances, Sights
 from tracking.fixed_interval import Evidence, Reference, log_likelihood, shifted, smoothed, told_by_the_others
+from tracking.hypotheses import PROOF
 from tracking.information import fit_alone
 from tracking.misfit import DEADBAND
 from tracking.recording import Recording
@@ -26,7 +27,7 @@ from tracking.relabel import AllDetections, clutter_density, evidence_of, labell
 from tracking.rigid_tracker import LOST_SIGMA_M, LOST_SIGMA_RAD
 from tracking.smoothed import Smoothed
 from tracking.surroundings import RADIUS_PX
-from tracking.temper import JUMP_OF_SPEED, LEAST_JUMP, RANGE, STEADIES_WITHIN_S
+from tracking.temper import JUMP_OF_SPEED, LEAST_JUMP, STEADIES_WITHIN_S
 
 MOST_ROUNDS = 5
 MOST_STEPS = 8  # of Gauss-Newton per round
@@ -34,6 +35,8 @@ SHOCK = 45.0  # chi-square of 6 degrees (p = 5e-8): a jump of the velocities bey
 APART = 2  # frames: of shocks so near each other the largest is looked at first
 SMALL_STEP = 0.02  # sigmas: a step of Gauss-Newton that is nothing any more
 LONGEST_STEP = 0.3  # m and rad, of the reference: beyond it nothing is linear
+# m/s^3 or rad/s^3 per sqrt(Hz). The lower end is for a vehicle that stands for a minute: 1e-4 already is 2e-3 rad in 6 s.
+RANGE = (1e-7, 1e5)
 MOST_FRAMES_FOR_JERK = 3000  # the likelihood is sharp enough by then
 MOST_FRAMES_BETWEEN = 1000  # the same of the other one, which takes five times as long
 FINER = np.log(3.0)  # so much smaller than the likeliest the other one usually is: where to begin
@@ -71,7 +74,9 @@ def smooth(recording: Recording) -> Smoothed:
         log_clutter = _log_clutter(rec, views, sights, every, assigned, ref, known)
         found, certain = relabelled(views, sights, chances, every, assigned, extra, ref, pose_P, log_clutter)
         new = np.where((certain >= parameters.min_label_probability) & known[:, None], found, -1)
-        probability = np.where(found >= 0, certain, np.nan)
+        lone = _lone_points(new)
+        new[lone] = -1
+        probability = np.where((found >= 0) & ~lone[:, None], certain, np.nan)
         changed = int(np.count_nonzero(new != assigned))
         assigned = new
         measured, rms = _alone(rec, views, every, assigned, extra, ref)
@@ -99,6 +104,18 @@ def smooth(recording: Recording) -> Smoothed:
         noise_scale=scale,
         extra=extra,
     )
+
+
+def _lone_points(assigned: Ints) -> Bools:
+    """(T,): frames beside a dark one with a spot or two, where the other side is dark too, or shows many more.
+
+    What is there is rather a false point or two than the last or first light: measured, all of some ten such labels in
+    recordings with blackouts were wrong.
+    """
+    count = np.count_nonzero(assigned >= 0, axis=1)
+    before, after = np.concatenate([[-1], count[:-1]]), np.concatenate([count[1:], [-1]])
+    company = ((before > 0) & (before < count + 2)) | ((after > 0) & (after < count + 2))
+    return (count > 0) & (count < PROOF) & ((before == 0) | (after == 0)) & ~company
 
 
 def _all_detections(rec: Recording) -> AllDetections:
