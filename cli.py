@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -16,10 +17,26 @@ _FOLDER = click.Path(file_okay=False, path_type=Path)
 _ANY_PATH = click.Path(path_type=Path)
 
 
+class _ToStderr(logging.Handler):
+    """What the floors below tell whoever waits, such as that they compile: a line on stderr."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        print(f"beampose: {record.getMessage()}", file=sys.stderr)  # not by click, which writes into a progress bar
+
+
+def _listen_on_a_terminal() -> None:
+    """On a terminal only, as the progress bar: elsewhere nobody waits, and a word on stderr means trouble."""
+    logger = logging.getLogger("beampose")
+    if sys.stderr.isatty() and not logger.handlers:
+        logger.addHandler(_ToStderr())
+        logger.setLevel(logging.INFO)
+
+
 class _Commands(click.Group):
     """Turns the lab's own exceptions and click's into a plain line or two and an exit status, in one place."""
 
     def main(self, *args: Any, **kwargs: Any) -> Any:
+        _listen_on_a_terminal()
         try:
             sys.exit(super().main(*args, **{**kwargs, "standalone_mode": False}))
         except click.exceptions.NoArgsIsHelpError as error:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import logging
 import re
 import shlex
 import subprocess
@@ -399,3 +400,17 @@ def test_a_foreign_folder_is_not_replaced(tmp_path):
     assert done.exit_code == 2
     assert "something other than earlier results" in done.stderr
     assert (tmp_path / "thesis/chapter.tex").read_text() == "years"
+
+
+@pytest.mark.parametrize(("terminal", "words"), [(True, "beampose: compiling\n"), (False, "")])
+def test_what_the_floors_below_tell_is_shown_on_a_terminal_only(monkeypatch, capsys, terminal, words):
+    logger = logging.getLogger("beampose")
+    monkeypatch.setattr(logger, "handlers", [])
+    monkeypatch.setattr(logger, "level", logging.NOTSET)
+    logger.manager._clear_cache()
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal)
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    logger.info("compiling")
+    logger.manager._clear_cache()
+    assert capsys.readouterr().err == words
