@@ -1,0 +1,191 @@
+"""Recordings as points, tracked and looked at again, and how far off the answers are. For the tests."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from geometry.arrays import Array, Bools, Ints
+from geometry.pose import Pose
+from geometry.rig import Rig
+from geometry.rig_parameters import RigCovariance
+from lab.simulate.points import CLUTTER, PointRun
+from lab.simulate.scene import SHINING
+from tracking.detections import Detections
+from tracking.labels import PosePrior
+from tracking.match import UNMATCHED
+from tracking.parameters import TrackerParameters
+from tracking.recording import Recording
+from tracking.rigid_tracker import RigidTracker
+from tracking.smoothed import Smoothed
+from tracking.smoother import smooth
+from tracking.tracked_frame import TrackedFrame
+
+START = 10  # frames until the velocities are known
+RIGID = TrackerParameters()
+
+
+def prior_of(run: PointRun) -> PosePrior:
+    p = run.prior
+    centre = Pose.from_ypr(np.deg2rad(p.yaw_pitch_roll_deg), np.array(p.position_m))
+    return PosePrior(centre, p.within_m, float(np.deg2rad(p.within_deg)))
+
+
+def found_in(run: PointRun, k: int) -> list[Detections | None]:
+    return [d if run.has_image[k, c] else None for c, d in enumerate(run.detections[k])]
+
+
+def dt_of(run: PointRun, k: int) -> float:
+    return float(run.t_s[k] - run.t_s[k - 1]) if k else 0.0
+
+
+def tracked(
+    run: PointRun,
+    parameters: TrackerParameters = RIGID,
+    rig: Rig | None = None,
+    covariance: RigCovariance | None = None,
+    prior: PosePrior | None = None,
+) -> list[TrackedFrame]:
+    """What the rigid tracker says of a recording; rig: the one it believes in."""
+    tracker = RigidTracker(rig or run.rig, parameters, prior or prior_of(run), covariance)
+    return [tracker.step(dt_of(run, k), found_in(run, k)) for k in range(len(run.frame))]
+
+
+def looked_at_again(
+    run: PointRun,
+    frames: list[TrackedFrame],
+    parameters: TrackerParameters = RIGID,
+    rig: Rig | None = None,
+    covariance: RigCovariance | None = None,
+) -> tuple[list[TrackedFrame], Smoothed]:
+    """The smoother's answers after the tracker's."""
+    recording = Recording(rig or run.rig, parameters, covariance)
+    for k, frame in enumerate(frames):
+        recording.append(dt_of(run, k), found_in(run, k), frame)
+    smoothed = smooth(recording)
+    return [smoothed.frame(k, frame, found_in(run, k)) for k, frame in enumerate(frames)], smoothed
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """Answers against truth: T frames, n views."""
+
+    labelled: Bools  # (T, n) a detection was named
+    right: Bools  # (T, n) and is the spot's
+    shining: Bools  # (T, n) there was one to be named
+    errors: Array  # (T, 6) of the poses; nan without
+    nees: Array  # (T,) e^T P^-1 e of the poses; nan without
+    bound: Array  # (T, 6) Cramer-Rao variances from the frame's own spots; nan where they give no pose
+    prediction: Array  # (T, n, 2) px, error of the predicted places
+
+    @property
+    def identity(self) -> float:
+        return float(np.sum(self.right & self.shining) / np.sum(self.shining))
+
+    @property
+    def wrong(self) -> int:
+        return int(np.sum(self.labelled & ~self.right))
+
+    @property
+    def lit(self) -> Bools:
+        """Frames that give a pose by themselves, after the start."""
+        return ~np.isnan(self.bound[:, 0]) & ~np.isnan(self.errors[:, 0]) & (np.arange(len(self.nees)) >= START)
+
+    def missed(self) -> int:
+        return int(np.sum(self.shining & ~self.right))
+
+
+def judged(run: PointRun, frames: list[TrackedFrame]) -> Judged:
+    shape = run.in_view.shape
+    origin: Ints = np.full(shape, CLUTTER)
+    labelled = np.array([f.point != UNMATCHED for f in frames])
+    for k, v in zip(*np.nonzero(labelled), strict=True):
+        origin[k, v] = run.origin[k][run.model.camera_of[v]][frames[k].point[v]]
+    shining = (run.in_view == SHINING) & run.has_image[:, run.model.camera_of]
+    _, J = run.model.project(run.poses)
+    errors, nees, bound = np.full((shape[0], 6), np.nan), np.full(shape[0], np.nan), np.full((shape[0], 6), np.nan)
+    for k, f in enumerate(frames):
+        A = J[k][shining[k]].reshape(-1, 6) / run.noise_px
+        scale = np.maximum(np.linalg.norm(A, axis=0), 1e-9)
+        if shining[k].sum() >= 3 and np.linalg.cond(A / scale) < 1e4:
+            bound[k] = np.diagonal(np.linalg.inv(A.T @ A))
+        if f.pose is not None and f.pose_covariance is not None:
+            errors[k] = run.poses[k].minus(f.pose)
+            nees[k] = errors[k] @ np.linalg.solve(f.pose_covariance, errors[k])
+    prediction = np.array([f.predicted_px for f in frames]) - run.uv_px
+    views = np.arange(shape[1])
+    return Judged(labelled, labelled & (origin == views), shining, errors, nees, bound, prediction)
+
+
+@dataclass(frozen=True, slots=True)
+class Pooled:
+    """Several recordings together."""
+
+    some: list[Judged]
+
+    @property
+    def identity(self) -> float:
+        return float(sum(np.sum(j.right & j.shining) for j in self.some) / sum(np.sum(j.shining) for j in self.some))
+
+    @property
+    def wrong_share(self) -> float:
+        return sum(j.wrong for j in self.some) / sum(int(np.sum(j.labelled)) for j in self.some)
+
+    def nees(self, lit: bool = False) -> float:
+        """Mean NEES / 6 of all poses, or of those in the light."""
+        values = np.concatenate([j.nees[j.lit] if lit else j.nees for j in self.some])
+        return float(np.nanmean(values) / 6)
+
+    def over_bound(self, rotation: bool = True) -> float:
+        """Root mean square error over the single-frame bound's, of the attitude or the position."""
+        part = slice(3, 6) if rotation else slice(0, 3)
+        squares = sum((np.sum(j.errors[j.lit][:, part] ** 2, axis=0) for j in self.some), np.zeros(3))
+        bounds = sum((np.sum(j.bound[j.lit][:, part], axis=0) for j in self.some), np.zeros(3))
+        return float(np.sqrt(np.mean(squares / bounds)))
+
+    def prediction_px(self) -> Array:
+        """(2,) root mean square error per axis of the places predicted for shining spots, after the start."""
+        values = np.concatenate([j.prediction[START:][j.shining[START:] & j.right[START:]] for j in self.some])
+        return np.asarray(np.sqrt(np.nanmean(values**2, axis=0)))
+
+
+def around_bends(run: PointRun, which: str, frames: int, seed: int) -> Bools:
+    """What to hide (T, n): for so many frames about each bend `one` spot, `two`, a `screen` or `all`."""
+    rng = np.random.default_rng([seed, 7])
+    hide = np.zeros(run.in_view.shape, dtype=bool)
+    views, free = np.arange(hide.shape[1]), START
+    for bend in np.flatnonzero(run.turned).tolist():
+        first = bend - frames // 2 - int(rng.integers(0, 2))
+        if first < free:
+            continue
+        free = first + frames + START
+        if which == "screen":
+            hidden_views = views[run.model.camera_of == rng.integers(len(run.model.camera_names))]
+        else:
+            hidden_views = rng.choice(views, {"one": 1, "two": 2, "all": len(views)}[which], replace=False)
+        hide[first : first + frames, hidden_views] = True
+    return hide
+
+
+def some_frames(run: PointRun, frames: Ints) -> PointRun:
+    """The same recording with only these frames: those between were never taken."""
+    return replace(
+        run,
+        frame=run.frame[frames],
+        t_s=run.t_s[frames],
+        poses=run.poses[frames],
+        uv_px=run.uv_px[frames],
+        in_view=run.in_view[frames],
+        has_image=run.has_image[frames],
+        turned=run.turned[frames],
+        detections=tuple(run.detections[k] for k in frames),
+        origin=tuple(run.origin[k] for k in frames),
+    )
+
+
+def without_pictures(run: PointRun, frames: slice, camera: int) -> PointRun:
+    """The same recording, for some frames without this camera's pictures."""
+    has_image = run.has_image.copy()
+    has_image[frames, camera] = False
+    return replace(run, has_image=has_image)
