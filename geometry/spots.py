@@ -14,7 +14,7 @@ from geometry.arrays import Array, Bools, Ints, cross, skew
 from geometry.camera import FISHEYE, in_picture, pinhole_numbers, project_points_full
 from geometry.lens import padded, tilt_matrix
 from geometry.pose import Pose
-from geometry.projection import Views, lens_kinds, project_all
+from geometry.projection import VIEW, Views, lens_kinds, project_all
 from geometry.rig import Rig
 
 
@@ -83,9 +83,10 @@ class SpotModel:
     def __post_init__(self) -> None:
         lens = lens_kinds(self.distortion, self.fisheye)
         tilt = tilt_matrix(self.distortion[..., 12], self.distortion[..., 13])
-        whole = {name: getattr(self, name) for name in Views._fields if name not in ("lens", "tilt")}
-        arrays = {name: np.ascontiguousarray(a) for name, a in {**whole, "lens": lens, "tilt": tilt}.items()}
-        object.__setattr__(self, "numbers", Views(**arrays))
+        numbers = np.empty(len(self.point), VIEW)
+        for name in VIEW.names or ():
+            numbers[name] = lens if name == "lens" else tilt if name == "tilt" else getattr(self, name)
+        object.__setattr__(self, "numbers", numbers)
 
     @staticmethod
     def of(rig: Rig) -> SpotModel:

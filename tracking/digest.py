@@ -173,7 +173,7 @@ def ahead(views: Views, h: Hypotheses, dt: float) -> Array:
     for i in range(6):
         step[i] = dt * h.m[0, i] + 0.5 * dt * dt * h.m[0, 6 + i]
     R, t = _moved(h.R[0], h.t[0], step)
-    n = views.point.shape[0]
+    n = views.shape[0]
     uv, J = np.empty((n, 2)), np.empty((2, 6))
     for i in range(n):
         project_view(views, i, R, t, uv[i], J)

@@ -220,7 +220,6 @@ def _chi_square(L: Array, x: Array) -> float:
     return total
 
 
-@compiled
 def told_by_the_others(ref: Reference, ev: Evidence, jerk: Array) -> float:
     """How likely each frame's evidence is given that of all the others, summed, nats, up to a constant.
 
@@ -228,6 +227,12 @@ def told_by_the_others(ref: Reference, ev: Evidence, jerk: Array) -> float:
     which is what a smoother is for.
     """
     x, P, _, _ = smoothed(ref, ev, jerk)
+    return float(_told_by_the_others(x, P, ev))
+
+
+@compiled
+def _told_by_the_others(x: Array, P: Array, ev: Evidence) -> float:
+    """The same of smoothed deviations (T, 18) and their poses' covariances (T, 6, 6)."""
     total = 0.0
     r = np.empty((6, 1))
     for k in range(ev.dt.shape[0]):
