@@ -83,7 +83,7 @@ def smooth(recording: Recording) -> Smoothed:
         if changed == 0:
             break
     measured, rms = _alone(rec, views, every, assigned, extra, ref)
-    differ = (assigned % BLENDED != causal) & ~((assigned < 0) & (causal < 0))
+    differ = (assigned % BLENDED != causal % BLENDED) & ~((assigned < 0) & (causal < 0))
     return Smoothed(
         model=model,
         parameters=parameters,
@@ -208,6 +208,15 @@ def _evidence(
 ) -> Evidence:
     """The frames' information at a reference, and where the motion may have bent."""
     L, g, _, _ = evidence_of(views, every, assigned, extra, ref)
+    if rec.exposure_s > 0:
+        for k in np.flatnonzero(bent[1:] & measured[1:] & measured[:-1]):
+            # The light of an exposure in which the velocities jump lies beside the corner, by up to an eighth of the
+            # exposure's share of the jump: the same for all spots, as if the vehicle were there.
+            b = (ref.m[k + 1, :6] - ref.m[k, :6]) * rec.exposure_s / 8
+            Lb = L[k] @ b
+            share = 1 / (1 + b @ Lb)
+            g[k] -= Lb * (b @ g[k]) * share
+            L[k] -= np.outer(Lb, Lb) * share
     dt = rec.dt_s
     usual = float(np.median(dt[dt > 0])) if np.any(dt > 0) else SPEED_WINDOW_S
     window = max(1, min(round(SPEED_WINDOW_S / usual), len(dt)))
@@ -352,7 +361,9 @@ def _by_frame(ahead: Array, between: Array, ev: Evidence, pose_P: Array, measure
     ahead, between (2,): logarithms of the jerk. Near is within the smoother's memory: twice as many frames as it makes
     a mean of.
     """
-    share = float(np.median(np.einsum("kij,kji->k", pose_P, ev.information)[measured])) / 6
+    if not measured.any():  # nothing to fill in
+        return np.broadcast_to(np.exp(2 * ahead), (len(measured), 2)).copy()
+    share = float(np.median(np.einsum("kij,kji->k", pose_P, ev.information)[measured])) / 6 if measured.any() else 1.0
     memory = int(np.clip(np.ceil(2 / max(share, 1e-3)), 3, 200))
     edge = np.concatenate([[True], ~measured, [True]])
     near = np.asarray(maximum_filter1d(edge.astype(np.int8), 2 * memory + 1, mode="nearest"), dtype=bool)[1:-1]
