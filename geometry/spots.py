@@ -83,7 +83,7 @@ class SpotModel:
     def __post_init__(self) -> None:
         lens = lens_kinds(self.distortion, self.fisheye)
         tilt = tilt_matrix(self.distortion[..., 12], self.distortion[..., 13])
-        numbers = np.empty(len(self.point), VIEW)
+        numbers = np.empty(self.point.shape[:-1], VIEW)
         for name in VIEW.names or ():
             numbers[name] = lens if name == "lens" else tilt if name == "tilt" else getattr(self, name)
         object.__setattr__(self, "numbers", numbers)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
@@ -57,7 +57,9 @@ class SpotTerm:
         screen_of = np.array([screens.index(self.rig.spots[s].screen) for _, s in model.views], dtype=np.int64)
         seen = model.subset(self.spots.view)
         one_each = {
-            n: getattr(seen, n)[:, None] for n in SpotModel.__slots__ if isinstance(getattr(seen, n), np.ndarray)
+            f.name: getattr(seen, f.name)[:, None]
+            for f in fields(seen)
+            if f.init and isinstance(getattr(seen, f.name), np.ndarray)
         }
         endless = np.full_like(one_each["half_size"], np.inf)
         object.__setattr__(self, "_model", replace(seen, **{**one_each, "half_size": endless}))
