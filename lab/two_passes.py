@@ -54,7 +54,7 @@ class TwoPasses:
     def records(self) -> Generator[tuple[FrameRecord, FrameRecord], None, None]:
         """Both passes: each frame as the whole run tells it, and as it was known at its instant."""
         run, total = self.pipeline.run, self.pipeline.reader.expected_frames
-        recording = Recording(run.rig, run.tracker, run.covariance)
+        recording = Recording(run.rig, run.tracker, run.covariance, run.exposure_s or 0.0)
         with tempfile.TemporaryFile(dir=self.folder, prefix=".frames-") as waiting:
             for done, record in enumerate(self.pipeline.records(), start=1):
                 pickle.dump(record, waiting, pickle.HIGHEST_PROTOCOL)

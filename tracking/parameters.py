@@ -49,7 +49,7 @@ class TrackerParameters:
 
     # The rigid tracker (ours)
     p_detect: float = 0.98  # probability that a spot which is in the picture and not hidden is found
-    p_blend: float = 0.01  # ... that it has melted into a neighbour; needs the detections' shapes
+    p_blend: float = 0.02  # ... that it has melted into a neighbour; needs the detections' shapes
     min_label_probability: float = 0.8  # a label less likely than this is not given: the row says occluded
     learn_jerk: bool = True  # learn the strength of the steady motion's jerk from the innovations, from these on:
     jerk_m_s3: float = 20.0  # m/s^3 per sqrt(Hz), of the translation

@@ -11,6 +11,7 @@ from geometry.calibration_spread import CalibrationSpread
 from geometry.rig import Rig
 from geometry.rig_parameters import RigCovariance
 from geometry.spots import SpotModel
+from tracking.association import BLENDED
 from tracking.detections import Detections
 from tracking.match import UNMATCHED
 from tracking.parameters import TrackerParameters
@@ -21,11 +22,19 @@ from tracking.tracked_frame import TrackedFrame
 class Recording:
     """Feed it each frame with what the causal tracker said of it; about 1 kB per frame is kept."""
 
-    def __init__(self, rig: Rig, parameters: TrackerParameters, covariance: RigCovariance | None = None) -> None:
+    def __init__(
+        self,
+        rig: Rig,
+        parameters: TrackerParameters,
+        covariance: RigCovariance | None = None,
+        exposure_s: float = 0.0,
+    ) -> None:
+        """covariance: of the rig's calibration, where it is known. exposure_s: of each picture; 0: a moment."""
         self.rig = rig
         self.model = SpotModel.of(rig)
         self.parameters = parameters
         self.calibration = None if covariance is None else CalibrationSpread(rig, self.model, covariance)
+        self.exposure_s = exposure_s
         self._dt: list[float] = []
         self._uv: list[Array] = []
         self._cov: list[Array] = []
@@ -54,7 +63,10 @@ class Recording:
         self._first.append(first)
         self._has_image.append(np.array([f is not None for f in found]))
         start = first[self.model.camera_of]
-        self._assigned.append(np.where(tracked.point == UNMATCHED, -1, tracked.point + start))
+        assigned = np.where(tracked.point == UNMATCHED, -1, tracked.point + start)
+        if tracked.witness is not None:
+            assigned += np.where((assigned >= 0) & ~tracked.witness, BLENDED, 0)
+        self._assigned.append(assigned)
         self._bent.append(SpotStatus.TURNED in tracked.status)
         self._measured.append(tracked.pose_status is PoseStatus.MEASURED)
         pose = np.full((4, 3), np.nan)
@@ -84,7 +96,7 @@ class Recording:
 
     @property
     def assigned(self) -> Ints:
-        """(T, n): row in the frame's detections (all cameras in one list), -1 without."""
+        """(T, n): row in the frame's detections (all cameras in one list), plus BLENDED; -1 without."""
         return np.array(self._assigned, dtype=np.int64).reshape(len(self), len(self.model))
 
     def detections(self, k: int) -> tuple[Array, Array, Bools, Ints, Bools]:

@@ -376,6 +376,7 @@ class RigidTracker:
             rms_px=float(d.rms_px) if measured else float("nan"),
             events=tuple(events),
             label_probability=np.where(assigned >= 0, certain, np.nan),
+            witness=d.use & labelled,
             predicted_cov_px2=predicted_cov,
             motion=MotionEstimate(h.m[0, :3], h.m[0, 3:6], h.P[0, 6:12, 6:12]) if known else None,
             pose_systematic=systematic if known else None,

@@ -348,6 +348,7 @@ class SpotTracker:
             spots_used=len(fit.rows) if fit is not None else (int(np.count_nonzero(seen)) if pose is not None else 0),
             rms_px=fit.rms_px if fit is not None else float("nan"),
             events=tuple(events),
+            witness=witness & seen,
         )
 
     def _believed(self, found: Sequence[Detections | None], point: Ints) -> Ints:
