@@ -206,6 +206,7 @@ def grow(
                         and (
                             misfit > dof + SURPRISE * np.sqrt(2.0 * max(dof, 1))
                             or (spots < PROOF and _misses(assigned[k], shining))
+                            or _misses_a_screen(assigned[k], shining, sights.group)
                         )
                     )
                 if spots == 0:
@@ -237,6 +238,24 @@ def _misses(assigned: Ints, shown: Array) -> bool:
     for i in range(assigned.shape[0]):
         misses |= (assigned[i] == MISSED or assigned[i] >= BLENDED) and shown[i] > 0.5
     return misses
+
+
+@compiled
+def _misses_a_screen(assigned: Ints, shown: Array, group: Ints) -> bool:
+    """Whether a screen has gone dark, as it seems: none of its spots was found, and one should be seen.
+
+    After frames with one screen only the gates of its spots are narrow and those of the other's are not: then a bend
+    looks like a dark screen, however many spots of the one are found.
+    """
+    for i in range(assigned.shape[0]):
+        if assigned[i] != MISSED or shown[i] <= 0.5:
+            continue
+        none = True
+        for j in range(assigned.shape[0]):
+            none = none and (group[j] != group[i] or assigned[j] < 0)
+        if none:
+            return True
+    return False
 
 
 @compiled

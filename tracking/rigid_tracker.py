@@ -200,7 +200,8 @@ class RigidTracker:
             events.append(Event("tie", self._tie_text(result)))
             self._told_tie = True
         candidates = [result.chosen] if result.chosen is not None else list(result.candidates[:4])
-        if result.chosen is not None and result.chosen.fit.dof > 0:
+        if result.chosen is not None and result.chosen.fit.dof > 0 and self._anchor is None:
+            # Later the scale is known: an answer that then misfits is a wrong one (a scale of 3 after a dark screen).
             self._believe_misfit(frame, result)
             frame = self._frame(found)
         P = np.diag(
