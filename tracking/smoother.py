@@ -35,7 +35,7 @@ SHOCK = 45.0  # chi-square of 6 degrees (p = 5e-8): a jump of the velocities bey
 APART = 2  # frames: of shocks so near each other the largest is looked at first
 SMALL_STEP = 0.02  # sigmas: a step of Gauss-Newton that is nothing any more
 LONGEST_STEP = 0.3  # m and rad, of the reference: beyond it nothing is linear
-# m/s^3 or rad/s^3 per sqrt(Hz). The lower end is for a vehicle that stands for a minute: 1e-4 already is 2e-3 rad in 6 s.
+# m/s^3 or rad/s^3 per sqrt(Hz). The lower end is for a vehicle that stands for a minute: 1e-4 is 2e-3 rad in 6 s.
 RANGE = (1e-7, 1e5)
 MOST_FRAMES_FOR_JERK = 3000  # the likelihood is sharp enough by then
 MOST_FRAMES_BETWEEN = 1000  # the same of the other one, which takes five times as long
