@@ -9,6 +9,7 @@ from geometry.pose import Pose
 from geometry.rig import Rig
 from geometry.rig_parameters import RigCovariance, moved, rig_names, split
 from lab.simulate.points import PointRun, simulate_points
+from tests.tracking.rigid_runs import Pooled, judged, looked_at_again, tracked
 from tracking.labels import PosePrior
 from tracking.parameters import TrackerParameters
 from tracking.spot_tracker import SpotTracker
@@ -96,3 +97,44 @@ def test_over_200_rigs_the_stated_covariance_is_the_errors_own(scenario):
     assert 0.85 < mean < 1.15
     assert measured == 1.0
     assert drops == 0
+
+
+def rigid_nees(scenario: str, seeds: range, frames: int, noise_px: float, stated: bool = True) -> tuple[float, float]:
+    """Mean NEES / 6 of the rigid tracker and of the smoother over rigs."""
+    causal, again = [], []
+    for seed in seeds:
+        run = simulate_points(scenario, seed, frames=frames, noise_px=noise_px, clutter=0.0)
+        covariance = covariance_of(run.rig)
+        rig = drawn(run.rig, covariance, np.random.default_rng([seed, 99]))
+        known = covariance if stated else None
+        first = tracked(run, rig=rig, covariance=known)
+        second, _ = looked_at_again(run, first, rig=rig, covariance=known)
+        causal.append(judged(run, first))
+        again.append(judged(run, second))
+        if stated:
+            assert causal[-1].missed() + causal[-1].wrong + again[-1].missed() + again[-1].wrong == 0
+    return Pooled(causal).nees(), Pooled(again).nees()
+
+
+@pytest.mark.parametrize("scenario", ["clean", "four-skew-beams"])
+def test_the_rigid_tracker_and_the_smoother_carry_the_calibrations_errors_too(scenario):
+    # A smoothed motion has one rig's errors in all frames: of 12 rigs the mean of NEES / 6 scatters by 0.17.
+    for value in rigid_nees(scenario, range(12), frames=20, noise_px=0.05):
+        assert 0.5 < value < 1.7
+
+
+def test_a_calibration_taken_for_perfect_is_far_off():
+    causal, smoothed = rigid_nees("clean", range(3), frames=20, noise_px=0.05, stated=False)
+    assert causal > 2
+    assert smoothed > 3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scenario", ["clean", "four-skew-beams"])
+def test_over_60_rigs_the_rigid_trackers_and_the_smoothers_covariance_is_the_errors_own(scenario):
+    # The mean over 60 rigs scatters by 0.08.
+    causal, smoothed = rigid_nees(scenario, range(60), frames=60, noise_px=0.05)
+    assert 0.8 < causal < 1.3
+    # Measured 1.45 (clean): its weights hold each spot's calibration errors as if they were independent, and what a
+    # calibration does to the pose is reckoned for the single frame's weights.
+    assert 0.8 < smoothed < 1.6
