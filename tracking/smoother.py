@@ -361,8 +361,6 @@ def _by_frame(ahead: Array, between: Array, ev: Evidence, pose_P: Array, measure
     ahead, between (2,): logarithms of the jerk. Near is within the smoother's memory: twice as many frames as it makes
     a mean of.
     """
-    if not measured.any():  # nothing to fill in
-        return np.broadcast_to(np.exp(2 * ahead), (len(measured), 2)).copy()
     share = float(np.median(np.einsum("kij,kji->k", pose_P, ev.information)[measured])) / 6 if measured.any() else 1.0
     memory = int(np.clip(np.ceil(2 / max(share, 1e-3)), 3, 200))
     edge = np.concatenate([[True], ~measured, [True]])
