@@ -18,13 +18,14 @@ from geometry.compiled import compiled
 from geometry.projection import Views
 from tracking.association import BLENDED, Chances, Frame, Sights, associate
 from tracking.hiding import MISSED, later, learnt, marginal, together
-from tracking.information import frame_information
+from tracking.information import frame_information, widen_by_curvature
 from tracking.motion import STATE, predicted, updated
 
 MOST_CHILDREN = 48  # of one frame, over all hypotheses
 MOST_KEPT = 8  # hypotheses from frame to frame
 FORGET = 12.0  # nats: a hypothesis so far behind is dropped
 SAME = 0.7  # two hypotheses with one assignment whose states differ by less than this in sigmas are one
+TOO_WIDE = 0.06  # m, rad: where a frame leaves its widest direction so open, it is not taken
 LEAST_SHARE = 1e-3  # of the probability: hypotheses below it, however far away, do not widen the covariance
 PROOF = 3  # spots: where so many lie in their narrow gates, the velocities have not jumped
 LEAST_TO_TURN = 6.0  # nats: a hypothesis so far behind is not tried with a manoeuvre as well
@@ -131,25 +132,35 @@ def concluded(
     out_R, out_t, out_m, out_P = R0, t0, m0, P0
     gaussian = misfit = 0.0
     count = 0
-    for _ in range(4):
-        L, g, chi2, count, log_norm = frame_information(views, R, t, use, uv, cov)
-        if count == 0:
-            return R0, t0, m0.copy(), P0.copy(), 0.0, 0.0, 0
-        delta = _apart(R, t, R0, t0)
-        r = _apply(L, delta)
-        for i in range(6):
-            r[i] += g[i]
-        out_R, out_t, out_m, out_P, log_det, w = updated(R0, t0, m0, P0, L, r)
-        step = _apply(_block(P0, 6), w)
-        misfit = chi2
-        for i in range(6):
-            misfit += g[i] * delta[i] + r[i] * (delta[i] - step[i])
-        gaussian = -0.5 * (log_norm + log_det + misfit)
-        moved = _apart(out_R, out_t, R, t)
-        R, t = out_R, out_t
-        # A thousandth of the pose's own sigma is good enough.
-        if _dot(moved, _apply(L, moved)) < 1e-4:
+    sigma = 0.0
+    for _ in range(2):
+        for _ in range(4):
+            L, g, chi2, count, log_norm = frame_information(views, R, t, use, uv, cov)
+            if count == 0:
+                return R0, t0, m0.copy(), P0.copy(), 0.0, 0.0, 0
+            delta = _apart(R, t, R0, t0)
+            r = _apply(L, delta)
+            for i in range(6):
+                r[i] += g[i]
+            out_R, out_t, out_m, out_P, log_det, w = updated(R0, t0, m0, P0, L, r)
+            step = _apply(_block(P0, 6), w)
+            misfit = chi2
+            for i in range(6):
+                misfit += g[i] * delta[i] + r[i] * (delta[i] - step[i])
+            gaussian = -0.5 * (log_norm + log_det + misfit)
+            moved = _apart(out_R, out_t, R, t)
+            R, t = out_R, out_t
+            # A thousandth of the pose's own sigma is good enough.
+            if _dot(moved, _apply(L, moved)) < 1e-4:
+                break
+        # Where a direction stays open the spots' paths along it are not straight, and must not narrow what they do not
+        # see: once more, with what the bend of each path is off by.
+        sigma = widen_by_curvature(views, use, cov, out_R, out_t, _block(out_P, 6))
+        if sigma == 0.0:
             break
+    if sigma > TOO_WIDE:
+        # So few spots of a vehicle that may be anywhere narrow nothing that a straight line could tell.
+        return R0, t0, m0.copy(), P0.copy(), gaussian, misfit, count
     return out_R, out_t, out_m, out_P, gaussian, misfit, count
 
 

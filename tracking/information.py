@@ -12,7 +12,12 @@ from geometry.arrays import Array, Bools
 from geometry.compiled import compiled
 from geometry.projection import Views, project_view
 
+_apply = small.apply
 _moved, _solve, _column, _dot = small.moved, small.solve, small.column, small.dot
+
+
+SAME_FOR_LONG = 10.0  # the root of the frames over which a curvature keeps its sign
+NARROW = 0.005  # m, rad: over a sigma smaller than this the paths of spots are straight to some hundredths of a px
 
 
 @compiled
@@ -80,3 +85,63 @@ def fit_alone(
         if size < 1e-9:
             break
     return R, t, L, chi2, count
+
+
+@compiled
+def widen_by_curvature(views: Views, use: Bools, cov: Array, R: Array, t: Array, P: Array) -> float:
+    """Add to the covariances (n, 2, 2) of the used spots what a straight line misses along P's widest direction.
+
+    It is much the same from frame to frame, so it weighs as much more as a mean of many frames would make of it.
+
+    In place. Returns the sigma in that direction; 0 where P (6, 6), of the pose (R, t), is so narrow that nothing is
+    missed. Half the second difference
+    over one sigma, as a covariance. Ours: with one camera missing for 60 frames the filter claimed 30 times too much.
+    """
+    e = np.empty(6)
+    for i in range(6):
+        e[i] = np.sqrt(max(P[i, i], 0.0))
+    length2 = 0.0
+    for i in range(6):
+        length2 += e[i] * e[i]
+    if not length2 > NARROW**2:
+        return 0.0
+    size = 0.0
+    for _ in range(6):  # power iteration
+        e = _apply(P, e)
+        size = 0.0
+        for i in range(6):
+            size += e[i] * e[i]
+        size = np.sqrt(size)
+        for i in range(6):
+            e[i] /= size
+    sigma = np.sqrt(size_of(P, e))
+    if not sigma > NARROW:
+        return 0.0
+    for i in range(6):
+        e[i] *= sigma
+    R_up, t_up = _moved(R, t, e)
+    for i in range(6):
+        e[i] = -e[i]
+    R_down, t_down = _moved(R, t, e)
+    here, up, down, J = np.empty(2), np.empty(2), np.empty(2), np.empty((2, 6))
+    for i in range(use.shape[0]):
+        if not use[i] or not project_view(views, i, R, t, here, J):
+            continue
+        if not project_view(views, i, R_up, t_up, up, J) or not project_view(views, i, R_down, t_down, down, J):
+            continue
+        a, b = SAME_FOR_LONG * (0.5 * (up[0] + down[0]) - here[0]), SAME_FOR_LONG * (0.5 * (up[1] + down[1]) - here[1])
+        cov[i, 0, 0] += a * a
+        cov[i, 0, 1] += a * b
+        cov[i, 1, 0] += a * b
+        cov[i, 1, 1] += b * b
+    return sigma
+
+
+@compiled
+def size_of(P: Array, e: Array) -> float:
+    """e^T P e."""
+    out = 0.0
+    for i in range(e.shape[0]):
+        for j in range(e.shape[0]):
+            out += e[i] * P[i, j] * e[j]
+    return out

@@ -25,7 +25,7 @@ from tracking.motion import STATE
 SHOWN = np.array([0.2, 0.6, 0.98])
 LIT = np.array([0.01, 0.3, 0.995])
 RIVAL = 9.0  # nats: assignments so far behind the best say nothing of its certainty
-VAGUE_M, VAGUE_RAD = 0.3, 0.5  # a frame of which the others say less than this is left as it is
+VAGUE_M, VAGUE_RAD = 0.1, 0.06  # a frame of which the others say less keeps its labels: a fan looks alike 20 deg on
 
 _apply, _multiply, _solve = small.apply, small.multiply, small.solve
 _moved, _symmetrise, _block, _column, _beside = small.moved, small.symmetrise, small.block, small.column, small.beside

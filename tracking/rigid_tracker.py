@@ -52,6 +52,8 @@ FIRST_ACCELERATION, FIRST_ANGULAR = 30.0, 100.0  # m/s^2, rad/s^2
 P_FRESH = 1e-3  # probability per frame that the vehicle is not where any hypothesis has it
 LOST_SIGMA_M, LOST_SIGMA_RAD = 1.0, np.deg2rad(60.0)  # a predicted pose vaguer than this is `lost`
 FEW = 4  # spots: fewer do not tell a lost vehicle from one that is mostly hidden
+LONG_UNMEASURED = 10  # frames without a measured pose, after which two missing spots are enough to doubt it
+SEARCH_AT = (2, 4, 8, 14)  # frames in a row that contradict the hypothesis
 DOUBT_FRAMES = 50  # in a row with fewer: then they are doubted
 NOWHERE = (SpotStatus.LOST, SpotStatus.OFF_SCREEN)
 VAGUE_PX = 15.0  # 1 sigma of a predicted spot: beyond it the whole picture is searched at once
@@ -83,6 +85,8 @@ class RigidTracker:
         self._anchor: Pose | None = None  # the last measured pose ...
         self._anchor_age_s = 0.0  # ... and its age
         self._saw_any = False  # the frame before showed spots
+        self._unmeasured = 0  # frames in a row without a measured pose
+        self._doubts = 0  # frames in a row that contradict the best hypothesis
         self._few = 0  # frames in a row with fewer than FEW spots
         self._searches = 0  # in a row without success
         self._told_tie = False
@@ -159,12 +163,26 @@ class RigidTracker:
                 self._few = 0
                 return False
             self._few += 1
+            if self._contradicted(children, best, found):
+                return self._doubts in SEARCH_AT or self._doubts % 20 == 0
             if not self._vague(self._hypotheses):
                 # Few spots where the motion is known are mostly hidden ones; seldom they are false points.
                 return self._few % DOUBT_FRAMES == 0
         # At once when light returns, then ever more rarely: what fails for long will fail in the next frame too.
         self._searches += 1
         return self._searches <= 10 or self._searches % 5 == 0
+
+    def _contradicted(self, children: Children, best: int, found: Sequence[Detections | None]) -> bool:
+        """Whether a camera shows enough points, but none where the hypothesis expects several spots."""
+        missed = children.assigned[best] == MISSED
+        here = [
+            int(np.count_nonzero(missed & (self.model.camera_of == c))) if f is not None else 0
+            for c, f in enumerate(found)
+        ]
+        least = PROOF if self._unmeasured < LONG_UNMEASURED else 2
+        against = any(m >= least and f is not None and len(f) >= m for m, f in zip(here, found, strict=True))
+        self._doubts = self._doubts + 1 if against else 0
+        return against
 
     def _vague(self, hypotheses: Hypotheses) -> bool:
         _, J = project_all(self.model.numbers, hypotheses.R[:1], hypotheses.t[:1])
@@ -309,6 +327,7 @@ class RigidTracker:
         d = digest(model.numbers, self._sights, frame, h.R[0], h.t[0], assigned, certain, least, RADIUS_PX)
         count = int(np.count_nonzero(d.use))
         measured = count >= 3 and self._good(d.alone)
+        self._unmeasured = 0 if measured else self._unmeasured + 1
         if measured and self.calibration is not None:
             self._look_at_calibration(d, h)
         elif measured:

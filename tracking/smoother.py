@@ -41,6 +41,7 @@ MOST_FRAMES_FOR_JERK = 3000  # the likelihood is sharp enough by then
 MOST_FRAMES_BETWEEN = 1000  # the same of the other one, which takes five times as long
 FINER = np.log(3.0)  # so much smaller than the likeliest the other one usually is: where to begin
 P_DARK = 0.05  # probability of a bend in each frame that does not show the pose
+DEEP = 8  # frames: so far from any measured one a few spots are not taken for evidence
 SPEED_WINDOW_S = 0.5  # a bend's size is judged by the fastest motion within this time of it
 
 
@@ -62,15 +63,19 @@ def smooth(recording: Recording) -> Smoothed:
     every = every._replace(cov=every.cov * scale**2 + parameters.sigma_model_px**2 * np.eye(2))
     set_by_hand = np.log([[parameters.jerk_m_s3, parameters.jerk_rad_s3]] * 2)
     jerk: Array | None = None if parameters.learn_jerk else set_by_hand
-    bent = rec.bent.copy()
+    bent, gapless = rec.bent.copy(), bool(measured.all())
     rounds, relabels = 0, parameters.method == "rigid"
     while True:
         rounds += 1
+        # The first reference is a straight line over each gap: too far off for the few spots seen there.
+        deep = 0 if rounds == 1 else DEEP
         ref, pose_P, motion_P, jerk, known = _motion(
-            views, every, assigned, extra, ref, rec, measured, bent, jerk, parameters.learn_jerk
+            views, every, assigned, extra, ref, rec, measured, bent, deep, jerk, parameters.learn_jerk
         )
-        if not relabels or rounds == MOST_ROUNDS:
+        if rounds == MOST_ROUNDS or (not relabels and (rounds > 1 or gapless)):
             break
+        if not relabels:
+            continue
         log_clutter = _log_clutter(rec, views, sights, every, assigned, ref, known)
         found, certain = relabelled(views, sights, chances, every, assigned, extra, ref, pose_P, log_clutter)
         new = np.where((certain >= parameters.min_label_probability) & known[:, None], found, -1)
@@ -80,7 +85,7 @@ def smooth(recording: Recording) -> Smoothed:
         changed = int(np.count_nonzero(new != assigned))
         assigned = new
         measured, rms = _alone(rec, views, every, assigned, extra, ref)
-        if changed == 0:
+        if changed == 0 and (rounds > 1 or gapless):
             break
     measured, rms = _alone(rec, views, every, assigned, extra, ref)
     differ = (assigned % BLENDED != causal % BLENDED) & ~((assigned < 0) & (causal < 0))
@@ -205,9 +210,14 @@ def _evidence(
     rec: Recording,
     measured: Bools,
     bent: Bools,
+    deep: int,
 ) -> Evidence:
     """The frames' information at a reference, and where the motion may have bent."""
     L, g, _, _ = evidence_of(views, every, assigned, extra, ref)
+    # Deep in a gap a frame's few spots leave some direction open, and the reference may be so far off along it that
+    # what is straight there is not here: they are not taken.
+    far = ~np.asarray(maximum_filter1d(measured.astype(np.int8), 2 * deep + 1, mode="constant"), dtype=bool)
+    L[far], g[far] = 0.0, 0.0
     if rec.exposure_s > 0:
         for k in np.flatnonzero(bent[1:] & measured[1:] & measured[:-1]):
             # The light of an exposure in which the velocities jump lies beside the corner, by up to an eighth of the
@@ -263,6 +273,7 @@ def _motion(
     rec: Recording,
     measured: Bools,
     bent: Bools,
+    deep: int,
     jerk: Array | None,
     learn: bool,
 ) -> tuple[Reference, Array, Array, Array, Bools]:
@@ -279,7 +290,7 @@ def _motion(
     strong = jerk is None  # to be estimated (anew)
     pose_P = np.zeros((frames, 6, 6))
     for step in range(MOST_STEPS):
-        ev = _evidence(views, every, assigned, extra, ref, rec, measured, bent)
+        ev = _evidence(views, every, assigned, extra, ref, rec, measured, bent, deep)
         if strong:
             ahead = _likeliest(log_likelihood, ref, ev, None if jerk is None else jerk[0], MOST_FRAMES_FOR_JERK)
             jerk = np.stack([ahead, ahead])
