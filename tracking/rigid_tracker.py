@@ -163,8 +163,8 @@ class RigidTracker:
                 self._few = 0
                 return False
             self._few += 1
-            if self._contradicted(children, best, found):
-                return self._doubts in SEARCH_AT or self._doubts % 20 == 0
+            if self._contradicted(children, best, found) and (self._doubts in SEARCH_AT or self._doubts % 20 == 0):
+                return True
             if not self._vague(self._hypotheses):
                 # Few spots where the motion is known are mostly hidden ones; seldom they are false points.
                 return self._few % DOUBT_FRAMES == 0

@@ -41,7 +41,7 @@ MOST_FRAMES_FOR_JERK = 3000  # the likelihood is sharp enough by then
 MOST_FRAMES_BETWEEN = 1000  # the same of the other one, which takes five times as long
 FINER = np.log(3.0)  # so much smaller than the likeliest the other one usually is: where to begin
 P_DARK = 0.05  # probability of a bend in each frame that does not show the pose
-DEEP = 8  # frames: so far from any measured one a few spots are not taken for evidence
+DEEP = 12  # frames: so far from any measured one a few spots are not taken for evidence
 SPEED_WINDOW_S = 0.5  # a bend's size is judged by the fastest motion within this time of it
 
 
