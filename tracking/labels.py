@@ -86,6 +86,19 @@ class LabelResult:
         """Whether several poses explain the pictures about equally well."""
         return self.chosen is None and len(self.candidates) > 1
 
+    def in_words(self, model: SpotModel) -> str:
+        """The reason and the two best candidates: which spots they name and where they put the vehicle."""
+        parts = []
+        for one in self.candidates[:2]:
+            ypr = np.rad2deg(one.fit.world_from_body.ypr)
+            x, y, z = one.fit.world_from_body.translation
+            names = " ".join(model.views[v][1] for v in np.flatnonzero(one.point_of != NO_POINT))
+            parts.append(
+                f"spots {names} at x {x:.3f} y {y:.3f} z {z:.3f} m,"
+                f" yaw {ypr[0]:.2f} pitch {ypr[1]:.2f} roll {ypr[2]:.2f} deg"
+            )
+        return f"{self.reason}: " + " | ".join(parts)
+
 
 def find_labels(
     rig: Rig,

@@ -215,7 +215,7 @@ class RigidTracker:
         prior = self._search_prior()
         result = find_labels(self.rig, self.model, by_camera, prior, self.parameters.labels, self.calibration)
         if result.tie and not self._told_tie:
-            events.append(Event("tie", self._tie_text(result)))
+            events.append(Event("tie", result.in_words(self.model)))
             self._told_tie = True
         candidates = [result.chosen] if result.chosen is not None else list(result.candidates[:4])
         if result.chosen is not None and result.chosen.fit.dof > 0 and self._anchor is None:
@@ -272,19 +272,6 @@ class RigidTracker:
         dof = 2 * count - 6
         if dof > 0 and chi2 / dof > 9.0:
             self.misfit.at_least(chi2 * self.noise_scale**2, dof)
-
-    def _tie_text(self, result: LabelResult) -> str:
-        """Both candidates in words: which spots they name and where they put the vehicle."""
-        parts = []
-        for one in result.candidates[:2]:
-            ypr = np.rad2deg(one.fit.world_from_body.ypr)
-            x, y, z = one.fit.world_from_body.translation
-            names = " ".join(self.model.views[v][1] for v in np.flatnonzero(one.point_of != NO_POINT))
-            parts.append(
-                f"spots {names} at x {x:.3f} y {y:.3f} z {z:.3f} m,"
-                f" yaw {ypr[0]:.2f} pitch {ypr[1]:.2f} roll {ypr[2]:.2f} deg"
-            )
-        return f"{result.reason}: " + " | ".join(parts)
 
     # -- what the frame's result is -----------------------------------------------------------------------------------
 

@@ -27,7 +27,7 @@ from geometry.solve import (
 )
 from geometry.spots import SpotModel
 from tracking.detections import Detections
-from tracking.labels import NO_POINT, LabelResult, PosePrior, find_labels
+from tracking.labels import NO_POINT, PosePrior, find_labels
 from tracking.match import UNMATCHED, match
 from tracking.out_of_view import CoplanarViews, quadratic_positions
 from tracking.parameters import TrackerParameters
@@ -255,7 +255,7 @@ class SpotTracker:
         result = find_labels(self.rig, self.model, by_camera, prior, self.parameters.labels, self.calibration)
         if result.chosen is None:
             if result.tie and not self._told_tie:
-                events.append(Event("tie", self._tie_text(result)))
+                events.append(Event("tie", result.in_words(self.model)))
                 self._told_tie = True
             return nothing
         point = np.where(result.chosen.point_of == NO_POINT, UNMATCHED, result.chosen.point_of)
@@ -283,19 +283,6 @@ class SpotTracker:
         events.append(Event(kind, f"spots {names} found from the prior alone"))
         self._told_tie = False
         return fit, point
-
-    def _tie_text(self, result: LabelResult) -> str:
-        """Both candidates in words: which spots they name and where they put the vehicle."""
-        parts = []
-        for one in result.candidates[:2]:
-            ypr = np.rad2deg(one.fit.world_from_body.ypr)
-            x, y, z = one.fit.world_from_body.translation
-            names = " ".join(self.model.views[v][1] for v in np.flatnonzero(one.point_of != NO_POINT))
-            parts.append(
-                f"spots {names} at x {x:.3f} y {y:.3f} z {z:.3f} m,"
-                f" yaw {ypr[0]:.2f} pitch {ypr[1]:.2f} roll {ypr[2]:.2f} deg"
-            )
-        return f"{result.reason}: " + " | ".join(parts)
 
     # -- modification -------------------------------------------------------------------------------------------------
 
