@@ -6,6 +6,7 @@ PYTHON ?= python3
 VENV ?= .venv
 VENV_PEERS ?= .venv-peers
 WORKERS ?= 2
+SEEDS ?= 1:301
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 READY_PEERS := $(VENV_PEERS)/.ready
@@ -15,7 +16,7 @@ SAMPLE_RUNS := $(patsubst %/run.yaml,%,$(wildcard sample_runs/*/run.yaml))
 DEMO := results/demo
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all check format bench-tracking bench-detection bench-calibration peers bench-peers lock wheel pointcloud clean
+.PHONY: help setup demo test test-all check format bench-tracking bench-random bench-detection bench-calibration peers bench-peers lock wheel pointcloud clean
 
 help:  ## List the chores
 	@sed -n 's/^\([a-z-]*\):.*##  */\1|/p' $(MAKEFILE_LIST) | while IFS='|' read -r name what; do \
@@ -67,6 +68,9 @@ bench-tracking: setup  ## The tracking figures on fresh seeds, the cost of a who
 	$(BIN)/python -m bench.rigid
 	$(BIN)/python -m bench.whole_run
 	$(BENCH_PEERS)
+
+bench-random: setup  ## Recordings drawn at random: how many are clean, and why the others are not (SEEDS=1:301)
+	$(BIN)/python -m bench.random_scenes --seeds $(SEEDS) --jobs $(WORKERS)
 
 bench-detection: setup  ## The detection figures, on fresh seeds
 	$(BIN)/python -m bench.detection

@@ -1,0 +1,97 @@
+"""`python -m bench.random_scenes --seeds 1:301`: random scenes through the program, and how many are clean.
+
+One scene to look at: `--seeds N:N+1 -v`, and `--keep DIR` writes its run folder.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+import traceback
+from collections.abc import Iterator
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+
+from bench.random_scenes.answers import answers_in_memory, answers_through_files
+from bench.random_scenes.judge import Judgement, judge
+from bench.random_scenes.oracle import ask_oracle
+from bench.random_scenes.report import crashed, details, summary, write_rows
+from bench.random_scenes.scene import Scene, random_scene
+from bench.random_scenes.write_folder import write_run_folder
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """One scene to run."""
+
+    seed: int
+    frames: int
+    through_files: bool
+    keep: Path | None
+
+
+def make_scene(job: Job) -> Scene:
+    """The scene of a job."""
+    return random_scene(job.seed, job.frames)
+
+
+def judged(job: Job) -> Judgement:
+    """Draw, run and judge one scene; an exception of the program is a class of failure, not the end of the bench."""
+    scene = make_scene(job)
+    if job.keep is not None:
+        write_run_folder(scene, job.keep / f"seed-{job.seed}")
+    oracle = ask_oracle(scene)
+    try:
+        if job.through_files:
+            with tempfile.TemporaryDirectory() as name:
+                answers = answers_through_files(scene, write_run_folder(scene, Path(name) / "run"))
+        else:
+            answers = answers_in_memory(scene)
+    except Exception:
+        return crashed(scene, oracle, traceback.format_exc())
+    return judge(scene, oracle, answers)
+
+
+def run_all(jobs: list[Job], workers: int) -> Iterator[Judgement]:
+    """In the order of the jobs."""
+    if workers == 1:
+        yield from map(judged, jobs)
+        return
+    with get_context("spawn").Pool(workers) as pool:
+        yield from pool.imap(judged, jobs)
+
+
+def seed_range(text: str) -> range:
+    """A:B without B, or one seed."""
+    first, _, last = text.partition(":")
+    return range(int(first), int(last) if last else int(first) + 1)
+
+
+def main() -> None:
+    """Run the seeds and print the summary."""
+    parser = argparse.ArgumentParser(prog="bench.random_scenes", description=__doc__)
+    parser.add_argument("--seeds", type=seed_range, default=range(1, 301), metavar="A:B", help="default 1:301")
+    parser.add_argument("--frames", type=int, default=200)
+    parser.add_argument("--jobs", type=int, default=1, help="processes (default 1)")
+    parser.add_argument("--out", type=Path, help="a CSV file with a row per scene")
+    parser.add_argument("--through-files", action="store_true", help="write run folders and process those")
+    parser.add_argument("--keep", type=Path, metavar="DIR", help="write each scene's run folder there")
+    parser.add_argument("-v", "--verbose", action="store_true", help="all figures of every scene")
+    a = parser.parse_args()
+    jobs = [Job(s, a.frames, a.through_files, a.keep) for s in a.seeds]
+    rows: list[Judgement] = []
+    for row in run_all(jobs, a.jobs):
+        rows.append(row)
+        if a.verbose:
+            print(details(row), flush=True)
+        elif sys.stderr.isatty():
+            print(f"\r{len(rows)} of {len(jobs)}", end="", file=sys.stderr, flush=True)
+    if a.out is not None:
+        write_rows(rows, a.out)
+    print(summary(rows))
+
+
+if __name__ == "__main__":
+    main()

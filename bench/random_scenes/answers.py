@@ -1,0 +1,192 @@
+"""What the program answers to a scene, through the same code as `beampose run`: in memory, or through files."""
+
+from __future__ import annotations
+
+import contextlib
+import tempfile
+import time
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from bench.random_scenes.scene import Scene
+from geometry.arrays import Array, Bools
+from geometry.pose import Pose
+from geometry.spots import SpotModel
+from lab import process
+from lab.frames import FrameSet
+from lab.model_check.check import check_kept
+from lab.model_check.keeper import FrameKeeper
+from lab.pictures import DROPPED, Missing
+from lab.pipeline import FrameRecord, Pipeline, tracker_of
+from lab.results import read_poses, read_spots
+from lab.run_file import Run
+from lab.tables import TableWriter
+from lab.times import Times
+from lab.two_passes import TwoPasses
+from tracking.match import UNMATCHED
+from tracking.parameters import TrackerParameters
+from tracking.statuses import PoseStatus
+
+LOST, PREDICTED, MEASURED = range(3)
+_STATUS = {PoseStatus.LOST: LOST, PoseStatus.PREDICTED: PREDICTED, PoseStatus.MEASURED: MEASURED}
+
+
+@dataclass(frozen=True, slots=True)
+class Pass:
+    """The answers of the causal pass, or of both: T frames, n views."""
+
+    labelled: Bools  # (T, n)
+    uv_px: Array  # (T, n, 2) of the points that were given a label; nan without
+    status: Array  # (T,) LOST, PREDICTED or MEASURED
+    poses: Pose  # (T,), nan where lost
+    covariance: Array  # (T, 6, 6), nan where lost
+
+
+@dataclass(frozen=True, slots=True)
+class Answers:
+    """Everything that a run says, and what it cost."""
+
+    smoothed: Pass
+    causal: Pass | None  # labels are not in the files, so through files there are none
+    exit_status: int
+    reasons: tuple[str, ...]  # of the verdict
+    warnings: tuple[str, ...]  # numeric ones, each text once
+    warnings_count: int
+    ms_per_frame: float  # process time, tracking and smoothing
+    rounds: int  # of smoothing
+
+
+class PointReader:
+    """The frames of a scene as lab/frames.py gives those of a run folder."""
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene = scene
+        self.cameras = tuple(scene.rig.cameras)
+        self.expected_frames = len(scene)
+        self.listings: dict[str, object] = {}
+        self.notes: list[str] = []
+
+    def __iter__(self) -> Iterator[FrameSet]:
+        for k in range(len(self._scene)):
+            pictures = [Missing(DROPPED) if d is None else d for d in self._scene.found(k)]
+            yield FrameSet(k, dict(zip(self.cameras, pictures, strict=True)))
+
+
+def answers_in_memory(scene: Scene, parameters: TrackerParameters | None = None) -> Answers:
+    """Track, smooth, write the tables and judge as lab/process.py does, without reading files and without a report."""
+    run = Run(
+        folder=Path(),
+        name=f"seed {scene.seed}",
+        rig=scene.known_rig,
+        rig_path=Path("rig.yaml"),
+        frame_rate_hz=scene.frame_rate_hz,
+        exposure_s=None,
+        times=Times(scene.frame_rate_hz),
+        times_path=None,
+        cameras={},
+        left_out=(),
+        prior=scene.prior,
+        tracker=TrackerParameters() if parameters is None else parameters,
+        notes="",
+        covariance=scene.covariance,
+    )
+    views = tuple(f"{c}/{s}" for c, s in SpotModel.of(run.rig).views)
+    smoothed: list[FrameRecord] = []
+    causal: list[FrameRecord] = []
+    with _recorded_warnings() as caught, tempfile.TemporaryDirectory() as name:
+        work = Path(name)
+        pipeline = Pipeline(run, PointReader(scene), tracker_of(run, run.prior), {})  # type: ignore[arg-type]
+        tally = process._Tally(tuple(run.rig.cameras), views)
+        passes, keeper = TwoPasses(pipeline, work), FrameKeeper()
+        start = time.process_time()
+        with (
+            TableWriter(work, run.rig, run.covariance is not None, with_causal=True) as tables,
+            contextlib.closing(passes.records()) as records,
+        ):
+            for record, then in records:
+                tables.write(record, then)
+                keeper.add_tracked(record.t_s, record.tracked, record.tracked.predicted_cov_px2)
+                tally.add(record)
+                smoothed.append(record)
+                causal.append(then)
+        seconds = time.process_time() - start
+        verdict = process._verdict(pipeline, tally, check_kept(run.rig, keeper, run.covariance))
+    return Answers(
+        _pass(scene, smoothed),
+        _pass(scene, causal),
+        verdict.exit_status,
+        verdict.reasons,
+        tuple(dict.fromkeys(caught)),
+        len(caught),
+        seconds / len(scene) * 1e3,
+        passes.smoothing.iterations if passes.smoothing is not None else 0,
+    )
+
+
+def answers_through_files(scene: Scene, run_folder: Path) -> Answers:
+    """What `beampose run` makes of a written run folder (write_folder.py), read back from its tables."""
+    with _recorded_warnings() as caught, tempfile.TemporaryDirectory() as name:
+        out = Path(name) / "out"
+        start = time.process_time()
+        outcome = process.process_run(run_folder, out)
+        seconds = time.process_time() - start
+        smoothed = _pass_of_files(scene, out, causal=False)
+    return Answers(
+        smoothed, None, outcome.exit_status, outcome.verdict.reasons, tuple(dict.fromkeys(caught)), len(caught),
+        seconds / len(scene) * 1e3, 0,
+    )  # fmt: skip
+
+
+@contextlib.contextmanager
+def _recorded_warnings() -> Iterator[list[str]]:
+    """The texts of all warnings raised meanwhile."""
+    texts: list[str] = []
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        yield texts
+        texts += [f"{w.category.__name__}: {w.message} ({Path(w.filename).name})" for w in caught]
+
+
+def _pass(scene: Scene, records: list[FrameRecord]) -> Pass:
+    frames, views = len(scene), len(scene.camera_of)
+    labelled, uv = np.zeros((frames, views), dtype=bool), np.full((frames, views, 2), np.nan)
+    status, rotation = np.full(frames, LOST), np.full((frames, 3, 3), np.nan)
+    translation, covariance = np.full((frames, 3), np.nan), np.full((frames, 6, 6), np.nan)
+    for k, record in enumerate(records):
+        tracked = record.tracked
+        labelled[k] = tracked.point != UNMATCHED
+        for v in np.flatnonzero(labelled[k]):
+            points = record.detections[int(scene.camera_of[v])]
+            if points is not None:
+                uv[k, v] = points.uv_px[tracked.point[v]]
+        status[k] = _STATUS[tracked.pose_status]
+        if tracked.pose is not None and tracked.pose_covariance is not None:
+            rotation[k], translation[k] = tracked.pose.rotation, tracked.pose.translation
+            covariance[k] = tracked.pose_covariance
+    return Pass(labelled, uv, status, Pose(rotation, translation), covariance)
+
+
+def _pass_of_files(scene: Scene, results: Path, causal: bool) -> Pass:
+    spots, poses = read_spots(results), read_poses(results, causal=causal)
+    frames, views = len(scene), scene.rig.views()
+    labelled, uv = np.zeros((frames, len(views)), dtype=bool), np.full((frames, len(views), 2), np.nan)
+    for j, view in enumerate(views):
+        if view in spots.views:
+            i = list(spots.views).index(view)
+            labelled[spots.frames, j] = spots.measured[:, i]
+            uv[spots.frames, j] = np.where(spots.measured[:, i, None], spots.uv_px[:, i], np.nan)
+    status = np.full(frames, LOST)
+    rotation, translation = np.full((frames, 3, 3), np.nan), np.full((frames, 3), np.nan)
+    covariance = np.full((frames, 6, 6), np.nan)
+    status[poses.frames[poses.has(PoseStatus.PREDICTED)]] = PREDICTED
+    status[poses.frames[poses.has(PoseStatus.MEASURED)]] = MEASURED
+    rotation[poses.frames], translation[poses.frames] = (
+        poses.world_from_body.rotation,
+        poses.world_from_body.translation,
+    )
+    covariance[poses.frames] = poses.covariance
+    return Pass(labelled, uv, status, Pose(rotation, translation), covariance)

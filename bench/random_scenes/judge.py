@@ -1,0 +1,256 @@
+"""The answers to a scene against its truth: identity, wrong labels, covariances, and the class of a failure.
+
+A label is right if its point is the spot's own, or lies within SAME_SPOT_PX or SAME_SPOT_SIGMAS of the spot's true place
+with no other spot nearer (the rule of lab/score.py). Identity counts spots that shine, have a picture, and have no other
+point within TOGETHER_SIGMAS of their true place, where nobody can tell which is which.
+
+A pose is confidently wrong if its Mahalanobis distance from the truth is above 10 (NEES above 100; of 1e9 right poses
+with 6 degrees of freedom none is).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bench.random_scenes.answers import LOST, MEASURED, PREDICTED, Answers, Pass
+from bench.random_scenes.oracle import Oracle
+from bench.random_scenes.scene import CLUTTER, Scene
+from geometry.arrays import Array, Bools
+
+SAME_SPOT_PX, SAME_SPOT_SIGMAS = 3.0, 5.0
+TOGETHER_SIGMAS, TOGETHER_PX = 6.0, 0.1
+CONFIDENTLY_WRONG = 100.0  # NEES
+CHI2_95 = 12.592  # of 6 degrees of freedom
+LEAST_IDENTITY, MOST_NEES = 0.995, 12.0
+SAME_POINT_PX = 1e-3  # between a label's point and the detection: files round
+
+CLASSES = (
+    "crash",
+    "never locked",
+    "lost after occlusion",
+    "wrong labels",
+    "confidently wrong measured",
+    "confidently wrong predicted",
+    "NEES",
+    "labels missing",
+    "exit status",
+    "numeric warnings",
+)
+CLEAN = "clean"
+
+
+@dataclass(frozen=True, slots=True)
+class PassFigures:
+    """One pass (causal or smoothed) against truth."""
+
+    identity: float
+    countable: int  # spot-frames that identity is of
+    wrong: int  # labels on another spot or on clutter
+    near: int  # labels on another point, within SAME_SPOT_PX of the spot but beyond SAME_SPOT_SIGMAS
+    measured: int  # frames
+    predicted: int
+    lost: int
+    nees: float  # mean over measured and predicted poses ...
+    nees_median: float
+    nees_measured: float  # ... and of each
+    nees_predicted: float
+    nees_max: float
+    coverage: float  # share of poses inside the 95 % ellipsoid
+    wrong_measured: int  # confidently wrong poses
+    wrong_predicted: int
+    not_definite: int  # covariances that are not positive definite
+    locked_in: int  # the first frame with a measured pose that is not confidently wrong; -1: none
+    worst_deg: float  # largest attitude error of a measured pose
+    worst_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class Judgement:
+    """A scene's verdict."""
+
+    seed: int
+    counts: bool
+    why_not: str
+    classes: tuple[str, ...]  # of the failure, the first is the leading one; empty: clean
+    smoothed: PassFigures
+    causal: PassFigures | None
+    oracle_nees: float  # /6
+    solvable: float  # share of frames
+    lost_though_solvable: int  # frames without a measured pose (smoothed) that the oracle can solve
+    exit_status: int
+    reasons: str
+    warnings: int
+    first_warning: str
+    ms_per_frame: float
+    rounds: int
+    text: str
+
+    @property
+    def clean(self) -> bool:
+        """Whether nothing is wrong."""
+        return not self.classes
+
+    @property
+    def failure(self) -> str:
+        """The leading class, or CLEAN."""
+        return self.classes[0] if self.classes else CLEAN
+
+
+def judge(scene: Scene, oracle: Oracle, answers: Answers) -> Judgement:
+    """All figures of one scene."""
+    smoothed = figures(scene, answers.smoothed)
+    causal = None if answers.causal is None else figures(scene, answers.causal)
+    missing = oracle.solvable & (answers.smoothed.status != MEASURED)
+    return Judgement(
+        seed=scene.seed,
+        counts=oracle.counts,
+        why_not=oracle.why_not,
+        classes=classes_of(scene, answers, smoothed, causal, missing),
+        smoothed=smoothed,
+        causal=causal,
+        oracle_nees=_mean(oracle.nees) / 6,
+        solvable=float(oracle.solvable.mean()),
+        lost_though_solvable=int(missing.sum()),
+        exit_status=answers.exit_status,
+        reasons="; ".join(answers.reasons),
+        warnings=answers.warnings_count,
+        first_warning=answers.warnings[0] if answers.warnings else "",
+        ms_per_frame=answers.ms_per_frame,
+        rounds=answers.rounds,
+        text=scene.text,
+    )
+
+
+def figures(scene: Scene, answer: Pass) -> PassFigures:
+    """One pass against truth."""
+    right, wrong, near = label_verdicts(scene, answer)
+    countable = scene.shining & ~_together(scene)
+    nees = nees_of(scene, answer)
+    known = answer.status != LOST
+    measured, predicted = answer.status == MEASURED, answer.status == PREDICTED
+    good = known & ~np.isnan(nees)
+    off = nees > CONFIDENTLY_WRONG
+    locked = np.flatnonzero(measured & good & ~off)
+    delta = scene.poses.minus(answer.poses)
+    return PassFigures(
+        identity=float((right & countable).sum() / max(countable.sum(), 1)),
+        countable=int(countable.sum()),
+        wrong=int(wrong.sum()),
+        near=int(near.sum()),
+        measured=int(measured.sum()),
+        predicted=int(predicted.sum()),
+        lost=int((~known).sum()),
+        nees=_mean(nees[good]),
+        nees_median=float(np.median(nees[good])) if good.any() else float("nan"),
+        nees_measured=_mean(nees[good & measured]),
+        nees_predicted=_mean(nees[good & predicted]),
+        nees_max=float(nees[good].max(initial=0.0)),
+        coverage=_mean((nees[good] <= CHI2_95).astype(float)),
+        wrong_measured=int((off & measured).sum()),
+        wrong_predicted=int((off & predicted).sum()),
+        not_definite=int((known & np.isnan(nees)).sum()),
+        locked_in=int(locked[0]) if locked.size else -1,
+        worst_deg=float(np.rad2deg(np.linalg.norm(delta[measured, 3:], axis=1)).max(initial=0.0)),
+        worst_m=float(np.linalg.norm(delta[measured, :3], axis=1).max(initial=0.0)),
+    )
+
+
+def label_verdicts(scene: Scene, answer: Pass) -> tuple[Bools, Bools, Bools]:
+    """Of each label (T, n): right; wrong; and on another point that is too near to be called wrong."""
+    frames, views = answer.labelled.shape
+    right, wrong, near = (np.zeros((frames, views), dtype=bool) for _ in range(3))
+    for k, v in zip(*np.nonzero(answer.labelled), strict=True):
+        c, at, true = scene.camera_of[v], answer.uv_px[k, v], scene.uv_px[k]
+        points = scene.detections[k][c].uv_px
+        gap = np.linalg.norm(points - at, axis=-1) if len(points) else np.zeros(0)
+        origin = scene.origin[k][c][int(np.argmin(gap))] if gap.size and gap.min() < SAME_POINT_PX else CLUTTER
+        if origin == v:
+            right[k, v] = True
+            continue
+        away = float(np.linalg.norm(at - true[v]))
+        others = np.flatnonzero((scene.camera_of == c) & (np.arange(views) != v))
+        others_away = np.nan_to_num(np.linalg.norm(true[others] - at, axis=-1), nan=np.inf).min(initial=np.inf)
+        tolerance = SAME_SPOT_SIGMAS * scene.sigma_px[v]
+        if away <= max(SAME_SPOT_PX, tolerance) and away - others_away <= tolerance:
+            right[k, v] = True
+            near[k, v] = away > tolerance
+        else:
+            wrong[k, v] = True
+    return right, wrong, near
+
+
+def _together(scene: Scene) -> Bools:
+    """(T, n): another point lies where the spot is."""
+    out = np.zeros(scene.in_view.shape, dtype=bool)
+    limit = np.maximum(TOGETHER_SIGMAS * scene.sigma_px, TOGETHER_PX)
+    for k in range(len(scene)):
+        for v in np.flatnonzero(scene.shining[k]):
+            c = scene.camera_of[v]
+            gap = np.linalg.norm(scene.detections[k][c].uv_px - scene.uv_px[k, v], axis=-1)
+            out[k, v] = bool(np.any((gap < limit[v]) & (scene.origin[k][c] != v)))
+    return out
+
+
+def nees_of(scene: Scene, answer: Pass) -> Array:
+    """(T,): e^T P^-1 e of the poses; nan where lost, or where P is not positive definite."""
+    delta = scene.poses.minus(answer.poses)
+    out = np.full(len(scene), np.nan)
+    for k in np.flatnonzero(answer.status != LOST):
+        P = answer.covariance[k]
+        variance = np.diagonal(P)
+        if not (np.isfinite(P).all() and (variance > 0).all() and np.isfinite(delta[k]).all()):
+            continue
+        scale = np.sqrt(variance)
+        C = P / np.outer(scale, scale)
+        if np.linalg.eigvalsh(C)[0] > 0:
+            out[k] = float(delta[k] / scale @ np.linalg.solve(C, delta[k] / scale))
+    return out
+
+
+def classes_of(
+    scene: Scene, answers: Answers, smoothed: PassFigures, causal: PassFigures | None, missing: Bools
+) -> tuple[str, ...]:
+    """What is wrong, gravest cause first; empty for a clean scene."""
+    found = []
+    labels_missing = smoothed.identity < LEAST_IDENTITY
+    locked = smoothed.locked_in if causal is None else causal.locked_in
+    if locked < 0:
+        found.append("never locked")
+    elif labels_missing and _after_darkness(scene, missing):
+        found.append("lost after occlusion")
+    if smoothed.wrong:
+        found.append("wrong labels")
+    if smoothed.wrong_measured or smoothed.not_definite:
+        found.append("confidently wrong measured")
+    if smoothed.wrong_predicted:
+        found.append("confidently wrong predicted")
+    if not smoothed.nees <= MOST_NEES:
+        found.append("NEES")
+    if labels_missing and not found:
+        found.append("labels missing")
+    if answers.exit_status:
+        found.append("exit status")
+    if answers.warnings_count:
+        found.append("numeric warnings")
+    return tuple(found)
+
+
+def _after_darkness(scene: Scene, missing: Bools) -> bool:
+    """Whether most frames that lack a pose though they show it follow on a hidden stretch without recovery."""
+    if missing.sum() < 10:
+        return False
+    starts = np.flatnonzero(missing & ~np.concatenate([[False], missing[:-1]]))
+    full = scene.shining.sum(axis=1)
+    lost = 0
+    for a in starts:
+        b = a + int(np.argmin(np.append(missing[a:], False)))
+        before = full[max(a - 3, 0) : a + 1].min()
+        lost += (b - a) if before < np.median(full) else 0
+    return lost > 0.5 * missing.sum()
+
+
+def _mean(values: Array) -> float:
+    values = values[~np.isnan(values)]
+    return float(values.mean()) if values.size else float("nan")

@@ -1,0 +1,102 @@
+"""What the true labels allow: each frame's pose by itself, and whether the first frame has one answer only."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bench.random_scenes.scene import CLUTTER, SHINING, Scene
+from geometry.arrays import Array, Bools
+from geometry.solve import SolveLimits, fit_pose, good_enough
+from geometry.spots import SpotModel
+from tracking.detections import Detections
+from tracking.labels import PosePrior, find_labels
+
+FIRST_FRAMES = 3  # each of these must give a pose ...
+LEAST_SPOTS = 4  # ... from so many spots at least
+LEAST_SOLVABLE = 0.5  # share of all frames that must give one
+EXACT_SIGMA = 0.005  # px, of the points that are searched for a tie
+TIE_CHI2 = 30.0  # of a wrong pose that the first frame's noise cannot exclude
+
+
+@dataclass(frozen=True, slots=True)
+class Oracle:
+    """What can be asked of a tracker."""
+
+    solvable: Bools  # (T,) the frame's own spots give a pose
+    nees: Array  # (T,) of that pose; nan without
+    tie: bool  # the first frame admits another pose within the prior
+    first_solvable: bool
+
+    @property
+    def counts(self) -> bool:
+        """Whether the scene is one that a tracker can be asked to solve."""
+        return self.first_solvable and not self.tie and float(self.solvable.mean()) >= LEAST_SOLVABLE
+
+    @property
+    def why_not(self) -> str:
+        """Why the scene does not count; empty where it does."""
+        if not self.first_solvable:
+            return "first frames give no pose"
+        if self.solvable.mean() < LEAST_SOLVABLE:
+            return "most frames give no pose"
+        return "tie in the first frame" if self.tie else ""
+
+
+def ask_oracle(scene: Scene) -> Oracle:
+    """Fit every frame with its true labels, from the true pose."""
+    model = SpotModel.of(scene.rig)
+    limits = SolveLimits()
+    solvable, nees = np.zeros(len(scene), dtype=bool), np.full(len(scene), np.nan)
+    shining = scene.shining
+    for k in range(len(scene)):
+        rows = np.flatnonzero(shining[k])
+        if len(np.unique(scene.spot_of[rows])) < 3:
+            continue
+        uv = measured_pixels(scene, k)[rows]
+        covariances = scene.sigma_px[rows, None, None] ** 2 * np.eye(2)
+        fit = fit_pose(model, rows, uv, covariances, scene.poses[k])
+        if fit is None or not good_enough(fit, limits):
+            continue
+        d = scene.poses[k].minus(fit.world_from_body)
+        solvable[k], nees[k] = True, float(d @ np.linalg.solve(fit.covariance, d))
+    spots = [len(np.unique(scene.spot_of[shining[k]])) for k in range(FIRST_FRAMES)]
+    first = bool(solvable[:FIRST_FRAMES].all() and min(spots) >= LEAST_SPOTS)
+    return Oracle(solvable, nees, first and _ties(scene, model), first)
+
+
+def measured_pixels(scene: Scene, k: int) -> Array:
+    """The detected place of each view (n, 2), px; nan without a point."""
+    out = np.full((len(scene.camera_of), 2), np.nan)
+    for found, origin in zip(scene.detections[k], scene.origin[k], strict=True):
+        of_spot = origin != CLUTTER
+        out[origin[of_spot]] = found.uv_px[of_spot]
+    return out
+
+
+def _ties(scene: Scene, model: SpotModel) -> bool:
+    """Whether the noise-free first frame without false points has another answer that its noise cannot exclude."""
+    if scene.prior is None:
+        return False
+    return another_pose(scene, model, scene.prior)
+
+
+def another_pose(scene: Scene, model: SpotModel, prior: PosePrior) -> bool:
+    """As `_ties`, within a given prior."""
+    found = {}
+    for c, name in enumerate(model.camera_names):
+        rows = np.flatnonzero((scene.camera_of == c) & (scene.in_view[0] == SHINING))
+        found[name] = Detections.at(scene.uv_px[0][rows], np.tile(EXACT_SIGMA**2 * np.eye(2), (len(rows), 1, 1)))
+    for other in find_labels(scene.rig, model, found, prior).candidates:
+        used = np.flatnonzero(other.point_of >= 0)
+        at = np.array([found[model.camera_names[scene.camera_of[v]]].uv_px[other.point_of[v]] for v in used])
+        if len(used) == len(np.flatnonzero(scene.in_view[0] == SHINING)) and np.allclose(
+            at, scene.uv_px[0][used], atol=1e-6
+        ):
+            continue  # the true labels
+        covariances = scene.sigma_px[used, None, None] ** 2 * np.eye(2)
+        fit = fit_pose(model, used, at, covariances, other.fit.world_from_body)
+        if fit is not None and fit.chi2 < TIE_CHI2 and len(used) >= min(LEAST_SPOTS, model.spot_of.max() + 1):
+            return True
+    return False

@@ -1,0 +1,166 @@
+"""The judgements of many scenes as a table, as a summary, and one scene's figures in full."""
+
+from __future__ import annotations
+
+import csv
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import asdict, fields
+from pathlib import Path
+
+import numpy as np
+
+from bench.random_scenes.judge import CLASSES, CLEAN, Judgement, PassFigures
+from bench.random_scenes.oracle import Oracle
+from bench.random_scenes.scene import Scene
+from geometry.arrays import Array
+
+WORST = 10
+
+
+def nothing() -> PassFigures:
+    """The figures of a run that ended in an exception."""
+    nan = float("nan")
+    return PassFigures(0.0, 0, 0, 0, 0, 0, 0, nan, nan, nan, nan, nan, nan, 0, 0, 0, -1, nan, nan)
+
+
+def crashed(scene: Scene, oracle: Oracle, trace: str) -> Judgement:
+    """The judgement of a scene on which the program raised an exception."""
+    return Judgement(
+        scene.seed, oracle.counts, oracle.why_not, ("crash",), nothing(), None, float("nan"),
+        float(oracle.solvable.mean()), int(oracle.solvable.sum()), 1, trace.strip().splitlines()[-1], 0, trace,
+        float("nan"), 0, scene.text,
+    )  # fmt: skip
+
+
+def write_rows(rows: Sequence[Judgement], path: Path) -> None:
+    """One row per scene: every field, those of the two passes with a prefix."""
+    flat = [_flat(row) for row in rows]
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.DictWriter(file, list(flat[0]) if flat else ["seed"], lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(flat)
+
+
+def _flat(row: Judgement) -> dict[str, object]:
+    out: dict[str, object] = {"seed": row.seed, "counts": int(row.counts), "class": row.failure}
+    out["classes"] = "|".join(row.classes)
+    for name in ("smoothed", "causal"):
+        figures = getattr(row, name)
+        values = asdict(figures) if figures is not None else {f.name: "" for f in fields(PassFigures)}
+        out |= {f"{name}_{key}": _short(value) for key, value in values.items()}
+    for field in fields(Judgement):
+        if field.name not in ("seed", "counts", "classes", "smoothed", "causal"):
+            out[field.name] = _short(getattr(row, field.name))
+    return out
+
+
+def _short(value: object) -> object:
+    return f"{value:.6g}" if isinstance(value, float) else value
+
+
+def summary(rows: Sequence[Judgement]) -> str:
+    """The share of clean scenes, distributions, classes and the worst seeds, in plain text."""
+    counted = [r for r in rows if r.counts]
+    out = [f"{len(rows)} scenes; the oracle with the true labels can solve {len(counted)}"]
+    out += [f"  left out: {n} x {why}" for why, n in Counter(r.why_not for r in rows if not r.counts).items()]
+    if not counted:
+        return "\n".join(out)
+    n = len(counted)
+    clean = sum(r.clean for r in counted)
+    out.append(f"clean: {clean} of {n} = {clean / n:.1%}")
+    out.append(f"identity < .995: {_count(counted, lambda r: not r.smoothed.identity >= 0.995)}")
+    out.append(f"any wrong label as measured: {_count(counted, lambda r: r.smoothed.wrong > 0)}")
+    out.append(
+        f"any confidently wrong pose (Mahalanobis > 10): measured {_count(counted, lambda r: r.smoothed.wrong_measured > 0)},"
+        f" predicted {_count(counted, lambda r: r.smoothed.wrong_predicted > 0)};"
+        f" covariance not positive definite {_count(counted, lambda r: r.smoothed.not_definite > 0)}"
+    )
+    out.append(
+        f"NEES mean > 12: {_count(counted, lambda r: not r.smoothed.nees <= 12)};"
+        f" exit status not 0: {_count(counted, lambda r: r.exit_status != 0)};"
+        f" numeric warnings: {_count(counted, lambda r: r.warnings > 0)}"
+    )
+    for name in ("smoothed", "causal"):
+        figures = [f for r in counted if (f := getattr(r, name)) is not None]
+        if figures:
+            out += [f"{name}:", *(f"  {line}" for line in _distributions(figures))]
+    ratio = np.array([r.smoothed.nees / 6 for r in counted])
+    outside = int(np.sum(~((ratio >= 0.6) & (ratio <= 1.6))))
+    out.append(f"smoothed NEES/6 outside .6 to 1.6: {outside} = {outside / n:.1%}")
+    out.append(f"oracle NEES/6: {_quantiles(np.array([r.oracle_nees for r in counted]))}")
+    out.append(f"process time: {_quantiles(np.array([r.ms_per_frame for r in counted]))} ms per frame")
+    out.append(f"rounds of smoothing: {dict(sorted(Counter(r.rounds for r in counted).items()))}")
+    out.append("classes (leading | anywhere):")
+    leading = Counter(r.failure for r in counted)
+    anywhere = Counter(c for r in counted for c in r.classes)
+    out += [f"  {c}: {leading[c]} | {anywhere[c]}" for c in CLASSES if anywhere[c]]
+    failed = [r for r in counted if not r.clean]
+    if failed:
+        out.append("seeds by leading class:")
+        out += [f"  {c}: {' '.join(str(r.seed) for r in failed if r.failure == c)}" for c in CLASSES if leading[c]]
+        out.append("worst:")
+        out += [f"  {line(r)}" for r in sorted(failed, key=_badness)[:WORST]]
+    return "\n".join(out)
+
+
+def line(row: Judgement) -> str:
+    """One line about a scene."""
+    s = row.smoothed
+    what = ", ".join(row.classes) or CLEAN
+    return (
+        f"seed {row.seed}: {what}; identity {s.identity:.4f}, wrong {s.wrong}, NEES {s.nees:.3g} (max {s.nees_max:.3g}),"
+        f" status {row.exit_status} | {row.text}"
+    )
+
+
+def details(row: Judgement) -> str:
+    """All figures of one scene."""
+    left_out = "" if row.counts else f" (left out: {row.why_not})"
+    out = [f"seed {row.seed}: {', '.join(row.classes) or CLEAN}{left_out}", f"  {row.text}"]
+    for name in ("smoothed", "causal"):
+        figures = getattr(row, name)
+        if figures is not None:
+            out.append(f"  {name}: " + ", ".join(f"{k} {_short(v)}" for k, v in asdict(figures).items()))
+    out.append(
+        f"  oracle: NEES/6 {row.oracle_nees:.2f}, solvable {row.solvable:.1%}, not measured though solvable"
+        f" {row.lost_though_solvable}; {row.ms_per_frame:.1f} ms/frame, {row.rounds} rounds"
+    )
+    out.append(f"  exit status {row.exit_status}: {row.reasons}")
+    if row.warnings or row.first_warning:
+        out.append(f"  {row.warnings} warnings: {row.first_warning}")
+    return "\n".join(out)
+
+
+def _badness(row: Judgement) -> tuple[int, float]:
+    return CLASSES.index(row.failure), row.smoothed.identity - np.nan_to_num(row.smoothed.nees_max) * 1e-9
+
+
+def _count(rows: Sequence[Judgement], bad: object) -> str:
+    n = sum(bool(bad(r)) for r in rows)  # type: ignore[operator]
+    return f"{n} = {n / len(rows):.1%}"
+
+
+def _distributions(figures: Sequence[PassFigures]) -> list[str]:
+    def of(name: str) -> Array:
+        return np.array([getattr(f, name) for f in figures], dtype=float)
+
+    return [
+        f"identity: least {of('identity').min():.4f}, {_quantiles(of('identity'))};"
+        f" pooled {np.sum(of('identity') * of('countable')) / max(of('countable').sum(), 1):.5f};"
+        f" wrong labels {of('wrong').sum():.0f}, near ones {of('near').sum():.0f}",
+        f"NEES/6 over scenes: {_quantiles(of('nees') / 6)}; of measured poses {_quantiles(of('nees_measured') / 6)};"
+        f" of predicted ones {_quantiles(of('nees_predicted') / 6)}",
+        f"95 % coverage: {_quantiles(of('coverage'))}",
+        f"frames measured {of('measured').sum():.0f}, predicted {of('predicted').sum():.0f}, lost {of('lost').sum():.0f}",
+        f"locked in frame: {_quantiles(np.where(of('locked_in') < 0, np.nan, of('locked_in')))};"
+        f" never {int(np.sum(of('locked_in') < 0))}",
+    ]
+
+
+def _quantiles(values: Array) -> str:
+    values = values[~np.isnan(values)]
+    if not values.size:
+        return "none"
+    low, middle, high = np.quantile(values, [0.05, 0.5, 0.95])
+    return f"median {middle:.4g} (5 % {low:.4g}, 95 % {high:.4g})"
