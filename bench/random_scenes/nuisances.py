@@ -56,7 +56,7 @@ def draw_reflections(
     near: bool,
     at_frame: int | None = None,
 ) -> Array:
-    """Points (count, 2), px, that stay: 10 to 80 px from a spot's mean place, or from its place in a frame, or anywhere.
+    """Points (count, 2), px, that stay: 10 to 80 px from a spot's median place (or its place in a frame), or anywhere.
 
     uv_px (T, m, 2): the camera's spots.
     """

@@ -72,7 +72,8 @@ def summary(rows: Sequence[Judgement]) -> str:
     out.append(f"identity < .995: {_count(counted, lambda r: not r.smoothed.identity >= 0.995)}")
     out.append(f"any wrong label as measured: {_count(counted, lambda r: r.smoothed.wrong > 0)}")
     out.append(
-        f"any confidently wrong pose (Mahalanobis > 10): measured {_count(counted, lambda r: r.smoothed.wrong_measured > 0)},"
+        "any confidently wrong pose (Mahalanobis > 10):"
+        f" measured {_count(counted, lambda r: r.smoothed.wrong_measured > 0)},"
         f" predicted {_count(counted, lambda r: r.smoothed.wrong_predicted > 0)};"
         f" covariance not positive definite {_count(counted, lambda r: r.smoothed.not_definite > 0)}"
     )
@@ -109,8 +110,8 @@ def line(row: Judgement) -> str:
     s = row.smoothed
     what = ", ".join(row.classes) or CLEAN
     return (
-        f"seed {row.seed}: {what}; identity {s.identity:.4f}, wrong {s.wrong}, NEES {s.nees:.3g} (max {s.nees_max:.3g}),"
-        f" status {row.exit_status} | {row.text}"
+        f"seed {row.seed}: {what}; identity {s.identity:.4f}, wrong {s.wrong},"
+        f" NEES {s.nees:.3g} (max {s.nees_max:.3g}), status {row.exit_status} | {row.text}"
     )
 
 
@@ -152,7 +153,8 @@ def _distributions(figures: Sequence[PassFigures]) -> list[str]:
         f"NEES/6 over scenes: {_quantiles(of('nees') / 6)}; of measured poses {_quantiles(of('nees_measured') / 6)};"
         f" of predicted ones {_quantiles(of('nees_predicted') / 6)}",
         f"95 % coverage: {_quantiles(of('coverage'))}",
-        f"frames measured {of('measured').sum():.0f}, predicted {of('predicted').sum():.0f}, lost {of('lost').sum():.0f}",
+        f"frames measured {of('measured').sum():.0f}, predicted {of('predicted').sum():.0f},"
+        f" lost {of('lost').sum():.0f}",
         f"locked in frame: {_quantiles(np.where(of('locked_in') < 0, np.nan, of('locked_in')))};"
         f" never {int(np.sum(of('locked_in') < 0))}",
     ]

@@ -1,7 +1,7 @@
 """Rigs drawn at random: screens, a vehicle with beams, and cameras that are aimed at where the spots fall.
 
-All is laid out in a base frame (x from the left screen to the right one, z up) and a vehicle frame; at the end the whole
-lab is moved to a world frame and the beams to a body frame of their own.
+All is laid out in a base frame (x from the left screen to the right one, z up) and a vehicle frame; at the end the
+whole lab is moved to a world frame and the beams to a body frame of their own.
 """
 
 from __future__ import annotations
