@@ -24,6 +24,7 @@ TOGETHER_SIGMAS, TOGETHER_PX = 6.0, 0.1
 CONFIDENTLY_WRONG = 100.0  # NEES
 CHI2_95 = 12.592  # of 6 degrees of freedom
 LEAST_IDENTITY, MOST_NEES = 0.995, 12.0
+LEAST_LOCKED = 0.5  # identity below which the tracker is not locked at all
 SAME_POINT_PX = 1e-3  # between a label's point and the detection: files round
 
 CLASSES = (
@@ -57,9 +58,11 @@ class PassFigures:
     nees_measured: float  # ... and of each
     nees_predicted: float
     nees_max: float
+    poses: int  # that NEES is of
     coverage: float  # share of poses inside the 95 % ellipsoid
     wrong_measured: int  # confidently wrong poses
     wrong_predicted: int
+    beyond_6: int  # poses of which one of the six components is off by more than 6 of its sigmas
     not_definite: int  # covariances that are not positive definite
     locked_in: int  # the first frame with a measured pose that is not confidently wrong; -1: none
     worst_deg: float  # largest attitude error of a measured pose
@@ -107,7 +110,7 @@ def judge(scene: Scene, oracle: Oracle, answers: Answers) -> Judgement:
         seed=scene.seed,
         counts=oracle.counts,
         why_not=oracle.why_not,
-        classes=classes_of(scene, answers, smoothed, causal, missing),
+        classes=classes_of(scene, oracle, answers, smoothed, causal),
         smoothed=smoothed,
         causal=causal,
         oracle_nees=_mean(oracle.nees) / 6,
@@ -134,6 +137,8 @@ def figures(scene: Scene, answer: Pass) -> PassFigures:
     off = nees > CONFIDENTLY_WRONG
     locked = np.flatnonzero(measured & good & ~off)
     delta = scene.poses.minus(answer.poses)
+    with np.errstate(invalid="ignore"):
+        components = np.abs(delta / np.sqrt(np.diagonal(answer.covariance, axis1=1, axis2=2))).max(axis=1)
     return PassFigures(
         identity=float((right & countable).sum() / max(countable.sum(), 1)),
         countable=int(countable.sum()),
@@ -147,9 +152,11 @@ def figures(scene: Scene, answer: Pass) -> PassFigures:
         nees_measured=_mean(nees[good & measured]),
         nees_predicted=_mean(nees[good & predicted]),
         nees_max=float(nees[good].max(initial=0.0)),
+        poses=int(good.sum()),
         coverage=_mean((nees[good] <= CHI2_95).astype(float)),
         wrong_measured=int((off & measured).sum()),
         wrong_predicted=int((off & predicted).sum()),
+        beyond_6=int((known & ~(components <= 6.0)).sum()),
         not_definite=int((known & np.isnan(nees)).sum()),
         locked_in=int(locked[0]) if locked.size else -1,
         worst_deg=float(np.rad2deg(np.linalg.norm(delta[measured, 3:], axis=1)).max(initial=0.0)),
@@ -210,16 +217,20 @@ def nees_of(scene: Scene, answer: Pass) -> Array:
 
 
 def classes_of(
-    scene: Scene, answers: Answers, smoothed: PassFigures, causal: PassFigures | None, missing: Bools
+    scene: Scene, oracle: Oracle, answers: Answers, smoothed: PassFigures, causal: PassFigures | None
 ) -> tuple[str, ...]:
-    """What is wrong, gravest cause first; empty for a clean scene."""
+    """What is wrong, gravest cause first; empty for a clean scene.
+
+    never locked: no pose, or less than half of the labels without an occlusion that explains it. lost after occlusion:
+    most frames that lack a pose, though their spots give one, follow directly on dark ones.
+    """
     found = []
     labels_missing = smoothed.identity < LEAST_IDENTITY
     locked = smoothed.locked_in if causal is None else causal.locked_in
-    if locked < 0:
-        found.append("never locked")
-    elif labels_missing and _after_darkness(scene, missing):
+    if labels_missing and locked >= 0 and _after_darkness(scene, oracle, answers.smoothed):
         found.append("lost after occlusion")
+    elif locked < 0 or smoothed.identity < LEAST_LOCKED:
+        found.append("never locked")
     if smoothed.wrong:
         found.append("wrong labels")
     if smoothed.wrong_measured or smoothed.not_definite:
@@ -237,18 +248,18 @@ def classes_of(
     return tuple(found)
 
 
-def _after_darkness(scene: Scene, missing: Bools) -> bool:
-    """Whether most frames that lack a pose though they show it follow on a hidden stretch without recovery."""
-    if missing.sum() < 10:
-        return False
-    starts = np.flatnonzero(missing & ~np.concatenate([[False], missing[:-1]]))
-    full = scene.shining.sum(axis=1)
-    lost = 0
-    for a in starts:
-        b = a + int(np.argmin(np.append(missing[a:], False)))
-        before = full[max(a - 3, 0) : a + 1].min()
-        lost += (b - a) if before < np.median(full) else 0
-    return lost > 0.5 * missing.sum()
+def _after_darkness(scene: Scene, oracle: Oracle, answer: Pass) -> bool:
+    """Whether most frames without a measured pose, though the oracle has one, follow directly on a dark frame.
+
+    Dark: the oracle has no pose, or less than half of the usual number of spots shine.
+    """
+    missing = oracle.solvable & (answer.status != MEASURED)
+    shining = scene.shining.sum(axis=1)
+    dark = ~oracle.solvable | (shining < 0.5 * np.median(shining))
+    after = np.zeros(len(scene), dtype=bool)
+    for k in range(1, len(scene)):
+        after[k] = missing[k] and (dark[k - 1] or after[k - 1])
+    return bool(missing.any() and after.sum() > 0.5 * missing.sum())
 
 
 def _mean(values: Array) -> float:

@@ -21,7 +21,11 @@ WORST = 10
 def nothing() -> PassFigures:
     """The figures of a run that ended in an exception."""
     nan = float("nan")
-    return PassFigures(0.0, 0, 0, 0, 0, 0, 0, nan, nan, nan, nan, nan, nan, 0, 0, 0, -1, nan, nan)
+    return PassFigures(
+        identity=0.0, countable=0, wrong=0, near=0, measured=0, predicted=0, lost=0, nees=nan, nees_median=nan,
+        nees_measured=nan, nees_predicted=nan, nees_max=nan, poses=0, coverage=nan, wrong_measured=0,
+        wrong_predicted=0, beyond_6=0, not_definite=0, locked_in=-1, worst_deg=nan, worst_m=nan,
+    )  # fmt: skip
 
 
 def crashed(scene: Scene, oracle: Oracle, trace: str) -> Judgement:
@@ -153,11 +157,20 @@ def _distributions(figures: Sequence[PassFigures]) -> list[str]:
         f"NEES/6 over scenes: {_quantiles(of('nees') / 6)}; of measured poses {_quantiles(of('nees_measured') / 6)};"
         f" of predicted ones {_quantiles(of('nees_predicted') / 6)}",
         f"95 % coverage: {_quantiles(of('coverage'))}",
+        f"all poses together: NEES/6 {_pooled(of('nees'), of('poses')) / 6:.3f}, 95 % coverage"
+        f" {_pooled(of('coverage'), of('poses')):.4f},"
+        f" beyond 6 sigma {of('beyond_6').sum():.0f} of {of('poses').sum():.0f}",
         f"frames measured {of('measured').sum():.0f}, predicted {of('predicted').sum():.0f},"
         f" lost {of('lost').sum():.0f}",
         f"locked in frame: {_quantiles(np.where(of('locked_in') < 0, np.nan, of('locked_in')))};"
         f" never {int(np.sum(of('locked_in') < 0))}",
     ]
+
+
+def _pooled(means: Array, counts: Array) -> float:
+    """The mean over all poses, from those of scenes."""
+    some = counts > 0
+    return float(np.sum(means[some] * counts[some]) / max(counts[some].sum(), 1))
 
 
 def _quantiles(values: Array) -> str:
