@@ -169,6 +169,88 @@ def solve(a: Array, b: Array) -> tuple[Array, float]:
     return x, log_det
 
 
+LEAST_PIVOT = 1e-15  # of a diagonal entry: what Cholesky's pivot is raised to where rounding has eaten it
+
+
+@compiled
+def cholesky(a: Array) -> Array:
+    """The lower triangular L (n, n) with L L^T = a, of a symmetric, positive semidefinite matrix."""
+    n = a.shape[0]
+    out = np.zeros((n, n))
+    for j in range(n):
+        s = a[j, j]
+        for k in range(j):
+            s -= out[j, k] * out[j, k]
+        least = LEAST_PIVOT * a[j, j]
+        if not s > least:
+            s = least
+        if not s > 0.0:
+            continue  # nothing varies here: the column stays 0
+        root = np.sqrt(s)
+        out[j, j] = root
+        for i in range(j + 1, n):
+            s = a[i, j]
+            for k in range(j):
+                s -= out[i, k] * out[j, k]
+            out[i, j] = s / root
+    return out
+
+
+@compiled
+def posterior(P: Array, information: Array) -> tuple[Array, float]:
+    """(P^-1 + Y)^-1 of a covariance P (n, n), and log det(I + P Y); positive definite whatever the rounding.
+
+    information (k, k), k <= n: Y of the first k numbers, 0 of the others; it may lack rank. With P = S S^T the result
+    is S (I + S^T Y S)^-1 S^T, a square: nothing is subtracted, so a vague P and a sharp Y lose no digits.
+    """
+    n, k = P.shape[0], information.shape[0]
+    S = cholesky(P)
+    half = np.zeros((k, n))  # Y S
+    for i in range(k):
+        for j in range(k):
+            y = information[i, j]
+            if y != 0.0:
+                for c in range(j + 1):  # S is lower triangular
+                    half[i, c] += y * S[j, c]
+    M = np.zeros((n, n))
+    for i in range(n):
+        for a in range(i, k):
+            s = S[a, i]
+            if s != 0.0:
+                for c in range(i + 1):
+                    M[i, c] += s * half[a, c]
+        for c in range(i):
+            M[c, i] = M[i, c]
+        M[i, i] += 1.0
+    W = cholesky(M)
+    log_det = 0.0
+    for i in range(n):
+        log_det += 2 * np.log(W[i, i])
+    # Z = W^-1 S^T
+    Z = np.zeros((n, n))
+    for i in range(n):
+        for c in range(n):
+            Z[i, c] = S[c, i]
+        for a in range(i):
+            w = W[i, a]
+            if w != 0.0:
+                for c in range(n):
+                    Z[i, c] -= w * Z[a, c]
+        for c in range(n):
+            Z[i, c] /= W[i, i]
+    out = np.zeros((n, n))
+    for a in range(n):
+        for i in range(n):
+            z = Z[a, i]
+            if z != 0.0:
+                for j in range(i + 1):
+                    out[i, j] += z * Z[a, j]
+    for i in range(n):
+        for j in range(i):
+            out[j, i] = out[i, j]
+    return out, log_det
+
+
 @compiled
 def symmetrise(a: Array) -> None:
     """Take away what rounding did to a covariance's symmetry, in place."""

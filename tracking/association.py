@@ -29,6 +29,8 @@ GATE = 25.0  # squared sigmas: beyond it a detection is not this spot (p = 4e-6)
 # A step of s px is off by about s^2 / 1500 px where the projection is taken as straight (lenses of 1000 to 1500 px).
 BEND_PX = 1500.0
 NEIGHBOUR_PX2 = 100.0  # px^2: farther than any neighbour melts into a spot
+# A neighbour of a fifth of the light that shifts a spot by 0.3 of its sigma makes it a tenth wider.
+GROWN = 1.08
 LEAST_IN_PICTURE = 1e-3  # a spot less likely than this to be in the picture is not looked for
 BEHIND = 14.0  # nats: a partial assignment so far behind the best is dropped
 
@@ -46,6 +48,9 @@ class Frame(NamedTuple):
     first: Ints  # (cameras + 1,) where each camera's begin
     has_image: Bools  # (cameras,)
     log_clutter: Array  # (n,) of each view: log density of false points where it is looked for, 1/px^2
+    log_static: Array  # (m,) log density of points that stay in their place, at each detection; -inf: none known there
+    size_px: Array  # (m,) the detection's larger half axis; nan: not known
+    usual_px: Array  # (n,) the same of each view's spot as it usually is; nan: not known
 
 
 class Sights(NamedTuple):
@@ -68,6 +73,44 @@ class Chances(NamedTuple):
 
     detect: float  # of a spot in the picture that is not hidden
     blend: float  # that a detected spot has melted into a neighbour
+
+
+@compiled
+def log_false(frame: Frame, view: int, d: int) -> float:
+    """Log density of false points, 1/px^2, where detection d is taken for a view's spot."""
+    return max(frame.log_clutter[view], frame.log_static[d])
+
+
+@compiled
+def grown(frame: Frame, view: int, d: int) -> bool:
+    """Whether a detection is wider than the view's spot usually is: two points of light that have melted into one are."""
+    return bool(frame.size_px[d] > GROWN * frame.usual_px[view])
+
+
+@compiled
+def log_chance(
+    views: Views, sights: Sights, frame: Frame, chances: Chances, shown: Array, assigned: Ints, R: Array, t: Array
+) -> float:
+    """Log-likelihood of an assignment (n,) at a pose, without its Gaussian terms: detected, missed, blended.
+
+    The spots that the pose puts in a picture count, and those that are labelled; shown (n,) as in `associate`.
+    """
+    uv, J = np.empty(2), np.empty((2, 6))
+    total = 0.0
+    for i in range(assigned.shape[0]):
+        if not frame.has_image[sights.camera[i]]:
+            continue
+        p = chances.detect * shown[i]
+        if assigned[i] >= 0:
+            d = assigned[i] % BLENDED
+            total += np.log(p) - log_false(frame, i, d)
+            if assigned[i] >= BLENDED:
+                r = frame.blend_px[d]
+                total += np.log(chances.blend / (np.pi * r * r)) if r > 0.0 else -np.inf
+        elif project_view(views, i, R, t, uv, J):
+            if -0.5 <= uv[0] < sights.size[i, 0] - 0.5 and -0.5 <= uv[1] < sights.size[i, 1] - 0.5:
+                total += np.log(1.0 - p)
+    return total
 
 
 @compiled
@@ -183,7 +226,7 @@ def associate(
                 child_score, child_counted, child_node, child_choice, children, worst,
                 score[b_node] + gain, counted[b_node] + gain, b_node, MISSED,
             )  # fmt: skip
-            gain = np.log(p_detect) - frame.log_clutter[view]
+            found = np.log(p_detect)
             for d in range(frame.first[camera], frame.first[camera + 1]):
                 y0, y1 = frame.uv[d, 0] - uv[0], frame.uv[d, 1] - uv[1]
                 near2 = y0 * y0 + y1 * y1
@@ -195,6 +238,7 @@ def associate(
                         taken = True
                 if taken:
                     continue
+                gain = found - log_false(frame, view, d)
                 sa, sb, sc, det = inverse2(a + frame.cov[d, 0, 0], b + frame.cov[d, 0, 1], c + frame.cov[d, 1, 1])
                 d2 = y0 * (sa * y0 + sb * y1) + y1 * (sb * y0 + sc * y1)
                 if d2 < GATE:
@@ -204,7 +248,7 @@ def associate(
                         counted[b_node] + gain, b_node, d,
                     )  # fmt: skip
                 else:
-                    r = frame.blend_px[d]
+                    r = frame.blend_px[d] if grown(frame, view, d) else 0.0
                     if r > 0.0 and near2 < (r + 2 * np.sqrt(max(a, c))) ** 2 and a + c < r * r:
                         apart = np.log(chances.blend / (np.pi * r * r))
                         children, worst = _kept(

@@ -133,11 +133,10 @@ def inverse(L: Array) -> Array:
 def surprise(
     views: Views, before: Hypotheses, h: int, dt: float, jerk: Array, use: Bools, uv: Array, cov: Array
 ) -> tuple[Array, Array]:
-    """(2,) and (n, 2, 2). First: how the likelihood of a frame grows with the share of the prediction's covariance that
-    translation makes, and rotation, per unit of its size: what the steady motion's jerk is learnt from.
+    """(6,) and (n, 2, 2). First: how the likelihood of a frame grows with the share of the prediction's covariance that
+    each axis makes, per unit of its size: what the steady motion's jerk is learnt from.
 
-    With w = S^-1 y: (w^T P w - tr(S^-1 P)) / (1 + tr(S^-1 P)) / 2, taken for the two diagonal blocks of P. 0 on average
-    where the jerk is right. h: the hypothesis of the frame before. Second: the covariance of each spot's predicted
+    With w = S^-1 y: (w_i P_ii w_i - (S^-1)_ii P_ii) / (1 + (S^-1)_ii P_ii) / 2. 0 on average where the jerk is right. h: the hypothesis of the frame before. Second: the covariance of each spot's predicted
     place, px^2, without the detection's own.
     """
     none = np.zeros(2)
@@ -148,14 +147,10 @@ def surprise(
     for i in range(6):
         A[i, i] += 1.0
     x, _ = _solve(A, _beside(L, g))
-    out = np.zeros(2)
-    for block in range(2):
-        expected = square = 0.0
-        for i in range(3 * block, 3 * block + 3):
-            for j in range(3 * block, 3 * block + 3):
-                expected += x[i, j] * pose[i, j]
-                square += x[i, 6] * pose[i, j] * x[j, 6]
-        out[block] = 0.5 * (square - expected) / (1.0 + expected)
+    out = np.empty(6)
+    for i in range(6):
+        expected = x[i, i] * pose[i, i]
+        out[i] = 0.5 * (x[i, 6] * pose[i, i] * x[i, 6] - expected) / (1.0 + expected)
     n = use.shape[0]
     spread, at, J = np.empty((n, 2, 2)), np.empty(2), np.empty((2, 6))
     for i in range(n):

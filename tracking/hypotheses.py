@@ -31,6 +31,7 @@ PROOF = 3  # spots: where so many lie in their narrow gates, the velocities have
 LEAST_TO_TURN = 6.0  # nats: a hypothesis so far behind is not tried with a manoeuvre as well
 SURPRISE = 3.5  # sigmas of a misfit's own scatter: beyond it a manoeuvre is considered although every spot is found
 _apart, _apply, _dot, _block = small.apart, small.apply, small.dot, small.block
+_moved, _posterior = small.moved, small.posterior
 _put, _put_matrix, _best_first = small.put, small.put_matrix, small.best_first
 
 
@@ -57,7 +58,7 @@ class Children(NamedTuple):
 class Dynamics(NamedTuple):
     """How the vehicle may move; pairs are of translation and rotation."""
 
-    jerk: Array  # (2,) spectral densities of the steady motion's jerk
+    jerk: Array  # (6,) spectral densities of the steady motion's jerk, by axis as in motion.py
     jump: Array  # (2,) variances of a manoeuvre's jump of the velocities
     unsteady: Array  # (2,) and of the accelerations
     p_manoeuvre: float  # per frame
@@ -129,7 +130,8 @@ def concluded(
     """
     R0, t0, m0, P0 = before
     use, uv, cov = chosen_points(frame, assigned, extra)
-    out_R, out_t, out_m, out_P = R0, t0, m0, P0
+    pose_P0 = _block(P0, 6)
+    pose_P, L, r = pose_P0, np.zeros((6, 6)), np.zeros(6)
     gaussian = misfit = 0.0
     count = 0
     sigma = 0.0
@@ -142,25 +144,27 @@ def concluded(
             r = _apply(L, delta)
             for i in range(6):
                 r[i] += g[i]
-            out_R, out_t, out_m, out_P, log_det, w = updated(R0, t0, m0, P0, L, r)
-            step = _apply(_block(P0, 6), w)
+            pose_P, log_det = _posterior(pose_P0, L)
+            step = _apply(pose_P, r)
             misfit = chi2
             for i in range(6):
                 misfit += g[i] * delta[i] + r[i] * (delta[i] - step[i])
             gaussian = -0.5 * (log_norm + log_det + misfit)
-            moved = _apart(out_R, out_t, R, t)
-            R, t = out_R, out_t
+            R_new, t_new = _moved(R0, t0, step)
+            moved = _apart(R_new, t_new, R, t)
+            R, t = R_new, t_new
             # A thousandth of the pose's own sigma is good enough.
             if _dot(moved, _apply(L, moved)) < 1e-4:
                 break
         # Where a direction stays open the spots' paths along it are not straight, and must not narrow what they do not
         # see: once more, with what the bend of each path is off by.
-        sigma = widen_by_curvature(views, use, cov, out_R, out_t, _block(out_P, 6))
+        sigma = widen_by_curvature(views, use, cov, R, t, pose_P)
         if sigma == 0.0:
             break
     if sigma > TOO_WIDE:
         # So few spots of a vehicle that may be anywhere narrow nothing that a straight line could tell.
         return R0, t0, m0.copy(), P0.copy(), gaussian, misfit, count
+    out_R, out_t, out_m, out_P, _, _ = updated(R0, t0, m0, P0, L, r)
     return out_R, out_t, out_m, out_P, gaussian, misfit, count
 
 

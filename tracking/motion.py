@@ -18,20 +18,35 @@ POSE, VELOCITY, ACCELERATION = slice(0, 6), slice(6, 12), slice(12, 18)
 STATE = 18
 
 _multiply, _exp, _right_jacobian, _symmetrise = small.multiply, small.exp, small.right_jacobian, small.symmetrise
-_apply, _solve, _moved = small.apply, small.solve, small.moved
-_block, _column, _beside = small.block, small.column, small.beside
+_moved, _posterior = small.moved, small.posterior
 
 
 @compiled
-def predicted(
-    R: Array, t: Array, m: Array, P: Array, dt: float, jerk: Array, jump: Array, unsteady: Array
-) -> tuple[Array, Array, Array, Array, Array]:
-    """One step of dt (s) on: R, t, m, P and the transition matrix F (18, 18) of the error state.
+def process_noise(dt: float, jerk: float, jump: float, unsteady: float) -> tuple[float, float, float, float, float, float]:
+    """Covariance that a step of dt (s) adds to one axis: entries pp, pv, pa, vv, va, aa (p pose, v velocity, a accel.).
 
-    jerk (2,): spectral densities of the white jerk, (m/s^3)^2/Hz and (rad/s^3)^2/Hz, of translation and rotation.
-    jump (2,): variances by which the velocities may jump at the step's beginning, (m/s)^2 and (rad/s)^2.
-    unsteady (2,): the same of the accelerations.
+    jerk: spectral density of the white jerk. jump: variance of an impulse of the velocity, unsteady: of a step of the
+    acceleration, each at an unknown moment of the step. With the moment uniformly distributed an impulse J adds
+    J [[dt^2/3, dt/2], [dt/2, 1]] to pose and velocity: the same as white acceleration of density J/dt (a corner between
+    two frames leaves the old direction before it reaches the new one). So a step of the acceleration is white jerk.
+
+    Source: Bar-Shalom, Li & Kirubarajan (2001), sec. 6.2.3 (white jerk); the uniform moment: ours.
     """
+    q = jerk + unsteady / dt
+    w = jump / dt
+    return (
+        q * dt**5 / 20 + w * dt**3 / 3,
+        q * dt**4 / 8 + w * dt**2 / 2,
+        q * dt**3 / 6,
+        q * dt**3 / 3 + w * dt,
+        q * dt**2 / 2,
+        q * dt,
+    )
+
+
+@compiled
+def transition(m: Array, dt: float) -> tuple[Array, Array]:
+    """The transition matrix F (18, 18) of the error state over dt (s), and the rotation vector (3,) of the step."""
     h = 0.5 * dt * dt
     turn, back = np.empty(3), np.empty(3)
     for i in range(3):
@@ -50,31 +65,48 @@ def predicted(
             F[3 + i, 3 + j] = E[i, j]
             F[3 + i, 9 + j] = dt * G[i, j]
             F[3 + i, 15 + j] = h * G[i, j]
-    start = P.copy()
-    for i in range(STATE):
-        if 6 <= i < 12:
-            start[i, i] += jump[(i - 6) // 3]
-        elif i >= 12:
-            start[i, i] += unsteady[(i - 12) // 3]
-    out = _transformed(F, start)
-    for i in range(6):
-        q = jerk[i // 3]
-        out[i, i] += q * dt**5 / 20
-        out[i, i + 6] += q * dt**4 / 8
-        out[i + 6, i] += q * dt**4 / 8
-        out[i, i + 12] += q * dt**3 / 6
-        out[i + 12, i] += q * dt**3 / 6
-        out[i + 6, i + 6] += q * dt**3 / 3
-        out[i + 6, i + 12] += q * dt**2 / 2
-        out[i + 12, i + 6] += q * dt**2 / 2
-        out[i + 12, i + 12] += q * dt
-    _symmetrise(out)
+    return F, turn
+
+
+@compiled
+def propagated(R: Array, t: Array, m: Array, dt: float, turn: Array) -> tuple[Array, Array, Array]:
+    """Pose and motion after dt (s) with constant accelerations; turn (3,): the step's rotation vector."""
+    h = 0.5 * dt * dt
     t_new, m_new = t.copy(), m.copy()
     for i in range(3):
         t_new[i] = t[i] + dt * m[i] + h * m[6 + i]
     for i in range(6):
         m_new[i] += dt * m[6 + i]
-    return _multiply(R, _exp(turn)), t_new, m_new, out, F
+    return _multiply(R, _exp(turn)), t_new, m_new
+
+
+@compiled
+def predicted(
+    R: Array, t: Array, m: Array, P: Array, dt: float, jerk: Array, jump: Array, unsteady: Array
+) -> tuple[Array, Array, Array, Array, Array]:
+    """One step of dt (s) on: R, t, m, P and the transition matrix F (18, 18) of the error state.
+
+    jerk (6,): spectral densities of the white jerk, (m/s^3)^2/Hz of the three axes of world, then (rad/s^3)^2/Hz of
+    those of body. jump (2,): variances of a jump of the velocities at an unknown moment of the step, (m/s)^2 and
+    (rad/s)^2, of translation and rotation. unsteady (2,): the same of the accelerations.
+    """
+    F, turn = transition(m, dt)
+    out = _transformed(F, P)
+    if dt > 0.0:
+        for i in range(6):
+            pp, pv, pa, vv, va, aa = process_noise(dt, jerk[i], jump[i // 3], unsteady[i // 3])
+            out[i, i] += pp
+            out[i, i + 6] += pv
+            out[i + 6, i] += pv
+            out[i, i + 12] += pa
+            out[i + 12, i] += pa
+            out[i + 6, i + 6] += vv
+            out[i + 6, i + 12] += va
+            out[i + 12, i + 6] += va
+            out[i + 12, i + 12] += aa
+    _symmetrise(out)
+    R_new, t_new, m_new = propagated(R, t, m, dt, turn)
+    return R_new, t_new, m_new, out, F
 
 
 @compiled
@@ -99,32 +131,15 @@ def updated(
     """After a measurement of the pose with information matrix (6, 6), which may lack rank, and vector r (6,).
 
     r = J^T C^-1 (measured - expected), J and C of the measurement, at this pose. Returns R, t, m, P, then
-    log det(I + P information), which with the whitened misfit makes the likelihood, and w (6,) = S^-1 (innovation) in
-    pose space: w^T P w is the part of the misfit that the motion takes.
+    log det(I + P information), which with the whitened misfit makes the likelihood, and the step (6,) of the pose.
     """
-    A = _multiply(information, _block(P, 6))
-    for i in range(6):
-        A[i, i] += 1.0
-    x, log_det = _solve(A, _beside(information, r))  # (I + L P)^-1 [L, r]
-    w = _column(x, 6)
-    half = np.zeros((STATE, 6))
+    out, log_det = _posterior(P, information)
     step = np.zeros(STATE)
     for i in range(STATE):
         for j in range(6):
-            p = P[i, j]
-            step[i] += p * w[j]
-            for k in range(6):
-                half[i, k] += p * x[j, k]
-    out = P.copy()
-    for i in range(STATE):
-        for j in range(i + 1):
-            s = 0.0
-            for k in range(6):
-                s += half[i, k] * P[j, k]
-            out[i, j] -= s
-            out[j, i] = out[i, j]
+            step[i] += out[i, j] * r[j]
     R_new, t_new = _moved(R, t, step)
     m_new = m.copy()
     for i in range(12):
         m_new[i] += step[6 + i]
-    return R_new, t_new, m_new, out, log_det, w
+    return R_new, t_new, m_new, out, log_det, step[:6]

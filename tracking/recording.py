@@ -38,7 +38,7 @@ class Recording:
         self._dt: list[float] = []
         self._uv: list[Array] = []
         self._cov: list[Array] = []
-        self._shaped: list[Bools] = []
+        self._size: list[Array] = []
         self._first: list[Ints] = []
         self._has_image: list[Bools] = []
         self._assigned: list[Ints] = []
@@ -59,7 +59,7 @@ class Recording:
         self._dt.append(dt_s)
         self._uv.append(np.concatenate([f.uv_px for f in some]) if some else none2)
         self._cov.append(np.concatenate([f.cov_px2 for f in some]) if some else none4)
-        self._shaped.append(np.concatenate([~np.isnan(f.major_px) for f in some]) if some else np.zeros(0, dtype=bool))
+        self._size.append(np.concatenate([f.major_px for f in some]) if some else np.zeros(0))
         self._first.append(first)
         self._has_image.append(np.array([f is not None for f in found]))
         start = first[self.model.camera_of]
@@ -99,8 +99,8 @@ class Recording:
         """(T, n): row in the frame's detections (all cameras in one list), plus BLENDED; -1 without."""
         return np.array(self._assigned, dtype=np.int64).reshape(len(self), len(self.model))
 
-    def detections(self, k: int) -> tuple[Array, Array, Bools, Ints, Bools]:
-        """Of frame k: pixels (m, 2), covariances (m, 2, 2), whether their shapes are known (m,), where each camera's
-        begin (cameras + 1,), which cameras have a picture.
+    def detections(self, k: int) -> tuple[Array, Array, Array, Ints, Bools]:
+        """Of frame k: pixels (m, 2), covariances (m, 2, 2), larger half axes (m,), px, nan where not known; where each
+        camera's begin (cameras + 1,), which cameras have a picture.
         """
-        return self._uv[k], self._cov[k], self._shaped[k], self._first[k], self._has_image[k]
+        return self._uv[k], self._cov[k], self._size[k], self._first[k], self._has_image[k]

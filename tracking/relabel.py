@@ -13,11 +13,11 @@ from geometry import small
 from geometry.arrays import Array, Bools, Ints
 from geometry.compiled import compiled
 from geometry.projection import Views, project_view
-from tracking.association import BLENDED, Chances, Frame, Sights, associate
+from tracking.association import BLENDED, Chances, Frame, Sights, associate, expected_at, log_chance
 from tracking.fixed_interval import Reference
 from tracking.hiding import marginal, together
-from tracking.hypotheses import concluded
-from tracking.information import frame_information
+from tracking.hypotheses import chosen_points, concluded
+from tracking.information import fit_alone, frame_information
 from tracking.motion import STATE
 
 # Probability that a spot is not hidden where its screen is lit, by what the frames beside it (those in which the screen
@@ -25,7 +25,13 @@ from tracking.motion import STATE
 SHOWN = np.array([0.2, 0.6, 0.98])
 LIT = np.array([0.01, 0.3, 0.995])
 RIVAL = 9.0  # nats: assignments so far behind the best say nothing of its certainty
-VAGUE_M, VAGUE_RAD = 0.1, 0.06  # a frame of which the others say less keeps its labels: a fan looks alike 20 deg on
+VAGUE_PX = 15.0  # a frame in which the others place a spot worse than this keeps its labels
+P_BEND = 0.02  # probability that the motion bent at a frame although nothing was found of it
+P_ANYWHERE = 1e-4  # ... that the other frames are wrong about it; then its pose is within
+ANYWHERE_M, ANYWHERE_RAD = 0.3, 0.3  # of where they have it
+ENOUGH = 5  # labelled spots whose own pose may contradict the other frames
+KEEP = 3.0  # nats in favour of the labels that a frame has, where its spots do not give its pose
+FINE = 3.5  # sigmas of a misfit's own scatter: below it nothing but the plain explanation is looked at
 
 _apply, _multiply, _solve = small.apply, small.multiply, small.solve
 _moved, _symmetrise, _block, _column, _beside = small.moved, small.symmetrise, small.block, small.column, small.beside
@@ -41,6 +47,9 @@ class AllDetections(NamedTuple):
     begin: Ints  # (T + 1,)
     first: Ints  # (T, cameras + 1) within the frame
     has_image: Bools  # (T, cameras)
+    log_static: Array  # (m,) as in association.Frame
+    size_px: Array  # (m,)
+    usual_px: Array  # (n,)
 
 
 @compiled
@@ -61,14 +70,17 @@ def labelled_points(all_of: AllDetections, k: int, assigned: Ints, extra: Array)
 
 @compiled
 def evidence_of(
-    views: Views, all_of: AllDetections, assigned: Ints, extra: Array, ref: Reference
+    views: Views, all_of: AllDetections, assigned: Ints, extra: Array, ref: Reference, start: int
 ) -> tuple[Array, Array, Array, Ints]:
-    """Information matrices (T, 6, 6), vectors (T, 6), misfits (T,) and numbers of spots (T,) at a reference motion."""
-    frames = assigned.shape[0]
+    """Information matrices (F, 6, 6), vectors (F, 6), misfits (F,) and numbers of spots (F,) at a reference motion.
+
+    ref: of F frames from frame `start` on.
+    """
+    frames = ref.t.shape[0]
     L, g = np.empty((frames, 6, 6)), np.empty((frames, 6))
     chi2, spots = np.empty(frames), np.empty(frames, np.int64)
     for k in range(frames):
-        use, uv, cov = labelled_points(all_of, k, assigned[k], extra)
+        use, uv, cov = labelled_points(all_of, start + k, assigned[start + k], extra)
         L_k, g_k, chi2[k], spots[k], _ = frame_information(views, ref.R[k], ref.t[k], use, uv, cov)
         _put_matrix(L[k], L_k)
         _put(g[k], g_k)
@@ -116,70 +128,187 @@ def relabelled(
     ref: Reference,
     pose_P: Array,
     log_clutter: Array,
+    jump_px: Array,
 ) -> tuple[Ints, Array]:
     """Assignments (T, n) and their probabilities (T, n), from the smoothed poses and their covariances (T, 6, 6).
 
-    assigned (T, n): those that the smoothing used. log_clutter (T, n). A frame of whose pose nothing is known keeps
-    its assignments.
+    assigned (T, n): those that the smoothing used. log_clutter (T, n). jump_px (T, 6): sigmas of the pose, m and rad,
+    that a bend at the frame would add. Each frame is explained by where the others put the vehicle; where that leaves
+    something open, also by a bend there, and its labels by its own pose: labels that agree with each other and with
+    one of these stay. A frame of whose pose the others say too little keeps its labels.
     """
     frames, n = assigned.shape
     out, certain = assigned.copy(), np.ones((frames, n))
     groups = 0
     for i in range(n):
         groups = max(groups, sights.group[i] + 1)
-    nothing = np.zeros(12)
+    anywhere = np.empty(6)
+    for i in range(6):
+        anywhere[i] = ANYWHERE_M if i < 3 else ANYWHERE_RAD
     for k in range(frames):
-        use, uv, cov = labelled_points(all_of, k, assigned[k], extra)
-        L, g, _, _, _ = frame_information(views, ref.R[k], ref.t[k], use, uv, cov)
-        P = pose_P[k]
-        A, step = _multiply(P, L), _apply(P, g)
-        for i in range(6):
-            step[i] = -step[i]
-            for j in range(6):
-                A[i, j] = -A[i, j]
-            A[i, i] += 1.0
-        x, _ = _solve(A, _beside(P, step))
-        alone = _block(x, 6)
-        _symmetrise(alone)
-        vague = False
-        for i in range(6):
-            limit = VAGUE_M if i < 3 else VAGUE_RAD
-            vague |= not 0.0 < alone[i, i] < limit * limit
+        alone, R, t, vague = _by_the_others(views, sights, all_of, assigned, extra, ref, pose_P, k)
         if vague:
             continue
-        R, t = _moved(ref.R[k], ref.t[k], _column(x, 6))
         a, b = all_of.begin[k], all_of.begin[k + 1]
         frame = Frame(
-            all_of.uv[a:b], all_of.cov[a:b], all_of.blend_px[a:b], all_of.first[k], all_of.has_image[k], log_clutter[k]
-        )
+            all_of.uv[a:b], all_of.cov[a:b], all_of.blend_px[a:b], all_of.first[k], all_of.has_image[k],
+            log_clutter[k], all_of.log_static[a:b], all_of.size_px[a:b], all_of.usual_px,
+        )  # fmt: skip
         hidden = _hiding(assigned, sights.group, groups, k)
-        shining = marginal(hidden, sights.group)
-        found, score, counted, R_b, t_b, count = associate(views, sights, frame, chances, R, t, alone, shining, extra)
-        whole = np.zeros((STATE, STATE))
-        _put_matrix(whole, alone)
-        exact = np.empty(count)
-        before = (R, t, nothing, whole)
+        now = np.empty(n, np.int64)
+        labels = 0
+        for i in range(n):
+            now[i] = assigned[k, i]
+            if now[i] < 0:
+                now[i] = -1
+            elif now[i] < BLENDED:
+                labels += 1
+        tried, score = _explanations(
+            views, sights, frame, chances, extra, hidden, alone, R, t, now, labels, jump_px[k], anywhere
+        )
         best = 0
-        for j in range(count):
-            exact[j] = -np.inf
-            if score[j] > score[0] - 2 * RIVAL:
-                _, _, _, _, gaussian, _, _ = concluded(views, frame, extra, before, found[j], R_b[j], t_b[j])
-                exact[j] = counted[j] + gaussian + together(hidden, sights.group, found[j], chances.detect)
-            if exact[j] > exact[best]:
+        for j in range(score.shape[0]):
+            if score[j] > score[best]:
                 best = j
         total = 0.0
         share = np.zeros(n)
-        for j in range(count):
-            if exact[j] > exact[best] - RIVAL:
-                p = np.exp(exact[j] - exact[best])
+        for j in range(score.shape[0]):
+            if score[j] > score[best] - RIVAL:
+                p = np.exp(score[j] - score[best])
                 total += p
                 for i in range(n):
-                    if found[j, i] % BLENDED == found[best, i] % BLENDED:
+                    if _same(tried[j, i], tried[best, i]):
                         share[i] += p
         for i in range(n):
-            out[k, i] = found[best, i] if found[best, i] >= 0 else -1
+            out[k, i] = tried[best, i] if tried[best, i] >= 0 else -1
             certain[k, i] = share[i] / total
     return out, certain
+
+
+@compiled
+def _same(a: int, b: int) -> bool:
+    """Whether two assignments of a view are the same point of light, or both none."""
+    return (a < 0 and b < 0) or (a >= 0 and b >= 0 and a % BLENDED == b % BLENDED)
+
+
+@compiled
+def _by_the_others(
+    views: Views,
+    sights: Sights,
+    all_of: AllDetections,
+    assigned: Ints,
+    extra: Array,
+    ref: Reference,
+    pose_P: Array,
+    k: int,
+) -> tuple[Array, Array, Array, bool]:
+    """Where all other frames put frame k: covariance (6, 6), R, t; and whether that says too little to label by."""
+    use, uv, cov = labelled_points(all_of, k, assigned[k], extra)
+    L, g, _, _, _ = frame_information(views, ref.R[k], ref.t[k], use, uv, cov)
+    P = pose_P[k]
+    A, step = _multiply(P, L), _apply(P, g)
+    for i in range(6):
+        step[i] = -step[i]
+        for j in range(6):
+            A[i, j] = -A[i, j]
+        A[i, i] += 1.0
+    x, _ = _solve(A, _beside(P, step))
+    alone = _block(x, 6)
+    _symmetrise(alone)
+    vague = False
+    for i in range(6):
+        vague |= not 0.0 < alone[i, i] < 1.0
+    if vague:
+        return alone, ref.R[k], ref.t[k], True
+    R, t = _moved(ref.R[k], ref.t[k], _column(x, 6))
+    at, J = np.empty(2), np.empty((2, 6))
+    for i in range(assigned.shape[1]):
+        there, a, _, c = expected_at(views, i, R, t, alone, at, J)
+        if there and -0.5 <= at[0] < sights.size[i, 0] - 0.5 and -0.5 <= at[1] < sights.size[i, 1] - 0.5:
+            vague |= not a + c < 2 * VAGUE_PX * VAGUE_PX
+    return alone, R, t, vague
+
+
+@compiled
+def _explanations(
+    views: Views,
+    sights: Sights,
+    frame: Frame,
+    chances: Chances,
+    extra: Array,
+    hidden: Array,
+    alone: Array,
+    R: Array,
+    t: Array,
+    now: Ints,
+    labels: int,
+    jump: Array,
+    anywhere: Array,
+) -> tuple[Ints, Array]:
+    """Assignments (c, n) of one frame with their log-likelihoods (c,), nats; now (n,): the ones that it has."""
+    n = now.shape[0]
+    room = 300
+    tried, score = np.empty((room, n), np.int64), np.empty(room)
+    count = 0
+    shining = marginal(hidden, sights.group)
+    bonus = KEEP if labels < ENOUGH else 0.0
+    whole, nothing = np.zeros((STATE, STATE)), np.zeros(12)
+    for mode in range(3):
+        P = alone.copy()
+        prior = np.log(1.0 - P_BEND)
+        if mode > 0:
+            prior = np.log(P_BEND) if mode == 1 else np.log(P_ANYWHERE)
+            add = jump if mode == 1 else anywhere
+            for i in range(6):
+                P[i, i] += add[i] * add[i]
+        _put_matrix(whole, P)
+        before = (R, t, nothing, whole)
+        if mode < 2:
+            found, rough, _, R_b, t_b, found_count = associate(
+                views, sights, frame, chances, R, t, P, shining, extra
+            )
+            plain = False
+            for j in range(found_count):
+                if rough[j] < rough[0] - 2 * RIVAL or count == room - 4:
+                    break
+                R_j, t_j, _, _, gaussian, misfit, spots = concluded(
+                    views, frame, extra, before, found[j], R_b[j], t_b[j]
+                )
+                same = True
+                for i in range(n):
+                    tried[count, i] = found[j, i]
+                    same &= (found[j, i] < 0 and now[i] < 0) or found[j, i] == now[i]
+                score[count] = (
+                    prior
+                    + gaussian
+                    + log_chance(views, sights, frame, chances, shining, found[j], R_j, t_j)
+                    + together(hidden, sights.group, found[j], chances.detect)
+                    + (bonus if same else 0.0)
+                )
+                if j == 0:
+                    plain = same and misfit <= 2 * spots + FINE * np.sqrt(4.0 * max(spots, 1))
+                count += 1
+            if mode == 0 and plain:
+                break
+        if labels == 0 or (mode == 2 and labels < ENOUGH):
+            continue
+        # The labels that the frame has, although they may lie outside the gates.
+        own_R, own_t = R, t
+        if mode == 2:
+            use, uv, cov = chosen_points(frame, now, extra)
+            own_R, own_t, _, _, _ = fit_alone(views, R, t, use, uv, cov)
+        R_j, t_j, _, _, gaussian, _, _ = concluded(views, frame, extra, before, now, own_R, own_t)
+        for i in range(n):
+            tried[count, i] = now[i]
+        score[count] = (
+            prior
+            + gaussian
+            + log_chance(views, sights, frame, chances, shining, now, R_j, t_j)
+            + together(hidden, sights.group, now, chances.detect)
+            + bonus
+        )
+        count += 1
+    return tried[:count], score[:count]
 
 
 @compiled

@@ -40,22 +40,26 @@ from tracking.labels import NO_POINT, LabelResult, PosePrior, find_labels
 from tracking.match import UNMATCHED
 from tracking.misfit import Misfit
 from tracking.parameters import TrackerParameters
+from tracking.static_points import FADES, no_places
+from tracking.static_points import learn as learn_static
+from tracking.static_points import log_density as log_static_density
 from tracking.statuses import PoseStatus, SpotStatus, view_statuses
 from tracking.surroundings import RADIUS_PX, ClutterNearSpots
 from tracking.temper import Temper
 from tracking.tracked_frame import Event, MotionEstimate, TrackedFrame
 from tracking.usable_points import UsablePoints, check_step
+from tracking.whole_run import LOST_SIGMA_M, LOST_SIGMA_RAD
 
 # What is known of the motion of a vehicle that has just been found: sigmas.
 FIRST_SPEED, FIRST_RATE = 4.0, 6.0  # m/s, rad/s
 FIRST_ACCELERATION, FIRST_ANGULAR = 30.0, 100.0  # m/s^2, rad/s^2
 P_FRESH = 1e-3  # probability per frame that the vehicle is not where any hypothesis has it
-LOST_SIGMA_M, LOST_SIGMA_RAD = 1.0, np.deg2rad(60.0)  # a predicted pose vaguer than this is `lost`
 FEW = 4  # spots: fewer do not tell a lost vehicle from one that is mostly hidden
 LONG_UNMEASURED = 10  # frames without a measured pose, after which two missing spots are enough to doubt it
 SEARCH_AT = (2, 4, 8, 14)  # frames in a row that contradict the hypothesis
 DOUBT_FRAMES = 50  # in a row with fewer: then they are doubted
 NOWHERE = (SpotStatus.LOST, SpotStatus.OFF_SCREEN)
+SIZE_GAIN = 0.1  # of one frame, for how wide a spot usually is
 VAGUE_PX = 15.0  # 1 sigma of a predicted spot: beyond it the whole picture is searched at once
 
 
@@ -79,6 +83,8 @@ class RigidTracker:
         self._groups = int(self._sights.group.max(initial=-1)) + 1
         self._chances = Chances(parameters.p_detect, parameters.p_blend)
         self._clutter = ClutterNearSpots(self.model, parameters.labels.clutter_per_px2)
+        self._static = no_places(len(self.model.camera_names))
+        self._usual_px = np.full(n, np.nan)  # larger half axis of each view's spot
         self._hypotheses: Hypotheses | None = None
         self._extra = np.zeros((n, 2, 2))  # of the calibration's errors, on the expected pixels ...
         self._systematic = np.zeros((6, 6))  # ... and on the pose
@@ -140,6 +146,7 @@ class RigidTracker:
         first = np.zeros(len(found) + 1, dtype=np.int64)
         np.cumsum(counts, out=first[1:])
         some = [f for f in found if f is not None]
+        major = np.zeros(0)
         if some:
             uv = np.concatenate([f.uv_px for f in some])
             major = np.concatenate([f.major_px for f in some])
@@ -149,7 +156,9 @@ class RigidTracker:
         else:
             uv, cov, blend = np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0)
         has_image = np.array([f is not None for f in found])
-        return Frame(uv, cov, blend, first, has_image, self._clutter.log_density(first))
+        static = log_static_density(self._static, uv, cov, first)
+        log_clutter = self._clutter.log_density(first)
+        return Frame(uv, cov, blend, first, has_image, log_clutter, static, major, self._usual_px)
 
     # -- labels from a prior alone ------------------------------------------------------------------------------------
 
@@ -246,7 +255,9 @@ class RigidTracker:
             inside = self.model.in_picture(uv[0]) & has_image
             weight = np.log(P_FRESH) if self._hypotheses is not None else 0.0
             p = self.parameters.p_detect * 0.9  # marginal(shown)
-            weight += gaussian + spots * np.log(p) - float(np.sum(frame.log_clutter[assigned >= 0]))
+            seen = assigned >= 0
+            false = np.maximum(frame.log_clutter[seen], frame.log_static[assigned[seen]])
+            weight += gaussian + spots * np.log(p) - float(np.sum(false))
             weight += np.count_nonzero(inside & (assigned < 0)) * np.log(1 - p)
             assigned = np.where((assigned < 0) & ~inside, -2, assigned)
             if not np.isfinite(weight):
@@ -352,6 +363,7 @@ class RigidTracker:
                 self._searches = 0
         if known:
             self._clutter.learn(d.near, d.discs)
+            self._learn_points(frame, assigned, d, measured)
             events.extend(
                 Event("undecided", _why_open(bool(d.labelled[v]), float(certain[v])), int(v))
                 for v in np.flatnonzero((assigned >= 0) & ~labelled)
@@ -388,6 +400,20 @@ class RigidTracker:
             motion=MotionEstimate(h.m[0, :3], h.m[0, 3:6], h.P[0, 6:12, 6:12]) if known else None,
             pose_systematic=systematic if known else None,
         )
+
+    def _learn_points(self, frame: Frame, assigned: Ints, d: Digest, measured: bool) -> None:
+        """What stays in its place, and how wide each spot is, from a frame with a pose."""
+        if measured:
+            labels = np.where(assigned >= 0, assigned % BLENDED, -1)
+            camera = self._sights.camera
+            learn_static(
+                self._static, frame.uv, frame.cov, frame.first, frame.has_image, labels, d.expected_px, camera, FADES
+            )
+        for v in np.flatnonzero(d.use):
+            size = frame.size_px[assigned[v]]
+            if np.isfinite(size):
+                old = self._usual_px[v]
+                self._usual_px[v] = size if np.isnan(old) else old + SIZE_GAIN * (size - old)
 
     def _kind_of_search(self, dt_s: float) -> str:
         if self._anchor is None:

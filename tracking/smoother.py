@@ -1,48 +1,42 @@
-"""The second look at a run: labels anew from both sides, and the motion given all frames.
+"""The smoothing pass: labels revised with the whole run known, and the motion estimated from all frames.
 
-Rounds of: evidence of the labelled spots; the jerk's strength by maximum likelihood; fixed-interval smoothing; and each
-frame's detections assigned anew from where all other frames say that the vehicle was. What the causal pass lost or left
-open is so found from the side on which it is known. Source: ours; see fixed_interval.py and relabel.py.
+Rounds of: the most probable motion given the labels (tracking/whole_run.py), then each frame's detections assigned
+again from where all other frames put the vehicle (tracking/relabel.py), until no label changes. The last round ends
+with the motion, so labels and poses belong together. Then each pose is held against its own spots
+(tracking/consistency.py): where they contradict each other the frame is resolved by itself, or is not `measured`.
+
+Source: ours.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
-from scipy.ndimage import maximum_filter1d
-from scipy.optimize import minimize
 
 from geometry.arrays import Array, Bools, Ints
 from geometry.pose import Pose
 from geometry.projection import Views, project_all
-from geometry.solve import SolveLimits, covariance_of, fit_pose
+from geometry.solve import SolveLimits, covariance_of
 from tracking.association import BLENDED, Chances, Sights
-from tracking.fixed_interval import Evidence, Reference, log_likelihood, shifted, smoothed, told_by_the_others
+from tracking.fixed_interval import Reference
 from tracking.hypotheses import PROOF
-from tracking.information import fit_alone
+from tracking.information import fit_alone, frame_information
 from tracking.misfit import DEADBAND
+from tracking.motion import process_noise
 from tracking.recording import Recording
-from tracking.relabel import AllDetections, clutter_density, evidence_of, labelled_points, relabelled
-from tracking.rigid_tracker import LOST_SIGMA_M, LOST_SIGMA_RAD
+from tracking.relabel import AllDetections, clutter_density, labelled_points, relabelled
 from tracking.smoothed import Smoothed
+from tracking.static_points import learn as learn_static
+from tracking.static_points import log_density as log_static_density
+from tracking.static_points import no_places
 from tracking.surroundings import RADIUS_PX
-from tracking.temper import JUMP_OF_SPEED, LEAST_JUMP, STEADIES_WITHIN_S
+from tracking.temper import JUMP_OF_SPEED, LEAST_JUMP
+from tracking.whole_run import DEEP, Motion, WholeRun, estimate, straight_between
 
-MOST_ROUNDS = 5
-MOST_STEPS = 8  # of Gauss-Newton per round
-SHOCK = 45.0  # chi-square of 6 degrees (p = 5e-8): a jump of the velocities beyond what the motion allows
-APART = 2  # frames: of shocks so near each other the largest is looked at first
-SMALL_STEP = 0.02  # sigmas: a step of Gauss-Newton that is nothing any more
-LONGEST_STEP = 0.3  # m and rad, of the reference: beyond it nothing is linear
-# m/s^3 or rad/s^3 per sqrt(Hz). The lower end is for a vehicle that stands for a minute: 1e-4 is 2e-3 rad in 6 s.
-RANGE = (1e-7, 1e5)
-MOST_FRAMES_FOR_JERK = 3000  # the likelihood is sharp enough by then
-MOST_FRAMES_BETWEEN = 1000  # the same of the other one, which takes five times as long
-FINER = np.log(3.0)  # so much smaller than the likeliest the other one usually is: where to begin
-P_DARK = 0.05  # probability of a bend in each frame that does not show the pose
-DEEP = 12  # frames: so far from any measured one a few spots are not taken for evidence
-SPEED_WINDOW_S = 0.5  # a bend's size is judged by the fastest motion within this time of it
+MOST_ROUNDS = 4
+MOST_REPAIRS = 3  # times that frames whose pose contradicts their spots are taken for bends
+CONTRADICTS = 60.0  # chi-square that a frame's spots lose at the smoothed pose, against their own (6 degrees: 5e-11)
 
 
 def smooth(recording: Recording) -> Smoothed:
@@ -50,65 +44,228 @@ def smooth(recording: Recording) -> Smoothed:
 
     With `method: spots` the labels stay as that tracker gave them. Where nothing was measured nothing is known.
     """
-    rec, model, parameters = recording, recording.model, recording.parameters
-    views = model.numbers
-    sights = Sights.of(rec.rig, model)
-    chances = Chances(parameters.p_detect, parameters.p_blend)
-    causal, measured = rec.assigned, rec.measured
-    assigned, probability = causal.copy(), np.where(causal >= 0, 1.0, np.nan)
-    every = _all_detections(rec)
-    ref = _first_reference(rec)
-    extra, systematic = _calibration(rec, every, assigned, ref)
-    scale = _noise_scale(views, every, assigned, extra, ref, measured)
-    every = every._replace(cov=every.cov * scale**2 + parameters.sigma_model_px**2 * np.eye(2))
-    set_by_hand = np.log([[parameters.jerk_m_s3, parameters.jerk_rad_s3]] * 2)
-    jerk: Array | None = None if parameters.learn_jerk else set_by_hand
-    bent, gapless = rec.bent.copy(), bool(measured.all())
-    rounds, relabels = 0, parameters.method == "rigid"
-    while True:
-        rounds += 1
+    rec, parameters = recording, recording.parameters
+    pass_ = _Pass(rec)
+    pass_.estimate(deep=0)
+    rounds = 1
+    if rec.measured.any():
         # The first reference is a straight line over each gap: too far off for the few spots seen there.
-        deep = 0 if rounds == 1 else DEEP
-        ref, pose_P, motion_P, jerk, known = _motion(
-            views, every, assigned, extra, ref, rec, measured, bent, deep, jerk, parameters.learn_jerk
+        gapless = bool(rec.measured.all())
+        if not gapless:
+            pass_.estimate(deep=DEEP)
+        if parameters.method == "rigid":
+            while rounds < MOST_ROUNDS and pass_.relabel():
+                rounds += 1
+                pass_.estimate(deep=DEEP)
+        pass_.repair()
+    return pass_.result(rounds)
+
+
+class _Pass:
+    """One run in work: T frames, n views."""
+
+    def __init__(self, rec: Recording) -> None:
+        model, parameters = rec.model, rec.parameters
+        self.rec, self.model, self.parameters = rec, model, parameters
+        self.views = model.numbers
+        self.sights = Sights.of(rec.rig, model)
+        self.causal = rec.assigned
+        self.assigned = self.causal.copy()
+        self.measured = rec.measured
+        self.probability = np.where(self.causal >= 0, 1.0, np.nan)
+        poses = rec.poses
+        ref = straight_between(poses, self.measured, np.cumsum(rec.dt_s))
+        every = _all_detections(rec)
+        self.extra, self.systematic = _calibration(rec, every, self.assigned, ref)
+        self.scale = _noise_scale(self.views, every, self.assigned, self.extra, ref, self.measured)
+        self.every = every._replace(
+            cov=every.cov * self.scale**2 + parameters.sigma_model_px**2 * np.eye(2),
+            usual_px=_usual_sizes(every, self.assigned),
         )
-        if rounds == MOST_ROUNDS or (not relabels and (rounds > 1 or gapless)):
-            break
-        if not relabels:
-            continue
-        log_clutter = _log_clutter(rec, views, sights, every, assigned, ref, known)
-        found, certain = relabelled(views, sights, chances, every, assigned, extra, ref, pose_P, log_clutter)
-        new = np.where((certain >= parameters.min_label_probability) & known[:, None], found, -1)
+        log_density: Array | None = None
+        if not parameters.learn_jerk:
+            by_hand = 2 * np.log(np.repeat([parameters.jerk_m_s3, parameters.jerk_rad_s3], 3))
+            log_density = np.tile(by_hand, (len(rec), 1))
+        self.motion = Motion.begin(ref, rec.bent.copy(), log_density)
+        self.rms = np.full(len(rec), np.nan)
+        self.own = _Own.nothing(len(rec))
+
+    def estimate(self, deep: int) -> None:
+        """The motion given the labels."""
+        rec = self.rec
+        run = WholeRun(
+            self.views, self.every, self.extra, rec.dt_s, rec.exposure_s, self.parameters.learn_jerk
+        )
+        self.motion = estimate(run, self.assigned, self.measured, self.motion, deep)
+        self.own = _alone(rec, self.views, self.every, self.assigned, self.extra, self.motion.ref)
+        self.measured = self.own.measured
+
+    def relabel(self) -> bool:
+        """Labels from where the other frames put the vehicle; whether any changed."""
+        rec, ref, known = self.rec, self.motion.ref, self.motion.known
+        self.every = self.every._replace(log_static=_log_static(self.views, self.sights, self.every, self.assigned, ref, known))
+        log_clutter = _log_clutter(rec, self.views, self.sights, self.every, self.assigned, ref, known)
+        chances = Chances(self.parameters.p_detect, self.parameters.p_blend)
+        found, certain = relabelled(
+            self.views, self.sights, chances, self.every, self.assigned, self.extra, ref, self.motion.pose_P,
+            log_clutter, _bend_sigmas(ref, rec.dt_s),
+        )  # fmt: skip
+        new = np.where((certain >= self.parameters.min_label_probability) & known[:, None], found, -1)
         lone = _lone_points(new)
         new[lone] = -1
-        probability = np.where((found >= 0) & ~lone[:, None], certain, np.nan)
-        changed = int(np.count_nonzero(new != assigned))
-        assigned = new
-        measured, rms = _alone(rec, views, every, assigned, extra, ref)
-        if changed == 0 and (rounds > 1 or gapless):
-            break
-    measured, rms = _alone(rec, views, every, assigned, extra, ref)
-    differ = (assigned % BLENDED != causal % BLENDED) & ~((assigned < 0) & (causal < 0))
-    return Smoothed(
-        model=model,
-        parameters=parameters,
-        poses=Pose(ref.R, ref.t),
-        velocities=ref.m[:, :6],
-        covariance=pose_P,
-        systematic=systematic,
-        motion_covariance=motion_P,
-        known=known,
-        measured=measured & known,
-        assigned=assigned,
-        probability=probability,
-        first=every.first,
-        rms_px=rms,
-        jerk=np.exp(jerk[0]),
-        iterations=rounds,
-        relabelled=int(np.count_nonzero(differ)),
-        noise_scale=scale,
-        extra=extra,
-    )
+        self.probability = np.where((found >= 0) & ~lone[:, None], certain, np.nan)
+        changed = bool(np.any(new != self.assigned))
+        self.assigned = new
+        self.measured = _alone(rec, self.views, self.every, new, self.extra, ref).measured
+        return changed
+
+    def repair(self) -> None:
+        """Take frames whose pose contradicts their own spots for bends, and estimate again."""
+        for _ in range(MOST_REPAIRS):
+            wrong = self.own.measured & (self.own.excess > CONTRADICTS)
+            if not wrong.any():
+                return
+            bent = self.motion.bent.copy()
+            bent |= wrong
+            bent[1:] |= wrong[:-1]
+            if np.array_equal(bent, self.motion.bent):
+                return
+            self.motion = replace(self.motion, bent=bent)
+            self.estimate(deep=DEEP)
+
+    def result(self, rounds: int) -> Smoothed:
+        """What the whole run says."""
+        motion, own = self.motion, self.own
+        ref, pose_P, motion_P = motion.ref, motion.pose_P.copy(), motion.motion_P.copy()
+        R, t = ref.R.copy(), ref.t.copy()
+        wrong = own.measured & (own.excess > CONTRADICTS) & motion.known
+        for k in np.flatnonzero(wrong):
+            # Its own spots decide, with their own covariance; what the motion says there is not to be believed.
+            R[k], t[k], pose_P[k] = own.R[k], own.t[k], own.covariance[k]
+            d = Pose(own.R[k], own.t[k]).minus(Pose(ref.R[k], ref.t[k]))
+            spread = np.diag((d / max(float(np.median(self.rec.dt_s[1:])), 1e-6)) ** 2)
+            motion_P[k] = motion_P[k] + spread
+        measured = own.measured & motion.known
+        causal = self.causal
+        assigned = self.assigned
+        differ = (assigned % BLENDED != causal % BLENDED) & ~((assigned < 0) & (causal < 0))
+        strength = np.full(2, np.nan)
+        if motion.log_density is not None:
+            half = 0.5 * np.median(motion.log_density, axis=0)
+            strength = np.exp([half[:3].mean(), half[3:].mean()])
+        return Smoothed(
+            model=self.model,
+            parameters=self.parameters,
+            poses=Pose(R, t),
+            velocities=ref.m[:, :6],
+            covariance=pose_P,
+            systematic=self.systematic,
+            motion_covariance=motion_P,
+            known=motion.known,
+            measured=measured,
+            assigned=assigned,
+            probability=self.probability,
+            first=self.every.first,
+            rms_px=_rms(self.views, self.every, assigned, Reference(R, t, ref.m)),
+            jerk=strength,
+            iterations=rounds,
+            relabelled=int(np.count_nonzero(differ)),
+            noise_scale=self.scale,
+            extra=self.extra,
+        )
+
+
+class _Own:
+    """Each frame by itself, T frames: what its own labelled spots say of the pose."""
+
+    def __init__(self, R: Array, t: Array, covariance: Array, measured: Bools, excess: Array) -> None:
+        self.R, self.t, self.covariance = R, t, covariance  # nan where not measured
+        self.measured = measured  # (T,) the spots give the pose
+        self.excess = excess  # (T,) chi-square of the spots at the smoothed pose, more than at their own
+
+    @staticmethod
+    def nothing(frames: int) -> _Own:
+        """Of frames that were not looked at."""
+        nan = np.nan
+        return _Own(
+            np.full((frames, 3, 3), nan), np.full((frames, 3), nan), np.full((frames, 6, 6), nan),
+            np.zeros(frames, dtype=bool), np.zeros(frames),
+        )  # fmt: skip
+
+
+def _alone(rec: Recording, views: Views, every: AllDetections, assigned: Ints, extra: Array, ref: Reference) -> _Own:
+    """Each frame's own pose, and how far the reference's is from it."""
+    frames = len(rec)
+    limits = SolveLimits(rec.parameters.max_sigma_m, float(np.deg2rad(rec.parameters.max_sigma_deg)))
+    out = _Own.nothing(frames)
+    for k in range(frames):
+        use, uv, cov = labelled_points(every, k, assigned[k], extra)
+        if np.count_nonzero(use) < 3:
+            continue
+        R, t, L, chi2, count = fit_alone(views, ref.R[k], ref.t[k], use, uv, cov)
+        covariance, full = covariance_of(L)
+        if not full or count < 3:
+            continue
+        worst = [np.sqrt(np.linalg.eigvalsh(covariance[i, i])[-1]) for i in (slice(0, 3), slice(3, 6))]
+        out.measured[k] = worst[0] <= limits.max_sigma_m and worst[1] <= limits.max_sigma_rad
+        if out.measured[k]:
+            out.R[k], out.t[k], out.covariance[k] = R, t, covariance
+            out.excess[k] = frame_information(views, ref.R[k], ref.t[k], use, uv, cov)[2] - chi2
+    return out
+
+
+def _rms(views: Views, every: AllDetections, assigned: Ints, ref: Reference) -> Array:
+    """(T,) root mean square residual of the reported poses against their own spots, per axis, px."""
+    out = np.full(len(ref.t), np.nan)
+    none = np.zeros((assigned.shape[1], 2, 2))
+    uv_all, _ = project_all(views, ref.R, ref.t)
+    for k in range(len(out)):
+        use, uv, _ = labelled_points(every, k, assigned[k], none)
+        if use.any():
+            out[k] = np.sqrt(np.nanmean((uv - uv_all[k])[use] ** 2)) if np.isfinite(uv_all[k][use]).any() else np.nan
+    return out
+
+
+def _bend_sigmas(ref: Reference, dt: Array) -> Array:
+    """(T, 6) sigmas of the pose, m and rad, that a bend in the step before a frame adds."""
+    speed = np.stack([np.linalg.norm(ref.m[:, :3], axis=1), np.linalg.norm(ref.m[:, 3:6], axis=1)], axis=1)
+    size = (LEAST_JUMP + JUMP_OF_SPEED * speed) ** 2
+    step = np.maximum(dt, np.concatenate([dt[1:], dt[-1:]]))
+    out = np.empty((len(dt), 6))
+    for k in range(len(dt)):
+        for i in range(2):
+            add = process_noise(float(max(step[k], 1e-9)), 0.0, float(size[k, i]), 0.0)[0]
+            out[k, 3 * i : 3 * i + 3] = np.sqrt(add)
+    return out
+
+
+def _usual_sizes(every: AllDetections, assigned: Ints) -> Array:
+    """(n,) the median larger half axis of each view's labelled points, px; nan where none is known."""
+    out = np.full(assigned.shape[1], np.nan)
+    for i in range(assigned.shape[1]):
+        k = np.flatnonzero(assigned[:, i] >= 0)
+        sizes = every.size_px[every.begin[k] + assigned[k, i] % BLENDED]
+        if np.isfinite(sizes).any():
+            out[i] = np.nanmedian(sizes)
+    return out
+
+
+def _log_static(
+    views: Views, sights: Sights, every: AllDetections, assigned: Ints, ref: Reference, known: Bools
+) -> Array:
+    """(m,) log density of points that stay in their place, at each detection, from the whole run."""
+    frames = len(known)
+    places = no_places(every.has_image.shape[1])
+    expected, _ = project_all(views, ref.R, ref.t)
+    rows = [slice(int(every.begin[k]), int(every.begin[k + 1])) for k in range(frames)]
+    for k in np.flatnonzero(known):
+        labels = np.where(assigned[k] >= 0, assigned[k] % BLENDED, -1)
+        learn_static(
+            places, every.uv[rows[k]], every.cov[rows[k]], every.first[k], every.has_image[k], labels, expected[k],
+            sights.camera, 1.0,
+        )  # fmt: skip
+    parts = [log_static_density(places, every.uv[r], every.cov[r], every.first[k]) for k, r in enumerate(rows)]
+    return np.concatenate([np.zeros(0), *parts])
 
 
 def _lone_points(assigned: Ints) -> Bools:
@@ -127,68 +284,78 @@ def _all_detections(rec: Recording) -> AllDetections:
     frames = [rec.detections(k) for k in range(len(rec))]
     counts = [len(f[0]) for f in frames]
     cameras = len(rec.model.camera_names)
-    blend = np.concatenate([np.zeros(0), *[np.where(f[2], rec.parameters.blend_px, 0.0) for f in frames]])
+    size = np.concatenate([np.zeros(0), *[f[2] for f in frames]])
     return AllDetections(
         uv=np.concatenate([np.zeros((0, 2)), *[f[0] for f in frames]]),
         cov=np.concatenate([np.zeros((0, 2, 2)), *[f[1] for f in frames]]),
-        blend_px=blend,
+        blend_px=np.where(np.isnan(size), 0.0, rec.parameters.blend_px),
         begin=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
         first=np.array([f[3] for f in frames], dtype=np.int64).reshape(-1, cameras + 1),
         has_image=np.array([f[4] for f in frames], dtype=bool).reshape(-1, cameras),
+        log_static=np.full(len(size), -np.inf),
+        size_px=size,
+        usual_px=np.full(len(rec.model), np.nan),
     )
 
 
-def _first_reference(rec: Recording) -> Reference:
-    """The measured poses, what lies between two of them on the straight way, with the velocities of differences."""
-    poses, t_s = rec.poses, np.cumsum(rec.dt_s)
-    at = np.flatnonzero(rec.measured & np.isfinite(poses[:, 3, 0]))
-    frames = len(rec)
-    if not len(at):
-        centre = np.concatenate([np.eye(3), np.zeros((1, 3))])
-        return Reference(np.tile(centre[:3], (frames, 1, 1)), np.tile(centre[3], (frames, 1)), np.zeros((frames, 12)))
-    right = np.clip(np.searchsorted(at, np.arange(frames)), 0, len(at) - 1)
-    left = np.where(at[right] > np.arange(frames), np.maximum(right - 1, 0), right)
-    a, b = at[left], at[right]
-    length = t_s[b] - t_s[a]
-    share = np.where(length > 0, (t_s - t_s[a]) / np.where(length > 0, length, 1.0), 0.0)
-    share = np.clip(share, 0.0, 1.0)  # before the first and after the last: that pose
-    before, after = Pose(poses[a, :3], poses[a, 3]), Pose(poses[b, :3], poses[b, 3])
-    between = before.plus(after.minus(before) * share[:, None])
-    R, t = np.ascontiguousarray(between.rotation), np.ascontiguousarray(between.translation)
-    m = np.zeros((frames, 12))
-    if frames > 2:
-        step = Pose(R[2:], t[2:]).minus(Pose(R[:-2], t[:-2]))
-        time = (t_s[2:] - t_s[:-2])[:, None]
-        m[1:-1, :6] = step / np.where(time > 0, time, 1.0)
-        m[0], m[-1] = m[1], m[-2]
-    return Reference(R, t, m)
-
-
 def _calibration(rec: Recording, every: AllDetections, assigned: Ints, ref: Reference) -> tuple[Array, Array]:
-    """What the calibration's errors do: to expected pixels (n, 2, 2), mean over the run, and to poses (T, 6, 6)."""
-    n = len(rec.model)
+    """What the calibration's errors do: to expected pixels (n, 2, 2), mean over the run, and to poses (T, 6, 6).
+
+    The smoother weighs spots with their noise and the first of these, each spot by itself. The pose that such weights
+    give moves with the calibration's errors by (J^T W J)^-1 J^T W: the same in every frame with these spots, so no
+    averaging lessens it.
+    """
+    model = rec.model
+    n = len(model)
     extra, systematic = np.zeros((n, 2, 2)), np.zeros((1, 6, 6))
     if rec.calibration is None:
         return extra, systematic
-    systematic = np.zeros((len(rec), 6, 6))
-    count, latest = 0, np.zeros((6, 6))
-    for k in range(len(rec)):
-        use, uv, cov = labelled_points(every, k, assigned[k], np.zeros_like(extra))
-        rows = np.flatnonzero(use)
-        if rec.measured[k]:
-            fit = fit_pose(rec.model, rows, uv[rows], cov[rows], Pose(ref.R[k], ref.t[k]), calibration=rec.calibration)
-            if fit is not None and fit.observable:
-                latest = fit.systematic
-                extra += fit.calibration_px()
+    points = [labelled_points(every, k, assigned[k], np.zeros_like(extra)) for k in range(len(rec))]
+    common = [rec.calibration.at(Pose(ref.R[k], ref.t[k])) if rec.measured[k] else None for k in range(len(rec))]
+    J_all = project_all(model.numbers, ref.R, ref.t)[1]
+    gains: list[tuple[Ints, Array] | None] = [None] * len(rec)
+    for second in (False, True):
+        total, count = np.zeros((n, 2, 2)), 0
+        for k in np.flatnonzero(rec.measured):
+            use, _, cov = points[k]
+            rows, C = np.flatnonzero(use), common[k]
+            assert C is not None
+            if len(rows) < 3:
+                continue
+            J, W = J_all[k][rows], np.linalg.inv(cov[rows] + extra[rows])
+            JW = np.swapaxes(J, 1, 2) @ W  # (m, 6, 2)
+            covariance, full = covariance_of(np.sum(JW @ J, axis=0))
+            if not full:
+                continue
+            G = covariance @ np.concatenate(list(JW), axis=1)  # (6, 2m)
+            gains[k] = rows, G
+            if not second:
+                both = np.stack([2 * rows, 2 * rows + 1], axis=-1).ravel()
+                left = np.eye(2 * n)
+                left[:, both] -= J_all[k].reshape(2 * n, 6) @ G
+                joint = (left @ C @ left.T).reshape(n, 2, n, 2)
+                total += joint[np.arange(n), :, np.arange(n)]
                 count += 1
+        if not second:
+            extra = total / max(count, 1)
+    systematic = np.zeros((len(rec), 6, 6))
+    latest = np.zeros((6, 6))
+    for k in range(len(rec)):
+        gain, C = gains[k], common[k]
+        if gain is not None and C is not None:
+            rows, G = gain
+            both = np.stack([2 * rows, 2 * rows + 1], axis=-1).ravel()
+            latest = G @ C[np.ix_(both, both)] @ G.T
         systematic[k] = latest
-    return extra / max(count, 1), systematic
+    return extra, systematic
 
 
 def _noise_scale(
     views: Views, every: AllDetections, assigned: Ints, extra: Array, ref: Reference, measured: Bools
 ) -> float:
-    """How much larger than claimed the spots' errors are: of the frames' own fits, deaf to the worst; 1 if honest."""
+    """How much larger than claimed the spots' errors are, from the frames' own fits, robust to outliers; 1 if the
+    stated sigmas are correct.
+    """
     shares = []
     for k in np.flatnonzero(measured).tolist():
         use, uv, cov = labelled_points(every, k, assigned[k], extra)
@@ -201,184 +368,6 @@ def _noise_scale(
     return float(np.sqrt(mean)) if mean > DEADBAND else 1.0
 
 
-def _evidence(
-    views: Views,
-    every: AllDetections,
-    assigned: Ints,
-    extra: Array,
-    ref: Reference,
-    rec: Recording,
-    measured: Bools,
-    bent: Bools,
-    deep: int,
-) -> Evidence:
-    """The frames' information at a reference, and where the motion may have bent."""
-    L, g, _, _ = evidence_of(views, every, assigned, extra, ref)
-    # Deep in a gap a frame's few spots leave some direction open, and the reference may be so far off along it that
-    # what is straight there is not here: they are not taken.
-    far = ~np.asarray(maximum_filter1d(measured.astype(np.int8), 2 * deep + 1, mode="constant"), dtype=bool)
-    L[far], g[far] = 0.0, 0.0
-    if rec.exposure_s > 0:
-        for k in np.flatnonzero(bent[1:] & measured[1:] & measured[:-1]):
-            # The light of an exposure in which the velocities jump lies beside the corner, by up to an eighth of the
-            # exposure's share of the jump: the same for all spots, as if the vehicle were there.
-            b = (ref.m[k + 1, :6] - ref.m[k, :6]) * rec.exposure_s / 8
-            Lb = L[k] @ b
-            share = 1 / (1 + b @ Lb)
-            g[k] -= Lb * (b @ g[k]) * share
-            L[k] -= np.outer(Lb, Lb) * share
-    dt = rec.dt_s
-    usual = float(np.median(dt[dt > 0])) if np.any(dt > 0) else SPEED_WINDOW_S
-    window = max(1, min(round(SPEED_WINDOW_S / usual), len(dt)))
-    speed = np.stack([np.linalg.norm(ref.m[:, :3], axis=1), np.linalg.norm(ref.m[:, 3:6], axis=1)], axis=1)
-    fastest = _running_maximum(np.where(measured[:, None], speed, 0.0), window)
-    size = (LEAST_JUMP + JUMP_OF_SPEED * fastest) ** 2
-    # After a dark stretch the first light does not tell when it bent, and the second not whether it did so between.
-    dark = ~measured
-    dark[1:] |= ~measured[:-1]
-    dark[2:] |= ~measured[:-2]
-    chance = np.where(dark, P_DARK, 0.0)
-    for k in np.flatnonzero(bent):
-        first = k
-        while first > 1 and not measured[first - 1]:
-            first -= 1
-        # In one of the steps since the frame that was last measured, nobody knows which.
-        chance[first : k + 1] = np.maximum(chance[first : k + 1], 1.0 / (k + 1 - first))
-    jump = chance[:, None] * size
-    return Evidence(L, g, dt, jump, jump / STEADIES_WITHIN_S**2, _before_the_first(ref, dt, bool(measured[0])))
-
-
-def _before_the_first(ref: Reference, dt: Array, measured: bool) -> Array:
-    """(18,) variances of the first frame's deviation: wide against what the run shows, but not so wide that rounding
-    would eat what is left after the smoothing.
-    """
-    speed = np.abs(ref.m[:, :6]).reshape(-1, 2, 3).max(axis=(0, 2), initial=0.0)
-    change = np.abs(np.diff(ref.m[:, :6], axis=0)) / np.maximum(dt[1:, None], 1e-9)
-    acceleration = change.reshape(-1, 2, 3).max(axis=(0, 2), initial=0.0)
-    pose = [0.1, 0.1] if measured else [1.0, 1.0]
-    return np.repeat([*pose, *(2 * speed + 0.1), *(2 * acceleration + 1.0)], 3) ** 2
-
-
-def _running_maximum(values: Array, half: int) -> Array:
-    """The largest of values (T, k) within half frames of each."""
-    return np.asarray(maximum_filter1d(values, 2 * half + 1, axis=0, mode="nearest"))
-
-
-def _motion(
-    views: Views,
-    every: AllDetections,
-    assigned: Ints,
-    extra: Array,
-    ref: Reference,
-    rec: Recording,
-    measured: Bools,
-    bent: Bools,
-    deep: int,
-    jerk: Array | None,
-    learn: bool,
-) -> tuple[Reference, Array, Array, Array, Bools]:
-    """Gauss-Newton on the whole run: the motion, covariances of poses and velocities, jerk, and what is known.
-
-    jerk (2, 2): logarithms of translation's and rotation's, first for looking ahead, then for filling in. The first is
-    the likeliest (of each frame given those before it), the second that under which each frame is best told by all
-    others: a motion without jerk at high frequencies, as of all heavy things, is smoother than white jerk of the
-    likeliest strength. Measured on sinuous motions: errors 0.75 to 0.9 of those with the first alone; but at a run's
-    ends the second looks too far, and was off by 4 sigma. bent (T,): where the velocities jumped; what the smoothing
-    finds of them is added to it.
-    """
-    frames = len(rec)
-    strong = jerk is None  # to be estimated (anew)
-    pose_P = np.zeros((frames, 6, 6))
-    for step in range(MOST_STEPS):
-        ev = _evidence(views, every, assigned, extra, ref, rec, measured, bent, deep)
-        if strong:
-            ahead = _likeliest(log_likelihood, ref, ev, None if jerk is None else jerk[0], MOST_FRAMES_FOR_JERK)
-            jerk = np.stack([ahead, ahead])
-        assert jerk is not None
-        if learn and step > 0 and not strong and np.array_equal(jerk[0], jerk[1]):
-            between = _likeliest(told_by_the_others, ref, ev, jerk[0] - FINER, MOST_FRAMES_BETWEEN)
-            jerk = np.stack([jerk[0], np.minimum(between, jerk[0] - 1e-6)])
-        if np.array_equal(jerk[0], jerk[1]):
-            density = np.broadcast_to(np.exp(2 * jerk[0]), (frames, 2)).copy()
-        else:
-            density = _by_frame(jerk[0], jerk[1], ev, pose_P, measured)
-        x, pose_P, motion_P, shock = smoothed(ref, ev, density)
-        sd = np.sqrt(np.maximum(np.diagonal(pose_P, axis1=1, axis2=2), 1e-30))
-        known = (sd[:, :3].max(axis=1) < LOST_SIGMA_M) & (sd[:, 3:].max(axis=1) < LOST_SIGMA_RAD)
-        # A frame of which nothing is known stays where it is: far moves are not linear, and it has no say.
-        long = np.abs(x[:, :6]).max(axis=1) > LONGEST_STEP
-        x[~known & long] = 0.0
-        ref = shifted(ref, x)
-        one_jerk = np.array_equal(jerk[0], jerk[1])
-        if one_jerk:  # under the other every turn is a shock
-            more = _new_bends(shock, bent, measured)
-            bent |= more
-            strong = learn and bool(more.any() or (strong and step == 0))
-        settled = np.all(np.abs(x[known, :6]) < SMALL_STEP * sd[known])
-        if step > 0 and settled and not strong and not (learn and one_jerk):
-            break
-    assert jerk is not None
-    return ref, pose_P, motion_P, jerk, known & bool(measured.any())
-
-
-def _new_bends(shock: Array, bent: Bools, measured: Bools) -> Bools:
-    """(T,): steps in which the velocities jumped although nobody said so: the largest shock of their surroundings."""
-    peak = shock >= maximum_filter1d(shock, 2 * APART + 1, mode="nearest")
-    lit = measured.copy()
-    lit[1:] &= measured[:-1]
-    return np.asarray(peak & (shock > SHOCK) & lit & ~bent)
-
-
-def _likeliest(
-    criterion: Callable[[Reference, Evidence, Array], float],
-    ref: Reference,
-    ev: Evidence,
-    before: Array | None,
-    most_frames: int,
-) -> Array:
-    """Logarithms of the jerk of translation and rotation for which the criterion is largest.
-
-    before: where to begin; None: nobody knows. Of a long run so many frames from its middle.
-    """
-    frames = len(ev.dt)
-    middle = slice(max(0, (frames - most_frames) // 2), (frames + most_frames) // 2)
-    ref = Reference(*(a[middle] for a in ref))
-    ev = Evidence(
-        ev.information[middle], ev.vector[middle], ev.dt[middle], ev.jump[middle], ev.unsteady[middle], ev.first
-    )
-
-    def cost(log_jerk: Array) -> float:
-        density = np.exp(2 * np.clip(log_jerk, *np.log(RANGE)))
-        value = -criterion(ref, ev, np.broadcast_to(density, (len(ev.dt), 2)).copy())
-        return value if np.isfinite(value) else 1e300
-
-    if before is None:
-        steps = np.log(10.0) * np.arange(-2.0, 4.0)
-        grid = [np.array([a, a + b]) for a in steps for b in np.log([0.5, 3.0, 20.0])]
-        before = min(grid, key=cost)
-    simplex = before + 0.7 * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
-    found = minimize(
-        cost,
-        before,
-        method="Nelder-Mead",
-        options={"xatol": 0.1, "fatol": 0.1, "maxiter": 40, "initial_simplex": simplex},
-    )
-    return np.clip(np.asarray(found.x, dtype=float), *np.log(RANGE))
-
-
-def _by_frame(ahead: Array, between: Array, ev: Evidence, pose_P: Array, measured: Bools) -> Array:
-    """Spectral densities (T, 2): those for looking ahead near the run's ends and gaps, else those for filling in.
-
-    ahead, between (2,): logarithms of the jerk. Near is within the smoother's memory: twice as many frames as it makes
-    a mean of.
-    """
-    share = float(np.median(np.einsum("kij,kji->k", pose_P, ev.information)[measured])) / 6 if measured.any() else 1.0
-    memory = int(np.clip(np.ceil(2 / max(share, 1e-3)), 3, 200))
-    edge = np.concatenate([[True], ~measured, [True]])
-    near = np.asarray(maximum_filter1d(edge.astype(np.int8), 2 * memory + 1, mode="nearest"), dtype=bool)[1:-1]
-    return np.exp(2 * np.where(near[:, None], ahead, between))
-
-
 def _log_clutter(
     rec: Recording, views: Views, sights: Sights, every: AllDetections, assigned: Ints, ref: Reference, known: Bools
 ) -> Array:
@@ -388,24 +377,3 @@ def _log_clutter(
     area = np.array([np.prod(model.image_size_px[model.camera_of == c][:1]) for c in range(len(near))])
     density = np.maximum(np.maximum(near, np.diff(every.first, axis=1) / area), rec.parameters.labels.clutter_per_px2)
     return np.ascontiguousarray(np.log(density)[:, model.camera_of])
-
-
-def _alone(
-    rec: Recording, views: Views, every: AllDetections, assigned: Ints, extra: Array, ref: Reference
-) -> tuple[Bools, Array]:
-    """Of each frame by itself: whether its spots give the pose, and their root mean square residual, px."""
-    frames = len(rec)
-    limits = SolveLimits(rec.parameters.max_sigma_m, float(np.deg2rad(rec.parameters.max_sigma_deg)))
-    measured, rms = np.zeros(frames, dtype=bool), np.full(frames, np.nan)
-    for k in range(frames):
-        use, uv, cov = labelled_points(every, k, assigned[k], np.zeros_like(extra))
-        if np.count_nonzero(use) < 3:
-            continue
-        R, t, L, _, _ = fit_alone(views, ref.R[k], ref.t[k], use, uv, cov)
-        alone, full = covariance_of(L)
-        if full:
-            worst = [np.sqrt(np.linalg.eigvalsh(alone[i, i])[-1]) for i in (slice(0, 3), slice(3, 6))]
-            measured[k] = worst[0] <= limits.max_sigma_m and worst[1] <= limits.max_sigma_rad
-        residual = (uv - project_all(views, R[None], t[None])[0][0])[use]
-        rms[k] = np.sqrt(np.nanmean(residual**2))
-    return measured, rms

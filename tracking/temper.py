@@ -28,7 +28,7 @@ class Temper:
 
     def __init__(self, parameters: TrackerParameters) -> None:
         self._learn = parameters.learn_jerk
-        self._log_jerk = 2 * np.log([parameters.jerk_m_s3, parameters.jerk_rad_s3])
+        self._log_jerk = 2 * np.log(np.repeat([parameters.jerk_m_s3, parameters.jerk_rad_s3], 3))
         self._gain = FIRST_GAIN
         self._p_manoeuvre = parameters.p_manoeuvre
         self._lately = np.zeros(2)
@@ -41,7 +41,7 @@ class Temper:
 
     def learn(self, moved: Array, manoeuvre: bool, slope: Array) -> None:
         """Take a measured frame: its velocities (6,), whether it began with a manoeuvre, and how the likelihood of its
-        innovation grows with the logarithm of the jerk (2,), a step up which is taken (tracking/digest.py: surprise).
+        innovation grows with the logarithm of each axis' jerk (6,), a step up which is taken (tracking/digest.py: surprise).
         """
         speed = np.sqrt([moved[:3] @ moved[:3], moved[3:] @ moved[3:]])
         self._lately = np.maximum(FADES * self._lately, speed)

@@ -10,7 +10,7 @@ from geometry.arrays import Array, numeric_jacobian
 from geometry.pose import Pose
 from tracking.motion import ACCELERATION, POSE, STATE, VELOCITY, predicted, updated
 
-JERK = np.array([20.0, 60.0]) ** 2
+JERK = np.repeat([20.0, 60.0], 3) ** 2
 NONE = np.zeros(2)
 State = tuple[Pose, Array]
 

@@ -1,0 +1,57 @@
+"""Strength of the motion's white jerk, by axis and by time, from the smoother's own test quantities.
+
+MacKay's fixed point: the strength q is right where the energy r^T Q r of the process noise, summed, equals its
+expectation tr(Q N), the number of its components that the evidence determines. Both come with one pass of the smoother
+for all axes and frames, so no search over q is needed. A pseudo-count keeps q from collapsing where the evidence
+determines next to nothing, as on uniform motion: q stops falling where the evidence can no longer tell.
+
+Source: MacKay (1992), "Bayesian interpolation", Neural Computation 4, eq. 4.9 (the fixed point); windows and
+pseudo-counts: ours.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.ndimage import uniform_filter1d
+
+from geometry.arrays import Array, Bools
+from tracking.fixed_interval import Interval
+
+# (m/s^3)^2/Hz or (rad/s^3)^2/Hz, as logarithms. The lower end is for a vehicle that stands for a minute: a jerk of 1e-4
+# for 6 s makes 2e-3 rad.
+LOG_RANGE = 2 * np.log([1e-6, 1e6])
+PSEUDO_COUNT = 2.0  # determined components that any window is taken to have, with the strength that it has now
+WINDOW_COUNT = 12.0  # determined components per window: the logarithm of its strength is then good to 0.4
+RELAXATION = 1.6  # of the fixed point's step in log q: gamma changes by q^(1/6), so plain steps are short
+LONGEST_STEP = 4.0  # in log q
+
+
+def next_log_density(log_density: Array, out: Interval, usable: Bools, local: bool) -> Array:
+    """The logarithms (T, 6) of the spectral densities after one step of the fixed point.
+
+    log_density (T, 6): those of the pass that made `out`; usable (T,): steps that say something of the steady motion
+    (none with a bend). local: let each window have its own strength, else the whole run has that of its median window.
+    """
+    energy = np.where(usable[:, None], out.energy, 0.0)
+    gamma = np.where(usable[:, None], out.gamma, 0.0)
+    frames = len(energy)
+    change = np.empty_like(log_density)
+    for axis in range(log_density.shape[1]):
+        total = float(gamma[:, axis].sum())
+        width = frames if total <= 0 else int(np.clip(np.ceil(frames * WINDOW_COUNT / total), 9, frames))
+        e, g = (uniform_filter1d(a[:, axis], width, mode="constant") * width for a in (energy, gamma))
+        e, g = np.maximum(e, 0.0), np.maximum(g, 0.0)
+        step = np.log((e + PSEUDO_COUNT) / (g + PSEUDO_COUNT))
+        if not local:
+            # The median of the windows: corners that are not known of yet raise few of them.
+            step[:] = _weighted_median(step, g)
+        change[:, axis] = np.clip(RELAXATION * step, -LONGEST_STEP, LONGEST_STEP)
+    return np.clip(log_density + change, *LOG_RANGE)
+
+
+def _weighted_median(values: Array, weights: Array) -> float:
+    total = float(weights.sum())
+    if total <= 0:
+        return 0.0
+    order = np.argsort(values)
+    return float(values[order[np.searchsorted(np.cumsum(weights[order]), 0.5 * total)]])
