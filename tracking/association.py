@@ -29,6 +29,7 @@ GATE = 25.0  # squared sigmas: beyond it a detection is not this spot (p = 4e-6)
 # A step of s px is off by about s^2 / 1500 px where the projection is taken as straight (lenses of 1000 to 1500 px).
 BEND_PX = 1500.0
 NEIGHBOUR_PX2 = 100.0  # px^2: farther than any neighbour melts into a spot
+CROWD_PX = 15.0  # of a spot: the disc in which tracking/surroundings.py counts false points
 # A neighbour of a fifth of the light that shifts a spot by 0.3 of its sigma makes it a tenth wider.
 GROWN = 1.08
 LEAST_IN_PICTURE = 1e-3  # a spot less likely than this to be in the picture is not looked for
@@ -51,6 +52,7 @@ class Frame(NamedTuple):
     log_static: Array  # (m,) log density of points that stay in their place, at each detection; -inf: none known there
     size_px: Array  # (m,) the detection's larger half axis; nan: not known
     usual_px: Array  # (n,) the same of each view's spot as it usually is; nan: not known
+    log_crowding: Array  # (n,) of each view: log of how much denser false points are near a spot than in the picture
 
 
 class Sights(NamedTuple):
@@ -79,6 +81,33 @@ class Chances(NamedTuple):
 def log_false(frame: Frame, view: int, d: int) -> float:
     """Log density of false points, 1/px^2, where detection d is taken for a view's spot."""
     return max(frame.log_clutter[view], frame.log_static[d])
+
+
+@compiled
+def crowding(views: Views, sights: Sights, frame: Frame, R: Array, t: Array) -> float:
+    """Log-likelihood of where all points lie, spots and false ones, given that false points crowd near spots; nats.
+
+    Each point within CROWD_PX of a spot's place at this pose counts once: false points are expected there rather than
+    elsewhere. Without it a pose would be compared with "all of this is clutter" as if the clutter near spots filled
+    the picture, and a vehicle that moves far between two frames would never be found.
+    """
+    total = 0.0
+    n = sights.camera.shape[0]
+    uv, J = np.empty(2), np.empty((2, 6))
+    at = np.empty((n, 2))
+    for i in range(n):
+        there = project_view(views, i, R, t, uv, J)
+        at[i, 0], at[i, 1] = (uv[0], uv[1]) if there else (np.inf, np.inf)
+    for c in range(frame.has_image.shape[0]):
+        for d in range(frame.first[c], frame.first[c + 1]):
+            for i in range(n):
+                if sights.camera[i] != c or frame.log_static[d] > frame.log_clutter[i]:
+                    continue
+                a, b = at[i, 0] - frame.uv[d, 0], at[i, 1] - frame.uv[d, 1]
+                if a * a + b * b < CROWD_PX * CROWD_PX:
+                    total += frame.log_crowding[i]
+                    break
+    return total
 
 
 @compiled

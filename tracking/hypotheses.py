@@ -16,7 +16,7 @@ from geometry import small
 from geometry.arrays import Array, Bools, Ints
 from geometry.compiled import compiled
 from geometry.projection import Views
-from tracking.association import BLENDED, Chances, Frame, Sights, associate
+from tracking.association import BLENDED, Chances, Frame, Sights, associate, crowding
 from tracking.hiding import MISSED, later, learnt, marginal, together
 from tracking.information import frame_information, widen_by_curvature
 from tracking.motion import STATE, predicted, updated
@@ -207,8 +207,12 @@ def grow(
                 views, sights, frame, chances, R, t, _block(P, 6), shining, extra
             )
             before = (R, t, m, P)
+            # An upper bound of what `crowding` may add, so that no child is dropped before its likelihood is known.
+            crowd = 0.0
+            for i in range(n):
+                crowd += frame.log_crowding[i]
             for k in range(b):
-                if prior + score[k] < best - FORGET or (k > 0 and score[k] < score[0] - FORGET):
+                if prior + score[k] + crowd < best - FORGET or (k > 0 and score[k] < score[0] - FORGET):
                     continue
                 R_k, t_k, m_k, P_k, gaussian, misfit, spots = concluded(
                     views, frame, extra, before, assigned[k], R_b[k], t_b[k]
@@ -235,11 +239,12 @@ def grow(
                         )
                         P_k = _mixed(steady_P, P_jump, p)
                 total = prior + counted[k] + gaussian + together(shown, sights.group, assigned[k], chances.detect)
+                total += crowding(views, sights, frame, R_k, t_k)
                 if not np.isfinite(total):
                     continue
                 best = max(best, total)
                 after = learnt(shown, sights.group, assigned[k], chances.detect)
-                count = add_child(out, count, R_k, t_k, m_k, P_k, total, after, assigned[k], mode == 1, h)
+                count, _ = add_child(out, count, R_k, t_k, m_k, P_k, total, after, assigned[k], mode == 1, h)
     return out, count
 
 
@@ -296,8 +301,8 @@ def add_child(
     assigned: Ints,
     manoeuvre: bool,
     parent: int,
-) -> int:
-    """Add a child, in place of the worst where there is no room; how many there are then."""
+) -> tuple[int, int]:
+    """Add a child, in place of the worst where there is no room; how many there are then, and its place, -1: none."""
     place = count
     if count == MOST_CHILDREN:
         place = 0
@@ -305,13 +310,13 @@ def add_child(
             if children.after.weight[k] < children.after.weight[place]:
                 place = k
         if children.after.weight[place] >= weight:
-            return count
+            return count, -1
     else:
         count += 1
     _put_hypothesis(children.after, place, R, t, m, P, weight, shown)
     _put(children.assigned[place], assigned)
     children.manoeuvre[place], children.parent[place] = manoeuvre, parent
-    return count
+    return count, place
 
 
 @compiled

@@ -142,7 +142,7 @@ def relabelled(
     groups = 0
     for i in range(n):
         groups = max(groups, sights.group[i] + 1)
-    anywhere = np.empty(6)
+    anywhere, nowhere = np.empty(6), np.zeros(n)
     for i in range(6):
         anywhere[i] = ANYWHERE_M if i < 3 else ANYWHERE_RAD
     for k in range(frames):
@@ -152,7 +152,7 @@ def relabelled(
         a, b = all_of.begin[k], all_of.begin[k + 1]
         frame = Frame(
             all_of.uv[a:b], all_of.cov[a:b], all_of.blend_px[a:b], all_of.first[k], all_of.has_image[k],
-            log_clutter[k], all_of.log_static[a:b], all_of.size_px[a:b], all_of.usual_px,
+            log_clutter[k], all_of.log_static[a:b], all_of.size_px[a:b], all_of.usual_px, nowhere,
         )  # fmt: skip
         hidden = _hiding(assigned, sights.group, groups, k)
         now = np.empty(n, np.int64)

@@ -11,6 +11,7 @@ RADIUS_PX = 15.0  # of the discs around the expected spots in which false points
 AREA_PX2 = np.pi * RADIUS_PX**2
 START_PER_PX2 = 2e-4  # the paper's 20 % of false points within 15 px of a spot
 MEMORY = 300.0  # discs looked at
+LEAST_COUNT = 0.5  # false points that a picture is taken to have when it shows none
 
 
 class ClutterNearSpots:
@@ -26,10 +27,13 @@ class ClutterNearSpots:
         self._least = least_per_px2
         self._near = np.full(cameras, START_PER_PX2)
 
-    def log_density(self, first: Ints) -> Array:
-        """(n,) of each view, log of 1/px^2, in a frame whose cameras' detections begin at `first` (cameras + 1,)."""
-        density = np.maximum(np.maximum(self._near, np.diff(first) / self._area), self._least)
-        return np.log(density)[self._camera_of]
+    def log_density(self, first: Ints) -> tuple[Array, Array]:
+        """(n,) of each view, log of 1/px^2, in a frame whose cameras' detections begin at `first` (cameras + 1,): of
+        false points near spots, and the log of how much denser they are there than in the whole picture.
+        """
+        whole = np.maximum(np.diff(first), LEAST_COUNT) / self._area
+        density = np.maximum(np.maximum(self._near, whole), self._least)
+        return np.log(density)[self._camera_of], np.log(density / whole)[self._camera_of]
 
     def learn(self, near: Array, discs: Array) -> None:
         """Of one frame: how many false points (cameras,) lay within RADIUS_PX of how many expected spots (cameras,)."""
