@@ -194,7 +194,7 @@ def spot_lengths(points: Array, rays: Array, world: Array, work: Array, out: Arr
 
 @compiled
 def pose_of_lengths(points: Array, rays: Array, world: Array, lengths: Array, R: Array, t: Array) -> bool:
-    """The pose that puts the lit points p_i + l_i d_i on the world points, into R (3, 3), t (3,); False: on one line."""
+    """The pose that puts lit points p_i + l_i d_i on the world points, into R (3, 3), t (3,); False: on one line."""
     q, body, lab = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     for i in range(3):
         for a in range(3):

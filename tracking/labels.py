@@ -2,9 +2,9 @@
 after a full occlusion.
 
 Candidate poses come from three spots each, in closed form (tracking/first_labels/). Each pose predicts all spots; the
-points near the predictions are its labels. The likelihood of the points given the labels, averaged over the poses of the
-prior, decides; spots that should be seen but are not count against a pose. Where two poses explain the picture about
-equally well both are reported and none is chosen.
+points near the predictions are its labels. The likelihood of the points given the labels, averaged over the poses of
+the prior, decides; spots that should be seen but are not count against a pose. Where two poses explain the picture
+about equally well both are reported and none is chosen.
 
 Source: ours; the likelihood is the usual one of multi-target data association (Bar-Shalom & Li 1995, sec. 6.2).
 """
@@ -18,7 +18,9 @@ import numpy as np
 
 from geometry.arrays import Array
 from geometry.calibration_spread import CalibrationSpread
+from geometry.outliers import fit_pose_robust
 from geometry.rig import Rig
+from geometry.solve import SolveLimits, largest_chi2, whiten
 from geometry.spots import SpotModel
 from tracking.detections import Detections
 from tracking.first_labels.candidates import NO_POINT
@@ -40,7 +42,9 @@ __all__ = [
 HOPELESS = 2
 # nats: how much likelier a pose must be than that all points are false and the vehicle is not seen. A likelihood ratio
 # has the mean 1 where there is nothing, so the chance of a pose from false points alone is below exp(-7) = 1e-3.
-OVER_NOTHING = 7.0
+OVER_NOTHING = 3.0
+CLOSE = 0.2  # of `model_sigma_px`: the model's error where spots agree as their own sigmas claim ...
+P_ODD = 1e-3  # ... or a better one, with this probability
 SAME_POSE = 0.01  # of the picture's diagonal: poses that put all spots nearer to each other than this are one
 
 
@@ -100,7 +104,39 @@ def find_labels(
         return LabelResult(
             None, (), f"false points alone would explain the best pose nearly as well (lead {best[0].score:.1f} nats)"
         )
-    return _decided(model, best, parameters)
+    first = _without_odd_spots(model, detections, best[0], parameters, calibration)
+    return _decided(model, [first, *best[1:]], parameters)
+
+
+def _without_odd_spots(
+    model: SpotModel,
+    detections: Mapping[str, Detections],
+    one: Labelling,
+    parameters: LabelParameters,
+    calibration: CalibrationSpread | None,
+) -> Labelling:
+    """A labelling without a spot or two, where the others then agree as well as their own sigmas claim.
+
+    The evidence allows for an error of the model, and so may take a false point a pixel beside a spot that was not
+    found for the spot. Where all but that one agree without such an allowance, its label is left open.
+    """
+    rows = np.flatnonzero(one.point_of != NO_POINT)
+    found = [detections[model.views[v][0]] for v in rows]
+    pixels = np.array([f.uv_px[p] for f, p in zip(found, one.point_of[rows], strict=True)])
+    covariances = np.array([f.cov_px2[p] for f, p in zip(found, one.point_of[rows], strict=True)])
+    covariances = covariances + (CLOSE * parameters.model_sigma_px) ** 2 * np.eye(2)
+    W = whiten(covariances)
+    misfit = float(np.sum((W @ one.fit.residuals_px[..., None]) ** 2))
+    if one.fit.dof <= 2 or misfit <= largest_chi2(P_ODD, one.fit.dof):
+        return one
+    limits = SolveLimits(p_false_alarm=P_ODD)
+    start = one.fit.world_from_body
+    fit = fit_pose_robust(model, rows, pixels, covariances, start, limits=limits, calibration=calibration)
+    if fit is None or len({int(model.spot_of[r]) for r in fit.rows}) < parameters.min_spots:
+        return one
+    point_of = np.full_like(one.point_of, NO_POINT)
+    point_of[fit.rows] = one.point_of[fit.rows]
+    return replace(one, fit=fit, point_of=point_of)
 
 
 def _decided(model: SpotModel, best: Sequence[Labelling], parameters: LabelParameters) -> LabelResult:

@@ -60,7 +60,7 @@ class Best(NamedTuple):
     seed_view: Ints  # (most, 3) the three spots' views ...
     seed_point: Ints  # (most, 3) ... and points
     labels: Ints  # (most, n) the point that each view takes, or NO_POINT
-    count: Ints  # (2,): how many there are; the place of the worst
+    taken: Ints  # (2,): how many there are; the place of the worst
 
     @staticmethod
     def none(most: int, views: int) -> Best:
@@ -92,7 +92,13 @@ def generate(
     reached: (spots, m) which points each spot may light under the prior. The best candidates go into `best`.
     """
     n = views.shape[0]
-    body, rays, lab, lengths, work = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((8, 3)), np.empty((16, 9))
+    body, rays, lab, lengths, work = (
+        np.empty((3, 3)),
+        np.empty((3, 3)),
+        np.empty((3, 3)),
+        np.empty((8, 3)),
+        np.empty((16, 9)),
+    )
     R, t = np.empty((3, 3)), np.empty(3)
     uv, J = np.empty((n, 2)), np.empty((n, 2, 6))
     H, left = np.empty((6, 6)), np.empty((2, 6))
@@ -116,7 +122,7 @@ def generate(
                     continue
                 for i2 in range(screens.first[k2], screens.first[k2 + 1]):
                     p2 = screens.point[i2]
-                    if p2 == p0 or p2 == p1 or not reached[s2, p2]:
+                    if p2 == p0 or p2 == p1 or not reached[s2, p2]:  # noqa: SIM109 (compiled)
                         continue
                     for a in range(3):
                         lab[0, a], lab[1, a], lab[2, a] = points.world[p0, a], points.world[p1, a], points.world[p2, a]
@@ -313,7 +319,7 @@ def predicted_spread(L: Array, J: Array, left: Array) -> tuple[float, float, flo
 def _keep(best: Best, score: float, R: Array, t: Array, seed_view: Ints, seed_point: Ints, labels: Ints) -> None:
     """Put a candidate among the best, in place of its double or of the worst, if it is better."""
     most, n = best.labels.shape
-    count, place = best.count[0], best.count[1]
+    count, place = best.taken[0], best.taken[1]
     if count == most and score <= best.score[place]:
         return
     if count < most:
@@ -326,7 +332,7 @@ def _keep(best: Best, score: float, R: Array, t: Array, seed_view: Ints, seed_po
         place = k
         break
     if place == count:
-        best.count[0] = count + 1
+        best.taken[0] = count + 1
     best.score[place] = score
     for a in range(3):
         best.t[place, a] = t[a]
@@ -336,10 +342,10 @@ def _keep(best: Best, score: float, R: Array, t: Array, seed_view: Ints, seed_po
     for v in range(n):
         best.labels[place, v] = labels[v]
     worst = 0
-    for k in range(best.count[0]):
+    for k in range(best.taken[0]):
         if best.score[k] < best.score[worst]:
             worst = k
-    best.count[1] = worst
+    best.taken[1] = worst
 
 
 @compiled

@@ -12,13 +12,14 @@ from __future__ import annotations
 import numpy as np
 
 from geometry import small
-from geometry.arrays import Array, Bools, Ints
+from geometry.arrays import Array, Ints
 from geometry.compiled import compiled
 from geometry.projection import Views, project_view
 from tracking.first_labels.candidates import (
     GATE,
     LOG_2PI,
     NO_POINT,
+    Best,
     Limits,
     Sight,
     add_information,
@@ -37,6 +38,35 @@ SHARES = np.array([1.0, 0.3, 0.06, 0.01])
 # A screen lit from the side on which no camera is (rear projection) is that seldom.
 LOG_REAR = float(-np.log(100.0))
 MISFIT_PER_POINT = 12.0  # squared sigmas of the two residuals of a point: above it (p = 2.5e-3) the worst is left out
+
+
+@compiled
+def complete_all(
+    views: Views, sight: Sight, points: Points, limits: Limits, front: Array, best: Best
+) -> tuple[Array, Array, Ints, Array, Ints, Ints]:
+    """All candidates completed: R (k, 3, 3), t (k, 3), labels (k, n), evidence (k,), best share (k,), expected (k,)."""
+    count, n = best.taken[0], views.shape[0]
+    R, t = np.empty((count, 3, 3)), np.empty((count, 3))
+    labels, evidence = np.empty((count, n), np.int64), np.empty(count)
+    share, expected = np.empty(count, np.int64), np.empty(count, np.int64)
+    for k in range(count):
+        R_k, t_k, evidence[k], share[k], expected[k] = complete(
+            views,
+            sight,
+            points,
+            limits,
+            front,
+            best.seed_view[k],
+            best.seed_point[k],
+            best.R[k].copy(),
+            best.t[k].copy(),
+            labels[k],
+        )
+        for a in range(3):
+            t[k, a] = t_k[a]
+            for b in range(3):
+                R[k, a, b] = R_k[a, b]
+    return R, t, labels, evidence, share, expected
 
 
 @compiled
@@ -64,7 +94,7 @@ def complete(
         labels[v] = NO_POINT
     for i in range(3):
         labels[seed_view[i]] = seed_point[i]
-    for sweep in range(2):
+    for _ in range(2):
         for v in range(n):
             refused[v] = False
         while True:
@@ -117,7 +147,7 @@ def _fit(
 ) -> tuple[Array, Array, bool]:
     """Gauss-Newton on the labelled points, with the model's error at a share of its allowance.
 
-    Leaves all views' pixels and Jacobians at the last pose but one step, and the Cholesky factor of the information.
+    Leaves all views' pixels and Jacobians at that pose, and the Cholesky factor of its information in H.
     """
     n = views.shape[0]
     g, left = np.empty(6), np.empty(2)
@@ -183,7 +213,10 @@ def _nearest(
 ) -> int:
     """The free point that explains a view best, or NO_POINT where none is likelier than a missed spot."""
     camera = sight.camera[v]
-    best, chosen = np.log(1 - limits.p_detect) - np.log(limits.p_detect) + points.log_density[camera] + LOG_2PI, NO_POINT
+    best, chosen = (
+        np.log(1 - limits.p_detect) - np.log(limits.p_detect) + points.log_density[camera] + LOG_2PI,
+        NO_POINT,
+    )
     for p in range(points.first[camera], points.first[camera + 1]):
         free = True
         for other in range(labels.shape[0]):

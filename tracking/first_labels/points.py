@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from geometry.arrays import Array, Bools, Ints
+from geometry.arrays import Array, Ints
 from geometry.rig import Rig
 from geometry.spots import SpotModel
 from geometry.surfaces import meet_surface
@@ -31,9 +31,7 @@ class Points(NamedTuple):
     log_unused: Array  # (cameras, most + 1): see `_log_unused`
 
 
-def points_of(
-    rig: Rig, model: SpotModel, detections: Mapping[str, Detections], parameters: LabelParameters
-) -> Points:
+def points_of(rig: Rig, model: SpotModel, detections: Mapping[str, Detections], parameters: LabelParameters) -> Points:
     """All cameras' points in one list. The rig is the one that `model` was made of."""
     cameras = len(model.camera_names)
     uv, cov, world, row = [np.zeros((0, 2))], [np.zeros((0, 2, 2))], [np.zeros((0, 3))], [np.zeros(0, dtype=np.int64)]

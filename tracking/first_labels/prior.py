@@ -36,7 +36,9 @@ class PosePrior:
         picture of a camera, is required of every candidate pose, with this prior as with any other.
         """
         seen = [_seen_of_screen(rig, name) for name in rig.cameras]
-        places = np.concatenate([*seen, *(c.camera_from_world.inverse().translation[None] for c in rig.cameras.values())])
+        places = np.concatenate(
+            [*seen, *(c.camera_from_world.inverse().translation[None] for c in rig.cameras.values())]
+        )
         low, high = places.min(axis=0), places.max(axis=0)
         return PosePrior(Pose(np.eye(3), 0.5 * (low + high)), float(0.5 * (high - low).max()), np.pi)
 
@@ -95,7 +97,7 @@ def sample(prior: PosePrior, count: int, rng: np.random.Generator) -> Pose:
 
 
 def _seen_of_screen(rig: Rig, camera: str) -> Array:
-    """Points (k, 3), m, in world, of a screen on the border of what a camera sees of it; the screen's own ends bound it."""
+    """Points (k, 3), m, in world, of a screen where the border of a camera's picture falls on it, within its extent."""
     seen_by = rig.cameras[camera]
     screen = rig.screens[seen_by.screen]
     width, height = seen_by.image_size_px

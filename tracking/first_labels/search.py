@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -15,8 +16,8 @@ from geometry.solve import PoseFit, fit_pose
 from geometry.spots import SpotModel
 from tracking.detections import Detections
 from tracking.first_labels.candidates import NO_POINT, Best, Limits, Sight, generate
-from tracking.first_labels.completion import SHARES, complete
-from tracking.first_labels.points import Points, on_screens, points_of
+from tracking.first_labels.completion import SHARES, complete_all
+from tracking.first_labels.points import Points, PointsOnScreens, on_screens, points_of
 from tracking.first_labels.prior import PosePrior, sample
 from tracking.first_labels.triples import conditioning, covering
 from tracking.parameters import LabelParameters
@@ -26,9 +27,10 @@ from tracking.parameters import LabelParameters
 LARGEST_MODEL_ERROR = 3.0
 # Chance that a right set of labels is refused by its misfit.
 P_MISFIT = 1e-6
-KEPT = 96  # candidate poses that are completed
+FEWEST_POINTS = 6  # per camera: of a crowd at least so many of the brightest take part
 LEAST_LIKELY = 25.0  # nats: labellings so far behind the best are not reported
-SAMPLES = 300  # poses on which it is judged how well three spots fix a pose
+MANY = 200  # poses on which it is judged how well three spots fix a pose
+SAMPLES = 6_000  # poses, of all that the lab has room for, on which it is judged which show enough spots
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +56,7 @@ class RigPlan:
     spot_point: Array  # (spots, 3)
     spot_ray: Array  # (spots, 3)
     front: Array  # (n, 4) the plane of each view's screen, with the normal towards its camera
+    log_share: float  # of the poses anywhere, log of the share that shows at least `min_spots` spots
 
     @staticmethod
     def of(rig: Rig, model: SpotModel, min_spots: int) -> RigPlan:
@@ -66,6 +69,12 @@ class RigPlan:
         point[model.spot_of], ray[model.spot_of] = model.point, model.ray
         spots = sorted({int(s) for s in model.spot_of})
         poses = sample(everywhere, SAMPLES, np.random.default_rng(0))
+        pixels, J = model.project(poses)
+        shown = np.zeros((SAMPLES, len(model.spot_names)), dtype=bool)
+        for v, inside in enumerate(model.in_picture(pixels).T):
+            shown[:, model.spot_of[v]] |= inside
+        enough = np.count_nonzero(shown, axis=1) >= min(min_spots, len(spots))
+        good = np.flatnonzero(enough if enough.any() else np.isfinite(pixels[..., 0]).any(axis=1))[:MANY]
         normal = model.screen_rotation[..., 2]
         camera = -np.einsum("nij,ni->nj", model.camera_rotation, model.camera_translation)
         side = np.sign(np.sum(normal * (camera - model.screen_origin), axis=-1))
@@ -73,13 +82,14 @@ class RigPlan:
         return RigPlan(
             model=model,
             everywhere=everywhere,
-            triples=covering(conditioning(model, poses, spots), spots, min(min_spots, len(spots))),
+            triples=covering(conditioning(model, pixels[good], J[good], spots), spots, min(min_spots, len(spots))),
             screen_of_camera=np.array([screens.index(rig.cameras[c].screen) for c in model.camera_names]),
             spot_screen=np.array([screens.index(rig.spots[s].screen) for s in model.spot_names]),
             view_at=view_at,
             spot_point=point,
             spot_ray=ray,
             front=np.concatenate([normal, np.sum(normal * model.screen_origin, axis=-1)[:, None]], axis=-1),
+            log_share=float(np.log((np.count_nonzero(enough) + 1) / SAMPLES)),
         )
 
 
@@ -114,6 +124,7 @@ def candidate_labellings(
     """
     parameters = LabelParameters() if parameters is None else parameters
     plan = plan_of(rig, model, parameters.min_spots)
+    log_volume = plan.everywhere.log_volume + plan.log_share if prior is None else prior.log_volume
     prior = plan.everywhere if prior is None else prior
     points = points_of(rig, model, detections, parameters)
     has_image = np.array([model.camera_names[c] in detections for c in model.camera_of])
@@ -130,17 +141,50 @@ def candidate_labellings(
         [prior.reaches(p, r, points.world) for p, r in zip(plan.spot_point, plan.spot_ray, strict=True)], dtype=bool
     ).reshape(len(plan.spot_point), len(points.uv))
     sigma_px = LARGEST_MODEL_ERROR * parameters.model_sigma_px
-    usable = np.array([t for t in plan.triples if (sight.spot_screen[t] >= 0).all()], dtype=np.int64).reshape(-1, 3)
-    on_screen = on_screens(points, plan.screen_of_camera, len(rig.screens), sigma_px, parameters.max_points)
-    best = Best.none(KEPT, len(model))
-    generate(model.numbers, sight, points, on_screen, reached, limits, usable, best)
-    return _completed(plan, sight, points, limits, prior, best, calibration, most, sigma_px)
+    screens, triples = _within_budget(plan, sight, points, reached, parameters, _by_brightness(detections), sigma_px)
+    best = Best.none(parameters.max_refined, len(model))
+    generate(model.numbers, sight, points, screens, reached, limits, triples, best)
+    return _completed(plan, sight, points, limits, prior, log_volume, best, calibration, most, sigma_px)
+
+
+def _within_budget(
+    plan: RigPlan,
+    sight: Sight,
+    points: Points,
+    reached: Bools,
+    parameters: LabelParameters,
+    brightness_known: bool,
+    sigma_px: float,
+) -> tuple[PointsOnScreens, Ints]:
+    """The points and triples of spots to make poses from, so that there are at most `max_triples` sets of points.
+
+    In a crowd spots are brighter than most: fewer points are used. Where brightness is not known all points are used,
+    and fewer triples of spots, the ones first that serve most sets of visible spots.
+    """
+    triples = np.array([t for t in plan.triples if (sight.spot_screen[t] >= 0).all()], dtype=np.int64).reshape(-1, 3)
+    most = parameters.max_points
+    while True:
+        screens = on_screens(points, plan.screen_of_camera, int(plan.screen_of_camera.max()) + 1, sigma_px, most)
+        of_screen = [screens.point[a:b] for a, b in pairwise(screens.first)]
+        options = np.array([np.count_nonzero(reached[s, of_screen[k]]) for s, k in enumerate(plan.spot_screen)])
+        sets = np.cumsum(np.prod(options[triples].astype(float), axis=1))
+        if not len(sets) or sets[-1] <= parameters.max_triples:
+            return screens, triples
+        if not brightness_known or most <= FEWEST_POINTS:
+            return screens, triples[: max(1, np.count_nonzero(sets <= parameters.max_triples))]
+        most = max(int(0.8 * most), FEWEST_POINTS)
+
+
+def _by_brightness(detections: Mapping[str, Detections]) -> bool:
+    return all(np.isfinite(found.flux).any() for found in detections.values() if len(found))
 
 
 def _sight(plan: RigPlan, points: Points, has_image: Bools, parameters: LabelParameters) -> Sight:
     model = plan.model
     sigma2 = (LARGEST_MODEL_ERROR * parameters.model_sigma_px) ** 2
-    with_points = {int(plan.screen_of_camera[c]) for c in range(len(model.camera_names)) if points.first[c + 1] > points.first[c]}
+    with_points = {
+        int(plan.screen_of_camera[c]) for c in range(len(model.camera_names)) if points.first[c + 1] > points.first[c]
+    }
     seen = np.isin(plan.spot_screen, list(with_points)) & (plan.view_at >= 0).any(axis=1)
     return Sight(
         model.camera_of,
@@ -161,6 +205,7 @@ def _completed(
     points: Points,
     limits: Limits,
     prior: PosePrior,
+    log_volume: float,
     best: Best,
     calibration: CalibrationSpread | None,
     most: int,
@@ -168,32 +213,32 @@ def _completed(
 ) -> list[Labelling]:
     """The best candidates completed, weighed, no two alike, best first."""
     model = plan.model
-    found: list[tuple[float, int, int, Pose, Ints]] = []
-    for k in np.argsort(-best.score[: best.count[0]], kind="stable"):
-        labels = np.full(len(model), NO_POINT)
-        R, t, evidence, share, expected = complete(
-            model.numbers, sight, points, limits, plan.front, best.seed_view[k], best.seed_point[k], best.R[k].copy(),
-            best.t[k].copy(), labels,
-        )  # fmt: skip
-        if evidence > -np.inf:
-            found.append((evidence - prior.log_volume, share, expected, Pose(R, t), labels))
-    found.sort(key=lambda one: -one[0])
+    R, t, labels_of, evidences, shares, expected_of = complete_all(
+        model.numbers, sight, points, limits, plan.front, best
+    )
+    evidences = evidences - log_volume
     out: list[Labelling] = []
     kept: list[tuple[Pose, Ints]] = []
-    for evidence, share, expected, pose, labels in found:
-        if len(out) == most or evidence < found[0][0] - LEAST_LIKELY:
+    for k in np.argsort(-evidences, kind="stable"):
+        evidence, pose, labels = evidences[k], Pose(R[k], t[k]), labels_of[k]
+        if len(out) == most or not evidence > evidences.max() - LEAST_LIKELY:
             break
         if any(np.array_equal(labels, other) and _near(pose, there) for there, other in kept):
             continue
         kept.append((pose, labels))
         rows = np.flatnonzero(labels != NO_POINT)
         chosen = labels[rows]
-        covariances = points.cov[chosen] + (SHARES[share] * sigma_px) ** 2 * np.eye(2)
+        covariances = points.cov[chosen] + (SHARES[shares[k]] * sigma_px) ** 2 * np.eye(2)
         fit = fit_pose(model, rows, points.uv[chosen], covariances, pose, calibration=calibration)
-        if fit is None or not fit.observable or not fit.consistent(P_MISFIT) or not bool(prior.holds(fit.world_from_body)):
+        if (
+            fit is None
+            or not fit.observable
+            or not fit.consistent(P_MISFIT)
+            or not bool(prior.holds(fit.world_from_body))
+        ):
             continue
         point_of = np.where(labels == NO_POINT, NO_POINT, points.row[np.maximum(labels, 0)])
-        out.append(Labelling(fit, point_of, float(evidence), expected))
+        out.append(Labelling(fit, point_of, float(evidence), int(expected_of[k])))
     return out
 
 

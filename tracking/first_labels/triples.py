@@ -8,21 +8,19 @@ from itertools import combinations
 import numpy as np
 
 from geometry.arrays import Array, Bools, Ints
-from geometry.pose import Pose
 from geometry.spots import SpotModel
 
 TIMES = 2  # triples in any four spots, where they have as many that fix the pose: noise may spoil one
 FIXES = 1e-4  # least relative size of a singular value of the three spots' Jacobian; collinear spots have 1e-12
 
 
-def conditioning(model: SpotModel, poses: Pose, spots: Sequence[int]) -> dict[tuple[int, int, int], float]:
+def conditioning(model: SpotModel, pixels: Array, J: Array, spots: Sequence[int]) -> dict[tuple[int, int, int], float]:
     """How well three spots fix the pose, for all sets of three: the median over poses of the least singular value.
 
-    Relative to the largest, with pixels against metres and radians. Sets that never fix it, and sets with two spots
-    of one beam end (a ray that may meet one of two screens), are left out.
+    Relative to the largest, with pixels against metres and radians. pixels (k, n, 2), J (k, n, 2, 6): of k poses. Sets
+    that never fix it, and sets with two spots of one beam end (a ray that may meet one of two screens), are left out.
     """
     first = {s: int(np.flatnonzero(model.spot_of == s)[0]) for s in spots}
-    pixels, J = model.project(poses)
     projected: Bools = np.isfinite(pixels[..., 0])
     out: dict[tuple[int, int, int], float] = {}
     for triple in combinations(spots, 3):
@@ -47,7 +45,9 @@ def covering(triples: dict[tuple[int, int, int], float], spots: Sequence[int], l
     Greedy: the triple that serves most sets of spots which still lack one, of equals the one that fixes the pose best.
     """
     sets = [frozenset(s) for s in combinations(spots, least)]
-    holds: Array = np.array([[set(t) <= s for s in sets] for t in triples], dtype=float).reshape(len(triples), len(sets))
+    holds: Array = np.array([[set(t) <= s for s in sets] for t in triples], dtype=float).reshape(
+        len(triples), len(sets)
+    )
     names = list(triples)
     quality = np.array([triples[t] for t in names])
     lacking = np.minimum(holds.sum(axis=0), TIMES)
