@@ -22,10 +22,7 @@ class DetectParameters:
 class LabelParameters:
     """Labels without a track: the first frame and after a blackout (tracking/labels.py)."""
 
-    gate_px: float = (
-        12.0  # px: a point this near a predicted spot may be it; three noisy spots predict a fourth to a few px
-    )
-    model_sigma_px: float = 0.3  # px: what calibration may be off, added to every point's own sigma
+    model_sigma_px: float = 0.3  # px: what calibration may be off, beside every point's own sigma
     p_detect: float = 0.95  # probability that a spot in the picture is found
     clutter_per_px2: float = (
         2e-5  # false points per px^2; a picture with more raises it (20 % clutter near spots: 1e-5 to 2e-4)
@@ -33,8 +30,8 @@ class LabelParameters:
     lead_nats: float = 3.0  # a pose must be exp(3) = 20 times as likely as the next, else it is a tie
     min_spots: int = 4  # three spots fit any labels exactly: the fourth is the first that can contradict
     max_points: int = 30  # per camera: the brightest
-    max_refined: int = 40  # label sets that are fitted; enough for 30 points per camera
-    max_triples: int = 4000  # three-spot sets tried per start where no whole beam is seen
+    max_refined: int = 96  # poses that are completed to all points; enough for 30 points per camera
+    max_triples: int = 60_000  # sets of three points that are tried: 0.5 s; five false points per picture make 10,000
 
 
 @dataclass(frozen=True, slots=True)

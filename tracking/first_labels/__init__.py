@@ -1,0 +1,1 @@
+"""The search for the labels of one frame: candidate poses from geometry, completed and weighed."""

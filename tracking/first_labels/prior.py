@@ -1,0 +1,118 @@
+"""Where the vehicle may be before anything was measured: a cube of positions and a cone of attitudes, or everywhere."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from geometry import rotations
+from geometry.arrays import Array, Bools
+from geometry.pose import Pose
+from geometry.rig import Rig
+from geometry.surfaces import meet_surface
+
+SLACK, SLACK_M, SLACK_RAD = 1.02, 0.005, float(np.deg2rad(0.25))  # the limits are widened so much: poses are noisy
+BORDER = 9  # points along each side of a picture, whose rays bound what the camera sees of its screen
+# An oblique camera may see its screen up to the horizon: beyond this multiple of its distance from the screen a spot
+# is too faint and too oblique to count.
+FARTHEST = 6.0
+
+
+@dataclass(frozen=True, slots=True)
+class PosePrior:
+    """Where the vehicle may be: every coordinate and the angle are within these of the centre."""
+
+    centre: Pose
+    within_m: float
+    within_rad: float
+
+    @staticmethod
+    def everywhere(rig: Rig) -> PosePrior:
+        """All poses in which the rig can see its spots: what a run without a prior starts from.
+
+        The vehicle lies in the space between the screens and their cameras: the cube about everything that the cameras
+        see of their screens and the cameras themselves. Its attitude is any. That each beam meets its screen, in the
+        picture of a camera, is required of every candidate pose, with this prior as with any other.
+        """
+        seen = [_seen_of_screen(rig, name) for name in rig.cameras]
+        places = np.concatenate(
+            [*seen, *(c.camera_from_world.inverse().translation[None] for c in rig.cameras.values())]
+        )
+        low, high = places.min(axis=0), places.max(axis=0)
+        return PosePrior(Pose(np.eye(3), 0.5 * (low + high)), float(0.5 * (high - low).max()), np.pi)
+
+    @property
+    def is_everywhere(self) -> bool:
+        """Whether it says nothing of the attitude."""
+        return self.within_rad >= np.pi
+
+    @property
+    def half_width_m(self) -> float:
+        """The largest distance from the centre, m, per coordinate, with the allowance for noise."""
+        return SLACK * self.within_m + SLACK_M
+
+    @property
+    def largest_turn_rad(self) -> float:
+        """The largest angle from the centre, with the allowance for noise."""
+        return min(SLACK * self.within_rad + SLACK_RAD, np.pi)
+
+    @property
+    def log_volume(self) -> float:
+        """Log of the volume of poses that it allows, in m^3 rad^3: the measure in which pose covariances are given."""
+        angle = self.largest_turn_rad
+        return float(3 * np.log(2 * self.half_width_m) + np.log(8 * np.pi * (angle - np.sin(angle))))
+
+    def holds(self, poses: Pose) -> Bools:
+        """Which of a stack of poses (...) lie in it; a little more is allowed, as poses are noisy. nan does not."""
+        near = np.all(np.abs(poses.translation - self.centre.translation) <= self.half_width_m, axis=-1)
+        trace = np.einsum("ij,...ij->...", self.centre.rotation, poses.rotation)
+        return np.asarray(near & ((trace - 1) / 2 >= np.cos(self.largest_turn_rad) - 1e-12))
+
+    def reaches(self, point: Array, ray: Array, places: Array) -> Bools:
+        """Which places (m, 3), in world, a ray of the vehicle (point and unit direction, in body) may light.
+
+        Necessary, not sufficient: the angle between the ray as the centre has it and the way to the place is at most
+        the largest turn, plus what a shift of the ray's start by the prior's widths makes of it.
+        """
+        start = self.centre.apply(point)
+        shift = np.sqrt(3) * self.half_width_m + 2 * np.linalg.norm(point) * np.sin(0.5 * self.largest_turn_rad)
+        way = places - start
+        length = np.linalg.norm(way, axis=-1)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            cosine = np.clip(way @ self.centre.turn(ray) / length, -1, 1)
+            parallax = np.where(length > shift, np.arcsin(np.minimum(shift / length, 1.0)), np.pi)
+        return np.asarray(~(np.arccos(cosine) > self.largest_turn_rad + parallax))
+
+
+def sample(prior: PosePrior, count: int, rng: np.random.Generator) -> Pose:
+    """Poses (count,) spread evenly over a prior: over its cube, and over all turns up to its angle."""
+    axis = rng.normal(size=(count, 3))
+    axis /= np.linalg.norm(axis, axis=1, keepdims=True)
+    grid = np.linspace(0, prior.within_rad, 2001)
+    below = grid - np.sin(grid)  # the share of turns up to an angle
+    angle = np.interp(rng.uniform(0, below[-1], count), below, grid)
+    shift = rng.uniform(-prior.within_m, prior.within_m, (count, 3))
+    return Pose(prior.centre.rotation @ rotations.exp(axis * angle[:, None]), prior.centre.translation + shift)
+
+
+def _seen_of_screen(rig: Rig, camera: str) -> Array:
+    """Points (k, 3), m, in world, of a screen where the border of a camera's picture falls on it, within its extent."""
+    seen_by = rig.cameras[camera]
+    screen = rig.screens[seen_by.screen]
+    width, height = seen_by.image_size_px
+    u, v = np.meshgrid(np.linspace(-0.5, width - 0.5, BORDER), np.linspace(-0.5, height - 0.5, BORDER))
+    origin, rays = seen_by.rays(np.stack([u.ravel(), v.ravel()], axis=-1))
+    hits = meet_surface(origin, rays, screen.world_from_screen, screen.bow)
+    middle = screen.world_from_screen.translation
+    distance = abs((origin - middle) @ screen.world_from_screen.rotation[:, 2])
+    near = np.linalg.norm(hits - origin, axis=-1) <= FARTHEST * distance
+    hits = hits[near]
+    if not len(hits):
+        hits = middle[None]
+    if screen.size_m is not None:
+        local = screen.world_from_screen.inverse().apply(hits)
+        half = np.asarray(screen.size_m) / 2
+        local[:, :2] = np.clip(local[:, :2], -half, half)
+        hits = screen.world_from_screen.apply(local)
+    return np.asarray(hits)

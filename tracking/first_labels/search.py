@@ -1,0 +1,248 @@
+"""Candidate labellings of one frame under any prior, or none: the parts of this folder put together."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from geometry.arrays import Array, Bools, Ints
+from geometry.calibration_spread import CalibrationSpread
+from geometry.pose import Pose
+from geometry.rig import Rig
+from geometry.solve import PoseFit, fit_pose
+from geometry.spots import SpotModel
+from tracking.detections import Detections
+from tracking.first_labels.candidates import NO_POINT, Best, Limits, Sight, generate
+from tracking.first_labels.completion import SHARES, complete_all
+from tracking.first_labels.points import Points, PointsOnScreens, on_screens, points_of
+from tracking.first_labels.prior import PosePrior, sample
+from tracking.first_labels.triples import conditioning, covering
+from tracking.parameters import LabelParameters
+
+# The largest error of the model that is allowed for, as a multiple of the parameter's: evidence is the mean over
+# several sizes up to this one.
+LARGEST_MODEL_ERROR = 3.0
+# Chance that a right set of labels is refused by its misfit.
+P_MISFIT = 1e-6
+FEWEST_POINTS = 6  # per camera: of a crowd at least so many of the brightest take part
+LEAST_LIKELY = 25.0  # nats: labellings so far behind the best are not reported
+MANY = 200  # poses on which it is judged how well three spots fix a pose
+SAMPLES = 6_000  # poses, of all that the lab has room for, on which it is judged which show enough spots
+
+
+@dataclass(frozen=True, slots=True)
+class Labelling:
+    """A pose and the points that it explains."""
+
+    fit: PoseFit
+    point_of: Ints  # (n views,) row in its camera's detections, or NO_POINT
+    score: float  # log evidence against "all points are false", nats: the likelihood averaged over the prior's poses
+    expected: int  # how many views it puts in the picture
+
+
+@dataclass(frozen=True, slots=True)
+class RigPlan:
+    """What the search prepares once for a rig."""
+
+    model: SpotModel
+    everywhere: PosePrior
+    triples: Ints  # (k, 3) spots, the best first
+    screen_of_camera: Ints  # (cameras,)
+    spot_screen: Ints  # (spots,)
+    view_at: Ints  # (spots, cameras)
+    spot_point: Array  # (spots, 3)
+    spot_ray: Array  # (spots, 3)
+    front: Array  # (n, 4) the plane of each view's screen, with the normal towards its camera
+    log_share: float  # of the poses anywhere, log of the share that shows at least `min_spots` spots
+
+    @staticmethod
+    def of(rig: Rig, model: SpotModel, min_spots: int) -> RigPlan:
+        """Prepare the search for a rig. The rig is the one that `model` was made of."""
+        screens = list(rig.screens)
+        everywhere = PosePrior.everywhere(rig)
+        view_at = np.full((len(model.spot_names), len(model.camera_names)), -1)
+        view_at[model.spot_of, model.camera_of] = np.arange(len(model))
+        point, ray = np.zeros((len(model.spot_names), 3)), np.zeros((len(model.spot_names), 3))
+        point[model.spot_of], ray[model.spot_of] = model.point, model.ray
+        spots = sorted({int(s) for s in model.spot_of})
+        poses = sample(everywhere, SAMPLES, np.random.default_rng(0))
+        pixels, J = model.project(poses)
+        shown = np.zeros((SAMPLES, len(model.spot_names)), dtype=bool)
+        for v, inside in enumerate(model.in_picture(pixels).T):
+            shown[:, model.spot_of[v]] |= inside
+        enough = np.count_nonzero(shown, axis=1) >= min(min_spots, len(spots))
+        good = np.flatnonzero(enough if enough.any() else np.isfinite(pixels[..., 0]).any(axis=1))[:MANY]
+        normal = model.screen_rotation[..., 2]
+        camera = -np.einsum("nij,ni->nj", model.camera_rotation, model.camera_translation)
+        side = np.sign(np.sum(normal * (camera - model.screen_origin), axis=-1))
+        normal = normal * np.where(side < 0, -1.0, 1.0)[:, None]
+        return RigPlan(
+            model=model,
+            everywhere=everywhere,
+            triples=covering(conditioning(model, pixels[good], J[good], spots), spots, min(min_spots, len(spots))),
+            screen_of_camera=np.array([screens.index(rig.cameras[c].screen) for c in model.camera_names]),
+            spot_screen=np.array([screens.index(rig.spots[s].screen) for s in model.spot_names]),
+            view_at=view_at,
+            spot_point=point,
+            spot_ray=ray,
+            front=np.concatenate([normal, np.sum(normal * model.screen_origin, axis=-1)[:, None]], axis=-1),
+            log_share=float(np.log((np.count_nonzero(enough) + 1) / SAMPLES)),
+        )
+
+
+_plans: list[tuple[SpotModel, int, RigPlan]] = []
+
+
+def plan_of(rig: Rig, model: SpotModel, min_spots: int) -> RigPlan:
+    """The plan of a rig, kept for the models last asked for."""
+    for known, least, plan in _plans:
+        if known is model and least == min_spots:
+            return plan
+    plan = RigPlan.of(rig, model, min_spots)
+    _plans.insert(0, (model, min_spots, plan))
+    del _plans[8:]
+    return plan
+
+
+def candidate_labellings(
+    rig: Rig,
+    model: SpotModel,
+    detections: Mapping[str, Detections],
+    prior: PosePrior | None = None,
+    parameters: LabelParameters | None = None,
+    calibration: CalibrationSpread | None = None,
+    most: int = 8,
+) -> list[Labelling]:
+    """The labellings of one frame that explain its points best, best first, without a decision between them.
+
+    detections: by camera name; a camera without a picture is absent. The rig is the one that `model` was made of.
+    prior: None for all poses in which the rig can see its spots. calibration: what its errors do to the spots, where
+    that is known. A labelling has at least `parameters.min_spots` spots.
+    """
+    parameters = LabelParameters() if parameters is None else parameters
+    plan = plan_of(rig, model, parameters.min_spots)
+    log_volume = plan.everywhere.log_volume + plan.log_share if prior is None else prior.log_volume
+    prior = plan.everywhere if prior is None else prior
+    points = points_of(rig, model, detections, parameters)
+    has_image = np.array([model.camera_names[c] in detections for c in model.camera_of])
+    sight = _sight(plan, points, has_image, parameters)
+    limits = Limits(
+        np.ascontiguousarray(prior.centre.rotation, dtype=np.float64),
+        np.array(prior.centre.translation, dtype=np.float64),
+        prior.half_width_m,
+        float(1 + 2 * np.cos(prior.largest_turn_rad)) - 1e-9,
+        parameters.p_detect,
+        parameters.min_spots,
+    )
+    reached = np.array(
+        [prior.reaches(p, r, points.world) for p, r in zip(plan.spot_point, plan.spot_ray, strict=True)], dtype=bool
+    ).reshape(len(plan.spot_point), len(points.uv))
+    sigma_px = LARGEST_MODEL_ERROR * parameters.model_sigma_px
+    screens, triples = _within_budget(plan, sight, points, reached, parameters, _by_brightness(detections), sigma_px)
+    best = Best.none(parameters.max_refined, len(model))
+    generate(model.numbers, sight, points, screens, reached, limits, triples, best)
+    return _completed(plan, sight, points, limits, prior, log_volume, best, calibration, most, sigma_px)
+
+
+def _within_budget(
+    plan: RigPlan,
+    sight: Sight,
+    points: Points,
+    reached: Bools,
+    parameters: LabelParameters,
+    brightness_known: bool,
+    sigma_px: float,
+) -> tuple[PointsOnScreens, Ints]:
+    """The points and triples of spots to make poses from, so that there are at most `max_triples` sets of points.
+
+    In a crowd spots are brighter than most: fewer points are used. Where brightness is not known all points are used,
+    and fewer triples of spots, the ones first that serve most sets of visible spots.
+    """
+    triples = np.array([t for t in plan.triples if (sight.spot_screen[t] >= 0).all()], dtype=np.int64).reshape(-1, 3)
+    most = parameters.max_points
+    while True:
+        screens = on_screens(points, plan.screen_of_camera, int(plan.screen_of_camera.max()) + 1, sigma_px, most)
+        of_screen = [screens.point[a:b] for a, b in pairwise(screens.first)]
+        options = np.array([np.count_nonzero(reached[s, of_screen[k]]) for s, k in enumerate(plan.spot_screen)])
+        sets = np.cumsum(np.prod(options[triples].astype(float), axis=1))
+        if not len(sets) or sets[-1] <= parameters.max_triples:
+            return screens, triples
+        if not brightness_known or most <= FEWEST_POINTS:
+            return screens, triples[: max(1, np.count_nonzero(sets <= parameters.max_triples))]
+        most = max(int(0.8 * most), FEWEST_POINTS)
+
+
+def _by_brightness(detections: Mapping[str, Detections]) -> bool:
+    return all(np.isfinite(found.flux).any() for found in detections.values() if len(found))
+
+
+def _sight(plan: RigPlan, points: Points, has_image: Bools, parameters: LabelParameters) -> Sight:
+    model = plan.model
+    sigma2 = (LARGEST_MODEL_ERROR * parameters.model_sigma_px) ** 2
+    with_points = {
+        int(plan.screen_of_camera[c]) for c in range(len(model.camera_names)) if points.first[c + 1] > points.first[c]
+    }
+    seen = np.isin(plan.spot_screen, list(with_points)) & (plan.view_at >= 0).any(axis=1)
+    return Sight(
+        model.camera_of,
+        model.spot_of,
+        model.image_size_px,
+        has_image,
+        np.tile(sigma2 * np.eye(2), (len(model), 1, 1)),
+        plan.view_at,
+        plan.spot_point,
+        plan.spot_ray,
+        np.where(seen, plan.spot_screen, -1),
+    )
+
+
+def _completed(
+    plan: RigPlan,
+    sight: Sight,
+    points: Points,
+    limits: Limits,
+    prior: PosePrior,
+    log_volume: float,
+    best: Best,
+    calibration: CalibrationSpread | None,
+    most: int,
+    sigma_px: float,
+) -> list[Labelling]:
+    """The best candidates completed, weighed, no two alike, best first."""
+    model = plan.model
+    R, t, labels_of, evidences, shares, expected_of = complete_all(
+        model.numbers, sight, points, limits, plan.front, best
+    )
+    evidences = evidences - log_volume
+    out: list[Labelling] = []
+    kept: list[tuple[Pose, Ints]] = []
+    for k in np.argsort(-evidences, kind="stable"):
+        evidence, pose, labels = evidences[k], Pose(R[k], t[k]), labels_of[k]
+        if len(out) == most or not evidence > evidences.max() - LEAST_LIKELY:
+            break
+        if any(np.array_equal(labels, other) and _near(pose, there) for there, other in kept):
+            continue
+        kept.append((pose, labels))
+        rows = np.flatnonzero(labels != NO_POINT)
+        chosen = labels[rows]
+        covariances = points.cov[chosen] + (SHARES[shares[k]] * sigma_px) ** 2 * np.eye(2)
+        fit = fit_pose(model, rows, points.uv[chosen], covariances, pose, calibration=calibration)
+        if (
+            fit is None
+            or not fit.observable
+            or not fit.consistent(P_MISFIT)
+            or not bool(prior.holds(fit.world_from_body))
+        ):
+            continue
+        point_of = np.where(labels == NO_POINT, NO_POINT, points.row[np.maximum(labels, 0)])
+        out.append(Labelling(fit, point_of, float(evidence), int(expected_of[k])))
+    return out
+
+
+def _near(one: Pose, other: Pose) -> bool:
+    """Whether two poses with the same labels are the same solution."""
+    away = one.minus(other)
+    return bool(np.abs(away[:3]).max() < 0.02 and np.abs(away[3:]).max() < 0.02)
