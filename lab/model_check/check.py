@@ -29,7 +29,7 @@ from lab.model_check.linear import Linearised, linearise
 from lab.model_check.recording import Recording, evenly
 from lab.model_check.statistics import Statistics, group_key, residual_weights, statistics
 from lab.model_check.unseen import unseen_finding, unseen_views
-from lab.model_check.words import culprit_finding, unexplained_finding
+from lab.model_check.words import culprit_finding, noise_finding, unexplained_finding
 
 MOST_FRAMES = 2000  # for the statistics: their sigmas halve for four times as many only
 MOST_FRAMES_FOR_CULPRITS = 400  # for the normal equations; 0.02 deg of a camera show in these
@@ -118,7 +118,15 @@ def check_model(rig: Rig, recording: Recording, calibration: RigCovariance | Non
     claimed = None if recording.pose_covariance is None else recording.pose_covariance[lin.frames]
     effects = tuple(
         tuple(
-            effect_of(lin, moves, e.fault.numbers @ e.change.delta, e.fault.views, columns.covariance, claimed)
+            effect_of(
+                lin,
+                moves,
+                e.fault.numbers @ e.change.delta,
+                e.fault.views,
+                columns.covariance,
+                claimed,
+                inquest.excess_noise,
+            )
             for e in c.explanations
         )
         for c in inquest.culprits
@@ -127,6 +135,9 @@ def check_model(rig: Rig, recording: Recording, calibration: RigCovariance | Non
     findings = [culprit_finding(c, e, inquest, model, frame_s) for c, e in zip(inquest.culprits, effects, strict=True)]
     if inquest.unexplained:
         findings.append(unexplained_finding(inquest))
+    noisy = noise_finding(inquest, told)
+    if noisy is not None:
+        findings.append(noisy)
     findings += unseen
     findings.sort(key=lambda f: -f.level)
     return ModelCheck(

@@ -26,6 +26,7 @@ AHEAD = 12.0  # of 2 ln(evidence): so far behind the best (1 : 400) another faul
 LINEAR_SHARE = 0.005
 MOST_FAULTS = 3  # named at once: where more seem wrong, the whole rig wants calibrating
 MOST_RIVALS = 2  # named beside the best
+LASTING_FRAMES = 2.0  # frames that count as one: white noise gives 1.0 to 1.2 in 300 frames
 _SEEN = 1e-10  # of the largest eigenvalue: combinations of numbers that show less show by rounding only
 
 
@@ -64,6 +65,16 @@ class Inquest:
     noise: float  # the same of what no constant fault could explain: how far the sigmas are from true
     correlation_frames: float  # how many of the frames used count as one
     unexplained: bool  # whether something is significant beyond what was named
+
+    @property
+    def excess_noise(self) -> float:
+        """How much larger than claimed the errors are that no fault of the rig makes; 1 where the claims hold."""
+        return max(self.noise, 1.0) if np.isfinite(self.noise) else 1.0
+
+    @property
+    def lasts(self) -> bool:
+        """Whether what no constant fault explains stays the same over several frames, as noise does not."""
+        return self.correlation_frames > LASTING_FRAMES
 
 
 def inquire(lin: Linearised, columns: Array, covariance: Array, faults: Sequence[Fault]) -> Inquest:
