@@ -109,16 +109,21 @@ def against_causal(
         return CausalAgreement(np.sqrt(squared), np.asarray(squared > float(chdtri(6, p))))
 
 
-def contradictory(own: SpotAgreement, causal: CausalAgreement | None, measured: Bools) -> Bools:
+def contradictory(
+    own: SpotAgreement, measured: Bools, causal: CausalAgreement | None = None, causal_own: SpotAgreement | None = None
+) -> Bools:
     """(T,): frames whose reported pose must not be believed.
 
-    Those that contradict their own spots; and those that contradict the causal pose unless the frame's own spots
-    confirm the reported one: measured (T,) from four or more spots, so that one of them could have contradicted.
+    Those that contradict their own spots. Those that contradict the causal pose, where spots stand behind that one
+    (causal_own: two or more, which it agrees with; without any it is the motion model's, which knows no bend in an
+    occlusion) and the frame's own spots do not confirm the reported one: measured (T,) from four or more spots, so that
+    one of them could have contradicted.
     """
-    if causal is None:
+    if causal is None or causal_own is None:
         return own.contradicts
     confirmed = measured & (own.dof >= 8) & ~own.contradicts
-    return np.asarray(own.contradicts | (causal.contradicts & ~confirmed))
+    witnessed = (causal_own.dof >= 4) & ~causal_own.contradicts
+    return np.asarray(own.contradicts | (causal.contradicts & witnessed & ~confirmed))
 
 
 def is_covariance(matrices: Array) -> Bools:

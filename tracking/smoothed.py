@@ -54,7 +54,6 @@ class Smoothed:
         labels left open are told anew.
         """
         model = self.model
-        n = len(model)
         known = bool(self.known[k])
         assigned = np.where(known, self.assigned[k], -1)
         labelled = assigned >= 0
