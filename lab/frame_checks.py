@@ -28,6 +28,7 @@ from tracking.consistency import (
     against_causal,
     against_own_spots,
     contradictory,
+    finite,
     is_covariance,
 )
 from tracking.statuses import PoseStatus, SpotStatus
@@ -76,9 +77,9 @@ class FrameChecks:
             bad = contradictory(own, measured, against_causal(*_poses(now), *_poses(then)), own_then)
         else:
             bad = contradictory(own, measured)
-        for k in np.flatnonzero(invalid):
+        for k in np.flatnonzero(invalid).tolist():
             self.invalid.add(numbers[k])
-        for k in np.flatnonzero(bad):
+        for k in np.flatnonzero(bad).tolist():
             now[k] = self._contradicted(
                 numbers[k],
                 now[k],
@@ -102,7 +103,7 @@ class FrameChecks:
         if self._spread is None or not out.contradicts.any():
             return out
         n = used.shape[1]
-        for k in np.flatnonzero(out.contradicts):
+        for k in np.flatnonzero(out.contradicts).tolist():
             joint = self._spread.at(poses[k]).reshape(n, 2, n, 2)
             cov[k] += joint[np.arange(n), :, np.arange(n)]
         return against_own_spots(self._model, poses, covariance, used, uv, cov)
@@ -149,14 +150,14 @@ def _with_valid_covariances(frames: list[TrackedFrame]) -> tuple[list[TrackedFra
     bad_spots = ~np.isnan(spots[..., 0, 0]) & ~is_covariance(spots)
     has_pose = np.array([t.pose is not None for t in frames])
     poses, covariances = _poses(frames)
-    good = is_covariance(covariances) & np.isfinite(poses.translation).all(axis=-1)
-    bad_pose = has_pose & ~(good & np.isfinite(poses.rotation).all(axis=(-2, -1)))
+    good = is_covariance(covariances) & finite(poses.translation, -1) & finite(poses.rotation, (-2, -1))
+    bad_pose = has_pose & ~good
     has_motion = np.array([t.motion is not None for t in frames])
     motions = np.stack([_UNKNOWN if t.motion is None else t.motion.covariance for t in frames])
     bad_motion = has_motion & ~is_covariance(motions)
     invalid = bad_spots.any(axis=1) | bad_pose | bad_motion
     out = list(frames)
-    for k in np.flatnonzero(invalid):
+    for k in np.flatnonzero(invalid).tolist():
         what = "pose" if bad_pose[k] else "velocity" if bad_motion[k] else "spot"
         words = f"internal error: the covariance of the {what} is not positive definite; it is left out"
         changed = replace(

@@ -60,12 +60,12 @@ def against_own_spots(
     loses at most a factor 1.4 in sigmas where a frame's own spots make the pose (P of a single frame), nothing where
     many frames do.
     """
-    known = np.isfinite(poses.translation).all(axis=-1)
+    known = finite(poses.translation, -1)
     safe = Pose(
         np.where(known[:, None, None], poses.rotation, np.eye(3)), np.where(known[:, None], poses.translation, 0.0)
     )
     projected, J = model.project(safe)
-    use: Bools = np.asarray(used & known[:, None] & np.isfinite(projected).all(axis=-1))
+    use: Bools = np.asarray(used & known[:, None] & finite(projected, -1))
     residual = np.where(use[..., None], uv_px - projected, 0.0)
     R = np.where(use[..., None, None], cov_px2, np.eye(2))
     gate = limits(2 * use.sum(axis=1), p)
@@ -130,12 +130,17 @@ def is_covariance(matrices: Array) -> Bools:
     """(...,): which of matrices (..., m, m) are finite, symmetric and positive definite, in any units."""
     variance = np.diagonal(matrices, axis1=-2, axis2=-1)
     with np.errstate(invalid="ignore"):
-        good = np.isfinite(matrices).all(axis=(-2, -1)) & (variance > 0).all(axis=-1)
+        good = finite(matrices, (-2, -1)) & np.asarray((variance > 0).all(axis=-1))
     sigma = np.sqrt(np.where(good[..., None], variance, 1.0))
     scaled = matrices / (sigma[..., :, None] * sigma[..., None, :])
     scaled = np.where(good[..., None, None], scaled, np.eye(matrices.shape[-1]))
     symmetric = np.abs(scaled - np.swapaxes(scaled, -1, -2)).max(axis=(-2, -1)) < 1e-6
     return np.asarray(good & symmetric & (np.linalg.eigvalsh(scaled)[..., 0] > _LEAST_EIGENVALUE))
+
+
+def finite(values: Array, axes: int | tuple[int, ...]) -> Bools:
+    """Whether all numbers along these axes are finite."""
+    return np.asarray(np.isfinite(values).all(axis=axes), dtype=np.bool_)
 
 
 def limits(dof: Ints, p: float) -> Array:
@@ -182,8 +187,4 @@ def _joint(residual: Array, R: Array, J: Array, P: Array) -> Array:
 
 
 def _all_finite(poses: Pose, covariance: Array) -> Bools:
-    return np.asarray(
-        np.isfinite(poses.translation).all(axis=-1)
-        & np.isfinite(poses.rotation).all(axis=(-2, -1))
-        & np.isfinite(covariance).all(axis=(-2, -1))
-    )
+    return finite(poses.translation, -1) & finite(poses.rotation, (-2, -1)) & finite(covariance, (-2, -1))
