@@ -8,13 +8,13 @@ occlusions, few spots in view, a camera that stopped) is reported with wide sigm
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from enum import StrEnum
+from dataclasses import dataclass
 from typing import Any, Literal
 
 from calibration.findings import Finding, Level
 from lab.errors import QUALITY_GATE_FAILED
-from lab.run_facts import CameraFacts, Cause, RunFacts
+from lab.evidence import REMEDIES, REMEDIES_BY_CAUSE, Evidence, Kind
+from lab.run_facts import MISSED, CameraFacts, Cause, RunFacts
 
 # Of the frames that show enough to be measured: where the tracker missed more than half of them, it is not known
 # whether it followed the vehicle in the others. Frames that do not show enough do not count.
@@ -28,84 +28,9 @@ GOOD_MEASURED = 0.95  # of all frames: fewer are mentioned with their causes
 MOST_MISFIT, GOOD_MISFIT = 5.0, 1.5
 GOOD_PICTURES = 0.95  # share of frames with a usable picture, per camera
 MOSTLY_EMPTY = 0.5  # share of a camera's pictures without any point of light, from which it is mentioned
+FEW_SHOWN = 0.1  # share of the frames with enough points, below which too few points are the reason, not the prior
+LONG_EMPTY = 0.05  # share of the run at whose end a camera shows nothing where it should, from which it is mentioned
 _FEW_FOUND = 0.2  # of the spots expected in a camera that is mostly empty: a camera that should see and does not
-
-
-class Kind(StrEnum):
-    """What a piece of evidence is about."""
-
-    NO_FRAMES = "no_frames"
-    NEVER_FOUND = "never_found"
-    FEW_MEASURED = "few_measured"
-    NO_PICTURES = "no_pictures"  # a camera without any
-    CAMERA_LATE = "camera_late"
-    CAMERA_STOPPED = "camera_stopped"
-    MISSING_PICTURES = "missing_pictures"
-    NOTHING_DETECTED = "nothing_detected"
-    FEW_POINTS = "few_points"
-    NOT_ACQUIRED = "not_acquired"
-    NOT_CONFIRMED = "not_confirmed"  # measured in the causal pass, and not in the smoothed one
-    AMBIGUOUS = "ambiguous"
-    LOST = "lost"
-    CONTRADICTION = "contradiction"
-    INTERNAL = "internal"
-    MISFIT = "misfit"
-    MODEL = "model"  # a finding of the model check
-
-
-REMEDIES = {
-    Kind.NO_FRAMES: "Check the folders of pictures, or the detections, that run.yaml names (`beampose check`).",
-    Kind.NEVER_FOUND: "See the evidence below it.",
-    Kind.NO_PICTURES: "Check the camera, its cable and the path that run.yaml names; or leave the camera out.",
-    Kind.CAMERA_LATE: "Start all cameras before the motion; the poses before that moment have wider sigmas.",
-    Kind.CAMERA_STOPPED: "Check the camera's disk, cable and trigger; the poses after that moment have wider sigmas.",
-    Kind.MISSING_PICTURES: "Check the camera's disk, cable and trigger for dropped or damaged frames.",
-    Kind.NOTHING_DETECTED: "Look at its pictures: are the lasers on, the lens uncovered, the spots on that screen and"
-    " bright enough? If spots can be seen, lower the detection threshold or state the camera's noise.",
-    Kind.FEW_POINTS: "Make more spots visible: light, exposure and the cameras' fields of view; or record while the"
-    " vehicle is where they are.",
-    Kind.NOT_ACQUIRED: "Check the prior (position, attitude, within_m, within_deg), that each camera's pictures are in"
-    " its own folder, and that rig.yaml is the rig of this recording (`beampose calibrate check`).",
-    Kind.NOT_CONFIRMED: "Use attitude_causal.csv with care, and report this run: the two passes disagree.",
-    Kind.AMBIGUOUS: "Make the prior narrower around the right candidate, start where another spot can be seen, or"
-    " use a fan with unequal angles.",
-    Kind.LOST: "Look at the first of these frames: hide fewer spots, or hide them for a shorter time.",
-    Kind.CONTRADICTION: "Look at these frames: reflections near the spots, a rig that has moved. Their sigmas cover the"
-    " difference.",
-    Kind.INTERNAL: "These numbers are left out. Please report this run as an error of the program.",
-    Kind.MISFIT: "Check the calibration (`beampose calibrate check`) and the light (speckle).",
-}
-_BY_CAUSE = {
-    Cause.NO_PICTURE: "Check the cameras for dropped frames.",
-    Cause.CONTRADICTION: REMEDIES[Kind.CONTRADICTION],
-    Cause.UNEXPLAINED: "Look at these frames: reflections, another light, or a rig that has moved.",
-    Cause.LABELS_OPEN: "Use a fan with unequal angles, or keep four spots in view.",
-    Cause.FEW_POINTS: REMEDIES[Kind.FEW_POINTS],
-    Cause.OUT_OF_VIEW: "Use a wider field of view, more cameras or more beams (`beampose plan` tells what is seen).",
-    Cause.NOT_DETERMINED: "Keep spots of two screens in view: those of one screen alone do not determine the pose.",
-    Cause.HIDDEN: "Keep what hides the spots out of the beams, or add beams.",
-}
-
-
-@dataclass(frozen=True, slots=True)
-class Evidence:
-    """One reason of a verdict."""
-
-    kind: Kind
-    fails: bool  # a gate; else a doubt
-    what: str
-    remedy: str
-    numbers: Mapping[str, Any] = field(default_factory=dict)  # plain values
-
-    def as_mapping(self) -> dict[str, Any]:
-        """For summary.json."""
-        return {
-            "kind": self.kind.value,
-            "level": "fail" if self.fails else "check",
-            "what": self.what,
-            "remedy": self.remedy,
-            "numbers": dict(self.numbers),
-        }
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,7 +62,9 @@ def judge(facts: RunFacts, findings: Sequence[Finding] = (), misfit: float | Non
     if facts.frames == 0:
         nothing = Evidence(Kind.NO_FRAMES, True, "there is no frame at all", REMEDIES[Kind.NO_FRAMES])
         return Verdict("fail", (nothing.what,), (nothing,))
-    found = [*_measured(facts), *_cameras(facts)]
+    found = _measured(facts)
+    if facts.measured:
+        found += _cameras(facts)
     if misfit is not None:
         found += _misfit(misfit)
     for finding in findings:
@@ -156,22 +83,23 @@ def judge(facts: RunFacts, findings: Sequence[Finding] = (), misfit: float | Non
 
 
 def _measured(facts: RunFacts) -> list[Evidence]:
-    """How many frames have a measured pose, and why the others do not."""
+    """How many frames have a measured pose, and why the others do not; of no frame the cameras come first."""
     measured, frames, causes = facts.measured, facts.frames, facts.causes
     numbers = {"measured": measured, "frames": frames, "causes": {c.value: n for c, n in causes.items()}}
     if measured == 0:
         what = "the vehicle was never found: no frame has a measured pose"
-        return [Evidence(Kind.NEVER_FOUND, True, what, REMEDIES[Kind.NEVER_FOUND], numbers), *_why_never(facts)]
+        never = Evidence(Kind.NEVER_FOUND, True, what, REMEDIES[Kind.NEVER_FOUND], numbers)
+        return [never, *_cameras(facts), *_why_never(facts)]
     share, shown = measured / frames, measured / (measured + facts.missed)
-    remedy = _BY_CAUSE[next(iter(causes))] if causes else ""
+    remedy = REMEDIES_BY_CAUSE[next(iter(causes))] if causes else ""
     why = f": of the others, {_in_words(causes)}" if causes else ""
     if shown < LEAST_MEASURED_OF_SHOWN:
-        worst = max((c for c in causes if c in _MISSED_REMEDY), key=lambda c: causes[c])
+        worst = max((c for c in causes if c in MISSED), key=lambda c: causes[c])
         what = (
             f"only {shown:.0%} of the frames that show enough spots have a measured pose"
             f" (gate: {LEAST_MEASURED_OF_SHOWN:.0%}){why}"
         )
-        return [Evidence(Kind.FEW_MEASURED, True, what, _MISSED_REMEDY[worst], numbers)]
+        return [Evidence(Kind.FEW_MEASURED, True, what, REMEDIES_BY_CAUSE[worst], numbers)]
     if share < LEAST_MEASURED:
         what = f"only {share:.1%} of the frames have a measured pose (gate: {LEAST_MEASURED:.0%}){why}"
         return [Evidence(Kind.FEW_MEASURED, True, what, remedy, numbers)]
@@ -181,16 +109,13 @@ def _measured(facts: RunFacts) -> list[Evidence]:
     return []
 
 
-_MISSED_REMEDY = {c: _BY_CAUSE[c] for c in (Cause.CONTRADICTION, Cause.UNEXPLAINED, Cause.LABELS_OPEN)}
-
-
 def _in_words(causes: Mapping[Cause, int], most: int = 3) -> str:
     """`30 with hidden spots, 4 without a picture of some camera`."""
     return ", ".join(f"{count} {cause.meaning}" for cause, count in list(causes.items())[:most])
 
 
 def _why_never(facts: RunFacts) -> list[Evidence]:
-    """Why the vehicle was never found; a camera that shows nothing is evidence of its own (`_cameras`)."""
+    """Why the vehicle was never found, beyond cameras that show nothing (`_cameras`), which are reason enough."""
     if facts.causal_measured:
         what = (
             f"the causal pass has a measured pose in {facts.causal_measured} of {facts.frames} frames, and the"
@@ -209,14 +134,19 @@ def _why_never(facts: RunFacts) -> list[Evidence]:
         f"{f.points / f.pictures:.1f} per picture in camera {name}" for name, f in facts.cameras.items() if f.pictures
     )
     points = {name: f.points for name, f in facts.cameras.items()}
-    if unexplained:
+    if not all(f.points for f in facts.cameras.values()):
+        return []
+    if unexplained > FEW_SHOWN * facts.frames:
         what = (
-            f"{unexplained} of {facts.frames} frames show points of light enough ({per_frame}), but no pose within the"
+            f"{unexplained} of {facts.frames} frames show enough points of light ({per_frame}), but no pose within the"
             " prior explains them"
         )
         return [Evidence(Kind.NOT_ACQUIRED, True, what, REMEDIES[Kind.NOT_ACQUIRED], {"points": points})]
-    if few and any(f.points for f in facts.cameras.values()):
-        what = f"no frame shows the {facts.min_spots} points of light that a first pose needs ({per_frame})"
+    if few or unexplained:
+        what = (
+            f"{_frames(few)} of {facts.frames} show fewer than the {facts.min_spots} points of light that a first pose"
+            f" needs ({per_frame})"
+        )
         return [Evidence(Kind.FEW_POINTS, True, what, REMEDIES[Kind.FEW_POINTS], {"points": points})]
     return []
 
@@ -232,14 +162,19 @@ def _cameras(facts: RunFacts) -> list[Evidence]:
         never = facts.measured == 0 and empty > MOSTLY_EMPTY
         dark = empty > MOSTLY_EMPTY and camera.expected > 0 and camera.found < _FEW_FOUND * camera.expected
         if never or dark:
-            which = "all" if camera.empty == camera.pictures else f"{camera.empty} of {camera.pictures}"
-            what = f"camera {name}: nothing was detected in {which} of its pictures"
-            if camera.empty == camera.pictures:
-                what = f"camera {name}: nothing was detected in any of its {camera.pictures} pictures"
+            which = "any" if camera.empty == camera.pictures else f"{camera.empty}"
+            what = f"camera {name}: nothing was detected in {which} of its {camera.pictures} pictures"
             numbers = {"camera": name, **camera.as_mapping()}
             out.append(
                 Evidence(Kind.NOTHING_DETECTED, facts.measured == 0, what, REMEDIES[Kind.NOTHING_DETECTED], numbers)
             )
+        elif camera.expected_at_end and camera.empty_at_end > LONG_EMPTY * facts.frames:
+            what = (
+                f"camera {name}: nothing was detected in its last {camera.empty_at_end} pictures, where the pose puts"
+                " spots inside them"
+            )
+            numbers = {"camera": name, **camera.as_mapping()}
+            out.append(Evidence(Kind.NOTHING_DETECTED, False, what, REMEDIES[Kind.NOTHING_DETECTED], numbers))
     return out
 
 
@@ -298,10 +233,11 @@ def _interruptions(facts: RunFacts) -> list[Evidence]:
     """What happened in the midst of a run in which the vehicle was found."""
     out = []
     if facts.measured and facts.ties:
-        what = f"frames {facts.ties.in_words()} could be explained in more than one way: {facts.tie_text}"
+        which = "frame" if len(facts.ties) == 1 else "frames"
+        what = f"{which} {facts.ties.in_words()} could be explained in more than one way: {facts.tie_text}"
         numbers: dict[str, Any] = {"frames": [list(r) for r in facts.ties]}
         out.append(Evidence(Kind.AMBIGUOUS, False, what, REMEDIES[Kind.AMBIGUOUS], numbers))
-    if len(facts.lost):
+    if facts.measured and len(facts.lost):
         never = facts.lost.ranges[-1][1] == facts.last_frame
         after = "it was not found again" if never else "it was found again each time"
         what = f"nothing is known of the vehicle in {_frames(len(facts.lost))} ({facts.lost.in_words()}); {after}"

@@ -62,6 +62,8 @@ class CameraFacts:
     points: int = 0  # of light, in all of them
     expected: int = 0  # spots that the pose puts inside these pictures
     found: int = 0  # of these, measured
+    empty_at_end: int = 0  # pictures without any point since the last one that has one
+    expected_at_end: int = 0  # spots that the pose puts inside these
     missing: FrameRanges = field(default_factory=FrameRanges)  # frames without a usable picture
 
     def as_mapping(self) -> dict[str, Any]:
@@ -72,6 +74,7 @@ class CameraFacts:
             "points": self.points,
             "spots_expected": self.expected,
             "spots_found": self.found,
+            "empty_at_end": self.empty_at_end,
             "missing": [list(r) for r in self.missing.ranges],
         }
 
@@ -142,10 +145,16 @@ class RunFacts:
             facts.pictures += 1
             facts.empty += len(found) == 0
             facts.points += len(found)
+            if len(found):
+                facts.empty_at_end = facts.expected_at_end = 0
+            else:
+                facts.empty_at_end += 1
             if record.tracked.pose is not None:
                 own = [s for s, camera in zip(status, self.camera_of, strict=True) if camera == c]
                 facts.found += sum(s.measured for s in own)
-                facts.expected += sum(s.measured or s is SpotStatus.OCCLUDED for s in own)
+                expected = sum(s.measured or s is SpotStatus.OCCLUDED for s in own)
+                facts.expected += expected
+                facts.expected_at_end += expected if facts.empty_at_end else 0
 
     def _cause(self, record: FrameRecord) -> Cause:
         tracked = record.tracked
