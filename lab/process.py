@@ -22,8 +22,10 @@ from lab import quality
 from lab.calibration_state import require_usable, state_mapping
 from lab.fields import dataclass_from_yaml
 from lab.fingerprints import fingerprints
-from lab.model_check.keeper import FrameKeeper
+from lab.frame_checks import FrameChecks
+from lab.model_check.keeper import FrameKeeper, claimed_covariances
 from lab.pipeline import FrameRecord, Pipeline
+from lab.run_facts import CameraFacts, RunFacts
 from lab.run_file import Run, load_run
 from lab.tables import TableWriter
 from lab.two_passes import Progress, TwoPasses
@@ -34,8 +36,9 @@ if TYPE_CHECKING:
     from lab.model_check.check import ModelCheck
 
 SUMMARY_SCHEMA = "beampose/summary/1"
-MOST_EVENTS = 500  # told one by one; of the rest the number
-LASTING = ("undecided", "changed")  # events of a spot that tell no more in the next frame: told once, with their length
+MOST_EVENTS = 500  # listed one by one; of the rest the number
+# Events that say no more in the next frame: listed once, with their length.
+LASTING = ("undecided", "changed", "contradiction", "not_a_covariance")
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,24 +59,22 @@ class Outcome:
         return self.verdict.exit_status
 
     def line(self) -> str:
-        """One line for the command line."""
+        """One line for the command line; where a gate failed, with what to do about the first reason."""
+        remedy = f" {self.verdict.remedy}" if self.verdict.remedy else ""
         return (
             f"{self.name}: {self.verdict.status.upper()}: {self.measured} of {self.frames} frames measured"
-            f" ({'; '.join(self.verdict.reasons)}) -> {self.out}"
+            f" ({'; '.join(self.verdict.reasons)}){remedy} -> {self.out}"
         )
 
 
 @dataclass(slots=True)
 class _Tally:
-    """Counts over a run; its size does not grow with the number of frames (gaps are kept as ranges)."""
+    """Counts of spots and events over a run; its size does not grow with the number of frames."""
 
     cameras: tuple[str, ...]
     views: tuple[str, ...]
-    frames: int = 0
     spot_status: list[Counter[str]] = field(default_factory=list)
-    pose_status: Counter[str] = field(default_factory=Counter)
     detections: Counter[str] = field(default_factory=Counter)
-    no_image: dict[str, list[list[int]]] = field(default_factory=dict)
     reasons: dict[str, Counter[str]] = field(default_factory=dict)
     events: list[dict[str, Any]] = field(default_factory=list)
     event_kinds: Counter[str] = field(default_factory=Counter)
@@ -82,15 +83,13 @@ class _Tally:
     left_open: int = 0  # rows of spots.csv with a detection whose label was too uncertain to be given
 
     def add(self, record: FrameRecord) -> None:
-        self.frames += 1
         if not self.spot_status:
             self.spot_status = [Counter() for _ in self.views]
         for counter, status in zip(self.spot_status, record.tracked.status, strict=True):
             counter[status.value] += 1
-        self.pose_status[record.tracked.pose_status.value] += 1
         for camera, found, reason in zip(self.cameras, record.detections, record.missing, strict=True):
             if found is None:
-                self._missed(camera, record.frame, reason)
+                self.reasons.setdefault(camera, Counter())[reason] += 1
             else:
                 self.detections[camera] += len(found)
         if record.tracked.label_probability is not None:
@@ -117,14 +116,6 @@ class _Tally:
             else:
                 self.untold += 1
 
-    def _missed(self, camera: str, frame: int, reason: str) -> None:
-        ranges = self.no_image.setdefault(camera, [])
-        if ranges and ranges[-1][1] == frame - 1:
-            ranges[-1][1] = frame
-        else:
-            ranges.append([frame, frame])
-        self.reasons.setdefault(camera, Counter())[reason] += 1
-
 
 def process_run(
     run_folder: Path,
@@ -150,21 +141,35 @@ def process_run(
     require_usable(run.calibration, run.rig_path, recorded, "today" if run.recorded is None else "the recording's day")
     with whole_folder(out, may_replace=are_results) as work:
         pipeline = Pipeline.of(run)
-        tally = _Tally(tuple(run.rig.cameras), tuple(f"{c}/{s}" for c, s in SpotModel.of(run.rig).views))
+        model = SpotModel.of(run.rig)
+        tally = _Tally(tuple(run.rig.cameras), tuple(f"{c}/{s}" for c, s in model.views))
+        checks = FrameChecks(run.rig, run.covariance)
+        facts = RunFacts(
+            {name: CameraFacts() for name in run.rig.cameras},
+            tuple(model.camera_of.tolist()),
+            run.tracker.labels.min_spots,
+            own_spots=checks.own_spots,
+            causal=checks.causal,
+            invalid=checks.invalid,
+        )
         passes = TwoPasses(pipeline, work, progress)
         keeper = FrameKeeper()
         with (
             TableWriter(work, run.rig, run.covariance is not None, with_causal=not causal) as tables,
             contextlib.closing(passes.causal_only() if causal else passes.records()) as records,
         ):
-            for record, known_then in records:
+            for record, known_then in checks.passed(records):
                 tables.write(record, known_then)
-                keeper.add_tracked(record.t_s, record.tracked, record.tracked.predicted_cov_px2)
+                claimed = claimed_covariances(record.tracked, record.detections, model.camera_of, run.tracker)
+                keeper.add_tracked(record.t_s, record.tracked, record.tracked.predicted_cov_px2, claimed)
                 tally.add(record)
+                facts.add(record, known_then)
         from lab.model_check.check import check_kept  # the words of its report: only for those who need them
 
         model_check = check_kept(run.rig, keeper, run.covariance)
-        verdict = _verdict(pipeline, tally, model_check)
+        # Where the model check has tested the residuals, it has told noise from faults.
+        misfit = None if model_check.inquest is not None else pipeline.tracker.noise_scale
+        verdict = quality.judge(facts, model_check.findings, misfit)
         errors = _errors(work, run)
         seconds = {
             "waiting_for_pictures_s": pipeline.timings.waiting,
@@ -173,15 +178,13 @@ def process_run(
             "smoothing_s": pipeline.timings.smoothing,
         }
         content = _summary(
-            run, pipeline, passes, tally, verdict, model_check, errors, seconds, time.perf_counter() - started
+            run, pipeline, passes, tally, facts, verdict, model_check, errors, seconds, time.perf_counter() - started
         )
         _write_json(content, work / "summary.json")
         from lab.report import write_report  # the template engine: only for those who write a report
 
         write_report(work, run.folder)
-    return Outcome(
-        run.name, Path(out), verdict, tally.frames, tally.pose_status["measured"], time.perf_counter() - started, errors
-    )
+    return Outcome(run.name, Path(out), verdict, facts.frames, facts.measured, time.perf_counter() - started, errors)
 
 
 def are_results(folder: Path) -> bool:
@@ -209,19 +212,6 @@ def overridden(parameters: TrackerParameters, overrides: Mapping[str, Any]) -> T
     return dataclass_from_yaml(TrackerParameters, content, "--set")
 
 
-def _verdict(pipeline: Pipeline, tally: _Tally, model_check: ModelCheck) -> quality.Verdict:
-    return quality.judge(
-        frames=tally.frames,
-        measured=tally.pose_status["measured"],
-        lost=tally.pose_status["lost"],
-        misfit=pipeline.tracker.noise_scale,
-        no_image={c: sum(b - a + 1 for a, b in ranges) for c, ranges in tally.no_image.items()},
-        ties=tally.event_kinds["tie"],
-        measured_before_lost_again=tally.event_kinds["reacquired"],
-        findings=model_check.findings,
-    )
-
-
 def _errors(results: Path, run: Run) -> dict[str, Any] | None:
     from lab.score import score
 
@@ -233,13 +223,14 @@ def _summary(
     pipeline: Pipeline,
     passes: TwoPasses,
     tally: _Tally,
+    facts: RunFacts,
     verdict: quality.Verdict,
     model_check: ModelCheck,
     errors: Mapping[str, Any] | None,
     seconds: Mapping[str, float],
     wall_s: float,
 ) -> dict[str, Any]:
-    frames = max(tally.frames, 1)
+    frames = max(facts.frames, 1)
     notes = list(pipeline.reader.notes)
     if run.left_out:
         notes.append(f"cameras of the rig that this run has nothing of: {', '.join(run.left_out)}")
@@ -254,21 +245,32 @@ def _summary(
         "notes_of_run": run.notes,
         "attitude": "causal" if passes.smoothing is None else "smoothed",
         "smoother": None if passes.smoothing is None else dataclasses.asdict(passes.smoothing),
-        "verdict": {"status": verdict.status, "reasons": list(verdict.reasons), "exit_status": verdict.exit_status},
+        "verdict": {
+            "status": verdict.status,
+            "reasons": list(verdict.reasons),
+            "exit_status": verdict.exit_status,
+            "evidence": [e.as_mapping() for e in verdict.evidence],
+        },
         "counts": {
-            "frames": tally.frames,
+            "frames": facts.frames,
             "spot_status": {v: dict(c) for v, c in zip(tally.views, tally.spot_status, strict=False)},
-            "pose_status": dict(tally.pose_status),
+            "pose_status": dict(facts.pose),
             "detections_per_frame": {c: tally.detections[c] / frames for c in tally.cameras},
-            "no_image": tally.no_image,
+            "no_image": {c: f.missing.ranges for c, f in facts.cameras.items() if len(f.missing)},
             "no_image_reasons": {c: dict(r) for c, r in tally.reasons.items()},
             "events": dict(tally.event_kinds),
             "labels_left_open": tally.left_open,
+            "causal_measured": facts.causal_measured,
+            "not_measured": {cause.value: count for cause, count in facts.causes.items()},
+            "found_again": facts.found_again,
+            "contradictions": {"own_spots": len(facts.own_spots), "causal": len(facts.causal)},
+            "invalid_covariances": len(facts.invalid),
+            "cameras": {c: f.as_mapping() for c, f in facts.cameras.items()},
         },
         "rates": {
-            "measured_share": tally.pose_status["measured"] / frames,
+            "measured_share": facts.measured / frames,
             "frame_rate_hz": run.frame_rate_hz,
-            "processed_frames_per_s": tally.frames / wall_s if wall_s > 0 else None,
+            "processed_frames_per_s": facts.frames / wall_s if wall_s > 0 else None,
             "misfit": pipeline.tracker.noise_scale,
         },
         "model_check": model_check.as_mapping(),

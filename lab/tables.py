@@ -15,6 +15,7 @@ from geometry.rig import Rig
 from geometry.spots import SpotModel
 from lab import columns
 from lab.columns import CAUSAL
+from lab.errors import RunError
 from lab.pipeline import FrameRecord
 from tracking.tracked_frame import MotionEstimate
 
@@ -75,7 +76,7 @@ class TableWriter:
         for camera, found in zip(self._cameras, record.detections, strict=True):
             if found is None:
                 continue
-            sigma = np.sqrt(np.stack([found.cov_px2[:, 0, 0], found.cov_px2[:, 1, 1]], axis=-1))
+            sigma = _sigmas(np.stack([found.cov_px2[:, 0, 0], found.cov_px2[:, 1, 1]], axis=-1), record.frame)
             for i in range(len(found)):
                 values = (
                     *found.uv_px[i], *sigma[i], found.flux[i], found.peak[i], found.major_px[i], found.minor_px[i],
@@ -86,8 +87,7 @@ class TableWriter:
 
     def _spots(self, record: FrameRecord) -> None:
         t = record.tracked
-        with np.errstate(invalid="ignore"):
-            sigma = np.sqrt(np.stack([t.cov_px2[:, 0, 0], t.cov_px2[:, 1, 1]], axis=-1))
+        sigma = _sigmas(np.stack([t.cov_px2[:, 0, 0], t.cov_px2[:, 1, 1]], axis=-1), record.frame)
         numbers = np.column_stack([t.uv_px, sigma])
         probability = np.full(len(t.gain), np.nan) if t.label_probability is None else t.label_probability
         after = np.column_stack([t.predicted_px, t.gain, t.cov_px2[:, 0, 1], probability])
@@ -105,13 +105,15 @@ class TableWriter:
             nothing, no_motion = "," * len(columns.POSE), "," * len(columns.MOTION)
             attitude.write(f"{head}{nothing},{t.spots_used},,{status}{no_motion}\n")
             return
+        for covariance in (t.pose_covariance, *([] if t.motion is None else [t.motion.covariance])):
+            _sigmas(np.diagonal(covariance), record.frame)
         attitude.write(
             f"{head},{_joined(pose_numbers(t.pose, t.pose_covariance))},{t.spots_used},{_number(t.rms_px)},{status},"
             f"{_joined(motion_numbers(t.motion))}\n"
         )
-        self._open[f"covariance{which}.csv"].write(f"{record.frame},{_joined(t.pose_covariance[_UPPER])}\n")
+        self._open[f"covariance{which}.csv"].write(f"{record.frame},{_exact(t.pose_covariance[_UPPER])}\n")
         if not which and "systematic.csv" in self._open and t.pose_systematic is not None:
-            self._open["systematic.csv"].write(f"{record.frame},{_joined(t.pose_systematic[_UPPER])}\n")
+            self._open["systematic.csv"].write(f"{record.frame},{_exact(t.pose_systematic[_UPPER])}\n")
 
     def _beam_rows(self, record: FrameRecord) -> None:
         t, head = record.tracked, f"{record.frame},{_number(record.t_s)}"
@@ -123,6 +125,13 @@ class TableWriter:
         self._open["beams.csv"].writelines(
             f"{head},{b},{_joined(direction[i])},{_joined(point[i])},{status}\n" for i, b in enumerate(self._beams)
         )
+
+
+def _sigmas(variances: Array, frame: int) -> Array:
+    """Square roots; nan for nan. A negative variance is an error of the program: lab.frame_checks comes before."""
+    if np.any(variances < 0):
+        raise RunError(f"frame {frame}: internal error: a variance is negative; please report this run")
+    return np.asarray(np.sqrt(variances))
 
 
 def pose_numbers(pose: Pose, covariance: Array) -> Array:
@@ -147,6 +156,13 @@ def motion_numbers(motion: MotionEstimate | None) -> Array:
 
 def _joined(values: Sequence[float] | Array) -> str:
     return ",".join(map(_number, values))
+
+
+def _exact(values: Array) -> str:
+    """As many digits as give the same number when read: rounded to ten, a covariance whose axes differ by 1e5 in size
+    may come back with a negative variance along one of them.
+    """
+    return ",".join(map(repr, values.tolist()))
 
 
 def _number(value: float) -> str:

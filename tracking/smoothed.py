@@ -54,7 +54,6 @@ class Smoothed:
         labels left open are told anew.
         """
         model = self.model
-        n = len(model)
         known = bool(self.known[k])
         assigned = np.where(known, self.assigned[k], -1)
         labelled = assigned >= 0
@@ -95,12 +94,21 @@ class Smoothed:
             spots_used=int(np.count_nonzero(labelled & (assigned < BLENDED))) if measured else 0,
             rms_px=float(self.rms_px[k]) if measured else float("nan"),
             events=self._events(k, causal, point, known),
-            label_probability=self.probability[k] if known else np.full(n, np.nan),
+            label_probability=self._label_probability(k, causal, known),
+            witness=labelled & (assigned < BLENDED),
             motion=MotionEstimate(self.velocities[k, :3], self.velocities[k, 3:], self.motion_covariance[k])
             if known
             else None,
             pose_systematic=systematic if known else None,
         )
+
+    def _label_probability(self, k: int, causal: TrackedFrame, known: bool) -> Array | None:
+        """(n,) that each label is right; nan without a label. The labels of `method: spots` stay as that tracker gave
+        them, and so does what it says of them (None: it estimates no probability).
+        """
+        if self.parameters.method != "rigid":
+            return causal.label_probability
+        return self.probability[k] if known else np.full(len(self.model), np.nan)
 
     def _events(self, k: int, causal: TrackedFrame, point: Ints, known: bool) -> tuple[Event, ...]:
         events = [e for e in causal.events if e.kind != "undecided"]

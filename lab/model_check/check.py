@@ -11,7 +11,7 @@ together with the opposite one, and a beam of a fan raised with the other beams:
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -29,12 +29,13 @@ from lab.model_check.linear import Linearised, linearise
 from lab.model_check.recording import Recording, evenly
 from lab.model_check.statistics import Statistics, group_key, residual_weights, statistics
 from lab.model_check.unseen import unseen_finding, unseen_views
-from lab.model_check.words import culprit_finding, unexplained_finding
+from lab.model_check.words import UNEVEN, culprit_finding, is_noisy, noise_finding, unexplained_finding
 
 MOST_FRAMES = 2000  # for the statistics: their sigmas halve for four times as many only
 MOST_FRAMES_FOR_CULPRITS = 400  # for the normal equations; 0.02 deg of a camera show in these
 _MOST_NUMBERS = 12_000_000  # of one array of derivatives, 96 MB: large rigs make do with fewer frames ...
 _FEWEST_FRAMES = 30  # ... but not with fewer than these; and a recording of fewer is not tested
+_ROUNDS_OF_NOISE, _SETTLED = 5, 1.1  # of estimating the cameras' noise; a factor that changes it no more
 _FEWEST_SPOTS = 3  # of a frame: fewer leave nothing for a test, whatever the pose
 
 
@@ -49,6 +50,7 @@ class ModelCheck:
     effects: tuple[tuple[Effect, ...], ...]  # of each culprit: of its best explanation and of the rivals, in order
     findings: tuple[Finding, ...]  # the gravest things first; empty where nothing was found
     why_not: str = ""  # why nothing was tested; empty where it was
+    noise_of_cameras: Mapping[str, float] = field(default_factory=dict)  # their errors over what the detections claim
     image_sizes_px: Mapping[str, tuple[int, int]] = field(default_factory=dict)  # of each camera: width, height
 
     @property
@@ -60,7 +62,8 @@ class ModelCheck:
         """For summary.json, plain values.
 
         tested, why_not; frames_used, frames_for_culprits; findings: level (PASS, WARN, FAIL), what, why, cure;
-        misfit, noise, correlation_frames, p_before, p_after: see Inquest; culprits: thing, name, kind, delta and sigma
+        misfit, noise, correlation_frames, p_before, p_after: see Inquest (with the claims widened where the cameras'
+        noise is uneven); noise_of_cameras; culprits: thing, name, kind, delta and sigma
         (in rad, m, px, s, or relative), explained (chi-square), p, off_px, off_sigmas, attitude_deg, position_mm,
         pose_sigmas: see Effect; and rivals, each with the same; views, cameras, beams: see GroupStatistics;
         image_sizes_px.
@@ -77,6 +80,7 @@ class ModelCheck:
             out |= {
                 "misfit": q.misfit,
                 "noise": q.noise,
+                "noise_of_cameras": dict(self.noise_of_cameras),
                 "correlation_frames": q.correlation_frames,
                 "p_before": q.p_before,
                 "p_after": q.p_after,
@@ -113,12 +117,36 @@ def check_model(rig: Rig, recording: Recording, calibration: RigCovariance | Non
     unseen = [unseen_finding(u, model) for u in unseen_views(model, recording, all_frames.frames)]
     if lin.dof <= 0:
         why = "in no frame are more spots measured than its pose takes"
-        return ModelCheck(len(all_frames.frames), len(lin.frames), told, None, (), tuple(unseen), why, sizes)
-    inquest = inquire(lin, moves, columns.covariance, possible_faults(rig, columns))
+        counts = len(all_frames.frames), len(lin.frames)
+        return ModelCheck(*counts, told, None, (), tuple(unseen), why, image_sizes_px=sizes)
+    faults = possible_faults(rig, columns)
+    inquest = inquire(lin, moves, columns.covariance, faults)
+    factor = [max(f, 1.0) for f in _noise_of_cameras(inquest, model)]
+    # Cameras whose claims are wrong by different factors would break all tests, which weigh by the claims. The factors
+    # are variance components (Helmert's): estimated, applied, and estimated again until they settle.
+    misfit = inquest.misfit
+    for _ in range(_ROUNDS_OF_NOISE if max(factor) > UNEVEN * min(factor) and is_noisy(max(factor), misfit) else 0):
+        wider = np.array(factor)[model.camera_of][:, None, None] ** 2
+        lin = linearise(model, replace(recording, cov_px2=recording.cov_px2 * wider), lin.frames)
+        moves = columns.at(recording, lin)
+        inquest = inquire(lin, moves, columns.covariance, faults)
+        before, factor = factor, [f * m for f, m in zip(factor, _noise_of_cameras(inquest, model), strict=True)]
+        factor = [max(f, 1.0) for f in factor]
+        if all(1 / _SETTLED < f / b < _SETTLED for f, b in zip(factor, before, strict=True)):
+            break
+    noise_of_cameras = dict(zip(model.camera_names, factor, strict=True))
     claimed = None if recording.pose_covariance is None else recording.pose_covariance[lin.frames]
     effects = tuple(
         tuple(
-            effect_of(lin, moves, e.fault.numbers @ e.change.delta, e.fault.views, columns.covariance, claimed)
+            effect_of(
+                lin,
+                moves,
+                e.fault.numbers @ e.change.delta,
+                e.fault.views,
+                columns.covariance,
+                claimed,
+                inquest.excess_noise,
+            )
             for e in c.explanations
         )
         for c in inquest.culprits
@@ -127,10 +155,20 @@ def check_model(rig: Rig, recording: Recording, calibration: RigCovariance | Non
     findings = [culprit_finding(c, e, inquest, model, frame_s) for c, e in zip(inquest.culprits, effects, strict=True)]
     if inquest.unexplained:
         findings.append(unexplained_finding(inquest))
+    noisy = noise_finding(inquest, noise_of_cameras, misfit)
+    if noisy is not None:
+        findings.append(noisy)
     findings += unseen
     findings.sort(key=lambda f: -f.level)
     return ModelCheck(
-        len(all_frames.frames), len(lin.frames), told, inquest, effects, tuple(findings), image_sizes_px=sizes
+        len(all_frames.frames),
+        len(lin.frames),
+        told,
+        inquest,
+        effects,
+        tuple(findings),
+        noise_of_cameras=noise_of_cameras,
+        image_sizes_px=sizes,
     )
 
 
@@ -140,6 +178,18 @@ def check_kept(rig: Rig, kept: FrameKeeper, calibration: RigCovariance | None = 
     if recording is None:
         return ModelCheck(0, 0, None, None, (), (), "there is no frame")
     return check_model(rig, recording, calibration)
+
+
+def _noise_of_cameras(inquest: Inquest, model: SpotModel) -> list[float]:
+    """How much larger than claimed each camera's errors are that no fault makes; 1 where that is not known.
+
+    The median of its views: one that is at fault by itself does not count for the camera.
+    """
+    out = []
+    for c in range(len(model.camera_names)):
+        known = inquest.noise_of_views[(model.camera_of == c) & np.isfinite(inquest.noise_of_views)]
+        out.append(float(np.median(known)) if len(known) else 1.0)
+    return out
 
 
 def _calibration_px(

@@ -26,6 +26,8 @@ AHEAD = 12.0  # of 2 ln(evidence): so far behind the best (1 : 400) another faul
 LINEAR_SHARE = 0.005
 MOST_FAULTS = 3  # named at once: where more seem wrong, the whole rig wants calibrating
 MOST_RIVALS = 2  # named beside the best
+_LEAST_OWN = 10.0  # degrees of freedom of a view: of fewer its noise is not told
+LASTING_FRAMES = 2.0  # frames that count as one: white noise gives 1.0 to 1.2 in 300 frames
 _SEEN = 1e-10  # of the largest eigenvalue: combinations of numbers that show less show by rounding only
 
 
@@ -64,6 +66,17 @@ class Inquest:
     noise: float  # the same of what no constant fault could explain: how far the sigmas are from true
     correlation_frames: float  # how many of the frames used count as one
     unexplained: bool  # whether something is significant beyond what was named
+    noise_of_views: Array  # (n,) as `noise`, of each view; nan where it was not seen, or the poses follow it
+
+    @property
+    def excess_noise(self) -> float:
+        """How much larger than claimed the errors are that no fault of the rig makes; 1 where the claims hold."""
+        return max(self.noise, 1.0) if np.isfinite(self.noise) else 1.0
+
+    @property
+    def lasts(self) -> bool:
+        """Whether what no constant fault explains stays the same over several frames, as noise does not."""
+        return self.correlation_frames > LASTING_FRAMES
 
 
 def inquire(lin: Linearised, columns: Array, covariance: Array, faults: Sequence[Fault]) -> Inquest:
@@ -81,6 +94,9 @@ def inquire(lin: Linearised, columns: Array, covariance: Array, faults: Sequence
     noise2 = float(np.sum((left - fitted) ** 2)) / rest_dof if rest_dof > 0 else 1.0
     series = np.where(lin.used[..., None], left - fitted, np.nan).reshape(len(left), -1)
     together = correlation_time(series)
+    own = np.einsum("knii->n", lin.own_share()) * rest_dof / dof if rest_dof > 0 else np.zeros(lin.used.shape[1])
+    squares = np.sum((left - fitted) ** 2, axis=(0, 2))
+    noise_of_views = np.where(own > _LEAST_OWN, np.sqrt(squares / np.where(own > _LEAST_OWN, own, 1.0)), np.nan)
     # Sigmas claimed too small, or errors that last, make chance larger than it is told; smaller it is not believed.
     chance = max(noise2, 1.0) * together
     root = np.linalg.cholesky(chance * np.eye(len(y)) + X @ covariance @ X.T)
@@ -95,6 +111,7 @@ def inquire(lin: Linearised, columns: Array, covariance: Array, faults: Sequence
         misfit=float(np.sqrt(chi2 / dof)) if dof > 0 else float("nan"),
         noise=float(np.sqrt(noise2)),
         correlation_frames=together,
+        noise_of_views=noise_of_views,
         unexplained=after.p_value < P_FALSE_ALARM and after.chi2 - after.dof > LINEAR_SHARE * start.chi2,
     )
 

@@ -2,17 +2,43 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from geometry.arrays import Array, Bools
+from geometry.arrays import Array, Bools, Ints
 from geometry.pose import Pose
 from lab.model_check.recording import Recording
+from tracking.detections import Detections
+from tracking.match import UNMATCHED
+from tracking.parameters import TrackerParameters
 from tracking.tracked_frame import TrackedFrame
 
 MOST_KEPT = 2000  # frames; as many as the statistics use
 BLOCK = 3  # neighbouring frames are kept together: they tell how fast the spots move
+
+
+def claimed_covariances(
+    tracked: TrackedFrame, found: Sequence[Detections | None], camera_of: Ints, parameters: TrackerParameters
+) -> Array:
+    """Covariances (n, 2, 2), px^2, of the n views' measurements as the detections state them.
+
+    The tracker's own (`TrackedFrame.cov_px2`) are widened by the noise scale that it has learnt. Residuals divided by
+    those are near 1 whatever is wrong with the rig, so a test of the rig needs these. The error that the parameters
+    state for the model, and for a detection that a neighbour has pulled, is added. Views without a detection keep the
+    tracker's. camera_of (n,): of each view, index into `found`.
+    """
+    out = tracked.cov_px2.copy()
+    model = parameters.sigma_model_px**2 * np.eye(2)
+    for view in np.flatnonzero(tracked.point != UNMATCHED):
+        points = found[int(camera_of[view])]
+        if points is None:
+            continue
+        out[view] = points.cov_px2[tracked.point[view]] + model
+        if tracked.witness is not None and not tracked.witness[view]:
+            out[view] += (parameters.blend_px / 2) ** 2 * np.eye(2)
+    return out
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,16 +91,27 @@ class FrameKeeper:
             self._frames = [self._frames[i] for i in kept]
             self._numbers = [self._numbers[i] for i in kept]
 
-    def add_tracked(self, t_s: float, tracked: TrackedFrame, predicted_cov_px2: Array | None = None) -> None:
-        """The next frame as a tracker or a smoother tells it: seen is what it measured.
+    def add_tracked(
+        self,
+        t_s: float,
+        tracked: TrackedFrame,
+        predicted_cov_px2: Array | None = None,
+        claimed_px2: Array | None = None,
+    ) -> None:
+        """The next frame as a tracker or a smoother reports it: seen is what it measured.
 
-        predicted_cov_px2 (n, 2, 2): what it claimed of its prediction; without it there is no NIS.
+        predicted_cov_px2 (n, 2, 2): what it claimed of its prediction; without it there is no NIS. claimed_px2
+        (n, 2, 2): see `claimed_covariances`; without it the tracker's covariances are taken for the claims.
         """
+        seen = np.array([status.measured for status in tracked.status], dtype=np.bool_)
+        if claimed_px2 is not None and predicted_cov_px2 is not None:
+            # An innovation is judged by all that the tracker claims of it, its learnt noise scale included.
+            predicted_cov_px2 = predicted_cov_px2 + tracked.cov_px2 - claimed_px2
         self.add(
             t_s,
-            np.array([status.measured for status in tracked.status], dtype=np.bool_),
+            seen,
             tracked.uv_px,
-            tracked.cov_px2,
+            tracked.cov_px2 if claimed_px2 is None else claimed_px2,
             tracked.pose,
             tracked.predicted_px,
             predicted_cov_px2,

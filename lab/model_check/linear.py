@@ -57,6 +57,11 @@ class Linearised:
         A = self.A.reshape(len(rows), -1, 6)
         return np.asarray((flat - A @ self.to_pose(rows).reshape(len(rows), 6, -1)).reshape(rows.shape))
 
+    def own_share(self) -> Array:
+        """I - H_ii (K, n, 2, 2): what of each view's error the poses do not follow; 0 for views that are not used."""
+        own = np.eye(2) - self.A @ (self.gain[:, None] @ np.swapaxes(self.A, -1, -2))
+        return np.where(self.used[..., None, None], own, 0.0)
+
     def weights(self) -> Array:
         """(I - H_ii)^-1 (K, n, 2, 2); nan where the others do not tell where the spot should be, or it is not used."""
         own = np.eye(2) - self.A @ (self.gain[:, None] @ np.swapaxes(self.A, -1, -2))

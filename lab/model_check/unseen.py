@@ -49,5 +49,5 @@ def unseen_finding(unseen: Unseen, model: SpotModel) -> Finding:
         " pose puts it well inside the picture",
         "its laser is off or hidden, or points so far elsewhere that its light is taken for clutter; the pose is made"
         " without it",
-        "Look at the pictures where that spot should be; then check its laser's mount, or calibrate the beams anew.",
+        "Look at the pictures where that spot should be; then check its laser's mount, or calibrate the beams again.",
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -15,13 +15,18 @@ from lab.report.svg import plus_minus, short
 
 MATTERS_SIGMAS = 0.5  # of a pose's claimed sigmas, or of a spot's: a bias below it is lost in what is claimed anyway
 WRONG_SIGMAS = 5.0  # beyond it the run's claims are untrue; the misfit gate's limit is the same (lab/quality.py)
+NOISY = 1.5  # factor on the claimed sigmas from which it is reported; the limit of lab/quality.py
+UNEVEN = 1.5  # the largest over the smallest factor of the cameras, from which each is named
+# Of the squared misfit: what a linear fit may leave of a fault in one camera. Measured: a camera 10 and 30 ms late in a
+# motion with bends leaves 0.5 and 0.9 %.
+_NOT_LINEAR = 0.02
 _ONE_FRAME = 0.1  # of a frame interval: as near as this to a whole number of them, frames are counted wrong
 
 _CURES = {
-    f.CAMERA: "Look for a knocked or loose mount, focus or zoom ring of that camera; fix it, run `calibrate daily` to"
-    " make sure, then find its place anew (`calibrate rig`).",
-    f.SCREEN: "Measure where that screen is (`calibrate screen`), then calibrate the rig anew.",
-    f.BEAM: "Check that laser's mount on the vehicle, then calibrate the beams anew (`calibrate beams`).",
+    f.CAMERA: "Look for a knocked or loose mount, focus or zoom ring of that camera; fix it, run `calibrate check` to"
+    " make sure, then find its place again (`calibrate rig`).",
+    f.SCREEN: "Measure where that screen is (`calibrate screen`), then calibrate the rig again.",
+    f.BEAM: "Check that laser's mount on the vehicle, then calibrate the beams again (`calibrate beams`).",
     f.VIEW: "Look at that spot in the pictures: a reflection, an edge of the screen or a wrong label; then at its"
     " laser.",
     f.CLOCK: "Check trigger cable, exposure settings and frame numbers of the cameras: one number must be one instant.",
@@ -37,7 +42,7 @@ def level_of(inquest: Inquest, effects: Sequence[Effect]) -> Level:
     def worst(sigmas: float) -> list[bool]:
         return [e.pose_sigmas > sigmas or e.off_sigmas > sigmas for e in effects]
 
-    if inquest.misfit > WRONG_SIGMAS or all(worst(WRONG_SIGMAS)):
+    if _misfit_of_faults(inquest) > WRONG_SIGMAS or all(worst(WRONG_SIGMAS)):
         return Level.FAIL
     return Level.WARN if any(worst(MATTERS_SIGMAS)) else Level.PASS
 
@@ -64,14 +69,14 @@ def culprit_finding(
     things = list(dict.fromkeys(e.fault.thing for e in culprit.explanations))
     cure = " ".join(_CURES[t] for t in things) if level > Level.PASS else ""
     if culprit.rivals and level > Level.PASS:
-        way = "A new calibration of the beams" if things == [f.BEAM] else "A `calibrate daily` with marked points"
+        way = "A new calibration of the beams" if things == [f.BEAM] else "A `calibrate check` with marked points"
         cure += f" {way} tells the candidates apart."
     return Finding(level, what, _consequence(effects, level), cure)
 
 
 def unexplained_finding(inquest: Inquest) -> Finding:
     """What no single fault explains."""
-    level = Level.FAIL if inquest.misfit > WRONG_SIGMAS else Level.WARN
+    level = Level.FAIL if _misfit_of_faults(inquest) > WRONG_SIGMAS else Level.WARN
     alone = "" if not inquest.culprits else " beyond what is named above"
     return Finding(
         level,
@@ -79,8 +84,54 @@ def unexplained_finding(inquest: Inquest) -> Finding:
         f" p {p_text(inquest.p_after)}",
         f"they are {short(inquest.misfit, 2)} times what the spots' sigmas allow; the stated sigmas of the poses leave"
         " this out",
-        "Calibrate the rig anew; if that does not help, check lens models and the flatness of the screens.",
+        "Calibrate the rig again; if that does not help, check lens models and the flatness of the screens.",
     )
+
+
+def is_noisy(factor: float, misfit: float) -> bool:
+    """Whether errors are so much larger than claimed that it is reported.
+
+    misfit: with all faults included. Of a large fault the linear model leaves some in single cameras, which is no noise.
+    """
+    return factor > NOISY and factor**2 - 1 > _NOT_LINEAR * misfit**2
+
+
+def noise_finding(inquest: Inquest, of_cameras: Mapping[str, float], misfit: float) -> Finding | None:
+    """Errors larger than claimed that no fault of the rig explains; None where the claims hold well enough.
+
+    Noise changes from frame to frame; the poses' covariances are widened by it and stay right, so it is a warning
+    whatever its size. What lasts over frames is not averaged away as noise is, so it fails beyond WRONG_SIGMAS.
+    of_cameras: how much larger than claimed the errors of each are; misfit: of the claims, faults included.
+    """
+    factor = max(of_cameras.values())
+    if not is_noisy(factor, misfit):
+        return None
+    size = f"{short(factor, 2)} times as large as the sigmas of the detections"
+    uneven = factor > UNEVEN * min(of_cameras.values())
+    each = ", ".join(f"camera `{name}` {short(value, 2)}" for name, value in of_cameras.items())
+    where = f" ({each})" if uneven else ""
+    if inquest.lasts:
+        return Finding(
+            Level.FAIL if factor > WRONG_SIGMAS else Level.WARN,
+            f"the spots' residuals are {size}{where}, last over about {inquest.correlation_frames:.0f} of the frames"
+            " used, and no constant change of a camera, screen, beam or clock explains them",
+            "errors that last do not average out over frames: the stated sigmas of the poses are too small",
+            "Check lens models, the flatness of the screens and the light (reflections, clipped spots); then calibrate"
+            " the rig again.",
+        )
+    return Finding(
+        Level.WARN,
+        f"the spots' residuals are {size}{where}; they are random, and no fault of the rig explains them",
+        "the sigmas of the detections are too small (speckle, vibration within an exposure, or sigmas of another"
+        " program); the covariances of the poses are widened by this factor",
+        "State larger sigmas with the detections, or improve the light: larger or brighter spots, a shorter exposure,"
+        " a matt screen.",
+    )
+
+
+def _misfit_of_faults(inquest: Inquest) -> float:
+    """The misfit in units of the recording's own noise: what the rig, not the detections, is responsible for."""
+    return inquest.misfit / inquest.excess_noise
 
 
 def _consequence(effects: Sequence[Effect], level: Level) -> str:

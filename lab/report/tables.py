@@ -254,12 +254,15 @@ def label_words(m: Material) -> str:
     left_open = int((np.isfinite(m.spots.label_probability) & ~m.spots.measured).sum())
     counts = at(m.summary, "counts", "events")
     kinds = counts if isinstance(counts, dict) else {}
+    # Searches of the causal pass are events too, where the smoothing pass knows the vehicle throughout.
+    again = at(m.summary, "counts", "found_again")
+    again = kinds.get("reacquired") if again is None else again
     said = [
         (left_open, "left open: no label was likely enough to be given"),
-        (kinds.get("changed"), "changed by the second look, which knows what came after"),
+        (kinds.get("changed"), "changed by the smoothing pass, which knows what came after"),
         (kinds.get("tie"), "ties, in which two labellings were as likely"),
         (kinds.get("relabelled"), "times all spots were named anew in the midst of the track"),
-        (kinds.get("reacquired"), "times the vehicle was found again after it was lost"),
+        (again, "times the vehicle was found again after it was lost"),
     ]
     parts = [f"{count} {words}" for count, words in said if isinstance(count, int) and count]
     return f"Labels: {'; '.join(parts)}." if parts else ""
