@@ -220,13 +220,14 @@ def _corners(draw: Draw, kind: str) -> Scene | None:
     lab, noise = _usual_lab(draw), 0.01
     rng = draw.rng(scene.MOTION)
     hard = kind == "hard" or (kind == "hidden" and rng.random() < 0.5)
-    low, high = (120, 5000) if hard else (3, 25)  # in sigmas of the noise
+    low, high = (120, 6000) if hard else (3, 25)  # in sigmas of the noise
     bend = noise * float(np.exp(rng.uniform(np.log(low), np.log(high))))
-    made = _zigzag_with_bends(lab, rng, draw.frames, (12, 40), bend, 40.0)
+    made = _zigzag_with_bends(lab, rng, draw.frames, (8, 40), bend, 60.0)
     if made is None:
         return None
     q, corners = made
-    draft = Draft(draw, lab, q, 100.0, noise, _false(lab, beside=0.2), corners, f"corners, bend {bend:.2g} px")
+    rate = float(np.exp(rng.uniform(np.log(50), np.log(300))))
+    draft = Draft(draw, lab, q, rate, noise, _false(lab, beside=0.2), corners, f"corners, bend {bend:.2g} px")
     if kind == "hidden":
         _hide_across(draft, draw.rng(scene.NUISANCE), (3, 12), ("one", "two", "screen", "all"))
         draft.text += ", hidden across them"
@@ -281,7 +282,7 @@ def _three_left(draw: Draw) -> Scene | None:
     lab = _usual_lab(draw)
     rng = draw.rng(scene.MOTION)
     motion = motions.sines(rng, np.arange(draw.frames) / 50.0)
-    q = fitted_motion(lab, motion, draw_amplitudes(rng, lab), 20.0, 1.0)
+    q = fitted_motion(lab, motion, rng.uniform(1, 3) * draw_amplitudes(rng, lab), 30.0, 0.9)
     if q is None:
         return None
     noise = float(np.exp(rng.uniform(np.log(0.02), np.log(0.2))))
@@ -313,7 +314,7 @@ def _screen_corner(draw: Draw) -> Scene | None:
         return None
     q, corners = made
     noise = float(np.exp(rng.uniform(np.log(0.02), np.log(0.15))))
-    text = f"both spots of a screen hidden 16 draw.frames across corners of {bend:.2g} px"
+    text = f"both spots of a screen hidden 16 frames across corners of {bend:.2g} px"
     draft = Draft(draw, lab, q, 100.0, noise, replace(_false(lab), exactly=1), corners, text)
     _hide_across(draft, draw.rng(scene.NUISANCE), (16, 16), ("screen",), share=1.0)
     return draft.scene()
@@ -362,21 +363,21 @@ def _two_beams_25hz(draw: Draw) -> Scene | None:
 
 def _uniform(draw: Draw) -> Scene | None:
     rng = draw.rng(scene.LAB)
-    lab = (
-        fan_lab(rng, np.array([-10.0, 10.0]), 0.5, (800.0, 2500.0), "2 beams 20 deg apart")
-        if draw.seed % 2
-        else paper_lab()
-    )
+    if draw.seed % 2:
+        lab = fan_lab(rng, np.array([-10.0, 10.0]), 0.5, (800.0, 2500.0), "2 beams 20 deg apart")
+    else:
+        lab = paper_lab()
     rng = draw.rng(scene.MOTION)
-    bend = float(np.exp(rng.uniform(np.log(0.3), np.log(10))))
-    made = _zigzag_with_bends(lab, rng, draw.frames, (20, 70), bend, 20.0)
+    bend = float(np.exp(rng.uniform(np.log(0.3), np.log(30))))
+    made = _zigzag_with_bends(lab, rng, draw.frames, (20, 70), bend, 30.0)
     if made is None:
         return None
     q, corners = made
     if rng.random() < 0.3:  # at rest from some corner on
         k = int(corners[int(rng.integers(len(corners)))]) + 1
         q[k:] = q[k]
-    return Draft(draw, lab, q, 200.0, 0.012, _false(lab), corners, f"uniform between bends of {bend:.2g} px").scene()
+    false = _false(lab, beside=float(rng.choice([0.0, 0.2])))
+    return Draft(draw, lab, q, 200.0, 0.012, false, corners, f"uniform between bends of {bend:.2g} px").scene()
 
 
 def _quiet_then_turn(draw: Draw) -> Scene | None:
@@ -389,7 +390,7 @@ def _quiet_then_turn(draw: Draw) -> Scene | None:
     q = fitted_motion(lab, motion, 2 * draw_amplitudes(rng, lab), 20.0, 0.9)
     if q is None:
         return None
-    text = f"rest, then an eased turn over {length:.0f} draw.frames from {start:.0f} on"
+    text = f"rest, then an eased turn over {length:.0f} frames from {start:.0f} on"
     return Draft(draw, lab, q, 401.0, 0.011, _false(lab, beside=0.2), motion.corners_s, text).scene()
 
 
