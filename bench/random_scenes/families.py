@@ -151,12 +151,18 @@ def _false(lab: Lab, beside: float = 0.0, anywhere: float = 0.0) -> FalsePoints:
 def _corners_between(rng: np.random.Generator, frames: int, apart: tuple[float, float]) -> tuple[Array, Motion]:
     """A zig-zag over `frames` with corners so many frames apart, at random moments between frames.
 
-    Returns the corners in frames and the motion over times in frames.
+    In half of the scenes it goes from one random place to the next, in the others back and forth at one speed. Returns
+    the corners in frames and the motion over times in frames.
     """
     corners = [-rng.uniform(1, apart[0])]
     while corners[-1] < frames:
         corners.append(corners[-1] + rng.uniform(*apart))
-    values = rng.uniform(-1, 1, (len(corners), 6))
+    if rng.random() < 0.5:
+        values = rng.uniform(-1, 1, (len(corners), 6))
+    else:
+        pieces = np.diff(corners, prepend=corners[0]) * (-1.0) ** np.arange(len(corners))
+        path = np.cumsum(pieces) - np.mean(np.cumsum(pieces))
+        values = path[:, None] / np.abs(path).max() * rng.uniform(-1, 1, 6)
     t = np.arange(frames, dtype=float)
     shape = np.stack([np.interp(t, corners, v) for v in values.T], axis=-1)
     inside = np.array([c for c in corners if 3 < c < frames - 3])
