@@ -1,6 +1,6 @@
 """`python -m bench.random_scenes --seeds 1:301`: random scenes through the program, and how many are clean.
 
-One scene to look at: `--seeds N:N+1 -v`, and `--keep DIR` writes its run folder.
+One scene to look at: `--seeds N -v`, and `--keep DIR` writes its run folder. `--family NAME`: see families.py.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from multiprocessing import get_context
 from pathlib import Path
 
 from bench.random_scenes.answers import answers_in_memory, answers_through_files
+from bench.random_scenes.families import FAMILIES, family_scene
 from bench.random_scenes.judge import Judgement, judge
 from bench.random_scenes.oracle import ask_oracle
 from bench.random_scenes.report import crashed, details, summary, write_rows
@@ -27,14 +28,17 @@ class Job:
     """One scene to run."""
 
     seed: int
-    frames: int
+    frames: int | None
+    family: str | None
     through_files: bool
     keep: Path | None
 
 
 def make_scene(job: Job) -> Scene:
     """The scene of a job."""
-    return random_scene(job.seed, job.frames)
+    if job.family is not None:
+        return family_scene(job.family, job.seed, job.frames)
+    return random_scene(job.seed) if job.frames is None else random_scene(job.seed, job.frames)
 
 
 def judged(job: Job) -> Judgement:
@@ -73,14 +77,15 @@ def main() -> None:
     """Run the seeds and print the summary."""
     parser = argparse.ArgumentParser(prog="bench.random_scenes", description=__doc__)
     parser.add_argument("--seeds", type=seed_range, default=range(1, 301), metavar="A:B", help="default 1:301")
-    parser.add_argument("--frames", type=int, default=200)
+    parser.add_argument("--family", choices=list(FAMILIES), help="one difficulty instead of everything at random")
+    parser.add_argument("--frames", type=int, help="default 200; each family has its own")
     parser.add_argument("--jobs", type=int, default=1, help="processes (default 1)")
     parser.add_argument("--out", type=Path, help="a CSV file with a row per scene")
     parser.add_argument("--through-files", action="store_true", help="write run folders and process those")
     parser.add_argument("--keep", type=Path, metavar="DIR", help="write each scene's run folder there")
     parser.add_argument("-v", "--verbose", action="store_true", help="all figures of every scene")
     a = parser.parse_args()
-    jobs = [Job(s, a.frames, a.through_files, a.keep) for s in a.seeds]
+    jobs = [Job(s, a.frames, a.family, a.through_files, a.keep) for s in a.seeds]
     rows: list[Judgement] = []
     for row in run_all(jobs, a.jobs):
         rows.append(row)
@@ -90,6 +95,8 @@ def main() -> None:
             print(f"\r{len(rows)} of {len(jobs)}", end="", file=sys.stderr, flush=True)
     if a.out is not None:
         write_rows(rows, a.out)
+    if a.family is not None:
+        print(f"family {a.family}; goal: {FAMILIES[a.family].goal}")
     print(summary(rows))
 
 

@@ -6,7 +6,7 @@ import contextlib
 import tempfile
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,15 +21,17 @@ from lab.frames import FrameSet
 from lab.model_check.check import check_kept
 from lab.model_check.keeper import FrameKeeper
 from lab.pictures import DROPPED, Missing
-from lab.pipeline import FrameRecord, Pipeline, tracker_of
+from lab.pipeline import FrameRecord, Pipeline, Tracker, tracker_of
 from lab.results import read_poses, read_spots
 from lab.run_file import Run
 from lab.tables import TableWriter
 from lab.times import Times
 from lab.two_passes import TwoPasses
+from tracking.detections import Detections
 from tracking.match import UNMATCHED
 from tracking.parameters import TrackerParameters
 from tracking.statuses import PoseStatus
+from tracking.tracked_frame import TrackedFrame
 
 LOST, PREDICTED, MEASURED = range(3)
 _STATUS = {PoseStatus.LOST: LOST, PoseStatus.PREDICTED: PREDICTED, PoseStatus.MEASURED: MEASURED}
@@ -57,7 +59,32 @@ class Answers:
     warnings: tuple[str, ...]  # numeric ones, each text once
     warnings_count: int
     ms_per_frame: float  # process time, tracking and smoothing
+    ms_causal: float  # of the causal pass, median over frames ...
+    ms_slowest: float  # ... and of its slowest frame
     rounds: int  # of smoothing
+
+
+class TimedTracker:
+    """A tracker whose steps are timed."""
+
+    def __init__(self, tracker: Tracker) -> None:
+        self._tracker = tracker
+        self.ms: list[float] = []
+
+    @property
+    def noise_scale(self) -> float:
+        """The tracker's own."""
+        return self._tracker.noise_scale
+
+    def step(self, dt_s: float, found: Sequence[Detections | None]) -> TrackedFrame:
+        """One frame."""
+        start = time.process_time()
+        tracked = self._tracker.step(dt_s, found)
+        self.ms.append((time.process_time() - start) * 1e3)
+        return tracked
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self._tracker, name)
 
 
 class PointReader:
@@ -99,7 +126,8 @@ def answers_in_memory(scene: Scene, parameters: TrackerParameters | None = None)
     causal: list[FrameRecord] = []
     with _recorded_warnings() as caught, tempfile.TemporaryDirectory() as name:
         work = Path(name)
-        pipeline = Pipeline(run, PointReader(scene), tracker_of(run, run.prior), {})  # type: ignore[arg-type]
+        tracker = TimedTracker(tracker_of(run, run.prior))  # type: ignore[arg-type]
+        pipeline = Pipeline(run, PointReader(scene), tracker, {})  # type: ignore[arg-type]
         tally = process._Tally(tuple(run.rig.cameras), views)
         passes, keeper = TwoPasses(pipeline, work), FrameKeeper()
         start = time.process_time()
@@ -123,6 +151,8 @@ def answers_in_memory(scene: Scene, parameters: TrackerParameters | None = None)
         tuple(dict.fromkeys(caught)),
         len(caught),
         seconds / len(scene) * 1e3,
+        float(np.median(tracker.ms)),
+        float(np.max(tracker.ms)),
         passes.smoothing.iterations if passes.smoothing is not None else 0,
     )
 
@@ -137,7 +167,7 @@ def answers_through_files(scene: Scene, run_folder: Path) -> Answers:
         smoothed = _pass_of_files(scene, out, causal=False)
     return Answers(
         smoothed, None, outcome.exit_status, outcome.verdict.reasons, tuple(dict.fromkeys(caught)), len(caught),
-        seconds / len(scene) * 1e3, 0,
+        seconds / len(scene) * 1e3, float("nan"), float("nan"), 0,
     )  # fmt: skip
 
 

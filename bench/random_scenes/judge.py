@@ -64,6 +64,8 @@ class PassFigures:
     wrong_predicted: int
     beyond_6: int  # poses of which one of the six components is off by more than 6 of its sigmas
     not_definite: int  # covariances that are not positive definite
+    first_labels: int  # the first frame with a label; -1: none ...
+    first_wrong: int  # ... and how many of its labels are wrong
     locked_in: int  # the first frame with a measured pose that is not confidently wrong; -1: none
     worst_deg: float  # largest attitude error of a measured pose
     worst_m: float
@@ -86,7 +88,9 @@ class Judgement:
     reasons: str
     warnings: int
     first_warning: str
-    ms_per_frame: float
+    ms_per_frame: float  # process time of both passes
+    ms_causal: float
+    ms_slowest: float
     rounds: int
     text: str
 
@@ -121,6 +125,8 @@ def judge(scene: Scene, oracle: Oracle, answers: Answers) -> Judgement:
         warnings=answers.warnings_count,
         first_warning=answers.warnings[0] if answers.warnings else "",
         ms_per_frame=answers.ms_per_frame,
+        ms_causal=answers.ms_causal,
+        ms_slowest=answers.ms_slowest,
         rounds=answers.rounds,
         text=scene.text,
     )
@@ -135,6 +141,7 @@ def figures(scene: Scene, answer: Pass) -> PassFigures:
     measured, predicted = answer.status == MEASURED, answer.status == PREDICTED
     good = known & ~np.isnan(nees)
     off = nees > CONFIDENTLY_WRONG
+    labelled = np.flatnonzero(answer.labelled.any(axis=1))
     locked = np.flatnonzero(measured & good & ~off)
     delta = scene.poses.minus(answer.poses)
     with np.errstate(invalid="ignore"):
@@ -158,6 +165,8 @@ def figures(scene: Scene, answer: Pass) -> PassFigures:
         wrong_predicted=int((off & predicted).sum()),
         beyond_6=int((known & ~(components <= 6.0)).sum()),
         not_definite=int((known & np.isnan(nees)).sum()),
+        first_labels=int(labelled[0]) if labelled.size else -1,
+        first_wrong=int(wrong[labelled[0]].sum()) if labelled.size else 0,
         locked_in=int(locked[0]) if locked.size else -1,
         worst_deg=float(np.rad2deg(np.linalg.norm(delta[measured, 3:], axis=1)).max(initial=0.0)),
         worst_m=float(np.linalg.norm(delta[measured, :3], axis=1).max(initial=0.0)),

@@ -70,7 +70,7 @@ def rest_then_motion(rng: np.random.Generator, t_s: Array) -> Motion:
         text = f"rest, then a swing of {hz:.2g} Hz"
     if how == 2:
         ease = rng.uniform(0.05, 0.6) * (t_s[-1] - start)
-        shape = shape * _smooth_step(since / ease)[:, None]
+        shape = shape * smooth_step(since / ease)[:, None]
         text += ", eased"
     return Motion(shape, np.array([start]), text)
 
@@ -86,7 +86,7 @@ def excursions(rng: np.random.Generator, t_s: Array) -> Motion:
         out, stay, back = frame_s * np.exp(rng.uniform(np.log([3, 1, 3]), np.log([40, 30, 40])))
         times = np.cumsum([at, out, stay, back])
         level = np.interp(t_s, times, [0, 1, 1, 0])
-        shape += (level if abrupt else _smooth_step(level))[:, None] * rng.uniform(-1, 1, 6)
+        shape += (level if abrupt else smooth_step(level))[:, None] * rng.uniform(-1, 1, 6)
         corners += times.tolist()
         at = times[-1] + rng.uniform(5, 60) * frame_s
     return Motion(shape, np.array([c for c in corners if c < t_s[-1]]), f"excursions{', abrupt' * abrupt}")
@@ -112,7 +112,7 @@ def steps(rng: np.random.Generator, t_s: Array) -> Motion:
         path = np.full(len(t_s), levels[-1])
         for a, b, u, v in zip(times[1::2], times[2::2], levels[1::2], levels[2::2], strict=True):
             now = (t_s >= a) & (t_s < b)
-            path[now] = u + (v - u) * _smooth_step((t_s[now] - a) / (b - a))
+            path[now] = u + (v - u) * smooth_step((t_s[now] - a) / (b - a))
         for b, a, u in zip([0.0, *times[2::2]], [*times[1::2], np.inf], levels[::2], strict=True):
             path[(t_s >= b) & (t_s < a)] = u
     corners = np.array([c for c in times[1:] if c < t_s[-1]])
@@ -130,7 +130,12 @@ def rest(rng: np.random.Generator, t_s: Array) -> Motion:
     return Motion(np.zeros((len(t_s), 6)) + rng.uniform(-1, 1, 6), np.zeros(0), "at rest")
 
 
-def _smooth_step(x: Array) -> Array:
+def slow(rng: np.random.Generator, t_s: Array) -> Motion:
+    """Sines slower than 0.2 Hz."""
+    return Motion(_sines(rng, t_s, float(rng.uniform(0.02, 0.1))), np.zeros(0), "slow")
+
+
+def smooth_step(x: Array) -> Array:
     """0 below 0, 1 above 1, and between them x^3 (10 - 15 x + 6 x^2), whose second derivative is continuous."""
     x = np.clip(x, 0, 1)
     return np.asarray(x**3 * (10 - 15 * x + 6 * x**2))

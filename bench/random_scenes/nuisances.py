@@ -21,12 +21,14 @@ class FalsePoints:
     anywhere: float  # mean number anywhere in each picture, at most MOST_ANYWHERE
     reflections: tuple[Array, ...]  # by camera (m, 2), px: points that stay where they are
     reflection_seen: float = 0.97  # probability in each frame
+    exactly: int | None = None  # so many anywhere in each picture, in place of the mean
 
     @property
     def text(self) -> str:
         """In a few words."""
         parts = [f"clutter {self.beside:.0%}"] if self.beside else []
         parts += [f"{self.anywhere:.1f} anywhere"] if self.anywhere else []
+        parts += [f"{self.exactly} anywhere"] if self.exactly else []
         many = sum(map(len, self.reflections))
         parts += [f"{many} static"] if many else []
         return ", ".join(parts) or "no false points"

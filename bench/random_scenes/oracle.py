@@ -27,7 +27,7 @@ class Oracle:
     solvable: Bools  # (T,) the frame's own spots give a pose
     nees: Array  # (T,) of that pose; nan without
     tie: bool  # the first frame admits another pose within the prior
-    first_solvable: bool
+    first_solvable: bool  # or they need not be
 
     @property
     def counts(self) -> bool:
@@ -63,7 +63,7 @@ def ask_oracle(scene: Scene) -> Oracle:
         solvable[k], nees[k] = True, float(d @ np.linalg.solve(fit.covariance, d))
     spots = [len(np.unique(scene.spot_of[shining[k]])) for k in range(FIRST_FRAMES)]
     first = bool(solvable[:FIRST_FRAMES].all() and min(spots) >= LEAST_SPOTS)
-    return Oracle(solvable, nees, first and _ties(scene, model), first)
+    return Oracle(solvable, nees, first and _ties(scene, model), first or scene.late_start)
 
 
 def measured_pixels(scene: Scene, k: int) -> Array:

@@ -24,7 +24,8 @@ def nothing() -> PassFigures:
     return PassFigures(
         identity=0.0, countable=0, wrong=0, near=0, measured=0, predicted=0, lost=0, nees=nan, nees_median=nan,
         nees_measured=nan, nees_predicted=nan, nees_max=nan, poses=0, coverage=nan, wrong_measured=0,
-        wrong_predicted=0, beyond_6=0, not_definite=0, locked_in=-1, worst_deg=nan, worst_m=nan,
+        wrong_predicted=0, beyond_6=0, not_definite=0,
+        first_labels=-1, first_wrong=0, locked_in=-1, worst_deg=nan, worst_m=nan,
     )  # fmt: skip
 
 
@@ -33,7 +34,7 @@ def crashed(scene: Scene, oracle: Oracle, trace: str) -> Judgement:
     return Judgement(
         scene.seed, oracle.counts, oracle.why_not, ("crash",), nothing(), None, float("nan"),
         float(oracle.solvable.mean()), int(oracle.solvable.sum()), 1, trace.strip().splitlines()[-1], 0, trace,
-        float("nan"), 0, scene.text,
+        float("nan"), float("nan"), float("nan"), 0, scene.text,
     )  # fmt: skip
 
 
@@ -94,7 +95,8 @@ def summary(rows: Sequence[Judgement]) -> str:
     outside = int(np.sum(~((ratio >= 0.6) & (ratio <= 1.6))))
     out.append(f"smoothed NEES/6 outside .6 to 1.6: {outside} = {outside / n:.1%}")
     out.append(f"oracle NEES/6: {_quantiles(np.array([r.oracle_nees for r in counted]))}")
-    out.append(f"process time: {_quantiles(np.array([r.ms_per_frame for r in counted]))} ms per frame")
+    for what, field in (("both passes", "ms_per_frame"), ("causal", "ms_causal"), ("slowest frame", "ms_slowest")):
+        out.append(f"process time, {what}: {_quantiles(np.array([getattr(r, field) for r in counted]))} ms")
     out.append(f"rounds of smoothing: {dict(sorted(Counter(r.rounds for r in counted).items()))}")
     out.append("classes (leading | anywhere):")
     leading = Counter(r.failure for r in counted)
@@ -163,7 +165,11 @@ def _distributions(figures: Sequence[PassFigures]) -> list[str]:
         f"frames measured {of('measured').sum():.0f}, predicted {of('predicted').sum():.0f},"
         f" lost {of('lost').sum():.0f}",
         f"locked in frame: {_quantiles(np.where(of('locked_in') < 0, np.nan, of('locked_in')))};"
+        f" within 3 frames {int(np.sum((of('locked_in') >= 0) & (of('locked_in') <= 3)))} of {len(figures)},"
         f" never {int(np.sum(of('locked_in') < 0))}",
+        f"first labels: right in {int(np.sum((of('first_labels') >= 0) & (of('first_wrong') == 0)))},"
+        f" with wrong ones in {int(np.sum(of('first_wrong') > 0))}, none in {int(np.sum(of('first_labels') < 0))};"
+        f" in frame 0: {int(np.sum(of('first_labels') == 0))}",
     ]
 
 

@@ -52,6 +52,7 @@ class Scene:
     origin: tuple[tuple[Ints, ...], ...]  # [frame][camera] (rows,): the view that each point is of, or CLUTTER
     corner_frames: Array  # (k,) where the motion has corners, in frames and fractions
     text: str
+    late_start: bool = False  # the first frames need not give a pose
     camera_of: Ints = field(init=False)  # (n,)
     spot_of: Ints = field(init=False)  # (n,)
 
@@ -198,7 +199,8 @@ def _one_picture(
     chosen = mine[rng.random(len(mine)) < false.beside]
     turn, radius = rng.uniform(0, 2 * np.pi, len(chosen)), np.sqrt(rng.uniform(low**2, high**2, len(chosen)))
     beside = uv[chosen] + radius[:, None] * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
-    anywhere = rng.uniform(-0.5, size - 0.5, (min(int(rng.poisson(false.anywhere)), MOST_ANYWHERE), 2))
+    drawn = min(int(rng.poisson(false.anywhere)), MOST_ANYWHERE)
+    anywhere = rng.uniform(-0.5, size - 0.5, (drawn if false.exactly is None else false.exactly, 2))
     static = false.reflections[camera]
     static = static[rng.random(len(static)) < false.reflection_seen]
     false_uv = np.concatenate([beside, anywhere, static])
