@@ -9,6 +9,7 @@ parts are in motion.py, association.py, hypotheses.py.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -20,10 +21,10 @@ from geometry.rig import Rig
 from geometry.rig_parameters import RigCovariance
 from geometry.solve import SolveLimits, fit_pose
 from geometry.spots import SpotModel
-from tracking.association import BLENDED, Chances, Frame, Sights
+from tracking.association import BLENDED, Chances, Frame, Sights, crowding, log_chance
 from tracking.detections import Detections
 from tracking.digest import Digest, ahead, digest, surprise
-from tracking.hiding import MISSED, learnt, together
+from tracking.hiding import MISSED, later, learnt, marginal, together
 from tracking.hypotheses import (
     PROOF,
     Children,
@@ -36,9 +37,10 @@ from tracking.hypotheses import (
     sift,
 )
 from tracking.information import fit_alone
-from tracking.labels import NO_POINT, LabelResult, PosePrior, find_labels
+from tracking.labels import NO_POINT, Labelling, PosePrior, candidate_labellings, find_labels
 from tracking.match import UNMATCHED
 from tracking.misfit import Misfit
+from tracking.motion import predicted
 from tracking.parameters import TrackerParameters
 from tracking.static_points import FADES, no_places
 from tracking.static_points import learn as learn_static
@@ -59,6 +61,10 @@ LONG_UNMEASURED = 10  # frames without a measured pose, after which two missing 
 SEARCH_AT = (2, 4, 8, 14)  # frames in a row that contradict the hypothesis
 DOUBT_FRAMES = 50  # in a row with fewer: then they are doubted
 NOWHERE = (SpotStatus.LOST, SpotStatus.OFF_SCREEN)
+YOUNG = 5  # frames after a search found the vehicle: until then its velocities may be known to next to nothing
+MOST_LINKED, MOST_CANDIDATES = 3, 4  # hypotheses that a search's answers continue, and answers
+FARTHEST_M, FARTHEST_RAD = 1.5, np.deg2rad(60.0)  # of a search from the last pose: beyond it a fan looks like itself
+STATIC_LOG_DENSITY = -4.0  # 1/px^2: a point where static ones are denser is left out of a search
 SIZE_GAIN = 0.1  # of one frame, for how wide a spot usually is
 VAGUE_PX = 15.0  # 1 sigma of a predicted spot: beyond it the whole picture is searched at once
 
@@ -95,6 +101,7 @@ class RigidTracker:
         self._doubts = 0  # frames in a row that contradict the best hypothesis
         self._few = 0  # frames in a row with fewer than FEW spots
         self._searches = 0  # in a row without success
+        self._since_found = 0  # frames since a search found the vehicle
         self._told_tie = False
         self._begun = False
 
@@ -129,8 +136,9 @@ class RigidTracker:
             )
         predicted = self._predicted_px(dt_s)
         fresh: dict[int, str] = {}
-        if self._should_search(children, count, found):
-            count = self._search(children, count, frame, found, events, fresh)
+        self._since_found += 1
+        if self._should_search(children, count, found, dt_s):
+            count = self._search(children, count, frame, found, dt_s, events, fresh)
         if count == 0:
             return self._nothing(found, predicted, events)
         staying, places, certain, spread = sift(children, count)
@@ -157,24 +165,27 @@ class RigidTracker:
             uv, cov, blend = np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0)
         has_image = np.array([f is not None for f in found])
         static = log_static_density(self._static, uv, cov, first)
-        log_clutter = self._clutter.log_density(first)
-        return Frame(uv, cov, blend, first, has_image, log_clutter, static, major, self._usual_px)
+        log_clutter, crowded = self._clutter.log_density(first)
+        return Frame(uv, cov, blend, first, has_image, log_clutter, static, major, self._usual_px, crowded)
 
     # -- labels from a prior alone ------------------------------------------------------------------------------------
 
-    def _should_search(self, children: Children, count: int, found: Sequence[Detections | None]) -> bool:
-        """Whether to look for the whole vehicle: enough points are there, and no hypothesis explains them."""
+    def _should_search(self, children: Children, count: int, found: Sequence[Detections | None], dt_s: float) -> bool:
+        """Whether to look for the whole vehicle: enough points are there, and no hypothesis explains them for sure."""
         if sum(len(f) for f in found if f is not None) < self.parameters.labels.min_spots:
             return False
         if self._hypotheses is not None and count:
             best = int(np.argmax(children.after.weight[:count]))
-            if np.count_nonzero(children.assigned[best] >= 0) >= FEW:
+            explained = np.count_nonzero(children.assigned[best] >= 0) >= FEW
+            young = self._since_found <= YOUNG
+            vague = (young or not explained) and self._vague(self._hypotheses, dt_s)
+            if explained and not vague:
                 self._few = 0
                 return False
-            self._few += 1
-            if self._contradicted(children, best, found) and (self._doubts in SEARCH_AT or self._doubts % 20 == 0):
-                return True
-            if not self._vague(self._hypotheses):
+            if not vague:
+                self._few += 1
+                if self._contradicted(children, best, found):
+                    return self._doubts in SEARCH_AT or self._doubts % 20 == 0
                 # Few spots where the motion is known are mostly hidden ones; seldom they are false points.
                 return self._few % DOUBT_FRAMES == 0
         # At once when light returns, then ever more rarely: what fails for long will fail in the next frame too.
@@ -193,10 +204,19 @@ class RigidTracker:
         self._doubts = self._doubts + 1 if against else 0
         return against
 
-    def _vague(self, hypotheses: Hypotheses) -> bool:
-        _, J = project_all(self.model.numbers, hypotheses.R[:1], hypotheses.t[:1])
-        spread = J[0] @ hypotheses.P[0, :6, :6] @ np.swapaxes(J[0], -1, -2)
+    def _vague(self, hypotheses: Hypotheses, dt_s: float) -> bool:
+        """Whether the best hypothesis predicts some spot of this frame worse than VAGUE_PX."""
+        R, t, _, P, _ = self._predicted(hypotheses, 0, dt_s, manoeuvre=False)
+        _, J = project_all(self.model.numbers, R[None], t[None])
+        spread = J[0] @ P[:6, :6] @ np.swapaxes(J[0], -1, -2)
         return bool(np.sqrt(np.max(spread[:, [0, 1], [0, 1]])) > VAGUE_PX)
+
+    def _predicted(self, h: Hypotheses, k: int, dt_s: float, manoeuvre: bool) -> tuple[Array, Array, Array, Array, Array]:
+        """Hypothesis k of the frame before, in this frame."""
+        dynamics = self.temper.dynamics
+        none = np.zeros(2)
+        jump, unsteady = (dynamics.jump, dynamics.unsteady) if manoeuvre else (none, none)
+        return predicted(h.R[k], h.t[k], h.m[k], h.P[k], dt_s, dynamics.jerk, jump, unsteady)
 
     def _search_prior(self) -> PosePrior:
         """Around the last measured pose, as far as the vehicle may have got since; before there is one, the run's."""
@@ -204,10 +224,12 @@ class RigidTracker:
             return self.prior
         p, age = self.parameters, self._anchor_age_s
         speed, rate = self.temper.fastest + np.array([p.reacquire_m_s, np.deg2rad(p.reacquire_deg_s)])
+        if self._since_found <= YOUNG:  # how fast it moves is not known yet
+            speed, rate = max(speed, 3 * FIRST_SPEED), max(rate, 3 * FIRST_RATE)
         return PosePrior(
             self._anchor,
-            min(0.05 + speed * age, max(1.0, self.prior.within_m)),
-            min(np.deg2rad(3.0) + rate * age, max(np.deg2rad(45.0), self.prior.within_rad)),
+            min(0.05 + speed * age, max(FARTHEST_M, self.prior.within_m)),
+            min(np.deg2rad(3.0) + rate * age, max(FARTHEST_RAD, self.prior.within_rad)),
         )
 
     def _search(
@@ -216,68 +238,123 @@ class RigidTracker:
         count: int,
         frame: Frame,
         found: Sequence[Detections | None],
+        dt_s: float,
         events: list[Event],
         fresh: dict[int, str],
     ) -> int:
-        """Add what the search from a prior alone finds to the children; how many there are then."""
-        by_camera = {name: f for name, f in zip(self.model.camera_names, found, strict=True) if f is not None}
+        """Add what a search of the frame alone finds to the children; how many there are then.
+
+        Each candidate competes as the continuation of every hypothesis, so that two frames' poses make the velocities,
+        and as a vehicle of which nothing was known before.
+        """
         prior = self._search_prior()
-        result = find_labels(self.rig, self.model, by_camera, prior, self.parameters.labels, self.calibration)
-        if result.tie and not self._told_tie:
-            events.append(Event("tie", result.in_words(self.model)))
-            self._told_tie = True
-        candidates = [result.chosen] if result.chosen is not None else list(result.candidates[:4])
-        if result.chosen is not None and result.chosen.fit.dof > 0 and self._anchor is None:
+        candidates = self._proposed(frame, found, prior, events)
+        if candidates and self._anchor is None and len(candidates) == 1 and candidates[0].fit.dof > 0:
             # Later the scale is known: an answer that then misfits is a wrong one (a scale of 3 after a dark screen).
-            self._believe_misfit(frame, result)
+            self._believe_misfit(frame, candidates[0])
             frame = self._frame(found)
+        n = len(self.model)
+        starts: list[tuple[tuple[Array, Array, Array, Array], Array, float, int]] = []
         P = np.diag(
             np.repeat(
                 [
-                    prior.within_m / np.sqrt(3), prior.within_rad / np.sqrt(3), FIRST_SPEED, FIRST_RATE,
+                    min(prior.within_m, 10.0) / np.sqrt(3), prior.within_rad / np.sqrt(3), FIRST_SPEED, FIRST_RATE,
                     FIRST_ACCELERATION, FIRST_ANGULAR,
                 ],
                 3,
             ) ** 2
         )  # fmt: skip
-        n = len(self.model)
+        centre = (np.ascontiguousarray(prior.centre.rotation), np.array(prior.centre.translation), np.zeros(12), P)
         shown = np.full(n + self._groups, 0.95)
-        start = (np.ascontiguousarray(prior.centre.rotation), prior.centre.translation.copy(), np.zeros(12), P)
+        starts.append((centre, shown, np.log(P_FRESH) if self._hypotheses is not None else 0.0, -1))
+        h = self._hypotheses
+        if h is not None and dt_s > 0:
+            for k in np.argsort(-h.weight)[:MOST_LINKED].tolist():
+                *state, _ = self._predicted(h, k, dt_s, manoeuvre=True)
+                weight = float(h.weight[k]) + np.log(self.temper.dynamics.p_manoeuvre)
+                starts.append(((state[0], state[1], state[2], state[3]), later(h.shown[k], n), weight, k))
+        known = {tuple(np.maximum(children.assigned[k], MISSED)) for k in range(count)}
         for one in candidates:
-            pose = one.fit.world_from_body
-            assigned = np.where(one.point_of == NO_POINT, MISSED, one.point_of + frame.first[self.model.camera_of])
-            R, t = np.ascontiguousarray(pose.rotation), np.ascontiguousarray(pose.translation)
-            R, t, m, P_after, gaussian, _, spots = concluded(
-                self.model.numbers, frame, self._extra, start, assigned, R, t
-            )
-            uv, _ = project_all(self.model.numbers, R[None], t[None])
-            has_image = frame.has_image[self.model.camera_of]
-            inside = self.model.in_picture(uv[0]) & has_image
-            weight = np.log(P_FRESH) if self._hypotheses is not None else 0.0
-            p = self.parameters.p_detect * 0.9  # marginal(shown)
-            seen = assigned >= 0
-            false = np.maximum(frame.log_clutter[seen], frame.log_static[assigned[seen]])
-            weight += gaussian + spots * np.log(p) - float(np.sum(false))
-            weight += np.count_nonzero(inside & (assigned < 0)) * np.log(1 - p)
-            assigned = np.where((assigned < 0) & ~inside, -2, assigned)
-            if not np.isfinite(weight):
-                continue
-            before = count
-            weight += together(shown, self._sights.group, assigned, self.parameters.p_detect)
-            after = learnt(shown, self._sights.group, assigned, self.parameters.p_detect)
-            count = add_child(children, count, R, t, m, P_after, weight, after, assigned, False, -1)
-            if count > before:
-                names = ", ".join(self.model.views[v][1] for v in np.flatnonzero(assigned >= 0))
-                fresh[count - 1] = names
+            for before, chances, weight, parent in starts:
+                count = self._add_candidate(children, count, frame, one, before, chances, weight, parent, known, fresh)
         return count
 
-    def _believe_misfit(self, frame: Frame, result: LabelResult) -> None:
+    def _add_candidate(
+        self,
+        children: Children,
+        count: int,
+        frame: Frame,
+        one: Labelling,
+        before: tuple[Array, Array, Array, Array],
+        shown: Array,
+        weight: float,
+        parent: int,
+        known: set[tuple[int, ...]],
+        fresh: dict[int, str],
+    ) -> int:
+        """One labelling as the continuation of one state; how many children there are then."""
+        views, sights = self.model.numbers, self._sights
+        pose = one.fit.world_from_body
+        assigned = np.where(one.point_of == NO_POINT, MISSED, one.point_of + frame.first[self.model.camera_of])
+        R, t = np.ascontiguousarray(pose.rotation), np.ascontiguousarray(pose.translation)
+        R, t, m, P_after, gaussian, _, _ = concluded(views, frame, self._extra, before, assigned, R, t)
+        uv, _ = project_all(views, R[None], t[None])
+        inside = self.model.in_picture(uv[0]) & frame.has_image[self.model.camera_of]
+        assigned = np.where((assigned < 0) & ~inside, -2, assigned)
+        weight += gaussian + crowding(views, sights, frame, R, t)
+        shining = marginal(shown, sights.group)
+        weight += log_chance(views, sights, frame, self._chances, shining, assigned, R, t)
+        weight += together(shown, sights.group, assigned, self.parameters.p_detect)
+        if not np.isfinite(weight):
+            return count
+        after = learnt(shown, sights.group, assigned, self.parameters.p_detect)
+        count, place = add_child(children, count, R, t, m, P_after, weight, after, assigned, False, parent)
+        if place >= 0:
+            fresh.pop(place, None)
+            if tuple(np.maximum(assigned, MISSED)) not in known:
+                fresh[place] = ", ".join(self.model.views[v][1] for v in np.flatnonzero(assigned >= 0))
+        return count
+
+    def _proposed(
+        self, frame: Frame, found: Sequence[Detections | None], prior: PosePrior, events: list[Event]
+    ) -> list[Labelling]:
+        """Labellings of the frame that a search from the prior alone proposes, best first.
+
+        Points that stay in their place are no spots; every few searches they are looked at all the same.
+        """
+        p, by_camera, rows = self.parameters, {}, []
+        all_points = self._searches % 5 == 0
+        for c, (name, points) in enumerate(zip(self.model.camera_names, found, strict=True)):
+            rows.append(np.zeros(0, dtype=np.int64))
+            if points is None:
+                continue
+            static = frame.log_static[frame.first[c] : frame.first[c + 1]] > STATIC_LOG_DENSITY
+            rows[c] = np.arange(len(points)) if all_points else np.flatnonzero(~static)
+            by_camera[name] = points if len(rows[c]) == len(points) else points[rows[c]]
+        if self._anchor is None:
+            result = find_labels(self.rig, self.model, by_camera, prior, p.labels, self.calibration)
+            if result.tie and not self._told_tie:
+                events.append(Event("tie", result.in_words(self.model)))
+                self._told_tie = True
+            some = [result.chosen] if result.chosen is not None else list(result.candidates)
+        else:
+            some = candidate_labellings(
+                self.rig, self.model, by_camera, prior, p.labels, self.calibration, most=MOST_CANDIDATES
+            )
+        out = []
+        for one in some:
+            point = one.point_of.copy()
+            for v in np.flatnonzero(point != NO_POINT):
+                point[v] = rows[self.model.camera_of[v]][point[v]]
+            out.append(replace(one, point_of=point))
+        return out
+
+    def _believe_misfit(self, frame: Frame, one: Labelling) -> None:
         """The labels hold within the model's error; where the claimed sigmas do not, this frame says by how much."""
-        assert result.chosen is not None
-        labels = result.chosen.point_of
+        labels = one.point_of
         assigned = np.where(labels == NO_POINT, MISSED, labels + frame.first[self.model.camera_of])
         use, uv, cov = chosen_points(frame, assigned, self._extra)
-        pose = result.chosen.fit.world_from_body
+        pose = one.fit.world_from_body
         start = np.ascontiguousarray(pose.rotation), np.ascontiguousarray(pose.translation)
         _, _, _, chi2, count = fit_alone(self.model.numbers, *start, use, uv, cov)
         dof = 2 * count - 6
@@ -344,7 +421,8 @@ class RigidTracker:
         if measured:
             if best in fresh:
                 events.append(Event(self._kind_of_search(dt_s), f"spots {fresh[best]} found from the prior alone"))
-            elif before is not None and dt_s > 0:
+                self._since_found = 0
+            elif before is not None and dt_s > 0 and children.parent[best] >= 0:
                 slope, spread_px = surprise(
                     model.numbers,
                     before,
