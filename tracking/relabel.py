@@ -129,8 +129,9 @@ def relabelled(
     pose_P: Array,
     log_clutter: Array,
     jump_px: Array,
-) -> tuple[Ints, Array]:
-    """Assignments (T, n) and their probabilities (T, n), from the smoothed poses and their covariances (T, 6, 6).
+) -> tuple[Ints, Array, Bools]:
+    """Assignments (T, n) and their probabilities (T, n), from the smoothed poses and their covariances (T, 6, 6); and
+    of which frames the others say too little to label by (T,).
 
     assigned (T, n): those that the smoothing used. log_clutter (T, n). jump_px (T, 6): sigmas of the pose, m and rad,
     that a bend at the frame would add. Each frame is explained by where the others put the vehicle; where that leaves
@@ -139,6 +140,7 @@ def relabelled(
     """
     frames, n = assigned.shape
     out, certain = assigned.copy(), np.ones((frames, n))
+    vague = np.zeros(frames, np.bool_)
     groups = 0
     for i in range(n):
         groups = max(groups, sights.group[i] + 1)
@@ -146,8 +148,8 @@ def relabelled(
     for i in range(6):
         anywhere[i] = ANYWHERE_M if i < 3 else ANYWHERE_RAD
     for k in range(frames):
-        alone, R, t, vague = _by_the_others(views, sights, all_of, assigned, extra, ref, pose_P, k)
-        if vague:
+        alone, R, t, vague[k] = _by_the_others(views, sights, all_of, assigned, extra, ref, pose_P, k)
+        if vague[k]:
             continue
         a, b = all_of.begin[k], all_of.begin[k + 1]
         frame = Frame(
@@ -182,7 +184,7 @@ def relabelled(
         for i in range(n):
             out[k, i] = tried[best, i] if tried[best, i] >= 0 else -1
             certain[k, i] = share[i] / total
-    return out, certain
+    return out, certain, vague
 
 
 @compiled

@@ -37,7 +37,7 @@ from tracking.hypotheses import (
     sift,
 )
 from tracking.information import fit_alone
-from tracking.labels import NO_POINT, Labelling, PosePrior, candidate_labellings, find_labels
+from tracking.labels import NO_POINT, OVER_NOTHING, Labelling, PosePrior, candidate_labellings, find_labels
 from tracking.match import UNMATCHED
 from tracking.misfit import Misfit
 from tracking.motion import predicted
@@ -61,6 +61,7 @@ LONG_UNMEASURED = 10  # frames without a measured pose, after which two missing 
 SEARCH_AT = (2, 4, 8, 14)  # frames in a row that contradict the hypothesis
 DOUBT_FRAMES = 50  # in a row with fewer: then they are doubted
 NOWHERE = (SpotStatus.LOST, SpotStatus.OFF_SCREEN)
+MOST_EVIDENCE, LEAST_EVIDENCE = 50.0, -5.0  # nats; a vehicle that was never found and is less likely than this goes
 YOUNG = 5  # frames after a search found the vehicle: until then its velocities may be known to next to nothing
 MOST_LINKED, MOST_CANDIDATES = 3, 4  # hypotheses that a search's answers continue, and answers
 FARTHEST_M, FARTHEST_RAD = 1.5, np.deg2rad(60.0)  # of a search from the last pose: beyond it a fan looks like itself
@@ -101,6 +102,7 @@ class RigidTracker:
         self._doubts = 0  # frames in a row that contradict the best hypothesis
         self._few = 0  # frames in a row with fewer than FEW spots
         self._searches = 0  # in a row without success
+        self._evidence = 0.0  # nats, of the best hypothesis against "all points are false", until a pose is measured
         self._since_found = 0  # frames since a search found the vehicle
         self._told_tie = False
         self._begun = False
@@ -141,6 +143,12 @@ class RigidTracker:
             count = self._search(children, count, frame, found, dt_s, events, fresh)
         if count == 0:
             return self._nothing(found, predicted, events)
+        if self._anchor is None:
+            best = float(np.max(children.after.weight[:count]))
+            self._evidence = min(best + (0.0 if self._hypotheses is None else self._evidence), MOST_EVIDENCE)
+            if self._evidence < LEAST_EVIDENCE:
+                self._hypotheses, self._evidence = None, 0.0
+                return self._nothing(found, predicted, events)
         staying, places, certain, spread = sift(children, count)
         before = self._hypotheses
         self._hypotheses = staying
@@ -266,7 +274,11 @@ class RigidTracker:
         )  # fmt: skip
         centre = (np.ascontiguousarray(prior.centre.rotation), np.array(prior.centre.translation), np.zeros(12), P)
         shown = np.full(n + self._groups, 0.95)
-        starts.append((centre, shown, np.log(P_FRESH) if self._hypotheses is not None else 0.0, -1))
+        appears = 0.0
+        if self._hypotheses is not None:
+            # A vehicle that was never found may as well appear now; one that was is rarely not where it was thought.
+            appears = -self._evidence if self._anchor is None else float(np.log(P_FRESH))
+        starts.append((centre, shown, appears, -1))
         h = self._hypotheses
         if h is not None and dt_s > 0:
             for k in np.argsort(-h.weight)[:MOST_LINKED].tolist():
@@ -331,13 +343,15 @@ class RigidTracker:
             static = frame.log_static[frame.first[c] : frame.first[c + 1]] > STATIC_LOG_DENSITY
             rows[c] = np.arange(len(points)) if all_points else np.flatnonzero(~static)
             by_camera[name] = points if len(rows[c]) == len(points) else points[rows[c]]
-        if self._anchor is None:
+        if self._anchor is None and not self._told_tie:
             result = find_labels(self.rig, self.model, by_camera, prior, p.labels, self.calibration)
-            if result.tie and not self._told_tie:
+            if result.tie:
                 events.append(Event("tie", result.in_words(self.model)))
                 self._told_tie = True
             some = [result.chosen] if result.chosen is not None else list(result.candidates)
         else:
+            some = []
+        if not some:
             some = candidate_labellings(
                 self.rig, self.model, by_camera, prior, p.labels, self.calibration, most=MOST_CANDIDATES
             )
@@ -401,7 +415,8 @@ class RigidTracker:
         least = max(p.min_label_probability, 1 / (1 + np.exp(-p.labels.lead_nats)) if unproven else 0.0)
         d = digest(model.numbers, self._sights, frame, h.R[0], h.t[0], assigned, certain, least, RADIUS_PX)
         count = int(np.count_nonzero(d.use))
-        measured = count >= 3 and self._good(d.alone)
+        proven = self._anchor is not None or self._evidence >= OVER_NOTHING
+        measured = count >= 3 and proven and self._good(d.alone)
         self._unmeasured = 0 if measured else self._unmeasured + 1
         if measured and self.calibration is not None:
             self._look_at_calibration(d, h)

@@ -49,14 +49,15 @@ def smooth(recording: Recording) -> Smoothed:
     pass_.estimate(deep=0)
     rounds = 1
     if rec.measured.any():
-        # The first reference is a straight line over each gap: too far off for the few spots seen there.
+        # The first reference is a straight line over each gap: too far off for the few spots seen there, which wait
+        # until they were held against it.
         gapless = bool(rec.measured.all())
-        if not gapless:
-            pass_.estimate(deep=DEEP)
         if parameters.method == "rigid":
-            while rounds < MOST_ROUNDS and pass_.relabel():
+            while rounds < MOST_ROUNDS and (pass_.relabel() or (rounds == 1 and not gapless)):
                 rounds += 1
                 pass_.estimate(deep=DEEP)
+        elif not gapless:
+            pass_.estimate(deep=DEEP)
         pass_.repair()
     return pass_.result(rounds)
 
@@ -73,6 +74,7 @@ class _Pass:
         self.assigned = self.causal.copy()
         self.measured = rec.measured
         self.probability = np.where(self.causal >= 0, 1.0, np.nan)
+        self.trusted = np.ones(len(rec), dtype=bool)  # frames whose labels may be evidence
         poses = rec.poses
         ref = straight_between(poses, self.measured, np.cumsum(rec.dt_s))
         every = _all_detections(rec)
@@ -96,7 +98,7 @@ class _Pass:
         run = WholeRun(
             self.views, self.every, self.extra, rec.dt_s, rec.exposure_s, self.parameters.learn_jerk
         )
-        self.motion = estimate(run, self.assigned, self.measured, self.motion, deep)
+        self.motion = estimate(run, self.assigned, self.measured, self.motion, deep, self.trusted)
         self.own = _alone(rec, self.views, self.every, self.assigned, self.extra, self.motion.ref)
         self.measured = self.own.measured
 
@@ -106,7 +108,7 @@ class _Pass:
         self.every = self.every._replace(log_static=_log_static(self.views, self.sights, self.every, self.assigned, ref, known))
         log_clutter = _log_clutter(rec, self.views, self.sights, self.every, self.assigned, ref, known)
         chances = Chances(self.parameters.p_detect, self.parameters.p_blend)
-        found, certain = relabelled(
+        found, certain, vague = relabelled(
             self.views, self.sights, chances, self.every, self.assigned, self.extra, ref, self.motion.pose_P,
             log_clutter, _bend_sigmas(ref, rec.dt_s),
         )  # fmt: skip
@@ -117,6 +119,7 @@ class _Pass:
         changed = bool(np.any(new != self.assigned))
         self.assigned = new
         self.measured = _alone(rec, self.views, self.every, new, self.extra, ref).measured
+        self.trusted = self.measured | ~vague
         return changed
 
     def repair(self) -> None:

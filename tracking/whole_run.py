@@ -80,15 +80,15 @@ class Motion:
         return Motion(ref, log_density, 0.0, bent, nothing, nothing, none, none)
 
 
-def estimate(run: WholeRun, assigned: Ints, measured: Bools, motion: Motion, deep: int) -> Motion:
+def estimate(run: WholeRun, assigned: Ints, measured: Bools, motion: Motion, deep: int, trusted: Bools) -> Motion:
     """The motion given labels (T, n). measured (T,): frames whose own spots give the pose.
 
-    deep: frames; so far from any measured frame spots are not taken for evidence (0: only measured frames are). Frames
-    before the first evidence and after the last are extrapolated.
+    deep: frames; so far from any measured frame spots are not taken for evidence (0: only measured frames are), nor are
+    those of frames that are not trusted (T,). Frames before the first evidence and after the last are extrapolated.
     """
     frames = len(run.dt)
     far = ~np.asarray(maximum_filter1d(measured.astype(np.int8), 2 * deep + 1, mode="constant"), dtype=bool)
-    used = ~far & (assigned >= 0).any(axis=1)
+    used = ~far & trusted & (assigned >= 0).any(axis=1)
     if not measured.any():
         return replace(motion, known=np.zeros(frames, dtype=bool), settled=np.zeros(frames, dtype=bool))
     at = np.flatnonzero(used)
@@ -123,7 +123,13 @@ class _Estimator:
         settled = np.zeros(len(self.dt), dtype=bool)
         for number in range(first, first + MOST_PASSES):
             density = self._density(out, filling_in=not learning)
-            out, moved = self._step(density)
+            there, moved = self._step(density)
+            if not (np.isfinite(there.x).all() and np.isfinite(there.pose_P).all()):
+                if out is None:
+                    raise FloatingPointError("the smoothing pass has no finite first step")
+                settled[:] = False
+                break
+            out = there
             sd = np.sqrt(np.maximum(np.diagonal(out.pose_P, axis1=1, axis2=2), 1e-30))
             settled = np.all(np.abs(moved[:, :6]) < SMALL_STEP * sd, axis=1)
             more = np.zeros_like(self.bent)
@@ -222,7 +228,7 @@ class _Estimator:
             there = shifted(self.ref, x)
             ev_there, misfit_there = self._evidence(there)
             cost_there = 0.5 * misfit_there + motion_cost(there, ev, density)
-            if cost_there <= cost + 1e-3 * abs(cost) + 1.0:
+            if cost_there <= cost + 1e-6 * abs(cost) + 0.1:
                 self.ref = there
                 return out, x
         return out, np.zeros_like(out.x)
