@@ -42,11 +42,6 @@ class PosePrior:
         return PosePrior(Pose(np.eye(3), 0.5 * (low + high)), float(0.5 * (high - low).max()), np.pi)
 
     @property
-    def is_everywhere(self) -> bool:
-        """Whether it says nothing of the attitude."""
-        return self.within_rad >= np.pi
-
-    @property
     def half_width_m(self) -> float:
         """The largest distance from the centre, m, per coordinate, with the allowance for noise."""
         return SLACK * self.within_m + SLACK_M
