@@ -6,13 +6,12 @@ import numpy as np
 
 from geometry import rotations
 from geometry.arrays import Bools
-from geometry.pose import Pose
 from geometry.spots import SpotModel
+from geometry.symmetry import lie_on_each_other
 from tracking.first_labels.candidates import NO_POINT
 from tracking.first_labels.search import Labelling
 
-# A turned rig coincides with itself to within this: the turn is known from two fitted poses.
-SAME_RAD, SAME_M = float(np.deg2rad(1.0)), 0.02
+FITTED_RAD, FITTED_M = float(np.deg2rad(0.3)), 0.01  # two fitted poses of a symmetric rig differ from it by this
 APART_PX = 5.0  # a spot expected at places farther apart than this tells two poses from each other
 
 
@@ -37,28 +36,16 @@ def what_decides(model: SpotModel, one: Labelling, other: Labelling) -> str:
         )
     if at_two_places.any():
         parts.append(f"spot {spot_names(model, at_two_places)}, expected at two places and found at neither")
-    if is_symmetric(model, here, there):
+    if lie_on_each_other(model, here.inverse() @ there, FITTED_RAD, FITTED_M):
         parts.append("no spot of this rig: turned from one pose to the other it coincides with itself")
     elif not parts:
         parts.append("another spot in view")
     shift = float(np.abs(here.translation - there.translation).max())
     turn = float(np.rad2deg(rotations.angle(here.rotation.T @ there.rotation)))
     bounds = [f"within_deg below {turn / 2:.1f}"] if turn > 1 else []
-    bounds += [f"within_m below {shift / 2:.3f}"] if shift > SAME_M else []
+    bounds += [f"within_m below {shift / 2:.3f}"] if shift > FITTED_M else []
     parts.append(
         f"a prior that excludes one: the first two are {shift:.3f} m and {turn:.1f} deg apart, so"
         f" {' or '.join(bounds)} about the true pose"
     )
     return "; or ".join(parts)
-
-
-def is_symmetric(model: SpotModel, here: Pose, there: Pose) -> bool:
-    """Whether the beams of the rig in one pose lie on those in the other, so that no spot can tell them apart."""
-    turn = here.inverse() @ there  # body in the first pose from body in the second
-    _, first = np.unique(model.spot_of, return_index=True)
-    points, rays = turn.apply(model.point[first]), turn.turn(model.ray[first])
-    same_screen = np.all(np.abs(model.screen_origin[first][:, None] - model.screen_origin[first]) < 1e-9, axis=-1)
-    angle = np.arccos(np.clip(rays @ model.ray[first].T, -1, 1))
-    gap = np.linalg.norm(np.cross(points[:, None] - model.point[first], model.ray[first]), axis=-1)
-    lies_on = same_screen & (angle < SAME_RAD) & (gap < SAME_M)
-    return bool(lies_on.any(axis=1).all() and lies_on.any(axis=0).all())
