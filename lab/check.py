@@ -9,10 +9,13 @@ from pathlib import Path
 
 import numpy as np
 
+from geometry import rotations
 from geometry.arrays import Ints
 from geometry.rig import Rig
 from geometry.rig_parameters import RigCovariance
 from geometry.solve import SolveLimits
+from geometry.spots import SpotModel
+from geometry.symmetry import symmetries
 from lab import sight
 from lab.calibration_state import CalibrationState, require_usable
 from lab.errors import CalibrationError, InputError
@@ -102,10 +105,7 @@ def _check_run(folder: Path, progress: Progress | None) -> CheckResult:
     for name in run.left_out:
         findings.remarks.append(f"{run.path}: cameras: camera {name!r} of the rig is left out; the run does without it")
     if run.prior is None:
-        findings.remarks.append(
-            f"{run.path}: prior: none given; without position_m, yaw_pitch_roll_deg, within_m and within_deg"
-            " the spots of the first frame cannot be told apart"
-        )
+        _describe_search(findings, run)
     try:
         reader = open_frames(run)
     except InputError as error:
@@ -138,6 +138,24 @@ def _describe_calibration(
     if covariance is not None:
         known = f"covariance of {len(covariance.names)} numbers: sigmas will hold the calibration's errors too"
     findings.facts += ["", "Calibration", f"  {words}", f"  {known}"]
+
+
+def _describe_search(findings: _Findings, run: Run) -> None:
+    """What it means that a run has no prior: what is searched, and whether the rig leaves a tie."""
+    space = PosePrior.everywhere(run.rig)
+    centre = ", ".join(f"{v + 0.0:.3g}" for v in space.centre.translation)
+    findings.facts += [
+        "",
+        "Prior: none given; the first pose is searched for among all that show enough spots,"
+        f" within {space.within_m:.3g} m of ({centre}), in any attitude",
+    ]
+    for turn in symmetries(SpotModel.of(run.rig)):
+        findings.remarks.append(
+            f"{run.path}: prior: none given, and the beams lie on each other after a turn of"
+            f" {np.rad2deg(rotations.angle(turn.rotation)):.4g} deg: the first labels stay a tie between these poses."
+            " Add prior: {position_m: [x, y, z], yaw_pitch_roll_deg: [yaw, pitch, roll], within_m: 0.5, within_deg: 30}"
+            " with about the first pose"
+        )
 
 
 def _describe_rig(findings: _Findings, rig: Rig) -> None:

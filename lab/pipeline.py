@@ -10,7 +10,6 @@ from typing import Protocol
 import numpy as np
 
 from geometry.camera import SensorNoise
-from lab.errors import InputError
 from lab.frames import FrameReader, FrameSet, open_frames, pictures_at
 from lab.pictures import Missing
 from lab.run_file import FramesFolder, Run
@@ -48,8 +47,9 @@ class FrameRecord:
     tracked: TrackedFrame
 
 
-def tracker_of(run: Run, prior: PosePrior) -> Tracker:
-    """The tracker of the run's method, at its start."""
+def tracker_of(run: Run) -> Tracker:
+    """The tracker of the run's method, at its start; without a prior the vehicle may be wherever its spots are seen."""
+    prior = PosePrior.everywhere(run.rig) if run.prior is None else run.prior
     if run.tracker.method == "spots":
         return SpotTracker(run.rig, run.tracker, prior, run.covariance)
     return RigidTracker(run.rig, run.tracker, prior, run.covariance)
@@ -77,20 +77,14 @@ class Pipeline:
 
     @staticmethod
     def of(run: Run) -> Pipeline:
-        """Open a run. Raises InputError where it has no prior, or its pictures cannot be found."""
-        if run.prior is None:
-            raise InputError(
-                f"{run.path}: prior: expected where the vehicle is at the first frame, found none: the first labels"
-                " need it. Add prior: {position_m: [0, 0, 0], yaw_pitch_roll_deg: [0, 0, 0], within_m: 0.5,"
-                " within_deg: 30}"
-            )
+        """Open a run. Raises InputError where its pictures cannot be found."""
         reader = open_frames(run)
         noise: dict[str, SensorNoise | NoiseModel] = {}
         for name, camera in run.rig.cameras.items():
             model = camera.noise or _noise_of_pictures(run, reader, name)
             if model is not None:
                 noise[name] = model
-        return Pipeline(run, reader, tracker_of(run, run.prior), noise)
+        return Pipeline(run, reader, tracker_of(run), noise)
 
     def records(self) -> Iterator[FrameRecord]:
         """One record per frame number, from the first to the last."""

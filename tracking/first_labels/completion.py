@@ -31,7 +31,7 @@ from tracking.first_labels.candidates import (
 )
 from tracking.first_labels.points import Points
 
-_moved = small.moved
+_moved, best_first = small.moved, small.best_first
 
 # The model's error as shares of the largest allowed: evidence is the mean over these.
 SHARES = np.array([1.0, 0.3, 0.06, 0.01])
@@ -42,24 +42,26 @@ MISFIT_PER_POINT = 12.0  # squared sigmas of the two residuals of a point: above
 
 @compiled
 def complete_all(
-    views: Views, sight: Sight, points: Points, limits: Limits, front: Array, best: Best
+    views: Views, sight: Sight, points: Points, limits: Limits, front: Array, best: Best, most: int
 ) -> tuple[Array, Array, Ints, Array, Ints, Ints]:
-    """All candidates completed: R (k, 3, 3), t (k, 3), labels (k, n), evidence (k,), best share (k,), expected (k,)."""
-    count, n = best.taken[0], views.shape[0]
+    """The likeliest `most` candidates completed, as `complete` has it, with a leading axis (most,)."""
+    count, n = most, views.shape[0]
+    order = best_first(best.score[: best.taken[0]])
     R, t = np.empty((count, 3, 3)), np.empty((count, 3))
     labels, evidence = np.empty((count, n), np.int64), np.empty(count)
     share, expected = np.empty(count, np.int64), np.empty(count, np.int64)
     for k in range(count):
+        i = order[k]
         R_k, t_k, evidence[k], share[k], expected[k] = complete(
             views,
             sight,
             points,
             limits,
             front,
-            best.seed_view[k],
-            best.seed_point[k],
-            best.R[k].copy(),
-            best.t[k].copy(),
+            best.seed_view[i],
+            best.seed_point[i],
+            best.R[i].copy(),
+            best.t[i].copy(),
             labels[k],
         )
         for a in range(3):
@@ -261,6 +263,15 @@ def _worst(sight: Sight, points: Points, labels: Ints, uv: Array, J: Array, L: A
 
 
 @compiled
+def _first_of_spot(spot: Ints, labels: Ints, v: int) -> int:
+    """The first view that has a point of the same spot as view v."""
+    for w in range(v):
+        if labels[w] != NO_POINT and spot[w] == spot[v]:
+            return w
+    return v
+
+
+@compiled
 def _evidence(
     views: Views,
     sight: Sight,
@@ -281,7 +292,7 @@ def _evidence(
     for c in range(cameras):
         used = 0
         for v in range(n):
-            used += sight.camera[v] == c and labels[v] != NO_POINT
+            used += sight.camera[v] == c and labels[v] != NO_POINT and _first_of_spot(sight.spot, labels, v) == v
         fixed += points.log_unused[c, used]
     logs = np.full(SHARES.shape[0], -np.inf)
     best, best_R, best_t = 0, R, t
@@ -328,6 +339,19 @@ def _evidence(
             det = A * C - B * B
             du, dv = points.uv[p, 0] - uv[v, 0], points.uv[p, 1] - uv[v, 1]
             value -= 0.5 * (np.log(det) + (C * du * du - 2 * B * du * dv + A * dv * dv) / det)
+            w = _first_of_spot(sight.spot, labels, v)
+            if w != v:
+                # A false light on the screen, too, is seen by both cameras, at the same place of the screen.
+                q = labels[w]
+                gap2 = 0.0
+                for a in range(3):
+                    gap2 += (points.world[p, a] - points.world[q, a]) ** 2
+                var = 0.5 * points.m_per_px[p] ** 2 * (A + C) + 0.5 * points.m_per_px[q] ** 2 * (
+                    points.cov[q, 0, 0]
+                    + points.cov[q, 1, 1]
+                    + share2 * (sight.model_cov[w, 0, 0] + sight.model_cov[w, 1, 1])
+                )
+                value += LOG_2PI + np.log(var / points.m_per_px[p] ** 2) + 0.5 * gap2 / var
         logs[k] = value
         if value >= logs[best]:
             best, best_R, best_t = k, R, t

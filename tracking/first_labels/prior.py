@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from geometry import rotations
 from geometry.arrays import Array, Bools
 from geometry.pose import Pose
 from geometry.rig import Rig
@@ -41,11 +40,6 @@ class PosePrior:
         )
         low, high = places.min(axis=0), places.max(axis=0)
         return PosePrior(Pose(np.eye(3), 0.5 * (low + high)), float(0.5 * (high - low).max()), np.pi)
-
-    @property
-    def is_everywhere(self) -> bool:
-        """Whether it says nothing of the attitude."""
-        return self.within_rad >= np.pi
 
     @property
     def half_width_m(self) -> float:
@@ -83,17 +77,6 @@ class PosePrior:
             cosine = np.clip(way @ self.centre.turn(ray) / length, -1, 1)
             parallax = np.where(length > shift, np.arcsin(np.minimum(shift / length, 1.0)), np.pi)
         return np.asarray(~(np.arccos(cosine) > self.largest_turn_rad + parallax))
-
-
-def sample(prior: PosePrior, count: int, rng: np.random.Generator) -> Pose:
-    """Poses (count,) spread evenly over a prior: over its cube, and over all turns up to its angle."""
-    axis = rng.normal(size=(count, 3))
-    axis /= np.linalg.norm(axis, axis=1, keepdims=True)
-    grid = np.linspace(0, prior.within_rad, 2001)
-    below = grid - np.sin(grid)  # the share of turns up to an angle
-    angle = np.interp(rng.uniform(0, below[-1], count), below, grid)
-    shift = rng.uniform(-prior.within_m, prior.within_m, (count, 3))
-    return Pose(prior.centre.rotation @ rotations.exp(axis * angle[:, None]), prior.centre.translation + shift)
 
 
 def _seen_of_screen(rig: Rig, camera: str) -> Array:

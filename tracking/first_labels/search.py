@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 
@@ -18,8 +17,9 @@ from tracking.detections import Detections
 from tracking.first_labels.candidates import NO_POINT, Best, Limits, Sight, generate
 from tracking.first_labels.completion import SHARES, complete_all
 from tracking.first_labels.points import Points, PointsOnScreens, on_screens, points_of
-from tracking.first_labels.prior import PosePrior, sample
-from tracking.first_labels.triples import conditioning, covering
+from tracking.first_labels.prior import PosePrior
+from tracking.first_labels.triples import covering
+from tracking.first_labels.visible_poses import VisiblePoses
 from tracking.parameters import LabelParameters
 
 # The largest error of the model that is allowed for, as a multiple of the parameter's: evidence is the mean over
@@ -29,8 +29,6 @@ LARGEST_MODEL_ERROR = 3.0
 P_MISFIT = 1e-6
 FEWEST_POINTS = 6  # per camera: of a crowd at least so many of the brightest take part
 LEAST_LIKELY = 25.0  # nats: labellings so far behind the best are not reported
-MANY = 200  # poses on which it is judged how well three spots fix a pose
-SAMPLES = 6_000  # poses, of all that the lab has room for, on which it is judged which show enough spots
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,14 +47,15 @@ class RigPlan:
 
     model: SpotModel
     everywhere: PosePrior
-    triples: Ints  # (k, 3) spots, the best first
+    triples: Ints  # (k, 3) spots: the first `stages[m]` of them serve any m visible spots and more
+    stages: Mapping[int, int]
     screen_of_camera: Ints  # (cameras,)
     spot_screen: Ints  # (spots,)
     view_at: Ints  # (spots, cameras)
     spot_point: Array  # (spots, 3)
     spot_ray: Array  # (spots, 3)
     front: Array  # (n, 4) the plane of each view's screen, with the normal towards its camera
-    log_share: float  # of the poses anywhere, log of the share that shows at least `min_spots` spots
+    log_volume: float  # m^3 rad^3, of the poses that show at least `min_spots` spots
 
     @staticmethod
     def of(rig: Rig, model: SpotModel, min_spots: int) -> RigPlan:
@@ -68,13 +67,8 @@ class RigPlan:
         point, ray = np.zeros((len(model.spot_names), 3)), np.zeros((len(model.spot_names), 3))
         point[model.spot_of], ray[model.spot_of] = model.point, model.ray
         spots = sorted({int(s) for s in model.spot_of})
-        poses = sample(everywhere, SAMPLES, np.random.default_rng(0))
-        pixels, J = model.project(poses)
-        shown = np.zeros((SAMPLES, len(model.spot_names)), dtype=bool)
-        for v, inside in enumerate(model.in_picture(pixels).T):
-            shown[:, model.spot_of[v]] |= inside
-        enough = np.count_nonzero(shown, axis=1) >= min(min_spots, len(spots))
-        good = np.flatnonzero(enough if enough.any() else np.isfinite(pixels[..., 0]).any(axis=1))[:MANY]
+        visible = VisiblePoses.of(rig, model, everywhere, min_spots)
+        triples, stages = covering(visible.triples, spots, min(min_spots, len(spots)))
         normal = model.screen_rotation[..., 2]
         camera = -np.einsum("nij,ni->nj", model.camera_rotation, model.camera_translation)
         side = np.sign(np.sum(normal * (camera - model.screen_origin), axis=-1))
@@ -82,14 +76,15 @@ class RigPlan:
         return RigPlan(
             model=model,
             everywhere=everywhere,
-            triples=covering(conditioning(model, pixels[good], J[good], spots), spots, min(min_spots, len(spots))),
+            triples=triples,
+            stages=stages,
             screen_of_camera=np.array([screens.index(rig.cameras[c].screen) for c in model.camera_names]),
             spot_screen=np.array([screens.index(rig.spots[s].screen) for s in model.spot_names]),
             view_at=view_at,
             spot_point=point,
             spot_ray=ray,
             front=np.concatenate([normal, np.sum(normal * model.screen_origin, axis=-1)[:, None]], axis=-1),
-            log_share=float(np.log((np.count_nonzero(enough) + 1) / SAMPLES)),
+            log_volume=visible.log_volume,
         )
 
 
@@ -124,8 +119,8 @@ def candidate_labellings(
     """
     parameters = LabelParameters() if parameters is None else parameters
     plan = plan_of(rig, model, parameters.min_spots)
-    log_volume = plan.everywhere.log_volume + plan.log_share if prior is None else prior.log_volume
     prior = plan.everywhere if prior is None else prior
+    log_volume = min(prior.log_volume, plan.log_volume)
     points = points_of(rig, model, detections, parameters)
     has_image = np.array([model.camera_names[c] in detections for c in model.camera_of])
     sight = _sight(plan, points, has_image, parameters)
@@ -141,10 +136,27 @@ def candidate_labellings(
         [prior.reaches(p, r, points.world) for p, r in zip(plan.spot_point, plan.spot_ray, strict=True)], dtype=bool
     ).reshape(len(plan.spot_point), len(points.uv))
     sigma_px = LARGEST_MODEL_ERROR * parameters.model_sigma_px
-    screens, triples = _within_budget(plan, sight, points, reached, parameters, _by_brightness(detections), sigma_px)
     best = Best.none(parameters.max_refined, len(model))
-    generate(model.numbers, sight, points, screens, reached, limits, triples, best)
+    brightness_known = all(np.isfinite(found.flux).any() for found in detections.values() if len(found))
+    screens, most_triples = _within_budget(plan, sight, points, reached, parameters, brightness_known, sigma_px)
+    done = 0
+    for size, end in plan.stages.items():
+        now = plan.triples[done : min(end, most_triples)]
+        now = np.ascontiguousarray(now[(sight.spot_screen[now] >= 0).all(axis=1)])
+        done = end
+        generate(model.numbers, sight, points, screens, reached, limits, now, best)
+        # What is not served yet explains two spots less: it is no rival.
+        if done >= most_triples or _spots_of_best(plan, sight, points, limits, best) > size:
+            break
     return _completed(plan, sight, points, limits, prior, log_volume, best, calibration, most, sigma_px)
+
+
+def _spots_of_best(plan: RigPlan, sight: Sight, points: Points, limits: Limits, best: Best) -> int:
+    """How many spots the likeliest candidate of those made so far explains."""
+    if not best.taken[0]:
+        return 0
+    _, _, labels, evidence, _, _ = complete_all(plan.model.numbers, sight, points, limits, plan.front, best, 1)
+    return len(set(plan.model.spot_of[labels[0] != NO_POINT])) if evidence[0] > -np.inf else 0
 
 
 def _within_budget(
@@ -155,28 +167,26 @@ def _within_budget(
     parameters: LabelParameters,
     brightness_known: bool,
     sigma_px: float,
-) -> tuple[PointsOnScreens, Ints]:
-    """The points and triples of spots to make poses from, so that there are at most `max_triples` sets of points.
+) -> tuple[PointsOnScreens, int]:
+    """The points to make poses from and how many of the plan's triples: at most `max_triples` sets of three points.
 
     In a crowd spots are brighter than most: fewer points are used. Where brightness is not known all points are used,
-    and fewer triples of spots, the ones first that serve most sets of visible spots.
+    and fewer triples of spots, those first that serve most sets of visible spots.
     """
-    triples = np.array([t for t in plan.triples if (sight.spot_screen[t] >= 0).all()], dtype=np.int64).reshape(-1, 3)
     most = parameters.max_points
+    screen_count = int(plan.screen_of_camera.max()) + 1
     while True:
-        screens = on_screens(points, plan.screen_of_camera, int(plan.screen_of_camera.max()) + 1, sigma_px, most)
-        of_screen = [screens.point[a:b] for a, b in pairwise(screens.first)]
-        options = np.array([np.count_nonzero(reached[s, of_screen[k]]) for s, k in enumerate(plan.spot_screen)])
-        sets = np.cumsum(np.prod(options[triples].astype(float), axis=1))
+        screens = on_screens(points, plan.screen_of_camera, screen_count, sigma_px, most)
+        options = np.zeros(len(plan.spot_screen))
+        for spot, k in enumerate(sight.spot_screen):
+            if k >= 0:
+                options[spot] = np.count_nonzero(reached[spot, screens.point[screens.first[k] : screens.first[k + 1]]])
+        sets = np.cumsum(np.prod(options[plan.triples], axis=1))
         if not len(sets) or sets[-1] <= parameters.max_triples:
-            return screens, triples
+            return screens, len(sets)
         if not brightness_known or most <= FEWEST_POINTS:
-            return screens, triples[: max(1, np.count_nonzero(sets <= parameters.max_triples))]
+            return screens, max(1, int(np.count_nonzero(sets <= parameters.max_triples)))
         most = max(int(0.8 * most), FEWEST_POINTS)
-
-
-def _by_brightness(detections: Mapping[str, Detections]) -> bool:
-    return all(np.isfinite(found.flux).any() for found in detections.values() if len(found))
 
 
 def _sight(plan: RigPlan, points: Points, has_image: Bools, parameters: LabelParameters) -> Sight:
@@ -214,7 +224,7 @@ def _completed(
     """The best candidates completed, weighed, no two alike, best first."""
     model = plan.model
     R, t, labels_of, evidences, shares, expected_of = complete_all(
-        model.numbers, sight, points, limits, plan.front, best
+        model.numbers, sight, points, limits, plan.front, best, int(best.taken[0])
     )
     evidences = evidences - log_volume
     out: list[Labelling] = []
