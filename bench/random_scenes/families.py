@@ -8,36 +8,27 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bench.random_scenes import motions, nuisances, rigs, scene
+from bench.random_scenes import motions, nuisances, scene
+from bench.random_scenes.drafts import (
+    Draft,
+    Draw,
+    false_points,
+    fan_lab,
+    hide_across,
+    paper_lab,
+    usual_lab,
+    zigzag_with_bends,
+)
 from bench.random_scenes.motions import Motion
-from bench.random_scenes.nuisances import CLEAN_FRAMES, FalsePoints
+from bench.random_scenes.nuisances import CLEAN_FRAMES
 from bench.random_scenes.projection import spot_pixels
-from bench.random_scenes.rigs import LEFT, RIGHT, Lab, Vehicle
-from bench.random_scenes.scene import Scene, draw_amplitudes, draw_prior, fitted_motion, view_indices
-from geometry.arrays import Array, Bools, Ints
-from geometry.pose import Pose
+from bench.random_scenes.scene import Scene, draw_amplitudes, fitted_motion, view_indices
 from geometry.rig import Rig
 from geometry.rig_parameters import RigCovariance, moved, rig_names, split
-from lab.simulate.rigs import RIGS
-
-SCREENS_M = 2.5  # of the rigs made for a family
-
-
-@dataclass(frozen=True, slots=True)
-class Draw:
-    """What a family makes a scene from."""
-
-    seed: int
-    frames: int
-    key: list[int]  # of the random numbers
-
-    def rng(self, purpose: int) -> np.random.Generator:
-        """The stream of random numbers for one purpose."""
-        return np.random.default_rng([*self.key, purpose])
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,54 +38,6 @@ class Family:
     make: Callable[[Draw], Scene | None]  # None: these draws do not fit, try others
     frames: int
     goal: str
-
-
-@dataclass(slots=True)
-class Draft:
-    """A scene in the making: what most families share, to be changed before `scene` is called."""
-
-    draw: Draw
-    lab: Lab
-    q: Array  # (T, 6) of the vehicle in base
-    rate_hz: float
-    noise_px: float
-    false: FalsePoints
-    corner_frames: Array
-    text: str
-    poses: Pose = field(init=False)  # (T,) world_from_body
-    uv: Array = field(init=False)  # (T, n, 2) px
-    camera_of: Ints = field(init=False)  # (n,)
-    spot_of: Ints = field(init=False)  # (n,)
-    hidden: Bools = field(init=False)  # (T, n)
-    has_image: Bools = field(init=False)  # (T, c)
-
-    def __post_init__(self) -> None:
-        self.poses = self.lab.poses(self.q)
-        self.uv = spot_pixels(self.lab.rig, self.poses)
-        self.camera_of, self.spot_of = view_indices(self.lab.rig)
-        self.hidden = np.zeros(self.uv.shape[:2], dtype=bool)
-        self.has_image = np.ones((len(self.q), len(self.lab.rig.cameras)), dtype=bool)
-
-    def scene(self) -> Scene:
-        """The scene with all that was set."""
-        step = np.nanmedian(np.linalg.norm(np.diff(self.uv, axis=0), axis=-1))
-        text = (
-            f"{self.text}; {self.rate_hz:.0f} Hz, {step:.2g} px/frame, noise {self.noise_px:.2g} px, {self.false.text}"
-        )
-        return scene.composed(
-            key=self.draw.key,
-            seed=self.draw.seed,
-            rig=self.lab.rig,
-            poses=self.poses,
-            rate_hz=self.rate_hz,
-            sigma_px=np.full(len(self.camera_of), self.noise_px),
-            false=self.false,
-            hidden=self.hidden,
-            has_image=self.has_image,
-            corner_frames=self.corner_frames,
-            text=f"{text}; {self.lab.text}",
-            prior=draw_prior(self.draw.rng(scene.PRIOR), self.poses[0]),
-        )
 
 
 def family_scene(name: str, seed: int, frames: int | None = None) -> Scene:
@@ -108,140 +51,26 @@ def family_scene(name: str, seed: int, frames: int | None = None) -> Scene:
     raise RuntimeError(f"family {name}: no scene for seed {seed}")
 
 
-# Rigs ---------------------------------------------------------------------------------------------------------------
-
-
-def paper_lab(name: str = "fan", reach_m: float = 0.5) -> Lab:
-    """One of the project's example rigs, with the vehicle about its origin."""
-    return Lab(RIGS[name](), Pose.identity(), Pose.identity(), np.zeros(6), reach_m, SCREENS_M, f"{name} rig")
-
-
-def _usual_lab(draw: Draw) -> Lab:
-    return paper_lab() if draw.seed % 2 == 0 else rigs.draw_lab(draw.rng(scene.LAB))
-
-
-def fan_lab(
-    rng: np.random.Generator, angles_deg: Array, reach_m: float, focal_px: tuple[float, float], name: str
-) -> Lab:
-    """A fan whose beams are seen at both ends, screens at SCREENS_M, cameras drawn for it."""
-    angles = np.deg2rad(angles_deg)
-    names = [chr(ord("A") + i) for i in range(len(angles))]
-    beams = {n: (np.array([np.cos(a), np.sin(a), 0.0]), np.zeros(3)) for n, a in zip(names, angles, strict=True)}
-    ends = tuple((n, sign, s) for sign, s in ((-1, LEFT), (1, RIGHT)) for n in names)
-    turn = np.array([0.5, 0.5, 0.5, 0.5])
-    screens = {
-        s: rigs.Screen(s, Pose.from_quaternion(turn, np.array([x, 0.0, 0.0])))
-        for s, x in ((LEFT, -SCREENS_M), (RIGHT, SCREENS_M))
-    }
-    vehicle = Vehicle(beams, ends, name)
-    lab = rigs.assembled(
-        rng, screens, vehicle, np.zeros(6), reach_m, SCREENS_M, [1, 1], f"screens at {SCREENS_M} m", focal_px, True
-    )
-    assert lab is not None
-    return lab
-
-
-# Parts --------------------------------------------------------------------------------------------------------------
-
-
-def _false(lab: Lab, beside: float = 0.0, anywhere: float = 0.0) -> FalsePoints:
-    return FalsePoints(beside, (15.0, 40.0), anywhere, tuple(np.zeros((0, 2)) for _ in lab.rig.cameras))
-
-
-def _corners_between(rng: np.random.Generator, frames: int, apart: tuple[float, float]) -> tuple[Array, Motion]:
-    """A zig-zag over `frames` with corners so many frames apart, at random moments between frames.
-
-    In half of the scenes it goes from one random place to the next, in the others back and forth at one speed. Returns
-    the corners in frames and the motion over times in frames.
-    """
-    corners = [-rng.uniform(1, apart[0])]
-    while corners[-1] < frames:
-        corners.append(corners[-1] + rng.uniform(*apart))
-    if rng.random() < 0.5:
-        values = rng.uniform(-1, 1, (len(corners), 6))
-    else:
-        pieces = np.diff(corners, prepend=corners[0]) * (-1.0) ** np.arange(len(corners))
-        path = np.cumsum(pieces) - np.mean(np.cumsum(pieces))
-        values = path[:, None] / np.abs(path).max() * rng.uniform(-1, 1, 6)
-    t = np.arange(frames, dtype=float)
-    shape = np.stack([np.interp(t, corners, v) for v in values.T], axis=-1)
-    inside = np.array([c for c in corners if 3 < c < frames - 3])
-    return inside, Motion(shape, inside, "zig-zag")
-
-
-def bends_px(uv: Array, corner_frames: Array) -> Array:
-    """(k,): the largest change of any spot's step from before a corner to after it, px."""
-    out = []
-    for corner in corner_frames:
-        k = int(np.floor(corner))
-        if 1 <= k < len(uv) - 2:
-            change = (uv[k + 2] - uv[k + 1]) - (uv[k] - uv[k - 1])
-            out.append(float(np.nanmax(np.linalg.norm(change, axis=-1), initial=0.0)))
-    return np.array(out)
-
-
-def _zigzag_with_bends(
-    lab: Lab, rng: np.random.Generator, frames: int, apart: tuple[float, float], bend_px: float, fastest_px: float
-) -> tuple[Array, Array] | None:
-    """x, y, z, yaw, pitch, roll (T, 6) of a zig-zag whose median bend is bend_px, and its corners in frames."""
-    corners, motion = _corners_between(rng, frames, apart)
-    amplitudes = draw_amplitudes(rng, lab)
-    bends = bends_px(spot_pixels(lab.rig, lab.poses(lab.rest + amplitudes * motion.shape)), corners)
-    if not bends.size or not np.median(bends) > 0:
-        return None
-    size = bend_px / np.median(bends)
-    q = fitted_motion(lab, motion, size * amplitudes, fastest_px, 0.9)
-    if q is None:
-        return None
-    reached = bends_px(spot_pixels(lab.rig, lab.poses(q)), corners)
-    return (q, corners) if 0.5 * bend_px < np.median(reached) < 2 * bend_px else None
-
-
-def _hide_across(
-    draft: Draft, rng: np.random.Generator, length: tuple[int, int], which: tuple[str, ...], share: float = 0.6
-) -> None:
-    """Hide spots for some frames across corners; the gaps do not touch each other."""
-    free = CLEAN_FRAMES + 2
-    spots = np.unique(draft.spot_of)
-    for corner in draft.corner_frames:
-        frames = int(rng.integers(length[0], length[1] + 1))
-        first = int(corner) + 1 - int(rng.integers(1, frames))
-        if first < free or first + frames > len(draft.q) - 3 or rng.random() > share:
-            continue
-        free = first + frames + 8
-        what = which[int(rng.integers(len(which)))]
-        if what == "all":
-            views = np.ones(len(draft.camera_of), dtype=bool)
-        elif what == "screen":
-            views = draft.camera_of == rng.integers(draft.camera_of.max() + 1)
-        else:
-            views = np.isin(draft.spot_of, rng.choice(spots, {"one": 1, "two": 2}[what], replace=False))
-        draft.hidden[first : first + frames, views] = True
-
-
-# Families -----------------------------------------------------------------------------------------------------------
-
-
 def _corners(draw: Draw, kind: str) -> Scene | None:
-    lab, noise = _usual_lab(draw), 0.01
+    lab, noise = usual_lab(draw), 0.01
     rng = draw.rng(scene.MOTION)
     hard = kind == "hard" or (kind == "hidden" and rng.random() < 0.5)
     low, high = (120, 6000) if hard else (3, 25)  # in sigmas of the noise
     bend = noise * float(np.exp(rng.uniform(np.log(low), np.log(high))))
-    made = _zigzag_with_bends(lab, rng, draw.frames, (8, 40), bend, 60.0)
+    made = zigzag_with_bends(lab, rng, draw.frames, (8, 40), bend, 60.0)
     if made is None:
         return None
     q, corners = made
     rate = float(np.exp(rng.uniform(np.log(50), np.log(300))))
-    draft = Draft(draw, lab, q, rate, noise, _false(lab, beside=0.2), corners, f"corners, bend {bend:.2g} px")
+    draft = Draft(draw, lab, q, rate, noise, false_points(lab, beside=0.2), corners, f"corners, bend {bend:.2g} px")
     if kind == "hidden":
-        _hide_across(draft, draw.rng(scene.NUISANCE), (3, 12), ("one", "two", "screen", "all"))
+        hide_across(draft, draw.rng(scene.NUISANCE), (3, 12), ("one", "two", "screen", "all"))
         draft.text += ", hidden across them"
     return draft.scene()
 
 
 def _camera_gaps(draw: Draw) -> Scene | None:
-    lab = _usual_lab(draw)
+    lab = usual_lab(draw)
     rng = draw.rng(scene.MOTION)
     rate = float(np.exp(rng.uniform(np.log(50), np.log(200))))
     kind = (motions.sines, motions.zigzag)[int(rng.integers(2))]
@@ -250,7 +79,7 @@ def _camera_gaps(draw: Draw) -> Scene | None:
     if q is None:
         return None
     noise = float(np.exp(rng.uniform(np.log(0.02), np.log(0.2))))
-    draft = Draft(draw, lab, q, rate, noise, _false(lab, beside=0.2), motion.corners_s * rate, "camera gap")
+    draft = Draft(draw, lab, q, rate, noise, false_points(lab, beside=0.2), motion.corners_s * rate, "camera gap")
     rng = draw.rng(scene.NUISANCE)
     length = int(np.exp(rng.uniform(np.log(3), np.log(40))))
     where = ("start", "end", "middle", "middle")[int(rng.integers(4))]
@@ -262,7 +91,7 @@ def _camera_gaps(draw: Draw) -> Scene | None:
 
 
 def _blackout_static(draw: Draw) -> Scene | None:
-    lab = _usual_lab(draw)
+    lab = usual_lab(draw)
     rng = draw.rng(scene.MOTION)
     rate = float(np.exp(rng.uniform(np.log(50), np.log(200))))
     motion = motions.sines(rng, np.arange(draw.frames) / rate)
@@ -270,7 +99,7 @@ def _blackout_static(draw: Draw) -> Scene | None:
     if q is None:
         return None
     noise = float(np.exp(rng.uniform(np.log(0.02), np.log(0.2))))
-    draft = Draft(draw, lab, q, rate, noise, _false(lab), motion.corners_s, "everything hidden 25 frames")
+    draft = Draft(draw, lab, q, rate, noise, false_points(lab), motion.corners_s, "everything hidden 25 frames")
     rng = draw.rng(scene.NUISANCE)
     first = int(rng.integers(40, draw.frames - 60))
     draft.hidden[first : first + 25] = True
@@ -285,14 +114,14 @@ def _blackout_static(draw: Draw) -> Scene | None:
 
 
 def _three_left(draw: Draw) -> Scene | None:
-    lab = _usual_lab(draw)
+    lab = usual_lab(draw)
     rng = draw.rng(scene.MOTION)
     motion = motions.sines(rng, np.arange(draw.frames) / 50.0)
     q = fitted_motion(lab, motion, rng.uniform(1, 3) * draw_amplitudes(rng, lab), 30.0, 0.9)
     if q is None:
         return None
     noise = float(np.exp(rng.uniform(np.log(0.02), np.log(0.2))))
-    draft = Draft(draw, lab, q, 50.0, noise, _false(lab, beside=0.1), np.zeros(0), "three spots left")
+    draft = Draft(draw, lab, q, 50.0, noise, false_points(lab, beside=0.1), np.zeros(0), "three spots left")
     rng = draw.rng(scene.NUISANCE)
     screen_of = {name: s.screen for name, s in lab.rig.spots.items()}
     names = list(lab.rig.spots)
@@ -315,14 +144,14 @@ def _screen_corner(draw: Draw) -> Scene | None:
     lab = fan_lab(rng, np.array([-half, half]), 0.5, (600.0, 2500.0), f"2 beams {2 * half:.0f} deg apart")
     rng = draw.rng(scene.MOTION)
     bend = float(np.exp(rng.uniform(np.log(1), np.log(15))))
-    made = _zigzag_with_bends(lab, rng, draw.frames, (25, 50), bend, 20.0)
+    made = zigzag_with_bends(lab, rng, draw.frames, (25, 50), bend, 20.0)
     if made is None:
         return None
     q, corners = made
     noise = float(np.exp(rng.uniform(np.log(0.02), np.log(0.15))))
     text = f"both spots of a screen hidden 16 frames across corners of {bend:.2g} px"
-    draft = Draft(draw, lab, q, 100.0, noise, replace(_false(lab), exactly=1), corners, text)
-    _hide_across(draft, draw.rng(scene.NUISANCE), (16, 16), ("screen",), share=1.0)
+    draft = Draft(draw, lab, q, 100.0, noise, replace(false_points(lab), exactly=1), corners, text)
+    hide_across(draft, draw.rng(scene.NUISANCE), (16, 16), ("screen",), share=1.0)
     return draft.scene()
 
 
@@ -348,7 +177,7 @@ def _fast_close(draw: Draw) -> Scene | None:
     if q is None:
         return None
     text = f"shaking of {hz.min():.1f} to {hz.max():.1f} Hz, up to 116 px/frame, spots 28 px apart"
-    draft = Draft(draw, lab, q, rate, 0.1, _false(lab, beside=0.2), np.zeros(0), text)
+    draft = Draft(draw, lab, q, rate, 0.1, false_points(lab, beside=0.2), np.zeros(0), text)
     fastest = np.nanmax(np.linalg.norm(np.diff(draft.uv, axis=0), axis=-1))
     return draft.scene() if fastest > 95 else None
 
@@ -364,7 +193,7 @@ def _two_beams_25hz(draw: Draw) -> Scene | None:
         return None
     noise = float(np.exp(rng.uniform(np.log(0.02), np.log(0.2))))
     clutter = float(rng.choice([0.0, 0.2]))
-    return Draft(draw, lab, q, 25.0, noise, _false(lab, clutter), np.zeros(0), motion.text).scene()
+    return Draft(draw, lab, q, 25.0, noise, false_points(lab, clutter), np.zeros(0), motion.text).scene()
 
 
 def _uniform(draw: Draw) -> Scene | None:
@@ -375,19 +204,19 @@ def _uniform(draw: Draw) -> Scene | None:
         lab = paper_lab()
     rng = draw.rng(scene.MOTION)
     bend = float(np.exp(rng.uniform(np.log(0.3), np.log(30))))
-    made = _zigzag_with_bends(lab, rng, draw.frames, (20, 70), bend, 30.0)
+    made = zigzag_with_bends(lab, rng, draw.frames, (20, 70), bend, 30.0)
     if made is None:
         return None
     q, corners = made
     if rng.random() < 0.3:  # at rest from some corner on
         k = int(corners[int(rng.integers(len(corners)))]) + 1
         q[k:] = q[k]
-    false = _false(lab, beside=float(rng.choice([0.0, 0.2])))
+    false = false_points(lab, beside=float(rng.choice([0.0, 0.2])))
     return Draft(draw, lab, q, 200.0, 0.012, false, corners, f"uniform between bends of {bend:.2g} px").scene()
 
 
 def _quiet_then_turn(draw: Draw) -> Scene | None:
-    lab = _usual_lab(draw)
+    lab = usual_lab(draw)
     rng = draw.rng(scene.MOTION)
     start = rng.uniform(0.5, 0.75) * draw.frames
     length = rng.uniform(0.1, 0.25) * draw.frames
@@ -397,7 +226,7 @@ def _quiet_then_turn(draw: Draw) -> Scene | None:
     if q is None:
         return None
     text = f"rest, then an eased turn over {length:.0f} frames from {start:.0f} on"
-    return Draft(draw, lab, q, 401.0, 0.011, _false(lab, beside=0.2), motion.corners_s, text).scene()
+    return Draft(draw, lab, q, 401.0, 0.011, false_points(lab, beside=0.2), motion.corners_s, text).scene()
 
 
 def _no_prior(draw: Draw) -> Scene | None:
@@ -409,7 +238,7 @@ def _no_prior(draw: Draw) -> Scene | None:
     q = fitted_motion(lab, motion, draw_amplitudes(rng, lab), 10.0, 0.7)
     if q is None:
         return None
-    false = replace(_false(lab, beside=0.0), exactly=5)
+    false = replace(false_points(lab, beside=0.0), exactly=5)
     draft = Draft(draw, lab, q, 100.0, 0.1, false, np.zeros(0), "no prior")
     return replace(draft.scene(), prior=None)
 
@@ -443,7 +272,7 @@ def _drawn_rig(draw: Draw) -> Scene | None:
     q = fitted_motion(lab, motion, 2 * draw_amplitudes(rng, lab), 20.0, 0.8)
     if q is None:
         return None
-    draft = Draft(draw, lab, q, 100.0, 0.05, _false(lab, beside=0.2), np.zeros(0), "rig off by its covariance")
+    draft = Draft(draw, lab, q, 100.0, 0.05, false_points(lab, beside=0.2), np.zeros(0), "rig off by its covariance")
     return replace(draft.scene(), known_rig=known.rig, covariance=covariance)
 
 

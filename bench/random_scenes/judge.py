@@ -58,7 +58,8 @@ class PassFigures:
     nees_measured: float  # ... and of each
     nees_predicted: float
     nees_max: float
-    poses: int  # that NEES is of
+    poses: int  # that NEES is of ...
+    independent: float  # ... and as how many independent ones their mean scatters
     coverage: float  # share of poses inside the 95 % ellipsoid
     wrong_measured: int  # confidently wrong poses
     wrong_predicted: int
@@ -136,7 +137,8 @@ def figures(scene: Scene, answer: Pass) -> PassFigures:
     """One pass against truth."""
     right, wrong, near = label_verdicts(scene, answer)
     countable = scene.shining & ~_together(scene)
-    nees = nees_of(scene, answer)
+    whitened = whitened_errors(scene, answer)
+    nees = np.sum(whitened**2, axis=1)
     known = answer.status != LOST
     measured, predicted = answer.status == MEASURED, answer.status == PREDICTED
     good = known & ~np.isnan(nees)
@@ -160,6 +162,7 @@ def figures(scene: Scene, answer: Pass) -> PassFigures:
         nees_predicted=_mean(nees[good & predicted]),
         nees_max=float(nees[good].max(initial=0.0)),
         poses=int(good.sum()),
+        independent=independent_poses(whitened),
         coverage=_mean((nees[good] <= CHI2_95).astype(float)),
         wrong_measured=int((off & measured).sum()),
         wrong_predicted=int((off & predicted).sum()),
@@ -211,8 +214,13 @@ def _together(scene: Scene) -> Bools:
 
 def nees_of(scene: Scene, answer: Pass) -> Array:
     """(T,): e^T P^-1 e of the poses; nan where lost, or where P is not positive definite."""
+    return np.asarray(np.sum(whitened_errors(scene, answer) ** 2, axis=1))
+
+
+def whitened_errors(scene: Scene, answer: Pass) -> Array:
+    """(T, 6): errors of the poses with unit covariance if theirs is right; nan as in `nees_of`."""
     delta = scene.poses.minus(answer.poses)
-    out = np.full(len(scene), np.nan)
+    out = np.full((len(scene), 6), np.nan)
     for k in np.flatnonzero(answer.status != LOST):
         P = answer.covariance[k]
         variance = np.diagonal(P)
@@ -220,9 +228,30 @@ def nees_of(scene: Scene, answer: Pass) -> Array:
             continue
         scale = np.sqrt(variance)
         C = P / np.outer(scale, scale)
-        if np.linalg.eigvalsh(C)[0] > 0:
-            out[k] = float(delta[k] / scale @ np.linalg.solve(C, delta[k] / scale))
+        values, vectors = np.linalg.eigh(C)
+        if values[0] > 0:
+            # The symmetric root: it changes smoothly with C, so that neighbouring frames can be compared.
+            out[k] = vectors @ ((vectors.T @ (delta[k] / scale)) / np.sqrt(values))
     return out
+
+
+def independent_poses(whitened: Array) -> float:
+    """How many independent errors (T, 6) hold: T over the sum of their autocorrelation, to its first zero.
+
+    A smoothed pose at rest has nearly the same error in all frames, and the mean NEES of a scene then scatters as that
+    of one or two poses.
+    """
+    w = whitened[~np.isnan(whitened).any(axis=1)]
+    power = float(np.mean(np.sum(w**2, axis=1))) if len(w) else 0.0
+    if power == 0.0:
+        return float(len(w))
+    total = 1.0
+    for lag in range(1, len(w) // 2):
+        correlation = float(np.mean(np.sum(w[lag:] * w[:-lag], axis=1))) / power
+        if correlation <= 0:
+            break
+        total += 2 * correlation * (1 - lag / len(w))
+    return len(w) / total
 
 
 def classes_of(

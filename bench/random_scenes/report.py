@@ -9,6 +9,7 @@ from dataclasses import asdict, fields
 from pathlib import Path
 
 import numpy as np
+from scipy.stats import chi2
 
 from bench.random_scenes.judge import CLASSES, CLEAN, Judgement, PassFigures
 from bench.random_scenes.oracle import Oracle
@@ -23,7 +24,7 @@ def nothing() -> PassFigures:
     nan = float("nan")
     return PassFigures(
         identity=0.0, countable=0, wrong=0, near=0, measured=0, predicted=0, lost=0, nees=nan, nees_median=nan,
-        nees_measured=nan, nees_predicted=nan, nees_max=nan, poses=0, coverage=nan, wrong_measured=0,
+        nees_measured=nan, nees_predicted=nan, nees_max=nan, poses=0, independent=0.0, coverage=nan, wrong_measured=0,
         wrong_predicted=0, beyond_6=0, not_definite=0,
         first_labels=-1, first_wrong=0, locked_in=-1, worst_deg=nan, worst_m=nan,
     )  # fmt: skip
@@ -93,7 +94,14 @@ def summary(rows: Sequence[Judgement]) -> str:
             out += [f"{name}:", *(f"  {line}" for line in _distributions(figures))]
     ratio = np.array([r.smoothed.nees / 6 for r in counted])
     outside = int(np.sum(~((ratio >= 0.6) & (ratio <= 1.6))))
-    out.append(f"smoothed NEES/6 outside .6 to 1.6: {outside} = {outside / n:.1%}")
+    independent = np.array([r.smoothed.independent for r in counted])
+    p = chi2.cdf(6 * independent * ratio, 6 * np.maximum(independent, 1e-9))
+    beyond = int(np.sum(~((p >= 0.005) & (p <= 0.995))))
+    out.append(
+        f"smoothed NEES/6 outside .6 to 1.6: {outside} = {outside / n:.1%};"
+        f" beyond the 99 % of chance, given how many independent poses a scene holds: {beyond} = {beyond / n:.1%}"
+        f" (independent poses: {_quantiles(independent)})"
+    )
     out.append(f"oracle NEES/6: {_quantiles(np.array([r.oracle_nees for r in counted]))}")
     for what, field in (("both passes", "ms_per_frame"), ("causal", "ms_causal"), ("slowest frame", "ms_slowest")):
         out.append(f"process time, {what}: {_quantiles(np.array([getattr(r, field) for r in counted]))} ms")

@@ -16,7 +16,8 @@ from bench.random_scenes.nuisances import (
     draw_missing,
 )
 from bench.random_scenes.projection import in_picture, spot_pixels
-from bench.random_scenes.rigs import LEAST_SPOTS, Lab, draw_lab
+from bench.random_scenes.rigs import Lab, draw_lab
+from bench.random_scenes.vehicles import LEAST_SPOTS
 from geometry import rotations
 from geometry.arrays import Array, Bools, Ints
 from geometry.pose import Pose

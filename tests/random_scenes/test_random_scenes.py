@@ -13,12 +13,13 @@ import pytest
 
 from bench.random_scenes.__main__ import main
 from bench.random_scenes.answers import MEASURED, Answers, Pass, answers_in_memory, answers_through_files
-from bench.random_scenes.families import FAMILIES, bends_px, family_scene
-from bench.random_scenes.judge import figures, judge
+from bench.random_scenes.drafts import bends_px
+from bench.random_scenes.families import FAMILIES, family_scene
+from bench.random_scenes.judge import figures, independent_poses, judge
 from bench.random_scenes.oracle import ask_oracle, measured_pixels
 from bench.random_scenes.report import summary
-from bench.random_scenes.rigs import LEAST_SPOTS
 from bench.random_scenes.scene import CLUTTER, HIDDEN, OUTSIDE, SHINING, Scene, random_scene
+from bench.random_scenes.vehicles import LEAST_SPOTS
 from bench.random_scenes.write_folder import write_run_folder
 from geometry.solve import fit_pose
 from geometry.spots import SpotModel
@@ -198,6 +199,13 @@ def test_a_covariance_that_is_none_is_seen(easy):
     judgement = judge(easy, ask_oracle(easy), answers_of(replace(right, covariance=covariance)))
     assert judgement.smoothed.not_definite == 1
     assert not judgement.clean
+
+
+def test_errors_that_stay_count_as_one_pose_and_white_ones_as_many():
+    white = np.random.default_rng(5).normal(size=(400, 6))
+    assert independent_poses(white) > 200
+    assert independent_poses(np.ones((400, 6))) < 2
+    assert 15 < independent_poses(np.repeat(white[:40], 10, axis=0)) < 60
 
 
 def test_a_written_run_folder_reads_back_as_the_scene(tmp_path: Path):
