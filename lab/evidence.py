@@ -34,7 +34,7 @@ class Kind(StrEnum):
 
 REMEDIES = {
     Kind.NO_FRAMES: "Check the folders of pictures, or the detections, that run.yaml names (`beampose check`).",
-    Kind.NEVER_FOUND: "See the evidence below it.",
+    Kind.NEVER_FOUND: "See the reasons below.",
     Kind.NO_PICTURES: "Check the camera, its cable and the path that run.yaml names; or leave the camera out.",
     Kind.CAMERA_LATE: "Start all cameras before the motion; the poses before that moment have wider sigmas.",
     Kind.CAMERA_STOPPED: "Check the camera's disk, cable and trigger; the poses after that moment have wider sigmas.",

@@ -148,6 +148,9 @@ def _why_never(facts: RunFacts) -> list[Evidence]:
             f" needs ({per_frame})"
         )
         return [Evidence(Kind.FEW_POINTS, True, what, REMEDIES[Kind.FEW_POINTS], {"points": points})]
+    if causes:
+        what = f"of {_frames(facts.frames)}, {_in_words(causes)}"
+        return [Evidence(Kind.FEW_MEASURED, True, what, REMEDIES_BY_CAUSE[next(iter(causes))], {"points": points})]
     return []
 
 

@@ -58,7 +58,7 @@ def against_own_spots(
     A residual's covariance is taken as R + J P J^T, which holds for a pose made without the spot. A pose made with it
     has R - J P J^T, so the test is conservative there: it never accuses more than P_CONTRADICTION of right poses, and
     loses at most a factor 1.4 in sigmas where a frame's own spots make the pose (P of a single frame), nothing where
-    many frames do.
+    many frames do. To first order: a pose a few degrees off its spots contradicts them however vague it is.
     """
     known = finite(poses.translation, -1)
     safe = Pose(

@@ -91,7 +91,7 @@ def unexplained_finding(inquest: Inquest) -> Finding:
 def is_noisy(factor: float, misfit: float) -> bool:
     """Whether errors are so much larger than claimed that it is reported.
 
-    misfit: with all faults included. Of a large fault the linear model leaves some in single cameras, which is no noise.
+    misfit: with all faults included. Of a large fault the linear model leaves some in one camera, which is no noise.
     """
     return factor > NOISY and factor**2 - 1 > _NOT_LINEAR * misfit**2
 

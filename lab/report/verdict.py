@@ -14,6 +14,15 @@ UNKNOWN = ("NO VERDICT", "The results hold no verdict: summary.json is missing o
 
 
 @dataclass(frozen=True, slots=True)
+class Point:
+    """One reason, with what to do about it."""
+
+    what: str
+    remedy: str = ""
+    fails: bool = False  # a gate
+
+
+@dataclass(frozen=True, slots=True)
 class Verdict:
     """What to think of a run, and why."""
 
@@ -22,6 +31,7 @@ class Verdict:
     sentence: str
     reasons: tuple[str, ...]
     exit_status: int | None
+    points: tuple[Point, ...]  # the reasons with their remedies; of results without evidence the reasons alone
 
 
 def verdict_of(summary: dict[str, Any]) -> Verdict:
@@ -40,4 +50,10 @@ def verdict_of(summary: dict[str, Any]) -> Verdict:
         sentence=sentence,
         reasons=tuple(str(r) for r in reasons),
         exit_status=code if isinstance(code, int) else None,
+        points=_points(block.get("evidence")) or tuple(Point(str(r)) for r in reasons),
     )
+
+
+def _points(evidence: Any) -> tuple[Point, ...]:
+    found = [e for e in evidence if isinstance(e, dict)] if isinstance(evidence, list) else []
+    return tuple(Point(str(e.get("what")), str(e.get("remedy") or ""), e.get("level") == "fail") for e in found)

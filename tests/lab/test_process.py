@@ -13,13 +13,15 @@ import numpy as np
 import pytest
 import yaml
 
+from geometry.pose import Pose
+from geometry.spots import SpotModel
 from lab import columns, process
 from lab.batch import process_batch
 from lab.errors import InputError, RunError
 from lab.pipeline import FrameRecord, Pipeline
 from lab.process import are_results, process_run
 from lab.quality import LEAST_MEASURED
-from lab.results import read_poses
+from lab.results import read_poses, read_spots
 from lab.run_file import load_run
 from lab.score import normalised_squares
 from lab.simulate.scenarios import SCENARIOS, Fault
@@ -27,6 +29,7 @@ from lab.simulate.write import simulate
 from lab.two_passes import SMOOTHING, TRACKING, WRITING, TwoPasses
 from tests.lab.run_folders import write_run
 from tracking.rigid_tracker import RigidTracker
+from tracking.smoothed import Smoothed
 from tracking.spot_tracker import SpotTracker
 from tracking.statuses import PoseStatus, SpotStatus
 from tracking.tracked_frame import Event, TrackedFrame
@@ -261,17 +264,129 @@ def test_a_run_in_which_the_vehicle_is_never_found_is_a_failed_gate_with_all_its
     assert rows_of(tmp_path / "out/covariance.csv") == []
 
 
-def test_a_run_that_is_dark_for_most_of_its_frames_fails_the_gate(tmp_path):
-    folder = points_run(tmp_path / "run", frames=40)
-    table = folder / "detections.csv"
+def lit(folder: Path, frames: int) -> Path:
+    """A run of 40 frames of which the first so many, and the last, show spots."""
+    table = points_run(folder, frames=40) / "detections.csv"
     lines = table.read_text().splitlines(keepends=True)
-    few = int(40 * LEAST_MEASURED) - 2
     table.write_text(
-        "".join(ln for i, ln in enumerate(lines) if i == 0 or int(ln.split(",")[0]) < few or ln.startswith("39,"))
+        "".join(ln for i, ln in enumerate(lines) if i == 0 or int(ln.split(",")[0]) < frames or ln.startswith("39,"))
     )
-    outcome = process_run(folder, tmp_path / "out")
+    return folder
+
+
+def evidence_of(out: Path) -> dict[str, dict]:
+    """The evidence of a run's verdict by its kind, as summary.json has it."""
+    return {e["kind"]: e for e in json.loads((out / "summary.json").read_text())["verdict"]["evidence"]}
+
+
+def test_a_run_that_is_dark_for_nearly_all_of_its_frames_fails_the_gate(tmp_path):
+    outcome = process_run(lit(tmp_path / "run", int(40 * LEAST_MEASURED) - 2), tmp_path / "out")
     assert outcome.frames == 40
     assert outcome.exit_status == 4
+
+
+def test_a_run_that_is_dark_for_half_of_its_frames_and_says_so_does_not_fail(tmp_path):
+    outcome = process_run(lit(tmp_path / "run", 18), tmp_path / "out")
+    assert (outcome.measured, outcome.verdict.status, outcome.exit_status) == (19, "check", 0)
+    few = evidence_of(tmp_path / "out")["few_measured"]
+    assert few["numbers"]["causes"] == {"hidden": 21}
+    assert few["remedy"]
+
+
+def test_a_camera_that_shows_nothing_is_named_with_what_to_do(tmp_path):
+    folder = points_run(tmp_path / "run", frames=20)
+    table = folder / "detections.csv"
+    table.write_text("".join(ln for ln in table.read_text().splitlines(keepends=True) if ",right," not in ln))
+    outcome = process_run(folder, tmp_path / "out")
+    assert outcome.exit_status == 4
+    evidence = evidence_of(tmp_path / "out")
+    assert list(evidence) == ["never_found", "nothing_detected"]
+    assert evidence["nothing_detected"]["what"] == "camera right: nothing was detected in any of its 20 pictures"
+    assert evidence["nothing_detected"]["remedy"] in outcome.line()
+    page = (tmp_path / "out/report.html").read_text("utf-8")
+    assert "nothing was detected in any of its 20 pictures" in page
+    assert "are the lasers on, the lens uncovered" in page
+
+
+def test_a_prior_that_is_wrong_is_not_taken_for_darkness(tmp_path):
+    folder = points_run(tmp_path / "run", frames=20)
+    content = yaml.safe_load((folder / "run.yaml").read_text())
+    content["prior"] |= {"position_m": [2.0, 1.5, 0.0], "within_m": 0.1, "within_deg": 3.0}
+    (folder / "run.yaml").write_text(yaml.safe_dump(content))
+    assert process_run(folder, tmp_path / "out").exit_status == 4
+    evidence = evidence_of(tmp_path / "out")
+    assert list(evidence) == ["never_found", "not_acquired"]
+    assert evidence["not_acquired"]["remedy"].startswith("Check the prior")
+
+
+def test_a_camera_that_stops_or_starts_late_is_told_in_words(tmp_path):
+    gone = tuple(Fault(k, "dropped", camera) for camera, k in (("left", 12), ("left", 13), ("right", 0)))
+    scenario = replace(SCENARIOS["smooth"], faults=gone)
+    folder = simulate(scenario, tmp_path / "run", seed=5, frames=FRAMES, picture_scale=0.3)
+    process_run(folder, tmp_path / "out")
+    evidence = evidence_of(tmp_path / "out")
+    assert (
+        evidence["camera_stopped"]["what"]
+        == "camera left stopped before the end: it has no picture from frame 12 on (2 frames)"
+    )
+    assert evidence["camera_late"]["what"] == "camera right starts late: it has no picture of the first 1 frame"
+
+
+def test_a_vehicle_that_the_smoothing_pass_knows_throughout_was_not_lost(tmp_path, monkeypatch):
+    """Searches of the causal pass are events; the verdict counts what is reported."""
+    causal_step = RigidTracker.step
+
+    def step(self, dt_s, found):
+        tracked = causal_step(self, dt_s, found)
+        return replace(tracked, events=(*tracked.events, Event("reacquired", "found from the prior alone")))
+
+    monkeypatch.setattr(RigidTracker, "step", step)
+    outcome = process_run(points_run(tmp_path / "run", frames=40), tmp_path / "out")
+    counts = json.loads((tmp_path / "out/summary.json").read_text())["counts"]
+    assert counts["events"]["reacquired"] == 40
+    assert counts["found_again"] == 0
+    assert outcome.verdict.status == "pass"
+    assert "found again" not in (tmp_path / "out/report.html").read_text("utf-8")
+
+
+@pytest.mark.parametrize("causal", [True, False])
+def test_the_residual_is_that_of_the_reported_pose_against_its_own_spots(tmp_path, causal):
+    folder = points_run(tmp_path / "run", frames=40)
+    process_run(folder, tmp_path / "out", causal=causal)
+    model = SpotModel.of(load_run(folder).rig)
+    poses, spots = read_poses(tmp_path / "out"), read_spots(tmp_path / "out")
+    order = [spots.views.index(view) for view in model.views]
+    residual = spots.uv_px[:, order] - model.project(poses.world_from_body)[0]
+    residual[~spots.measured[:, order]] = np.nan
+    measured = poses.has(PoseStatus.MEASURED)
+    assert measured.sum() > 30
+    rms = np.sqrt(np.nanmean(residual**2, axis=(1, 2)))
+    np.testing.assert_allclose(poses.rms_px[measured], rms[measured], rtol=1e-4)
+
+
+def test_a_smoother_that_goes_astray_is_reported_as_predicted_with_sigmas_that_cover_it(tmp_path, monkeypatch):
+    """A pose 5 mm off for ten frames, at claimed sigmas of 0.1 mm: its spots deny it, and the verdict says so."""
+    smoothed_frame = Smoothed.frame
+
+    def astray(self, k, causal, found):
+        tracked = smoothed_frame(self, k, causal, found)
+        if not 20 <= k < 30:
+            return tracked
+        return replace(tracked, pose=tracked.pose.plus(np.array([5e-3, 0, 0, 0, 0, 0])))
+
+    folder = points_run(tmp_path / "run", frames=40)
+    monkeypatch.setattr(Smoothed, "frame", astray)
+    outcome = process_run(folder, tmp_path / "out")
+    evidence = evidence_of(tmp_path / "out")["contradiction"]
+    assert evidence["numbers"] == {"frames": [[20, 29]]}
+    assert "contradict their own spots" in outcome.line()
+    poses = read_poses(tmp_path / "out")
+    assert np.flatnonzero(poses.has(PoseStatus.PREDICTED)).tolist() == list(range(20, 30))
+    truth = rows_of(folder / "truth/pose.csv")
+    q = np.array([[float(r[n]) for n in ("qw", "qx", "qy", "qz")] for r in truth])
+    true = Pose.from_quaternion(q, np.array([[float(r[n]) for n in ("x_m", "y_m", "z_m")] for r in truth]))
+    nees = normalised_squares(true.minus(poses.world_from_body), poses.covariance)
+    assert np.all(nees[20:30] < 25)
 
 
 def test_the_same_run_gives_the_same_tables(tmp_path, run_folder, results):
@@ -408,6 +523,7 @@ def test_the_papers_tracker_is_smoothed_too_and_keeps_its_labels(tmp_path):
     assert (summary["attitude"], summary["smoother"]["relabelled"]) == ("smoothed", 0)
     smoothed, causal = (rows_of(tmp_path / which / "spots.csv") for which in ("smoothed", "causal"))
     assert [r["status"] for r in smoothed] == [r["status"] for r in causal]
+    assert {r["label_probability"] for r in smoothed} == {""}  # nothing estimates it
     assert {r["velocity_x_m_s"] for r in rows_of(tmp_path / "causal/attitude.csv")} == {""}  # it has none
     assert "" not in {r["velocity_x_m_s"] for r in rows_of(tmp_path / "smoothed/attitude.csv")}
 

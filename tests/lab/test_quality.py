@@ -155,6 +155,12 @@ def test_a_tie_gives_its_candidates():
     assert "narrower" in verdict.remedy
 
 
+def test_frames_that_do_not_determine_the_pose_are_the_reason_where_nothing_else_is():
+    verdict = never(causes={Cause.NOT_DETERMINED: 700, Cause.OUT_OF_VIEW: 300})
+    assert verdict.reasons[1].startswith("of 1000 frames, 700 whose spots do not determine the pose, 300 with fewer")
+    assert "two screens" in verdict.remedy
+
+
 def test_a_run_that_only_the_causal_pass_measured_says_so_and_not_that_it_was_found_again():
     verdict = never(causal_measured=98, lost=ranges((0, 999)), found_again=0)
     assert kinds(verdict)[:2] == [Kind.NEVER_FOUND, Kind.NOT_CONFIRMED]

@@ -183,7 +183,7 @@ def test_what_became_of_doubtful_labels_is_told(fake, tmp_path):
     path.write_text(json.dumps(summary | {"events": [open_for_long]}))
     html = write_report(tmp_path / "results").read_text(encoding="utf-8")
     assert len(doubtful) == 3
-    assert "Labels: 3 left open: no label was likely enough to be given; 4 changed by the second look" in html
+    assert "Labels: 3 left open: no label was likely enough to be given; 4 changed by the smoothing pass" in html
     assert "1 ties, in which" in html
     assert "2 times the vehicle was found again" in html
     assert "<td>spot 1: open, for 5 frames</td>" in html
@@ -212,6 +212,22 @@ def test_the_verdict_is_that_of_the_summary_with_all_its_reasons(tmp_path, statu
     assert f'<section class="verdict {status}">' in html
     assert f">{word}</strong>" in html
     assert "<li>one thing</li><li>another</li>" in html
+
+
+def test_each_reason_stands_at_the_top_with_its_remedy(tmp_path):
+    make(tmp_path, 40)
+    path = tmp_path / "results/summary.json"
+    evidence = [
+        {"kind": "model", "level": "fail", "what": "camera <right> has turned", "remedy": "Fix its mount."},
+        {"kind": "lost", "level": "check", "what": "3 frames are lost", "remedy": ""},
+    ]
+    verdict = {"status": "fail", "reasons": ["a", "b"], "exit_status": 4, "evidence": evidence}
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"verdict": verdict}))
+    html = write_report(tmp_path / "results").read_text(encoding="utf-8")
+    top = html[html.index('<section class="verdict fail">') : html.index("</section>")]
+    assert "<strong>camera &lt;right&gt; has turned</strong><br>" in top
+    assert '<span class="remedy">Fix its mount.</span>' in top
+    assert "<li>3 frames are lost</li>" in top
 
 
 @pytest.mark.parametrize("summary", [{}, {"verdict": None}, {"verdict": "good"}, {"verdict": {"status": "splendid"}}])

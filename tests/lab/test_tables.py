@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from geometry.pose import Pose, ypr_sigmas
 from lab import columns
+from lab.errors import RunError
 from lab.pipeline import FrameRecord
 from lab.tables import TableWriter, csv_word, pose_numbers
 from tests.geometry.scenes import paper_rig, random_pose
@@ -220,6 +221,38 @@ def test_what_was_known_at_the_instant_has_tables_of_its_own_with_the_same_colum
     assert float(rows[0]["x_m"]) == pytest.approx(known_then[0].tracked.pose.translation[0], rel=1e-9)
     (row,) = csv.DictReader((tmp_path / "covariance_causal.csv").open(newline=""))
     assert float(row["c00"]) == pytest.approx(known_then[0].tracked.pose_covariance[0, 0], rel=1e-9)
+
+
+def test_a_covariance_of_very_unequal_axes_is_still_one_when_it_is_read_back(tmp_path):
+    """Known to 1 um across and to 1 m along one direction: ten digits would make it negative along another."""
+    rng = np.random.default_rng(12)
+    axes = np.linalg.qr(rng.normal(size=(6, 6)))[0]
+    C = axes @ np.diag([1.0, *[1e-12] * 5]) @ axes.T
+    C = 0.5 * (C + C.T)
+    record = a_record(rng)
+    rows = written(tmp_path, replace(record, tracked=replace(record.tracked, pose_covariance=C)))["covariance.csv"]
+    back = np.zeros((6, 6))
+    back[np.triu_indices(6)] = [float(rows[0][name]) for name in columns.COVARIANCE[1:]]
+    back += np.triu(back, 1).T
+    assert np.array_equal(back, C)
+    assert np.linalg.eigvalsh(back)[0] > 0.9e-12
+    rounded = np.vectorize(lambda x: float(f"{x:.10g}"))(C)
+    assert np.linalg.eigvalsh(rounded)[0] < 0
+
+
+@pytest.mark.parametrize("what", ["pose", "motion", "spots"])
+@pytest.mark.filterwarnings("error")
+def test_a_negative_variance_is_never_written(tmp_path, what):
+    """lab.frame_checks takes such numbers out; here they are an error of the program, not an empty field."""
+    record = a_record(np.random.default_rng(13))
+    t, bad = record.tracked, np.diag([1.0, 1.0, 1.0, 1.0, 1.0, -1e-12])
+    wrong = {
+        "pose": replace(t, pose_covariance=bad),
+        "motion": replace(t, motion=replace(t.motion, covariance=bad)),
+        "spots": replace(t, cov_px2=np.where(np.arange(len(VIEWS))[:, None, None] == 1, -t.cov_px2, t.cov_px2)),
+    }
+    with pytest.raises(RunError, match="frame 7: internal error: a variance is negative"):
+        written(tmp_path, replace(record, tracked=wrong[what]))
 
 
 def test_the_sixteen_numbers_of_the_pose_are_in_the_order_of_the_columns():
