@@ -127,7 +127,7 @@ def answers_in_memory(scene: Scene, parameters: TrackerParameters | None = None)
     causal: list[FrameRecord] = []
     with _recorded_warnings() as caught, tempfile.TemporaryDirectory() as name:
         work = Path(name)
-        tracker = TimedTracker(tracker_of(run, run.prior))  # type: ignore[arg-type]
+        tracker = TimedTracker(tracker_of(run))
         pipeline = Pipeline(run, PointReader(scene), tracker, {})  # type: ignore[arg-type]
         model = SpotModel.of(run.rig)
         checks = FrameChecks(run.rig, run.covariance)
