@@ -16,7 +16,7 @@ from geometry import small
 from geometry.arrays import Array, Bools, Ints
 from geometry.compiled import compiled
 from geometry.projection import Views
-from tracking.association import BLENDED, Chances, Frame, Sights, associate, crowding
+from tracking.association import BLENDED, Chances, Frame, Sights, associate, crowding, expected_at
 from tracking.hiding import MISSED, later, learnt, marginal, together
 from tracking.information import frame_information, widen_by_curvature
 from tracking.motion import STATE, predicted, updated
@@ -27,6 +27,8 @@ FORGET = 12.0  # nats: a hypothesis so far behind is dropped
 SAME = 0.7  # two hypotheses with one assignment whose states differ by less than this in sigmas are one
 TOO_WIDE = 0.06  # m, rad: where a frame leaves its widest direction so open, it is not taken
 LEAST_SHARE = 1e-3  # of the probability: hypotheses below it, however far away, do not widen the covariance
+FEW = 4  # spots: fewer than these fit any labels
+VAGUE_PX = 15.0  # 1 sigma of a predicted spot: beyond it the whole picture is searched at once
 PROOF = 3  # spots: where so many lie in their narrow gates, the velocities have not jumped
 LEAST_TO_TURN = 6.0  # nats: a hypothesis so far behind is not tried with a manoeuvre as well
 SURPRISE = 3.5  # sigmas of a misfit's own scatter: beyond it a manoeuvre is considered although every spot is found
@@ -191,7 +193,6 @@ def grow(
         shown = later(old.shown[h], n) if dt > 0.0 else old.shown[h]
         shining = marginal(shown, sights.group)
         turning = False
-        steady_P = old.P[h]
         for mode in range(2):
             if mode == 1 and not turning:
                 break
@@ -200,20 +201,28 @@ def grow(
                 R, t, m, P, _ = predicted(old.R[h], old.t[h], old.m[h], old.P[h], dt, dynamics.jerk, jump, unsteady)
             else:
                 R, t, m, P = old.R[h], old.t[h], old.m[h], old.P[h]
-            if mode == 0:
-                steady_P = P
             prior = old.weight[h] + np.log(1 - dynamics.p_manoeuvre if mode == 0 else dynamics.p_manoeuvre)
             assigned, score, counted, R_b, t_b, b = associate(
                 views, sights, frame, chances, R, t, _block(P, 6), shining, extra
             )
-            before = (R, t, m, P)
             # An upper bound of what `crowding` may add, so that no child is dropped before its likelihood is known.
             crowd = 0.0
             for i in range(n):
                 crowd += frame.log_crowding[i]
+            unseen = P
+            if mode == 0 and dt > 0.0:
+                # Where the spots do not give the pose nothing tells the two motions apart: their mixture, of one mean.
+                _, _, _, P_jump, _ = predicted(
+                    old.R[h], old.t[h], old.m[h], old.P[h], dt, dynamics.jerk, dynamics.jump, dynamics.unsteady
+                )
+                unseen = _mixed(P, P_jump, max(dynamics.p_manoeuvre, DARK_MANOEUVRE))
             for k in range(b):
                 if prior + score[k] + crowd < best - FORGET or (k > 0 and score[k] < score[0] - FORGET):
                     continue
+                labelled = 0
+                for i in range(n):
+                    labelled += 1 if 0 <= assigned[k, i] < BLENDED else 0
+                before = (R, t, m, unseen if labelled < PROOF else P)
                 R_k, t_k, m_k, P_k, gaussian, misfit, spots = concluded(
                     views, frame, extra, before, assigned[k], R_b[k], t_b[k]
                 )
@@ -228,16 +237,11 @@ def grow(
                             or _misses_a_screen(assigned[k], shining, sights.group)
                         )
                     )
-                if spots == 0:
-                    if mode == 1:
-                        continue
-                    # Nothing tells the two motions apart: their mixture, which has one mean.
-                    if dt > 0.0:
-                        p = max(dynamics.p_manoeuvre, DARK_MANOEUVRE)
-                        _, _, _, P_jump, _ = predicted(
-                            old.R[h], old.t[h], old.m[h], old.P[h], dt, dynamics.jerk, dynamics.jump, dynamics.unsteady
-                        )
-                        P_k = _mixed(steady_P, P_jump, p)
+                if mode == 1 and spots < PROOF:
+                    continue  # a bend is in the mixture above; a point or two would be one wherever they lie
+                if spots < FEW and widest(views, R, t, unseen, assigned[k]) > VAGUE_PX:
+                    # Where a spot may be anywhere some false point fits: so few say nothing of the pose.
+                    R_k, t_k, m_k, P_k = R, t, m, unseen
                 total = prior + counted[k] + gaussian + together(shown, sights.group, assigned[k], chances.detect)
                 total += crowding(views, sights, frame, R_k, t_k)
                 if not np.isfinite(total):
@@ -248,7 +252,19 @@ def grow(
     return out, count
 
 
-DARK_MANOEUVRE = 0.05  # least chance of a manoeuvre per frame that nothing was seen in: what is hidden is often a bend
+DARK_MANOEUVRE = 0.05  # least chance of a manoeuvre per frame that does not show the pose: what is hidden is often a bend
+
+
+@compiled
+def widest(views: Views, R: Array, t: Array, P: Array, assigned: Ints) -> float:
+    """The largest sigma, px, with which a predicted pose (R, t) and its P (6 or more, square) place a labelled spot."""
+    uv, J = np.empty(2), np.empty((2, 6))
+    worst = 0.0
+    for i in range(assigned.shape[0]):
+        if assigned[i] >= 0:
+            there, a, _, c = expected_at(views, i, R, t, P, uv, J)
+            worst = max(worst, 0.5 * (a + c)) if there else np.inf
+    return np.sqrt(worst)
 
 
 @compiled

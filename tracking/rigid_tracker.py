@@ -13,6 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from geometry.alternatives import alternatives
 from geometry.arrays import Array, Ints
 from geometry.calibration_spread import CalibrationSpread
 from geometry.pose import Pose
@@ -26,7 +27,9 @@ from tracking.detections import Detections
 from tracking.digest import Digest, ahead, digest, surprise
 from tracking.hiding import MISSED, later, learnt, marginal, together
 from tracking.hypotheses import (
+    FEW,
     PROOF,
+    VAGUE_PX,
     Children,
     Hypotheses,
     add_child,
@@ -35,6 +38,7 @@ from tracking.hypotheses import (
     grow,
     no_children,
     sift,
+    widest,
 )
 from tracking.information import fit_alone
 from tracking.labels import NO_POINT, OVER_NOTHING, Labelling, PosePrior, candidate_labellings, find_labels
@@ -56,18 +60,18 @@ from tracking.whole_run import LOST_SIGMA_M, LOST_SIGMA_RAD
 FIRST_SPEED, FIRST_RATE = 4.0, 6.0  # m/s, rad/s
 FIRST_ACCELERATION, FIRST_ANGULAR = 30.0, 100.0  # m/s^2, rad/s^2
 P_FRESH = 1e-3  # probability per frame that the vehicle is not where any hypothesis has it
-FEW = 4  # spots: fewer do not tell a lost vehicle from one that is mostly hidden
 LONG_UNMEASURED = 10  # frames without a measured pose, after which two missing spots are enough to doubt it
 SEARCH_AT = (2, 4, 8, 14)  # frames in a row that contradict the hypothesis
 DOUBT_FRAMES = 50  # in a row with fewer: then they are doubted
 NOWHERE = (SpotStatus.LOST, SpotStatus.OFF_SCREEN)
 MOST_EVIDENCE, LEAST_EVIDENCE = 50.0, -5.0  # nats; a vehicle that was never found and is less likely than this goes
+ALTERNATIVE_NATS = 8.0  # a child so far behind the best is not asked for its mirror solutions
+AMBIGUOUS = 9.0  # share of the frame's own variance that other answers may add to a measured pose of few spots
 YOUNG = 5  # frames after a search found the vehicle: until then its velocities may be known to next to nothing
 MOST_LINKED, MOST_CANDIDATES = 3, 4  # hypotheses that a search's answers continue, and answers
 FARTHEST_M, FARTHEST_RAD = 1.5, np.deg2rad(60.0)  # of a search from the last pose: beyond it a fan looks like itself
 STATIC_LOG_DENSITY = -4.0  # 1/px^2: a point where static ones are denser is left out of a search
 SIZE_GAIN = 0.1  # of one frame, for how wide a spot usually is
-VAGUE_PX = 15.0  # 1 sigma of a predicted spot: beyond it the whole picture is searched at once
 
 
 class RigidTracker:
@@ -143,6 +147,7 @@ class RigidTracker:
             count = self._search(children, count, frame, found, dt_s, events, fresh)
         if count == 0:
             return self._nothing(found, predicted, events)
+        count = self._add_alternatives(children, count, frame, dt_s)
         if self._anchor is None:
             best = float(np.max(children.after.weight[:count]))
             self._evidence = min(best + (0.0 if self._hypotheses is None else self._evidence), MOST_EVIDENCE)
@@ -287,44 +292,70 @@ class RigidTracker:
                 starts.append(((state[0], state[1], state[2], state[3]), later(h.shown[k], n), weight, k))
         known = {tuple(np.maximum(children.assigned[k], MISSED)) for k in range(count)}
         for one in candidates:
+            pose = one.fit.world_from_body
+            assigned = np.where(one.point_of == NO_POINT, MISSED, one.point_of + frame.first[self.model.camera_of])
             for before, chances, weight, parent in starts:
-                count = self._add_candidate(children, count, frame, one, before, chances, weight, parent, known, fresh)
+                count, place = self._add(children, count, frame, assigned, pose, before, chances, weight, parent)
+                if place >= 0:
+                    fresh.pop(place, None)
+                    if tuple(np.maximum(children.assigned[place], MISSED)) not in known:
+                        names = ", ".join(self.model.views[v][1] for v in np.flatnonzero(assigned >= 0))
+                        fresh[place] = names
         return count
 
-    def _add_candidate(
+    def _add(
         self,
         children: Children,
         count: int,
         frame: Frame,
-        one: Labelling,
+        assigned: Ints,
+        pose: Pose,
         before: tuple[Array, Array, Array, Array],
         shown: Array,
         weight: float,
         parent: int,
-        known: set[tuple[int, ...]],
-        fresh: dict[int, str],
-    ) -> int:
-        """One labelling as the continuation of one state; how many children there are then."""
+    ) -> tuple[int, int]:
+        """Add an assignment (n,) near a pose, as the continuation of one state: number of children, place (-1: none)."""
         views, sights = self.model.numbers, self._sights
-        pose = one.fit.world_from_body
-        assigned = np.where(one.point_of == NO_POINT, MISSED, one.point_of + frame.first[self.model.camera_of])
-        R, t = np.ascontiguousarray(pose.rotation), np.ascontiguousarray(pose.translation)
+        R, t = np.array(pose.rotation, order="C"), np.array(pose.translation)
         R, t, m, P_after, gaussian, _, _ = concluded(views, frame, self._extra, before, assigned, R, t)
         uv, _ = project_all(views, R[None], t[None])
         inside = self.model.in_picture(uv[0]) & frame.has_image[self.model.camera_of]
         assigned = np.where((assigned < 0) & ~inside, -2, assigned)
         weight += gaussian + crowding(views, sights, frame, R, t)
-        shining = marginal(shown, sights.group)
-        weight += log_chance(views, sights, frame, self._chances, shining, assigned, R, t)
+        weight += log_chance(views, sights, frame, self._chances, marginal(shown, sights.group), assigned, R, t)
         weight += together(shown, sights.group, assigned, self.parameters.p_detect)
         if not np.isfinite(weight):
-            return count
+            return count, -1
         after = learnt(shown, sights.group, assigned, self.parameters.p_detect)
-        count, place = add_child(children, count, R, t, m, P_after, weight, after, assigned, False, parent)
-        if place >= 0:
-            fresh.pop(place, None)
-            if tuple(np.maximum(assigned, MISSED)) not in known:
-                fresh[place] = ", ".join(self.model.views[v][1] for v in np.flatnonzero(assigned >= 0))
+        return add_child(children, count, R, t, m, P_after, weight, after, assigned, False, parent)
+
+    def _add_alternatives(self, children: Children, count: int, frame: Frame, dt_s: float) -> int:
+        """Add the other poses that so few spots allow, mirror solutions, to the children; how many there are then.
+
+        Three spots fix a pose up to a few solutions; which one it is only the motion can tell. Each solution competes
+        with its own, so that one that the vehicle may have changed to is not forgotten.
+        """
+        h = self._hypotheses
+        if h is None or count == 0 or dt_s <= 0:
+            return count
+        w = children.after.weight[:count]
+        for c in np.argsort(-w)[:MOST_LINKED].tolist():
+            assigned = children.assigned[c].copy()
+            rows = np.flatnonzero((assigned >= 0) & (assigned < BLENDED))
+            parent = int(children.parent[c])
+            if w[c] < w.max() - ALTERNATIVE_NATS or parent < 0 or len(np.unique(self.model.spot_of[rows])) != PROOF:
+                continue
+            pose = Pose(children.after.R[c].copy(), children.after.t[c].copy())
+            others = alternatives(self.model, pose, rows)
+            manoeuvre = bool(children.manoeuvre[c])
+            p = self.temper.dynamics.p_manoeuvre
+            weight = float(h.weight[parent]) + float(np.log(p if manoeuvre else 1 - p))
+            *state, _ = self._predicted(h, parent, dt_s, manoeuvre)
+            before = (state[0], state[1], state[2], state[3])
+            for i in range(len(others.translation)):
+                shown = later(h.shown[parent], len(self.model))
+                count, _ = self._add(children, count, frame, assigned, others[i], before, shown, weight, parent)
         return count
 
     def _proposed(
@@ -416,7 +447,12 @@ class RigidTracker:
         d = digest(model.numbers, self._sights, frame, h.R[0], h.t[0], assigned, certain, least, RADIUS_PX)
         count = int(np.count_nonzero(d.use))
         proven = self._anchor is not None or self._evidence >= OVER_NOTHING
-        measured = count >= 3 and proven and self._good(d.alone)
+        if 0 < count < FEW and before is not None and dt_s > 0 and children.parent[best] >= 0:
+            R, t, _, P, _ = self._predicted(before, int(children.parent[best]), dt_s, bool(children.manoeuvre[best]))
+            proven &= bool(widest(model.numbers, R, t, P, assigned) <= VAGUE_PX)
+        # Another pose that is not excluded makes it a prediction, with a covariance that covers both.
+        ambiguous = count <= FEW and bool(np.any(spread.diagonal() > AMBIGUOUS * d.alone.diagonal()))
+        measured = count >= 3 and proven and not ambiguous and self._good(d.alone)
         self._unmeasured = 0 if measured else self._unmeasured + 1
         if measured and self.calibration is not None:
             self._look_at_calibration(d, h)
@@ -431,7 +467,7 @@ class RigidTracker:
         # After a frame that showed nothing, one or two points may be false ones: a second such frame must follow.
         alone = np.count_nonzero(d.labelled) < PROOF and not self._saw_any
         self._saw_any = bool((assigned >= 0).any())
-        labelled = d.labelled if known and not alone else np.zeros_like(d.labelled)
+        labelled = d.labelled if known and proven and not alone else np.zeros_like(d.labelled)
         predicted_cov: Array | None = None
         if measured:
             if best in fresh:

@@ -74,7 +74,7 @@ class _Pass:
         self.assigned = self.causal.copy()
         self.measured = rec.measured
         self.probability = np.where(self.causal >= 0, 1.0, np.nan)
-        self.trusted = np.ones(len(rec), dtype=bool)  # frames whose labels may be evidence
+        self.trusted = _trusted(self.assigned, self.measured)  # frames whose labels may be evidence
         poses = rec.poses
         ref = straight_between(poses, self.measured, np.cumsum(rec.dt_s))
         every = _all_detections(rec)
@@ -119,7 +119,8 @@ class _Pass:
         changed = bool(np.any(new != self.assigned))
         self.assigned = new
         self.measured = _alone(rec, self.views, self.every, new, self.extra, ref).measured
-        self.trusted = self.measured | ~vague
+        # Three spots fit any labels: where the other frames cannot confirm them they are no evidence.
+        self.trusted = (self.measured & (np.count_nonzero(new >= 0, axis=1) > PROOF)) | ~vague
         return changed
 
     def repair(self) -> None:
@@ -176,6 +177,21 @@ class _Pass:
             noise_scale=self.scale,
             extra=self.extra,
         )
+
+
+def _trusted(assigned: Ints, measured: Bools) -> Bools:
+    """(T,): frames whose labels confirm each other, or those of the frames beside them.
+
+    Three spots fit any labels. A measured frame with three is believed where an unbroken row of measured frames leads
+    from it to one with more.
+    """
+    sure = measured & (np.count_nonzero(assigned >= 0, axis=1) > PROOF)
+    out = sure.copy()
+    for order in (range(1, len(out)), range(len(out) - 2, -1, -1)):
+        step = 1 if order.step > 0 else -1
+        for k in order:
+            out[k] |= measured[k] and out[k - step]
+    return out
 
 
 class _Own:

@@ -87,6 +87,7 @@ def estimate(run: WholeRun, assigned: Ints, measured: Bools, motion: Motion, dee
     those of frames that are not trusted (T,). Frames before the first evidence and after the last are extrapolated.
     """
     frames = len(run.dt)
+    measured = measured & trusted
     far = ~np.asarray(maximum_filter1d(measured.astype(np.int8), 2 * deep + 1, mode="constant"), dtype=bool)
     used = ~far & trusted & (assigned >= 0).any(axis=1)
     if not measured.any():
