@@ -24,6 +24,7 @@ TOGETHER_SIGMAS, TOGETHER_PX = 6.0, 0.1
 CONFIDENTLY_WRONG = 100.0  # NEES
 CHI2_95 = 12.592  # of 6 degrees of freedom
 LEAST_IDENTITY, MOST_NEES = 0.995, 12.0
+LASTS, LEAST_LASTING = 10, 0.8  # a track is locked in if this share of so many frames is found
 LEAST_LOCKED = 0.5  # identity below which the tracker is not locked at all
 SAME_POINT_PX = 1e-3  # between a label's point and the detection: files round
 
@@ -67,7 +68,7 @@ class PassFigures:
     not_definite: int  # covariances that are not positive definite
     first_labels: int  # the first frame with a label; -1: none ...
     first_wrong: int  # ... and how many of its labels are wrong
-    locked_in: int  # the first frame with a measured pose that is not confidently wrong; -1: none
+    locked_in: int  # the first frame with a measured pose that is not confidently wrong, and that lasts; -1: none
     worst_deg: float  # largest attitude error of a measured pose
     worst_m: float
 
@@ -108,8 +109,8 @@ class Judgement:
 
 def judge(scene: Scene, oracle: Oracle, answers: Answers) -> Judgement:
     """All figures of one scene."""
-    smoothed = figures(scene, answers.smoothed)
-    causal = None if answers.causal is None else figures(scene, answers.causal)
+    smoothed = figures(scene, answers.smoothed, oracle.solvable)
+    causal = None if answers.causal is None else figures(scene, answers.causal, oracle.solvable)
     missing = oracle.solvable & (answers.smoothed.status != MEASURED)
     return Judgement(
         seed=scene.seed,
@@ -133,8 +134,8 @@ def judge(scene: Scene, oracle: Oracle, answers: Answers) -> Judgement:
     )
 
 
-def figures(scene: Scene, answer: Pass) -> PassFigures:
-    """One pass against truth."""
+def figures(scene: Scene, answer: Pass, solvable: Bools) -> PassFigures:
+    """One pass against truth. solvable (T,): frames whose own spots give a pose."""
     right, wrong, near = label_verdicts(scene, answer)
     countable = scene.shining & ~_together(scene)
     whitened = whitened_errors(scene, answer)
@@ -144,7 +145,6 @@ def figures(scene: Scene, answer: Pass) -> PassFigures:
     good = known & ~np.isnan(nees)
     off = nees > CONFIDENTLY_WRONG
     labelled = np.flatnonzero(answer.labelled.any(axis=1))
-    locked = np.flatnonzero(measured & good & ~off)
     delta = scene.poses.minus(answer.poses)
     with np.errstate(invalid="ignore"):
         components = np.abs(delta / np.sqrt(np.diagonal(answer.covariance, axis1=1, axis2=2))).max(axis=1)
@@ -170,10 +170,19 @@ def figures(scene: Scene, answer: Pass) -> PassFigures:
         not_definite=int((known & np.isnan(nees)).sum()),
         first_labels=int(labelled[0]) if labelled.size else -1,
         first_wrong=int(wrong[labelled[0]].sum()) if labelled.size else 0,
-        locked_in=int(locked[0]) if locked.size else -1,
+        locked_in=_locked_in(measured & good & ~off, solvable),
         worst_deg=float(np.rad2deg(np.linalg.norm(delta[measured, 3:], axis=1)).max(initial=0.0)),
         worst_m=float(np.linalg.norm(delta[measured, :3], axis=1).max(initial=0.0)),
     )
+
+
+def _locked_in(found: Bools, solvable: Bools) -> int:
+    """The first of the found frames (T,) from which on most solvable ones of the next LASTS frames are found too."""
+    for k in np.flatnonzero(found):
+        asked = solvable[k : k + LASTS]
+        if (found[k : k + LASTS] & asked).sum() >= LEAST_LASTING * asked.sum():
+            return int(k)
+    return -1
 
 
 def label_verdicts(scene: Scene, answer: Pass) -> tuple[Bools, Bools, Bools]:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from bench.random_scenes.__main__ import main
-from bench.random_scenes.answers import MEASURED, Answers, Pass, answers_in_memory, answers_through_files
+from bench.random_scenes.answers import LOST, MEASURED, Answers, Pass, answers_in_memory, answers_through_files
 from bench.random_scenes.drafts import bends_px
 from bench.random_scenes.families import FAMILIES, family_scene
 from bench.random_scenes.judge import figures, independent_poses, judge
@@ -176,7 +176,7 @@ def test_a_label_on_a_hidden_spots_clutter_is_seen(easy):
     right = true_answers(easy)
     uv = right.uv_px.copy()
     uv[20, 0] = moved[rows[0]]
-    assert figures(scene, replace(right, uv_px=uv)).wrong == 1
+    assert figures(scene, replace(right, uv_px=uv), np.ones(FRAMES, dtype=bool)).wrong == 1
 
 
 def test_a_confidently_wrong_pose_is_seen(easy):
@@ -206,6 +206,18 @@ def test_errors_that_stay_count_as_one_pose_and_white_ones_as_many():
     assert independent_poses(white) > 200
     assert independent_poses(np.ones((400, 6))) < 2
     assert 15 < independent_poses(np.repeat(white[:40], 10, axis=0)) < 60
+
+
+def test_a_pose_that_is_lost_at_once_is_no_lock(easy):
+    right = true_answers(easy)
+    late = np.where(np.arange(FRAMES) < 5, LOST, MEASURED)
+    oracle = ask_oracle(easy)
+    assert judge(easy, oracle, answers_of(right)).smoothed.locked_in == 0
+    assert judge(easy, oracle, answers_of(replace(right, status=late))).smoothed.locked_in == 5
+    flash = np.where(np.arange(FRAMES) == 0, MEASURED, LOST)
+    judgement = judge(easy, oracle, answers_of(replace(right, status=flash)))
+    assert judgement.smoothed.locked_in == -1
+    assert "never locked" in judgement.classes
 
 
 def test_a_written_run_folder_reads_back_as_the_scene(tmp_path: Path):
