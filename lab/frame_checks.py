@@ -111,7 +111,9 @@ class FrameChecks:
     def _contradicted(
         self, frame: int, tracked: TrackedFrame, chi2: float | None, dof: int, then: TrackedFrame | None
     ) -> TrackedFrame:
-        """The frame as predicted, with a covariance that covers where its spots or the causal pass put the vehicle.
+        """The frame as predicted, with a covariance that covers where its spots and the causal pass put the vehicle.
+
+        Its velocities are left out. This is the last resort: it makes a wrong pose honest, not right.
 
         chi2, dof: of the pose against its own spots; None where these agree and the causal pose does not.
         """
@@ -129,16 +131,26 @@ class FrameChecks:
             else:
                 P = P * (chi2 / max(dof, 1))
         else:
-            assert then is not None
-            assert then.pose is not None
-            assert then.pose_covariance is not None
             self.causal.add(frame)
             words = "the smoothed pose contradicts the causal one beyond their sigmas"
+        if then is not None and then.pose is not None and then.pose_covariance is not None:
+            # Also where its own spots contradict it: they may be the wrong ones.
             gap = then.pose.minus(tracked.pose)
             P = P + np.outer(gap, gap) + then.pose_covariance
+        _, J = self._model.project(tracked.pose)
+        wider = J @ (P - tracked.pose_covariance) @ np.swapaxes(J, -1, -2)
+        seen = np.array([s.measured for s in tracked.status])
         status = PoseStatus.PREDICTED if tracked.pose_status is PoseStatus.MEASURED else tracked.pose_status
         events = (*tracked.events, Event(CONTRADICTION, f"{words}: reported as predicted, with wider sigmas"))
-        return replace(tracked, pose_covariance=P, pose_status=status, spots_used=0, events=events)
+        return replace(
+            tracked,
+            cov_px2=np.where(seen[:, None, None], tracked.cov_px2, tracked.cov_px2 + wider),
+            pose_covariance=P,
+            pose_status=status,
+            spots_used=0,
+            motion=None,
+            events=events,
+        )
 
 
 def _with_valid_covariances(frames: list[TrackedFrame]) -> tuple[list[TrackedFrame], Bools]:

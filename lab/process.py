@@ -79,7 +79,7 @@ class _Tally:
     events: list[dict[str, Any]] = field(default_factory=list)
     event_kinds: Counter[str] = field(default_factory=Counter)
     lasting: dict[tuple[str, int | None], dict[str, Any]] = field(default_factory=dict)  # the latest of each kind
-    untold: int = 0
+    unlisted: int = 0
     left_open: int = 0  # rows of spots.csv with a detection whose label was too uncertain to be given
 
     def add(self, record: FrameRecord) -> None:
@@ -114,7 +114,7 @@ class _Tally:
                 )
                 self.lasting[event.kind, event.view] = self.events[-1]
             else:
-                self.untold += 1
+                self.unlisted += 1
 
 
 def process_run(
@@ -167,7 +167,7 @@ def process_run(
         from lab.model_check.check import check_kept  # the words of its report: only for those who need them
 
         model_check = check_kept(run.rig, keeper, run.covariance)
-        # Where the model check has tested the residuals, it has told noise from faults.
+        # Where the model check has tested the residuals, it has separated noise from faults.
         misfit = None if model_check.inquest is not None else pipeline.tracker.noise_scale
         verdict = quality.judge(facts, model_check.findings, misfit)
         errors = _errors(work, run)
@@ -234,8 +234,8 @@ def _summary(
     notes = list(pipeline.reader.notes)
     if run.left_out:
         notes.append(f"cameras of the rig that this run has nothing of: {', '.join(run.left_out)}")
-    if tally.untold:
-        notes.append(f"events: the first {MOST_EVENTS} of {MOST_EVENTS + tally.untold} are listed")
+    if tally.unlisted:
+        notes.append(f"events: the first {MOST_EVENTS} of {MOST_EVENTS + tally.unlisted} are listed")
     return {
         "schema": SUMMARY_SCHEMA,
         "name": run.name,

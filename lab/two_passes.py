@@ -18,7 +18,7 @@ from tracking.smoothed import Smoothed
 from tracking.smoother import smooth
 
 Progress = Callable[[int, int | None, str], None]  # frames done, frames in all where known, what is being done
-TRACKING, SMOOTHING, WRITING = "tracking", "smoothing", "writing"  # what it is told
+TRACKING, SMOOTHING, WRITING = "tracking", "smoothing", "writing"  # its stages
 
 
 @dataclass(frozen=True, slots=True)

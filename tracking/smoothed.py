@@ -51,7 +51,7 @@ class Smoothed:
         """Frame k as the causal tracker's, with what the whole run says of labels, pose and motion.
 
         `predicted_px` and `gain` stay: they are about what was known before. Events of the search stay, those about
-        labels left open are told anew.
+        labels left open are replaced.
         """
         model = self.model
         known = bool(self.known[k])

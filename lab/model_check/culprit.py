@@ -26,7 +26,7 @@ AHEAD = 12.0  # of 2 ln(evidence): so far behind the best (1 : 400) another faul
 LINEAR_SHARE = 0.005
 MOST_FAULTS = 3  # named at once: where more seem wrong, the whole rig wants calibrating
 MOST_RIVALS = 2  # named beside the best
-_LEAST_OWN = 10.0  # degrees of freedom of a view: of fewer its noise is not told
+_LEAST_OWN = 10.0  # degrees of freedom of a view: of fewer its noise is unknown
 LASTING_FRAMES = 2.0  # frames that count as one: white noise gives 1.0 to 1.2 in 300 frames
 _SEEN = 1e-10  # of the largest eigenvalue: combinations of numbers that show less show by rounding only
 

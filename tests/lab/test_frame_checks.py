@@ -83,10 +83,26 @@ def test_a_pose_that_contradicts_its_spots_is_predicted_with_sigmas_that_cover_w
     assert distance(Pose.identity(), record.tracked.pose, P) > 400
     assert t.pose_status is PoseStatus.PREDICTED
     assert distance(Pose.identity(), t.pose, t.pose_covariance) < 2
+    assert t.motion is None
     assert np.isnan(t.rms_px)
     assert t.spots_used == 0
     assert [e.kind for e in t.events] == [CONTRADICTION]
     assert checks.own_spots.ranges == [[4, 4]]
+
+
+def test_where_the_spots_may_be_the_wrong_ones_the_sigmas_cover_the_causal_pose_too():
+    """Its three spots put the vehicle 200 sigmas from the reported pose, and the causal pass on the other side."""
+    record, causal = a_record(off=200.0, spots=4), a_record(off=400.0)
+    uv, _ = MODEL.project(causal.tracked.pose)
+    causal = changed(causal, uv_px=uv)
+    ((kept, _),) = FrameChecks(RIG).passed([(record, causal)])
+    t = kept.tracked
+    for pose in (Pose.identity(), causal.tracked.pose):
+        assert distance(pose, t.pose, t.pose_covariance) < 2
+    _, J = MODEL.project(t.pose)
+    hidden = J[5] @ t.pose_covariance @ J[5].T
+    np.testing.assert_allclose(t.cov_px2[5] - record.tracked.cov_px2[5], hidden - J[5] @ P @ J[5].T, rtol=1e-6)
+    np.testing.assert_allclose(t.cov_px2[0], record.tracked.cov_px2[0])
 
 
 def test_a_pose_that_two_spots_deny_is_widened_as_far_as_they_ask():
@@ -177,9 +193,10 @@ def test_a_spot_whose_covariance_is_none_has_no_sigmas():
 
 
 def test_an_invalid_covariance_of_the_causal_tables_is_left_out_and_counted_once():
-    checks = FrameChecks(RIG)
     bad = changed(a_record(), pose_covariance=NOT_POSITIVE)
-    ((_, then),) = checks.passed([(bad, bad)])
-    assert then is not None
-    assert then.tracked.pose is None
-    assert len(checks.invalid) == 1
+    for now in (bad, a_record()):
+        checks = FrameChecks(RIG)
+        ((_, then),) = checks.passed([(now, bad)])
+        assert then is not None
+        assert then.tracked.pose is None
+        assert len(checks.invalid) == 1

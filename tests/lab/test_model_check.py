@@ -296,8 +296,28 @@ def test_the_camera_with_the_wrong_sigmas_is_named():
     (finding,) = check_model(run.rig, dataclasses.replace(recording, cov_px2=claims)).findings
     assert finding.level == Level.WARN
     factors = dict(re.findall(r"camera `(\w+)` ([\d.]+)", finding.what))
-    assert float(factors["left"]) < 1.5
-    assert float(factors["right"]) > 3.0
+    assert float(factors["left"]) == pytest.approx(1.0, abs=0.15)
+    assert float(factors["right"]) == pytest.approx(4.0, rel=0.1)
+
+
+def test_uneven_claims_do_not_make_a_right_rig_look_wrong():
+    """All tests weigh by the claims: with those of one camera of four too small, p was 2e-9 for a right rig."""
+    run, recording = recorded("two-cameras-per-screen", 5, frames=300)
+    claims = recording.cov_px2.copy()
+    claims[:, run.model.camera_of == 1] /= 4.0**2
+    check = check_model(run.rig, dataclasses.replace(recording, cov_px2=claims))
+    assert check.inquest is not None
+    assert check.inquest.p_before > 1e-4
+    assert len(check.findings) == 1
+    expected = {"left-a": 1.0, "left-b": 4.0, "right-a": 1.0, "right-b": 1.0}
+    assert check.noise_of_cameras == pytest.approx(expected, rel=0.1)
+
+
+def test_noise_alone_does_not_make_a_small_fault_a_failure():
+    small = [Effect(0, 0, 0.0, 0.2, 0.1, 0.1, 0.1)]
+    for noise, level in ((1.0, Level.FAIL), (8.0, Level.PASS)):
+        inquest = Inquest((), 0.0, 1.0, 30, 8.0, noise, 1.0, False, np.ones(6))
+        assert words.level_of(inquest, small) == level
 
 
 def test_large_errors_that_last_are_no_noise_and_fail():
