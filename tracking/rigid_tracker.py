@@ -441,6 +441,8 @@ class RigidTracker:
         h = self._hypotheses
         assert h is not None
         assigned = children.assigned[best]
+        if best in fresh:
+            self._searches = self._since_found = 0  # the next frame is searched too: it confirms this one, or does not
         # What was found from a prior alone must lead as it must in labels.py: a tie of 5 to 1 is still a tie.
         unproven = self._anchor is None or best in fresh
         least = max(p.min_label_probability, 1 / (1 + np.exp(-p.labels.lead_nats)) if unproven else 0.0)
@@ -472,7 +474,6 @@ class RigidTracker:
         if measured:
             if best in fresh:
                 events.append(Event(self._kind_of_search(dt_s), f"spots {fresh[best]} found from the prior alone"))
-                self._since_found = 0
             elif before is not None and dt_s > 0 and children.parent[best] >= 0:
                 slope, spread_px = surprise(
                     model.numbers,
