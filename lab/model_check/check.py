@@ -8,7 +8,7 @@ three) accused; alone and wrongly accused was nothing. With one camera per scree
 together with the opposite one, and a beam of a fan raised with the other beams: only marked points tell these apart.
 
 The sigmas are those that the detections claim. Claims too small are distinguished from faults: by 3 or 20 in all
-cameras, a warning with the factor; by 4 in one camera of two or four, 3.8 and 1.0 for the others, and p stays above 1e-4.
+cameras, a warning with the factor; by 4 in one camera of two or four, 3.8 and 1.0 for the others, p stays above 1e-4.
 """
 
 from __future__ import annotations
