@@ -18,7 +18,7 @@ from geometry.compiled import compiled
 from geometry.projection import Views
 from tracking.association import BLENDED, Chances, Frame, Sights, associate, crowding, expected_at
 from tracking.hiding import MISSED, later, learnt, marginal, together
-from tracking.information import frame_information, widen_by_curvature
+from tracking.information import all_controlled, frame_information, widen_by_curvature
 from tracking.motion import STATE, predicted, updated
 
 MOST_CHILDREN = 48  # of one frame, over all hypotheses
@@ -27,7 +27,7 @@ FORGET = 12.0  # nats: a hypothesis so far behind is dropped
 SAME = 0.7  # two hypotheses with one assignment whose states differ by less than this in sigmas are one
 TOO_WIDE = 0.06  # m, rad: where a frame leaves its widest direction so open, it is not taken
 LEAST_SHARE = 1e-3  # of the probability: hypotheses below it, however far away, do not widen the covariance
-FEW = 4  # spots: fewer than these fit any labels
+FEW = 4  # spots: fewer do not tell a lost vehicle from one that is mostly hidden
 VAGUE_PX = 15.0  # 1 sigma of a predicted spot: beyond it the whole picture is searched at once
 PROOF = 3  # spots: where so many lie in their narrow gates, the velocities have not jumped
 LEAST_TO_TURN = 6.0  # nats: a hypothesis so far behind is not tried with a manoeuvre as well
@@ -239,8 +239,8 @@ def grow(
                     )
                 if mode == 1 and spots < PROOF:
                     continue  # a bend is in the mixture above; a point or two would be one wherever they lie
-                if spots < FEW and widest(views, R, t, unseen, assigned[k]) > VAGUE_PX:
-                    # Where a spot may be anywhere some false point fits: so few say nothing of the pose.
+                if spots > 0 and unconfirmed(views, frame, extra, assigned[k], R_k, t_k, R, t, unseen):
+                    # Where a spot may be anywhere some false point fits: it says nothing of the pose.
                     R_k, t_k, m_k, P_k = R, t, m, unseen
                 total = prior + counted[k] + gaussian + together(shown, sights.group, assigned[k], chances.detect)
                 total += crowding(views, sights, frame, R_k, t_k)
@@ -265,6 +265,19 @@ def widest(views: Views, R: Array, t: Array, P: Array, assigned: Ints) -> float:
             there, a, _, c = expected_at(views, i, R, t, P, uv, J)
             worst = max(worst, 0.5 * (a + c)) if there else np.inf
     return np.sqrt(worst)
+
+
+@compiled
+def unconfirmed(
+    views: Views, frame: Frame, extra: Array, assigned: Ints, R: Array, t: Array, R0: Array, t0: Array, P0: Array
+) -> bool:
+    """Whether nothing checks some label of an assignment (n,) at a pose (R, t): neither the frame's other labels nor
+    the prediction (R0, t0) with its P0 (6 or more, square).
+    """
+    if widest(views, R0, t0, P0, assigned) <= VAGUE_PX:
+        return False
+    use, _, cov = chosen_points(frame, assigned, extra)
+    return not all_controlled(views, R, t, use, cov)
 
 
 @compiled

@@ -14,8 +14,10 @@ from geometry.projection import Views, project_view
 
 _apply = small.apply
 _moved, _solve, _column, _dot = small.moved, small.solve, small.column, small.dot
+_posterior = small.posterior
 
 
+LEAST_REDUNDANCY = 0.2  # of the two coordinates of a spot: with less the others do not check it
 SAME_FOR_LONG = 10.0  # the root of the frames over which a curvature keeps its sign
 NARROW = 0.005  # m, rad: over a sigma smaller than this the paths of spots are straight to some hundredths of a px
 
@@ -85,6 +87,37 @@ def fit_alone(
         if size < 1e-9:
             break
     return R, t, L, chi2, count
+
+
+@compiled
+def all_controlled(views: Views, R: Array, t: Array, use: Bools, cov: Array) -> bool:
+    """Whether each of the spots use (n,), with covariances (n, 2, 2), px^2, is checked by the others at the pose (R, t).
+
+    A spot's redundancy, 2 - tr(J P J^T C^-1), is the part of its two coordinates that the pose does not take up (Baarda
+    1968, "A testing procedure for use in geodetic networks": reliability). Without it a gross error of that spot, a
+    false point, moves the pose and leaves no residual.
+    """
+    n = use.shape[0]
+    nothing = np.zeros((n, 2))
+    L, _, _, count, _ = frame_information(views, R, t, use, nothing, cov)
+    if count < 4:
+        return False
+    vague = np.zeros((6, 6))
+    for i in range(6):
+        vague[i, i] = 100.0
+    P, _ = _posterior(vague, L)
+    at, J = np.empty(2), np.empty((2, 6))
+    for i in range(n):
+        if not use[i] or not project_view(views, i, R, t, at, J):
+            continue
+        a, b, c, _ = inverse2(cov[i, 0, 0], cov[i, 0, 1], cov[i, 1, 1])
+        taken = 0.0
+        for j in range(6):
+            for k in range(6):
+                taken += P[j, k] * (J[0, j] * (a * J[0, k] + b * J[1, k]) + J[1, j] * (b * J[0, k] + c * J[1, k]))
+        if 2.0 - taken < LEAST_REDUNDANCY:
+            return False
+    return True
 
 
 @compiled

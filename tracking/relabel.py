@@ -225,6 +225,8 @@ def _by_the_others(
     R, t = _moved(ref.R[k], ref.t[k], _column(x, 6))
     at, J = np.empty(2), np.empty((2, 6))
     for i in range(assigned.shape[1]):
+        if not all_of.has_image[k, sights.camera[i]]:
+            continue
         there, a, _, c = expected_at(views, i, R, t, alone, at, J)
         if there and -0.5 <= at[0] < sights.size[i, 0] - 0.5 and -0.5 <= at[1] < sights.size[i, 1] - 0.5:
             vague |= not a + c < 2 * VAGUE_PX * VAGUE_PX

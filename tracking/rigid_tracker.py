@@ -38,7 +38,7 @@ from tracking.hypotheses import (
     grow,
     no_children,
     sift,
-    widest,
+    unconfirmed,
 )
 from tracking.information import fit_alone
 from tracking.labels import NO_POINT, OVER_NOTHING, Labelling, PosePrior, candidate_labellings, find_labels
@@ -203,7 +203,7 @@ class RigidTracker:
                 return self._few % DOUBT_FRAMES == 0
         # At once when light returns, then ever more rarely: what fails for long will fail in the next frame too.
         self._searches += 1
-        return self._searches <= 10 or self._searches % 5 == 0
+        return self._searches <= 20 or self._searches % (2 if self._searches < 100 else 5) == 0
 
     def _contradicted(self, children: Children, best: int, found: Sequence[Detections | None]) -> bool:
         """Whether a camera shows enough points, but none where the hypothesis expects several spots."""
@@ -449,9 +449,10 @@ class RigidTracker:
         d = digest(model.numbers, self._sights, frame, h.R[0], h.t[0], assigned, certain, least, RADIUS_PX)
         count = int(np.count_nonzero(d.use))
         proven = self._anchor is not None or self._evidence >= OVER_NOTHING
-        if 0 < count < FEW and before is not None and dt_s > 0 and children.parent[best] >= 0:
+        if count > 0 and before is not None and dt_s > 0 and children.parent[best] >= 0:
             R, t, _, P, _ = self._predicted(before, int(children.parent[best]), dt_s, bool(children.manoeuvre[best]))
-            proven &= bool(widest(model.numbers, R, t, P, assigned) <= VAGUE_PX)
+            checked = (np.where(d.use, assigned, -1), h.R[0], h.t[0], R, t, P)
+            proven &= not unconfirmed(model.numbers, frame, self._extra, *checked)
         # Another pose that is not excluded makes it a prediction, with a covariance that covers both.
         ambiguous = count <= FEW and bool(np.any(spread.diagonal() > AMBIGUOUS * d.alone.diagonal()))
         measured = count >= 3 and proven and not ambiguous and self._good(d.alone)

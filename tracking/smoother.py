@@ -21,7 +21,7 @@ from geometry.solve import SolveLimits, covariance_of
 from tracking.association import BLENDED, Chances, Sights
 from tracking.fixed_interval import Reference
 from tracking.hypotheses import PROOF
-from tracking.information import fit_alone, frame_information
+from tracking.information import all_controlled, fit_alone, frame_information
 from tracking.misfit import DEADBAND
 from tracking.motion import process_noise
 from tracking.recording import Recording
@@ -74,7 +74,7 @@ class _Pass:
         self.assigned = self.causal.copy()
         self.measured = rec.measured
         self.probability = np.where(self.causal >= 0, 1.0, np.nan)
-        self.trusted = _trusted(self.assigned, self.measured)  # frames whose labels may be evidence
+        self.trusted = self.measured.copy()  # frames whose labels may be evidence
         poses = rec.poses
         ref = straight_between(poses, self.measured, np.cumsum(rec.dt_s))
         every = _all_detections(rec)
@@ -88,6 +88,7 @@ class _Pass:
         if not parameters.learn_jerk:
             by_hand = 2 * np.log(np.repeat([parameters.jerk_m_s3, parameters.jerk_rad_s3], 3))
             log_density = np.tile(by_hand, (len(rec), 1))
+        self.trusted = _chained(self.measured, self._controlled(ref))
         self.motion = Motion.begin(ref, rec.bent.copy(), log_density)
         self.rms = np.full(len(rec), np.nan)
         self.own = _Own.nothing(len(rec))
@@ -102,6 +103,14 @@ class _Pass:
         self.own = _alone(rec, self.views, self.every, self.assigned, self.extra, self.motion.ref)
         self.measured = self.own.measured
 
+    def _controlled(self, ref: Reference) -> Bools:
+        """(T,): frames whose labels check each other."""
+        out = np.zeros(len(self.rec), dtype=bool)
+        for k in range(len(out)):
+            use, _, cov = labelled_points(self.every, k, self.assigned[k], self.extra)
+            out[k] = bool(use.any()) and all_controlled(self.views, ref.R[k], ref.t[k], use, cov)
+        return out
+
     def relabel(self) -> bool:
         """Labels from where the other frames put the vehicle; whether any changed."""
         rec, ref, known = self.rec, self.motion.ref, self.motion.known
@@ -112,21 +121,24 @@ class _Pass:
             self.views, self.sights, chances, self.every, self.assigned, self.extra, ref, self.motion.pose_P,
             log_clutter, _bend_sigmas(ref, rec.dt_s),
         )  # fmt: skip
+        before = self.assigned
         new = np.where((certain >= self.parameters.min_label_probability) & known[:, None], found, -1)
+        self.assigned = new
+        unchecked = vague & ~self._controlled(ref)
+        new[unchecked] = -1  # where a spot may be anywhere some false point fits
         lone = _lone_points(new)
         new[lone] = -1
-        self.probability = np.where((found >= 0) & ~lone[:, None], certain, np.nan)
-        changed = bool(np.any(new != self.assigned))
-        self.assigned = new
+        self.probability = np.where((found >= 0) & ~(lone | unchecked)[:, None], certain, np.nan)
+        changed = bool(np.any(new != before))
         self.measured = _alone(rec, self.views, self.every, new, self.extra, ref).measured
         # Three spots fit any labels: where the other frames cannot confirm them they are no evidence.
-        self.trusted = (self.measured & (np.count_nonzero(new >= 0, axis=1) > PROOF)) | ~vague
+        self.trusted = ~unchecked
         return changed
 
     def repair(self) -> None:
         """Take frames whose pose contradicts their own spots for bends, and estimate again."""
         for _ in range(MOST_REPAIRS):
-            wrong = self.own.measured & (self.own.excess > CONTRADICTS)
+            wrong = self.own.measured & self.trusted & (self.own.excess > CONTRADICTS)
             if not wrong.any():
                 return
             bent = self.motion.bent.copy()
@@ -142,6 +154,7 @@ class _Pass:
         motion, own = self.motion, self.own
         ref, pose_P, motion_P = motion.ref, motion.pose_P.copy(), motion.motion_P.copy()
         R, t = ref.R.copy(), ref.t.copy()
+        own.measured &= self.trusted
         wrong = own.measured & (own.excess > CONTRADICTS) & motion.known
         for k in np.flatnonzero(wrong):
             # Its own spots decide, with their own covariance; what the motion says there is not to be believed.
@@ -179,18 +192,14 @@ class _Pass:
         )
 
 
-def _trusted(assigned: Ints, measured: Bools) -> Bools:
-    """(T,): frames whose labels confirm each other, or those of the frames beside them.
-
-    Three spots fit any labels. A measured frame with three is believed where an unbroken row of measured frames leads
-    from it to one with more.
+def _chained(measured: Bools, controlled: Bools) -> Bools:
+    """(T,): measured frames whose labels check each other, and those that an unbroken row of measured frames joins to
+    one of them.
     """
-    sure = measured & (np.count_nonzero(assigned >= 0, axis=1) > PROOF)
-    out = sure.copy()
+    out = measured & controlled
     for order in (range(1, len(out)), range(len(out) - 2, -1, -1)):
-        step = 1 if order.step > 0 else -1
         for k in order:
-            out[k] |= measured[k] and out[k - step]
+            out[k] |= measured[k] and out[k - order.step]
     return out
 
 

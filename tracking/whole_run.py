@@ -41,6 +41,8 @@ SMALL_STEP = 0.02  # sigmas: a step of Gauss-Newton that is nothing any more
 SMALL_CHANGE = 0.3  # of log q, weighted by what determines it: the strength has settled
 TRUST = (np.inf, 0.1, 0.03, 0.01, 3e-3, 1e-3)  # m and rad: damping of a step, tried in turn until the cost falls
 P_DARK = 0.05  # probability of a bend in each frame that does not show the pose
+P_EITHER = 0.3  # of a bend being in each of several steps, where a frame between them says little
+WEAK = 2 * 6 * np.log(1.5)  # of log det of a frame's information below the usual: its pose's sigmas are half as large again
 DEEP = 12  # frames: so far from any measured one a few spots are not taken for evidence
 SPEED_WINDOW_S = 0.5  # a bend's size is judged by the fastest motion within this time of it
 FINER = (-2.0, -4.0, -6.0)  # of log q: tried for filling in between frames
@@ -250,11 +252,11 @@ class _Estimator:
                 share = 1 / (1 + b @ Lb)
                 g[k] -= Lb * (b @ g[k]) * share
                 L[k] -= np.outer(Lb, Lb) * share
-        jump = self._jumps(ref)
+        jump = self._jumps(ref, L)
         first = _before_the_first(ref, self.dt, bool(measured[0]))
         return Evidence(L, g, self.dt, jump, jump / STEADIES_WITHIN_S**2, first), float(chi2.sum())
 
-    def _jumps(self, ref: Reference) -> Array:
+    def _jumps(self, ref: Reference, information: Array) -> Array:
         """(T, 2) variances of the velocities' jumps in each step."""
         measured, dt = self.measured, self.dt
         usual = float(np.median(dt[dt > 0])) if np.any(dt > 0) else SPEED_WINDOW_S
@@ -267,12 +269,17 @@ class _Estimator:
         dark[1:] |= ~measured[:-1]
         dark[2:] |= ~measured[:-2]
         chance = np.where(dark, P_DARK, 0.0)
+        weak = ~measured | _weak(information, measured)
         for k in np.flatnonzero(self.bent):
-            first = k
-            while first > 1 and not measured[first - 1]:
+            first, last = k, k
+            while first > 1 and weak[first - 1]:
                 first -= 1
-            # In one of the steps since the frame that was last measured, nobody knows which.
-            chance[first : k + 1] = np.maximum(chance[first : k + 1], 1.0 / (k + 1 - first))
+            while last < len(dt) - 1 and weak[last]:
+                last += 1
+            # In one of the steps between the frames that show the pose well; which one is not known.
+            share = 1.0 if first == last else max(1.0 / (last + 1 - first), P_EITHER)
+            chance[first : last + 1] = np.maximum(chance[first : last + 1], share)
+            chance[k] = 1.0
         return np.asarray(chance[:, None] * size)
 
     def _new_bends(self, shock: Array) -> Bools:
@@ -322,6 +329,14 @@ class _Estimator:
         m = self.ref.m
         speed = np.array([[np.linalg.norm(m[k, :3]), np.linalg.norm(m[k, 3:6])] for k in (0, -1)])
         return np.asarray((LEAST_JUMP + JUMP_OF_SPEED * speed) ** 2)
+
+
+def _weak(information: Array, measured: Bools) -> Bools:
+    """(T,): frames that say much less of the pose than the run's frames usually do."""
+    sign, log_det = np.linalg.slogdet(information)
+    log_det = np.where(sign > 0, log_det, -np.inf)
+    usual = float(np.median(log_det[measured])) if measured.any() else 0.0
+    return np.asarray(log_det < usual - WEAK)
 
 
 def _damped(ev: Evidence, trust: float) -> Evidence:
