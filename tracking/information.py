@@ -17,7 +17,7 @@ _moved, _solve, _column, _dot = small.moved, small.solve, small.column, small.do
 _posterior = small.posterior
 
 
-LEAST_REDUNDANCY = 0.2  # of the two coordinates of a spot: with less the others do not check it
+DETECTABLE_PX = 5.0  # a false point so far from a spot's place is found out by the frame's other spots
 SAME_FOR_LONG = 10.0  # the root of the frames over which a curvature keeps its sign
 NARROW = 0.005  # m, rad: over a sigma smaller than this the paths of spots are straight to some hundredths of a px
 
@@ -93,9 +93,9 @@ def fit_alone(
 def all_controlled(views: Views, R: Array, t: Array, use: Bools, cov: Array) -> bool:
     """Whether each of the spots use (n,), with covariances (n, 2, 2), px^2, is checked by the others at the pose (R, t).
 
-    A spot's redundancy, 2 - tr(J P J^T C^-1), is the part of its two coordinates that the pose does not take up (Baarda
-    1968, "A testing procedure for use in geodetic networks": reliability). Without it a gross error of that spot, a
-    false point, moves the pose and leaves no residual.
+    A spot's redundancy, r = 1 - tr(J P J^T C^-1) / 2, is the share of its coordinates that the pose does not take up: a
+    gross error of that spot, a false point, shows in its residual by that share only. Checked means that an error of
+    DETECTABLE_PX shows. Source: Baarda (1968), "A testing procedure for use in geodetic networks": reliability.
     """
     n = use.shape[0]
     nothing = np.zeros((n, 2))
@@ -115,7 +115,8 @@ def all_controlled(views: Views, R: Array, t: Array, use: Bools, cov: Array) -> 
         for j in range(6):
             for k in range(6):
                 taken += P[j, k] * (J[0, j] * (a * J[0, k] + b * J[1, k]) + J[1, j] * (b * J[0, k] + c * J[1, k]))
-        if 2.0 - taken < LEAST_REDUNDANCY:
+        # The least error that shows, at five sigmas of the residual.
+        if 25.0 * 0.5 * (cov[i, 0, 0] + cov[i, 1, 1]) > DETECTABLE_PX * DETECTABLE_PX * max(0.5 * (2.0 - taken), 0.0):
             return False
     return True
 

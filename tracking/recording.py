@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -98,6 +99,16 @@ class Recording:
     def assigned(self) -> Ints:
         """(T, n): row in the frame's detections (all cameras in one list), plus BLENDED; -1 without."""
         return np.array(self._assigned, dtype=np.int64).reshape(len(self), len(self.model))
+
+    def found(self, k: int) -> list[Detections | None]:
+        """Frame k's detections by camera, None without a picture, as a tracker wants them; without brightness."""
+        uv, cov, size, first, has_image = self.detections(k)
+        out: list[Detections | None] = []
+        for c, there in enumerate(has_image):
+            rows = slice(int(first[c]), int(first[c + 1]))
+            points = Detections.at(uv[rows], cov[rows])
+            out.append(replace(points, major_px=size[rows], minor_px=size[rows]) if there else None)
+        return out
 
     def detections(self, k: int) -> tuple[Array, Array, Array, Ints, Bools]:
         """Of frame k: pixels (m, 2), covariances (m, 2, 2), larger half axes (m,), px, nan where not known; where each

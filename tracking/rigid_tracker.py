@@ -111,6 +111,16 @@ class RigidTracker:
         self._told_tie = False
         self._begun = False
 
+    def begin_at(self, pose: Pose, m: Array, P: Array) -> None:
+        """Start from a known state instead of the prior: m (12,) and P (18, 18) as in tracking/motion.py."""
+        n = len(self.model)
+        self._hypotheses = Hypotheses(
+            np.array(pose.rotation, order="C")[None], np.array(pose.translation)[None], m[None].copy(), P[None].copy(),
+            np.zeros(1), np.full((1, n + self._groups), 0.95),
+        )  # fmt: skip
+        self._anchor, self._begun, self._saw_any = pose, True, True
+        self.temper.fastest = np.array([np.linalg.norm(m[:3]), np.linalg.norm(m[3:6])])
+
     @property
     def noise_scale(self) -> float:
         """How much larger than claimed the spots' errors are."""

@@ -19,6 +19,7 @@ from geometry.pose import Pose
 from geometry.projection import Views, project_all
 from geometry.solve import SolveLimits, covariance_of
 from tracking.association import BLENDED, Chances, Sights
+from tracking.backward import merged, track_backward
 from tracking.fixed_interval import Reference
 from tracking.hypotheses import PROOF
 from tracking.information import all_controlled, fit_alone, frame_information
@@ -53,6 +54,8 @@ def smooth(recording: Recording) -> Smoothed:
         # until they were held against it.
         gapless = bool(rec.measured.all())
         if parameters.method == "rigid":
+            if pass_.look_back():
+                pass_.estimate(deep=0)
             while rounds < MOST_ROUNDS and (pass_.relabel() or (rounds == 1 and not gapless)):
                 rounds += 1
                 pass_.estimate(deep=DEEP)
@@ -90,7 +93,7 @@ class _Pass:
             log_density = np.tile(by_hand, (len(rec), 1))
         self.trusted = _chained(self.measured, self._controlled(ref))
         self.motion = Motion.begin(ref, rec.bent.copy(), log_density)
-        self.rms = np.full(len(rec), np.nan)
+        self.doubtful = np.zeros(len(rec), dtype=bool)  # frames in which two poses were measured
         self.own = _Own.nothing(len(rec))
 
     def estimate(self, deep: int) -> None:
@@ -101,6 +104,7 @@ class _Pass:
         )
         self.motion = estimate(run, self.assigned, self.measured, self.motion, deep, self.trusted)
         self.own = _alone(rec, self.views, self.every, self.assigned, self.extra, self.motion.ref)
+        self.own.measured &= ~self.doubtful
         self.measured = self.own.measured
 
     def _controlled(self, ref: Reference) -> Bools:
@@ -132,8 +136,35 @@ class _Pass:
         changed = bool(np.any(new != before))
         self.measured = _alone(rec, self.views, self.every, new, self.extra, ref).measured
         # Three spots fit any labels: where the other frames cannot confirm them they are no evidence.
-        self.trusted = ~unchecked
+        self.trusted = ~unchecked & ~self.doubtful
+        self.measured &= ~self.doubtful
         return changed
+
+    def look_back(self) -> bool:
+        """Labels of frames that the causal tracker did not measure for sure, from the frames after them; whether any."""
+        motion = self.motion
+        sure = self.trusted & self.measured & self._controlled(motion.ref) & motion.known
+        weak = ~sure
+        if not weak.any() or not sure.any():
+            return False
+        back = track_backward(self.rec, motion.ref, motion.pose_P, motion.motion_P, weak, sure)
+        new = merged(self.assigned, back, weak)
+        if np.array_equal(new, self.assigned) and not back.disagrees.any():
+            return False
+        self.assigned = new
+        self.measured = _alone(self.rec, self.views, self.every, new, self.extra, motion.ref).measured
+        # Two directions of time that measured two poses: neither is believed.
+        self.doubtful = back.disagrees
+        self.measured &= ~self.doubtful
+        self.trusted = _chained(self.measured, self._controlled(motion.ref))
+        # The frames that were found now have no reference yet.
+        poses = np.concatenate([motion.ref.R, motion.ref.t[:, None]], axis=1)
+        found = sure | (back.measured & self.measured)
+        for k in np.flatnonzero(found & ~sure):
+            poses[k, :3], poses[k, 3] = back.R[k], back.t[k]
+        ref = straight_between(poses, found, np.cumsum(self.rec.dt_s))
+        self.motion = replace(motion, ref=ref)
+        return True
 
     def repair(self) -> None:
         """Take frames whose pose contradicts their own spots for bends, and estimate again."""
