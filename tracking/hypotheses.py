@@ -239,8 +239,8 @@ def grow(
                     )
                 if mode == 1 and spots < PROOF:
                     continue  # a bend is in the mixture above; a point or two would be one wherever they lie
-                if spots > 0 and unconfirmed(views, frame, extra, assigned[k], R_k, t_k, R, t, unseen):
-                    # Where a spot may be anywhere some false point fits: it says nothing of the pose.
+                if 0 < spots < FEW and widest(views, R, t, unseen, assigned[k]) > VAGUE_PX:
+                    # Where a spot may be anywhere some false point fits: so few say nothing of the pose.
                     R_k, t_k, m_k, P_k = R, t, m, unseen
                 total = prior + counted[k] + gaussian + together(shown, sights.group, assigned[k], chances.detect)
                 total += crowding(views, sights, frame, R_k, t_k)
@@ -400,6 +400,23 @@ def sift(children: Children, count: int) -> tuple[Hypotheses, Ints, Array, Array
         k = kept[i]
         _put_hypothesis(staying, i, a.R[k], a.t[k], a.m[k], a.P[k], weight[i] - heaviest, a.shown[k])
     return staying, kept[:h], certain, spread
+
+
+@compiled
+def spread_of_all(children: Children, places: Ints) -> Array:
+    """The spread (6, 6) of the kept children's poses about the best's, each as if it were as likely as the best.
+
+    For a pose that no label is sure of: a covariance that covers all answers.
+    """
+    out = np.zeros((6, 6))
+    a, best = children.after, places[0]
+    for place in range(1, places.shape[0]):
+        k = places[place]
+        d = _apart(a.R[k], a.t[k], a.R[best], a.t[best])
+        for i in range(6):
+            for j in range(6):
+                out[i, j] += d[i] * d[j]
+    return out
 
 
 @compiled

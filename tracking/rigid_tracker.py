@@ -38,6 +38,7 @@ from tracking.hypotheses import (
     grow,
     no_children,
     sift,
+    spread_of_all,
     unconfirmed,
 )
 from tracking.information import fit_alone
@@ -67,6 +68,7 @@ NOWHERE = (SpotStatus.LOST, SpotStatus.OFF_SCREEN)
 MOST_EVIDENCE, LEAST_EVIDENCE = 50.0, -5.0  # nats; a vehicle that was never found and is less likely than this goes
 ALTERNATIVE_NATS = 8.0  # a child so far behind the best is not asked for its mirror solutions
 AMBIGUOUS = 9.0  # share of the frame's own variance that other answers may add to a measured pose of few spots
+SURE = 1 - 2.5e-3  # label probability (6 nats) where nothing else checks a label
 YOUNG = 5  # frames after a search found the vehicle: until then its velocities may be known to next to nothing
 MOST_LINKED, MOST_CANDIDATES = 3, 4  # hypotheses that a search's answers continue, and answers
 FARTHEST_M, FARTHEST_RAD = 1.5, np.deg2rad(60.0)  # of a search from the last pose: beyond it a fan looks like itself
@@ -456,13 +458,18 @@ class RigidTracker:
         # What was found from a prior alone must lead as it must in labels.py: a tie of 5 to 1 is still a tie.
         unproven = self._anchor is None or best in fresh
         least = max(p.min_label_probability, 1 / (1 + np.exp(-p.labels.lead_nats)) if unproven else 0.0)
+        proven = self._anchor is not None or self._evidence >= OVER_NOTHING
+        parent, spots = int(children.parent[best]), int(np.count_nonzero(assigned >= 0))
+        if spots and before is not None and dt_s > 0 and parent >= 0:
+            R, t, _, P, _ = self._predicted(before, parent, dt_s, bool(children.manoeuvre[best]))
+            used = np.where(assigned < BLENDED, assigned, -1)
+            if unconfirmed(model.numbers, frame, self._extra, used, h.R[0], h.t[0], R, t, P):
+                # Neither the motion nor the other spots check some label: it must be beyond doubt for other reasons.
+                least = max(least, SURE)
+                if spots < FEW or float(np.min(certain[assigned >= 0])) < SURE:
+                    proven, spread = False, spread_of_all(children, places)
         d = digest(model.numbers, self._sights, frame, h.R[0], h.t[0], assigned, certain, least, RADIUS_PX)
         count = int(np.count_nonzero(d.use))
-        proven = self._anchor is not None or self._evidence >= OVER_NOTHING
-        if count > 0 and before is not None and dt_s > 0 and children.parent[best] >= 0:
-            R, t, _, P, _ = self._predicted(before, int(children.parent[best]), dt_s, bool(children.manoeuvre[best]))
-            checked = (np.where(d.use, assigned, -1), h.R[0], h.t[0], R, t, P)
-            proven &= not unconfirmed(model.numbers, frame, self._extra, *checked)
         # Another pose that is not excluded makes it a prediction, with a covariance that covers both.
         ambiguous = count <= FEW and bool(np.any(spread.diagonal() > AMBIGUOUS * d.alone.diagonal()))
         measured = count >= 3 and proven and not ambiguous and self._good(d.alone)

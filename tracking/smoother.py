@@ -21,7 +21,7 @@ from geometry.solve import SolveLimits, covariance_of
 from tracking.association import BLENDED, Chances, Sights
 from tracking.backward import merged, track_backward
 from tracking.fixed_interval import Reference
-from tracking.hypotheses import PROOF
+from tracking.hypotheses import FEW, PROOF
 from tracking.information import all_controlled, fit_alone, frame_information
 from tracking.misfit import DEADBAND
 from tracking.motion import process_noise
@@ -91,7 +91,9 @@ class _Pass:
         if not parameters.learn_jerk:
             by_hand = 2 * np.log(np.repeat([parameters.jerk_m_s3, parameters.jerk_rad_s3], 3))
             log_density = np.tile(by_hand, (len(rec), 1))
-        self.trusted = _chained(self.measured, self._controlled(ref))
+        # Frames that a tracker measured with enough spots: where the others do not check a label it was beyond doubt.
+        self.sure = self.measured & (np.count_nonzero(self.assigned >= 0, axis=1) >= FEW)
+        self.trusted = _chained(self.measured, self.sure | self._controlled(ref))
         self.motion = Motion.begin(ref, rec.bent.copy(), log_density)
         self.doubtful = np.zeros(len(rec), dtype=bool)  # frames in which two poses were measured
         self.own = _Own.nothing(len(rec))
@@ -128,7 +130,8 @@ class _Pass:
         before = self.assigned
         new = np.where((certain >= self.parameters.min_label_probability) & known[:, None], found, -1)
         self.assigned = new
-        unchecked = vague & ~self._controlled(ref)
+        self.measured = _alone(rec, self.views, self.every, new, self.extra, ref).measured
+        unchecked = vague & ~_chained(self.measured, self.sure | self._controlled(ref))
         new[unchecked] = -1  # where a spot may be anywhere some false point fits
         lone = _lone_points(new)
         new[lone] = -1
@@ -143,7 +146,7 @@ class _Pass:
     def look_back(self) -> bool:
         """Labels of frames that the causal tracker did not measure for sure, from the frames after them; whether any."""
         motion = self.motion
-        sure = self.trusted & self.measured & self._controlled(motion.ref) & motion.known
+        sure = self.trusted & self.measured & (self.sure | self._controlled(motion.ref)) & motion.known
         weak = ~sure
         if not weak.any() or not sure.any():
             return False
@@ -156,7 +159,9 @@ class _Pass:
         # Two directions of time that measured two poses: neither is believed.
         self.doubtful = back.disagrees
         self.measured &= ~self.doubtful
-        self.trusted = _chained(self.measured, self._controlled(motion.ref))
+        self.sure |= back.measured & (np.count_nonzero(back.assigned >= 0, axis=1) >= FEW)
+        self.sure &= ~self.doubtful
+        self.trusted = _chained(self.measured, self.sure | self._controlled(motion.ref))
         # The frames that were found now have no reference yet.
         poses = np.concatenate([motion.ref.R, motion.ref.t[:, None]], axis=1)
         found = sure | (back.measured & self.measured)
