@@ -427,6 +427,9 @@ def _alike(children: Children, k: int, o: int) -> bool:
             return False
     a = children.after
     d = _apart(a.R[k], a.t[k], a.R[o], a.t[o])
+    for i in range(6, STATE):
+        if not 0.1 * a.P[o, i, i] < a.P[k, i, i] < 10.0 * a.P[o, i, i]:
+            return False  # one knows much more of the motion than the other
     for i in range(6):
         if abs(d[i]) > SAME * np.sqrt(a.P[o, i, i]):
             return False

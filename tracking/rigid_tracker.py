@@ -60,6 +60,7 @@ from tracking.whole_run import LOST_SIGMA_M, LOST_SIGMA_RAD
 # What is known of the motion of a vehicle that has just been found: sigmas.
 FIRST_SPEED, FIRST_RATE = 4.0, 6.0  # m/s, rad/s
 FIRST_ACCELERATION, FIRST_ANGULAR = 30.0, 100.0  # m/s^2, rad/s^2
+SLOW = 0.03  # of these: of a vehicle that hardly moves; both are tried
 P_FRESH = 1e-3  # probability per frame that the vehicle is not where any hypothesis has it
 LONG_UNMEASURED = 10  # frames without a measured pose, after which two missing spots are enough to doubt it
 SEARCH_AT = (2, 4, 8, 14)  # frames in a row that contradict the hypothesis
@@ -280,22 +281,17 @@ class RigidTracker:
             frame = self._frame(found)
         n = len(self.model)
         starts: list[tuple[tuple[Array, Array, Array, Array], Array, float, int]] = []
-        P = np.diag(
-            np.repeat(
-                [
-                    min(prior.within_m, 10.0) / np.sqrt(3), prior.within_rad / np.sqrt(3), FIRST_SPEED, FIRST_RATE,
-                    FIRST_ACCELERATION, FIRST_ANGULAR,
-                ],
-                3,
-            ) ** 2
-        )  # fmt: skip
-        centre = (np.ascontiguousarray(prior.centre.rotation), np.array(prior.centre.translation), np.zeros(12), P)
         shown = np.full(n + self._groups, 0.95)
         appears = 0.0
         if self._hypotheses is not None:
             # A vehicle that was never found may as well appear now; one that was is rarely not where it was thought.
             appears = -self._evidence if self._anchor is None else float(np.log(P_FRESH))
-        starts.append((centre, shown, appears, -1))
+        where = (min(prior.within_m, 10.0) / np.sqrt(3), prior.within_rad / np.sqrt(3))
+        for slower in (1.0, SLOW):  # a vehicle at rest must not look unlikely because it might have been fast
+            motion = (slower * FIRST_SPEED, slower * FIRST_RATE, slower * FIRST_ACCELERATION, slower * FIRST_ANGULAR)
+            P = np.diag(np.repeat([*where, *motion], 3) ** 2)
+            centre = (np.ascontiguousarray(prior.centre.rotation), np.array(prior.centre.translation), np.zeros(12), P)
+            starts.append((centre, shown, appears + float(np.log(0.5)), -1))
         h = self._hypotheses
         if h is not None and dt_s > 0:
             for k in np.argsort(-h.weight)[:MOST_LINKED].tolist():
