@@ -46,7 +46,8 @@ def drawn(
     moment: float = 0.5,
 ) -> Run:
     """A run. jumps: variance of the velocities' jumps that the model knows of, in every step; jump_at: one that it
-    does not know of, in the step before that frame, at this moment of it (0 to 1). dark: frames without evidence. jerk (6,) or (T, 6).
+    does not know of, in the step before that frame, at this moment of it (0 to 1). dark: frames without evidence.
+    jerk (6,) or (T, 6).
     """
     rng = np.random.default_rng(seed)
     t = 0.1 * np.cumsum(rng.normal(size=(frames, 3)) * DT, axis=0)

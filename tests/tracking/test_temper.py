@@ -30,7 +30,7 @@ def test_each_jerk_follows_its_own_slope_and_stays_in_its_range():
 
 
 def test_the_jerk_settles_where_the_slope_is_zero():
-    # The slope of a log-likelihood that is largest at 3 to 200 m/s^3 or rad/s^3, by axis, with the noise of single frames.
+    # The slope of a log-likelihood that is largest at 3 to 200 m/s^3 or rad/s^3, with the noise of single frames.
     rng = np.random.default_rng(1)
     temper, goal = Temper(TrackerParameters()), 2 * np.log([3.0, 200.0, 20.0, 9.0, 150.0, 60.0])
     settled = []
