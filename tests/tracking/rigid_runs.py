@@ -10,8 +10,10 @@ from geometry.arrays import Array, Bools, Ints
 from geometry.pose import Pose
 from geometry.rig import Rig
 from geometry.rig_parameters import RigCovariance
+from geometry.spots import SpotModel
 from lab.simulate.points import CLUTTER, PointRun
-from lab.simulate.scene import SHINING
+from lab.simulate.scenarios import Prior
+from lab.simulate.scene import HIDDEN, OUTSIDE, SHINING
 from tracking.detections import Detections
 from tracking.labels import PosePrior
 from tracking.match import UNMATCHED
@@ -24,6 +26,7 @@ from tracking.tracked_frame import TrackedFrame
 
 START = 10  # frames until the velocities are known
 RIGID = TrackerParameters()
+NEAR_THE_ORIGIN = Prior((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.3, 15.0)
 
 
 def prior_of(run: PointRun) -> PosePrior:
@@ -166,6 +169,70 @@ def around_bends(run: PointRun, which: str, frames: int, seed: int) -> Bools:
             hidden_views = rng.choice(views, {"one": 1, "two": 2, "all": len(views)}[which], replace=False)
         hide[first : first + frames, hidden_views] = True
     return hide
+
+
+def filmed(
+    rig: Rig,
+    poses: Pose,
+    t_s: Array,
+    noise_px: float,
+    seed: int,
+    turned: Bools | None = None,
+    hide: Bools | None = None,
+    prior: Prior = NEAR_THE_ORIGIN,
+) -> PointRun:
+    """A recording of a motion (T poses at t_s) as points, without false ones. hide (T, n): spots that do not shine."""
+    model, frames = SpotModel.of(rig), len(t_s)
+    uv = model.project(poses)[0]
+    rng = np.random.default_rng([seed, 3])
+    shines = model.in_picture(uv) & ~(np.zeros(uv.shape[:2], dtype=bool) if hide is None else hide)
+    noisy = uv + noise_px * rng.normal(size=uv.shape)
+    detections, origin = [], []
+    for k in range(frames):
+        rows = [np.flatnonzero(shines[k] & (model.camera_of == c)) for c in range(len(model.camera_names))]
+        cov = noise_px**2 * np.eye(2)
+        detections.append(tuple(Detections.at(noisy[k, r], np.tile(cov, (len(r), 1, 1))) for r in rows))
+        origin.append(tuple(rows))
+    return PointRun(
+        name="made for a test",
+        seed=seed,
+        rig=rig,
+        model=model,
+        prior=prior,
+        noise_px=noise_px,
+        frame_rate_hz=float(1 / np.median(np.diff(t_s))),
+        frame=np.arange(frames),
+        t_s=t_s,
+        poses=poses,
+        uv_px=uv,
+        in_view=np.where(model.in_picture(uv), np.where(shines, SHINING, HIDDEN), OUTSIDE),
+        has_image=np.ones((frames, len(model.camera_names)), dtype=bool),
+        turned=np.zeros(frames, dtype=bool) if turned is None else turned,
+        detections=tuple(detections),
+        origin=tuple(origin),
+    )
+
+
+def zig_zag(
+    seed: int, frames: int, frame_rate_hz: float, every: int, rate_rad_s: float, start: Pose
+) -> tuple[Pose, Array, Bools]:
+    """Poses (T), times (T,) and frames after a corner (T,): uniform motion between corners at random moments of a step.
+
+    A corner every so many frames, forth and back; rate_rad_s: 1 sigma of each axis' angular rate, in m/s a third of it.
+    """
+    rng = np.random.default_rng([seed, 5])
+    t_s = np.arange(frames) / frame_rate_hz
+    before = np.arange(every, frames - every // 2, every)  # the corner lies between this frame and the next
+    knots = np.concatenate([[0.0], (before + rng.random(len(before))) / frame_rate_hz])
+    pace = rate_rad_s * rng.normal(size=(len(knots), 6)) * np.repeat([1 / 3, 1.0], 3)
+    pace = np.abs(pace) * np.sign(pace[0]) * (-1.0) ** np.arange(len(knots))[:, None]
+    at_knots = [start]
+    for length, velocity in zip(np.diff(knots), pace, strict=False):
+        at_knots.append(at_knots[-1].plus(velocity * length))
+    piece = np.searchsorted(knots, t_s, side="right") - 1
+    poses = [at_knots[i].plus(pace[i] * (t - knots[i])) for t, i in zip(t_s, piece, strict=True)]
+    turned = np.isin(np.arange(frames), before + 1)
+    return Pose(np.stack([p.rotation for p in poses]), np.stack([p.translation for p in poses])), t_s, turned
 
 
 def some_frames(run: PointRun, frames: Ints) -> PointRun:

@@ -16,12 +16,15 @@ from lab.simulate.rigs import RIGS
 from tracking.association import (
     BEHIND,
     BLENDED,
+    CROWD_PX,
     GATE,
     NOT_LOOKED_FOR,
     Chances,
     Frame,
     Sights,
     associate,
+    crowding,
+    grown,
     in_picture,
 )
 from tracking.hiding import MISSED
@@ -49,12 +52,18 @@ class Found:
     counted: Array
 
 
-def frame_of(points: list[Array], has_image: tuple[bool, bool] = (True, True), blend_px: float = 0.0) -> Frame:
-    """A frame with these pixels (k, 2) per camera."""
+def frame_of(
+    points: list[Array], has_image: tuple[bool, bool] = (True, True), blend_px: float = 0.0, grown: float = 1.0
+) -> Frame:
+    """A frame with these pixels (k, 2) per camera; grown: how much wider than usual each point is."""
     uv = np.concatenate([np.zeros((0, 2)), *points])
     first = np.concatenate([[0], np.cumsum([len(p) for p in points])]).astype(np.int64)
     cov = np.tile(SIGMA_PX**2 * np.eye(2), (len(uv), 1, 1))
-    return Frame(uv, cov, np.full(len(uv), blend_px), first, np.array(has_image), np.full(N, LOG_CLUTTER))
+    m = len(uv)
+    return Frame(
+        uv, cov, np.full(m, blend_px), first, np.array(has_image), np.full(N, LOG_CLUTTER),
+        np.full(m, -np.inf), np.full(m, 2.0 * grown), np.full(N, 2.0), np.zeros(N),
+    )  # fmt: skip
 
 
 def search(frame: Frame, P: Array = P_NEAR, pose: Pose = POSE, extra: Array | None = None) -> Found:
@@ -193,9 +202,11 @@ def test_a_spot_that_melted_into_a_neighbour_keeps_its_label_but_costs_what_that
     shifted[4] += [2.0, 0.0]
     points = [shifted[MODEL.camera_of == c] for c in range(2)]
     assert search(frame_of(points), 1e-4 * P_NEAR).assigned[0, 4] == MISSED
-    found = search(frame_of(points, blend_px=3.0), 1e-4 * P_NEAR)
+    found = search(frame_of(points, blend_px=3.0, grown=1.2), 1e-4 * P_NEAR)
     assert found.assigned[0, 4] >= BLENDED
-    honest = search(frame_of([EXPECTED[MODEL.camera_of == c] for c in range(2)], blend_px=3.0), 1e-4 * P_NEAR)
+    honest = search(
+        frame_of([EXPECTED[MODEL.camera_of == c] for c in range(2)], blend_px=3.0, grown=1.2), 1e-4 * P_NEAR
+    )
     assert honest.score[0] > found.score[0] + 4
 
 
@@ -261,3 +272,52 @@ def test_no_point_is_two_spots_and_no_assignment_is_hopelessly_behind():
             assert len(set(taken.tolist())) == len(taken)
         assert len({tuple(row) for row in found.assigned}) == len(found.assigned)
         assert found.score[0] - found.score[-1] <= BEHIND
+
+
+def crowd_at(frame: Frame, pose: Pose) -> float:
+    return crowding(MODEL.numbers, SIGHTS, frame, np.ascontiguousarray(pose.rotation), pose.translation)
+
+
+def test_only_points_near_a_spots_place_are_expected_to_be_clutter_of_spots():
+    points = [EXPECTED[MODEL.camera_of == c] + [4.0, 0.0] for c in range(2)]
+    frame = frame_of(points)._replace(log_crowding=np.full(N, 3.0))
+    assert crowd_at(frame, POSE) == pytest.approx(3.0 * N)
+    # A vehicle elsewhere, all of whose spots would be hidden, has none of these points for its own clutter.
+    elsewhere = POSE.plus(np.array([0, 0.3, 0.3, 0, 0, 0]))
+    assert np.nanmin(np.linalg.norm(MODEL.project(elsewhere)[0] - EXPECTED, axis=1)) > 2 * CROWD_PX
+    assert crowd_at(frame, elsewhere) == 0.0
+    # Two points beside one spot count both, one point beside two spots once.
+    twice = frame_of([np.concatenate([points[0], points[0] + 1.0]), points[1]])._replace(log_crowding=np.full(N, 3.0))
+    assert crowd_at(twice, POSE) == pytest.approx(3.0 * (N + np.count_nonzero(MODEL.camera_of == 0)))
+
+
+def test_points_that_stay_in_their_place_are_nobodys_crowd():
+    points = [EXPECTED[MODEL.camera_of == c] + [4.0, 0.0] for c in range(2)]
+    frame = frame_of(points)._replace(log_crowding=np.full(N, 3.0))
+    frame.log_static[0] = LOG_CLUTTER + 2.0
+    assert crowd_at(frame, POSE) == pytest.approx(3.0 * (N - 1))
+
+
+def test_a_point_where_static_ones_are_is_hardly_a_spot():
+    points = [EXPECTED[MODEL.camera_of == c] for c in range(2)]
+    plain, static = frame_of(points), frame_of(points)
+    static.log_static[:] = LOG_CLUTTER + 4.0
+    a, b = search(plain), search(static)
+    np.testing.assert_array_equal(a.assigned[0], b.assigned[0])
+    assert b.score[0] == pytest.approx(a.score[0] - 4.0 * N)
+
+
+def test_without_shapes_no_point_is_taken_for_two_that_melted_into_one():
+    shifted = EXPECTED.copy()
+    shifted[4] += [2.0, 0.0]
+    points = [shifted[MODEL.camera_of == c] for c in range(2)]
+    wide = frame_of(points, blend_px=3.0, grown=1.2)
+    unknown = np.full(len(wide.uv), np.nan)
+    for frame in (
+        wide._replace(size_px=unknown),
+        wide._replace(usual_px=np.full(N, np.nan)),
+        frame_of(points, blend_px=3.0),  # as wide as ever
+    ):
+        assert not any(grown(frame, v, d) for v in range(N) for d in range(len(frame.uv)))
+        assert not np.any(search(frame, 1e-4 * P_NEAR).assigned >= BLENDED)
+    assert grown(wide, 4, 0)

@@ -12,6 +12,7 @@ from geometry.pose import Pose
 from tracking import fixed_interval
 from tracking.fixed_interval import Evidence, Reference, log_left_out, log_likelihood, shifted, smoothed
 from tracking.motion import STATE, predicted, updated
+from tracking.whole_run import APART
 
 DT = 0.01
 JERK = np.repeat([20.0, 60.0], 3) ** 2
@@ -23,7 +24,7 @@ class Run:
 
     ref: Reference
     ev: Evidence
-    jerk: Array  # (T, 2)
+    jerk: Array  # (T, 6)
     true: Array  # (T, 18)
 
 
@@ -35,9 +36,18 @@ def transition(ref: Reference, ev: Evidence, jerk: Array, k: int) -> tuple[Array
     return F, Q, np.concatenate([away, m - ref.m[k]])
 
 
-def drawn(seed: int, frames: int, jump_at: int | None = None, jumps: float = 0.0, dark: slice = slice(0, 0)) -> Run:
+def drawn(
+    seed: int,
+    frames: int,
+    jump_at: int | None = None,
+    jumps: float = 0.0,
+    dark: slice = slice(0, 0),
+    jerk: Array = JERK,
+    moment: float = 0.5,
+) -> Run:
     """A run. jumps: variance of the velocities' jumps that the model knows of, in every step; jump_at: one that it
-    does not know of, in the step before that frame. dark: frames without evidence.
+    does not know of, in the step before that frame, at this moment of it (0 to 1). dark: frames without evidence.
+    jerk (6,) or (T, 6).
     """
     rng = np.random.default_rng(seed)
     t = 0.1 * np.cumsum(rng.normal(size=(frames, 3)) * DT, axis=0)
@@ -53,13 +63,15 @@ def drawn(seed: int, frames: int, jump_at: int | None = None, jumps: float = 0.0
     sizes = np.full((frames, 2), jumps)
     first = np.repeat([0.02, 0.02, 0.5, 0.5, 5.0, 5.0], 3) ** 2
     ev = Evidence(L, np.zeros((frames, 6)), dt, sizes, 100 * sizes, first)
-    jerk = np.tile(JERK, (frames, 1))
+    jerk = np.array(np.broadcast_to(jerk, (frames, 6)))
     x = np.sqrt(first) * rng.normal(size=STATE)
     true, g = np.empty((frames, STATE)), np.zeros((frames, 6))
     for k in range(frames):
         if k > 0:
             if k == jump_at:
-                x[6:12] += [1.0, -0.5, 0.3, 3.0, -2.0, 1.0]
+                jump = np.array([1.0, -0.5, 0.3, 3.0, -2.0, 1.0])
+                x[:6] -= moment * dt[k] * jump  # until then it goes on as before
+                x[6:12] += jump
             F, Q, away = transition(ref, ev, jerk, k)
             x = F @ x + away + np.linalg.cholesky(Q + 1e-25 * np.eye(STATE)) @ rng.normal(size=STATE)
         true[k] = x
@@ -142,6 +154,48 @@ def test_means_and_covariances_are_those_of_one_dense_gaussian(kind):
     scale = sigma[:, :, None] * sigma[:, None, :]
     np.testing.assert_allclose((pose_P - blocks[:, :6, :6]) / scale[:, :6, :6], 0, atol=1e-6)
     np.testing.assert_allclose((motion_P - blocks[:, 6:12, 6:12]) / scale[:, 6:12, 6:12], 0, atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["steady", "jumps that are known of", "dark in the middle", "dark at the end"])
+def test_the_process_noise_of_each_axis_is_what_the_dense_gaussian_says(kind):
+    """Energy w^T Q^-1 w of the noise's mean w, and 3 - tr(Q^-1 cov w): how many of its numbers are determined."""
+    run = RUNS[kind]()
+    frames = len(run.ev.dt)
+    out = smoothed(run.ref, run.ev, run.jerk)
+    mean, P = dense(run)
+    assert np.all(out.energy[0] == 0)  # there is no step before the first frame
+    assert np.all(out.gamma[0] == 0)
+    for k in range(1, frames):
+        F, Q, away = transition(run.ref, run.ev, run.jerk, k)
+        w = mean[k] - F @ mean[k - 1] - away
+        step = np.hstack([-F, np.eye(STATE)])
+        both = slice(STATE * (k - 1), STATE * (k + 1))
+        C = step @ P[both, both] @ step.T
+        for axis in range(6):
+            rows = [axis, axis + 6, axis + 12]
+            inverse = np.linalg.inv(Q[np.ix_(rows, rows)])
+            assert out.energy[k, axis] == pytest.approx(w[rows] @ inverse @ w[rows], rel=1e-4, abs=1e-4)
+            assert out.gamma[k, axis] == pytest.approx(3 - np.trace(inverse @ C[np.ix_(rows, rows)]), abs=1e-4)
+
+
+def test_the_energy_of_the_process_noise_is_on_average_what_is_determined_of_it():
+    ratio = []
+    for seed in range(6):
+        run = drawn(300 + seed, 150, jumps=0.01)
+        out = smoothed(run.ref, run.ev, run.jerk)
+        ratio.append(out.energy.sum(axis=0) / out.gamma.sum(axis=0))
+    # Some 6 x 150 steps, each of which determines about one number of every axis' noise: sqrt(2 / 900) = 0.05.
+    np.testing.assert_allclose(np.mean(ratio, axis=0), 1.0, atol=0.2)
+
+
+@pytest.mark.parametrize("kind", RUNS)
+def test_the_covariances_of_the_ends_are_those_of_the_dense_gaussian(kind):
+    run = RUNS[kind]()
+    ends = smoothed(run.ref, run.ev, run.jerk).ends_P
+    _, P = dense(run)
+    for end, block in zip(ends, (P[:STATE, :STATE], P[-STATE:, -STATE:]), strict=True):
+        sigma = np.sqrt(np.diagonal(block))
+        np.testing.assert_allclose((end - block) / np.outer(sigma, sigma), 0, atol=1e-6)
 
 
 def test_the_last_frame_is_the_filters():
@@ -251,6 +305,11 @@ def test_a_jump_of_the_velocities_is_found_at_its_step_and_none_where_there_is_n
         bent = smoothed(run.ref, run.ev, run.jerk)[3]
         assert int(np.argmax(bent)) == 61
         assert bent[61] > 200
+        for moment in (0.05, 0.95):  # at either end of its step it may as well be in the step beside it
+            run = drawn(200 + seed, 120, jump_at=61, moment=moment)
+            bent = smoothed(run.ref, run.ev, run.jerk)[3]
+            assert abs(int(np.argmax(bent)) - 61) <= APART
+            assert np.max(bent) > 200
     alarms = np.concatenate(shocks)
     # Chi-square of 6 degrees: its mean is 6, and 45 is exceeded five times in 10^8.
     assert np.mean(alarms) == pytest.approx(6.0, abs=1.0)

@@ -32,7 +32,7 @@ N, GROUPS = len(MODEL), 2
 SIGHTS = Sights.of(RIG, MODEL)
 NO_EXTRA = np.zeros((N, 2, 2))
 CHANCES = Chances(0.98, 0.01)
-DYNAMICS = Dynamics(np.array([400.0, 3600.0]), np.array([0.2, 0.5]) ** 2, np.array([2.0, 5.0]) ** 2, 0.02)
+DYNAMICS = Dynamics(np.repeat([400.0, 3600.0], 3), np.array([0.2, 0.5]) ** 2, np.array([2.0, 5.0]) ** 2, 0.02)
 DT, SIGMA_PX = 0.01, 0.1
 P_START = np.diag(np.repeat([2e-4, 1e-4, 0.02, 0.02, 1.0, 3.0], 3) ** 2)
 
@@ -46,8 +46,11 @@ def a_frame(uv: Array, seen: Ints) -> Frame:
     rows = [v for c in range(2) for v in seen if MODEL.camera_of[v] == c]
     first = np.array([0, *np.cumsum([np.sum(MODEL.camera_of[seen] == c) for c in range(2)])], dtype=np.int64)
     cov = np.tile(SIGMA_PX**2 * np.eye(2), (len(rows), 1, 1))
-    clutter = np.full(N, np.log(2e-4))
-    return Frame(uv[rows].reshape(-1, 2), cov, np.zeros(len(rows)), first, np.ones(2, dtype=bool), clutter)
+    m, clutter = len(rows), np.full(N, np.log(2e-4))
+    return Frame(
+        uv[rows].reshape(-1, 2), cov, np.zeros(m), first, np.ones(2, dtype=bool), clutter,
+        np.full(m, -np.inf), np.full(m, np.nan), np.full(N, np.nan), np.zeros(N),
+    )  # fmt: skip
 
 
 def rows_in(seen: Ints) -> Ints:
@@ -67,7 +70,7 @@ def children_of(weights: list[float], assigned: list[Ints], poses: list[Pose], P
     for w, a, pose in zip(weights, assigned, poses, strict=True):
         chances = np.full(N + GROUPS, 0.9)
         R = rotation_of(pose)
-        count = add_child(out, count, R, pose.translation, np.zeros(12), P, w, chances, a, False, 0)
+        count, _ = add_child(out, count, R, pose.translation, np.zeros(12), P, w, chances, a, False, 0)
     assert count == min(len(weights), MOST_CHILDREN)
     return out
 
@@ -169,11 +172,12 @@ def test_where_there_is_no_room_a_better_child_takes_the_worsts_place():
     children = children_of([float(-k) for k in range(MOST_CHILDREN)], [ALL_SEEN] * MOST_CHILDREN, poses)
     R, t, m, chances = np.eye(3), np.zeros(3), np.zeros(12), np.full(N + GROUPS, 0.5)
     full = MOST_CHILDREN
-    assert add_child(children, full, R, t, m, P_START, -1000.0, chances, ONE_LESS, True, 7) == full
+    assert add_child(children, full, R, t, m, P_START, -1000.0, chances, ONE_LESS, True, 7) == (full, -1)
     assert children.after.weight.min() == 1.0 - full
-    assert add_child(children, full, R, t, m, P_START, -0.5, chances, ONE_LESS, True, 7) == full
+    count, place = add_child(children, full, R, t, m, P_START, -0.5, chances, ONE_LESS, True, 7)
+    assert count == full
     assert children.after.weight.min() == 2.0 - full
-    place = int(np.flatnonzero(children.after.weight == -0.5)[0])
+    assert children.after.weight[place] == -0.5
     assert children.parent[place] == 7
     assert children.manoeuvre[place]
 
@@ -184,7 +188,7 @@ def grown(jump: Array, seen: Ints = ALL_SEEN) -> tuple[Children, int, Pose]:
     pose = Pose.from_ypr(np.deg2rad([7.0, 0, 0]), np.zeros(3))
     m = np.repeat([0.3, 0.5, 0.0, 0.0], 3)
     R, t, _, _, _ = predicted(
-        rotation_of(pose), pose.translation, m + np.append(jump, np.zeros(6)), P_START, DT, np.zeros(2), np.zeros(2),
+        rotation_of(pose), pose.translation, m + np.append(jump, np.zeros(6)), P_START, DT, np.zeros(6), np.zeros(2),
         np.zeros(2),
     )  # fmt: skip
     uv = MODEL.project(Pose(R, t))[0] + SIGMA_PX * rng.normal(size=(N, 2))

@@ -71,7 +71,7 @@ def test_an_update_is_the_ordinary_kalman_update_with_all_pixels_in_one_vector(s
     A = rng.normal(size=(STATE, 30)) * np.repeat([1e-3, 1e-3, 0.1, 0.1, 1.0, 1.0], 3)[:, None]
     P = A @ A.T / 30
     L, g, misfit, _, _ = information(pose, use, uv, cov)
-    R1, t1, m1, P1, log_det, w = updated(pose.rotation, pose.translation, m, P, L, g)
+    R1, t1, m1, P1, log_det, step = updated(pose.rotation, pose.translation, m, P, L, g)
 
     predicted_uv, J = MODEL.project(pose)
     H = np.zeros((2 * spots, STATE))
@@ -90,9 +90,10 @@ def test_an_update_is_the_ordinary_kalman_update_with_all_pixels_in_one_vector(s
     np.testing.assert_allclose((P1 - joseph) / np.outer(sigma, sigma), 0, atol=1e-9)
     assert log_det == pytest.approx(np.linalg.slogdet(S)[1] - np.linalg.slogdet(C)[1], rel=1e-9)
     # The misfit of the innovation, y^T S^-1 y, and the part of it that the motion takes.
-    shift = P[:6, :6] @ w
-    assert misfit - g @ shift == pytest.approx(y @ np.linalg.solve(S, y), rel=1e-8)
-    assert w @ P[:6, :6] @ w == pytest.approx(y @ np.linalg.solve(S, H @ P @ H.T @ np.linalg.solve(S, y)), rel=1e-8)
+    assert misfit - g @ step == pytest.approx(y @ np.linalg.solve(S, y), rel=1e-8)
+    assert step @ np.linalg.solve(P[:6, :6], step) == pytest.approx(
+        y @ np.linalg.solve(S, H @ P @ H.T @ np.linalg.solve(S, y)), rel=1e-8
+    )
 
 
 def test_a_frame_by_itself_is_fitted_where_no_step_makes_it_better():

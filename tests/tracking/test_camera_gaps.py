@@ -1,0 +1,36 @@
+"""A camera that stops before the end, or begins late: nothing is confidently wrong, and every covariance is one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lab.simulate.points import simulate_points
+from tests.tracking.rigid_runs import judged, looked_at_again, tracked, without_pictures
+from tracking.tracked_frame import TrackedFrame
+
+FRAMES = 120
+
+
+def is_a_covariance(P: np.ndarray) -> bool:
+    sigma = np.sqrt(np.diagonal(P))
+    return bool(np.isfinite(P).all() and np.linalg.eigvalsh(P / np.outer(sigma, sigma))[0] > 0)
+
+
+@pytest.mark.parametrize("camera", [0, 1])
+@pytest.mark.parametrize("gap", [slice(110, FRAMES), slice(60, FRAMES), slice(0, 12)], ids=["end", "half", "start"])
+def test_a_gap_of_a_camera_to_the_end_or_from_the_start_makes_no_pose_confidently_wrong(camera, gap):
+    for scenario in ("smooth", "sharp-turns"):
+        run = without_pictures(simulate_points(scenario, 7010, frames=FRAMES), gap, camera)
+        causal = tracked(run)
+        again, _ = looked_at_again(run, causal)
+        both: tuple[list[TrackedFrame], ...] = (causal, again)
+        for frames in both:
+            of = judged(run, frames)
+            assert of.wrong == 0
+            known = ~np.isnan(of.nees)
+            assert known.sum() > 40
+            assert np.all(of.nees[known] < 36 + 6)  # 6 sigmas of one direction, beside the others' mean
+            for f in frames:
+                assert f.pose_covariance is None or is_a_covariance(f.pose_covariance)
+                assert f.motion is None or is_a_covariance(f.motion.covariance)

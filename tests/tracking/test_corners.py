@@ -1,0 +1,51 @@
+"""Corners of the motion between two frames, hard and soft: labels stay, and poses are as good as they claim."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from geometry.pose import Pose
+from lab.simulate.points import PointRun
+from lab.simulate.rigs import RIGS
+from lab.simulate.scenarios import Prior
+from tests.tracking.rigid_runs import Judged, filmed, judged, looked_at_again, tracked, zig_zag
+
+NOISE_PX = 0.01
+START = Pose.from_ypr(np.deg2rad([7.0, 0.0, 0.0]), np.zeros(3))
+PRIOR = Prior((0.0, 0.0, 0.0), (7.0, 0.0, 0.0), 0.3, 15.0)
+# Angular rates, 1 sigma, rad/s. A spot moves by some 1200 px per rad: 12 px per frame, and 0.2 px.
+HARD, SOFT = 1.0, 0.02
+FRAMES, EVERY = 160, 23
+COVERED = 12.592  # chi-square of 6 degrees that 95 % stay below
+
+
+@cache
+def both(rate: float, seed: int) -> tuple[PointRun, Judged, Judged]:
+    poses, t_s, turned = zig_zag(seed, FRAMES, 100.0, EVERY, rate, START)
+    run = filmed(RIGS["four-skew-beams"](), poses, t_s, NOISE_PX, seed, turned, prior=PRIOR)
+    causal = tracked(run)
+    again, _ = looked_at_again(run, causal)
+    return run, judged(run, causal), judged(run, again)
+
+
+@pytest.mark.parametrize("rate", [HARD, SOFT], ids=["hard", "soft"])
+def test_corners_between_frames_keep_all_labels(rate):
+    for seed in (1, 2):
+        run, causal, smoothed = both(rate, seed)
+        assert run.turned.sum() >= 5
+        for of in (causal, smoothed):
+            assert of.wrong == 0
+        assert smoothed.missed() == 0
+
+
+@pytest.mark.parametrize("rate", [HARD, SOFT], ids=["hard", "soft"])
+def test_poses_around_corners_between_frames_are_as_good_as_they_claim(rate):
+    nees = np.concatenate([both(rate, seed)[2].nees for seed in (1, 2)])
+    near = np.concatenate([np.convolve(both(rate, seed)[0].turned, np.ones(5), "same") > 0 for seed in (1, 2)])
+    assert 0.7 < np.mean(nees) / 6 < 1.4
+    assert np.mean(nees < COVERED) >= 0.9
+    assert np.mean(nees[near]) / 6 < 1.6
+    assert np.max(nees) < 60
