@@ -84,29 +84,39 @@ def log_false(frame: Frame, view: int, d: int) -> float:
 
 
 @compiled
-def crowding(views: Views, sights: Sights, frame: Frame, R: Array, t: Array) -> float:
+def crowding(views: Views, sights: Sights, frame: Frame, R: Array, t: Array, P: Array) -> float:
     """Log-likelihood of where all points lie, spots and false ones, given that false points crowd near spots; nats.
 
-    Each point within CROWD_PX of a spot's place at this pose counts once: false points are expected there rather than
-    elsewhere. Without it a pose would be compared with "all of this is clutter" as if the clutter near spots filled
-    the picture, and a vehicle that moves far between two frames would never be found.
+    A point near a spot's place counts once: false points are expected there rather than elsewhere, the more so the
+    better the place is known at this pose (R, t) with its P (6 or more, square). Without it a pose would be compared
+    with "all of this is clutter" as if the clutter near spots filled the picture, and a vehicle that moves far between
+    two frames would never be found.
     """
     total = 0.0
     n = sights.camera.shape[0]
     uv, J = np.empty(2), np.empty((2, 6))
-    at = np.empty((n, 2))
+    at, inverse, most = np.empty((n, 2)), np.empty((n, 3)), np.zeros(n)
+    disc = 0.25 * CROWD_PX * CROWD_PX  # the variance per axis of a point spread evenly over it
     for i in range(n):
-        there = project_view(views, i, R, t, uv, J)
-        at[i, 0], at[i, 1] = (uv[0], uv[1]) if there else (np.inf, np.inf)
+        if frame.log_crowding[i] <= 0.0:
+            continue
+        there, a, b, c = expected_at(views, i, R, t, P, uv, J)
+        if not there:
+            continue
+        at[i, 0], at[i, 1] = uv[0], uv[1]
+        inverse[i, 0], inverse[i, 1], inverse[i, 2], det = inverse2(a + disc, b, c + disc)
+        # The excess over the picture's density at the middle of the region: that of the disc, spread over it.
+        most[i] = (np.exp(frame.log_crowding[i]) - 1.0) * 2.0 * disc / np.sqrt(det)
     for c in range(frame.has_image.shape[0]):
         for d in range(frame.first[c], frame.first[c + 1]):
+            best = 0.0
             for i in range(n):
-                if sights.camera[i] != c or frame.log_static[d] > frame.log_clutter[i]:
+                if sights.camera[i] != c or most[i] <= 0.0 or frame.log_static[d] > frame.log_clutter[i]:
                     continue
-                a, b = at[i, 0] - frame.uv[d, 0], at[i, 1] - frame.uv[d, 1]
-                if a * a + b * b < CROWD_PX * CROWD_PX:
-                    total += frame.log_crowding[i]
-                    break
+                x, y = at[i, 0] - frame.uv[d, 0], at[i, 1] - frame.uv[d, 1]
+                far = x * (inverse[i, 0] * x + inverse[i, 1] * y) + y * (inverse[i, 1] * x + inverse[i, 2] * y)
+                best = max(best, most[i] * np.exp(-0.5 * far))
+            total += np.log(1.0 + best)
     return total
 
 

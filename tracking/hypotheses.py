@@ -239,11 +239,11 @@ def grow(
                     )
                 if mode == 1 and spots < PROOF:
                     continue  # a bend is in the mixture above; a point or two would be one wherever they lie
-                if 0 < spots < FEW and widest(views, R, t, unseen, assigned[k]) > VAGUE_PX:
+                if 0 < spots < PROOF and widest(views, R, t, unseen, assigned[k]) > VAGUE_PX:
                     # Where a spot may be anywhere some false point fits: so few say nothing of the pose.
                     R_k, t_k, m_k, P_k = R, t, m, unseen
                 total = prior + counted[k] + gaussian + together(shown, sights.group, assigned[k], chances.detect)
-                total += crowding(views, sights, frame, R_k, t_k)
+                total += crowding(views, sights, frame, R_k, t_k, P_k)
                 if not np.isfinite(total):
                     continue
                 best = max(best, total)
@@ -427,9 +427,6 @@ def _alike(children: Children, k: int, o: int) -> bool:
             return False
     a = children.after
     d = _apart(a.R[k], a.t[k], a.R[o], a.t[o])
-    for i in range(6, STATE):
-        if not 0.1 * a.P[o, i, i] < a.P[k, i, i] < 10.0 * a.P[o, i, i]:
-            return False  # one knows much more of the motion than the other
     for i in range(6):
         if abs(d[i]) > SAME * np.sqrt(a.P[o, i, i]):
             return False

@@ -39,14 +39,22 @@ def next_log_density(log_density: Array, out: Interval, usable: Bools, local: bo
     for axis in range(log_density.shape[1]):
         total = float(gamma[:, axis].sum())
         width = frames if total <= 0 else int(np.clip(np.ceil(frames * WINDOW_COUNT / total), 9, frames))
-        e, g = (uniform_filter1d(a[:, axis], width, mode="constant") * width for a in (energy, gamma))
-        e, g = np.maximum(e, 0.0), np.maximum(g, 0.0)
+        e, g = (_window_sums(a[:, axis], width) for a in (energy, gamma))
         step = np.log((e + PSEUDO_COUNT) / (g + PSEUDO_COUNT))
         if not local:
             # The median of the windows: corners that are not known of yet raise few of them.
             step[:] = _weighted_median(step, g)
         change[:, axis] = np.clip(RELAXATION * step, -LONGEST_STEP, LONGEST_STEP)
     return np.clip(log_density + change, *LOG_RANGE)
+
+
+def _window_sums(values: Array, width: int) -> Array:
+    """Sums over a triangle about each value (T,) with the area of `width` of them.
+
+    A triangle, not a box: what a box averages away at some wavelengths the fixed point would let grow without end.
+    """
+    once = uniform_filter1d(values, width, mode="constant")
+    return np.maximum(uniform_filter1d(once, width, mode="constant") * width, 0.0)
 
 
 def _weighted_median(values: Array, weights: Array) -> float:

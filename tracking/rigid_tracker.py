@@ -42,7 +42,7 @@ from tracking.hypotheses import (
     unconfirmed,
 )
 from tracking.information import fit_alone
-from tracking.labels import NO_POINT, OVER_NOTHING, Labelling, PosePrior, candidate_labellings, find_labels
+from tracking.labels import NO_POINT, Labelling, PosePrior, candidate_labellings, find_labels
 from tracking.match import UNMATCHED
 from tracking.misfit import Misfit
 from tracking.motion import predicted
@@ -60,12 +60,12 @@ from tracking.whole_run import LOST_SIGMA_M, LOST_SIGMA_RAD
 # What is known of the motion of a vehicle that has just been found: sigmas.
 FIRST_SPEED, FIRST_RATE = 4.0, 6.0  # m/s, rad/s
 FIRST_ACCELERATION, FIRST_ANGULAR = 30.0, 100.0  # m/s^2, rad/s^2
-SLOW = 0.03  # of these: of a vehicle that hardly moves; both are tried
 P_FRESH = 1e-3  # probability per frame that the vehicle is not where any hypothesis has it
 LONG_UNMEASURED = 10  # frames without a measured pose, after which two missing spots are enough to doubt it
 SEARCH_AT = (2, 4, 8, 14)  # frames in a row that contradict the hypothesis
 DOUBT_FRAMES = 50  # in a row with fewer: then they are doubted
 NOWHERE = (SpotStatus.LOST, SpotStatus.OFF_SCREEN)
+ENOUGH_EVIDENCE = 7.0  # nats: chance alone reaches it with a probability of exp(-7) = 1e-3 per frame
 MOST_EVIDENCE, LEAST_EVIDENCE = 50.0, -5.0  # nats; a vehicle that was never found and is less likely than this goes
 ALTERNATIVE_NATS = 8.0  # a child so far behind the best is not asked for its mirror solutions
 AMBIGUOUS = 9.0  # share of the frame's own variance that other answers may add to a measured pose of few spots
@@ -287,11 +287,9 @@ class RigidTracker:
             # A vehicle that was never found may as well appear now; one that was is rarely not where it was thought.
             appears = -self._evidence if self._anchor is None else float(np.log(P_FRESH))
         where = (min(prior.within_m, 10.0) / np.sqrt(3), prior.within_rad / np.sqrt(3))
-        for slower in (1.0, SLOW):  # a vehicle at rest must not look unlikely because it might have been fast
-            motion = (slower * FIRST_SPEED, slower * FIRST_RATE, slower * FIRST_ACCELERATION, slower * FIRST_ANGULAR)
-            P = np.diag(np.repeat([*where, *motion], 3) ** 2)
-            centre = (np.ascontiguousarray(prior.centre.rotation), np.array(prior.centre.translation), np.zeros(12), P)
-            starts.append((centre, shown, appears + float(np.log(0.5)), -1))
+        P = np.diag(np.repeat([*where, FIRST_SPEED, FIRST_RATE, FIRST_ACCELERATION, FIRST_ANGULAR], 3) ** 2)
+        centre = (np.ascontiguousarray(prior.centre.rotation), np.array(prior.centre.translation), np.zeros(12), P)
+        starts.append((centre, shown, appears, -1))
         h = self._hypotheses
         if h is not None and dt_s > 0:
             for k in np.argsort(-h.weight)[:MOST_LINKED].tolist():
@@ -330,7 +328,7 @@ class RigidTracker:
         uv, _ = project_all(views, R[None], t[None])
         inside = self.model.in_picture(uv[0]) & frame.has_image[self.model.camera_of]
         assigned = np.where((assigned < 0) & ~inside, -2, assigned)
-        weight += gaussian + crowding(views, sights, frame, R, t)
+        weight += gaussian + crowding(views, sights, frame, R, t, P_after)
         weight += log_chance(views, sights, frame, self._chances, marginal(shown, sights.group), assigned, R, t)
         weight += together(shown, sights.group, assigned, self.parameters.p_detect)
         if not np.isfinite(weight):
@@ -454,7 +452,7 @@ class RigidTracker:
         # What was found from a prior alone must lead as it must in labels.py: a tie of 5 to 1 is still a tie.
         unproven = self._anchor is None or best in fresh
         least = max(p.min_label_probability, 1 / (1 + np.exp(-p.labels.lead_nats)) if unproven else 0.0)
-        proven = self._anchor is not None or self._evidence >= OVER_NOTHING
+        proven = self._anchor is not None or self._evidence >= ENOUGH_EVIDENCE
         parent, spots = int(children.parent[best]), int(np.count_nonzero(assigned >= 0))
         if spots and before is not None and dt_s > 0 and parent >= 0:
             R, t, _, P, _ = self._predicted(before, parent, dt_s, bool(children.manoeuvre[best]))
