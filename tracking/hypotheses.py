@@ -209,20 +209,23 @@ def grow(
             crowd = 0.0
             for i in range(n):
                 crowd += frame.log_crowding[i]
-            unseen = P
+            unseen = startled = P
             if mode == 0 and dt > 0.0:
                 # Where the spots do not give the pose nothing tells the two motions apart: their mixture, of one mean.
                 _, _, _, P_jump, _ = predicted(
                     old.R[h], old.t[h], old.m[h], old.P[h], dt, dynamics.jerk, dynamics.jump, dynamics.unsteady
                 )
                 unseen = _mixed(P, P_jump, max(dynamics.p_manoeuvre, DARK_MANOEUVRE))
+                startled = _mixed(P, P_jump, SUDDEN_MANOEUVRE)
             for k in range(b):
                 if prior + score[k] + crowd < best - FORGET or (k > 0 and score[k] < score[0] - FORGET):
                     continue
                 labelled = 0
                 for i in range(n):
                     labelled += 1 if 0 <= assigned[k, i] < BLENDED else 0
-                before = (R, t, m, unseen if labelled < PROOF else P)
+                # Spots that were shining and are not found were hidden, or are elsewhere.
+                dim = startled if _misses(assigned[k], shining) else unseen
+                before = (R, t, m, dim if labelled < PROOF else P)
                 R_k, t_k, m_k, P_k, gaussian, misfit, spots = concluded(
                     views, frame, extra, before, assigned[k], R_b[k], t_b[k]
                 )
@@ -239,9 +242,9 @@ def grow(
                     )
                 if mode == 1 and spots < PROOF:
                     continue  # a bend is in the mixture above; a point or two would be one wherever they lie
-                if 0 < spots < PROOF and widest(views, R, t, unseen, assigned[k]) > VAGUE_PX:
+                if 0 < spots < PROOF and widest(views, R, t, dim, assigned[k]) > VAGUE_PX:
                     # Where a spot may be anywhere some false point fits: so few say nothing of the pose.
-                    R_k, t_k, m_k, P_k = R, t, m, unseen
+                    R_k, t_k, m_k, P_k = R, t, m, dim
                 total = prior + counted[k] + gaussian + together(shown, sights.group, assigned[k], chances.detect)
                 total += crowding(views, sights, frame, R_k, t_k, P_k)
                 if not np.isfinite(total):
@@ -252,6 +255,7 @@ def grow(
     return out, count
 
 
+SUDDEN_MANOEUVRE = 0.5  # of a frame in which spots that were shining are suddenly not where they were expected
 DARK_MANOEUVRE = 0.05  # least chance of a manoeuvre per frame that does not show the pose: what is hidden is often a bend
 
 

@@ -17,9 +17,9 @@ from scipy.ndimage import uniform_filter1d
 from geometry.arrays import Array, Bools
 from tracking.fixed_interval import Interval
 
-# (m/s^3)^2/Hz or (rad/s^3)^2/Hz, as logarithms. The lower end is for a vehicle that stands for a minute: a jerk of 1e-4
-# for 6 s makes 2e-3 rad.
-LOG_RANGE = 2 * np.log([1e-6, 1e6])
+# (m/s^3)^2/Hz or (rad/s^3)^2/Hz, as logarithms. The lower end is for a vehicle that stands: over 10 s it allows 1 mm.
+# Below it rounding is felt.
+LOG_RANGE = 2 * np.log([1e-5, 1e6])
 PSEUDO_COUNT = 2.0  # determined components that any window is taken to have, with the strength that it has now
 WINDOW_COUNT = 12.0  # determined components per window: the logarithm of its strength is then good to 0.4
 RELAXATION = 1.6  # of the fixed point's step in log q: gamma changes by q^(1/6), so plain steps are short

@@ -192,6 +192,9 @@ class RigidTracker:
         has_image = np.array([f is not None for f in found])
         static = log_static_density(self._static, uv, cov, first)
         log_clutter, crowded = self._clutter.log_density(first)
+        if self._anchor is None:
+            # That false points crowd near spots must not make points without any spot evidence of a vehicle.
+            log_clutter, crowded = log_clutter - crowded, np.zeros_like(crowded)
         return Frame(uv, cov, blend, first, has_image, log_clutter, static, major, self._usual_px, crowded)
 
     # -- labels from a prior alone ------------------------------------------------------------------------------------
@@ -452,7 +455,7 @@ class RigidTracker:
         # What was found from a prior alone must lead as it must in labels.py: a tie of 5 to 1 is still a tie.
         unproven = self._anchor is None or best in fresh
         least = max(p.min_label_probability, 1 / (1 + np.exp(-p.labels.lead_nats)) if unproven else 0.0)
-        proven = self._anchor is not None or self._evidence >= ENOUGH_EVIDENCE
+        proven, fixed = self._anchor is not None or self._evidence >= ENOUGH_EVIDENCE, True
         parent, spots = int(children.parent[best]), int(np.count_nonzero(assigned >= 0))
         if spots and before is not None and dt_s > 0 and parent >= 0:
             R, t, _, P, _ = self._predicted(before, parent, dt_s, bool(children.manoeuvre[best]))
@@ -460,13 +463,14 @@ class RigidTracker:
             if unconfirmed(model.numbers, frame, self._extra, used, h.R[0], h.t[0], R, t, P):
                 # Neither the motion nor the other spots check some label: it must be beyond doubt for other reasons.
                 least = max(least, SURE)
-                if spots < FEW or float(np.min(certain[assigned >= 0])) < SURE:
+                fixed = spots >= FEW
+                if spots < PROOF or float(np.min(certain[assigned >= 0])) < SURE:
                     proven, spread = False, spread_of_all(children, places)
         d = digest(model.numbers, self._sights, frame, h.R[0], h.t[0], assigned, certain, least, RADIUS_PX)
         count = int(np.count_nonzero(d.use))
         # Another pose that is not excluded makes it a prediction, with a covariance that covers both.
         ambiguous = count <= FEW and bool(np.any(spread.diagonal() > AMBIGUOUS * d.alone.diagonal()))
-        measured = count >= 3 and proven and not ambiguous and self._good(d.alone)
+        measured = count >= 3 and proven and fixed and not ambiguous and self._good(d.alone)
         self._unmeasured = 0 if measured else self._unmeasured + 1
         if measured and self.calibration is not None:
             self._look_at_calibration(d, h)

@@ -132,10 +132,10 @@ class _Pass:
         self.assigned = new
         self.measured = _alone(rec, self.views, self.every, new, self.extra, ref).measured
         unchecked = vague & ~_chained(self.measured, self.sure | self._controlled(ref))
-        new[unchecked] = -1  # where a spot may be anywhere some false point fits
+        # Such frames keep the labels that a tracker was sure of, but they are no evidence of the motion.
         lone = _lone_points(new)
         new[lone] = -1
-        self.probability = np.where((found >= 0) & ~(lone | unchecked)[:, None], certain, np.nan)
+        self.probability = np.where((found >= 0) & ~lone[:, None], certain, np.nan)
         changed = bool(np.any(new != before))
         self.measured = _alone(rec, self.views, self.every, new, self.extra, ref).measured
         # Three spots fit any labels: where the other frames cannot confirm them they are no evidence.

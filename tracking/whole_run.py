@@ -31,15 +31,16 @@ from tracking.relabel import AllDetections, evidence_of
 from tracking.temper import JUMP_OF_SPEED, LEAST_JUMP, STEADIES_WITHIN_S
 
 LOST_SIGMA_M, LOST_SIGMA_RAD = 1.0, np.deg2rad(60.0)  # a predicted pose vaguer than this is `lost`
-MOST_PASSES = 40
+MOST_PASSES = 25
+ROUNDING = 10.0  # nats of the cost
 GLOBAL_PASSES = 5  # one strength for the whole run, before windows have their own
-LEARNING_PASSES = 14  # after which the strength stays
+LEARNING_PASSES, MORE_PASSES = 14, 2  # after which the strength stays: at first, and in later rounds
 NO_BENDS_BEFORE = 2  # passes: until then the strength is anybody's guess
 SHOCK = 30.0  # chi-square of 6 degrees (p = 4e-5): a jump of the velocities beyond what the motion allows
 APART = 2  # frames: of shocks so near each other the largest is looked at first
 SMALL_STEP = 0.02  # sigmas: a step of Gauss-Newton that is nothing any more
 SMALL_CHANGE = 0.3  # of log q, weighted by what determines it: the strength has settled
-TRUST = (np.inf, 0.1, 0.03, 0.01, 3e-3, 1e-3)  # m and rad: damping of a step, tried in turn until the cost falls
+TRUST = (np.inf, 0.1, 0.01, 1e-3)  # m and rad: damping of a step, tried in turn until the cost falls
 P_DARK = 0.05  # probability of a bend in each frame that does not show the pose
 P_EITHER = 0.3  # of a bend being in each of several steps, where a frame between them says little
 WEAK = 2 * 6 * np.log(1.5)  # of log det of a frame's information below the usual: its pose's sigmas are half as large again
@@ -148,7 +149,7 @@ class _Estimator:
                 weight = np.minimum(out.gamma, 1.0)
                 change = float(np.max(np.abs(self.log_density - before) * np.sqrt(weight), initial=0.0))
                 still = number >= GLOBAL_PASSES + 1 and change < SMALL_CHANGE and not more.any()
-                if still or number >= LEARNING_PASSES + (0 if fresh else 3):
+                if still or number - first + 1 >= (LEARNING_PASSES if fresh else MORE_PASSES):
                     learning = False
                     if fresh:
                         self.finer = self._best_finer(out)
@@ -231,7 +232,8 @@ class _Estimator:
             there = shifted(self.ref, x)
             ev_there, misfit_there = self._evidence(there)
             cost_there = 0.5 * misfit_there + motion_cost(there, ev, density)
-            if cost_there <= cost + 1e-6 * abs(cost) + 0.1:
+            # Damping is against steps that leave the region where all is straight; rounding alone makes some nats.
+            if cost_there <= cost + ROUNDING * (1 + 1e-3 * abs(cost)):
                 self.ref = there
                 return out, x
         return out, np.zeros_like(out.x)
