@@ -29,6 +29,7 @@ TOO_WIDE = 0.06  # m, rad: where a frame leaves its widest direction so open, it
 LEAST_SHARE = 1e-3  # of the probability: hypotheses below it, however far away, do not widen the covariance
 FEW = 4  # spots: fewer do not tell a lost vehicle from one that is mostly hidden
 VAGUE_PX = 15.0  # 1 sigma of a predicted spot: beyond it the whole picture is searched at once
+FAR_TOO_VAGUE_PX = 45.0  # beyond it three spots fit anywhere too
 PROOF = 3  # spots: where so many lie in their narrow gates, the velocities have not jumped
 LEAST_TO_TURN = 6.0  # nats: a hypothesis so far behind is not tried with a manoeuvre as well
 SURPRISE = 3.5  # sigmas of a misfit's own scatter: beyond it a manoeuvre is considered although every spot is found
@@ -242,7 +243,8 @@ def grow(
                     )
                 if mode == 1 and spots < PROOF:
                     continue  # a bend is in the mixture above; a point or two would be one wherever they lie
-                if 0 < spots < PROOF and widest(views, R, t, dim, assigned[k]) > VAGUE_PX:
+                most = VAGUE_PX if spots < PROOF else FAR_TOO_VAGUE_PX
+                if 0 < spots < FEW and widest(views, R, t, dim, assigned[k]) > most:
                     # Where a spot may be anywhere some false point fits: so few say nothing of the pose.
                     R_k, t_k, m_k, P_k = R, t, m, dim
                 total = prior + counted[k] + gaussian + together(shown, sights.group, assigned[k], chances.detect)
