@@ -36,8 +36,8 @@ _moved, best_first = small.moved, small.best_first
 # The model's error as shares of the largest allowed, and the log of how probable each is. A model that is off by more
 # than the points' noise is improbable, as it must be: with equal weights false points near four hidden spots made a
 # pose, with residuals of 0.3 to 1 px, in 11 % of the frames; so weighted in 2 %.
-SHARES = np.array([1.0, 0.3, 0.06, 0.01])
-LOG_WEIGHTS = np.log(np.array([0.003, 0.01, 0.4935, 0.4935]))
+SHARES = np.array([1.0, 0.5, 0.1, 0.015])
+LOG_WEIGHTS = np.log(np.array([0.002, 0.008, 0.495, 0.495]))
 # A screen lit from the side on which no camera is (rear projection) is that seldom.
 LOG_REAR = float(-np.log(100.0))
 MISFIT_PER_POINT = 12.0  # squared sigmas of the two residuals of a point: above it (p = 2.5e-3) the worst is left out
@@ -171,7 +171,8 @@ def _fit(
             p = labels[v]
             for i in range(2):
                 for j in range(2):
-                    model[i, j] = share * share * sight.model_cov[v, i, j]
+                    model[i, j] = sight.known_cov[v, i, j]
+                model[i, i] += share * share * sight.allowance
             det = add_information(H, J[v], points.cov[p], model)
             a, b, c = (
                 points.cov[p, 0, 0] + model[0, 0],
@@ -335,10 +336,10 @@ def _evidence(
             p = labels[v]
             if p == NO_POINT:
                 continue
-            share2 = SHARES[k] ** 2
-            A = points.cov[p, 0, 0] + share2 * sight.model_cov[v, 0, 0]
-            B = points.cov[p, 0, 1] + share2 * sight.model_cov[v, 0, 1]
-            C = points.cov[p, 1, 1] + share2 * sight.model_cov[v, 1, 1]
+            allowance = SHARES[k] ** 2 * sight.allowance
+            A = points.cov[p, 0, 0] + sight.known_cov[v, 0, 0] + allowance
+            B = points.cov[p, 0, 1] + sight.known_cov[v, 0, 1]
+            C = points.cov[p, 1, 1] + sight.known_cov[v, 1, 1] + allowance
             det = A * C - B * B
             du, dv = points.uv[p, 0] - uv[v, 0], points.uv[p, 1] - uv[v, 1]
             value -= 0.5 * (np.log(det) + (C * du * du - 2 * B * du * dv + A * dv * dv) / det)
@@ -352,7 +353,9 @@ def _evidence(
                 var = 0.5 * points.m_per_px[p] ** 2 * (A + C) + 0.5 * points.m_per_px[q] ** 2 * (
                     points.cov[q, 0, 0]
                     + points.cov[q, 1, 1]
-                    + share2 * (sight.model_cov[w, 0, 0] + sight.model_cov[w, 1, 1])
+                    + sight.known_cov[w, 0, 0]
+                    + sight.known_cov[w, 1, 1]
+                    + 2 * allowance
                 )
                 value += LOG_2PI + np.log(var / points.m_per_px[p] ** 2) + 0.5 * gap2 / var
         logs[k] = value

@@ -24,7 +24,7 @@ from tracking.parameters import LabelParameters
 
 # The largest error of the model that is allowed for, as a multiple of the parameter's: evidence is the mean over
 # several sizes up to this one.
-LARGEST_MODEL_ERROR = 3.0
+LARGEST_MODEL_ERROR = 2.0
 # Chance that a right set of labels is refused by its misfit.
 P_MISFIT = 1e-6
 FEWEST_POINTS = 6  # per camera: of a crowd at least so many of the brightest take part
@@ -56,6 +56,7 @@ class RigPlan:
     spot_ray: Array  # (spots, 3)
     front: Array  # (n, 4) the plane of each view's screen, with the normal towards its camera
     log_volume: float  # m^3 rad^3, of the poses that show at least `min_spots` spots
+    typical: Pose | None  # one that shows as many spots as any
 
     @staticmethod
     def of(rig: Rig, model: SpotModel, min_spots: int) -> RigPlan:
@@ -85,6 +86,7 @@ class RigPlan:
             spot_ray=ray,
             front=np.concatenate([normal, np.sum(normal * model.screen_origin, axis=-1)[:, None]], axis=-1),
             log_volume=visible.log_volume,
+            typical=visible.typical,
         )
 
 
@@ -123,7 +125,7 @@ def candidate_labellings(
     log_volume = min(prior.log_volume, plan.log_volume)
     points = points_of(rig, model, detections, parameters)
     has_image = np.array([model.camera_names[c] in detections for c in model.camera_of])
-    sight = _sight(plan, points, has_image, parameters)
+    sight = _sight(plan, points, has_image, parameters, _known_px(plan, calibration))
     limits = Limits(
         np.ascontiguousarray(prior.centre.rotation, dtype=np.float64),
         np.array(prior.centre.translation, dtype=np.float64),
@@ -189,7 +191,24 @@ def _within_budget(
         most = max(int(0.8 * most), FEWEST_POINTS)
 
 
-def _sight(plan: RigPlan, points: Points, has_image: Bools, parameters: LabelParameters) -> Sight:
+_known: list[tuple[CalibrationSpread, RigPlan, Array]] = []
+
+
+def _known_px(plan: RigPlan, calibration: CalibrationSpread | None) -> Array:
+    """What the calibration's errors make of each view's pixel (n, 2, 2), px^2, in a typical pose; kept."""
+    n = len(plan.model)
+    if calibration is None or plan.typical is None:
+        return np.zeros((n, 2, 2))
+    for spread, of, px2 in _known:
+        if spread is calibration and of is plan:
+            return px2
+    px2 = calibration.at(plan.typical).reshape(n, 2, n, 2)[np.arange(n), :, np.arange(n)].copy()
+    _known.insert(0, (calibration, plan, px2))
+    del _known[8:]
+    return px2
+
+
+def _sight(plan: RigPlan, points: Points, has_image: Bools, parameters: LabelParameters, known_cov: Array) -> Sight:
     model = plan.model
     sigma2 = (LARGEST_MODEL_ERROR * parameters.model_sigma_px) ** 2
     with_points = {
@@ -201,7 +220,9 @@ def _sight(plan: RigPlan, points: Points, has_image: Bools, parameters: LabelPar
         model.spot_of,
         model.image_size_px,
         has_image,
-        np.tile(sigma2 * np.eye(2), (len(model), 1, 1)),
+        known_cov + sigma2 * np.eye(2),
+        known_cov,
+        sigma2,
         plan.view_at,
         plan.spot_point,
         plan.spot_ray,
