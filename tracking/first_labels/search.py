@@ -257,20 +257,37 @@ def _completed(
         if any(np.array_equal(labels, other) and _near(pose, there) for there, other in kept):
             continue
         kept.append((pose, labels))
-        rows = np.flatnonzero(labels != NO_POINT)
-        chosen = labels[rows]
-        covariances = points.cov[chosen] + (SHARES[shares[k]] * sigma_px) ** 2 * np.eye(2)
-        fit = fit_pose(model, rows, points.uv[chosen], covariances, pose, calibration=calibration)
-        if (
-            fit is None
-            or not fit.observable
-            or not fit.consistent(P_MISFIT)
-            or not bool(prior.holds(fit.world_from_body))
-        ):
+        fit = _consistent_fit(model, points, labels, pose, SHARES[: shares[k] + 1] * sigma_px, calibration)
+        if fit is None or not bool(prior.holds(fit.world_from_body)):
             continue
         point_of = np.where(labels == NO_POINT, NO_POINT, points.row[np.maximum(labels, 0)])
         out.append(Labelling(fit, point_of, float(evidence), int(expected_of[k])))
     return out
+
+
+def _consistent_fit(
+    model: SpotModel,
+    points: Points,
+    labels: Ints,
+    start: Pose,
+    model_errors_px: Array,
+    calibration: CalibrationSpread | None,
+) -> PoseFit | None:
+    """The fit to labelled points with the smallest of some model errors, falling, under which all agree.
+
+    None where they do not even under the largest. One spot that a neighbour has pulled may misfit by many of its own
+    sigmas while the others are perfect.
+    """
+    rows = np.flatnonzero(labels != NO_POINT)
+    chosen = labels[rows]
+    for sigma_px in model_errors_px[::-1]:
+        covariances = points.cov[chosen] + sigma_px**2 * np.eye(2)
+        fit = fit_pose(model, rows, points.uv[chosen], covariances, start, calibration=calibration)
+        if fit is None or not fit.observable:
+            return None
+        if fit.consistent(P_MISFIT):
+            return fit
+    return None
 
 
 def _near(one: Pose, other: Pose) -> bool:
