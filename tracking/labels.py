@@ -25,7 +25,7 @@ from geometry.spots import SpotModel
 from tracking.detections import Detections
 from tracking.first_labels.candidates import NO_POINT
 from tracking.first_labels.prior import PosePrior
-from tracking.first_labels.search import Labelling, candidate_labellings
+from tracking.first_labels.search import Labelling, candidate_labellings, crowd_of_unknown_brightness
 from tracking.first_labels.ties import spot_names, what_decides
 from tracking.parameters import LabelParameters
 
@@ -38,8 +38,8 @@ __all__ = [
     "find_labels",
 ]
 
-# A camera with so many times `max_points` points of unknown brightness is not searched: the points looked at would be
-# anyone's, and such a search fails after 3 s (400 points per camera).
+# A camera with so many times `max_points` points that may be spots, of unknown brightness, is not searched: the points
+# looked at would be any of them.
 HOPELESS = 2
 # nats: how much likelier a pose must be than that all points are false and the vehicle is not seen. Measured with five
 # and eight false points per picture and no vehicle: a pose in 0.2 and 0.5 % of the frames without a prior, in none of
@@ -91,11 +91,13 @@ def find_labels(
     As `candidate_labellings`, with the decision: labels, a tie with its candidates, or the reason why there are none.
     """
     parameters = LabelParameters() if parameters is None else parameters
-    for name, found in detections.items():
-        if len(found) > HOPELESS * parameters.max_points and not np.isfinite(found.flux).any():
-            return LabelResult(
-                None, (), f"{len(found)} points of light of camera {name!r}, and no flux that tells which may be spots"
-            )
+    limit = HOPELESS * parameters.max_points
+    crowd = crowd_of_unknown_brightness(rig, model, detections, prior, parameters, limit)
+    if crowd is not None:
+        name, points = crowd
+        return LabelResult(
+            None, (), f"{points} points of light of camera {name!r}, and no flux that tells which may be spots"
+        )
     count = sum(len(found) for found in detections.values())
     if count < parameters.min_spots:
         return LabelResult(None, (), f"only {count} points of light, at least {parameters.min_spots} needed")

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 
 from geometry import rotations
 from geometry.arrays import Array, normalised
-from geometry.closed_form import poses_from_line_and_spot
 from geometry.pose import Pose
 from geometry.three_spots import poses_from_three_spots
+from tests.geometry.line_and_spot import poses_from_line_and_spot
 
 MANY = 2000
 EXACT = 1e-6  # m, and m over a lever of 1 m

@@ -340,7 +340,7 @@ def test_points_on_a_bent_screen_lie_where_the_forward_model_puts_them():
     uv, hits = model.project(pose)[0], model.hits(pose)[0]
     found = {n: Detections.at(uv[model.camera_of == c], np.tile(0.01 * np.eye(2), (3, 1, 1)))
              for c, n in enumerate(model.camera_names)}  # fmt: skip
-    points = points_of(rig, model, found, LabelParameters())
+    points = points_of(rig, model, found, LabelParameters(), lambda _, places: np.isfinite(places[:, 0]))
     np.testing.assert_allclose(points.world, hits, atol=1e-6)
     picture = Picture(found, {n: np.flatnonzero(model.camera_of == c) for c, n in enumerate(model.camera_names)})
     del rng
@@ -364,3 +364,17 @@ def test_a_crowd_without_known_brightness_is_searched_within_the_budget():
     result = find_labels(rig, model, picture.detections, WIDE, few)
     assert result.chosen is not None
     assert wrong_labels(result, model, picture) == []
+
+
+def test_a_narrow_prior_finds_the_vehicle_among_hundreds_of_points_of_unknown_brightness():
+    """Only the points that some spot may light under the prior count, however many others there are."""
+    rig = RIGS["four-skew-beams"]()
+    model, rng = SpotModel.of(rig), np.random.default_rng(19)
+    for _ in range(3):
+        picture = photograph(model, Pose.identity(), rng, false_points=200)
+        result = find_labels(rig, model, picture.detections, PosePrior(Pose.identity(), 0.05, np.deg2rad(2)))
+        assert result.chosen is not None
+        assert wrong_labels(result, model, picture) == []
+    result = find_labels(rig, model, picture.detections, WIDE)
+    assert result.chosen is None
+    assert "no flux that tells which may be spots" in result.reason

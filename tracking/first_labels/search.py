@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from geometry.pose import Pose
 from geometry.rig import Rig
 from geometry.solve import PoseFit, fit_pose
 from geometry.spots import SpotModel
+from geometry.surfaces import meet_surface
 from tracking.detections import Detections
 from tracking.first_labels.candidates import NO_POINT, Best, Limits, Sight, generate
 from tracking.first_labels.completion import SHARES, complete_all
@@ -123,7 +125,7 @@ def candidate_labellings(
     plan = plan_of(rig, model, parameters.min_spots)
     prior = plan.everywhere if prior is None else prior
     log_volume = min(prior.log_volume, plan.log_volume)
-    points = points_of(rig, model, detections, parameters)
+    points = points_of(rig, model, detections, parameters, partial(_reached_by_any, plan, prior))
     has_image = np.array([model.camera_names[c] in detections for c in model.camera_of])
     sight = _sight(plan, points, has_image, parameters, _known_px(plan, calibration))
     limits = Limits(
@@ -134,9 +136,7 @@ def candidate_labellings(
         parameters.p_detect,
         parameters.min_spots,
     )
-    reached = np.array(
-        [prior.reaches(p, r, points.world) for p, r in zip(plan.spot_point, plan.spot_ray, strict=True)], dtype=bool
-    ).reshape(len(plan.spot_point), len(points.uv))
+    reached = _reached(plan, prior, points.world)
     sigma_px = LARGEST_MODEL_ERROR * parameters.model_sigma_px
     best = Best.none(parameters.max_refined, len(model))
     brightness_known = all(np.isfinite(found.flux).any() for found in detections.values() if len(found))
@@ -151,6 +151,42 @@ def candidate_labellings(
         if done >= most_triples or _spots_of_best(plan, sight, points, limits, best) > size:
             break
     return _completed(plan, sight, points, limits, prior, log_volume, best, calibration, most, sigma_px)
+
+
+def crowd_of_unknown_brightness(
+    rig: Rig,
+    model: SpotModel,
+    detections: Mapping[str, Detections],
+    prior: PosePrior | None,
+    parameters: LabelParameters,
+    limit: int,
+) -> tuple[str, int] | None:
+    """A camera with more points than a limit that may be spots under the prior, and no flux; and how many it has."""
+    crowds = [n for n, found in detections.items() if len(found) > limit and not np.isfinite(found.flux).any()]
+    if not crowds:
+        return None
+    plan = plan_of(rig, model, parameters.min_spots)
+    prior = plan.everywhere if prior is None else prior
+    for name in crowds:
+        camera = rig.cameras[name]
+        screen = rig.screens[camera.screen]
+        places = meet_surface(*camera.rays(detections[name].uv_px), screen.world_from_screen, screen.bow)
+        count = int(np.count_nonzero(_reached_by_any(plan, prior, model.camera_names.index(name), places)))
+        if count > limit:
+            return name, count
+    return None
+
+
+def _reached(plan: RigPlan, prior: PosePrior, places: Array) -> Bools:
+    """Which places (m, 3) each spot may light under a prior: (spots, m)."""
+    rays = zip(plan.spot_point, plan.spot_ray, strict=True)
+    return np.array([prior.reaches(p, r, places) for p, r in rays], dtype=bool).reshape(-1, len(places))
+
+
+def _reached_by_any(plan: RigPlan, prior: PosePrior, camera: int, places: Array) -> Bools:
+    """Which places (m, 3) on the screen of a camera any of its spots may light."""
+    mine = plan.view_at[:, camera] >= 0
+    return np.asarray(_reached(plan, prior, places)[mine].any(axis=0) & np.isfinite(places).all(axis=-1))
 
 
 def _spots_of_best(plan: RigPlan, sight: Sight, points: Points, limits: Limits, best: Best) -> int:
