@@ -65,6 +65,7 @@ format: setup  ## Format the code and mend what the linter can mend
 
 bench-tracking: setup  ## The tracking figures on fresh seeds, the cost of a whole run, peers if installed
 	$(BIN)/python -m bench.tracking
+	$(BIN)/python -m bench.first_labels
 	$(BIN)/python -m bench.rigid
 	$(BIN)/python -m bench.whole_run
 	$(BENCH_PEERS)

@@ -239,7 +239,7 @@ def label_row(poses: int) -> Row:
         done += 1
         found, origin = {}, {}
         for c, name in enumerate(model.camera_names):
-            points, of = _one_picture(rng, uv, visible & (model.camera_of == c), model.image_size_px[0])
+            points, of = one_picture(rng, uv, visible & (model.camera_of == c), model.image_size_px[0])
             found[name] = Detections.at(points, np.tile(np.eye(2) * 0.01, (len(points), 1, 1)))
             origin[c] = of
         start = time.process_time()
@@ -259,22 +259,30 @@ def label_row(poses: int) -> Row:
     return Row("first labels, prior +-1 m 30 deg, clutter", text, ">= 0.97; <= 0.01")
 
 
-def _one_picture(rng: np.random.Generator, uv: Array, visible: Array, size: Array) -> tuple[Array, Array]:
+def one_picture(
+    rng: np.random.Generator,
+    uv: Array,
+    visible: Array,
+    size: Array,
+    noise_px: float = 0.1,
+    false_points: int = 5,
+    clutter: float = 0.2,
+) -> tuple[Array, Array]:
     """Noisy points of one picture in random order, and the view that each is of (NO_POINT: none)."""
     points, of = [], []
     for v in np.flatnonzero(visible):
         if rng.random() < 0.98:
-            points.append(uv[v] + rng.normal(0, 0.1, 2))
+            points.append(uv[v] + rng.normal(0, noise_px, 2))
             of.append(v)
-        if rng.random() < 0.2:
+        if rng.random() < clutter:
             turn = rng.uniform(0, 2 * np.pi)
             points.append(uv[v] + 15 * np.sqrt(rng.random()) * np.array([np.cos(turn), np.sin(turn)]))
             of.append(NO_POINT)
-    for _ in range(5):
+    for _ in range(false_points):
         points.append(rng.uniform([0, 0], size - 1))
         of.append(NO_POINT)
     order = rng.permutation(len(points))
-    return np.array(points)[order], np.array(of)[order]
+    return np.array(points).reshape(-1, 2)[order], np.array(of, dtype=np.int64)[order]
 
 
 def main() -> None:

@@ -354,16 +354,20 @@ def test_causal_leaves_out_the_second_pass(tmp_path):
         assert not (out / "attitude_causal.csv").exists()
 
 
-def test_a_run_without_a_prior_is_told_what_to_add(tmp_path):
+def test_a_run_without_a_prior_is_processed_and_a_symmetric_rig_is_not_guessed(tmp_path):
+    """The fan of equal angles is the same after half a turn: FAIL, and the check has said what would resolve it."""
     folder = points_run(tmp_path / "run")
     content = yaml.safe_load((folder / "run.yaml").read_text())
     del content["prior"]
     (folder / "run.yaml").write_text(yaml.safe_dump(content))
     done = typed("run", folder, "--out", tmp_path / "out")
-    assert done.exit_code == 2
-    assert "run.yaml: prior: expected" in done.stderr
-    assert "position_m: [0, 0, 0]" in done.stderr
-    assert len(done.stderr.splitlines()) <= 2
+    assert done.exit_code == 4
+    assert "some frames could be explained in two ways" in done.stdout
+    assert json.loads((tmp_path / "out/summary.json").read_text())["parameters"]["prior"] is None
+    checked = typed("check", folder)
+    assert checked.exit_code == 0
+    assert "after a turn of 180 deg: the first labels stay a tie" in checked.stdout
+    assert "Add prior: {position_m:" in checked.stdout
 
 
 def test_a_batch_says_what_became_of_each_and_ends_with_the_worst(tmp_path):

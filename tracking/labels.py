@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from geometry.arrays import Array
+from geometry.arrays import Array, Bools, Ints
 from geometry.calibration_spread import CalibrationSpread
 from geometry.outliers import fit_pose_robust
 from geometry.rig import Rig
@@ -25,7 +25,7 @@ from geometry.spots import SpotModel
 from tracking.detections import Detections
 from tracking.first_labels.candidates import NO_POINT
 from tracking.first_labels.prior import PosePrior
-from tracking.first_labels.search import Labelling, candidate_labellings
+from tracking.first_labels.search import Labelling, candidate_labellings, crowd_of_unknown_brightness
 from tracking.first_labels.ties import spot_names, what_decides
 from tracking.parameters import LabelParameters
 
@@ -38,15 +38,16 @@ __all__ = [
     "find_labels",
 ]
 
-# A camera with so many times `max_points` points of unknown brightness is not searched: the points looked at would be
-# anyone's, and such a search fails after 3 s (400 points per camera).
+# A camera with so many times `max_points` points that may be spots, of unknown brightness, is not searched: the points
+# looked at would be any of them.
 HOPELESS = 2
 # nats: how much likelier a pose must be than that all points are false and the vehicle is not seen. Measured with five
-# and eight false points per picture and no vehicle: a pose in 0.7 and 1.0 % of the frames without a prior, in 0 and
-# 0.2 % with one of 1 m and 30 deg. One nat more halves that, and leaves 2 % more of the frames of a vehicle unlabelled.
+# and eight false points per picture and no vehicle: a pose in 0.2 and 0.5 % of the frames without a prior, in none of
+# 3000 with one of 1 m and 30 deg. With 3.0: in 0.1 and 0.3 %, and 1 % more of the frames of a vehicle stay unlabelled.
 OVER_NOTHING = 2.0
 CLOSE = 0.2  # of `model_sigma_px`: the model's error where spots agree as their own sigmas claim ...
 P_ODD = 1e-3  # ... or a better one, with this probability
+MELTED_PX = 1.0  # spots nearer to each other than this make one point of light
 SAME_POSE = 0.01  # of the picture's diagonal: poses that put all spots nearer to each other than this are one
 
 
@@ -90,11 +91,13 @@ def find_labels(
     As `candidate_labellings`, with the decision: labels, a tie with its candidates, or the reason why there are none.
     """
     parameters = LabelParameters() if parameters is None else parameters
-    for name, found in detections.items():
-        if len(found) > HOPELESS * parameters.max_points and not np.isfinite(found.flux).any():
-            return LabelResult(
-                None, (), f"{len(found)} points of light of camera {name!r}, and no flux that tells which may be spots"
-            )
+    limit = HOPELESS * parameters.max_points
+    crowd = crowd_of_unknown_brightness(rig, model, detections, prior, parameters, limit)
+    if crowd is not None:
+        name, points = crowd
+        return LabelResult(
+            None, (), f"{points} points of light of camera {name!r}, and no flux that tells which may be spots"
+        )
     count = sum(len(found) for found in detections.values())
     if count < parameters.min_spots:
         return LabelResult(None, (), f"only {count} points of light, at least {parameters.min_spots} needed")
@@ -154,7 +157,7 @@ def _decided(model: SpotModel, best: Sequence[Labelling], parameters: LabelParam
         there = model.project(other.fit.world_from_body)[0]
         apart = np.linalg.norm(here - there, axis=-1)
         if np.all(np.isnan(apart) | (apart < near)):
-            labels[labels != other.point_of] = NO_POINT
+            labels[_disputed(model, labels, other.point_of, here)] = NO_POINT
         else:
             rivals.append(other)
     if len(rivals) > 1:
@@ -162,3 +165,15 @@ def _decided(model: SpotModel, best: Sequence[Labelling], parameters: LabelParam
         reason = f"{len(rivals)} poses explain the points about equally well (lead {lead:.1f} nats)"
         return LabelResult(None, tuple(rivals), reason)
     return LabelResult(replace(first, point_of=labels), (first,), "")
+
+
+def _disputed(model: SpotModel, labels: Ints, other: Ints, here: Array) -> Bools:
+    """Which views (n,) have a point in one labelling and not the same in another of about the same pose.
+
+    Of two spots that lie on each other (nearer than a detection can tell) either may have the one point.
+    """
+    out = (labels != other) & (labels != NO_POINT)
+    for v in np.flatnonzero(out):
+        same = (other == labels[v]) & (model.camera_of == model.camera_of[v])
+        out[v] = not np.any(np.linalg.norm(here[same] - here[v], axis=-1) < MELTED_PX)
+    return out

@@ -23,7 +23,7 @@ class LabelParameters:
     """Labels without a track: the first frame and after a blackout (tracking/labels.py)."""
 
     model_sigma_px: float = 0.3  # px: what calibration may be off, beside every point's own sigma
-    p_detect: float = 0.97  # probability that a spot in the picture is found: one that is missing counts 3.5 nats
+    p_detect: float = 0.95  # probability that a spot in the picture is found: one that is missing is a tie, two are not
     clutter_per_px2: float = (
         2e-5  # false points per px^2; a picture with more raises it (20 % clutter near spots: 1e-5 to 2e-4)
     )

@@ -117,7 +117,7 @@ def test_a_run_without_a_prior_or_a_camera_is_told_what_that_means(folder):
     text, status = said(folder)
     assert status == 0
     assert "camera 'right' of the rig is left out" in text
-    assert "prior: none given; without position_m, yaw_pitch_roll_deg, within_m and within_deg" in text
+    assert "Prior: none given; the first pose is searched for among all that show enough spots" in text
 
 
 def test_uneven_timestamps_are_remarked_on_and_missing_ones_a_problem(folder):

@@ -21,7 +21,7 @@ from lab.errors import InputError, RunError
 from lab.pipeline import FrameRecord, Pipeline
 from lab.process import are_results, process_run
 from lab.quality import LEAST_MEASURED
-from lab.results import read_poses, read_spots
+from lab.results import POSE_STATUSES, read_poses, read_spots
 from lab.run_file import load_run
 from lab.score import normalised_squares
 from lab.simulate.scenarios import SCENARIOS, Fault
@@ -436,29 +436,21 @@ def test_a_wrong_override_is_a_plain_error_and_nothing_is_written(tmp_path, over
     assert names(tmp_path) == ["run"]
 
 
-def test_a_run_without_a_prior_says_what_to_add(tmp_path):
-    folder = points_run(tmp_path / "run", frames=3)
+@pytest.mark.parametrize("method", ["rigid", "spots"])
+def test_a_run_without_a_prior_gives_the_same_as_with_one(tmp_path, method):
+    """Four skew beams have no symmetry: their first labels need no prior."""
+    folder = simulate("four-skew-beams", tmp_path / "run", seed=5, frames=20, detections_only=True)
+    process_run(folder, tmp_path / "with", overrides={"method": method})
     content = yaml.safe_load((folder / "run.yaml").read_text())
     del content["prior"]
     (folder / "run.yaml").write_text(yaml.safe_dump(content))
-    with pytest.raises(InputError, match=r"run\.yaml: prior: expected where the vehicle is .*Add prior: \{position_m"):
-        Pipeline.of(load_run(folder))
-    with pytest.raises(InputError, match="prior"):
-        process_run(folder, tmp_path / "out")
-    assert names(tmp_path) == ["run"]
-
-
-def test_what_the_error_says_to_add_is_what_makes_it_work(tmp_path):
-    folder = points_run(tmp_path / "run", frames=3)
-    content = yaml.safe_load((folder / "run.yaml").read_text())
-    del content["prior"]
-    (folder / "run.yaml").write_text(yaml.safe_dump(content))
-    with pytest.raises(InputError) as caught:
-        process_run(folder, tmp_path / "out")
-    advice = str(caught.value).split("Add ")[1]
-    with (folder / "run.yaml").open("a") as file:
-        file.write(advice + "\n")
-    assert process_run(folder, tmp_path / "out").frames == 3
+    process_run(folder, tmp_path / "without", overrides={"method": method})
+    assert json.loads((tmp_path / "without/summary.json").read_text())["parameters"]["prior"] is None
+    one, other = (read_poses(tmp_path / which) for which in ("with", "without"))
+    assert (other.status == POSE_STATUSES.index(PoseStatus.MEASURED)).all()
+    away = one.world_from_body.minus(other.world_from_body)
+    assert np.abs(away[:, :3]).max() < 1e-3
+    assert np.abs(away[:, 3:]).max() < np.deg2rad(0.02)
 
 
 # -- two passes -------------------------------------------------------------------------------------------------------

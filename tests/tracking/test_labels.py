@@ -1,4 +1,4 @@
-"""First labels: right from a wide prior among clutter, a tie where two poses fit equally, nothing where none does."""
+"""First labels: right from a wide prior or none, a tie where two poses fit equally, nothing where none does."""
 
 from __future__ import annotations
 

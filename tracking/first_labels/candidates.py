@@ -33,7 +33,9 @@ class Sight(NamedTuple):
     spot: Ints  # (n,)
     size: Array  # (n, 2) px: width, height of the picture
     has_image: Bools  # (n,)
-    model_cov: Array  # (n, 2, 2) px^2, what the model may be off
+    model_cov: Array  # (n, 2, 2) px^2, what the model may be off at most: the sum of
+    known_cov: Array  # (n, 2, 2) px^2, what the calibration's errors are known to make ...
+    allowance: float  # px^2, ... and the largest allowance for the rest
     view_at: Ints  # (spots, cameras) the view of a spot in a camera, or -1
     spot_point: Array  # (spots, 3) m, in body
     spot_ray: Array  # (spots, 3) in body

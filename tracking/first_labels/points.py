@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
 
-from geometry.arrays import Array, Ints
+from geometry.arrays import Array, Bools, Ints
 from geometry.rig import Rig
 from geometry.spots import SpotModel
 from geometry.surfaces import meet_surface
@@ -19,7 +19,7 @@ SAME_POINT = 6.0
 
 
 class Points(NamedTuple):
-    """m points of light, those of a camera together; of a crowded picture the brightest."""
+    """m points of light that may be spots, those of a camera together; of a crowded picture the brightest."""
 
     uv: Array  # (m, 2) px
     cov: Array  # (m, 2, 2) px^2, as claimed
@@ -31,8 +31,17 @@ class Points(NamedTuple):
     log_unused: Array  # (cameras, most + 1): see `_log_unused`
 
 
-def points_of(rig: Rig, model: SpotModel, detections: Mapping[str, Detections], parameters: LabelParameters) -> Points:
-    """All cameras' points in one list. The rig is the one that `model` was made of."""
+def points_of(
+    rig: Rig,
+    model: SpotModel,
+    detections: Mapping[str, Detections],
+    parameters: LabelParameters,
+    reached: Callable[[int, Array], Bools],
+) -> Points:
+    """All cameras' points in one list. The rig is the one that `model` was made of.
+
+    reached: which places (k, 3) on the screen of a camera (by number) a spot may light at all.
+    """
     cameras = len(model.camera_names)
     uv, cov, world, row = [np.zeros((0, 2))], [np.zeros((0, 2, 2))], [np.zeros((0, 3))], [np.zeros(0, dtype=np.int64)]
     m_per_px = [np.zeros(0)]
@@ -44,8 +53,17 @@ def points_of(rig: Rig, model: SpotModel, detections: Mapping[str, Detections], 
         count = 0
         if found is not None and len(found):
             camera = rig.cameras[name]
-            brightest = np.argsort(-np.nan_to_num(found.flux, nan=0.0), kind="stable")[: parameters.max_points]
             screen = rig.screens[camera.screen]
+            order = np.argsort(-np.nan_to_num(found.flux, nan=0.0), kind="stable")
+            if len(found) > parameters.max_points:
+                origin, rays = camera.rays(found.uv_px[order])
+                possible = np.flatnonzero(reached(c, meet_surface(origin, rays, screen.world_from_screen, screen.bow)))
+                brightest = order[possible[: parameters.max_points]]
+                # As many points are as bright as these; a false one may be any of them.
+                if len(possible) > parameters.max_points:
+                    order = order[: possible[parameters.max_points]]
+            else:
+                brightest = order
             here = found.uv_px[brightest]
             origin, rays = camera.rays(here + np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])[:, None])
             hits = meet_surface(origin, rays, screen.world_from_screen, screen.bow)
@@ -55,9 +73,10 @@ def points_of(rig: Rig, model: SpotModel, detections: Mapping[str, Detections], 
             m_per_px.append(np.linalg.norm(hits[1:] - hits[0], axis=-1).max(axis=0))
             row.append(brightest)
             count = len(brightest)
+            rivals = len(order)
             area = float(np.prod(camera.image_size_px))
-            log_density[c] = np.log(count / area)
-            log_unused[c] = _log_unused(count, area, parameters.clutter_per_px2 * area, len(model))
+            log_density[c] = np.log(rivals / area)
+            log_unused[c] = _log_unused(rivals, area, parameters.clutter_per_px2 * area, len(model))
         first[c + 1] = first[c] + count
     return Points(
         np.concatenate(uv),

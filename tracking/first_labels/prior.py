@@ -12,6 +12,7 @@ from geometry.rig import Rig
 from geometry.surfaces import meet_surface
 
 SLACK, SLACK_M, SLACK_RAD = 1.02, 0.005, float(np.deg2rad(0.25))  # the limits are widened so much: poses are noisy
+ROOM = 2.0  # the vehicle's cube as a multiple of that of the screens and cameras
 BORDER = 9  # points along each side of a picture, whose rays bound what the camera sees of its screen
 # An oblique camera may see its screen up to the horizon: beyond this multiple of its distance from the screen a spot
 # is too faint and too oblique to count.
@@ -30,16 +31,17 @@ class PosePrior:
     def everywhere(rig: Rig) -> PosePrior:
         """All poses in which the rig can see its spots: what a run without a prior starts from.
 
-        The vehicle lies in the space between the screens and their cameras: the cube about everything that the cameras
-        see of their screens and the cameras themselves. Its attitude is any. That each beam meets its screen, in the
-        picture of a camera, is required of every candidate pose, with this prior as with any other.
+        The vehicle lies in the space that the screens and their cameras span: a cube ROOM times as wide as everything
+        that the cameras see of their screens, and the cameras themselves (a vehicle may be farther from its only screen
+        than the camera is). Its attitude is any. That each beam meets its screen, in the picture of a camera, is
+        required of every candidate pose, with this prior as with any other.
         """
         seen = [_seen_of_screen(rig, name) for name in rig.cameras]
         places = np.concatenate(
             [*seen, *(c.camera_from_world.inverse().translation[None] for c in rig.cameras.values())]
         )
         low, high = places.min(axis=0), places.max(axis=0)
-        return PosePrior(Pose(np.eye(3), 0.5 * (low + high)), float(0.5 * (high - low).max()), np.pi)
+        return PosePrior(Pose(np.eye(3), 0.5 * (low + high)), float(0.5 * ROOM * (high - low).max()), np.pi)
 
     @property
     def half_width_m(self) -> float:

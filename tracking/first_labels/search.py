@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from geometry.pose import Pose
 from geometry.rig import Rig
 from geometry.solve import PoseFit, fit_pose
 from geometry.spots import SpotModel
+from geometry.surfaces import meet_surface
 from tracking.detections import Detections
 from tracking.first_labels.candidates import NO_POINT, Best, Limits, Sight, generate
 from tracking.first_labels.completion import SHARES, complete_all
@@ -24,7 +26,7 @@ from tracking.parameters import LabelParameters
 
 # The largest error of the model that is allowed for, as a multiple of the parameter's: evidence is the mean over
 # several sizes up to this one.
-LARGEST_MODEL_ERROR = 3.0
+LARGEST_MODEL_ERROR = 2.0
 # Chance that a right set of labels is refused by its misfit.
 P_MISFIT = 1e-6
 FEWEST_POINTS = 6  # per camera: of a crowd at least so many of the brightest take part
@@ -56,6 +58,7 @@ class RigPlan:
     spot_ray: Array  # (spots, 3)
     front: Array  # (n, 4) the plane of each view's screen, with the normal towards its camera
     log_volume: float  # m^3 rad^3, of the poses that show at least `min_spots` spots
+    typical: Pose | None  # one that shows as many spots as any
 
     @staticmethod
     def of(rig: Rig, model: SpotModel, min_spots: int) -> RigPlan:
@@ -85,6 +88,7 @@ class RigPlan:
             spot_ray=ray,
             front=np.concatenate([normal, np.sum(normal * model.screen_origin, axis=-1)[:, None]], axis=-1),
             log_volume=visible.log_volume,
+            typical=visible.typical,
         )
 
 
@@ -121,9 +125,9 @@ def candidate_labellings(
     plan = plan_of(rig, model, parameters.min_spots)
     prior = plan.everywhere if prior is None else prior
     log_volume = min(prior.log_volume, plan.log_volume)
-    points = points_of(rig, model, detections, parameters)
+    points = points_of(rig, model, detections, parameters, partial(_reached_by_any, plan, prior))
     has_image = np.array([model.camera_names[c] in detections for c in model.camera_of])
-    sight = _sight(plan, points, has_image, parameters)
+    sight = _sight(plan, points, has_image, parameters, _known_px(plan, calibration))
     limits = Limits(
         np.ascontiguousarray(prior.centre.rotation, dtype=np.float64),
         np.array(prior.centre.translation, dtype=np.float64),
@@ -132,9 +136,7 @@ def candidate_labellings(
         parameters.p_detect,
         parameters.min_spots,
     )
-    reached = np.array(
-        [prior.reaches(p, r, points.world) for p, r in zip(plan.spot_point, plan.spot_ray, strict=True)], dtype=bool
-    ).reshape(len(plan.spot_point), len(points.uv))
+    reached = _reached(plan, prior, points.world)
     sigma_px = LARGEST_MODEL_ERROR * parameters.model_sigma_px
     best = Best.none(parameters.max_refined, len(model))
     brightness_known = all(np.isfinite(found.flux).any() for found in detections.values() if len(found))
@@ -149,6 +151,42 @@ def candidate_labellings(
         if done >= most_triples or _spots_of_best(plan, sight, points, limits, best) > size:
             break
     return _completed(plan, sight, points, limits, prior, log_volume, best, calibration, most, sigma_px)
+
+
+def crowd_of_unknown_brightness(
+    rig: Rig,
+    model: SpotModel,
+    detections: Mapping[str, Detections],
+    prior: PosePrior | None,
+    parameters: LabelParameters,
+    limit: int,
+) -> tuple[str, int] | None:
+    """A camera with more points than a limit that may be spots under the prior, and no flux; and how many it has."""
+    crowds = [n for n, found in detections.items() if len(found) > limit and not np.isfinite(found.flux).any()]
+    if not crowds:
+        return None
+    plan = plan_of(rig, model, parameters.min_spots)
+    prior = plan.everywhere if prior is None else prior
+    for name in crowds:
+        camera = rig.cameras[name]
+        screen = rig.screens[camera.screen]
+        places = meet_surface(*camera.rays(detections[name].uv_px), screen.world_from_screen, screen.bow)
+        count = int(np.count_nonzero(_reached_by_any(plan, prior, model.camera_names.index(name), places)))
+        if count > limit:
+            return name, count
+    return None
+
+
+def _reached(plan: RigPlan, prior: PosePrior, places: Array) -> Bools:
+    """Which places (m, 3) each spot may light under a prior: (spots, m)."""
+    rays = zip(plan.spot_point, plan.spot_ray, strict=True)
+    return np.array([prior.reaches(p, r, places) for p, r in rays], dtype=bool).reshape(-1, len(places))
+
+
+def _reached_by_any(plan: RigPlan, prior: PosePrior, camera: int, places: Array) -> Bools:
+    """Which places (m, 3) on the screen of a camera any of its spots may light."""
+    mine = plan.view_at[:, camera] >= 0
+    return np.asarray(_reached(plan, prior, places)[mine].any(axis=0) & np.isfinite(places).all(axis=-1))
 
 
 def _spots_of_best(plan: RigPlan, sight: Sight, points: Points, limits: Limits, best: Best) -> int:
@@ -189,7 +227,24 @@ def _within_budget(
         most = max(int(0.8 * most), FEWEST_POINTS)
 
 
-def _sight(plan: RigPlan, points: Points, has_image: Bools, parameters: LabelParameters) -> Sight:
+_known: list[tuple[CalibrationSpread, RigPlan, Array]] = []
+
+
+def _known_px(plan: RigPlan, calibration: CalibrationSpread | None) -> Array:
+    """What the calibration's errors make of each view's pixel (n, 2, 2), px^2, in a typical pose; kept."""
+    n = len(plan.model)
+    if calibration is None or plan.typical is None:
+        return np.zeros((n, 2, 2))
+    for spread, of, px2 in _known:
+        if spread is calibration and of is plan:
+            return px2
+    px2 = calibration.at(plan.typical).reshape(n, 2, n, 2)[np.arange(n), :, np.arange(n)].copy()
+    _known.insert(0, (calibration, plan, px2))
+    del _known[8:]
+    return px2
+
+
+def _sight(plan: RigPlan, points: Points, has_image: Bools, parameters: LabelParameters, known_cov: Array) -> Sight:
     model = plan.model
     sigma2 = (LARGEST_MODEL_ERROR * parameters.model_sigma_px) ** 2
     with_points = {
@@ -201,7 +256,9 @@ def _sight(plan: RigPlan, points: Points, has_image: Bools, parameters: LabelPar
         model.spot_of,
         model.image_size_px,
         has_image,
-        np.tile(sigma2 * np.eye(2), (len(model), 1, 1)),
+        known_cov + sigma2 * np.eye(2),
+        known_cov,
+        sigma2,
         plan.view_at,
         plan.spot_point,
         plan.spot_ray,
@@ -236,20 +293,37 @@ def _completed(
         if any(np.array_equal(labels, other) and _near(pose, there) for there, other in kept):
             continue
         kept.append((pose, labels))
-        rows = np.flatnonzero(labels != NO_POINT)
-        chosen = labels[rows]
-        covariances = points.cov[chosen] + (SHARES[shares[k]] * sigma_px) ** 2 * np.eye(2)
-        fit = fit_pose(model, rows, points.uv[chosen], covariances, pose, calibration=calibration)
-        if (
-            fit is None
-            or not fit.observable
-            or not fit.consistent(P_MISFIT)
-            or not bool(prior.holds(fit.world_from_body))
-        ):
+        fit = _consistent_fit(model, points, labels, pose, SHARES[: shares[k] + 1] * sigma_px, calibration)
+        if fit is None or not bool(prior.holds(fit.world_from_body)):
             continue
         point_of = np.where(labels == NO_POINT, NO_POINT, points.row[np.maximum(labels, 0)])
         out.append(Labelling(fit, point_of, float(evidence), int(expected_of[k])))
     return out
+
+
+def _consistent_fit(
+    model: SpotModel,
+    points: Points,
+    labels: Ints,
+    start: Pose,
+    model_errors_px: Array,
+    calibration: CalibrationSpread | None,
+) -> PoseFit | None:
+    """The fit to labelled points with the smallest of some model errors, falling, under which all agree.
+
+    None where they do not even under the largest. One spot that a neighbour has pulled may misfit by many of its own
+    sigmas while the others are perfect.
+    """
+    rows = np.flatnonzero(labels != NO_POINT)
+    chosen = labels[rows]
+    for sigma_px in model_errors_px[::-1]:
+        covariances = points.cov[chosen] + sigma_px**2 * np.eye(2)
+        fit = fit_pose(model, rows, points.uv[chosen], covariances, start, calibration=calibration)
+        if fit is None or not fit.observable:
+            return None
+        if fit.consistent(P_MISFIT):
+            return fit
+    return None
 
 
 def _near(one: Pose, other: Pose) -> bool:

@@ -15,6 +15,7 @@ from itertools import combinations
 import numpy as np
 
 from geometry.arrays import Array, Bools, Ints
+from geometry.pose import Pose
 from geometry.rig import Rig
 from geometry.spots import SpotModel
 from geometry.surfaces import meet_surface
@@ -31,6 +32,7 @@ class VisiblePoses:
 
     triples: dict[tuple[int, int, int], float]  # of spots: the median relative size of the least singular value
     log_volume: float  # m^3 rad^3, of the poses that show at least `min_spots` spots
+    typical: Pose | None  # one that shows as many spots as any
 
     @staticmethod
     def of(rig: Rig, model: SpotModel, everywhere: PosePrior, min_spots: int) -> VisiblePoses:
@@ -38,7 +40,7 @@ class VisiblePoses:
         rng = np.random.default_rng(0)
         triples = _sets_of_three(model)
         if not triples:
-            return VisiblePoses({}, everywhere.log_volume)
+            return VisiblePoses({}, everywhere.log_volume, None)
         views_of = [np.flatnonzero(model.spot_of == s) for s in range(len(model.spot_names))]
         which = rng.integers(len(triples), size=DRAWN)
         spots = np.array(triples)[which]
@@ -58,11 +60,12 @@ class VisiblePoses:
         quality = s[:, -1] / np.maximum(s[:, 0], 1e-300)
         good = _fixing(triples, which[source], quality, enough)
         if not good:
-            return VisiblePoses({}, everywhere.log_volume)
+            return VisiblePoses({}, everywhere.log_volume, None)
         weight = _weights(model, triples, good, which[source], views[source], views_of, shown, s)
         volume = float(np.sum(weight[enough])) / DRAWN * len(triples)
         log_volume = min(float(np.log(max(volume, 1e-300))), everywhere.log_volume)
-        return VisiblePoses({triples[i]: q for i, q in good.items()}, log_volume)
+        typical = poses[int(np.argmax(np.count_nonzero(shown, axis=1) + quality / quality.max()))]
+        return VisiblePoses({triples[i]: q for i, q in good.items()}, log_volume, typical)
 
 
 def _sets_of_three(model: SpotModel) -> list[tuple[int, int, int]]:
