@@ -122,8 +122,14 @@ def crowding(views: Views, sights: Sights, frame: Frame, R: Array, t: Array, P: 
 
 @compiled
 def grown(frame: Frame, view: int, d: int) -> bool:
-    """Whether a detection is wider than the view's spot usually is: two points of light that have melted into one are."""
+    """Whether a detection is wider than the view's spot usually is, as two points of light that have merged are."""
     return bool(frame.size_px[d] > GROWN * frame.usual_px[view])
+
+
+@compiled
+def _is_inside(uv: Array, size: Array) -> bool:
+    """Whether a pixel lies in a picture of this width and height."""
+    return bool(-0.5 <= uv[0] < size[0] - 0.5 and -0.5 <= uv[1] < size[1] - 0.5)
 
 
 @compiled
@@ -146,9 +152,8 @@ def log_chance(
             if assigned[i] >= BLENDED:
                 r = frame.blend_px[d]
                 total += np.log(chances.blend / (np.pi * r * r)) if r > 0.0 else -np.inf
-        elif project_view(views, i, R, t, uv, J):
-            if -0.5 <= uv[0] < sights.size[i, 0] - 0.5 and -0.5 <= uv[1] < sights.size[i, 1] - 0.5:
-                total += np.log(1.0 - p)
+        elif project_view(views, i, R, t, uv, J) and _is_inside(uv, sights.size[i]):
+            total += np.log(1.0 - p)
     return total
 
 

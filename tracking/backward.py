@@ -12,7 +12,6 @@ import numpy as np
 from geometry.arrays import Array, Bools, Ints
 from geometry.pose import Pose
 from tracking.association import BLENDED
-from tracking.detections import Detections
 from tracking.fixed_interval import Reference
 from tracking.labels import PosePrior
 from tracking.match import UNMATCHED
@@ -35,7 +34,9 @@ class BackwardLabels:
         self.disagrees = np.zeros(frames, dtype=bool)  # with the pose that the forward tracker measured
 
 
-def track_backward(rec: Recording, ref: Reference, pose_P: Array, motion_P: Array, weak: Bools, sure: Bools) -> BackwardLabels:
+def track_backward(
+    rec: Recording, ref: Reference, pose_P: Array, motion_P: Array, weak: Bools, sure: Bools
+) -> BackwardLabels:
     """Labels of the stretches of weak (T,) frames, each from the first sure (T,) frame after it.
 
     ref, pose_P, motion_P: the motion as it is known so far, where it is sure.

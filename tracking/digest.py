@@ -136,8 +136,9 @@ def surprise(
     """(6,) and (n, 2, 2). First: how the likelihood of a frame grows with the share of the prediction's covariance that
     each axis makes, per unit of its size: what the steady motion's jerk is learnt from.
 
-    With w = S^-1 y: (w_i P_ii w_i - (S^-1)_ii P_ii) / (1 + (S^-1)_ii P_ii) / 2. 0 on average where the jerk is right. h: the hypothesis of the frame before. Second: the covariance of each spot's predicted
-    place, px^2, without the detection's own.
+    With w = S^-1 y: (w_i P_ii w_i - (S^-1)_ii P_ii) / (1 + (S^-1)_ii P_ii) / 2. 0 on average where the jerk is
+    right. h: the hypothesis of the frame before. Second: the covariance of each spot's predicted place, px^2, without
+    the detection's own.
     """
     none = np.zeros(2)
     R, t, _, P, _ = predicted(before.R[h], before.t[h], before.m[h], before.P[h], dt, jerk, none, none)

@@ -225,11 +225,17 @@ def grow(
                 for i in range(n):
                     labelled += 1 if 0 <= assigned[k, i] < BLENDED else 0
                 # Spots that were shining and are not found were hidden, or are elsewhere.
-                dim = startled if _misses(assigned[k], shining) else unseen
+                sudden = _misses(assigned[k], shining)
+                dim = startled if sudden else unseen
                 before = (R, t, m, dim if labelled < PROOF else P)
                 R_k, t_k, m_k, P_k, gaussian, misfit, spots = concluded(
                     views, frame, extra, before, assigned[k], R_b[k], t_b[k]
                 )
+                if mode == 0 and 0 < labelled < PROOF and dt > 0.0:
+                    # The mixture is no less likely than its steady part: else a false third spot would seem likelier.
+                    steady = (R, t, m, P)
+                    _, _, _, _, narrow, misfit, _ = concluded(views, frame, extra, steady, assigned[k], R_b[k], t_b[k])
+                    gaussian = max(gaussian, narrow + np.log(1.0 - (SUDDEN_MANOEUVRE if sudden else DARK_MANOEUVRE)))
                 if mode == 0 and k == 0:
                     dof = 2 * spots
                     turning = (
@@ -258,7 +264,9 @@ def grow(
 
 
 SUDDEN_MANOEUVRE = 0.5  # of a frame in which spots that were shining are suddenly not where they were expected
-DARK_MANOEUVRE = 0.05  # least chance of a manoeuvre per frame that does not show the pose: what is hidden is often a bend
+DARK_MANOEUVRE = (
+    0.05  # least chance of a manoeuvre per frame that does not show the pose: what is hidden is often a bend
+)
 
 
 @compiled

@@ -91,16 +91,17 @@ def fit_alone(
 
 @compiled
 def all_controlled(views: Views, R: Array, t: Array, use: Bools, cov: Array) -> bool:
-    """Whether each of the spots use (n,), with covariances (n, 2, 2), px^2, is checked by the others at the pose (R, t).
+    """Whether each of the spots use (n,), with covariances (n, 2, 2), px^2, is checked by the others at a pose (R, t).
 
     A spot's redundancy, r = 1 - tr(J P J^T C^-1) / 2, is the share of its coordinates that the pose does not take up: a
     gross error of that spot, a false point, shows in its residual by that share only. Checked means that an error of
-    DETECTABLE_PX shows. Source: Baarda (1968), "A testing procedure for use in geodetic networks": reliability.
+    DETECTABLE_PX shows. Three spots of one screen on a line check each other although they leave the pose open.
+    Source: Baarda (1968), "A testing procedure for use in geodetic networks": reliability.
     """
     n = use.shape[0]
     nothing = np.zeros((n, 2))
     L, _, _, count, _ = frame_information(views, R, t, use, nothing, cov)
-    if count < 4:
+    if count < 3:
         return False
     vague = np.zeros((6, 6))
     for i in range(6):

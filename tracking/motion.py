@@ -22,7 +22,9 @@ _moved, _posterior = small.moved, small.posterior
 
 
 @compiled
-def process_noise(dt: float, jerk: float, jump: float, unsteady: float) -> tuple[float, float, float, float, float, float]:
+def process_noise(
+    dt: float, jerk: float, jump: float, unsteady: float
+) -> tuple[float, float, float, float, float, float]:
     """Covariance that a step of dt (s) adds to one axis: entries pp, pv, pa, vv, va, aa (p pose, v velocity, a accel.).
 
     jerk: spectral density of the white jerk. jump: variance of an impulse of the velocity, unsteady: of a step of the

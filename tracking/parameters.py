@@ -72,7 +72,7 @@ class TrackerParameters:
     # Prediction, section 3
     sigma_a_px_s2: float = 5000.0  # px/s^2: white acceleration of a spot, at the start where it is learnt
     learn_sigma_a: bool = True  # learn it from the innovations, per spot
-    sigma_model_px: float = 0.005  # px: added to every detection's own sigma
+    sigma_model_px: float = 0.0005  # px: added to every detection's own sigma
     curve_switch: bool = True  # eq. (6): restart the filter at a bend; off: the conventional filter
     image_margin_px: float = 4.0  # px: spots predicted this far outside the picture are searched for as well
 

@@ -268,9 +268,7 @@ def _explanations(
         _put_matrix(whole, P)
         before = (R, t, nothing, whole)
         if mode < 2:
-            found, rough, _, R_b, t_b, found_count = associate(
-                views, sights, frame, chances, R, t, P, shining, extra
-            )
+            found, rough, _, R_b, t_b, found_count = associate(views, sights, frame, chances, R, t, P, shining, extra)
             plain = False
             for j in range(found_count):
                 if rough[j] < rough[0] - 2 * RIVAL or count == room - 4:

@@ -240,7 +240,9 @@ class RigidTracker:
         spread = J[0] @ P[:6, :6] @ np.swapaxes(J[0], -1, -2)
         return bool(np.sqrt(np.max(spread[:, [0, 1], [0, 1]])) > VAGUE_PX)
 
-    def _predicted(self, h: Hypotheses, k: int, dt_s: float, manoeuvre: bool) -> tuple[Array, Array, Array, Array, Array]:
+    def _predicted(
+        self, h: Hypotheses, k: int, dt_s: float, manoeuvre: bool
+    ) -> tuple[Array, Array, Array, Array, Array]:
         """Hypothesis k of the frame before, in this frame."""
         dynamics = self.temper.dynamics
         none = np.zeros(2)
@@ -324,7 +326,7 @@ class RigidTracker:
         weight: float,
         parent: int,
     ) -> tuple[int, int]:
-        """Add an assignment (n,) near a pose, as the continuation of one state: number of children, place (-1: none)."""
+        """Add an assignment (n,) near a pose, as the continuation of one state: children, and its place (-1: none)."""
         views, sights = self.model.numbers, self._sights
         R, t = np.array(pose.rotation, order="C"), np.array(pose.translation)
         R, t, m, P_after, gaussian, _, _ = concluded(views, frame, self._extra, before, assigned, R, t)
@@ -455,7 +457,7 @@ class RigidTracker:
         # What was found from a prior alone must lead as it must in labels.py: a tie of 5 to 1 is still a tie.
         unproven = self._anchor is None or best in fresh
         least = max(p.min_label_probability, 1 / (1 + np.exp(-p.labels.lead_nats)) if unproven else 0.0)
-        proven, fixed = self._anchor is not None or self._evidence >= ENOUGH_EVIDENCE, True
+        proven = self._anchor is not None or self._evidence >= ENOUGH_EVIDENCE
         parent, spots = int(children.parent[best]), int(np.count_nonzero(assigned >= 0))
         if spots and before is not None and dt_s > 0 and parent >= 0:
             R, t, _, P, _ = self._predicted(before, parent, dt_s, bool(children.manoeuvre[best]))
@@ -463,14 +465,13 @@ class RigidTracker:
             if unconfirmed(model.numbers, frame, self._extra, used, h.R[0], h.t[0], R, t, P):
                 # Neither the motion nor the other spots check some label: it must be beyond doubt for other reasons.
                 least = max(least, SURE)
-                fixed = spots >= FEW
-                if spots < PROOF or float(np.min(certain[assigned >= 0])) < SURE:
+                if spots < FEW or float(np.min(certain[assigned >= 0])) < SURE:
                     proven, spread = False, spread_of_all(children, places)
         d = digest(model.numbers, self._sights, frame, h.R[0], h.t[0], assigned, certain, least, RADIUS_PX)
         count = int(np.count_nonzero(d.use))
         # Another pose that is not excluded makes it a prediction, with a covariance that covers both.
         ambiguous = count <= FEW and bool(np.any(spread.diagonal() > AMBIGUOUS * d.alone.diagonal()))
-        measured = count >= 3 and proven and fixed and not ambiguous and self._good(d.alone)
+        measured = count >= 3 and proven and not ambiguous and self._good(d.alone)
         self._unmeasured = 0 if measured else self._unmeasured + 1
         if measured and self.calibration is not None:
             self._look_at_calibration(d, h)

@@ -101,9 +101,7 @@ class _Pass:
     def estimate(self, deep: int) -> None:
         """The motion given the labels."""
         rec = self.rec
-        run = WholeRun(
-            self.views, self.every, self.extra, rec.dt_s, rec.exposure_s, self.parameters.learn_jerk
-        )
+        run = WholeRun(self.views, self.every, self.extra, rec.dt_s, rec.exposure_s, self.parameters.learn_jerk)
         self.motion = estimate(run, self.assigned, self.measured, self.motion, deep, self.trusted)
         self.own = _alone(rec, self.views, self.every, self.assigned, self.extra, self.motion.ref)
         self.own.measured &= ~self.doubtful
@@ -120,7 +118,9 @@ class _Pass:
     def relabel(self) -> bool:
         """Labels from where the other frames put the vehicle; whether any changed."""
         rec, ref, known = self.rec, self.motion.ref, self.motion.known
-        self.every = self.every._replace(log_static=_log_static(self.views, self.sights, self.every, self.assigned, ref, known))
+        self.every = self.every._replace(
+            log_static=_log_static(self.views, self.sights, self.every, self.assigned, ref, known)
+        )
         log_clutter = _log_clutter(rec, self.views, self.sights, self.every, self.assigned, ref, known)
         chances = Chances(self.parameters.p_detect, self.parameters.p_blend)
         found, certain, vague = relabelled(
@@ -144,7 +144,7 @@ class _Pass:
         return changed
 
     def look_back(self) -> bool:
-        """Labels of frames that the causal tracker did not measure for sure, from the frames after them; whether any."""
+        """Labels of frames that the causal tracker did not measure for sure, from the frames after; whether any."""
         motion = self.motion
         sure = self.trusted & self.measured & (self.sure | self._controlled(motion.ref)) & motion.known
         weak = ~sure
@@ -404,13 +404,12 @@ def _calibration(rec: Recording, every: AllDetections, assigned: Ints, ref: Refe
             extra = total / max(count, 1)
     systematic = np.zeros((len(rec), 6, 6))
     latest = np.zeros((6, 6))
-    for k in range(len(rec)):
-        gain, C = gains[k], common[k]
+    for at, (gain, C) in enumerate(zip(gains, common, strict=True)):
         if gain is not None and C is not None:
             rows, G = gain
             both = np.stack([2 * rows, 2 * rows + 1], axis=-1).ravel()
             latest = G @ C[np.ix_(both, both)] @ G.T
-        systematic[k] = latest
+        systematic[at] = latest
     return extra, systematic
 
 

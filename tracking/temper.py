@@ -41,7 +41,7 @@ class Temper:
 
     def learn(self, moved: Array, manoeuvre: bool, slope: Array) -> None:
         """Take a measured frame: its velocities (6,), whether it began with a manoeuvre, and how the likelihood of its
-        innovation grows with the logarithm of each axis' jerk (6,), a step up which is taken (tracking/digest.py: surprise).
+        innovation grows with the logarithm of each axis' jerk (6,), a step up which is taken (surprise in digest.py).
         """
         speed = np.sqrt([moved[:3] @ moved[:3], moved[3:] @ moved[3:]])
         self._lately = np.maximum(FADES * self._lately, speed)

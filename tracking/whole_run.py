@@ -43,7 +43,9 @@ SMALL_CHANGE = 0.3  # of log q, weighted by what determines it: the strength has
 TRUST = (np.inf, 0.1, 0.01, 1e-3)  # m and rad: damping of a step, tried in turn until the cost falls
 P_DARK = 0.05  # probability of a bend in each frame that does not show the pose
 P_EITHER = 0.3  # of a bend being in each of several steps, where a frame between them says little
-WEAK = 2 * 6 * np.log(1.5)  # of log det of a frame's information below the usual: its pose's sigmas are half as large again
+WEAK = (
+    2 * 6 * np.log(1.5)
+)  # of log det of a frame's information below the usual: its pose's sigmas are half as large again
 DEEP = 12  # frames: so far from any measured one a few spots are not taken for evidence
 SPEED_WINDOW_S = 0.5  # a bend's size is judged by the fastest motion within this time of it
 FINER = (-2.0, -4.0, -6.0)  # of log q: tried for filling in between frames
@@ -137,10 +139,9 @@ class _Estimator:
             sd = np.sqrt(np.maximum(np.diagonal(out.pose_P, axis1=1, axis2=2), 1e-30))
             settled = np.all(np.abs(moved[:, :6]) < SMALL_STEP * sd, axis=1)
             more = np.zeros_like(self.bent)
-            if learning or not self.run.learn:
-                if number >= NO_BENDS_BEFORE:
-                    more = self._new_bends(out.shock)
-                    self.bent |= more
+            if (learning or not self.run.learn) and number >= NO_BENDS_BEFORE:
+                more = self._new_bends(out.shock)
+                self.bent |= more
             if learning:
                 before = self.log_density
                 steady = ~self.bent
@@ -230,7 +231,7 @@ class _Estimator:
             if not np.isfinite(x).all():
                 continue
             there = shifted(self.ref, x)
-            ev_there, misfit_there = self._evidence(there)
+            _, misfit_there = self._evidence(there)
             cost_there = 0.5 * misfit_there + motion_cost(there, ev, density)
             # Damping is against steps that leave the region where all is straight; rounding alone makes some nats.
             if cost_there <= cost + ROUNDING * (1 + 1e-3 * abs(cost)):
@@ -239,7 +240,7 @@ class _Estimator:
         return out, np.zeros_like(out.x)
 
     def _evidence(self, ref: Reference) -> tuple[Evidence, float]:
-        """The frames' information at a reference, where the motion may have bent, and the spots' misfit (chi-square)."""
+        """The frames' information at a reference, where the motion may have bent; the spots' misfit (chi-square)."""
         run, core = self.run, self.core
         L, g, chi2, _ = evidence_of(run.views, run.every, self.assigned, run.extra, ref, core.start)
         dropped = ~self.used[core]
@@ -316,8 +317,8 @@ class _Estimator:
             at = (R[start].copy(), t[start].copy(), m[start] * flip[6:], P * np.outer(flip, flip))
             density = np.exp(log_density[start])
             for k, step in steps:
-                *at_list, _ = predicted(*at, step, density, size, size / STEADIES_WITHIN_S**2)
-                at = tuple(at_list)
+                R_k, t_k, m_k, P_k, _ = predicted(*at, step, density, size, size / STEADIES_WITHIN_S**2)
+                at = (R_k, t_k, m_k, P_k)
                 R[k], t[k], m[k] = at[0], at[1], at[2] * flip[6:]
                 pose_P[k], motion_P[k] = at[3][:6, :6], at[3][6:12, 6:12]
         sd = np.sqrt(np.diagonal(pose_P, axis1=1, axis2=2))
