@@ -35,6 +35,7 @@ from tracking.hypotheses import (
     add_child,
     chosen_points,
     concluded,
+    count_wide,
     grow,
     no_children,
     sift,
@@ -465,7 +466,9 @@ class RigidTracker:
             if unconfirmed(model.numbers, frame, self._extra, used, h.R[0], h.t[0], R, t, P):
                 # Neither the motion nor the other spots check some label: it must be beyond doubt for other reasons.
                 least = max(least, SURE)
-                if spots < FEW or float(np.min(certain[assigned >= 0])) < SURE:
+                # One spot that returns where it may be anywhere waits for the next frame, which finds it again or not.
+                lone = count_wide(model.numbers, R, t, P, used) == 1
+                if spots < FEW or lone or float(np.min(certain[assigned >= 0])) < SURE:
                     proven, spread = False, spread_of_all(children, places)
         d = digest(model.numbers, self._sights, frame, h.R[0], h.t[0], assigned, certain, least, RADIUS_PX)
         count = int(np.count_nonzero(d.use))
