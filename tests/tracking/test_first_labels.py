@@ -28,21 +28,26 @@ from tracking.parameters import LabelParameters
 WIDE = PosePrior(Pose.identity(), 1.0, np.deg2rad(30))
 
 
-def rates(rig: Rig, count: int, seed: int, prior: PosePrior | None = None) -> tuple[float, float]:
-    """Shares right and wrong: 20 % clutter, 5 false points per picture, 2 % misses, poses of 1 m and 30 deg."""
+def rates(rig: Rig, count: int, seed: int) -> tuple[float, float, float]:
+    """Shares right, wrong, and tied with the truth among the candidates, without a prior.
+
+    20 % clutter, 5 false points per picture, 2 % misses, poses of 1 m and 30 deg, at least four spots found.
+    """
     model, rng = SpotModel.of(rig), np.random.default_rng(seed)
-    right = wrong = done = 0
+    right = wrong = tied = done = 0
     while done < count:
-        pose = pose_within(WIDE, rng)
-        if model.in_picture(model.project(pose)[0]).sum() < 4:
+        picture = photograph(model, pose_within(WIDE, rng), rng, found=0.98, clutter=0.2, false_points=5)
+        if sum(np.count_nonzero(of >= 0) for of in picture.origin.values()) < 4:
             continue
         done += 1
-        picture = photograph(model, pose, rng, found=0.98, clutter=0.2, false_points=5)
-        result = find_labels(rig, model, picture.detections, prior)
+        result = find_labels(rig, model, picture.detections)
         if result.chosen is not None:
             good = not wrong_labels(result, model, picture)
             right, wrong = right + good, wrong + (not good)
-    return right / count, wrong / count
+        tied += any(
+            not wrong_labels(replace(result, chosen=c), model, picture) for c in result.candidates if result.tie
+        )
+    return right / count, wrong / count, tied / count
 
 
 # -- without a prior --------------------------------------------------------------------------------------------------
@@ -51,7 +56,7 @@ def rates(rig: Rig, count: int, seed: int, prior: PosePrior | None = None) -> tu
 @pytest.mark.parametrize("name", ["unequal-fan", "four-skew-beams"])
 def test_labels_are_right_without_a_prior_among_clutter(name):
     """30 poses: two may stay open (four spots of two beams are a tie), none may be wrong."""
-    right, wrong = rates(RIGS[name](), 30, seed=1)
+    right, wrong, _ = rates(RIGS[name](), 30, seed=1)
     assert right >= 28 / 30
     assert wrong == 0
 
@@ -59,9 +64,11 @@ def test_labels_are_right_without_a_prior_among_clutter(name):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["unequal-fan", "four-skew-beams"])
 def test_labels_are_right_without_a_prior_among_clutter_over_hundreds_of_poses(name):
-    right, wrong = rates(RIGS[name](), 600, seed=2)
-    assert right >= 0.97
-    assert wrong <= 0.01
+    """Two beams of the fan are the same after half a turn, but for the absent third: one missing spot is a tie."""
+    right, wrong, tied = rates(RIGS[name](), 600, seed=2)
+    assert right >= (0.955 if name == "unequal-fan" else 0.98)
+    assert right + tied >= 0.985
+    assert wrong <= 0.005
 
 
 def test_screens_all_round_cameras_behind_them_and_any_lens_need_no_prior_either():
