@@ -2,8 +2,8 @@
 
 MacKay's fixed point: the strength q is right where the energy r^T Q r of the process noise, summed, equals its
 expectation tr(Q N), the number of its components that the evidence determines. Both come with one pass of the smoother
-for all axes and frames, so no search over q is needed. A pseudo-count keeps q from collapsing where the evidence
-determines next to nothing, as on uniform motion: q stops falling where the evidence can no longer tell.
+for all axes and frames, so no search over q is needed. On uniform motion q stops falling where one component of the
+noise is still determined: the floor follows from the evidence, and a later corner can raise q again.
 
 Source: MacKay (1992), "Bayesian interpolation", Neural Computation 4, eq. 4.9 (the fixed point); windows and
 pseudo-counts: ours.
@@ -21,6 +21,7 @@ from tracking.fixed_interval import Interval
 # Below it rounding is felt.
 LOG_RANGE = 2 * np.log([1e-5, 1e6])
 PSEUDO_COUNT = 2.0  # determined components that any window is taken to have, with the strength that it has now
+LEAST_COUNT = 1.0  # determined components of a window, below which the strength does not fall
 WINDOW_COUNT = 12.0  # determined components per window: the logarithm of its strength is then good to 0.4
 RELAXATION = 1.6  # of the fixed point's step in log q: gamma changes by q^(1/6), so plain steps are short
 LONGEST_STEP = 4.0  # in log q
@@ -41,6 +42,8 @@ def next_log_density(log_density: Array, out: Interval, usable: Bools, local: bo
         width = frames if total <= 0 else int(np.clip(np.ceil(frames * WINDOW_COUNT / total), 9, frames))
         e, g = (_window_sums(a[:, axis], width) for a in (energy, gamma))
         step = np.log((e + PSEUDO_COUNT) / (g + PSEUDO_COUNT))
+        # Where next to nothing of the noise is determined any more, no evidence could raise its strength again.
+        step = np.maximum(step, 2 * np.log(LEAST_COUNT / np.maximum(g, 1e-3 * LEAST_COUNT)))
         if not local:
             # The median of the windows: corners that are not known of yet raise few of them.
             step[:] = _weighted_median(step, g)
