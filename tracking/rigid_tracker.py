@@ -251,10 +251,17 @@ class RigidTracker:
         return predicted(h.R[k], h.t[k], h.m[k], h.P[k], dt_s, dynamics.jerk, jump, unsteady)
 
     def _search_prior(self) -> PosePrior:
-        """Around the last measured pose, as far as the vehicle may have got since; before there is one, the run's."""
-        if self._anchor is None:
-            return self.prior
+        """Around the last measured pose, as far as the vehicle may have moved since; before there is one, the run's
+        prior, which is about the first frame, likewise.
+        """
         p, age = self.parameters, self._anchor_age_s
+        if self._anchor is None:
+            if age == 0.0 or self.prior.within_rad >= np.pi:
+                return self.prior
+            within_m = self.prior.within_m + min((FIRST_SPEED + p.reacquire_m_s) * age, FARTHEST_M)
+            turned = self.prior.within_rad + (FIRST_RATE + np.deg2rad(p.reacquire_deg_s)) * age
+            within_rad = min(turned, max(FARTHEST_RAD, self.prior.within_rad))
+            return PosePrior(self.prior.centre, within_m, within_rad)
         speed, rate = self.temper.fastest + np.array([p.reacquire_m_s, np.deg2rad(p.reacquire_deg_s)])
         if self._since_found <= YOUNG:  # how fast it moves is not known yet
             speed, rate = max(speed, 3 * FIRST_SPEED), max(rate, 3 * FIRST_RATE)

@@ -36,7 +36,7 @@ ROUNDING = 10.0  # nats of the cost
 GLOBAL_PASSES = 5  # one strength for the whole run, before windows have their own
 LEARNING_PASSES, MORE_PASSES = 14, 2  # after which the strength stays: at first, and in later rounds
 NO_BENDS_BEFORE = 2  # passes: until then the strength is anybody's guess
-SHOCK = 20.0  # chi-square of 6 degrees (p = 3e-3; a needless bend costs little): a jump of the velocities beyond what the motion allows
+SHOCK = 20.0  # chi-square of 6 degrees (p = 3e-3): a jump of the velocities beyond what the motion allows
 APART = 2  # frames: of shocks so near each other the largest is looked at first
 SMALL_STEP = 0.02  # sigmas: a step of Gauss-Newton that is nothing any more
 SMALL_CHANGE = 0.3  # of log q, weighted by what determines it: the strength has settled
