@@ -18,7 +18,7 @@ from geometry.compiled import compiled
 from geometry.projection import Views
 from tracking.association import BLENDED, Chances, Frame, Sights, associate, crowding, expected_at
 from tracking.hiding import MISSED, later, learnt, marginal, together
-from tracking.information import all_controlled, frame_information, widen_by_curvature
+from tracking.information import frame_information, widen_by_curvature
 from tracking.motion import STATE, predicted, updated
 
 MOST_CHILDREN = 48  # of one frame, over all hypotheses
@@ -292,19 +292,6 @@ def count_wide(views: Views, R: Array, t: Array, P: Array, assigned: Ints) -> in
             if not there or 0.5 * (a + c) > VAGUE_PX * VAGUE_PX:
                 count += 1
     return count
-
-
-@compiled
-def unconfirmed(
-    views: Views, frame: Frame, extra: Array, assigned: Ints, R: Array, t: Array, R0: Array, t0: Array, P0: Array
-) -> bool:
-    """Whether nothing checks some label of an assignment (n,) at a pose (R, t): neither the frame's other labels nor
-    the prediction (R0, t0) with its P0 (6 or more, square).
-    """
-    if widest(views, R0, t0, P0, assigned) <= VAGUE_PX:
-        return False
-    use, _, cov = chosen_points(frame, assigned, extra)
-    return not all_controlled(views, R, t, use, cov)
 
 
 @compiled

@@ -27,6 +27,7 @@ from tracking.detections import Detections
 from tracking.digest import Digest, ahead, digest, surprise
 from tracking.hiding import MISSED, later, learnt, marginal, together
 from tracking.hypotheses import (
+    FAR_TOO_VAGUE_PX,
     FEW,
     PROOF,
     VAGUE_PX,
@@ -40,9 +41,9 @@ from tracking.hypotheses import (
     no_children,
     sift,
     spread_of_all,
-    unconfirmed,
+    widest,
 )
-from tracking.information import fit_alone
+from tracking.information import all_controlled, fit_alone
 from tracking.labels import NO_POINT, Labelling, PosePrior, candidate_labellings, find_labels
 from tracking.match import UNMATCHED
 from tracking.misfit import Misfit
@@ -470,12 +471,16 @@ class RigidTracker:
         if spots and before is not None and dt_s > 0 and parent >= 0:
             R, t, _, P, _ = self._predicted(before, parent, dt_s, bool(children.manoeuvre[best]))
             used = np.where(assigned < BLENDED, assigned, -1)
-            if unconfirmed(model.numbers, frame, self._extra, used, h.R[0], h.t[0], R, t, P):
-                # Neither the motion nor the other spots check some label: it must be beyond doubt for other reasons.
+            worst = widest(model.numbers, R, t, P, used)
+            if worst > VAGUE_PX:
+                # The motion does not check some label: the other spots must, or it must be beyond doubt.
                 least = max(least, SURE)
+                use, _, cov = chosen_points(frame, assigned, self._extra)
+                checked = all_controlled(model.numbers, h.R[0], h.t[0], use, cov)
+                few = spots < FEW and (not checked or worst > FAR_TOO_VAGUE_PX)
                 # One spot that returns where it may be anywhere waits for the next frame, which finds it again or not.
-                lone = count_wide(model.numbers, R, t, P, used) == 1
-                if spots < FEW or lone or float(np.min(certain[assigned >= 0])) < SURE:
+                lone = not checked and count_wide(model.numbers, R, t, P, used) == 1
+                if few or lone or float(np.min(certain[assigned >= 0])) < SURE:
                     proven, spread = False, spread_of_all(children, places)
         d = digest(model.numbers, self._sights, frame, h.R[0], h.t[0], assigned, certain, least, RADIUS_PX)
         count = int(np.count_nonzero(d.use))
