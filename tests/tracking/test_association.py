@@ -6,6 +6,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import combinations, permutations, product
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -274,28 +276,43 @@ def test_no_point_is_two_spots_and_no_assignment_is_hopelessly_behind():
         assert found.score[0] - found.score[-1] <= BEHIND
 
 
-def crowd_at(frame: Frame, pose: Pose) -> float:
-    return crowding(MODEL.numbers, SIGHTS, frame, np.ascontiguousarray(pose.rotation), pose.translation)
+def crowd_at(frame: Frame, pose: Pose, P: Array = 1e-4 * P_NEAR) -> float:
+    return crowding(MODEL.numbers, SIGHTS, frame, np.ascontiguousarray(pose.rotation), pose.translation, P)
+
+
+def beside_the_spots(px: float) -> list[Array]:
+    return [EXPECTED[MODEL.camera_of == c] + [px, 0.0] for c in range(2)]
 
 
 def test_only_points_near_a_spots_place_are_expected_to_be_clutter_of_spots():
-    points = [EXPECTED[MODEL.camera_of == c] + [4.0, 0.0] for c in range(2)]
-    frame = frame_of(points)._replace(log_crowding=np.full(N, 3.0))
-    assert crowd_at(frame, POSE) == pytest.approx(3.0 * N)
+    frame = frame_of(beside_the_spots(1.0))._replace(log_crowding=np.full(N, 3.0))
+    # Twice the disc's mean density in its middle.
+    assert crowd_at(frame, POSE) == pytest.approx(N * np.log(1 + 2 * (np.exp(3.0) - 1)), rel=0.01)
+    farther = frame_of(beside_the_spots(CROWD_PX))._replace(log_crowding=np.full(N, 3.0))
+    assert 0 < crowd_at(farther, POSE) < 0.6 * crowd_at(frame, POSE)
     # A vehicle elsewhere, all of whose spots would be hidden, has none of these points for its own clutter.
     elsewhere = POSE.plus(np.array([0, 0.3, 0.3, 0, 0, 0]))
-    assert np.nanmin(np.linalg.norm(MODEL.project(elsewhere)[0] - EXPECTED, axis=1)) > 2 * CROWD_PX
-    assert crowd_at(frame, elsewhere) == 0.0
-    # Two points beside one spot count both, one point beside two spots once.
+    assert np.nanmin(np.linalg.norm(MODEL.project(elsewhere)[0] - EXPECTED, axis=1)) > 4 * CROWD_PX
+    assert crowd_at(frame, elsewhere) == pytest.approx(0.0, abs=1e-6)
+    # Two points beside one spot count both.
+    points = beside_the_spots(0.0)
     twice = frame_of([np.concatenate([points[0], points[0] + 1.0]), points[1]])._replace(log_crowding=np.full(N, 3.0))
-    assert crowd_at(twice, POSE) == pytest.approx(3.0 * (N + np.count_nonzero(MODEL.camera_of == 0)))
+    beside_two = N + np.count_nonzero(MODEL.camera_of == 0)
+    assert crowd_at(twice, POSE) == pytest.approx(crowd_at(frame, POSE) * beside_two / N, rel=0.01)
+
+
+def test_false_points_near_spots_count_as_far_as_the_spots_places_are_known():
+    frame = frame_of(beside_the_spots(4.0))._replace(log_crowding=np.full(N, 3.0))
+    sharper_first = [crowd_at(frame, POSE, scale * P_NEAR) for scale in (1e-4, 1e2, 1e3, 1e4, 1e8)]
+    assert all(a > b > 0 for a, b in pairwise(sharper_first))
+    assert sharper_first[-1] < 0.01
 
 
 def test_points_that_stay_in_their_place_are_nobodys_crowd():
-    points = [EXPECTED[MODEL.camera_of == c] + [4.0, 0.0] for c in range(2)]
-    frame = frame_of(points)._replace(log_crowding=np.full(N, 3.0))
+    frame = frame_of(beside_the_spots(1.0))._replace(log_crowding=np.full(N, 3.0))
+    every = crowd_at(frame, POSE)
     frame.log_static[0] = LOG_CLUTTER + 2.0
-    assert crowd_at(frame, POSE) == pytest.approx(3.0 * (N - 1))
+    assert crowd_at(frame, POSE) == pytest.approx(every * (N - 1) / N, rel=0.01)
 
 
 def test_a_point_where_static_ones_are_is_hardly_a_spot():
