@@ -282,16 +282,15 @@ def widest(views: Views, R: Array, t: Array, P: Array, assigned: Ints) -> float:
 
 
 @compiled
-def count_wide(views: Views, R: Array, t: Array, P: Array, assigned: Ints) -> int:
-    """How many labelled spots a predicted pose (R, t) with its P (6 or more, square) places worse than VAGUE_PX."""
+def wide_views(views: Views, R: Array, t: Array, P: Array, assigned: Ints) -> Bools:
+    """(n,): labelled spots that a predicted pose (R, t) with its P (6 or more, square) places worse than VAGUE_PX."""
     uv, J = np.empty(2), np.empty((2, 6))
-    count = 0
+    out = np.zeros(assigned.shape[0], np.bool_)
     for i in range(assigned.shape[0]):
         if assigned[i] >= 0:
             there, a, _, c = expected_at(views, i, R, t, P, uv, J)
-            if not there or 0.5 * (a + c) > VAGUE_PX * VAGUE_PX:
-                count += 1
-    return count
+            out[i] = not there or 0.5 * (a + c) > VAGUE_PX * VAGUE_PX
+    return out
 
 
 @compiled

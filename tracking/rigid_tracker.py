@@ -36,11 +36,11 @@ from tracking.hypotheses import (
     add_child,
     chosen_points,
     concluded,
-    count_wide,
     grow,
     no_children,
     sift,
     spread_of_all,
+    wide_views,
     widest,
 )
 from tracking.information import all_controlled, fit_alone
@@ -106,6 +106,7 @@ class RigidTracker:
         self._systematic = np.zeros((6, 6))  # ... and on the pose
         self._anchor: Pose | None = None  # the last measured pose ...
         self._anchor_age_s = 0.0  # ... and its age
+        self._found_before = np.zeros(n, dtype=bool)  # (n,): spots of the best hypothesis in the frame before
         self._saw_any = False  # the frame before showed spots
         self._unmeasured = 0  # frames in a row without a measured pose
         self._doubts = 0  # frames in a row that contradict the best hypothesis
@@ -471,17 +472,20 @@ class RigidTracker:
         if spots and before is not None and dt_s > 0 and parent >= 0:
             R, t, _, P, _ = self._predicted(before, parent, dt_s, bool(children.manoeuvre[best]))
             used = np.where(assigned < BLENDED, assigned, -1)
-            worst = widest(model.numbers, R, t, P, used)
-            if worst > VAGUE_PX:
+            wide = wide_views(model.numbers, R, t, P, used)
+            if wide.any():
                 # The motion does not check some label: the other spots must, or it must be beyond doubt.
                 least = max(least, SURE)
                 use, _, cov = chosen_points(frame, assigned, self._extra)
                 checked = all_controlled(model.numbers, h.R[0], h.t[0], use, cov)
-                few = spots < FEW and (not checked or worst > FAR_TOO_VAGUE_PX)
-                # One spot that returns where it may be anywhere waits for the next frame, which finds it again or not.
-                lone = not checked and count_wide(model.numbers, R, t, P, used) == 1
-                if few or lone or float(np.min(certain[assigned >= 0])) < SURE:
+                # A spot that was found in the frame before too confirms itself. A single one that returns where it may
+                # be anywhere waits for the next frame, which finds it again or does not.
+                new = int(np.count_nonzero(wide & ~self._found_before))
+                far = widest(model.numbers, R, t, P, used) > FAR_TOO_VAGUE_PX
+                few = spots < FEW and (not checked or far)
+                if few or (new == 1 and not checked) or float(np.min(certain[assigned >= 0])) < SURE:
                     proven, spread = False, spread_of_all(children, places)
+        self._found_before = assigned >= 0
         d = digest(model.numbers, self._sights, frame, h.R[0], h.t[0], assigned, certain, least, RADIUS_PX)
         count = int(np.count_nonzero(d.use))
         # Another pose that is not excluded makes it a prediction, with a covariance that covers both.
