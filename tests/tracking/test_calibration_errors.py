@@ -83,8 +83,8 @@ def mean_nees(scenario: str, seeds: range, stated: bool = True, frames: int = 6)
 
 @pytest.mark.parametrize("scenario", ["clean", "four-skew-beams"])
 def test_the_stated_covariance_holds_the_calibrations_errors(scenario):
-    # 16 rigs, and frames of a rig share its errors: the mean of NEES / 6 scatters by 0.14.
-    mean, measured, drops = mean_nees(scenario, range(16), frames=4)
+    # 12 rigs, and frames of a rig share its errors: the mean of NEES / 6 scatters by 0.16.
+    mean, measured, drops = mean_nees(scenario, range(12), frames=4)
     assert 0.55 < mean < 1.45
     assert measured == 1.0
     assert drops == 0
@@ -118,8 +118,8 @@ def rigid_nees(scenario: str, seeds: range, frames: int, noise_px: float, stated
 
 @pytest.mark.parametrize("scenario", ["clean", "four-skew-beams"])
 def test_the_rigid_tracker_and_the_smoother_carry_the_calibrations_errors_too(scenario):
-    # A smoothed motion has one rig's errors in all frames: of 12 rigs the mean of NEES / 6 scatters by 0.17.
-    for value in rigid_nees(scenario, range(12), frames=20, noise_px=0.05):
+    # A smoothed motion has one rig's errors in all frames: of 7 rigs the mean of NEES / 6 scatters by 0.22.
+    for value in rigid_nees(scenario, range(7), frames=20, noise_px=0.05):
         assert 0.5 < value < 1.7
 
 

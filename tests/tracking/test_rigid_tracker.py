@@ -68,7 +68,7 @@ FEW_FRAMES: list[tuple[str, tuple[str, int] | None, float | None, int]] = [
     ("smooth", None, 1.0, 1),
     ("sharp-turns", None, None, 0),
     ("sharp-turns", None, 1.0, 3),
-    ("sharp-turns", ("one", 10), None, 8),  # four spots of two frames after a bend wait: nothing checks them
+    ("sharp-turns", ("one", 10), None, 4),  # four spots of the frame after a bend wait: nothing checks them
     ("sharp-turns", ("two", 10), None, 6),  # likewise, three of two frames
     ("sharp-turns", ("screen", 10), None, 4),
     ("sharp-turns", ("all", 3), None, 8),
