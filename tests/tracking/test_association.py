@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import combinations, permutations, product
-
-from itertools import pairwise
+from itertools import combinations, pairwise, permutations, product
 
 import numpy as np
 import pytest
