@@ -362,7 +362,7 @@ def test_a_run_without_a_prior_is_processed_and_a_symmetric_rig_is_not_guessed(t
     (folder / "run.yaml").write_text(yaml.safe_dump(content))
     done = typed("run", folder, "--out", tmp_path / "out")
     assert done.exit_code == 4
-    assert "some frames could be explained in two ways" in done.stdout
+    assert "the spots fit more than one pose" in done.stdout
     assert json.loads((tmp_path / "out/summary.json").read_text())["parameters"]["prior"] is None
     checked = typed("check", folder)
     assert checked.exit_code == 0
