@@ -13,6 +13,7 @@ from geometry.arrays import Array, Bools, Ints
 from geometry.pose import Pose
 from tracking.association import BLENDED
 from tracking.fixed_interval import Reference
+from tracking.hypotheses import FEW
 from tracking.labels import PosePrior
 from tracking.match import UNMATCHED
 from tracking.motion import STATE
@@ -85,10 +86,13 @@ def _stretches(mask: Bools) -> list[tuple[int, int]]:
 
 
 def merged(causal: Ints, backward: BackwardLabels, weak: Bools) -> Ints:
-    """Labels (T, n): of weak frames those of the backward tracker where they give the pose, else what was there."""
+    """Labels (T, n): of weak frames those of the backward tracker where they give the pose, else what was there.
+
+    One label more than the causal tracker gave may be a false point beside a hidden spot, and so may one of three: they
+    are not taken.
+    """
     out = causal.copy()
-    take = weak & backward.measured
+    had, has = (np.count_nonzero(labels >= 0, axis=1) for labels in (causal, backward.assigned))
+    take = weak & backward.measured & (has >= FEW) & ((has >= had + 2) | (had == 0))
     out[take] = backward.assigned[take]
-    fill = weak & ~backward.measured & ~(causal >= 0).any(axis=1)
-    out[fill] = backward.assigned[fill]
     return out

@@ -29,6 +29,7 @@ TOO_WIDE = 0.06  # m, rad: where a frame leaves its widest direction so open, it
 LEAST_SHARE = 1e-3  # of the probability: hypotheses below it, however far away, do not widen the covariance
 FEW = 4  # spots: fewer do not tell a lost vehicle from one that is mostly hidden
 VAGUE_PX = 15.0  # 1 sigma of a predicted spot: beyond it the whole picture is searched at once
+CHECK_PX = 8.0  # 1 sigma of a predicted spot: up to it the prediction checks a label
 FAR_TOO_VAGUE_PX = 45.0  # beyond it three spots fit anywhere too
 PROOF = 3  # spots: where so many lie in their narrow gates, the velocities have not jumped
 LEAST_TO_TURN = 6.0  # nats: a hypothesis so far behind is not tried with a manoeuvre as well
@@ -283,13 +284,13 @@ def widest(views: Views, R: Array, t: Array, P: Array, assigned: Ints) -> float:
 
 @compiled
 def wide_views(views: Views, R: Array, t: Array, P: Array, assigned: Ints) -> Bools:
-    """(n,): labelled spots that a predicted pose (R, t) with its P (6 or more, square) places worse than VAGUE_PX."""
+    """(n,): labelled spots that a predicted pose (R, t) with its P (6 or more, square) places worse than CHECK_PX."""
     uv, J = np.empty(2), np.empty((2, 6))
     out = np.zeros(assigned.shape[0], np.bool_)
     for i in range(assigned.shape[0]):
         if assigned[i] >= 0:
             there, a, _, c = expected_at(views, i, R, t, P, uv, J)
-            out[i] = not there or 0.5 * (a + c) > VAGUE_PX * VAGUE_PX
+            out[i] = not there or 0.5 * (a + c) > CHECK_PX * CHECK_PX
     return out
 
 

@@ -129,9 +129,9 @@ def relabelled(
     pose_P: Array,
     log_clutter: Array,
     jump_px: Array,
-) -> tuple[Ints, Array, Bools]:
+) -> tuple[Ints, Array, Array]:
     """Assignments (T, n) and their probabilities (T, n), from the smoothed poses and their covariances (T, 6, 6); and
-    of which frames the others say too little to label by (T,).
+    how well the other frames place the spots of each (T,): the largest sigma, px.
 
     assigned (T, n): those that the smoothing used. log_clutter (T, n). jump_px (T, 6): sigmas of the pose, m and rad,
     that a bend at the frame would add. Each frame is explained by where the others put the vehicle; where that leaves
@@ -140,7 +140,7 @@ def relabelled(
     """
     frames, n = assigned.shape
     out, certain = assigned.copy(), np.ones((frames, n))
-    vague = np.zeros(frames, np.bool_)
+    sigma_px = np.zeros(frames)
     groups = 0
     for i in range(n):
         groups = max(groups, sights.group[i] + 1)
@@ -148,8 +148,8 @@ def relabelled(
     for i in range(6):
         anywhere[i] = ANYWHERE_M if i < 3 else ANYWHERE_RAD
     for k in range(frames):
-        alone, R, t, vague[k] = _by_the_others(views, sights, all_of, assigned, extra, ref, pose_P, k)
-        if vague[k]:
+        alone, R, t, sigma_px[k] = _by_the_others(views, sights, all_of, assigned, extra, ref, pose_P, k)
+        if not sigma_px[k] < VAGUE_PX:
             continue
         a, b = all_of.begin[k], all_of.begin[k + 1]
         frame = Frame(
@@ -184,7 +184,7 @@ def relabelled(
         for i in range(n):
             out[k, i] = tried[best, i] if tried[best, i] >= 0 else -1
             certain[k, i] = share[i] / total
-    return out, certain, vague
+    return out, certain, sigma_px
 
 
 @compiled
@@ -203,8 +203,8 @@ def _by_the_others(
     ref: Reference,
     pose_P: Array,
     k: int,
-) -> tuple[Array, Array, Array, bool]:
-    """Where all other frames put frame k: covariance (6, 6), R, t; and whether that says too little to label by."""
+) -> tuple[Array, Array, Array, float]:
+    """Where all other frames put frame k: covariance (6, 6), R, t; and the largest sigma of a spot there, px."""
     use, uv, cov = labelled_points(all_of, k, assigned[k], extra)
     L, g, _, _, _ = frame_information(views, ref.R[k], ref.t[k], use, uv, cov)
     P = pose_P[k]
@@ -217,20 +217,21 @@ def _by_the_others(
     x, _ = _solve(A, _beside(P, step))
     alone = _block(x, 6)
     _symmetrise(alone)
-    vague = False
+    nothing = False
     for i in range(6):
-        vague |= not 0.0 < alone[i, i] < 1.0
-    if vague:
-        return alone, ref.R[k], ref.t[k], True
+        nothing |= not 0.0 < alone[i, i] < 1.0
+    if nothing:
+        return alone, ref.R[k], ref.t[k], np.inf
     R, t = _moved(ref.R[k], ref.t[k], _column(x, 6))
     at, J = np.empty(2), np.empty((2, 6))
+    worst = 0.0
     for i in range(assigned.shape[1]):
         if not all_of.has_image[k, sights.camera[i]]:
             continue
         there, a, _, c = expected_at(views, i, R, t, alone, at, J)
         if there and -0.5 <= at[0] < sights.size[i, 0] - 0.5 and -0.5 <= at[1] < sights.size[i, 1] - 0.5:
-            vague |= not a + c < 2 * VAGUE_PX * VAGUE_PX
-    return alone, R, t, vague
+            worst = max(worst, 0.5 * (a + c))
+    return alone, R, t, np.sqrt(worst)
 
 
 @compiled

@@ -395,6 +395,8 @@ class RigidTracker:
             static = frame.log_static[frame.first[c] : frame.first[c + 1]] > STATIC_LOG_DENSITY
             rows[c] = np.arange(len(points)) if all_points else np.flatnonzero(~static)
             by_camera[name] = points if len(rows[c]) == len(points) else points[rows[c]]
+        if sum(len(points) for points in by_camera.values()) < p.labels.min_spots:
+            return []
         if self._anchor is None and not self._told_tie:
             result = find_labels(self.rig, self.model, by_camera, prior, p.labels, self.calibration)
             if result.tie:

@@ -21,7 +21,7 @@ from geometry.solve import SolveLimits, covariance_of
 from tracking.association import BLENDED, Chances, Sights
 from tracking.backward import merged, track_backward
 from tracking.fixed_interval import Reference
-from tracking.hypotheses import FEW, PROOF
+from tracking.hypotheses import CHECK_PX, FEW, PROOF
 from tracking.information import all_controlled, fit_alone, frame_information
 from tracking.misfit import DEADBAND
 from tracking.motion import process_noise
@@ -92,6 +92,7 @@ class _Pass:
             by_hand = 2 * np.log(np.repeat([parameters.jerk_m_s3, parameters.jerk_rad_s3], 3))
             log_density = np.tile(by_hand, (len(rec), 1))
         # Frames that a tracker measured with enough spots: where the others do not check a label it was beyond doubt.
+        self.certified = self.causal  # labels that a tracker gave, forward or backward
         self.sure = self.measured & (np.count_nonzero(self.assigned >= 0, axis=1) >= FEW)
         self.trusted = _chained(self.measured, self.sure | self._controlled(ref))
         self.motion = Motion.begin(ref, rec.bent.copy(), log_density)
@@ -123,7 +124,7 @@ class _Pass:
         )
         log_clutter = _log_clutter(rec, self.views, self.sights, self.every, self.assigned, ref, known)
         chances = Chances(self.parameters.p_detect, self.parameters.p_blend)
-        found, certain, vague = relabelled(
+        found, certain, sigma_px = relabelled(
             self.views, self.sights, chances, self.every, self.assigned, self.extra, ref, self.motion.pose_P,
             log_clutter, _bend_sigmas(ref, rec.dt_s),
         )  # fmt: skip
@@ -131,7 +132,8 @@ class _Pass:
         new = np.where((certain >= self.parameters.min_label_probability) & known[:, None], found, -1)
         self.assigned = new
         self.measured = _alone(rec, self.views, self.every, new, self.extra, ref).measured
-        unchecked = vague & ~_chained(self.measured, self.sure | self._controlled(ref))
+        unchecked = (sigma_px > CHECK_PX) & ~_chained(self.measured, self.sure | self._controlled(ref))
+        new[unchecked[:, None] & (new != self.certified)] = -1
         # Such frames keep the labels that a tracker was sure of, but they are no evidence of the motion.
         lone = _lone_points(new)
         new[lone] = -1
@@ -154,7 +156,7 @@ class _Pass:
         new = merged(self.assigned, back, weak)
         if np.array_equal(new, self.assigned) and not back.disagrees.any():
             return False
-        self.assigned = new
+        self.assigned = self.certified = new
         self.measured = _alone(self.rec, self.views, self.every, new, self.extra, motion.ref).measured
         # Two directions of time that measured two poses: neither is believed.
         self.doubtful = back.disagrees

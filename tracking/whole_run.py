@@ -46,6 +46,7 @@ P_EITHER = 0.3  # of a bend being in each of several steps, where a frame betwee
 WEAK = (
     2 * 6 * np.log(1.5)
 )  # of log det of a frame's information below the usual: its pose's sigmas are half as large again
+OPEN_WEIGHT = 0.25  # of the spots of a frame that does not show the pose
 DEEP = 12  # frames: so far from any measured one a few spots are not taken for evidence
 SPEED_WINDOW_S = 0.5  # a bend's size is judged by the fastest motion within this time of it
 FINER = (-2.0, -4.0, -6.0)  # of log q: tried for filling in between frames
@@ -246,6 +247,9 @@ class _Estimator:
         dropped = ~self.used[core]
         L[dropped], g[dropped], chi2[dropped] = 0.0, 0.0, 0.0
         measured, bent = self.measured, self.bent
+        # Spots that leave a direction of the pose open are not straight along it, frame after frame in the same sense.
+        for a in (L, g, chi2):
+            a[~measured] *= OPEN_WEIGHT
         if run.exposure_s > 0:
             for k in np.flatnonzero(bent[1:] & measured[1:] & measured[:-1]):
                 # The light of an exposure in which the velocities jump lies beside the corner, by up to an eighth of
@@ -288,9 +292,7 @@ class _Estimator:
     def _new_bends(self, shock: Array) -> Bools:
         """(T,): steps in which the velocities jumped and that are not known of: the largest shock of each place."""
         peak = shock >= maximum_filter1d(np.where(self.bent, 0.0, shock), 2 * APART + 1, mode="nearest")
-        lit = self.measured.copy()
-        lit[1:] &= self.measured[:-1]
-        return np.asarray(peak & (shock > SHOCK) & lit & ~self.bent)
+        return np.asarray(peak & (shock > SHOCK) & ~self.bent)
 
     def _whole(self, out: Interval, settled: Bools) -> Motion:
         """The result of all frames: the core's, and what follows from its ends."""
