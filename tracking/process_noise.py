@@ -22,6 +22,7 @@ from tracking.fixed_interval import Interval
 LOG_RANGE = 2 * np.log([1e-5, 1e6])
 PSEUDO_COUNT = 2.0  # determined components that any window is taken to have, with the strength that it has now
 LEAST_COUNT = 1.0  # determined components of a window, below which the strength does not fall
+NOTHING = 0.01  # of that: a window without evidence, whose strength stays
 WINDOW_COUNT = 12.0  # determined components per window: the logarithm of its strength is then good to 0.4
 RELAXATION = 1.6  # of the fixed point's step in log q: gamma changes by q^(1/6), so plain steps are short
 LONGEST_STEP = 4.0  # in log q
@@ -43,7 +44,8 @@ def next_log_density(log_density: Array, out: Interval, usable: Bools, local: bo
         e, g = (_window_sums(a[:, axis], width) for a in (energy, gamma))
         step = np.log((e + PSEUDO_COUNT) / (g + PSEUDO_COUNT))
         # Where next to nothing of the noise is determined any more, no evidence could raise its strength again.
-        step = np.maximum(step, 2 * np.log(LEAST_COUNT / np.maximum(g, 1e-3 * LEAST_COUNT)))
+        some = g > NOTHING * LEAST_COUNT
+        step = np.where(some, np.maximum(step, 2 * np.log(LEAST_COUNT / np.maximum(g, NOTHING * LEAST_COUNT))), 0.0)
         if not local:
             # The median of the windows: corners that are not known of yet raise few of them.
             step[:] = _weighted_median(step, g)

@@ -47,6 +47,7 @@ WEAK = (
     2 * 6 * np.log(1.5)
 )  # of log det of a frame's information below the usual: its pose's sigmas are half as large again
 OPEN_WEIGHT = 0.25  # of the spots of a frame that does not show the pose
+P_BEYOND = 0.15  # of a bend in each frame before the first evidence or after the last: nothing beyond bounds it
 DEEP = 12  # frames: so far from any measured one a few spots are not taken for evidence
 SPEED_WINDOW_S = 0.5  # a bend's size is judged by the fastest motion within this time of it
 FINER = (-2.0, -4.0, -6.0)  # of log q: tried for filling in between frames
@@ -305,7 +306,7 @@ class _Estimator:
         log_density = np.empty((frames, 6))
         log_density[core] = self.log_density
         log_density[: core.start], log_density[core.stop :] = self.log_density[0], self.log_density[-1]
-        jump = P_DARK * self._size_at_ends()
+        jump = P_BEYOND * self._size_at_ends()
         dt = self.run.dt
         last = core.stop - 1
         forward = [(k, dt[k]) for k in range(core.stop, frames)]

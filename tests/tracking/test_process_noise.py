@@ -71,7 +71,6 @@ def test_a_uniform_motion_lets_the_jerk_fall_until_the_evidence_cannot_tell():
     assert np.mean(chi2) < 2.5
 
 
-@pytest.mark.xfail(strict=True, reason="where nothing is determined the strength grows by exp(4) with every pass")
 def test_a_run_without_evidence_keeps_its_jerk():
     run = drawn(6, FRAMES, dark=slice(0, FRAMES))
     np.testing.assert_array_equal(learnt(run, 8)[0], START)
