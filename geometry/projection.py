@@ -38,6 +38,12 @@ Views: TypeAlias = NDArray[np.void]  # (n,) of VIEW
 
 
 @compiled
+def inside(uv: Array, size: Array) -> bool:
+    """Whether a pixel (2,) lies in a picture of a size (2,). nan does not."""
+    return uv[0] >= -0.5 and uv[1] >= -0.5 and uv[0] < size[0] - 0.5 and uv[1] < size[1] - 0.5
+
+
+@compiled
 def project_all(v: Views, R: Array, t: Array) -> tuple[Array, Array]:
     """Pixels (m, n, 2) and Jacobians (m, n, 2, 6) of poses R (m, 3, 3), t (m, 3). nan and 0 where there is none."""
     m, n = R.shape[0], v.shape[0]

@@ -9,7 +9,7 @@ import json
 import platform
 import time
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
@@ -141,35 +141,11 @@ def process_run(
     require_usable(run.calibration, run.rig_path, recorded, "today" if run.recorded is None else "the recording's day")
     with whole_folder(out, may_replace=are_results) as work:
         pipeline = Pipeline.of(run)
-        model = SpotModel.of(run.rig)
-        tally = _Tally(tuple(run.rig.cameras), tuple(f"{c}/{s}" for c, s in model.views))
-        checks = FrameChecks(run.rig, run.covariance)
-        facts = RunFacts(
-            {name: CameraFacts() for name in run.rig.cameras},
-            tuple(model.camera_of.tolist()),
-            run.tracker.labels.min_spots,
-            own_spots=checks.own_spots,
-            causal=checks.causal,
-            invalid=checks.invalid,
-        )
+        tally = _Tally(tuple(run.rig.cameras), tuple(f"{c}/{s}" for c, s in SpotModel.of(run.rig).views))
         passes = TwoPasses(pipeline, work, progress)
-        keeper = FrameKeeper()
-        with (
-            TableWriter(work, run.rig, run.covariance is not None, with_causal=not causal) as tables,
-            contextlib.closing(passes.causal_only() if causal else passes.records()) as records,
-        ):
-            for record, known_then in checks.passed(records):
-                tables.write(record, known_then)
-                claimed = claimed_covariances(record.tracked, record.detections, model.camera_of, run.tracker)
-                keeper.add_tracked(record.t_s, record.tracked, record.tracked.predicted_cov_px2, claimed)
-                tally.add(record)
-                facts.add(record, known_then)
-        from lab.model_check.check import check_kept  # the words of its report: only for those who need them
-
-        model_check = check_kept(run.rig, keeper, run.covariance)
-        # Where the model check has tested the residuals, it has separated noise from faults.
-        misfit = None if model_check.inquest is not None else pipeline.tracker.noise_scale
-        verdict = quality.judge(facts, model_check.findings, misfit)
+        facts, model_check, verdict = write_tables(
+            pipeline, passes, work, causal=causal, on_frame=lambda record, _: tally.add(record)
+        )
         errors = _errors(work, run)
         seconds = {
             "waiting_for_pictures_s": pipeline.timings.waiting,
@@ -185,6 +161,45 @@ def process_run(
 
         write_report(work, run.folder)
     return Outcome(run.name, Path(out), verdict, facts.frames, facts.measured, time.perf_counter() - started, errors)
+
+
+def write_tables(
+    pipeline: Pipeline,
+    passes: TwoPasses,
+    work: Path,
+    *,
+    causal: bool = False,
+    on_frame: Callable[[FrameRecord, FrameRecord | None], None],
+) -> tuple[RunFacts, ModelCheck, quality.Verdict]:
+    """Track a run, write its tables into `work`, and judge it. on_frame: called with each frame as it was written."""
+    run = pipeline.run
+    model = SpotModel.of(run.rig)
+    checks = FrameChecks(run.rig, run.covariance)
+    facts = RunFacts(
+        {name: CameraFacts() for name in run.rig.cameras},
+        tuple(model.camera_of.tolist()),
+        run.tracker.labels.min_spots,
+        own_spots=checks.own_spots,
+        causal=checks.causal,
+        invalid=checks.invalid,
+    )
+    keeper = FrameKeeper()
+    with (
+        TableWriter(work, run.rig, run.covariance is not None, with_causal=not causal) as tables,
+        contextlib.closing(passes.causal_only() if causal else passes.records()) as records,
+    ):
+        for record, known_then in checks.passed(records):
+            tables.write(record, known_then)
+            claimed = claimed_covariances(record.tracked, record.detections, model.camera_of, run.tracker)
+            keeper.add_tracked(record.t_s, record.tracked, record.tracked.predicted_cov_px2, claimed)
+            facts.add(record, known_then)
+            on_frame(record, known_then)
+    from lab.model_check.check import check_kept  # the words of its report: only for those who need them
+
+    model_check = check_kept(run.rig, keeper, run.covariance)
+    # Where the model check has tested the residuals, it has separated noise from faults.
+    misfit = None if model_check.inquest is not None else pipeline.tracker.noise_scale
+    return facts, model_check, quality.judge(facts, model_check.findings, misfit)
 
 
 def are_results(folder: Path) -> bool:

@@ -18,7 +18,7 @@ import numpy as np
 from geometry import small
 from geometry.arrays import Array, Bools, Ints
 from geometry.compiled import compiled
-from geometry.projection import Views, project_view
+from geometry.projection import Views, inside, project_view
 from geometry.rig import Rig
 from geometry.spots import SpotModel
 from tracking.hiding import MISSED
@@ -127,12 +127,6 @@ def grown(frame: Frame, view: int, d: int) -> bool:
 
 
 @compiled
-def _is_inside(uv: Array, size: Array) -> bool:
-    """Whether a pixel lies in a picture of this width and height."""
-    return bool(-0.5 <= uv[0] < size[0] - 0.5 and -0.5 <= uv[1] < size[1] - 0.5)
-
-
-@compiled
 def log_chance(
     views: Views, sights: Sights, frame: Frame, chances: Chances, shown: Array, assigned: Ints, R: Array, t: Array
 ) -> float:
@@ -152,7 +146,7 @@ def log_chance(
             if assigned[i] >= BLENDED:
                 r = frame.blend_px[d]
                 total += np.log(chances.blend / (np.pi * r * r)) if r > 0.0 else -np.inf
-        elif project_view(views, i, R, t, uv, J) and _is_inside(uv, sights.size[i]):
+        elif project_view(views, i, R, t, uv, J) and inside(uv, sights.size[i]):
             total += np.log(1.0 - p)
     return total
 

@@ -11,13 +11,11 @@ import numpy as np
 
 from geometry.arrays import Array, Bools, Ints
 from geometry.pose import Pose
-from tracking.association import BLENDED
 from tracking.fixed_interval import Reference
 from tracking.hypotheses import FEW
 from tracking.labels import PosePrior
-from tracking.match import UNMATCHED
 from tracking.motion import STATE
-from tracking.recording import Recording
+from tracking.recording import Recording, assigned_in_one_list
 from tracking.rigid_tracker import FIRST_ACCELERATION, FIRST_ANGULAR, RigidTracker
 from tracking.statuses import PoseStatus
 
@@ -64,12 +62,7 @@ def _track_stretch(
     poses, causal = rec.poses, rec.measured
     for k in range(last, first - 1, -1):
         tracked = tracker.step(float(dt[k + 1]), rec.found(k))
-        start_of = rec.detections(k)[3][rec.model.camera_of]
-        labelled = tracked.point != UNMATCHED
-        labels = np.where(labelled, tracked.point + start_of, -1)
-        if tracked.witness is not None:
-            labels += np.where(labelled & ~tracked.witness, BLENDED, 0)
-        out.assigned[k] = labels
+        out.assigned[k] = assigned_in_one_list(tracked, rec.detections(k)[3][rec.model.camera_of])
         out.measured[k] = tracked.pose_status is PoseStatus.MEASURED
         if out.measured[k] and tracked.pose is not None:
             out.R[k], out.t[k] = tracked.pose.rotation, tracked.pose.translation

@@ -37,6 +37,11 @@ class Reference(NamedTuple):
     m: Array  # (T, 12)
 
 
+def speeds(m: Array) -> Array:
+    """The sizes (..., 2) of velocity, m/s, and angular rate, rad/s, of motions (..., 12)."""
+    return np.stack([np.linalg.norm(m[..., :3], axis=-1), np.linalg.norm(m[..., 3:6], axis=-1)], axis=-1)
+
+
 class Evidence(NamedTuple):
     """What the spots of each frame say of its pose at the reference, and how the vehicle may move before it."""
 

@@ -211,14 +211,6 @@ def grow(
             crowd = 0.0
             for i in range(n):
                 crowd += frame.log_crowding[i]
-            unseen = startled = P
-            if mode == 0 and dt > 0.0:
-                # Where the spots do not give the pose nothing tells the two motions apart: their mixture, of one mean.
-                _, _, _, P_jump, _ = predicted(
-                    old.R[h], old.t[h], old.m[h], old.P[h], dt, dynamics.jerk, dynamics.jump, dynamics.unsteady
-                )
-                unseen = _mixed(P, P_jump, max(dynamics.p_manoeuvre, DARK_MANOEUVRE))
-                startled = _mixed(P, P_jump, SUDDEN_MANOEUVRE)
             for k in range(b):
                 if prior + score[k] + crowd < best - FORGET or (k > 0 and score[k] < score[0] - FORGET):
                     continue
@@ -227,8 +219,10 @@ def grow(
                     labelled += 1 if 0 <= assigned[k, i] < BLENDED else 0
                 # Spots that were shining and are not found were hidden, or are elsewhere.
                 sudden = _misses(assigned[k], shining)
-                dim = startled if sudden else unseen
-                before = (R, t, m, dim if labelled < PROOF else P)
+                dim = P
+                if mode == 0 and dt > 0.0 and labelled < PROOF:
+                    dim = _either_motion(old, h, P, dynamics, dt, sudden)
+                before = (R, t, m, dim)
                 R_k, t_k, m_k, P_k, gaussian, misfit, spots = concluded(
                     views, frame, extra, before, assigned[k], R_b[k], t_b[k]
                 )
@@ -251,6 +245,8 @@ def grow(
                 if mode == 1 and spots < PROOF:
                     continue  # a bend is in the mixture above; a point or two would be one wherever they lie
                 most = VAGUE_PX if spots < PROOF else FAR_TOO_VAGUE_PX
+                if mode == 0 and dt > 0.0 and 0 < spots < FEW and labelled >= PROOF:
+                    dim = _either_motion(old, h, P, dynamics, dt, sudden)
                 if 0 < spots < FEW and widest(views, R, t, dim, assigned[k]) > most:
                     # Where a spot may be anywhere some false point fits: so few say nothing of the pose.
                     R_k, t_k, m_k, P_k = R, t, m, dim
@@ -268,6 +264,17 @@ SUDDEN_MANOEUVRE = 0.5  # of a frame in which spots that were shining are sudden
 DARK_MANOEUVRE = (
     0.05  # least chance of a manoeuvre per frame that does not show the pose: what is hidden is often a bend
 )
+
+
+@compiled
+def _either_motion(old: Hypotheses, h: int, P: Array, dynamics: Dynamics, dt: float, sudden: bool) -> Array:
+    """The covariance (18, 18) of hypothesis h where the spots do not give the pose. They do not separate the two
+    motions, so it is that of their mixture, which has one mean. P: of the steady motion; sudden: spots are missing.
+    """
+    _, _, _, P_jump, _ = predicted(
+        old.R[h], old.t[h], old.m[h], old.P[h], dt, dynamics.jerk, dynamics.jump, dynamics.unsteady
+    )
+    return _mixed(P, P_jump, SUDDEN_MANOEUVRE if sudden else max(dynamics.p_manoeuvre, DARK_MANOEUVRE))
 
 
 @compiled

@@ -20,6 +20,17 @@ from tracking.statuses import PoseStatus, SpotStatus
 from tracking.tracked_frame import TrackedFrame
 
 
+def assigned_in_one_list(tracked: TrackedFrame, start: Ints) -> Ints:
+    """The labels (n,) of a frame as rows of all its detections in one list, plus BLENDED; -1 without.
+
+    start (n,): where the detections of each view's camera begin.
+    """
+    assigned = np.where(tracked.point == UNMATCHED, -1, tracked.point + start)
+    if tracked.witness is not None:
+        assigned += np.where((assigned >= 0) & ~tracked.witness, BLENDED, 0)
+    return assigned
+
+
 class Recording:
     """Feed it each frame with what the causal tracker said of it; about 1 kB per frame is kept."""
 
@@ -63,11 +74,7 @@ class Recording:
         self._size.append(np.concatenate([f.major_px for f in some]) if some else np.zeros(0))
         self._first.append(first)
         self._has_image.append(np.array([f is not None for f in found]))
-        start = first[self.model.camera_of]
-        assigned = np.where(tracked.point == UNMATCHED, -1, tracked.point + start)
-        if tracked.witness is not None:
-            assigned += np.where((assigned >= 0) & ~tracked.witness, BLENDED, 0)
-        self._assigned.append(assigned)
+        self._assigned.append(assigned_in_one_list(tracked, first[self.model.camera_of]))
         self._bent.append(SpotStatus.TURNED in tracked.status)
         self._measured.append(tracked.pose_status is PoseStatus.MEASURED)
         pose = np.full((4, 3), np.nan)

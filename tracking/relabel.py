@@ -12,7 +12,7 @@ import numpy as np
 from geometry import small
 from geometry.arrays import Array, Bools, Ints
 from geometry.compiled import compiled
-from geometry.projection import Views, project_view
+from geometry.projection import Views, inside, project_view
 from tracking.association import BLENDED, Chances, Frame, Sights, associate, expected_at, log_chance
 from tracking.fixed_interval import Reference
 from tracking.hiding import marginal, together
@@ -102,7 +102,7 @@ def clutter_density(
             c = sights.camera[i]
             if not all_of.has_image[k, c] or not project_view(views, i, ref.R[k], ref.t[k], uv, J):
                 continue
-            if not (-0.5 <= uv[0] < sights.size[i, 0] - 0.5 and -0.5 <= uv[1] < sights.size[i, 1] - 0.5):
+            if not inside(uv, sights.size[i]):
                 continue
             discs[c] += 1
             for d in range(all_of.first[k, c], all_of.first[k, c + 1]):
@@ -128,15 +128,15 @@ def relabelled(
     ref: Reference,
     pose_P: Array,
     log_clutter: Array,
-    jump_px: Array,
+    bend_sigma: Array,
 ) -> tuple[Ints, Array, Array]:
     """Assignments (T, n) and their probabilities (T, n), from the smoothed poses and their covariances (T, 6, 6); and
     how well the other frames place the spots of each (T,): the largest sigma, px.
 
-    assigned (T, n): those that the smoothing used. log_clutter (T, n). jump_px (T, 6): sigmas of the pose, m and rad,
-    that a bend at the frame would add. Each frame is explained by where the others put the vehicle; where that leaves
-    something open, also by a bend there, and its labels by its own pose: labels that agree with each other and with
-    one of these stay. A frame of whose pose the others say too little keeps its labels.
+    assigned (T, n): those that the smoothing used. log_clutter (T, n). bend_sigma (T, 6): sigmas of the pose, m and
+    rad, that a bend at the frame would add. Each frame is explained by where the others put the vehicle; where that
+    leaves something open, also by a bend there, and its labels by its own pose: labels that agree with each other and
+    with one of these stay. A frame of whose pose the others say too little keeps its labels.
     """
     frames, n = assigned.shape
     out, certain = assigned.copy(), np.ones((frames, n))
@@ -166,7 +166,7 @@ def relabelled(
             elif now[i] < BLENDED:
                 labels += 1
         tried, score = _explanations(
-            views, sights, frame, chances, extra, hidden, alone, R, t, now, labels, jump_px[k], anywhere
+            views, sights, frame, chances, extra, hidden, alone, R, t, now, labels, bend_sigma[k], anywhere
         )
         best = 0
         for j in range(score.shape[0]):
@@ -229,7 +229,7 @@ def _by_the_others(
         if not all_of.has_image[k, sights.camera[i]]:
             continue
         there, a, _, c = expected_at(views, i, R, t, alone, at, J)
-        if there and -0.5 <= at[0] < sights.size[i, 0] - 0.5 and -0.5 <= at[1] < sights.size[i, 1] - 0.5:
+        if there and inside(at, sights.size[i]):
             worst = max(worst, 0.5 * (a + c))
     return alone, R, t, np.sqrt(worst)
 

@@ -2,8 +2,9 @@
 
 Rounds of: the most probable motion given the labels (tracking/whole_run.py), then each frame's detections assigned
 again from where all other frames put the vehicle (tracking/relabel.py), until no label changes. The last round ends
-with the motion, so labels and poses belong together. Then each pose is held against its own spots
-(tracking/consistency.py): where they contradict each other the frame is resolved by itself, or is not `measured`.
+with the motion, so labels and poses belong together. Then each pose is compared with the one of its own spots: where
+they contradict each other the frame is taken for a bend, and at last its own spots decide. (What is written is tested
+once more, against spots and causal pose: lab/frame_checks.py.)
 
 Source: ours.
 """
@@ -20,7 +21,7 @@ from geometry.projection import Views, project_all
 from geometry.solve import SolveLimits, covariance_of
 from tracking.association import BLENDED, Chances, Sights
 from tracking.backward import merged, track_backward
-from tracking.fixed_interval import Reference
+from tracking.fixed_interval import Reference, speeds
 from tracking.hypotheses import CHECK_PX, FEW, PROOF
 from tracking.information import all_controlled, fit_alone, frame_information
 from tracking.misfit import DEADBAND
@@ -32,7 +33,7 @@ from tracking.static_points import learn as learn_static
 from tracking.static_points import log_density as log_static_density
 from tracking.static_points import no_places
 from tracking.surroundings import RADIUS_PX
-from tracking.temper import JUMP_OF_SPEED, LEAST_JUMP
+from tracking.temper import jump_variance
 from tracking.whole_run import DEEP, Motion, WholeRun, estimate, straight_between
 
 MOST_ROUNDS = 4
@@ -77,9 +78,7 @@ class _Pass:
         self.assigned = self.causal.copy()
         self.measured = rec.measured
         self.probability = np.where(self.causal >= 0, 1.0, np.nan)
-        self.trusted = self.measured.copy()  # frames whose labels may be evidence
-        poses = rec.poses
-        ref = straight_between(poses, self.measured, np.cumsum(rec.dt_s))
+        ref = straight_between(rec.poses, self.measured, np.cumsum(rec.dt_s))
         every = _all_detections(rec)
         self.extra, self.systematic = _calibration(rec, every, self.assigned, ref)
         self.scale = _noise_scale(self.views, every, self.assigned, self.extra, ref, self.measured)
@@ -91,10 +90,10 @@ class _Pass:
         if not parameters.learn_jerk:
             by_hand = 2 * np.log(np.repeat([parameters.jerk_m_s3, parameters.jerk_rad_s3], 3))
             log_density = np.tile(by_hand, (len(rec), 1))
-        # Frames that a tracker measured with enough spots: where the others do not check a label it was beyond doubt.
         self.certified = self.causal  # labels that a tracker gave, forward or backward
+        # Frames that a tracker measured with enough spots: where nothing checked a label it was beyond doubt.
         self.sure = self.measured & (np.count_nonzero(self.assigned >= 0, axis=1) >= FEW)
-        self.trusted = _chained(self.measured, self.sure | self._controlled(ref))
+        self.trusted = _chained(self.measured, self.sure | self._controlled(ref))  # their labels may be evidence
         self.motion = Motion.begin(ref, rec.bent.copy(), log_density)
         self.doubtful = np.zeros(len(rec), dtype=bool)  # frames in which two poses were measured
         self.own = _Own.nothing(len(rec))
@@ -133,14 +132,13 @@ class _Pass:
         self.assigned = new
         self.measured = _alone(rec, self.views, self.every, new, self.extra, ref).measured
         unchecked = (sigma_px > CHECK_PX) & ~_chained(self.measured, self.sure | self._controlled(ref))
-        new[unchecked[:, None] & (new != self.certified)] = -1
         # Such frames keep the labels that a tracker was sure of, but they are no evidence of the motion.
+        new[unchecked[:, None] & (new != self.certified)] = -1
         lone = _lone_points(new)
         new[lone] = -1
         self.probability = np.where((found >= 0) & ~lone[:, None], certain, np.nan)
         changed = bool(np.any(new != before))
         self.measured = _alone(rec, self.views, self.every, new, self.extra, ref).measured
-        # Three spots fit any labels: where the other frames cannot confirm them they are no evidence.
         self.trusted = ~unchecked & ~self.doubtful
         self.measured &= ~self.doubtful
         return changed
@@ -294,8 +292,7 @@ def _rms(views: Views, every: AllDetections, assigned: Ints, ref: Reference) -> 
 
 def _bend_sigmas(ref: Reference, dt: Array) -> Array:
     """(T, 6) sigmas of the pose, m and rad, that a bend in the step before a frame adds."""
-    speed = np.stack([np.linalg.norm(ref.m[:, :3], axis=1), np.linalg.norm(ref.m[:, 3:6], axis=1)], axis=1)
-    size = (LEAST_JUMP + JUMP_OF_SPEED * speed) ** 2
+    size = jump_variance(speeds(ref.m))
     step = np.maximum(dt, np.concatenate([dt[1:], dt[-1:]]))
     out = np.empty((len(dt), 6))
     for k in range(len(dt)):

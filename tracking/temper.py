@@ -23,6 +23,11 @@ MANOEUVRE_MEMORY = 200.0  # frames
 LEAST_P, MOST_P = 0.002, 0.2  # of a manoeuvre, per frame
 
 
+def jump_variance(speed: Array) -> Array:
+    """Variances (..., 2) by which a manoeuvre may change speeds (..., 2), m/s and rad/s."""
+    return (LEAST_JUMP + JUMP_OF_SPEED * speed) ** 2
+
+
 class Temper:
     """What the tracker knows of the vehicle's way of moving."""
 
@@ -36,7 +41,7 @@ class Temper:
         self.dynamics = self._dynamics()
 
     def _dynamics(self) -> Dynamics:
-        jump = (LEAST_JUMP + JUMP_OF_SPEED * self._lately) ** 2
+        jump = jump_variance(self._lately)
         return Dynamics(np.exp(self._log_jerk), jump, jump / STEADIES_WITHIN_S**2, self._p_manoeuvre)
 
     def learn(self, moved: Array, manoeuvre: bool, slope: Array) -> None:

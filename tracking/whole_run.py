@@ -24,11 +24,12 @@ from tracking.fixed_interval import (
     motion_cost,
     shifted,
     smoothed,
+    speeds,
 )
 from tracking.motion import STATE, predicted
 from tracking.process_noise import next_log_density
 from tracking.relabel import AllDetections, evidence_of
-from tracking.temper import JUMP_OF_SPEED, LEAST_JUMP, STEADIES_WITHIN_S
+from tracking.temper import STEADIES_WITHIN_S, jump_variance
 
 LOST_SIGMA_M, LOST_SIGMA_RAD = 1.0, np.deg2rad(60.0)  # a predicted pose vaguer than this is `lost`
 MOST_PASSES = 25
@@ -43,9 +44,8 @@ SMALL_CHANGE = 0.3  # of log q, weighted by what determines it: the strength has
 TRUST = (np.inf, 0.1, 0.01, 1e-3)  # m and rad: damping of a step, tried in turn until the cost falls
 P_DARK = 0.05  # probability of a bend in each frame that does not show the pose
 P_EITHER = 0.3  # of a bend being in each of several steps, where a frame between them says little
-WEAK = (
-    2 * 6 * np.log(1.5)
-)  # of log det of a frame's information below the usual: its pose's sigmas are half as large again
+# Of log det of a frame's information below the usual: its pose's sigmas are half as large again.
+WEAK = 2 * 6 * np.log(1.5)
 OPEN_WEIGHT = 0.25  # of the spots of a frame that does not show the pose
 P_BEYOND = 0.15  # of a bend in each frame before the first evidence or after the last: nothing beyond bounds it
 DEEP = 12  # frames: so far from any measured one a few spots are not taken for evidence
@@ -76,7 +76,6 @@ class Motion:
     pose_P: Array  # (T, 6, 6)
     motion_P: Array  # (T, 6, 6) of the velocities
     known: Bools  # (T,) the pose says something
-    settled: Bools  # (T,) the last step was small against the covariance
 
     @staticmethod
     def begin(ref: Reference, bent: Bools, log_density: Array | None) -> Motion:
@@ -84,7 +83,7 @@ class Motion:
         frames = len(ref.t)
         nothing = np.zeros((frames, 6, 6))
         none = np.zeros(frames, dtype=bool)
-        return Motion(ref, log_density, 0.0, bent, nothing, nothing, none, none)
+        return Motion(ref, log_density, 0.0, bent, nothing, nothing, none)
 
 
 def estimate(run: WholeRun, assigned: Ints, measured: Bools, motion: Motion, deep: int, trusted: Bools) -> Motion:
@@ -98,7 +97,7 @@ def estimate(run: WholeRun, assigned: Ints, measured: Bools, motion: Motion, dee
     far = ~np.asarray(maximum_filter1d(measured.astype(np.int8), 2 * deep + 1, mode="constant"), dtype=bool)
     used = ~far & trusted & (assigned >= 0).any(axis=1)
     if not measured.any():
-        return replace(motion, known=np.zeros(frames, dtype=bool), settled=np.zeros(frames, dtype=bool))
+        return replace(motion, known=np.zeros(frames, dtype=bool))
     at = np.flatnonzero(used)
     core = slice(int(at[0]), int(at[-1]) + 1)
     estimator = _Estimator(run, assigned, measured, used, core, motion)
@@ -128,18 +127,16 @@ class _Estimator:
             self.log_density = self._first_density()
         first = 0 if fresh else GLOBAL_PASSES
         out: Interval | None = None
-        settled = np.zeros(len(self.dt), dtype=bool)
         for number in range(first, first + MOST_PASSES):
             density = self._density(out, filling_in=not learning)
             there, moved = self._step(density)
             if not (np.isfinite(there.x).all() and np.isfinite(there.pose_P).all()):
                 if out is None:
                     raise FloatingPointError("the smoothing pass has no finite first step")
-                settled[:] = False
                 break
             out = there
             sd = np.sqrt(np.maximum(np.diagonal(out.pose_P, axis1=1, axis2=2), 1e-30))
-            settled = np.all(np.abs(moved[:, :6]) < SMALL_STEP * sd, axis=1)
+            settled = bool(np.all(np.abs(moved[:, :6]) < SMALL_STEP * sd))
             more = np.zeros_like(self.bent)
             if (learning or not self.run.learn) and number >= NO_BENDS_BEFORE:
                 more = self._new_bends(out.shock)
@@ -157,10 +154,10 @@ class _Estimator:
                     if fresh:
                         self.finer = self._best_finer(out)
                 continue
-            if settled.all() and not more.any():
+            if settled and not more.any():
                 break
         assert out is not None
-        return self._whole(out, settled)
+        return self._whole(out)
 
     def _first_density(self) -> Array:
         """The likeliest strength on a coarse grid, the same for all axes of translation, and of rotation."""
@@ -233,8 +230,7 @@ class _Estimator:
             if not np.isfinite(x).all():
                 continue
             there = shifted(self.ref, x)
-            _, misfit_there = self._evidence(there)
-            cost_there = 0.5 * misfit_there + motion_cost(there, ev, density)
+            cost_there = 0.5 * float(self._of_the_spots(there)[2].sum()) + motion_cost(there, ev, density)
             # Damping is against steps that leave the region where all is straight; rounding alone makes some nats.
             if cost_there <= cost + ROUNDING * (1 + 1e-3 * abs(cost)):
                 self.ref = there
@@ -243,14 +239,8 @@ class _Estimator:
 
     def _evidence(self, ref: Reference) -> tuple[Evidence, float]:
         """The frames' information at a reference, where the motion may have bent; the spots' misfit (chi-square)."""
-        run, core = self.run, self.core
-        L, g, chi2, _ = evidence_of(run.views, run.every, self.assigned, run.extra, ref, core.start)
-        dropped = ~self.used[core]
-        L[dropped], g[dropped], chi2[dropped] = 0.0, 0.0, 0.0
-        measured, bent = self.measured, self.bent
-        # Spots that leave a direction of the pose open are not straight along it, frame after frame in the same sense.
-        for a in (L, g, chi2):
-            a[~measured] *= OPEN_WEIGHT
+        run, measured, bent = self.run, self.measured, self.bent
+        L, g, chi2 = self._of_the_spots(ref)
         if run.exposure_s > 0:
             for k in np.flatnonzero(bent[1:] & measured[1:] & measured[:-1]):
                 # The light of an exposure in which the velocities jump lies beside the corner, by up to an eighth of
@@ -264,21 +254,31 @@ class _Estimator:
         first = _before_the_first(ref, self.dt, bool(measured[0]))
         return Evidence(L, g, self.dt, jump, jump / STEADIES_WITHIN_S**2, first), float(chi2.sum())
 
+    def _of_the_spots(self, ref: Reference) -> tuple[Array, Array, Array]:
+        """What the labelled spots say at a reference: information (T, 6, 6), vector (T, 6), chi-square (T,)."""
+        run = self.run
+        L, g, chi2, _ = evidence_of(run.views, run.every, self.assigned, run.extra, ref, self.core.start)
+        dropped = ~self.used[self.core]
+        L[dropped], g[dropped], chi2[dropped] = 0.0, 0.0, 0.0
+        # Spots that leave a direction of the pose open are not straight along it, frame after frame in the same sense.
+        for a in (L, g, chi2):
+            a[~self.measured] *= OPEN_WEIGHT
+        return L, g, chi2
+
     def _jumps(self, ref: Reference, information: Array) -> Array:
         """(T, 2) variances of the velocities' jumps in each step."""
         measured, dt = self.measured, self.dt
         usual = float(np.median(dt[dt > 0])) if np.any(dt > 0) else SPEED_WINDOW_S
         window = max(1, min(round(SPEED_WINDOW_S / usual), len(dt)))
-        speed = np.stack([np.linalg.norm(ref.m[:, :3], axis=1), np.linalg.norm(ref.m[:, 3:6], axis=1)], axis=1)
-        fastest = _running_maximum(np.where(measured[:, None], speed, 0.0), window)
-        size = (LEAST_JUMP + JUMP_OF_SPEED * fastest) ** 2
+        size = jump_variance(_running_maximum(np.where(measured[:, None], speeds(ref.m), 0.0), window))
         # After a dark stretch the first light does not tell when it bent, and the second not whether it did so between.
         dark = ~measured
         dark[1:] |= ~measured[:-1]
         dark[2:] |= ~measured[:-2]
         chance = np.where(dark, P_DARK, 0.0)
-        weak = ~measured | _weak(information, measured)
-        for k in np.flatnonzero(self.bent):
+        bends = np.flatnonzero(self.bent)
+        weak = ~measured | _weak(information, measured) if len(bends) else measured
+        for k in bends:
             first, last = k, k
             while first > 1 and weak[first - 1]:
                 first -= 1
@@ -295,7 +295,7 @@ class _Estimator:
         peak = shock >= maximum_filter1d(np.where(self.bent, 0.0, shock), 2 * APART + 1, mode="nearest")
         return np.asarray(peak & (shock > SHOCK) & ~self.bent)
 
-    def _whole(self, out: Interval, settled: Bools) -> Motion:
+    def _whole(self, out: Interval) -> Motion:
         """The result of all frames: the core's, and what follows from its ends."""
         core, frames = self.core, len(self.run.dt)
         assert self.log_density is not None
@@ -306,7 +306,7 @@ class _Estimator:
         log_density = np.empty((frames, 6))
         log_density[core] = self.log_density
         log_density[: core.start], log_density[core.stop :] = self.log_density[0], self.log_density[-1]
-        jump = P_BEYOND * self._size_at_ends()
+        jump = P_BEYOND * jump_variance(speeds(self.ref.m[[0, -1]]))  # at the core's first frame, and at its last
         dt = self.run.dt
         last = core.stop - 1
         forward = [(k, dt[k]) for k in range(core.stop, frames)]
@@ -326,15 +326,9 @@ class _Estimator:
                 pose_P[k], motion_P[k] = at[3][:6, :6], at[3][6:12, 6:12]
         sd = np.sqrt(np.diagonal(pose_P, axis1=1, axis2=2))
         known = (sd[:, :3].max(axis=1) < LOST_SIGMA_M) & (sd[:, 3:].max(axis=1) < LOST_SIGMA_RAD)
-        bent, all_settled = self.motion.bent.copy(), np.ones(frames, dtype=bool)
-        bent[core], all_settled[core] = self.bent, settled
-        return Motion(Reference(R, t, m), log_density, self.finer, bent, pose_P, motion_P, known, all_settled)
-
-    def _size_at_ends(self) -> Array:
-        """(2, 2) variances of a jump of the velocities at the first frame of the core, and at the last."""
-        m = self.ref.m
-        speed = np.array([[np.linalg.norm(m[k, :3]), np.linalg.norm(m[k, 3:6])] for k in (0, -1)])
-        return np.asarray((LEAST_JUMP + JUMP_OF_SPEED * speed) ** 2)
+        bent = self.motion.bent.copy()
+        bent[core] = self.bent
+        return Motion(Reference(R, t, m), log_density, self.finer, bent, pose_P, motion_P, known)
 
 
 def _weak(information: Array, measured: Bools) -> Bools:

@@ -15,18 +15,12 @@ import numpy as np
 from bench.random_scenes.scene import Scene
 from geometry.arrays import Array, Bools
 from geometry.pose import Pose
-from geometry.spots import SpotModel
-from lab import process, quality
-from lab.frame_checks import FrameChecks
+from lab import process
 from lab.frames import FrameSet
-from lab.model_check.check import check_kept
-from lab.model_check.keeper import FrameKeeper, claimed_covariances
 from lab.pictures import DROPPED, Missing
 from lab.pipeline import FrameRecord, Pipeline, Tracker, tracker_of
 from lab.results import read_poses, read_spots
-from lab.run_facts import CameraFacts, RunFacts
 from lab.run_file import Run
-from lab.tables import TableWriter
 from lab.times import Times
 from lab.two_passes import TwoPasses
 from tracking.detections import Detections
@@ -128,34 +122,20 @@ def answers_in_memory(scene: Scene, parameters: TrackerParameters | None = None)
     with _recorded_warnings() as caught, tempfile.TemporaryDirectory() as name:
         work = Path(name)
         tracker = TimedTracker(tracker_of(run))
+        # PointReader and TimedTracker have what Pipeline uses of a reader and a tracker, and no more.
         pipeline = Pipeline(run, PointReader(scene), tracker, {})  # type: ignore[arg-type]
-        model = SpotModel.of(run.rig)
-        checks = FrameChecks(run.rig, run.covariance)
-        facts = RunFacts(
-            {name: CameraFacts() for name in run.rig.cameras},
-            tuple(model.camera_of.tolist()),
-            run.tracker.labels.min_spots,
-            own_spots=checks.own_spots,
-            causal=checks.causal,
-            invalid=checks.invalid,
-        )
-        passes, keeper = TwoPasses(pipeline, work), FrameKeeper()
+        seconds = 0.0
         start = time.process_time()
-        with (
-            TableWriter(work, run.rig, run.covariance is not None, with_causal=True) as tables,
-            contextlib.closing(passes.records()) as records,
-        ):
-            for record, then in checks.passed(records):
-                tables.write(record, then)
-                claimed = claimed_covariances(record.tracked, record.detections, model.camera_of, run.tracker)
-                keeper.add_tracked(record.t_s, record.tracked, record.tracked.predicted_cov_px2, claimed)
-                facts.add(record, then)
-                smoothed.append(record)
-                causal.append(then)
-        seconds = time.process_time() - start
-        model_check = check_kept(run.rig, keeper, run.covariance)
-        misfit = None if model_check.inquest is not None else pipeline.tracker.noise_scale
-        verdict = quality.judge(facts, model_check.findings, misfit)
+
+        def on_frame(record: FrameRecord, then: FrameRecord | None) -> None:
+            nonlocal seconds
+            assert then is not None, "both passes were asked for"
+            smoothed.append(record)
+            causal.append(then)
+            seconds = time.process_time() - start
+
+        passes = TwoPasses(pipeline, work)
+        _, _, verdict = process.write_tables(pipeline, passes, work, on_frame=on_frame)
     return Answers(
         _pass(scene, smoothed),
         _pass(scene, causal),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
 from geometry.arrays import Array
 from tests.tracking.test_fixed_interval import Run, drawn

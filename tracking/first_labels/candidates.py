@@ -15,7 +15,7 @@ import numpy as np
 
 from geometry.arrays import Array, Bools, Ints
 from geometry.compiled import compiled
-from geometry.projection import Views, project_view
+from geometry.projection import Views, inside, project_view
 from geometry.three_spots import pose_of_lengths, spot_lengths
 from tracking.first_labels.points import Points, PointsOnScreens
 
@@ -245,12 +245,6 @@ def _weigh(
     if distinct_spots(labels, sight.spot) < limits.min_spots:
         return -np.inf
     return score
-
-
-@compiled
-def inside(uv: Array, size: Array) -> bool:
-    """Whether a pixel (2,) lies in a picture of a size (2,). nan does not."""
-    return uv[0] >= -0.5 and uv[1] >= -0.5 and uv[0] < size[0] - 0.5 and uv[1] < size[1] - 0.5
 
 
 @compiled

@@ -14,7 +14,7 @@ import numpy as np
 from geometry import small
 from geometry.arrays import Array, Ints
 from geometry.compiled import compiled
-from geometry.projection import Views, project_view
+from geometry.projection import Views, inside, project_view
 from tracking.first_labels.candidates import (
     GATE,
     LOG_2PI,
@@ -26,7 +26,6 @@ from tracking.first_labels.candidates import (
     allowed,
     cholesky,
     distinct_spots,
-    inside,
     predicted_spread,
 )
 from tracking.first_labels.points import Points

@@ -92,16 +92,16 @@ class RigPlan:
         )
 
 
-_plans: list[tuple[SpotModel, int, RigPlan]] = []
+_plans: list[tuple[Rig, int, RigPlan]] = []
 
 
 def plan_of(rig: Rig, model: SpotModel, min_spots: int) -> RigPlan:
-    """The plan of a rig, kept for the models last asked for."""
+    """The plan of a rig, kept for the rigs last asked for; `model` is made of it."""
     for known, least, plan in _plans:
-        if known is model and least == min_spots:
+        if known is rig and least == min_spots:
             return plan
     plan = RigPlan.of(rig, model, min_spots)
-    _plans.insert(0, (model, min_spots, plan))
+    _plans.insert(0, (rig, min_spots, plan))
     del _plans[8:]
     return plan
 
