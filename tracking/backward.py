@@ -11,6 +11,7 @@ import numpy as np
 
 from geometry.arrays import Array, Bools, Ints
 from geometry.pose import Pose
+from tracking.association import distinct_spots
 from tracking.fixed_interval import Reference
 from tracking.hypotheses import FEW
 from tracking.labels import PosePrior
@@ -78,14 +79,14 @@ def _stretches(mask: Bools) -> list[tuple[int, int]]:
     return [(int(a), int(b) - 1) for a, b in zip(edges[::2], edges[1::2], strict=True)][::-1]
 
 
-def merged(causal: Ints, backward: BackwardLabels, weak: Bools) -> Ints:
+def merged(causal: Ints, backward: BackwardLabels, weak: Bools, spot_of: Ints) -> Ints:
     """Labels (T, n): of weak frames those of the backward tracker where they give the pose, else what was there.
 
     One label more than the causal tracker gave may be a false point beside a hidden spot, and so may one of three: they
     are not taken.
     """
     out = causal.copy()
-    had, has = (np.count_nonzero(labels >= 0, axis=1) for labels in (causal, backward.assigned))
+    had, has = (distinct_spots(labels >= 0, spot_of) for labels in (causal, backward.assigned))
     take = weak & backward.measured & (has >= FEW) & ((has >= had + 2) | (had == 0))
     out[take] = backward.assigned[take]
     return out

@@ -16,15 +16,16 @@ from geometry import small
 from geometry.arrays import Array, Bools, Ints
 from geometry.compiled import compiled
 from geometry.projection import Views
-from tracking.association import BLENDED, Chances, Frame, Sights, associate, crowding, expected_at
+from tracking.association import BLENDED, Chances, Frame, Sights, associate, crowding, distinct, expected_at
 from tracking.hiding import MISSED, later, learnt, marginal, together
-from tracking.information import frame_information, widen_by_curvature
+from tracking.information import frame_information, size_of, widen_by_curvature
 from tracking.motion import STATE, predicted, updated
 
 MOST_CHILDREN = 48  # of one frame, over all hypotheses
 MOST_KEPT = 8  # hypotheses from frame to frame
 FORGET = 12.0  # nats: a hypothesis so far behind is dropped
 SAME = 0.7  # two hypotheses with one assignment whose states differ by less than this in sigmas are one
+MOST_STEPS, MOST_HALVINGS = 8, 5  # of Gauss-Newton, and of one step
 TOO_WIDE = 0.06  # m, rad: where a frame leaves its widest direction so open, it is not taken
 LEAST_SHARE = 1e-3  # of the probability: hypotheses below it, however far away, do not widen the covariance
 FEW = 4  # spots: fewer do not tell a lost vehicle from one that is mostly hidden
@@ -35,7 +36,7 @@ PROOF = 3  # spots: where so many lie in their narrow gates, the velocities have
 LEAST_TO_TURN = 6.0  # nats: a hypothesis so far behind is not tried with a manoeuvre as well
 SURPRISE = 3.5  # sigmas of a misfit's own scatter: beyond it a manoeuvre is considered although every spot is found
 _apart, _apply, _dot, _block = small.apart, small.apply, small.dot, small.block
-_moved, _posterior = small.moved, small.posterior
+_moved, _posterior, _solve = small.moved, small.posterior, small.solve
 _put, _put_matrix, _best_first = small.put, small.put_matrix, small.best_first
 
 
@@ -130,46 +131,90 @@ def concluded(
     """The exact update of a predicted state by one assignment, linearised at its own optimum; start pose (R, t).
 
     before: R, t, m, P. Returns the same after, the Gaussian part of the log-likelihood, the misfit (chi-square of as
-    many numbers as the spots have) and the number of spots.
+    many numbers as the spots have) and the number of spots. A spot that the pose found does not project makes the
+    likelihood 0. An update that does not settle leaves the state as it was, and counts by its misfit there.
     """
     R0, t0, m0, P0 = before
     use, uv, cov = chosen_points(frame, assigned, extra)
+    wanted = 0
+    for i in range(use.shape[0]):
+        wanted += 1 if use[i] else 0
+    if wanted == 0:
+        return R0, t0, m0.copy(), P0.copy(), 0.0, 0.0, 0
     pose_P0 = _block(P0, 6)
-    pose_P, L, r = pose_P0, np.zeros((6, 6)), np.zeros(6)
-    gaussian = misfit = 0.0
-    count = 0
-    sigma = 0.0
-    for _ in range(2):
-        for _ in range(4):
-            L, g, chi2, count, log_norm = frame_information(views, R, t, use, uv, cov)
-            if count == 0:
-                return R0, t0, m0.copy(), P0.copy(), 0.0, 0.0, 0
-            delta = _apart(R, t, R0, t0)
-            r = _apply(L, delta)
-            for i in range(6):
-                r[i] += g[i]
-            pose_P, log_det = _posterior(pose_P0, L)
-            step = _apply(pose_P, r)
-            misfit = chi2
-            for i in range(6):
-                misfit += g[i] * delta[i] + r[i] * (delta[i] - step[i])
-            gaussian = -0.5 * (log_norm + log_det + misfit)
-            R_new, t_new = _moved(R0, t0, step)
-            moved = _apart(R_new, t_new, R, t)
-            R, t = R_new, t_new
-            # A thousandth of the pose's own sigma is good enough.
-            if _dot(moved, _apply(L, moved)) < 1e-4:
-                break
-        # Where a direction stays open the spots' paths along it are not straight, and must not narrow what they do not
-        # see: once more, with what the bend of each path is off by.
-        sigma = widen_by_curvature(views, use, cov, R, t, pose_P)
-        if sigma == 0.0:
-            break
-    if sigma > TOO_WIDE:
+    found = _found_near(views, (R0, t0, pose_P0), use, uv, cov, wanted, R, t)
+    R, t, pose_P, L, r, gaussian, misfit, settled = found
+    if gaussian == -np.inf:
+        return R0, t0, m0.copy(), P0.copy(), gaussian, misfit, wanted
+    # Where a direction stays open the spots' paths along it are not straight, and must not narrow what they do not see:
+    # once more, with what the bend of each path is off by.
+    sigma = widen_by_curvature(views, use, cov, R, t, pose_P)
+    if sigma > 0.0:
+        found = _found_near(views, (R0, t0, pose_P0), use, uv, cov, wanted, R, t)
+        R, t, pose_P, L, r, gaussian, misfit, settled = found
+    if not settled or sigma > TOO_WIDE:
         # So few spots of a vehicle that may be anywhere narrow nothing that a straight line could tell.
-        return R0, t0, m0.copy(), P0.copy(), gaussian, misfit, count
+        return R0, t0, m0.copy(), P0.copy(), gaussian, misfit, wanted
     out_R, out_t, out_m, out_P, _, _ = updated(R0, t0, m0, P0, L, r)
-    return out_R, out_t, out_m, out_P, gaussian, misfit, count
+    return out_R, out_t, out_m, out_P, gaussian, misfit, wanted
+
+
+@compiled
+def _found_near(
+    views: Views,
+    before: tuple[Array, Array, Array],
+    use: Bools,
+    uv: Array,
+    cov: Array,
+    wanted: int,
+    R: Array,
+    t: Array,
+) -> tuple[Array, Array, Array, Array, Array, float, float, bool]:
+    """The likeliest pose given a prior `before` (R, t, P of 6) and so many spots, by Gauss-Newton with halved steps.
+
+    Starts at (R, t). Returns the pose, its covariance (6, 6), the spots' information matrix (6, 6) and vector (6,)
+    about the prior's pose, the Gaussian part of the log-likelihood, the misfit, and whether the steps settled.
+    """
+    R0, t0, P0 = before
+    eye = np.zeros((6, 6))
+    for i in range(6):
+        eye[i, i] = 1.0
+    stiff, _ = _solve(P0, eye)  # the prior's information
+    delta = _apart(R, t, R0, t0)
+    L, g, chi2, count, log_norm = frame_information(views, R, t, use, uv, cov)
+    cost = chi2 + size_of(stiff, delta) if count == wanted else np.inf
+    P, r, log_det, settled = P0, np.zeros(6), 0.0, False
+    for _ in range(MOST_STEPS):
+        r = _apply(L, delta)
+        for i in range(6):
+            r[i] += g[i]
+        P, log_det = _posterior(P0, L)
+        moved = _apply(P, r)
+        for i in range(6):
+            moved[i] -= delta[i]
+        # A thousandth of the pose's own sigma is good enough.
+        settled = count == wanted and _dot(moved, _apply(L, moved)) < 1e-4
+        better = False
+        for _ in range(MOST_HALVINGS):
+            if settled:
+                break
+            there = np.empty(6)
+            for i in range(6):
+                there[i] = delta[i] + moved[i]
+                moved[i] *= 0.5
+            R_new, t_new = _moved(R0, t0, there)
+            L_new, g_new, chi2_new, count_new, norm_new = frame_information(views, R_new, t_new, use, uv, cov)
+            cost_new = chi2_new + size_of(stiff, there)
+            if count_new == wanted and cost_new < cost:
+                R, t, delta, cost, better = R_new, t_new, there, cost_new, True
+                L, g, chi2, count, log_norm = L_new, g_new, chi2_new, count_new, norm_new
+                break
+        if not better:
+            break
+    # The prior alone may make the likelihood small, never large.
+    misfit = max(cost, 0.0)
+    gaussian = -0.5 * (log_norm + log_det + misfit) if np.isfinite(misfit) else -np.inf
+    return R, t, P, L, r, gaussian, misfit, settled
 
 
 @compiled
@@ -214,9 +259,7 @@ def grow(
             for k in range(b):
                 if prior + score[k] + crowd < best - FORGET or (k > 0 and score[k] < score[0] - FORGET):
                     continue
-                labelled = 0
-                for i in range(n):
-                    labelled += 1 if 0 <= assigned[k, i] < BLENDED else 0
+                labelled = distinct(assigned[k], sights.spot)
                 # Spots that were shining and are not found were hidden, or are elsewhere.
                 sudden = _misses(assigned[k], shining)
                 dim = P
@@ -238,16 +281,16 @@ def grow(
                         and old.weight[h] > -LEAST_TO_TURN
                         and (
                             misfit > dof + SURPRISE * np.sqrt(2.0 * max(dof, 1))
-                            or (spots < PROOF and _misses(assigned[k], shining))
+                            or (labelled < PROOF and _misses(assigned[k], shining))
                             or _misses_a_screen(assigned[k], shining, sights.group)
                         )
                     )
-                if mode == 1 and spots < PROOF:
+                if mode == 1 and labelled < PROOF:
                     continue  # a bend is in the mixture above; a point or two would be one wherever they lie
-                most = VAGUE_PX if spots < PROOF else FAR_TOO_VAGUE_PX
-                if mode == 0 and dt > 0.0 and 0 < spots < FEW and labelled >= PROOF:
+                most = VAGUE_PX if labelled < PROOF else FAR_TOO_VAGUE_PX
+                if mode == 0 and dt > 0.0 and PROOF <= labelled < FEW:
                     dim = _either_motion(old, h, P, dynamics, dt, sudden)
-                if 0 < spots < FEW and widest(views, R, t, dim, assigned[k]) > most:
+                if 0 < labelled < FEW and widest(views, R, t, dim, assigned[k]) > most:
                     # Where a spot may be anywhere some false point fits: so few say nothing of the pose.
                     R_k, t_k, m_k, P_k = R, t, m, dim
                 total = prior + counted[k] + gaussian + together(shown, sights.group, assigned[k], chances.detect)

@@ -90,8 +90,8 @@ def fit_alone(
 
 
 @compiled
-def all_controlled(views: Views, R: Array, t: Array, use: Bools, cov: Array) -> bool:
-    """Whether each of the spots use (n,), with covariances (n, 2, 2), px^2, is checked by the others at a pose (R, t).
+def controlled(views: Views, R: Array, t: Array, use: Bools, cov: Array) -> Bools:
+    """(n,): which of the spots use (n,), with covariances (n, 2, 2), px^2, the others check at a pose (R, t).
 
     A spot's redundancy, r = 1 - tr(J P J^T C^-1) / 2, is the share of its coordinates that the pose does not take up: a
     gross error of that spot, a false point, shows in its residual by that share only. Checked means that an error of
@@ -99,10 +99,10 @@ def all_controlled(views: Views, R: Array, t: Array, use: Bools, cov: Array) -> 
     Source: Baarda (1968), "A testing procedure for use in geodetic networks": reliability.
     """
     n = use.shape[0]
-    nothing = np.zeros((n, 2))
+    out, nothing = np.zeros(n, np.bool_), np.zeros((n, 2))
     L, _, _, count, _ = frame_information(views, R, t, use, nothing, cov)
     if count < 3:
-        return False
+        return out
     vague = np.zeros((6, 6))
     for i in range(6):
         vague[i, i] = 100.0
@@ -117,9 +117,9 @@ def all_controlled(views: Views, R: Array, t: Array, use: Bools, cov: Array) -> 
             for k in range(6):
                 taken += P[j, k] * (J[0, j] * (a * J[0, k] + b * J[1, k]) + J[1, j] * (b * J[0, k] + c * J[1, k]))
         # The least error that shows, at five sigmas of the residual.
-        if 25.0 * 0.5 * (cov[i, 0, 0] + cov[i, 1, 1]) > DETECTABLE_PX * DETECTABLE_PX * max(0.5 * (2.0 - taken), 0.0):
-            return False
-    return True
+        least = 25.0 * 0.5 * (cov[i, 0, 0] + cov[i, 1, 1])
+        out[i] = least <= DETECTABLE_PX * DETECTABLE_PX * max(0.5 * (2.0 - taken), 0.0)
+    return out
 
 
 @compiled

@@ -25,7 +25,7 @@ from tracking.motion import STATE
 SHOWN = np.array([0.2, 0.6, 0.98])
 LIT = np.array([0.01, 0.3, 0.995])
 RIVAL = 9.0  # nats: assignments so far behind the best say nothing of its certainty
-VAGUE_PX = 15.0  # a frame in which the others place a spot worse than this keeps its labels
+VAGUE_PX = 60.0  # a frame in which the others place a spot worse than this keeps its labels
 P_BEND = 0.02  # probability that the motion bent at a frame although nothing was found of it
 P_ANYWHERE = 1e-4  # ... that the other frames are wrong about it; then its pose is within
 ANYWHERE_M, ANYWHERE_RAD = 0.3, 0.3  # of where they have it

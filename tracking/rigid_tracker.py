@@ -22,7 +22,7 @@ from geometry.rig import Rig
 from geometry.rig_parameters import RigCovariance
 from geometry.solve import SolveLimits, fit_pose
 from geometry.spots import SpotModel
-from tracking.association import BLENDED, Chances, Frame, Sights, crowding, log_chance
+from tracking.association import BLENDED, Chances, Frame, Sights, crowding, distinct_spots, log_chance
 from tracking.detections import Detections
 from tracking.digest import Digest, ahead, digest, surprise
 from tracking.hiding import MISSED, later, learnt, marginal, together
@@ -43,7 +43,7 @@ from tracking.hypotheses import (
     wide_views,
     widest,
 )
-from tracking.information import all_controlled, fit_alone
+from tracking.information import controlled, fit_alone
 from tracking.labels import NO_POINT, Labelling, PosePrior, candidate_labellings, find_labels
 from tracking.match import UNMATCHED
 from tracking.misfit import Misfit
@@ -72,6 +72,7 @@ MOST_EVIDENCE, LEAST_EVIDENCE = 50.0, -5.0  # nats; a vehicle that was never fou
 ALTERNATIVE_NATS = 8.0  # a child so far behind the best is not asked for its mirror solutions
 AMBIGUOUS = 9.0  # share of the frame's own variance that other answers may add to a measured pose of few spots
 SURE = 1 - 2.5e-3  # label probability (6 nats) where nothing else checks a label
+LARGE = 6  # spots: so many leave only a spot itself unchecked
 YOUNG = 5  # frames after a search found the vehicle: until then its velocities may be known to next to nothing
 MOST_LINKED, MOST_CANDIDATES = 3, 4  # hypotheses that a search's answers continue, and answers
 FARTHEST_M, FARTHEST_RAD = 1.5, np.deg2rad(60.0)  # of a search from the last pose: beyond it a fan looks like itself
@@ -114,6 +115,7 @@ class RigidTracker:
         self._searches = 0  # in a row without success
         self._evidence = 0.0  # nats, of the best hypothesis against "all points are false", until a pose is measured
         self._since_found = 0  # frames since a search found the vehicle
+        self._vague_since = False  # no frame has had enough spots since the labels of one were left open
         self._told_tie = False
         self._begun = False
 
@@ -208,7 +210,7 @@ class RigidTracker:
             return False
         if self._hypotheses is not None and count:
             best = int(np.argmax(children.after.weight[:count]))
-            explained = np.count_nonzero(children.assigned[best] >= 0) >= FEW
+            explained = distinct_spots(children.assigned[best] >= 0, self.model.spot_of) >= FEW
             young = self._since_found <= YOUNG
             vague = (young or not explained) and self._vague(self._hypotheses, dt_s)
             if explained and not vague:
@@ -470,28 +472,38 @@ class RigidTracker:
         unproven = self._anchor is None or best in fresh
         least = max(p.min_label_probability, 1 / (1 + np.exp(-p.labels.lead_nats)) if unproven else 0.0)
         proven = self._anchor is not None or self._evidence >= ENOUGH_EVIDENCE
-        parent, spots = int(children.parent[best]), int(np.count_nonzero(assigned >= 0))
+        parent, spots = int(children.parent[best]), int(distinct_spots(assigned >= 0, model.spot_of))
         if spots and before is not None and dt_s > 0 and parent >= 0:
             R, t, _, P, _ = self._predicted(before, parent, dt_s, bool(children.manoeuvre[best]))
             used = np.where(assigned < BLENDED, assigned, -1)
             wide = wide_views(model.numbers, R, t, P, used)
+            again = (assigned >= 0) & self._found_before & ~wide
+            if self._vague_since and (parent > 0 or distinct_spots(again, model.spot_of) < PROOF):
+                # Labels that nothing checked must not check what comes after them, until a whole pose is found again.
+                wide |= used >= 0
+            self._vague_since = False
             if wide.any():
                 # The motion does not check some label: the other spots must, or it must be beyond doubt.
                 least = max(least, SURE)
                 use, _, cov = chosen_points(frame, assigned, self._extra)
-                checked = all_controlled(model.numbers, h.R[0], h.t[0], use, cov)
+                unchecked = use & ~controlled(model.numbers, h.R[0], h.t[0], use, cov)
                 # A spot that was found in the frame before too confirms itself. A single one that returns where it may
                 # be anywhere waits for the next frame, which finds it again or does not.
-                new = int(np.count_nonzero(wide & ~self._found_before))
+                new = wide & ~self._found_before
+                lone = np.count_nonzero(new) == 1 and (unchecked if spots >= LARGE else unchecked.any()) & new
                 far = widest(model.numbers, R, t, P, used) > FAR_TOO_VAGUE_PX
-                few = spots < FEW and (not checked or far)
-                if few or (new == 1 and not checked) or float(np.min(certain[assigned >= 0])) < SURE:
+                doubted = (assigned >= 0) & (certain < SURE)
+                sure = distinct_spots((assigned >= 0) & ~doubted, model.spot_of)
+                few = sure < FEW and (unchecked.any() or far or doubted.any())
+                if few or np.any(lone):
                     proven, spread = False, spread_of_all(children, places)
+                    self._vague_since = True
         self._found_before = assigned >= 0
         d = digest(model.numbers, self._sights, frame, h.R[0], h.t[0], assigned, certain, least, RADIUS_PX)
         count = int(np.count_nonzero(d.use))
         # Another pose that is not excluded makes it a prediction, with a covariance that covers both.
-        ambiguous = count <= FEW and bool(np.any(spread.diagonal() > AMBIGUOUS * d.alone.diagonal()))
+        distinct = int(distinct_spots(d.use, model.spot_of))
+        ambiguous = distinct <= FEW and bool(np.any(spread.diagonal() > AMBIGUOUS * d.alone.diagonal()))
         measured = count >= 3 and proven and not ambiguous and self._good(d.alone)
         self._unmeasured = 0 if measured else self._unmeasured + 1
         if measured and self.calibration is not None:
@@ -505,7 +517,7 @@ class RigidTracker:
         covariance = h.P[0, :6, :6] + spread + systematic
         known = measured or (self._anchor is not None and not self._lost(covariance))
         # After a frame that showed nothing, one or two points may be false ones: a second such frame must follow.
-        alone = np.count_nonzero(d.labelled) < PROOF and not self._saw_any
+        alone = distinct_spots(d.labelled, model.spot_of) < PROOF and not self._saw_any
         self._saw_any = bool((assigned >= 0).any())
         labelled = d.labelled if known and proven and not alone else np.zeros_like(d.labelled)
         predicted_cov: Array | None = None
@@ -527,7 +539,7 @@ class RigidTracker:
                     predicted_cov = spread_px + self._extra
                 self.temper.learn(h.m[0, :6], bool(children.manoeuvre[best]), slope)
             self._anchor, self._anchor_age_s, self._told_tie = pose, 0.0, False
-            if count >= FEW:
+            if distinct >= FEW:
                 self._searches = 0
         if known:
             self._clutter.learn(d.near, d.discs)

@@ -19,11 +19,12 @@ from geometry.arrays import Array, Bools, Ints
 from geometry.pose import Pose
 from geometry.projection import Views, project_all
 from geometry.solve import SolveLimits, covariance_of
-from tracking.association import BLENDED, Chances, Sights
+from tracking.association import BLENDED, Chances, Sights, distinct_spots
 from tracking.backward import merged, track_backward
+from tracking.continuity import Surroundings, continued
 from tracking.fixed_interval import Reference, speeds
 from tracking.hypotheses import CHECK_PX, FEW, PROOF
-from tracking.information import all_controlled, fit_alone, frame_information
+from tracking.information import controlled, fit_alone, frame_information
 from tracking.misfit import DEADBAND
 from tracking.motion import process_noise
 from tracking.recording import Recording
@@ -63,6 +64,8 @@ def smooth(recording: Recording) -> Smoothed:
         elif not gapless:
             pass_.estimate(deep=DEEP)
         pass_.repair()
+        if parameters.method == "rigid":
+            pass_.continue_paths()
     return pass_.result(rounds)
 
 
@@ -92,8 +95,8 @@ class _Pass:
             log_density = np.tile(by_hand, (len(rec), 1))
         self.certified = self.causal  # labels that a tracker gave, forward or backward
         # Frames that a tracker measured with enough spots: where nothing checked a label it was beyond doubt.
-        self.sure = self.measured & (np.count_nonzero(self.assigned >= 0, axis=1) >= FEW)
-        self.trusted = _chained(self.measured, self.sure | self._controlled(ref))  # their labels may be evidence
+        self.sure = self.measured & (distinct_spots(self.assigned >= 0, model.spot_of) >= FEW)
+        self.trusted = _chained(self.measured, self.sure | self._controlled(ref)[0])  # their labels may be evidence
         self.motion = Motion.begin(ref, rec.bent.copy(), log_density)
         self.doubtful = np.zeros(len(rec), dtype=bool)  # frames in which two poses were measured
         self.own = _Own.nothing(len(rec))
@@ -107,13 +110,18 @@ class _Pass:
         self.own.measured &= ~self.doubtful
         self.measured = self.own.measured
 
-    def _controlled(self, ref: Reference) -> Bools:
-        """(T,): frames whose labels check each other."""
-        out = np.zeros(len(self.rec), dtype=bool)
-        for k in range(len(out)):
-            use, _, cov = labelled_points(self.every, k, self.assigned[k], self.extra)
-            out[k] = bool(use.any()) and all_controlled(self.views, ref.R[k], ref.t[k], use, cov)
-        return out
+    def _controlled(self, ref: Reference) -> tuple[Bools, Bools]:
+        """(T,): frames whose labels check each other, all or enough for a pose; and their labels (T, n) that nothing
+        checks.
+        """
+        labelled = np.zeros(self.assigned.shape, dtype=bool)
+        checked = labelled.copy()
+        for k in range(len(self.rec)):
+            labelled[k], _, cov = labelled_points(self.every, k, self.assigned[k], self.extra)
+            checked[k] = controlled(self.views, ref.R[k], ref.t[k], labelled[k], cov)
+        count = distinct_spots(checked, self.model.spot_of)
+        frames = (count >= FEW) | ((count > 0) & ~np.any(labelled & ~checked, axis=1))
+        return frames, labelled & ~checked & frames[:, None]
 
     def relabel(self) -> bool:
         """Labels from where the other frames put the vehicle; whether any changed."""
@@ -131,10 +139,12 @@ class _Pass:
         new = np.where((certain >= self.parameters.min_label_probability) & known[:, None], found, -1)
         self.assigned = new
         self.measured = _alone(rec, self.views, self.every, new, self.extra, ref).measured
-        unchecked = (sigma_px > CHECK_PX) & ~_chained(self.measured, self.sure | self._controlled(ref))
+        vague = sigma_px > CHECK_PX
+        controlled_frames, loose = self._controlled(ref)
+        unchecked = vague & ~_chained(self.measured, self.sure | controlled_frames)
         # Such frames keep the labels that a tracker was sure of, but they are no evidence of the motion.
-        new[unchecked[:, None] & (new != self.certified)] = -1
-        lone = _lone_points(new)
+        new[((vague[:, None] & loose) | unchecked[:, None]) & (new != self.certified)] = -1
+        lone = _lone_points(distinct_spots(new >= 0, self.model.spot_of))
         new[lone] = -1
         self.probability = np.where((found >= 0) & ~lone[:, None], certain, np.nan)
         changed = bool(np.any(new != before))
@@ -146,12 +156,12 @@ class _Pass:
     def look_back(self) -> bool:
         """Labels of frames that the causal tracker did not measure for sure, from the frames after; whether any."""
         motion = self.motion
-        sure = self.trusted & self.measured & (self.sure | self._controlled(motion.ref)) & motion.known
+        sure = self.trusted & self.measured & (self.sure | self._controlled(motion.ref)[0]) & motion.known
         weak = ~sure
         if not weak.any() or not sure.any():
             return False
         back = track_backward(self.rec, motion.ref, motion.pose_P, motion.motion_P, weak, sure)
-        new = merged(self.assigned, back, weak)
+        new = merged(self.assigned, back, weak, self.model.spot_of)
         if np.array_equal(new, self.assigned) and not back.disagrees.any():
             return False
         self.assigned = self.certified = new
@@ -159,9 +169,9 @@ class _Pass:
         # Two directions of time that measured two poses: neither is believed.
         self.doubtful = back.disagrees
         self.measured &= ~self.doubtful
-        self.sure |= back.measured & (np.count_nonzero(back.assigned >= 0, axis=1) >= FEW)
+        self.sure |= back.measured & (distinct_spots(back.assigned >= 0, self.model.spot_of) >= FEW)
         self.sure &= ~self.doubtful
-        self.trusted = _chained(self.measured, self.sure | self._controlled(motion.ref))
+        self.trusted = _chained(self.measured, self.sure | self._controlled(motion.ref)[0])
         # The frames that were found now have no reference yet.
         poses = np.concatenate([motion.ref.R, motion.ref.t[:, None]], axis=1)
         found = sure | (back.measured & self.measured)
@@ -184,6 +194,19 @@ class _Pass:
                 return
             self.motion = replace(self.motion, bent=bent)
             self.estimate(deep=DEEP)
+
+    def continue_paths(self) -> None:
+        """Labels of frames that do not give the pose, by the continuity of each spot's path."""
+        motion = self.motion
+        uv, J = project_all(self.views, motion.ref.R, motion.ref.t)
+        spread = J @ motion.pose_P[:, None] @ np.swapaxes(J, -1, -2) + self.extra
+        camera = self.sights.camera
+        log_clutter = _log_clutter(
+            self.rec, self.views, self.sights, self.every, self.assigned, motion.ref, self.own.measured
+        )
+        around = Surroundings(camera, uv, spread, log_clutter, motion.known & ~(self.own.measured & self.trusted))
+        self.assigned, probability = continued(self.every, self.assigned, around)
+        self.probability = np.where(np.isnan(probability), self.probability, probability)
 
     def result(self, rounds: int) -> Smoothed:
         """What the whole run says."""
@@ -331,13 +354,13 @@ def _log_static(
     return np.concatenate([np.zeros(0), *parts])
 
 
-def _lone_points(assigned: Ints) -> Bools:
-    """(T,): frames beside a dark one with a spot or two, where the other side is dark too, or shows many more.
+def _lone_points(count: Ints) -> Bools:
+    """(T,), of numbers of spots found in frames: those beside a dark one with a spot or two, where the other side is
+    dark too, or shows many more.
 
     What is there is rather a false point or two than the last or first light: measured, all of some ten such labels in
     recordings with blackouts were wrong.
     """
-    count = np.count_nonzero(assigned >= 0, axis=1)
     before, after = np.concatenate([[-1], count[:-1]]), np.concatenate([count[1:], [-1]])
     company = ((before > 0) & (before < count + 2)) | ((after > 0) & (after < count + 2))
     return (count > 0) & (count < PROOF) & ((before == 0) | (after == 0)) & ~company
