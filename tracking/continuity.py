@@ -29,7 +29,7 @@ USUAL = 1  # the part by which forms are compared
 MOST_SIGMA_PX = 15.0  # of a prediction that is used
 P_GONE = 0.1  # probability per frame that the spot shows no more
 POSE_GATE = 25.0  # squared Mahalanobis distance from where the pose has the spot
-SURE = 0.98  # label probability
+SURE, SURER = 0.98, 0.995  # label probability; where the path from the other side does not go through the point
 LONG_CHAIN = 5  # frames in a row in which one spot alone is followed
 
 
@@ -52,9 +52,12 @@ def continued(every: AllDetections, assigned: Ints, around: Surroundings) -> tup
             continue
         ahead, back = path.chain(1), path.chain(-1)
         for k in ahead.keys() | back.keys():
-            found = [side[k] for side in (ahead, back) if k in side]
-            if len({row for row, _ in found}) == 1:
-                out[k, view], probability[k, view] = found[0][0], max(p for _, p in found)
+            # Where both ends reach they must agree, or one be surer; None: looked for in vain.
+            sides = [side[k] for side in (ahead, back) if k in side]
+            found = [s for s in sides if s is not None]
+            p = max((p for _, p in found), default=0.0)
+            if len({row for row, _ in found}) == 1 and (len(found) == len(sides) or p >= SURER):
+                out[k, view], probability[k, view] = found[0][0], p
     _undo_shared(out, probability, assigned, around.camera)
     lone = _lone(out, assigned)
     out[lone], probability[lone] = assigned[lone], np.nan
@@ -103,12 +106,13 @@ class _Path:
             return None
         return _Path(every, assigned, around, view)
 
-    def chain(self, way: int) -> dict[int, tuple[int, float]]:
-        """Labels of unlabelled frames, from the earlier to the later ones (way 1) or back (-1): row, probability.
+    def chain(self, way: int) -> dict[int, tuple[int, float] | None]:
+        """Labels of unlabelled frames, from the earlier to the later ones (way 1) or back (-1): row, probability; None
+        where the path goes through a frame but no point is on it.
 
         A path that ends has its last label taken away: what was found just where a spot vanished may be a false point.
         """
-        out: dict[int, tuple[int, float]] = {}
+        out: dict[int, tuple[int, float] | None] = {}
         uv, latest = self.uv.copy(), -1
         frames = range(len(uv)) if way == 1 else range(len(uv) - 1, -1, -1)
         for k in frames:
@@ -116,29 +120,27 @@ class _Path:
                 latest = -1  # the chain before has reached a label: it stands
                 continue
             if self.assigned[k, self.view] < 0 and self.around.open[k]:
-                found = self._found(k, uv, way)
-                if found is not None:
-                    row, _ = out[k] = found
-                    uv[k] = self.every.uv[self.every.begin[k] + row]
-                    latest = k
-                    continue
+                predicted = self._predicted(k, uv, way)
+                if predicted is not None:
+                    out[k] = found = self._found(k, *predicted)
+                    if found is not None:
+                        uv[k] = self.every.uv[self.every.begin[k] + found[0]]
+                        latest = k
+                        continue
             if latest >= 0 and abs(k - latest) >= MOST_AHEAD:
-                del out[latest]
+                out[latest] = None
                 latest = -1
         if latest >= 0:
-            del out[latest]
+            out[latest] = None
         return out
 
-    def _found(self, k: int, uv: Array, way: int) -> tuple[int, float] | None:
-        """The point that continues the path in frame k, and the probability that it does; None without one."""
+    def _found(self, k: int, at: Array, sigma: Array) -> tuple[int, float] | None:
+        """The point of frame k that continues a path expected `at`, px, and the probability that it does; None: none.
+
+        sigma (parts,): of the path's errors, as of _predicted.
+        """
         every, around, view = self.every, self.around, self.view
         first, last = every.first[k, self.camera], every.first[k, self.camera + 1]
-        if first == last:
-            return None
-        predicted = self._predicted(k, uv, way)
-        if predicted is None:
-            return None
-        at, sigma = predicted
         rows = np.arange(first, last)
         rows = rows[~np.isin(rows, self.assigned[k][self.assigned[k] >= 0] % BLENDED)]
         if not len(rows):

@@ -32,6 +32,7 @@ FEW = 4  # spots: fewer do not tell a lost vehicle from one that is mostly hidde
 VAGUE_PX = 15.0  # 1 sigma of a predicted spot: beyond it the whole picture is searched at once
 CHECK_PX = 8.0  # 1 sigma of a predicted spot: up to it the prediction checks a label
 FAR_TOO_VAGUE_PX = 45.0  # beyond it three spots fit anywhere too
+SURE = 1 - 2.5e-3  # label probability (6 nats) where nothing else checks a label
 PROOF = 3  # spots: where so many lie in their narrow gates, the velocities have not jumped
 LEAST_TO_TURN = 6.0  # nats: a hypothesis so far behind is not tried with a manoeuvre as well
 SURPRISE = 3.5  # sigmas of a misfit's own scatter: beyond it a manoeuvre is considered although every spot is found

@@ -30,6 +30,7 @@ from tracking.hypotheses import (
     FAR_TOO_VAGUE_PX,
     FEW,
     PROOF,
+    SURE,
     VAGUE_PX,
     Children,
     Hypotheses,
@@ -71,7 +72,6 @@ ENOUGH_EVIDENCE = 7.0  # nats: chance alone reaches it with a probability of exp
 MOST_EVIDENCE, LEAST_EVIDENCE = 50.0, -5.0  # nats; a vehicle that was never found and is less likely than this goes
 ALTERNATIVE_NATS = 8.0  # a child so far behind the best is not asked for its mirror solutions
 AMBIGUOUS = 9.0  # share of the frame's own variance that other answers may add to a measured pose of few spots
-SURE = 1 - 2.5e-3  # label probability (6 nats) where nothing else checks a label
 LARGE = 6  # spots: so many leave only a spot itself unchecked
 YOUNG = 5  # frames after a search found the vehicle: until then its velocities may be known to next to nothing
 MOST_LINKED, MOST_CANDIDATES = 3, 4  # hypotheses that a search's answers continue, and answers

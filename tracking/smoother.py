@@ -23,7 +23,7 @@ from tracking.association import BLENDED, Chances, Sights, distinct_spots
 from tracking.backward import merged, track_backward
 from tracking.continuity import Surroundings, continued
 from tracking.fixed_interval import Reference, speeds
-from tracking.hypotheses import CHECK_PX, FEW, PROOF
+from tracking.hypotheses import CHECK_PX, FEW, PROOF, SURE
 from tracking.information import controlled, fit_alone, frame_information
 from tracking.misfit import DEADBAND
 from tracking.motion import process_noise
@@ -94,6 +94,7 @@ class _Pass:
             by_hand = 2 * np.log(np.repeat([parameters.jerk_m_s3, parameters.jerk_rad_s3], 3))
             log_density = np.tile(by_hand, (len(rec), 1))
         self.certified = self.causal  # labels that a tracker gave, forward or backward
+        self.found = self.measured  # frames that a tracker measured
         # Frames that a tracker measured with enough spots: where nothing checked a label it was beyond doubt.
         self.sure = self.measured & (distinct_spots(self.assigned >= 0, model.spot_of) >= FEW)
         self.trusted = _chained(self.measured, self.sure | self._controlled(ref)[0])  # their labels may be evidence
@@ -139,11 +140,13 @@ class _Pass:
         new = np.where((certain >= self.parameters.min_label_probability) & known[:, None], found, -1)
         self.assigned = new
         self.measured = _alone(rec, self.views, self.every, new, self.extra, ref).measured
+        # Where the other frames do not check a label, those of its frame must, or a tracker that was sure of it.
         vague = sigma_px > CHECK_PX
         controlled_frames, loose = self._controlled(ref)
-        unchecked = vague & ~_chained(self.measured, self.sure | controlled_frames)
-        # Such frames keep the labels that a tracker was sure of, but they are no evidence of the motion.
-        new[((vague[:, None] & loose) | unchecked[:, None]) & (new != self.certified)] = -1
+        clear = (new >= 0) & (certain >= SURE)
+        beyond_doubt = self.sure | controlled_frames | (distinct_spots(clear, self.model.spot_of) >= FEW)
+        new[(vague[:, None] & (loose | ~beyond_doubt[:, None])) & (new != self.certified)] = -1
+        unchecked = vague & ~_chained(self.measured & self.found, beyond_doubt)
         lone = _lone_points(distinct_spots(new >= 0, self.model.spot_of))
         new[lone] = -1
         self.probability = np.where((found >= 0) & ~lone[:, None], certain, np.nan)
@@ -165,6 +168,7 @@ class _Pass:
         if np.array_equal(new, self.assigned) and not back.disagrees.any():
             return False
         self.assigned = self.certified = new
+        self.found = self.found | back.measured
         self.measured = _alone(self.rec, self.views, self.every, new, self.extra, motion.ref).measured
         # Two directions of time that measured two poses: neither is believed.
         self.doubtful = back.disagrees
