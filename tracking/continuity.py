@@ -25,11 +25,9 @@ LEAST_HISTORY = 12  # errors that a form's spread is estimated from
 # The errors' distribution is taken for a mixture: of each part the weight, and the quantile of the measured errors that
 # gives its spread. Smooth motion makes the first, bends the last.
 PARTS = ((0.6, 0.5), (0.35, 0.95), (0.05, 0.995))
-USUAL = 1  # the part by which forms are compared
-MOST_SIGMA_PX = 15.0  # of a prediction that is used
 P_GONE = 0.1  # probability per frame that the spot shows no more
 POSE_GATE = 25.0  # squared Mahalanobis distance from where the pose has the spot
-SURE, SURER = 0.98, 0.995  # label probability; where the path from the other side does not go through the point
+SURE, SURER = 0.99, 0.995  # label probability; where the path from the other side does not go through the point
 LONG_CHAIN = 5  # frames in a row in which one spot alone is followed
 
 
@@ -87,6 +85,21 @@ def _undo_shared(out: Ints, probability: Array, before: Ints, camera: Ints) -> N
                 out[k, i], probability[k, i] = before[k, i], np.nan
 
 
+class _Prediction(NamedTuple):
+    """Where one form of a path expects the spot."""
+
+    at: Array  # (2,) px
+    sigma: Array  # (parts,) px per axis, of each part of its errors
+
+    def density(self, place: Array, cov: Array) -> Array:
+        """(m,) 1/px^2, of the spot's being at places (m, 2) with covariances (m, 2, 2)."""
+        S = cov[:, None] + self.sigma[:, None, None] ** 2 * np.eye(2)  # (m, parts, 2, 2)
+        e = place - self.at
+        d2 = np.einsum("mi,mpij,mj->mp", e, np.linalg.inv(S), e)
+        parts = np.exp(-0.5 * d2) / (2 * np.pi * np.sqrt(np.linalg.det(S)))
+        return np.asarray(parts @ np.array([w for w, _ in PARTS]))
+
+
 class _Path:
     """One view's path in its picture."""
 
@@ -96,7 +109,7 @@ class _Path:
         k = np.flatnonzero((assigned[:, view] >= 0) & (assigned[:, view] < BLENDED))
         self.uv = np.full((len(assigned), 2), np.nan)
         self.uv[k] = every.uv[every.begin[k] + assigned[k, view]]
-        self.sigma = np.array([[_spread(self.uv, *form, h) for h in range(1, MOST_AHEAD + 1)] for form in FORMS])
+        self.spreads = [[_spread(self.uv, *form, h) for h in range(1, MOST_AHEAD + 1)] for form in FORMS]
 
     @staticmethod
     def of(every: AllDetections, assigned: Ints, around: Surroundings, view: int) -> _Path | None:
@@ -121,8 +134,8 @@ class _Path:
                 continue
             if self.assigned[k, self.view] < 0 and self.around.open[k]:
                 predicted = self._predicted(k, uv, way)
-                if predicted is not None:
-                    out[k] = found = self._found(k, *predicted)
+                if predicted:
+                    out[k] = found = self._found(k, predicted)
                     if found is not None:
                         uv[k] = self.every.uv[self.every.begin[k] + found[0]]
                         latest = k
@@ -134,51 +147,44 @@ class _Path:
             out[latest] = None
         return out
 
-    def _found(self, k: int, at: Array, sigma: Array) -> tuple[int, float] | None:
-        """The point of frame k that continues a path expected `at`, px, and the probability that it does; None: none.
-
-        sigma (parts,): of the path's errors, as of _predicted.
-        """
+    def _found(self, k: int, predicted: list[_Prediction]) -> tuple[int, float] | None:
+        """The point of frame k that continues a path, and the probability that it does; None: none."""
         every, around, view = self.every, self.around, self.view
-        first, last = every.first[k, self.camera], every.first[k, self.camera + 1]
-        rows = np.arange(first, last)
+        rows = np.arange(every.first[k, self.camera], every.first[k, self.camera + 1])
         rows = rows[~np.isin(rows, self.assigned[k][self.assigned[k] >= 0] % BLENDED)]
         if not len(rows):
             return None
         place, cov = every.uv[every.begin[k] + rows], every.cov[every.begin[k] + rows]
-        S = cov[:, None] + sigma[:, None, None] ** 2 * np.eye(2)  # (m, parts, 2, 2)
-        e = place - at
-        d2 = np.einsum("mi,mpij,mj->mp", e, np.linalg.inv(S), e)
-        likelihood = np.exp(-0.5 * d2) / (2 * np.pi * np.sqrt(np.linalg.det(S))) @ np.array([w for w, _ in PARTS])
+        likelihood = np.mean([p.density(place, cov) for p in predicted], axis=0)
         false = np.exp(np.maximum(around.log_clutter[k, view], every.log_static[every.begin[k] + rows]))
         odds = likelihood * (1 - P_GONE) / false
         best = int(np.argmax(odds))
         p = float(odds[best] / (odds.sum() + P_GONE))
         y = place[best] - around.expected[k, view]
-        far = y @ np.linalg.solve(around.spread[k, view] + S[best, USUAL], y)
+        far = y @ np.linalg.solve(around.spread[k, view] + cov[best], y)
         if p < SURE or not far < POSE_GATE:
             return None
         return int(rows[best]), p
 
-    def _predicted(self, k: int, uv: Array, way: int) -> tuple[Array, Array] | None:
-        """Where the path goes on in frame k, px, and the sigma per axis of each part of its errors (parts,)."""
+    def _predicted(self, k: int, uv: Array, way: int) -> list[_Prediction]:
+        """Where the path goes on in frame k: after a bend a short form is right, on a smooth path a long one."""
         near = k - way * np.arange(1, REACH + MOST_AHEAD)
         near = near[(near >= 0) & (near < len(uv))]
         near = near[np.isfinite(uv[near, 0])]
         if not len(near) or abs(k - near[0]) > MOST_AHEAD:
-            return None
+            return []
         ahead = int(abs(k - near[0]))
-        best, sigma = None, np.full(len(PARTS), MOST_SIGMA_PX)
-        for (degree, points), spread in zip(FORMS, self.sigma[:, ahead - 1], strict=True):
-            if len(near) < points or abs(near[points - 1] - near[0]) >= REACH:
+        out = []
+        for (degree, points), spreads in zip(FORMS, self.spreads, strict=True):
+            sigma = spreads[ahead - 1]
+            if sigma is None or len(near) < points or abs(near[points - 1] - near[0]) >= REACH:
                 continue
             weights = _weights(-np.abs(k - near[:points]).astype(float), degree)
             usual = _weights(-np.arange(ahead, ahead + points, dtype=float), degree)
             # Points farther apart than in the labelled path that the spread is of make it larger with their weights.
-            wide = spread * max(np.linalg.norm(weights) / np.linalg.norm(usual), 1.0)
-            if wide[USUAL] < sigma[USUAL]:
-                best, sigma = weights @ uv[near[:points]], wide
-        return None if best is None else (best, sigma)
+            wider = max(float(np.linalg.norm(weights) / np.linalg.norm(usual)), 1.0)
+            out.append(_Prediction(weights @ uv[near[:points]], sigma * wider))
+        return out
 
 
 def _weights(at: Array, degree: int) -> Array:
@@ -186,17 +192,19 @@ def _weights(at: Array, degree: int) -> Array:
     return np.asarray(np.linalg.pinv(np.vander(at, degree + 1, increasing=True))[0])
 
 
-def _spread(uv: Array, degree: int, points: int, ahead: int) -> Array:
-    """(parts,) sigmas per axis, px, of predictions so many frames ahead along a labelled path (T, 2); inf: too few."""
+def _spread(uv: Array, degree: int, points: int, ahead: int) -> Array | None:
+    """(parts,) sigmas per axis, px, of predictions so many frames ahead along a labelled path uv (T, 2); None: too few
+    labels to know.
+    """
     weights = _weights(-np.arange(ahead, ahead + points, dtype=float), degree)
     n = len(uv) - ahead - points + 1
     if n < LEAST_HISTORY:
-        return np.full(len(PARTS), np.inf)
+        return None
     predicted = sum(w * uv[points - 1 - j : points - 1 - j + n] for j, w in enumerate(weights))
     squared = np.sum((uv[points - 1 + ahead :][:n] - predicted) ** 2, axis=1)
     squared = squared[np.isfinite(squared)]
     if len(squared) < LEAST_HISTORY:
-        return np.full(len(PARTS), np.inf)
+        return None
     # Of a Gaussian the squared distance of two axes is exponential; the tail's part is as wide as its quantile.
-    core = [np.sqrt(np.quantile(squared, q) / (-2 * np.log(1 - q))) for _, q in PARTS[:-1]]
-    return np.array([*core, np.sqrt(np.quantile(squared, PARTS[-1][1]) / 2)])
+    core = [np.quantile(squared, q) / (-2 * np.log(1 - q)) for _, q in PARTS[:-1]]
+    return np.asarray(np.sqrt([*core, np.quantile(squared, PARTS[-1][1]) / 2]))

@@ -113,6 +113,7 @@ class RigidTracker:
         self._doubts = 0  # frames in a row that contradict the best hypothesis
         self._few = 0  # frames in a row with fewer than FEW spots
         self._searches = 0  # in a row without success
+        self._points_before = 0  # of all cameras, in the frame before
         self._evidence = 0.0  # nats, of the best hypothesis against "all points are false", until a pose is measured
         self._since_found = 0  # frames since a search found the vehicle
         self._vague_since = False  # no frame has had enough spots since the labels of one were left open
@@ -206,7 +207,9 @@ class RigidTracker:
 
     def _should_search(self, children: Children, count: int, found: Sequence[Detections | None], dt_s: float) -> bool:
         """Whether to look for the whole vehicle: enough points are there, and no hypothesis explains them for sure."""
-        if sum(len(f) for f in found if f is not None) < self.parameters.labels.min_spots:
+        points, before = sum(len(f) for f in found if f is not None), self._points_before
+        self._points_before = points
+        if points < self.parameters.labels.min_spots:
             return False
         if self._hypotheses is not None and count:
             best = int(np.argmax(children.after.weight[:count]))
@@ -224,7 +227,8 @@ class RigidTracker:
                 return self._few % DOUBT_FRAMES == 0
         # At once when light returns, then ever more rarely: what fails for long will fail in the next frame too.
         self._searches += 1
-        return self._searches <= 20 or self._searches % (2 if self._searches < 100 else 5) == 0
+        more = points > before + 1
+        return more or self._searches <= 20 or self._searches % (2 if self._searches < 100 else 5) == 0
 
     def _contradicted(self, children: Children, best: int, found: Sequence[Detections | None]) -> bool:
         """Whether a camera shows enough points, but none where the hypothesis expects several spots."""
@@ -239,11 +243,12 @@ class RigidTracker:
         return against
 
     def _vague(self, hypotheses: Hypotheses, dt_s: float) -> bool:
-        """Whether the best hypothesis predicts some spot of this frame worse than VAGUE_PX."""
+        """Whether the best hypothesis predicts some spot of this frame worse than VAGUE_PX, or no spot at all."""
         R, t, _, P, _ = self._predicted(hypotheses, 0, dt_s, manoeuvre=False)
         _, J = project_all(self.model.numbers, R[None], t[None])
         spread = J[0] @ P[:6, :6] @ np.swapaxes(J[0], -1, -2)
-        return bool(np.sqrt(np.max(spread[:, [0, 1], [0, 1]])) > VAGUE_PX)
+        there = J[0].any(axis=(1, 2))  # project_all gives 0 where there is no projection
+        return self._lost(P) or not there.any() or bool(np.sqrt(np.max(spread[there][:, [0, 1], [0, 1]])) > VAGUE_PX)
 
     def _predicted(
         self, h: Hypotheses, k: int, dt_s: float, manoeuvre: bool
