@@ -478,6 +478,10 @@ class RigidTracker:
         least = max(p.min_label_probability, 1 / (1 + np.exp(-p.labels.lead_nats)) if unproven else 0.0)
         proven = self._anchor is not None or self._evidence >= ENOUGH_EVIDENCE
         parent, spots = int(children.parent[best]), int(distinct_spots(assigned >= 0, model.spot_of))
+        doubted = (assigned >= 0) & (certain < SURE)
+        sure = distinct_spots((assigned >= 0) & ~doubted, model.spot_of)
+        if sure < FEW:
+            least = max(least, SURE)  # the others do not check a label
         if spots and before is not None and dt_s > 0 and parent >= 0:
             R, t, _, P, _ = self._predicted(before, parent, dt_s, bool(children.manoeuvre[best]))
             used = np.where(assigned < BLENDED, assigned, -1)
@@ -497,8 +501,6 @@ class RigidTracker:
                 new = wide & ~self._found_before
                 lone = np.count_nonzero(new) == 1 and (unchecked if spots >= LARGE else unchecked.any()) & new
                 far = widest(model.numbers, R, t, P, used) > FAR_TOO_VAGUE_PX
-                doubted = (assigned >= 0) & (certain < SURE)
-                sure = distinct_spots((assigned >= 0) & ~doubted, model.spot_of)
                 few = sure < FEW and (unchecked.any() or far or doubted.any())
                 if few or np.any(lone):
                     proven, spread = False, spread_of_all(children, places)
