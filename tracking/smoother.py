@@ -147,7 +147,11 @@ class _Pass:
         beyond_doubt = self.sure | controlled_frames | (distinct_spots(clear, self.model.spot_of) >= FEW)
         new[(vague[:, None] & (loose | ~beyond_doubt[:, None])) & (new != self.certified)] = -1
         unchecked = vague & ~_chained(self.measured & self.found, beyond_doubt)
-        lone = _lone_points(distinct_spots(new >= 0, self.model.spot_of))
+        count = distinct_spots(new >= 0, self.model.spot_of)
+        lone = _lone_points(count)
+        # So few spots fit false points by chance once in a long dark time; the next frame would show them again.
+        whole = _alone(rec, self.views, self.every, new, self.extra, ref).measured
+        lone |= vague & whole & (count <= FEW) & ~_beside(whole)
         new[lone] = -1
         self.probability = np.where((found >= 0) & ~lone[:, None], certain, np.nan)
         changed = bool(np.any(new != before))
@@ -263,6 +267,14 @@ def _chained(measured: Bools, controlled: Bools) -> Bools:
     for order in (range(1, len(out)), range(len(out) - 2, -1, -1)):
         for k in order:
             out[k] |= measured[k] and out[k - order.step]
+    return out
+
+
+def _beside(measured: Bools) -> Bools:
+    """(T,): frames next to a measured one."""
+    out = np.zeros_like(measured)
+    out[1:] |= measured[:-1]
+    out[:-1] |= measured[1:]
     return out
 
 
