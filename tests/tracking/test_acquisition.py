@@ -9,6 +9,7 @@ import pytest
 
 from geometry.pose import Pose
 from geometry.rig import Beam, Rig, Spot
+from lab.simulate.points import hidden
 from lab.simulate.rigs import fan, look_at
 from tests.tracking.rigid_runs import filmed, judged, looked_at_again, tracked
 from tracking.statuses import PoseStatus
@@ -57,3 +58,22 @@ def test_a_vehicle_at_rest_with_two_beams_is_found_in_the_first_frames(focal_px,
         assert all(f.pose_status is PoseStatus.MEASURED for f in causal[3:])
         again, _ = looked_at_again(run, causal)
         assert judged(run, again).identity == 1.0
+
+
+def test_a_vehicle_is_found_at_once_when_light_returns_wherever_the_prediction_has_drifted():
+    """A swing that is cut off in full motion: after a second in the dark the prediction shows no spot any more."""
+    for seed in range(3):
+        frames, rate = 90, 30.0
+        t = np.arange(frames) / rate
+        yaw = np.deg2rad(6.0) * np.sin(2 * np.pi * 2.0 * t + seed)
+        poses = Pose.from_ypr(
+            np.stack([yaw, 0.5 * yaw, 0 * yaw], axis=1), np.stack([0.02 * yaw, yaw * 0.3, 0 * yaw], 1)
+        )
+        run = filmed(two_beams(1500.0), poses, t, 0.05, seed)
+        dark = np.zeros_like(run.in_view, dtype=bool)
+        dark[30:62] = True
+        run = hidden(run, dark)
+        of = judged(run, tracked(run))
+        assert of.wrong == 0
+        assert np.array_equal(of.right[63:], of.shining[63:])
+        assert of.shining[63:].sum() > 60

@@ -24,6 +24,8 @@ from tracking.association import (
     Sights,
     associate,
     crowding,
+    distinct,
+    distinct_spots,
     grown,
     in_picture,
 )
@@ -336,3 +338,17 @@ def test_without_shapes_no_point_is_taken_for_two_that_melted_into_one():
         assert not any(grown(frame, v, d) for v in range(N) for d in range(len(frame.uv)))
         assert not np.any(search(frame, 1e-4 * P_NEAR).assigned >= BLENDED)
     assert grown(wide, 4, 0)
+
+
+def test_spots_are_counted_once_however_many_cameras_see_them():
+    spot = np.array([0, 0, 1, 2, 2, 3])
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        assigned = rng.choice([MISSED, 0, 5, BLENDED + 2], 6).astype(np.int64)
+        own = {int(s) for s, a in zip(spot, assigned, strict=True) if 0 <= a < BLENDED}
+        assert distinct(assigned, spot) == len(own)
+        chosen = (assigned >= 0) & (assigned < BLENDED)
+        assert distinct_spots(chosen, spot) == len(own)
+        assert distinct_spots(np.stack([chosen, ~chosen]), spot).tolist() == [
+            len(own), len({int(s) for s in spot[~chosen]}),
+        ]  # fmt: skip

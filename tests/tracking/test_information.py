@@ -10,7 +10,7 @@ from geometry.pose import Pose
 from geometry.spots import SpotModel
 from lab.simulate.rigs import RIGS
 from tracking.digest import inverse
-from tracking.information import fit_alone, frame_information
+from tracking.information import controlled, fit_alone, frame_information
 from tracking.motion import STATE, updated
 
 MODEL = SpotModel.of(RIGS["fan"]())
@@ -116,3 +116,30 @@ def test_a_pose_that_two_spots_do_not_give_has_no_covariance():
     two = np.arange(N) < 2
     assert np.isinf(inverse(information(pose, two, uv, cov)[0])).all()
     assert np.isinf(inverse(np.zeros((6, 6)))).all()
+
+
+def test_a_spot_is_checked_by_the_others_where_its_own_error_would_show():
+    """All six check each other; of three alone none does; a fourth that one far stronger camera sees is not checked."""
+    pose, _, _ = some(np.random.default_rng(2))
+    cov = np.tile(0.01 * np.eye(2), (N, 1, 1))
+    R, t = np.ascontiguousarray(pose.rotation), np.ascontiguousarray(pose.translation)
+    assert controlled(VIEWS, R, t, ALL, cov).all()
+    three = np.isin(np.arange(N), [0, 2, 4])
+    assert not controlled(VIEWS, R, t, three, cov).any()
+    vague = cov.copy()
+    vague[1:] *= 100.0**2
+    checked = controlled(VIEWS, R, t, ALL, vague)
+    assert not checked[0]  # by what is a hundred times less exact
+    assert not checked[~ALL].any()
+
+
+@pytest.mark.parametrize("view", range(N))
+def test_an_error_of_a_checked_spot_shows_in_its_residual(view):
+    pose, _, _ = some(np.random.default_rng(view))
+    cov = np.tile(0.01 * np.eye(2), (N, 1, 1))
+    uv = MODEL.project(pose)[0]
+    uv[view] += 5.0 / np.sqrt(2)
+    R, t = np.ascontiguousarray(pose.rotation), np.ascontiguousarray(pose.translation)
+    assert controlled(VIEWS, R, t, ALL, cov)[view]
+    *_, misfit, _ = fit_alone(VIEWS, R, t, ALL, uv, cov)
+    assert misfit > 25.0
