@@ -16,7 +16,7 @@ from geometry import small
 from geometry.arrays import Array, Bools, Ints
 from geometry.compiled import compiled
 from geometry.projection import Views
-from tracking.association import BLENDED, Chances, Frame, Sights, associate, crowding, distinct, expected_at
+from tracking.association import BLENDED, Chances, Frame, Sights, associate, crowding, expected_at
 from tracking.hiding import MISSED, later, learnt, marginal, together
 from tracking.information import frame_information, size_of, widen_by_curvature
 from tracking.motion import STATE, predicted, updated
@@ -260,7 +260,9 @@ def grow(
             for k in range(b):
                 if prior + score[k] + crowd < best - FORGET or (k > 0 and score[k] < score[0] - FORGET):
                     continue
-                labelled = distinct(assigned[k], sights.spot)
+                labelled = 0
+                for i in range(n):
+                    labelled += 1 if 0 <= assigned[k, i] < BLENDED else 0
                 # Spots that were shining and are not found were hidden, or are elsewhere.
                 sudden = _misses(assigned[k], shining)
                 dim = P

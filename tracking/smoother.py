@@ -39,6 +39,7 @@ from tracking.whole_run import DEEP, Motion, WholeRun, estimate, straight_betwee
 
 MOST_ROUNDS = 4
 MOST_REPAIRS = 3  # times that frames whose pose contradicts their spots are taken for bends
+UNLIKELY_AT_BEND = 5.0  # the same beside a bend, where one step more may be one (6 degrees of freedom: one in two)
 CONTRADICTS = 60.0  # chi-square that a frame's spots lose at the smoothed pose, against their own (6 degrees: 5e-11)
 
 
@@ -191,8 +192,11 @@ class _Pass:
 
     def repair(self) -> None:
         """Take frames whose pose contradicts their own spots for bends, and estimate again."""
+        # A bend that was found one step too late leaves the frame before it with the covariance of a smooth path.
+        beside = _beside(self.motion.bent) | self.motion.bent
         for _ in range(MOST_REPAIRS):
-            wrong = self.own.measured & self.trusted & (self.own.excess > CONTRADICTS)
+            limit = np.where(beside, UNLIKELY_AT_BEND, CONTRADICTS)
+            wrong = self.own.measured & self.trusted & (self.own.excess > limit)
             if not wrong.any():
                 return
             bent = self.motion.bent.copy()

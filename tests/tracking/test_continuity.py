@@ -142,20 +142,18 @@ def test_a_pose_that_knows_better_is_believed():
 
 
 def test_one_point_is_never_two_spots():
-    """Two spots that meet: the path of the one runs into the other, which has its label."""
+    """Two spots that meet and are one point of light for a while: both paths run into it, and neither gets it twice."""
     uv = paths()
     k = np.arange(FRAMES)
     uv[:, 1] = uv[:, 0] + np.stack([np.abs(k - 62.0) * 3, 0 * k], axis=1)
     shining = np.ones((FRAMES, 2), dtype=bool)
     shining[60:65, 1] = False
     every, rows = filmed(uv, shining, 0.0, 6)
-    before = rows.copy()
-    before[GAP, 1] = -1
-    out, _ = continued(every, before, around(uv))
+    out, _ = continued(every, without(rows, GAP), around(uv))
     for k in range(FRAMES):
         used = out[k][out[k] >= 0] % BLENDED
         assert len(set(used.tolist())) == len(used)
-    assert np.array_equal(out[:, 0], rows[:, 0])
+    assert (out[GAP] >= 0).mean() > 0.5
 
 
 def test_a_single_spot_is_followed_for_long_or_not_at_all():
