@@ -505,6 +505,12 @@ class RigidTracker:
                 if few or np.any(lone):
                     proven, spread = False, spread_of_all(children, places)
                     self._vague_since = True
+        elif best in fresh and self._anchor is not None:
+            use, _, cov = chosen_points(frame, assigned, self._extra)
+            if distinct_spots(controlled(model.numbers, h.R[0], h.t[0], use, cov), model.spot_of) < FEW:
+                # Where the others leave a direction of the pose open some false point fits: the next frame must agree.
+                proven, spread = False, spread_of_all(children, places)
+                self._vague_since = True
         self._found_before = assigned >= 0
         d = digest(model.numbers, self._sights, frame, h.R[0], h.t[0], assigned, certain, least, RADIUS_PX)
         count = int(np.count_nonzero(d.use))
