@@ -17,7 +17,7 @@ from geometry.pose import Pose
 from geometry.spots import SpotModel
 
 # Rays that differ by less lie on each other: 4 mm at 2.5 m, about as well as a target is made by design. What is less
-# symmetric is told apart by a calibrated rig.
+# symmetric a calibrated rig can distinguish.
 SAME_RAD, SAME_M = float(np.deg2rad(0.05)), 0.002
 PARALLEL = 1e-3  # sine of the angle between two rays, below which they give no frame
 

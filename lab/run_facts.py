@@ -43,7 +43,7 @@ _MEANINGS = {
     Cause.NO_PICTURE: "without a picture of some camera",
     Cause.CONTRADICTION: "whose pose contradicts its spots or the causal pass",
     Cause.UNEXPLAINED: "with enough points of light, which no pose explains",
-    Cause.LABELS_OPEN: "with spots that could not be told apart",
+    Cause.LABELS_OPEN: "with spots whose labels stayed open",
     Cause.FEW_POINTS: "with too few points of light",
     Cause.OUT_OF_VIEW: f"with fewer than {FEWEST_SPOTS} spots inside the pictures",
     Cause.NOT_DETERMINED: "whose spots do not determine the pose",

@@ -61,15 +61,13 @@ class Sights(NamedTuple):
     camera: Ints  # (n,)
     size: Array  # (n, 2) px: width, height of the picture
     group: Ints  # (n,) spots that may be hidden together: those of one screen
-    spot: Ints  # (n,) two cameras may see one spot
 
     @staticmethod
     def of(rig: Rig, model: SpotModel) -> Sights:
         """Those of a rig."""
         screens = list(dict.fromkeys(rig.spots[s].screen for _, s in model.views))
         group = np.array([screens.index(rig.spots[s].screen) for _, s in model.views], dtype=np.int64)
-        camera, spot = np.ascontiguousarray(model.camera_of), np.ascontiguousarray(model.spot_of)
-        return Sights(camera, np.ascontiguousarray(model.image_size_px), group, spot)
+        return Sights(np.ascontiguousarray(model.camera_of), np.ascontiguousarray(model.image_size_px), group)
 
 
 class Chances(NamedTuple):
@@ -79,20 +77,8 @@ class Chances(NamedTuple):
     blend: float  # that a detected spot has melted into a neighbour
 
 
-@compiled
-def distinct(assigned: Ints, spot: Ints) -> int:
-    """How many spots, each in one view or several, an assignment (n,) has a point of their own for."""
-    count = 0
-    for i in range(assigned.shape[0]):
-        new = 0 <= assigned[i] < BLENDED
-        for j in range(i):
-            new = new and not (spot[j] == spot[i] and 0 <= assigned[j] < BLENDED)
-        count += 1 if new else 0
-    return count
-
-
 def distinct_spots(chosen: Bools, spot: Ints) -> Ints:
-    """The same of chosen views (..., n), for many frames at once: numbers (...)."""
+    """How many spots, each in one view or several, are among chosen views (..., n): numbers (...)."""
     return np.count_nonzero(np.stack([chosen[..., spot == s].any(axis=-1) for s in np.unique(spot)], axis=-1), axis=-1)
 
 

@@ -10,6 +10,7 @@ far it can be trusted is measured on the labelled part of the same path.
 
 from __future__ import annotations
 
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -56,7 +57,7 @@ def continued(every: AllDetections, assigned: Ints, around: Surroundings) -> tup
             p = max((p for _, p in found), default=0.0)
             if len({row for row, _ in found}) == 1 and (len(found) == len(sides) or p >= SURER):
                 out[k, view], probability[k, view] = found[0][0], p
-    _undo_shared(out, probability, assigned, around.camera)
+    _undo_shared(out, probability, assigned)
     lone = _lone(out, assigned)
     out[lone], probability[lone] = assigned[lone], np.nan
     return out, probability
@@ -76,11 +77,11 @@ def _lone(out: Ints, before: Ints) -> Bools:
     return np.asarray(alone)
 
 
-def _undo_shared(out: Ints, probability: Array, before: Ints, camera: Ints) -> None:
+def _undo_shared(out: Ints, probability: Array, before: Ints) -> None:
     """Take away new labels by which one point would be two spots, in place."""
     for k in np.flatnonzero(np.any(out != before, axis=1)):
         for i in np.flatnonzero(out[k] != before[k]):
-            others = (camera == camera[i]) & (np.arange(len(camera)) != i) & (out[k] >= 0)
+            others = (np.arange(out.shape[1]) != i) & (out[k] >= 0)
             if np.any(out[k][others] % BLENDED == out[k, i]):
                 out[k, i], probability[k, i] = before[k, i], np.nan
 
@@ -179,16 +180,18 @@ class _Path:
             sigma = spreads[ahead - 1]
             if sigma is None or len(near) < points or abs(near[points - 1] - near[0]) >= REACH:
                 continue
-            weights = _weights(-np.abs(k - near[:points]).astype(float), degree)
-            usual = _weights(-np.arange(ahead, ahead + points, dtype=float), degree)
+            weights = _weights(tuple(np.abs(k - near[:points]).tolist()), degree)
+            usual = _weights(tuple(range(ahead, ahead + points)), degree)
             # Points farther apart than in the labelled path that the spread is of make it larger with their weights.
             wider = max(float(np.linalg.norm(weights) / np.linalg.norm(usual)), 1.0)
             out.append(_Prediction(weights @ uv[near[:points]], sigma * wider))
         return out
 
 
-def _weights(at: Array, degree: int) -> Array:
-    """(m,) of the points of a polynomial at times `at` (m,), for its value at 0, by least squares."""
+@cache
+def _weights(ago: tuple[int, ...], degree: int) -> Array:
+    """(m,) of the points of a polynomial so many frames ago, m of them, for its value now, by least squares."""
+    at = -np.array(ago, dtype=float)
     return np.asarray(np.linalg.pinv(np.vander(at, degree + 1, increasing=True))[0])
 
 
@@ -196,7 +199,7 @@ def _spread(uv: Array, degree: int, points: int, ahead: int) -> Array | None:
     """(parts,) sigmas per axis, px, of predictions so many frames ahead along a labelled path uv (T, 2); None: too few
     labels to know.
     """
-    weights = _weights(-np.arange(ahead, ahead + points, dtype=float), degree)
+    weights = _weights(tuple(range(ahead, ahead + points)), degree)
     n = len(uv) - ahead - points + 1
     if n < LEAST_HISTORY:
         return None

@@ -370,12 +370,12 @@ class RigidTracker:
         w = children.after.weight[:count]
         for c in np.argsort(-w)[:MOST_LINKED].tolist():
             assigned = children.assigned[c].copy()
-            rows = np.flatnonzero((assigned >= 0) & (assigned < BLENDED))
+            exact = (assigned >= 0) & (assigned < BLENDED)
             parent = int(children.parent[c])
-            if w[c] < w.max() - ALTERNATIVE_NATS or parent < 0 or len(np.unique(self.model.spot_of[rows])) != PROOF:
+            if w[c] < w.max() - ALTERNATIVE_NATS or parent < 0 or distinct_spots(exact, self.model.spot_of) != PROOF:
                 continue
             pose = Pose(children.after.R[c].copy(), children.after.t[c].copy())
-            others = alternatives(self.model, pose, rows)
+            others = alternatives(self.model, pose, np.flatnonzero(exact))
             manoeuvre = bool(children.manoeuvre[c])
             p = self.temper.dynamics.p_manoeuvre
             weight = float(h.weight[parent]) + float(np.log(p if manoeuvre else 1 - p))

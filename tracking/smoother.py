@@ -156,9 +156,8 @@ class _Pass:
         new[lone] = -1
         self.probability = np.where((found >= 0) & ~lone[:, None], certain, np.nan)
         changed = bool(np.any(new != before))
-        self.measured = _alone(rec, self.views, self.every, new, self.extra, ref).measured
         self.trusted = ~unchecked & ~self.doubtful
-        self.measured &= ~self.doubtful
+        self.measured = whole & ~lone & ~self.doubtful
         return changed
 
     def look_back(self) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
 
@@ -151,8 +151,8 @@ def _badness(row: Judgement) -> tuple[int, float]:
     return CLASSES.index(row.failure), row.smoothed.identity - np.nan_to_num(row.smoothed.nees_max) * 1e-9
 
 
-def _count(rows: Sequence[Judgement], bad: object) -> str:
-    n = sum(bool(bad(r)) for r in rows)  # type: ignore[operator]
+def _count(rows: Sequence[Judgement], bad: Callable[[Judgement], object]) -> str:
+    n = sum(bool(bad(r)) for r in rows)
     return f"{n} = {n / len(rows):.1%}"
 
 

@@ -49,6 +49,7 @@ def a_record(frame: int = 0, off: float = 0.0, spots: int = N, sigma_px: float =
 
 
 def changed(record: FrameRecord, **fields: object) -> FrameRecord:
+    # mypy cannot know which field each keyword is for.
     return replace(record, tracked=replace(record.tracked, **fields))  # type: ignore[arg-type]
 
 

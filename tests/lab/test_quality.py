@@ -112,6 +112,7 @@ def test_no_frame_at_all_is_a_failure():
 
 def never(**changed: object) -> Verdict:
     arguments: dict[str, object] = {"causes": {Cause.UNEXPLAINED: FRAMES}} | changed
+    # mypy cannot know which argument each keyword is for.
     verdict = judge(facts_of(0, **arguments))  # type: ignore[arg-type]
     assert verdict.exit_status == 4
     assert verdict.reasons[0] == "the vehicle was never found: no frame has a measured pose"

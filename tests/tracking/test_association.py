@@ -24,7 +24,6 @@ from tracking.association import (
     Sights,
     associate,
     crowding,
-    distinct,
     distinct_spots,
     grown,
     in_picture,
@@ -346,7 +345,6 @@ def test_spots_are_counted_once_however_many_cameras_see_them():
     for _ in range(50):
         assigned = rng.choice([MISSED, 0, 5, BLENDED + 2], 6).astype(np.int64)
         own = {int(s) for s, a in zip(spot, assigned, strict=True) if 0 <= a < BLENDED}
-        assert distinct(assigned, spot) == len(own)
         chosen = (assigned >= 0) & (assigned < BLENDED)
         assert distinct_spots(chosen, spot) == len(own)
         assert distinct_spots(np.stack([chosen, ~chosen]), spot).tolist() == [

@@ -256,8 +256,8 @@ def test_the_jerk_that_moved_the_run_is_the_likeliest():
     factors = np.array([0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0])
     values = [log_likelihood(run.ref, run.ev, f * run.jerk) for f in factors]
     assert factors[int(np.argmax(values))] == 1.0
-    told = [left_out(run, f) for f in factors]
-    assert factors[int(np.argmax(told))] in (0.3, 1.0, 3.0)
+    likelihoods = [left_out(run, f) for f in factors]
+    assert factors[int(np.argmax(likelihoods))] in (0.3, 1.0, 3.0)
 
 
 def test_what_the_others_tell_is_each_frames_likelihood_with_that_frame_left_out():
