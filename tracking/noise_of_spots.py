@@ -1,0 +1,87 @@
+"""What fitted spots leave of their pictures: the only pixels that are as bright as the spots, as evidence of noise."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from geometry.arrays import Array, Bools
+from tracking.detections import Detections
+from tracking.noise import Picture
+
+_REACH = 2.2  # sigmas of a spot over which its residuals are taken
+_RING = 3.4  # sigmas up to which the background is fitted
+_FREE = 9  # numbers that a fit of a spot adjusts
+_MOST_SPOTS = 20  # per picture: the brightest
+_SMALLEST_PX = 0.9  # sigma: a Gaussian's mean over a pixel is no Gaussian in narrower ones
+_MOST_SIDE = 15  # pixels of a window's side that are used
+_LARGEST_PX = 12.0  # sigma: wider spots have more pixels than are needed
+
+
+@dataclass(frozen=True, slots=True)
+class SpotResiduals:
+    """m pixels of fitted spots."""
+
+    level: Array  # (m,), DN, fitted
+    light: Array  # (m,), DN, of it above the local background
+    square: Array  # (m,), DN^2: squared residual, scaled by what the fit has absorbed
+
+
+def residuals_of_spots(pictures: Sequence[Picture], found: Sequence[Detections], top_dn: float) -> SpotResiduals:
+    """Squared residuals of the detections of pictures (h, w), found by a first noise model. top_dn: the sensor clips.
+
+    The detections' shapes are taken as measured; amplitude and background plane are fitted with equal weights, so the
+    result hardly depends on the first model.
+    """
+    parts = []
+    for picture, points in zip(pictures, found, strict=True):
+        good = np.flatnonzero((points.major_px < _LARGEST_PX) & (points.minor_px > _SMALLEST_PX) & np.isfinite(points.peak))[:_MOST_SPOTS]
+        for i in good:
+            alone = _alone(points, int(i))
+            part = _residuals(picture, points, int(i), top_dn) if alone else None
+            if part is not None:
+                parts.append(part)
+    joined = np.concatenate(parts, axis=1) if parts else np.zeros((3, 0))
+    return SpotResiduals(joined[0], joined[1], joined[2])
+
+
+def _alone(points: Detections, i: int) -> bool:
+    """Whether no other spot reaches into the window of this one."""
+    away = np.hypot(*(points.uv_px - points.uv_px[i]).T)
+    away[i] = np.inf
+    return bool(np.all(away > _RING * (points.major_px[i] + points.major_px) + 2))
+
+
+def _residuals(picture: Picture, points: Detections, i: int, top_dn: float) -> Array | None:
+    """(3, m) level, light and squared residual of one spot's core; None where it is cut by the border or clipped."""
+    major, minor = float(points.major_px[i]), float(points.minor_px[i])
+    u, v = points.uv_px[i]
+    half = int(np.ceil(_RING * np.hypot(major, 0.3))) + 1
+    left, upper = round(float(u)) - half, round(float(v)) - half
+    side = 2 * half + 1
+    if left < 0 or upper < 0 or left + side > picture.shape[1] or upper + side > picture.shape[0]:
+        return None
+    values = picture[upper : upper + side, left : left + side].astype(float)
+    if values.max() >= top_dn:
+        return None
+    every = max(side // _MOST_SIDE, 1)  # of a wide spot some pixels are enough
+    values = values[::every, ::every]
+    du, dv = np.meshgrid(np.arange(side)[::every] + left - u, np.arange(side)[::every] + upper - v)
+    turn = np.radians(points.angle_deg[i])
+    along, across = du * np.cos(turn) + dv * np.sin(turn), -du * np.sin(turn) + dv * np.cos(turn)
+    r2 = along**2 / (major**2 + 1 / 12) + across**2 / (minor**2 + 1 / 12)
+    shape = np.exp(-0.5 * r2)
+    inside: Bools = r2 < _RING**2
+    A = np.stack([shape, np.ones_like(shape), du, dv, shape * along, shape * across], axis=-1)
+    A = np.concatenate([A, (shape * np.stack([along**2, along * across, across**2])).transpose(1, 2, 0)], axis=-1)
+    x = np.linalg.lstsq(A[inside], values[inside], rcond=None)[0]
+    fitted = A @ x
+    core = r2 < _REACH**2
+    count = int(inside.sum())
+    if count <= _FREE + 6 or x[0] <= 0:
+        return None
+    square = (values - fitted) ** 2 * count / (count - _FREE)
+    light = fitted - (x[1] + x[2] * du + x[3] * dv)
+    return np.stack([fitted[core], np.maximum(light[core], 0.0), square[core]])
