@@ -62,7 +62,13 @@ def run_all(jobs: list[PictureJob], workers: int) -> Iterator[PictureJudgement]:
 
 
 def run_pictures(
-    seeds: range, family: str | None, frames: int | None, workers: int, out: Path | None, keep: Path | None, verbose: bool
+    seeds: range,
+    family: str | None,
+    frames: int | None,
+    workers: int,
+    out: Path | None,
+    keep: Path | None,
+    verbose: bool,
 ) -> None:
     """Run the seeds and print the summary. family `all`: each seed takes the next family in turn."""
     names = [None] if family is None else list(FAMILIES) if family == "all" else [family]

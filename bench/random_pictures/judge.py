@@ -7,6 +7,7 @@ within max(3 px, 5 sigma / SNR) of the truth. Only scenes count that the true la
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +22,7 @@ from bench.random_scenes.answers import LOST, MEASURED, pass_of_files
 from bench.random_scenes.judge import CONFIDENTLY_WRONG, whitened_errors
 from bench.random_scenes.nuisances import FalsePoints
 from bench.random_scenes.oracle import ask_oracle
-from bench.random_scenes.scene import SHINING, Scene, composed
+from bench.random_scenes.scene import OUTSIDE, SHINING, Scene, composed
 from geometry.arrays import Array, Bools
 from lab.evidence import Kind
 from lab.results import read_spots, read_summary, read_table
@@ -202,14 +203,16 @@ def detections_against(renderer: Renderer, results: Path, asked: Bools, limit: A
 def wrong_diagnoses(renderer: Renderer, summary: Mapping[str, Any]) -> tuple[str, ...]:
     """Reasons of the verdict that the truth contradicts; rig, prior, lasers and cameras of a scene are in order.
 
-    Pictures that are missing, hidden spots and few measured frames of these may be named; that spots lie beside the
-    pose, that the rig or the prior is wrong, or that nothing shines may not.
+    Pictures that are missing, hidden spots and few measured frames of these may be named, and that the spots' errors
+    are larger than claimed. That the rig or the prior is wrong, or that nothing shines, may not.
     """
     scene, seen = renderer.ps.scene, visible(renderer)
     out = []
     for item in summary.get("verdict", {}).get("evidence", []):
         kind, camera = item["kind"], item.get("numbers", {}).get("camera")
         false = kind in (Kind.MISFIT, Kind.MODEL, Kind.NOT_ACQUIRED, Kind.FEW_POINTS, Kind.NEVER_FOUND, Kind.INTERNAL)
+        if kind == Kind.MODEL:
+            false = not _about_noise_or_hidden(item["what"], scene, seen)
         if camera in scene.rig.cameras:
             c = list(scene.rig.cameras).index(camera)
             mine = seen[:, scene.camera_of == c].any(axis=1)
@@ -220,6 +223,17 @@ def wrong_diagnoses(renderer: Renderer, summary: Mapping[str, Any]) -> tuple[str
         if false:
             out.append(f"{kind}: {item['what']}")
     return tuple(out)
+
+
+def _about_noise_or_hidden(what: str, scene: Scene, seen: Bools) -> bool:
+    """Whether a finding of the model check is about sigmas that are too small, or about a spot that is hardly seen."""
+    if what.startswith("the spots' residuals are"):
+        return True
+    named = re.match(r"spot (\S+) in camera `(.+)` was measured in", what)
+    if named is None:
+        return False
+    view = scene.rig.views().index((named[2], named[1]))
+    return bool(seen[:, view].sum() < SEEN * np.count_nonzero(scene.in_view[:, view] != OUTSIDE))
 
 
 def noise_figures(renderer: Renderer, summary: Mapping[str, Any]) -> tuple[NoiseFigures, ...]:
@@ -260,4 +274,3 @@ def _claimed(scene: Scene, results: Path) -> Array:
 def _rms(values: Array) -> float:
     values = values[np.isfinite(values)]
     return float(np.sqrt(np.mean(values**2))) if values.size else float("nan")
-

@@ -164,7 +164,9 @@ FAMILIES: dict[str, Callable[[np.random.Generator, Look], Look]] = {
         k, flicker=0.03, drift=float(r.choice([-0.2, 0.2])), background=float(r.uniform(0.06, 0.2)), texture=0.02
     ),
     "clutter": _clutter,
-    "flat-top": lambda r, k: replace(k, flat=int(r.integers(2, 4)), ratio=float(r.uniform(0.5, 1)), sigma_px=_log(r, 1, 8)),
+    "flat-top": lambda r, k: replace(
+        k, flat=int(r.integers(2, 4)), ratio=float(r.uniform(0.5, 1)), sigma_px=_log(r, 1, 8)
+    ),
     "quiet-sensor": lambda r, k: replace(
         k, sensor=replace(draw_sensor(r, "8"), full_well_e=float(r.uniform(3e4, 6e4)), read_e=1.0, row_e=0.0),
         background=float(r.uniform(0, 0.03)), texture=0.0, flicker=0.0,

@@ -73,7 +73,7 @@ class Renderer:
         else:
             light = np.asarray(still.ambient_e[patch.where] + still.steady_e[patch.where], dtype=float)
         texture = (look.texture * light) ** 2
-        return np.sqrt(look.sensor.variance_e2(light) + texture + self.compression_e2[camera])
+        return np.asarray(np.sqrt(look.sensor.variance_e2(light) + texture + self.compression_e2[camera]))
 
     def _draw_amplitudes(self) -> None:
         """Light so that the median spot of each camera, at rest, has the look's peak."""
@@ -125,7 +125,7 @@ class Renderer:
         if ps.hidden[k, view] or np.isnan(scene.uv_px[k, view]).any():
             return None
         during = ps.during(k)
-        ends, _ = ps.ends[view].hits(during[[0, -1]])
+        ends, _ = ps.ends[view].hits(during[np.array([0, -1])])
         if np.linalg.norm(ends[1] - ends[0]) < 1e-6:  # m: at rest
             during = during[ps.parts // 2 : ps.parts // 2 + 1]
         patch = ps.ends[view].patch(during)
@@ -147,7 +147,8 @@ class Renderer:
                 if scene.in_view[k, view] == SHINING:
                     self.snr[k, view] = self._snr(camera, patch)
         for path, (sigma, peak) in zip(self.clutter_uv[camera], self.clutter_light[camera], strict=True):
-            patch = gaussian_patch(*path[k], sigma, light.shape[::-1])  # type: ignore[arg-type]
+            u, v = path[k]
+            patch = gaussian_patch(u, v, sigma, (light.shape[1], light.shape[0]))
             if patch is not None:
                 light[patch.where] += patch.light * np.float32(peak)
         return light

@@ -77,7 +77,9 @@ def summary(rows: Sequence[PictureJudgement]) -> str:
     out += _figures(counted)
     families = list(dict.fromkeys(r.family for r in counted))
     if len(families) > 1:
-        out.append("family               scenes clean  right least/median  recall  NEES/6  err/sig  noise bg / half (median)")
+        out.append(
+            "family               scenes clean  right least/median  recall  NEES/6  err/sig  noise bg / half (median)"
+        )
         out += [_family_row(name, [r for r in counted if r.family == name]) for name in families]
     failed = [r for r in counted if r.classes]
     if failed:

@@ -28,7 +28,7 @@ from bench.random_scenes.scene import (
     fitted_motion,
     view_indices,
 )
-from geometry.arrays import Array, Bools
+from geometry.arrays import Array, Bools, Ints
 from geometry.pose import Pose
 
 FRAMES = 48
@@ -130,7 +130,7 @@ def _during(lab: Lab, look: Look, seed: int, motion: Motion, q: Array, times: Ar
 
 
 def _disturbances(
-    key: list[int], look: Look, frames: int, camera_of: Array, spot_of: Array, corner_frames: Array
+    key: list[int], look: Look, frames: int, camera_of: Ints, spot_of: Ints, corner_frames: Array
 ) -> tuple[Bools, Bools, str]:
     """Hidden views (T, n), pictures (T, c), and a few words; a video has all its pictures."""
     rng = np.random.default_rng([*key, NUISANCE])
@@ -149,19 +149,17 @@ def _disturbances(
     return hidden, has_image, f"; {words}{'; ' * bool(missing)}{missing}"
 
 
-def _beam_ends(
-    rng: np.random.Generator, look: Look, scene: Scene
-) -> tuple[tuple[BeamEnd, ...] | None, Array]:
+def _beam_ends(rng: np.random.Generator, look: Look, scene: Scene) -> tuple[tuple[BeamEnd, ...] | None, Array]:
     """The views' light; the median view has the look's width. None where a view has no place to take it from."""
     rig = scene.rig
     speckles: dict[str, Light | None] = {
         name: draw_speckle(rng, look.speckle, look.speckle_grain_px) for name in rig.cameras
     }
     unit = BeamShape(1e-3, 0.0)
-    probes = [
-        BeamEnd(rig.cameras[c], rig.screens[rig.spots[s].screen], rig.beams[rig.spots[s].beam], rig.spots[s], unit, 0.0, None)
-        for c, s in rig.views()
-    ]  # fmt: skip
+    probes = []
+    for c, s in rig.views():
+        spot = rig.spots[s]
+        probes.append(BeamEnd(rig.cameras[c], rig.screens[spot.screen], rig.beams[spot.beam], spot, unit, 0.0, None))
     widths, reaches = [], []
     for i, probe in enumerate(probes):
         shown = np.flatnonzero(scene.in_view[:, i])

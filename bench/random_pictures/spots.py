@@ -58,7 +58,7 @@ class BeamEnd:
     def covariance_px2(self, world_from_body: Pose) -> Array:
         """(2, 2), px^2: of the light in the picture without motion, to first order, for one pose as a stack (1,)."""
         hit, reach = self.hits(world_from_body)
-        _, along, across = self.rays(world_from_body)
+        _, _, across = self.rays(world_from_body)
         J = screen_jacobian(self.camera, self.screen, hit[0])
         R = self.screen.world_from_screen.rotation
         # Screen vectors onto the plane across the beam; its inverse spreads the cross-section over the screen.
@@ -91,8 +91,9 @@ class BeamEnd:
         high = np.minimum(np.ceil(uv.max(axis=0) + margin) + 1, size).astype(int)
         if (low >= high).any():
             return None
-        narrow = float(np.sqrt(max(np.linalg.eigvalsh(covariance)[0] - 1 / 12, 0.01)))
-        parts = parts or max(samples_per_pixel(narrow), 2 if self.speckle is not None else 1)
+        narrow = float(np.linalg.eigvalsh(covariance)[0]) - 1 / 12
+        own = np.sqrt(max(narrow - self.blur_px**2, 0.0))
+        parts = parts or max(samples_per_pixel(np.sqrt(narrow), own), 2 if self.speckle is not None else 1)
         u, v = (fine_pixels(low[i], high[i] - low[i], parts) for i in (0, 1))
         seen = screen_points(self.camera, self.screen, hits[middle], u, v)
         if seen is None:

@@ -162,9 +162,7 @@ def _hump(rng: np.random.Generator, width: int, height: int) -> Light:
     )
 
 
-def _detail(
-    rng: np.random.Generator, look: Look, ambient: Light, steady: Light
-) -> tuple[float, float, float] | None:
+def _detail(rng: np.random.Generator, look: Look, ambient: Light, steady: Light) -> tuple[float, float, float] | None:
     """Adds one detail; its place and radius where it looks like a spot."""
     height, width = ambient.shape
     u, v = float(rng.uniform(0, width - 1)), float(rng.uniform(0, height - 1))
