@@ -1,6 +1,8 @@
 """`python -m bench.random_scenes --seeds 1:301`: random scenes through the program, and how many are clean.
 
 One scene to look at: `--seeds N -v`, and `--keep DIR` writes its run folder. `--family NAME`: see families.py.
+
+`--pictures`: scenes as pictures, through detection too (bench/random_pictures; its families are in looks.py).
 """
 
 from __future__ import annotations
@@ -14,6 +16,8 @@ from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
 
+from bench.random_pictures.command import run_pictures
+from bench.random_pictures.looks import FAMILIES as PICTURE_FAMILIES
 from bench.random_scenes.answers import answers_in_memory, answers_through_files
 from bench.random_scenes.families import FAMILIES, family_scene
 from bench.random_scenes.judge import Judgement, judge
@@ -76,15 +80,24 @@ def seed_range(text: str) -> range:
 def main() -> None:
     """Run the seeds and print the summary."""
     parser = argparse.ArgumentParser(prog="bench.random_scenes", description=__doc__)
-    parser.add_argument("--seeds", type=seed_range, default=range(1, 301), metavar="A:B", help="default 1:301")
-    parser.add_argument("--family", choices=list(FAMILIES), help="one difficulty instead of everything at random")
-    parser.add_argument("--frames", type=int, help="default 200; each family has its own")
+    parser.add_argument("--seeds", type=seed_range, metavar="A:B", help="default 1:301, of pictures 1:61")
+    parser.add_argument("--family", metavar="NAME", help="one difficulty instead of everything at random")
+    parser.add_argument("--pictures", action="store_true", help="render pictures; --family all: one of each per seed")
+    parser.add_argument("--frames", type=int, help="default 200, in pictures 48; each family has its own")
     parser.add_argument("--jobs", type=int, default=1, help="processes (default 1)")
     parser.add_argument("--out", type=Path, help="a CSV file with a row per scene")
     parser.add_argument("--through-files", action="store_true", help="write run folders and process those")
     parser.add_argument("--keep", type=Path, metavar="DIR", help="write each scene's run folder there")
     parser.add_argument("-v", "--verbose", action="store_true", help="all figures of every scene")
     a = parser.parse_args()
+    known = ["all", *PICTURE_FAMILIES] if a.pictures else list(FAMILIES)
+    if a.family is not None and a.family not in known:
+        parser.error(f"--family: expected one of {', '.join(known)}; found {a.family}")
+    if a.seeds is None:
+        a.seeds = range(1, 61 if a.pictures else 301)
+    if a.pictures:
+        run_pictures(a.seeds, a.family, a.frames, a.jobs, a.out, a.keep, a.verbose)
+        return
     jobs = [Job(s, a.frames, a.family, a.through_files, a.keep) for s in a.seeds]
     rows: list[Judgement] = []
     for row in run_all(jobs, a.jobs):

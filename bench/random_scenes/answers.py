@@ -119,7 +119,7 @@ def answers_in_memory(scene: Scene, parameters: TrackerParameters | None = None)
     )
     smoothed: list[FrameRecord] = []
     causal: list[FrameRecord] = []
-    with _recorded_warnings() as caught, tempfile.TemporaryDirectory() as name:
+    with recorded_warnings() as caught, tempfile.TemporaryDirectory() as name:
         work = Path(name)
         tracker = TimedTracker(tracker_of(run))
         # PointReader and TimedTracker have what Pipeline uses of a reader and a tracker, and no more.
@@ -152,12 +152,12 @@ def answers_in_memory(scene: Scene, parameters: TrackerParameters | None = None)
 
 def answers_through_files(scene: Scene, run_folder: Path) -> Answers:
     """What `beampose run` makes of a written run folder (write_folder.py), read back from its tables."""
-    with _recorded_warnings() as caught, tempfile.TemporaryDirectory() as name:
+    with recorded_warnings() as caught, tempfile.TemporaryDirectory() as name:
         out = Path(name) / "out"
         start = time.process_time()
         outcome = process.process_run(run_folder, out)
         seconds = time.process_time() - start
-        smoothed = _pass_of_files(scene, out, causal=False)
+        smoothed = pass_of_files(scene, out, causal=False)
     return Answers(
         smoothed, None, outcome.exit_status, outcome.verdict.reasons, tuple(dict.fromkeys(caught)), len(caught),
         seconds / len(scene) * 1e3, float("nan"), float("nan"), 0,
@@ -165,7 +165,7 @@ def answers_through_files(scene: Scene, run_folder: Path) -> Answers:
 
 
 @contextlib.contextmanager
-def _recorded_warnings() -> Iterator[list[str]]:
+def recorded_warnings() -> Iterator[list[str]]:
     """The texts of all warnings raised meanwhile."""
     texts: list[str] = []
     with warnings.catch_warnings(record=True) as caught:
@@ -193,7 +193,8 @@ def _pass(scene: Scene, records: list[FrameRecord]) -> Pass:
     return Pass(labelled, uv, status, Pose(rotation, translation), covariance)
 
 
-def _pass_of_files(scene: Scene, results: Path, causal: bool) -> Pass:
+def pass_of_files(scene: Scene, results: Path, causal: bool) -> Pass:
+    """The answers in the tables of a results folder."""
     spots, poses = read_spots(results), read_poses(results, causal=causal)
     frames, views = len(scene), scene.rig.views()
     labelled, uv = np.zeros((frames, len(views)), dtype=bool), np.full((frames, len(views), 2), np.nan)

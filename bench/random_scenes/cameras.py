@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from bench.random_scenes.projection import fold_radius
@@ -25,9 +27,10 @@ def draw_camera(
     azimuth: float,
     vehicle_at: Array,
     focal_px: tuple[float, float],
+    sizes_px: Sequence[tuple[int, int]] = SIZES_PX,
 ) -> tuple[Camera, str]:
     """A camera that films a disc on its screen; `centre` (3,), `radius` in m, in base."""
-    width, height = SIZES_PX[rng.integers(len(SIZES_PX))]
+    width, height = sizes_px[rng.integers(len(sizes_px))]
     fill = rng.uniform(0.75, 1.15) * 0.45 * min(width, height)  # px that the radius takes
     shortest = max(focal_px[0], 0.5 * max(width, height))  # a field of view of 90 deg
     for _ in range(50):

@@ -6,11 +6,12 @@ whole lab is moved to a world frame and the beams to a body frame of their own.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from bench.random_scenes.cameras import FOCAL_PX, draw_camera
+from bench.random_scenes.cameras import FOCAL_PX, SIZES_PX, draw_camera
 from bench.random_scenes.vehicles import LEAST_SPOTS, LEFT, RIGHT, THIRD, Vehicle, draw_vehicle
 from geometry import rotations
 from geometry.arrays import Array
@@ -43,15 +44,15 @@ class Lab:
         return self.world_from_base @ Pose.from_ypr(q[:, 3:], q[:, :3]) @ self.vehicle_from_body
 
 
-def draw_lab(rng: np.random.Generator) -> Lab:
-    """A lab with at least LEAST_SPOTS spots on its screens when the vehicle rests."""
+def draw_lab(rng: np.random.Generator, sizes_px: Sequence[tuple[int, int]] = SIZES_PX) -> Lab:
+    """A lab with at least LEAST_SPOTS spots on its screens when the vehicle rests; sizes_px: of its pictures."""
     while True:
-        lab = _attempt(rng)
+        lab = _attempt(rng, sizes_px)
         if lab is not None:
             return lab
 
 
-def _attempt(rng: np.random.Generator) -> Lab | None:
+def _attempt(rng: np.random.Generator, sizes_px: Sequence[tuple[int, int]]) -> Lab | None:
     screens, screen_text = draw_screens(rng)
     vehicle = draw_vehicle(rng, third=_towards(screens[THIRD]) if THIRD in screens else None)
     rest = np.concatenate([rng.uniform(-0.3, 0.3, 3), np.deg2rad(rng.uniform(-12, 12, 3))])
@@ -60,7 +61,7 @@ def _attempt(rng: np.random.Generator) -> Lab | None:
     per_screen = [1 + int(rng.random() < 0.2) for _ in screens]
     if sum(per_screen) > 4:
         per_screen = [1] * len(screens)
-    return assembled(rng, screens, vehicle, rest, reach, lever, per_screen, screen_text)
+    return assembled(rng, screens, vehicle, rest, reach, lever, per_screen, screen_text, sizes_px=sizes_px)
 
 
 def assembled(
@@ -74,6 +75,7 @@ def assembled(
     screen_text: str,
     focal_px: tuple[float, float] = FOCAL_PX,
     plain_frames: bool = False,
+    sizes_px: Sequence[tuple[int, int]] = SIZES_PX,
 ) -> Lab | None:
     """Cameras for the screens, and all of it in one world and body; None where too few spots fall on the screens.
 
@@ -97,7 +99,9 @@ def assembled(
         for i in range(count):
             label = name if count == 1 else f"{name}{i + 1}"
             towards = azimuth + i * rng.uniform(1.5, 4.5)
-            cameras[label], text = draw_camera(rng, label, screen, centre, radius, towards, rest[:3], focal_px)
+            cameras[label], text = draw_camera(
+                rng, label, screen, centre, radius, towards, rest[:3], focal_px, sizes_px
+            )
             texts.append(text)
     world_from_base, vehicle_from_body = Pose.identity(), Pose.identity()
     turned = not plain_frames and rng.random() < 0.3

@@ -30,15 +30,29 @@ def write_run_folder(scene: Scene, folder: Path) -> Path:
         "cameras": {name: {"detections": "detections.csv"} for name in scene.rig.cameras},
         "notes": scene.text,
     }
-    if scene.prior is not None:
-        content["prior"] = {
+    content |= prior_block(scene)
+    save_run(content, folder)
+    _write(folder / "detections.csv", columns.DETECTIONS, _detection_rows(scene))
+    write_truth(scene, folder)
+    return folder
+
+
+def prior_block(scene: Scene) -> dict[str, object]:
+    """The key `prior` of run.yaml; empty without one."""
+    if scene.prior is None:
+        return {}
+    return {
+        "prior": {
             "position_m": scene.prior.centre.translation.tolist(),
             "yaw_pitch_roll_deg": np.rad2deg(scene.prior.centre.ypr).tolist(),
             "within_m": scene.prior.within_m,
             "within_deg": float(np.rad2deg(scene.prior.within_rad)),
         }
-    save_run(content, folder)
-    _write(folder / "detections.csv", columns.DETECTIONS, _detection_rows(scene))
+    }
+
+
+def write_truth(scene: Scene, folder: Path) -> None:
+    """truth/pose.csv and truth/spots.csv of a run folder."""
     (folder / "truth").mkdir(exist_ok=True)
     quaternions = scene.poses.quaternion_wxyz
     pose_rows = (
@@ -52,7 +66,6 @@ def write_run_folder(scene: Scene, folder: Path) -> Path:
         for i, (camera, spot) in enumerate(scene.rig.views())
     )
     _write(folder / "truth" / "spots.csv", columns.TRUTH_SPOTS, spot_rows)
-    return folder
 
 
 def _detection_rows(scene: Scene) -> Iterable[tuple[object, ...]]:

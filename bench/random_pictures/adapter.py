@@ -1,0 +1,28 @@
+"""The only place that knows how the program estimates a camera's noise, and how it reports the model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+
+from bench.random_pictures.sensors import Picture
+from lab.pipeline import NOISE_PICTURES
+from tracking.noise import NoiseModel, estimate_noise
+
+
+def model_of_pictures(frames: int, picture: Callable[[int], Picture]) -> NoiseModel:
+    """The noise model that a run without a stated noise starts with, from a recording of so many pictures."""
+    return estimate_noise([picture(k) for k in range(min(NOISE_PICTURES, frames))])
+
+
+def reported_model(block: Mapping[str, Any]) -> NoiseModel:
+    """The model in summary.json's `parameters.noise.CAMERA`."""
+    return NoiseModel(**{f.name: block[f.name] for f in fields(NoiseModel) if f.name in block})
+
+
+def variance_at(model: NoiseModel, level_dn: float) -> float:
+    """Variance, DN^2 of the file's numbers, that a model expects at a level."""
+    return float(np.asarray(model.variance(level_dn)))

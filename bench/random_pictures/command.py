@@ -1,0 +1,85 @@
+"""Draw, render, run and judge scenes in pictures: what `python -m bench.random_scenes --pictures` does."""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+import time
+import traceback
+from collections.abc import Iterator
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+
+import cv2
+
+from bench.random_pictures.judge import PictureJudgement, asked_pairs, judge
+from bench.random_pictures.looks import FAMILIES
+from bench.random_pictures.render import Renderer
+from bench.random_pictures.report import crashed, details, summary, write_rows
+from bench.random_pictures.scene import picture_scene
+from bench.random_pictures.write_folder import write_pictures
+from lab.errors import BeamposeError
+from lab.process import process_run
+
+
+@dataclass(frozen=True, slots=True)
+class PictureJob:
+    """One scene to run."""
+
+    seed: int
+    family: str | None
+    frames: int | None
+    keep: Path | None
+
+
+def judged(job: PictureJob) -> PictureJudgement:
+    """One scene; an exception of the program is a class of failure, not the end of the bench."""
+    cv2.setNumThreads(1)
+    start = time.process_time()
+    renderer = Renderer(picture_scene(job.seed, job.family, job.frames))
+    with tempfile.TemporaryDirectory() as name:
+        place = Path(name) if job.keep is None else job.keep / f"{job.family or 'mixed'}-{job.seed}"
+        folder = write_pictures(renderer, place / "run")
+        rendered = time.process_time()
+        try:
+            outcome = process_run(folder, place / "out")
+        except Exception as error:
+            plain = isinstance(error, BeamposeError)
+            trace = f"{type(error).__name__}: {error}" if plain else traceback.format_exc()
+            return crashed(renderer, int(asked_pairs(renderer).sum()), trace)
+        ran = time.process_time()
+        return judge(renderer, place / "out", outcome.exit_status, (rendered - start, ran - rendered))
+
+
+def run_all(jobs: list[PictureJob], workers: int) -> Iterator[PictureJudgement]:
+    """In the order of the jobs."""
+    if workers == 1:
+        yield from map(judged, jobs)
+        return
+    with get_context("spawn").Pool(workers) as pool:
+        yield from pool.imap(judged, jobs)
+
+
+def run_pictures(
+    seeds: range,
+    family: str | None,
+    frames: int | None,
+    workers: int,
+    out: Path | None,
+    keep: Path | None,
+    verbose: bool,
+) -> None:
+    """Run the seeds and print the summary. family `all`: each seed takes the next family in turn."""
+    names = [None] if family is None else list(FAMILIES) if family == "all" else [family]
+    jobs = [PictureJob(s, n, frames, keep) for s in seeds for n in names]
+    rows: list[PictureJudgement] = []
+    for row in run_all(jobs, workers):
+        rows.append(row)
+        if verbose:
+            print(details(row), flush=True)
+        elif sys.stderr.isatty():
+            print(f"\r{len(rows)} of {len(jobs)}", end="", file=sys.stderr, flush=True)
+    if out is not None:
+        write_rows(rows, out)
+    print(summary(rows))

@@ -1,0 +1,276 @@
+"""What a run says of pictures against their truth: spots, labels, poses, noise model, and the words of its verdict.
+
+A pair (view, frame) is asked for where the spot shines, its matched-filter SNR is at least LEAST_SNR, its centre is in
+the picture, and no other light of the scene lies within the widths of both. It is right where the reported place is
+within max(3 px, 5 sigma / SNR) of the truth. Only scenes count that the true labels solve with points of that quality.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bench.random_pictures.adapter import reported_model, variance_at
+from bench.random_pictures.render import Renderer
+from bench.random_pictures.sensors import true_noise
+from bench.random_scenes.answers import LOST, MEASURED, pass_of_files
+from bench.random_scenes.judge import CONFIDENTLY_WRONG, whitened_errors
+from bench.random_scenes.nuisances import FalsePoints
+from bench.random_scenes.oracle import ask_oracle
+from bench.random_scenes.scene import OUTSIDE, SHINING, Scene, composed
+from geometry.arrays import Array, Bools
+from lab.evidence import Kind
+from lab.results import read_spots, read_summary, read_table
+
+LEAST_SNR = 8.0
+SAME_SPOT_PX, SAME_SPOT_SIGMAS = 3.0, 5.0
+APART_WIDTHS = 4.0  # sigmas of both lights, within which two lights are not asked for
+LEAST_RIGHT, MOST_NEES = 0.97, 2.0  # of a good scene; NEES/6
+SEEN = 0.5  # share of a camera's pictures with a spot in them, from which "nothing detected" is wrong
+
+CLASSES = ("crash", "nothing measured", "confidently wrong", "wrong labels", "spots missing", "wrong diagnosis",
+           "exit status", "NEES")  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class NoiseFigures:
+    """One camera's noise model: estimated over true variance."""
+
+    camera: str
+    background_dn: float  # true level
+    background: float  # ratio there
+    half: float  # ratio at half of full scale
+
+
+@dataclass(frozen=True, slots=True)
+class PictureJudgement:
+    """A scene's verdict; ratios are nan where there is nothing to take them of."""
+
+    seed: int
+    family: str
+    counts: bool
+    why_not: str
+    classes: tuple[str, ...]
+    asked: int  # pairs
+    right: float  # share of them, measured and right
+    recall: float  # share of them with a detection at the right place
+    false_per_picture: float  # detections without any light of the scene near them
+    wrong: int  # labels
+    measured: float  # share of the frames
+    wrong_poses: int  # confidently
+    nees: float  # smoothed NEES/6, mean over measured and predicted poses
+    nees_max: float
+    scatter: float  # rms of the asked pairs' errors over their claimed sigmas, per coordinate
+    error_px: float  # rms, per coordinate
+    noise: tuple[NoiseFigures, ...]
+    exit_status: int
+    verdict: str
+    wrong_diagnoses: tuple[str, ...]
+    render_s: float  # process time
+    run_s: float
+    text: str
+
+    @property
+    def failure(self) -> str:
+        """The leading class, or clean."""
+        return self.classes[0] if self.classes else "clean"
+
+
+def visible(renderer: Renderer) -> Bools:
+    """(T, n): shining with LEAST_SNR in a picture that exists."""
+    scene = renderer.ps.scene
+    return scene.shining & (np.nan_to_num(renderer.snr) >= LEAST_SNR)
+
+
+def oracle_scene(renderer: Renderer) -> Scene:
+    """The recording as points: those of visible spots, with the noise that their light allows."""
+    ps = renderer.ps
+    scene, seen = ps.scene, visible(renderer)
+    sigma = np.full(len(scene.camera_of), 0.05)
+    for i in range(len(sigma)):
+        if seen[:, i].any():
+            sigma[i] = renderer.width_px[i] / float(np.median(renderer.snr[seen[:, i], i]))
+    nothing = FalsePoints(0.0, (15.0, 40.0), 0.0, tuple(np.zeros((0, 2)) for _ in scene.rig.cameras))
+    return composed(
+        ps.key, ps.seed, scene.rig, scene.poses, scene.frame_rate_hz, np.maximum(sigma, 0.01), nothing, ~seen,
+        scene.has_image, scene.corner_frames, ps.text, scene.prior,
+    )  # fmt: skip
+
+
+def other_lights(renderer: Renderer, k: int, camera: int, but: int = -1) -> Array:
+    """(m, 3) u, v, width (px) of everything in a picture that looks like a spot, without the view `but`."""
+    scene = renderer.ps.scene
+    views = np.flatnonzero((scene.camera_of == camera) & (scene.in_view[k] == SHINING))
+    views = views[views != but]
+    spots = np.column_stack([scene.uv_px[k, views], renderer.width_px[views]])
+    details = renderer.still[camera].bright * [1, 1, 1 / 3]
+    clutter = np.column_stack([renderer.clutter_uv[camera][:, k], renderer.clutter_light[camera][:, 0]])
+    return np.concatenate([spots, details, clutter])
+
+
+def asked_pairs(renderer: Renderer) -> Bools:
+    """(T, n): the pairs that are asked for."""
+    scene = renderer.ps.scene
+    out = visible(renderer)
+    for k, i in zip(*np.nonzero(out), strict=True):
+        lights = other_lights(renderer, k, int(scene.camera_of[i]), i)
+        away = np.linalg.norm(lights[:, :2] - scene.uv_px[k, i], axis=1)
+        out[k, i] = not np.any(away < APART_WIDTHS * np.maximum(lights[:, 2], renderer.width_px[i]) + 3)
+    return out
+
+
+def tolerances(renderer: Renderer) -> Array:
+    """(T, n) px, within which a place is right."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(np.fmax(SAME_SPOT_PX, SAME_SPOT_SIGMAS * renderer.width_px / np.fmax(renderer.snr, 1.0)))
+
+
+def judge(renderer: Renderer, results: Path, exit_status: int, seconds: tuple[float, float]) -> PictureJudgement:
+    """All figures of one scene. seconds: process time of rendering and of the run."""
+    ps = renderer.ps
+    scene = ps.scene
+    answer = pass_of_files(scene, results, causal=False)
+    summary = read_summary(results)
+    asked, limit = asked_pairs(renderer), tolerances(renderer)
+    error = answer.uv_px - scene.uv_px
+    away = np.linalg.norm(error, axis=-1)
+    right = answer.labelled & (away <= limit)
+    wrong = int((answer.labelled & ~(away <= limit)).sum())
+    nees = np.sum(whitened_errors(scene, answer) ** 2, axis=1)
+    good = (answer.status != LOST) & ~np.isnan(nees)
+    recall, false = detections_against(renderer, results, asked, limit)
+    oracle = ask_oracle(oracle_scene(renderer))
+    diagnoses = wrong_diagnoses(renderer, summary) if oracle.counts else ()
+    share = float((right & asked).sum() / max(asked.sum(), 1))
+    chosen = right & asked
+    sigma = _claimed(scene, results)
+    wrong_poses = int((nees[good] > CONFIDENTLY_WRONG).sum())
+    mean_nees = float(nees[good].mean()) / 6 if good.any() else float("nan")
+    classes = []
+    if not (answer.status == MEASURED).any():
+        classes.append("nothing measured")
+    if wrong_poses:
+        classes.append("confidently wrong")
+    if wrong:
+        classes.append("wrong labels")
+    if share < LEAST_RIGHT and "nothing measured" not in classes:
+        classes.append("spots missing")
+    if diagnoses:
+        classes.append("wrong diagnosis")
+    if exit_status:
+        classes.append("exit status")
+    if mean_nees > MOST_NEES:
+        classes.append("NEES")
+    return PictureJudgement(
+        seed=ps.seed, family=ps.family or "mixed", counts=oracle.counts, why_not=oracle.why_not, classes=tuple(classes),
+        asked=int(asked.sum()), right=share, recall=recall, false_per_picture=false, wrong=wrong,
+        measured=float((answer.status == MEASURED).mean()), wrong_poses=wrong_poses, nees=mean_nees,
+        nees_max=float(nees[good].max(initial=0.0)) / 6,
+        scatter=_rms(error[chosen] / sigma[chosen]), error_px=_rms(error[chosen]),
+        noise=noise_figures(renderer, summary), exit_status=exit_status,
+        verdict="; ".join(summary.get("verdict", {}).get("reasons", [])), wrong_diagnoses=diagnoses,
+        render_s=seconds[0], run_s=seconds[1], text=ps.text,
+    )  # fmt: skip
+
+
+def detections_against(renderer: Renderer, results: Path, asked: Bools, limit: Array) -> tuple[float, float]:
+    """Share of the asked pairs that have a detection at their place, and detections per picture far from any light."""
+    scene = renderer.ps.scene
+    table = read_table(results / "detections.csv", ("frame", "u_px", "v_px"), ("camera",))
+    cameras = list(scene.rig.cameras)
+    frame, uv = table.numbers["frame"], table.stack("u_px", "v_px")
+    camera = table.texts["camera"].recoded(tuple(cameras))
+    found = false = 0
+    for c in range(len(cameras)):
+        mine = np.flatnonzero(scene.camera_of == c)
+        for k in np.flatnonzero(scene.has_image[:, c]):
+            points = uv[(frame == k) & (camera == c)]
+            points = points[np.isfinite(points).all(axis=1)]
+            for i in mine[asked[k, mine]]:
+                found += bool(np.any(np.linalg.norm(points - scene.uv_px[k, i], axis=1) <= limit[k, i]))
+            lights = other_lights(renderer, int(k), c)
+            gap = np.linalg.norm(points[:, None] - lights[None, :, :2], axis=-1)
+            near = gap < np.maximum(5 * lights[:, 2], 5.0)
+            false += int((~near.any(axis=1)).sum())
+    return found / max(int(asked.sum()), 1), false / max(int(scene.has_image.sum()), 1)
+
+
+def wrong_diagnoses(renderer: Renderer, summary: Mapping[str, Any]) -> tuple[str, ...]:
+    """Reasons of the verdict that the truth contradicts; rig, prior, lasers and cameras of a scene are in order.
+
+    Pictures that are missing, hidden spots and few measured frames of these may be named, and that the spots' errors
+    are larger than claimed. That the rig or the prior is wrong, or that nothing shines, may not.
+    """
+    scene, seen = renderer.ps.scene, visible(renderer)
+    out = []
+    for item in summary.get("verdict", {}).get("evidence", []):
+        kind, camera = item["kind"], item.get("numbers", {}).get("camera")
+        false = kind in (Kind.MISFIT, Kind.MODEL, Kind.NOT_ACQUIRED, Kind.FEW_POINTS, Kind.NEVER_FOUND, Kind.INTERNAL)
+        if kind == Kind.MODEL:
+            false = not _about_noise_or_hidden(item["what"], scene, seen)
+        if camera in scene.rig.cameras:
+            c = list(scene.rig.cameras).index(camera)
+            mine = seen[:, scene.camera_of == c].any(axis=1)
+            pictures = scene.has_image[:, c]
+            false |= kind == Kind.NOTHING_DETECTED and mine[pictures].mean() > SEEN
+            false |= kind == Kind.NO_PICTURES and bool(pictures.any())
+            false |= kind in (Kind.CAMERA_LATE, Kind.CAMERA_STOPPED, Kind.MISSING_PICTURES) and bool(pictures.all())
+        if false:
+            out.append(f"{kind}: {item['what']}")
+    return tuple(out)
+
+
+def _about_noise_or_hidden(what: str, scene: Scene, seen: Bools) -> bool:
+    """Whether a finding of the model check is about sigmas that are too small, or about a spot that is hardly seen."""
+    if what.startswith("the spots' residuals are"):
+        return True
+    named = re.match(r"spot (\S+) in camera `(.+)` was measured in", what)
+    if named is None:
+        return False
+    view = scene.rig.views().index((named[2], named[1]))
+    return bool(seen[:, view].sum() < SEEN * np.count_nonzero(scene.in_view[:, view] != OUTSIDE))
+
+
+def noise_figures(renderer: Renderer, summary: Mapping[str, Any]) -> tuple[NoiseFigures, ...]:
+    """Of each camera whose model the run reports."""
+    blocks = summary.get("parameters", {}).get("noise", {})
+    return tuple(
+        compared(renderer, c, name, reported_model(blocks[name]))
+        for c, name in enumerate(renderer.ps.scene.rig.cameras)
+        if name in blocks
+    )
+
+
+def compared(renderer: Renderer, camera: int, name: str, model: Any) -> NoiseFigures:
+    """A model against the sensor, at the level of the background and at half of full scale."""
+    look, still = renderer.ps.look, renderer.still[camera]
+    rng = np.random.default_rng([*renderer.ps.key, 31, camera])
+    dark = float(np.median((still.ambient_e + still.steady_e)[::4, ::4]))
+    ratios, levels = [], []
+    for light in (dark, 0.5 * look.sensor.full_well_e):
+        level, variance = true_noise(look.sensor, light, rng)
+        levels.append(level)
+        # Rounding bounds what can be seen of a noise: a flat 8-bit background may not scatter at all.
+        floor = 4.0**look.sensor.shift / 12
+        ratios.append(variance_at(model, level) / max(variance, floor))
+    return NoiseFigures(name, levels[0], ratios[0], ratios[1])
+
+
+def _claimed(scene: Scene, results: Path) -> Array:
+    """(T, n, 2) px: the sigmas of spots.csv."""
+    spots = read_spots(results)
+    out = np.full((len(scene), len(scene.camera_of), 2), np.nan)
+    for j, view in enumerate(scene.rig.views()):
+        if view in spots.views:
+            out[spots.frames, j] = spots.sigma_px[:, spots.views.index(view)]
+    return out
+
+
+def _rms(values: Array) -> float:
+    values = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(values**2))) if values.size else float("nan")

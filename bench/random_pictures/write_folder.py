@@ -1,0 +1,70 @@
+"""A scene in pictures as a run folder in the form of the files' contract; rig.yaml states no noise."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+
+from bench.random_pictures.render import Renderer
+from bench.random_scenes.write_folder import prior_block, write_truth
+from lab.rig_file import RigFile, save_rig
+from lab.run_file import save_run
+
+# Noise does not compress: 11 ms for 1280x1024 in place of 27 at level 1 with filters, and no larger.
+_FAST_PNG = (
+    cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_NONE,
+    cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY,
+)  # fmt: skip
+
+
+def write_pictures(renderer: Renderer, folder: Path) -> Path:
+    """rig.yaml, run.yaml, truth and the pictures: a folder of PNG or JPEG files per camera, or a video in MJPG."""
+    ps = renderer.ps
+    scene, sensor = ps.scene, ps.look.sensor
+    folder.mkdir(parents=True, exist_ok=True)
+    save_rig(RigFile(scene.known_rig), folder / "rig.yaml")
+    video = sensor.file_format == "mjpg"
+    content: dict[str, object] = {
+        "name": f"{ps.family or 'mixed'}-{ps.seed}",
+        "rig": "rig.yaml",
+        "frame_rate_hz": scene.frame_rate_hz,
+        "exposure_s": ps.look.exposure_share / scene.frame_rate_hz,
+        "cameras": {name: {"frames": f"{name}.avi" if video else f"frames/{name}"} for name in scene.rig.cameras},
+        "notes": ps.text,
+    }
+    save_run(content | prior_block(scene), folder)
+    write_truth(scene, folder)
+    for c, name in enumerate(scene.rig.cameras):
+        if video:
+            _write_video(renderer, c, folder / f"{name}.avi")
+        else:
+            _write_files(renderer, c, folder / "frames" / name)
+    return folder
+
+
+def _write_files(renderer: Renderer, camera: int, folder: Path) -> None:
+    folder.mkdir(parents=True)
+    sensor, scene = renderer.ps.look.sensor, renderer.ps.scene
+    how = [cv2.IMWRITE_JPEG_QUALITY, sensor.quality] if sensor.lossy else list(_FAST_PNG)
+    for k in range(len(scene)):
+        if not scene.has_image[k, camera]:
+            renderer.expected(k, camera)  # how well spots could be seen
+            continue
+        path = folder / f"{k:06}.{'jpg' if sensor.lossy else 'png'}"
+        if not cv2.imwrite(str(path), renderer.raw(k, camera), how):
+            raise RuntimeError(f"{path}: cannot be written")
+
+
+def _write_video(renderer: Renderer, camera: int, path: Path) -> None:
+    size = list(renderer.ps.scene.rig.cameras.values())[camera].image_size_px
+    # OpenCV's own writer: through FFmpeg the quality cannot be set.
+    writer = cv2.VideoWriter(
+        str(path), cv2.CAP_OPENCV_MJPEG, cv2.VideoWriter.fourcc(*"MJPG"), 25.0, size,
+        [cv2.VIDEOWRITER_PROP_IS_COLOR, 0, cv2.VIDEOWRITER_PROP_QUALITY, renderer.ps.look.sensor.quality],
+    )  # fmt: skip
+    if not writer.isOpened():
+        raise RuntimeError(f"{path}: OpenCV cannot write an MJPG video")
+    for k in range(len(renderer.ps)):
+        writer.write(renderer.raw(k, camera))
+    writer.release()
