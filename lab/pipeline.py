@@ -9,19 +9,15 @@ from typing import Protocol
 
 import numpy as np
 
-from geometry.camera import SensorNoise
-from lab.frames import FrameReader, FrameSet, open_frames, pictures_at
+from lab.frames import FrameReader, FrameSet, open_frames
 from lab.pictures import Missing
-from lab.run_file import FramesFolder, Run
-from tracking.detect import find_spots
+from lab.run_file import Run
+from lab.sensor_noise import CameraNoise, camera_noises
 from tracking.detections import Detections
 from tracking.labels import PosePrior
-from tracking.noise import NoiseModel, estimate_noise
 from tracking.rigid_tracker import RigidTracker
 from tracking.spot_tracker import SpotTracker
 from tracking.tracked_frame import TrackedFrame
-
-NOISE_PICTURES = 3  # per camera, where the rig states no noise: enough for the slope, and read in an instant
 
 
 class Tracker(Protocol):
@@ -72,19 +68,19 @@ class Pipeline:
     run: Run
     reader: FrameReader
     tracker: Tracker
-    noise: dict[str, SensorNoise | NoiseModel]
+    noise: dict[str, CameraNoise]  # of cameras with pictures
     timings: Timings = field(default_factory=Timings)
 
     @staticmethod
     def of(run: Run) -> Pipeline:
         """Open a run. Raises InputError where its pictures cannot be found."""
         reader = open_frames(run)
-        noise: dict[str, SensorNoise | NoiseModel] = {}
-        for name, camera in run.rig.cameras.items():
-            model = camera.noise or _noise_of_pictures(run, reader, name)
-            if model is not None:
-                noise[name] = model
-        return Pipeline(run, reader, tracker_of(run), noise)
+        return Pipeline(run, reader, tracker_of(run), camera_noises(run, reader))
+
+    @property
+    def notes(self) -> list[str]:
+        """What a reader of the results should know of the pictures; complete once the iteration has ended."""
+        return self.reader.notes + [note for noise in self.noise.values() for note in noise.notes]
 
     def records(self) -> Iterator[FrameRecord]:
         """One record per frame number, from the first to the last."""
@@ -122,19 +118,7 @@ class Pipeline:
                 missing.append(picture.reason)
                 continue
             if isinstance(picture, np.ndarray):
-                if name not in self.noise:
-                    self.noise[name] = estimate_noise([picture])
-                picture = find_spots(picture, self.run.tracker.detect, self.noise[name])
+                picture = self.noise[name].detect(picture, self.run.tracker.detect)
             found.append(picture)
             missing.append("")
         return tuple(found), tuple(missing)
-
-
-def _noise_of_pictures(run: Run, reader: FrameReader, camera: str) -> NoiseModel | None:
-    """From the first readable pictures of a folder; videos and tables: None (a video's first picture will do)."""
-    if not isinstance(run.cameras[camera], FramesFolder):
-        return None
-    numbers = reader.listings[camera].numbers[:NOISE_PICTURES]
-    pictures = pictures_at(run, camera, [int(n) for n in numbers]).values()
-    usable = [p for p in pictures if isinstance(p, np.ndarray)]
-    return estimate_noise(usable) if usable else None

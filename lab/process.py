@@ -246,7 +246,7 @@ def _summary(
     wall_s: float,
 ) -> dict[str, Any]:
     frames = max(facts.frames, 1)
-    notes = list(pipeline.reader.notes)
+    notes = pipeline.notes
     if run.left_out:
         notes.append(f"cameras of the rig that this run has nothing of: {', '.join(run.left_out)}")
     if tally.unlisted:
@@ -294,7 +294,7 @@ def _summary(
         "versions": versions(),
         "parameters": {
             "tracker": dataclasses.asdict(run.tracker),
-            "noise": {name: dataclasses.asdict(model) for name, model in pipeline.noise.items()},
+            "noise": {name: noise.as_mapping() for name, noise in pipeline.noise.items()},
             "prior": _prior_numbers(run),
         },
         "inputs": fingerprints(run),

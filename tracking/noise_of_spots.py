@@ -37,7 +37,8 @@ def residuals_of_spots(pictures: Sequence[Picture], found: Sequence[Detections],
     """
     parts = []
     for picture, points in zip(pictures, found, strict=True):
-        good = np.flatnonzero((points.major_px < _LARGEST_PX) & (points.minor_px > _SMALLEST_PX) & np.isfinite(points.peak))[:_MOST_SPOTS]
+        fits = (points.major_px < _LARGEST_PX) & (points.minor_px > _SMALLEST_PX) & np.isfinite(points.peak)
+        good = np.flatnonzero(fits)[:_MOST_SPOTS]
         for i in good:
             alone = _alone(points, int(i))
             part = _residuals(picture, points, int(i), top_dn) if alone else None

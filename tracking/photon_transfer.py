@@ -3,8 +3,8 @@
 The variance of a pixel is the variance of the difference of two pictures, halved, where the scene stays still
 (Janesick, Photon Transfer, SPIE 2007, chapter 5; EMVA Standard 1288, release 4.0, 6.6). Texture, edges and spots of a
 vehicle at rest cancel in it. What does not cancel (moving spots, changing light) is removed by its local mean and by
-robust statistics. The evidence for the slope is weighed together with a broad prior, so neither a structure nor a lack of
-bright pixels can lead to a model that no sensor has. The combination is ours.
+robust statistics. The evidence for the slope is weighed together with a broad prior, so neither a structure nor a lack
+of bright pixels can lead to a model that no sensor has. The combination is ours.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from statistics import NormalDist
+from typing import Any, TypeAlias
 
 import cv2
 import numpy as np
@@ -20,9 +21,11 @@ from numpy.typing import NDArray
 
 from geometry.arrays import Array, Bools
 from tracking.detect import find_spots
-from tracking.noise import FULL_SCALE_E, ROUNDING_DN2, NoiseModel, Picture, quantile_variance
+from tracking.noise import FULL_SCALE_E, NoiseModel, Picture, guess_noise, quantile_variance
 from tracking.noise_of_spots import SpotResiduals, residuals_of_spots
 from tracking.normal_tail import clipped_normal
+
+Floats: TypeAlias = NDArray[Any]
 
 _SIDE = 15  # px: changes of the light that are smooth over so many pixels are no noise
 _KEPT = 3.5  # sigmas: differences beyond are outliers ...
@@ -64,6 +67,11 @@ class _Levels:
     sigma: Array  # (k,), DN^2, of the variance
     temporal: bool
 
+    def scaled(self, floor: float) -> _Levels:
+        """With all variances larger by so much that the least is near `floor`, where that is larger by _GRAIN."""
+        factor = floor / max(float(self.variance.min()), 1e-12) if len(self.variance) else 1.0
+        return replace(self, variance=self.variance * factor, sigma=self.sigma * factor) if factor > _GRAIN else self
+
 
 def estimate_noise(pictures: Sequence[Picture]) -> NoiseEstimate:
     """The noise of a sensor from pictures (h, w) of one camera in their order of time, best in pairs of neighbours.
@@ -100,11 +108,6 @@ def estimate_noise(pictures: Sequence[Picture]) -> NoiseEstimate:
         slope, slope_sigma = _summary(slopes, belief)
     model = NoiseModel(floor, slope, background)
     return NoiseEstimate(model, floor_sigma, slope_sigma, saturation, step, len(usable), levels.temporal)
-
-
-def with_saturation(estimate: NoiseEstimate, saturation_dn: float | None) -> NoiseEstimate:
-    """The estimate with a saturation level that is known."""
-    return replace(estimate, saturation_dn=saturation_dn)
 
 
 # What the numbers of the pictures are -------------------------------------------------------------------------------
@@ -153,15 +156,17 @@ def _small_picture_variance(pictures: Sequence[Picture]) -> float:
 def _levels(pictures: Sequence[Picture], top: float, rounding: float) -> _Levels:
     """Variance as a function of level: in time if the scene stays still, else within the pictures."""
     within = _binned(*_within(pictures[0], top), rounding)
+    # Noise that goes together over pixels (JPEG, demosaicing) hardly shows in differences of near ones.
+    within = replace(within, temporal=False).scaled(guess_noise(pictures[0]).floor_dn2)
     samples = [_between(a, b, top) for a, b in _pairs(pictures)]
     if not samples:
-        return replace(within, temporal=False)
+        return within
     level, difference, grain = (np.concatenate(x) for x in zip(*samples, strict=True))
     between = _binned(level, difference, rounding)
     between = replace(between, variance=between.variance * np.median(grain), sigma=between.sigma * np.median(grain))
     at = float(np.median(level))
     if _floor(between, at)[0] > 1.5 * max(_floor(within, at)[0], 2 * rounding):
-        return replace(within, temporal=False)  # the camera or the scene shakes
+        return within  # the camera or the scene shakes
     return between
 
 
@@ -173,7 +178,7 @@ def _pairs(pictures: Sequence[Picture]) -> list[tuple[Picture, Picture]]:
     return [(a, b) for a, b in some if not np.array_equal(a, b)]
 
 
-def _between(a: Picture, b: Picture, top: float) -> tuple[Array, Array, Array]:
+def _between(a: Picture, b: Picture, top: float) -> tuple[Floats, Floats, Array]:
     """Levels (m,), differences in time over sqrt 2 (m,), and by how much noise goes together over pixels (1,)."""
     a, b = _stripes(a), _stripes(b)
     x, y = a.astype(np.float32), b.astype(np.float32)
@@ -202,7 +207,7 @@ def _stripes(picture: Picture) -> Picture:
 _FOURTH_DIFFERENCE = np.array([1.0, -4.0, 6.0, -4.0, 1.0])  # zero for anything cubic; nearly so for a smooth spot
 
 
-def _within(picture: Picture, top: float) -> tuple[Array, Array]:
+def _within(picture: Picture, top: float) -> tuple[Floats, Floats]:
     """Levels (m,) and fourth differences in u and v (m,), normalised to a pixel's noise. After Immerkaer (1996), "Fast
     noise variance estimation", Computer Vision and Image Understanding 64, with a higher difference."""
     picture = _stripes(picture)
@@ -215,7 +220,7 @@ def _within(picture: Picture, top: float) -> tuple[Array, Array]:
     return level[chosen], rest[chosen]
 
 
-def _sample(level: NDArray[np.float32]) -> Bools:
+def _sample(level: Floats) -> Bools:
     """A sparse sample of the background, and every pixel that is brighter."""
     few = level[::8, ::8]
     middle = np.median(few)
@@ -226,7 +231,7 @@ def _sample(level: NDArray[np.float32]) -> Bools:
     return chosen
 
 
-def trimmed_variance(deviates: NDArray[np.floating]) -> float:
+def trimmed_variance(deviates: Floats) -> float:
     """Variance of normal, perhaps rounded, deviates among up to a tenth of outliers."""
     size = np.abs(deviates)
     variance = quantile_variance(size) if size.size else 0.0
@@ -237,7 +242,7 @@ def trimmed_variance(deviates: NDArray[np.floating]) -> float:
     return variance
 
 
-def _binned(level: Array, deviates: Array, rounding: float) -> _Levels:
+def _binned(level: Floats, deviates: Floats, rounding: float) -> _Levels:
     """Variances of up to `_LEVELS` levels with enough pixels each."""
     if len(level) < _LEAST_PIXELS:
         return _Levels(np.zeros(0), np.zeros(0), np.zeros(0), temporal=True)
@@ -368,6 +373,3 @@ def _summary(slopes: Array, belief: Array) -> tuple[float, float]:
     log = np.log(slopes)
     mean = float(weight @ log)
     return float(np.exp(mean)), float(np.sqrt(weight @ (log - mean) ** 2))
-
-
-__all__ = ["ROUNDING_DN2", "NoiseEstimate", "estimate_noise", "saturation_level", "trimmed_variance", "with_saturation"]

@@ -9,13 +9,14 @@ from typing import Any
 import numpy as np
 
 from bench.random_pictures.sensors import Picture
-from lab.pipeline import NOISE_PICTURES
-from tracking.noise import NoiseModel, estimate_noise
+from lab.sensor_noise import frames_to_learn_from
+from tracking.noise import NoiseModel
+from tracking.photon_transfer import estimate_noise
 
 
 def model_of_pictures(frames: int, picture: Callable[[int], Picture]) -> NoiseModel:
     """The noise model that a run without a stated noise starts with, from a recording of so many pictures."""
-    return estimate_noise([picture(k) for k in range(min(NOISE_PICTURES, frames))])
+    return estimate_noise([picture(k) for k in frames_to_learn_from(frames)]).model
 
 
 def reported_model(block: Mapping[str, Any]) -> NoiseModel:

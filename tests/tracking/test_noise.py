@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 
 from geometry.camera import SensorNoise
 from tests.tracking.rendering import Scene, Spot, photograph
-from tracking.noise import ROUNDING_DN2, NoiseModel, estimate_noise, guess_noise
+from tracking.noise import ROUNDING_DN2, NoiseModel, guess_noise
+from tracking.photon_transfer import estimate_noise
 
 SPOTS = [
     Spot(60 + 70 * i, 60 + 60 * j, 40.0 + 35 * ((i + j) % 5), 2.4, 1.9, 30.0 * i) for i in range(5) for j in range(4)
@@ -30,7 +31,7 @@ def test_more_light_never_scatters_less(level, more):
 def test_noise_is_estimated_from_pictures_of_spots(gain, read):
     rng = np.random.default_rng(1)
     scene = Scene(SPOTS, (400, 300), 15.0, (10.0, 5.0), gain=gain, read=read)
-    model = estimate_noise([photograph(scene, rng) for _ in range(6)])
+    model = estimate_noise([photograph(scene, rng) for _ in range(6)]).model
     for level in (15.0, 60.0, 120.0):
         truth = level / gain + read**2 + ROUNDING_DN2
         assert 0.8 * truth < model.variance(level) < 1.3 * truth
@@ -44,7 +45,7 @@ def test_noise_that_goes_together_over_pixels_is_not_taken_for_less():
     for axis in (0, 1):
         white = np.apply_along_axis(np.convolve, axis, white, kernel, "same")
     image = np.rint(60 + white).astype(np.uint8)
-    assert estimate_noise([image]).floor_dn2 > 0.8 * white.var()
+    assert estimate_noise([image]).model.floor_dn2 > 0.8 * white.var()
 
 
 @pytest.mark.parametrize("bits", [8, 16])
@@ -59,7 +60,7 @@ def test_a_quick_guess_knows_the_background_noise(bits):
 @pytest.mark.parametrize("shape", [(1, 1), (3, 50), (0, 0), (9, 9)])
 def test_pictures_too_small_to_tell_leave_the_rounding(shape):
     assert guess_noise(np.zeros(shape, np.uint8)).floor_dn2 == pytest.approx(ROUNDING_DN2)
-    assert estimate_noise([np.zeros(shape, np.uint8)]).floor_dn2 == pytest.approx(ROUNDING_DN2)
+    assert estimate_noise([np.zeros(shape, np.uint8)]).model.floor_dn2 == pytest.approx(ROUNDING_DN2)
 
 
 def test_no_picture_and_no_noise_are_refused():

@@ -11,7 +11,8 @@ import pytest
 
 from tracking.detect import find_spots
 from tracking.detections import Detections
-from tracking.noise import Picture, estimate_noise
+from tracking.noise import Picture
+from tracking.photon_transfer import estimate_noise
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 px = 1.0
@@ -82,7 +83,7 @@ def test_a_burnt_out_spot_with_a_noisy_halo_is_found_at_its_core():
 def test_the_brightest_stars_are_found_and_are_as_narrow_as_stars(name):
     """Brightest: the ten highest maxima of a smoothed picture that are not hot pixels or at the border."""
     image = picture(f"star_fields/{name}")
-    found = find_spots(image, noise=estimate_noise([image]))
+    found = find_spots(image, noise=estimate_noise([image]).model)
     smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), 1.2)
     smooth -= cv2.blur(smooth, (41, 41))
     highest = (smooth == cv2.dilate(smooth, np.ones((15, 15)))) & (smooth > 0)
