@@ -15,8 +15,8 @@ from lab.run_file import DetectionsTable, FramesFolder, Run
 from tracking.detect import find_spots
 from tracking.detections import Detections
 from tracking.noise import NoiseModel, Picture, guess_noise
+from tracking.noise_estimation.photon_transfer import NoiseEstimate, estimate_noise
 from tracking.parameters import DetectParameters
-from tracking.photon_transfer import NoiseEstimate, estimate_noise
 
 VIDEO_PICTURES = (0, 1, 8, 9, 16, 17)  # of a video, whose end cannot be read without reading all of it
 _BLANK = 3  # pictures without any point, after which the noise is doubted ...

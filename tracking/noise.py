@@ -15,9 +15,9 @@ Picture: TypeAlias = NDArray[np.uint8] | NDArray[np.uint16]
 
 ROUNDING_DN2 = 1.0 / 12.0  # variance of rounding to whole DN
 
-# Where nothing is known of the gain: a full scale of 10 000 electrons, as small industrial sensors have. 8 bit: 39
-# electrons per DN.
-FULL_SCALE_E = 10_000.0
+# Where nothing is known of the gain: a full scale of 15 000 electrons, as small industrial sensors have (5 000 to
+# 60 000). 8 bit: 59 electrons per DN.
+FULL_SCALE_E = 15_000.0
 
 NORMAL_68, NORMAL_95 = 0.994457883, 1.959963985  # quantiles 0.68 and 0.95 of |standard normal|
 

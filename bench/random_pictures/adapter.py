@@ -11,7 +11,7 @@ import numpy as np
 from bench.random_pictures.sensors import Picture
 from lab.sensor_noise import frames_to_learn_from
 from tracking.noise import NoiseModel
-from tracking.photon_transfer import estimate_noise
+from tracking.noise_estimation.photon_transfer import estimate_noise
 
 
 def model_of_pictures(frames: int, picture: Callable[[int], Picture]) -> NoiseModel:

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from geometry.camera import SensorNoise
 from tests.tracking.rendering import Scene, Spot, photograph
 from tracking.noise import ROUNDING_DN2, NoiseModel, guess_noise
-from tracking.photon_transfer import estimate_noise
+from tracking.noise_estimation.photon_transfer import estimate_noise
 
 SPOTS = [
     Spot(60 + 70 * i, 60 + 60 * j, 40.0 + 35 * ((i + j) % 5), 2.4, 1.9, 30.0 * i) for i in range(5) for j in range(4)

@@ -12,7 +12,7 @@ import pytest
 from tracking.detect import find_spots
 from tracking.detections import Detections
 from tracking.noise import Picture
-from tracking.photon_transfer import estimate_noise
+from tracking.noise_estimation.photon_transfer import estimate_noise
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 px = 1.0

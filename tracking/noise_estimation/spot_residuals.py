@@ -16,6 +16,7 @@ _RING = 3.4  # sigmas up to which the background is fitted
 _FREE = 9  # numbers that a fit of a spot adjusts
 _MOST_SPOTS = 20  # per picture: the brightest
 _SMALLEST_PX = 0.9  # sigma: a Gaussian's mean over a pixel is no Gaussian in narrower ones
+_BLURRED = 0.1  # share of a spot's peak whose grain the lens carries into its wings
 _MOST_SIDE = 15  # pixels of a window's side that are used
 _LARGEST_PX = 12.0  # sigma: wider spots have more pixels than are needed
 
@@ -26,6 +27,7 @@ class SpotResiduals:
 
     level: Array  # (m,), DN, fitted
     light: Array  # (m,), DN, of it above the local background
+    grainy: Array  # (m,), DN, light whose grain reaches this pixel: the lens blurs some of the core's into the wings
     square: Array  # (m,), DN^2: squared residual, scaled by what the fit has absorbed
 
 
@@ -44,8 +46,8 @@ def residuals_of_spots(pictures: Sequence[Picture], found: Sequence[Detections],
             part = _residuals(picture, points, int(i), top_dn) if alone else None
             if part is not None:
                 parts.append(part)
-    joined = np.concatenate(parts, axis=1) if parts else np.zeros((3, 0))
-    return SpotResiduals(joined[0], joined[1], joined[2])
+    joined = np.concatenate(parts, axis=1) if parts else np.zeros((4, 0))
+    return SpotResiduals(*joined)
 
 
 def _alone(points: Detections, i: int) -> bool:
@@ -56,7 +58,7 @@ def _alone(points: Detections, i: int) -> bool:
 
 
 def _residuals(picture: Picture, points: Detections, i: int, top_dn: float) -> Array | None:
-    """(3, m) level, light and squared residual of one spot's core; None where it is cut by the border or clipped."""
+    """(4, m) level, light, grainy light, squared residual of one spot's core; None: cut by the border, or clipped."""
     major, minor = float(points.major_px[i]), float(points.minor_px[i])
     u, v = points.uv_px[i]
     half = int(np.ceil(_RING * np.hypot(major, 0.3))) + 1
@@ -84,5 +86,5 @@ def _residuals(picture: Picture, points: Detections, i: int, top_dn: float) -> A
     if count <= _FREE + 6 or x[0] <= 0:
         return None
     square = (values - fitted) ** 2 * count / (count - _FREE)
-    light = fitted - (x[1] + x[2] * du + x[3] * dv)
-    return np.stack([fitted[core], np.maximum(light[core], 0.0), square[core]])
+    light = np.maximum(fitted - (x[1] + x[2] * du + x[3] * dv), 0.0)[core]
+    return np.stack([fitted[core], light, light + _BLURRED * light.max(), square[core]])

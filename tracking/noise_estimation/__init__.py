@@ -1,0 +1,1 @@
+"""The noise of a sensor, estimated from its own pictures (photon_transfer.estimate_noise)."""
