@@ -29,6 +29,7 @@ class Smoothing:
     jerk_rad_s3: float  # ... and of the rotation's, rad/s^3 per sqrt(Hz)
     iterations: int
     relabelled: int  # labels that the second look changed
+    place_share: float  # of the spots' error variance that averaging over a vehicle at rest does not lessen
     seconds: float
 
 
@@ -77,8 +78,9 @@ class TwoPasses:
         seconds = time.perf_counter() - clock
         self.pipeline.timings.smoothing += seconds
         self.smoothing = Smoothing(
-            float(smoothed.jerk[0]), float(smoothed.jerk[1]), smoothed.iterations, smoothed.relabelled, seconds
-        )
+            float(smoothed.jerk[0]), float(smoothed.jerk[1]), smoothed.iterations, smoothed.relabelled,
+            smoothed.place_share, seconds,
+        )  # fmt: skip
         return smoothed
 
     def _tell(self, done: int, total: int | None, stage: str) -> None:

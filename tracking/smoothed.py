@@ -27,7 +27,8 @@ class Smoothed:
     parameters: TrackerParameters
     poses: Pose  # (T,)
     velocities: Array  # (T, 6): m/s in world, rad/s in body
-    covariance: Array  # (T, 6, 6) of the poses, of the noise
+    covariance: Array  # (T, 6, 6) of the poses, of noise and of errors that stay in their place
+    place_share: float  # of the spots' error variance that stays in its place (tracking/place_errors.py)
     systematic: Array  # (T or 1, 6, 6) and the calibration's share to be added
     motion_covariance: Array  # (T, 6, 6) of the velocities
     known: Bools  # (T,): the pose says something

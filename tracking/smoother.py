@@ -27,6 +27,7 @@ from tracking.hypotheses import CHECK_PX, FEW, PROOF, SURE
 from tracking.information import controlled, fit_alone, frame_information
 from tracking.misfit import DEADBAND
 from tracking.motion import process_noise
+from tracking.place_errors import place_errors
 from tracking.recording import Recording
 from tracking.relabel import AllDetections, clutter_density, labelled_points, relabelled
 from tracking.smoothed import Smoothed
@@ -236,6 +237,7 @@ class _Pass:
         causal = self.causal
         assigned = self.assigned
         differ = (assigned % BLENDED != causal % BLENDED) & ~((assigned < 0) & (causal < 0))
+        places = self._place_errors(Reference(R, t, ref.m), pose_P)
         strength = np.full(2, np.nan)
         if motion.log_density is not None:
             half = 0.5 * np.median(motion.log_density, axis=0)
@@ -245,7 +247,8 @@ class _Pass:
             parameters=self.parameters,
             poses=Pose(R, t),
             velocities=ref.m[:, :6],
-            covariance=pose_P,
+            covariance=pose_P * places[1][:, None, None],
+            place_share=places[0],
             systematic=self.systematic,
             motion_covariance=motion_P,
             known=motion.known,
@@ -260,6 +263,27 @@ class _Pass:
             noise_scale=self.scale,
             extra=self.extra,
         )
+
+    def _place_errors(self, ref: Reference, pose_P: Array) -> tuple[float, Array]:
+        """The share of errors that stay in their place, and by how much (T,) the poses' covariances grow for it."""
+        averaged = np.full(len(self.rec), np.nan)
+        for k in np.flatnonzero(self.own.measured).tolist():
+            averaged[k] = 6 / max(float(np.trace(np.linalg.solve(self.own.covariance[k], pose_P[k]))), 1e-9)
+        usual = float(np.nanmedian(averaged)) if np.isfinite(averaged).any() else 1.0
+        averaged = np.where(np.isfinite(averaged), averaged, usual)
+        shape = (*self.assigned.shape, 2)
+        residual, uv_px = np.full(shape, np.nan), np.full(shape, np.nan)
+        expected, _ = project_all(self.views, ref.R, ref.t)
+        explained = np.zeros(shape[1])
+        for k in np.flatnonzero(self.own.measured).tolist():
+            use, uv, cov = labelled_points(self.every, k, self.assigned[k], self.extra)
+            use = use & np.isfinite(expected[k]).all(axis=-1)
+            size = np.sqrt(0.5 * np.trace(cov[use], axis1=1, axis2=2))
+            residual[k, use] = (uv[use] - expected[k, use]) / size[:, None]
+            uv_px[k, use] = uv[use]
+            explained[use] = 0.5 * np.trace(self.extra[use], axis1=1, axis2=2) / size**2
+        found = place_errors(residual, uv_px, self.every.usual_px, averaged, explained)
+        return found.share, found.factor(averaged)
 
 
 def _chained(measured: Bools, controlled: Bools) -> Bools:
