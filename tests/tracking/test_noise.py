@@ -1,5 +1,9 @@
 """The noise model: from a sensor's data sheet, and estimated from pictures."""
 
+from dataclasses import dataclass
+from statistics import NormalDist
+
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
@@ -7,12 +11,64 @@ from hypothesis import strategies as st
 
 from geometry.camera import SensorNoise
 from tests.tracking.rendering import Scene, Spot, photograph
+from tracking.detect import find_spots
 from tracking.noise import ROUNDING_DN2, NoiseModel, guess_noise
+from tracking.noise_estimation.grey_values import saturation_level
 from tracking.noise_estimation.photon_transfer import estimate_noise
+from tracking.noise_estimation.rounding import clipped_normal, unrounded
 
 SPOTS = [
     Spot(60 + 70 * i, 60 + 60 * j, 40.0 + 35 * ((i + j) % 5), 2.4, 1.9, 30.0 * i) for i in range(5) for j in range(4)
 ]
+
+
+@dataclass
+class Lab:
+    """A still scene filmed by a sensor: texture, a gradient, bright details and spots that move."""
+
+    bits: int = 8
+    shift: int = 0  # bits at the lower end of the file's numbers that are not used
+    gain: float = 40.0  # electrons per DN
+    read_e: float = 6.0
+    black: float = 4.0
+    background: float = 18.0
+    texture: float = 0.04
+    spot_peak: float = 150.0
+    flicker: float = 0.0
+    speed_px: float = 9.0
+    details: int = 8
+    quality: int | None = None  # of JPEG
+
+    def pictures(self, seed: int, count: int = 6) -> list[np.ndarray]:
+        rng = np.random.default_rng(seed)
+        h, w = 400, 520
+        v, u = np.mgrid[:h, :w]
+        grain = cv2.GaussianBlur(rng.standard_normal((h, w)), (0, 0), 1.5)
+        albedo = 1 + self.texture * grain / grain.std()
+        light = self.background * (1 + 0.4 * (u / w - 0.5)) * albedo
+        for x, y in rng.uniform([20, 20], [w - 20, h - 20], (self.details, 2)):
+            light += 5 * self.background * (np.hypot(u - x, v - y) < 5)
+        start, step = rng.uniform(60, 300, (5, 2)), rng.normal(0, self.speed_px, (5, 2))
+        out = []
+        for k in range(count):
+            lit = light.copy()
+            for x, y in start + k * step:
+                lit += self.spot_peak * np.exp(-((u - x) ** 2 + (v - y) ** 2) / (2 * 2.2**2)) * albedo
+            lit *= 1 + self.flicker * rng.standard_normal()
+            noise = np.sqrt(np.maximum(lit, 0) * self.gain + self.read_e**2) / self.gain * rng.standard_normal((h, w))
+            grey = np.clip(np.rint(lit + self.black + noise), 0, 2**self.bits - 1)
+            picture = (grey * 2**self.shift).astype(np.uint8 if self.bits == 8 else np.uint16)
+            if self.quality is not None:
+                picture = cv2.imdecode(
+                    cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, self.quality])[1], cv2.IMREAD_GRAYSCALE
+                )
+            out.append(picture)
+        return out
+
+    def variance(self, level: float) -> float:
+        """Of a pixel at this level of the sensor's own numbers, in those of the file."""
+        own = (max(level - self.black, 0.0) * self.gain + self.read_e**2) / self.gain**2 + ROUNDING_DN2
+        return own * 4.0**self.shift
 
 
 def test_a_sensor_of_38_electrons_per_dn_scatters_as_its_electrons_do():
@@ -28,13 +84,101 @@ def test_more_light_never_scatters_less(level, more):
 
 
 @pytest.mark.parametrize(("gain", "read"), [(30.0, 1.5), (10.0, 1.0), (60.0, 3.0)])
-def test_noise_is_estimated_from_pictures_of_spots(gain, read):
+def test_noise_is_estimated_from_pictures_of_spots_at_rest(gain, read):
     rng = np.random.default_rng(1)
     scene = Scene(SPOTS, (400, 300), 15.0, (10.0, 5.0), gain=gain, read=read)
     model = estimate_noise([photograph(scene, rng) for _ in range(6)]).model
     for level in (15.0, 60.0, 120.0):
         truth = level / gain + read**2 + ROUNDING_DN2
         assert 0.8 * truth < model.variance(level) < 1.3 * truth
+
+
+@pytest.mark.parametrize(
+    "lab",
+    [
+        Lab(),
+        Lab(texture=0.0, details=0),
+        Lab(speed_px=0.0),
+        Lab(flicker=0.03),
+        Lab(bits=12, gain=3.0, background=300.0, black=60.0, spot_peak=2400.0),
+        Lab(bits=12, shift=4, gain=3.0, background=300.0, black=60.0, spot_peak=2400.0),
+        Lab(bits=10, gain=12.0, background=60.0, black=20.0, spot_peak=500.0),
+        Lab(bits=16, gain=0.4, read_e=3.0, background=5000.0, black=1000.0, spot_peak=38_000.0),
+        Lab(gain=160.0, read_e=3.0),
+        Lab(background=80.0, texture=0.06, spot_peak=300.0),
+    ],
+    ids=["usual", "plain", "at rest", "flicker", "12 bit", "12 of 16", "10 bit", "16 bit", "fine steps", "clipped"],
+)
+def test_the_structure_of_a_scene_is_no_noise(lab):
+    """Texture of 4 %, edges, moving spots and changing light: within 1.3 at the background, 2 at half of full scale."""
+    model = estimate_noise(lab.pictures(3)).model
+    level, half = lab.background + lab.black, 0.5 * (2**lab.bits - 1)
+    at = 2.0**lab.shift
+    assert lab.variance(level) / 1.3 < model.variance(level * at) < 1.3 * lab.variance(level)
+    assert lab.variance(half) / 2 < model.variance(half * at) < 2 * lab.variance(half)
+
+
+def test_without_light_between_background_and_spots_the_slope_is_that_of_a_sensor():
+    """Texture of 8 % in 16 bits is 500 times the shot noise of a spot: its residuals say nothing of the electrons."""
+    lab = Lab(bits=16, gain=0.4, read_e=3.0, background=20.0, black=500.0, details=0, texture=0.08, spot_peak=30_000.0)
+    estimate = estimate_noise(lab.pictures(4))
+    assert 0.1 < estimate.model.slope_dn * lab.gain < 10
+    assert estimate.slope_sigma > 0.2
+
+
+@pytest.mark.parametrize("quality", [70, 95])
+def test_compressed_pictures_give_a_model_that_finds_their_spots(quality):
+    lab = Lab(quality=quality)
+    pictures = lab.pictures(5)
+    model = estimate_noise(pictures).model
+    assert min(len(find_spots(p, noise=model)) for p in pictures) >= 5
+
+
+def test_a_background_that_is_clipped_at_black_keeps_its_noise():
+    rng = np.random.default_rng(6)
+    model = estimate_noise(
+        [np.clip(np.rint(rng.normal(0.3, 2.0, (300, 400))), 0, 255).astype(np.uint8) for _ in range(4)]
+    ).model
+    assert model.variance(0.0) == pytest.approx(4.0, rel=0.25)
+
+
+@given(st.floats(-1.0, 3.0), st.floats(1.0, 6.0))
+def test_mean_and_sigma_of_clipped_values(mean, sigma):
+    places = (np.arange(4000) + 0.5) / 4000
+    values = np.rint([NormalDist(mean, sigma).inv_cdf(p) for p in places]).clip(0)
+    got = clipped_normal(values)
+    assert got == pytest.approx((mean, sigma), abs=0.15 * sigma)
+
+
+@pytest.mark.parametrize("sigma", [0.1, 0.25, 0.4, 0.7, 2.0])
+def test_the_part_of_rounding_that_time_does_not_show_is_added(sigma):
+    rng = np.random.default_rng(7)
+    level = rng.uniform(0, 50, 60_000)
+    a, b = (np.rint(level + sigma * rng.standard_normal(level.size)) for _ in range(2))
+    assert unrounded(float(np.mean((a - b) ** 2) / 2), ROUNDING_DN2) == pytest.approx(sigma**2 + 1 / 12, rel=0.06)
+
+
+@pytest.mark.parametrize(("bits", "shift"), [(10, 0), (12, 0), (12, 4)])
+def test_a_sensor_clips_where_its_numbers_end(bits, shift):
+    """And not at 65535, which no 12-bit camera writes."""
+    full = 2**bits - 1
+    lab = Lab(
+        bits=bits, shift=shift, gain=20_000 / full, background=0.05 * full, black=0.01 * full, spot_peak=2.0 * full
+    )
+    assert estimate_noise(lab.pictures(8)).saturation_dn == full * 2**shift
+
+
+def test_a_bright_picture_that_does_not_clip_has_no_saturation_level():
+    lab = Lab(bits=12, gain=5.0, background=300.0, spot_peak=3000.0)
+    assert saturation_level(lab.pictures(9), 1.0) is None
+
+
+def test_copies_of_one_picture_are_no_evidence_of_silence():
+    """Recorders repeat a frame that was dropped."""
+    picture = Lab().pictures(10, 1)[0]
+    estimate = estimate_noise([picture, picture.copy()])
+    assert not estimate.temporal
+    assert estimate.model.variance(22.0) > 0.7 * Lab().variance(22.0)
 
 
 def test_noise_that_goes_together_over_pixels_is_not_taken_for_less():
@@ -57,10 +201,15 @@ def test_a_quick_guess_knows_the_background_noise(bits):
     assert model.variance(20 * scale) == pytest.approx((2.0 * scale) ** 2, rel=0.25)
 
 
-@pytest.mark.parametrize("shape", [(1, 1), (3, 50), (0, 0), (9, 9)])
-def test_pictures_too_small_to_tell_leave_the_rounding(shape):
-    assert guess_noise(np.zeros(shape, np.uint8)).floor_dn2 == pytest.approx(ROUNDING_DN2)
-    assert estimate_noise([np.zeros(shape, np.uint8)]).model.floor_dn2 == pytest.approx(ROUNDING_DN2)
+@pytest.mark.parametrize("value", [0, 255])
+@pytest.mark.parametrize("shape", [(1, 1), (3, 50), (0, 0), (9, 9), (40, 40), (300, 400)])
+def test_pictures_without_any_contrast_leave_the_rounding(shape, value):
+    image = np.full(shape, value, np.uint8)
+    assert guess_noise(image).floor_dn2 == pytest.approx(ROUNDING_DN2)
+    for pictures in ([image], [image, image.copy(), image.copy()]):
+        model = estimate_noise(pictures).model
+        assert model.floor_dn2 == pytest.approx(ROUNDING_DN2)
+        assert np.isfinite(model.variance(200.0))
 
 
 def test_no_picture_and_no_noise_are_refused():

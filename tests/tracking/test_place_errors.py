@@ -1,4 +1,4 @@
-"""Errors that belong to a place on the screen: a vehicle at rest shows them in every frame, and no mean lessens them."""
+"""Errors that belong to a place on the screen: a vehicle at rest shows them in every frame; no mean lessens them."""
 
 from dataclasses import replace
 

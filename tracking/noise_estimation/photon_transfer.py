@@ -20,6 +20,7 @@ from tracking.noise import FULL_SCALE_E, NoiseModel, Picture, quantile_variance
 from tracking.noise_estimation.grey_values import clipped_background, full_scale, grey_step, saturation_level
 from tracking.noise_estimation.levels import LEAST_PIXELS, LEVELS, SIDE, LevelVariances, level_variances
 from tracking.noise_estimation.spot_residuals import SpotResiduals, residuals_of_spots
+from tracking.parameters import DetectParameters
 
 _WELL_E = (1_000.0, 200_000.0)  # electrons at full scale: what sensors have, from the smallest to the largest
 _WELL_SPREAD = 1.2  # sigma of the logarithm about FULL_SCALE_E: a decade is two sigmas
@@ -27,6 +28,7 @@ _SLOPES = 81
 _READ_E = (0.7, 20.0)  # electrons of read noise, from scientific sensors to old ones
 _LARGEST_MISFIT = 9.0  # squared sigmas: a level that contradicts the line by more is not noise alone
 _SURE = 0.25  # sigma of the slope's logarithm from which spots are not asked: photon transfer is the better evidence
+_MOST_SPOTS = 40  # of one picture: the brightest
 _LEAST_OF_SPOTS, _MOST_OF_SPOTS = 30, 300  # pixels of one brightness; residuals of one spot are not independent
 _CONTRASTS = (0.0, 0.005, 0.01, 0.02, 0.04, 0.08, 0.16, 0.32)  # of the light's grain
 _GRAIN_SIGMA = 0.5  # share of its own variance to which the grain is known
@@ -71,7 +73,7 @@ def estimate_noise(pictures: Sequence[Picture]) -> NoiseEstimate:
     slope, slope_sigma = lines.slope(rounding)
     if slope_sigma > _SURE:  # nothing still is bright enough: the spots themselves
         first = lines.model(slope, rounding)
-        found = [find_spots(p, noise=first) for p in usable]
+        found = [find_spots(p, DetectParameters(max_detections=_MOST_SPOTS), first) for p in usable]
         lines.add(residuals_of_spots(usable, found, top))
         slope, slope_sigma = lines.slope(rounding)
     model = lines.model(slope, rounding)
