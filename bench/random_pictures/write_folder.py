@@ -58,13 +58,13 @@ def _write_files(renderer: Renderer, camera: int, folder: Path) -> None:
 
 def _write_video(renderer: Renderer, camera: int, path: Path) -> None:
     size = list(renderer.ps.scene.rig.cameras.values())[camera].image_size_px
-    # OpenCV's own writer: through FFmpeg the quality cannot be set.
+    # OpenCV's own writer: through FFmpeg the quality cannot be set. Its grey videos are damaged (5.0.0), so in colour.
     writer = cv2.VideoWriter(
         str(path), cv2.CAP_OPENCV_MJPEG, cv2.VideoWriter.fourcc(*"MJPG"), 25.0, size,
-        [cv2.VIDEOWRITER_PROP_IS_COLOR, 0, cv2.VIDEOWRITER_PROP_QUALITY, renderer.ps.look.sensor.quality],
+        [cv2.VIDEOWRITER_PROP_IS_COLOR, 1, cv2.VIDEOWRITER_PROP_QUALITY, renderer.ps.look.sensor.quality],
     )  # fmt: skip
     if not writer.isOpened():
         raise RuntimeError(f"{path}: OpenCV cannot write an MJPG video")
     for k in range(len(renderer.ps)):
-        writer.write(renderer.raw(k, camera))
+        writer.write(cv2.cvtColor(renderer.raw(k, camera), cv2.COLOR_GRAY2BGR))
     writer.release()
