@@ -72,6 +72,17 @@ def test_each_family_gives_a_scene_with_spots_to_ask_for(family):
     assert np.mean(renderer.snr[0, first] >= LEAST_SNR) > 0.4
 
 
+def test_the_true_noise_is_stated_in_the_numbers_of_the_files_where_that_is_asked(tmp_path: Path):
+    ps = picture_scene(2, None, 5, SMALL)
+    sensor = Sensor(10, 20_000, 4.0, 0.02, row_e=3.0, shift=6)
+    ps = replace(ps, look=replace(ps.look, sensor=sensor))
+    rig = load_run(write_pictures(Renderer(ps), tmp_path / "run", state_noise=True)).rig
+    noise = next(iter(rig.cameras.values())).noise
+    assert noise is not None
+    level, variance = true_noise(sensor, 4_000.0, np.random.default_rng(1))
+    assert NoiseModel.of(noise).variance(level) == pytest.approx(variance, rel=0.05)
+
+
 def test_the_same_seed_gives_the_same_pictures():
     first, again = (Renderer(picture_scene(3, None, 12, SMALL)) for _ in range(2))
     np.testing.assert_array_equal(first.picture(4, 0), again.picture(4, 0))
