@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from bench.random_pictures.sensors import Picture
+from geometry.camera import SensorNoise
 from lab.sensor_noise import frames_to_learn_from
 from tracking.noise import NoiseModel
 from tracking.noise_estimation.photon_transfer import estimate_noise
@@ -20,7 +21,9 @@ def model_of_pictures(frames: int, picture: Callable[[int], Picture]) -> NoiseMo
 
 
 def reported_model(block: Mapping[str, Any]) -> NoiseModel:
-    """The model in summary.json's `parameters.noise.CAMERA`."""
+    """The model in summary.json's `parameters.noise.CAMERA`: estimated, or as rig.yaml stated it."""
+    if "gain_e_per_dn" in block:
+        return NoiseModel.of(SensorNoise(**block))
     return NoiseModel(**{f.name: block[f.name] for f in fields(NoiseModel) if f.name in block})
 
 

@@ -30,7 +30,8 @@ class PictureJob:
     seed: int
     family: str | None
     frames: int | None
-    keep: Path | None
+    keep: Path | None  # where its run folder and its results stay
+    state_noise: bool  # in rig.yaml: for diagnosis only
 
 
 def judged(job: PictureJob) -> PictureJudgement:
@@ -40,7 +41,7 @@ def judged(job: PictureJob) -> PictureJudgement:
     renderer = Renderer(picture_scene(job.seed, job.family, job.frames))
     with tempfile.TemporaryDirectory() as name:
         place = Path(name) if job.keep is None else job.keep / f"{job.family or 'mixed'}-{job.seed}"
-        folder = write_pictures(renderer, place / "run")
+        folder = write_pictures(renderer, place / "run", job.state_noise)
         rendered = time.process_time()
         try:
             outcome = process_run(folder, place / "out")
@@ -61,18 +62,16 @@ def run_all(jobs: list[PictureJob], workers: int) -> Iterator[PictureJudgement]:
         yield from pool.imap(judged, jobs)
 
 
-def run_pictures(
-    seeds: range,
-    family: str | None,
-    frames: int | None,
-    workers: int,
-    out: Path | None,
-    keep: Path | None,
-    verbose: bool,
-) -> None:
-    """Run the seeds and print the summary. family `all`: each seed takes the next family in turn."""
+def picture_jobs(
+    seeds: range, family: str | None, frames: int | None, keep: Path | None, state_noise: bool
+) -> list[PictureJob]:
+    """One scene per seed; family `all`: one of each family per seed."""
     names = [None] if family is None else list(FAMILIES) if family == "all" else [family]
-    jobs = [PictureJob(s, n, frames, keep) for s in seeds for n in names]
+    return [PictureJob(s, n, frames, keep, state_noise) for s in seeds for n in names]
+
+
+def run_pictures(jobs: list[PictureJob], workers: int, out: Path | None, verbose: bool) -> None:
+    """Run the scenes and print the summary; out: a CSV file with a row per scene."""
     rows: list[PictureJudgement] = []
     for row in run_all(jobs, workers):
         rows.append(row)

@@ -215,9 +215,9 @@ def wrong_diagnoses(renderer: Renderer, summary: Mapping[str, Any]) -> tuple[str
             false = not _about_noise_or_hidden(item["what"], scene, seen)
         if camera in scene.rig.cameras:
             c = list(scene.rig.cameras).index(camera)
-            mine = seen[:, scene.camera_of == c].any(axis=1)
+            mine = np.asarray(seen[:, scene.camera_of == c].any(axis=1))
             pictures = scene.has_image[:, c]
-            false |= kind == Kind.NOTHING_DETECTED and mine[pictures].mean() > SEEN
+            false |= kind == Kind.NOTHING_DETECTED and float(mine[pictures].mean()) > SEEN
             false |= kind == Kind.NO_PICTURES and bool(pictures.any())
             false |= kind in (Kind.CAMERA_LATE, Kind.CAMERA_STOPPED, Kind.MISSING_PICTURES) and bool(pictures.all())
         if false:

@@ -40,6 +40,7 @@ class Look:
     clutter: int  # moving spots per picture that are none
     exposure_share: float  # of the frame interval
     fastest_px: float  # per frame
+    least_streak_px: float = 0.0  # of the longest streak
     motion: str = ""  # of bench.random_scenes.motions; empty: any
     hidden: bool = True  # spots are hidden now and then, pictures are missing
     plain_rig: bool = False  # the paper's rig at 1280 x 1024
@@ -146,7 +147,8 @@ FAMILIES: dict[str, Callable[[np.random.Generator, Look], Look]] = {
     "saturated": lambda r, k: replace(k, peak_snr=1e4, most_peak=float(r.uniform(1.2, 4.0)), sigma_px=_log(r, 0.9, 6)),
     "still": lambda r, k: replace(k, motion="rest", texture=0.04, texture_grain_px=_log(r, 0.7, 4)),
     "streaks": lambda r, k: replace(
-        k, exposure_share=float(r.uniform(0.4, 0.9)), fastest_px=float(r.uniform(12, 30)), motion="sines"
+        k, exposure_share=float(r.uniform(0.4, 0.9)), fastest_px=float(r.uniform(12, 30)), least_streak_px=5.0,
+        motion="sines",
     ),
     "wide": lambda r, k: replace(k, sigma_px=_log(r, 5, 20), divergence=float(r.uniform(0.5, 1))),
     "small": lambda r, k: replace(k, sigma_px=_log(r, 0.5, 0.8), blur_px=0.35),

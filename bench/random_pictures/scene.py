@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -66,19 +67,26 @@ class PictureScene:
         return self.exposures[k * self.parts : (k + 1) * self.parts]
 
 
-def picture_scene(seed: int, family: str | None = None, frames: int | None = None) -> PictureScene:
-    """The scene of a seed."""
+def picture_scene(
+    seed: int,
+    family: str | None = None,
+    frames: int | None = None,
+    sizes_px: Sequence[tuple[int, int]] = SIZES_PX,
+) -> PictureScene:
+    """The scene of a seed; of other sizes of pictures it is another scene."""
     name = 0 if family is None else zlib.crc32(family.encode())
     for attempt in range(1000):
-        made = _attempt([seed, name, attempt], seed, family, FRAMES if frames is None else frames)
+        made = _attempt([seed, name, attempt], seed, family, FRAMES if frames is None else frames, sizes_px)
         if made is not None:
             return made
     raise RuntimeError(f"no scene in pictures for seed {seed}, family {family}")
 
 
-def _attempt(key: list[int], seed: int, family: str | None, frames: int) -> PictureScene | None:
+def _attempt(
+    key: list[int], seed: int, family: str | None, frames: int, sizes_px: Sequence[tuple[int, int]]
+) -> PictureScene | None:
     look = draw_look(np.random.default_rng([*key, LOOK]), family)
-    lab = paper_lab() if look.plain_rig else draw_lab(np.random.default_rng([*key, LAB]), SIZES_PX)
+    lab = paper_lab() if look.plain_rig else draw_lab(np.random.default_rng([*key, LAB]), sizes_px)
     rng = np.random.default_rng([*key, MOTION])
     rate = float(np.exp(rng.uniform(np.log(25), np.log(300))))
     draw_seed = int(rng.integers(2**31))
@@ -90,6 +98,8 @@ def _attempt(key: list[int], seed: int, family: str | None, frames: int) -> Pict
     poses = lab.poses(q)
     uv = spot_pixels(lab.rig, poses)
     streak = float(np.nanmax(np.linalg.norm(np.diff(uv, axis=0), axis=-1), initial=0.0)) * look.exposure_share
+    if streak < look.least_streak_px:
+        return None
     parts = int(min(2 * np.ceil(streak / max(0.5 * look.sigma_px, 0.3)) + 1, MOST_PARTS))
     exposures = lab.poses(_during(lab, look, draw_seed, motion, q, times, parts))
     camera_of, spot_of = view_indices(lab.rig)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import TypeAlias, cast
 
 import cv2
 import numpy as np
@@ -33,7 +33,7 @@ class Sensor:
     @property
     def top_dn(self) -> int:
         """Largest number of the converter."""
-        return 2**self.bits - 1
+        return (1 << self.bits) - 1
 
     @property
     def black_dn(self) -> float:
@@ -93,8 +93,8 @@ def expose(sensor: Sensor, light_e: Light, rng: np.random.Generator) -> Picture:
     np.rint(electrons, out=electrons)
     np.clip(electrons, 0, sensor.top_dn, out=electrons)
     if sensor.bits == 8:
-        return electrons.astype(np.uint8)
-    return np.left_shift(electrons.astype(np.uint16), np.uint16(sensor.shift))
+        return cast(Picture, electrons.astype(np.uint8))
+    return cast(Picture, np.left_shift(electrons.astype(np.uint16), np.uint16(sensor.shift)))
 
 
 def compressed(sensor: Sensor, picture: Picture) -> Picture:
@@ -103,8 +103,7 @@ def compressed(sensor: Sensor, picture: Picture) -> Picture:
         return picture
     good, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, sensor.quality])
     assert good
-    out: Picture = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
-    return out
+    return cast(Picture, cv2.imdecode(data, cv2.IMREAD_UNCHANGED))
 
 
 def true_noise(sensor: Sensor, light_e: float, rng: np.random.Generator) -> tuple[float, float]:

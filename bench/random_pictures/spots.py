@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from bench.random_pictures.optics import (
@@ -136,9 +137,7 @@ def draw_speckle(rng: np.random.Generator, contrast: float, grain_px: float) -> 
 
 def periodic_field(rng: np.random.Generator, size: int, sigma: float) -> Light:
     """(size, size): a normal random field of mean 0 and variance 1, smoothed by a Gaussian of sigma samples."""
-    f = np.fft.rfftfreq(size)
-    g = np.fft.fftfreq(size)
-    smooth = np.exp(-2 * (np.pi * sigma) ** 2 * (g[:, None] ** 2 + f[None, :] ** 2))
-    white = np.fft.rfft2(rng.standard_normal((size, size), dtype=np.float32))
-    field = np.fft.irfft2(white * smooth, s=(size, size))
+    margin = int(np.ceil(5 * sigma))
+    white = np.pad(rng.standard_normal((size, size), dtype=np.float32), margin, mode="wrap")
+    field = cv2.GaussianBlur(white, (2 * margin + 1, 2 * margin + 1), sigma)[margin:-margin, margin:-margin]
     return np.asarray((field - field.mean()) / field.std(), dtype=np.float32)

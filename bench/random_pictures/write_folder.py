@@ -1,13 +1,18 @@
-"""A scene in pictures as a run folder in the form of the files' contract; rig.yaml states no noise."""
+"""A scene in pictures as a run folder in the form of the files' contract; rig.yaml states no noise, unless asked."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
+import numpy as np
 
 from bench.random_pictures.render import Renderer
+from bench.random_pictures.sensors import Sensor
 from bench.random_scenes.write_folder import prior_block, write_truth
+from geometry.camera import SensorNoise
+from geometry.rig import Rig
 from lab.rig_file import RigFile, save_rig
 from lab.run_file import save_run
 
@@ -18,12 +23,17 @@ _FAST_PNG = (
 )  # fmt: skip
 
 
-def write_pictures(renderer: Renderer, folder: Path) -> Path:
-    """rig.yaml, run.yaml, truth and the pictures: a folder of PNG or JPEG files per camera, or a video in MJPG."""
+def write_pictures(renderer: Renderer, folder: Path, state_noise: bool = False) -> Path:
+    """rig.yaml, run.yaml, truth and the pictures: a folder of PNG or JPEG files per camera, or a video in MJPG.
+
+    state_noise: rig.yaml states the sensor's true noise (without what a lossy file adds), to tell errors of the noise
+    estimate from those of the detector.
+    """
     ps = renderer.ps
     scene, sensor = ps.scene, ps.look.sensor
     folder.mkdir(parents=True, exist_ok=True)
-    save_rig(RigFile(scene.known_rig), folder / "rig.yaml")
+    rig = _with_noise(scene.known_rig, sensor) if state_noise else scene.known_rig
+    save_rig(RigFile(rig), folder / "rig.yaml")
     video = sensor.file_format == "mjpg"
     content: dict[str, object] = {
         "name": f"{ps.family or 'mixed'}-{ps.seed}",
@@ -43,8 +53,16 @@ def write_pictures(renderer: Renderer, folder: Path) -> Path:
     return folder
 
 
+def _with_noise(rig: Rig, sensor: Sensor) -> Rig:
+    """The rig with the sensor in every camera, in the numbers of its files."""
+    scale = float(1 << sensor.shift)
+    read_e = float(np.hypot(sensor.read_e, sensor.row_e))
+    noise = SensorNoise(sensor.gain_e_per_dn / scale, read_e, sensor.black_dn * scale)
+    return replace(rig, cameras={name: replace(camera, noise=noise) for name, camera in rig.cameras.items()})
+
+
 def _write_files(renderer: Renderer, camera: int, folder: Path) -> None:
-    folder.mkdir(parents=True)
+    folder.mkdir(parents=True, exist_ok=True)
     sensor, scene = renderer.ps.look.sensor, renderer.ps.scene
     how = [cv2.IMWRITE_JPEG_QUALITY, sensor.quality] if sensor.lossy else list(_FAST_PNG)
     for k in range(len(scene)):
@@ -58,13 +76,13 @@ def _write_files(renderer: Renderer, camera: int, folder: Path) -> None:
 
 def _write_video(renderer: Renderer, camera: int, path: Path) -> None:
     size = list(renderer.ps.scene.rig.cameras.values())[camera].image_size_px
-    # OpenCV's own writer: through FFmpeg the quality cannot be set.
+    # OpenCV's own writer: through FFmpeg the quality cannot be set. Its grey videos are damaged (5.0.0), so in colour.
     writer = cv2.VideoWriter(
         str(path), cv2.CAP_OPENCV_MJPEG, cv2.VideoWriter.fourcc(*"MJPG"), 25.0, size,
-        [cv2.VIDEOWRITER_PROP_IS_COLOR, 0, cv2.VIDEOWRITER_PROP_QUALITY, renderer.ps.look.sensor.quality],
+        [cv2.VIDEOWRITER_PROP_IS_COLOR, 1, cv2.VIDEOWRITER_PROP_QUALITY, renderer.ps.look.sensor.quality],
     )  # fmt: skip
     if not writer.isOpened():
         raise RuntimeError(f"{path}: OpenCV cannot write an MJPG video")
     for k in range(len(renderer.ps)):
-        writer.write(renderer.raw(k, camera))
+        writer.write(cv2.cvtColor(renderer.raw(k, camera), cv2.COLOR_GRAY2BGR))
     writer.release()

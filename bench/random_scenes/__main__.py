@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
 
-from bench.random_pictures.command import run_pictures
+from bench.random_pictures.command import picture_jobs, run_pictures
 from bench.random_pictures.looks import FAMILIES as PICTURE_FAMILIES
 from bench.random_scenes.answers import answers_in_memory, answers_through_files
 from bench.random_scenes.families import FAMILIES, family_scene
@@ -83,6 +83,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=seed_range, metavar="A:B", help="default 1:301, of pictures 1:61")
     parser.add_argument("--family", metavar="NAME", help="one difficulty instead of everything at random")
     parser.add_argument("--pictures", action="store_true", help="render pictures; --family all: one of each per seed")
+    parser.add_argument("--state-noise", action="store_true", help="of pictures: rig.yaml states the true noise")
     parser.add_argument("--frames", type=int, help="default 200, in pictures 48; each family has its own")
     parser.add_argument("--jobs", type=int, default=1, help="processes (default 1)")
     parser.add_argument("--out", type=Path, help="a CSV file with a row per scene")
@@ -96,7 +97,8 @@ def main() -> None:
     if a.seeds is None:
         a.seeds = range(1, 61 if a.pictures else 301)
     if a.pictures:
-        run_pictures(a.seeds, a.family, a.frames, a.jobs, a.out, a.keep, a.verbose)
+        picture = picture_jobs(a.seeds, a.family, a.frames, a.keep, a.state_noise)
+        run_pictures(picture, a.jobs, a.out, a.verbose)
         return
     jobs = [Job(s, a.frames, a.family, a.through_files, a.keep) for s in a.seeds]
     rows: list[Judgement] = []
