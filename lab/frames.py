@@ -26,7 +26,6 @@ from lab.frame_sources import (
     arrived,
     list_folder,
     promised_pictures,
-    quiet_opencv,
 )
 from lab.pictures import DROPPED, Grey, Missing
 from lab.run_file import DetectionsTable, FramesFolder, Run, VideoFile
@@ -67,8 +66,7 @@ class FrameReader:
             if isinstance(source, FramesFolder):
                 self._listings[name] = list_folder(source.path)
             elif isinstance(source, VideoFile):
-                with quiet_opencv():
-                    self._promised[name] = promised_pictures(source.path)
+                self._promised[name] = promised_pictures(source.path)
             else:
                 if source.path not in opened:
                     opened[source.path] = read_detections(source.path)
@@ -110,7 +108,6 @@ class FrameReader:
     def __iter__(self) -> Iterator[FrameSet]:
         self._trouble, self._ended = {c: {} for c in self._run.cameras}, {}
         with ExitStack() as stack:
-            stack.enter_context(quiet_opencv())
             pool = ThreadPoolExecutor(THREADS, thread_name_prefix="decode")
             stack.callback(pool.shutdown, cancel_futures=True)
             sources = {}
@@ -266,7 +263,7 @@ def pictures_at(run: Run, camera: str, frames: Sequence[int]) -> dict[int, Pictu
     wanted = sorted(set(frames))
     source, size_px = run.cameras[camera], run.rig.cameras[camera].image_size_px
     out: dict[int, Picture] = {}
-    with quiet_opencv(), ExitStack() as stack:
+    with ExitStack() as stack:
         if isinstance(source, VideoFile):
             video = VideoSource(source.path, size_px)
             stack.callback(video.close)
