@@ -18,7 +18,7 @@ from lab.tiff import TIFF_MARKS, Tiff
 
 Bytes: TypeAlias = memoryview  # of a file's content
 
-MOST_PIXELS = 2**28  # of one picture: a header that promises more is damaged or hostile; the largest sensors have 2^27.3
+MOST_PIXELS = 2**28  # of one picture: the largest sensors have 2^27.3; a header that promises more is wrong
 PNG_MARK = b"\x89PNG\r\n\x1a\n"
 _JPEG_FRAMES = {0xC0 + k for k in range(16)} - {0xC4, 0xC8, 0xCC}  # SOF0 to SOF15 without DHT, JPG, DAC
 _PNM_WORD = re.compile(rb"(?:\s|#[^\r\n]*[\r\n])+([0-9]+)")

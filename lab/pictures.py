@@ -160,8 +160,10 @@ def _pnm(data: NDArray[np.uint8], header: Header) -> NDArray[np.generic]:
         stored = data[start : start + count * dtype.itemsize]
         if len(stored) < count * dtype.itemsize:
             raise DamagedError("cut short")
-        pixels = stored.view(dtype).reshape(shape)
-        return pixels if dtype.itemsize == 1 else pixels.astype(np.uint16)
+        if dtype.itemsize == 1:
+            return stored.reshape(shape)
+        pixels = np.frombuffer(stored.tobytes(), dtype)  # aligned: the header has any length
+        return pixels.astype(np.uint16).reshape(shape)
     if kind == 2:
         return _written_out(bytes(data[start - 1 :]), largest, count).reshape(shape)
     return _by_opencv(data)

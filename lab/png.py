@@ -8,6 +8,7 @@ Source: PNG (third edition), ISO 15948.
 from __future__ import annotations
 
 import struct
+import zlib
 from dataclasses import dataclass
 
 import numpy as np
@@ -104,8 +105,7 @@ class Png:
 
         Raises DamagedError where the content cannot be unpacked.
         """
-        self.rows()
-        content = b"".join([b"IDAT", self.content])
+        content = b"IDAT" + zlib.compress(self.rows(), 0)  # stored as it is: unpacking twice would take 8 ms
         idat = struct.pack(">I", len(content) - 4) + content + struct.pack(">I", crc32(content))
         return PNG_MARK + self.before + idat + b"\0\0\0\0IEND\xaeB`\x82"
 
@@ -116,53 +116,61 @@ def unfiltered(rows, out, step):  # type: ignore[no-untyped-def]
 
     rows: (h, 1 + n) u8, each row's filter first. out: (h, n) u8, filled. step: bytes per pixel. Returns the first row
     of an unknown filter, or -1. Source: PNG, ISO 15948, 9.2.
+
+    The left neighbour is kept in a register: read back from `out` it costs as much as the whole filter.
     """
-    height, n = out.shape
-    for y in range(height):
+    nothing = np.zeros(out.shape[1], np.uint8)  # above the first row
+    for y in range(out.shape[0]):
         kind = rows[y, 0]
         line, here = rows[y, 1:], out[y]
+        above = out[y - 1] if y > 0 else nothing
         if kind == 0:
             here[:] = line
         elif kind == 1:
-            here[:step] = line[:step]
-            for x in range(step, n):
-                here[x] = line[x] + here[x - step]
+            _unsub(line, here, step)
         elif kind == 2:
-            if y == 0:
-                here[:] = line
-            else:
-                above = out[y - 1]
-                for x in range(n):
-                    here[x] = line[x] + above[x]
+            for x in range(line.size):
+                here[x] = line[x] + above[x]
         elif kind == 3:
-            _unaverage(line, out, y, step)
+            _unaverage(line, above, here, step)
         elif kind == 4:
-            _unpaeth(line, out, y, step)
+            _unpaeth(line, above, here, step)
         else:
             return y
     return -1
 
 
 @compiled_for_threads
-def _unaverage(line, out, y, step):  # type: ignore[no-untyped-def]
-    """Each byte is the difference to the mean of its left and upper neighbour."""
-    here = out[y]
-    for x in range(line.size):
-        left = np.int64(here[x - step]) if x >= step else np.int64(0)
-        up = np.int64(out[y - 1, x]) if y > 0 else np.int64(0)
-        here[x] = line[x] + np.uint8((left + up) >> 1)
+def _unsub(line, here, step):  # type: ignore[no-untyped-def]
+    """Each byte is the difference to its left neighbour."""
+    for first in range(step):
+        left = np.int64(0)
+        for x in range(first, line.size, step):
+            left = (left + line[x]) & 255
+            here[x] = left
 
 
 @compiled_for_threads
-def _unpaeth(line, out, y, step):  # type: ignore[no-untyped-def]
-    """Each byte is the difference to that neighbour (left, upper, upper left) which is nearest to left + up - corner."""
-    here = out[y]
-    for x in range(line.size):
-        left = np.int64(here[x - step]) if x >= step else np.int64(0)
-        up = np.int64(out[y - 1, x]) if y > 0 else np.int64(0)
-        corner = np.int64(out[y - 1, x - step]) if y > 0 and x >= step else np.int64(0)
-        to_left, to_up, to_corner = abs(up - corner), abs(left - corner), abs(left + up - 2 * corner)
-        nearest = up if to_up <= to_corner else corner
-        if to_left <= to_up and to_left <= to_corner:
-            nearest = left
-        here[x] = line[x] + np.uint8(nearest)
+def _unaverage(line, above, here, step):  # type: ignore[no-untyped-def]
+    """Each byte is the difference to the mean of its left and upper neighbour."""
+    for first in range(step):
+        left = np.int64(0)
+        for x in range(first, line.size, step):
+            left = (line[x] + ((left + above[x]) >> 1)) & 255
+            here[x] = left
+
+
+@compiled_for_threads
+def _unpaeth(line, above, here, step):  # type: ignore[no-untyped-def]
+    """Each byte is the difference to the one of left, upper, upper left that is nearest to left + upper - upper left."""
+    for first in range(step):
+        left, corner = np.int64(0), np.int64(0)
+        for x in range(first, line.size, step):
+            up = np.int64(above[x])
+            from_left, from_up = up - corner, left - corner
+            to_left, to_up, to_corner = abs(from_left), abs(from_up), abs(from_left + from_up)
+            nearest = up if to_up <= to_corner else corner
+            nearest = left if to_left <= to_up and to_left <= to_corner else nearest
+            left = (line[x] + nearest) & 255
+            here[x] = left
+            corner = up
