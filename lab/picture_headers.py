@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lab.inflate import crc32
-from lab.tiff import TIFF_MARKS, Tiff
+from lab.tiff import KNOWN_COMPRESSIONS, TIFF_MARKS, Tiff
 
 Bytes: TypeAlias = memoryview  # of a file's content
 
@@ -105,6 +105,8 @@ def _tiff(view: Bytes) -> Header:
     tiff = Tiff.read(view)
     if tiff.tile is not None and tiff.tile[0] * tiff.tile[1] > MOST_PIXELS:
         raise DamagedError(f"damaged (tiles of {tiff.tile[0]}x{tiff.tile[1]} px)")
+    if tiff.compression not in KNOWN_COMPRESSIONS:
+        raise DamagedError(f"packed by a method that is not known (TIFF compression {tiff.compression})")
     signs = {1: "uint", 2: "int", 3: "float"}
     usual = tiff.sample_format in (1, 4) and tiff.bits in (1, 4, 8, 10, 12, 14, 16)  # 4: not said
     numbers = "" if usual else f"{signs.get(tiff.sample_format, 'unknown')}{tiff.bits}"

@@ -6,6 +6,7 @@ Checksums are verified where a format has them. What a library writes to standar
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeAlias, cast
@@ -19,6 +20,7 @@ from lab.picture_headers import DamagedError, Header, read_header
 SUFFIXES = (".png", ".tif", ".tiff", ".bmp", ".pgm", ".jpg", ".jpeg")
 UNREADABLE = "unreadable"
 DROPPED = "dropped"
+_PADDING = 16  # bytes that some cameras leave before the end of a JPEG; damage leaves some fifty and more
 _LARGE = 1 << 26  # bytes of a file: a larger one is mapped, not read, since its header may show that it is of no use
 
 Grey: TypeAlias = NDArray[np.uint8] | NDArray[np.uint16]  # (h, w), DN
@@ -108,7 +110,8 @@ def _jpeg(data: NDArray[np.uint8], header: Header) -> NDArray[np.generic]:
     try:
         picture = simplejpeg.decode_jpeg(data, "GRAY" if grey else "CMYK", strict=True)
     except ValueError as error:
-        if "extraneous bytes" not in str(error):  # which some cameras leave before a marker
+        left_over = re.search(r"(\d+) extraneous bytes", str(error))
+        if left_over is None or int(left_over[1]) > _PADDING:
             raise DamagedError(f"damaged ({_first_line(error)})") from None
         picture = simplejpeg.decode_jpeg(data, "GRAY" if grey else "CMYK", strict=False)
     return picture[..., 0] if grey else _by_opencv(data)

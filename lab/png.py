@@ -162,7 +162,7 @@ def _unaverage(line, above, here, step):  # type: ignore[no-untyped-def]
 
 @compiled_for_threads
 def _unpaeth(line, above, here, step):  # type: ignore[no-untyped-def]
-    """Each byte is the difference to the one of left, upper, upper left that is nearest to left + upper - upper left."""
+    """Each byte is the difference to that neighbour (left, up, corner) which is nearest to left + up - corner."""
     for first in range(step):
         left, corner = np.int64(0), np.int64(0)
         for x in range(first, line.size, step):

@@ -17,6 +17,8 @@ _TYPES = {1: "B", 3: "H", 4: "I", 16: "Q"}  # BYTE, SHORT, LONG, LONG8
 _ORIENTATION = 274
 _MOST_SEGMENTS = 1 << 20  # strips or tiles: one per row is 65536 at most
 PLAIN, DEFLATE, OLD_DEFLATE = 1, 8, 32946
+# What OpenCV's libtiff unpacks: CCITT (2, 3, 4), LZW, JPEG, PackBits, LZMA, Zstandard. Of any other OpenCV makes zeros.
+KNOWN_COMPRESSIONS = (PLAIN, 2, 3, 4, 5, 7, DEFLATE, 32773, OLD_DEFLATE, 34925, 50000)
 
 
 @dataclass(frozen=True, slots=True)
