@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from geometry.arrays import Bools, Ints
-from lab.detections_file import CameraPoints, DetectionsFile, read_detections, too_sparse
+from lab.detections_file import CameraPoints, DetectionsFile, far_off, read_detections, too_sparse
 from lab.errors import InputError
 from lab.frame_sources import (
     Asked,
@@ -163,6 +163,22 @@ class FrameReader:
                 f" pictures between frame {self.first} and frame {self.last}; is a stray {stray} among them, or do the"
                 f" {holders} hold a time?"
             )
+        self._check_strays()
+
+    def _check_strays(self) -> None:
+        """Raises InputError for a few pictures far from all others. (Of tables such rows are left out.)"""
+        everything: list[Ints] = [v.numbers for v in self._listings.values()]
+        everything += [c.frames for t in self._tables.values() for c in t.cameras.values()]
+        numbers = np.unique(np.concatenate(everything)) if everything else np.empty(0, np.int64)
+        strays = far_off(numbers)
+        for listing in self._listings.values():
+            for number in numbers[strays].tolist():
+                if number in listing.names:
+                    others = numbers[~strays]
+                    raise InputError(
+                        f"{listing.folder / listing.names[number]}: expected frame numbers without a long gap, got"
+                        f" {number}, where the others are {others[0]} to {others[-1]}; is it a stray file? Take it away"
+                    )
 
     def _check_times(self) -> None:
         with_picture: list[Ints] = [v.numbers for v in self._listings.values()]

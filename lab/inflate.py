@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 from isal import isal_zlib
 
 crc32 = isal_zlib.crc32
+_Damaged = cast("type[Exception]", isal_zlib.error)
 
 
 def inflated(data: object, size: int) -> bytes | None:
@@ -16,6 +19,6 @@ def inflated(data: object, size: int) -> bytes | None:
     stream = isal_zlib.decompressobj()
     try:
         out: bytes = stream.decompress(data, size + 1)
-    except isal_zlib.error:
+    except _Damaged:
         return None
     return out if stream.eof and len(out) == size else None

@@ -55,7 +55,7 @@ class Header:
 
 def read_header(data: NDArray[np.uint8]) -> Header:
     """The header of a picture file, (n,) bytes. Raises DamagedError where it is none, or is cut short."""
-    view = memoryview(data)
+    view = data.data
     start = bytes(view[:8])
     try:
         if start == PNG_MARK:

@@ -69,7 +69,7 @@ def _content(path: Path) -> NDArray[np.uint8]:
         file.seek(0)
         data = np.empty(size, np.uint8)
         got = 0
-        while got < size and (more := file.readinto(data[got:])):
+        while got < size and (more := file.readinto(data[got:].data)):
             got += more
         return data[:got]
 
@@ -127,7 +127,7 @@ def _require_jpeg_end(data: NDArray[np.uint8]) -> None:
     Decoders take the upper part of a file that was cut short for the picture. Within a scan the byte FF is always
     followed by 00 or a restart marker, so FF D9 there is the end and nothing else.
     """
-    view, at = memoryview(data), 2
+    view, at = data.data, 2
     while at + 4 <= len(view):
         if view[at] != 0xFF:
             raise DamagedError("damaged (no marker where one must be)")
@@ -183,7 +183,7 @@ def _written_out(text: bytes, largest: int, count: int) -> NDArray[np.uint8] | N
         raise DamagedError("damaged (expected whole numbers)") from None
     if values.min() < 0 or values.max() > largest:
         raise DamagedError(f"damaged (a value is not within 0 and {largest})")
-    return values.astype(np.uint8 if largest < 256 else np.uint16)
+    return values.astype(np.uint8) if largest < 256 else values.astype(np.uint16)
 
 
 def _bmp(data: NDArray[np.uint8], header: Header) -> NDArray[np.generic]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import struct
 import zlib
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,8 @@ from numpy.typing import NDArray
 from geometry.compiled import compiled_for_threads
 from lab.inflate import crc32, inflated
 from lab.picture_headers import PNG_MARK, DamagedError
+
+Bytes: TypeAlias = NDArray[np.uint8]
 
 GREY = 0  # a colour type
 _CHANNELS = {GREY: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # of each colour type
@@ -40,7 +43,7 @@ class Png:
     @staticmethod
     def read(data: NDArray[np.uint8]) -> Png:
         """From a file's bytes. Raises DamagedError."""
-        view, at = memoryview(data), len(PNG_MARK)
+        view, at = data.data, len(PNG_MARK)
         before, parts = [], []
         while True:
             if at + 12 > len(view):
@@ -105,13 +108,13 @@ class Png:
 
         Raises DamagedError where the content cannot be unpacked.
         """
-        content = b"IDAT" + zlib.compress(self.rows(), 0)  # stored as it is: unpacking twice would take 8 ms
+        content = b"IDAT" + zlib.compress(self.rows().data, 0)  # stored as it is: unpacking twice would take 8 ms
         idat = struct.pack(">I", len(content) - 4) + content + struct.pack(">I", crc32(content))
         return PNG_MARK + self.before + idat + b"\0\0\0\0IEND\xaeB`\x82"
 
 
 @compiled_for_threads
-def unfiltered(rows, out, step):  # type: ignore[no-untyped-def]
+def unfiltered(rows: Bytes, out: Bytes, step: int) -> int:
     """Undo the filters of a PNG's rows. The GIL is released.
 
     rows: (h, 1 + n) u8, each row's filter first. out: (h, n) u8, filled. step: bytes per pixel. Returns the first row
@@ -141,30 +144,30 @@ def unfiltered(rows, out, step):  # type: ignore[no-untyped-def]
 
 
 @compiled_for_threads
-def _unsub(line, here, step):  # type: ignore[no-untyped-def]
+def _unsub(line: Bytes, here: Bytes, step: int) -> None:
     """Each byte is the difference to its left neighbour."""
     for first in range(step):
-        left = np.int64(0)
+        left = 0
         for x in range(first, line.size, step):
             left = (left + line[x]) & 255
             here[x] = left
 
 
 @compiled_for_threads
-def _unaverage(line, above, here, step):  # type: ignore[no-untyped-def]
+def _unaverage(line: Bytes, above: Bytes, here: Bytes, step: int) -> None:
     """Each byte is the difference to the mean of its left and upper neighbour."""
     for first in range(step):
-        left = np.int64(0)
+        left = 0
         for x in range(first, line.size, step):
             left = (line[x] + ((left + above[x]) >> 1)) & 255
             here[x] = left
 
 
 @compiled_for_threads
-def _unpaeth(line, above, here, step):  # type: ignore[no-untyped-def]
+def _unpaeth(line: Bytes, above: Bytes, here: Bytes, step: int) -> None:
     """Each byte is the difference to that neighbour (left, up, corner) which is nearest to left + up - corner."""
     for first in range(step):
-        left, corner = np.int64(0), np.int64(0)
+        left = corner = np.int64(0)
         for x in range(first, line.size, step):
             up = np.int64(above[x])
             from_left, from_up = up - corner, left - corner

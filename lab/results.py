@@ -78,11 +78,13 @@ def _read_large(path: Path, numbers: Sequence[str], texts: Sequence[str], option
     there = [name for name in (*numbers, *texts) if name in header]
     rows = data.count(b"\n") if data.endswith(b"\n") else 0
     even = data.count(b",") == rows * (len(header) - 1) and b'"' not in data and b"\n\n" not in data
-    if not rows or not even or not set((*numbers, *texts)) - set(optional) <= set(header):
+    if not rows or not even or not {*numbers, *texts} - set(optional) <= set(header):
         return None
     del data  # memory
     import pandas as pd
 
+    # To the last bit; since 3.1 that is what pandas does, and asking for it is deprecated.
+    exactly: Any = {} if tuple(map(int, pd.__version__.split(".")[:2])) >= (3, 1) else {"float_precision": "round_trip"}
     try:
         table = pd.read_csv(
             path,
@@ -90,7 +92,7 @@ def _read_large(path: Path, numbers: Sequence[str], texts: Sequence[str], option
             dtype={name: "category" if name in texts else float for name in there},
             keep_default_na=False,
             na_values={name: ["", "nan"] for name in numbers if name in there},
-            float_precision="round_trip",
+            **exactly,
         )
     except ValueError:
         return None

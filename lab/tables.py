@@ -74,6 +74,8 @@ class TableWriter:
 
         They reach the files some frames later, since what is worked out for many frames together costs a third.
         """
+        if self._open["spots.csv"].closed:
+            raise ValueError("the tables are a closed file by now")
         self._waiting.append(record)
         if causal is not None:
             self._waiting_causal.append(causal)

@@ -45,7 +45,7 @@ class Tiff:
     def read(view: memoryview) -> Tiff:
         """From a file's content. Raises struct.error or IndexError where it ends within the directory."""
         order = "<" if view[0] == ord("I") else ">"
-        big = view[2:4] in (b"+\0", b"\0+")
+        big = bytes(view[2:4]) in (b"+\0", b"\0+")
         tags = _directory(view, order, big)
 
         def number(tag: int, default: int) -> int:

@@ -189,8 +189,8 @@ class _Estimator:
         share = np.einsum("kij,kji->k", out.pose_P, ev.information)[self.measured]
         usual = float(np.median(share)) / 6 if len(share) else 1.0
         memory = int(np.clip(np.ceil(2 / max(usual, 1e-3)), 3, 200))
-        edge = np.concatenate([[True], ~self.measured | self.bent, [True]])
-        near = largest_near(edge, memory)[1:-1]
+        edge: Bools = np.concatenate([[True], ~self.measured | self.bent, [True]])
+        near: Bools = largest_near(edge, memory)[1:-1]
         return ~near
 
     def _best_finer(self, out: Interval) -> float:

@@ -5,17 +5,20 @@ scipy.ndimage has both; importing it takes 0.1 s of a run that must be ready in 
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import numpy as np
 
-from geometry.arrays import Array
+from geometry.arrays import Array, Bools
+
+Values = TypeVar("Values", Array, Bools)
 
 
-def largest_near(values: Array, half: int) -> Array:
+def largest_near(values: Values, half: int) -> Values:
     """The largest of the values (T, ...) at most `half` places away along the first axis, of those that there are.
 
     Maxima over 1, 2, 4 ... places, of which the last two that overlap make the window.
     """
-    values = np.asarray(values)
     frames = len(values)
     half = min(half, frames)
     if frames == 0 or half == 0:
@@ -27,7 +30,7 @@ def largest_near(values: Array, half: int) -> Array:
         largest = np.maximum(largest[:-span], largest[span:])
         span *= 2
     rest = window - span
-    return np.asarray(np.maximum(largest[:frames], largest[rest : rest + frames]))
+    return np.asarray(np.maximum(largest[:frames], largest[rest : rest + frames]), dtype=values.dtype)
 
 
 def window_mean(values: Array, width: int) -> Array:
