@@ -1,6 +1,7 @@
-"""TIFF files: their first picture's tags, and grey content that is stored plainly or deflated, read without a library.
+"""TIFF files: their first picture's tags, and grey content as most cameras store it.
 
-OpenCV reads the others (LZW, JPEG, PackBits, colour, palettes). It applies the turn that a file wishes for display
+OpenCV reads the others (colour, palettes, JPEG and other packings). Of 8-bit content that cannot be unpacked it makes
+zeros and says so on standard error alone. It applies the turn that a file wishes for display
 even where it is told not to (5.0.0), so that tag is set to "as stored" before.
 """
 
@@ -12,13 +13,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lab.inflate import inflated
+
 TIFF_MARKS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")  # the last two: BigTIFF
 _TYPES = {1: "B", 3: "H", 4: "I", 16: "Q"}  # BYTE, SHORT, LONG, LONG8
 _ORIENTATION = 274
 _MOST_SEGMENTS = 1 << 20  # strips or tiles: one per row is 65536 at most
-PLAIN, DEFLATE, OLD_DEFLATE = 1, 8, 32946
+PLAIN, LZW, DEFLATE, PACK_BITS, OLD_DEFLATE = 1, 5, 8, 32773, 32946
+_READ_HERE = (PLAIN, LZW, DEFLATE, PACK_BITS, OLD_DEFLATE)
 # What OpenCV's libtiff unpacks: CCITT (2, 3, 4), LZW, JPEG, PackBits, LZMA, Zstandard. Of any other OpenCV makes zeros.
-KNOWN_COMPRESSIONS = (PLAIN, 2, 3, 4, 5, 7, DEFLATE, 32773, OLD_DEFLATE, 34925, 50000)
+KNOWN_COMPRESSIONS = (PLAIN, 2, 3, 4, LZW, 7, DEFLATE, PACK_BITS, OLD_DEFLATE, 34925, 50000)
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,15 +78,15 @@ class Tiff:
 
     @property
     def is_simple(self) -> bool:
-        """Whether `content` reads it: one grey sample of 8 or 16 bits, plain or deflated."""
-        deflated = self.compression in (DEFLATE, OLD_DEFLATE)
+        """Whether `content` reads it: one grey sample of 8 or 16 bits, packed in a usual way or not at all."""
         return (
             self.samples == 1
             and self.bits in (8, 16)
             and self.sample_format in (1, 4)
             and self.photometric == 1
             and self.fill_order == 1
-            and (self.compression == PLAIN or (deflated and self.predictor in (1, 2)))
+            and self.compression in ((PLAIN, DEFLATE, OLD_DEFLATE) if self.bits == 16 else _READ_HERE)
+            and self.predictor in (1, 2)
             and min(self.tile or (1, self.rows_per_strip)) >= 1
             and len(self.offsets) == len(self.counts) == self._across * self._down
         )
@@ -121,7 +125,7 @@ class Tiff:
             if stored is None:
                 return None
             pixels = stored.view(dtype).reshape(rows, wide)
-            if self.compression != PLAIN and self.predictor == 2:
+            if self.compression in (LZW, DEFLATE, OLD_DEFLATE) and self.predictor == 2:
                 pixels = np.cumsum(pixels, axis=1, dtype=out.dtype)
             target = out[row : row + high, column : column + wide]
             target[:] = pixels[: target.shape[0], : target.shape[1]]
@@ -133,12 +137,17 @@ class Tiff:
 
     def _stored(self, piece: NDArray[np.uint8], size: int) -> NDArray[np.uint8] | None:
         """The content of a strip or tile, unpacked; None where it is not of this many bytes."""
-        if self.compression != PLAIN:
-            from lab.inflate import inflated
-
+        if self.compression == PLAIN:
+            return piece[:size] if len(piece) >= size else None
+        if self.compression in (DEFLATE, OLD_DEFLATE):
             unpacked = inflated(piece, size)
             return None if unpacked is None else np.frombuffer(unpacked, np.uint8)
-        return piece[:size] if len(piece) >= size else None
+        from lab.tiff_packing import unpacked_bits, unpacked_lzw  # compiled code: only where there are such pictures
+
+        if self.compression == LZW:
+            return unpacked_lzw(piece, size)
+        out = np.empty(size, np.uint8)
+        return out if unpacked_bits(piece, out) == size else None
 
     def as_stored(self, data: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """The file's bytes without a turn for display; a copy where there was one."""

@@ -134,6 +134,30 @@ def test_a_tiff_that_opencv_wrote_is_read_to_the_last_bit(compression):
         assert_same(data, noise(dtype))
 
 
+def test_packed_bytes_of_every_length_and_kind_come_back():
+    """Long runs, strings that name themselves, tables that fill up and are emptied, by OpenCV's own packers."""
+    rng = np.random.default_rng(2)
+    for picture in (
+        np.zeros((300, 400), np.uint8),
+        rng.integers(0, 256, (300, 400)).astype(np.uint8),
+        rng.integers(0, 3, (300, 400)).astype(np.uint8),
+        np.repeat(rng.integers(0, 256, (300, 20)), 20, axis=1).astype(np.uint8),
+    ):
+        for compression, predictor in ((5, 1), (5, 2), (32773, 1)):
+            flags = [cv2.IMWRITE_TIFF_COMPRESSION, compression, cv2.IMWRITE_TIFF_PREDICTOR, predictor]
+            got = decode(cv2.imencode(".tif", picture, flags)[1].tobytes(), (400, 300))
+            np.testing.assert_array_equal(got, picture)
+
+
+def test_an_8_bit_strip_that_cannot_be_unpacked_is_no_picture_of_zeros(capfd):
+    data = cv2.imencode(".tif", noise(), [cv2.IMWRITE_TIFF_COMPRESSION, 5])[1].tobytes()
+    at = data.index(b"\x80", 8)  # the first code of LZW empties the table
+    beyond = data[: at + 40] + b"\xff\xff\xff" + data[at + 43 :]  # a code that is not in the table yet
+    assert not as_opencv(beyond).all()
+    assert decode(beyond, SIZE) == Missing("unreadable: damaged, or cut short")
+    assert capfd.readouterr() == ("", "")
+
+
 @pytest.mark.parametrize("order", ["<", ">"])
 def test_the_turn_that_a_tiff_wishes_for_display_is_not_applied(order):
     assert_same(tiff(noise(), order=order, tags={274: 3}), noise())
