@@ -40,7 +40,7 @@ def compiled(function: Function) -> Function:
 def compiled_for_threads(function: Function) -> Function:
     """As `compiled`, and other threads go on meanwhile: for functions that work for a tenth of a millisecond or more.
 
-    Whoever releases the GIL may wait for a long time to get it back.
+    A thread that releases the GIL may wait long to get it back, so it does not pay for short functions.
     """
     return _compiled(function, release_gil=True)
 

@@ -2,7 +2,7 @@
 
 OpenCV reads the others (colour, palettes, JPEG and other packings). Of 8-bit content that cannot be unpacked it makes
 zeros and says so on standard error alone. It applies the turn that a file wishes for display
-even where it is told not to (5.0.0), so that tag is set to "as stored" before.
+even with IMREAD_IGNORE_ORIENTATION (5.0.0), so that tag is set to "as stored" before.
 """
 
 from __future__ import annotations
