@@ -16,7 +16,7 @@ SAMPLE_RUNS := $(patsubst %/run.yaml,%,$(wildcard sample_runs/*/run.yaml))
 DEMO := results/demo
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all check format bench-tracking bench-random bench-detection bench-calibration peers bench-peers lock wheel pointcloud clean
+.PHONY: help setup demo test test-all check format bench-tracking bench-random bench-detection bench-throughput bench-calibration peers bench-peers lock wheel pointcloud clean
 
 help:  ## List the chores
 	@sed -n 's/^\([a-z-]*\):.*##  */\1|/p' $(MAKEFILE_LIST) | while IFS='|' read -r name what; do \
@@ -37,6 +37,8 @@ $(READY): requirements.lock pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --require-virtualenv --requirement requirements.lock
 	$(BIN)/python -m pip install --quiet --require-virtualenv --no-deps --no-build-isolation --editable .
+	@echo "Compiling for this machine, once (about a minute)."
+	$(BIN)/python -m lab.warm_up
 	@touch $(READY)
 
 # The batch's exit status is the demo's, but the paths are shown in any case.
@@ -63,11 +65,10 @@ format: setup  ## Format the code and mend what the linter can mend
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-bench-tracking: setup  ## The tracking figures on fresh seeds, the cost of a whole run, peers if installed
+bench-tracking: setup  ## The tracking figures on fresh seeds, peers if installed
 	$(BIN)/python -m bench.tracking
 	$(BIN)/python -m bench.first_labels
 	$(BIN)/python -m bench.rigid
-	$(BIN)/python -m bench.whole_run
 	$(BENCH_PEERS)
 
 bench-random: setup  ## Recordings drawn at random: how many are clean, and why the others are not (SEEDS=1:301)
@@ -75,6 +76,9 @@ bench-random: setup  ## Recordings drawn at random: how many are clean, and why 
 
 bench-detection: setup  ## The detection figures, on fresh seeds
 	$(BIN)/python -m bench.detection
+
+bench-throughput: setup  ## What a run costs, stage by stage, beside reading its pictures (some minutes)
+	$(BIN)/python -m bench.throughput
 
 bench-calibration: setup  ## The calibration figures, on fresh seeds (a quarter of an hour)
 	$(BIN)/python -m bench.calibration

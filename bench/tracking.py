@@ -3,7 +3,7 @@
 bench/rigid.py has that of the rigid tracker and the smoother; `make bench-tracking` prints both.
 
 Every row is a Monte Carlo on simulated points (lab/simulate/points.py) with fresh seeds that no parameter was chosen on
-(parameters were looked at with seeds 100 to 103). Nothing here needs pictures; bench/whole_run.py has those rows.
+(parameters were looked at with seeds 100 to 103). Nothing here needs pictures; bench/throughput has those rows.
 """
 
 from __future__ import annotations

@@ -15,10 +15,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import cholesky, solve_triangular
-from scipy.optimize import brentq
-from scipy.special import chdtrc, chdtri, chndtr
 
 from geometry.arrays import Array, skew
+from geometry.chi_square import chi2_limit, chi2_tail
 
 TURNED, MOVED, ZOOMED = "turned", "moved and turned", "focus changed"
 TURNED_ZOOMED, ALL_CHANGED = "turned and focus changed", "moved, turned and focus changed"
@@ -112,7 +111,7 @@ class Change:
     @property
     def p_value(self) -> float:
         """How probable so good an explanation is when nothing has changed."""
-        return float(chdtrc(self.rank, self.explained)) if self.rank else 1.0
+        return chi2_tail(self.explained, self.rank) if self.rank else 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,7 +151,7 @@ class Misfit:
     @property
     def p_value(self) -> float:
         """How probable so large a misfit is when nothing has changed."""
-        return float(chdtrc(self.dof, self.chi2)) if self.dof > 0 else 1.0
+        return chi2_tail(self.chi2, self.dof) if self.dof > 0 else 1.0
 
     def _whitened(self, columns: Array) -> Array:
         return columns if self.is_unit else solve_triangular(self.factor, columns, lower=True)
@@ -207,7 +206,7 @@ class Misfit:
     def p_value_of(self, columns: Array) -> float:
         """How probable so much in the ways of these columns is when nothing has changed."""
         U = self._basis_of(columns)
-        return float(chdtrc(U.shape[1], np.sum((U.T @ self.white) ** 2))) if U.shape[1] else 1.0
+        return chi2_tail(float(np.sum((U.T @ self.white) ** 2)), U.shape[1]) if U.shape[1] else 1.0
 
     def detectable(self, directions: Array, columns: Array, p_false_alarm: float, power: float) -> float:
         """The length, px, of the least visible of some displacements that a test of `columns` finds with this power.
@@ -226,7 +225,10 @@ class Misfit:
 
 def _noncentrality(dof: int, p_false_alarm: float, power: float) -> float:
     """Lambda at which a chi-square test of this size finds a change with this power."""
-    limit = float(chdtri(dof, p_false_alarm))
+    from scipy.optimize import brentq  # 0.3 s to import: a run without a fault does not ask
+    from scipy.special import chndtr
+
+    limit = chi2_limit(p_false_alarm, dof)
     return float(brentq(lambda x: 1 - chndtr(limit, dof, x) - power, 1e-6, 10 * limit + 200))
 
 

@@ -7,7 +7,6 @@ from directions is Wahba's problem, solved by scipy (Kabsch's method).
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from geometry.arrays import Array, normalised
 from geometry.lines import nearest_point
@@ -26,6 +25,8 @@ def pose_from_lines(
     body, world = normalised(beam_directions), normalised(line_directions)
     if len(body) < 2 or np.linalg.matrix_rank(body, tol=1e-6) < 2:
         return None
+    from scipy.spatial.transform import Rotation  # 0.1 s to import: only where it is asked for
+
     R = Rotation.align_vectors(world, body)[0].as_matrix()
     origin = nearest_point(line_points - beam_points @ R.T, world)
     return None if np.isnan(origin).any() else Pose(R, origin)

@@ -34,6 +34,18 @@ _packages: set[Path] = set()  # that have compiled functions
 
 def compiled(function: Function) -> Function:
     """numba.njit with numpy's division (x / 0 is inf, no exception) and the cache on disk where there is a place."""
+    return _compiled(function, release_gil=False)
+
+
+def compiled_for_threads(function: Function) -> Function:
+    """As `compiled`, and other threads go on meanwhile: for functions that work for a tenth of a millisecond or more.
+
+    A thread that releases the GIL may wait long to get it back, so it does not pay for short functions.
+    """
+    return _compiled(function, release_gil=True)
+
+
+def _compiled(function: Function, release_gil: bool) -> Function:
     package = Path(function.__code__.co_filename).parent
     _packages.add(package)
     folder = cache_folder(package)
@@ -41,7 +53,7 @@ def compiled(function: Function) -> Function:
     before = settings.CACHE_DIR
     settings.CACHE_DIR = before if folder is None else str(folder)
     try:
-        dispatcher = numba.njit(function, cache=folder is not None, error_model="numpy")
+        dispatcher = numba.njit(function, cache=folder is not None, error_model="numpy", nogil=release_gil)
     finally:
         settings.CACHE_DIR = before
     _take_literals_for_plain(dispatcher)

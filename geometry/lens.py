@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.polynomial import polynomial as poly
-from scipy.optimize import brentq
 
 from geometry.arrays import Array, Bools
 
@@ -180,8 +179,20 @@ def _first_sign_change(p: Array) -> float:
     for r in sorted(1 / w for w in inverse.real[near_real]):
         below, above = r * (1 - 1e-5), r * (1 + 1e-5)
         if poly.polyval(below, p) > 0 > poly.polyval(above, p):
-            return float(brentq(lambda x: float(poly.polyval(x, p)), below, above, rtol=1e-14))
+            return _bisected(p, below, above)
     return np.inf
+
+
+def _bisected(p: Array, below: float, above: float) -> float:
+    """Where a polynomial (n,) that is positive at `below` and negative at `above` turns, to the last bit."""
+    while True:
+        middle = 0.5 * (below + above)
+        if not below < middle < above:
+            return middle
+        if poly.polyval(middle, p) > 0:
+            below = middle
+        else:
+            above = middle
 
 
 def holds(xy: Array, jacobian: Array, fold_r2: Array) -> Bools:

@@ -82,6 +82,7 @@ class Pose:
 
 
 def ypr_sigmas(pose: Pose, covariance: Array) -> Array:
-    """Standard deviations of yaw, pitch, roll (3,), rad, from a pose covariance (6, 6), to first order."""
+    """Standard deviations of yaw, pitch, roll (..., 3), rad, from pose covariances (..., 6, 6), to first order."""
     J = rotations.ypr_jacobian(pose.rotation)
-    return np.sqrt(np.maximum(np.diagonal(J @ covariance[3:, 3:] @ J.T), 0.0))
+    turned = J @ covariance[..., 3:, 3:] @ np.swapaxes(J, -1, -2)
+    return np.sqrt(np.maximum(np.diagonal(turned, axis1=-2, axis2=-1), 0.0))

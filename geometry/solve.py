@@ -7,13 +7,12 @@ model of geometry/spots.py and its analytic Jacobian.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cache
 
 import numpy as np
-from scipy.special import chdtri
 
 from geometry.arrays import Array, Ints, symmetric
 from geometry.calibration_spread import CalibrationSpread
+from geometry.chi_square import chi2_limit
 from geometry.pose import Pose
 from geometry.spots import SpotModel
 
@@ -87,10 +86,9 @@ class PoseFit:
         return self.dof <= 0 or self.chi2 <= largest_chi2(p_false_alarm, self.dof)
 
 
-@cache
 def largest_chi2(p_false_alarm: float, dof: int) -> float:
     """The chi-square that a right fit exceeds with this probability. Kept, as it is asked for in every frame."""
-    return float(chdtri(dof, p_false_alarm))
+    return chi2_limit(p_false_alarm, dof)
 
 
 def whiten(covariances: Array) -> Array:

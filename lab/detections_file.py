@@ -24,6 +24,8 @@ DEFAULT_SIGMA_PX = 0.1  # px: where the file gives no sigma; a centroid of a cle
 SHAPE = ("flux", "peak", "major_px", "minor_px", "angle_deg")
 SPARSEST = 1000  # frame numbers per picture: more than that is a stray number, or a number that holds a time
 MANY = 100_000  # frame numbers that a run may span however sparse it is
+LONGEST_GAP = 10_000  # frame numbers, 100 s at 100 Hz: behind a longer one so few pictures are strays ...
+MOST_ALONE = 3
 STRAY = 0.1  # of the frames: a few far from all others are left out, but who shall say which half of a run is wrong?
 
 
@@ -127,7 +129,7 @@ class _Rows:
         self._leave_out(~is_whole(frame), "the frame is no whole number", "frame")
         self._leave_out(frame < 0, "the frame is negative; frames count from 0", "frame")
         self._leave_out(self.camera == "", "no camera is named")
-        far = f"the frame is more than {MANY} numbers away from the others"
+        far = f"the frame is more than {LONGEST_GAP} numbers away from the others"
         self._leave_out(_stray(frame, self.good), far, "frame")
 
     def leave_out_unmeasured(self, uv: Array, sigma: Array, shared: Array) -> None:
@@ -178,11 +180,27 @@ def too_sparse(span: int, pictures: int) -> bool:
     return span > MANY and span > SPARSEST * pictures
 
 
+def far_off(numbers: Array | Ints) -> Bools:
+    """Which of the rising frame numbers (n,) are strays: a few behind a gap longer than all that is recorded.
+
+    Every number in the gap would cost what a frame costs: a file named 090000.png beside 300 pictures, 90 s.
+    """
+    long = np.diff(numbers) > max(LONGEST_GAP, len(numbers))
+    piece = np.concatenate([np.zeros(1, dtype=np.int64), np.cumsum(long)])[: len(numbers)]
+    sizes = np.bincount(piece, minlength=1)
+    few = sizes <= max(1, min(MOST_ALONE, int(0.01 * len(numbers))))
+    few[int(np.argmax(sizes))] = False
+    return np.asarray(few[piece])
+
+
 def _stray(frame: Array, good: Bools) -> Bools:
     """Which rows (n,) stand for a few frames so far from all the others that the run would be too sparse with them."""
     out = np.zeros(len(frame), dtype=bool)
     numbers = np.unique(frame[good])
-    if not numbers.size or not too_sparse(int(numbers[-1] - numbers[0]) + 1, numbers.size):
+    if not numbers.size:
+        return out
+    if not too_sparse(int(numbers[-1] - numbers[0]) + 1, numbers.size):
+        out[good] = np.isin(frame[good], numbers[far_off(numbers)])
         return out
     pieces = np.split(numbers, np.flatnonzero(np.diff(numbers) > MANY) + 1)
     longest = max(pieces, key=len)

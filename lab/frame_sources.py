@@ -4,36 +4,26 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, TypeAlias
+from typing import TYPE_CHECKING, Protocol, TypeAlias
 
-import cv2
 import numpy as np
 
 from geometry.arrays import Ints
 from lab.detections_file import CameraPoints
 from lab.errors import InputError
+from lab.opencv import quiet_cv2
 from lab.pictures import DROPPED, SUFFIXES, UNREADABLE, Grey, Missing, checked, read_picture
 from tracking.detections import Detections
+
+if TYPE_CHECKING:
+    import cv2
 
 Picture: TypeAlias = Grey | Detections | Missing
 Asked: TypeAlias = Picture | Future[Grey | Missing] | Future[Grey | Missing | None]
 _LAST_NUMBER = re.compile(r"([0-9]+)[^0-9]*$")
-
-
-@contextmanager
-def quiet_opencv() -> Iterator[None]:
-    """No remarks of OpenCV and FFmpeg on standard error about pictures whose damage we report ourselves."""
-    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # read by OpenCV when the first video is opened
-    before = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-    try:
-        yield
-    finally:
-        cv2.utils.logging.setLogLevel(before)
 
 
 def arrived(asked: Asked) -> Picture | None:
@@ -159,6 +149,7 @@ class VideoSource:
         if not good or picture is None:
             return Missing(f"{UNREADABLE}: damaged")
         if picture.ndim == 3:
+            cv2 = quiet_cv2()
             picture = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY) if picture.shape[2] == 3 else picture[..., 0]
         return checked(picture, self._size_px)
 
@@ -177,6 +168,7 @@ class VideoSource:
 
 def open_video(path: Path) -> cv2.VideoCapture:
     """An opened video. Raises InputError where OpenCV cannot read it."""
+    cv2 = quiet_cv2()
     capture = cv2.VideoCapture(str(path))
     if not capture.isOpened():
         raise InputError(
@@ -190,6 +182,6 @@ def open_video(path: Path) -> cv2.VideoCapture:
 def promised_pictures(path: Path) -> int | None:
     """How many pictures the video's header promises; it may be wrong. None where it says nothing."""
     capture = open_video(path)
-    count = capture.get(cv2.CAP_PROP_FRAME_COUNT)
+    count = capture.get(quiet_cv2().CAP_PROP_FRAME_COUNT)
     capture.release()
     return int(count) if 0 < count < 2**40 else None

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from geometry.arrays import Bools, Ints
-from lab.detections_file import CameraPoints, DetectionsFile, read_detections, too_sparse
+from lab.detections_file import CameraPoints, DetectionsFile, far_off, read_detections, too_sparse
 from lab.errors import InputError
 from lab.frame_sources import (
     Asked,
@@ -26,7 +26,6 @@ from lab.frame_sources import (
     arrived,
     list_folder,
     promised_pictures,
-    quiet_opencv,
 )
 from lab.pictures import DROPPED, Grey, Missing
 from lab.run_file import DetectionsTable, FramesFolder, Run, VideoFile
@@ -67,8 +66,7 @@ class FrameReader:
             if isinstance(source, FramesFolder):
                 self._listings[name] = list_folder(source.path)
             elif isinstance(source, VideoFile):
-                with quiet_opencv():
-                    self._promised[name] = promised_pictures(source.path)
+                self._promised[name] = promised_pictures(source.path)
             else:
                 if source.path not in opened:
                     opened[source.path] = read_detections(source.path)
@@ -110,7 +108,6 @@ class FrameReader:
     def __iter__(self) -> Iterator[FrameSet]:
         self._trouble, self._ended = {c: {} for c in self._run.cameras}, {}
         with ExitStack() as stack:
-            stack.enter_context(quiet_opencv())
             pool = ThreadPoolExecutor(THREADS, thread_name_prefix="decode")
             stack.callback(pool.shutdown, cancel_futures=True)
             sources = {}
@@ -166,6 +163,22 @@ class FrameReader:
                 f" pictures between frame {self.first} and frame {self.last}; is a stray {stray} among them, or do the"
                 f" {holders} hold a time?"
             )
+        self._check_strays()
+
+    def _check_strays(self) -> None:
+        """Raises InputError for a few pictures far from all others. (Of tables such rows are left out.)"""
+        everything: list[Ints] = [v.numbers for v in self._listings.values()]
+        everything += [c.frames for t in self._tables.values() for c in t.cameras.values()]
+        numbers = np.unique(np.concatenate(everything)) if everything else np.empty(0, np.int64)
+        strays = far_off(numbers)
+        for listing in self._listings.values():
+            for number in numbers[strays].tolist():
+                if number in listing.names:
+                    others = numbers[~strays]
+                    raise InputError(
+                        f"{listing.folder / listing.names[number]}: expected frame numbers without a long gap, got"
+                        f" {number}, where the others are {others[0]} to {others[-1]}; is it a stray file? Take it away"
+                    )
 
     def _check_times(self) -> None:
         with_picture: list[Ints] = [v.numbers for v in self._listings.values()]
@@ -266,7 +279,7 @@ def pictures_at(run: Run, camera: str, frames: Sequence[int]) -> dict[int, Pictu
     wanted = sorted(set(frames))
     source, size_px = run.cameras[camera], run.rig.cameras[camera].image_size_px
     out: dict[int, Picture] = {}
-    with quiet_opencv(), ExitStack() as stack:
+    with ExitStack() as stack:
         if isinstance(source, VideoFile):
             video = VideoSource(source.path, size_px)
             stack.callback(video.close)

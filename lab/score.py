@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.special import gammaincinv
 
 from geometry.arrays import Array, Bools, Ints
+from geometry.chi_square import gamma_quantile
 from geometry.pose import Pose
 from lab.motion_score import motion_scores
 from lab.results import (
@@ -294,7 +294,7 @@ def _pose_spread(delta: Array, covariance: Array) -> dict[str, Any] | None:
         "rotation_deg": _norms(angle),
         "nees_mean": float(nees.mean()) if n else None,
         # In which the mean of n independent rows lies 95 times in 100; rows of a filter are not independent.
-        "nees_mean_95": [float(2 * gammaincinv(3 * n, p) / n) for p in (0.025, 0.975)] if n else None,
+        "nees_mean_95": [2 * gamma_quantile(1 - p, 3 * n) / n for p in (0.025, 0.975)] if n else None,
         "nees_rows": n,
     }
 

@@ -10,9 +10,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import chdtri
 
 from geometry.arrays import Array, Bools, Ints
+from geometry.chi_square import chi2_limit
 from geometry.pose import Pose
 from geometry.spots import SpotModel
 
@@ -106,7 +106,7 @@ def against_causal(
     squared = mahalanobis2(gap, total)
     squared = np.where(known, squared, np.nan)
     with np.errstate(invalid="ignore"):
-        return CausalAgreement(np.sqrt(squared), np.asarray(squared > float(chdtri(6, p))))
+        return CausalAgreement(np.sqrt(squared), np.asarray(squared > chi2_limit(p, 6)))
 
 
 def contradictory(
@@ -145,7 +145,7 @@ def finite(values: Array, axes: int | tuple[int, ...]) -> Bools:
 
 def limits(dof: Ints, p: float) -> Array:
     """(T,): chi-square that is exceeded with probability p; inf for 0 degrees of freedom."""
-    table = np.array([np.inf, *(float(chdtri(k, p)) for k in range(1, int(dof.max(initial=0)) + 1))])
+    table = np.array([np.inf, *(chi2_limit(p, k) for k in range(1, int(dof.max(initial=0)) + 1))])
     return np.asarray(table[dof])
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from geometry.arrays import Array, Ints
 from tracking.gain import combined, picture_scale
@@ -74,6 +73,8 @@ def _take(
     """Assign the allowed pairs of largest total gain, and note them."""
     if not allowed.any():
         return
+    from scipy.optimize import linear_sum_assignment  # 0.3 s to import: only where the paper's tracker runs
+
     # A match, however poor, is worth more than none: 1 on top of the gain.
     value = np.where(allowed, 1.0 + g, 0.0)
     for i, j in zip(*linear_sum_assignment(value, maximize=True), strict=True):

@@ -12,10 +12,10 @@ pseudo-counts: ours.
 from __future__ import annotations
 
 import numpy as np
-from scipy.ndimage import uniform_filter1d
 
 from geometry.arrays import Array, Bools
 from tracking.fixed_interval import Interval
+from tracking.windows import window_mean
 
 # (m/s^3)^2/Hz or (rad/s^3)^2/Hz, as logarithms. The lower end is for a vehicle that stands: over 10 s it allows 1 mm.
 # Below it rounding is felt.
@@ -58,8 +58,8 @@ def _window_sums(values: Array, width: int) -> Array:
 
     A triangle, not a box: what a box averages away at some wavelengths the fixed point would let grow without end.
     """
-    once = uniform_filter1d(values, width, mode="constant")
-    return np.maximum(uniform_filter1d(once, width, mode="constant") * width, 0.0)
+    once = window_mean(values, width)
+    return np.maximum(window_mean(once, width) * width, 0.0)
 
 
 def _weighted_median(values: Array, weights: Array) -> float:

@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.ndimage import maximum_filter1d
 
 from geometry.arrays import Array, Bools, Ints
 from geometry.pose import Pose
@@ -30,6 +29,7 @@ from tracking.motion import STATE, predicted
 from tracking.process_noise import next_log_density
 from tracking.relabel import AllDetections, evidence_of
 from tracking.temper import STEADIES_WITHIN_S, jump_variance
+from tracking.windows import largest_near
 
 LOST_SIGMA_M, LOST_SIGMA_RAD = 1.0, np.deg2rad(60.0)  # a predicted pose vaguer than this is `lost`
 MOST_PASSES = 25
@@ -94,7 +94,7 @@ def estimate(run: WholeRun, assigned: Ints, measured: Bools, motion: Motion, dee
     """
     frames = len(run.dt)
     measured = measured & trusted
-    far = ~np.asarray(maximum_filter1d(measured.astype(np.int8), 2 * deep + 1, mode="constant"), dtype=bool)
+    far = ~largest_near(measured, deep)
     used = ~far & trusted & (assigned >= 0).any(axis=1)
     if not measured.any():
         return replace(motion, known=np.zeros(frames, dtype=bool))
@@ -189,8 +189,8 @@ class _Estimator:
         share = np.einsum("kij,kji->k", out.pose_P, ev.information)[self.measured]
         usual = float(np.median(share)) / 6 if len(share) else 1.0
         memory = int(np.clip(np.ceil(2 / max(usual, 1e-3)), 3, 200))
-        edge = np.concatenate([[True], ~self.measured | self.bent, [True]])
-        near = np.asarray(maximum_filter1d(edge.astype(np.int8), 2 * memory + 1, mode="nearest"), dtype=bool)[1:-1]
+        edge: Bools = np.concatenate([[True], ~self.measured | self.bent, [True]])
+        near: Bools = largest_near(edge, memory)[1:-1]
         return ~near
 
     def _best_finer(self, out: Interval) -> float:
@@ -270,7 +270,7 @@ class _Estimator:
         measured, dt = self.measured, self.dt
         usual = float(np.median(dt[dt > 0])) if np.any(dt > 0) else SPEED_WINDOW_S
         window = max(1, min(round(SPEED_WINDOW_S / usual), len(dt)))
-        size = jump_variance(_running_maximum(np.where(measured[:, None], speeds(ref.m), 0.0), window))
+        size = jump_variance(largest_near(np.where(measured[:, None], speeds(ref.m), 0.0), window))
         # After a dark stretch the first light does not tell when it bent, and the second not whether it did so between.
         dark = ~measured
         dark[1:] |= ~measured[:-1]
@@ -292,7 +292,7 @@ class _Estimator:
 
     def _new_bends(self, shock: Array) -> Bools:
         """(T,): steps in which the velocities jumped and that are not known of: the largest shock of each place."""
-        peak = shock >= maximum_filter1d(np.where(self.bent, 0.0, shock), 2 * APART + 1, mode="nearest")
+        peak = shock >= largest_near(np.where(self.bent, 0.0, shock), APART)
         return np.asarray(peak & (shock > SHOCK) & ~self.bent)
 
     def _whole(self, out: Interval) -> Motion:
@@ -351,11 +351,6 @@ def _before_the_first(ref: Reference, dt: Array, measured: bool) -> Array:
     acceleration = change.reshape(-1, 2, 3).max(axis=(0, 2), initial=0.0)
     pose = [0.1, 0.1] if measured else [1.0, 1.0]
     return np.asarray(np.repeat([*pose, *(2 * speed + 0.1), *(2 * acceleration + 1.0)], 3) ** 2)
-
-
-def _running_maximum(values: Array, half: int) -> Array:
-    """The largest of values (T, k) within half frames of each."""
-    return np.asarray(maximum_filter1d(values, 2 * half + 1, axis=0, mode="nearest"))
 
 
 def straight_between(poses: Array, measured: Bools, t_s: Array) -> Reference:

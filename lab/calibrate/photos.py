@@ -10,14 +10,14 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from calibration.boards.board_detection import NO_CLOSE_LOOK, BoardView, NotFound, find_board
 from calibration.boards.board_view import GreyImage
 from calibration.boards.kinds import Board, Chessboard
 from lab.errors import InputError
-from lab.pictures import SUFFIXES, UNREADABLE, Grey, Missing, checked, decode
+from lab.opencv import quiet_cv2
+from lab.pictures import SUFFIXES, UNREADABLE, Grey, Missing, checked, read_picture
 
 VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".webm")
 VIDEO_PICTURES = 120  # of one video at most, evenly spread: neighbouring frames show the same pose again
@@ -185,20 +185,13 @@ def _pictures(files: Sequence[Path], names: dict[Path, str]) -> Iterator[tuple[s
         if path.suffix.lower() in VIDEO_SUFFIXES:
             yield from ((f"{names[path]}#{k}", path, picture) for k, picture in _frames(path))
         else:
-            yield names[path], path, _read(path)
-
-
-def _read(path: Path) -> Grey | Missing:
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        return Missing(f"unreadable: {error.strerror}")
-    return decode(data, None)
+            yield names[path], path, read_picture(path, None)
 
 
 def _frame_count(path: Path) -> int:
     if path.suffix.lower() not in VIDEO_SUFFIXES:
         return 1
+    cv2 = quiet_cv2()
     video = cv2.VideoCapture(str(path))
     count = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
     video.release()
@@ -207,6 +200,7 @@ def _frame_count(path: Path) -> int:
 
 def _frames(path: Path) -> Iterator[tuple[int, Grey | Missing]]:
     """Evenly spread frames of a video with their numbers."""
+    cv2 = quiet_cv2()
     video = cv2.VideoCapture(str(path))
     try:
         count = int(video.get(cv2.CAP_PROP_FRAME_COUNT))

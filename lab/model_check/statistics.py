@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.stats import gamma
 
 from geometry.arrays import Array, Ints
+from geometry.chi_square import gamma_quantile
 from geometry.spots import SpotModel
 from lab.model_check.linear import Linearised
 from lab.model_check.recording import Recording, finite, whitening
@@ -100,7 +100,7 @@ def correlation_time(series: Array) -> float:
 def nis_band(frames: float) -> tuple[float, float]:
     """Where the mean of NIS / 2 over so many independent frames lies in 95 of 100: a gamma distribution of mean 1."""
     shape = max(frames, 1.0)
-    return float(gamma.ppf(0.025, shape, scale=1 / shape)), float(gamma.ppf(0.975, shape, scale=1 / shape))
+    return gamma_quantile(0.975, shape) / shape, gamma_quantile(0.025, shape) / shape
 
 
 def statistics(

@@ -216,8 +216,16 @@ def test_a_few_frames_far_from_all_others_are_left_out_and_the_run_is_kept(tmp_p
     folder = points_for_right(tmp_path / "a", *rows)
     reader = open_frames(load_run(folder))
     assert (reader.first, reader.last) == (0, 599)
-    far = "1 of 601 rows left out: the frame is more than 100000 numbers away from the others (the first near line 302,"
+    far = "1 of 601 rows left out: the frame is more than 10000 numbers away from the others (the first near line 302,"
     assert any(far in n and n.endswith("with frame 1e+09)") for n in reader.notes)
+
+
+def test_one_row_behind_a_gap_longer_than_the_recording_is_left_out_too(tmp_path):
+    rows = [row(f, "right", 5 + f % 50, 6) for f in range(600)]
+    folder = points_for_right(tmp_path / "a", *rows, row(90000, "right", 9, 9))
+    reader = open_frames(load_run(folder))
+    assert (reader.first, reader.last) == (0, 599)
+    assert any("1 of 601 rows left out: the frame is more than 10000 numbers away" in n for n in reader.notes)
 
 
 def test_frame_numbers_that_hold_a_time_are_refused_before_a_thousand_million_rows_are_written(tmp_path):

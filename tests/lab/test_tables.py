@@ -294,3 +294,20 @@ def test_the_files_are_closed_when_the_run_breaks(tmp_path):
         break_it()
     with pytest.raises(ValueError, match="closed file"):
         tables.write(a_record(np.random.default_rng(9)))
+
+
+def test_rows_are_the_same_whether_frames_are_worked_out_alone_or_together(tmp_path, monkeypatch):
+    rng = np.random.default_rng(21)
+    records = [a_record(rng, frame, n_points=frame % 5) for frame in range(150)]
+    records = [lost(r) if r.frame % 7 == 3 else r for r in records]
+    texts = []
+    for together in (64, 1):
+        folder = tmp_path / str(together)
+        folder.mkdir()
+        monkeypatch.setattr("lab.tables._TOGETHER", together)
+        with TableWriter(folder, RIG, with_causal=True) as tables:
+            for record in records:
+                tables.write(record, lost(record) if record.frame % 11 == 0 else record)
+        texts.append({path.name: path.read_bytes() for path in sorted(folder.iterdir())})
+    assert texts[0] == texts[1]
+    assert texts[0]["attitude.csv"].count(b"\n") == 151

@@ -1,0 +1,155 @@
+"""Run one job in this process and print, as JSON, the process time of each of its stages and the largest memory.
+
+`python -m bench.throughput.stages run RUN OUT`, `report OUT`, `read RUN`, `imread RUN`, `video RUN`. A stage is a
+function of the program (STAGES), whose time is that of the thread which calls it, without what another stage takes
+inside. "start-up" is all that happens before the first picture is asked for, and all imports, but not the loading of
+compiled code.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import json
+import resource
+import sys
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+STAGES = (
+    ("decode", "lab.frame_sources", "read_picture"),
+    ("decode", "lab.frame_sources", "VideoSource._next"),
+    ("detect", "lab.pipeline", "Pipeline._detect"),
+    ("track", "tracking.rigid_tracker", "RigidTracker.step"),
+    ("smooth", "lab.two_passes", "smooth"),
+    ("smooth", "tracking.smoothed", "Smoothed.frame"),
+    ("tables", "lab.tables", "TableWriter.write"),
+    ("tables", "lab.tables", "TableWriter.__exit__"),
+    ("model check", "lab.model_check.check", "check_kept"),
+    ("report", "lab.report.page", "write_report"),
+    ("load compiled", "numba.core.caching", "Cache.load_overload"),
+    ("compile", "numba.core.dispatcher", "_FunctionCompiler.compile"),
+)
+
+
+class Clock:
+    """Adds up what stages take, each without those inside it."""
+
+    def __init__(self) -> None:
+        self.spent: Counter[str] = Counter()
+        self._lock = threading.Lock()
+        self._inside = threading.local()
+
+    def timed(self, stage: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        """The same function, whose time is counted."""
+
+        @functools.wraps(function)
+        def wrapped(*args: Any, **kwargs: Any) -> Any:
+            outer = getattr(self._inside, "of_others", 0.0)
+            self._inside.of_others = 0.0
+            begun = time.thread_time()
+            try:
+                return function(*args, **kwargs)
+            finally:
+                whole = time.thread_time() - begun
+                with self._lock:
+                    self.spent[stage] += whole - self._inside.of_others
+                self._inside.of_others = outer + whole
+
+        return wrapped
+
+
+def watch(clock: Clock) -> None:
+    """Count the time of all STAGES from now on. Raises AttributeError where a function has another name by now."""
+    for stage, module, name in STAGES:
+        owner: Any = importlib.import_module(module)
+        *classes, last = name.split(".")
+        for part in classes:
+            owner = getattr(owner, part)
+        setattr(owner, last, clock.timed(stage, getattr(owner, last)))
+
+
+def _run(folder: Path, out: Path) -> Counter[str]:
+    from lab import frames, process
+
+    clock = Clock()
+    watch(clock)  # imports the report and the model check, too, which a run imports at its end
+    started: list[float] = []
+    reading = frames.FrameReader.__iter__
+
+    def first_asked(reader: frames.FrameReader) -> Any:
+        loaded = clock.spent["load compiled"] + clock.spent["compile"]
+        started.append(time.process_time() - loaded)
+        return reading(reader)
+
+    frames.FrameReader.__iter__ = first_asked  # type: ignore[method-assign]
+    process.process_run(folder, out)
+    return clock.spent + Counter({"start-up": started[0]})
+
+
+def _report(out: Path) -> Counter[str]:
+    from lab.report import write_report
+
+    begun = time.process_time()
+    write_report(out, None)
+    return Counter({"report": time.process_time() - begun})
+
+
+def _read(folder: Path) -> Counter[str]:
+    """Only the pictures, read ahead in threads as in a run."""
+    from lab.frames import open_frames
+    from lab.run_file import load_run
+
+    reader = open_frames(load_run(folder))
+    begun = time.process_time()
+    for _ in reader:
+        pass
+    return Counter({"read": time.process_time() - begun})
+
+
+def _imread(folder: Path) -> Counter[str]:
+    import cv2
+
+    cv2.setNumThreads(1)
+    paths = sorted((folder / "frames").rglob("*.*"))
+    begun = time.process_time()
+    for path in paths:
+        cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    return Counter({"read": time.process_time() - begun})
+
+
+def _video(folder: Path) -> Counter[str]:
+    import cv2
+
+    cv2.setNumThreads(1)
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    begun = time.process_time()
+    for path in sorted(folder.glob("*.avi")):
+        capture = cv2.VideoCapture(str(path))
+        while capture.read()[0]:
+            pass
+        capture.release()
+    return Counter({"read": time.process_time() - begun})
+
+
+JOBS = {"run": _run, "report": _report, "read": _read, "imread": _imread, "video": _video}
+
+
+def main() -> None:
+    """See the module."""
+    job, *paths = sys.argv[1:]
+    begun = time.perf_counter()
+    spent = JOBS[job](*map(Path, paths))
+    wall = time.perf_counter() - begun
+    usage = resource.getrusage(resource.RUSAGE_SELF)
+    total = usage.ru_utime + usage.ru_stime
+    megabytes = usage.ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
+    print(json.dumps({"stages": spent, "total": total, "wall": wall, "megabytes": megabytes}))
+
+
+if __name__ == "__main__":
+    main()

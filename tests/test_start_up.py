@@ -1,0 +1,77 @@
+"""What a command imports: nobody waits for a library that has no part in it."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.lab.run_folders import RIG, RUN
+
+ROOT = Path(__file__).resolve().parents[1]
+REPORT = """
+import sys
+from cli import main
+try:
+    main({arguments!r})
+except SystemExit:
+    pass
+print("LOADED", *sorted(sys.modules))
+"""
+# Imports modules as usual, and says which were there when the tables were begun.
+WATCHED = """
+import sys
+import lab.tables
+first = []
+enter = lab.tables.TableWriter.__enter__
+def begun(self):
+    first.extend(sys.modules)
+    return enter(self)
+lab.tables.TableWriter.__enter__ = begun
+from cli import main
+try:
+    main({arguments!r})
+except SystemExit as done:
+    print("STATUS", done.code)
+print("FIRST", *sorted(first))
+print("LOADED", *sorted(sys.modules))
+"""
+SLOW_SCIPY = {"scipy.stats", "scipy.optimize", "scipy.special", "scipy.ndimage", "scipy.spatial", "scipy.sparse"}
+
+
+def loaded(code: str, *arguments: str, word: str = "LOADED") -> set[str]:
+    command = [sys.executable, "-c", code.format(arguments=list(arguments))]
+    out = subprocess.run(command, capture_output=True, text=True, check=True, cwd=ROOT).stdout
+    line = next(line for line in out.splitlines() if line.startswith(word + " "))
+    return set(line.split()[1:])
+
+
+@pytest.mark.parametrize("arguments", [("--version",), ("--help",), ("run", "--help"), ("calibrate", "rig", "--help")])
+def test_help_and_version_import_no_library_but_the_command_lines(arguments):
+    heavy = {"numpy", "scipy", "cv2", "pandas", "numba", "pydantic", "yaml", "jinja2", "rich"}
+    assert heavy & loaded(REPORT, *arguments) == set()
+
+
+@pytest.fixture(scope="module")
+def points_run(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("points")
+    (folder / "rig.yaml").write_text(RIG)
+    text = RUN.replace("{frames: frames/left}", "{detections: points.csv}")
+    (folder / "run.yaml").write_text(text.replace("{frames: frames/right}", "{detections: points.csv}"))
+    rows = [f"{f},{camera},{20 + f / 10},{20 - f / 10}" for f in range(12) for camera in ("left", "right")]
+    (folder / "points.csv").write_text("\n".join(["frame,camera,u_px,v_px", *rows]) + "\n")
+    return folder
+
+
+def test_a_run_loads_neither_the_report_nor_the_slow_parts_of_scipy_before_its_first_row(points_run, tmp_path):
+    before = loaded(WATCHED, "run", str(points_run), "--out", str(tmp_path / "out"), word="FIRST")
+    assert {"numpy", "numba", "lab.tables"} <= before
+    assert before & (SLOW_SCIPY | {"jinja2", "markupsafe", "rich", "lab.report.page", "lab.simulate.write"}) == set()
+
+
+def test_a_run_never_loads_the_slow_parts_of_scipy(points_run, tmp_path):
+    after = loaded(WATCHED, "run", str(points_run), "--out", str(tmp_path / "out"))
+    assert {"jinja2", "lab.report.page"} <= after
+    assert after & SLOW_SCIPY == set()
