@@ -12,12 +12,12 @@ from functools import lru_cache
 
 import numpy as np
 
-from geometry.arrays import Array
+from geometry.arrays import Array, Bools
 from geometry.camera import Camera
 from geometry.planes import meet_plane
 from geometry.rig import Screen
 
-_WINDOW = 3.7  # sigmas from centre to side of the window in which a spot is fitted: 3.2 along the major axis, more across
+_WINDOW = 3.7  # sigmas from centre to side of the window of a fit: 3.2 along the major axis, more across it
 _STEP = 0.5  # sigmas of the spot: of the differences that give the map's curvature
 _LARGEST_SHARE = 0.25  # of the spot's sigma: a larger offset means that the second order is not enough
 
@@ -45,9 +45,9 @@ def centre_offsets(camera: Camera, screen: Screen, uv_px: Array, shape_px2: Arra
     N11 = (s[:, 1] - 2 * s[:, 0] + s[:, 2]) / _STEP**2
     N22 = (s[:, 3] - 2 * s[:, 0] + s[:, 4]) / _STEP**2
     N12 = (s[:, 5] + s[:, 6] - s[:, 7] - s[:, 8]) / (4 * _STEP**2)
-    good = np.isfinite(s).all(axis=(1, 2))
-    M = np.where(good[:, None, None], M, np.eye(2))
-    P = np.linalg.solve(M, np.where(good[:, None, None], 0.5 * np.stack([N11, N12, N22], axis=-1), 0.0))
+    good: Bools = np.isfinite(s).all(axis=(1, 2))
+    curvature: Array = np.where(good[:, None, None], 0.5 * np.stack([N11, N12, N22], axis=-1), 0.0)
+    P: Array = np.linalg.solve(np.where(good[:, None, None], M, np.eye(2)).astype(float), curvature)
     # The exponent is -|M^-1 (s - s0)|^2 / 2 = -|g|^2 / 2 - g . (P_11 g1^2 + 2 P_12 g1 g2 + P_22 g2^2).
     cube1, cube2 = -P[:, 0, 0], -P[:, 1, 2]
     mixed1, mixed2 = -(P[:, 0, 2] + 2 * P[:, 1, 1]), -(P[:, 1, 0] + 2 * P[:, 0, 1])  # of g1 g2^2 and g1^2 g2

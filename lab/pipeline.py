@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
 
+from geometry.light_centroid import centre_offsets
+from geometry.rig import Rig
 from lab.frames import FrameReader, FrameSet, open_frames
 from lab.pictures import Missing
 from lab.run_file import Run
 from lab.sensor_noise import CameraNoise, camera_noises
 from tracking.detections import Detections
 from tracking.labels import PosePrior
+from tracking.noise import NoiseModel
 from tracking.rigid_tracker import RigidTracker
 from tracking.spot_tracker import SpotTracker
 from tracking.tracked_frame import TrackedFrame
@@ -118,7 +121,21 @@ class Pipeline:
                 missing.append(picture.reason)
                 continue
             if isinstance(picture, np.ndarray):
-                picture = self.noise[name].detect(picture, self.run.tracker.detect)
+                noise = self.noise[name]
+                picture = on_beam_axes(noise.detect(picture, self.run.tracker.detect), self.run.rig, name, noise.model)
             found.append(picture)
             missing.append("")
         return tuple(found), tuple(missing)
+
+
+def on_beam_axes(found: Detections, rig: Rig, camera: str, noise: NoiseModel | None) -> Detections:
+    """Detections (n) with their centres moved from the light's centre to the image of the beam's axis."""
+    if not len(found) or noise is None:
+        return found
+    c, s = np.cos(np.radians(found.angle_deg)), np.sin(np.radians(found.angle_deg))
+    major2, minor2 = found.major_px**2, found.minor_px**2
+    shape = np.stack([major2 * c**2 + minor2 * s**2, (major2 - minor2) * c * s, major2 * s**2 + minor2 * c**2], axis=-1)
+    seen_by = rig.cameras[camera]
+    brightness = noise.slope_dn * found.peak / noise.floor_dn2
+    offset = centre_offsets(seen_by, rig.screens[seen_by.screen], found.uv_px, shape, brightness)
+    return replace(found, uv_px=found.uv_px - offset)
