@@ -1,0 +1,310 @@
+"""Where in a picture a spot may be: a closer look at the blocks that stand out.
+
+A candidate is a maximum of the mean of 3x3 pixels. How far it stands out is asked of the means of 3x3 and of 5x5 pixels,
+matched filters for spots of 1 and 2 px sigma that lose a tenth of the signal-to-noise ratio; spots so wide and faint
+that only a mean of 8x8 pixels shows them are looked for apart (`wide_candidate`).
+"""
+
+from __future__ import annotations
+
+from math import sqrt
+from typing import NamedTuple
+
+import numpy as np
+
+from geometry.arrays import Array, Ints
+from geometry.compiled import compiled
+from tracking.detection.block_search import BLOCK, Blocks
+from tracking.detection.pixels import Pixels, clamped, mean3, mirrored, pixel
+
+RADIUS = 48  # px: peaks further apart than this never belong to one spot of the largest size
+NEAREST = 4  # brighter peaks that a peak is compared with
+DIP = 0.12  # share of the fainter peak by which the light must fall between two spots: speckle falls by less
+HOT = 0.08  # light of the four neighbours over the pixel's: 0.15 for the sharpest spot (1 px wide), 0 for a hot pixel
+HOT_SIGMAS = 4.0  # a pixel must stand out so far of its surroundings to be called hot
+_REACH = 4  # px around a block that are looked at with it: 2 for maxima, 2 for the means
+_SIDE = BLOCK + 2 * _REACH
+_WIDE_CLIP = 4.0  # sigmas over the background at which pixels are cut where a wide faint spot is looked for
+
+
+class Noise(NamedTuple):
+    """tracking.noise.NoiseModel for compiled code."""
+
+    floor: float
+    slope: float
+    black: float
+
+
+class Peaks(NamedTuple):
+    """Room for places where a spot may be."""
+
+    uv: Ints  # (most, 2) px
+    height: Array  # (most,) DN of the mean of 3x3 pixels above the background
+    level: Array  # (most,) DN, the background
+    wide: Ints  # (most,) 1: seen in the mean of 8x8 pixels only
+
+    @staticmethod
+    def of(most: int) -> Peaks:
+        """Room for so many."""
+        return Peaks(np.zeros((most, 2), np.int64), np.zeros(most), np.zeros(most), np.zeros(most, np.int64))
+
+
+class Room(NamedTuple):
+    """Room to work in, for one block."""
+
+    values: Array  # (side, side) pixels
+    lines: Array  # (side, side) sums of three or five in a row
+    sum3: Array  # (side, side) sums of 3x3 pixels
+    few: Array  # (32,)
+
+    @staticmethod
+    def new() -> Room:
+        """All of it."""
+        return Room(*(np.zeros((_SIDE, _SIDE)) for _ in range(3)), np.zeros(32))
+
+
+@compiled
+def variance(noise: Noise, level: float) -> float:
+    """Of a pixel of that expected grey value, DN^2."""
+    return noise.floor + noise.slope * max(level - noise.black, 0.0)
+
+
+@compiled
+def find_peaks(
+    image: Pixels, blocks: Blocks, noise: Noise, found: Ints, found_count: int, least_sigmas: float, room: Room,
+    peaks: Peaks, count: int,
+) -> int:  # fmt: skip
+    """Add the peaks of the blocks `found` to the first `count` ones; returns how many there are then."""
+    for k in range(found_count):
+        row, column = found[k, 0], found[k, 1]
+        if not found[k, 2]:
+            level = blocks.ground[row, column] / 64.0
+            count = _peaks_of_block(image, BLOCK * column, BLOCK * row, level, noise, least_sigmas, room, peaks, count)
+        elif _is_highest_block(blocks, row, column):
+            count = _wide_peak(image, blocks, row, column, noise, least_sigmas, room, peaks, count)
+    return count
+
+
+@compiled
+def _peaks_of_block(
+    image: Pixels, left: int, top: int, level: float, noise: Noise, least_sigmas: float, room: Room, peaks: Peaks,
+    count: int,
+) -> int:  # fmt: skip
+    """Maxima of the mean of 3x3 pixels among 5x5 of them that lie in one block and stand out."""
+    values, lines, sum3 = room.values, room.lines, room.sum3
+    # Mirrored at the border: with repeated pixels the maximum of a spot at the edge would come to lie outside.
+    for i in range(_SIDE):
+        v = mirrored(top + i - _REACH, image.height)
+        for j in range(_SIDE):
+            values[i, j] = pixel(image, mirrored(left + j - _REACH, image.width), v)
+    for i in range(_SIDE):
+        for j in range(1, _SIDE - 1):
+            lines[i, j] = values[i, j - 1] + values[i, j] + values[i, j + 1]
+    for i in range(1, _SIDE - 1):
+        for j in range(1, _SIDE - 1):
+            sum3[i, j] = lines[i - 1, j] + lines[i, j] + lines[i + 1, j]
+    sigma = sqrt(variance(noise, level))
+    for i in range(_REACH, min(_REACH + BLOCK, image.height - top + _REACH)):
+        for j in range(_REACH, min(_REACH + BLOCK, image.width - left + _REACH)):
+            if sum3[i, j] <= 9 * level or not _is_maximum(sum3, i, j):
+                continue
+            total = 0.0
+            for a in range(i - 2, i + 3):
+                for b in range(j - 2, j + 3):
+                    total += values[a, b]
+            height3, height5 = sum3[i, j] - 9 * level, total - 25 * level
+            least = least_sigmas * sigma
+            if max(height3 / 3, height5 / 5) < least:
+                continue
+            excess = _hot_excess(image, left + j - _REACH, top + i - _REACH, noise, level + height3 / 9, room.few)
+            height3, height5 = height3 - excess, height5 - excess
+            if max(height3 / 3, height5 / 5) < least or height3 <= 0 or count >= peaks.level.shape[0]:
+                continue
+            peaks.uv[count, 0], peaks.uv[count, 1] = left + j - _REACH, top + i - _REACH
+            peaks.height[count], peaks.level[count], peaks.wide[count] = height3 / 9, level, 0
+            count += 1
+    return count
+
+
+@compiled
+def _is_maximum(values: Array, i: int, j: int) -> bool:
+    """Whether no value among the 5x5 around is larger, nor an earlier one as large."""
+    here = values[i, j]
+    for a in range(i - 2, i + 3):
+        for b in range(j - 2, j + 3):
+            if values[a, b] > here or (values[a, b] == here and (a < i or (a == i and b < j))):
+                return False
+    return True
+
+
+@compiled
+def _hot_excess(image: Pixels, u: int, v: int, noise: Noise, level: float, few: Array) -> float:
+    """By how much, DN, the brightest of 3x3 pixels exceeds its four neighbours, if it stands alone; else 0.
+
+    No light stands so alone that came through a lens. `level`, DN, gives the noise: on the broad top of a wide spot the
+    highest pixel is the luckiest one.
+    """
+    best, bu, bv = -1.0, u, v
+    for i in range(max(v - 1, 0), min(v + 2, image.height)):
+        for j in range(max(u - 1, 0), min(u + 2, image.width)):
+            x = pixel(image, j, i)
+            if x > best:
+                best, bu, bv = x, j, i
+    cross, n = 0.0, 0
+    for i in range(-2, 3):
+        row = mirrored(bv + i, image.height)
+        for j in range(-2, 3):
+            if max(abs(i), abs(j)) == 2:
+                few[n] = pixel(image, mirrored(bu + j, image.width), row)
+                n += 1
+            elif abs(i) + abs(j) == 1:
+                cross += 0.25 * pixel(image, mirrored(bu + j, image.width), row)
+    sort(few, 16)
+    ring = 0.5 * (few[7] + few[8])
+    above = best - ring
+    if cross - ring < HOT * above and above > HOT_SIGMAS * sqrt(variance(noise, level)):
+        return best - cross
+    return 0.0
+
+
+@compiled
+def sort(values: Array, n: int) -> None:
+    """Sort the first n values, few of them, in place."""
+    for i in range(1, n):
+        x, j = values[i], i
+        while j > 0 and values[j - 1] > x:
+            values[j] = values[j - 1]
+            j -= 1
+        values[j] = x
+
+
+@compiled
+def _is_highest_block(blocks: Blocks, row: int, column: int) -> bool:
+    rows, columns = blocks.sums.shape
+    here = blocks.highest8[row, column]
+    for i in range(max(row - 1, 0), min(row + 2, rows)):
+        for j in range(max(column - 1, 0), min(column + 2, columns)):
+            other = blocks.highest8[i, j]
+            if other > here or (other == here and (i < row or (i == row and j < column))):
+                return False
+    return True
+
+
+@compiled
+def _wide_peak(
+    image: Pixels, blocks: Blocks, row: int, column: int, noise: Noise, least_sigmas: float, room: Room, peaks: Peaks,
+    count: int,
+) -> int:  # fmt: skip
+    """A peak where 8x8 pixels stand out of the surroundings by more than their curvature explains.
+
+    Of c, the mean in the middle, and the medians r and R of eight means around it, 16 and 32 px away, c - 4/3 r + 1/3 R
+    is blind to a plane and to a paraboloid: to diffuse reflections. Bright pixels are cut, for a hot one is no spot.
+    """
+    rows, columns = blocks.quads.shape
+    bi, bj, best = 2 * row, 2 * column, -1.0
+    for i in range(2 * row, min(2 * row + 2, rows - 1)):
+        for j in range(2 * column, min(2 * column + 2, columns - 1)):
+            four = (blocks.quads[i, j] + blocks.quads[i, j + 1]) + (blocks.quads[i + 1, j] + blocks.quads[i + 1, j + 1])
+            if four > best:
+                best, bi, bj = four, i, j
+    u, v = 4 * bj + 4, 4 * bi + 4
+    if u >= image.width or v >= image.height:
+        return count
+    level = blocks.ground[row, column] / 64.0
+    sigma2 = variance(noise, level)
+    top = level + _WIDE_CLIP * sqrt(sigma2)
+    here = _mean8(image, u, v, top)
+    height = here
+    for k in range(2):
+        away, n = 16 * (k + 1), 0
+        for i in range(-1, 2):
+            for j in range(-1, 2):
+                if i != 0 or j != 0:
+                    room.few[n] = _mean8(image, u + j * away, v + i * away, top)
+                    n += 1
+        sort(room.few, 8)
+        height += (-4.0 / 3.0 if k == 0 else 1.0 / 3.0) * 0.5 * (room.few[3] + room.few[4])
+    # A median of eight has 1.4 times the variance of their mean.
+    scatter = sqrt(sigma2 / 64.0 * (1 + 1.4 / 8 * 17.0 / 9.0))
+    if height < least_sigmas * scatter or count >= peaks.level.shape[0]:
+        return count
+    peaks.uv[count, 0], peaks.uv[count, 1] = u, v
+    peaks.height[count], peaks.level[count], peaks.wide[count] = height, level, 1
+    return count + 1
+
+
+@compiled
+def _mean8(image: Pixels, u: int, v: int, top: float) -> float:
+    """The mean of 8x8 pixels, cut at `top`, from u - 4, v - 4 on; the border's pixels are repeated outside."""
+    total = 0.0
+    for i in range(v - 4, v + 4):
+        for j in range(u - 4, u + 4):
+            total += min(pixel(image, clamped(j, image.width), clamped(i, image.height)), top)
+    return total / 64.0
+
+
+@compiled
+def find_apart(image: Pixels, peaks: Peaks, order: Ints, noise: Noise, apart: Ints, near: Ints, gaps: Array) -> int:
+    """Which peaks, brightest first in `order`, are spots of their own; their number, and in `apart` which.
+
+    Between a peak and each of the nearest brighter ones the light must fall by `DIP` of the fainter peak, and by four
+    sigmas of the difference of two means of nine pixels. A wide faint peak must have no other within 16 px. `near`,
+    `gaps` (NEAREST,) are room to work in.
+    """
+    count = 0
+    for place in range(order.shape[0]):
+        i = order[place]
+        if peaks.wide[i]:
+            alone = not _has_neighbour(peaks, order, i)
+        else:
+            alone = True
+            needed = max(
+                DIP * peaks.height[i], 4.0 / 3.0 * sqrt(2.0) * sqrt(variance(noise, peaks.level[i]))
+            )
+            for k in range(_nearest_brighter(peaks, order, place, near, gaps)):
+                lowest = _lowest_between(image, peaks, i, near[k]) - peaks.level[i]
+                alone = alone and peaks.height[i] - lowest >= needed
+        if alone:
+            apart[count] = i
+            count += 1
+    return count
+
+
+@compiled
+def _has_neighbour(peaks: Peaks, order: Ints, i: int) -> bool:
+    for place in range(order.shape[0]):
+        j = order[place]
+        if not peaks.wide[j] and abs(peaks.uv[i, 0] - peaks.uv[j, 0]) < 16 and abs(peaks.uv[i, 1] - peaks.uv[j, 1]) < 16:
+            return True
+    return False
+
+
+@compiled
+def _nearest_brighter(peaks: Peaks, order: Ints, place: int, near: Ints, gaps: Array) -> int:
+    """The nearest peaks, at most NEAREST, before a place in `order`, into `near`; their number."""
+    i, filled = order[place], 0
+    for before in range(place):
+        j = order[before]
+        du, dv = peaks.uv[i, 0] - peaks.uv[j, 0], peaks.uv[i, 1] - peaks.uv[j, 1]
+        gap = 1.0 * (du * du + dv * dv)
+        if peaks.wide[j] or gap >= RADIUS**2 or (filled == NEAREST and gap >= gaps[NEAREST - 1]):
+            continue
+        k = min(filled, NEAREST - 1)
+        while k > 0 and gaps[k - 1] > gap:
+            gaps[k], near[k] = gaps[k - 1], near[k - 1]
+            k -= 1
+        gaps[k], near[k] = gap, j
+        filled = min(filled + 1, NEAREST)
+    return filled
+
+
+@compiled
+def _lowest_between(image: Pixels, peaks: Peaks, i: int, j: int) -> float:
+    """The lowest mean of 3x3 pixels on the line between two peaks, at eleven places."""
+    lowest = np.inf
+    for k in range(1, 12):
+        share = k / 12.0
+        u = peaks.uv[i, 0] * (1 - share) + peaks.uv[j, 0] * share
+        v = peaks.uv[i, 1] * (1 - share) + peaks.uv[j, 1] * share
+        lowest = min(lowest, mean3(image, int(np.rint(u)), int(np.rint(v))))
+    return lowest
