@@ -13,7 +13,7 @@ from geometry.camera import SensorNoise
 from lab.frames import FrameReader, FrameSet, open_frames, pictures_at
 from lab.pictures import Missing
 from lab.run_file import FramesFolder, Run
-from tracking.detect import find_spots
+from tracking.detection.detect import find_spots
 from tracking.detections import Detections
 from tracking.labels import PosePrior
 from tracking.noise import NoiseModel, estimate_noise

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from geometry.camera import SensorNoise
 from tests.tracking.rendering import Scene, Spot, photograph
-from tracking.detect import find_spots
+from tracking.detection.detect import find_spots
 from tracking.detections import Detections
 from tracking.parameters import DetectParameters
 

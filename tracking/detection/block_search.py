@@ -23,24 +23,25 @@ AROUND = 2  # blocks on each side whose median is the background
 Sums = NDArray[np.float32]
 
 
+SUMS, HIGHEST2, HIGHEST4, HIGHEST8, MIDDLE, GROUND = range(6)
+
+
 class Blocks(NamedTuple):
     """Sums over the pixels of a picture of n x m blocks; only those are up to date that were asked for."""
 
     pairs: Sums  # (4n, 4m) of 2x2 pixels
     quads: Sums  # (2n, 2m) of 4x4 pixels
-    sums: Sums  # (n, m) of 8x8 pixels
-    highest2: Sums  # (n, m) largest of 2x2 pixels in the block
-    highest4: Sums  # (n, m) ... of 4x4 pixels that begins in the block, at every second pixel
-    highest8: Sums  # (n, m) ... of 8x8 pixels that begins in the block, at every fourth pixel
-    middle: Sums  # (n, m) median over five blocks of a row
-    ground: Sums  # (n, m) median of five `middle`: the background, summed over 8x8 pixels
-    line: Sums  # (4m,) room to work in
+    # (6, n, m). SUMS: of 8x8 pixels. HIGHEST2: the largest of 2x2 pixels in the block. HIGHEST4, HIGHEST8: of 4x4 and 8x8
+    # pixels that begin in the block, at every second and fourth pixel. MIDDLE: median of SUMS over five blocks of a row.
+    # GROUND: median of MIDDLE over five rows, the background
+    maps: Sums
+    lines: Sums  # (2, 4m) room to work in
 
     @staticmethod
     def of(width: int, height: int) -> Blocks:
         """Room for a picture of that size."""
         n, m = -(-height // BLOCK), -(-width // BLOCK)
-        shapes = [(4 * n, 4 * m), (2 * n, 2 * m), *[(n, m)] * 6, (4 * m,)]
+        shapes = [(4 * n, 4 * m), (2 * n, 2 * m), (6, n, m), (2, 4 * m)]
         return Blocks(*(np.zeros(shape, np.float32) for shape in shapes))
 
 
@@ -90,46 +91,52 @@ def fold(fine: Sums, runs: Ints, size: int, coarse: Sums) -> None:
 
 
 @compiled
-def find_highest(sums: Sums, runs: Ints, size: int, line: Sums, highest: Sums) -> None:
-    """The highest entry of each block; `size` entries lie along a block's side."""
+def find_highest_pairs(blocks: Blocks, runs: Ints) -> None:
+    """HIGHEST2 and HIGHEST4."""
+    rows, columns = blocks.pairs.shape
     for k in range(runs.shape[0]):
-        row, first, last = runs[k, 0], runs[k, 1], runs[k, 2]
-        best = line[: size * (last - first)]
-        for j in range(best.shape[0]):
-            best[j] = 0.0
-        for i in range(size * row, size * row + size):
-            x = sums[i, size * first : size * last]
-            for j in range(best.shape[0]):
-                a, b = x[j], best[j]
-                best[j] = a if a > b else b
-        _highest_of_groups(best, size, highest[row, first:last])
+        row, first, last = runs[k, 0], 4 * runs[k, 1], 4 * runs[k, 2]
+        own, over = blocks.lines[0, : last - first], blocks.lines[1, : last - first]
+        for j in range(own.shape[0]):
+            own[j] = 0.0
+            over[j] = 0.0
+        inner = min(last, columns - 1) - first
+        for i in range(4 * row, 4 * row + 4):
+            x, y = blocks.pairs[i, first:], blocks.pairs[min(i + 1, rows - 1), first:]
+            for j in range(inner):
+                a, b = x[j], own[j]
+                own[j] = a if a > b else b
+                a, b = (x[j] + x[j + 1]) + (y[j] + y[j + 1]), over[j]
+                over[j] = a if a > b else b
+            if inner < own.shape[0]:
+                own[inner] = max(own[inner], x[inner])
+        for line in range(2):
+            x, out = blocks.lines[line], blocks.maps[HIGHEST2 + line, row, runs[k, 1] : runs[k, 2]]
+            for j in range(out.shape[0]):
+                a, b, c, d = x[4 * j], x[4 * j + 1], x[4 * j + 2], x[4 * j + 3]
+                a, b = (a if a > b else b), (c if c > d else d)
+                out[j] = a if a > b else b
 
 
 @compiled
-def find_highest_overlapping(sums: Sums, runs: Ints, size: int, line: Sums, highest: Sums) -> None:
-    """The highest sum of 2x2 entries that begins in each block."""
-    rows, columns = sums.shape
+def find_highest_quads(blocks: Blocks, runs: Ints) -> None:
+    """HIGHEST8."""
+    rows, columns = blocks.quads.shape
     for k in range(runs.shape[0]):
-        row, first, last = runs[k, 0], runs[k, 1], runs[k, 2]
-        best = line[: size * (last - first)]
-        for j in range(best.shape[0]):
-            best[j] = 0.0
-        inner = best[: min(size * last, columns - 1) - size * first]
-        for i in range(size * row, min(size * row + size, rows - 1)):
-            x, y = sums[i, size * first :], sums[i + 1, size * first :]
-            for j in range(inner.shape[0]):
-                a, b = (x[j] + x[j + 1]) + (y[j] + y[j + 1]), inner[j]
-                inner[j] = a if a > b else b
-        _highest_of_groups(best, size, highest[row, first:last])
-
-
-@compiled
-def _highest_of_groups(line: Sums, size: int, out: Sums) -> None:
-    for j in range(out.shape[0]):
-        best = line[size * j]
-        for i in range(size * j + 1, size * j + size):
-            best = line[i] if line[i] > best else best
-        out[j] = best
+        row, first, last = runs[k, 0], 2 * runs[k, 1], 2 * runs[k, 2]
+        over = blocks.lines[0, : last - first]
+        for j in range(over.shape[0]):
+            over[j] = 0.0
+        inner = min(last, columns - 1) - first
+        for i in range(2 * row, 2 * row + 2):
+            x, y = blocks.quads[i, first:], blocks.quads[min(i + 1, rows - 1), first:]
+            for j in range(inner):
+                a, b = (x[j] + x[j + 1]) + (y[j] + y[j + 1]), over[j]
+                over[j] = a if a > b else b
+        out = blocks.maps[HIGHEST8, row, runs[k, 1] : runs[k, 2]]
+        for j in range(out.shape[0]):
+            a, b = over[2 * j], over[2 * j + 1]
+            out[j] = a if a > b else b
 
 
 @compiled
@@ -145,10 +152,10 @@ def median5(a: float, b: float, c: float, d: float, e: float) -> float:
 @compiled
 def find_middle(blocks: Blocks, runs: Ints) -> None:
     """The median of each block and two on each side of it; at the border the outermost blocks are repeated."""
-    columns = blocks.sums.shape[1]
+    columns = blocks.maps.shape[2]
     for k in range(runs.shape[0]):
         row, first, last = runs[k, 0], runs[k, 1], runs[k, 2]
-        x, out = blocks.sums[row], blocks.middle[row]
+        x, out = blocks.maps[SUMS, row], blocks.maps[MIDDLE, row]
         for j in range(first, last):
             if j < AROUND or j >= columns - AROUND:
                 left, right = max(j - 1, 0), min(j + 1, columns - 1)
@@ -166,42 +173,48 @@ def find_ground(blocks: Blocks, runs: Ints) -> None:
 
     Nearly as good as the median of all 25, and ten times as fast.
     """
-    rows = blocks.sums.shape[0]
+    rows = blocks.maps.shape[1]
     for k in range(runs.shape[0]):
         row, first, last = runs[k, 0], runs[k, 1], runs[k, 2]
-        a, b = blocks.middle[max(row - 2, 0), first:last], blocks.middle[max(row - 1, 0), first:last]
-        d, e = blocks.middle[min(row + 1, rows - 1), first:last], blocks.middle[min(row + 2, rows - 1), first:last]
-        c, out = blocks.middle[row, first:last], blocks.ground[row, first:last]
+        x = blocks.maps[MIDDLE, :, first:last]
+        a, b, c = x[max(row - 2, 0)], x[max(row - 1, 0)], x[row]
+        d, e, out = x[min(row + 1, rows - 1)], x[min(row + 2, rows - 1)], blocks.maps[GROUND, row, first:last]
         for j in range(out.shape[0]):
             out[j] = median5(a[j], b[j], c[j], d[j], e[j])
 
 
 @compiled
 def find_standing_out(
-    blocks: Blocks, runs: Ints, floor: float, slope: float, black: float, least_sigmas: float, searched: NDArray[np.uint8],
-    found: Ints,
+    blocks: Blocks, runs: Ints, floor: float, slope: float, black: float, least_sigmas: float, least_wide: float,
+    searched: NDArray[np.uint8], found: Ints,
 ) -> int:  # fmt: skip
-    """Blocks with a sum of 2x2, 4x4 or 8x8 pixels so many sigmas over the background.
+    """Blocks with a sum of 2x2 or 4x4 pixels `least_sigmas` over the background, or of 8x8 pixels `least_wide`.
 
     Those marked in searched (n, m) are passed over, the others become marked. found (most, 3): row, column, and 1 where
     it was only the 8x8 pixels. Returns how many.
     """
     count = 0
-    least = least_sigmas**2
+    fine, wide = 16.0 * least_sigmas**2, 64.0 * least_wide**2
     for k in range(runs.shape[0]):
         row, first, last = runs[k, 0], runs[k, 1], runs[k, 2]
-        for j in range(first, last):
-            if searched[row, j]:
+        ground, highest2 = blocks.maps[GROUND, row, first:last], blocks.maps[HIGHEST2, row, first:last]
+        highest4, highest8 = blocks.maps[HIGHEST4, row, first:last], blocks.maps[HIGHEST8, row, first:last]
+        excess, excess8 = blocks.lines[0, : last - first], blocks.lines[1, : last - first]
+        for j in range(ground.shape[0]):  # squares over the variance, over their thresholds
+            level = ground[j] / 64.0
+            lit = level - black
+            variance = floor + slope * (lit if lit > 0.0 else 0.0)
+            a, b, c = 2.0 * (highest2[j] - 4.0 * level), highest4[j] - 16.0 * level, highest8[j] - 64.0 * level
+            a = a if a > b else b
+            a, c = (a if a > 0.0 else 0.0), (c if c > 0.0 else 0.0)
+            excess[j] = a * a / (fine * variance)
+            excess8[j] = c * c / (wide * variance)
+        for j in range(ground.shape[0]):
+            if searched[row, first + j]:
                 continue
-            searched[row, j] = 1
-            level = blocks.ground[row, j] / 64.0
-            variance = floor + slope * max(level - black, 0.0)
-            d2 = max(blocks.highest2[row, j] - 4.0 * level, 0.0)
-            d4 = max(blocks.highest4[row, j] - 16.0 * level, 0.0)
-            d8 = max(blocks.highest8[row, j] - 64.0 * level, 0.0)
-            fine = max(4.0 * d2 * d2, d4 * d4)
-            if max(4.0 * fine, d8 * d8) > least * 64.0 * variance:
-                found[count, 0], found[count, 1] = row, j
-                found[count, 2] = 0 if fine > least * 16.0 * variance else 1
+            searched[row, first + j] = 1
+            if excess[j] > 1.0 or excess8[j] > 1.0:
+                found[count, 0], found[count, 1] = row, first + j
+                found[count, 2] = 0 if excess[j] > 1.0 else 1
                 count += 1
     return count

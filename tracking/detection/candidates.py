@@ -14,7 +14,7 @@ import numpy as np
 
 from geometry.arrays import Array, Ints
 from geometry.compiled import compiled
-from tracking.detection.block_search import BLOCK, Blocks
+from tracking.detection.block_search import BLOCK, GROUND, HIGHEST8, Blocks
 from tracking.detection.pixels import Pixels, clamped, mean3, mirrored, pixel
 
 RADIUS = 48  # px: peaks further apart than this never belong to one spot of the largest size
@@ -35,32 +35,14 @@ class Noise(NamedTuple):
     black: float
 
 
-class Peaks(NamedTuple):
-    """Room for places where a spot may be."""
-
-    uv: Ints  # (most, 2) px
-    height: Array  # (most,) DN of the mean of 3x3 pixels above the background
-    level: Array  # (most,) DN, the background
-    wide: Ints  # (most,) 1: seen in the mean of 8x8 pixels only
-
-    @staticmethod
-    def of(most: int) -> Peaks:
-        """Room for so many."""
-        return Peaks(np.zeros((most, 2), np.int64), np.zeros(most), np.zeros(most), np.zeros(most, np.int64))
+# Columns of peaks (most, 5), places where a spot may be: px; the mean of 3x3 pixels above the background and that, DN;
+# 1 where it is seen in the mean of 8x8 pixels only
+AT_U, AT_V, HEIGHT, LEVEL, WIDE = range(5)
 
 
-class Room(NamedTuple):
-    """Room to work in, for one block."""
-
-    values: Array  # (side, side) pixels
-    lines: Array  # (side, side) sums of three or five in a row
-    sum3: Array  # (side, side) sums of 3x3 pixels
-    few: Array  # (32,)
-
-    @staticmethod
-    def new() -> Room:
-        """All of it."""
-        return Room(*(np.zeros((_SIDE, _SIDE)) for _ in range(3)), np.zeros(32))
+def room_for_a_block() -> Array:
+    """Room to work in: pixels; sums of three in a row, of 3x3; a few numbers."""
+    return np.zeros((4, _SIDE, _SIDE))
 
 
 @compiled
@@ -71,14 +53,14 @@ def variance(noise: Noise, level: float) -> float:
 
 @compiled
 def find_peaks(
-    image: Pixels, blocks: Blocks, noise: Noise, found: Ints, found_count: int, least_sigmas: float, room: Room,
-    peaks: Peaks, count: int,
+    image: Pixels, blocks: Blocks, noise: Noise, found: Ints, found_count: int, least_sigmas: float, room: Array,
+    peaks: Array, count: int,
 ) -> int:  # fmt: skip
     """Add the peaks of the blocks `found` to the first `count` ones; returns how many there are then."""
     for k in range(found_count):
         row, column = found[k, 0], found[k, 1]
         if not found[k, 2]:
-            level = blocks.ground[row, column] / 64.0
+            level = blocks.maps[GROUND, row, column] / 64.0
             count = _peaks_of_block(image, BLOCK * column, BLOCK * row, level, noise, least_sigmas, room, peaks, count)
         elif _is_highest_block(blocks, row, column):
             count = _wide_peak(image, blocks, row, column, noise, least_sigmas, room, peaks, count)
@@ -87,11 +69,11 @@ def find_peaks(
 
 @compiled
 def _peaks_of_block(
-    image: Pixels, left: int, top: int, level: float, noise: Noise, least_sigmas: float, room: Room, peaks: Peaks,
+    image: Pixels, left: int, top: int, level: float, noise: Noise, least_sigmas: float, room: Array, peaks: Array,
     count: int,
 ) -> int:  # fmt: skip
     """Maxima of the mean of 3x3 pixels among 5x5 of them that lie in one block and stand out."""
-    values, lines, sum3 = room.values, room.lines, room.sum3
+    values, lines, sum3, few = room[0], room[1], room[2], room[3, 0]
     # Mirrored at the border: with repeated pixels the maximum of a spot at the edge would come to lie outside.
     for i in range(_SIDE):
         v = mirrored(top + i - _REACH, image.height)
@@ -116,12 +98,11 @@ def _peaks_of_block(
             least = least_sigmas * sigma
             if max(height3 / 3, height5 / 5) < least:
                 continue
-            excess = _hot_excess(image, left + j - _REACH, top + i - _REACH, noise, level + height3 / 9, room.few)
+            excess = _hot_excess(image, left + j - _REACH, top + i - _REACH, noise, level + height3 / 9, few)
             height3, height5 = height3 - excess, height5 - excess
-            if max(height3 / 3, height5 / 5) < least or height3 <= 0 or count >= peaks.level.shape[0]:
+            if max(height3 / 3, height5 / 5) < least or height3 <= 0 or count >= peaks.shape[0]:
                 continue
-            peaks.uv[count, 0], peaks.uv[count, 1] = left + j - _REACH, top + i - _REACH
-            peaks.height[count], peaks.level[count], peaks.wide[count] = height3 / 9, level, 0
+            _add(peaks, count, left + j - _REACH, top + i - _REACH, height3 / 9, level, 0.0)
             count += 1
     return count
 
@@ -180,11 +161,11 @@ def sort(values: Array, n: int) -> None:
 
 @compiled
 def _is_highest_block(blocks: Blocks, row: int, column: int) -> bool:
-    rows, columns = blocks.sums.shape
-    here = blocks.highest8[row, column]
+    rows, columns = blocks.maps.shape[1:]
+    here = blocks.maps[HIGHEST8, row, column]
     for i in range(max(row - 1, 0), min(row + 2, rows)):
         for j in range(max(column - 1, 0), min(column + 2, columns)):
-            other = blocks.highest8[i, j]
+            other = blocks.maps[HIGHEST8, i, j]
             if other > here or (other == here and (i < row or (i == row and j < column))):
                 return False
     return True
@@ -192,7 +173,7 @@ def _is_highest_block(blocks: Blocks, row: int, column: int) -> bool:
 
 @compiled
 def _wide_peak(
-    image: Pixels, blocks: Blocks, row: int, column: int, noise: Noise, least_sigmas: float, room: Room, peaks: Peaks,
+    image: Pixels, blocks: Blocks, row: int, column: int, noise: Noise, least_sigmas: float, room: Array, peaks: Array,
     count: int,
 ) -> int:  # fmt: skip
     """A peak where 8x8 pixels stand out of the surroundings by more than their curvature explains.
@@ -210,7 +191,8 @@ def _wide_peak(
     u, v = 4 * bj + 4, 4 * bi + 4
     if u >= image.width or v >= image.height:
         return count
-    level = blocks.ground[row, column] / 64.0
+    few = room[3, 0]
+    level = blocks.maps[GROUND, row, column] / 64.0
     sigma2 = variance(noise, level)
     top = level + _WIDE_CLIP * sqrt(sigma2)
     here = _mean8(image, u, v, top)
@@ -220,17 +202,22 @@ def _wide_peak(
         for i in range(-1, 2):
             for j in range(-1, 2):
                 if i != 0 or j != 0:
-                    room.few[n] = _mean8(image, u + j * away, v + i * away, top)
+                    few[n] = _mean8(image, u + j * away, v + i * away, top)
                     n += 1
-        sort(room.few, 8)
-        height += (-4.0 / 3.0 if k == 0 else 1.0 / 3.0) * 0.5 * (room.few[3] + room.few[4])
+        sort(few, 8)
+        height += (-4.0 / 3.0 if k == 0 else 1.0 / 3.0) * 0.5 * (few[3] + few[4])
     # A median of eight has 1.4 times the variance of their mean.
     scatter = sqrt(sigma2 / 64.0 * (1 + 1.4 / 8 * 17.0 / 9.0))
-    if height < least_sigmas * scatter or count >= peaks.level.shape[0]:
+    if height < least_sigmas * scatter or count >= peaks.shape[0]:
         return count
-    peaks.uv[count, 0], peaks.uv[count, 1] = u, v
-    peaks.height[count], peaks.level[count], peaks.wide[count] = height, level, 1
+    _add(peaks, count, u, v, height, level, 1.0)
     return count + 1
+
+
+@compiled
+def _add(peaks: Array, row: int, u: int, v: int, height: float, level: float, wide: float) -> None:
+    peak = peaks[row]
+    peak[AT_U], peak[AT_V], peak[HEIGHT], peak[LEVEL], peak[WIDE] = u, v, height, level, wide
 
 
 @compiled
@@ -244,7 +231,7 @@ def _mean8(image: Pixels, u: int, v: int, top: float) -> float:
 
 
 @compiled
-def find_apart(image: Pixels, peaks: Peaks, order: Ints, noise: Noise, apart: Ints, near: Ints, gaps: Array) -> int:
+def find_apart(image: Pixels, peaks: Array, order: Ints, noise: Noise, apart: Ints, near: Ints, gaps: Array) -> int:
     """Which peaks, brightest first in `order`, are spots of their own; their number, and in `apart` which.
 
     Between a peak and each of the nearest brighter ones the light must fall by `DIP` of the fainter peak, and by four
@@ -254,16 +241,16 @@ def find_apart(image: Pixels, peaks: Peaks, order: Ints, noise: Noise, apart: In
     count = 0
     for place in range(order.shape[0]):
         i = order[place]
-        if peaks.wide[i]:
+        if peaks[i, WIDE]:
             alone = not _has_neighbour(peaks, order, i)
         else:
             alone = True
             needed = max(
-                DIP * peaks.height[i], 4.0 / 3.0 * sqrt(2.0) * sqrt(variance(noise, peaks.level[i]))
+                DIP * peaks[i, HEIGHT], 4.0 / 3.0 * sqrt(2.0) * sqrt(variance(noise, peaks[i, LEVEL]))
             )
             for k in range(_nearest_brighter(peaks, order, place, near, gaps)):
-                lowest = _lowest_between(image, peaks, i, near[k]) - peaks.level[i]
-                alone = alone and peaks.height[i] - lowest >= needed
+                lowest = _lowest_between(image, peaks, i, near[k]) - peaks[i, LEVEL]
+                alone = alone and peaks[i, HEIGHT] - lowest >= needed
         if alone:
             apart[count] = i
             count += 1
@@ -271,23 +258,23 @@ def find_apart(image: Pixels, peaks: Peaks, order: Ints, noise: Noise, apart: In
 
 
 @compiled
-def _has_neighbour(peaks: Peaks, order: Ints, i: int) -> bool:
+def _has_neighbour(peaks: Array, order: Ints, i: int) -> bool:
     for place in range(order.shape[0]):
         j = order[place]
-        if not peaks.wide[j] and abs(peaks.uv[i, 0] - peaks.uv[j, 0]) < 16 and abs(peaks.uv[i, 1] - peaks.uv[j, 1]) < 16:
+        if not peaks[j, WIDE] and abs(peaks[i, AT_U] - peaks[j, AT_U]) < 16 and abs(peaks[i, AT_V] - peaks[j, AT_V]) < 16:
             return True
     return False
 
 
 @compiled
-def _nearest_brighter(peaks: Peaks, order: Ints, place: int, near: Ints, gaps: Array) -> int:
+def _nearest_brighter(peaks: Array, order: Ints, place: int, near: Ints, gaps: Array) -> int:
     """The nearest peaks, at most NEAREST, before a place in `order`, into `near`; their number."""
     i, filled = order[place], 0
     for before in range(place):
         j = order[before]
-        du, dv = peaks.uv[i, 0] - peaks.uv[j, 0], peaks.uv[i, 1] - peaks.uv[j, 1]
-        gap = 1.0 * (du * du + dv * dv)
-        if peaks.wide[j] or gap >= RADIUS**2 or (filled == NEAREST and gap >= gaps[NEAREST - 1]):
+        du, dv = peaks[i, AT_U] - peaks[j, AT_U], peaks[i, AT_V] - peaks[j, AT_V]
+        gap = du * du + dv * dv
+        if peaks[j, WIDE] or gap >= RADIUS**2 or (filled == NEAREST and gap >= gaps[NEAREST - 1]):
             continue
         k = min(filled, NEAREST - 1)
         while k > 0 and gaps[k - 1] > gap:
@@ -299,12 +286,12 @@ def _nearest_brighter(peaks: Peaks, order: Ints, place: int, near: Ints, gaps: A
 
 
 @compiled
-def _lowest_between(image: Pixels, peaks: Peaks, i: int, j: int) -> float:
+def _lowest_between(image: Pixels, peaks: Array, i: int, j: int) -> float:
     """The lowest mean of 3x3 pixels on the line between two peaks, at eleven places."""
     lowest = np.inf
     for k in range(1, 12):
         share = k / 12.0
-        u = peaks.uv[i, 0] * (1 - share) + peaks.uv[j, 0] * share
-        v = peaks.uv[i, 1] * (1 - share) + peaks.uv[j, 1] * share
+        u = peaks[i, AT_U] * (1 - share) + peaks[j, AT_U] * share
+        v = peaks[i, AT_V] * (1 - share) + peaks[j, AT_V] * share
         lowest = min(lowest, mean3(image, int(np.rint(u)), int(np.rint(v))))
     return lowest

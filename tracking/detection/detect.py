@@ -11,12 +11,13 @@ from numpy.typing import ArrayLike
 from geometry.arrays import Array, Ints
 from geometry.camera import SensorNoise
 from tracking.detection.block_search import Blocks, bin_pixels, runs_of
-from tracking.detection.candidates import NEAREST, Noise, Peaks, Room, find_apart
-from tracking.detection.gaussian_fit import Work, reach_of
-from tracking.detection.measuring import Found, Limits, measure, write_out
+from tracking.detection.candidates import AT_U, AT_V, HEIGHT, NEAREST, Noise, find_apart, room_for_a_block
+from tracking.detection.gaussian_fit import reach_of
+from tracking.detection.measuring import Limits, measure, write_out
 from tracking.detection.pixels import Pixels
 from tracking.detection.regions import MARGIN, NEAR, boxes_of, find_relevant
 from tracking.detection.search import HALO, find_peaks_in
+from tracking.detection.table import ALGEBRA, CELL_ROWS, COLUMNS, MOST_CELLS, SPAN
 from tracking.detections import Detections
 from tracking.noise import NoiseModel, Picture, guess_noise
 from tracking.parameters import DetectParameters
@@ -59,15 +60,15 @@ class SpotFinder:
         """most: DetectParameters.max_detections of the calls to come."""
         self.width, self.height, self.most = width, height, most
         self._blocks = Blocks.of(width, height)
-        rows, columns = self._blocks.sums.shape
+        rows, columns = self._blocks.maps.shape[1:]
         self._whole = np.array([[0, rows - 1, 0, columns - 1]])
         self._runs = np.zeros((rows + 4, 3), np.int64)
         self._searched = np.zeros((rows, columns), np.uint8)
         self._standing_out = np.zeros((rows * columns, 3), np.int64)
-        self._peaks, self._found = Peaks.of(4 * rows * columns), Found.of(most)
+        self._room, self._peaks = room_for_a_block(), np.zeros((4 * rows * columns, 5))
         self._apart, self._near, self._gaps = np.zeros(4 * most, np.int64), np.zeros(NEAREST, np.int64), np.zeros(NEAREST)
-        self._out, self._count = np.zeros((most, 10)), 0
-        self._room, self._work, self._few = Room.new(), Work.new(), np.zeros(256)
+        self._cells, self._algebra = np.zeros((CELL_ROWS, MOST_CELLS)), np.zeros((ALGEBRA, 9, 10))
+        self._table, self._count, self._out = np.zeros((most, COLUMNS)), 0, np.zeros((most, 10))
 
     def find(
         self,
@@ -99,13 +100,13 @@ class SpotFinder:
             reach = np.concatenate([reach, np.full(count - len(reach), NEAR)])
             relevant = np.zeros(count, np.int64)
             more = find_relevant(
-                self._peaks.uv[:count], regions, reach, self._searched, self.width, self.height, relevant, room
+                self._peaks[:count], regions, reach, self._searched, self.width, self.height, relevant, room
             )
             if more:
                 boxes = room[:more]
                 continue
             chosen = self._measure(task, count, relevant)
-            needed = np.array([reach_of(int(cell)) for cell in self._found.span[: len(chosen)]])
+            needed = np.array([reach_of(int(cell)) for cell in self._table[: len(chosen), SPAN]])
             far = needed + MARGIN > reach[chosen]
             far &= needed > reach_of(1)
             if not far.any():
@@ -115,7 +116,7 @@ class SpotFinder:
 
     def _search(self, task: _Task, boxes: Ints, count: int) -> int:
         """Add the peaks in boxes of blocks to the first `count` ones; their number then."""
-        rows, columns = self._blocks.sums.shape
+        rows, columns = self._blocks.maps.shape[1:]
         needed = int((boxes[:, 1] - boxes[:, 0] + 5).sum())
         if len(self._runs) < needed:
             self._runs = np.zeros((2 * needed, 3), np.int64)
@@ -127,21 +128,21 @@ class SpotFinder:
 
     def _measure(self, task: _Task, count: int, relevant: Ints | None = None) -> Ints:
         """Measure the relevant ones of the first `count` peaks that are spots of their own: which, row by row."""
-        peaks = self._peaks
-        uv = peaks.uv[:count]
-        order = np.lexsort((uv[:, 0], uv[:, 1], -peaks.height[:count]))[: len(self._apart)]
+        peaks = self._peaks[:count]
+        order = np.lexsort((peaks[:, AT_U], peaks[:, AT_V], -peaks[:, HEIGHT]))[: len(self._apart)]
         n = find_apart(task.pixels, peaks, order, task.noise, self._apart, self._near, self._gaps)
         chosen = self._apart[:n]
         if relevant is not None:
             chosen = chosen[relevant[chosen] > 0]
         chosen = chosen[: self.most]
-        measure(task.pixels, peaks, chosen, task.noise, task.limits, self._found, self._work, self._few)
         self._count = len(chosen)
+        table = self._table[: self._count]
+        measure(task.pixels, peaks, chosen, task.noise, task.limits, table, self._cells, self._algebra)
         return chosen
 
     def _detections(self, regions: Array) -> Detections:
         """The spots among the candidates measured last that lie in one of the regions."""
-        rows = self._out[: write_out(self._found, self._count, regions, self._out)]
+        rows = self._out[: write_out(self._table[: self._count], regions, self._out)]
         cov = rows[:, [2, 3, 3, 4]].reshape(-1, 2, 2)
         return Detections(rows[:, :2].copy(), cov, *(rows[:, k].copy() for k in range(5, 10)))
 

@@ -3,147 +3,170 @@
 from __future__ import annotations
 
 from math import ceil, sqrt
-from typing import NamedTuple
 
 import numpy as np
 
-from geometry.arrays import Array, Ints
+from geometry.arrays import Array
 from geometry.compiled import compiled
 from tracking.detection import ellipse
 from tracking.detection.candidates import Noise
-from tracking.detection.normal_equations import (
+from tracking.detection.normal_equations import Frame, accumulate, add_light, frame_of, solve_normal
+from tracking.detection.pixels import VALID, Pixels, Window, cut, window_around
+from tracking.detection.quality import gain_over_plane, judge
+from tracking.detection.table import (
+    ACTIVE,
+    COV_UV,
+    FACTOR,
     FLUX,
+    GAIN,
+    GAPS,
+    GROUND,
     LEVEL,
+    MOMENT_U,
+    MOMENT_UU,
+    MOMENT_UV,
+    MOMENT_V,
+    MOMENT_VV,
+    NEAR,
+    NORMAL,
+    OTHERS,
+    RESIDUAL,
+    RIGHT_SIDE,
+    ROW,
+    SIGMA_FLUX,
     SLOPE_U,
     SLOPE_V,
+    SOLUTION,
+    SPAN,
+    STATE,
+    USE,
     UU,
     UV,
+    VALUES,
+    VAR_U,
+    VAR_V,
+    VECTORS,
     VV,
-    Cells,
-    Frame,
+    WEIGHT,
     U,
     V,
-    accumulate,
-    add_light,
-    frame_of,
-    solve_normal,
 )
-from tracking.detection.pixels import Pixels, Window, cut, window_around
-from tracking.detection.quality import COV_UV, SIGMA_FLUX, VAR_U, VAR_V, judge
 
 _STEPS = 12  # Gauss-Newton converges in three or four; a clipped spot, whose top must be guessed, takes up to ten
-_CONVERGED = 0.1  # of the centre's own sigma. The next step would be some hundredths of this one
-_WINDOW = 3.2  # sigmas from centre to the window's side
+_CONVERGED, _CONVERGED_MOST = 0.1, 0.4  # of the centre's own sigma: after a smaller step there is no other
+_CURVED = 0.02  # the next step, of about step^2 / (2 width), may be a hundredth of the sigma
+_WINDOW = 3.7  # sigmas from centre to the window's side: 3.2 costs 3 % of the accuracy, 2.5 costs 8 %, for the plane
+_WINDOW_WIDE, _WIDE_PX = 3.2, 4.5  # ... of spots wider than this, for which the background is no plane over more
 _LEAST_HALF = 7  # cells from the centre to the side
 _MOST_NEIGHBOURS = 6
 _OUTLIER = 6.0  # sigmas by which a hot or dead pixel sticks out of the fit
 _LONELY = 2.5  # times its neighbours does it
 _LEAST_VARIANCE = 0.02  # px^2: narrower is a point to any sensor
-MOST_CELLS, MOST_COLUMNS = 73 * 73, 73
-
-
-class Work(NamedTuple):
-    """Room to work in."""
-
-    cells: Cells
-    N: Array  # (9, 9)
-    b: Array  # (9,)
-    X: Array  # (9, 4)
-    L: Array  # (9, 10)
-    near: Ints  # (_MOST_NEIGHBOURS,)
-    gaps: Array  # (_MOST_NEIGHBOURS,)
-
-    @staticmethod
-    def new() -> Work:
-        """All of it."""
-        return Work(
-            Cells.of(MOST_CELLS, MOST_COLUMNS), np.zeros((9, 9)), np.zeros(9), np.zeros((9, 4)), np.zeros((9, 10)),
-            np.zeros(_MOST_NEIGHBOURS, np.int64), np.zeros(_MOST_NEIGHBOURS),
-        )  # fmt: skip
 
 
 @compiled
 def fit_all(
-    image: Pixels, spots: Array, noise: Noise, saturation: float, widest: float, work: Work, active: Ints,
-    start: Array, span: Ints, quality: Array,
+    image: Pixels, table: Array, noise: Noise, saturation: float, widest: float, least_gain: float, cells: Array,
+    algebra: Array,
 ) -> None:  # fmt: skip
-    """Fit all candidates of a picture together, in place: spots (n, 9), see normal_equations.U to SLOPE_V.
+    """Fit all candidates of a picture (n, COLUMNS) together, from their moments, in place.
 
     Gauss-Newton as long as the centres move; clipped pixels, pixels outside and hot pixels are left out; the light of
-    the neighbours is taken off. A candidate that grows beyond `widest`, px, or walks away is given up: its flux is 0.
-    active (n,) and start (n, 3) are room to work in; span (n,) is raised to the size of the cells used, px; quality
-    (n, COLUMNS) is filled as quality.judge says.
+    the neighbours is taken off. A candidate that grows beyond `widest`, px, walks away, or lowers chi-square by less than
+    `least_gain` is given up: its flux is 0.
     """
-    n = spots.shape[0]
+    n = table.shape[0]
     for i in range(n):
-        major = ellipse.axes(spots[i, UU], spots[i, UV], spots[i, VV])[0]
-        start[i, 0], start[i, 1], start[i, 2] = spots[i, U], spots[i, V], 3.0 + 2.0 * major
-        active[i] = 1
-        if major > 1.5 * widest:  # moments see a spot too wide rather than too narrow
-            spots[i, FLUX], active[i] = 0.0, 0
+        spot = table[i]
+        spot[U], spot[V], spot[UU], spot[UV] = spot[MOMENT_U], spot[MOMENT_V], spot[MOMENT_UU], spot[MOMENT_UV]
+        spot[VV], spot[LEVEL], spot[ACTIVE] = spot[MOMENT_VV], spot[GROUND], 1.0
+        spot[SLOPE_U] = spot[SLOPE_V] = 0.0
+        spot[FLUX] = max(spot[FLUX], 1.0)
+        if _is_lost(spot, widest):  # moments see a spot too wide rather than too narrow
+            spot[FLUX], spot[ACTIVE] = 0.0, 0.0
     for step in range(_STEPS):
         busy = False
         for i in range(n):
-            if not active[i]:
+            spot = table[i]
+            if not spot[ACTIVE]:
                 continue
-            active[i] = 0
-            span[i] = max(span[i], window_of(spots[i]).cell)
-            moved = _step(image, spots, i, noise, saturation, work, step == _STEPS - 1, quality)
-            away = sqrt((spots[i, U] - start[i, 0]) ** 2 + (spots[i, V] - start[i, 1]) ** 2)
-            major = ellipse.axes(spots[i, UU], spots[i, UV], spots[i, VV])[0]
-            if major > 1.5 * widest or away > start[i, 2]:
-                spots[i, FLUX], moved = 0.0, True
-            else:
-                active[i] = moved
+            spot[ACTIVE], spot[SPAN] = 0.0, max(spot[SPAN], 1.0 * window_of(spot).cell)
+            moved = _step(image, table, i, noise, saturation, step == _STEPS - 1, cells, algebra)
+            # Noise does not become a spot by further steps.
+            if _is_lost(spot, widest) or (step >= 1 and spot[GAIN] < least_gain):
+                spot[FLUX] = 0.0
+            if spot[FLUX] <= 0.0:
+                moved = True
+            elif moved:
+                spot[ACTIVE] = 1.0
             if moved:
                 busy = True
-                _wake_neighbours(spots, i, active)
+                _wake_neighbours(table, i)
         if not busy:
             break
 
 
 @compiled
+def _is_lost(spot: Array, widest: float) -> bool:
+    """Whether a spot has become too wide, or has walked away from its moments."""
+    if ellipse.axes(spot[UU], spot[UV], spot[VV])[0] > 1.5 * widest:
+        return True
+    away = sqrt((spot[U] - spot[MOMENT_U]) ** 2 + (spot[V] - spot[MOMENT_V]) ** 2)
+    return away > 3.0 + 2.0 * ellipse.axes(spot[MOMENT_UU], spot[MOMENT_UV], spot[MOMENT_VV])[0]
+
+
+@compiled
 def _step(
-    image: Pixels, spots: Array, i: int, noise: Noise, saturation: float, work: Work, last: bool, quality: Array
+    image: Pixels, table: Array, i: int, noise: Noise, saturation: float, last: bool, cells: Array, algebra: Array
 ) -> bool:
     """One step of one spot; whether it moved by so much that there must be another."""
-    spot, cells = spots[i], work.cells
+    spot, X, b = table[i], algebra[SOLUTION], algebra[VECTORS, RIGHT_SIDE]
     window = window_of(spot)
-    cut(image, window, saturation, cells.values, cells.state)
-    count = window.columns * window.rows
-    for k in range(count):
-        cells.others[k], cells.use[k] = 0.0, 1
-    for k in range(_neighbours(spots, i, window, work.near, work.gaps)):
-        add_light(window, spots[work.near[k]], cells.row, cells.others)
-    chi2 = accumulate(window, spot, noise, cells, work.N, work.b)
+    cut(image, window, saturation, cells[VALUES], cells[STATE])
+    for k in range(window.columns * window.rows):
+        cells[OTHERS, k] = 0.0
+        cells[USE, k] = 1.0 if cells[STATE, k] == VALID else 0.0
+    near, gaps = algebra[VECTORS, NEAR], algebra[VECTORS, GAPS]
+    for k in range(_neighbours(table, i, window, near, gaps)):
+        add_light(window, table[int(near[k])], cells[ROW], cells[OTHERS])
+    chi2 = accumulate(window, spot, noise, cells, algebra)
     if _leave_out_lonely(window, spot, cells):
-        chi2 = accumulate(window, spot, noise, cells, work.N, work.b)
+        chi2 = accumulate(window, spot, noise, cells, algebra)
     frame = frame_of(window, spot)
-    if not _solve(frame, spot, work):
+    if not _solve(frame, algebra):
         spot[FLUX] = 0.0
         return True
     before_u, before_v = spot[U], spot[V]
-    var_u, var_v, cov_uv = _centre_covariance(frame, work.X)
-    var_flux = _flux_variance(frame, spot, work)
-    gain = 0.0
+    var_u, var_v, cov_uv = _centre_covariance(frame, X)
+    sigma_flux = spot[FLUX] * sqrt(_flux_variance(frame, X))
+    after = chi2
     for p in range(9):
-        gain += work.X[p, 0] * work.b[p]
-    _advance(frame, spot, work.X)
+        after -= X[p, 0] * b[p]
+    spot[GAIN] = gain_over_plane(algebra[NORMAL], b, chi2, after)
+    _advance(frame, spot, X)
     du, dv = spot[U] - before_u, spot[V] - before_v
-    moved = abs(du) > _CONVERGED * sqrt(var_u) or abs(dv) > _CONVERGED * sqrt(var_v)
+    moved = _is_far(du, var_u, spot[UU]) or _is_far(dv, var_v, spot[VV])
     if not moved or last:
-        out = quality[i]
-        out[VAR_U], out[COV_UV], out[VAR_V], out[SIGMA_FLUX] = var_u, cov_uv, var_v, sqrt(var_flux)
-        judge(window, frame, cells, work.N, work.b, chi2, chi2 - gain, out)
+        spot[VAR_U], spot[COV_UV], spot[VAR_V], spot[SIGMA_FLUX] = var_u, cov_uv, var_v, sigma_flux
+        judge(window, frame, after, cells, spot)
         if moved:  # a centre that still moves is known no better than by that
-            out[VAR_U], out[COV_UV], out[VAR_V] = out[VAR_U] + du * du, out[COV_UV] + du * dv, out[VAR_V] + dv * dv
+            spot[VAR_U], spot[COV_UV] = spot[VAR_U] + du * du, spot[COV_UV] + du * dv
+            spot[VAR_V] += dv * dv
     return moved and not last
+
+
+@compiled
+def _is_far(step: float, variance: float, width2: float) -> bool:
+    """Whether after this step of Gauss-Newton, whose error falls with its square, there must be another."""
+    sigma = sqrt(variance)
+    return abs(step) > max(_CONVERGED * sigma, min(_CONVERGED_MOST * sigma, sqrt(_CURVED * sigma * sqrt(width2))))
 
 
 @compiled
 def _half_width(variance: float) -> float:
     """Half width, px, of the window for a spot: its wings and a ring of background."""
-    return _WINDOW * sqrt(variance + 1 / 12.0) + 1.0
+    sigma = sqrt(variance + 1 / 12.0)
+    return max(min(_WINDOW * sigma, _WINDOW * _WIDE_PX), _WINDOW_WIDE * sigma) + 1.0
 
 
 @compiled
@@ -179,13 +202,13 @@ def _gap(spot: Array, other: Array, window: Window) -> float:
 
 
 @compiled
-def _neighbours(spots: Array, i: int, window: Window, near: Ints, gaps: Array) -> int:
+def _neighbours(table: Array, i: int, window: Window, near: Array, gaps: Array) -> int:
     """The spots whose light reaches into a window most, into `near`; their number."""
     filled = 0
-    for j in range(spots.shape[0]):
-        if j == i or spots[j, FLUX] <= 0.0:
+    for j in range(table.shape[0]):
+        if j == i or table[j, FLUX] <= 0.0:
             continue
-        gap = _gap(spots[i], spots[j], window)
+        gap = _gap(table[i], table[j], window)
         if gap >= 0 or (filled == _MOST_NEIGHBOURS and gap >= gaps[_MOST_NEIGHBOURS - 1]):
             continue
         k = min(filled, _MOST_NEIGHBOURS - 1)
@@ -198,51 +221,51 @@ def _neighbours(spots: Array, i: int, window: Window, near: Ints, gaps: Array) -
 
 
 @compiled
-def _wake_neighbours(spots: Array, i: int, active: Ints) -> None:
+def _wake_neighbours(table: Array, i: int) -> None:
     """A spot has moved: those into whose windows it shines must be fitted again."""
-    for j in range(spots.shape[0]):
-        if j != i and not active[j] and spots[j, FLUX] > 0.0 and _gap(spots[j], spots[i], window_of(spots[j])) < 0:
-            active[j] = 1
+    for j in range(table.shape[0]):
+        spot = table[j]
+        if j != i and not spot[ACTIVE] and spot[FLUX] > 0.0 and _gap(spot, table[i], window_of(spot)) < 0:
+            spot[ACTIVE] = 1.0
 
 
 @compiled
-def _leave_out_lonely(window: Window, spot: Array, cells: Cells) -> bool:
+def _leave_out_lonely(window: Window, spot: Array, cells: Array) -> bool:
     """Take out cells that stick out of the fit and of all eight neighbours: hot or dead pixels, never a spot's body."""
     found = False
     narrow = min(spot[UU], spot[VV]) < 0.8**2
+    rest, weight = cells[RESIDUAL], cells[WEIGHT]
     middle = 0.5 * (window.cell - 1)
-    for r in range(window.rows):
-        for c in range(window.columns):
-            k = r * window.columns + c
-            size = cells.residual[k] ** 2 * cells.weight[k]
-            if size <= _OUTLIER**2:
-                continue
-            if narrow:  # the middle of a spot about one pixel wide is lonely by nature
-                u = window.left + middle + c * window.cell - spot[U]
-                v = window.top + middle + r * window.cell - spot[V]
-                if u * u + v * v < 1.8**2:
-                    continue
-            around = 0.0
-            for i in range(max(r - 1, 0), min(r + 2, window.rows)):
-                for j in range(max(c - 1, 0), min(c + 2, window.columns)):
-                    if i != r or j != c:
-                        other = i * window.columns + j
-                        around = max(around, cells.residual[other] ** 2 * cells.weight[other])
-            if size > _LONELY**2 * around:
-                cells.use[k], found = 0, True
+    for k in range(window.rows * window.columns):
+        size = rest[k] * rest[k] * weight[k]
+        if size <= _OUTLIER**2:
+            continue
+        r, c = k // window.columns, k % window.columns
+        u = window.left + middle + c * window.cell - spot[U]
+        v = window.top + middle + r * window.cell - spot[V]
+        if narrow and u * u + v * v < 1.8**2:  # the middle of a spot about one pixel wide is lonely by nature
+            continue
+        around = 0.0
+        for i in range(max(r - 1, 0), min(r + 2, window.rows)):
+            for j in range(max(c - 1, 0), min(c + 2, window.columns)):
+                other = i * window.columns + j
+                if other != k:
+                    around = max(around, rest[other] * rest[other] * weight[other])
+        if size > _LONELY**2 * around:
+            cells[USE, k], found = 0.0, True
     return found
 
 
 @compiled
-def _solve(frame: Frame, spot: Array, work: Work) -> bool:
+def _solve(frame: Frame, algebra: Array) -> bool:
     """Into the columns of X: the step, and N^-1 times the directions of the centre's u' and v' and of the flux."""
-    X = work.X
+    X = algebra[SOLUTION]
     for p in range(9):
-        X[p, 0] = work.b[p]
+        X[p, 0] = algebra[VECTORS, RIGHT_SIDE, p]
         X[p, 1] = X[p, 2] = X[p, 3] = 0.0
     X[1, 1], X[2, 2] = 1.0, 1.0
     _flux_direction(frame, X, 3)
-    return solve_normal(work.N, X, work.L)
+    return solve_normal(algebra[NORMAL], X, 4, algebra[FACTOR])
 
 
 @compiled
@@ -267,15 +290,15 @@ def _centre_covariance(frame: Frame, X: Array) -> tuple[float, float, float]:
 
 
 @compiled
-def _flux_variance(frame: Frame, spot: Array, work: Work) -> float:
-    X = work.X
+def _flux_variance(frame: Frame, X: Array) -> float:
+    """Of the flux, over its square."""
     relative = (
         X[0, 3]
         + X[3, 3] * frame.S[0] / frame.su**2
         + X[4, 3] * frame.S[1] / (frame.su * frame.sv)
         + X[5, 3] * frame.S[2] / frame.sv**2
     )
-    return max(relative, 0.0) * spot[FLUX] ** 2
+    return max(relative, 0.0)
 
 
 @compiled

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from geometry.arrays import Array
 from geometry.compiled import compiled
 
-OUTSIDE, CLIPPED, VALID = 0, 1, 2
+OUTSIDE, CLIPPED, VALID = 0.0, 1.0, 2.0
 
 
 class Pixels(NamedTuple):
@@ -77,7 +77,7 @@ def window_around(u: float, v: float, half_columns: int, half_rows: int, cell: i
 
 
 @compiled
-def cut(image: Pixels, window: Window, saturation: float, values: Array, state: NDArray[np.int8]) -> None:
+def cut(image: Pixels, window: Window, saturation: float, values: Array, state: Array) -> None:
     """The cells' values (cells,), DN, and state (cells,): OUTSIDE (partly), CLIPPED (one of the pixels) or VALID."""
     cell = window.cell
     share = 1.0 / (cell * cell)
@@ -86,14 +86,17 @@ def cut(image: Pixels, window: Window, saturation: float, values: Array, state: 
         for j in range(window.columns):
             left = window.left + j * cell
             k = i * window.columns + j
+            values[k], state[k] = 0.0, OUTSIDE
             if left < 0 or top < 0 or left + cell > image.width or top + cell > image.height:
-                values[k], state[k] = 0.0, OUTSIDE
                 continue
-            total, most = 0.0, 0.0
-            for v in range(top, top + cell):
-                for u in range(left, left + cell):
-                    x = pixel(image, u, v)
-                    total += x
-                    most = max(most, x)
+            if cell == 1:
+                total = most = pixel(image, left, top)
+            else:
+                total = most = 0.0
+                for v in range(top, top + cell):
+                    for u in range(left, left + cell):
+                        x = pixel(image, u, v)
+                        total += x
+                        most = max(most, x)
             values[k] = total * share
             state[k] = VALID if most < saturation else CLIPPED

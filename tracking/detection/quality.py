@@ -7,49 +7,61 @@ from math import sqrt
 from geometry.arrays import Array
 from geometry.compiled import compiled
 from tracking.detection import ellipse
-from tracking.detection.normal_equations import Cells, Frame
+from tracking.detection.normal_equations import Frame
 from tracking.detection.pixels import OUTSIDE, Window
+from tracking.detection.table import (
+    CHI2,
+    COV_UV,
+    EXPLAINED,
+    GAIN,
+    LIGHT,
+    OTHERS,
+    PEAK,
+    RESIDUAL,
+    SIGMA_FLUX,
+    STATE,
+    VALUES,
+    VAR_U,
+    VAR_V,
+    WEIGHT,
+)
 
-# Columns of a fit's quality: covariance of the centre, px^2; sigma of the flux, DN; highest pixel above plane and
-# neighbours, DN (of a clipped spot the clipping level's); chi-square per degree of freedom; share of what stands out of
-# the plane, beyond noise, that the Gaussian explains; by how much the Gaussian lowers chi-square.
-VAR_U, COV_UV, VAR_V, SIGMA_FLUX, PEAK, CHI2, EXPLAINED, GAIN = range(8)
-COLUMNS = 8
 _CORE = 0.2  # of the brightest cell's light: clipped cells count there, hot pixels in the wings do not
 _LAGS = 2  # cells
 
 
 @compiled
-def judge(window: Window, frame: Frame, cells: Cells, N: Array, b: Array, before: float, chi2: float, out: Array) -> None:
-    """Complete a row of quality (COLUMNS,), whose first four are given, from the normal equations of the last step.
+def judge(window: Window, frame: Frame, chi2: float, cells: Array, spot: Array) -> None:
+    """Complete what a spot (COLUMNS,) says of itself, which has covariances and GAIN; chi2 is that after its last step.
 
-    `before` is chi-square before that step, `chi2` after. The covariance given is the Cramer-Rao bound of the model; it
+    The covariance given is the Cramer-Rao bound of the model; it
     and the flux's variance are raised by `_misfit`.
     """
     count = window.columns * window.rows
     used, most = 0, 0.0
     for k in range(count):
-        used += 1 if cells.weight[k] > 0 else 0
-        most = max(most, cells.light[k])
+        used += 1 if cells[WEIGHT, k] > 0 else 0
+        most = max(most, cells[LIGHT, k])
     free = max(used - 9, 1)
     peak = 0.0
     for k in range(count):
-        if cells.state[k] != OUTSIDE and cells.light[k] > _CORE * most:
-            peak = max(peak, cells.residual[k] + cells.light[k])
-    flat = max(before + 2 * b[0] + N[0, 0] - _gain_of_plane(N, b), chi2)
-    out[PEAK], out[CHI2], out[GAIN] = peak, chi2 / free, flat - chi2
+        if cells[STATE, k] != OUTSIDE and cells[LIGHT, k] > _CORE * most:
+            peak = max(peak, cells[RESIDUAL, k] + cells[LIGHT, k])
+    spot[PEAK], spot[CHI2] = peak, chi2 / free
     # Chi-square scatters by sqrt(2 free): so much in a faint spot's surroundings is no misfit.
     noise = min(free + 2.0 * sqrt(2.0 * free), chi2)
-    out[EXPLAINED] = (flat - chi2) / max(flat - noise, 1e-9)
+    spot[EXPLAINED] = spot[GAIN] / max(chi2 + spot[GAIN] - noise, 1e-9)
     factor = _misfit(window, frame, cells, used)
-    out[VAR_U], out[COV_UV], out[VAR_V] = out[VAR_U] * factor, out[COV_UV] * factor, out[VAR_V] * factor
-    out[SIGMA_FLUX] *= sqrt(factor)
+    spot[VAR_U], spot[COV_UV], spot[VAR_V] = spot[VAR_U] * factor, spot[COV_UV] * factor, spot[VAR_V] * factor
+    spot[SIGMA_FLUX] *= sqrt(factor)
 
 
 @compiled
-def _gain_of_plane(N: Array, b: Array) -> float:
-    """By how much a plane alone lowers chi-square: of what it leaves, the Gaussian explains its share."""
-    gain = 0.0
+def gain_over_plane(N: Array, b: Array, before: float, chi2: float) -> float:
+    """By how much Gaussian and plane together lower chi-square more than a plane alone does.
+
+    From the normal equations (normal_equations.accumulate) and chi-square before their step and after.
+    """
     y0, y1, y2 = b[6] + N[0, 6], b[7] + N[0, 7], b[8] + N[0, 8]
     d0 = max(N[6, 6], 1e-300)
     l1, l2 = N[7, 6] / d0, N[8, 6] / d0
@@ -58,12 +70,12 @@ def _gain_of_plane(N: Array, b: Array) -> float:
     d2 = max(N[8, 8] - l2 * N[8, 6] - l3 * l3 * d1, 1e-9 * N[8, 8] + 1e-300)
     y1 -= l1 * y0
     y2 -= l2 * y0 + l3 * y1
-    gain = y0 * y0 / d0 + y1 * y1 / d1 + y2 * y2 / d2
-    return gain
+    plane = y0 * y0 / d0 + y1 * y1 / d1 + y2 * y2 / d2
+    return max(before + 2 * b[0] + N[0, 0] - plane - chi2, 0.0)
 
 
 @compiled
-def _misfit(window: Window, frame: Frame, cells: Cells, used: int) -> float:
+def _misfit(window: Window, frame: Frame, cells: Array, used: int) -> float:
     """Factor >= 1 by which the model's faults raise the covariance of the centre.
 
     Only the part of the residuals that is odd about the centre can move it: a flat top, a ring or a streak is a bad
@@ -75,18 +87,18 @@ def _misfit(window: Window, frame: Frame, cells: Cells, used: int) -> float:
     count = window.columns * window.rows
     both = 0
     for k in range(count):
-        both += 1 if cells.weight[k] > 0 and cells.weight[count - 1 - k] > 0 else 0
+        both += 1 if cells[WEIGHT, k] > 0 and cells[WEIGHT, count - 1 - k] > 0 else 0
     whole = 0.5 * both < 0.3 * used
     free = max(used - 9.0, 1.0) if whole else max(0.5 * both - 4.0, 1.0)  # u, v and two slopes are odd
     squares = 0.0
-    odd = cells.values  # no longer needed
+    odd = cells[VALUES]  # no longer needed
     for k in range(count):
         mirror = count - 1 - k
-        here = cells.residual[k] * sqrt(cells.weight[k])
-        there = cells.residual[mirror] * sqrt(cells.weight[mirror])
+        here = cells[RESIDUAL, k] * sqrt(cells[WEIGHT, k])
+        there = cells[RESIDUAL, mirror] * sqrt(cells[WEIGHT, mirror])
         if whole:
             odd[k] = here * sqrt(2.0)
-        elif cells.weight[k] > 0 and cells.weight[mirror] > 0:
+        elif cells[WEIGHT, k] > 0 and cells[WEIGHT, mirror] > 0:
             odd[k] = (here - there) * sqrt(0.5)
         else:
             odd[k] = 0.0
@@ -97,17 +109,17 @@ def _misfit(window: Window, frame: Frame, cells: Cells, used: int) -> float:
 
 
 @compiled
-def _lopsided(window: Window, frame: Frame, cells: Cells, odd: Array, doubled: float) -> float:
+def _lopsided(window: Window, frame: Frame, cells: Array, odd: Array, doubled: float) -> float:
     """The factor where there is a misfit; `odd` (cells,), residuals in sigmas, is overwritten."""
     count = window.columns * window.rows
-    share = cells.others  # no longer needed
+    share = cells[OTHERS]  # no longer needed
     a, b, c = ellipse.inverse(frame.S[0], frame.S[1], frame.S[2])
     total = 0.0
     for k in range(count):
         du = frame.u0 + (k % window.columns) * window.cell
         dv = frame.v0 + (k // window.columns) * window.cell
         wu, wv = a * du + b * dv, b * du + c * dv
-        share[k] = cells.weight[k] * cells.light[k] ** 2 * (wu * wu + wv * wv)
+        share[k] = cells[WEIGHT, k] * cells[LIGHT, k] ** 2 * (wu * wu + wv * wv)
         total += share[k]
     total = max(total, 1e-300)
     square, crowd = 0.0, 0.0

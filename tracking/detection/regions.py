@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from geometry.arrays import Array, Ints
 from geometry.compiled import compiled
 from tracking.detection.block_search import BLOCK
-from tracking.detection.candidates import RADIUS
+from tracking.detection.candidates import AT_U, AT_V, RADIUS
 
 MARGIN = 16  # px: so far from a spot's centre its peak, or that of a neighbour, may lie
 
@@ -54,17 +54,17 @@ def in_a_region(regions: Array, u: float, v: float, more: float) -> bool:
 
 @compiled
 def find_relevant(
-    uv: Ints, regions: Array, reach: Array, searched: NDArray[np.uint8], width: int, height: int, relevant: Ints,
+    peaks: Array, regions: Array, reach: Array, searched: NDArray[np.uint8], width: int, height: int, relevant: Ints,
     boxes: Ints,
 ) -> int:  # fmt: skip
-    """Which peaks (n, 2) bear on the regions (n, 3), and boxes of blocks that must be searched for others that do.
+    """Which peaks (n, 5) bear on the regions (n, 3), and boxes of blocks that must be searched for others that do.
 
     reach (n,), px, is how far around each peak others matter. relevant (n,) becomes 1 where it does; returns the number
     of boxes.
     """
-    n, count = uv.shape[0], 0
+    n, count = peaks.shape[0], 0
     for i in range(n):
-        relevant[i] = 1 if in_a_region(regions, 1.0 * uv[i, 0], 1.0 * uv[i, 1], MARGIN) else 0
+        relevant[i] = 1 if in_a_region(regions, peaks[i, AT_U], peaks[i, AT_V], MARGIN) else 0
     busy = True
     while busy:
         busy = False
@@ -73,11 +73,12 @@ def find_relevant(
                 continue
             relevant[i] = 2  # its neighbours are done
             for j in range(n):
-                if relevant[j] == 0 and max(abs(uv[i, 0] - uv[j, 0]), abs(uv[i, 1] - uv[j, 1])) <= reach[i]:
+                apart = max(abs(peaks[i, AT_U] - peaks[j, AT_U]), abs(peaks[i, AT_V] - peaks[j, AT_V]))
+                if relevant[j] == 0 and apart <= reach[i]:
                     relevant[j], busy = 1, True
     for i in range(n):
         if relevant[i] and count < boxes.shape[0]:
-            more = _add_box(1.0 * uv[i, 0], 1.0 * uv[i, 1], reach[i], width, height, boxes, count)
+            more = _add_box(peaks[i, AT_U], peaks[i, AT_V], reach[i], width, height, boxes, count)
             if not _is_searched(searched, boxes[count]):
                 count = more
     return count
