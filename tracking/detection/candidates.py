@@ -20,6 +20,7 @@ from tracking.detection.pixels import Pixels, clamped, mean3, mirrored, pixel
 RADIUS = 48  # px: peaks further apart than this never belong to one spot of the largest size
 NEAREST = 4  # brighter peaks that a peak is compared with
 DIP = 0.12  # share of the fainter peak by which the light must fall between two spots: speckle falls by less
+HALO = 0.012  # ... and of the brighter peak: rings and halos of real beams have up to 0.009
 HOT = 0.08  # light of the four neighbours over the pixel's: 0.15 for the sharpest spot (1 px wide), 0 for a hot pixel
 HOT_SIGMAS = 4.0  # a pixel must stand out so far of its surroundings to be called hot
 _REACH = 4  # px around a block that are looked at with it: 2 for maxima, 2 for the means
@@ -90,16 +91,14 @@ def _peaks_of_block(
         for j in range(_REACH, min(_REACH + BLOCK, image.width - left + _REACH)):
             if sum3[i, j] <= 9 * level or not _is_maximum(sum3, i, j):
                 continue
-            total = 0.0
-            for a in range(i - 2, i + 3):
-                for b in range(j - 2, j + 3):
-                    total += values[a, b]
-            height3, height5 = sum3[i, j] - 9 * level, total - 25 * level
             least = least_sigmas * sigma
+            height3, height5 = sum3[i, j] - 9 * level, _sum_below(values, i, j, 2, np.inf) - 25 * level
             if max(height3 / 3, height5 / 5) < least:
                 continue
-            excess = _hot_excess(image, left + j - _REACH, top + i - _REACH, noise, level + height3 / 9, few)
-            height3, height5 = height3 - excess, height5 - excess
+            limit = _hot_limit(image, left + j - _REACH, top + i - _REACH, noise, level + height3 / 9, few)
+            if limit < np.inf:
+                height3 = _sum_below(values, i, j, 1, limit) - 9 * level
+                height5 = _sum_below(values, i, j, 2, limit) - 25 * level
             if max(height3 / 3, height5 / 5) < least or height3 <= 0 or count >= peaks.shape[0]:
                 continue
             _add(peaks, count, left + j - _REACH, top + i - _REACH, height3 / 9, level, 0.0)
@@ -119,10 +118,20 @@ def _is_maximum(values: Array, i: int, j: int) -> bool:
 
 
 @compiled
-def _hot_excess(image: Pixels, u: int, v: int, noise: Noise, level: float, few: Array) -> float:
-    """By how much, DN, the brightest of 3x3 pixels exceeds its four neighbours, if it stands alone; else 0.
+def _sum_below(values: Array, i: int, j: int, reach: int, limit: float) -> float:
+    """The sum of the values around one, each cut at the limit."""
+    total = 0.0
+    for a in range(i - reach, i + reach + 1):
+        for b in range(j - reach, j + reach + 1):
+            total += min(values[a, b], limit)
+    return total
 
-    No light stands so alone that came through a lens. `level`, DN, gives the noise: on the broad top of a wide spot the
+
+@compiled
+def _hot_limit(image: Pixels, u: int, v: int, noise: Noise, level: float, few: Array) -> float:
+    """If the brightest of 3x3 pixels is hot, a level that light may reach beside it, DN: four sigmas over its neighbours.
+
+    Else inf. Hot is what stands alone. No light stands so alone that came through a lens. `level`, DN, gives the noise: on the broad top of a wide spot the
     highest pixel is the luckiest one.
     """
     best, bu, bv = -1.0, u, v
@@ -144,8 +153,8 @@ def _hot_excess(image: Pixels, u: int, v: int, noise: Noise, level: float, few: 
     ring = 0.5 * (few[7] + few[8])
     above = best - ring
     if cross - ring < HOT * above and above > HOT_SIGMAS * sqrt(variance(noise, level)):
-        return best - cross
-    return 0.0
+        return cross + HOT_SIGMAS * sqrt(variance(noise, cross))
+    return np.inf
 
 
 @compiled
@@ -250,7 +259,8 @@ def find_apart(image: Pixels, peaks: Array, order: Ints, noise: Noise, apart: In
             )
             for k in range(_nearest_brighter(peaks, order, place, near, gaps)):
                 lowest = _lowest_between(image, peaks, i, near[k]) - peaks[i, LEVEL]
-                alone = alone and peaks[i, HEIGHT] - lowest >= needed
+                least = max(needed, HALO * peaks[near[k], HEIGHT])
+                alone = alone and peaks[i, HEIGHT] - lowest >= least
         if alone:
             apart[count] = i
             count += 1

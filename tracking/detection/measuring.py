@@ -18,6 +18,7 @@ from tracking.detection.pixels import Pixels
 from tracking.detection.regions import in_a_region
 from tracking.detection.table import (
     ACTIVE,
+    CHI2,
     COV_UV,
     EXPLAINED,
     FEW,
@@ -43,6 +44,10 @@ from tracking.detection.table import (
 )
 
 AT_U, AT_V, LEVEL, WIDE_PEAK = candidates.AT_U, candidates.AT_V, candidates.LEVEL, candidates.WIDE
+# Of threshold^2: by how much a spot lowers chi-square (of one degree of freedom, where it is larger than 1). The maximum of
+# noise over places and shapes is higher than at one place: with 1.0 a picture of 1280x1024 has 0.04 false points.
+_SPOT_GAIN = 1.1
+_SPOT_FLUX = 0.5  # of the threshold: the flux in its own sigmas, which know of misfit; it goes together with the shape
 _LEAST_GAIN = 0.7  # of what a spot must lower chi-square by: with less, the fit stops early
 NARROWER = 0.5  # a spot narrower than so much of another one is not that one found again
 _ONE_LIGHT = 1.5  # sigmas of a brighter spot: in its middle a second one is the same light
@@ -83,7 +88,8 @@ def _is_spot(image: Pixels, spot: Array, limits: Limits) -> bool:
     major, minor, _ = ellipse.axes(spot[UU], spot[UV], spot[VV])
     sigma_u, sigma_v = sqrt(max(spot[VAR_U], 0.0)), sqrt(max(spot[VAR_V], 0.0))
     return (
-        spot[GAIN] > limits.threshold_sigma**2
+        spot[GAIN] > _SPOT_GAIN * limits.threshold_sigma**2 * max(spot[CHI2], 1.0)
+        and spot[FLUX] > _SPOT_FLUX * limits.threshold_sigma * spot[SIGMA_FLUX]
         and spot[PEAK] > 0.0
         and major <= limits.max_sigma
         and minor >= limits.min_sigma
@@ -104,6 +110,8 @@ def _is_compact(image: Pixels, spot: Array, noise: Noise, limits: Limits, few: A
     # What the fit found to be narrow stays out: a hot pixel is compact and bright, too.
     narrow = min(minor, ellipse.axes(spot[UU], spot[UV], spot[VV])[1]) < limits.min_sigma
     if narrow or major > limits.max_sigma:
+        return False
+    if spot[GAIN] < limits.threshold_sigma**2:
         return False
     u, v = spot[MOMENT_U], spot[MOMENT_V]
     height = height_of_compact(image, u, v, (uu, uv, vv), noise, limits.threshold_sigma, few)

@@ -44,10 +44,10 @@ from tracking.detection.table import (
 
 EXACT_PX2 = 0.9**2  # narrower spots are integrated over the pixels numerically
 _POWERS_U, _POWERS_V = (0, 1, 0, 2, 1, 0), (0, 0, 1, 0, 1, 2)
-_FOUR_NODES_PX2 = 0.4**2  # narrower: eight nodes each way
+_FOUR_NODES_PX2 = 0.5**2  # narrower: eight nodes each way
 _EDGEWORTH = 0.4  # 1/variance times cell^2 from which the pixels' fourth cumulant shows
 
-# Gauss-Legendre nodes and weights on [-1/2, 1/2] for 4 and 8 points: exact to 1e-5 of the peak at sigma 0.5 and 0.2 px.
+# Gauss-Legendre nodes and weights on [-1/2, 1/2] for 4 and 8 points: exact to 1e-4 of the peak from sigma 0.5 and 0.2 px on.
 _FOUR = np.polynomial.legendre.leggauss(4)
 _EIGHT = np.polynomial.legendre.leggauss(8)
 _NODES4, _WEIGHTS4, _NODES8, _WEIGHTS8 = _FOUR[0] / 2, _FOUR[1] / 2, _EIGHT[0] / 2, _EIGHT[1] / 2
