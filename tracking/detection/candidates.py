@@ -1,7 +1,7 @@
 """Where in a picture a spot may be: a closer look at the blocks that stand out.
 
-A candidate is a maximum of the mean of 3x3 pixels. How far it stands out is asked of the means of 3x3 and of 5x5 pixels,
-matched filters for spots of 1 and 2 px sigma that lose a tenth of the signal-to-noise ratio; spots so wide and faint
+A candidate is a maximum of the mean of 3x3 pixels. How far it stands out is asked of the means of 3x3, 5x5 and 7x7
+pixels, matched filters for spots of 1 to 3 px sigma that lose an eighth of the signal-to-noise ratio; spots so wide and faint
 that only a mean of 8x8 pixels shows them are looked for apart (`wide_candidate`).
 """
 
@@ -23,6 +23,7 @@ DIP = 0.12  # share of the fainter peak by which the light must fall between two
 HALO = 0.012  # ... and of the brighter peak: rings and halos of real beams have up to 0.009
 HOT = 0.08  # light of the four neighbours over the pixel's: 0.15 for the sharpest spot (1 px wide), 0 for a hot pixel
 HOT_SIGMAS = 4.0  # a pixel must stand out so far of its surroundings to be called hot
+_BESIDE_HOT = 2.0  # sigmas over a hot pixel's neighbours at which the others are cut: hot pixels come in pairs
 _REACH = 4  # px around a block that are looked at with it: 2 for maxima, 2 for the means
 _SIDE = BLOCK + 2 * _REACH
 _WIDE_CLIP = 4.0  # sigmas over the background at which pixels are cut where a wide faint spot is looked for
@@ -93,13 +94,15 @@ def _peaks_of_block(
                 continue
             least = least_sigmas * sigma
             height3, height5 = sum3[i, j] - 9 * level, _sum_below(values, i, j, 2, np.inf) - 25 * level
-            if max(height3 / 3, height5 / 5) < least:
+            height7 = _sum_below(values, i, j, 3, np.inf) - 49 * level
+            if max(height3 / 3, height5 / 5, height7 / 7) < least:
                 continue
             limit = _hot_limit(image, left + j - _REACH, top + i - _REACH, noise, level + height3 / 9, few)
             if limit < np.inf:
                 height3 = _sum_below(values, i, j, 1, limit) - 9 * level
                 height5 = _sum_below(values, i, j, 2, limit) - 25 * level
-            if max(height3 / 3, height5 / 5) < least or height3 <= 0 or count >= peaks.shape[0]:
+                height7 = _sum_below(values, i, j, 3, limit) - 49 * level
+            if max(height3 / 3, height5 / 5, height7 / 7) < least or height3 <= 0 or count >= peaks.shape[0]:
                 continue
             _add(peaks, count, left + j - _REACH, top + i - _REACH, height3 / 9, level, 0.0)
             count += 1
@@ -129,7 +132,7 @@ def _sum_below(values: Array, i: int, j: int, reach: int, limit: float) -> float
 
 @compiled
 def _hot_limit(image: Pixels, u: int, v: int, noise: Noise, level: float, few: Array) -> float:
-    """If the brightest of 3x3 pixels is hot, a level that light may reach beside it, DN: four sigmas over its neighbours.
+    """If the brightest of 3x3 pixels is hot, a level that light may reach beside it, DN: that of its neighbours and a little more.
 
     Else inf. Hot is what stands alone. No light stands so alone that came through a lens. `level`, DN, gives the noise: on the broad top of a wide spot the
     highest pixel is the luckiest one.
@@ -153,7 +156,7 @@ def _hot_limit(image: Pixels, u: int, v: int, noise: Noise, level: float, few: A
     ring = 0.5 * (few[7] + few[8])
     above = best - ring
     if cross - ring < HOT * above and above > HOT_SIGMAS * sqrt(variance(noise, level)):
-        return cross + HOT_SIGMAS * sqrt(variance(noise, cross))
+        return cross + _BESIDE_HOT * sqrt(variance(noise, cross))
     return np.inf
 
 

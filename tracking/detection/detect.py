@@ -56,7 +56,7 @@ def find_spots(
 class SpotFinder:
     """Finds spots in pictures of one size and keeps the room to work in; for one thread at a time."""
 
-    def __init__(self, width: int, height: int, most: int = DetectParameters.max_detections) -> None:
+    def __init__(self, width: int, height: int, most: int = 400) -> None:
         """most: DetectParameters.max_detections of the calls to come."""
         self.width, self.height, self.most = width, height, most
         self._blocks = Blocks.of(width, height)

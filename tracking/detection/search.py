@@ -23,7 +23,7 @@ from tracking.detection.candidates import Noise, find_peaks
 from tracking.detection.pixels import Pixels
 
 HALO = 2  # blocks around a box that its search needs
-BLOCK_SHARE, PEAK_SHARE = 0.64, 0.77  # of the threshold: to look closer at a block; to measure a peak
+BLOCK_SHARE, PEAK_SHARE = 0.63, 0.75  # of the threshold: to look closer at a block; to measure a peak
 
 
 @compiled
