@@ -15,8 +15,32 @@ from tracking.detection.moments import find_moments
 from tracking.detection.normal_equations import accumulate, solve_normal
 from tracking.detection.pixels import CLIPPED, OUTSIDE, Pixels, Window, cut, window_around
 from tracking.detection.table import (
-    ALGEBRA, CELL_ROWS, CHI2, COLUMNS, COV_UV, FLUX, GROUND, LIGHT, MOMENT_U, MOMENT_UU, MOMENT_UV, MOMENT_V, MOMENT_VV,
-    MOST_CELLS, NORMAL, RESIDUAL, RIGHT_SIDE, SLOPE_V, USE, UU, VAR_U, VAR_V, VECTORS, WEIGHT, U, V,
+    ALGEBRA,
+    CELL_ROWS,
+    CHI2,
+    COLUMNS,
+    COV_UV,
+    FLUX,
+    GROUND,
+    LIGHT,
+    MOMENT_U,
+    MOMENT_UU,
+    MOMENT_UV,
+    MOMENT_V,
+    MOMENT_VV,
+    MOST_CELLS,
+    NORMAL,
+    RESIDUAL,
+    RIGHT_SIDE,
+    SLOPE_V,
+    USE,
+    UU,
+    VAR_U,
+    VAR_V,
+    VECTORS,
+    WEIGHT,
+    U,
+    V,
 )  # fmt: skip
 
 px = 1.0
@@ -82,7 +106,8 @@ def test_a_row_of_a_gaussian_is_the_exponential_at_each_point(a, b, turn, u0, v,
 
 
 @pytest.mark.parametrize(
-    ("sigma", "tolerance"), [(0.25, 1e-4), (0.42, 1e-4), (0.5, 1e-4), (0.8, 1e-4), (0.95, 4e-4), (1.5, 3e-4), (3.0, 1e-4)]
+    ("sigma", "tolerance"),
+    [(0.25, 1e-4), (0.42, 1e-4), (0.5, 1e-4), (0.8, 1e-4), (0.95, 4e-4), (1.5, 3e-4), (3.0, 1e-4)],
 )
 @pytest.mark.parametrize("phase", [0.0, 0.23, 0.5])
 def test_pixels_integrate_the_gaussian(sigma, tolerance, phase):

@@ -254,13 +254,13 @@ FAINT_SIGMA = 2.0
 
 @pytest.mark.parametrize("sigma", [1.0, 1.5, 2.0])
 @pytest.mark.parametrize("bits", [8, 16])
-def test_spots_of_nine_sigmas_in_a_matched_filter_are_found(sigma, bits):
-    """With peaks of 2.5 to 5 sigmas of a pixel's noise."""
+def test_spots_of_ten_sigmas_in_a_matched_filter_are_found(sigma, bits):
+    """With peaks of 2.8 to 5.6 sigmas of a pixel's noise."""
     rng = np.random.default_rng([bits, int(10 * sigma)])
     noise = NoiseModel((FAINT_SIGMA * (1 if bits == 8 else 20)) ** 2 + 1 / 12, 1e-9)
     missed = false = 0
     for _ in range(5):
-        image, at = faint(sigma, 9.0, rng, bits)
+        image, at = faint(sigma, 10.0, rng, bits)
         found = find_spots(image, noise=noise)
         away = np.hypot(*(found.uv_px[:, None, :] - at[None, :, :]).transpose(2, 0, 1))
         missed += int((away.min(axis=0) > 2.0).sum())

@@ -31,9 +31,9 @@ class Blocks(NamedTuple):
 
     pairs: Sums  # (4n, 4m) of 2x2 pixels
     quads: Sums  # (2n, 2m) of 4x4 pixels
-    # (6, n, m). SUMS: of 8x8 pixels. HIGHEST2: the largest of 2x2 pixels in the block. HIGHEST4, HIGHEST8: of 4x4 and 8x8
-    # pixels that begin in the block, at every second and fourth pixel. MIDDLE: median of SUMS over five blocks of a row.
-    # GROUND: median of MIDDLE over five rows, the background
+    # (6, n, m). SUMS: of 8x8 pixels. HIGHEST2: the largest of 2x2 pixels in the block. HIGHEST4, HIGHEST8: of 4x4 and
+    # 8x8 pixels that begin in the block, at every second and fourth pixel. MIDDLE: median of SUMS over five blocks of a
+    # row. GROUND: median of MIDDLE over five rows, the background
     maps: Sums
     lines: Sums  # (2, 4m) room to work in
 

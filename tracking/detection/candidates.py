@@ -1,8 +1,8 @@
 """Where in a picture a spot may be: a closer look at the blocks that stand out.
 
 A candidate is a maximum of the mean of 3x3 pixels. How far it stands out is asked of the means of 3x3, 5x5 and 7x7
-pixels, matched filters for spots of 1 to 3 px sigma that lose an eighth of the signal-to-noise ratio; spots so wide and faint
-that only a mean of 8x8 pixels shows them are looked for apart (`wide_candidate`).
+pixels, matched filters for spots of 1 to 3 px sigma that lose an eighth of the signal-to-noise ratio; spots so wide and
+faint that only a mean of 8x8 pixels shows them are looked for apart (`_wide_peak`).
 """
 
 from __future__ import annotations
@@ -132,10 +132,10 @@ def _sum_below(values: Array, i: int, j: int, reach: int, limit: float) -> float
 
 @compiled
 def _hot_limit(image: Pixels, u: int, v: int, noise: Noise, level: float, few: Array) -> float:
-    """If the brightest of 3x3 pixels is hot, a level that light may reach beside it, DN: that of its neighbours and a little more.
+    """If the brightest of 3x3 pixels is hot, how bright light may be beside it, DN; else inf.
 
-    Else inf. Hot is what stands alone. No light stands so alone that came through a lens. `level`, DN, gives the noise: on the broad top of a wide spot the
-    highest pixel is the luckiest one.
+    Hot is what stands alone, as no light does that came through a lens. `level`, DN, gives the noise: on the broad top of
+    a wide spot the highest pixel is the luckiest one.
     """
     best, bu, bv = -1.0, u, v
     for i in range(max(v - 1, 0), min(v + 2, image.height)):
@@ -257,9 +257,7 @@ def find_apart(image: Pixels, peaks: Array, order: Ints, noise: Noise, apart: In
             alone = not _has_neighbour(peaks, order, i)
         else:
             alone = True
-            needed = max(
-                DIP * peaks[i, HEIGHT], 4.0 / 3.0 * sqrt(2.0) * sqrt(variance(noise, peaks[i, LEVEL]))
-            )
+            needed = max(DIP * peaks[i, HEIGHT], 4.0 / 3.0 * sqrt(2.0) * sqrt(variance(noise, peaks[i, LEVEL])))
             for k in range(_nearest_brighter(peaks, order, place, near, gaps)):
                 lowest = _lowest_between(image, peaks, i, near[k]) - peaks[i, LEVEL]
                 least = max(needed, HALO * peaks[near[k], HEIGHT])
@@ -274,7 +272,11 @@ def find_apart(image: Pixels, peaks: Array, order: Ints, noise: Noise, apart: In
 def _has_neighbour(peaks: Array, order: Ints, i: int) -> bool:
     for place in range(order.shape[0]):
         j = order[place]
-        if not peaks[j, WIDE] and abs(peaks[i, AT_U] - peaks[j, AT_U]) < 16 and abs(peaks[i, AT_V] - peaks[j, AT_V]) < 16:
+        if (
+            not peaks[j, WIDE]
+            and abs(peaks[i, AT_U] - peaks[j, AT_U]) < 16
+            and abs(peaks[i, AT_V] - peaks[j, AT_V]) < 16
+        ):
             return True
     return False
 

@@ -38,8 +38,8 @@ def find_spots(
     estimate it once, from several pictures (tracking.noise.estimate_noise).
 
     regions (n, 3), px: boxes u, v, half size; only spots in one of them are looked for and returned. They are the same,
-    bit for bit, as those of the whole picture there, as long as that has fewer than max_detections. Boxes with nan or of
-    negative size hold nothing.
+    bit for bit, as those of the whole picture there, as long as that has fewer than max_detections. Boxes with nan or
+    of negative size hold nothing.
 
     Errors: ValueError if the picture or the regions are not of that form.
     """
@@ -66,7 +66,11 @@ class SpotFinder:
         self._searched = np.zeros((rows, columns), np.uint8)
         self._standing_out = np.zeros((rows * columns, 3), np.int64)
         self._room, self._peaks = room_for_a_block(), np.zeros((4 * rows * columns, 5))
-        self._apart, self._near, self._gaps = np.zeros(4 * most, np.int64), np.zeros(NEAREST, np.int64), np.zeros(NEAREST)
+        self._apart, self._near, self._gaps = (
+            np.zeros(4 * most, np.int64),
+            np.zeros(NEAREST, np.int64),
+            np.zeros(NEAREST),
+        )
         self._cells, self._algebra = np.zeros((CELL_ROWS, MOST_CELLS)), np.zeros((ALGEBRA, 9, 10))
         self._table, self._count, self._out = np.zeros((most, COLUMNS)), 0, np.zeros((most, 10))
 
@@ -158,7 +162,7 @@ class _Task(NamedTuple):
     @staticmethod
     def of(image: Picture, parameters: DetectParameters, noise: NoiseModel | None) -> _Task:
         model = noise or guess_noise(image)
-        image = np.ascontiguousarray(image)
+        image = image if image.flags.c_contiguous else image.copy()
         saturation = parameters.saturation_dn
         limits = Limits(
             float(parameters.threshold_sigma),

@@ -72,8 +72,8 @@ def fit_all(
     """Fit all candidates of a picture (n, COLUMNS) together, from their moments, in place.
 
     Gauss-Newton as long as the centres move; clipped pixels, pixels outside and hot pixels are left out; the light of
-    the neighbours is taken off. A candidate that grows beyond `widest`, px, walks away, or lowers chi-square by less than
-    `least_gain` is given up: its flux is 0.
+    the neighbours is taken off. A candidate that grows beyond `widest`, px, walks away, or lowers chi-square by less
+    than `least_gain` is given up: its flux is 0.
     """
     n = table.shape[0]
     for i in range(n):
@@ -179,8 +179,8 @@ def window_of(spot: Array) -> Window:
         # A long streak too has cells of two: four would blur its narrow side.
         slim = ellipse.eigenvalues(spot[UU], spot[UV], spot[VV])[0] < 9.0
         cell, most = (2, 36) if half <= 36 or slim else (4, 24)
-    columns = int(ceil(min(max(half_u / cell, _LEAST_HALF), most)))
-    rows = int(ceil(min(max(half_v / cell, _LEAST_HALF), most)))
+    columns = ceil(min(max(half_u / cell, _LEAST_HALF), most))
+    rows = ceil(min(max(half_v / cell, _LEAST_HALF), most))
     return window_around(spot[U], spot[V], columns, rows, cell)
 
 
@@ -320,9 +320,7 @@ def _advance(frame: Frame, spot: Array, X: Array) -> None:
     duu, duv, dvv = 2 * (a * S[0] + b * S[1]), 2 * (a * S[1] + b * S[2]), 2 * (c * S[1] + d * S[2])
     pixel = 1 / 12.0
     base = (spot[UU] + pixel, spot[UV], spot[VV] + pixel)
-    uu, uv, vv = ellipse.kept_within(
-        (base[0] + more * duu, base[1] + more * duv, base[2] + more * dvv), base, 0.4, 2.5
-    )
+    uu, uv, vv = ellipse.kept_within((base[0] + more * duu, base[1] + more * duv, base[2] + more * dvv), base, 0.4, 2.5)
     short = 1.0 / max(ellipse.length(du, dv, base[0], base[1], base[2]), 1.0)
     du, dv = short * du, short * dv
     spot[UU], spot[UV], spot[VV] = ellipse.with_eigenvalues(uu - pixel, uv, vv - pixel, _LEAST_VARIANCE, np.inf)

@@ -98,9 +98,9 @@ def _take_ground(window: Window, table: Array, i: int, ground: float, values: Ar
 
 @compiled
 def _one_round(window: Window, light: Array, spot: Array, row: Array) -> float:
-    """Under a window W a Gaussian S has covariance (1/S + 1/W)^-1; if they are equal, half its offset and flux are seen.
+    """Under a window W a Gaussian S has covariance (1/S + 1/W)^-1; if they are equal, half its offset is seen.
 
-    Returns the flux, DN cells.
+    Half its flux, too. Returns the flux, DN cells.
     """
     pixel = window.cell**2 / 12.0
     W = (spot[MOMENT_UU] + pixel, spot[MOMENT_UV], spot[MOMENT_VV] + pixel)

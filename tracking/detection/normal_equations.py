@@ -2,8 +2,8 @@
 
 Linearised, the model is a Gaussian times a polynomial of second degree in the place (which spans the derivatives by
 centre, shape and flux) and a plane. So the normal matrix consists of moments of weight, weight times light and weight
-times squared light, up to the fourth degree; those are summed row by row, where the row's v is a constant. That takes 18
-products per cell, where nine columns would take 54.
+times squared light, up to the fourth degree; those are summed row by row, where the row's v is a constant. That takes
+18 products per cell, where nine columns would take 54.
 """
 
 from __future__ import annotations
@@ -47,7 +47,8 @@ _POWERS_U, _POWERS_V = (0, 1, 0, 2, 1, 0), (0, 0, 1, 0, 1, 2)
 _FOUR_NODES_PX2 = 0.5**2  # narrower: eight nodes each way
 _EDGEWORTH = 0.4  # 1/variance times cell^2 from which the pixels' fourth cumulant shows
 
-# Gauss-Legendre nodes and weights on [-1/2, 1/2] for 4 and 8 points: exact to 1e-4 of the peak from sigma 0.5 and 0.2 px on.
+# Gauss-Legendre nodes and weights on [-1/2, 1/2] for 4 and 8 points: exact to 1e-4 of the peak
+# from sigma 0.5 and 0.2 px on.
 _FOUR = np.polynomial.legendre.leggauss(4)
 _EIGHT = np.polynomial.legendre.leggauss(8)
 _NODES4, _WEIGHTS4, _NODES8, _WEIGHTS8 = _FOUR[0] / 2, _FOUR[1] / 2, _EIGHT[0] / 2, _EIGHT[1] / 2
@@ -79,8 +80,8 @@ def frame_of(window: Window, spot: Array) -> Frame:
 def accumulate(window: Window, spot: Array, noise: Noise, cells: Array, algebra: Array) -> float:
     """Fill the normal matrix and right side at a spot, and the cells' light, weight and residual; returns chi-square.
 
-    Columns: 1, x, y, x^2, x y, y^2 times the light, then 1, x, y, in the coordinates of `frame_of`. Cells are weighted by
-    the noise at the fitted level: weights from the noisy values would pull the fit down.
+    Columns: 1, x, y, x^2, x y, y^2 times the light, then 1, x, y, in the coordinates of `frame_of`. Cells are weighted
+    by the noise at the fitted level: weights from the noisy values would pull the fit down.
     """
     frame = frame_of(window, spot)
     if frame.exact:
@@ -200,8 +201,8 @@ def _fill(A: Array, R: Array, N: Array, b: Array) -> None:
 def _integrate_row(a: tuple[float, float, float], u0: float, v: float, cell: float, row: Array) -> None:
     """Take point values, of a Gaussian that has the pixels' variance already, to the pixels' means.
 
-    The square's fourth cumulant, -cell^4/120, enters as an Edgeworth term. Against the exact integral the error is below
-    0.05 % of the peak from sigma 0.8 px on (a test says so).
+    The square's fourth cumulant, -cell^4/120, enters as an Edgeworth term. Against the exact integral the error is
+    below 0.05 % of the peak from sigma 0.8 px on (a test says so).
     """
     share = cell**4 / 2880.0
     for j in range(row.shape[0]):

@@ -7,8 +7,6 @@ so much is searched too, and around the peaks that this brings to light, until t
 
 from __future__ import annotations
 
-from math import floor
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,7 +20,7 @@ MARGIN = 16  # px: so far from a spot's centre its peak, or that of a neighbour,
 
 @compiled
 def boxes_of(regions: Array, width: int, height: int, boxes: Ints) -> int:
-    """The blocks (n, 4: first row, last, first column, last) of regions (n, 3: u, v, half size, px), with the margin."""
+    """The blocks (n, 4: first row, last, first column, last) of regions (n, 3: u, v, half size, px), and a margin."""
     count = 0
     for k in range(regions.shape[0]):
         u, v, half = regions[k, 0], regions[k, 1], regions[k, 2]
@@ -36,8 +34,8 @@ def _add_box(u: float, v: float, half: float, width: int, height: int, boxes: In
     left, right = max(u - half, 0.0), min(u + half, width - 1.0)
     top, bottom = max(v - half, 0.0), min(v + half, height - 1.0)
     if left <= right and top <= bottom:
-        boxes[count, 0], boxes[count, 1] = int(floor(top)) // BLOCK, int(floor(bottom)) // BLOCK
-        boxes[count, 2], boxes[count, 3] = int(floor(left)) // BLOCK, int(floor(right)) // BLOCK
+        boxes[count, 0], boxes[count, 1] = int(top) // BLOCK, int(bottom) // BLOCK
+        boxes[count, 2], boxes[count, 3] = int(left) // BLOCK, int(right) // BLOCK
         count += 1
     return count
 

@@ -33,8 +33,8 @@ def find_peaks_in(
 ) -> int:  # fmt: skip
     """Add the peaks in boxes (n, 4) of blocks to the first `count` ones; their number then.
 
-    The pixels of the boxes and of HALO blocks around them are binned into blocks.pairs already. Blocks that are marked in
-    `searched` are passed over, the others become marked.
+    The pixels of the boxes and of HALO blocks around them are binned into blocks.pairs already. Blocks that are marked
+    in `searched` are passed over, the others become marked.
     """
     rows, columns = blocks.maps.shape[1:]
     wide = runs[: runs_of(boxes, HALO, HALO, rows, columns, runs)]

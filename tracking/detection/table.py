@@ -8,12 +8,12 @@ from __future__ import annotations
 # What the fit varies: centre, px; shape, the covariance of the light before the pixels integrate it, px^2; flux, DN;
 # background at the centre, DN, and its slopes, DN/px.
 U, V, UU, UV, VV, FLUX, LEVEL, SLOPE_U, SLOPE_V = range(9)
-# What it says of itself: covariance of the centre, px^2; sigma of the flux, DN; highest pixel above plane and neighbours,
-# DN (of a clipped spot the clipping level's); chi-square per degree of freedom; share of what stands out of the plane,
+# What it says of itself: covariance of the centre, px^2; sigma of the flux, DN; highest pixel above plane and
+# neighbours, DN (of a clipped spot the clipping level's); chi-square per degree of freedom; share of what stands out of the plane,
 # beyond noise, that the Gaussian explains; by how much the Gaussian lowers chi-square.
 VAR_U, COV_UV, VAR_V, SIGMA_FLUX, PEAK, CHI2, EXPLAINED, GAIN = range(9, 17)
-# Moments; then the background found before, DN; 1 for those that only a mean of 8x8 pixels shows; size of the largest cells
-# used, px; 1: to be fitted (again); 1: is a spot.
+# Moments; then the background found before, DN; 1 for those that only a mean of 8x8 pixels shows; size of the
+# largest cells used, px; 1: to be fitted (again); 1: is a spot.
 MOMENT_U, MOMENT_V, MOMENT_UU, MOMENT_UV, MOMENT_VV, GROUND, WIDE, SPAN, ACTIVE, GOOD = range(17, 27)
 COLUMNS = 27
 
