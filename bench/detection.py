@@ -16,7 +16,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from geometry.camera import SensorNoise
 from tests.tracking.rendering import Scene, Spot, bound, expected, expose
-from tracking.detect import find_spots
+from tracking.detection.detect import find_spots
 
 SETS = ("main", "faint", "saturated", "near", "edge", "streak", "wide", "small", "speckle", "blank")
 SIZE = (1280, 1024)

@@ -14,7 +14,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from tracking.detect import find_spots
+from tracking.detection.detect import find_spots
 from tracking.detections import Detections
 
 SETS = ("laser_beam_series_t", "laser_beam_modes", "laser_spot_room", "laser_spot_saturated", "star_fields")

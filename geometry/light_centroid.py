@@ -45,7 +45,7 @@ def centre_offsets(camera: Camera, screen: Screen, uv_px: Array, shape_px2: Arra
     N11 = (s[:, 1] - 2 * s[:, 0] + s[:, 2]) / _STEP**2
     N22 = (s[:, 3] - 2 * s[:, 0] + s[:, 4]) / _STEP**2
     N12 = (s[:, 5] + s[:, 6] - s[:, 7] - s[:, 8]) / (4 * _STEP**2)
-    good: Bools = np.isfinite(s).all(axis=(1, 2))
+    good: Bools = np.asarray(np.isfinite(s).all(axis=(1, 2)))
     curvature: Array = np.where(good[:, None, None], 0.5 * np.stack([N11, N12, N22], axis=-1), 0.0)
     P: Array = np.linalg.solve(np.where(good[:, None, None], M, np.eye(2)).astype(float), curvature)
     # The exponent is -|M^-1 (s - s0)|^2 / 2 = -|g|^2 / 2 - g . (P_11 g1^2 + 2 P_12 g1 g2 + P_22 g2^2).

@@ -12,7 +12,7 @@ import numpy as np
 from geometry.camera import SensorNoise
 from lab.frames import FrameReader, pictures_at
 from lab.run_file import DetectionsTable, FramesFolder, Run
-from tracking.detect import find_spots
+from tracking.detection.detect import find_spots
 from tracking.detections import Detections
 from tracking.noise import NoiseModel, Picture, guess_noise
 from tracking.noise_estimation.photon_transfer import NoiseEstimate, estimate_noise

@@ -8,7 +8,7 @@ from typing import Literal
 
 @dataclass(frozen=True, slots=True)
 class DetectParameters:
-    """Finding and measuring points of light in one picture (tracking/detect.py, tracking/centroid.py)."""
+    """Finding and measuring points of light in one picture (tracking/detection)."""
 
     threshold_sigma: float = 6.0  # detection threshold over the local background, in sigmas of its noise
     max_detections: int = 400  # keep the brightest so many of one picture

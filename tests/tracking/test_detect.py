@@ -8,9 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from geometry.camera import SensorNoise
-from tests.tracking.rendering import Scene, Spot, photograph
-from tracking.detect import find_spots
+from tests.tracking.rendering import Scene, Spot, expected, expose, photograph
+from tracking.detection.detect import find_spots
 from tracking.detections import Detections
+from tracking.noise import NoiseModel
 from tracking.parameters import DetectParameters
 
 px = 1.0
@@ -236,3 +237,42 @@ def test_centres_reach_the_cramer_rao_bound_and_their_sigma_is_honest(kind, limi
     assert 0.9 < row.honesty < 1.1
     assert row.recall > (0.93 if kind == "faint" else 0.999)
     assert row.false_per_frame <= 0.02
+
+
+def faint(sigma: float, snr: float, rng: np.random.Generator, bits: int = 8) -> tuple[np.ndarray, np.ndarray]:
+    """A picture of twelve faint round spots of that matched-filter signal-to-noise ratio, and their places."""
+    scale = 1.0 if bits == 8 else 20.0
+    at = np.array([[60 + 100 * i, 50 + 100 * j] for i in range(4) for j in range(3)]) + rng.uniform(-9, 9, (12, 2))
+    peak = snr * FAINT_SIGMA / (np.sqrt(np.pi) * sigma)
+    scene = Scene([Spot(u, v, peak, sigma, sigma) for u, v in at], (420, 310), 20.0, gain=1e9, read=FAINT_SIGMA)
+    mean = expected(scene) * scale
+    return expose(mean, Scene([], scene.size, gain=1e9, read=FAINT_SIGMA * scale), rng, bits), at
+
+
+FAINT_SIGMA = 2.0
+
+
+@pytest.mark.parametrize("sigma", [1.0, 1.5, 2.0])
+@pytest.mark.parametrize("bits", [8, 16])
+def test_spots_of_ten_sigmas_in_a_matched_filter_are_found(sigma, bits):
+    """With peaks of 2.8 to 5.6 sigmas of a pixel's noise."""
+    rng = np.random.default_rng([bits, int(10 * sigma)])
+    noise = NoiseModel((FAINT_SIGMA * (1 if bits == 8 else 20)) ** 2 + 1 / 12, 1e-9)
+    missed = false = 0
+    for _ in range(5):
+        image, at = faint(sigma, 10.0, rng, bits)
+        found = find_spots(image, noise=noise)
+        away = np.hypot(*(found.uv_px[:, None, :] - at[None, :, :]).transpose(2, 0, 1))
+        missed += int((away.min(axis=0) > 2.0).sum())
+        false += int((away.min(axis=1) > 2.0).sum())
+    assert missed <= 1  # of 60
+    assert false == 0
+
+
+@pytest.mark.parametrize("bits", [8, 16])
+def test_noise_alone_holds_nothing_in_megapixels(bits):
+    rng = np.random.default_rng(bits)
+    scale = 1 if bits == 8 else 30
+    for _ in range(3):
+        image = np.rint(rng.normal(30 * scale, 2 * scale, (1024, 1280))).astype(np.uint8 if bits == 8 else np.uint16)
+        assert len(find_spots(image, noise=NoiseModel((2.0 * scale) ** 2 + 1 / 12, 1e-9))) == 0

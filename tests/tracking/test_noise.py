@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from geometry.camera import SensorNoise
 from tests.tracking.rendering import Scene, Spot, photograph
-from tracking.detect import find_spots
+from tracking.detection.detect import find_spots
 from tracking.noise import ROUNDING_DN2, NoiseModel, guess_noise
 from tracking.noise_estimation.grey_values import saturation_level
 from tracking.noise_estimation.photon_transfer import estimate_noise

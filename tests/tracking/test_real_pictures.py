@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tracking.detect import find_spots
+from tracking.detection.detect import find_spots
 from tracking.detections import Detections
 from tracking.noise import Picture
 from tracking.noise_estimation.photon_transfer import estimate_noise

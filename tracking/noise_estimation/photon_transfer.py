@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from geometry.arrays import Array
-from tracking.detect import find_spots
+from tracking.detection.detect import find_spots
 from tracking.noise import FULL_SCALE_E, NoiseModel, Picture, quantile_variance
 from tracking.noise_estimation.grey_values import clipped_background, full_scale, grey_step, saturation_level
 from tracking.noise_estimation.levels import LEAST_PIXELS, LEVELS, SIDE, LevelVariances, level_variances

@@ -1,0 +1,77 @@
+"""Looking into regions gives the same spots, bit for bit, as looking at the whole picture."""
+
+import numpy as np
+import pytest
+
+from bench.detection import scene_of
+from geometry.camera import SensorNoise
+from tests.tracking.rendering import Scene, Spot, photograph
+from tracking.detection.detect import SpotFinder, find_spots
+from tracking.detections import Detections
+from tracking.noise import Picture
+from tracking.parameters import DetectParameters
+
+NOISE = SensorNoise(gain_e_per_dn=30.0, read_noise_e=45.0)
+
+
+def inside(found: Detections, regions: np.ndarray) -> np.ndarray:
+    away = np.abs(found.uv_px[:, None, :] - regions[None, :, :2]).max(axis=2)
+    return (away <= regions[None, :, 2]).any(axis=1)
+
+
+def assert_same(image: Picture, regions: np.ndarray) -> int:
+    whole, part = find_spots(image, noise=NOISE), find_spots(image, noise=NOISE, regions=regions)
+    there = whole[inside(whole, regions)]
+    for name in Detections.__slots__:
+        np.testing.assert_array_equal(getattr(part, name), getattr(there, name), err_msg=name)
+    return len(part)
+
+
+@pytest.mark.parametrize("kind", ["main", "faint", "near", "edge", "wide", "small", "speckle"])
+def test_regions_hold_the_same_spots_as_the_whole_picture(kind):
+    rng = np.random.default_rng([3, len(kind)])
+    scene = scene_of(kind, rng)
+    image = photograph(scene, rng)
+    at = np.array([[s.u, s.v] for s in scene.spots])
+    some = rng.permutation(len(at))[: len(at) // 2 + 1]
+    regions = np.column_stack([at[some] + rng.normal(0, 3, (len(some), 2)), rng.uniform(8, 40, len(some))])
+    empty = np.column_stack([rng.uniform(0, 1000, (3, 2)), rng.uniform(5, 60, 3)])
+    assert assert_same(image, np.concatenate([regions, empty])) >= len(some) - 1
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("sigma", [1.5, 4.0, 8.0])
+def test_a_region_in_a_crowd_takes_the_neighbours_into_account(seed, sigma):
+    """Spots overlap in chains that lead far out of the region."""
+    rng = np.random.default_rng(seed)
+    gap = 6 * sigma
+    spots = [
+        Spot(30 + gap * i + rng.uniform(-sigma, sigma), 30 + gap * j + rng.uniform(-sigma, sigma), rng.uniform(30, 200),
+             sigma, sigma * rng.uniform(0.7, 1.0))
+        for i in range(int(400 / gap)) for j in range(int(340 / gap))
+    ]  # fmt: skip
+    image = photograph(Scene(spots, (430, 370)), rng)
+    assert assert_same(image, np.array([[200.0, 160.0, 30.0], [90.0, 300.0, 15.0]])) > 0
+
+
+def test_regions_outside_the_picture_without_size_or_with_nan_hold_nothing():
+    image = photograph(Scene([Spot(80.0, 60.0, 150.0)], (160, 120)), np.random.default_rng(0))
+    odd = np.array([[-500.0, 60.0, 20.0], [80.0, 60.0, -1.0], [np.nan, 60.0, 20.0], [80.0, 60.0, np.nan]])
+    assert len(find_spots(image, noise=NOISE, regions=odd)) == 0
+    assert len(find_spots(image, noise=NOISE, regions=np.zeros((0, 3)))) == 0
+    assert len(find_spots(image, noise=NOISE, regions=[[80.0, 60.0, 1e12]])) == 1
+    with pytest.raises(ValueError, match=r"regions: expected \(n, 3\).* got shape \(2,\)"):
+        find_spots(image, regions=[1.0, 2.0])
+
+
+def test_a_finder_keeps_nothing_of_the_picture_before():
+    """Also after looking at parts, and in 8 and 16 bits by turns."""
+    rng = np.random.default_rng(1)
+    finder, parameters = SpotFinder(330, 250), DetectParameters()
+    for k in range(6):
+        spots = [Spot(*rng.uniform(30, 220, 2), float(rng.uniform(60, 200))) for _ in range(4)]
+        image = photograph(Scene(spots, (330, 250)), rng, 8 if k % 2 else 16)
+        finder.find(image, parameters, NOISE, [[spots[0].u, spots[0].v, 12.0]])
+        again, fresh = finder.find(image, parameters, NOISE), SpotFinder(330, 250).find(image, parameters, NOISE)
+        np.testing.assert_array_equal(again.uv_px, fresh.uv_px)
+        np.testing.assert_array_equal(again.cov_px2, fresh.cov_px2)

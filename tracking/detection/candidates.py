@@ -1,0 +1,312 @@
+"""Where in a picture a spot may be: a closer look at the blocks that stand out.
+
+A candidate is a maximum of the mean of 3x3 pixels. How far it stands out is asked of the means of 3x3, 5x5 and 7x7
+pixels, matched filters for spots of 1 to 3 px sigma that lose an eighth of the signal-to-noise ratio; spots so wide and
+faint that only a mean of 8x8 pixels shows them are looked for apart (`_wide_peak`).
+"""
+
+from __future__ import annotations
+
+from math import sqrt
+from typing import NamedTuple
+
+import numpy as np
+
+from geometry.arrays import Array, Ints
+from geometry.compiled import compiled
+from tracking.detection.block_search import BLOCK, GROUND, HIGHEST8, Blocks
+from tracking.detection.pixels import Pixels, clamped, mean3, mirrored, pixel
+
+RADIUS = 48  # px: peaks further apart than this never belong to one spot of the largest size
+NEAREST = 4  # brighter peaks that a peak is compared with
+DIP = 0.12  # share of the fainter peak by which the light must fall between two spots: speckle falls by less
+HALO = 0.012  # ... and of the brighter peak: rings and halos of real beams have up to 0.009
+HOT = 0.08  # light of the four neighbours over the pixel's: 0.15 for the sharpest spot (1 px wide), 0 for a hot pixel
+HOT_SIGMAS = 4.0  # a pixel must stand out so far of its surroundings to be called hot
+_BESIDE_HOT = 2.0  # sigmas over a hot pixel's neighbours at which the others are cut: hot pixels come in pairs
+_REACH = 4  # px around a block that are looked at with it: 2 for maxima, 2 for the means
+_SIDE = BLOCK + 2 * _REACH
+_WIDE_CLIP = 4.0  # sigmas over the background at which pixels are cut where a wide faint spot is looked for
+
+
+class Noise(NamedTuple):
+    """tracking.noise.NoiseModel for compiled code."""
+
+    floor: float
+    slope: float
+    black: float
+
+
+# Columns of peaks (most, 5), places where a spot may be: px; the mean of 3x3 pixels above the background and that, DN;
+# 1 where it is seen in the mean of 8x8 pixels only
+AT_U, AT_V, HEIGHT, LEVEL, WIDE = range(5)
+
+
+def room_for_a_block() -> Array:
+    """Room to work in: pixels; sums of three in a row, of 3x3; a few numbers."""
+    return np.zeros((4, _SIDE, _SIDE))
+
+
+@compiled
+def variance(noise: Noise, level: float) -> float:
+    """Of a pixel of that expected grey value, DN^2."""
+    return noise.floor + noise.slope * max(level - noise.black, 0.0)
+
+
+@compiled
+def find_peaks(
+    image: Pixels, blocks: Blocks, noise: Noise, found: Ints, found_count: int, least_sigmas: float, room: Array,
+    peaks: Array, count: int,
+) -> int:  # fmt: skip
+    """Add the peaks of the blocks `found` to the first `count` ones; returns how many there are then."""
+    for k in range(found_count):
+        row, column = found[k, 0], found[k, 1]
+        if not found[k, 2]:
+            level = blocks.maps[GROUND, row, column] / 64.0
+            count = _peaks_of_block(image, BLOCK * column, BLOCK * row, level, noise, least_sigmas, room, peaks, count)
+        elif _is_highest_block(blocks, row, column):
+            count = _wide_peak(image, blocks, row, column, noise, least_sigmas, room, peaks, count)
+    return count
+
+
+@compiled
+def _peaks_of_block(
+    image: Pixels, left: int, top: int, level: float, noise: Noise, least_sigmas: float, room: Array, peaks: Array,
+    count: int,
+) -> int:  # fmt: skip
+    """Maxima of the mean of 3x3 pixels among 5x5 of them that lie in one block and stand out."""
+    values, lines, sum3, few = room[0], room[1], room[2], room[3, 0]
+    # Mirrored at the border: with repeated pixels the maximum of a spot at the edge would come to lie outside.
+    for i in range(_SIDE):
+        v = mirrored(top + i - _REACH, image.height)
+        for j in range(_SIDE):
+            values[i, j] = pixel(image, mirrored(left + j - _REACH, image.width), v)
+    for i in range(_SIDE):
+        for j in range(1, _SIDE - 1):
+            lines[i, j] = values[i, j - 1] + values[i, j] + values[i, j + 1]
+    for i in range(1, _SIDE - 1):
+        for j in range(1, _SIDE - 1):
+            sum3[i, j] = lines[i - 1, j] + lines[i, j] + lines[i + 1, j]
+    sigma = sqrt(variance(noise, level))
+    for i in range(_REACH, min(_REACH + BLOCK, image.height - top + _REACH)):
+        for j in range(_REACH, min(_REACH + BLOCK, image.width - left + _REACH)):
+            if sum3[i, j] <= 9 * level or not _is_maximum(sum3, i, j):
+                continue
+            least = least_sigmas * sigma
+            height3, height5 = sum3[i, j] - 9 * level, _sum_below(values, i, j, 2, np.inf) - 25 * level
+            height7 = _sum_below(values, i, j, 3, np.inf) - 49 * level
+            if max(height3 / 3, height5 / 5, height7 / 7) < least:
+                continue
+            limit = _hot_limit(image, left + j - _REACH, top + i - _REACH, noise, level + height3 / 9, few)
+            if limit < np.inf:
+                height3 = _sum_below(values, i, j, 1, limit) - 9 * level
+                height5 = _sum_below(values, i, j, 2, limit) - 25 * level
+                height7 = _sum_below(values, i, j, 3, limit) - 49 * level
+            if max(height3 / 3, height5 / 5, height7 / 7) < least or height3 <= 0 or count >= peaks.shape[0]:
+                continue
+            _add(peaks, count, left + j - _REACH, top + i - _REACH, height3 / 9, level, 0.0)
+            count += 1
+    return count
+
+
+@compiled
+def _is_maximum(values: Array, i: int, j: int) -> bool:
+    """Whether no value among the 5x5 around is larger, nor an earlier one as large."""
+    here = values[i, j]
+    for a in range(i - 2, i + 3):
+        for b in range(j - 2, j + 3):
+            if values[a, b] > here or (values[a, b] == here and (a < i or (a == i and b < j))):
+                return False
+    return True
+
+
+@compiled
+def _sum_below(values: Array, i: int, j: int, reach: int, limit: float) -> float:
+    """The sum of the values around one, each cut at the limit."""
+    total = 0.0
+    for a in range(i - reach, i + reach + 1):
+        for b in range(j - reach, j + reach + 1):
+            total += min(values[a, b], limit)
+    return total
+
+
+@compiled
+def _hot_limit(image: Pixels, u: int, v: int, noise: Noise, level: float, few: Array) -> float:
+    """If the brightest of 3x3 pixels is hot, how bright light may be beside it, DN; else inf.
+
+    Hot is what stands alone, as no light does that came through a lens. `level`, DN, gives the noise: on the broad top of
+    a wide spot the highest pixel is the luckiest one.
+    """
+    best, bu, bv = -1.0, u, v
+    for i in range(max(v - 1, 0), min(v + 2, image.height)):
+        for j in range(max(u - 1, 0), min(u + 2, image.width)):
+            x = pixel(image, j, i)
+            if x > best:
+                best, bu, bv = x, j, i
+    cross, n = 0.0, 0
+    for i in range(-2, 3):
+        row = mirrored(bv + i, image.height)
+        for j in range(-2, 3):
+            if max(abs(i), abs(j)) == 2:
+                few[n] = pixel(image, mirrored(bu + j, image.width), row)
+                n += 1
+            elif abs(i) + abs(j) == 1:
+                cross += 0.25 * pixel(image, mirrored(bu + j, image.width), row)
+    sort(few, 16)
+    ring = 0.5 * (few[7] + few[8])
+    above = best - ring
+    if cross - ring < HOT * above and above > HOT_SIGMAS * sqrt(variance(noise, level)):
+        return cross + _BESIDE_HOT * sqrt(variance(noise, cross))
+    return np.inf
+
+
+@compiled
+def sort(values: Array, n: int) -> None:
+    """Sort the first n values, few of them, in place."""
+    for i in range(1, n):
+        x, j = values[i], i
+        while j > 0 and values[j - 1] > x:
+            values[j] = values[j - 1]
+            j -= 1
+        values[j] = x
+
+
+@compiled
+def _is_highest_block(blocks: Blocks, row: int, column: int) -> bool:
+    rows, columns = blocks.maps.shape[1:]
+    here = blocks.maps[HIGHEST8, row, column]
+    for i in range(max(row - 1, 0), min(row + 2, rows)):
+        for j in range(max(column - 1, 0), min(column + 2, columns)):
+            other = blocks.maps[HIGHEST8, i, j]
+            if other > here or (other == here and (i < row or (i == row and j < column))):
+                return False
+    return True
+
+
+@compiled
+def _wide_peak(
+    image: Pixels, blocks: Blocks, row: int, column: int, noise: Noise, least_sigmas: float, room: Array, peaks: Array,
+    count: int,
+) -> int:  # fmt: skip
+    """A peak where 8x8 pixels stand out of the surroundings by more than their curvature explains.
+
+    Of c, the mean in the middle, and the medians r and R of eight means around it, 16 and 32 px away, c - 4/3 r + 1/3 R
+    is blind to a plane and to a paraboloid: to diffuse reflections. Bright pixels are cut, for a hot one is no spot.
+    """
+    rows, columns = blocks.quads.shape
+    bi, bj, best = 2 * row, 2 * column, -1.0
+    for i in range(2 * row, min(2 * row + 2, rows - 1)):
+        for j in range(2 * column, min(2 * column + 2, columns - 1)):
+            four = (blocks.quads[i, j] + blocks.quads[i, j + 1]) + (blocks.quads[i + 1, j] + blocks.quads[i + 1, j + 1])
+            if four > best:
+                best, bi, bj = four, i, j
+    u, v = 4 * bj + 4, 4 * bi + 4
+    if u >= image.width or v >= image.height:
+        return count
+    few = room[3, 0]
+    level = blocks.maps[GROUND, row, column] / 64.0
+    sigma2 = variance(noise, level)
+    top = level + _WIDE_CLIP * sqrt(sigma2)
+    here = _mean8(image, u, v, top)
+    height = here
+    for k in range(2):
+        away, n = 16 * (k + 1), 0
+        for i in range(-1, 2):
+            for j in range(-1, 2):
+                if i != 0 or j != 0:
+                    few[n] = _mean8(image, u + j * away, v + i * away, top)
+                    n += 1
+        sort(few, 8)
+        height += (-4.0 / 3.0 if k == 0 else 1.0 / 3.0) * 0.5 * (few[3] + few[4])
+    # A median of eight has 1.4 times the variance of their mean.
+    scatter = sqrt(sigma2 / 64.0 * (1 + 1.4 / 8 * 17.0 / 9.0))
+    if height < least_sigmas * scatter or count >= peaks.shape[0]:
+        return count
+    _add(peaks, count, u, v, height, level, 1.0)
+    return count + 1
+
+
+@compiled
+def _add(peaks: Array, row: int, u: int, v: int, height: float, level: float, wide: float) -> None:
+    peak = peaks[row]
+    peak[AT_U], peak[AT_V], peak[HEIGHT], peak[LEVEL], peak[WIDE] = u, v, height, level, wide
+
+
+@compiled
+def _mean8(image: Pixels, u: int, v: int, top: float) -> float:
+    """The mean of 8x8 pixels, cut at `top`, from u - 4, v - 4 on; the border's pixels are repeated outside."""
+    total = 0.0
+    for i in range(v - 4, v + 4):
+        for j in range(u - 4, u + 4):
+            total += min(pixel(image, clamped(j, image.width), clamped(i, image.height)), top)
+    return total / 64.0
+
+
+@compiled
+def find_apart(image: Pixels, peaks: Array, order: Ints, noise: Noise, apart: Ints, near: Ints, gaps: Array) -> int:
+    """Which peaks, brightest first in `order`, are spots of their own; their number, and in `apart` which.
+
+    Between a peak and each of the nearest brighter ones the light must fall by `DIP` of the fainter peak, and by four
+    sigmas of the difference of two means of nine pixels. A wide faint peak must have no other within 16 px. `near`,
+    `gaps` (NEAREST,) are room to work in.
+    """
+    count = 0
+    for place in range(order.shape[0]):
+        i = order[place]
+        if peaks[i, WIDE]:
+            alone = not _has_neighbour(peaks, order, i)
+        else:
+            alone = True
+            needed = max(DIP * peaks[i, HEIGHT], 4.0 / 3.0 * sqrt(2.0) * sqrt(variance(noise, peaks[i, LEVEL])))
+            for k in range(_nearest_brighter(peaks, order, place, near, gaps)):
+                lowest = _lowest_between(image, peaks, i, near[k]) - peaks[i, LEVEL]
+                least = max(needed, HALO * peaks[near[k], HEIGHT])
+                alone = alone and peaks[i, HEIGHT] - lowest >= least
+        if alone:
+            apart[count] = i
+            count += 1
+    return count
+
+
+@compiled
+def _has_neighbour(peaks: Array, order: Ints, i: int) -> bool:
+    for place in range(order.shape[0]):
+        j = order[place]
+        if (
+            not peaks[j, WIDE]
+            and abs(peaks[i, AT_U] - peaks[j, AT_U]) < 16
+            and abs(peaks[i, AT_V] - peaks[j, AT_V]) < 16
+        ):
+            return True
+    return False
+
+
+@compiled
+def _nearest_brighter(peaks: Array, order: Ints, place: int, near: Ints, gaps: Array) -> int:
+    """The nearest peaks, at most NEAREST, before a place in `order`, into `near`; their number."""
+    i, filled = order[place], 0
+    for before in range(place):
+        j = order[before]
+        du, dv = peaks[i, AT_U] - peaks[j, AT_U], peaks[i, AT_V] - peaks[j, AT_V]
+        gap = du * du + dv * dv
+        if peaks[j, WIDE] or gap >= RADIUS**2 or (filled == NEAREST and gap >= gaps[NEAREST - 1]):
+            continue
+        k = min(filled, NEAREST - 1)
+        while k > 0 and gaps[k - 1] > gap:
+            gaps[k], near[k] = gaps[k - 1], near[k - 1]
+            k -= 1
+        gaps[k], near[k] = gap, j
+        filled = min(filled + 1, NEAREST)
+    return filled
+
+
+@compiled
+def _lowest_between(image: Pixels, peaks: Array, i: int, j: int) -> float:
+    """The lowest mean of 3x3 pixels on the line between two peaks, at eleven places."""
+    lowest = np.inf
+    for k in range(1, 12):
+        share = k / 12.0
+        u = peaks[i, AT_U] * (1 - share) + peaks[j, AT_U] * share
+        v = peaks[i, AT_V] * (1 - share) + peaks[j, AT_V] * share
+        lowest = min(lowest, mean3(image, int(np.rint(u)), int(np.rint(v))))
+    return lowest

@@ -1,0 +1,332 @@
+"""Measuring candidates: all of a picture are fitted together, each with its neighbours' light taken off."""
+
+from __future__ import annotations
+
+from math import ceil, sqrt
+
+import numpy as np
+
+from geometry.arrays import Array
+from geometry.compiled import compiled
+from tracking.detection import ellipse
+from tracking.detection.candidates import Noise
+from tracking.detection.normal_equations import Frame, accumulate, add_light, frame_of, solve_normal
+from tracking.detection.pixels import VALID, Pixels, Window, cut, window_around
+from tracking.detection.quality import gain_over_plane, judge
+from tracking.detection.table import (
+    ACTIVE,
+    COV_UV,
+    FACTOR,
+    FLUX,
+    GAIN,
+    GAPS,
+    GROUND,
+    LEVEL,
+    MOMENT_U,
+    MOMENT_UU,
+    MOMENT_UV,
+    MOMENT_V,
+    MOMENT_VV,
+    NEAR,
+    NORMAL,
+    OTHERS,
+    RESIDUAL,
+    RIGHT_SIDE,
+    ROW,
+    SIGMA_FLUX,
+    SLOPE_U,
+    SLOPE_V,
+    SOLUTION,
+    SPAN,
+    STATE,
+    USE,
+    UU,
+    UV,
+    VALUES,
+    VAR_U,
+    VAR_V,
+    VECTORS,
+    VV,
+    WEIGHT,
+    U,
+    V,
+)
+
+_STEPS = 12  # Gauss-Newton converges in three or four; a clipped spot, whose top must be guessed, takes up to ten
+_CONVERGED, _CONVERGED_MOST = 0.1, 0.4  # of the centre's own sigma: after a smaller step there is no other
+_CURVED = 0.02  # the next step, of about step^2 / (2 width), may be a hundredth of the sigma
+_WINDOW = 3.7  # sigmas from centre to the window's side: 3.2 costs 3 % of the accuracy, 2.5 costs 8 %, for the plane
+_WINDOW_WIDE, _WIDE_PX = 3.2, 4.5  # ... of spots wider than this, for which the background is no plane over more
+_LEAST_HALF = 7  # cells from the centre to the side
+_MOST_NEIGHBOURS = 6
+_OUTLIER = 6.0  # sigmas by which a hot or dead pixel sticks out of the fit
+_LONELY = 2.5  # times its neighbours does it
+_LEAST_VARIANCE = 0.02  # px^2: narrower is a point to any sensor
+
+
+@compiled
+def fit_all(
+    image: Pixels, table: Array, noise: Noise, saturation: float, widest: float, least_gain: float, cells: Array,
+    algebra: Array,
+) -> None:  # fmt: skip
+    """Fit all candidates of a picture (n, COLUMNS) together, from their moments, in place.
+
+    Gauss-Newton as long as the centres move; clipped pixels, pixels outside and hot pixels are left out; the light of
+    the neighbours is taken off. A candidate that grows beyond `widest`, px, walks away, or lowers chi-square by less
+    than `least_gain` is given up: its flux is 0.
+    """
+    n = table.shape[0]
+    for i in range(n):
+        spot = table[i]
+        spot[U], spot[V], spot[UU], spot[UV] = spot[MOMENT_U], spot[MOMENT_V], spot[MOMENT_UU], spot[MOMENT_UV]
+        spot[VV], spot[LEVEL], spot[ACTIVE] = spot[MOMENT_VV], spot[GROUND], 1.0
+        spot[SLOPE_U] = spot[SLOPE_V] = 0.0
+        spot[FLUX] = max(spot[FLUX], 1.0)
+        if _is_lost(spot, widest):  # moments see a spot too wide rather than too narrow
+            spot[FLUX], spot[ACTIVE] = 0.0, 0.0
+    for step in range(_STEPS):
+        busy = False
+        for i in range(n):
+            spot = table[i]
+            if not spot[ACTIVE]:
+                continue
+            spot[ACTIVE], spot[SPAN] = 0.0, max(spot[SPAN], 1.0 * window_of(spot).cell)
+            moved = _step(image, table, i, noise, saturation, step == _STEPS - 1, cells, algebra)
+            # Noise does not become a spot by further steps.
+            if _is_lost(spot, widest) or (step >= 1 and spot[GAIN] < least_gain):
+                spot[FLUX] = 0.0
+            if spot[FLUX] <= 0.0:
+                moved = True
+            elif moved:
+                spot[ACTIVE] = 1.0
+            if moved:
+                busy = True
+                _wake_neighbours(table, i)
+        if not busy:
+            break
+
+
+@compiled
+def _is_lost(spot: Array, widest: float) -> bool:
+    """Whether a spot has become too wide, or has walked away from its moments."""
+    if ellipse.axes(spot[UU], spot[UV], spot[VV])[0] > 1.5 * widest:
+        return True
+    away = sqrt((spot[U] - spot[MOMENT_U]) ** 2 + (spot[V] - spot[MOMENT_V]) ** 2)
+    return away > 3.0 + 2.0 * ellipse.axes(spot[MOMENT_UU], spot[MOMENT_UV], spot[MOMENT_VV])[0]
+
+
+@compiled
+def _step(
+    image: Pixels, table: Array, i: int, noise: Noise, saturation: float, last: bool, cells: Array, algebra: Array
+) -> bool:
+    """One step of one spot; whether it moved by so much that there must be another."""
+    spot, X, b = table[i], algebra[SOLUTION], algebra[VECTORS, RIGHT_SIDE]
+    window = window_of(spot)
+    cut(image, window, saturation, cells[VALUES], cells[STATE])
+    for k in range(window.columns * window.rows):
+        cells[OTHERS, k] = 0.0
+        cells[USE, k] = 1.0 if cells[STATE, k] == VALID else 0.0
+    near, gaps = algebra[VECTORS, NEAR], algebra[VECTORS, GAPS]
+    for k in range(_neighbours(table, i, window, near, gaps)):
+        add_light(window, table[int(near[k])], cells[ROW], cells[OTHERS])
+    chi2 = accumulate(window, spot, noise, cells, algebra)
+    if _leave_out_lonely(window, spot, cells):
+        chi2 = accumulate(window, spot, noise, cells, algebra)
+    frame = frame_of(window, spot)
+    if not _solve(frame, algebra):
+        spot[FLUX] = 0.0
+        return True
+    before_u, before_v = spot[U], spot[V]
+    var_u, var_v, cov_uv = _centre_covariance(frame, X)
+    sigma_flux = spot[FLUX] * sqrt(_flux_variance(frame, X))
+    after = chi2
+    for p in range(9):
+        after -= X[p, 0] * b[p]
+    spot[GAIN] = gain_over_plane(algebra[NORMAL], b, chi2, after)
+    _advance(frame, spot, X)
+    du, dv = spot[U] - before_u, spot[V] - before_v
+    moved = _is_far(du, var_u, spot[UU]) or _is_far(dv, var_v, spot[VV])
+    if not moved or last:
+        spot[VAR_U], spot[COV_UV], spot[VAR_V], spot[SIGMA_FLUX] = var_u, cov_uv, var_v, sigma_flux
+        judge(window, frame, after, cells, spot)
+        if moved:  # a centre that still moves is known no better than by that
+            spot[VAR_U], spot[COV_UV] = spot[VAR_U] + du * du, spot[COV_UV] + du * dv
+            spot[VAR_V] += dv * dv
+    return moved and not last
+
+
+@compiled
+def _is_far(step: float, variance: float, width2: float) -> bool:
+    """Whether after this step of Gauss-Newton, whose error falls with its square, there must be another."""
+    sigma = sqrt(variance)
+    return abs(step) > max(_CONVERGED * sigma, min(_CONVERGED_MOST * sigma, sqrt(_CURVED * sigma * sqrt(width2))))
+
+
+@compiled
+def _half_width(variance: float) -> float:
+    """Half width, px, of the window for a spot: its wings and a ring of background."""
+    sigma = sqrt(variance + 1 / 12.0)
+    return max(min(_WINDOW * sigma, _WINDOW * _WIDE_PX), _WINDOW_WIDE * sigma) + 1.0
+
+
+@compiled
+def window_of(spot: Array) -> Window:
+    """The window that a spot (9,) needs. One long in u or v only gets a rectangle."""
+    half_u, half_v = _half_width(spot[UU]), _half_width(spot[VV])
+    half = max(half_u, half_v)
+    cell, most = 1, 18
+    if half > 18:
+        # A long streak too has cells of two: four would blur its narrow side.
+        slim = ellipse.eigenvalues(spot[UU], spot[UV], spot[VV])[0] < 9.0
+        cell, most = (2, 36) if half <= 36 or slim else (4, 24)
+    columns = ceil(min(max(half_u / cell, _LEAST_HALF), most))
+    rows = ceil(min(max(half_v / cell, _LEAST_HALF), most))
+    return window_around(spot[U], spot[V], columns, rows, cell)
+
+
+@compiled
+def reach_of(cell: int) -> float:
+    """Pixels from a spot whose windows have such cells at which another one may lie that changes its measurement."""
+    return 40.0 if cell == 1 else (80.0 if cell == 2 else 150.0)
+
+
+@compiled
+def _gap(spot: Array, other: Array, window: Window) -> float:
+    """Pixels between the window of a spot and the light of another one; negative where that shines in."""
+    du, dv = abs(spot[U] - other[U]), abs(spot[V] - other[V])
+    if max(du, dv) >= reach_of(window.cell):
+        return np.inf
+    gap_u = du - 0.5 * window.cell * window.columns - 1.25 * _half_width(other[UU])
+    gap_v = dv - 0.5 * window.cell * window.rows - 1.25 * _half_width(other[VV])
+    return max(gap_u, gap_v)
+
+
+@compiled
+def _neighbours(table: Array, i: int, window: Window, near: Array, gaps: Array) -> int:
+    """The spots whose light reaches into a window most, into `near`; their number."""
+    filled = 0
+    for j in range(table.shape[0]):
+        if j == i or table[j, FLUX] <= 0.0:
+            continue
+        gap = _gap(table[i], table[j], window)
+        if gap >= 0 or (filled == _MOST_NEIGHBOURS and gap >= gaps[_MOST_NEIGHBOURS - 1]):
+            continue
+        k = min(filled, _MOST_NEIGHBOURS - 1)
+        while k > 0 and gaps[k - 1] > gap:
+            gaps[k], near[k] = gaps[k - 1], near[k - 1]
+            k -= 1
+        gaps[k], near[k] = gap, j
+        filled = min(filled + 1, _MOST_NEIGHBOURS)
+    return filled
+
+
+@compiled
+def _wake_neighbours(table: Array, i: int) -> None:
+    """A spot has moved: those into whose windows it shines must be fitted again."""
+    for j in range(table.shape[0]):
+        spot = table[j]
+        if j != i and not spot[ACTIVE] and spot[FLUX] > 0.0 and _gap(spot, table[i], window_of(spot)) < 0:
+            spot[ACTIVE] = 1.0
+
+
+@compiled
+def _leave_out_lonely(window: Window, spot: Array, cells: Array) -> bool:
+    """Take out cells that stick out of the fit and of all eight neighbours: hot or dead pixels, never a spot's body."""
+    found = False
+    narrow = min(spot[UU], spot[VV]) < 0.8**2
+    rest, weight = cells[RESIDUAL], cells[WEIGHT]
+    middle = 0.5 * (window.cell - 1)
+    for k in range(window.rows * window.columns):
+        size = rest[k] * rest[k] * weight[k]
+        if size <= _OUTLIER**2:
+            continue
+        r, c = k // window.columns, k % window.columns
+        u = window.left + middle + c * window.cell - spot[U]
+        v = window.top + middle + r * window.cell - spot[V]
+        if narrow and u * u + v * v < 1.8**2:  # the middle of a spot about one pixel wide is lonely by nature
+            continue
+        around = 0.0
+        for i in range(max(r - 1, 0), min(r + 2, window.rows)):
+            for j in range(max(c - 1, 0), min(c + 2, window.columns)):
+                other = i * window.columns + j
+                if other != k:
+                    around = max(around, rest[other] * rest[other] * weight[other])
+        if size > _LONELY**2 * around:
+            cells[USE, k], found = 0.0, True
+    return found
+
+
+@compiled
+def _solve(frame: Frame, algebra: Array) -> bool:
+    """Into the columns of X: the step, and N^-1 times the directions of the centre's u' and v' and of the flux."""
+    X = algebra[SOLUTION]
+    for p in range(9):
+        X[p, 0] = algebra[VECTORS, RIGHT_SIDE, p]
+        X[p, 1] = X[p, 2] = X[p, 3] = 0.0
+    X[1, 1], X[2, 2] = 1.0, 1.0
+    _flux_direction(frame, X, 3)
+    return solve_normal(algebra[NORMAL], X, 4, algebra[FACTOR])
+
+
+@compiled
+def _flux_direction(frame: Frame, X: Array, column: int) -> None:
+    """How the relative flux depends on the coefficients."""
+    X[0, column] = 1.0
+    X[3, column] = frame.S[0] / frame.su**2
+    X[4, column] = frame.S[1] / (frame.su * frame.sv)
+    X[5, column] = frame.S[2] / frame.sv**2
+
+
+@compiled
+def _centre_covariance(frame: Frame, X: Array) -> tuple[float, float, float]:
+    """var(u), var(v), cov(u, v), px^2: the Cramer-Rao bound of the model."""
+    a, b, c = X[1, 1] / frame.su**2, X[1, 2] / (frame.su * frame.sv), X[2, 2] / frame.sv**2
+    p, q, r = frame.S
+    return (
+        p * p * a + 2 * p * q * b + q * q * c,
+        q * q * a + 2 * q * r * b + r * r * c,
+        p * q * a + (p * r + q * q) * b + q * r * c,
+    )
+
+
+@compiled
+def _flux_variance(frame: Frame, X: Array) -> float:
+    """Of the flux, over its square."""
+    relative = (
+        X[0, 3]
+        + X[3, 3] * frame.S[0] / frame.su**2
+        + X[4, 3] * frame.S[1] / (frame.su * frame.sv)
+        + X[5, 3] * frame.S[2] / frame.sv**2
+    )
+    return max(relative, 0.0)
+
+
+@compiled
+def _advance(frame: Frame, spot: Array, X: Array) -> None:
+    """Step, held to one sigma of the spot in length, to a factor 2.5 in its variances and to 5 in its flux.
+
+    With light F (1 + f) and a step d the coefficient of the derivative is (1 + f) d, not d.
+    """
+    su, sv, S = frame.su, frame.sv, frame.S
+    q3, q4, q5 = X[3, 0] / su**2, 0.5 * X[4, 0] / (su * sv), X[5, 0] / sv**2
+    f = X[0, 0] + q3 * S[0] + 2.0 * q4 * S[1] + q5 * S[2]
+    f = min(max(f, -0.8), 4.0)
+    more = 1.0 / (1.0 + f)
+    x, y = more * X[1, 0] / su, more * X[2, 0] / sv
+    du, dv = S[0] * x + S[1] * y, S[1] * x + S[2] * y
+    # dS = 2 S Q S, with Q the polynomial's quadratic form
+    a, b = S[0] * q3 + S[1] * q4, S[0] * q4 + S[1] * q5
+    c, d = S[1] * q3 + S[2] * q4, S[1] * q4 + S[2] * q5
+    duu, duv, dvv = 2 * (a * S[0] + b * S[1]), 2 * (a * S[1] + b * S[2]), 2 * (c * S[1] + d * S[2])
+    pixel = 1 / 12.0
+    base = (spot[UU] + pixel, spot[UV], spot[VV] + pixel)
+    uu, uv, vv = ellipse.kept_within((base[0] + more * duu, base[1] + more * duv, base[2] + more * dvv), base, 0.4, 2.5)
+    short = 1.0 / max(ellipse.length(du, dv, base[0], base[1], base[2]), 1.0)
+    du, dv = short * du, short * dv
+    spot[UU], spot[UV], spot[VV] = ellipse.with_eigenvalues(uu - pixel, uv, vv - pixel, _LEAST_VARIANCE, np.inf)
+    spot[SLOPE_U] += X[7, 0] / su
+    spot[SLOPE_V] += X[8, 0] / sv
+    spot[LEVEL] += X[6, 0] + spot[SLOPE_U] * du + spot[SLOPE_V] * dv
+    spot[U] += du
+    spot[V] += dv
+    spot[FLUX] *= 1.0 + f

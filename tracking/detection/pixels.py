@@ -1,0 +1,102 @@
+"""Single pixels and small windows of a picture, for compiled code.
+
+A picture is seen as bytes, so that 8 and 16 bits share one compiled form of everything but the first pass.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geometry.arrays import Array
+from geometry.compiled import compiled
+
+OUTSIDE, CLIPPED, VALID = 0.0, 1.0, 2.0
+
+
+class Pixels(NamedTuple):
+    """The pixels of a picture."""
+
+    bytes: NDArray[np.uint8]  # (h, w depth)
+    depth: int  # bytes per pixel: 1 or 2, little end first
+    width: int
+    height: int
+
+
+@compiled
+def pixel(image: Pixels, u: int, v: int) -> float:
+    """The grey value at column u, row v."""
+    if image.depth == 1:
+        return np.float64(image.bytes[v, u])
+    return image.bytes[v, 2 * u] + 256.0 * image.bytes[v, 2 * u + 1]
+
+
+@compiled
+def mirrored(i: int, size: int) -> int:
+    """An index outside a row or column of that size, reflected at its outermost pixels."""
+    i = abs(i)
+    if i > size - 1:
+        i = 2 * (size - 1) - i
+    return min(max(i, 0), size - 1)
+
+
+@compiled
+def clamped(i: int, size: int) -> int:
+    """An index outside a row or column of that size, moved to its outermost pixels."""
+    return min(max(i, 0), size - 1)
+
+
+@compiled
+def mean3(image: Pixels, u: int, v: int) -> float:
+    """The mean of the 3x3 pixels around a whole point; the border's pixels are repeated outside."""
+    total = 0.0
+    for i in range(v - 1, v + 2):
+        for j in range(u - 1, u + 2):
+            total += pixel(image, clamped(j, image.width), clamped(i, image.height))
+    return total / 9.0
+
+
+class Window(NamedTuple):
+    """A rectangle of cells, each the mean of cell x cell pixels: a wide spot needs no more cells than a small one."""
+
+    left: int  # px, first column
+    top: int  # px, first row
+    columns: int
+    rows: int
+    cell: int  # px
+
+
+@compiled
+def window_around(u: float, v: float, half_columns: int, half_rows: int, cell: int) -> Window:
+    """The window of (2 half + 1) cells each way whose middle is nearest to a point."""
+    columns, rows = 2 * half_columns + 1, 2 * half_rows + 1
+    left, top = int(np.rint(u - 0.5 * (columns * cell - 1))), int(np.rint(v - 0.5 * (rows * cell - 1)))
+    return Window(left, top, columns, rows, cell)
+
+
+@compiled
+def cut(image: Pixels, window: Window, saturation: float, values: Array, state: Array) -> None:
+    """The cells' values (cells,), DN, and state (cells,): OUTSIDE (partly), CLIPPED (one of the pixels) or VALID."""
+    cell = window.cell
+    share = 1.0 / (cell * cell)
+    for i in range(window.rows):
+        top = window.top + i * cell
+        for j in range(window.columns):
+            left = window.left + j * cell
+            k = i * window.columns + j
+            values[k], state[k] = 0.0, OUTSIDE
+            if left < 0 or top < 0 or left + cell > image.width or top + cell > image.height:
+                continue
+            if cell == 1:
+                total = most = pixel(image, left, top)
+            else:
+                total = most = 0.0
+                for v in range(top, top + cell):
+                    for u in range(left, left + cell):
+                        x = pixel(image, u, v)
+                        total += x
+                        most = max(most, x)
+            values[k] = total * share
+            state[k] = VALID if most < saturation else CLIPPED

@@ -1,0 +1,153 @@
+"""What a finished fit says of itself."""
+
+from __future__ import annotations
+
+from math import sqrt
+
+from geometry.arrays import Array
+from geometry.compiled import compiled
+from tracking.detection import ellipse
+from tracking.detection.normal_equations import Frame
+from tracking.detection.pixels import OUTSIDE, Window
+from tracking.detection.table import (
+    CHI2,
+    COV_UV,
+    EXPLAINED,
+    GAIN,
+    LIGHT,
+    OTHERS,
+    PEAK,
+    RESIDUAL,
+    SIGMA_FLUX,
+    STATE,
+    VALUES,
+    VAR_U,
+    VAR_V,
+    WEIGHT,
+)
+
+_CORE = 0.2  # of the brightest cell's light: clipped cells count there, hot pixels in the wings do not
+_LAGS = 2  # cells
+
+
+@compiled
+def judge(window: Window, frame: Frame, chi2: float, cells: Array, spot: Array) -> None:
+    """Complete what a spot (COLUMNS,) says of itself, which has covariances and GAIN; chi2 is that after its last step.
+
+    The covariance given is the Cramer-Rao bound of the model; it
+    and the flux's variance are raised by `_misfit`.
+    """
+    count = window.columns * window.rows
+    used, most = 0, 0.0
+    for k in range(count):
+        used += 1 if cells[WEIGHT, k] > 0 else 0
+        most = max(most, cells[LIGHT, k])
+    free = max(used - 9, 1)
+    peak = 0.0
+    for k in range(count):
+        if cells[STATE, k] != OUTSIDE and cells[LIGHT, k] > _CORE * most:
+            peak = max(peak, cells[RESIDUAL, k] + cells[LIGHT, k])
+    spot[PEAK], spot[CHI2] = peak, chi2 / free
+    # Chi-square scatters by sqrt(2 free): so much in a faint spot's surroundings is no misfit.
+    noise = min(free + 2.0 * sqrt(2.0 * free), chi2)
+    spot[EXPLAINED] = spot[GAIN] / max(chi2 + spot[GAIN] - noise, 1e-9)
+    factor = _misfit(window, frame, cells, used)
+    spot[VAR_U], spot[COV_UV], spot[VAR_V] = spot[VAR_U] * factor, spot[COV_UV] * factor, spot[VAR_V] * factor
+    spot[SIGMA_FLUX] *= sqrt(factor)
+
+
+@compiled
+def gain_over_plane(N: Array, b: Array, before: float, chi2: float) -> float:
+    """By how much Gaussian and plane together lower chi-square more than a plane alone does.
+
+    From the normal equations (normal_equations.accumulate) and chi-square before their step and after.
+    """
+    y0, y1, y2 = b[6] + N[0, 6], b[7] + N[0, 7], b[8] + N[0, 8]
+    d0 = max(N[6, 6], 1e-300)
+    l1, l2 = N[7, 6] / d0, N[8, 6] / d0
+    d1 = max(N[7, 7] - l1 * N[7, 6], 1e-9 * N[7, 7] + 1e-300)
+    l3 = (N[8, 7] - l2 * N[7, 6]) / d1
+    d2 = max(N[8, 8] - l2 * N[8, 6] - l3 * l3 * d1, 1e-9 * N[8, 8] + 1e-300)
+    y1 -= l1 * y0
+    y2 -= l2 * y0 + l3 * y1
+    plane = y0 * y0 / d0 + y1 * y1 / d1 + y2 * y2 / d2
+    return max(before + 2 * b[0] + N[0, 0] - plane - chi2, 0.0)
+
+
+@compiled
+def _misfit(window: Window, frame: Frame, cells: Array, used: int) -> float:
+    """Factor >= 1 by which the model's faults raise the covariance of the centre.
+
+    Only the part of the residuals that is odd about the centre can move it: a flat top, a ring or a streak is a bad
+    Gaussian with a good centre. Where the odd part is significantly larger than noise, the factor is its mean square,
+    taken where the centre is read (the slopes), times the number of cells over which it goes together. Spots with few
+    cells to mirror (at the border) are judged by all residuals. Ours, after the sandwich covariance of misspecified
+    models; measured in bench/detection.py (sets streak, speckle).
+    """
+    count = window.columns * window.rows
+    both = 0
+    for k in range(count):
+        both += 1 if cells[WEIGHT, k] > 0 and cells[WEIGHT, count - 1 - k] > 0 else 0
+    whole = 0.5 * both < 0.3 * used
+    free = max(used - 9.0, 1.0) if whole else max(0.5 * both - 4.0, 1.0)  # u, v and two slopes are odd
+    squares = 0.0
+    odd = cells[VALUES]  # no longer needed
+    for k in range(count):
+        mirror = count - 1 - k
+        here = cells[RESIDUAL, k] * sqrt(cells[WEIGHT, k])
+        there = cells[RESIDUAL, mirror] * sqrt(cells[WEIGHT, mirror])
+        if whole:
+            odd[k] = here * sqrt(2.0)
+        elif cells[WEIGHT, k] > 0 and cells[WEIGHT, mirror] > 0:
+            odd[k] = (here - there) * sqrt(0.5)
+        else:
+            odd[k] = 0.0
+        squares += odd[k] * odd[k]
+    if 0.5 * squares / free <= 1.0 + 3.0 * sqrt(2.0 / free):
+        return 1.0
+    return _lopsided(window, frame, cells, odd, 2.0 if whole else 1.0)
+
+
+@compiled
+def _lopsided(window: Window, frame: Frame, cells: Array, odd: Array, doubled: float) -> float:
+    """The factor where there is a misfit; `odd` (cells,), residuals in sigmas, is overwritten."""
+    count = window.columns * window.rows
+    share = cells[OTHERS]  # no longer needed
+    a, b, c = ellipse.inverse(frame.S[0], frame.S[1], frame.S[2])
+    total = 0.0
+    for k in range(count):
+        du = frame.u0 + (k % window.columns) * window.cell
+        dv = frame.v0 + (k // window.columns) * window.cell
+        wu, wv = a * du + b * dv, b * du + c * dv
+        share[k] = cells[WEIGHT, k] * cells[LIGHT, k] ** 2 * (wu * wu + wv * wv)
+        total += share[k]
+    total = max(total, 1e-300)
+    square, crowd = 0.0, 0.0
+    for k in range(count):
+        part = share[k] / total if odd[k] != 0.0 else 0.0
+        square += odd[k] * odd[k] * part / doubled
+        crowd += part * part
+        odd[k] *= sqrt(part)
+    grain = _grain(window, odd)
+    grains = 1.0 / max(crowd * grain, 1e-12)  # independent ones in the slopes
+    # The fit has bent four parameters to the odd part, so that less of it is left than was.
+    return max(square * grain * min(grains / max(grains - 4.0, 1e-9), 3.0), 1.0)
+
+
+@compiled
+def _grain(window: Window, z: Array) -> float:
+    """Number of cells over which residuals (cells,) go together: by so much fewer independent ones does the fit have.
+
+    Speckle is smooth, so chi2 alone understates what it does to the centre. The sum of the residuals' autocorrelation
+    over lags up to two cells.
+    """
+    power, other = 0.0, 0.0
+    for r in range(window.rows):
+        for c in range(window.columns):
+            here = z[r * window.columns + c]
+            power += here * here
+            for i in range(min(_LAGS + 1, window.rows - r)):
+                for j in range(-_LAGS if i > 0 else 1, _LAGS + 1):
+                    if c + j >= 0 and c + j < window.columns:
+                        other += here * z[(r + i) * window.columns + c + j]
+    return max(1.0 + 2.0 * other / max(power, 1e-12), 1.0)

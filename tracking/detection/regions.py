@@ -1,0 +1,94 @@
+"""Looking into parts of a picture only, with the same result there as from the whole picture.
+
+A spot's measurement depends on its neighbours: which peaks are spots of their own is decided with the brighter ones
+within candidates.RADIUS, and light of others within gaussian_fit.reach_of is taken off. So around each peak of a region
+so much is searched too, and around the peaks that this brings to light, until there are no more.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geometry.arrays import Array, Ints
+from geometry.compiled import compiled
+from tracking.detection.block_search import BLOCK
+from tracking.detection.candidates import AT_U, AT_V, RADIUS
+
+MARGIN = 16  # px: so far from a spot's centre its peak, or that of a neighbour, may lie
+
+
+@compiled
+def boxes_of(regions: Array, width: int, height: int, boxes: Ints) -> int:
+    """The blocks (n, 4: first row, last, first column, last) of regions (n, 3: u, v, half size, px), and a margin."""
+    count = 0
+    for k in range(regions.shape[0]):
+        u, v, half = regions[k, 0], regions[k, 1], regions[k, 2]
+        if half >= 0.0 and half < np.inf and abs(u) < np.inf and abs(v) < np.inf:  # not where one is nan
+            count = _add_box(u, v, half + MARGIN, width, height, boxes, count)
+    return count
+
+
+@compiled
+def _add_box(u: float, v: float, half: float, width: int, height: int, boxes: Ints, count: int) -> int:
+    left, right = max(u - half, 0.0), min(u + half, width - 1.0)
+    top, bottom = max(v - half, 0.0), min(v + half, height - 1.0)
+    if left <= right and top <= bottom:
+        boxes[count, 0], boxes[count, 1] = int(top) // BLOCK, int(bottom) // BLOCK
+        boxes[count, 2], boxes[count, 3] = int(left) // BLOCK, int(right) // BLOCK
+        count += 1
+    return count
+
+
+@compiled
+def in_a_region(regions: Array, u: float, v: float, more: float) -> bool:
+    """Whether a point lies in a region (n, 3), grown by `more` px."""
+    for k in range(regions.shape[0]):
+        half = regions[k, 2] + more
+        if abs(u - regions[k, 0]) <= half and abs(v - regions[k, 1]) <= half:
+            return True
+    return False
+
+
+@compiled
+def find_relevant(
+    peaks: Array, regions: Array, reach: Array, searched: NDArray[np.uint8], width: int, height: int, relevant: Ints,
+    boxes: Ints,
+) -> int:  # fmt: skip
+    """Which peaks (n, 5) bear on the regions (n, 3), and boxes of blocks that must be searched for others that do.
+
+    reach (n,), px, is how far around each peak others matter. relevant (n,) becomes 1 where it does; returns the number
+    of boxes.
+    """
+    n, count = peaks.shape[0], 0
+    for i in range(n):
+        relevant[i] = 1 if in_a_region(regions, peaks[i, AT_U], peaks[i, AT_V], MARGIN) else 0
+    busy = True
+    while busy:
+        busy = False
+        for i in range(n):
+            if relevant[i] != 1:
+                continue
+            relevant[i] = 2  # its neighbours are done
+            for j in range(n):
+                apart = max(abs(peaks[i, AT_U] - peaks[j, AT_U]), abs(peaks[i, AT_V] - peaks[j, AT_V]))
+                if relevant[j] == 0 and apart <= reach[i]:
+                    relevant[j], busy = 1, True
+    for i in range(n):
+        if relevant[i] and count < boxes.shape[0]:
+            more = _add_box(peaks[i, AT_U], peaks[i, AT_V], reach[i], width, height, boxes, count)
+            if not _is_searched(searched, boxes[count]):
+                count = more
+    return count
+
+
+@compiled
+def _is_searched(searched: NDArray[np.uint8], box: Ints) -> bool:
+    for row in range(box[0], box[1] + 1):
+        for column in range(box[2], box[3] + 1):
+            if not searched[row, column]:
+                return False
+    return True
+
+
+NEAR = float(RADIUS)  # px: reach of a peak whose size is not known yet
