@@ -35,6 +35,11 @@ class Noise(NamedTuple):
     floor: float
     slope: float
     black: float
+    texture: float
+
+
+TEXTURE_SHARE = 5.0 / 6.0  # of the threshold: sigmas of the texture that a spot must stand out by; there are far fewer
+# independent places in it than pixels
 
 
 # Columns of peaks (most, 5), places where a spot may be: px; the mean of 3x3 pixels above the background and that, DN;
@@ -51,6 +56,12 @@ def room_for_a_block() -> Array:
 def variance(noise: Noise, level: float) -> float:
     """Of a pixel of that expected grey value, DN^2."""
     return noise.floor + noise.slope * max(level - noise.black, 0.0)
+
+
+@compiled
+def texture_variance(noise: Noise, level: float) -> float:
+    """Of the mean of a few pixels of a background of that level, by its fixed structure, DN^2."""
+    return (TEXTURE_SHARE * noise.texture * level) ** 2
 
 
 @compiled
@@ -87,22 +98,26 @@ def _peaks_of_block(
     for i in range(1, _SIDE - 1):
         for j in range(1, _SIDE - 1):
             sum3[i, j] = lines[i - 1, j] + lines[i, j] + lines[i + 1, j]
-    sigma = sqrt(variance(noise, level))
+    noise2, texture2 = variance(noise, level), texture_variance(noise, level)
+    least3 = least_sigmas * sqrt(noise2 + 9.0 * texture2)
+    least5 = least_sigmas * sqrt(noise2 + 25.0 * texture2)
+    least7 = least_sigmas * sqrt(noise2 + 49.0 * texture2)
     for i in range(_REACH, min(_REACH + BLOCK, image.height - top + _REACH)):
         for j in range(_REACH, min(_REACH + BLOCK, image.width - left + _REACH)):
             if sum3[i, j] <= 9 * level or not _is_maximum(sum3, i, j):
                 continue
-            least = least_sigmas * sigma
             height3, height5 = sum3[i, j] - 9 * level, _sum_below(values, i, j, 2, np.inf) - 25 * level
             height7 = _sum_below(values, i, j, 3, np.inf) - 49 * level
-            if max(height3 / 3, height5 / 5, height7 / 7) < least:
+            if height3 / 3 < least3 and height5 / 5 < least5 and height7 / 7 < least7:
                 continue
             limit = _hot_limit(image, left + j - _REACH, top + i - _REACH, noise, level + height3 / 9, few)
             if limit < np.inf:
                 height3 = _sum_below(values, i, j, 1, limit) - 9 * level
                 height5 = _sum_below(values, i, j, 2, limit) - 25 * level
                 height7 = _sum_below(values, i, j, 3, limit) - 49 * level
-            if max(height3 / 3, height5 / 5, height7 / 7) < least or height3 <= 0 or count >= peaks.shape[0]:
+            if height3 / 3 < least3 and height5 / 5 < least5 and height7 / 7 < least7:
+                continue
+            if height3 <= 0 or count >= peaks.shape[0]:
                 continue
             _add(peaks, count, left + j - _REACH, top + i - _REACH, height3 / 9, level, 0.0)
             count += 1
@@ -134,8 +149,8 @@ def _sum_below(values: Array, i: int, j: int, reach: int, limit: float) -> float
 def _hot_limit(image: Pixels, u: int, v: int, noise: Noise, level: float, few: Array) -> float:
     """If the brightest of 3x3 pixels is hot, how bright light may be beside it, DN; else inf.
 
-    Hot is what stands alone, as no light does that came through a lens. `level`, DN, gives the noise: on the broad top of
-    a wide spot the highest pixel is the luckiest one.
+    Hot is what stands alone, as no light does that came through a lens. `level`, DN, gives the noise: on the broad top
+    of a wide spot the highest pixel is the luckiest one.
     """
     best, bu, bv = -1.0, u, v
     for i in range(max(v - 1, 0), min(v + 2, image.height)):
@@ -219,7 +234,7 @@ def _wide_peak(
         sort(few, 8)
         height += (-4.0 / 3.0 if k == 0 else 1.0 / 3.0) * 0.5 * (few[3] + few[4])
     # A median of eight has 1.4 times the variance of their mean.
-    scatter = sqrt(sigma2 / 64.0 * (1 + 1.4 / 8 * 17.0 / 9.0))
+    scatter = sqrt((sigma2 / 64.0 + texture_variance(noise, level)) * (1 + 1.4 / 8 * 17.0 / 9.0))
     if height < least_sigmas * scatter or count >= peaks.shape[0]:
         return count
     _add(peaks, count, u, v, height, level, 1.0)
