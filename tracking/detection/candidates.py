@@ -134,8 +134,8 @@ def _sum_below(values: Array, i: int, j: int, reach: int, limit: float) -> float
 def _hot_limit(image: Pixels, u: int, v: int, noise: Noise, level: float, few: Array) -> float:
     """If the brightest of 3x3 pixels is hot, how bright light may be beside it, DN; else inf.
 
-    Hot is what stands alone, as no light does that came through a lens. `level`, DN, gives the noise: on the broad top of
-    a wide spot the highest pixel is the luckiest one.
+    Hot is what stands alone, as no light does that came through a lens. `level`, DN, gives the noise: on the broad top
+    of a wide spot the highest pixel is the luckiest one.
     """
     best, bu, bv = -1.0, u, v
     for i in range(max(v - 1, 0), min(v + 2, image.height)):
