@@ -176,9 +176,10 @@ def find_ground(blocks: Blocks, runs: Ints) -> None:
     rows = blocks.maps.shape[1]
     for k in range(runs.shape[0]):
         row, first, last = runs[k, 0], runs[k, 1], runs[k, 2]
-        x = blocks.maps[MIDDLE, :, first:last]
-        a, b, c = x[max(row - 2, 0)], x[max(row - 1, 0)], x[row]
-        d, e, out = x[min(row + 1, rows - 1)], x[min(row + 2, rows - 1)], blocks.maps[GROUND, row, first:last]
+        a, b = blocks.maps[MIDDLE, max(row - 2, 0), first:last], blocks.maps[MIDDLE, max(row - 1, 0), first:last]
+        below, last_row = min(row + 1, rows - 1), min(row + 2, rows - 1)
+        d, e = blocks.maps[MIDDLE, below, first:last], blocks.maps[MIDDLE, last_row, first:last]
+        c, out = blocks.maps[MIDDLE, row, first:last], blocks.maps[GROUND, row, first:last]
         for j in range(out.shape[0]):
             out[j] = median5(a[j], b[j], c[j], d[j], e[j])
 

@@ -26,6 +26,7 @@ HOT_SIGMAS = 4.0  # a pixel must stand out so far of its surroundings to be call
 _BESIDE_HOT = 2.0  # sigmas over a hot pixel's neighbours at which the others are cut: hot pixels come in pairs
 _REACH = 4  # px around a block that are looked at with it: 2 for maxima, 2 for the means
 _SIDE = BLOCK + 2 * _REACH
+_WEAK, _WEAK_SHARE = 20.0, 0.7  # sigmas below which a peak must also stand out of the background's curvature; how far
 _WIDE_CLIP = 4.0  # sigmas over the background at which pixels are cut where a wide faint spot is looked for
 
 
@@ -99,6 +100,7 @@ def _peaks_of_block(
         for j in range(1, _SIDE - 1):
             sum3[i, j] = lines[i - 1, j] + lines[i, j] + lines[i + 1, j]
     noise2, texture2 = variance(noise, level), texture_variance(noise, level)
+    sigma = sqrt(noise2)
     least3 = least_sigmas * sqrt(noise2 + 9.0 * texture2)
     least5 = least_sigmas * sqrt(noise2 + 25.0 * texture2)
     least7 = least_sigmas * sqrt(noise2 + 49.0 * texture2)
@@ -110,7 +112,8 @@ def _peaks_of_block(
             height7 = _sum_below(values, i, j, 3, np.inf) - 49 * level
             if height3 / 3 < least3 and height5 / 5 < least5 and height7 / 7 < least7:
                 continue
-            limit = _hot_limit(image, left + j - _REACH, top + i - _REACH, noise, level + height3 / 9, few)
+            u, v = left + j - _REACH, top + i - _REACH
+            limit = _hot_limit(image, u, v, noise, level + height3 / 9, few)
             if limit < np.inf:
                 height3 = _sum_below(values, i, j, 1, limit) - 9 * level
                 height5 = _sum_below(values, i, j, 2, limit) - 25 * level
@@ -119,7 +122,12 @@ def _peaks_of_block(
                 continue
             if height3 <= 0 or count >= peaks.shape[0]:
                 continue
-            _add(peaks, count, left + j - _REACH, top + i - _REACH, height3 / 9, level, 0.0)
+            if max(height3 / 3, height5 / 5, height7 / 7) < _WEAK * sigma:  # is it the top of a diffuse reflection?
+                more = _level_around(image, u, v, level + _WIDE_CLIP * sigma, few) - level
+                higher = max(height3 / 3 - 3 * more, height5 / 5 - 5 * more, height7 / 7 - 7 * more)
+                if higher < _WEAK_SHARE * least_sigmas * sigma:
+                    continue
+            _add(peaks, count, u, v, height3 / 9, level, 0.0)
             count += 1
     return count
 
@@ -205,8 +213,7 @@ def _wide_peak(
 ) -> int:  # fmt: skip
     """A peak where 8x8 pixels stand out of the surroundings by more than their curvature explains.
 
-    Of c, the mean in the middle, and the medians r and R of eight means around it, 16 and 32 px away, c - 4/3 r + 1/3 R
-    is blind to a plane and to a paraboloid: to diffuse reflections. Bright pixels are cut, for a hot one is no spot.
+    Bright pixels are cut, for a hot one is no spot.
     """
     rows, columns = blocks.quads.shape
     bi, bj, best = 2 * row, 2 * column, -1.0
@@ -223,16 +230,7 @@ def _wide_peak(
     sigma2 = variance(noise, level)
     top = level + _WIDE_CLIP * sqrt(sigma2)
     here = _mean8(image, u, v, top)
-    height = here
-    for k in range(2):
-        away, n = 16 * (k + 1), 0
-        for i in range(-1, 2):
-            for j in range(-1, 2):
-                if i != 0 or j != 0:
-                    few[n] = _mean8(image, u + j * away, v + i * away, top)
-                    n += 1
-        sort(few, 8)
-        height += (-4.0 / 3.0 if k == 0 else 1.0 / 3.0) * 0.5 * (few[3] + few[4])
+    height = here - _level_around(image, u, v, top, few)
     # A median of eight has 1.4 times the variance of their mean.
     scatter = sqrt((sigma2 / 64.0 + texture_variance(noise, level)) * (1 + 1.4 / 8 * 17.0 / 9.0))
     if height < least_sigmas * scatter or count >= peaks.shape[0]:
@@ -245,6 +243,26 @@ def _wide_peak(
 def _add(peaks: Array, row: int, u: int, v: int, height: float, level: float, wide: float) -> None:
     peak = peaks[row]
     peak[AT_U], peak[AT_V], peak[HEIGHT], peak[LEVEL], peak[WIDE] = u, v, height, level, wide
+
+
+@compiled
+def _level_around(image: Pixels, u: int, v: int, top: float, few: Array) -> float:
+    """The background at a point from what is around it, DN: right on a plane and on a paraboloid.
+
+    It is 4/3 r - 1/3 R with r and R the medians of eight means of 8x8 pixels, cut at `top`, 16 and 32 px away: the
+    curvature of a diffuse reflection falls out.
+    """
+    level = 0.0
+    for k in range(2):
+        away, n = 16 * (k + 1), 0
+        for i in range(-1, 2):
+            for j in range(-1, 2):
+                if i != 0 or j != 0:
+                    few[n] = _mean8(image, u + j * away, v + i * away, top)
+                    n += 1
+        sort(few, 8)
+        level += (4.0 / 3.0 if k == 0 else -1.0 / 3.0) * 0.5 * (few[3] + few[4])
+    return level
 
 
 @compiled
