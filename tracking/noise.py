@@ -32,6 +32,8 @@ class NoiseModel:
     texture: float = 0.0  # contrast of the background's fixed structure over a few pixels, share of its level: what a
     # spot must stand out of beside the noise. Its share in the errors of spots is another matter (place_errors.py)
 
+    banding_dn: float = 0.0  # sigma of steps of the grey scale that no noise blurs: rounding goes together over pixels
+
     def __post_init__(self) -> None:
         if not (self.floor_dn2 > 0 and self.slope_dn >= 0):
             raise ValueError(

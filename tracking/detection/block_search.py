@@ -186,18 +186,19 @@ def find_ground(blocks: Blocks, runs: Ints) -> None:
 
 @compiled
 def find_standing_out(
-    blocks: Blocks, runs: Ints, floor: float, slope: float, black: float, texture: float, least_sigmas: float,
-    least_wide: float, searched: NDArray[np.uint8], found: Ints,
+    blocks: Blocks, runs: Ints, floor: float, slope: float, black: float, texture: float, banding: float,
+    least_sigmas: float, least_wide: float, searched: NDArray[np.uint8], found: Ints,
 ) -> int:  # fmt: skip
     """Blocks with a sum of 2x2 or 4x4 pixels `least_sigmas` over the background, or of 8x8 pixels `least_wide`.
 
-    texture: sigma of means over a few pixels by the background's structure, share of its level.
+    texture, banding: sigma of means over a few pixels by the background's structure, share of its level and DN.
 
     Those marked in searched (n, m) are passed over, the others become marked. found (most, 3): row, column, and 1 where
     it was only the 8x8 pixels. Returns how many.
     """
     count = 0
     fine, wide, texture2 = 16.0 * least_sigmas**2, 64.0 * least_wide**2, texture**2
+    banding2 = banding**2
     for k in range(runs.shape[0]):
         row, first, last = runs[k, 0], runs[k, 1], runs[k, 2]
         ground, highest2 = blocks.maps[GROUND, row, first:last], blocks.maps[HIGHEST2, row, first:last]
@@ -206,7 +207,7 @@ def find_standing_out(
         for j in range(ground.shape[0]):  # squares over the variance, over their thresholds
             level = ground[j] / 64.0
             lit = level - black
-            variance, rough = floor + slope * (lit if lit > 0.0 else 0.0), texture2 * level * level
+            variance, rough = floor + slope * (lit if lit > 0.0 else 0.0), texture2 * level * level + banding2
             a, b, c = 2.0 * (highest2[j] - 4.0 * level), highest4[j] - 16.0 * level, highest8[j] - 64.0 * level
             a, b, c = (a if a > 0.0 else 0.0), (b if b > 0.0 else 0.0), (c if c > 0.0 else 0.0)
             a, b = a * a / (fine * (variance + 4.0 * rough)), b * b / (fine * (variance + 16.0 * rough))

@@ -37,6 +37,7 @@ class Noise(NamedTuple):
     slope: float
     black: float
     texture: float
+    banding: float
 
 
 TEXTURE_SHARE = 5.0 / 6.0  # of the threshold: sigmas of the texture that a spot must stand out by; there are far fewer
@@ -61,8 +62,8 @@ def variance(noise: Noise, level: float) -> float:
 
 @compiled
 def texture_variance(noise: Noise, level: float) -> float:
-    """Of the mean of a few pixels of a background of that level, by its fixed structure, DN^2."""
-    return (TEXTURE_SHARE * noise.texture * level) ** 2
+    """Of the mean of a few pixels of a background of that level, by its fixed structure and by rounding, DN^2."""
+    return TEXTURE_SHARE**2 * ((noise.texture * level) ** 2 + noise.banding**2)
 
 
 @compiled

@@ -47,7 +47,8 @@ def find_peaks_in(
     find_highest_pairs(blocks, inner)
     least, measured = BLOCK_SHARE * threshold_sigma, PEAK_SHARE * threshold_sigma
     n = find_standing_out(
-        blocks, inner, noise.floor, noise.slope, noise.black, TEXTURE_SHARE * noise.texture, least,
+        blocks, inner, noise.floor, noise.slope, noise.black, TEXTURE_SHARE * noise.texture,
+        TEXTURE_SHARE * noise.banding, least,
         measured, searched, found,
     )  # fmt: skip
     return find_peaks(image, blocks, noise, found, n, measured, room, peaks, count)

@@ -19,6 +19,7 @@ from tracking.detection.detect import find_spots
 from tracking.noise import FULL_SCALE_E, NoiseModel, Picture, quantile_variance
 from tracking.noise_estimation.grey_values import clipped_background, full_scale, grey_step, saturation_level
 from tracking.noise_estimation.levels import LEAST_PIXELS, LEVELS, SIDE, LevelVariances, level_variances
+from tracking.noise_estimation.rounding import banding
 from tracking.noise_estimation.spot_residuals import SpotResiduals, residuals_of_spots
 from tracking.noise_estimation.texture import texture_of
 from tracking.parameters import DetectParameters
@@ -73,7 +74,7 @@ def estimate_noise(pictures: Sequence[Picture]) -> NoiseEstimate:
     lines = _Lines.through(levels, background, full, rounding) if dark is None else _Lines.from_point(*dark, full)
     slope, slope_sigma = lines.slope(rounding)
     first = lines.model(slope, rounding)
-    first = replace(first, texture=texture_of(usable, first))
+    first = replace(first, texture=texture_of(usable, first), banding_dn=banding(first.floor_dn2, rounding))
     if slope_sigma > _SURE:  # nothing still is bright enough: the spots themselves
         found = [find_spots(p, DetectParameters(max_detections=_MOST_SPOTS), first) for p in usable]
         lines.add(residuals_of_spots(usable, found, top))
