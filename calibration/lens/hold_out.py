@@ -57,7 +57,7 @@ def hold_out(table: CornerTable, found: LensFit, folds: int | None = None) -> He
     for group in folds_of(used_views(found, table), folds):
         held = np.isin(table.view, group)
         without = fit(
-            table, found.used & ~held, found.model, found.values, found.warp_free, limits=BRIEF, sigma_px=found.sigma_px
+            table, found.used & ~held, found.model, found.values, found.board, limits=BRIEF, sigma_px=found.sigma_px
         )
         kept.append(without)
         error[group] = _errors(table, found.used & held, without, found.values)[group]

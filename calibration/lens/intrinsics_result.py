@@ -7,11 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibration.findings import Finding, Level, verdict
+from calibration.lens.board_shape import BoardTest, WarpTest
 from calibration.lens.corner_table import CornerTable
 from calibration.lens.coverage import Coverage
 from calibration.lens.hold_out import HeldOut, Scatter
 from calibration.lens.lens_fit import LensFit
-from calibration.lens.lens_ladder import Ladder, WarpTest
+from calibration.lens.lens_ladder import Ladder
 from calibration.lens.lens_models import LensModel
 from calibration.lens.projection_map import Difference, ProjectionMap
 from geometry.arrays import Array
@@ -38,13 +39,18 @@ class Intrinsics:
     scatter: Scatter
     held: HeldOut
     ladder: Ladder
-    warp: WarpTest | None  # None where the views do not determine a bend
+    board: BoardTest | None  # the board as the photographs show it; None where they do not determine its bend
     halves: Difference | None  # None where a half does not determine the lens
     origins: Origins | None  # None where all photographs are of one origin
     map: ProjectionMap
     distance_m: float
     coverage: Coverage
     findings: tuple[Finding, ...] = ()
+
+    @property
+    def warp(self) -> WarpTest | None:
+        """The board's bend; None where the views do not determine it."""
+        return None if self.board is None else self.board.warp
 
     @property
     def verdict(self) -> Level:

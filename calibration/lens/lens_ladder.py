@@ -12,14 +12,14 @@ from calibration.least_squares.adjustment import AdjustmentError
 from calibration.least_squares.stacks import Vectors
 from calibration.lens.corner_table import CornerTable
 from calibration.lens.hold_out import BRIEF, HeldOut, Scatter, hold_out, scatter
-from calibration.lens.lens_fit import LensFit, Values, fit, robust_fit
-from calibration.lens.lens_models import LADDER, LensModel, folds_in_picture
+from calibration.lens.lens_fit import AS_STATED, BoardFreedom, LensFit, Values, fit, robust_fit
+from calibration.lens.lens_models import LADDER, LensModel, folds_in_picture, rational_of_fisheye
 from geometry.arrays import Bools
 
 # With so many corners time counts: models that cannot be chosen any more are not solved another five times. 400 views
 # took 25 s without this, 11 s with it; the choice is the same.
 MANY_CORNERS = 4000
-WARP_SIGNIFICANT = 1e-3  # of a flat board's chance to look this bent
+RATIONAL = LensModel(8)
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,23 +47,27 @@ class Ladder:
 def climb(
     table: CornerTable,
     used: Bools,
-    starts: Sequence[Values | None],
-    warp_free: bool,
+    rich: Sequence[LensFit],
+    shape: Values,
+    board: BoardFreedom,
     folds: int | None = None,
     only: LensModel | None = None,
 ) -> Ladder:
     """Solve every model (or only one) on the same corners (N,) and hold out.
 
-    starts: of perspective lenses and of a fisheye, None where there is none. Each rung starts from the one below of
-    its own kind. AdjustmentError where no model can be used.
+    rich: fits of rich models, from which the others start; shape: the stacks of the board's shape to start from. Each
+    rung also starts from the one below of its own kind. AdjustmentError where no model can be used.
     """
-    perspective, fisheye = starts
     fitted: list[Rung] = []
-    below = perspective
+    below: LensFit | None = None
     for model in LADDER if only is None else (only,):
-        rung = _fitted(table, used, model, fisheye if model.fisheye else below, warp_free)
+        starts = [f for f in rich if f.model.fisheye == model.fisheye and f.model.coefficients <= model.coefficients]
+        starts = starts or [f for f in rich if f.model.fisheye == model.fisheye]
+        if below is not None and not model.fisheye and model.coefficients > 5:
+            starts = [*starts, below]
+        rung = _best_rung(table, used, model, [{**f.values, **shape} for f in starts], board)
         if rung.fit is not None and not model.fisheye and model.coefficients:
-            below = rung.fit.values
+            below = rung.fit
         fitted.append(rung)
     rungs = []
     for rung in fitted:
@@ -72,6 +76,14 @@ def climb(
     if only is not None and rungs[0].held is not None:
         return Ladder(rungs, rungs[0], "it was asked for")
     return choose(rungs)
+
+
+def _best_rung(
+    table: CornerTable, used: Bools, model: LensModel, starts: Sequence[Values], board: BoardFreedom
+) -> Rung:
+    """The model solved from each start, where it fits best."""
+    rungs = [_fitted(table, used, model, start, board) for start in starts or [None]]
+    return min(rungs, key=lambda r: np.inf if r.fit is None else r.fit.sigma_px)
 
 
 def choose(rungs: Sequence[Rung]) -> Ladder:
@@ -107,12 +119,12 @@ def _rms(rung: Rung) -> float:
     return np.inf if rung.held is None else rung.held.rms_px
 
 
-def _fitted(table: CornerTable, used: Bools, model: LensModel, start: Values | None, warp_free: bool) -> Rung:
+def _fitted(table: CornerTable, used: Bools, model: LensModel, start: Values | None, board: BoardFreedom) -> Rung:
     """A model solved on all views."""
     if start is None:
         return Rung(model, None, None, refused="no focal length and no position of the board explain the corners")
     try:
-        found = fit(table, used, model, start, warp_free, limits=BRIEF)
+        found = fit(table, used, model, start, board, limits=BRIEF)
     except AdjustmentError as error:
         return Rung(model, None, None, refused=f"it cannot be solved: {error}")
     return Rung(model, found, None)
@@ -157,87 +169,53 @@ def _held_out(table: CornerTable, rung: Rung, folds: int | None) -> Rung:
     )
 
 
-@dataclass(frozen=True, slots=True)
-class WarpTest:
-    """Whether the board is bent, as the corners see it."""
-
-    warp: tuple[float, float, float]  # 1/m, as found when free
-    sigma: tuple[float, float, float]
-    rise_m: float  # from its lowest to its highest point
-    p_value: float  # of a flat board looking bent as much
-    gain_px2: float  # mean squared error that held-out views lose with the bend; nan where p is too large to ask
-    corrected: bool
-    why: str
-
-
-def warp_test(table: CornerTable, found: LensFit, folds: int | None = None, force: bool | None = None) -> WarpTest:
-    """Solve with the board free to bend and without; force: True or False decide whatever is found.
-
-    AdjustmentError where the bend cannot be determined.
-    """
-    flat = fit(table, found.used, found.model, {**found.values, "warp": Vectors(np.zeros((1, 3)))}, False)
-    bent = fit(table, found.used, found.model, flat.values, True)
-    C = bent.warp_covariance
-    size = np.sqrt(np.diagonal(C))
-    if not np.all(size > 0):
-        raise AdjustmentError("the views do not determine the board's bend")
-    flatness = float(bent.warp @ np.linalg.solve(C, bent.warp))
-    p, gain, error = float(chi2.sf(flatness, 3)), np.nan, np.nan
-    if p < WARP_SIGNIFICANT:
-        held = hold_out(table, bent, folds)
-        # Corners of one photograph err together: against noise alone nearly every board on real photographs is bent.
-        factor = max(1.0, scatter(bent, held).factor)
-        size = size * factor
-        p = float(chi2.sf(flatness / factor**2, 3))
-        gain, error = held.better_than(hold_out(table, flat, folds))
-    if force is not None:
-        corrected, why = force, "as asked for"
-    elif p >= WARP_SIGNIFICANT:
-        corrected, why = False, "not significantly different from a flat board"
-    elif gain < -error:
-        corrected, why = False, "significant, but held-out views are predicted worse"
-    else:
-        better = "better" if gain > error else "as well"
-        corrected, why = True, f"significant, and held-out views are predicted {better}"
-    return WarpTest(
-        tuple(bent.warp),
-        tuple(size),
-        rise(table, bent),
-        p,
-        gain,
-        corrected,
-        why,
-    )
-
-
-def rise(table: CornerTable, found: LensFit) -> float:
-    """How far the board's points lie apart across it, m, by its warp, after the best-fitting flat board."""
-    x, y = (table.board_points - table.middle)[:, :2].T
-    a, b, c = found.warp
-    z = a * x * x + b * x * y + c * y * y
-    plane = np.stack([np.ones_like(x), x, y], axis=1)
-    return float(np.ptp(z - plane @ np.linalg.lstsq(plane, z, rcond=None)[0]))
-
-
-def union_of_used(table: CornerTable, starts: Sequence[tuple[LensModel, Values]]) -> tuple[Bools, list[LensFit]]:
+def union_of_used(
+    table: CornerTable, starts: Sequence[tuple[LensModel, Values]], only: LensModel | None = None
+) -> tuple[Bools, list[LensFit]]:
     """Corners (N,) that some rich model takes for the board's, and the robust fits that say so, best first.
 
-    A model too small for the lens would throw out the corners of the picture's edge, which tell the models apart.
-    AdjustmentError where none can be solved.
+    A model too small for the lens would throw out the corners of the picture's edge, which tell the models apart; so
+    the rational model is asked as well, where the plain ones leave it something. AdjustmentError where none can be
+    solved.
     """
     fits: list[LensFit] = []
-    reasons = []
+    reasons: list[str] = []
     for model, values in starts:
-        for warp_free in (True, False):
-            try:
-                fits.append(robust_fit(table, model, values, warp_free))
-                break
-            except AdjustmentError as error:
-                reasons.append(str(error))
+        fits += _rich_fit(table, model, values, reasons)
+    if only is None or only.coefficients >= RATIONAL.coefficients:
+        for values in [_as_rational(table, f) for f in fits]:
+            fits += _rich_fit(table, RATIONAL, values, reasons)
     if not fits:
         raise AdjustmentError(reasons[-1])
-    fits.sort(key=lambda f: float(np.nanmedian(np.abs(f.residuals))))
+    fits.sort(key=lambda f: _information(table, f))
     # A view's corners count only where the best fit has a use for the view at all.
     views = table.counts(fits[0].used) > 0
     used = np.any([f.used for f in fits], axis=0) & views[table.view]
     return used, fits
+
+
+def _rich_fit(table: CornerTable, model: LensModel, values: Values, reasons: list[str]) -> list[LensFit]:
+    """The robust fit with as much of the board's shape as can be solved for; none where even the lens cannot."""
+    for board in (BoardFreedom(warp=True, stretch=True), BoardFreedom(warp=True), AS_STATED):
+        try:
+            return [robust_fit(table, model, values, board)]
+        except AdjustmentError as error:
+            reasons.append(str(error))
+    return []
+
+
+def _as_rational(table: CornerTable, found: LensFit) -> Values:
+    """The values of a fit with a rational lens that draws about the same."""
+    if not found.model.fisheye:
+        return found.values
+    inside = np.linalg.norm((table.pixels[found.used] - found.lens[2:4]) / found.lens[:2], axis=1)
+    lens = rational_of_fisheye(found.lens, float(inside.max()))
+    return {**found.values, "intrinsics": Vectors(lens[None])}
+
+
+def _information(table: CornerTable, found: LensFit) -> float:
+    """Schwarz's criterion over all corners of views that it uses: what it misses by, and a price for each number."""
+    left = found.residuals[np.isfinite(found.residuals).all(axis=1)]
+    spread = 1.4826 * float(np.median(np.abs(left)))
+    n = 2 * len(table)
+    return n * 2 * np.log(max(spread, 1e-9)) + found.model.coefficients * np.log(n)

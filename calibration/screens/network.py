@@ -15,6 +15,7 @@ from scipy.stats import chi2 as chi2_distribution
 
 from calibration.least_squares.adjustment import Adjusted, At, Cauchy, Term, Values, solve
 from calibration.least_squares.priors import Prior, independent
+from calibration.least_squares.some_rows import picked
 from calibration.least_squares.stacks import Poses, Stack, Vectors
 from calibration.lens.corners import CornerTerm
 from calibration.rig.rig_stacks import named_errors, rig_of, stacks_of
@@ -266,16 +267,9 @@ def _weighed_corners(network: Network, start: Start, values: Values, free: Mappi
     spent = 6 * (len(network.placements) + len(network.rig.cameras) - 1)
     dof = max(2 * int(good.sum()) - spent, int(good.sum()) // 2)
     factor = max(float(np.sqrt(np.sum(residuals[good] ** 2) / dof)), 0.1)
-    return CornerTerm(
-        term.pixels[good],
-        term.points[good],
-        term.from_middle[good],
-        term.camera[good],
-        term.placement[good],
-        term.board[good],
-        term.sigma_px[good] * factor,
-        term.fisheye,
-    )
+    kept = picked(term, good)
+    assert isinstance(kept, CornerTerm)
+    return replace(kept, sigma_px=kept.sigma_px * factor)
 
 
 def _fit(

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.boards.kinds import Board
+from calibration.boards.kinds import Board, CircleGrid
 from calibration.findings import Level
-from calibration.lens.corner_table import CornerTable
+from calibration.lens.corner_table import CircleAreas, CornerTable
 from calibration.lens.intrinsics import (
     FEWEST_VIEWS,
     IntrinsicsError,
@@ -26,7 +26,7 @@ from geometry.camera import FISHEYE, PERSPECTIVE
 from lab.calibrate.board_file import board_of
 from lab.calibrate.camera_file import CameraCalibration, CameraFile, save_camera
 from lab.calibrate.camera_outcome import Outcome
-from lab.calibrate.photos import Progress, find_in_photos, origins_of
+from lab.calibrate.photos import PhotoSet, Progress, find_in_photos, origins_of
 from lab.camera_block import Covariance
 from lab.errors import CalibrationError, InputError
 from lab.whole_folder import beside_a_good_one, refuse_foreign, whole_folder
@@ -87,7 +87,7 @@ def calibrate_camera(
     day = today or datetime.date.today()
     known = board_of(board) if isinstance(board, str | Path) else board
     found = find_in_photos(photos, known, progress, fewest=FEWEST_VIEWS)
-    table = CornerTable.of([(v.ids, v.pixels) for _, v in found.views], known.points, known.middle, found.image_size_px)
+    table = corner_table(found)
     try:
         result = calibrate_intrinsics(table, options.intrinsics(origins_of(found)))
     except TooFewViewsError as error:
@@ -104,6 +104,19 @@ def calibrate_camera(
 
         write_page(outcome, file, day, work)
     return outcome
+
+
+def corner_table(photos: PhotoSet) -> CornerTable:
+    """What the photographs gave, for the solve."""
+    board = photos.board
+    views = [view for _, view in photos.views]
+    circles = None
+    if isinstance(board, CircleGrid):
+        areas = [view.areas_px2 for view in views if view.areas_px2 is not None]
+        measured = np.concatenate(areas) if len(areas) == len(views) else None
+        circles = CircleAreas(measured, board.stated_diameter_m)
+    rows = [(np.searchsorted(board.ids, view.ids), view.pixels) for view in views]
+    return CornerTable.of(rows, board.points, board.middle, photos.image_size_px, circles)
 
 
 def _is_ours(folder: Path) -> bool:
