@@ -116,7 +116,7 @@ class Adjusted:
             # Scaled to a unit diagonal, pivots tell how nearly singular the equations are, whatever the units.
             scale = 1.0 / np.sqrt(np.maximum(self._normal.diagonal(), 1e-300))
             factor = _factor(_scaled(self._normal, scale))
-            if factor is None or np.min(np.abs(factor.U.diagonal())) < 1e-11:
+            if factor is None or np.min(np.abs(factor.U.diagonal())) < 1e-13:
                 raise AdjustmentError("the data leave some direction of the unknowns undetermined")
             picked = columns[free]
             rhs = np.zeros((self._normal.shape[0], len(picked)))

@@ -74,6 +74,11 @@ class Intrinsics:
         return np.sqrt(np.diagonal(self.covariance))
 
     @property
+    def map_covariance_px2(self) -> Array:
+        """(rows, columns, 2, 2): of a pixel's direction over the picture, all that is known to be uncertain."""
+        return self.map.covariance_px2(self.covariance)
+
+    @property
     def rms_px(self) -> float:
         """Of the used corners' residuals, per coordinate."""
         return float(np.sqrt(np.mean(self.fit.residuals[self.fit.used] ** 2)))

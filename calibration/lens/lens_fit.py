@@ -11,7 +11,7 @@ from calibration.least_squares.adjustment import Adjusted, Cauchy, Limits, Loss,
 from calibration.least_squares.priors import Anchors, independent
 from calibration.least_squares.stacks import Poses, Stack, Vectors
 from calibration.lens.corner_table import CornerTable
-from calibration.lens.corners import CornerTerm, single_camera
+from calibration.lens.corners import INTRINSICS, CornerTerm, single_camera
 from calibration.lens.lens_models import LensModel
 from geometry.arrays import Array, Bools, Ints
 from geometry.pose import Pose
@@ -31,6 +31,7 @@ _ROUNDS = 6  # of solving and rejecting; sets seen so far settle within three
 # A circle's size by its blobs' areas: blur and the ink's soft edge move it by .1 to .3 %, the same in all views.
 _RADIUS_SIGMA = 0.005
 _STATED_RADIUS_SIGMA = 0.02  # of a printed circle, by what was said: ink spreads and light edges bloom
+_MODERATE, _MODERATE_PRISM = 3.0, 0.1  # of a distortion number times its power of the radius, at the picture's edge
 _PRINT_SIGMA = 0.02  # of a printed point's place, in spacings: wide: it fixes their common place, turn and scale
 
 
@@ -158,6 +159,27 @@ def term_of(
     )
 
 
+def moderate_numbers(table: CornerTable, used: Bools, model: LensModel, values: Values) -> Term:
+    """That each distortion number does a moderate thing to a point at the picture's edge: k r^2, k r^4 ... are of some.
+
+    The numerator and the denominator of the rational model nearly cancel: without this, photographs leave directions
+    of its numbers open that no corner shows, and the solve runs along them for ever. Its bias is far below the noise.
+    """
+    poses = values["boards"]
+    assert isinstance(poses, Poses)
+    xyz = poses.pose[table.view[used]].apply(table.points[used])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        r2 = np.nanquantile(np.sum(xyz[:, :2] ** 2, axis=1) / xyz[:, 2] ** 2, 0.99)
+    power = np.array([1, 2, 0, 0, 3, 1, 2, 3, 1, 2, 1, 2, 0, 0])
+    sigmas = np.full(INTRINSICS, np.inf)
+    radial = np.array([0, 1, 4, 5, 6, 7])
+    sigmas[4 + radial] = _MODERATE / float(r2) ** power[radial]
+    prism = np.array([8, 9, 10, 11])
+    sigmas[4 + prism] = _MODERATE_PRISM / float(r2) ** power[prism]
+    sigmas[~model.free] = np.inf
+    return independent("intrinsics", Vectors(np.zeros((1, INTRINSICS))), sigmas[None])[0]
+
+
 def with_radius(table: CornerTable, used: Bools, model: LensModel, values: Values) -> tuple[Values, list[Term]]:
     """The values with the radius of the board's circles, by their blobs' areas, and what is known of it so.
 
@@ -220,6 +242,8 @@ def adjust(
         "stretch": board.stretch and not board.points,
         "radius": whole_lens and table.circles is not None,
     }
+    if model.coefficients > 5 and whole_lens:
+        known.append(moderate_numbers(table, used, model, values))
     if board.points:
         seen = np.bincount(table.point[used], minlength=len(table.board_points)) > 0
         free["print"] = np.repeat(seen[:, None], 3, axis=1)
