@@ -31,6 +31,7 @@ from calibration.lens.lens_fit import (
 from calibration.lens.lens_ladder import Rung, climb, union_of_used
 from calibration.lens.lens_models import LensModel
 from calibration.lens.lens_start import StartError, start
+from calibration.lens.model_doubt import model_doubt
 from calibration.lens.projection_map import Difference, ProjectionMap, difference, projection_map
 from geometry.arrays import Ints
 
@@ -88,12 +89,14 @@ def _calibrated(table: CornerTable, options: IntrinsicsOptions) -> Intrinsics:
     noise = max(1.0, spread.factor) if spread.p_value < SCATTER_SIGNIFICANT else 1.0
     distance = options.distance_m or _typical_depth(table, found)
     pixel_map = projection_map(found.model, found.lens, table.image_size_px, distance)
+    doubt = model_doubt(table, found, ladder, pixel_map, found.covariance * noise**2)
     out = Intrinsics(
         table=table,
         model=found.model,
         fit=found,
         parameters=found.model.parameters,
-        covariance=found.covariance * noise**2,
+        covariance=found.covariance * (noise * doubt.factor) ** 2,
+        doubt=doubt,
         correlated_noise=noise,
         scatter=spread,
         held=held,

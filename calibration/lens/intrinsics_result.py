@@ -14,6 +14,7 @@ from calibration.lens.hold_out import HeldOut, Scatter
 from calibration.lens.lens_fit import LensFit
 from calibration.lens.lens_ladder import Ladder
 from calibration.lens.lens_models import LensModel
+from calibration.lens.model_doubt import ModelDoubt
 from calibration.lens.projection_map import Difference, ProjectionMap
 from geometry.arrays import Array
 
@@ -34,7 +35,8 @@ class Intrinsics:
     model: LensModel
     fit: LensFit
     parameters: tuple[str, ...]  # fx, fy, cx, cy, k1 ...
-    covariance: Array  # (p, p) in that order, scatter between photographs included
+    covariance: Array  # (p, p) in that order, scatter between photographs and the model's own doubt included
+    doubt: ModelDoubt
     correlated_noise: float  # factor on the sigmas from that scatter; 1 where it is not significant
     scatter: Scatter
     held: HeldOut

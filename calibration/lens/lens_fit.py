@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from calibration.least_squares.adjustment import Adjusted, Cauchy, Limits, Loss, Term, solve
 from calibration.least_squares.priors import Anchors, independent
@@ -248,7 +249,27 @@ def adjust(
         seen = np.bincount(table.point[used], minlength=len(table.board_points)) > 0
         free["print"] = np.repeat(seen[:, None], 3, axis=1)
         known.append(Anchors("print", np.zeros((len(seen), 3)), _PRINT_SIGMA * table.spacing_m))
-    return solve(values, [term_of(table, used, model.fisheye, sigma_px, loss), *known], free, limits)
+    term = term_of(table, used, model.fisheye, sigma_px, loss)
+    basis = {"intrinsics": _lens_basis(term, known, model, values)} if whole_lens and model.coefficients else {}
+    return solve(values, [term, *known], free, limits, basis)
+
+
+def _lens_basis(term: CornerTerm, known: Sequence[Term], model: LensModel, values: Values) -> Array:
+    """(18, 18): combinations of the lens' numbers that each move the corners in a way of their own, by about a sigma.
+
+    From the triangle of a QR decomposition of the derivatives at the start; the numbers themselves where that is
+    singular.
+    """
+    own = [p.jacobian for t in [term, *known] for p in t.linearise(values).parts if p.stack == "intrinsics"]
+    rows = np.concatenate([J.reshape(-1, INTRINSICS) for J in own])[:, model.free]
+    basis = np.eye(INTRINSICS)
+    scale = np.linalg.norm(rows, axis=0)
+    if not (np.isfinite(scale).all() and np.all(scale > 0)):
+        return basis
+    R = np.linalg.qr(rows / scale, mode="r")
+    if np.min(np.abs(np.diagonal(R))) > 1e-12:
+        basis[np.ix_(model.free, model.free)] = solve_triangular(R, np.eye(len(R))) / scale[:, None]
+    return basis
 
 
 def fit(

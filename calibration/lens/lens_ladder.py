@@ -20,6 +20,7 @@ from geometry.arrays import Bools
 # took 25 s without this, 11 s with it; the choice is the same.
 MANY_CORNERS = 4000
 RATIONAL = LensModel(8)
+SYSTEMATIC = 1e-3  # of residuals' chance to exceed those of the best model so far by noise alone
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +88,12 @@ def _best_rung(
 
 
 def choose(rungs: Sequence[Rung]) -> Ladder:
-    """Of rungs in ascending order: the first whose held-out error is within one standard error of the smallest."""
+    """Of rungs in ascending order: the first that predicts as well as the best and leaves nothing that it explains.
+
+    As well: its held-out error is within one standard error of the smallest. What it leaves in the residuals beyond the
+    best one's must be noise: the standard error is large where few views reach the parts of the picture in which two
+    models differ, though all corners together leave no doubt.
+    """
     able = [r for r in rungs if not r.refused and r.held is not None]
     if not able:
         reasons = "; ".join(f"{r.model.title}: {r.refused}" for r in rungs)
@@ -100,19 +106,31 @@ def choose(rungs: Sequence[Rung]) -> Ladder:
             continue
         gain, error = best.held.better_than(r.held)
         out.append(replace(r, behind_px2=gain, standard_error_px2=error))
-    chosen = next(r for r in out if not r.refused and r.held is not None and r.behind_px2 <= r.standard_error_px2)
+    as_good = [r for r in out if not r.refused and r.held is not None and r.behind_px2 <= r.standard_error_px2]
+    chosen = next(r for r in as_good if r.model == best.model or not _leaves_something(r, best))
     if chosen.model == best.model:
         why = f"it predicts held-out views best ({_rms(best):.3f} px)"
         smaller = [r for r in out if r.held is not None and not r.refused][: [r.model for r in able].index(best.model)]
         if smaller:
             least = min(_rms(r) for r in smaller)
-            why += f", and every smaller usable model errs more by over one standard error ({least:.3f} px at best)"
+            why += f", and every smaller usable model errs more ({least:.3f} px at best) or leaves residuals that this one explains"
     else:
         why = (
             f"its held-out error ({_rms(chosen):.3f} px) is within one standard error of the best model's"
             f" ({best.model.words}: {_rms(best):.3f} px), and it has fewer numbers to determine"
         )
     return Ladder(out, chosen, why)
+
+
+def _leaves_something(rung: Rung, best: Rung) -> bool:
+    """Whether a model's residuals exceed those of the best one by more than noise and its fewer numbers explain."""
+    assert rung.fit is not None
+    assert best.fit is not None
+    assert best.scatter is not None
+    more, least = (f.sigma_px**2 * f.adjusted.dof for f in (rung.fit, best.fit))
+    noise = best.fit.sigma_px * max(1.0, best.scatter.factor)
+    fewer = max(best.model.coefficients - rung.model.coefficients, 3)
+    return bool(chi2.sf((more - least) / noise**2, fewer) < SYSTEMATIC)
 
 
 def _rms(rung: Rung) -> float:

@@ -130,6 +130,15 @@ def corners_of(true: TrueLens, seed: int, views: int = 20, sigma_px: float = 0.1
     return CornerTable.of(seen, board, middle, SIZE)
 
 
+def within_boards(c: Intrinsics, pixels: Array) -> Array:
+    """Which pixels (n, 2) lie within the corners of some view."""
+    inside = np.zeros(len(pixels), dtype=bool)
+    for v in np.flatnonzero(c.table.counts(c.fit.used) > 2):
+        hull = cv2.convexHull(c.table.pixels[c.fit.used & (c.table.view == v)].astype(np.float32))
+        inside |= np.array([cv2.pointPolygonTest(hull, (float(x), float(y)), False) >= 0 for x, y in pixels])
+    return inside
+
+
 @dataclass(frozen=True)
 class Judged:
     """How far a calibrated lens errs where corners were seen, and what it claims, RMS, px."""
@@ -141,8 +150,7 @@ class Judged:
 def judged(true: TrueLens, c: Intrinsics) -> Judged:
     """Pixels on a grid, drawn by the true lens along the calibrated rays, after the turn that explains most."""
     grid = c.map.pixels.reshape(-1, 2)
-    seen = c.table.pixels[c.fit.used]
-    near = np.array([np.min(np.sum((seen - g) ** 2, axis=1)) for g in grid]) < 40.0**2
+    near = within_boards(c, grid)
     flat = undistorted(grid[near], c.fit.lens, c.model.fisheye)
     rays = np.column_stack([flat, np.ones(len(flat))])
 

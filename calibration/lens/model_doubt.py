@@ -1,0 +1,99 @@
+"""What the lens model itself may be wrong by: residuals that go together over the picture, and models that fit as well.
+
+A covariance knows the corners' noise and nothing of a lens that the model cannot follow. Two things tell of that. The
+mean residuals in cells of the picture: of a lens that follows they are noise. And the other models that predict
+held-out photographs as well as the chosen one does: where these draw the same ray elsewhere, the photographs do not
+decide between them. What both make is added to the claim. Ours; the second is the spread between models of Bayesian
+model averaging (Hoeting et al. 1999, Statistical Science 14), with the largest difference in place of its mean.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2
+
+from calibration.lens.corner_table import CornerTable
+from calibration.lens.coverage import seen_at
+from calibration.lens.lens_fit import LensFit
+from calibration.lens.lens_ladder import Ladder
+from calibration.lens.lens_models import LensModel, undistorted
+from calibration.lens.projection_map import ProjectionMap
+from geometry.arrays import Array, Ints
+from geometry.camera import project_points_full
+
+AS_GOOD_SE = 2.0  # standard errors of held-out error within which the photographs do not decide between two models
+SIGNIFICANT = 1e-3  # of noise whose means go together as much
+_CORNERS_PER_CELL = 12
+_MOST_COLUMNS = 16
+
+
+@dataclass(frozen=True, slots=True)
+class ModelDoubt:
+    """How far the model may be off, beyond its numbers' covariance."""
+
+    cell_px: Array  # (rows, columns, 2): mean residual in each cell of the picture, projected less measured; nan: none
+    cell_count: Ints  # (rows, columns)
+    p_value: float  # of residuals whose means are as large, if they were noise
+    left_px: float  # RMS per coordinate of what goes together in them beyond noise; 0 where not significant
+    other: LensModel | None  # of the models that predict as well, the one that draws most differently
+    between_px: float  # how far it differs where corners were seen, RMS; 0 where there is none
+    factor: float  # on the sigmas of the lens, so that the claim holds both
+
+
+def model_doubt(table: CornerTable, found: LensFit, ladder: Ladder, at: ProjectionMap, covariance: Array) -> ModelDoubt:
+    """Of a lens with the covariance (p, p) of its numbers, over the part of the picture where corners were seen."""
+    noise = min([found.sigma_px, *(r.fit.sigma_px for r in ladder.rungs if r.fit is not None)])
+    cells, count = _cell_means(table, found)
+    p, left = _beyond_noise(cells, count, noise)
+    inside = seen_at(table, found.used, at.pixels) & np.isfinite(at.by_parameter).all(axis=(2, 3))
+    other, between = None, 0.0
+    for rung in ladder.rungs:
+        as_good = not rung.refused and rung.behind_px2 <= AS_GOOD_SE * rung.standard_error_px2
+        if rung.fit is None or rung.model == found.model or not as_good:
+            continue
+        apart = _apart(at.pixels[inside], found, rung.fit)
+        if apart > between:
+            other, between = rung.model, apart
+    claimed = float(np.mean(np.trace(at.covariance_px2(covariance)[inside], axis1=-2, axis2=-1))) if inside.any() else 0
+    factor = float(np.sqrt(1 + (between**2 + 2 * left**2) / claimed)) if claimed > 0 else 1.0
+    return ModelDoubt(cells, count, p, left, other, between, factor)
+
+
+def _cell_means(table: CornerTable, found: LensFit) -> tuple[Array, Ints]:
+    """Mean residuals (rows, columns, 2), px, and how many there are."""
+    width, height = table.image_size_px
+    pixels, residuals = table.pixels[found.used], found.residuals[found.used]
+    columns = int(np.clip(np.sqrt(len(pixels) / _CORNERS_PER_CELL * width / height), 3, _MOST_COLUMNS))
+    rows = max(2, round(columns * height / width))
+    j = np.clip(((pixels[:, 0] + 0.5) / width * columns).astype(int), 0, columns - 1)
+    i = np.clip(((pixels[:, 1] + 0.5) / height * rows).astype(int), 0, rows - 1)
+    total, count = np.zeros((rows, columns, 2)), np.zeros((rows, columns), dtype=np.int64)
+    np.add.at(total, (i, j), residuals)
+    np.add.at(count, (i, j), 1)
+    return np.where(count[..., None] > 0, total / np.maximum(count, 1)[..., None], np.nan), count
+
+
+def _beyond_noise(cells: Array, count: Ints, noise_px: float) -> tuple[float, float]:
+    """The chance of such means from noise, and what is left of them beyond it (RMS per coordinate, px)."""
+    full = count > 0
+    score = float(np.sum(count[full, None] * cells[full] ** 2)) / noise_px**2
+    dof = 2 * int(full.sum())
+    p = float(chi2.sf(score, dof))
+    left = noise_px * np.sqrt(max(score - dof, 0.0) / (2 * count.sum()))
+    return p, float(left) if p < SIGNIFICANT else 0.0
+
+
+def _apart(pixels: Array, first: LensFit, second: LensFit) -> float:
+    """How far (RMS, px) another lens draws the rays of pixels (n, 2) of the first, after the turn that explains most."""
+    flat = undistorted(pixels, first.lens, first.model.fisheye)
+    rays = np.concatenate([flat, np.ones((len(flat), 1))], axis=1)
+    wide = np.asarray(second.model.fisheye)
+    seen = project_points_full(rays, second.lens[:4], second.lens[4:], np.asarray(np.inf), wide)
+    away = seen.pixels - pixels
+    good = np.isfinite(away).all(axis=1)
+    turn = np.cross(rays[:, None, :], seen.d_point)[good].reshape(-1, 3)
+    moved = away[good].reshape(-1)
+    left = moved - turn @ np.linalg.lstsq(turn, moved, rcond=None)[0]
+    return float(np.sqrt(np.sum(left**2) / max(int(good.sum()), 1)))
