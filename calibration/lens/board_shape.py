@@ -16,7 +16,7 @@ from scipy.stats import chi2
 from calibration.least_squares.adjustment import AdjustmentError
 from calibration.lens.corner_table import CornerTable
 from calibration.lens.hold_out import HeldOut, hold_out, scatter
-from calibration.lens.lens_fit import AS_STATED, BoardFreedom, LensFit, board_as_stated, fit, term_of
+from calibration.lens.lens_fit import AS_STATED, BoardFreedom, LensFit, Values, board_as_stated, fit, term_of
 from geometry.arrays import Array
 
 SIGNIFICANT = 1e-3  # of a true board's chance to look this wrong
@@ -138,7 +138,7 @@ def board_test(table: CornerTable, found: LensFit, asked: Asked = Asked()) -> Bo
     )
 
 
-def _true_board(table: CornerTable, found: LensFit) -> dict[str, object]:
+def _true_board(table: CornerTable, found: LensFit) -> Values:
     """The board as stated, its circles as measured."""
     return {**board_as_stated(len(table.board_points)), "radius": found.values["radius"]}
 

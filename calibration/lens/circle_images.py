@@ -9,9 +9,14 @@ effect under perspective; the outline's nodes, which serve any lens, are ours.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
+from calibration.boards.circle_detection import homography, mapped
 from geometry.arrays import Array
+from geometry.camera import Camera
+from geometry.pose import Pose
 
 # Images of circles hold harmonics 1 and 2 of the angle, the second a hundredth of the first; products of three of them
 # that six nodes cannot tell from a constant are below 1e-5 px. Five nodes err by up to 1e-3 px.
@@ -53,3 +58,26 @@ def centroid(outline: Array) -> tuple[Array, Array]:
         G[:, 1, :, 0] = share * (0.5 * (y * y) @ _D.T - cy[:, None] * dy)
         G[:, 1, :, 1] = share * (cy[:, None] - y) * dx
     return middle + np.stack([cx, cy], axis=1), G
+
+
+def radius_by_areas(board_xy: Array, pixels: Array, areas_px2: Array, camera: Camera) -> float:
+    """Of circles, m, by the areas (n,) of their blobs at pixels (n, 2); board_xy (n, 2), m: where their centres lie.
+
+    Each area over that of a circle of 1 m by the local scale, through the lens; the median. Raises ValueError where the
+    pixels are not of such a board.
+    """
+    alone = replace(camera, camera_from_world=Pose.identity())
+    _, rays = alone.rays(pixels)
+    good = np.isfinite(rays).all(axis=1)
+    if good.sum() < 4:
+        raise ValueError("expected pixels that the lens draws rays to")
+    H = homography(board_xy[good], rays[good, :2] / rays[good, 2:])
+
+    def seen(xy: Array) -> Array:
+        flat = mapped(H, xy)
+        return alone.project(np.concatenate([flat, np.ones((len(flat), 1))], axis=1))
+
+    step = 1e-3 * float(np.ptp(board_xy))
+    by_x, by_y = ((seen(board_xy[good] + d) - seen(board_xy[good] - d)) / (2 * step) for d in step * np.eye(2))
+    scale = np.abs(by_x[:, 0] * by_y[:, 1] - by_x[:, 1] * by_y[:, 0])
+    return float(np.sqrt(np.nanmedian(areas_px2[good] / (np.pi * scale))))

@@ -161,7 +161,9 @@ def _shape(table: CornerTable, rich: LensFit, options: IntrinsicsOptions) -> Boa
         return None
 
 
-def _final(table: CornerTable, chosen: Rung, board: BoardFreedom, folds: int | None) -> tuple[LensFit, HeldOut, Scatter]:
+def _final(
+    table: CornerTable, chosen: Rung, board: BoardFreedom, folds: int | None
+) -> tuple[LensFit, HeldOut, Scatter]:
     """The chosen model once more from all corners: what is no corner is judged by the lens that stays."""
     assert chosen.fit is not None
     assert chosen.held is not None

@@ -91,6 +91,11 @@ class LensFit:
         return float(_array(self.values, "radius")[0, 0])
 
     @property
+    def radius_sigma_m(self) -> float:
+        """1 sigma of it; 0 where the points are points. AdjustmentError."""
+        return float(np.sqrt(self.adjusted.covariance([("radius", 0)])[0, 0])) * self.relative_sigma
+
+    @property
     def poses(self) -> Pose:
         """camera_from_board of all V views."""
         stack = self.values["boards"]
@@ -294,9 +299,7 @@ def fit(
     residuals = everything.project(adjusted.values) - table.pixels
     residuals[~(table.counts(used) > 0)[table.view]] = np.nan
     relative = float(np.sqrt(adjusted.chi2 / max(adjusted.dof, 1)))
-    return LensFit(
-        model, adjusted.values, adjusted, used, residuals, relative * scale, relative, board, dict(dropped)
-    )
+    return LensFit(model, adjusted.values, adjusted, used, residuals, relative * scale, relative, board, dict(dropped))
 
 
 def robust_fit(table: CornerTable, model: LensModel, values: Values, board: BoardFreedom) -> LensFit:

@@ -66,7 +66,7 @@ def climb(
         starts = starts or [f for f in rich if f.model.fisheye == model.fisheye]
         if below is not None and not model.fisheye and model.coefficients > 5:
             starts = [*starts, below]
-        rung = _best_rung(table, used, model, [{**f.values, **shape} for f in starts], board)
+        rung = _best_rung(table, used, model, [{**f.values, **shape} for f in starts] or [None], board)
         if rung.fit is not None and not model.fisheye and model.coefficients:
             below = rung.fit
         fitted.append(rung)
@@ -80,10 +80,10 @@ def climb(
 
 
 def _best_rung(
-    table: CornerTable, used: Bools, model: LensModel, starts: Sequence[Values], board: BoardFreedom
+    table: CornerTable, used: Bools, model: LensModel, starts: Sequence[Values | None], board: BoardFreedom
 ) -> Rung:
     """The model solved from each start, where it fits best."""
-    rungs = [_fitted(table, used, model, start, board) for start in starts or [None]]
+    rungs = [_fitted(table, used, model, start, board) for start in starts]
     return min(rungs, key=lambda r: np.inf if r.fit is None else r.fit.sigma_px)
 
 
@@ -113,7 +113,7 @@ def choose(rungs: Sequence[Rung]) -> Ladder:
         smaller = [r for r in out if r.held is not None and not r.refused][: [r.model for r in able].index(best.model)]
         if smaller:
             least = min(_rms(r) for r in smaller)
-            why += f", and every smaller usable model errs more ({least:.3f} px at best) or leaves residuals that this one explains"
+            why += f", and every smaller usable model errs more ({least:.3f} px at best) or leaves more in them"
     else:
         why = (
             f"its held-out error ({_rms(chosen):.3f} px) is within one standard error of the best model's"

@@ -79,7 +79,7 @@ def named(title: str) -> LensModel:
 
 
 def rational_of_fisheye(numbers: Array, widest_rad: float) -> Array:
-    """The perspective lens (18,) with k1 ... k6 that draws about what a fisheye (18,) does, up to an angle off its axis.
+    """The perspective lens (18,) with k1 ... k6 that draws about what a fisheye (18,) does up to an angle off its axis.
 
     Linear least squares over the radius: of d = r N / D, the equation N - (d / r) D = 0.
     """

@@ -38,7 +38,7 @@ class ModelDoubt:
     p_value: float  # of residuals whose means are as large, if they were noise
     left_px: float  # RMS per coordinate of what goes together in them beyond noise; 0 where not significant
     other: LensModel | None  # of the models that predict as well, the one that draws most differently
-    between_px: float  # how far it differs where corners were seen, RMS; 0 where there is none
+    between_px: float  # how far it differs where corners were seen, RMS, less where it predicts worse; 0: no other
     factor: float  # on the sigmas of the lens, so that the claim holds both
 
 
@@ -53,7 +53,9 @@ def model_doubt(table: CornerTable, found: LensFit, ladder: Ladder, at: Projecti
         as_good = not rung.refused and rung.behind_px2 <= AS_GOOD_SE * rung.standard_error_px2
         if rung.fit is None or rung.model == found.model or not as_good:
             continue
-        apart = _apart(at.pixels[inside], found, rung.fit)
+        behind = rung.behind_px2 / rung.standard_error_px2 if rung.behind_px2 > 0 else 0.0
+        # Weighed by the chance that held-out error leaves it: two standard errors behind, a third counts.
+        apart = _apart(at.pixels[inside], found, rung.fit) * float(np.exp(-(behind**2) / 4))
         if apart > between:
             other, between = rung.model, apart
     claimed = float(np.mean(np.trace(at.covariance_px2(covariance)[inside], axis1=-2, axis2=-1))) if inside.any() else 0
@@ -86,7 +88,7 @@ def _beyond_noise(cells: Array, count: Ints, noise_px: float) -> tuple[float, fl
 
 
 def _apart(pixels: Array, first: LensFit, second: LensFit) -> float:
-    """How far (RMS, px) another lens draws the rays of pixels (n, 2) of the first, after the turn that explains most."""
+    """How far off (RMS, px) another lens draws the rays of the first at pixels (n, 2), the best turn taken out."""
     flat = undistorted(pixels, first.lens, first.model.fisheye)
     rays = np.concatenate([flat, np.ones((len(flat), 1))], axis=1)
     wide = np.asarray(second.model.fisheye)

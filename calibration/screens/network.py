@@ -75,6 +75,7 @@ class Network:
     screen_priors: tuple[Prior, ...] = ()  # what scans say of screens
     lens_priors: tuple[Prior, ...] = ()
     warp_sigma_m: float = WARP_SIGMA_M  # by how much a board may be bent at its edge; 0: not at all
+    radii_m: Array | None = None  # (boards,): of their circles, 0 for boards of corners; None: no circles
     lens_free: Bools | None = None  # (cameras, 18): which lens numbers may move; None: none
 
 
@@ -142,6 +143,8 @@ def _unknowns(network: Network, start: Start) -> tuple[Values, dict[str, bool | 
     values["boards"] = Poses(start.world_from_board)
     count = 0 if network.corners is None else int(network.corners.board.max(initial=-1)) + 1
     values["warp"] = Vectors(np.zeros((count, 3)))
+    if network.radii_m is not None:
+        values["radius"] = Vectors(network.radii_m[:count, None])
     n_cameras, n_screens = len(rig.cameras), len(rig.screens)
     cameras = np.ones((n_cameras, 6), dtype=bool)
     bow = np.zeros((n_screens, 3), dtype=bool)

@@ -173,7 +173,8 @@ class Project:
 def load_project(path: Path, lab_known: bool = False) -> Project:
     """Read and check a calibration.yaml and the lenses that it names; tables and photographs are not opened.
 
-    path may be the folder of it. lab_known: cameras and screens come from a rig.yaml and may be left out. Raises InputError: file, field, what was expected and what was found.
+    path may be the folder of it. lab_known: cameras and screens come from a rig.yaml and may be left out.
+    Raises InputError: file, field, what was expected and what was found.
     """
     path = Path(path)
     if path.is_dir():
@@ -356,7 +357,9 @@ def _broken_references(content: _ProjectBlock, lab_known: bool) -> list[str]:
     out: list[str] = []
     if not lab_known:
         empty = [what for what in ("cameras", "screens") if not getattr(content, what)]
-        out = [f"{what}: expected one or more, got none; only `calibrate beams` takes them from a rig" for what in empty]
+        out = [
+            f"{what}: expected one or more, got none; only `calibrate beams` takes them from a rig" for what in empty
+        ]
     elsewhere = lab_known and not content.screens
     for name, camera in content.cameras.items():
         if camera.screen not in content.screens and not elsewhere:
