@@ -124,8 +124,8 @@ class CircleGrid:
             _check_length(self.kind, "diameter", self.stated_diameter_m)
             if self.stated_diameter_m >= self.neighbours_m:
                 raise ValueError(
-                    f"{self.kind}: expected circles smaller than the {_mm(self.neighbours_m)} between neighbours, got a"
-                    f" diameter of {_mm(self.stated_diameter_m)}; the spacing comes first: {EXAMPLES[self.kind]}"
+                    f"{self.kind}: expected circles smaller than the {1000 * self.neighbours_m:.4g} mm between neighbours, got a"
+                    f" diameter of {_mm(self.stated_diameter_m)}; the spacing comes first; example: {EXAMPLES[self.kind]}"
                 )
 
     @property

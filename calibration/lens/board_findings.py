@@ -9,6 +9,7 @@ from calibration.lens.intrinsics_result import Intrinsics
 
 DOUBTFUL = 2.0  # factor on the sigmas, from what lens models disagree on and residuals that go together
 OUT_OF_SCALE = 0.001  # share by which a board's rows and columns may be out of scale: printers reach .1 %
+UNDETERMINED = 0.002  # of that share, and of the pixels' shape: beyond it the two cannot be told apart
 OTHER_CIRCLE = 0.03  # share by which circles may differ from what was stated
 
 
@@ -51,7 +52,15 @@ def stretch_finding(c: Intrinsics) -> Finding | None:
         f" (p = {s.p_value:.1g}): {s.why}"
     )
     if not s.corrected:
-        return Finding(Level.PASS, text + "; taken as stated.")
+        fx, fy = c.fit.lens[:2]
+        open_question = s.sigma[0] > UNDETERMINED and abs(fx / fy - 1) > UNDETERMINED
+        return _unless_pass(
+            Level.WARN if open_question else Level.PASS,
+            text + "; taken as stated.",
+            f"The photographs cannot tell a board that is out of scale from pixels that are not square, and fx / fy is"
+            f" {fx / fy:.4f}: one of the two is so.",
+            "Photograph the board turned by 90 deg in its plane as well; measure it along both directions.",
+        )
     off = max(abs(s.stretch), abs(s.lean_rad))
     return _unless_pass(
         Level.WARN if off > OUT_OF_SCALE else Level.PASS,

@@ -9,7 +9,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.boards.board_detection import BoardView, find_board
+from calibration.boards.circle_detection import fit_ellipses
 from calibration.boards.kinds import CircleGrid
+from calibration.lens.corner_table import CircleAreas, CornerTable
 from geometry.arrays import Array
 from geometry.rotations import exp
 
@@ -123,3 +126,27 @@ def _ink(scene: CircleScene, R: Array, t: Array, centre: Array, first: Array, la
             place = (1 - b) * across[:-1] + b * across[1:]
             covered += np.sum(place * place, axis=-1) < _radius(scene) ** 2
     return covered / _SAMPLES**2
+
+
+def table_of(scene: CircleScene, seed: int, searched: bool = False) -> CornerTable:
+    """Blobs as detected in the pictures.
+
+    searched: by the whole search for the board; else by its measurement alone, at about the true places, which is much
+    faster and ends in the same numbers.
+    """
+    board = scene.board
+    views, areas = [], []
+    for shot in shots(scene, seed):
+        if searched:
+            view = find_board(shot.image, board)
+            assert isinstance(view, BoardView), view
+            assert view.areas_px2 is not None
+            ids, pixels, area = view.ids, view.pixels, view.areas_px2
+        else:
+            found = fit_ellipses(shot.image, shot.centres, shot.radii_px)
+            ids = np.flatnonzero(np.isfinite(found.areas))
+            pixels, area = found.centres[ids], found.areas[ids]
+        views.append((ids, pixels))
+        areas.append(area)
+    circles = CircleAreas(np.concatenate(areas), board.stated_diameter_m)
+    return CornerTable.of(views, board.points, board.middle, scene.size_px, circles)

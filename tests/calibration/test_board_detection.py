@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from calibration.boards import charuco_detection, chessboard_detection, circle_detection, corner_refinement
+from calibration.boards import charuco_detection, chessboard_detection, corner_refinement
 from calibration.boards.board_detection import NO_CLOSE_LOOK, BoardView, NotFound, find_board
 from calibration.boards.kinds import Board, CircleGrid, parse
 from calibration.lens.circle_images import radius_by_areas
