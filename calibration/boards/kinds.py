@@ -124,8 +124,9 @@ class CircleGrid:
             _check_length(self.kind, "diameter", self.stated_diameter_m)
             if self.stated_diameter_m >= self.neighbours_m:
                 raise ValueError(
-                    f"{self.kind}: expected circles smaller than the {1000 * self.neighbours_m:.4g} mm between neighbours, got a"
-                    f" diameter of {_mm(self.stated_diameter_m)}; the spacing comes first; example: {EXAMPLES[self.kind]}"
+                    f"{self.kind}: expected circles smaller than the {1000 * self.neighbours_m:.4g} mm between"
+                    f" neighbours, got a diameter of {_mm(self.stated_diameter_m)}; the spacing comes first; example:"
+                    f" {EXAMPLES[self.kind]}"
                 )
 
     @property

@@ -89,7 +89,7 @@ def _calibrated(table: CornerTable, options: IntrinsicsOptions) -> Intrinsics:
     noise = max(1.0, spread.factor) if spread.p_value < SCATTER_SIGNIFICANT else 1.0
     distance = options.distance_m or _typical_depth(table, found)
     pixel_map = projection_map(found.model, found.lens, table.image_size_px, distance)
-    doubt = model_doubt(table, found, ladder, pixel_map, found.covariance * noise**2)
+    doubt = model_doubt(table, found, ladder, pixel_map, found.covariance * noise**2, noise)
     out = Intrinsics(
         table=table,
         model=found.model,

@@ -12,7 +12,7 @@ from calibration.least_squares.adjustment import AdjustmentError
 from calibration.least_squares.stacks import Vectors
 from calibration.lens.corner_table import CornerTable
 from calibration.lens.hold_out import BRIEF, HeldOut, Scatter, hold_out, scatter
-from calibration.lens.lens_fit import AS_STATED, BoardFreedom, LensFit, Values, fit, robust_fit
+from calibration.lens.lens_fit import AS_STATED, CORNER_GATE, BoardFreedom, LensFit, Values, fit, robust_fit
 from calibration.lens.lens_models import LADDER, LensModel, folds_in_picture, rational_of_fisheye
 from geometry.arrays import Bools
 
@@ -107,7 +107,7 @@ def choose(rungs: Sequence[Rung]) -> Ladder:
         gain, error = best.held.better_than(r.held)
         out.append(replace(r, behind_px2=gain, standard_error_px2=error))
     as_good = [r for r in out if not r.refused and r.held is not None and r.behind_px2 <= r.standard_error_px2]
-    chosen = next(r for r in as_good if r.model == best.model or not _leaves_something(r, best))
+    chosen = next(r for r in as_good if r.model == best.model or not leaves_something(r, best))
     if chosen.model == best.model:
         why = f"it predicts held-out views best ({_rms(best):.3f} px)"
         smaller = [r for r in out if r.held is not None and not r.refused][: [r.model for r in able].index(best.model)]
@@ -122,11 +122,10 @@ def choose(rungs: Sequence[Rung]) -> Ladder:
     return Ladder(out, chosen, why)
 
 
-def _leaves_something(rung: Rung, best: Rung) -> bool:
+def leaves_something(rung: Rung, best: Rung) -> bool:
     """Whether a model's residuals exceed those of the best one by more than noise and its fewer numbers explain."""
-    assert rung.fit is not None
-    assert best.fit is not None
-    assert best.scatter is not None
+    if rung.fit is None or best.fit is None or best.scatter is None:
+        return False
     more, least = (f.sigma_px**2 * f.adjusted.dof for f in (rung.fit, best.fit))
     noise = best.fit.sigma_px * max(1.0, best.scatter.factor)
     fewer = max(best.model.coefficients - rung.model.coefficients, 3)
@@ -205,7 +204,8 @@ def union_of_used(
             fits += _rich_fit(table, RATIONAL, values, reasons)
     if not fits:
         raise AdjustmentError(reasons[-1])
-    fits.sort(key=lambda f: _information(table, f))
+    gate = CORNER_GATE * min(f.sigma_px for f in fits)
+    fits.sort(key=lambda f: _information(table, f, gate))
     # A view's corners count only where the best fit has a use for the view at all.
     views = table.counts(fits[0].used) > 0
     used = np.any([f.used for f in fits], axis=0) & views[table.view]
@@ -231,9 +231,8 @@ def _as_rational(table: CornerTable, found: LensFit) -> Values:
     return {**found.values, "intrinsics": Vectors(lens[None])}
 
 
-def _information(table: CornerTable, found: LensFit) -> float:
-    """Schwarz's criterion over all corners of views that it uses: what it misses by, and a price for each number."""
-    left = found.residuals[np.isfinite(found.residuals).all(axis=1)]
-    spread = 1.4826 * float(np.median(np.abs(left)))
+def _information(table: CornerTable, found: LensFit, gate_px: float) -> float:
+    """Schwarz's criterion over all corners: what it misses by (a gate at most), and a price for each number."""
+    missed = np.minimum(np.nan_to_num(np.linalg.norm(found.residuals, axis=1), nan=np.inf), gate_px)
     n = 2 * len(table)
-    return n * 2 * np.log(max(spread, 1e-9)) + found.model.coefficients * np.log(n)
+    return n * float(np.log(max(np.sum(missed**2) / n, 1e-18))) + found.model.coefficients * np.log(n)

@@ -17,7 +17,7 @@ from scipy.stats import chi2
 from calibration.lens.corner_table import CornerTable
 from calibration.lens.coverage import seen_at
 from calibration.lens.lens_fit import LensFit
-from calibration.lens.lens_ladder import Ladder
+from calibration.lens.lens_ladder import Ladder, leaves_something
 from calibration.lens.lens_models import LensModel, undistorted
 from calibration.lens.projection_map import ProjectionMap
 from geometry.arrays import Array, Ints
@@ -42,16 +42,23 @@ class ModelDoubt:
     factor: float  # on the sigmas of the lens, so that the claim holds both
 
 
-def model_doubt(table: CornerTable, found: LensFit, ladder: Ladder, at: ProjectionMap, covariance: Array) -> ModelDoubt:
-    """Of a lens with the covariance (p, p) of its numbers, over the part of the picture where corners were seen."""
+def model_doubt(
+    table: CornerTable, found: LensFit, ladder: Ladder, at: ProjectionMap, covariance: Array, scatter: float = 1.0
+) -> ModelDoubt:
+    """Of a lens with the covariance (p, p) of its numbers, over the part of the picture where corners were seen.
+
+    scatter: factor by which photographs scatter more than noise explains: errors that go together within a photograph
+    make means of cells larger as well, and are in the covariance already.
+    """
     noise = min([found.sigma_px, *(r.fit.sigma_px for r in ladder.rungs if r.fit is not None)])
     cells, count = _cell_means(table, found)
-    p, left = _beyond_noise(cells, count, noise)
+    p, left = _beyond_noise(cells, count, noise * scatter)
     inside = seen_at(table, found.used, at.pixels) & np.isfinite(at.by_parameter).all(axis=(2, 3))
     other, between = None, 0.0
+    chosen = ladder.chosen
     for rung in ladder.rungs:
         as_good = not rung.refused and rung.behind_px2 <= AS_GOOD_SE * rung.standard_error_px2
-        if rung.fit is None or rung.model == found.model or not as_good:
+        if rung.fit is None or rung.model == found.model or not as_good or leaves_something(rung, chosen):
             continue
         behind = rung.behind_px2 / rung.standard_error_px2 if rung.behind_px2 > 0 else 0.0
         # Weighed by the chance that held-out error leaves it: two standard errors behind, a third counts.

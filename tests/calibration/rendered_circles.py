@@ -139,7 +139,8 @@ def table_of(scene: CircleScene, seed: int, searched: bool = False) -> CornerTab
     for shot in shots(scene, seed):
         if searched:
             view = find_board(shot.image, board)
-            assert isinstance(view, BoardView), view
+            if not isinstance(view, BoardView):  # as a person would leave out a picture
+                continue
             assert view.areas_px2 is not None
             ids, pixels, area = view.ids, view.pixels, view.areas_px2
         else:
