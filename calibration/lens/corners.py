@@ -106,7 +106,9 @@ class CornerTerm:
             out["stretch"] = by_board_point[..., :1] * placed.from_middle[:, None]
         if "print" in values:
             out["print"] = by_board_point
-        if "radius" in values:
+        if "radius" in values and not np.any(placed.by_radius):
+            out["radius"] = np.zeros((*by_board_point.shape[:2], 1))
+        elif "radius" in values:
             out["radius"] = (by_board_point @ placed.by_radius[..., None])[..., :1]
         return out
 
@@ -161,9 +163,11 @@ class _Placed:
             on_board += _stack(values, "print", Vectors).array[term.point[rows]]
         on_board[:, 0] += np.sum(stretch * from_middle, axis=1)
         on_board[:, 2] += np.sum(warp * _bend(from_middle), axis=1)
-        by_radius = np.concatenate([step, np.zeros((len(rows), 1))], axis=1)
-        by_radius[:, 0] += np.sum(stretch * step, axis=1)
-        by_radius[:, 2] += np.sum(warp * _bend_slope(from_middle, step), axis=1)
+        by_radius = np.zeros((len(rows), 3))
+        if radii is not None:
+            by_radius[:, :2] = step
+            by_radius[:, 0] += np.sum(stretch * step, axis=1)
+            by_radius[:, 2] += np.sum(warp * _bend_slope(from_middle, step), axis=1)
         in_world = _stack(values, "boards", Poses).pose[placement].apply(on_board)
         in_camera = _stack(values, "cameras", Poses).pose[camera].apply(in_world)
         return _Placed(rows, camera, from_middle, on_board, in_world, in_camera, by_radius)

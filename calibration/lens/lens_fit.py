@@ -255,7 +255,7 @@ def adjust(
         free["print"] = np.repeat(seen[:, None], 3, axis=1)
         known.append(Anchors("print", np.zeros((len(seen), 3)), _PRINT_SIGMA * table.spacing_m))
     term = term_of(table, used, model.fisheye, sigma_px, loss)
-    basis = {"intrinsics": _lens_basis(term, known, model, values)} if whole_lens and model.coefficients else {}
+    basis = {"intrinsics": _lens_basis(term, known, model, values)} if whole_lens and model.coefficients > 5 else {}
     return solve(values, [term, *known], free, limits, basis)
 
 

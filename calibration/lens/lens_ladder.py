@@ -14,12 +14,14 @@ from calibration.lens.corner_table import CornerTable
 from calibration.lens.hold_out import BRIEF, HeldOut, Scatter, hold_out, scatter
 from calibration.lens.lens_fit import AS_STATED, CORNER_GATE, BoardFreedom, LensFit, Values, fit, robust_fit
 from calibration.lens.lens_models import LADDER, LensModel, folds_in_picture, rational_of_fisheye
+from calibration.lens.residual_cells import SIGNIFICANT, beyond_noise, cell_means
 from geometry.arrays import Bools
 
 # With so many corners time counts: models that cannot be chosen any more are not solved another five times. 400 views
 # took 25 s without this, 11 s with it; the choice is the same.
 MANY_CORNERS = 4000
 RATIONAL = LensModel(8)
+KEPT = 0.99  # share of the corners that a lens which follows leaves in use
 SYSTEMATIC = 1e-3  # of residuals' chance to exceed those of the best model so far by noise alone
 
 
@@ -64,8 +66,10 @@ def climb(
     for model in LADDER if only is None else (only,):
         starts = [f for f in rich if f.model.fisheye == model.fisheye and f.model.coefficients <= model.coefficients]
         starts = starts or [f for f in rich if f.model.fisheye == model.fisheye]
-        if below is not None and not model.fisheye and model.coefficients > 5:
-            starts = [*starts, below]
+        if below is not None and not model.fisheye and model.coefficients >= RATIONAL.coefficients:
+            starts = [*(f for f in starts if f.model == RATIONAL), below]
+        elif len(starts) > 1:
+            starts = starts[:1]  # the best of them
         rung = _best_rung(table, used, model, [{**f.values, **shape} for f in starts] or [None], board)
         if rung.fit is not None and not model.fisheye and model.coefficients:
             below = rung.fit
@@ -199,7 +203,9 @@ def union_of_used(
     reasons: list[str] = []
     for model, values in starts:
         fits += _rich_fit(table, model, values, reasons)
-    if only is None or only.coefficients >= RATIONAL.coefficients:
+    leaves = [beyond_noise(*cell_means(table, f), f.sigma_px)[0] < SIGNIFICANT or f.used.mean() < KEPT for f in fits]
+    asked = only is not None and only.coefficients >= RATIONAL.coefficients
+    if asked or (only is None and all(leaves)):
         for values in [_as_rational(table, f) for f in fits]:
             fits += _rich_fit(table, RATIONAL, values, reasons)
     if not fits:

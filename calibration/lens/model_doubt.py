@@ -12,7 +12,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
 
 from calibration.lens.corner_table import CornerTable
 from calibration.lens.coverage import seen_at
@@ -20,13 +19,11 @@ from calibration.lens.lens_fit import LensFit
 from calibration.lens.lens_ladder import Ladder, leaves_something
 from calibration.lens.lens_models import LensModel, undistorted
 from calibration.lens.projection_map import ProjectionMap
+from calibration.lens.residual_cells import beyond_noise, cell_means
 from geometry.arrays import Array, Ints
 from geometry.camera import project_points_full
 
 AS_GOOD_SE = 2.0  # standard errors of held-out error within which the photographs do not decide between two models
-SIGNIFICANT = 1e-3  # of noise whose means go together as much
-_CORNERS_PER_CELL = 12
-_MOST_COLUMNS = 16
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,8 +48,8 @@ def model_doubt(
     make means of cells larger as well, and are in the covariance already.
     """
     noise = min([found.sigma_px, *(r.fit.sigma_px for r in ladder.rungs if r.fit is not None)])
-    cells, count = _cell_means(table, found)
-    p, left = _beyond_noise(cells, count, noise * scatter)
+    cells, count = cell_means(table, found)
+    p, left = beyond_noise(cells, count, noise * scatter)
     inside = seen_at(table, found.used, at.pixels) & np.isfinite(at.by_parameter).all(axis=(2, 3))
     other, between = None, 0.0
     chosen = ladder.chosen
@@ -68,30 +65,6 @@ def model_doubt(
     claimed = float(np.mean(np.trace(at.covariance_px2(covariance)[inside], axis1=-2, axis2=-1))) if inside.any() else 0
     factor = float(np.sqrt(1 + (between**2 + 2 * left**2) / claimed)) if claimed > 0 else 1.0
     return ModelDoubt(cells, count, p, left, other, between, factor)
-
-
-def _cell_means(table: CornerTable, found: LensFit) -> tuple[Array, Ints]:
-    """Mean residuals (rows, columns, 2), px, and how many there are."""
-    width, height = table.image_size_px
-    pixels, residuals = table.pixels[found.used], found.residuals[found.used]
-    columns = int(np.clip(np.sqrt(len(pixels) / _CORNERS_PER_CELL * width / height), 3, _MOST_COLUMNS))
-    rows = max(2, round(columns * height / width))
-    j = np.clip(((pixels[:, 0] + 0.5) / width * columns).astype(int), 0, columns - 1)
-    i = np.clip(((pixels[:, 1] + 0.5) / height * rows).astype(int), 0, rows - 1)
-    total, count = np.zeros((rows, columns, 2)), np.zeros((rows, columns), dtype=np.int64)
-    np.add.at(total, (i, j), residuals)
-    np.add.at(count, (i, j), 1)
-    return np.where(count[..., None] > 0, total / np.maximum(count, 1)[..., None], np.nan), count
-
-
-def _beyond_noise(cells: Array, count: Ints, noise_px: float) -> tuple[float, float]:
-    """The chance of such means from noise, and what is left of them beyond it (RMS per coordinate, px)."""
-    full = count > 0
-    score = float(np.sum(count[full, None] * cells[full] ** 2)) / noise_px**2
-    dof = 2 * int(full.sum())
-    p = float(chi2.sf(score, dof))
-    left = noise_px * np.sqrt(max(score - dof, 0.0) / (2 * count.sum()))
-    return p, float(left) if p < SIGNIFICANT else 0.0
 
 
 def _apart(pixels: Array, first: LensFit, second: LensFit) -> float:
