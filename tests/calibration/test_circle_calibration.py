@@ -42,7 +42,7 @@ def test_a_lens_from_circles_errs_by_its_sigmas_and_the_circles_are_measured():
 
 def test_circles_taken_for_points_would_bias_the_lens_far_beyond_its_sigmas():
     c = calibrate_intrinsics(replace(pictures(), circles=None), QUICK)
-    assert nees(c) > 20
+    assert nees(c) > 8  # though the scatter between photographs has raised the sigmas
 
 
 def test_a_size_that_nothing_tells_is_solved_for():
