@@ -336,6 +336,9 @@ def board(board: str, out: Path, page: str, dpi: float) -> None:
 )
 @click.option("--lens", default="auto", show_default=True, help="0, 4, 5, 8, 12, fisheye; auto: by views held out.")
 @click.option("--warp", default="auto", show_default=True, help="auto, on, off: is the board's bend solved for.")
+@click.option(
+    "--stretch", default="auto", show_default=True, help="auto, on, off: is the board's scale x to y solved for."
+)
 @click.option("--valid-days", default=365, show_default=True, type=click.IntRange(min=1), help="How long it holds.")
 def camera(
     photos: tuple[Path, ...],
@@ -345,6 +348,7 @@ def camera(
     distance_m: float | None,
     lens: str,
     warp: str,
+    stretch: str,
     valid_days: int,
 ) -> None:
     """Calibrate a camera's lens from photos of a board: files, folders, patterns or a video.
@@ -356,7 +360,12 @@ def camera(
     from lab.calibrate.camera import CameraOptions, calibrate_camera
 
     options = CameraOptions(
-        name=name or out.resolve().name, distance_m=distance_m, lens=lens, warp=warp, valid_days=valid_days
+        name=name or out.resolve().name,
+        distance_m=distance_m,
+        lens=lens,
+        warp=warp,
+        stretch=stretch,
+        valid_days=valid_days,
     )
     with _progress("photos") as progress:
         tell = None if progress is None else lambda done, total, _: progress(done, total)
