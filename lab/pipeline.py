@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Protocol
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from geometry.light_centroid import centre_offsets
 from geometry.rig import Rig
-from lab.frames import FrameReader, FrameSet, open_frames
+from lab.frames import FrameSet, open_frames
 from lab.pictures import Missing
 from lab.run_file import Run
 from lab.sensor_noise import CameraNoise, camera_noises
@@ -32,6 +32,20 @@ class Tracker(Protocol):
 
     def step(self, dt_s: float, found: Sequence[Detections | None]) -> TrackedFrame:
         """One frame. dt_s: time since the frame before (0 for the first); found: per camera, None without a picture."""
+
+
+class Frames(Protocol):
+    """Where the pictures of all cameras come from, frame by frame: recorded (lab.frames) or live (lab.watch)."""
+
+    @property
+    def notes(self) -> list[str]:
+        """What a reader of the results should know, in plain words; complete once the iteration has ended."""
+
+    @property
+    def expected_frames(self) -> int | None:
+        """How many frames there will be; None where nothing tells."""
+
+    def __iter__(self) -> Iterator[FrameSet]: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,9 +83,10 @@ class Pipeline:
     """One run in work. Iterate over `records()` once; `notes`, `noise` and `timings` are complete afterwards."""
 
     run: Run
-    reader: FrameReader
+    reader: Frames
     tracker: Tracker
     noise: dict[str, CameraNoise]  # of cameras with pictures
+    on_record: Callable[[FrameRecord], None] | None = None  # called with each record as soon as it is known
     timings: Timings = field(default_factory=Timings)
 
     @staticmethod
@@ -98,7 +113,10 @@ class Pipeline:
             tracked = self.tracker.step(dt_s, found)
             before = t_s
             self._spent("tracking", clock)
-            yield FrameRecord(frames.frame, t_s, dt_s, found, missing, tracked)
+            record = FrameRecord(frames.frame, t_s, dt_s, found, missing, tracked)
+            if self.on_record is not None:
+                self.on_record(record)
+            yield record
             clock = time.perf_counter()
 
     def detections(self) -> Iterator[tuple[int, tuple[Detections | None, ...]]]:

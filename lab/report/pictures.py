@@ -20,7 +20,7 @@ from lab.report import svg
 from lab.report.material import Material
 from lab.report.tracks import SPOT_COLOURS
 from lab.results import SPOT_STATUSES, read_table
-from lab.run_file import DetectionsTable, VideoFile
+from lab.run_file import DetectionsTable, LiveDevice, VideoFile
 from tracking.detections import Detections
 from tracking.statuses import PoseStatus, SpotStatus
 
@@ -136,7 +136,7 @@ def pictures(m: Material, results: Path, selection: list[Event]) -> list[str]:
     read: dict[tuple[str, int], Grey | str] = {}
     for camera, source in m.run.cameras.items():
         frames = [int(m.spots.frames[e.index]) for e in selection if e.camera == camera]
-        if not frames or isinstance(source, DetectionsTable):
+        if not frames or isinstance(source, DetectionsTable | LiveDevice):
             continue
         try:
             found = pictures_at(m.run, camera, frames)
