@@ -77,6 +77,7 @@ def watch_run(
         output = LiveOutput(Path(out), frames, FrameChecks(run.rig, run.covariance), sender)
         stack.callback(output.close)
         _get_ready(run)
+        _log.info("ready: waiting for the first picture")
         with frames, _low_latency():
             first = frames.begin()
             if not first:
