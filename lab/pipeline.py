@@ -12,7 +12,7 @@ import numpy as np
 from geometry.light_centroid import centre_offsets
 from geometry.rig import Rig
 from lab.frames import FrameSet, open_frames
-from lab.pictures import Missing
+from lab.pictures import Grey, Missing
 from lab.run_file import Run
 from lab.sensor_noise import CameraNoise, camera_noises
 from tracking.detections import Detections
@@ -139,11 +139,15 @@ class Pipeline:
                 missing.append(picture.reason)
                 continue
             if isinstance(picture, np.ndarray):
-                noise = self.noise[name]
-                picture = on_beam_axes(noise.detect(picture, self.run.tracker.detect), self.run.rig, name, noise.model)
+                picture = spots_in(picture, self.run, name, self.noise[name])
             found.append(picture)
             missing.append("")
         return tuple(found), tuple(missing)
+
+
+def spots_in(picture: Grey, run: Run, camera: str, noise: CameraNoise) -> Detections:
+    """The points that one picture of a run's camera shows. For one thread at a time and camera."""
+    return on_beam_axes(noise.detect(picture, run.tracker.detect), run.rig, camera, noise.model)
 
 
 def on_beam_axes(found: Detections, rig: Rig, camera: str, noise: NoiseModel | None) -> Detections:

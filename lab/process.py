@@ -22,7 +22,7 @@ from lab.fields import dataclass_from_yaml
 from lab.fingerprints import fingerprints
 from lab.frame_checks import FrameChecks
 from lab.json_text import write_json
-from lab.model_check.keeper import FrameKeeper, claimed_covariances
+from lab.model_check.keeper import FrameKeeper, claimed_covariances, widths
 from lab.pipeline import FrameRecord, Pipeline
 from lab.run_facts import CameraFacts, RunFacts
 from lab.run_file import Run, load_run
@@ -217,7 +217,8 @@ def write_tables(
         for record, known_then in checks.passed(records):
             tables.write(record, known_then)
             claimed = claimed_covariances(record.tracked, record.detections, model.camera_of, run.tracker)
-            keeper.add_tracked(record.t_s, record.tracked, record.tracked.predicted_cov_px2, claimed)
+            width = widths(record.tracked, record.detections, model.camera_of)
+            keeper.add_tracked(record.t_s, record.tracked, record.tracked.predicted_cov_px2, claimed, width)
             facts.add(record, known_then)
             on_frame(record, known_then)
     from lab.model_check.check import check_kept  # the words of its report: only for those who need them

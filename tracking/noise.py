@@ -29,6 +29,10 @@ class NoiseModel:
     floor_dn2: float  # read noise and rounding, DN^2 (estimated: all noise at the background's level)
     slope_dn: float  # DN^2 per DN: 1 / (electrons per DN)
     black_dn: float = 0.0  # level that the floor belongs to
+    texture: float = 0.0  # contrast of the background's fixed structure over a few pixels, share of its level: what a
+    # spot must stand out of beside the noise. Its share in the errors of spots is another matter (place_errors.py)
+
+    banding_dn: float = 0.0  # sigma of steps of the grey scale that no noise blurs: rounding goes together over pixels
 
     def __post_init__(self) -> None:
         if not (self.floor_dn2 > 0 and self.slope_dn >= 0):

@@ -28,6 +28,7 @@ class PlaceErrors:
 
     share: float  # of the spots' error variance, in [0, 1]
     alike: Array  # (T,) number of frames, this one included, with the same errors; mean over the views
+    elsewhere: float = 0.0  # what share of it is the same in all places: errors of the rig, not of a place
     few: float = 1.0  # factor of their variance for what so few places leave unknown of it
 
     def factor(self, averaged: Array) -> Array:
@@ -59,7 +60,7 @@ def place_errors(residual: Array, uv_px: Array, width_px: Array, averaged: Array
     frames, views = residual.shape[:2]
     width = np.where(np.isfinite(width_px), np.maximum(width_px, 0.5), USUAL_WIDTH_PX)
     alike = np.ones((frames, views))
-    products = expected = variance = known = 0.0
+    products = expected = variance = known = far_products = far_expected = 0.0
     for view in range(views):
         rows = np.flatnonzero(np.isfinite(residual[:, view]).all(axis=-1))
         if len(rows) < 2:
@@ -71,6 +72,8 @@ def place_errors(residual: Array, uv_px: Array, width_px: Array, averaged: Array
             some = rows[start : start + _CHUNK]
             r, at = residual[some, view], uv_px[some, view]
             rho = correlation(np.linalg.norm(at[:, None] - at[None], axis=-1), width[view])
+            far_products += float(np.sum((rho == 0) * (r @ r.T))) / mean_square
+            far_expected += float(np.count_nonzero(rho == 0))
             np.fill_diagonal(rho, 0.0)
             alike[some, view] = 1 + rho.sum(axis=1)
             weight = 0.5 / mean_square  # each pair is counted twice
@@ -94,4 +97,5 @@ def place_errors(residual: Array, uv_px: Array, width_px: Array, averaged: Array
     # Few places say little of the size of their errors: Student's distribution is wider by this factor in variance.
     free = 2 * (1 - absorbed) * float(np.sum(labelled / np.maximum(alike, 1.0)))
     few = min(free / max(free - 2, 1e-9), _LARGEST_STUDENT)
-    return PlaceErrors(place / (place + white), mean_alike, few)
+    elsewhere = max(far_products / far_expected, 0.0) if far_expected > 0 else 0.0
+    return PlaceErrors(place / (place + white), mean_alike, elsewhere, few)

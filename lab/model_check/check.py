@@ -29,6 +29,7 @@ from lab.model_check.effect import Effect, effect_of
 from lab.model_check.faults import FaultColumns, possible_faults
 from lab.model_check.keeper import FrameKeeper
 from lab.model_check.linear import Linearised, linearise
+from lab.model_check.place import with_place_errors
 from lab.model_check.recording import Recording, evenly
 from lab.model_check.statistics import Statistics, group_key, residual_weights, statistics
 from lab.model_check.unseen import unseen_finding, unseen_views
@@ -104,6 +105,7 @@ def check_model(rig: Rig, recording: Recording, calibration: RigCovariance | Non
     model = SpotModel.of(rig)
     if recording.seen.shape[1] != len(model):
         raise ValueError(f"recording: expected {len(model)} views as the rig has, got {recording.seen.shape[1]}")
+    recording = with_place_errors(recording, model)
     fit_for_it = np.flatnonzero(recording.usable.sum(axis=1) >= _FEWEST_SPOTS)
     columns = FaultColumns.of(rig, model, calibration)
     each = 2 * len(model) * len(columns.names)

@@ -41,6 +41,16 @@ def claimed_covariances(
     return out
 
 
+def widths(tracked: TrackedFrame, found: Sequence[Detections | None], camera_of: Ints) -> Array:
+    """Sigmas (n,), px, of the light of the n views' detections; nan without. camera_of as in `claimed_covariances`."""
+    out = np.full(len(camera_of), np.nan)
+    for view in np.flatnonzero(tracked.point != UNMATCHED):
+        points = found[int(camera_of[view])]
+        if points is not None:
+            out[view] = points.major_px[tracked.point[view]]
+    return out
+
+
 @dataclass(frozen=True, slots=True)
 class KeptFrame:
     """One frame of n views, as a Recording has them."""
@@ -53,6 +63,7 @@ class KeptFrame:
     predicted_px: Array  # (n, 2); nan without
     predicted_cov_px2: Array  # (n, 2, 2); nan without
     pose_covariance: Array | None  # (6, 6)
+    width_px: Array | None = None  # (n,) sigma of the light; nan where not seen or not known
 
 
 @dataclass(slots=True)
@@ -75,6 +86,7 @@ class FrameKeeper:
         predicted_px: Array | None = None,
         predicted_cov_px2: Array | None = None,
         pose_covariance: Array | None = None,
+        width_px: Array | None = None,
     ) -> None:
         """The next frame. Shapes as in KeptFrame; the arrays are not copied."""
         number, self._count = self._count, self._count + 1
@@ -83,7 +95,7 @@ class FrameKeeper:
         n = len(seen)
         nothing = np.full((n, 2), np.nan) if predicted_px is None else predicted_px
         unsure = np.full((n, 2, 2), np.nan) if predicted_cov_px2 is None else predicted_cov_px2
-        self._frames.append(KeptFrame(t_s, seen, uv_px, cov_px2, pose, nothing, unsure, pose_covariance))
+        self._frames.append(KeptFrame(t_s, seen, uv_px, cov_px2, pose, nothing, unsure, pose_covariance, width_px))
         self._numbers.append(number)
         if len(self._frames) > self.most:
             self._stride *= 2
@@ -97,6 +109,7 @@ class FrameKeeper:
         tracked: TrackedFrame,
         predicted_cov_px2: Array | None = None,
         claimed_px2: Array | None = None,
+        width_px: Array | None = None,
     ) -> None:
         """The next frame as a tracker or a smoother reports it: seen is what it measured.
 
@@ -116,6 +129,7 @@ class FrameKeeper:
             tracked.predicted_px,
             predicted_cov_px2,
             tracked.pose_covariance,
+            width_px,
         )
 
     def recording(self) -> Recording | None:
@@ -135,5 +149,18 @@ class FrameKeeper:
             poses=Pose(np.stack([p.rotation for p in poses]), np.stack([p.translation for p in poses])),
             predicted_px=np.stack([k.predicted_px for k in kept]),
             predicted_cov_px2=np.stack([k.predicted_cov_px2 for k in kept]),
+            width_px=_usual(kept),
             pose_covariance=None if all(k.pose_covariance is None for k in kept) else np.stack(claims),
         )
+
+
+def _usual(kept: Sequence[KeptFrame]) -> Array | None:
+    """Median over the frames of each view's width (n,); None where no frame knows any."""
+    widths = [k.width_px for k in kept if k.width_px is not None]
+    if not widths:
+        return None
+    stack = np.stack(widths)
+    known = np.isfinite(stack).any(axis=0)
+    out = np.full(stack.shape[1], np.nan)
+    out[known] = np.nanmedian(stack[:, known], axis=0)
+    return out

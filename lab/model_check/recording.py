@@ -23,6 +23,7 @@ class Recording:
     predicted_px: Array | None = None  # (T, n, 2) one-step predictions, made before the picture was looked at ...
     predicted_cov_px2: Array | None = None  # (T, n, 2, 2) ... and what they claim; of where the spot will be
     pose_covariance: Array | None = None  # (T, 6, 6) claimed by the run, [m in world, rad in body]
+    width_px: Array | None = None  # (n,) usual sigma of each view's light; nan or None: not known
 
     def __post_init__(self) -> None:
         T, n = self.seen.shape
@@ -33,6 +34,7 @@ class Recording:
             "predicted_px": (T, n, 2),
             "predicted_cov_px2": (T, n, 2, 2),
             "pose_covariance": (T, 6, 6),
+            "width_px": (n,),
         }
         for name, shape in expected.items():
             value = getattr(self, name)

@@ -28,7 +28,10 @@ _FAILURES = 5  # of a device in a row: it has gone
 
 
 class LiveCamera(Protocol):
-    """Gives pictures to an inbox until it ends or is told to stop."""
+    """Gives pictures to an inbox until it ends, or the inbox stops."""
+
+    name: str
+    inbox: Inbox
 
     def run(self) -> None:
         """Give pictures; for a thread of its own."""
@@ -70,6 +73,7 @@ class FolderCamera:
     def run(self) -> None:
         """Look, read, wait, until the inbox stops."""
         while not self.inbox.stopping.is_set():
+            self.inbox.catch_up(self.name)
             if not self.look():
                 idle = time.perf_counter() - self._busy_s > _IDLE_S
                 self.inbox.stopping.wait(_POLL_IDLE_S if idle else POLL_S)
@@ -161,6 +165,7 @@ class DeviceCamera:
         failures = 0
         try:
             while not self.inbox.stopping.is_set():
+                self.inbox.catch_up(self.name)
                 if not self.endless and not self.inbox.has_room(self.name):
                     self.inbox.stopping.wait(POLL_S)
                     continue
@@ -179,7 +184,6 @@ class DeviceCamera:
                 self.inbox.give(self.name, number, self._decoded(), arrived_s)
         finally:
             self.capture.release()
-            self.inbox.end(self.name)
 
     @property
     def notes(self) -> list[str]:
@@ -216,15 +220,16 @@ def open_device(name: str, device: int | str, size_px: tuple[int, int], inbox: I
     return DeviceCamera(name, capture, size_px, inbox, FrameClock(rate_hz), endless)
 
 
-def in_thread(camera: LiveCamera, name: str, failed: Callable[[BaseException], None]) -> threading.Thread:
+def in_thread(camera: LiveCamera, failed: Callable[[BaseException], None]) -> threading.Thread:
     """A thread that runs a camera; failed: called with what went wrong within it."""
 
     def work() -> None:
         try:
             camera.run()
+            camera.inbox.finish(camera.name)
         except BaseException as error:
             failed(error)
 
-    thread = threading.Thread(target=work, name=f"watch-{name}", daemon=True)
+    thread = threading.Thread(target=work, name=f"watch-{camera.name}", daemon=True)
     thread.start()
     return thread

@@ -7,16 +7,20 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TypeAlias
 
+import numpy as np
+
 from lab.pictures import DROPPED, Grey, Missing
+from tracking.detections import Detections
 
 MOST_WAITING = 32  # pictures of one camera that wait here; of a folder the others wait on disk
 LONGEST_GAP = 10_000  # frame numbers: a picture so far beyond all others is a stray file
 
-Content: TypeAlias = Grey | Missing
+Content: TypeAlias = Grey | Detections | Missing
+Finder: TypeAlias = Callable[[Grey], Detections]
 
 
 @dataclass(slots=True)
@@ -40,6 +44,7 @@ class CameraBox:
     refused: int = 0  # pictures that there was no room for
     strays: list[int] = field(default_factory=list)
     given: int = 0  # pictures in all
+    grey: bool = False  # pictures wait here whose points are not looked for yet
 
     def later_s(self, frame: int) -> float | None:
         """Since when (perf_counter) there has been a picture of a later frame; None without any."""
@@ -61,6 +66,8 @@ def is_complete(
     first = []
     for box in boxes:
         if frame in box.pictures:
+            if isinstance(box.pictures[frame].content, np.ndarray):
+                return False, []  # its points are being looked for
             first.append(box.pictures[frame].seen_s)
             continue
         later = box.later_s(frame)
@@ -85,14 +92,52 @@ class Inbox:
         self.stopping = threading.Event()  # the cameras shall stop
         self.next_frame: int | None = None  # the first that is not closed yet; None: not begun
         self.last_seen_s: float | None = None  # when something came, of whatever camera
+        self._finders: Mapping[str, Finder] | None = None
         self._interval_s, self._timeout_s = interval_s, timeout_s
 
     def has_room(self, camera: str) -> bool:
         """Whether a camera may give another picture. Only its own thread adds to its box, so the answer holds."""
         return len(self.boxes[camera].pictures) < MOST_WAITING
 
+    def find_with(self, finders: Mapping[str, Finder]) -> None:
+        """From now on the points of each camera's pictures are looked for, in the camera's own thread."""
+        with self.changed:
+            self._finders = finders
+            self.changed.notify_all()
+
+    def catch_up(self, camera: str) -> None:
+        """Look for the points of pictures that were given before there was a finder. By the camera's own thread."""
+        box = self.boxes[camera]
+        if not (box.grey and self._finders):
+            return
+        with self.changed:
+            grey = sorted(n for n, w in box.pictures.items() if isinstance(w.content, np.ndarray))
+        for number in grey:
+            waiting = box.pictures[number]  # no frame is taken before its points are found
+            assert isinstance(waiting.content, np.ndarray)
+            found = self._finders[camera](waiting.content)
+            with self.changed:
+                waiting.content = found
+                self.changed.notify_all()
+        box.grey = False
+
+    def finish(self, camera: str) -> None:
+        """The last of a camera's thread: wait for the finders, and catch up."""
+        with self.changed:
+            self.boxes[camera].ended = True
+            self.changed.notify_all()
+            while self._finders is None and not self.stopping.is_set():
+                self.changed.wait(0.05)
+        self.catch_up(camera)
+
     def give(self, camera: str, number: int, content: Content, arrived_s: float | None) -> None:
         """A camera gives a picture, or why there is none."""
+        self.catch_up(camera)
+        if isinstance(content, np.ndarray):
+            if self._finders is None:
+                self.boxes[camera].grey = True
+            else:
+                content = self._finders[camera](content)
         with self.changed:
             box = self.boxes[camera]
             box.incomplete.pop(number, None)
@@ -114,12 +159,6 @@ class Inbox:
         """A camera could not give a picture since its box was full."""
         with self.changed:
             self.boxes[camera].refused += 1
-
-    def end(self, camera: str) -> None:
-        """A camera gives no more."""
-        with self.changed:
-            self.boxes[camera].ended = True
-            self.changed.notify_all()
 
     def take(self, frame: int) -> tuple[dict[str, Content], float | None]:
         """A frame's pictures by camera, and when (time.time()) the last of them arrived; the frame is closed with it.

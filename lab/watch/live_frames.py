@@ -64,8 +64,8 @@ class LiveFrames:
         self._cameras = {name: self._camera(name) for name in self.run.cameras}
 
     def __enter__(self) -> LiveFrames:
-        for name, camera in self._cameras.items():
-            thread = in_thread(camera, name, self._failed)
+        for camera in self._cameras.values():
+            thread = in_thread(camera, self._failed)
             self._stack.callback(thread.join, 5.0)
         self._stack.callback(self.inbox.stopping.set)
         return self
@@ -176,7 +176,7 @@ class LiveFrames:
     @staticmethod
     def _usable(box: CameraBox) -> list[Grey]:
         contents = [waiting.content for _, waiting in sorted(box.pictures.items(), key=lambda item: item[0])]
-        return [content for content in contents if not isinstance(content, Missing)]
+        return [content for content in contents if isinstance(content, np.ndarray)]
 
     def _failed(self, error: BaseException) -> None:
         with self.inbox.changed:

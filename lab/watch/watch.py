@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,8 @@ from geometry.pose import Pose
 from geometry.spots import SpotModel
 from lab.errors import RunError
 from lab.frame_checks import FrameChecks
-from lab.pipeline import Pipeline, tracker_of
+from lab.pictures import Grey
+from lab.pipeline import Pipeline, spots_in, tracker_of
 from lab.process import Outcome, are_results, ready_run, write_results
 from lab.run_file import Run
 from lab.sensor_noise import CameraNoise
@@ -85,11 +87,16 @@ def watch_run(
             noise = {name: CameraNoise(name, camera.noise) for name, camera in run.rig.cameras.items()}
             for name, pictures in first.items():
                 noise[name].learn(pictures)
+            frames.inbox.find_with({name: partial(_spots, run, name, noise[name]) for name in noise})
             pipeline = Pipeline(run, frames, tracker_of(run), noise, output.write)
             outcome = write_results(
                 pipeline, work, Path(out), started, progress=progress, more=lambda: output.finish(work)
             )
     return WatchOutcome(outcome, output.latency)
+
+
+def _spots(run: Run, camera: str, noise: CameraNoise, picture: Grey) -> Detections:
+    return spots_in(picture, run, camera, noise)
 
 
 @contextlib.contextmanager

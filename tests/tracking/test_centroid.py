@@ -44,7 +44,7 @@ from tracking.detection.table import (
 )  # fmt: skip
 
 px = 1.0
-NOISE = Noise(1.5**2 + 1 / 12, 1 / 30, 0.0)
+NOISE = Noise(1.5**2 + 1 / 12, 1 / 30, 0.0, 0.0, 0.0)
 sigmas = st.floats(0.3, 15)
 
 
@@ -178,7 +178,7 @@ def test_moments_come_close_and_the_fit_reaches_the_truth_without_noise():
     table = start(spot, 1000.0)
     find_moments(image, table, cells)
     assert np.abs(table[0, [MOMENT_U, MOMENT_V]] - [40.3, 30.8]).max() < 0.1 * px
-    fit_all(image, table, Noise(1.0, 1.0, 1000.0), 65535.0, 20.0, 0.0, cells, algebra)
+    fit_all(image, table, Noise(1.0, 1.0, 1000.0, 0.0, 0.0), 65535.0, 20.0, 0.0, cells, algebra)
     assert np.abs(table[0, [U, V]] - [40.3, 30.8]).max() < 2e-4 * px
     assert ellipse.axes(*table[0, UU : UU + 3]) == pytest.approx((3.1, 1.7, 25.0), abs=0.01)
     assert table[0, FLUX] == pytest.approx(spot.flux, rel=1e-3)
@@ -249,5 +249,5 @@ def test_centres_are_not_drawn_to_pixels(sigma, lock):
         cells, algebra = room()
         table = start(spot, 1000.0)
         find_moments(image, table, cells)
-        fit_all(image, table, Noise(100.0, 0.1, 1000.0), 65535.0, 20.0, 0.0, cells, algebra)
+        fit_all(image, table, Noise(100.0, 0.1, 1000.0, 0.0, 0.0), 65535.0, 20.0, 0.0, cells, algebra)
         assert np.abs(table[0, [U, V]] - [spot.u, spot.v]).max() < lock * px

@@ -176,25 +176,29 @@ def find_ground(blocks: Blocks, runs: Ints) -> None:
     rows = blocks.maps.shape[1]
     for k in range(runs.shape[0]):
         row, first, last = runs[k, 0], runs[k, 1], runs[k, 2]
-        x = blocks.maps[MIDDLE, :, first:last]
-        a, b, c = x[max(row - 2, 0)], x[max(row - 1, 0)], x[row]
-        d, e, out = x[min(row + 1, rows - 1)], x[min(row + 2, rows - 1)], blocks.maps[GROUND, row, first:last]
+        a, b = blocks.maps[MIDDLE, max(row - 2, 0), first:last], blocks.maps[MIDDLE, max(row - 1, 0), first:last]
+        below, last_row = min(row + 1, rows - 1), min(row + 2, rows - 1)
+        d, e = blocks.maps[MIDDLE, below, first:last], blocks.maps[MIDDLE, last_row, first:last]
+        c, out = blocks.maps[MIDDLE, row, first:last], blocks.maps[GROUND, row, first:last]
         for j in range(out.shape[0]):
             out[j] = median5(a[j], b[j], c[j], d[j], e[j])
 
 
 @compiled
 def find_standing_out(
-    blocks: Blocks, runs: Ints, floor: float, slope: float, black: float, least_sigmas: float, least_wide: float,
-    searched: NDArray[np.uint8], found: Ints,
+    blocks: Blocks, runs: Ints, floor: float, slope: float, black: float, texture: float, banding: float,
+    least_sigmas: float, least_wide: float, searched: NDArray[np.uint8], found: Ints,
 ) -> int:  # fmt: skip
     """Blocks with a sum of 2x2 or 4x4 pixels `least_sigmas` over the background, or of 8x8 pixels `least_wide`.
+
+    texture, banding: sigma of means over a few pixels by the background's structure, share of its level and DN.
 
     Those marked in searched (n, m) are passed over, the others become marked. found (most, 3): row, column, and 1 where
     it was only the 8x8 pixels. Returns how many.
     """
     count = 0
-    fine, wide = 16.0 * least_sigmas**2, 64.0 * least_wide**2
+    fine, wide, texture2 = 16.0 * least_sigmas**2, 64.0 * least_wide**2, texture**2
+    banding2 = banding**2
     for k in range(runs.shape[0]):
         row, first, last = runs[k, 0], runs[k, 1], runs[k, 2]
         ground, highest2 = blocks.maps[GROUND, row, first:last], blocks.maps[HIGHEST2, row, first:last]
@@ -203,12 +207,12 @@ def find_standing_out(
         for j in range(ground.shape[0]):  # squares over the variance, over their thresholds
             level = ground[j] / 64.0
             lit = level - black
-            variance = floor + slope * (lit if lit > 0.0 else 0.0)
+            variance, rough = floor + slope * (lit if lit > 0.0 else 0.0), texture2 * level * level + banding2
             a, b, c = 2.0 * (highest2[j] - 4.0 * level), highest4[j] - 16.0 * level, highest8[j] - 64.0 * level
-            a = a if a > b else b
-            a, c = (a if a > 0.0 else 0.0), (c if c > 0.0 else 0.0)
-            excess[j] = a * a / (fine * variance)
-            excess8[j] = c * c / (wide * variance)
+            a, b, c = (a if a > 0.0 else 0.0), (b if b > 0.0 else 0.0), (c if c > 0.0 else 0.0)
+            a, b = a * a / (fine * (variance + 4.0 * rough)), b * b / (fine * (variance + 16.0 * rough))
+            excess[j] = a if a > b else b
+            excess8[j] = c * c / (wide * (variance + 64.0 * rough))
         for j in range(ground.shape[0]):
             if searched[row, first + j]:
                 continue

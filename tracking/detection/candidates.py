@@ -26,6 +26,7 @@ HOT_SIGMAS = 4.0  # a pixel must stand out so far of its surroundings to be call
 _BESIDE_HOT = 2.0  # sigmas over a hot pixel's neighbours at which the others are cut: hot pixels come in pairs
 _REACH = 4  # px around a block that are looked at with it: 2 for maxima, 2 for the means
 _SIDE = BLOCK + 2 * _REACH
+_WEAK, _WEAK_SHARE = 20.0, 0.7  # sigmas below which a peak must also stand out of the background's curvature; how far
 _WIDE_CLIP = 4.0  # sigmas over the background at which pixels are cut where a wide faint spot is looked for
 
 
@@ -35,6 +36,12 @@ class Noise(NamedTuple):
     floor: float
     slope: float
     black: float
+    texture: float
+    banding: float
+
+
+TEXTURE_SHARE = 5.0 / 6.0  # of the threshold: sigmas of the texture that a spot must stand out by; there are far fewer
+# independent places in it than pixels
 
 
 # Columns of peaks (most, 5), places where a spot may be: px; the mean of 3x3 pixels above the background and that, DN;
@@ -51,6 +58,12 @@ def room_for_a_block() -> Array:
 def variance(noise: Noise, level: float) -> float:
     """Of a pixel of that expected grey value, DN^2."""
     return noise.floor + noise.slope * max(level - noise.black, 0.0)
+
+
+@compiled
+def texture_variance(noise: Noise, level: float) -> float:
+    """Of the mean of a few pixels of a background of that level, by its fixed structure and by rounding, DN^2."""
+    return TEXTURE_SHARE**2 * ((noise.texture * level) ** 2 + noise.banding**2)
 
 
 @compiled
@@ -87,24 +100,35 @@ def _peaks_of_block(
     for i in range(1, _SIDE - 1):
         for j in range(1, _SIDE - 1):
             sum3[i, j] = lines[i - 1, j] + lines[i, j] + lines[i + 1, j]
-    sigma = sqrt(variance(noise, level))
+    noise2, texture2 = variance(noise, level), texture_variance(noise, level)
+    sigma = sqrt(noise2)
+    least3 = least_sigmas * sqrt(noise2 + 9.0 * texture2)
+    least5 = least_sigmas * sqrt(noise2 + 25.0 * texture2)
+    least7 = least_sigmas * sqrt(noise2 + 49.0 * texture2)
     for i in range(_REACH, min(_REACH + BLOCK, image.height - top + _REACH)):
         for j in range(_REACH, min(_REACH + BLOCK, image.width - left + _REACH)):
             if sum3[i, j] <= 9 * level or not _is_maximum(sum3, i, j):
                 continue
-            least = least_sigmas * sigma
             height3, height5 = sum3[i, j] - 9 * level, _sum_below(values, i, j, 2, np.inf) - 25 * level
             height7 = _sum_below(values, i, j, 3, np.inf) - 49 * level
-            if max(height3 / 3, height5 / 5, height7 / 7) < least:
+            if height3 / 3 < least3 and height5 / 5 < least5 and height7 / 7 < least7:
                 continue
-            limit = _hot_limit(image, left + j - _REACH, top + i - _REACH, noise, level + height3 / 9, few)
+            u, v = left + j - _REACH, top + i - _REACH
+            limit = _hot_limit(image, u, v, noise, level + height3 / 9, few)
             if limit < np.inf:
                 height3 = _sum_below(values, i, j, 1, limit) - 9 * level
                 height5 = _sum_below(values, i, j, 2, limit) - 25 * level
                 height7 = _sum_below(values, i, j, 3, limit) - 49 * level
-            if max(height3 / 3, height5 / 5, height7 / 7) < least or height3 <= 0 or count >= peaks.shape[0]:
+            if height3 / 3 < least3 and height5 / 5 < least5 and height7 / 7 < least7:
                 continue
-            _add(peaks, count, left + j - _REACH, top + i - _REACH, height3 / 9, level, 0.0)
+            if height3 <= 0 or count >= peaks.shape[0]:
+                continue
+            if max(height3 / 3, height5 / 5, height7 / 7) < _WEAK * sigma:  # is it the top of a diffuse reflection?
+                more = _level_around(image, u, v, level + _WIDE_CLIP * sigma, few) - level
+                higher = max(height3 / 3 - 3 * more, height5 / 5 - 5 * more, height7 / 7 - 7 * more)
+                if higher < _WEAK_SHARE * least_sigmas * sigma:
+                    continue
+            _add(peaks, count, u, v, height3 / 9, level, 0.0)
             count += 1
     return count
 
@@ -134,8 +158,8 @@ def _sum_below(values: Array, i: int, j: int, reach: int, limit: float) -> float
 def _hot_limit(image: Pixels, u: int, v: int, noise: Noise, level: float, few: Array) -> float:
     """If the brightest of 3x3 pixels is hot, how bright light may be beside it, DN; else inf.
 
-    Hot is what stands alone, as no light does that came through a lens. `level`, DN, gives the noise: on the broad top of
-    a wide spot the highest pixel is the luckiest one.
+    Hot is what stands alone, as no light does that came through a lens. `level`, DN, gives the noise: on the broad top
+    of a wide spot the highest pixel is the luckiest one.
     """
     best, bu, bv = -1.0, u, v
     for i in range(max(v - 1, 0), min(v + 2, image.height)):
@@ -190,8 +214,7 @@ def _wide_peak(
 ) -> int:  # fmt: skip
     """A peak where 8x8 pixels stand out of the surroundings by more than their curvature explains.
 
-    Of c, the mean in the middle, and the medians r and R of eight means around it, 16 and 32 px away, c - 4/3 r + 1/3 R
-    is blind to a plane and to a paraboloid: to diffuse reflections. Bright pixels are cut, for a hot one is no spot.
+    Bright pixels are cut, for a hot one is no spot.
     """
     rows, columns = blocks.quads.shape
     bi, bj, best = 2 * row, 2 * column, -1.0
@@ -208,18 +231,9 @@ def _wide_peak(
     sigma2 = variance(noise, level)
     top = level + _WIDE_CLIP * sqrt(sigma2)
     here = _mean8(image, u, v, top)
-    height = here
-    for k in range(2):
-        away, n = 16 * (k + 1), 0
-        for i in range(-1, 2):
-            for j in range(-1, 2):
-                if i != 0 or j != 0:
-                    few[n] = _mean8(image, u + j * away, v + i * away, top)
-                    n += 1
-        sort(few, 8)
-        height += (-4.0 / 3.0 if k == 0 else 1.0 / 3.0) * 0.5 * (few[3] + few[4])
+    height = here - _level_around(image, u, v, top, few)
     # A median of eight has 1.4 times the variance of their mean.
-    scatter = sqrt(sigma2 / 64.0 * (1 + 1.4 / 8 * 17.0 / 9.0))
+    scatter = sqrt((sigma2 / 64.0 + texture_variance(noise, level)) * (1 + 1.4 / 8 * 17.0 / 9.0))
     if height < least_sigmas * scatter or count >= peaks.shape[0]:
         return count
     _add(peaks, count, u, v, height, level, 1.0)
@@ -230,6 +244,26 @@ def _wide_peak(
 def _add(peaks: Array, row: int, u: int, v: int, height: float, level: float, wide: float) -> None:
     peak = peaks[row]
     peak[AT_U], peak[AT_V], peak[HEIGHT], peak[LEVEL], peak[WIDE] = u, v, height, level, wide
+
+
+@compiled
+def _level_around(image: Pixels, u: int, v: int, top: float, few: Array) -> float:
+    """The background at a point from what is around it, DN: right on a plane and on a paraboloid.
+
+    It is 4/3 r - 1/3 R with r and R the medians of eight means of 8x8 pixels, cut at `top`, 16 and 32 px away: the
+    curvature of a diffuse reflection falls out.
+    """
+    level = 0.0
+    for k in range(2):
+        away, n = 16 * (k + 1), 0
+        for i in range(-1, 2):
+            for j in range(-1, 2):
+                if i != 0 or j != 0:
+                    few[n] = _mean8(image, u + j * away, v + i * away, top)
+                    n += 1
+        sort(few, 8)
+        level += (4.0 / 3.0 if k == 0 else -1.0 / 3.0) * 0.5 * (few[3] + few[4])
+    return level
 
 
 @compiled

@@ -172,4 +172,6 @@ class _Task(NamedTuple):
             float(parameters.min_explained),
         )
         pixels = Pixels(image.view(np.uint8), image.itemsize, image.shape[1], image.shape[0])
-        return _Task(image, pixels, Noise(float(model.floor_dn2), float(model.slope_dn), float(model.black_dn)), limits)
+        search = float(model.texture), float(model.banding_dn)
+        known = Noise(float(model.floor_dn2), float(model.slope_dn), float(model.black_dn), *search)
+        return _Task(image, pixels, known, limits)

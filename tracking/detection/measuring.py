@@ -10,7 +10,7 @@ import numpy as np
 from geometry.arrays import Array, Ints
 from geometry.compiled import compiled
 from tracking.detection import candidates, ellipse
-from tracking.detection.candidates import Noise
+from tracking.detection.candidates import Noise, texture_variance
 from tracking.detection.compact import CENTRE_SHARE, height_of_compact
 from tracking.detection.gaussian_fit import fit_all
 from tracking.detection.moments import find_moments
@@ -79,19 +79,21 @@ def measure(
     for k in range(chosen.shape[0]):
         spot = table[k]
         spot[GOOD] = (
-            1.0 if _is_spot(image, spot, limits) or _is_compact(image, spot, noise, limits, cells[FEW]) else 0.0
+            1.0 if _is_spot(image, spot, noise, limits) or _is_compact(image, spot, noise, limits, cells[FEW]) else 0.0
         )
     _drop_doubles(table)
 
 
 @compiled
-def _is_spot(image: Pixels, spot: Array, limits: Limits) -> bool:
+def _is_spot(image: Pixels, spot: Array, noise: Noise, limits: Limits) -> bool:
     if not spot[FLUX] > 0.0:
         return False
     major, minor, _ = ellipse.axes(spot[UU], spot[UV], spot[VV])
     sigma_u, sigma_v = sqrt(max(spot[VAR_U], 0.0)), sqrt(max(spot[VAR_V], 0.0))
+    amplitude = spot[FLUX] / (2 * pi * (major * minor + 1 / 12))
     return (
-        spot[GAIN] > _SPOT_GAIN * limits.threshold_sigma**2 * max(spot[CHI2] / _CHI2, 1.0)
+        amplitude > limits.threshold_sigma * sqrt(texture_variance(noise, spot[GROUND]))
+        and spot[GAIN] > _SPOT_GAIN * limits.threshold_sigma**2 * max(spot[CHI2] / _CHI2, 1.0)
         and spot[FLUX] > _SPOT_FLUX * limits.threshold_sigma * spot[SIGMA_FLUX]
         and spot[PEAK] > 0.0
         and major <= limits.max_sigma

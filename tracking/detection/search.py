@@ -19,7 +19,7 @@ from tracking.detection.block_search import (
     fold,
     runs_of,
 )
-from tracking.detection.candidates import Noise, find_peaks
+from tracking.detection.candidates import TEXTURE_SHARE, Noise, find_peaks
 from tracking.detection.pixels import Pixels
 
 HALO = 2  # blocks around a box that its search needs
@@ -46,5 +46,9 @@ def find_peaks_in(
     find_ground(blocks, inner)
     find_highest_pairs(blocks, inner)
     least, measured = BLOCK_SHARE * threshold_sigma, PEAK_SHARE * threshold_sigma
-    n = find_standing_out(blocks, inner, noise.floor, noise.slope, noise.black, least, measured, searched, found)
+    n = find_standing_out(
+        blocks, inner, noise.floor, noise.slope, noise.black, TEXTURE_SHARE * noise.texture,
+        TEXTURE_SHARE * noise.banding, least,
+        measured, searched, found,
+    )  # fmt: skip
     return find_peaks(image, blocks, noise, found, n, measured, room, peaks, count)

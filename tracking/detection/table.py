@@ -9,8 +9,8 @@ from __future__ import annotations
 # background at the centre, DN, and its slopes, DN/px.
 U, V, UU, UV, VV, FLUX, LEVEL, SLOPE_U, SLOPE_V = range(9)
 # What it says of itself: covariance of the centre, px^2; sigma of the flux, DN; highest pixel above plane and
-# neighbours, DN (of a clipped spot the clipping level's); chi-square per degree of freedom; share of what stands out of the plane,
-# beyond noise, that the Gaussian explains; by how much the Gaussian lowers chi-square.
+# neighbours, DN (of a clipped spot the clipping level's); chi-square per degree of freedom; share of what stands out of
+# the plane, beyond noise, that the Gaussian explains; by how much the Gaussian lowers chi-square.
 VAR_U, COV_UV, VAR_V, SIGMA_FLUX, PEAK, CHI2, EXPLAINED, GAIN = range(9, 17)
 # Moments; then the background found before, DN; 1 for those that only a mean of 8x8 pixels shows; size of the
 # largest cells used, px; 1: to be fitted (again); 1: is a spot.

@@ -23,6 +23,7 @@ LEVELS = 12
 _STRIPE = 64  # rows
 _KEPT = 3.5  # sigmas: differences beyond are outliers ...
 _KEPT_VARIANCE = 0.99389  # ... and this is the variance of normal deviates that are cut there
+_LEAST_WHITE = 0.01  # DN^2: changes in time by less are single steps of a few pixels
 _GRAIN = 1.25  # excess of the variance of means over white noise, below which it is taken for white
 _FOURTH_DIFFERENCE = np.array([1.0, -4.0, 6.0, -4.0, 1.0])  # zero for anything cubic; nearly so for a smooth spot
 
@@ -56,10 +57,10 @@ def level_variances(pictures: Sequence[Picture], top: float, rounding: float) ->
         return within
     level, difference, grain = (np.concatenate(x) for x in zip(*samples, strict=True))
     between = _binned(level, difference, rounding)
-    between = replace(between, variance=between.variance * np.median(grain), sigma=between.sigma * np.median(grain))
     at = float(np.median(level))
     if between.nearest(at) > 1.5 * max(within.nearest(at), 2 * rounding):
         return within  # the camera or the scene shakes
+    between = replace(between, variance=between.variance * np.median(grain), sigma=between.sigma * np.median(grain))
     return between
 
 
@@ -83,7 +84,7 @@ def _between(a: Picture, b: Picture, top: float) -> tuple[Floats, Floats, Array]
     chosen = _sample(level) & (cv2.dilate(cv2.max(a, b), np.ones((3, 3), np.uint8)) < top) & (cv2.min(a, b) > 0)
     white = trimmed_variance(difference[::4, ::4].ravel())
     grain = 1.0
-    for cell in (2, 4):
+    for cell in (2, 4) if white > _LEAST_WHITE else ():  # compressed pictures may not change at all
         small = cv2.resize(difference, None, fx=1 / cell, fy=1 / cell, interpolation=cv2.INTER_AREA)
         share = cell**2 * trimmed_variance(small[::2, ::2].ravel()) / max(white, 1e-12)
         grain = max(grain, share / (1 - cell**2 / SIDE**2))

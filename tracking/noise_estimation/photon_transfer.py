@@ -10,7 +10,7 @@ of bright pixels can lead to a model that no sensor has. The combination is ours
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,7 +19,9 @@ from tracking.detection.detect import find_spots
 from tracking.noise import FULL_SCALE_E, NoiseModel, Picture, quantile_variance
 from tracking.noise_estimation.grey_values import clipped_background, full_scale, grey_step, saturation_level
 from tracking.noise_estimation.levels import LEAST_PIXELS, LEVELS, SIDE, LevelVariances, level_variances
+from tracking.noise_estimation.rounding import banding
 from tracking.noise_estimation.spot_residuals import SpotResiduals, residuals_of_spots
+from tracking.noise_estimation.texture import texture_of
 from tracking.parameters import DetectParameters
 
 _WELL_E = (1_000.0, 200_000.0)  # electrons at full scale: what sensors have, from the smallest to the largest
@@ -71,12 +73,13 @@ def estimate_noise(pictures: Sequence[Picture]) -> NoiseEstimate:
     dark = clipped_background(usable, step)
     lines = _Lines.through(levels, background, full, rounding) if dark is None else _Lines.from_point(*dark, full)
     slope, slope_sigma = lines.slope(rounding)
+    first = lines.model(slope, rounding)
+    first = replace(first, texture=texture_of(usable, first), banding_dn=banding(first.floor_dn2, rounding))
     if slope_sigma > _SURE:  # nothing still is bright enough: the spots themselves
-        first = lines.model(slope, rounding)
         found = [find_spots(p, DetectParameters(max_detections=_MOST_SPOTS), first) for p in usable]
         lines.add(residuals_of_spots(usable, found, top))
         slope, slope_sigma = lines.slope(rounding)
-    model = lines.model(slope, rounding)
+    model = replace(first, slope_dn=slope, floor_dn2=lines.model(slope, rounding).floor_dn2)
     floor_sigma = float(np.interp(slope, lines.slopes, lines.floor_sigma)) / model.floor_dn2
     return NoiseEstimate(model, floor_sigma, slope_sigma, saturation, step, len(usable), levels.temporal)
 

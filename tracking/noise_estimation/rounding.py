@@ -41,6 +41,15 @@ def rounding_ripple(variance: Array, rounding: float) -> Array:
     return np.asarray((1 / np.pi**2 + 4 * noise) * np.exp(-2 * np.pi**2 * noise) * 12 * rounding)
 
 
+def banding(variance: float, rounding: float) -> float:
+    """Sigma, DN, of the rounding error that neighbouring pixels share, given the variance of noise and rounding.
+
+    Noise of s steps blurs the steps of the grey scale to exp(-2 pi^2 s^2) of their height (the fundamental's).
+    """
+    noise = max(variance / (12 * rounding) - 1 / 12, 0.0)
+    return float(np.sqrt(rounding) * np.exp(-2 * np.pi**2 * noise))
+
+
 def unrounded(variance: float, rounding: float) -> float:
     """The variance of noise and rounding, DN^2, from the variance in time of rounded values.
 
