@@ -172,7 +172,7 @@ def write_results(
     facts, model_check, verdict = write_tables(
         pipeline, passes, work, causal=causal, on_frame=lambda record, _: tally.add(record)
     )
-    errors = _errors(work, run)
+    errors, added = _errors(work, run), more()
     seconds = {
         "waiting_for_pictures_s": pipeline.timings.waiting,
         "detection_s": pipeline.timings.detection,
@@ -182,7 +182,7 @@ def write_results(
     content = _summary(
         run, pipeline, passes, tally, facts, verdict, model_check, errors, seconds, time.perf_counter() - started
     )
-    write_json({**content, **more()}, work / "summary.json")
+    write_json({**content, **added}, work / "summary.json")
     from lab.report import write_report  # the template engine: only for those who write a report
 
     write_report(work, run.folder)
