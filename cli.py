@@ -167,6 +167,39 @@ def batch(run_folders: tuple[Path, ...], out: Path, causal: bool, settings: dict
 
 
 @main.command()
+@click.argument("pictures", metavar="IMAGES_OR_VIDEO...", nargs=-1, required=True, type=_ANY_PATH)
+@click.option("--out", required=True, type=_FOLDER, help="Gets detections.csv, contact-sheet.png and report.html.")
+@click.option("--camera", help="The camera's name in the table; default: that of the folder or file.")
+@click.option(
+    "--every", default=1, show_default=True, type=click.IntRange(min=1), help="Look at each N-th picture only."
+)
+@click.option("--limit", type=click.IntRange(min=1), help="Look at so many pictures at most.")
+@_set_option
+def detect(
+    pictures: tuple[Path, ...],
+    out: Path,
+    camera: str | None,
+    every: int,
+    limit: int | None,
+    settings: dict[str, Any],
+) -> None:
+    """Find the spots in pictures or a video, without a rig: table, contact sheet, noise, sizes and signal.
+
+    A folder of pictures, picture files, a pattern such as 'shots/*.png', or one video.
+
+    \b
+    Example:
+        beampose detect sample_runs/huo2015/frames/left --every 10 --out results/spots
+    """
+    from lab.detect.detect import DetectOptions, detect_pictures
+
+    options = DetectOptions(camera, every, limit, settings)
+    with _progress("pictures") as progress:
+        outcome = detect_pictures(list(pictures), out, options, progress)
+    _concluded(outcome)
+
+
+@main.command()
 @click.argument("run_folder", metavar="RUN", type=_ANY_PATH)
 @click.option("--out", required=True, type=_FOLDER, help="Gets attitude_live.csv at once, and the results at the end.")
 @click.option("--udp", metavar="HOST:PORT", help="Also send a line of JSON per frame there.")

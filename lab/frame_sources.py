@@ -136,7 +136,8 @@ class TableSource:
 class VideoSource:
     """A video, decoded one picture after the other in a thread of its own."""
 
-    def __init__(self, path: Path, size_px: tuple[int, int]) -> None:
+    def __init__(self, path: Path, size_px: tuple[int, int] | None) -> None:
+        """size_px: width and height of its pictures; None: any."""
         self._capture = open_video(path)
         self._size_px = size_px
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="video")

@@ -18,11 +18,11 @@ import numpy as np
 from geometry.spots import SpotModel
 from lab import quality
 from lab.calibration_state import require_usable, state_mapping
-from lab.fields import dataclass_from_yaml
 from lab.fingerprints import fingerprints
 from lab.frame_checks import FrameChecks
 from lab.json_text import write_json
 from lab.model_check.keeper import FrameKeeper, claimed_covariances, widths
+from lab.parameter_overrides import overridden
 from lab.pipeline import FrameRecord, Pipeline
 from lab.run_facts import CameraFacts, RunFacts
 from lab.run_file import Run, load_run
@@ -30,7 +30,6 @@ from lab.tables import TableWriter
 from lab.two_passes import Progress, TwoPasses
 from lab.versions import versions
 from lab.whole_folder import whole_folder
-from tracking.parameters import TrackerParameters
 
 if TYPE_CHECKING:
     from lab.model_check.check import ModelCheck
@@ -235,23 +234,6 @@ def are_results(folder: Path) -> bool:
         return bool(json.loads((folder / "summary.json").read_text("utf-8")).get("schema") == SUMMARY_SCHEMA)
     except (OSError, ValueError, AttributeError):
         return False
-
-
-def overridden(parameters: TrackerParameters, overrides: Mapping[str, Any]) -> TrackerParameters:
-    """Parameters with some replaced, checked like those of a file; dotted names reach the inner blocks."""
-    content = dataclasses.asdict(parameters)
-    for name, value in overrides.items():
-        *blocks, last = name.split(".")
-        inner = content
-        for block in blocks:
-            inner = inner.setdefault(block, {})
-            if not isinstance(inner, dict):
-                break
-        else:
-            inner[last] = value
-            continue
-        content[name] = value  # no such block: the checker says so
-    return dataclass_from_yaml(TrackerParameters, content, "--set")
 
 
 def _errors(results: Path, run: Run) -> dict[str, Any] | None:

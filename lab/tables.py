@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from types import TracebackType
-from typing import TextIO
+from typing import TYPE_CHECKING, TextIO
 
 import numpy as np
 
@@ -17,7 +17,10 @@ from geometry.spots import SpotModel
 from lab import columns
 from lab.columns import CAUSAL
 from lab.errors import RunError
-from lab.pipeline import FrameRecord
+from tracking.detections import Detections
+
+if TYPE_CHECKING:
+    from lab.pipeline import FrameRecord
 
 _UPPER = np.triu_indices(6)
 _TOGETHER = 64  # frames worked out at once
@@ -99,11 +102,7 @@ class TableWriter:
             for camera, found in zip(self._cameras, record.detections, strict=True):
                 if found is None or not len(found):
                     continue
-                cov = found.cov_px2
-                sigma = _sigmas(np.stack([cov[:, 0, 0], cov[:, 1, 1]], axis=-1), [record.frame])
-                shape = (found.flux, found.peak, found.major_px, found.minor_px, found.angle_deg, cov[:, 0, 1])
-                numbers = np.column_stack([found.uv_px, sigma, *shape])
-                rows += [f"{record.frame},{camera},{_joined(row)}\n" for row in numbers.tolist()]
+                rows += detection_rows(record.frame, camera, found)
         self._open["detections.csv"].writelines(rows)
 
     def _spots(self, records: Sequence[FrameRecord]) -> None:
@@ -156,6 +155,15 @@ class TableWriter:
             both = np.concatenate([t.pose.turn(self._directions), t.pose.apply(self._points)], axis=-1)
             rows += [f"{head},{b},{_joined(row)},{status}\n" for b, row in zip(self._beams, both.tolist(), strict=True)]
         self._open["beams.csv"].writelines(rows)
+
+
+def detection_rows(frame: int, camera: str, found: Detections) -> list[str]:
+    """The lines of detections.csv for one picture. camera: as a CSV field (`csv_word`)."""
+    cov = found.cov_px2
+    sigma = _sigmas(np.stack([cov[:, 0, 0], cov[:, 1, 1]], axis=-1), [frame])
+    shape = (found.flux, found.peak, found.major_px, found.minor_px, found.angle_deg, cov[:, 0, 1])
+    numbers = np.column_stack([found.uv_px, sigma, *shape])
+    return [f"{frame},{camera},{_joined(row)}\n" for row in numbers.tolist()]
 
 
 def attitude_rows(records: Sequence[FrameRecord]) -> list[str]:
