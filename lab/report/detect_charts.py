@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from geometry.arrays import Array
+from geometry.arrays import Array, Bools
 from lab.report.plane import Plane, axes, dots, frame, image_plane, note, plane, polyline, svg_of
 from lab.report.svg import BLUE, ORANGE, VERMILLION, line_path, short, text, ticks
 from tracking.noise_estimation.levels import LevelVariances
@@ -64,7 +64,10 @@ def places_chart(uv_px: Array, size_px: tuple[int, int]) -> str:
 
 
 def noise_chart(estimate: NoiseEstimate, measured: LevelVariances | None, name: str) -> str:
-    """Photon transfer: a pixel's variance over its grey level, as measured and as modelled with its 1-sigma band."""
+    """Photon transfer: a pixel's variance over its grey level, as measured and as modelled with its 1-sigma band.
+
+    Measured levels far above the line stand as triangles at the top.
+    """
     model = estimate.model
     top = model.black_dn + 10.0
     if measured is not None and len(measured.level):
@@ -79,7 +82,8 @@ def noise_chart(estimate: NoiseEstimate, measured: LevelVariances | None, name: 
     below, above = (model.floor_dn2 * f + model.slope_dn * s * rise for f, s in spread)
     highest = float(line.max()) * 1.3
     if measured is not None and len(measured.variance):
-        highest = max(highest, float((measured.variance + measured.sigma).max()) * 1.08)
+        # What rises far above the line is light that changed between the pictures, such as spots that moved.
+        highest = max(highest, float(np.minimum(measured.variance + measured.sigma, 2 * highest).max()) * 1.08)
     p = plane((bottom, top), (0.0, highest), height=280)
     title = f"Variance of a pixel: {name}"
     out = axes(p, title, "grey value (DN)", "variance (DN²)")
@@ -89,17 +93,21 @@ def noise_chart(estimate: NoiseEstimate, measured: LevelVariances | None, name: 
     out.append(f'<path d="{polyline(p.at(band), closed=True)}" fill="{BLUE}" fill-opacity="0.18"/>')
     x, y = p.at(np.stack([level, line], -1)).T
     out.append(f'<path class="line" d="{line_path(x, y)}" stroke="{BLUE}" stroke-width="1.5"/>')
+    inside: Bools = np.ones(0, dtype=bool)
     if measured is not None and len(measured.level):
         ends = p.at(np.stack([measured.level, np.maximum(measured.variance - measured.sigma, 0.0)], -1))
-        tops = p.at(np.stack([measured.level, measured.variance + measured.sigma], -1))
+        tops = p.at(np.stack([measured.level, np.minimum(measured.variance + measured.sigma, highest)], -1))
+        inside = measured.variance <= highest
+        ends, tops = ends[inside], tops[inside]
         whiskers = "".join(
             f"M{a:.1f} {b:.1f}V{c:.1f}" for (a, b), (_, c) in zip(ends.tolist(), tops.tolist(), strict=True)
         )
         out.append(f'<path d="{whiskers}" stroke="{VERMILLION}" fill="none"/>')
-        places = p.at(np.stack([measured.level, measured.variance], -1))
+        places = p.at(np.stack([measured.level, measured.variance], -1)[inside])
+        above_all = p.at(np.stack([measured.level, np.full(len(measured.level), highest)], -1)[~inside])
+        marks = "".join(f"M{x - 4:.1f} {y + 8:.1f}h8l-4 -7z" for x, y in above_all.tolist())
+        out.append(f'<path d="{marks}" fill="none" stroke="{VERMILLION}"/>' if marks else "")
         out.append(f'<path d="{dots(places, 2.6)}" fill="{VERMILLION}"/>')
-    how = "in time" if estimate.temporal else "within pictures"
-    out.append(note(p, f"dots: measured ({how}), with 1 sigma; line: the model in use, with its 1-sigma band"))
     return svg_of(p, title, [*out, frame(p)])
 
 
@@ -117,7 +125,10 @@ def _log_axes(p: Plane, title: str, x_name: str) -> list[str]:
     values = np.log10(np.outer(10.0**decades, steps).ravel())
     values = values[(values >= p.X.lo) & (values <= p.X.hi)]
     out.append(f'<path class="grid" d="{"".join(f"M{x:.1f} {top:.1f}v{high + 4:.1f}" for x in p.X(values))}"/>')
-    out += [text(float(p.X(v)), bottom + 14, f"{10.0**v:.4g}", "mid") for v in values.tolist()]
+    out += [
+        text(float(p.X(v)), bottom + 14, f"{10.0**v:.4g}" if v < 3.9 else f"{10.0**v:.0f}", "mid")
+        for v in values.tolist()
+    ]
     out.append(text(left + wide / 2, bottom + 29, x_name, "mid"))
     out.append(f'<text x="0" y="0" class="mid" transform="translate(12 {top + high / 2:.1f}) rotate(-90)">spots</text>')
     return out

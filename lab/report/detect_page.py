@@ -153,7 +153,7 @@ def _noise(work: Work, groups: list[SizeGroup]) -> Section:
     for g in groups[:_MOST_KINDS]:
         measured = _levels(work.learnt.get((g.size_px, g.bits), []), g)
         if g.noise.estimate is not None:
-            drawings.append(Drawing(noise_chart(g.noise.estimate, measured, g.words())))
+            drawings.append(Drawing(noise_chart(g.noise.estimate, measured, g.words()), _caption(measured)))
     words = [
         "The variance of a pixel grows in a straight line with the light: its level at the background is read noise,"
         " rounding and the background's own shot noise; its slope is one over the electrons per grey value.",
@@ -161,6 +161,15 @@ def _noise(work: Work, groups: list[SizeGroup]) -> Section:
         " says so.",
     ]
     return Section("Noise of the sensor", words, drawings, Table(heads, rows))
+
+
+def _caption(measured: LevelVariances | None) -> str:
+    """What the dots and lines of a noise chart are."""
+    line = "Line: the model in use, with its 1-sigma band."
+    if measured is None or not len(measured.level):
+        return f"{line} No grey level has enough pixels to be measured by itself."
+    how = "from differences in time" if measured.temporal else "within pictures"
+    return f"{line} Dots: measured {how}; triangles: more than that, where the light itself changed."
 
 
 def _levels(pictures: list[Grey], group: SizeGroup) -> LevelVariances | None:

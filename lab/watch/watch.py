@@ -77,9 +77,9 @@ def watch_run(
         frames = LiveFrames(run, options, stop or threading.Event())
         output = LiveOutput(Path(out), frames, FrameChecks(run.rig, run.covariance), sender)
         stack.callback(output.close)
-        _get_ready(run)
-        _log.info("ready: waiting for the first picture")
         with frames, _low_latency():
+            _get_ready(run)
+            _log.info("ready: waiting for the first picture")
             first = frames.begin()
             if not first:
                 raise RunError(f"{run.path}: expected pictures while the run was watched, got none")
