@@ -13,18 +13,16 @@ from typing import Any
 import numpy as np
 
 from lab import columns
-from lab.detect.findings import SizeGroup, SpotCollection, matched_snr
 from lab.detect.inputs import PictureFiles, Video, open_inputs
+from lab.detect.work import Work
 from lab.errors import InputError
 from lab.json_text import write_json
 from lab.parameter_overrides import overridden
-from lab.pictures import Grey, Missing
+from lab.pictures import Missing
 from lab.report.contact_sheet import ContactSheet
-from lab.sensor_noise import CameraNoise
 from lab.tables import csv_word, detection_rows
 from lab.versions import versions
 from lab.whole_folder import whole_folder
-from tracking.detections import Detections
 from tracking.parameters import DetectParameters, TrackerParameters
 
 SCHEMA = "beampose/detect/1"
@@ -52,49 +50,6 @@ class DetectOptions:
                 " does not track"
             )
         return overridden(TrackerParameters(), self.overrides).detect
-
-
-@dataclass(slots=True)
-class Work:
-    """What comes out of going through the pictures; the report is made of it."""
-
-    camera: str
-    source: str
-    parameters: DetectParameters
-    groups: dict[tuple[tuple[int, int], int], SizeGroup] = field(default_factory=dict)
-    learnt: dict[tuple[tuple[int, int], int], list[Grey]] = field(default_factory=dict)  # pictures behind the noise
-    spots: SpotCollection = field(default_factory=SpotCollection)
-    unreadable: dict[str, list[int]] = field(default_factory=dict)  # frames by reason
-    notes: list[str] = field(default_factory=list)
-
-    @property
-    def pictures(self) -> int:
-        """How many were searched."""
-        return sum(group.pictures for group in self.groups.values())
-
-    def group_of(self, picture: Grey) -> SizeGroup:
-        """The group of a picture, made where it is new; its noise is learnt from the picture when that is searched."""
-        key = _kind(picture)
-        if key not in self.groups:
-            self.groups[key] = SizeGroup(*key, CameraNoise(self.camera))
-        return self.groups[key]
-
-    def learn(self, pictures: list[Grey]) -> None:
-        """The noise of each size and depth among some pictures."""
-        for picture in pictures:
-            self.learnt.setdefault(_kind(picture), []).append(picture)
-        for some in self.learnt.values():
-            self.group_of(some[0]).noise.learn(some)
-
-    def search(self, frame: int, picture: Grey) -> Detections:
-        """The spots of a picture, which are counted."""
-        group = self.group_of(picture)
-        found = group.noise.detect(picture, self.parameters)
-        group.pictures += 1
-        model = group.noise.model
-        assert model is not None  # learnt at the latest by the search
-        self.spots.add(frame, found, matched_snr(found, float(np.sqrt(model.floor_dn2))))
-        return found
 
 
 @dataclass(frozen=True, slots=True)
@@ -226,10 +181,6 @@ def _summary(work: Work, options: DetectOptions, wall_s: float) -> dict[str, Any
         "versions": versions(),
         "notes": work.notes,
     }
-
-
-def _kind(picture: Grey) -> tuple[tuple[int, int], int]:
-    return (picture.shape[1], picture.shape[0]), 8 * picture.dtype.itemsize
 
 
 def _counted(pictures: int) -> str:

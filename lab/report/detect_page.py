@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
 
 from geometry.arrays import Array
 from lab.detect.findings import SizeGroup
+from lab.detect.work import Work
 from lab.pictures import Grey
 from lab.report.calibration_page import Drawing, Section, Table, section_context
 from lab.report.contact_sheet import ContactSheet
@@ -21,9 +22,6 @@ from lab.report.svg import BLUE, Line, short, time_panel
 from lab.versions import versions
 from lab.yaml_text import write_whole
 from tracking.noise_estimation.levels import LevelVariances, level_variances
-
-if TYPE_CHECKING:
-    from lab.detect.detect import Work
 
 _MOST_KINDS = 4  # sizes and depths of pictures whose noise is drawn
 _MOST_ROWS = 20  # ... and that are listed

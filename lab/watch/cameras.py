@@ -68,6 +68,7 @@ class FolderCamera:
     _pending: dict[int, _Pending] = field(default_factory=dict)
     _looked_s: float | None = None  # time.time() of the last look; None: not yet
     _busy_s: float = field(default_factory=time.perf_counter)  # when something was last to be done
+    _old: int = 0  # pictures that were there at the first look
     _failure: str = ""
 
     def run(self) -> None:
@@ -84,6 +85,7 @@ class FolderCamera:
         try:
             for number, name in self.poll.new():
                 self._pending[number] = _Pending(self.poll.folder / name, self._looked_s)
+                self._old += self._looked_s is None
             self._failure = ""
         except OSError as error:  # a drive that is away for a moment
             self._failure = f"{self.poll.folder}: cannot be read: {error.strerror}"
@@ -99,8 +101,9 @@ class FolderCamera:
 
     @property
     def notes(self) -> list[str]:
-        """Pictures of one number, and a folder that went away."""
-        out = [f"{self.poll.folder}: two pictures of one frame: {a} was used, {b} not" for a, b in self.poll.twins[:5]]
+        """Pictures that were there already, those of one number, and a folder that went away."""
+        out = [f"{self.name}: {self._old} pictures were there before the watch began"] if self._old else []
+        out += [f"{self.poll.folder}: two pictures of one frame: {a} was used, {b} not" for a, b in self.poll.twins[:5]]
         return out + ([self._failure] if self._failure else [])
 
     def _read(self, number: int, file: _Pending) -> bool:
@@ -164,6 +167,8 @@ class DeviceCamera:
         """Give pictures until the device ends or the inbox stops."""
         failures = 0
         try:
+            while not (self.inbox.wanted.wait(0.05) or self.inbox.stopping.is_set()):
+                pass
             while not self.inbox.stopping.is_set():
                 self.inbox.catch_up(self.name)
                 if not self.endless and not self.inbox.has_room(self.name):

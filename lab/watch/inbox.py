@@ -16,7 +16,7 @@ import numpy as np
 from lab.pictures import DROPPED, Grey, Missing
 from tracking.detections import Detections
 
-MOST_WAITING = 32  # pictures of one camera that wait here; of a folder the others wait on disk
+MOST_WAITING = 64  # pictures of one camera that wait here; of a folder the others wait on disk
 LONGEST_GAP = 10_000  # frame numbers: a picture so far beyond all others is a stray file
 
 Content: TypeAlias = Grey | Detections | Missing
@@ -90,6 +90,7 @@ class Inbox:
         self.boxes = {name: CameraBox() for name in cameras}
         self.changed = threading.Condition()
         self.stopping = threading.Event()  # the cameras shall stop
+        self.wanted = threading.Event()  # devices shall begin; folders are looked into from the start
         self.next_frame: int | None = None  # the first that is not closed yet; None: not begun
         self.last_seen_s: float | None = None  # when something came, of whatever camera
         self._finders: Mapping[str, Finder] | None = None

@@ -100,6 +100,7 @@ class LiveFrames:
 
         Empty where the recording ended without any. Raises InputError where the names hold no frame numbers.
         """
+        self.inbox.wanted.set()
         begun: float | None = None
         patience = max(_START_S, 8 / self.run.frame_rate_hz, self.options.timeout_s)
         with self.inbox.changed:
