@@ -113,6 +113,7 @@ def test_pictures_of_mixed_sizes_and_depths_each_have_their_noise_and_the_report
         (160, 120, 16): 3,
         (200, 130, 8): 2,
     }
+    assert [n["estimated"]["pictures"] for n in told["noise"]] == [2, 2, 2]
     assert any("different sizes or depths" in note for note in told["notes"])
     assert "different sizes or depths" in (tmp_path / "out/report.html").read_text("utf-8")
 

@@ -174,16 +174,19 @@ def test_dropped_and_damaged_pictures_are_what_they_are_in_a_run(recorded, tmp_p
 
 def test_stopping_ends_the_recording_and_makes_the_results(recorded, tmp_path):
     run, stop = empty_copy(recorded, tmp_path / "run"), threading.Event()
+    all_there = []
 
     def feeder() -> None:
         feed(recorded, run)
         until = time.monotonic() + 20
         while time.monotonic() < until and not _has_rows(tmp_path / "out" / LIVE_TABLE, FRAMES):
             time.sleep(0.02)
+        all_there.append(_has_rows(tmp_path / "out" / LIVE_TABLE, FRAMES))
         stop.set()
 
     patient = WatchOptions(idle_s=60.0)
     outcome = watched(run, tmp_path / "out", feeder, options=patient, stop=stop)
+    assert all_there == [True]  # the live table has each frame at once, not when a buffer is full
     assert outcome.run.frames == FRAMES
     assert (tmp_path / "out/report.html").is_file()
 
