@@ -167,6 +167,80 @@ def batch(run_folders: tuple[Path, ...], out: Path, causal: bool, settings: dict
 
 
 @main.command()
+@click.argument("pictures", metavar="IMAGES_OR_VIDEO...", nargs=-1, required=True, type=_ANY_PATH)
+@click.option("--out", required=True, type=_FOLDER, help="Gets detections.csv, contact-sheet.png and report.html.")
+@click.option("--camera", help="The camera's name in the table; default: that of the folder or file.")
+@click.option(
+    "--every", default=1, show_default=True, type=click.IntRange(min=1), help="Look at each N-th picture only."
+)
+@click.option("--limit", type=click.IntRange(min=1), help="Look at so many pictures at most.")
+@_set_option
+def detect(
+    pictures: tuple[Path, ...],
+    out: Path,
+    camera: str | None,
+    every: int,
+    limit: int | None,
+    settings: dict[str, Any],
+) -> None:
+    """Find the spots in pictures or a video, without a rig: table, contact sheet, noise, sizes and signal.
+
+    A folder of pictures, picture files, a pattern such as 'shots/*.png', or one video.
+
+    \b
+    Example:
+        beampose detect sample_runs/huo2015/frames/left --every 10 --out results/spots
+    """
+    from lab.detect.detect import DetectOptions, detect_pictures
+
+    options = DetectOptions(camera, every, limit, settings)
+    with _progress("pictures") as progress:
+        outcome = detect_pictures(list(pictures), out, options, progress)
+    _concluded(outcome)
+
+
+@main.command()
+@click.argument("run_folder", metavar="RUN", type=_ANY_PATH)
+@click.option("--out", required=True, type=_FOLDER, help="Gets attitude_live.csv at once, and the results at the end.")
+@click.option("--udp", metavar="HOST:PORT", help="Also send a line of JSON per frame there.")
+@click.option(
+    "--idle",
+    default=10.0,
+    show_default=True,
+    type=click.FloatRange(min=0.1),
+    help="So many seconds without a new picture end the recording.",
+)
+@click.option(
+    "--timeout",
+    default=0.25,
+    show_default=True,
+    type=click.FloatRange(min=0.001),
+    help="So many seconds a frame waits for a camera that does not give it.",
+)
+@_set_option
+def watch(run_folder: Path, out: Path, udp: str | None, idle: float, timeout: float, settings: dict[str, Any]) -> None:
+    """Follow a run while it is recorded: the pose of every frame as it arrives.
+
+    RUN is a run folder whose frame folders are being filled, or whose run.yaml names a `device` for a camera (a number
+    or name that OpenCV opens). Each pose is appended to attitude_live.csv in the folder --out. When the recording
+    ends (--idle, Ctrl-C, the device's end), the results of `run` are made of what was received.
+
+    \b
+    Example:
+        beampose watch runs/today --out results/today --udp 127.0.0.1:5005
+    """
+    from lab.watch.live_frames import WatchOptions
+    from lab.watch.watch import stopped_by_ctrl_c, watch_run
+
+    with _progress(run_folder.name) as progress, stopped_by_ctrl_c() as stop:
+        outcome = watch_run(
+            run_folder, out, udp=udp, options=WatchOptions(idle, timeout), overrides=settings, progress=progress,
+            stop=stop,
+        )  # fmt: skip
+    _concluded(outcome)
+
+
+@main.command()
 @click.argument("scenario")
 @click.option("--out", type=_FOLDER, help="The run folder to write; it must not exist yet.")
 @click.option("--seed", default=0, show_default=True, type=click.IntRange(min=0), help="The same seed, the same bytes.")

@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from lab.errors import QUALITY_GATE_FAILED, BeamposeError, CalibrationError, InputError, RunError
-from lab.process import Outcome, overridden, process_run
+from lab.parameter_overrides import overridden
+from lab.process import Outcome, process_run
 from lab.two_passes import Progress
 from tracking.parameters import TrackerParameters
 

@@ -6,7 +6,7 @@ import hashlib
 from pathlib import Path
 from typing import Any
 
-from lab.run_file import FramesFolder, Run
+from lab.run_file import FramesFolder, LiveDevice, Run
 
 LARGEST_FILE = 64 * 2**20  # bytes: a video beyond it is tied by its first so many bytes and its size
 _BLOCK = 2**20
@@ -24,7 +24,7 @@ def fingerprints(run: Run) -> list[dict[str, Any]]:
     out = [_of_file(f) for f in files]
     done: set[Path] = set()
     for source in run.cameras.values():
-        if source.path in done:
+        if isinstance(source, LiveDevice) or source.path in done:
             continue
         done.add(source.path)
         out.append(_of_folder(source.path) if isinstance(source, FramesFolder) else _of_file(source.path))

@@ -55,6 +55,15 @@ class FolderListing:
         return np.fromiter(self.names, dtype=np.int64, count=len(self.names))
 
 
+def number_of(name: str) -> int | None:
+    """The frame number in a picture's file name: its last group of digits, before the ending. None: no such picture."""
+    stem, suffix = os.path.splitext(name)
+    match = _LAST_NUMBER.search(stem)
+    if name.startswith(".") or suffix.lower() not in SUFFIXES or match is None or len(match[1].lstrip("0")) > 15:
+        return None
+    return int(match[1])
+
+
 def list_folder(folder: Path) -> FolderListing:
     """Find the pictures in a folder: the number is the last group of digits of the name, without its ending.
 
@@ -68,12 +77,10 @@ def list_folder(folder: Path) -> FolderListing:
     except OSError as error:
         raise InputError(f"{folder}: cannot be read: {error.strerror}") from None
     for name in found:
-        stem, suffix = os.path.splitext(name)
-        match = _LAST_NUMBER.search(stem)
-        if name.startswith(".") or suffix.lower() not in SUFFIXES or match is None or len(match[1].lstrip("0")) > 15:
+        number = number_of(name)
+        if number is None:
             ignored.append(name)
             continue
-        number = int(match[1])
         if number in names:
             raise InputError(
                 f"{folder}: expected one picture per frame, got {names[number]} and {name} for frame {number};"
@@ -129,7 +136,8 @@ class TableSource:
 class VideoSource:
     """A video, decoded one picture after the other in a thread of its own."""
 
-    def __init__(self, path: Path, size_px: tuple[int, int]) -> None:
+    def __init__(self, path: Path, size_px: tuple[int, int] | None) -> None:
+        """size_px: width and height of its pictures; None: any."""
         self._capture = open_video(path)
         self._size_px = size_px
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="video")

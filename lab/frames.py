@@ -28,7 +28,7 @@ from lab.frame_sources import (
     promised_pictures,
 )
 from lab.pictures import DROPPED, Grey, Missing
-from lab.run_file import DetectionsTable, FramesFolder, Run, VideoFile
+from lab.run_file import DetectionsTable, FramesFolder, LiveDevice, Run, VideoFile
 from lab.yaml_text import did_you_mean
 
 __all__ = ["FrameReader", "FrameSet", "Grey", "Missing", "Picture", "open_frames", "pictures_at"]
@@ -67,6 +67,11 @@ class FrameReader:
                 self._listings[name] = list_folder(source.path)
             elif isinstance(source, VideoFile):
                 self._promised[name] = promised_pictures(source.path)
+            elif isinstance(source, LiveDevice):
+                raise InputError(
+                    f"{run.path}: cameras.{name}.device: expected recorded frames or detections, got a live camera; use"
+                    " `beampose watch`"
+                )
             else:
                 if source.path not in opened:
                     opened[source.path] = read_detections(source.path)
@@ -292,6 +297,8 @@ def pictures_at(run: Run, camera: str, frames: Sequence[int]) -> dict[int, Pictu
                 out[frame] = Missing(DROPPED) if shown is None else shown
         elif isinstance(source, DetectionsTable):
             out = dict.fromkeys(wanted, Missing("no pictures: points found already"))
+        elif isinstance(source, LiveDevice):
+            out = dict.fromkeys(wanted, Missing("no pictures: a live camera"))
         else:
             folder = FolderSource(list_folder(source.path), size_px)
             pool = stack.enter_context(ThreadPoolExecutor(THREADS))

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
 
 from geometry.light_centroid import CentreOffsets
-from lab.frames import FrameReader, FrameSet, open_frames
-from lab.pictures import Missing
+from lab.frames import FrameSet, open_frames
+from lab.pictures import Grey, Missing
 from lab.run_file import Run
 from lab.sensor_noise import CameraNoise, camera_noises
 from tracking.detections import Detections
@@ -31,6 +31,20 @@ class Tracker(Protocol):
 
     def step(self, dt_s: float, found: Sequence[Detections | None]) -> TrackedFrame:
         """One frame. dt_s: time since the frame before (0 for the first); found: per camera, None without a picture."""
+
+
+class Frames(Protocol):
+    """Where the pictures of all cameras come from, frame by frame: recorded (lab.frames) or live (lab.watch)."""
+
+    @property
+    def notes(self) -> list[str]:
+        """What a reader of the results should know, in plain words; complete once the iteration has ended."""
+
+    @property
+    def expected_frames(self) -> int | None:
+        """How many frames there will be; None where nothing tells."""
+
+    def __iter__(self) -> Iterator[FrameSet]: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,11 +82,11 @@ class Pipeline:
     """One run in work. Iterate over `records()` once; `notes`, `noise` and `timings` are complete afterwards."""
 
     run: Run
-    reader: FrameReader
+    reader: Frames
     tracker: Tracker
     noise: dict[str, CameraNoise]  # of cameras with pictures
+    on_record: Callable[[FrameRecord], None] | None = None  # called with each record as soon as it is known
     timings: Timings = field(default_factory=Timings)
-    _offsets: dict[str, CentreOffsets] = field(default_factory=dict)
 
     @staticmethod
     def of(run: Run) -> Pipeline:
@@ -98,19 +112,16 @@ class Pipeline:
             tracked = self.tracker.step(dt_s, found)
             before = t_s
             self._spent("tracking", clock)
-            yield FrameRecord(frames.frame, t_s, dt_s, found, missing, tracked)
+            record = FrameRecord(frames.frame, t_s, dt_s, found, missing, tracked)
+            if self.on_record is not None:
+                self.on_record(record)
+            yield record
             clock = time.perf_counter()
 
     def detections(self) -> Iterator[tuple[int, tuple[Detections | None, ...]]]:
         """Frame numbers and the points found in each, without tracking them. Instead of `records`, not beside it."""
         for frames in self.reader:
             yield frames.frame, self._detect(frames)[0]
-
-    def _offsets_of(self, camera: str) -> CentreOffsets:
-        if camera not in self._offsets:
-            seen_by = self.run.rig.cameras[camera]
-            self._offsets[camera] = CentreOffsets(seen_by, self.run.rig.screens[seen_by.screen])
-        return self._offsets[camera]
 
     def _spent(self, on: str, since: float) -> float:
         now = time.perf_counter()
@@ -127,12 +138,18 @@ class Pipeline:
                 missing.append(picture.reason)
                 continue
             if isinstance(picture, np.ndarray):
-                noise = self.noise[name]
-                points = noise.detect(picture, self.run.tracker.detect)
-                picture = on_beam_axes(points, self._offsets_of(name), noise.model)
+                picture = spots_in(picture, self.run, self.noise[name])
             found.append(picture)
             missing.append("")
         return tuple(found), tuple(missing)
+
+
+def spots_in(picture: Grey, run: Run, noise: CameraNoise) -> Detections:
+    """The points that one picture of a run's camera shows. For one thread at a time and camera."""
+    if noise.offsets is None:
+        seen_by = run.rig.cameras[noise.camera]
+        noise.offsets = CentreOffsets(seen_by, run.rig.screens[seen_by.screen])
+    return on_beam_axes(noise.detect(picture, run.tracker.detect), noise.offsets, noise.model)
 
 
 def on_beam_axes(found: Detections, offsets: CentreOffsets, noise: NoiseModel | None) -> Detections:

@@ -6,12 +6,10 @@ import contextlib
 import dataclasses
 import datetime
 import json
-import platform
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,17 +18,18 @@ import numpy as np
 from geometry.spots import SpotModel
 from lab import quality
 from lab.calibration_state import require_usable, state_mapping
-from lab.fields import dataclass_from_yaml
 from lab.fingerprints import fingerprints
 from lab.frame_checks import FrameChecks
+from lab.json_text import write_json
 from lab.model_check.keeper import FrameKeeper, claimed_covariances, widths
+from lab.parameter_overrides import overridden
 from lab.pipeline import FrameRecord, Pipeline
 from lab.run_facts import CameraFacts, RunFacts
 from lab.run_file import Run, load_run
 from lab.tables import TableWriter
 from lab.two_passes import Progress, TwoPasses
+from lab.versions import versions
 from lab.whole_folder import whole_folder
-from tracking.parameters import TrackerParameters
 
 if TYPE_CHECKING:
     from lab.model_check.check import ModelCheck
@@ -134,33 +133,59 @@ def process_run(
     used); `out` is then as it was before.
     """
     started = time.perf_counter()
+    run = ready_run(run_folder, overrides)
+    with whole_folder(out, may_replace=are_results) as work:
+        return write_results(Pipeline.of(run), work, Path(out), started, causal=causal, progress=progress)
+
+
+def ready_run(run_folder: Path, overrides: Mapping[str, Any] | None = None) -> Run:
+    """A run that may be processed, with some tracker parameters replaced.
+
+    Raises InputError; CalibrationError where its rig's calibration must not be used.
+    """
     run = load_run(run_folder)
     if overrides:
         run = dataclasses.replace(run, tracker=overridden(run.tracker, overrides))
     recorded = datetime.date.today() if run.recorded is None else run.recorded
     require_usable(run.calibration, run.rig_path, recorded, "today" if run.recorded is None else "the recording's day")
-    with whole_folder(out, may_replace=are_results) as work:
-        pipeline = Pipeline.of(run)
-        tally = _Tally(tuple(run.rig.cameras), tuple(f"{c}/{s}" for c, s in SpotModel.of(run.rig).views))
-        passes = TwoPasses(pipeline, work, progress)
-        facts, model_check, verdict = write_tables(
-            pipeline, passes, work, causal=causal, on_frame=lambda record, _: tally.add(record)
-        )
-        errors = _errors(work, run)
-        seconds = {
-            "waiting_for_pictures_s": pipeline.timings.waiting,
-            "detection_s": pipeline.timings.detection,
-            "tracking_s": pipeline.timings.tracking,
-            "smoothing_s": pipeline.timings.smoothing,
-        }
-        content = _summary(
-            run, pipeline, passes, tally, facts, verdict, model_check, errors, seconds, time.perf_counter() - started
-        )
-        _write_json(content, work / "summary.json")
-        from lab.report import write_report  # the template engine: only for those who write a report
+    return run
 
-        write_report(work, run.folder)
-    return Outcome(run.name, Path(out), verdict, facts.frames, facts.measured, time.perf_counter() - started, errors)
+
+def write_results(
+    pipeline: Pipeline,
+    work: Path,
+    out: Path,
+    started: float,
+    *,
+    causal: bool = False,
+    progress: Progress | None = None,
+    more: Callable[[], Mapping[str, Any]] = dict,
+) -> Outcome:
+    """Process what a pipeline gives into the folder `work`, which will be `out`.
+
+    started: time.perf_counter() at the beginning. more: what else summary.json shall hold, asked for at the end.
+    """
+    run = pipeline.run
+    tally = _Tally(tuple(run.rig.cameras), tuple(f"{c}/{s}" for c, s in SpotModel.of(run.rig).views))
+    passes = TwoPasses(pipeline, work, progress)
+    facts, model_check, verdict = write_tables(
+        pipeline, passes, work, causal=causal, on_frame=lambda record, _: tally.add(record)
+    )
+    errors, added = _errors(work, run), more()
+    seconds = {
+        "waiting_for_pictures_s": pipeline.timings.waiting,
+        "detection_s": pipeline.timings.detection,
+        "tracking_s": pipeline.timings.tracking,
+        "smoothing_s": pipeline.timings.smoothing,
+    }
+    content = _summary(
+        run, pipeline, passes, tally, facts, verdict, model_check, errors, seconds, time.perf_counter() - started
+    )
+    write_json({**content, **added}, work / "summary.json")
+    from lab.report import write_report  # the template engine: only for those who write a report
+
+    write_report(work, run.folder)
+    return Outcome(run.name, out, verdict, facts.frames, facts.measured, time.perf_counter() - started, errors)
 
 
 def write_tables(
@@ -209,23 +234,6 @@ def are_results(folder: Path) -> bool:
         return bool(json.loads((folder / "summary.json").read_text("utf-8")).get("schema") == SUMMARY_SCHEMA)
     except (OSError, ValueError, AttributeError):
         return False
-
-
-def overridden(parameters: TrackerParameters, overrides: Mapping[str, Any]) -> TrackerParameters:
-    """Parameters with some replaced, checked like those of a file; dotted names reach the inner blocks."""
-    content = dataclasses.asdict(parameters)
-    for name, value in overrides.items():
-        *blocks, last = name.split(".")
-        inner = content
-        for block in blocks:
-            inner = inner.setdefault(block, {})
-            if not isinstance(inner, dict):
-                break
-        else:
-            inner[last] = value
-            continue
-        content[name] = value  # no such block: the checker says so
-    return dataclass_from_yaml(TrackerParameters, content, "--set")
 
 
 def _errors(results: Path, run: Run) -> dict[str, Any] | None:
@@ -313,31 +321,3 @@ def _prior_numbers(run: Run) -> dict[str, Any] | None:
         "within_m": run.prior.within_m,
         "within_deg": float(np.rad2deg(run.prior.within_rad)),
     }
-
-
-def versions() -> dict[str, str]:
-    """Of this program, Python, and the libraries that numbers depend on."""
-    out = {"python": platform.python_version()}
-    for name in ("beampose", "numpy", "scipy", "opencv-python-headless", "pandas"):
-        try:
-            out[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            out[name] = "not installed as a package"
-    return out
-
-
-def _write_json(content: Any, path: Path) -> None:
-    path.write_text(json.dumps(_plain(content), indent=1, ensure_ascii=False, allow_nan=False) + "\n", encoding="utf-8")
-
-
-def _plain(value: Any) -> Any:
-    """JSON knows no nan and no numpy."""
-    if isinstance(value, Mapping):
-        return {str(k): _plain(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(v) for v in value]
-    if isinstance(value, np.generic):
-        value = value.item()
-    if isinstance(value, float) and not np.isfinite(value):
-        return None
-    return value

@@ -62,7 +62,19 @@ class DetectionsTable:
     path: Path
 
 
-Source = FramesFolder | VideoFile | DetectionsTable
+@dataclass(frozen=True, slots=True)
+class LiveDevice:
+    """A camera that OpenCV opens, for `beampose watch`; frames are numbered from 0 at the frame rate of run.yaml."""
+
+    device: int | str  # its number, or a name such as /dev/video0 or an address of a stream
+
+    @property
+    def path(self) -> Path:
+        """What messages call it."""
+        return Path(f"device {self.device}")
+
+
+Source = FramesFolder | VideoFile | DetectionsTable | LiveDevice
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,15 +179,27 @@ def save_run(content: Mapping[str, Any], run_folder: Path) -> Path:
 # What the file may hold -----------------------------------------------------------------------------------------
 
 
+def _a_device(value: Any) -> int | str:
+    if isinstance(value, int) and not isinstance(value, bool) and value >= 0:
+        return value
+    if isinstance(value, str) and value.strip():
+        return value
+    raise unexpected("a camera's number from 0, or the name of a device", value)
+
+
 class _SourceBlock(Block):
     frames: Word | None = None
     detections: Word | None = None
+    device: Annotated[int | str | None, pydantic.PlainValidator(_a_device)] = None
 
     @pydantic.model_validator(mode="after")
     def _one_of_them(self) -> _SourceBlock:
-        if self.frames is not None and self.detections is not None:
+        given = [n for n in ("frames", "detections", "device") if getattr(self, n) is not None]
+        if "device" in given and len(given) > 1:
+            raise wrong(f"expected one of frames, detections and device, got {' and '.join(given)}; keep one")
+        if len(given) > 1:
             raise wrong("expected frames or detections, got both; keep one")
-        if self.frames is None and self.detections is None:
+        if not given:
             raise wrong("expected frames or detections, got neither")
         return self
 
@@ -222,6 +246,8 @@ def _prior_of(block: _PriorBlock) -> PosePrior:
 
 
 def _source_of(block: _SourceBlock, folder: Path, where: str) -> Source:
+    if block.device is not None:
+        return LiveDevice(block.device)
     if block.detections is not None:
         path = folder / block.detections
         if not path.is_file():

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from types import TracebackType
-from typing import TextIO
+from typing import TYPE_CHECKING, TextIO
 
 import numpy as np
 
@@ -17,7 +17,10 @@ from geometry.spots import SpotModel
 from lab import columns
 from lab.columns import CAUSAL
 from lab.errors import RunError
-from lab.pipeline import FrameRecord
+from tracking.detections import Detections
+
+if TYPE_CHECKING:
+    from lab.pipeline import FrameRecord
 
 _UPPER = np.triu_indices(6)
 _TOGETHER = 64  # frames worked out at once
@@ -99,11 +102,7 @@ class TableWriter:
             for camera, found in zip(self._cameras, record.detections, strict=True):
                 if found is None or not len(found):
                     continue
-                cov = found.cov_px2
-                sigma = _sigmas(np.stack([cov[:, 0, 0], cov[:, 1, 1]], axis=-1), [record.frame])
-                shape = (found.flux, found.peak, found.major_px, found.minor_px, found.angle_deg, cov[:, 0, 1])
-                numbers = np.column_stack([found.uv_px, sigma, *shape])
-                rows += [f"{record.frame},{camera},{_joined(row)}\n" for row in numbers.tolist()]
+                rows += detection_rows(record.frame, camera, found)
         self._open["detections.csv"].writelines(rows)
 
     def _spots(self, records: Sequence[FrameRecord]) -> None:
@@ -131,23 +130,16 @@ class TableWriter:
 
     def _poses(self, records: Sequence[FrameRecord], which: str = "") -> None:
         """The rows of attitude and covariance; `which` is CAUSAL or nothing."""
-        numbers = iter(_numbers_of_poses(records))
-        moving = iter(_numbers_of_motions(records))
         systematic = None if which else self._open.get("systematic.csv")
-        rows, covariances, of_calibration = [], [], []
-        nothing, no_motion = "," * len(columns.POSE), "," * len(columns.MOTION)
+        covariances, of_calibration = [], []
         for record in records:
             t = record.tracked
-            head, status = f"{record.frame},{_number(record.t_s)}", t.pose_status.value
             if t.pose is None or t.pose_covariance is None:
-                rows.append(f"{head}{nothing},{t.spots_used},,{status}{no_motion}\n")
                 continue
-            motion = no_motion[1:] if t.motion is None else _joined(next(moving))
-            rows.append(f"{head},{_joined(next(numbers))},{t.spots_used},{_number(t.rms_px)},{status},{motion}\n")
             covariances.append(f"{record.frame},{_exact(t.pose_covariance[_UPPER])}\n")
             if systematic is not None and t.pose_systematic is not None:
                 of_calibration.append(f"{record.frame},{_exact(t.pose_systematic[_UPPER])}\n")
-        self._open[f"attitude{which}.csv"].writelines(rows)
+        self._open[f"attitude{which}.csv"].writelines(attitude_rows(records))
         self._open[f"covariance{which}.csv"].writelines(covariances)
         if systematic is not None:
             systematic.writelines(of_calibration)
@@ -163,6 +155,32 @@ class TableWriter:
             both = np.concatenate([t.pose.turn(self._directions), t.pose.apply(self._points)], axis=-1)
             rows += [f"{head},{b},{_joined(row)},{status}\n" for b, row in zip(self._beams, both.tolist(), strict=True)]
         self._open["beams.csv"].writelines(rows)
+
+
+def detection_rows(frame: int, camera: str, found: Detections) -> list[str]:
+    """The lines of detections.csv for one picture. camera: as a CSV field (`csv_word`)."""
+    cov = found.cov_px2
+    sigma = _sigmas(np.stack([cov[:, 0, 0], cov[:, 1, 1]], axis=-1), [frame])
+    shape = (found.flux, found.peak, found.major_px, found.minor_px, found.angle_deg, cov[:, 0, 1])
+    numbers = np.column_stack([found.uv_px, sigma, *shape])
+    return [f"{frame},{camera},{_joined(row)}\n" for row in numbers.tolist()]
+
+
+def attitude_rows(records: Sequence[FrameRecord]) -> list[str]:
+    """The lines of attitude.csv for some frames."""
+    numbers = iter(_numbers_of_poses(records))
+    moving = iter(_numbers_of_motions(records))
+    nothing, no_motion = "," * len(columns.POSE), "," * len(columns.MOTION)
+    rows = []
+    for record in records:
+        t = record.tracked
+        head, status = f"{record.frame},{_number(record.t_s)}", t.pose_status.value
+        if t.pose is None or t.pose_covariance is None:
+            rows.append(f"{head}{nothing},{t.spots_used},,{status}{no_motion}\n")
+            continue
+        motion = no_motion[1:] if t.motion is None else _joined(next(moving))
+        rows.append(f"{head},{_joined(next(numbers))},{t.spots_used},{_number(t.rms_px)},{status},{motion}\n")
+    return rows
 
 
 def _numbers_of_poses(records: Sequence[FrameRecord]) -> list[list[float]]:

@@ -53,14 +53,14 @@ def whole_folder(target: Path, may_replace: Callable[[Path], bool]) -> Iterator[
         raise InputError(f"{target}: the folder cannot be made: {error.strerror}; choose another --out") from None
     try:
         yield work
-        _replace(work, target)
+        replace_folder(work, target)
     except BaseException:
         shutil.rmtree(work, ignore_errors=True)
         raise
 
 
-def _replace(work: Path, target: Path) -> None:
-    """Rename, with the old results out of the way only for the moment between two renames."""
+def replace_folder(work: Path, target: Path) -> None:
+    """Rename, with an old target out of the way only for the moment between two renames, and then deleted."""
     if not target.exists():
         work.rename(target)
         return

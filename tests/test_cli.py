@@ -7,8 +7,10 @@ import json
 import logging
 import re
 import shlex
+import signal
 import subprocess
 import sys
+import time
 import warnings
 from collections.abc import Callable
 from contextlib import chdir
@@ -112,7 +114,18 @@ def works(desk: Path, capfd: pytest.CaptureFixture[str]) -> Callable[..., str]:
 
 
 def test_there_are_the_commands_of_the_contract():
-    assert set(main.commands) == {"run", "batch", "simulate", "check", "report", "study", "calibrate", "plan"}
+    assert set(main.commands) == {
+        "run",
+        "batch",
+        "detect",
+        "watch",
+        "simulate",
+        "check",
+        "report",
+        "study",
+        "calibrate",
+        "plan",
+    }
     steps = {"board", "camera", "screen", "beams", "rig", "check", "convert", "simulate"}
     assert {name for name in COMMANDS if name.startswith("calibrate ")} == {f"calibrate {step}" for step in steps}
 
@@ -153,7 +166,7 @@ def test_the_example_of_run_leaves_the_files_of_the_contract(desk):
     assert isinstance(json.loads((out / "summary.json").read_text()), dict)
 
 
-@pytest.mark.parametrize("name", ["check", "report"])
+@pytest.mark.parametrize("name", ["check", "report", "detect"])
 def test_the_example_works(works, name):
     assert works(*example(name)).strip()
 
@@ -229,6 +242,15 @@ def test_simulate_lists_every_scenario(works):
         ("run sample_runs/huo2015 --out r --set r1_px", "expected NAME=VALUE, got 'r1_px'"),
         ("run sample_runs/huo2015 --out r --set r1_pz=3", "unknown key 'r1_pz'"),
         ("batch --out r", "Missing argument 'RUN...'"),
+        ("detect --out r", "Missing argument 'IMAGES_OR_VIDEO...'"),
+        ("detect nowhere --out r", "nowhere: expected a picture"),
+        ("detect sample_runs/README.md --out r", "sample_runs/README.md: expected a picture"),
+        ("detect sample_runs/huo2015/frames --out r", "its folders left, right do: name one of them"),
+        ("detect sample_runs/huo2015/frames/left --out r --every 0", "0 is not in the range"),
+        ("detect sample_runs/huo2015/frames/left --out r --set r1_px=3", "expected a parameter of detection"),
+        ("watch nowhere --out r", "nowhere: expected a run folder, found nothing"),
+        ("watch sample_runs/four-skew-beams --out r", "expected a folder of pictures or a device to watch"),
+        ("watch sample_runs/huo2015 --out r --udp here", "--udp: expected HOST:PORT"),
         ("simulate clean", "Missing option '--out'"),
         ("simulate nothing --out r", "got 'nothing'"),
         ("simulate clean --out r --frames 0", "0 is not in the range"),
@@ -395,6 +417,24 @@ def test_a_batch_that_is_stopped_says_so(tmp_path, monkeypatch):
     done = typed("batch", tmp_path / "a", "--out", tmp_path / "out")
     assert done.exit_code == 1
     assert done.stderr.strip() == "beampose: stopped"
+
+
+def test_ctrl_c_ends_the_recording_that_is_watched_with_its_results(tmp_path):
+    simulate("smooth", tmp_path / "run", seed=5, frames=8, picture_scale=0.25)
+    program = f"import sys; sys.path.insert(0, {str(ROOT)!r}); from cli import main; main(prog_name='beampose')"
+    command = [sys.executable, "-P", "-c", program, "watch", "run", "--out", "out"]
+    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as watching:
+        until, table = time.monotonic() + 60, tmp_path / "out/attitude_live.csv"
+        while time.monotonic() < until and not (table.is_file() and len(table.read_text().splitlines()) == 9):
+            time.sleep(0.05)
+        watching.send_signal(signal.SIGINT)
+        out, errors = watching.communicate(timeout=60)
+    assert (watching.returncode, errors) == (0, "")
+    assert out.startswith("smooth-5: PASS: 8 of 8 frames measured")
+    assert json.loads((tmp_path / "out/summary.json").read_text())["notes"] == [
+        "left: 8 pictures were there before the watch began",
+        "right: 8 pictures were there before the watch began",
+    ]
 
 
 def test_a_foreign_folder_is_not_replaced(tmp_path):

@@ -48,7 +48,17 @@ def loaded(code: str, *arguments: str, word: str = "LOADED") -> set[str]:
     return set(line.split()[1:])
 
 
-@pytest.mark.parametrize("arguments", [("--version",), ("--help",), ("run", "--help"), ("calibrate", "rig", "--help")])
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("--version",),
+        ("--help",),
+        ("run", "--help"),
+        ("detect", "--help"),
+        ("watch", "--help"),
+        ("calibrate", "rig", "--help"),
+    ],
+)
 def test_help_and_version_import_no_library_but_the_command_lines(arguments):
     heavy = {"numpy", "scipy", "cv2", "pandas", "numba", "pydantic", "yaml", "jinja2", "rich"}
     assert heavy & loaded(REPORT, *arguments) == set()

@@ -186,6 +186,11 @@ def _rendered(report: CalibrationReport, drawn: list[list[Drawing]]) -> str:
     return environment().get_template("calibration.html.j2").render(context)
 
 
+def section_context(section: Section) -> dict[str, Any]:
+    """A section as the template sections.html.j2 takes it."""
+    return _section(section, [_drawing(d) for d in section.drawings])
+
+
 def _section(section: Section, drawings: list[Drawing]) -> dict[str, Any]:
     table = section.table
     return {

@@ -20,7 +20,7 @@ from lab.report import svg
 from lab.report.material import Material
 from lab.report.tracks import SPOT_COLOURS
 from lab.results import SPOT_STATUSES, read_table
-from lab.run_file import DetectionsTable, VideoFile
+from lab.run_file import DetectionsTable, LiveDevice, VideoFile
 from tracking.detections import Detections
 from tracking.statuses import PoseStatus, SpotStatus
 
@@ -136,7 +136,7 @@ def pictures(m: Material, results: Path, selection: list[Event]) -> list[str]:
     read: dict[tuple[str, int], Grey | str] = {}
     for camera, source in m.run.cameras.items():
         frames = [int(m.spots.frames[e.index]) for e in selection if e.camera == camera]
-        if not frames or isinstance(source, DetectionsTable):
+        if not frames or isinstance(source, DetectionsTable | LiveDevice):
             continue
         try:
             found = pictures_at(m.run, camera, frames)
@@ -191,7 +191,7 @@ def _drawing(m: Material, event: Event, picture: Array | str, points: dict[tuple
         out.append(f'<rect class="nopicture" x="-0.5" y="-0.5" width="{w}" height="{h}"/>')
         out.append(svg.text(w / 2, 0.09 * h, picture, "halo mid", f"fill:#fff;font-size:{14 / scale:.0f}px"))
     else:
-        shown = _stretched(picture, *_limits(picture))
+        shown = stretched(picture, *grey_limits(picture))
         if w > 2 * _SHOWN_WIDTH:
             shown = np.asarray(cv2.resize(shown, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), np.uint8)
         out.append(
@@ -216,7 +216,7 @@ def _focus(m: Material, event: Event, views: list[int], size: tuple[int, int]) -
     return None
 
 
-def _limits(picture: Array) -> tuple[float, float]:
+def grey_limits(picture: Array) -> tuple[float, float]:
     """The grey values to show as black and as white: what is brighter than 3 pixels in 10,000 clips.
 
     At least eight times the spread of the background lies between them, so that a dark picture does not become noise.
@@ -225,7 +225,7 @@ def _limits(picture: Array) -> tuple[float, float]:
     return float(low), float(max(high, low + 8.0 * (usual - low), low + 8.0))
 
 
-def _stretched(picture: Array, low: float, high: float) -> Bytes:
+def stretched(picture: Array, low: float, high: float) -> Bytes:
     """Eight bits, so that the background is just seen and the spots do not all clip."""
     shares = np.clip((picture - low) / max(high - low, 1.0), 0.0, 1.0)
     return (255 * np.sqrt(shares)).astype(np.uint8)
@@ -327,8 +327,8 @@ def _zoom(m: Material, event: Event, picture: Array, focus: Array, views: list[i
     x0, y0 = corner - 0.5
     marks = _overlay(m, event.index, views, (w, h), unit, points, enlarged=True)
     frame = f'x="{x0}" y="{y0}" width="{side}" height="{side}"'
-    low, high = _limits(picture)
-    data = _data_uri(_stretched(part, low, max(high, float(part.max()))), ".png")
+    low, high = grey_limits(picture)
+    data = _data_uri(stretched(part, low, max(high, float(part.max()))), ".png")
     inner = (
         f'<svg x="408" y="34" width="{_ZOOM_SHOWN}" height="{_ZOOM_SHOWN}" viewBox="{x0} {y0} {side} {side}">'
         f'<image {frame} style="image-rendering:pixelated" href="{data}"/>{marks}</svg>'

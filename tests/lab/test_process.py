@@ -18,6 +18,7 @@ from geometry.spots import SpotModel
 from lab import columns, process
 from lab.batch import process_batch
 from lab.errors import InputError, RunError
+from lab.json_text import plain
 from lab.pipeline import FrameRecord, Pipeline
 from lab.process import are_results, process_run
 from lab.quality import LEAST_MEASURED
@@ -222,7 +223,7 @@ def test_the_summary_is_strict_json(results):
 
 def test_a_number_that_does_not_exist_is_null_in_the_summary():
     content = {"a": float("nan"), "b": [np.float64("inf"), np.int64(3)], "c": (np.float32(0.5), True, None, "text")}
-    assert process._plain(content) == {"a": None, "b": [None, 3], "c": [0.5, True, None, "text"]}
+    assert plain(content) == {"a": None, "b": [None, 3], "c": [0.5, True, None, "text"]}
 
 
 def test_without_truth_there_are_no_errors(tmp_path):
@@ -624,7 +625,7 @@ def test_a_run_that_breaks_leaves_earlier_results_as_they_were(tmp_path, monkeyp
     def fail(*_):
         raise RunError("the disk is full")
 
-    monkeypatch.setattr(process, "_write_json", fail)
+    monkeypatch.setattr(process, "write_json", fail)
     with pytest.raises(RunError):
         process_run(folder, out)
     assert {p.name: p.read_bytes() for p in out.iterdir()} == before

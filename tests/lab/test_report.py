@@ -14,7 +14,7 @@ import pytest
 from lab.report import svg, tables, write_report
 from lab.report.index import write_index
 from lab.report.material import gather
-from lab.report.pictures import MOST_PICTURES, _arrow, _limits, _stretched, chosen, events
+from lab.report.pictures import MOST_PICTURES, _arrow, chosen, events, grey_limits, stretched
 from lab.report.verdict import verdict_of
 from tests.lab.fake_results import Fake, make, without_added_columns
 from tracking.statuses import PoseStatus, SpotStatus
@@ -274,8 +274,8 @@ def test_a_faint_spot_on_a_dark_picture_is_shown_bright_and_a_dark_picture_stays
     faint = dark.copy()
     faint[250:256, 300:306] += 30
     faint[10, 10] = 255.0  # a hot pixel
-    assert _stretched(faint, *_limits(faint))[253, 303] > 200
-    assert np.median(_stretched(dark, *_limits(dark))) < 128
+    assert stretched(faint, *grey_limits(faint))[253, 303] > 200
+    assert np.median(stretched(dark, *grey_limits(dark))) < 128
 
 
 def test_a_spot_far_outside_is_named_with_its_distance_and_an_arrow_at_the_border():

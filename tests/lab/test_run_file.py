@@ -139,7 +139,11 @@ BROKEN = [
     ("{frames: frames/left}", "{frames: frames/lft}", "cameras.left.frames: expected a folder of pictures or a video,"),
     ("{frames: frames/left}", "{detections: d.csv}", "cameras.left.detections: expected a table, found none at "),
     ("{frames: frames/left}", "{frames: frames/left/000000.png}", "got the single picture "),
-    ("{frames: frames/left}", "frames/left", "cameras.left: expected a mapping with frames, detections, got 'frames/"),
+    (
+        "{frames: frames/left}",
+        "frames/left",
+        "cameras.left: expected a mapping with frames, detections, device, got 'frames/",
+    ),
     ("  left: {", "  lefft: {", "cameras.lefft: expected a camera of rig.yaml, got 'lefft'; did you mean 'left'?"),
     ("position_m: [0.0, 0.0, 0.0]", "position_m: [0.0, 0.0]", "prior.position_m: expected 3 numbers, got 2"),
     ("  position_m: [0.0, 0.0, 0.0]\n", "", "prior.position_m: expected a value, got nothing; add it"),

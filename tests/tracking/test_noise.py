@@ -217,3 +217,12 @@ def test_no_picture_and_no_noise_are_refused():
         estimate_noise([])
     with pytest.raises(ValueError, match="floor_dn2 > 0"):
         NoiseModel(0.0, 0.1)
+
+
+@pytest.mark.parametrize("size", [(40, 32), (100, 60), (160, 120)])
+def test_pictures_too_small_for_levels_still_have_the_noise_that_was_drawn(size):
+    rng = np.random.default_rng(5)
+    scene = Scene([Spot(size[0] / 2, size[1] / 2, 3000.0, 1, 1)], size=size, background=200.0, read=20.0)
+    model = estimate_noise([photograph(scene, rng, bits=16) for _ in range(2)]).model
+    true = 20.0**2 + 200.0 / scene.gain
+    assert 1 / 1.6 < float(model.variance(200.0)) / true < 1.6

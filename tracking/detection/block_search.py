@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.arrays import Ints
-from geometry.compiled import compiled
+from geometry.compiled import compiled, compiled_for_threads
 
 BLOCK = 8  # px
 AROUND = 2  # blocks on each side whose median is the background
@@ -58,7 +58,7 @@ def runs_of(boxes: Ints, more_rows: int, more_columns: int, rows: int, columns: 
     return count
 
 
-@compiled
+@compiled_for_threads
 def bin_pixels(image: NDArray, runs: Ints, pairs: Sums) -> None:
     """Sums of 2x2 pixels of a picture (h, w), u8 or u16; the border's pixels are repeated outside."""
     height, width = image.shape

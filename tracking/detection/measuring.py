@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from geometry.arrays import Array, Ints
-from geometry.compiled import compiled
+from geometry.compiled import compiled, compiled_for_threads
 from tracking.detection import candidates, ellipse
 from tracking.detection.candidates import Noise, texture_variance
 from tracking.detection.compact import CENTRE_SHARE, height_of_compact
@@ -64,7 +64,7 @@ class Limits(NamedTuple):
     min_explained: float
 
 
-@compiled
+@compiled_for_threads
 def measure(
     image: Pixels, peaks: Array, chosen: Ints, noise: Noise, limits: Limits, table: Array, cells: Array, algebra: Array
 ) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.arrays import Array, Ints
-from geometry.compiled import compiled
+from geometry.compiled import compiled_for_threads
 from tracking.detection.block_search import (
     AROUND,
     SUMS,
@@ -26,7 +26,7 @@ HALO = 2  # blocks around a box that its search needs
 BLOCK_SHARE, PEAK_SHARE = 0.63, 0.75  # of the threshold: to look closer at a block; to measure a peak
 
 
-@compiled
+@compiled_for_threads
 def find_peaks_in(
     boxes: Ints, image: Pixels, blocks: Blocks, noise: Noise, threshold_sigma: float, searched: NDArray[np.uint8],
     found: Ints, runs: Ints, room: Array, peaks: Array, count: int,

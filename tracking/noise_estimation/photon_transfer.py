@@ -64,13 +64,14 @@ def estimate_noise(pictures: Sequence[Picture]) -> NoiseEstimate:
     saturation = saturation_level(usable, step)
     full = full_scale(usable, step)
     rounding = step**2 / 12
-    if min(usable[0].shape) < 2 * SIDE:
-        model = NoiseModel(max(_small_picture_variance(usable), rounding), full / FULL_SCALE_E)
-        return NoiseEstimate(model, 1.0, _WELL_SPREAD, saturation, step, len(usable), temporal=False)
     top = float(np.iinfo(usable[0].dtype).max) if saturation is None else saturation
-    levels = level_variances(usable, top, rounding)
-    background = float(np.median(np.concatenate([p[::8, ::8].ravel() for p in usable])))
-    dark = clipped_background(usable, step)
+    background = float(np.median(np.concatenate([p[::8, ::8].ravel() for p in usable]))) if usable[0].size else 0.0
+    small = min(usable[0].shape) < 2 * SIDE
+    dark = None if small else clipped_background(usable, step)
+    levels = None if small else level_variances(usable, top, rounding)
+    if levels is None or (dark is None and not len(levels.level)):  # too few pixels for a level
+        model = NoiseModel(max(_small_picture_variance(usable), rounding), full / FULL_SCALE_E, background)
+        return NoiseEstimate(model, 1.0, _WELL_SPREAD, saturation, step, len(usable), temporal=False)
     lines = _Lines.through(levels, background, full, rounding) if dark is None else _Lines.from_point(*dark, full)
     slope, slope_sigma = lines.slope(rounding)
     first = lines.model(slope, rounding)

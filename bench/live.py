@@ -1,0 +1,85 @@
+"""How late the poses of `beampose watch` are: `python -m bench.live [--frames 1000] [--rate 100] [--format pgm]`.
+
+A process of its own writes simulated pictures of two 1280x1024 cameras into the frame folders at the given rate, whole
+files under their own names, as a recorder does. The latency is what summary.json says: from the arrival of a frame's
+last picture until its pose is written. The table also says how busy the machine was.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import os
+import shutil
+import tempfile
+import time
+from pathlib import Path
+
+from bench.throughput.folders import run_folder
+from lab.watch.live_frames import WatchOptions
+from lab.watch.watch import watch_run
+
+KEPT = 300  # frames on disk behind the latest: older ones are deleted, as in a recorder's ring
+
+
+def feed(source: Path, target: Path, frames: int, rate_hz: float, begin: multiprocessing.Event) -> None:
+    """Write the pictures of a run folder into another one at a constant rate."""
+    cameras = sorted(p.name for p in (source / "frames").iterdir())
+    pictures = {c: [p.read_bytes() for p in sorted((source / "frames" / c).iterdir())] for c in cameras}
+    suffix = next((source / "frames" / cameras[0]).iterdir()).suffix
+    begin.wait()
+    start = time.perf_counter()
+    for frame in range(frames):
+        time.sleep(max(0.0, start + frame / rate_hz - time.perf_counter()))
+        for camera in cameras:
+            some = pictures[camera]
+            turn, k = divmod(frame, len(some))
+            data = some[k if turn % 2 == 0 else len(some) - 1 - k]
+            (target / "frames" / camera / f"{frame:06d}{suffix}").write_bytes(data)
+            old = target / "frames" / camera / f"{frame - KEPT:06d}{suffix}"
+            old.unlink(missing_ok=True)
+    took = time.perf_counter() - start
+    print(f"fed {frames} frames in {took:.2f} s ({frames / took:.1f} Hz)", flush=True)
+
+
+def measure(kept: Path, work: Path, kind: str, frames: int, rate_hz: float, scenario: str) -> dict[str, object]:
+    """Feed and watch one run; what summary.json says of the latency."""
+    source = run_folder(kept, kind, min(frames, 100), scenario)
+    target = work / "run"
+    for camera in sorted(p.name for p in (source / "frames").iterdir()):
+        (target / "frames" / camera).mkdir(parents=True)
+    for name in ("rig.yaml", "run.yaml"):
+        shutil.copy(source / name, target / name)
+    begin = multiprocessing.Event()
+    feeder = multiprocessing.Process(target=feed, args=(source, target, frames, rate_hz, begin), daemon=True)
+    feeder.start()
+    from threading import Timer
+
+    Timer(8.0, begin.set).start()  # loading takes some seconds
+    watch_run(target, work / "out", options=WatchOptions(idle_s=2.0))
+    feeder.join()
+    summary = json.loads((work / "out" / "summary.json").read_text("utf-8"))
+    live: dict[str, object] = summary["live"]["latency_ms"]
+    live["notes"], live["timings"] = summary["notes"], summary["timings"]
+    return live
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--frames", type=int, default=1000)
+    parser.add_argument("--rate", type=float, default=100.0, help="Hz")
+    parser.add_argument("--format", default="pgm", choices=("pgm", "tiff", "png"))
+    parser.add_argument("--scenario", default="huo2015")
+    parser.add_argument("--kept", type=Path, default=Path(tempfile.gettempdir()) / "beampose-bench-live")
+    given = parser.parse_args()
+    with tempfile.TemporaryDirectory(prefix="beampose-live-") as name:
+        load = os.getloadavg()[0]
+        live = measure(given.kept, Path(name), given.format, given.frames, given.rate, given.scenario)
+        print(f"load before {load:.1f}, after {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
+        print(json.dumps(live, indent=1))
+
+
+if __name__ == "__main__":
+    main()

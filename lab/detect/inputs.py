@@ -1,0 +1,167 @@
+"""The pictures that `beampose detect` was given: a folder, picture files, or a video, with a frame number each."""
+
+from __future__ import annotations
+
+import glob
+from collections import deque
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+from lab.errors import InputError
+from lab.frame_sources import VideoSource, number_of, open_video, promised_pictures
+from lab.frames import AHEAD, THREADS
+from lab.pictures import SUFFIXES, Grey, Missing, read_picture
+from lab.sensor_noise import VIDEO_PICTURES, frames_to_learn_from
+
+_HINT = f"a picture ({', '.join(s[1:] for s in SUFFIXES)}), a folder of pictures, or a video"
+_SHOWN = 3  # names in a message
+
+
+@dataclass(frozen=True, slots=True)
+class PictureFiles:
+    """Pictures by rising frame number."""
+
+    camera: str  # the folder's or the file's name
+    files: tuple[tuple[int, Path], ...]
+    notes: tuple[str, ...] = ()
+
+    def count(self, every: int) -> int | None:
+        """How many pictures there are, of each `every` one."""
+        return -(-len(self.files) // every)
+
+    def pictures(self, every: int) -> Iterator[tuple[int, Grey | Missing]]:
+        """Every so many pictures with their frame numbers, read ahead in threads."""
+        wanted = iter(self.files[::every])
+        waiting: deque[tuple[int, Future[Grey | Missing]]] = deque()
+        with ThreadPoolExecutor(THREADS, thread_name_prefix="decode") as pool:
+            while True:
+                while len(waiting) < AHEAD and (following := next(wanted, None)) is not None:
+                    waiting.append((following[0], pool.submit(read_picture, following[1], None)))
+                if not waiting:
+                    return
+                number, later = waiting.popleft()
+                yield number, later.result()
+
+    def to_learn_from(self) -> Iterator[Grey | Missing]:
+        """Pairs of neighbours, from which the noise is learnt."""
+        for i in frames_to_learn_from(len(self.files)):
+            yield read_picture(self.files[i][1], None)
+
+
+@dataclass(frozen=True, slots=True)
+class Video:
+    """A video; frame n is its n-th picture."""
+
+    camera: str
+    path: Path
+    notes: tuple[str, ...] = ()
+
+    def count(self, every: int) -> int | None:
+        """What the header promises; None where it promises nothing."""
+        promised = promised_pictures(self.path)
+        return None if promised is None else -(-promised // every)
+
+    def pictures(self, every: int) -> Iterator[tuple[int, Grey | Missing]]:
+        """Every so many pictures with their frame numbers."""
+        video = VideoSource(self.path, None)
+        try:
+            number = 0
+            while True:
+                if number % every:
+                    if not video.skip():
+                        return
+                else:
+                    picture = video.next_picture()
+                    if picture is None:
+                        return
+                    yield number, picture
+                number += 1
+        finally:
+            video.close()
+
+    def to_learn_from(self) -> Iterator[Grey | Missing]:
+        """Pairs of neighbours at the start."""
+        video = VideoSource(self.path, None)
+        try:
+            for number in range(VIDEO_PICTURES[-1] + 1):
+                picture = video.next_picture()
+                if picture is None:
+                    return
+                if number in VIDEO_PICTURES:
+                    yield picture
+        finally:
+            video.close()
+
+
+def open_inputs(given: Sequence[Path], camera: str | None = None) -> PictureFiles | Video:
+    """What was given on the command line. camera: a name in place of the folder's or file's own.
+
+    Raises InputError where something is not there, a folder holds no pictures, or kinds are mixed.
+    """
+    if len(given) == 1 and given[0].is_dir():
+        files = _pictures_in(given[0])
+        return _numbered(files, camera or given[0].resolve().name)
+    files = [file for path in given for file in _files_of(path)]
+    files = list({file.resolve(): file for file in files}.values())
+    others = [f for f in files if f.suffix.lower() not in SUFFIXES]
+    if others and len(files) > 1:
+        raise InputError(
+            f"{others[0]}: expected pictures only, or a single video, got it among {len(files)} files; name the"
+            " pictures in one call and each video in its own"
+        )
+    if others:
+        _require_video(others[0])
+        return Video(camera or others[0].stem, others[0])
+    folders = {file.resolve().parent for file in files}
+    own = files[0].stem if len(files) == 1 else folders.pop().name if len(folders) == 1 else "pictures"
+    return _numbered(files, camera or own)
+
+
+def _files_of(path: Path) -> list[Path]:
+    if path.is_dir():
+        raise InputError(f"{path}: expected a folder alone, or files, got a folder among others; name one at a time")
+    if path.exists():
+        return [path]
+    if any(c in str(path) for c in "*?["):
+        matching = [Path(p) for p in sorted(glob.glob(str(path), recursive=True))]
+        matching = [p for p in matching if p.is_file()]
+        if not matching:
+            raise InputError(f"{path}: no file matches this pattern")
+        return matching
+    raise InputError(f"{path}: expected {_HINT}, found nothing; check the path")
+
+
+def _pictures_in(folder: Path) -> list[Path]:
+    try:
+        names = sorted(p for p in folder.iterdir() if not p.name.startswith("."))
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be read: {error.strerror}") from None
+    pictures = [p for p in names if p.suffix.lower() in SUFFIXES and p.is_file()]
+    if pictures:
+        return pictures
+    below = [p.name for p in names if p.is_dir() and any(q.suffix.lower() in SUFFIXES for q in p.iterdir())]
+    hint = f"; its folders {', '.join(below[:_SHOWN])} do: name one of them" if below else ""
+    among = f" among {len(names)} files" if names and not below else ""
+    raise InputError(f"{folder}: the folder holds no pictures ({', '.join(s[1:] for s in SUFFIXES)}){among}{hint}")
+
+
+def _require_video(path: Path) -> None:
+    try:
+        open_video(path).release()
+    except InputError:
+        raise InputError(f"{path}: expected {_HINT}, found a file that is none of them, or damaged") from None
+
+
+def _numbered(files: Sequence[Path], camera: str) -> PictureFiles:
+    """By the numbers in the names, as in runs; by the names' order where these do not tell the pictures apart."""
+    numbers = [number_of(f.name) for f in files]
+    known = [n for n in numbers if n is not None]
+    if len(set(known)) == len(files):
+        return PictureFiles(camera, tuple(sorted(zip(known, files, strict=True))))
+    if len(files) == 1:
+        return PictureFiles(camera, ((0, files[0]),))
+    why = "some names hold no number" if len(known) < len(files) else "some names hold the same number"
+    note = f"frames are numbered from 0 in the order of the names: {why}"
+    return PictureFiles(camera, tuple(enumerate(files)), (note,))

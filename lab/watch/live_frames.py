@@ -1,0 +1,207 @@
+"""Frames as they arrive, in the form in which recorded ones are read: the pipeline does not see the difference."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from lab.detections_file import LONGEST_GAP
+from lab.errors import BeamposeError, InputError
+from lab.frames import FrameSet
+from lab.pictures import Grey, Missing
+from lab.run_file import FramesFolder, LiveDevice, Run
+from lab.watch.cameras import DeviceCamera, FolderCamera, LiveCamera, in_thread, open_device
+from lab.watch.folder_poll import FolderPoll
+from lab.watch.inbox import CameraBox, Inbox, is_complete
+
+FIRST = 6  # pictures of each camera that the noise is learnt from
+_START_S = 0.5  # a camera is waited for so long for them, or for the time of eight frames
+
+
+@dataclass(frozen=True, slots=True)
+class WatchOptions:
+    """How long to wait for what, s."""
+
+    idle_s: float = 10.0  # without anything new: the recording has ended
+    timeout_s: float = 0.25  # for a camera whose picture of a frame does not come, or stays damaged
+
+
+@dataclass(slots=True)
+class LiveFrames:
+    """The frames of a run that is being recorded. Use it as a context; iterate once, after `begin`.
+
+    stop: set it to end the recording, as when the user has pressed Ctrl-C; what has arrived is still given.
+    """
+
+    run: Run
+    options: WatchOptions
+    stop: threading.Event = field(default_factory=threading.Event)
+    inbox: Inbox = field(init=False)
+    arrived_s: dict[int, float | None] = field(default_factory=dict)  # time.time(), of frames given and not yet asked
+    caught_up: bool = False  # a frame was the newest when it was given: the start's backlog is worked off
+    _cameras: dict[str, LiveCamera] = field(init=False)
+    _stack: ExitStack = field(default_factory=ExitStack)
+    _reasons: dict[str, Counter[str]] = field(default_factory=dict)
+    _failures: list[BaseException] = field(default_factory=list)
+    _first: int = 0
+
+    def __post_init__(self) -> None:
+        """Raises InputError where a camera cannot be watched."""
+        interval_s = 1 / self.run.frame_rate_hz
+        self.inbox = Inbox(tuple(self.run.cameras), interval_s, self.options.timeout_s)
+        self._reasons = {name: Counter() for name in self.run.cameras}
+        if self.run.times_path is not None:
+            raise InputError(
+                f"{self.run.path}: timestamps: expected none in a run that is watched, since they are not there yet;"
+                " leave them out: t_s is then frame / frame_rate_hz"
+            )
+        self._cameras = {name: self._camera(name) for name in self.run.cameras}
+
+    def __enter__(self) -> LiveFrames:
+        for camera in self._cameras.values():
+            thread = in_thread(camera, self._failed)
+            self._stack.callback(thread.join, 5.0)
+        self._stack.callback(self.inbox.stopping.set)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+    @property
+    def expected_frames(self) -> int | None:
+        """Nobody knows how long it will go on."""
+        return None
+
+    @property
+    def notes(self) -> list[str]:
+        """What a reader of the results should know, in plain words."""
+        out = [note for camera in self._cameras.values() for note in camera.notes]
+        for name, box in self.inbox.boxes.items():
+            out += [f"{name}: {count} frames {reason}" for reason, count in self._reasons[name].items()]
+            if box.late:
+                out.append(
+                    f"{name}: {box.late} pictures came after their frame had been closed and were not used; `beampose"
+                    " run` on the finished folder uses them"
+                )
+            if box.refused:
+                out.append(f"{name}: {box.refused} pictures were left out: they came faster than they are processed")
+            if box.strays:
+                out.append(f"{name}: pictures far beyond all others were left out: {_some(box.strays)}")
+        return out
+
+    def begin(self) -> Mapping[str, list[Grey]]:
+        """Wait for the first pictures of every camera; up to FIRST of each, in the order of their numbers.
+
+        Empty where the recording ended without any. Raises InputError where the names hold no frame numbers.
+        """
+        self.inbox.wanted.set()
+        begun: float | None = None
+        patience = max(_START_S, 8 / self.run.frame_rate_hz, self.options.timeout_s)
+        with self.inbox.changed:
+            while True:
+                self._raise_failure()
+                counts = [self._usable(box) for box in self.inbox.boxes.values()]
+                if begun is None and any(box.pictures for box in self.inbox.boxes.values()):
+                    begun = time.perf_counter()
+                waited = 0.0 if begun is None else time.perf_counter() - begun
+                over = self.stop.is_set() or all(box.ended for box in self.inbox.boxes.values())
+                if min(len(c) for c in counts) >= FIRST or waited > patience or over:
+                    break
+                self.inbox.changed.wait(0.05)
+            return self._first_pictures()
+
+    def __iter__(self) -> Iterator[FrameSet]:
+        frame = self._first
+        since = time.perf_counter()
+        try:
+            while self._wait_for(frame, since):
+                with self.inbox.changed:
+                    images, self.arrived_s[frame] = self.inbox.take(frame)
+                    self.caught_up |= not self.inbox.has_later(frame)
+                for name, content in images.items():
+                    if isinstance(content, Missing):
+                        self._reasons[name][content.reason] += 1
+                yield FrameSet(frame, images)
+                frame += 1
+                since = time.perf_counter()
+        finally:
+            self.inbox.stopping.set()
+
+    def _wait_for(self, frame: int, since: float) -> bool:
+        """Wait until a frame can be worked on; False: the recording has ended before it."""
+        boxes = list(self.inbox.boxes.values())
+        with self.inbox.changed:
+            while True:
+                self._raise_failure()
+                now = time.perf_counter()
+                timeout = 0.0 if self.stop.is_set() else self.options.timeout_s
+                complete, given_up = is_complete(frame, boxes, now, since, timeout, 1 / self.run.frame_rate_hz)
+                if complete:
+                    for box in given_up:
+                        box.asleep = True
+                    return True
+                if not self._anything_from(frame, boxes) and self._is_over(now, boxes):
+                    return False
+                self.inbox.changed.wait(0.005)
+
+    def _is_over(self, now: float, boxes: list[CameraBox]) -> bool:
+        seen = self.inbox.last_seen_s
+        idle = seen is not None and now - seen > self.options.idle_s
+        return self.stop.is_set() or idle or all(box.ended for box in boxes)
+
+    @staticmethod
+    def _anything_from(frame: int, boxes: list[CameraBox]) -> bool:
+        """Whether any camera has something complete of this frame or a later one."""
+        return any(number >= frame for box in boxes for number in box.pictures)
+
+    def _first_pictures(self) -> dict[str, list[Grey]]:
+        numbers = sorted({n for box in self.inbox.boxes.values() for n in (*box.pictures, *box.incomplete)})
+        if not numbers:
+            return {}
+        gaps = np.diff(numbers)
+        if gaps.size and gaps.max() > LONGEST_GAP:
+            raise InputError(
+                f"{self.run.path}: cameras: expected frame numbers without gaps of many thousands, got {numbers[0]} and"
+                f" {numbers[int(np.argmax(gaps)) + 1]} among the first; is a stray file among them, or do the names"
+                " hold a time?"
+            )
+        self._first = self.inbox.next_frame = numbers[0]
+        return {name: self._usable(box)[:FIRST] for name, box in self.inbox.boxes.items()}
+
+    @staticmethod
+    def _usable(box: CameraBox) -> list[Grey]:
+        contents = [waiting.content for _, waiting in sorted(box.pictures.items(), key=lambda item: item[0])]
+        return [content for content in contents if isinstance(content, np.ndarray)]
+
+    def _failed(self, error: BaseException) -> None:
+        with self.inbox.changed:
+            self._failures.append(error)
+            self.inbox.changed.notify_all()
+
+    def _raise_failure(self) -> None:
+        if self._failures:
+            raise self._failures[0]
+
+    def _camera(self, name: str) -> FolderCamera | DeviceCamera:
+        source, size_px = self.run.cameras[name], self.run.rig.cameras[name].image_size_px
+        if isinstance(source, LiveDevice):
+            try:
+                return open_device(name, source.device, size_px, self.inbox, self.run.frame_rate_hz)
+            except BeamposeError as error:
+                raise InputError(f"{self.run.path}: {error}") from None
+        if not isinstance(source, FramesFolder):
+            raise InputError(
+                f"{self.run.path}: cameras.{name}: expected a folder of pictures or a device to watch, got"
+                f" {source.path}, which is read when it is complete: use `beampose run`"
+            )
+        return FolderCamera(name, FolderPoll(source.path), size_px, self.inbox, self.options.timeout_s)
+
+
+def _some(numbers: list[int]) -> str:
+    return ", ".join(map(str, numbers[:5])) + (", ..." if len(numbers) > 5 else "")

@@ -1,0 +1,173 @@
+"""What leaves a watched run at once: a row of attitude_live.csv and a line of JSON by UDP per frame, and how late."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import socket
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TextIO
+
+import numpy as np
+
+from lab import columns
+from lab.errors import InputError
+from lab.frame_checks import FrameChecks
+from lab.json_text import plain
+from lab.pipeline import FrameRecord
+from lab.tables import attitude_rows, pose_numbers
+from lab.watch.live_frames import LiveFrames
+from lab.whole_folder import replace_folder
+
+LIVE_TABLE = "attitude_live.csv"
+
+
+@dataclass(slots=True)
+class UdpLines:
+    """Sends text to one address; whoever listens may come and go."""
+
+    address: str  # HOST:PORT
+    failures: int = 0
+    _socket: socket.socket = field(init=False)
+    _to: Any = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Raises InputError where the address is none."""
+        host, colon, port = self.address.rpartition(":")
+        if not (colon and host and port.isascii() and port.isdigit() and 0 < int(port) < 65536):
+            raise InputError(f"--udp: expected HOST:PORT, such as 127.0.0.1:5005, got {self.address!r}")
+        try:
+            found = socket.getaddrinfo(host.strip("[]"), int(port), type=socket.SOCK_DGRAM)
+        except OSError as error:
+            raise InputError(f"--udp: the host {host!r} is not known: {error.strerror}") from None
+        family, kind, protocol, _, self._to = found[0]
+        self._socket = socket.socket(family, kind, protocol)
+        self._socket.setblocking(False)
+
+    def send(self, line: str) -> None:
+        """Send a line; that it cannot be sent is counted and stops nothing."""
+        try:
+            self._socket.sendto(line.encode("utf-8"), self._to)
+        except OSError:
+            self.failures += 1
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._socket.close()
+
+
+@dataclass(slots=True)
+class Latency:
+    """How late poses are: from the arrival of a frame's last picture until its pose is written, ms."""
+
+    steady: list[float] = field(default_factory=list)  # once the backlog of the start is worked off
+    start: list[float] = field(default_factory=list)  # before
+
+    def as_mapping(self) -> dict[str, Any]:
+        """For summary.json."""
+        out: dict[str, Any] = {"frames": len(self.steady), "start_frames": len(self.start)}
+        if self.steady:
+            values = np.array(self.steady)
+            out |= dict(zip(("median", "p95", "p99"), np.percentile(values, [50, 95, 99]).tolist(), strict=True))
+            out["largest"] = float(values.max())
+        if self.start:
+            out["largest_at_start"] = max(self.start)
+        return out
+
+    def line(self) -> str:
+        """In words; empty without a frame."""
+        if not self.steady:
+            return ""
+        median, p95, p99 = np.percentile(self.steady, [50, 95, 99])
+        return (
+            f"latency: median {median:.1f} ms, 95 % within {p95:.1f} ms, 99 % within {p99:.1f} ms, largest"
+            f" {max(self.steady):.1f} ms ({len(self.steady)} frames)"
+        )
+
+
+@dataclass(slots=True)
+class LiveOutput:
+    """Writes each frame's pose as soon as it is known, into the folder of the results to come.
+
+    The folder holds the live table alone until the results replace it. Every pose passes the checks of a finished run
+    first: the rows are those that `beampose run --causal` writes.
+    """
+
+    out: Path
+    frames: LiveFrames
+    checks: FrameChecks
+    udp: UdpLines | None = None
+    latency: Latency = field(default_factory=Latency)
+    _file: TextIO | None = None
+
+    def write(self, record: FrameRecord) -> None:
+        """Write and send one frame."""
+        ((checked, _),) = self.checks.passed([(record, None)])
+        if self._file is None:
+            self._file = self._opened()
+        self._file.write(attitude_rows([checked])[0])
+        self._file.flush()
+        arrived_s = self.frames.arrived_s.pop(record.frame, None)
+        latency_ms = None if arrived_s is None else max(1e3 * (time.time() - arrived_s), 0.0)
+        if latency_ms is not None:
+            (self.latency.steady if self.frames.caught_up else self.latency.start).append(latency_ms)
+        if self.udp is not None:
+            self.udp.send(json_line(checked, latency_ms))
+
+    def finish(self, work: Path) -> dict[str, Any]:
+        """Put the live table among the results in `work`; what summary.json says of the watch."""
+        if self._file is not None:
+            self._file.seek(0)
+            with (work / LIVE_TABLE).open("w", encoding="utf-8", newline="") as copy:
+                shutil.copyfileobj(self._file, copy)
+        return {
+            "live": {
+                "latency_ms": self.latency.as_mapping(),
+                "idle_s": self.frames.options.idle_s,
+                "timeout_s": self.frames.options.timeout_s,
+                "udp": None if self.udp is None else {"to": self.udp.address, "not_sent": self.udp.failures},
+            }
+        }
+
+    def close(self) -> None:
+        """Close what is open."""
+        if self._file is not None:
+            self._file.close()
+        if self.udp is not None:
+            self.udp.close()
+
+    def _opened(self) -> TextIO:
+        """The live table in a folder of its own, in place of earlier results."""
+        new = self.out.parent / f".{self.out.name}.live-{os.getpid()}"
+        shutil.rmtree(new, ignore_errors=True)
+        new.mkdir(parents=True)
+        file = (new / LIVE_TABLE).open("w+", encoding="utf-8", newline="")
+        file.write(",".join(columns.ATTITUDE) + "\n")
+        replace_folder(new, self.out)
+        return file
+
+
+def json_line(record: FrameRecord, latency_ms: float | None) -> str:
+    """One frame as a line of JSON. Units are in the names; null for what is not known."""
+    t = record.tracked
+    content: dict[str, Any] = {"frame": record.frame, "t_s": record.t_s, "status": t.pose_status.value}
+    names = ("position_m", "quaternion_wxyz", "yaw_pitch_roll_deg", "sigma_position_m", "sigma_yaw_pitch_roll_deg")
+    if t.pose is None or t.pose_covariance is None:
+        content |= dict.fromkeys(names)
+    else:
+        numbers = pose_numbers(t.pose, t.pose_covariance).tolist()
+        parts = (numbers[0:3], numbers[3:7], numbers[7:10], numbers[10:13], numbers[13:16])
+        content |= dict(zip(names, parts, strict=True))
+    content |= {"spots_used": t.spots_used, "latency_ms": latency_ms}
+    return json.dumps(plain(content), allow_nan=False) + "\n"
+
+
+def is_live_table(folder: Path) -> bool:
+    """Whether a folder holds a live table and nothing else: what a watch leaves that was stopped by force."""
+    try:
+        return [p.name for p in folder.iterdir()] == [LIVE_TABLE]
+    except OSError:
+        return False

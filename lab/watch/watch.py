@@ -1,0 +1,162 @@
+"""A run followed while it is recorded: poses as frames arrive, and the ordinary results when the recording ends."""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import logging
+import signal
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from geometry.pose import Pose
+from geometry.spots import SpotModel
+from lab.errors import RunError
+from lab.frame_checks import FrameChecks
+from lab.pictures import Grey
+from lab.pipeline import Pipeline, spots_in, tracker_of
+from lab.process import Outcome, are_results, ready_run, write_results
+from lab.run_file import Run
+from lab.sensor_noise import CameraNoise
+from lab.two_passes import Progress
+from lab.watch.live_frames import LiveFrames, WatchOptions
+from lab.watch.live_output import Latency, LiveOutput, UdpLines, is_live_table
+from lab.whole_folder import whole_folder
+from tracking.detections import Detections
+
+_log = logging.getLogger("beampose")
+
+
+@dataclass(frozen=True, slots=True)
+class WatchOutcome:
+    """What became of a watched run."""
+
+    run: Outcome
+    latency: Latency
+
+    @property
+    def exit_status(self) -> int:
+        """That of the finished run."""
+        return self.run.exit_status
+
+    def line(self) -> str:
+        """What the finished run says, and how late its poses were."""
+        return "\n".join(filter(None, (self.run.line(), self.latency.line())))
+
+
+def watch_run(
+    run_folder: Path,
+    out: Path,
+    *,
+    udp: str | None = None,
+    options: WatchOptions = WatchOptions(),  # noqa: B008  (frozen)
+    overrides: Mapping[str, Any] | None = None,
+    progress: Progress | None = None,
+    stop: threading.Event | None = None,
+) -> WatchOutcome:
+    """Follow a run folder whose cameras are folders that are being filled, or devices.
+
+    While it goes on, `out` holds attitude_live.csv: a row per frame, flushed, as the causal tracker knows it. udp: a
+    HOST:PORT that gets the same as a line of JSON. The recording ends when nothing has come for `options.idle_s`, when
+    all devices have ended, or when `stop` is set; then `out` gets what `beampose run` writes, made of the detections
+    that were received. The noise of cameras without a stated one is learnt from their first pictures.
+
+    Raises a BeamposeError where the run cannot be watched, or no picture came.
+    """
+    started = time.perf_counter()
+    run = ready_run(run_folder, overrides)
+    with contextlib.ExitStack() as stack:
+        work = stack.enter_context(whole_folder(out, may_replace=lambda p: are_results(p) or is_live_table(p)))
+        sender = None if udp is None else UdpLines(udp)
+        frames = LiveFrames(run, options, stop or threading.Event())
+        output = LiveOutput(Path(out), frames, FrameChecks(run.rig, run.covariance), sender)
+        stack.callback(output.close)
+        with frames, _low_latency():
+            _get_ready(run)
+            _log.info("ready: waiting for the first picture")
+            first = frames.begin()
+            if not first:
+                raise RunError(f"{run.path}: expected pictures while the run was watched, got none")
+            noise = {name: CameraNoise(name, camera.noise) for name, camera in run.rig.cameras.items()}
+            for name, pictures in first.items():
+                noise[name].learn(pictures)
+            finders = {name: _Finder(run, name, noise[name]) for name in noise}
+            frames.inbox.find_with(finders)
+            pipeline = Pipeline(run, frames, tracker_of(run), noise, output.write)
+
+            def more() -> dict[str, Any]:
+                pipeline.timings.detection += sum(finder.seconds for finder in finders.values())
+                return output.finish(work)
+
+            outcome = write_results(pipeline, work, Path(out), started, progress=progress, more=more)
+    return WatchOutcome(outcome, output.latency)
+
+
+@dataclass(slots=True)
+class _Finder:
+    """Finds the points of one camera's pictures, in that camera's thread."""
+
+    run: Run
+    camera: str
+    noise: CameraNoise
+    seconds: float = 0.0
+
+    def __call__(self, picture: Grey) -> Detections:
+        clock = time.perf_counter()
+        found = spots_in(picture, self.run, self.noise)
+        self.seconds += time.perf_counter() - clock
+        return found
+
+
+@contextlib.contextmanager
+def stopped_by_ctrl_c() -> Iterator[threading.Event]:
+    """An event that Ctrl-C sets, once; a second Ctrl-C stops the program as usual."""
+    stop = threading.Event()
+
+    def end(*_: object) -> None:
+        stop.set()
+        signal.signal(signal.SIGINT, before)
+        _log.info("the recording ends; making the results (Ctrl-C again: without results)")
+
+    before = signal.signal(signal.SIGINT, end)
+    try:
+        yield stop
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _get_ready(run: Run) -> None:
+    """Load the compiled code before the first picture is here: a few frames of spots, made up, and then forgotten."""
+    tracker, model = tracker_of(run), SpotModel.of(run.rig)
+    for width, height in {camera.image_size_px for camera in run.rig.cameras.values()}:
+        v, u = np.mgrid[:height, :width]
+        grey = 8.0 + ((7 * u + 13 * v) % 5) + 90 * np.exp(-((u - width / 2) ** 2 + (v - height / 2) ** 2) / 8)
+        pictures = [(grey + k).astype(np.uint8) for k in range(2)]
+        noise = CameraNoise("made up")
+        noise.learn(pictures)
+        noise.detect(pictures[0], run.tracker.detect)
+    uv_px, _ = model.project(Pose.identity() if run.prior is None else run.prior.centre)
+    seen = np.isfinite(uv_px).all(axis=1) & ((uv_px > 0) & (uv_px < model.image_size_px)).all(axis=1)
+    found = []
+    for camera in range(len(run.rig.cameras)):
+        uv = uv_px[seen & (model.camera_of == camera)]
+        found.append(Detections.at(uv, np.tile(0.01 * np.eye(2), (len(uv), 1, 1))))
+    for frame in range(4):
+        tracker.step(1 / run.frame_rate_hz if frame else 0.0, found)
+
+
+@contextlib.contextmanager
+def _low_latency() -> Iterator[None]:
+    """The garbage collector leaves alone what is there already: a full collection takes longer than a frame."""
+    gc.collect()
+    gc.freeze()
+    try:
+        yield
+    finally:
+        gc.unfreeze()

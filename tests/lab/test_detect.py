@@ -1,0 +1,255 @@
+"""`beampose detect`: spots of pictures without a rig, whatever the pictures are."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from lab import columns
+from lab.detect.detect import SHEET, DetectOptions, detect_pictures
+from lab.detect.findings import MOST_KEPT, SpotCollection, matched_snr
+from lab.errors import InputError
+from lab.report.contact_sheet import MOST, ContactSheet
+from tests.tracking.rendering import Scene, Spot, expected
+from tracking.detections import Detections
+
+SPOTS = [Spot(60.3, 40.6, 90.0, 1.4, 1.2), Spot(110.2, 70.4, 160.0, 1.6, 1.3), Spot(31.7, 92.1, 120.0, 1.2, 1.1)]
+SIZE = (160, 120)
+
+
+def picture(frame: int, *, size: tuple[int, int] = SIZE, bits: int = 8, seed: int = 0) -> np.ndarray:
+    """Three spots that move one pixel to the right each frame, on a background with noise of 1 DN (of 8 bit)."""
+    moved = [Spot(s.u + frame, s.v, s.peak, s.major, s.minor) for s in SPOTS]
+    clean = expected(Scene(moved, size=size, background=12.0))
+    noisy = clean + np.random.default_rng([seed, frame]).normal(0, 1.0, clean.shape)
+    factor, dtype = (1, np.uint8) if bits == 8 else (64, np.uint16)
+    return np.clip(np.round(noisy * factor), 0, np.iinfo(dtype).max).astype(dtype)
+
+
+def write_folder(folder: Path, frames: range, suffix: str = ".png", **looks: int) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    for frame in frames:
+        cv2.imwrite(str(folder / f"img_{frame:04d}{suffix}"), picture(frame, **looks))
+    return folder
+
+
+def rows(out: Path) -> list[dict[str, str]]:
+    with (out / "detections.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def summary(out: Path) -> dict:
+    return json.loads((out / "summary.json").read_text("utf-8"))
+
+
+def test_the_spots_of_a_folder_are_where_they_were_drawn_and_as_wide(tmp_path):
+    folder = write_folder(tmp_path / "left", range(7, 19))
+    outcome = detect_pictures([folder], tmp_path / "out")
+    assert (outcome.pictures, outcome.spots, outcome.exit_status) == (12, 36, 0)
+    found = rows(tmp_path / "out")
+    assert tuple(found[0]) == columns.DETECTIONS
+    assert {r["camera"] for r in found} == {"left"}
+    assert [int(r["frame"]) for r in found] == sorted(3 * list(range(7, 19)))
+    for frame in (7, 18):
+        uv = np.array([[float(r["u_px"]), float(r["v_px"])] for r in found if int(r["frame"]) == frame])
+        truth = np.array([[s.u + frame, s.v] for s in SPOTS])
+        gaps = np.linalg.norm(uv[:, None] - truth, axis=-1)
+        assert gaps.min(axis=0).max() < 0.1
+    sizes = summary(tmp_path / "out")["sizes_px"]
+    # A pixel adds 1/12 px^2 to the square of each axis.
+    assert sizes["major"]["median"] == pytest.approx(np.hypot(1.4, 0.29), rel=0.05)
+
+
+def test_the_noise_that_was_drawn_is_found(tmp_path):
+    detect_pictures([write_folder(tmp_path / "cam", range(8))], tmp_path / "out")
+    (noise,) = summary(tmp_path / "out")["noise"]
+    assert np.sqrt(noise["floor_dn2"]) == pytest.approx(np.sqrt(1 + 1 / 12), rel=0.15)
+    assert noise["estimated"]["temporal"]
+
+
+def test_16_bit_pictures_give_the_same_places_and_signal_to_noise(tmp_path):
+    shallow = write_folder(tmp_path / "8", range(6))
+    deep = write_folder(tmp_path / "16", range(6), ".tif", bits=16)
+    for name, folder in (("a", shallow), ("b", deep)):
+        detect_pictures([folder], tmp_path / name)
+    a, b = rows(tmp_path / "a"), rows(tmp_path / "b")
+    assert len(a) == len(b) == 18
+    assert np.allclose([float(r["u_px"]) for r in a], [float(r["u_px"]) for r in b], atol=0.1)
+    ratio = summary(tmp_path / "b")["snr"]["median"] / summary(tmp_path / "a")["snr"]["median"]
+    assert ratio == pytest.approx(1.0, abs=0.2)
+
+
+def test_a_video_gives_what_its_pictures_give(tmp_path):
+    folder = write_folder(tmp_path / "pictures", range(20))
+    video = cv2.VideoWriter(str(tmp_path / "shot.avi"), cv2.VideoWriter_fourcc(*"FFV1"), 25, SIZE, False)
+    for frame in range(20):
+        video.write(picture(frame))
+    video.release()
+    detect_pictures([tmp_path / "shot.avi"], tmp_path / "v", DetectOptions(every=4, limit=4))
+    detect_pictures([folder], tmp_path / "p", DetectOptions(camera="shot", every=4, limit=4))
+    assert {r["camera"] for r in rows(tmp_path / "v")} == {"shot"}
+    assert {int(r["frame"]) for r in rows(tmp_path / "v")} == {0, 4, 8, 12}
+    a, b = rows(tmp_path / "v"), rows(tmp_path / "p")
+    assert len(a) == len(b) == 12
+    assert np.allclose([float(r["u_px"]) for r in a], [float(r["u_px"]) for r in b], atol=0.02)
+
+
+def test_pictures_of_mixed_sizes_and_depths_each_have_their_noise_and_the_report_says_so(tmp_path):
+    folder = write_folder(tmp_path / "mixed", range(3))
+    write_folder(folder, range(3, 6), ".tif", bits=16)
+    write_folder(folder, range(6, 8), size=(200, 130))
+    outcome = detect_pictures([folder], tmp_path / "out")
+    assert outcome.pictures == 8
+    assert outcome.spots == 24
+    told = summary(tmp_path / "out")
+    assert {(*n["size_px"], n["bits"]): n["pictures"] for n in told["noise"]} == {
+        (160, 120, 8): 3,
+        (160, 120, 16): 3,
+        (200, 130, 8): 2,
+    }
+    assert [n["estimated"]["pictures"] for n in told["noise"]] == [2, 2, 2]
+    assert any("different sizes or depths" in note for note in told["notes"])
+    assert "different sizes or depths" in (tmp_path / "out/report.html").read_text("utf-8")
+
+
+def test_one_picture_is_enough(tmp_path):
+    cv2.imwrite(str(tmp_path / "screen.bmp"), picture(0))
+    outcome = detect_pictures([tmp_path / "screen.bmp"], tmp_path / "out")
+    assert (outcome.camera, outcome.pictures, outcome.spots) == ("screen", 1, 3)
+
+
+def test_several_files_are_numbered_by_their_names_or_else_in_their_order(tmp_path):
+    folder = write_folder(tmp_path / "shots", range(4, 8))
+    files = sorted(folder.iterdir())
+    assert detect_pictures(files[::-1], tmp_path / "a").camera == "shots"
+    assert [int(r["frame"]) for r in rows(tmp_path / "a")] == sorted(3 * [4, 5, 6, 7])
+    detect_pictures([folder / "img_*.png"], tmp_path / "pattern")
+    assert rows(tmp_path / "pattern") == rows(tmp_path / "a")
+    files[0].rename(folder / "first.png")
+    detect_pictures([folder], tmp_path / "b")
+    assert {int(r["frame"]) for r in rows(tmp_path / "b")} == {0, 1, 2, 3}
+    assert any("in the order of the names" in note for note in summary(tmp_path / "b")["notes"])
+
+
+def test_a_damaged_picture_costs_only_itself(tmp_path):
+    folder = write_folder(tmp_path / "cam", range(5))
+    whole = (folder / "img_0002.png").read_bytes()
+    (folder / "img_0002.png").write_bytes(whole[: len(whole) // 2])
+    outcome = detect_pictures([folder], tmp_path / "out")
+    assert (outcome.pictures, outcome.unreadable, outcome.exit_status) == (4, 1, 0)
+    assert "1 more cannot be read" in outcome.line()
+    assert any("cut short (frame 2)" in note for note in summary(tmp_path / "out")["notes"])
+
+
+def test_pictures_without_a_spot_are_a_result(tmp_path):
+    for frame in range(3):
+        grey = np.random.default_rng(frame).normal(20, 1, (60, 80))
+        cv2.imwrite(str(tmp_path / f"{frame}.png"), np.round(grey).astype(np.uint8))
+    outcome = detect_pictures(sorted(tmp_path.glob("*.png")), tmp_path / "out")
+    assert (outcome.spots, outcome.exit_status) == (0, 0)
+    assert "No spot was found" in (tmp_path / "out/report.html").read_text("utf-8")
+
+
+@pytest.mark.parametrize(
+    "names", [["nothing"], ["text.txt"], ["text.png"], ["cam", "text.png"], ["empty"], ["no*.png"]]
+)
+def test_what_is_no_picture_is_a_plain_line(tmp_path, names):
+    (tmp_path / "text.txt").write_text("words")
+    (tmp_path / "text.png").write_text("words")
+    (tmp_path / "empty").mkdir()
+    write_folder(tmp_path / "cam", range(1))
+    with pytest.raises(InputError) as raised:
+        detect_pictures([tmp_path / name for name in names], tmp_path / "out")
+    words = str(raised.value)
+    assert "\n" not in words
+    assert names[0].split(".")[0].rstrip("*") in words
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_parameter_that_is_none_of_detection_is_refused(tmp_path):
+    folder = write_folder(tmp_path / "cam", range(1))
+    with pytest.raises(InputError, match="expected a parameter of detection"):
+        detect_pictures([folder], tmp_path / "out", DetectOptions(overrides={"r1_px": 3}))
+    with pytest.raises(InputError, match=r"did you mean .*threshold_sigma"):
+        detect_pictures([folder], tmp_path / "out", DetectOptions(overrides={"detect.threshold_sigmas": 3}))
+
+
+def test_a_higher_threshold_finds_fewer(tmp_path):
+    folder = write_folder(tmp_path / "cam", range(2))
+    high = DetectOptions(overrides={"detect.threshold_sigma": 700.0})
+    assert detect_pictures([folder], tmp_path / "out", high).spots < 6
+
+
+def test_earlier_results_are_replaced_and_other_folders_are_not(tmp_path):
+    folder = write_folder(tmp_path / "cam", range(1))
+    for _ in range(2):
+        detect_pictures([folder], tmp_path / "out")
+    assert {p.name for p in (tmp_path / "out").iterdir()} == {"detections.csv", "report.html", "summary.json", SHEET}
+    with pytest.raises(InputError, match="something other than earlier results"):
+        detect_pictures([folder], folder)
+
+
+def test_the_report_is_one_file_that_needs_no_network(tmp_path):
+    detect_pictures([write_folder(tmp_path / "<cam> & co", range(3))], tmp_path / "out")
+    html = (tmp_path / "out/report.html").read_text("utf-8")
+    assert not re.findall(r'(?:src|href)="(?!data:)[^"#]', html)
+    assert "<cam>" not in html
+    assert "&lt;cam&gt; &amp; co" in html
+
+
+@pytest.mark.parametrize(("pictures", "shown"), [(1, 1), (24, 24), (25, 24), (1000, 24)])
+def test_a_contact_sheet_shows_pictures_from_the_first_to_the_last(pictures, shown):
+    sheet = ContactSheet(pictures)
+    for k in range(pictures):
+        sheet.offer(k, k, np.zeros((3, 4), np.uint8), Detections.none())
+    places = sorted(sheet._kept)
+    assert len(places) == shown
+    assert (places[0], places[-1]) == (0, pictures - 1)
+    assert pictures == 1 or np.ptp(np.diff(places)) <= 1
+
+
+def test_a_contact_sheet_of_an_unknown_number_of_pictures_is_still_even():
+    sheet = ContactSheet(None)
+    for k in range(333):
+        sheet.offer(k, k, np.zeros((3, 4), np.uint8), Detections.none())
+    places = sorted(sheet._kept)
+    assert MOST / 2 <= len(places) <= MOST
+    assert np.ptp(np.diff(places)) == 0
+
+
+def test_a_contact_sheet_rings_the_spots_at_their_places():
+    sheet = ContactSheet(1)
+    found = Detections(np.array([[100.0, 50.0]]), np.eye(2)[None], *(np.array([x]) for x in (1.0, 1.0, 2.0, 2.0, 0.0)))
+    sheet.offer(0, 5, np.full((120, 160), 10, np.uint8), found)
+    drawn = sheet.drawn().astype(int)
+    coloured = np.argwhere(drawn.max(axis=-1) - drawn.min(axis=-1) > 100)
+    scale = 8  # 1280 / 160
+    centre = np.array([8 + 22 + 50.5 * scale, 8 + 100.5 * scale])
+    ring = coloured[np.abs(coloured - centre).max(axis=1) < 70]  # its number stands above it, to the right
+    radius = 3.5 * 2 * scale
+    assert (ring[:, 0].max(), ring[:, 1].min()) == pytest.approx((centre[0] + radius, centre[1] - radius), abs=3)
+
+
+def test_signal_to_noise_is_that_of_a_filter_of_the_spots_own_shape():
+    """A Gaussian filter on a drawn spot and on noise alone says the same."""
+    v, u = np.mgrid[:81, :81] - 40.0
+    shape = np.exp(-0.5 * ((u / 2.5) ** 2 + (v / 1.5) ** 2))
+    light, sigma = 30 * shape, 2.0
+    response, spread = np.sum(light * shape), sigma * np.sqrt(np.sum(shape**2))
+    found = Detections(np.zeros((1, 2)), np.eye(2)[None], *(np.array([x]) for x in (light.sum(), 30.0, 2.5, 1.5, 0.0)))
+    assert matched_snr(found, sigma)[0] == pytest.approx(response / spread, rel=1e-3)
+
+
+def test_the_memory_for_figures_is_bounded_and_the_total_is_not():
+    collection, n = SpotCollection(), MOST_KEPT // 8
+    found = Detections(np.zeros((n, 2)), np.zeros((n, 2, 2)), *(np.zeros(n) for _ in range(5)))
+    for frame in range(20):
+        collection.add(frame, found, np.zeros(n))
+    assert collection.total == 20 * n
+    assert len(collection.table()) <= MOST_KEPT

@@ -1,0 +1,457 @@
+"""`beampose watch`: a run followed while it is recorded."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+import socket
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from lab import columns
+from lab.errors import InputError, RunError
+from lab.pictures import Missing, read_picture
+from lab.process import process_run
+from lab.run_file import LiveDevice, load_run
+from lab.simulate.write import simulate
+from lab.watch import watch
+from lab.watch.cameras import DeviceCamera, FolderCamera
+from lab.watch.folder_poll import FolderPoll
+from lab.watch.frame_clock import FrameClock
+from lab.watch.inbox import MOST_WAITING, Inbox, is_complete
+from lab.watch.live_frames import WatchOptions
+from lab.watch.live_output import LIVE_TABLE
+from lab.watch.watch import WatchOutcome, watch_run
+from tracking.detections import Detections
+
+FRAMES = 24
+FAST = WatchOptions(idle_s=1.0, timeout_s=5.0)  # this machine may be busy: no camera is given up by chance
+IMPATIENT = WatchOptions(idle_s=1.5, timeout_s=1.0)
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return simulate("smooth", tmp_path_factory.mktemp("recorded") / "run", seed=3, frames=FRAMES, picture_scale=0.25)
+
+
+@pytest.fixture(scope="module")
+def processed(recorded: Path) -> Path:
+    return process_run(recorded, recorded.parent / "out").out
+
+
+def empty_copy(recorded: Path, folder: Path) -> Path:
+    """The run before its first picture."""
+    folder.mkdir()
+    for name in ("rig.yaml", "run.yaml"):
+        shutil.copy(recorded / name, folder / name)
+    for camera in ("left", "right"):
+        (folder / "frames" / camera).mkdir(parents=True)
+    return folder
+
+
+def write_picture(source: Path, target: Path, in_two: bool = False) -> None:
+    data = source.read_bytes()
+    with target.open("wb", buffering=0) as file:
+        if in_two:
+            file.write(data[: len(data) // 2])
+            time.sleep(0.02)
+            data = data[len(data) // 2 :]
+        file.write(data)
+
+
+def feed(recorded: Path, run: Path, given: Callable[[str, int], bool] = lambda camera, frame: True) -> None:
+    """Copy picture after picture, every fourth in two writes."""
+    for frame in range(FRAMES):
+        for camera in ("left", "right"):
+            name = f"frames/{camera}/{frame:06d}.png"
+            if given(camera, frame):
+                write_picture(recorded / name, run / name, in_two=frame % 4 == 1)
+        time.sleep(0.005)
+
+
+def watched(run: Path, out: Path, feeder: Callable[[], None], **options: object) -> WatchOutcome:
+    """Watch a run while a thread feeds it."""
+    thread = threading.Thread(target=feeder)
+    thread.start()
+    try:
+        return watch_run(run, out, **{"options": FAST, **options})
+    finally:
+        thread.join()
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.fixture(scope="module")
+def followed(recorded: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[dict]]:
+    """The results of a run that was watched, and what came by UDP meanwhile."""
+    run, ready = empty_copy(recorded, tmp_path_factory.mktemp("live") / "run"), threading.Event()
+    get_ready = watch._get_ready
+
+    def feeder() -> None:
+        assert ready.wait(60)
+        feed(recorded, run)
+
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(watch, "_get_ready", lambda run: (get_ready(run), ready.set()))
+        listener.bind(("127.0.0.1", 0))
+        listener.settimeout(0.5)
+        address = f"127.0.0.1:{listener.getsockname()[1]}"
+        outcome = watched(run, run.parent / "out", feeder, udp=address)
+        lines = [json.loads(listener.recv(10_000)) for _ in range(FRAMES)]
+    assert outcome.exit_status == 0, outcome.line()
+    return run.parent / "out", lines
+
+
+@pytest.mark.parametrize("name", ["attitude.csv", "spots.csv", "beams.csv", "covariance.csv", "detections.csv"])
+def test_the_results_are_those_of_the_finished_folder(followed, processed, name):
+    assert (followed[0] / name).read_bytes() == (processed / name).read_bytes()
+
+
+def test_the_live_table_is_what_a_causal_run_says(followed, recorded, tmp_path):
+    causal = process_run(recorded, tmp_path / "causal", causal=True).out
+    assert (followed[0] / LIVE_TABLE).read_bytes() == (causal / "attitude.csv").read_bytes()
+
+
+def test_a_line_of_json_is_sent_for_every_frame(followed):
+    out, lines = followed
+    live = rows(out / LIVE_TABLE)
+    assert [line["frame"] for line in lines] == list(range(FRAMES))
+    assert [line["status"] for line in lines] == [row["status"] for row in live]
+    last, row = lines[-1], live[-1]
+    assert last["position_m"] == pytest.approx([float(row[c]) for c in ("x_m", "y_m", "z_m")])
+    assert last["quaternion_wxyz"] == pytest.approx([float(row[c]) for c in ("qw", "qx", "qy", "qz")])
+    assert last["sigma_yaw_pitch_roll_deg"][0] == pytest.approx(float(row["sigma_yaw_deg"]))
+    assert 0 <= last["latency_ms"] < 10_000
+
+
+def test_the_summary_says_how_late_the_poses_were(followed):
+    live = json.loads((followed[0] / "summary.json").read_text("utf-8"))["live"]
+    latency = live["latency_ms"]
+    assert latency["frames"] + latency["start_frames"] == FRAMES
+    assert live["udp"]["not_sent"] == 0
+
+
+def test_a_camera_that_stops_does_not_stop_the_other(recorded, tmp_path):
+    run = empty_copy(recorded, tmp_path / "run")
+
+    def feeder() -> None:
+        feed(recorded, run, lambda camera, frame: camera == "left" or frame < 10)
+
+    watched(run, tmp_path / "out", feeder, options=IMPATIENT)
+    spots = rows(tmp_path / "out/spots.csv")
+    assert {int(r["frame"]) for r in spots} == set(range(FRAMES))
+    assert {r["status"] for r in spots if r["camera"] == "right" and int(r["frame"]) >= 10} == {"no_image"}
+    assert all(r["status"] == "matched" for r in spots if r["camera"] == "left" and int(r["frame"]) == FRAMES - 1)
+    reasons = json.loads((tmp_path / "out/summary.json").read_text("utf-8"))["counts"]["no_image_reasons"]
+    assert reasons == {"right": {"dropped": FRAMES - 10}}
+    assert process_run(run, tmp_path / "again").measured > 0
+    assert (tmp_path / "out/attitude.csv").read_bytes() == (tmp_path / "again/attitude.csv").read_bytes()
+
+
+def test_dropped_and_damaged_pictures_are_what_they_are_in_a_run(recorded, tmp_path):
+    run = empty_copy(recorded, tmp_path / "run")
+
+    def given(camera: str, frame: int) -> bool:
+        if (camera, frame) == ("right", 15):
+            whole = (recorded / "frames/right/000015.png").read_bytes()
+            (run / "frames/right/000015.png").write_bytes(whole[:99])
+        return frame != 9 and (camera, frame) not in {("left", 12), ("right", 15)}
+
+    watched(run, tmp_path / "out", lambda: feed(recorded, run, given), options=IMPATIENT)
+    process_run(run, tmp_path / "again")
+    assert (tmp_path / "out/attitude.csv").read_bytes() == (tmp_path / "again/attitude.csv").read_bytes()
+
+
+def test_stopping_ends_the_recording_and_makes_the_results(recorded, tmp_path):
+    run, stop = empty_copy(recorded, tmp_path / "run"), threading.Event()
+    all_there = []
+
+    def feeder() -> None:
+        feed(recorded, run)
+        until = time.monotonic() + 20
+        while time.monotonic() < until and not _has_rows(tmp_path / "out" / LIVE_TABLE, FRAMES):
+            time.sleep(0.02)
+        all_there.append(_has_rows(tmp_path / "out" / LIVE_TABLE, FRAMES))
+        stop.set()
+
+    patient = WatchOptions(idle_s=60.0)
+    outcome = watched(run, tmp_path / "out", feeder, options=patient, stop=stop)
+    assert all_there == [True]  # the live table has each frame at once, not when a buffer is full
+    assert outcome.run.frames == FRAMES
+    assert (tmp_path / "out/report.html").is_file()
+
+
+def _has_rows(path: Path, count: int) -> bool:
+    return path.is_file() and len(path.read_text().splitlines()) >= 1 + count
+
+
+def test_a_recording_without_a_picture_is_said_plainly_and_leaves_nothing(recorded, tmp_path):
+    run, stop = empty_copy(recorded, tmp_path / "run"), threading.Event()
+    stop.set()
+    with pytest.raises(RunError, match="expected pictures while the run was watched, got none"):
+        watch_run(run, tmp_path / "out", stop=stop)
+    assert {p.name for p in tmp_path.iterdir()} == {"run"}
+
+
+def test_what_a_stopped_watch_left_may_be_replaced_and_nothing_else(recorded, tmp_path):
+    run = empty_copy(recorded, tmp_path / "run")
+    feed(recorded, run)
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / LIVE_TABLE).write_text("frame\n")
+    assert watch_run(run, tmp_path / "out", options=FAST).run.frames == FRAMES
+    (tmp_path / "thesis").mkdir()
+    (tmp_path / "thesis/chapter.tex").write_text("years")
+    with pytest.raises(InputError, match="something other than earlier results"):
+        watch_run(run, tmp_path / "thesis", options=FAST)
+
+
+def test_a_device_with_an_end_gives_what_its_pictures_give(tmp_path):
+    recorded = simulate("smooth", tmp_path / "video", seed=3, frames=FRAMES, picture_scale=0.25, video=True)
+    content = yaml.safe_load((recorded / "run.yaml").read_text())
+    ordinary = process_run(recorded, tmp_path / "ordinary").out
+    for camera in content["cameras"].values():
+        camera["device"] = str(recorded / camera.pop("frames"))
+    (recorded / "run.yaml").write_text(yaml.safe_dump(content))
+    outcome = watch_run(recorded, tmp_path / "out", options=FAST)
+    assert (outcome.run.out / "attitude.csv").read_bytes() == (ordinary / "attitude.csv").read_bytes()
+    with pytest.raises(InputError, match="a live camera; use `beampose watch`"):
+        process_run(recorded, tmp_path / "again")
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"timestamps": "times.csv"}, "timestamps: expected none in a run that is watched"),
+        ({"cameras": {"left": {"detections": "points.csv"}}}, "expected a folder of pictures or a device to watch"),
+        ({"cameras": {"left": {"device": "nothing-there"}}}, "expected a camera that OpenCV can open"),
+        ({"cameras": {"left": {"device": -1}}}, "cameras.left.device: expected a camera's number from 0"),
+        ({"cameras": {"left": {"device": 0, "frames": "frames/left"}}}, "got frames and device; keep one"),
+    ],
+)
+def test_what_cannot_be_watched_is_said_plainly(recorded, tmp_path, change, words):
+    run = empty_copy(recorded, tmp_path / "run")
+    (run / "times.csv").write_text("frame,t_s\n0,0\n")
+    (run / "points.csv").write_text("frame,camera,u_px,v_px\n0,left,1,1\n")
+    content = yaml.safe_load((run / "run.yaml").read_text())
+    (run / "run.yaml").write_text(yaml.safe_dump({**content, **change}))
+    with pytest.raises(InputError) as raised:
+        watch_run(run, tmp_path / "out", options=FAST)
+    assert words in str(raised.value)
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("address", ["5005", "host:", "host:0", "host:70000", "no.such.host.invalid:5005"])
+def test_an_address_that_is_none_is_said_before_anything_is_watched(recorded, tmp_path, address):
+    run = empty_copy(recorded, tmp_path / "run")
+    with pytest.raises(InputError, match="--udp"):
+        watch_run(run, tmp_path / "out", udp=address)
+
+
+def test_names_that_hold_a_time_are_refused(recorded, tmp_path):
+    run = empty_copy(recorded, tmp_path / "run")
+    for k in range(6):
+        for camera in ("left", "right"):
+            target = run / f"frames/{camera}/{1_700_000_000_000 + 10_000 * k * k}.png"
+            shutil.copy(recorded / f"frames/{camera}/{k:06d}.png", target)
+    with pytest.raises(InputError, match="do the names hold a time"):
+        watch_run(run, tmp_path / "out", options=FAST)
+
+
+def test_a_device_is_a_number_or_a_name(recorded, tmp_path):
+    run = empty_copy(recorded, tmp_path / "run")
+    content = yaml.safe_load((run / "run.yaml").read_text())
+    content["cameras"] = {"left": {"device": 2}, "right": {"device": "rtsp://camera/stream"}}
+    (run / "run.yaml").write_text(yaml.safe_dump(content))
+    assert list(load_run(run).cameras.values()) == [LiveDevice(2), LiveDevice("rtsp://camera/stream")]
+
+
+# -- a folder that is being filled ------------------------------------------------------------------------------------
+
+
+def names_of(poll: FolderPoll, until: int) -> dict[int, str]:
+    """All that a poll finds until it has so many, or two seconds have passed."""
+    end = time.monotonic() + 2
+    while len(poll.names) < until and time.monotonic() < end:
+        poll.new()
+        time.sleep(0.001)
+    return poll.names
+
+
+@pytest.mark.parametrize(
+    ("first", "later"),
+    [
+        ("000009.png", ["000010.png", "000011.png"]),
+        ("img-9_left.tif", ["img-10_left.tif", "img-12_left.tif"]),
+        ("a7.png", ["a300.png", "a301.png"]),
+        ("a7.png", ["b8.png", "c0009.PNG"]),
+        ("a7.png", ["a6.png", "a9.png", "a8.png"]),
+    ],
+)
+def test_pictures_are_found_whatever_their_next_name_is(tmp_path, first, later):
+    poll = FolderPoll(tmp_path)
+    (tmp_path / first).touch()
+    names_of(poll, 1)
+    for name in ("notes.txt", ".a8.png.part", *later):
+        (tmp_path / name).touch()
+        poll.new()
+    assert set(names_of(poll, 1 + len(later)).values()) == {first, *later}
+
+
+def test_the_next_picture_costs_the_same_in_a_large_folder(tmp_path, monkeypatch):
+    poll = FolderPoll(tmp_path)
+    for k in range(500):
+        (tmp_path / f"{k:06d}.png").touch()
+    names_of(poll, 500)
+    monkeypatch.setattr("os.scandir", lambda _: pytest.fail("the folder is listed"))
+    for k in range(500, 520):
+        (tmp_path / f"{k:06d}.png").touch()
+        assert poll.new() == [(k, f"{k:06d}.png")]
+
+
+def test_two_pictures_of_one_number_are_one_and_said(tmp_path):
+    poll = FolderPoll(tmp_path)
+    for name in ("a1.png", "a1.tif"):
+        (tmp_path / name).touch()
+    assert poll.new() == [(1, "a1.png")]
+    camera = FolderCamera("left", poll, (1, 1), Inbox(("left",), 0.01, 0.1), 0.1)
+    assert camera.notes == [f"{tmp_path}: two pictures of one frame: a1.png was used, a1.tif not"]
+
+
+def test_a_half_written_picture_is_waited_for_and_a_damaged_one_is_not(recorded, tmp_path):
+    inbox = Inbox(("left",), 0.01, 0.05)
+    camera = FolderCamera("left", FolderPoll(tmp_path), (320, 256), inbox, patience_s=0.05)
+    whole = (recorded / "frames/left/000000.png").read_bytes()
+    for name in ("0.png", "1.png"):
+        (tmp_path / name).write_bytes(whole[: len(whole) // 3])
+    camera.look()
+    assert set(inbox.boxes["left"].incomplete) == {0, 1}
+    (tmp_path / "0.png").write_bytes(whole)
+    time.sleep(0.06)
+    camera.look()
+    box = inbox.boxes["left"]
+    assert not box.incomplete
+    assert np.array_equal(box.pictures[0].content, read_picture(recorded / "frames/left/000000.png", None))
+    assert box.pictures[1].content == Missing("unreadable: cut short")
+
+
+# -- when a frame is complete -----------------------------------------------------------------------------------------
+
+FOUND = Detections.none()
+
+
+def boxes_with(*given: tuple[str, int]) -> Inbox:
+    inbox = Inbox(("a", "b"), interval_s=0.01, timeout_s=0.2)
+    for camera, frame in given:
+        inbox.give(camera, frame, FOUND, None)
+    return inbox
+
+
+def complete(inbox: Inbox, frame: int, waited_s: float) -> tuple[bool, list[str]]:
+    now = time.perf_counter()
+    names = {id(box): name for name, box in inbox.boxes.items()}
+    done, given_up = is_complete(frame, list(inbox.boxes.values()), now + waited_s, now, 0.2, 0.01)
+    return done, [names[id(box)] for box in given_up]
+
+
+def test_a_frame_is_complete_when_all_cameras_have_given_it():
+    assert complete(boxes_with(("a", 0), ("b", 0)), 0, 0.0) == (True, [])
+    assert complete(boxes_with(("a", 0)), 0, 0.0) == (False, [])
+
+
+def test_a_camera_that_has_given_a_later_frame_for_a_frames_time_has_dropped_this_one():
+    inbox = boxes_with(("a", 0), ("b", 1))
+    assert complete(inbox, 0, 0.0) == (False, [])
+    assert complete(inbox, 0, 0.011) == (True, [])
+
+
+def test_a_camera_that_gives_nothing_is_given_up_after_the_timeout_and_not_waited_for_again():
+    inbox = boxes_with(("a", 0), ("a", 1))
+    assert complete(inbox, 0, 0.19) == (False, [])
+    assert complete(inbox, 0, 0.21) == (True, ["b"])
+    inbox.boxes["b"].asleep = True
+    assert complete(inbox, 1, 0.0) == (True, [])
+    inbox.next_frame = 1
+    inbox.give("b", 0, FOUND, None)  # it is late, but there again
+    assert inbox.boxes["b"].late == 1
+    assert complete(inbox, 1, 0.0) == (False, [])
+
+
+def test_a_camera_that_lags_by_more_than_the_timeout_is_not_waited_for():
+    inbox = boxes_with(("a", 100))
+    inbox.next_frame, inbox.boxes["b"].asleep = 100, True
+    inbox.give("b", 70, FOUND, None)
+    assert complete(inbox, 100, 0.0) == (True, [])
+
+
+def test_nothing_is_complete_before_any_camera_has_something():
+    assert complete(boxes_with(), 0, 100.0) == (False, [])
+
+
+def test_a_stray_number_is_left_out():
+    inbox = boxes_with(("a", 5))
+    inbox.next_frame = 5
+    inbox.give("a", 90_000, FOUND, None)
+    assert (inbox.boxes["a"].strays, set(inbox.boxes["a"].pictures)) == ([90_000], {5})
+
+
+# -- devices ----------------------------------------------------------------------------------------------------------
+
+
+def test_frames_of_a_device_are_counted_while_they_come_in_time():
+    clock = FrameClock(100.0)
+    jitter = np.random.default_rng(1).normal(0, 0.002, 300)
+    assert [clock.number(0.01 * k + float(jitter[k])) for k in range(300)] == list(range(300))
+    assert clock.left_out == 0
+
+
+def test_pictures_that_a_device_lost_leave_a_gap_and_a_burst_does_not():
+    clock = FrameClock(100.0)
+    times = [0.01 * k for k in range(50)]
+    burst = [0.55 + 0.0005 * k for k in range(6)]  # 50 to 55 were held back
+    lost = [0.01 * k for k in range(56, 100) if k not in (70, 71, 72)]
+    numbers = [clock.number(t) for t in times + burst + lost]
+    assert numbers[:70] == list(range(70))
+    assert numbers[-1] == 99
+    assert clock.left_out == 3
+
+
+class FakeCapture:
+    """A device with pictures of one grey value each, all there at once."""
+
+    def __init__(self, pictures: int, shape: tuple[int, ...] = (4, 6)) -> None:
+        self.left, self.shape, self.released = pictures, shape, False
+
+    def grab(self) -> bool:
+        self.left -= 1
+        return self.left >= 0
+
+    def retrieve(self) -> tuple[bool, np.ndarray]:
+        return True, np.full(self.shape, 7, np.uint8)
+
+    def release(self) -> None:
+        self.released = True
+
+
+@pytest.mark.parametrize("shape", [(4, 6), (4, 6, 1), (4, 6, 3)])
+def test_a_device_that_is_not_kept_up_with_loses_pictures_and_ends_by_itself(shape):
+    inbox, capture = Inbox(("left",), 0.01, 0.1), FakeCapture(MOST_WAITING + 5, shape)
+    camera = DeviceCamera("left", capture, (6, 4), inbox, FrameClock(100.0))
+    inbox.wanted.set()
+    camera.run()
+    box = inbox.boxes["left"]
+    assert (len(box.pictures), box.refused, capture.released) == (MOST_WAITING, 5, True)
+    assert all(np.array_equal(w.content, np.full((4, 6), 7)) for w in box.pictures.values())
+
+
+def test_the_live_table_has_the_columns_of_the_contract(followed):
+    assert (followed[0] / LIVE_TABLE).read_text().splitlines()[0] == ",".join(columns.ATTITUDE)
