@@ -217,8 +217,19 @@ def detect(
     type=click.FloatRange(min=0.001),
     help="So many seconds a frame waits for a camera that does not give it.",
 )
+@click.option(
+    "--reprocess", is_flag=True, help="At the end, make the results from the finished folders, as `run` does."
+)
 @_set_option
-def watch(run_folder: Path, out: Path, udp: str | None, idle: float, timeout: float, settings: dict[str, Any]) -> None:
+def watch(
+    run_folder: Path,
+    out: Path,
+    udp: str | None,
+    idle: float,
+    timeout: float,
+    reprocess: bool,
+    settings: dict[str, Any],
+) -> None:
     """Follow a run while it is recorded: the pose of every frame as it arrives.
 
     RUN is a run folder whose frame folders are being filled, or whose run.yaml names a `device` for a camera (a number
@@ -234,9 +245,15 @@ def watch(run_folder: Path, out: Path, udp: str | None, idle: float, timeout: fl
 
     with _progress(run_folder.name) as progress, stopped_by_ctrl_c() as stop:
         outcome = watch_run(
-            run_folder, out, udp=udp, options=WatchOptions(idle, timeout), overrides=settings, progress=progress,
+            run_folder,
+            out,
+            udp=udp,
+            reprocess=reprocess,
+            options=WatchOptions(idle, timeout),
+            overrides=settings,
+            progress=progress,
             stop=stop,
-        )  # fmt: skip
+        )
     _concluded(outcome)
 
 
@@ -410,6 +427,9 @@ def board(board: str, out: Path, page: str, dpi: float) -> None:
 )
 @click.option("--lens", default="auto", show_default=True, help="0, 4, 5, 8, 12, fisheye; auto: by views held out.")
 @click.option("--warp", default="auto", show_default=True, help="auto, on, off: is the board's bend solved for.")
+@click.option(
+    "--stretch", default="auto", show_default=True, help="auto, on, off: is the board's scale x to y solved for."
+)
 @click.option("--valid-days", default=365, show_default=True, type=click.IntRange(min=1), help="How long it holds.")
 def camera(
     photos: tuple[Path, ...],
@@ -419,6 +439,7 @@ def camera(
     distance_m: float | None,
     lens: str,
     warp: str,
+    stretch: str,
     valid_days: int,
 ) -> None:
     """Calibrate a camera's lens from photos of a board: files, folders, patterns or a video.
@@ -430,7 +451,12 @@ def camera(
     from lab.calibrate.camera import CameraOptions, calibrate_camera
 
     options = CameraOptions(
-        name=name or out.resolve().name, distance_m=distance_m, lens=lens, warp=warp, valid_days=valid_days
+        name=name or out.resolve().name,
+        distance_m=distance_m,
+        lens=lens,
+        warp=warp,
+        stretch=stretch,
+        valid_days=valid_days,
     )
     with _progress("photos") as progress:
         tell = None if progress is None else lambda done, total, _: progress(done, total)

@@ -18,44 +18,76 @@ from geometry.planes import meet_plane
 from geometry.rig import Screen
 
 _WINDOW = 3.7  # sigmas from centre to side of the window of a fit: 3.2 along the major axis, more across it
-_STEP = 0.5  # sigmas of the spot: of the differences that give the map's curvature
+_STEP_PX = 4.0  # of the differences that give the map's curvature
+_NODES = 33  # along each side of the picture, at which the curvature is computed; it varies slowly
 _LARGEST_SHARE = 0.25  # of the spot's sigma: a larger offset means that the second order is not enough
 
-# In spot sigmas: the centre, one step along each axis, and the four diagonal ones.
+# In steps: the centre, one along each axis, and the four diagonal ones.
 _STENCIL = np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [-1, -1], [1, -1], [-1, 1]], dtype=float)
 
 
-def centre_offsets(camera: Camera, screen: Screen, uv_px: Array, shape_px2: Array, brightness: Array) -> Array:
-    """Fitted centres less the images of the beams' axes (n, 2), px; 0 where the screen is not met.
+class CentreOffsets:
+    """The offsets in one camera's pictures of one screen, which is taken to be flat over a spot, and matt: it looks
+    equally bright from everywhere."""
 
-    uv_px (n, 2): centres of the light, distorted pixels. shape_px2 (n, 3): uu, uv, vv of the Gaussians in the picture.
-    brightness (n,): shot noise over background noise, in variance, at the peak, which says how much the wings weigh.
-    The screen is taken to be flat over a spot, and matt: it looks equally bright from everywhere.
-    """
-    n = len(uv_px)
-    if n == 0:
-        return np.zeros((0, 2))
-    covariance = shape_px2[:, [0, 1, 1, 2]].reshape(n, 2, 2)
-    L = np.linalg.cholesky(covariance + 1e-9 * np.eye(2))
-    pixels = uv_px[:, None] + _STEP * np.einsum("nij,sj->nsi", L, _STENCIL)
-    origin, direction = camera.rays(pixels)
-    s = meet_plane(origin, direction, screen.world_from_screen)  # (n, 9, 2), m
-    # s(g) = s0 + M g + N_11 g1^2 / 2 + N_12 g1 g2 + N_22 g2^2 / 2, g in sigmas of the spot in the picture.
-    M = np.stack([s[:, 1] - s[:, 2], s[:, 3] - s[:, 4]], axis=-1) / (2 * _STEP)
-    N11 = (s[:, 1] - 2 * s[:, 0] + s[:, 2]) / _STEP**2
-    N22 = (s[:, 3] - 2 * s[:, 0] + s[:, 4]) / _STEP**2
-    N12 = (s[:, 5] + s[:, 6] - s[:, 7] - s[:, 8]) / (4 * _STEP**2)
-    good: Bools = np.asarray(np.isfinite(s).all(axis=(1, 2)))
-    curvature: Array = np.where(good[:, None, None], 0.5 * np.stack([N11, N12, N22], axis=-1), 0.0)
-    P: Array = np.linalg.solve(np.where(good[:, None, None], M, np.eye(2)).astype(float), curvature)
-    # The exponent is -|M^-1 (s - s0)|^2 / 2 = -|g|^2 / 2 - g . (P_11 g1^2 + 2 P_12 g1 g2 + P_22 g2^2).
-    cube1, cube2 = -P[:, 0, 0], -P[:, 1, 2]
-    mixed1, mixed2 = -(P[:, 0, 2] + 2 * P[:, 1, 1]), -(P[:, 1, 0] + 2 * P[:, 0, 1])  # of g1 g2^2 and g1^2 g2
-    a, b = np.array([_moved_by(float(r)) for r in brightness]).T
-    g = np.stack([a * cube1 + b * mixed1, a * cube2 + b * mixed2], axis=-1)
-    length = np.linalg.norm(g, axis=-1, keepdims=True)
-    g = g * np.minimum(1.0, _LARGEST_SHARE / np.maximum(length, 1e-12))
-    return np.asarray(np.einsum("nij,nj->ni", L, g))
+    def __init__(self, camera: Camera, screen: Screen) -> None:
+        width, height = camera.image_size_px
+        self._size = np.array([width - 1.0, height - 1.0])
+        u, v = (np.linspace(0.0, end, _NODES) for end in self._size)
+        nodes = np.stack(np.meshgrid(u, v, indexing="ij"), axis=-1)
+        self._curvature = _curvature(camera, screen, nodes)  # (_NODES, _NODES, 2, 3)
+
+    def at(self, uv_px: Array, shape_px2: Array, brightness: Array) -> Array:
+        """Fitted centres less the images of the beams' axes (n, 2), px; 0 where the screen is not met.
+
+        uv_px (n, 2): centres of the light, distorted pixels. shape_px2 (n, 3): uu, uv, vv of the Gaussians in the
+        picture. brightness (n,): shot noise over background noise, in variance, at the peak, which says how much the
+        wings weigh.
+        """
+        n = len(uv_px)
+        if n == 0:
+            return np.zeros((0, 2))
+        T = self._interpolated(uv_px)
+        # A Cholesky factor L of each shape; the map in sigmas of the spot, g = L^-1 x.
+        l11 = np.sqrt(np.maximum(shape_px2[:, 0], 1e-9))
+        l21 = shape_px2[:, 1] / l11
+        l22 = np.sqrt(np.maximum(shape_px2[:, 2] - l21**2, 1e-9))
+        t11 = T[..., 0] * (l11**2)[:, None] + 2 * T[..., 1] * (l11 * l21)[:, None] + T[..., 2] * (l21**2)[:, None]
+        t12 = T[..., 1] * (l11 * l22)[:, None] + T[..., 2] * (l21 * l22)[:, None]
+        t22 = T[..., 2] * (l22**2)[:, None]
+        P1 = np.stack([t11[:, 0], t12[:, 0], t22[:, 0]]) / l11
+        P2 = (np.stack([t11[:, 1], t12[:, 1], t22[:, 1]]) - l21 * P1) / l22
+        # The exponent is -|g + P(g, g)|^2 / 2 = -|g|^2 / 2 - g . (P_11 g1^2 + 2 P_12 g1 g2 + P_22 g2^2) + ...
+        cube1, cube2 = -P1[0], -P2[2]
+        mixed1, mixed2 = -(P1[2] + 2 * P2[1]), -(P2[0] + 2 * P1[1])  # of g1 g2^2 and g1^2 g2
+        a, b = np.array([_moved_by(float(r)) for r in brightness]).T
+        g1, g2 = a * cube1 + b * mixed1, a * cube2 + b * mixed2
+        kept = np.minimum(1.0, _LARGEST_SHARE / np.maximum(np.hypot(g1, g2), 1e-12))
+        return np.asarray(np.stack([l11 * g1, l21 * g1 + l22 * g2], axis=-1) * kept[:, None])
+
+    def _interpolated(self, uv_px: Array) -> Array:
+        """(n, 2, 3), bilinear between the nodes."""
+        place = np.clip(uv_px / self._size, 0.0, 1.0) * (_NODES - 1)
+        first = np.minimum(place.astype(np.int64), _NODES - 2)
+        i, j = first.T
+        x, y = (place - first).T[:, :, None, None]
+        C = self._curvature
+        return (1 - x) * ((1 - y) * C[i, j] + y * C[i, j + 1]) + x * ((1 - y) * C[i + 1, j] + y * C[i + 1, j + 1])
+
+
+def _curvature(camera: Camera, screen: Screen, uv_px: Array) -> Array:
+    """Half of the second derivatives (..., 2, 3: uu, uv, vv), 1/px, of the map from the picture to the screen, the
+    screen measured in pixels: s(u + x) = s(u) + J (x + T(x, x)). 0 where the screen is not met."""
+    origin, direction = camera.rays(uv_px[..., None, :] + _STEP_PX * _STENCIL)
+    s = meet_plane(origin, direction, screen.world_from_screen)  # (..., 9, 2), m
+    at = np.moveaxis(s, -2, 0)
+    J = np.stack([at[1] - at[2], at[3] - at[4]], axis=-1) / (2 * _STEP_PX)
+    uu = (at[1] - 2 * at[0] + at[2]) / _STEP_PX**2
+    vv = (at[3] - 2 * at[0] + at[4]) / _STEP_PX**2
+    uv = (at[5] + at[6] - at[7] - at[8]) / (4 * _STEP_PX**2)
+    good: Bools = np.asarray(np.isfinite(s).all(axis=(-1, -2)))[..., None, None]
+    curvature: Array = np.where(good, 0.5 * np.stack([uu, uv, vv], axis=-1), 0.0)
+    return np.asarray(np.linalg.solve(np.where(good, J, np.eye(2)).astype(float), curvature))
 
 
 def _moved_by(brightness: float) -> tuple[float, float]:

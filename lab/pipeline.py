@@ -9,8 +9,7 @@ from typing import Protocol
 
 import numpy as np
 
-from geometry.light_centroid import centre_offsets
-from geometry.rig import Rig
+from geometry.light_centroid import CentreOffsets
 from lab.frames import FrameSet, open_frames
 from lab.pictures import Grey, Missing
 from lab.run_file import Run
@@ -88,6 +87,7 @@ class Pipeline:
     noise: dict[str, CameraNoise]  # of cameras with pictures
     on_record: Callable[[FrameRecord], None] | None = None  # called with each record as soon as it is known
     timings: Timings = field(default_factory=Timings)
+    _offsets: dict[str, CentreOffsets] = field(default_factory=dict)
 
     @staticmethod
     def of(run: Run) -> Pipeline:
@@ -124,6 +124,18 @@ class Pipeline:
         for frames in self.reader:
             yield frames.frame, self._detect(frames)[0]
 
+    def spots_in(self, camera: str, picture: Grey) -> Detections:
+        """The points that one picture of a camera shows. For one thread at a time and camera."""
+        noise = self.noise[camera]
+        points = noise.detect(picture, self.run.tracker.detect)
+        return on_beam_axes(points, self._offsets_of(camera), noise.model)
+
+    def _offsets_of(self, camera: str) -> CentreOffsets:
+        if camera not in self._offsets:
+            seen_by = self.run.rig.cameras[camera]
+            self._offsets[camera] = CentreOffsets(seen_by, self.run.rig.screens[seen_by.screen])
+        return self._offsets[camera]
+
     def _spent(self, on: str, since: float) -> float:
         now = time.perf_counter()
         setattr(self.timings, on, getattr(self.timings, on) + now - since)
@@ -139,25 +151,18 @@ class Pipeline:
                 missing.append(picture.reason)
                 continue
             if isinstance(picture, np.ndarray):
-                picture = spots_in(picture, self.run, name, self.noise[name])
+                picture = self.spots_in(name, picture)
             found.append(picture)
             missing.append("")
         return tuple(found), tuple(missing)
 
 
-def spots_in(picture: Grey, run: Run, camera: str, noise: CameraNoise) -> Detections:
-    """The points that one picture of a run's camera shows. For one thread at a time and camera."""
-    return on_beam_axes(noise.detect(picture, run.tracker.detect), run.rig, camera, noise.model)
-
-
-def on_beam_axes(found: Detections, rig: Rig, camera: str, noise: NoiseModel | None) -> Detections:
+def on_beam_axes(found: Detections, offsets: CentreOffsets, noise: NoiseModel | None) -> Detections:
     """Detections (n) with their centres moved from the light's centre to the image of the beam's axis."""
     if not len(found) or noise is None:
         return found
     c, s = np.cos(np.radians(found.angle_deg)), np.sin(np.radians(found.angle_deg))
     major2, minor2 = found.major_px**2, found.minor_px**2
     shape = np.stack([major2 * c**2 + minor2 * s**2, (major2 - minor2) * c * s, major2 * s**2 + minor2 * c**2], axis=-1)
-    seen_by = rig.cameras[camera]
     brightness = noise.slope_dn * found.peak / noise.floor_dn2
-    offset = centre_offsets(seen_by, rig.screens[seen_by.screen], found.uv_px, shape, brightness)
-    return replace(found, uv_px=found.uv_px - offset)
+    return replace(found, uv_px=found.uv_px - offsets.at(found.uv_px, shape, brightness))

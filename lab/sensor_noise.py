@@ -39,9 +39,12 @@ class CameraNoise:
     @property
     def model(self) -> NoiseModel | None:
         """The model in use; None before the first picture."""
-        if self.stated is not None and not self._overruled:
-            return NoiseModel.of(self.stated)
-        return None if self.estimate is None else self.estimate.model
+        seen = None if self.estimate is None else self.estimate.model
+        if self.stated is None or self._overruled:
+            return seen
+        stated = NoiseModel.of(self.stated)
+        # A sensor's data sheet does not know what its pictures show.
+        return stated if seen is None else replace(stated, texture=seen.texture, banding_dn=seen.banding_dn)
 
     def learn(self, pictures: Sequence[Picture]) -> None:
         """Estimate from some pictures, in their order of time; nothing happens without any."""

@@ -14,7 +14,7 @@ class DetectParameters:
     max_detections: int = 400  # keep the brightest so many of one picture
     saturation_dn: float | None = None  # grey value at which the sensor clips; None: the largest of the picture's type
     min_sigma_px: float = 0.25  # narrower (minor half axis) is a hot pixel: a spot one pixel wide has 0.42
-    max_sigma_px: float = 20.0  # wider (major half axis) is a reflection or lit screen: a spot 30 px wide has 13
+    max_sigma_px: float = 30.0  # wider (major half axis) is a reflection or lit screen: a spot 70 px wide has 30
     min_explained: float = 0.5  # least share of a candidate's light, about its background, that a Gaussian explains
 
 

@@ -17,7 +17,8 @@ from geometry.arrays import Array
 USUAL_WIDTH_PX = 2.0  # of spots whose width is not known
 _CHUNK = 256  # frames that are compared with each other
 _ALIKE = 0.05  # correlation below which two places count as different
-_SIGNIFICANT = 2.5  # sigmas of what noise alone shows
+_REACHES = (1.0, 2.0, 4.0, 8.0)  # widths of the spot
+_SIGNIFICANT = 3.0  # sigmas of what noise alone shows
 _LARGEST_STUDENT = 3.0  # that of three free numbers
 _MOST_ABSORBED = 0.8  # share of the errors that the poses take up, above which the residuals say too little
 
@@ -28,6 +29,7 @@ class PlaceErrors:
 
     share: float  # of the spots' error variance, in [0, 1]
     alike: Array  # (T,) number of frames, this one included, with the same errors; mean over the views
+    reach_px: Array  # (n,) distance over which they are alike, as the sigma of a spot that they are a mean over
     elsewhere: float = 0.0  # what share of it is the same in all places: errors of the rig, not of a place
     few: float = 1.0  # factor of their variance for what so few places leave unknown of it
 
@@ -57,45 +59,60 @@ def place_errors(residual: Array, uv_px: Array, width_px: Array, averaged: Array
     each pose is a mean of. explained (n,): share of the residuals' variance that calibration errors are expected to
     make, which are constant as well.
     """
-    frames, views = residual.shape[:2]
     width = np.where(np.isfinite(width_px), np.maximum(width_px, 0.5), USUAL_WIDTH_PX)
-    alike = np.ones((frames, views))
-    products = expected = variance = known = far_products = far_expected = 0.0
-    for view in range(views):
+    labelled = np.isfinite(residual[..., 0])
+    count = float(np.mean(labelled.sum(axis=1)[labelled.any(axis=1)])) if labelled.any() else 0.0
+    absorbed = min(3.0 / max(count, 1e-9), _MOST_ABSORBED)
+    # Coarse structure of the screen and its edges reach farther than a spot is wide: what the residuals show best.
+    reaches = [r * width for r in _REACHES]
+    sums = max((_products(residual, uv_px, reach, explained) for reach in reaches), key=lambda p: p.significance)
+    alike = np.where(labelled.any(axis=1), (sums.alike * labelled).sum(axis=1) / np.maximum(labelled.sum(axis=1), 1), 1)
+    # The poses take up so much of the residuals that fewer numbers are free than there are.
+    if sums.significance * np.sqrt(1 - absorbed) < _SIGNIFICANT:
+        return PlaceErrors(0.0, alike, sums.reach_px)
+    seen = sums.near / sums.expected
+    place = min(seen, 1.0) / (1 - absorbed)
+    white = max(1 - seen, 0.0) / (1 - absorbed / float(np.median(np.maximum(averaged, 1.0))))
+    # Few places say little of the size of their errors: Student's distribution is wider by this factor in variance.
+    free = 2 * (1 - absorbed) * float(np.sum(labelled / np.maximum(sums.alike, 1.0)))
+    few = min(free / max(free - 2, 1e-9), _LARGEST_STUDENT)
+    return PlaceErrors(place / (place + white), alike, sums.reach_px, sums.elsewhere, few)
+
+
+@dataclass(frozen=True, slots=True)
+class _Products:
+    """Sums over pairs of frames of the products of a view's residuals, over their mean square."""
+
+    reach_px: Array  # (n,) over which errors are taken to be alike
+    alike: Array  # (T, n) number of frames with the same errors
+    near: float  # weighted by the correlation of their places, less what the calibration explains
+    expected: float  # the same if all errors belonged to places
+    elsewhere: float  # mean over pairs in different places
+
+    @property
+    def significance(self) -> float:
+        """`near` in sigmas of what white residuals in two coordinates would show."""
+        return self.near / np.sqrt(0.5 * self.expected) if self.expected > 0 else 0.0
+
+
+def _products(residual: Array, uv_px: Array, reach_px: Array, explained: Array) -> _Products:
+    alike = np.ones(residual.shape[:2])
+    near = expected = far = far_pairs = 0.0
+    for view in range(residual.shape[1]):
         rows = np.flatnonzero(np.isfinite(residual[:, view]).all(axis=-1))
-        if len(rows) < 2:
-            continue
-        mean_square = float(np.mean(np.sum(residual[rows, view] ** 2, axis=-1)))
+        mean_square = float(np.mean(np.sum(residual[rows, view] ** 2, axis=-1))) if len(rows) > 1 else 0.0
         if mean_square <= 0:
             continue
         for start in range(0, len(rows), _CHUNK):
             some = rows[start : start + _CHUNK]
             r, at = residual[some, view], uv_px[some, view]
-            rho = correlation(np.linalg.norm(at[:, None] - at[None], axis=-1), width[view])
-            far_products += float(np.sum((rho == 0) * (r @ r.T))) / mean_square
-            far_expected += float(np.count_nonzero(rho == 0))
+            products = r @ r.T / mean_square
+            rho = correlation(np.linalg.norm(at[:, None] - at[None], axis=-1), reach_px[view])
+            far += float(np.sum(products[rho == 0]))
+            far_pairs += float(np.count_nonzero(rho == 0))
             np.fill_diagonal(rho, 0.0)
             alike[some, view] = 1 + rho.sum(axis=1)
-            weight = 0.5 / mean_square  # each pair is counted twice
-            products += weight * float(np.sum(rho * (r @ r.T)))
+            # Each pair is counted twice.
+            near += 0.5 * float(np.sum(rho * products) - explained[view] * np.sum(rho**2))
             expected += 0.5 * float(np.sum(rho**2))
-            variance += 0.25 * float(np.sum(rho**2))  # of white residuals in two coordinates
-            known += 0.5 * float(np.sum(rho**2)) * explained[view]
-    labelled = np.isfinite(residual[..., 0])
-    count = float(np.mean(labelled.sum(axis=1)[labelled.any(axis=1)])) if labelled.any() else 0.0
-    absorbed = min(3.0 / max(count, 1e-9), _MOST_ABSORBED)
-    mean_alike = np.where(labelled.any(axis=1), (alike * labelled).sum(axis=1) / np.maximum(labelled.sum(axis=1), 1), 1)
-    if expected <= 0:
-        return PlaceErrors(0.0, mean_alike)
-    seen = (products - known) / expected
-    # The poses take up so much of the residuals that fewer numbers are free than there are.
-    sigma = np.sqrt(variance / (1 - absorbed)) / expected
-    if seen < _SIGNIFICANT * sigma:
-        return PlaceErrors(0.0, mean_alike)
-    place = min(seen, 1.0) / (1 - absorbed)
-    white = max(1 - seen, 0.0) / (1 - absorbed / float(np.median(np.maximum(averaged, 1.0))))
-    # Few places say little of the size of their errors: Student's distribution is wider by this factor in variance.
-    free = 2 * (1 - absorbed) * float(np.sum(labelled / np.maximum(alike, 1.0)))
-    few = min(free / max(free - 2, 1e-9), _LARGEST_STUDENT)
-    elsewhere = max(far_products / far_expected, 0.0) if far_expected > 0 else 0.0
-    return PlaceErrors(place / (place + white), mean_alike, elsewhere, few)
+    return _Products(reach_px, alike, near, expected, max(far / far_pairs, 0.0) if far_pairs else 0.0)

@@ -25,7 +25,8 @@ class Smoothed:
 
     model: SpotModel
     parameters: TrackerParameters
-    poses: Pose  # (T,)
+    poses: Pose  # (T,) at mid-exposure
+    exposure_px: Array  # (T, n, 2) mean place of a spot over the exposure less its place in the middle
     velocities: Array  # (T, 6): m/s in world, rad/s in body
     covariance: Array  # (T, 6, 6) of the poses, of noise and of errors that stay in their place
     place_share: float  # of the spots' error variance that stays in its place (tracking/place_errors.py)
@@ -68,7 +69,7 @@ class Smoothed:
         for v in np.flatnonzero(labelled):
             points = found[int(model.camera_of[v])]
             assert points is not None
-            uv_px[v] = points.uv_px[point[v]]
+            uv_px[v] = points.uv_px[point[v]] - self.exposure_px[k, v]
             cov_px2[v] = points.cov_px2[point[v]] * self.noise_scale**2
             cov_px2[v] += self.parameters.sigma_model_px**2 * np.eye(2)
             if assigned[v] >= BLENDED:

@@ -22,6 +22,7 @@ from geometry.solve import SolveLimits, covariance_of
 from tracking.association import BLENDED, Chances, Sights, distinct_spots
 from tracking.backward import merged, track_backward
 from tracking.continuity import Surroundings, continued
+from tracking.exposure import exposure_offsets, moved_by
 from tracking.fixed_interval import Reference, speeds
 from tracking.hypotheses import CHECK_PX, FEW, PROOF, SURE
 from tracking.information import controlled, fit_alone, frame_information
@@ -237,7 +238,12 @@ class _Pass:
         causal = self.causal
         assigned = self.assigned
         differ = (assigned % BLENDED != causal % BLENDED) & ~((assigned < 0) & (causal < 0))
-        places = self._place_errors(Reference(R, t, ref.m), pose_P)
+        final = Reference(R, t, ref.m)
+        places = self._place_errors(final, pose_P)
+        # What was measured is the mean over the exposure; what is reported is the middle.
+        jumps = motion.bent | np.append(motion.bent[1:], False)
+        offsets = exposure_offsets(self.views, final, self.rec.exposure_s, motion.known & ~jumps)
+        middle = Pose(R, t).plus(-moved_by(self.views, final, offsets))
         strength = np.full(2, np.nan)
         if motion.log_density is not None:
             half = 0.5 * np.median(motion.log_density, axis=0)
@@ -245,7 +251,8 @@ class _Pass:
         return Smoothed(
             model=self.model,
             parameters=self.parameters,
-            poses=Pose(R, t),
+            poses=middle,
+            exposure_px=offsets,
             velocities=ref.m[:, :6],
             covariance=pose_P * places[1][:, None, None],
             place_share=places[0],
@@ -256,7 +263,7 @@ class _Pass:
             assigned=assigned,
             probability=self.probability,
             first=self.every.first,
-            rms_px=_rms(self.views, self.every, assigned, Reference(R, t, ref.m)),
+            rms_px=_rms(self.views, self.every, assigned, final),
             jerk=strength,
             iterations=rounds,
             relabelled=int(np.count_nonzero(differ)),

@@ -21,11 +21,12 @@ class BoardView:
     """
 
     ids: Ints  # (n,), ascending: which of the board's points
-    pixels: Array  # (n, 2), distorted
+    pixels: Array  # (n, 2), distorted; of circles the centroids of their blobs, not the images of their centres
     spacing_px: float  # median distance of neighbouring points
     blur_px: float  # sigma of the edges, a pixel's own width included; nan where it could not be measured
     contrast_dn: float  # light minus dark
     notes: tuple[str, ...] = ()  # what the user should know of this picture
+    areas_px2: Array | None = None  # (n,), of the blobs that circles are seen as; None for other boards
 
     def __len__(self) -> int:
         return len(self.ids)

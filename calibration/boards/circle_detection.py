@@ -1,4 +1,8 @@
-"""Grids of circles in pictures: ellipse centres, corrected for what perspective does to them."""
+"""Grids of circles in pictures: centres and areas of the ellipses that they are seen as.
+
+A centre is that of the blob, not the image of the circle's centre: the two differ by tenths of a pixel, which the
+calibration's model takes into account (calibration/lens/circle_images.py) and for which it needs the areas.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +45,7 @@ class Ellipses:
 
 
 def find_circles(image: GreyImage, board: CircleGrid, closely: bool = True) -> BoardView | NotFound:
-    """All centres of a grid of circles, or the reason why they cannot be had.
+    """All centres of a grid of circles, with the blobs' areas, or the reason why they cannot be had.
 
     closely: else no cause is looked for.
     """
@@ -121,7 +125,7 @@ def _measured(image: GreyImage, grid: Array, board: CircleGrid, light: bool) -> 
     if turned is not None:
         ordered = turned
         ellipses = fit_ellipses(image, ordered.reshape(-1, 2), _radii(ordered, board, blobs))
-    centres = ellipses.centres - perspective_shift(ellipses, board)
+    centres = ellipses.centres
     contrast = float(np.median(ellipses.contrasts))
     sigma = np.median(ellipses.contrasts / ellipses.slopes) / np.sqrt(2 * np.pi)
     blur = float(sigma)
@@ -129,7 +133,7 @@ def _measured(image: GreyImage, grid: Array, board: CircleGrid, light: bool) -> 
     if blur > BLUR_LIMIT * apart:
         return too_blurred(blur, apart)
     notes = ("light circles on a dark ground",) if light else ()
-    return BoardView(board.ids, centres, apart, blur, contrast, notes)
+    return BoardView(board.ids, centres, apart, blur, contrast, notes, ellipses.areas)
 
 
 def _radii(grid: Array, board: CircleGrid, blobs: Array) -> Array:
@@ -208,27 +212,6 @@ def _ellipse(gx: Array, gy: Array, grey: Array, centre: Array, reach: float) -> 
     outside = np.hypot(x, y) > 0.85 * reach
     contrast = float(np.median(grey[outside]) - np.min(grey[inside])) if inside.any() and outside.any() else np.nan
     return np.array([*(place + centre), np.pi * np.sqrt(det), float(np.percentile(strength[edge], 90)), contrast])
-
-
-def perspective_shift(ellipses: Ellipses, board: CircleGrid) -> Array:
-    """How far (n, 2), px, the centre of each ellipse lies from the image of its circle's centre.
-
-    The dual conic of a circle, moved by the homography H of the board, is H D H^T; its centre is the ellipse's, and
-    H c the circle's. The radius is the one that gives the areas measured. A lens' own bend over one circle, which adds
-    a few thousandths of a pixel, is not taken off.
-    """
-    H = homography(board.points[:, :2], ellipses.centres)
-    shares = _jacobian_determinants(H, board.points[:, :2])
-    r2 = float(np.median(ellipses.areas / np.abs(shares))) / np.pi
-    x, y = board.points[:, 0], board.points[:, 1]
-    one = np.ones(len(x))
-    dual = np.empty((len(x), 3, 3))
-    dual[:, 0, 0], dual[:, 1, 1], dual[:, 2, 2] = x * x - r2, y * y - r2, one
-    dual[:, 0, 1] = dual[:, 1, 0] = x * y
-    dual[:, 0, 2] = dual[:, 2, 0] = x
-    dual[:, 1, 2] = dual[:, 2, 1] = y
-    moved = H @ dual @ H.T
-    return moved[:, :2, 2] / moved[:, 2:, 2] - mapped(H, board.points[:, :2])
 
 
 def homography(from_xy: Array, to_xy: Array) -> Array:

@@ -20,8 +20,8 @@ from geometry.arrays import Array, Ints
 
 EXAMPLES = {
     "chessboard": "chessboard:9x6:25mm (inner corners, side of a square)",
-    "circles": "circles:10x10:12mm (circles, distance of neighbours)",
-    "acircles": "acircles:4x11:20mm (circles in a row, rows, distance of two rows)",
+    "circles": "circles:10x10:12mm (circles, distance of neighbours; then perhaps their diameter, :6mm)",
+    "acircles": "acircles:4x11:20mm (circles in a row, rows, distance of two rows; then perhaps their diameter, :14mm)",
     "charuco": "charuco:5x7:40mm:20mm:DICT_4X4_50 (squares, side of a square, side of a marker, dictionary;"
     " then :inverted for white markers, :legacy for OpenCV's pattern before 4.6)",
 }
@@ -115,10 +115,19 @@ class CircleGrid:
     rows: int
     spacing_m: float
     asymmetric: bool = False
+    stated_diameter_m: float | None = None  # of the circles; None: not said, and measured in the pictures
 
     def __post_init__(self) -> None:
         _check_count(self.kind, "circles", self.columns, self.rows)
         _check_length(self.kind, "spacing", self.spacing_m)
+        if self.stated_diameter_m is not None:
+            _check_length(self.kind, "diameter", self.stated_diameter_m)
+            if self.stated_diameter_m >= self.neighbours_m:
+                raise ValueError(
+                    f"{self.kind}: expected circles smaller than the {1000 * self.neighbours_m:.4g} mm between"
+                    f" neighbours, got a diameter of {_mm(self.stated_diameter_m)}; the spacing comes first; example:"
+                    f" {EXAMPLES[self.kind]}"
+                )
 
     @property
     def kind(self) -> str:
@@ -151,8 +160,8 @@ class CircleGrid:
 
     @property
     def diameter_m(self) -> float:
-        """Of the circles as beampose prints them. Detection measures it and does not rely on it."""
-        return _INK * self.neighbours_m
+        """Of the circles as stated, or as beampose prints them. Calibrations measure it and do not rely on it."""
+        return _INK * self.neighbours_m if self.stated_diameter_m is None else self.stated_diameter_m
 
     @property
     def size_m(self) -> tuple[float, float]:
@@ -169,7 +178,8 @@ class CircleGrid:
 
     def describe(self) -> str:
         """The text that `parse` reads."""
-        return f"{self.kind}:{self.columns}x{self.rows}:{_mm(self.spacing_m)}"
+        text = f"{self.kind}:{self.columns}x{self.rows}:{_mm(self.spacing_m)}"
+        return text if self.stated_diameter_m is None else f"{text}:{_mm(self.stated_diameter_m)}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -270,7 +280,8 @@ Board: TypeAlias = Chessboard | CircleGrid | Charuco
 def parse(text: str) -> Board:
     """The board that a text names. Raises ValueError: one line with an example.
 
-    chessboard:9x6:25mm, circles:10x10:12mm, acircles:4x11:20mm, charuco:5x7:40mm:20mm:DICT_4X4_50[:inverted][:legacy];
+    chessboard:9x6:25mm, circles:10x10:12mm[:DIAMETER], acircles:4x11:20mm[:DIAMETER],
+    charuco:5x7:40mm:20mm:DICT_4X4_50[:inverted][:legacy];
     lengths in mm, cm or m.
     """
     kind, *parts = [part.strip() for part in text.strip().split(":")]
@@ -293,13 +304,16 @@ def parse(text: str) -> Board:
 
 def _board_of(kind: str, parts: list[str]) -> Board:
     wanted = 4 if kind == "charuco" else 2
-    if len(parts) < wanted or (kind != "charuco" and len(parts) > wanted):
-        raise ValueError(f"expected {wanted} parts after {kind!r}, got {len(parts)}")
+    round_ones = kind in ("circles", "acircles")
+    if len(parts) < wanted or (kind != "charuco" and len(parts) > wanted + round_ones):
+        most = f"{wanted} or {wanted + 1}" if round_ones else f"{wanted}"
+        raise ValueError(f"expected {most} parts after {kind!r}, got {len(parts)}")
     columns, rows = _read_count(parts[0])
     if kind == "chessboard":
         return Chessboard(columns, rows, _read_length(parts[1]))
     if kind != "charuco":
-        return CircleGrid(columns, rows, _read_length(parts[1]), asymmetric=kind == "acircles")
+        diameter = _read_length(parts[2]) if len(parts) > 2 else None
+        return CircleGrid(columns, rows, _read_length(parts[1]), kind == "acircles", diameter)
     words = [word.lower() for word in parts[4:]]
     for word in words:
         if word not in ("inverted", "legacy"):

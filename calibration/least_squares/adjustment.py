@@ -14,6 +14,7 @@ from typing import Protocol
 
 import numpy as np
 from scipy import sparse
+from scipy.linalg import block_diag
 from scipy.sparse.linalg import SuperLU, splu
 
 from calibration.least_squares.stacks import Stack
@@ -22,6 +23,10 @@ from geometry.arrays import Array, Bools, Ints
 Values = Mapping[str, Stack]
 Free = Mapping[str, bool | Bools]  # per stack: which numbers (k, dof) may move, True for all; not named: none
 At = tuple[str, int]  # a stack's name and which of its unknowns
+# Per stack: steps are taken in other coordinates, error = basis @ coordinates, (dof, dof). Numbers that nearly do the
+# same (the k1 and k4 of a lens) make normal equations that rounding alone makes singular; a basis in which they do not
+# keeps all digits. Fixed numbers are coordinates of their own.
+Basis = Mapping[str, Array]
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,13 +128,19 @@ class Adjusted:
             rhs[picked, np.arange(len(picked))] = scale[picked]
             block = (factor.solve(rhs) * scale[:, None])[picked]
             out[np.ix_(free, free)] = (block + block.T) / 2
+        if any(stack in self._columns.basis for stack, _ in at):
+            M = block_diag(*[self._columns.basis_of(a[0]) for a in at])
+            out = M @ out @ M.T
         return out
 
     def reduced_normal(self, keep: Sequence[At]) -> Array:
         """The information (p, p) on some unknowns once all the other free ones are solved for (Schur complement).
 
-        Rows of fixed numbers are 0. The others must be determined when the kept ones are known.
+        Rows of fixed numbers are 0. The others must be determined when the kept ones are known. Not for stacks that
+        were solved in another basis: ValueError.
         """
+        if any(stack in self._columns.basis for stack, _ in keep):
+            raise ValueError("expected stacks solved in their own numbers, got one with another basis")
         columns = np.concatenate([self._columns.of(*a) for a in keep])
         free = columns >= 0
         kept = columns[free]
@@ -162,13 +173,15 @@ class Adjusted:
         return out
 
 
-def solve(values: Values, terms: Sequence[Term], free: Free, limits: Limits = Limits()) -> Adjusted:
+def solve(
+    values: Values, terms: Sequence[Term], free: Free, limits: Limits = Limits(), basis: Basis | None = None
+) -> Adjusted:
     """The values that make the terms' residuals smallest.
 
     Start values must be near enough for Newton steps. Raises AdjustmentError where the residuals are not finite at the
     start or the steps do not settle. Directions that nothing determines stay where they started.
     """
-    columns = _Columns.of_free(values, free)
+    columns = _Columns.of_free(values, free, basis or {})
     lines = [t.linearise(values) for t in terms]
     if not all(np.isfinite(line.residuals).all() for line in lines):
         raise AdjustmentError("some measurement cannot be predicted from the start values")
@@ -210,9 +223,10 @@ class _Columns:
 
     column: Mapping[str, Ints]  # per stack (k, dof)
     count: int
+    basis: Basis
 
     @staticmethod
-    def of_free(values: Values, free: Free) -> _Columns:
+    def of_free(values: Values, free: Free, basis: Basis) -> _Columns:
         unknown = set(free) - set(values)
         if unknown:
             raise KeyError(f"no such stacks: {', '.join(sorted(unknown))}")
@@ -223,15 +237,28 @@ class _Columns:
             numbers[mask] = count + np.arange(int(mask.sum()))
             column[name] = numbers
             count += int(mask.sum())
-        return _Columns(column, count)
+        return _Columns(column, count, basis)
 
     def of(self, stack: str, element: int) -> Ints:
         return self.column[stack][element]
 
+    def basis_of(self, stack: str) -> Array:
+        """(dof, dof)."""
+        return self.basis.get(stack, np.eye(self.column[stack].shape[1]))
+
+    def jacobian(self, part: Part) -> Array:
+        """By the coordinates in which steps are taken."""
+        return part.jacobian @ self.basis[part.stack] if part.stack in self.basis else part.jacobian
+
+    def step(self, stack: str, padded: Array) -> Array:
+        """(k, dof): the errors of a stack's numbers from a step in coordinates, 0 at its end."""
+        delta: Array = padded[self.column[stack]]
+        return delta @ self.basis[stack].T if stack in self.basis else delta
+
     def moved(self, values: Values, delta: Array) -> Values:
         padded = np.append(delta, 0.0)  # column -1 reads the 0 at the end
         return {
-            name: stack.plus(padded[self.column[name]]) if (self.column[name] >= 0).any() else stack
+            name: stack.plus(self.step(name, padded)) if (self.column[name] >= 0).any() else stack
             for name, stack in values.items()
         }
 
@@ -269,7 +296,7 @@ def _normal_equations(
             continue
         root = np.sqrt(_weights(term, line))[:, None]
         r = line.residuals * root
-        J = np.concatenate([p.jacobian for p in parts], axis=2) * root[..., None]
+        J = np.concatenate([columns.jacobian(p) for p in parts], axis=2) * root[..., None]
         shape = [len(columns.column[p.stack]) for p in parts]
         keys = np.ravel_multi_index([p.index for p in parts], shape)  # one number each: three times as fast to sort
         groups, group_of, sizes = np.unique(keys, return_inverse=True, return_counts=True)

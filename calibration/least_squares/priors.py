@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from calibration.least_squares.adjustment import At, Linearised, Loss, Part, Values
-from calibration.least_squares.stacks import Poses, Stack
+from calibration.least_squares.stacks import Poses, Stack, Vectors
 from geometry import rotations
 from geometry.arrays import Array
 
@@ -52,6 +52,25 @@ class Prior:
             parts.append(Part(stack, one, J[None]))
             start += known.dof
         return Linearised((self._root @ np.concatenate(away))[None], parts)
+
+
+@dataclass(frozen=True, slots=True)
+class Anchors:
+    """That all unknowns of a stack of vectors lie about where they were said to, each by itself."""
+
+    stack: str
+    known: Array  # (k, d)
+    sigma: float  # of each number
+    loss: Loss | None = None
+
+    def linearise(self, values: Values) -> Linearised:
+        """k residuals of d numbers."""
+        now = values[self.stack]
+        assert isinstance(now, Vectors)
+        k, d = self.known.shape
+        away = now.minus(Vectors(self.known)) / self.sigma
+        J = np.broadcast_to(np.eye(d) / self.sigma, (k, d, d))
+        return Linearised(away, [Part(self.stack, np.arange(k), J)])
 
 
 def _slope(known: Stack, delta: Array) -> Array:

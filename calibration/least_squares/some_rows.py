@@ -35,7 +35,8 @@ def picked(term: Term, rows: Bools, loss: Loss | None = None) -> Term:
     if isinstance(term, RecordTerm):
         return RecordTerm(term.stack, term.index[rows], term.recorded[rows], term.sigmas[rows], loss)
     assert isinstance(term, CornerTerm)
-    per_row = ("pixels", "points", "from_middle", "camera", "placement", "board", "sigma_px")
+    per_row = ["pixels", "points", "from_middle", "camera", "placement", "board", "sigma_px"]
+    per_row += [] if term.point is None else ["point"]
     return replace(term, **{n: getattr(term, n)[rows] for n in per_row}, loss=loss)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,8 +11,16 @@ from geometry.arrays import Array, Bools, Ints
 
 
 @dataclass(frozen=True, slots=True)
+class CircleAreas:
+    """That the points are circles, whose centroids were seen, and what tells their size."""
+
+    areas_px2: Array | None = None  # (N,), of their blobs; None: not measured
+    diameter_m: float | None = None  # as stated; None: not said
+
+
+@dataclass(frozen=True, slots=True)
 class CornerTable:
-    """N corners in V views of one board with P points."""
+    """N corners, or centroids of circles, in V views of one board with P points."""
 
     view: Ints  # (N,): in which photograph, 0 ... V - 1; in ascending order
     point: Ints  # (N,): which point of the board
@@ -21,6 +29,7 @@ class CornerTable:
     middle: Array  # (3,), m: about which a bent board is described
     views: int
     image_size_px: tuple[int, int]
+    circles: CircleAreas | None = None  # None: the points are points
 
     def __post_init__(self) -> None:
         if not np.isfinite(self.pixels).all():
@@ -30,9 +39,13 @@ class CornerTable:
 
     @staticmethod
     def of(
-        views: Sequence[tuple[Ints, Array]], board_points: Array, middle: Array, image_size_px: tuple[int, int]
+        views: Sequence[tuple[Ints, Array]],
+        board_points: Array,
+        middle: Array,
+        image_size_px: tuple[int, int],
+        circles: CircleAreas | None = None,
     ) -> CornerTable:
-        """From (ids (n,), pixels (n, 2)) per photograph."""
+        """From (ids (n,), pixels (n, 2)) per photograph; the circles' areas in the order of the views."""
         sizes = [len(ids) for ids, _ in views]
         return CornerTable(
             view=np.repeat(np.arange(len(views)), sizes),
@@ -42,6 +55,7 @@ class CornerTable:
             middle=np.asarray(middle, dtype=float),
             views=len(views),
             image_size_px=image_size_px,
+            circles=circles,
         )
 
     def __len__(self) -> int:
@@ -77,4 +91,16 @@ class CornerTable:
             self.middle,
             len(views),
             self.image_size_px,
+            self._circles_of(order),
         )
+
+    def _circles_of(self, rows: Ints) -> CircleAreas | None:
+        if self.circles is None or self.circles.areas_px2 is None:
+            return self.circles
+        return replace(self.circles, areas_px2=self.circles.areas_px2[rows])
+
+    @property
+    def spacing_m(self) -> float:
+        """Distance of the nearest points of the board."""
+        xy = self.board_points[:, :2]
+        return float(np.min(np.linalg.norm(xy[1:] - xy[0], axis=1)))

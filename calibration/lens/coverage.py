@@ -50,13 +50,29 @@ def spread_deg(normals: Array) -> float:
 
 
 def _filled(table: CornerTable, used: Bools) -> float:
+    return float(_mask(table, used).mean())
+
+
+def seen_at(table: CornerTable, used: Bools, pixels: Array) -> Bools:
+    """Which pixels (..., 2) lie within the corners of some view; nan ones do not."""
+    mask = _mask(table, used)
+    scale = _CELLS / table.image_size_px[0]
+    cell = np.nan_to_num((pixels + 0.5) * scale, nan=-1.0)
+    i, j = np.floor(cell[..., 1]).astype(int), np.floor(cell[..., 0]).astype(int)
+    inside = (i >= 0) & (j >= 0) & (i < mask.shape[0]) & (j < mask.shape[1])
+    out: Bools = inside & mask[np.clip(i, 0, mask.shape[0] - 1), np.clip(j, 0, mask.shape[1] - 1)]
+    return out
+
+
+def _mask(table: CornerTable, used: Bools) -> Bools:
+    """(rows, _CELLS): the parts of the picture within the corners of some view."""
     width, height = table.image_size_px
     scale = _CELLS / width
     mask = np.zeros((max(1, round(height * scale)), _CELLS), dtype=np.uint8)
     for v in np.flatnonzero(table.counts(used) > 2):
         corners = (table.pixels[used & (table.view == v)] + 0.5) * scale - 0.5
         cv2.fillConvexPoly(mask, cv2.convexHull(corners.astype(np.float32)).round().astype(np.int32), 1)
-    return float(mask.mean())
+    return np.asarray(mask > 0)
 
 
 def _gaps(pixels: Array, size: tuple[int, int]) -> tuple[str, ...]:

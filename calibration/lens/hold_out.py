@@ -21,8 +21,8 @@ from geometry.arrays import Array, Bools, Ints
 
 FOLDS = 5
 # Models with numbers that the views hardly determine creep along a valley for ever: they are given up early, and a
-# hundredth of a sigma is nothing beside what a fold moves.
-BRIEF = Limits(steps=40, small_step_sigmas=0.01)
+# twentieth of a sigma is nothing beside what a fold moves.
+BRIEF = Limits(steps=40, small_step_sigmas=0.05)
 _ONE_BY_ONE = 10  # up to so many views each is held out alone: with fewer, a fifth of the views is too much to spare
 
 
@@ -57,7 +57,7 @@ def hold_out(table: CornerTable, found: LensFit, folds: int | None = None) -> He
     for group in folds_of(used_views(found, table), folds):
         held = np.isin(table.view, group)
         without = fit(
-            table, found.used & ~held, found.model, found.values, found.warp_free, limits=BRIEF, sigma_px=found.sigma_px
+            table, found.used & ~held, found.model, found.values, found.board, limits=BRIEF, sigma_px=found.sigma_px
         )
         kept.append(without)
         error[group] = _errors(table, found.used & held, without, found.values)[group]

@@ -9,16 +9,29 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calibration.least_squares.adjustment import AdjustmentError
-from calibration.least_squares.stacks import Poses, Vectors
+from calibration.least_squares.stacks import Poses
+from calibration.lens.board_shape import Asked, BoardTest, board_test
 from calibration.lens.corner_table import CornerTable
 from calibration.lens.coverage import coverage_of, spread_deg
 from calibration.lens.hold_out import HeldOut, Scatter, hold_out, scatter
 from calibration.lens.intrinsics_findings import findings_of
 from calibration.lens.intrinsics_result import Intrinsics, Origins
-from calibration.lens.lens_fit import FEWEST_CORNERS, LensFit, Values, fit, robust_fit, used_views
-from calibration.lens.lens_ladder import Rung, WarpTest, climb, union_of_used, warp_test
+from calibration.lens.lens_fit import (
+    AS_STATED,
+    BOARD_STACKS,
+    FEWEST_CORNERS,
+    BoardFreedom,
+    LensFit,
+    Values,
+    board_as_stated,
+    fit,
+    robust_fit,
+    used_views,
+)
+from calibration.lens.lens_ladder import Rung, climb, union_of_used
 from calibration.lens.lens_models import LensModel
 from calibration.lens.lens_start import StartError, start
+from calibration.lens.model_doubt import model_doubt
 from calibration.lens.projection_map import Difference, ProjectionMap, difference, projection_map
 from geometry.arrays import Ints
 
@@ -44,6 +57,7 @@ class IntrinsicsOptions:
     distance_m: float | None = None  # of the screen, for figures in mm; None: the median distance of the boards
     lens: LensModel | None = None  # None: chosen by hold-out error
     warp: bool | None = None  # whether to correct a bent board; None: where it is significant
+    stretch: bool | None = None  # whether to correct rows and columns that are not to scale; None: where significant
     folds: int | None = None  # of the hold-out; None: five, or one view each up to ten views
     origins: tuple[str, ...] = ()  # of each view: those of unlike origin may be of two cameras; empty: nothing known
 
@@ -65,26 +79,29 @@ def calibrate_intrinsics(table: CornerTable, options: IntrinsicsOptions | None =
 
 def _calibrated(table: CornerTable, options: IntrinsicsOptions) -> Intrinsics:
     starts = _starts(table, options.lens)
-    used, rich = union_of_used(table, starts)
-    bend = _bend(table, rich[0], options)
-    warp_free = bend is not None and bend.corrected
-    values = [_start_of(rich, fisheye, warp_free) for fisheye in (False, True)]
-    ladder = climb(table, used, values, warp_free, options.folds, options.lens)
-    found, held, spread = _final(table, ladder.chosen, warp_free, options.folds)
+    used, rich = union_of_used(table, starts, options.lens)
+    shape = _shape(table, rich[0], options)
+    free = AS_STATED if shape is None else shape.free
+    as_found = (rich[0] if shape is None else shape.fit).values
+    board = {name: as_found[name] for name in BOARD_STACKS} if shape else board_as_stated(len(table.board_points))
+    ladder = climb(table, used, rich, board, replace(free, points=False), options.folds, options.lens)
+    found, held, spread = _final(table, ladder.chosen, free, options.folds)
     noise = max(1.0, spread.factor) if spread.p_value < SCATTER_SIGNIFICANT else 1.0
     distance = options.distance_m or _typical_depth(table, found)
     pixel_map = projection_map(found.model, found.lens, table.image_size_px, distance)
+    doubt = model_doubt(table, found, ladder, pixel_map, found.covariance * noise**2, noise)
     out = Intrinsics(
         table=table,
         model=found.model,
         fit=found,
         parameters=found.model.parameters,
-        covariance=found.covariance * noise**2,
+        covariance=found.covariance * (noise * doubt.factor) ** 2,
+        doubt=doubt,
         correlated_noise=noise,
         scatter=spread,
         held=held,
         ladder=ladder,
-        warp=bend,
+        board=shape,
         halves=_halves(table, found, pixel_map),
         origins=_origins(table, found, pixel_map, options.origins),
         map=pixel_map,
@@ -135,30 +152,24 @@ def _check_tilts(values: Values) -> None:
         )
 
 
-def _bend(table: CornerTable, rich: LensFit, options: IntrinsicsOptions) -> WarpTest | None:
+def _shape(table: CornerTable, rich: LensFit, options: IntrinsicsOptions) -> BoardTest | None:
     try:
-        return warp_test(table, rich, options.folds, options.warp)
+        return board_test(table, rich, Asked(options.warp, options.stretch, options.folds))
     except AdjustmentError:
-        if options.warp:
+        if options.warp or options.stretch:
             raise
         return None
 
 
-def _start_of(fits: Sequence[LensFit], fisheye: bool, warp_free: bool) -> Values | None:
-    """Where the ladder starts with one kind of lens; None where none was solved."""
-    for found in fits:
-        if found.model.fisheye == fisheye:
-            return found.values if warp_free else {**found.values, "warp": Vectors(np.zeros((1, 3)))}
-    return None
-
-
-def _final(table: CornerTable, chosen: Rung, warp_free: bool, folds: int | None) -> tuple[LensFit, HeldOut, Scatter]:
+def _final(
+    table: CornerTable, chosen: Rung, board: BoardFreedom, folds: int | None
+) -> tuple[LensFit, HeldOut, Scatter]:
     """The chosen model once more from all corners: what is no corner is judged by the lens that stays."""
     assert chosen.fit is not None
     assert chosen.held is not None
     assert chosen.scatter is not None
     try:
-        found = robust_fit(table, chosen.model, chosen.fit.values, warp_free)
+        found = robust_fit(table, chosen.model, chosen.fit.values, board)
         held = hold_out(table, found, folds)
         return found, held, scatter(found, held)
     except AdjustmentError:
@@ -193,7 +204,7 @@ def _apart(table: CornerTable, found: LensFit, at: ProjectionMap, *views: Ints) 
     """How two sets of views differ, the board's bend as found from all: it is one board."""
     try:
         first, second = (
-            fit(table, found.used & np.isin(table.view, some), found.model, found.values, False) for some in views
+            fit(table, found.used & np.isin(table.view, some), found.model, found.values, AS_STATED) for some in views
         )
         return difference(at, first, second)
     except AdjustmentError:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibration.findings import Finding, Level
+from calibration.lens.board_findings import circles_finding, doubt_finding, points_finding, stretch_finding
 from calibration.lens.intrinsics_result import Intrinsics
 from calibration.lens.lens_models import folds_in_picture
 from calibration.lens.projection_map import Difference
@@ -54,7 +55,11 @@ def findings_of(c: Intrinsics, limits: Limits = LIMITS) -> tuple[Finding, ...]:
         _origins(c, limits),
         _scatter(c),
         _map(c, limits),
+        doubt_finding(c),
         _warp(c, limits),
+        stretch_finding(c),
+        points_finding(c),
+        circles_finding(c),
     ]
     return tuple(f for f in found if f is not None)
 

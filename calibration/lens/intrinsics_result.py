@@ -7,12 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibration.findings import Finding, Level, verdict
+from calibration.lens.board_shape import BoardTest, WarpTest
 from calibration.lens.corner_table import CornerTable
 from calibration.lens.coverage import Coverage
 from calibration.lens.hold_out import HeldOut, Scatter
 from calibration.lens.lens_fit import LensFit
-from calibration.lens.lens_ladder import Ladder, WarpTest
+from calibration.lens.lens_ladder import Ladder
 from calibration.lens.lens_models import LensModel
+from calibration.lens.model_doubt import ModelDoubt
 from calibration.lens.projection_map import Difference, ProjectionMap
 from geometry.arrays import Array
 
@@ -33,18 +35,24 @@ class Intrinsics:
     model: LensModel
     fit: LensFit
     parameters: tuple[str, ...]  # fx, fy, cx, cy, k1 ...
-    covariance: Array  # (p, p) in that order, scatter between photographs included
+    covariance: Array  # (p, p) in that order, scatter between photographs and the model's own doubt included
+    doubt: ModelDoubt
     correlated_noise: float  # factor on the sigmas from that scatter; 1 where it is not significant
     scatter: Scatter
     held: HeldOut
     ladder: Ladder
-    warp: WarpTest | None  # None where the views do not determine a bend
+    board: BoardTest | None  # the board as the photographs show it; None where they do not determine its bend
     halves: Difference | None  # None where a half does not determine the lens
     origins: Origins | None  # None where all photographs are of one origin
     map: ProjectionMap
     distance_m: float
     coverage: Coverage
     findings: tuple[Finding, ...] = ()
+
+    @property
+    def warp(self) -> WarpTest | None:
+        """The board's bend; None where the views do not determine it."""
+        return None if self.board is None else self.board.warp
 
     @property
     def verdict(self) -> Level:
@@ -66,6 +74,11 @@ class Intrinsics:
     def sigmas(self) -> Array:
         """(p,): 1 sigma of each parameter."""
         return np.sqrt(np.diagonal(self.covariance))
+
+    @property
+    def map_covariance_px2(self) -> Array:
+        """(rows, columns, 2, 2): of a pixel's direction over the picture, all that is known to be uncertain."""
+        return self.map.covariance_px2(self.covariance)
 
     @property
     def rms_px(self) -> float:

@@ -12,14 +12,17 @@ from calibration.least_squares.adjustment import AdjustmentError
 from calibration.least_squares.stacks import Vectors
 from calibration.lens.corner_table import CornerTable
 from calibration.lens.hold_out import BRIEF, HeldOut, Scatter, hold_out, scatter
-from calibration.lens.lens_fit import LensFit, Values, fit, robust_fit
-from calibration.lens.lens_models import LADDER, LensModel, folds_in_picture
+from calibration.lens.lens_fit import AS_STATED, CORNER_GATE, BoardFreedom, LensFit, Values, fit, robust_fit
+from calibration.lens.lens_models import LADDER, LensModel, folds_in_picture, rational_of_fisheye
+from calibration.lens.residual_cells import SIGNIFICANT, beyond_noise, cell_means
 from geometry.arrays import Bools
 
 # With so many corners time counts: models that cannot be chosen any more are not solved another five times. 400 views
 # took 25 s without this, 11 s with it; the choice is the same.
 MANY_CORNERS = 4000
-WARP_SIGNIFICANT = 1e-3  # of a flat board's chance to look this bent
+RATIONAL = LensModel(8)
+KEPT = 0.99  # share of the corners that a lens which follows leaves in use
+SYSTEMATIC = 1e-3  # of residuals' chance to exceed those of the best model so far by noise alone
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,23 +50,29 @@ class Ladder:
 def climb(
     table: CornerTable,
     used: Bools,
-    starts: Sequence[Values | None],
-    warp_free: bool,
+    rich: Sequence[LensFit],
+    shape: Values,
+    board: BoardFreedom,
     folds: int | None = None,
     only: LensModel | None = None,
 ) -> Ladder:
     """Solve every model (or only one) on the same corners (N,) and hold out.
 
-    starts: of perspective lenses and of a fisheye, None where there is none. Each rung starts from the one below of
-    its own kind. AdjustmentError where no model can be used.
+    rich: fits of rich models, from which the others start; shape: the stacks of the board's shape to start from. Each
+    rung also starts from the one below of its own kind. AdjustmentError where no model can be used.
     """
-    perspective, fisheye = starts
     fitted: list[Rung] = []
-    below = perspective
+    below: LensFit | None = None
     for model in LADDER if only is None else (only,):
-        rung = _fitted(table, used, model, fisheye if model.fisheye else below, warp_free)
+        starts = [f for f in rich if f.model.fisheye == model.fisheye and f.model.coefficients <= model.coefficients]
+        starts = starts or [f for f in rich if f.model.fisheye == model.fisheye]
+        if below is not None and not model.fisheye and model.coefficients >= RATIONAL.coefficients:
+            starts = [*(f for f in starts if f.model == RATIONAL), below]
+        elif len(starts) > 1:
+            starts = starts[:1]  # the best of them
+        rung = _best_rung(table, used, model, [{**f.values, **shape} for f in starts] or [None], board)
         if rung.fit is not None and not model.fisheye and model.coefficients:
-            below = rung.fit.values
+            below = rung.fit
         fitted.append(rung)
     rungs = []
     for rung in fitted:
@@ -74,8 +83,21 @@ def climb(
     return choose(rungs)
 
 
+def _best_rung(
+    table: CornerTable, used: Bools, model: LensModel, starts: Sequence[Values | None], board: BoardFreedom
+) -> Rung:
+    """The model solved from each start, where it fits best."""
+    rungs = [_fitted(table, used, model, start, board) for start in starts]
+    return min(rungs, key=lambda r: np.inf if r.fit is None else r.fit.sigma_px)
+
+
 def choose(rungs: Sequence[Rung]) -> Ladder:
-    """Of rungs in ascending order: the first whose held-out error is within one standard error of the smallest."""
+    """Of rungs in ascending order: the first that predicts as well as the best and leaves nothing that it explains.
+
+    As well: its held-out error is within one standard error of the smallest. What it leaves in the residuals beyond the
+    best one's must be noise: the standard error is large where few views reach the parts of the picture in which two
+    models differ, though all corners together leave no doubt.
+    """
     able = [r for r in rungs if not r.refused and r.held is not None]
     if not able:
         reasons = "; ".join(f"{r.model.title}: {r.refused}" for r in rungs)
@@ -88,13 +110,14 @@ def choose(rungs: Sequence[Rung]) -> Ladder:
             continue
         gain, error = best.held.better_than(r.held)
         out.append(replace(r, behind_px2=gain, standard_error_px2=error))
-    chosen = next(r for r in out if not r.refused and r.held is not None and r.behind_px2 <= r.standard_error_px2)
+    as_good = [r for r in out if not r.refused and r.held is not None and r.behind_px2 <= r.standard_error_px2]
+    chosen = next(r for r in as_good if r.model == best.model or not leaves_something(r, best))
     if chosen.model == best.model:
         why = f"it predicts held-out views best ({_rms(best):.3f} px)"
         smaller = [r for r in out if r.held is not None and not r.refused][: [r.model for r in able].index(best.model)]
         if smaller:
             least = min(_rms(r) for r in smaller)
-            why += f", and every smaller usable model errs more by over one standard error ({least:.3f} px at best)"
+            why += f", and every smaller usable model errs more ({least:.3f} px at best) or leaves more in them"
     else:
         why = (
             f"its held-out error ({_rms(chosen):.3f} px) is within one standard error of the best model's"
@@ -103,16 +126,26 @@ def choose(rungs: Sequence[Rung]) -> Ladder:
     return Ladder(out, chosen, why)
 
 
+def leaves_something(rung: Rung, best: Rung) -> bool:
+    """Whether a model's residuals exceed those of the best one by more than noise and its fewer numbers explain."""
+    if rung.fit is None or best.fit is None or best.scatter is None:
+        return False
+    more, least = (f.sigma_px**2 * f.adjusted.dof for f in (rung.fit, best.fit))
+    noise = best.fit.sigma_px * max(1.0, best.scatter.factor)
+    fewer = max(best.model.coefficients - rung.model.coefficients, 3)
+    return bool(chi2.sf((more - least) / noise**2, fewer) < SYSTEMATIC)
+
+
 def _rms(rung: Rung) -> float:
     return np.inf if rung.held is None else rung.held.rms_px
 
 
-def _fitted(table: CornerTable, used: Bools, model: LensModel, start: Values | None, warp_free: bool) -> Rung:
+def _fitted(table: CornerTable, used: Bools, model: LensModel, start: Values | None, board: BoardFreedom) -> Rung:
     """A model solved on all views."""
     if start is None:
         return Rung(model, None, None, refused="no focal length and no position of the board explain the corners")
     try:
-        found = fit(table, used, model, start, warp_free, limits=BRIEF)
+        found = fit(table, used, model, start, board, limits=BRIEF)
     except AdjustmentError as error:
         return Rung(model, None, None, refused=f"it cannot be solved: {error}")
     return Rung(model, found, None)
@@ -157,87 +190,55 @@ def _held_out(table: CornerTable, rung: Rung, folds: int | None) -> Rung:
     )
 
 
-@dataclass(frozen=True, slots=True)
-class WarpTest:
-    """Whether the board is bent, as the corners see it."""
-
-    warp: tuple[float, float, float]  # 1/m, as found when free
-    sigma: tuple[float, float, float]
-    rise_m: float  # from its lowest to its highest point
-    p_value: float  # of a flat board looking bent as much
-    gain_px2: float  # mean squared error that held-out views lose with the bend; nan where p is too large to ask
-    corrected: bool
-    why: str
-
-
-def warp_test(table: CornerTable, found: LensFit, folds: int | None = None, force: bool | None = None) -> WarpTest:
-    """Solve with the board free to bend and without; force: True or False decide whatever is found.
-
-    AdjustmentError where the bend cannot be determined.
-    """
-    flat = fit(table, found.used, found.model, {**found.values, "warp": Vectors(np.zeros((1, 3)))}, False)
-    bent = fit(table, found.used, found.model, flat.values, True)
-    C = bent.warp_covariance
-    size = np.sqrt(np.diagonal(C))
-    if not np.all(size > 0):
-        raise AdjustmentError("the views do not determine the board's bend")
-    flatness = float(bent.warp @ np.linalg.solve(C, bent.warp))
-    p, gain, error = float(chi2.sf(flatness, 3)), np.nan, np.nan
-    if p < WARP_SIGNIFICANT:
-        held = hold_out(table, bent, folds)
-        # Corners of one photograph err together: against noise alone nearly every board on real photographs is bent.
-        factor = max(1.0, scatter(bent, held).factor)
-        size = size * factor
-        p = float(chi2.sf(flatness / factor**2, 3))
-        gain, error = held.better_than(hold_out(table, flat, folds))
-    if force is not None:
-        corrected, why = force, "as asked for"
-    elif p >= WARP_SIGNIFICANT:
-        corrected, why = False, "not significantly different from a flat board"
-    elif gain < -error:
-        corrected, why = False, "significant, but held-out views are predicted worse"
-    else:
-        better = "better" if gain > error else "as well"
-        corrected, why = True, f"significant, and held-out views are predicted {better}"
-    return WarpTest(
-        tuple(bent.warp),
-        tuple(size),
-        rise(table, bent),
-        p,
-        gain,
-        corrected,
-        why,
-    )
-
-
-def rise(table: CornerTable, found: LensFit) -> float:
-    """How far the board's points lie apart across it, m, by its warp, after the best-fitting flat board."""
-    x, y = (table.board_points - table.middle)[:, :2].T
-    a, b, c = found.warp
-    z = a * x * x + b * x * y + c * y * y
-    plane = np.stack([np.ones_like(x), x, y], axis=1)
-    return float(np.ptp(z - plane @ np.linalg.lstsq(plane, z, rcond=None)[0]))
-
-
-def union_of_used(table: CornerTable, starts: Sequence[tuple[LensModel, Values]]) -> tuple[Bools, list[LensFit]]:
+def union_of_used(
+    table: CornerTable, starts: Sequence[tuple[LensModel, Values]], only: LensModel | None = None
+) -> tuple[Bools, list[LensFit]]:
     """Corners (N,) that some rich model takes for the board's, and the robust fits that say so, best first.
 
-    A model too small for the lens would throw out the corners of the picture's edge, which tell the models apart.
-    AdjustmentError where none can be solved.
+    A model too small for the lens would throw out the corners of the picture's edge, which tell the models apart; so
+    the rational model is asked as well, where the plain ones leave it something. AdjustmentError where none can be
+    solved.
     """
     fits: list[LensFit] = []
-    reasons = []
+    reasons: list[str] = []
     for model, values in starts:
-        for warp_free in (True, False):
-            try:
-                fits.append(robust_fit(table, model, values, warp_free))
-                break
-            except AdjustmentError as error:
-                reasons.append(str(error))
+        fits += _rich_fit(table, model, values, reasons)
+    leaves = [beyond_noise(*cell_means(table, f), f.sigma_px)[0] < SIGNIFICANT or f.used.mean() < KEPT for f in fits]
+    asked = only is not None and only.coefficients >= RATIONAL.coefficients
+    if asked or (only is None and all(leaves)):
+        for values in [_as_rational(table, f) for f in fits]:
+            fits += _rich_fit(table, RATIONAL, values, reasons)
     if not fits:
         raise AdjustmentError(reasons[-1])
-    fits.sort(key=lambda f: float(np.nanmedian(np.abs(f.residuals))))
+    gate = CORNER_GATE * min(f.sigma_px for f in fits)
+    fits.sort(key=lambda f: _information(table, f, gate))
     # A view's corners count only where the best fit has a use for the view at all.
     views = table.counts(fits[0].used) > 0
     used = np.any([f.used for f in fits], axis=0) & views[table.view]
     return used, fits
+
+
+def _rich_fit(table: CornerTable, model: LensModel, values: Values, reasons: list[str]) -> list[LensFit]:
+    """The robust fit with as much of the board's shape as can be solved for; none where even the lens cannot."""
+    for board in (BoardFreedom(warp=True, stretch=True), BoardFreedom(warp=True), AS_STATED):
+        try:
+            return [robust_fit(table, model, values, board)]
+        except AdjustmentError as error:
+            reasons.append(str(error))
+    return []
+
+
+def _as_rational(table: CornerTable, found: LensFit) -> Values:
+    """The values of a fit with a rational lens that draws about the same."""
+    if not found.model.fisheye:
+        return found.values
+    inside = np.linalg.norm((table.pixels[found.used] - found.lens[2:4]) / found.lens[:2], axis=1)
+    lens = rational_of_fisheye(found.lens, float(inside.max()))
+    return {**found.values, "intrinsics": Vectors(lens[None])}
+
+
+def _information(table: CornerTable, found: LensFit, gate_px: float) -> float:
+    """Schwarz's criterion over all corners: what it misses by (a gate at most), and a price for each number."""
+    missed = np.minimum(np.nan_to_num(np.linalg.norm(found.residuals, axis=1), nan=np.inf), gate_px)
+    n = 2 * len(table)
+    return n * float(np.log(max(np.sum(missed**2) / n, 1e-18))) + found.model.coefficients * np.log(n)

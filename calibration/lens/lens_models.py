@@ -78,6 +78,26 @@ def named(title: str) -> LensModel:
     raise ValueError(f"expected a lens model out of {', '.join(m.title for m in LADDER)}, got {title!r}")
 
 
+def rational_of_fisheye(numbers: Array, widest_rad: float) -> Array:
+    """The perspective lens (18,) with k1 ... k6 that draws about what a fisheye (18,) does up to an angle off its axis.
+
+    Linear least squares over the radius: of d = r N / D, the equation N - (d / r) D = 0.
+    """
+    angle = np.linspace(0, min(widest_rad, np.deg2rad(80)), 200)[1:]
+    r2 = np.tan(angle) ** 2
+    points = np.stack([np.tan(angle), 0 * angle], axis=1)
+    scale = lens.distort_fisheye(points, np.broadcast_to(numbers[4:], (len(angle), 14)))[0][:, 0] / points[:, 0]
+    powers = np.stack([r2, r2**2, r2**3], axis=1)
+    weight = (1 / (1 + r2**3))[:, None]
+    A = np.concatenate([powers, -scale[:, None] * powers], axis=1) * weight
+    norm = np.linalg.norm(A, axis=0)
+    k = np.linalg.lstsq(A / norm, (scale - 1) * weight[:, 0], rcond=1e-10)[0] / norm
+    out = np.zeros(INTRINSICS)
+    out[:4] = numbers[:4]
+    out[[4, 5, 8]], out[9:12] = k[:3], k[3:]
+    return out
+
+
 def fold_r2(numbers: Array, fisheye: bool) -> float:
     """The squared normalised radius up to which a lens (18,) is one to one along every ray from the middle."""
     coefficients = tuple(float(v) for v in numbers[4:])

@@ -14,7 +14,7 @@ import numpy as np
 from calibration.least_squares.adjustment import AdjustmentError, Cauchy
 from calibration.lens.corner_table import CornerTable
 from calibration.lens.corners import INTRINSICS
-from calibration.lens.lens_fit import FEWEST_CORNERS, Values, adjust, lens_of, term_of, values_of
+from calibration.lens.lens_fit import AS_STATED, FEWEST_CORNERS, Values, adjust, lens_of, term_of, values_of
 from calibration.lens.lens_models import LensModel, folds_in_picture, undistorted
 from geometry.arrays import Array, Bools, Ints
 from geometry.camera import FISHEYE
@@ -49,7 +49,7 @@ def start(table: CornerTable, fisheye: bool) -> tuple[LensModel, Values]:
         if not trusted.any():
             continue
         try:
-            values = _short_solve(trial, trusted, model, values_of(lens, poses))
+            values = _short_solve(trial, trusted, model, values_of(lens, poses, len(table.board_points)))
         except AdjustmentError:
             continue
         left = np.linalg.norm(term_of(trial, trusted, fisheye).project(values) - trial.pixels[trusted], axis=1)
@@ -65,7 +65,7 @@ def start(table: CornerTable, fisheye: bool) -> tuple[LensModel, Values]:
     if best is None:
         raise StartError("no focal length and no position of the board explain the corners")
     poses, _ = _poses(table, best[1], fisheye)
-    return model, values_of(best[1], poses)
+    return model, values_of(best[1], poses, len(table.board_points))
 
 
 def board_poses(table: CornerTable, lens: Array, fisheye: bool) -> Pose:
@@ -110,7 +110,7 @@ def _short_solve(table: CornerTable, used: Bools, model: LensModel, values: Valu
     for lens_free in (gentle, model.free):
         term = term_of(table, used, model.fisheye)
         sigma = max(float(np.median(np.linalg.norm(term.project(values) - term.pixels, axis=1))), 0.05)
-        values = adjust(table, used, model, values, False, sigma, Cauchy(), lens_free).values
+        values = adjust(table, used, model, values, AS_STATED, sigma, Cauchy(), lens_free).values
     return values
 
 

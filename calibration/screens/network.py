@@ -15,6 +15,7 @@ from scipy.stats import chi2 as chi2_distribution
 
 from calibration.least_squares.adjustment import Adjusted, At, Cauchy, Term, Values, solve
 from calibration.least_squares.priors import Prior, independent
+from calibration.least_squares.some_rows import picked
 from calibration.least_squares.stacks import Poses, Stack, Vectors
 from calibration.lens.corners import CornerTerm
 from calibration.rig.rig_stacks import named_errors, rig_of, stacks_of
@@ -74,6 +75,7 @@ class Network:
     screen_priors: tuple[Prior, ...] = ()  # what scans say of screens
     lens_priors: tuple[Prior, ...] = ()
     warp_sigma_m: float = WARP_SIGMA_M  # by how much a board may be bent at its edge; 0: not at all
+    radii_m: Array | None = None  # (boards,): of their circles, 0 for boards of corners; None: no circles
     lens_free: Bools | None = None  # (cameras, 18): which lens numbers may move; None: none
 
 
@@ -141,6 +143,8 @@ def _unknowns(network: Network, start: Start) -> tuple[Values, dict[str, bool | 
     values["boards"] = Poses(start.world_from_board)
     count = 0 if network.corners is None else int(network.corners.board.max(initial=-1)) + 1
     values["warp"] = Vectors(np.zeros((count, 3)))
+    if network.radii_m is not None:
+        values["radius"] = Vectors(network.radii_m[:count, None])
     n_cameras, n_screens = len(rig.cameras), len(rig.screens)
     cameras = np.ones((n_cameras, 6), dtype=bool)
     bow = np.zeros((n_screens, 3), dtype=bool)
@@ -266,16 +270,9 @@ def _weighed_corners(network: Network, start: Start, values: Values, free: Mappi
     spent = 6 * (len(network.placements) + len(network.rig.cameras) - 1)
     dof = max(2 * int(good.sum()) - spent, int(good.sum()) // 2)
     factor = max(float(np.sqrt(np.sum(residuals[good] ** 2) / dof)), 0.1)
-    return CornerTerm(
-        term.pixels[good],
-        term.points[good],
-        term.from_middle[good],
-        term.camera[good],
-        term.placement[good],
-        term.board[good],
-        term.sigma_px[good] * factor,
-        term.fisheye,
-    )
+    kept = picked(term, good)
+    assert isinstance(kept, CornerTerm)
+    return replace(kept, sigma_px=kept.sigma_px * factor)
 
 
 def _fit(

@@ -77,12 +77,13 @@ def calibrate_beams(
     """Calibrate the beams of a project; writes rig.yaml (not where it fails), three tables and report.html into `out`.
 
     rig: the rig.yaml or screens.yaml with cameras and screens as calibrated and their covariances (None: `rig.yaml`
-    beside the project). A target in it is replaced by the project's, if that has one. A FAIL does not replace an
+    beside the project). The project need not state cameras, screens and target again: those of the rig serve; a target
+    in it is replaced by the project's, if that has one. A FAIL does not replace an
     earlier calibration: it then goes to `OUT-failed`. Raises InputError for what is wrong with the files,
     CalibrationError where the spots give no calibration at all; `out` is then as it was.
     """
     refuse_foreign(out, _is_ours)
-    project = load_project(Path(project_path))
+    project = load_project(Path(project_path), lab_known=True)
     day = day_of(project, today)
     refuse_repeated(project)
     rig_path = Path(rig) if rig is not None else project.path.parent / RIG

@@ -47,6 +47,8 @@ def as_mapping(board: Board) -> dict[str, Any]:
     elif isinstance(board, CircleGrid):
         content |= {"kind": CIRCLES, "columns": board.columns, "rows": board.rows, "spacing_m": board.spacing_m}
         content |= {"asymmetric": board.asymmetric}
+        if board.stated_diameter_m is not None:
+            content |= {"diameter_m": board.stated_diameter_m}
     else:
         content |= {"kind": CHARUCO, "columns": board.columns, "rows": board.rows, "square_m": board.square_m}
         content |= {"marker_m": board.marker_m, "dictionary": board.dictionary}
@@ -56,7 +58,7 @@ def as_mapping(board: Board) -> dict[str, Any]:
 
 _FIELDS = {  # of each kind: those it must have, those it may have
     CHESSBOARD: ({"square_m"}, set()),
-    CIRCLES: ({"spacing_m"}, {"asymmetric"}),
+    CIRCLES: ({"spacing_m"}, {"asymmetric", "diameter_m"}),
     CHARUCO: ({"square_m", "marker_m", "dictionary"}, {"inverted", "legacy"}),
 }
 
@@ -69,6 +71,7 @@ class _BoardBlock(Block):
     square_m: Positive | None = None
     spacing_m: Positive | None = None
     asymmetric: _TruthValue | None = None
+    diameter_m: Positive | None = None  # of the circles; left out: measured in the photographs
     marker_m: Positive | None = None
     dictionary: Word | None = None
     inverted: _TruthValue | None = None
@@ -92,7 +95,8 @@ class _BoardBlock(Block):
         if self.kind == CHESSBOARD:
             return Chessboard(self.columns, self.rows, self.square_m or 0.0)
         if self.kind == CIRCLES:
-            return CircleGrid(self.columns, self.rows, self.spacing_m or 0.0, bool(self.asymmetric))
+            asymmetric = bool(self.asymmetric)
+            return CircleGrid(self.columns, self.rows, self.spacing_m or 0.0, asymmetric, self.diameter_m)
         return Charuco(
             self.columns,
             self.rows,

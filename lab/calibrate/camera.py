@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.boards.kinds import Board
+from calibration.boards.kinds import Board, CircleGrid
 from calibration.findings import Level
-from calibration.lens.corner_table import CornerTable
+from calibration.lens.corner_table import CircleAreas, CornerTable
 from calibration.lens.intrinsics import (
     FEWEST_VIEWS,
     IntrinsicsError,
@@ -26,7 +26,7 @@ from geometry.camera import FISHEYE, PERSPECTIVE
 from lab.calibrate.board_file import board_of
 from lab.calibrate.camera_file import CameraCalibration, CameraFile, save_camera
 from lab.calibrate.camera_outcome import Outcome
-from lab.calibrate.photos import Progress, find_in_photos, origins_of
+from lab.calibrate.photos import PhotoSet, Progress, find_in_photos, origins_of
 from lab.camera_block import Covariance
 from lab.errors import CalibrationError, InputError
 from lab.whole_folder import beside_a_good_one, refuse_foreign, whole_folder
@@ -48,12 +48,16 @@ class CameraOptions:
     folds: int | None = None  # of the hold-out; None: five, or one view each up to ten views
     lens: str = "auto"  # or 0, 4, 5, 8, 12, fisheye: the model, whatever the hold-out says
     warp: str = "auto"  # or on, off: whether the board's bend is solved for
+    stretch: str = "auto"  # or on, off: whether its rows and columns are taken as to scale, and its points as in place
 
     def __post_init__(self) -> None:
         if self.lens not in LENSES:
             raise InputError(f"lens: expected {', '.join(LENSES)}, got {self.lens!r}{did_you_mean(self.lens, LENSES)}")
         if self.warp not in WARPS:
             raise InputError(f"warp: expected {', '.join(WARPS)}, got {self.warp!r}{did_you_mean(self.warp, WARPS)}")
+        if self.stretch not in WARPS:
+            near = did_you_mean(self.stretch, WARPS)
+            raise InputError(f"stretch: expected {', '.join(WARPS)}, got {self.stretch!r}{near}")
         if self.distance_m is not None and not (np.isfinite(self.distance_m) and self.distance_m > 0):
             raise InputError(f"distance: expected metres above 0, got {self.distance_m:g}")
         if self.folds is not None and self.folds < 2:
@@ -64,7 +68,8 @@ class CameraOptions:
     def intrinsics(self, origins: tuple[str, ...] = ()) -> IntrinsicsOptions:
         """The same for the solve, and where each view comes from."""
         lens = None if self.lens == "auto" else named(self.lens)
-        return IntrinsicsOptions(self.distance_m, lens, WARPS[self.warp], self.folds, origins)
+        warp, stretch = WARPS[self.warp], WARPS[self.stretch]
+        return IntrinsicsOptions(self.distance_m, lens, warp, stretch, self.folds, origins)
 
 
 def calibrate_camera(
@@ -87,7 +92,7 @@ def calibrate_camera(
     day = today or datetime.date.today()
     known = board_of(board) if isinstance(board, str | Path) else board
     found = find_in_photos(photos, known, progress, fewest=FEWEST_VIEWS)
-    table = CornerTable.of([(v.ids, v.pixels) for _, v in found.views], known.points, known.middle, found.image_size_px)
+    table = corner_table(found)
     try:
         result = calibrate_intrinsics(table, options.intrinsics(origins_of(found)))
     except TooFewViewsError as error:
@@ -104,6 +109,19 @@ def calibrate_camera(
 
         write_page(outcome, file, day, work)
     return outcome
+
+
+def corner_table(photos: PhotoSet) -> CornerTable:
+    """What the photographs gave, for the solve."""
+    board = photos.board
+    views = [view for _, view in photos.views]
+    circles = None
+    if isinstance(board, CircleGrid):
+        areas = [view.areas_px2 for view in views if view.areas_px2 is not None]
+        measured = np.concatenate(areas) if len(areas) == len(views) else None
+        circles = CircleAreas(measured, board.stated_diameter_m)
+    rows = [(np.searchsorted(board.ids, view.ids), view.pixels) for view in views]
+    return CornerTable.of(rows, board.points, board.middle, photos.image_size_px, circles)
 
 
 def _is_ours(folder: Path) -> bool:
@@ -150,6 +168,9 @@ def figures_of(r: Intrinsics) -> dict[str, float]:
         "uncertainty_worst_mm": float(np.nanmax(mm)),
         "scatter_between_photographs": r.scatter.factor,
         "sigmas_raised_by": r.correlated_noise,
+        "sigmas_raised_for_model_by": r.doubt.factor,
+        "residuals_together_px": r.doubt.left_px,
+        "lens_models_differ_px": r.doubt.between_px,
         "picture_covered": r.coverage.filled,
         "tilts_differ_by_deg": r.coverage.spread_deg,
     }
@@ -157,6 +178,14 @@ def figures_of(r: Intrinsics) -> dict[str, float]:
         out |= {"halves_differ_px": r.halves.rms_px, "halves_expected_px": r.halves.expected_rms_px}
     if r.warp is not None:
         out |= {"board_bend_mm": 1000 * r.warp.rise_m, "board_bend_corrected": float(r.warp.corrected)}
+    if r.board is not None and r.board.stretch is not None:
+        s = r.board.stretch
+        out |= {"board_stretch_percent": 100 * s.stretch, "board_stretch_sigma_percent": 100 * s.sigma[0]}
+        out |= {"board_stretch_corrected": float(s.corrected)}
+    if r.board is not None and r.board.points.corrected:
+        out |= {"board_points_off_mm": 1000 * r.board.points.rms_m}
+    if r.table.circles is not None:
+        out |= {"circle_diameter_mm": 2000 * r.fit.radius_m, "circle_diameter_sigma_mm": 2000 * r.fit.radius_sigma_m}
     return out
 
 

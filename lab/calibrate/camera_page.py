@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.findings import Level
+from calibration.lens.board_findings import circles_finding, doubt_finding, points_finding, stretch_finding
 from calibration.lens.intrinsics_result import Intrinsics
 from calibration.lens.lens_models import LensModel
 from geometry.arrays import Array
@@ -133,6 +134,7 @@ def _model(r: Intrinsics) -> Section:
             f" solved for: {bend} per metre along x², xy, y²: {1000 * r.warp.rise_m:.2f} mm from its lowest to its"
             " highest point."
         )
+    words += [f.what for f in (stretch_finding(r), points_finding(r), circles_finding(r), doubt_finding(r)) if f]
     caption = (
         "Bars: error on photographs held out; whiskers: of the difference to the best; ticks: on those solved from."
     )

@@ -1,7 +1,8 @@
 """calibration.yaml: what was measured to calibrate the screens, the cameras' places, the beams, and where that lies.
 
-One file serves `calibrate screen`, `calibrate beams` and `calibrate rig`; each takes of it what it needs. Paths start
-at the file's folder.
+One file serves `calibrate screen`, `calibrate beams` and `calibrate rig`; each takes of it what it needs. Cameras and
+screens (and the target, unless it is to start from another one) may be left out for `calibrate beams`, which takes them
+from its rig.yaml. Paths start at the file's folder.
 """
 
 from __future__ import annotations
@@ -169,10 +170,11 @@ class Project:
         return tuple(dict.fromkeys(out))
 
 
-def load_project(path: Path) -> Project:
+def load_project(path: Path, lab_known: bool = False) -> Project:
     """Read and check a calibration.yaml and the lenses that it names; tables and photographs are not opened.
 
-    path may be the folder of it. Raises InputError: file, field, what was expected and what was found.
+    path may be the folder of it. lab_known: cameras and screens come from a rig.yaml and may be left out.
+    Raises InputError: file, field, what was expected and what was found.
     """
     path = Path(path)
     if path.is_dir():
@@ -198,7 +200,7 @@ def load_project(path: Path) -> Project:
         recordings=tuple(reader.recording(r, f"recordings.{i}") for i, r in enumerate(content.recordings)),
         notes=content.notes,
     )
-    mistakes += _broken_references(content)
+    mistakes += _broken_references(content, lab_known)
     if mistakes:
         raise FileError(f"{path}: {m}" for m in mistakes)
     return project
@@ -338,8 +340,8 @@ class _ProjectBlock(Block):
     name: Annotated[str | None, pydantic.PlainValidator(lambda v: None if v is None else _name(v))] = None
     date: Day | None = None
     valid_days: Annotated[int | None, pydantic.PlainValidator(_days)] = None
-    cameras: dict[_Name, _CameraBlock]
-    screens: dict[_Name, _ScreenBlock]
+    cameras: dict[_Name, _CameraBlock] = {}  # noqa: RUF012 - frozen
+    screens: dict[_Name, _ScreenBlock] = {}  # noqa: RUF012 - frozen
     survey: _Paths = []  # noqa: RUF012 - frozen
     points: _Paths = []  # noqa: RUF012 - frozen
     boards: list[_SharedBoardBlock] = []  # noqa: RUF012 - frozen
@@ -350,11 +352,17 @@ class _ProjectBlock(Block):
     notes: Text = ""
 
 
-def _broken_references(content: _ProjectBlock) -> list[str]:
-    """Names that nothing in the file bears."""
-    out = [f"{what}: expected one or more, got none" for what in ("cameras", "screens") if not getattr(content, what)]
+def _broken_references(content: _ProjectBlock, lab_known: bool) -> list[str]:
+    """Names that nothing in the file bears. lab_known: what is not in it may be in a rig.yaml."""
+    out: list[str] = []
+    if not lab_known:
+        empty = [what for what in ("cameras", "screens") if not getattr(content, what)]
+        out = [
+            f"{what}: expected one or more, got none; only `calibrate beams` takes them from a rig" for what in empty
+        ]
+    elsewhere = lab_known and not content.screens
     for name, camera in content.cameras.items():
-        if camera.screen not in content.screens:
+        if camera.screen not in content.screens and not elsewhere:
             out.append(no_such("screen", camera.screen, f"cameras.{name}.screen", content.screens))
     places: list[tuple[str, Mapping[str, Any]]] = [
         (f"screens.{s}.boards.{i}.photos", b.photos)
@@ -366,10 +374,11 @@ def _broken_references(content: _ProjectBlock) -> list[str]:
         if not photos:
             out.append(f"{where}: expected a photograph per camera, got none")
         out += [no_such("camera", c, f"{where}.{c}", content.cameras) for c in photos if c not in content.cameras]
-    if content.world is not None and content.world not in content.screens:
+    if content.world is not None and content.world not in content.screens and not elsewhere:
         out.append(no_such("screen", content.world, "world", content.screens))
-    if content.target is not None:
-        out += content.target.mistakes(content.screens)
+    if content.target is not None:  # `calibrate beams` asks the rig for the spots' screens
+        named = {s.screen for s in content.target.spots.values()} if elsewhere else content.screens
+        out += content.target.mistakes(named)
     return out
 
 

@@ -8,11 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.boards.board_detection import NotFound, find_board
+from calibration.boards.board_detection import BoardView, NotFound, find_board
 from calibration.boards.kinds import Board
+from calibration.lens.circle_images import radius_by_areas
 from calibration.lens.corners import CornerTerm
 from calibration.screens.board_on_screen import BoardOnScreenTerm
-from geometry.arrays import Array, Bools, Ints
+from geometry.arrays import Array, Bools
 from geometry.camera import FISHEYE
 from geometry.rig import Rig
 from lab.calibrate.photos import as_8_bit
@@ -32,6 +33,7 @@ class BoardViews:
     fixed: BoardOnScreenTerm | None
     photo_of: Mapping[tuple[int, int], Path]  # (camera, placement) -> photograph
     notes: tuple[str, ...]  # photographs that were left out, and why
+    radii_m: Array | None = None  # (boards,): of the circles of each, 0 for boards of corners; None: no circles
 
 
 def board_views(project: Project, rig: Rig) -> BoardViews:
@@ -54,6 +56,7 @@ def board_views(project: Project, rig: Rig) -> BoardViews:
     photo_of: dict[tuple[int, int], Path] = {}
     notes: list[str] = []
     used: list[int] = []
+    radii: dict[int, list[float]] = {}
     for p, (name, board, photos, which) in enumerate(places):
         views = {}
         for camera, path in photos.items():
@@ -68,9 +71,13 @@ def board_views(project: Project, rig: Rig) -> BoardViews:
             if views:
                 notes.append(f"{name}: only one camera shows this board: it says nothing of the cameras' places")
             continue
-        for camera, (ids, found) in views.items():
+        for camera, view in views.items():
+            ids, found = view.ids, view.pixels
             rows = np.searchsorted(board.ids, ids)
             pixels.append(found)
+            if view.areas_px2 is not None:
+                seen_radius = radius_by_areas(board.points[rows][:, :2], found, view.areas_px2, rig.cameras[camera])
+                radii.setdefault(which, []).append(seen_radius)
             points.append(board.points[rows])
             middle.append(board.points[rows][:, :2] - board.middle[:2])
             camera_of.append(np.full(len(ids), cameras.index(camera)))
@@ -100,17 +107,18 @@ def board_views(project: Project, rig: Rig) -> BoardViews:
             sigma_m=np.array([b.sigma_m for _, _, b in fixed_rows]),
             tilt_sigma_rad=np.array([b.tilt_sigma_rad for _, _, b in fixed_rows]),
         )
-    return BoardViews(corners, tuple(places[p][0] for p in used), fixed, photo_of, tuple(notes))
+    of_boards = np.array([float(np.median(radii.get(b, [0.0]))) for b in range(physical)]) if radii else None
+    return BoardViews(corners, tuple(places[p][0] for p in used), fixed, photo_of, tuple(notes), of_boards)
 
 
 def _fisheye(rig: Rig) -> Bools:
     return np.array([c.lens == FISHEYE for c in rig.cameras.values()], dtype=bool)
 
 
-def _view(path: Path, board: Board, size_px: tuple[int, int]) -> tuple[Ints, Array] | str:
-    """The numbers (n,) and pixels (n, 2) of a board's points in a photograph, or why there are none."""
+def _view(path: Path, board: Board, size_px: tuple[int, int]) -> BoardView | str:
+    """A board's points in a photograph, or why there are none."""
     picture = read_picture(path, size_px)
     if isinstance(picture, Missing):
         return picture.reason.replace("the rig says", "the camera's calibration says")
     found = find_board(as_8_bit(picture), board)
-    return found.reason if isinstance(found, NotFound) else (found.ids, found.pixels)
+    return found.reason if isinstance(found, NotFound) else found

@@ -77,6 +77,7 @@ def screen_inputs(project: Project) -> ScreenInputs:
         corners=boards.corners,
         placements=boards.placements,
         fixed=boards.fixed,
+        radii_m=boards.radii_m,
         lens_priors=() if prior is None else (prior,),
         lens_free=lens_free,
     )

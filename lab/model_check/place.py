@@ -44,7 +44,7 @@ def with_place_errors(recording: Recording, model: SpotModel) -> Recording:
         place = min(found.few * share * max(square, size2[rows, view].mean()), (LARGEST_SHARE * width) ** 2)
         for some in np.array_split(rows, len(rows) // _CHUNK + 1):
             at = recording.uv_px[some, view]
-            rho = correlation(np.linalg.norm(at[:, None] - at[None], axis=-1), max(width, 0.5))
+            rho = correlation(np.linalg.norm(at[:, None] - at[None], axis=-1), found.reach_px[view])
             # The other chunks are taken to be like this one.
             added[some, view] = place * rho.sum(axis=1) * len(rows) / len(some)
     return replace(recording, cov_px2=recording.cov_px2 + added[..., None, None] * np.eye(2))

@@ -124,7 +124,7 @@ def test_errors_that_go_together_in_each_photograph_raise_the_sigmas():
     assert c.correlated_noise > 1.5
     assert finding(c, "scatters") is Level.WARN
     raw = np.sqrt(np.diagonal(c.fit.covariance))
-    np.testing.assert_allclose(c.sigmas, c.correlated_noise * raw)
+    np.testing.assert_allclose(c.sigmas, c.correlated_noise * c.doubt.factor * raw)
 
 
 def test_halves_that_were_taken_with_two_focal_lengths_do_not_agree():

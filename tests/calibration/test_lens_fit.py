@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from calibration.lens.corner_table import CornerTable
-from calibration.lens.lens_fit import robust_fit
+from calibration.lens.lens_fit import AS_STATED, robust_fit
 from calibration.lens.lens_start import StartError, start
 from tests.calibration.lens_scenes import SIZE, TRUTH, WIDE, Scene, board_points, photographs
 
 
 def solved(table: CornerTable, fisheye: bool = False):
     model, values = start(table, fisheye)
-    return robust_fit(table, model, values, False)
+    return robust_fit(table, model, values, AS_STATED)
 
 
 @pytest.mark.parametrize("focal", [450.0, 1000.0, 3500.0])

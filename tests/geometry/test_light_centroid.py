@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from geometry.camera import Camera
-from geometry.light_centroid import centre_offsets
+from geometry.light_centroid import CentreOffsets
 from geometry.planes import meet_plane
 from geometry.pose import Pose
 from geometry.rig import Screen
@@ -51,7 +51,7 @@ def test_the_offset_is_that_of_a_fitted_gaussian(tilt, brightness):
     covariance = (d * image[:, None]).T @ d / image.sum()
     measured = fitted_centre(image, u, v, axis, covariance, brightness)
     shape = covariance[[0, 0, 1], [0, 1, 1]][None]
-    predicted = centre_offsets(CAMERA, screen, measured[None], shape, np.array([brightness]))[0]
+    predicted = CentreOffsets(CAMERA, screen).at(measured[None], shape, np.array([brightness]))[0]
     size = np.linalg.norm(measured - axis)
     assert size > 0.005
     assert np.linalg.norm(measured - axis - predicted) < 0.2 * size + 5e-4
@@ -60,11 +60,12 @@ def test_the_offset_is_that_of_a_fitted_gaussian(tilt, brightness):
 def test_it_grows_with_the_square_of_the_width():
     screen = Screen("s", Pose(turned([0, 1, 0], 40), np.array([0.0, 0.0, 2.0])))
     at, dark = np.array([[700.0, 500.0]]), np.zeros(1)
-    narrow, wide = (centre_offsets(CAMERA, screen, at, w**2 * np.array([[1.0, 0, 1]]), dark) for w in (2.0, 4.0))
+    narrow, wide = (CentreOffsets(CAMERA, screen).at(at, w**2 * np.array([[1.0, 0, 1]]), dark) for w in (2.0, 4.0))
     assert wide == pytest.approx(4 * narrow, rel=0.01)
 
 
 def test_a_screen_that_is_not_met_moves_nothing():
     behind = Screen("s", Pose(np.eye(3), np.array([0.0, 0.0, -2.0])))
-    assert not centre_offsets(CAMERA, behind, np.array([[700.0, 500.0]]), np.array([[9.0, 0, 9]]), np.zeros(1)).any()
-    assert centre_offsets(CAMERA, behind, np.zeros((0, 2)), np.zeros((0, 3)), np.zeros(0)).shape == (0, 2)
+    offsets = CentreOffsets(CAMERA, behind)
+    assert not offsets.at(np.array([[700.0, 500.0]]), np.array([[9.0, 0, 9]]), np.zeros(1)).any()
+    assert offsets.at(np.zeros((0, 2)), np.zeros((0, 3)), np.zeros(0)).shape == (0, 2)

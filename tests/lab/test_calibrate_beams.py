@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 from calibration.beams.spot_term import SpotPixels
 from calibration.findings import Level
@@ -425,3 +426,44 @@ def test_a_lab_and_a_project_without_beams_are_asked_for_them(campaign, tmp_path
     project.write_text(text[: text.index("target:")] + text[text.index("recordings:") :])
     with pytest.raises(InputError, match="target: expected beams and spots as drawn, got none; add them"):
         calibrate_beams(project, tmp_path / "out", tmp_path / "screens.yaml")
+
+
+def test_cameras_screens_and_target_of_a_rig_need_not_be_stated_again(campaign, tmp_path):
+    _, project = campaign
+    content = yaml.safe_load(project.read_text())
+    whole = calibrate_beams(project, tmp_path / "whole")
+    lean = tmp_path / "lean"
+    lean.mkdir()
+    for name in ("spots.csv", "poses.csv"):
+        shutil.copy(tmp_path / name, lean / name)
+    drawing = {k: content[k] for k in ("schema", "name", "valid_days", "target", "recordings", "stand")}
+    write_mapping(drawing, lean / "calibration.yaml")
+    found = calibrate_beams(lean / "calibration.yaml", tmp_path / "out", tmp_path / "rig.yaml")
+    np.testing.assert_array_equal(found.calibration.lines.directions, whole.calibration.lines.directions)
+    # With the target in the rig not even that is needed.
+    both = replace(load_rig_file(tmp_path / "rig.yaml"))
+    target = load_project(project)
+    save_rig(replace(both, rig=replace(both.rig, beams=target.beams, spots=target.spots)), tmp_path / "known.yaml")
+    write_mapping({k: v for k, v in drawing.items() if k != "target"}, lean / "calibration.yaml")
+    found = calibrate_beams(lean / "calibration.yaml", tmp_path / "again", tmp_path / "known.yaml")
+    np.testing.assert_allclose(found.calibration.lines.directions, whole.calibration.lines.directions, atol=1e-9)
+
+
+def test_a_spot_on_a_screen_that_the_rig_does_not_have_is_named(campaign, tmp_path):
+    _, project = campaign
+    content = yaml.safe_load(project.read_text())
+    del content["cameras"], content["screens"]
+    spot = next(iter(content["target"]["spots"]))
+    content["target"]["spots"][spot]["screen"] = "cellar"
+    write_mapping(content, project)
+    with pytest.raises(InputError, match=rf"target.spots.{re.escape(spot)}.screen: expected a screen of .*'cellar'"):
+        calibrate_beams(project, tmp_path / "out")
+
+
+def test_screens_alone_still_ask_for_cameras_and_say_who_does_not(campaign, tmp_path):
+    _, project = campaign
+    content = yaml.safe_load(project.read_text())
+    del content["cameras"]
+    write_mapping(content, project)
+    with pytest.raises(InputError, match="cameras: expected one or more, got none; only `calibrate beams`"):
+        load_project(project)

@@ -493,7 +493,8 @@ def test_a_causal_run_is_what_a_smoothed_one_keeps_of_each_instant(tmp_path):
     told = [json.loads((tmp_path / which / "summary.json").read_text()) for which in ("smoothed", "causal")]
     assert [t["attitude"] for t in told] == ["smoothed", "causal"]
     assert [t["timings"]["smoothing_s"] > 0 for t in told] == [True, False]
-    assert set(told[0]["smoother"]) == {"jerk_m_s3", "jerk_rad_s3", "iterations", "relabelled", "seconds"}
+    said = {"jerk_m_s3", "jerk_rad_s3", "iterations", "relabelled", "place_share", "seconds"}
+    assert set(told[0]["smoother"]) == said
     assert told[1]["smoother"] is None
     assert [t["errors"]["pose_causal"] is None for t in told] == [False, True]
 

@@ -83,10 +83,10 @@ def test_a_diffuse_reflection_is_no_spot_and_a_spot_on_its_slope_is_measured_rig
     assert np.abs(np.mean(errors, axis=0)).max() < 0.015 * px  # 4 sigmas of the mean
 
 
-def test_what_is_wider_or_narrower_than_told_is_no_spot():
-    wide, narrow = Spot(150.0, 130.0, 120.0, 22, 22), Spot(80.3, 64.2, 150.0, 0.6, 0.6)
-    assert len(seen(Scene([wide], (300, 260)))) == 0
-    assert len(seen(Scene([wide], (300, 260)), max_sigma_px=30.0)) == 1
+def test_what_is_wider_or_narrower_than_the_limits_is_no_spot():
+    wide, narrow = Spot(220.0, 200.0, 120.0, 33, 33), Spot(80.3, 64.2, 150.0, 0.6, 0.6)
+    assert len(seen(Scene([wide], (440, 400)))) == 0
+    assert len(seen(Scene([wide], (440, 400)), max_sigma_px=45.0)) == 1
     assert len(seen(Scene([narrow], SMALL))) == 1
     assert len(seen(Scene([narrow], SMALL), min_sigma_px=1.0)) == 0
 

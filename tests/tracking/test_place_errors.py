@@ -88,6 +88,6 @@ def test_nothing_labelled_says_nothing():
 
 def test_a_pose_of_one_frame_keeps_its_covariance():
     """It holds the whole error of its spots already."""
-    errors = PlaceErrors(0.7, np.full(3, 50.0))
+    errors = PlaceErrors(0.7, np.full(3, 50.0), np.full(6, 2.0))
     assert errors.factor(np.ones(3)) == pytest.approx(1.0)
     assert errors.factor(np.full(3, 1e6)) == pytest.approx(1 + 0.7 * 49)

@@ -60,8 +60,7 @@ def level_variances(pictures: Sequence[Picture], top: float, rounding: float) ->
     at = float(np.median(level))
     if between.nearest(at) > 1.5 * max(within.nearest(at), 2 * rounding):
         return within  # the camera or the scene shakes
-    between = replace(between, variance=between.variance * np.median(grain), sigma=between.sigma * np.median(grain))
-    return between
+    return replace(between, variance=between.variance * np.median(grain), sigma=between.sigma * np.median(grain))
 
 
 def _pairs(pictures: Sequence[Picture]) -> list[tuple[Picture, Picture]]:
