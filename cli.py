@@ -217,8 +217,19 @@ def detect(
     type=click.FloatRange(min=0.001),
     help="So many seconds a frame waits for a camera that does not give it.",
 )
+@click.option(
+    "--reprocess", is_flag=True, help="At the end, make the results from the finished folders, as `run` does."
+)
 @_set_option
-def watch(run_folder: Path, out: Path, udp: str | None, idle: float, timeout: float, settings: dict[str, Any]) -> None:
+def watch(
+    run_folder: Path,
+    out: Path,
+    udp: str | None,
+    idle: float,
+    timeout: float,
+    reprocess: bool,
+    settings: dict[str, Any],
+) -> None:
     """Follow a run while it is recorded: the pose of every frame as it arrives.
 
     RUN is a run folder whose frame folders are being filled, or whose run.yaml names a `device` for a camera (a number
@@ -234,9 +245,15 @@ def watch(run_folder: Path, out: Path, udp: str | None, idle: float, timeout: fl
 
     with _progress(run_folder.name) as progress, stopped_by_ctrl_c() as stop:
         outcome = watch_run(
-            run_folder, out, udp=udp, options=WatchOptions(idle, timeout), overrides=settings, progress=progress,
+            run_folder,
+            out,
+            udp=udp,
+            reprocess=reprocess,
+            options=WatchOptions(idle, timeout),
+            overrides=settings,
+            progress=progress,
             stop=stop,
-        )  # fmt: skip
+        )
     _concluded(outcome)
 
 

@@ -87,6 +87,7 @@ class Pipeline:
     noise: dict[str, CameraNoise]  # of cameras with pictures
     on_record: Callable[[FrameRecord], None] | None = None  # called with each record as soon as it is known
     timings: Timings = field(default_factory=Timings)
+    _offsets: dict[str, CentreOffsets] = field(default_factory=dict)
 
     @staticmethod
     def of(run: Run) -> Pipeline:
@@ -123,6 +124,18 @@ class Pipeline:
         for frames in self.reader:
             yield frames.frame, self._detect(frames)[0]
 
+    def spots_in(self, camera: str, picture: Grey) -> Detections:
+        """The points that one picture of a camera shows. For one thread at a time and camera."""
+        noise = self.noise[camera]
+        points = noise.detect(picture, self.run.tracker.detect)
+        return on_beam_axes(points, self._offsets_of(camera), noise.model)
+
+    def _offsets_of(self, camera: str) -> CentreOffsets:
+        if camera not in self._offsets:
+            seen_by = self.run.rig.cameras[camera]
+            self._offsets[camera] = CentreOffsets(seen_by, self.run.rig.screens[seen_by.screen])
+        return self._offsets[camera]
+
     def _spent(self, on: str, since: float) -> float:
         now = time.perf_counter()
         setattr(self.timings, on, getattr(self.timings, on) + now - since)
@@ -138,18 +151,10 @@ class Pipeline:
                 missing.append(picture.reason)
                 continue
             if isinstance(picture, np.ndarray):
-                picture = spots_in(picture, self.run, self.noise[name])
+                picture = self.spots_in(name, picture)
             found.append(picture)
             missing.append("")
         return tuple(found), tuple(missing)
-
-
-def spots_in(picture: Grey, run: Run, noise: CameraNoise) -> Detections:
-    """The points that one picture of a run's camera shows. For one thread at a time and camera."""
-    if noise.offsets is None:
-        seen_by = run.rig.cameras[noise.camera]
-        noise.offsets = CentreOffsets(seen_by, run.rig.screens[seen_by.screen])
-    return on_beam_axes(noise.detect(picture, run.tracker.detect), noise.offsets, noise.model)
 
 
 def on_beam_axes(found: Detections, offsets: CentreOffsets, noise: NoiseModel | None) -> Detections:

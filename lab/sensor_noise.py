@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from geometry.camera import SensorNoise
-from geometry.light_centroid import CentreOffsets
 from lab.frames import FrameReader, pictures_at
 from lab.run_file import DetectionsTable, FramesFolder, Run
 from tracking.detection.detect import find_spots
@@ -33,7 +32,6 @@ class CameraNoise:
     stated: SensorNoise | None = None
     estimate: NoiseEstimate | None = None
     notes: list[str] = field(default_factory=list)
-    offsets: CentreOffsets | None = None  # of the light from the beams' axes, once the rig's camera has been asked
     _overruled: bool = False  # the stated noise finds nothing where there is light
     _blank: int = 0
     _recent: deque[Picture] = field(default_factory=lambda: deque(maxlen=2))

@@ -126,6 +126,7 @@ class LiveOutput:
         return {
             "live": {
                 "latency_ms": self.latency.as_mapping(),
+                "notes": self.frames.notes,
                 "idle_s": self.frames.options.idle_s,
                 "timeout_s": self.frames.options.timeout_s,
                 "udp": None if self.udp is None else {"to": self.udp.address, "not_sent": self.udp.failures},

@@ -17,14 +17,14 @@ import numpy as np
 
 from geometry.pose import Pose
 from geometry.spots import SpotModel
-from lab.errors import RunError
+from lab.errors import InputError, RunError
 from lab.frame_checks import FrameChecks
 from lab.pictures import Grey
-from lab.pipeline import Pipeline, spots_in, tracker_of
+from lab.pipeline import Pipeline, tracker_of
 from lab.process import Outcome, are_results, ready_run, write_results
-from lab.run_file import Run
+from lab.run_file import LiveDevice, Run
 from lab.sensor_noise import CameraNoise
-from lab.two_passes import Progress
+from lab.two_passes import TRACKING, Progress
 from lab.watch.live_frames import LiveFrames, WatchOptions
 from lab.watch.live_output import Latency, LiveOutput, UdpLines, is_live_table
 from lab.whole_folder import whole_folder
@@ -55,6 +55,7 @@ def watch_run(
     out: Path,
     *,
     udp: str | None = None,
+    reprocess: bool = False,
     options: WatchOptions = WatchOptions(),  # noqa: B008  (frozen)
     overrides: Mapping[str, Any] | None = None,
     progress: Progress | None = None,
@@ -65,12 +66,18 @@ def watch_run(
     While it goes on, `out` holds attitude_live.csv: a row per frame, flushed, as the causal tracker knows it. udp: a
     HOST:PORT that gets the same as a line of JSON. The recording ends when nothing has come for `options.idle_s`, when
     all devices have ended, or when `stop` is set; then `out` gets what `beampose run` writes, made of the detections
-    that were received. The noise of cameras without a stated one is learnt from their first pictures.
+    that were received. They differ from those of a run by what the noise was learnt from (here each camera's first
+    pictures) and by pictures that came too late. reprocess: the results are made from the finished folders instead,
+    as `beampose run` makes them, which takes its time.
 
     Raises a BeamposeError where the run cannot be watched, or no picture came.
     """
     started = time.perf_counter()
     run = ready_run(run_folder, overrides)
+    if reprocess and any(isinstance(source, LiveDevice) for source in run.cameras.values()):
+        raise InputError(
+            f"{run.path}: cameras: expected folders of pictures to reprocess, got a device, which keeps none"
+        )
     with contextlib.ExitStack() as stack:
         work = stack.enter_context(whole_folder(out, may_replace=lambda p: are_results(p) or is_live_table(p)))
         sender = None if udp is None else UdpLines(udp)
@@ -78,38 +85,49 @@ def watch_run(
         output = LiveOutput(Path(out), frames, FrameChecks(run.rig, run.covariance), sender)
         stack.callback(output.close)
         with frames, _low_latency():
-            _get_ready(run)
-            _log.info("ready: waiting for the first picture")
-            first = frames.begin()
-            if not first:
-                raise RunError(f"{run.path}: expected pictures while the run was watched, got none")
-            noise = {name: CameraNoise(name, camera.noise) for name, camera in run.rig.cameras.items()}
-            for name, pictures in first.items():
-                noise[name].learn(pictures)
-            finders = {name: _Finder(run, name, noise[name]) for name in noise}
-            frames.inbox.find_with(finders)
-            pipeline = Pipeline(run, frames, tracker_of(run), noise, output.write)
+            pipeline, finders = _begun(run, frames, output)
+            if reprocess:
+                for done, _ in enumerate(pipeline.records(), start=1):
+                    if progress is not None:
+                        progress(done, None, TRACKING)
+                pipeline = Pipeline.of(run)
 
             def more() -> dict[str, Any]:
-                pipeline.timings.detection += sum(finder.seconds for finder in finders.values())
+                if not reprocess:
+                    pipeline.timings.detection += sum(finder.seconds for finder in finders.values())
                 return output.finish(work)
 
             outcome = write_results(pipeline, work, Path(out), started, progress=progress, more=more)
     return WatchOutcome(outcome, output.latency)
 
 
+def _begun(run: Run, frames: LiveFrames, output: LiveOutput) -> tuple[Pipeline, dict[str, _Finder]]:
+    """The pipeline, once the first pictures are here and the noise is known. Raises RunError where none come."""
+    _get_ready(run)
+    _log.info("ready: waiting for the first picture")
+    first = frames.begin()
+    if not first:
+        raise RunError(f"{run.path}: expected pictures while the run was watched, got none")
+    noise = {name: CameraNoise(name, camera.noise) for name, camera in run.rig.cameras.items()}
+    for name, pictures in first.items():
+        noise[name].learn(pictures)
+    pipeline = Pipeline(run, frames, tracker_of(run), noise, output.write)
+    finders = {name: _Finder(pipeline, name) for name in noise}
+    frames.inbox.find_with(finders)
+    return pipeline, finders
+
+
 @dataclass(slots=True)
 class _Finder:
     """Finds the points of one camera's pictures, in that camera's thread."""
 
-    run: Run
+    pipeline: Pipeline
     camera: str
-    noise: CameraNoise
     seconds: float = 0.0
 
     def __call__(self, picture: Grey) -> Detections:
         clock = time.perf_counter()
-        found = spots_in(picture, self.run, self.noise)
+        found = self.pipeline.spots_in(self.camera, picture)
         self.seconds += time.perf_counter() - clock
         return found
 
