@@ -41,6 +41,7 @@ class Smoothed:
     jerk: Array  # (2,) m/s^3 and rad/s^3 per sqrt(Hz), of translation and rotation
     iterations: int  # rounds of smoothing and labelling
     relabelled: int  # labels that differ from the causal ones
+    width_share: float  # errors beyond the claims, as a share of the spots' sigmas
     noise_scale: float  # how much larger than claimed the spots' errors are
     extra: Array  # (n, 2, 2) of the calibration's errors, on the expected pixels
 
@@ -70,7 +71,9 @@ class Smoothed:
             points = found[int(model.camera_of[v])]
             assert points is not None
             uv_px[v] = points.uv_px[point[v]] - self.exposure_px[k, v]
-            cov_px2[v] = points.cov_px2[point[v]] * self.noise_scale**2
+            width = np.nan_to_num(points.major_px[point[v]], nan=0.0)
+            claimed = points.cov_px2[point[v]] + (self.width_share * width) ** 2 * np.eye(2)
+            cov_px2[v] = claimed * self.noise_scale**2
             cov_px2[v] += self.parameters.sigma_model_px**2 * np.eye(2)
             if assigned[v] >= BLENDED:
                 cov_px2[v] += (self.parameters.blend_px / 2) ** 2 * np.eye(2)

@@ -22,11 +22,11 @@ from geometry.solve import SolveLimits, covariance_of
 from tracking.association import BLENDED, Chances, Sights, distinct_spots
 from tracking.backward import merged, track_backward
 from tracking.continuity import Surroundings, continued
+from tracking.error_scale import noise_scale, width_covariance, width_share
 from tracking.exposure import exposure_offsets, moved_by
 from tracking.fixed_interval import Reference, speeds
 from tracking.hypotheses import CHECK_PX, FEW, PROOF, SURE
 from tracking.information import controlled, fit_alone, frame_information
-from tracking.misfit import DEADBAND
 from tracking.motion import process_noise
 from tracking.place_errors import place_errors
 from tracking.recording import Recording
@@ -87,7 +87,9 @@ class _Pass:
         ref = straight_between(rec.poses, self.measured, np.cumsum(rec.dt_s))
         every = _all_detections(rec)
         self.extra, self.systematic = _calibration(rec, every, self.assigned, ref)
-        self.scale = _noise_scale(self.views, every, self.assigned, self.extra, ref, self.measured)
+        self.share = width_share(self.views, every, self.assigned, self.extra, ref, self.measured)
+        every = every._replace(cov=every.cov + width_covariance(every.size_px, self.share))
+        self.scale = noise_scale(self.views, every, self.assigned, self.extra, ref, self.measured)
         self.every = every._replace(
             cov=every.cov * self.scale**2 + parameters.sigma_model_px**2 * np.eye(2),
             usual_px=_usual_sizes(every, self.assigned),
@@ -268,6 +270,7 @@ class _Pass:
             iterations=rounds,
             relabelled=int(np.count_nonzero(differ)),
             noise_scale=self.scale,
+            width_share=self.share,
             extra=self.extra,
         )
 
@@ -483,24 +486,6 @@ def _calibration(rec: Recording, every: AllDetections, assigned: Ints, ref: Refe
             latest = G @ C[np.ix_(both, both)] @ G.T
         systematic[at] = latest
     return extra, systematic
-
-
-def _noise_scale(
-    views: Views, every: AllDetections, assigned: Ints, extra: Array, ref: Reference, measured: Bools
-) -> float:
-    """How much larger than claimed the spots' errors are, from the frames' own fits, robust to outliers; 1 if the
-    stated sigmas are correct.
-    """
-    shares = []
-    for k in np.flatnonzero(measured).tolist():
-        use, uv, cov = labelled_points(every, k, assigned[k], extra)
-        _, _, _, chi2, count = fit_alone(views, ref.R[k], ref.t[k], use, uv, cov)
-        if count > 3:
-            shares.append(chi2 / (2 * count - 6))
-    if not shares:
-        return 1.0
-    mean = float(np.mean(np.minimum(shares, 3 * np.median(shares))))
-    return float(np.sqrt(mean)) if mean > DEADBAND else 1.0
 
 
 def _log_clutter(
