@@ -1,8 +1,9 @@
 """How late the poses of `beampose watch` are: `python -m bench.live [--frames 1000] [--rate 100] [--format pgm]`.
 
 A process of its own writes simulated pictures of two 1280x1024 cameras into the frame folders at the given rate, whole
-files under their own names, as a recorder does (the pictures are made once and kept in build/live). The latency is what summary.json says: from the arrival of a frame's
-last picture until its pose is written. The table also says how busy the machine was.
+files under their own names, as a recorder does (the pictures are made once and kept in build/live). The latency is what
+summary.json says: from the arrival of a frame's last picture until its pose is written. The load of the machine is
+printed beside it: the figure is for two free cores.
 """
 
 from __future__ import annotations
