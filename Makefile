@@ -16,7 +16,7 @@ SAMPLE_RUNS := $(patsubst %/run.yaml,%,$(wildcard sample_runs/*/run.yaml))
 DEMO := results/demo
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all check format bench-tracking bench-random bench-detection bench-throughput bench-calibration peers bench-peers lock wheel pointcloud clean
+.PHONY: help setup demo test test-all check format bench-tracking bench-random bench-detection bench-throughput bench-live bench-calibration peers bench-peers lock wheel pointcloud clean
 
 help:  ## List the chores
 	@sed -n 's/^\([a-z-]*\):.*##  */\1|/p' $(MAKEFILE_LIST) | while IFS='|' read -r name what; do \
@@ -79,6 +79,9 @@ bench-detection: setup  ## The detection figures, on fresh seeds
 
 bench-throughput: setup  ## What a run costs, stage by stage, beside reading its pictures (some minutes)
 	$(BIN)/python -m bench.throughput
+
+bench-live: setup  ## How late the poses of `beampose watch` are at 100 Hz (half a minute)
+	$(BIN)/python -m bench.live
 
 bench-calibration: setup  ## The calibration figures, on fresh seeds (a quarter of an hour)
 	$(BIN)/python -m bench.calibration

@@ -1,8 +1,9 @@
 """How late the poses of `beampose watch` are: `python -m bench.live [--frames 1000] [--rate 100] [--format pgm]`.
 
 A process of its own writes simulated pictures of two 1280x1024 cameras into the frame folders at the given rate, whole
-files under their own names, as a recorder does. The latency is what summary.json says: from the arrival of a frame's
-last picture until its pose is written. The table also says how busy the machine was.
+files under their own names, as a recorder does (the pictures are made once and kept in build/live). The latency is what
+summary.json says: from the arrival of a frame's last picture until its pose is written. The load of the machine is
+printed beside it: the figure is for two free cores.
 """
 
 from __future__ import annotations
@@ -14,7 +15,9 @@ import os
 import shutil
 import tempfile
 import time
+from multiprocessing.synchronize import Event
 from pathlib import Path
+from threading import Timer
 
 from bench.throughput.folders import run_folder
 from lab.watch.live_frames import WatchOptions
@@ -23,7 +26,7 @@ from lab.watch.watch import watch_run
 KEPT = 300  # frames on disk behind the latest: older ones are deleted, as in a recorder's ring
 
 
-def feed(source: Path, target: Path, frames: int, rate_hz: float, begin: multiprocessing.Event) -> None:
+def feed(source: Path, target: Path, frames: int, rate_hz: float, begin: Event) -> None:
     """Write the pictures of a run folder into another one at a constant rate."""
     cameras = sorted(p.name for p in (source / "frames").iterdir())
     pictures = {c: [p.read_bytes() for p in sorted((source / "frames" / c).iterdir())] for c in cameras}
@@ -54,8 +57,6 @@ def measure(kept: Path, work: Path, kind: str, frames: int, rate_hz: float, scen
     begin = multiprocessing.Event()
     feeder = multiprocessing.Process(target=feed, args=(source, target, frames, rate_hz, begin), daemon=True)
     feeder.start()
-    from threading import Timer
-
     Timer(8.0, begin.set).start()  # loading takes some seconds
     watch_run(target, work / "out", options=WatchOptions(idle_s=2.0))
     feeder.join()
@@ -72,7 +73,7 @@ def main() -> None:
     parser.add_argument("--rate", type=float, default=100.0, help="Hz")
     parser.add_argument("--format", default="pgm", choices=("pgm", "tiff", "png"))
     parser.add_argument("--scenario", default="huo2015")
-    parser.add_argument("--kept", type=Path, default=Path(tempfile.gettempdir()) / "beampose-bench-live")
+    parser.add_argument("--kept", type=Path, default=Path("build/live"))
     given = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="beampose-live-") as name:
         load = os.getloadavg()[0]

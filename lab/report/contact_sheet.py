@@ -106,7 +106,7 @@ def _tile(one: _Kept, width: int, height: int) -> Colour:
 
 def _circle(picture: Colour, found: Detections, scale: float) -> None:
     """Rings about the spots, the brightest with numbers, those that crowd without."""
-    taken: list[tuple[float, float]] = []
+    taken: list[tuple[int, int, int]] = []
     font = 0.38 if picture.shape[1] < 400 else 0.5
     for i in range(len(found)):
         # OpenCV's whole pixels are centres; here the picture's edge is at -0.5.
@@ -115,16 +115,25 @@ def _circle(picture: Colour, found: Detections, scale: float) -> None:
         radius = round(max(3.5 * major * scale, 5.0 if font < 0.5 else 8.0))
         centre = (round(u), round(v))
         cv2.circle(picture, centre, radius, _RING, 1, cv2.LINE_AA)
-        if i >= _NUMBERED or any(abs(u - a) < 18 and abs(v - b) < 12 for a, b in taken):
-            continue
-        taken.append((u, v))
-        words = str(i + 1)
-        wide = cv2.getTextSize(words, _FONT, font, 1)[0][0]
-        x = (
-            centre[0] + radius + 2
-            if centre[0] + radius + 2 + wide < picture.shape[1]
-            else centre[0] - radius - 2 - wide
-        )
-        y = min(max(centre[1] - radius + 4, 12), picture.shape[0] - 3)
-        cv2.putText(picture, words, (x, y), _FONT, font, (0, 0, 0), 3, cv2.LINE_AA)
-        cv2.putText(picture, words, (x, y), _FONT, font, _RING, 1, cv2.LINE_AA)
+        if i < _NUMBERED:
+            _number(picture, str(i + 1), centre, radius, font, taken)
+
+
+def _number(
+    picture: Colour, words: str, centre: tuple[int, int], radius: int, font: float, taken: list[tuple[int, int, int]]
+) -> None:
+    """A spot's number beside its ring, at the first corner that is free; none where all are taken.
+
+    taken: left end, foot and width of the numbers that stand already; this one is added.
+    """
+    height, width = picture.shape[:2]
+    wide = int(cv2.getTextSize(words, _FONT, font, 1)[0][0])
+    for side, down in ((1, -1), (-1, -1), (1, 1), (-1, 1)):
+        x = centre[0] + radius + 2 if side > 0 else centre[0] - radius - 2 - wide
+        y = centre[1] - radius + 4 if down < 0 else centre[1] + radius + 8
+        inside = 0 <= x <= width - wide and 10 <= y < height
+        if inside and not any(x < a + w + 3 and a < x + wide + 3 and abs(y - b) < 13 for a, b, w in taken):
+            taken.append((x, y, wide))
+            cv2.putText(picture, words, (x, y), _FONT, font, (0, 0, 0), 3, cv2.LINE_AA)
+            cv2.putText(picture, words, (x, y), _FONT, font, _RING, 1, cv2.LINE_AA)
+            return

@@ -57,7 +57,7 @@ def places_chart(uv_px: Array, size_px: tuple[int, int]) -> str:
     p = image_plane(size_px)
     shown = uv_px[:: max(1, -(-len(uv_px) // _MOST_DOTS))]
     out = axes(p, "Places of the spots", "u (px)", "v (px)", grid=False)
-    out.append(f'<path d="{dots(p.at(shown), 1.6)}" fill="{BLUE}" fill-opacity="0.45"/>')
+    out.append(f'<path d="{dots(p.at(shown), 1.6 if len(shown) > 300 else 2.6)}" fill="{BLUE}" fill-opacity="0.45"/>')
     some = "" if len(shown) == len(uv_px) else f", {len(shown)} of them shown"
     out.append(note(p, f"{len(uv_px)} spots{some}"))
     return svg_of(p, "Places of the spots", [*out, frame(p)])

@@ -52,13 +52,14 @@ class FolderPoll:
         if self._pattern is None:
             return []
         head, digits, tail = self._pattern
+        folder = f"{self.folder}{os.sep}"  # joining paths costs as much as asking for them
         behind = [n for n in range(max(self._latest - _BEHIND, 0), self._latest) if n not in self.names]
         out: list[tuple[int, str]] = []
         tried = [*behind, *range(self._latest + 1, self._latest + 1 + _AHEAD)]
         while tried:
             number = tried.pop(0)
             name = f"{head}{number:0{digits}d}{tail}"
-            if name in self._known or not os.path.isfile(self.folder / name):
+            if name in self._known or not os.path.isfile(f"{folder}{name}"):
                 continue
             self._add(number, name, out)
             if not tried:

@@ -6,9 +6,11 @@ import contextlib
 import gc
 import logging
 import signal
+import sys
 import threading
 import time
 from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,6 +33,7 @@ from lab.whole_folder import whole_folder
 from tracking.detections import Detections
 
 _log = logging.getLogger("beampose")
+_TURN_S = 0.0005
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,8 +112,8 @@ def _begun(run: Run, frames: LiveFrames, output: LiveOutput) -> tuple[Pipeline, 
     if not first:
         raise RunError(f"{run.path}: expected pictures while the run was watched, got none")
     noise = {name: CameraNoise(name, camera.noise) for name, camera in run.rig.cameras.items()}
-    for name, pictures in first.items():
-        noise[name].learn(pictures)
+    with ThreadPoolExecutor(max(len(first), 1)) as pool:  # pictures pile up meanwhile
+        list(pool.map(lambda name: noise[name].learn(first[name]), first))
     pipeline = Pipeline(run, frames, tracker_of(run), noise, output.write)
     finders = {name: _Finder(pipeline, name) for name in noise}
     frames.inbox.find_with(finders)
@@ -171,10 +174,16 @@ def _get_ready(run: Run) -> None:
 
 @contextlib.contextmanager
 def _low_latency() -> Iterator[None]:
-    """The garbage collector leaves alone what is there already: a full collection takes longer than a frame."""
+    """Threads take turns after 0.5 ms, not 5, and the garbage collector leaves alone what is there already.
+
+    A thread whose picture is here would else wait for most of a tracking step; a full collection takes several frames.
+    """
+    turn_s = sys.getswitchinterval()
+    sys.setswitchinterval(_TURN_S)
     gc.collect()
     gc.freeze()
     try:
         yield
     finally:
         gc.unfreeze()
+        sys.setswitchinterval(turn_s)
