@@ -9,7 +9,7 @@ from calibration.lens.intrinsics_result import Intrinsics
 
 DOUBTFUL = 2.0  # factor on the sigmas, from what lens models disagree on and residuals that go together
 OUT_OF_SCALE = 0.001  # share by which a board's rows and columns may be out of scale: printers reach .1 %
-UNDETERMINED = 0.002  # of that share, and of the pixels' shape: beyond it the two cannot be told apart
+UNDETERMINED = 0.002  # of that share, and of the pixels' shape: beyond it the two cannot be distinguished
 OTHER_CIRCLE = 0.03  # share by which circles may differ from what was stated
 
 

@@ -27,7 +27,7 @@ LIVE_TABLE = "attitude_live.csv"
 
 @dataclass(slots=True)
 class UdpLines:
-    """Sends text to one address; whoever listens may come and go."""
+    """Sends text to one address; a listener need not be there."""
 
     address: str  # HOST:PORT
     failures: int = 0
