@@ -1,5 +1,6 @@
 """The noise model: from a sensor's data sheet, and estimated from pictures."""
 
+import warnings
 from dataclasses import dataclass
 from statistics import NormalDist
 
@@ -199,6 +200,18 @@ def test_a_quick_guess_knows_the_background_noise(bits):
     image = np.rint(rng.normal(20 * scale, 2.0 * scale, (300, 400))).astype(np.uint8 if bits == 8 else np.uint16)
     model = guess_noise(image)
     assert model.variance(20 * scale) == pytest.approx((2.0 * scale) ** 2, rel=0.25)
+
+
+def test_black_pictures_with_spots_have_a_model_and_warn_of_nothing():
+    """No pixel but those of the spots is above zero, as behind a filter."""
+    pictures = [np.zeros((300, 400), np.uint8) for _ in range(4)]
+    for k, picture in enumerate(pictures):
+        cv2.circle(picture, (100 + 40 * k, 120), 3, 140, -1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        model = estimate_noise(pictures).model
+    assert model.floor_dn2 == pytest.approx(ROUNDING_DN2, rel=0.5)
+    assert all(len(find_spots(p, noise=model)) == 1 for p in pictures)
 
 
 @pytest.mark.parametrize("value", [0, 255])

@@ -10,17 +10,20 @@ from numpy.typing import NDArray
 from tracking.noise import Picture
 from tracking.noise_estimation.rounding import clipped_normal
 
+_FEWEST_VALUES = 8  # distinct grey values from which their common divisor is a step
 _CLIPPED = 0.02  # share of pixels at zero from which the background counts as clipped
 
 
 def grey_step(pictures: Sequence[Picture]) -> float:
     """Greatest common divisor of the grey values, as sampled."""
-    divisor = 0
+    divisor, distinct = 0, 0
     for picture in pictures:
         sample = np.unique(picture[::3, ::3]) if picture.size else np.zeros(1, picture.dtype)
         divisor = int(np.gcd.reduce(np.append(sample.astype(np.int64), divisor)))
-    # A constant picture has any divisor; real steps are powers of two.
-    return float(divisor & -divisor) if 0 < divisor & -divisor <= 64 else 1.0
+        distinct = max(distinct, len(sample))
+    # A few values have any divisor; real steps are powers of two.
+    few = distinct < _FEWEST_VALUES
+    return float(divisor & -divisor) if not few and 0 < divisor & -divisor <= 64 else 1.0
 
 
 def saturation_level(pictures: Sequence[Picture], step_dn: float) -> float | None:

@@ -56,6 +56,8 @@ def level_variances(pictures: Sequence[Picture], top: float, rounding: float) ->
     if not samples:
         return within
     level, difference, grain = (np.concatenate(x) for x in zip(*samples, strict=True))
+    if not len(level):  # black, or clipped
+        return within
     between = _binned(level, difference, rounding)
     at = float(np.median(level))
     if between.nearest(at) > 1.5 * max(within.nearest(at), 2 * rounding):
