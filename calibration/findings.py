@@ -25,6 +25,11 @@ class Finding:
     cure: str = ""  # what to do; empty for PASS
 
 
+def unless_pass(level: Level, what: str, why: str, remedy: str) -> Finding:
+    """A finding that gives its reason and remedy only where it is no PASS."""
+    return Finding(level, what) if level is Level.PASS else Finding(level, what, why, remedy)
+
+
 def verdict(findings: Iterable[Finding]) -> Level:
     """The gravest level among the findings; PASS where there are none."""
     return max((f.level for f in findings), default=Level.PASS)

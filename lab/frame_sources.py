@@ -7,7 +7,7 @@ import re
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
 import numpy as np
 
@@ -29,6 +29,23 @@ _LAST_NUMBER = re.compile(r"([0-9]+)[^0-9]*$")
 def arrived(asked: Asked) -> Picture | None:
     """The picture that was asked for, waited for; None: the pictures have ended."""
     return asked.result() if isinstance(asked, Future) else asked
+
+
+class Grabbed(Protocol):
+    """An OpenCV capture that has grabbed a picture."""
+
+    def retrieve(self) -> Any: ...
+
+
+def retrieved(capture: Grabbed, size_px: tuple[int, int] | None) -> Grey | Missing:
+    """The picture that a capture has grabbed, as grey of this (width, height); it may use the buffer again."""
+    good, picture = capture.retrieve()
+    if not good or picture is None:
+        return Missing(f"{UNREADABLE}: damaged")
+    if picture.ndim == 3:
+        cv2 = quiet_cv2()
+        picture = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY) if picture.shape[2] == 3 else picture[..., 0]
+    return checked(picture, size_px)
 
 
 class Source(Protocol):
@@ -150,16 +167,7 @@ class VideoSource:
         if not self._capture.grab():
             return None
         self.pictures += 1
-        return self._decoded()
-
-    def _decoded(self) -> Grey | Missing:
-        good, picture = self._capture.retrieve()
-        if not good or picture is None:
-            return Missing(f"{UNREADABLE}: damaged")
-        if picture.ndim == 3:
-            cv2 = quiet_cv2()
-            picture = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY) if picture.shape[2] == 3 else picture[..., 0]
-        return checked(picture, self._size_px)
+        return retrieved(self._capture, self._size_px)
 
     def skip(self) -> bool:
         """Pass over one picture; False at the end."""

@@ -13,6 +13,7 @@ from geometry.projection import project_all
 from geometry.spots import SpotModel
 from tracking.association import BLENDED
 from tracking.detections import Detections
+from tracking.error_scale import width_covariance
 from tracking.match import UNMATCHED
 from tracking.parameters import TrackerParameters
 from tracking.statuses import PoseStatus, SpotStatus, view_statuses
@@ -71,8 +72,8 @@ class Smoothed:
             points = found[int(model.camera_of[v])]
             assert points is not None
             uv_px[v] = points.uv_px[point[v]] - self.exposure_px[k, v]
-            width = np.nan_to_num(points.major_px[point[v]], nan=0.0)
-            claimed = points.cov_px2[point[v]] + (self.width_share * width) ** 2 * np.eye(2)
+            row = point[v : v + 1]
+            claimed = (points.cov_px2[row] + width_covariance(points.major_px[row], self.width_share))[0]
             cov_px2[v] = claimed * self.noise_scale**2
             cov_px2[v] += self.parameters.sigma_model_px**2 * np.eye(2)
             if assigned[v] >= BLENDED:

@@ -86,7 +86,7 @@ def _run(folder: Path, out: Path) -> Counter[str]:
         started.append(time.process_time() - loaded)
         return reading(reader)
 
-    frames.FrameReader.__iter__ = first_asked  # type: ignore[method-assign]
+    frames.FrameReader.__iter__ = first_asked  # type: ignore[method-assign]  # to time the original
     process.process_run(folder, out)
     return clock.spent + Counter({"start-up": started[0]})
 

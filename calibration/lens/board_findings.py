@@ -4,17 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from calibration.findings import Finding, Level
+from calibration.findings import Finding, Level, unless_pass
 from calibration.lens.intrinsics_result import Intrinsics
 
 DOUBTFUL = 2.0  # factor on the sigmas, from what lens models disagree on and residuals that go together
 OUT_OF_SCALE = 0.001  # share by which a board's rows and columns may be out of scale: printers reach .1 %
 UNDETERMINED = 0.002  # of that share, and of the pixels' shape: beyond it the two cannot be distinguished
 OTHER_CIRCLE = 0.03  # share by which circles may differ from what was stated
-
-
-def _unless_pass(level: Level, what: str, why: str, cure: str) -> Finding:
-    return Finding(level, what) if level is Level.PASS else Finding(level, what, why, cure)
 
 
 def _two(value: float) -> str:
@@ -32,7 +28,7 @@ def doubt_finding(c: Intrinsics) -> Finding | None:
         parts.append(f"{_two(d.between_px)} px to the {d.other.words}, which predicts held-out views nearly as well")
     if not parts:
         return None
-    return _unless_pass(
+    return unless_pass(
         Level.WARN if d.factor > DOUBTFUL or d.left_px > 0 else Level.PASS,
         f"Doubt about the lens model: {' and '.join(parts)}; all sigmas have been multiplied by {d.factor:.2f} for it.",
         "The lens bends light in a way that no model here follows, or the photographs do not tell which one does.",
@@ -54,7 +50,7 @@ def stretch_finding(c: Intrinsics) -> Finding | None:
     if not s.corrected:
         fx, fy = c.fit.lens[:2]
         open_question = s.sigma[0] > UNDETERMINED and abs(fx / fy - 1) > UNDETERMINED
-        return _unless_pass(
+        return unless_pass(
             Level.WARN if open_question else Level.PASS,
             text + "; taken as stated.",
             f"The photographs cannot tell a board that is out of scale from pixels that are not square, and fx / fy is"
@@ -62,7 +58,7 @@ def stretch_finding(c: Intrinsics) -> Finding | None:
             "Photograph the board turned by 90 deg in its plane as well; measure it along both directions.",
         )
     off = max(abs(s.stretch), abs(s.lean_rad))
-    return _unless_pass(
+    return unless_pass(
         Level.WARN if off > OUT_OF_SCALE else Level.PASS,
         text + "; corrected.",
         "The lens is right with that. Which of the two directions is right, and the board's size as a whole, no"
@@ -105,7 +101,7 @@ def circles_finding(c: Intrinsics) -> Finding | None:
     if stated is None:
         return Finding(Level.PASS, text + ".")
     share = found / (1000 * stated) - 1
-    return _unless_pass(
+    return unless_pass(
         Level.WARN if abs(share) > OTHER_CIRCLE else Level.PASS,
         f"{text}, {100 * share:+.1f} % against the {1000 * stated:.4g} mm stated.",
         "The measured size was used. Ink that spreads makes circles larger; else spacing and diameter do not belong to"

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.findings import Finding, Level
+from calibration.findings import Finding, Level, unless_pass
 from calibration.lens.board_findings import circles_finding, doubt_finding, points_finding, stretch_finding
 from calibration.lens.intrinsics_result import Intrinsics
 from calibration.lens.lens_models import folds_in_picture
@@ -71,10 +71,6 @@ def _level(value: float, limits: tuple[float, float]) -> Level:
     return Level.FAIL if sign * value > sign * fail else Level.WARN if sign * value > sign * warn else Level.PASS
 
 
-def _unless_pass(level: Level, what: str, why: str, cure: str) -> Finding:
-    return Finding(level, what) if level is Level.PASS else Finding(level, what, why, cure)
-
-
 def _two(value: float) -> str:
     """Two significant digits, never with an exponent: 0.29, 3.9, 240."""
     if not np.isfinite(value) or value == 0:
@@ -101,7 +97,7 @@ def _lens(c: Intrinsics) -> Finding:
 
 
 def _noise(c: Intrinsics, limits: Limits) -> Finding:
-    return _unless_pass(
+    return unless_pass(
         _level(c.fit.sigma_px, limits.noise_px),
         f"Corners miss the model by {_mm(c, c.fit.sigma_px)} per coordinate (1 sigma; RMS {c.rms_px:.3g} px).",
         "Sharp photographs of a flat board give 0.03 to 0.25 px. Larger residuals mean blur, a board that is not flat"
@@ -118,7 +114,7 @@ def _rejected(c: Intrinsics, limits: Limits) -> Finding:
     text = f"{lost} of {len(c.table)} corners left out ({share:.1%})"
     if dropped:
         text += f", among them {dropped} whole view{'s' if dropped > 1 else ''}"
-    return _unless_pass(
+    return unless_pass(
         _level(share, limits.rejected),
         text + ".",
         "What lies off the model by more than 4.5 sigmas is taken for a false corner; so many false ones leave a doubt"
@@ -129,7 +125,7 @@ def _rejected(c: Intrinsics, limits: Limits) -> Finding:
 
 def _views(c: Intrinsics, limits: Limits) -> Finding:
     count = int(np.sum(c.table.counts(c.fit.used) > 0))
-    return _unless_pass(
+    return unless_pass(
         Level.WARN if count < limits.views else Level.PASS,
         f"{count} photographs used, {int(c.fit.used.sum())} corners.",
         "With few photographs neither the lens model nor its errors can be checked against others.",
@@ -138,7 +134,7 @@ def _views(c: Intrinsics, limits: Limits) -> Finding:
 
 
 def _tilts(c: Intrinsics, limits: Limits) -> Finding:
-    return _unless_pass(
+    return unless_pass(
         _level(c.coverage.spread_deg, limits.spread_deg),
         f"The boards' directions differ by up to {c.coverage.spread_deg:.0f} deg.",
         "Without tilted boards the focal length can hardly be told from the distance.",
@@ -150,7 +146,7 @@ def _coverage(c: Intrinsics, limits: Limits) -> Finding:
     gaps = c.coverage.gaps
     level = max(_level(c.coverage.filled, limits.filled), Level.WARN if gaps else Level.PASS)
     where = f"; none came near the {_listed(gaps)} of it" if gaps else ""
-    return _unless_pass(
+    return unless_pass(
         level,
         f"Boards covered {c.coverage.filled:.0%} of the picture{where}.",
         "Where no corner was, the lens is extrapolated, and its uncertainty map holds only if the model does.",
@@ -164,7 +160,7 @@ def _listed(words: tuple[str, ...]) -> str:
 
 def _focal(c: Intrinsics, limits: Limits) -> Finding:
     share = float(c.sigmas[0] / c.fit.lens[0])
-    return _unless_pass(
+    return unless_pass(
         _level(share, limits.focal),
         f"Focal length {c.fit.lens[0]:.2f} ± {_two(c.sigmas[0])} px ({share:.2%}).",
         "A pose's distance is uncertain by that share:"
@@ -181,7 +177,7 @@ def _aspect(c: Intrinsics, limits: Limits) -> Finding:
     level = _level(abs(away), limits.aspect)
     if level is not Level.FAIL and abs(away) < 2 * sigma:
         level = Level.PASS
-    return _unless_pass(
+    return unless_pass(
         level,
         f"fx / fy = {fx / fy:.4f} ± {sigma:.1g}.",
         "Pixels are square on nearly every sensor: two focal lengths mean that the board's rows and columns are not as"
@@ -196,7 +192,7 @@ def _principal_point(c: Intrinsics, limits: Limits) -> Finding:
     share = float(np.max(np.abs(away) / size))
     sure = bool(np.any(np.abs(away) > 2 * c.sigmas[2:4] + limits.off_centre[0] * size))
     level = _level(share, limits.off_centre)
-    return _unless_pass(
+    return unless_pass(
         level,
         f"Principal point {away[0]:+.1f}, {away[1]:+.1f} px from the middle"
         f" (± {_two(c.sigmas[2])}, {_two(c.sigmas[3])}).",
@@ -208,7 +204,7 @@ def _principal_point(c: Intrinsics, limits: Limits) -> Finding:
 
 def _overfit(c: Intrinsics, limits: Limits) -> Finding:
     ratio = c.held.rms_px / c.fit.sigma_px
-    return _unless_pass(
+    return unless_pass(
         _level(ratio, limits.overfit),
         f"Held-out photographs are predicted to {_mm(c, c.held.rms_px)}, {ratio:.2f} times the corners' own noise.",
         "The lens follows the photographs that it was made from, not others.",
@@ -225,7 +221,7 @@ def _halves(c: Intrinsics, limits: Limits) -> Finding:
             "Nothing then tells of errors of the model, which no covariance knows.",
             _MORE[0].upper() + _MORE[1:] + ".",
         )
-    return _unless_pass(
+    return unless_pass(
         _disagreement(d, limits),
         f"Two halves of the photographs differ by {d.rms_px:.3g} px ({_two(d.rms_mm)} mm at {c.distance_m:.3g} m), RMS"
         f" over the picture; their sigmas let expect {d.expected_rms_px:.3g} px (p = {d.p_value:.2g}).",
@@ -246,7 +242,7 @@ def _origins(c: Intrinsics, limits: Limits) -> Finding | None:
     if c.origins is None:
         return None
     d, (first, second) = c.origins.difference, c.origins.names
-    return _unless_pass(
+    return unless_pass(
         _disagreement(d, limits),
         f"The photographs {first!r} and {second!r} give lenses that differ by {d.rms_px:.3g} px, RMS over the picture;"
         f" their sigmas let expect {d.expected_rms_px:.3g} px (p = {d.p_value:.2g}).",
@@ -274,7 +270,7 @@ def _scatter(c: Intrinsics) -> Finding:
 def _map(c: Intrinsics, limits: Limits) -> Finding:
     px, mm = c.map.sigma_px(c.covariance), c.map.sigma_mm(c.covariance)
     (half, most, worst), (half_mm, most_mm, worst_mm) = (np.nanquantile(m, [0.5, 0.9, 1.0]) for m in (px, mm))
-    return _unless_pass(
+    return unless_pass(
         _level(float(most), limits.map_px),
         f"A pixel's direction is known to {_two(half)} px ({_two(half_mm)} mm at {c.distance_m:.3g} m) or better in"
         f" half of the picture, to {_two(most)} px ({_two(most_mm)} mm) in nine tenths, to {_two(worst)} px"
@@ -291,7 +287,7 @@ def _warp(c: Intrinsics, limits: Limits) -> Finding | None:
     text = f"The board looks bent by {1000 * w.rise_m:.2f} mm (p = {w.p_value:.1g} if it were flat): {w.why}"
     if not w.corrected:
         return Finding(Level.PASS, text + "; taken as flat.")
-    return _unless_pass(
+    return unless_pass(
         Level.WARN if w.rise_m > limits.warp_m else Level.PASS,
         text + "; corrected.",
         "A board bent so much is no longer the smooth surface that the correction assumes, and may bend differently"

@@ -8,11 +8,9 @@ import numpy as np
 
 from geometry.spots import SpotModel
 from lab.model_check.recording import Recording
+from tracking.error_scale import LARGEST_WIDTH_SHARE
 from tracking.place_errors import correlation, place_errors
 
-# Share of a spot's sigma by which texture, speckle and its shape shift its centre at most: 4 % texture makes 0.04,
-# speckle of contrast 0.3 makes 0.1. What is farther off has moved.
-LARGEST_SHARE = 0.1
 _CHUNK = 500  # frames that are compared with each other
 
 
@@ -41,7 +39,8 @@ def with_place_errors(recording: Recording, model: SpotModel) -> Recording:
             continue
         width = recording.width_px[view] if np.isfinite(recording.width_px[view]) else np.nanmedian(recording.width_px)
         square = np.mean(np.sum((recording.uv_px[rows, view] - uv[rows, view]) ** 2, axis=-1)) / 2
-        place = min(found.few * share * max(square, size2[rows, view].mean()), (LARGEST_SHARE * width) ** 2)
+        # What is farther off than texture and speckle explain has moved.
+        place = min(found.few * share * max(square, size2[rows, view].mean()), (LARGEST_WIDTH_SHARE * width) ** 2)
         for some in np.array_split(rows, len(rows) // _CHUNK + 1):
             at = recording.uv_px[some, view]
             rho = correlation(np.linalg.norm(at[:, None] - at[None], axis=-1), found.reach_px[view])

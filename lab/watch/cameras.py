@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lab.errors import InputError
+from lab.frame_sources import retrieved
 from lab.opencv import quiet_cv2
-from lab.pictures import UNREADABLE, Missing, checked, read_picture
+from lab.pictures import UNREADABLE, Missing, read_picture
 from lab.watch.folder_poll import FolderPoll
 from lab.watch.frame_clock import FrameClock
 from lab.watch.inbox import Inbox
@@ -197,14 +198,9 @@ class DeviceCamera:
         return [f"{self.name}: {lost} pictures lost by the device, as its clock shows"] if lost else []
 
     def _decoded(self) -> NDArray | Missing:
-        good, picture = self.capture.retrieve()
-        if not good or picture is None:
-            return Missing(f"{UNREADABLE}: damaged")
-        if picture.ndim == 3:
-            cv2 = quiet_cv2()
-            picture = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY) if picture.shape[2] == 3 else picture[..., 0]
+        picture = retrieved(self.capture, self.size_px)
         # The device may use its buffer again.
-        return checked(np.array(picture), self.size_px)
+        return picture if isinstance(picture, Missing) else np.array(picture)
 
 
 def open_device(name: str, device: int | str, size_px: tuple[int, int], inbox: Inbox, rate_hz: float) -> DeviceCamera:

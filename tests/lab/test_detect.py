@@ -107,14 +107,14 @@ def test_pictures_of_mixed_sizes_and_depths_each_have_their_noise_and_the_report
     outcome = detect_pictures([folder], tmp_path / "out")
     assert outcome.pictures == 8
     assert outcome.spots == 24
-    told = summary(tmp_path / "out")
-    assert {(*n["size_px"], n["bits"]): n["pictures"] for n in told["noise"]} == {
+    said = summary(tmp_path / "out")
+    assert {(*n["size_px"], n["bits"]): n["pictures"] for n in said["noise"]} == {
         (160, 120, 8): 3,
         (160, 120, 16): 3,
         (200, 130, 8): 2,
     }
-    assert [n["estimated"]["pictures"] for n in told["noise"]] == [2, 2, 2]
-    assert any("different sizes or depths" in note for note in told["notes"])
+    assert [n["estimated"]["pictures"] for n in said["noise"]] == [2, 2, 2]
+    assert any("different sizes or depths" in note for note in said["notes"])
     assert "different sizes or depths" in (tmp_path / "out/report.html").read_text("utf-8")
 
 

@@ -490,13 +490,13 @@ def test_a_causal_run_is_what_a_smoothed_one_keeps_of_each_instant(tmp_path):
         kept, alone = tmp_path / "smoothed" / f"{name}_causal.csv", tmp_path / "causal" / f"{name}.csv"
         assert kept.read_bytes() == alone.read_bytes()
         assert kept.read_bytes() != (tmp_path / "smoothed" / f"{name}.csv").read_bytes()
-    told = [json.loads((tmp_path / which / "summary.json").read_text()) for which in ("smoothed", "causal")]
-    assert [t["attitude"] for t in told] == ["smoothed", "causal"]
-    assert [t["timings"]["smoothing_s"] > 0 for t in told] == [True, False]
+    summaries = [json.loads((tmp_path / which / "summary.json").read_text()) for which in ("smoothed", "causal")]
+    assert [t["attitude"] for t in summaries] == ["smoothed", "causal"]
+    assert [t["timings"]["smoothing_s"] > 0 for t in summaries] == [True, False]
     said = {"jerk_m_s3", "jerk_rad_s3", "iterations", "relabelled", "place_share", "seconds"}
-    assert set(told[0]["smoother"]) == said
-    assert told[1]["smoother"] is None
-    assert [t["errors"]["pose_causal"] is None for t in told] == [False, True]
+    assert set(summaries[0]["smoother"]) == said
+    assert summaries[1]["smoother"] is None
+    assert [t["errors"]["pose_causal"] is None for t in summaries] == [False, True]
 
 
 def test_what_was_predicted_before_a_frame_is_the_same_in_both_passes(tmp_path):
