@@ -138,7 +138,7 @@ def run(run_folder: Path, out: Path, causal: bool, settings: dict[str, Any]) -> 
     Example:
         beampose run sample_runs/huo2015 --out results/huo2015
     """
-    from lab.process import process_run
+    from lab.runs.process import process_run
 
     with _progress(run_folder.name) as progress:
         outcome = process_run(run_folder, out, overrides=settings, causal=causal, progress=progress)
@@ -158,7 +158,7 @@ def batch(run_folders: tuple[Path, ...], out: Path, causal: bool, settings: dict
     Example:
         beampose batch sample_runs/huo2015 sample_runs/damaged --out results/all
     """
-    from lab.batch import process_batch
+    from lab.runs.batch import process_batch
 
     outcome = process_batch(run_folders, out, overrides=settings, causal=causal, tell=click.echo)
     click.echo(f"table: {outcome.table}")
@@ -332,7 +332,7 @@ def check(path: Path) -> None:
     Example:
         beampose check sample_runs/huo2015
     """
-    from lab.check import check as check_path
+    from lab.runs.check import check as check_path
 
     result = check_path(path)
     for line in result.lines:
@@ -350,8 +350,8 @@ def report(results: Path, run_folder: Path | None) -> None:
     Example:
         beampose report results/huo2015
     """
-    from lab.process import are_results
-    from lab.report import write_report
+    from lab.report.run.page import write_report
+    from lab.runs.process import are_results
 
     if not are_results(results):
         raise InputError(f"{results}: expected a folder that `beampose run` wrote, found no summary.json of one")
@@ -369,7 +369,7 @@ def study(name: str, out: Path, seed: int) -> None:
     Example:
         beampose study huo2015 --out results/study
     """
-    from lab.studies import study_huo2015
+    from lab.study.studies import study_huo2015
 
     outcome = study_huo2015(out, seed=seed)
     for line in outcome.lines:
@@ -412,7 +412,7 @@ def board(board: str, out: Path, page: str, dpi: float) -> None:
     Example:
         beampose calibrate board charuco:5x7:36mm:18mm:DICT_4X4_50 --out board
     """
-    from lab.calibrate.board import write_board
+    from lab.calibrate.board.board import write_board
 
     _concluded(write_board(board, out, page=page, dpi=dpi))
 
@@ -448,7 +448,7 @@ def camera(
     Example:
         beampose calibrate camera campaign/photos/left --board campaign/board.yaml --out results/left
     """
-    from lab.calibrate.camera import CameraOptions, calibrate_camera
+    from lab.calibrate.camera.camera import CameraOptions, calibrate_camera
 
     options = CameraOptions(
         name=name or out.resolve().name,
@@ -477,7 +477,7 @@ def screen(project: Path, out: Path) -> None:
     Example:
         beampose calibrate screen campaign/calibration.yaml --out results/screens
     """
-    from lab.calibrate.screen import calibrate_screen
+    from lab.calibrate.screens.screen import calibrate_screen
 
     _concluded(calibrate_screen(project, out))
 
@@ -493,7 +493,7 @@ def beams(project: Path, out: Path, rig: Path | None) -> None:
     Example:
         beampose calibrate beams campaign/calibration.yaml --rig results/screens/rig.yaml --out results/beams
     """
-    from lab.calibrate.beams import calibrate_beams
+    from lab.calibrate.beams.beams import calibrate_beams
 
     _concluded(calibrate_beams(project, out, rig))
 
@@ -508,7 +508,7 @@ def rig(project: Path, out: Path) -> None:
     Example:
         beampose calibrate rig campaign/calibration.yaml --out results/rig
     """
-    from lab.calibrate.rig import calibrate_rig
+    from lab.calibrate.rig.rig import calibrate_rig
 
     _concluded(calibrate_rig(project, out))
 
@@ -538,7 +538,7 @@ def daily(
     Example:
         beampose calibrate check results/rig/rig.yaml --points points.csv --survey survey.csv --out results/today
     """
-    from lab.calibrate.daily import daily_check
+    from lab.calibrate.drift_check.drift_check import daily_check
 
     _concluded(daily_check(rig, out, points, run_folder, survey=survey, pose=pose, history=history))
 
@@ -556,7 +556,7 @@ def convert(source: Path, destination: Path, origin: str | None, target: str | N
     Example:
         beampose calibrate convert sample_runs/huo2015/rig.yaml camchain.yaml --to kalibr
     """
-    from lab.calibrate.interchange import convert as convert_file
+    from lab.files.rig.interchange import convert as convert_file
 
     _concluded(convert_file(source, destination, origin, target, camera))
 
@@ -634,8 +634,8 @@ def plan(
     Example:
         beampose plan sample_runs/huo2015/rig.yaml --out results/plan
     """
-    from lab.plan import plan_rig
-    from lab.plan_options import options_of
+    from lab.plan.plan import plan_rig
+    from lab.plan.plan_options import options_of
 
     goal_m = None if goal_mm is None else goal_mm / 1000
     options = options_of(ranges, sigma_px=sigma_px, goal_deg=goal_deg, goal_m=goal_m, expected=settings)

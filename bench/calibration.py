@@ -18,20 +18,20 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from bench.rig_calibration import bench_figures
-from calibration.boards.kinds import parse
+from calibration.boards.board_types import parse
 from calibration.findings import Level
+from calibration.lens.fit.lens_fit import AS_STATED, robust_fit
+from calibration.lens.fit.lens_start import start
 from calibration.lens.intrinsics import IntrinsicsError, calibrate_intrinsics
-from calibration.lens.lens_fit import AS_STATED, robust_fit
-from calibration.lens.lens_start import start
 from lab.simulate.rigs import RIGS
-from tests.calibration.bench import ARCSEC, exact, unknown_place
-from tests.calibration.lens_scenes import TRUTH, Scene, photographs
-from tests.calibration.random_lenses import corners_of, judged, random_lens
-from tests.calibration.rendered_circles import LENS as CIRCLE_LENS
-from tests.calibration.rendered_circles import CircleScene, table_of
-from tests.calibration.test_beams import bench_case, tally
-from tests.calibration.test_intrinsics import FIVE, bowed, coverage_and_nees
-from tests.tracking.test_calibration_errors import mean_nees
+from tests.calibration.beams.bench import ARCSEC, exact, unknown_place
+from tests.calibration.beams.test_beams import bench_case, tally
+from tests.calibration.lens.lens_scenes import TRUTH, Scene, photographs
+from tests.calibration.lens.random_lenses import corners_of, judged, random_lens
+from tests.calibration.lens.rendered_circles import LENS as CIRCLE_LENS
+from tests.calibration.lens.rendered_circles import CircleScene, table_of
+from tests.calibration.lens.test_intrinsics import FIVE, bowed, coverage_and_nees
+from tests.tracking.curve_switching.test_calibration_errors import mean_nees
 
 
 def lenses(seeds: range) -> Iterator[tuple[str, str, str]]:

@@ -18,12 +18,12 @@ from bench.tracking import FIRST_SEED, Row, one_picture, random_poses
 from geometry import rotations
 from geometry.arrays import Array
 from geometry.camera import Camera
+from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.rig import Beam, Rig, Screen, Spot
-from geometry.spots import SpotModel
 from lab.simulate.rigs import DISTORTION, RIGS, look_at
 from tracking.detections import Detections
-from tracking.labels import NO_POINT, LabelResult, PosePrior, find_labels
+from tracking.labelling.first_labels import NO_POINT, LabelResult, PosePrior, find_labels
 
 PRIOR = PosePrior(Pose.identity(), 1.0, float(np.deg2rad(30.0)))
 GOAL = ">= 0.97; <= 0.01; <= 3 s"

@@ -20,17 +20,17 @@ from scipy.linalg import block_diag
 
 from calibration.beams.beams import Stand
 from calibration.rig.joint import Joint
-from calibration.rig.rig_stacks import prior_of, stacks_of
 from calibration.rig.rig_steps import RigSteps, calibrate_in_steps
 from calibration.screens.network import Dots, Network, Sightings
 from calibration.screens.screens import ScreenSetup, calibrate
+from calibration.terms.rig_blocks import prior_of, stacks_of
 from geometry.arrays import Array, normalised
-from geometry.calibration_spread import CalibrationSpread
+from geometry.forward_model import SpotModel
 from geometry.pose import Pose
+from geometry.pose_solver.gauss_newton import fit_pose
 from geometry.rig import Rig
-from geometry.rig_parameters import RigCovariance
-from geometry.solve import fit_pose
-from geometry.spots import SpotModel
+from geometry.uncertainty.rig_parameters import RigCovariance
+from geometry.uncertainty.rig_uncertainty import CalibrationSpread
 from lab.simulate.calibration_campaign import Campaign, Quality, draw_campaign, spots_at
 
 POSES_PER_CAMPAIGN = 5  # of the new recording; they share the calibration's errors

@@ -16,10 +16,10 @@ import numpy as np
 from bench.tracking import Row, Tally, found_in, tally, track
 from geometry.arrays import Array, Bools
 from lab.simulate.points import PointRun, hidden, simulate_points
-from tracking.match import UNMATCHED
+from tracking.detections import UNMATCHED
 from tracking.parameters import TrackerParameters
-from tracking.recording import Recording
-from tracking.smoother import smooth
+from tracking.smoothing.recording import Recording
+from tracking.smoothing.smoother import smooth
 from tracking.tracked_frame import TrackedFrame
 
 FIRST_SEED = 9100

@@ -17,17 +17,17 @@ import numpy as np
 
 from geometry import rotations
 from geometry.arrays import Array
+from geometry.forward_model import SpotModel
 from geometry.pose import Pose
-from geometry.solve import fit_pose
-from geometry.spots import SpotModel
+from geometry.pose_solver.gauss_newton import fit_pose
 from lab.simulate.points import PointRun, simulate_points
 from lab.simulate.rigs import RIGS
+from tracking.curve_switching.out_of_view import CoplanarViews, quadratic_positions
+from tracking.curve_switching.spot_tracker import SpotTracker
 from tracking.detections import Detections
-from tracking.labels import NO_POINT, PosePrior, find_labels
-from tracking.out_of_view import CoplanarViews, quadratic_positions
+from tracking.labelling.first_labels import NO_POINT, PosePrior, find_labels
 from tracking.parameters import TrackerParameters
-from tracking.rigid_tracker import RigidTracker
-from tracking.spot_tracker import SpotTracker
+from tracking.rigid_body.rigid_tracker import RigidTracker
 from tracking.statuses import PoseStatus, SpotStatus
 from tracking.tracked_frame import TrackedFrame
 

@@ -11,7 +11,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from lab.process import process_run
+from lab.runs.process import process_run
 from lab.simulate.write import simulate
 
 SCENARIO = "huo2015"

@@ -11,7 +11,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from lab.calibrate.rig import RIG, calibrate_rig
+from lab.calibrate.rig.rig import RIG, calibrate_rig
 from lab.simulate.campaign_files import PROJECT, simulate_calibration
 from lab.simulate.write import simulate
 

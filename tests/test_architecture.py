@@ -18,7 +18,8 @@ import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-ROOT = Path(__file__).resolve().parents[1]
+from tests.paths import ROOT
+
 FLOORS = ("geometry", "tracking", "calibration", "lab", "cli")
 MAY_USE = {
     "geometry": set(),
@@ -130,7 +131,9 @@ def test_the_walk_sees_the_whole_program():
     found = modules(ROOT)
     geometry = {name for name in found if name.startswith("geometry.")}
     assert len(found) >= 20
-    assert {"geometry.lens", "geometry.spots", "geometry.rotations", "tracking.statuses", "lab.errors"} <= set(found)
+    assert {"geometry.lens", "geometry.forward_model", "geometry.rotations", "tracking.statuses", "lab.errors"} <= set(
+        found
+    )
     assert sum(len(imports(name, found[name])) for name in geometry) >= 30
 
 

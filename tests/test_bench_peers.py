@@ -29,7 +29,7 @@ from bench.peers.scenes import (
 )
 from bench.peers.trackers import ENTRIES, Entry
 from bench.peers.unseen import score_unseen
-from geometry.spots import SpotModel
+from geometry.forward_model import SpotModel
 
 FRAMES = 400
 

@@ -23,13 +23,13 @@ import yaml
 from click.testing import CliRunner, Result
 
 from cli import main
-from lab import batch, process
 from lab.errors import CalibrationError, InputError, RunError
+from lab.runs import batch, process
 from lab.simulate.scenarios import SCENARIOS
 from lab.simulate.write import simulate
 from tests.lab.run_folders import write_run
+from tests.paths import ROOT
 
-ROOT = Path(__file__).resolve().parents[1]
 SAMPLE = ROOT / "sample_runs" / "huo2015"
 PICTURES = 40  # of each camera of the sample run, enough for every file of a result; `-m slow` takes all 220
 EXAMPLE = re.compile(r"^\s*beampose (.+)$", flags=re.MULTILINE)

@@ -2,20 +2,20 @@
 
 import importlib.util
 import re
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from lab.calibrate.rig import calibrate_rig
-from lab.check import check
-from lab.process import process_run
-from lab.rig_covariance import joint_covariance
-from lab.rig_file import load_rig_file
+from lab.calibrate.rig.rig import calibrate_rig
+from lab.files.rig.rig_covariance import joint_covariance
+from lab.files.rig.rig_file import load_rig_file
+from lab.runs.check import check
+from lab.runs.process import process_run
 from lab.simulate.scene import compose
+from tests.paths import ROOT
 
-FOLDER = Path(__file__).resolve().parents[1] / "sample_runs"
+FOLDER = ROOT / "sample_runs"
 if not FOLDER.is_dir():
     pytest.skip("a source distribution has no sample runs", allow_module_level=True)
 _SPEC = importlib.util.spec_from_file_location("sample_runs_make", FOLDER / "make.py")

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from tests.lab.run_folders import RIG, RUN
+from tests.paths import ROOT
 
-ROOT = Path(__file__).resolve().parents[1]
 REPORT = """
 import sys
 from cli import main
@@ -23,13 +23,13 @@ print("LOADED", *sorted(sys.modules))
 # Imports modules as usual, and says which were there when the tables were begun.
 WATCHED = """
 import sys
-import lab.tables
+import lab.runs.tables
 first = []
-enter = lab.tables.TableWriter.__enter__
+enter = lab.runs.tables.TableWriter.__enter__
 def begun(self):
     first.extend(sys.modules)
     return enter(self)
-lab.tables.TableWriter.__enter__ = begun
+lab.runs.tables.TableWriter.__enter__ = begun
 from cli import main
 try:
     main({arguments!r})
@@ -77,11 +77,13 @@ def points_run(tmp_path_factory) -> Path:
 
 def test_a_run_loads_neither_the_report_nor_the_slow_parts_of_scipy_before_its_first_row(points_run, tmp_path):
     before = loaded(WATCHED, "run", str(points_run), "--out", str(tmp_path / "out"), word="FIRST")
-    assert {"numpy", "numba", "lab.tables"} <= before
-    assert before & (SLOW_SCIPY | {"jinja2", "markupsafe", "rich", "lab.report.page", "lab.simulate.write"}) == set()
+    assert {"numpy", "numba", "lab.runs.tables"} <= before
+    assert (
+        before & (SLOW_SCIPY | {"jinja2", "markupsafe", "rich", "lab.report.run.page", "lab.simulate.write"}) == set()
+    )
 
 
 def test_a_run_never_loads_the_slow_parts_of_scipy(points_run, tmp_path):
     after = loaded(WATCHED, "run", str(points_run), "--out", str(tmp_path / "out"))
-    assert {"jinja2", "lab.report.page"} <= after
+    assert {"jinja2", "lab.report.run.page"} <= after
     assert after & SLOW_SCIPY == set()

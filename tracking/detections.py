@@ -8,6 +8,8 @@ import numpy as np
 
 from geometry.arrays import Array, Bools, Ints
 
+UNMATCHED = -1  # in place of the row of a detection: no detection
+
 
 @dataclass(frozen=True, slots=True)
 class Detections:

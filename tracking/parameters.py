@@ -20,7 +20,7 @@ class DetectParameters:
 
 @dataclass(frozen=True, slots=True)
 class LabelParameters:
-    """Labels without a track: the first frame and after a blackout (tracking/labels.py)."""
+    """Labels without a track: the first frame and after a blackout (tracking/labelling/first_labels.py)."""
 
     model_sigma_px: float = 0.3  # px: what calibration may be off, beside every point's own sigma
     p_detect: float = 0.95  # probability that a spot in the picture is found: one that is missing is a tie, two are not

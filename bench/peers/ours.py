@@ -11,14 +11,13 @@ import numpy as np
 from bench.peers.rows import Tracked
 from bench.peers.scenes import CAMERA_OF, FRAME_S, NOISE_PX, Scene, rig
 from geometry.pose import Pose
-from tracking.detections import Detections
-from tracking.labels import PosePrior
-from tracking.match import UNMATCHED
+from tracking.curve_switching.spot_tracker import SpotTracker
+from tracking.detections import UNMATCHED, Detections
+from tracking.labelling.first_labels import PosePrior
 from tracking.parameters import TrackerParameters
-from tracking.recording import Recording
-from tracking.rigid_tracker import RigidTracker
-from tracking.smoother import smooth
-from tracking.spot_tracker import SpotTracker
+from tracking.rigid_body.rigid_tracker import RigidTracker
+from tracking.smoothing.recording import Recording
+from tracking.smoothing.smoother import smooth
 from tracking.tracked_frame import TrackedFrame
 
 PRIOR = PosePrior(Pose.identity(), within_m=1.0, within_rad=float(np.deg2rad(35.0)))

@@ -19,7 +19,7 @@ from bench.peers.rows import Tracked
 from bench.peers.scenes import HIDDEN, OUTSIDE, SCENES, Scene
 from bench.peers.trackers import ENTRIES, Entry
 from bench.peers.unseen import score_unseen
-from lab.yaml_text import write_whole
+from lab.files.text.yaml_text import write_whole
 
 SHARED = ("numpy", "scipy", "numba")
 NAN = math.nan

@@ -10,7 +10,7 @@ import numpy as np
 
 from bench.random_pictures.sensors import Picture
 from geometry.camera import SensorNoise
-from lab.sensor_noise import frames_to_learn_from
+from lab.runs.frames.sensor_noise import frames_to_learn_from
 from tracking.noise import NoiseModel
 from tracking.noise_estimation.photon_transfer import estimate_noise
 

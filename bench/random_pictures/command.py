@@ -20,7 +20,7 @@ from bench.random_pictures.report import crashed, details, summary, write_rows
 from bench.random_pictures.scene import picture_scene
 from bench.random_pictures.write_folder import write_pictures
 from lab.errors import BeamposeError
-from lab.process import process_run
+from lab.runs.process import process_run
 
 
 @dataclass(frozen=True, slots=True)

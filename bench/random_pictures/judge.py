@@ -24,8 +24,8 @@ from bench.random_scenes.nuisances import FalsePoints
 from bench.random_scenes.oracle import ask_oracle
 from bench.random_scenes.scene import OUTSIDE, SHINING, Scene, composed
 from geometry.arrays import Array, Bools
-from lab.evidence import Kind
-from lab.results import read_spots, read_summary, read_table
+from lab.files.run.results import read_spots, read_summary, read_table
+from lab.runs.verdict.evidence import Kind
 
 LEAST_SNR = 8.0
 SAME_SPOT_PX, SAME_SPOT_SIGMAS = 3.0, 5.0

@@ -13,8 +13,8 @@ from bench.random_pictures.sensors import Sensor
 from bench.random_scenes.write_folder import prior_block, write_truth
 from geometry.camera import SensorNoise
 from geometry.rig import Rig
-from lab.rig_file import RigFile, save_rig
-from lab.run_file import save_run
+from lab.files.rig.rig_file import RigFile, save_rig
+from lab.files.run.run_file import save_run
 
 # Noise does not compress: 11 ms for 1280x1024 in place of 27 at level 1 with filters, and no larger.
 _FAST_PNG = (

@@ -15,16 +15,15 @@ import numpy as np
 from bench.random_scenes.scene import Scene
 from geometry.arrays import Array, Bools
 from geometry.pose import Pose
-from lab import process
-from lab.frames import FrameSet
-from lab.pictures import DROPPED, Missing
-from lab.pipeline import FrameRecord, Pipeline, Tracker, tracker_of
-from lab.results import read_poses, read_spots
-from lab.run_file import Run
-from lab.times import Times
-from lab.two_passes import TwoPasses
-from tracking.detections import Detections
-from tracking.match import UNMATCHED
+from lab.files.run.results import read_poses, read_spots
+from lab.files.run.run_file import Run
+from lab.files.run.times import Times
+from lab.pictures.picture_file import DROPPED, Missing
+from lab.runs import process
+from lab.runs.frames.frames import FrameSet
+from lab.runs.frames.pipeline import FrameRecord, Pipeline, Tracker, tracker_of
+from lab.runs.smoothing_pass import TwoPasses
+from tracking.detections import UNMATCHED, Detections
 from tracking.parameters import TrackerParameters
 from tracking.statuses import PoseStatus
 from tracking.tracked_frame import TrackedFrame
@@ -84,7 +83,7 @@ class TimedTracker:
 
 
 class PointReader:
-    """The frames of a scene as lab/frames.py gives those of a run folder."""
+    """The frames of a scene as lab/runs/frames/frames.py gives those of a run folder."""
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
@@ -100,7 +99,9 @@ class PointReader:
 
 
 def answers_in_memory(scene: Scene, parameters: TrackerParameters | None = None) -> Answers:
-    """Track, smooth, write the tables and judge as lab/process.py does, without reading files and without a report."""
+    """Track, smooth, write the tables and judge as lab/runs/process.py does, without reading files and without a
+    report.
+    """
     run = Run(
         folder=Path(),
         name=f"seed {scene.seed}",

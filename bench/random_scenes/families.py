@@ -28,7 +28,7 @@ from bench.random_scenes.nuisances import CLEAN_FRAMES
 from bench.random_scenes.projection import spot_pixels
 from bench.random_scenes.scene import Scene, draw_amplitudes, fitted_motion, view_indices
 from geometry.rig import Rig
-from geometry.rig_parameters import RigCovariance, moved, rig_names, split
+from geometry.uncertainty.rig_parameters import RigCovariance, moved, rig_names, split
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,8 +1,8 @@
 """The answers to a scene against its truth: identity, wrong labels, covariances, and the class of a failure.
 
 A label is right if its point is the spot's own, or lies within SAME_SPOT_PX or SAME_SPOT_SIGMAS of the spot's true
-place with no other spot nearer (the rule of lab/score.py). Identity counts spots that shine and have a picture, except
-where another point lies within TOGETHER_SIGMAS of the spot's true place: there either may be the spot.
+place with no other spot nearer (the rule of lab/runs/score/score.py). Identity counts spots that shine and have a
+picture, except where another point lies within TOGETHER_SIGMAS of the spot's true place: there either may be the spot.
 
 A pose is confidently wrong if its Mahalanobis distance from the truth is above 10 (NEES above 100; of 1e9 right poses
 with 6 degrees of freedom none is).

@@ -22,9 +22,9 @@ from geometry import rotations
 from geometry.arrays import Array, Bools, Ints
 from geometry.pose import Pose
 from geometry.rig import Rig
-from geometry.rig_parameters import RigCovariance
+from geometry.uncertainty.rig_parameters import RigCovariance
 from tracking.detections import Detections
-from tracking.labels import PosePrior
+from tracking.labelling.first_labels import PosePrior
 
 # Independent streams of random numbers: a change of one kind of draw leaves the others as they were.
 LAB, MOTION, NUISANCE, POINTS, PRIOR = range(5)

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from bench.random_scenes.scene import Scene
-from lab import columns
-from lab.rig_covariance import blocks_of
-from lab.rig_file import RigFile, save_rig
-from lab.run_file import save_run
+from lab.files.rig.rig_covariance import blocks_of
+from lab.files.rig.rig_file import RigFile, save_rig
+from lab.files.run.run_file import save_run
+from lab.files.text import columns
 
 
 def write_run_folder(scene: Scene, folder: Path) -> Path:

@@ -21,16 +21,16 @@ from pathlib import Path
 from typing import Any
 
 STAGES = (
-    ("decode", "lab.frame_sources", "read_picture"),
-    ("decode", "lab.frame_sources", "VideoSource._next"),
-    ("detect", "lab.pipeline", "Pipeline._detect"),
-    ("track", "tracking.rigid_tracker", "RigidTracker.step"),
-    ("smooth", "lab.two_passes", "smooth"),
-    ("smooth", "tracking.smoothed", "Smoothed.frame"),
-    ("tables", "lab.tables", "TableWriter.write"),
-    ("tables", "lab.tables", "TableWriter.__exit__"),
-    ("model check", "lab.model_check.check", "check_kept"),
-    ("report", "lab.report.page", "write_report"),
+    ("decode", "lab.runs.frames.frame_sources", "read_picture"),
+    ("decode", "lab.runs.frames.frame_sources", "VideoSource._next"),
+    ("detect", "lab.runs.frames.pipeline", "Pipeline._detect"),
+    ("track", "tracking.rigid_body.rigid_tracker", "RigidTracker.step"),
+    ("smooth", "lab.runs.smoothing_pass", "smooth"),
+    ("smooth", "tracking.smoothing.smoothed", "Smoothed.frame"),
+    ("tables", "lab.runs.tables", "TableWriter.write"),
+    ("tables", "lab.runs.tables", "TableWriter.__exit__"),
+    ("model check", "lab.runs.model_check.check", "check_kept"),
+    ("report", "lab.report.run.page", "write_report"),
     ("load compiled", "numba.core.caching", "Cache.load_overload"),
     ("compile", "numba.core.dispatcher", "_FunctionCompiler.compile"),
 )
@@ -74,7 +74,8 @@ def watch(clock: Clock) -> None:
 
 
 def _run(folder: Path, out: Path) -> Counter[str]:
-    from lab import frames, process
+    from lab.runs import process
+    from lab.runs.frames import frames
 
     clock = Clock()
     watch(clock)  # imports the report and the model check, too, which a run imports at its end
@@ -92,7 +93,7 @@ def _run(folder: Path, out: Path) -> Counter[str]:
 
 
 def _report(out: Path) -> Counter[str]:
-    from lab.report import write_report
+    from lab.report.run.page import write_report
 
     begun = time.process_time()
     write_report(out, None)
@@ -101,8 +102,8 @@ def _report(out: Path) -> Counter[str]:
 
 def _read(folder: Path) -> Counter[str]:
     """Only the pictures, read ahead in threads as in a run."""
-    from lab.frames import open_frames
-    from lab.run_file import load_run
+    from lab.files.run.run_file import load_run
+    from lab.runs.frames.frames import open_frames
 
     reader = open_frames(load_run(folder))
     begun = time.process_time()

@@ -9,7 +9,7 @@ from itertools import combinations
 import numpy as np
 from scipy.special import chdtrc
 
-from calibration.least_squares.stacks import Lines
+from calibration.least_squares.parameter_blocks import Lines
 from geometry.arrays import Array, normalised
 
 _OPPOSED = np.deg2rad(5.0)  # of lasers that were meant to be one line: no more is left after mounting by eye

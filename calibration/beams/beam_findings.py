@@ -10,7 +10,7 @@ import numpy as np
 
 from calibration.beams.beam_figures import OneLine
 from calibration.beams.beams import BeamCalibration
-from calibration.beams.exchanged_labels import exchanged_pairs
+from calibration.beams.label_swaps import exchanged_pairs
 from calibration.findings import Finding, Level
 from geometry.arrays import Array
 from geometry.rig import Rig

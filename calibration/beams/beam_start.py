@@ -7,14 +7,14 @@ from itertools import combinations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calibration.beams.spot_term import SpotPixels
+from calibration.terms.spot_term import SpotPixels
 from geometry.arrays import Array, Ints, normalised
-from geometry.closed_form import pose_from_lines
+from geometry.forward_model import SpotModel
 from geometry.planes import meet_plane, screen_to_world
 from geometry.pose import Pose
+from geometry.pose_solver.closed_form import pose_from_lines
+from geometry.pose_solver.gauss_newton import PoseFit, fit_pose
 from geometry.rig import Beam, Rig
-from geometry.solve import PoseFit, fit_pose
-from geometry.spots import SpotModel
 
 _MOST_FOR_PAIRS = 60  # spots of a beam whose pairs are all tried
 _NEAR_M = 0.02  # m from the line, at least: spots that take part in it

@@ -17,17 +17,17 @@ from calibration.beams.beam_start import beams_through_spots, body_poses, stand_
 from calibration.beams.body_gauge import BodyGauge
 from calibration.beams.excitation import Motion, in_words, without_frame
 from calibration.beams.spot_fit import SpotFit, fit_spots
-from calibration.beams.spot_term import SpotPixels, SpotTerm
 from calibration.least_squares.adjustment import Adjusted, AdjustmentError, At, Cauchy, Term, Values, solve
+from calibration.least_squares.parameter_blocks import Lines, Poses
 from calibration.least_squares.priors import Prior, independent
-from calibration.least_squares.stacks import Lines, Poses
-from calibration.rig.rig_stacks import BEAMS, POSES, STAND, lines_in, named_errors, prior_of, rig_of, stacks_of
-from calibration.screens.surveyed import pose_of
+from calibration.terms.rig_blocks import BEAMS, POSES, STAND, lines_in, named_errors, prior_of, rig_of, stacks_of
+from calibration.terms.spot_term import SpotPixels, SpotTerm
+from calibration.terms.surveyed import pose_of
 from geometry.arrays import Array, Bools
+from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.rig import Beam, Rig, Spot
-from geometry.rig_parameters import RigCovariance
-from geometry.spots import SpotModel
+from geometry.uncertainty.rig_parameters import RigCovariance
 
 _FOR_THE_STAND = 15  # positions from which its place is first guessed
 

@@ -9,8 +9,8 @@ from scipy.linalg import block_diag
 
 from calibration.beams.excitation import body_motion
 from calibration.least_squares.adjustment import Linearised, Loss, Part, Values
-from calibration.least_squares.stacks import Lines
-from calibration.rig.rig_stacks import BEAMS, lines_in
+from calibration.least_squares.parameter_blocks import Lines
+from calibration.terms.rig_blocks import BEAMS, lines_in
 from geometry.arrays import Array
 
 # m and rad to which the frame is held. It does not compete with the spots, which say nothing of it, so the number is of

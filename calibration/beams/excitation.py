@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.least_squares.stacks import Lines
+from calibration.least_squares.parameter_blocks import Lines
 from geometry import rotations
 from geometry.arrays import Array, cross, normalised
 from geometry.pose import Pose

@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import chdtri
 
-from calibration.beams.spot_term import SpotPixels, SpotTerm
 from calibration.least_squares.adjustment import Adjusted, AdjustmentError, Cauchy, Free, Limits, Term, Values, solve
+from calibration.terms.spot_term import SpotPixels, SpotTerm
 from geometry.arrays import Array, Bools
 from geometry.rig import Rig
 

@@ -12,11 +12,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from calibration.boards.board_types import Board, Charuco, Chessboard
 from calibration.boards.board_view import NO_CLOSE_LOOK, BoardView, GreyImage, NotFound
 from calibration.boards.charuco_detection import find_charuco
 from calibration.boards.chessboard_detection import find_chessboard
 from calibration.boards.circle_detection import find_circles
-from calibration.boards.kinds import Board, Charuco, Chessboard
 
 __all__ = ["NO_CLOSE_LOOK", "BoardView", "NotFound", "find_board"]
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from calibration.boards.kinds import DICTIONARIES, Board, Charuco, CircleGrid
+from calibration.boards.board_types import DICTIONARIES, Board, Charuco, CircleGrid
 from geometry.arrays import Array, Bools, Ints
 
 

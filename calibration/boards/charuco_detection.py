@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from calibration.boards import corner_refinement
+from calibration.boards.board_types import DICTIONARIES, Charuco, dictionary_size
 from calibration.boards.board_view import (
     BLUR_LIMIT,
     NO_CLOSE_LOOK,
@@ -17,8 +18,7 @@ from calibration.boards.board_view import (
     low_contrast,
     too_blurred,
 )
-from calibration.boards.kinds import DICTIONARIES, Charuco, dictionary_size
-from calibration.boards.smaller_pictures import scaled, scales
+from calibration.boards.pyramid import scaled, scales
 from geometry.arrays import Array, Ints
 
 _FEWEST = 6  # corners, not all on one line: a pose from fewer says nothing about the lens

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from calibration.boards import corner_refinement
+from calibration.boards.board_types import Chessboard
 from calibration.boards.board_view import (
     BLUR_LIMIT,
     NO_CLOSE_LOOK,
@@ -18,8 +19,7 @@ from calibration.boards.board_view import (
     low_contrast,
     too_blurred,
 )
-from calibration.boards.kinds import Chessboard
-from calibration.boards.smaller_pictures import at_full_size, scaled, scales
+from calibration.boards.pyramid import at_full_size, scaled, scales
 from geometry.arrays import Array
 
 _ALTERNATING = 0.9  # share of neighbouring squares that differ as they should; real boards reach 1

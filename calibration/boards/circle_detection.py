@@ -1,7 +1,7 @@
 """Grids of circles in pictures: centres and areas of the ellipses that they are seen as.
 
 A centre is that of the blob, not the image of the circle's centre: the two differ by tenths of a pixel, which the
-calibration's model takes into account (calibration/lens/circle_images.py) and for which it needs the areas.
+calibration's model takes into account (calibration/terms/circle_images.py) and for which it needs the areas.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from calibration.boards import corner_refinement
+from calibration.boards.board_types import CircleGrid
 from calibration.boards.board_view import (
     BLUR_LIMIT,
     NO_CLOSE_LOOK,
@@ -23,8 +24,7 @@ from calibration.boards.board_view import (
     too_blurred,
 )
 from calibration.boards.chessboard_detection import upright
-from calibration.boards.kinds import CircleGrid
-from calibration.boards.smaller_pictures import at_full_size, scaled, scales
+from calibration.boards.pyramid import at_full_size, scaled, scales
 from geometry.arrays import Array
 
 _BIG_DOT = 1.35  # area of a corner's circle over what its neighbours have, from which it marks the origin

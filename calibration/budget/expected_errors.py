@@ -19,7 +19,16 @@ from geometry.camera import FISHEYE, Camera, Projected, pinhole_numbers, project
 from geometry.lens import padded
 from geometry.planes import meet_plane
 from geometry.rig import Rig, Screen
-from geometry.rig_parameters import DIRECTION, PINHOLE, POINT, POSE, RigCovariance, distortion_names, rig_names, split
+from geometry.uncertainty.rig_parameters import (
+    DIRECTION,
+    PINHOLE,
+    POINT,
+    POSE,
+    RigCovariance,
+    distortion_names,
+    rig_names,
+    split,
+)
 
 _FEWEST_DOTS = 4  # below it the resection is not tried: three dots fix a pose four ways
 

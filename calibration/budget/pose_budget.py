@@ -1,9 +1,10 @@
 """What a pose measured with a rig would be known to, and which error makes how much of it: noise, and each calibration.
 
-For designing a rig before it stands. The pose is taken to be solved as geometry/solve.py does it, by least squares with
-the spots' noise and the calibration's errors weighed together: with J = d(pixels)/d(pose), S = d(pixels)/d(rig) and the
-rig's covariance C, the pixels err by V = sigma^2 I + S C S^T, the solution is G = (J^T V^-1 J)^-1 J^T V^-1, and the
-pose errs by G of whatever the pixels err by. Source: ours; generalised least squares, error propagation to first order.
+For designing a rig before it stands. The pose is taken to be solved as geometry/pose_solver/gauss_newton.py does it, by
+least squares with the spots' noise and the calibration's errors weighed together: with J = d(pixels)/d(pose), S =
+d(pixels)/d(rig) and the rig's covariance C, the pixels err by V = sigma^2 I + S C S^T, the solution is G = (J^T V^-1
+J)^-1 J^T V^-1, and the pose errs by G of whatever the pixels err by. Source: ours; generalised least squares, error
+propagation to first order.
 """
 
 from __future__ import annotations
@@ -15,10 +16,10 @@ import numpy as np
 
 from geometry.arrays import Array, Bools, symmetric
 from geometry.camera import in_picture
+from geometry.forward_model import SpotModel
 from geometry.pose import Pose
-from geometry.rig_parameters import BOW, DIRECTION, POSE, Sensitivity, split
-from geometry.solve import RANK_TOLERANCE
-from geometry.spots import SpotModel
+from geometry.pose_solver.gauss_newton import RANK_TOLERANCE
+from geometry.uncertainty.rig_parameters import BOW, DIRECTION, POSE, Sensitivity, split
 
 INTRINSICS, CAMERA_POSES, SCREEN_POSES = "camera intrinsics", "camera poses", "screen poses"
 SCREEN_SHAPES, BEAM_DIRECTIONS, BEAM_POINTS = "screen shapes", "beam directions", "beam points"
@@ -39,7 +40,7 @@ def group_of(name: str) -> str:
 class RigErrors:
     """What the p numbers of a rig are known to, and which sources of error make it."""
 
-    names: tuple[str, ...]  # (p,) as in geometry/rig_parameters.py
+    names: tuple[str, ...]  # (p,) as in geometry/uncertainty/rig_parameters.py
     covariance: Array  # (p, p)
     groups: Mapping[str, Array]  # by group (p, p): its share of the covariance; what joins groups is in none of them
     moves: Array  # (p, q) how the numbers move together when one of q errors is one sigma

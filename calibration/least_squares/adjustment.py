@@ -17,7 +17,7 @@ from scipy import sparse
 from scipy.linalg import block_diag
 from scipy.sparse.linalg import SuperLU, splu
 
-from calibration.least_squares.stacks import Stack
+from calibration.least_squares.parameter_blocks import Stack
 from geometry.arrays import Array, Bools, Ints
 
 Values = Mapping[str, Stack]

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from calibration.least_squares.adjustment import At, Linearised, Loss, Part, Values
-from calibration.least_squares.stacks import Poses, Stack, Vectors
+from calibration.least_squares.parameter_blocks import Poses, Stack, Vectors
 from geometry import rotations
 from geometry.arrays import Array
 

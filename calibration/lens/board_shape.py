@@ -14,9 +14,9 @@ import numpy as np
 from scipy.stats import chi2
 
 from calibration.least_squares.adjustment import AdjustmentError
-from calibration.lens.corner_table import CornerTable
-from calibration.lens.hold_out import HeldOut, hold_out, scatter
-from calibration.lens.lens_fit import AS_STATED, BoardFreedom, LensFit, Values, board_as_stated, fit, term_of
+from calibration.lens.fit.corner_table import CornerTable
+from calibration.lens.fit.hold_out import HeldOut, hold_out, scatter
+from calibration.lens.fit.lens_fit import AS_STATED, BoardFreedom, LensFit, Values, board_as_stated, fit, term_of
 from geometry.arrays import Array
 
 SIGNIFICANT = 1e-3  # of a true board's chance to look this wrong

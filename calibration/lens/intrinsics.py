@@ -9,14 +9,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calibration.least_squares.adjustment import AdjustmentError
-from calibration.least_squares.stacks import Poses
+from calibration.least_squares.parameter_blocks import Poses
 from calibration.lens.board_shape import Asked, BoardTest, board_test
-from calibration.lens.corner_table import CornerTable
-from calibration.lens.coverage import coverage_of, spread_deg
-from calibration.lens.hold_out import HeldOut, Scatter, hold_out, scatter
-from calibration.lens.intrinsics_findings import findings_of
-from calibration.lens.intrinsics_result import Intrinsics, Origins
-from calibration.lens.lens_fit import (
+from calibration.lens.fit.corner_table import CornerTable
+from calibration.lens.fit.coverage import coverage_of, spread_deg
+from calibration.lens.fit.hold_out import HeldOut, Scatter, hold_out, scatter
+from calibration.lens.fit.lens_fit import (
     AS_STATED,
     BOARD_STACKS,
     FEWEST_CORNERS,
@@ -28,11 +26,13 @@ from calibration.lens.lens_fit import (
     robust_fit,
     used_views,
 )
-from calibration.lens.lens_ladder import Rung, climb, union_of_used
-from calibration.lens.lens_models import LensModel
-from calibration.lens.lens_start import StartError, start
+from calibration.lens.fit.lens_models import LensModel
+from calibration.lens.fit.lens_start import StartError, start
+from calibration.lens.fit.model_selection import Rung, climb, union_of_used
+from calibration.lens.fit.projection_map import Difference, ProjectionMap, difference, projection_map
+from calibration.lens.intrinsics_findings import findings_of
+from calibration.lens.intrinsics_result import Intrinsics, Origins
 from calibration.lens.model_doubt import model_doubt
-from calibration.lens.projection_map import Difference, ProjectionMap, difference, projection_map
 from geometry.arrays import Ints
 
 FEWEST_VIEWS = 4

@@ -8,9 +8,9 @@ import numpy as np
 
 from calibration.findings import Finding, Level, unless_pass
 from calibration.lens.board_findings import circles_finding, doubt_finding, points_finding, stretch_finding
+from calibration.lens.fit.lens_models import folds_in_picture
+from calibration.lens.fit.projection_map import Difference
 from calibration.lens.intrinsics_result import Intrinsics
-from calibration.lens.lens_models import folds_in_picture
-from calibration.lens.projection_map import Difference
 
 _TILTED = "tilt the board by 20 to 45 deg to all sides and photograph it at two or three distances"
 _MORE = "take more photographs, the board tilted by 20 to 45 deg to all sides and moved into the picture's corners"

@@ -8,14 +8,14 @@ import numpy as np
 
 from calibration.findings import Finding, Level, verdict
 from calibration.lens.board_shape import BoardTest, WarpTest
-from calibration.lens.corner_table import CornerTable
-from calibration.lens.coverage import Coverage
-from calibration.lens.hold_out import HeldOut, Scatter
-from calibration.lens.lens_fit import LensFit
-from calibration.lens.lens_ladder import Ladder
-from calibration.lens.lens_models import LensModel
+from calibration.lens.fit.corner_table import CornerTable
+from calibration.lens.fit.coverage import Coverage
+from calibration.lens.fit.hold_out import HeldOut, Scatter
+from calibration.lens.fit.lens_fit import LensFit
+from calibration.lens.fit.lens_models import LensModel
+from calibration.lens.fit.model_selection import Ladder
+from calibration.lens.fit.projection_map import Difference, ProjectionMap
 from calibration.lens.model_doubt import ModelDoubt
-from calibration.lens.projection_map import Difference, ProjectionMap
 from geometry.arrays import Array
 
 

@@ -13,13 +13,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.lens.corner_table import CornerTable
-from calibration.lens.coverage import seen_at
-from calibration.lens.lens_fit import LensFit
-from calibration.lens.lens_ladder import Ladder, leaves_something
-from calibration.lens.lens_models import LensModel, undistorted
-from calibration.lens.projection_map import ProjectionMap
-from calibration.lens.residual_cells import beyond_noise, cell_means
+from calibration.lens.fit.corner_table import CornerTable
+from calibration.lens.fit.coverage import seen_at
+from calibration.lens.fit.lens_fit import LensFit
+from calibration.lens.fit.lens_models import LensModel, undistorted
+from calibration.lens.fit.model_selection import Ladder, leaves_something
+from calibration.lens.fit.projection_map import ProjectionMap
+from calibration.lens.fit.residual_cells import beyond_noise, cell_means
 from geometry.arrays import Array, Ints
 from geometry.camera import project_points_full
 

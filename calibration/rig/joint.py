@@ -13,21 +13,21 @@ import numpy as np
 from scipy.special import chdtri
 
 from calibration.beams.beams import Stand
-from calibration.beams.spot_term import SpotPixels, SpotTerm
 from calibration.least_squares.adjustment import Adjusted, At, Cauchy, Free, Limits, Term, Values, solve
+from calibration.least_squares.parameter_blocks import Poses
 from calibration.least_squares.priors import Prior
-from calibration.least_squares.some_rows import picked, rows_of, widened
-from calibration.least_squares.stacks import Poses
 from calibration.rig.measurement_groups import GroupFit, Unknowns, group_fit, information
-from calibration.rig.pose_records import RecordTerm
-from calibration.rig.rig_stacks import BEAMS, BOWS, CAMERAS, INTRINSICS, POSES, SCREENS, STAND, named_errors, rig_of
 from calibration.screens.flatness import smallest_scatter
 from calibration.screens.network import Network, NetworkFit, flat_boards, sighting_sigmas
-from calibration.screens.surveyed import FrameTerm, PointTerm, SurfaceTerm, SurveyTerm, pose_of, whitening
+from calibration.terms.pose_records import RecordTerm
+from calibration.terms.rig_blocks import BEAMS, BOWS, CAMERAS, INTRINSICS, POSES, SCREENS, STAND, named_errors, rig_of
+from calibration.terms.spot_term import SpotPixels, SpotTerm
+from calibration.terms.surveyed import FrameTerm, PointTerm, SurfaceTerm, SurveyTerm, pose_of, whitening
+from calibration.terms.term_subset import picked, rows_of, widened
 from geometry.arrays import Array, Bools
 from geometry.camera import FISHEYE
 from geometry.rig import Rig
-from geometry.rig_parameters import RigCovariance
+from geometry.uncertainty.rig_parameters import RigCovariance
 
 # The kinds of measurement, in words that a report can use.
 LENSES, SURVEY, DOTS, SURFACES = "lens calibrations", "survey", "pixels of dots", "screen surfaces"

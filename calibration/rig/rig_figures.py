@@ -9,16 +9,16 @@ import numpy as np
 from scipy.stats import chi2 as chi2_distribution
 
 from calibration.beams.beam_findings import FEWEST_POSITIONS
-from calibration.beams.spot_term import SpotPixels, SpotTerm
 from calibration.rig.joint import SPOTS, Joint, Measured, calibrate_jointly
 from calibration.rig.measurement_groups import jacobian, shares
-from calibration.rig.rig_stacks import POSES, STAND, named_errors
-from calibration.screens.surveyed import pose_of
+from calibration.terms.rig_blocks import POSES, STAND, named_errors
+from calibration.terms.spot_term import SpotPixels, SpotTerm
+from calibration.terms.surveyed import pose_of
 from geometry.arrays import Array, Ints, symmetric
+from geometry.forward_model import SpotModel
 from geometry.pose import Pose
-from geometry.rig_parameters import Sensitivity
-from geometry.solve import fit_pose
-from geometry.spots import SpotModel
+from geometry.pose_solver.gauss_newton import fit_pose
+from geometry.uncertainty.rig_parameters import Sensitivity
 
 FOLDS = 5  # parts into which the positions are divided; each is predicted by the other four
 
@@ -73,7 +73,7 @@ def central_pose(joint: Joint) -> Pose:
 def expected_pose(joint: Joint, world_from_body: Pose, spot_sigma_px: float) -> ExpectedPose | None:
     """The covariance of a pose measured from one frame with the calibrated rig; None where too few spots are seen.
 
-    The solution weighs noise and calibration together as geometry/solve.py does.
+    The solution weighs noise and calibration together as geometry/pose_solver/gauss_newton.py does.
     """
     model = SpotModel.of(joint.rig)
     d = model.derivatives(world_from_body)

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 from calibration.beams.beams import BeamCalibration, Stand, calibrate_beams
 from calibration.beams.excitation import Motion, briefly
-from calibration.beams.spot_term import SpotPixels
 from calibration.least_squares.adjustment import AdjustmentError
 from calibration.rig.joint import Joint, Measured, calibrate_jointly
-from calibration.rig.rig_stacks import BEAMS, POSES, STAND
 from calibration.screens.screens import ScreensResult
+from calibration.terms.rig_blocks import BEAMS, POSES, STAND
+from calibration.terms.spot_term import SpotPixels
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,19 +14,19 @@ import numpy as np
 from scipy.stats import chi2 as chi2_distribution
 
 from calibration.least_squares.adjustment import Adjusted, At, Cauchy, Term, Values, solve
+from calibration.least_squares.parameter_blocks import Poses, Stack, Vectors
 from calibration.least_squares.priors import Prior, independent
-from calibration.least_squares.some_rows import picked
-from calibration.least_squares.stacks import Poses, Stack, Vectors
-from calibration.lens.corners import CornerTerm
-from calibration.rig.rig_stacks import named_errors, rig_of, stacks_of
-from calibration.screens.board_on_screen import BoardOnScreenTerm
 from calibration.screens.flatness import smallest_scatter
-from calibration.screens.surveyed import FrameTerm, PointTerm, SurfaceTerm, SurveyTerm, array_of, whitening
+from calibration.terms.board_on_screen import BoardOnScreenTerm
+from calibration.terms.corners import CornerTerm
+from calibration.terms.rig_blocks import named_errors, rig_of, stacks_of
+from calibration.terms.surveyed import FrameTerm, PointTerm, SurfaceTerm, SurveyTerm, array_of, whitening
+from calibration.terms.term_subset import picked
 from geometry.arrays import Array, Bools, Ints
 from geometry.camera import FISHEYE
 from geometry.pose import Pose
 from geometry.rig import Rig
-from geometry.rig_parameters import RigCovariance
+from geometry.uncertainty.rig_parameters import RigCovariance
 
 OUTLIER_SIGMAS = 5.0  # in two dimensions one right point of 270 000 lies farther off
 WARP_SIGMA_M = 1e-3  # by how much a board may be bent at its edge

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from calibration.least_squares.parameter_blocks import Poses, Vectors
 from calibration.least_squares.priors import Prior
-from calibration.least_squares.stacks import Poses, Vectors
 from calibration.screens.flatness import Flatness, Surface, judge_flatness
 from calibration.screens.network import Network, NetworkFit, adjust
 from calibration.screens.network_start import CameraOnDots, boards_seen, camera_on_dots, chain, start_of

@@ -5,8 +5,8 @@ from __future__ import annotations
 import datetime
 
 from calibration.findings import Finding, Level
-from lab.calibrate.project import Project
 from lab.errors import InputError
+from lab.files.project.project import Project
 
 
 def day_of(project: Project, today: datetime.date | None) -> datetime.date:

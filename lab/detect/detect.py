@@ -12,17 +12,17 @@ from typing import Any
 
 import numpy as np
 
-from lab import columns
+from lab.detect.contact_sheet import ContactSheet
 from lab.detect.inputs import PictureFiles, Video, open_inputs
 from lab.detect.work import Work
 from lab.errors import InputError
-from lab.json_text import write_json
-from lab.parameter_overrides import overridden
-from lab.pictures import Missing
-from lab.report.contact_sheet import ContactSheet
-from lab.tables import csv_word, detection_rows
+from lab.files.run.parameter_overrides import overridden
+from lab.files.text import columns
+from lab.files.text.atomic_write import whole_folder
+from lab.files.text.json_text import write_json
+from lab.pictures.picture_file import Missing
+from lab.runs.tables import csv_word, detection_rows
 from lab.versions import versions
-from lab.whole_folder import whole_folder
 from tracking.parameters import DetectParameters, TrackerParameters
 
 SCHEMA = "beampose/detect/1"
@@ -89,7 +89,7 @@ def detect_pictures(
         _search_all(inputs, work, sheet, folder / "detections.csv", options, progress)
         _conclude(work)
         sheet.write(folder / SHEET)
-        from lab.report.detect_page import write_detect_page  # the template engine: only when there is a result
+        from lab.detect.detect_page import write_detect_page  # the template engine: only when there is a result
 
         write_json(_summary(work, options, time.perf_counter() - started), folder / "summary.json")
         write_detect_page(work, sheet, folder)

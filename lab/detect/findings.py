@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from geometry.arrays import Array
-from lab.sensor_noise import CameraNoise
+from lab.runs.frames.sensor_noise import CameraNoise
 from tracking.detections import Detections
 
 MOST_KEPT = 400_000  # spots of which sizes and places are kept for figures; beyond, every second one, and so on

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lab.errors import InputError
-from lab.frame_sources import VideoSource, number_of, open_video, promised_pictures
-from lab.frames import AHEAD, THREADS
-from lab.pictures import SUFFIXES, Grey, Missing, read_picture
-from lab.sensor_noise import VIDEO_PICTURES, frames_to_learn_from
+from lab.pictures.picture_file import SUFFIXES, Grey, Missing, read_picture
+from lab.runs.frames.frame_sources import VideoSource, number_of, open_video, promised_pictures
+from lab.runs.frames.frames import AHEAD, THREADS
+from lab.runs.frames.sensor_noise import VIDEO_PICTURES, frames_to_learn_from
 
 _HINT = f"a picture ({', '.join(s[1:] for s in SUFFIXES)}), a folder of pictures, or a video"
 _SHOWN = 3  # names in a message

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from lab.detect.findings import SizeGroup, SpotCollection, matched_snr
-from lab.pictures import Grey
-from lab.sensor_noise import CameraNoise
+from lab.pictures.picture_file import Grey
+from lab.runs.frames.sensor_noise import CameraNoise
 from tracking.detections import Detections
 from tracking.parameters import DetectParameters
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.boards.board_drawing import ink_at
-from calibration.boards.kinds import Board
+from calibration.boards.board_types import Board
 from geometry.arrays import Array, Bools, Ints
 from geometry.camera import Camera
 from geometry.pose import Pose

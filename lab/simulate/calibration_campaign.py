@@ -6,20 +6,20 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibration.beams.spot_term import SpotPixels
 from calibration.least_squares.adjustment import solve
-from calibration.least_squares.stacks import Poses, Stack, Vectors
-from calibration.lens.corners import single_camera
+from calibration.least_squares.parameter_blocks import Poses, Stack, Vectors
+from calibration.terms.corners import single_camera
+from calibration.terms.spot_term import SpotPixels
 from geometry.arrays import Array, Bools, Ints
 from geometry.camera import FISHEYE, Camera, in_picture, pinhole_numbers
+from geometry.forward_model import SpotModel
 from geometry.lens import padded
 from geometry.pose import Pose
 from geometry.rig import Beam, Rig, Screen
-from geometry.rig_parameters import PINHOLE, distortion_names
-from geometry.spots import SpotModel
+from geometry.uncertainty.rig_parameters import PINHOLE, distortion_names
 from lab.errors import InputError
+from lab.files.text.yaml_text import did_you_mean
 from lab.simulate.rigs import RIGS
-from lab.yaml_text import did_you_mean
 
 # One stream of random numbers per subject, so that more dots do not change the stand's positions.
 _MOUNTING, _LENSES, _DOTS, _PIXELS, _STAND, _SPOTS, _WRONG = range(7)

@@ -13,22 +13,22 @@ from typing import Any
 
 import cv2
 
-from calibration.boards import kinds as boards
+from calibration.boards import board_types as boards
 from geometry.arrays import Array
 from geometry.camera import Camera
 from geometry.pose import Pose
-from lab import columns
-from lab.calibrate.board_file import save_board
-from lab.calibrate.camera_file import CameraCalibration, CameraFile, save_camera
-from lab.calibrate.point_files import POINTS, POSE_SIGMAS, SURVEY, SURVEY_SIGMAS
-from lab.calibrate.project import SCHEMA
-from lab.camera_block import Covariance
 from lab.errors import InputError
-from lab.rig_file import RigFile, as_mapping, pose_mapping, save_rig
+from lab.files.project.point_files import POINTS, POSE_SIGMAS, SURVEY, SURVEY_SIGMAS
+from lab.files.project.project import SCHEMA
+from lab.files.rig.board_file import save_board
+from lab.files.rig.camera_block import Covariance
+from lab.files.rig.camera_file import CameraCalibration, CameraFile, save_camera
+from lab.files.rig.rig_file import RigFile, as_mapping, pose_mapping, save_rig
+from lab.files.text import columns
+from lab.files.text.atomic_write import whole_folder
+from lab.files.text.yaml_text import write_mapping
 from lab.simulate.board_photo import Look, photograph
 from lab.simulate.calibration_campaign import Campaign, LensDraw, Quality, board_poses, draw_campaign
-from lab.whole_folder import whole_folder
-from lab.yaml_text import write_mapping
 
 PROJECT = "calibration.yaml"
 BOARD = "charuco:11x9:36mm:27mm:DICT_4X4_100"  # its corners count also where the board leaves the picture

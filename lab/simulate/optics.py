@@ -8,8 +8,8 @@ import numpy as np
 
 from geometry.arrays import Array
 from geometry.camera import project_points
+from geometry.forward_model import SpotModel
 from geometry.pose import Pose
-from geometry.spots import SpotModel
 
 _REACH = 5.0  # sigmas that are drawn: a 150 DN spot ends below 0.001 DN
 # Gauss-Legendre nodes within a pixel, per axis. With four, the sum over a pixel of a Gaussian with sigma 0.5 px is

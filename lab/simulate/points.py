@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from geometry.arrays import Array, Bools, Ints
+from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.rig import Rig
-from geometry.spots import SpotModel
 from lab.simulate.scenarios import Prior, Scenario
 from lab.simulate.scene import HIDDEN, POINT_NOISE, SHINING, compose, with_overrides
 from tracking.detections import Detections

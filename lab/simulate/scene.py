@@ -13,9 +13,9 @@ import numpy as np
 from geometry import rotations
 from geometry.arrays import Array, Bools, Ints
 from geometry.camera import SensorNoise
+from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.rig import Rig
-from geometry.spots import SpotModel
 from lab.errors import InputError
 from lab.simulate.motion import Motion
 from lab.simulate.rigs import RIGS, scaled, with_noise

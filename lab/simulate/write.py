@@ -13,12 +13,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from geometry.forward_model import SpotModel
 from geometry.rig import Rig
-from geometry.spots import SpotModel
-from lab import columns
 from lab.errors import InputError
-from lab.rig_file import RigFile, load_rig_file, save_rig
-from lab.run_file import save_run
+from lab.files.rig.rig_file import RigFile, load_rig_file, save_rig
+from lab.files.run.run_file import save_run
+from lab.files.text import columns
 from lab.simulate.picture import Picture, Powers, Sensor, laser_powers, make_sensor, take
 from lab.simulate.points import simulate_points
 from lab.simulate.scenarios import LIGHTS, Scenario

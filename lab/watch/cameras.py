@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lab.errors import InputError
-from lab.frame_sources import retrieved
-from lab.opencv import quiet_cv2
-from lab.pictures import UNREADABLE, Missing, read_picture
+from lab.pictures.opencv import quiet_cv2
+from lab.pictures.picture_file import UNREADABLE, Missing, read_picture
+from lab.runs.frames.frame_sources import retrieved
 from lab.watch.folder_poll import FolderPoll
 from lab.watch.frame_clock import FrameClock
 from lab.watch.inbox import Inbox

@@ -8,7 +8,7 @@ import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from lab.frame_sources import number_of
+from lab.runs.frames.frame_sources import number_of
 
 _AHEAD = 3  # names that are tried beyond the latest
 _BEHIND = 8  # ... and numbers below it, which another thread of the recorder may still write

@@ -13,7 +13,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from lab.pictures import DROPPED, Grey, Missing
+from lab.pictures.picture_file import DROPPED, Grey, Missing
 from tracking.detections import Detections
 
 MOST_WAITING = 64  # pictures of one camera that wait here; of a folder the others wait on disk

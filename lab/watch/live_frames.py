@@ -11,11 +11,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from lab.detections_file import LONGEST_GAP
 from lab.errors import BeamposeError, InputError
-from lab.frames import FrameSet
-from lab.pictures import Grey, Missing
-from lab.run_file import FramesFolder, LiveDevice, Run
+from lab.files.run.detections_file import LONGEST_GAP
+from lab.files.run.run_file import FramesFolder, LiveDevice, Run
+from lab.pictures.picture_file import Grey, Missing
+from lab.runs.frames.frames import FrameSet
 from lab.watch.cameras import DeviceCamera, FolderCamera, LiveCamera, in_thread, open_device
 from lab.watch.folder_poll import FolderPoll
 from lab.watch.inbox import CameraBox, Inbox, is_complete

@@ -13,14 +13,14 @@ from typing import Any, TextIO
 
 import numpy as np
 
-from lab import columns
 from lab.errors import InputError
-from lab.frame_checks import FrameChecks
-from lab.json_text import plain
-from lab.pipeline import FrameRecord
-from lab.tables import attitude_rows, pose_numbers
+from lab.files.text import columns
+from lab.files.text.atomic_write import replace_folder
+from lab.files.text.json_text import plain
+from lab.runs.frames.pipeline import FrameRecord
+from lab.runs.tables import attitude_rows, pose_numbers
+from lab.runs.verdict.frame_checks import FrameChecks
 from lab.watch.live_frames import LiveFrames
-from lab.whole_folder import replace_folder
 
 LIVE_TABLE = "attitude_live.csv"
 

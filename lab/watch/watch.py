@@ -17,19 +17,19 @@ from typing import Any
 
 import numpy as np
 
+from geometry.forward_model import SpotModel
 from geometry.pose import Pose
-from geometry.spots import SpotModel
 from lab.errors import InputError, RunError
-from lab.frame_checks import FrameChecks
-from lab.pictures import Grey
-from lab.pipeline import Pipeline, tracker_of
-from lab.process import Outcome, are_results, ready_run, write_results
-from lab.run_file import LiveDevice, Run
-from lab.sensor_noise import CameraNoise
-from lab.two_passes import TRACKING, Progress
+from lab.files.run.run_file import LiveDevice, Run
+from lab.files.text.atomic_write import whole_folder
+from lab.pictures.picture_file import Grey
+from lab.runs.frames.pipeline import Pipeline, tracker_of
+from lab.runs.frames.sensor_noise import CameraNoise
+from lab.runs.process import Outcome, are_results, ready_run, write_results
+from lab.runs.smoothing_pass import TRACKING, Progress
+from lab.runs.verdict.frame_checks import FrameChecks
 from lab.watch.live_frames import LiveFrames, WatchOptions
 from lab.watch.live_output import Latency, LiveOutput, UdpLines, is_live_table
-from lab.whole_folder import whole_folder
 from tracking.detections import Detections
 
 _log = logging.getLogger("beampose")

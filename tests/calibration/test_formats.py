@@ -19,7 +19,7 @@ from calibration.formats.model import ROOM, CameraModel, FormatError, Read, sign
 from geometry.camera import FISHEYE, PERSPECTIVE
 from geometry.pose import Pose
 from geometry.rotations import exp
-from lab.yaml_text import parse_mapping
+from lab.files.text.yaml_text import parse_mapping
 
 MODULES = {m.NAME: m for m in (opencv_yaml, kalibr, ros, colmap, mrcal)}
 

@@ -23,12 +23,12 @@ from calibration.budget.pose_budget import (
     group_of,
     worst_direction,
 )
-from geometry.calibration_spread import CalibrationSpread
+from geometry.forward_model import SpotModel
 from geometry.pose import Pose
+from geometry.pose_solver.gauss_newton import fit_pose
 from geometry.rig import Rig
-from geometry.rig_parameters import RigCovariance, Sensitivity, moved
-from geometry.solve import fit_pose
-from geometry.spots import SpotModel
+from geometry.uncertainty.rig_parameters import RigCovariance, Sensitivity, moved
+from geometry.uncertainty.rig_uncertainty import CalibrationSpread
 from tests.geometry.scenes import LENSES, paper_rig
 
 SIGMA_PX = 0.1

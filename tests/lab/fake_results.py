@@ -17,12 +17,12 @@ import numpy as np
 from geometry import rotations
 from geometry.arrays import Array
 from geometry.camera import Camera
+from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.rig import Beam, Rig, Screen, Spot
-from geometry.spots import SpotModel
-from lab import columns
-from lab.rig_file import save_rig
-from lab.run_file import save_run
+from lab.files.rig.rig_file import save_rig
+from lab.files.run.run_file import save_run
+from lab.files.text import columns
 
 NOISE_PX = 0.1
 RATE_HZ = 100.0

@@ -7,8 +7,8 @@ import csv
 import numpy as np
 import pytest
 
-from lab.experiment_huo2015 import NOISE_PX, repeat_huo2015, same_spots
-from lab.studies import COLUMNS, study_huo2015
+from lab.study.experiment_huo2015 import NOISE_PX, repeat_huo2015, same_spots
+from lab.study.studies import COLUMNS, study_huo2015
 
 FRAMES = 200  # a bend, and spots 3 and 6 leave the picture
 

@@ -15,11 +15,12 @@ import numpy as np
 import pytest
 import yaml
 
-from lab import columns, sensor_noise
 from lab.errors import InputError, RunError
-from lab.pictures import Missing, read_picture
-from lab.process import process_run
-from lab.run_file import LiveDevice, load_run
+from lab.files.run.run_file import LiveDevice, load_run
+from lab.files.text import columns
+from lab.pictures.picture_file import Missing, read_picture
+from lab.runs.frames import sensor_noise
+from lab.runs.process import process_run
 from lab.simulate.write import simulate
 from lab.watch import watch
 from lab.watch.cameras import DeviceCamera, FolderCamera

@@ -28,10 +28,10 @@ from bench.random_pictures.sensors import Sensor, true_noise
 from bench.random_pictures.write_folder import write_pictures
 from bench.random_scenes.__main__ import main
 from bench.random_scenes.write_folder import write_run_folder
-from lab.frames import open_frames
-from lab.pictures import Missing
-from lab.process import process_run
-from lab.run_file import load_run
+from lab.files.run.run_file import load_run
+from lab.pictures.picture_file import Missing
+from lab.runs.frames.frames import open_frames
+from lab.runs.process import process_run
 from tracking.noise import NoiseModel
 
 SMALL = ((320, 256),)

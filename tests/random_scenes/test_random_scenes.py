@@ -21,12 +21,12 @@ from bench.random_scenes.report import summary
 from bench.random_scenes.scene import CLUTTER, HIDDEN, OUTSIDE, SHINING, Scene, random_scene
 from bench.random_scenes.vehicles import LEAST_SPOTS
 from bench.random_scenes.write_folder import write_run_folder
-from geometry.solve import fit_pose
-from geometry.spots import SpotModel
-from lab.frames import open_frames
-from lab.pictures import Missing
-from lab.run_file import load_run
-from lab.truth import load_truth
+from geometry.forward_model import SpotModel
+from geometry.pose_solver.gauss_newton import fit_pose
+from lab.files.run.run_file import load_run
+from lab.files.run.truth import load_truth
+from lab.pictures.picture_file import Missing
+from lab.runs.frames.frames import open_frames
 from tracking.detections import Detections
 
 FRAMES = 40

@@ -7,21 +7,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from geometry.arrays import Array, Bools, Ints
+from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.rig import Rig
-from geometry.rig_parameters import RigCovariance
-from geometry.spots import SpotModel
+from geometry.uncertainty.rig_parameters import RigCovariance
 from lab.simulate.points import CLUTTER, PointRun
 from lab.simulate.scenarios import Prior
 from lab.simulate.scene import HIDDEN, OUTSIDE, SHINING
-from tracking.detections import Detections
-from tracking.labels import PosePrior
-from tracking.match import UNMATCHED
+from tracking.detections import UNMATCHED, Detections
+from tracking.labelling.first_labels import PosePrior
 from tracking.parameters import TrackerParameters
-from tracking.recording import Recording
-from tracking.rigid_tracker import RigidTracker
-from tracking.smoothed import Smoothed
-from tracking.smoother import smooth
+from tracking.rigid_body.rigid_tracker import RigidTracker
+from tracking.smoothing.recording import Recording
+from tracking.smoothing.smoothed import Smoothed
+from tracking.smoothing.smoother import smooth
 from tracking.tracked_frame import TrackedFrame
 
 START = 10  # frames until the velocities are known

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from geometry.forward_model import SpotModel
 from geometry.pose import Pose
-from geometry.solve import fit_pose
-from geometry.spots import SpotModel
+from geometry.pose_solver.gauss_newton import fit_pose
 from tests.geometry.scenes import paper_rig, random_pose
 from tracking.consistency import (
     CausalAgreement,

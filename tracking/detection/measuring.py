@@ -8,14 +8,14 @@ from typing import NamedTuple
 import numpy as np
 
 from geometry.arrays import Array, Ints
-from geometry.compiled import compiled, compiled_for_threads
+from geometry.compiled.jit import compiled, compiled_for_threads
 from tracking.detection import candidates, ellipse
 from tracking.detection.candidates import Noise, texture_variance
-from tracking.detection.compact import CENTRE_SHARE, height_of_compact
 from tracking.detection.gaussian_fit import fit_all
 from tracking.detection.moments import find_moments
 from tracking.detection.pixels import Pixels
 from tracking.detection.regions import in_a_region
+from tracking.detection.saturated_spots import CENTRE_SHARE, height_of_compact
 from tracking.detection.table import (
     ACTIVE,
     CHI2,

@@ -1,0 +1,1 @@
+"""Fitting lens models to board corners, and choosing one."""

@@ -1,0 +1,98 @@
+"""Which parts of the sensor a board was seen on, and how variously it was tilted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from calibration.lens.fit.corner_table import CornerTable
+from geometry.arrays import Array, Bools
+from geometry.pose import Pose
+
+_CELLS = 96  # across the picture, for the share that is filled
+_NEAR_CORNER = 0.18  # of the diagonal: a board's point this near to the picture's corner tells of the lens there
+_NEAR_SIDE = 0.12  # of the picture's width or height
+
+
+@dataclass(frozen=True, slots=True)
+class Coverage:
+    """Where on the sensor, and from which directions, the board was seen."""
+
+    filled: float  # share of the picture's area within the corners of some view
+    gaps: tuple[str, ...]  # sides and corners of the picture that no board came near
+    tilt_deg: Array  # (V,): of the board's normal against the optical axis; nan where not used
+    azimuth_deg: Array  # (V,): towards which it leaned
+    spread_deg: float  # the largest angle between two boards' normals
+
+
+def coverage_of(table: CornerTable, used: Bools, camera_from_board: Pose) -> Coverage:
+    """Of the used corners (N,), with the V poses of the board."""
+    in_use = table.counts(used) > 0
+    normals = camera_from_board.rotation[..., 2]
+    tilt = np.degrees(np.arccos(np.clip(normals[:, 2], -1, 1)))
+    azimuth = np.degrees(np.arctan2(normals[:, 1], normals[:, 0]))
+    return Coverage(
+        filled=_filled(table, used),
+        gaps=_gaps(table.pixels[used], table.image_size_px),
+        tilt_deg=np.where(in_use, tilt, np.nan),
+        azimuth_deg=np.where(in_use, azimuth, np.nan),
+        spread_deg=spread_deg(normals[in_use]),
+    )
+
+
+def spread_deg(normals: Array) -> float:
+    """The largest angle between two of some unit vectors (n, 3); 0 for fewer than two."""
+    if len(normals) < 2:
+        return 0.0
+    return float(np.degrees(np.arccos(np.clip(normals @ normals.T, -1, 1).min())))
+
+
+def _filled(table: CornerTable, used: Bools) -> float:
+    return float(_mask(table, used).mean())
+
+
+def seen_at(table: CornerTable, used: Bools, pixels: Array) -> Bools:
+    """Which pixels (..., 2) lie within the corners of some view; nan ones do not."""
+    mask = _mask(table, used)
+    scale = _CELLS / table.image_size_px[0]
+    cell = np.nan_to_num((pixels + 0.5) * scale, nan=-1.0)
+    i, j = np.floor(cell[..., 1]).astype(int), np.floor(cell[..., 0]).astype(int)
+    inside = (i >= 0) & (j >= 0) & (i < mask.shape[0]) & (j < mask.shape[1])
+    out: Bools = inside & mask[np.clip(i, 0, mask.shape[0] - 1), np.clip(j, 0, mask.shape[1] - 1)]
+    return out
+
+
+def _mask(table: CornerTable, used: Bools) -> Bools:
+    """(rows, _CELLS): the parts of the picture within the corners of some view."""
+    width, height = table.image_size_px
+    scale = _CELLS / width
+    mask = np.zeros((max(1, round(height * scale)), _CELLS), dtype=np.uint8)
+    for v in np.flatnonzero(table.counts(used) > 2):
+        corners = (table.pixels[used & (table.view == v)] + 0.5) * scale - 0.5
+        cv2.fillConvexPoly(mask, cv2.convexHull(corners.astype(np.float32)).round().astype(np.int32), 1)
+    return np.asarray(mask > 0)
+
+
+def _gaps(pixels: Array, size: tuple[int, int]) -> tuple[str, ...]:
+    width, height = size
+    u, v = pixels.T
+    sides = {
+        "left side": u.min() / width,
+        "right side": 1 - u.max() / width,
+        "top": v.min() / height,
+        "bottom": 1 - v.max() / height,
+    }
+    empty = [name for name, share in sides.items() if share > _NEAR_SIDE]
+    diagonal = np.hypot(width, height)
+    for name, x, y in (
+        ("top left corner", 0, 0),
+        ("top right corner", width, 0),
+        ("bottom left corner", 0, height),
+        ("bottom right corner", width, height),
+    ):
+        told = any(word in name for side in empty for word in side.split()[:1])
+        if not told and np.hypot(u - x, v - y).min() / diagonal > _NEAR_CORNER:
+            empty.append(name)
+    return tuple(empty)

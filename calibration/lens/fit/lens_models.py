@@ -1,0 +1,131 @@
+"""The rungs of the lens ladder: which distortion numbers a model has, and whether a lens draws the whole picture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from calibration.terms.corners import INTRINSICS
+from geometry import lens
+from geometry.arrays import Array, Bools
+from geometry.camera import FISHEYE, PERSPECTIVE
+from geometry.uncertainty.rig_parameters import DISTORTION, FISHEYE_DISTORTION, PINHOLE
+
+_BORDER = 25  # pixels asked of along each side of the picture; between them a lens bends by little
+
+
+@dataclass(frozen=True, slots=True)
+class LensModel:
+    """Which kind of lens, and how many distortion numbers are free."""
+
+    coefficients: int  # 0, 4, 5, 8 or 12; of a fisheye 4
+    lens: str = PERSPECTIVE
+
+    def __post_init__(self) -> None:
+        allowed = (4,) if self.lens == FISHEYE else (0, 4, 5, 8, 12)
+        if self.lens not in (PERSPECTIVE, FISHEYE) or self.coefficients not in allowed:
+            raise ValueError(f"expected one of the models {', '.join(m.title for m in LADDER)}")
+
+    @property
+    def fisheye(self) -> bool:
+        """Whether the numbers are those of OpenCV's fisheye model."""
+        return self.lens == FISHEYE
+
+    @property
+    def title(self) -> str:
+        """`5` or `fisheye`: how reports and options name it."""
+        return FISHEYE if self.fisheye else str(self.coefficients)
+
+    @property
+    def words(self) -> str:
+        """The name in a sentence."""
+        return "fisheye lens, 4 coefficients" if self.fisheye else f"perspective lens, {self.coefficients} coefficients"
+
+    @property
+    def free(self) -> Bools:
+        """(18,): which of fx, fy, cx, cy and the fourteen distortion numbers a solve may move."""
+        return np.arange(INTRINSICS) < 4 + self.coefficients
+
+    def cut(self, numbers: Array) -> Array:
+        """The lens (18,) without what this model does not have."""
+        return np.where(self.free, numbers, 0.0)
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the free numbers, in order."""
+        names = FISHEYE_DISTORTION if self.fisheye else DISTORTION
+        return (*PINHOLE, *names[: self.coefficients])
+
+
+# From the least to the most that a model can take up. Fisheye stands before the rational model: it has as many numbers
+# as the second rung, but bends even with all of them 0.
+LADDER = (
+    LensModel(0),
+    LensModel(4),
+    LensModel(5),
+    LensModel(4, FISHEYE),
+    LensModel(8),
+    LensModel(12),
+)
+
+
+def named(title: str) -> LensModel:
+    """The model that `title` names. Raises ValueError with the known names."""
+    for model in LADDER:
+        if model.title == title:
+            return model
+    raise ValueError(f"expected a lens model out of {', '.join(m.title for m in LADDER)}, got {title!r}")
+
+
+def rational_of_fisheye(numbers: Array, widest_rad: float) -> Array:
+    """The perspective lens (18,) with k1 ... k6 that draws about what a fisheye (18,) does up to an angle off its axis.
+
+    Linear least squares over the radius: of d = r N / D, the equation N - (d / r) D = 0.
+    """
+    angle = np.linspace(0, min(widest_rad, np.deg2rad(80)), 200)[1:]
+    r2 = np.tan(angle) ** 2
+    points = np.stack([np.tan(angle), 0 * angle], axis=1)
+    scale = lens.distort_fisheye(points, np.broadcast_to(numbers[4:], (len(angle), 14)))[0][:, 0] / points[:, 0]
+    powers = np.stack([r2, r2**2, r2**3], axis=1)
+    weight = (1 / (1 + r2**3))[:, None]
+    A = np.concatenate([powers, -scale[:, None] * powers], axis=1) * weight
+    norm = np.linalg.norm(A, axis=0)
+    k = np.linalg.lstsq(A / norm, (scale - 1) * weight[:, 0], rcond=1e-10)[0] / norm
+    out = np.zeros(INTRINSICS)
+    out[:4] = numbers[:4]
+    out[[4, 5, 8]], out[9:12] = k[:3], k[3:]
+    return out
+
+
+def fold_r2(numbers: Array, fisheye: bool) -> float:
+    """The squared normalised radius up to which a lens (18,) is one to one along every ray from the middle."""
+    coefficients = tuple(float(v) for v in numbers[4:])
+    return lens.fisheye_fold_limit(coefficients[:4]) if fisheye else lens.fold_limit(coefficients)
+
+
+def folds_in_picture(numbers: Array, fisheye: bool, image_size_px: tuple[int, int]) -> bool:
+    """Whether some pixel of the picture's border is one that the lens (18,) draws nothing to, or draws twice.
+
+    Inside the border it then holds as well: a radial model that reaches the corners has grown all the way there.
+    A fisheye that grows up to 90 deg off its axis does not fold; its pixels farther out see nothing in front.
+    """
+    if fisheye and np.isinf(fold_r2(numbers, fisheye)):
+        return False
+    width, height = image_size_px
+    along_x, along_y = np.linspace(-0.5, width - 0.5, _BORDER), np.linspace(-0.5, height - 0.5, _BORDER)
+    border = np.concatenate(
+        [
+            np.stack([along_x, np.full(_BORDER, -0.5)], axis=1),
+            np.stack([along_x, np.full(_BORDER, height - 0.5)], axis=1),
+            np.stack([np.full(_BORDER, -0.5), along_y], axis=1),
+            np.stack([np.full(_BORDER, width - 0.5), along_y], axis=1),
+        ]
+    )
+    return bool(np.isnan(undistorted(border, numbers, fisheye)).any())
+
+
+def undistorted(pixels: Array, numbers: Array, fisheye: bool) -> Array:
+    """Normalised image points X/Z, Y/Z (n, 2) of pixels (n, 2) through a lens (18,); nan where there is none."""
+    bent = (pixels - numbers[2:4]) / numbers[:2]
+    return lens.undistort(bent, numbers[4:], fold_r2(numbers, fisheye), fisheye)

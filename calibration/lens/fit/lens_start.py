@@ -1,0 +1,160 @@
+"""Start values for a camera of which nothing is known: focal lengths tried, poses of the board from them.
+
+Several starts, and the best one after a short solve on some of the views: OpenCV's solvers have been seen to end in bad
+minima without a start (4.13: 22 of 300 strongly distorted sets), with a seeded focal length in none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+from calibration.least_squares.adjustment import AdjustmentError, Cauchy
+from calibration.lens.fit.corner_table import CornerTable
+from calibration.lens.fit.lens_fit import AS_STATED, FEWEST_CORNERS, Values, adjust, lens_of, term_of, values_of
+from calibration.lens.fit.lens_models import LensModel, folds_in_picture, undistorted
+from calibration.terms.corners import INTRINSICS
+from geometry.arrays import Array, Bools, Ints
+from geometry.camera import FISHEYE
+from geometry.pose import Pose
+
+TRIAL_VIEWS = 25  # enough to tell a good start from a bad one
+_PERSPECTIVE_GUESSES = (0.5, 0.9, 1.8)  # focal lengths over the longer side: 90, 58 and 31 deg across
+_FISHEYE_GUESSES = (1 / np.pi, 0.5, 0.9)  # 180, 115 and 64 deg across
+_WIDEST = np.deg2rad(75.0)  # off the axis: beyond it the normalised image that a pose is found in stretches without end
+
+
+class StartError(ValueError):
+    """No start explains the corners: the words say what was wrong with them."""
+
+
+def start(table: CornerTable, fisheye: bool) -> tuple[LensModel, Values]:
+    """The best start of a kind of lens, with a pose for every view (nan where none explains its corners).
+
+    Raises StartError where no start can be made, or where the board is seen as in a mirror.
+    """
+    model = LensModel(4, FISHEYE) if fisheye else LensModel(5)
+    trial = table.only_views(_spread_out(table))
+    best: tuple[float, Array] | None = None
+    mirrored = 0
+    guesses = _guesses(trial, fisheye)
+    for focal in guesses:
+        lens = _first_lens(focal, table.image_size_px)
+        poses, back_to_front = _poses(trial, lens, fisheye)
+        mirrored += back_to_front
+        found = np.asarray(np.isfinite(poses.translation).all(axis=1))
+        trusted = found[trial.view]
+        if not trusted.any():
+            continue
+        try:
+            values = _short_solve(trial, trusted, model, values_of(lens, poses, len(table.board_points)))
+        except AdjustmentError:
+            continue
+        left = np.linalg.norm(term_of(trial, trusted, fisheye).project(values) - trial.pixels[trusted], axis=1)
+        # Half of the corners may be wrong without a say in which start is best; a view without a pose counts as bad.
+        error = float(np.median(np.concatenate([left, np.full(len(trial) - len(left), np.inf)])))
+        lens = lens_of(values)
+        if folds_in_picture(lens, fisheye, table.image_size_px):
+            error *= 1.5
+        if best is None or error < best[0]:
+            best = error, lens
+    if mirrored > len(guesses) * trial.views / 2:
+        raise StartError("the board is seen as in a mirror: its points run the wrong way round")
+    if best is None:
+        raise StartError("no focal length and no position of the board explain the corners")
+    poses, _ = _poses(table, best[1], fisheye)
+    return model, values_of(best[1], poses, len(table.board_points))
+
+
+def board_poses(table: CornerTable, lens: Array, fisheye: bool) -> Pose:
+    """camera_from_board of every view (V) through a lens (18,); nan where none explains its corners."""
+    return _poses(table, lens, fisheye)[0]
+
+
+def _spread_out(table: CornerTable) -> Ints:
+    """Some of the views, evenly over the sequence, those with enough corners."""
+    able = np.flatnonzero(table.counts() >= FEWEST_CORNERS)
+    if not len(able):
+        raise StartError(f"no view has {FEWEST_CORNERS} corners or more")
+    return able[np.unique(np.linspace(0, len(able) - 1, TRIAL_VIEWS).round().astype(np.int64))]
+
+
+def _guesses(table: CornerTable, fisheye: bool) -> Sequence[float]:
+    """Focal lengths, px: Zhang's from the homographies where it makes sense, and fixed shares of the picture."""
+    longer = max(table.image_size_px)
+    guesses = [g * longer for g in (_FISHEYE_GUESSES if fisheye else _PERSPECTIVE_GUESSES)]
+    if fisheye:
+        return guesses
+    points = [table.points[table.view == v].astype(np.float32) for v in range(table.views)]
+    pixels = [table.pixels[table.view == v].astype(np.float32) for v in range(table.views)]
+    try:
+        zhang = float(cv2.initCameraMatrix2D(points, pixels, table.image_size_px, 1.0)[0, 0])
+    except cv2.error:
+        return guesses
+    return [zhang, *guesses] if 0.15 * longer < zhang < 30 * longer else guesses
+
+
+def _first_lens(focal: float, image_size_px: tuple[int, int]) -> Array:
+    lens = np.zeros(INTRINSICS)
+    width, height = image_size_px
+    lens[:4] = focal, focal, (width - 1) / 2, (height - 1) / 2
+    return lens
+
+
+def _short_solve(table: CornerTable, used: Bools, model: LensModel, values: Values) -> Values:
+    """Focal lengths and the first distortion numbers alone, then the rest: from far off, all at once may run away."""
+    gentle = np.zeros(INTRINSICS, dtype=bool)
+    gentle[[0, 1, 4]] = True
+    for lens_free in (gentle, model.free):
+        term = term_of(table, used, model.fisheye)
+        sigma = max(float(np.median(np.linalg.norm(term.project(values) - term.pixels, axis=1))), 0.05)
+        values = adjust(table, used, model, values, AS_STATED, sigma, Cauchy(), lens_free).values
+    return values
+
+
+def _poses(table: CornerTable, lens: Array, fisheye: bool) -> tuple[Pose, int]:
+    """camera_from_board of every view (V), nan where there is none, and how many boards are seen from behind."""
+    rotation, translation = np.full((table.views, 3, 3), np.nan), np.full((table.views, 3), np.nan)
+    flat, in_reach = _flattened(table, lens, fisheye)
+    points = table.points
+    behind = 0
+    for v in range(table.views):
+        mine = (table.view == v) & in_reach
+        if mine.sum() < FEWEST_CORNERS:
+            continue
+        pose = _planar_pose(points[mine], flat[mine])
+        if pose is None:
+            continue
+        facing = pose.rotation[:, 2] @ pose.apply(table.middle)
+        behind += int(facing < 0)
+        if facing > 0:
+            rotation[v], translation[v] = pose.rotation, pose.translation
+    return Pose(rotation, translation), behind
+
+
+def _planar_pose(points: Array, flat: Array) -> Pose | None:
+    """camera_from_board from points (n, 3) of a plane and normalised image points (n, 2); None where there is none."""
+    # IPPE knows a plane through the origin of its frame best; the corners' own middle makes it so for parts of boards.
+    origin = points.mean(axis=0)
+    try:
+        good, rotvec, t = cv2.solvePnP(points - origin, flat, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE)
+    except cv2.error:
+        return None
+    R = np.asarray(cv2.Rodrigues(rotvec)[0], dtype=float)
+    t = np.asarray(t, dtype=float).ravel() - R @ origin
+    depth = points @ R[2] + t[2]
+    return Pose(R, t) if good and np.isfinite(t).all() and np.all(depth > 0) else None
+
+
+def _flattened(table: CornerTable, lens: Array, fisheye: bool) -> tuple[Array, Bools]:
+    """Normalised image points (N, 2) without distortion, and which of them are usable."""
+    fx, fy, cx, cy = lens[:4]
+    bent = (table.pixels - [cx, cy]) / [fx, fy]
+    if not lens[4:].any() and not fisheye:
+        return bent, np.ones(len(bent), dtype=bool)
+    flat = undistorted(table.pixels, lens, fisheye)
+    with np.errstate(invalid="ignore"):
+        good = np.hypot(*flat.T) < np.tan(_WIDEST)
+    return np.where(good[:, None], flat, 0.0), good

@@ -1,0 +1,118 @@
+"""What errors of a lens' numbers do to pixels, all over the picture: its uncertainty map, and two lenses compared.
+
+A small turn of the camera and a change of its lens look much alike, and where the camera stands is always solved for
+through the same lens later on. So every change is compared after the turn of the camera that undoes most of it: the
+one with the smallest sum of squares over the picture. That is what mrcal does by way of the board poses ("A tour of
+mrcal", sections on projection uncertainty and on differencing); a uniform weight over the picture is ours.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2
+
+from calibration.lens.fit.lens_fit import LensFit
+from calibration.lens.fit.lens_models import LensModel, fold_r2, undistorted
+from geometry.arrays import Array
+from geometry.camera import project_points_full
+
+
+@dataclass(frozen=True, slots=True)
+class ProjectionMap:
+    """How pixels on a grid over the picture follow the lens' numbers.
+
+    nan where the lens has no ray for a pixel.
+    """
+
+    pixels: Array  # (rows, columns, 2)
+    by_parameter: Array  # (rows, columns, 2, p), px per unit of the model's free parameters, best turn taken out
+    mm_per_px: Array  # (rows, columns, 2, 2): on a screen that faces the camera at the distance
+
+    def covariance_px2(self, covariance: Array) -> Array:
+        """(rows, columns, 2, 2) of a covariance (p, p) of the parameters."""
+        return self.by_parameter @ covariance @ np.swapaxes(self.by_parameter, -1, -2)
+
+    def sigma_px(self, covariance: Array) -> Array:
+        """(rows, columns): 1 sigma in the worst direction."""
+        return _largest_axis(self.covariance_px2(covariance))
+
+    def sigma_mm(self, covariance: Array) -> Array:
+        """(rows, columns): the same on the screen."""
+        C = self.covariance_px2(covariance)
+        return _largest_axis(self.mm_per_px @ C @ np.swapaxes(self.mm_per_px, -1, -2))
+
+
+def projection_map(
+    model: LensModel, lens: Array, image_size_px: tuple[int, int], distance_m: float, columns: int = 32
+) -> ProjectionMap:
+    """The map of a lens (18,): `columns` points across the picture, from border to border."""
+    width, height = image_size_px
+    rows = max(2, round(columns * height / width))
+    u, v = np.meshgrid(np.linspace(-0.5, width - 0.5, columns), np.linspace(-0.5, height - 0.5, rows))
+    pixels = np.stack([u, v], axis=-1)
+    flat = undistorted(pixels.reshape(-1, 2), lens, model.fisheye)
+    good = np.asarray(np.isfinite(flat).all(axis=1))
+    rays = np.concatenate([np.where(good[:, None], flat, 0.0), np.ones((len(flat), 1))], axis=1)
+    seen = project_points_full(
+        rays, lens[:4], lens[4:], np.asarray(fold_r2(lens, model.fisheye)), np.asarray(model.fisheye)
+    )
+    by_lens = np.concatenate([seen.d_pinhole, seen.d_distortion], axis=-1)[..., model.free]
+    # A turn by omega moves the ray x by omega x x: d(pixel) = D (omega x x) = (x x D_row) . omega.
+    by_turn = np.cross(rays[:, None, :], seen.d_point)
+    A, B = by_turn[good].reshape(-1, 3), by_lens[good].reshape(-1, by_lens.shape[-1])
+    left = by_lens - by_turn @ np.linalg.lstsq(A, B, rcond=None)[0]
+    left[~good] = np.nan
+    # The screen faces the camera: its points are distance_m (x, y, 1), and d_point at z = 1 is the derivative by x, y.
+    to_mm = np.full((len(flat), 2, 2), np.nan)
+    to_mm[good] = 1000 * distance_m * np.linalg.inv(seen.d_point[good][:, :, :2])
+    return ProjectionMap(pixels, left.reshape(rows, columns, 2, -1), to_mm.reshape(rows, columns, 2, 2))
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """Two lenses solved from different photographs, compared over the picture."""
+
+    pixels: Array  # (rows, columns, 2)
+    moved_px: Array  # (rows, columns, 2): second less first
+    rms_px: float
+    expected_rms_px: float  # by the two covariances
+    rms_mm: float
+    p_value: float  # of a difference as large or larger, if model and noise were right
+
+    @property
+    def ratio(self) -> float:
+        """Found over expected."""
+        return self.rms_px / self.expected_rms_px
+
+
+def difference(at: ProjectionMap, first: LensFit, second: LensFit) -> Difference:
+    """Of two independent fits of the same model, to first order about the lens of the map. AdjustmentError."""
+    free = first.model.free
+    delta = (second.lens - first.lens)[free]
+    C = first.covariance + second.covariance
+    moved = at.by_parameter @ delta
+    rows = at.by_parameter.reshape(-1, len(delta))
+    rows = rows[np.isfinite(rows).all(axis=1)]
+    gram = rows.T @ rows / (len(rows) / 2)
+    M = gram @ C
+    expected = float(np.trace(M))
+    found = float(delta @ gram @ delta)
+    # The mean square is a sum of chi-squares with unequal weights: Satterthwaite's chi-square of the same two moments.
+    dof = expected**2 / float(np.trace(M @ M))
+    mm = (at.mm_per_px @ moved[..., None])[..., 0]
+    return Difference(
+        pixels=at.pixels,
+        moved_px=moved,
+        rms_px=float(np.sqrt(found)),
+        expected_rms_px=float(np.sqrt(expected)),
+        rms_mm=float(np.sqrt(np.nanmean(np.sum(mm**2, axis=-1)))),
+        p_value=float(chi2.sf(found / expected * dof, dof)),
+    )
+
+
+def _largest_axis(C: Array) -> Array:
+    """(...): the square root of the larger eigenvalue of (..., 2, 2)."""
+    a, b, c = C[..., 0, 0], C[..., 0, 1], C[..., 1, 1]
+    return np.sqrt(np.maximum((a + c) / 2 + np.hypot((a - c) / 2, b), 0.0))

@@ -1,0 +1,38 @@
+"""Mean residuals in cells of the picture: of a lens that a model follows they are noise."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.stats import chi2
+
+from calibration.lens.fit.corner_table import CornerTable
+from calibration.lens.fit.lens_fit import LensFit
+from geometry.arrays import Array, Ints
+
+SIGNIFICANT = 1e-3  # of noise whose means go together as much
+_CORNERS_PER_CELL = 12
+_MOST_COLUMNS = 16
+
+
+def cell_means(table: CornerTable, found: LensFit) -> tuple[Array, Ints]:
+    """Mean residuals (rows, columns, 2), px, and how many there are."""
+    width, height = table.image_size_px
+    pixels, residuals = table.pixels[found.used], found.residuals[found.used]
+    columns = int(np.clip(np.sqrt(len(pixels) / _CORNERS_PER_CELL * width / height), 3, _MOST_COLUMNS))
+    rows = max(2, round(columns * height / width))
+    j = np.clip(((pixels[:, 0] + 0.5) / width * columns).astype(int), 0, columns - 1)
+    i = np.clip(((pixels[:, 1] + 0.5) / height * rows).astype(int), 0, rows - 1)
+    total, count = np.zeros((rows, columns, 2)), np.zeros((rows, columns), dtype=np.int64)
+    np.add.at(total, (i, j), residuals)
+    np.add.at(count, (i, j), 1)
+    return np.where(count[..., None] > 0, total / np.maximum(count, 1)[..., None], np.nan), count
+
+
+def beyond_noise(cells: Array, count: Ints, noise_px: float) -> tuple[float, float]:
+    """The chance of such means from noise, and what is left of them beyond it (RMS per coordinate, px)."""
+    full = count > 0
+    score = float(np.sum(count[full, None] * cells[full] ** 2)) / noise_px**2
+    dof = 2 * int(full.sum())
+    p = float(chi2.sf(score, dof))
+    left = noise_px * np.sqrt(max(score - dof, 0.0) / (2 * count.sum()))
+    return p, float(left) if p < SIGNIFICANT else 0.0

@@ -1,0 +1,1 @@
+"""Measurements as terms of an adjustment: whitened residuals with analytic Jacobians."""

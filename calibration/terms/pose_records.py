@@ -1,0 +1,35 @@
+"""Records of poses as a term of an adjustment: what a stand says of each of its positions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from calibration.least_squares.adjustment import Linearised, Loss, Part, Values
+from calibration.terms.surveyed import pose_of
+from geometry import rotations
+from geometry.arrays import Array, Ints
+from geometry.pose import Pose
+
+
+@dataclass(frozen=True, slots=True)
+class RecordTerm:
+    """n recorded transforms of a stack of poses, each number with its own sigma."""
+
+    stack: str
+    index: Ints  # (n,): of the stack
+    recorded: Pose  # (n,)
+    sigmas: Array  # (n, 6): m, rad of the error [dt, dtheta]; inf: not known; 0 only where the number is held fixed
+    loss: Loss | None = None
+
+    def linearise(self, values: Values) -> Linearised:
+        """Pose less record, (n, 6), in sigmas; numbers that are not known, or held, give 0."""
+        away = pose_of(values, self.stack)[self.index].minus(self.recorded)
+        told = np.isfinite(self.sigmas) & (self.sigmas > 0)
+        per_sigma = np.where(told, 1.0 / np.where(told, self.sigmas, 1.0), 0.0)
+        J = np.zeros((len(self.index), 6, 6))
+        J[:, :3, :3] = np.eye(3)
+        # d(log(R_0^T R Exp(theta))) / d(theta) at the difference: the inverse of the right Jacobian.
+        J[:, 3:, 3:] = np.linalg.inv(rotations.right_jacobian(away[:, 3:]))
+        return Linearised(away * per_sigma, [Part(self.stack, self.index, per_sigma[..., None] * J)])

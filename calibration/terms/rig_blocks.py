@@ -1,0 +1,149 @@
+"""A rig as stacks of unknowns, and back: values, names and covariances.
+
+The stacks "intrinsics", "cameras", "screens", "bow" and "beams" hold the rig's things in the rig's order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from calibration.least_squares.adjustment import At, Values
+from calibration.least_squares.parameter_blocks import Lines, Poses, Stack, Vectors
+from calibration.least_squares.priors import Prior
+from calibration.terms.surveyed import array_of, pose_of
+from geometry.arrays import Array, Bools
+from geometry.camera import Camera, pinhole_numbers
+from geometry.lens import padded
+from geometry.rig import Beam, Rig
+from geometry.uncertainty.rig_parameters import BOW, DIRECTION, PINHOLE, POINT, POSE, RigCovariance, distortion_names
+
+INTRINSICS, CAMERAS, SCREENS, BOWS, BEAMS = "intrinsics", "cameras", "screens", "bow", "beams"
+STAND, POSES = "stand", "poses"  # world_from_stand (1), and stand_from_body, one per stand position
+_LENS_NUMBERS = 18  # fx fy cx cy and 14 distortion numbers
+# Of its own variance, added to each number of a prior: a covariance of less than full rank then still holds the
+# directions in which it is 0 (to 1e-4 of a sigma), which a prior otherwise leaves free.
+_RIDGE = 1e-8
+
+
+def stacks_of(rig: Rig) -> dict[str, Stack]:
+    """The rig's numbers. Lens numbers beyond those of a camera's model are 0; leave them out of what is free."""
+    lens = [np.concatenate([pinhole_numbers(c), padded(c.distortion)]) for c in rig.cameras.values()]
+    return {
+        INTRINSICS: Vectors(np.array(lens, dtype=float).reshape(-1, _LENS_NUMBERS)),
+        CAMERAS: Poses.of([c.camera_from_world for c in rig.cameras.values()]),
+        SCREENS: Poses.of([s.world_from_screen for s in rig.screens.values()]),
+        BOWS: Vectors(np.array([s.bow for s in rig.screens.values()], dtype=float).reshape(-1, 3)),
+        BEAMS: Lines(
+            np.array([b.point for b in rig.beams.values()], dtype=float).reshape(-1, 3),
+            np.array([b.direction for b in rig.beams.values()], dtype=float).reshape(-1, 3),
+        ),
+    }
+
+
+def rig_of(rig: Rig, values: Values) -> Rig:
+    """The rig with the numbers of the stacks that are there; the other ones, names and spots stay."""
+    cameras, screens, beams = dict(rig.cameras), dict(rig.screens), dict(rig.beams)
+    for i, (name, c) in enumerate(rig.cameras.items()):
+        cameras[name] = _camera(c, i, values)
+    for i, (name, s) in enumerate(rig.screens.items()):
+        world_from_screen = pose_of(values, SCREENS)[i] if SCREENS in values else s.world_from_screen
+        a, b, c_ = array_of(values, BOWS)[i].tolist() if BOWS in values else s.bow
+        screens[name] = replace(s, world_from_screen=world_from_screen, bow=(a, b, c_))
+    if BEAMS in values:
+        lines = lines_in(values)
+        beams = {n: Beam(n, lines.directions[i], lines.points[i]) for i, n in enumerate(beams)}
+    return Rig(screens, cameras, beams, rig.spots)
+
+
+def lines_in(values: Values) -> Lines:
+    """The stack of beams."""
+    stack = values[BEAMS]
+    assert isinstance(stack, Lines)
+    return stack
+
+
+def names_at(rig: Rig, at: At) -> tuple[str, ...]:
+    """The names, as in rig.yaml's covariance blocks, of the numbers of one unknown of a stack."""
+    stack, i = at
+    if stack in (INTRINSICS, CAMERAS):
+        name, camera = list(rig.cameras.items())[i]
+        return _of(f"cameras.{name}", (*PINHOLE, *distortion_names(camera)) if stack == INTRINSICS else POSE)
+    if stack in (SCREENS, BOWS):
+        return _of(f"screens.{list(rig.screens)[i]}", POSE if stack == SCREENS else BOW)
+    if stack == BEAMS:
+        return _of(f"beams.{list(rig.beams)[i]}", (*DIRECTION, *POINT))
+    raise KeyError(stack)
+
+
+def named_errors(rig: Rig, values: Values, at: Sequence[At]) -> tuple[tuple[str, ...], Array]:
+    """Names (p) and the matrix (p, q) that takes errors of unknowns, stacked, to errors of the named numbers.
+
+    A beam's four errors make six, none along the beam; of a lens only the numbers that its model uses have names.
+    """
+    names = [names_at(rig, a) for a in at]
+    T = np.zeros((sum(map(len, names)), sum(values[s].dof for s, _ in at)))
+    row = column = 0
+    for a, n in zip(at, names, strict=True):
+        block = _to_names(values, a, len(n))
+        T[row : row + len(n), column : column + block.shape[1]] = block
+        row, column = row + len(n), column + block.shape[1]
+    return tuple(n for some in names for n in some), T
+
+
+def prior_of(rig: Rig, covariance: RigCovariance) -> tuple[Prior | None, dict[str, Bools]]:
+    """What a covariance of rig numbers says as a prior about the rig's stacks, and which numbers (k, dof) it frees.
+
+    What it does not name, or names with a variance of 0, is taken as known and stays fixed. KeyError for a name that
+    the rig does not have.
+    """
+    values = stacks_of(rig)
+    every = [(s, i) for s, stack in values.items() for i in range(len(stack))]
+    place = {n: (a, k) for a in every for k, n in enumerate(names_at(rig, a))}
+    used: list[At] = list(dict.fromkeys(place[n][0] for n in covariance.names))
+    if not used:
+        return None, {}
+    names, T = named_errors(rig, values, used)
+    order = {n: i for i, n in enumerate(names)}
+    rows = np.array([order[n] for n in covariance.names], dtype=np.int64)
+    full = np.zeros((len(names), len(names)))
+    full[np.ix_(rows, rows)] = covariance.matrix
+    # The columns and rows of T are unit vectors across each other, so that its transpose leads back.
+    C = T.T @ full @ T
+    C += np.diag(_RIDGE * np.diagonal(C))
+    known = np.diagonal(C) > 0
+    free: dict[str, Bools] = {}
+    start = 0
+    for stack, i in used:
+        dof = values[stack].dof
+        mask = free.setdefault(stack, np.zeros((len(values[stack]), dof), dtype=bool))
+        mask[i] = known[start : start + dof]
+        start += dof
+    picked = tuple(values[s].pick(np.array([i])) for s, i in used)
+    return (Prior(tuple(used), picked, C) if known.any() else None), free
+
+
+def _camera(c: Camera, i: int, values: Values) -> Camera:
+    pose = pose_of(values, CAMERAS)[i] if CAMERAS in values else c.camera_from_world
+    if INTRINSICS not in values:
+        return replace(c, camera_from_world=pose)
+    fx, fy, cx, cy, *lens = array_of(values, INTRINSICS)[i].tolist()
+    matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    return replace(c, matrix=matrix, distortion=tuple(lens[: len(c.distortion)]), camera_from_world=pose)
+
+
+def _of(thing: str, parameters: Sequence[str]) -> tuple[str, ...]:
+    return tuple(f"{thing}.{p}" for p in parameters)
+
+
+def _to_names(values: Mapping[str, Stack], at: At, count: int) -> Array:
+    """(count, dof): errors of an unknown's numbers to errors of those that have names."""
+    stack = values[at[0]]
+    if not isinstance(stack, Lines):
+        return np.eye(count, stack.dof)
+    B = stack.basis[at[1]]
+    T = np.zeros((6, 4))
+    T[:3, :2] = T[3:, 2:] = B
+    return T

@@ -1,0 +1,176 @@
+"""Surveyed points as terms of an adjustment: where a camera sees them, which screen they lie on, what the survey says.
+
+Stacks: "intrinsics" (fx, fy, cx, cy, px, and 14 distortion numbers), "cameras" (camera_from_world), "screens"
+(world_from_screen), "bow" (1/m), "points" (world, m). All Jacobians are for the errors that these stacks define.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from calibration.least_squares.adjustment import Linearised, Loss, Part, Values
+from calibration.least_squares.parameter_blocks import Poses, Vectors
+from geometry import lens
+from geometry.arrays import Array, Bools, Ints, skew
+from geometry.camera import project_points_full
+from geometry.pose import Pose
+
+
+def pose_of(values: Values, stack: str) -> Pose:
+    """The transforms of a stack."""
+    poses = values[stack]
+    assert isinstance(poses, Poses)
+    return poses.pose
+
+
+def array_of(values: Values, stack: str) -> Array:
+    """The vectors (k, d) of a stack."""
+    vectors = values[stack]
+    assert isinstance(vectors, Vectors)
+    return vectors.array
+
+
+def whitening(covariances: Array) -> Array:
+    """W (..., d, d) with W C W^T = 1, of covariances C (..., d, d): turns an error into sigmas."""
+    return np.linalg.inv(np.linalg.cholesky(covariances))
+
+
+def fold_limits(intrinsics: Array, fisheye: Bools) -> Array:
+    """How far out each camera's lens model holds (n_cameras,), of intrinsics (n_cameras, 18)."""
+    return np.array(
+        [
+            (lens.fisheye_fold_limit(tuple(row[4:8])) if wide else lens.fold_limit(tuple(row[4:])))
+            for row, wide in zip(intrinsics, fisheye, strict=True)
+        ]
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class PointTerm:
+    """Pixels of surveyed points in fixed cameras: n observations."""
+
+    camera_of: Ints  # (n,)
+    point_of: Ints  # (n,)
+    pixels: Array  # (n, 2), px, distorted
+    whiten: Array  # (n, 2, 2): turns a pixel error into sigmas, `whitening` of its covariance
+    fisheye: Bools  # (n_cameras,)
+    loss: Loss | None = None
+
+    def linearise(self, values: Values) -> Linearised:
+        """Predicted less measured pixel; nan where the point lies behind the camera."""
+        intrinsics = array_of(values, "intrinsics")
+        camera_from_world = pose_of(values, "cameras")[self.camera_of]
+        points = array_of(values, "points")[self.point_of]
+        projected = project_points_full(
+            camera_from_world.apply(points),
+            intrinsics[self.camera_of, :4],
+            intrinsics[self.camera_of, 4:],
+            fold_limits(intrinsics, self.fisheye)[self.camera_of],
+            self.fisheye[self.camera_of],
+        )
+        R = camera_from_world.rotation
+        W = self.whiten
+        d_point = W @ projected.d_point
+        # x_c = R Exp(dtheta) X + t + dt
+        d_camera = np.concatenate([d_point, -d_point @ R @ skew(points)], axis=-1)
+        d_intrinsics = W @ np.concatenate([projected.d_pinhole, projected.d_distortion], axis=-1)
+        return Linearised(
+            (W @ (projected.pixels - self.pixels)[..., None])[..., 0],
+            [
+                Part("intrinsics", self.camera_of, d_intrinsics),
+                Part("cameras", self.camera_of, d_camera),
+                Part("points", self.point_of, d_point @ R),
+            ],
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class SurfaceTerm:
+    """Points that lie on a screen's surface: n of them, each within its sigma of it."""
+
+    screen_of: Ints  # (n,)
+    point_of: Ints  # (n,)
+    sigma_m: Array  # (n,): how far a point may lie off the surface: paint, paper, what the bow does not describe
+    loss: Loss | None = None
+
+    def linearise(self, values: Values) -> Linearised:
+        """Heights over the surface z = a x^2 + b x y + c y^2 of the screen's frame."""
+        world_from_screen = pose_of(values, "screens")[self.screen_of]
+        bow = array_of(values, "bow")[self.screen_of]
+        points = array_of(values, "points")[self.point_of]
+        on_screen = world_from_screen.inverse().apply(points)
+        per_m = 1.0 / self.sigma_m[:, None, None]
+        slope = surface_slope(on_screen, bow)[:, None, :] * per_m  # (n, 1, 3)
+        R_t = np.swapaxes(world_from_screen.rotation, -1, -2)
+        # x_s = Exp(-dtheta) R^T (X - t - dt)
+        d_screen = np.concatenate([-slope @ R_t, slope @ skew(on_screen)], axis=-1)
+        return Linearised(
+            surface_heights(on_screen, bow)[:, None] / self.sigma_m[:, None],
+            [
+                Part("screens", self.screen_of, d_screen),
+                Part("bow", self.screen_of, -bow_shape(on_screen)[:, None, :] * per_m),
+                Part("points", self.point_of, slope @ R_t),
+            ],
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class SurveyTerm:
+    """What the survey says of n points, in world."""
+
+    point_of: Ints  # (n,)
+    surveyed: Array  # (n, 3), m
+    whiten: Array  # (n, 3, 3): turns an error into sigmas, `whitening` of its covariance
+    loss: Loss | None = None
+
+    def linearise(self, values: Values) -> Linearised:
+        """Point less survey."""
+        away = array_of(values, "points")[self.point_of] - self.surveyed
+        return Linearised((self.whiten @ away[..., None])[..., 0], [Part("points", self.point_of, self.whiten)])
+
+
+@dataclass(frozen=True, slots=True)
+class FrameTerm:
+    """Holds the two axes of a screen where they were chosen: no measurement says where a plane's origin is.
+
+    Only the shift within the plane and the turn about its normal are held, to a micrometre and a microradian: by
+    definition, not by knowledge. What the plane itself does stays free.
+    """
+
+    screen_of: Ints  # (n,)
+    chosen: Pose  # (n,) world_from_screen
+    loss: Loss | None = None
+    sigma: float = 1e-6  # m and rad
+
+    def linearise(self, values: Values) -> Linearised:
+        """Shift along x, along y and turn about z away from the chosen frame."""
+        world_from_screen = pose_of(values, "screens")[self.screen_of]
+        delta = world_from_screen.minus(self.chosen)
+        axes = np.swapaxes(self.chosen.rotation[..., :2], -1, -2)  # (n, 2, 3)
+        shift = (axes @ delta[..., :3, None])[..., 0]
+        residuals = np.concatenate([shift, delta[..., 5:]], axis=-1)
+        # The turn away stays far below a radian, where d(log)/d(theta) is 1.
+        J = np.zeros((len(self.screen_of), 3, 6))
+        J[:, :2, :3] = axes
+        J[:, 2, 5] = 1.0
+        return Linearised(residuals / self.sigma, [Part("screens", self.screen_of, J / self.sigma)])
+
+
+def bow_shape(on_screen: Array) -> Array:
+    """x^2, x y, y^2 (..., 3), m^2, of points (..., 3), m, in the screen's frame."""
+    x, y = on_screen[..., 0], on_screen[..., 1]
+    return np.stack([x * x, x * y, y * y], axis=-1)
+
+
+def surface_heights(on_screen: Array, bow: Array) -> Array:
+    """How far points (..., 3), m, in the screen's frame, lie over its surface along z. bow (..., 3), 1/m."""
+    return on_screen[..., 2] - np.sum(bow_shape(on_screen) * bow, axis=-1)
+
+
+def surface_slope(on_screen: Array, bow: Array) -> Array:
+    """d(height)/d(point) (..., 3) in the screen's frame."""
+    a, b, c = np.moveaxis(bow, -1, 0)
+    x, y = on_screen[..., 0], on_screen[..., 1]
+    return np.stack([-(2 * a * x + b * y), -(b * x + 2 * c * y), np.ones_like(x)], axis=-1)

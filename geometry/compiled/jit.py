@@ -1,0 +1,86 @@
+"""The decorator of all compiled functions: numba.njit with machine code kept on disk.
+
+The first call on a new machine compiles; later processes load the code (compile_cache.py says from where). While a
+process compiles, the logger `beampose` gets one line (INFO).
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numba
+from numba.core import event
+from numba.core.types import unliteral
+
+from geometry.compiled.compile_cache import cache_folder, is_empty
+
+Function = TypeVar("Function", bound=Callable)
+
+_folders: set[Path] = set()  # source folders that have compiled functions
+
+
+def compiled(function: Function) -> Function:
+    """numba.njit with numpy's division (x / 0 is inf, no exception) and the cache on disk where there is a place."""
+    return _compiled(function, release_gil=False)
+
+
+def compiled_for_threads(function: Function) -> Function:
+    """As `compiled`, and other threads run meanwhile: for functions that work for a tenth of a millisecond or more.
+
+    A thread that releases the GIL may wait long to get it back, so it does not pay for short functions.
+    """
+    return _compiled(function, release_gil=True)
+
+
+def _compiled(function: Function, release_gil: bool) -> Function:
+    folder = Path(function.__code__.co_filename).parent
+    _folders.add(folder)
+    cached = cache_folder(folder)
+    settings: Any = numba.config  # numba reads it while it decorates
+    before = settings.CACHE_DIR
+    settings.CACHE_DIR = before if cached is None else str(cached)
+    try:
+        dispatcher = numba.njit(function, cache=cached is not None, error_model="numpy", nogil=release_gil)
+    finally:
+        settings.CACHE_DIR = before
+    _take_literals_for_plain(dispatcher)
+    return dispatcher
+
+
+def _take_literals_for_plain(dispatcher: Any) -> None:
+    """Let a compiled function that is called with a literal, `f(x, 0)`, be the same as for any other number.
+
+    numba would compile it once more for each literal; also for the first value of a variable that begins as one, as
+    in `count = 0`, and discard that: a sixth of all compiling here.
+    """
+    of_types = dispatcher.get_call_template
+    plain: Any = unliteral
+
+    def of_plain_types(args: Any, kws: Any) -> Any:
+        return of_types([plain(a) for a in args], {name: plain(a) for name, a in kws.items()})
+
+    dispatcher.get_call_template = of_plain_types
+
+
+class _Notice(event.Listener):
+    """Reports once that code is being compiled, if none was cached: the first call takes longer than usual."""
+
+    def __init__(self) -> None:
+        self._reported = False
+
+    def on_start(self, begun: Any) -> None:
+        folder = Path(begun.data["dispatcher"].py_func.__code__.co_filename).parent
+        if not self._reported and folder in _folders and is_empty(folder):
+            self._reported = True
+            how_often = "once" if cache_folder(folder) else "each time, since no folder can be written to keep it"
+            logging.getLogger("beampose").info("compiling for this machine, %s (about half a minute)", how_often)
+
+    def on_end(self, ended: Any) -> None:
+        pass
+
+
+_register: Any = event.register
+_register("numba:compile", _Notice())

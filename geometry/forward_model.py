@@ -1,0 +1,255 @@
+"""The one forward model: from a pose of the vehicle to the pixels of its spots, with the Jacobian.
+
+A pose puts each beam into world; its ray meets its screen; the camera sees the point of light. The solver, the
+trackers, the spots out of view and the simulator all use this and nothing else.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from geometry.arrays import Array, Bools, Ints, cross, skew
+from geometry.camera import FISHEYE, in_picture, pinhole_numbers, project_points_full
+from geometry.compiled_projection import VIEW, Views, lens_kinds, project_all
+from geometry.lens import padded, tilt_matrix
+from geometry.pose import Pose
+from geometry.rig import Rig
+
+
+@dataclass(frozen=True, slots=True)
+class SpotDerivatives:
+    """Pixels of n views and what each number of the rig does to them, px per unit.
+
+    A transform's error is [dt (m, in its first frame), dtheta (rad, in its second)], section 1 of the files' contract.
+    """
+
+    pixels: Array  # (..., n, 2); nan where there is no projection
+    pose: Array  # (..., n, 2, 6) of world_from_body
+    pinhole: Array  # (..., n, 2, 4) of the camera's fx, fy, cx, cy
+    distortion: Array  # (..., n, 2, 14) of its distortion
+    camera: Array  # (..., n, 2, 6) of camera_from_world
+    screen: Array  # (..., n, 2, 6) of world_from_screen
+    bow: Array  # (..., n, 2, 3) of the screen's bow
+    direction: Array  # (..., n, 2, 3) of the beam's direction, in body; along the beam it does nothing
+    point: Array  # (..., n, 2, 3) of the beam's point, m, in body; along the beam it does nothing
+
+
+@dataclass(frozen=True, slots=True)
+class _Meeting:
+    """Rays that meet their screens, (..., n)."""
+
+    R: Array  # (..., 1, 3, 3) world from body
+    d: Array  # (..., n, 3) the ray in world
+    t: Array  # (..., n) m, its length to the screen
+    hit: Array  # (..., n, 3) m, in world
+    on_screen: Array  # (..., n, 3) m, the same in the screen's frame
+    normal: Array  # (..., n, 3) the surface's normal there, in world; not of unit length on a bent screen
+    along: Array  # (..., n) normal . d, 1 where that is none
+    oblique: Array  # (..., n, 3, 3) the projection along the ray onto the surface
+    good: Bools  # (..., n)
+
+
+@dataclass(frozen=True, slots=True)
+class SpotModel:
+    """A rig unrolled into arrays, one row per view: a camera and a spot of the screen that it observes.
+
+    n views, in the order of Rig.views(): by camera, then by spot.
+    """
+
+    views: tuple[tuple[str, str], ...]  # (camera, spot)
+    camera_names: tuple[str, ...]
+    spot_names: tuple[str, ...]
+    camera_of: Ints  # (n,) index into camera_names
+    spot_of: Ints  # (n,) index into spot_names
+    beam_of: Ints  # (n,) index into the rig's beams
+    point: Array  # (n, 3), m, in body: the beam's point
+    ray: Array  # (n, 3), unit, in body: from that point towards the spot
+    sign: Array  # (n,) +1 where the ray runs along the beam's direction, -1 against it
+    screen_rotation: Array  # (n, 3, 3), world from screen
+    screen_origin: Array  # (n, 3), m, in world
+    bow: Array  # (n, 3), 1/m, of the screen's surface; all 0: flat
+    half_size: Array  # (n, 2), m, half the extent of the screen; inf where it has none
+    camera_rotation: Array  # (n, 3, 3), camera from world
+    camera_translation: Array  # (n, 3), m
+    pinhole: Array  # (n, 4): fx, fy, cx, cy, px
+    distortion: Array  # (n, 14)
+    fisheye: Bools  # (n,)
+    fold_r2: Array  # (n,)
+    image_size_px: Array  # (n, 2): width, height
+    numbers: Views = field(init=False, repr=False, compare=False)  # the same for the compiled functions
+
+    def __post_init__(self) -> None:
+        lens = lens_kinds(self.distortion, self.fisheye)
+        tilt = tilt_matrix(self.distortion[..., 12], self.distortion[..., 13])
+        numbers = np.empty(self.point.shape[:-1], VIEW)
+        for name in VIEW.names or ():
+            numbers[name] = lens if name == "lens" else tilt if name == "tilt" else getattr(self, name)
+        object.__setattr__(self, "numbers", numbers)
+
+    @staticmethod
+    def of(rig: Rig) -> SpotModel:
+        """Unroll a rig."""
+        views = rig.views()
+        cameras = [rig.cameras[c] for c, _ in views]
+        spots = [rig.spots[s] for _, s in views]
+        beams = [rig.beams[s.beam] for s in spots]
+        screens = [rig.screens[s.screen] for s in spots]
+        camera_names, spot_names, beam_names = list(rig.cameras), list(rig.spots), list(rig.beams)
+
+        def rows(values: list[Array], width: int) -> Array:
+            return np.array(values, dtype=float).reshape(len(views), width)
+
+        def matrices(values: list[Array]) -> Array:
+            return np.array(values, dtype=float).reshape(len(views), 3, 3)
+
+        return SpotModel(
+            views=tuple(views),
+            camera_names=tuple(camera_names),
+            spot_names=tuple(spot_names),
+            camera_of=np.array([camera_names.index(c) for c, _ in views], dtype=np.int64),
+            spot_of=np.array([spot_names.index(s) for _, s in views], dtype=np.int64),
+            beam_of=np.array([beam_names.index(b.name) for b in beams], dtype=np.int64),
+            point=rows([b.point for b in beams], 3),
+            ray=rows([s.sign * b.direction for s, b in zip(spots, beams, strict=True)], 3),
+            sign=np.array([s.sign for s in spots], dtype=float),
+            screen_rotation=matrices([s.world_from_screen.rotation for s in screens]),
+            screen_origin=rows([s.world_from_screen.translation for s in screens], 3),
+            bow=rows([np.asarray(s.bow, dtype=float) for s in screens], 3),
+            half_size=rows([np.full(2, np.inf) if s.size_m is None else np.asarray(s.size_m) / 2 for s in screens], 2),
+            camera_rotation=matrices([c.camera_from_world.rotation for c in cameras]),
+            camera_translation=rows([c.camera_from_world.translation for c in cameras], 3),
+            pinhole=rows([pinhole_numbers(c) for c in cameras], 4),
+            distortion=rows([padded(c.distortion) for c in cameras], 14),
+            fisheye=np.array([c.lens == FISHEYE for c in cameras], dtype=bool),
+            fold_r2=np.array([c.fold_r2 for c in cameras]),
+            image_size_px=rows([np.asarray(c.image_size_px, dtype=float) for c in cameras], 2),
+        )
+
+    def __len__(self) -> int:
+        return len(self.views)
+
+    def subset(self, rows: Ints | Bools) -> SpotModel:
+        """Some of the views, in the given order."""
+        index = np.flatnonzero(rows) if np.asarray(rows).dtype == bool else np.asarray(rows, dtype=np.int64)
+        per_view = {
+            name: getattr(self, name)[index]
+            for name in SpotModel.__slots__
+            if name not in ("views", "camera_names", "spot_names", "numbers")
+        }
+        return SpotModel(
+            views=tuple(self.views[i] for i in index),
+            camera_names=self.camera_names,
+            spot_names=self.spot_names,
+            **per_view,
+        )
+
+    def hits(self, world_from_body: Pose) -> tuple[Array, Array]:
+        """Where the rays meet their screens: world points (..., n, 3), m, and their Jacobian (..., n, 3, 6).
+
+        The pose may be a stack (...). The Jacobian is with respect to the pose error [dt (m, world), dtheta (rad,
+        body)], section 1 of the files' contract. A ray that is parallel to its screen, points away from it or falls
+        beside its extent gives nan.
+        """
+        m = self._meet(world_from_body)
+        # Along the ray a small move changes nothing, so only what the move does across the ray counts:
+        # d(hit) = (I - d n^T / (n.d)) (d(p) + t d(d)), and with theta in body: d(p) + t d(d) = dt - R [q]x dtheta,
+        # q = point + t ray the lit point in body.
+        q = self.point + m.t[..., None] * self.ray
+        J = np.empty((*m.hit.shape, 6))
+        J[..., :3] = m.oblique
+        # The columns of -R [q]x are R (e_i x q) = (R e_i) x (R q).
+        lever = (m.R @ q[..., None])[..., 0]
+        columns = cross(np.swapaxes(m.R, -1, -2), lever[..., None, :])  # (..., n, 3 axes, 3)
+        J[..., 3:] = m.oblique @ np.swapaxes(columns, -1, -2)
+        return np.where(m.good[..., None], m.hit, np.nan), J
+
+    def _meet(self, world_from_body: Pose) -> _Meeting:
+        """Rays and screens brought together."""
+        R = world_from_body.rotation[..., None, :, :]
+        p = (R @ self.point[..., None])[..., 0] + world_from_body.translation[..., None, :]
+        d = (R @ self.ray[..., None])[..., 0]
+        normal = self.screen_rotation[..., 2]
+        facing = np.sum(normal * d, axis=-1)
+        height = np.sum(normal * (self.screen_origin - p), axis=-1)
+        ahead = np.abs(facing) > 1e-12
+        t = height / np.where(ahead, facing, 1.0)
+        if self.bow.any():
+            t, normal = self._meet_bent(p, d, t)
+            facing = np.sum(normal * d, axis=-1)
+        hit = p + t[..., None] * d
+        on_screen = ((hit - self.screen_origin)[..., None, :] @ self.screen_rotation)[..., 0, :]
+        good = ahead & (t > 0) & np.all(np.abs(on_screen[..., :2]) <= self.half_size, axis=-1)
+        along = np.where(ahead, facing, 1.0)
+        oblique = np.eye(3) - d[..., :, None] * normal[..., None, :] / along[..., None, None]
+        return _Meeting(R, d, t, hit, on_screen, normal, along, oblique, good)
+
+    def _meet_bent(self, p: Array, d: Array, t: Array) -> tuple[Array, Array]:
+        """Where rays meet bent screens: lengths (..., n) and the surface's normal there, (..., n, 3), in world.
+
+        Newton's method from the flat screen. A bow of centimetres over metres converges in two or three steps to
+        rounding; the fourth is for larger ones.
+        """
+        a, b, c = np.moveaxis(self.bow, -1, 0)
+        p_s = ((p - self.screen_origin)[..., None, :] @ self.screen_rotation)[..., 0, :]
+        d_s = (d[..., None, :] @ self.screen_rotation)[..., 0, :]
+        for _ in range(4):
+            x, y = p_s[..., 0] + t * d_s[..., 0], p_s[..., 1] + t * d_s[..., 1]
+            height = p_s[..., 2] + t * d_s[..., 2] - (a * x * x + b * x * y + c * y * y)
+            slope = d_s[..., 2] - (2 * a * x + b * y) * d_s[..., 0] - (b * x + 2 * c * y) * d_s[..., 1]
+            t = t - height / np.where(np.abs(slope) > 1e-12, slope, 1.0)
+        x, y = p_s[..., 0] + t * d_s[..., 0], p_s[..., 1] + t * d_s[..., 1]
+        normal = np.stack([-(2 * a * x + b * y), -(b * x + 2 * c * y), np.ones_like(x)], axis=-1)
+        return t, (self.screen_rotation @ normal[..., None])[..., 0]
+
+    def project(self, world_from_body: Pose) -> tuple[Array, Array]:
+        """Distorted pixels (..., n, 2) and their Jacobian (..., n, 2, 6), px per m and px per rad.
+
+        nan where no projection exists: the beam misses its screen, or the point lies beyond what the lens model
+        maps. Pixels outside the picture are given as well. Jacobian as in `hits`.
+        """
+        R, t = world_from_body.rotation, world_from_body.translation
+        stack = np.broadcast_shapes(R.shape[:-2], t.shape[:-1])
+        # Copies, since numba takes arrays that must not be written to for another type and compiles anew for each.
+        uv, J = project_all(
+            self.numbers,
+            np.array(np.broadcast_to(R, (*stack, 3, 3)), dtype=np.float64, order="C").reshape(-1, 3, 3),
+            np.array(np.broadcast_to(t, (*stack, 3)), dtype=np.float64, order="C").reshape(-1, 3),
+        )
+        n = len(self)
+        return uv.reshape(*stack, n, 2), J.reshape(*stack, n, 2, 6)
+
+    def derivatives(self, world_from_body: Pose) -> SpotDerivatives:
+        """As `project`, with the derivatives with respect to everything in the rig that a calibration determines.
+
+        The pose may be a stack (...). Where there is no projection the pixel is nan and the derivatives mean nothing.
+        """
+        m = self._meet(world_from_body)
+        R_c, R_s = self.camera_rotation, self.screen_rotation
+        in_camera = (R_c @ m.hit[..., None])[..., 0] + self.camera_translation
+        safe = np.where(m.good[..., None], in_camera, [0.0, 0.0, 1.0])
+        projected = project_points_full(safe, self.pinhole, self.distortion, self.fold_r2, self.fisheye)
+        d_hit = projected.d_point @ R_c  # px per m of the lit point, in world
+        # A screen that moves by delta at the lit point carries the point along the ray: d (n.delta) / (n.d).
+        carried = m.d[..., :, None] * (m.normal / m.along[..., None])[..., None, :]
+        x, y = m.on_screen[..., 0], m.on_screen[..., 1]
+        bulge = R_s[..., :, 2:] * np.stack([x * x, x * y, y * y], axis=-1)[..., None, :]
+        d_screen = np.concatenate([np.broadcast_to(np.eye(3), carried.shape), -(R_s @ skew(m.on_screen))], axis=-1)
+        d_camera = np.concatenate([np.broadcast_to(np.eye(3), carried.shape), -(R_c @ skew(m.hit))], axis=-1)
+        d_point = d_hit @ m.oblique @ m.R
+        return SpotDerivatives(
+            pixels=np.where(m.good[..., None], projected.pixels, np.nan),
+            pose=d_hit @ self.hits(world_from_body)[1],
+            pinhole=projected.d_pinhole,
+            distortion=projected.d_distortion,
+            camera=projected.d_point @ d_camera,
+            screen=d_hit @ carried @ d_screen,
+            bow=d_hit @ carried @ bulge,
+            direction=(self.sign * m.t)[..., None, None] * d_point,
+            point=d_point,
+        )
+
+    def in_picture(self, pixels: Array, margin_px: float = 0.0) -> Bools:
+        """Whether pixels (..., n, 2) lie in their cameras' pictures, or at most the margin outside. nan does not."""
+        return in_picture(pixels, self.image_size_px, margin_px)

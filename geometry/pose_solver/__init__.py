@@ -1,0 +1,1 @@
+"""The pose from labelled spots: closed forms, least squares, robustness, ambiguity."""

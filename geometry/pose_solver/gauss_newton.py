@@ -1,0 +1,266 @@
+"""The pose from labelled spots: weighted Gauss-Newton on pixel residuals, its covariance, and what cannot be seen.
+
+Source: ours; Gauss-Newton on the error state [dt, dtheta] of section 1 of the files' contract, with the one forward
+model of geometry/forward_model.py and its analytic Jacobian.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from geometry.arrays import Array, Ints, symmetric
+from geometry.chi_square import chi2_limit
+from geometry.forward_model import SpotModel
+from geometry.pose import Pose
+from geometry.uncertainty.rig_uncertainty import CalibrationSpread
+
+# Relative size under which a singular value of the whitened, scaled Jacobian is zero. Exact degeneracies (three spots
+# of one screen are collinear whatever the pose) give 1e-13 and less; the worst usable geometry about 1e-4.
+RANK_TOLERANCE = 1e-7
+
+
+@dataclass(frozen=True, slots=True)
+class SolveLimits:
+    """When a pose of one frame counts as measured."""
+
+    max_sigma_m: float = 0.25  # m: a larger sigma of any direction is no measurement ...
+    max_sigma_rad: float = np.deg2rad(5.0)  # ... nor is this: beyond it first-order covariances mean little
+    p_false_alarm: float = 1e-5  # of the chi-square test that a right set of spots must pass
+    min_outlier_px: float = 0.1  # a spot is left out only if it also lies this far off: smaller misfits are model error
+
+
+@dataclass(frozen=True, slots=True)
+class PoseFit:
+    """A pose fitted to m labelled spots."""
+
+    world_from_body: Pose
+    covariance: Array  # (6, 6) of [dt (m, world), dtheta (rad, body)]; inf where not observable
+    systematic: Array  # (6, 6) the part of it that the calibration's errors make; 0 where nothing is known of them
+    systematic_share: float  # of the misfit to expect, 0 ... 1: how much of it is the same in every frame
+    observable: bool
+    rows: Ints  # (m,) the views used
+    residuals_px: Array  # (m, 2) measured minus fitted
+    chi2: float  # of the whitened residuals
+    dof: int  # 2 m - 6
+    projected_px: Array  # (n, 2) all views of the model from this pose, as SpotModel.project gives them ...
+    jacobian: Array  # (n, 2, 6) ... so that nobody projects the same pose again
+    log_det: float  # of the covariance (2m, 2m), px^2, that the residuals were weighed with
+    _gain: Array  # (6, 2m) what the pose makes of the residuals ...
+    _common: Array | None  # (2n, 2n) ... and the calibration's share of the pixels' covariance
+
+    @property
+    def noise(self) -> Array:
+        """(6, 6) the part of the covariance that differs from frame to frame."""
+        return self.covariance if self._common is None else self.covariance - self.systematic
+
+    def widened(self, factor: float) -> PoseFit:
+        """The same fit with all its covariance that many times larger."""
+        return replace(self, covariance=self.covariance * factor, systematic=self.systematic * factor)
+
+    def spot_covariances(self) -> Array:
+        """What this fit leaves open of each view's pixel: (n, 2, 2), px^2; of where the spot is, not of a measurement.
+
+        Errors of the calibration move a spot and, through the pose, what is expected of it; what is common cancels.
+        """
+        return point_covariance(self.jacobian, self.noise) + self.calibration_px()
+
+    def calibration_px(self) -> Array | float:
+        """The calibration's part of `spot_covariances`: (n, 2, 2), px^2; 0 where nothing is known of its errors."""
+        if self._common is None:
+            return 0.0
+        n = len(self.jacobian)
+        left = np.eye(2 * n)
+        left[:, _both(self.rows)] -= np.nan_to_num(self.jacobian.reshape(2 * n, 6)) @ self._gain
+        joint = (left @ self._common @ left.T).reshape(n, 2, n, 2)
+        return np.asarray(joint[np.arange(n), :, np.arange(n)])
+
+    @property
+    def rms_px(self) -> float:
+        """Root mean square of the residuals, per axis, px; nan without spots."""
+        return float(np.sqrt(np.mean(self.residuals_px**2))) if len(self.rows) else float("nan")
+
+    def consistent(self, p_false_alarm: float) -> bool:
+        """Whether the misfit is what the spots' covariances allow."""
+        return self.dof <= 0 or self.chi2 <= largest_chi2(p_false_alarm, self.dof)
+
+
+def largest_chi2(p_false_alarm: float, dof: int) -> float:
+    """The chi-square that a right fit exceeds with this probability. Kept, as it is asked for in every frame."""
+    return chi2_limit(p_false_alarm, dof)
+
+
+def whiten(covariances: Array) -> Array:
+    """Matrices W (..., 2, 2) with W C W^T = I, of covariances C (..., 2, 2): the inverse of the Cholesky factor."""
+    a, b, c = covariances[..., 0, 0], covariances[..., 0, 1], covariances[..., 1, 1]
+    l11 = np.sqrt(a)
+    l21 = b / l11
+    l22 = np.sqrt(np.maximum(c - l21 * l21, 1e-300))
+    W = np.zeros_like(covariances)
+    W[..., 0, 0] = 1 / l11
+    W[..., 1, 0] = -l21 / (l11 * l22)
+    W[..., 1, 1] = 1 / l22
+    return W
+
+
+def fit_pose(
+    model: SpotModel,
+    rows: Ints,
+    pixels: Array,
+    covariances: Array,
+    start: Pose,
+    *,
+    prior: tuple[Pose, Array] | None = None,
+    calibration: CalibrationSpread | None = None,
+    max_iterations: int = 25,
+) -> PoseFit | None:
+    """The pose that puts the spots of views `rows` (m,) at `pixels` (m, 2), px, with covariances (m, 2, 2), px^2.
+
+    start: where to begin; within some ten degrees it need not be good. prior: a pose and its information matrix
+    (6, 6), added as six more measurements. calibration: its errors are weighed in beside the spots' own and come out
+    as the systematic part. Levenberg's damping keeps a far start from running away. None where it does not converge
+    (a spot without projection on the way, or a singular start).
+    """
+    if len(rows) == 0:
+        return None
+    rows = np.asarray(rows)
+    common = None if calibration is None else calibration.at(start)
+    fit = _fit(model, rows, pixels, covariances, start, prior, common, max_iterations)
+    if fit is None or calibration is None:
+        return fit
+    now = calibration.at(fit.world_from_body)
+    if now is common:
+        return fit
+    # The start was so far off that the calibration's errors act differently here.
+    return _fit(model, rows, pixels, covariances, fit.world_from_body, prior, now, max_iterations)
+
+
+def _fit(
+    model: SpotModel,
+    rows: Ints,
+    pixels: Array,
+    covariances: Array,
+    start: Pose,
+    prior: tuple[Pose, Array] | None,
+    common: Array | None,
+    max_iterations: int,
+) -> PoseFit | None:
+    if common is None:
+        W = whiten(covariances)
+        log_det = -2 * float(np.sum(np.log(W[:, [0, 1], [0, 1]])))
+    else:
+        root = np.linalg.cholesky(_blocks(covariances) + common[np.ix_(_both(rows), _both(rows))])
+        W = np.linalg.inv(root)
+        log_det = 2 * float(np.sum(np.log(np.diagonal(root))))
+    pose, damping = start, 0.0
+    terms = _terms(model, rows, pixels, W, pose, prior)
+    if terms is None:
+        return None
+    H, g, cost, residuals, projected, J = terms
+    for _ in range(max_iterations):
+        scale = np.maximum(np.diagonal(H), 1e-12 * np.trace(H))
+        # The smallest damping only steadies directions that no spot sees; elsewhere it is far below rounding.
+        step = np.asarray(np.linalg.solve(H + np.diag((damping + 1e-14) * scale), g), dtype=np.float64)
+        gain = float(step @ g)
+        if not np.isfinite(gain):
+            return None
+        trial = pose.plus(step)
+        trial_terms = _terms(model, rows, pixels, W, trial, prior)
+        if trial_terms is None or trial_terms[2] > cost * (1 + 1e-9) + 1e-12:
+            damping = max(10 * damping, 1e-3)
+            if damping > 1e8:
+                break
+            continue
+        pose, (H, g, cost, residuals, projected, J) = trial, trial_terms
+        damping = damping / 10 if damping > 1e-6 else 0.0
+        if gain < 1e-6:  # in squared sigmas; the step was a thousandth, and what is left is about its square
+            break
+    else:
+        return None
+    covariance, observable = covariance_of(H)
+    dof = 2 * len(rows) - 6 + (6 if prior is not None else 0)
+    K, systematic, share = np.zeros((6, 2 * len(rows))), np.zeros((6, 6)), 0.0
+    if common is not None and observable:
+        S = common[np.ix_(_both(rows), _both(rows))]
+        A = W @ J[rows].reshape(-1, 6)
+        K = covariance @ A.T @ W
+        systematic = symmetric(K @ S @ K.T)
+        left = W @ S @ W.T
+        share = float(np.trace(left) - np.trace(covariance @ A.T @ left @ A)) / dof if dof > 0 else 0.0
+    return PoseFit(
+        world_from_body=pose,
+        covariance=covariance,
+        systematic=systematic,
+        systematic_share=share,
+        observable=observable,
+        rows=rows,
+        residuals_px=residuals,
+        chi2=cost,
+        dof=dof,
+        projected_px=projected,
+        jacobian=J,
+        log_det=log_det,
+        _gain=K,
+        _common=common if observable else None,
+    )
+
+
+def _both(rows: Ints) -> Ints:
+    """Where u and v of some views stand among the pixels of all, (2m,)."""
+    return np.ravel(2 * rows[:, None] + np.arange(2))
+
+
+def _blocks(covariances: Array) -> Array:
+    """Covariances (m, 2, 2) as one block-diagonal matrix (2m, 2m)."""
+    m = len(covariances)
+    out = np.zeros((m, 2, m, 2))
+    out[np.arange(m), :, np.arange(m)] = covariances
+    return out.reshape(2 * m, 2 * m)
+
+
+def _terms(
+    model: SpotModel, rows: Ints, pixels: Array, W: Array, pose: Pose, prior: tuple[Pose, Array] | None
+) -> tuple[Array, Array, float, Array, Array, Array] | None:
+    """Normal matrix (6, 6), right-hand side (6,), cost, residuals (m, 2) px, and the projection; None if that fails.
+
+    W: (m, 2, 2) for each spot, or (2m, 2m) where their errors go together.
+    """
+    projected, J = model.project(pose)
+    residuals = pixels - projected[rows]
+    if np.isnan(residuals).any():
+        return None
+    if W.ndim == 3:
+        r = (W @ residuals[..., None])[..., 0].ravel()
+        A = (W @ J[rows]).reshape(-1, 6)
+    else:
+        r = W @ residuals.ravel()
+        A = W @ J[rows].reshape(-1, 6)
+    H, g, cost = A.T @ A, A.T @ r, float(r @ r)
+    if prior is not None:
+        # d(minus)/d(step) is the identity to first order in the distance, which is what a prior is good for.
+        gap = prior[0].minus(pose)
+        H, g, cost = H + prior[1], g + prior[1] @ gap, cost + float(gap @ prior[1] @ gap)
+    return H, g, cost, residuals, projected, J
+
+
+def covariance_of(H: Array) -> tuple[Array, bool]:
+    """Covariance (6, 6) of a normal matrix (6, 6), and whether it has full rank; without it all entries are inf."""
+    eigenvalues, vectors = np.linalg.eigh(symmetric(H))
+    if eigenvalues[0] <= (RANK_TOLERANCE**2) * eigenvalues[-1]:
+        return np.full((6, 6), np.inf), False
+    return (vectors / eigenvalues) @ vectors.T, True
+
+
+def good_enough(fit: PoseFit, limits: SolveLimits) -> bool:
+    """Whether a fit is a measurement of the pose: full rank, and no direction vaguer than the limits."""
+    if not fit.observable:
+        return False
+    worst_m = np.sqrt(np.linalg.eigvalsh(fit.covariance[:3, :3])[-1])
+    worst_rad = np.sqrt(np.linalg.eigvalsh(fit.covariance[3:, 3:])[-1])
+    return bool(worst_m <= limits.max_sigma_m and worst_rad <= limits.max_sigma_rad)
+
+
+def point_covariance(J: Array, covariance: Array) -> Array:
+    """What a pose covariance (6, 6) means for pixels: J C J^T (..., 2, 2), px^2, of Jacobians (..., 2, 6)."""
+    return J @ covariance @ np.swapaxes(J, -1, -2)

@@ -1,0 +1,1 @@
+"""The rig's numbers, their covariance, and what it does to pixels."""

@@ -1,0 +1,96 @@
+"""The tables that a calibration of beams writes: beams.csv, angles.csv, residuals.csv."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from calibration.beams.beam_findings import ARCSEC, direction_sigmas, offset_sigmas
+from calibration.beams.beam_start import world_points
+from calibration.beams.beams import BeamCalibration
+from geometry.arrays import Array
+from geometry.rig import Rig
+from lab.files.text.yaml_text import write_whole
+from lab.runs.tables import csv_word
+
+BEAMS, ANGLES, RESIDUALS = "beams.csv", "angles.csv", "residuals.csv"
+BEAM_COLUMNS = (
+    "beam", "dx", "dy", "dz", "px_m", "py_m", "pz_m", "sigma_direction_arcsec", "sigma_offset_mm",
+    "from_drawing_arcsec", "from_drawing_mm",
+)  # fmt: skip
+ANGLE_COLUMNS = ("first", "second", "angle_deg", "sigma_arcsec")
+RESIDUAL_COLUMNS = (
+    "position", "camera", "spot", "u_px", "v_px", "residual_u_px", "residual_v_px", "residual_mm", "sigmas", "used",
+)  # fmt: skip
+
+
+def write_tables(c: BeamCalibration, drawing: Rig, positions: Sequence[str], folder: Path) -> None:
+    """Write the three. drawing: the rig with nominal beams; positions: the names of all positions."""
+    write_whole(_beam_table(c, drawing), folder / BEAMS)
+    write_whole(_angle_table(c), folder / ANGLES)
+    write_whole(_residual_table(c, positions), folder / RESIDUALS)
+
+
+def _beam_table(c: BeamCalibration, drawing: Rig) -> str:
+    rows = []
+    away = from_drawing(c, drawing)
+    for i, name in enumerate(c.rig.beams):
+        numbers = [*c.lines.directions[i], *c.lines.points[i]]
+        figures = [direction_sigmas(c)[i] / ARCSEC, 1e3 * offset_sigmas(c)[i], away[i, 0] / ARCSEC, 1e3 * away[i, 1]]
+        if c.undetermined:
+            figures[:2] = [np.nan, np.nan]
+        rows.append([csv_word(name), *(f"{v:.12g}" for v in numbers), *(_short(v) for v in figures)])
+    return _csv(BEAM_COLUMNS, rows)
+
+
+def _angle_table(c: BeamCalibration) -> str:
+    rows = [
+        [csv_word(a.first), csv_word(a.second), f"{np.rad2deg(a.angle):.9g}", _short(a.sigma / ARCSEC)]
+        for a in c.angles
+    ]
+    return _csv(ANGLE_COLUMNS, rows)
+
+
+def _residual_table(c: BeamCalibration, positions: Sequence[str]) -> str:
+    names = used_positions(c, positions)
+    views = c.rig.views()
+    mm = residuals_mm(c)
+    rows = []
+    for i in range(len(c.spots)):
+        camera, spot = views[c.spots.view[i]]
+        numbers = [*c.spots.pixels[i], *c.fit.residuals_px[i], mm[i], c.fit.sigmas[i]]
+        words = [csv_word(names[c.spots.position[i]]), csv_word(camera), csv_word(spot)]
+        rows.append([*words, *(_short(v) for v in numbers), "yes" if c.fit.kept[i] else "no"])
+    return _csv(RESIDUAL_COLUMNS, rows)
+
+
+def used_positions(c: BeamCalibration, positions: Sequence[str]) -> list[str]:
+    """The names of the positions that the calibration counts, in its order."""
+    return [p for i, p in enumerate(positions) if i not in set(c.dropped)]
+
+
+def residuals_mm(c: BeamCalibration) -> Array:
+    """(N,): how far each spot lies from where it should, on its screen, mm."""
+    should = replace(c.spots, pixels=c.spots.pixels - c.fit.residuals_px)
+    return 1e3 * np.linalg.norm(world_points(c.rig, c.spots) - world_points(c.rig, should), axis=1)
+
+
+def from_drawing(c: BeamCalibration, drawing: Rig) -> Array:
+    """(k, 2): angle (rad) between each beam and its drawing, and the distance (m) across at the foot point."""
+    out = []
+    for i, b in enumerate(drawing.beams.values()):
+        d = c.lines.directions[i]
+        gap = np.cross(c.lines.points[i] - b.point, b.direction)
+        out.append((np.arctan2(np.linalg.norm(np.cross(d, b.direction)), d @ b.direction), np.linalg.norm(gap)))
+    return np.array(out)
+
+
+def _csv(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    return "\n".join([",".join(heads), *(",".join(r) for r in rows)]) + "\n"
+
+
+def _short(value: float) -> str:
+    return f"{value:.6g}" if np.isfinite(value) else ""

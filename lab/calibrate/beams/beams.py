@@ -1,0 +1,220 @@
+"""`beampose calibrate beams`: each laser's own direction and offset, from recordings at positions of a stand."""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from calibration.beams.beam_findings import ARCSEC, UNDETERMINED, BeamGoals, beam_findings, direction_sigmas
+from calibration.beams.beams import BeamCalibration, self_calibrate
+from calibration.beams.beams import calibrate_beams as find_beams
+from calibration.beams.excitation import briefly
+from calibration.findings import Finding, Level, verdict
+from calibration.least_squares.adjustment import AdjustmentError
+from geometry.uncertainty.rig_parameters import RigCovariance
+from lab.calibrate.beams.beam_tables import BEAMS, write_tables
+from lab.calibrate.beams.recording_check import refuse_known_mistakes, refuse_repeated
+from lab.calibrate.beams.recordings import Recordings, read_recordings, stand_of
+from lab.calibrate.calibration_day import day_of, expired
+from lab.errors import CalibrationError, InputError
+from lab.files.project.project import Project, load_project
+from lab.files.rig.calibration_state import CalibrationState
+from lab.files.rig.rig_covariance import blocks_of, joint_covariance
+from lab.files.rig.rig_file import RigFile, load_rig_file, save_rig
+from lab.files.rig.screens_file import load_screens
+from lab.files.text.atomic_write import beside_a_good_one, refuse_foreign, whole_folder
+from lab.files.text.yaml_text import did_you_mean, read_mapping
+
+RIG = "rig.yaml"
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """How a calibration of beams ended."""
+
+    name: str
+    out: Path
+    level: Level
+    findings: tuple[Finding, ...]
+    calibration: BeamCalibration
+    rig: Path | None  # the rig.yaml written; None where the verdict is FAIL
+
+    @property
+    def exit_status(self) -> int:
+        """0, or 3 where the calibration must not be used."""
+        return CalibrationError.exit_status if self.level == Level.FAIL else 0
+
+    def line(self) -> str:
+        """One line for the terminal."""
+        c = self.calibration
+        sigma = float(np.sqrt(np.mean(direction_sigmas(c) ** 2))) / ARCSEC
+        worst = max(self.findings, key=lambda f: f.level)
+        what = f"{len(c.lines)} beams from {len(c.world_from_body.translation)} positions"
+        if c.world_from_stand is None and c.angles:
+            between = float(np.sqrt(np.mean([a.sigma**2 for a in c.angles]))) / ARCSEC
+            what += f" of which nothing is known, angles between beams to {between:.3g} arcsec RMS"
+        elif not c.undetermined:
+            what += f", directions to {sigma:.3g} arcsec RMS"
+        if not c.fit.kept.all():
+            what += f", {int(np.sum(~c.fit.kept))} of {len(c.fit.kept)} spots left out"
+        warnings = sum(f.level == Level.WARN for f in self.findings)
+        reason = f"; {warnings} warning{'s' if warnings > 1 else ''}, see report.html" if warnings else ""
+        if self.level == Level.FAIL:
+            what_failed = worst.what.split(" (")[0]
+            if c.undetermined and worst.what.startswith(UNDETERMINED):
+                what_failed = f"{UNDETERMINED}: {briefly(c.undetermined)}"
+            reason = f"; {what_failed}: {worst.cure}"
+        return f"{self.name}: {self.level.name}: {what}{reason} -> {self.out}"
+
+
+def calibrate_beams(
+    project_path: Path, out: Path, rig: Path | None = None, today: datetime.date | None = None
+) -> Outcome:
+    """Calibrate the beams of a project; writes rig.yaml (not where it fails), three tables and report.html into `out`.
+
+    rig: the rig.yaml or screens.yaml with cameras and screens as calibrated and their covariances (None: `rig.yaml`
+    beside the project). The project need not state cameras, screens and target again: those of the rig serve; a target
+    in it is replaced by the project's, if that has one. A FAIL does not replace an
+    earlier calibration: it then goes to `OUT-failed`. Raises InputError for what is wrong with the files,
+    CalibrationError where the spots give no calibration at all; `out` is then as it was.
+    """
+    refuse_foreign(out, _is_ours)
+    project = load_project(Path(project_path), lab_known=True)
+    day = day_of(project, today)
+    refuse_repeated(project)
+    rig_path = Path(rig) if rig is not None else project.path.parent / RIG
+    file, knowledge = _calibrated_lab(project, rig_path)
+    recordings = read_recordings(project, file.rig)
+    try:
+        if recordings.stand_from_body is None:
+            found = self_calibrate(file.rig, recordings.spots, len(recordings.names), knowledge)
+        else:
+            found = find_beams(file.rig, recordings.spots, stand_of(project, recordings), knowledge)
+    except AdjustmentError as error:
+        if recordings.stand_from_body is not None:
+            refuse_known_mistakes(project, file.rig, recordings, knowledge)
+        raise CalibrationError(f"{project.path}: the beams cannot be calibrated: {error}") from None
+    findings = [
+        *beam_findings(found, file.rig, recordings.names, BeamGoals()),
+        *expired(project, day, today),
+        *_findings_of_inputs(project, recordings, knowledge is not None, file.calibration, rig_path),
+    ]
+    level = verdict(findings)
+    folder = beside_a_good_one(out, level == Level.FAIL, RIG)
+    outcome = Outcome(
+        project.name, folder, level, tuple(findings), found, None if level == Level.FAIL else folder / RIG
+    )
+    with whole_folder(folder, may_replace=_is_ours) as work:
+        write_tables(found, file.rig, recordings.names, work)
+        if level != Level.FAIL:
+            save_rig(_rig_file(file, found, project, findings, day), work / RIG)
+        from lab.calibrate.beams.beams_page import write_page  # the template engine: only for those who write a report
+
+        inputs = [rig_path, *project.inputs]
+        write_page(project.name, found, findings, file.rig, recordings.names, inputs, day, work)
+    return outcome
+
+
+def _is_ours(folder: Path) -> bool:
+    return (folder / BEAMS).is_file()
+
+
+def _calibrated_lab(project: Project, rig_path: Path) -> tuple[RigFile, RigCovariance | None]:
+    """Cameras and screens as calibrated, with the project's target, and what is known of their errors."""
+    if not rig_path.is_file():
+        raise InputError(
+            f"{rig_path}: expected a rig.yaml with cameras and screens as calibrated, found none; run"
+            f" `beampose calibrate screen {project.path}` first and give its rig.yaml with --rig"
+        )
+    file, knowledge = _lab_file(rig_path)
+    for kind, asked, there in (
+        ("camera", project.cameras, file.rig.cameras),
+        ("screen", project.screens, file.rig.screens),
+    ):
+        for name in asked:
+            if name not in there:
+                raise InputError(
+                    f"{rig_path}: expected {kind} {name!r} of {project.path.name}, got {', '.join(there)}"
+                    f"{did_you_mean(name, there)}; calibrate it first (`beampose calibrate screen`)"[:300]
+                )
+    if not project.beams and not file.rig.beams:
+        raise InputError(
+            f"{project.path}: target: expected beams and spots as drawn, got none; add them: their names, ends and"
+            " screens are needed, directions and points only roughly"
+        )
+    if not project.beams:
+        return file, knowledge
+    for name, spot in project.spots.items():
+        if spot.screen not in file.rig.screens:
+            raise InputError(
+                f"{project.path}: target.spots.{name}.screen: expected a screen of {rig_path}, got {spot.screen!r}"
+            )
+    return replace(file, rig=replace(file.rig, beams=project.beams, spots=project.spots)), knowledge
+
+
+def _lab_file(path: Path) -> tuple[RigFile, RigCovariance | None]:
+    """Cameras and screens of a rig.yaml or a screens.yaml, and what is known of their errors."""
+    if str(read_mapping(path).get("schema", "")).startswith("beampose/screens/"):
+        screens = load_screens(path)
+        return RigFile(screens.rig, {}, screens.calibration), screens.covariance
+    file = load_rig_file(path)
+    return file, joint_covariance(file.rig, file.covariances, path)
+
+
+def _findings_of_inputs(
+    project: Project, recordings: Recordings, with_covariance: bool, of_lab: CalibrationState | None, rig_path: Path
+) -> list[Finding]:
+    out = [Finding(Level.PASS, note) for note in recordings.notes]
+    if of_lab is not None and of_lab.verdict != Level.PASS.name:
+        out.append(
+            Finding(
+                Level[of_lab.verdict],
+                f"{rig_path.name} ends in {of_lab.verdict}: {'; '.join(of_lab.reasons) or 'no reason given'}",
+                "what is wrong with cameras and screens is wrong with the beams found by them",
+                "see the report beside it",
+            )
+        )
+    if not with_covariance:
+        out.append(
+            Finding(
+                Level.WARN,
+                f"{rig_path.name} holds no covariance of cameras and screens: they are taken as exact",
+                "the sigmas of the beams are of the spots' noise alone, too small",
+                "calibrate cameras and screens with beampose, which writes their covariance",
+            )
+        )
+    stand = project.stand
+    placed = recordings.stand_from_body is not None and stand is not None and stand.world_from_stand is not None
+    if placed and stand is not None and stand.sigma_m == stand.sigma_rad == 0:
+        out.append(
+            Finding(
+                Level.WARN,
+                "stand.world_from_stand has no sigma: it is taken as exact",
+                "its error goes into the boresight of all beams unseen",
+                "give stand.sigma_m and stand.sigma_deg, or leave world_from_stand out and let it be found",
+            )
+        )
+    if recordings.stand_from_body is not None and not np.any(recordings.pose_sigmas):
+        out.append(
+            Finding(
+                Level.PASS,
+                "the stand's positions are taken as exact; give stand.pose_sigma_m and pose_sigma_deg where their"
+                " encoders are not much better than the spots",
+            )
+        )
+    return out
+
+
+def _rig_file(
+    file: RigFile, c: BeamCalibration, project: Project, findings: Sequence[Finding], day: datetime.date
+) -> RigFile:
+    lab = file.calibration  # of cameras and screens: what they warn of, and when they end, holds for the whole
+    ends = [] if lab is None or lab.valid_until is None else [lab.valid_until]
+    ends += [] if project.valid_days is None else [day + datetime.timedelta(days=project.valid_days)]
+    reasons = [f.what for f in findings if f.level > Level.PASS]
+    state = CalibrationState(day, verdict(findings).name, min(ends, default=None), tuple(reasons), project.notes)
+    return RigFile(c.rig, blocks_of(c.covariance), state)

@@ -1,0 +1,241 @@
+"""The report of a calibration of beams."""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from calibration.beams.beam_findings import ARCSEC, direction_sigmas, offset_sigmas
+from calibration.beams.beams import BeamCalibration
+from calibration.findings import Finding, verdict
+from geometry.arrays import Array, Bools
+from geometry.pose import ypr_sigmas
+from geometry.rig import Rig
+from lab.calibrate.beams.beam_tables import from_drawing, residuals_mm, used_positions
+from lab.number_format import short
+from lab.report.calibration.calibration_charts import residual_histogram
+from lab.report.calibration.calibration_drawings import coverage_map, residual_field
+from lab.report.calibration.calibration_page import (
+    CalibrationReport,
+    Drawing,
+    Section,
+    Table,
+    provenance,
+    write_calibration_report,
+)
+from lab.report.calibration.calibration_scene import rig_things, scene_views
+
+
+def write_page(
+    name: str,
+    c: BeamCalibration,
+    findings: Sequence[Finding],
+    drawing: Rig,
+    positions: Sequence[str],
+    inputs: Sequence[Path],
+    day: datetime.date,
+    folder: Path,
+) -> Path:
+    """Write report.html. drawing: the rig with nominal beams; positions: the names of all positions."""
+    sections = [
+        _beams(c, drawing),
+        _between(c),
+        _body_frame(c),
+        _positions(c, positions),
+        _residuals(c),
+        Section(
+            "The lab",
+            "The vehicle stands where it stood at the first position; the beams are the ones found.",
+            [Drawing(view) for view in scene_views(rig_things(c.rig, c.world_from_body[0]))],
+        ),
+    ]
+    report = CalibrationReport(
+        "Beams",
+        name,
+        verdict(findings),
+        findings,
+        _key_figures(c),
+        sections,
+        provenance(inputs, day),
+    )
+    return write_calibration_report(report, folder)
+
+
+def _key_figures(c: BeamCalibration) -> list[tuple[str, str, str]]:
+    direction, offset = direction_sigmas(c), offset_sigmas(c)
+    kept = c.fit.kept
+    rms_px = float(np.sqrt(np.mean(c.fit.residuals_px[kept] ** 2)))
+    rms_mm = float(np.sqrt(np.nanmean(residuals_mm(c)[kept] ** 2) / 2))
+    out = []
+    if not c.undetermined:
+        worst = list(c.rig.beams)[int(np.argmax(direction))]
+        rms = float(np.sqrt(np.mean(direction**2))) / ARCSEC
+        note = f"1 sigma per axis, RMS over beams; worst: {worst} with {short(float(direction.max()) / ARCSEC, 3)}"
+        note += "; in the frame of the drawing" if c.world_from_stand is None else ""
+        out.append(("directions known to", f"{short(rms, 3)} arcsec", note))
+        rms = 1e3 * float(np.sqrt(np.mean(offset**2)))
+        out.append(("offsets known to", f"{short(rms, 3)} mm", "1 sigma per axis, nearest to the body's origin"))
+    if c.angles:
+        angles = float(np.sqrt(np.mean([a.sigma**2 for a in c.angles]))) / ARCSEC
+        out.append(("angles between beams", f"± {short(angles, 3)} arcsec", "RMS over pairs; free of the body frame"))
+    out.append(("residuals", f"{short(rms_px, 3)} px · {short(rms_mm, 3)} mm", "RMS per axis, on the screens in mm"))
+    out.append(("spots", f"{int(kept.sum())} of {len(kept)}", "used; the others were left out as wrong"))
+    count = len(c.world_from_body.translation)
+    out.append(("positions", str(count), "known" if c.world_from_stand is not None else "of which nothing is known"))
+    return out
+
+
+def _beams(c: BeamCalibration, drawing: Rig) -> Section:
+    away = from_drawing(c, drawing)
+    direction, offset = direction_sigmas(c) / ARCSEC, 1e3 * offset_sigmas(c)
+    if c.undetermined:
+        direction, offset = np.full_like(direction, np.nan), np.full_like(offset, np.nan)
+    ends = {
+        b: "".join(sorted({"+" if s.sign > 0 else "−" for s in c.rig.spots.values() if s.beam == b}))
+        for b in c.rig.beams
+    }
+    rows = [
+        (
+            name,
+            ends[name],
+            _three(c.lines.directions[i], 6),
+            _three(1e3 * c.lines.points[i], 2),
+            float(direction[i]),
+            float(offset[i]),
+            float(np.rad2deg(away[i, 0]) * 60),
+            float(1e3 * away[i, 1]),
+        )
+        for i, name in enumerate(c.rig.beams)
+    ]
+    heads = (
+        "beam", "ends", "direction", "offset (mm)", "sigma direction (arcsec)", "sigma offset (mm)",
+        "from drawing (arcmin)", "from drawing (mm)",
+    )  # fmt: skip
+    words = [
+        "Each laser in the body frame. The offset is the beam's point nearest to the body's origin; sigmas are RMS of"
+        " the two axes across the beam.",
+        "Direction and offset errors go together, since a beam is best known where its spots fell: rig.yaml holds their"
+        " joint covariance, which tells more than the sigmas alone.",
+    ]
+    if c.undetermined:
+        words[1] = "These numbers are not determined by the recordings: no rig.yaml was written."
+    return Section("Beams", words, (), Table(heads, rows))
+
+
+def _three(vector: Array, digits: int) -> str:
+    return ", ".join(f"{v:.{digits}f}".replace("-", "−") for v in vector)
+
+
+def _between(c: BeamCalibration) -> Section:
+    rows = [(a.first, a.second, f"{np.rad2deg(a.angle):.5f}", a.sigma / ARCSEC) for a in c.angles]
+    words = ["What a turn or shift of the body frame does not change."]
+    return Section("Angles between beams", words, (), Table(("first", "second", "angle (deg)", "sigma (arcsec)"), rows))
+
+
+def _body_frame(c: BeamCalibration) -> Section:
+    if c.world_from_stand is None or c.stand_covariance is None:
+        return Section(
+            "The body frame",
+            [
+                "No position of the stand was known. Turning or shifting the body frame, with the vehicle's poses the"
+                f" other way, moves no spot: {c.frame_free} numbers of the {4 * len(c.lines)} of the beams cannot be"
+                " found, the place (3) and the attitude (3) of the body frame.",
+                "It was laid so that the beams found are, all together, nearest to the drawing (least squares, a radian"
+                " counting like a metre). The sigmas of the beams above are against that frame. Angles and distances"
+                " between beams do not depend on this choice.",
+            ],
+        )
+    yaw, pitch, roll = np.rad2deg(c.world_from_stand.ypr)
+    sigmas = np.sqrt(np.maximum(np.diagonal(c.stand_covariance), 0))
+    turns = np.rad2deg(ypr_sigmas(c.world_from_stand, c.stand_covariance))
+    place = 1e3 * c.world_from_stand.translation
+    rows = [
+        ("x (mm)", float(place[0]), float(1e3 * sigmas[0])),
+        ("y (mm)", float(place[1]), float(1e3 * sigmas[1])),
+        ("z (mm)", float(place[2]), float(1e3 * sigmas[2])),
+        ("yaw (deg)", float(yaw), float(turns[0])),
+        ("pitch (deg)", float(pitch), float(turns[1])),
+        ("roll (deg)", float(roll), float(turns[2])),
+    ]
+    words = [
+        "The body frame is the stand's carriage, as its positions were recorded. The stand's place in the world:",
+    ]
+    if c.undetermined:
+        words.append(f"Not determined: {'; '.join(c.undetermined)}. {c.motion.cure().capitalize()}.")
+        rows = [(name, value, float("nan")) for name, value, _ in rows]
+    return Section("The stand", words, (), Table(("world_from_stand", "value", "sigma"), rows))
+
+
+def _positions(c: BeamCalibration, positions: Sequence[str]) -> Section:
+    names = used_positions(c, positions)
+    rows = []
+    for k, name in enumerate(names):
+        here = c.spots.position == k
+        good = here & c.fit.kept
+        rms = float(np.sqrt(np.mean(c.fit.residuals_px[good] ** 2))) if good.any() else float("nan")
+        yaw, pitch, roll = np.rad2deg(c.world_from_body[k].ypr)
+        x, y, z = 1e3 * c.world_from_body[k].translation
+        rows.append(
+            (name, float(yaw), float(pitch), float(roll), float(x), float(y), float(z), int(here.sum()),
+             int(here.sum() - good.sum()), rms)
+        )  # fmt: skip
+    heads = (
+        "position", "yaw (deg)", "pitch (deg)", "roll (deg)", "x (mm)", "y (mm)", "z (mm)", "spots", "left out",
+        "RMS (px)",
+    )  # fmt: skip
+    coverage = [
+        Drawing(coverage_map(c.rig.cameras[n].image_size_px, pixels, f"Camera {n}: where spots were", things="spots"))
+        for n, pixels in _by_camera(c, c.spots.pixels).items()
+    ]
+    words = [
+        f"The vehicle's pose in the world at each position. {str(c.motion)[0].upper()}{str(c.motion)[1:]}.",
+        "A direction is told by spots at different distances along its beam: turns and shifts towards the screens.",
+    ]
+    return Section("Positions", words, coverage, Table(heads, rows))
+
+
+def _residuals(c: BeamCalibration) -> Section:
+    kept = c.fit.kept
+    drawings = [
+        Drawing(
+            residual_field(
+                c.rig.cameras[n].image_size_px,
+                pixels,
+                _by_camera(c, c.fit.residuals_px, kept)[n],
+                f"Camera {n}: found − predicted",
+                things="spots",
+            ),
+            "Arrows that turn slowly with the place: lens or screen. All of one position alike: the stand."
+            if i == 0
+            else "",
+        )
+        for i, (n, pixels) in enumerate(_by_camera(c, c.spots.pixels, kept).items())
+    ]
+    whitened = c.fit.adjusted.residuals[0]
+    drawings.append(Drawing(residual_histogram(whitened, "Residuals in sigmas", "sigma", sigma=1.0)))
+    views = c.rig.views()
+    rows = []
+    mm = residuals_mm(c)
+    for v, (camera, spot) in enumerate(views):
+        here = (c.spots.view == v) & kept
+        if here.any():
+            px = float(np.sqrt(np.mean(c.fit.residuals_px[here] ** 2)))
+            on_screen = float(np.sqrt(np.nanmean(mm[here] ** 2) / 2))
+            left_out = int(((c.spots.view == v) & ~kept).sum())
+            rows.append((camera, spot, c.rig.spots[spot].beam, int(here.sum()), left_out, px, on_screen))
+    heads = ("camera", "spot", "beam", "spots used", "left out", "RMS (px)", "RMS on the screen (mm)")
+    words = "RMS is per axis. The curve is what residuals of the stated sigmas follow."
+    if c.fit.scale > 1:
+        words += f" The sigmas were widened by {c.fit.scale:.3g}, since the spots scattered more than told."
+    return Section("Residuals", words, drawings, Table(heads, rows))
+
+
+def _by_camera(c: BeamCalibration, values: Array, rows: Bools | None = None) -> dict[str, Array]:
+    """Rows of values (N, 2) by camera, cameras without any left out."""
+    camera = np.array([name for name, _ in c.rig.views()])[c.spots.view]
+    used = np.ones(len(c.spots), dtype=bool) if rows is None else rows
+    out = {n: values[(camera == n) & used] for n in c.rig.cameras}
+    return {n: v for n, v in out.items() if len(v)}

@@ -1,0 +1,241 @@
+"""Spots recorded at positions of a stand: from tables or run folders, labelled, frames at rest averaged."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from calibration.beams.beams import Stand
+from calibration.terms.spot_term import SpotPixels
+from geometry.arrays import Array, Ints
+from geometry.pose import Pose
+from geometry.rig import Rig
+from lab.calibrate.beams.stationary_frames import SpotRows, average, positions_at_rest
+from lab.errors import InputError
+from lab.files.project.point_files import StandPoses, read_poses
+from lab.files.project.project import Project, Recording
+from lab.files.text.csv_text import numbers_in, read_table, shown_line, whole_numbers
+from lab.files.text.range_checks import SIGMAS_PX, refuse_far_pixels, refuse_sigmas
+from lab.files.text.yaml_text import did_you_mean
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+SPOTS = ("camera", "spot", "u_px", "v_px")
+DEFAULT_SPOT_SIGMA_PX = 0.1  # px: where the table gives none; a laser spot on a matt screen, speckle included
+MOST_FREE = 200  # positions of which nothing is known: more say little and cost six unknowns each
+_USED = ("matched", "turned")  # statuses of a spots.csv that are measurements
+
+
+@dataclass(frozen=True, slots=True)
+class Recordings:
+    """All recordings of a project, as positions of the stand."""
+
+    names: tuple[str, ...]  # P, for messages: recording and frames
+    spots: SpotPixels
+    stand_from_body: Pose | None  # (P,); None where no position is known
+    pose_sigmas: Array  # (P, 6): m, rad
+    notes: tuple[str, ...]  # what was assumed
+
+
+def stand_of(project: Project, recordings: Recordings) -> Stand:
+    """The stand of recordings whose positions are known, for the solve."""
+    assert recordings.stand_from_body is not None
+    stand = project.stand
+    if stand is None or stand.world_from_stand is None:
+        return Stand(recordings.stand_from_body, recordings.pose_sigmas, None, None)
+    covariance = np.diag([stand.sigma_m**2] * 3 + [stand.sigma_rad**2] * 3)
+    return Stand(recordings.stand_from_body, recordings.pose_sigmas, stand.world_from_stand, covariance)
+
+
+def read_recordings(project: Project, rig: Rig) -> Recordings:
+    """The recordings of a project. rig: cameras and screens as calibrated, beams as drawn, spots by name.
+
+    Raises InputError in one line: file, line, what was expected and what was found.
+    """
+    if not project.recordings:
+        raise InputError(
+            f"{project.path}: recordings: expected spots at positions of the stand, got none; add"
+            " recordings: [{spots: spots.csv, poses: poses.csv}] or [{run: RUN, poses: poses.csv}]"
+        )
+    with_poses = [r.poses is not None for r in project.recordings]
+    if any(with_poses) and not all(with_poses):
+        raise InputError(
+            f"{project.path}: recordings.{with_poses.index(False)}.poses: expected poses for all recordings or for"
+            " none; without poses only the shape of the rig can be found, and mixing hides which was used"
+        )
+    names: list[str] = []
+    notes: list[str] = []
+    spots: list[SpotPixels] = []
+    poses: list[Pose] = []
+    sigmas: list[Array] = []
+    for recording in project.recordings:
+        known = None if recording.poses is None else read_poses(recording.poses)
+        rows = _rows(recording, known, project, rig, notes)
+        if known is None:
+            rows = spread(rows, notes)
+        frames = np.unique(rows.frame)
+        first: Pose | None = None
+        if known is not None:
+            at = np.searchsorted(known.frames, frames)
+            first = known.stand_from_body[at]
+            told = _pose_sigmas(known, project)[at]
+            position_of = positions_at_rest(first, told)
+            starts = np.unique(position_of, return_index=True)[1]
+            poses.append(first[starts])
+            sigmas.append(told[starts])
+        else:
+            position_of = np.arange(len(frames))
+        averaged = average(rows, position_of[np.searchsorted(frames, rows.frame)])
+        spots.append(dataclasses.replace(averaged, position=averaged.position + len(names)))
+        names += _names(recording, frames, position_of, len(project.recordings) > 1)
+    joined = SpotPixels(*(np.concatenate([getattr(s, f) for s in spots]) for f in SpotPixels.__slots__))
+    stand_from_body = None
+    if poses:
+        stand_from_body = Pose(
+            np.concatenate([p.rotation for p in poses]), np.concatenate([p.translation for p in poses])
+        )
+    return Recordings(
+        tuple(names),
+        joined,
+        stand_from_body,
+        np.concatenate(sigmas) if sigmas else np.zeros((len(names), 6)),
+        tuple(dict.fromkeys(notes)),
+    )
+
+
+def _rows(recording: Recording, known: StandPoses | None, project: Project, rig: Rig, notes: list[str]) -> SpotRows:
+    if recording.spots is not None:
+        rows = read_spot_table(recording.spots, rig, notes)
+        if known is not None:
+            without = np.setdiff1d(rows.frame, known.frames)
+            if len(without):
+                raise InputError(
+                    f"{recording.poses}: frame: expected a pose for each of {len(np.unique(rows.frame))} positions of"
+                    f" {recording.spots.name}, got none for {without[0]}"
+                    f"{f' and {len(without) - 1} more' if len(without) > 1 else ''}"
+                )
+        return rows
+    from lab.calibrate.beams.recorded_runs import spots_of_run  # detection and tracking: only for those who need them
+
+    assert recording.run is not None
+    place = None if project.stand is None else project.stand.world_from_stand
+    rows = spots_of_run(recording.run, rig, known, place)
+    if not len(rows.frame):
+        raise InputError(
+            f"{recording.run}: expected spots that fit the beams as drawn, found none; check target.beams, the stand's"
+            " poses and the pictures"
+        )
+    return rows
+
+
+def read_spot_table(path: Path, rig: Rig, notes: list[str]) -> SpotRows:
+    """Spots from `position,camera,spot,u_px,v_px[,sigma_px]`, or from a run's spots.csv (`frame`, matched spots only).
+
+    notes: what was assumed is added. Raises InputError.
+    """
+    numbers = ("position", "frame", "u_px", "v_px", "sigma_px", "sigma_u_px", "sigma_v_px", "cov_uv_px2")
+    table = read_table(path, SPOTS, numbers=numbers)
+    if not len(table):
+        raise InputError(f"{path}: expected rows position,camera,spot,u_px,v_px below the header, got none")
+    if table.attrs["malformed"]:
+        raise InputError(f"{path}: {table.attrs['malformed']} lines have more fields than the header; mend them")
+    key = "position" if "position" in table else "frame"
+    if key not in table:
+        raise InputError(
+            f"{path}: expected a column 'position' (or 'frame'), got {shown_line(','.join(table.columns))}"
+        )
+    whole = whole_numbers(table, key, path)
+    table = table.assign(**{key: whole}, line=np.arange(len(table)) + 2)
+    if "status" in table:
+        table = table[table["status"].isin(_USED)]
+        if not len(table):
+            raise InputError(f"{path}: status: expected spots that are {' or '.join(_USED)}, got none")
+    views = {view: i for i, view in enumerate(rig.views())}
+    view = np.empty(len(table), dtype=np.int64)
+    lines = table["line"].to_numpy()
+    wanted = {"camera": "a calibrated camera", "spot": "a spot of the target"}
+    for i, (camera, spot) in enumerate(zip(table["camera"], table["spot"], strict=True)):
+        for kind, name, names in (("camera", camera, rig.cameras), ("spot", spot, rig.spots)):
+            if name not in names:
+                raise InputError(
+                    f"{path}: line {lines[i]}: {kind}: expected {wanted[kind]}, got {name!r}"
+                    f"{did_you_mean(name, names)}"[:240]
+                )
+        if (camera, spot) not in views:
+            raise InputError(
+                f"{path}: line {lines[i]}: camera {camera!r} observes screen {rig.cameras[camera].screen!r}, spot"
+                f" {spot!r} falls on {rig.spots[spot].screen!r}; one of the two names is wrong"
+            )
+        view[i] = views[camera, spot]
+    pixels = np.stack([numbers_in(table, name, path) for name in ("u_px", "v_px")], axis=1)
+    sizes = {name: c.image_size_px for name, c in rig.cameras.items()}
+    refuse_far_pixels(path, lines.tolist(), table["camera"].tolist(), pixels, sizes)
+    pairs = np.stack([table[key].to_numpy(), view], axis=1)
+    _, first, count = np.unique(pairs, axis=0, return_index=True, return_counts=True)
+    if key == "frame" and np.any(count > 1):
+        i = first[np.argmax(count > 1)]
+        raise InputError(
+            f"{path}: line {lines[i]}: expected one row per frame, camera and spot, got spot"
+            f" {table['spot'].iloc[i]!r} in frame {whole[i]} more than once"
+        )
+    return SpotRows(table[key].to_numpy(dtype=np.int64), view, pixels, _covariances(path, table, notes))
+
+
+def _covariances(path: Path, table: pd.DataFrame, notes: list[str]) -> Array:
+    """(n, 2, 2), px^2, from whichever columns there are."""
+    out = np.zeros((len(table), 2, 2))
+    columns = ("sigma_u_px", "sigma_v_px") if "sigma_u_px" in table and "sigma_v_px" in table else ("sigma_px",) * 2
+    for k, name in enumerate(columns):
+        if name not in table:
+            if k == 0:
+                notes.append(f"{path.name}: no column sigma_px: {DEFAULT_SPOT_SIGMA_PX:g} px is assumed")
+            out[:, k, k] = DEFAULT_SPOT_SIGMA_PX**2
+            continue
+        given = numbers_in(table, name, path, "a number above 0", may_be_empty=True)
+        refuse_sigmas(path, table["line"].tolist(), name, given, SIGMAS_PX, "px")
+        out[:, k, k] = np.where(np.isnan(given), DEFAULT_SPOT_SIGMA_PX, given) ** 2
+        if k == 0 and np.isnan(given).any():
+            notes.append(
+                f"{path.name}: {int(np.isnan(given).sum())} spots without a sigma: {DEFAULT_SPOT_SIGMA_PX:g} px is"
+                " assumed"
+            )
+    if "cov_uv_px2" in table and columns[0] != columns[1]:
+        cov = np.nan_to_num(numbers_in(table, "cov_uv_px2", path, may_be_empty=True))
+        bound = 0.99 * np.sqrt(out[:, 0, 0] * out[:, 1, 1])
+        out[:, 0, 1] = out[:, 1, 0] = np.clip(cov, -bound, bound)
+    return out
+
+
+def _pose_sigmas(known: StandPoses, project: Project) -> Array:
+    """(n, 6): the table's, else the stand's, else 0."""
+    stand = project.stand
+    general = [0.0] * 6 if stand is None else [stand.pose_sigma_m] * 3 + [stand.pose_sigma_rad] * 3
+    return np.where(np.isnan(known.sigmas), np.array(general), known.sigmas)
+
+
+def spread(rows: SpotRows, notes: list[str]) -> SpotRows:
+    """At most MOST_FREE frames, evenly spread."""
+    frames = np.unique(rows.frame)
+    if len(frames) <= MOST_FREE:
+        return rows
+    notes.append(f"of {len(frames)} frames without a pose {MOST_FREE} were used, evenly spread")
+    used = np.isin(rows.frame, frames[np.linspace(0, len(frames) - 1, MOST_FREE).round().astype(np.int64)])
+    return SpotRows(rows.frame[used], rows.view[used], rows.pixels[used], rows.covariance[used])
+
+
+def _names(recording: Recording, frames: Ints, position_of: Ints, several: bool) -> list[str]:
+    label = ""
+    if several:
+        path = recording.run or recording.spots
+        assert path is not None
+        label = f"{path.name if recording.run else path.stem} "
+    out = []
+    for k in range(int(position_of[-1]) + 1):
+        here = frames[position_of == k]
+        out.append(f"{label}{here[0]}" + (f"-{here[-1]}" if len(here) > 1 else ""))
+    return out

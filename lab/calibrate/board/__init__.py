@@ -1,0 +1,1 @@
+"""`beampose calibrate board`: boards to print."""

@@ -1,0 +1,1 @@
+"""`beampose calibrate camera`: photographs of a board to a lens."""

@@ -1,0 +1,205 @@
+"""`calibrate camera`: photographs of a board in, camera.yaml with its covariance and a report out."""
+
+from __future__ import annotations
+
+import csv
+import datetime
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from calibration.boards.board_types import Board, CircleGrid
+from calibration.findings import Level
+from calibration.lens.fit.corner_table import CircleAreas, CornerTable
+from calibration.lens.fit.lens_models import LADDER, named
+from calibration.lens.intrinsics import (
+    FEWEST_VIEWS,
+    IntrinsicsError,
+    IntrinsicsOptions,
+    TooFewViewsError,
+    calibrate_intrinsics,
+)
+from calibration.lens.intrinsics_result import Intrinsics
+from geometry.camera import FISHEYE, PERSPECTIVE
+from lab.calibrate.camera.camera_outcome import Outcome
+from lab.calibrate.camera.photos import PhotoSet, Progress, find_in_photos, origins_of
+from lab.errors import CalibrationError, InputError
+from lab.files.rig.board_file import board_of
+from lab.files.rig.camera_block import Covariance
+from lab.files.rig.camera_file import CameraCalibration, CameraFile, save_camera
+from lab.files.text.atomic_write import beside_a_good_one, refuse_foreign, whole_folder
+from lab.files.text.yaml_text import did_you_mean
+
+CAMERA, FAILED, CORNERS = "camera.yaml", "camera.failed.yaml", "corners.csv"
+CORNER_COLUMNS = ("view", "id", "u_px", "v_px", "residual_u_px", "residual_v_px", "used")  # residual: found less model
+LENSES = ("auto", *(m.title for m in LADDER))
+WARPS = {"auto": None, "on": True, "off": False}
+
+
+@dataclass(frozen=True, slots=True)
+class CameraOptions:
+    """What the user may decide."""
+
+    name: str = "camera"
+    distance_m: float | None = None  # of the screen, for figures in mm; None: the median distance of the boards
+    valid_days: int | None = 365  # after that a run warns; None: for ever. A year: mounts and lenses creep
+    folds: int | None = None  # of the hold-out; None: five, or one view each up to ten views
+    lens: str = "auto"  # or 0, 4, 5, 8, 12, fisheye: the model, whatever the hold-out says
+    warp: str = "auto"  # or on, off: whether the board's bend is solved for
+    stretch: str = "auto"  # or on, off: whether its rows and columns are taken as to scale, and its points as in place
+
+    def __post_init__(self) -> None:
+        if self.lens not in LENSES:
+            raise InputError(f"lens: expected {', '.join(LENSES)}, got {self.lens!r}{did_you_mean(self.lens, LENSES)}")
+        if self.warp not in WARPS:
+            raise InputError(f"warp: expected {', '.join(WARPS)}, got {self.warp!r}{did_you_mean(self.warp, WARPS)}")
+        if self.stretch not in WARPS:
+            near = did_you_mean(self.stretch, WARPS)
+            raise InputError(f"stretch: expected {', '.join(WARPS)}, got {self.stretch!r}{near}")
+        if self.distance_m is not None and not (np.isfinite(self.distance_m) and self.distance_m > 0):
+            raise InputError(f"distance: expected metres above 0, got {self.distance_m:g}")
+        if self.folds is not None and self.folds < 2:
+            raise InputError(f"folds: expected 2 or more, got {self.folds}")
+        if self.valid_days is not None and self.valid_days < 1:
+            raise InputError(f"valid days: expected 1 or more, got {self.valid_days}")
+
+    def intrinsics(self, origins: tuple[str, ...] = ()) -> IntrinsicsOptions:
+        """The same for the solve, and where each view comes from."""
+        lens = None if self.lens == "auto" else named(self.lens)
+        warp, stretch = WARPS[self.warp], WARPS[self.stretch]
+        return IntrinsicsOptions(self.distance_m, lens, warp, stretch, self.folds, origins)
+
+
+def calibrate_camera(
+    photos: Iterable[Path | str],
+    board: Board | str | Path,
+    out: Path,
+    options: CameraOptions | None = None,
+    today: datetime.date | None = None,
+    progress: Progress | None = None,
+) -> Outcome:
+    """Calibrate a camera from photographs (files, folders, patterns, videos) of a board (value, text or board.yaml).
+
+    Writes camera.yaml (camera.failed.yaml where the verdict is FAIL, so that nothing reads it by mistake), corners.csv
+    and report.html into the folder `out`, whole or not at all; a FAIL does not replace an earlier calibration, it then
+    goes to `OUT-failed`. Raises InputError for pictures or a board that cannot be used, CalibrationError where the
+    photographs do not determine the camera.
+    """
+    options = options or CameraOptions()
+    refuse_foreign(out, _is_ours)
+    day = today or datetime.date.today()
+    known = board_of(board) if isinstance(board, str | Path) else board
+    found = find_in_photos(photos, known, progress, fewest=FEWEST_VIEWS)
+    table = corner_table(found)
+    try:
+        result = calibrate_intrinsics(table, options.intrinsics(origins_of(found)))
+    except TooFewViewsError as error:
+        raise InputError(f"{options.name} ({found.line()}): {error}") from None
+    except IntrinsicsError as error:
+        raise CalibrationError(f"{options.name} ({found.line()}): {error}") from None
+    folder = beside_a_good_one(out, result.verdict == Level.FAIL, CAMERA)
+    outcome = Outcome(options.name, folder, result, found)
+    file = camera_file(outcome, options, day)
+    with whole_folder(folder, may_replace=_is_ours) as work:
+        save_camera(file, work / (FAILED if outcome.level == Level.FAIL else CAMERA))
+        _write_corners(outcome, work / CORNERS)
+        from lab.calibrate.camera.camera_page import (
+            write_page,  # the template engine: only for those who write a report
+        )
+
+        write_page(outcome, file, day, work)
+    return outcome
+
+
+def corner_table(photos: PhotoSet) -> CornerTable:
+    """What the photographs gave, for the solve."""
+    board = photos.board
+    views = [view for _, view in photos.views]
+    circles = None
+    if isinstance(board, CircleGrid):
+        areas = [view.areas_px2 for view in views if view.areas_px2 is not None]
+        measured = np.concatenate(areas) if len(areas) == len(views) else None
+        circles = CircleAreas(measured, board.stated_diameter_m)
+    rows = [(np.searchsorted(board.ids, view.ids), view.pixels) for view in views]
+    return CornerTable.of(rows, board.points, board.middle, photos.image_size_px, circles)
+
+
+def _is_ours(folder: Path) -> bool:
+    return (folder / CORNERS).is_file()
+
+
+def camera_file(outcome: Outcome, options: CameraOptions, day: datetime.date) -> CameraFile:
+    """What camera.yaml holds."""
+    r = outcome.result
+    failed = outcome.level == Level.FAIL
+    until = "" if options.valid_days is None or failed else (day + datetime.timedelta(options.valid_days)).isoformat()
+    calibration = CameraCalibration(
+        date=day.isoformat(),
+        verdict=outcome.level.name,
+        rms_px=r.rms_px,
+        sigma_px=r.fit.sigma_px,
+        hold_out_rms_px=r.held.rms_px,
+        views=int(np.sum(r.table.counts(r.fit.used) > 0)),
+        corners=int(r.fit.used.sum()),
+        board=outcome.photos.board.describe(),
+        distance_m=r.distance_m,
+        valid_until=until,
+        reasons=tuple(f"{f.level.name}: {f.what}" for f in r.findings if f.level > Level.PASS),
+        figures=figures_of(r),
+    )
+    return CameraFile(
+        name=outcome.name,
+        image_size_px=r.table.image_size_px,
+        camera_matrix=r.matrix,
+        distortion=r.distortion,
+        lens=FISHEYE if r.model.fisheye else PERSPECTIVE,
+        covariance=Covariance(r.parameters, r.covariance),
+        calibration=calibration,
+    )
+
+
+def figures_of(r: Intrinsics) -> dict[str, float]:
+    """Further key figures of camera.yaml, by name with unit."""
+    px, mm = r.map.sigma_px(r.covariance), r.map.sigma_mm(r.covariance)
+    out = {
+        "uncertainty_median_px": float(np.nanmedian(px)),
+        "uncertainty_worst_px": float(np.nanmax(px)),
+        "uncertainty_median_mm": float(np.nanmedian(mm)),
+        "uncertainty_worst_mm": float(np.nanmax(mm)),
+        "scatter_between_photographs": r.scatter.factor,
+        "sigmas_raised_by": r.correlated_noise,
+        "sigmas_raised_for_model_by": r.doubt.factor,
+        "residuals_together_px": r.doubt.left_px,
+        "lens_models_differ_px": r.doubt.between_px,
+        "picture_covered": r.coverage.filled,
+        "tilts_differ_by_deg": r.coverage.spread_deg,
+    }
+    if r.halves is not None:
+        out |= {"halves_differ_px": r.halves.rms_px, "halves_expected_px": r.halves.expected_rms_px}
+    if r.warp is not None:
+        out |= {"board_bend_mm": 1000 * r.warp.rise_m, "board_bend_corrected": float(r.warp.corrected)}
+    if r.board is not None and r.board.stretch is not None:
+        s = r.board.stretch
+        out |= {"board_stretch_percent": 100 * s.stretch, "board_stretch_sigma_percent": 100 * s.sigma[0]}
+        out |= {"board_stretch_corrected": float(s.corrected)}
+    if r.board is not None and r.board.points.corrected:
+        out |= {"board_points_off_mm": 1000 * r.board.points.rms_m}
+    if r.table.circles is not None:
+        out |= {"circle_diameter_mm": 2000 * r.fit.radius_m, "circle_diameter_sigma_mm": 2000 * r.fit.radius_sigma_m}
+    return out
+
+
+def _write_corners(outcome: Outcome, path: Path) -> None:
+    """A row per corner; residuals are empty in views that were left out."""
+    r, names = outcome.result, [name for name, _ in outcome.photos.views]
+    ids = outcome.photos.board.ids
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(CORNER_COLUMNS)
+        for k in range(len(r.table)):
+            miss = ["" if np.isnan(v) else f"{-v:.4f}" for v in r.fit.residuals[k].tolist()]
+            u, v = r.table.pixels[k].tolist()
+            point = int(ids[r.table.point[k]])
+            writer.writerow([names[r.table.view[k]], point, f"{u:.4f}", f"{v:.4f}", *miss, int(r.fit.used[k])])

@@ -1,0 +1,46 @@
+"""How a camera's calibration ended."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from calibration.findings import Level
+from calibration.lens.intrinsics_result import Intrinsics
+from lab.calibrate.camera.photos import PhotoSet
+from lab.errors import CalibrationError
+from lab.number_format import short
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """How a camera's calibration ended."""
+
+    name: str
+    out: Path
+    result: Intrinsics
+    photos: PhotoSet
+
+    @property
+    def level(self) -> Level:
+        """The verdict."""
+        return self.result.verdict
+
+    @property
+    def exit_status(self) -> int:
+        """0, or 3 where the calibration must not be used."""
+        return CalibrationError.exit_status if self.level == Level.FAIL else 0
+
+    def line(self) -> str:
+        """One line for the terminal."""
+        r = self.result
+        worst = max(r.findings, key=lambda f: f.level)
+        reason = "" if self.level == Level.PASS else f": {worst.what.rstrip('.')}"
+        px, mm = (np.nanmedian(m) for m in (r.map.sigma_px(r.covariance), r.map.sigma_mm(r.covariance)))
+        return (
+            f"{self.name}: {self.level.name}: fx {r.fit.lens[0]:.2f} ± {short(r.sigmas[0], 2)} px, {r.model.words}, RMS"
+            f" {r.rms_px:.3f} px, directions to {short(px, 2)} px / {short(mm, 2)} mm at"
+            f" {r.distance_m:.3g} m{reason} -> {self.out}"
+        )

@@ -1,0 +1,1 @@
+"""`beampose calibrate check`: whether a stored calibration still holds."""

@@ -1,0 +1,179 @@
+"""The report of a daily check."""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from geometry.arrays import Array
+from lab.calibrate.drift_check.drift_expected import Compared
+from lab.calibrate.drift_check.drift_history import HistoryRow
+from lab.calibrate.drift_check.drift_messages import size, told
+from lab.calibrate.drift_check.drift_result import CameraDrift, DailyLimits, OtherChange, Outcome, is_weak
+from lab.files.rig.rig_file import RigFile
+from lab.number_format import short
+from lab.report.calibration.calibration_charts import DriftLine, drift_chart
+from lab.report.calibration.calibration_drawings import corners_overlay
+from lab.report.calibration.calibration_page import (
+    CalibrationReport,
+    Drawing,
+    Section,
+    Table,
+    provenance,
+    write_calibration_report,
+)
+from lab.report.calibration.calibration_scene import Dot, rig_things, scene_views
+
+
+def write_page(
+    outcome: Outcome,
+    file: RigFile,
+    compared: Sequence[Compared],
+    others: Sequence[OtherChange],
+    history: Sequence[HistoryRow],
+    limits: DailyLimits,
+    today: datetime.date,
+    inputs: Sequence[Path],
+    folder: Path,
+) -> Path:
+    """Write report.html of a check. history: all checks so far, this one included."""
+    sections = [_drift_section(outcome.cameras, compared, limits, file)]
+    if len({r.date for r in history}) > 1:
+        sections.append(_history_section(history, limits, file))
+    sections += [_points_section(compared, others, outcome.cameras), _scene_section(file, compared)]
+    report = CalibrationReport(
+        "Daily check",
+        f"check of {today.isoformat()}",
+        outcome.level,
+        outcome.findings,
+        _key_figures(outcome.cameras, file, limits, today),
+        sections,
+        provenance(inputs, today),
+    )
+    return write_calibration_report(report, folder)
+
+
+def _key_figures(
+    cameras: Sequence[CameraDrift], file: RigFile, limits: DailyLimits, today: datetime.date
+) -> list[tuple[str, str, str]]:
+    out = []
+    for c in cameras:
+        value = f"{short(c.drift_px)} px · {short(c.drift_mm)} mm"
+        state = told(c) if c.change is not None else f"by noise alone {short(c.noise_px, 2)} px"
+        if c.change is None and is_weak(c.detectable_mm, limits):
+            state = f"a weak check: shifts below {short(c.detectable_px, 2)} px can hide"
+        out.append((f"drift of camera {c.camera}", value, state))
+    if file.calibration is not None:
+        until = file.calibration.valid_until
+        left = "no expiry date" if until is None else f"valid until {until}"
+        if until is not None:
+            days = (until - today).days
+            left += f", {days} days left" if days >= 0 else f", expired {-days} days ago"
+        out.append(("calibrated on", file.calibration.date.isoformat(), left))
+    out.append(("limits", f"{limits.warn_mm:g} / {limits.fail_mm:g} mm", "warning / not to be used, at the screen"))
+    return out
+
+
+def _drift_section(
+    cameras: Sequence[CameraDrift], compared: Sequence[Compared], limits: DailyLimits, file: RigFile
+) -> Section:
+    labels = {name: [one.label[i] for i in one.rows_of(name)] for one in compared for name in one.columns}
+    heads = (
+        "camera", "verdict", "points", "drift (px)", "drift (mm)", "noise alone (px)", "p", "found at (px)",
+        "found at (mm)", "shift u, v (px)", "turn x, y, z (deg)", "scale (ppm)",
+    )  # fmt: skip
+    rows = [
+        (
+            c.camera, c.level.name, len(c.pixels), c.drift_px, c.drift_mm, c.noise_px, f"{c.p_value:.1g}",
+            c.detectable_px, c.detectable_mm, _plus_minus(c.shift_px, c.sigma_shift_px),
+            _plus_minus(c.turn_deg, c.sigma_turn_deg), f"{short(c.scale_ppm)} ± {short(c.sigma_scale_ppm, 2)}",
+        )
+        for c in cameras
+    ]  # fmt: skip
+    drawings = [
+        Drawing(
+            corners_overlay(
+                file.rig.cameras[c.camera].image_size_px,
+                c.pixels,
+                c.residual_px,
+                f"Camera {c.camera}: measured − foretold",
+                labels=labels[c.camera],
+            ),
+            "Arrows that all point one way: the camera turned. Round a middle: it rolled. From a middle: focus or"
+            " zoom. One alone: that point is wrong."
+            if i == 0
+            else "",
+        )
+        for i, c in enumerate(cameras)
+    ]
+    words = [
+        "Drift: the similarity (turn of the camera and change of its focal length) that today's pixels ask for, RMS"
+        " over the points. Its sigmas hold the pixels' noise, the survey's and the calibration's own uncertainty.",
+        f"A drift counts where it is both sure (a false alarm in {1 / limits.p_false_alarm:,.0f} checks) and large:"
+        f" warning beyond {limits.warn_mm:g} mm at the screen, not to be used beyond {limits.fail_mm:g} mm. “Found at”:"
+        f" the shift that this check finds in {100 * limits.power:.0f} of 100 cases.",
+    ]
+    return Section("Drift per camera", words, drawings, Table(heads, rows))
+
+
+def _plus_minus(values: Array, sigmas: Array) -> str:
+    """Values to the place that the largest of their sigmas reaches, and that sigma."""
+    sigma = float(np.max(sigmas))
+    decimals = int(np.clip(1 - np.floor(np.log10(sigma)), 0, 6)) if sigma > 0 else 3
+    words = ", ".join(f"{v:.{decimals}f}" for v in values.tolist())
+    return f"{words} ± {short(sigma, 2)}".replace("-", "−")
+
+
+def _history_section(history: Sequence[HistoryRow], limits: DailyLimits, file: RigFile) -> Section:
+    def lines(unit: str) -> dict[str, DriftLine]:
+        out = {}
+        for camera in dict.fromkeys(r.camera for r in history):
+            rows = [r for r in history if r.camera == camera]
+            values = np.array([getattr(r, f"drift_{unit}") for r in rows])
+            noise = np.array([r.noise_px for r in rows]) if unit == "px" else None
+            out[camera] = DriftLine([r.date for r in rows], values, noise)
+        return out
+
+    until = None if file.calibration is None else file.calibration.valid_until
+    in_mm = drift_chart(
+        lines("mm"), "Drift at the screen", "mm", warn=limits.warn_mm, fail=limits.fail_mm, expires=until
+    )
+    drawings = [Drawing(in_mm), Drawing(drift_chart(lines("px"), "Drift in the picture", "px", expires=until))]
+    words = "Each check so far. A slow rise is a mount that creeps or a hall that warms up; a step is a knock."
+    return Section("Drift over time", words, drawings)
+
+
+def _points_section(
+    compared: Sequence[Compared], others: Sequence[OtherChange], cameras: Sequence[CameraDrift]
+) -> Section:
+    by_camera = {c.camera: c for c in cameras}
+    heads = (
+        "camera", "point", "u (px)", "v (px)", "measured − foretold u (px)", "v (px)", "after the camera's change (px)",
+        "sigma of the pixel (px)", "sigma of the calibration (px)",
+    )  # fmt: skip
+    rows = []
+    for one in compared:
+        for name in dict.fromkeys(one.camera):
+            c = by_camera[name]
+            for k, i in enumerate(one.rows_of(name)):
+                left = float(np.linalg.norm(c.residual_px[k] - c.explained_px[k]))
+                rows.append(
+                    (
+                        name, one.label[i], *one.pixels[i].tolist(), *c.residual_px[k].tolist(), left,
+                        float(one.measured_sigma_px[i]), float(one.calibration_sigma_px[i]),
+                    )
+                )  # fmt: skip
+    words = [f"{o.change.subject}: {o.change.kind}, {size(o.px, o.mm)}." for o in others]
+    return Section("Point by point", words, (), Table(heads, rows))
+
+
+def _scene_section(file: RigFile, compared: Sequence[Compared]) -> Section:
+    things = rig_things(file.rig)
+    marks: dict[str, Dot] = {}
+    for one in compared:
+        for label, place in zip(one.label, one.place, strict=True):
+            marks.setdefault(label, Dot(label, place))
+    return Section("Where the points are", (), scene_views([*things, *marks.values()], "Cameras, screens and points"))

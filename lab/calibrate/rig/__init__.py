@@ -1,0 +1,1 @@
+"""`beampose calibrate rig`: the joint calibration of a whole project."""

@@ -1,0 +1,185 @@
+"""`beampose calibrate rig`: lenses, cameras, screens and beams together, from everything that a project measured."""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from calibration.beams.beam_findings import BeamGoals, beam_findings
+from calibration.findings import Finding, Level, verdict
+from calibration.least_squares.adjustment import AdjustmentError
+from calibration.rig.joint_findings import RigLimits, joint_findings
+from calibration.rig.rig_figures import central_pose, expected_pose, hold_out, spot_sigma
+from calibration.rig.rig_steps import RigSteps, calibrate_in_steps
+from calibration.screens.network_findings import ScreenLimits, near_findings
+from calibration.screens.network_findings import findings as network_findings
+from calibration.screens.screens import ScreensResult
+from geometry.rig import Rig
+from lab.calibrate.beams.recording_check import refuse_known_mistakes, refuse_repeated
+from lab.calibrate.beams.recordings import Recordings, read_recordings, stand_of
+from lab.calibrate.calibration_day import day_of, expired, last_day
+from lab.calibrate.rig.rig_outcome import Outcome
+from lab.calibrate.rig.rig_tables import RESIDUALS, write_residuals
+from lab.calibrate.screens.screen_inputs import ScreenInputs, screen_inputs
+from lab.calibrate.screens.survey_check import adjusted_screens, survey_findings
+from lab.errors import CalibrationError, InputError
+from lab.files.project.project import Project, load_project
+from lab.files.rig.calibration_state import CalibrationState
+from lab.files.rig.rig_covariance import blocks_of
+from lab.files.rig.rig_file import RigFile, save_rig
+from lab.files.text.atomic_write import beside_a_good_one, refuse_foreign, whole_folder
+
+RIG = "rig.yaml"
+FAILED_RIG = "rig.failed.yaml"  # its name where the verdict is FAIL, so that nothing reads it by mistake
+_ANY_FIT = ScreenLimits(np.inf, np.inf, factor_warn=np.inf, factor_fail=np.inf)
+_ANY_SIGMA = BeamGoals(direction=np.inf, direction_unusable=np.inf, wrong_share=np.inf, noise_scale=np.inf)
+
+
+def calibrate_rig(
+    project_path: Path, out: Path, today: datetime.date | None = None, limits: RigLimits | None = None
+) -> Outcome:
+    """Calibrate a whole rig; writes rig.yaml, residuals.csv and report.html into the folder `out`.
+
+    rig.yaml carries the joint covariance of everything (in the target's block; excerpts at cameras and screens) and the
+    verdict. A FAIL is named rig.failed.yaml and does not replace an earlier calibration: it then goes to `OUT-failed`.
+    Raises InputError for what is wrong with the files, CalibrationError where the measurements give no calibration at
+    all; nothing is then written.
+    """
+    refuse_foreign(out, _is_ours)
+    project = load_project(Path(project_path))
+    day = day_of(project, today)
+    refuse_repeated(project)
+    if not project.beams or not project.spots:
+        raise InputError(
+            f"{project.path}: target: expected beams and spots as designed, got none; add them, or calibrate the"
+            " screens alone (`beampose calibrate screen`)"
+        )
+    inputs = screen_inputs(project)
+    rig = replace(inputs.network.rig, beams=project.beams, spots=project.spots)
+    inputs = replace(inputs, network=replace(inputs.network, rig=rig))
+    screens = adjusted_screens(project, inputs)
+    recordings = _recordings(project, screens.fit.rig)
+    steps = _solved(project, screens, recordings)
+    joint = steps.joint
+    expected = expected_pose(joint, central_pose(joint), spot_sigma(joint))
+    try:
+        held_out = hold_out(steps.measured, joint)
+    except AdjustmentError:
+        held_out = None
+    findings = [
+        *near_findings(screens, inputs.near),
+        *joint_findings(steps, recordings.names, expected, held_out, limits or RigLimits()),
+        *survey_findings(project, screens),
+        *_of_the_steps(steps, rig, recordings.names),
+        *expired(project, day, today),
+        *_of_the_inputs(project, recordings, inputs, day),
+    ]
+    level = verdict(findings)
+    folder = beside_a_good_one(out, level == Level.FAIL, RIG)
+    outcome = Outcome(project.name, folder, level, tuple(findings), steps, expected, held_out)
+    with whole_folder(folder, may_replace=_is_ours) as work:
+        save_rig(_rig_file(outcome, project, day), work / (FAILED_RIG if level == Level.FAIL else RIG))
+        write_residuals(steps, recordings.names, work / RESIDUALS)
+        from lab.calibrate.rig.rig_page import write_page  # the template engine: only for those who write a report
+
+        write_page(outcome, rig, recordings, project.inputs, day, work)
+    return outcome
+
+
+def _is_ours(folder: Path) -> bool:
+    return (folder / RESIDUALS).is_file()
+
+
+def _recordings(project: Project, lab: Rig) -> Recordings:
+    """The recordings with their positions. lab: cameras and screens as surveyed, which label frames of runs."""
+    recordings = read_recordings(project, lab)
+    if recordings.stand_from_body is None:
+        raise InputError(
+            f"{project.path}: recordings: expected poses of the stand, got none; add `poses` to each recording, or find"
+            " the angles between the beams alone (`beampose calibrate beams`)"
+        )
+    return recordings
+
+
+def _solved(project: Project, screens: ScreensResult, recordings: Recordings) -> RigSteps:
+    try:
+        return calibrate_in_steps(screens, recordings.spots, stand_of(project, recordings))
+    except (AdjustmentError, ValueError) as error:
+        refuse_known_mistakes(project, screens.fit.rig, recordings, screens.fit.covariance)
+        raise CalibrationError(f"{project.path}: the rig cannot be calibrated: {error}") from None
+
+
+def _of_the_steps(steps: RigSteps, drawing: Rig, positions: Sequence[str]) -> list[Finding]:
+    """What the single steps warn of in the measurements; how well they fit is the joint adjustment's to say."""
+    beams = steps.beams
+    if steps.joint.scales:
+        # Whether two ends are one line was tested with sigmas that turned out too small.
+        beams = replace(beams, one_line=())
+    out = network_findings(steps.screens, _ANY_FIT) + beam_findings(beams, drawing, positions, _ANY_SIGMA)
+    return [f for f in out if f.level > Level.PASS]
+
+
+def _of_the_inputs(project: Project, recordings: Recordings, inputs: ScreenInputs, day: datetime.date) -> list[Finding]:
+    out = [Finding(Level.PASS, note) for note in (*inputs.notes, *recordings.notes)]
+    for name, camera in project.cameras.items():
+        state = camera.lens.calibration
+        if state is not None and state.verdict == "FAIL":
+            why = f": {state.reasons[0]}" if state.reasons else ""
+            out.append(
+                Finding(
+                    Level.FAIL,
+                    f"camera {name!r}: {camera.lens_path.name} says FAIL of its lens{why}",
+                    "a lens that is wrong bends every measurement",
+                    "calibrate the lens again (`beampose calibrate camera`)",
+                )
+            )
+        if state is not None and state.valid_until and state.valid_until < day.isoformat():
+            out.append(
+                Finding(
+                    Level.WARN,
+                    f"camera {name!r}: {camera.lens_path.name} held until {state.valid_until}",
+                    "lenses move with time and temperature",
+                    "calibrate the lens again (`beampose calibrate camera`)",
+                )
+            )
+        if camera.lens.covariance is None:
+            out.append(
+                Finding(
+                    Level.WARN,
+                    f"camera {name!r}: {camera.lens_path.name} holds no covariance: its lens is taken as exact",
+                    "the sigmas of everything are too small by what the lens is wrong",
+                    "calibrate the lens with beampose, which writes its covariance",
+                )
+            )
+    stand = project.stand
+    if stand is not None and stand.world_from_stand is not None and stand.sigma_m == 0 and stand.sigma_rad == 0:
+        out.append(
+            Finding(
+                Level.WARN,
+                "stand.world_from_stand has no sigma: it is taken as exact",
+                "its error goes into the boresight of all beams unseen",
+                "give stand.sigma_m and stand.sigma_deg, or leave world_from_stand out and let it be found",
+            )
+        )
+    if not np.any(recordings.pose_sigmas):
+        out.append(
+            Finding(
+                Level.PASS,
+                "the stand's positions are taken as exact; give stand.pose_sigma_m and pose_sigma_deg where its"
+                " encoders are not much better than the spots",
+            )
+        )
+    return out
+
+
+def _rig_file(outcome: Outcome, project: Project, day: datetime.date) -> RigFile:
+    joint = outcome.steps.joint
+    until = last_day(project, day)
+    worst_first = sorted(outcome.findings, key=lambda f: -f.level)
+    reasons = tuple(f.what for f in worst_first if f.level > Level.PASS)
+    state = CalibrationState(day, outcome.level.name, until, reasons, project.notes)
+    return RigFile(joint.rig, blocks_of(joint.covariance), state)

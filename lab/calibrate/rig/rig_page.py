@@ -1,0 +1,231 @@
+"""The report of a joint calibration of a rig."""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from calibration.rig.joint import DOTS, FRAMES, LOST, SPOTS
+from calibration.rig.joint_findings import in_degrees, in_mm
+from calibration.rig.measurement_groups import LEAST_REDUNDANCY
+from geometry.arrays import Array, Bools, Ints
+from geometry.pose import ypr_sigmas
+from geometry.rig import Rig
+from lab.calibrate.beams.recordings import Recordings
+from lab.calibrate.rig import rig_page_lab
+from lab.calibrate.rig.rig_outcome import Outcome
+from lab.number_format import short
+from lab.report.calibration.calibration_charts import residual_histogram
+from lab.report.calibration.calibration_drawings import residual_field
+from lab.report.calibration.calibration_page import (
+    CalibrationReport,
+    Drawing,
+    Section,
+    Table,
+    provenance,
+    write_calibration_report,
+)
+
+_WORST = 10  # held-out positions in the table
+
+
+def write_page(
+    outcome: Outcome, drawing: Rig, recordings: Recordings, inputs: Sequence[Path], day: datetime.date, folder: Path
+) -> Path:
+    """Write report.html. drawing: the rig with nominal beams."""
+    sections = [
+        _expected(outcome),
+        _shares(outcome),
+        _held_out(outcome, recordings.names),
+        _groups(outcome),
+        _residuals(outcome),
+        rig_page_lab.screens(outcome),
+        rig_page_lab.beams(outcome, drawing),
+        rig_page_lab.cameras(outcome),
+        rig_page_lab.correlations(outcome),
+        rig_page_lab.lab(outcome),
+    ]
+    report = CalibrationReport(
+        "Rig",
+        outcome.name,
+        outcome.level,
+        outcome.findings,
+        _key_figures(outcome),
+        [s for s in sections if s is not None],
+        provenance(inputs, day),
+    )
+    return write_calibration_report(report, folder)
+
+
+def _key_figures(o: Outcome) -> list[tuple[str, str, str]]:
+    joint, out = o.steps.joint, []
+    if o.expected is not None:
+        e = o.expected
+        out.append(
+            ("attitude, one frame", f"{in_degrees(e.total):.2g} deg", "1 sigma per axis, expected in the middle")
+        )
+        out.append(("position, one frame", f"{in_mm(e.total):.2g} mm", "1 sigma per axis, expected in the middle"))
+        words = f"{in_degrees(e.systematic):.2g} deg · {in_mm(e.systematic):.2g} mm"
+        out.append(("of it calibration", words, "no averaging lessens it"))
+    if o.held_out is not None:
+        h = o.held_out
+        words = f"{np.rad2deg(h.attitude_rms):.2g} deg · {1e3 * h.position_rms:.2g} mm"
+        out.append(("held-out positions", words, f"RMS per axis, {h.ratio:.2f} times what is expected"))
+    spots = joint.every[SPOTS].linearise(joint.values).residuals
+    px = _spot_pixels(o, spots)[joint.kept[SPOTS]]
+    out.append(("spots", f"{short(float(np.sqrt(np.mean(px**2))), 3)} px", "RMS residual per axis"))
+    if DOTS in joint.every:
+        s = o.steps.measured.network.sightings
+        px = joint.every[DOTS].linearise(joint.values).residuals * s.sigma_px[:, None]
+        rms = float(np.sqrt(np.mean(px[joint.kept[DOTS]] ** 2)))
+        out.append(("dots", f"{short(rms, 3)} px", "RMS residual per axis"))
+    sigma = rig_page_lab.beam_sigmas(joint)[0] / rig_page_lab.ARCSEC
+    out.append(("beam directions", f"{short(float(np.sqrt(np.mean(sigma**2))), 3)} arcsec", "1 sigma per axis"))
+    return out
+
+
+def _expected(o: Outcome) -> Section | None:
+    e = o.expected
+    if e is None:
+        return None
+    rows = []
+    for name, C in (
+        ("all", e.total),
+        ("noise of the spots in that frame", e.noise),
+        ("calibration", e.systematic),
+    ):
+        mm = 1e3 * np.sqrt(np.maximum(np.diagonal(C)[:3], 0))
+        ypr = np.rad2deg(ypr_sigmas(e.world_from_body, C))
+        rows.append((name, *(float(v) for v in ypr), *(float(v) for v in mm)))
+    heads = ("part", "yaw (deg)", "pitch (deg)", "roll (deg)", "x (mm)", "y (mm)", "z (mm)")
+    words = [
+        f"1 sigma of a pose measured from one frame in the middle of the stand's positions, {e.views} spots in the"
+        " pictures.",
+        "The noise differs from frame to frame and averages out. The calibration's part is the same in every frame: no"
+        " averaging lessens it; between two poses that are near to each other it cancels.",
+    ]
+    return Section("What one frame will tell", words, (), Table(heads, rows))
+
+
+def _shares(o: Outcome) -> Section | None:
+    e = o.expected
+    if e is None:
+        return None
+    total = float(np.trace(e.systematic[3:, 3:])), float(np.trace(e.systematic[:3, :3]))
+    rows = [
+        (
+            name,
+            f"{in_degrees(C):.5f}",
+            f"{in_mm(C):.4f}",
+            f"{100 * float(np.trace(C[3:, 3:])) / total[0]:.1f}",
+            f"{100 * float(np.trace(C[:3, :3])) / total[1]:.1f}",
+        )
+        for name, C in e.shares.items()
+        if name not in (FRAMES, LOST)
+    ]
+    rows.sort(key=lambda r: -float(r[3]))
+    heads = ("errors of", "attitude (deg)", "position (mm)", "% of attitude variance", "% of position variance")
+    words = [
+        "Whose errors make the calibration's part: each kind of measurement carried through the joint adjustment to the"
+        " pose. The variances add up to the whole.",
+        f"Improve {rows[0][0]} first: better sigmas there, or more of them." if rows else "",
+    ]
+    return Section("What contributes most", words, (), Table(heads, rows))
+
+
+def _held_out(o: Outcome, positions: Sequence[str]) -> Section | None:
+    h = o.held_out
+    if h is None:
+        return None
+    deg, mm = np.rad2deg(h.errors[:, 3:]), 1e3 * h.errors[:, :3]
+    rows = [
+        (positions[k], *(f"{v:.4f}" for v in deg[i]), *(f"{v:.3f}" for v in mm[i]), f"{h.sigmas[i]:.2f}")
+        for i, k in enumerate(h.positions)
+    ]
+    rows = sorted(rows, key=lambda r: -float(r[-1]))[:_WORST]
+    heads = (
+        "position", "about x (deg)", "about y (deg)", "about z (deg)", "x (mm)", "y (mm)", "z (mm)",
+        "misfit / expected",
+    )  # fmt: skip
+    drawings = [
+        Drawing(residual_histogram(deg, "Attitude of held-out positions, per axis", "deg")),
+        Drawing(residual_histogram(mm, "Position of held-out positions, per axis", "mm")),
+    ]
+    words = (
+        "Each fifth of the positions was measured with a calibration that had not seen its spots, and compared with the"
+        " stand's record: what a user's own recording will meet, the stand's errors included. The table has the worst"
+        f" {min(_WORST, len(rows))}; x, y, z are the body's axes in the attitude, the world's in the position."
+    )
+    return Section("Positions held out", words, drawings, Table(heads, rows))
+
+
+def _groups(o: Outcome) -> Section:
+    joint = o.steps.joint
+    rows = []
+    for name, g in joint.groups.items():
+        if name in (FRAMES, LOST):
+            continue
+        kept = joint.kept.get(name)
+        left_out = 0 if kept is None else int(np.sum(~kept))
+        tested = g.redundancy > LEAST_REDUNDANCY
+        p = f"{g.p:.2g}" if tested else "–"
+        rows.append(
+            (
+                name,
+                g.numbers,
+                f"{g.redundancy:.0f}",
+                f"{g.scale:.2f}" if tested else "–",
+                p,
+                left_out,
+                f"{joint.scales.get(name, 1.0):.2f}",
+            )
+        )
+    heads = ("kind", "numbers", "redundant", "misfit / sigma", "p", "left out", "sigmas widened by")
+    words = [
+        "How far each kind of measurement lies from what all the others say, in its own sigmas: 1 is right. Numbers"
+        " that are not redundant fix what nothing else knows, and cannot be tested.",
+        "Where a kind misfits beyond chance (p below 0.001) its sigmas were widened until it fits.",
+    ]
+    return Section("How the measurements fit together", words, (), Table(heads, rows))
+
+
+def _residuals(o: Outcome) -> Section:
+    joint, measured = o.steps.joint, o.steps.measured
+    cameras = list(joint.rig.cameras)
+    views = joint.rig.views()
+    drawings = []
+    spots = joint.every[SPOTS].linearise(joint.values).residuals
+    px = -_spot_pixels(o, spots)
+    camera_of = np.array([cameras.index(views[v][0]) for v in measured.spots.view], dtype=np.int64)
+    drawings += _fields(o, "spots", measured.spots.pixels, px, camera_of, joint.kept[SPOTS])
+    if DOTS in joint.every:
+        s = measured.network.sightings
+        r = joint.every[DOTS].linearise(joint.values).residuals
+        drawings += _fields(o, "dots", s.pixels, -r * s.sigma_px[:, None], s.camera_of, joint.kept[DOTS])
+    drawings.append(
+        Drawing(residual_histogram(spots[joint.kept[SPOTS]], "Spots: residuals in sigmas", "sigma", sigma=1.0))
+    )
+    words = (
+        "Found less predicted, of what was kept. Arrows that turn slowly with the place tell of a lens or a screen; all"
+        " of one position alike, of the stand. residuals.csv has every one."
+    )
+    return Section("Residuals", words, drawings)
+
+
+def _fields(o: Outcome, what: str, pixels: Array, residuals: Array, camera_of: Ints, kept: Bools) -> list[Drawing]:
+    out = []
+    for c, (name, camera) in enumerate(o.steps.joint.rig.cameras.items()):
+        here = (camera_of == c) & kept
+        if here.any():
+            title = f"Camera {name}: {what}, found − predicted"
+            out.append(Drawing(residual_field(camera.image_size_px, pixels[here], residuals[here], title, things=what)))
+    return out
+
+
+def _spot_pixels(o: Outcome, residuals: Array) -> Array:
+    """Residuals of spots (N, 2) in px, from those in sigmas."""
+    roots = np.linalg.cholesky(o.steps.measured.spots.covariance)
+    return np.asarray((roots @ residuals[..., None])[..., 0])

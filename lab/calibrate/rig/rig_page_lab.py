@@ -1,0 +1,189 @@
+"""The report of a calibrated rig: its screens, beams and cameras, and how their errors go together."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from calibration.rig.joint import Joint
+from calibration.terms.rig_blocks import POSES, STAND, lines_in, stacks_of
+from calibration.terms.surveyed import pose_of
+from geometry.arrays import Array
+from geometry.pose import ypr_sigmas
+from geometry.rig import Rig
+from geometry.uncertainty.rig_parameters import split
+from lab.calibrate.rig.rig_outcome import Outcome
+from lab.report.calibration.calibration_maps import correlation_matrix, flatness_map
+from lab.report.calibration.calibration_page import (
+    Drawing,
+    Section,
+    Table,
+)
+from lab.report.calibration.calibration_scene import rig_things, scene_views
+
+ARCSEC = np.deg2rad(1 / 3600)
+_GAUGE = 3e-6  # m, rad: sigmas below it are of axes that were chosen, not measured
+
+
+def screens(o: Outcome) -> Section | None:
+    """Where the screens are, and how flat."""
+    joint = o.steps.joint
+    drawings, rows = [], []
+    sigmas = dict(zip(joint.covariance.names, np.sqrt(np.diagonal(joint.covariance.matrix)), strict=True))
+    for (name, screen), result in zip(joint.rig.screens.items(), o.steps.screens.screens, strict=True):
+        if result.flatness is not None and len(result.xyz):
+            chosen = result.flatness.chosen
+            sigma = float(np.median(chosen.sigma_m[chosen.used]))
+            drawings.append(
+                Drawing(
+                    flatness_map(
+                        result.xyz[:, :2],
+                        result.xyz[:, 2],
+                        f"Screen {name}: height of the dots over its plane",
+                        size_m=screen.size_m,
+                        bow=screen.bow if any(screen.bow) else None,
+                        sigma_m=sigma,
+                    )
+                )
+            )
+        normal = screen.world_from_screen.rotation[:, 2]
+        along = tilt = 0.0
+        if "screens" in joint.unknowns.start:
+            at = joint.unknowns.places("screens", list(joint.rig.screens).index(name))
+            C = joint.all_covariance[np.ix_(at, at)]
+            along = float(np.sqrt(np.maximum(normal @ C[:3, :3] @ normal, 0.0)))
+            tilt = float(np.sqrt(np.maximum(C[3, 3] + C[4, 4], 0.0) / 2))
+        bow = float(sigmas.get(f"screens.{name}.bow_xx_per_m", 0.0))
+        rows.append(
+            (name, ", ".join(f"{v:.4f}" for v in screen.world_from_screen.translation), 1e3 * along,
+             float(np.rad2deg(tilt)), "bent" if any(screen.bow) else "flat", float(1e3 * bow) if bow else None)
+        )  # fmt: skip
+    heads = ("screen", "origin (m)", "sigma along its normal (mm)", "sigma of its tilt (deg)", "surface",
+             "sigma of the bow (1/km)")  # fmt: skip
+    words = (
+        "Where the screens are. Origin and axes within a plane are a choice, no measurement; what counts is how far and"
+        " how tilted it is."
+    )
+    return Section("Screens", words, drawings, Table(heads, rows))
+
+
+def beams(o: Outcome, drawing: Rig) -> Section:
+    """The beams against their drawing, and where the stand stands."""
+    joint = o.steps.joint
+    direction, offset = beam_sigmas(joint)
+    away = lines_in(joint.values).minus(lines_in(stacks_of(drawing)))
+    rows = [
+        (
+            name,
+            ", ".join(f"{v:.6f}" for v in joint.rig.beams[name].direction),
+            ", ".join(f"{1e3 * v:.2f}" for v in joint.rig.beams[name].point),
+            float(direction[i] / ARCSEC),
+            float(1e3 * offset[i]),
+            float(np.rad2deg(np.linalg.norm(away[i, :2])) * 60),
+            float(1e3 * np.linalg.norm(away[i, 2:])),
+        )
+        for i, name in enumerate(joint.rig.beams)
+    ]
+    heads = (
+        "beam", "direction", "offset (mm)", "sigma direction (arcsec)", "sigma offset (mm)", "from drawing (arcmin)",
+        "from drawing (mm)",
+    )  # fmt: skip
+    pose, place = pose_of(joint.values, STAND)[0], joint.unknowns
+    words = ["Each laser in the body frame, which is the stand's carriage as its positions were recorded."]
+    if STAND in place.start:
+        rows_of = place.places(STAND, 0)
+        C = joint.all_covariance[np.ix_(rows_of, rows_of)]
+        mm = ", ".join(
+            f"{1e3 * t:.2f} ± {1e3 * s:.2f}" for t, s in zip(pose.translation, np.sqrt(np.diagonal(C)[:3]), strict=True)
+        )
+        deg = ", ".join(
+            f"{v:.4f} ± {s:.4f}" for v, s in zip(np.rad2deg(pose.ypr), np.rad2deg(ypr_sigmas(pose, C)), strict=True)
+        )
+        words.append(f"The stand in the world: x, y, z {mm} mm; yaw, pitch, roll {deg} deg.")
+    return Section("Beams", words, (), Table(heads, rows))
+
+
+def cameras(o: Outcome) -> Section:
+    """Where the cameras stand, and what became of their lenses."""
+    joint = o.steps.joint
+    sigmas = dict(zip(joint.covariance.names, np.sqrt(np.diagonal(joint.covariance.matrix)), strict=True))
+    before = o.steps.measured.network.rig
+    rows = []
+    for i, (name, camera) in enumerate(joint.rig.cameras.items()):
+        at = joint.unknowns.places("cameras", i)
+        C = joint.all_covariance[np.ix_(at, at)]
+        # Where it stands: x_w = R^T (x_c - t); errors of t come through R^T, those of the attitude by the lever.
+        R, t = camera.camera_from_world.rotation, camera.camera_from_world.translation
+        J = np.concatenate([-R.T, _lever(R, t)], axis=1)
+        place = np.sqrt(np.mean(np.maximum(np.diagonal(J @ C @ J.T), 0.0)))
+        centre = camera.camera_from_world.inverse().translation
+        rows.append(
+            (
+                name,
+                ", ".join(f"{v:.4f}" for v in centre),
+                float(1e3 * place),
+                float(np.rad2deg(np.sqrt(np.mean(np.diagonal(C)[3:])))),
+                float(camera.matrix[0, 0]),
+                float(sigmas.get(f"cameras.{name}.fx", 0.0)),
+                float(camera.matrix[0, 0] - before.cameras[name].matrix[0, 0]),
+            )
+        )
+    heads = ("camera", "stands at (m)", "sigma of that (mm)", "sigma of its attitude (deg)", "fx (px)",
+             "sigma (px)", "moved from its lens calibration (px)")  # fmt: skip
+    words = (
+        "Lens and place of a camera are known better together than each alone: a focal length that is too long looks"
+        " like a camera that stands farther off. rig.yaml holds the joint covariance."
+    )
+    return Section("Cameras", words, (), Table(heads, rows))
+
+
+def _lever(R: Array, t: Array) -> Array:
+    """d(centre)/d(theta) (3, 3) for camera_from_world R Exp(theta), t: the centre is -(R Exp(theta))^T t."""
+    c = -R.T @ t
+    # Exp(-theta) c = c - theta x c
+    return np.array([[0, -c[2], c[1]], [c[2], 0, -c[0]], [-c[1], c[0], 0]])
+
+
+def correlations(o: Outcome) -> Section:
+    """Which errors go together."""
+    C = o.steps.joint.covariance
+    sigma = np.sqrt(np.diagonal(C.matrix))
+    shown = [
+        i
+        for i, n in enumerate(C.names)
+        if split(n)[0] == "beams" or (sigma[i] > _GAUGE and not split(n)[2].startswith(("k", "p1", "p2", "s", "tau")))
+    ]
+    shown.sort(key=lambda i: ("beams", "screens", "cameras").index(split(C.names[i])[0]))
+    names = [_short_name(C.names[i]) for i in shown]
+    picture = correlation_matrix(names, C.matrix[np.ix_(shown, shown)], "Correlations of the rig's numbers")
+    words = "Errors that go together. Taken one by one they would promise a worse attitude than the rig gives."
+    return Section("Correlations", words, [Drawing(picture, wide=True)])
+
+
+def _short_name(name: str) -> str:
+    """`camera left fx` of `cameras.left.fx`."""
+    kind, thing, parameter = split(name)
+    bare = parameter.removesuffix("_per_m").removesuffix("_rad").removesuffix("_m")
+    return f"{kind.removesuffix('s')} {thing} {bare}"
+
+
+def lab(o: Outcome) -> Section:
+    """The lab from three sides."""
+    joint = o.steps.joint
+    body = (
+        o.expected.world_from_body
+        if o.expected is not None
+        else pose_of(joint.values, STAND)[0] @ pose_of(joint.values, POSES)[0]
+    )
+    return Section(
+        "The lab",
+        "Cameras, screens and beams as found; the vehicle stands in the middle of the stand's positions.",
+        [Drawing(view) for view in scene_views(rig_things(joint.rig, body))],
+    )
+
+
+def beam_sigmas(joint: Joint) -> tuple[Array, Array]:
+    """Of each beam: direction (rad) and offset (m), RMS of the two axes across it."""
+    variances = np.array(
+        [np.diagonal(joint.all_covariance)[joint.unknowns.places("beams", i)] for i in range(len(joint.rig.beams))]
+    )
+    return np.sqrt(variances[:, :2].mean(axis=1)), np.sqrt(variances[:, 2:].mean(axis=1))

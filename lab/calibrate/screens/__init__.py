@@ -1,0 +1,1 @@
+"""`beampose calibrate screen`: where screens and cameras are."""

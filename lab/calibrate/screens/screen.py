@@ -1,0 +1,124 @@
+"""`beampose calibrate screen`: where screens and cameras are, how flat screens are, and how well all that is known."""
+
+from __future__ import annotations
+
+import datetime
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from calibration.findings import Finding, Level, verdict
+from calibration.screens.network_findings import findings as network_findings
+from calibration.screens.network_findings import near_findings
+from calibration.screens.network_sigmas import pointing_sigmas_m, spot_sigmas
+from calibration.screens.screens import ScreensResult
+from geometry.rig import Rig
+from lab.calibrate.calibration_day import day_of, expired, last_day
+from lab.calibrate.screens.screen_inputs import screen_inputs
+from lab.calibrate.screens.screen_tables import DOTS, RESIDUALS, write_tables
+from lab.calibrate.screens.survey_check import adjusted_screens, survey_findings
+from lab.errors import CalibrationError
+from lab.files.project.project import Project, load_project
+from lab.files.rig.calibration_state import CalibrationState
+from lab.files.rig.rig_covariance import blocks_of
+from lab.files.rig.rig_file import RigFile, save_rig
+from lab.files.rig.screens_file import ScreensFile, save_screens
+from lab.files.text.atomic_write import beside_a_good_one, refuse_foreign, whole_folder
+
+SCREENS, RIG = "screens.yaml", "rig.yaml"
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """How a calibration of screens ended."""
+
+    name: str
+    out: Path
+    level: Level
+    findings: tuple[Finding, ...]
+    result: ScreensResult
+
+    @property
+    def exit_status(self) -> int:
+        """0, or 3 where the calibration must not be used."""
+        return CalibrationError.exit_status if self.level == Level.FAIL else 0
+
+    def line(self) -> str:
+        """One line for the terminal."""
+        rig = self.result.fit.rig
+        surface = 1e3 * max(float(np.max(spot_sigmas(self.result, k))) for k in range(len(rig.screens)))
+        place = 1e3 * max(pointing_sigmas_m(self.result).values())
+        worst = max(self.findings, key=lambda f: f.level)
+        reason = "" if self.level == Level.PASS else f": {worst.what}"
+        return (
+            f"{self.name}: {self.level.name}: {_counted(len(rig.cameras), 'camera')}, "
+            f"{_counted(len(rig.screens), 'screen')}, surfaces to {surface:.2g} mm, cameras to {place:.2g} mm on them"
+            f"{reason} -> {self.out}"
+        )
+
+
+def _counted(n: int, what: str) -> str:
+    return f"{n} {what}{'' if n == 1 else 's'}"
+
+
+def calibrate_screen(project_path: Path, out: Path, today: datetime.date | None = None) -> Outcome:
+    """Calibrate the screens and the cameras' places of a project.
+
+    Writes into `out`: screens.yaml; rig.yaml with the beams as drawn, where the project has a target; residuals.csv,
+    dots.csv and report.html. Neither YAML is written where the verdict is FAIL, which does not replace an earlier
+    calibration: it then goes to `OUT-failed`. Raises InputError for what is wrong with the files, CalibrationError
+    where they give no calibration at all; `out` is then as it was.
+    """
+    refuse_foreign(out, _is_ours)
+    project = load_project(Path(project_path))
+    day = day_of(project, today)
+    inputs = screen_inputs(project)
+    result = adjusted_screens(project, inputs)
+    placed = near_findings(result, inputs.near)
+    found = [
+        *placed,
+        *network_findings(result, names_doubted=verdict(placed) > Level.PASS),
+        *survey_findings(project, result),
+        *expired(project, day, today),
+        *(Finding(Level.WARN, note) for note in inputs.notes),
+    ]
+    level = verdict(found)
+    folder = beside_a_good_one(out, level == Level.FAIL, SCREENS)
+    outcome = Outcome(project.name, folder, level, tuple(found), result)
+    with whole_folder(folder, may_replace=_is_ours) as work:
+        if level != Level.FAIL:
+            _save(project, outcome, day, work)
+        write_tables(result, work)
+        from lab.calibrate.screens.screen_page import (
+            write_page,  # the template engine: only for those who write a report
+        )
+
+        write_page(result, found, project, inputs, day, work)
+    return outcome
+
+
+def _is_ours(folder: Path) -> bool:
+    return (folder / DOTS).is_file() and (folder / RESIDUALS).is_file()
+
+
+# Files ------------------------------------------------------------------------------------------------------------
+
+
+def _save(project: Project, outcome: Outcome, day: datetime.date, folder: Path) -> None:
+    until = last_day(project, day)
+    reasons = tuple(f.what for f in outcome.findings if f.level > Level.PASS)
+    state = CalibrationState(day, outcome.level.name, until, reasons, project.notes)
+    fit = outcome.result.fit
+    rig = fit.rig
+    for k, (name, screen) in enumerate(rig.screens.items()):
+        scan = None if project.screens[name].cloud is None else outcome.result.screens[k]
+        if screen.size_m is None and scan is not None:
+            width, height = (2 * np.abs(scan.xyz[:, :2]).max(axis=0)).tolist()
+            rig = replace(rig, screens={**rig.screens, name: replace(screen, size_m=(width, height))})
+    save_screens(ScreensFile(project.name, rig, fit.covariance, state), folder / SCREENS)
+    if project.beams:
+        note = "the beams are as drawn, not calibrated: run `beampose calibrate beams`"
+        state = replace(state, verdict=max(outcome.level, Level.WARN).name, reasons=(note, *reasons))
+        whole = Rig(rig.screens, rig.cameras, project.beams, project.spots)
+        save_rig(RigFile(whole, blocks_of(fit.covariance), state), folder / RIG)

@@ -1,0 +1,215 @@
+"""From a calibration project to the network that the adjustment solves: tables and scans read and checked."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from calibration.least_squares.priors import Prior
+from calibration.screens.clouds import MissingOpen3DError, scan_of
+from calibration.screens.network import Dots, Network, Sightings
+from calibration.screens.registration import register
+from calibration.screens.screens import Near, Scan, ScreenSetup
+from calibration.screens.survey_suspects import wrong_unit
+from calibration.terms.rig_blocks import prior_of
+from geometry.arrays import Array, Bools, Ints
+from geometry.pose import Pose
+from geometry.rig import Rig, Screen
+from geometry.uncertainty.rig_parameters import RigCovariance
+from lab.calibrate.screens.screen_boards import board_views
+from lab.errors import InputError
+from lab.files.project.cloud_file import read_cloud
+from lab.files.project.point_files import Observations, Survey, read_observations, read_survey
+from lab.files.project.project import Cloud, Project, ScreenEntry
+from lab.files.text.range_checks import FARTHEST_IN_SCAN
+from lab.files.text.yaml_text import did_you_mean
+
+LARGEST_SCREEN_M = 100.0  # a "screen" beyond it is one in another unit
+SMALLEST_SCREEN_M = 0.02
+_TOO_LARGE = 1.3  # times that dots may reach beyond a screen's size before a unit is suspected
+_TARGET_SIGMA_M = 0.001  # m: of a target's coordinate in a scan, where the project gives no point_sigma_m
+
+
+@dataclass(frozen=True, slots=True)
+class ScreenInputs:
+    """All that `calibrate screen` adjusts, and what was noticed on the way."""
+
+    network: Network
+    setups: tuple[ScreenSetup, ...]  # one per screen
+    near: Mapping[int, Near]
+    held_screen: int | None  # whose frame is the world's, where there is no survey
+    notes: tuple[str, ...]  # assumptions and things left out: the user should know
+    remarks: tuple[str, ...] = ()  # what the scans say of themselves
+    photo_of: Mapping[tuple[int, int], Path] = field(default_factory=dict)  # (camera, placement) -> photograph
+
+
+def screen_inputs(project: Project) -> ScreenInputs:
+    """Read everything that a project measured of its screens. Raises InputError, CalibrationError."""
+    survey = read_survey(project.survey, project.screens)
+    observations = read_observations(
+        project.points, {n: c.lens.image_size_px for n, c in project.cameras.items()}, survey.names
+    )
+    rig = Rig(
+        screens={n: Screen(n, Pose.identity(), s.size_m) for n, s in project.screens.items()},
+        cameras={n: replace(c.lens.camera(c.screen), name=n) for n, c in project.cameras.items()},
+        beams={},
+        spots={},
+    )
+    screen_of = _screens_of_dots(project, survey, observations)
+    _check_sizes(project, survey, screen_of)
+    dots = Dots(survey.names, survey.xyz, survey.covariance, screen_of)
+    cameras, index = list(rig.cameras), {n: i for i, n in enumerate(survey.names)}
+    sightings = Sightings(
+        np.array([cameras.index(c) for c in observations.camera], dtype=np.int64),
+        np.array([index[p] for p in observations.point], dtype=np.int64),
+        observations.pixels,
+        observations.sigma_px,
+    )
+    boards = board_views(project, rig)
+    prior, lens_free = _lens_knowledge(project, rig)
+    network = Network(
+        rig=rig,
+        dots=dots,
+        sightings=sightings,
+        corners=boards.corners,
+        placements=boards.placements,
+        fixed=boards.fixed,
+        radii_m=boards.radii_m,
+        lens_priors=() if prior is None else (prior,),
+        lens_free=lens_free,
+    )
+    held = None if len(dots) and len(sightings) else _held_screen(project)
+    scans = {n: _scan(s.cloud, s, survey, project) for n, s in project.screens.items() if s.cloud is not None}
+    setups = tuple(_setup(s, survey, project, scans.get(n)) for n, s in project.screens.items())
+    near = {i: Near(c.near_m, c.within_m) for i, c in enumerate(project.cameras.values()) if c.near_m is not None}
+    scan_notes = [note for _, ns in scans.values() for note in ns]
+    noted = (*survey.notes, *observations.notes, *boards.notes)
+    return ScreenInputs(network, setups, near, held, noted, tuple(scan_notes), boards.photo_of)
+
+
+def _screens_of_dots(project: Project, survey: Survey, observations: Observations) -> Ints:
+    """The screen of each dot: its column `screen`, else the one screen of all cameras that see it, else none."""
+    names = list(project.screens)
+    out = np.full(len(survey.names), -1, dtype=np.int64)
+    seen: dict[str, set[str]] = {}
+    for camera, point in zip(observations.camera, observations.point, strict=True):
+        seen.setdefault(point, set()).add(project.cameras[camera].screen)
+    for i, (name, screen) in enumerate(zip(survey.names, survey.screen, strict=True)):
+        watched = seen.get(name, set())
+        if screen:
+            out[i] = names.index(screen)
+        elif len(watched) == 1:
+            out[i] = names.index(next(iter(watched)))
+        elif len(names) == 1 and not any(survey.screen):
+            out[i] = 0
+    return out
+
+
+def _check_sizes(project: Project, survey: Survey, screen_of: Ints) -> None:
+    """Refuses surveys in another unit: told by the screen's size, or by what no screen is."""
+    for k, (name, screen) in enumerate(project.screens.items()):
+        mine = np.flatnonzero(screen_of == k)
+        if len(mine) < 3:
+            continue
+        where = survey.source[mine[0]]
+        xyz = survey.xyz[mine]
+        reach = float(np.max(np.linalg.norm(xyz[:, None] - xyz[None], axis=2)))
+        if screen.size_m is not None:
+            diagonal = float(np.hypot(*screen.size_m))
+            if reach > _TOO_LARGE * diagonal or reach < 0.02 * diagonal:
+                # Dots rarely reach the corners: of a typical 60 to 100 % of the diagonal the middle is taken.
+                unit = next((u for s in (0.9, 0.7, 0.5) for u in [wrong_unit(reach, s * diagonal)] if u), "")
+                hint = f"; {unit}?" if unit else "; check the unit, size_m and which dots lie on it"
+                raise InputError(
+                    f"{where}: the dots of screen {name!r} reach over {reach:.4g} m, its size_m is"
+                    f" {screen.size_m[0]:g} m x {screen.size_m[1]:g} m{hint}"
+                )
+        elif not SMALLEST_SCREEN_M < reach < LARGEST_SCREEN_M:
+            raise InputError(
+                f"{where}: the dots of screen {name!r} reach over {reach:.4g} m; expected"
+                f" {SMALLEST_SCREEN_M:g} to {LARGEST_SCREEN_M:g} m: are they in millimetres? coordinates are in metres"
+            )
+
+
+def _lens_knowledge(project: Project, rig: Rig) -> tuple[Prior | None, Bools | None]:
+    """What the camera calibrations know of their lenses' errors: priors, and which numbers they free."""
+    names: list[str] = []
+    blocks: list[Array] = []
+    for name, entry in project.cameras.items():
+        c = entry.lens.covariance
+        if c is not None:
+            names += [f"cameras.{name}.{p}" for p in c.parameters]
+            blocks.append(c.matrix)
+    if not names:
+        return None, None
+    joint = np.zeros((len(names), len(names)))
+    at = 0
+    for block in blocks:
+        joint[at : at + len(block), at : at + len(block)] = block
+        at += len(block)
+    prior, free = prior_of(rig, RigCovariance(tuple(names), joint))
+    return prior, free.get("intrinsics")
+
+
+# Screens ----------------------------------------------------------------------------------------------------------
+
+
+def _held_screen(project: Project) -> int:
+    """Whose frame is the world's where no surveyed dot is seen."""
+    names = list(project.screens)
+    if project.world is not None:
+        return names.index(project.world)
+    with_boards = [n for n, s in project.screens.items() if s.boards]
+    if not with_boards:
+        raise InputError(
+            f"{project.path}: nothing ties the cameras to the screens: expected a survey with `points`, or boards fixed"
+            " to screens (`screens.NAME.boards`)"
+        )
+    return names.index(with_boards[0])
+
+
+def _setup(entry: ScreenEntry, survey: Survey, project: Project, scan: tuple[Scan, list[str]] | None) -> ScreenSetup:
+    dots = None
+    if entry.frame is not None:
+        for key in ("origin", "x", "y"):
+            name = getattr(entry.frame, key)
+            if name not in survey.names:
+                raise InputError(
+                    f"{project.path}: screens.{entry.name}.frame.{key}: expected a point of the survey, got {name!r}"
+                    f"{did_you_mean(name, survey.names)}"[:240]
+                )
+        dots = tuple(survey.names.index(getattr(entry.frame, k)) for k in ("origin", "x", "y"))
+    return ScreenSetup(
+        frame_dots=None if dots is None else (dots[0], dots[1], dots[2]),
+        origin_at=(0.0, 0.0) if entry.frame is None else entry.frame.origin_at_m,
+        bow=entry.bow,
+        scatter_m=entry.surface_sigma_m,
+        scan=None if scan is None else scan[0],
+    )
+
+
+def _scan(cloud: Cloud, entry: ScreenEntry, survey: Survey, project: Project) -> tuple[Scan, list[str]]:
+    """The screen in its scanned cloud, in world."""
+    points, notes = read_cloud(cloud.path, cloud.unit_m)
+    pose, covariance, words = cloud.world_from_cloud, None, list(notes)
+    try:
+        if cloud.targets is not None:
+            targets = read_survey([cloud.targets], project.screens, FARTHEST_IN_SCAN)
+            both = [n for n in targets.names if n in survey.names]
+            a = [targets.names.index(n) for n in both]
+            b = [survey.names.index(n) for n in both]
+            sigma = cloud.point_sigma_m or _TARGET_SIGMA_M
+            at = targets.xyz[a] * cloud.unit_m
+            found = register(both, at, survey.xyz[b], survey.covariance[b], sigma)
+            pose, covariance = found.world_from_cloud, found.covariance
+            misses = 1e3 * float(np.sqrt(np.mean(np.sum(found.misses_m**2, axis=1))))
+            words.append(f"{cloud.path.name}: {len(both)} targets fit the survey to {misses:.2g} mm RMS")
+        scan = scan_of(points, entry.size_m, cloud.point_sigma_m, entry.bow, None, pose, covariance)
+    except MissingOpen3DError as error:
+        raise InputError(f"{cloud.path}: {error}") from None
+    except ValueError as error:
+        raise InputError(f"{cloud.path}: {error}") from None
+    return scan, [*words, f"{cloud.path.name}: {scan.words}"]

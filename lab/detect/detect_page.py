@@ -1,0 +1,198 @@
+"""The page of `beampose detect`: contact sheet, spots over frames and places, sizes, signal, the sensor's noise."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from geometry.arrays import Array
+from lab.detect.contact_sheet import ContactSheet
+from lab.detect.detect_charts import counts_chart, noise_chart, places_chart
+from lab.detect.findings import SizeGroup
+from lab.detect.work import Work
+from lab.files.text.yaml_text import write_whole
+from lab.number_format import short
+from lab.pictures.picture_file import Grey
+from lab.report.calibration.calibration_page import Drawing, Section, Table, section_context
+from lab.report.html import environment
+from lab.report.plot.axes import picture_uri
+from lab.report.plot.svg import BLUE, Line, time_panel
+from lab.versions import versions
+from tracking.noise_estimation.levels import LevelVariances, level_variances
+
+_MOST_KINDS = 4  # sizes and depths of pictures whose noise is drawn
+_MOST_ROWS = 20  # ... and that are listed
+
+
+def write_detect_page(work: Work, sheet: ContactSheet, folder: Path) -> Path:
+    """Write report.html into a folder; returns its path."""
+    table = work.spots.table()
+    groups = sorted(work.groups.values(), key=lambda g: -g.pictures)
+    sections = [
+        _sheet(sheet),
+        _spots(work, table),
+        *([_places(table, groups)] if len(table) else []),
+        _noise(work, groups),
+    ]
+    context: dict[str, Any] = {
+        "name": work.camera,
+        "source": work.source,
+        "key_figures": _key_figures(work, table, groups),
+        "notes": work.notes,
+        "sections": [section_context(section) for section in sections],
+        "made": _made(work),
+    }
+    path = folder / "report.html"
+    write_whole(environment().get_template("detect.html.j2").render(context), path)
+    return path
+
+
+def _key_figures(work: Work, table: Array, groups: list[SizeGroup]) -> list[tuple[str, str, str]]:
+    counts = np.array([n for _, n in work.spots.per_frame])
+    bad = sum(map(len, work.unreadable.values()))
+    each = f"{counts.min()} to {counts.max()}, median {np.median(counts):.0f}"
+    figures = [
+        ("Pictures", str(work.pictures), f"{bad} more cannot be read" if bad else groups[0].words()),
+        ("Spots", str(work.spots.total), f"{each} in a picture" if work.pictures > 1 else "in the picture"),
+    ]
+    if len(table):
+        low, middle, high = np.percentile(table[:, 3], [5, 50, 95])
+        figures.append(
+            ("Size", f"{short(middle)} px", f"1 sigma of the major axis; 90 %: {short(low)} to {short(high)}")
+        )
+        low, middle, high = np.percentile(table[:, 5], [5, 50, 95])
+        figures.append(
+            ("Signal to noise", short(middle), f"matched filter, median; 90 %: {short(low)} to {short(high)}")
+        )
+    model = groups[0].noise.model
+    if model is not None:
+        figures.append(
+            ("Noise", f"{short(math.sqrt(model.floor_dn2))} DN", f"of a pixel at {short(model.black_dn)} DN")
+        )
+    return figures
+
+
+def _sheet(sheet: ContactSheet) -> Section:
+    jpeg = cv2.imencode(".jpg", sheet.drawn(), [cv2.IMWRITE_JPEG_QUALITY, 82])[1].tobytes()
+    picture = f'<img src="{picture_uri(jpeg, "jpeg")}" alt="contact sheet: pictures with the spots found in them">'
+    caption = (
+        "Evenly chosen pictures, grey values stretched. Rings: spots found, numbered by brightness, as the rows of a"
+        " frame in detections.csv. The same without loss: contact-sheet.png."
+    )
+    return Section("Contact sheet", (), [Drawing(picture, caption, wide=True)])
+
+
+def _spots(work: Work, table: Array) -> Section:
+    drawings = []
+    if len(work.spots.per_frame) > 1:
+        frame, count = np.array(work.spots.per_frame, dtype=float).T
+        drawings.append(
+            Drawing(
+                time_panel(
+                    frame, "Spots in each picture", "", lines=(Line(count, BLUE, "spots"),),
+                    y_range=(0.0, max(float(count.max()) * 1.1, 1.0)), width=1100, height=150, time_name="frame",
+                ),
+                wide=True,
+            )
+        )  # fmt: skip
+    if len(table):
+        drawings += [
+            Drawing(counts_chart([("major", table[:, 3]), ("minor", table[:, 4])], "Sizes", "half axis, 1 sigma (px)")),
+            Drawing(
+                counts_chart(
+                    [("signal to noise", table[:, 5])], "Signal to noise behind a matched filter", "ratio",
+                    mark=work.parameters.threshold_sigma,
+                ),
+                "The flux over its noise if the background were all of it. Spots left of the line, which is the"
+                " threshold, would not be looked for.",
+            ),
+        ]  # fmt: skip
+    words = (
+        "Positions are those of the light's centre."
+        if work.spots.total
+        else "No spot was found. Is the light in the pictures? A lower threshold (--set detect.threshold_sigma=4) finds"
+        " fainter spots, and more false ones."
+    )
+    return Section("Spots", words, drawings)
+
+
+def _places(table: Array, groups: list[SizeGroup]) -> Section:
+    width = max(g.size_px[0] for g in groups)
+    height = max(g.size_px[1] for g in groups)
+    words = (
+        "All spots of all pictures. What stays in its place while others move (a reflection, a hot pixel) shows as one"
+        " dark dot."
+    )
+    return Section("Where they are", words, [Drawing(places_chart(table[:, 1:3], (width, height)))])
+
+
+def _noise(work: Work, groups: list[SizeGroup]) -> Section:
+    rows: list[list[object]] = []
+    for g in groups[:_MOST_ROWS]:
+        e = g.noise.estimate
+        if e is None:
+            continue
+        m = e.model
+        rows.append(
+            [
+                g.words(), e.pictures, "in time" if e.temporal else "within pictures", m.black_dn,
+                _with_sigma(math.sqrt(m.floor_dn2), e.floor_sigma / 2), _with_sigma(1 / m.slope_dn, e.slope_sigma),
+                100 * m.texture, "not seen" if e.saturation_dn is None else e.saturation_dn, e.step_dn,
+            ]
+        )  # fmt: skip
+    heads = (
+        "pictures", "learnt from", "differences", "background (DN)", "noise there (DN)", "electrons per DN",
+        "texture (%)", "clips at (DN)", "grey step (DN)",
+    )  # fmt: skip
+    drawings = []
+    for g in groups[:_MOST_KINDS]:
+        measured = _levels(work.learnt.get((g.size_px, g.bits), []), g)
+        if g.noise.estimate is not None:
+            drawings.append(Drawing(noise_chart(g.noise.estimate, measured, g.words()), _caption(measured)))
+    words = [
+        "The variance of a pixel grows in a straight line with the light: its level at the background is read noise,"
+        " rounding and the background's own shot noise; its slope is one over the electrons per grey value.",
+        "Where the pictures hold little that is bright and still, the slope is what usual sensors have, and its sigma"
+        " says so.",
+    ]
+    return Section("Noise of the sensor", words, drawings, Table(heads, rows))
+
+
+def _caption(measured: LevelVariances | None) -> str:
+    """What the dots and lines of a noise chart are."""
+    line = "Line: the model in use, with its 1-sigma band."
+    if measured is None or not len(measured.level):
+        return f"{line} No grey level has enough pixels to be measured by itself."
+    how = "from differences in time" if measured.temporal else "within pictures"
+    return f"{line} Dots: measured {how}; triangles: more than that, where the light itself changed."
+
+
+def _levels(pictures: list[Grey], group: SizeGroup) -> LevelVariances | None:
+    """The variances by grey level that the estimate was made from; None for small pictures."""
+    estimate = group.noise.estimate
+    if not pictures or estimate is None or min(pictures[0].shape) < 32:
+        return None
+    top = float(np.iinfo(pictures[0].dtype).max) if estimate.saturation_dn is None else estimate.saturation_dn
+    return level_variances(pictures, top, estimate.step_dn**2 / 12)
+
+
+def _with_sigma(value: float, relative: float) -> str:
+    """A value with the sigma of its logarithm as a factor, where that is large, or as a share."""
+    return (
+        f"{short(value)} ×/÷ {math.exp(relative):.2f}"
+        if relative > 0.15
+        else f"{short(value)} ± {100 * relative:.0f} %"
+    )
+
+
+def _made(work: Work) -> list[tuple[str, str]]:
+    p = work.parameters
+    own = versions()
+    return [
+        ("detection", f"threshold {p.threshold_sigma:g} sigma, at most {p.max_detections} spots in a picture"),
+        ("beampose", f"{own['beampose']}, numpy {own['numpy']}, OpenCV {own['opencv-python-headless']}"),
+    ]

@@ -1,0 +1,1 @@
+"""All files that the program reads and writes."""

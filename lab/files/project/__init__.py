@@ -1,0 +1,1 @@
+"""calibration.yaml and the tables of a calibration project."""

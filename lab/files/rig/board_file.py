@@ -1,0 +1,108 @@
+"""board.yaml: a calibration board in words; or the short text that names one, whichever the user has."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import pydantic
+
+from calibration.boards.board_types import Board, Charuco, Chessboard, CircleGrid, parse
+from lab.errors import InputError
+from lab.files.text.fields import Block, Integer, Positive, Word, a_truth_value, one_of, validated, wrong
+from lab.files.text.yaml_text import read_mapping, write_mapping
+
+SCHEMA = "beampose/board/1"
+CHESSBOARD, CIRCLES, CHARUCO = "chessboard", "circles", "charuco"
+_TruthValue = Annotated[bool, pydantic.PlainValidator(a_truth_value)]
+
+
+def board_of(text_or_path: str | Path) -> Board:
+    """The board of a board.yaml, or of a text such as chessboard:9x6:25mm. Raises InputError in one line."""
+    text = str(text_or_path)
+    if Path(text).suffix.lower() in (".yaml", ".yml") or Path(text).is_file():
+        return load_board(Path(text))
+    try:
+        return parse(text)
+    except ValueError as error:
+        raise InputError(f"{error}; or name a board.yaml") from None
+
+
+def load_board(path: Path) -> Board:
+    """The board that a board.yaml describes. Raises InputError: one line for each mistake, naming file and field."""
+    path = Path(path)
+    return validated(_BoardBlock, read_mapping(path), path).board()
+
+
+def save_board(board: Board, path: Path) -> None:
+    """Write a board.yaml, complete or not at all."""
+    write_mapping(as_mapping(board), Path(path))
+
+
+def as_mapping(board: Board) -> dict[str, Any]:
+    """The plain mapping that board.yaml holds."""
+    content: dict[str, Any] = {"schema": SCHEMA}
+    if isinstance(board, Chessboard):
+        content |= {"kind": CHESSBOARD, "columns": board.columns, "rows": board.rows, "square_m": board.square_m}
+    elif isinstance(board, CircleGrid):
+        content |= {"kind": CIRCLES, "columns": board.columns, "rows": board.rows, "spacing_m": board.spacing_m}
+        content |= {"asymmetric": board.asymmetric}
+        if board.stated_diameter_m is not None:
+            content |= {"diameter_m": board.stated_diameter_m}
+    else:
+        content |= {"kind": CHARUCO, "columns": board.columns, "rows": board.rows, "square_m": board.square_m}
+        content |= {"marker_m": board.marker_m, "dictionary": board.dictionary}
+        content |= {"inverted": board.inverted, "legacy": board.legacy}
+    return content
+
+
+_FIELDS = {  # of each kind: those it must have, those it may have
+    CHESSBOARD: ({"square_m"}, set()),
+    CIRCLES: ({"spacing_m"}, {"asymmetric", "diameter_m"}),
+    CHARUCO: ({"square_m", "marker_m", "dictionary"}, {"inverted", "legacy"}),
+}
+
+
+class _BoardBlock(Block):
+    schema_: Annotated[str, pydantic.PlainValidator(one_of((SCHEMA,)))] = pydantic.Field(alias="schema")
+    kind: Annotated[str, pydantic.PlainValidator(one_of((CHESSBOARD, CIRCLES, CHARUCO)))]
+    columns: Integer  # inner corners, circles in a row, or squares of a ChArUco board
+    rows: Integer
+    square_m: Positive | None = None
+    spacing_m: Positive | None = None
+    asymmetric: _TruthValue | None = None
+    diameter_m: Positive | None = None  # of the circles; left out: measured in the photographs
+    marker_m: Positive | None = None
+    dictionary: Word | None = None
+    inverted: _TruthValue | None = None
+    legacy: _TruthValue | None = None
+
+    @pydantic.model_validator(mode="after")
+    def _whole(self) -> _BoardBlock:
+        must, may = _FIELDS[self.kind]
+        given = {name for name in self.model_fields_set if name not in ("schema_", "kind", "columns", "rows")}
+        for name in sorted(must - given):
+            raise wrong(f"expected {name} for a board of kind {self.kind!r}, got nothing; add it")
+        for name in sorted(given - must - may):
+            raise wrong(f"unexpected {name} for a board of kind {self.kind!r}; remove it")
+        try:
+            self.board()
+        except ValueError as error:
+            raise wrong(str(error)) from None
+        return self
+
+    def board(self) -> Board:
+        if self.kind == CHESSBOARD:
+            return Chessboard(self.columns, self.rows, self.square_m or 0.0)
+        if self.kind == CIRCLES:
+            asymmetric = bool(self.asymmetric)
+            return CircleGrid(self.columns, self.rows, self.spacing_m or 0.0, asymmetric, self.diameter_m)
+        return Charuco(
+            self.columns,
+            self.rows,
+            self.square_m or 0.0,
+            self.marker_m or 0.0,
+            self.dictionary or "",
+            bool(self.inverted),
+            bool(self.legacy),
+        )

@@ -1,0 +1,157 @@
+"""What the files say of one camera, and of errors: the blocks that rig.yaml and camera.yaml share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import numpy as np
+import pydantic
+
+from geometry import lens
+from geometry.arrays import Array, symmetric
+from geometry.camera import FISHEYE, LENSES, PERSPECTIVE
+from lab.files.text.fields import Block, Number, Positive, a_number, an_integer, numbers, one_of, unexpected, wrong
+
+# Against the diagonal: what sums in double precision, written with all digits, may miss.
+COVARIANCE_TOLERANCE = 1e-6
+
+
+@dataclass(frozen=True, slots=True)
+class Covariance:
+    """What a calibration knows of the errors of one camera, one screen or the target."""
+
+    parameters: tuple[str, ...]  # n names
+    matrix: Array  # (n, n), symmetric, in the parameters' units
+
+
+def _image_size(value: Any) -> list[int]:
+    numbers(2)(value)
+    size = [an_integer(v) for v in value]
+    if min(size) < 1:
+        raise unexpected("a width and a height of at least 1 pixel", value)
+    return size
+
+
+def _distortion(value: Any) -> list[float]:
+    words = "0, 4, 5, 8, 12 or 14 numbers"
+    if not isinstance(value, list):
+        raise unexpected(f"a list of {words}", value)
+    if len(value) not in lens.ALLOWED_LENGTHS:
+        raise wrong(f"expected {words}, got {len(value)}")
+    return [a_number(v) for v in value]
+
+
+def _parameter_names(value: Any) -> list[str]:
+    if not isinstance(value, list) or not all(isinstance(v, str) for v in value):
+        raise unexpected("a list of parameter names", value)
+    return value
+
+
+def _matrix(value: Any) -> list[list[float]]:
+    if not isinstance(value, list) or not all(isinstance(row, list) and len(row) == len(value) for row in value):
+        raise unexpected("a square matrix, as a list of rows", value)
+    return [[a_number(v) for v in row] for row in value]
+
+
+class CovarianceBlock(Block):
+    """A covariance matrix and the ordered names of its parameters."""
+
+    parameters: Annotated[list[str], pydantic.PlainValidator(_parameter_names)]
+    matrix: Annotated[list[list[float]], pydantic.PlainValidator(_matrix)]
+
+    @pydantic.model_validator(mode="after")
+    def _same_size(self) -> CovarianceBlock:
+        if len(self.matrix) != len(self.parameters):
+            raise wrong(f"expected a matrix row for each of {len(self.parameters)} parameters, got {len(self.matrix)}")
+        return self
+
+    def value(self) -> Covariance:
+        """The block as a value."""
+        return Covariance(tuple(self.parameters), np.array(self.matrix, dtype=float).reshape(len(self.matrix), -1))
+
+
+def covariance_mistake(covariance: Covariance) -> str:
+    """What is wrong with a matrix that is no covariance, in a line's words; empty where nothing is."""
+    C, names = covariance.matrix, covariance.parameters
+    variances = np.diagonal(C)
+    if not len(C):
+        return ""
+    if np.any(variances < 0):
+        worst = int(np.argmin(variances))
+        return f"expected variances from zero up on the diagonal, got {variances[worst]:.6g} for {names[worst]}"
+    unit = np.sqrt(np.where(variances > 0, variances, 1.0))
+    scaled = C / np.outer(unit, unit)
+    apart = np.abs(scaled - scaled.T)
+    if apart.max() > COVARIANCE_TOLERANCE:
+        i, j = np.unravel_index(int(np.argmax(apart)), C.shape)
+        return (
+            f"expected a symmetric matrix, got {C[i, j]:.6g} for {names[i]}, {names[j]} and {C[j, i]:.6g}"
+            f" for {names[j]}, {names[i]}"
+        )
+    if np.linalg.eigvalsh(symmetric(scaled))[0] < -COVARIANCE_TOLERANCE * len(C):
+        return "expected a covariance, got a matrix with a negative eigenvalue: correlations that no errors can have"
+    return ""
+
+
+class _MatrixBlock(Block):
+    fx: Positive
+    fy: Positive
+    cx: Number
+    cy: Number
+
+
+class LensBlock(Block):
+    """How a camera draws: picture size, camera matrix, distortion and which model its numbers belong to."""
+
+    image_size_px: Annotated[list[int], pydantic.PlainValidator(_image_size)]
+    camera_matrix: _MatrixBlock
+    distortion: Annotated[list[float], pydantic.PlainValidator(_distortion)] = []  # noqa: RUF012 - frozen
+    lens: Annotated[str, pydantic.PlainValidator(one_of(LENSES))] = PERSPECTIVE
+
+    @pydantic.model_validator(mode="after")
+    def _numbers_of_the_model(self) -> LensBlock:
+        if self.lens == FISHEYE and len(self.distortion) not in (0, 4):
+            raise wrong(f"expected 4 distortion numbers (or none) for lens {FISHEYE!r}, got {len(self.distortion)}")
+        return self
+
+    def size(self) -> tuple[int, int]:
+        """Width and height, px."""
+        return self.image_size_px[0], self.image_size_px[1]
+
+    def matrix(self) -> Array:
+        """The camera matrix (3, 3), px."""
+        m = self.camera_matrix
+        return np.array([[m.fx, 0, m.cx], [0, m.fy, m.cy], [0, 0, 1]])
+
+
+def lens_mapping(
+    image_size_px: tuple[int, int], matrix: Array, distortion: tuple[float, ...], lens_name: str
+) -> dict[str, Any]:
+    """The plain mapping that a `LensBlock` reads back to the same numbers. matrix (3, 3), px."""
+    out: dict[str, Any] = {
+        "image_size_px": [int(v) for v in image_size_px],
+        "camera_matrix": {
+            "fx": float(matrix[0, 0]),
+            "fy": float(matrix[1, 1]),
+            "cx": float(matrix[0, 2]),
+            "cy": float(matrix[1, 2]),
+        },
+        "distortion": [float(v) for v in distortion],
+    }
+    if lens_name != PERSPECTIVE:
+        out["lens"] = lens_name
+    return out
+
+
+def covariance_mapping(covariance: Covariance) -> dict[str, Any]:
+    """The plain mapping that a `CovarianceBlock` reads back to the same numbers."""
+    return {
+        "parameters": list(covariance.parameters),
+        "matrix": [floats(row) for row in covariance.matrix],
+    }
+
+
+def floats(values: Array) -> list[float]:
+    """Plain numbers for a file, without a minus before a zero."""
+    return [float(v) + 0.0 for v in values]

@@ -1,0 +1,190 @@
+"""camera.yaml: one camera's calibration, read, checked and written."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+import pydantic
+
+from geometry.arrays import Array
+from geometry.camera import PERSPECTIVE, Camera
+from geometry.pose import Pose
+from geometry.uncertainty.rig_parameters import PINHOLE, distortion_names
+from lab.files.rig.calibration_state import VERDICTS
+from lab.files.rig.camera_block import (
+    Covariance,
+    CovarianceBlock,
+    LensBlock,
+    covariance_mapping,
+    covariance_mistake,
+    lens_mapping,
+)
+from lab.files.text.fields import (
+    Block,
+    FromZero,
+    Integer,
+    Lines,
+    Number,
+    Positive,
+    Text,
+    Word,
+    one_of,
+    validated,
+    wrong,
+)
+from lab.files.text.yaml_text import did_you_mean, read_mapping, write_mapping
+
+SCHEMA = "beampose/camera/1"
+
+
+@dataclass(frozen=True, slots=True)
+class CameraCalibration:
+    """Where a camera's numbers come from, and how good they are. What is not known is None, or empty."""
+
+    date: str = ""  # ISO 8601: 2026-03-14, with a time if wanted
+    verdict: str = ""  # PASS, WARN or FAIL; empty for numbers that nobody judged, such as converted ones
+    rms_px: float | None = None  # of the corners' residuals, per axis
+    sigma_px: float | None = None  # of one corner's coordinate, as the solve estimates it
+    hold_out_rms_px: float | None = None  # of corners that the solve did not use
+    views: int | None = None  # photographs used
+    corners: int | None = None  # corners used
+    board: str = ""  # the board in words, or its file
+    distance_m: float | None = None  # at which figures in millimetres hold
+    valid_until: str = ""  # ISO 8601; empty: for ever
+    reasons: tuple[str, ...] = ()  # a line for each finding that is not a PASS
+    figures: Mapping[str, float] = field(default_factory=dict)  # further key figures, their unit in the name
+    notes: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class CameraFile:
+    """What a camera.yaml holds."""
+
+    name: str
+    image_size_px: tuple[int, int]  # width, height
+    camera_matrix: Array  # (3, 3), px: fx, fy, cx, cy; no skew
+    distortion: tuple[float, ...]  # OpenCV order; 0, 4, 5, 8, 12 or 14 numbers
+    lens: str = PERSPECTIVE  # or "fisheye": OpenCV's k1 ... k4
+    covariance: Covariance | None = None  # of fx, fy, cx, cy, k1 ... or some of them
+    calibration: CameraCalibration | None = None
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """The names of the camera's numbers, in order: fx, fy, cx, cy and as many distortion numbers as it has."""
+        return (*PINHOLE, *distortion_names(self.camera()))
+
+    def camera(self, screen: str = "", camera_from_world: Pose | None = None) -> Camera:
+        """The camera as the geometry knows it; without a pose it stands at the world's origin."""
+        pose = Pose.identity() if camera_from_world is None else camera_from_world
+        return Camera(self.name, screen, self.image_size_px, self.camera_matrix, self.distortion, pose, lens=self.lens)
+
+
+def load_camera(path: Path) -> CameraFile:
+    """The camera that a camera.yaml describes. Raises InputError: one line for a mistake, naming file and field."""
+    path = Path(path)
+    content = validated(_CameraFileBlock, read_mapping(path), path)
+    return CameraFile(
+        name=content.name,
+        image_size_px=content.size(),
+        camera_matrix=content.matrix(),
+        distortion=tuple(content.distortion),
+        lens=content.lens,
+        covariance=None if content.covariance is None else content.covariance.value(),
+        calibration=None if content.calibration is None else content.calibration.value(),
+    )
+
+
+def save_camera(file: CameraFile, path: Path) -> None:
+    """Write a camera.yaml, complete or not at all; it reads back to the last bit.
+
+    Raises InputError for a camera that could not be loaded again; the file is then what it was before.
+    """
+    content = as_mapping(file)
+    validated(_CameraFileBlock, content, path)
+    write_mapping(content, Path(path))
+
+
+def as_mapping(file: CameraFile) -> dict[str, Any]:
+    """The plain mapping that camera.yaml holds."""
+    content: dict[str, Any] = {
+        "schema": SCHEMA,
+        "name": file.name,
+        **lens_mapping(file.image_size_px, file.camera_matrix, file.distortion, file.lens),
+    }
+    if file.covariance is not None:
+        content["covariance"] = covariance_mapping(file.covariance)
+    if file.calibration is not None:
+        content["calibration"] = _calibration_mapping(file.calibration)
+    return content
+
+
+def _calibration_mapping(calibration: CameraCalibration) -> dict[str, Any]:
+    """The fields that say something; those left at their default are left out."""
+    nothing = CameraCalibration()
+    out: dict[str, Any] = {}
+    for name in CameraCalibration.__slots__:
+        value = getattr(calibration, name)
+        if value == getattr(nothing, name):
+            continue
+        if name == "reasons":
+            value = list(value)
+        elif name == "figures":
+            value = {key: float(v) for key, v in value.items()}
+        elif name in ("views", "corners"):
+            value = int(value)
+        elif not isinstance(value, str):
+            value = float(value)
+        out[name] = value
+    return out
+
+
+# What the file may hold -----------------------------------------------------------------------------------------
+
+
+class _CalibrationBlock(Block):
+    date: Text = ""
+    verdict: Annotated[str, pydantic.PlainValidator(one_of((*VERDICTS, "")))] = ""
+    rms_px: FromZero | None = None
+    sigma_px: FromZero | None = None
+    hold_out_rms_px: FromZero | None = None
+    views: Integer | None = None
+    corners: Integer | None = None
+    board: Text = ""
+    distance_m: Positive | None = None
+    valid_until: Text = ""
+    reasons: Lines = []  # noqa: RUF012 - frozen
+    figures: dict[str, Number] = {}  # noqa: RUF012 - frozen
+    notes: Text = ""
+
+    def value(self) -> CameraCalibration:
+        """The block as a value."""
+        values = {name: getattr(self, name) for name in CameraCalibration.__slots__}
+        return CameraCalibration(**{**values, "reasons": tuple(self.reasons)})
+
+
+class _CameraFileBlock(LensBlock):
+    schema_: Annotated[str, pydantic.PlainValidator(one_of((SCHEMA,)))] = pydantic.Field(alias="schema")
+    name: Word
+    covariance: CovarianceBlock | None = None
+    calibration: _CalibrationBlock | None = None
+
+    @pydantic.model_validator(mode="after")
+    def _covariance_of_this_camera(self) -> _CameraFileBlock:
+        if self.covariance is None:
+            return self
+        camera = CameraFile(self.name, self.size(), self.matrix(), tuple(self.distortion), self.lens)
+        known = camera.parameter_names
+        seen: set[str] = set()
+        for name in self.covariance.parameters:
+            if name not in known:
+                raise wrong(f"covariance.parameters: unknown parameter {name!r}{did_you_mean(name, known)}")
+            if name in seen:
+                raise wrong(f"covariance.parameters: expected each name once, got {name!r} a second time")
+            seen.add(name)
+        mistake = covariance_mistake(self.covariance.value())
+        if mistake:
+            raise wrong(f"covariance.matrix: {mistake}")
+        return self

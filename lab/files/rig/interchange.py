@@ -1,0 +1,283 @@
+"""Cameras from one file format into another: ours, OpenCV's, Kalibr's, ROS's, COLMAP's, mrcal's."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+
+from calibration.formats import colmap, kalibr, mrcal, opencv_yaml, ros
+from calibration.formats.model import CameraModel, FormatError, Read, Written, significant
+from geometry.camera import Camera, pinhole_numbers
+from lab.errors import InputError
+from lab.files.rig.camera_block import Covariance
+from lab.files.rig.camera_file import CameraFile, load_camera, save_camera
+from lab.files.rig.rig_file import SCHEMA as RIG_SCHEMA
+from lab.files.rig.rig_file import RigFile, load_rig_file
+from lab.files.text.yaml_text import did_you_mean, parse_mapping, read_text, write_whole
+
+BEAMPOSE, RIG = "beampose", "beampose-rig"
+_FOREIGN: Mapping[str, ModuleType] = {m.NAME: m for m in (opencv_yaml, kalibr, ros, colmap, mrcal)}
+FORMATS = (BEAMPOSE, *_FOREIGN)  # that can be written
+READABLE = (BEAMPOSE, RIG, *_FOREIGN)
+_LABELS = {
+    BEAMPOSE: "beampose camera.yaml",
+    RIG: "beampose rig.yaml",
+    "opencv": "OpenCV YAML",
+    "kalibr": "Kalibr camchain",
+    "ros": "ROS camera_info",
+    "colmap": "COLMAP cameras.txt",
+    "mrcal": "mrcal .cameramodel",
+}
+ROUND_TRIP = 1e-12  # relative: what a written file, read again, may differ by
+
+
+@dataclass(frozen=True, slots=True)
+class ConvertOutcome:
+    """What was converted."""
+
+    source: Path
+    destination: Path
+    from_format: str
+    to_format: str
+    cameras: tuple[str, ...]
+    notes: tuple[str, ...]  # what is not in the destination, a line each
+
+    exit_status = 0
+
+    def line(self) -> str:
+        """For the command line: what became what, and below it what was left out."""
+        names = ", ".join(self.cameras)
+        first = f"{names}: {_LABELS[self.from_format]} -> {_LABELS[self.to_format]}, {self.destination}"
+        return "\n".join([first, *(f"  note: {note}" for note in self.notes)])
+
+
+def convert(
+    source: Path,
+    destination: Path,
+    from_format: str | None = None,
+    to_format: str | None = None,
+    camera: str | None = None,
+) -> ConvertOutcome:
+    """Write the cameras of one file into another.
+
+    Formats: beampose (camera.yaml), opencv, kalibr, ros, colmap, mrcal, and as a source beampose-rig (rig.yaml). The
+    source's is told by its content, the destination's by its name, where they are not given. camera: the one to
+    convert; without it all are, if the destination holds several. Raises InputError; the destination is then what it
+    was before. What the destination has no place for is an error (a lens), or a note (a pose, a covariance).
+    """
+    source, destination = Path(source), Path(destination)
+    text = read_text(source)
+    origin = _known(from_format, READABLE, "--from") if from_format else recognise(text, source)
+    target = _known(to_format, FORMATS, "--to") if to_format else _format_of_name(destination)
+    found, covariances = _read(text, source, origin)
+    models = _chosen(found.cameras, camera, source, target)
+    _check_destination(source, destination, target)
+    try:
+        notes = found.notes + _write(models, covariances, destination, target)
+    except FormatError as error:
+        raise InputError(f"{source}: {error}") from None
+    return ConvertOutcome(source, destination, origin, target, tuple(m.name for m in models), notes)
+
+
+def read_cameras(path: Path, from_format: str | None = None) -> tuple[CameraModel, ...]:
+    """The cameras that a file of any known format holds. Raises InputError."""
+    path = Path(path)
+    text = read_text(path)
+    origin = _known(from_format, READABLE, "--from") if from_format else recognise(text, path)
+    return _read(text, path, origin)[0].cameras
+
+
+# Which format -----------------------------------------------------------------------------------------------------
+
+
+def recognise(text: str, path: Path) -> str:
+    """The format of a file's text. Raises InputError naming those that are known."""
+    body = text.lstrip("\ufeff \t\r\n")
+    if body.startswith(("<?xml", "<opencv_storage")):
+        raise InputError(f"{path}: expected YAML, got OpenCV's XML; save it as .yml from OpenCV")
+    if re.search(r"^\s*Model\s*=\s*(CAHV|.*CAHV)", body):
+        raise InputError(f"{path}: expected an OpenCV-like lens, got a CAHVOR model; mrcal-convert-lensmodel fits one")
+    if body.startswith("%YAML:") or "!!opencv-" in body:
+        return "opencv"
+    if mrcal.looks_like(body):
+        return "mrcal"
+    if colmap.looks_like(body):
+        return "colmap"
+    try:
+        content = parse_mapping(text, path)
+    except InputError as error:
+        raise InputError(f"{path}: {_unknown()} ({str(error).removeprefix(f'{path}: ')})") from None
+    if content.get("schema") == RIG_SCHEMA:
+        return RIG
+    if str(content.get("schema", "")).startswith("beampose/"):
+        return BEAMPOSE
+    if any(re.fullmatch(r"cam\d+", key) for key in content):
+        return "kalibr"
+    if "camera_matrix" in content or {"width", "height"} <= set(content):
+        return "ros"
+    raise InputError(f"{path}: {_unknown()}; name it with --from if it is one")
+
+
+def _unknown() -> str:
+    return f"expected one of {', '.join(_LABELS.values())}, got something else"
+
+
+def _known(name: str, allowed: Sequence[str], option: str) -> str:
+    if name not in allowed:
+        raise InputError(f"{option}: expected {', '.join(allowed)}, got {name!r}{did_you_mean(name, allowed)}")
+    return name
+
+
+def _format_of_name(path: Path) -> str:
+    """The format that a file's name tells. Raises InputError where it tells none."""
+    name = path.name.lower()
+    for ending, format_name in ((".cameramodel", "mrcal"), (".txt", "colmap"), (".yml", "opencv")):
+        if name.endswith(ending):
+            return format_name
+    for part, format_name in (("camchain", "kalibr"), ("camera_info", "ros"), ("camera.yaml", BEAMPOSE)):
+        if part in name:
+            return format_name
+    raise InputError(f"{path}: the name does not tell the format; add --to with one of {', '.join(FORMATS)}")
+
+
+# In ---------------------------------------------------------------------------------------------------------------
+
+
+def _read(text: str, path: Path, origin: str) -> tuple[Read, dict[str, Covariance]]:
+    """The cameras of a file, and what is known of their numbers' errors."""
+    if origin == RIG:
+        return _from_rig(load_rig_file(path))
+    if origin == BEAMPOSE:
+        file = load_camera(path)
+        covariances = {} if file.covariance is None else {file.name: file.covariance}
+        return Read((_model_of(file.camera(), placed=False),)), covariances
+    module = _FOREIGN[origin]
+    content = text if origin in ("colmap", "mrcal") else parse_mapping(text, path, opencv=origin == "opencv")
+    try:
+        found: Read = module.read(content, path.stem)
+    except FormatError as error:
+        raise InputError(f"{path}: {error}") from None
+    return found, {}
+
+
+def _model_of(camera: Camera, placed: bool) -> CameraModel:
+    fx, fy, cx, cy = pinhole_numbers(camera).tolist()
+    pose = camera.camera_from_world if placed else None
+    return CameraModel(camera.name, camera.image_size_px, (fx, fy, cx, cy), camera.distortion, camera.lens, pose)
+
+
+def _from_rig(file: RigFile) -> tuple[Read, dict[str, Covariance]]:
+    """A rig's cameras; of the joint covariance each camera's own share."""
+    covariances = {}
+    for name in file.rig.cameras:
+        joint = file.covariances.get("target")
+        own = None if joint is None else _share(joint, f"cameras.{name}.")
+        alone = file.covariances.get(f"cameras.{name}")
+        if own is None and alone is not None:
+            own = _share(alone, "")
+        if own is not None:
+            covariances[name] = own
+    return Read(tuple(_model_of(c, placed=True) for c in file.rig.cameras.values())), covariances
+
+
+def _share(covariance: Covariance, prefix: str) -> Covariance | None:
+    """The block of the lens's numbers: those with the prefix that are no part of the pose. None where there is none."""
+    own = [
+        i
+        for i, name in enumerate(covariance.parameters)
+        if name.startswith(prefix) and "." not in name[len(prefix) :] and not re.search(r"_(m|rad)$", name)
+    ]
+    if not own:
+        return None
+    names = tuple(covariance.parameters[i].removeprefix(prefix) for i in own)
+    return Covariance(names, covariance.matrix[np.ix_(own, own)])
+
+
+def _chosen(models: Sequence[CameraModel], camera: str | None, path: Path, target: str) -> tuple[CameraModel, ...]:
+    """The cameras to write. Raises InputError where the destination holds one and the file has several."""
+    names = [m.name for m in models]
+    if camera is not None:
+        if camera not in names:
+            raise InputError(f"{path}: expected a camera {camera!r}, found none{did_you_mean(camera, names)}")
+        return tuple(m for m in models if m.name == camera)
+    holds_many = target != BEAMPOSE and _FOREIGN[target].HOLDS_MANY
+    if len(models) > 1 and not holds_many:
+        raise InputError(
+            f"{path}: holds cameras {', '.join(names)}, {_LABELS[target]} one; choose with --camera {names[0]}"
+        )
+    return tuple(models)
+
+
+# Out --------------------------------------------------------------------------------------------------------------
+
+
+def _check_destination(source: Path, destination: Path, target: str) -> None:
+    """Raises InputError where writing would destroy the source or anything but cameras in the format to be written."""
+    if not destination.exists():
+        return
+    if destination.is_dir():
+        raise InputError(f"{destination}: expected a file to write, found a folder; name a file in it")
+    if destination.samefile(source):
+        raise InputError(f"{destination}: source and destination are the same file; choose another name")
+    if not destination.stat().st_size:
+        return
+    try:
+        text = read_text(destination)
+        there = recognise(text, destination)
+        if there == target:
+            _read(text, destination, target)
+    except InputError:
+        there = ""  # the format alone is not enough: a board.yaml is ours too, and OpenCV stores anything as YAML
+    if there == RIG:
+        raise InputError(f"{destination}: is a rig, which one camera must not replace; choose another name")
+    if there != target:
+        raise InputError(
+            f"{destination}: exists and is no {_LABELS[target]}; choose another name, or remove that file first"
+        )
+
+
+def _write(
+    models: tuple[CameraModel, ...], covariances: Mapping[str, Covariance], path: Path, target: str
+) -> tuple[str, ...]:
+    """Write and return what was left out."""
+    if target == BEAMPOSE:
+        return _write_ours(models[0], covariances.get(models[0].name), path)
+    written: Written = _FOREIGN[target].write(models)
+    _check_round_trip(models, written.text, path, target)
+    write_whole(written.text, path)
+    lost = [m.name for m in models if m.name in covariances]
+    if not lost:
+        return written.notes
+    return (*written.notes, f"{target} has no place for a covariance: that of {', '.join(lost)} is left out")
+
+
+def _write_ours(model: CameraModel, covariance: Covariance | None, path: Path) -> tuple[str, ...]:
+    fx, fy, cx, cy = model.pinhole
+    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+    save_camera(CameraFile(model.name, model.image_size_px, K, model.distortion, model.lens, covariance), path)
+    if model.camera_from_reference is None:
+        return ()
+    return (f"camera.yaml has no place for a pose: where {model.name} stands is left out",)
+
+
+def _check_round_trip(models: Sequence[CameraModel], text: str, path: Path, target: str) -> None:
+    """Raises InputError unless a text, read again, gives the same lenses: a last guard before anything is written."""
+    content = text if target in ("colmap", "mrcal") else parse_mapping(text, path, opencv=target == "opencv")
+    again: Read = _FOREIGN[target].read(content, path.stem)
+    for before, after in zip(models, again.cameras, strict=True):
+        if not same_lens(before, after):
+            raise InputError(f"{path}: {before.name} read back from {target} is another lens; please report this")
+
+
+def same_lens(a: CameraModel, b: CameraModel) -> bool:
+    """Whether two models draw the same picture: sizes, pinhole and distortion alike to `ROUND_TRIP`."""
+    if (a.image_size_px, a.lens) != (b.image_size_px, b.lens):
+        return False
+    numbers = [np.array([*m.pinhole, *significant(m.distortion)]) for m in (a, b)]
+    scale = np.maximum(np.abs(numbers[0]), [1.0] * 4 + [0.0] * (len(numbers[0]) - 4))
+    return len(numbers[0]) == len(numbers[1]) and bool(np.all(np.abs(numbers[0] - numbers[1]) <= ROUND_TRIP * scale))

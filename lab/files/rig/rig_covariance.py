@@ -1,0 +1,66 @@
+"""The covariance blocks of a rig.yaml as one joint covariance of the rig's numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from geometry.arrays import Array, symmetric
+from geometry.rig import Rig
+from geometry.uncertainty.rig_parameters import RigCovariance, is_known, split
+from lab.errors import InputError
+from lab.files.rig.camera_block import Covariance, covariance_mistake
+
+TARGET = "target"
+
+
+def joint_covariance(rig: Rig, blocks: Mapping[str, Covariance], path: Path | str) -> RigCovariance | None:
+    """All that the blocks say of numbers which this rig has; None where they say nothing.
+
+    blocks: by `cameras.NAME`, `screens.NAME`, `target`. The target's block may name cameras' and screens' numbers too
+    (a joint solve writes it so): it is then the whole truth, and the other blocks are excerpts of it. Names that are
+    not ours are passed over, as the files' contract has it. Raises InputError for a matrix that is no covariance.
+    """
+    target = blocks.get(TARGET)
+    if target is not None and any(n.startswith(("cameras.", "screens.")) for n in target.parameters):
+        used = {TARGET: target}
+    else:
+        used = dict(blocks)
+    names: list[str] = []
+    pieces: list[Array] = []
+    for where, block in used.items():
+        full = [n if where == TARGET else f"{where}.{n}" for n in block.parameters]
+        known = [i for i, n in enumerate(full) if is_known(rig, n)]
+        if not known:
+            continue
+        matrix = block.matrix[np.ix_(known, known)]
+        mistake = covariance_mistake(Covariance(tuple(block.parameters[i] for i in known), matrix))
+        if mistake:
+            raise InputError(f"{path}: {where}.covariance.matrix: {mistake}")
+        names += [full[i] for i in known]
+        pieces.append(symmetric(matrix))
+    if not names:
+        return None
+    joint = np.zeros((len(names), len(names)))
+    at = 0
+    for piece in pieces:
+        joint[at : at + len(piece), at : at + len(piece)] = piece
+        at += len(piece)
+    return RigCovariance(tuple(names), joint)
+
+
+def blocks_of(covariance: RigCovariance) -> dict[str, Covariance]:
+    """A joint covariance as the blocks of a rig.yaml: whole in the target's, an excerpt for each camera and screen."""
+    out: dict[str, Covariance] = {}
+    of: dict[str, list[int]] = {}
+    for i, name in enumerate(covariance.names):
+        kind, thing, _ = split(name)
+        if kind in ("cameras", "screens"):
+            of.setdefault(f"{kind}.{thing}", []).append(i)
+    for where, rows in of.items():
+        names = tuple(split(covariance.names[i])[2] for i in rows)
+        out[where] = Covariance(names, symmetric(covariance.matrix[np.ix_(rows, rows)]))
+    out[TARGET] = Covariance(covariance.names, symmetric(covariance.matrix))
+    return out

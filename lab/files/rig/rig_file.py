@@ -1,0 +1,336 @@
+"""rig.yaml: what is mounted in the lab, read, checked and written."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import pydantic
+
+from geometry.arrays import Array
+from geometry.camera import Camera, SensorNoise
+from geometry.pose import Pose
+from geometry.rig import Beam, Rig, Screen, Spot
+from geometry.rotations import matrix_from_quaternion, quaternion_from_matrix
+from lab.files.rig.calibration_state import CalibrationState, CalibrationStateBlock, state_mapping
+from lab.files.rig.camera_block import Covariance, CovarianceBlock, LensBlock, covariance_mapping, floats, lens_mapping
+from lab.files.text.fields import (
+    Block,
+    FromZero,
+    Number,
+    Positive,
+    Vector3,
+    Word,
+    numbers,
+    one_of,
+    positive_numbers,
+    unexpected,
+    validated,
+    wrong,
+)
+from lab.files.text.yaml_text import FileError, did_you_mean, read_mapping, write_mapping
+
+SCHEMA = "beampose/rig/1"
+QUATERNION_TOLERANCE = 1e-6  # what a quaternion written with seven digits may miss of length 1
+
+
+@dataclass(frozen=True, slots=True)
+class RigFile:
+    """A rig and what else its file holds. The keys of `covariances` are `cameras.NAME`, `screens.NAME`, `target`.
+
+    lab/files/rig/rig_covariance.py makes one covariance of them.
+    """
+
+    rig: Rig
+    covariances: Mapping[str, Covariance] = field(default_factory=dict)
+    calibration: CalibrationState | None = None  # None: nobody says when and how well it was calibrated
+
+
+def load_rig(path: Path) -> Rig:
+    """The rig that a rig.yaml describes. Raises InputError: one line for a mistake, naming file and field."""
+    return load_rig_file(path).rig
+
+
+def load_rig_file(path: Path) -> RigFile:
+    """The rig of a rig.yaml with its covariance blocks. Raises InputError."""
+    path = Path(path)
+    content = validated(_RigBlock, read_mapping(path), path)
+    mistakes = _broken_references(content)
+    if mistakes:
+        raise FileError(f"{path}: {m}" for m in mistakes)
+    covariances = {where: block.value() for where, block in _covariance_blocks(content)}
+    state = None if content.calibration is None else content.calibration.value()
+    return RigFile(_rig_of(content), covariances, state)
+
+
+def save_rig(rig: Rig | RigFile, path: Path) -> None:
+    """Write a rig.yaml, complete or not at all.
+
+    What was loaded from a file comes back to the last bit; of a rotation that no unit quaternion gives exactly, one
+    within 1e-15 is written.
+    """
+    file = rig if isinstance(rig, RigFile) else RigFile(rig)
+    content = as_mapping(file)
+    validated(_RigBlock, content, path)
+    write_mapping(content, Path(path))
+
+
+# What the file may hold -----------------------------------------------------------------------------------------
+
+
+def _unit_quaternion(value: Any) -> list[float]:
+    q = numbers(4)(value)
+    length = float(np.linalg.norm(q))
+    if abs(length - 1) > QUATERNION_TOLERANCE:
+        raise wrong(f"expected a quaternion of length 1, got one of length {length:.7g}; divide its numbers by that")
+    return q
+
+
+def _direction(value: Any) -> list[float]:
+    d = numbers(3)(value)
+    if np.linalg.norm(d) < 1e-9:
+        raise unexpected("a direction, which has a length", value)
+    return d
+
+
+class PoseBlock(Block):
+    """A transform a_from_b."""
+
+    quaternion_wxyz: Annotated[list[float], pydantic.PlainValidator(_unit_quaternion)]
+    translation_m: Vector3
+
+    def pose(self) -> Pose:
+        """The transform."""
+        return Pose.from_quaternion(np.array(self.quaternion_wxyz), np.array(self.translation_m))
+
+
+class ScreenBlock(Block):
+    """A screen of a rig."""
+
+    world_from_screen: PoseBlock
+    size_m: Annotated[list[float] | None, pydantic.PlainValidator(positive_numbers(2))] = None
+    bow_per_m: Vector3 = [0.0, 0.0, 0.0]  # noqa: RUF012 - frozen
+    covariance: CovarianceBlock | None = None
+
+    def value(self, name: str) -> Screen:
+        """The screen."""
+        a, b, c = self.bow_per_m
+        size = None if self.size_m is None else (self.size_m[0], self.size_m[1])
+        return Screen(name, self.world_from_screen.pose(), size, (a, b, c))
+
+
+class _NoiseBlock(Block):
+    gain_e_per_dn: Positive
+    read_noise_e: FromZero
+    black_dn: Number = 0.0
+
+
+class CameraBlock(LensBlock):
+    """A camera of a rig."""
+
+    screen: Word
+    camera_from_world: PoseBlock
+    noise: _NoiseBlock | None = None
+    covariance: CovarianceBlock | None = None
+
+    def value(self, name: str) -> Camera:
+        """The camera."""
+        n = self.noise
+        return Camera(
+            name=name,
+            screen=self.screen,
+            image_size_px=self.size(),
+            matrix=self.matrix(),
+            distortion=tuple(self.distortion),
+            camera_from_world=self.camera_from_world.pose(),
+            noise=None if n is None else SensorNoise(n.gain_e_per_dn, n.read_noise_e, n.black_dn),
+            lens=self.lens,
+        )
+
+
+class _BeamBlock(Block):
+    direction: Annotated[list[float], pydantic.PlainValidator(_direction)]
+    point_m: Vector3
+
+
+class _SpotBlock(Block):
+    beam: Word
+    end: Annotated[str, pydantic.PlainValidator(one_of(("+", "-")))]
+    screen: Word
+
+
+class TargetBlock(Block):
+    """The vehicle's beams and spots."""
+
+    beams: dict[str, _BeamBlock]
+    spots: dict[str, _SpotBlock]
+    covariance: CovarianceBlock | None = None
+
+    def beam_values(self) -> dict[str, Beam]:
+        """The beams by name."""
+        return {name: Beam(name, np.array(b.direction), np.array(b.point_m)) for name, b in self.beams.items()}
+
+    def spot_values(self) -> dict[str, Spot]:
+        """The spots by name."""
+        return {name: Spot(name, s.beam, 1 if s.end == "+" else -1, s.screen) for name, s in self.spots.items()}
+
+    def mistakes(self, screens: Collection[str]) -> list[str]:
+        """What no field alone can tell: too few things, and names that nothing bears."""
+        out = []
+        if len(self.beams) < 2:
+            out.append(f"target.beams: expected two or more, got {len(self.beams)}; one line cannot fix an attitude")
+        if not self.spots:
+            out.append("target.spots: expected one or more, got none")
+        ends: dict[tuple[str, str], str] = {}
+        for name, spot in self.spots.items():
+            if spot.beam not in self.beams:
+                out.append(no_such("beam", spot.beam, f"target.spots.{name}.beam", self.beams))
+            if spot.screen not in screens:
+                out.append(no_such("screen", spot.screen, f"target.spots.{name}.screen", screens))
+            other = ends.setdefault((spot.beam, spot.end), name)
+            if other != name:
+                out.append(
+                    f"target.spots.{name}: expected one spot per beam end, got beam {spot.beam!r} end {spot.end!r}"
+                    f" a second time (spot {other!r} has it)"
+                )
+        return out
+
+
+class _RigBlock(Block):
+    schema_: Annotated[str, pydantic.PlainValidator(one_of((SCHEMA,)))] = pydantic.Field(alias="schema")
+    screens: dict[str, ScreenBlock]
+    cameras: dict[str, CameraBlock]
+    target: TargetBlock
+    calibration: CalibrationStateBlock | None = None
+
+
+def _broken_references(content: _RigBlock) -> list[str]:
+    """What no field alone can tell: too few things, and names that nothing bears."""
+    out = []
+    for name, block in (("screens", content.screens), ("cameras", content.cameras)):
+        if not block:
+            out.append(f"{name}: expected one or more, got none")
+    for name, camera in content.cameras.items():
+        if camera.screen not in content.screens:
+            out.append(no_such("screen", camera.screen, f"cameras.{name}.screen", content.screens))
+    return out + content.target.mistakes(content.screens)
+
+
+def no_such(kind: str, name: str, where: str, known: Collection[str]) -> str:
+    """The mistake of a name that nothing in the file bears."""
+    return f"{where}: expected a {kind} of this file, got {name!r}{did_you_mean(name, known)}"
+
+
+def _covariance_blocks(content: _RigBlock) -> list[tuple[str, CovarianceBlock]]:
+    blocks = [(f"screens.{n}", s.covariance) for n, s in content.screens.items()]
+    blocks += [(f"cameras.{n}", c.covariance) for n, c in content.cameras.items()]
+    blocks += [("target", content.target.covariance)]
+    return [(where, block) for where, block in blocks if block is not None]
+
+
+def _rig_of(content: _RigBlock) -> Rig:
+    return Rig(
+        screens={name: s.value(name) for name, s in content.screens.items()},
+        cameras={name: c.value(name) for name, c in content.cameras.items()},
+        beams=content.target.beam_values(),
+        spots=content.target.spot_values(),
+    )
+
+
+# From values to the file ----------------------------------------------------------------------------------------
+
+
+def as_mapping(file: RigFile) -> dict[str, Any]:
+    """The plain mapping that rig.yaml holds."""
+    rig = file.rig
+    screens = {name: screen_mapping(screen) for name, screen in rig.screens.items()}
+    cameras = {name: camera_mapping(camera) for name, camera in rig.cameras.items()}
+    target = {
+        "beams": {
+            name: {"direction": _same_when_read(b.direction), "point_m": floats(b.point)}
+            for name, b in rig.beams.items()
+        },
+        "spots": {
+            name: {"beam": s.beam, "end": "+" if s.sign > 0 else "-", "screen": s.screen}
+            for name, s in rig.spots.items()
+        },
+    }
+    content: dict[str, Any] = {"schema": SCHEMA, "screens": screens, "cameras": cameras, "target": target}
+    for where, covariance in file.covariances.items():
+        block = content
+        for key in where.split(".", 1):
+            block = block[key]
+        block["covariance"] = covariance_mapping(covariance)
+    if file.calibration is not None:
+        content["calibration"] = state_mapping(file.calibration)
+    return content
+
+
+def screen_mapping(screen: Screen) -> dict[str, Any]:
+    """The plain mapping that a `ScreenBlock` reads back to the same numbers."""
+    out: dict[str, Any] = {"world_from_screen": pose_mapping(screen.world_from_screen)}
+    if screen.size_m is not None:
+        out["size_m"] = [float(v) for v in screen.size_m]
+    if any(screen.bow):
+        out["bow_per_m"] = [float(v) for v in screen.bow]
+    return out
+
+
+def camera_mapping(camera: Camera) -> dict[str, Any]:
+    """The plain mapping that a `CameraBlock` reads back to the same numbers."""
+    out: dict[str, Any] = {
+        "screen": camera.screen,
+        **lens_mapping(camera.image_size_px, camera.matrix, camera.distortion, camera.lens),
+        "camera_from_world": pose_mapping(camera.camera_from_world),
+    }
+    if camera.noise is not None:
+        n = camera.noise
+        out["noise"] = {
+            "gain_e_per_dn": float(n.gain_e_per_dn),
+            "read_noise_e": float(n.read_noise_e),
+            "black_dn": float(n.black_dn),
+        }
+    return out
+
+
+def pose_mapping(pose: Pose) -> dict[str, Any]:
+    """The plain mapping that a `PoseBlock` reads back to the same transform."""
+    return {
+        "quaternion_wxyz": floats(_quaternion_of(pose.rotation)),
+        "translation_m": floats(pose.translation),
+    }
+
+
+def _quaternion_of(rotation: Array) -> Array:
+    """The quaternion that the reader turns into this very matrix, bit for bit, if a search near the closest finds one.
+
+    Rounding makes quaternion -> matrix -> quaternion miss by a few units in the last place, and a rig that moves by
+    1e-16 whenever it is saved can no longer be compared by `==`. The search draws changes between the last place of
+    each number and that of 1, and lengths of 1 to 1 + 1e-9, which the reader's division rounds in ever new ways.
+    Measured: found for all of 550 random turns, for 40 of 50 turns of 1e-6 rad; else the closest, 1e-16 away.
+    """
+    closest = quaternion_from_matrix(rotation)
+    if np.array_equal(matrix_from_quaternion(closest), rotation):
+        return closest
+    rng = np.random.default_rng(0)
+    last_place = np.log2(np.spacing(np.maximum(np.abs(closest), 1e-30)))
+    for _ in range(40):
+        size = 2.0 ** rng.uniform(np.minimum(last_place, -52), -51.5, (4000, 4))
+        trials = (closest + size * rng.normal(size=(4000, 4))) * (1 + rng.uniform(0, 1e-9, (4000, 1)))
+        same = np.all(matrix_from_quaternion(trials) == rotation, axis=(-2, -1))
+        if same.any():
+            return trials[int(np.argmax(same))]
+    return closest
+
+
+def _same_when_read(direction: Array) -> list[float]:
+    """Numbers that are this unit direction, bit for bit, once the reader has divided them by their length."""
+    trial, rng = direction, np.random.default_rng(0)
+    for _ in range(3000):
+        if np.array_equal(trial / np.linalg.norm(trial), direction):
+            return floats(trial)
+        trial = direction * (1 + rng.uniform(0, 1e-9))
+    return floats(direction)

@@ -1,0 +1,1 @@
+"""Files of a run: run.yaml, detections, truth, and its results read back."""

@@ -1,0 +1,53 @@
+"""What went into a run, so that a result can be tied to its inputs."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import Any
+
+from lab.files.run.run_file import FramesFolder, LiveDevice, Run
+
+LARGEST_FILE = 64 * 2**20  # bytes: a video beyond it is tied by its first so many bytes and its size
+_BLOCK = 2**20
+
+
+def fingerprints(run: Run) -> list[dict[str, Any]]:
+    """Path, SHA-256 and size of every input.
+
+    A folder of pictures has one entry: its digest is over the names and sizes of its files, which costs no second
+    reading of gigabytes; `covers` says what each digest covers.
+    """
+    files = [run.path, run.rig_path]
+    if run.times_path is not None:
+        files.append(run.times_path)
+    out = [_of_file(f) for f in files]
+    done: set[Path] = set()
+    for source in run.cameras.values():
+        if isinstance(source, LiveDevice) or source.path in done:
+            continue
+        done.add(source.path)
+        out.append(_of_folder(source.path) if isinstance(source, FramesFolder) else _of_file(source.path))
+    return out
+
+
+def _of_file(path: Path) -> dict[str, Any]:
+    size = path.stat().st_size
+    digest = hashlib.sha256()
+    left = min(size, LARGEST_FILE)
+    with path.open("rb") as file:
+        while left > 0 and (block := file.read(min(_BLOCK, left))):
+            digest.update(block)
+            left -= len(block)
+    covers = "contents" if size <= LARGEST_FILE else f"the first {LARGEST_FILE} bytes"
+    return {"path": str(path), "sha256": digest.hexdigest(), "bytes": size, "covers": covers}
+
+
+def _of_folder(path: Path) -> dict[str, Any]:
+    digest = hashlib.sha256()
+    total = 0
+    for file in sorted(p for p in path.iterdir() if p.is_file()):
+        size = file.stat().st_size
+        total += size
+        digest.update(f"{file.name}\0{size}\n".encode())
+    return {"path": str(path), "sha256": digest.hexdigest(), "bytes": total, "covers": "names and sizes"}

@@ -1,0 +1,265 @@
+"""A run folder: run.yaml, and where its pictures or points lie."""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import pydantic
+
+from geometry.pose import Pose
+from geometry.rig import Rig
+from geometry.uncertainty.rig_parameters import RigCovariance
+from lab.errors import InputError
+from lab.files.rig.calibration_state import CalibrationState, OptionalDay
+from lab.files.rig.rig_covariance import joint_covariance
+from lab.files.rig.rig_file import load_rig_file
+from lab.files.run.times import Times, load_times
+from lab.files.text.fields import (
+    Block,
+    FromZero,
+    Positive,
+    Text,
+    Vector3,
+    Word,
+    dataclass_from_yaml,
+    one_of,
+    unexpected,
+    validated,
+    wrong,
+)
+from lab.files.text.yaml_text import FileError, did_you_mean, read_mapping, write_mapping
+from lab.pictures.picture_file import SUFFIXES
+from tracking.labelling.first_labels import PosePrior
+from tracking.parameters import TrackerParameters
+
+SCHEMA = "beampose/run/1"
+
+
+@dataclass(frozen=True, slots=True)
+class FramesFolder:
+    """A folder of pictures; the number in a picture's name is its frame."""
+
+    path: Path
+
+
+@dataclass(frozen=True, slots=True)
+class VideoFile:
+    """A video; frame n is its n-th picture, from 0."""
+
+    path: Path
+
+
+@dataclass(frozen=True, slots=True)
+class DetectionsTable:
+    """A detections.csv: points found already."""
+
+    path: Path
+
+
+@dataclass(frozen=True, slots=True)
+class LiveDevice:
+    """A camera that OpenCV opens, for `beampose watch`; frames are numbered from 0 at the frame rate of run.yaml."""
+
+    device: int | str  # its number, or a name such as /dev/video0 or an address of a stream
+
+    @property
+    def path(self) -> Path:
+        """What messages call it."""
+        return Path(f"device {self.device}")
+
+
+Source = FramesFolder | VideoFile | DetectionsTable | LiveDevice
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """One recording and all that is known of it before a picture is looked at."""
+
+    folder: Path
+    name: str
+    rig: Rig  # of the rig file, the cameras that this run has
+    rig_path: Path
+    frame_rate_hz: float
+    exposure_s: float | None
+    times: Times
+    times_path: Path | None  # the timestamps file, where the run has one
+    cameras: Mapping[str, Source]  # in the rig's order
+    left_out: tuple[str, ...]  # cameras of the rig that this run has nothing of
+    prior: PosePrior | None  # where the vehicle is at the first frame
+    tracker: TrackerParameters
+    notes: str
+    covariance: RigCovariance | None = None  # of the rig's calibration
+    calibration: CalibrationState | None = None  # when it was made, and how good it is
+    recorded: datetime.date | None = None  # the day of the recording
+
+    @property
+    def path(self) -> Path:
+        """The run.yaml itself."""
+        return self.folder / "run.yaml"
+
+
+def load_run(run_folder: Path) -> Run:
+    """Read and check a run folder's run.yaml, its rig and its timestamps; pictures are not opened.
+
+    Raises InputError: file, field, what was expected and what was found.
+    """
+    folder = Path(run_folder)
+    if folder.name == "run.yaml" and not folder.is_dir():
+        folder = folder.parent
+    if not folder.is_dir():
+        raise InputError(f"{folder}: expected a run folder, found {'a file' if folder.exists() else 'nothing'}")
+    path = folder / "run.yaml"
+    content = validated(_RunBlock, read_mapping(path), path)
+    tracker = dataclass_from_yaml(TrackerParameters, content.tracker, path, "tracker")
+
+    rig_path = folder / content.rig
+    if not rig_path.is_file():
+        raise InputError(
+            f"{path}: rig: expected a rig file, found none at {rig_path}; paths start at run.yaml's folder"
+        )
+    rig_file = load_rig_file(rig_path)
+    rig = rig_file.rig
+    mistakes = [
+        f"{path}: cameras.{name}: expected a camera of {rig_path.name}, got {name!r}{did_you_mean(name, rig.cameras)}"
+        for name in content.cameras
+        if name not in rig.cameras
+    ]
+    sources: dict[str, Source] = {}
+    for name in rig.cameras:
+        if name not in content.cameras:
+            continue
+        try:
+            sources[name] = _source_of(content.cameras[name], folder, f"{path}: cameras.{name}")
+        except InputError as error:
+            mistakes.append(str(error))
+    if mistakes:
+        raise FileError(mistakes)
+
+    times_path = None if content.timestamps is None else folder / content.timestamps
+    in_use = dataclasses.replace(rig, cameras={n: c for n, c in rig.cameras.items() if n in sources})
+    return Run(
+        folder=folder,
+        name=content.name or folder.resolve().name,
+        rig=in_use,
+        rig_path=rig_path,
+        frame_rate_hz=content.frame_rate_hz,
+        exposure_s=content.exposure_s,
+        times=Times(content.frame_rate_hz) if times_path is None else load_times(times_path, content.frame_rate_hz),
+        times_path=times_path,
+        cameras=sources,
+        left_out=tuple(n for n in rig.cameras if n not in sources),
+        prior=None if content.prior is None else _prior_of(content.prior),
+        tracker=tracker,
+        notes=content.notes,
+        covariance=joint_covariance(in_use, rig_file.covariances, rig_path),
+        calibration=rig_file.calibration,
+        recorded=content.recorded,
+    )
+
+
+def save_run(content: Mapping[str, Any], run_folder: Path) -> Path:
+    """Write run.yaml from the plain mapping that it shall hold, checked as the reader checks it; returns its path.
+
+    `schema` may be left out. Paths within the mapping are relative to the run folder. Raises InputError.
+    """
+    path = Path(run_folder) / "run.yaml"
+    full = {"schema": SCHEMA, **content}
+    block = validated(_RunBlock, full, path)
+    dataclass_from_yaml(TrackerParameters, block.tracker, path, "tracker")
+    write_mapping(full, path)
+    return path
+
+
+# What the file may hold -----------------------------------------------------------------------------------------
+
+
+def _a_device(value: Any) -> int | str:
+    if isinstance(value, int) and not isinstance(value, bool) and value >= 0:
+        return value
+    if isinstance(value, str) and value.strip():
+        return value
+    raise unexpected("a camera's number from 0, or the name of a device", value)
+
+
+class _SourceBlock(Block):
+    frames: Word | None = None
+    detections: Word | None = None
+    device: Annotated[int | str | None, pydantic.PlainValidator(_a_device)] = None
+
+    @pydantic.model_validator(mode="after")
+    def _one_of_them(self) -> _SourceBlock:
+        given = [n for n in ("frames", "detections", "device") if getattr(self, n) is not None]
+        if "device" in given and len(given) > 1:
+            raise wrong(f"expected one of frames, detections and device, got {' and '.join(given)}; keep one")
+        if len(given) > 1:
+            raise wrong("expected frames or detections, got both; keep one")
+        if not given:
+            raise wrong("expected frames or detections, got neither")
+        return self
+
+
+def _an_angle_range(value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value <= 180:
+        raise unexpected("an angle above 0 and up to 180", value)
+    return float(value)
+
+
+class _PriorBlock(Block):
+    position_m: Vector3
+    yaw_pitch_roll_deg: Vector3
+    within_m: FromZero
+    within_deg: Annotated[float, pydantic.PlainValidator(_an_angle_range)]
+
+
+def _some_cameras(value: Any) -> Any:
+    if isinstance(value, dict) and not value:
+        raise wrong("expected one or more cameras, got none")
+    return value
+
+
+class _RunBlock(Block):
+    schema_: Annotated[str, pydantic.PlainValidator(one_of((SCHEMA,)))] = pydantic.Field(alias="schema")
+    name: Word | None = None
+    rig: Word
+    frame_rate_hz: Positive
+    exposure_s: Positive | None = None
+    timestamps: Word | None = None
+    cameras: Annotated[dict[str, _SourceBlock], pydantic.BeforeValidator(_some_cameras)]
+    prior: _PriorBlock | None = None
+    tracker: Any = None
+    recorded: OptionalDay = None
+    notes: Text = ""
+
+
+def _prior_of(block: _PriorBlock) -> PosePrior:
+    return PosePrior(
+        centre=Pose.from_ypr(np.radians(block.yaw_pitch_roll_deg), np.array(block.position_m)),
+        within_m=block.within_m,
+        within_rad=float(np.radians(block.within_deg)),
+    )
+
+
+def _source_of(block: _SourceBlock, folder: Path, where: str) -> Source:
+    if block.device is not None:
+        return LiveDevice(block.device)
+    if block.detections is not None:
+        path = folder / block.detections
+        if not path.is_file():
+            raise InputError(f"{where}.detections: expected a table, found none at {path}")
+        return DetectionsTable(path)
+    path = folder / str(block.frames)
+    if path.is_dir():
+        return FramesFolder(path)
+    if path.suffix.lower() in SUFFIXES and path.is_file():
+        raise InputError(
+            f"{where}.frames: expected a folder or a video, got the single picture {path}; name its folder"
+        )
+    if path.is_file():
+        return VideoFile(path)
+    raise InputError(f"{where}.frames: expected a folder of pictures or a video, found nothing at {path}")

@@ -1,0 +1,56 @@
+"""Numbers in reports and messages: significant digits, units, and values with their sigma."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def short(value: float | None, digits: int = 3) -> str:
+    """A number with so many significant digits, without exponent where it is of ordinary size; a dash for none."""
+    if value is None or not np.isfinite(value):
+        return "\u2013"
+    if value == 0:
+        return "0"
+    if not 1e-4 <= abs(value) < 1e6:
+        mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
+        return f"{mantissa} × 10^{int(exponent)}".replace("-", "\u2212")
+    decimals = max(0, digits - 1 - int(np.floor(np.log10(abs(value)))))
+    return f"{value:.{decimals}f}".replace("-", "\u2212")
+
+
+def plus_minus(value: float, sigma: float, signed: bool = False) -> str:
+    """`0.350 ± 0.012`: the sigma to one digit, to two where that is a 1, and the value to as many decimals."""
+    if not np.isfinite(value):
+        return "\u2013"
+    if not (np.isfinite(sigma) and sigma > 0):
+        return ("+" if signed and value > 0 else "") + short(value, 2)
+    power = int(np.floor(np.log10(sigma)))
+    decimals = max(0, -power + (1 if sigma / 10.0**power < 2 else 0))
+    text = f"{value:{'+' if signed else ''}.{decimals}f} ± {sigma:.{decimals}f}"
+    return text.replace("-", "\u2212")
+
+
+def percent(share: float | None) -> str:
+    """A share as a percentage that does not round up to 100 what is not all."""
+    if share is None or not np.isfinite(share):
+        return "\u2013"
+    if share in (0.0, 1.0):
+        return f"{100 * share:.0f} %"
+    decimals = 1
+    while decimals < 4 and f"{100 * share:.{decimals}f}" in ("100." + "0" * decimals, "0." + "0" * decimals):
+        decimals += 1
+    return f"{100 * share:.{decimals}f} %"
+
+
+def length(metres: float | None) -> str:
+    """A length in mm, or in m from one metre on."""
+    if metres is None or not np.isfinite(metres):
+        return "\u2013"
+    return f"{short(metres)} m" if abs(metres) >= 1 else f"{short(1000 * metres)} mm"
+
+
+def angle(degrees: float | None) -> str:
+    """An angle in degrees, or in thousandths of a degree below a tenth."""
+    if degrees is None or not np.isfinite(degrees):
+        return "\u2013"
+    return f"{short(degrees)}\u00b0" if abs(degrees) >= 0.1 else f"{short(1000 * degrees)} mdeg"

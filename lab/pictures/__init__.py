@@ -1,0 +1,1 @@
+"""Picture files and videos of all kinds, decoded to grey."""

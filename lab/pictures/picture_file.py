@@ -1,0 +1,208 @@
+"""One picture file: decoded to grey, or the reason why it cannot be.
+
+The header is read first: what is of another size than the rig says, or promises an absurd one, is never decoded.
+Checksums are verified where a format has them. What a library writes to standard error about damage never gets there.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeAlias, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lab.pictures.opencv import quiet_cv2
+from lab.pictures.picture_headers import DamagedError, Header, read_header
+
+SUFFIXES = (".png", ".tif", ".tiff", ".bmp", ".pgm", ".jpg", ".jpeg")
+UNREADABLE = "unreadable"
+DROPPED = "dropped"
+_PADDING = 16  # bytes that some cameras leave before the end of a JPEG; damage leaves some fifty and more
+_LARGE = 1 << 26  # bytes of a file: a larger one is mapped, not read, since its header may show that it is of no use
+
+Grey: TypeAlias = NDArray[np.uint8] | NDArray[np.uint16]  # (h, w), DN
+
+
+@dataclass(frozen=True, slots=True)
+class Missing:
+    """There is no usable picture: why."""
+
+    reason: str  # "dropped", "unreadable: ...", "wrong size ..."
+
+
+def read_picture(path: Path, size_px: tuple[int, int] | None) -> Grey | Missing:
+    """The picture in a file as grey (h, w), 8 or 16 bit; Missing where it is damaged or not of this (width, height).
+
+    size_px None: of any size. The array is the caller's own. May be called in any thread.
+    """
+    try:
+        data = _content(path)
+    except OSError as error:
+        return Missing(f"{UNREADABLE}: {error.strerror}")
+    return _decoded(data, size_px)
+
+
+def decode(data: bytes, size_px: tuple[int, int] | None) -> Grey | Missing:
+    """As `read_picture`, from the bytes of a file."""
+    return _decoded(np.frombuffer(bytearray(data), np.uint8), size_px)
+
+
+def checked(picture: NDArray[np.generic], size_px: tuple[int, int] | None) -> Grey | Missing:
+    """The picture itself, if it has this width and height and 8 or 16 bits."""
+    height, width = picture.shape[:2]
+    if size_px is not None and (width, height) != size_px:
+        return Missing(_wrong_size(width, height, size_px))
+    if picture.dtype not in (np.uint8, np.uint16):
+        return Missing(f"{UNREADABLE}: {picture.dtype} numbers, expected 8 or 16 bits without sign")
+    return cast(Grey, picture)
+
+
+def _content(path: Path) -> NDArray[np.uint8]:
+    """A file's bytes, that may be written to without changing the file. Raises OSError."""
+    with open(path, "rb", buffering=0) as file:
+        size = file.seek(0, 2)
+        if size > _LARGE:
+            return np.memmap(file, np.uint8, "c", shape=(size,))
+        file.seek(0)
+        data = np.empty(size, np.uint8)
+        got = 0
+        while got < size and (more := file.readinto(data[got:].data)):
+            got += more
+        return data[:got]
+
+
+def _wrong_size(width: int, height: int, size_px: tuple[int, int]) -> str:
+    return f"wrong size {width}x{height}, the rig says {size_px[0]}x{size_px[1]}"
+
+
+def _decoded(data: NDArray[np.uint8], size_px: tuple[int, int] | None) -> Grey | Missing:
+    if not data.size:
+        return Missing(f"{UNREADABLE}: the file is empty")
+    try:
+        header = read_header(data)
+        header.require_sound()
+        if size_px is not None and (header.width, header.height) != size_px:
+            return Missing(_wrong_size(header.width, header.height, size_px))
+        picture = _DECODERS[header.kind](data, header)
+    except DamagedError as error:
+        return Missing(f"{UNREADABLE}: {error}")
+    except MemoryError:
+        return Missing(f"{UNREADABLE}: not enough memory for it")
+    return checked(picture, size_px)
+
+
+def _png(data: NDArray[np.uint8], header: Header) -> NDArray[np.generic]:
+    from lab.pictures.png import Png  # compiled code: only where there are such pictures
+
+    png = Png.read(data)
+    return png.grey() if png.is_simple else _by_opencv(np.frombuffer(png.plain_file(), np.uint8))
+
+
+def _jpeg(data: NDArray[np.uint8], header: Header) -> NDArray[np.generic]:
+    """By libjpeg-turbo, which tells of damage where OpenCV writes it to standard error and goes on."""
+    import simplejpeg
+
+    _require_jpeg_end(data)
+    grey = header.jpeg_components in (1, 3)
+    try:
+        picture = simplejpeg.decode_jpeg(data, "GRAY" if grey else "CMYK", strict=True)
+    except ValueError as error:
+        left_over = re.search(r"(\d+) extraneous bytes", str(error))
+        if left_over is None or int(left_over[1]) > _PADDING:
+            raise DamagedError(f"damaged ({_first_line(error)})") from None
+        picture = simplejpeg.decode_jpeg(data, "GRAY" if grey else "CMYK", strict=False)
+    return picture[..., 0] if grey else _by_opencv(data)
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).splitlines()[0][:80] if str(error) else type(error).__name__
+
+
+def _require_jpeg_end(data: NDArray[np.uint8]) -> None:
+    """Raises DamagedError unless an end marker comes after the first scan. Source: ITU T.81, B.1.
+
+    Decoders take the upper part of a file that was cut short for the picture. Within a scan the byte FF is always
+    followed by 00 or a restart marker, so FF D9 there is the end and nothing else.
+    """
+    view, at = data.data, 2
+    while at + 4 <= len(view):
+        if view[at] != 0xFF:
+            raise DamagedError("damaged (no marker where one must be)")
+        marker = view[at + 1]
+        if marker == 0xFF:  # a fill byte
+            at += 1
+            continue
+        at += 2 + int.from_bytes(view[at + 2 : at + 4], "big")
+        if marker == 0xDA:
+            if bytes(view[at:]).find(b"\xff\xd9") >= 0:
+                return
+            break
+    raise DamagedError("cut short")
+
+
+def _tiff(data: NDArray[np.uint8], header: Header) -> NDArray[np.generic]:
+    tiff = header.tiff
+    assert tiff is not None
+    if not tiff.is_simple:
+        return _by_opencv(tiff.as_stored(data))
+    picture = tiff.content(data)
+    if picture is None:
+        raise DamagedError("damaged, or cut short")
+    return picture
+
+
+def _pnm(data: NDArray[np.uint8], header: Header) -> NDArray[np.generic]:
+    """Grey pictures with their values as stored, whatever the largest may be. Source: netpbm's pgm(5)."""
+    kind, largest, start = header.pnm
+    dtype, shape = np.dtype(np.uint8 if largest < 256 else ">u2"), (header.height, header.width)
+    count = header.height * header.width
+    if kind == 5:
+        stored = data[start : start + count * dtype.itemsize]
+        if len(stored) < count * dtype.itemsize:
+            raise DamagedError("cut short")
+        if dtype.itemsize == 1:
+            return stored.reshape(shape)
+        pixels = np.frombuffer(stored.tobytes(), dtype)  # aligned: the header has any length
+        return pixels.astype(np.uint16).reshape(shape)
+    if kind == 2:
+        return _written_out(bytes(data[start - 1 :]), largest, count).reshape(shape)
+    return _by_opencv(data)
+
+
+def _written_out(text: bytes, largest: int, count: int) -> NDArray[np.uint8] | NDArray[np.uint16]:
+    """The first `count` numbers of a text."""
+    words = text.split(None, count)[:count]
+    if len(words) < count:
+        raise DamagedError("cut short")
+    try:
+        values = np.fromiter(map(int, words), np.int64, count)
+    except (ValueError, OverflowError):
+        raise DamagedError("damaged (expected whole numbers)") from None
+    if values.min() < 0 or values.max() > largest:
+        raise DamagedError(f"damaged (a value is not within 0 and {largest})")
+    return values.astype(np.uint8) if largest < 256 else values.astype(np.uint16)
+
+
+def _bmp(data: NDArray[np.uint8], header: Header) -> NDArray[np.generic]:
+    return _by_opencv(data)
+
+
+def _by_opencv(data: NDArray[np.uint8]) -> NDArray[np.generic]:
+    """Colour becomes grey by OpenCV's weights. A turn that the file wishes for display (EXIF) is not applied: a
+    camera's pixels are where the sensor has them.
+    """
+    cv2 = quiet_cv2()
+    as_stored = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+    try:
+        picture = cv2.imdecode(data, as_stored)
+    except cv2.error:
+        picture = None
+    if picture is None:
+        raise DamagedError("damaged, or no picture")
+    return cast("NDArray[np.generic]", picture)
+
+
+_DECODERS = {"png": _png, "jpeg": _jpeg, "tiff": _tiff, "bmp": _bmp, "pnm": _pnm}

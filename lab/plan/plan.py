@@ -1,0 +1,78 @@
+"""What a rig will see and how well it will measure, before it is built: `beampose plan`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from calibration.budget.expected_errors import expected_errors
+from calibration.findings import Level, verdict
+from lab.errors import QUALITY_GATE_FAILED
+from lab.files.rig.rig_covariance import TARGET, joint_covariance
+from lab.files.rig.rig_file import load_rig_file
+from lab.files.text.atomic_write import refuse_foreign, whole_folder
+from lab.number_format import angle, length, percent
+from lab.plan.plan_findings import findings, median_sigma
+from lab.plan.plan_grid import Plan, plan_grid
+from lab.plan.plan_options import PlanOptions
+from lab.plan.plan_page import write_plan_page
+from lab.plan.plan_tables import write_effects, write_plan
+
+TABLE, EFFECTS, REPORT = "plan.csv", "effects.csv", "report.html"
+
+
+@dataclass(frozen=True, slots=True)
+class PlanOutcome:
+    """What was planned, and where it is written."""
+
+    verdict: Level
+    poses: int
+    measured: float  # share of the poses
+    sigma_m: float  # along the worst direction, median over the solved poses
+    sigma_deg: float
+    out: Path
+
+    @property
+    def exit_status(self) -> int:
+        """0, or 4 where the rig is not fit for the range: a gate, as of a run."""
+        return QUALITY_GATE_FAILED if self.verdict is Level.FAIL else 0
+
+    def line(self) -> str:
+        """For the command line."""
+        sigmas = f"sigma {angle(self.sigma_deg)} and {length(self.sigma_m)} (worst direction, median of the poses)"
+        return (
+            f"plan: {self.verdict.name}, {percent(self.measured)} of {self.poses} poses can be measured, {sigmas};"
+            f" {self.out / REPORT}"
+        )
+
+
+def plan_rig(rig_path: Path, out: Path, options: PlanOptions | None = None) -> PlanOutcome:
+    """Plan a rig into the folder `out`: plan.csv, effects.csv and report.html.
+
+    The rig file's covariance is used where it has one, else the errors that the options expect. Raises InputError for a
+    rig that cannot be read, options that make no sense, or a folder with something else in it.
+    """
+    options = PlanOptions() if options is None else options
+    refuse_foreign(out, _is_ours)
+    plan = plan_of(rig_path, options)
+    found = findings(plan)
+    with whole_folder(Path(out), may_replace=_is_ours) as work:
+        write_plan(plan, work / TABLE)
+        write_effects(plan, work / EFFECTS)
+        write_plan_page(plan, found, Path(rig_path), work)
+    sigma_m, sigma_deg = median_sigma(plan)
+    return PlanOutcome(verdict(found), len(plan.status), float(plan.measured.mean()), sigma_m, sigma_deg, Path(out))
+
+
+def _is_ours(folder: Path) -> bool:
+    return (folder / TABLE).is_file()
+
+
+def plan_of(rig_path: Path, options: PlanOptions) -> Plan:
+    """The plan of a rig file. Raises InputError."""
+    file = load_rig_file(Path(rig_path))
+    stated = joint_covariance(file.rig, file.covariances, rig_path)
+    target = file.covariances.get(TARGET)
+    whole = target is not None and any(n.startswith(("cameras.", "screens.")) for n in target.parameters)
+    errors, sources = expected_errors(file.rig, options.expected, stated, whole)
+    return plan_grid(file.rig, errors, sources, options)

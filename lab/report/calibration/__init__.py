@@ -1,0 +1,1 @@
+"""Reports of calibrations: the page and its charts, maps and scenes."""

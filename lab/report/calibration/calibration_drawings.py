@@ -1,0 +1,311 @@
+"""Drawings of what a camera saw of its boards: corners, residuals, coverage. The other drawings of a calibration are
+here by name as well: maps (calibration_maps), charts (calibration_charts), the 3-D view (calibration_scene).
+
+Every function returns one `<svg>` as text, about 540 units wide: half a page. Pixels as in OpenCV: (0, 0) is the centre
+of the top-left pixel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+from geometry.arrays import Array, Bools
+from lab.report.calibration.calibration_charts import (
+    DriftLine,
+    drift_chart,
+    error_ellipses,
+    lens_ladder,
+    residual_histogram,
+)
+from lab.report.calibration.calibration_maps import correlation_matrix, flatness_map, heat_map
+from lab.report.calibration.calibration_scene import (
+    CAMERA_VIEWS,
+    LAB_VIEWS,
+    Dot,
+    Frustum,
+    Ray,
+    Rectangle,
+    frustum_of,
+    rig_things,
+    scene_view,
+    scene_views,
+)
+from lab.report.plot.axes import (
+    INK,
+    Plane,
+    axes,
+    dots,
+    frame,
+    image_plane,
+    number,
+    picture_uri,
+    polyline,
+    round_size,
+    segments,
+    svg_of,
+)
+from lab.report.plot.axes import (
+    note as foot,
+)
+from lab.report.plot.svg import BLUE, ORANGE, VERMILLION, Scale, text
+
+__all__ = [
+    "CAMERA_VIEWS",
+    "LAB_VIEWS",
+    "Dot",
+    "DriftLine",
+    "Frustum",
+    "Ray",
+    "Rectangle",
+    "corners_overlay",
+    "correlation_matrix",
+    "coverage_map",
+    "drift_chart",
+    "error_ellipses",
+    "flatness_map",
+    "frustum_of",
+    "heat_map",
+    "lens_ladder",
+    "residual_field",
+    "residual_histogram",
+    "rig_things",
+    "scene_view",
+    "scene_views",
+    "tilt_polar",
+]
+
+_MOST_VECTORS = 2000  # of a residual field: more only make ink
+_ARROW = 24.0  # drawing units: how long the 95th percentile of the residuals is drawn
+_LONGEST = 70.0  # drawing units: longer vectors are cut
+_PICTURE_WIDTH = 720  # px of an embedded photograph
+_JPEG_QUALITY = 72
+
+
+def corners_overlay(
+    size_px: tuple[int, int],
+    found_px: Array,
+    residual_px: Array,
+    title: str,
+    *,
+    picture: Array | np.ndarray | None = None,
+    rejected: Bools | None = None,
+    labels: Sequence[str] | None = None,
+) -> str:
+    """One view: its corners and how far the model misses each, magnified.
+
+    found_px, residual_px (n, 2), px: where each corner was found, and found minus model. picture (height, width) or
+    (height, width, 3): the photograph, drawn under it smaller and as JPEG. rejected (n,): corners that were not used.
+    labels (n,): names of the corners, where they have some.
+    """
+    p = image_plane(size_px)
+    out = axes(p, title, "u (px)", "v (px)", grid=picture is None)
+    if picture is not None:
+        out.append(_photograph(p, np.asarray(picture)))
+    found, residual = np.asarray(found_px, dtype=float), np.asarray(residual_px, dtype=float)
+    bad = np.zeros(len(found), dtype=bool) if rejected is None else np.asarray(rejected, dtype=bool)
+    stretch, bar = _magnification(residual[~bad])
+    starts = p.at(found)
+    ends = starts + _capped(residual * stretch)
+    for colour, some, radius in ((BLUE, ~bad, 2.2), (VERMILLION, bad, 3.0)):
+        vectors, places = segments(starts[some], ends[some]), dots(starts[some], radius)
+        # A light line beneath the coloured one keeps it visible on any photograph.
+        out.append(f'<path d="{vectors}" stroke="#fff" stroke-width="3.4" stroke-opacity="0.75" fill="none"/>')
+        out.append(f'<path d="{vectors}" stroke="{ORANGE}" stroke-width="1.6" fill="none"/>')
+        out.append(f'<path d="{places}" fill="{colour}" stroke="#fff" stroke-width="0.7"/>')
+    for place, label in zip(starts.tolist(), labels or (), strict=labels is not None):
+        out.append(text(place[0] - 5, place[1] + 13, label, "end"))
+    out.append(_scale_bar(p, stretch, bar))
+    if bad.any():
+        out.append(foot(p, f"{bad.sum()} corners not used (red); their vectors are cut"))
+    return svg_of(p, title, [*out, frame(p)])
+
+
+def residual_field(
+    size_px: tuple[int, int],
+    found_px: Array,
+    residual_px: Array,
+    title: str = "Residuals over the sensor, all views",
+    *,
+    cells: int = 16,
+    things: str = "corners",
+) -> str:
+    """The residuals of all views over the sensor: single ones faint, the mean of each cell bold.
+
+    found_px, residual_px (n, 2), px. A good lens model leaves means about nought; means that turn with the place show
+    what it cannot bend. A mean is drawn where its cell has 5 or more corners. `cells` over the width.
+    things: what they are called.
+    """
+    found, residual = np.asarray(found_px, dtype=float), np.asarray(residual_px, dtype=float)
+    good = np.isfinite(found).all(axis=1) & np.isfinite(residual).all(axis=1)
+    found, residual = found[good], residual[good]
+    p = image_plane(size_px)
+    out = axes(p, title, "u (px)", "v (px)")
+    if not len(found):
+        return svg_of(p, title, [*out, frame(p), _in_the_middle(p, f"no {things}")])
+    stretch, bar = _magnification(residual)
+    kept = np.arange(len(found))
+    if len(found) > _MOST_VECTORS:
+        # Every k-th, and the largest ones: these are what somebody looks for.
+        largest = np.argsort(np.linalg.norm(residual, axis=1))[-_MOST_VECTORS // 10 :]
+        kept = np.union1d(np.linspace(0, len(found) - 1, _MOST_VECTORS).astype(np.int64), largest)
+    starts = p.at(found)
+    d = segments(starts[kept], starts[kept] + _capped(residual[kept] * stretch))
+    out.append(f'<path d="{d}" stroke="{BLUE}" stroke-width="0.7" stroke-opacity="0.55" fill="none"/>')
+    middle, mean, _ = cell_means(size_px, found, residual, cells)
+    tips = p.at(middle) + mean * stretch * 2
+    d = segments(p.at(middle), tips)
+    out.append(f'<path d="{d}" stroke="var(--paper)" stroke-width="4" fill="none"/>')
+    out.append(f'<path d="{d}" stroke="{VERMILLION}" stroke-width="2" stroke-linecap="round" fill="none"/>')
+    out.append(f'<path d="{dots(p.at(middle), 1.7)}" fill="{VERMILLION}"/>')
+    out.append(_scale_bar(p, stretch, bar))
+    counted = f"{len(found)} {things}" + (f", {len(kept)} drawn" if len(kept) < len(found) else "")
+    note = f"blue: {counted}; red: mean of a cell, twice as long"
+    out.append(foot(p, note))
+    return svg_of(p, title, [*out, frame(p)])
+
+
+def cell_means(
+    size_px: tuple[int, int], places_px: Array, values: Array, cells: int, at_least: int = 5
+) -> tuple[Array, Array, Array]:
+    """Middles (m, 2), means (m, k) and counts (m,) of the square cells of a sensor that hold enough values (n, k)."""
+    side = size_px[0] / cells
+    column = np.clip((places_px[:, 0] + 0.5) // side, 0, cells - 1).astype(np.int64)
+    rows = max(1, round(size_px[1] / side))
+    row = np.clip((places_px[:, 1] + 0.5) // (size_px[1] / rows), 0, rows - 1).astype(np.int64)
+    cell = row * cells + column
+    count = np.bincount(cell, minlength=rows * cells)
+    sums = np.stack([np.bincount(cell, values[:, k], rows * cells) for k in range(values.shape[1])], axis=1)
+    held = np.flatnonzero(count >= at_least)
+    middle = np.stack([(held % cells + 0.5) * side - 0.5, (held // cells + 0.5) * size_px[1] / rows - 0.5], axis=1)
+    return middle, sums[held] / np.maximum(count[held, None], 1), count[held].astype(float)
+
+
+def coverage_map(
+    size_px: tuple[int, int],
+    corners_px: Array,
+    title: str = "Where the sensor had corners",
+    *,
+    cells: int = 12,
+    things: str = "corners",
+    outlines_px: list[Array] | None = None,
+) -> str:
+    """How many corners each part of the sensor had; parts with none are hatched.
+
+    corners_px (n, 2), px, of all views. outlines_px: a closed outline (k, 2) per view, drawn thin (60 at most).
+    things: what they are called.
+    """
+    corners = np.asarray(corners_px, dtype=float)
+    corners = corners[np.isfinite(corners).all(axis=1)]
+    p = image_plane(size_px)
+    out = axes(p, title, "u (px)", "v (px)", grid=False)
+    middle, _, count = cell_means(size_px, corners, np.zeros((len(corners), 1)), cells, 0)
+    side = np.array([size_px[0] / cells, size_px[1] * cells / len(count)])
+    most = max(float(count.max()), 1.0)
+    for (x, y), n in zip(middle.tolist(), count.tolist(), strict=True):
+        left, top = p.at(np.array([x - side[0] / 2, y - side[1] / 2])).tolist()
+        right, low = p.at(np.array([x + side[0] / 2, y + side[1] / 2])).tolist()
+        box = f'x="{left:.1f}" y="{top:.1f}" width="{right - left:.1f}" height="{low - top:.1f}"'
+        if n:
+            # The square root, since a cell with 5 corners must be told from an empty one beside one with 500.
+            out.append(f'<rect {box} fill="{BLUE}" fill-opacity="{0.12 + 0.8 * np.sqrt(n / most):.2f}"/>')
+        else:
+            slope = f"M{left:.1f} {low:.1f}L{right:.1f} {top:.1f}M{left:.1f} {top:.1f}L{right:.1f} {low:.1f}"
+            out.append(f'<path d="{slope}" stroke="{VERMILLION}" stroke-width="1" stroke-opacity="0.8"/>')
+        if n or most > 1:
+            words = f"{n:.0f}"
+            style = "font-size:9.5px;fill:#fff;paint-order:stroke;stroke:#0008;stroke-width:2px" if n else "fill:none"
+            out.append(text((left + right) / 2, (top + low) / 2 + 3.5, words, "mid", style))
+    step = max(1, -(-len(outlines_px or []) // 60))
+    for outline in (outlines_px or [])[::step]:
+        d = polyline(p.at(outline), closed=True)
+        out.append(f'<path d="{d}" fill="none" stroke="{ORANGE}" stroke-width="0.8" stroke-opacity="0.7"/>')
+    share = float((count > 0).mean())
+    note = f"{len(corners)} {things}; {100 * share:.0f} % of the sensor's cells have some; crossed out: none"
+    out.append(foot(p, note))
+    return svg_of(p, title, [*out, frame(p)])
+
+
+def tilt_polar(
+    tilts_deg: Array, azimuths_deg: Array, title: str = "How the boards were tilted", *, wanted_deg: float = 20.0
+) -> str:
+    """Each view's tilt against the sensor: from the middle how much, round it towards where.
+
+    tilts_deg (n,) angle between the board's normal and the optical axis; azimuths_deg (n,) where the normal leans, from
+    +u towards +v. Views within `wanted_deg` of facing the camera tell little of the focal length.
+    """
+    tilts, azimuths = np.asarray(tilts_deg, dtype=float), np.radians(np.asarray(azimuths_deg, dtype=float))
+    finite = tilts[np.isfinite(tilts)]
+    outer = max(60.0, float(finite.max()) * 1.05 if finite.size else 0.0)
+    p = Plane(Scale(-outer, outer, 95, 445), Scale(-outer, outer, 30, 380), 540, 412)
+    out = [text(58, 15, title, "title")]
+    at = p.at(np.zeros(2))
+    per_degree = 175 / outer
+    for ring in range(20, int(outer) + 1, 20):
+        out.append(
+            f'<circle class="ring" cx="{at[0]}" cy="{at[1]}" r="{ring * per_degree:.1f}" fill="none"'
+            f' stroke="var(--line)" stroke-width="0.8"/>'
+        )
+        out.append(text(float(at[0]) + 3, float(at[1]) - ring * per_degree - 2, f"{ring}°"))
+    out.append(
+        f'<circle cx="{at[0]}" cy="{at[1]}" r="{wanted_deg * per_degree:.1f}" fill="{ORANGE}" fill-opacity="0.16"/>'
+    )
+    out.append('<path class="grid" d="M95 205H445M270 30V380"/>')
+    out += [text(449, 209, "+u"), text(270, 394, "+v", "mid")]
+    places = p.at(np.stack([tilts * np.cos(azimuths), tilts * np.sin(azimuths)], axis=-1))
+    out.append(
+        f'<path d="{dots(places, 3.6)}" fill="{BLUE}" fill-opacity="0.75" stroke="var(--paper)" stroke-width="0.7"/>'
+    )
+    few = int((finite > wanted_deg).sum())
+    out.append(text(58, 408, f"{few} of {finite.size} views are tilted by more than {wanted_deg:g}°"))
+    return svg_of(p, title, out)
+
+
+def _magnification(residual: Array) -> tuple[float, float]:
+    """Drawing units per px of residual, and the residual (px) that the scale bar shows."""
+    size = np.linalg.norm(residual, axis=1)
+    size = size[np.isfinite(size)]
+    usual = max(float(np.percentile(size, 95)) if size.size else 0.0, 1e-6)
+    return _ARROW / usual, round_size(usual * 1.5)
+
+
+def _capped(vectors: Array) -> Array:
+    """Vectors (n, 2), drawing units, of at most the longest length: an outlier must not cross the whole page."""
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return vectors * np.minimum(1.0, _LONGEST / np.maximum(length, 1e-9))
+
+
+def _scale_bar(p: Plane, stretch: float, bar: float) -> str:
+    left, top, wide, _ = p.box
+    long = bar * stretch
+    x, y = left + wide - 8, top - 8
+    words = f"residual of {number(bar)} px"
+    line = f'<path d="M{x - long:.1f} {y:.1f}h{long:.1f}m0 -3v6m{-long:.1f} 0v-6"'
+    line += f' stroke="{INK}" stroke-width="1.3" fill="none"/>'
+    return line + text(x - long - 6, y + 4, words, "end")
+
+
+def _photograph(p: Plane, picture: np.ndarray) -> str:
+    """The picture inside the axes, pale, as JPEG."""
+    if picture.dtype != np.uint8:
+        top = max(float(picture.max()), 1.0)
+        picture = (picture.astype(float) * (255 / top)).astype(np.uint8)
+    if picture.shape[1] > _PICTURE_WIDTH:
+        shrink = _PICTURE_WIDTH / picture.shape[1]
+        size = (_PICTURE_WIDTH, max(1, round(picture.shape[0] * shrink)))
+        picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+    done, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
+    if not done:
+        raise ValueError(f"a picture of shape {picture.shape} cannot be written as JPEG")
+    left, top_y, wide, high = p.box
+    return (
+        f'<image x="{left:.1f}" y="{top_y:.1f}" width="{wide:.1f}" height="{high:.1f}" preserveAspectRatio="none"'
+        f' href="{picture_uri(data.tobytes(), "jpeg")}"/>'
+    )
+
+
+def _in_the_middle(p: Plane, words: str) -> str:
+    left, top, wide, high = p.box
+    return text(left + wide / 2, top + high / 2, words, "mid")

@@ -1,0 +1,234 @@
+"""The report of a calibration: verdict, findings, key figures and pictures in one HTML file that needs nothing else."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from datetime import date
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup
+
+from calibration.findings import Finding, Level
+from geometry.arrays import Array
+from lab.errors import InputError
+from lab.files.text.yaml_text import write_whole
+from lab.number_format import short
+from lab.report.html import environment
+
+FILE_NAME = "report.html"
+KINDS = ("Camera", "Board", "Screens", "Beams", "Rig", "Daily check", "Plan")
+LARGEST_BYTES = 5_000_000  # a report that a mail carries and a browser opens at once
+_LONG_TABLE = 40  # rows beyond which a table is folded away
+_CSS = {Level.PASS: "pass", Level.WARN: "check", Level.FAIL: "fail"}  # the classes of style.css
+_SENTENCE = {
+    Level.PASS: "This may be used.",
+    Level.WARN: "This may be used; know the warnings below.",
+    Level.FAIL: "This must not be used as it is.",
+}
+_PLAN_SENTENCE = {
+    Level.PASS: "This rig suits the range of poses.",
+    Level.WARN: "This rig can be built; know the warnings below.",
+    Level.FAIL: "This rig does not suit the range of poses.",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """A table. Cells are text, or numbers, which are shown with four significant digits (nan: a dash)."""
+
+    heads: Sequence[str]  # with units: "drift (px)"
+    rows: Sequence[Sequence[object]]  # each as long as heads
+
+    def __post_init__(self) -> None:
+        for i, row in enumerate(self.rows):
+            if len(row) != len(self.heads):
+                raise ValueError(f"row {i} has {len(row)} cells, the table {len(self.heads)} heads")
+
+
+@dataclass(frozen=True, slots=True)
+class Drawing:
+    """A picture as SVG or HTML text, trusted as it is, and what it shows, in plain words."""
+
+    picture: str
+    caption: str = ""
+    wide: bool = False  # over the whole page instead of half
+
+
+@dataclass(frozen=True, slots=True)
+class Section:
+    """One subject of a report: words, then pictures, then a table."""
+
+    title: str
+    words: str | Sequence[str] = ()  # one paragraph or several; plain text
+    drawings: Sequence[Drawing | str] = ()
+    table: Table | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Provenance:
+    """When, with what program and from what a calibration was made."""
+
+    date: str  # ISO
+    version: str
+    inputs: tuple[str, ...] = ()  # a line each: name and fingerprint
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationReport:
+    """All that a calibration says of itself."""
+
+    kind: str  # one of KINDS
+    name: str
+    verdict: Level
+    findings: Sequence[Finding]
+    key_figures: Sequence[tuple[str, str, str]]  # label, value with unit (px and mm), note
+    sections: Sequence[Section]
+    made: Provenance = field(default_factory=lambda: provenance())
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise ValueError(f"expected a kind of report out of {', '.join(KINDS)}, got {self.kind!r}")
+
+
+def provenance(inputs: Iterable[Path] = (), made: date | None = None) -> Provenance:
+    """Today's date (or the given one), this program's version and the SHA-256 of the input files.
+
+    Raises InputError for an input that cannot be read.
+    """
+    try:
+        version = metadata.version("beampose")
+    except metadata.PackageNotFoundError:  # run from a checkout that was never installed
+        version = "not installed as a package"
+    lines = []
+    for path in inputs:
+        try:
+            digest = hashlib.sha256(Path(path).read_bytes()).hexdigest()
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+        lines.append(f"{Path(path).name}  sha256 {digest[:16]}")
+    return Provenance((made or date.today()).isoformat(), version, tuple(lines))
+
+
+def telling_views(rms_px: Array, worst: int = 4) -> list[tuple[int, str]]:
+    """Which of n views to show as pictures: the worst few, the median and the best, each once, with that word.
+
+    rms_px (n,): nan for a view that was not used; such views come last and are never shown.
+    """
+    rms = np.asarray(rms_px, dtype=float)
+    order = [int(i) for i in np.argsort(rms, kind="stable") if np.isfinite(rms[i])]
+    named = [(i, "worst" if k == 0 else f"{k + 1}. worst") for k, i in enumerate(order[::-1][:worst])]
+    if order:
+        named += [(order[len(order) // 2], "median"), (order[0], "best")]
+    shown: dict[int, str] = {}
+    for i, word in named:
+        shown.setdefault(i, word)
+    return list(shown.items())
+
+
+def write_calibration_report(report: CalibrationReport, folder: Path) -> Path:
+    """Write report.html into a folder, whole or not at all; returns its path.
+
+    Where it would be larger than 5 MB its largest pictures are left out, each with a line that says so.
+    """
+    path = Path(folder) / FILE_NAME
+    write_whole(page(report), path)
+    return path
+
+
+def page(report: CalibrationReport) -> str:
+    """The HTML text of a report, at most 5 MB unless its tables alone are larger."""
+    drawn = [[_drawing(d) for d in s.drawings] for s in report.sections]
+    html = _rendered(report, drawn)
+    by_size = sorted(
+        ((len(d.picture.encode()), i, k) for i, section in enumerate(drawn) for k, d in enumerate(section)),
+        reverse=True,
+    )
+    excess = len(html.encode()) - LARGEST_BYTES
+    if excess <= 0:
+        return html
+    for size, i, k in by_size:
+        if excess <= 0:
+            break
+        left_out = '<p class="empty">Picture left out: the report would have passed 5 MB.</p>'
+        drawn[i][k] = replace(drawn[i][k], picture=left_out)
+        excess -= size - len(left_out)
+    return _rendered(report, drawn)
+
+
+def _drawing(drawing: Drawing | str) -> Drawing:
+    return drawing if isinstance(drawing, Drawing) else Drawing(drawing)
+
+
+def _rendered(report: CalibrationReport, drawn: list[list[Drawing]]) -> str:
+    worst_first = sorted(report.findings, key=lambda f: -f.level)
+    context: dict[str, Any] = {
+        "kind": report.kind,
+        "name": report.name,
+        "word": report.verdict.name,
+        "css": _CSS[report.verdict],
+        "sentence": (_PLAN_SENTENCE if report.kind == "Plan" else _SENTENCE)[report.verdict],
+        "made": report.made,
+        "made_line": f"{report.made.date} · {_counted(report.findings)}",
+        "findings": [
+            {"css": _CSS[f.level], "word": f.level.name, "what": f.what, "why": f.why, "cure": f.cure}
+            for f in worst_first
+        ],
+        "key_figures": report.key_figures,
+        "sections": [_section(s, d) for s, d in zip(report.sections, drawn, strict=True)],
+    }
+    return environment().get_template("calibration.html.j2").render(context)
+
+
+def section_context(section: Section) -> dict[str, Any]:
+    """A section as the template sections.html.j2 takes it."""
+    return _section(section, [_drawing(d) for d in section.drawings])
+
+
+def _section(section: Section, drawings: list[Drawing]) -> dict[str, Any]:
+    table = section.table
+    return {
+        "title": section.title,
+        "words": [section.words] if isinstance(section.words, str) else list(section.words),
+        "drawings": [{"picture": Markup(d.picture), "caption": d.caption, "wide": d.wide} for d in drawings],
+        "table": None if table is None else {"heads": table.heads, "rows": [[cell(c) for c in r] for r in table.rows]},
+        "numeric": [] if table is None else _numeric(table),
+        "long": table is not None and len(table.rows) > _LONG_TABLE,
+    }
+
+
+def _counted(findings: Sequence[Finding]) -> str:
+    """`2 failed, 1 warning, 5 passed`."""
+    count = {level: sum(f.level == level for f in findings) for level in Level}
+    warnings = f"{count[Level.WARN]} warning{'s' if count[Level.WARN] != 1 else ''}"
+    return f"{count[Level.FAIL]} failed, {warnings}, {count[Level.PASS]} passed"
+
+
+def cell(value: object) -> str:
+    """A table's cell as text: numbers with four significant digits, none and nan as a dash."""
+    if value is None:
+        return "–"
+    if isinstance(value, bool | np.bool_):
+        return "yes" if value else "no"
+    if isinstance(value, int | np.integer):
+        return str(value)
+    if isinstance(value, float | np.floating):
+        return short(float(value), 4) if math.isfinite(value) else "–" if math.isnan(value) else "∞"
+    return str(value)
+
+
+_NUMBER_TEXT = re.compile(r"^[-+−±]?[\d.,]+(\s*[×%°].*)?(\s*±.*)?$|^[–∞]?$")
+
+
+def _numeric(table: Table) -> list[bool]:
+    """Which columns hold numbers alone: those stand flush right."""
+    return [
+        bool(table.rows) and all(_NUMBER_TEXT.match(cell(row[k])) is not None for row in table.rows)
+        for k in range(len(table.heads))
+    ]

@@ -1,0 +1,244 @@
+"""Cameras, screens, boards and beams in space, as still drawings from fixed directions."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+
+import numpy as np
+
+from geometry.arrays import Array
+from geometry.camera import Camera, pinhole_numbers
+from geometry.forward_model import SpotModel
+from geometry.pose import Pose
+from geometry.rig import Rig
+from lab.report.plot.axes import Plane, dots, number, polyline, round_size, segments, svg_of
+from lab.report.plot.svg import BLUE, GREEN, ORANGE, PURPLE, VERMILLION, Scale, text
+
+
+@dataclass(frozen=True, slots=True)
+class Frustum:
+    """A camera, drawn as its field of view."""
+
+    name: str
+    camera_from_world: Pose
+    half_width: tuple[float, float]  # tangents of half the angle of view, across and down
+    colour: str = BLUE
+
+
+@dataclass(frozen=True, slots=True)
+class Rectangle:
+    """A screen or a board."""
+
+    name: str
+    world_from_rectangle: Pose
+    size_m: tuple[float, float]
+    centred: bool = True  # whether its origin is its middle, else its corner
+    colour: str = GREEN
+    faint: bool = False  # one of many boards: thin, without a name
+
+
+@dataclass(frozen=True, slots=True)
+class Ray:
+    """A beam from its source to where it ends."""
+
+    name: str
+    start: Array  # (3,), m, in world
+    end: Array  # (3,), m, in world
+    colour: str = VERMILLION
+
+
+@dataclass(frozen=True, slots=True)
+class Dot:
+    """A point: a spot, a surveyed mark, a body's origin."""
+
+    name: str
+    place: Array  # (3,), m, in world
+    colour: str = ORANGE
+
+
+Thing = Frustum | Rectangle | Ray | Dot
+
+# World to drawing: which way is right, which is up. z is up in a lab's world; in a camera's own frame y is down.
+VIEWS: dict[str, tuple[Array, Array]] = {
+    "seen obliquely": (np.array([0.82, 0.57, 0.0]), np.array([-0.285, 0.41, 0.866])),
+    "from above (along −z)": (np.array([1.0, 0, 0]), np.array([0, 1.0, 0])),
+    "from the front (along +y)": (np.array([1.0, 0, 0]), np.array([0, 0, 1.0])),
+    "from the side (along −x)": (np.array([0, 1.0, 0]), np.array([0, 0, 1.0])),
+    "obliquely from behind the camera": (np.array([0.82, 0.0, 0.57]), np.array([-0.285, -0.866, 0.41])),
+    "from above the camera": (np.array([1.0, 0, 0]), np.array([0, 0, 1.0])),
+    "from beside the camera": (np.array([0, 0, 1.0]), np.array([0, -1.0, 0])),
+}
+LAB_VIEWS = tuple(VIEWS)[:3]
+CAMERA_VIEWS = tuple(VIEWS)[4:]  # for things in a camera's own frame
+
+
+def frustum_of(camera: Camera, colour: str = BLUE) -> Frustum:
+    """A calibrated camera as drawn; its lens is taken as straight."""
+    fx, fy, _, _ = pinhole_numbers(camera)
+    half = (0.5 * camera.image_size_px[0] / fx, 0.5 * camera.image_size_px[1] / fy)
+    return Frustum(camera.name, camera.camera_from_world, half, colour)
+
+
+def rig_things(rig: Rig, world_from_body: Pose | None = None) -> list[Thing]:
+    """The cameras and screens of a rig and, where the vehicle's pose is given, its beams and spots.
+
+    A screen without a size is drawn as large as its spots and the place that its camera looks at ask for, at least 1 m.
+    """
+    things: list[Thing] = []
+    model = SpotModel.of(rig)
+    hits = np.full((len(model), 3), np.nan) if world_from_body is None else model.hits(world_from_body)[0]
+    for screen in rig.screens.values():
+        size = screen.size_m
+        if size is None:
+            on_screen = np.array([s.screen == screen.name for s in (rig.spots[v] for _, v in model.views)], dtype=bool)
+            local = screen.world_from_screen.inverse().apply(hits[on_screen].reshape(-1, 3))[:, :2]
+            local = local[np.isfinite(local).all(axis=1)]
+            half = np.maximum(np.abs(local).max(axis=0, initial=0.4) * 1.2, 0.5)
+            size = (2 * float(half[0]), 2 * float(half[1]))
+        things.append(Rectangle(f"screen {screen.name}", screen.world_from_screen, size))
+    things += [frustum_of(c) for c in rig.cameras.values()]
+    if world_from_body is not None:
+        drawn = set()
+        for i, (_, spot) in enumerate(model.views):
+            if spot in drawn or not np.isfinite(hits[i]).all():
+                continue
+            drawn.add(spot)
+            start = world_from_body.apply(rig.beams[rig.spots[spot].beam].point)
+            things += [Ray(rig.spots[spot].beam, start, hits[i]), Dot(spot, hits[i])]
+        things.append(Dot("vehicle", world_from_body.translation, PURPLE))
+    return things
+
+
+def scene_views(
+    things: Sequence[Thing], title: str = "Cameras, screens and beams", views: Sequence[str] = LAB_VIEWS
+) -> list[str]:
+    """The same things from several directions: LAB_VIEWS, or CAMERA_VIEWS for boards before a single camera."""
+    return [scene_view(things, f"{title}, {name}", name) for name in views]
+
+
+def scene_view(things: Sequence[Thing], title: str, view: str = LAB_VIEWS[0]) -> str:
+    """Things in space by parallel projection. view: one of VIEWS. Metres keep their length along the drawing's axes."""
+    right, up = VIEWS[view]
+    to_drawing = np.stack([right / np.linalg.norm(right), up / np.linalg.norm(up)])
+    reach = _frustum_length(things)
+    outlines = [_outline(t, reach) for t in things]
+    flat = [o @ to_drawing.T for o in outlines]
+    all_points = np.concatenate([*flat, np.zeros((1, 2))]) if flat else np.zeros((1, 2))
+    all_points = all_points[np.isfinite(all_points).all(axis=1)]
+    lo, hi = all_points.min(axis=0), all_points.max(axis=0)
+    span = np.maximum(hi - lo, 1e-3 * max(float((hi - lo).max()), 1.0))
+    scale = min(440 / span[0], 360 / span[1])
+    high = span[1] * scale
+    x0 = (540 - span[0] * scale) / 2
+    p = Plane(
+        Scale(lo[0], lo[0] + span[0], x0, x0 + span[0] * scale),
+        Scale(lo[1], lo[1] + span[1], 44 + high, 44),
+        540,
+        high + 92,
+    )
+    nearness = np.cross(to_drawing[0], to_drawing[1])
+    far_first = sorted(range(len(things)), key=lambda i: float(np.nanmean(outlines[i] @ nearness)))
+    out, labels = [text(8, 15, title, "title")], []
+    for i in far_first:
+        parts, label = _drawn(things[i], p, p.at(flat[i]))
+        out.append(parts)
+        labels += [label] if label else []
+    out += _placed(labels, p)
+    out += _axis_cross(p, to_drawing)
+    long = round_size(0.3 * float(span.max()))
+    width = long * scale
+    y = p.height - 12
+    out.append(
+        f'<path d="M{524 - width:.1f} {y:.1f}h{width:.1f}m0 -4v8m{-width:.1f} 0v-8" stroke="var(--ink)" fill="none"/>'
+    )
+    out.append(text(524 - width - 6, y + 4, f"{number(long)} m", "end"))
+    return svg_of(p, title, out)
+
+
+def _frustum_length(things: Sequence[Thing]) -> float:
+    """How long the fields of view are drawn: a seventh of the scene."""
+    points = [t.camera_from_world.inverse().translation for t in things if isinstance(t, Frustum)]
+    points += [p for t in things if not isinstance(t, Frustum) for p in _outline(t, 0.0)]
+    cloud = np.array(points).reshape(-1, 3)
+    cloud = cloud[np.isfinite(cloud).all(axis=1)]
+    return max(float(np.ptp(cloud, axis=0).max()) / 7, 0.02) if len(cloud) else 1.0
+
+
+def _outline(thing: Thing, reach: float) -> Array:
+    """The corners of a thing (k, 3), m, in world."""
+    if isinstance(thing, Frustum):
+        a, b = thing.half_width
+        # An angle of view beyond 120 degrees would be drawn as a wall.
+        a, b = min(a, 1.7) * reach, min(b, 1.7) * reach
+        body = np.array([[0, 0, 0], [-a, -b, reach], [a, -b, reach], [a, b, reach], [-a, b, reach]])
+        return thing.camera_from_world.inverse().apply(body)
+    if isinstance(thing, Rectangle):
+        w, h = thing.size_m
+        corners = np.array([[0.0, 0, 0], [w, 0, 0], [w, h, 0], [0, h, 0]])
+        return thing.world_from_rectangle.apply(corners - (np.array([w / 2, h / 2, 0]) if thing.centred else 0))
+    if isinstance(thing, Ray):
+        return np.stack([thing.start, thing.end])
+    return np.asarray(thing.place, dtype=float).reshape(1, 3)
+
+
+def _drawn(thing: Thing, p: Plane, at: Array) -> tuple[str, tuple[float, float, str, str] | None]:
+    """A thing's shapes, and its label: x, y, words, colour."""
+    c = thing.colour
+    told = f"<title>{escape(thing.name)}</title>"
+    if isinstance(thing, Frustum):
+        d = polyline(at[1:], closed=True) + segments(np.repeat(at[:1], 4, axis=0), at[1:])
+        shape = f'<path d="{d}" fill="{c}" fill-opacity="0.13" stroke="{c}" stroke-width="1.3">{told}</path>'
+        return shape + f'<path d="{dots(at[:1], 3)}" fill="{c}"/>', (*_pair(at[0]), thing.name, c)
+    if isinstance(thing, Rectangle):
+        width, opacity = (0.6, 0.03) if thing.faint else (1.5, 0.12)
+        d = polyline(at, closed=True)
+        shape = f'<path d="{d}" fill="{c}" fill-opacity="{opacity}" stroke="{c}" stroke-width="{width}">{told}</path>'
+        topmost = at[int(np.argmin(at[:, 1]))]
+        return shape, None if thing.faint else (*_pair(topmost), thing.name, c)
+    if isinstance(thing, Ray):
+        return (
+            f'<path d="{segments(at[:1], at[1:])}" stroke="{c}" stroke-width="1.1" stroke-opacity="0.85">{told}</path>',
+            None,
+        )
+    shape = f'<path d="{dots(at, 3.2)}" fill="{c}" stroke="var(--paper)" stroke-width="0.6">{told}</path>'
+    return shape, (*_pair(at[0]), thing.name, c)
+
+
+def _pair(at: Array) -> tuple[float, float]:
+    return float(at[0]), float(at[1])
+
+
+def _placed(labels: list[tuple[float, float, str, str]], p: Plane) -> list[str]:
+    """Labels beside their things, moved down or up until none covers another; those that fit nowhere are left out."""
+    out: list[str] = []
+    taken: list[tuple[float, float, float, float]] = []
+    for x, y, words, _ in labels[:60]:
+        wide = 6.2 * len(words) + 4
+        start = min(x + 7, p.width - wide - 4)
+        for shift in (-6, 12, -18, 24, -30, 36):
+            box = (start, y + shift - 10, start + wide, y + shift + 3)
+            if box[1] < 18 or box[3] > p.height - 4:
+                continue
+            if all(box[2] < t[0] or box[0] > t[2] or box[3] < t[1] or box[1] > t[3] for t in taken):
+                taken.append(box)
+                style = "fill:var(--ink);paint-order:stroke;stroke:var(--paper);stroke-width:3px"
+                out.append(text(start, y + shift, words, "", style))
+                break
+    return out
+
+
+def _axis_cross(p: Plane, to_drawing: Array) -> list[str]:
+    """Which way the world's axes run, bottom left; an axis that points at the reader is left out."""
+    out = []
+    origin = np.array([34.0, p.height - 30.0])
+    for axis, name in zip(np.eye(3), "xyz", strict=True):
+        flat = to_drawing @ axis
+        if np.linalg.norm(flat) < 0.1:
+            continue
+        tip = origin + 24 * flat * [1, -1]
+        out.append(f'<path d="{segments(origin[None], tip[None])}" stroke="var(--ink)" stroke-width="1.4"/>')
+        beyond = origin + 32 * flat * [1, -1]
+        out.append(text(float(beyond[0]), float(beyond[1]) + 4, name, "mid", "fill:var(--ink)"))
+    return out

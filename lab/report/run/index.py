@@ -1,0 +1,84 @@
+"""The index of a batch: one line per run, the worst first, each with a link to its report."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+from lab.files.text.yaml_text import write_whole
+from lab.number_format import short
+from lab.report.html import environment
+from lab.report.run.verdict import WORDS
+
+FILE_NAME = "index.html"
+_ORDER = {"error": 0, "fail": 1, "check": 2, "pass": 3}
+_FIRST = ("name", "run", "run_folder")  # any of these names a run
+_VERDICT = ("verdict", "status")
+_LINK = ("report", "results")
+
+
+def write_index(rows: list[dict[str, Any]], out: Path) -> Path:
+    """Write index.html into the batch's folder `out`; returns its path.
+
+    rows: those of batch.csv, a mapping per run. Known keys: `name`, `run` (its folder), `verdict` (or `status`): pass,
+    check, fail or error, `report` or `results` (a path relative to `out`; without it, the folder of the run's name).
+    Every other key is a column.
+    """
+    known = {*_FIRST, *_VERDICT, *_LINK}
+    heads = list(dict.fromkeys(key for row in rows for key in row if key not in known))
+    lines = [
+        {
+            "name": _first(row, _FIRST) or "unnamed",
+            "folder": _first(row, _FIRST[1:]),
+            "href": _href(row, out),
+            "status": (status := _status(row)),
+            "word": WORDS[status][0] if status in WORDS else status.upper(),
+            "rank": _ORDER.get(status, 0),
+            "cells": [_cell(row.get(head)) for head in heads],
+        }
+        for row in rows
+    ]
+    lines.sort(key=lambda line: (line["rank"], str(line["name"])))
+    counts = {word: sum(line["word"] == word for line in lines) for word in dict.fromkeys(x["word"] for x in lines)}
+    text = (
+        environment()
+        .get_template("index.html.j2")
+        .render(heads=[h.replace("_", " ") for h in heads], lines=lines, counts=counts)
+    )
+    path = out / FILE_NAME
+    write_whole(text, path)
+    return path
+
+
+def _first(row: dict[str, Any], keys: tuple[str, ...]) -> str:
+    return next((str(row[k]) for k in keys if row.get(k) not in (None, "")), "")
+
+
+def _status(row: dict[str, Any]) -> str:
+    return _first(row, _VERDICT).lower() or "error"
+
+
+def _href(row: dict[str, Any], out: Path) -> str:
+    """The report's address relative to the index, or nothing where there is no such file."""
+    place = _first(row, _LINK) or _first(row, _FIRST)
+    path = Path(place) if place.endswith(".html") else Path(place) / "report.html"
+    if path.is_absolute():
+        path = path.relative_to(out.resolve()) if path.is_relative_to(out.resolve()) else path
+    if not (out / path).is_file():
+        return ""
+    return path.as_uri() if path.is_absolute() else "./" + quote(path.as_posix())
+
+
+def _cell(value: Any) -> tuple[str, str]:
+    """What to show, and by what to sort."""
+    if value is None or value == "":
+        return "", ""
+    if isinstance(value, bool):
+        return ("yes" if value else "no"), str(int(value))
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        return str(value), str(value).lower()
+    whole = number.is_integer() and abs(number) < 1e9
+    return (str(int(number)) if whole else short(number, 4)), repr(number)

@@ -1,0 +1,152 @@
+"""Does the rig fit the recording? The report's part on it, from summary.json alone."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from html import escape
+from typing import Any
+
+import numpy as np
+
+from geometry.arrays import Array
+from lab.number_format import plus_minus, short
+from lab.report.plot.axes import dots, frame, image_plane, note, number, round_size, segments, svg_of
+from lab.report.plot.svg import BLUE, VERMILLION, text
+
+HEADS = (
+    "spot", "camera", "frames", "mean u (px)", "mean v (px)", "u, v in σ", "calibration allows (px)", "scatter",
+    "NIS/2 (95 %)", "outliers",
+)  # fmt: skip
+_LONGEST = 0.1  # of the picture's width: the longest arrow
+_SURE = 3.0  # sigmas: the circle that chance and the calibration explain
+_WORDS = {"PASS": "small", "WARN": "check", "FAIL": "fail"}
+
+
+@dataclass(frozen=True, slots=True)
+class FindingRow:
+    """One finding as the report shows it."""
+
+    level: str  # small, check or fail
+    what: str
+    why: str
+    cure: str
+
+
+@dataclass(frozen=True, slots=True)
+class ModelFit:
+    """What the section shows."""
+
+    sentence: str  # the answer
+    findings: tuple[FindingRow, ...]
+    rows: tuple[tuple[str, ...], ...]  # under HEADS: views, then cameras, then beams
+    drawings: tuple[str, ...]  # SVG, one per camera
+
+
+def model_fit(summary: Mapping[str, Any]) -> ModelFit | None:
+    """The section of a summary; None where it holds no model check."""
+    block = summary.get("model_check")
+    if not isinstance(block, Mapping):
+        return None
+    findings = tuple(
+        FindingRow(_WORDS.get(str(f.get("level")), "check"), *(str(f.get(k) or "") for k in ("what", "why", "cure")))
+        for f in _mappings(block.get("findings"))
+    )
+    rows = []
+    for kind, prefix in (("views", ""), ("cameras", "all of camera "), ("beams", "all of beam ")):
+        for g in _mappings(block.get(kind)):
+            name = str(g.get("name"))
+            camera, spot = name.rsplit("/", 1) if kind == "views" and "/" in name else ("", f"{prefix}{name}")
+            rows.append((spot, camera, *_numbers(g)))
+    sizes = block.get("image_sizes_px")
+    drawings = [
+        drawn
+        for camera, size in (sizes.items() if isinstance(sizes, Mapping) else ())
+        if (drawn := _drawing(str(camera), size, _mappings(block.get("views"))))
+    ]
+    return ModelFit(_sentence(block, findings), findings, tuple(rows), tuple(drawings))
+
+
+def _sentence(block: Mapping[str, Any], findings: tuple[FindingRow, ...]) -> str:
+    if not block.get("tested"):
+        return f"Not tested: {block.get('why_not') or 'no reason is given'}."
+    used = f"{block.get('frames_for_culprits')} frames, evenly chosen"
+    if not findings:
+        return f"Yes: no camera, screen, beam or clock is found off ({used})."
+    if all(f.level == "small" for f in findings):
+        return f"Nearly: what is off is lost in the stated uncertainty ({used})."
+    return f"No, or so it seems ({used}):"
+
+
+def _mappings(value: Any) -> list[Mapping[str, Any]]:
+    return [v for v in value if isinstance(v, Mapping)] if isinstance(value, list) else []
+
+
+def _float(value: Any) -> float:
+    return float(value) if isinstance(value, int | float) else float("nan")
+
+
+def _pair(group: Mapping[str, Any], name: str) -> Array:
+    """Two numbers of a group; nan where they are missing."""
+    value = group.get(name)
+    return np.array([_float(v) for v in value] if isinstance(value, list) and len(value) == 2 else [np.nan, np.nan])
+
+
+def _numbers(g: Mapping[str, Any]) -> tuple[str, ...]:
+    mean, sigma, sigmas = _pair(g, "mean_px"), _pair(g, "sigma_of_mean_px"), _pair(g, "mean_sigmas")
+    allowed = _pair(g, "calibration_px")
+    means = [plus_minus(m, s, signed=True) for m, s in zip(mean.tolist(), sigma.tolist(), strict=True)]
+    nis = g.get("nis")
+    told = "–"
+    if isinstance(nis, Mapping):
+        low, high = short(_float(nis.get("low"))), short(_float(nis.get("high")))
+        told = f"{short(_float(nis.get('mean')))} ({low} to {high})"
+    share = _float(g.get("outliers"))
+    return (
+        str(g.get("frames")),
+        *means,
+        ", ".join(f"{s:+.2f}".replace("-", "\u2212") for s in sigmas) if np.isfinite(sigmas).all() else "–",
+        f"{short(allowed[0], 2)}, {short(allowed[1], 2)}" if np.any(allowed > 0) else "–",
+        short(_float(g.get("scatter"))),
+        told,
+        "–" if not np.isfinite(share) else f"{100 * share:.2g} %",
+    )
+
+
+def _signed(value: float) -> str:
+    return "–" if not np.isfinite(value) else ("+" if value > 0 else "") + short(value, 2)
+
+
+def _drawing(camera: str, size: Any, views: list[Mapping[str, Any]]) -> str:
+    """Mean residuals as arrows over the picture, with circles of what chance and the calibration explain."""
+    own = [v for v in views if str(v.get("name")).rpartition("/")[0] == camera]
+    place = np.array([_pair(v, "place_px") for v in own]).reshape(-1, 2)
+    mean = np.array([_pair(v, "mean_px") for v in own]).reshape(-1, 2)
+    chance = np.array([np.hypot(_pair(v, "sigma_of_mean_px"), _pair(v, "calibration_px")) for v in own]).reshape(-1, 2)
+    known = np.isfinite(place).all(axis=1) & np.isfinite(mean).all(axis=1)
+    if not known.any() or not (isinstance(size, list) and len(size) == 2):
+        return ""
+    plane = image_plane((int(size[0]), int(size[1])))
+    longest = float(np.linalg.norm(mean[known], axis=1).max())
+    factor = round_size(_LONGEST * float(size[0]) / max(longest, 1e-6))
+    parts = [frame(plane), text(plane.box[0], 15, f"camera {camera}: mean residual of each spot", "title")]
+    scale = abs(plane.X.b - plane.X.a) / abs(plane.X.hi - plane.X.lo)
+    for v, at, r, s, good in zip(own, place, mean, chance, known, strict=True):
+        if not good:
+            continue
+        radius = _SURE * float(np.sqrt(np.mean(s**2)))
+        sure = bool(np.linalg.norm(r) > radius)
+        start, end = plane.at(at[None]), plane.at((at + factor * r)[None])
+        colour = VERMILLION if sure else BLUE
+        spot = str(v.get("name")).rpartition("/")[2]
+        words = escape(f"spot {spot}: {_signed(r[0])}, {_signed(r[1])} px")
+        parts.append(
+            f'<g><title>{words}</title><circle cx="{start[0, 0]:.1f}" cy="{start[0, 1]:.1f}"'
+            f' r="{min(radius * factor * scale, 2000.0):.1f}" fill="none" stroke="var(--soft)" stroke-dasharray="3 3"/>'
+            f'<path d="{segments(start, end)}" stroke="{colour}" stroke-width="2"/>'
+            f'<path d="{dots(start, 3)}" fill="{colour}"/>{text(start[0, 0] + 7, start[0, 1] - 7, spot, "label")}</g>'
+        )
+    parts.append(
+        note(plane, f"arrows {number(factor)} times as long as in the picture; longest {short(longest, 2)} px")
+    )
+    return svg_of(plane, f"mean residuals in camera {camera}", parts)

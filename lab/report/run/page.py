@@ -1,0 +1,133 @@
+"""The report of one run: a single HTML file that needs nothing else."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from markupsafe import Markup
+
+from lab.files.text.yaml_text import write_whole
+from lab.report.html import environment
+from lab.report.run import figures, pose_curves, tables, uncertainty
+from lab.report.run.model_fit import HEADS as MODEL_FIT_HEADS
+from lab.report.run.model_fit import model_fit
+from lab.report.run.pictures import Event, chosen, events, pictures
+from lab.report.run.report_data import Material, gather
+from lab.report.run.tracks import POSE_COLOURS, SPOT_COLOURS, timeline_figure, tracks_figure
+from lab.report.run.verdict import verdict_of
+from tracking.statuses import PoseStatus, SpotStatus
+
+FILE_NAME = "report.html"
+_MOST_EVENTS = 200
+
+
+def write_report(results: Path, run_folder: Path | None = None) -> Path:
+    """Write report.html into a results folder, from its tables alone; returns its path.
+
+    Where the run folder can be reached (the one given, or the one that summary.json names), pictures, residuals and
+    errors against truth are added. Raises InputError if the tables cannot be read.
+    """
+    material = gather(results, run_folder)
+    path = results / FILE_NAME
+    write_whole(page(material, results), path)
+    return path
+
+
+def page(m: Material, results: Path) -> str:
+    """The HTML text of a report."""
+    found = events(m)
+    listed = _event_rows(m, found)
+    heads, rows = tables.spot_rows(m)
+    fit = model_fit(m.summary)
+    context: dict[str, Any] = {
+        "name": m.name,
+        "verdict": verdict_of(m.summary),
+        "keys": tables.key_figures(m),
+        "truth_keys": tables.truth_figures(m.errors),
+        "pixel_rows": tables.pixel_rows(m.errors),
+        "run_line": _run_line(m),
+        "pose_figure": Markup(pose_curves.pose_figure(m)),
+        "motion_figure": Markup(pose_curves.motion_figure(m)),
+        "smoothed": m.causal is not None,
+        "method": tables.at(m.summary, "parameters", "tracker", "method") or "spots",
+        "budget_heads": uncertainty.HEADS,
+        "budget_rows": uncertainty.budget_rows(m),
+        "budget_words": uncertainty.words(m),
+        "tracks": [Markup(t) for c in m.spots.cameras if (t := tracks_figure(m, c))],
+        "timeline": Markup(timeline_figure(m)) if len(m.spots.frames) and m.spots.views else "",
+        "spot_legend": [(str(s), SPOT_COLOURS[s], s.meaning) for s in SpotStatus],
+        "pose_legend": [(str(s), POSE_COLOURS[s], s.meaning) for s in PoseStatus],
+        "truth_grid": Markup(figures.error_grid(m, columns)) if (columns := figures.truth_columns(m)) else "",
+        "nees_figure": Markup(figures.nees_figure(m)),
+        "rms_figure": Markup(figures.rms_figure(m)),
+        "residual_grid": Markup(figures.error_grid(m, figures.residual_columns(m))),
+        "residual_known": m.residual_px is not None,
+        "model_fit": fit,
+        "model_fit_heads": MODEL_FIT_HEADS,
+        "model_fit_drawings": [] if fit is None else [Markup(d) for d in fit.drawings],
+        "error_rows": tables.error_rows(m.errors),
+        "has_truth": m.errors is not None,
+        "spot_heads": heads,
+        "spot_rows": rows,
+        "pictures": [Markup(p) for p in pictures(m, results, chosen(m, found))],
+        "events": listed[:_MOST_EVENTS],
+        "label_words": tables.label_words(m),
+        "more_events": max(len(listed) - _MOST_EVENTS, 0),
+        "no_image": tables.no_image_ranges(m),
+        "notes": [str(n) for n in _listed(m.summary.get("notes"))],
+        "run_notes": "" if m.run is None else m.run.notes,
+        "missing": _missing(m),
+        "parameters": tables.flattened(m.summary.get("parameters") or {}),
+        "smoother": tables.flattened(m.summary.get("smoother") or {}),
+        "timings": tables.flattened(m.summary.get("timings") or {}),
+        "rates": tables.flattened(m.summary.get("rates") or {}),
+        "versions": tables.flattened(m.summary.get("versions") or {}),
+        "inputs": [i for i in _listed(m.summary.get("inputs")) if isinstance(i, dict)],
+    }
+    return environment().get_template("report.html.j2").render(context)
+
+
+def _listed(value: Any) -> list[Any]:
+    if value is None:
+        return []
+    return value if isinstance(value, list) else [value]
+
+
+def _run_line(m: Material) -> str:
+    parts = []
+    if len(m.spots.frames):
+        parts.append(f"frames {m.spots.frames[0]} to {m.spots.frames[-1]}")
+    if m.run is not None:
+        parts.append(f"{m.run.frame_rate_hz:g} Hz")
+    cameras = m.spots.cameras
+    parts.append(f"{len(cameras)} camera{'s' if len(cameras) != 1 else ''} ({', '.join(cameras)})" if cameras else "")
+    parts.append(f"{len(dict.fromkeys(s for _, s in m.spots.views))} spots")
+    method = tables.at(m.summary, "parameters", "tracker", "method") or tables.at(m.summary, "parameters", "method")
+    if method:
+        parts.append(f"tracker: {method}")
+    return " · ".join(p for p in parts if p)
+
+
+def _event_rows(m: Material, found: list[Event]) -> list[tuple[str, str, str, str]]:
+    """Frame, time, camera and what happened. Hidden spots are in the status figure; they would bury the rest here."""
+    clock = m.time_name != "frame"
+    return [
+        (str(m.spots.frames[e.index]), f"{m.t_s[e.index]:.3f}" if clock else "", e.camera, e.text)
+        for e in found
+        if e.kind != "hidden"
+    ]
+
+
+def _missing(m: Material) -> list[str]:
+    """What this report could not show, and why."""
+    out = []
+    if not m.summary:
+        out.append("summary.json is missing: no verdict, parameters, versions or fingerprints.")
+    if m.run_folder is None:
+        out.append("The run folder could not be reached: no pictures, no residuals per spot, no errors against truth.")
+    elif m.run is None:
+        out.append("The run folder's run.yaml or its rig cannot be read: no pictures and no residuals per spot.")
+    if m.run_folder is not None and m.errors is None:
+        out.append("The run has no truth: no errors against it.")
+    return out

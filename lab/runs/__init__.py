@@ -1,0 +1,1 @@
+"""`beampose run`, `batch` and `check`: run folders in, result folders out."""

@@ -1,0 +1,1 @@
+"""Frames of a run: read, searched for spots, tracked."""

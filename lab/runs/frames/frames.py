@@ -1,0 +1,309 @@
+"""The pictures of a run by frame number, all cameras together, read ahead of the one who works on them."""
+
+from __future__ import annotations
+
+import os
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from geometry.arrays import Bools, Ints
+from lab.errors import InputError
+from lab.files.run.detections_file import CameraPoints, DetectionsFile, far_off, read_detections, too_sparse
+from lab.files.run.run_file import DetectionsTable, FramesFolder, LiveDevice, Run, VideoFile
+from lab.files.text.yaml_text import did_you_mean
+from lab.pictures.picture_file import DROPPED, Grey, Missing
+from lab.runs.frames.frame_sources import (
+    Asked,
+    FolderListing,
+    FolderSource,
+    Picture,
+    Source,
+    TableSource,
+    VideoSource,
+    arrived,
+    list_folder,
+    promised_pictures,
+)
+
+__all__ = ["FrameReader", "FrameSet", "Grey", "Missing", "Picture", "open_frames", "pictures_at"]
+
+AHEAD = 8  # frames read before they are asked for: 21 MB of two 1280x1024 cameras, whatever the run's length
+THREADS = min(4, os.cpu_count() or 1)  # pictures decoded at once
+BEYOND_PX = 32.0  # a fit may put the centre of a spot that the edge cuts outside the picture, but not so far
+NAMED = 5  # so many frames of each trouble are named in the notes
+
+
+@dataclass(frozen=True, slots=True)
+class FrameSet:
+    """What all cameras have for one frame number."""
+
+    frame: int
+    images: Mapping[str, Picture]  # by camera: grey (h, w) u8 or u16, the points found already, or Missing
+
+
+class FrameReader:
+    """Iterates over all frame numbers from the first to the last of any camera. May be iterated again.
+
+    Pictures are read and decoded in threads; at most `AHEAD` frames are in flight.
+    """
+
+    def __init__(self, run: Run) -> None:
+        self._run = run
+        self._listings: dict[str, FolderListing] = {}
+        self._tables: dict[str, DetectionsFile] = {}
+        self._notes: list[str] = []
+        self._trouble: dict[str, dict[str, tuple[int, list[int]]]] = {}  # camera, reason: count, first frames
+        self._ended: dict[str, str] = {}
+        self._promised: dict[str, int | None] = {}
+        opened: dict[Path, DetectionsFile] = {}
+        for name, source in run.cameras.items():
+            if isinstance(source, FramesFolder):
+                self._listings[name] = list_folder(source.path)
+            elif isinstance(source, VideoFile):
+                self._promised[name] = promised_pictures(source.path)
+            elif isinstance(source, LiveDevice):
+                raise InputError(
+                    f"{run.path}: cameras.{name}.device: expected recorded frames or detections, got a live camera; use"
+                    " `beampose watch`"
+                )
+            else:
+                if source.path not in opened:
+                    opened[source.path] = read_detections(source.path)
+                    self._note_table(source.path, opened[source.path])
+                self._note_camera(name, source.path, opened[source.path])
+        self.first, self.last = self._span()
+        self._check_density()
+        self._check_times()
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Their names, in the rig's order."""
+        return tuple(self._run.cameras)
+
+    @property
+    def listings(self) -> Mapping[str, FolderListing]:
+        """The folders' pictures, by camera."""
+        return self._listings
+
+    @property
+    def expected_frames(self) -> int | None:
+        """How many frame numbers there will be; of videos what their headers promise. None where nothing tells."""
+        promised = list(self._promised.values())
+        if None in promised:
+            return None
+        ends = [n - 1 for n in promised if n is not None] + ([] if self.last is None else [self.last])
+        return max(ends) - self.first + 1
+
+    @property
+    def notes(self) -> list[str]:
+        """What a reader of the results should know, in plain words; complete once the iteration has ended."""
+        out = list(self._notes) + list(self._ended.values())
+        for camera, reasons in self._trouble.items():
+            for reason, (count, frames) in reasons.items():
+                some = ", ".join(map(str, frames)) + (", ..." if count > len(frames) else "")
+                out.append(f"{camera}: {count} frame{'s' if count > 1 else ''} {reason} ({some})")
+        return out
+
+    def __iter__(self) -> Iterator[FrameSet]:
+        self._trouble, self._ended = {c: {} for c in self._run.cameras}, {}
+        with ExitStack() as stack:
+            pool = ThreadPoolExecutor(THREADS, thread_name_prefix="decode")
+            stack.callback(pool.shutdown, cancel_futures=True)
+            sources = {}
+            for name in self._run.cameras:
+                sources[name] = self._open(name)
+                stack.callback(sources[name].close)
+            in_flight: deque[tuple[int, dict[str, Asked]]] = deque()
+            asked = self.first
+            while True:
+                while len(in_flight) < AHEAD and (self._promised or self.last is None or asked <= self.last):
+                    in_flight.append((asked, {name: s.ask(asked, pool) for name, s in sources.items()}))
+                    asked += 1
+                if not in_flight:
+                    return
+                frame, waiting = in_flight.popleft()
+                got = {name: arrived(w) for name, w in waiting.items()}
+                ended = [name for name, picture in got.items() if picture is None]
+                self._note_ends(ended, frame)
+                if len(ended) == len(self._promised) and (self.last is None or frame > self.last):
+                    return
+                images = {name: Missing(DROPPED) if picture is None else picture for name, picture in got.items()}
+                self._count(frame, images)
+                yield FrameSet(frame, images)
+
+    def _open(self, name: str) -> Source:
+        size_px = self._run.rig.cameras[name].image_size_px
+        source = self._run.cameras[name]
+        if isinstance(source, FramesFolder):
+            return FolderSource(self._listings[name], size_px)
+        if isinstance(source, VideoFile):
+            return VideoSource(source.path, size_px)
+        table = self._tables[name]
+        return TableSource(table.cameras.get(name), table.first, table.last)
+
+    def _span(self) -> tuple[int, int | None]:
+        """First and last frame number; the last as far as it is known without reading videos to their end."""
+        firsts = [int(v.numbers[0]) for v in self._listings.values()] + [t.first for t in self._tables.values()]
+        lasts = [int(v.numbers[-1]) for v in self._listings.values()] + [t.last for t in self._tables.values()]
+        if self._promised:
+            firsts.append(0)
+        return min(firsts), max(lasts) if lasts else None
+
+    def _check_density(self) -> None:
+        if self.last is None:
+            return
+        pictures = sum(len(v.names) for v in self._listings.values())
+        pictures += sum(len(c.frames) for t in self._tables.values() for c in t.cameras.values())
+        if too_sparse(self.last - self.first + 1, pictures):
+            stray = "file" if self._listings else "row"
+            holders = "names" if self._listings else "frame numbers"
+            raise InputError(
+                f"{self._run.path}: cameras: expected frame numbers without gaps of many thousands, got {pictures}"
+                f" pictures between frame {self.first} and frame {self.last}; is a stray {stray} among them, or do the"
+                f" {holders} hold a time?"
+            )
+        self._check_strays()
+
+    def _check_strays(self) -> None:
+        """Raises InputError for a few pictures far from all others. (Of tables such rows are left out.)"""
+        everything: list[Ints] = [v.numbers for v in self._listings.values()]
+        everything += [c.frames for t in self._tables.values() for c in t.cameras.values()]
+        numbers = np.unique(np.concatenate(everything)) if everything else np.empty(0, np.int64)
+        strays = far_off(numbers)
+        for listing in self._listings.values():
+            for number in numbers[strays].tolist():
+                if number in listing.names:
+                    others = numbers[~strays]
+                    raise InputError(
+                        f"{listing.folder / listing.names[number]}: expected frame numbers without a long gap, got"
+                        f" {number}, where the others are {others[0]} to {others[-1]}; is it a stray file? Take it away"
+                    )
+
+    def _check_times(self) -> None:
+        with_picture: list[Ints] = [v.numbers for v in self._listings.values()]
+        with_picture += [c.frames for t in self._tables.values() for c in t.cameras.values()]
+        if not with_picture:
+            return
+        untimed = self._run.times.without_time(np.unique(np.concatenate(with_picture)))
+        if untimed.size:
+            raise InputError(
+                f"{self._run.path}: timestamps: expected a time for every frame with a picture, got none for"
+                f" {untimed.size} of them (the first is frame {untimed[0]})"
+            )
+
+    def _note_table(self, path: Path, table: DetectionsFile) -> None:
+        self._notes.extend(table.notes)
+        unknown = self._unknown(table)
+        if unknown:
+            self._notes.append(f"{path}: rows of cameras that the rig does not have are not used: {', '.join(unknown)}")
+
+    def _unknown(self, table: DetectionsFile) -> list[str]:
+        """Cameras of a table that the rig does not have."""
+        known = (*self._run.rig.cameras, *self._run.left_out)
+        return [c for c in (*table.cameras, *table.spoilt) if c not in known]
+
+    def _note_camera(self, name: str, path: Path, table: DetectionsFile) -> None:
+        points = table.cameras.get(name)
+        if points is not None:
+            points = self._in_picture(name, path, points)
+            self._tables[name] = replace(table, cameras={**table.cameras, name: points})
+            return
+        if name in table.spoilt:
+            raise InputError(
+                f"{path}: camera {name!r}: expected rows that can be used, got none: {table.spoilt[name]}; put them"
+                f" right, or leave {name!r} out of `cameras` in {self._run.path}"
+            )
+        unknown = self._unknown(table)
+        if unknown:
+            raise InputError(
+                f"{path}: camera: expected rows of {name!r}, got none, but rows of {', '.join(map(repr, unknown))},"
+                f" which the rig does not have{did_you_mean(unknown[0], self._run.rig.cameras)}"
+            )
+        self._tables[name] = table
+        self._notes.append(f"{path}: no rows of camera {name!r}; it is taken to have found nothing")
+
+    def _in_picture(self, name: str, path: Path, points: CameraPoints) -> CameraPoints:
+        """A camera's points without those far outside its picture. Raises InputError where that is most of them."""
+        size = np.array(self._run.rig.cameras[name].image_size_px)
+        uv = points.points.uv_px
+        outside: Bools = np.any((uv < -0.5 - BEYOND_PX) | (uv > size - 0.5 + BEYOND_PX), axis=-1)
+        count = np.diff(points.starts)
+        fullest = int(np.argmax(count))
+        if count[fullest] > self._run.tracker.detect.max_detections:
+            self._notes.append(
+                f"{path}: camera {name!r}: up to {count[fullest]} points in one picture (frame"
+                f" {points.frames[fullest]}); few spots are sure to be told from so many, and it takes longer"
+            )
+        if not outside.any():
+            return points
+        row = int(np.flatnonzero(outside)[0])
+        frame = int(points.frames[np.searchsorted(points.starts, row, side="right") - 1])
+        told = (
+            f"{outside.sum()} of {len(uv)} points more than {BEYOND_PX:g} px outside its picture of"
+            f" {size[0]}x{size[1]} px (the first in frame {frame}, at {uv[row, 0]:.7g}, {uv[row, 1]:.7g})"
+        )
+        if outside.mean() > 0.5:
+            raise InputError(
+                f"{path}: camera {name!r}: expected points in the picture, got {told}; are u and v exchanged, or the"
+                " pictures of another size than the rig says?"
+            )
+        self._notes.append(f"{path}: camera {name!r}: left out: {told}")
+        return points.without(outside)
+
+    def _note_ends(self, ended: Sequence[str], frame: int) -> None:
+        for name in ended:
+            promised = self._promised[name]
+            if name not in self._ended and promised is not None and frame < promised:
+                source = self._run.cameras[name]
+                self._ended[name] = f"{source.path}: ended after {frame} pictures; its header says {promised}"
+
+    def _count(self, frame: int, images: Mapping[str, Picture]) -> None:
+        for camera, picture in images.items():
+            if isinstance(picture, Missing):
+                count, frames = self._trouble[camera].get(picture.reason, (0, []))
+                self._trouble[camera][picture.reason] = (count + 1, [*frames, frame][:NAMED])
+
+
+def open_frames(run: Run) -> FrameReader:
+    """The reader of a run's pictures.
+
+    Raises InputError where there is nothing to read: an empty folder, two pictures of one number, a video or table that
+    cannot be read, a frame without a timestamp. Damaged single pictures are no error: they come as Missing.
+    """
+    return FrameReader(run)
+
+
+def pictures_at(run: Run, camera: str, frames: Sequence[int]) -> dict[int, Picture]:
+    """Some pictures of one camera, for looking at; a video is read from its start, so ask once for all."""
+    wanted = sorted(set(frames))
+    source, size_px = run.cameras[camera], run.rig.cameras[camera].image_size_px
+    out: dict[int, Picture] = {}
+    with ExitStack() as stack:
+        if isinstance(source, VideoFile):
+            video = VideoSource(source.path, size_px)
+            stack.callback(video.close)
+            at = 0
+            for frame in wanted:
+                while at < frame and video.skip():
+                    at += 1
+                shown = video.next_picture() if at == frame else None
+                at += 1
+                out[frame] = Missing(DROPPED) if shown is None else shown
+        elif isinstance(source, DetectionsTable):
+            out = dict.fromkeys(wanted, Missing("no pictures: points found already"))
+        elif isinstance(source, LiveDevice):
+            out = dict.fromkeys(wanted, Missing("no pictures: a live camera"))
+        else:
+            folder = FolderSource(list_folder(source.path), size_px)
+            pool = stack.enter_context(ThreadPoolExecutor(THREADS))
+            asked = {frame: folder.ask(frame, pool) for frame in wanted}
+            for frame, later in asked.items():
+                picture = arrived(later)
+                out[frame] = Missing(DROPPED) if picture is None else picture
+    return out

@@ -1,0 +1,170 @@
+"""From a run to records, one per frame: pictures in, detection, tracking, pose. A generator: nothing piles up."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Protocol
+
+import numpy as np
+
+from geometry.light_centroid import CentreOffsets
+from lab.files.run.run_file import Run
+from lab.pictures.picture_file import Grey, Missing
+from lab.runs.frames.frames import FrameSet, open_frames
+from lab.runs.frames.sensor_noise import CameraNoise, camera_noises
+from tracking.curve_switching.spot_tracker import SpotTracker
+from tracking.detections import Detections
+from tracking.labelling.first_labels import PosePrior
+from tracking.noise import NoiseModel
+from tracking.rigid_body.rigid_tracker import RigidTracker
+from tracking.tracked_frame import TrackedFrame
+
+
+class Tracker(Protocol):
+    """What is fed the detections of one frame after the other, whatever its method."""
+
+    @property
+    def noise_scale(self) -> float:
+        """How much larger than claimed the spots' errors are."""
+
+    def step(self, dt_s: float, found: Sequence[Detections | None]) -> TrackedFrame:
+        """One frame. dt_s: time since the frame before (0 for the first); found: per camera, None without a picture."""
+
+
+class Frames(Protocol):
+    """Where the pictures of all cameras come from, frame by frame: recorded (lab.runs.frames.frames) or live
+    (lab.watch).
+    """
+
+    @property
+    def notes(self) -> list[str]:
+        """What a reader of the results should know, in plain words; complete once the iteration has ended."""
+
+    @property
+    def expected_frames(self) -> int | None:
+        """How many frames there will be; None where nothing tells."""
+
+    def __iter__(self) -> Iterator[FrameSet]: ...
+
+
+@dataclass(frozen=True, slots=True)
+class FrameRecord:
+    """All that is known of one frame."""
+
+    frame: int
+    t_s: float
+    dt_s: float  # since the record before; 0 for the first
+    detections: tuple[Detections | None, ...]  # per camera of the run; None without a usable picture
+    missing: tuple[str, ...]  # per camera: why there is no picture; "" where there is one
+    tracked: TrackedFrame
+
+
+def tracker_of(run: Run) -> Tracker:
+    """The tracker of the run's method, at its start; without a prior the vehicle may be wherever its spots are seen."""
+    prior = PosePrior.everywhere(run.rig) if run.prior is None else run.prior
+    if run.tracker.method == "spots":
+        return SpotTracker(run.rig, run.tracker, prior, run.covariance)
+    return RigidTracker(run.rig, run.tracker, prior, run.covariance)
+
+
+@dataclass(slots=True)
+class Timings:
+    """Seconds spent, wall clock of the thread that works."""
+
+    waiting: float = 0.0  # for pictures
+    detection: float = 0.0
+    tracking: float = 0.0
+    smoothing: float = 0.0
+
+
+@dataclass(slots=True)
+class Pipeline:
+    """One run in work. Iterate over `records()` once; `notes`, `noise` and `timings` are complete afterwards."""
+
+    run: Run
+    reader: Frames
+    tracker: Tracker
+    noise: dict[str, CameraNoise]  # of cameras with pictures
+    on_record: Callable[[FrameRecord], None] | None = None  # called with each record as soon as it is known
+    timings: Timings = field(default_factory=Timings)
+    _offsets: dict[str, CentreOffsets] = field(default_factory=dict)
+
+    @staticmethod
+    def of(run: Run) -> Pipeline:
+        """Open a run. Raises InputError where its pictures cannot be found."""
+        reader = open_frames(run)
+        return Pipeline(run, reader, tracker_of(run), camera_noises(run, reader))
+
+    @property
+    def notes(self) -> list[str]:
+        """What a reader of the results should know of the pictures; complete once the iteration has ended."""
+        return self.reader.notes + [note for noise in self.noise.values() for note in noise.notes]
+
+    def records(self) -> Iterator[FrameRecord]:
+        """One record per frame number, from the first to the last."""
+        before: float | None = None
+        clock = time.perf_counter()
+        for frames in self.reader:
+            clock = self._spent("waiting", clock)
+            t_s = float(self.run.times.t_s(frames.frame))
+            found, missing = self._detect(frames)
+            clock = self._spent("detection", clock)
+            dt_s = 0.0 if before is None else t_s - before
+            tracked = self.tracker.step(dt_s, found)
+            before = t_s
+            self._spent("tracking", clock)
+            record = FrameRecord(frames.frame, t_s, dt_s, found, missing, tracked)
+            if self.on_record is not None:
+                self.on_record(record)
+            yield record
+            clock = time.perf_counter()
+
+    def detections(self) -> Iterator[tuple[int, tuple[Detections | None, ...]]]:
+        """Frame numbers and the points found in each, without tracking them. Instead of `records`, not beside it."""
+        for frames in self.reader:
+            yield frames.frame, self._detect(frames)[0]
+
+    def spots_in(self, camera: str, picture: Grey) -> Detections:
+        """The points that one picture of a camera shows. For one thread at a time and camera."""
+        noise = self.noise[camera]
+        points = noise.detect(picture, self.run.tracker.detect)
+        return on_beam_axes(points, self._offsets_of(camera), noise.model)
+
+    def _offsets_of(self, camera: str) -> CentreOffsets:
+        if camera not in self._offsets:
+            seen_by = self.run.rig.cameras[camera]
+            self._offsets[camera] = CentreOffsets(seen_by, self.run.rig.screens[seen_by.screen])
+        return self._offsets[camera]
+
+    def _spent(self, on: str, since: float) -> float:
+        now = time.perf_counter()
+        setattr(self.timings, on, getattr(self.timings, on) + now - since)
+        return now
+
+    def _detect(self, frames: FrameSet) -> tuple[tuple[Detections | None, ...], tuple[str, ...]]:
+        found: list[Detections | None] = []
+        missing: list[str] = []
+        for name in self.run.rig.cameras:
+            picture = frames.images[name]
+            if isinstance(picture, Missing):
+                found.append(None)
+                missing.append(picture.reason)
+                continue
+            if isinstance(picture, np.ndarray):
+                picture = self.spots_in(name, picture)
+            found.append(picture)
+            missing.append("")
+        return tuple(found), tuple(missing)
+
+
+def on_beam_axes(found: Detections, offsets: CentreOffsets, noise: NoiseModel | None) -> Detections:
+    """Detections (n) with their centres moved from the light's centre to the image of the beam's axis."""
+    if not len(found) or noise is None:
+        return found
+    c, s = np.cos(np.radians(found.angle_deg)), np.sin(np.radians(found.angle_deg))
+    major2, minor2 = found.major_px**2, found.minor_px**2
+    shape = np.stack([major2 * c**2 + minor2 * s**2, (major2 - minor2) * c * s, major2 * s**2 + minor2 * c**2], axis=-1)
+    brightness = noise.slope_dn * found.peak / noise.floor_dn2
+    return replace(found, uv_px=found.uv_px - offsets.at(found.uv_px, shape, brightness))

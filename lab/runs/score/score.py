@@ -1,0 +1,326 @@
+"""How far a run's results are from the truth, where the run folder has one (a simulation, or a turntable's record)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from geometry.arrays import Array, Bools, Ints
+from geometry.chi_square import gamma_quantile
+from geometry.pose import Pose
+from lab.files.run.results import (
+    ABSENT,
+    POSE_STATUSES,
+    SPOT_STATUSES,
+    PoseTrack,
+    SpotGrid,
+    has_causal,
+    on_grid,
+    pose_stack,
+    read_poses,
+    read_spots,
+    read_table,
+)
+from lab.runs.score.motion_score import motion_scores
+from tracking.statuses import PoseStatus, SpotStatus
+
+# How far from its true place a spot may be measured and still be that spot: several times the noise of a poor
+# centroid, and a fraction of the distance at which clutter or another spot usually lies.
+SAME_SPOT_PX = 3.0
+SAME_SPOT_SIGMAS = 5.0
+# A spot that returns must be found again within so many frames with a picture.
+RETURN_FRAMES = 5
+# Where the true path departs by more than this from a straight, even continuation of its last two places, it bends
+# there: no constant-velocity prediction can follow. About five times the prediction error on a smooth path.
+BEND_PX = 2.0
+HIDDEN, IN_VIEW, OUTSIDE = 2, 1, 0
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """The truth on the results' own grid: F frames, V views. Either half may be missing (None)."""
+
+    uv_px: Array | None  # (F, V, 2), nan where no projection exists or the truth is silent
+    in_view: Ints | None  # (F, V): 1 in the picture, 2 hidden, 0 outside it; -1 where the truth is silent
+    world_from_body: Pose | None  # (F',), on the pose table's frames; nan translation where the truth is silent
+
+
+def read_truth(run_folder: Path, spots: SpotGrid, poses: PoseTrack) -> Truth | None:
+    """The truth of a run folder at the frames and views of its results; None where it has none."""
+    spots_file, pose_file = run_folder / "truth" / "spots.csv", run_folder / "truth" / "pose.csv"
+    uv = in_view = world_from_body = None
+    if spots_file.exists():
+        table = read_table(spots_file, ("frame", "u_px", "v_px", "in_view"), ("camera", "spot"))
+        frame, camera, spot = table.numbers["frame"], table.texts["camera"], table.texts["spot"]
+        rows, i, j = on_grid(frame, camera, spot, spots.views, spots.frames)
+        uv = np.full(spots.uv_px.shape, np.nan)
+        in_view = np.full(spots.status.shape, -1, dtype=np.int64)
+        uv[i, j] = table.stack("u_px", "v_px")[rows]
+        in_view[i, j] = table.numbers["in_view"][rows].astype(np.int64)
+    if pose_file.exists():
+        table = read_table(pose_file, ("frame", "x_m", "y_m", "z_m", "qw", "qx", "qy", "qz"))
+        at = np.searchsorted(poses.frames, table.numbers["frame"])
+        here = at < len(poses.frames)
+        here[here] = poses.frames[at[here]] == table.numbers["frame"][here]
+        numbers = np.full((len(poses.frames), 7), np.nan)
+        numbers[at[here]] = table.stack("x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")[here]
+        world_from_body = pose_stack(numbers[:, :3], numbers[:, 3:])
+    if in_view is None and world_from_body is None:
+        return None
+    return Truth(uv, in_view, world_from_body)
+
+
+def score(results: Path, run_folder: Path) -> dict[str, Any] | None:
+    """Errors of a results folder against its run's truth, as plain JSON values; None where the run has no truth.
+
+    Pixels, metres and degrees as the names say; None where there is nothing to count.
+    """
+    if not (run_folder / "truth").is_dir():
+        return None
+    spots, poses = read_spots(results), read_poses(results)
+    truth = read_truth(run_folder, spots, poses)
+    causal = read_poses(results, causal=True) if has_causal(results) else None
+    return None if truth is None else score_against(spots, poses, truth, causal)
+
+
+def score_against(spots: SpotGrid, poses: PoseTrack, truth: Truth, causal: PoseTrack | None = None) -> dict[str, Any]:
+    """The same, from tables that are already read.
+
+    causal: poses as they were known at each instant, where `poses` are smoothed; of the same frames.
+    """
+    blocks = ("spots", "pose", "pose_causal", "motion_vs_differences", "motion_causal_vs_differences")
+    out: dict[str, Any] = dict.fromkeys(blocks)
+    if truth.uv_px is not None and truth.in_view is not None:
+        out["spots"] = _spot_scores(spots, truth.uv_px, truth.in_view)
+    if truth.world_from_body is not None:
+        true = truth.world_from_body
+        out["pose"], out["motion_vs_differences"] = _pose_scores(poses, true), motion_scores(poses, true)
+        if causal is not None and np.array_equal(causal.frames, poses.frames):
+            out["pose_causal"] = _pose_scores(causal, true)
+            out["motion_causal_vs_differences"] = motion_scores(causal, true)
+    return out
+
+
+def right_spot(spots: SpotGrid, true_uv: Array) -> Bools:
+    """(F, V): the position is that of the true spot of its name.
+
+    It lies within SAME_SPOT_PX, or SAME_SPOT_SIGMAS of its own sigma if that is more, and no other true spot of the
+    camera is nearer by more than SAME_SPOT_SIGMAS. (Where two spots cross closer than the noise, nobody can tell.)
+    """
+    sigma = np.nan_to_num(np.hypot(spots.sigma_px[..., 0], spots.sigma_px[..., 1]) / np.sqrt(2))
+    own = np.linalg.norm(spots.uv_px - true_uv, axis=-1)
+    near = own <= np.maximum(SAME_SPOT_PX, SAME_SPOT_SIGMAS * sigma)  # nan is not near
+    camera_of = np.array([spots.cameras.index(c) for c, _ in spots.views], dtype=np.int64)
+    for j in range(len(spots.views)):
+        others = np.flatnonzero((camera_of == camera_of[j]) & (np.arange(len(camera_of)) != j))
+        if len(others):
+            gaps = np.linalg.norm(spots.uv_px[:, j, None] - true_uv[:, others], axis=-1)
+            nearest = np.min(np.where(np.isnan(gaps), np.inf, gaps), axis=1)
+            near[:, j] &= ~(own[:, j] - nearest > SAME_SPOT_SIGMAS * sigma[:, j])
+    return near
+
+
+def _spot_scores(spots: SpotGrid, true_uv: Array, in_view: Ints) -> dict[str, Any]:
+    measured, right = spots.measured, right_spot(spots, true_uv)
+    told = in_view >= 0
+    # A frame without a picture shows nothing to anybody: it counts neither for nor against.
+    pictured = told & ~spots.has(SpotStatus.NO_IMAGE)
+    visible = pictured & (in_view == IN_VIEW)
+    found = measured & right & visible
+    wrong = measured & ~right & told
+    error = spots.uv_px - true_uv
+    early = spots.predicted_px - true_uv
+    bent = _bends(spots.frames, true_uv)
+    starting = _starting(spots)
+    close = np.linalg.norm(error, axis=-1) <= SAME_SPOT_PX
+
+    per_spot = []
+    for j, (camera, spot) in enumerate(spots.views):
+        seen = visible[:, j]
+        per_spot.append(
+            {
+                "camera": camera,
+                "spot": spot,
+                "in_view_frames": int(seen.sum()),
+                "identity": _share(found[:, j], seen),
+                "wrong_labels": int(wrong[:, j].sum()),
+                "measured_error_px": _spread(error[:, j][found[:, j]]),
+                "prediction_error_px": _spread(early[:, j][seen & measured[:, j]]),
+                "out_of_view_error_px": _spread(
+                    error[:, j][spots.has(SpotStatus.OUT_OF_VIEW)[:, j] & (in_view[:, j] == OUTSIDE)]
+                ),
+            }
+        )
+    outside_said = spots.has(SpotStatus.OUT_OF_VIEW) & told
+    return {
+        "frames": int(told.any(axis=1).sum()),
+        "in_view_identity": _share(found, visible),
+        "in_view_rows": int(visible.sum()),
+        "wrong_labels": int(wrong.sum()),
+        "wrong_label_share": _share(wrong, measured & told),
+        # `straight` leaves out the rows that step 2 found, as the paper does; `smooth` goes by the true path instead,
+        # whatever the tracker called it. Both leave out a track's first frames, in which nothing can know its speed;
+        # `all_measured` leaves out nothing.
+        "prediction_px": {
+            "smooth": _spread(early[visible & measured & ~bent & ~starting]),
+            "straight": _spread(early[visible & spots.has(SpotStatus.MATCHED) & ~starting]),
+            "turned": _spread(early[visible & spots.has(SpotStatus.TURNED)]),
+            "bends": _spread(early[visible & bent]),
+            "start": _spread(early[visible & starting]),
+            "all_measured": _spread(early[visible & measured]),
+        },
+        "measured_px": _spread(error[found]),
+        "out_of_view_px": _spread(error[outside_said & (in_view == OUTSIDE)]),
+        "out_of_view_but_visible_rows": int((outside_said & (in_view == IN_VIEW)).sum()),
+        "occluded_px": _spread(error[spots.has(SpotStatus.OCCLUDED) & np.isin(in_view, (IN_VIEW, HIDDEN))]),
+        "visible_but_not_found_rows": int((visible & ~measured).sum()),
+        "hidden_but_measured_rows": int((measured & pictured & (in_view == HIDDEN)).sum()),
+        "re_entries": _returns(in_view, OUTSIDE, measured, right, pictured),
+        "after_hiding": _returns(in_view, HIDDEN, measured, right, pictured),
+        "recognition_rate_eq15": {
+            # Huo (2015), eq. (15), S_correct / S_total. Its 65.97 % is about 4/6: as if every place solved outside
+            # the picture counted as wrong. So: right detections over all rows; over those in view; and over all
+            # rows, a place within SAME_SPOT_PX being right whether it was seen or solved.
+            "paper": _share(measured & right & told, told),
+            "in_view": _share(found, visible),
+            "all_within_tolerance": _share(close & told, told & np.isfinite(true_uv).all(axis=-1)),
+        },
+        "status_share": {str(s): _share(spots.status == i, spots.status >= 0) for i, s in enumerate(SPOT_STATUSES)},
+        "tolerance_px": SAME_SPOT_PX,
+        "per_spot": per_spot,
+    }
+
+
+def _bends(frames: Ints, true_uv: Array) -> Bools:
+    """(F, V): the true path departs there by more than BEND_PX from an even continuation of its last two places."""
+    out = np.zeros(true_uv.shape[:2], dtype=bool)
+    if len(frames) > 2:
+        step = true_uv[2:] - 2 * true_uv[1:-1] + true_uv[:-2]
+        consecutive = (np.diff(frames)[1:] == 1) & (np.diff(frames)[:-1] == 1)
+        out[2:] = consecutive[:, None] & (np.linalg.norm(step, axis=-1) > BEND_PX)
+    return out
+
+
+def _starting(spots: SpotGrid) -> Bools:
+    """(F, V): fewer than two frames lie between this one and the start of the view's track."""
+    known = (spots.status != ABSENT) & ~spots.has(SpotStatus.LOST)
+    out = np.ones(known.shape, dtype=bool)
+    out[2:] = ~(known[1:-1] & known[:-2])
+    return out & known
+
+
+def _returns(in_view: Ints, after: int, measured: Bools, right: Bools, pictured: Bools) -> dict[str, Any]:
+    """Of the spots that come (back) into view after state `after`: how many are found again under their own name.
+
+    A return is kept when the first row measured within RETURN_FRAMES pictures of it is the right spot, and counts only
+    if there is such a picture with the spot in view. delay: pictures until that row (0: at once).
+    """
+    total = kept = 0
+    delays: list[int] = []
+    for j in range(in_view.shape[1]):
+        state = in_view[:, j]
+        starts = np.flatnonzero((state[1:] == IN_VIEW) & (state[:-1] == after)) + 1
+        for start in starts:
+            ends = np.flatnonzero(state[start:] != IN_VIEW)
+            stop = start + (ends[0] if len(ends) else len(state) - start)
+            rows = np.arange(start, stop)
+            rows = rows[pictured[rows, j]][: RETURN_FRAMES + 1]
+            if not len(rows):
+                continue
+            total += 1
+            hits = np.flatnonzero(measured[rows, j])
+            if len(hits) and right[rows[hits[0]], j]:
+                kept += 1
+                delays.append(int(hits[0]))
+    return {
+        "total": total,
+        "kept": kept,
+        "median_delay_frames": float(np.median(delays)) if delays else None,
+        "max_delay_frames": max(delays, default=None),
+    }
+
+
+def _pose_scores(poses: PoseTrack, truth: Pose) -> dict[str, Any]:
+    known: Bools = poses.known & np.all(np.isfinite(truth.translation), axis=-1)
+    delta = pose_errors(poses, truth)
+    measured = known & poses.has(PoseStatus.MEASURED)
+    predicted = known & poses.has(PoseStatus.PREDICTED)
+    status = {str(s): _share(poses.status == i, poses.status >= 0) for i, s in enumerate(POSE_STATUSES)}
+    return {
+        "frames": int(known.sum()),
+        "measured": _pose_spread(delta[measured], poses.covariance[measured]),
+        "predicted": _pose_spread(delta[predicted], poses.covariance[predicted]),
+        "status_share": status,
+    }
+
+
+def pose_errors(poses: PoseTrack, truth: Pose) -> Array:
+    """(F, 6): truth minus estimate, [dt (m, world), dtheta (rad, body)]; nan where either is missing."""
+    delta = truth.minus(poses.world_from_body)
+    return np.where(np.isfinite(delta[:, :3]).all(axis=-1, keepdims=True), delta, np.nan)
+
+
+def normalised_squares(delta: Array, covariance: Array) -> Array:
+    """NEES (n,): delta^T C^-1 delta of errors (n, 6) and covariances (n, 6, 6); nan where C cannot be inverted.
+
+    Its mean is 6 where the covariance tells the truth (Bar-Shalom, Li & Kirubarajan, 2001, section 5.4).
+    Metres and radians differ in scale, so each C is brought to unit diagonal first.
+    """
+    variance = np.diagonal(covariance, axis1=-2, axis2=-1)
+    good: Bools = np.all(np.isfinite(covariance), axis=(-2, -1)) & np.all(variance > 0, axis=-1)
+    scale = np.sqrt(np.where(good[:, None], variance, 1.0))
+    C = np.where(good[:, None, None], covariance, np.eye(6)) / (scale[:, :, None] * scale[:, None, :])
+    good = good & (np.linalg.eigvalsh(C)[:, 0] > 1e-12)
+    C = np.where(good[:, None, None], C, np.eye(6))
+    x = delta / scale
+    return np.where(good, np.sum(x * np.linalg.solve(C, x[..., None])[..., 0], axis=-1), np.nan)
+
+
+def _pose_spread(delta: Array, covariance: Array) -> dict[str, Any] | None:
+    if not len(delta):
+        return None
+    position, angle = np.linalg.norm(delta[:, :3], axis=-1), np.degrees(np.linalg.norm(delta[:, 3:], axis=-1))
+    nees = normalised_squares(delta, covariance)
+    nees = nees[np.isfinite(nees)]
+    n = len(nees)
+    return {
+        "rows": len(delta),
+        "position_rms_m": dict(zip("xyz", _rms(delta[:, :3]), strict=True)),
+        "position_m": _norms(position),
+        "rotation_rms_deg": dict(zip("xyz", _rms(np.degrees(delta[:, 3:])), strict=True)),  # about the body's axes
+        "rotation_deg": _norms(angle),
+        "nees_mean": float(nees.mean()) if n else None,
+        # In which the mean of n independent rows lies 95 times in 100; rows of a filter are not independent.
+        "nees_mean_95": [2 * gamma_quantile(1 - p, 3 * n) / n for p in (0.025, 0.975)] if n else None,
+        "nees_rows": n,
+    }
+
+
+def _spread(error: Array) -> dict[str, Any] | None:
+    """RMS per axis, and of the distance its RMS, median, 99th percentile and maximum, of errors (n, 2), px."""
+    error = error[np.isfinite(error).all(axis=-1)]
+    if not len(error):
+        return None
+    u, v = _rms(error)
+    return {"rms_u": u, "rms_v": v, **_norms(np.linalg.norm(error, axis=-1)), "rows": len(error)}
+
+
+def _norms(distance: Array) -> dict[str, float]:
+    return {
+        "rms": float(np.sqrt(np.mean(distance**2))),
+        "median": float(np.median(distance)),
+        "p99": float(np.percentile(distance, 99)),
+        "max": float(distance.max()),
+    }
+
+
+def _rms(error: Array) -> list[float]:
+    return [float(x) for x in np.sqrt(np.mean(error**2, axis=0))]
+
+
+def _share(part: Bools, whole: Bools) -> float | None:
+    total = int(whole.sum())
+    return int((part & whole).sum()) / total if total else None

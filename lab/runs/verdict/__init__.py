@@ -1,0 +1,1 @@
+"""Checks of the results, and the verdict on a run."""

@@ -1,0 +1,200 @@
+"""What a run shows, counted frame by frame: what the verdict is made from. Its size does not grow with the run."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Any
+
+import numpy as np
+
+from lab.runs.frames.pipeline import FrameRecord
+from lab.runs.verdict.frame_checks import CONTRADICTION
+from lab.runs.verdict.frame_ranges import FrameRanges
+from tracking.detections import UNMATCHED
+from tracking.statuses import PoseStatus, SpotStatus
+
+FEWEST_SPOTS = 3  # that give a pose
+_USUAL_CLUTTER = 0.95  # of the measured frames have no more points without a label than are taken for clutter
+_MOST_POINTS = 50  # more points without a label are counted as so many
+
+
+class Cause(StrEnum):
+    """Why a frame has no measured pose: the first that applies."""
+
+    NO_PICTURE = "no_picture"
+    CONTRADICTION = "contradiction"
+    UNEXPLAINED = "unexplained"
+    LABELS_OPEN = "labels_open"
+    FEW_POINTS = "few_points"
+    OUT_OF_VIEW = "out_of_view"
+    NOT_DETERMINED = "not_determined"
+    HIDDEN = "hidden"
+
+    @property
+    def meaning(self) -> str:
+        """What such a frame shows, to follow a number of frames."""
+        return _MEANINGS[self]
+
+
+_MEANINGS = {
+    Cause.NO_PICTURE: "without a picture of some camera",
+    Cause.CONTRADICTION: "whose pose contradicts its spots or the causal pass",
+    Cause.UNEXPLAINED: "with enough points of light, which no pose explains",
+    Cause.LABELS_OPEN: "with spots whose labels stayed open",
+    Cause.FEW_POINTS: "with too few points of light",
+    Cause.OUT_OF_VIEW: f"with fewer than {FEWEST_SPOTS} spots inside the pictures",
+    Cause.NOT_DETERMINED: "whose spots do not determine the pose",
+    Cause.HIDDEN: "with hidden spots",
+}
+# Frames that show enough to be measured, so that the tracker and not the recording is the reason.
+MISSED = (Cause.CONTRADICTION, Cause.UNEXPLAINED, Cause.LABELS_OPEN)
+
+
+@dataclass(slots=True)
+class CameraFacts:
+    """Of one camera."""
+
+    pictures: int = 0  # frames with a usable picture
+    empty: int = 0  # of these, without any point of light
+    points: int = 0  # of light, in all of them
+    expected: int = 0  # spots that the pose puts inside these pictures
+    found: int = 0  # of these, measured
+    empty_at_end: int = 0  # pictures without any point since the last one that has one
+    expected_at_end: int = 0  # spots that the pose puts inside these
+    missing: FrameRanges = field(default_factory=FrameRanges)  # frames without a usable picture
+
+    def as_mapping(self) -> dict[str, Any]:
+        """For summary.json."""
+        return {
+            "pictures": self.pictures,
+            "pictures_without_points": self.empty,
+            "points": self.points,
+            "spots_expected": self.expected,
+            "spots_found": self.found,
+            "empty_at_end": self.empty_at_end,
+            "missing": [list(r) for r in self.missing.ranges],
+        }
+
+
+@dataclass(slots=True)
+class RunFacts:
+    """Counts of one run; feed it the frames as they are written, in order."""
+
+    cameras: dict[str, CameraFacts]
+    camera_of: tuple[int, ...] = ()  # of each view, index into cameras
+    min_spots: int = 4  # points that a first pose needs
+    frames: int = 0
+    first_frame: int = 0
+    last_frame: int = -1
+    pose: Counter[str] = field(default_factory=Counter)  # PoseStatus -> frames
+    causal_measured: int | None = None  # frames measured in the causal pass, where the frames are smoothed
+    lost: FrameRanges = field(default_factory=FrameRanges)  # frames of which nothing is known, after the first pose
+    found_again: int = 0  # how often a pose followed upon such a range
+    ties: FrameRanges = field(default_factory=FrameRanges)  # frames with a tie that were not measured in the end either
+    tie_text: str = ""  # of the first of them
+    own_spots: FrameRanges = field(default_factory=FrameRanges)  # see lab.runs.verdict.frame_checks.FrameChecks
+    causal: FrameRanges = field(default_factory=FrameRanges)
+    invalid: FrameRanges = field(default_factory=FrameRanges)
+    _known: bool = False  # a pose has been found
+    _causes: Counter[tuple[Cause, int]] = field(default_factory=Counter)  # with the points that have no label
+    _surplus: Counter[int] = field(default_factory=Counter)  # points without a label, in measured frames
+
+    @property
+    def measured(self) -> int:
+        """Frames with a measured pose."""
+        return self.pose[PoseStatus.MEASURED.value]
+
+    def add(self, record: FrameRecord, known_then: FrameRecord | None = None) -> None:
+        """The next frame as it is written, and as the causal pass had it."""
+        tracked = record.tracked
+        self.first_frame = record.frame if self.frames == 0 else self.first_frame
+        self.last_frame = record.frame
+        self.frames += 1
+        self.pose[tracked.pose_status.value] += 1
+        if known_then is not None:
+            now = known_then.tracked.pose_status is PoseStatus.MEASURED
+            self.causal_measured = (self.causal_measured or 0) + now
+        self._add_cameras(record)
+        if tracked.pose_status is PoseStatus.LOST:
+            if self._known:
+                self.lost.add(record.frame)
+        else:
+            if self.lost.ranges and self.lost.ranges[-1][1] == record.frame - 1:
+                self.found_again += 1
+            self._known = True
+        points = sum(len(f) for f in record.detections if f is not None)
+        surplus = min(points - int(np.count_nonzero(tracked.point != UNMATCHED)), _MOST_POINTS)
+        if tracked.pose_status is PoseStatus.MEASURED:
+            self._surplus[surplus] += 1
+            return
+        self._causes[self._cause(record), surplus] += 1
+        for event in tracked.events:
+            if event.kind == "tie":
+                self.ties.add(record.frame)
+                self.tie_text = self.tie_text or event.text
+
+    def _add_cameras(self, record: FrameRecord) -> None:
+        status = record.tracked.status
+        for c, (facts, found) in enumerate(zip(self.cameras.values(), record.detections, strict=True)):
+            if found is None:
+                facts.missing.add(record.frame)
+                continue
+            facts.pictures += 1
+            facts.empty += len(found) == 0
+            facts.points += len(found)
+            if len(found):
+                facts.empty_at_end = facts.expected_at_end = 0
+            else:
+                facts.empty_at_end += 1
+            if record.tracked.pose is not None:
+                own = [s for s, camera in zip(status, self.camera_of, strict=True) if camera == c]
+                facts.found += sum(s.measured for s in own)
+                expected = sum(s.measured or s is SpotStatus.OCCLUDED for s in own)
+                facts.expected += expected
+                facts.expected_at_end += expected if facts.empty_at_end else 0
+
+    def _cause(self, record: FrameRecord) -> Cause:
+        tracked = record.tracked
+        if any(found is None for found in record.detections):
+            return Cause.NO_PICTURE
+        if any(event.kind == CONTRADICTION for event in tracked.events):
+            return Cause.CONTRADICTION
+        given = np.array([s.measured for s in tracked.status])
+        p = tracked.label_probability
+        left_open = 0 if p is None else int(np.count_nonzero(~given & np.isfinite(p)))
+        if left_open and given.sum() + left_open >= FEWEST_SPOTS:
+            return Cause.LABELS_OPEN
+        if tracked.pose is None:
+            return Cause.FEW_POINTS
+        if sum(s.measured or s is SpotStatus.OCCLUDED for s in tracked.status) < FEWEST_SPOTS:
+            return Cause.OUT_OF_VIEW
+        return Cause.NOT_DETERMINED if given.sum() >= FEWEST_SPOTS else Cause.HIDDEN
+
+    @property
+    def causes(self) -> Mapping[Cause, int]:
+        """Frames without a measured pose by cause, the commonest first.
+
+        A frame with more points without a label than is usual in measured frames, by as many as a first pose needs,
+        shows spots that no pose explains, whatever else may be the cause.
+        """
+        total, usual = sum(self._surplus.values()), 0
+        below = 0
+        for surplus in sorted(self._surplus):
+            below += self._surplus[surplus]
+            usual = surplus
+            if below >= _USUAL_CLUTTER * total:
+                break
+        out: Counter[Cause] = Counter()
+        for (cause, surplus), frames in self._causes.items():
+            shows_more = cause not in (Cause.NO_PICTURE, *MISSED) and surplus >= usual + self.min_spots
+            out[Cause.UNEXPLAINED if shows_more else cause] += frames
+        return dict(out.most_common())
+
+    @property
+    def missed(self) -> int:
+        """Frames that show enough to be measured and were not."""
+        causes = self.causes
+        return sum(causes.get(cause, 0) for cause in MISSED)

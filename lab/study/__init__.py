@@ -1,0 +1,1 @@
+"""`beampose study`: published experiments repeated."""

@@ -1,0 +1,45 @@
+"""Published experiments repeated, as tables and pages."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import dataclass
+from pathlib import Path
+
+from lab.files.text.atomic_write import whole_folder
+from lab.study.experiment_huo2015 import repeat_huo2015
+from lab.study.study_page import write_study
+
+COLUMNS = ("quantity", "unit", "paper", "conventional", "curve_switching", "beampose", "note")
+
+
+@dataclass(frozen=True, slots=True)
+class StudyOutcome:
+    """What was written, and lines for the command line."""
+
+    lines: tuple[str, ...]
+    table: Path
+    report: Path
+
+
+def study_huo2015(out: Path, seed: int = 1, frames: int = 600) -> StudyOutcome:
+    """Repeat section 5.1 into the folder `out`: figures.csv and report.html. Raises InputError if `out` is in use."""
+    study = repeat_huo2015(seed, frames)
+    with whole_folder(out, may_replace=lambda folder: (folder / "figures.csv").is_file()) as work:
+        with (work / "figures.csv").open("w", encoding="utf-8", newline="") as file:
+            writer = csv.writer(file, lineterminator="\n")
+            writer.writerow(COLUMNS)
+            for row in study.rows:
+                values = [getattr(row, name) for name in COLUMNS]
+                writer.writerow(["" if v is None else f"{v:.6g}" if isinstance(v, float) else v for v in values])
+        write_study(study, work)
+    lines = tuple(
+        f"{row.quantity} ({row.unit}): paper {_shown(row.paper)}, conventional {_shown(row.conventional)},"
+        f" curve switching {_shown(row.curve_switching)}, beampose {_shown(row.beampose)}"
+        for row in study.rows
+    )
+    return StudyOutcome(lines, Path(out) / "figures.csv", Path(out) / "report.html")
+
+
+def _shown(value: float | None) -> str:
+    return "-" if value is None else f"{value:.4g}"

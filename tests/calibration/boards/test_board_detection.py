@@ -1,0 +1,359 @@
+"""Boards in rendered pictures, where the truth is known, and in real ones, where the right number or reason is."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from dataclasses import replace
+from functools import cache
+
+import cv2
+import numpy as np
+import pytest
+
+from calibration.boards import charuco_detection, chessboard_detection, corner_refinement
+from calibration.boards.board_detection import NO_CLOSE_LOOK, BoardView, NotFound, find_board
+from calibration.boards.board_types import Board, CircleGrid, parse
+from calibration.terms.circle_images import radius_by_areas
+from geometry import rotations
+from geometry.camera import FISHEYE, PERSPECTIVE, Camera
+from geometry.pose import Pose
+from lab.simulate.board_photo import BoardPhoto, Look, photograph
+from tests.paths import DATA
+
+px = 1.0
+CHESS, CHARUCO = "chessboard:9x6:25mm", "charuco:7x5:35mm:24mm:DICT_5X5_100"
+CLEAN = Look(blur_px=0.7, samples=16)
+
+
+def camera(lens: str = PERSPECTIVE) -> Camera:
+    f = 560.0 if lens == PERSPECTIVE else 420.0
+    numbers = (-0.25, 0.08, 5e-4, -3e-4, 0.02) if lens == PERSPECTIVE else (0.03, -0.01, 0.002, -5e-4)
+    matrix = np.array([[f, 0, 239.5], [0, f, 179.5], [0, 0, 1]])
+    return Camera("c", "s", (480, 360), matrix, numbers, Pose.identity(), lens=lens)
+
+
+def held(board: Board, turn: tuple[float, float, float], away: float = 1.9) -> Pose:
+    """A board turned about its middle, `away` of its own sizes from the camera."""
+    R = rotations.exp(np.array(turn))
+    return Pose(R, np.array([0, 0, away * max(board.size_m)]) - R @ board.middle)
+
+
+@cache
+def shot(text: str, turn=(0.4, -0.3, 0.15), look: Look = CLEAN, **more) -> tuple[Board, BoardPhoto]:
+    board = parse(text)
+    return board, photograph(board, camera(), held(board, turn), look=look, **more)
+
+
+def seen(image, board: Board) -> BoardView:
+    found = find_board(image, board)
+    assert isinstance(found, BoardView), found
+    return found
+
+
+def refused(image, board: Board) -> str:
+    found = find_board(image, board)
+    assert isinstance(found, NotFound), "found"
+    return found.reason
+
+
+def rms(view: BoardView, photo: BoardPhoto) -> float:
+    return float(np.sqrt(np.mean((view.pixels - photo.pixels[view.ids]) ** 2)))
+
+
+def centroids(board: Board, turn: tuple[float, float, float]) -> tuple[np.ndarray, np.ndarray]:
+    """Where the blobs of a board's circles truly lie (n, 2), px, and their areas, from fine outlines."""
+    assert isinstance(board, CircleGrid)
+    angle = np.linspace(0, 2 * np.pi, 300, endpoint=False)
+    ring = board.diameter_m / 2 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+    out = camera().project(held(board, turn).apply(board.points[:, None] + ring))
+    before = np.roll(out, 1, axis=1)
+    twice = before[..., 0] * out[..., 1] - out[..., 0] * before[..., 1]
+    area = twice.sum(axis=1)
+    return np.sum((before + out) * twice[..., None], axis=1) / (3 * area[:, None]), np.abs(area) / 2
+
+
+# How near to the truth ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "within"),
+    [
+        (CHESS, 0.03),
+        (CHARUCO, 0.04),
+        ("charuco:5x8:40mm:20mm:DICT_4X4_50:inverted:legacy", 0.04),
+    ],
+)
+def test_points_are_found_where_they_truly_are(text, within):
+    board, photo = shot(text)
+    view = seen(photo.image, board)
+    assert len(view) == len(board.ids)
+    assert rms(view, photo) < within * px
+    assert np.abs(np.mean(view.pixels - photo.pixels, axis=0)).max() < 0.015 * px  # no common shift
+    assert view.notes == ()
+
+
+@pytest.mark.parametrize("text", [CHESS, "circles:9x7:25mm", CHARUCO])
+def test_noise_and_blur_cost_less_than_a_tenth_of_a_pixel(text):
+    board, photo = shot(text, look=Look(blur_px=1.2, noise_dn=4, gradient=0.4, samples=9), seed=3)
+    view = seen(photo.image, board)
+    assert len(view) >= 0.9 * len(board.ids)
+    assert rms(view, photo) < 0.1 * px
+
+
+def test_a_bent_board_in_a_fisheye_picture_is_found_too():
+    board = parse(CHESS)
+    lens = camera(FISHEYE)
+    photo = photograph(board, lens, held(board, (0.2, 0.3, 0.1), 1.0), np.array([0.3, -0.1, 0.2]), CLEAN)
+    assert rms(seen(photo.image, board), photo) < 0.04 * px
+
+
+@pytest.mark.parametrize(
+    ("text", "turn"),
+    [
+        ("circles:9x7:25mm", (0.4, -0.3, 0.15)),
+        ("circles:7x5:30mm:18mm", (0.0, 0.95, 0.0)),  # steep: there the circles' centres lie .1 px and more away
+        ("acircles:4x11:20mm", (0.4, -0.3, 0.15)),
+        ("acircles:5x8:25mm", (0.4, -0.3, 0.15)),
+    ],
+)
+def test_blobs_of_circles_are_found_where_they_truly_are_with_their_areas(text, turn):
+    board, photo = shot(text, turn=turn)
+    view = seen(photo.image, board)
+    places, areas = centroids(board, turn)
+    assert np.sqrt(np.mean((view.pixels - places) ** 2)) < 0.02 * px
+    assert np.abs(np.mean(view.pixels - places, axis=0)).max() < 0.008 * px
+    assert view.areas_px2 is not None
+    np.testing.assert_allclose(np.sqrt(view.areas_px2 / areas), 1, atol=0.02)
+    radius = radius_by_areas(board.points[:, :2], view.pixels, view.areas_px2, camera())
+    assert 2 * radius == pytest.approx(board.diameter_m, rel=0.01)
+
+
+@pytest.mark.parametrize("blur", [0.6, 1.0, 1.8])
+def test_blur_is_measured(blur):
+    board, photo = shot(CHESS, look=Look(blur_px=blur, noise_dn=2, samples=9))
+    assert seen(photo.image, board).blur_px == pytest.approx(np.hypot(blur, 12**-0.5), abs=0.1)
+
+
+# The order of the points ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("text", [CHESS, "chessboard:5x5:30mm", "acircles:4x11:20mm", CHARUCO])
+@pytest.mark.parametrize("roll", [0.0, -1.7, 3.0])
+def test_the_first_point_stays_the_first_however_the_camera_is_rolled(text, roll):
+    """5x5 corners look the same after half a turn: there the rows point to the right."""
+    board, photo = shot(text, turn=(0.25, 0.2, roll), look=Look(samples=9))
+    view = seen(photo.image, board)
+    miss = np.linalg.norm(view.pixels - photo.pixels[view.ids], axis=1).max()
+    if board.symmetry == 1 or abs(roll) < 1.5:
+        assert miss < 0.3 * px
+    else:
+        np.testing.assert_allclose(view.pixels, photo.pixels[::-1], atol=0.3 * px)
+
+
+def test_corners_in_any_wrong_order_come_out_right():
+    """Releases of OpenCV differ in the order they give: every order of a grid must lead to the one."""
+    _, photo = shot(CHESS)
+    true = photo.pixels.reshape(6, 9, 2)
+    for given in (true, true[::-1], true[:, ::-1], true[::-1, ::-1]):
+        np.testing.assert_array_equal(chessboard_detection.oriented(photo.image, given), true)
+
+
+def test_a_larger_dot_in_a_corner_becomes_the_first():
+    board, photo = shot("circles:6x6:30mm", turn=(0.2, 0.2, 0.1))
+    for corner in (0, 5, 30, 35):
+        image = photo.image.copy()
+        u, v = np.round(photo.pixels[corner]).astype(int)
+        cv2.circle(image, (int(u), int(v)), 19, 35, -1, cv2.LINE_AA)
+        assert np.linalg.norm(seen(image, board).pixels[0] - [u, v]) < 1.5 * px
+
+
+# What is said when there is no view -----------------------------------------------------------------------------
+
+
+def test_an_empty_wall_and_a_dark_picture_say_so():
+    wall = np.random.default_rng(0).integers(60, 190, (360, 480)).astype(np.uint8)
+    assert "no chessboard seen" in refused(wall, parse(CHESS))
+    assert "no marker of DICT_5X5_100 seen" in refused(wall, parse(CHARUCO))
+    assert "circles" in refused(wall, parse("circles:9x7:25mm"))
+    for text in (CHESS, CHARUCO, "circles:9x7:25mm"):
+        assert "hardly any contrast" in refused(np.full((360, 480), 7, dtype=np.uint8), parse(text))
+
+
+def test_a_board_of_another_size_is_named():
+    board, photo = shot(CHESS)
+    assert "9x6" in refused(photo.image, parse("chessboard:7x7:25mm"))
+    assert refused(photo.image, parse("chessboard:8x6:25mm")).startswith(
+        ("the chessboard goes on", "a chessboard of 9x6 inner corners, not 8x6")
+    )
+    assert "only 9x6 of the 11x6" in refused(photo.image, parse("chessboard:11x6:25mm"))
+    assert len(seen(photo.image, parse("chessboard:6x9:25mm"))) == len(board.ids)  # the same board, held upright
+
+
+def test_a_grid_of_another_size_or_kind_is_named():
+    _, photo = shot("circles:9x7:25mm")
+    assert "9x7 circles, not 10x8" in refused(photo.image, parse("circles:10x8:25mm"))
+    assert "goes on" in refused(photo.image, parse("circles:8x7:25mm"))
+    _, photo = shot("acircles:4x11:20mm")
+    assert "write acircles instead of circles" in refused(photo.image, parse("circles:4x11:20mm"))
+
+
+def test_a_charuco_board_is_told_from_its_neighbours():
+    _, photo = shot(CHARUCO)
+    assert "do on 7x5 squares; exchange the two" in refused(photo.image, parse("charuco:5x7:35mm:24mm:DICT_5X5_100"))
+    assert "of DICT_5X5_50 with numbers up to 16; check the dictionary" in refused(
+        photo.image, parse("charuco:7x5:35mm:24mm:DICT_6X6_250")
+    )
+    assert "do not lie as on this board; check the number of columns and rows" in refused(
+        photo.image, parse("charuco:8x6:35mm:24mm:DICT_5X5_100")
+    )
+
+
+def test_an_inverted_or_older_charuco_board_is_found_all_the_same_and_said_to_be_one():
+    _, photo = shot("charuco:6x8:30mm:20mm:DICT_4X4_50:inverted:legacy")
+    view = seen(photo.image, parse("charuco:6x8:30mm:20mm:DICT_4X4_50"))
+    assert rms(view, photo) < 0.05 * px
+    assert len(view) == 35
+    assert view.notes == (
+        "the board is inverted (white markers)",
+        "the board has OpenCV's older pattern (legacy)",
+    )
+
+
+def test_markers_of_another_size_than_said_are_measured():
+    _, photo = shot("charuco:7x5:35mm:24mm:DICT_5X5_100")
+    (note,) = seen(photo.image, parse("charuco:7x5:35mm:17mm:DICT_5X5_100")).notes
+    assert note.startswith("markers measure 0.6")
+    assert note.endswith("of a square, the board's text says 0.49")
+
+
+@pytest.mark.parametrize("text", [CHARUCO, CHARUCO + ":inverted"])
+def test_a_mirrored_picture_is_refused_where_the_pattern_can_tell(text):
+    board, photo = shot(text)
+    seen(photo.image, board)
+    assert "mirror" in refused(np.ascontiguousarray(photo.image[:, ::-1]), board)
+
+
+def test_a_mirrored_board_of_4x4_bits_says_so_although_some_of_its_markers_look_like_others():
+    board = parse("charuco:11x9:36mm:27mm:DICT_4X4_100")
+    larger = replace(camera(), image_size_px=(800, 600), matrix=np.diag([5 / 3, 5 / 3, 1]) @ camera().matrix)
+    photo = photograph(board, larger, held(board, (0.2, 0.1, 0.1), 1.6), look=Look(blur_px=0.7, samples=4))
+    mirrored = np.ascontiguousarray(photo.image[:, ::-1])
+    assert len(charuco_detection.find_markers(mirrored, board.dictionary, board.markers).ids) >= 2
+    assert "mirror" in refused(mirrored, board)
+
+
+@pytest.mark.parametrize("text", [CHESS, "circles:9x7:25mm", CHARUCO])
+def test_a_quick_look_sees_a_board_and_looks_for_no_cause(text):
+    board, photo = shot(text)
+    view = find_board(photo.image, board, closely=False)
+    assert isinstance(view, BoardView)
+    assert rms(view, photo) < 0.04 * px
+    wall = np.random.default_rng(0).integers(60, 190, (360, 480)).astype(np.uint8)
+    assert find_board(wall, board, closely=False) is NO_CLOSE_LOOK
+
+
+def test_a_mirrored_chessboard_is_its_own_mirror_image_but_its_order_is_not_mirrored():
+    board, photo = shot(CHESS)
+    grid = seen(np.ascontiguousarray(photo.image[:, ::-1]), board).pixels.reshape(6, 9, 2)
+    right, down = grid[0, 1] - grid[0, 0], grid[1, 0] - grid[0, 0]
+    assert right[0] * down[1] - right[1] * down[0] > 0
+
+
+def test_a_picture_out_of_focus_says_so():
+    board, photo = shot(CHESS)
+    blurred = cv2.GaussianBlur(photo.image, (0, 0), 9)
+    assert "too blurred" in refused(blurred, board)
+    board, photo = shot(CHARUCO)
+    assert "blurred" in refused(cv2.GaussianBlur(photo.image, (0, 0), 5), board)
+
+
+def test_a_part_of_a_chessboard_is_refused_and_a_part_of_a_charuco_board_used():
+    board, photo = shot(CHESS)
+    image = photo.image.copy()
+    image[:, : int(photo.pixels[2, 0])] = 110
+    assert "only" in refused(image, board)
+    board, photo = shot(CHARUCO)
+    image = photo.image.copy()
+    image[:, : int(photo.pixels[2, 0])] = 110
+    view = seen(image, board)
+    assert 6 <= len(view) < len(board.ids)
+    assert rms(view, photo) < 0.05 * px
+
+
+def test_other_kinds_of_picture_are_a_mistake_of_the_caller():
+    with pytest.raises(ValueError, match="expected a grey picture"):
+        find_board(np.zeros((100, 100, 3), dtype=np.uint8), parse(CHESS))
+
+
+def test_refinement_keeps_away_from_edges_that_do_not_meet_in_the_corner():
+    grid = np.stack(np.meshgrid(np.arange(4) * 30.0, np.arange(3) * 12.0), axis=-1)
+    np.testing.assert_allclose(corner_refinement.edge_distance(grid, np.ones((3, 4), dtype=bool)), 12.0)
+
+
+# Real pictures --------------------------------------------------------------------------------------------------
+
+
+def counts(pattern: str, text: str) -> Counter[str]:
+    """How often what was said of real pictures."""
+    files = sorted(DATA.glob(pattern))
+    if not files:
+        pytest.skip(f"the real pictures are not here: {pattern.split('/')[0]} is missing")
+    out: Counter[str] = Counter()
+    for path in files:
+        found = find_board(np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), dtype=np.uint8), parse(text))
+        out["found" if isinstance(found, BoardView) else found.reason] += 1
+    return out
+
+
+@pytest.mark.parametrize(
+    ("pattern", "text", "found", "all_"),
+    [
+        ("chessboard_stereo_opencv/*.jpg", CHESS, 14, 14),
+        ("chessboard_webcam_c920/*.jpg", "chessboard:9x7:24.4mm", 7, 7),
+        ("chessboard_lowquality_400x300/*.png", CHESS, 13, 13),
+        pytest.param(  # in one the board stands on edge
+            *("chessboard_portrait_cams/*/*.jpg", "chessboard:4x7:60mm", 13, 14), marks=pytest.mark.slow
+        ),
+        ("charuco_aruco_stills/ch*.jpg", "charuco:5x7:40mm:20mm:DICT_6X6_250", 2, 2),
+    ],
+)
+def test_real_boards_are_found(pattern, text, found, all_):
+    said = counts(pattern, text)
+    assert (said["found"], sum(said.values())) == (found, all_)
+    assert all(reason == "found" or reason.startswith("no chessboard seen") for reason in said)
+
+
+@pytest.mark.parametrize(
+    ("pattern", "text", "words"),
+    [
+        ("chessboard_stereo_opencv/left*.jpg", "chessboard:8x6:25mm", "the chessboard goes on"),
+        ("chessboard_webcam_c920/*4.jpg", "chessboard:9x6:25mm", "9x7 inner corners, not 9x6|beyond 9x6 inner"),
+        ("charuco_aruco_stills/chor*.jpg", "charuco:5x7:40mm:20mm:DICT_5X5_100", "of DICT_6X6_50 with numbers up to"),
+        ("charuco_aruco_stills/chor*.jpg", "charuco:7x5:40mm:20mm:DICT_6X6_250", "they do on 5x7 squares"),
+        ("charuco_aruco_stills/single*.jpg", "charuco:5x7:40mm:20mm:DICT_6X6_250", "another board"),
+        ("charuco_aruco_stills/gb*.jpg", "chessboard:4x6:40mm", "no chessboard seen"),
+        ("circlegrid_robot_wrist/images/[02].png", "circles:9x10:20mm", "the grid goes on to the right"),
+    ],
+)
+def test_what_is_wrong_with_real_pictures_is_said(pattern, text, words):
+    said = counts(pattern, text)
+    assert all(re.search(words, reason) for reason in said), said
+
+
+def test_the_large_dot_of_the_robots_target_is_first_in_all_its_pictures():
+    board = parse("circles:10x10:20mm")
+    files = sorted((DATA / "circlegrid_robot_wrist" / "images").glob("*.png"))
+    if not files:
+        pytest.skip("the real pictures are not here: circlegrid_robot_wrist is missing")
+    assert len(files) == 6
+    for path in files:
+        image = np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), dtype=np.uint8)
+        view = seen(image, board)
+        (u, v), reach = np.round(view.pixels[0]).astype(int), int(0.4 * view.spacing_px)
+        other = np.round(view.pixels[99]).astype(int)
+        dark = [
+            np.mean(image[max(y - reach, 0) : y + reach, max(x - reach, 0) : x + reach] < 90)
+            for x, y in ((u, v), other)
+        ]
+        assert dark[0] > 1.8 * dark[1]

@@ -1,0 +1,63 @@
+"""Boards that are not as stated: solved for where the photographs show it, and named."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calibration.findings import Level
+from calibration.lens.fit.corner_table import CornerTable
+from calibration.lens.fit.lens_models import LensModel
+from calibration.lens.intrinsics import IntrinsicsOptions, calibrate_intrinsics
+from tests.calibration.lens.lens_scenes import TRUTH, Scene, photographs
+
+FIVE = IntrinsicsOptions(lens=LensModel(5), folds=2)
+
+
+def stated(table: CornerTable, points: np.ndarray) -> CornerTable:
+    """The same photographs, the board said to be another one."""
+    return replace(table, board_points=points, middle=(points.min(axis=0) + points.max(axis=0)) / 2)
+
+
+def misses(c) -> np.ndarray:
+    return np.abs((c.fit.lens[:9] - np.array(TRUTH)) / c.sigmas)
+
+
+def test_a_board_printed_longer_along_x_is_named_and_does_not_bend_the_lens():
+    table = photographs(Scene(views=12), 22)
+    wrong = stated(table, table.board_points / [1.005, 1, 1])
+    c = calibrate_intrinsics(wrong, FIVE)
+    assert c.board is not None
+    assert c.board.stretch is not None
+    assert c.board.stretch.corrected
+    assert abs(c.board.stretch.stretch - 0.005) < 4 * c.board.stretch.sigma[0]
+    assert np.all(misses(c) < 3.5)
+    assert c.verdict < Level.FAIL
+    about = next(f for f in c.findings if "longer than was said" in f.what)
+    assert about.level is Level.WARN
+    assert "Measure the board" in about.cure
+    taken_as_stated = calibrate_intrinsics(wrong, replace(FIVE, stretch=False))
+    assert abs(taken_as_stated.fit.lens[0] - TRUTH[0]) > 5.0  # px
+
+
+def test_a_true_board_is_taken_as_stated():
+    c = calibrate_intrinsics(photographs(Scene(views=10), 21), FIVE)
+    assert c.board is not None
+    assert c.board.stretch is not None
+    assert not c.board.stretch.corrected
+    assert not c.board.points.corrected
+    assert not np.any(c.fit.stretch)
+
+
+@pytest.mark.slow
+def test_points_printed_out_of_place_are_solved_for():
+    table = photographs(Scene(), 23)
+    off = np.random.default_rng(3).normal(0, 3e-4, table.board_points.shape) * [1, 1, 0]
+    c = calibrate_intrinsics(stated(table, table.board_points + off), IntrinsicsOptions(lens=LensModel(5)))
+    assert c.board is not None
+    assert c.board.points.corrected
+    assert c.board.points.rms_m == pytest.approx(3e-4 * np.sqrt(2), rel=0.25)
+    assert np.all(misses(c) < 3.5)
+    assert c.fit.sigma_px == pytest.approx(0.2, rel=0.1)

@@ -1,0 +1,76 @@
+"""Cameras from grids of circles: the blobs' centroids are not the images of the circles' centres, and that is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from calibration.boards.board_types import parse
+from calibration.findings import Level
+from calibration.lens.fit.corner_table import CircleAreas, CornerTable
+from calibration.lens.fit.lens_models import LensModel
+from calibration.lens.intrinsics import IntrinsicsOptions, calibrate_intrinsics
+from calibration.lens.intrinsics_result import Intrinsics
+from tests.calibration.lens.rendered_circles import LENS, CircleScene, table_of
+
+QUICK = IntrinsicsOptions(lens=LensModel(5), warp=False, stretch=False, folds=2)
+SCENE = CircleScene(parse("acircles:4x9:20mm"), views=8)
+
+
+@cache
+def pictures() -> CornerTable:
+    return table_of(SCENE, 3)
+
+
+def nees(c: Intrinsics) -> float:
+    truth = np.zeros(18)
+    truth[: len(LENS)] = LENS
+    off = (c.fit.lens - truth)[c.model.free]
+    return float(off @ np.linalg.solve(c.covariance, off)) / len(off)
+
+
+def test_a_lens_from_circles_errs_by_its_sigmas_and_the_circles_are_measured():
+    c = calibrate_intrinsics(pictures(), QUICK)
+    assert nees(c) < 2.9  # of nine numbers: one set in 500 lies beyond
+    assert 2 * c.fit.radius_m == pytest.approx(SCENE.board.diameter_m, rel=0.005)
+    assert 0 < c.fit.radius_sigma_m < 0.006 * c.fit.radius_m
+    assert c.fit.sigma_px < 0.01
+
+
+def test_circles_taken_for_points_would_bias_the_lens_far_beyond_its_sigmas():
+    c = calibrate_intrinsics(replace(pictures(), circles=None), QUICK)
+    assert nees(c) > 8  # though the scatter between photographs has raised the sigmas
+
+
+def test_a_size_that_nothing_tells_is_solved_for():
+    c = calibrate_intrinsics(replace(pictures(), circles=CircleAreas()), QUICK)
+    assert nees(c) < 2.9
+    assert abs(2 * c.fit.radius_m - SCENE.board.diameter_m) < 4 * 2 * c.fit.radius_sigma_m
+    assert c.fit.radius_sigma_m > 0.005 * c.fit.radius_m  # less is known than with areas
+
+
+@pytest.mark.slow
+def test_a_stated_size_that_the_pictures_contradict_is_named_and_not_used():
+    areas = pictures().circles
+    assert areas is not None
+    c = calibrate_intrinsics(replace(pictures(), circles=replace(areas, diameter_m=0.012)), QUICK)
+    assert nees(c) < 2.9
+    about = next(f for f in c.findings if f.what.startswith("The circles measure"))
+    assert about.level is Level.WARN
+    assert "against the 12 mm stated" in about.what
+
+
+@pytest.mark.slow
+def test_a_stated_size_serves_where_areas_are_not_known():
+    c = calibrate_intrinsics(replace(pictures(), circles=CircleAreas(None, SCENE.board.diameter_m)), QUICK)
+    assert nees(c) < 2.9
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("text", ["acircles:4x11:20mm", "circles:9x7:25mm"])
+def test_claims_of_circle_calibrations_are_honest(text):
+    found = [nees(calibrate_intrinsics(table_of(CircleScene(parse(text)), seed), QUICK)) for seed in range(50, 58)]
+    assert 0.6 < np.mean(found) < 1.5  # 72 numbers: one mean in 1000 lies beyond

@@ -1,0 +1,100 @@
+"""The ladder's choice, lenses that fold, and what errors of a lens do over the picture."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calibration.lens.fit.hold_out import HeldOut, folds_of
+from calibration.lens.fit.lens_fit import AS_STATED, robust_fit
+from calibration.lens.fit.lens_models import LADDER, LensModel, folds_in_picture, named
+from calibration.lens.fit.lens_start import start
+from calibration.lens.fit.model_selection import Rung, choose
+from calibration.lens.fit.projection_map import difference, projection_map
+from geometry.arrays import Array
+from geometry.rotations import exp
+from tests.calibration.lens.lens_scenes import SIZE, TRUTH, WIDE, Scene, photographs
+
+
+def lens_of(numbers: tuple[float, ...]) -> Array:
+    return np.array([*numbers, *[0.0] * (18 - len(numbers))])
+
+
+def rung(title: str, errors_px2: list[float], refused: str = "") -> Rung:
+    errors = np.array(errors_px2)
+    return Rung(named(title), None, HeldOut(errors, (), float(np.sqrt(errors.mean()))), refused=refused)
+
+
+def test_the_smaller_model_is_taken_where_the_larger_one_gains_within_its_standard_error():
+    ladder = choose([rung("4", [1.0, 1.2, 0.9, 1.1]), rung("5", [0.9, 1.25, 0.92, 1.1])])
+    assert ladder.chosen.model.title == "4"
+    assert "within one standard error" in ladder.why
+
+
+def test_a_small_gain_in_every_view_counts_as_a_gain():
+    """Pairs tell: the views differ by far more than the two models do."""
+    ladder = choose([rung("4", [1.0, 5.2, 0.3, 9.1]), rung("5", [0.9, 5.1, 0.2, 9.0])])
+    assert ladder.chosen.model.title == "5"
+    assert "every smaller usable model errs more" in ladder.why
+
+
+def test_a_refused_model_is_never_chosen_however_well_it_predicts():
+    ladder = choose([rung("4", [1.0, 1.2, 0.9]), rung("8", [0.1, 0.1, 0.1], refused="it folds")])
+    assert ladder.chosen.model.title == "4"
+
+
+def test_folds_deal_out_every_view_once():
+    for count in (5, 10, 23):
+        views = np.arange(count) * 2
+        folds = folds_of(views)
+        assert sorted(np.concatenate(folds).tolist()) == views.tolist()
+        assert len(folds) == (count if count <= 10 else 5)
+
+
+def test_a_lens_that_shrinks_again_before_the_corner_folds_in_the_picture():
+    assert not folds_in_picture(lens_of(TRUTH), False, SIZE)
+    assert folds_in_picture(lens_of((1000.0, 1000, 640, 512, -0.8)), False, SIZE)
+    assert not folds_in_picture(lens_of(WIDE), True, SIZE)
+    assert folds_in_picture(lens_of((500.0, 500, 640, 512, -0.3)), True, SIZE)
+
+
+def test_only_the_numbers_of_the_model_stay():
+    everything = np.arange(1.0, 19.0)
+    assert np.count_nonzero(LensModel(4).cut(everything)) == 8
+    assert [int(m.free.sum()) for m in LADDER] == [4, 8, 9, 8, 12, 16]
+
+
+def test_a_turn_of_the_camera_makes_no_difference_on_the_map():
+    """Pixels move alike when the principal point moves and when the camera turns, near the middle of a long lens."""
+    model, lens = LensModel(0), lens_of((20000.0, 20000, 640, 512))
+    at = projection_map(model, lens, SIZE, 1.0)
+    by_cx, by_fx = at.by_parameter[..., 2], at.by_parameter[..., 0]
+    assert np.abs(by_cx).max() < 0.002  # of the 1 px that cx moves every pixel
+    assert np.abs(by_fx).max() > 0.03  # no turn does what a focal length does
+    # The turn that undoes it, done: pixels of turned rays with the other lens are the old ones.
+    turn = exp(np.array([0.0, -1.0 / 20000, 0.0]))
+    assert (turn @ [0, 0, 1])[0] * 20000 + 641 == pytest.approx(640, abs=1e-6)
+
+
+def test_sigmas_on_the_screen_are_those_in_the_picture_times_the_distance_over_the_focal_length():
+    model, lens = LensModel(0), lens_of((1000.0, 1000, 639.5, 511.5))
+    at = projection_map(model, lens, SIZE, 2.5)
+    C = np.diag([1.0, 1.0, 0.0, 0.0])
+    np.testing.assert_allclose(at.sigma_mm(C), at.sigma_px(C) * 2.5, rtol=1e-9)
+
+
+def test_the_map_foretells_how_far_pixels_scatter_between_calibrations():
+    """Independent sets of photographs: the pixels of one direction, best turn taken out, against the map's sigmas."""
+    fits = []
+    for seed in range(8):
+        table = photographs(Scene(views=8), 50 + seed)
+        _, values = start(table, False)
+        fits.append(robust_fit(table, LensModel(4), values, AS_STATED))
+    at = projection_map(fits[0].model, lens_of(TRUTH), SIZE, 1.0, columns=8)
+    ratios = [difference(at, a, b).ratio for a, b in zip(fits[::2], fits[1::2], strict=True)]
+    assert 0.5 < np.sqrt(np.mean(np.square(ratios))) < 1.6
+    same = difference(at, fits[0], replace(fits[0]))
+    assert same.rms_px == 0
+    assert same.p_value == 1

@@ -1,0 +1,138 @@
+"""The numbers of a rig: their names, how they move it, and their derivatives against differences."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from geometry.arrays import numeric_jacobian
+from geometry.camera import FISHEYE
+from geometry.forward_model import SpotModel
+from geometry.pose import Pose
+from geometry.rig import Rig
+from geometry.uncertainty.rig_parameters import RigCovariance, Sensitivity, is_known, moved, rig_names, split
+from geometry.uncertainty.rig_uncertainty import NEAR_M, CalibrationSpread
+from tests.geometry.scenes import LENSES, paper_rig, random_pose, random_rig
+
+seeds = st.integers(0, 2**32 - 1)
+
+
+def uncommon_rig(rng: np.random.Generator) -> Rig:
+    """Bent screens, one fisheye camera, the others with the fourteen numbers."""
+    rig = random_rig(rng)
+    screens = {n: replace(s, bow=tuple(rng.normal(0, 0.004, 3))) for n, s in rig.screens.items()}
+    cameras = {}
+    for i, (name, camera) in enumerate(rig.cameras.items()):
+        if i == 0:
+            cameras[name] = replace(camera, lens=FISHEYE, distortion=(0.01, -0.02, 0.003, 0.001))
+        else:
+            cameras[name] = replace(camera, distortion=LENSES[14])
+    return Rig(screens, cameras, rig.beams, rig.spots)
+
+
+@settings(max_examples=5, deadline=None)
+@given(seed=seeds)
+def test_every_derivative_is_the_difference_that_moving_the_number_makes(seed):
+    rng = np.random.default_rng(seed)
+    rig, pose = uncommon_rig(rng), random_pose(rng, 0.3, 0.3)
+    names = rig_names(rig, bow=True)
+    model = SpotModel.of(rig)
+    found = Sensitivity(rig, model, names).of(model.derivatives(pose))
+    expected = numeric_jacobian(lambda q: SpotModel.of(moved(rig, names, q)).project(pose)[0], np.zeros(len(names)))
+    # Spots far off the picture, where the lens bends most, have derivatives of thousands of px.
+    good = np.isfinite(model.project(pose)[0][:, 0])
+    np.testing.assert_allclose(found[good], expected[good], rtol=2e-5, atol=2e-3)
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=seeds)
+def test_pixels_and_pose_derivatives_are_those_of_project(seed):
+    rng = np.random.default_rng(seed)
+    rig, pose = uncommon_rig(rng), random_pose(rng, 0.3, 0.3)
+    model = SpotModel.of(rig)
+    pixels, J = model.project(pose)
+    found = model.derivatives(pose)
+    np.testing.assert_allclose(found.pixels, pixels, rtol=0, atol=1e-9)  # two ways to the same: numpy and compiled
+    good = np.isfinite(pixels[:, 0])
+    np.testing.assert_allclose(found.pose[good], J[good], rtol=1e-9, atol=1e-9)
+
+
+def test_a_stack_of_poses_gives_the_derivatives_of_each():
+    rng = np.random.default_rng(3)
+    rig = uncommon_rig(rng)
+    model = SpotModel.of(rig)
+    poses = Pose.from_ypr(rng.normal(0, 0.1, (4, 3)), rng.normal(0, 0.1, (4, 3)))
+    together = Sensitivity(rig, model, rig_names(rig)).of(model.derivatives(poses))
+    for k in range(4):
+        one = Sensitivity(rig, model, rig_names(rig)).of(model.derivatives(poses[k]))
+        np.testing.assert_allclose(together[k], one, rtol=1e-12, atol=1e-9)
+
+
+def test_every_name_is_known_and_splits_into_kind_thing_and_parameter():
+    rig = paper_rig(LENSES[5])
+    for name in rig_names(rig, bow=True):
+        assert is_known(rig, name)
+        assert ".".join(split(name)) == name
+    assert split("cameras.left.upper.fx") == ("cameras", "left.upper", "fx")
+
+
+@pytest.mark.parametrize(
+    "name", ["fx", "cameras.left.k4", "cameras.middle.fx", "screens.left.fx", "beams.A.length", "lights.a.b"]
+)
+def test_what_the_rig_does_not_have_is_not_known_and_cannot_be_moved(name):
+    rig = paper_rig(LENSES[5])
+    assert not is_known(rig, name)
+    with pytest.raises(KeyError):
+        moved(rig, [name], np.ones(1))
+    with pytest.raises(KeyError):
+        Sensitivity(rig, SpotModel.of(rig), [name])
+
+
+def test_moving_by_nothing_changes_no_number():
+    rig = uncommon_rig(np.random.default_rng(4))
+    names = rig_names(rig, bow=True)
+    same = SpotModel.of(moved(rig, names, np.zeros(len(names))))
+    model = SpotModel.of(rig)
+    np.testing.assert_allclose(same.pinhole, model.pinhole, rtol=0)
+    np.testing.assert_allclose(same.screen_rotation, model.screen_rotation, rtol=0)
+    np.testing.assert_allclose(same.ray, model.ray, rtol=0, atol=1e-15)
+
+
+def test_the_spread_of_the_pixels_is_that_of_rigs_drawn_from_the_covariance():
+    rng = np.random.default_rng(5)
+    rig, pose = paper_rig(LENSES[5]), Pose.identity()
+    names = rig_names(rig)
+    A = rng.normal(size=(len(names), len(names))) * 1e-4
+    A[[i for i, n in enumerate(names) if n.endswith((".fx", ".cy"))]] *= 3000
+    spread = CalibrationSpread(rig, SpotModel.of(rig), RigCovariance(names, A @ A.T)).at(pose)
+    draws = [
+        SpotModel.of(moved(rig, names, A @ rng.normal(size=len(names)))).project(pose)[0].ravel() for _ in range(1500)
+    ]
+    claimed, seen = np.sqrt(np.diagonal(spread)), np.std(draws, axis=0)
+    np.testing.assert_allclose(seen, claimed, rtol=0.08)  # 1500 draws scatter by 2 %
+    np.testing.assert_allclose(np.corrcoef(np.transpose(draws)), spread / np.outer(claimed, claimed), atol=0.12)
+
+
+def test_near_poses_share_one_spread_and_far_ones_do_not():
+    rig = paper_rig(LENSES[5])
+    names = ("cameras.left.fx", "beams.A.direction_y") if "A" in rig.beams else rig_names(rig)[:2]
+    spread = CalibrationSpread(rig, SpotModel.of(rig), RigCovariance(tuple(names), np.eye(2) * 1e-6))
+    first = spread.at(Pose.identity())
+    assert spread.at(Pose(np.eye(3), np.array([0.5 * NEAR_M, 0, 0]))) is first
+    assert spread.at(Pose(np.eye(3), np.array([3 * NEAR_M, 0, 0]))) is not first
+
+
+def test_views_without_a_projection_have_no_spread():
+    rig = paper_rig(LENSES[5], size_m=(1.0, 1.0))
+    model = SpotModel.of(rig)
+    pose = Pose.from_ypr(np.array([0.5, 0, 0]), np.zeros(3))
+    gone = np.isnan(model.project(pose)[0][:, 0])
+    assert gone.any()
+    names = rig_names(rig)
+    joint = CalibrationSpread(rig, model, RigCovariance(names, np.eye(len(names)) * 1e-8)).at(pose)
+    assert np.all(np.isfinite(joint))
+    assert np.all(np.diagonal(joint).reshape(-1, 2)[gone] == 0)

@@ -1,0 +1,146 @@
+"""A calibrated lab for the daily check: a rig with an honest covariance, the lab as it truly is, its dots and spots."""
+
+from __future__ import annotations
+
+import datetime
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from geometry.forward_model import SpotModel
+from geometry.pose import Pose
+from geometry.rig import Rig
+from geometry.rotations import exp
+from geometry.uncertainty.rig_parameters import camera_names, moved
+from lab.files.rig.calibration_state import CalibrationState
+from lab.files.rig.rig_file import Covariance, RigFile, save_rig
+from tests.geometry.scenes import LENSES, paper_rig
+
+DAY = datetime.date(2026, 5, 1)
+STATE = CalibrationState(datetime.date(2026, 3, 1), "PASS", datetime.date(2026, 9, 1))
+DOT_SIGMA_M = 1e-4
+
+
+def rig_and_covariance() -> tuple[Rig, Covariance]:
+    """The stored rig, and what a calibration from 60 dots of 0.15 px per camera leaves uncertain.
+
+    Numeric derivatives of the projection, so that nothing here shares code with the check.
+    """
+    rig = paper_rig(LENSES[5], (4.0, 3.0))
+    names: list[str] = []
+    blocks = []
+    for name, camera in rig.cameras.items():
+        own = [f"cameras.{name}.{p}" for p in camera_names(camera)]
+        x, y = np.meshgrid(np.linspace(-1.8, 1.8, 10), np.linspace(-1.3, 1.3, 6))
+        # Dots on two planes, as a calibration with boards has them: one plane alone leaves the focal length open.
+        z = 0.8 * ((np.arange(x.size) % 2) - 0.5)
+        pose = rig.screens[camera.screen].world_from_screen
+        dots = pose.apply(np.stack([x.ravel(), y.ravel(), z], axis=-1))
+        J = np.empty((dots.shape[0] * 2, len(own)))
+        for k, parameter in enumerate(own):
+            step = np.zeros(len(own))
+            step[k] = 1e-3 if parameter.endswith((".fx", ".fy", ".cx", ".cy")) else 1e-6
+            ends = [moved(rig, own, s * step).cameras[name].project(dots).ravel() for s in (1, -1)]
+            J[:, k] = (ends[0] - ends[1]) / (2 * step[k])
+        names += own
+        blocks.append(np.linalg.inv(J.T @ J / 0.15**2))
+    size = len(names)
+    matrix = np.zeros((size, size))
+    at = 0
+    for block in blocks:
+        matrix[at : at + len(block), at : at + len(block)] = block
+        at += len(block)
+    return rig, Covariance(tuple(names), matrix)
+
+
+def true_rig(rig: Rig, covariance: Covariance, rng: np.random.Generator) -> Rig:
+    """The rig as it really is: the stored one is off by what its covariance says."""
+    values, vectors = np.linalg.eigh(covariance.matrix)
+    return moved(rig, covariance.parameters, vectors @ (np.sqrt(np.maximum(values, 0)) * rng.normal(size=len(values))))
+
+
+def turned(rig: Rig, camera: str, degrees: float, axis: int = 1) -> Rig:
+    """With a camera turned about one of its own axes."""
+    old = rig.cameras[camera]
+    turn = np.zeros(3)
+    turn[axis] = np.deg2rad(degrees)
+    new = replace(old, camera_from_world=Pose(exp(turn), np.zeros(3)) @ old.camera_from_world)
+    return Rig(rig.screens, {**rig.cameras, camera: new}, rig.beams, rig.spots)
+
+
+def dots(rig: Rig) -> dict[str, tuple[str, np.ndarray]]:
+    """Five dots on each screen: name, the screen, its place on the screen (2,), m."""
+    places = [(-1.0, -0.8), (1.0, -0.8), (1.0, 0.8), (-1.0, 0.8), (0.1, 0.0)]
+    return {f"{s[0].upper()}{i}": (s, np.array(p)) for s in rig.screens for i, p in enumerate(places, 1)}
+
+
+def write_rig(folder: Path, rig: Rig, covariance: Covariance | None, state: CalibrationState | None = STATE) -> Path:
+    """rig.yaml of a calibrated lab."""
+    path = folder / "rig.yaml"
+    save_rig(RigFile(rig, {} if covariance is None else {"target": covariance}, state), path)
+    return path
+
+
+def write_points(
+    folder: Path,
+    today: Rig,
+    rng: np.random.Generator,
+    *,
+    wrong: dict[str, tuple[float, float]] | None = None,
+    on_screens: bool = False,
+    sigma_px: float = 0.1,
+) -> tuple[Path, Path]:
+    """points.csv and survey.csv of a check on a day on which the lab is `today`; wrong: px that dots are off by."""
+    pixels, survey = ["camera,point,u_px,v_px,sigma_px"], []
+    survey.append("point,screen,x_m,y_m,sigma_x_m,sigma_y_m" if on_screens else
+                  "point,x_m,y_m,z_m,sigma_x_m,sigma_y_m,sigma_z_m")  # fmt: skip
+    for name, (screen, place) in dots(today).items():
+        pose = today.screens[screen].world_from_screen
+        error = rng.normal(0, DOT_SIGMA_M, 3)
+        if on_screens:
+            real = pose.apply(np.array([*(place + error[:2]), 0.0]))
+            survey.append(f"{name},{screen},{place[0]:.7f},{place[1]:.7f},{DOT_SIGMA_M},{DOT_SIGMA_M}")
+        else:
+            told = pose.apply(np.array([*place, 0.0]))
+            real = told + error
+            survey.append(f"{name}," + ",".join(f"{v:.7f}" for v in told) + f",{DOT_SIGMA_M}" * 3)
+        for camera in today.cameras.values():
+            if camera.screen != screen:
+                continue
+            uv = camera.project(real) + rng.normal(0, sigma_px, 2) + np.array((wrong or {}).get(name, (0.0, 0.0)))
+            pixels.append(f"{camera.name},{name},{uv[0]:.5f},{uv[1]:.5f},{sigma_px}")
+    (folder / "points.csv").write_text("\n".join(pixels) + "\n")
+    (folder / "survey.csv").write_text("\n".join(survey) + "\n")
+    return folder / "points.csv", folder / "survey.csv"
+
+
+SPOTS_HEADER = (
+    "frame,t_s,camera,spot,u_px,v_px,sigma_u_px,sigma_v_px,status,predicted_u_px,predicted_v_px,gain,cov_uv_px2"
+)
+ATTITUDE_HEADER = (
+    "frame,t_s,x_m,y_m,z_m,qw,qx,qy,qz,yaw_deg,pitch_deg,roll_deg,sigma_x_m,sigma_y_m,sigma_z_m,"
+    "sigma_yaw_deg,sigma_pitch_deg,sigma_roll_deg,spots_used,rms_px,status"
+)
+
+
+def write_still(
+    folder: Path, today: Rig, pose: Pose, rng: np.random.Generator, *, frames: int = 50, wander_px: float = 0.0
+) -> Path:
+    """spots.csv, attitude.csv and pose.csv of a vehicle at rest, seen with 0.05 px noise."""
+    folder.mkdir(parents=True, exist_ok=True)
+    model = SpotModel.of(today)
+    uv = model.derivatives(pose).pixels
+    rows, attitude = [SPOTS_HEADER], [ATTITUDE_HEADER]
+    p, q = pose.translation, pose.quaternion_wxyz
+    seven = ",".join(f"{v:.9f}" for v in (*p, *q))
+    for frame in range(frames):
+        t = frame / 100
+        seen = uv + rng.normal(0, 0.05, uv.shape) + wander_px * frame / frames
+        for (camera, spot), (u, v) in zip(model.views, seen.tolist(), strict=True):
+            rows.append(f"{frame},{t},{camera},{spot},{u:.4f},{v:.4f},0.05,0.05,matched,{u:.4f},{v:.4f},0.5,0")
+        attitude.append(f"{frame},{t},{seven},0,0,0,0.001,0.001,0.001,0.01,0.01,0.01,6,0.05,measured")
+    (folder / "spots.csv").write_text("\n".join(rows) + "\n")
+    (folder / "attitude.csv").write_text("\n".join(attitude) + "\n")
+    (folder / "pose.csv").write_text(f"frame,t_s,x_m,y_m,z_m,qw,qx,qy,qz\n0,0,{seven}\n")
+    return folder

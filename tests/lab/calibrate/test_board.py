@@ -1,0 +1,94 @@
+"""Printed boards are to scale, described by a file that says the same, and complete or absent."""
+
+from __future__ import annotations
+
+import re
+import struct
+import zlib
+
+import cv2
+import numpy as np
+import pytest
+
+from calibration.boards.board_detection import BoardView, find_board
+from calibration.boards.board_types import parse
+from lab.calibrate.board.board import write_board
+from lab.calibrate.board.board_page import as_pdf, lay_out
+from lab.errors import InputError
+from lab.files.rig.board_file import board_of, load_board
+
+TEXTS = ["chessboard:9x6:25mm", "acircles:4x11:20mm", "charuco:5x7:36mm:27mm:DICT_4X4_50:inverted"]
+
+
+@pytest.mark.parametrize("text", TEXTS)
+def test_a_printed_picture_shows_the_board_at_its_size(tmp_path, text):
+    outcome = write_board(text, tmp_path / "b", dpi=300)
+    data = (tmp_path / "b" / "board.png").read_bytes()
+    at = data.index(b"pHYs")
+    per_metre, same, unit = struct.unpack(">IIB", data[at + 4 : at + 13])
+    assert (per_metre, unit) == (same, 1)
+    image = np.asarray(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE), dtype=np.uint8)
+    view = find_board(image, outcome.board)
+    assert isinstance(view, BoardView)
+    assert len(view) == len(outcome.board.ids)
+    mm = 1000 * view.pixels / per_metre
+    np.testing.assert_allclose(mm - mm[0], 1000 * outcome.board.points[:, :2], atol=0.02)  # a printer's own error
+    assert load_board(tmp_path / "b" / "board.yaml") == outcome.board
+    assert outcome.exit_status == 0
+    assert "measure the bar of 100 mm" in outcome.line()
+
+
+@pytest.mark.parametrize("text", TEXTS)
+def test_the_pdf_holds_the_same_shapes_in_millimetres(text):
+    page = lay_out(parse(text))
+    pdf = as_pdf(page)
+    content = zlib.decompress(re.search(rb"stream\n(.*?)\nendstream", pdf, re.DOTALL)[1]).decode()
+    scale = float(content.split()[0])
+    assert scale == pytest.approx(72 / 25.4)
+    found = np.array([[float(v) for v in row] for row in re.findall(r"(\S+) (\S+) (\S+) (\S+) re", content)])
+    wanted = [page.rectangles_mm(layer) for layer in page.drawing.layers] + [page.bar_parts_mm()]
+    np.testing.assert_allclose(found, np.concatenate(wanted), atol=1e-5)
+    for number, place in enumerate(re.findall(rb"(\d{10}) 00000 n", pdf), 1):
+        assert pdf[int(place) :].startswith(b"%d 0 obj" % number)
+
+
+def test_a_board_too_large_for_the_page_is_refused_with_the_cure(tmp_path):
+    with pytest.raises(InputError, match=r"300 x 210 mm do not fit on A4; take A3 .*, or make 25\.1 mm of the 30 mm"):
+        write_board("chessboard:9x6:30mm", tmp_path / "b")
+    assert list(tmp_path.iterdir()) == []
+    assert write_board("chessboard:9x6:30mm", tmp_path / "b", page="fit").page == "fit"
+
+
+def test_a_folder_with_something_else_in_it_is_left_alone(tmp_path):
+    (tmp_path / "thesis.tex").write_text("years")
+    with pytest.raises(InputError, match="choose another"):
+        write_board("chessboard:9x6:20mm", tmp_path)
+    assert [p.name for p in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+def test_a_file_with_mistakes_is_answered_with_its_field(tmp_path):
+    path = tmp_path / "board.yaml"
+    path.write_text("schema: beampose/board/1\nkind: chessboard\ncolumns: 9\nrows: 6\nspacing_m: 0.025\n")
+    with pytest.raises(InputError, match=r"board\.yaml: expected square_m for a board of kind 'chessboard'"):
+        board_of(path)
+    with pytest.raises(InputError, match=r"expected a length with its unit .* or name a board\.yaml"):
+        board_of("chessboard:9x6:25")
+
+
+@pytest.mark.parametrize("name", ["x.jpg", "board.yaml", "board.PDF2"])
+def test_a_file_of_another_kind_is_refused_instead_of_becoming_a_folder(tmp_path, name):
+    with pytest.raises(InputError, match=r"expected a folder, or a file ending in \.pdf, \.svg, \.png, got \."):
+        write_board("chessboard:9x6:20mm", tmp_path / name)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_may_have_a_dot_in_its_name(tmp_path):
+    write_board("chessboard:9x6:20mm", tmp_path / "boards-v1.2", ["svg"])
+    assert (tmp_path / "boards-v1.2" / "board.svg").is_file()
+
+
+def test_a_marker_too_large_for_its_square_is_not_printed_and_the_largest_one_is_told(tmp_path):
+    with pytest.raises(InputError, match=r"only 0\.01 of a marker's dots .* make the markers 29\.1 mm or smaller"):
+        write_board("charuco:5x7:36mm:35.9mm:DICT_4X4_50", tmp_path / "b")
+    assert list(tmp_path.iterdir()) == []
+    write_board("charuco:5x7:36mm:29.1mm:DICT_4X4_50", tmp_path / "b", ["svg"])

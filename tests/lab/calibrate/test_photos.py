@@ -1,0 +1,141 @@
+"""Photographs of a board: which files are read, and what is said of those that are of no use."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from calibration.boards.board_detection import NO_CLOSE_LOOK, find_board
+from calibration.boards.board_types import parse
+from geometry.camera import Camera
+from geometry.pose import Pose
+from lab.calibrate.camera import photos as photos_module
+from lab.calibrate.camera.photos import PhotoSet, find_in_photos, load_photos, origins_of
+from lab.errors import InputError
+from lab.simulate.board_photo import Look, photograph
+
+BOARD = parse("chessboard:9x6:25mm")
+
+
+@pytest.fixture(scope="module")
+def picture() -> np.ndarray:
+    camera = Camera("c", "s", (400, 300), np.array([[500.0, 0, 200], [0, 500, 150], [0, 0, 1]]), (), Pose.identity())
+    at = Pose(np.eye(3), np.array([0, 0, 0.5]) - BOARD.middle)
+    return photograph(BOARD, camera, at, look=Look(samples=16)).image
+
+
+def test_pictures_of_every_kind_are_read_in_natural_order(tmp_path, picture):
+    for k in (1, 2, 10):
+        cv2.imwrite(str(tmp_path / f"shot-{k}.png"), np.clip(picture.astype(int) + k, 0, 255).astype(np.uint8))
+    cv2.imwrite(str(tmp_path / "shot-11.png"), 100 + picture.astype(np.uint16) * 7)  # 16 bits, of which 11 are used
+    cv2.imwrite(str(tmp_path / "shot-12.jpg"), cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR))
+    (tmp_path / "shot-13.png").write_bytes(b"")
+    steps = []
+    photos = find_in_photos([tmp_path, tmp_path / "shot-1.png"], BOARD, lambda *step: steps.append(step))
+    assert [name for name, _ in photos.views] == [f"shot-{k}" for k in ("1.png", "2.png", "10.png", "11.png", "12.jpg")]
+    assert photos.refused == (("shot-13.png", "unreadable: the file is empty"),)
+    assert photos.image_size_px == (400, 300)
+    assert steps[-1] == (6, 6, "shot-13.png")
+    first = photos.views[0][1].pixels
+    for _, view in photos.views:
+        np.testing.assert_allclose(view.pixels, first, atol=0.05)
+
+
+def test_the_same_picture_twice_counts_once(tmp_path, picture):
+    for name in "abc":
+        cv2.imwrite(str(tmp_path / f"{name}.png"), picture)
+    with pytest.raises(InputError, match=r"found in 1 of 3 pictures, 3 or more .*\(2 of 2.*the same picture as a"):
+        find_in_photos([tmp_path], BOARD)
+
+
+def test_mixed_sizes_name_the_pictures(tmp_path, picture):
+    for k in range(3):
+        cv2.imwrite(str(tmp_path / f"a{k}.png"), picture + np.uint8(k))
+    cv2.imwrite(str(tmp_path / "b.png"), picture[:, ::2])
+    with pytest.raises(InputError, match=r"different sizes: 400x300 \(a0.png, a1.png, a2.png\), 200x300 \(b.png\)"):
+        find_in_photos([tmp_path / "*.png"], BOARD)
+
+
+def test_what_names_no_picture_is_said(tmp_path):
+    for given, words in (
+        ([], "no pictures given"),
+        ([tmp_path], "holds no pictures"),
+        ([tmp_path / "x.png"], "found nothing; check the path"),
+        ([tmp_path / "*.png"], "no picture matches"),
+    ):
+        with pytest.raises(InputError, match=words):
+            load_photos(given)
+
+
+def test_the_commonest_reason_is_told(tmp_path, picture):
+    for k in range(3):
+        cv2.imwrite(str(tmp_path / f"a{k}.png"), picture + np.uint8(k))
+    with pytest.raises(
+        InputError, match=r"found in none of 3 pictures; .*\(2 of 2, first a0.png\): .*9x6.*in 1 more no board"
+    ):
+        find_in_photos([tmp_path], parse("chessboard:7x7:25mm"))
+
+
+def test_copies_of_a_picture_without_a_board_do_not_hide_why_it_was_refused(tmp_path):
+    for name in "abcd":
+        cv2.imwrite(str(tmp_path / f"{name}.png"), np.full((300, 400), 90, dtype=np.uint8))
+    with pytest.raises(InputError, match=r"\(1 of 1, first a.png\): hardly any contrast.*; 3 more are copies"):
+        find_in_photos([tmp_path], BOARD)
+
+
+def test_only_the_first_pictures_without_a_board_are_looked_at_closely(tmp_path, picture, monkeypatch):
+    """And once a picture shows the board, the others after all: none is lost to a quick look."""
+    looks = []
+
+    def noted(image, board, closely=True):
+        looks.append(closely)
+        return find_board(image, board, closely)
+
+    monkeypatch.setattr(photos_module, "find_board", noted)
+    wall = np.random.default_rng(0).integers(60, 190, picture.shape).astype(np.uint8)
+    for k in range(4):
+        cv2.imwrite(str(tmp_path / f"a{k}.png"), np.roll(wall, k))
+    with pytest.raises(
+        InputError, match=r"none of 4 pictures; .*\(2 of 2, first a0.png\).*in 2 more no board was seen"
+    ):
+        find_in_photos([tmp_path], BOARD)
+    assert looks == [True, True, False, False]
+    for k in range(3):
+        cv2.imwrite(str(tmp_path / f"b{k}.png"), picture + np.uint8(k))
+    looks.clear()
+    found = find_in_photos([tmp_path], BOARD)
+    assert looks == [True, True, False, False, False, True, True, True, True]
+    assert [name for name, _ in found.views] == ["b0.png", "b1.png", "b2.png"]
+    assert [name for name, _ in found.refused] == ["a0.png", "a1.png", "a2.png", "a3.png"]
+    assert {reason for _, reason in found.refused} == {found.refused[0][1]}
+
+
+def test_a_film_that_shows_a_charuco_board_now_and_then_has_the_cause_of_ten_frames_only(tmp_path, monkeypatch):
+    board = parse("charuco:5x4:40mm:30mm:DICT_4X4_50")
+    camera = Camera("c", "s", (400, 300), np.array([[500.0, 0, 200], [0, 500, 150], [0, 0, 1]]), (), Pose.identity())
+    seen = photograph(board, camera, Pose(np.eye(3), np.array([0, 0, 0.5]) - board.middle), look=Look(samples=9)).image
+    wall = np.random.default_rng(0).integers(60, 190, seen.shape).astype(np.uint8)
+    monkeypatch.setattr(photos_module, "_CAUSES", 3)
+    for k in range(12):
+        cv2.imwrite(str(tmp_path / f"{k}.png"), seen + np.uint8(k) if k % 4 == 3 else np.roll(wall, k))
+    found = find_in_photos([tmp_path], board)
+    assert [name for name, _ in found.views] == ["3.png", "7.png", "11.png"]
+    quick = [name for name, reason in found.refused if reason == NO_CLOSE_LOOK.reason]
+    assert quick == ["2.png", "5.png", "6.png", "8.png", "9.png", "10.png"]
+    assert "(3 of 3, first 0.png)" in found.line()
+
+
+def test_where_a_picture_comes_from_is_told_by_folder_video_or_name(picture):
+    def origins(*paths):
+        names = [str(k) for k in range(len(paths))]
+        where = {name: Path(path) for name, path in zip(names, paths, strict=True)}
+        return origins_of(PhotoSet(BOARD, (400, 300), tuple((n, picture) for n in names), (), where))
+
+    assert origins("left01.jpg", "left12.jpg", "right01.jpg") == ("left", "left", "right")
+    assert origins("IMG_0001_a.jpg", "IMG_0002_a.jpg", "IMG_0001_b.jpg") == ("IMG_a", "IMG_a", "IMG_b")
+    assert origins("cam0_001.png", "cam0_002.png", "cam1_001.png") == ("cam0", "cam0", "cam1")
+    assert origins("cam_0.mp4", "cam_0.mp4", "cam_1.mp4") == ("cam_0.mp4", "cam_0.mp4", "cam_1.mp4")
+    assert origins("l/01.png", "l/02.png", "r/01.png") == ("l/", "l/", "r/")

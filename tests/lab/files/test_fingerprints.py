@@ -1,0 +1,84 @@
+"""A result can be tied to what went in: a changed input has another fingerprint, the same input the same."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from pathlib import Path
+
+import pytest
+
+from lab.files.run import fingerprints as module
+from lab.files.run.fingerprints import fingerprints
+from lab.files.run.run_file import load_run
+from tests.lab.run_folders import edit, write_run
+
+
+def by_name(folder: Path) -> dict[str, dict]:
+    return {str(Path(entry["path"]).relative_to(folder)): entry for entry in fingerprints(load_run(folder))}
+
+
+def test_every_input_has_one_entry_with_its_digest_and_size(tmp_path):
+    folder = write_run(tmp_path / "run")
+    entries = by_name(folder)
+    assert list(entries) == ["run.yaml", "rig.yaml", "frames/left", "frames/right"]
+    for name in ("run.yaml", "rig.yaml"):
+        content = (folder / name).read_bytes()
+        assert entries[name]["sha256"] == hashlib.sha256(content).hexdigest()
+        assert entries[name]["bytes"] == len(content)
+        assert entries[name]["covers"] == "contents"
+    pictures = list((folder / "frames/left").iterdir())
+    assert entries["frames/left"]["bytes"] == sum(p.stat().st_size for p in pictures)
+    assert entries["frames/left"]["covers"] == "names and sizes"
+
+
+def test_the_same_inputs_have_the_same_fingerprints_wherever_they_lie(tmp_path):
+    one, other = (by_name(write_run(tmp_path / name / "run")) for name in ("a", "b"))
+    assert {n: e["sha256"] for n, e in one.items()} == {n: e["sha256"] for n, e in other.items()}
+
+
+def test_a_timestamps_file_is_an_input(tmp_path):
+    folder = write_run(tmp_path / "run")
+    (folder / "times.csv").write_text("frame,t_s\n" + "".join(f"{k},{k * 0.01}\n" for k in range(5)))
+    edit(folder / "run.yaml", "frame_rate_hz: 100.0\n", "frame_rate_hz: 100.0\ntimestamps: times.csv\n")
+    assert "times.csv" in by_name(folder)
+
+
+@pytest.mark.parametrize("change", ["rename", "grow", "remove", "add"])
+def test_a_changed_folder_of_pictures_has_another_digest(tmp_path, change):
+    folder = write_run(tmp_path / "run")
+    before = by_name(folder)
+    picture = folder / "frames/left/000002.png"
+    match change:
+        case "rename":
+            picture.rename(picture.with_name("000007.png"))
+        case "grow":
+            picture.write_bytes(picture.read_bytes() + b"\0")
+        case "remove":
+            picture.unlink()
+        case "add":
+            picture.with_name("000009.png").write_bytes(picture.read_bytes())
+    after = by_name(folder)
+    assert after["frames/left"]["sha256"] != before["frames/left"]["sha256"]
+    assert after["frames/right"] == before["frames/right"]
+
+
+def test_a_table_of_both_cameras_is_listed_once(tmp_path):
+    folder = write_run(tmp_path / "run")
+    (folder / "detections.csv").write_text(
+        "frame,camera,u_px,v_px,sigma_u_px,sigma_v_px,flux,peak,major_px,minor_px,angle_deg,cov_uv_px2\n"
+    )
+    for camera in ("left", "right"):
+        edit(folder / "run.yaml", f"{{frames: frames/{camera}}}", "{detections: detections.csv}")
+    assert list(by_name(folder)) == ["run.yaml", "rig.yaml", "detections.csv"]
+
+
+def test_of_a_huge_file_the_beginning_and_the_size_are_covered(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "LARGEST_FILE", 1000)
+    folder = write_run(tmp_path / "run")
+    rig = folder / "rig.yaml"
+    rig.write_text(rig.read_text() + "# " + "x" * 2000 + "\n")
+    entry = by_name(folder)["rig.yaml"]
+    assert entry["covers"] == "the first 1000 bytes"
+    assert entry["sha256"] == hashlib.sha256(rig.read_bytes()[:1000]).hexdigest()
+    assert entry["bytes"] == os.path.getsize(rig)

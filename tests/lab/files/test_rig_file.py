@@ -1,0 +1,409 @@
+"""rig.yaml: what is read is what the file says, what is written reads back, and each mistake has its line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from geometry.camera import Camera, SensorNoise
+from geometry.pose import Pose
+from geometry.rig import Beam, Rig, Screen, Spot
+from lab.errors import InputError
+from lab.files.rig.rig_file import Covariance, RigFile, load_rig, load_rig_file, save_rig
+from lab.files.text import yaml_text
+from lab.files.text.yaml_text import FileError
+from tests.lab.run_folders import RIG
+
+QUATERNION = "quaternion_wxyz: [0.5, -0.5, 0.5, 0.5]"
+BEAM_A = "A: {direction: [1.0, 0.0, 0.0], point_m: [0, 0, 0]}"
+SPOT_6 = '"6": {beam: C, end: "+", screen: right}'
+
+
+def written(folder: Path, text: str) -> Path:
+    path = folder / "rig.yaml"
+    path.write_text(text)
+    return path
+
+
+def test_a_rig_is_what_its_file_says(tmp_path):
+    rig = load_rig(written(tmp_path, RIG))
+    assert list(rig.cameras) == ["left", "right"]
+    assert list(rig.spots) == ["1", "2", "3", "4", "5", "6"]
+    assert rig.cameras["left"].image_size_px == (64, 48)
+    assert rig.cameras["left"].noise == SensorNoise(38.0, 30.0, 8.0)
+    assert rig.cameras["right"].distortion == (-0.05, 0.01, 1e-3, 0.0, 0.0)
+    assert rig.screens["left"].size_m == (4.0, 3.0)
+    assert (rig.spots["2"].beam, rig.spots["2"].sign, rig.spots["5"].sign) == ("B", -1, 1)
+    # the contract's example: screen x, y, z = world y, z, x
+    np.testing.assert_array_equal(rig.screens["left"].world_from_screen.apply([1, 2, 3]), [3 - 2.5, 1, 2])
+    np.testing.assert_allclose(rig.beams["B"].direction, np.array([1, 0.3, 0]) / np.hypot(1, 0.3), rtol=1e-15)
+
+
+def same(a: Rig, b: Rig) -> None:
+    """Fails unless two rigs are equal to the last bit."""
+    assert list(a.screens) == list(b.screens)
+    assert a.spots == b.spots
+    for x, y in zip(a.screens.values(), b.screens.values(), strict=True):
+        assert x.size_m == y.size_m
+        np.testing.assert_array_equal(x.world_from_screen.rotation, y.world_from_screen.rotation)
+        np.testing.assert_array_equal(x.world_from_screen.translation, y.world_from_screen.translation)
+    for c, d in zip(a.cameras.values(), b.cameras.values(), strict=True):
+        assert (c.name, c.screen, c.image_size_px, c.distortion, c.noise) == (
+            d.name, d.screen, d.image_size_px, d.distortion, d.noise,
+        )  # fmt: skip
+        np.testing.assert_array_equal(c.matrix, d.matrix)
+        np.testing.assert_array_equal(c.camera_from_world.rotation, d.camera_from_world.rotation)
+        np.testing.assert_array_equal(c.camera_from_world.translation, d.camera_from_world.translation)
+    for p, q in zip(a.beams.values(), b.beams.values(), strict=True):
+        assert p.name == q.name
+        np.testing.assert_array_equal(p.direction, q.direction)
+        np.testing.assert_array_equal(p.point, q.point)
+
+
+def test_there_and_back_changes_no_bit_of_the_small_lab(tmp_path):
+    rig = load_rig(written(tmp_path, RIG))
+    save_rig(rig, tmp_path / "again.yaml")
+    same(rig, load_rig(tmp_path / "again.yaml"))
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_there_and_back_changes_no_number_of_any_rig(seed, tmp_path_factory):
+    """All plain numbers to the last bit. Rotations to 4e-16 an entry: two units in the last place of 1, since some
+    rotation matrices are the image of no quaternion at all."""
+    rng = np.random.default_rng(seed)
+
+    def pose() -> Pose:
+        return Pose.from_quaternion(rng.normal(size=4), rng.normal(size=3) * 10.0 ** rng.integers(-9, 4))
+
+    rig = Rig(
+        screens={"on": Screen("on", pose(), tuple(rng.uniform(1e-3, 9, 2)))},
+        cameras={
+            "1e-3": Camera(
+                "1e-3", "on", (640, 480),
+                np.array([[rng.uniform(1, 5e3), 0, rng.normal()], [0, rng.uniform(1, 5e3), rng.normal()], [0, 0, 1]]),
+                tuple(rng.normal(size=14) * 1e-3), pose(), SensorNoise(1 / 3, 0.1, -0.7),
+            )
+        },
+        beams={n: Beam(n, rng.normal(size=3), rng.normal(size=3)) for n in ("007", "true")},
+        spots={"~": Spot("~", "007", -1, "on"), "0x1": Spot("0x1", "true", 1, "on")},
+    )  # fmt: skip
+    path = tmp_path_factory.mktemp("rigs") / "rig.yaml"
+    save_rig(rig, path)
+    back = load_rig(path)
+    assert list(back.cameras) == ["1e-3"]
+    assert back.spots == rig.spots
+    before, after = rig.cameras["1e-3"], back.cameras["1e-3"]
+    assert after.distortion == before.distortion
+    assert after.noise == before.noise
+    np.testing.assert_array_equal(after.matrix, before.matrix)
+    np.testing.assert_array_equal(after.camera_from_world.translation, before.camera_from_world.translation)
+    turn = after.camera_from_world.rotation - before.camera_from_world.rotation
+    assert np.abs(turn).max() <= 4e-16
+    for name in rig.beams:
+        np.testing.assert_array_equal(back.beams[name].point, rig.beams[name].point)
+        np.testing.assert_allclose(back.beams[name].direction, rig.beams[name].direction, rtol=0, atol=2e-16)
+
+
+def test_most_rotations_that_come_from_a_quaternion_keep_their_last_bit(tmp_path):
+    rng = np.random.default_rng(5)
+    kept = 0
+    for _ in range(40):
+        pose = Pose.from_quaternion(rng.normal(size=4), np.zeros(3))
+        rig = load_rig(written(tmp_path, RIG))
+        rig = Rig({**rig.screens, "left": Screen("left", pose)}, rig.cameras, rig.beams, rig.spots)
+        save_rig(rig, tmp_path / "again.yaml")
+        kept += np.array_equal(
+            load_rig(tmp_path / "again.yaml").screens["left"].world_from_screen.rotation, pose.rotation
+        )
+    assert kept >= 38
+
+
+def test_covariance_blocks_are_read_past_and_kept(tmp_path):
+    block = "    covariance: {parameters: [fx, fy], matrix: [[1.0, 0.1], [0.1, 2.0]]}\n"
+    text = RIG.replace("    noise: {gain", block + "    noise: {gain")
+    text += "  covariance: {parameters: [A.x], matrix: [[1e-8]]}\n"
+    file = load_rig_file(written(tmp_path, text))
+    assert set(file.covariances) == {"cameras.left", "target"}
+    save_rig(file, tmp_path / "again.yaml")
+    again = load_rig_file(tmp_path / "again.yaml")
+    assert again.covariances["cameras.left"].parameters == ("fx", "fy")
+    np.testing.assert_array_equal(again.covariances["cameras.left"].matrix, [[1.0, 0.1], [0.1, 2.0]])
+    np.testing.assert_array_equal(again.covariances["target"].matrix, [[1e-8]])
+    same(load_rig(tmp_path / "again.yaml"), load_rig(written(tmp_path, RIG)))
+
+
+def test_a_file_that_cannot_be_finished_leaves_the_old_one(tmp_path, monkeypatch):
+    path = written(tmp_path, RIG)
+    rig = load_rig(path)
+
+    def full_disk(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(yaml_text.os, "fsync", full_disk)
+    with pytest.raises(InputError, match="cannot be written: No space left"):
+        save_rig(RigFile(rig, {"target": Covariance(("a",), np.eye(1))}), path)
+    assert path.read_text() == RIG
+    assert [p.name for p in tmp_path.iterdir()] == ["rig.yaml"]
+
+
+def test_a_rig_that_could_not_be_loaded_is_not_saved(tmp_path):
+    rig = load_rig(written(tmp_path, RIG))
+    nowhere = Screen("left", Pose(np.eye(3), np.array([np.nan, 0, 0])))
+    with pytest.raises(InputError, match=r"screens\.left\.world_from_screen\.translation_m: expected a finite number"):
+        save_rig(Rig({**rig.screens, "left": nowhere}, rig.cameras, rig.beams, rig.spots), tmp_path / "rig.yaml")
+    assert (tmp_path / "rig.yaml").read_text() == RIG
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("schema:", "\ufeffschema:"),  # a byte order mark
+        ('    "1": {beam: A', "    1: {beam: A"),  # a number as a name
+        (
+            "fx: 40.0, fy: 40.0, cx: 31.5, cy: 23.5}\n    distortion: []",
+            "fx: 4e1, fy: +40, cx: 315e-1, cy: 23.5}\n    distortion: []",
+        ),
+        (QUATERNION, "quaternion_wxyz: [-0.5, 0.5, -0.5, -0.5]"),  # the same turn
+        (QUATERNION, "quaternion_wxyz: [0.5000002, -0.5, 0.5, 0.5]"),  # seven digits are unit enough
+        (
+            "image_size_px: [64, 48]\n    camera_matrix: {fx: 40.0, fy: 40.0, cx: 31.5, cy: 23.5}\n    distortion: []",
+            "image_size_px: [64.0, 48]\n    camera_matrix: {fx: 40.0, fy: 40.0, cx: 31.5, cy: 23.5}",
+        ),
+        ("\n", "\r\n"),
+    ],
+)
+def test_other_spellings_mean_the_same(old, new, tmp_path):
+    assert old in RIG
+    (tmp_path / "rig.yaml").write_bytes(RIG.replace(old, new).encode())
+    rig, plain = load_rig(tmp_path / "rig.yaml"), load_rig(written(tmp_path, RIG))
+    assert rig.spots == plain.spots
+    for name, camera in plain.cameras.items():
+        assert rig.cameras[name].image_size_px == camera.image_size_px
+        assert rig.cameras[name].distortion == camera.distortion
+        np.testing.assert_array_equal(rig.cameras[name].matrix, camera.matrix)
+        turn = rig.cameras[name].camera_from_world.rotation - camera.camera_from_world.rotation
+        assert np.abs(turn).max() < 1e-6
+
+
+def test_names_that_look_like_numbers_or_switches_stay_names(tmp_path):
+    text = RIG.replace("screen: right", "screen: on").replace("  right:\n    world", "  on:\n    world")
+    text = text.replace("beam: A", "beam: 007").replace("    A: {", "    007: {")
+    rig = load_rig(written(tmp_path, text))
+    assert set(rig.screens) == {"left", "on"}
+    assert rig.spots["1"].beam == "007"
+
+
+# (what is replaced, by what, the words that the message must have)
+BROKEN = [
+    (
+        "schema: beampose/rig/1",
+        "schema: beampose/rig/2",
+        "rig.yaml: schema: expected 'beampose/rig/1', got 'beampose/rig/2'",
+    ),
+    ("schema: beampose/rig/1\n", "", "rig.yaml: schema: expected a value, got nothing"),
+    ("schema: beampose/rig/1", "schema: [", "rig.yaml: line 3: expected YAML"),
+    ("screens:\n", "screens:\n\t", "rig.yaml: line 3: expected YAML, found a tab; indent with spaces"),
+    ("  beams:\n", "  beams: {}\n  old:\n", "target: unknown key 'old'; known: beams, spots, covariance"),
+    ("target:\n", "taget:\n", "rig.yaml: unknown key 'taget'; did you mean 'target'?"),
+    ("    distortion: []", "    distorsion: []", "cameras.left: unknown key 'distorsion'; did you mean 'distortion'?"),
+    ("    distortion: []", "    Distortion: []", "cameras.left: unknown key 'Distortion'; did you mean 'distortion'?"),
+    (
+        "    distortion: []",
+        "    distortion: [1, 2, 3]",
+        "cameras.left.distortion: expected 0, 4, 5, 8, 12 or 14 numbers, got 3",
+    ),
+    (
+        "    distortion: []",
+        "    distortion: 0.1",
+        "cameras.left.distortion: expected a list of 0, 4, 5, 8, 12 or 14 numbers, got 0.1",
+    ),
+    (
+        "    distortion: []",
+        "    distortion: [0, 0, 0, .nan]",
+        "cameras.left.distortion: expected a finite number, got nan",
+    ),
+    ("-0.05, 0.01,", "-0.05, true,", "cameras.right.distortion: expected a finite number, got true"),
+    ("-0.05, 0.01,", "-0.05, 0..1,", "cameras.right.distortion: expected a finite number, got '0..1'"),
+    (
+        "translation_m: [-2.5, 0, 0]",
+        "translation_m: [-2.5, 0]",
+        "screens.left.world_from_screen.translation_m: expected 3 numbers, got 2",
+    ),
+    (
+        "translation_m: [-2.5, 0, 0]",
+        "translation_m: [-.inf, 0, 0]",
+        "translation_m: expected a finite number, got -inf",
+    ),
+    (
+        "translation_m: [-2.5, 0, 0]",
+        "translation_mm: [-2500, 0, 0]",
+        "unknown key 'translation_mm'; did you mean 'translation_m'?",
+    ),
+    (
+        QUATERNION,
+        "quaternion_wxyz: [1, 1, 0, 0]",
+        "cameras.left.camera_from_world.quaternion_wxyz: expected a quaternion of length 1, got one of length 1.414214",
+    ),
+    (QUATERNION, "quaternion_wxyz: [0, 0, 0, 0]", "expected a quaternion of length 1, got one of length 0"),
+    (
+        QUATERNION,
+        "quaternion_wxyz: [0.50001, -0.5, 0.5, 0.5]",
+        "expected a quaternion of length 1, got one of length 1.000005",
+    ),
+    (QUATERNION, "quaternion_wxyz: 1", "quaternion_wxyz: expected a list of 4 numbers, got 1"),
+    (
+        f"camera_from_world: {{{QUATERNION}, translation_m: [0, 0.4, 0]}}",
+        "camera_from_world: [1, 2]",
+        "cameras.left.camera_from_world: expected a mapping with quaternion_wxyz, translation_m, got [1, 2]",
+    ),
+    (
+        "noise: {gain_e_per_dn: 38.0",
+        "noise: {gain_e_per_dn: 0",
+        "cameras.left.noise.gain_e_per_dn: expected a number above 0, got 0",
+    ),
+    (
+        "read_noise_e: 30.0",
+        "read_noise_e: -1",
+        "cameras.left.noise.read_noise_e: expected a number of 0 or more, got -1",
+    ),
+    (
+        BEAM_A,
+        "A: {direction: [0, 0, 0], point_m: [0, 0, 0]}",
+        "target.beams.A.direction: expected a direction, which has a length",
+    ),
+    (BEAM_A, "A: {direction: [1, 0, 0]}", "target.beams.A.point_m: expected a value, got nothing"),
+    (BEAM_A, "A:", "target.beams.A: expected a mapping with direction, point_m, got nothing"),
+    (BEAM_A, f"{BEAM_A}\n    {BEAM_A}", "expected YAML, found the key 'A' a second time"),
+    (
+        '"1": {beam: A, end: "-"',
+        '"1": {beam: D, end: "-"',
+        "target.spots.1.beam: expected a beam of this file, got 'D'; known: A, B, C",
+    ),
+    (
+        '"1": {beam: A, end: "-", screen: left}',
+        '"1": {beam: A, end: "-", screen: lft}',
+        "target.spots.1.screen: expected a screen of this file, got 'lft'; did you mean 'left'?",
+    ),
+    (SPOT_6, SPOT_6.replace('"+"', "1"), "target.spots.6.end: expected '+' or '-', got 1"),
+    (SPOT_6, SPOT_6.replace('"+"', "plus"), "target.spots.6.end: expected '+' or '-', got 'plus'"),
+    (
+        SPOT_6,
+        '"6":\n      beam: C\n      end: -\n      screen: right',
+        'expected YAML, found a lone minus; quote it: "-"',
+    ),
+    (
+        SPOT_6,
+        SPOT_6.replace("C", "A"),
+        "target.spots.6: expected one spot per beam end, got beam 'A' end '+' a second time (spot '4' has it)",
+    ),
+    (SPOT_6, f"{SPOT_6}\n    6: {{beam: C, end: '+', screen: right}}", "the key '6' a second time"),
+    (SPOT_6, SPOT_6.replace("C, ", "null, "), "target.spots.6.beam: expected a word, got nothing"),
+]
+
+
+@pytest.mark.parametrize(("old", "new", "words"), BROKEN)
+def test_a_mistake_gets_one_line_that_names_field_expected_and_found(old, new, words, tmp_path):
+    assert old in RIG
+    path = written(tmp_path, RIG.replace(old, new, 1))
+    with pytest.raises(InputError) as caught:
+        load_rig(path)
+    message = str(caught.value).replace(f"{tmp_path}/", "")
+    assert words in message
+    assert message.startswith("rig.yaml: ")
+    assert len(message.splitlines()) <= 2
+    assert caught.value.exit_status == 2
+
+
+# Fields that stand twice in the small lab are broken everywhere.
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("size_m: [4.0, 3.0]", "size_m: [4.0, -3.0]", "screens.left.size_m: expected a number above 0, got -3.0"),
+        (
+            "image_size_px: [64, 48]",
+            "image_size_px: [64.5, 48]",
+            "cameras.left.image_size_px: expected a whole number, got 64.5",
+        ),
+        (
+            "image_size_px: [64, 48]",
+            "image_size_px: [64, 0]",
+            "image_size_px: expected a width and a height of at least 1 pixel, got [64, 0]",
+        ),
+        ("image_size_px: [64, 48]", "image_size_px: 64x48", "image_size_px: expected a list of 2 numbers, got '64x48'"),
+        ("fx: 40.0", "fx: -40.0", "cameras.left.camera_matrix.fx: expected a number above 0, got -40.0"),
+        ("cy: 23.5", "cy: '23,5'", "cameras.left.camera_matrix.cy: expected a finite number, got '23,5'"),
+        (
+            "    screen: left\n",
+            "    screen: lefft\n",
+            "cameras.left.screen: expected a screen of this file, got 'lefft'; did you mean 'left'?",
+        ),
+        ("    screen: left\n", "", "cameras.left.screen: expected a value, got nothing"),
+    ],
+)
+def test_a_mistake_made_twice_is_told_once_and_the_rest_counted(old, new, words, tmp_path):
+    assert old in RIG
+    with pytest.raises(FileError) as caught:
+        load_rig(written(tmp_path, RIG.replace(old, new)))
+    assert words in str(caught.value)
+    assert words in caught.value.lines[0]
+    more = len(caught.value.lines) - 1
+    assert more == RIG.count(old) - 1
+    assert (f"and {more} more" in str(caught.value)) == (more > 0)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "rig.yaml: expected `key: value` lines, got nothing"),
+        ("- 1\n- 2\n", "rig.yaml: expected `key: value` lines, got [1, 2]"),
+        ("just words", "rig.yaml: expected `key: value` lines, got 'just words'"),
+        ("a: 1\n---\nb: 2\n", "rig.yaml: line 2: expected YAML, found another document"),
+        ("a: *nothing\n", "rig.yaml: line 1: expected YAML, found undefined alias 'nothing'"),
+        ("a: !!python/object/apply:os.getcwd []\n", "rig.yaml: line 1: expected YAML, found could not determine"),
+        ("\x00", "rig.yaml: expected YAML, found unacceptable character"),
+        ("[" * 5000, "rig.yaml: expected YAML, found a nesting too deep to read"),
+    ],
+)
+def test_a_file_that_is_no_rig_is_told_so(text, words, tmp_path):
+    with pytest.raises(InputError) as caught:
+        load_rig(written(tmp_path, text))
+    assert words in str(caught.value).replace(f"{tmp_path}/", "")
+
+
+def test_a_file_that_is_not_there_or_no_text_is_told_so(tmp_path):
+    with pytest.raises(InputError, match=r"rig\.yaml: expected a file, found none; check the path"):
+        load_rig(tmp_path / "rig.yaml")
+    with pytest.raises(InputError, match="cannot be read: Is a directory"):
+        load_rig(tmp_path)
+    (tmp_path / "rig.yaml").write_bytes("name: Prüfstand".encode("latin-1"))
+    with pytest.raises(InputError, match="expected UTF-8 text, got a byte that is none at position 8"):
+        load_rig(tmp_path / "rig.yaml")
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_fewer_than_two_beams_are_refused(count, tmp_path):
+    head, _ = RIG.split("  beams:\n")
+    beams = "  beams: {" + "A: {direction: [1, 0, 0], point_m: [0, 0, 0]}" * count + "}\n"
+    spots = '  spots: {1: {beam: A, end: "+", screen: right}}\n'
+    with pytest.raises(InputError, match=f"target.beams: expected two or more, got {count}; one line cannot fix"):
+        load_rig(written(tmp_path, head + beams + spots))
+
+
+@pytest.mark.parametrize(
+    ("block", "words"),
+    [
+        ("{parameters: [a, b], matrix: [[1]]}", "expected a matrix row for each of 2 parameters, got 1"),
+        ("{parameters: [a], matrix: [[1, 2]]}", "covariance.matrix: expected a square matrix, as a list of rows"),
+        ("{parameters: a, matrix: [[1]]}", "covariance.parameters: expected a list of parameter names, got 'a'"),
+        ("{parameters: [a], matrix: [[.nan]]}", "covariance.matrix: expected a finite number, got nan"),
+    ],
+)
+def test_a_covariance_block_needs_names_and_a_square_matrix(block, words, tmp_path):
+    with pytest.raises(InputError) as caught:
+        load_rig(written(tmp_path, RIG + f"  covariance: {block}\n"))
+    assert words in str(caught.value)

@@ -1,0 +1,251 @@
+"""A calibration's report is one file that opens anywhere, says all it found, and stays small; so do its drawings."""
+
+from __future__ import annotations
+
+import datetime
+import re
+import xml.etree.ElementTree as ET
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calibration.findings import Finding, Level
+from geometry.pose import Pose
+from lab.errors import InputError
+from lab.report.calibration import calibration_drawings as draw
+from lab.report.calibration.calibration_charts import DriftLine
+from lab.report.calibration.calibration_maps import contour, contour_levels, value_range
+from lab.report.calibration.calibration_page import (
+    LARGEST_BYTES,
+    CalibrationReport,
+    Drawing,
+    Section,
+    Table,
+    cell,
+    page,
+    provenance,
+    telling_views,
+    write_calibration_report,
+)
+from lab.report.calibration.calibration_scene import CAMERA_VIEWS
+from tests.geometry.scenes import paper_rig
+
+SIZE = (640, 480)
+RNG = np.random.default_rng(4)
+CORNERS = RNG.uniform([0, 0], SIZE, (300, 2))
+RESIDUALS = RNG.normal(0, 0.2, (300, 2))
+HOLED = np.where(np.arange(300)[:, None] % 7 == 0, np.nan, CORNERS)
+MAP = 0.02 + np.hypot(*np.meshgrid(np.linspace(-1, 1, 17), np.linspace(-1, 1, 13))) ** 3
+
+
+def all_drawings() -> dict[str, str]:
+    """One of each kind, with names that must be escaped and values that are missing."""
+    holed = MAP.copy()
+    holed[:3, :3] = np.nan
+    photograph = RNG.integers(0, 255, (480, 640)).astype(np.uint8)
+    rig = paper_rig()
+    days = [datetime.date(2026, 1, 1 + 3 * i) for i in range(5)]
+    rejected = np.arange(300) % 50 == 0
+    things = draw.rig_things(rig, Pose.identity())
+    A = RNG.normal(size=(6, 6))
+    covariance = A @ A.T
+    covariance[2] = covariance[:, 2] = 0.0
+    return {
+        "overlay": draw.corners_overlay(
+            SIZE, CORNERS, RESIDUALS, "a <view> & b", picture=photograph, rejected=rejected
+        ),
+        "overlay without picture": draw.corners_overlay(SIZE, CORNERS[:2], RESIDUALS[:2], "v", labels=["<a>", "b"]),
+        "field": draw.residual_field(SIZE, CORNERS, RESIDUALS),
+        "field with holes": draw.residual_field(SIZE, HOLED, RESIDUALS),
+        "field of none": draw.residual_field(SIZE, CORNERS[:0], RESIDUALS[:0]),
+        "coverage": draw.coverage_map(SIZE, CORNERS, outlines_px=[CORNERS[:4]]),
+        "coverage with holes": draw.coverage_map(SIZE, HOLED),
+        "coverage of none": draw.coverage_map(SIZE, CORNERS[:0]),
+        "tilt": draw.tilt_polar(np.array([10.0, 40, np.nan]), np.array([0.0, 90, 10])),
+        "map": draw.heat_map(holed, (0, 640, 0, 480), "uncertainty <px>", "px"),
+        "signed map": draw.heat_map(MAP - 1, (-1, 1, -1, 1), "t", "mm", diverging=True, y_down=False, levels=[0.0]),
+        "map of nothing": draw.heat_map(np.full((3, 4), np.nan), (0, 1, 0, 1), "t", "px"),
+        "histogram": draw.residual_histogram(RESIDUALS, sigma=0.2),
+        "histogram of none": draw.residual_histogram(RESIDUALS[:0]),
+        "ladder": draw.lens_ladder(
+            ["4 <&>", "5", "fisheye"], np.array([0.3, 0.2, np.nan]), 1, fit_rms_px=np.array([0.3, 0.1, np.nan])
+        ),
+        "ellipses": draw.error_ellipses(
+            RNG.normal(size=(2, 2)), np.array([np.eye(2)] * 2) * 1e-8, ["<a>", "b"], "m", "t"
+        ),
+        "one ellipse": draw.error_ellipses(np.zeros((1, 2)), np.eye(2)[None], ["a"], "px", "t"),
+        "flatness": draw.flatness_map(
+            RNG.normal(size=(40, 2)), RNG.normal(0, 1e-3, 40), size_m=(4, 3), bow=(1e-3, 0, 0)
+        ),
+        "correlations": draw.correlation_matrix(["fx", "<k1>", "fixed", "a", "b", "c"], covariance),
+        "drift": draw.drift_chart(
+            {"left": DriftLine(days, np.array([0.1, np.nan, 0.2, 0.1, 0.3]), np.full(5, 0.1))},
+            warn=0.2,
+            fail=0.5,
+            expires=datetime.date(2026, 2, 1),
+        ),
+        "one check": draw.drift_chart({"l & r": DriftLine(days[:1], np.array([0.1]))}),
+        **{f"scene {i}": s for i, s in enumerate(draw.scene_views(things))},
+        "boards": draw.scene_view(
+            [
+                draw.Frustum("<c>", Pose.identity(), (0.5, 0.4)),
+                draw.Rectangle("b", Pose.identity(), (1, 1), faint=True),
+            ],
+            "a <scene>",
+            CAMERA_VIEWS[0],
+        ),
+    }
+
+
+DRAWINGS = all_drawings()
+
+
+def report(sections: list[Section], findings: list[Finding] | None = None) -> CalibrationReport:
+    findings = findings if findings is not None else [Finding(Level.PASS, "fine")]
+    level = max(f.level for f in findings)
+    figures = [("RMS <&>", "0.2 px", "0.5 mm")]
+    return CalibrationReport("Camera", "left <b>", level, findings, figures, sections)
+
+
+@pytest.mark.parametrize("name", DRAWINGS)
+def test_a_drawing_is_well_formed_and_says_what_it_shows(name):
+    root = ET.fromstring(DRAWINGS[name])
+    assert root.tag == "svg"
+    assert root.get("aria-label")
+    assert root.find("title") is not None
+    assert "nan" not in re.sub(r'href="data:[^"]*"', "", DRAWINGS[name])
+
+
+@pytest.mark.parametrize("name", DRAWINGS)
+def test_a_drawing_stays_within_its_frame_and_holds_no_endless_text(name):
+    _, _, width, height = (float(v) for v in ET.fromstring(DRAWINGS[name]).get("viewBox").split())
+    assert 300 <= width <= 1200
+    assert 60 <= height <= 800
+    for place in ET.fromstring(DRAWINGS[name]).iter("text"):
+        if place.get("transform") is None:
+            assert -20 <= float(place.get("x")) <= width + 20
+            assert -20 <= float(place.get("y")) <= height + 20
+
+
+class _Tags(HTMLParser):
+    """Whether every tag that opens is closed, in order, and what the page would load."""
+
+    VOID = frozenset({"meta", "br", "link", "img", "input", "hr"})
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.loads: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.loads += [v for k, v in attrs if k in ("src", "href", "xlink:href", "data") and v]
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.loads += [v for k, v in attrs if k in ("src", "href", "xlink:href", "data") and v]
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open
+        assert self.open.pop() == tag
+
+
+def test_the_page_is_balanced_and_loads_nothing_from_anywhere():
+    table = Table(("a", "b (px)"), [("x", 1.5), ("y", float("nan"))])
+    html = page(report([Section("s", ["w"], [*map(Drawing, DRAWINGS.values()), "<p>plain</p>"], table)]))
+    tags = _Tags()
+    tags.feed(html)
+    assert tags.open == []
+    assert tags.loads
+    assert all(u.startswith("data:image/") for u in tags.loads)
+    outside = re.sub(r"data:image/[^\"]*", "", html)
+    assert not re.search(r"https?://|url\(|@import|<script", outside)
+
+
+def test_every_finding_is_shown_the_worst_first_with_its_reason_and_its_cure():
+    findings = [
+        Finding(Level.PASS, "what-pass"),
+        Finding(Level.WARN, "what-warn", "why-warn", "cure-warn"),
+        Finding(Level.FAIL, "what-fail", "why-fail", "cure-fail"),
+    ]
+    html = page(report([], findings))
+    places = [
+        html.index(w) for w in ("what-fail", "why-fail", "cure-fail", "what-warn", "why-warn", "cure-warn", "what-pass")
+    ]
+    assert places == sorted(places)
+    assert "1 failed, 1 warning, 1 passed" in html
+    assert "<title>FAIL" in html
+
+
+def test_names_and_words_are_escaped_everywhere():
+    evil = "<script>alert(1)</script>"
+    finding = Finding(Level.WARN, evil, evil, evil)
+    section = Section(evil, evil, [Drawing("<svg></svg>", evil)], Table((evil,), [(evil,)]))
+    whole = CalibrationReport("Rig", evil, Level.WARN, [finding], [(evil, evil, evil)], [section])
+    assert "<script" not in page(whole)
+
+
+def test_a_report_of_400_views_stays_below_5_mb_and_keeps_its_table():
+    photograph = RNG.integers(0, 255, (1024, 1280)).astype(np.uint8)  # noise: the worst case of JPEG
+    one = draw.corners_overlay((1280, 1024), CORNERS, RESIDUALS, "view", picture=photograph)
+    views = [Drawing(one, f"view {i}") for i in range(400)]
+    rows = [(f"photograph-{i}", 0.2) for i in range(400)]
+    html = page(report([Section("views", (), views, Table(("view", "RMS (px)"), rows))]))
+    assert len(html.encode()) <= LARGEST_BYTES
+    assert html.count("Picture left out") > 100
+    assert "<svg" in html  # and some pictures are still there
+    assert all(f"photograph-{i}<" in html for i in range(400))
+
+
+def test_the_views_worth_a_picture_are_the_worst_the_median_and_the_best():
+    rms = np.array([0.5, 0.1, 0.9, np.nan, 0.3, 0.7])
+    assert dict(telling_views(rms, 2)) == {2: "worst", 5: "2. worst", 0: "median", 1: "best"}
+    assert telling_views(np.full(3, np.nan)) == []
+    assert [i for i, _ in telling_views(np.array([0.2]))] == [0]
+
+
+def test_the_file_is_written_whole_and_names_its_inputs(tmp_path: Path):
+    data = tmp_path / "photo.png"
+    data.write_bytes(b"123")
+    made = provenance([data], datetime.date(2026, 5, 1))
+    whole = CalibrationReport("Beams", "x", Level.PASS, [], [], [], made)
+    path = write_calibration_report(whole, tmp_path)
+    assert path == tmp_path / "report.html"
+    text = path.read_text(encoding="utf-8")
+    assert "photo.png" in text
+    assert "a665a45920422f9d" in text
+    assert "2026-05-01" in text
+    assert [p.name for p in tmp_path.iterdir() if p.name.endswith(".part")] == []
+    with pytest.raises(InputError, match="cannot be read"):
+        provenance([tmp_path / "missing.png"])
+
+
+def test_what_a_report_cannot_be_is_refused():
+    with pytest.raises(ValueError, match="kind of report"):
+        CalibrationReport("Kamera", "x", Level.PASS, [], [], [])
+    with pytest.raises(ValueError, match="2 cells"):
+        Table(("a",), [("b", "c")])
+
+
+@pytest.mark.parametrize(
+    ("value", "shown"), [(0.123456, "0.1235"), (float("nan"), "–"), (None, "–"), (3, "3"), (True, "yes"), ("a", "a")]
+)
+def test_a_cell_shows_numbers_to_four_digits(value, shown):
+    assert cell(value) == shown
+
+
+def test_contours_of_a_cone_lie_on_its_circles():
+    x, y = np.linspace(-1, 1, 81), np.linspace(-1, 1, 61)
+    X, Y = np.meshgrid(x, y)
+    for level in (0.3, 0.6):
+        starts, ends = contour(np.hypot(X, Y), x, y, level)
+        radii = np.linalg.norm(np.concatenate([starts, ends]), axis=1)
+        assert np.abs(radii - level).max() < 2e-3  # chords of cells of 1/40
+        assert np.linalg.norm(ends - starts, axis=1).sum() == pytest.approx(2 * np.pi * level, rel=5e-3)
+
+
+def test_levels_of_a_steep_map_crowd_where_it_is_low():
+    assert contour_levels(0.02, 1.0).tolist() == pytest.approx([0.05, 0.1, 0.2, 0.5])
+    assert value_range(np.array([1.0] * 99 + [1e6]), False)[1] < 10  # one runaway value does not drown the map

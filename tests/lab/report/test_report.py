@@ -1,0 +1,412 @@
+"""A report is one file that opens anywhere, leaves nothing out, and survives poor results."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lab import number_format
+from lab.report.plot import svg
+from lab.report.run.index import write_index
+from lab.report.run.page import write_report
+from lab.report.run.pictures import MOST_PICTURES, _arrow, chosen, events, grey_limits, stretched
+from lab.report.run.report_data import gather
+from lab.report.run.verdict import verdict_of
+from tests.lab.fake_results import Fake, make, without_added_columns
+from tracking.statuses import PoseStatus, SpotStatus
+
+
+@pytest.fixture(scope="module")
+def fake(tmp_path_factory: pytest.TempPathFactory) -> Fake:
+    return make(tmp_path_factory.mktemp("run"), 300)
+
+
+@pytest.fixture(scope="module")
+def page(fake: Fake) -> str:
+    return write_report(fake.results).read_text(encoding="utf-8")
+
+
+@pytest.fixture(scope="module")
+def filmed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Fake, str]:
+    """With pictures; that of frame 8 of the left camera is cut short, and its rows say no_image."""
+    fake = make(tmp_path_factory.mktemp("filmed"), 12, pictures=True)
+    path = fake.results / "spots.csv"
+    lines = path.read_text().splitlines()
+    damaged = [
+        re.sub(r"matched", "no_image", line) if line.startswith("8,") and ",left," in line else line for line in lines
+    ]
+    path.write_text("\n".join(damaged) + "\n")
+    return fake, write_report(fake.results).read_text(encoding="utf-8")
+
+
+class _Balance(HTMLParser):
+    """Whether every tag that opens is closed, in order."""
+
+    VOID = frozenset({"meta", "br", "link", "img", "input", "hr"})
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        pass
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open, f"</{tag}> closes nothing"
+        assert self.open.pop() == tag
+
+
+def assert_well_formed(html: str) -> None:
+    parser = _Balance()
+    parser.feed(html)
+    parser.close()
+    assert parser.open == []
+
+
+def test_a_report_asks_for_nothing_outside_itself(filmed):
+    html = filmed[1]
+    for found in re.findall(r"""(?:src|href|url|action)\s*[=(]\s*["']?([^"')\s>]+)""", html):
+        assert found.startswith(("data:image/", "#")), found
+    assert "@import" not in html
+    assert "fetch(" not in html
+
+
+def test_a_report_has_every_part(page):
+    for head in ("Attitude and position", "Spots over the picture", "Status over time", "Residuals", "Events",
+                 "Errors against truth", "How this was made", "Input fingerprints", "Method"):  # fmt: skip
+        assert head in page
+    for status in (*SpotStatus, *PoseStatus):
+        assert status.meaning in page.replace("&#39;", "'")
+    assert "ab" * 32 in page
+    assert "tracker.r1_px" in page
+    assert_well_formed(page)
+
+
+def test_a_users_words_are_shown_and_not_obeyed(page):
+    assert "fake &lt;yaw &amp; bend&gt;" in page
+    assert "A note with &lt;b&gt;markup&lt;/b&gt; &amp; an ampersand." in page
+    assert "<yaw" not in page
+    assert "<b>markup" not in page
+
+
+def test_names_of_spots_and_cameras_are_shown_and_not_obeyed(fake, tmp_path):
+    shutil.copytree(fake.results, tmp_path / "results")
+    path = tmp_path / "results" / "spots.csv"
+    path.write_text(path.read_text().replace(",left,1,", ",left,<script>1,"))
+    html = write_report(tmp_path / "results").read_text(encoding="utf-8")
+    assert "&lt;script&gt;1" in html
+    assert "<script>1" not in html
+    assert_well_formed(html)
+
+
+def test_the_same_results_give_the_same_report(fake, page):
+    assert write_report(fake.results).read_text(encoding="utf-8") == page
+
+
+@pytest.mark.parametrize(
+    ("kind", "words"),
+    [
+        ({"n_frames": 1}, "PASS"),
+        ({"n_frames": 3}, "PASS"),
+        ({"n_frames": 150, "truth": False}, "The run has no truth"),
+        ({"n_frames": 60, "all_lost": True}, "No frame has a pose"),
+        ({"n_frames": 150, "n_cameras": 1}, "1 camera (left)"),
+    ],
+    ids=["one frame", "three frames", "no truth", "all lost", "one camera"],
+)
+@pytest.mark.filterwarnings("error")
+def test_a_report_is_made_of_poor_results_too(tmp_path, kind, words):
+    html = write_report(make(tmp_path, **kind).results).read_text(encoding="utf-8")
+    assert words in html
+    assert_well_formed(html)
+    assert not re.search(r'[ "M]-?(nan|inf)\b', re.sub(r"<title>.*?</title>", "", html))
+
+
+def test_a_report_is_made_from_the_tables_alone_and_says_what_is_missing(tmp_path):
+    fake = make(tmp_path, 50)
+    shutil.rmtree(fake.run_folder)
+    for told in (None, fake.run_folder):
+        html = write_report(fake.results, told).read_text(encoding="utf-8")
+        assert "The run folder could not be reached" in html
+    (fake.results / "summary.json").unlink()
+    html = write_report(fake.results).read_text(encoding="utf-8")
+    assert "NO VERDICT" in html
+    assert "summary.json is missing" in html
+
+
+def test_a_smoothed_run_shows_what_was_known_at_the_instant_as_a_thin_line_beside_it(tmp_path, page):
+    html = write_report(make(tmp_path, 120, causal=True).results).read_text(encoding="utf-8")
+    assert html.count("causal minus truth</title>") == 6
+    assert "median, smoothed; causal" in html
+    assert "RMS, smoothed; causal" in html
+    assert "Bierman (1973)" in html
+    assert_well_formed(html)
+    for words in ("causal minus", "median, smoothed", "Bierman"):  # of a run that was not smoothed
+        assert words not in page
+
+
+def test_velocity_and_rate_have_a_panel_and_a_band_each(fake, page):
+    for name in ("velocity x", "velocity y", "velocity z", "rate x", "rate y", "rate z"):
+        assert f"<title>{name}</title>" in page
+        assert f"<title>{name}: \u00b1\u03c3, \u00b13\u03c3 and error</title>" in page
+    assert "against differences of the true poses" in page
+
+
+def test_a_report_is_made_of_results_from_before_there_were_velocities(fake, tmp_path):
+    html = write_report(without_added_columns(fake.results, tmp_path / "older")).read_text(encoding="utf-8")
+    assert "Velocity and angular rate" not in html
+    assert "label left open" not in html.split("<h2>Residuals")[0].split("Status over time")[1]
+    assert "Attitude and position" in html
+    assert_well_formed(html)
+
+
+def test_what_became_of_doubtful_labels_is_told(fake, tmp_path):
+    shutil.copytree(fake.results, tmp_path / "results")
+    spots = tmp_path / "results" / "spots.csv"
+    lines = spots.read_text().splitlines()
+    doubtful = [i for i, line in enumerate(lines) if ",occluded," in line][:3]
+    for i in doubtful:
+        lines[i] += "0.6"  # a detection was there, but not likely enough to be this spot
+    spots.write_text("\n".join(lines) + "\n")
+    path = tmp_path / "results" / "summary.json"
+    summary = json.loads(path.read_text())
+    summary["counts"]["events"] = {"changed": 4, "tie": 1, "reacquired": 2, "labelled": 1}
+    open_for_long = {"frame": 20, "last_frame": 24, "kind": "undecided", "camera": "left", "spot": "1", "text": "open"}
+    path.write_text(json.dumps(summary | {"events": [open_for_long]}))
+    html = write_report(tmp_path / "results").read_text(encoding="utf-8")
+    assert len(doubtful) == 3
+    assert "Labels: 3 left open: no label was likely enough to be given; 4 changed by the smoothing pass" in html
+    assert "1 ties, in which" in html
+    assert "2 times the vehicle was found again" in html
+    assert "<td>spot 1: open, for 5 frames</td>" in html
+
+
+def test_residuals_are_judged_by_what_the_pose_leaves_of_them(fake):
+    material = gather(fake.results, None)
+    shares = (material.residual_px / material.spots.sigma_px) ** 2
+    # These poses were drawn without looking at the measured places: residuals are larger than a fit's.
+    assert np.nanmean(shares) > 1.0
+    assert material.residual_share == pytest.approx(1 - 6 / 12, abs=0.1)  # as a fit of six numbers to six spots leaves
+
+
+def test_frames_without_a_picture_are_listed_as_ranges(fake, page):
+    first, last = json.loads((fake.results / "summary.json").read_text())["counts"]["no_image"]["left"][0]
+    assert f"Camera left has no usable picture for frames {first}\u2013{last} (3 in all)." in page
+
+
+@pytest.mark.parametrize(("status", "word"), [("pass", "PASS"), ("check", "CHECK"), ("fail", "FAIL")])
+def test_the_verdict_is_that_of_the_summary_with_all_its_reasons(tmp_path, status, word):
+    fake = make(tmp_path, 3)
+    path = fake.results / "summary.json"
+    summary = json.loads(path.read_text()) | {"verdict": {"status": status, "reasons": ["one thing", "another"]}}
+    path.write_text(json.dumps(summary))
+    html = write_report(fake.results).read_text(encoding="utf-8")
+    assert f'<section class="verdict {status}">' in html
+    assert f">{word}</strong>" in html
+    assert "<li>one thing</li><li>another</li>" in html
+
+
+def test_each_reason_stands_at_the_top_with_its_remedy(tmp_path):
+    make(tmp_path, 40)
+    path = tmp_path / "results/summary.json"
+    evidence = [
+        {"kind": "model", "level": "fail", "what": "camera <right> has turned", "remedy": "Fix its mount."},
+        {"kind": "lost", "level": "check", "what": "3 frames are lost", "remedy": ""},
+    ]
+    verdict = {"status": "fail", "reasons": ["a", "b"], "exit_status": 4, "evidence": evidence}
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"verdict": verdict}))
+    html = write_report(tmp_path / "results").read_text(encoding="utf-8")
+    top = html[html.index('<section class="verdict fail">') : html.index("</section>")]
+    assert "<strong>camera &lt;right&gt; has turned</strong><br>" in top
+    assert '<span class="remedy">Fix its mount.</span>' in top
+    assert "<li>3 frames are lost</li>" in top
+
+
+@pytest.mark.parametrize("summary", [{}, {"verdict": None}, {"verdict": "good"}, {"verdict": {"status": "splendid"}}])
+def test_a_verdict_that_is_not_there_is_not_made_up(summary):
+    verdict = verdict_of(summary)
+    assert (verdict.word, verdict.status) == ("NO VERDICT", "unknown")
+
+
+def test_pictures_show_the_spot_where_it_was_measured(filmed):
+    fake, html = filmed
+    row = next(line.split(",") for line in (fake.results / "spots.csv").read_text().splitlines()[1:])
+    assert f'cx="{float(row[4]):.2f}" cy="{float(row[5]):.2f}"' in html
+    assert html.count('class="plot shot"') <= MOST_PICTURES
+
+
+def test_a_damaged_picture_is_shown_as_such(filmed):
+    assert "unreadable: cut short" in filmed[1]
+    assert "no usable picture, for 1 frame" in filmed[1]
+
+
+def test_at_most_eight_pictures_with_every_kind_of_event_among_them(fake):
+    material = gather(fake.results, None)
+    found = events(material)
+    selection = chosen(material, found)
+    assert len(selection) <= MOST_PICTURES
+    assert {e.kind for e in found} <= {e.kind for e in selection}
+
+
+def test_what_the_run_itself_noted_is_listed_and_pictured(fake, tmp_path):
+    shutil.copytree(fake.results, tmp_path / "results")
+    path = tmp_path / "results" / "summary.json"
+    noted = {"frame": 33, "kind": "tie", "camera": None, "spot": None, "text": "two labels fit <equally>"}
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"events": [noted, {"frame": 10**9}, "odd"]}))
+    assert "<td>33</td><td>0.330</td><td>left</td><td>two labels fit &lt;equally&gt;</td>" in write_report(
+        tmp_path / "results"
+    ).read_text(encoding="utf-8")
+    material = gather(tmp_path / "results", fake.run_folder)
+    assert "tie" in {e.kind for e in chosen(material, events(material))}
+
+
+def test_a_faint_spot_on_a_dark_picture_is_shown_bright_and_a_dark_picture_stays_dark():
+    rng = np.random.default_rng(1)
+    dark = 8 + rng.normal(scale=1, size=(512, 640))
+    faint = dark.copy()
+    faint[250:256, 300:306] += 30
+    faint[10, 10] = 255.0  # a hot pixel
+    assert stretched(faint, *grey_limits(faint))[253, 303] > 200
+    assert np.median(stretched(dark, *grey_limits(dark))) < 128
+
+
+def test_a_spot_far_outside_is_named_with_its_distance_and_an_arrow_at_the_border():
+    x, y, d = _arrow(np.array([1500.0, 300.0]), (1280, 1024), 2.0)
+    tip = [float(v) for v in d[1:].split("L")[0].split()]
+    assert tip == pytest.approx([1275, 300])  # two units inside the border
+    assert x < tip[0]
+    assert y == pytest.approx(308)
+
+
+class TestDrawing:
+    def test_a_spike_of_one_frame_survives_thinning(self):
+        t, y = np.arange(100_000.0), np.zeros(100_000)
+        y[51_234] = 7.0
+        x, thin = svg.envelope(t, y, 500)
+        assert len(x) <= 1000
+        assert x[np.argmax(thin)] == 51_234
+        assert thin.max() == 7.0
+        assert (np.diff(x) >= 0).all()
+
+    def test_a_gap_survives_thinning(self):
+        t, y = np.arange(10_000.0), np.ones(10_000)
+        y[4000:6000] = np.nan
+        x, thin = svg.envelope(t, y, 100)
+        assert np.isnan(thin[(x > 4200) & (x < 5800)]).all()
+        assert np.isfinite(thin[(x < 3900) | (x > 6100)]).all()
+
+    def test_a_band_keeps_its_widest_place(self):
+        t = np.arange(10_000.0)
+        low, high = -np.ones(10_000), np.ones(10_000)
+        high[777], low[778] = 5.0, -6.0
+        _, thin_low, thin_high = svg.band_envelope(t, low, high, 100)
+        assert (thin_low.min(), thin_high.max()) == (-6.0, 5.0)
+
+    def test_a_plot_of_a_hundred_thousand_frames_stays_small(self):
+        rng = np.random.default_rng(5)
+        t = np.arange(100_000) / 100
+        panel = svg.time_panel(t, "noise", "px", lines=(svg.Line(rng.normal(size=100_000), svg.BLUE, "noise"),))
+        assert len(panel) < 30_000
+
+    def test_one_frame_that_is_lost_among_a_hundred_thousand_is_still_shaded(self):
+        t, lost = np.arange(100_000.0), np.zeros(100_000, dtype=bool)
+        lost[31_415] = True
+        panel = svg.time_panel(t, "x", "m", lines=(), shades=(svg.Shade(lost, "lost", "lost"),))
+        assert panel.count('class="lost"') == 1
+
+    def test_what_lies_beyond_the_axis_is_marked_and_named(self):
+        y = np.zeros(500)
+        y[100] = 40.0
+        panel = svg.time_panel(np.arange(500.0), "x", "px", lines=(svg.Line(y, svg.BLUE, "x"),), y_range=(-1.0, 1.0))
+        assert "up to 40.0 px" in panel
+        assert "h6l-3 -5z" in panel
+
+    def test_a_lone_value_between_gaps_is_drawn(self):
+        assert svg.line_path(np.array([1.0, 2, 3]), np.array([np.nan, 5.0, np.nan])) == "M2.0 5.0h0"
+
+    def test_ticks_are_round_inside_and_without_minus_nought(self):
+        for lo, hi in ((-0.3, 0.4), (-2e-5, 1e-6), (19_990.0, 20_010.0), (-7.0, -6.9)):
+            values = svg.ticks(lo, hi, 5)
+            assert 2 <= len(values) <= 7
+            assert ((values >= lo - 1e-9) & (values <= hi + 1e-9)).all()
+            texts = svg.tick_texts(values)
+            assert len(set(texts)) == len(texts)
+            assert not any(re.fullmatch("\u22120(\\.0+)?", t) for t in texts)
+            np.testing.assert_allclose([float(t.replace("\u2212", "-")) for t in texts], values, atol=1e-3 * (hi - lo))
+
+
+class TestNumbers:
+    def test_a_share_under_one_never_reads_as_all(self):
+        assert number_format.percent(0.99996) != "100.0 %"
+        assert number_format.percent(0.99996).startswith("99.99")
+        assert number_format.percent(1.0) == "100 %"
+        assert number_format.percent(0.00001) != "0.0 %"
+
+    @pytest.mark.parametrize(
+        ("value", "words"),
+        [
+            (0.0, "0"),
+            (0.1, "0.100"),
+            (-12.345, "\u221212.3"),
+            (123456.0, "123456"),
+            (None, "\u2013"),
+            (np.nan, "\u2013"),
+        ],
+    )
+    def test_numbers_are_short_and_plain(self, value, words):
+        assert number_format.short(value) == words
+
+    def test_lengths_and_angles_choose_their_unit(self):
+        assert number_format.length(0.00046) == "0.460 mm"
+        assert number_format.length(1.5) == "1.50 m"
+        assert number_format.angle(0.0027) == "2.70 mdeg"
+        assert number_format.angle(2.5) == "2.50\u00b0"
+
+
+class TestIndex:
+    ROWS = (
+        {"name": "a-pass", "status": "pass", "results": "a-pass", "frames": 600, "message": ""},
+        {"name": "b-error", "status": "error", "results": "", "frames": "", "message": "no <rig> & no run"},
+        {"name": "c-fail", "status": "fail", "results": "c-fail", "frames": 20, "message": "lost"},
+        {"name": "d-check", "status": "check", "results": "d-check", "frames": 20, "message": "look"},
+    )
+
+    def write(self, out: Path) -> str:
+        for name in ("a-pass", "c-fail"):
+            (out / name).mkdir()
+            (out / name / "report.html").write_text("x")
+        return write_index(list(self.ROWS), out).read_text(encoding="utf-8")
+
+    def test_the_worst_come_first(self, tmp_path):
+        html = self.write(tmp_path)
+        assert re.findall(r'class="badge (\w+)"', html) == ["error", "fail", "check", "pass"]
+        assert_well_formed(html)
+
+    def test_links_lead_to_the_reports_that_are_there(self, tmp_path):
+        html = self.write(tmp_path)
+        links = re.findall(r'<a href="([^"]+)"', html)
+        assert links == ["./c-fail/report.html", "./a-pass/report.html"]
+        assert all((tmp_path / link).is_file() for link in links)
+
+    def test_messages_are_shown_and_not_obeyed(self, tmp_path):
+        html = self.write(tmp_path)
+        assert "no &lt;rig&gt; &amp; no run" in html
+        assert "<rig>" not in html
+
+    def test_a_batch_of_nothing_says_so(self, tmp_path):
+        assert "The batch has no runs." in write_index([], tmp_path).read_text(encoding="utf-8")
+
+
+@pytest.mark.slow
+def test_a_report_of_a_hundred_thousand_frames_stays_under_five_megabytes(tmp_path):
+    assert write_report(make(tmp_path, 100_000).results).stat().st_size < 5_000_000

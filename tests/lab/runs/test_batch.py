@@ -1,0 +1,146 @@
+"""Many runs: a bad one costs only itself, and batch.csv says what became of each."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import pytest
+
+from lab.errors import CalibrationError, InputError, RunError
+from lab.runs import batch as module
+from lab.runs.batch import COLUMNS, process_batch
+from lab.simulate.write import simulate
+from tests.lab.run_folders import write_run
+
+
+def points_run(folder: Path, seed: int = 5) -> Path:
+    return simulate("smooth", folder, seed=seed, frames=4, detections_only=True)
+
+
+def rows_of(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.fixture(scope="module")
+def mixed(tmp_path_factory):
+    """A good run, a folder that is none, a run without spots, another good one."""
+    folder = tmp_path_factory.mktemp("batch")
+    runs = [points_run(folder / "good"), folder / "nothing", write_run(folder / "grey"), points_run(folder / "last", 6)]
+    told: list[str] = []
+    return process_batch(runs, folder / "out", tell=told.append), told
+
+
+def test_the_batch_goes_on_after_a_bad_run_and_every_run_has_a_row(mixed):
+    outcome, _ = mixed
+    rows = rows_of(outcome.table)
+    assert tuple(rows[0]) == COLUMNS
+    assert [r["exit_status"] for r in rows] == ["0", "2", "4", "0"]
+    assert [r["status"] for r in rows] == ["pass", "error", "fail", "pass"]
+    assert [r["measured_frames"] for r in rows] == ["4", "", "0", "4"]
+    assert "expected a run folder, found nothing" in rows[1]["message"]
+
+
+def test_the_good_runs_have_their_results_and_the_bad_one_has_none(mixed):
+    outcome, _ = mixed
+    out = outcome.table.parent
+    for row in rows_of(outcome.table):
+        if row["results"]:
+            assert (out / row["results"] / "attitude.csv").is_file()
+    assert sorted(p.name for p in out.iterdir()) == ["batch.csv", "good", "grey", "index.html", "last"]
+
+
+def test_a_line_is_told_of_every_run_as_it_ends(mixed):
+    _, told = mixed
+    assert [line.split(":")[:2] for line in told] == [
+        ["good", " PASS"], ["nothing", " ERROR"], ["grey", " FAIL"], ["last", " PASS"],
+    ]  # fmt: skip
+
+
+def test_the_index_names_every_run_and_links_the_reports(mixed):
+    outcome, _ = mixed
+    page = outcome.index.read_text("utf-8")
+    for name in ("good", "grey", "last"):
+        assert f"{name}/report.html" in page
+    assert "nothing" in page
+
+
+def test_the_exit_status_is_that_of_the_worst(mixed, tmp_path):
+    outcome, _ = mixed
+    assert outcome.exit_status == 1
+    good, grey = points_run(tmp_path / "good"), write_run(tmp_path / "grey")
+    assert process_batch([good], tmp_path / "a").exit_status == 0
+    assert process_batch([good, grey], tmp_path / "b").exit_status == 4
+
+
+@pytest.mark.parametrize("error", [RunError("gone\nhalf-way"), InputError("wrong"), CalibrationError("out of date")])
+def test_whatever_kind_of_error_a_run_ends_with_is_its_row(tmp_path, monkeypatch, error):
+    def fail(*_, **__):
+        raise error
+
+    monkeypatch.setattr(module, "process_run", fail)
+    outcome = process_batch([tmp_path / "a"], tmp_path / "out")
+    (row,) = rows_of(outcome.table)
+    assert row["exit_status"] == str(error.exit_status)
+    assert row["message"] == str(error).replace("\n", " | ")
+    # section 5: some run could not be processed; the calibration's own status where it alone is the cause
+    assert outcome.exit_status == (3 if isinstance(error, CalibrationError) else 1)
+
+
+def test_the_table_is_there_after_every_run(tmp_path, monkeypatch):
+    """A batch that is killed in its second run keeps the first one's row."""
+    runs = [points_run(tmp_path / "a"), points_run(tmp_path / "b")]
+    process_run = module.process_run
+
+    def stop_at_b(folder, *args, **kwargs):
+        if folder.name == "b":
+            raise KeyboardInterrupt
+        return process_run(folder, *args, **kwargs)
+
+    monkeypatch.setattr(module, "process_run", stop_at_b)
+    with pytest.raises(KeyboardInterrupt):
+        process_batch(runs, tmp_path / "out")
+    assert [r["run"] for r in rows_of(tmp_path / "out/batch.csv")] == [str(runs[0])]
+
+
+def test_runs_of_the_same_name_get_folders_of_their_own(tmp_path):
+    for day in ("monday", "tuesday"):
+        (tmp_path / day).mkdir()
+    runs = [points_run(tmp_path / "monday/run"), points_run(tmp_path / "tuesday/run", 6)]
+    rows = rows_of(process_batch(runs, tmp_path / "out").table)
+    assert len({r["results"] for r in rows}) == 2
+    assert all((tmp_path / "out" / r["results"] / "report.html").is_file() for r in rows)
+    assert [r["results"].split("-")[0] for r in rows] == ["monday", "tuesday"]
+
+
+def test_the_same_run_twice_is_a_mistake(tmp_path):
+    run = points_run(tmp_path / "a")
+    with pytest.raises(InputError, match="given more than once"):
+        process_batch([run, tmp_path / "x" / ".." / "a"], tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_no_run_at_all_is_a_mistake(tmp_path):
+    with pytest.raises(InputError, match="expected one or more run folders"):
+        process_batch([], tmp_path / "out")
+
+
+def test_a_file_in_place_of_the_out_folder_is_a_mistake(tmp_path):
+    (tmp_path / "out").write_text("")
+    with pytest.raises(InputError, match="expected a folder for the results, found a file"):
+        process_batch([points_run(tmp_path / "a")], tmp_path / "out")
+
+
+def test_a_batch_may_be_repeated_into_the_same_folder(tmp_path):
+    run = points_run(tmp_path / "a")
+    first, second = process_batch([run], tmp_path / "out"), process_batch([run], tmp_path / "out")
+    keep = [n for n in COLUMNS if n != "seconds"]
+    assert [[r[n] for n in keep] for r in first.rows] == [[r[n] for n in keep] for r in second.rows]
+
+
+def test_names_with_commas_survive_in_the_table(tmp_path):
+    run = points_run(tmp_path / "a, b")
+    (row,) = rows_of(process_batch([run], tmp_path / "out").table)
+    assert row["run"] == str(run)
+    assert (tmp_path / "out" / row["results"] / "summary.json").is_file()

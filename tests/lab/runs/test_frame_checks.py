@@ -1,0 +1,203 @@
+"""No frame is written with a covariance that is none, or with a pose that its spots or the causal pass deny."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from geometry.forward_model import SpotModel
+from geometry.pose import Pose
+from geometry.uncertainty.rig_parameters import RigCovariance
+from lab.runs.frames.pipeline import FrameRecord
+from lab.runs.verdict.frame_checks import CONTRADICTION, NOT_A_COVARIANCE, FrameChecks
+from tests.geometry.scenes import paper_rig
+from tracking.detections import Detections
+from tracking.statuses import PoseStatus, SpotStatus
+from tracking.tracked_frame import MotionEstimate, TrackedFrame
+
+RIG = paper_rig()
+MODEL = SpotModel.of(RIG)
+N = len(MODEL)
+P = np.diag([1e-4**2] * 3 + [5e-5**2] * 3)
+
+
+def a_record(frame: int = 0, off: float = 0.0, spots: int = N, sigma_px: float = 0.1) -> FrameRecord:
+    """A measured frame whose reported pose lies `off` sigmas beside the one that its spots show, in every axis."""
+    rng = np.random.default_rng(frame)
+    true = Pose.identity()
+    uv, _ = MODEL.project(true)
+    measured = np.arange(N) < spots
+    uv = uv + sigma_px * rng.standard_normal(uv.shape)
+    tracked = TrackedFrame(
+        uv_px=uv,
+        cov_px2=np.broadcast_to(sigma_px**2 * np.eye(2), (N, 2, 2)).copy(),
+        status=tuple(SpotStatus.MATCHED if m else SpotStatus.OCCLUDED for m in measured),
+        predicted_px=uv,
+        gain=np.full(N, np.nan),
+        point=np.where(measured, 0, -1),
+        pose_status=PoseStatus.MEASURED,
+        pose=true.plus(off * np.sqrt(np.diagonal(P))),
+        pose_covariance=P.copy(),
+        spots_used=spots,
+        rms_px=0.01,
+        events=(),
+        motion=MotionEstimate(np.zeros(3), np.zeros(3), np.eye(6)),
+    )
+    return FrameRecord(frame, 0.01 * frame, 0.01, (Detections.none(),) * 2, ("", ""), tracked)
+
+
+def changed(record: FrameRecord, **fields: object) -> FrameRecord:
+    # mypy cannot know which field each keyword is for.
+    return replace(record, tracked=replace(record.tracked, **fields))  # type: ignore[arg-type]
+
+
+def test_a_right_frame_stays_as_it_is_but_for_its_residual():
+    record = a_record()
+    checks = FrameChecks(RIG)
+    ((kept, nothing),) = checks.passed([(record, None)])
+    assert nothing is None
+    assert replace(kept.tracked, rms_px=0.01) == record.tracked
+    residual = record.tracked.uv_px - MODEL.project(record.tracked.pose)[0]
+    assert kept.tracked.rms_px == pytest.approx(np.sqrt(np.mean(residual**2)))
+    assert (len(checks.own_spots), len(checks.causal), len(checks.invalid)) == (0, 0, 0)
+
+
+def test_frames_come_out_in_order_and_all_of_them():
+    records = [(a_record(k), a_record(k)) for k in range(150)]
+    out = list(FrameChecks(RIG).passed(iter(records)))
+    assert [(now.frame, then.frame) for now, then in out if then is not None] == [(k, k) for k in range(150)]
+    assert list(FrameChecks(RIG).passed([])) == []
+
+
+def distance(pose: Pose, of: Pose, covariance: np.ndarray) -> float:
+    gap = pose.minus(of)
+    return float(np.sqrt(gap @ np.linalg.solve(covariance, gap)))
+
+
+def test_a_pose_that_contradicts_its_spots_is_predicted_with_sigmas_that_cover_what_they_show():
+    record = a_record(off=200.0)
+    checks = FrameChecks(RIG)
+    (_, (kept, _)) = checks.passed([(a_record(3), None), (replace(record, frame=4), None)])
+    t = kept.tracked
+    assert distance(Pose.identity(), record.tracked.pose, P) > 400
+    assert t.pose_status is PoseStatus.PREDICTED
+    assert distance(Pose.identity(), t.pose, t.pose_covariance) < 2
+    assert t.motion is None
+    assert np.isnan(t.rms_px)
+    assert t.spots_used == 0
+    assert [e.kind for e in t.events] == [CONTRADICTION]
+    assert checks.own_spots.ranges == [[4, 4]]
+
+
+def test_where_the_spots_may_be_the_wrong_ones_the_sigmas_cover_the_causal_pose_too():
+    """Its three spots put the vehicle 200 sigmas from the reported pose, and the causal pass on the other side."""
+    record, causal = a_record(off=200.0, spots=4), a_record(off=400.0)
+    uv, _ = MODEL.project(causal.tracked.pose)
+    causal = changed(causal, uv_px=uv)
+    ((kept, _),) = FrameChecks(RIG).passed([(record, causal)])
+    t = kept.tracked
+    for pose in (Pose.identity(), causal.tracked.pose):
+        assert distance(pose, t.pose, t.pose_covariance) < 2
+    _, J = MODEL.project(t.pose)
+    hidden = J[5] @ t.pose_covariance @ J[5].T
+    np.testing.assert_allclose(t.cov_px2[5] - record.tracked.cov_px2[5], hidden - J[5] @ P @ J[5].T, rtol=1e-6)
+    np.testing.assert_allclose(t.cov_px2[0], record.tracked.cov_px2[0])
+
+
+def test_a_pose_that_two_spots_deny_is_widened_as_far_as_they_ask():
+    record = a_record(off=200.0, spots=2)
+    checks = FrameChecks(RIG)
+    ((kept, _),) = checks.passed([(record, None)])
+    assert len(checks.own_spots) == 1
+    assert np.all(np.diagonal(kept.tracked.pose_covariance) > 100 * np.diagonal(P))
+
+
+def test_a_smoothed_pose_without_spots_that_the_causal_pass_denies_covers_that_one():
+    smoothed = changed(
+        a_record(off=200.0), status=(SpotStatus.OCCLUDED,) * N, point=np.full(N, -1), pose_status=PoseStatus.PREDICTED
+    )
+    causal = a_record(spots=3)
+    checks = FrameChecks(RIG)
+    ((kept, then),) = checks.passed([(smoothed, causal)])
+    assert checks.causal.ranges == [[0, 0]]
+    assert kept.tracked.pose_status is PoseStatus.PREDICTED
+    assert distance(causal.tracked.pose, kept.tracked.pose, kept.tracked.pose_covariance) < 1
+    assert then is not None
+    assert then.tracked.pose_status is PoseStatus.MEASURED  # the causal tables stay what was known then
+    agreeing = changed(smoothed, pose=causal.tracked.pose)
+    assert [len(c.causal) for c in [checked(agreeing, causal)]] == [0]
+
+
+def checked(now: FrameRecord, then: FrameRecord | None = None) -> FrameChecks:
+    checks = FrameChecks(RIG)
+    list(checks.passed([(now, then)]))
+    return checks
+
+
+def test_a_spot_that_a_neighbour_has_pulled_does_not_accuse_the_pose():
+    record = a_record()
+    uv = record.tracked.uv_px.copy()
+    uv[2] += 3.0
+    assert len(checked(changed(record, uv_px=uv)).own_spots) == 1
+    assert len(checked(changed(record, uv_px=uv, witness=np.arange(N) != 2)).own_spots) == 0
+
+
+def test_what_the_calibration_allows_is_no_contradiction():
+    """A camera whose principal point is known to 4 px: its spots may all lie 4 px beside the pose's."""
+    record = a_record()
+    uv = record.tracked.uv_px + np.where((MODEL.camera_of == 1)[:, None], 4.0, 0.0)
+    off = changed(record, uv_px=uv)
+    assert len(checked(off).own_spots) == 1
+    checks = FrameChecks(RIG, RigCovariance(("cameras.right.cx", "cameras.right.cy"), 4.0**2 * np.eye(2)))
+    list(checks.passed([(off, None)]))
+    assert len(checks.own_spots) == 0
+
+
+NOT_POSITIVE = np.diag([1.0, 1.0, 1.0, 1.0, 1.0, -1e-9])
+
+
+def test_a_pose_whose_covariance_is_none_is_lost_and_its_measured_spots_stay():
+    checks = FrameChecks(RIG)
+    record = changed(a_record(spots=4), pose_covariance=NOT_POSITIVE)
+    ((kept, _),) = checks.passed([(record, None)])
+    t = kept.tracked
+    assert t.pose_status is PoseStatus.LOST
+    assert (t.pose, t.pose_covariance, t.motion, t.spots_used) == (None, None, None, 0)
+    assert t.status == (SpotStatus.MATCHED,) * 4 + (SpotStatus.LOST,) * 2
+    assert np.isfinite(t.uv_px[:4]).all()
+    assert np.isnan(t.uv_px[4:]).all()
+    assert [e.kind for e in t.events] == [NOT_A_COVARIANCE]
+    assert "internal error" in t.events[0].text
+    assert checks.invalid.ranges == [[0, 0]]
+
+
+def test_velocities_whose_covariance_is_none_are_left_out_and_the_pose_stays():
+    checks = FrameChecks(RIG)
+    record = changed(a_record(), motion=MotionEstimate(np.zeros(3), np.zeros(3), NOT_POSITIVE))
+    ((kept, _),) = checks.passed([(record, None)])
+    assert kept.tracked.motion is None
+    assert kept.tracked.pose_status is PoseStatus.MEASURED
+    assert len(checks.invalid) == 1
+
+
+def test_a_spot_whose_covariance_is_none_has_no_sigmas():
+    record = a_record(spots=4)
+    cov = record.tracked.cov_px2.copy()
+    cov[5] = np.diag([1.0, -1.0])
+    checks = FrameChecks(RIG)
+    ((kept, _),) = checks.passed([(changed(record, cov_px2=cov), None)])
+    assert np.isnan(kept.tracked.cov_px2[5]).all()
+    assert np.isfinite(kept.tracked.uv_px[5]).all()
+    assert len(checks.invalid) == 1
+
+
+def test_an_invalid_covariance_of_the_causal_tables_is_left_out_and_counted_once():
+    bad = changed(a_record(), pose_covariance=NOT_POSITIVE)
+    for now in (bad, a_record()):
+        checks = FrameChecks(RIG)
+        ((_, then),) = checks.passed([(now, bad)])
+        assert then is not None
+        assert then.tracked.pose is None
+        assert len(checks.invalid) == 1

@@ -1,0 +1,689 @@
+"""From a run folder to its results: every file, every row, honest numbers; complete or absent."""
+
+from __future__ import annotations
+
+import csv
+import json
+import weakref
+from collections import Counter
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from geometry.forward_model import SpotModel
+from geometry.pose import Pose
+from lab.errors import InputError, RunError
+from lab.files.run.results import POSE_STATUSES, read_poses, read_spots
+from lab.files.run.run_file import load_run
+from lab.files.text import columns
+from lab.files.text.json_text import plain
+from lab.runs import process
+from lab.runs.batch import process_batch
+from lab.runs.frames.pipeline import FrameRecord, Pipeline
+from lab.runs.process import are_results, process_run
+from lab.runs.score.score import normalised_squares
+from lab.runs.smoothing_pass import SMOOTHING, TRACKING, WRITING, TwoPasses
+from lab.runs.verdict.quality import LEAST_MEASURED
+from lab.simulate.scenarios import SCENARIOS, Fault
+from lab.simulate.write import simulate
+from tests.lab.run_folders import write_run
+from tests.paths import ROOT
+from tracking.curve_switching.spot_tracker import SpotTracker
+from tracking.rigid_body.rigid_tracker import RigidTracker
+from tracking.smoothing.smoothed import Smoothed
+from tracking.statuses import PoseStatus, SpotStatus
+from tracking.tracked_frame import Event, TrackedFrame
+
+CAUSAL_FILES = (
+    "attitude.csv", "beams.csv", "covariance.csv", "detections.csv", "report.html", "spots.csv", "summary.json",
+)  # fmt: skip
+FILES = (*CAUSAL_FILES, "attitude_causal.csv", "covariance_causal.csv")
+HEADERS = {"attitude.csv": columns.ATTITUDE, "beams.csv": columns.BEAMS, "covariance.csv": columns.COVARIANCE,
+           "detections.csv": columns.DETECTIONS, "spots.csv": columns.SPOTS,
+           "attitude_causal.csv": columns.ATTITUDE, "covariance_causal.csv": columns.COVARIANCE}  # fmt: skip
+FRAMES = 14
+# Frame 4 in no camera; 6 and 7 only in the right one; 9 damaged in the right one.
+DAMAGED = replace(
+    SCENARIOS["smooth"],
+    faults=(
+        Fault(4, "dropped"),
+        Fault(6, "dropped", "left"),
+        Fault(7, "dropped", "left"),
+        Fault(9, "truncated", "right"),
+    ),
+)
+
+
+def rows_of(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(p.name for p in folder.iterdir())
+
+
+def points_run(folder: Path, frames: int = 12, seed: int = 5) -> Path:
+    return simulate("smooth", folder, seed=seed, frames=frames, detections_only=True)
+
+
+class WeakRecord(FrameRecord):
+    """A record that can be watched: the slots of the plain one leave no room for that."""
+
+
+def a_tracked_frame(n: int) -> TrackedFrame:
+    """A frame in which nothing is known of n views."""
+    return TrackedFrame(
+        np.full((n, 2), np.nan), np.full((n, 2, 2), np.nan), (SpotStatus.OCCLUDED,) * n, np.full((n, 2), np.nan),
+        np.full(n, np.nan), np.full(n, -1), PoseStatus.LOST, None, None, 0, float("nan"), (),
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def run_folder(tmp_path_factory) -> Path:
+    """Half-size pictures with missing and damaged ones."""
+    return simulate(DAMAGED, tmp_path_factory.mktemp("process") / "run", seed=5, frames=FRAMES, picture_scale=0.5)
+
+
+@pytest.fixture(scope="module")
+def results(run_folder) -> Path:
+    out = run_folder.parent / "results"
+    process_run(run_folder, out)
+    return out
+
+
+@pytest.fixture(scope="module")
+def tables(results) -> dict[str, list[dict[str, str]]]:
+    return {name: rows_of(results / name) for name in HEADERS}
+
+
+# -- files and rows ---------------------------------------------------------------------------------------------------
+
+
+def test_all_files_of_the_contract_are_there_and_no_other(results):
+    assert names(results) == sorted(FILES)
+
+
+def test_no_half_written_folder_is_left_beside_the_results(results, run_folder):
+    assert names(results.parent) == ["results", "run"]
+
+
+@pytest.mark.parametrize("name", HEADERS)
+def test_every_line_has_exactly_the_columns_in_their_order(results, name):
+    with (results / name).open(newline="", encoding="utf-8") as file:
+        lines = list(csv.reader(file))
+    assert tuple(lines[0]) == HEADERS[name]
+    assert {len(line) for line in lines} == {len(HEADERS[name])}
+
+
+def test_attitude_has_a_row_for_every_frame_number_dropped_ones_too(tables):
+    assert [int(r["frame"]) for r in tables["attitude.csv"]] == list(range(FRAMES))
+    np.testing.assert_allclose([float(r["t_s"]) for r in tables["attitude.csv"]], np.arange(FRAMES) / 100)
+
+
+def test_spots_has_a_row_for_every_frame_camera_and_spot(tables, run_folder):
+    views = load_run(run_folder).rig.views()
+    assert [(int(r["frame"]), r["camera"], r["spot"]) for r in tables["spots.csv"]] == [
+        (k, c, s) for k in range(FRAMES) for c, s in views
+    ]
+
+
+def test_beams_has_a_row_for_every_frame_and_beam(tables, run_folder):
+    beams = load_run(run_folder).rig.beams
+    assert [(int(r["frame"]), r["beam"]) for r in tables["beams.csv"]] == [(k, b) for k in range(FRAMES) for b in beams]
+
+
+def test_covariance_has_a_row_for_every_frame_with_a_pose(tables):
+    with_pose = [r["frame"] for r in tables["attitude.csv"] if r["status"] != "lost"]
+    assert [r["frame"] for r in tables["covariance.csv"]] == with_pose
+
+
+def test_a_picture_that_is_missing_or_damaged_is_no_image(tables):
+    gone = {(4, "left"), (4, "right"), (6, "left"), (7, "left"), (9, "right")}
+    found = {(int(r["frame"]), r["camera"]) for r in tables["spots.csv"] if r["status"] == "no_image"}
+    assert found == gone
+    assert gone.isdisjoint({(int(r["frame"]), r["camera"]) for r in tables["detections.csv"]})
+
+
+def test_quaternions_are_unit_and_have_w_not_negative(tables):
+    q = np.array([[float(r[n]) for n in ("qw", "qx", "qy", "qz")] for r in tables["attitude.csv"] if r["qw"]])
+    assert np.all(q[:, 0] >= 0)
+    np.testing.assert_allclose(np.linalg.norm(q, axis=1), 1.0, atol=1e-9)
+
+
+def test_statuses_and_numbers_go_together(tables):
+    for r in tables["spots.csv"]:
+        empty = r["status"] in ("off_screen", "lost")
+        assert (r["u_px"] == "") == (r["v_px"] == "") == (r["sigma_u_px"] == "") == empty
+        assert (r["gain"] == "") or r["status"] in ("matched", "turned")
+    for r in tables["attitude.csv"]:
+        assert (r["x_m"] == "") == (r["status"] == "lost")
+    text = {v.lower() for name in HEADERS for r in tables[name] for v in r.values()}
+    assert text.isdisjoint({"nan", "inf", "-inf", "none"})
+
+
+@pytest.mark.parametrize("causal", [True, False])
+def test_a_beam_that_misses_its_screen_has_neither_place_nor_sigma(tmp_path, causal):
+    process_run(ROOT / "sample_runs/four-skew-beams", tmp_path / "out", causal=causal)
+    rows = [r for r in rows_of(tmp_path / "out/spots.csv") if r["status"] == "off_screen"]
+    assert rows
+    for name in ("u_px", "v_px", "sigma_u_px", "sigma_v_px", "cov_uv_px2"):
+        assert {r[name] for r in rows} == {""}
+
+
+def test_measured_poses_lie_within_their_sigmas_of_the_truth(tables, run_folder):
+    truth = {r["frame"]: r for r in rows_of(run_folder / "truth/pose.csv")}
+    squares = [
+        ((float(r[f"{axis}_m"]) - float(truth[r["frame"]][f"{axis}_m"])) / float(r[f"sigma_{axis}_m"])) ** 2
+        for r in tables["attitude.csv"]
+        if r["status"] == "measured"
+        for axis in "xyz"
+    ]
+    assert len(squares) >= 3 * 9
+    assert 0.3 < np.mean(squares) < 3.0
+
+
+# -- summary ----------------------------------------------------------------------------------------------------------
+
+
+def test_the_summary_counts_what_the_tables_hold(results, tables):
+    summary = json.loads((results / "summary.json").read_text("utf-8"))
+    counts = summary["counts"]
+    assert counts["frames"] == FRAMES
+    assert counts["pose_status"] == dict(Counter(r["status"] for r in tables["attitude.csv"]))
+    for view, statuses in counts["spot_status"].items():
+        camera, spot = view.split("/")
+        here = Counter(r["status"] for r in tables["spots.csv"] if (r["camera"], r["spot"]) == (camera, spot))
+        assert statuses == dict(here)
+    assert counts["no_image"] == {"left": [[4, 4], [6, 7]], "right": [[4, 4], [9, 9]]}
+    found = Counter(r["camera"] for r in tables["detections.csv"])
+    assert counts["detections_per_frame"] == pytest.approx({c: n / FRAMES for c, n in found.items()})
+    assert summary["rates"]["measured_share"] == counts["pose_status"]["measured"] / FRAMES
+
+
+def test_the_summary_says_what_went_in_and_what_was_done(results, run_folder):
+    summary = json.loads((results / "summary.json").read_text("utf-8"))
+    assert {Path(e["path"]).name for e in summary["inputs"]} == {"run.yaml", "rig.yaml", "left", "right"}
+    assert summary["parameters"]["tracker"]["r1_px"] == 10.0
+    assert summary["parameters"]["prior"]["within_m"] == pytest.approx(1.0)
+    assert summary["parameters"]["prior"]["within_deg"] == pytest.approx(30.0)
+    assert {"python", "numpy", "beampose"} <= set(summary["versions"])
+    assert summary["errors"] is not None  # there is truth
+    assert summary["verdict"]["exit_status"] in (0, 4)
+    assert all(s >= 0 for s in summary["timings"].values())
+
+
+def test_the_summary_is_strict_json(results):
+    def refuse(word):
+        raise AssertionError(f"{word} is no JSON")
+
+    json.loads((results / "summary.json").read_text("utf-8"), parse_constant=refuse)
+
+
+def test_a_number_that_does_not_exist_is_null_in_the_summary():
+    content = {"a": float("nan"), "b": [np.float64("inf"), np.int64(3)], "c": (np.float32(0.5), True, None, "text")}
+    assert plain(content) == {"a": None, "b": [None, 3], "c": [0.5, True, None, "text"]}
+
+
+def test_without_truth_there_are_no_errors(tmp_path):
+    folder = points_run(tmp_path / "run")
+    for file in (folder / "truth").iterdir():
+        file.unlink()
+    (folder / "truth").rmdir()
+    outcome = process_run(folder, tmp_path / "out")
+    assert outcome.errors is None
+    assert json.loads((tmp_path / "out/summary.json").read_text())["errors"] is None
+
+
+# -- the outcome ------------------------------------------------------------------------------------------------------
+
+
+def test_the_outcome_its_line_and_the_summary_agree(tmp_path):
+    folder = points_run(tmp_path / "run")
+    outcome = process_run(folder, tmp_path / "out")
+    summary = json.loads((tmp_path / "out/summary.json").read_text())
+    assert (outcome.frames, outcome.measured) == (12, summary["counts"]["pose_status"]["measured"])
+    assert outcome.verdict.status == summary["verdict"]["status"] == "pass"
+    assert outcome.exit_status == summary["verdict"]["exit_status"] == 0
+    assert outcome.line() == (
+        f"smooth-5: PASS: 12 of 12 frames measured ({outcome.verdict.reasons[0]}) -> {tmp_path / 'out'}"
+    )
+
+
+def test_a_run_in_which_the_vehicle_is_never_found_is_a_failed_gate_with_all_its_files(tmp_path):
+    """Grey pictures without any spot: processed, and exit status 4."""
+    folder = write_run(tmp_path / "run")
+    outcome = process_run(folder, tmp_path / "out")
+    assert outcome.exit_status == 4
+    assert outcome.measured == 0
+    assert "never found" in outcome.line()
+    assert names(tmp_path / "out") == sorted(FILES)
+    attitude = rows_of(tmp_path / "out/attitude.csv")
+    assert [r["status"] for r in attitude] == ["lost"] * 5
+    assert {r["status"] for r in rows_of(tmp_path / "out/spots.csv")} == {"lost"}
+    assert rows_of(tmp_path / "out/covariance.csv") == []
+
+
+def lit(folder: Path, frames: int) -> Path:
+    """A run of 40 frames of which the first so many, and the last, show spots."""
+    table = points_run(folder, frames=40) / "detections.csv"
+    lines = table.read_text().splitlines(keepends=True)
+    table.write_text(
+        "".join(ln for i, ln in enumerate(lines) if i == 0 or int(ln.split(",")[0]) < frames or ln.startswith("39,"))
+    )
+    return folder
+
+
+def evidence_of(out: Path) -> dict[str, dict]:
+    """The evidence of a run's verdict by its kind, as summary.json has it."""
+    return {e["kind"]: e for e in json.loads((out / "summary.json").read_text())["verdict"]["evidence"]}
+
+
+def test_a_run_that_is_dark_for_nearly_all_of_its_frames_fails_the_gate(tmp_path):
+    outcome = process_run(lit(tmp_path / "run", int(40 * LEAST_MEASURED) - 2), tmp_path / "out")
+    assert outcome.frames == 40
+    assert outcome.exit_status == 4
+
+
+def test_a_run_that_is_dark_for_half_of_its_frames_and_says_so_does_not_fail(tmp_path):
+    outcome = process_run(lit(tmp_path / "run", 18), tmp_path / "out")
+    assert (outcome.measured, outcome.verdict.status, outcome.exit_status) == (19, "check", 0)
+    few = evidence_of(tmp_path / "out")["few_measured"]
+    assert few["numbers"]["causes"] == {"hidden": 21}
+    assert few["remedy"]
+
+
+def test_a_camera_that_shows_nothing_is_named_with_what_to_do(tmp_path):
+    folder = points_run(tmp_path / "run", frames=20)
+    table = folder / "detections.csv"
+    table.write_text("".join(ln for ln in table.read_text().splitlines(keepends=True) if ",right," not in ln))
+    outcome = process_run(folder, tmp_path / "out")
+    assert outcome.exit_status == 4
+    evidence = evidence_of(tmp_path / "out")
+    assert list(evidence) == ["never_found", "nothing_detected"]
+    assert evidence["nothing_detected"]["what"] == "camera right: nothing was detected in any of its 20 pictures"
+    assert evidence["nothing_detected"]["remedy"] in outcome.line()
+    page = (tmp_path / "out/report.html").read_text("utf-8")
+    assert "nothing was detected in any of its 20 pictures" in page
+    assert "are the lasers on, the lens uncovered" in page
+
+
+def test_a_prior_that_is_wrong_is_not_taken_for_darkness(tmp_path):
+    folder = points_run(tmp_path / "run", frames=20)
+    content = yaml.safe_load((folder / "run.yaml").read_text())
+    content["prior"] |= {"position_m": [2.0, 1.5, 0.0], "within_m": 0.1, "within_deg": 3.0}
+    (folder / "run.yaml").write_text(yaml.safe_dump(content))
+    assert process_run(folder, tmp_path / "out").exit_status == 4
+    evidence = evidence_of(tmp_path / "out")
+    assert list(evidence) == ["never_found", "not_acquired"]
+    assert evidence["not_acquired"]["remedy"].startswith("Check the prior")
+
+
+def test_a_camera_that_stops_or_starts_late_is_told_in_words(tmp_path):
+    gone = tuple(Fault(k, "dropped", camera) for camera, k in (("left", 12), ("left", 13), ("right", 0)))
+    scenario = replace(SCENARIOS["smooth"], faults=gone)
+    folder = simulate(scenario, tmp_path / "run", seed=5, frames=FRAMES, picture_scale=0.3)
+    process_run(folder, tmp_path / "out")
+    evidence = evidence_of(tmp_path / "out")
+    assert (
+        evidence["camera_stopped"]["what"]
+        == "camera left stopped before the end: it has no picture from frame 12 on (2 frames)"
+    )
+    assert evidence["camera_late"]["what"] == "camera right starts late: it has no picture of the first 1 frame"
+
+
+def test_a_vehicle_that_the_smoothing_pass_knows_throughout_was_not_lost(tmp_path, monkeypatch):
+    """Searches of the causal pass are events; the verdict counts what is reported."""
+    causal_step = RigidTracker.step
+
+    def step(self, dt_s, found):
+        tracked = causal_step(self, dt_s, found)
+        return replace(tracked, events=(*tracked.events, Event("reacquired", "found from the prior alone")))
+
+    monkeypatch.setattr(RigidTracker, "step", step)
+    outcome = process_run(points_run(tmp_path / "run", frames=40), tmp_path / "out")
+    counts = json.loads((tmp_path / "out/summary.json").read_text())["counts"]
+    assert counts["events"]["reacquired"] == 40
+    assert counts["found_again"] == 0
+    assert outcome.verdict.status == "pass"
+    assert "found again" not in (tmp_path / "out/report.html").read_text("utf-8")
+
+
+@pytest.mark.parametrize("causal", [True, False])
+def test_the_residual_is_that_of_the_reported_pose_against_its_own_spots(tmp_path, causal):
+    folder = points_run(tmp_path / "run", frames=40)
+    process_run(folder, tmp_path / "out", causal=causal)
+    model = SpotModel.of(load_run(folder).rig)
+    poses, spots = read_poses(tmp_path / "out"), read_spots(tmp_path / "out")
+    order = [spots.views.index(view) for view in model.views]
+    residual = spots.uv_px[:, order] - model.project(poses.world_from_body)[0]
+    residual[~spots.measured[:, order]] = np.nan
+    measured = poses.has(PoseStatus.MEASURED)
+    assert measured.sum() > 30
+    rms = np.sqrt(np.nanmean(residual**2, axis=(1, 2)))
+    np.testing.assert_allclose(poses.rms_px[measured], rms[measured], rtol=1e-4)
+
+
+def test_a_smoother_that_goes_astray_is_reported_as_predicted_with_sigmas_that_cover_it(tmp_path, monkeypatch):
+    """A pose 5 mm off for ten frames, at claimed sigmas of 0.1 mm: its spots deny it, and the verdict says so."""
+    smoothed_frame = Smoothed.frame
+
+    def astray(self, k, causal, found):
+        tracked = smoothed_frame(self, k, causal, found)
+        if not 20 <= k < 30:
+            return tracked
+        return replace(tracked, pose=tracked.pose.plus(np.array([5e-3, 0, 0, 0, 0, 0])))
+
+    folder = points_run(tmp_path / "run", frames=40)
+    monkeypatch.setattr(Smoothed, "frame", astray)
+    outcome = process_run(folder, tmp_path / "out")
+    evidence = evidence_of(tmp_path / "out")["contradiction"]
+    assert evidence["numbers"] == {"frames": [[20, 29]]}
+    assert "contradict their own spots" in outcome.line()
+    poses = read_poses(tmp_path / "out")
+    assert np.flatnonzero(poses.has(PoseStatus.PREDICTED)).tolist() == list(range(20, 30))
+    truth = rows_of(folder / "truth/pose.csv")
+    q = np.array([[float(r[n]) for n in ("qw", "qx", "qy", "qz")] for r in truth])
+    true = Pose.from_quaternion(q, np.array([[float(r[n]) for n in ("x_m", "y_m", "z_m")] for r in truth]))
+    nees = normalised_squares(true.minus(poses.world_from_body), poses.covariance)
+    assert np.all(nees[20:30] < 25)
+
+
+def test_the_same_run_gives_the_same_tables(tmp_path, run_folder, results):
+    process_run(run_folder, tmp_path / "again")
+    for name in HEADERS:
+        assert (tmp_path / "again" / name).read_bytes() == (results / name).read_bytes()
+
+
+def test_detections_that_were_written_can_be_the_input(tmp_path, run_folder, results):
+    """A run from its own detections.csv: the same poses without the pictures, to the digits written."""
+    run = yaml.safe_load((run_folder / "run.yaml").read_text())
+    other = tmp_path / "run"
+    other.mkdir()
+    (other / "rig.yaml").write_bytes((run_folder / "rig.yaml").read_bytes())
+    (other / "detections.csv").write_bytes((results / "detections.csv").read_bytes())
+    run["cameras"] = {name: {"detections": "detections.csv"} for name in run["cameras"]}
+    (other / "run.yaml").write_text(yaml.safe_dump(run))
+    process_run(other, tmp_path / "out")
+    for a, b in zip(rows_of(tmp_path / "out/attitude.csv"), rows_of(results / "attitude.csv"), strict=True):
+        if a["status"] == b["status"] == "measured" and a["spots_used"] == b["spots_used"]:
+            assert float(a["yaw_deg"]) == pytest.approx(float(b["yaw_deg"]), abs=1e-5)
+
+
+def test_overrides_replace_parameters_of_the_run_and_reach_inner_blocks(tmp_path):
+    folder = points_run(tmp_path / "run")
+    process_run(folder, tmp_path / "out", overrides={"r1_px": 12.0, "labels.p_detect": 0.9, "method": "rigid"})
+    tracker = json.loads((tmp_path / "out/summary.json").read_text())["parameters"]["tracker"]
+    assert (tracker["r1_px"], tracker["labels"]["p_detect"], tracker["method"]) == (12.0, 0.9, "rigid")
+    assert tracker["r2_px"] == 30.0
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        ({"r1_pz": 3}, r"--set: unknown key 'r1_pz'.*did you mean 'r1_px'"),
+        ({"labels.p_detct": 3}, r"--set: labels.*'p_detct'.*did you mean 'p_detect'"),
+        ({"lables.p_detect": 3}, r"'lables'.*did you mean 'labels'"),
+        ({"r1_px.x": 3}, r"--set: .*r1_px\.x"),
+        ({"r1_px": "wide"}, r"--set: r1_px: expected a finite number, got 'wide'"),
+        ({"method": "magic"}, r"--set: method: expected .*rigid.*spots.*'magic'"),
+    ],
+)
+def test_a_wrong_override_is_a_plain_error_and_nothing_is_written(tmp_path, overrides, words):
+    folder = points_run(tmp_path / "run", frames=3)
+    with pytest.raises(InputError, match=words):
+        process_run(folder, tmp_path / "out", overrides=overrides)
+    assert names(tmp_path) == ["run"]
+
+
+@pytest.mark.parametrize("method", ["rigid", "spots"])
+def test_a_run_without_a_prior_gives_the_same_as_with_one(tmp_path, method):
+    """Four skew beams have no symmetry: their first labels need no prior."""
+    folder = simulate("four-skew-beams", tmp_path / "run", seed=5, frames=20, detections_only=True)
+    process_run(folder, tmp_path / "with", overrides={"method": method})
+    content = yaml.safe_load((folder / "run.yaml").read_text())
+    del content["prior"]
+    (folder / "run.yaml").write_text(yaml.safe_dump(content))
+    process_run(folder, tmp_path / "without", overrides={"method": method})
+    assert json.loads((tmp_path / "without/summary.json").read_text())["parameters"]["prior"] is None
+    one, other = (read_poses(tmp_path / which) for which in ("with", "without"))
+    assert (other.status == POSE_STATUSES.index(PoseStatus.MEASURED)).all()
+    away = one.world_from_body.minus(other.world_from_body)
+    assert np.abs(away[:, :3]).max() < 1e-3
+    assert np.abs(away[:, 3:]).max() < np.deg2rad(0.02)
+
+
+# -- two passes -------------------------------------------------------------------------------------------------------
+
+
+def test_in_the_last_frame_the_whole_run_is_what_was_known_at_the_instant(tmp_path):
+    """Nothing comes after it. (The jerk is set: learnt from all frames it would differ from what was known then.)"""
+    known = {"learn_jerk": False, "jerk_m_s3": 2.0, "jerk_rad_s3": 5.0}
+    process_run(points_run(tmp_path / "run", frames=60), tmp_path / "out", overrides=known)
+    smoothed, causal = (read_poses(tmp_path / "out", causal=c) for c in (False, True))
+    assert np.array_equal(smoothed.frames, causal.frames)
+    away = normalised_squares(smoothed.world_from_body.minus(causal.world_from_body), causal.covariance)
+    assert away[-1] < 1e-3**2  # a thousandth of a sigma: about other references both are linear
+    assert np.median(away[:-5]) > 1.0
+    np.testing.assert_allclose(smoothed.sigma_position_m[-1], causal.sigma_position_m[-1], rtol=1e-3)
+    np.testing.assert_allclose(smoothed.sigma_ypr_deg[-1], causal.sigma_ypr_deg[-1], rtol=1e-3)
+    np.testing.assert_allclose(smoothed.sigma_velocity_m_s[-1], causal.sigma_velocity_m_s[-1], rtol=1e-2)
+    # In the midst the frames that follow tell as much as those before.
+    inner = [np.median(p.sigma_ypr_deg[10:-10, 0]) for p in (smoothed, causal)]
+    assert inner[0] < 0.75 * inner[1]
+
+
+def test_in_the_first_frame_the_whole_run_tells_more_than_the_instant(tmp_path):
+    process_run(points_run(tmp_path / "run", frames=30), tmp_path / "out")
+    smoothed, causal = (read_poses(tmp_path / "out", causal=c) for c in (False, True))
+    assert np.all(smoothed.sigma_position_m[0] < causal.sigma_position_m[0])
+    assert np.all(smoothed.sigma_velocity_m_s[0] < 0.1 * causal.sigma_velocity_m_s[0])
+
+
+def test_a_causal_run_is_what_a_smoothed_one_keeps_of_each_instant(tmp_path):
+    folder = points_run(tmp_path / "run")
+    process_run(folder, tmp_path / "smoothed")
+    process_run(folder, tmp_path / "causal", causal=True)
+    assert names(tmp_path / "causal") == sorted(CAUSAL_FILES)
+    for name in ("attitude", "covariance"):
+        kept, alone = tmp_path / "smoothed" / f"{name}_causal.csv", tmp_path / "causal" / f"{name}.csv"
+        assert kept.read_bytes() == alone.read_bytes()
+        assert kept.read_bytes() != (tmp_path / "smoothed" / f"{name}.csv").read_bytes()
+    summaries = [json.loads((tmp_path / which / "summary.json").read_text()) for which in ("smoothed", "causal")]
+    assert [t["attitude"] for t in summaries] == ["smoothed", "causal"]
+    assert [t["timings"]["smoothing_s"] > 0 for t in summaries] == [True, False]
+    said = {"jerk_m_s3", "jerk_rad_s3", "iterations", "relabelled", "place_share", "seconds"}
+    assert set(summaries[0]["smoother"]) == said
+    assert summaries[1]["smoother"] is None
+    assert [t["errors"]["pose_causal"] is None for t in summaries] == [False, True]
+
+
+def test_what_was_predicted_before_a_frame_is_the_same_in_both_passes(tmp_path):
+    folder = points_run(tmp_path / "run")
+    process_run(folder, tmp_path / "smoothed")
+    process_run(folder, tmp_path / "causal", causal=True)
+    smoothed, causal = (rows_of(tmp_path / which / "spots.csv") for which in ("smoothed", "causal"))
+    for a, b in zip(smoothed, causal, strict=True):
+        assert (a["predicted_u_px"], a["predicted_v_px"]) == (b["predicted_u_px"], b["predicted_v_px"])
+    assert any(a["predicted_u_px"] for a in smoothed)
+
+
+def test_the_papers_tracker_is_smoothed_too_and_keeps_its_labels(tmp_path):
+    folder = points_run(tmp_path / "run")
+    process_run(folder, tmp_path / "smoothed", overrides={"method": "spots"})
+    process_run(folder, tmp_path / "causal", overrides={"method": "spots"}, causal=True)
+    summary = json.loads((tmp_path / "smoothed/summary.json").read_text())
+    assert (summary["attitude"], summary["smoother"]["relabelled"]) == ("smoothed", 0)
+    smoothed, causal = (rows_of(tmp_path / which / "spots.csv") for which in ("smoothed", "causal"))
+    assert [r["status"] for r in smoothed] == [r["status"] for r in causal]
+    assert {r["label_probability"] for r in smoothed} == {""}  # nothing estimates it
+    assert {r["velocity_x_m_s"] for r in rows_of(tmp_path / "causal/attitude.csv")} == {""}  # it has none
+    assert "" not in {r["velocity_x_m_s"] for r in rows_of(tmp_path / "smoothed/attitude.csv")}
+
+
+def test_the_method_chooses_the_tracker(tmp_path):
+    run = load_run(points_run(tmp_path / "run", frames=3))
+    for method, kind in (("rigid", RigidTracker), ("spots", SpotTracker)):
+        chosen = replace(run, tracker=replace(run.tracker, method=method))
+        assert type(Pipeline.of(chosen).tracker) is kind
+    assert run.tracker.method == "rigid"  # unless the run says otherwise
+
+
+def test_frames_wait_on_disk_and_not_in_memory(tmp_path):
+    """Between the passes only the recording is held: no record of pass 1 is alive, and memory does not follow them."""
+    pipeline = Pipeline.of(load_run(points_run(tmp_path / "run", frames=40)))
+    alive = []
+
+    class Watched:
+        """A pipeline whose records are watched until they are gone."""
+
+        run, reader, timings = pipeline.run, pipeline.reader, pipeline.timings
+
+        @staticmethod
+        def records():
+            for record in pipeline.records():
+                copy = WeakRecord(*(getattr(record, f.name) for f in fields(record)))
+                alive.append(weakref.ref(copy))
+                yield copy
+
+    left = []
+    passes = TwoPasses(Watched(), tmp_path, lambda done, total, stage: left.append(stage == SMOOTHING and still()))
+
+    def still():
+        return sum(ref() is not None for ref in alive)
+
+    assert sum(1 for _ in passes.records()) == 40
+    assert len(alive) == 40
+    assert max(left) <= 1  # the one that the loop still holds
+    assert names(tmp_path) == ["run"]  # and no file stays
+
+
+def test_what_waits_between_the_passes_is_gone_when_nobody_reads_on(tmp_path):
+    pipeline = Pipeline.of(load_run(points_run(tmp_path / "run", frames=6)))
+    work = tmp_path / "work"
+    work.mkdir()
+    records = TwoPasses(pipeline, work).records()
+    next(records)
+    records.close()
+    assert names(work) == []
+
+
+def test_labels_that_stay_open_for_long_are_one_event():
+    tally = process._Tally(("left",), ("left/1", "left/2"))
+    nothing = replace(a_tracked_frame(2), label_probability=np.array([0.6, np.nan]))
+    for frame in (3, 4, 5, 9):
+        events = (Event("undecided", "label left open", 0), Event("dropped", "contradicts", 1))
+        tally.add(FrameRecord(frame, 0.0, 0.0, (None,), ("dark",), replace(nothing, events=events)))
+    told = [(e["frame"], e["last_frame"], e["kind"], e["spot"]) for e in tally.events]
+    assert told == [
+        (3, 5, "undecided", "1"), (3, 3, "dropped", "2"), (4, 4, "dropped", "2"), (5, 5, "dropped", "2"),
+        (9, 9, "undecided", "1"), (9, 9, "dropped", "2"),
+    ]  # fmt: skip
+    assert tally.event_kinds == {"undecided": 4, "dropped": 4}
+    assert tally.left_open == 4
+
+
+# -- complete or absent -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("error", [RunError("the disk is full"), KeyboardInterrupt(), RuntimeError("a bug")])
+def test_a_run_that_breaks_in_the_middle_leaves_nothing(tmp_path, monkeypatch, error):
+    folder = points_run(tmp_path / "run")
+    write = process.TableWriter.write
+
+    def break_at_frame_6(self, record, causal):
+        if record.frame == 6:
+            raise error
+        write(self, record, causal)
+
+    monkeypatch.setattr(process.TableWriter, "write", break_at_frame_6)
+    with pytest.raises(type(error)):
+        process_run(folder, tmp_path / "out")
+    assert names(tmp_path) == ["run"]
+
+
+@pytest.mark.parametrize("stage", [TRACKING, SMOOTHING, WRITING])
+def test_a_run_that_is_stopped_in_either_pass_leaves_nothing(tmp_path, stage):
+    folder = points_run(tmp_path / "run")
+
+    def stop(done, total, now):
+        if now == stage and done in (0, 4):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        process_run(folder, tmp_path / "out", progress=stop)
+    assert names(tmp_path) == ["run"]
+
+
+def test_a_run_that_breaks_leaves_earlier_results_as_they_were(tmp_path, monkeypatch):
+    folder = points_run(tmp_path / "run", frames=4)
+    out = tmp_path / "out"
+    process_run(folder, out)
+    before = {p.name: p.read_bytes() for p in out.iterdir()}
+
+    def fail(*_):
+        raise RunError("the disk is full")
+
+    monkeypatch.setattr(process, "write_json", fail)
+    with pytest.raises(RunError):
+        process_run(folder, out)
+    assert {p.name: p.read_bytes() for p in out.iterdir()} == before
+    assert names(tmp_path) == ["out", "run"]
+
+
+def test_earlier_results_are_replaced_as_a_whole(tmp_path):
+    out = tmp_path / "out"
+    process_run(points_run(tmp_path / "long", frames=6), out)
+    (out / "left-over.txt").write_text("from an older version")
+    process_run(points_run(tmp_path / "short", frames=4), out)
+    assert names(out) == sorted(FILES)
+    assert len(rows_of(out / "attitude.csv")) == 4
+
+
+def test_a_foreign_folder_is_not_deleted(tmp_path):
+    folder = points_run(tmp_path / "run", frames=3)
+    foreign = tmp_path / "photos"
+    foreign.mkdir()
+    (foreign / "summary.json").write_text('{"schema": "another program"}')
+    with pytest.raises(InputError, match="something other than earlier results"):
+        process_run(folder, foreign)
+    assert names(foreign) == ["summary.json"]
+    with pytest.raises(InputError, match="something other than earlier results"):
+        process_run(folder, folder)  # the run folder itself
+    assert (folder / "run.yaml").is_file()
+
+
+@pytest.mark.parametrize("content", [None, "", "[]", "3", "{}", '{"schema": "beampose/run/1"}', "\xff"])
+def test_what_is_no_summary_of_ours_is_no_result(tmp_path, content):
+    if content is not None:
+        (tmp_path / "summary.json").write_bytes(content.encode("latin-1"))
+    assert not are_results(tmp_path)
+
+
+def test_results_are_results(results):
+    assert are_results(results)
+
+
+@pytest.mark.parametrize("causal", [True, False])
+def test_progress_counts_every_frame_of_every_pass(tmp_path, causal):
+    told = []
+    process_run(
+        points_run(tmp_path / "run", frames=7),
+        tmp_path / "out",
+        causal=causal,
+        progress=lambda *what: told.append(what),
+    )
+    tracked = [(done, 7, TRACKING) for done in range(1, 8)]
+    assert [(done, total or 7, stage) for done, total, stage in told[:7]] == tracked
+    assert told[7:] == ([] if causal else [(0, None, SMOOTHING), *((done, 7, WRITING) for done in range(1, 8))])
+
+
+def test_a_batch_of_one_is_the_run(tmp_path):
+    folder = points_run(tmp_path / "run", frames=4)
+    process_run(folder, tmp_path / "one")
+    process_batch([folder], tmp_path / "many")
+    for name in HEADERS:
+        assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "many/run" / name).read_bytes()

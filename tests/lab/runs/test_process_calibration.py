@@ -1,0 +1,96 @@
+"""A rig's calibration in a run: its covariance in the tables and the report, its expiry in the exit status."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import datetime
+
+import numpy as np
+import pytest
+import yaml
+
+from geometry.uncertainty.rig_parameters import rig_names
+from lab.errors import CalibrationError
+from lab.files.rig.calibration_state import CalibrationState
+from lab.files.rig.camera_block import Covariance
+from lab.files.rig.rig_file import RigFile, load_rig_file, save_rig
+from lab.files.run.results import read_poses
+from lab.runs.batch import process_batch
+from lab.runs.process import process_run
+from lab.simulate.write import simulate
+
+DAY = datetime.date(2026, 3, 14)
+
+
+@pytest.fixture
+def run_folder(tmp_path):
+    return simulate("smooth", tmp_path / "run", seed=5, frames=10, detections_only=True)
+
+
+def change_rig(run_folder, **changes):
+    path = run_folder / "rig.yaml"
+    save_rig(dataclasses.replace(load_rig_file(path), **changes), path)
+
+
+def covariance(rig, sigma=2e-4):
+    names = rig_names(rig)
+    return {"target": Covariance(names, np.diag([(1.0 if n.endswith((".cx", ".cy")) else sigma) ** 2 for n in names]))}
+
+
+def test_the_calibrations_share_comes_out_in_its_own_table_and_in_the_total(run_folder, tmp_path):
+    process_run(run_folder, tmp_path / "without")
+    assert not (tmp_path / "without" / "systematic.csv").exists()
+    rig = load_rig_file(run_folder / "rig.yaml").rig
+    change_rig(run_folder, covariances=covariance(rig))
+    process_run(run_folder, tmp_path / "with")
+    plain, poses = read_poses(tmp_path / "without"), read_poses(tmp_path / "with")
+    noise = poses.covariance - poses.systematic
+    assert np.linalg.eigvalsh(noise).min() > 0
+    assert np.linalg.eigvalsh(poses.systematic).min() > -1e-12
+    # A principal point that is known to a pixel outweighs spots that are known to a tenth.
+    variances, alone = (np.diagonal(p.covariance, axis1=1, axis2=2) for p in (poses, plain))
+    assert np.all(variances > 2 * alone)
+    with (tmp_path / "with" / "systematic.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 10
+    assert float(rows[0]["c00"]) == pytest.approx(poses.systematic[0, 0, 0])
+    report = (tmp_path / "with" / "report.html").read_text()
+    assert "of it calibration" in report
+    assert "no mean lessens them" in report
+    assert "states no covariance of its calibration" in (tmp_path / "without" / "report.html").read_text()
+
+
+def test_an_expired_calibration_stops_a_run_and_leaves_nothing(run_folder, tmp_path):
+    change_rig(run_folder, calibration=CalibrationState(DAY, "PASS", DAY))
+    with pytest.raises(CalibrationError, match="out of date"):
+        process_run(run_folder, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_day_of_the_recording_counts_where_the_run_tells_it(run_folder, tmp_path):
+    change_rig(run_folder, calibration=CalibrationState(DAY, "WARN", DAY, ("a corner of the picture was not covered",)))
+    path = run_folder / "run.yaml"
+    content = yaml.safe_load(path.read_text())
+    path.write_text(yaml.safe_dump({**content, "recorded": "2026-03-14"}))
+    assert process_run(run_folder, tmp_path / "out").exit_status == 0
+    path.write_text(yaml.safe_dump({**content, "recorded": "2026-03-15"}))
+    with pytest.raises(CalibrationError, match=r"1 day before 2026-03-15 \(the recording's day\)"):
+        process_run(run_folder, tmp_path / "late")
+
+
+def test_a_batch_with_an_expired_calibration_ends_with_status_3(run_folder, tmp_path):
+    good = simulate("smooth", tmp_path / "good", seed=6, frames=8, detections_only=True)
+    change_rig(run_folder, calibration=CalibrationState(DAY, "FAIL", None, ("the stand did not roll",)))
+    outcome = process_batch([good, run_folder], tmp_path / "out")
+    assert outcome.exit_status == 3
+    assert (tmp_path / "out" / "good" / "report.html").exists()
+    assert "FAIL" in (tmp_path / "out" / "batch.csv").read_text()
+
+
+def test_cameras_that_a_run_does_without_do_not_matter(run_folder, tmp_path):
+    file = load_rig_file(run_folder / "rig.yaml")
+    extra = dataclasses.replace(file.rig.cameras["left"], name="spare")
+    rig = dataclasses.replace(file.rig, cameras={**file.rig.cameras, "spare": extra})
+    save_rig(RigFile(rig, covariance(rig)), run_folder / "rig.yaml")
+    assert process_run(run_folder, tmp_path / "out").exit_status == 0

@@ -1,0 +1,372 @@
+"""The score says what is known of a run by construction."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from geometry.pose import Pose
+from lab.errors import InputError
+from lab.files.run.results import ABSENT, SPOT_STATUSES, SpotGrid, read_poses, read_spots
+from lab.runs.score.motion_score import differenced
+from lab.runs.score.score import Truth, _returns, normalised_squares, read_truth, right_spot, score, score_against
+from tests.lab.fake_results import MOTION_SIGMA, NOISE_PX, Fake, make, without_added_columns
+from tracking.statuses import PoseStatus, SpotStatus
+
+
+@pytest.fixture(scope="module")
+def quiet(tmp_path_factory: pytest.TempPathFactory) -> Fake:
+    """600 frames in which every spot in the picture was found under its own name."""
+    return make(tmp_path_factory.mktemp("quiet"), 600, eventful=False)
+
+
+@pytest.fixture(scope="module")
+def eventful(tmp_path_factory: pytest.TempPathFactory) -> Fake:
+    return make(tmp_path_factory.mktemp("eventful"), 600)
+
+
+def rewritten(source: Fake, folder: Path, change: Callable[[dict[str, str]], dict[str, str] | None]) -> Path:
+    """A copy of the results with every row of spots.csv passed through `change`; None takes the row out."""
+    folder.mkdir(exist_ok=True)
+    for path in source.results.iterdir():
+        (folder / path.name).write_bytes(path.read_bytes())
+    with (source.results / "spots.csv").open(newline="") as file:
+        reader = csv.DictReader(file)
+        rows = [row for old in reader if (row := change(old)) is not None]
+    with (folder / "spots.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, reader.fieldnames or [])
+        writer.writeheader()
+        writer.writerows(rows)
+    return folder
+
+
+def test_a_run_with_every_label_right_scores_one_and_its_errors_are_the_noise_put_in(quiet):
+    s = score(quiet.results, quiet.run_folder)["spots"]
+    assert s["in_view_identity"] == 1.0
+    assert s["wrong_labels"] == 0
+    assert s["visible_but_not_found_rows"] == 0
+    n = s["measured_px"]["rows"]
+    tolerance = 4 / np.sqrt(2 * n)  # four sigmas of an RMS of n numbers
+    for axis in ("rms_u", "rms_v"):
+        assert s["measured_px"][axis] == pytest.approx(NOISE_PX, rel=tolerance)
+        assert s["prediction_px"]["all_measured"][axis] == pytest.approx(0.2, rel=tolerance)
+
+
+def test_poses_scattered_as_their_covariance_says_have_a_mean_nees_of_six(quiet):
+    block = score(quiet.results, quiet.run_folder)["pose"]["measured"]
+    low, high = block["nees_mean_95"]
+    assert low < block["nees_mean"] < high
+    assert low < 6 < high
+
+
+def test_half_the_stated_covariance_doubles_the_nees(quiet):
+    spots, poses = read_spots(quiet.results), read_poses(quiet.results)
+    truth = read_truth(quiet.run_folder, spots, poses)
+    once = score_against(spots, poses, truth)["pose"]["measured"]["nees_mean"]
+    twice = score_against(spots, replace(poses, covariance=poses.covariance / 2), truth)["pose"]["measured"][
+        "nees_mean"
+    ]
+    assert twice == pytest.approx(2 * once, rel=1e-9)
+
+
+def test_nees_weighs_an_error_by_the_whole_covariance_with_its_correlations():
+    rng = np.random.default_rng(3)
+    A = rng.normal(size=(50, 6, 6)) * np.array([1e-3, 1e-3, 1e-3, 1e-5, 1e-5, 1e-5])[:, None]  # metres beside radians
+    C, delta = A @ np.swapaxes(A, 1, 2), rng.normal(size=(50, 6)) * 1e-4
+    plain = np.einsum("ni,nij,nj->n", delta, np.linalg.inv(C), delta)
+    np.testing.assert_allclose(normalised_squares(delta, C), plain, rtol=1e-6)
+
+
+def test_a_covariance_that_cannot_be_inverted_gives_no_nees():
+    C = np.stack([np.zeros((6, 6)), np.ones((6, 6)), np.full((6, 6), np.nan)])
+    assert np.isnan(normalised_squares(np.ones((3, 6)), C)).all()
+
+
+def test_a_pose_off_by_a_known_turn_and_shift_is_reported_in_body_and_world_axes(quiet):
+    spots, poses = read_spots(quiet.results), read_poses(quiet.results)
+    delta = np.array([1e-3, -2e-3, 3e-3, *np.radians([0.1, 0.2, -0.3])])
+    truth = Truth(None, None, poses.world_from_body.plus(np.broadcast_to(delta, (len(poses.frames), 6))))
+    out = score_against(spots, poses, truth)
+    assert out["spots"] is None
+    assert list(out["pose"]["measured"]["position_rms_m"].values()) == pytest.approx([1e-3, 2e-3, 3e-3])
+    assert list(out["pose"]["measured"]["rotation_rms_deg"].values()) == pytest.approx([0.1, 0.2, 0.3])
+
+
+def test_two_spots_that_swap_names_are_wrong_and_cost_just_those_frames(quiet, tmp_path):
+    swap = {"1": "2", "2": "1"}
+
+    def change(row: dict[str, str]) -> dict[str, str]:
+        if 100 <= int(row["frame"]) < 110:
+            row["spot"] = swap.get(row["spot"], row["spot"])
+        return row
+
+    s = score(rewritten(quiet, tmp_path / "results", change), quiet.run_folder)["spots"]
+    assert s["wrong_labels"] == 20
+    assert s["in_view_identity"] == pytest.approx(1 - 20 / s["in_view_rows"], abs=1e-12)
+    assert [r["wrong_labels"] for r in s["per_spot"]] == [10, 10, 0, 0, 0, 0]
+
+
+def test_clutter_beside_a_spot_taken_for_it_is_a_wrong_label(quiet, tmp_path):
+    def change(row: dict[str, str]) -> dict[str, str]:
+        if row["frame"] == "50" and row["spot"] == "5":
+            row["u_px"] = str(float(row["u_px"]) + 5.0)
+        return row
+
+    assert score(rewritten(quiet, tmp_path / "results", change), quiet.run_folder)["spots"]["wrong_labels"] == 1
+
+
+def test_spots_that_cross_closer_than_the_noise_are_not_called_swapped():
+    true_uv = np.array([[[100.0, 100.0], [100.3, 100.0]]])
+    measured = SpotGrid(
+        frames=np.array([0]), t_s=np.zeros(1), views=(("a", "1"), ("a", "2")), uv_px=true_uv[:, ::-1].copy(),
+        sigma_px=np.full((1, 2, 2), 0.1), predicted_px=true_uv, gain=np.ones((1, 2)), status=np.zeros((1, 2), np.int64),
+        label_probability=np.ones((1, 2)),
+    )  # fmt: skip
+    assert right_spot(measured, true_uv).all()
+    apart = true_uv + np.array([[[0.0, 0.0], [2.0, 0.0]]])  # 2.3 px: well over the noise, under the tolerance
+    assert not right_spot(replace(measured, uv_px=apart[:, ::-1]), apart).any()
+
+
+def test_a_visible_spot_that_is_not_found_costs_identity_but_is_no_wrong_label(quiet, tmp_path):
+    def change(row: dict[str, str]) -> dict[str, str]:
+        if row["frame"] == "7" and row["spot"] == "6":
+            row["status"] = "occluded"
+        return row
+
+    s = score(rewritten(quiet, tmp_path / "results", change), quiet.run_folder)["spots"]
+    assert s["visible_but_not_found_rows"] == 1
+    assert s["wrong_labels"] == 0
+    assert s["in_view_identity"] == pytest.approx(1 - 1 / s["in_view_rows"], abs=1e-12)
+
+
+def test_a_row_that_the_results_do_not_have_costs_as_much_as_a_spot_not_found(quiet, tmp_path):
+    results = rewritten(quiet, tmp_path / "results", lambda r: None if (r["frame"], r["spot"]) == ("7", "6") else r)
+    assert (read_spots(results).status == ABSENT).sum() == 1
+    assert score(results, quiet.run_folder)["spots"]["visible_but_not_found_rows"] == 1
+
+
+def test_a_frame_without_a_picture_counts_neither_for_nor_against(quiet, tmp_path):
+    def change(row: dict[str, str]) -> dict[str, str]:
+        if row["frame"] in ("7", "8") and row["camera"] == "right":
+            row["status"] = "no_image"
+        return row
+
+    before = score(quiet.results, quiet.run_folder)["spots"]
+    after = score(rewritten(quiet, tmp_path / "results", change), quiet.run_folder)["spots"]
+    assert after["in_view_identity"] == 1.0
+    assert after["in_view_rows"] == before["in_view_rows"] - 6
+
+
+def test_the_papers_recognition_rate_counts_all_that_is_out_of_view_as_wrong(quiet):
+    s = score(quiet.results, quiet.run_folder)["spots"]
+    inside = quiet.model.in_picture(quiet.true_uv)
+    assert 0.5 < inside.mean() < 1
+    assert s["recognition_rate_eq15"]["paper"] == pytest.approx(inside.mean())
+    assert s["recognition_rate_eq15"]["in_view"] == 1.0
+    assert s["recognition_rate_eq15"]["all_within_tolerance"] == 1.0  # out of view it is 0.4 px off at 1 sigma
+
+
+def test_turned_frames_do_not_enter_the_straight_prediction_error_but_stay_in_the_whole(eventful):
+    s = score(eventful.results, eventful.run_folder)["spots"]["prediction_px"]
+    assert s["straight"]["max"] < 2
+    assert s["turned"]["rms"] == pytest.approx(8 * np.sqrt(2), rel=0.05)  # what fake_results puts there
+    assert s["all_measured"]["max"] == s["turned"]["max"]
+
+
+def test_bends_of_the_true_path_are_set_apart_whatever_the_tracker_called_them(eventful, tmp_path):
+    def change(row: dict[str, str]) -> dict[str, str]:
+        row["status"] = "matched" if row["status"] == "turned" else row["status"]
+        return row
+
+    s = score(rewritten(eventful, tmp_path / "results", change), eventful.run_folder)["spots"]["prediction_px"]
+    assert s["turned"] is None
+    assert s["straight"]["max"] > 8
+    assert s["smooth"]["max"] < 2
+    assert s["bends"]["rms"] == pytest.approx(8 * np.sqrt(2), rel=0.05)
+
+
+def test_the_first_two_frames_of_a_track_are_set_apart_and_not_lost(quiet, tmp_path):
+    def change(row: dict[str, str]) -> dict[str, str]:
+        if row["frame"] in ("0", "1"):  # no speed is known yet: the prediction is far behind
+            row["predicted_u_px"] = str(float(row["predicted_u_px"]) + 50.0)
+        return row
+
+    s = score(rewritten(quiet, tmp_path / "results", change), quiet.run_folder)["spots"]["prediction_px"]
+    assert s["start"]["rows"] == 12
+    assert s["start"]["rms_u"] == pytest.approx(50, abs=1)
+    assert s["smooth"]["max"] < 2
+    assert s["straight"]["max"] < 2
+    assert s["all_measured"]["max"] > 49
+
+
+def test_the_out_of_view_error_is_that_put_in_and_takes_only_what_truly_is_outside(eventful):
+    s = score(eventful.results, eventful.run_folder)["spots"]
+    block = s["out_of_view_px"]
+    assert block["rows"] > 50
+    assert block["rms_u"] == pytest.approx(0.4, rel=4 / np.sqrt(2 * block["rows"]))
+    assert s["out_of_view_but_visible_rows"] == 0
+
+
+class TestReturns:
+    """One view, one number per frame: truth 0 outside, 1 in view."""
+
+    in_view = np.array([[1, 0, 0, 1, 1, 1, 1, 1, 1, 1, 1, 1]]).T
+    yes = np.ones((12, 1), dtype=bool)
+
+    def test_a_spot_found_at_once_is_kept_without_delay(self):
+        out = _returns(self.in_view, 0, self.yes, self.yes, self.yes)
+        assert (out["total"], out["kept"], out["max_delay_frames"]) == (1, 1, 0)
+
+    def test_a_spot_found_two_pictures_late_is_kept_with_that_delay(self):
+        measured = self.yes.copy()
+        measured[3:5] = False
+        assert _returns(self.in_view, 0, measured, self.yes, self.yes)["max_delay_frames"] == 2
+
+    def test_a_dropped_picture_is_no_delay(self):
+        pictured, measured = self.yes.copy(), self.yes.copy()
+        pictured[3] = measured[3] = False
+        assert _returns(self.in_view, 0, measured, self.yes, pictured)["max_delay_frames"] == 0
+
+    def test_a_wrong_spot_first_is_not_kept(self):
+        right = self.yes.copy()
+        right[3] = False
+        out = _returns(self.in_view, 0, self.yes, right, self.yes)
+        assert (out["total"], out["kept"]) == (1, 0)
+
+    def test_a_spot_found_too_late_is_not_kept(self):
+        measured = self.yes.copy()
+        measured[3:9] = False
+        assert _returns(self.in_view, 0, measured, self.yes, self.yes)["kept"] == 0
+
+
+def test_a_run_without_truth_has_no_score(tmp_path):
+    fake = make(tmp_path, 5, truth=False)
+    assert score(fake.results, fake.run_folder) is None
+
+
+def test_a_lost_run_scores_nothing_and_breaks_nothing(tmp_path):
+    fake = make(tmp_path, 20, all_lost=True)
+    out = score(fake.results, fake.run_folder)
+    assert out["spots"]["in_view_identity"] == 0
+    assert out["pose"]["measured"] is None
+    json.dumps(out, allow_nan=False)
+
+
+def test_a_score_is_plain_json_without_nan(eventful):
+    json.dumps(score(eventful.results, eventful.run_folder), allow_nan=False)
+
+
+def test_tables_read_back_what_the_contract_says(eventful):
+    spots, poses = read_spots(eventful.results), read_poses(eventful.results)
+    assert spots.views == eventful.model.views
+    lost = spots.has(SpotStatus.LOST)
+    assert lost.any()
+    assert np.isnan(spots.uv_px[lost]).all()
+    assert np.isnan(poses.world_from_body.translation[poses.has(PoseStatus.LOST)]).all()
+    known = poses.known
+    np.testing.assert_allclose(poses.covariance[known], np.swapaxes(poses.covariance[known], 1, 2))
+    sigma = np.sqrt(np.diagonal(poses.covariance[known], axis1=1, axis2=2)[:, :3])
+    np.testing.assert_allclose(sigma, poses.sigma_position_m[known], atol=1e-8)
+    from_angles = Pose.from_ypr(np.radians(poses.yaw_pitch_roll_deg[known]), np.zeros((int(known.sum()), 3))).rotation
+    np.testing.assert_allclose(from_angles, poses.world_from_body.rotation[known], atol=1e-8)
+    assert SPOT_STATUSES[spots.status[0, 0]] in SpotStatus
+
+
+def test_a_table_without_a_column_is_an_error_that_names_file_and_column(quiet, tmp_path):
+    fake = make(tmp_path, 3)
+    path = fake.results / "spots.csv"
+    path.write_text(path.read_text().replace("predicted_u_px", "predicted_x"))
+    with pytest.raises(InputError, match=r"spots\.csv: expected a column 'predicted_u_px', found frame, t_s"):
+        read_spots(fake.results)
+
+
+def test_a_table_with_a_word_for_a_number_is_an_error_that_names_the_file(tmp_path):
+    fake = make(tmp_path, 3)
+    path = fake.results / "attitude.csv"
+    path.write_text(path.read_text().replace("0.01", "oh", 1))
+    with pytest.raises(InputError, match=r"attitude\.csv: expected rows of equal length and numbers"):
+        read_poses(fake.results)
+
+
+# -- velocity, rate, and what was known at each instant ---------------------------------------------------------------
+
+
+def test_velocities_and_rates_are_off_by_the_noise_put_in_and_bends_are_left_out(quiet):
+    s = score(quiet.results, quiet.run_folder)["motion_vs_differences"]
+    for name, sigma in (("velocity_m_s", MOTION_SIGMA[:3]), ("rate_rad_s", MOTION_SIGMA[3:])):
+        rms = np.array(list(s[name]["rms_axes"].values()))
+        np.testing.assert_allclose(rms, sigma, rtol=0.12)  # 600 rows: 3 % per sigma
+        assert s[name]["square_over_claimed_mean"] == pytest.approx(1.0, abs=0.12)
+    # The yaw's triangle has four corners in 6 s; of each the frame and the two to either side are left out.
+    assert s["rows_at_bends_left_out"] == 4 * 5
+    assert s["rows"] == 600 - 4 - 4 * 5
+
+
+def test_five_frames_tell_a_smooth_motion_to_a_millionth():
+    t = np.arange(200) / 100
+    a, b = 0.3 * np.sin(6 * t), 0.4 * np.cos(5 * t)
+    poses = Pose.from_ypr(np.stack([a, 0 * t, 0 * t], -1), np.stack([b, a, 0 * t], -1))
+    motion, bent = differenced(poses, t)
+    assert not bent.any()
+    assert np.isnan(motion[[0, 1, -2, -1]]).all()
+    true_a, true_b = 1.8 * np.cos(6 * t), -2.0 * np.sin(5 * t)
+    true = np.stack([true_b, true_a, 0 * t, 0 * t, 0 * t, true_a], -1)
+    np.testing.assert_allclose(motion[2:-2], true[2:-2], atol=1e-5)
+
+
+def test_a_rate_is_about_the_bodys_own_axes():
+    """A vehicle that is pitched by 90 degrees and turns about the world's z turns about its own -x."""
+    t = np.arange(20) / 100
+    turn = Rotation.from_rotvec(0.7 * t[:, None] * [0, 0, 1])
+    pitched = turn * Rotation.from_rotvec([0, np.pi / 2, 0])
+    motion, _ = differenced(Pose(pitched.as_matrix(), np.zeros((20, 3))), t)
+    np.testing.assert_allclose(motion[5], [0, 0, 0, -0.7, 0, 0], atol=1e-9)
+
+
+def test_across_a_gap_or_a_change_of_the_frame_rate_no_difference_is_taken():
+    t = np.concatenate([np.arange(20), np.arange(20, 40) * 2.0 - 20]) / 100
+    poses = Pose.from_ypr(np.zeros((40, 3)), np.stack([0.5 * t, 0 * t, 0 * t], -1))
+    gone = poses.translation.copy()
+    gone[10] = np.nan
+    motion, bent = differenced(Pose(poses.rotation, gone), t)
+    known = np.isfinite(motion[:, 0])
+    assert np.flatnonzero(~known).tolist() == [0, 1, 8, 9, 10, 11, 12, 19, 20, 21, 38, 39]
+    np.testing.assert_allclose(motion[known, 0], 0.5, atol=1e-9)
+    assert not bent.any()
+
+
+def test_poses_known_at_the_instant_are_scored_beside_the_smoothed_ones(tmp_path):
+    fake = make(tmp_path, 300, causal=True)
+    s = score(fake.results, fake.run_folder)
+    later, then = (s[name]["measured"] for name in ("pose", "pose_causal"))
+    assert then["position_m"]["rms"] == pytest.approx(2 * later["position_m"]["rms"], rel=1e-3)
+    assert then["nees_mean"] == pytest.approx(later["nees_mean"], rel=1e-2)
+    assert s["motion_causal_vs_differences"]["rows"] == s["motion_vs_differences"]["rows"]
+
+
+def test_results_from_before_there_were_velocities_are_read_and_have_none(quiet, tmp_path):
+    older = without_added_columns(quiet.results, tmp_path / "older")
+    poses, spots = read_poses(older), read_spots(older)
+    assert np.isnan(poses.velocity_m_s).all()
+    assert np.isnan(poses.sigma_rate_rad_s).all()
+    assert np.isnan(spots.label_probability).all()
+    now, before = score(quiet.results, quiet.run_folder), score(older, quiet.run_folder)
+    assert (before["spots"], before["pose"]) == (now["spots"], now["pose"])
+    assert before["motion_vs_differences"] is None
+    assert before["pose_causal"] is None
+
+
+def test_a_column_that_was_always_there_is_still_missed(quiet, tmp_path):
+    results = tmp_path / "results"
+    results.mkdir()
+    text = (quiet.results / "attitude.csv").read_text()
+    (results / "attitude.csv").write_text(text.replace("qw", "qq", 1))
+    with pytest.raises(InputError, match="expected a column 'qw'"):
+        read_poses(results)

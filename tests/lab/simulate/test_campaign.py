@@ -1,0 +1,166 @@
+"""Simulated calibration campaigns: folders that the program reads, with a truth that explains them."""
+
+from __future__ import annotations
+
+import filecmp
+
+import numpy as np
+import pytest
+
+from geometry.forward_model import SpotModel
+from geometry.pose import Pose
+from lab.errors import InputError
+from lab.files.project.point_files import read_observations, read_poses, read_survey
+from lab.files.project.project import load_project
+from lab.files.rig.rig_file import load_rig
+from lab.files.text.csv_text import read_table
+from lab.simulate.calibration_campaign import Quality, draw_campaign, lens_covariance
+from lab.simulate.campaign_files import simulate_calibration
+from lab.simulate.rigs import RIGS
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return simulate_calibration(tmp_path_factory.mktemp("campaigns") / "one", seed=7, positions=8)
+
+
+def sizes(project):
+    return {name: camera.lens.image_size_px for name, camera in project.cameras.items()}
+
+
+def test_the_folder_is_a_project_that_reads_without_a_mistake(folder):
+    project = load_project(folder)
+    survey = read_survey(project.survey, project.screens)
+    seen = read_observations(project.points, sizes(project), survey.names)
+    assert len(survey.names) > 20
+    assert len(seen.pixels) >= len(survey.names)
+    assert len(read_poses(project.recordings[0].poses).frames) == 8
+    assert all(c.lens.covariance is not None for c in project.cameras.values())
+    assert project.stand.world_from_stand is None
+
+
+def test_the_truth_beside_it_explains_every_spot_and_every_dot_to_their_sigmas(folder):
+    truth, project = load_rig(folder / "truth" / "rig.yaml"), load_project(folder)
+    survey = read_survey(project.survey, project.screens)
+    seen = read_observations(project.points, sizes(project), survey.names)
+    for name, camera in truth.cameras.items():
+        mine = np.array([c == name for c in seen.camera])
+        at = survey.xyz[[survey.names.index(p) for p, m in zip(seen.point, mine, strict=True) if m]]
+        # 0.3 mm of the survey are 0.08 px at 4.4 m and 0.14 px at 2.5 m; the pixel's own 0.07 px come on top.
+        rms = np.sqrt(np.mean((camera.project(at) - seen.pixels[mine]) ** 2))
+        assert 0.07 < rms < 0.16
+    poses = read_poses(folder / "truth" / "poses.csv")
+    model = SpotModel.of(truth)
+    pixels, _ = model.project(poses.stand_from_body)
+    spots = read_table(folder / "spots.csv", ("frame", "camera", "spot", "u_px", "v_px"))
+    view = [model.views.index(v) for v in zip(spots["camera"], spots["spot"], strict=True)]
+    away = spots[["u_px", "v_px"]].to_numpy() - pixels[spots["frame"].to_numpy(dtype=int), view]
+    # Some 90 numbers: their RMS scatters by 7 %.
+    assert np.sqrt(np.mean(away**2)) == pytest.approx(0.054, rel=0.25)
+
+
+def test_the_stand_is_recorded_as_well_as_its_sigmas_say():
+    c = draw_campaign(3, quality=Quality(positions=400))
+    errors = c.stand_recorded.minus(c.stand_from_body) / c.record_sigmas
+    assert np.sqrt(np.mean(errors**2)) == pytest.approx(1.0, abs=0.05)
+
+
+def test_the_rig_is_mounted_off_its_drawing_by_what_mounting_by_eye_leaves():
+    c = draw_campaign(0)
+    for name, camera in c.truth.cameras.items():
+        drawn = c.nominal.cameras[name]
+        apart = camera.camera_from_world.inverse().minus(drawn.camera_from_world.inverse())
+        assert 1e-4 < np.linalg.norm(apart[:3]) < 0.03
+        assert np.deg2rad(0.02) < np.linalg.norm(apart[3:]) < np.deg2rad(2)
+
+
+def test_lenses_come_with_errors_as_large_as_their_covariance_says():
+    sizes = []
+    for seed in range(12):
+        c = draw_campaign(seed, quality=Quality(positions=3, dots=(2, 2)))
+        for name, lens in c.lenses.items():
+            true = c.truth.cameras[name]
+            e = np.array(
+                [
+                    lens.camera.matrix[i] - true.matrix[i] for i in ((0, 0), (1, 1), (0, 2), (1, 2))
+                ] + list(np.array(lens.camera.distortion) - true.distortion)
+            )  # fmt: skip
+            sizes.append(e @ np.linalg.solve(lens.covariance, e) / len(e))
+    # 24 lenses of 9 numbers: sqrt(2 / 216) = 0.1.
+    assert np.mean(sizes) == pytest.approx(1.0, abs=0.3)
+
+
+def test_more_board_photographs_make_a_lens_better_known():
+    camera = RIGS["fan"]().cameras["left"]
+    few, many = lens_covariance(camera, 0.1, views=10), lens_covariance(camera, 0.1, views=40)
+    assert np.all(np.diagonal(many) < np.diagonal(few))
+
+
+def test_the_same_seed_gives_the_same_bytes_and_another_one_does_not(folder, tmp_path):
+    again = simulate_calibration(tmp_path / "again", seed=7, positions=8)
+    other = simulate_calibration(tmp_path / "other", seed=5, positions=8)
+    names = sorted(p.relative_to(folder) for p in folder.rglob("*") if p.is_file())
+    same, _, _ = filecmp.cmpfiles(folder, again, names, shallow=False)
+    assert sorted(map(str, same)) == sorted(map(str, names))
+    assert not filecmp.cmp(folder / "spots.csv", other / "spots.csv", shallow=False)
+
+
+def test_wrong_measurements_are_as_many_as_asked_for_and_far_off():
+    c = draw_campaign(6, quality=Quality(wrong=0.1))
+    good = draw_campaign(6)
+    assert 0.04 < c.wrong_spots.mean() < 0.18
+    away = np.linalg.norm(c.spots.pixels - good.spots.pixels, axis=1)
+    assert away[c.wrong_spots].min() > 3.9
+    assert not away[~c.wrong_spots].any()
+
+
+@pytest.mark.parametrize("rig", sorted(RIGS))
+def test_every_example_rig_can_be_calibrated_by_its_campaign(rig):
+    c = draw_campaign(1, rig, Quality(positions=10))
+    # Each camera needs four dots, each position five numbers.
+    assert np.bincount(c.seen_camera).min() >= 8
+    assert np.bincount(c.spots.position).min() >= 3
+    assert {c.truth.spots[s].beam for _, s in c.truth.views()} == set(c.truth.beams)
+
+
+@pytest.mark.slow
+def test_board_photographs_show_the_board_that_the_folder_names(tmp_path, monkeypatch):
+    from calibration.boards.board_detection import NotFound, find_board
+    from lab.files.rig.board_file import load_board
+    from lab.pictures.picture_file import read_picture
+    from lab.simulate import campaign_files
+
+    monkeypatch.setattr(campaign_files, "PHOTOS", 1)
+    folder = simulate_calibration(tmp_path / "photos", seed=1, positions=3, photos=True)
+    board = load_board(folder / "board.yaml")
+    picture = read_picture(folder / "photos" / "left" / "00.png", None)
+    assert not isinstance(find_board(picture, board), NotFound)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"rig": "fann"}, "did you mean 'fan'"),
+        ({"positions": 2}, "positions: expected 3 or more, got 2"),
+        ({"wrong": 0.5}, "wrong: expected a share from 0 up to 0.3, got 0.5"),
+    ],
+)
+def test_arguments_that_do_not_fit_are_refused_and_nothing_is_left(tmp_path, arguments, words):
+    with pytest.raises(InputError, match=words):
+        simulate_calibration(tmp_path / "none", **arguments)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_existing_folder_is_not_written_over(folder):
+    with pytest.raises(InputError, match="choose another --out"):
+        simulate_calibration(folder, seed=9)
+
+
+def test_a_known_place_of_the_stand_is_told_with_its_sigmas(tmp_path):
+    quality = Quality(place_known=True)
+    stand = load_project(simulate_calibration(tmp_path / "known", seed=2, positions=3, quality=quality)).stand
+    c = draw_campaign(2, quality=Quality(place_known=True, positions=3))
+    assert isinstance(stand.world_from_stand, Pose)
+    error = stand.world_from_stand.minus(c.world_from_stand)
+    assert np.all(np.abs(error) < 5 * np.sqrt(np.diagonal(c.place_covariance)))
+    assert np.isclose(stand.sigma_m, quality.place_m)

@@ -1,0 +1,140 @@
+"""What errors of a calibration do to the poses, and whether the stated covariance tells: rigs that are a bit off."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from geometry.pose import Pose
+from geometry.rig import Rig
+from geometry.uncertainty.rig_parameters import RigCovariance, moved, rig_names, split
+from lab.simulate.points import PointRun, simulate_points
+from tests.tracking.rigid_runs import Pooled, judged, looked_at_again, tracked
+from tracking.curve_switching.spot_tracker import SpotTracker
+from tracking.labelling.first_labels import PosePrior
+from tracking.parameters import TrackerParameters
+from tracking.statuses import PoseStatus
+from tracking.tracked_frame import TrackedFrame
+
+# One sigma of each kind of number, as a careful lab reaches them. With these the calibration moves the spots by some
+# tenths of a pixel, several times their noise.
+SIGMAS = {
+    "fx": 0.4, "fy": 0.4, "cx": 0.6, "cy": 0.6, "k1": 3e-4, "k2": 1e-3, "p1": 5e-5, "p2": 5e-5, "k3": 1e-3,
+    "direction_x": 7e-5, "direction_y": 7e-5, "direction_z": 7e-5,
+    "point_x_m": 1e-4, "point_y_m": 1e-4, "point_z_m": 1e-4,
+}  # fmt: skip
+POSE_SIGMA = {"m": 3e-4, "rad": 1e-4}
+
+
+def covariance_of(rig: Rig, scale: float = 1.0) -> RigCovariance:
+    """Independent kinds of errors, but correlated within each camera as calibrations are."""
+    names = rig_names(rig)
+    sigma = np.array([SIGMAS.get(split(n)[2], POSE_SIGMA["rad" if n.endswith("_rad") else "m"]) for n in names])
+    correlation = np.eye(len(names))
+    for i, a in enumerate(names):
+        for j, b in enumerate(names):
+            if i != j and split(a)[:2] == split(b)[:2]:
+                correlation[i, j] = 0.3 if (i + j) % 2 else 0.2
+    C = correlation * np.outer(sigma, sigma) * scale**2
+    return RigCovariance(names, C)
+
+
+def drawn(rig: Rig, covariance: RigCovariance, rng: np.random.Generator) -> Rig:
+    values, vectors = np.linalg.eigh(covariance.matrix)
+    return moved(rig, covariance.names, vectors @ (np.sqrt(np.maximum(values, 0)) * rng.normal(size=len(values))))
+
+
+def track(run: PointRun, rig: Rig, covariance: RigCovariance | None) -> list[TrackedFrame]:
+    p = run.prior
+    centre = Pose.from_ypr(np.deg2rad(p.yaw_pitch_roll_deg), np.array(p.position_m))
+    tracker = SpotTracker(
+        rig, TrackerParameters(), PosePrior(centre, p.within_m, float(np.deg2rad(p.within_deg))), covariance
+    )
+    return [
+        tracker.step(float(run.t_s[k] - run.t_s[k - 1]) if k else 0.0, list(run.detections[k]))
+        for k in range(len(run.frame))
+    ]
+
+
+def nees(run: PointRun, frames: list[TrackedFrame], kind: PoseStatus = PoseStatus.MEASURED) -> list[float]:
+    out = []
+    for k, f in enumerate(frames):
+        if f.pose_status == kind and f.pose is not None and f.pose_covariance is not None:
+            delta = run.poses[k].minus(f.pose)
+            out.append(float(delta @ np.linalg.solve(f.pose_covariance, delta)))
+    return out
+
+
+def mean_nees(scenario: str, seeds: range, stated: bool = True, frames: int = 6) -> tuple[float, float, int]:
+    """Mean NEES / 6 over rigs, the share of frames that are measured, and how often a right spot was dropped."""
+    values, measured, drops = [], 0, 0
+    for seed in seeds:
+        run = simulate_points(scenario, seed, frames=frames, noise_px=0.05, clutter=0.0)
+        covariance = covariance_of(run.rig)
+        rig = drawn(run.rig, covariance, np.random.default_rng([seed, 99]))
+        tracked = track(run, rig, covariance if stated else None)
+        found = nees(run, tracked)
+        measured += len(found)
+        drops += sum(e.kind == "dropped" for f in tracked for e in f.events)
+        if found:
+            values.append(np.mean(found) / 6)
+    return float(np.mean(values)), measured / (len(seeds) * frames), drops
+
+
+@pytest.mark.parametrize("scenario", ["clean", "four-skew-beams"])
+def test_the_stated_covariance_holds_the_calibrations_errors(scenario):
+    # 12 rigs, and frames of a rig share its errors: the mean of NEES / 6 scatters by 0.16.
+    mean, measured, drops = mean_nees(scenario, range(12), frames=4)
+    assert 0.55 < mean < 1.45
+    assert measured == 1.0
+    assert drops == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scenario", ["clean", "four-skew-beams"])
+def test_over_200_rigs_the_stated_covariance_is_the_errors_own(scenario):
+    mean, measured, drops = mean_nees(scenario, range(200))
+    assert 0.85 < mean < 1.15
+    assert measured == 1.0
+    assert drops == 0
+
+
+def rigid_nees(scenario: str, seeds: range, frames: int, noise_px: float, stated: bool = True) -> tuple[float, float]:
+    """Mean NEES / 6 of the rigid tracker and of the smoother over rigs."""
+    causal, again = [], []
+    for seed in seeds:
+        run = simulate_points(scenario, seed, frames=frames, noise_px=noise_px, clutter=0.0)
+        covariance = covariance_of(run.rig)
+        rig = drawn(run.rig, covariance, np.random.default_rng([seed, 99]))
+        known = covariance if stated else None
+        first = tracked(run, rig=rig, covariance=known)
+        second, _ = looked_at_again(run, first, rig=rig, covariance=known)
+        causal.append(judged(run, first))
+        again.append(judged(run, second))
+        if stated:
+            assert causal[-1].missed() + causal[-1].wrong + again[-1].missed() + again[-1].wrong == 0
+    return Pooled(causal).nees(), Pooled(again).nees()
+
+
+@pytest.mark.parametrize("scenario", ["clean", "four-skew-beams"])
+def test_the_rigid_tracker_and_the_smoother_carry_the_calibrations_errors_too(scenario):
+    # A smoothed motion has one rig's errors in all frames: of 7 rigs the mean of NEES / 6 scatters by 0.22.
+    for value in rigid_nees(scenario, range(7), frames=20, noise_px=0.05):
+        assert 0.5 < value < 1.7
+
+
+def test_a_calibration_taken_for_perfect_is_far_off():
+    causal, smoothed = rigid_nees("clean", range(3), frames=20, noise_px=0.05, stated=False)
+    assert causal > 2
+    assert smoothed > 3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scenario", ["clean", "four-skew-beams"])
+def test_over_60_rigs_the_rigid_trackers_and_the_smoothers_covariance_is_the_errors_own(scenario):
+    # The mean over 60 rigs scatters by 0.08.
+    causal, smoothed = rigid_nees(scenario, range(60), frames=60, noise_px=0.05)
+    assert 0.8 < causal < 1.3
+    # Measured 1.45 (clean): its weights hold each spot's calibration errors as if they were independent, and what a
+    # calibration does to the pose is reckoned for the single frame's weights.
+    assert 0.8 < smoothed < 1.6

@@ -1,0 +1,352 @@
+"""Which detection is which spot: the joint search against trying every assignment."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import combinations, pairwise, permutations, product
+
+import numpy as np
+import pytest
+
+from geometry.arrays import Array, Ints
+from geometry.forward_model import SpotModel
+from geometry.pose import Pose
+from lab.simulate.rigs import RIGS
+from tracking.rigid_body.association import (
+    BEHIND,
+    BLENDED,
+    CROWD_PX,
+    GATE,
+    NOT_LOOKED_FOR,
+    Chances,
+    Frame,
+    Sights,
+    associate,
+    crowding,
+    distinct_spots,
+    grown,
+    in_picture,
+)
+from tracking.rigid_body.occlusion import MISSED
+
+RIG = RIGS["fan"]()
+MODEL = SpotModel.of(RIG)
+N = len(MODEL)
+SIGHTS = Sights.of(RIG, MODEL)
+CHANCES = Chances(0.95, 0.01)
+SHOWN = np.full(N, 0.97)
+POSE = Pose.from_ypr(np.deg2rad([7.0, 0.0, 0.0]), np.zeros(3))
+EXPECTED, JACOBIAN = MODEL.project(POSE)
+# A pose known to 0.5 mm and 0.3 mrad: spots to about a pixel, against a noise of 0.1 px.
+P_NEAR = np.diag(np.repeat([5e-4, 3e-4], 3) ** 2)
+SIGMA_PX = 0.1
+LOG_CLUTTER = float(np.log(1e-3))
+
+
+@dataclass(frozen=True)
+class Found:
+    """What the search says, best first."""
+
+    assigned: Ints
+    score: Array
+    counted: Array
+
+
+def frame_of(
+    points: list[Array], has_image: tuple[bool, bool] = (True, True), blend_px: float = 0.0, grown: float = 1.0
+) -> Frame:
+    """A frame with these pixels (k, 2) per camera; grown: how much wider than usual each point is."""
+    uv = np.concatenate([np.zeros((0, 2)), *points])
+    first = np.concatenate([[0], np.cumsum([len(p) for p in points])]).astype(np.int64)
+    cov = np.tile(SIGMA_PX**2 * np.eye(2), (len(uv), 1, 1))
+    m = len(uv)
+    return Frame(
+        uv, cov, np.full(m, blend_px), first, np.array(has_image), np.full(N, LOG_CLUTTER),
+        np.full(m, -np.inf), np.full(m, 2.0 * grown), np.full(N, 2.0), np.zeros(N),
+    )  # fmt: skip
+
+
+def search(frame: Frame, P: Array = P_NEAR, pose: Pose = POSE, extra: Array | None = None) -> Found:
+    none = np.zeros((N, 2, 2))
+    found = associate(
+        MODEL.numbers, SIGHTS, frame, CHANCES, np.ascontiguousarray(pose.rotation), pose.translation, P, SHOWN,
+        none if extra is None else extra,
+    )  # fmt: skip
+    return Found(*found[:3])
+
+
+def injections(views: Ints, points: range) -> Iterator[tuple[int, ...]]:
+    """All ways to give each of some views another point or none."""
+    for k in range(min(len(views), len(points)) + 1):
+        for some in combinations(range(len(views)), k):
+            for chosen in permutations(points, k):
+                out = [MISSED] * len(views)
+                for at, point in zip(some, chosen, strict=True):
+                    out[at] = point
+                yield tuple(out)
+
+
+def log_likelihood(frame: Frame, views: Ints, assigned: tuple[int, ...], P: Array) -> tuple[float, float]:
+    """One Gaussian of all pixels together, against false points; and the largest squared distance of a spot from what
+    the others of this assignment and the prior say, which a gate would look at last.
+    """
+    score, rows, at = 0.0, [], []
+    for v, d in zip(views, assigned, strict=True):
+        p = CHANCES.detect * SHOWN[v]
+        score += np.log(1 - p) if d == MISSED else np.log(p) - LOG_CLUTTER
+        if d != MISSED:
+            rows.append(v)
+            at.append(d)
+    if not rows:
+        return score, 0.0
+    H = JACOBIAN[rows].reshape(-1, 6)
+    S = H @ P @ H.T + SIGMA_PX**2 * np.eye(len(H))
+    y = (frame.uv[at] - EXPECTED[rows]).ravel()
+    # Of each spot given the others: its block of the inverse.
+    inverse = np.linalg.inv(S)
+    z = (inverse @ y).reshape(-1, 2)
+    far = [z[i] @ np.linalg.solve(inverse[2 * i : 2 * i + 2, 2 * i : 2 * i + 2], z[i]) for i in range(len(rows))]
+    gaussian = -0.5 * float(y @ z.ravel() + np.linalg.slogdet(2 * np.pi * S)[1])
+    return score + gaussian, max(far)
+
+
+def scattered(rng: np.random.Generator, cameras: tuple[bool, bool], most: int) -> Frame:
+    """Spots about a pose drawn from the prior, some missing, and false points within some pixels of them."""
+    pose = POSE.plus(np.sqrt(np.diagonal(P_NEAR)) * rng.normal(size=6))
+    true = MODEL.project(pose)[0] + SIGMA_PX * rng.normal(size=(N, 2))
+    points = []
+    for c, there in enumerate(cameras):
+        of = np.flatnonzero(MODEL.camera_of == c)
+        spots = true[of[rng.random(len(of)) < 0.8]]
+        false = true[rng.choice(of, size=most - len(spots))] + rng.uniform(-3, 3, size=(most - len(spots), 2))
+        both = np.concatenate([spots, false])
+        points.append(both[rng.permutation(len(both))] if there else np.zeros((0, 2)))
+    return frame_of(points, cameras)
+
+
+ONE, BOTH = (True, False), (True, True)
+
+
+@pytest.mark.parametrize(("cameras", "most", "seeds"), [(ONE, 4, range(60)), (BOTH, 3, range(60, 70))])
+def test_the_best_assignment_is_the_best_of_all(cameras, most, seeds):
+    judged = 0
+    for seed in seeds:
+        frame = scattered(np.random.default_rng(seed), cameras, most)
+        by_camera = []
+        for c in np.flatnonzero(cameras):
+            views = np.flatnonzero(MODEL.camera_of == c)
+            by_camera.append((views, list(injections(views, range(frame.first[c], frame.first[c + 1])))))
+        views = np.concatenate([v for v, _ in by_camera])
+        scores = {}
+        for parts in product(*(some for _, some in by_camera)):
+            assigned = sum(parts, ())
+            score, far = log_likelihood(frame, views, assigned, P_NEAR)
+            if far < 0.9 * GATE:  # the search's gates see some of the others only, and are narrower or as wide
+                scores[assigned] = score
+        found = search(frame)
+        assert np.all(np.diff(found.score) <= 0)
+        elsewhere = np.setdiff1d(np.arange(N), views)
+        assert np.all(found.assigned[:, elsewhere] == NOT_LOOKED_FOR)
+        # 0.03 nats: over a pixel the projection is straight to a thousandth of one.
+        best = max(scores, key=lambda a: scores[a])
+        assert found.score[0] == pytest.approx(scores[best], abs=0.03)
+        for row, score in zip(found.assigned[:, views], found.score, strict=True):
+            if tuple(row) in scores:
+                assert score == pytest.approx(scores[tuple(row)], abs=0.03)
+        rivals = [s for s in scores.values() if s > scores[best] - 0.1]
+        if len(rivals) == 1:
+            judged += 1
+            assert tuple(found.assigned[0, views]) == best
+    assert judged >= 0.8 * len(seeds)
+
+
+def test_the_gaussian_terms_can_be_taken_out_of_a_score():
+    frame = frame_of([EXPECTED[MODEL.camera_of == c] for c in range(2)])
+    found = search(frame)
+    np.testing.assert_array_equal(found.assigned[0], np.argsort(np.argsort(MODEL.camera_of, kind="stable")))
+    assert found.counted[0] == pytest.approx(N * (np.log(CHANCES.detect * SHOWN[0]) - LOG_CLUTTER))
+
+
+def test_a_false_point_in_the_first_gate_is_not_taken_once_the_other_spots_have_narrowed_it():
+    # A pose known to 5 mm and 3 mrad leaves a spot a gate of dozens of pixels; five others leave it less than one.
+    P = 100 * P_NEAR
+    view = 2
+    wide = JACOBIAN[view] @ P @ JACOBIAN[view].T
+    along = np.linalg.eigh(wide)[1][:, 1]
+    false = EXPECTED[view] + 2.0 * np.sqrt(np.linalg.eigvalsh(wide)[1]) * along
+    assert np.linalg.norm(false - EXPECTED[view]) > 20 * SIGMA_PX
+    others = [EXPECTED[(MODEL.camera_of == c) & (np.arange(N) != view)] for c in range(2)]
+    camera = MODEL.camera_of[view]
+    alone = [false[None] if c == camera else np.zeros((0, 2)) for c in range(2)]
+    taken = search(frame_of(alone), P).assigned[0]
+    assert np.count_nonzero(taken >= 0) == 1  # by itself it may be a spot ...
+    together = [np.concatenate([others[c], alone[c]]) for c in range(2)]
+    found = search(frame_of(together), P).assigned[0]
+    assert found[view] == MISSED  # ... and among the others it is none
+    assert np.all(np.delete(found, view) >= 0)
+
+
+def test_errors_of_the_calibration_widen_the_gates():
+    # A spot whose own calibration is a pixel off, where all others fit.
+    shifted = EXPECTED.copy()
+    shifted[4] += [1.0, -0.5]
+    frame = frame_of([shifted[MODEL.camera_of == c] for c in range(2)])
+    assert search(frame, 1e-4 * P_NEAR).assigned[0, 4] == MISSED
+    extra = np.zeros((N, 2, 2))
+    extra[4] = 0.5 * np.eye(2)
+    assert search(frame, 1e-4 * P_NEAR, extra=extra).assigned[0, 4] >= 0
+
+
+def test_a_spot_that_melted_into_a_neighbour_keeps_its_label_but_costs_what_that_is_worth():
+    shifted = EXPECTED.copy()
+    shifted[4] += [2.0, 0.0]
+    points = [shifted[MODEL.camera_of == c] for c in range(2)]
+    assert search(frame_of(points), 1e-4 * P_NEAR).assigned[0, 4] == MISSED
+    found = search(frame_of(points, blend_px=3.0, grown=1.2), 1e-4 * P_NEAR)
+    assert found.assigned[0, 4] >= BLENDED
+    honest = search(
+        frame_of([EXPECTED[MODEL.camera_of == c] for c in range(2)], blend_px=3.0, grown=1.2), 1e-4 * P_NEAR
+    )
+    assert honest.score[0] > found.score[0] + 4
+
+
+def at_the_border(past_px: float) -> tuple[Pose, int]:
+    """A pose that puts one spot so far beyond its picture's left or right border, and the spot."""
+    view, pose = 2, POSE
+    width = float(MODEL.image_size_px[view, 0])
+    for _ in range(20):
+        uv, J = MODEL.project(pose)
+        right = uv[view, 0] > width / 2
+        goal = width - 0.5 + past_px if right else -0.5 - past_px
+        pose = pose.plus(np.array([0, 0, 0, 0, 0, 1.0]) * (goal - uv[view, 0]) / J[view, 0, 5])
+    return pose, view
+
+
+def chance_in_picture(view: int, pose: Pose, P: Array) -> float:
+    uv, J = MODEL.project(pose)
+    S = J[view] @ P @ J[view].T
+    width, height = MODEL.image_size_px[view]
+    return in_picture(uv[view, 0], uv[view, 1], S[0, 0], S[1, 1], float(width), float(height))
+
+
+def only(view: int, points: Array) -> Frame:
+    """A frame in whose picture there is nothing but these points."""
+    camera = MODEL.camera_of[view]
+    return frame_of([points if c == camera else np.zeros((0, 2)) for c in range(2)])
+
+
+def test_a_spot_at_the_pictures_border_is_taken_if_it_is_there_and_hardly_missed_if_it_is_not():
+    for past, chance in ((-30.0, 1.0), (0.0, 0.5), (30.0, 0.0)):
+        pose, view = at_the_border(past)
+        uv, J = MODEL.project(pose)
+        P = 4 * P_NEAR
+        S = J[view] @ P @ J[view].T
+        inside = uv[view] - [np.sign(uv[view, 0] - MODEL.image_size_px[view, 0] / 2) * 1.5 * np.sqrt(S[0, 0]), 0.0]
+        found = search(only(view, inside[None]), P, pose)
+        none = search(only(view, np.zeros((0, 2))), P, pose)
+        if past > 0:
+            assert none.assigned[0, view] == NOT_LOOKED_FOR
+            assert found.assigned[0, view] == NOT_LOOKED_FOR
+            continue
+        assert found.assigned[0, view] == 0
+        there = [chance_in_picture(i, pose, P) for i in range(N)]
+        assert there[view] == pytest.approx(chance, abs=1e-6)
+        cost = np.log(1 - CHANCES.detect * SHOWN * there)[none.assigned[0] == MISSED].sum()
+        assert none.score[0] == pytest.approx(cost, abs=1e-3)
+
+
+def test_a_camera_without_a_picture_is_not_asked():
+    frame = frame_of([EXPECTED[MODEL.camera_of == 0], np.zeros((0, 2))], (True, False))
+    found = search(frame)
+    assert np.all(found.assigned[:, MODEL.camera_of == 1] == NOT_LOOKED_FOR)
+    assert np.all(found.assigned[0, MODEL.camera_of == 0] >= 0)
+
+
+def test_no_point_is_two_spots_and_no_assignment_is_hopelessly_behind():
+    rng = np.random.default_rng(8)
+    for _ in range(5):
+        frame = scattered(rng, (True, True), 4)
+        found = search(frame, 200**2 * P_NEAR)  # so wide that each point is in several spots' gates
+        for row in found.assigned:
+            taken = row[row >= 0] % BLENDED
+            assert len(set(taken.tolist())) == len(taken)
+        assert len({tuple(row) for row in found.assigned}) == len(found.assigned)
+        assert found.score[0] - found.score[-1] <= BEHIND
+
+
+def crowd_at(frame: Frame, pose: Pose, P: Array = 1e-4 * P_NEAR) -> float:
+    return crowding(MODEL.numbers, SIGHTS, frame, np.ascontiguousarray(pose.rotation), pose.translation, P)
+
+
+def beside_the_spots(px: float) -> list[Array]:
+    return [EXPECTED[MODEL.camera_of == c] + [px, 0.0] for c in range(2)]
+
+
+def test_only_points_near_a_spots_place_are_expected_to_be_clutter_of_spots():
+    frame = frame_of(beside_the_spots(1.0))._replace(log_crowding=np.full(N, 3.0))
+    # Twice the disc's mean density in its middle.
+    assert crowd_at(frame, POSE) == pytest.approx(N * np.log(1 + 2 * (np.exp(3.0) - 1)), rel=0.01)
+    farther = frame_of(beside_the_spots(CROWD_PX))._replace(log_crowding=np.full(N, 3.0))
+    assert 0 < crowd_at(farther, POSE) < 0.6 * crowd_at(frame, POSE)
+    # A vehicle elsewhere, all of whose spots would be hidden, has none of these points for its own clutter.
+    elsewhere = POSE.plus(np.array([0, 0.3, 0.3, 0, 0, 0]))
+    assert np.nanmin(np.linalg.norm(MODEL.project(elsewhere)[0] - EXPECTED, axis=1)) > 4 * CROWD_PX
+    assert crowd_at(frame, elsewhere) == pytest.approx(0.0, abs=1e-6)
+    # Two points beside one spot count both.
+    points = beside_the_spots(0.0)
+    twice = frame_of([np.concatenate([points[0], points[0] + 1.0]), points[1]])._replace(log_crowding=np.full(N, 3.0))
+    beside_two = N + np.count_nonzero(MODEL.camera_of == 0)
+    assert crowd_at(twice, POSE) == pytest.approx(crowd_at(frame, POSE) * beside_two / N, rel=0.01)
+
+
+def test_false_points_near_spots_count_as_far_as_the_spots_places_are_known():
+    frame = frame_of(beside_the_spots(4.0))._replace(log_crowding=np.full(N, 3.0))
+    sharper_first = [crowd_at(frame, POSE, scale * P_NEAR) for scale in (1e-4, 1e2, 1e3, 1e4, 1e8)]
+    assert all(a > b > 0 for a, b in pairwise(sharper_first))
+    assert sharper_first[-1] < 0.01
+
+
+def test_points_that_stay_in_their_place_are_nobodys_crowd():
+    frame = frame_of(beside_the_spots(1.0))._replace(log_crowding=np.full(N, 3.0))
+    every = crowd_at(frame, POSE)
+    frame.log_static[0] = LOG_CLUTTER + 2.0
+    assert crowd_at(frame, POSE) == pytest.approx(every * (N - 1) / N, rel=0.01)
+
+
+def test_a_point_where_static_ones_are_is_hardly_a_spot():
+    points = [EXPECTED[MODEL.camera_of == c] for c in range(2)]
+    plain, static = frame_of(points), frame_of(points)
+    static.log_static[:] = LOG_CLUTTER + 4.0
+    a, b = search(plain), search(static)
+    np.testing.assert_array_equal(a.assigned[0], b.assigned[0])
+    assert b.score[0] == pytest.approx(a.score[0] - 4.0 * N)
+
+
+def test_without_shapes_no_point_is_taken_for_two_that_melted_into_one():
+    shifted = EXPECTED.copy()
+    shifted[4] += [2.0, 0.0]
+    points = [shifted[MODEL.camera_of == c] for c in range(2)]
+    wide = frame_of(points, blend_px=3.0, grown=1.2)
+    unknown = np.full(len(wide.uv), np.nan)
+    for frame in (
+        wide._replace(size_px=unknown),
+        wide._replace(usual_px=np.full(N, np.nan)),
+        frame_of(points, blend_px=3.0),  # as wide as ever
+    ):
+        assert not any(grown(frame, v, d) for v in range(N) for d in range(len(frame.uv)))
+        assert not np.any(search(frame, 1e-4 * P_NEAR).assigned >= BLENDED)
+    assert grown(wide, 4, 0)
+
+
+def test_spots_are_counted_once_however_many_cameras_see_them():
+    spot = np.array([0, 0, 1, 2, 2, 3])
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        assigned = rng.choice([MISSED, 0, 5, BLENDED + 2], 6).astype(np.int64)
+        own = {int(s) for s, a in zip(spot, assigned, strict=True) if 0 <= a < BLENDED}
+        chosen = (assigned >= 0) & (assigned < BLENDED)
+        assert distinct_spots(chosen, spot) == len(own)
+        assert distinct_spots(np.stack([chosen, ~chosen]), spot).tolist() == [
+            len(own), len({int(s) for s in spot[~chosen]}),
+        ]  # fmt: skip

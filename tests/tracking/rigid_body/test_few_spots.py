@@ -1,0 +1,92 @@
+"""Few spots: labelled only where the prediction can check them, and no measured pose that has a mirror solution."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from geometry.pose import Pose
+from geometry.pose_solver.alternative_poses import alternatives
+from lab.simulate.points import PointRun, hidden, simulate_points
+from lab.simulate.rigs import RIGS, scaled
+from lab.simulate.scenarios import Prior
+from tests.tracking.rigid_runs import RIGID, dt_of, filmed, found_in, judged, prior_of, tracked
+from tracking.detections import UNMATCHED
+from tracking.rigid_body.hypotheses import FEW, VAGUE_PX, widest
+from tracking.rigid_body.motion import predicted
+from tracking.rigid_body.rigid_tracker import RigidTracker
+from tracking.statuses import PoseStatus
+
+NONE = np.zeros(2)
+
+
+def dark_then_few(seed: int, dark: int, few: int) -> PointRun:
+    """From frame 60 on everything is hidden, then three spots and false points show."""
+    run = simulate_points("sharp-turns", seed, frames=60 + dark + few, clutter=1.0)
+    hide = np.zeros(run.in_view.shape, dtype=bool)
+    hide[60:] = True
+    hide[60 + dark :, [0, 1, 4]] = False
+    return hidden(run, hide)
+
+
+def test_where_the_prediction_is_wide_fewer_than_four_spots_are_not_labelled():
+    labelled = 0
+    for seed in (7001, 7002):
+        run = dark_then_few(seed, 25, 30)
+        tracker = RigidTracker(run.rig, RIGID, prior_of(run))
+        for k in range(len(run.frame)):
+            before, dt, noise = tracker._hypotheses, dt_of(run, k), tracker.temper.dynamics.jerk
+            frame = tracker.step(dt, found_in(run, k))
+            count = np.count_nonzero(frame.point != UNMATCHED)
+            labelled += count
+            if before is None or dt == 0 or not 0 < count < FEW:
+                continue
+            # No hypothesis of the frame before, moved on without a bend, is wider: with one they are wider still.
+            sigmas = []
+            for h in range(len(before.t)):
+                R, t, _, P, _ = predicted(before.R[h], before.t[h], before.m[h], before.P[h], dt, noise, NONE, NONE)
+                assigned = np.where(frame.point == UNMATCHED, -1, frame.point)
+                sigmas.append(widest(tracker.model.numbers, R, t, P, assigned))
+            assert min(sigmas) <= VAGUE_PX
+    assert labelled > 300
+    assert VAGUE_PX > 5
+
+
+# A pose whose three spots of the left screen have a second solution 2.9 deg away.
+ROTATION = [
+    [0.995223865498, 0.021078516958, 0.095316072439],
+    [-0.020951424878, 0.999777770257, -0.002334072573],
+    [-0.095344089161, 0.000325917197, 0.99544432212],
+]
+PLACE = Pose(np.array(ROTATION), np.array([-0.126657502757949, -0.08162926119623469, 0.029764307521126868]))
+THREE, MIRROR_DEG, SEEN = np.array([0, 1, 2]), 2.93, 30
+
+
+@pytest.mark.parametrize("dark", [0, 5])
+def test_three_spots_are_measured_only_where_the_motion_excludes_their_mirror_solution(dark):
+    rig = scaled(RIGS["four-skew-beams"](), 0.25)  # 2.9 deg are 16 px: narrow enough for labels
+    frames = SEEN + dark + 5
+    poses = Pose(np.tile(PLACE.rotation, (frames, 1, 1)), np.tile(PLACE.translation, (frames, 1)))
+    hide = np.zeros((frames, 7), dtype=bool)
+    hide[SEEN:] = True
+    hide[SEEN + dark :, THREE] = False
+    run = filmed(rig, poses, np.arange(frames) / 50.0, 0.01, 1, hide=hide, prior=Prior(within_m=0.5, within_deg=20.0))
+    others = alternatives(run.model, PLACE, THREE)
+    away = [others[i].minus(PLACE) for i in range(len(others.translation))]
+    mirror = min(away, key=lambda d: float(np.linalg.norm(d[3:])))
+    assert np.rad2deg(np.linalg.norm(mirror[3:])) == pytest.approx(MIRROR_DEG, abs=0.01)
+    causal = tracked(run)
+    of = judged(run, causal)
+    assert of.wrong == 0
+    # Where three spots after the dark could be either, they wait for some frames.
+    assert of.missed() <= (3 * len(THREE) if dark else 0)
+    first = causal[SEEN + dark]
+    assert first.pose_covariance is not None
+    distance2 = mirror @ np.linalg.solve(first.pose_covariance, mirror)
+    if dark:
+        assert first.pose_status is PoseStatus.PREDICTED
+        assert distance2 < 100  # the covariance allows for the other solution with its share of some per cent
+    else:
+        assert all(f.pose_status is PoseStatus.MEASURED for f in causal[SEEN:])
+        assert distance2 > 1000
+    assert np.all(of.nees[SEEN:] < 22.5)

@@ -1,0 +1,63 @@
+"""A picture shows the mean of a spot's path over the exposure; the pose is asked for in the middle of it."""
+
+import numpy as np
+import pytest
+
+from geometry.compiled_projection import project_all
+from geometry.pose import Pose
+from lab.simulate.points import simulate_points
+from tracking.smoothing.exposure import exposure_offsets, moved_by
+from tracking.smoothing.fixed_interval import Reference
+
+EXPOSURE_S = 0.02
+
+
+@pytest.fixture(scope="module")
+def turning():
+    """Poses of a run with velocities and accelerations of a vehicle that is shaken."""
+    run = simulate_points("smooth", 3, frames=12, clutter=0.0)
+    rng = np.random.default_rng(4)
+    m = rng.normal(0, [0.5] * 3 + [1.5] * 3 + [8.0] * 3 + [20.0] * 3, (12, 12))
+    return run.model, Reference(run.poses.rotation, run.poses.translation, m)
+
+
+def mean_over_exposure(model, motion):
+    """(T, n, 2) by many instants."""
+    nodes, weights = np.polynomial.legendre.leggauss(12)
+    out = 0.0
+    for node, weight in zip(nodes, weights, strict=True):
+        h = 0.5 * EXPOSURE_S * node
+        pose = Pose(motion.R, motion.t).plus(h * motion.m[:, :6] + 0.5 * h * h * motion.m[:, 6:])
+        out = out + 0.5 * weight * project_all(model.numbers, pose.rotation, pose.translation)[0]
+    return out
+
+
+def test_the_mean_of_a_path_lies_beside_its_middle(turning):
+    model, motion = turning
+    offsets = exposure_offsets(model.numbers, motion, EXPOSURE_S, np.ones(12, dtype=bool))
+    middle, _ = project_all(model.numbers, motion.R, motion.t)
+    expected = mean_over_exposure(model, motion) - middle
+    seen = np.isfinite(expected).all(axis=-1)
+    assert np.abs(expected[seen]).max() > 0.1
+    assert np.abs(offsets - expected)[seen].max() < 0.01 * np.abs(expected[seen]).max()
+
+
+def test_the_pose_in_the_middle_is_found_from_the_mean_pixels(turning):
+    """The pose that fits the means best, less what the offsets make of it, is the pose in the middle."""
+    model, motion = turning
+    offsets = exposure_offsets(model.numbers, motion, EXPOSURE_S, np.ones(12, dtype=bool))
+    shift = moved_by(model.numbers, motion, offsets)
+    _, J = project_all(model.numbers, motion.R, motion.t)
+    left = offsets - np.einsum("tnij,tj->tni", J, shift)
+    fine = np.isfinite(left).all(axis=-1)
+    assert np.sqrt(np.mean(left[fine] ** 2)) < 0.2 * np.sqrt(np.mean(offsets[fine] ** 2))
+
+
+def test_a_jump_within_the_exposure_or_no_exposure_changes_nothing(turning):
+    model, motion = turning
+    steady = np.arange(12) % 2 == 0
+    offsets = exposure_offsets(model.numbers, motion, EXPOSURE_S, steady)
+    assert not offsets[~steady].any()
+    assert offsets[steady].any()
+    assert not exposure_offsets(model.numbers, motion, 0.0, steady).any()
+    assert not moved_by(model.numbers, motion, offsets)[~steady].any()

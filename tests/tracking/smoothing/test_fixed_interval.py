@@ -1,0 +1,334 @@
+"""The fixed-interval smoother against one dense Gaussian of the whole run, and what it says of shocks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from geometry.arrays import Array
+from geometry.pose import Pose
+from tracking.rigid_body.motion import STATE, predicted, updated
+from tracking.smoothing import fixed_interval
+from tracking.smoothing.fixed_interval import Evidence, Reference, log_left_out, log_likelihood, shifted, smoothed
+from tracking.smoothing.whole_run import APART
+
+DT = 0.01
+JERK = np.repeat([20.0, 60.0], 3) ** 2
+
+
+@dataclass(frozen=True)
+class Run:
+    """Deviations drawn from the very model, and the evidence that noisy spots would give of them."""
+
+    ref: Reference
+    ev: Evidence
+    jerk: Array  # (T, 6)
+    true: Array  # (T, 18)
+
+
+def transition(ref: Reference, ev: Evidence, jerk: Array, k: int) -> tuple[Array, Array, Array]:
+    """F, the covariance that step k adds, and how far the reference itself is from moving so."""
+    args = ref.R[k - 1], ref.t[k - 1], ref.m[k - 1], np.zeros((STATE, STATE)), ev.dt[k]
+    R, t, m, Q, F = predicted(*args, jerk[k], ev.jump[k], ev.unsteady[k])
+    away = Pose(R, t).minus(Pose(ref.R[k], ref.t[k]))
+    return F, Q, np.concatenate([away, m - ref.m[k]])
+
+
+def drawn(
+    seed: int,
+    frames: int,
+    jump_at: int | None = None,
+    jumps: float = 0.0,
+    dark: slice = slice(0, 0),
+    jerk: Array = JERK,
+    moment: float = 0.5,
+) -> Run:
+    """A run. jumps: variance of the velocities' jumps that the model knows of, in every step; jump_at: one that it
+    does not know of, in the step before that frame, at this moment of it (0 to 1). dark: frames without evidence.
+    jerk (6,) or (T, 6).
+    """
+    rng = np.random.default_rng(seed)
+    t = 0.1 * np.cumsum(rng.normal(size=(frames, 3)) * DT, axis=0)
+    angles = np.cumsum(rng.normal(size=(frames, 3)) * DT, axis=0)
+    poses = Pose.from_ypr(angles, t)
+    m = rng.normal(size=(frames, 12)) * np.repeat([0.3, 1.0, 1.0, 3.0], 3)
+    ref = Reference(poses.rotation, t, m)  # any motion will do: deviations are about it
+    J = rng.normal(size=(frames, 12, 6)) * [800, 800, 800, 1500, 1500, 1500]  # px per m and rad
+    L = np.swapaxes(J, 1, 2) @ J / 0.1**2
+    L[dark] = 0.0
+    dt = np.full(frames, DT)
+    dt[3 * frames // 4] = 2 * DT  # a frame was dropped
+    sizes = np.full((frames, 2), jumps)
+    first = np.repeat([0.02, 0.02, 0.5, 0.5, 5.0, 5.0], 3) ** 2
+    ev = Evidence(L, np.zeros((frames, 6)), dt, sizes, 100 * sizes, first)
+    jerk = np.array(np.broadcast_to(jerk, (frames, 6)))
+    x = np.sqrt(first) * rng.normal(size=STATE)
+    true, g = np.empty((frames, STATE)), np.zeros((frames, 6))
+    for k in range(frames):
+        if k > 0:
+            if k == jump_at:
+                jump = np.array([1.0, -0.5, 0.3, 3.0, -2.0, 1.0])
+                x[:6] -= moment * dt[k] * jump  # until then it goes on as before
+                x[6:12] += jump
+            F, Q, away = transition(ref, ev, jerk, k)
+            x = F @ x + away + np.linalg.cholesky(Q + 1e-25 * np.eye(STATE)) @ rng.normal(size=STATE)
+        true[k] = x
+        if L[k].any():
+            g[k] = L[k] @ x[:6] + np.linalg.cholesky(L[k]) @ rng.normal(size=6)
+    return Run(ref, ev._replace(vector=g), jerk, true)
+
+
+def dense(run: Run, without: int | None = None) -> tuple[Array, Array]:
+    """Mean (T, 18) and covariance (18 T, 18 T) given all evidence, as one Gaussian; without one frame's, if said."""
+    frames = len(run.ev.dt)
+    L, g = run.ev.information.copy(), run.ev.vector.copy()
+    if without is not None:
+        L[without], g[without] = 0.0, 0.0
+    mean, P = np.zeros((frames, STATE)), np.zeros((frames, STATE, frames, STATE))
+    P[0, :, 0] = np.diag(run.ev.first)
+    for k in range(1, frames):
+        F, Q, away = transition(run.ref, run.ev, run.jerk, k)
+        mean[k] = F @ mean[k - 1] + away
+        for j in range(k):
+            P[k, :, j] = F @ P[k - 1, :, j]
+            P[j, :, k] = P[k, :, j].T
+        P[k, :, k] = F @ P[k - 1, :, k - 1] @ F.T + Q
+    seen = [k for k in range(frames) if L[k].any()]
+    rows = np.concatenate([np.arange(6) + STATE * k for k in seen])
+    whole = P.reshape(frames * STATE, frames * STATE)
+    # The evidence as measurements L^T/2 x with the covariance 1.
+    H = np.zeros((6 * len(seen), frames * STATE))
+    y = np.zeros(6 * len(seen))
+    for n, k in enumerate(seen):
+        root = np.linalg.cholesky(L[k]).T
+        H[6 * n : 6 * n + 6, rows[6 * n : 6 * n + 6]] = root
+        y[6 * n : 6 * n + 6] = np.linalg.solve(root.T, g[k]) - root @ mean[k, :6]
+    S = H @ whole @ H.T + np.eye(len(y))
+    K = np.linalg.solve(S, H @ whole).T
+    return mean + (K @ y).reshape(frames, STATE), whole - K @ H @ whole
+
+
+def log_evidence(run: Run, jerk: Array) -> float:
+    """The plain sum over the innovations' Gaussians, of x with noise of covariance L^-1."""
+    x, P, total = np.zeros(STATE), np.diag(run.ev.first), 0.0
+    for k in range(len(run.ev.dt)):
+        if k > 0:
+            F, Q, away = transition(run.ref, run.ev, jerk, k)
+            x, P = F @ x + away, F @ P @ F.T + Q
+        L = run.ev.information[k]
+        if not L.any():
+            continue
+        C = np.linalg.inv(L)
+        y, S = C @ run.ev.vector[k] - x[:6], P[:6, :6] + C
+        total -= 0.5 * (y @ np.linalg.solve(S, y) + np.linalg.slogdet(2 * np.pi * S)[1])
+        K = P[:, :6] @ np.linalg.inv(S)
+        x, P = x + K @ y, P - K @ P[:6]
+    return total
+
+
+def left_out(run: Run, factor: float) -> float:
+    out = smoothed(run.ref, run.ev, factor * run.jerk)
+    return float(log_left_out(out.x, out.pose_P, run.ev))
+
+
+RUNS = {
+    "steady": lambda: drawn(1, 16),
+    "jumps that are known of": lambda: drawn(2, 16, jumps=0.5),
+    "dark in the middle": lambda: drawn(3, 20, dark=slice(8, 13)),
+    "dark at the end": lambda: drawn(4, 14, dark=slice(10, 14)),
+    "one frame": lambda: drawn(5, 1),
+}
+
+
+@pytest.mark.parametrize("kind", RUNS)
+def test_means_and_covariances_are_those_of_one_dense_gaussian(kind):
+    run = RUNS[kind]()
+    frames = len(run.ev.dt)
+    x, pose_P, motion_P, *_ = smoothed(run.ref, run.ev, run.jerk)
+    mean, P = dense(run)
+    blocks = np.stack([P[STATE * k : STATE * (k + 1), STATE * k : STATE * (k + 1)] for k in range(frames)])
+    sigma = np.sqrt(np.diagonal(blocks, axis1=1, axis2=2))
+    np.testing.assert_allclose((x - mean) / sigma, 0, atol=1e-6)
+    scale = sigma[:, :, None] * sigma[:, None, :]
+    np.testing.assert_allclose((pose_P - blocks[:, :6, :6]) / scale[:, :6, :6], 0, atol=1e-6)
+    np.testing.assert_allclose((motion_P - blocks[:, 6:12, 6:12]) / scale[:, 6:12, 6:12], 0, atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["steady", "jumps that are known of", "dark in the middle", "dark at the end"])
+def test_the_process_noise_of_each_axis_is_what_the_dense_gaussian_says(kind):
+    """Energy w^T Q^-1 w of the noise's mean w, and 3 - tr(Q^-1 cov w): how many of its numbers are determined."""
+    run = RUNS[kind]()
+    frames = len(run.ev.dt)
+    out = smoothed(run.ref, run.ev, run.jerk)
+    mean, P = dense(run)
+    assert np.all(out.energy[0] == 0)  # there is no step before the first frame
+    assert np.all(out.gamma[0] == 0)
+    for k in range(1, frames):
+        F, Q, away = transition(run.ref, run.ev, run.jerk, k)
+        w = mean[k] - F @ mean[k - 1] - away
+        step = np.hstack([-F, np.eye(STATE)])
+        both = slice(STATE * (k - 1), STATE * (k + 1))
+        C = step @ P[both, both] @ step.T
+        for axis in range(6):
+            rows = [axis, axis + 6, axis + 12]
+            inverse = np.linalg.inv(Q[np.ix_(rows, rows)])
+            assert out.energy[k, axis] == pytest.approx(w[rows] @ inverse @ w[rows], rel=1e-4, abs=1e-4)
+            assert out.gamma[k, axis] == pytest.approx(3 - np.trace(inverse @ C[np.ix_(rows, rows)]), abs=1e-4)
+
+
+def test_the_energy_of_the_process_noise_is_on_average_what_is_determined_of_it():
+    ratio = []
+    for seed in range(6):
+        run = drawn(300 + seed, 150, jumps=0.01)
+        out = smoothed(run.ref, run.ev, run.jerk)
+        ratio.append(out.energy.sum(axis=0) / out.gamma.sum(axis=0))
+    # Some 6 x 150 steps, each of which determines about one number of every axis' noise: sqrt(2 / 900) = 0.05.
+    np.testing.assert_allclose(np.mean(ratio, axis=0), 1.0, atol=0.2)
+
+
+@pytest.mark.parametrize("kind", RUNS)
+def test_the_covariances_of_the_ends_are_those_of_the_dense_gaussian(kind):
+    run = RUNS[kind]()
+    ends = smoothed(run.ref, run.ev, run.jerk).ends_P
+    _, P = dense(run)
+    for end, block in zip(ends, (P[:STATE, :STATE], P[-STATE:, -STATE:]), strict=True):
+        sigma = np.sqrt(np.diagonal(block))
+        np.testing.assert_allclose((end - block) / np.outer(sigma, sigma), 0, atol=1e-6)
+
+
+def test_the_last_frame_is_the_filters():
+    run = drawn(6, 200)
+    x, pose_P, motion_P, *_ = smoothed(run.ref, run.ev, run.jerk)
+    d, P = np.zeros(STATE), np.diag(run.ev.first)
+    for k in range(len(run.ev.dt)):
+        if k > 0:
+            F, Q, away = transition(run.ref, run.ev, run.jerk, k)
+            d, P = F @ d + away, F @ P @ F.T + Q
+        L, g = run.ev.information[k], run.ev.vector[k]
+        # The causal tracker's own update, of a state at rest in the origin: it moves by the deviation's change.
+        R, t, m, P, _, _ = updated(np.eye(3), np.zeros(3), np.zeros(12), P, L, g - L @ d[:6])
+        d = d + np.concatenate([Pose(R, t).minus(Pose.identity()), m])
+    sigma = np.sqrt(np.diagonal(P))
+    np.testing.assert_allclose((x[-1] - d) / sigma, 0, atol=1e-6)
+    np.testing.assert_allclose((pose_P[-1] - P[:6, :6]) / np.outer(sigma[:6], sigma[:6]), 0, atol=1e-6)
+    np.testing.assert_allclose((motion_P[-1] - P[6:12, 6:12]) / np.outer(sigma[6:12], sigma[6:12]), 0, atol=1e-6)
+
+
+@pytest.mark.parametrize("chunk", [1, 7, 12, 24, 25])
+def test_the_frames_in_memory_at_once_do_not_change_the_result(chunk, monkeypatch):
+    run = drawn(7, 24, dark=slice(5, 8))
+    compiled = smoothed(run.ref, run.ev, run.jerk)  # all in one chunk
+    monkeypatch.setattr(fixed_interval, "CHUNK", chunk)
+    for a, b in zip(smoothed.py_func(run.ref, run.ev, run.jerk), compiled, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-18)
+
+
+def test_a_run_of_more_frames_than_are_in_memory_is_smooth_where_the_chunks_meet():
+    run = drawn(8, fixed_interval.CHUNK + 40)
+    x, pose_P, *_ = smoothed(run.ref, run.ev, run.jerk)
+    meet = fixed_interval.CHUNK
+    # The frames about the seam by themselves: what lies 70 frames away has no say beyond a thousandth of a sigma.
+    part = slice(meet - 100, meet + 40)
+    ev = Evidence(*(a[part] for a in run.ev[:5]), run.ev.first)
+    alone_x, alone_P, *_ = smoothed(Reference(*(a[part] for a in run.ref)), ev, run.jerk[part])
+    sigma = np.sqrt(np.diagonal(pose_P, axis1=1, axis2=2))[part]
+    seam = slice(70, 135)
+    np.testing.assert_allclose((alone_x[:, :6] - x[part, :6])[seam] / sigma[seam], 0, atol=1e-3)
+    np.testing.assert_allclose(alone_P[seam], pose_P[part][seam], rtol=1e-2, atol=1e-2 * np.max(sigma) ** 2)
+
+
+def test_the_likelihood_is_the_product_of_the_innovations_gaussians():
+    run = drawn(9, 25, dark=slice(9, 12))
+
+    def both(factor: float) -> Array:
+        return np.array([log_likelihood(run.ref, run.ev, factor * run.jerk), log_evidence(run, factor * run.jerk)])
+
+    at_truth = both(1.0)
+    for factor in (0.01, 0.3, 5.0, 1000.0):
+        ours, plain = both(factor) - at_truth
+        assert ours == pytest.approx(plain, abs=1e-5)
+
+
+def test_the_jerk_that_moved_the_run_is_the_likeliest():
+    run = drawn(10, 400)
+    factors = np.array([0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0])
+    values = [log_likelihood(run.ref, run.ev, f * run.jerk) for f in factors]
+    assert factors[int(np.argmax(values))] == 1.0
+    likelihoods = [left_out(run, f) for f in factors]
+    assert factors[int(np.argmax(likelihoods))] in (0.3, 1.0, 3.0)
+
+
+def test_what_the_others_tell_is_each_frames_likelihood_with_that_frame_left_out():
+    run = drawn(11, 10, dark=slice(4, 6))
+
+    def plainly(factor: float) -> float:
+        total = 0.0
+        for k in range(10):
+            L = run.ev.information[k]
+            if not L.any():
+                continue
+            mean, P = dense(Run(run.ref, run.ev, factor * run.jerk, run.true), without=k)
+            own = slice(STATE * k, STATE * k + 6)
+            C = np.linalg.inv(L)
+            y, S = C @ run.ev.vector[k] - mean[k, :6], P[own, own] + C
+            total -= 0.5 * (y @ np.linalg.solve(S, y) + np.linalg.slogdet(S)[1])
+        return total
+
+    ours = [left_out(run, f) for f in (1.0, 0.1, 50.0)]
+    plain = [plainly(f) for f in (1.0, 0.1, 50.0)]
+    np.testing.assert_allclose(np.array(ours) - ours[0], np.array(plain) - plain[0], atol=1e-4)
+
+
+def test_a_smoothed_state_is_as_far_off_as_it_claims():
+    chi2, motion = [], []
+    for seed in range(6):
+        run = drawn(100 + seed, 150, dark=slice(70, 80))
+        x, pose_P, motion_P, *_ = smoothed(run.ref, run.ev, run.jerk)
+        d = x - run.true
+        chi2 += [d[k, :6] @ np.linalg.solve(pose_P[k], d[k, :6]) / 6 for k in range(0, 150, 10)]
+        motion += [d[k, 6:12] @ np.linalg.solve(motion_P[k], d[k, 6:12]) / 6 for k in range(0, 150, 10)]
+    # 90 states, each ten frames from the next: the mean of a chi-square over 6 scatters by 0.06.
+    assert np.mean(chi2) == pytest.approx(1.0, abs=0.2)
+    assert np.mean(motion) == pytest.approx(1.0, abs=0.25)
+
+
+def test_a_jump_of_the_velocities_is_found_at_its_step_and_none_where_there_is_none():
+    shocks = []
+    for seed in range(8):
+        run = drawn(200 + seed, 120)
+        steady = smoothed(run.ref, run.ev, run.jerk)[3]
+        assert steady[0] == 0.0  # there is no step before the first frame
+        shocks.append(steady[1:-5])
+        run = drawn(200 + seed, 120, jump_at=61)
+        bent = smoothed(run.ref, run.ev, run.jerk)[3]
+        assert int(np.argmax(bent)) == 61
+        assert bent[61] > 200
+        for moment in (0.05, 0.95):  # at either end of its step it may as well be in the step beside it
+            run = drawn(200 + seed, 120, jump_at=61, moment=moment)
+            bent = smoothed(run.ref, run.ev, run.jerk)[3]
+            assert abs(int(np.argmax(bent)) - 61) <= APART
+            assert np.max(bent) > 200
+    alarms = np.concatenate(shocks)
+    # Chi-square of 6 degrees: its mean is 6, and 45 is exceeded five times in 10^8.
+    assert np.mean(alarms) == pytest.approx(6.0, abs=1.0)
+    assert np.max(alarms) < 45
+
+
+def test_a_jump_that_the_motion_allows_for_is_no_shock():
+    run = drawn(12, 80, jump_at=41)
+    assert smoothed(run.ref, run.ev, run.jerk)[3][41] > 200
+    run.ev.jump[41], run.ev.unsteady[41] = 16.0, 100.0
+    shock = smoothed(run.ref, run.ev, run.jerk)[3]
+    assert shock[41] < 20
+    assert np.max(shock) < 45
+
+
+def test_a_reference_is_shifted_by_the_contracts_pose_error():
+    run = drawn(13, 5)
+    there = shifted(run.ref, 10 * run.true)
+    np.testing.assert_allclose(
+        Pose(there.R, there.t).minus(Pose(run.ref.R, run.ref.t)), 10 * run.true[:, :6], atol=1e-12
+    )
+    np.testing.assert_allclose(there.m - run.ref.m, 10 * run.true[:, 6:], atol=1e-12)

@@ -1,0 +1,93 @@
+"""Errors that belong to a place on the screen: a vehicle at rest shows them in every frame; no mean lessens them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lab.simulate.points import CLUTTER, PointRun, simulate_points
+from tests.tracking.rigid_runs import judged, looked_at_again, tracked
+from tracking.detections import Detections
+from tracking.smoothing.place_errors import PlaceErrors, correlation, place_errors
+
+WIDTH_PX = 2.0
+
+
+def textured(run: PointRun, place_px: float, white_px: float, seed: int) -> PointRun:
+    """The recording with other errors: white ones, and a smooth field over each picture for each spot."""
+    rng = np.random.default_rng(seed)
+    waves, n = 48, run.uv_px.shape[1]
+    k_vectors = rng.normal(0, 1 / np.sqrt(2) / WIDTH_PX, (n, 2, waves, 2))
+    phases = rng.uniform(0, 2 * np.pi, (n, 2, waves))
+    sigma2 = place_px**2 + white_px**2
+    detections = []
+    for k, per_camera in enumerate(run.detections):
+        row = []
+        for found, views in zip(per_camera, run.origin[k], strict=True):
+            uv = found.uv_px.copy()
+            for i, view in enumerate(views):
+                if view != CLUTTER:
+                    at = run.uv_px[k, view]
+                    field = np.sqrt(2 / waves) * np.cos(k_vectors[view] @ at + phases[view]).sum(axis=-1)
+                    uv[i] = at + place_px * field + white_px * rng.standard_normal(2)
+            width = np.full(len(uv), WIDTH_PX)
+            points = Detections.at(uv, np.tile(sigma2 * np.eye(2), (len(uv), 1, 1)))
+            row.append(replace(points, major_px=width, minor_px=width))
+        detections.append(tuple(row))
+    return replace(run, detections=tuple(detections))
+
+
+@pytest.mark.parametrize(("scenario", "least", "most"), [("static", 0.1, 3.0), ("huo2015", 0.5, 1.6)])
+def test_sigmas_stay_right_where_texture_shifts_the_spots(scenario, least, most):
+    """White noise alone would make the pose at rest 10 times as sure as it is: 100 in the squares."""
+    nees, shares = [], []
+    for seed in range(2):
+        run = textured(simulate_points(scenario, seed, frames=120, noise_px=0.05, clutter=0.0), 0.03, 0.01, seed)
+        frames, smoothed = looked_at_again(run, tracked(run))
+        answers = judged(run, frames).nees
+        nees.append(np.nanmean(answers) / 6)
+        shares.append(smoothed.place_share)
+    assert least < np.mean(nees) < most
+    assert np.min(shares) > 0.5
+
+
+def test_white_noise_is_averaged_over_a_vehicle_at_rest():
+    for seed in range(2):
+        run = textured(simulate_points("static", seed, frames=120, noise_px=0.05, clutter=0.0), 0.0, 0.05, seed)
+        frames, smoothed = looked_at_again(run, tracked(run))
+        assert smoothed.place_share < 0.02
+        one = judged(run, frames).bound[60]
+        assert frames[60].pose_covariance[0, 0] < one[0] / 20
+
+
+def test_errors_are_alike_as_far_as_the_spot_is_wide():
+    """The mean over a Gaussian of white texture, in two places: the overlap of the two Gaussians."""
+    rng = np.random.default_rng(5)
+    width, shift = 3.0, 4.0
+    x = np.arange(-20, 21)
+    weight = [np.exp(-((x - c) ** 2) / (2 * width**2)) for c in (0.0, shift)]
+    means = rng.standard_normal((4000, len(x))) @ np.array(weight).T
+    assert np.corrcoef(means.T)[0, 1] == pytest.approx(float(correlation(np.array(shift), width)), abs=0.03)
+
+
+def test_calibration_errors_that_are_known_are_no_errors_of_places():
+    rng = np.random.default_rng(6)
+    residual = np.tile(rng.standard_normal((1, 6, 2)), (80, 1, 1))
+    uv, width, averaged = np.zeros((80, 6, 2)), np.full(6, 2.0), np.full(80, 80.0)
+    assert place_errors(residual, uv, width, averaged, np.zeros(6)).share > 0.9
+    assert place_errors(residual, uv, width, averaged, np.ones(6)).share == 0.0
+
+
+def test_nothing_labelled_says_nothing():
+    nothing = place_errors(
+        np.full((5, 4, 2), np.nan), np.full((5, 4, 2), np.nan), np.full(4, np.nan), np.ones(5), np.zeros(4)
+    )
+    assert nothing.share == 0.0
+    assert np.array_equal(nothing.factor(np.ones(5)), np.ones(5))
+
+
+def test_a_pose_of_one_frame_keeps_its_covariance():
+    """It holds the whole error of its spots already."""
+    errors = PlaceErrors(0.7, np.full(3, 50.0), np.full(6, 2.0))
+    assert errors.factor(np.ones(3)) == pytest.approx(1.0)
+    assert errors.factor(np.full(3, 1e6)) == pytest.approx(1 + 0.7 * 49)

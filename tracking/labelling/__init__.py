@@ -1,0 +1,1 @@
+"""First labels: which point of light is which spot, from one frame and a prior or none."""

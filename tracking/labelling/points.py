@@ -1,0 +1,133 @@
+"""The points of light of all cameras of one frame, as the search for labels needs them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from geometry.arrays import Array, Bools, Ints
+from geometry.forward_model import SpotModel
+from geometry.rig import Rig
+from geometry.surfaces import meet_surface
+from tracking.detections import Detections
+from tracking.parameters import LabelParameters
+
+# Sigmas within which points of two cameras that observe the same screen are one point of light.
+SAME_POINT = 6.0
+
+
+class Points(NamedTuple):
+    """m points of light that may be spots, those of a camera together; of a crowded picture the brightest."""
+
+    uv: Array  # (m, 2) px
+    cov: Array  # (m, 2, 2) px^2, as claimed
+    world: Array  # (m, 3) m, on the screen; nan where the line of sight misses it
+    m_per_px: Array  # (m,) how far on the screen a step of one pixel goes, the longer of both axes
+    first: Ints  # (cameras + 1,) where each camera's begin
+    row: Ints  # (m,) row in that camera's detections
+    log_density: Array  # (cameras,) log of the density of all points, 1/px^2
+    log_unused: Array  # (cameras, most + 1): see `_log_unused`
+
+
+def points_of(
+    rig: Rig,
+    model: SpotModel,
+    detections: Mapping[str, Detections],
+    parameters: LabelParameters,
+    reached: Callable[[int, Array], Bools],
+) -> Points:
+    """All cameras' points in one list. The rig is the one that `model` was made of.
+
+    reached: which places (k, 3) on the screen of a camera (by number) a spot may light at all.
+    """
+    cameras = len(model.camera_names)
+    uv, cov, world, row = [np.zeros((0, 2))], [np.zeros((0, 2, 2))], [np.zeros((0, 3))], [np.zeros(0, dtype=np.int64)]
+    m_per_px = [np.zeros(0)]
+    first = np.zeros(cameras + 1, dtype=np.int64)
+    log_density = np.zeros(cameras)
+    log_unused = np.zeros((cameras, len(model) + 1))
+    for c, name in enumerate(model.camera_names):
+        found = detections.get(name)
+        count = 0
+        if found is not None and len(found):
+            camera = rig.cameras[name]
+            screen = rig.screens[camera.screen]
+            order = np.argsort(-np.nan_to_num(found.flux, nan=0.0), kind="stable")
+            if len(found) > parameters.max_points:
+                origin, rays = camera.rays(found.uv_px[order])
+                possible = np.flatnonzero(reached(c, meet_surface(origin, rays, screen.world_from_screen, screen.bow)))
+                brightest = order[possible[: parameters.max_points]]
+                # As many points are as bright as these; a false one may be any of them.
+                if len(possible) > parameters.max_points:
+                    order = order[: possible[parameters.max_points]]
+            else:
+                brightest = order
+            here = found.uv_px[brightest]
+            origin, rays = camera.rays(here + np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])[:, None])
+            hits = meet_surface(origin, rays, screen.world_from_screen, screen.bow)
+            uv.append(here)
+            cov.append(found.cov_px2[brightest])
+            world.append(hits[0])
+            m_per_px.append(np.linalg.norm(hits[1:] - hits[0], axis=-1).max(axis=0))
+            row.append(brightest)
+            count = len(brightest)
+            rivals = len(order)
+            area = float(np.prod(camera.image_size_px))
+            log_density[c] = np.log(rivals / area)
+            log_unused[c] = _log_unused(rivals, area, parameters.clutter_per_px2 * area, len(model))
+        first[c + 1] = first[c] + count
+    return Points(
+        np.concatenate(uv),
+        np.concatenate(cov),
+        np.concatenate(world),
+        np.concatenate(m_per_px),
+        first,
+        np.concatenate(row).astype(np.int64),
+        log_density,
+        log_unused,
+    )
+
+
+def _log_unused(count: int, area: float, expected: float, most: int) -> Array:
+    """Log of how much likelier a picture's false points become when k = 0 ... most of its points are no longer false.
+
+    Under a Poisson density that is not known, with an exponential prior about `expected` false points per picture: j
+    false points of a picture of `area` px^2 have the density j! / area^j mu^j / (1 + mu)^(j + 1).
+    """
+    k = np.minimum(np.arange(most + 1), count)
+    falling = np.concatenate([[0.0], np.cumsum(np.log(np.maximum(count - np.arange(most), 1.0)))])
+    mu = max(expected, 1e-3)
+    return np.asarray(k * (np.log(area) + np.log1p(1 / mu)) - falling[k])
+
+
+class PointsOnScreens(NamedTuple):
+    """The points from which candidate poses are made: a point seen by two cameras of one screen stands once."""
+
+    point: Ints  # (k,) index into Points, those of a screen together, the brightest first
+    first: Ints  # (screens + 1,)
+
+
+def on_screens(points: Points, screen_of_camera: Ints, screens: int, sigma_px: float, most: int) -> PointsOnScreens:
+    """screen_of_camera: (cameras,) which of the screens each observes; most: of each camera the brightest so many.
+
+    sigma_px: the error that the model adds to a point's own.
+    """
+    sigma_m = points.m_per_px * np.sqrt(np.trace(points.cov, axis1=1, axis2=2) + 2 * sigma_px**2)
+    chosen: list[int] = []
+    first = [0]
+    for s in range(screens):
+        here: list[int] = []
+        for c in np.flatnonzero(screen_of_camera == s):
+            of_camera = np.arange(points.first[c], points.first[c + 1])[:most]
+            of_camera = of_camera[np.isfinite(points.world[of_camera]).all(axis=1)]
+            if here:
+                before = np.array(here)
+                gap = np.linalg.norm(points.world[of_camera][:, None] - points.world[before], axis=-1)
+                limit = SAME_POINT * np.hypot(sigma_m[of_camera][:, None], sigma_m[before])
+                of_camera = of_camera[~(gap < limit).any(axis=1)]
+            here += [int(i) for i in of_camera]
+        chosen += here
+        first.append(len(chosen))
+    return PointsOnScreens(np.array(chosen, dtype=np.int64), np.array(first, dtype=np.int64))

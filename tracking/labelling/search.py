@@ -1,0 +1,332 @@
+"""Candidate labellings of one frame under any prior, or none: the parts of this folder put together."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from geometry.arrays import Array, Bools, Ints
+from geometry.forward_model import SpotModel
+from geometry.pose import Pose
+from geometry.pose_prior import PosePrior
+from geometry.pose_solver.gauss_newton import PoseFit, fit_pose
+from geometry.rig import Rig
+from geometry.surfaces import meet_surface
+from geometry.uncertainty.rig_uncertainty import CalibrationSpread
+from tracking.detections import Detections
+from tracking.labelling.candidates import NO_POINT, Best, Limits, Sight, generate
+from tracking.labelling.completion import SHARES, complete_all
+from tracking.labelling.points import Points, PointsOnScreens, on_screens, points_of
+from tracking.labelling.triples import covering
+from tracking.labelling.visible_poses import VisiblePoses
+from tracking.parameters import LabelParameters
+
+# The largest error of the model that is allowed for, as a multiple of the parameter's: evidence is the mean over
+# several sizes up to this one.
+LARGEST_MODEL_ERROR = 2.0
+# Chance that a right set of labels is refused by its misfit.
+P_MISFIT = 1e-6
+FEWEST_POINTS = 6  # per camera: of a crowd at least so many of the brightest take part
+LEAST_LIKELY = 25.0  # nats: labellings so far behind the best are not reported
+
+
+@dataclass(frozen=True, slots=True)
+class Labelling:
+    """A pose and the points that it explains."""
+
+    fit: PoseFit
+    point_of: Ints  # (n views,) row in its camera's detections, or NO_POINT
+    score: float  # log evidence against "all points are false", nats: the likelihood averaged over the prior's poses
+    expected: int  # how many views it puts in the picture
+
+
+@dataclass(frozen=True, slots=True)
+class RigPlan:
+    """What the search prepares once for a rig."""
+
+    model: SpotModel
+    everywhere: PosePrior
+    triples: Ints  # (k, 3) spots: the first `stages[m]` of them serve any m visible spots and more
+    stages: Mapping[int, int]
+    screen_of_camera: Ints  # (cameras,)
+    spot_screen: Ints  # (spots,)
+    view_at: Ints  # (spots, cameras)
+    spot_point: Array  # (spots, 3)
+    spot_ray: Array  # (spots, 3)
+    front: Array  # (n, 4) the plane of each view's screen, with the normal towards its camera
+    log_volume: float  # m^3 rad^3, of the poses that show at least `min_spots` spots
+    typical: Pose | None  # one that shows as many spots as any
+
+    @staticmethod
+    def of(rig: Rig, model: SpotModel, min_spots: int) -> RigPlan:
+        """Prepare the search for a rig. The rig is the one that `model` was made of."""
+        screens = list(rig.screens)
+        everywhere = PosePrior.everywhere(rig)
+        view_at = np.full((len(model.spot_names), len(model.camera_names)), -1)
+        view_at[model.spot_of, model.camera_of] = np.arange(len(model))
+        point, ray = np.zeros((len(model.spot_names), 3)), np.zeros((len(model.spot_names), 3))
+        point[model.spot_of], ray[model.spot_of] = model.point, model.ray
+        spots = sorted({int(s) for s in model.spot_of})
+        visible = VisiblePoses.of(rig, model, everywhere, min_spots)
+        triples, stages = covering(visible.triples, spots, min(min_spots, len(spots)))
+        normal = model.screen_rotation[..., 2]
+        camera = -np.einsum("nij,ni->nj", model.camera_rotation, model.camera_translation)
+        side = np.sign(np.sum(normal * (camera - model.screen_origin), axis=-1))
+        normal = normal * np.where(side < 0, -1.0, 1.0)[:, None]
+        return RigPlan(
+            model=model,
+            everywhere=everywhere,
+            triples=triples,
+            stages=stages,
+            screen_of_camera=np.array([screens.index(rig.cameras[c].screen) for c in model.camera_names]),
+            spot_screen=np.array([screens.index(rig.spots[s].screen) for s in model.spot_names]),
+            view_at=view_at,
+            spot_point=point,
+            spot_ray=ray,
+            front=np.concatenate([normal, np.sum(normal * model.screen_origin, axis=-1)[:, None]], axis=-1),
+            log_volume=visible.log_volume,
+            typical=visible.typical,
+        )
+
+
+_plans: list[tuple[Rig, int, RigPlan]] = []
+
+
+def plan_of(rig: Rig, model: SpotModel, min_spots: int) -> RigPlan:
+    """The plan of a rig, kept for the rigs last asked for; `model` is made of it."""
+    for known, least, plan in _plans:
+        if known is rig and least == min_spots:
+            return plan
+    plan = RigPlan.of(rig, model, min_spots)
+    _plans.insert(0, (rig, min_spots, plan))
+    del _plans[8:]
+    return plan
+
+
+def candidate_labellings(
+    rig: Rig,
+    model: SpotModel,
+    detections: Mapping[str, Detections],
+    prior: PosePrior | None = None,
+    parameters: LabelParameters | None = None,
+    calibration: CalibrationSpread | None = None,
+    most: int = 8,
+) -> list[Labelling]:
+    """The labellings of one frame that explain its points best, best first, without a decision between them.
+
+    detections: by camera name; a camera without a picture is absent. The rig is the one that `model` was made of.
+    prior: None for all poses in which the rig can see its spots. calibration: what its errors do to the spots, where
+    that is known. A labelling has at least `parameters.min_spots` spots.
+    """
+    parameters = LabelParameters() if parameters is None else parameters
+    plan = plan_of(rig, model, parameters.min_spots)
+    prior = plan.everywhere if prior is None else prior
+    log_volume = min(prior.log_volume, plan.log_volume)
+    points = points_of(rig, model, detections, parameters, partial(_reached_by_any, plan, prior))
+    has_image = np.array([model.camera_names[c] in detections for c in model.camera_of])
+    sight = _sight(plan, points, has_image, parameters, _known_px(plan, calibration))
+    limits = Limits(
+        np.ascontiguousarray(prior.centre.rotation, dtype=np.float64),
+        np.array(prior.centre.translation, dtype=np.float64),
+        prior.half_width_m,
+        float(1 + 2 * np.cos(prior.largest_turn_rad)) - 1e-9,
+        parameters.p_detect,
+        parameters.min_spots,
+    )
+    reached = _reached(plan, prior, points.world)
+    sigma_px = LARGEST_MODEL_ERROR * parameters.model_sigma_px
+    best = Best.none(parameters.max_refined, len(model))
+    brightness_known = all(np.isfinite(found.flux).any() for found in detections.values() if len(found))
+    screens, most_triples = _within_budget(plan, sight, points, reached, parameters, brightness_known, sigma_px)
+    done = 0
+    for size, end in plan.stages.items():
+        now = plan.triples[done : min(end, most_triples)]
+        now = np.ascontiguousarray(now[(sight.spot_screen[now] >= 0).all(axis=1)])
+        done = end
+        generate(model.numbers, sight, points, screens, reached, limits, now, best)
+        # What is not served yet explains two spots less: it is no rival.
+        if done >= most_triples or _spots_of_best(plan, sight, points, limits, best) > size:
+            break
+    return _completed(plan, sight, points, limits, prior, log_volume, best, calibration, most, sigma_px)
+
+
+def crowd_of_unknown_brightness(
+    rig: Rig,
+    model: SpotModel,
+    detections: Mapping[str, Detections],
+    prior: PosePrior | None,
+    parameters: LabelParameters,
+    limit: int,
+) -> tuple[str, int] | None:
+    """A camera with more points than a limit that may be spots under the prior, and no flux; and how many it has."""
+    crowds = [n for n, found in detections.items() if len(found) > limit and not np.isfinite(found.flux).any()]
+    if not crowds:
+        return None
+    plan = plan_of(rig, model, parameters.min_spots)
+    prior = plan.everywhere if prior is None else prior
+    for name in crowds:
+        camera = rig.cameras[name]
+        screen = rig.screens[camera.screen]
+        places = meet_surface(*camera.rays(detections[name].uv_px), screen.world_from_screen, screen.bow)
+        count = int(np.count_nonzero(_reached_by_any(plan, prior, model.camera_names.index(name), places)))
+        if count > limit:
+            return name, count
+    return None
+
+
+def _reached(plan: RigPlan, prior: PosePrior, places: Array) -> Bools:
+    """Which places (m, 3) each spot may light under a prior: (spots, m)."""
+    rays = zip(plan.spot_point, plan.spot_ray, strict=True)
+    return np.array([prior.reaches(p, r, places) for p, r in rays], dtype=bool).reshape(-1, len(places))
+
+
+def _reached_by_any(plan: RigPlan, prior: PosePrior, camera: int, places: Array) -> Bools:
+    """Which places (m, 3) on the screen of a camera any of its spots may light."""
+    mine = plan.view_at[:, camera] >= 0
+    return np.asarray(_reached(plan, prior, places)[mine].any(axis=0) & np.isfinite(places).all(axis=-1))
+
+
+def _spots_of_best(plan: RigPlan, sight: Sight, points: Points, limits: Limits, best: Best) -> int:
+    """How many spots the likeliest candidate of those made so far explains."""
+    if not best.taken[0]:
+        return 0
+    _, _, labels, evidence, _, _ = complete_all(plan.model.numbers, sight, points, limits, plan.front, best, 1)
+    return len(set(plan.model.spot_of[labels[0] != NO_POINT])) if evidence[0] > -np.inf else 0
+
+
+def _within_budget(
+    plan: RigPlan,
+    sight: Sight,
+    points: Points,
+    reached: Bools,
+    parameters: LabelParameters,
+    brightness_known: bool,
+    sigma_px: float,
+) -> tuple[PointsOnScreens, int]:
+    """The points to make poses from and how many of the plan's triples: at most `max_triples` sets of three points.
+
+    In a crowd spots are brighter than most: fewer points are used. Where brightness is not known all points are used,
+    and fewer triples of spots, those first that serve most sets of visible spots.
+    """
+    most = parameters.max_points
+    screen_count = int(plan.screen_of_camera.max()) + 1
+    while True:
+        screens = on_screens(points, plan.screen_of_camera, screen_count, sigma_px, most)
+        options = np.zeros(len(plan.spot_screen))
+        for spot, k in enumerate(sight.spot_screen):
+            if k >= 0:
+                options[spot] = np.count_nonzero(reached[spot, screens.point[screens.first[k] : screens.first[k + 1]]])
+        sets = np.cumsum(np.prod(options[plan.triples], axis=1))
+        if not len(sets) or sets[-1] <= parameters.max_triples:
+            return screens, len(sets)
+        if not brightness_known or most <= FEWEST_POINTS:
+            return screens, max(1, int(np.count_nonzero(sets <= parameters.max_triples)))
+        most = max(int(0.8 * most), FEWEST_POINTS)
+
+
+_known: list[tuple[CalibrationSpread, RigPlan, Array]] = []
+
+
+def _known_px(plan: RigPlan, calibration: CalibrationSpread | None) -> Array:
+    """What the calibration's errors make of each view's pixel (n, 2, 2), px^2, in a typical pose; kept."""
+    n = len(plan.model)
+    if calibration is None or plan.typical is None:
+        return np.zeros((n, 2, 2))
+    for spread, of, px2 in _known:
+        if spread is calibration and of is plan:
+            return px2
+    px2 = calibration.at(plan.typical).reshape(n, 2, n, 2)[np.arange(n), :, np.arange(n)].copy()
+    _known.insert(0, (calibration, plan, px2))
+    del _known[8:]
+    return px2
+
+
+def _sight(plan: RigPlan, points: Points, has_image: Bools, parameters: LabelParameters, known_cov: Array) -> Sight:
+    model = plan.model
+    sigma2 = (LARGEST_MODEL_ERROR * parameters.model_sigma_px) ** 2
+    with_points = {
+        int(plan.screen_of_camera[c]) for c in range(len(model.camera_names)) if points.first[c + 1] > points.first[c]
+    }
+    seen = np.isin(plan.spot_screen, list(with_points)) & (plan.view_at >= 0).any(axis=1)
+    return Sight(
+        model.camera_of,
+        model.spot_of,
+        model.image_size_px,
+        has_image,
+        known_cov + sigma2 * np.eye(2),
+        known_cov,
+        sigma2,
+        plan.view_at,
+        plan.spot_point,
+        plan.spot_ray,
+        np.where(seen, plan.spot_screen, -1),
+    )
+
+
+def _completed(
+    plan: RigPlan,
+    sight: Sight,
+    points: Points,
+    limits: Limits,
+    prior: PosePrior,
+    log_volume: float,
+    best: Best,
+    calibration: CalibrationSpread | None,
+    most: int,
+    sigma_px: float,
+) -> list[Labelling]:
+    """The best candidates completed, weighed, no two alike, best first."""
+    model = plan.model
+    R, t, labels_of, evidences, shares, expected_of = complete_all(
+        model.numbers, sight, points, limits, plan.front, best, int(best.taken[0])
+    )
+    evidences = evidences - log_volume
+    out: list[Labelling] = []
+    kept: list[tuple[Pose, Ints]] = []
+    for k in np.argsort(-evidences, kind="stable"):
+        evidence, pose, labels = evidences[k], Pose(R[k], t[k]), labels_of[k]
+        if len(out) == most or not evidence > evidences.max() - LEAST_LIKELY:
+            break
+        if any(np.array_equal(labels, other) and _near(pose, there) for there, other in kept):
+            continue
+        kept.append((pose, labels))
+        fit = _consistent_fit(model, points, labels, pose, SHARES[: shares[k] + 1] * sigma_px, calibration)
+        if fit is None or not bool(prior.holds(fit.world_from_body)):
+            continue
+        point_of = np.where(labels == NO_POINT, NO_POINT, points.row[np.maximum(labels, 0)])
+        out.append(Labelling(fit, point_of, float(evidence), int(expected_of[k])))
+    return out
+
+
+def _consistent_fit(
+    model: SpotModel,
+    points: Points,
+    labels: Ints,
+    start: Pose,
+    model_errors_px: Array,
+    calibration: CalibrationSpread | None,
+) -> PoseFit | None:
+    """The fit to labelled points with the smallest of some model errors, falling, under which all agree.
+
+    None where they do not even under the largest. One spot that a neighbour has pulled may misfit by many of its own
+    sigmas while the others are perfect.
+    """
+    rows = np.flatnonzero(labels != NO_POINT)
+    chosen = labels[rows]
+    for sigma_px in model_errors_px[::-1]:
+        covariances = points.cov[chosen] + sigma_px**2 * np.eye(2)
+        fit = fit_pose(model, rows, points.uv[chosen], covariances, start, calibration=calibration)
+        if fit is None or not fit.observable:
+            return None
+        if fit.consistent(P_MISFIT):
+            return fit
+    return None
+
+
+def _near(one: Pose, other: Pose) -> bool:
+    """Whether two poses with the same labels are the same solution."""
+    away = one.minus(other)
+    return bool(np.abs(away[:3]).max() < 0.02 and np.abs(away[3:]).max() < 0.02)

@@ -1,0 +1,123 @@
+"""The poses in which a rig sees enough of its spots: a sample of them, and their volume.
+
+Three spots at random pixels of their pictures give poses in closed form. A pose is met so in proportion to |det J|, the
+Jacobian of the three spots' six pixels, and once for each set of three views that shows it: its weight is the inverse.
+Poses drawn from the lab's whole space would hardly ever show a spot to a long lens (one in 1e6 at f = 6000 px).
+Source: ours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from geometry.arrays import Array, Bools, Ints
+from geometry.forward_model import SpotModel
+from geometry.pose import Pose
+from geometry.pose_prior import PosePrior
+from geometry.pose_solver.three_spots import poses_from_three_spots
+from geometry.rig import Rig
+from geometry.surfaces import meet_surface
+
+DRAWN = 4000  # sets of three pixels; the volume is then known to a tenth or two
+FIXES = 1e-4  # least relative size of a singular value of three spots' Jacobian; collinear spots have 1e-12
+
+
+@dataclass(frozen=True, slots=True)
+class VisiblePoses:
+    """What a rig can see, with the sets of three spots that fix a pose."""
+
+    triples: dict[tuple[int, int, int], float]  # of spots: the median relative size of the least singular value
+    log_volume: float  # m^3 rad^3, of the poses that show at least `min_spots` spots
+    typical: Pose | None  # one that shows as many spots as any
+
+    @staticmethod
+    def of(rig: Rig, model: SpotModel, everywhere: PosePrior, min_spots: int) -> VisiblePoses:
+        """Of the rig that `model` was made of; the same for the same arguments."""
+        rng = np.random.default_rng(0)
+        triples = _sets_of_three(model)
+        if not triples:
+            return VisiblePoses({}, everywhere.log_volume, None)
+        views_of = [np.flatnonzero(model.spot_of == s) for s in range(len(model.spot_names))]
+        which = rng.integers(len(triples), size=DRAWN)
+        spots = np.array(triples)[which]
+        views = np.array([[rng.choice(views_of[s]) for s in row] for row in spots])
+        places = _at_random_pixels(rig, model, views, rng)
+        poses = poses_from_three_spots(model.point[views], model.ray[views], places)
+        usable = np.isfinite(poses.translation[..., 0]) & everywhere.holds(poses)
+        source, _ = np.nonzero(usable)
+        poses = poses[usable]
+        pixels, J = model.project(poses)
+        seen = model.in_picture(pixels)
+        # (k, spots): in how many pictures each spot is.
+        shown = np.stack([seen[:, rows].sum(axis=1) for rows in views_of], axis=-1)
+        enough = np.count_nonzero(shown, axis=1) >= min(min_spots, len({int(s) for s in model.spot_of}))
+        at = np.arange(len(source))[:, None]
+        s = np.linalg.svd(J[at, views[source]].reshape(-1, 6, 6), compute_uv=False)
+        quality = s[:, -1] / np.maximum(s[:, 0], 1e-300)
+        good = _fixing(triples, which[source], quality, enough)
+        if not good:
+            return VisiblePoses({}, everywhere.log_volume, None)
+        weight = _weights(model, triples, good, which[source], views[source], views_of, shown, s)
+        volume = float(np.sum(weight[enough])) / DRAWN * len(triples)
+        log_volume = min(float(np.log(max(volume, 1e-300))), everywhere.log_volume)
+        typical = poses[int(np.argmax(np.count_nonzero(shown, axis=1) + quality / quality.max()))]
+        return VisiblePoses({triples[i]: q for i, q in good.items()}, log_volume, typical)
+
+
+def _sets_of_three(model: SpotModel) -> list[tuple[int, int, int]]:
+    """All sets of three spots, but those with two of one beam end (a ray that may meet one of two screens)."""
+    first = {int(s): int(np.flatnonzero(model.spot_of == s)[0]) for s in np.unique(model.spot_of)}
+    ends = {s: (int(model.beam_of[v]), float(model.sign[v])) for s, v in first.items()}
+    return [t for t in combinations(sorted(first), 3) if len({ends[s] for s in t}) == 3]
+
+
+def _at_random_pixels(rig: Rig, model: SpotModel, views: Ints, rng: np.random.Generator) -> Array:
+    """World points (k, 3, 3), m, at random pixels of the pictures of views (k, 3); nan beside the screen."""
+    pixels = rng.uniform(-0.5, model.image_size_px[views] - 0.5)
+    places = np.full((*views.shape, 3), np.nan)
+    for c, name in enumerate(model.camera_names):
+        of_camera = model.camera_of[views] == c
+        screen = rig.screens[rig.cameras[name].screen]
+        origin, rays = rig.cameras[name].rays(pixels[of_camera])
+        hits = meet_surface(origin, rays, screen.world_from_screen, screen.bow)
+        if screen.size_m is not None:
+            local = screen.world_from_screen.inverse().apply(hits)
+            hits[(np.abs(local[:, :2]) > np.asarray(screen.size_m) / 2).any(axis=1)] = np.nan
+        places[of_camera] = hits
+    return places
+
+
+def _fixing(triples: Sequence[tuple[int, int, int]], which: Ints, quality: Array, enough: Bools) -> dict[int, float]:
+    """Which sets of three fix a pose where they are seen, by place in the list, and how well."""
+    out = {}
+    for i in range(len(triples)):
+        mine = which == i
+        if not (mine & enough).any():
+            continue
+        value = float(np.median(quality[mine & enough]))
+        if value > FIXES:
+            out[i] = value
+    return out
+
+
+def _weights(
+    model: SpotModel,
+    triples: Sequence[tuple[int, int, int]],
+    good: dict[int, float],
+    which: Ints,
+    views: Ints,
+    views_of: Sequence[Ints],
+    shown: Array,
+    singular: Array,
+) -> Array:
+    """The volume that each of k poses stands for, times the number of sets; 0 from a set that is not good."""
+    area = np.prod(model.image_size_px, axis=-1)[views].prod(axis=1)
+    ways = np.array([np.prod([len(views_of[s]) for s in triples[i]]) for i in which], dtype=float)
+    met = sum(np.prod(shown[:, list(triples[i])], axis=1) for i in good)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        weight = area * ways / (np.prod(singular, axis=1) * met)
+    return np.where(np.isin(which, list(good)) & (met > 0), weight, 0.0)

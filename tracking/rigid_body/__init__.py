@@ -1,0 +1,1 @@
+"""The rigid tracker: one multiple-hypothesis filter of the vehicle, which carries all spots."""

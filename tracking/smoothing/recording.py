@@ -1,0 +1,123 @@
+"""A run as the smoother wants it: detections and causal labels of all frames, compact."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from geometry.arrays import Array, Bools, Ints
+from geometry.forward_model import SpotModel
+from geometry.rig import Rig
+from geometry.uncertainty.rig_parameters import RigCovariance
+from geometry.uncertainty.rig_uncertainty import CalibrationSpread
+from tracking.detections import UNMATCHED, Detections
+from tracking.parameters import TrackerParameters
+from tracking.rigid_body.association import BLENDED
+from tracking.statuses import PoseStatus, SpotStatus
+from tracking.tracked_frame import TrackedFrame
+
+
+def assigned_in_one_list(tracked: TrackedFrame, start: Ints) -> Ints:
+    """The labels (n,) of a frame as rows of all its detections in one list, plus BLENDED; -1 without.
+
+    start (n,): where the detections of each view's camera begin.
+    """
+    assigned = np.where(tracked.point == UNMATCHED, -1, tracked.point + start)
+    if tracked.witness is not None:
+        assigned += np.where((assigned >= 0) & ~tracked.witness, BLENDED, 0)
+    return assigned
+
+
+class Recording:
+    """Feed it each frame with what the causal tracker said of it; about 1 kB per frame is kept."""
+
+    def __init__(
+        self,
+        rig: Rig,
+        parameters: TrackerParameters,
+        covariance: RigCovariance | None = None,
+        exposure_s: float = 0.0,
+    ) -> None:
+        """covariance: of the rig's calibration, where it is known. exposure_s: of each picture; 0: a moment."""
+        self.rig = rig
+        self.model = SpotModel.of(rig)
+        self.parameters = parameters
+        self.calibration = None if covariance is None else CalibrationSpread(rig, self.model, covariance)
+        self.exposure_s = exposure_s
+        self._dt: list[float] = []
+        self._uv: list[Array] = []
+        self._cov: list[Array] = []
+        self._size: list[Array] = []
+        self._first: list[Ints] = []
+        self._has_image: list[Bools] = []
+        self._assigned: list[Ints] = []
+        self._bent: list[bool] = []
+        self._measured: list[bool] = []
+        self._pose: list[Array] = []
+
+    def __len__(self) -> int:
+        return len(self._dt)
+
+    def append(self, dt_s: float, found: Sequence[Detections | None], tracked: TrackedFrame) -> None:
+        """One frame; dt_s since the one before (0 for the first)."""
+        counts = [0 if f is None else len(f) for f in found]
+        first = np.zeros(len(found) + 1, dtype=np.int64)
+        np.cumsum(counts, out=first[1:])
+        some = [f for f in found if f is not None and len(f)]
+        none2, none4 = np.zeros((0, 2)), np.zeros((0, 2, 2))
+        self._dt.append(dt_s)
+        self._uv.append(np.concatenate([f.uv_px for f in some]) if some else none2)
+        self._cov.append(np.concatenate([f.cov_px2 for f in some]) if some else none4)
+        self._size.append(np.concatenate([f.major_px for f in some]) if some else np.zeros(0))
+        self._first.append(first)
+        self._has_image.append(np.array([f is not None for f in found]))
+        self._assigned.append(assigned_in_one_list(tracked, first[self.model.camera_of]))
+        self._bent.append(SpotStatus.TURNED in tracked.status)
+        self._measured.append(tracked.pose_status is PoseStatus.MEASURED)
+        pose = np.full((4, 3), np.nan)
+        if tracked.pose is not None:
+            pose[:3], pose[3] = tracked.pose.rotation, tracked.pose.translation
+        self._pose.append(pose)
+
+    @property
+    def dt_s(self) -> Array:
+        """(T,)"""
+        return np.array(self._dt)
+
+    @property
+    def poses(self) -> Array:
+        """(T, 4, 3): rotation and, below it, translation of the causal poses; nan where lost."""
+        return np.array(self._pose).reshape(-1, 4, 3)
+
+    @property
+    def measured(self) -> Bools:
+        """(T,): frames whose pose was measured."""
+        return np.array(self._measured, dtype=bool)
+
+    @property
+    def bent(self) -> Bools:
+        """(T,): frames in which the tracker saw the trajectory bend."""
+        return np.array(self._bent, dtype=bool)
+
+    @property
+    def assigned(self) -> Ints:
+        """(T, n): row in the frame's detections (all cameras in one list), plus BLENDED; -1 without."""
+        return np.array(self._assigned, dtype=np.int64).reshape(len(self), len(self.model))
+
+    def found(self, k: int) -> list[Detections | None]:
+        """Frame k's detections by camera, None without a picture, as a tracker wants them; without brightness."""
+        uv, cov, size, first, has_image = self.detections(k)
+        out: list[Detections | None] = []
+        for c, there in enumerate(has_image):
+            rows = slice(int(first[c]), int(first[c + 1]))
+            points = Detections.at(uv[rows], cov[rows])
+            out.append(replace(points, major_px=size[rows], minor_px=size[rows]) if there else None)
+        return out
+
+    def detections(self, k: int) -> tuple[Array, Array, Array, Ints, Bools]:
+        """Of frame k: pixels (m, 2), covariances (m, 2, 2), larger half axes (m,), px, nan where not known; where each
+        camera's begin (cameras + 1,), which cameras have a picture.
+        """
+        return self._uv[k], self._cov[k], self._size[k], self._first[k], self._has_image[k]

@@ -1,0 +1,130 @@
+"""What the second look at a run says of it, frame by frame."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from geometry.arrays import Array, Bools, Ints
+from geometry.compiled_projection import project_all
+from geometry.forward_model import SpotModel
+from geometry.pose import Pose
+from tracking.detections import UNMATCHED, Detections
+from tracking.parameters import TrackerParameters
+from tracking.rigid_body.association import BLENDED
+from tracking.smoothing.error_scale import width_covariance
+from tracking.statuses import PoseStatus, SpotStatus, view_statuses
+from tracking.tracked_frame import Event, MotionEstimate, TrackedFrame
+
+
+@dataclass(frozen=True, slots=True)
+class Smoothed:
+    """A run's motion and labels given all its frames: T frames, n views."""
+
+    model: SpotModel
+    parameters: TrackerParameters
+    poses: Pose  # (T,) at mid-exposure
+    exposure_px: Array  # (T, n, 2) mean place of a spot over the exposure less its place in the middle
+    velocities: Array  # (T, 6): m/s in world, rad/s in body
+    covariance: Array  # (T, 6, 6) of the poses, of noise and of errors that stay in their place
+    place_share: float  # of the spots' error variance that stays in its place (tracking/smoothing/place_errors.py)
+    systematic: Array  # (T or 1, 6, 6) and the calibration's share to be added
+    motion_covariance: Array  # (T, 6, 6) of the velocities
+    known: Bools  # (T,): the pose says something
+    measured: Bools  # (T,): the pose is observable from this frame's spots alone
+    assigned: Ints  # (T, n): row in the frame's detections (all cameras in one list), plus BLENDED; -1 without
+    probability: Array  # (T, n) of the best label, given or left open; nan without
+    first: Ints  # (T, cameras + 1): where each camera's detections begin
+    rms_px: Array  # (T,) of the frame's own fit
+    jerk: Array  # (2,) m/s^3 and rad/s^3 per sqrt(Hz), of translation and rotation
+    iterations: int  # rounds of smoothing and labelling
+    relabelled: int  # labels that differ from the causal ones
+    width_share: float  # errors beyond the claims, as a share of the spots' sigmas
+    noise_scale: float  # how much larger than claimed the spots' errors are
+    extra: Array  # (n, 2, 2) of the calibration's errors, on the expected pixels
+
+    @property
+    def frames(self) -> int:
+        """T"""
+        return len(self.known)
+
+    def frame(self, k: int, causal: TrackedFrame, found: Sequence[Detections | None]) -> TrackedFrame:
+        """Frame k as the causal tracker's, with what the whole run says of labels, pose and motion.
+
+        `predicted_px` and `gain` stay: they are about what was known before. Events of the search stay, those about
+        labels left open are replaced.
+        """
+        model = self.model
+        known = bool(self.known[k])
+        assigned = np.where(known, self.assigned[k], -1)
+        labelled = assigned >= 0
+        pose = self.poses[k]
+        systematic = self.systematic[min(k, len(self.systematic) - 1)]
+        covariance = self.covariance[k] + systematic
+        uv, J = project_all(model.numbers, pose.rotation[None], pose.translation[None])
+        uv_px, cov_px2 = uv[0], J[0] @ covariance @ np.swapaxes(J[0], -1, -2) + self.extra
+        exists: Bools = ~np.isnan(uv_px[:, 0])
+        point = np.where(labelled, assigned % BLENDED - self.first[k][model.camera_of], UNMATCHED)
+        for v in np.flatnonzero(labelled):
+            points = found[int(model.camera_of[v])]
+            assert points is not None
+            uv_px[v] = points.uv_px[point[v]] - self.exposure_px[k, v]
+            row = point[v : v + 1]
+            claimed = (points.cov_px2[row] + width_covariance(points.major_px[row], self.width_share))[0]
+            cov_px2[v] = claimed * self.noise_scale**2
+            cov_px2[v] += self.parameters.sigma_model_px**2 * np.eye(2)
+            if assigned[v] >= BLENDED:
+                cov_px2[v] += (self.parameters.blend_px / 2) ** 2 * np.eye(2)
+        turned = np.array([s is SpotStatus.TURNED for s in causal.status]) & (point == causal.point)
+        has_image = np.array([f is not None for f in found])[model.camera_of]
+        status = view_statuses(labelled, turned, exists, model.in_picture(uv_px), has_image, known)
+        nowhere = [s in (SpotStatus.LOST, SpotStatus.OFF_SCREEN) for s in status]
+        uv_px[nowhere], cov_px2[nowhere] = np.nan, np.nan
+        measured = bool(self.measured[k])
+        if not known:
+            pose_status = PoseStatus.LOST
+        else:
+            pose_status = PoseStatus.MEASURED if measured else PoseStatus.PREDICTED
+        return replace(
+            causal,
+            uv_px=uv_px,
+            cov_px2=cov_px2,
+            status=status,
+            point=point,
+            pose_status=pose_status,
+            pose=pose if known else None,
+            pose_covariance=covariance if known else None,
+            spots_used=int(np.count_nonzero(labelled & (assigned < BLENDED))) if measured else 0,
+            rms_px=float(self.rms_px[k]) if measured else float("nan"),
+            events=self._events(k, causal, point, known),
+            label_probability=self._label_probability(k, causal, known),
+            witness=labelled & (assigned < BLENDED),
+            motion=MotionEstimate(self.velocities[k, :3], self.velocities[k, 3:], self.motion_covariance[k])
+            if known
+            else None,
+            pose_systematic=systematic if known else None,
+        )
+
+    def _label_probability(self, k: int, causal: TrackedFrame, known: bool) -> Array | None:
+        """(n,) that each label is right; nan without a label. The labels of `method: spots` stay as that tracker gave
+        them, and so does what it says of them (None: it estimates no probability).
+        """
+        if self.parameters.method != "rigid":
+            return causal.label_probability
+        return self.probability[k] if known else np.full(len(self.model), np.nan)
+
+    def _events(self, k: int, causal: TrackedFrame, point: Ints, known: bool) -> tuple[Event, ...]:
+        events = [e for e in causal.events if e.kind != "undecided"]
+        if known and self.parameters.method == "rigid":
+            p = self.probability[k]
+            events += [
+                Event("undecided", f"label left open: its probability is {p[v]:.2f}", int(v))
+                for v in np.flatnonzero((p < self.parameters.min_label_probability) & (point == UNMATCHED))
+            ]
+            events += [
+                Event("changed", "the frames after it show that it was another point of light", int(v))
+                for v in np.flatnonzero((point != causal.point) & (causal.point != UNMATCHED))
+            ]
+        return tuple(events)
