@@ -38,7 +38,7 @@ $(READY): requirements.lock pyproject.toml
 	$(BIN)/python -m pip install --quiet --require-virtualenv --requirement requirements.lock
 	$(BIN)/python -m pip install --quiet --require-virtualenv --no-deps --no-build-isolation --editable .
 	@echo "Compiling for this machine, once (about a minute)."
-	$(BIN)/python -m lab.warm_up
+	$(BIN)/python -m lab.runs.warm_up
 	@touch $(READY)
 
 # The batch's exit status is the demo's, but the paths are shown in any case.

@@ -20,10 +20,11 @@ from geometry.arrays import Array
 from geometry.camera import Camera
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
+from geometry.pose_prior import PosePrior
 from geometry.rig import Beam, Rig, Screen, Spot
 from lab.simulate.rigs import DISTORTION, RIGS, look_at
 from tracking.detections import Detections
-from tracking.labelling.first_labels import NO_POINT, LabelResult, PosePrior, find_labels
+from tracking.labelling.first_labels import NO_POINT, LabelResult, find_labels
 
 PRIOR = PosePrior(Pose.identity(), 1.0, float(np.deg2rad(30.0)))
 GOAL = ">= 0.97; <= 0.01; <= 3 s"

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.linalg import cholesky, solve_triangular
 
 from geometry.arrays import Array, skew
-from geometry.chi_square import chi2_limit, chi2_tail
+from geometry.uncertainty.chi_square import chi2_limit, chi2_tail
 
 TURNED, MOVED, ZOOMED = "turned", "moved and turned", "focus changed"
 TURNED_ZOOMED, ALL_CHANGED = "turned and focus changed", "moved, turned and focus changed"

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.arrays import Array, Bools
-from geometry.compiled.jit import compiled
+from geometry.compilation.jit import compiled
 
 # A SpotModel's numbers as the compiled functions want them, one record per view; meanings and units as there. In one
 # array, since numba unpacks a tuple of arrays at every call: with thirteen a frame took 0.39 ms, in place of 0.32.

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from geometry.arrays import Array, Bools, Ints
-from geometry.chi_square import chi2_limit
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
+from geometry.uncertainty.chi_square import chi2_limit
 
 P_CONTRADICTION = 1e-6  # of one frame, where all is right: of 100,000 frames, 0.1 are accused wrongly, or fewer
 _LEAST_EIGENVALUE = 1e-14  # of a covariance scaled to unit diagonal: below lies the rounding of the scaling itself

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from geometry.arrays import Array, Bools, Ints
-from geometry.compiled.jit import compiled
+from geometry.compilation.jit import compiled
 from tracking.detections import UNMATCHED, Detections
 from tracking.tracked_frame import TrackedFrame
 

@@ -11,9 +11,9 @@ import numpy as np
 from bench.peers.rows import Tracked
 from bench.peers.scenes import CAMERA_OF, FRAME_S, NOISE_PX, Scene, rig
 from geometry.pose import Pose
+from geometry.pose_prior import PosePrior
 from tracking.curve_switching.spot_tracker import SpotTracker
 from tracking.detections import UNMATCHED, Detections
-from tracking.labelling.first_labels import PosePrior
 from tracking.parameters import TrackerParameters
 from tracking.rigid_body.rigid_tracker import RigidTracker
 from tracking.smoothing.recording import Recording

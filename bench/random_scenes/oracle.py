@@ -9,9 +9,10 @@ import numpy as np
 from bench.random_scenes.scene import CLUTTER, SHINING, Scene
 from geometry.arrays import Array, Bools
 from geometry.forward_model import SpotModel
+from geometry.pose_prior import PosePrior
 from geometry.pose_solver.gauss_newton import SolveLimits, fit_pose, good_enough
 from tracking.detections import Detections
-from tracking.labelling.first_labels import PosePrior, find_labels
+from tracking.labelling.first_labels import find_labels
 
 FIRST_FRAMES = 3  # each of these must give a pose ...
 LEAST_SPOTS = 4  # ... from so many spots at least

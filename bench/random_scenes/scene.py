@@ -21,10 +21,10 @@ from bench.random_scenes.vehicles import LEAST_SPOTS
 from geometry import rotations
 from geometry.arrays import Array, Bools, Ints
 from geometry.pose import Pose
+from geometry.pose_prior import PosePrior
 from geometry.rig import Rig
 from geometry.uncertainty.rig_parameters import RigCovariance
 from tracking.detections import Detections
-from tracking.labelling.first_labels import PosePrior
 
 # Independent streams of random numbers: a change of one kind of draw leaves the others as they were.
 LAB, MOTION, NUISANCE, POINTS, PRIOR = range(5)

@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from geometry.arrays import Array, Ints, symmetric
-from geometry.chi_square import chi2_limit
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
+from geometry.uncertainty.chi_square import chi2_limit
 from geometry.uncertainty.rig_uncertainty import CalibrationSpread
 
 # Relative size under which a singular value of the whitened, scaled Jacobian is zero. Exact degeneracies (three spots

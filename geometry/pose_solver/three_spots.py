@@ -21,7 +21,7 @@ from __future__ import annotations
 import numpy as np
 
 from geometry.arrays import Array
-from geometry.compiled.jit import compiled
+from geometry.compilation.jit import compiled
 from geometry.pose import Pose
 
 MOST_POSES = 8

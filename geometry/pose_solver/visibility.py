@@ -12,9 +12,9 @@ from geometry import rotations
 from geometry.arrays import Array, Bools, normalised
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
+from geometry.pose_prior import PosePrior
 from geometry.pose_solver.gauss_newton import SolveLimits, covariance_of
 from geometry.rig import Rig
-from tracking.labelling.first_labels import PosePrior
 
 POSES = 2000  # a share of 50 % is then known to 1 %
 SEED = 0

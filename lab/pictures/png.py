@@ -15,7 +15,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from geometry.compiled.jit import compiled_for_threads
+from geometry.compilation.jit import compiled_for_threads
 from lab.pictures.inflate import crc32, inflated
 from lab.pictures.picture_headers import PNG_MARK, DamagedError
 

@@ -11,7 +11,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from geometry.compiled.jit import compiled_for_threads
+from geometry.compilation.jit import compiled_for_threads
 
 Bytes: TypeAlias = NDArray[np.uint8]
 

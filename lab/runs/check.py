@@ -12,6 +12,7 @@ import numpy as np
 from geometry import rotations
 from geometry.arrays import Ints
 from geometry.forward_model import SpotModel
+from geometry.pose_prior import PosePrior
 from geometry.pose_solver import visibility
 from geometry.pose_solver.gauss_newton import SolveLimits
 from geometry.pose_solver.symmetry import symmetries
@@ -27,7 +28,6 @@ from lab.files.text.yaml_text import FileError
 from lab.pictures.picture_file import DROPPED, UNREADABLE, Missing
 from lab.runs.frames.frames import FrameReader, open_frames
 from tracking.detections import Detections
-from tracking.labelling.first_labels import PosePrior
 
 Progress = Callable[[int, int | None], None]  # frames done, of how many
 AGREES_PX = 0.01  # px: truth written with two decimals lies this near to what the rig makes of the true pose

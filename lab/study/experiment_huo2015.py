@@ -8,13 +8,14 @@ import numpy as np
 
 from geometry.arrays import Array, Bools
 from geometry.pose import Pose
+from geometry.pose_prior import PosePrior
 from geometry.pose_solver.gauss_newton import fit_pose
 from lab.simulate.points import PointRun, simulate_points
 from tracking.curve_switching import kalman
 from tracking.curve_switching.out_of_view import CoplanarViews, quadratic_positions
 from tracking.curve_switching.spot_tracker import SpotTracker
 from tracking.curve_switching.tracks import BENT_NIS
-from tracking.labelling.first_labels import NO_POINT, PosePrior
+from tracking.labelling.first_labels import NO_POINT
 from tracking.parameters import TrackerParameters
 from tracking.statuses import SpotStatus
 from tracking.tracked_frame import TrackedFrame

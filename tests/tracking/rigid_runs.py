@@ -9,13 +9,13 @@ import numpy as np
 from geometry.arrays import Array, Bools, Ints
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
+from geometry.pose_prior import PosePrior
 from geometry.rig import Rig
 from geometry.uncertainty.rig_parameters import RigCovariance
 from lab.simulate.points import CLUTTER, PointRun
 from lab.simulate.scenarios import Prior
 from lab.simulate.scene import HIDDEN, OUTSIDE, SHINING
 from tracking.detections import UNMATCHED, Detections
-from tracking.labelling.first_labels import PosePrior
 from tracking.parameters import TrackerParameters
 from tracking.rigid_body.rigid_tracker import RigidTracker
 from tracking.smoothing.recording import Recording

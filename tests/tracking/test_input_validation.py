@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 
 from geometry.arrays import Array, Ints
 from geometry.pose import Pose
+from geometry.pose_prior import PosePrior
 from lab.simulate.points import CLUTTER, PointRun, simulate_points
 from tracking.detections import UNMATCHED, Detections
 from tracking.input_validation import TWIN_PX, usable_rows
-from tracking.labelling.first_labels import PosePrior
 from tracking.parameters import TrackerParameters
 from tracking.rigid_body.rigid_tracker import RigidTracker
 from tracking.statuses import PoseStatus

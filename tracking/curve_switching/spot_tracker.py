@@ -15,6 +15,7 @@ import numpy as np
 from geometry.arrays import Array, Bools, Ints
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
+from geometry.pose_prior import PosePrior
 from geometry.pose_solver.gauss_newton import (
     PoseFit,
     SolveLimits,
@@ -31,7 +32,7 @@ from tracking.curve_switching.out_of_view import CoplanarViews, quadratic_positi
 from tracking.curve_switching.tracks import Tracks
 from tracking.curve_switching.vehicle import Vehicle
 from tracking.detections import UNMATCHED, Detections
-from tracking.labelling.first_labels import NO_POINT, PosePrior, find_labels
+from tracking.labelling.first_labels import NO_POINT, find_labels
 from tracking.parameters import TrackerParameters
 from tracking.statuses import SpotStatus
 from tracking.tracked_frame import Event, TrackedFrame

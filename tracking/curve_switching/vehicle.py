@@ -10,10 +10,10 @@ import numpy as np
 from geometry.arrays import Array, Bools, Ints
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
+from geometry.pose_prior import PosePrior
 from geometry.pose_solver.gauss_newton import PoseFit, point_covariance
 from tracking.curve_switching import pose_filter
 from tracking.curve_switching.pose_filter import Motion
-from tracking.labelling.first_labels import PosePrior
 from tracking.parameters import TrackerParameters
 from tracking.statuses import LOST_SIGMA_M, LOST_SIGMA_RAD, PoseStatus
 

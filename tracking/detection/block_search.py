@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.arrays import Ints
-from geometry.compiled.jit import compiled, compiled_for_threads
+from geometry.compilation.jit import compiled, compiled_for_threads
 
 BLOCK = 8  # px
 AROUND = 2  # blocks on each side whose median is the background

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from geometry.arrays import Array, Ints
-from geometry.compiled.jit import compiled
+from geometry.compilation.jit import compiled
 from tracking.detection.block_search import BLOCK, GROUND, HIGHEST8, Blocks
 from tracking.detection.pixels import Pixels, clamped, mean3, mirrored, pixel
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from math import atan2, degrees, hypot, sqrt
 
-from geometry.compiled.jit import compiled
+from geometry.compilation.jit import compiled
 
 Entries = tuple[float, float, float]
 

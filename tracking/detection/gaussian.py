@@ -5,7 +5,7 @@ from __future__ import annotations
 from math import exp
 
 from geometry.arrays import Array
-from geometry.compiled.jit import compiled
+from geometry.compilation.jit import compiled
 
 
 @compiled

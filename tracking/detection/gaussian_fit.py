@@ -7,7 +7,7 @@ from math import ceil, sqrt
 import numpy as np
 
 from geometry.arrays import Array
-from geometry.compiled.jit import compiled
+from geometry.compilation.jit import compiled
 from tracking.detection import ellipse
 from tracking.detection.candidates import Noise
 from tracking.detection.normal_equations import Frame, accumulate, add_light, frame_of, solve_normal

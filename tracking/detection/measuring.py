@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from geometry.arrays import Array, Ints
-from geometry.compiled.jit import compiled, compiled_for_threads
+from geometry.compilation.jit import compiled, compiled_for_threads
 from tracking.detection import candidates, ellipse
 from tracking.detection.candidates import Noise, texture_variance
 from tracking.detection.gaussian_fit import fit_all

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from geometry.arrays import Array
-from geometry.compiled.jit import compiled
+from geometry.compilation.jit import compiled
 from tracking.detection import ellipse
 from tracking.detection.candidates import sort
 from tracking.detection.gaussian import gaussian_row

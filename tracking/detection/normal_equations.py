@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from geometry.arrays import Array
-from geometry.compiled.jit import compiled
+from geometry.compilation.jit import compiled
 from tracking.detection import ellipse
 from tracking.detection.candidates import Noise
 from tracking.detection.gaussian import gaussian_row

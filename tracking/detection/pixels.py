@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.arrays import Array
-from geometry.compiled.jit import compiled
+from geometry.compilation.jit import compiled
 
 OUTSIDE, CLIPPED, VALID = 0.0, 1.0, 2.0
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from math import sqrt
 
 from geometry.arrays import Array
-from geometry.compiled.jit import compiled
+from geometry.compilation.jit import compiled
 from tracking.detection import ellipse
 from tracking.detection.normal_equations import Frame
 from tracking.detection.pixels import OUTSIDE, Window

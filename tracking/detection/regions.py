@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.arrays import Array, Ints
-from geometry.compiled.jit import compiled
+from geometry.compilation.jit import compiled
 from tracking.detection.block_search import BLOCK
 from tracking.detection.candidates import AT_U, AT_V, RADIUS
 

@@ -7,7 +7,7 @@ from math import cos, pi, sin, sqrt
 import numpy as np
 
 from geometry.arrays import Array
-from geometry.compiled.jit import compiled
+from geometry.compilation.jit import compiled
 from tracking.detection import ellipse
 from tracking.detection.candidates import Noise, sort, variance
 from tracking.detection.pixels import Pixels, pixel

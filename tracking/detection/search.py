@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.arrays import Array, Ints
-from geometry.compiled.jit import compiled_for_threads
+from geometry.compilation.jit import compiled_for_threads
 from tracking.detection.block_search import (
     AROUND,
     SUMS,

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from geometry.arrays import Array, Bools, Ints
-from geometry.compiled.jit import compiled
+from geometry.compilation.jit import compiled
 from geometry.compiled_projection import Views, inside, project_view
 from geometry.pose_solver.three_spots import pose_of_lengths, spot_lengths
 from tracking.labelling.points import Points, PointsOnScreens

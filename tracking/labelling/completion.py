@@ -11,9 +11,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from geometry import compiled_linalg
 from geometry.arrays import Array, Ints
-from geometry.compiled import compiled_linalg
-from geometry.compiled.jit import compiled
+from geometry.compilation.jit import compiled
 from geometry.compiled_projection import Views, inside, project_view
 from tracking.labelling.candidates import (
     GATE,

@@ -12,9 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from geometry import compiled_linalg
 from geometry.arrays import Array, Bools, Ints
-from geometry.compiled import compiled_linalg
-from geometry.compiled.jit import compiled
+from geometry.compilation.jit import compiled
 from geometry.compiled_projection import Views
 from tracking.rigid_body.association import BLENDED, Chances, Frame, Sights, associate, crowding, expected_at
 from tracking.rigid_body.information import frame_information, size_of, widen_by_curvature

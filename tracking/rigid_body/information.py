@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from geometry import compiled_linalg
 from geometry.arrays import Array, Bools
-from geometry.compiled import compiled_linalg
-from geometry.compiled.jit import compiled
+from geometry.compilation.jit import compiled
 from geometry.compiled_projection import Views, project_view
 
 _apply = compiled_linalg.apply

@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from geometry import compiled_linalg
 from geometry.arrays import Array
-from geometry.compiled import compiled_linalg
-from geometry.compiled.jit import compiled
+from geometry.compilation.jit import compiled
 
 POSE, VELOCITY, ACCELERATION = slice(0, 6), slice(6, 12), slice(12, 18)
 STATE = 18

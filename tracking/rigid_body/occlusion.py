@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from geometry.arrays import Array, Ints
-from geometry.compiled.jit import compiled
+from geometry.compilation.jit import compiled
 
 HIDES, SHOWS = 0.01, 0.15  # per frame: a shown spot becomes hidden, a hidden one shows: hidings last some frames
 DARKENS, LIGHTS = 0.005, 0.15  # the same of a whole screen

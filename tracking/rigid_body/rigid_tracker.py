@@ -17,6 +17,7 @@ from geometry.arrays import Array, Ints
 from geometry.compiled_projection import project_all
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
+from geometry.pose_prior import PosePrior
 from geometry.pose_solver.alternative_poses import alternatives
 from geometry.pose_solver.gauss_newton import SolveLimits, fit_pose
 from geometry.rig import Rig
@@ -24,7 +25,7 @@ from geometry.uncertainty.rig_parameters import RigCovariance
 from geometry.uncertainty.rig_uncertainty import CalibrationSpread
 from tracking.detections import UNMATCHED, Detections
 from tracking.input_validation import UsablePoints, check_step
-from tracking.labelling.first_labels import NO_POINT, Labelling, PosePrior, candidate_labellings, find_labels
+from tracking.labelling.first_labels import NO_POINT, Labelling, candidate_labellings, find_labels
 from tracking.parameters import TrackerParameters
 from tracking.rigid_body.adaptive_process_noise import Temper
 from tracking.rigid_body.association import BLENDED, Chances, Frame, Sights, crowding, distinct_spots, log_chance

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from geometry.arrays import Array, Bools, Ints
-from geometry.compiled.jit import compiled
+from geometry.compilation.jit import compiled
 
 MOST_PLACES = 64  # per camera
 SIGMAS, LEAST_RADIUS_PX = 5.0, 0.4  # of a place: so many sigmas of a point, and at least this

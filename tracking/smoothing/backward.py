@@ -11,7 +11,7 @@ import numpy as np
 
 from geometry.arrays import Array, Bools, Ints
 from geometry.pose import Pose
-from tracking.labelling.first_labels import PosePrior
+from geometry.pose_prior import PosePrior
 from tracking.rigid_body.association import distinct_spots
 from tracking.rigid_body.hypotheses import FEW
 from tracking.rigid_body.motion import STATE

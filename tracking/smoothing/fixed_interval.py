@@ -2,7 +2,7 @@
 
 Deviations (18) from a reference motion are filtered forward; an information filter runs backward; each frame's result
 combines the two (the two-filter smoother). Every covariance is a product of triangular factors
-(geometry/compiled/compiled_linalg.py: posterior), so it is positive definite whatever the rounding. A new reference and
+(geometry/compiled_linalg.py: posterior), so it is positive definite whatever the rounding. A new reference and
 again is Gauss-Newton on the whole run at the cost of a filter. Sources: Fraser & Potter (1969), "The optimum linear
 smoother as a combination of two optimum linear filters"; the iteration: Bell (1994), "The iterated Kalman smoother as a
 Gauss-Newton method"; on a manifold, and with measurements as information: ours.
@@ -14,9 +14,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from geometry import compiled_linalg
 from geometry.arrays import Array
-from geometry.compiled import compiled_linalg
-from geometry.compiled.jit import compiled
+from geometry.compilation.jit import compiled
 from tracking.rigid_body.motion import STATE, predicted, process_noise, propagated, transition
 
 CHUNK = 512  # frames whose covariances are in memory at once; the filter is run twice instead

@@ -9,9 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from geometry import compiled_linalg
 from geometry.arrays import Array, Bools, Ints
-from geometry.compiled import compiled_linalg
-from geometry.compiled.jit import compiled
+from geometry.compilation.jit import compiled
 from geometry.compiled_projection import Views, inside, project_view
 from tracking.rigid_body.association import BLENDED, Chances, Frame, Sights, associate, expected_at, log_chance
 from tracking.rigid_body.hypotheses import chosen_points, concluded

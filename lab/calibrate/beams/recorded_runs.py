@@ -12,6 +12,7 @@ from scipy.optimize import linear_sum_assignment
 from geometry.arrays import Array
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
+from geometry.pose_prior import PosePrior
 from geometry.rig import Rig
 from lab.calibrate.beams.stationary_frames import SpotRows
 from lab.errors import InputError
@@ -19,7 +20,6 @@ from lab.files.project.point_files import StandPoses
 from lab.files.run.run_file import Run, load_run
 from lab.runs.frames.pipeline import FrameRecord, Pipeline
 from tracking.detections import Detections
-from tracking.labelling.first_labels import PosePrior
 from tracking.statuses import SpotStatus
 
 # How far a beam may be from its drawing for its spots to be found: at 2.5 m from the vehicle together 64 mm on the

@@ -13,6 +13,7 @@ import numpy as np
 import pydantic
 
 from geometry.pose import Pose
+from geometry.pose_prior import PosePrior
 from geometry.rig import Rig
 from geometry.uncertainty.rig_parameters import RigCovariance
 from lab.errors import InputError
@@ -35,7 +36,6 @@ from lab.files.text.fields import (
 )
 from lab.files.text.yaml_text import FileError, did_you_mean, read_mapping, write_mapping
 from lab.pictures.picture_file import SUFFIXES
-from tracking.labelling.first_labels import PosePrior
 from tracking.parameters import TrackerParameters
 
 SCHEMA = "beampose/run/1"

@@ -10,13 +10,13 @@ from typing import Protocol
 import numpy as np
 
 from geometry.light_centroid import CentreOffsets
+from geometry.pose_prior import PosePrior
 from lab.files.run.run_file import Run
 from lab.pictures.picture_file import Grey, Missing
 from lab.runs.frames.frames import FrameSet, open_frames
 from lab.runs.frames.sensor_noise import CameraNoise, camera_noises
 from tracking.curve_switching.spot_tracker import SpotTracker
 from tracking.detections import Detections
-from tracking.labelling.first_labels import PosePrior
 from tracking.noise import NoiseModel
 from tracking.rigid_body.rigid_tracker import RigidTracker
 from tracking.tracked_frame import TrackedFrame

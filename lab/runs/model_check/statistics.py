@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from geometry.arrays import Array, Ints
-from geometry.chi_square import gamma_quantile
 from geometry.forward_model import SpotModel
+from geometry.uncertainty.chi_square import gamma_quantile
 from lab.runs.model_check.linear import Linearised
 from lab.runs.model_check.recording import Recording, finite, whitening
 

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from geometry.arrays import Array, Bools, Ints
-from geometry.chi_square import gamma_quantile
 from geometry.pose import Pose
+from geometry.uncertainty.chi_square import gamma_quantile
 from lab.files.run.results import (
     ABSENT,
     POSE_STATUSES,

@@ -11,6 +11,7 @@ import pytest
 from geometry import rotations
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
+from geometry.pose_prior import PosePrior
 from geometry.pose_solver import visibility
 from geometry.pose_solver.gauss_newton import SolveLimits
 from lab.files.rig.rig_file import load_rig
@@ -18,7 +19,6 @@ from lab.files.text.yaml_text import FileError
 from lab.runs.check import check
 from tests.lab.files.test_truth import write_truth
 from tests.lab.run_folders import edit, picture_of, write_run
-from tracking.labelling.first_labels import PosePrior
 
 
 @pytest.fixture

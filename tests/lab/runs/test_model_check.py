@@ -11,6 +11,7 @@ import pytest
 
 from calibration.findings import Level
 from geometry.forward_model import SpotModel
+from geometry.pose_prior import PosePrior
 from geometry.pose_solver.gauss_newton import fit_pose
 from geometry.uncertainty.rig_parameters import RigCovariance
 from lab.number_format import plus_minus, short
@@ -28,7 +29,6 @@ from lab.simulate.points import simulate_points
 from tests.lab.runs.model_scenes import NOISE_PX, SCENES, changed, one_camera, recorded, turned
 from tracking.curve_switching.spot_tracker import SpotTracker
 from tracking.detections import Detections
-from tracking.labelling.first_labels import PosePrior
 from tracking.parameters import TrackerParameters
 from tracking.statuses import PoseStatus, SpotStatus
 from tracking.tracked_frame import TrackedFrame

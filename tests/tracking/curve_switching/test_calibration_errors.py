@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from geometry.pose import Pose
+from geometry.pose_prior import PosePrior
 from geometry.rig import Rig
 from geometry.uncertainty.rig_parameters import RigCovariance, moved, rig_names, split
 from lab.simulate.points import PointRun, simulate_points
 from tests.tracking.rigid_runs import Pooled, judged, looked_at_again, tracked
 from tracking.curve_switching.spot_tracker import SpotTracker
-from tracking.labelling.first_labels import PosePrior
 from tracking.parameters import TrackerParameters
 from tracking.statuses import PoseStatus
 from tracking.tracked_frame import TrackedFrame

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from geometry.pose import Pose
+from geometry.pose_prior import PosePrior
 from lab.simulate.points import PointRun, simulate_points
 from lab.simulate.rigs import RIGS
 from lab.simulate.scenarios import SCENARIOS, Clutter, Hiding
 from tracking.curve_switching.out_of_view import CoplanarViews, quadratic_positions
 from tracking.curve_switching.spot_tracker import SpotTracker
 from tracking.detections import UNMATCHED, Detections
-from tracking.labelling.first_labels import PosePrior
 from tracking.parameters import TrackerParameters
 from tracking.statuses import PoseStatus, SpotStatus
 from tracking.tracked_frame import TrackedFrame

@@ -10,10 +10,11 @@ from scipy.spatial.transform import Rotation
 
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
+from geometry.pose_prior import PosePrior
 from geometry.rig import Beam, Rig
 from lab.simulate.rigs import RIGS
 from tracking.detections import Detections
-from tracking.labelling.first_labels import NO_POINT, LabelResult, PosePrior, find_labels
+from tracking.labelling.first_labels import NO_POINT, LabelResult, find_labels
 from tracking.parameters import LabelParameters
 
 NOISE_PX = 0.1

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from geometry.arrays import Array, numeric_jacobian
 from geometry.pose import Pose
+from geometry.pose_prior import PosePrior
 from geometry.rig import Rig
 from lab.simulate.points import PointRun, hidden, simulate_points
 from tests.tracking.rigid_runs import (
@@ -30,7 +31,6 @@ from tests.tracking.rigid_runs import (
     without_pictures,
 )
 from tracking.detections import UNMATCHED, Detections
-from tracking.labelling.first_labels import PosePrior
 from tracking.parameters import TrackerParameters
 from tracking.rigid_body.rigid_tracker import RigidTracker
 from tracking.statuses import PoseStatus, SpotStatus

@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from geometry import rotations
-from geometry.compiled import compiled_linalg
+from geometry import compiled_linalg, rotations
 from geometry.pose import Pose
 
 seeds = st.integers(0, 2**32 - 1)

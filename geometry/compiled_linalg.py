@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from geometry.arrays import Array, Ints
-from geometry.compiled.jit import compiled
+from geometry.compilation.jit import compiled
 
 
 @compiled

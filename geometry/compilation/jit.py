@@ -15,7 +15,7 @@ import numba
 from numba.core import event
 from numba.core.types import unliteral
 
-from geometry.compiled.compile_cache import cache_folder, is_empty
+from geometry.compilation.compile_cache import cache_folder, is_empty
 
 Function = TypeVar("Function", bound=Callable)
 

@@ -1,4 +1,4 @@
-"""Compile what runs need, so that the first run does not wait: `python -m lab.warm_up`, the end of `make setup`.
+"""Compile what runs need, so that the first run does not wait: `python -m lab.runs.warm_up`, the end of `make setup`.
 
 Two short simulated recordings are processed in a temporary folder, one of points and one of small pictures. What is
 compiled already is only loaded.

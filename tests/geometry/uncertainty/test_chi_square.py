@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.special import chdtrc, chdtri, gammaincinv
 
-from geometry.chi_square import chi2_limit, chi2_tail, gamma_quantile
+from geometry.uncertainty.chi_square import chi2_limit, chi2_tail, gamma_quantile
 
 
 @pytest.mark.parametrize("dof", [1, 2, 3, 6, 12, 47, 1000])

@@ -14,18 +14,18 @@ from typing import Any
 import pytest
 
 from geometry import compiled_projection as forward
-from geometry.compiled import compile_cache, jit
+from geometry.compilation import compile_cache, jit
 
 # A program of two floors. What the upper one compiles stands on the lower one's source.
 INNER = """
-from geometry.compiled.jit import compiled
+from geometry.compilation.jit import compiled
 
 @compiled
 def grown(x, by):
     return x + 10 * by
 """
 OUTER = """
-from geometry.compiled.jit import compiled
+from geometry.compilation.jit import compiled
 from geometry.inner import grown
 
 @compiled
@@ -45,7 +45,7 @@ logging.getLogger("beampose").setLevel(logging.INFO)
 logging.getLogger("beampose").addHandler(type("Keep", (logging.Handler,), {"emit": lambda _, r: lines.append(r)})())
 from pathlib import Path
 from numba.core import event
-from geometry.compiled import compile_cache as compiled
+from geometry.compilation import compile_cache as compiled
 from floor import outer
 with event.install_listener("numba:compile", type("Count", (event.Listener,), {
     "on_start": lambda _, e: begun.append(e.data["dispatcher"].py_func.__name__), "on_end": lambda _, e: None
@@ -64,11 +64,11 @@ print(json.dumps({
 def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The two floors in a folder, as yet never run."""
     folder = tmp_path_factory.mktemp("program")
-    for floor in ("geometry", "geometry/compiled", "floor"):
+    for floor in ("geometry", "geometry/compilation", "floor"):
         (folder / floor).mkdir()
         (folder / floor / "__init__.py").write_text("")
     for module in (jit, compile_cache):
-        shutil.copy(str(module.__file__), folder / "geometry" / "compiled")
+        shutil.copy(str(module.__file__), folder / "geometry" / "compilation")
     (folder / "geometry" / "inner.py").write_text(INNER)
     (folder / "floor" / "outer.py").write_text(OUTER)
     return folder
@@ -128,7 +128,7 @@ def test_the_next_process_compiles_nothing_and_code_of_an_edited_source_is_never
 
 def test_without_any_folder_to_write_it_works_and_says_that_it_compiles_each_time(program, tmp_path):
     shutil.copytree(program, tmp_path / "program", ignore=shutil.ignore_patterns("__pycache__"))
-    (tmp_path / "program" / "geometry" / "compiled" / "__pycache__").write_text(
+    (tmp_path / "program" / "geometry" / "compilation" / "__pycache__").write_text(
         "a file where a folder should be: not even root can"
     )
     alone = found(started(tmp_path / "program", "nowhere", XDG_CACHE_HOME="/dev/null/nowhere"))
