@@ -389,7 +389,7 @@ def calibrate() -> None:
     """Calibrate cameras, screens and beams, and check that they still hold.
 
     Each step writes its numbers with their covariance, and a report that ends in PASS, WARN or FAIL with the reason and
-    the cure. Exit status: 0 for PASS and WARN, 3 for FAIL.
+    the remedy. Exit status: 0 for PASS and WARN, 3 for FAIL.
 
     \b
     Example:
@@ -538,9 +538,9 @@ def daily(
     Example:
         beampose calibrate check results/rig/rig.yaml --points points.csv --survey survey.csv --out results/today
     """
-    from lab.calibrate.drift_check.drift_check import daily_check
+    from lab.calibrate.drift_check.drift_check import check_drift
 
-    _concluded(daily_check(rig, out, points, run_folder, survey=survey, pose=pose, history=history))
+    _concluded(check_drift(rig, out, points, run_folder, survey=survey, pose=pose, history=history))
 
 
 @calibrate.command()

@@ -18,10 +18,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import block_diag
 
-from calibration.beams.beams import Stand
+from calibration.beams.beams import StandModel
 from calibration.rig.joint import Joint
 from calibration.rig.rig_steps import RigSteps, calibrate_in_steps
-from calibration.screens.network import Dots, Network, Sightings
+from calibration.screens.network import Dots, Network, PointObservations
 from calibration.screens.screens import ScreenSetup, calibrate
 from calibration.terms.rig_blocks import prior_of, stacks_of
 from geometry.arrays import Array, normalised
@@ -50,7 +50,7 @@ class Trial:
     seconds: float
 
 
-def as_measured(c: Campaign) -> tuple[Network, list[ScreenSetup], Stand]:
+def as_measured(c: Campaign) -> tuple[Network, list[ScreenSetup], StandModel]:
     """What a campaign hands to a calibration, as arrays: without the way over files."""
     rig = replace(
         c.nominal,
@@ -64,12 +64,12 @@ def as_measured(c: Campaign) -> tuple[Network, list[ScreenSetup], Stand]:
     network = Network(
         rig,
         Dots(c.dot_names, c.dots_surveyed, survey, c.dot_screen),
-        Sightings(c.seen_camera, c.seen_dot, c.seen_pixels, np.full(len(c.seen_dot), c.quality.dot_px)),
+        PointObservations(c.seen_camera, c.seen_dot, c.seen_pixels, np.full(len(c.seen_dot), c.quality.dot_px)),
         lens_priors=() if prior is None else (prior,),
         lens_free=free["intrinsics"],
     )
     known = c.quality.place_known
-    stand = Stand(
+    stand = StandModel(
         c.stand_recorded, c.record_sigmas, c.stand_surveyed if known else None, c.place_covariance if known else None
     )
     return network, [ScreenSetup() for _ in rig.screens], stand

@@ -18,7 +18,7 @@ from geometry.arrays import Array, Bools
 from lab.simulate.points import PointRun, hidden, simulate_points
 from tracking.detections import UNMATCHED
 from tracking.parameters import TrackerParameters
-from tracking.smoothing.recording import Recording
+from tracking.smoothing.recording import TrackedRecording
 from tracking.smoothing.smoother import smooth
 from tracking.tracked_frame import TrackedFrame
 
@@ -88,7 +88,7 @@ def _delays(run: PointRun, out: list[TrackedFrame], shining: Bools) -> Iterator[
 def second_look(run: PointRun, out: list[TrackedFrame]) -> tuple[list[TrackedFrame], float]:
     """The smoother's answers, and its process time per frame, ms."""
     start = time.process_time()
-    recording = Recording(run.rig, RIGID)
+    recording = TrackedRecording(run.rig, RIGID)
     for k, frame in enumerate(out):
         recording.append(float(run.t_s[k] - run.t_s[k - 1]) if k else 0.0, found_in(run, k), frame)
     smoothed = smooth(recording)

@@ -39,16 +39,16 @@ class UsualSizes:
 
 
 @dataclass(frozen=True, slots=True)
-class Candidate:
+class ChangeCandidate:
     """What a possible change does to the pixels."""
 
     columns: Array  # (m, k), px per unit
     size: Array  # (k,), the change's unit: how large it usually is
 
-    def beside(self, other: Candidate) -> Candidate:
+    def beside(self, other: ChangeCandidate) -> ChangeCandidate:
         """Both at once."""
         both = np.concatenate([self.columns, other.columns], axis=1)
-        return Candidate(both, np.concatenate([self.size, other.size]))
+        return ChangeCandidate(both, np.concatenate([self.size, other.size]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,11 +64,11 @@ class CameraColumns:
         """(m, 4): turn and zoom, a similarity of the picture: what the drift is tested by."""
         return np.concatenate([self.turn, self.zoom], axis=1)
 
-    def kinds(self, sizes: UsualSizes) -> dict[str, Candidate]:
+    def kinds(self, sizes: UsualSizes) -> dict[str, ChangeCandidate]:
         """The explanations that a camera can give."""
-        turn = Candidate(self.turn, np.full(3, sizes.turn_rad))
-        move = Candidate(self.move, np.full(3, sizes.move_m))
-        zoom = Candidate(self.zoom, np.full(1, sizes.zoom))
+        turn = ChangeCandidate(self.turn, np.full(3, sizes.turn_rad))
+        move = ChangeCandidate(self.move, np.full(3, sizes.move_m))
+        zoom = ChangeCandidate(self.zoom, np.full(1, sizes.zoom))
         return {
             TURNED: turn,
             ZOOMED: zoom,
@@ -115,7 +115,7 @@ class Change:
 
 
 @dataclass(frozen=True, slots=True)
-class Misfit:
+class ExcessResidual:
     """A whitened misfit from which everything that needs no explanation has been projected out."""
 
     white: Array  # (m,)
@@ -125,7 +125,7 @@ class Misfit:
     is_unit: bool = False  # C is 1: columns need no whitening, which is nearly all the work of a fit
 
     @staticmethod
-    def of(residual: Array, covariance: Array, nuisance: Array | None = None) -> Misfit:
+    def of(residual: Array, covariance: Array, nuisance: Array | None = None) -> ExcessResidual:
         """residual (m,), measured minus foretold, px; covariance (m, m); nuisance (m, k): free, of no interest.
 
         Raises ValueError where the covariance is not positive definite.
@@ -135,13 +135,13 @@ class Misfit:
         except np.linalg.LinAlgError:
             raise ValueError("the pixels' covariance is not positive definite") from None
         white = solve_triangular(factor, residual, lower=True)
-        start = Misfit(white, factor, np.zeros((len(white), 0)), len(white))
+        start = ExcessResidual(white, factor, np.zeros((len(white), 0)), len(white))
         return start if nuisance is None else start.freed(nuisance)
 
     @staticmethod
-    def of_white(residual: Array) -> Misfit:
+    def of_white(residual: Array) -> ExcessResidual:
         """Of a residual (m,) whose errors are independent and of size 1; columns must be whitened in the same way."""
-        return Misfit(residual, np.eye(len(residual)), np.zeros((len(residual), 0)), len(residual), True)
+        return ExcessResidual(residual, np.eye(len(residual)), np.zeros((len(residual), 0)), len(residual), True)
 
     @property
     def chi2(self) -> float:
@@ -169,21 +169,21 @@ class Misfit:
         U, s, _ = np.linalg.svd(left, full_matrices=False)
         return U[:, s > _RANK]
 
-    def freed(self, columns: Array) -> Misfit:
+    def freed(self, columns: Array) -> ExcessResidual:
         """With these changes free: the misfit that they cannot explain."""
         U = self._basis_of(columns)
         white = self.white - U @ (U.T @ self.white)
         basis = np.concatenate([self.basis, U], axis=1)
         return replace(self, white=white, basis=basis, dof=self.dof - U.shape[1])
 
-    def without(self, changes: Iterable[Change]) -> Misfit:
+    def without(self, changes: Iterable[Change]) -> ExcessResidual:
         """With all these changes free."""
         out = self
         for change in changes:
             out = out.freed(change.columns)
         return out
 
-    def fit(self, kind: str, subject: str, candidate: Candidate) -> Change:
+    def fit(self, kind: str, subject: str, candidate: ChangeCandidate) -> Change:
         """How well a change explains the misfit."""
         U = self._basis_of(candidate.columns)
         explained = float(np.sum((U.T @ self.white) ** 2))
@@ -237,16 +237,16 @@ class Verdicts:
     """What was found to have changed, and the tests behind it."""
 
     changes: tuple[Change, ...]  # in the order of their weight
-    left: Misfit  # what they leave
+    left: ExcessResidual  # what they leave
     p_values: Mapping[str, float]  # per camera, of the first test: before anything was explained
     p_rest: float  # of the first test of what no camera explains
     unexplained: bool  # what is left is still significant
 
 
 def find_changes(
-    misfit: Misfit,
+    misfit: ExcessResidual,
     cameras: Mapping[str, CameraColumns],
-    others: Mapping[tuple[str, str], Candidate],
+    others: Mapping[tuple[str, str], ChangeCandidate],
     p_false_alarm: float,
     sizes: UsualSizes | None = None,
 ) -> Verdicts:
@@ -260,7 +260,7 @@ def find_changes(
     sizes = sizes or UsualSizes()
     each = p_false_alarm / 2 / max(len(cameras), 1)
 
-    def tests(left: Misfit, names: list[str]) -> tuple[dict[str, float], float]:
+    def tests(left: ExcessResidual, names: list[str]) -> tuple[dict[str, float], float]:
         models = [cameras[n].model for n in names]
         rest = left.freed(np.concatenate(models, axis=1)) if models else left
         return {n: left.p_value_of(cameras[n].model) for n in names}, rest.p_value
@@ -281,10 +281,10 @@ def find_changes(
 
 
 def _chosen_anew(
-    misfit: Misfit,
+    misfit: ExcessResidual,
     changes: list[Change],
     cameras: Mapping[str, CameraColumns],
-    others: Mapping[tuple[str, str], Candidate],
+    others: Mapping[tuple[str, str], ChangeCandidate],
     sizes: UsualSizes,
 ) -> list[Change]:
     """Each change chosen and fitted again with the others free: the first was picked while they were not known.
@@ -304,10 +304,10 @@ def _chosen_anew(
 
 
 def _best(
-    misfit: Misfit,
+    misfit: ExcessResidual,
     known: list[Change],
     cameras: Mapping[str, CameraColumns],
-    others: Mapping[tuple[str, str], Candidate],
+    others: Mapping[tuple[str, str], ChangeCandidate],
     sizes: UsualSizes,
 ) -> Change | None:
     """The most probable explanation of what the known changes leave; None where none is better than none.

@@ -1,4 +1,4 @@
-"""What a calibration concludes about itself: findings with a level, a reason and a cure, and the verdict they make."""
+"""The findings of a calibration, each with a level, a reason and a remedy; and their verdict."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Finding:
     level: Level
     what: str  # what was tested and what came out, with figures
     why: str = ""  # what it means for a measurement
-    cure: str = ""  # what to do; empty for PASS
+    remedy: str = ""  # what to do; empty for PASS
 
 
 def unless_pass(level: Level, what: str, why: str, remedy: str) -> Finding:

@@ -16,14 +16,14 @@ from geometry.compilation.jit import compiled
 
 
 @compiled
-def put(out: Array | Ints, x: Array | Ints) -> None:
+def copy_into(out: Array | Ints, x: Array | Ints) -> None:
     """out[:] = x, vectors (n,)."""
     for i in range(x.shape[0]):
         out[i] = x[i]
 
 
 @compiled
-def put_matrix(out: Array, a: Array) -> None:
+def copy_matrix_into(out: Array, a: Array) -> None:
     """out[:] = a, matrices (n, m)."""
     for i in range(a.shape[0]):
         for j in range(a.shape[1]):
@@ -50,7 +50,7 @@ def column(a: Array, j: int) -> Array:
 
 
 @compiled
-def beside(a: Array, x: Array) -> Array:
+def hstack(a: Array, x: Array) -> Array:
     """[a, x] (n, m + 1): the right sides of one system."""
     n, m = a.shape
     out = np.empty((n, m + 1))
@@ -331,7 +331,7 @@ def right_jacobian(w: Array) -> Array:
 
 
 @compiled
-def moved(R: Array, t: Array, d: Array) -> tuple[Array, Array]:
+def pose_plus(R: Array, t: Array, d: Array) -> tuple[Array, Array]:
     """The pose that is d (6,) away: R Exp(dtheta) and t + dt, as Pose.plus."""
     t_new = np.empty(3)
     for i in range(3):
@@ -340,7 +340,7 @@ def moved(R: Array, t: Array, d: Array) -> tuple[Array, Array]:
 
 
 @compiled
-def apart(R: Array, t: Array, R0: Array, t0: Array) -> Array:
+def pose_minus(R: Array, t: Array, R0: Array, t0: Array) -> Array:
     """The delta (6,) from pose (R0, t0) to (R, t), as Pose.minus."""
     out = np.empty(6)
     turn = log(transposed_multiply(R0, R))

@@ -44,7 +44,9 @@ class TrackedFrame:
     rms_px: float
     events: tuple[Event, ...]
     label_probability: Array | None = None  # (n,) that the label is right; nan without a label. None: not reckoned
-    witness: Bools | None = None  # (n,): takes part in the pose; a blended detection keeps its label only. None: all
+    used_in_pose: Bools | None = (
+        None  # (n,): takes part in the pose; a blended detection keeps its label only. None: all
+    )
     predicted_cov_px2: Array | None = None  # (n, 2, 2) of predicted_px, without the detection's own; None: not reckoned
     motion: MotionEstimate | None = None  # velocity and rate; None: unknown, or the tracker does not have them
     pose_systematic: Array | None = None  # (6, 6) the calibration's share of the covariance, the same in every frame

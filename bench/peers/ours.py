@@ -16,7 +16,7 @@ from tracking.curve_switching.spot_tracker import SpotTracker
 from tracking.detections import UNMATCHED, Detections
 from tracking.parameters import TrackerParameters
 from tracking.rigid_body.rigid_tracker import RigidTracker
-from tracking.smoothing.recording import Recording
+from tracking.smoothing.recording import TrackedRecording
 from tracking.smoothing.smoother import smooth
 from tracking.tracked_frame import TrackedFrame
 
@@ -27,7 +27,7 @@ def track(scene: Scene, method: Literal["rigid", "spots"], smoothed: bool = Fals
     """Frame after frame, as in a run of the lab; with the second look at the whole run, if smoothed."""
     parameters = TrackerParameters(method=method)
     tracker = RigidTracker(rig(), parameters, PRIOR) if method == "rigid" else SpotTracker(rig(), parameters, PRIOR)
-    recording = Recording(rig(), parameters) if smoothed else None
+    recording = TrackedRecording(rig(), parameters) if smoothed else None
     frames, every = [], []
     start = process_time()
     for k, found in enumerate(scene.detections):

@@ -19,7 +19,7 @@ from bench.peers.rows import Tracked
 from bench.peers.scenes import HIDDEN, OUTSIDE, SCENES, Scene
 from bench.peers.trackers import ENTRIES, Entry
 from bench.peers.unseen import score_unseen
-from lab.files.text.yaml_text import write_whole
+from lab.files.text.yaml_text import atomic_write_text
 
 SHARED = ("numpy", "scipy", "numba")
 NAN = math.nan
@@ -133,7 +133,7 @@ def write_results(results: Iterable[Result], path: Path) -> None:
     writer.writerow(f.name for f in dataclasses.fields(Result))
     for result in results:
         writer.writerow(_text(getattr(result, f.name)) for f in dataclasses.fields(Result))
-    write_whole(out.getvalue(), path)
+    atomic_write_text(out.getvalue(), path)
 
 
 def _number(text: str) -> float:

@@ -92,7 +92,7 @@ def _determined(c: BeamCalibration, positions: Sequence[str]) -> list[Finding]:
                 Level.FAIL,
                 f"{UNDETERMINED}: {'; '.join(c.undetermined)} ({c.motion})",
                 "along these motions no spot moves: what is written of them would be the start value",
-                c.motion.cure() + (", or give world_from_stand with its sigmas" if known else ""),
+                c.motion.remedy() + (", or give world_from_stand with its sigmas" if known else ""),
             )
         )
     elif known:
@@ -198,7 +198,7 @@ def _sigmas(c: BeamCalibration, goals: BeamGoals) -> Finding:
     between = np.sqrt(np.mean([a.sigma**2 for a in c.angles])) if c.angles else rms
     times = int(np.ceil((rms / goals.direction) ** 2))
     why = "direction and offset errors that go together cancel near the distances of the calibration, no farther"
-    cure = (
+    remedy = (
         "a beam's direction is told by spots at different distances along it: shift the vehicle farther along its"
         f" beams, or record {times} times as many positions"
     )
@@ -207,13 +207,13 @@ def _sigmas(c: BeamCalibration, goals: BeamGoals) -> Finding:
             f"the angles between beams are known to {between / ARCSEC:.3g} arcsec: it is the whole target against the"
             f" stand that is not; the stand's positions: {c.motion}"
         )
-        cure = "measure world_from_stand better"
-        cure = f"{c.motion.cure()}, or {cure}" if c.motion.flat else cure
+        remedy = "measure world_from_stand better"
+        remedy = f"{c.motion.remedy()}, or {remedy}" if c.motion.flat else remedy
     return Finding(
         Level.FAIL if each[worst] > goals.direction_unusable else Level.WARN,
         f"{words} (goal {goals.direction / ARCSEC:.3g} arcsec)",
         why,
-        cure,
+        remedy,
     )
 
 

@@ -15,7 +15,7 @@ from scipy.linalg import block_diag
 from calibration.beams.beam_figures import Between, OneLine, angles_between, opposed_pairs
 from calibration.beams.beam_start import beams_through_spots, body_poses, stand_of
 from calibration.beams.body_gauge import BodyGauge
-from calibration.beams.excitation import Motion, in_words, without_frame
+from calibration.beams.excitation import StandMotion, in_words, without_frame
 from calibration.beams.spot_fit import SpotFit, fit_spots
 from calibration.least_squares.adjustment import Adjusted, AdjustmentError, At, Cauchy, Term, Values, solve
 from calibration.least_squares.parameter_blocks import Lines, Poses
@@ -33,7 +33,7 @@ _FOR_THE_STAND = 15  # positions from which its place is first guessed
 
 
 @dataclass(frozen=True, slots=True)
-class Stand:
+class StandModel:
     """What is known of the stand that carried the vehicle."""
 
     stand_from_body: Pose  # (P,) as recorded: the carriage, which is the body frame
@@ -57,14 +57,14 @@ class BeamCalibration:
     world_from_body: Pose  # (P,) at the positions, as found
     spots: SpotPixels  # the ones given
     fit: SpotFit
-    motion: Motion
+    motion: StandMotion
     undetermined: Sequence[str]  # empty, or what no spot tells, in words; sigmas are then those of the rest
     frame_free: int  # undetermined directions that are motions of the body frame: 6 where no position is known
     dropped: Sequence[int]  # positions with too few spots to find their pose
 
 
 def calibrate_beams(
-    rig: Rig, spots: SpotPixels, stand: Stand, knowledge: RigCovariance | None = None, *, nominal: bool = True
+    rig: Rig, spots: SpotPixels, stand: StandModel, knowledge: RigCovariance | None = None, *, nominal: bool = True
 ) -> BeamCalibration:
     """Beams from spots at recorded positions of a stand.
 
@@ -122,7 +122,7 @@ def self_calibrate(
     return _finished(rig, used, values, others, free, None, dropped)
 
 
-def _start(rig: Rig, spots: SpotPixels, stand: Stand, nominal: bool) -> tuple[Rig, Pose]:
+def _start(rig: Rig, spots: SpotPixels, stand: StandModel, nominal: bool) -> tuple[Rig, Pose]:
     """The rig with beams to start from, and world_from_stand."""
     world_from_stand = stand.world_from_stand
     if world_from_stand is None:
@@ -185,7 +185,7 @@ def _finished(
     values: Values,
     others: list[Term],
     free: dict[str, bool | Bools],
-    stand: Stand | None,
+    stand: StandModel | None,
     dropped: Sequence[int],
 ) -> BeamCalibration:
     """Adjust, and say how well."""
@@ -234,7 +234,7 @@ def _finished(
         world_from_body=poses,
         spots=spots,
         fit=fit,
-        motion=Motion.of(poses if stand is None else stand.stand_from_body),
+        motion=StandMotion.of(poses if stand is None else stand.stand_from_body),
         undetermined=undetermined,
         frame_free=len(directions) if gauge else 0,
         dropped=dropped,

@@ -14,7 +14,7 @@ from itertools import combinations
 import numpy as np
 
 from calibration.beams.beam_start import body_poses, stand_of
-from calibration.beams.beams import Stand, calibrate_beams
+from calibration.beams.beams import StandModel, calibrate_beams
 from calibration.least_squares.adjustment import AdjustmentError
 from calibration.least_squares.parameter_blocks import Poses
 from calibration.terms.spot_term import SpotPixels
@@ -32,15 +32,17 @@ _FEWEST = 6  # positions that a shifted record must share with the spots
 
 
 @dataclass(frozen=True, slots=True)
-class Suspect:
+class SuspectPose:
     """A mistake that, once mended, lets the spots agree."""
 
     in_labels: bool  # or else in the stand's record
     words: str  # what was done so that they fit
-    cure: str
+    remedy: str
 
 
-def suspect(rig: Rig, spots: SpotPixels, stand: Stand, knowledge: RigCovariance | None = None) -> Suspect | None:
+def suspect(
+    rig: Rig, spots: SpotPixels, stand: StandModel, knowledge: RigCovariance | None = None
+) -> SuspectPose | None:
     """The mistake that explains why the spots do not agree; None where none of the usual ones does.
 
     Arguments as of calibrate_beams, which did not find enough spots that agree. rig: beams as drawn, which are needed.
@@ -54,10 +56,10 @@ def suspect(rig: Rig, spots: SpotPixels, stand: Stand, knowledge: RigCovariance 
 
 @dataclass(frozen=True, slots=True)
 class _Change:
-    of: Suspect
+    of: SuspectPose
     misfit: float  # against the one as it is
     spots: SpotPixels
-    stand: Stand
+    stand: StandModel
 
 
 def _agreeing(rig: Rig, change: _Change, knowledge: RigCovariance | None) -> float:
@@ -71,7 +73,7 @@ def _agreeing(rig: Rig, change: _Change, knowledge: RigCovariance | None) -> flo
 # The stand's record -----------------------------------------------------------------------------------------------
 
 
-def _of_records(rig: Rig, spots: SpotPixels, stand: Stand) -> list[_Change]:
+def _of_records(rig: Rig, spots: SpotPixels, stand: StandModel) -> list[_Change]:
     count = len(stand.stand_from_body.translation)
     looked = np.arange(min(count, _MOST_POSITIONS))
     fits = body_poses(rig, spots.pick(spots.position < len(looked)), len(looked))
@@ -99,35 +101,37 @@ def _of_records(rig: Rig, spots: SpotPixels, stand: Stand) -> list[_Change]:
     return out
 
 
-def _other_records(poses: Pose) -> Iterator[tuple[Suspect, Pose]]:
+def _other_records(poses: Pose) -> Iterator[tuple[SuspectPose, Pose]]:
     """The record with a usual mistake mended."""
     q, t = poses.quaternion_wxyz, poses.translation
     yield (
-        Suspect(False, "with their quaternions read in the order x, y, z, w", "write them in the order qw, qx, qy, qz"),
+        SuspectPose(
+            False, "with their quaternions read in the order x, y, z, w", "write them in the order qw, qx, qy, qz"
+        ),
         Pose.from_quaternion(np.roll(q, 1, axis=-1), t),
     )
     yield (
-        Suspect(False, "inverted", "write stand_from_body, the body's pose in the stand, and not its inverse"),
+        SuspectPose(False, "inverted", "write stand_from_body, the body's pose in the stand, and not its inverse"),
         poses.inverse(),
     )
     turned = np.swapaxes(poses.rotation, -1, -2)
     yield (
-        Suspect(False, "with their turns reversed", "write quaternions that turn from the body into the stand"),
+        SuspectPose(False, "with their turns reversed", "write quaternions that turn from the body into the stand"),
         Pose(turned, t),
     )
     for factor, unit in ((1e-3, "millimetres"), (1e-2, "centimetres"), (1e3, "kilometres")):
-        cure = "write x_m, y_m, z_m in metres"
+        remedy = "write x_m, y_m, z_m in metres"
         words = f"with their positions times {factor:g} ({unit} were written)"
-        yield Suspect(False, words, cure), Pose(poses.rotation, factor * t)
+        yield SuspectPose(False, words, remedy), Pose(poses.rotation, factor * t)
 
 
 def _shifts(count: int) -> Sequence[int]:
     return [n for n in range(-(count // 2), count // 2 + 1) if n]
 
 
-def _shifted(n: int) -> Suspect:
+def _shifted(n: int) -> SuspectPose:
     rows = f"{abs(n)} row{'' if abs(n) == 1 else 's'} {'above' if n < 0 else 'below'}"
-    return Suspect(
+    return SuspectPose(
         False,
         f"when each position takes the pose {rows}",
         "the positions' numbers in spots and poses are shifted against each other: number both alike",
@@ -143,7 +147,7 @@ def _apart(bodies: Pose, records: Pose) -> float:
 # Labels -----------------------------------------------------------------------------------------------------------
 
 
-def _of_labels(rig: Rig, spots: SpotPixels, stand: Stand) -> list[_Change]:
+def _of_labels(rig: Rig, spots: SpotPixels, stand: StandModel) -> list[_Change]:
     """Pairs of spots whose labels are exchanged in every picture of one camera."""
     few = spots.pick(spots.position < _FOR_LABELS)
     count = min(_FOR_LABELS, len(stand.stand_from_body.translation))
@@ -155,7 +159,7 @@ def _of_labels(rig: Rig, spots: SpotPixels, stand: Stand) -> list[_Change]:
         miss = _own_misfit(rig, exchanged(few, a, b), count)
         if miss < _FAR_BETTER * now:
             camera, first, second = views[a][0], views[a][1], views[b][1]
-            of = Suspect(
+            of = SuspectPose(
                 True,
                 f"with the labels {first} and {second} of camera {camera!r} exchanged everywhere",
                 "exchange them in the table of spots, or in target.spots",

@@ -23,21 +23,21 @@ _SHIFT_RMS = 0.02  # m
 
 
 @dataclass(frozen=True, slots=True)
-class Motion:
+class StandMotion:
     """How much a stand's positions differ: root mean square about their mean, along and about its three axes."""
 
     turns: Array  # (3,) rad, about x, y, z of the stand
     shifts: Array  # (3,) m, along them
 
     @staticmethod
-    def of(stand_from_body: Pose) -> Motion:
+    def of(stand_from_body: Pose) -> StandMotion:
         """Of positions (P,)."""
         shifts = np.sqrt(np.mean((stand_from_body.translation - stand_from_body.translation.mean(axis=0)) ** 2, axis=0))
         mean = stand_from_body.rotation.mean(axis=0)
         U, _, V = np.linalg.svd(mean)
         middle = U @ np.diag([1.0, 1.0, np.linalg.det(U @ V)]) @ V
         turns = rotations.log(stand_from_body.rotation @ middle.T)
-        return Motion(np.sqrt(np.mean(turns**2, axis=0)), shifts)
+        return StandMotion(np.sqrt(np.mean(turns**2, axis=0)), shifts)
 
     def __str__(self) -> str:
         turns = ", ".join(f"{a} {np.rad2deg(t):.1f} deg" for a, t in zip("xyz", self.turns, strict=True))
@@ -49,7 +49,7 @@ class Motion:
         """The axes about which the positions hardly turn."""
         return [a for a, t in zip("xyz", self.turns, strict=True) if t < _TURN_RMS]
 
-    def cure(self) -> str:
+    def remedy(self) -> str:
         """Which positions to add."""
         if self.flat:
             return f"add positions turned by 10 deg or more about the stand's {_and(self.flat)}"

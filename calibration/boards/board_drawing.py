@@ -1,7 +1,7 @@
 """What is ink on a board and what is paper: as shapes for a printer, and as a shade at any point.
 
-Drawings have their own frame: the top left corner of the printed area, x right, y down, m. `Drawing.first_point` says
-where the board's frame begins in it.
+Drawings have their own frame: the top left corner of the printed area, x right, y down, m. `BoardShapes.first_point`
+says where the board's frame begins in it.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class Layer:
 
 
 @dataclass(frozen=True, slots=True)
-class Drawing:
+class BoardShapes:
     """A board as layers from the bottom up, on white paper."""
 
     size_m: tuple[float, float]  # width, height of the printed area
@@ -36,13 +36,13 @@ class Drawing:
     layers: tuple[Layer, ...]
 
 
-def draw(board: Board) -> Drawing:
+def draw(board: Board) -> BoardShapes:
     """The shapes of a board, at their size in the world."""
     none = np.empty((0, 4))
     if isinstance(board, CircleGrid):
         start = np.full(2, board.diameter_m / 2)
         circles = np.column_stack([board.points[:, :2] + start, np.full(len(board.ids), board.diameter_m / 2)])
-        return Drawing(board.size_m, start, (Layer(True, none, circles),))
+        return BoardShapes(board.size_m, start, (Layer(True, none, circles),))
     s, (columns, rows) = board.square_m, squares(board)
     start = np.array([s, s])
     j, i = np.meshgrid(np.arange(columns), np.arange(rows))
@@ -53,7 +53,7 @@ def draw(board: Board) -> Drawing:
         markers, cells = _marker_cells(board, j[~dark], i[~dark])
         layers.append(Layer(not board.inverted, markers, np.empty((0, 3))))
         layers.append(Layer(board.inverted, cells, np.empty((0, 3))))
-    return Drawing(board.size_m, start, tuple(layers))
+    return BoardShapes(board.size_m, start, tuple(layers))
 
 
 def squares(board: Board) -> tuple[int, int]:

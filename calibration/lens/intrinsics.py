@@ -28,7 +28,7 @@ from calibration.lens.fit.lens_fit import (
 )
 from calibration.lens.fit.lens_models import LensModel
 from calibration.lens.fit.lens_start import StartError, start
-from calibration.lens.fit.model_selection import Rung, climb, union_of_used
+from calibration.lens.fit.model_selection import ModelCandidate, select_model, union_of_used
 from calibration.lens.fit.projection_map import Difference, ProjectionMap, difference, projection_map
 from calibration.lens.intrinsics_findings import findings_of
 from calibration.lens.intrinsics_result import Intrinsics, Origins
@@ -84,7 +84,7 @@ def _calibrated(table: CornerTable, options: IntrinsicsOptions) -> Intrinsics:
     free = AS_STATED if shape is None else shape.free
     as_found = (rich[0] if shape is None else shape.fit).values
     board = {name: as_found[name] for name in BOARD_STACKS} if shape else board_as_stated(len(table.board_points))
-    ladder = climb(table, used, rich, board, replace(free, points=False), options.folds, options.lens)
+    ladder = select_model(table, used, rich, board, replace(free, points=False), options.folds, options.lens)
     found, held, spread = _final(table, ladder.chosen, free, options.folds)
     noise = max(1.0, spread.factor) if spread.p_value < SCATTER_SIGNIFICANT else 1.0
     distance = options.distance_m or _typical_depth(table, found)
@@ -162,7 +162,7 @@ def _shape(table: CornerTable, rich: LensFit, options: IntrinsicsOptions) -> Boa
 
 
 def _final(
-    table: CornerTable, chosen: Rung, board: BoardFreedom, folds: int | None
+    table: CornerTable, chosen: ModelCandidate, board: BoardFreedom, folds: int | None
 ) -> tuple[LensFit, HeldOut, Scatter]:
     """The chosen model once more from all corners: what is no corner is judged by the lens that stays."""
     assert chosen.fit is not None

@@ -1,4 +1,4 @@
-"""What a camera's calibration says of itself: each test with its figures, what they mean, and the cure."""
+"""What a camera's calibration says of itself: each test with its figures, what they mean, and the remedy."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _MORE = "take more photographs, the board tilted by 20 to 45 deg to all sides an
 
 
 @dataclass(frozen=True, slots=True)
-class Limits:
+class FindingLimits:
     """From where on a figure earns a warning, and a failure."""
 
     noise_px: tuple[float, float] = (0.35, 1.0)  # of a corner; sharp photographs of flat boards give 0.03 to 0.25
@@ -35,10 +35,10 @@ class Limits:
     warp_m: float = 0.002  # a board this bent is more than a quadratic surface
 
 
-LIMITS = Limits()
+LIMITS = FindingLimits()
 
 
-def findings_of(c: Intrinsics, limits: Limits = LIMITS) -> tuple[Finding, ...]:
+def findings_of(c: Intrinsics, limits: FindingLimits = LIMITS) -> tuple[Finding, ...]:
     """All tests, in the order in which a reader asks."""
     found = [
         _lens(c),
@@ -96,7 +96,7 @@ def _lens(c: Intrinsics) -> Finding:
     return Finding(Level.PASS, f"Lens: {c.model.words}: {c.ladder.why}.")
 
 
-def _noise(c: Intrinsics, limits: Limits) -> Finding:
+def _noise(c: Intrinsics, limits: FindingLimits) -> Finding:
     return unless_pass(
         _level(c.fit.sigma_px, limits.noise_px),
         f"Corners miss the model by {_mm(c, c.fit.sigma_px)} per coordinate (1 sigma; RMS {c.rms_px:.3g} px).",
@@ -107,7 +107,7 @@ def _noise(c: Intrinsics, limits: Limits) -> Finding:
     )
 
 
-def _rejected(c: Intrinsics, limits: Limits) -> Finding:
+def _rejected(c: Intrinsics, limits: FindingLimits) -> Finding:
     lost = int(np.sum(~c.fit.used))
     share = lost / len(c.table)
     dropped = len(c.fit.dropped)
@@ -123,7 +123,7 @@ def _rejected(c: Intrinsics, limits: Limits) -> Finding:
     )
 
 
-def _views(c: Intrinsics, limits: Limits) -> Finding:
+def _views(c: Intrinsics, limits: FindingLimits) -> Finding:
     count = int(np.sum(c.table.counts(c.fit.used) > 0))
     return unless_pass(
         Level.WARN if count < limits.views else Level.PASS,
@@ -133,7 +133,7 @@ def _views(c: Intrinsics, limits: Limits) -> Finding:
     )
 
 
-def _tilts(c: Intrinsics, limits: Limits) -> Finding:
+def _tilts(c: Intrinsics, limits: FindingLimits) -> Finding:
     return unless_pass(
         _level(c.coverage.spread_deg, limits.spread_deg),
         f"The boards' directions differ by up to {c.coverage.spread_deg:.0f} deg.",
@@ -142,7 +142,7 @@ def _tilts(c: Intrinsics, limits: Limits) -> Finding:
     )
 
 
-def _coverage(c: Intrinsics, limits: Limits) -> Finding:
+def _coverage(c: Intrinsics, limits: FindingLimits) -> Finding:
     gaps = c.coverage.gaps
     level = max(_level(c.coverage.filled, limits.filled), Level.WARN if gaps else Level.PASS)
     where = f"; none came near the {_listed(gaps)} of it" if gaps else ""
@@ -158,7 +158,7 @@ def _listed(words: tuple[str, ...]) -> str:
     return words[0] if len(words) == 1 else ", ".join(words[:-1]) + " and " + words[-1]
 
 
-def _focal(c: Intrinsics, limits: Limits) -> Finding:
+def _focal(c: Intrinsics, limits: FindingLimits) -> Finding:
     share = float(c.sigmas[0] / c.fit.lens[0])
     return unless_pass(
         _level(share, limits.focal),
@@ -169,7 +169,7 @@ def _focal(c: Intrinsics, limits: Limits) -> Finding:
     )
 
 
-def _aspect(c: Intrinsics, limits: Limits) -> Finding:
+def _aspect(c: Intrinsics, limits: FindingLimits) -> Finding:
     fx, fy = c.fit.lens[:2]
     away = fx / fy - 1
     C = c.covariance[:2, :2] / np.outer([fx, fy], [fx, fy])
@@ -186,7 +186,7 @@ def _aspect(c: Intrinsics, limits: Limits) -> Finding:
     )
 
 
-def _principal_point(c: Intrinsics, limits: Limits) -> Finding:
+def _principal_point(c: Intrinsics, limits: FindingLimits) -> Finding:
     size = np.array(c.table.image_size_px)
     away = c.fit.lens[2:4] - (size - 1) / 2
     share = float(np.max(np.abs(away) / size))
@@ -202,7 +202,7 @@ def _principal_point(c: Intrinsics, limits: Limits) -> Finding:
     )
 
 
-def _overfit(c: Intrinsics, limits: Limits) -> Finding:
+def _overfit(c: Intrinsics, limits: FindingLimits) -> Finding:
     ratio = c.held.rms_px / c.fit.sigma_px
     return unless_pass(
         _level(ratio, limits.overfit),
@@ -212,7 +212,7 @@ def _overfit(c: Intrinsics, limits: Limits) -> Finding:
     )
 
 
-def _halves(c: Intrinsics, limits: Limits) -> Finding:
+def _halves(c: Intrinsics, limits: FindingLimits) -> Finding:
     d = c.halves
     if d is None:
         return Finding(
@@ -232,13 +232,13 @@ def _halves(c: Intrinsics, limits: Limits) -> Finding:
     )
 
 
-def _disagreement(d: Difference, limits: Limits) -> Level:
+def _disagreement(d: Difference, limits: FindingLimits) -> Level:
     if d.p_value >= limits.p_value:
         return Level.PASS
     return Level.FAIL if d.rms_px > limits.halves_px else Level.WARN
 
 
-def _origins(c: Intrinsics, limits: Limits) -> Finding | None:
+def _origins(c: Intrinsics, limits: FindingLimits) -> Finding | None:
     if c.origins is None:
         return None
     d, (first, second) = c.origins.difference, c.origins.names
@@ -267,7 +267,7 @@ def _scatter(c: Intrinsics) -> Finding:
     )
 
 
-def _map(c: Intrinsics, limits: Limits) -> Finding:
+def _map(c: Intrinsics, limits: FindingLimits) -> Finding:
     px, mm = c.map.sigma_px(c.covariance), c.map.sigma_mm(c.covariance)
     (half, most, worst), (half_mm, most_mm, worst_mm) = (np.nanquantile(m, [0.5, 0.9, 1.0]) for m in (px, mm))
     return unless_pass(
@@ -280,7 +280,7 @@ def _map(c: Intrinsics, limits: Limits) -> Finding:
     )
 
 
-def _warp(c: Intrinsics, limits: Limits) -> Finding | None:
+def _warp(c: Intrinsics, limits: FindingLimits) -> Finding | None:
     w = c.warp
     if w is None:
         return None

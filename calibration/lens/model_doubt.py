@@ -47,13 +47,13 @@ def model_doubt(
     scatter: factor by which photographs scatter more than noise explains: errors that go together within a photograph
     make means of cells larger as well, and are in the covariance already.
     """
-    noise = min([found.sigma_px, *(r.fit.sigma_px for r in ladder.rungs if r.fit is not None)])
+    noise = min([found.sigma_px, *(r.fit.sigma_px for r in ladder.candidates if r.fit is not None)])
     cells, count = cell_means(table, found)
     p, left = beyond_noise(cells, count, noise * scatter)
     inside = seen_at(table, found.used, at.pixels) & np.isfinite(at.by_parameter).all(axis=(2, 3))
     other, between = None, 0.0
     chosen = ladder.chosen
-    for rung in ladder.rungs:
+    for rung in ladder.candidates:
         as_good = not rung.refused and rung.behind_px2 <= AS_GOOD_SE * rung.standard_error_px2
         if rung.fit is None or rung.model == found.model or not as_good or leaves_something(rung, chosen):
             continue

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import chdtri
 
-from calibration.beams.beams import Stand
+from calibration.beams.beams import StandModel
 from calibration.least_squares.adjustment import Adjusted, At, Cauchy, Free, Limits, Term, Values, solve
 from calibration.least_squares.parameter_blocks import Poses
 from calibration.least_squares.priors import Prior
@@ -53,7 +53,7 @@ class Measured:
     network: Network  # cameras, screens, dots, boards; its rig holds the nominal or found beams and the spots
     screens: NetworkFit  # the single step: its values start the joint one
     spots: SpotPixels
-    stand: Stand
+    stand: StandModel
     beams: Values  # of the single step: "beams", "stand", "poses"
 
 

@@ -151,9 +151,9 @@ def _fit_of(joint: Joint, name: str, limits: RigLimits) -> Finding:
         scale = now.scale
     level = Level.FAIL if scale > limits.scale_fail else Level.WARN if scale > limits.scale_warn else Level.PASS
     done = "all their sigmas were widened by that" if name in joint.scales else "their sigmas were left as told"
-    why, cure = _WHY[name]
+    why, remedy = _WHY[name]
     words = f"{name}: {scale:.2g} times as far from the others as their sigmas say ({counted}); {done}"
-    return Finding(level, words, why, "" if level == Level.PASS else cure)
+    return Finding(level, words, why, "" if level == Level.PASS else remedy)
 
 
 def _together(steps: RigSteps, limits: RigLimits) -> list[Finding]:

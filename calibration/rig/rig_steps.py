@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from calibration.beams.beams import BeamCalibration, Stand, calibrate_beams
-from calibration.beams.excitation import Motion, briefly
+from calibration.beams.beams import BeamCalibration, StandModel, calibrate_beams
+from calibration.beams.excitation import StandMotion, briefly
 from calibration.least_squares.adjustment import AdjustmentError
 from calibration.rig.joint import Joint, Measured, calibrate_jointly
 from calibration.screens.screens import ScreensResult
@@ -23,7 +23,9 @@ class RigSteps:
     joint: Joint  # everything at once
 
 
-def calibrate_in_steps(screens: ScreensResult, spots: SpotPixels, stand: Stand, *, nominal: bool = True) -> RigSteps:
+def calibrate_in_steps(
+    screens: ScreensResult, spots: SpotPixels, stand: StandModel, *, nominal: bool = True
+) -> RigSteps:
     """Screens, beams, then all together.
 
     screens: of screens/screens.py, the first step; its network's rig holds nominal beams and the spots too. nominal:
@@ -33,13 +35,13 @@ def calibrate_in_steps(screens: ScreensResult, spots: SpotPixels, stand: Stand, 
         beams = calibrate_beams(screens.fit.rig, spots, stand, screens.fit.covariance, nominal=nominal)
     except AdjustmentError as error:
         # Along a direction that nothing determines the steps may wander instead of ending.
-        motion = Motion.of(stand.stand_from_body)
+        motion = StandMotion.of(stand.stand_from_body)
         if not motion.flat:
             raise
-        raise AdjustmentError(f"{error}; the stand's positions do not tell all ({motion}): {motion.cure()}") from None
+        raise AdjustmentError(f"{error}; the stand's positions do not tell all ({motion}): {motion.remedy()}") from None
     if beams.undetermined:
         raise AdjustmentError(
-            f"the stand's positions leave undetermined: {briefly(beams.undetermined)}: {beams.motion.cure()}"
+            f"the stand's positions leave undetermined: {briefly(beams.undetermined)}: {beams.motion.remedy()}"
         )
     found = beams.fit.adjusted.values
     starts = {n: found[n] for n in (BEAMS, STAND, POSES)}

@@ -38,7 +38,7 @@ class MissingOpen3DError(RuntimeError):
 
 
 @dataclass(frozen=True, slots=True)
-class Candidate:
+class PlaneCandidate:
     """One plane of a cloud."""
 
     points: Array  # (n, 3): its largest connected piece
@@ -98,11 +98,11 @@ def scan_of(
     return Scan(frame, flatness, C, xyz, (float(size[0]), float(size[1])), words)
 
 
-def planes(points: Array) -> list[Candidate]:
+def planes(points: Array) -> list[PlaneCandidate]:
     """The planes of a cloud (n, 3), m, that hold most points: of each the largest connected piece."""
     o3d = open3d()
     rest = points
-    out: list[Candidate] = []
+    out: list[PlaneCandidate] = []
     extent = float(np.linalg.norm(np.ptp(points, axis=0)))
     # Of a screen and its surroundings; a cloud far beyond that is in another unit, which its planes' sizes then tell.
     within = 0.003 * extent if extent > 100 else float(np.clip(0.003 * extent, 0.002, 0.02))
@@ -120,7 +120,7 @@ def planes(points: Array) -> list[Candidate]:
             piece = rest[near][_largest_piece(rest[near], normal)]
             if len(piece) >= FEWEST:
                 sides = np.sort(np.ptp(frame_of_extent(piece).inverse().apply(piece)[:, :2], axis=0))[::-1]
-                out.append(Candidate(piece, sides))
+                out.append(PlaneCandidate(piece, sides))
         rest = rest[~near]
     return out
 
@@ -160,7 +160,7 @@ def _along(points: Array) -> Array:
     return np.asarray(A @ np.linalg.lstsq(A, points[:, 2], rcond=None)[0])
 
 
-def _like(found: list[Candidate], size_m: tuple[float, float] | None) -> Candidate:
+def _like(found: list[PlaneCandidate], size_m: tuple[float, float] | None) -> PlaneCandidate:
     """The plane whose extent is nearest to a screen's, or the one with most points."""
     if size_m is None:
         return max(found, key=lambda c: len(c.points))

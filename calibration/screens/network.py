@@ -47,7 +47,7 @@ class Dots:
 
 
 @dataclass(frozen=True, slots=True)
-class Sightings:
+class PointObservations:
     """Where cameras see dots: n of them."""
 
     camera_of: Ints  # (n,)
@@ -65,7 +65,7 @@ class Network:
 
     rig: Rig
     dots: Dots
-    sightings: Sightings
+    sightings: PointObservations
     corners: CornerTerm | None = None  # of boards that were carried about, and of boards fixed to screens
     placements: tuple[str, ...] = ()  # names of the boards' places, as the corners count them
     fixed: BoardOnScreenTerm | None = None

@@ -146,18 +146,18 @@ def _dots(result: ScreensResult, limits: ScreenLimits) -> list[Finding]:
         if m.swapped:
             told.add((m.camera, m.instead))
             what = f"camera {m.camera!r}: dots {m.dot!r} and {m.instead!r} are swapped ({m.away_px:.1f} px)"
-            cure = "swap the two names in the table of points, or in the survey"
+            remedy = "swap the two names in the table of points, or in the survey"
         elif m.instead:
-            what, cure = f"{where}, where dot {m.instead!r} is", "mend the name in the table of points"
+            what, remedy = f"{where}, where dot {m.instead!r} is", "mend the name in the table of points"
         elif len(by_dot[m.dot]) == seen and seen > 1:
             what = f"{where}; all {seen} cameras that see it say so"
-            cure = "survey it again: its coordinates are wrong, or it has moved"
+            remedy = "survey it again: its coordinates are wrong, or it has moved"
         else:
-            what, cure = (
+            what, remedy = (
                 where,
                 "look at the picture: another point of light was taken for it, or it was surveyed wrongly",
             )
-        out.append(Finding(Level.WARN, what, "it was left out", cure))
+        out.append(Finding(Level.WARN, what, "it was left out", remedy))
     for c, name in enumerate(network.rig.cameras):
         mine = network.sightings.camera_of == c
         if mine.any() and np.mean(~result.fit.used[mine]) > limits.outliers_fail:
@@ -287,14 +287,14 @@ def near_findings(result: ScreensResult, near: Mapping[int, Near]) -> list[Findi
         if away <= n.within_m:
             out.append(Finding(Level.PASS, what))
         else:
-            cure = "check near_m, the survey's columns, the pixels' u and v, and the cameras' names"
+            remedy = "check near_m, the survey's columns, the pixels' u and v, and the cameras' names"
             why = "the survey may have swapped axes or another unit, pixels may be mirrored, or cameras exchanged"
             out.append(
                 Finding(
                     Level.FAIL,
                     what,
                     why,
-                    cure,
+                    remedy,
                 )
             )
     return out

@@ -39,7 +39,7 @@ def wrong_unit(extent_m: float, expected_m: float) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class Suspect:
+class SurveySuspect:
     """A change to the survey that makes everything fit."""
 
     words: str  # what was done to the survey to mend it
@@ -52,7 +52,7 @@ def suspects(
     near: Mapping[int, Near],
     held_screen: int | None,
     current: float,
-) -> list[Suspect]:
+) -> list[SurveySuspect]:
     """Changes to the survey with which everything fits much better than with the survey as it is, the best first.
 
     current: by how much the measurements miss their sigmas now (inf where nothing was found at all).
@@ -62,7 +62,7 @@ def suspects(
         trial = replace(network, dots=replace(network.dots, xyz=change(network.dots.xyz)))
         miss = misfit(trial, setups, near, held_screen)
         if miss < 0.3 * current:
-            out.append(Suspect(words, miss))
+            out.append(SurveySuspect(words, miss))
     return sorted(out, key=lambda s: s.factor)
 
 

@@ -55,8 +55,8 @@ def fit_pose_robust(
         if not sets:
             continue
         # At a bend the motion is far from every set, and says nothing about which is right.
-        witness = expected is not None and min(distance for _, _, distance in sets) < EXPECTED_GATE
-        scores = [misfit + (distance if witness else 0.0) for _, misfit, distance in sets]
+        used_in_pose = expected is not None and min(distance for _, _, distance in sets) < EXPECTED_GATE
+        scores = [misfit + (distance if used_in_pose else 0.0) for _, misfit, distance in sets]
         first, *others = np.argsort(scores, kind="stable")
         # 3 nats: below that it is a guess which spot is wrong.
         if others and scores[others[0]] - scores[first] < 6.0:

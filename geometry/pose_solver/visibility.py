@@ -23,7 +23,7 @@ DEFAULT_RANGE = PosePrior(Pose.identity(), within_m=0.5, within_rad=float(np.deg
 
 
 @dataclass(frozen=True, slots=True)
-class Sight:
+class Visibility:
     """What n poses of a range show. All shares are 0 to 1."""
 
     views: tuple[tuple[str, str], ...]  # camera, spot
@@ -55,7 +55,7 @@ def poses_within(prior: PosePrior, count: int, seed: int = SEED) -> Pose:
     )
 
 
-def look(rig: Rig, prior: PosePrior, limits: SolveLimits, count: int = POSES) -> Sight:
+def visibility_of(rig: Rig, prior: PosePrior, limits: SolveLimits, count: int = POSES) -> Visibility:
     """What the rig sees of poses drawn from a range; the same for the same arguments."""
     poses = poses_within(prior, count)
     model = SpotModel.of(rig)
@@ -65,7 +65,7 @@ def look(rig: Rig, prior: PosePrior, limits: SolveLimits, count: int = POSES) ->
     hits = np.isfinite(model.hits(poses)[0][..., 0])
     sigma_m, sigma_rad, good = _sigmas(np.where(seen[..., None, None], J, 0.0), limits)
     cameras, spots = np.array([c for c, _ in model.views]), np.array([s for _, s in model.views])
-    return Sight(
+    return Visibility(
         views=model.views,
         in_picture=seen.mean(axis=0),
         outside=(projected & ~seen).mean(axis=0),

@@ -18,7 +18,7 @@ from lab.detect.work import Work
 from lab.errors import InputError
 from lab.files.run.parameter_overrides import overridden
 from lab.files.text import columns
-from lab.files.text.atomic_write import whole_folder
+from lab.files.text.atomic_write import atomic_folder
 from lab.files.text.json_text import write_json
 from lab.pictures.picture_file import Missing
 from lab.runs.tables import csv_word, detection_rows
@@ -83,7 +83,7 @@ def detect_pictures(
     inputs = open_inputs(given, options.camera)
     source = str(inputs.path if isinstance(inputs, Video) else given[0] if len(given) == 1 else f"{len(given)} files")
     work = Work(inputs.camera, source, parameters, notes=list(inputs.notes))
-    with whole_folder(out, may_replace=are_detections) as folder:
+    with atomic_folder(out, may_replace=are_detections) as folder:
         work.learn([p for p in inputs.to_learn_from() if not isinstance(p, Missing)])
         sheet = ContactSheet(_total(inputs, options))
         _search_all(inputs, work, sheet, folder / "detections.csv", options, progress)

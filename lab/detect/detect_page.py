@@ -14,10 +14,10 @@ from lab.detect.contact_sheet import ContactSheet
 from lab.detect.detect_charts import counts_chart, noise_chart, places_chart
 from lab.detect.findings import SizeGroup
 from lab.detect.work import Work
-from lab.files.text.yaml_text import write_whole
+from lab.files.text.yaml_text import atomic_write_text
 from lab.number_format import short
 from lab.pictures.picture_file import Grey
-from lab.report.calibration.calibration_page import Drawing, Section, Table, section_context
+from lab.report.calibration.calibration_page import PageDrawing, PageTable, Section, section_context
 from lab.report.html import environment
 from lab.report.plot.axes import picture_uri
 from lab.report.plot.svg import BLUE, Line, time_panel
@@ -47,7 +47,7 @@ def write_detect_page(work: Work, sheet: ContactSheet, folder: Path) -> Path:
         "made": _made(work),
     }
     path = folder / "report.html"
-    write_whole(environment().get_template("detect.html.j2").render(context), path)
+    atomic_write_text(environment().get_template("detect.html.j2").render(context), path)
     return path
 
 
@@ -83,7 +83,7 @@ def _sheet(sheet: ContactSheet) -> Section:
         "Evenly chosen pictures, grey values stretched. Rings: spots found, numbered by brightness, as the rows of a"
         " frame in detections.csv. The same without loss: contact-sheet.png."
     )
-    return Section("Contact sheet", (), [Drawing(picture, caption, wide=True)])
+    return Section("Contact sheet", (), [PageDrawing(picture, caption, wide=True)])
 
 
 def _spots(work: Work, table: Array) -> Section:
@@ -91,7 +91,7 @@ def _spots(work: Work, table: Array) -> Section:
     if len(work.spots.per_frame) > 1:
         frame, count = np.array(work.spots.per_frame, dtype=float).T
         drawings.append(
-            Drawing(
+            PageDrawing(
                 time_panel(
                     frame, "Spots in each picture", "", lines=(Line(count, BLUE, "spots"),),
                     y_range=(0.0, max(float(count.max()) * 1.1, 1.0)), width=1100, height=150, time_name="frame",
@@ -101,8 +101,10 @@ def _spots(work: Work, table: Array) -> Section:
         )  # fmt: skip
     if len(table):
         drawings += [
-            Drawing(counts_chart([("major", table[:, 3]), ("minor", table[:, 4])], "Sizes", "half axis, 1 sigma (px)")),
-            Drawing(
+            PageDrawing(
+                counts_chart([("major", table[:, 3]), ("minor", table[:, 4])], "Sizes", "half axis, 1 sigma (px)")
+            ),
+            PageDrawing(
                 counts_chart(
                     [("signal to noise", table[:, 5])], "Signal to noise behind a matched filter", "ratio",
                     mark=work.parameters.threshold_sigma,
@@ -127,7 +129,7 @@ def _places(table: Array, groups: list[SizeGroup]) -> Section:
         "All spots of all pictures. What stays in its place while others move (a reflection, a hot pixel) shows as one"
         " dark dot."
     )
-    return Section("Where they are", words, [Drawing(places_chart(table[:, 1:3], (width, height)))])
+    return Section("Where they are", words, [PageDrawing(places_chart(table[:, 1:3], (width, height)))])
 
 
 def _noise(work: Work, groups: list[SizeGroup]) -> Section:
@@ -152,14 +154,14 @@ def _noise(work: Work, groups: list[SizeGroup]) -> Section:
     for g in groups[:_MOST_KINDS]:
         measured = _levels(work.learnt.get((g.size_px, g.bits), []), g)
         if g.noise.estimate is not None:
-            drawings.append(Drawing(noise_chart(g.noise.estimate, measured, g.words()), _caption(measured)))
+            drawings.append(PageDrawing(noise_chart(g.noise.estimate, measured, g.words()), _caption(measured)))
     words = [
         "The variance of a pixel grows in a straight line with the light: its level at the background is read noise,"
         " rounding and the background's own shot noise; its slope is one over the electrons per grey value.",
         "Where the pictures hold little that is bright and still, the slope is what usual sensors have, and its sigma"
         " says so.",
     ]
-    return Section("Noise of the sensor", words, drawings, Table(heads, rows))
+    return Section("Noise of the sensor", words, drawings, PageTable(heads, rows))
 
 
 def _caption(measured: LevelVariances | None) -> str:

@@ -10,7 +10,7 @@ from calibration.findings import Level, verdict
 from lab.errors import QUALITY_GATE_FAILED
 from lab.files.rig.rig_covariance import TARGET, joint_covariance
 from lab.files.rig.rig_file import load_rig_file
-from lab.files.text.atomic_write import refuse_foreign, whole_folder
+from lab.files.text.atomic_write import atomic_folder, refuse_foreign
 from lab.number_format import angle, length, percent
 from lab.plan.plan_findings import findings, median_sigma
 from lab.plan.plan_grid import Plan, plan_grid
@@ -56,7 +56,7 @@ def plan_rig(rig_path: Path, out: Path, options: PlanOptions | None = None) -> P
     refuse_foreign(out, _is_ours)
     plan = plan_of(rig_path, options)
     found = findings(plan)
-    with whole_folder(Path(out), may_replace=_is_ours) as work:
+    with atomic_folder(Path(out), may_replace=_is_ours) as work:
         write_plan(plan, work / TABLE)
         write_effects(plan, work / EFFECTS)
         write_plan_page(plan, found, Path(rig_path), work)

@@ -30,7 +30,7 @@ TOGETHER = "calibration, all together"
 MOST_JOINED = 0.05
 
 _UNITS = {"x_m": "m", "y_m": "m", "z_m": "m", "yaw_deg": "°", "pitch_deg": "°", "roll_deg": "°"}
-_CURES = {
+_REMEDIES = {
     NOISE: "A longer lens or more pixels on the screen, brighter or rounder spots (longer exposure, less speckle),"
     " beams wider apart; and a mean over frames, which lessens noise alone.",
     INTRINSICS: "Calibrate the lenses with more photographs, with the board in the corners of the picture and tilted;"
@@ -123,13 +123,13 @@ def advice(plan: Plan) -> list[str]:
         )
     out += [
         f"Attitude: {first.name} makes {percent(first.share_deg)} of the variance along the worst direction. Halved,"
-        f" the sigma would fall from {angle(deg)} to {angle(first.halved_deg)}. {_CURES.get(first.name, '')}"
+        f" the sigma would fall from {angle(deg)} to {angle(first.halved_deg)}. {_REMEDIES.get(first.name, '')}"
     ]
     largest = max(lines, key=lambda line: line.share_m)
     start = f"Position: {largest.name} makes {percent(largest.share_m)} of the variance"
     fall = f"Halved, the sigma would fall from {length(m)} to {length(largest.halved_m)}."
-    cure = "The same cure helps." if largest.name == first.name else _CURES.get(largest.name, "")
-    out.append(f"{start}. {fall} {cure}")
+    remedy = "The same remedy helps." if largest.name == first.name else _REMEDIES.get(largest.name, "")
+    out.append(f"{start}. {fall} {remedy}")
     noise = next(line for line in lines if line.name == NOISE)
     rest_deg, rest_m = np.sqrt(max(1 - noise.share_deg, 0.0)) * deg, np.sqrt(max(1 - noise.share_m, 0.0)) * m
     out.append(
@@ -143,7 +143,7 @@ def advice(plan: Plan) -> list[str]:
 
 
 def findings(plan: Plan) -> list[Finding]:
-    """What was tested, worst news told with its cure."""
+    """What was tested, worst news told with its remedy."""
     return [*_observability(plan), *_redundancy(plan), *_views(plan), *_gaps(plan), *_goals(plan)]
 
 

@@ -20,9 +20,9 @@ from lab.plan.plan_options import Range, poses_of
 from lab.report.calibration.calibration_maps import heat_map
 from lab.report.calibration.calibration_page import (
     CalibrationReport,
-    Drawing,
+    PageDrawing,
+    PageTable,
     Section,
-    Table,
     provenance,
     write_calibration_report,
 )
@@ -100,10 +100,10 @@ def _budget(plan: Plan) -> Section:
             " large part, so that single shares would say nothing."
         )
     drawings = [
-        Drawing(share_bars([(x.name, x.share_deg) for x in lines], "Attitude: shares of the variance")),
-        Drawing(share_bars([(x.name, x.share_m) for x in lines], "Position: shares of the variance")),
+        PageDrawing(share_bars([(x.name, x.share_deg) for x in lines], "Attitude: shares of the variance")),
+        PageDrawing(share_bars([(x.name, x.share_m) for x in lines], "Position: shares of the variance")),
     ]
-    return Section("Error budget", words, drawings if lines else (), Table(heads, rows))
+    return Section("Error budget", words, drawings if lines else (), PageTable(heads, rows))
 
 
 def _maps(plan: Plan) -> list[Section]:
@@ -126,20 +126,20 @@ def _plane(plan: Plan, across: int, up: int) -> Section:
     x_name, y_name = axis_names[across], axis_names[up]
     fine = fine_map(plan, across, up)
 
-    def smooth(k: int, what: str, unit: str) -> Drawing:
+    def smooth(k: int, what: str, unit: str) -> PageDrawing:
         values = 1e3 * fine[..., k]
         extent = (a.first, a.last, b.first, b.last)
         title = f"{what} sigma ({unit}), the others in the middle of their ranges"
-        return Drawing(
+        return PageDrawing(
             heat_map(
                 values, extent, title, unit, x_name=x_name, y_name=y_name, y_down=False, equal=False,
                 limits=_limits(values),
             )
         )  # fmt: skip
 
-    def cells(values: Array, how: str, title: str, dark_is_low: bool = False) -> Drawing:
+    def cells(values: Array, how: str, title: str, dark_is_low: bool = False) -> PageDrawing:
         grid = _gathered(plan, values, across, up, how)
-        return Drawing(
+        return PageDrawing(
             cell_map(grid, a.values(), b.values(), title, x_name=x_name, y_name=y_name, dark_is_low=dark_is_low)
         )
 
@@ -208,7 +208,7 @@ def _sight(plan: Plan) -> Section:
         " picture's edge, negative outside: by so much a lens or a pose of the camera must give way."
     )
     heads = ("camera", "spot", "in view", "without projection", "median margin (px)", "least margin (px)")
-    return Section("What is in view", words, (), Table(heads, rows))
+    return Section("What is in view", words, (), PageTable(heads, rows))
 
 
 def _worst(plan: Plan) -> Section:
@@ -230,7 +230,7 @@ def _worst(plan: Plan) -> Section:
         "position", "along (world)", "condition",
     )  # fmt: skip
     words = "Those that cannot be solved first, then by attitude sigma. All poses are in plan.csv."
-    return Section("Worst poses", words, (), Table(heads, rows))
+    return Section("Worst poses", words, (), PageTable(heads, rows))
 
 
 def _three(values: Sequence[float], decimals: int) -> str:
@@ -250,7 +250,7 @@ def _effects(plan: Plan) -> Section:
         " effects on the attitude first. A lens's errors take its camera's pose along where that is to come from a"
         " resection. The effect of every single number is in effects.csv."
     )
-    return Section("What each calibration error does", words, (), Table(heads, rows))
+    return Section("What each calibration error does", words, (), PageTable(heads, rows))
 
 
 def _milli(axis: str) -> str:

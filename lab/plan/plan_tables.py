@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 
 from calibration.budget.pose_budget import group_of
-from lab.files.text.yaml_text import write_whole
+from lab.files.text.yaml_text import atomic_write_text
 from lab.plan.plan_grid import AXES, STATUS, Plan
 
 _DIRECTIONS = tuple(f"worst_{what}_axis_{a}" for what in ("position", "attitude") for a in "xyz")
@@ -109,4 +109,4 @@ def _write(path: Path, columns: tuple[str, ...], rows: Iterator[list[str]]) -> N
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(columns)
     writer.writerows(rows)
-    write_whole(text.getvalue(), path)
+    atomic_write_text(text.getvalue(), path)

@@ -11,7 +11,7 @@ from typing import Any
 
 from lab.errors import QUALITY_GATE_FAILED, BeamposeError, CalibrationError, InputError, RunError
 from lab.files.run.parameter_overrides import overridden
-from lab.runs.process import Outcome, process_run
+from lab.runs.process import RunOutcome, process_run
 from lab.runs.smoothing_pass import Progress
 from tracking.parameters import TrackerParameters
 
@@ -93,7 +93,7 @@ def _names(folders: Sequence[Path]) -> list[str]:
     ]
 
 
-def _row(folder: Path, outcome: Outcome) -> dict[str, Any]:
+def _row(folder: Path, outcome: RunOutcome) -> dict[str, Any]:
     return {
         "run": str(folder),
         "name": outcome.name,

@@ -319,7 +319,7 @@ def _look(findings: _Findings, rig: Rig, prior: PosePrior | None, limits: SolveL
     """Adds how often which spot is in view. What cannot work is a problem with a prior, else only a remark: the range
     of poses is then a guess."""
     span = visibility.DEFAULT_RANGE if prior is None else prior
-    seen = visibility.look(rig, span, limits)
+    seen = visibility.visibility_of(rig, span, limits)
     severe = findings.remarks if prior is None else findings.problems
     centre = ", ".join(f"{v + 0.0:.4g}" for v in span.centre.translation)
     turned = ", ".join(f"{v + 0.0:.4g}" for v in np.rad2deg(span.centre.ypr))
@@ -351,13 +351,13 @@ def _look(findings: _Findings, rig: Rig, prior: PosePrior | None, limits: SolveL
 
     for spot, share in seen.on_screen.items():
         if share == 0:
-            other = visibility.look(visibility.with_other_end(rig, spot), span, limits).on_screen[spot]
+            other = visibility.visibility_of(visibility.with_other_end(rig, spot), span, limits).on_screen[spot]
             hint = f"; from the other end of beam {rig.spots[spot].beam!r} it would: is `end` right?" if other else ""
             severe.append(f"{rig_path}: target.spots.{spot}: never meets its screen {rig.spots[spot].screen!r}{hint}")
     for camera, share in seen.blind.items():
         if share == 1:
             turned_rig = visibility.with_inverted_camera(rig, camera)
-            other = 1 - visibility.look(turned_rig, span, limits).blind[camera]
+            other = 1 - visibility.visibility_of(turned_rig, span, limits).blind[camera]
             hint = (
                 f"; with the inverse of camera_from_world it would in {_percent(other)}: is it world_from_camera?"
                 if other

@@ -20,10 +20,10 @@ from lab.files.rig.calibration_state import require_usable, state_mapping
 from lab.files.run.fingerprints import fingerprints
 from lab.files.run.parameter_overrides import overridden
 from lab.files.run.run_file import Run, load_run
-from lab.files.text.atomic_write import whole_folder
+from lab.files.text.atomic_write import atomic_folder
 from lab.files.text.json_text import write_json
 from lab.runs.frames.pipeline import FrameRecord, Pipeline
-from lab.runs.model_check.frame_sampler import FrameKeeper, claimed_covariances, widths
+from lab.runs.model_check.frame_sampler import FrameSampler, claimed_covariances, widths
 from lab.runs.smoothing_pass import Progress, TwoPasses
 from lab.runs.tables import TableWriter
 from lab.runs.verdict import quality
@@ -41,7 +41,7 @@ LASTING = ("undecided", "changed", "contradiction", "not_a_covariance")
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class RunOutcome:
     """What became of one run."""
 
     name: str
@@ -123,7 +123,7 @@ def process_run(
     overrides: Mapping[str, Any] | None = None,
     causal: bool = False,
     progress: Progress | None = None,
-) -> Outcome:
+) -> RunOutcome:
     """Process one run folder into the folder `out`: the tables, summary.json and report.html.
 
     overrides: tracker parameters that replace those of run.yaml. causal: the tables say what was known at each instant,
@@ -134,7 +134,7 @@ def process_run(
     """
     started = time.perf_counter()
     run = ready_run(run_folder, overrides)
-    with whole_folder(out, may_replace=are_results) as work:
+    with atomic_folder(out, may_replace=are_results) as work:
         return write_results(Pipeline.of(run), work, Path(out), started, causal=causal, progress=progress)
 
 
@@ -160,7 +160,7 @@ def write_results(
     causal: bool = False,
     progress: Progress | None = None,
     more: Callable[[], Mapping[str, Any]] = dict,
-) -> Outcome:
+) -> RunOutcome:
     """Process what a pipeline gives into the folder `work`, which will be `out`.
 
     started: time.perf_counter() at the beginning. more: what else summary.json shall hold, asked for at the end.
@@ -185,7 +185,7 @@ def write_results(
     from lab.report.run.page import write_report  # the template engine: only for those who write a report
 
     write_report(work, run.folder)
-    return Outcome(run.name, out, verdict, facts.frames, facts.measured, time.perf_counter() - started, errors)
+    return RunOutcome(run.name, out, verdict, facts.frames, facts.measured, time.perf_counter() - started, errors)
 
 
 def write_tables(
@@ -208,7 +208,7 @@ def write_tables(
         causal=checks.causal,
         invalid=checks.invalid,
     )
-    keeper = FrameKeeper()
+    keeper = FrameSampler()
     with (
         TableWriter(work, run.rig, run.covariance is not None, with_causal=not causal) as tables,
         contextlib.closing(passes.causal_only() if causal else passes.records()) as records,

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from lab.runs.frames.pipeline import FrameRecord, Pipeline
-from tracking.smoothing.recording import Recording
+from tracking.smoothing.recording import TrackedRecording
 from tracking.smoothing.smoothed import Smoothed
 from tracking.smoothing.smoother import smooth
 
@@ -55,7 +55,7 @@ class TwoPasses:
     def records(self) -> Generator[tuple[FrameRecord, FrameRecord], None, None]:
         """Both passes: each frame as the whole run tells it, and as it was known at its instant."""
         run, total = self.pipeline.run, self.pipeline.reader.expected_frames
-        recording = Recording(run.rig, run.tracker, run.covariance, run.exposure_s or 0.0)
+        recording = TrackedRecording(run.rig, run.tracker, run.covariance, run.exposure_s or 0.0)
         with tempfile.TemporaryFile(dir=self.folder, prefix=".frames-") as waiting:
             for done, record in enumerate(self.pipeline.records(), start=1):
                 pickle.dump(record, waiting, pickle.HIGHEST_PROTOCOL)
@@ -71,7 +71,7 @@ class TwoPasses:
                 yield replace(causal, tracked=tracked), causal
                 self._tell(k + 1, smoothed.frames, WRITING)
 
-    def _smooth(self, recording: Recording) -> Smoothed:
+    def _smooth(self, recording: TrackedRecording) -> Smoothed:
         self._tell(0, None, SMOOTHING)
         clock = time.perf_counter()
         smoothed = smooth(recording)

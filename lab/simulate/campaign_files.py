@@ -25,7 +25,7 @@ from lab.files.rig.camera_block import Covariance
 from lab.files.rig.camera_file import CameraCalibration, CameraFile, save_camera
 from lab.files.rig.rig_file import RigFile, as_mapping, pose_mapping, save_rig
 from lab.files.text import columns
-from lab.files.text.atomic_write import whole_folder
+from lab.files.text.atomic_write import atomic_folder
 from lab.files.text.yaml_text import write_mapping
 from lab.simulate.board_photo import Look, photograph
 from lab.simulate.calibration_campaign import Campaign, LensDraw, Quality, board_poses, draw_campaign
@@ -62,7 +62,7 @@ def simulate_calibration(
         raise InputError(f"positions: expected 3 or more, got {positions}")
     q = replace(Quality() if quality is None else quality, positions=positions, wrong=wrong)
     campaign = draw_campaign(seed, rig, q)
-    with whole_folder(Path(out), lambda _: False) as folder:
+    with atomic_folder(Path(out), lambda _: False) as folder:
         write_campaign(campaign, folder)
         if photos:
             _write_photos(campaign, folder)

@@ -10,7 +10,7 @@ from geometry.arrays import Array, Bools, Ints
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.rig import Rig
-from lab.simulate.scenarios import Prior, Scenario
+from lab.simulate.scenarios import PriorRegion, Scenario
 from lab.simulate.scene import HIDDEN, POINT_NOISE, SHINING, compose, with_overrides
 from tracking.detections import Detections
 
@@ -26,7 +26,7 @@ class PointRun:
     seed: int
     rig: Rig
     model: SpotModel
-    prior: Prior
+    prior: PriorRegion
     noise_px: float  # 1 sigma per axis of each detection
     frame_rate_hz: float
     frame: Ints  # (T,) 0, 1, ...

@@ -56,7 +56,7 @@ class Hiding:
 
 
 @dataclass(frozen=True, slots=True)
-class Fault:
+class RecordingFault:
     """One picture that did not arrive as it should."""
 
     frame: int
@@ -69,7 +69,7 @@ class Fault:
 
 
 @dataclass(frozen=True, slots=True)
-class Prior:
+class PriorRegion:
     """Where the vehicle is at the first frame, as run.yaml tells it. The drawn motion begins within it."""
 
     position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -88,14 +88,14 @@ class Scenario:
     motion: Motion
     frames: int = 600
     frame_rate_hz: float = 100.0  # the paper's 10 ms
-    prior: Prior = Prior()
+    prior: PriorRegion = PriorRegion()
     # The phases of the motion are drawn until these hold:
     all_in_view_at_start: bool = True
     always_in_view: tuple[str, ...] = ()  # spots that never leave the picture, in any camera, however long the run is
     leaves_and_returns: tuple[str, ...] = ()  # spots that do so at least once within the scenario's own frames
     clutter: Clutter = Clutter()
-    hiding: Hiding = Hiding()
-    faults: tuple[Fault, ...] = ()
+    occlusion: Hiding = Hiding()
+    faults: tuple[RecordingFault, ...] = ()
     light: Light = Light()
 
 
@@ -177,7 +177,7 @@ _ALL = (
         _SHARP_TURNS,
         name="hidden-in-turn",
         summary="As sharp-turns, and around every bend one spot is hidden for ten frames.",
-        hiding=Hiding(at_bends_frames=10),
+        occlusion=Hiding(at_bends_frames=10),
     ),
     replace(
         _SMOOTH_SCENARIO,
@@ -202,7 +202,7 @@ _ALL = (
         summary="A turntable goes up and down in yaw in six steps and stops after each; nothing else moves.",
         motion=Motion((0.05, 0.0, 0.0, 6.0, 2.0, 1.0), (Wave("yaw", 18.0, 0.1, "steps", phase=0.0),)),
         always_in_view=("1", "2", "4", "5"),
-        prior=Prior(yaw_pitch_roll_deg=(-10.0, 0.0, 0.0), within_m=0.3, within_deg=10.0),
+        prior=PriorRegion(yaw_pitch_roll_deg=(-10.0, 0.0, 0.0), within_m=0.3, within_deg=10.0),
     ),
     replace(
         _SMOOTH_SCENARIO,
@@ -243,7 +243,7 @@ _ALL = (
         _SMOOTH_SCENARIO,
         name="blackout",
         summary="As smooth, and every 150 frames all spots are hidden for ten.",
-        hiding=Hiding(blackout_every=150, blackout_frames=10),
+        occlusion=Hiding(blackout_every=150, blackout_frames=10),
     ),
     replace(
         _SMOOTH_SCENARIO,
@@ -251,11 +251,11 @@ _ALL = (
         summary="As smooth, with dropped frames (20 in both cameras, 31 to 33 in the left one), cut-off files (40"
         " right, 41 left) and a picture of the wrong size (55 left).",
         faults=(
-            Fault(20, "dropped"),
-            *(Fault(n, "dropped", "left") for n in (31, 32, 33)),
-            Fault(40, "truncated", "right"),
-            Fault(41, "truncated", "left"),
-            Fault(55, "wrong size", "left"),
+            RecordingFault(20, "dropped"),
+            *(RecordingFault(n, "dropped", "left") for n in (31, 32, 33)),
+            RecordingFault(40, "truncated", "right"),
+            RecordingFault(41, "truncated", "left"),
+            RecordingFault(55, "wrong size", "left"),
         ),
     ),
 )  # fmt: skip

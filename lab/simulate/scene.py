@@ -149,7 +149,7 @@ def _nuisances(
     scenario: Scenario, model: SpotModel, uv_px: Array, bend_frames: Ints, seed: int
 ) -> tuple[Bools, FalseSpots]:
     """Which views are hidden (T, n), and the clutter."""
-    clutter, hiding = scenario.clutter, scenario.hiding
+    clutter, occlusion = scenario.clutter, scenario.occlusion
     count, n = uv_px.shape[:2]
     n_spots, n_cameras = len(model.spot_names), len(model.camera_names)
     in_picture = model.in_picture(uv_px)
@@ -159,8 +159,8 @@ def _nuisances(
     for k in range(count):
         rng = np.random.default_rng([seed, NUISANCES, k])
         missed, chance, share, turn, strength = rng.random((5, n))
-        if k >= hiding.clean_start:
-            hidden_spots[k, model.spot_of] |= missed[model.spot_of] < hiding.miss_probability
+        if k >= occlusion.clean_start:
+            hidden_spots[k, model.spot_of] |= missed[model.spot_of] < occlusion.miss_probability
         radius = clutter.within_px * np.sqrt(share)
         around = uv_px[k] + radius[:, None] * np.stack([np.cos(2 * np.pi * turn), np.sin(2 * np.pi * turn)], -1)
         near = np.flatnonzero((chance < clutter.per_spot) & in_picture[k] & model.in_picture(around))
@@ -177,17 +177,17 @@ def _nuisances(
 
 def _hidden_spots(scenario: Scenario, n_spots: int, count: int, bend_frames: Ints, seed: int) -> Bools:
     """(T, spots): hidden at bends and in blackouts. Single misses come on top."""
-    hiding = scenario.hiding
+    occlusion = scenario.occlusion
     hidden = np.zeros((count, n_spots), dtype=bool)
-    if hiding.at_bends_frames:
+    if occlusion.at_bends_frames:
         for i, bend in enumerate(bend_frames):
-            spots = np.random.default_rng([seed, BENDS, i]).permutation(n_spots)[: hiding.at_bends_spots]
-            first = max(0, int(bend) + 1 - hiding.at_bends_frames // 2)
-            hidden[first : first + hiding.at_bends_frames, spots] = True
-    if hiding.blackout_every:
-        dark = np.arange(count) % hiding.blackout_every < hiding.blackout_frames
-        hidden[dark & (np.arange(count) >= hiding.blackout_every)] = True
-    hidden[: hiding.clean_start] = False
+            spots = np.random.default_rng([seed, BENDS, i]).permutation(n_spots)[: occlusion.at_bends_spots]
+            first = max(0, int(bend) + 1 - occlusion.at_bends_frames // 2)
+            hidden[first : first + occlusion.at_bends_frames, spots] = True
+    if occlusion.blackout_every:
+        dark = np.arange(count) % occlusion.blackout_every < occlusion.blackout_frames
+        hidden[dark & (np.arange(count) >= occlusion.blackout_every)] = True
+    hidden[: occlusion.clean_start] = False
     return hidden
 
 
@@ -213,5 +213,5 @@ def with_overrides(
     if miss_probability is not None:
         if not 0.0 <= miss_probability <= 1.0:
             raise InputError(f"miss_probability: expected 0 to 1, got {miss_probability:g}")
-        scenario = replace(scenario, hiding=replace(scenario.hiding, miss_probability=miss_probability))
+        scenario = replace(scenario, occlusion=replace(scenario.occlusion, miss_probability=miss_probability))
     return scenario

@@ -6,7 +6,7 @@ import csv
 from dataclasses import dataclass
 from pathlib import Path
 
-from lab.files.text.atomic_write import whole_folder
+from lab.files.text.atomic_write import atomic_folder
 from lab.study.experiment_huo2015 import repeat_huo2015
 from lab.study.study_page import write_study
 
@@ -25,7 +25,7 @@ class StudyOutcome:
 def study_huo2015(out: Path, seed: int = 1, frames: int = 600) -> StudyOutcome:
     """Repeat section 5.1 into the folder `out`: figures.csv and report.html. Raises InputError if `out` is in use."""
     study = repeat_huo2015(seed, frames)
-    with whole_folder(out, may_replace=lambda folder: (folder / "figures.csv").is_file()) as work:
+    with atomic_folder(out, may_replace=lambda folder: (folder / "figures.csv").is_file()) as work:
         with (work / "figures.csv").open("w", encoding="utf-8", newline="") as file:
             writer = csv.writer(file, lineterminator="\n")
             writer.writerow(COLUMNS)

@@ -9,7 +9,7 @@ import numpy as np
 from markupsafe import Markup
 
 from geometry.arrays import Array
-from lab.files.text.yaml_text import write_whole
+from lab.files.text.yaml_text import atomic_write_text
 from lab.report.html import environment
 from lab.report.plot import svg
 from lab.report.plot.svg import Line, Scale, Shade
@@ -37,7 +37,7 @@ def write_study(study: Study, folder: Path) -> Path:
         )
     )
     path = folder / "report.html"
-    write_whole(html, path)
+    atomic_write_text(html, path)
     return path
 
 

@@ -21,11 +21,11 @@ from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from lab.errors import InputError, RunError
 from lab.files.run.run_file import LiveDevice, Run
-from lab.files.text.atomic_write import whole_folder
+from lab.files.text.atomic_write import atomic_folder
 from lab.pictures.picture_file import Grey
 from lab.runs.frames.pipeline import Pipeline, tracker_of
 from lab.runs.frames.sensor_noise import CameraNoise
-from lab.runs.process import Outcome, are_results, ready_run, write_results
+from lab.runs.process import RunOutcome, are_results, ready_run, write_results
 from lab.runs.smoothing_pass import TRACKING, Progress
 from lab.runs.verdict.frame_checks import FrameChecks
 from lab.watch.live_frames import LiveFrames, WatchOptions
@@ -40,7 +40,7 @@ _TURN_S = 0.0005
 class WatchOutcome:
     """What became of a watched run."""
 
-    run: Outcome
+    run: RunOutcome
     latency: Latency
 
     @property
@@ -82,7 +82,7 @@ def watch_run(
             f"{run.path}: cameras: expected folders of pictures to reprocess, got a device, which keeps none"
         )
     with contextlib.ExitStack() as stack:
-        work = stack.enter_context(whole_folder(out, may_replace=lambda p: are_results(p) or is_live_table(p)))
+        work = stack.enter_context(atomic_folder(out, may_replace=lambda p: are_results(p) or is_live_table(p)))
         sender = None if udp is None else UdpLines(udp)
         frames = LiveFrames(run, options, stop or threading.Event())
         output = LiveOutput(Path(out), frames, FrameChecks(run.rig, run.covariance), sender)

@@ -13,8 +13,8 @@ from calibration.drift import (
     TURNED_ZOOMED,
     WRONG_POINT,
     ZOOMED,
-    Candidate,
-    Misfit,
+    ChangeCandidate,
+    ExcessResidual,
     camera_columns,
     find_changes,
 )
@@ -41,9 +41,9 @@ def columns():
     return camera_columns(PLACES, lens.d_point, lens.d_pinhole, pinhole_numbers(CAMERA)[:2])
 
 
-def points() -> dict[tuple[str, str], Candidate]:
+def points() -> dict[tuple[str, str], ChangeCandidate]:
     one = np.eye(2 * N)
-    return {(WRONG_POINT, str(i)): Candidate(one[:, 2 * i : 2 * i + 2], np.full(2, 3.0)) for i in range(N)}
+    return {(WRONG_POINT, str(i)): ChangeCandidate(one[:, 2 * i : 2 * i + 2], np.full(2, 3.0)) for i in range(N)}
 
 
 def covariance(rng: np.random.Generator) -> np.ndarray:
@@ -53,7 +53,7 @@ def covariance(rng: np.random.Generator) -> np.ndarray:
 
 
 def found(residual: np.ndarray, C: np.ndarray, p_false_alarm: float = 0.002):
-    return find_changes(Misfit.of(residual.ravel(), C), {"left": columns()}, points(), p_false_alarm)
+    return find_changes(ExcessResidual.of(residual.ravel(), C), {"left": columns()}, points(), p_false_alarm)
 
 
 def test_the_columns_are_the_derivatives_of_the_projection():
@@ -141,7 +141,7 @@ def test_what_hides_behind_a_free_nuisance_is_not_detectable():
     c = columns()
     shift = np.zeros((2 * N, 2))
     shift[::2, 0] = shift[1::2, 1] = 1.0
-    open_sight = Misfit.of(np.zeros(2 * N), 0.01 * np.eye(2 * N))
+    open_sight = ExcessResidual.of(np.zeros(2 * N), 0.01 * np.eye(2 * N))
     visible = open_sight.detectable(shift, c.model, 0.001, 0.9)
     assert 0.1 < visible < 0.4
     assert open_sight.freed(shift).detectable(shift, c.model, 0.001, 0.9) > 1e6
@@ -152,7 +152,7 @@ def test_a_drift_of_the_detectable_size_is_found_as_often_as_promised():
     c, C = columns(), 0.01 * np.eye(2 * N)
     shift = np.zeros((2 * N, 2))
     shift[::2, 0] = shift[1::2, 1] = 1.0
-    size = Misfit.of(np.zeros(2 * N), C).detectable(shift, c.model, 0.001, 0.9)
+    size = ExcessResidual.of(np.zeros(2 * N), C).detectable(shift, c.model, 0.001, 0.9)
     seen_in = sum(bool(found(size * shift[:, 0] + rng.normal(0, 0.1, 2 * N), C).changes) for _ in range(100))
     assert seen_in >= binom.ppf(0.001, 100, 0.9)
 
@@ -176,27 +176,27 @@ def test_a_laser_is_accused_before_two_cameras():
     laser[[0, 1], [0, 1]] = 1000.0  # px/rad
     laser[[12, 13], [0, 1]] = -1000.0, 1000.0
     one = np.eye(2 * n)
-    others = {(WRONG_POINT, str(i)): Candidate(one[:, 2 * i : 2 * i + 2], np.full(2, 3.0)) for i in range(n)}
-    others[(LASER_MOVED, "A")] = Candidate(laser, np.full(2, 1e-3))
-    misfit = Misfit.of((spots + rng.normal(0, 0.1, (n, 2))).ravel(), 0.01 * np.eye(2 * n))
+    others = {(WRONG_POINT, str(i)): ChangeCandidate(one[:, 2 * i : 2 * i + 2], np.full(2, 3.0)) for i in range(n)}
+    others[(LASER_MOVED, "A")] = ChangeCandidate(laser, np.full(2, 1e-3))
+    misfit = ExcessResidual.of((spots + rng.normal(0, 0.1, (n, 2))).ravel(), 0.01 * np.eye(2 * n))
     verdicts = find_changes(misfit, {"left": beside(True), "right": beside(False)}, others, 0.002)
     assert [(c.kind, c.subject) for c in verdicts.changes] == [(LASER_MOVED, "A")]
 
 
 def test_a_covariance_that_is_none_is_refused():
     with pytest.raises(ValueError, match="not positive definite"):
-        Misfit.of(np.zeros(2), np.array([[1.0, 2.0], [2.0, 1.0]]))
+        ExcessResidual.of(np.zeros(2), np.array([[1.0, 2.0], [2.0, 1.0]]))
 
 
 def test_a_misfit_whitened_beforehand_is_explained_just_the_same():
     rng = np.random.default_rng(4)
     root = np.tril(rng.standard_normal((12, 12))) + 5 * np.eye(12)
     columns, nuisance, residual = rng.standard_normal((12, 3)), rng.standard_normal((12, 2)), rng.standard_normal(12)
-    plain = Misfit.of(residual, root @ root.T).freed(nuisance)
-    white = Misfit.of_white(np.linalg.solve(root, residual)).freed(np.linalg.solve(root, nuisance))
+    plain = ExcessResidual.of(residual, root @ root.T).freed(nuisance)
+    white = ExcessResidual.of_white(np.linalg.solve(root, residual)).freed(np.linalg.solve(root, nuisance))
     size = np.array([0.5, 1.0, 2.0])
-    a = plain.fit("turned", "left", Candidate(columns, size))
-    b = white.fit("turned", "left", Candidate(np.linalg.solve(root, columns), size))
+    a = plain.fit("turned", "left", ChangeCandidate(columns, size))
+    b = white.fit("turned", "left", ChangeCandidate(np.linalg.solve(root, columns), size))
     assert white.p_value == pytest.approx(plain.p_value)
     assert b.evidence == pytest.approx(a.evidence)
     np.testing.assert_allclose(b.delta, a.delta)

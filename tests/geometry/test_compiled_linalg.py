@@ -34,11 +34,13 @@ def test_a_pose_moved_and_taken_apart_again_gives_the_same_difference(seed):
     rng = np.random.default_rng(seed)
     pose = Pose(rotations.exp(vector(rng, 1.0)), rng.normal(size=3))
     delta = np.concatenate([rng.normal(size=3), vector(rng, rng.uniform(0, 3.0))])
-    R, t = compiled_linalg.moved(pose.rotation, pose.translation, delta)
+    R, t = compiled_linalg.pose_plus(pose.rotation, pose.translation, delta)
     expected = pose.plus(delta)
     np.testing.assert_allclose(R, expected.rotation, rtol=0, atol=1e-14)
     np.testing.assert_allclose(t, expected.translation, rtol=0, atol=1e-14)
-    np.testing.assert_allclose(compiled_linalg.apart(R, t, pose.rotation, pose.translation), delta, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(
+        compiled_linalg.pose_minus(R, t, pose.rotation, pose.translation), delta, rtol=0, atol=1e-12
+    )
 
 
 @settings(max_examples=30, deadline=None)

@@ -13,19 +13,19 @@ from geometry.pose_prior import PosePrior
 from geometry.rig import Rig
 from geometry.uncertainty.rig_parameters import RigCovariance
 from lab.simulate.points import CLUTTER, PointRun
-from lab.simulate.scenarios import Prior
+from lab.simulate.scenarios import PriorRegion
 from lab.simulate.scene import HIDDEN, OUTSIDE, SHINING
 from tracking.detections import UNMATCHED, Detections
 from tracking.parameters import TrackerParameters
 from tracking.rigid_body.rigid_tracker import RigidTracker
-from tracking.smoothing.recording import Recording
+from tracking.smoothing.recording import TrackedRecording
 from tracking.smoothing.smoothed import Smoothed
 from tracking.smoothing.smoother import smooth
 from tracking.tracked_frame import TrackedFrame
 
 START = 10  # frames until the velocities are known
 RIGID = TrackerParameters()
-NEAR_THE_ORIGIN = Prior((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.3, 15.0)
+NEAR_THE_ORIGIN = PriorRegion((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.3, 15.0)
 
 
 def prior_of(run: PointRun) -> PosePrior:
@@ -62,7 +62,7 @@ def looked_at_again(
     covariance: RigCovariance | None = None,
 ) -> tuple[list[TrackedFrame], Smoothed]:
     """The smoother's answers after the tracker's."""
-    recording = Recording(rig or run.rig, parameters, covariance)
+    recording = TrackedRecording(rig or run.rig, parameters, covariance)
     for k, frame in enumerate(frames):
         recording.append(dt_of(run, k), found_in(run, k), frame)
     smoothed = smooth(recording)
@@ -178,7 +178,7 @@ def filmed(
     seed: int,
     turned: Bools | None = None,
     hide: Bools | None = None,
-    prior: Prior = NEAR_THE_ORIGIN,
+    prior: PriorRegion = NEAR_THE_ORIGIN,
 ) -> PointRun:
     """A recording of a motion (T poses at t_s) as points, without false ones. hide (T, n): spots that do not shine."""
     model, frames = SpotModel.of(rig), len(t_s)

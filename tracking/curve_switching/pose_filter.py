@@ -17,7 +17,7 @@ from geometry.pose import Pose
 
 
 @dataclass(frozen=True, slots=True)
-class Motion:
+class RigidMotion:
     """Pose and velocities with their covariance."""
 
     world_from_body: Pose
@@ -36,16 +36,16 @@ class Motion:
         return self.P[:6, :6]
 
 
-def begin(pose: Pose, covariance: Array, sigma_velocity_m_s: float = 3.0, sigma_rate_rad_s: float = 3.0) -> Motion:
+def begin(pose: Pose, covariance: Array, sigma_velocity_m_s: float = 3.0, sigma_rate_rad_s: float = 3.0) -> RigidMotion:
     """At rest, as far as anyone knows: a pose, its covariance (6, 6), and wide sigmas of the velocities."""
     P = np.zeros((12, 12))
     P[:6, :6] = covariance
     P[6:9, 6:9] = sigma_velocity_m_s**2 * np.eye(3)
     P[9:, 9:] = sigma_rate_rad_s**2 * np.eye(3)
-    return Motion(pose, np.zeros(3), np.zeros(3), P)
+    return RigidMotion(pose, np.zeros(3), np.zeros(3), P)
 
 
-def predict(motion: Motion, dt_s: float, sigma_a_m_s2: float, sigma_a_rad_s2: float) -> Motion:
+def predict(motion: RigidMotion, dt_s: float, sigma_a_m_s2: float, sigma_a_rad_s2: float) -> RigidMotion:
     """One step on, with white accelerations that are constant within the step."""
     turn = motion.rate * dt_s
     pose = motion.world_from_body.plus(np.concatenate([motion.velocity * dt_s, turn]))
@@ -59,10 +59,10 @@ def predict(motion: Motion, dt_s: float, sigma_a_m_s2: float, sigma_a_rad_s2: fl
     Q[i, i] = a2 * dt_s**4 / 4
     Q[i, i + 6] = Q[i + 6, i] = a2 * dt_s**3 / 2
     Q[i + 6, i + 6] = a2 * dt_s**2
-    return Motion(pose, motion.velocity, motion.rate, symmetric(F @ motion.P @ F.T + Q))
+    return RigidMotion(pose, motion.velocity, motion.rate, symmetric(F @ motion.P @ F.T + Q))
 
 
-def corrected(motion: Motion, y: Array, H: Array, R: Array) -> tuple[Motion, Array]:
+def corrected(motion: RigidMotion, y: Array, H: Array, R: Array) -> tuple[RigidMotion, Array]:
     """After a measurement: innovation y (k,), Jacobian H (k, 6) of the pose, covariance R (k, k). Also S (k, k)."""
     PH = motion.P[:, :6] @ H.T
     S = H @ PH[:6] + R
@@ -72,12 +72,12 @@ def corrected(motion: Motion, y: Array, H: Array, R: Array) -> tuple[Motion, Arr
     P = symmetric(keep @ motion.P @ keep.T + K @ R @ K.T)
     d = K @ y
     return (
-        Motion(motion.world_from_body.plus(d[:6]), motion.velocity + d[6:9], motion.rate + d[9:], P),
+        RigidMotion(motion.world_from_body.plus(d[:6]), motion.velocity + d[6:9], motion.rate + d[9:], P),
         S,
     )
 
 
-def corrected_by_pose(motion: Motion, pose: Pose, covariance: Array) -> tuple[Motion, Array, Array]:
+def corrected_by_pose(motion: RigidMotion, pose: Pose, covariance: Array) -> tuple[RigidMotion, Array, Array]:
     """After a measured pose with covariance (6, 6); also the innovation (6,) and its covariance (6, 6)."""
     y = pose.minus(motion.world_from_body)
     after, S = corrected(motion, y, np.eye(6), covariance)

@@ -310,8 +310,8 @@ class SpotTracker:
         seen = point != UNMATCHED
         cov = self._with_blends(fit, uv, cov, seen)
         estimate, estimate_cov, exists = self._estimates(fit, uv)
-        witness = seen if fit is None else np.isin(np.arange(len(self.model)), fit.rows)
-        self._update_tracks(uv, cov, witness, turned, estimate, estimate_cov, exists, fit is not None)
+        used_in_pose = seen if fit is None else np.isin(np.arange(len(self.model)), fit.rows)
+        self._update_tracks(uv, cov, used_in_pose, turned, estimate, estimate_cov, exists, fit is not None)
         t = self.tracks
         rest = ~seen
         uv = np.where(rest[:, None], np.where(exists[:, None], estimate, t.x[:, :2]), uv)
@@ -336,7 +336,7 @@ class SpotTracker:
             spots_used=len(fit.rows) if fit is not None else (int(np.count_nonzero(seen)) if pose is not None else 0),
             rms_px=fit.rms_px if fit is not None else float("nan"),
             events=tuple(events),
-            witness=witness & seen,
+            used_in_pose=used_in_pose & seen,
         )
 
     def _believed(self, found: Sequence[Detections | None], point: Ints) -> Ints:

@@ -9,7 +9,7 @@ import numpy as np
 from geometry.arrays import Array, Bools
 from geometry.forward_model import SpotModel
 from tracking.curve_switching import kalman
-from tracking.curve_switching.pose_filter import Motion
+from tracking.curve_switching.pose_filter import RigidMotion
 from tracking.parameters import TrackerParameters
 
 BENT_NIS = 25.0  # squared sigmas: a spot this far from its prediction has turned (p = 4e-6)
@@ -58,7 +58,7 @@ class Tracks:
         self.last_age_s += dt_s
         self.unseen_s = self.unseen_s + dt_s
 
-    def carry(self, views: Bools, model: SpotModel, motion: Motion) -> None:
+    def carry(self, views: Bools, model: SpotModel, motion: RigidMotion) -> None:
         """Give the tracks `views` (n,) the position, rate and covariance that the vehicle's motion means for them."""
         uv, J = model.project(motion.world_from_body)
         exists = ~np.isnan(uv[:, 0])

@@ -13,7 +13,7 @@ from geometry.pose import Pose
 from geometry.pose_prior import PosePrior
 from geometry.pose_solver.gauss_newton import PoseFit, point_covariance
 from tracking.curve_switching import pose_filter
-from tracking.curve_switching.pose_filter import Motion
+from tracking.curve_switching.pose_filter import RigidMotion
 from tracking.parameters import TrackerParameters
 from tracking.statuses import LOST_SIGMA_M, LOST_SIGMA_RAD, PoseStatus
 
@@ -31,7 +31,7 @@ class Vehicle:
 
     def __init__(self, parameters: TrackerParameters) -> None:
         self.parameters = parameters
-        self.motion: Motion | None = None
+        self.motion: RigidMotion | None = None
         self.anchor: Pose | None = None  # the last measured pose ...
         self.anchor_age_s = 0.0  # ... and its age
         self._accelerations = np.array([parameters.pose_sigma_a_m_s2, parameters.pose_sigma_a_rad_s2])
@@ -152,7 +152,7 @@ class Vehicle:
         """What the calibration's errors leave open of each view's expected pixel, (count, 2, 2), px^2."""
         return np.zeros((count, 2, 2)) + self._systematic_px
 
-    def _darkened(self, motion: Motion) -> Motion:
+    def _darkened(self, motion: RigidMotion) -> RigidMotion:
         """More process noise than the ordinary prediction has already added."""
         P = motion.P.copy()
         i = np.arange(6, 12)

@@ -13,7 +13,7 @@ from geometry.camera import SensorNoise
 from tracking.detection.block_search import Blocks, bin_pixels, runs_of
 from tracking.detection.candidates import AT_U, AT_V, HEIGHT, NEAREST, Noise, find_apart, room_for_a_block
 from tracking.detection.gaussian_fit import reach_of
-from tracking.detection.measuring import Limits, measure, write_out
+from tracking.detection.measuring import DetectionLimits, measure, write_out
 from tracking.detection.pixels import Pixels
 from tracking.detection.regions import MARGIN, NEAR, boxes_of, find_relevant
 from tracking.detection.search import HALO, find_peaks_in
@@ -157,14 +157,14 @@ class _Task(NamedTuple):
     image: Picture
     pixels: Pixels
     noise: Noise
-    limits: Limits
+    limits: DetectionLimits
 
     @staticmethod
     def of(image: Picture, parameters: DetectParameters, noise: NoiseModel | None) -> _Task:
         model = noise or guess_noise(image)
         image = image if image.flags.c_contiguous else image.copy()
         saturation = parameters.saturation_dn
-        limits = Limits(
+        limits = DetectionLimits(
             float(parameters.threshold_sigma),
             float(np.iinfo(image.dtype).max if saturation is None else saturation),
             float(parameters.min_sigma_px),

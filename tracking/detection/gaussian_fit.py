@@ -10,7 +10,7 @@ from geometry.arrays import Array
 from geometry.compilation.jit import compiled
 from tracking.detection import ellipse
 from tracking.detection.candidates import Noise
-from tracking.detection.normal_equations import Frame, accumulate, add_light, frame_of, solve_normal
+from tracking.detection.normal_equations import PolynomialFrame, accumulate, add_light, frame_of, solve_normal
 from tracking.detection.pixels import VALID, Pixels, Window, cut, window_around
 from tracking.detection.quality import gain_over_plane, judge
 from tracking.detection.table import (
@@ -257,7 +257,7 @@ def _leave_out_lonely(window: Window, spot: Array, cells: Array) -> bool:
 
 
 @compiled
-def _solve(frame: Frame, algebra: Array) -> bool:
+def _solve(frame: PolynomialFrame, algebra: Array) -> bool:
     """Into the columns of X: the step, and N^-1 times the directions of the centre's u' and v' and of the flux."""
     X = algebra[SOLUTION]
     for p in range(9):
@@ -269,7 +269,7 @@ def _solve(frame: Frame, algebra: Array) -> bool:
 
 
 @compiled
-def _flux_direction(frame: Frame, X: Array, column: int) -> None:
+def _flux_direction(frame: PolynomialFrame, X: Array, column: int) -> None:
     """How the relative flux depends on the coefficients."""
     X[0, column] = 1.0
     X[3, column] = frame.S[0] / frame.su**2
@@ -278,7 +278,7 @@ def _flux_direction(frame: Frame, X: Array, column: int) -> None:
 
 
 @compiled
-def _centre_covariance(frame: Frame, X: Array) -> tuple[float, float, float]:
+def _centre_covariance(frame: PolynomialFrame, X: Array) -> tuple[float, float, float]:
     """var(u), var(v), cov(u, v), px^2: the Cramer-Rao bound of the model."""
     a, b, c = X[1, 1] / frame.su**2, X[1, 2] / (frame.su * frame.sv), X[2, 2] / frame.sv**2
     p, q, r = frame.S
@@ -290,7 +290,7 @@ def _centre_covariance(frame: Frame, X: Array) -> tuple[float, float, float]:
 
 
 @compiled
-def _flux_variance(frame: Frame, X: Array) -> float:
+def _flux_variance(frame: PolynomialFrame, X: Array) -> float:
     """Of the flux, over its square."""
     relative = (
         X[0, 3]
@@ -302,7 +302,7 @@ def _flux_variance(frame: Frame, X: Array) -> float:
 
 
 @compiled
-def _advance(frame: Frame, spot: Array, X: Array) -> None:
+def _advance(frame: PolynomialFrame, spot: Array, X: Array) -> None:
     """Step, held to one sigma of the spot in length, to a factor 2.5 in its variances and to 5 in its flux.
 
     With light F (1 + f) and a step d the coefficient of the derivative is (1 + f) d, not d.

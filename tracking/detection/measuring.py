@@ -54,7 +54,7 @@ NARROWER = 0.5  # a spot narrower than so much of another one is not that one fo
 _ONE_LIGHT = 1.5  # sigmas of a brighter spot: in its middle a second one is the same light
 
 
-class Limits(NamedTuple):
+class DetectionLimits(NamedTuple):
     """tracking.parameters.DetectParameters for compiled code."""
 
     threshold_sigma: float
@@ -66,7 +66,14 @@ class Limits(NamedTuple):
 
 @compiled_for_threads
 def measure(
-    image: Pixels, peaks: Array, chosen: Ints, noise: Noise, limits: Limits, table: Array, cells: Array, algebra: Array
+    image: Pixels,
+    peaks: Array,
+    chosen: Ints,
+    noise: Noise,
+    limits: DetectionLimits,
+    table: Array,
+    cells: Array,
+    algebra: Array,
 ) -> None:
     """Measure the chosen peaks (n,), into table (n, COLUMNS)."""
     for k in range(chosen.shape[0]):
@@ -85,7 +92,7 @@ def measure(
 
 
 @compiled
-def _is_spot(image: Pixels, spot: Array, noise: Noise, limits: Limits) -> bool:
+def _is_spot(image: Pixels, spot: Array, noise: Noise, limits: DetectionLimits) -> bool:
     if not spot[FLUX] > 0.0:
         return False
     major, minor, _ = ellipse.axes(spot[UU], spot[UV], spot[VV])
@@ -108,7 +115,7 @@ def _is_spot(image: Pixels, spot: Array, noise: Noise, limits: Limits) -> bool:
 
 
 @compiled
-def _is_compact(image: Pixels, spot: Array, noise: Noise, limits: Limits, few: Array) -> bool:
+def _is_compact(image: Pixels, spot: Array, noise: Noise, limits: DetectionLimits, few: Array) -> bool:
     """Whether a candidate that the fit does not explain is light all the same; then its row becomes the moments'."""
     uu, uv, vv = spot[MOMENT_UU], spot[MOMENT_UV], spot[MOMENT_VV]
     major, minor, _ = ellipse.axes(uu, uv, vv)

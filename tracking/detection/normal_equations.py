@@ -54,7 +54,7 @@ _EIGHT = np.polynomial.legendre.leggauss(8)
 _NODES4, _WEIGHTS4, _NODES8, _WEIGHTS8 = _FOUR[0] / 2, _FOUR[1] / 2, _EIGHT[0] / 2, _EIGHT[1] / 2
 
 
-class Frame(NamedTuple):
+class PolynomialFrame(NamedTuple):
     """What coordinates the polynomial is written in: from the spot's centre, in units of its widths."""
 
     u0: float  # px, the first cell's centre from the spot's
@@ -66,14 +66,16 @@ class Frame(NamedTuple):
 
 
 @compiled
-def frame_of(window: Window, spot: Array) -> Frame:
+def frame_of(window: Window, spot: Array) -> PolynomialFrame:
     """The frame of a spot (9,) in a window."""
     middle, pixel = 0.5 * (window.cell - 1), window.cell**2 / 12.0
     exact = window.cell == 1 and ellipse.eigenvalues(spot[UU], spot[UV], spot[VV])[0] < EXACT_PX2
     if exact:
         pixel = 0.0
     S = (spot[UU] + pixel, spot[UV], spot[VV] + pixel)
-    return Frame(window.left + middle - spot[U], window.top + middle - spot[V], sqrt(S[0]), sqrt(S[2]), S, exact)
+    return PolynomialFrame(
+        window.left + middle - spot[U], window.top + middle - spot[V], sqrt(S[0]), sqrt(S[2]), S, exact
+    )
 
 
 @compiled
@@ -122,7 +124,7 @@ def accumulate(window: Window, spot: Array, noise: Noise, cells: Array, algebra:
 
 
 @compiled
-def _weigh(window: Window, r: int, frame: Frame, spot: Array, noise: Noise, row: Array, cells: Array) -> None:
+def _weigh(window: Window, r: int, frame: PolynomialFrame, spot: Array, noise: Noise, row: Array, cells: Array) -> None:
     """Light (given in `row`), residual and weight of a row of cells. Without branches: vector units do it."""
     first, last = r * window.columns, (r + 1) * window.columns
     cell = float(window.cell)
@@ -140,7 +142,7 @@ def _weigh(window: Window, r: int, frame: Frame, spot: Array, noise: Noise, row:
 
 
 @compiled
-def _sum_row(window: Window, r: int, frame: Frame, cells: Array, sums: Array) -> None:
+def _sum_row(window: Window, r: int, frame: PolynomialFrame, cells: Array, sums: Array) -> None:
     """Moments along a row by x: w l^2 (5), w l (4), w (3), w l r (3), w r (2)."""
     first, last = r * window.columns, (r + 1) * window.columns
     light, rest, weight = cells[LIGHT, first:last], cells[RESIDUAL, first:last], cells[WEIGHT, first:last]
@@ -214,7 +216,7 @@ def _integrate_row(a: tuple[float, float, float], u0: float, v: float, cell: flo
 
 @compiled
 def _accumulate_exact(
-    window: Window, frame: Frame, spot: Array, noise: Noise, cells: Array, N: Array, b: Array
+    window: Window, frame: PolynomialFrame, spot: Array, noise: Noise, cells: Array, N: Array, b: Array
 ) -> float:
     """The same for a spot so narrow that its light and the derivatives are integrated over each pixel by nodes."""
     low = ellipse.eigenvalues(spot[UU], spot[UV], spot[VV])[0]
@@ -249,7 +251,7 @@ def _accumulate_exact(
 
 @compiled
 def _moments_of_row(
-    frame: Frame, inverse: tuple[float, float, float], dv: float, nodes: Array, weights: Array, scale: float,
+    frame: PolynomialFrame, inverse: tuple[float, float, float], dv: float, nodes: Array, weights: Array, scale: float,
     columns: int, cells: Array,
 ) -> None:  # fmt: skip
     """Pixel means of the light times 1, x, y, x^2, x y, y^2 along a row of pixels, into cells[NODES:]."""

@@ -7,7 +7,7 @@ from math import sqrt
 from geometry.arrays import Array
 from geometry.compilation.jit import compiled
 from tracking.detection import ellipse
-from tracking.detection.normal_equations import Frame
+from tracking.detection.normal_equations import PolynomialFrame
 from tracking.detection.pixels import OUTSIDE, Window
 from tracking.detection.table import (
     CHI2,
@@ -31,7 +31,7 @@ _LAGS = 2  # cells
 
 
 @compiled
-def judge(window: Window, frame: Frame, chi2: float, cells: Array, spot: Array) -> None:
+def judge(window: Window, frame: PolynomialFrame, chi2: float, cells: Array, spot: Array) -> None:
     """Complete what a spot (COLUMNS,) says of itself, which has covariances and GAIN; chi2 is that after its last step.
 
     The covariance given is the Cramer-Rao bound of the model; it
@@ -75,7 +75,7 @@ def gain_over_plane(N: Array, b: Array, before: float, chi2: float) -> float:
 
 
 @compiled
-def _misfit(window: Window, frame: Frame, cells: Array, used: int) -> float:
+def _misfit(window: Window, frame: PolynomialFrame, cells: Array, used: int) -> float:
     """Factor >= 1 by which the model's faults raise the covariance of the centre.
 
     Only the part of the residuals that is odd about the centre can move it: a flat top, a ring or a streak is a bad
@@ -109,7 +109,7 @@ def _misfit(window: Window, frame: Frame, cells: Array, used: int) -> float:
 
 
 @compiled
-def _lopsided(window: Window, frame: Frame, cells: Array, odd: Array, doubled: float) -> float:
+def _lopsided(window: Window, frame: PolynomialFrame, cells: Array, odd: Array, doubled: float) -> float:
     """The factor where there is a misfit; `odd` (cells,), residuals in sigmas, is overwritten."""
     count = window.columns * window.rows
     share = cells[OTHERS]  # no longer needed

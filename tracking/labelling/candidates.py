@@ -26,7 +26,7 @@ LOG_2PI = float(np.log(2 * np.pi))
 SAME_M, SAME_TRACE = 0.05, 0.005  # m; 3 - trace of the turn between them, 0.005: 4 deg
 
 
-class Sight(NamedTuple):
+class SpotGeometry(NamedTuple):
     """What the search needs of the n views beside their projection."""
 
     camera: Ints  # (n,)
@@ -42,7 +42,7 @@ class Sight(NamedTuple):
     spot_screen: Ints  # (spots,) -1: observed by no camera that has a picture
 
 
-class Limits(NamedTuple):
+class LabelLimits(NamedTuple):
     """A prior's numbers."""
 
     R: Array  # (3, 3)
@@ -81,11 +81,11 @@ class Best(NamedTuple):
 @compiled
 def generate(
     views: Views,
-    sight: Sight,
+    spot_geometry: SpotGeometry,
     points: Points,
     screens: PointsOnScreens,
     reached: Bools,
-    limits: Limits,
+    limits: LabelLimits,
     triples: Ints,
     best: Best,
 ) -> int:
@@ -110,10 +110,10 @@ def generate(
     for row in range(triples.shape[0]):
         for i in range(3):
             for a in range(3):
-                body[i, a] = sight.spot_point[triples[row, i], a]
-                rays[i, a] = sight.spot_ray[triples[row, i], a]
+                body[i, a] = spot_geometry.spot_point[triples[row, i], a]
+                rays[i, a] = spot_geometry.spot_ray[triples[row, i], a]
         s0, s1, s2 = triples[row, 0], triples[row, 1], triples[row, 2]
-        k0, k1, k2 = sight.spot_screen[s0], sight.spot_screen[s1], sight.spot_screen[s2]
+        k0, k1, k2 = spot_geometry.spot_screen[s0], spot_geometry.spot_screen[s1], spot_geometry.spot_screen[s2]
         for i0 in range(screens.first[k0], screens.first[k0 + 1]):
             p0 = screens.point[i0]
             if not reached[s0, p0]:
@@ -139,9 +139,22 @@ def generate(
                             s = triples[row, i]
                             p = p0 if i == 0 else (p1 if i == 1 else p2)
                             seed_point[i] = p
-                            seed_view[i] = sight.view_at[s, camera_of(points.first, p)]
+                            seed_view[i] = spot_geometry.view_at[s, camera_of(points.first, p)]
                         score = _weigh(
-                            views, sight, points, limits, R, t, seed_view, seed_point, labels, gain, uv, J, H, left
+                            views,
+                            spot_geometry,
+                            points,
+                            limits,
+                            R,
+                            t,
+                            seed_view,
+                            seed_point,
+                            labels,
+                            gain,
+                            uv,
+                            J,
+                            H,
+                            left,
                         )
                         if score > -np.inf:
                             _keep(best, score, R, t, seed_view, seed_point, labels)
@@ -149,7 +162,7 @@ def generate(
 
 
 @compiled
-def allowed(limits: Limits, R: Array, t: Array) -> bool:
+def allowed(limits: LabelLimits, R: Array, t: Array) -> bool:
     """Whether the prior holds a pose."""
     trace = 0.0
     for a in range(3):
@@ -172,9 +185,9 @@ def camera_of(first: Ints, point: int) -> int:
 @compiled
 def _weigh(
     views: Views,
-    sight: Sight,
+    spot_geometry: SpotGeometry,
     points: Points,
-    limits: Limits,
+    limits: LabelLimits,
     R: Array,
     t: Array,
     seed_view: Ints,
@@ -202,19 +215,23 @@ def _weigh(
         if np.isnan(uv[v, 0]):
             return -np.inf
         labels[v] = p
-        det = add_information(H, J[v], points.cov[p], sight.model_cov[v])
-        score += found - points.log_density[sight.camera[v]] - 0.5 * np.log(det)
+        det = add_information(H, J[v], points.cov[p], spot_geometry.model_cov[v])
+        score += found - points.log_density[spot_geometry.camera[v]] - 0.5 * np.log(det)
         gain[v] = np.inf
     log_det = cholesky(H)
     if log_det == -np.inf:
         return -np.inf
     score -= 0.5 * log_det
     for v in range(n):
-        if labels[v] != NO_POINT or not sight.has_image[v] or not inside(uv[v], sight.size[v]):
+        if labels[v] != NO_POINT or not spot_geometry.has_image[v] or not inside(uv[v], spot_geometry.size[v]):
             continue
         a, b, c = predicted_spread(H, J[v], left)
-        a, b, c = a + sight.model_cov[v, 0, 0], b + sight.model_cov[v, 0, 1], c + sight.model_cov[v, 1, 1]
-        camera = sight.camera[v]
+        a, b, c = (
+            a + spot_geometry.model_cov[v, 0, 0],
+            b + spot_geometry.model_cov[v, 0, 1],
+            c + spot_geometry.model_cov[v, 1, 1],
+        )
+        camera = spot_geometry.camera[v]
         best, best_point = missed, NO_POINT
         for p in range(points.first[camera], points.first[camera + 1]):
             du, dv = points.uv[p, 0] - uv[v, 0], points.uv[p, 1] - uv[v, 1]
@@ -242,7 +259,7 @@ def _weigh(
             labels[owner] = NO_POINT
         labels[v], gain[v] = best_point, best
         score += best
-    if distinct_spots(labels, sight.spot) < limits.min_spots:
+    if distinct_spots(labels, spot_geometry.spot) < limits.min_spots:
         return -np.inf
     return score
 

@@ -20,8 +20,8 @@ from tracking.labelling.candidates import (
     LOG_2PI,
     NO_POINT,
     Best,
-    Limits,
-    Sight,
+    LabelLimits,
+    SpotGeometry,
     add_information,
     allowed,
     cholesky,
@@ -30,7 +30,7 @@ from tracking.labelling.candidates import (
 )
 from tracking.labelling.points import Points
 
-_moved, best_first = compiled_linalg.moved, compiled_linalg.best_first
+_moved, best_first = compiled_linalg.pose_plus, compiled_linalg.best_first
 
 # The model's error as shares of the largest allowed, and the log of how probable each is. A model that is off by more
 # than the points' noise is improbable, as it must be: with equal weights false points near four hidden spots made a
@@ -44,7 +44,7 @@ MISFIT_PER_POINT = 12.0  # squared sigmas of the two residuals of a point: above
 
 @compiled
 def complete_all(
-    views: Views, sight: Sight, points: Points, limits: Limits, front: Array, best: Best, most: int
+    views: Views, spot_geometry: SpotGeometry, points: Points, limits: LabelLimits, front: Array, best: Best, most: int
 ) -> tuple[Array, Array, Ints, Array, Ints, Ints]:
     """The likeliest `most` candidates completed, as `complete` has it, with a leading axis (most,)."""
     count, n = most, views.shape[0]
@@ -56,7 +56,7 @@ def complete_all(
         i = order[k]
         R_k, t_k, evidence[k], share[k], expected[k] = complete(
             views,
-            sight,
+            spot_geometry,
             points,
             limits,
             front,
@@ -76,9 +76,9 @@ def complete_all(
 @compiled
 def complete(
     views: Views,
-    sight: Sight,
+    spot_geometry: SpotGeometry,
     points: Points,
-    limits: Limits,
+    limits: LabelLimits,
     front: Array,
     seed_view: Ints,
     seed_point: Ints,
@@ -102,43 +102,48 @@ def complete(
         for v in range(n):
             refused[v] = False
         while True:
-            R, t, ok = _fit(views, sight, points, labels, 1.0, R, t, 2, uv, J, H)
+            R, t, ok = _fit(views, spot_geometry, points, labels, 1.0, R, t, 2, uv, J, H)
             if not ok:
                 return R, t, -np.inf, 0, 0
             chosen, smallest = -1, np.inf
             a = b = c = 0.0
             for v in range(n):
-                if labels[v] != NO_POINT or refused[v] or not sight.has_image[v] or not inside(uv[v], sight.size[v]):
+                if (
+                    labels[v] != NO_POINT
+                    or refused[v]
+                    or not spot_geometry.has_image[v]
+                    or not inside(uv[v], spot_geometry.size[v])
+                ):
                     continue
                 a_, b_, c_ = predicted_spread(H, J[v], left)
                 if a_ + c_ < smallest:
                     chosen, smallest, a, b, c = v, a_ + c_, a_, b_, c_
             if chosen < 0:
                 break
-            p = _nearest(sight, points, limits, labels, chosen, uv[chosen], a, b, c)
+            p = _nearest(spot_geometry, points, limits, labels, chosen, uv[chosen], a, b, c)
             if p == NO_POINT:
                 refused[chosen] = True
             else:
                 labels[chosen] = p
-    R, t, ok = _fit(views, sight, points, labels, 1.0, R, t, 6, uv, J, H)
+    R, t, ok = _fit(views, spot_geometry, points, labels, 1.0, R, t, 6, uv, J, H)
     while ok:
-        worst = _worst(sight, points, labels, uv, J, H, left)
+        worst = _worst(spot_geometry, points, labels, uv, J, H, left)
         if worst < 0:
             break
         labels[worst] = NO_POINT
-        if distinct_spots(labels, sight.spot) < limits.min_spots:
+        if distinct_spots(labels, spot_geometry.spot) < limits.min_spots:
             ok = False
         else:
-            R, t, ok = _fit(views, sight, points, labels, 1.0, R, t, 6, uv, J, H)
-    if not ok or distinct_spots(labels, sight.spot) < limits.min_spots or not allowed(limits, R, t):
+            R, t, ok = _fit(views, spot_geometry, points, labels, 1.0, R, t, 6, uv, J, H)
+    if not ok or distinct_spots(labels, spot_geometry.spot) < limits.min_spots or not allowed(limits, R, t):
         return R, t, -np.inf, 0, 0
-    return _evidence(views, sight, points, limits, front, labels, R, t, uv, J, H)
+    return _evidence(views, spot_geometry, points, limits, front, labels, R, t, uv, J, H)
 
 
 @compiled
 def _fit(
     views: Views,
-    sight: Sight,
+    spot_geometry: SpotGeometry,
     points: Points,
     labels: Ints,
     share: float,
@@ -170,8 +175,8 @@ def _fit(
             p = labels[v]
             for i in range(2):
                 for j in range(2):
-                    model[i, j] = sight.known_cov[v, i, j]
-                model[i, i] += share * share * sight.allowance
+                    model[i, j] = spot_geometry.known_cov[v, i, j]
+                model[i, i] += share * share * spot_geometry.allowance
             det = add_information(H, J[v], points.cov[p], model)
             a, b, c = (
                 points.cov[p, 0, 0] + model[0, 0],
@@ -214,10 +219,18 @@ def _solve_with(L: Array, x: Array) -> None:
 
 @compiled
 def _nearest(
-    sight: Sight, points: Points, limits: Limits, labels: Ints, v: int, uv: Array, a: float, b: float, c: float
+    spot_geometry: SpotGeometry,
+    points: Points,
+    limits: LabelLimits,
+    labels: Ints,
+    v: int,
+    uv: Array,
+    a: float,
+    b: float,
+    c: float,
 ) -> int:
     """The free point that explains a view best, or NO_POINT where none is likelier than a missed spot."""
-    camera = sight.camera[v]
+    camera = spot_geometry.camera[v]
     best, chosen = (
         np.log(1 - limits.p_detect) - np.log(limits.p_detect) + points.log_density[camera] + LOG_2PI,
         NO_POINT,
@@ -230,9 +243,9 @@ def _nearest(
         if not free:
             continue
         du, dv = points.uv[p, 0] - uv[0], points.uv[p, 1] - uv[1]
-        A = a + points.cov[p, 0, 0] + sight.model_cov[v, 0, 0]
-        B = b + points.cov[p, 0, 1] + sight.model_cov[v, 0, 1]
-        C = c + points.cov[p, 1, 1] + sight.model_cov[v, 1, 1]
+        A = a + points.cov[p, 0, 0] + spot_geometry.model_cov[v, 0, 0]
+        B = b + points.cov[p, 0, 1] + spot_geometry.model_cov[v, 0, 1]
+        C = c + points.cov[p, 1, 1] + spot_geometry.model_cov[v, 1, 1]
         det = A * C - B * B
         d2 = (C * du * du - 2 * B * du * dv + A * dv * dv) / det
         value = -0.5 * (np.log(det) + d2)
@@ -242,7 +255,9 @@ def _nearest(
 
 
 @compiled
-def _worst(sight: Sight, points: Points, labels: Ints, uv: Array, J: Array, L: Array, left: Array) -> int:
+def _worst(
+    spot_geometry: SpotGeometry, points: Points, labels: Ints, uv: Array, J: Array, L: Array, left: Array
+) -> int:
     """The view whose point misfits most for its share of the fit, if any misfits; else -1."""
     worst, largest = -1, MISFIT_PER_POINT
     for v in range(labels.shape[0]):
@@ -250,9 +265,9 @@ def _worst(sight: Sight, points: Points, labels: Ints, uv: Array, J: Array, L: A
         if p == NO_POINT:
             continue
         a, b, c = predicted_spread(L, J[v], left)
-        A = points.cov[p, 0, 0] + sight.model_cov[v, 0, 0]
-        B = points.cov[p, 0, 1] + sight.model_cov[v, 0, 1]
-        C = points.cov[p, 1, 1] + sight.model_cov[v, 1, 1]
+        A = points.cov[p, 0, 0] + spot_geometry.model_cov[v, 0, 0]
+        B = points.cov[p, 0, 1] + spot_geometry.model_cov[v, 0, 1]
+        C = points.cov[p, 1, 1] + spot_geometry.model_cov[v, 1, 1]
         # The residual's own covariance: noise less what the fit has adapted to. Where that is all, nothing is tested.
         a, b, c = max(A - a, 1e-3 * A), B - b, max(C - c, 1e-3 * C)
         det = a * c - b * b
@@ -277,9 +292,9 @@ def _first_of_spot(spot: Ints, labels: Ints, v: int) -> int:
 @compiled
 def _evidence(
     views: Views,
-    sight: Sight,
+    spot_geometry: SpotGeometry,
     points: Points,
-    limits: Limits,
+    limits: LabelLimits,
     front: Array,
     labels: Ints,
     R: Array,
@@ -295,7 +310,11 @@ def _evidence(
     for c in range(cameras):
         used = 0
         for v in range(n):
-            used += sight.camera[v] == c and labels[v] != NO_POINT and _first_of_spot(sight.spot, labels, v) == v
+            used += (
+                spot_geometry.camera[v] == c
+                and labels[v] != NO_POINT
+                and _first_of_spot(spot_geometry.spot, labels, v) == v
+            )
         fixed += points.log_unused[c, used]
     logs = np.full(SHARES.shape[0], -np.inf)
     best, best_R, best_t = 0, R, t
@@ -304,7 +323,7 @@ def _evidence(
         if labels[v] != NO_POINT:
             count += 1
             fixed += found - LOG_2PI
-        elif sight.has_image[v] and inside(uv[v], sight.size[v]):
+        elif spot_geometry.has_image[v] and inside(uv[v], spot_geometry.size[v]):
             expected += 1
             fixed += missed
     for v in range(n):
@@ -325,7 +344,7 @@ def _evidence(
         if height < 0.0 and new:
             fixed += LOG_REAR
     for k in range(SHARES.shape[0]):
-        R, t, ok = _fit(views, sight, points, labels, SHARES[k], R, t, 2, uv, J, H)
+        R, t, ok = _fit(views, spot_geometry, points, labels, SHARES[k], R, t, 2, uv, J, H)
         if not ok:
             break
         value = fixed + LOG_WEIGHTS[k]
@@ -335,14 +354,14 @@ def _evidence(
             p = labels[v]
             if p == NO_POINT:
                 continue
-            allowance = SHARES[k] ** 2 * sight.allowance
-            A = points.cov[p, 0, 0] + sight.known_cov[v, 0, 0] + allowance
-            B = points.cov[p, 0, 1] + sight.known_cov[v, 0, 1]
-            C = points.cov[p, 1, 1] + sight.known_cov[v, 1, 1] + allowance
+            allowance = SHARES[k] ** 2 * spot_geometry.allowance
+            A = points.cov[p, 0, 0] + spot_geometry.known_cov[v, 0, 0] + allowance
+            B = points.cov[p, 0, 1] + spot_geometry.known_cov[v, 0, 1]
+            C = points.cov[p, 1, 1] + spot_geometry.known_cov[v, 1, 1] + allowance
             det = A * C - B * B
             du, dv = points.uv[p, 0] - uv[v, 0], points.uv[p, 1] - uv[v, 1]
             value -= 0.5 * (np.log(det) + (C * du * du - 2 * B * du * dv + A * dv * dv) / det)
-            w = _first_of_spot(sight.spot, labels, v)
+            w = _first_of_spot(spot_geometry.spot, labels, v)
             if w != v:
                 # A false light on the screen, too, is seen by both cameras, at the same place of the screen.
                 q = labels[w]
@@ -352,8 +371,8 @@ def _evidence(
                 var = 0.5 * points.m_per_px[p] ** 2 * (A + C) + 0.5 * points.m_per_px[q] ** 2 * (
                     points.cov[q, 0, 0]
                     + points.cov[q, 1, 1]
-                    + sight.known_cov[w, 0, 0]
-                    + sight.known_cov[w, 1, 1]
+                    + spot_geometry.known_cov[w, 0, 0]
+                    + spot_geometry.known_cov[w, 1, 1]
                     + 2 * allowance
                 )
                 value += LOG_2PI + np.log(var / points.m_per_px[p] ** 2) + 0.5 * gap2 / var

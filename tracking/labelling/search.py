@@ -17,7 +17,7 @@ from geometry.rig import Rig
 from geometry.surfaces import meet_surface
 from geometry.uncertainty.rig_uncertainty import CalibrationSpread
 from tracking.detections import Detections
-from tracking.labelling.candidates import NO_POINT, Best, Limits, Sight, generate
+from tracking.labelling.candidates import NO_POINT, Best, LabelLimits, SpotGeometry, generate
 from tracking.labelling.completion import SHARES, complete_all
 from tracking.labelling.points import Points, PointsOnScreens, on_screens, points_of
 from tracking.labelling.triples import covering
@@ -127,8 +127,8 @@ def candidate_labellings(
     log_volume = min(prior.log_volume, plan.log_volume)
     points = points_of(rig, model, detections, parameters, partial(_reached_by_any, plan, prior))
     has_image = np.array([model.camera_names[c] in detections for c in model.camera_of])
-    sight = _sight(plan, points, has_image, parameters, _known_px(plan, calibration))
-    limits = Limits(
+    spot_geometry = _sight(plan, points, has_image, parameters, _known_px(plan, calibration))
+    limits = LabelLimits(
         np.ascontiguousarray(prior.centre.rotation, dtype=np.float64),
         np.array(prior.centre.translation, dtype=np.float64),
         prior.half_width_m,
@@ -140,17 +140,17 @@ def candidate_labellings(
     sigma_px = LARGEST_MODEL_ERROR * parameters.model_sigma_px
     best = Best.none(parameters.max_refined, len(model))
     brightness_known = all(np.isfinite(found.flux).any() for found in detections.values() if len(found))
-    screens, most_triples = _within_budget(plan, sight, points, reached, parameters, brightness_known, sigma_px)
+    screens, most_triples = _within_budget(plan, spot_geometry, points, reached, parameters, brightness_known, sigma_px)
     done = 0
     for size, end in plan.stages.items():
         now = plan.triples[done : min(end, most_triples)]
-        now = np.ascontiguousarray(now[(sight.spot_screen[now] >= 0).all(axis=1)])
+        now = np.ascontiguousarray(now[(spot_geometry.spot_screen[now] >= 0).all(axis=1)])
         done = end
-        generate(model.numbers, sight, points, screens, reached, limits, now, best)
+        generate(model.numbers, spot_geometry, points, screens, reached, limits, now, best)
         # What is not served yet explains two spots less: it is no rival.
-        if done >= most_triples or _spots_of_best(plan, sight, points, limits, best) > size:
+        if done >= most_triples or _spots_of_best(plan, spot_geometry, points, limits, best) > size:
             break
-    return _completed(plan, sight, points, limits, prior, log_volume, best, calibration, most, sigma_px)
+    return _completed(plan, spot_geometry, points, limits, prior, log_volume, best, calibration, most, sigma_px)
 
 
 def crowd_of_unknown_brightness(
@@ -189,17 +189,17 @@ def _reached_by_any(plan: RigPlan, prior: PosePrior, camera: int, places: Array)
     return np.asarray(_reached(plan, prior, places)[mine].any(axis=0) & np.isfinite(places).all(axis=-1))
 
 
-def _spots_of_best(plan: RigPlan, sight: Sight, points: Points, limits: Limits, best: Best) -> int:
+def _spots_of_best(plan: RigPlan, spot_geometry: SpotGeometry, points: Points, limits: LabelLimits, best: Best) -> int:
     """How many spots the likeliest candidate of those made so far explains."""
     if not best.taken[0]:
         return 0
-    _, _, labels, evidence, _, _ = complete_all(plan.model.numbers, sight, points, limits, plan.front, best, 1)
+    _, _, labels, evidence, _, _ = complete_all(plan.model.numbers, spot_geometry, points, limits, plan.front, best, 1)
     return len(set(plan.model.spot_of[labels[0] != NO_POINT])) if evidence[0] > -np.inf else 0
 
 
 def _within_budget(
     plan: RigPlan,
-    sight: Sight,
+    spot_geometry: SpotGeometry,
     points: Points,
     reached: Bools,
     parameters: LabelParameters,
@@ -216,7 +216,7 @@ def _within_budget(
     while True:
         screens = on_screens(points, plan.screen_of_camera, screen_count, sigma_px, most)
         options = np.zeros(len(plan.spot_screen))
-        for spot, k in enumerate(sight.spot_screen):
+        for spot, k in enumerate(spot_geometry.spot_screen):
             if k >= 0:
                 options[spot] = np.count_nonzero(reached[spot, screens.point[screens.first[k] : screens.first[k + 1]]])
         sets = np.cumsum(np.prod(options[plan.triples], axis=1))
@@ -244,14 +244,16 @@ def _known_px(plan: RigPlan, calibration: CalibrationSpread | None) -> Array:
     return px2
 
 
-def _sight(plan: RigPlan, points: Points, has_image: Bools, parameters: LabelParameters, known_cov: Array) -> Sight:
+def _sight(
+    plan: RigPlan, points: Points, has_image: Bools, parameters: LabelParameters, known_cov: Array
+) -> SpotGeometry:
     model = plan.model
     sigma2 = (LARGEST_MODEL_ERROR * parameters.model_sigma_px) ** 2
     with_points = {
         int(plan.screen_of_camera[c]) for c in range(len(model.camera_names)) if points.first[c + 1] > points.first[c]
     }
     seen = np.isin(plan.spot_screen, list(with_points)) & (plan.view_at >= 0).any(axis=1)
-    return Sight(
+    return SpotGeometry(
         model.camera_of,
         model.spot_of,
         model.image_size_px,
@@ -268,9 +270,9 @@ def _sight(plan: RigPlan, points: Points, has_image: Bools, parameters: LabelPar
 
 def _completed(
     plan: RigPlan,
-    sight: Sight,
+    spot_geometry: SpotGeometry,
     points: Points,
-    limits: Limits,
+    limits: LabelLimits,
     prior: PosePrior,
     log_volume: float,
     best: Best,
@@ -281,7 +283,7 @@ def _completed(
     """The best candidates completed, weighed, no two alike, best first."""
     model = plan.model
     R, t, labels_of, evidences, shares, expected_of = complete_all(
-        model.numbers, sight, points, limits, plan.front, best, int(best.taken[0])
+        model.numbers, spot_geometry, points, limits, plan.front, best, int(best.taken[0])
     )
     evidences = evidences - log_volume
     out: list[Labelling] = []

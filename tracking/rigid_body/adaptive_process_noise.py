@@ -28,7 +28,7 @@ def jump_variance(speed: Array) -> Array:
     return (LEAST_JUMP + JUMP_OF_SPEED * speed) ** 2
 
 
-class Temper:
+class AdaptiveProcessNoise:
     """What the tracker knows of the vehicle's way of moving."""
 
     def __init__(self, parameters: TrackerParameters) -> None:

@@ -38,14 +38,14 @@ BEHIND = 14.0  # nats: a partial assignment so far behind the best is dropped
 LOG_2PI = np.log(2 * np.pi)
 
 _moved, _put, _put_matrix, _best_first = (
-    compiled_linalg.moved,
-    compiled_linalg.put,
-    compiled_linalg.put_matrix,
+    compiled_linalg.pose_plus,
+    compiled_linalg.copy_into,
+    compiled_linalg.copy_matrix_into,
     compiled_linalg.best_first,
 )
 
 
-class Frame(NamedTuple):
+class FrameDetections(NamedTuple):
     """One frame's detections, m of them, those of a camera together."""
 
     uv: Array  # (m, 2) px
@@ -60,7 +60,7 @@ class Frame(NamedTuple):
     log_crowding: Array  # (n,) of each view: log of how much denser false points are near a spot than in the picture
 
 
-class Sights(NamedTuple):
+class ViewTable(NamedTuple):
     """What the search needs of the views beside their projection."""
 
     camera: Ints  # (n,)
@@ -68,14 +68,14 @@ class Sights(NamedTuple):
     group: Ints  # (n,) spots that may be hidden together: those of one screen
 
     @staticmethod
-    def of(rig: Rig, model: SpotModel) -> Sights:
+    def of(rig: Rig, model: SpotModel) -> ViewTable:
         """Those of a rig."""
         screens = list(dict.fromkeys(rig.spots[s].screen for _, s in model.views))
         group = np.array([screens.index(rig.spots[s].screen) for _, s in model.views], dtype=np.int64)
-        return Sights(np.ascontiguousarray(model.camera_of), np.ascontiguousarray(model.image_size_px), group)
+        return ViewTable(np.ascontiguousarray(model.camera_of), np.ascontiguousarray(model.image_size_px), group)
 
 
-class Chances(NamedTuple):
+class DetectionModel(NamedTuple):
     """Probabilities of detection."""
 
     detect: float  # of a spot in the picture that is not hidden
@@ -88,13 +88,13 @@ def distinct_spots(chosen: Bools, spot: Ints) -> Ints:
 
 
 @compiled
-def log_false(frame: Frame, view: int, d: int) -> float:
+def log_false(frame: FrameDetections, view: int, d: int) -> float:
     """Log density of false points, 1/px^2, where detection d is taken for a view's spot."""
     return max(frame.log_clutter[view], frame.log_static[d])
 
 
 @compiled
-def crowding(views: Views, sights: Sights, frame: Frame, R: Array, t: Array, P: Array) -> float:
+def log_clutter_ratio(views: Views, sights: ViewTable, frame: FrameDetections, R: Array, t: Array, P: Array) -> float:
     """Log-likelihood of where all points lie, spots and false ones, given that false points crowd near spots; nats.
 
     A point near a spot's place counts once: false points are expected there rather than elsewhere, the more so the
@@ -131,14 +131,21 @@ def crowding(views: Views, sights: Sights, frame: Frame, R: Array, t: Array, P: 
 
 
 @compiled
-def grown(frame: Frame, view: int, d: int) -> bool:
+def is_blended(frame: FrameDetections, view: int, d: int) -> bool:
     """Whether a detection is wider than the view's spot usually is, as two points of light that have merged are."""
     return bool(frame.size_px[d] > GROWN * frame.usual_px[view])
 
 
 @compiled
 def log_chance(
-    views: Views, sights: Sights, frame: Frame, chances: Chances, shown: Array, assigned: Ints, R: Array, t: Array
+    views: Views,
+    sights: ViewTable,
+    frame: FrameDetections,
+    chances: DetectionModel,
+    shown: Array,
+    assigned: Ints,
+    R: Array,
+    t: Array,
 ) -> float:
     """Log-likelihood of an assignment (n,) at a pose, without its Gaussian terms: detected, missed, blended.
 
@@ -192,14 +199,14 @@ def expected_at(
 @compiled
 def associate(
     views: Views,
-    sights: Sights,
-    frame: Frame,
-    chances: Chances,
+    sights: ViewTable,
+    frame: FrameDetections,
+    chances: DetectionModel,
     R: Array,
     t: Array,
     P: Array,
     shown: Array,
-    extra: Array,
+    calibration_cov: Array,
 ) -> tuple[Ints, Array, Array, Array, Array, int]:
     """Assignments of a frame's detections to spots, best first, from a predicted pose (R, t) and its P (6, 6).
 
@@ -243,7 +250,7 @@ def associate(
             there, a, b, c = expected_at(views, i, R_of[0], t_of[0], P_of[0], uv, J)
             if not there:
                 continue
-            a, b, c = a + extra[i, 0, 0], b + extra[i, 0, 1], c + extra[i, 1, 1]
+            a, b, c = a + calibration_cov[i, 0, 0], b + calibration_cov[i, 0, 1], c + calibration_cov[i, 1, 1]
             size = a * c - b * b
             if in_picture(uv[0], uv[1], a, c, sights.size[i, 0], sights.size[i, 1]) < LEAST_IN_PICTURE:
                 size += 1e12  # out of the picture: last, and mostly nothing is done about it
@@ -260,7 +267,11 @@ def associate(
             p_in = 0.0
             if there:
                 bend = ((a + c) / BEND_PX) ** 2 if a + c > 1.0 else 0.0
-                a, b, c = a + extra[view, 0, 0] + bend, b + extra[view, 0, 1], c + extra[view, 1, 1] + bend
+                a, b, c = (
+                    a + calibration_cov[view, 0, 0] + bend,
+                    b + calibration_cov[view, 0, 1],
+                    c + calibration_cov[view, 1, 1] + bend,
+                )
                 p_in = in_picture(uv[0], uv[1], a, c, sights.size[view, 0], sights.size[view, 1])
             if p_in < LEAST_IN_PICTURE:
                 children, worst = _kept(
@@ -296,7 +307,7 @@ def associate(
                         counted[b_node] + gain, b_node, d,
                     )  # fmt: skip
                 else:
-                    r = frame.blend_px[d] if grown(frame, view, d) else 0.0
+                    r = frame.blend_px[d] if is_blended(frame, view, d) else 0.0
                     if r > 0.0 and near2 < (r + 2 * np.sqrt(max(a, c))) ** 2 and a + c < r * r:
                         apart = np.log(chances.blend / (np.pi * r * r))
                         children, worst = _kept(
@@ -315,7 +326,7 @@ def associate(
             assigned_next[kept, view] = choice
             _put_pose(R_next[kept], t_next[kept], P_next[kept], R_of[node], t_of[node], P_of[node])
             if 0 <= choice < BLENDED:
-                _take(views, view, frame, choice, extra, R_next[kept], t_next[kept], P_next[kept])
+                _take(views, view, frame, choice, calibration_cov, R_next[kept], t_next[kept], P_next[kept])
             score_next[kept], counted_next[kept] = child_score[k], child_counted[k]
             kept += 1
         count = kept
@@ -370,13 +381,15 @@ def _kept(
 
 
 @compiled
-def _take(views: Views, view: int, frame: Frame, d: int, extra: Array, R: Array, t: Array, P: Array) -> None:
+def _take(
+    views: Views, view: int, frame: FrameDetections, d: int, calibration_cov: Array, R: Array, t: Array, P: Array
+) -> None:
     """Move and narrow a pose by the detection d of a view, in place."""
     uv, J = np.empty(2), np.empty((2, 6))
     _, a, b, c = expected_at(views, view, R, t, P, uv, J)
     bend = ((a + c) / BEND_PX) ** 2 if a + c > 1.0 else 0.0
     a, b, c = a + frame.cov[d, 0, 0] + bend, b + frame.cov[d, 0, 1], c + frame.cov[d, 1, 1] + bend
-    a, b, c = a + extra[view, 0, 0], b + extra[view, 0, 1], c + extra[view, 1, 1]
+    a, b, c = a + calibration_cov[view, 0, 0], b + calibration_cov[view, 0, 1], c + calibration_cov[view, 1, 1]
     sa, sb, sc, _ = inverse2(a, b, c)
     H = np.zeros((6, 2))
     for i in range(6):

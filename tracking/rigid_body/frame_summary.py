@@ -10,18 +10,18 @@ from geometry import compiled_linalg
 from geometry.arrays import Array, Bools, Ints
 from geometry.compilation.jit import compiled
 from geometry.compiled_projection import Views, project_view
-from tracking.rigid_body.association import BLENDED, Frame, Sights, expected_at
+from tracking.rigid_body.association import BLENDED, FrameDetections, ViewTable, expected_at
 from tracking.rigid_body.hypotheses import Hypotheses
 from tracking.rigid_body.information import fit_alone, frame_information
 from tracking.rigid_body.motion import predicted
 
 RANK = 1e-12  # pivot of a scaled normal matrix below which a pose is not observable; exact degeneracies give 1e-16
 
-_multiply, _solve, _moved = compiled_linalg.multiply, compiled_linalg.solve, compiled_linalg.moved
-_block, _beside = compiled_linalg.block, compiled_linalg.beside
+_multiply, _solve, _moved = compiled_linalg.multiply, compiled_linalg.solve, compiled_linalg.pose_plus
+_block, _beside = compiled_linalg.block, compiled_linalg.hstack
 
 
-class Digest(NamedTuple):
+class FrameSummary(NamedTuple):
     """Of n views and c cameras."""
 
     labelled: Bools  # (n,): the label is certain enough to be given
@@ -39,17 +39,17 @@ class Digest(NamedTuple):
 
 
 @compiled
-def digest(
+def summarise(
     views: Views,
-    sights: Sights,
-    frame: Frame,
+    sights: ViewTable,
+    frame: FrameDetections,
     R: Array,
     t: Array,
     assigned: Ints,
     certain: Array,
     least_probability: float,
     radius_px: float,
-) -> Digest:
+) -> FrameSummary:
     """The best hypothesis' pose (R, t), assignment (n,) and its probabilities (n,) in numbers."""
     n, cameras = assigned.shape[0], frame.has_image.shape[0]
     labelled, use = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
@@ -86,7 +86,7 @@ def digest(
                 if not taken:
                     near[c] += 1
     rms = np.sqrt(square / (2 * count)) if count > 0 else np.nan
-    return Digest(labelled, use, uv, cov, chi2, rms, alone, expected, J, inside, near, discs)
+    return FrameSummary(labelled, use, uv, cov, chi2, rms, alone, expected, J, inside, near, discs)
 
 
 @compiled
@@ -130,7 +130,7 @@ def inverse(L: Array) -> Array:
 
 
 @compiled
-def surprise(
+def innovation_score(
     views: Views, before: Hypotheses, h: int, dt: float, jerk: Array, use: Bools, uv: Array, cov: Array
 ) -> tuple[Array, Array]:
     """(6,) and (n, 2, 2). First: how the likelihood of a frame grows with the share of the prediction's covariance that

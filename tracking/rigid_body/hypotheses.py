@@ -16,14 +16,22 @@ from geometry import compiled_linalg
 from geometry.arrays import Array, Bools, Ints
 from geometry.compilation.jit import compiled
 from geometry.compiled_projection import Views
-from tracking.rigid_body.association import BLENDED, Chances, Frame, Sights, associate, crowding, expected_at
+from tracking.rigid_body.association import (
+    BLENDED,
+    DetectionModel,
+    FrameDetections,
+    ViewTable,
+    associate,
+    expected_at,
+    log_clutter_ratio,
+)
 from tracking.rigid_body.information import frame_information, size_of, widen_by_curvature
 from tracking.rigid_body.motion import STATE, predicted, updated
-from tracking.rigid_body.occlusion import MISSED, later, learnt, marginal, together
+from tracking.rigid_body.occlusion import MISSED, joint_log_likelihood, marginal, predict, update
 
 MOST_CHILDREN = 48  # of one frame, over all hypotheses
 MOST_KEPT = 8  # hypotheses from frame to frame
-FORGET = 12.0  # nats: a hypothesis so far behind is dropped
+PRUNE_NATS = 12.0  # nats: a hypothesis so far behind is dropped
 SAME = 0.7  # two hypotheses with one assignment whose states differ by less than this in sigmas are one
 MOST_STEPS, MOST_HALVINGS = 8, 5  # of Gauss-Newton, and of one step
 TOO_WIDE = 0.06  # m, rad: where a frame leaves its widest direction so open, it is not taken
@@ -33,12 +41,19 @@ VAGUE_PX = 15.0  # 1 sigma of a predicted spot: beyond it the whole picture is s
 CHECK_PX = 8.0  # 1 sigma of a predicted spot: up to it the prediction checks a label
 FAR_TOO_VAGUE_PX = 45.0  # beyond it three spots fit anywhere too
 SURE = 1 - 2.5e-3  # label probability (6 nats) where nothing else checks a label
-PROOF = 3  # spots: where so many lie in their narrow gates, the velocities have not jumped
+MIN_CONFIRMING_SPOTS = 3  # spots: where so many lie in their narrow gates, the velocities have not jumped
 LEAST_TO_TURN = 6.0  # nats: a hypothesis so far behind is not tried with a manoeuvre as well
-SURPRISE = 3.5  # sigmas of a misfit's own scatter: beyond it a manoeuvre is considered although every spot is found
-_apart, _apply, _dot, _block = compiled_linalg.apart, compiled_linalg.apply, compiled_linalg.dot, compiled_linalg.block
-_moved, _posterior, _solve = compiled_linalg.moved, compiled_linalg.posterior, compiled_linalg.solve
-_put, _put_matrix, _best_first = compiled_linalg.put, compiled_linalg.put_matrix, compiled_linalg.best_first
+UNEXPECTED_SIGMAS = (
+    3.5  # sigmas of a misfit's own scatter: beyond it a manoeuvre is considered although every spot is found
+)
+_apart, _apply, _dot, _block = (
+    compiled_linalg.pose_minus,
+    compiled_linalg.apply,
+    compiled_linalg.dot,
+    compiled_linalg.block,
+)
+_moved, _posterior, _solve = compiled_linalg.pose_plus, compiled_linalg.posterior, compiled_linalg.solve
+_put, _put_matrix, _best_first = compiled_linalg.copy_into, compiled_linalg.copy_matrix_into, compiled_linalg.best_first
 
 
 class Hypotheses(NamedTuple):
@@ -104,7 +119,7 @@ def _put_hypothesis(
 
 
 @compiled
-def chosen_points(frame: Frame, assigned: Ints, extra: Array) -> tuple[Bools, Array, Array]:
+def chosen_points(frame: FrameDetections, assigned: Ints, calibration_cov: Array) -> tuple[Bools, Array, Array]:
     """Which views take part in the pose, with pixels (n, 2) and covariances (n, 2, 2), of one assignment (n,)."""
     n = assigned.shape[0]
     use, uv, cov = np.zeros(n, np.bool_), np.empty((n, 2)), np.empty((n, 2, 2))
@@ -115,15 +130,15 @@ def chosen_points(frame: Frame, assigned: Ints, extra: Array) -> tuple[Bools, Ar
             for a in range(2):
                 uv[i, a] = frame.uv[d, a]
                 for b in range(2):
-                    cov[i, a, b] = frame.cov[d, a, b] + extra[i, a, b]
+                    cov[i, a, b] = frame.cov[d, a, b] + calibration_cov[i, a, b]
     return use, uv, cov
 
 
 @compiled
-def concluded(
+def iterated_update(
     views: Views,
-    frame: Frame,
-    extra: Array,
+    frame: FrameDetections,
+    calibration_cov: Array,
     before: tuple[Array, Array, Array, Array],
     assigned: Ints,
     R: Array,
@@ -136,7 +151,7 @@ def concluded(
     likelihood 0. An update that does not settle leaves the state as it was, and counts by its misfit there.
     """
     R0, t0, m0, P0 = before
-    use, uv, cov = chosen_points(frame, assigned, extra)
+    use, uv, cov = chosen_points(frame, assigned, calibration_cov)
     wanted = 0
     for i in range(use.shape[0]):
         wanted += 1 if use[i] else 0
@@ -219,13 +234,13 @@ def _found_near(
 
 
 @compiled
-def grow(
+def branch(
     views: Views,
-    sights: Sights,
-    frame: Frame,
-    chances: Chances,
+    sights: ViewTable,
+    frame: FrameDetections,
+    chances: DetectionModel,
     dynamics: Dynamics,
-    extra: Array,
+    calibration_cov: Array,
     dt: float,
     old: Hypotheses,
 ) -> tuple[Children, int]:
@@ -236,9 +251,9 @@ def grow(
     nothing = np.zeros(2)
     best = -np.inf
     for h in range(old.t.shape[0]):
-        if old.weight[h] < -FORGET:
+        if old.weight[h] < -PRUNE_NATS:
             continue
-        shown = later(old.shown[h], n) if dt > 0.0 else old.shown[h]
+        shown = predict(old.shown[h], n) if dt > 0.0 else old.shown[h]
         shining = marginal(shown, sights.group)
         turning = False
         for mode in range(2):
@@ -251,14 +266,14 @@ def grow(
                 R, t, m, P = old.R[h], old.t[h], old.m[h], old.P[h]
             prior = old.weight[h] + np.log(1 - dynamics.p_manoeuvre if mode == 0 else dynamics.p_manoeuvre)
             assigned, score, counted, R_b, t_b, b = associate(
-                views, sights, frame, chances, R, t, _block(P, 6), shining, extra
+                views, sights, frame, chances, R, t, _block(P, 6), shining, calibration_cov
             )
-            # An upper bound of what `crowding` may add, so that no child is dropped before its likelihood is known.
+            # Upper bound of what `log_clutter_ratio` may add: no child is dropped before its likelihood is known.
             crowd = 0.0
             for i in range(n):
                 crowd += frame.log_crowding[i]
             for k in range(b):
-                if prior + score[k] + crowd < best - FORGET or (k > 0 and score[k] < score[0] - FORGET):
+                if prior + score[k] + crowd < best - PRUNE_NATS or (k > 0 and score[k] < score[0] - PRUNE_NATS):
                     continue
                 labelled = 0
                 for i in range(n):
@@ -266,48 +281,57 @@ def grow(
                 # Spots that were shining and are not found were hidden, or are elsewhere.
                 sudden = _misses(assigned[k], shining)
                 dim = P
-                if mode == 0 and dt > 0.0 and labelled < PROOF:
+                if mode == 0 and dt > 0.0 and labelled < MIN_CONFIRMING_SPOTS:
                     dim = _either_motion(old, h, P, dynamics, dt, sudden)
                 before = (R, t, m, dim)
-                R_k, t_k, m_k, P_k, gaussian, misfit, spots = concluded(
-                    views, frame, extra, before, assigned[k], R_b[k], t_b[k]
+                R_k, t_k, m_k, P_k, gaussian, misfit, spots = iterated_update(
+                    views, frame, calibration_cov, before, assigned[k], R_b[k], t_b[k]
                 )
-                if mode == 0 and 0 < labelled < PROOF and dt > 0.0:
+                if mode == 0 and 0 < labelled < MIN_CONFIRMING_SPOTS and dt > 0.0:
                     # The mixture is no less likely than its steady part: else a false third spot would seem likelier.
                     steady = (R, t, m, P)
-                    _, _, _, _, narrow, misfit, _ = concluded(views, frame, extra, steady, assigned[k], R_b[k], t_b[k])
-                    gaussian = max(gaussian, narrow + np.log(1.0 - (SUDDEN_MANOEUVRE if sudden else DARK_MANOEUVRE)))
+                    _, _, _, _, narrow, misfit, _ = iterated_update(
+                        views, frame, calibration_cov, steady, assigned[k], R_b[k], t_b[k]
+                    )
+                    gaussian = max(
+                        gaussian, narrow + np.log(1.0 - (SUDDEN_MANOEUVRE if sudden else OCCLUDED_MANOEUVRE))
+                    )
                 if mode == 0 and k == 0:
                     dof = 2 * spots
                     turning = (
                         dt > 0.0
                         and old.weight[h] > -LEAST_TO_TURN
                         and (
-                            misfit > dof + SURPRISE * np.sqrt(2.0 * max(dof, 1))
-                            or (labelled < PROOF and _misses(assigned[k], shining))
+                            misfit > dof + UNEXPECTED_SIGMAS * np.sqrt(2.0 * max(dof, 1))
+                            or (labelled < MIN_CONFIRMING_SPOTS and _misses(assigned[k], shining))
                             or _misses_a_screen(assigned[k], shining, sights.group)
                         )
                     )
-                if mode == 1 and labelled < PROOF:
+                if mode == 1 and labelled < MIN_CONFIRMING_SPOTS:
                     continue  # a bend is in the mixture above; a point or two would be one wherever they lie
-                most = VAGUE_PX if labelled < PROOF else FAR_TOO_VAGUE_PX
-                if mode == 0 and dt > 0.0 and PROOF <= labelled < FEW:
+                most = VAGUE_PX if labelled < MIN_CONFIRMING_SPOTS else FAR_TOO_VAGUE_PX
+                if mode == 0 and dt > 0.0 and MIN_CONFIRMING_SPOTS <= labelled < FEW:
                     dim = _either_motion(old, h, P, dynamics, dt, sudden)
                 if 0 < labelled < FEW and widest(views, R, t, dim, assigned[k]) > most:
                     # Where a spot may be anywhere some false point fits: so few say nothing of the pose.
                     R_k, t_k, m_k, P_k = R, t, m, dim
-                total = prior + counted[k] + gaussian + together(shown, sights.group, assigned[k], chances.detect)
-                total += crowding(views, sights, frame, R_k, t_k, P_k)
+                total = (
+                    prior
+                    + counted[k]
+                    + gaussian
+                    + joint_log_likelihood(shown, sights.group, assigned[k], chances.detect)
+                )
+                total += log_clutter_ratio(views, sights, frame, R_k, t_k, P_k)
                 if not np.isfinite(total):
                     continue
                 best = max(best, total)
-                after = learnt(shown, sights.group, assigned[k], chances.detect)
+                after = update(shown, sights.group, assigned[k], chances.detect)
                 count, _ = add_child(out, count, R_k, t_k, m_k, P_k, total, after, assigned[k], mode == 1, h)
     return out, count
 
 
 SUDDEN_MANOEUVRE = 0.5  # of a frame in which spots that were shining are suddenly not where they were expected
-DARK_MANOEUVRE = (
+OCCLUDED_MANOEUVRE = (
     0.05  # least chance of a manoeuvre per frame that does not show the pose: what is hidden is often a bend
 )
 
@@ -320,7 +344,7 @@ def _either_motion(old: Hypotheses, h: int, P: Array, dynamics: Dynamics, dt: fl
     _, _, _, P_jump, _ = predicted(
         old.R[h], old.t[h], old.m[h], old.P[h], dt, dynamics.jerk, dynamics.jump, dynamics.unsteady
     )
-    return _mixed(P, P_jump, SUDDEN_MANOEUVRE if sudden else max(dynamics.p_manoeuvre, DARK_MANOEUVRE))
+    return _mixed(P, P_jump, SUDDEN_MANOEUVRE if sudden else max(dynamics.p_manoeuvre, OCCLUDED_MANOEUVRE))
 
 
 @compiled
@@ -416,7 +440,7 @@ def add_child(
 
 
 @compiled
-def sift(children: Children, count: int) -> tuple[Hypotheses, Ints, Array, Array]:
+def prune_and_merge(children: Children, count: int) -> tuple[Hypotheses, Ints, Array, Array]:
     """Weigh the children: those that stay, as hypotheses, best first.
 
     Also their places (h,) among the children, how likely the best one's choice for each view is (n,), and the spread
@@ -446,7 +470,7 @@ def sift(children: Children, count: int) -> tuple[Hypotheses, Ints, Array, Array
     h = 0
     for place in range(count):
         k = order[place]
-        if w[k] < w[best] - FORGET:
+        if w[k] < w[best] - PRUNE_NATS:
             break
         twin = -1
         for other in range(h):

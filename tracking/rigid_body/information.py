@@ -14,7 +14,7 @@ from geometry.compiled_projection import Views, project_view
 
 _apply = compiled_linalg.apply
 _moved, _solve, _column, _dot = (
-    compiled_linalg.moved,
+    compiled_linalg.pose_plus,
     compiled_linalg.solve,
     compiled_linalg.column,
     compiled_linalg.dot,

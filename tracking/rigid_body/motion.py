@@ -23,7 +23,7 @@ _multiply, _exp, _right_jacobian, _symmetrise = (
     compiled_linalg.right_jacobian,
     compiled_linalg.symmetrise,
 )
-_moved, _posterior = compiled_linalg.moved, compiled_linalg.posterior
+_moved, _posterior = compiled_linalg.pose_plus, compiled_linalg.posterior
 
 
 @compiled

@@ -20,7 +20,7 @@ MISSED = -1
 
 
 @compiled
-def later(chances: Array, n: int) -> Array:
+def predict(chances: Array, n: int) -> Array:
     """Probabilities (n + groups,) of being shown (the first n) and lit (the others) a frame later."""
     out = np.empty_like(chances)
     for i in range(chances.shape[0]):
@@ -40,7 +40,7 @@ def marginal(chances: Array, group: Ints) -> Array:
 
 
 @compiled
-def together(chances: Array, group: Ints, assigned: Ints, detect: float) -> float:
+def joint_log_likelihood(chances: Array, group: Ints, assigned: Ints, detect: float) -> float:
     """What an assignment's log-likelihood gains because spots of a group go dark together, nats.
 
     Against the product of the single marginals, which the search takes.
@@ -80,7 +80,7 @@ def _nothing(assigned: Ints) -> bool:
 
 
 @compiled
-def learnt(chances: Array, group: Ints, assigned: Ints, detect: float) -> Array:
+def update(chances: Array, group: Ints, assigned: Ints, detect: float) -> Array:
     """The probabilities (n + groups,) after a frame with this assignment (n,)."""
     n = group.shape[0]
     out = chances.copy()

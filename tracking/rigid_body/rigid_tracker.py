@@ -27,35 +27,43 @@ from tracking.detections import UNMATCHED, Detections
 from tracking.input_validation import UsablePoints, check_step
 from tracking.labelling.first_labels import NO_POINT, Labelling, candidate_labellings, find_labels
 from tracking.parameters import TrackerParameters
-from tracking.rigid_body.adaptive_process_noise import Temper
-from tracking.rigid_body.association import BLENDED, Chances, Frame, Sights, crowding, distinct_spots, log_chance
+from tracking.rigid_body.adaptive_process_noise import AdaptiveProcessNoise
+from tracking.rigid_body.association import (
+    BLENDED,
+    DetectionModel,
+    FrameDetections,
+    ViewTable,
+    distinct_spots,
+    log_chance,
+    log_clutter_ratio,
+)
 from tracking.rigid_body.clutter import RADIUS_PX, ClutterNearSpots
-from tracking.rigid_body.frame_summary import Digest, ahead, digest, surprise
+from tracking.rigid_body.frame_summary import FrameSummary, ahead, innovation_score, summarise
 from tracking.rigid_body.hypotheses import (
     FAR_TOO_VAGUE_PX,
     FEW,
-    PROOF,
+    MIN_CONFIRMING_SPOTS,
     SURE,
     VAGUE_PX,
     Children,
     Hypotheses,
     add_child,
+    branch,
     chosen_points,
-    concluded,
-    grow,
+    iterated_update,
     no_children,
-    sift,
+    prune_and_merge,
     spread_of_all,
     wide_views,
     widest,
 )
 from tracking.rigid_body.information import controlled, fit_alone
 from tracking.rigid_body.motion import predicted
-from tracking.rigid_body.occlusion import MISSED, later, learnt, marginal, together
+from tracking.rigid_body.occlusion import MISSED, joint_log_likelihood, marginal, predict, update
 from tracking.rigid_body.static_points import FADES, no_places
 from tracking.rigid_body.static_points import learn as learn_static
 from tracking.rigid_body.static_points import log_density as log_static_density
-from tracking.rigid_body.variance_factor import Misfit
+from tracking.rigid_body.variance_factor import VarianceFactor
 from tracking.statuses import LOST_SIGMA_M, LOST_SIGMA_RAD, PoseStatus, SpotStatus, view_statuses
 from tracking.tracked_frame import Event, MotionEstimate, TrackedFrame
 
@@ -92,12 +100,12 @@ class RigidTracker:
         self.prior = prior
         self.calibration = None if covariance is None else CalibrationSpread(rig, self.model, covariance)
         self.limits = SolveLimits(parameters.max_sigma_m, np.deg2rad(parameters.max_sigma_deg))
-        self.misfit = Misfit()
-        self.temper = Temper(parameters)
+        self.misfit = VarianceFactor()
+        self.temper = AdaptiveProcessNoise(parameters)
         n = len(self.model)
-        self._sights = Sights.of(rig, self.model)
+        self._sights = ViewTable.of(rig, self.model)
         self._groups = int(self._sights.group.max(initial=-1)) + 1
-        self._chances = Chances(parameters.p_detect, parameters.p_blend)
+        self._chances = DetectionModel(parameters.p_detect, parameters.p_blend)
         self._clutter = ClutterNearSpots(self.model, parameters.labels.clutter_per_px2)
         self._static = no_places(len(self.model.camera_names))
         self._usual_px = np.full(n, np.nan)  # larger half axis of each view's spot
@@ -155,7 +163,7 @@ class RigidTracker:
         if self._hypotheses is None:
             children, count = no_children(n, self._groups), 0
         else:
-            children, count = grow(
+            children, count = branch(
                 views, self._sights, frame, self._chances, self.temper.dynamics, self._extra, dt_s, self._hypotheses
             )
         predicted = self._predicted_px(dt_s)
@@ -172,14 +180,14 @@ class RigidTracker:
             if self._evidence < LEAST_EVIDENCE:
                 self._hypotheses, self._evidence = None, 0.0
                 return self._nothing(found, predicted, events)
-        staying, places, certain, spread = sift(children, count)
+        staying, places, certain, spread = prune_and_merge(children, count)
         before = self._hypotheses
         self._hypotheses = staying
         return self._conclude(dt_s, found, frame, children, places, certain, spread, predicted, before, events, fresh)
 
     # -- the frame's detections ---------------------------------------------------------------------------------------
 
-    def _frame(self, found: Sequence[Detections | None]) -> Frame:
+    def _frame(self, found: Sequence[Detections | None]) -> FrameDetections:
         """All cameras' detections in one list, with the errors that the run has shown them to have."""
         counts = [0 if f is None else len(f) for f in found]
         first = np.zeros(len(found) + 1, dtype=np.int64)
@@ -200,7 +208,7 @@ class RigidTracker:
         if self._anchor is None:
             # That false points crowd near spots must not make points without any spot evidence of a vehicle.
             log_clutter, crowded = log_clutter - crowded, np.zeros_like(crowded)
-        return Frame(uv, cov, blend, first, has_image, log_clutter, static, major, self._usual_px, crowded)
+        return FrameDetections(uv, cov, blend, first, has_image, log_clutter, static, major, self._usual_px, crowded)
 
     # -- labels from a prior alone ------------------------------------------------------------------------------------
 
@@ -236,7 +244,7 @@ class RigidTracker:
             int(np.count_nonzero(missed & (self.model.camera_of == c))) if f is not None else 0
             for c, f in enumerate(found)
         ]
-        least = PROOF if self._unmeasured < LONG_UNMEASURED else 2
+        least = MIN_CONFIRMING_SPOTS if self._unmeasured < LONG_UNMEASURED else 2
         against = any(m >= least and f is not None and len(f) >= m for m, f in zip(here, found, strict=True))
         self._doubts = self._doubts + 1 if against else 0
         return against
@@ -283,7 +291,7 @@ class RigidTracker:
         self,
         children: Children,
         count: int,
-        frame: Frame,
+        frame: FrameDetections,
         found: Sequence[Detections | None],
         dt_s: float,
         events: list[Event],
@@ -316,7 +324,7 @@ class RigidTracker:
             for k in np.argsort(-h.weight)[:MOST_LINKED].tolist():
                 *state, _ = self._predicted(h, k, dt_s, manoeuvre=True)
                 weight = float(h.weight[k]) + np.log(self.temper.dynamics.p_manoeuvre)
-                starts.append(((state[0], state[1], state[2], state[3]), later(h.shown[k], n), weight, k))
+                starts.append(((state[0], state[1], state[2], state[3]), predict(h.shown[k], n), weight, k))
         known = {tuple(np.maximum(children.assigned[k], MISSED)) for k in range(count)}
         for one in candidates:
             pose = one.fit.world_from_body
@@ -334,7 +342,7 @@ class RigidTracker:
         self,
         children: Children,
         count: int,
-        frame: Frame,
+        frame: FrameDetections,
         assigned: Ints,
         pose: Pose,
         before: tuple[Array, Array, Array, Array],
@@ -345,19 +353,19 @@ class RigidTracker:
         """Add an assignment (n,) near a pose, as the continuation of one state: children, and its place (-1: none)."""
         views, sights = self.model.numbers, self._sights
         R, t = np.array(pose.rotation, order="C"), np.array(pose.translation)
-        R, t, m, P_after, gaussian, _, _ = concluded(views, frame, self._extra, before, assigned, R, t)
+        R, t, m, P_after, gaussian, _, _ = iterated_update(views, frame, self._extra, before, assigned, R, t)
         uv, _ = project_all(views, R[None], t[None])
         inside = self.model.in_picture(uv[0]) & frame.has_image[self.model.camera_of]
         assigned = np.where((assigned < 0) & ~inside, -2, assigned)
-        weight += gaussian + crowding(views, sights, frame, R, t, P_after)
+        weight += gaussian + log_clutter_ratio(views, sights, frame, R, t, P_after)
         weight += log_chance(views, sights, frame, self._chances, marginal(shown, sights.group), assigned, R, t)
-        weight += together(shown, sights.group, assigned, self.parameters.p_detect)
+        weight += joint_log_likelihood(shown, sights.group, assigned, self.parameters.p_detect)
         if not np.isfinite(weight):
             return count, -1
-        after = learnt(shown, sights.group, assigned, self.parameters.p_detect)
+        after = update(shown, sights.group, assigned, self.parameters.p_detect)
         return add_child(children, count, R, t, m, P_after, weight, after, assigned, False, parent)
 
-    def _add_alternatives(self, children: Children, count: int, frame: Frame, dt_s: float) -> int:
+    def _add_alternatives(self, children: Children, count: int, frame: FrameDetections, dt_s: float) -> int:
         """Add the other poses that so few spots allow, mirror solutions, to the children; how many there are then.
 
         Three spots fix a pose up to a few solutions; which one it is only the motion can tell. Each solution competes
@@ -371,7 +379,11 @@ class RigidTracker:
             assigned = children.assigned[c].copy()
             exact = (assigned >= 0) & (assigned < BLENDED)
             parent = int(children.parent[c])
-            if w[c] < w.max() - ALTERNATIVE_NATS or parent < 0 or distinct_spots(exact, self.model.spot_of) != PROOF:
+            if (
+                w[c] < w.max() - ALTERNATIVE_NATS
+                or parent < 0
+                or distinct_spots(exact, self.model.spot_of) != MIN_CONFIRMING_SPOTS
+            ):
                 continue
             pose = Pose(children.after.R[c].copy(), children.after.t[c].copy())
             others = alternatives(self.model, pose, np.flatnonzero(exact))
@@ -381,12 +393,12 @@ class RigidTracker:
             *state, _ = self._predicted(h, parent, dt_s, manoeuvre)
             before = (state[0], state[1], state[2], state[3])
             for i in range(len(others.translation)):
-                shown = later(h.shown[parent], len(self.model))
+                shown = predict(h.shown[parent], len(self.model))
                 count, _ = self._add(children, count, frame, assigned, others[i], before, shown, weight, parent)
         return count
 
     def _proposed(
-        self, frame: Frame, found: Sequence[Detections | None], prior: PosePrior, events: list[Event]
+        self, frame: FrameDetections, found: Sequence[Detections | None], prior: PosePrior, events: list[Event]
     ) -> list[Labelling]:
         """Labellings of the frame that a search from the prior alone proposes, best first.
 
@@ -423,7 +435,7 @@ class RigidTracker:
             out.append(replace(one, point_of=point))
         return out
 
-    def _believe_misfit(self, frame: Frame, one: Labelling) -> None:
+    def _believe_misfit(self, frame: FrameDetections, one: Labelling) -> None:
         """The labels hold within the model's error; where the claimed sigmas do not, this frame says by how much."""
         labels = one.point_of
         assigned = np.where(labels == NO_POINT, MISSED, labels + frame.first[self.model.camera_of])
@@ -454,7 +466,7 @@ class RigidTracker:
         self,
         dt_s: float,
         found: Sequence[Detections | None],
-        frame: Frame,
+        frame: FrameDetections,
         children: Children,
         places: Ints,
         certain: Array,
@@ -486,7 +498,7 @@ class RigidTracker:
             used = np.where(assigned < BLENDED, assigned, -1)
             wide = wide_views(model.numbers, R, t, P, used)
             again = (assigned >= 0) & self._found_before & ~wide
-            if self._vague_since and (parent > 0 or distinct_spots(again, model.spot_of) < PROOF):
+            if self._vague_since and (parent > 0 or distinct_spots(again, model.spot_of) < MIN_CONFIRMING_SPOTS):
                 # Labels that nothing checked must not check what comes after them, until a whole pose is found again.
                 wide |= used >= 0
             self._vague_since = False
@@ -511,7 +523,7 @@ class RigidTracker:
                 proven, spread = False, spread_of_all(children, places)
                 self._vague_since = True
         self._found_before = assigned >= 0
-        d = digest(model.numbers, self._sights, frame, h.R[0], h.t[0], assigned, certain, least, RADIUS_PX)
+        d = summarise(model.numbers, self._sights, frame, h.R[0], h.t[0], assigned, certain, least, RADIUS_PX)
         count = int(np.count_nonzero(d.use))
         # Another pose that is not excluded makes it a prediction, with a covariance that covers both.
         distinct = int(distinct_spots(d.use, model.spot_of))
@@ -529,7 +541,7 @@ class RigidTracker:
         covariance = h.P[0, :6, :6] + spread + systematic
         known = measured or (self._anchor is not None and not self._lost(covariance))
         # After a frame that showed nothing, one or two points may be false ones: a second such frame must follow.
-        alone = distinct_spots(d.labelled, model.spot_of) < PROOF and not self._saw_any
+        alone = distinct_spots(d.labelled, model.spot_of) < MIN_CONFIRMING_SPOTS and not self._saw_any
         self._saw_any = bool((assigned >= 0).any())
         labelled = d.labelled if known and proven and not alone else np.zeros_like(d.labelled)
         predicted_cov: Array | None = None
@@ -537,7 +549,7 @@ class RigidTracker:
             if best in fresh:
                 events.append(Event(self._kind_of_search(dt_s), f"spots {fresh[best]} found from the prior alone"))
             elif before is not None and dt_s > 0 and children.parent[best] >= 0:
-                slope, spread_px = surprise(
+                slope, spread_px = innovation_score(
                     model.numbers,
                     before,
                     int(children.parent[best]),
@@ -587,13 +599,13 @@ class RigidTracker:
             rms_px=float(d.rms_px) if measured else float("nan"),
             events=tuple(events),
             label_probability=np.where(assigned >= 0, certain, np.nan),
-            witness=d.use & labelled,
+            used_in_pose=d.use & labelled,
             predicted_cov_px2=predicted_cov,
             motion=MotionEstimate(h.m[0, :3], h.m[0, 3:6], h.P[0, 6:12, 6:12]) if known else None,
             pose_systematic=systematic if known else None,
         )
 
-    def _learn_points(self, frame: Frame, assigned: Ints, d: Digest, measured: bool) -> None:
+    def _learn_points(self, frame: FrameDetections, assigned: Ints, d: FrameSummary, measured: bool) -> None:
         """What stays in its place, and how wide each spot is, from a frame with a pose."""
         if measured:
             labels = np.where(assigned >= 0, assigned % BLENDED, -1)
@@ -622,7 +634,7 @@ class RigidTracker:
         worst = [np.sqrt(np.linalg.eigvalsh(alone[i, i])[-1]) for i in (slice(0, 3), slice(3, 6))]
         return bool(worst[0] <= self.limits.max_sigma_m and worst[1] <= self.limits.max_sigma_rad)
 
-    def _look_at_calibration(self, d: Digest, h: Hypotheses) -> None:
+    def _look_at_calibration(self, d: FrameSummary, h: Hypotheses) -> None:
         """What the calibration's errors do to this frame's pose and, through it, to the expected pixels."""
         rows = np.flatnonzero(d.use)
         start = Pose(h.R[0], h.t[0])

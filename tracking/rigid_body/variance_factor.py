@@ -10,7 +10,7 @@ MEMORY = 100  # fits: memory of the misfit that scales claimed covariances ...
 DEADBAND = 1.3  # ... once it exceeds this: with honest sigmas it scatters by 0.06 about 1
 
 
-class Misfit:
+class VarianceFactor:
     """The slow mean of chi-square per degree of freedom, and what follows from it."""
 
     def __init__(self) -> None:

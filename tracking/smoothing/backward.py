@@ -17,7 +17,7 @@ from tracking.rigid_body.hypotheses import FEW
 from tracking.rigid_body.motion import STATE
 from tracking.rigid_body.rigid_tracker import FIRST_ACCELERATION, FIRST_ANGULAR, RigidTracker
 from tracking.smoothing.fixed_interval import Reference
-from tracking.smoothing.recording import Recording, assigned_in_one_list
+from tracking.smoothing.recording import TrackedRecording, assigned_in_one_list
 from tracking.statuses import PoseStatus
 
 LEAST_FRAMES = 2  # a shorter stretch is left to the smoother, which sees it from both sides
@@ -35,7 +35,7 @@ class BackwardLabels:
 
 
 def track_backward(
-    rec: Recording, ref: Reference, pose_P: Array, motion_P: Array, weak: Bools, sure: Bools
+    rec: TrackedRecording, ref: Reference, pose_P: Array, motion_P: Array, weak: Bools, sure: Bools
 ) -> BackwardLabels:
     """Labels of the stretches of weak (T,) frames, each from the first sure (T,) frame after it.
 
@@ -50,7 +50,7 @@ def track_backward(
 
 
 def _track_stretch(
-    rec: Recording, ref: Reference, pose_P: Array, motion_P: Array, first: int, last: int, out: BackwardLabels
+    rec: TrackedRecording, ref: Reference, pose_P: Array, motion_P: Array, first: int, last: int, out: BackwardLabels
 ) -> None:
     start = last + 1
     pose = Pose(ref.R[start], ref.t[start])

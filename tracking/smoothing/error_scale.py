@@ -23,7 +23,7 @@ def width_covariance(width_px: Array, share: float) -> Array:
 
 
 def width_share(
-    views: Views, every: AllDetections, assigned: Ints, extra: Array, ref: Reference, measured: Bools
+    views: Views, every: AllDetections, assigned: Ints, calibration_cov: Array, ref: Reference, measured: Bools
 ) -> float:
     """Errors beyond the claimed ones as a share of the spots' widths; 0 if the claims are right or no width is known.
 
@@ -36,7 +36,7 @@ def width_share(
 
     def misfit(share: float) -> float:
         wider = every._replace(cov=every.cov + width_covariance(every.size_px, share))
-        return _mean_misfit(views, wider, assigned, extra, ref, frames)
+        return _mean_misfit(views, wider, assigned, calibration_cov, ref, frames)
 
     if misfit(0.0) <= DEADBAND:
         return 0.0
@@ -55,20 +55,20 @@ def _evenly_spread(rows: Ints, most: int) -> Ints:
 
 
 def noise_scale(
-    views: Views, every: AllDetections, assigned: Ints, extra: Array, ref: Reference, measured: Bools
+    views: Views, every: AllDetections, assigned: Ints, calibration_cov: Array, ref: Reference, measured: Bools
 ) -> float:
     """How much larger than claimed the spots' errors are, from the frames' own fits; 1 if the claims are right."""
-    mean = _mean_misfit(views, every, assigned, extra, ref, np.flatnonzero(measured))
+    mean = _mean_misfit(views, every, assigned, calibration_cov, ref, np.flatnonzero(measured))
     return float(np.sqrt(mean)) if mean > DEADBAND else 1.0
 
 
 def _mean_misfit(
-    views: Views, every: AllDetections, assigned: Ints, extra: Array, ref: Reference, frames: Ints
+    views: Views, every: AllDetections, assigned: Ints, calibration_cov: Array, ref: Reference, frames: Ints
 ) -> float:
     """Chi-square per degree of freedom of the frames' own fits, robust to outliers; 1 where no frame can tell."""
     shares = []
     for k in frames.tolist():
-        use, uv, cov = labelled_points(every, k, assigned[k], extra)
+        use, uv, cov = labelled_points(every, k, assigned[k], calibration_cov)
         _, _, _, chi2, count = fit_alone(views, ref.R[k], ref.t[k], use, uv, cov)
         if count > 3:
             shares.append(chi2 / (2 * count - 6))

@@ -22,16 +22,16 @@ from tracking.rigid_body.motion import STATE, predicted, process_noise, propagat
 CHUNK = 512  # frames whose covariances are in memory at once; the filter is run twice instead
 
 _apart, _multiply, _apply, _solve = (
-    compiled_linalg.apart,
+    compiled_linalg.pose_minus,
     compiled_linalg.multiply,
     compiled_linalg.apply,
     compiled_linalg.solve,
 )
-_symmetrise, _moved, _posterior = compiled_linalg.symmetrise, compiled_linalg.moved, compiled_linalg.posterior
+_symmetrise, _moved, _posterior = compiled_linalg.symmetrise, compiled_linalg.pose_plus, compiled_linalg.posterior
 _transposed_multiply, _transposed_apply = compiled_linalg.transposed_multiply, compiled_linalg.transposed_apply
 _cholesky = compiled_linalg.cholesky
-_block, _column, _beside = compiled_linalg.block, compiled_linalg.column, compiled_linalg.beside
-_put, _put_matrix = compiled_linalg.put, compiled_linalg.put_matrix
+_block, _column, _beside = compiled_linalg.block, compiled_linalg.column, compiled_linalg.hstack
+_put, _put_matrix = compiled_linalg.copy_into, compiled_linalg.copy_matrix_into
 
 
 class Reference(NamedTuple):
@@ -47,7 +47,7 @@ def speeds(m: Array) -> Array:
     return np.stack([np.linalg.norm(m[..., :3], axis=-1), np.linalg.norm(m[..., 3:6], axis=-1)], axis=-1)
 
 
-class Evidence(NamedTuple):
+class FrameInformation(NamedTuple):
     """What the spots of each frame say of its pose at the reference, and how the vehicle may move before it."""
 
     information: Array  # (T, 6, 6) J^T C^-1 J; 0 without spots
@@ -71,7 +71,7 @@ class Interval(NamedTuple):
 
 
 @compiled
-def _step(ref: Reference, ev: Evidence, jerk: Array, k: int, x: Array, P: Array) -> tuple[Array, Array]:
+def _step(ref: Reference, ev: FrameInformation, jerk: Array, k: int, x: Array, P: Array) -> tuple[Array, Array]:
     """From frame k - 1 to frame k: deviation and covariance."""
     R, t, m, P_new, F = predicted(
         ref.R[k - 1], ref.t[k - 1], ref.m[k - 1], P, ev.dt[k], jerk[k], ev.jump[k], ev.unsteady[k]
@@ -86,7 +86,7 @@ def _step(ref: Reference, ev: Evidence, jerk: Array, k: int, x: Array, P: Array)
 
 
 @compiled
-def _update(ev: Evidence, k: int, x: Array, P: Array) -> tuple[Array, Array, float]:
+def _update(ev: FrameInformation, k: int, x: Array, P: Array) -> tuple[Array, Array, float]:
     """Frame k's measurement: deviation and covariance after it, and its log-likelihood up to a constant."""
     L, g = ev.information[k], ev.vector[k]
     if L[0, 0] == 0.0 and L[3, 3] == 0.0:
@@ -107,7 +107,7 @@ def _update(ev: Evidence, k: int, x: Array, P: Array) -> tuple[Array, Array, flo
 
 
 @compiled
-def _before_all(ev: Evidence) -> tuple[Array, Array]:
+def _before_all(ev: FrameInformation) -> tuple[Array, Array]:
     """The first frame's deviation (18,) and its covariance (18, 18) before anything was seen."""
     P = np.zeros((STATE, STATE))
     for i in range(STATE):
@@ -116,7 +116,7 @@ def _before_all(ev: Evidence) -> tuple[Array, Array]:
 
 
 @compiled
-def log_likelihood(ref: Reference, ev: Evidence, jerk: Array) -> float:
+def log_likelihood(ref: Reference, ev: FrameInformation, jerk: Array) -> float:
     """How likely the evidence is for a motion with this jerk (T, 6), nats, up to a constant."""
     x, P = _before_all(ev)
     total = 0.0
@@ -180,7 +180,7 @@ def _without_noise(Y: Array, y: Array, axis: int, root: Array) -> None:
 
 
 @compiled
-def _back(ref: Reference, ev: Evidence, jerk: Array, k: int, Y: Array, y: Array) -> tuple[Array, Array]:
+def _back(ref: Reference, ev: FrameInformation, jerk: Array, k: int, Y: Array, y: Array) -> tuple[Array, Array]:
     """The information about frame k - 1 that all frames from k on hold, from that about frame k; Y, y are spoiled."""
     for axis in range(6):
         _without_noise(
@@ -201,7 +201,7 @@ def _back(ref: Reference, ev: Evidence, jerk: Array, k: int, Y: Array, y: Array)
 
 
 @compiled
-def smoothed(ref: Reference, ev: Evidence, jerk: Array) -> Interval:
+def smoothed(ref: Reference, ev: FrameInformation, jerk: Array) -> Interval:
     """Of all frames given the whole run: deviations, covariances, and what the evidence says of the process noise.
 
     jerk (T, 6): spectral densities, as in motion.py, of the step before each frame. The shock is the test of de Jong &
@@ -264,7 +264,7 @@ def smoothed(ref: Reference, ev: Evidence, jerk: Array) -> Interval:
 
 @compiled
 def _process_noise_test(
-    ev: Evidence,
+    ev: FrameInformation,
     jerk: Array,
     k: int,
     Y: Array,
@@ -325,7 +325,7 @@ def _chi_square(L: Array, x: Array) -> float:
 
 
 @compiled
-def motion_cost(ref: Reference, ev: Evidence, jerk: Array) -> float:
+def motion_cost(ref: Reference, ev: FrameInformation, jerk: Array) -> float:
     """Half the squared Mahalanobis length of the process noise that a reference motion needs, nats."""
     total = 0.0
     w = np.empty(3)
@@ -346,7 +346,7 @@ def motion_cost(ref: Reference, ev: Evidence, jerk: Array) -> float:
 
 
 @compiled
-def log_left_out(x: Array, P: Array, ev: Evidence) -> float:
+def leave_one_out_log_likelihood(x: Array, P: Array, ev: FrameInformation) -> float:
     """How likely each frame's evidence is given that of all the others, summed, nats, up to a constant.
 
     x (T, 18), P (T, 6, 6): the smoothed deviations and their poses' covariances. The leave-one-out predictive

@@ -13,11 +13,19 @@ from geometry import compiled_linalg
 from geometry.arrays import Array, Bools, Ints
 from geometry.compilation.jit import compiled
 from geometry.compiled_projection import Views, inside, project_view
-from tracking.rigid_body.association import BLENDED, Chances, Frame, Sights, associate, expected_at, log_chance
-from tracking.rigid_body.hypotheses import chosen_points, concluded
+from tracking.rigid_body.association import (
+    BLENDED,
+    DetectionModel,
+    FrameDetections,
+    ViewTable,
+    associate,
+    expected_at,
+    log_chance,
+)
+from tracking.rigid_body.hypotheses import chosen_points, iterated_update
 from tracking.rigid_body.information import fit_alone, frame_information
 from tracking.rigid_body.motion import STATE
-from tracking.rigid_body.occlusion import marginal, together
+from tracking.rigid_body.occlusion import joint_log_likelihood, marginal
 from tracking.smoothing.fixed_interval import Reference
 
 # Probability that a spot is not hidden where its screen is lit, by what the frames beside it (those in which the screen
@@ -35,13 +43,13 @@ FINE = 3.5  # sigmas of a misfit's own scatter: below it nothing but the plain e
 
 _apply, _multiply, _solve = compiled_linalg.apply, compiled_linalg.multiply, compiled_linalg.solve
 _moved, _symmetrise, _block, _column, _beside = (
-    compiled_linalg.moved,
+    compiled_linalg.pose_plus,
     compiled_linalg.symmetrise,
     compiled_linalg.block,
     compiled_linalg.column,
-    compiled_linalg.beside,
+    compiled_linalg.hstack,
 )
-_put, _put_matrix = compiled_linalg.put, compiled_linalg.put_matrix
+_put, _put_matrix = compiled_linalg.copy_into, compiled_linalg.copy_matrix_into
 
 
 class AllDetections(NamedTuple):
@@ -59,7 +67,9 @@ class AllDetections(NamedTuple):
 
 
 @compiled
-def labelled_points(all_of: AllDetections, k: int, assigned: Ints, extra: Array) -> tuple[Bools, Array, Array]:
+def labelled_points(
+    all_of: AllDetections, k: int, assigned: Ints, calibration_cov: Array
+) -> tuple[Bools, Array, Array]:
     """Of frame k: which views take part in the pose (n,), their pixels (n, 2) and covariances (n, 2, 2)."""
     n = assigned.shape[0]
     use, uv, cov = np.zeros(n, np.bool_), np.zeros((n, 2)), np.zeros((n, 2, 2))
@@ -70,13 +80,13 @@ def labelled_points(all_of: AllDetections, k: int, assigned: Ints, extra: Array)
             for a in range(2):
                 uv[i, a] = all_of.uv[d, a]
                 for b in range(2):
-                    cov[i, a, b] = all_of.cov[d, a, b] + extra[i, a, b]
+                    cov[i, a, b] = all_of.cov[d, a, b] + calibration_cov[i, a, b]
     return use, uv, cov
 
 
 @compiled
 def evidence_of(
-    views: Views, all_of: AllDetections, assigned: Ints, extra: Array, ref: Reference, start: int
+    views: Views, all_of: AllDetections, assigned: Ints, calibration_cov: Array, ref: Reference, start: int
 ) -> tuple[Array, Array, Array, Ints]:
     """Information matrices (F, 6, 6), vectors (F, 6), misfits (F,) and numbers of spots (F,) at a reference motion.
 
@@ -86,7 +96,7 @@ def evidence_of(
     L, g = np.empty((frames, 6, 6)), np.empty((frames, 6))
     chi2, spots = np.empty(frames), np.empty(frames, np.int64)
     for k in range(frames):
-        use, uv, cov = labelled_points(all_of, start + k, assigned[start + k], extra)
+        use, uv, cov = labelled_points(all_of, start + k, assigned[start + k], calibration_cov)
         L_k, g_k, chi2[k], spots[k], _ = frame_information(views, ref.R[k], ref.t[k], use, uv, cov)
         _put_matrix(L[k], L_k)
         _put(g[k], g_k)
@@ -95,7 +105,13 @@ def evidence_of(
 
 @compiled
 def clutter_density(
-    views: Views, sights: Sights, all_of: AllDetections, assigned: Ints, ref: Reference, known: Bools, radius_px: float
+    views: Views,
+    sights: ViewTable,
+    all_of: AllDetections,
+    assigned: Ints,
+    ref: Reference,
+    known: Bools,
+    radius_px: float,
 ) -> Array:
     """(cameras,) false points per px^2 within a radius of where spots are expected, over a whole run."""
     cameras = all_of.has_image.shape[1]
@@ -124,13 +140,13 @@ def clutter_density(
 
 
 @compiled
-def relabelled(
+def reassociated(
     views: Views,
-    sights: Sights,
-    chances: Chances,
+    sights: ViewTable,
+    chances: DetectionModel,
     all_of: AllDetections,
     assigned: Ints,
-    extra: Array,
+    calibration_cov: Array,
     ref: Reference,
     pose_P: Array,
     log_clutter: Array,
@@ -154,11 +170,11 @@ def relabelled(
     for i in range(6):
         anywhere[i] = ANYWHERE_M if i < 3 else ANYWHERE_RAD
     for k in range(frames):
-        alone, R, t, sigma_px[k] = _by_the_others(views, sights, all_of, assigned, extra, ref, pose_P, k)
+        alone, R, t, sigma_px[k] = _by_the_others(views, sights, all_of, assigned, calibration_cov, ref, pose_P, k)
         if not sigma_px[k] < VAGUE_PX:
             continue
         a, b = all_of.begin[k], all_of.begin[k + 1]
-        frame = Frame(
+        frame = FrameDetections(
             all_of.uv[a:b], all_of.cov[a:b], all_of.blend_px[a:b], all_of.first[k], all_of.has_image[k],
             log_clutter[k], all_of.log_static[a:b], all_of.size_px[a:b], all_of.usual_px, nowhere,
         )  # fmt: skip
@@ -172,7 +188,7 @@ def relabelled(
             elif now[i] < BLENDED:
                 labels += 1
         tried, score = _explanations(
-            views, sights, frame, chances, extra, hidden, alone, R, t, now, labels, bend_sigma[k], anywhere
+            views, sights, frame, chances, calibration_cov, hidden, alone, R, t, now, labels, bend_sigma[k], anywhere
         )
         best = 0
         for j in range(score.shape[0]):
@@ -202,16 +218,16 @@ def _same(a: int, b: int) -> bool:
 @compiled
 def _by_the_others(
     views: Views,
-    sights: Sights,
+    sights: ViewTable,
     all_of: AllDetections,
     assigned: Ints,
-    extra: Array,
+    calibration_cov: Array,
     ref: Reference,
     pose_P: Array,
     k: int,
 ) -> tuple[Array, Array, Array, float]:
     """Where all other frames put frame k: covariance (6, 6), R, t; and the largest sigma of a spot there, px."""
-    use, uv, cov = labelled_points(all_of, k, assigned[k], extra)
+    use, uv, cov = labelled_points(all_of, k, assigned[k], calibration_cov)
     L, g, _, _, _ = frame_information(views, ref.R[k], ref.t[k], use, uv, cov)
     P = pose_P[k]
     A, step = _multiply(P, L), _apply(P, g)
@@ -243,10 +259,10 @@ def _by_the_others(
 @compiled
 def _explanations(
     views: Views,
-    sights: Sights,
-    frame: Frame,
-    chances: Chances,
-    extra: Array,
+    sights: ViewTable,
+    frame: FrameDetections,
+    chances: DetectionModel,
+    calibration_cov: Array,
     hidden: Array,
     alone: Array,
     R: Array,
@@ -275,13 +291,15 @@ def _explanations(
         _put_matrix(whole, P)
         before = (R, t, nothing, whole)
         if mode < 2:
-            found, rough, _, R_b, t_b, found_count = associate(views, sights, frame, chances, R, t, P, shining, extra)
+            found, rough, _, R_b, t_b, found_count = associate(
+                views, sights, frame, chances, R, t, P, shining, calibration_cov
+            )
             plain = False
             for j in range(found_count):
                 if rough[j] < rough[0] - 2 * RIVAL or count == room - 4:
                     break
-                R_j, t_j, _, _, gaussian, misfit, spots = concluded(
-                    views, frame, extra, before, found[j], R_b[j], t_b[j]
+                R_j, t_j, _, _, gaussian, misfit, spots = iterated_update(
+                    views, frame, calibration_cov, before, found[j], R_b[j], t_b[j]
                 )
                 same = True
                 for i in range(n):
@@ -291,7 +309,7 @@ def _explanations(
                     prior
                     + gaussian
                     + log_chance(views, sights, frame, chances, shining, found[j], R_j, t_j)
-                    + together(hidden, sights.group, found[j], chances.detect)
+                    + joint_log_likelihood(hidden, sights.group, found[j], chances.detect)
                     + (bonus if same else 0.0)
                 )
                 if j == 0:
@@ -304,16 +322,16 @@ def _explanations(
         # The labels that the frame has, although they may lie outside the gates.
         own_R, own_t = R, t
         if mode == 2:
-            use, uv, cov = chosen_points(frame, now, extra)
+            use, uv, cov = chosen_points(frame, now, calibration_cov)
             own_R, own_t, _, _, _ = fit_alone(views, R, t, use, uv, cov)
-        R_j, t_j, _, _, gaussian, _, _ = concluded(views, frame, extra, before, now, own_R, own_t)
+        R_j, t_j, _, _, gaussian, _, _ = iterated_update(views, frame, calibration_cov, before, now, own_R, own_t)
         for i in range(n):
             tried[count, i] = now[i]
         score[count] = (
             prior
             + gaussian
             + log_chance(views, sights, frame, chances, shining, now, R_j, t_j)
-            + together(hidden, sights.group, now, chances.detect)
+            + joint_log_likelihood(hidden, sights.group, now, chances.detect)
             + bonus
         )
         count += 1

@@ -25,12 +25,12 @@ def assigned_in_one_list(tracked: TrackedFrame, start: Ints) -> Ints:
     start (n,): where the detections of each view's camera begin.
     """
     assigned = np.where(tracked.point == UNMATCHED, -1, tracked.point + start)
-    if tracked.witness is not None:
-        assigned += np.where((assigned >= 0) & ~tracked.witness, BLENDED, 0)
+    if tracked.used_in_pose is not None:
+        assigned += np.where((assigned >= 0) & ~tracked.used_in_pose, BLENDED, 0)
     return assigned
 
 
-class Recording:
+class TrackedRecording:
     """Feed it each frame with what the causal tracker said of it; about 1 kB per frame is kept."""
 
     def __init__(

@@ -43,7 +43,7 @@ class Smoothed:
     relabelled: int  # labels that differ from the causal ones
     width_share: float  # errors beyond the claims, as a share of the spots' sigmas
     noise_scale: float  # how much larger than claimed the spots' errors are
-    extra: Array  # (n, 2, 2) of the calibration's errors, on the expected pixels
+    calibration_cov: Array  # (n, 2, 2) of the calibration's errors, on the expected pixels
 
     @property
     def frames(self) -> int:
@@ -64,7 +64,7 @@ class Smoothed:
         systematic = self.systematic[min(k, len(self.systematic) - 1)]
         covariance = self.covariance[k] + systematic
         uv, J = project_all(model.numbers, pose.rotation[None], pose.translation[None])
-        uv_px, cov_px2 = uv[0], J[0] @ covariance @ np.swapaxes(J[0], -1, -2) + self.extra
+        uv_px, cov_px2 = uv[0], J[0] @ covariance @ np.swapaxes(J[0], -1, -2) + self.calibration_cov
         exists: Bools = ~np.isnan(uv_px[:, 0])
         point = np.where(labelled, assigned % BLENDED - self.first[k][model.camera_of], UNMATCHED)
         for v in np.flatnonzero(labelled):
@@ -100,7 +100,7 @@ class Smoothed:
             rms_px=float(self.rms_px[k]) if measured else float("nan"),
             events=self._events(k, causal, point, known),
             label_probability=self._label_probability(k, causal, known),
-            witness=labelled & (assigned < BLENDED),
+            used_in_pose=labelled & (assigned < BLENDED),
             motion=MotionEstimate(self.velocities[k, :3], self.velocities[k, 3:], self.motion_covariance[k])
             if known
             else None,

@@ -20,9 +20,9 @@ from geometry.compiled_projection import Views, project_all
 from geometry.pose import Pose
 from geometry.pose_solver.gauss_newton import SolveLimits, covariance_of
 from tracking.rigid_body.adaptive_process_noise import jump_variance
-from tracking.rigid_body.association import BLENDED, Chances, Sights, distinct_spots
+from tracking.rigid_body.association import BLENDED, DetectionModel, ViewTable, distinct_spots
 from tracking.rigid_body.clutter import RADIUS_PX
-from tracking.rigid_body.hypotheses import CHECK_PX, FEW, PROOF, SURE
+from tracking.rigid_body.hypotheses import CHECK_PX, FEW, MIN_CONFIRMING_SPOTS, SURE
 from tracking.rigid_body.information import controlled, fit_alone, frame_information
 from tracking.rigid_body.motion import process_noise
 from tracking.rigid_body.static_points import learn as learn_static
@@ -34,10 +34,10 @@ from tracking.smoothing.error_scale import noise_scale, width_covariance, width_
 from tracking.smoothing.exposure import exposure_offsets, moved_by
 from tracking.smoothing.fixed_interval import Reference, speeds
 from tracking.smoothing.place_errors import place_errors
-from tracking.smoothing.reassociation import AllDetections, clutter_density, labelled_points, relabelled
-from tracking.smoothing.recording import Recording
+from tracking.smoothing.reassociation import AllDetections, clutter_density, labelled_points, reassociated
+from tracking.smoothing.recording import TrackedRecording
 from tracking.smoothing.smoothed import Smoothed
-from tracking.smoothing.whole_run import DEEP, Motion, WholeRun, estimate, straight_between
+from tracking.smoothing.whole_run import DEEP, SmoothedMotion, WholeRun, estimate, straight_between
 
 MOST_ROUNDS = 4
 MOST_REPAIRS = 3  # times that frames whose pose contradicts their spots are taken for bends
@@ -45,7 +45,7 @@ UNLIKELY_AT_BEND = 5.0  # the same beside a bend, where one step more may be one
 CONTRADICTS = 60.0  # chi-square that a frame's spots lose at the smoothed pose, against their own (6 degrees: 5e-11)
 
 
-def smooth(recording: Recording) -> Smoothed:
+def smooth(recording: TrackedRecording) -> Smoothed:
     """A run's labels and motion, given all of it.
 
     With `method: spots` the labels stay as that tracker gave them. Where nothing was measured nothing is known.
@@ -75,21 +75,21 @@ def smooth(recording: Recording) -> Smoothed:
 class _Pass:
     """One run in work: T frames, n views."""
 
-    def __init__(self, rec: Recording) -> None:
+    def __init__(self, rec: TrackedRecording) -> None:
         model, parameters = rec.model, rec.parameters
         self.rec, self.model, self.parameters = rec, model, parameters
         self.views = model.numbers
-        self.sights = Sights.of(rec.rig, model)
+        self.sights = ViewTable.of(rec.rig, model)
         self.causal = rec.assigned
         self.assigned = self.causal.copy()
         self.measured = rec.measured
         self.probability = np.where(self.causal >= 0, 1.0, np.nan)
         ref = straight_between(rec.poses, self.measured, np.cumsum(rec.dt_s))
         every = _all_detections(rec)
-        self.extra, self.systematic = _calibration(rec, every, self.assigned, ref)
-        self.share = width_share(self.views, every, self.assigned, self.extra, ref, self.measured)
+        self.calibration_cov, self.systematic = _calibration(rec, every, self.assigned, ref)
+        self.share = width_share(self.views, every, self.assigned, self.calibration_cov, ref, self.measured)
         every = every._replace(cov=every.cov + width_covariance(every.size_px, self.share))
-        self.scale = noise_scale(self.views, every, self.assigned, self.extra, ref, self.measured)
+        self.scale = noise_scale(self.views, every, self.assigned, self.calibration_cov, ref, self.measured)
         self.every = every._replace(
             cov=every.cov * self.scale**2 + parameters.sigma_model_px**2 * np.eye(2),
             usual_px=_usual_sizes(every, self.assigned),
@@ -103,16 +103,18 @@ class _Pass:
         # Frames that a tracker measured with enough spots: where nothing checked a label it was beyond doubt.
         self.sure = self.measured & (distinct_spots(self.assigned >= 0, model.spot_of) >= FEW)
         self.trusted = _chained(self.measured, self.sure | self._controlled(ref)[0])  # their labels may be evidence
-        self.motion = Motion.begin(ref, rec.bent.copy(), log_density)
+        self.motion = SmoothedMotion.begin(ref, rec.bent.copy(), log_density)
         self.doubtful = np.zeros(len(rec), dtype=bool)  # frames in which two poses were measured
         self.own = _Own.nothing(len(rec))
 
     def estimate(self, deep: int) -> None:
         """The motion given the labels."""
         rec = self.rec
-        run = WholeRun(self.views, self.every, self.extra, rec.dt_s, rec.exposure_s, self.parameters.learn_jerk)
+        run = WholeRun(
+            self.views, self.every, self.calibration_cov, rec.dt_s, rec.exposure_s, self.parameters.learn_jerk
+        )
         self.motion = estimate(run, self.assigned, self.measured, self.motion, deep, self.trusted)
-        self.own = _alone(rec, self.views, self.every, self.assigned, self.extra, self.motion.ref)
+        self.own = _alone(rec, self.views, self.every, self.assigned, self.calibration_cov, self.motion.ref)
         self.own.measured &= ~self.doubtful
         self.measured = self.own.measured
 
@@ -123,7 +125,7 @@ class _Pass:
         labelled = np.zeros(self.assigned.shape, dtype=bool)
         checked = labelled.copy()
         for k in range(len(self.rec)):
-            labelled[k], _, cov = labelled_points(self.every, k, self.assigned[k], self.extra)
+            labelled[k], _, cov = labelled_points(self.every, k, self.assigned[k], self.calibration_cov)
             checked[k] = controlled(self.views, ref.R[k], ref.t[k], labelled[k], cov)
         count = distinct_spots(checked, self.model.spot_of)
         frames = (count >= FEW) | ((count > 0) & ~np.any(labelled & ~checked, axis=1))
@@ -136,15 +138,15 @@ class _Pass:
             log_static=_log_static(self.views, self.sights, self.every, self.assigned, ref, known)
         )
         log_clutter = _log_clutter(rec, self.views, self.sights, self.every, self.assigned, ref, known)
-        chances = Chances(self.parameters.p_detect, self.parameters.p_blend)
-        found, certain, sigma_px = relabelled(
-            self.views, self.sights, chances, self.every, self.assigned, self.extra, ref, self.motion.pose_P,
+        chances = DetectionModel(self.parameters.p_detect, self.parameters.p_blend)
+        found, certain, sigma_px = reassociated(
+            self.views, self.sights, chances, self.every, self.assigned, self.calibration_cov, ref, self.motion.pose_P,
             log_clutter, _bend_sigmas(ref, rec.dt_s),
         )  # fmt: skip
         before = self.assigned
         new = np.where((certain >= self.parameters.min_label_probability) & known[:, None], found, -1)
         self.assigned = new
-        self.measured = _alone(rec, self.views, self.every, new, self.extra, ref).measured
+        self.measured = _alone(rec, self.views, self.every, new, self.calibration_cov, ref).measured
         # Where the other frames do not check a label, those of its frame must, or a tracker that was sure of it.
         vague = sigma_px > CHECK_PX
         controlled_frames, loose = self._controlled(ref)
@@ -155,7 +157,7 @@ class _Pass:
         count = distinct_spots(new >= 0, self.model.spot_of)
         lone = _lone_points(count)
         # So few spots fit false points by chance once in a long dark time; the next frame would show them again.
-        whole = _alone(rec, self.views, self.every, new, self.extra, ref).measured
+        whole = _alone(rec, self.views, self.every, new, self.calibration_cov, ref).measured
         lone |= vague & whole & (count <= FEW) & ~_beside(whole)
         new[lone] = -1
         self.probability = np.where((found >= 0) & ~lone[:, None], certain, np.nan)
@@ -177,7 +179,7 @@ class _Pass:
             return False
         self.assigned = self.certified = new
         self.found = self.found | back.measured
-        self.measured = _alone(self.rec, self.views, self.every, new, self.extra, motion.ref).measured
+        self.measured = _alone(self.rec, self.views, self.every, new, self.calibration_cov, motion.ref).measured
         # Two directions of time that measured two poses: neither is believed.
         self.doubtful = back.disagrees
         self.measured &= ~self.doubtful
@@ -214,7 +216,7 @@ class _Pass:
         """Labels of frames that do not give the pose, by the continuity of each spot's path."""
         motion = self.motion
         uv, J = project_all(self.views, motion.ref.R, motion.ref.t)
-        spread = J @ motion.pose_P[:, None] @ np.swapaxes(J, -1, -2) + self.extra
+        spread = J @ motion.pose_P[:, None] @ np.swapaxes(J, -1, -2) + self.calibration_cov
         camera = self.sights.camera
         log_clutter = _log_clutter(
             self.rec, self.views, self.sights, self.every, self.assigned, motion.ref, self.own.measured
@@ -271,7 +273,7 @@ class _Pass:
             relabelled=int(np.count_nonzero(differ)),
             noise_scale=self.scale,
             width_share=self.share,
-            extra=self.extra,
+            calibration_cov=self.calibration_cov,
         )
 
     def _place_errors(self, ref: Reference, pose_P: Array) -> tuple[float, Array]:
@@ -286,12 +288,12 @@ class _Pass:
         expected, _ = project_all(self.views, ref.R, ref.t)
         explained = np.zeros(shape[1])
         for k in np.flatnonzero(self.own.measured).tolist():
-            use, uv, cov = labelled_points(self.every, k, self.assigned[k], self.extra)
+            use, uv, cov = labelled_points(self.every, k, self.assigned[k], self.calibration_cov)
             use = use & np.isfinite(expected[k]).all(axis=-1)
             size = np.sqrt(0.5 * np.trace(cov[use], axis1=1, axis2=2))
             residual[k, use] = (uv[use] - expected[k, use]) / size[:, None]
             uv_px[k, use] = uv[use]
-            explained[use] = 0.5 * np.trace(self.extra[use], axis1=1, axis2=2) / size**2
+            explained[use] = 0.5 * np.trace(self.calibration_cov[use], axis1=1, axis2=2) / size**2
         found = place_errors(residual, uv_px, self.every.usual_px, averaged, explained)
         return found.share, found.factor(averaged)
 
@@ -333,13 +335,15 @@ class _Own:
         )  # fmt: skip
 
 
-def _alone(rec: Recording, views: Views, every: AllDetections, assigned: Ints, extra: Array, ref: Reference) -> _Own:
+def _alone(
+    rec: TrackedRecording, views: Views, every: AllDetections, assigned: Ints, calibration_cov: Array, ref: Reference
+) -> _Own:
     """Each frame's own pose, and how far the reference's is from it."""
     frames = len(rec)
     limits = SolveLimits(rec.parameters.max_sigma_m, float(np.deg2rad(rec.parameters.max_sigma_deg)))
     out = _Own.nothing(frames)
     for k in range(frames):
-        use, uv, cov = labelled_points(every, k, assigned[k], extra)
+        use, uv, cov = labelled_points(every, k, assigned[k], calibration_cov)
         if np.count_nonzero(use) < 3:
             continue
         R, t, L, chi2, count = fit_alone(views, ref.R[k], ref.t[k], use, uv, cov)
@@ -390,7 +394,7 @@ def _usual_sizes(every: AllDetections, assigned: Ints) -> Array:
 
 
 def _log_static(
-    views: Views, sights: Sights, every: AllDetections, assigned: Ints, ref: Reference, known: Bools
+    views: Views, sights: ViewTable, every: AllDetections, assigned: Ints, ref: Reference, known: Bools
 ) -> Array:
     """(m,) log density of points that stay in their place, at each detection, from the whole run."""
     frames = len(known)
@@ -416,10 +420,10 @@ def _lone_points(count: Ints) -> Bools:
     """
     before, after = np.concatenate([[-1], count[:-1]]), np.concatenate([count[1:], [-1]])
     company = ((before > 0) & (before < count + 2)) | ((after > 0) & (after < count + 2))
-    return (count > 0) & (count < PROOF) & ((before == 0) | (after == 0)) & ~company
+    return (count > 0) & (count < MIN_CONFIRMING_SPOTS) & ((before == 0) | (after == 0)) & ~company
 
 
-def _all_detections(rec: Recording) -> AllDetections:
+def _all_detections(rec: TrackedRecording) -> AllDetections:
     frames = [rec.detections(k) for k in range(len(rec))]
     counts = [len(f[0]) for f in frames]
     cameras = len(rec.model.camera_names)
@@ -437,7 +441,7 @@ def _all_detections(rec: Recording) -> AllDetections:
     )
 
 
-def _calibration(rec: Recording, every: AllDetections, assigned: Ints, ref: Reference) -> tuple[Array, Array]:
+def _calibration(rec: TrackedRecording, every: AllDetections, assigned: Ints, ref: Reference) -> tuple[Array, Array]:
     """What the calibration's errors do: to expected pixels (n, 2, 2), mean over the run, and to poses (T, 6, 6).
 
     The smoother weighs spots with their noise and the first of these, each spot by itself. The pose that such weights
@@ -446,10 +450,10 @@ def _calibration(rec: Recording, every: AllDetections, assigned: Ints, ref: Refe
     """
     model = rec.model
     n = len(model)
-    extra, systematic = np.zeros((n, 2, 2)), np.zeros((1, 6, 6))
+    calibration_cov, systematic = np.zeros((n, 2, 2)), np.zeros((1, 6, 6))
     if rec.calibration is None:
-        return extra, systematic
-    points = [labelled_points(every, k, assigned[k], np.zeros_like(extra)) for k in range(len(rec))]
+        return calibration_cov, systematic
+    points = [labelled_points(every, k, assigned[k], np.zeros_like(calibration_cov)) for k in range(len(rec))]
     common = [rec.calibration.at(Pose(ref.R[k], ref.t[k])) if rec.measured[k] else None for k in range(len(rec))]
     J_all = project_all(model.numbers, ref.R, ref.t)[1]
     gains: list[tuple[Ints, Array] | None] = [None] * len(rec)
@@ -461,7 +465,7 @@ def _calibration(rec: Recording, every: AllDetections, assigned: Ints, ref: Refe
             assert C is not None
             if len(rows) < 3:
                 continue
-            J, W = J_all[k][rows], np.linalg.inv(cov[rows] + extra[rows])
+            J, W = J_all[k][rows], np.linalg.inv(cov[rows] + calibration_cov[rows])
             JW = np.swapaxes(J, 1, 2) @ W  # (m, 6, 2)
             covariance, full = covariance_of(np.sum(JW @ J, axis=0))
             if not full:
@@ -476,7 +480,7 @@ def _calibration(rec: Recording, every: AllDetections, assigned: Ints, ref: Refe
                 total += joint[np.arange(n), :, np.arange(n)]
                 count += 1
         if not second:
-            extra = total / max(count, 1)
+            calibration_cov = total / max(count, 1)
     systematic = np.zeros((len(rec), 6, 6))
     latest = np.zeros((6, 6))
     for at, (gain, C) in enumerate(zip(gains, common, strict=True)):
@@ -485,11 +489,17 @@ def _calibration(rec: Recording, every: AllDetections, assigned: Ints, ref: Refe
             both = np.stack([2 * rows, 2 * rows + 1], axis=-1).ravel()
             latest = G @ C[np.ix_(both, both)] @ G.T
         systematic[at] = latest
-    return extra, systematic
+    return calibration_cov, systematic
 
 
 def _log_clutter(
-    rec: Recording, views: Views, sights: Sights, every: AllDetections, assigned: Ints, ref: Reference, known: Bools
+    rec: TrackedRecording,
+    views: Views,
+    sights: ViewTable,
+    every: AllDetections,
+    assigned: Ints,
+    ref: Reference,
+    known: Bools,
 ) -> Array:
     """(T, n) log density of false points: as counted near spots over the run, or a frame's whole picture's if more."""
     near = clutter_density(views, sights, every, assigned, ref, known, RADIUS_PX)

@@ -17,10 +17,10 @@ from geometry.pose import Pose
 from tracking.rigid_body.adaptive_process_noise import STEADIES_WITHIN_S, jump_variance
 from tracking.rigid_body.motion import STATE, predicted
 from tracking.smoothing.fixed_interval import (
-    Evidence,
+    FrameInformation,
     Interval,
     Reference,
-    log_left_out,
+    leave_one_out_log_likelihood,
     log_likelihood,
     motion_cost,
     shifted,
@@ -42,7 +42,7 @@ APART = 2  # frames: of shocks so near each other the largest is looked at first
 SMALL_STEP = 0.02  # sigmas: a step of Gauss-Newton that is nothing any more
 SMALL_CHANGE = 0.3  # of log q, weighted by what determines it: the strength has settled
 TRUST = (np.inf, 0.1, 0.01, 1e-3)  # m and rad: damping of a step, tried in turn until the cost falls
-P_DARK = 0.05  # probability of a bend in each frame that does not show the pose
+P_OCCLUDED = 0.05  # probability of a bend in each frame that does not show the pose
 P_EITHER = 0.3  # of a bend being in each of several steps, where a frame between them says little
 # Of log det of a frame's information below the usual: its pose's sigmas are half as large again.
 WEAK = 2 * 6 * np.log(1.5)
@@ -66,7 +66,7 @@ class WholeRun:
 
 
 @dataclass(frozen=True, slots=True)
-class Motion:
+class SmoothedMotion:
     """The estimate, T frames."""
 
     ref: Reference
@@ -78,15 +78,17 @@ class Motion:
     known: Bools  # (T,) the pose says something
 
     @staticmethod
-    def begin(ref: Reference, bent: Bools, log_density: Array | None) -> Motion:
+    def begin(ref: Reference, bent: Bools, log_density: Array | None) -> SmoothedMotion:
         """A first guess."""
         frames = len(ref.t)
         nothing = np.zeros((frames, 6, 6))
         none = np.zeros(frames, dtype=bool)
-        return Motion(ref, log_density, 0.0, bent, nothing, nothing, none)
+        return SmoothedMotion(ref, log_density, 0.0, bent, nothing, nothing, none)
 
 
-def estimate(run: WholeRun, assigned: Ints, measured: Bools, motion: Motion, deep: int, trusted: Bools) -> Motion:
+def estimate(
+    run: WholeRun, assigned: Ints, measured: Bools, motion: SmoothedMotion, deep: int, trusted: Bools
+) -> SmoothedMotion:
     """The motion given labels (T, n). measured (T,): frames whose own spots give the pose.
 
     deep: frames; so far from any measured frame spots are not taken for evidence (0: only measured frames are), nor are
@@ -108,7 +110,7 @@ class _Estimator:
     """The passes over the core of one run: the frames from the first evidence to the last."""
 
     def __init__(
-        self, run: WholeRun, assigned: Ints, measured: Bools, used: Bools, core: slice, motion: Motion
+        self, run: WholeRun, assigned: Ints, measured: Bools, used: Bools, core: slice, motion: SmoothedMotion
     ) -> None:
         self.run, self.assigned, self.used, self.core, self.motion = run, assigned, used, core, motion
         self.measured = measured[core]
@@ -119,7 +121,7 @@ class _Estimator:
         self.log_density = None if motion.log_density is None else motion.log_density[core].copy()
         self.finer = motion.finer
 
-    def run_passes(self) -> Motion:
+    def run_passes(self) -> SmoothedMotion:
         """Passes until nothing changes."""
         fresh = self.log_density is None
         learning = self.run.learn
@@ -212,10 +214,10 @@ class _Estimator:
                 best, value = finer, there
         return best
 
-    def _left_out(self, ev: Evidence, finer: float, inside: Bools) -> float:
+    def _left_out(self, ev: FrameInformation, finer: float, inside: Bools) -> float:
         assert self.log_density is not None
         out = smoothed(self.ref, ev, np.exp(self.log_density + finer * inside[:, None]))
-        value = float(log_left_out(out.x, out.pose_P, ev))
+        value = float(leave_one_out_log_likelihood(out.x, out.pose_P, ev))
         return value if np.isfinite(value) else -np.inf
 
     def _step(self, density: Array) -> tuple[Interval, Array]:
@@ -237,7 +239,7 @@ class _Estimator:
                 return out, x
         return out, np.zeros_like(out.x)
 
-    def _evidence(self, ref: Reference) -> tuple[Evidence, float]:
+    def _evidence(self, ref: Reference) -> tuple[FrameInformation, float]:
         """The frames' information at a reference, where the motion may have bent; the spots' misfit (chi-square)."""
         run, measured, bent = self.run, self.measured, self.bent
         L, g, chi2 = self._of_the_spots(ref)
@@ -252,7 +254,7 @@ class _Estimator:
                 L[k] -= np.outer(Lb, Lb) * share
         jump = self._jumps(ref, L)
         first = _before_the_first(ref, self.dt, bool(measured[0]))
-        return Evidence(L, g, self.dt, jump, jump / STEADIES_WITHIN_S**2, first), float(chi2.sum())
+        return FrameInformation(L, g, self.dt, jump, jump / STEADIES_WITHIN_S**2, first), float(chi2.sum())
 
     def _of_the_spots(self, ref: Reference) -> tuple[Array, Array, Array]:
         """What the labelled spots say at a reference: information (T, 6, 6), vector (T, 6), chi-square (T,)."""
@@ -275,7 +277,7 @@ class _Estimator:
         dark = ~measured
         dark[1:] |= ~measured[:-1]
         dark[2:] |= ~measured[:-2]
-        chance = np.where(dark, P_DARK, 0.0)
+        chance = np.where(dark, P_OCCLUDED, 0.0)
         bends = np.flatnonzero(self.bent)
         weak = ~measured | _weak(information, measured) if len(bends) else measured
         for k in bends:
@@ -295,7 +297,7 @@ class _Estimator:
         peak = shock >= largest_near(np.where(self.bent, 0.0, shock), APART)
         return np.asarray(peak & (shock > SHOCK) & ~self.bent)
 
-    def _whole(self, out: Interval) -> Motion:
+    def _whole(self, out: Interval) -> SmoothedMotion:
         """The result of all frames: the core's, and what follows from its ends."""
         core, frames = self.core, len(self.run.dt)
         assert self.log_density is not None
@@ -328,7 +330,7 @@ class _Estimator:
         known = (sd[:, :3].max(axis=1) < LOST_SIGMA_M) & (sd[:, 3:].max(axis=1) < LOST_SIGMA_RAD)
         bent = self.motion.bent.copy()
         bent[core] = self.bent
-        return Motion(Reference(R, t, m), log_density, self.finer, bent, pose_P, motion_P, known)
+        return SmoothedMotion(Reference(R, t, m), log_density, self.finer, bent, pose_P, motion_P, known)
 
 
 def _weak(information: Array, measured: Bools) -> Bools:
@@ -339,7 +341,7 @@ def _weak(information: Array, measured: Bools) -> Bools:
     return np.asarray(log_det < usual - WEAK)
 
 
-def _damped(ev: Evidence, trust: float) -> Evidence:
+def _damped(ev: FrameInformation, trust: float) -> FrameInformation:
     """Levenberg's damping: as if each frame's pose had been measured where it is, to within `trust` (m and rad)."""
     return ev._replace(information=ev.information + np.eye(6) / trust**2)
 

@@ -26,7 +26,7 @@ SYSTEMATIC = 1e-3  # of residuals' chance to exceed those of the best model so f
 
 
 @dataclass(frozen=True, slots=True)
-class Rung:
+class ModelCandidate:
     """One model tried."""
 
     model: LensModel
@@ -42,12 +42,12 @@ class Rung:
 class Ladder:
     """All rungs, and the one to stand on."""
 
-    rungs: Sequence[Rung]
-    chosen: Rung
+    candidates: Sequence[ModelCandidate]
+    chosen: ModelCandidate
     why: str
 
 
-def climb(
+def select_model(
     table: CornerTable,
     used: Bools,
     rich: Sequence[LensFit],
@@ -61,7 +61,7 @@ def climb(
     rich: fits of rich models, from which the others start; shape: the stacks of the board's shape to start from. Each
     rung also starts from the one below of its own kind. AdjustmentError where no model can be used.
     """
-    fitted: list[Rung] = []
+    fitted: list[ModelCandidate] = []
     below: LensFit | None = None
     for model in LADDER if only is None else (only,):
         starts = [f for f in rich if f.model.fisheye == model.fisheye and f.model.coefficients <= model.coefficients]
@@ -74,37 +74,37 @@ def climb(
         if rung.fit is not None and not model.fisheye and model.coefficients:
             below = rung.fit
         fitted.append(rung)
-    rungs = []
+    candidates = []
     for rung in fitted:
         hopeless = _hopeless(rung, fitted) if int(used.sum()) > MANY_CORNERS else ""
-        rungs.append(replace(rung, refused=hopeless) if hopeless else _held_out(table, rung, folds))
-    if only is not None and rungs[0].held is not None:
-        return Ladder(rungs, rungs[0], "it was asked for")
-    return choose(rungs)
+        candidates.append(replace(rung, refused=hopeless) if hopeless else _held_out(table, rung, folds))
+    if only is not None and candidates[0].held is not None:
+        return Ladder(candidates, candidates[0], "it was asked for")
+    return choose(candidates)
 
 
 def _best_rung(
     table: CornerTable, used: Bools, model: LensModel, starts: Sequence[Values | None], board: BoardFreedom
-) -> Rung:
+) -> ModelCandidate:
     """The model solved from each start, where it fits best."""
-    rungs = [_fitted(table, used, model, start, board) for start in starts]
-    return min(rungs, key=lambda r: np.inf if r.fit is None else r.fit.sigma_px)
+    candidates = [_fitted(table, used, model, start, board) for start in starts]
+    return min(candidates, key=lambda r: np.inf if r.fit is None else r.fit.sigma_px)
 
 
-def choose(rungs: Sequence[Rung]) -> Ladder:
+def choose(candidates: Sequence[ModelCandidate]) -> Ladder:
     """Of rungs in ascending order: the first that predicts as well as the best and leaves nothing that it explains.
 
     As well: its held-out error is within one standard error of the smallest. What it leaves in the residuals beyond the
     best one's must be noise: the standard error is large where few views reach the parts of the picture in which two
     models differ, though all corners together leave no doubt.
     """
-    able = [r for r in rungs if not r.refused and r.held is not None]
+    able = [r for r in candidates if not r.refused and r.held is not None]
     if not able:
-        reasons = "; ".join(f"{r.model.title}: {r.refused}" for r in rungs)
+        reasons = "; ".join(f"{r.model.title}: {r.refused}" for r in candidates)
         raise AdjustmentError(f"no lens model can be used ({reasons})")
     best = min(able, key=lambda r: _rms(r))
     out = []
-    for r in rungs:
+    for r in candidates:
         if r.held is None or best.held is None:
             out.append(r)
             continue
@@ -126,7 +126,7 @@ def choose(rungs: Sequence[Rung]) -> Ladder:
     return Ladder(out, chosen, why)
 
 
-def leaves_something(rung: Rung, best: Rung) -> bool:
+def leaves_something(rung: ModelCandidate, best: ModelCandidate) -> bool:
     """Whether a model's residuals exceed those of the best one by more than noise and its fewer numbers explain."""
     if rung.fit is None or best.fit is None or best.scatter is None:
         return False
@@ -136,22 +136,26 @@ def leaves_something(rung: Rung, best: Rung) -> bool:
     return bool(chi2.sf((more - least) / noise**2, fewer) < SYSTEMATIC)
 
 
-def _rms(rung: Rung) -> float:
+def _rms(rung: ModelCandidate) -> float:
     return np.inf if rung.held is None else rung.held.rms_px
 
 
-def _fitted(table: CornerTable, used: Bools, model: LensModel, start: Values | None, board: BoardFreedom) -> Rung:
+def _fitted(
+    table: CornerTable, used: Bools, model: LensModel, start: Values | None, board: BoardFreedom
+) -> ModelCandidate:
     """A model solved on all views."""
     if start is None:
-        return Rung(model, None, None, refused="no focal length and no position of the board explain the corners")
+        return ModelCandidate(
+            model, None, None, refused="no focal length and no position of the board explain the corners"
+        )
     try:
         found = fit(table, used, model, start, board, limits=BRIEF)
     except AdjustmentError as error:
-        return Rung(model, None, None, refused=f"it cannot be solved: {error}")
-    return Rung(model, found, None)
+        return ModelCandidate(model, None, None, refused=f"it cannot be solved: {error}")
+    return ModelCandidate(model, found, None)
 
 
-def _hopeless(rung: Rung, others: Sequence[Rung]) -> str:
+def _hopeless(rung: ModelCandidate, others: Sequence[ModelCandidate]) -> str:
     """Why a model cannot be chosen whatever its held-out error may be; empty where it can."""
     solved = [r for r in others if r.fit is not None]
     if rung.fit is None or not solved:
@@ -171,7 +175,7 @@ def _hopeless(rung: Rung, others: Sequence[Rung]) -> str:
     return ""
 
 
-def _held_out(table: CornerTable, rung: Rung, folds: int | None) -> Rung:
+def _held_out(table: CornerTable, rung: ModelCandidate, folds: int | None) -> ModelCandidate:
     """The rung with its held-out error, or with why it is refused."""
     found = rung.fit
     if found is None:

@@ -13,7 +13,7 @@ from calibration.beams.beam_start import world_points
 from calibration.beams.beams import BeamCalibration
 from geometry.arrays import Array
 from geometry.rig import Rig
-from lab.files.text.yaml_text import write_whole
+from lab.files.text.yaml_text import atomic_write_text
 from lab.runs.tables import csv_word
 
 BEAMS, ANGLES, RESIDUALS = "beams.csv", "angles.csv", "residuals.csv"
@@ -29,9 +29,9 @@ RESIDUAL_COLUMNS = (
 
 def write_tables(c: BeamCalibration, drawing: Rig, positions: Sequence[str], folder: Path) -> None:
     """Write the three. drawing: the rig with nominal beams; positions: the names of all positions."""
-    write_whole(_beam_table(c, drawing), folder / BEAMS)
-    write_whole(_angle_table(c), folder / ANGLES)
-    write_whole(_residual_table(c, positions), folder / RESIDUALS)
+    atomic_write_text(_beam_table(c, drawing), folder / BEAMS)
+    atomic_write_text(_angle_table(c), folder / ANGLES)
+    atomic_write_text(_residual_table(c, positions), folder / RESIDUALS)
 
 
 def _beam_table(c: BeamCalibration, drawing: Rig) -> str:

@@ -26,14 +26,14 @@ from lab.files.rig.calibration_state import CalibrationState
 from lab.files.rig.rig_covariance import blocks_of, joint_covariance
 from lab.files.rig.rig_file import RigFile, load_rig_file, save_rig
 from lab.files.rig.screens_file import load_screens
-from lab.files.text.atomic_write import beside_a_good_one, refuse_foreign, whole_folder
+from lab.files.text.atomic_write import atomic_folder, beside_a_good_one, refuse_foreign
 from lab.files.text.yaml_text import did_you_mean, read_mapping
 
 RIG = "rig.yaml"
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class BeamsOutcome:
     """How a calibration of beams ended."""
 
     name: str
@@ -67,13 +67,13 @@ class Outcome:
             what_failed = worst.what.split(" (")[0]
             if c.undetermined and worst.what.startswith(UNDETERMINED):
                 what_failed = f"{UNDETERMINED}: {briefly(c.undetermined)}"
-            reason = f"; {what_failed}: {worst.cure}"
+            reason = f"; {what_failed}: {worst.remedy}"
         return f"{self.name}: {self.level.name}: {what}{reason} -> {self.out}"
 
 
 def calibrate_beams(
     project_path: Path, out: Path, rig: Path | None = None, today: datetime.date | None = None
-) -> Outcome:
+) -> BeamsOutcome:
     """Calibrate the beams of a project; writes rig.yaml (not where it fails), three tables and report.html into `out`.
 
     rig: the rig.yaml or screens.yaml with cameras and screens as calibrated and their covariances (None: `rig.yaml`
@@ -105,10 +105,10 @@ def calibrate_beams(
     ]
     level = verdict(findings)
     folder = beside_a_good_one(out, level == Level.FAIL, RIG)
-    outcome = Outcome(
+    outcome = BeamsOutcome(
         project.name, folder, level, tuple(findings), found, None if level == Level.FAIL else folder / RIG
     )
-    with whole_folder(folder, may_replace=_is_ours) as work:
+    with atomic_folder(folder, may_replace=_is_ours) as work:
         write_tables(found, file.rig, recordings.names, work)
         if level != Level.FAIL:
             save_rig(_rig_file(file, found, project, findings, day), work / RIG)

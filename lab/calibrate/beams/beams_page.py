@@ -20,9 +20,9 @@ from lab.report.calibration.calibration_charts import residual_histogram
 from lab.report.calibration.calibration_drawings import coverage_map, residual_field
 from lab.report.calibration.calibration_page import (
     CalibrationReport,
-    Drawing,
+    PageDrawing,
+    PageTable,
     Section,
-    Table,
     provenance,
     write_calibration_report,
 )
@@ -49,7 +49,7 @@ def write_page(
         Section(
             "The lab",
             "The vehicle stands where it stood at the first position; the beams are the ones found.",
-            [Drawing(view) for view in scene_views(rig_things(c.rig, c.world_from_body[0]))],
+            [PageDrawing(view) for view in scene_views(rig_things(c.rig, c.world_from_body[0]))],
         ),
     ]
     report = CalibrationReport(
@@ -122,7 +122,7 @@ def _beams(c: BeamCalibration, drawing: Rig) -> Section:
     ]
     if c.undetermined:
         words[1] = "These numbers are not determined by the recordings: no rig.yaml was written."
-    return Section("Beams", words, (), Table(heads, rows))
+    return Section("Beams", words, (), PageTable(heads, rows))
 
 
 def _three(vector: Array, digits: int) -> str:
@@ -132,7 +132,9 @@ def _three(vector: Array, digits: int) -> str:
 def _between(c: BeamCalibration) -> Section:
     rows = [(a.first, a.second, f"{np.rad2deg(a.angle):.5f}", a.sigma / ARCSEC) for a in c.angles]
     words = ["What a turn or shift of the body frame does not change."]
-    return Section("Angles between beams", words, (), Table(("first", "second", "angle (deg)", "sigma (arcsec)"), rows))
+    return Section(
+        "Angles between beams", words, (), PageTable(("first", "second", "angle (deg)", "sigma (arcsec)"), rows)
+    )
 
 
 def _body_frame(c: BeamCalibration) -> Section:
@@ -164,9 +166,9 @@ def _body_frame(c: BeamCalibration) -> Section:
         "The body frame is the stand's carriage, as its positions were recorded. The stand's place in the world:",
     ]
     if c.undetermined:
-        words.append(f"Not determined: {'; '.join(c.undetermined)}. {c.motion.cure().capitalize()}.")
+        words.append(f"Not determined: {'; '.join(c.undetermined)}. {c.motion.remedy().capitalize()}.")
         rows = [(name, value, float("nan")) for name, value, _ in rows]
-    return Section("The stand", words, (), Table(("world_from_stand", "value", "sigma"), rows))
+    return Section("The stand", words, (), PageTable(("world_from_stand", "value", "sigma"), rows))
 
 
 def _positions(c: BeamCalibration, positions: Sequence[str]) -> Section:
@@ -187,20 +189,22 @@ def _positions(c: BeamCalibration, positions: Sequence[str]) -> Section:
         "RMS (px)",
     )  # fmt: skip
     coverage = [
-        Drawing(coverage_map(c.rig.cameras[n].image_size_px, pixels, f"Camera {n}: where spots were", things="spots"))
+        PageDrawing(
+            coverage_map(c.rig.cameras[n].image_size_px, pixels, f"Camera {n}: where spots were", things="spots")
+        )
         for n, pixels in _by_camera(c, c.spots.pixels).items()
     ]
     words = [
         f"The vehicle's pose in the world at each position. {str(c.motion)[0].upper()}{str(c.motion)[1:]}.",
         "A direction is told by spots at different distances along its beam: turns and shifts towards the screens.",
     ]
-    return Section("Positions", words, coverage, Table(heads, rows))
+    return Section("Positions", words, coverage, PageTable(heads, rows))
 
 
 def _residuals(c: BeamCalibration) -> Section:
     kept = c.fit.kept
     drawings = [
-        Drawing(
+        PageDrawing(
             residual_field(
                 c.rig.cameras[n].image_size_px,
                 pixels,
@@ -215,7 +219,7 @@ def _residuals(c: BeamCalibration) -> Section:
         for i, (n, pixels) in enumerate(_by_camera(c, c.spots.pixels, kept).items())
     ]
     whitened = c.fit.adjusted.residuals[0]
-    drawings.append(Drawing(residual_histogram(whitened, "Residuals in sigmas", "sigma", sigma=1.0)))
+    drawings.append(PageDrawing(residual_histogram(whitened, "Residuals in sigmas", "sigma", sigma=1.0)))
     views = c.rig.views()
     rows = []
     mm = residuals_mm(c)
@@ -230,7 +234,7 @@ def _residuals(c: BeamCalibration) -> Section:
     words = "RMS is per axis. The curve is what residuals of the stated sigmas follow."
     if c.fit.scale > 1:
         words += f" The sigmas were widened by {c.fit.scale:.3g}, since the spots scattered more than told."
-    return Section("Residuals", words, drawings, Table(heads, rows))
+    return Section("Residuals", words, drawings, PageTable(heads, rows))
 
 
 def _by_camera(c: BeamCalibration, values: Array, rows: Bools | None = None) -> dict[str, Array]:

@@ -25,7 +25,7 @@ def refuse_known_mistakes(
     files = [r.spots or r.run if found.in_labels else r.poses for r in project.recordings]
     where = ", ".join(str(f) for f in files if f is not None)
     subject = "the spots fit" if found.in_labels else "the spots fit these poses"
-    raise InputError(f"{where}: {subject} only {found.words}; {found.cure}")
+    raise InputError(f"{where}: {subject} only {found.words}; {found.remedy}")
 
 
 def refuse_repeated(project: Project) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calibration.beams.beams import Stand
+from calibration.beams.beams import StandModel
 from calibration.terms.spot_term import SpotPixels
 from geometry.arrays import Array, Ints
 from geometry.pose import Pose
@@ -17,7 +17,7 @@ from geometry.rig import Rig
 from lab.calibrate.beams.stationary_frames import SpotRows, average, positions_at_rest
 from lab.errors import InputError
 from lab.files.project.point_files import StandPoses, read_poses
-from lab.files.project.project import Project, Recording
+from lab.files.project.project import Project, RecordingEntry
 from lab.files.text.csv_text import numbers_in, read_table, shown_line, whole_numbers
 from lab.files.text.range_checks import SIGMAS_PX, refuse_far_pixels, refuse_sigmas
 from lab.files.text.yaml_text import did_you_mean
@@ -42,14 +42,14 @@ class Recordings:
     notes: tuple[str, ...]  # what was assumed
 
 
-def stand_of(project: Project, recordings: Recordings) -> Stand:
+def stand_of(project: Project, recordings: Recordings) -> StandModel:
     """The stand of recordings whose positions are known, for the solve."""
     assert recordings.stand_from_body is not None
     stand = project.stand
     if stand is None or stand.world_from_stand is None:
-        return Stand(recordings.stand_from_body, recordings.pose_sigmas, None, None)
+        return StandModel(recordings.stand_from_body, recordings.pose_sigmas, None, None)
     covariance = np.diag([stand.sigma_m**2] * 3 + [stand.sigma_rad**2] * 3)
-    return Stand(recordings.stand_from_body, recordings.pose_sigmas, stand.world_from_stand, covariance)
+    return StandModel(recordings.stand_from_body, recordings.pose_sigmas, stand.world_from_stand, covariance)
 
 
 def read_recordings(project: Project, rig: Rig) -> Recordings:
@@ -108,7 +108,9 @@ def read_recordings(project: Project, rig: Rig) -> Recordings:
     )
 
 
-def _rows(recording: Recording, known: StandPoses | None, project: Project, rig: Rig, notes: list[str]) -> SpotRows:
+def _rows(
+    recording: RecordingEntry, known: StandPoses | None, project: Project, rig: Rig, notes: list[str]
+) -> SpotRows:
     if recording.spots is not None:
         rows = read_spot_table(recording.spots, rig, notes)
         if known is not None:
@@ -228,7 +230,7 @@ def spread(rows: SpotRows, notes: list[str]) -> SpotRows:
     return SpotRows(rows.frame[used], rows.view[used], rows.pixels[used], rows.covariance[used])
 
 
-def _names(recording: Recording, frames: Ints, position_of: Ints, several: bool) -> list[str]:
+def _names(recording: RecordingEntry, frames: Ints, position_of: Ints, several: bool) -> list[str]:
     label = ""
     if several:
         path = recording.run or recording.spots

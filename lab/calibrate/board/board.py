@@ -12,7 +12,7 @@ from calibration.boards.board_types import Board, Charuco
 from lab.calibrate.board.board_page import as_pdf, as_png, as_svg, lay_out
 from lab.errors import InputError
 from lab.files.rig.board_file import board_of, load_board, save_board
-from lab.files.text.atomic_write import whole_folder
+from lab.files.text.atomic_write import atomic_folder
 from lab.files.text.yaml_text import did_you_mean
 
 FORMATS = ("pdf", "svg", "png")
@@ -23,7 +23,7 @@ LEAST_RIM = 0.7
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class BoardOutcome:
     """What was written."""
 
     board: Board
@@ -50,7 +50,7 @@ def write_board(
     formats: Sequence[str] = FORMATS,
     page: str = "A4",
     dpi: float = 300.0,
-) -> Outcome:
+) -> BoardOutcome:
     """Write a board as board.pdf, .svg, .png and board.yaml into the folder `out`, or as the one file that it names.
 
     board: a value, its text, or the path of a board.yaml. Everything is written or nothing. Raises InputError.
@@ -83,12 +83,12 @@ def write_board(
             raise InputError(f"{description}: describes another board; choose another name")
         _write_bytes(contents[single], out)
         save_board(board, description)
-        return Outcome(board, (out, description), layout.name)
-    with whole_folder(out, _holds_boards_only) as work:
+        return BoardOutcome(board, (out, description), layout.name)
+    with atomic_folder(out, _holds_boards_only) as work:
         for name, data in contents.items():
             (work / f"board.{name}").write_bytes(data)
         save_board(board, work / DESCRIPTION)
-    return Outcome(board, (*(out / f"board.{name}" for name in contents), out / DESCRIPTION), layout.name)
+    return BoardOutcome(board, (*(out / f"board.{name}" for name in contents), out / DESCRIPTION), layout.name)
 
 
 def _is_number(suffix: str) -> bool:

@@ -10,7 +10,7 @@ from xml.sax.saxutils import escape
 import cv2
 import numpy as np
 
-from calibration.boards.board_drawing import Drawing, Layer, draw
+from calibration.boards.board_drawing import BoardShapes, Layer, draw
 from calibration.boards.board_types import Board
 from geometry.arrays import Array
 from lab.errors import InputError
@@ -28,7 +28,7 @@ class Page:
     """Where everything lies, mm from the page's top left corner, y down."""
 
     size_mm: tuple[float, float]
-    drawing: Drawing
+    drawing: BoardShapes
     board_at_mm: Array  # (2,) top left corner of the printed area
     bar_mm: tuple[float, float, float]  # left, top, length
     caption: tuple[str, ...]
@@ -50,7 +50,7 @@ class Page:
 
 
 def lay_out(board: Board, page: str = "A4") -> Page:
-    """A board in the middle of a page. Raises InputError with the cure where it is too large or the page unknown."""
+    """A board in the middle of a page. Raises InputError with the remedy where it is too large or the page unknown."""
     drawing = draw(board)
     wide, high = (1000.0 * side for side in drawing.size_m)
     caption = (f"{board.describe()}   beampose", f"the bar is {_BAR_MM:.0f} mm: print at 100 %, then measure it")
@@ -79,7 +79,7 @@ def _larger(page: str, wide: float, high: float) -> str:
     return f"A3 or {FIT} (a page of the board's size)" if fits else f"{FIT} (a page of the board's size)"
 
 
-def _placed(drawing: Drawing, size: tuple[float, float], caption: tuple[str, ...], name: str) -> Page:
+def _placed(drawing: BoardShapes, size: tuple[float, float], caption: tuple[str, ...], name: str) -> Page:
     wide, high = (1000.0 * side for side in drawing.size_m)
     foot = size[1] - MARGIN_MM - _FOOT_MM
     at = np.array([(size[0] - wide) / 2, MARGIN_MM + (foot - MARGIN_MM - high) / 2])

@@ -23,13 +23,13 @@ from calibration.lens.intrinsics import (
 )
 from calibration.lens.intrinsics_result import Intrinsics
 from geometry.camera import FISHEYE, PERSPECTIVE
-from lab.calibrate.camera.camera_outcome import Outcome
+from lab.calibrate.camera.camera_outcome import CameraOutcome
 from lab.calibrate.camera.photos import PhotoSet, Progress, find_in_photos, origins_of
 from lab.errors import CalibrationError, InputError
 from lab.files.rig.board_file import board_of
 from lab.files.rig.camera_block import Covariance
 from lab.files.rig.camera_file import CameraCalibration, CameraFile, save_camera
-from lab.files.text.atomic_write import beside_a_good_one, refuse_foreign, whole_folder
+from lab.files.text.atomic_write import atomic_folder, beside_a_good_one, refuse_foreign
 from lab.files.text.yaml_text import did_you_mean
 
 CAMERA, FAILED, CORNERS = "camera.yaml", "camera.failed.yaml", "corners.csv"
@@ -79,7 +79,7 @@ def calibrate_camera(
     options: CameraOptions | None = None,
     today: datetime.date | None = None,
     progress: Progress | None = None,
-) -> Outcome:
+) -> CameraOutcome:
     """Calibrate a camera from photographs (files, folders, patterns, videos) of a board (value, text or board.yaml).
 
     Writes camera.yaml (camera.failed.yaml where the verdict is FAIL, so that nothing reads it by mistake), corners.csv
@@ -100,9 +100,9 @@ def calibrate_camera(
     except IntrinsicsError as error:
         raise CalibrationError(f"{options.name} ({found.line()}): {error}") from None
     folder = beside_a_good_one(out, result.verdict == Level.FAIL, CAMERA)
-    outcome = Outcome(options.name, folder, result, found)
+    outcome = CameraOutcome(options.name, folder, result, found)
     file = camera_file(outcome, options, day)
-    with whole_folder(folder, may_replace=_is_ours) as work:
+    with atomic_folder(folder, may_replace=_is_ours) as work:
         save_camera(file, work / (FAILED if outcome.level == Level.FAIL else CAMERA))
         _write_corners(outcome, work / CORNERS)
         from lab.calibrate.camera.camera_page import (
@@ -130,7 +130,7 @@ def _is_ours(folder: Path) -> bool:
     return (folder / CORNERS).is_file()
 
 
-def camera_file(outcome: Outcome, options: CameraOptions, day: datetime.date) -> CameraFile:
+def camera_file(outcome: CameraOutcome, options: CameraOptions, day: datetime.date) -> CameraFile:
     """What camera.yaml holds."""
     r = outcome.result
     failed = outcome.level == Level.FAIL
@@ -191,7 +191,7 @@ def figures_of(r: Intrinsics) -> dict[str, float]:
     return out
 
 
-def _write_corners(outcome: Outcome, path: Path) -> None:
+def _write_corners(outcome: CameraOutcome, path: Path) -> None:
     """A row per corner; residuals are empty in views that were left out."""
     r, names = outcome.result, [name for name, _ in outcome.photos.views]
     ids = outcome.photos.board.ids

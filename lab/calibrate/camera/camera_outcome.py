@@ -15,7 +15,7 @@ from lab.number_format import short
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class CameraOutcome:
     """How a camera's calibration ended."""
 
     name: str

@@ -14,7 +14,7 @@ from calibration.lens.board_findings import circles_finding, doubt_finding, poin
 from calibration.lens.fit.lens_models import LensModel
 from calibration.lens.intrinsics_result import Intrinsics
 from geometry.arrays import Array
-from lab.calibrate.camera.camera_outcome import Outcome
+from lab.calibrate.camera.camera_outcome import CameraOutcome
 from lab.calibrate.camera.photos import VIDEO_SUFFIXES
 from lab.files.rig.camera_file import CameraFile
 from lab.number_format import short
@@ -24,9 +24,9 @@ from lab.report.calibration.calibration_drawings import corners_overlay, coverag
 from lab.report.calibration.calibration_maps import correlation_matrix, heat_map
 from lab.report.calibration.calibration_page import (
     CalibrationReport,
-    Drawing,
+    PageDrawing,
+    PageTable,
     Section,
-    Table,
     provenance,
     telling_views,
     write_calibration_report,
@@ -35,7 +35,7 @@ from lab.report.calibration.calibration_page import (
 _WORST_VIEWS = 3  # of them as pictures, besides the median and the best
 
 
-def write_page(outcome: Outcome, file: CameraFile, day: datetime.date, folder: Path) -> Path:
+def write_page(outcome: CameraOutcome, file: CameraFile, day: datetime.date, folder: Path) -> Path:
     """Write report.html into the folder."""
     r = outcome.result
     used_paths = [outcome.photos.paths[name] for name, _ in outcome.photos.views]
@@ -100,18 +100,18 @@ def _numbers(r: Intrinsics) -> Section:
         "Numbers that go together (dark squares) are uncertain together: their errors cancel in part, and only the"
         " whole covariance, as in camera.yaml, says how a pixel's direction is known.",
     ]
-    drawing = Drawing(correlation_matrix(r.parameters, r.covariance), "How the errors of the numbers go together.")
-    return Section("The numbers", words, [drawing], Table(("parameter", "value", "sigma", "value / sigma"), rows))
+    drawing = PageDrawing(correlation_matrix(r.parameters, r.covariance), "How the errors of the numbers go together.")
+    return Section("The numbers", words, [drawing], PageTable(("parameter", "value", "sigma", "value / sigma"), rows))
 
 
 def _model(r: Intrinsics) -> Section:
-    rungs = [x for x in r.ladder.rungs if x.held is not None]
-    held = np.array([np.nan if x.held is None else x.held.rms_px for x in rungs])
-    fitted = np.array([np.nan if x.fit is None else x.fit.sigma_px for x in rungs])
+    candidates = [x for x in r.ladder.candidates if x.held is not None]
+    held = np.array([np.nan if x.held is None else x.held.rms_px for x in candidates])
+    fitted = np.array([np.nan if x.fit is None else x.fit.sigma_px for x in candidates])
     # Of the difference to the best, which is far better known than each error alone.
-    spread = np.array([x.standard_error_px2 for x in rungs]) / (2 * held)
-    chosen = next(k for k, x in enumerate(rungs) if x.model == r.ladder.chosen.model)
-    chart = lens_ladder([_label(x.model) for x in rungs], held, chosen, fit_rms_px=fitted, sigma_px=spread)
+    spread = np.array([x.standard_error_px2 for x in candidates]) / (2 * held)
+    chosen = next(k for k, x in enumerate(candidates) if x.model == r.ladder.chosen.model)
+    chart = lens_ladder([_label(x.model) for x in candidates], held, chosen, fit_rms_px=fitted, sigma_px=spread)
     rows = [
         (
             x.model.words,
@@ -119,7 +119,7 @@ def _model(r: Intrinsics) -> Section:
             np.nan if x.held is None else x.held.rms_px,
             "chosen" if x.model == r.ladder.chosen.model else x.refused or "errs more, or gains nothing",
         )
-        for x in r.ladder.rungs
+        for x in r.ladder.candidates
     ]
     words = [
         f"Each model was solved {len(r.held.folds)} times more, each time without some of the photographs, and then"
@@ -138,8 +138,8 @@ def _model(r: Intrinsics) -> Section:
     caption = (
         "Bars: error on photographs held out; whiskers: of the difference to the best; ticks: on those solved from."
     )
-    table = Table(("model", "on its own photographs (px)", "on held-out ones (px)", "outcome"), rows)
-    return Section("Which lens model", words, [Drawing(chart, caption)], table)
+    table = PageTable(("model", "on its own photographs (px)", "on held-out ones (px)", "outcome"), rows)
+    return Section("Which lens model", words, [PageDrawing(chart, caption)], table)
 
 
 def _label(model: LensModel) -> str:
@@ -154,11 +154,11 @@ def _extent(r: Intrinsics) -> tuple[float, float, float, float]:
 def _uncertainty(r: Intrinsics) -> Section:
     extent, at = _extent(r), f"at {short(r.distance_m)} m"
     drawings = [
-        Drawing(
+        PageDrawing(
             heat_map(r.map.sigma_px(r.covariance), extent, "Uncertainty of a pixel's direction", "px"),
             "1 sigma in its worst direction, after the best small turn of the camera.",
         ),
-        Drawing(
+        PageDrawing(
             heat_map(r.map.sigma_mm(r.covariance), extent, f"The same on a screen {at}", "mm"),
             f"On a screen that faces the camera {at}.",
         ),
@@ -174,7 +174,7 @@ def _uncertainty(r: Intrinsics) -> Section:
         d = r.halves
         size = np.linalg.norm(d.moved_px, axis=-1)
         drawings.append(
-            Drawing(
+            PageDrawing(
                 heat_map(size, extent, "Two halves of the photographs: how far they differ", "px"),
                 f"RMS {short(d.rms_px)} px ({short(d.rms_mm, 2)} mm {at}); expected from their sigmas"
                 f" {short(d.expected_rms_px)} px (p = {d.p_value:.2g}).",
@@ -187,13 +187,13 @@ def _uncertainty(r: Intrinsics) -> Section:
     return Section("How well a pixel's direction is known", words, drawings)
 
 
-def _residuals(outcome: Outcome) -> Section:
+def _residuals(outcome: CameraOutcome) -> Section:
     r = outcome.result
     t, used = r.table, r.fit.used
     found_less_model = -r.fit.residuals
     drawings = [
-        Drawing(residual_field(t.image_size_px, t.pixels[used], found_less_model[used]), "Found less model."),
-        Drawing(
+        PageDrawing(residual_field(t.image_size_px, t.pixels[used], found_less_model[used]), "Found less model."),
+        PageDrawing(
             residual_histogram(found_less_model[used], sigma=r.fit.sigma_px),
             "Per coordinate, used corners; the curve is that of normal errors.",
         ),
@@ -203,7 +203,7 @@ def _residuals(outcome: Outcome) -> Section:
         name, _ = outcome.photos.views[v]
         mine = t.view == v
         drawings.append(
-            Drawing(
+            PageDrawing(
                 corners_overlay(
                     t.image_size_px,
                     t.pixels[mine],
@@ -228,7 +228,7 @@ def _rms_per_view(r: Intrinsics) -> Array:
     return np.sqrt(r.table.mean_per_view(squared, r.fit.used))
 
 
-def _picture(outcome: Outcome, name: str) -> NDArray[np.uint8] | None:
+def _picture(outcome: CameraOutcome, name: str) -> NDArray[np.uint8] | None:
     """The photograph for the eye, 8 bits; None where it can no longer be read."""
     path = outcome.photos.paths[name]
     if path.suffix.lower() in VIDEO_SUFFIXES:
@@ -257,8 +257,8 @@ def _coverage(r: Intrinsics) -> Section:
     ]
     good = np.isfinite(r.coverage.tilt_deg)
     drawings = [
-        Drawing(coverage_map(t.image_size_px, t.pixels[used], outlines_px=outlines), "Used corners and outlines."),
-        Drawing(
+        PageDrawing(coverage_map(t.image_size_px, t.pixels[used], outlines_px=outlines), "Used corners and outlines."),
+        PageDrawing(
             tilt_polar(r.coverage.tilt_deg[good], r.coverage.azimuth_deg[good]),
             "Boards tilted to all sides, by 20 deg and more, tell the focal length.",
         ),
@@ -271,7 +271,7 @@ def _coverage(r: Intrinsics) -> Section:
     return Section("Where the boards were", words, drawings)
 
 
-def _views(outcome: Outcome) -> Section:
+def _views(outcome: CameraOutcome) -> Section:
     r, counts = outcome.result, outcome.result.table.counts(outcome.result.fit.used)
     rms = _rms_per_view(r)
     depth = r.fit.poses.apply(r.table.middle)[:, 2]
@@ -283,4 +283,4 @@ def _views(outcome: Outcome) -> Section:
         rows.append((name, f"{counts[v]} of {len(view)}", float(rms[v]), *where, note))
     rows += [(name, "none", np.nan, np.nan, np.nan, reason) for name, reason in outcome.photos.refused]
     heads = ("photograph", "corners used", "RMS (px)", "distance (m)", "tilt (deg)", "remarks")
-    return Section("The photographs", outcome.photos.line() + ".", (), Table(heads, rows))
+    return Section("The photographs", outcome.photos.line() + ".", (), PageTable(heads, rows))

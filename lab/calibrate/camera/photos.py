@@ -257,8 +257,10 @@ def _mixed(sizes: dict[tuple[int, int], list[str]]) -> str:
         more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
         parts.append(f"{width}x{height} ({', '.join(names[:_SHOWN])}{more})")
     turned = {(w, h) for w, h in sizes} == {(h, w) for w, h in sizes}
-    cure = "; some are turned on their side: keep the camera's own orientation" if turned else ""
-    return f"the pictures have different sizes: {', '.join(parts)}; one calibration is for one camera at one size{cure}"
+    remedy = "; some are turned on their side: keep the camera's own orientation" if turned else ""
+    return (
+        f"the pictures have different sizes: {', '.join(parts)}; one calibration is for one camera at one size{remedy}"
+    )
 
 
 def _enough(views: Sequence[object], refused: Sequence[tuple[str, str]], board: Board, fewest: int) -> None:

@@ -36,8 +36,8 @@ from lab.calibrate.drift_check.drift_page import write_page
 from lab.calibrate.drift_check.drift_result import (
     CameraDrift,
     DailyLimits,
+    DriftOutcome,
     OtherChange,
-    Outcome,
     is_weak,
     level_of,
     not_checked,
@@ -45,7 +45,7 @@ from lab.calibrate.drift_check.drift_result import (
 from lab.errors import InputError
 from lab.files.rig.rig_covariance import joint_covariance
 from lab.files.rig.rig_file import RigFile, load_rig_file
-from lab.files.text.atomic_write import refuse_foreign, whole_folder
+from lab.files.text.atomic_write import atomic_folder, refuse_foreign
 from lab.runs.tables import csv_word
 
 TABLE = "drift.csv"
@@ -57,7 +57,7 @@ COLUMNS = (
 )  # fmt: skip
 
 
-def daily_check(
+def check_drift(
     rig_path: Path,
     out: Path,
     points: Path | None = None,
@@ -68,7 +68,7 @@ def daily_check(
     pose: Path | None = None,
     history: Path | None = None,
     limits: DailyLimits | None = None,
-) -> Outcome:
+) -> DriftOutcome:
     """Compare known points or a still vehicle with the stored calibration; write report.html and drift.csv into `out`.
 
     points: CSV camera,point,u_px,v_px[,sigma_px], places in it or in `survey` (daily_inputs.read_points). run: a run
@@ -105,8 +105,8 @@ def daily_check(
     rows = [HistoryRow(today, c.camera, c.drift_px, c.noise_px, c.drift_mm, c.level) for c in cameras]
     inputs = [rig_path, *(p for p in (points, survey, pose) if p is not None)]
     inputs += [Path(run)] if run is not None and Path(run).is_file() else []
-    outcome = Outcome(Path(out), verdict(findings), tuple(cameras), tuple(findings), _unchecked(file.rig, cameras))
-    with whole_folder(Path(out), may_replace=_is_ours) as work:
+    outcome = DriftOutcome(Path(out), verdict(findings), tuple(cameras), tuple(findings), _unchecked(file.rig, cameras))
+    with atomic_folder(Path(out), may_replace=_is_ours) as work:
         write_drift_table(cameras, work / TABLE)
         write_page(outcome, file, compared, others, [*earlier, *rows], limits, today, inputs, work)
     if history is not None:

@@ -8,7 +8,15 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.drift import LASER_MOVED, WRONG_POINT, CameraColumns, Candidate, Misfit, UsualSizes, camera_columns
+from calibration.drift import (
+    LASER_MOVED,
+    WRONG_POINT,
+    CameraColumns,
+    ChangeCandidate,
+    ExcessResidual,
+    UsualSizes,
+    camera_columns,
+)
 from geometry.arrays import Array, Ints, skew
 from geometry.camera import FISHEYE, Camera, Projected, pinhole_numbers, project_points_full
 from geometry.forward_model import SpotModel
@@ -30,9 +38,9 @@ class Compared:
     pixels: Array  # (n, 2)
     foretold: Array  # (n, 2)
     place: Array  # (n, 3), m, in world
-    misfit: Misfit
+    misfit: ExcessResidual
     columns: Mapping[str, CameraColumns]  # by camera, over all 2n rows
-    others: Mapping[tuple[str, str], Candidate]  # as find_changes takes them
+    others: Mapping[tuple[str, str], ChangeCandidate]  # as find_changes takes them
     measured_sigma_px: Array  # (n,) of the measurement alone
     calibration_sigma_px: Array  # (n,) of what the calibration foretells
 
@@ -103,7 +111,7 @@ def _compare_camera(
         pixels=pixels,
         foretold=lens.pixels,
         place=world,
-        misfit=Misfit.of((pixels - lens.pixels).ravel(), C_noise + C_calibration),
+        misfit=ExcessResidual.of((pixels - lens.pixels).ravel(), C_noise + C_calibration),
         columns={camera.name: columns},
         others={(WRONG_POINT, label): _one_point(n, i) for i, label in enumerate(labels)},
         measured_sigma_px=_sigma(C_noise),
@@ -116,10 +124,10 @@ def _sigma(covariance: Array) -> Array:
     return np.sqrt(np.diagonal(covariance).reshape(-1, 2).mean(axis=1))
 
 
-def _one_point(n: int, i: int) -> Candidate:
+def _one_point(n: int, i: int) -> ChangeCandidate:
     out = np.zeros((2 * n, 2))
     out[2 * i, 0] = out[2 * i + 1, 1] = 1.0
-    return Candidate(out, np.full(2, UsualSizes().point_px))
+    return ChangeCandidate(out, np.full(2, UsualSizes().point_px))
 
 
 def _by_parameters(
@@ -219,7 +227,7 @@ def compare_still(
         on_beam = (part.beam_of == b)[:, None, None]
         moves = np.concatenate([d.direction * on_beam, d.point * on_beam], axis=-1).reshape(2 * n, 6)
         if on_beam.sum() > 1:  # a laser of one view is that view's own wrong point
-            others[(LASER_MOVED, beam)] = Candidate(moves, laser)
+            others[(LASER_MOVED, beam)] = ChangeCandidate(moves, laser)
     residual = (still.pixels - d.pixels).ravel()
     return Compared(
         camera=tuple(c for c, _ in part.views),
@@ -227,7 +235,7 @@ def compare_still(
         pixels=still.pixels,
         foretold=d.pixels,
         place=place,
-        misfit=Misfit.of(residual, C, by_pose if pose is None else None),
+        misfit=ExcessResidual.of(residual, C, by_pose if pose is None else None),
         columns=columns,
         others=others,
         measured_sigma_px=np.sqrt(variance.mean(axis=1)),

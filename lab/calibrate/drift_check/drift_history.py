@@ -12,7 +12,7 @@ from pathlib import Path
 from calibration.findings import Level
 from lab.errors import InputError
 from lab.files.text.csv_text import shown_line
-from lab.files.text.yaml_text import write_whole
+from lab.files.text.yaml_text import atomic_write_text
 from lab.runs.tables import csv_word
 
 COLUMNS = ("date", "camera", "drift_px", "noise_px", "drift_mm", "verdict")
@@ -72,4 +72,4 @@ def write_history(rows: Sequence[HistoryRow], path: Path) -> None:
     for r in rows:
         numbers = ["" if math.isnan(v) else f"{v:.6g}" for v in (r.drift_px, r.noise_px, r.drift_mm)]
         lines.append(",".join([r.date.isoformat(), csv_word(r.camera), *numbers, r.verdict.name]))
-    write_whole("\n".join(lines) + "\n", Path(path))
+    atomic_write_text("\n".join(lines) + "\n", Path(path))

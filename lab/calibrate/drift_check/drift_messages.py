@@ -103,9 +103,9 @@ def camera_findings(c: CameraDrift, limits: DailyLimits, pose_free: bool) -> lis
             Level.FAIL: f"beyond {limit:g} mm the pose is wrong by more than it claims",
         }[level]
         also = " An unknown vehicle pose may hide part of the change." if pose_free else ""
-        cure = "" if level == Level.PASS else _RECALIBRATE[c.change.kind]
+        remedy = "" if level == Level.PASS else _RECALIBRATE[c.change.kind]
         what = f"{name} {told(c)}: its picture is off by {size(c.drift_px, c.drift_mm)}, p = {_p(c.change.p_value)}"
-        out.append(Finding(level, what, why + "." + also if also else why, cure))
+        out.append(Finding(level, what, why + "." + also if also else why, remedy))
     if np.isfinite(c.unexplained_px):
         out.append(
             Finding(
@@ -126,11 +126,11 @@ def camera_findings(c: CameraDrift, limits: DailyLimits, pose_free: bool) -> lis
     what = f"{name} {state}: drift {size(c.drift_px, c.drift_mm)}, by noise alone {short(c.noise_px)} px; {seen}"
     if not weak:
         return [Finding(Level.PASS, what)]
-    cure = "Measure more points, spread over the picture, or with a smaller sigma."
+    remedy = "Measure more points, spread over the picture, or with a smaller sigma."
     if pose_free:
-        cure = "A vehicle at an unknown pose hides such shifts: give its pose (--pose) or measure known points."
+        remedy = "A vehicle at an unknown pose hides such shifts: give its pose (--pose) or measure known points."
     why = f"a drift far beyond {limits.fail_mm:g} mm, where it must not be used, could have been missed"
-    return [Finding(Level.WARN, what, why, cure)]
+    return [Finding(Level.WARN, what, why, remedy)]
 
 
 def told(c: CameraDrift) -> str:
@@ -163,13 +163,13 @@ def other_findings(others: Sequence[OtherChange], limits: DailyLimits) -> list[F
         level = level_of(o.px, o.mm, limits)
         if o.change.kind == LASER_MOVED:
             what = f"laser {o.change.subject} points elsewhere: its spots are off by {size(o.px, o.mm)}"
-            why, cure = "its direction in rig.yaml no longer holds", "Fix its mount, then calibrate the beams again."
+            why, remedy = "its direction in rig.yaml no longer holds", "Fix its mount, then calibrate the beams again."
         else:
             what = f"one point is wrong: {o.change.subject} is off by {size(o.px, o.mm)}; the others do not follow it"
             why = "the point moved, or was mistaken; the cameras are judged without it"
-            cure = "Look at the point, measure it again, and leave it out of the file if it is lost."
+            remedy = "Look at the point, measure it again, and leave it out of the file if it is lost."
             level = min(level, Level.WARN)  # it accuses the point, not the calibration
-        out.append(Finding(level, what + f", p = {_p(o.change.p_value)}", why, cure if level > Level.PASS else ""))
+        out.append(Finding(level, what + f", p = {_p(o.change.p_value)}", why, remedy if level > Level.PASS else ""))
     return out
 
 

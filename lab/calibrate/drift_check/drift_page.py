@@ -12,16 +12,16 @@ from geometry.arrays import Array
 from lab.calibrate.drift_check.drift_expected import Compared
 from lab.calibrate.drift_check.drift_history import HistoryRow
 from lab.calibrate.drift_check.drift_messages import size, told
-from lab.calibrate.drift_check.drift_result import CameraDrift, DailyLimits, OtherChange, Outcome, is_weak
+from lab.calibrate.drift_check.drift_result import CameraDrift, DailyLimits, DriftOutcome, OtherChange, is_weak
 from lab.files.rig.rig_file import RigFile
 from lab.number_format import short
 from lab.report.calibration.calibration_charts import DriftLine, drift_chart
 from lab.report.calibration.calibration_drawings import corners_overlay
 from lab.report.calibration.calibration_page import (
     CalibrationReport,
-    Drawing,
+    PageDrawing,
+    PageTable,
     Section,
-    Table,
     provenance,
     write_calibration_report,
 )
@@ -29,7 +29,7 @@ from lab.report.calibration.calibration_scene import Dot, rig_things, scene_view
 
 
 def write_page(
-    outcome: Outcome,
+    outcome: DriftOutcome,
     file: RigFile,
     compared: Sequence[Compared],
     others: Sequence[OtherChange],
@@ -94,7 +94,7 @@ def _drift_section(
         for c in cameras
     ]  # fmt: skip
     drawings = [
-        Drawing(
+        PageDrawing(
             corners_overlay(
                 file.rig.cameras[c.camera].image_size_px,
                 c.pixels,
@@ -116,7 +116,7 @@ def _drift_section(
         f" warning beyond {limits.warn_mm:g} mm at the screen, not to be used beyond {limits.fail_mm:g} mm. “Found at”:"
         f" the shift that this check finds in {100 * limits.power:.0f} of 100 cases.",
     ]
-    return Section("Drift per camera", words, drawings, Table(heads, rows))
+    return Section("Drift per camera", words, drawings, PageTable(heads, rows))
 
 
 def _plus_minus(values: Array, sigmas: Array) -> str:
@@ -141,7 +141,7 @@ def _history_section(history: Sequence[HistoryRow], limits: DailyLimits, file: R
     in_mm = drift_chart(
         lines("mm"), "Drift at the screen", "mm", warn=limits.warn_mm, fail=limits.fail_mm, expires=until
     )
-    drawings = [Drawing(in_mm), Drawing(drift_chart(lines("px"), "Drift in the picture", "px", expires=until))]
+    drawings = [PageDrawing(in_mm), PageDrawing(drift_chart(lines("px"), "Drift in the picture", "px", expires=until))]
     words = "Each check so far. A slow rise is a mount that creeps or a hall that warms up; a step is a knock."
     return Section("Drift over time", words, drawings)
 
@@ -167,7 +167,7 @@ def _points_section(
                     )
                 )  # fmt: skip
     words = [f"{o.change.subject}: {o.change.kind}, {size(o.px, o.mm)}." for o in others]
-    return Section("Point by point", words, (), Table(heads, rows))
+    return Section("Point by point", words, (), PageTable(heads, rows))
 
 
 def _scene_section(file: RigFile, compared: Sequence[Compared]) -> Section:

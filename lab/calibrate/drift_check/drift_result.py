@@ -86,7 +86,7 @@ class CameraDrift:
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class DriftOutcome:
     """How a daily check ended."""
 
     out: Path

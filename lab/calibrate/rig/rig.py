@@ -22,7 +22,7 @@ from geometry.rig import Rig
 from lab.calibrate.beams.recording_check import refuse_known_mistakes, refuse_repeated
 from lab.calibrate.beams.recordings import Recordings, read_recordings, stand_of
 from lab.calibrate.calibration_day import day_of, expired, last_day
-from lab.calibrate.rig.rig_outcome import Outcome
+from lab.calibrate.rig.rig_outcome import RigOutcome
 from lab.calibrate.rig.rig_tables import RESIDUALS, write_residuals
 from lab.calibrate.screens.screen_inputs import ScreenInputs, screen_inputs
 from lab.calibrate.screens.survey_check import adjusted_screens, survey_findings
@@ -31,7 +31,7 @@ from lab.files.project.project import Project, load_project
 from lab.files.rig.calibration_state import CalibrationState
 from lab.files.rig.rig_covariance import blocks_of
 from lab.files.rig.rig_file import RigFile, save_rig
-from lab.files.text.atomic_write import beside_a_good_one, refuse_foreign, whole_folder
+from lab.files.text.atomic_write import atomic_folder, beside_a_good_one, refuse_foreign
 
 RIG = "rig.yaml"
 FAILED_RIG = "rig.failed.yaml"  # its name where the verdict is FAIL, so that nothing reads it by mistake
@@ -41,7 +41,7 @@ _ANY_SIGMA = BeamGoals(direction=np.inf, direction_unusable=np.inf, wrong_share=
 
 def calibrate_rig(
     project_path: Path, out: Path, today: datetime.date | None = None, limits: RigLimits | None = None
-) -> Outcome:
+) -> RigOutcome:
     """Calibrate a whole rig; writes rig.yaml, residuals.csv and report.html into the folder `out`.
 
     rig.yaml carries the joint covariance of everything (in the target's block; excerpts at cameras and screens) and the
@@ -80,8 +80,8 @@ def calibrate_rig(
     ]
     level = verdict(findings)
     folder = beside_a_good_one(out, level == Level.FAIL, RIG)
-    outcome = Outcome(project.name, folder, level, tuple(findings), steps, expected, held_out)
-    with whole_folder(folder, may_replace=_is_ours) as work:
+    outcome = RigOutcome(project.name, folder, level, tuple(findings), steps, expected, held_out)
+    with atomic_folder(folder, may_replace=_is_ours) as work:
         save_rig(_rig_file(outcome, project, day), work / (FAILED_RIG if level == Level.FAIL else RIG))
         write_residuals(steps, recordings.names, work / RESIDUALS)
         from lab.calibrate.rig.rig_page import write_page  # the template engine: only for those who write a report
@@ -176,7 +176,7 @@ def _of_the_inputs(project: Project, recordings: Recordings, inputs: ScreenInput
     return out
 
 
-def _rig_file(outcome: Outcome, project: Project, day: datetime.date) -> RigFile:
+def _rig_file(outcome: RigOutcome, project: Project, day: datetime.date) -> RigFile:
     joint = outcome.steps.joint
     until = last_day(project, day)
     worst_first = sorted(outcome.findings, key=lambda f: -f.level)

@@ -16,7 +16,7 @@ from lab.errors import CalibrationError
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class RigOutcome:
     """How the calibration of a rig ended."""
 
     name: str

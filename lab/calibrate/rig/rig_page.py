@@ -16,15 +16,15 @@ from geometry.pose import ypr_sigmas
 from geometry.rig import Rig
 from lab.calibrate.beams.recordings import Recordings
 from lab.calibrate.rig import rig_page_lab
-from lab.calibrate.rig.rig_outcome import Outcome
+from lab.calibrate.rig.rig_outcome import RigOutcome
 from lab.number_format import short
 from lab.report.calibration.calibration_charts import residual_histogram
 from lab.report.calibration.calibration_drawings import residual_field
 from lab.report.calibration.calibration_page import (
     CalibrationReport,
-    Drawing,
+    PageDrawing,
+    PageTable,
     Section,
-    Table,
     provenance,
     write_calibration_report,
 )
@@ -33,7 +33,7 @@ _WORST = 10  # held-out positions in the table
 
 
 def write_page(
-    outcome: Outcome, drawing: Rig, recordings: Recordings, inputs: Sequence[Path], day: datetime.date, folder: Path
+    outcome: RigOutcome, drawing: Rig, recordings: Recordings, inputs: Sequence[Path], day: datetime.date, folder: Path
 ) -> Path:
     """Write report.html. drawing: the rig with nominal beams."""
     sections = [
@@ -60,7 +60,7 @@ def write_page(
     return write_calibration_report(report, folder)
 
 
-def _key_figures(o: Outcome) -> list[tuple[str, str, str]]:
+def _key_figures(o: RigOutcome) -> list[tuple[str, str, str]]:
     joint, out = o.steps.joint, []
     if o.expected is not None:
         e = o.expected
@@ -87,7 +87,7 @@ def _key_figures(o: Outcome) -> list[tuple[str, str, str]]:
     return out
 
 
-def _expected(o: Outcome) -> Section | None:
+def _expected(o: RigOutcome) -> Section | None:
     e = o.expected
     if e is None:
         return None
@@ -107,10 +107,10 @@ def _expected(o: Outcome) -> Section | None:
         "The noise differs from frame to frame and averages out. The calibration's part is the same in every frame: no"
         " averaging lessens it; between two poses that are near to each other it cancels.",
     ]
-    return Section("What one frame will tell", words, (), Table(heads, rows))
+    return Section("What one frame will tell", words, (), PageTable(heads, rows))
 
 
-def _shares(o: Outcome) -> Section | None:
+def _shares(o: RigOutcome) -> Section | None:
     e = o.expected
     if e is None:
         return None
@@ -133,10 +133,10 @@ def _shares(o: Outcome) -> Section | None:
         " pose. The variances add up to the whole.",
         f"Improve {rows[0][0]} first: better sigmas there, or more of them." if rows else "",
     ]
-    return Section("What contributes most", words, (), Table(heads, rows))
+    return Section("What contributes most", words, (), PageTable(heads, rows))
 
 
-def _held_out(o: Outcome, positions: Sequence[str]) -> Section | None:
+def _held_out(o: RigOutcome, positions: Sequence[str]) -> Section | None:
     h = o.held_out
     if h is None:
         return None
@@ -151,18 +151,18 @@ def _held_out(o: Outcome, positions: Sequence[str]) -> Section | None:
         "misfit / expected",
     )  # fmt: skip
     drawings = [
-        Drawing(residual_histogram(deg, "Attitude of held-out positions, per axis", "deg")),
-        Drawing(residual_histogram(mm, "Position of held-out positions, per axis", "mm")),
+        PageDrawing(residual_histogram(deg, "Attitude of held-out positions, per axis", "deg")),
+        PageDrawing(residual_histogram(mm, "Position of held-out positions, per axis", "mm")),
     ]
     words = (
         "Each fifth of the positions was measured with a calibration that had not seen its spots, and compared with the"
         " stand's record: what a user's own recording will meet, the stand's errors included. The table has the worst"
         f" {min(_WORST, len(rows))}; x, y, z are the body's axes in the attitude, the world's in the position."
     )
-    return Section("Positions held out", words, drawings, Table(heads, rows))
+    return Section("Positions held out", words, drawings, PageTable(heads, rows))
 
 
-def _groups(o: Outcome) -> Section:
+def _groups(o: RigOutcome) -> Section:
     joint = o.steps.joint
     rows = []
     for name, g in joint.groups.items():
@@ -189,10 +189,10 @@ def _groups(o: Outcome) -> Section:
         " that are not redundant fix what nothing else knows, and cannot be tested.",
         "Where a kind misfits beyond chance (p below 0.001) its sigmas were widened until it fits.",
     ]
-    return Section("How the measurements fit together", words, (), Table(heads, rows))
+    return Section("How the measurements fit together", words, (), PageTable(heads, rows))
 
 
-def _residuals(o: Outcome) -> Section:
+def _residuals(o: RigOutcome) -> Section:
     joint, measured = o.steps.joint, o.steps.measured
     cameras = list(joint.rig.cameras)
     views = joint.rig.views()
@@ -206,7 +206,7 @@ def _residuals(o: Outcome) -> Section:
         r = joint.every[DOTS].linearise(joint.values).residuals
         drawings += _fields(o, "dots", s.pixels, -r * s.sigma_px[:, None], s.camera_of, joint.kept[DOTS])
     drawings.append(
-        Drawing(residual_histogram(spots[joint.kept[SPOTS]], "Spots: residuals in sigmas", "sigma", sigma=1.0))
+        PageDrawing(residual_histogram(spots[joint.kept[SPOTS]], "Spots: residuals in sigmas", "sigma", sigma=1.0))
     )
     words = (
         "Found less predicted, of what was kept. Arrows that turn slowly with the place tell of a lens or a screen; all"
@@ -215,17 +215,21 @@ def _residuals(o: Outcome) -> Section:
     return Section("Residuals", words, drawings)
 
 
-def _fields(o: Outcome, what: str, pixels: Array, residuals: Array, camera_of: Ints, kept: Bools) -> list[Drawing]:
+def _fields(
+    o: RigOutcome, what: str, pixels: Array, residuals: Array, camera_of: Ints, kept: Bools
+) -> list[PageDrawing]:
     out = []
     for c, (name, camera) in enumerate(o.steps.joint.rig.cameras.items()):
         here = (camera_of == c) & kept
         if here.any():
             title = f"Camera {name}: {what}, found − predicted"
-            out.append(Drawing(residual_field(camera.image_size_px, pixels[here], residuals[here], title, things=what)))
+            out.append(
+                PageDrawing(residual_field(camera.image_size_px, pixels[here], residuals[here], title, things=what))
+            )
     return out
 
 
-def _spot_pixels(o: Outcome, residuals: Array) -> Array:
+def _spot_pixels(o: RigOutcome, residuals: Array) -> Array:
     """Residuals of spots (N, 2) in px, from those in sigmas."""
     roots = np.linalg.cholesky(o.steps.measured.spots.covariance)
     return np.asarray((roots @ residuals[..., None])[..., 0])

@@ -11,12 +11,12 @@ from geometry.arrays import Array
 from geometry.pose import ypr_sigmas
 from geometry.rig import Rig
 from geometry.uncertainty.rig_parameters import split
-from lab.calibrate.rig.rig_outcome import Outcome
+from lab.calibrate.rig.rig_outcome import RigOutcome
 from lab.report.calibration.calibration_maps import correlation_matrix, flatness_map
 from lab.report.calibration.calibration_page import (
-    Drawing,
+    PageDrawing,
+    PageTable,
     Section,
-    Table,
 )
 from lab.report.calibration.calibration_scene import rig_things, scene_views
 
@@ -24,7 +24,7 @@ ARCSEC = np.deg2rad(1 / 3600)
 _GAUGE = 3e-6  # m, rad: sigmas below it are of axes that were chosen, not measured
 
 
-def screens(o: Outcome) -> Section | None:
+def screens(o: RigOutcome) -> Section | None:
     """Where the screens are, and how flat."""
     joint = o.steps.joint
     drawings, rows = [], []
@@ -34,7 +34,7 @@ def screens(o: Outcome) -> Section | None:
             chosen = result.flatness.chosen
             sigma = float(np.median(chosen.sigma_m[chosen.used]))
             drawings.append(
-                Drawing(
+                PageDrawing(
                     flatness_map(
                         result.xyz[:, :2],
                         result.xyz[:, 2],
@@ -63,10 +63,10 @@ def screens(o: Outcome) -> Section | None:
         "Where the screens are. Origin and axes within a plane are a choice, no measurement; what counts is how far and"
         " how tilted it is."
     )
-    return Section("Screens", words, drawings, Table(heads, rows))
+    return Section("Screens", words, drawings, PageTable(heads, rows))
 
 
-def beams(o: Outcome, drawing: Rig) -> Section:
+def beams(o: RigOutcome, drawing: Rig) -> Section:
     """The beams against their drawing, and where the stand stands."""
     joint = o.steps.joint
     direction, offset = beam_sigmas(joint)
@@ -99,10 +99,10 @@ def beams(o: Outcome, drawing: Rig) -> Section:
             f"{v:.4f} ± {s:.4f}" for v, s in zip(np.rad2deg(pose.ypr), np.rad2deg(ypr_sigmas(pose, C)), strict=True)
         )
         words.append(f"The stand in the world: x, y, z {mm} mm; yaw, pitch, roll {deg} deg.")
-    return Section("Beams", words, (), Table(heads, rows))
+    return Section("Beams", words, (), PageTable(heads, rows))
 
 
-def cameras(o: Outcome) -> Section:
+def cameras(o: RigOutcome) -> Section:
     """Where the cameras stand, and what became of their lenses."""
     joint = o.steps.joint
     sigmas = dict(zip(joint.covariance.names, np.sqrt(np.diagonal(joint.covariance.matrix)), strict=True))
@@ -133,7 +133,7 @@ def cameras(o: Outcome) -> Section:
         "Lens and place of a camera are known better together than each alone: a focal length that is too long looks"
         " like a camera that stands farther off. rig.yaml holds the joint covariance."
     )
-    return Section("Cameras", words, (), Table(heads, rows))
+    return Section("Cameras", words, (), PageTable(heads, rows))
 
 
 def _lever(R: Array, t: Array) -> Array:
@@ -143,7 +143,7 @@ def _lever(R: Array, t: Array) -> Array:
     return np.array([[0, -c[2], c[1]], [c[2], 0, -c[0]], [-c[1], c[0], 0]])
 
 
-def correlations(o: Outcome) -> Section:
+def correlations(o: RigOutcome) -> Section:
     """Which errors go together."""
     C = o.steps.joint.covariance
     sigma = np.sqrt(np.diagonal(C.matrix))
@@ -156,7 +156,7 @@ def correlations(o: Outcome) -> Section:
     names = [_short_name(C.names[i]) for i in shown]
     picture = correlation_matrix(names, C.matrix[np.ix_(shown, shown)], "Correlations of the rig's numbers")
     words = "Errors that go together. Taken one by one they would promise a worse attitude than the rig gives."
-    return Section("Correlations", words, [Drawing(picture, wide=True)])
+    return Section("Correlations", words, [PageDrawing(picture, wide=True)])
 
 
 def _short_name(name: str) -> str:
@@ -166,7 +166,7 @@ def _short_name(name: str) -> str:
     return f"{kind.removesuffix('s')} {thing} {bare}"
 
 
-def lab(o: Outcome) -> Section:
+def lab(o: RigOutcome) -> Section:
     """The lab from three sides."""
     joint = o.steps.joint
     body = (
@@ -177,7 +177,7 @@ def lab(o: Outcome) -> Section:
     return Section(
         "The lab",
         "Cameras, screens and beams as found; the vehicle stands in the middle of the stand's positions.",
-        [Drawing(view) for view in scene_views(rig_things(joint.rig, body))],
+        [PageDrawing(view) for view in scene_views(rig_things(joint.rig, body))],
     )
 
 

@@ -13,7 +13,7 @@ from calibration.terms.corners import CornerTerm
 from calibration.terms.pose_records import RecordTerm
 from calibration.terms.surveyed import array_of
 from geometry.arrays import Array
-from lab.files.text.yaml_text import write_whole
+from lab.files.text.yaml_text import atomic_write_text
 from lab.runs.tables import csv_word
 
 RESIDUALS = "residuals.csv"
@@ -26,7 +26,7 @@ def write_residuals(steps: RigSteps, positions: Sequence[str], path: Path) -> No
     lines = [",".join(COLUMNS)]
     for kind, name, camera, axis, residual, unit, sigmas, used in _rows(steps, positions):
         lines.append(f"{kind},{csv_word(name)},{camera},{axis},{residual:.6g},{unit},{sigmas:.4g},{int(used)}")
-    write_whole("\n".join(lines) + "\n", path)
+    atomic_write_text("\n".join(lines) + "\n", path)
 
 
 _Row = tuple[str, str, str, str, float, str, float, bool]

@@ -24,13 +24,13 @@ from lab.files.rig.calibration_state import CalibrationState
 from lab.files.rig.rig_covariance import blocks_of
 from lab.files.rig.rig_file import RigFile, save_rig
 from lab.files.rig.screens_file import ScreensFile, save_screens
-from lab.files.text.atomic_write import beside_a_good_one, refuse_foreign, whole_folder
+from lab.files.text.atomic_write import atomic_folder, beside_a_good_one, refuse_foreign
 
 SCREENS, RIG = "screens.yaml", "rig.yaml"
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class ScreensOutcome:
     """How a calibration of screens ended."""
 
     name: str
@@ -62,7 +62,7 @@ def _counted(n: int, what: str) -> str:
     return f"{n} {what}{'' if n == 1 else 's'}"
 
 
-def calibrate_screen(project_path: Path, out: Path, today: datetime.date | None = None) -> Outcome:
+def calibrate_screen(project_path: Path, out: Path, today: datetime.date | None = None) -> ScreensOutcome:
     """Calibrate the screens and the cameras' places of a project.
 
     Writes into `out`: screens.yaml; rig.yaml with the beams as drawn, where the project has a target; residuals.csv,
@@ -85,8 +85,8 @@ def calibrate_screen(project_path: Path, out: Path, today: datetime.date | None 
     ]
     level = verdict(found)
     folder = beside_a_good_one(out, level == Level.FAIL, SCREENS)
-    outcome = Outcome(project.name, folder, level, tuple(found), result)
-    with whole_folder(folder, may_replace=_is_ours) as work:
+    outcome = ScreensOutcome(project.name, folder, level, tuple(found), result)
+    with atomic_folder(folder, may_replace=_is_ours) as work:
         if level != Level.FAIL:
             _save(project, outcome, day, work)
         write_tables(result, work)
@@ -105,7 +105,7 @@ def _is_ours(folder: Path) -> bool:
 # Files ------------------------------------------------------------------------------------------------------------
 
 
-def _save(project: Project, outcome: Outcome, day: datetime.date, folder: Path) -> None:
+def _save(project: Project, outcome: ScreensOutcome, day: datetime.date, folder: Path) -> None:
     until = last_day(project, day)
     reasons = tuple(f.what for f in outcome.findings if f.level > Level.PASS)
     state = CalibrationState(day, outcome.level.name, until, reasons, project.notes)

@@ -10,7 +10,7 @@ import numpy as np
 
 from calibration.least_squares.priors import Prior
 from calibration.screens.clouds import MissingOpen3DError, scan_of
-from calibration.screens.network import Dots, Network, Sightings
+from calibration.screens.network import Dots, Network, PointObservations
 from calibration.screens.registration import register
 from calibration.screens.screens import Near, Scan, ScreenSetup
 from calibration.screens.survey_suspects import wrong_unit
@@ -62,7 +62,7 @@ def screen_inputs(project: Project) -> ScreenInputs:
     _check_sizes(project, survey, screen_of)
     dots = Dots(survey.names, survey.xyz, survey.covariance, screen_of)
     cameras, index = list(rig.cameras), {n: i for i, n in enumerate(survey.names)}
-    sightings = Sightings(
+    sightings = PointObservations(
         np.array([cameras.index(c) for c in observations.camera], dtype=np.int64),
         np.array([index[p] for p in observations.point], dtype=np.int64),
         observations.pixels,

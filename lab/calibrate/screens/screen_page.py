@@ -20,9 +20,9 @@ from lab.report.calibration.calibration_drawings import corners_overlay
 from lab.report.calibration.calibration_maps import correlation_matrix, flatness_map
 from lab.report.calibration.calibration_page import (
     CalibrationReport,
-    Drawing,
+    PageDrawing,
+    PageTable,
     Section,
-    Table,
     provenance,
     write_calibration_report,
 )
@@ -122,7 +122,7 @@ def _places(result: ScreensResult) -> Section:
         "camera", "screen", "position in world (m)", "sigma of position (mm)", "sigma of attitude (°)",
         "on its screen (mm)", "dots used", "boards",
     ]  # fmt: skip
-    return Section("Cameras", words, table=Table(heads, rows))
+    return Section("Cameras", words, table=PageTable(heads, rows))
 
 
 def _screen(result: ScreensResult, project: Project, k: int) -> Section:
@@ -157,7 +157,7 @@ def _screen(result: ScreensResult, project: Project, k: int) -> Section:
         )
         a, b, c = screen.bow
         drawings.append(
-            Drawing(
+            PageDrawing(
                 flatness_map(
                     about.xyz[on, :2],
                     f.flat.heights_m[on],
@@ -171,7 +171,7 @@ def _screen(result: ScreensResult, project: Project, k: int) -> Section:
         )
         if f.chosen.bent:
             drawings.append(
-                Drawing(
+                PageDrawing(
                     flatness_map(about.xyz[on, :2], f.chosen.heights_m[on], f"Screen {name}: what the bow leaves",
                                  size_m=screen.size_m, sigma_m=sigma),
                     "The same after the bow: this should be noise.",
@@ -198,7 +198,7 @@ def _pixels(result: ScreensResult) -> Section:
             rejected = np.concatenate([rejected, np.zeros(int(its.sum()), dtype=bool)])
         if len(found):
             title = f"Camera {name}: measured less predicted"
-            drawings.append(Drawing(corners_overlay(c.image_size_px, found, error, title, rejected=rejected)))
+            drawings.append(PageDrawing(corners_overlay(c.image_size_px, found, error, title, rejected=rejected)))
     words = "Arrows that all point one way in a part of a picture show a lens that changed since its calibration."
     return Section("Pixels", words, drawings)
 
@@ -217,10 +217,10 @@ def _dots(result: ScreensResult) -> Section:
     rows = [rows[int(i)] for i in np.argsort(-fit.sighting_sigmas, kind="stable")]
     heads = ["camera", "dot", "screen", "u (px)", "v (px)", "misses u (px)", "misses v (px)", "in sigmas", "used"]
     words = "The worst first. Sigmas hold the pixel's and the survey's errors together; beyond 5 a pixel is left out."
-    return Section("Dots", words, table=Table(heads, rows[:_MOST_DOTS]))
+    return Section("Dots", words, table=PageTable(heads, rows[:_MOST_DOTS]))
 
 
-def _scene(result: ScreensResult) -> list[Drawing]:
+def _scene(result: ScreensResult) -> list[PageDrawing]:
     fit, network = result.fit, result.network
     things: list[Thing] = []
     for k, (name, screen) in enumerate(fit.rig.screens.items()):
@@ -233,7 +233,7 @@ def _scene(result: ScreensResult) -> list[Drawing]:
         f: Frustum = frustum_of(c)
         things.append(f)
     things += [Dot("", p) for p in network.dots.xyz[: 5 * _MOST_DOTS]]
-    return [Drawing(view) for view in scene_views(things, "Cameras, screens and dots", LAB_VIEWS)]
+    return [PageDrawing(view) for view in scene_views(things, "Cameras, screens and dots", LAB_VIEWS)]
 
 
 def _correlations(result: ScreensResult) -> Section:
@@ -250,4 +250,4 @@ def _correlations(result: ScreensResult) -> Section:
         f"Of camera {first} ({len(block.parameters)} numbers) and its screen. Errors that are so tied must be carried"
         " together; screens.yaml holds the whole matrix."
     )
-    return Section("What errs together", words, [Drawing(drawing)])
+    return Section("What errs together", words, [PageDrawing(drawing)])

@@ -13,7 +13,7 @@ from calibration.findings import Finding, Level
 from calibration.least_squares.adjustment import AdjustmentError
 from calibration.screens.network_start import NotConnectedError
 from calibration.screens.screens import ScreensResult, calibrate
-from calibration.screens.survey_suspects import Suspect, misfit_of, suspects
+from calibration.screens.survey_suspects import SurveySuspect, misfit_of, suspects
 from lab.calibrate.screens.screen_inputs import ScreenInputs
 from lab.errors import CalibrationError, InputError
 from lab.files.project.project import Project
@@ -39,9 +39,9 @@ def adjusted_screens(project: Project, inputs: ScreenInputs) -> ScreensResult:
     enough = len(inputs.network.sightings) >= 4
     if enough and miss > _SUSPICIOUS and not _plainly_missing(inputs, problem):
         changes = suspects(inputs.network, inputs.setups, inputs.near, inputs.held_screen, miss)
-        cures = [c for c in changes if c.factor < _CURED]
-        if cures:
-            raise InputError(_suspicion(where, cures))
+        remedies = [c for c in changes if c.factor < _CURED]
+        if remedies:
+            raise InputError(_suspicion(where, remedies))
     if isinstance(problem, AdjustmentError):
         raise CalibrationError(f"{project.path}: the measurements give no calibration: {problem}") from None
     if problem is not None:
@@ -55,10 +55,10 @@ def _plainly_missing(inputs: ScreenInputs, problem: Exception | None) -> bool:
     return any(words in text for words in ("expected 4 or more", "expected 3 or more", "on one line", "found none"))
 
 
-def _suspicion(where: str, cures: Sequence[Suspect]) -> str:
+def _suspicion(where: str, remedies: Sequence[SurveySuspect]) -> str:
     """What the survey's columns seem to hold."""
-    best = cures[0]
-    others = [c for c in cures[1:] if c.factor < 1.2 * best.factor]
+    best = remedies[0]
+    others = [c for c in remedies[1:] if c.factor < 1.2 * best.factor]
     text = f"{where}: does not fit the pixels as it is, but {best.words} does"
     if others:
         text += (

@@ -129,7 +129,7 @@ class Stand:
 
 
 @dataclass(frozen=True, slots=True)
-class Recording:
+class RecordingEntry:
     """Spots recorded while the stand stood at (or passed) known poses."""
 
     run: Path | None  # a run folder …
@@ -154,7 +154,7 @@ class Project:
     beams: Mapping[str, Beam] = field(default_factory=dict)  # as designed: where the calibration starts
     spots: Mapping[str, Spot] = field(default_factory=dict)
     stand: Stand | None = None
-    recordings: tuple[Recording, ...] = ()
+    recordings: tuple[RecordingEntry, ...] = ()
     notes: str = ""
 
     @property
@@ -490,14 +490,14 @@ class _Reader:
             self.mistakes.append(f"{where}.board: {str(error).removeprefix(f'board {text!r}: ')}")
             return None
 
-    def recording(self, block: _RecordingBlock, where: str) -> Recording:
+    def recording(self, block: _RecordingBlock, where: str) -> RecordingEntry:
         run = None if block.run is None else self.folder / block.run
         if run is not None and not (run / "run.yaml").is_file():
             self.mistakes.append(f"{where}.run: expected a run folder, found no run.yaml in {run}")
         poses = None if block.poses is None else self.file(block.poses, f"{where}.poses")
         if run is not None and block.use_truth:
             poses = self.file(str(Path(str(block.run)) / "truth" / "pose.csv"), f"{where}.use_truth")
-        return Recording(run, None if block.spots is None else self.file(block.spots, f"{where}.spots"), poses)
+        return RecordingEntry(run, None if block.spots is None else self.file(block.spots, f"{where}.spots"), poses)
 
 
 def placement_of(photo: Path) -> str:

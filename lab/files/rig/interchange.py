@@ -18,7 +18,7 @@ from lab.files.rig.camera_block import Covariance
 from lab.files.rig.camera_file import CameraFile, load_camera, save_camera
 from lab.files.rig.rig_file import SCHEMA as RIG_SCHEMA
 from lab.files.rig.rig_file import RigFile, load_rig_file
-from lab.files.text.yaml_text import did_you_mean, parse_mapping, read_text, write_whole
+from lab.files.text.yaml_text import atomic_write_text, did_you_mean, parse_mapping, read_text
 
 BEAMPOSE, RIG = "beampose", "beampose-rig"
 _FOREIGN: Mapping[str, ModuleType] = {m.NAME: m for m in (opencv_yaml, kalibr, ros, colmap, mrcal)}
@@ -249,7 +249,7 @@ def _write(
         return _write_ours(models[0], covariances.get(models[0].name), path)
     written: Written = _FOREIGN[target].write(models)
     _check_round_trip(models, written.text, path, target)
-    write_whole(written.text, path)
+    atomic_write_text(written.text, path)
     lost = [m.name for m in models if m.name in covariances]
     if not lost:
         return written.notes

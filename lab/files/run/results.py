@@ -43,7 +43,7 @@ class Text:
 
 
 @dataclass(frozen=True, slots=True)
-class Table:
+class CsvColumns:
     """Some columns of a CSV file, n rows: numbers as float (nan where the field is empty), words coded."""
 
     numbers: dict[str, Array]
@@ -57,7 +57,9 @@ class Table:
         return np.stack([self.numbers[n] for n in names], axis=-1)
 
 
-def read_table(path: Path, numbers: Iterable[str], texts: Iterable[str] = (), optional: Iterable[str] = ()) -> Table:
+def read_table(
+    path: Path, numbers: Iterable[str], texts: Iterable[str] = (), optional: Iterable[str] = ()
+) -> CsvColumns:
     """The named columns of a CSV file; numbers that are `optional` are nan in a file without such a column.
 
     Other columns are ignored. The csv module reads small files and pandas large ones: spots.csv of 600 frames takes 14
@@ -68,7 +70,7 @@ def read_table(path: Path, numbers: Iterable[str], texts: Iterable[str] = (), op
     return _read_rows(path, numbers, texts, tuple(optional)) if table is None else table
 
 
-def _read_large(path: Path, numbers: Sequence[str], texts: Sequence[str], optional: Sequence[str]) -> Table | None:
+def _read_large(path: Path, numbers: Sequence[str], texts: Sequence[str], optional: Sequence[str]) -> CsvColumns | None:
     """By pandas; None where the file is small or anything about it is unusual, which the other reader can name."""
     try:
         data = path.read_bytes() if path.stat().st_size >= _LARGE else b""
@@ -102,10 +104,10 @@ def _read_large(path: Path, numbers: Sequence[str], texts: Sequence[str], option
         codes, words = pd.factorize(table[name])
         coded[name] = Text(np.asarray(codes, dtype=np.int64), tuple(map(str, words)))
     absent = np.full(len(table), np.nan)
-    return Table({n: table[n].to_numpy(dtype=float) if n in table else absent.copy() for n in numbers}, coded)
+    return CsvColumns({n: table[n].to_numpy(dtype=float) if n in table else absent.copy() for n in numbers}, coded)
 
 
-def _read_rows(path: Path, numbers: Sequence[str], texts: Sequence[str], optional: Sequence[str]) -> Table:
+def _read_rows(path: Path, numbers: Sequence[str], texts: Sequence[str], optional: Sequence[str]) -> CsvColumns:
     """By the csv module. Raises InputError."""
     pieces: dict[str, list[Array]] = {n: [] for n in numbers}
     code_pieces: dict[str, list[Ints]] = {n: [] for n in texts}
@@ -136,7 +138,7 @@ def _read_rows(path: Path, numbers: Sequence[str], texts: Sequence[str], optiona
         raise InputError(f"{path}: cannot be read ({error})") from error
     except (ValueError, csv.Error) as error:
         raise InputError(f"{path}: expected rows of equal length and numbers in number columns ({error})") from error
-    return Table(
+    return CsvColumns(
         numbers={n: np.concatenate([np.zeros(0), *pieces[n]]) for n in numbers},
         texts={n: Text(np.concatenate([np.zeros(0, dtype=np.int64), *code_pieces[n]]), tuple(words[n])) for n in texts},
     )

@@ -26,14 +26,14 @@ COMPARED = 500  # frames at most that `largest_disagreement_px` looks at, spread
 
 
 @dataclass(frozen=True, slots=True)
-class Truth:
+class TruthTables:
     """The tables of a truth folder, columns as in lab/files/text/columns.py; one of them may be missing."""
 
     pose: pd.DataFrame | None  # TRUTH_POSE, rising frames, every field a number
     spots: pd.DataFrame | None  # TRUTH_SPOTS; u_px, v_px are nan where no projection exists
 
 
-def load_truth(run_folder: Path, rig: Rig | None = None) -> Truth | None:
+def load_truth(run_folder: Path, rig: Rig | None = None) -> TruthTables | None:
     """The truth of a run folder; None where it has none. With a rig, names that it does not have are mistakes.
 
     Raises InputError in one line: file, line, column, what was expected and what was found.
@@ -42,7 +42,9 @@ def load_truth(run_folder: Path, rig: Rig | None = None) -> Truth | None:
     pose, spots = folder / "pose.csv", folder / "spots.csv"
     if not pose.exists() and not spots.exists():
         return None
-    return Truth(load_pose_table(pose) if pose.exists() else None, _load_spots(spots, rig) if spots.exists() else None)
+    return TruthTables(
+        load_pose_table(pose) if pose.exists() else None, _load_spots(spots, rig) if spots.exists() else None
+    )
 
 
 def load_pose_table(path: Path) -> pd.DataFrame:
@@ -62,12 +64,12 @@ def refuse_other_lengths(path: Path, lines: Sequence[int], quaternions: Array) -
     bad = np.flatnonzero(~(np.abs(length - 1) <= QUATERNION_TOLERANCE))
     if bad.size:
         found = length[bad[0]]
-        cure = "give all digits, or divide each of the four numbers by that length"
+        remedy = "give all digits, or divide each of the four numbers by that length"
         if found == 0:
-            cure = "where nothing is turned it is 1,0,0,0"
+            remedy = "where nothing is turned it is 1,0,0,0"
         raise InputError(
             f"{path}: line {lines[bad[0]]}: qw,qx,qy,qz: expected a quaternion of length 1, got one of length"
-            f" {found:.7g}; {cure}"
+            f" {found:.7g}; {remedy}"
         )
 
 
@@ -102,7 +104,7 @@ def _refuse(path: Path, wrong: np.ndarray, expected: str, found: np.ndarray) -> 
         raise InputError(f"{path}: line {bad[0] + 2}: {expected}, got {found[bad[0]]}")
 
 
-def largest_disagreement_px(truth: Truth, rig: Rig) -> tuple[float, int] | None:
+def largest_disagreement_px(truth: TruthTables, rig: Rig) -> tuple[float, int] | None:
     """How far, px, the true spots lie from where the true poses put them through the rig, and in which frame.
 
     None where the two tables share nothing. Zero but for rounding if the truth was made with this rig.

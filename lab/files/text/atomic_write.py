@@ -36,7 +36,7 @@ def refuse_foreign(target: Path, may_replace: Callable[[Path], bool]) -> None:
 
 
 @contextmanager
-def whole_folder(target: Path, may_replace: Callable[[Path], bool]) -> Iterator[Path]:
+def atomic_folder(target: Path, may_replace: Callable[[Path], bool]) -> Iterator[Path]:
     """Yields an empty folder beside `target`, which takes its place when the block ends well, and vanishes when not.
 
     An existing target is replaced only if it is empty or `may_replace` says so of it. Raises InputError otherwise:

@@ -75,9 +75,9 @@ def table_bytes(path: Path, required: Sequence[str], damaged: bool = False) -> b
         raise InputError(f"{path}: expected a table, found a folder; name the CSV file in it") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from None
-    cure = "save it as CSV, comma-separated, in UTF-8"
+    remedy = "save it as CSV, comma-separated, in UTF-8"
     if data[:2] in (b"\xff\xfe", b"\xfe\xff") or b"\0" in data[:4096]:
-        raise InputError(f"{path}: expected a CSV table, got a file that is not text in UTF-8; {cure}")
+        raise InputError(f"{path}: expected a CSV table, got a file that is not text in UTF-8; {remedy}")
     if not data.removeprefix(b"\xef\xbb\xbf").strip():
         raise InputError(f"{path}: expected columns {','.join(required)}, got an empty file")
     if not damaged:
@@ -85,7 +85,9 @@ def table_bytes(path: Path, required: Sequence[str], damaged: bool = False) -> b
             data.decode("utf-8")
         except UnicodeDecodeError as error:
             line = data.count(b"\n", 0, error.start) + 1
-            raise InputError(f"{path}: line {line}: expected text in UTF-8, got a byte that is none; {cure}") from None
+            raise InputError(
+                f"{path}: line {line}: expected text in UTF-8, got a byte that is none; {remedy}"
+            ) from None
     return data
 
 
@@ -161,8 +163,8 @@ def numbers_in(
     for i in np.flatnonzero(~np.isfinite(values)).tolist():
         found = found_at(table, column, i)
         if found != "nothing" or not may_be_empty:
-            cure = "; leave the field empty where it is not known" if may_be_empty else ""
-            raise InputError(f"{path}: line {line_of(table, i)}: {column}: expected {expected}, got {found}{cure}")
+            remedy = "; leave the field empty where it is not known" if may_be_empty else ""
+            raise InputError(f"{path}: line {line_of(table, i)}: {column}: expected {expected}, got {found}{remedy}")
     return values
 
 

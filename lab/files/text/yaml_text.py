@@ -196,7 +196,7 @@ _Writer.add_representer(dict, _represent_dict)
 
 def write_mapping(content: Mapping[str, Any], path: Path) -> None:
     """Write plain values as YAML: floats to the last bit, complete or not at all."""
-    write_whole(yaml.dump(dict(content), Dumper=_Writer, sort_keys=False, allow_unicode=True, width=120), path)
+    atomic_write_text(yaml.dump(dict(content), Dumper=_Writer, sort_keys=False, allow_unicode=True, width=120), path)
 
 
 _WRITE_CURES = {
@@ -207,7 +207,7 @@ _WRITE_CURES = {
 }
 
 
-def write_whole(text: str, path: Path) -> None:
+def atomic_write_text(text: str, path: Path) -> None:
     """Write a text file so that `path` is either the whole new file or what it was before."""
     beside = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
@@ -218,5 +218,5 @@ def write_whole(text: str, path: Path) -> None:
         beside.replace(path)
     except OSError as error:
         beside.unlink(missing_ok=True)
-        cure = next((text for kind, text in _WRITE_CURES.items() if isinstance(error, kind)), "")
-        raise InputError(f"{path}: cannot be written: {error.strerror}{cure}") from None
+        remedy = next((text for kind, text in _WRITE_CURES.items() if isinstance(error, kind)), "")
+        raise InputError(f"{path}: cannot be written: {error.strerror}{remedy}") from None

@@ -18,7 +18,7 @@ from markupsafe import Markup
 from calibration.findings import Finding, Level
 from geometry.arrays import Array
 from lab.errors import InputError
-from lab.files.text.yaml_text import write_whole
+from lab.files.text.yaml_text import atomic_write_text
 from lab.number_format import short
 from lab.report.html import environment
 
@@ -40,7 +40,7 @@ _PLAN_SENTENCE = {
 
 
 @dataclass(frozen=True, slots=True)
-class Table:
+class PageTable:
     """A table. Cells are text, or numbers, which are shown with four significant digits (nan: a dash)."""
 
     heads: Sequence[str]  # with units: "drift (px)"
@@ -53,7 +53,7 @@ class Table:
 
 
 @dataclass(frozen=True, slots=True)
-class Drawing:
+class PageDrawing:
     """A picture as SVG or HTML text, trusted as it is, and what it shows, in plain words."""
 
     picture: str
@@ -67,8 +67,8 @@ class Section:
 
     title: str
     words: str | Sequence[str] = ()  # one paragraph or several; plain text
-    drawings: Sequence[Drawing | str] = ()
-    table: Table | None = None
+    drawings: Sequence[PageDrawing | str] = ()
+    table: PageTable | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,7 +138,7 @@ def write_calibration_report(report: CalibrationReport, folder: Path) -> Path:
     Where it would be larger than 5 MB its largest pictures are left out, each with a line that says so.
     """
     path = Path(folder) / FILE_NAME
-    write_whole(page(report), path)
+    atomic_write_text(page(report), path)
     return path
 
 
@@ -162,11 +162,11 @@ def page(report: CalibrationReport) -> str:
     return _rendered(report, drawn)
 
 
-def _drawing(drawing: Drawing | str) -> Drawing:
-    return drawing if isinstance(drawing, Drawing) else Drawing(drawing)
+def _drawing(drawing: PageDrawing | str) -> PageDrawing:
+    return drawing if isinstance(drawing, PageDrawing) else PageDrawing(drawing)
 
 
-def _rendered(report: CalibrationReport, drawn: list[list[Drawing]]) -> str:
+def _rendered(report: CalibrationReport, drawn: list[list[PageDrawing]]) -> str:
     worst_first = sorted(report.findings, key=lambda f: -f.level)
     context: dict[str, Any] = {
         "kind": report.kind,
@@ -177,7 +177,7 @@ def _rendered(report: CalibrationReport, drawn: list[list[Drawing]]) -> str:
         "made": report.made,
         "made_line": f"{report.made.date} · {_counted(report.findings)}",
         "findings": [
-            {"css": _CSS[f.level], "word": f.level.name, "what": f.what, "why": f.why, "cure": f.cure}
+            {"css": _CSS[f.level], "word": f.level.name, "what": f.what, "why": f.why, "remedy": f.remedy}
             for f in worst_first
         ],
         "key_figures": report.key_figures,
@@ -191,7 +191,7 @@ def section_context(section: Section) -> dict[str, Any]:
     return _section(section, [_drawing(d) for d in section.drawings])
 
 
-def _section(section: Section, drawings: list[Drawing]) -> dict[str, Any]:
+def _section(section: Section, drawings: list[PageDrawing]) -> dict[str, Any]:
     table = section.table
     return {
         "title": section.title,
@@ -226,7 +226,7 @@ def cell(value: object) -> str:
 _NUMBER_TEXT = re.compile(r"^[-+−±]?[\d.,]+(\s*[×%°].*)?(\s*±.*)?$|^[–∞]?$")
 
 
-def _numeric(table: Table) -> list[bool]:
+def _numeric(table: PageTable) -> list[bool]:
     """Which columns hold numbers alone: those stand flush right."""
     return [
         bool(table.rows) and all(_NUMBER_TEXT.match(cell(row[k])) is not None for row in table.rows)

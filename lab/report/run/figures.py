@@ -7,14 +7,14 @@ import numpy as np
 from geometry.arrays import Array
 from lab.report.plot import svg
 from lab.report.plot.svg import Band, Line, Shade
-from lab.report.run.report_data import Material
+from lab.report.run.report_data import ReportData
 from lab.runs.score.score import normalised_squares
 from tracking.statuses import PoseStatus, SpotStatus
 
 U_COLOUR, V_COLOUR = svg.BLUE, svg.VERMILLION
 
 
-def pose_shades(m: Material) -> tuple[Shade, ...]:
+def pose_shades(m: ReportData) -> tuple[Shade, ...]:
     """Where the pose was predicted or lost."""
     return (
         Shade(m.poses.has(PoseStatus.PREDICTED), "predicted", "pose predicted, not measured"),
@@ -22,7 +22,7 @@ def pose_shades(m: Material) -> tuple[Shade, ...]:
     )
 
 
-def nees_figure(m: Material) -> str:
+def nees_figure(m: ReportData) -> str:
     """The squared pose error in units of its covariance, over time."""
     delta = m.pose_errors
     if delta is None:
@@ -49,14 +49,14 @@ def nees_figure(m: Material) -> str:
     )
 
 
-def view_shades(m: Material, j: int) -> tuple[Shade, ...]:
+def view_shades(m: ReportData, j: int) -> tuple[Shade, ...]:
     """Where a view's position is not measured."""
     status = (SpotStatus.OUT_OF_VIEW, "outside"), (SpotStatus.OCCLUDED, "predicted"), (SpotStatus.NO_IMAGE, "lost")
     shades = [Shade(m.spots.has(s)[:, j], css, f"{s}: {s.meaning}") for s, css in status]
     return (*shades, Shade(m.spots.has(SpotStatus.LOST)[:, j], "lost", "lost"))
 
 
-def error_grid(m: Material, columns: tuple[tuple[str, Array], ...], at_least_px: float = 0.5) -> str:
+def error_grid(m: ReportData, columns: tuple[tuple[str, Array], ...], at_least_px: float = 0.5) -> str:
     """For each view a row of panels over time with u and v of the given errors (F, V, 2), px; one scale per column."""
     out = []
     shown = [j for j in range(len(m.spots.views)) if any(np.isfinite(e[:, j]).any() for _, e in columns)]
@@ -84,7 +84,7 @@ def error_grid(m: Material, columns: tuple[tuple[str, Array], ...], at_least_px:
     return "".join(out)
 
 
-def truth_columns(m: Material) -> tuple[tuple[str, Array], ...]:
+def truth_columns(m: ReportData) -> tuple[tuple[str, Array], ...]:
     """Prediction error and tracking error (the paper's Figs. 5 to 7, 9, 12 and 13)."""
     if m.truth is None or m.truth.uv_px is None:
         return ()
@@ -94,7 +94,7 @@ def truth_columns(m: Material) -> tuple[tuple[str, Array], ...]:
     )
 
 
-def residual_columns(m: Material) -> tuple[tuple[str, Array], ...]:
+def residual_columns(m: ReportData) -> tuple[tuple[str, Array], ...]:
     """Innovation, and residual where the rig is known."""
     columns: tuple[tuple[str, Array], ...] = (("measured \u2212 predicted", m.innovation_px),)
     if m.residual_px is not None:
@@ -102,7 +102,7 @@ def residual_columns(m: Material) -> tuple[tuple[str, Array], ...]:
     return columns
 
 
-def rms_figure(m: Material) -> str:
+def rms_figure(m: ReportData) -> str:
     """The pose solution's residual over time, and how the residuals are spread."""
     p = m.poses
     if not np.isfinite(p.rms_px).any():

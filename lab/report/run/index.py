@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from lab.files.text.yaml_text import write_whole
+from lab.files.text.yaml_text import atomic_write_text
 from lab.number_format import short
 from lab.report.html import environment
 from lab.report.run.verdict import WORDS
@@ -47,7 +47,7 @@ def write_index(rows: list[dict[str, Any]], out: Path) -> Path:
         .render(heads=[h.replace("_", " ") for h in heads], lines=lines, counts=counts)
     )
     path = out / FILE_NAME
-    write_whole(text, path)
+    atomic_write_text(text, path)
     return path
 
 

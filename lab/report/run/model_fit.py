@@ -30,7 +30,7 @@ class FindingRow:
     level: str  # small, check or fail
     what: str
     why: str
-    cure: str
+    remedy: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +49,7 @@ def model_fit(summary: Mapping[str, Any]) -> ModelFit | None:
     if not isinstance(block, Mapping):
         return None
     findings = tuple(
-        FindingRow(_WORDS.get(str(f.get("level")), "check"), *(str(f.get(k) or "") for k in ("what", "why", "cure")))
+        FindingRow(_WORDS.get(str(f.get("level")), "check"), *(str(f.get(k) or "") for k in ("what", "why", "remedy")))
         for f in _mappings(block.get("findings"))
     )
     rows = []

@@ -7,13 +7,13 @@ from typing import Any
 
 from markupsafe import Markup
 
-from lab.files.text.yaml_text import write_whole
+from lab.files.text.yaml_text import atomic_write_text
 from lab.report.html import environment
 from lab.report.run import figures, pose_curves, tables, uncertainty
 from lab.report.run.model_fit import HEADS as MODEL_FIT_HEADS
 from lab.report.run.model_fit import model_fit
-from lab.report.run.pictures import Event, chosen, events, pictures
-from lab.report.run.report_data import Material, gather
+from lab.report.run.pictures import ShownEvent, chosen, events, pictures
+from lab.report.run.report_data import ReportData, gather
 from lab.report.run.tracks import POSE_COLOURS, SPOT_COLOURS, timeline_figure, tracks_figure
 from lab.report.run.verdict import verdict_of
 from tracking.statuses import PoseStatus, SpotStatus
@@ -30,11 +30,11 @@ def write_report(results: Path, run_folder: Path | None = None) -> Path:
     """
     material = gather(results, run_folder)
     path = results / FILE_NAME
-    write_whole(page(material, results), path)
+    atomic_write_text(page(material, results), path)
     return path
 
 
-def page(m: Material, results: Path) -> str:
+def page(m: ReportData, results: Path) -> str:
     """The HTML text of a report."""
     found = events(m)
     listed = _event_rows(m, found)
@@ -94,7 +94,7 @@ def _listed(value: Any) -> list[Any]:
     return value if isinstance(value, list) else [value]
 
 
-def _run_line(m: Material) -> str:
+def _run_line(m: ReportData) -> str:
     parts = []
     if len(m.spots.frames):
         parts.append(f"frames {m.spots.frames[0]} to {m.spots.frames[-1]}")
@@ -109,7 +109,7 @@ def _run_line(m: Material) -> str:
     return " · ".join(p for p in parts if p)
 
 
-def _event_rows(m: Material, found: list[Event]) -> list[tuple[str, str, str, str]]:
+def _event_rows(m: ReportData, found: list[ShownEvent]) -> list[tuple[str, str, str, str]]:
     """Frame, time, camera and what happened. Hidden spots are in the status figure; they would bury the rest here."""
     clock = m.time_name != "frame"
     return [
@@ -119,7 +119,7 @@ def _event_rows(m: Material, found: list[Event]) -> list[tuple[str, str, str, st
     ]
 
 
-def _missing(m: Material) -> list[str]:
+def _missing(m: ReportData) -> list[str]:
     """What this report could not show, and why."""
     out = []
     if not m.summary:

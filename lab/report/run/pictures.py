@@ -18,7 +18,7 @@ from lab.files.run.results import SPOT_STATUSES, read_table
 from lab.files.run.run_file import DetectionsTable, LiveDevice, VideoFile
 from lab.pictures.picture_file import Grey, Missing
 from lab.report.plot import svg
-from lab.report.run.report_data import Material
+from lab.report.run.report_data import ReportData
 from lab.report.run.tracks import SPOT_COLOURS
 from lab.runs.frames.frames import pictures_at
 from tracking.detections import Detections
@@ -34,7 +34,7 @@ _ZOOM_PX, _ZOOM_SHOWN = 64, 130.0  # side of the enlarged part, px, and what it 
 
 
 @dataclass(frozen=True, slots=True)
-class Event:
+class ShownEvent:
     """Something that happened in one camera's picture."""
 
     index: int  # place among the frames
@@ -44,15 +44,15 @@ class Event:
     text: str
 
 
-def events(m: Material) -> list[Event]:
+def events(m: ReportData) -> list[ShownEvent]:
     """What happened, found in the tables: turns, exits, returns, hidden spots, missing pictures, a lost pose."""
-    out: list[Event] = []
+    out: list[ShownEvent] = []
     cameras = m.spots.cameras
     for camera in cameras:
         own = [j for j, (c, _) in enumerate(m.spots.views) if c == camera]
         gone = np.any(m.spots.has(SpotStatus.NO_IMAGE)[:, own], axis=1)
         out += [
-            Event(a, camera, None, "no usable picture", _for_frames("no usable picture", a, b))
+            ShownEvent(a, camera, None, "no usable picture", _for_frames("no usable picture", a, b))
             for a, b in svg.runs(gone)
         ]
     for j, (camera, spot) in enumerate(m.spots.views):
@@ -62,25 +62,28 @@ def events(m: Material) -> list[Event]:
         measured = m.spots.measured[:, j]
         for a, b in svg.runs(outside):
             if a > 0 and measured[a - 1]:
-                out.append(Event(a, camera, spot, "exit", _for_frames(f"spot {spot} leaves the picture", a, b)))
+                out.append(ShownEvent(a, camera, spot, "exit", _for_frames(f"spot {spot} leaves the picture", a, b)))
             if b < len(outside) and measured[b]:
                 text = f"spot {spot} returns after {_frames(b - a)} out of view"
-                out.append(Event(b, camera, spot, "return", text))
+                out.append(ShownEvent(b, camera, spot, "return", text))
         out += [
-            Event(a, camera, spot, "hidden", _for_frames(f"spot {spot} is not found where it should be", a, b))
+            ShownEvent(a, camera, spot, "hidden", _for_frames(f"spot {spot} is not found where it should be", a, b))
             for a, b in svg.runs(hidden)
         ]
-        out += [Event(a, camera, spot, "turn", f"the trajectory of spot {spot} bends") for a, _ in svg.runs(turned)]
+        out += [
+            ShownEvent(a, camera, spot, "turn", f"the trajectory of spot {spot} bends") for a, _ in svg.runs(turned)
+        ]
     if len(m.poses.frames) == len(m.spots.frames) and cameras:
         lost = m.poses.has(PoseStatus.LOST)
         out += [
-            Event(a, cameras[0], None, "pose lost", _for_frames("the pose is lost", a, b)) for a, b in svg.runs(lost)
+            ShownEvent(a, cameras[0], None, "pose lost", _for_frames("the pose is lost", a, b))
+            for a, b in svg.runs(lost)
         ]
     out += _noted(m)
     return sorted(out, key=lambda e: e.index)
 
 
-def _noted(m: Material) -> list[Event]:
+def _noted(m: ReportData) -> list[ShownEvent]:
     """What the run itself noted in summary.json; one of the whole rig stands under the first camera."""
     listed = m.summary.get("events")
     place = {f: i for i, f in enumerate(m.spots.frames.tolist())}
@@ -94,7 +97,7 @@ def _noted(m: Material) -> list[Event]:
             if isinstance(last, int) and last > noted["frame"]:
                 words = _for_frames(words, noted["frame"], last + 1)
             known = camera if camera in m.spots.cameras else m.spots.cameras[0]
-            out.append(Event(place[noted["frame"]], known, None if spot is None else str(spot), kind, words))
+            out.append(ShownEvent(place[noted["frame"]], known, None if spot is None else str(spot), kind, words))
     return out
 
 
@@ -106,7 +109,7 @@ def _for_frames(what: str, start: int, stop: int) -> str:
     return f"{what}, for {_frames(stop - start)}"
 
 
-def chosen(m: Material, found: list[Event]) -> list[Event]:
+def chosen(m: ReportData, found: list[ShownEvent]) -> list[ShownEvent]:
     """At most MOST_PICTURES events, every kind before any second one."""
     if m.run is not None and any(isinstance(s, VideoFile) for s in m.run.cameras.values()):
         found = [e for e in found if e.index < _VIDEO_REACH]
@@ -118,7 +121,7 @@ def chosen(m: Material, found: list[Event]) -> list[Event]:
     piles = [[e for e in found if e.kind == kind] for kind in kinds]
     # of each kind: its first, its last, its middle ...
     orders = [[pile[i] for i in dict.fromkeys([0, len(pile) - 1, len(pile) // 2])] if pile else [] for pile in piles]
-    picked = [Event(0, camera, None, "start", "the first frame") for camera in cameras[:2]]
+    picked = [ShownEvent(0, camera, None, "start", "the first frame") for camera in cameras[:2]]
     for turn in range(3):
         for order in orders:
             if turn < len(order) and len(picked) < MOST_PICTURES:
@@ -128,7 +131,7 @@ def chosen(m: Material, found: list[Event]) -> list[Event]:
     return sorted(picked, key=lambda e: e.index)
 
 
-def pictures(m: Material, results: Path, selection: list[Event]) -> list[str]:
+def pictures(m: ReportData, results: Path, selection: list[ShownEvent]) -> list[str]:
     """An SVG for each event: the picture with its overlay, an enlarged part beside it, and what it shows."""
     if m.run is None:
         return []
@@ -170,7 +173,7 @@ def _detections(path: Path, frames: set[int]) -> dict[tuple[int, str], Array]:
     return out
 
 
-def _drawing(m: Material, event: Event, picture: Array | str, points: dict[tuple[int, str], Array]) -> str:
+def _drawing(m: ReportData, event: ShownEvent, picture: Array | str, points: dict[tuple[int, str], Array]) -> str:
     """picture: grey values (h, w), or why there is none."""
     w, h = m.picture_sizes[event.camera]
     frame = int(m.spots.frames[event.index])
@@ -206,7 +209,7 @@ def _drawing(m: Material, event: Event, picture: Array | str, points: dict[tuple
     return "".join(out) + "</svg>"
 
 
-def _focus(m: Material, event: Event, views: list[int], size: tuple[int, int]) -> Array | None:
+def _focus(m: ReportData, event: ShownEvent, views: list[int], size: tuple[int, int]) -> Array | None:
     """Where to look closer (2,), px: at the event's spot, or else at the first that is in the picture."""
     named = [j for j in views if m.spots.views[j][1] == event.spot]
     for j in named or views:
@@ -238,7 +241,7 @@ def _data_uri(picture: Bytes, kind: str) -> str:
 
 
 def _overlay(
-    m: Material,
+    m: ReportData,
     k: int,
     views: list[int],
     size: tuple[int, int],
@@ -317,7 +320,9 @@ def _arrow(uv: Array, size: tuple[int, int], unit: float) -> tuple[float, float,
     return float(name_at[0]), float(name_at[1]) + 4 * unit, d
 
 
-def _zoom(m: Material, event: Event, picture: Array, focus: Array, views: list[int], points: Array | None) -> str:
+def _zoom(
+    m: ReportData, event: ShownEvent, picture: Array, focus: Array, views: list[int], points: Array | None
+) -> str:
     """The surroundings of one spot, enlarged, pixel by pixel."""
     h, w = picture.shape
     side = min(_ZOOM_PX, w, h)
@@ -337,7 +342,7 @@ def _zoom(m: Material, event: Event, picture: Array, focus: Array, views: list[i
     return inner + "".join(svg.text(408, 34 + _ZOOM_SHOWN + 15 + 14 * i, line, "tick") for i, line in enumerate(words))
 
 
-def _statuses(m: Material, k: int, views: list[int], tall: float) -> str:
+def _statuses(m: ReportData, k: int, views: list[int], tall: float) -> str:
     """The spots' statuses in words, beside the foot of the picture."""
     lines = []
     for j in views:

@@ -13,7 +13,7 @@ from lab.files.run.results import PoseTrack
 from lab.report.plot import svg
 from lab.report.plot.svg import Band, Line
 from lab.report.run.figures import pose_shades
-from lab.report.run.report_data import Material
+from lab.report.run.report_data import ReportData
 from lab.runs.score.motion_score import differenced
 from tracking.statuses import PoseStatus
 
@@ -34,7 +34,7 @@ class _Curve:
     causal: Array | None  # (F,) the causal filter's error, or its difference to `value` where there is no truth
 
 
-def pose_figure(m: Material) -> str:
+def pose_figure(m: ReportData) -> str:
     """Attitude and position over time beside their uncertainty; empty where no pose is known."""
     p = m.poses
     if not p.known.any():
@@ -60,7 +60,7 @@ def pose_figure(m: Material) -> str:
     )
 
 
-def motion_figure(m: Material) -> str:
+def motion_figure(m: ReportData) -> str:
     """Velocity and angular rate beside their uncertainty; empty where neither is known. Truth: differences of poses."""
     values, sigmas = _motion(m.poses)
     if not np.isfinite(values).any():
@@ -91,7 +91,7 @@ def _motion(p: PoseTrack) -> tuple[Array, Array]:
     return np.concatenate(both[0], axis=1), np.concatenate(both[1], axis=1)
 
 
-def _causal(m: Material, true: Pose | None) -> Array | None:
+def _causal(m: ReportData, true: Pose | None) -> Array | None:
     """(F, 6) as `_minus`: the causal filter's poses minus the truth, or minus the smoothed ones; None without them."""
     return None if m.causal is None else _minus(m.causal, m.poses.world_from_body if true is None else true)
 
@@ -106,13 +106,13 @@ def _minus(poses: PoseTrack, true: Pose | None) -> Array | None:
     return np.concatenate([np.where(np.isfinite(shift[:, :1]), ypr, np.nan), shift], axis=1)
 
 
-def _rows(m: Material, curves: list[_Curve]) -> str:
+def _rows(m: ReportData, curves: list[_Curve]) -> str:
     measured = m.poses.has(PoseStatus.MEASURED)
     parts = [_row(m, curve, measured, curve is curves[-1]) for curve in curves]
     return "".join(parts)
 
 
-def _row(m: Material, c: _Curve, measured: Bools, last: bool) -> str:
+def _row(m: ReportData, c: _Curve, measured: Bools, last: bool) -> str:
     """Two panels: the value with its band, and the uncertainty with the errors that are known."""
     t, shades, height = m.pose_times, pose_shades(m), 128 if last else 104
     value = svg.time_panel(

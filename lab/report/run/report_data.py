@@ -13,14 +13,14 @@ from geometry.forward_model import SpotModel
 from lab.errors import BeamposeError
 from lab.files.run.results import PoseTrack, SpotGrid, has_causal, read_poses, read_spots, read_summary
 from lab.files.run.run_file import Run, load_run
-from lab.runs.score.score import Truth, pose_errors, read_truth, score_against
+from lab.runs.score.score import TruthArrays, pose_errors, read_truth, score_against
 from tracking.statuses import PoseStatus
 
 _FRAMES_AT_ONCE = 2000  # bounds the memory of projecting all poses with their Jacobians
 
 
 @dataclass(frozen=True, slots=True)
-class Material:
+class ReportData:
     """What a results folder says, and the run it came from where that is still there."""
 
     name: str
@@ -32,7 +32,7 @@ class Material:
     time_name: str
     run: Run | None
     run_folder: Path | None
-    truth: Truth | None
+    truth: TruthArrays | None
     errors: dict[str, Any] | None  # lab.runs.score.score.score
     residual_px: Array | None  # (F, V, 2), measured minus projected from the frame's pose; None without a rig
     residual_share: float | None  # of a spot's variance that residuals should have: the pose has taken up the rest
@@ -60,7 +60,7 @@ class Material:
         return self.poses.t_s if self.time_name != "frame" else self.poses.frames.astype(float)
 
 
-def gather(results: Path, run_folder: Path | None) -> Material:
+def gather(results: Path, run_folder: Path | None) -> ReportData:
     """Read a results folder, and of its run folder what is there.
 
     Without `run_folder`, the one that summary.json names is tried. Raises InputError if the results cannot be read; a
@@ -85,7 +85,7 @@ def gather(results: Path, run_folder: Path | None) -> Material:
     errors = score_against(spots, poses, truth, causal) if truth is not None else summary.get("errors")
     times_known = bool(len(spots.t_s)) and bool(np.isfinite(spots.t_s).all())
     residual_px, residual_share = (None, None) if run is None else _residuals(spots, poses, run)
-    return Material(
+    return ReportData(
         name=str(summary.get("name") or results.resolve().name),
         summary=summary,
         spots=spots,

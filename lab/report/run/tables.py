@@ -10,7 +10,7 @@ import numpy as np
 from geometry.arrays import Array
 from lab.number_format import angle, length, percent, short
 from lab.report.plot.svg import runs
-from lab.report.run.report_data import Material
+from lab.report.run.report_data import ReportData
 from tracking.statuses import PoseStatus, SpotStatus
 
 
@@ -45,7 +45,7 @@ def _rms(values: Array) -> float | None:
     return float(np.sqrt(np.mean(values**2))) if values.size else None
 
 
-def key_figures(m: Material) -> list[Key]:
+def key_figures(m: ReportData) -> list[Key]:
     """What a reader wants to know first, from the results themselves."""
     n = len(m.spots.frames)
     p = m.poses
@@ -106,7 +106,7 @@ def _count(value: Any) -> str:
     return "\u2013" if value is None else str(value)
 
 
-def spot_rows(m: Material) -> tuple[list[str], list[list[str]]]:
+def spot_rows(m: ReportData) -> tuple[list[str], list[list[str]]]:
     """Heads and rows of the table of views: statuses, and what their errors are."""
     heads = ["camera", "spot", *(str(s).replace("_", " ") for s in SpotStatus), "median σ (px)", "innovation RMS (px)"]
     if m.residual_px is not None:
@@ -224,7 +224,7 @@ def _motion_rows(errors: dict[str, Any] | None) -> list[tuple[str, str, str]]:
     return out
 
 
-def label_words(m: Material) -> str:
+def label_words(m: ReportData) -> str:
     """What became of doubtful labels, in one sentence; empty where there were none."""
     left_open = int((np.isfinite(m.spots.label_probability) & ~m.spots.measured).sum())
     counts = at(m.summary, "counts", "events")
@@ -262,7 +262,7 @@ def _plain(value: Any) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
-def no_image_ranges(m: Material) -> list[tuple[str, str]]:
+def no_image_ranges(m: ReportData) -> list[tuple[str, str]]:
     """Camera, and the frame numbers without a usable picture, written as ranges."""
     out = []
     for camera in m.spots.cameras:

@@ -9,7 +9,7 @@ import numpy as np
 from geometry.arrays import Array, Bools, Ints
 from lab.files.run.results import POSE_STATUSES, SPOT_STATUSES
 from lab.report.plot import svg
-from lab.report.run.report_data import Material
+from lab.report.run.report_data import ReportData
 from tracking.statuses import PoseStatus, SpotStatus
 
 TRACK_COLOURS = (svg.BLUE, svg.VERMILLION, svg.GREEN, svg.PURPLE, svg.ORANGE, svg.SKY, "#6b4c9a", "#7a5c2e")
@@ -30,7 +30,7 @@ POSE_COLOURS = {
 _BEYOND = 0.75  # how far outside the picture tracks are drawn, in picture sizes
 
 
-def tracks_figure(m: Material, camera: str) -> str:
+def tracks_figure(m: ReportData, camera: str) -> str:
     """The tracks of a camera's spots in pixels, the picture's border, parts outside it dashed."""
     views = [j for j, (c, _) in enumerate(m.spots.views) if c == camera]
     uv = m.spots.uv_px[:, views]
@@ -156,7 +156,7 @@ def _labels(labels: list[tuple[float, float, str, str]]) -> list[str]:
     return out
 
 
-def timeline_figure(m: Material) -> str:
+def timeline_figure(m: ReportData) -> str:
     """A strip of colours for the pose and for each view: what its status was over time."""
     n = len(m.spots.frames)
     width, left, right, row = 1090.0, 128.0, 1000.0, 19.0

@@ -7,14 +7,14 @@ import numpy as np
 from geometry.arrays import Array
 from geometry.rotations import ypr_jacobian
 from lab.number_format import angle, length
-from lab.report.run.report_data import Material
+from lab.report.run.report_data import ReportData
 from tracking.statuses import PoseStatus
 
 AVERAGED = 100  # frames of the example
 HEADS = ("", "one frame", "of it noise", "of it calibration", f"mean of {AVERAGED} frames", "mean of endless frames")
 
 
-def budget_rows(m: Material) -> list[tuple[str, ...]]:
+def budget_rows(m: ReportData) -> list[tuple[str, ...]]:
     """A row per number of the pose: medians over the measured frames of 1-sigma; empty where nothing is stated.
 
     Noise is taken for independent from frame to frame, as the frames' own covariances claim it.
@@ -43,7 +43,7 @@ def _variances(R: Array, covariance: Array) -> Array:
     return np.concatenate(both, axis=1)
 
 
-def words(m: Material) -> str:
+def words(m: ReportData) -> str:
     """What the reader must know of the calibration's share."""
     if m.run is None or m.run.covariance is not None:
         return (

@@ -23,7 +23,7 @@ class Point:
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class VerdictText:
     """What to think of a run, and why."""
 
     status: str  # pass, check, fail or unknown
@@ -34,7 +34,7 @@ class Verdict:
     points: tuple[Point, ...]  # the reasons with their remedies; of results without evidence the reasons alone
 
 
-def verdict_of(summary: dict[str, Any]) -> Verdict:
+def verdict_of(summary: dict[str, Any]) -> VerdictText:
     """The verdict that summary.json holds, whatever of it is there."""
     block = summary.get("verdict")
     block = block if isinstance(block, dict) else {}
@@ -44,7 +44,7 @@ def verdict_of(summary: dict[str, Any]) -> Verdict:
     if isinstance(reasons, str):
         reasons = (reasons,)
     code = block.get("exit_status")
-    return Verdict(
+    return VerdictText(
         status=status if status in WORDS else "unknown",
         word=word,
         sentence=sentence,

@@ -25,13 +25,13 @@ from geometry.forward_model import SpotModel
 from geometry.rig import Rig
 from geometry.uncertainty.rig_parameters import RigCovariance
 from lab.runs.model_check.effect import Effect, effect_of
-from lab.runs.model_check.fault_identification import Culprit, Explained, Inquest, inquire
+from lab.runs.model_check.fault_identification import Explained, FaultDiagnosis, SuspectedFault, diagnose
 from lab.runs.model_check.faults import FaultColumns, possible_faults
-from lab.runs.model_check.frame_sampler import FrameKeeper
-from lab.runs.model_check.linear import Linearised, linearise
+from lab.runs.model_check.frame_sampler import FrameSampler
+from lab.runs.model_check.linear import LinearisedFrames, linearise
 from lab.runs.model_check.messages import UNEVEN, culprit_finding, is_noisy, noise_finding, unexplained_finding
 from lab.runs.model_check.place import with_place_errors
-from lab.runs.model_check.recording import Recording, evenly
+from lab.runs.model_check.recording import ModelCheckRecording, evenly
 from lab.runs.model_check.statistics import Statistics, group_key, residual_weights, statistics
 from lab.runs.model_check.unseen import unseen_finding, unseen_views
 
@@ -50,7 +50,7 @@ class ModelCheck:
     frames_used: int  # for the statistics
     frames_for_culprits: int
     statistics: Statistics | None  # None where no frame has enough spots
-    inquest: Inquest | None  # None where there is too little to test
+    inquest: FaultDiagnosis | None  # None where there is too little to test
     effects: tuple[tuple[Effect, ...], ...]  # of each culprit: of its best explanation and of the rivals, in order
     findings: tuple[Finding, ...]  # the gravest things first; empty where nothing was found
     why_not: str = ""  # why nothing was tested; empty where it was
@@ -65,7 +65,7 @@ class ModelCheck:
     def as_mapping(self) -> dict[str, Any]:
         """For summary.json, plain values.
 
-        tested, why_not; frames_used, frames_for_culprits; findings: level (PASS, WARN, FAIL), what, why, cure;
+        tested, why_not; frames_used, frames_for_culprits; findings: level (PASS, WARN, FAIL), what, why, remedy;
         misfit, noise, correlation_frames, p_before, p_after: see Inquest (with the claims widened where the cameras'
         noise is uneven); noise_of_cameras; culprits: thing, name, kind, delta and sigma
         (in rad, m, px, s, or relative), explained (chi-square), p, off_px, off_sigmas, attitude_deg, position_mm,
@@ -77,7 +77,9 @@ class ModelCheck:
             "why_not": self.why_not,
             "frames_used": self.frames_used,
             "frames_for_culprits": self.frames_for_culprits,
-            "findings": [{"level": f.level.name, "what": f.what, "why": f.why, "cure": f.cure} for f in self.findings],
+            "findings": [
+                {"level": f.level.name, "what": f.what, "why": f.why, "remedy": f.remedy} for f in self.findings
+            ],
         }
         if self.inquest is not None:
             q = self.inquest
@@ -96,7 +98,7 @@ class ModelCheck:
         return out
 
 
-def check_model(rig: Rig, recording: Recording, calibration: RigCovariance | None = None) -> ModelCheck:
+def check_model(rig: Rig, recording: ModelCheckRecording, calibration: RigCovariance | None = None) -> ModelCheck:
     """Test whether a recording fits the rig, and name the likely culprit where it does not.
 
     calibration: what is claimed of the rig's numbers; a misfit that it allows is no fault. Work and memory are bounded
@@ -125,7 +127,7 @@ def check_model(rig: Rig, recording: Recording, calibration: RigCovariance | Non
         counts = len(all_frames.frames), len(lin.frames)
         return ModelCheck(*counts, groups, None, (), tuple(unseen), why, image_sizes_px=sizes)
     faults = possible_faults(rig, columns)
-    inquest = inquire(lin, moves, columns.covariance, faults)
+    inquest = diagnose(lin, moves, columns.covariance, faults)
     factor = [max(f, 1.0) for f in _noise_of_cameras(inquest, model)]
     # Cameras whose claims are wrong by different factors would break all tests, which weigh by the claims. The factors
     # are variance components (Helmert's): estimated, applied, and estimated again until they settle.
@@ -134,7 +136,7 @@ def check_model(rig: Rig, recording: Recording, calibration: RigCovariance | Non
         wider = np.array(factor)[model.camera_of][:, None, None] ** 2
         lin = linearise(model, replace(recording, cov_px2=recording.cov_px2 * wider), lin.frames)
         moves = columns.at(recording, lin)
-        inquest = inquire(lin, moves, columns.covariance, faults)
+        inquest = diagnose(lin, moves, columns.covariance, faults)
         before, factor = factor, [f * m for f, m in zip(factor, _noise_of_cameras(inquest, model), strict=True)]
         factor = [max(f, 1.0) for f in factor]
         if all(1 / _SETTLED < f / b < _SETTLED for f, b in zip(factor, before, strict=True)):
@@ -177,7 +179,7 @@ def check_model(rig: Rig, recording: Recording, calibration: RigCovariance | Non
     )
 
 
-def check_kept(rig: Rig, kept: FrameKeeper, calibration: RigCovariance | None = None) -> ModelCheck:
+def check_kept(rig: Rig, kept: FrameSampler, calibration: RigCovariance | None = None) -> ModelCheck:
     """As `check_model`, of the frames that a run has kept."""
     recording = kept.recording()
     if recording is None:
@@ -185,7 +187,7 @@ def check_kept(rig: Rig, kept: FrameKeeper, calibration: RigCovariance | None = 
     return check_model(rig, recording, calibration)
 
 
-def _noise_of_cameras(inquest: Inquest, model: SpotModel) -> list[float]:
+def _noise_of_cameras(inquest: FaultDiagnosis, model: SpotModel) -> list[float]:
     """How much larger than claimed each camera's errors are that no fault makes; 1 where that is not known.
 
     The median of its views: one that is at fault by itself does not count for the camera.
@@ -198,7 +200,7 @@ def _noise_of_cameras(inquest: Inquest, model: SpotModel) -> list[float]:
 
 
 def _calibration_px(
-    lin: Linearised, moves: Array, covariance: Array, model: SpotModel, beams: tuple[str, ...]
+    lin: LinearisedFrames, moves: Array, covariance: Array, model: SpotModel, beams: tuple[str, ...]
 ) -> Mapping[str, Array]:
     """1 sigma (2,), px, that the calibration's errors make of each group's mean residual against the other spots."""
     known = np.flatnonzero(np.diagonal(covariance) > 0)
@@ -223,7 +225,7 @@ def _calibration_px(
     return out
 
 
-def _mapping(culprit: Culprit, effects: tuple[Effect, ...]) -> dict[str, Any]:
+def _mapping(culprit: SuspectedFault, effects: tuple[Effect, ...]) -> dict[str, Any]:
     best, *rivals = (_explained(e, effect) for e, effect in zip(culprit.explanations, effects, strict=True))
     return {**best, "rivals": rivals}
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from geometry.arrays import Array, Bools
-from lab.runs.model_check.linear import Linearised
+from lab.runs.model_check.linear import LinearisedFrames
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,7 +24,7 @@ class Effect:
 
 
 def effect_of(
-    lin: Linearised,
+    lin: LinearisedFrames,
     columns: Array,
     theta: Array,
     views: Bools,
@@ -71,7 +71,7 @@ def effect_of(
 
 
 def _claimed_variances(
-    lin: Linearised, columns: Array, covariance: Array, claimed: Array | None, noise: float
+    lin: LinearisedFrames, columns: Array, covariance: Array, claimed: Array | None, noise: float
 ) -> Array:
     """(K, 6) variances of the poses."""
     if claimed is not None:

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.drift import Candidate, Change, Misfit
+from calibration.drift import Change, ChangeCandidate, ExcessResidual
 from geometry.arrays import Array
-from lab.runs.model_check.faults import BESIDE, VIEW, Fault
-from lab.runs.model_check.linear import Linearised
+from lab.runs.model_check.faults import BESIDE, VIEW, PossibleFault
+from lab.runs.model_check.linear import LinearisedFrames
 from lab.runs.model_check.statistics import correlation_time
 
 P_FALSE_ALARM = 1e-6  # of naming anything in a right recording, all candidates together
@@ -35,13 +35,13 @@ _SEEN = 1e-10  # of the largest eigenvalue: combinations of numbers that show le
 class Explained:
     """A fault that was fitted to a recording."""
 
-    fault: Fault
+    fault: PossibleFault
     change: Change
     weight: float  # 2 ln of how much more probable it makes the recording, less the number of its like
 
 
 @dataclass(frozen=True, slots=True)
-class Culprit:
+class SuspectedFault:
     """The best explanation of a misfit, and those that the recording cannot tell from it, the best of each thing."""
 
     best: Explained
@@ -55,10 +55,10 @@ class Culprit:
 
 
 @dataclass(frozen=True, slots=True)
-class Inquest:
+class FaultDiagnosis:
     """What was found."""
 
-    culprits: tuple[Culprit, ...]
+    culprits: tuple[SuspectedFault, ...]
     p_before: float  # how probable so large a misfit is where nothing is wrong
     p_after: float  # the same of what the culprits leave
     tests: int  # candidates tried
@@ -79,7 +79,9 @@ class Inquest:
         return self.correlation_frames > LASTING_FRAMES
 
 
-def inquire(lin: Linearised, columns: Array, covariance: Array, faults: Sequence[Fault]) -> Inquest:
+def diagnose(
+    lin: LinearisedFrames, columns: Array, covariance: Array, faults: Sequence[PossibleFault]
+) -> FaultDiagnosis:
     """The inquest on K frames. columns (K, n, 2, p), whitened; covariance (p, p) of these numbers as claimed."""
     free = lin.pose_free(columns)
     flat = free.reshape(-1, free.shape[-1])
@@ -101,9 +103,9 @@ def inquire(lin: Linearised, columns: Array, covariance: Array, faults: Sequence
     chance = max(noise2, 1.0) * together
     root = np.linalg.cholesky(chance * np.eye(len(y)) + X @ covariance @ X.T)
     # Whitened once for all faults: the many small solves cost more than all the rest where BLAS runs in threads.
-    start = Misfit.of_white(np.linalg.solve(root, y))
+    start = ExcessResidual.of_white(np.linalg.solve(root, y))
     culprits, after = _search(start, np.linalg.solve(root, X), faults)
-    return Inquest(
+    return FaultDiagnosis(
         culprits=culprits,
         p_before=start.p_value,
         p_after=after.p_value,
@@ -126,9 +128,11 @@ def _compressed(N: Array) -> tuple[Array, Array]:
     return root * vectors[:, seen].T * scale, vectors[:, seen].T / root / safe
 
 
-def _search(start: Misfit, X: Array, faults: Sequence[Fault]) -> tuple[tuple[Culprit, ...], Misfit]:
+def _search(
+    start: ExcessResidual, X: Array, faults: Sequence[PossibleFault]
+) -> tuple[tuple[SuspectedFault, ...], ExcessResidual]:
     """Culprits, one after another, and what they leave."""
-    found: list[Culprit] = []
+    found: list[SuspectedFault] = []
     left = start
     while len(found) < MOST_FAULTS:
         more = _best(left, X, faults, found)
@@ -145,14 +149,16 @@ def _search(start: Misfit, X: Array, faults: Sequence[Fault]) -> tuple[tuple[Cul
     return tuple(found), left
 
 
-def _best(left: Misfit, X: Array, faults: Sequence[Fault], known: Sequence[Culprit]) -> Culprit | None:
+def _best(
+    left: ExcessResidual, X: Array, faults: Sequence[PossibleFault], known: Sequence[SuspectedFault]
+) -> SuspectedFault | None:
     """The best explanation that is significant, with its rivals; None where there is none."""
     taken = {_thing(c.best.fault) for c in known}
     fitted = []
     for fault in faults:
         if _thing(fault) in taken:
             continue
-        change = left.fit(fault.kind, fault.name, Candidate(X @ fault.numbers, fault.size))
+        change = left.fit(fault.kind, fault.name, ChangeCandidate(X @ fault.numbers, fault.size))
         alike = len({f.name for f in faults if f.thing == fault.thing})
         fitted.append(Explained(fault, change, change.evidence - 2 * float(np.log(alike))))
     significant = [e for e in fitted if e.weight > 0 and e.change.p_value < P_FALSE_ALARM / len(faults)]
@@ -168,8 +174,8 @@ def _best(left: Misfit, X: Array, faults: Sequence[Fault], known: Sequence[Culpr
         best_of_thing.setdefault(_thing(e.fault), e)
     best, *rivals = best_of_thing.values()
     rivals = [e for e in rivals if e.fault.thing != VIEW or best.fault.thing == VIEW]
-    return Culprit(best, tuple(rivals[:MOST_RIVALS]), max(len(rivals) - MOST_RIVALS, 0))
+    return SuspectedFault(best, tuple(rivals[:MOST_RIVALS]), max(len(rivals) - MOST_RIVALS, 0))
 
 
-def _thing(fault: Fault) -> tuple[str, str]:
+def _thing(fault: PossibleFault) -> tuple[str, str]:
     return fault.thing, fault.name

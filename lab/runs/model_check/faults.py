@@ -16,8 +16,8 @@ from geometry.arrays import Array, Bools, Ints, normalised, skew
 from geometry.forward_model import SpotModel
 from geometry.rig import Rig
 from geometry.uncertainty.rig_parameters import DIRECTION, POINT, POSE, RigCovariance, Sensitivity, is_known
-from lab.runs.model_check.linear import Linearised
-from lab.runs.model_check.recording import Recording, finite
+from lab.runs.model_check.linear import LinearisedFrames
+from lab.runs.model_check.recording import ModelCheckRecording, finite
 
 CAMERA, SCREEN, BEAM, VIEW, CLOCK = "camera", "screen", "beam", "spot", "clock"  # what a fault is of
 TURNED, MOVED, SHIFTED, ZOOMED = "turned", "moved and turned", "picture shifted", "focal length changed"
@@ -32,7 +32,7 @@ _NEAR_FRAMES = 1.5  # usual frame intervals: neighbours farther away in time tel
 
 
 @dataclass(frozen=True, slots=True)
-class Fault:
+class PossibleFault:
     """One possible fault of k numbers among the p of a `FaultColumns`."""
 
     thing: str  # CAMERA ... CLOCK
@@ -74,7 +74,7 @@ class FaultColumns:
             covariance[np.ix_(place, place)] = calibration.matrix
         return FaultColumns(tuple(names), sensitivity, model, covariance)
 
-    def at(self, recording: Recording, lin: Linearised) -> Array:
+    def at(self, recording: ModelCheckRecording, lin: LinearisedFrames) -> Array:
         """What each number does to the whitened pixels of these frames: (K, n, 2, p)."""
         K, n = lin.used.shape
         derivatives = self.model.derivatives(lin.poses)
@@ -91,7 +91,7 @@ class FaultColumns:
         return np.asarray(lin.W @ out)
 
 
-def _speeds(model: SpotModel, recording: Recording, frames: Ints) -> Array:
+def _speeds(model: SpotModel, recording: ModelCheckRecording, frames: Ints) -> Array:
     """How fast the spots move by the poses of the neighbouring frames, (K, n, 2), px/s; nan where these are unknown.
 
     A neighbour that is missing or far away in time is replaced by the frame itself.
@@ -110,7 +110,7 @@ def _speeds(model: SpotModel, recording: Recording, frames: Ints) -> Array:
     return np.where(elapsed > 0, moved / np.where(elapsed > 0, elapsed, 1.0), np.nan)
 
 
-def possible_faults(rig: Rig, columns: FaultColumns) -> tuple[Fault, ...]:
+def possible_faults(rig: Rig, columns: FaultColumns) -> tuple[PossibleFault, ...]:
     """Every fault that this rig may have."""
     model = columns.model
     index = {name: i for i, name in enumerate(columns.names)}
@@ -121,7 +121,7 @@ def possible_faults(rig: Rig, columns: FaultColumns) -> tuple[Fault, ...]:
         out[[index[f"{prefix}.{p}"] for p in parameters]] = effect
         return out
 
-    faults: list[Fault] = []
+    faults: list[PossibleFault] = []
     for i, (name, camera) in enumerate(rig.cameras.items()):
         views = model.camera_of == i
         if not views.any():
@@ -138,7 +138,7 @@ def possible_faults(rig: Rig, columns: FaultColumns) -> tuple[Fault, ...]:
             (ZOOMED, made(f"cameras.{name}", ("fx", "fy"), focal), np.full(1, USUAL.zoom)),
             (MOVED, np.concatenate([turn, move], axis=1), np.concatenate([turn_size, move_size])),
         ):
-            faults.append(Fault(CAMERA, name, kind, numbers, size, views))
+            faults.append(PossibleFault(CAMERA, name, kind, numbers, size, views))
     faults += _late_cameras(model, index)
     screen_of = [rig.spots[s].screen for _, s in model.views]
     for name, screen in rig.screens.items():
@@ -147,25 +147,27 @@ def possible_faults(rig: Rig, columns: FaultColumns) -> tuple[Fault, ...]:
         forward = made(f"screens.{name}", POSE[:3], screen.world_from_screen.rotation[:, 2:])
         tilt = made(f"screens.{name}", POSE[3:5], np.eye(2))
         sizes = np.array([USUAL.move_m, USUAL.turn_rad, USUAL.turn_rad])
-        faults.append(Fault(SCREEN, name, ALONG_NORMAL, forward, sizes[:1], views))
-        faults.append(Fault(SCREEN, name, TILTED, np.concatenate([forward, tilt], axis=1), sizes, views))
+        faults.append(PossibleFault(SCREEN, name, ALONG_NORMAL, forward, sizes[:1], views))
+        faults.append(PossibleFault(SCREEN, name, TILTED, np.concatenate([forward, tilt], axis=1), sizes, views))
     for i, (name, beam) in enumerate(rig.beams.items()):
         views = model.beam_of == i
         across = _across(beam.direction)  # along itself a beam may move as it likes
         aim, beside = made(f"beams.{name}", DIRECTION, across), made(f"beams.{name}", POINT, across)
         aim_size, beside_size = np.full(2, USUAL.laser_rad), np.full(2, USUAL.laser_m)
-        faults.append(Fault(BEAM, name, POINTS_ELSEWHERE, aim, aim_size, views))
-        faults.append(Fault(BEAM, name, POINT_OFF, beside, beside_size, views))
+        faults.append(PossibleFault(BEAM, name, POINTS_ELSEWHERE, aim, aim_size, views))
+        faults.append(PossibleFault(BEAM, name, POINT_OFF, beside, beside_size, views))
         both, size = np.concatenate([aim, beside], axis=1), np.concatenate([aim_size, beside_size])
-        faults.append(Fault(BEAM, name, LASER_MOVED, both, size, views))
+        faults.append(PossibleFault(BEAM, name, LASER_MOVED, both, size, views))
     for i, (camera_name, spot) in enumerate(model.views):
         name = f"{camera_name}/{spot}"
         numbers = made(f"view.{name}", ("u", "v"), np.eye(2))
-        faults.append(Fault(VIEW, name, BESIDE, numbers, np.full(2, USUAL.point_px), np.arange(len(model)) == i))
+        faults.append(
+            PossibleFault(VIEW, name, BESIDE, numbers, np.full(2, USUAL.point_px), np.arange(len(model)) == i)
+        )
     return tuple(f for f in faults if f.views.any())
 
 
-def _late_cameras(model: SpotModel, index: dict[str, int]) -> list[Fault]:
+def _late_cameras(model: SpotModel, index: dict[str, int]) -> list[PossibleFault]:
     """Each camera against the others; of two only the second, since one late is the other early."""
     filming = [c for i, c in enumerate(model.camera_names) if (model.camera_of == i).any()]
     if len(filming) < 2:
@@ -175,7 +177,7 @@ def _late_cameras(model: SpotModel, index: dict[str, int]) -> list[Fault]:
         numbers = np.zeros((len(index), 1))
         numbers[index[f"clock.{name}"]] = 1.0
         views = model.camera_of == model.camera_names.index(name)
-        out.append(Fault(CLOCK, name, LATE, numbers, np.array([USUAL_LATE_S]), views))
+        out.append(PossibleFault(CLOCK, name, LATE, numbers, np.array([USUAL_LATE_S]), views))
     return out
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from geometry.arrays import Array, Bools, Ints
 from geometry.pose import Pose
-from lab.runs.model_check.recording import Recording
+from lab.runs.model_check.recording import ModelCheckRecording
 from tracking.detections import UNMATCHED, Detections
 from tracking.parameters import TrackerParameters
 from tracking.tracked_frame import TrackedFrame
@@ -35,7 +35,7 @@ def claimed_covariances(
         if points is None:
             continue
         out[view] = points.cov_px2[tracked.point[view]] + model
-        if tracked.witness is not None and not tracked.witness[view]:
+        if tracked.used_in_pose is not None and not tracked.used_in_pose[view]:
             out[view] += (parameters.blend_px / 2) ** 2 * np.eye(2)
     return out
 
@@ -66,7 +66,7 @@ class KeptFrame:
 
 
 @dataclass(slots=True)
-class FrameKeeper:
+class FrameSampler:
     """Keeps blocks of neighbouring frames, evenly spread: whenever it is full, every other block goes."""
 
     most: int = MOST_KEPT
@@ -131,7 +131,7 @@ class FrameKeeper:
             width_px,
         )
 
-    def recording(self) -> Recording | None:
+    def recording(self) -> ModelCheckRecording | None:
         """What was kept; None where no frame came."""
         kept = self._frames
         if not kept:
@@ -140,7 +140,7 @@ class FrameKeeper:
         poses = [nowhere if k.pose is None else k.pose for k in kept]
         unknown = np.full((6, 6), np.nan)
         claims = [unknown if k.pose_covariance is None else k.pose_covariance for k in kept]
-        return Recording(
+        return ModelCheckRecording(
             t_s=np.array([k.t_s for k in kept]),
             seen=np.stack([k.seen for k in kept]),
             uv_px=np.stack([k.uv_px for k in kept]),

@@ -16,7 +16,7 @@ import numpy as np
 from geometry.arrays import Array, Bools, Ints
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
-from lab.runs.model_check.recording import Recording, finite, whitening
+from lab.runs.model_check.recording import ModelCheckRecording, finite, whitening
 
 _RANK = 1e-12  # of a normal matrix' largest eigenvalue, columns scaled to one: below lies rounding
 _LARGEST_STEP = np.array([0.1] * 3 + [0.05] * 3)  # m, rad: farther than this a pose is no good estimate; it is left
@@ -26,7 +26,7 @@ _ROUNDS = 2  # of dropping the worst spot of each frame: one gross error makes i
 
 
 @dataclass(frozen=True, slots=True)
-class Linearised:
+class LinearisedFrames:
     """K frames of n views about their poses, whitened by the claimed covariances; 0 for views that are not used."""
 
     frames: Ints  # (K,) index into the recording
@@ -103,7 +103,7 @@ class Linearised:
         return off, np.where(used[..., None, None], covariance, np.nan)
 
 
-def linearise(model: SpotModel, recording: Recording, frames: Ints) -> Linearised:
+def linearise(model: SpotModel, recording: ModelCheckRecording, frames: Ints) -> LinearisedFrames:
     """The given frames (K,) of a recording; gross outliers left out of the fits, two spots of a frame at most."""
     used = recording.usable[frames]
     uv, cov = recording.uv_px[frames], recording.cov_px2[frames]
@@ -128,7 +128,9 @@ def linearise(model: SpotModel, recording: Recording, frames: Ints) -> Linearise
     return at_pose
 
 
-def _about(model: SpotModel, frames: Ints, poses: Pose, seen: Bools, outlier: Bools, uv: Array, W: Array) -> Linearised:
+def _about(
+    model: SpotModel, frames: Ints, poses: Pose, seen: Bools, outlier: Bools, uv: Array, W: Array
+) -> LinearisedFrames:
     projected, J = model.project(poses)
     used = seen & ~outlier & finite(projected, -1)
     W = np.where(used[..., None, None], W, 0.0)
@@ -136,7 +138,7 @@ def _about(model: SpotModel, frames: Ints, poses: Pose, seen: Bools, outlier: Bo
     A = W @ np.where(used[..., None, None], J, 0.0)
     flat = A.reshape(len(frames), -1, 6)
     gain, rank = _pseudo_inverse(np.swapaxes(flat, -1, -2) @ flat)
-    return Linearised(frames, poses, used, outlier, W, (W @ residual[..., None])[..., 0], A, gain, rank)
+    return LinearisedFrames(frames, poses, used, outlier, W, (W @ residual[..., None])[..., 0], A, gain, rank)
 
 
 def _pseudo_inverse(N: Array) -> tuple[Array, Ints]:
@@ -150,7 +152,7 @@ def _pseudo_inverse(N: Array) -> tuple[Array, Ints]:
     return scaled / (scale[:, :, None] * scale[:, None, :]), good.sum(axis=-1)
 
 
-def _worst_of_frame(lin: Linearised) -> Bools:
+def _worst_of_frame(lin: LinearisedFrames) -> Bools:
     """(K, n): in each frame the one spot farthest from where its view usually lies, if that is grossly far.
 
     About the view's own median and by its own scatter: a set-up that is wrong makes all its residuals large, and they

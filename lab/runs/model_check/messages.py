@@ -11,7 +11,7 @@ from geometry.forward_model import SpotModel
 from lab.number_format import plus_minus, short
 from lab.runs.model_check import faults as f
 from lab.runs.model_check.effect import Effect
-from lab.runs.model_check.fault_identification import Culprit, Explained, Inquest
+from lab.runs.model_check.fault_identification import Explained, FaultDiagnosis, SuspectedFault
 
 MATTERS_SIGMAS = 0.5  # of a pose's claimed sigmas, or of a spot's: a bias below it is lost in what is claimed anyway
 WRONG_SIGMAS = (
@@ -24,7 +24,7 @@ UNEVEN = 1.5  # the largest over the smallest factor of the cameras, from which 
 _NOT_LINEAR = 0.02
 _ONE_FRAME = 0.1  # of a frame interval: as near as this to a whole number of them, frames are counted wrong
 
-_CURES = {
+_REMEDIES = {
     f.CAMERA: "Look for a knocked or loose mount, focus or zoom ring of that camera; fix it, run `calibrate check` to"
     " make sure, then find its place again (`calibrate rig`).",
     f.SCREEN: "Measure where that screen is (`calibrate screen`), then calibrate the rig again.",
@@ -35,7 +35,7 @@ _CURES = {
 }
 
 
-def level_of(inquest: Inquest, effects: Sequence[Effect]) -> Level:
+def level_of(inquest: FaultDiagnosis, effects: Sequence[Effect]) -> Level:
     """How grave a significant fault is; effects: of everything that it may be.
 
     What cannot be told apart fails only if each of it would, and is small only if each of it is.
@@ -50,7 +50,7 @@ def level_of(inquest: Inquest, effects: Sequence[Effect]) -> Level:
 
 
 def culprit_finding(
-    culprit: Culprit, effects: Sequence[Effect], inquest: Inquest, model: SpotModel, frame_s: float
+    culprit: SuspectedFault, effects: Sequence[Effect], inquest: FaultDiagnosis, model: SpotModel, frame_s: float
 ) -> Finding:
     """One finding for one culprit. effects: of its explanations, in order; frame_s: the usual time between frames."""
     level, effect = level_of(inquest, effects), effects[0]
@@ -69,14 +69,14 @@ def culprit_finding(
         )
     what = f"{where}{says}, p {p_text(culprit.best.change.p_value)}"
     things = list(dict.fromkeys(e.fault.thing for e in culprit.explanations))
-    cure = " ".join(_CURES[t] for t in things) if level > Level.PASS else ""
+    remedy = " ".join(_REMEDIES[t] for t in things) if level > Level.PASS else ""
     if culprit.rivals and level > Level.PASS:
         way = "A new calibration of the beams" if things == [f.BEAM] else "A `calibrate check` with marked points"
-        cure += f" {way} tells the candidates apart."
-    return Finding(level, what, _consequence(effects, level), cure)
+        remedy += f" {way} tells the candidates apart."
+    return Finding(level, what, _consequence(effects, level), remedy)
 
 
-def unexplained_finding(inquest: Inquest) -> Finding:
+def unexplained_finding(inquest: FaultDiagnosis) -> Finding:
     """What no single fault explains."""
     level = Level.FAIL if _misfit_of_faults(inquest) > WRONG_SIGMAS else Level.WARN
     alone = "" if not inquest.culprits else " beyond what is named above"
@@ -98,7 +98,7 @@ def is_noisy(factor: float, misfit: float) -> bool:
     return factor > NOISY and factor**2 - 1 > _NOT_LINEAR * misfit**2
 
 
-def noise_finding(inquest: Inquest, of_cameras: Mapping[str, float], misfit: float) -> Finding | None:
+def noise_finding(inquest: FaultDiagnosis, of_cameras: Mapping[str, float], misfit: float) -> Finding | None:
     """Errors larger than claimed that no fault of the rig explains; None where the claims hold well enough.
 
     Noise changes from frame to frame; the poses' covariances are widened by it and stay right, so it is a warning
@@ -131,7 +131,7 @@ def noise_finding(inquest: Inquest, of_cameras: Mapping[str, float], misfit: flo
     )
 
 
-def _misfit_of_faults(inquest: Inquest) -> float:
+def _misfit_of_faults(inquest: FaultDiagnosis) -> float:
     """The misfit in units of the recording's own noise: what the rig, not the detections, is responsible for."""
     return inquest.misfit / inquest.excess_noise
 

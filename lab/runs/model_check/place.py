@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 
 from geometry.forward_model import SpotModel
-from lab.runs.model_check.recording import Recording
+from lab.runs.model_check.recording import ModelCheckRecording
 from tracking.smoothing.error_scale import LARGEST_WIDTH_SHARE
 from tracking.smoothing.place_errors import correlation, place_errors
 
 _CHUNK = 500  # frames that are compared with each other
 
 
-def with_place_errors(recording: Recording, model: SpotModel) -> Recording:
+def with_place_errors(recording: ModelCheckRecording, model: SpotModel) -> ModelCheckRecording:
     """The recording with covariances that allow for such errors in tests that sum over its frames.
 
     Frames in which a spot is in the same place hold the same error: a covariance of noise plus so many times that of

@@ -12,7 +12,7 @@ from geometry.pose_solver.gauss_newton import whiten
 
 
 @dataclass(frozen=True, slots=True)
-class Recording:
+class ModelCheckRecording:
     """T frames of n views, in the order of SpotModel.views. What is not seen may be nan."""
 
     t_s: Array  # (T,) rising

@@ -12,8 +12,8 @@ import numpy as np
 from geometry.arrays import Array, Ints
 from geometry.forward_model import SpotModel
 from geometry.uncertainty.chi_square import gamma_quantile
-from lab.runs.model_check.linear import Linearised
-from lab.runs.model_check.recording import Recording, finite, whitening
+from lab.runs.model_check.linear import LinearisedFrames
+from lab.runs.model_check.recording import ModelCheckRecording, finite, whitening
 
 _FEWEST = 8  # frames below which a scatter or an autocorrelation says nothing
 
@@ -106,8 +106,8 @@ def nis_band(frames: float) -> tuple[float, float]:
 def statistics(
     model: SpotModel,
     beam_names: tuple[str, ...],
-    recording: Recording,
-    lin: Linearised,
+    recording: ModelCheckRecording,
+    lin: LinearisedFrames,
     calibration_px: Mapping[str, Array],
 ) -> Statistics:
     """Of the linearised frames of a recording. calibration_px: by `group_key`; what is not there is 0."""
@@ -139,7 +139,7 @@ def group_key(kind: str, name: str) -> str:
     return f"{kind} {name}"
 
 
-def _nis(recording: Recording, lin: Linearised) -> Array | None:
+def _nis(recording: ModelCheckRecording, lin: LinearisedFrames) -> Array | None:
     """(K, n) normalised innovations squared; nan where there is none."""
     if recording.predicted_px is None or recording.predicted_cov_px2 is None:
         return None
@@ -161,7 +161,7 @@ def _group(
     key: str,
     name: str,
     views: Ints,
-    lin: Linearised,
+    lin: LinearisedFrames,
     uv_px: Array,
     nis: Array | None,
     calibration_px: Mapping[str, Array],

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from calibration.findings import Finding, Level
 from geometry.arrays import Ints
 from geometry.forward_model import SpotModel
-from lab.runs.model_check.recording import Recording
+from lab.runs.model_check.recording import ModelCheckRecording
 
 MOSTLY_UNSEEN = 0.2  # measured in less than this share of the frames
 FEWEST_FRAMES = 30  # in which it should be seen: a shorter time behind a post is no fault
@@ -27,7 +27,7 @@ class Unseen:
     expected: int  # frames in which the pose puts it well inside the picture
 
 
-def unseen_views(model: SpotModel, recording: Recording, frames: Ints) -> tuple[Unseen, ...]:
+def unseen_views(model: SpotModel, recording: ModelCheckRecording, frames: Ints) -> tuple[Unseen, ...]:
     """Of the given frames, which all have a pose from other spots."""
     pixels = model.project(recording.poses[frames])[0]
     inside = model.in_picture(pixels, -_INSIDE_PX)

@@ -40,7 +40,7 @@ HIDDEN, IN_VIEW, OUTSIDE = 2, 1, 0
 
 
 @dataclass(frozen=True, slots=True)
-class Truth:
+class TruthArrays:
     """The truth on the results' own grid: F frames, V views. Either half may be missing (None)."""
 
     uv_px: Array | None  # (F, V, 2), nan where no projection exists or the truth is silent
@@ -48,7 +48,7 @@ class Truth:
     world_from_body: Pose | None  # (F',), on the pose table's frames; nan translation where the truth is silent
 
 
-def read_truth(run_folder: Path, spots: SpotGrid, poses: PoseTrack) -> Truth | None:
+def read_truth(run_folder: Path, spots: SpotGrid, poses: PoseTrack) -> TruthArrays | None:
     """The truth of a run folder at the frames and views of its results; None where it has none."""
     spots_file, pose_file = run_folder / "truth" / "spots.csv", run_folder / "truth" / "pose.csv"
     uv = in_view = world_from_body = None
@@ -70,7 +70,7 @@ def read_truth(run_folder: Path, spots: SpotGrid, poses: PoseTrack) -> Truth | N
         world_from_body = pose_stack(numbers[:, :3], numbers[:, 3:])
     if in_view is None and world_from_body is None:
         return None
-    return Truth(uv, in_view, world_from_body)
+    return TruthArrays(uv, in_view, world_from_body)
 
 
 def score(results: Path, run_folder: Path) -> dict[str, Any] | None:
@@ -86,7 +86,9 @@ def score(results: Path, run_folder: Path) -> dict[str, Any] | None:
     return None if truth is None else score_against(spots, poses, truth, causal)
 
 
-def score_against(spots: SpotGrid, poses: PoseTrack, truth: Truth, causal: PoseTrack | None = None) -> dict[str, Any]:
+def score_against(
+    spots: SpotGrid, poses: PoseTrack, truth: TruthArrays, causal: PoseTrack | None = None
+) -> dict[str, Any]:
     """The same, from tables that are already read.
 
     causal: poses as they were known at each instant, where `poses` are smoothed; of the same frames.

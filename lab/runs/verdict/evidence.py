@@ -67,7 +67,7 @@ REMEDIES_BY_CAUSE = {
 
 
 @dataclass(frozen=True, slots=True)
-class Evidence:
+class VerdictReason:
     """One reason of a verdict."""
 
     kind: Kind

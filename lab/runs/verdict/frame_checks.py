@@ -192,7 +192,7 @@ def _poses(frames: list[TrackedFrame]) -> tuple[Pose, Array]:
 def _used(tracked: TrackedFrame) -> Bools:
     """(n,): the spots that the pose was made with."""
     seen = np.array([status.measured for status in tracked.status], dtype=np.bool_)
-    return seen if tracked.witness is None else seen & tracked.witness
+    return seen if tracked.used_in_pose is None else seen & tracked.used_in_pose
 
 
 def _without_pose(tracked: TrackedFrame) -> TrackedFrame:

@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 from calibration.findings import Finding, Level
 from lab.errors import QUALITY_GATE_FAILED
-from lab.runs.verdict.evidence import REMEDIES, REMEDIES_BY_CAUSE, Evidence, Kind
+from lab.runs.verdict.evidence import REMEDIES, REMEDIES_BY_CAUSE, Kind, VerdictReason
 from lab.runs.verdict.run_facts import MISSED, CameraFacts, Cause, RunFacts
 
 # Of the frames that show enough to be measured: where the tracker missed more than half of them, it is not known
@@ -39,7 +39,7 @@ class Verdict:
 
     status: Literal["pass", "check", "fail"]
     reasons: tuple[str, ...]
-    evidence: tuple[Evidence, ...] = ()  # in the order of the reasons; a run that passes has none
+    evidence: tuple[VerdictReason, ...] = ()  # in the order of the reasons; a run that passes has none
 
     @property
     def exit_status(self) -> int:
@@ -60,7 +60,7 @@ def judge(facts: RunFacts, findings: Sequence[Finding] = (), misfit: float | Non
     a failure. misfit: the residuals over what the detections' sigmas allow; None where the model check has tested that.
     """
     if facts.frames == 0:
-        nothing = Evidence(Kind.NO_FRAMES, True, "there is no frame at all", REMEDIES[Kind.NO_FRAMES])
+        nothing = VerdictReason(Kind.NO_FRAMES, True, "there is no frame at all", REMEDIES[Kind.NO_FRAMES])
         return Verdict("fail", (nothing.what,), (nothing,))
     found = _measured(facts)
     if facts.measured:
@@ -70,7 +70,7 @@ def judge(facts: RunFacts, findings: Sequence[Finding] = (), misfit: float | Non
     for finding in findings:
         if finding.level > Level.PASS:
             fails = finding.level == Level.FAIL
-            found.append(Evidence(Kind.MODEL, fails, f"{finding.what}; {finding.why}", finding.cure))
+            found.append(VerdictReason(Kind.MODEL, fails, f"{finding.what}; {finding.why}", finding.remedy))
     found += _interruptions(facts)
     found.sort(key=lambda e: not e.fails)  # stable: failures first
     if found:
@@ -82,13 +82,13 @@ def judge(facts: RunFacts, findings: Sequence[Finding] = (), misfit: float | Non
     )
 
 
-def _measured(facts: RunFacts) -> list[Evidence]:
+def _measured(facts: RunFacts) -> list[VerdictReason]:
     """How many frames have a measured pose, and why the others do not; of no frame the cameras come first."""
     measured, frames, causes = facts.measured, facts.frames, facts.causes
     numbers = {"measured": measured, "frames": frames, "causes": {c.value: n for c, n in causes.items()}}
     if measured == 0:
         what = "the vehicle was never found: no frame has a measured pose"
-        never = Evidence(Kind.NEVER_FOUND, True, what, REMEDIES[Kind.NEVER_FOUND], numbers)
+        never = VerdictReason(Kind.NEVER_FOUND, True, what, REMEDIES[Kind.NEVER_FOUND], numbers)
         return [never, *_cameras(facts), *_why_never(facts)]
     share, shown = measured / frames, measured / (measured + facts.missed)
     remedy = REMEDIES_BY_CAUSE[next(iter(causes))] if causes else ""
@@ -99,13 +99,13 @@ def _measured(facts: RunFacts) -> list[Evidence]:
             f"only {shown:.0%} of the frames that show enough spots have a measured pose"
             f" (gate: {LEAST_MEASURED_OF_SHOWN:.0%}){why}"
         )
-        return [Evidence(Kind.FEW_MEASURED, True, what, REMEDIES_BY_CAUSE[worst], numbers)]
+        return [VerdictReason(Kind.FEW_MEASURED, True, what, REMEDIES_BY_CAUSE[worst], numbers)]
     if share < LEAST_MEASURED:
         what = f"only {share:.1%} of the frames have a measured pose (gate: {LEAST_MEASURED:.0%}){why}"
-        return [Evidence(Kind.FEW_MEASURED, True, what, remedy, numbers)]
+        return [VerdictReason(Kind.FEW_MEASURED, True, what, remedy, numbers)]
     if share < GOOD_MEASURED:
         what = f"{share:.1%} of the frames have a measured pose (usual: {GOOD_MEASURED:.0%} and more){why}"
-        return [Evidence(Kind.FEW_MEASURED, False, what, remedy, numbers)]
+        return [VerdictReason(Kind.FEW_MEASURED, False, what, remedy, numbers)]
     return []
 
 
@@ -114,7 +114,7 @@ def _in_words(causes: Mapping[Cause, int], most: int = 3) -> str:
     return ", ".join(f"{count} {cause.meaning}" for cause, count in list(causes.items())[:most])
 
 
-def _why_never(facts: RunFacts) -> list[Evidence]:
+def _why_never(facts: RunFacts) -> list[VerdictReason]:
     """Why the vehicle was never found, beyond cameras that show nothing (`_cameras`), which are reason enough."""
     if facts.causal_measured:
         what = (
@@ -122,11 +122,13 @@ def _why_never(facts: RunFacts) -> list[Evidence]:
             " smoothing pass confirms none of them"
         )
         numbers = {"causal_measured": facts.causal_measured}
-        return [Evidence(Kind.NOT_CONFIRMED, True, what, REMEDIES[Kind.NOT_CONFIRMED], numbers)]
+        return [VerdictReason(Kind.NOT_CONFIRMED, True, what, REMEDIES[Kind.NOT_CONFIRMED], numbers)]
     if facts.tie_text:
         what = f"the spots fit more than one pose: {facts.tie_text}"
         return [
-            Evidence(Kind.AMBIGUOUS, True, what, REMEDIES[Kind.AMBIGUOUS], {"frames": [list(r) for r in facts.ties]})
+            VerdictReason(
+                Kind.AMBIGUOUS, True, what, REMEDIES[Kind.AMBIGUOUS], {"frames": [list(r) for r in facts.ties]}
+            )
         ]
     causes = facts.causes
     unexplained, few = causes.get(Cause.UNEXPLAINED, 0), causes.get(Cause.FEW_POINTS, 0)
@@ -141,20 +143,20 @@ def _why_never(facts: RunFacts) -> list[Evidence]:
             f"{unexplained} of {facts.frames} frames show enough points of light ({per_frame}), but no pose within the"
             " prior explains them"
         )
-        return [Evidence(Kind.NOT_ACQUIRED, True, what, REMEDIES[Kind.NOT_ACQUIRED], {"points": points})]
+        return [VerdictReason(Kind.NOT_ACQUIRED, True, what, REMEDIES[Kind.NOT_ACQUIRED], {"points": points})]
     if few or unexplained:
         what = (
             f"{_frames(few)} of {facts.frames} show fewer than the {facts.min_spots} points of light that a first pose"
             f" needs ({per_frame})"
         )
-        return [Evidence(Kind.FEW_POINTS, True, what, REMEDIES[Kind.FEW_POINTS], {"points": points})]
+        return [VerdictReason(Kind.FEW_POINTS, True, what, REMEDIES[Kind.FEW_POINTS], {"points": points})]
     if causes:
         what = f"of {_frames(facts.frames)}, {_in_words(causes)}"
-        return [Evidence(Kind.FEW_MEASURED, True, what, REMEDIES_BY_CAUSE[next(iter(causes))], {"points": points})]
+        return [VerdictReason(Kind.FEW_MEASURED, True, what, REMEDIES_BY_CAUSE[next(iter(causes))], {"points": points})]
     return []
 
 
-def _cameras(facts: RunFacts) -> list[Evidence]:
+def _cameras(facts: RunFacts) -> list[VerdictReason]:
     """Cameras without pictures, or without points of light in them."""
     out = []
     for name, camera in facts.cameras.items():
@@ -169,7 +171,9 @@ def _cameras(facts: RunFacts) -> list[Evidence]:
             what = f"camera {name}: nothing was detected in {which} of its {camera.pictures} pictures"
             numbers = {"camera": name, **camera.as_mapping()}
             out.append(
-                Evidence(Kind.NOTHING_DETECTED, facts.measured == 0, what, REMEDIES[Kind.NOTHING_DETECTED], numbers)
+                VerdictReason(
+                    Kind.NOTHING_DETECTED, facts.measured == 0, what, REMEDIES[Kind.NOTHING_DETECTED], numbers
+                )
             )
         elif camera.expected_at_end and camera.empty_at_end > LONG_EMPTY * facts.frames:
             what = (
@@ -177,18 +181,18 @@ def _cameras(facts: RunFacts) -> list[Evidence]:
                 " spots inside them"
             )
             numbers = {"camera": name, **camera.as_mapping()}
-            out.append(Evidence(Kind.NOTHING_DETECTED, False, what, REMEDIES[Kind.NOTHING_DETECTED], numbers))
+            out.append(VerdictReason(Kind.NOTHING_DETECTED, False, what, REMEDIES[Kind.NOTHING_DETECTED], numbers))
     return out
 
 
-def _pictures(name: str, camera: CameraFacts, facts: RunFacts) -> list[Evidence]:
+def _pictures(name: str, camera: CameraFacts, facts: RunFacts) -> list[VerdictReason]:
     """A camera without pictures: none at all, at the start, to the end, or here and there."""
     missing, numbers = camera.missing, {"camera": name, "missing": [list(r) for r in camera.missing]}
     if not len(missing):
         return []
 
-    def evidence(kind: Kind, what: str, fails: bool = False) -> Evidence:
-        return Evidence(kind, fails, f"camera {name} {what}", REMEDIES[kind], numbers)
+    def evidence(kind: Kind, what: str, fails: bool = False) -> VerdictReason:
+        return VerdictReason(kind, fails, f"camera {name} {what}", REMEDIES[kind], numbers)
 
     if not camera.pictures:
         return [evidence(Kind.NO_PICTURES, "has no usable picture at all", facts.measured == 0)]
@@ -215,37 +219,37 @@ def _pictures(name: str, camera: CameraFacts, facts: RunFacts) -> list[Evidence]
     return out
 
 
-def _misfit(misfit: float) -> list[Evidence]:
+def _misfit(misfit: float) -> list[VerdictReason]:
     numbers = {"misfit": misfit}
     if misfit > MOST_MISFIT:
         what = (
             f"the spots lie {misfit:.1f} times as far from the fitted pose as their sigmas allow (gate:"
             f" {MOST_MISFIT:g}): the rig file does not describe this set-up"
         )
-        return [Evidence(Kind.MISFIT, True, what, REMEDIES[Kind.MISFIT], numbers)]
+        return [VerdictReason(Kind.MISFIT, True, what, REMEDIES[Kind.MISFIT], numbers)]
     if misfit > GOOD_MISFIT:
         what = (
             f"the spots lie {misfit:.1f} times as far from the fitted pose as their sigmas allow; the sigmas of the"
             " poses are widened by it"
         )
-        return [Evidence(Kind.MISFIT, False, what, REMEDIES[Kind.MISFIT], numbers)]
+        return [VerdictReason(Kind.MISFIT, False, what, REMEDIES[Kind.MISFIT], numbers)]
     return []
 
 
-def _interruptions(facts: RunFacts) -> list[Evidence]:
+def _interruptions(facts: RunFacts) -> list[VerdictReason]:
     """What happened in the midst of a run in which the vehicle was found."""
     out = []
     if facts.measured and facts.ties:
         which = "frame" if len(facts.ties) == 1 else "frames"
         what = f"{which} {facts.ties.in_words()} could be explained in more than one way: {facts.tie_text}"
         numbers: dict[str, Any] = {"frames": [list(r) for r in facts.ties]}
-        out.append(Evidence(Kind.AMBIGUOUS, False, what, REMEDIES[Kind.AMBIGUOUS], numbers))
+        out.append(VerdictReason(Kind.AMBIGUOUS, False, what, REMEDIES[Kind.AMBIGUOUS], numbers))
     if facts.measured and len(facts.lost):
         never = facts.lost.ranges[-1][1] == facts.last_frame
         after = "it was not found again" if never else "it was found again each time"
         what = f"nothing is known of the vehicle in {_frames(len(facts.lost))} ({facts.lost.in_words()}); {after}"
         numbers = {"frames": [list(r) for r in facts.lost], "found_again": facts.found_again}
-        out.append(Evidence(Kind.LOST, False, what, REMEDIES[Kind.LOST], numbers))
+        out.append(VerdictReason(Kind.LOST, False, what, REMEDIES[Kind.LOST], numbers))
     for ranges, against in ((facts.own_spots, "their own spots"), (facts.causal, "the causal pass")):
         if len(ranges):
             what = (
@@ -253,11 +257,11 @@ def _interruptions(facts: RunFacts) -> list[Evidence]:
                 " predicted, with wider sigmas"
             )
             numbers = {"frames": [list(r) for r in ranges]}
-            out.append(Evidence(Kind.CONTRADICTION, False, what, REMEDIES[Kind.CONTRADICTION], numbers))
+            out.append(VerdictReason(Kind.CONTRADICTION, False, what, REMEDIES[Kind.CONTRADICTION], numbers))
     if len(facts.invalid):
         what = f"covariances of {_frames(len(facts.invalid))} ({facts.invalid.in_words()}) are not positive definite"
         numbers = {"frames": [list(r) for r in facts.invalid]}
-        out.append(Evidence(Kind.INTERNAL, False, what, REMEDIES[Kind.INTERNAL], numbers))
+        out.append(VerdictReason(Kind.INTERNAL, False, what, REMEDIES[Kind.INTERNAL], numbers))
     return out
 
 

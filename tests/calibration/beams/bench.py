@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from calibration.beams.beams import Stand
+from calibration.beams.beams import StandModel
 from calibration.terms.rig_blocks import lines_in, stacks_of
 from calibration.terms.spot_term import SpotPixels
 from geometry.forward_model import SpotModel
@@ -40,14 +40,14 @@ def recorded(rng: np.random.Generator, rig: Rig, stand_from_body: Pose, sigma_px
     return SpotPixels(position, view, pixels[position, view] + noise, covariance)
 
 
-def exact(stand_from_body: Pose) -> Stand:
+def exact(stand_from_body: Pose) -> StandModel:
     """A stand whose place and positions are known without error."""
-    return Stand(stand_from_body, np.zeros(6), WORLD_FROM_STAND, np.zeros((6, 6)))
+    return StandModel(stand_from_body, np.zeros(6), WORLD_FROM_STAND, np.zeros((6, 6)))
 
 
-def unknown_place(stand_from_body: Pose) -> Stand:
+def unknown_place(stand_from_body: Pose) -> StandModel:
     """A stand of which only the positions are known."""
-    return Stand(stand_from_body, np.zeros(6), None, None)
+    return StandModel(stand_from_body, np.zeros(6), None, None)
 
 
 def opposed(rig: Rig, rng: np.random.Generator, turn_rad: float = 2e-3, shift_m: float = 2e-3) -> Rig:

@@ -10,7 +10,7 @@ from scipy.stats import chi2
 
 from calibration.beams.beam_findings import beam_findings, direction_sigmas
 from calibration.beams.beam_start import line_through
-from calibration.beams.beams import Stand, calibrate_beams
+from calibration.beams.beams import StandModel, calibrate_beams
 from calibration.findings import Level
 from calibration.least_squares.adjustment import AdjustmentError
 from geometry.forward_model import SpotModel
@@ -157,7 +157,7 @@ def test_a_stand_that_only_yaws_leaves_its_turn_and_height_to_the_beams():
         "all beams against the stand: a shift along z",
         "all beams against the stand: a turn about z",
     ]
-    assert found.motion.cure() == "add positions turned by 10 deg or more about the stand's x and y"
+    assert found.motion.remedy() == "add positions turned by 10 deg or more about the stand's x and y"
     assert calibrate_beams(rig, spots, exact(poses)).undetermined == []  # what the stand's known place mends
 
 
@@ -198,7 +198,7 @@ def test_errors_of_the_stand_are_in_the_boresight_and_not_in_the_angles():
     poses = positions(rng)
     spots = recorded(rng, rig, poses)
     yaw_sigma = 100 * ARCSEC
-    loose = Stand(poses, np.zeros(6), WORLD_FROM_STAND, np.diag([0, 0, 0, 0, 0, yaw_sigma**2]) + 1e-16 * np.eye(6))
+    loose = StandModel(poses, np.zeros(6), WORLD_FROM_STAND, np.diag([0, 0, 0, 0, 0, yaw_sigma**2]) + 1e-16 * np.eye(6))
     still, wide = (calibrate_beams(rig, spots, s) for s in (exact(poses), loose))
     assert wide.angles[0].sigma < 1.2 * still.angles[0].sigma
     assert np.diagonal(wide.lines_covariance).max() > np.diagonal(still.lines_covariance).max()
@@ -233,9 +233,9 @@ def simulated(seed: int, known: str):
     stand_sigmas = np.array([3e-4] * 3 + [30 * ARCSEC] * 3)
     if known == "known":
         place = WORLD_FROM_STAND.plus(rng.normal(size=6) * stand_sigmas)
-        stand = Stand(read, pose_sigmas, place, np.diag(stand_sigmas**2))
+        stand = StandModel(read, pose_sigmas, place, np.diag(stand_sigmas**2))
     else:
-        stand = Stand(read, pose_sigmas, None, None)
+        stand = StandModel(read, pose_sigmas, None, None)
     found = calibrate_beams(drawn(believed, rng, 0.01, 0.005), spots, stand, knowledge)
     return errors(mounted, found.rig), found
 
@@ -305,4 +305,4 @@ def test_a_stand_that_hardly_tilts_is_told_to_tilt():
     (weak,) = [f for f in beam_findings(found, rig, [str(k) for k in range(40)]) if "goal" in f.what]
     assert weak.level > Level.PASS
     assert "the whole target against the stand" in weak.why
-    assert weak.cure.startswith("add positions turned by 10 deg or more about the stand's x and y")
+    assert weak.remedy.startswith("add positions turned by 10 deg or more about the stand's x and y")

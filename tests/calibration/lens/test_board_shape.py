@@ -37,7 +37,7 @@ def test_a_board_printed_longer_along_x_is_named_and_does_not_bend_the_lens():
     assert c.verdict < Level.FAIL
     about = next(f for f in c.findings if "longer than was said" in f.what)
     assert about.level is Level.WARN
-    assert "Measure the board" in about.cure
+    assert "Measure the board" in about.remedy
     taken_as_stated = calibrate_intrinsics(wrong, replace(FIVE, stretch=False))
     assert abs(taken_as_stated.fit.lens[0] - TRUTH[0]) > 5.0  # px
 

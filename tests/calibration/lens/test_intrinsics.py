@@ -64,7 +64,7 @@ def test_the_ladder_ends_on_the_lens_that_took_the_photographs(lens, fisheye, ex
     near = (0.15, 0.4) if lens[0] < 900 else (0.35, 0.7)
     c = calibrate_intrinsics(photographs(Scene(lens=lens, fisheye=fisheye, views=20, distance_m=near), 3))
     assert c.model == named(expected)
-    assert [r.model for r in c.ladder.rungs] == list(LADDER)
+    assert [r.model for r in c.ladder.candidates] == list(LADDER)
 
 
 def test_a_lens_that_is_asked_for_is_taken_and_said_so():

@@ -11,7 +11,7 @@ from calibration.lens.fit.hold_out import HeldOut, folds_of
 from calibration.lens.fit.lens_fit import AS_STATED, robust_fit
 from calibration.lens.fit.lens_models import LADDER, LensModel, folds_in_picture, named
 from calibration.lens.fit.lens_start import start
-from calibration.lens.fit.model_selection import Rung, choose
+from calibration.lens.fit.model_selection import ModelCandidate, choose
 from calibration.lens.fit.projection_map import difference, projection_map
 from geometry.arrays import Array
 from geometry.rotations import exp
@@ -22,9 +22,9 @@ def lens_of(numbers: tuple[float, ...]) -> Array:
     return np.array([*numbers, *[0.0] * (18 - len(numbers))])
 
 
-def rung(title: str, errors_px2: list[float], refused: str = "") -> Rung:
+def rung(title: str, errors_px2: list[float], refused: str = "") -> ModelCandidate:
     errors = np.array(errors_px2)
-    return Rung(named(title), None, HeldOut(errors, (), float(np.sqrt(errors.mean()))), refused=refused)
+    return ModelCandidate(named(title), None, HeldOut(errors, (), float(np.sqrt(errors.mean()))), refused=refused)
 
 
 def test_the_smaller_model_is_taken_where_the_larger_one_gains_within_its_standard_error():

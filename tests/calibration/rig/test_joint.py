@@ -99,7 +99,7 @@ def test_a_stand_that_is_ten_times_less_exact_than_told_is_found_out_and_named()
     assert SPOTS not in found.joint.scales
     (told,) = [f for f in words(found) if f.what.startswith(RECORDS) and "sigmas" in f.what]
     assert told.level >= Level.WARN
-    assert "stand" in told.cure
+    assert "stand" in told.remedy
     # With the sigmas widened the result is honest again.
     _, nees = parameter_errors(found.joint, c.truth)
     assert nees < 2

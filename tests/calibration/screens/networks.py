@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from calibration.boards.board_types import Charuco
-from calibration.screens.network import Dots, Network, Sightings
+from calibration.screens.network import Dots, Network, PointObservations
 from calibration.terms.board_on_screen import BoardOnScreenTerm
 from calibration.terms.corners import CornerTerm
 from geometry.camera import Camera
@@ -73,7 +73,7 @@ def measured(seed=0, bow=0.0, dots=12, rig=None):
     return Network(
         rig,
         Dots(tuple(names), surveyed, C, np.array(on)),
-        Sightings(np.array(cameras), np.array(seen), np.array(pixels), np.full(len(seen), PIXEL_SIGMA_PX)),
+        PointObservations(np.array(cameras), np.array(seen), np.array(pixels), np.full(len(seen), PIXEL_SIGMA_PX)),
     )
 
 
@@ -125,5 +125,5 @@ def without_dots(network):
     return replace(
         network,
         dots=Dots((), np.empty((0, 3)), np.empty((0, 3, 3)), none),
-        sightings=Sightings(none, none, np.empty((0, 2)), np.empty(0)),
+        sightings=PointObservations(none, none, np.empty((0, 2)), np.empty(0)),
     )

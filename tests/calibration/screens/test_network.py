@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from calibration.findings import Level
-from calibration.screens.network import Dots, Sightings
+from calibration.screens.network import Dots, PointObservations
 from calibration.screens.network_findings import findings, misplaced, near_findings
 from calibration.screens.network_sigmas import pointing_sigmas_m, spot_sigmas
 from calibration.screens.network_start import NotConnectedError
@@ -181,7 +181,7 @@ def test_cameras_that_share_nothing_are_named():
     network = measured(3)
     some = network.sightings.camera_of == 0
     s = network.sightings
-    lone = Sightings(s.camera_of[some], s.dot_of[some], s.pixels[some], s.sigma_px[some])
+    lone = PointObservations(s.camera_of[some], s.dot_of[some], s.pixels[some], s.sigma_px[some])
     with pytest.raises(
         NotConnectedError, match=r"camera 'right' shares nothing with the others \('left' have a place\)"
     ):

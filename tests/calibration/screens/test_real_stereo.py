@@ -10,7 +10,7 @@ import pytest
 
 from calibration.boards.board_detection import BoardView, find_board
 from calibration.boards.board_types import Chessboard
-from calibration.screens.network import Dots, Network, Sightings
+from calibration.screens.network import Dots, Network, PointObservations
 from calibration.screens.screens import ScreenSetup, calibrate
 from calibration.terms.board_on_screen import BoardOnScreenTerm
 from calibration.terms.corners import CornerTerm
@@ -67,7 +67,7 @@ def stereo():
     network = Network(
         rig,
         Dots((), np.empty((0, 3)), np.empty((0, 3, 3)), none),
-        Sightings(none, none, np.empty((0, 2)), np.empty(0)),
+        PointObservations(none, none, np.empty((0, 2)), np.empty(0)),
         corners=corners,
         placements=tuple(f"{k}" for k in range(1, 8)),
         fixed=BoardOnScreenTerm(np.array([0]), np.array([0]), BOARD.middle[None], np.zeros(1), tight, tight),

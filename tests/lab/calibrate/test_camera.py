@@ -167,7 +167,7 @@ def test_photographs_of_two_cameras_in_one_set_are_told_by_their_names(tmp_path)
     (told,) = [f for f in outcome.result.findings if "'left' and 'right'" in f.what]
     assert told.level > Level.PASS
     assert "two cameras" in told.why
-    assert any("two cameras" in f.cure for f in outcome.result.findings if "Two halves" in f.what)
+    assert any("two cameras" in f.remedy for f in outcome.result.findings if "Two halves" in f.what)
 
 
 @needs_stereo

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from lab.errors import InputError
-from lab.files.text.atomic_write import beside_a_good_one, refuse_foreign, whole_folder
+from lab.files.text.atomic_write import atomic_folder, beside_a_good_one, refuse_foreign
 
 
 def never(folder: Path) -> bool:
@@ -26,7 +26,7 @@ def names(folder: Path) -> list[str]:
 
 def test_nothing_stands_at_the_target_until_the_block_has_ended(tmp_path):
     target = tmp_path / "results"
-    with whole_folder(target, never) as work:
+    with atomic_folder(target, never) as work:
         (work / "a.csv").write_text("1")
         assert not target.exists()
         assert work.parent == target.parent  # the same file system: a rename cannot become a copy
@@ -39,7 +39,7 @@ def test_whatever_ends_the_block_early_leaves_nothing(tmp_path, error):
     target = tmp_path / "results"
 
     def write_half():
-        with whole_folder(target, never) as work:
+        with atomic_folder(target, never) as work:
             (work / "a.csv").write_text("half")
             raise error
 
@@ -54,14 +54,14 @@ def test_earlier_results_stay_when_the_new_ones_fail_and_go_when_they_come(tmp_p
     (target / "old.csv").write_text("old")
 
     def fail():
-        with whole_folder(target, always) as work:
+        with atomic_folder(target, always) as work:
             (work / "new.csv").write_text("half")
             raise ValueError("disk on fire")
 
     with pytest.raises(ValueError, match="disk on fire"):
         fail()
     assert names(target) == ["old.csv"]
-    with whole_folder(target, always) as work:
+    with atomic_folder(target, always) as work:
         (work / "new.csv").write_text("new")
     assert names(target) == ["new.csv"]
     assert names(tmp_path) == ["results"]
@@ -73,7 +73,7 @@ def test_a_folder_with_something_else_in_it_is_refused_and_untouched(tmp_path):
     (target / "chapter.tex").write_text("years of work")
     with (
         pytest.raises(InputError, match=r"thesis: the folder holds something other than earlier results"),
-        whole_folder(target, never),
+        atomic_folder(target, never),
     ):
         pytest.fail("the block must not begin")
     assert (target / "chapter.tex").read_text() == "years of work"
@@ -83,7 +83,7 @@ def test_a_folder_with_something_else_in_it_is_refused_and_untouched(tmp_path):
 def test_an_empty_folder_is_taken(tmp_path):
     target = tmp_path / "results"
     target.mkdir()
-    with whole_folder(target, never) as work:
+    with atomic_folder(target, never) as work:
         (work / "a").write_text("1")
     assert names(target) == ["a"]
 
@@ -93,14 +93,14 @@ def test_a_file_in_its_place_is_refused(tmp_path):
     target.write_text("a file")
     with (
         pytest.raises(InputError, match="expected a folder for the results, found a file"),
-        whole_folder(target, always),
+        atomic_folder(target, always),
     ):
         pytest.fail("the block must not begin")
     assert target.read_text() == "a file"
 
 
 def test_folders_on_the_way_are_made(tmp_path):
-    with whole_folder(tmp_path / "a" / "b" / "results", never) as work:
+    with atomic_folder(tmp_path / "a" / "b" / "results", never) as work:
         (work / "x").write_text("1")
     assert names(tmp_path / "a" / "b" / "results") == ["x"]
 
@@ -109,7 +109,7 @@ def test_folders_on_the_way_are_made(tmp_path):
 def test_a_place_where_nothing_can_be_made_is_a_plain_error(tmp_path):
     closed = tmp_path / "closed"
     closed.mkdir(mode=0o500)
-    with pytest.raises(InputError, match="the folder cannot be made"), whole_folder(closed / "results", never):
+    with pytest.raises(InputError, match="the folder cannot be made"), atomic_folder(closed / "results", never):
         pytest.fail("the block must not begin")
 
 
@@ -117,7 +117,7 @@ def test_a_parent_that_is_a_file_is_a_plain_error(tmp_path):
     (tmp_path / "file").write_text("")
     with (
         pytest.raises(InputError, match="the folder cannot be made"),
-        whole_folder(tmp_path / "file" / "results", never),
+        atomic_folder(tmp_path / "file" / "results", never),
     ):
         pytest.fail("the block must not begin")
 
@@ -126,7 +126,7 @@ def test_what_a_killed_run_left_beside_is_cleared_away(tmp_path):
     left = tmp_path / f".results.part-{os.getpid()}"
     left.mkdir()
     (left / "a.csv").write_text("half of long ago")
-    with whole_folder(tmp_path / "results", never) as work:
+    with atomic_folder(tmp_path / "results", never) as work:
         (work / "b.csv").write_text("1")
     assert names(tmp_path / "results") == ["b.csv"]
 
@@ -143,7 +143,7 @@ def test_the_old_results_come_back_when_the_last_rename_fails(tmp_path, monkeypa
         return rename(self, to)
 
     def replace_it():
-        with whole_folder(target, always) as work:
+        with atomic_folder(target, always) as work:
             (work / "new").write_text("1")
             monkeypatch.setattr(Path, "rename", broken)
 

@@ -20,9 +20,9 @@ from lab.report.calibration.calibration_maps import contour, contour_levels, val
 from lab.report.calibration.calibration_page import (
     LARGEST_BYTES,
     CalibrationReport,
-    Drawing,
+    PageDrawing,
+    PageTable,
     Section,
-    Table,
     cell,
     page,
     provenance,
@@ -153,8 +153,8 @@ class _Tags(HTMLParser):
 
 
 def test_the_page_is_balanced_and_loads_nothing_from_anywhere():
-    table = Table(("a", "b (px)"), [("x", 1.5), ("y", float("nan"))])
-    html = page(report([Section("s", ["w"], [*map(Drawing, DRAWINGS.values()), "<p>plain</p>"], table)]))
+    table = PageTable(("a", "b (px)"), [("x", 1.5), ("y", float("nan"))])
+    html = page(report([Section("s", ["w"], [*map(PageDrawing, DRAWINGS.values()), "<p>plain</p>"], table)]))
     tags = _Tags()
     tags.feed(html)
     assert tags.open == []
@@ -167,12 +167,13 @@ def test_the_page_is_balanced_and_loads_nothing_from_anywhere():
 def test_every_finding_is_shown_the_worst_first_with_its_reason_and_its_cure():
     findings = [
         Finding(Level.PASS, "what-pass"),
-        Finding(Level.WARN, "what-warn", "why-warn", "cure-warn"),
-        Finding(Level.FAIL, "what-fail", "why-fail", "cure-fail"),
+        Finding(Level.WARN, "what-warn", "why-warn", "remedy-warn"),
+        Finding(Level.FAIL, "what-fail", "why-fail", "remedy-fail"),
     ]
     html = page(report([], findings))
     places = [
-        html.index(w) for w in ("what-fail", "why-fail", "cure-fail", "what-warn", "why-warn", "cure-warn", "what-pass")
+        html.index(w)
+        for w in ("what-fail", "why-fail", "remedy-fail", "what-warn", "why-warn", "remedy-warn", "what-pass")
     ]
     assert places == sorted(places)
     assert "1 failed, 1 warning, 1 passed" in html
@@ -182,7 +183,7 @@ def test_every_finding_is_shown_the_worst_first_with_its_reason_and_its_cure():
 def test_names_and_words_are_escaped_everywhere():
     evil = "<script>alert(1)</script>"
     finding = Finding(Level.WARN, evil, evil, evil)
-    section = Section(evil, evil, [Drawing("<svg></svg>", evil)], Table((evil,), [(evil,)]))
+    section = Section(evil, evil, [PageDrawing("<svg></svg>", evil)], PageTable((evil,), [(evil,)]))
     whole = CalibrationReport("Rig", evil, Level.WARN, [finding], [(evil, evil, evil)], [section])
     assert "<script" not in page(whole)
 
@@ -190,9 +191,9 @@ def test_names_and_words_are_escaped_everywhere():
 def test_a_report_of_400_views_stays_below_5_mb_and_keeps_its_table():
     photograph = RNG.integers(0, 255, (1024, 1280)).astype(np.uint8)  # noise: the worst case of JPEG
     one = draw.corners_overlay((1280, 1024), CORNERS, RESIDUALS, "view", picture=photograph)
-    views = [Drawing(one, f"view {i}") for i in range(400)]
+    views = [PageDrawing(one, f"view {i}") for i in range(400)]
     rows = [(f"photograph-{i}", 0.2) for i in range(400)]
-    html = page(report([Section("views", (), views, Table(("view", "RMS (px)"), rows))]))
+    html = page(report([Section("views", (), views, PageTable(("view", "RMS (px)"), rows))]))
     assert len(html.encode()) <= LARGEST_BYTES
     assert html.count("Picture left out") > 100
     assert "<svg" in html  # and some pictures are still there
@@ -226,7 +227,7 @@ def test_what_a_report_cannot_be_is_refused():
     with pytest.raises(ValueError, match="kind of report"):
         CalibrationReport("Kamera", "x", Level.PASS, [], [], [])
     with pytest.raises(ValueError, match="2 cells"):
-        Table(("a",), [("b", "c")])
+        PageTable(("a",), [("b", "c")])
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.rig import Rig
 from geometry.uncertainty.rig_parameters import moved
-from lab.runs.model_check.recording import Recording
+from lab.runs.model_check.recording import ModelCheckRecording
 from lab.simulate.scene import Scene, compose
 
 SCENES = ("smooth", "sharp-turns", "huo2015", "two-cameras-per-screen", "four-skew-beams")
@@ -59,7 +59,7 @@ def recorded(
     late: tuple[str, float] | None = None,
     claimed_px: float = NOISE_PX,
     predicted: bool = False,
-) -> tuple[Scene, Recording]:
+) -> tuple[Scene, ModelCheckRecording]:
     """What a run knows of the first frames of a simulated recording, by the true labels; poses to 1 mm and 0.3 mrad.
 
     The run's rig is what is claimed; `really` makes of it the one that the spots come from. late: a camera, and by how
@@ -76,7 +76,7 @@ def recorded(
     shift = np.array([1e-3] * 3 + [3e-4] * 3) * rng.standard_normal((frames, 6))
     covariance = np.broadcast_to(claimed_px**2 * np.eye(2), (*uv.shape, 2)).copy()
     guess = uv + 0.1 * rng.standard_normal(uv.shape) if predicted else None
-    return run, Recording(
+    return run, ModelCheckRecording(
         t_s=t_s,
         seen=(run.in_view[some] == 1) & run.has_image[some][:, run.model.camera_of],
         uv_px=measured,

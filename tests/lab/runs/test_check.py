@@ -200,7 +200,7 @@ def test_one_screen_alone_never_fixes_a_pose(folder):
 def test_shares_are_those_of_a_plain_count_over_the_same_poses(folder):
     rig = load_rig(folder / "rig.yaml")
     prior = PosePrior(Pose.from_ypr(np.array([0.1, 0, 0]), np.array([0.1, 0.2, 0])), 0.8, np.deg2rad(40))
-    seen = visibility.look(rig, prior, SolveLimits(), count=300)
+    seen = visibility.visibility_of(rig, prior, SolveLimits(), count=300)
     poses = visibility.poses_within(prior, 300)
     model = SpotModel.of(rig)
     for i, (camera, spot) in enumerate(seen.views):

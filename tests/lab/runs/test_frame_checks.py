@@ -141,7 +141,7 @@ def test_a_spot_that_a_neighbour_has_pulled_does_not_accuse_the_pose():
     uv = record.tracked.uv_px.copy()
     uv[2] += 3.0
     assert len(checked(changed(record, uv_px=uv)).own_spots) == 1
-    assert len(checked(changed(record, uv_px=uv, witness=np.arange(N) != 2)).own_spots) == 0
+    assert len(checked(changed(record, uv_px=uv, used_in_pose=np.arange(N) != 2)).own_spots) == 0
 
 
 def test_what_the_calibration_allows_is_no_contradiction():

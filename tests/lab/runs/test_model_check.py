@@ -18,9 +18,9 @@ from lab.number_format import plus_minus, short
 from lab.runs.model_check import messages
 from lab.runs.model_check.check import ModelCheck, check_kept, check_model
 from lab.runs.model_check.effect import Effect
-from lab.runs.model_check.fault_identification import P_FALSE_ALARM, Inquest
+from lab.runs.model_check.fault_identification import P_FALSE_ALARM, FaultDiagnosis
 from lab.runs.model_check.faults import FaultColumns, possible_faults
-from lab.runs.model_check.frame_sampler import FrameKeeper, claimed_covariances
+from lab.runs.model_check.frame_sampler import FrameSampler, claimed_covariances
 from lab.runs.model_check.linear import linearise
 from lab.runs.model_check.recording import evenly
 from lab.runs.model_check.statistics import correlation_time, nis_band
@@ -106,7 +106,7 @@ def test_a_camera_that_films_late_is_named_with_its_delay():
     assert re.search(r"camera `left` is about (2\.9|3\.0)\d ± 0\.0\d ms late against", check.findings[0].what)
     assert "late against camera `right`" in check.findings[0].what
     assert check.level == Level.FAIL
-    assert "trigger" in check.findings[0].cure
+    assert "trigger" in check.findings[0].remedy
 
 
 def test_a_camera_one_frame_off_is_told_that_its_pictures_may_be_numbered_wrong():
@@ -130,7 +130,7 @@ def test_a_finding_names_spot_size_effect_and_cure():
     assert " px) off in u against the other spots: camera `right-a` may have turned, by 0.87" in finding.what
     assert "deg and " in finding.why
     assert "of its claimed sigmas; averaging over frames does not lessen it" in finding.why
-    assert "mount" in finding.cure
+    assert "mount" in finding.remedy
 
 
 def test_what_a_recording_cannot_tell_apart_is_named_together():
@@ -145,7 +145,7 @@ def test_what_a_recording_cannot_tell_apart_is_named_together():
 
 def test_what_cannot_be_told_apart_fails_only_if_each_of_it_would_and_is_small_only_if_each_is():
     small, middle, large = (Effect(0, 0, 0.0, 0.0, 0.1, 0.1, sigmas) for sigmas in (0.1, 2.0, 9.0))
-    inquest = Inquest((), 0.0, 1.0, 30, 1.0, 1.0, 1.0, False, np.ones(6))
+    inquest = FaultDiagnosis((), 0.0, 1.0, 30, 1.0, 1.0, 1.0, False, np.ones(6))
     assert messages.level_of(inquest, [small, small]) == Level.PASS
     assert messages.level_of(inquest, [small, middle]) == Level.WARN
     assert messages.level_of(inquest, [middle, large]) == Level.WARN
@@ -316,7 +316,7 @@ def test_uneven_claims_do_not_make_a_right_rig_look_wrong():
 def test_noise_alone_does_not_make_a_small_fault_a_failure():
     small = [Effect(0, 0, 0.0, 0.2, 0.1, 0.1, 0.1)]
     for noise, level in ((1.0, Level.FAIL), (8.0, Level.PASS)):
-        inquest = Inquest((), 0.0, 1.0, 30, 8.0, noise, 1.0, False, np.ones(6))
+        inquest = FaultDiagnosis((), 0.0, 1.0, 30, 8.0, noise, 1.0, False, np.ones(6))
         assert messages.level_of(inquest, small) == level
 
 
@@ -351,7 +351,7 @@ def test_a_fault_is_measured_against_the_noise_that_the_recording_shows():
 def test_what_a_tracker_has_widened_is_tested_as_the_detections_claimed_it(factor):
     """A camera turned by 0.3 deg, 0.86 px: 8.6 sigma of the claims, whatever scale the tracker has learnt from it."""
     run, recording = recorded("smooth", 5, frames=200, really=turned("right", 0.3, 1))
-    kept, n = FrameKeeper(), len(run.model)
+    kept, n = FrameSampler(), len(run.model)
     nothing = np.full((n, 2), np.nan)
     for k in range(200):
         point, rows, found = np.full(n, -1), recording.seen[k], []
@@ -377,11 +377,11 @@ def test_a_detection_that_a_neighbour_has_pulled_has_little_say():
     _, recording = recorded("smooth", 5, frames=40)
     n, p = 6, TrackerParameters()
     found = [Detections.at(recording.uv_px[0, :3], recording.cov_px2[0, :3]), None]
-    witness = np.array([True, False, True, True, True, True])
+    used_in_pose = np.array([True, False, True, True, True, True])
     tracked = TrackedFrame(
         recording.uv_px[0], recording.cov_px2[0] * 9, (SpotStatus.MATCHED,) * n, np.full((n, 2), np.nan),
         np.full(n, np.nan), np.array([0, 1, -1, 0, 1, 2]), PoseStatus.MEASURED, recording.poses[0], None, 3, 0.1, (),
-        witness=witness,
+        used_in_pose=used_in_pose,
     )  # fmt: skip
     claimed = claimed_covariances(tracked, found, np.array([0, 0, 0, 1, 1, 1]), p)
     model = p.sigma_model_px**2
@@ -508,7 +508,7 @@ def test_each_rival_is_told_with_its_own_size_and_effect():
 
 def test_frames_kept_one_by_one_tell_the_same_as_all_of_them_and_stay_few():
     run, recording = recorded("smooth", 5, frames=600, late=("right", 3e-3))
-    keeper, kept = FrameKeeper(most=200), None
+    keeper, kept = FrameSampler(most=200), None
     for k in range(600):
         keeper.add(
             float(recording.t_s[k]), recording.seen[k], recording.uv_px[k], recording.cov_px2[k], recording.poses[k]
@@ -525,14 +525,14 @@ def test_frames_kept_one_by_one_tell_the_same_as_all_of_them_and_stay_few():
 
 def test_a_run_without_frames_is_not_tested_and_says_so():
     run, _ = recorded("smooth", 5, frames=40)
-    assert FrameKeeper().recording() is None
-    assert check_kept(run.rig, FrameKeeper()).why_not == "there is no frame"
+    assert FrameSampler().recording() is None
+    assert check_kept(run.rig, FrameSampler()).why_not == "there is no frame"
 
 
 def test_of_a_trackers_frames_only_what_it_measured_counts():
     _, recording = recorded("smooth", 5, frames=40)
     status = [SpotStatus.MATCHED, SpotStatus.TURNED, SpotStatus.OCCLUDED, SpotStatus.OUT_OF_VIEW, SpotStatus.LOST]
-    keeper, nowhere = FrameKeeper(), np.full((6, 2), np.nan)
+    keeper, nowhere = FrameSampler(), np.full((6, 2), np.nan)
     for k, pose in enumerate((recording.poses[0], None)):
         nothing = np.full(6, np.nan), np.full(6, -1)
         words_of = (*status, SpotStatus.NO_IMAGE)
@@ -553,7 +553,7 @@ def test_frames_of_a_tracker_are_checked_and_a_wrong_rig_is_told():
     levels = []
     for rig in (run.rig, changed("screens.right.x_m", -0.01)(run.rig)):
         tracker = SpotTracker(rig, TrackerParameters(), PosePrior(run.poses[0], 0.3, 0.1))
-        keeper = FrameKeeper()
+        keeper = FrameSampler()
         for t_s, found in zip(run.t_s, run.detections, strict=True):
             keeper.add_tracked(float(t_s), tracker.step(0.01, found))
         levels.append(check_kept(rig, keeper).level)
@@ -565,7 +565,7 @@ def test_a_fault_that_is_sure_but_small_is_no_alarm():
     check = check_model(run.rig, recording)
     assert [f.level for f in check.findings] == [Level.PASS]
     assert check.findings[0].why.startswith("it is sure but small")
-    assert check.findings[0].cure == ""
+    assert check.findings[0].remedy == ""
 
 
 @pytest.mark.parametrize(

@@ -27,7 +27,7 @@ from lab.runs.process import are_results, process_run
 from lab.runs.score.score import normalised_squares
 from lab.runs.smoothing_pass import SMOOTHING, TRACKING, WRITING, TwoPasses
 from lab.runs.verdict.quality import LEAST_MEASURED
-from lab.simulate.scenarios import SCENARIOS, Fault
+from lab.simulate.scenarios import SCENARIOS, RecordingFault
 from lab.simulate.write import simulate
 from tests.lab.run_folders import write_run
 from tests.paths import ROOT
@@ -49,10 +49,10 @@ FRAMES = 14
 DAMAGED = replace(
     SCENARIOS["smooth"],
     faults=(
-        Fault(4, "dropped"),
-        Fault(6, "dropped", "left"),
-        Fault(7, "dropped", "left"),
-        Fault(9, "truncated", "right"),
+        RecordingFault(4, "dropped"),
+        RecordingFault(6, "dropped", "left"),
+        RecordingFault(7, "dropped", "left"),
+        RecordingFault(9, "truncated", "right"),
     ),
 )
 
@@ -323,7 +323,7 @@ def test_a_prior_that_is_wrong_is_not_taken_for_darkness(tmp_path):
 
 
 def test_a_camera_that_stops_or_starts_late_is_told_in_words(tmp_path):
-    gone = tuple(Fault(k, "dropped", camera) for camera, k in (("left", 12), ("left", 13), ("right", 0)))
+    gone = tuple(RecordingFault(k, "dropped", camera) for camera, k in (("left", 12), ("left", 13), ("right", 0)))
     scenario = replace(SCENARIOS["smooth"], faults=gone)
     folder = simulate(scenario, tmp_path / "run", seed=5, frames=FRAMES, picture_scale=0.3)
     process_run(folder, tmp_path / "out")

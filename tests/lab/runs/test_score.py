@@ -16,7 +16,7 @@ from geometry.pose import Pose
 from lab.errors import InputError
 from lab.files.run.results import ABSENT, SPOT_STATUSES, SpotGrid, read_poses, read_spots
 from lab.runs.score.motion_score import differenced
-from lab.runs.score.score import Truth, _returns, normalised_squares, read_truth, right_spot, score, score_against
+from lab.runs.score.score import TruthArrays, _returns, normalised_squares, read_truth, right_spot, score, score_against
 from tests.lab.fake_results import MOTION_SIGMA, NOISE_PX, Fake, make, without_added_columns
 from tracking.statuses import PoseStatus, SpotStatus
 
@@ -92,7 +92,7 @@ def test_a_covariance_that_cannot_be_inverted_gives_no_nees():
 def test_a_pose_off_by_a_known_turn_and_shift_is_reported_in_body_and_world_axes(quiet):
     spots, poses = read_spots(quiet.results), read_poses(quiet.results)
     delta = np.array([1e-3, -2e-3, 3e-3, *np.radians([0.1, 0.2, -0.3])])
-    truth = Truth(None, None, poses.world_from_body.plus(np.broadcast_to(delta, (len(poses.frames), 6))))
+    truth = TruthArrays(None, None, poses.world_from_body.plus(np.broadcast_to(delta, (len(poses.frames), 6))))
     out = score_against(spots, poses, truth)
     assert out["spots"] is None
     assert list(out["pose"]["measured"]["position_rms_m"].values()) == pytest.approx([1e-3, 2e-3, 3e-3])

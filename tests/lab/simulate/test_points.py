@@ -11,7 +11,7 @@ from geometry.pose import Pose
 from lab.errors import InputError
 from lab.simulate.motion import Motion, Wave
 from lab.simulate.points import CLUTTER, simulate_points
-from lab.simulate.scenarios import SCENARIOS, Fault, Hiding
+from lab.simulate.scenarios import SCENARIOS, Hiding, RecordingFault
 from lab.simulate.scene import SHINING, compose
 
 HIDDEN = 2
@@ -224,7 +224,7 @@ def test_mistakes_are_told_in_words():
     with pytest.raises(InputError, match="frames: expected at least 1, got 0"):
         simulate_points("huo2015", 0, frames=0)
     with pytest.raises(ValueError, match="'dropped', 'truncated' or 'wrong size'"):
-        Fault(3, "lost")
+        RecordingFault(3, "lost")
 
 
 def test_a_scenario_that_cannot_keep_its_promise_says_so(monkeypatch):
@@ -235,6 +235,6 @@ def test_a_scenario_that_cannot_keep_its_promise_says_so(monkeypatch):
 
 
 def test_misses_hide_single_spots():
-    missing = replace(SCENARIOS["static"], hiding=Hiding(miss_probability=0.3))
+    missing = replace(SCENARIOS["static"], occlusion=Hiding(miss_probability=0.3))
     share = (simulate_points(missing, 0).in_view == HIDDEN).mean()
     assert share == pytest.approx(0.3, abs=0.05)

@@ -138,7 +138,7 @@ def test_a_hidden_spot_leaves_no_light_and_a_shining_one_does():
         SCENARIOS["static"],
         light=LIGHTS["clean"],
         clutter=Clutter(per_spot=0.0),
-        hiding=Hiding(blackout_every=1, blackout_frames=1, clean_start=1),
+        occlusion=Hiding(blackout_every=1, blackout_frames=1, clean_start=1),
     )
     scene = compose(dark, 0, 2)
     sensor, powers = make_sensor(scene, 0), laser_powers(scene)

@@ -10,27 +10,27 @@ from geometry import rotations
 from geometry.arrays import numeric_jacobian
 from geometry.pose import Pose
 from tracking.curve_switching import pose_filter
-from tracking.curve_switching.pose_filter import Motion
+from tracking.curve_switching.pose_filter import RigidMotion
 
 DT = 0.01
 
 
-def plus(motion: Motion, delta: np.ndarray) -> Motion:
+def plus(motion: RigidMotion, delta: np.ndarray) -> RigidMotion:
     """The motion that is an error state (12,) away."""
-    return Motion(
+    return RigidMotion(
         motion.world_from_body.plus(delta[:6]), motion.velocity + delta[6:9], motion.rate + delta[9:], motion.P
     )
 
 
-def minus(motion: Motion, other: Motion) -> np.ndarray:
+def minus(motion: RigidMotion, other: RigidMotion) -> np.ndarray:
     return np.concatenate([motion.world_from_body.minus(other.world_from_body), motion.velocity - other.velocity,
                            motion.rate - other.rate])  # fmt: skip
 
 
-def some_motion(rng: np.random.Generator, rate: float = 3.0) -> Motion:
+def some_motion(rng: np.random.Generator, rate: float = 3.0) -> RigidMotion:
     A = rng.normal(size=(12, 12)) * 0.01
     pose = Pose(Rotation.random(random_state=rng).as_matrix(), rng.normal(size=3))
-    return Motion(pose, rng.normal(size=3), rate * rng.normal(size=3), A @ A.T)
+    return RigidMotion(pose, rng.normal(size=3), rate * rng.normal(size=3), A @ A.T)
 
 
 def test_constant_velocity_and_rate_are_followed_exactly():
@@ -63,7 +63,7 @@ def test_the_covariance_is_carried_by_the_true_jacobian_of_the_prediction(rate, 
 
 
 def test_process_noise_is_that_of_accelerations_constant_within_the_step():
-    still = Motion(Pose.identity(), np.zeros(3), np.zeros(3), np.zeros((12, 12)))
+    still = RigidMotion(Pose.identity(), np.zeros(3), np.zeros(3), np.zeros((12, 12)))
     P = pose_filter.predict(still, DT, 2.0, 5.0).P
     for axis, a in ((0, 2.0), (3, 5.0)):
         assert P[axis, axis] == pytest.approx(a**2 * DT**4 / 4)
@@ -89,7 +89,7 @@ def test_a_measured_pose_without_noise_becomes_the_pose():
 
 
 def test_velocities_are_learnt_from_poses_alone():
-    truth = Motion(Pose.identity(), np.array([0.5, -0.2, 0.1]), np.array([0.3, 0.4, -0.5]), np.zeros((12, 12)))
+    truth = RigidMotion(Pose.identity(), np.array([0.5, -0.2, 0.1]), np.array([0.3, 0.4, -0.5]), np.zeros((12, 12)))
     C = 1e-6 * np.eye(6)
     motion = pose_filter.begin(truth.world_from_body, C)
     assert np.all(motion.twist == 0)
@@ -114,7 +114,7 @@ def test_the_covariance_is_honest_over_many_motions():
         for _ in range(20):
             a = np.concatenate([3.0 * rng.standard_normal(3), 6.0 * rng.standard_normal(3)])
             moved = truth.world_from_body.plus(truth.twist * DT + a * DT**2 / 2)
-            truth = Motion(moved, truth.velocity + a[:3] * DT, truth.rate + a[3:] * DT, truth.P)
+            truth = RigidMotion(moved, truth.velocity + a[:3] * DT, truth.rate + a[3:] * DT, truth.P)
             motion = pose_filter.predict(motion, DT, 3.0, 6.0)
             measured = truth.world_from_body.plus(-sigma * rng.standard_normal(6))
             motion, _, _ = pose_filter.corrected_by_pose(motion, measured, np.diag(sigma**2))

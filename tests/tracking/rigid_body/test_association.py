@@ -19,22 +19,22 @@ from tracking.rigid_body.association import (
     CROWD_PX,
     GATE,
     NOT_LOOKED_FOR,
-    Chances,
-    Frame,
-    Sights,
+    DetectionModel,
+    FrameDetections,
+    ViewTable,
     associate,
-    crowding,
     distinct_spots,
-    grown,
     in_picture,
+    is_blended,
+    log_clutter_ratio,
 )
 from tracking.rigid_body.occlusion import MISSED
 
 RIG = RIGS["fan"]()
 MODEL = SpotModel.of(RIG)
 N = len(MODEL)
-SIGHTS = Sights.of(RIG, MODEL)
-CHANCES = Chances(0.95, 0.01)
+SIGHTS = ViewTable.of(RIG, MODEL)
+CHANCES = DetectionModel(0.95, 0.01)
 SHOWN = np.full(N, 0.97)
 POSE = Pose.from_ypr(np.deg2rad([7.0, 0.0, 0.0]), np.zeros(3))
 EXPECTED, JACOBIAN = MODEL.project(POSE)
@@ -55,23 +55,23 @@ class Found:
 
 def frame_of(
     points: list[Array], has_image: tuple[bool, bool] = (True, True), blend_px: float = 0.0, grown: float = 1.0
-) -> Frame:
+) -> FrameDetections:
     """A frame with these pixels (k, 2) per camera; grown: how much wider than usual each point is."""
     uv = np.concatenate([np.zeros((0, 2)), *points])
     first = np.concatenate([[0], np.cumsum([len(p) for p in points])]).astype(np.int64)
     cov = np.tile(SIGMA_PX**2 * np.eye(2), (len(uv), 1, 1))
     m = len(uv)
-    return Frame(
+    return FrameDetections(
         uv, cov, np.full(m, blend_px), first, np.array(has_image), np.full(N, LOG_CLUTTER),
         np.full(m, -np.inf), np.full(m, 2.0 * grown), np.full(N, 2.0), np.zeros(N),
     )  # fmt: skip
 
 
-def search(frame: Frame, P: Array = P_NEAR, pose: Pose = POSE, extra: Array | None = None) -> Found:
+def search(frame: FrameDetections, P: Array = P_NEAR, pose: Pose = POSE, calibration_cov: Array | None = None) -> Found:
     none = np.zeros((N, 2, 2))
     found = associate(
         MODEL.numbers, SIGHTS, frame, CHANCES, np.ascontiguousarray(pose.rotation), pose.translation, P, SHOWN,
-        none if extra is None else extra,
+        none if calibration_cov is None else calibration_cov,
     )  # fmt: skip
     return Found(*found[:3])
 
@@ -87,7 +87,7 @@ def injections(views: Ints, points: range) -> Iterator[tuple[int, ...]]:
                 yield tuple(out)
 
 
-def log_likelihood(frame: Frame, views: Ints, assigned: tuple[int, ...], P: Array) -> tuple[float, float]:
+def log_likelihood(frame: FrameDetections, views: Ints, assigned: tuple[int, ...], P: Array) -> tuple[float, float]:
     """One Gaussian of all pixels together, against false points; and the largest squared distance of a spot from what
     the others of this assignment and the prior say, which a gate would look at last.
     """
@@ -111,7 +111,7 @@ def log_likelihood(frame: Frame, views: Ints, assigned: tuple[int, ...], P: Arra
     return score + gaussian, max(far)
 
 
-def scattered(rng: np.random.Generator, cameras: tuple[bool, bool], most: int) -> Frame:
+def scattered(rng: np.random.Generator, cameras: tuple[bool, bool], most: int) -> FrameDetections:
     """Spots about a pose drawn from the prior, some missing, and false points within some pixels of them."""
     pose = POSE.plus(np.sqrt(np.diagonal(P_NEAR)) * rng.normal(size=6))
     true = MODEL.project(pose)[0] + SIGMA_PX * rng.normal(size=(N, 2))
@@ -193,9 +193,9 @@ def test_errors_of_the_calibration_widen_the_gates():
     shifted[4] += [1.0, -0.5]
     frame = frame_of([shifted[MODEL.camera_of == c] for c in range(2)])
     assert search(frame, 1e-4 * P_NEAR).assigned[0, 4] == MISSED
-    extra = np.zeros((N, 2, 2))
-    extra[4] = 0.5 * np.eye(2)
-    assert search(frame, 1e-4 * P_NEAR, extra=extra).assigned[0, 4] >= 0
+    calibration_cov = np.zeros((N, 2, 2))
+    calibration_cov[4] = 0.5 * np.eye(2)
+    assert search(frame, 1e-4 * P_NEAR, calibration_cov=calibration_cov).assigned[0, 4] >= 0
 
 
 def test_a_spot_that_melted_into_a_neighbour_keeps_its_label_but_costs_what_that_is_worth():
@@ -230,7 +230,7 @@ def chance_in_picture(view: int, pose: Pose, P: Array) -> float:
     return in_picture(uv[view, 0], uv[view, 1], S[0, 0], S[1, 1], float(width), float(height))
 
 
-def only(view: int, points: Array) -> Frame:
+def only(view: int, points: Array) -> FrameDetections:
     """A frame in whose picture there is nothing but these points."""
     camera = MODEL.camera_of[view]
     return frame_of([points if c == camera else np.zeros((0, 2)) for c in range(2)])
@@ -275,8 +275,8 @@ def test_no_point_is_two_spots_and_no_assignment_is_hopelessly_behind():
         assert found.score[0] - found.score[-1] <= BEHIND
 
 
-def crowd_at(frame: Frame, pose: Pose, P: Array = 1e-4 * P_NEAR) -> float:
-    return crowding(MODEL.numbers, SIGHTS, frame, np.ascontiguousarray(pose.rotation), pose.translation, P)
+def crowd_at(frame: FrameDetections, pose: Pose, P: Array = 1e-4 * P_NEAR) -> float:
+    return log_clutter_ratio(MODEL.numbers, SIGHTS, frame, np.ascontiguousarray(pose.rotation), pose.translation, P)
 
 
 def beside_the_spots(px: float) -> list[Array]:
@@ -334,9 +334,9 @@ def test_without_shapes_no_point_is_taken_for_two_that_melted_into_one():
         wide._replace(usual_px=np.full(N, np.nan)),
         frame_of(points, blend_px=3.0),  # as wide as ever
     ):
-        assert not any(grown(frame, v, d) for v in range(N) for d in range(len(frame.uv)))
+        assert not any(is_blended(frame, v, d) for v in range(N) for d in range(len(frame.uv)))
         assert not np.any(search(frame, 1e-4 * P_NEAR).assigned >= BLENDED)
-    assert grown(wide, 4, 0)
+    assert is_blended(wide, 4, 0)
 
 
 def test_spots_are_counted_once_however_many_cameras_see_them():

@@ -9,7 +9,7 @@ from geometry.pose import Pose
 from geometry.pose_solver.alternative_poses import alternatives
 from lab.simulate.points import PointRun, hidden, simulate_points
 from lab.simulate.rigs import RIGS, scaled
-from lab.simulate.scenarios import Prior
+from lab.simulate.scenarios import PriorRegion
 from tests.tracking.rigid_runs import RIGID, dt_of, filmed, found_in, judged, prior_of, tracked
 from tracking.detections import UNMATCHED
 from tracking.rigid_body.hypotheses import FEW, VAGUE_PX, widest
@@ -70,7 +70,9 @@ def test_three_spots_are_measured_only_where_the_motion_excludes_their_mirror_so
     hide = np.zeros((frames, 7), dtype=bool)
     hide[SEEN:] = True
     hide[SEEN + dark :, THREE] = False
-    run = filmed(rig, poses, np.arange(frames) / 50.0, 0.01, 1, hide=hide, prior=Prior(within_m=0.5, within_deg=20.0))
+    run = filmed(
+        rig, poses, np.arange(frames) / 50.0, 0.01, 1, hide=hide, prior=PriorRegion(within_m=0.5, within_deg=20.0)
+    )
     others = alternatives(run.model, PLACE, THREE)
     away = [others[i].minus(PLACE) for i in range(len(others.translation))]
     mirror = min(away, key=lambda d: float(np.linalg.norm(d[3:])))

@@ -9,19 +9,19 @@ from geometry.arrays import Array, Ints
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from lab.simulate.rigs import RIGS
-from tracking.rigid_body.association import BLENDED, NOT_LOOKED_FOR, Chances, Frame, Sights
+from tracking.rigid_body.association import BLENDED, NOT_LOOKED_FOR, DetectionModel, FrameDetections, ViewTable
 from tracking.rigid_body.hypotheses import (
-    FORGET,
     MOST_CHILDREN,
     MOST_KEPT,
+    PRUNE_NATS,
     Children,
     Dynamics,
     Hypotheses,
     add_child,
-    concluded,
-    grow,
+    branch,
+    iterated_update,
     no_children,
-    sift,
+    prune_and_merge,
 )
 from tracking.rigid_body.motion import STATE, predicted
 from tracking.rigid_body.occlusion import MISSED
@@ -29,9 +29,9 @@ from tracking.rigid_body.occlusion import MISSED
 RIG = RIGS["fan"]()
 MODEL = SpotModel.of(RIG)
 N, GROUPS = len(MODEL), 2
-SIGHTS = Sights.of(RIG, MODEL)
+SIGHTS = ViewTable.of(RIG, MODEL)
 NO_EXTRA = np.zeros((N, 2, 2))
-CHANCES = Chances(0.98, 0.01)
+CHANCES = DetectionModel(0.98, 0.01)
 DYNAMICS = Dynamics(np.repeat([400.0, 3600.0], 3), np.array([0.2, 0.5]) ** 2, np.array([2.0, 5.0]) ** 2, 0.02)
 DT, SIGMA_PX = 0.01, 0.1
 P_START = np.diag(np.repeat([2e-4, 1e-4, 0.02, 0.02, 1.0, 3.0], 3) ** 2)
@@ -41,13 +41,13 @@ def rotation_of(pose: Pose) -> Array:
     return np.ascontiguousarray(pose.rotation)
 
 
-def a_frame(uv: Array, seen: Ints) -> Frame:
+def a_frame(uv: Array, seen: Ints) -> FrameDetections:
     """The frame in which these views shine at uv (n, 2), by camera, and nothing else."""
     rows = [v for c in range(2) for v in seen if MODEL.camera_of[v] == c]
     first = np.array([0, *np.cumsum([np.sum(MODEL.camera_of[seen] == c) for c in range(2)])], dtype=np.int64)
     cov = np.tile(SIGMA_PX**2 * np.eye(2), (len(rows), 1, 1))
     m, clutter = len(rows), np.full(N, np.log(2e-4))
-    return Frame(
+    return FrameDetections(
         uv[rows].reshape(-1, 2), cov, np.zeros(m), first, np.ones(2, dtype=bool), clutter,
         np.full(m, -np.inf), np.full(m, np.nan), np.full(N, np.nan), np.zeros(N),
     )  # fmt: skip
@@ -85,7 +85,7 @@ def test_a_conclusion_is_the_likeliest_pose_and_its_own_likelihood(seen):
     true = pose.plus(np.linalg.cholesky(P[:6, :6]) @ rng.normal(size=6))
     uv = MODEL.project(true)[0] + SIGMA_PX * rng.normal(size=(N, 2))
     before = rotation_of(pose), pose.translation, np.zeros(12), P
-    R, t, m, P_after, gaussian, misfit, count = concluded(
+    R, t, m, P_after, gaussian, misfit, count = iterated_update(
         MODEL.numbers, a_frame(uv, views), NO_EXTRA, before, rows_in(views), before[0], before[1]
     )
     assert count == len(seen)
@@ -122,7 +122,7 @@ def test_no_vagueness_of_a_prediction_makes_an_answer_likelier_than_a_perfect_fi
         if np.isnan(MODEL.project(away)[0][views]).any():
             continue
         before = rotation_of(away), away.translation, np.zeros(12), P
-        _, _, _, P_after, gaussian, misfit, _ = concluded(
+        _, _, _, P_after, gaussian, misfit, _ = iterated_update(
             MODEL.numbers, a_frame(uv, views), NO_EXTRA, before, rows_in(views), before[0], before[1]
         )
         perfect = -len(views) * np.log(2 * np.pi * SIGMA_PX**2)
@@ -136,7 +136,7 @@ def test_an_answer_whose_pose_does_not_show_its_spot_is_impossible():
     away = Pose.from_ypr(np.array([np.pi, 0.0, 0.0]), np.zeros(3))
     before = rotation_of(away), away.translation, np.zeros(12), P_START
     uv = MODEL.project(Pose.identity())[0]
-    *_, gaussian, _, count = concluded(
+    *_, gaussian, _, count = iterated_update(
         MODEL.numbers, a_frame(uv, np.array([0])), NO_EXTRA, before, rows_in(np.array([0])), before[0], before[1]
     )
     assert (gaussian, count) == (-np.inf, 1)
@@ -147,7 +147,9 @@ def test_a_frame_without_spots_leaves_the_prediction():
     before = rotation_of(pose), pose.translation, np.zeros(12), P_START
     none = np.full(N, MISSED)
     frame = a_frame(np.zeros((N, 2)), np.zeros(0, dtype=np.int64))
-    R, t, _, P, gaussian, misfit, count = concluded(MODEL.numbers, frame, NO_EXTRA, before, none, before[0], before[1])
+    R, t, _, P, gaussian, misfit, count = iterated_update(
+        MODEL.numbers, frame, NO_EXTRA, before, none, before[0], before[1]
+    )
     np.testing.assert_array_equal(R, before[0])
     np.testing.assert_array_equal(t, before[1])
     np.testing.assert_array_equal(P, P_START)
@@ -163,7 +165,7 @@ ONE_LESS = np.where(np.arange(N) == 2, MISSED, np.arange(N))
 def test_a_label_is_as_certain_as_the_share_of_the_answers_that_agree():
     melted = np.where(np.arange(N) == 4, 4 + BLENDED, np.arange(N))
     weights = np.log([0.6, 0.3, 0.1])
-    _, places, certain, _ = sift(
+    _, places, certain, _ = prune_and_merge(
         children_of(list(weights), [ALL_SEEN, ONE_LESS, melted], [HERE, FAR, NEAR]), len(weights)
     )
     assert places[0] == 0
@@ -175,29 +177,29 @@ def test_a_label_is_as_certain_as_the_share_of_the_answers_that_agree():
 def test_answers_far_apart_widen_the_covariance_by_their_distance_and_their_share():
     children = children_of(list(np.log([0.8, 0.2])), [ALL_SEEN, ONE_LESS], [HERE, FAR])
     d = FAR.minus(HERE)
-    np.testing.assert_allclose(sift(children, 2)[3], 0.2 * np.outer(d, d), atol=1e-15)
+    np.testing.assert_allclose(prune_and_merge(children, 2)[3], 0.2 * np.outer(d, d), atol=1e-15)
     alone = children_of([0.0], [ALL_SEEN], [HERE])
-    np.testing.assert_array_equal(sift(alone, 1)[3], 0)
+    np.testing.assert_array_equal(prune_and_merge(alone, 1)[3], 0)
 
 
 def test_two_answers_with_the_same_labels_and_states_are_one_with_both_weights():
     children = children_of(list(np.log([0.3, 0.4, 0.3])), [ALL_SEEN, ONE_LESS, ALL_SEEN], [HERE, HERE, NEAR])
-    staying, places, _, _ = sift(children, 3)
+    staying, places, _, _ = prune_and_merge(children, 3)
     assert sorted(places.tolist()) in ([0, 1], [1, 2])
     share = np.exp(staying.weight)
     np.testing.assert_allclose(sorted(share / share.sum()), [0.4, 0.6], rtol=1e-9)
     # The same labels elsewhere are another answer.
-    assert len(sift(children_of([0.0, 0.0], [ALL_SEEN, ALL_SEEN], [HERE, FAR]), 2)[1]) == 2
+    assert len(prune_and_merge(children_of([0.0, 0.0], [ALL_SEEN, ALL_SEEN], [HERE, FAR]), 2)[1]) == 2
 
 
 def test_the_likeliest_stay_and_the_hopeless_go():
     poses = [HERE.plus(np.array([0.01 * k, 0, 0, 0, 0, 0])) for k in range(12)]
     children = children_of([-0.5 * k for k in range(12)], [ALL_SEEN] * 12, poses)
-    staying, places, _, _ = sift(children, 12)
+    staying, places, _, _ = prune_and_merge(children, 12)
     assert places.tolist() == list(range(MOST_KEPT))
     np.testing.assert_allclose(staying.weight, -0.5 * np.arange(MOST_KEPT))
-    children = children_of([0.0, -FORGET - 1.0], [ALL_SEEN] * 2, [HERE, FAR])
-    assert sift(children, 2)[1].tolist() == [0]
+    children = children_of([0.0, -PRUNE_NATS - 1.0], [ALL_SEEN] * 2, [HERE, FAR])
+    assert prune_and_merge(children, 2)[1].tolist() == [0]
 
 
 def test_where_there_is_no_room_a_better_child_takes_the_worsts_place():
@@ -226,13 +228,13 @@ def grown(jump: Array, seen: Ints = ALL_SEEN) -> tuple[Children, int, Pose]:
     )  # fmt: skip
     uv = MODEL.project(Pose(R, t))[0] + SIGMA_PX * rng.normal(size=(N, 2))
     old = one_hypothesis(pose, m, P_START)
-    out, count = grow(MODEL.numbers, SIGHTS, a_frame(uv, seen), CHANCES, DYNAMICS, NO_EXTRA, DT, old)
+    out, count = branch(MODEL.numbers, SIGHTS, a_frame(uv, seen), CHANCES, DYNAMICS, NO_EXTRA, DT, old)
     return out, count, Pose(R, t)
 
 
 def test_a_steady_vehicle_is_not_tried_with_a_manoeuvre():
     children, count, true = grown(np.zeros(6))
-    staying, places, certain, _ = sift(children, count)
+    staying, places, certain, _ = prune_and_merge(children, count)
     assert not children.manoeuvre[:count].any()
     np.testing.assert_array_equal(children.assigned[places[0]], rows_in(ALL_SEEN))
     assert np.all(certain > 0.999)
@@ -242,7 +244,7 @@ def test_a_steady_vehicle_is_not_tried_with_a_manoeuvre():
 
 def test_a_bend_is_followed_by_the_manoeuvre_with_the_right_labels():
     children, count, true = grown(np.array([0.3, 0, -0.3, 1.2, -0.8, 0.5]))
-    staying, places, certain, _ = sift(children, count)
+    staying, places, certain, _ = prune_and_merge(children, count)
     assert children.manoeuvre[places[0]]
     np.testing.assert_array_equal(children.assigned[places[0]], rows_in(ALL_SEEN))
     assert np.all(certain > 0.99)
@@ -252,7 +254,7 @@ def test_a_bend_is_followed_by_the_manoeuvre_with_the_right_labels():
 
 def test_in_the_dark_a_vehicle_may_have_turned_and_the_covariance_says_so():
     children, count, _ = grown(np.zeros(6), seen=np.zeros(0, dtype=np.int64))
-    staying, places, _, _ = sift(children, count)
+    staying, places, _, _ = prune_and_merge(children, count)
     assert np.all(children.assigned[places[0]] <= MISSED)
     old = one_hypothesis(HERE, np.zeros(12), P_START)
     P = predicted(old.R[0], old.t[0], old.m[0], P_START, DT, DYNAMICS.jerk, np.zeros(2), np.zeros(2))[3]
@@ -267,7 +269,7 @@ def test_labels_of_views_without_a_picture_stay_out_of_it():
     uv = MODEL.project(pose)[0] + SIGMA_PX * rng.normal(size=(N, 2))
     frame = a_frame(uv, left)._replace(has_image=np.array([True, False]))
     old = one_hypothesis(pose, np.zeros(12), P_START)
-    out, count = grow(MODEL.numbers, SIGHTS, frame, CHANCES, DYNAMICS, NO_EXTRA, DT, old)
-    best = sift(out, count)[1][0]
+    out, count = branch(MODEL.numbers, SIGHTS, frame, CHANCES, DYNAMICS, NO_EXTRA, DT, old)
+    best = prune_and_merge(out, count)[1][0]
     assert np.all(out.assigned[best][MODEL.camera_of == 1] == NOT_LOOKED_FOR)
     assert np.all(out.assigned[best][left] >= 0)

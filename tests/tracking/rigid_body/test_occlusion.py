@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from geometry.arrays import Array
-from tracking.rigid_body.occlusion import BLACKOUT, MISSED, later, learnt, marginal, together
+from tracking.rigid_body.occlusion import BLACKOUT, MISSED, joint_log_likelihood, marginal, predict, update
 
 GROUP = np.array([0, 0, 0, 1, 1])
 N, GROUPS = len(GROUP), 2
@@ -41,7 +41,7 @@ def log_probability(chances: Array, assigned: Array) -> float:
     """As the tracker adds it up: each spot by itself, and what they gain together."""
     p = DETECT * marginal(chances, GROUP)
     apart = np.where(assigned >= 0, np.log(p), np.log(1 - p))[assigned != NOT_LOOKED_FOR]
-    return float(apart.sum()) + together(chances, GROUP, assigned, DETECT)
+    return float(apart.sum()) + joint_log_likelihood(chances, GROUP, assigned, DETECT)
 
 
 @given(chances_of_all)
@@ -63,7 +63,7 @@ def test_an_outcome_is_as_likely_as_the_sum_over_all_states_says(chances, assign
 @given(chances_of_all, outcome)
 def test_what_is_learnt_is_bayes_rule(chances, assigned):
     a = np.array(assigned)
-    after = learnt(chances, GROUP, a, DETECT)
+    after = update(chances, GROUP, a, DETECT)
     if np.any(a >= 0):  # else the blackout has its say
         np.testing.assert_allclose(after, by_trying(chances, a)[1], atol=3e-6)
 
@@ -71,7 +71,7 @@ def test_what_is_learnt_is_bayes_rule(chances, assigned):
 @given(chances_of_all, st.lists(outcome, min_size=1, max_size=30))
 def test_chances_stay_chances(chances, outcomes):
     for assigned in outcomes:
-        chances = learnt(later(chances, N), GROUP, np.array(assigned), DETECT)
+        chances = update(predict(chances, N), GROUP, np.array(assigned), DETECT)
         assert np.all((chances > 0) & (chances < 1))
         assert np.all((marginal(chances, GROUP) > 0) & (marginal(chances, GROUP) < 1))
 
@@ -79,7 +79,7 @@ def test_chances_stay_chances(chances, outcomes):
 def after(outcomes: list[list[int]]) -> Array:
     chances = np.full(N + GROUPS, 0.95)
     for assigned in outcomes:
-        chances = later(learnt(chances, GROUP, np.array(assigned), DETECT), N)
+        chances = predict(update(chances, GROUP, np.array(assigned), DETECT), N)
     return chances
 
 
@@ -110,7 +110,7 @@ def test_a_spot_missed_while_its_neighbours_shine_is_hidden_and_not_its_screen()
 def test_light_that_returns_for_one_screen_says_nothing_of_the_other():
     everything_dark = [[MISSED] * 5] * 4
     chances = after([[0] * 5] * 3 + everything_dark)
-    seen = learnt(chances, GROUP, np.array([0, 0, 0, NOT_LOOKED_FOR, NOT_LOOKED_FOR]), DETECT)
+    seen = update(chances, GROUP, np.array([0, 0, 0, NOT_LOOKED_FOR, NOT_LOOKED_FOR]), DETECT)
     assert seen[N] > 0.99
     assert seen[N + 1] == pytest.approx(chances[N + 1])
     np.testing.assert_array_equal(seen[3:N], chances[3:N])

@@ -10,12 +10,12 @@ import pytest
 from geometry.pose import Pose
 from lab.simulate.points import PointRun
 from lab.simulate.rigs import RIGS
-from lab.simulate.scenarios import Prior
+from lab.simulate.scenarios import PriorRegion
 from tests.tracking.rigid_runs import Judged, filmed, judged, looked_at_again, tracked, zig_zag
 
 NOISE_PX = 0.01
 START = Pose.from_ypr(np.deg2rad([7.0, 0.0, 0.0]), np.zeros(3))
-PRIOR = Prior((0.0, 0.0, 0.0), (7.0, 0.0, 0.0), 0.3, 15.0)
+PRIOR = PriorRegion((0.0, 0.0, 0.0), (7.0, 0.0, 0.0), 0.3, 15.0)
 # Angular rates, 1 sigma, rad/s. A spot moves by some 1200 px per rad: 12 px per frame, and 0.2 px.
 HARD, SOFT = 1.0, 0.02
 FRAMES, EVERY = 160, 23

@@ -11,7 +11,14 @@ from geometry.arrays import Array
 from geometry.pose import Pose
 from tracking.rigid_body.motion import STATE, predicted, updated
 from tracking.smoothing import fixed_interval
-from tracking.smoothing.fixed_interval import Evidence, Reference, log_left_out, log_likelihood, shifted, smoothed
+from tracking.smoothing.fixed_interval import (
+    FrameInformation,
+    Reference,
+    leave_one_out_log_likelihood,
+    log_likelihood,
+    shifted,
+    smoothed,
+)
 from tracking.smoothing.whole_run import APART
 
 DT = 0.01
@@ -23,12 +30,12 @@ class Run:
     """Deviations drawn from the very model, and the evidence that noisy spots would give of them."""
 
     ref: Reference
-    ev: Evidence
+    ev: FrameInformation
     jerk: Array  # (T, 6)
     true: Array  # (T, 18)
 
 
-def transition(ref: Reference, ev: Evidence, jerk: Array, k: int) -> tuple[Array, Array, Array]:
+def transition(ref: Reference, ev: FrameInformation, jerk: Array, k: int) -> tuple[Array, Array, Array]:
     """F, the covariance that step k adds, and how far the reference itself is from moving so."""
     args = ref.R[k - 1], ref.t[k - 1], ref.m[k - 1], np.zeros((STATE, STATE)), ev.dt[k]
     R, t, m, Q, F = predicted(*args, jerk[k], ev.jump[k], ev.unsteady[k])
@@ -62,7 +69,7 @@ def drawn(
     dt[3 * frames // 4] = 2 * DT  # a frame was dropped
     sizes = np.full((frames, 2), jumps)
     first = np.repeat([0.02, 0.02, 0.5, 0.5, 5.0, 5.0], 3) ** 2
-    ev = Evidence(L, np.zeros((frames, 6)), dt, sizes, 100 * sizes, first)
+    ev = FrameInformation(L, np.zeros((frames, 6)), dt, sizes, 100 * sizes, first)
     jerk = np.array(np.broadcast_to(jerk, (frames, 6)))
     x = np.sqrt(first) * rng.normal(size=STATE)
     true, g = np.empty((frames, STATE)), np.zeros((frames, 6))
@@ -130,7 +137,7 @@ def log_evidence(run: Run, jerk: Array) -> float:
 
 def left_out(run: Run, factor: float) -> float:
     out = smoothed(run.ref, run.ev, factor * run.jerk)
-    return float(log_left_out(out.x, out.pose_P, run.ev))
+    return float(leave_one_out_log_likelihood(out.x, out.pose_P, run.ev))
 
 
 RUNS = {
@@ -231,7 +238,7 @@ def test_a_run_of_more_frames_than_are_in_memory_is_smooth_where_the_chunks_meet
     meet = fixed_interval.CHUNK
     # The frames about the seam by themselves: what lies 70 frames away has no say beyond a thousandth of a sigma.
     part = slice(meet - 100, meet + 40)
-    ev = Evidence(*(a[part] for a in run.ev[:5]), run.ev.first)
+    ev = FrameInformation(*(a[part] for a in run.ev[:5]), run.ev.first)
     alone_x, alone_P, *_ = smoothed(Reference(*(a[part] for a in run.ref)), ev, run.jerk[part])
     sigma = np.sqrt(np.diagonal(pose_P, axis1=1, axis2=2))[part]
     seam = slice(70, 135)

@@ -24,7 +24,7 @@ from tests.tracking.rigid_runs import (
 )
 from tracking.detections import UNMATCHED
 from tracking.parameters import TrackerParameters
-from tracking.smoothing.recording import Recording
+from tracking.smoothing.recording import TrackedRecording
 from tracking.smoothing.smoothed import Smoothed
 from tracking.smoothing.smoother import smooth
 from tracking.statuses import PoseStatus, SpotStatus
@@ -267,7 +267,7 @@ def test_labels_of_the_paper_s_tracker_are_left_as_they_are():
     spots = TrackerParameters(method="spots")
     causal = tracked(run)
     worse = [replace(f, point=np.where(np.arange(6) == 2, UNMATCHED, f.point)) for f in causal]
-    recording = Recording(run.rig, spots)
+    recording = TrackedRecording(run.rig, spots)
     for k, f in enumerate(worse):
         recording.append(float(run.t_s[k] - run.t_s[k - 1]) if k else 0.0, found_in(run, k), f)
     smoothed = smooth(recording)
