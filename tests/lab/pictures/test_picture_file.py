@@ -364,7 +364,7 @@ def test_other_threads_go_on_while_a_png_is_decoded():
 
 CHATTER = """
 import sys
-from lab.pictures import decode
+from lab.pictures.picture_file import decode
 for line in sys.stdin.buffer.read().split(b"=====")[:-1]:
     print(type(decode(line, None)).__name__)
 """
