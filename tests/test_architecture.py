@@ -1,4 +1,6 @@
-"""Arrows between the folders point down only: cli -> lab -> tracking, calibration -> geometry -> numpy, scipy.
+"""Arrows between the packages point down only: cli -> lab -> tracking, calibration -> geometry -> numpy, scipy.
+
+Folders inside a package do not import each other in a circle, hold few modules, and modules are short.
 
 The imports are read with `ast`, wherever they stand in a module: one that hides in a function is an arrow too.
 """
@@ -6,6 +8,7 @@ The imports are read with `ast`, wherever they stand in a module: one that hides
 from __future__ import annotations
 
 import ast
+import statistics
 import sys
 import tomllib
 from collections.abc import Iterator
@@ -28,6 +31,7 @@ MAY_USE = {
     "lab": {"geometry", "tracking", "calibration"},
     "cli": {"lab"},
 }
+MOST_MODULES, MOST_LINES, MEDIAN_LINES = 15, 350, 150
 # lab and cli may use whatever pyproject.toml declares; the floors of formulas need no files, tables or plots.
 MAY_USE_FROM_OUTSIDE = {
     "geometry": {"numpy", "scipy", "numba"},
@@ -114,6 +118,45 @@ def circle(root: Path) -> list[str]:
     return []
 
 
+def folder_of(name: str, path: Path) -> str:
+    """The dotted name of the folder that a module lies in."""
+    return name if path.name == "__init__.py" else name.rpartition(".")[0]
+
+
+def folder_graph(root: Path) -> dict[str, set[str]]:
+    """Which folders of the program each folder imports from."""
+    known = modules(root)
+    graph: dict[str, set[str]] = {folder_of(name, path): set() for name, path in known.items()}
+    for name, path in known.items():
+        targets = imports(name, path) & set(known)
+        # `from lab.files import columns` names the folder and the module: only the module counts.
+        modules_only = {t for t in targets if not any(other.startswith(t + ".") for other in targets)}
+        graph[folder_of(name, path)] |= {folder_of(target, known[target]) for target in modules_only}
+    return {folder: used - {folder} for folder, used in graph.items()}
+
+
+def folder_circle(root: Path) -> list[str]:
+    """A circle of folders that import each other, or an empty list."""
+    try:
+        TopologicalSorter(folder_graph(root)).prepare()
+    except CycleError as error:
+        return list(error.args[1])
+    return []
+
+
+def crowded_folders(root: Path, most: int) -> list[str]:
+    """Folders of the program, its tests and its bench with more .py files than `most`."""
+    folders = {path.parent for top in (*FLOORS[:-1], "tests", "bench") for path in (root / top).rglob("*.py")}
+    counts = {folder: len(list(folder.glob("*.py"))) for folder in folders}
+    return sorted(f"{folder.relative_to(root)}: {n} modules" for folder, n in counts.items() if n > most)
+
+
+def long_modules(root: Path, most: int) -> list[str]:
+    """Modules of the program with more lines than `most`."""
+    lengths = {name: len(path.read_text(encoding="utf-8").splitlines()) for name, path in modules(root).items()}
+    return sorted(f"{name}: {n} lines" for name, n in lengths.items() if n > most)
+
+
 @pytest.fixture
 def small_program(tmp_path: Path) -> Path:
     """A program that keeps the rules, for a test to break."""
@@ -149,6 +192,20 @@ def test_nobody_imports_the_command_line():
 
 def test_modules_do_not_import_each_other_in_a_circle():
     assert circle(ROOT) == []
+
+
+def test_folders_do_not_import_each_other_in_a_circle():
+    assert folder_circle(ROOT) == []
+
+
+def test_no_folder_holds_more_than_fifteen_modules():
+    assert crowded_folders(ROOT, MOST_MODULES) == []
+
+
+def test_modules_are_short_enough_to_read():
+    assert long_modules(ROOT, MOST_LINES) == []
+    lengths = [len(path.read_text(encoding="utf-8").splitlines()) for path in modules(ROOT).values()]
+    assert statistics.median(lengths) <= MEDIAN_LINES
 
 
 @pytest.mark.parametrize("floor", MAY_USE_FROM_OUTSIDE)
@@ -193,6 +250,28 @@ def test_a_circle_is_seen(small_program):
     assert circle(small_program) == []
     (small_program / "geometry" / "pose.py").write_text("def late():\n    from geometry.rig import Rig\n")
     assert {"geometry.pose", "geometry.rig"} <= set(circle(small_program))
+
+
+def test_a_circle_of_folders_is_seen(small_program):
+    assert folder_circle(small_program) == []
+    inner = small_program / "geometry" / "solver"
+    inner.mkdir()
+    (inner / "__init__.py").write_text("")
+    (inner / "fit.py").write_text("from geometry.rig import Rig\n")
+    assert folder_circle(small_program) == []
+    # No circle of modules, and yet one of folders.
+    (small_program / "geometry" / "pose.py").write_text("from geometry.solver import errors\n")
+    (inner / "errors.py").write_text("")
+    assert circle(small_program) == []
+    assert {"geometry", "geometry.solver"} <= set(folder_circle(small_program))
+
+
+def test_a_crowded_folder_and_a_long_module_are_seen(small_program):
+    assert (crowded_folders(small_program, 3), long_modules(small_program, 3)) == ([], [])
+    (small_program / "geometry" / "rig.py").write_text("\n" * 4)
+    (small_program / "geometry" / "lens.py").write_text("")
+    assert crowded_folders(small_program, 3) == ["geometry: 4 modules"]
+    assert long_modules(small_program, 3) == ["geometry.rig: 4 lines"]
 
 
 def test_a_package_from_outside_is_seen(small_program):
