@@ -61,7 +61,7 @@ test: check  ## The checks and the fast tests
 test-all: check  ## The checks and all tests, the slow ones too
 	$(BIN)/python -m pytest -n $(WORKERS) -m 'slow or not slow'
 
-format: setup  ## Format the code and mend what the linter can mend
+format: setup  ## Format the code and apply the linter's automatic fixes
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
@@ -104,7 +104,7 @@ bench-peers: peers  ## Other people's trackers and ours on the same points (half
 # In an environment of its own, so that the lock file depends on pyproject.toml alone. Versions that are already
 # locked stay, unless pyproject.toml forbids them; `make lock LOCK_FLAGS=--upgrade` takes the newest. With the
 # oldest Python that we support the list also serves the newer ones.
-lock:  ## Write requirements.lock anew from pyproject.toml
+lock:  ## Write requirements.lock again from pyproject.toml
 	$(PYTHON) -m venv --clear build/lock
 	build/lock/bin/python -m pip install --quiet pip-tools
 	build/lock/bin/pip-compile --quiet --extra dev --strip-extras --no-header --no-emit-options \
