@@ -28,8 +28,7 @@ class ClutterNearSpots:
         self._near = np.full(cameras, START_PER_PX2)
 
     def log_density(self, first: Ints) -> tuple[Array, Array]:
-        """Log density of false points near each view's spot (n,), 1/px^2, and its log ratio to the whole picture's
-        (n,).
+        """Log density (n,) of false points near each view's spot, 1/px^2; its log ratio (n,) to the whole picture's.
 
         first (cameras + 1,): where the rows of each camera begin among the frame's detections.
         """

@@ -26,9 +26,8 @@ from tracking.rigid_body.models.information import well_controlled
 from tracking.rigid_body.pose_candidates import predicted_hypothesis
 
 MANY_SPOTS = 6  # with so many, an uncontrolled spot concerns only its own label
-MIN_EVIDENCE_NATS = (
-    7.0  # of a first acquisition; chance alone reaches it with a probability of exp(-7) = 1e-3 per frame
-)
+# Of a first acquisition against "all points are false"; false points reach it with exp(-7) = 1e-3 per frame.
+MIN_EVIDENCE_NATS = 7.0
 
 
 @dataclass(frozen=True, slots=True)

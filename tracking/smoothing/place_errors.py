@@ -1,5 +1,4 @@
-"""Errors of a spot that depend on its place on the screen, so that averaging over a vehicle at rest does not reduce
-them.
+"""Errors of a spot that depend on its place on the screen; averaging over a vehicle at rest does not reduce them.
 
 Texture and speckle of the screen, the skewed shape of an oblique spot and the phase of the pixels shift a centroid by
 an amount that belongs to the place on the screen. A vehicle at rest shows the same shift in every frame; a spot that
@@ -33,7 +32,7 @@ class PlaceErrors:
     same_error_frames: Array  # (T,) number of frames, this one included, with the same errors; mean over the views
     reach_px: Array  # (n,) correlation length: the sigma of a spot whose mean over white texture would make it
     elsewhere: float = 0.0  # share of the variance that is the same in all places: errors of the rig, not of a place
-    few: float = 1.0  # of their variance, because it is estimated from few places
+    few: float = 1.0  # factor of their variance, because it is estimated from few places
 
     def factor(self, averaged: Array) -> Array:
         """Factors (T,) of covariances that were computed as if the errors of all frames were independent.

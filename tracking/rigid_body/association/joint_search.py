@@ -23,10 +23,10 @@ GATE_CHI2 = 25.0  # a detection with a larger squared Mahalanobis distance is no
 # Linearising the projection over a step of s px makes an error of about s^2 / 1500 px (lenses of 1000 to 1500 px).
 LINEARISATION_PX = 1500.0
 MAX_BLEND_DISTANCE2_PX2 = 100.0  # squared distance beyond which no neighbour merges with a spot
-MIN_P_IN_PICTURE = 1e-3  # a spot that is less probably in the picture is not searched for
-BEAM_PRUNE_NATS = 14.0  # a partial assignment that is this much less likely than the best is dropped
-# Partial assignments that are kept: NARROW_BEAM if every spot's prediction has a smaller sigma (root of
-# the covariance's trace) than NARROW_PREDICTION_PX, WIDE_BEAM if smaller than WIDE_PREDICTION_PX, else WIDEST_BEAM.
+MIN_P_IN_PICTURE = 1e-3  # a spot whose probability of being in the picture is smaller is not searched for
+BEAM_PRUNE_NATS = 14.0  # partial assignments that are this much less likely than the best are dropped
+# Partial assignments that are kept: NARROW_BEAM if every spot's prediction has a smaller sigma (root of the
+# covariance's trace) than NARROW_PREDICTION_PX, WIDE_BEAM if smaller than WIDE_PREDICTION_PX, else WIDEST_BEAM.
 NARROW_PREDICTION_PX, WIDE_PREDICTION_PX = 30.0, 120.0
 NARROW_BEAM, WIDE_BEAM, WIDEST_BEAM = 12, 48, 128
 

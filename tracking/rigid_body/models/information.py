@@ -131,7 +131,7 @@ def add_curvature_covariance(views: Views, use: Bools, cov: Array, R: Array, t: 
     over many frames does not reduce it; CURVATURE_CORRELATION makes up for that. Returns the sigma in the widest
     direction; 0 where it is so small that the error is negligible.
 
-    Source: ours. Without it, with one camera missing for 60 frames, the filter claimed 30 times too much.
+    Source: ours. Without it, with one camera missing for 60 frames, the filter overstated its accuracy 30 times.
     """
     e = np.empty(6)
     for i in range(6):

@@ -121,22 +121,21 @@ class _Path:
             return None
         return _Path(detections, assigned, context, view)
 
-    def chain(self, way: int) -> dict[int, tuple[int, float] | None]:
-        """Labels of unlabelled frames in the direction of time (way 1) or against it (-1): row and probability by
-        frame.
+    def chain(self, direction: int) -> dict[int, tuple[int, float] | None]:
+        """Row and probability of new labels by frame, along the direction of time (1) or against it (-1).
 
         None where the path leads through a frame but no point lies on it. The last label of a path that ends is
         dropped: a point found just where a spot vanished may be false.
         """
         out: dict[int, tuple[int, float] | None] = {}
         uv, latest = self.uv.copy(), -1
-        frames = range(len(uv)) if way == 1 else range(len(uv) - 1, -1, -1)
+        frames = range(len(uv)) if direction == 1 else range(len(uv) - 1, -1, -1)
         for k in frames:
             if np.isfinite(self.uv[k, 0]):
                 latest = -1  # the chain has reached a label, which confirms it
                 continue
             if self.assigned[k, self.view] < 0 and self.context.open[k]:
-                predicted = self._predicted(k, uv, way)
+                predicted = self._predicted(k, uv, direction)
                 if predicted:
                     out[k] = found = self._found(k, predicted)
                     if found is not None:
@@ -164,14 +163,14 @@ class _Path:
         best = int(np.argmax(odds))
         p = float(odds[best] / (odds.sum() + P_GONE))
         y = place[best] - context.expected[k, view]
-        far = y @ np.linalg.solve(context.expected_cov[k, view] + cov[best], y)
-        if p < MIN_PROBABILITY or not far < POSE_GATE_CHI2:
+        chi2 = y @ np.linalg.solve(context.expected_cov[k, view] + cov[best], y)
+        if p < MIN_PROBABILITY or not chi2 < POSE_GATE_CHI2:
             return None
         return int(rows[best]), p
 
-    def _predicted(self, k: int, uv: Array, way: int) -> list[_Prediction]:
+    def _predicted(self, k: int, uv: Array, direction: int) -> list[_Prediction]:
         """Predictions for frame k: short polynomials suit the time after a velocity jump, long ones a smooth path."""
-        near = k - way * np.arange(1, REACH + MAX_AHEAD)
+        near = k - direction * np.arange(1, REACH + MAX_AHEAD)
         near = near[(near >= 0) & (near < len(uv))]
         near = near[np.isfinite(uv[near, 0])]
         if not len(near) or abs(k - near[0]) > MAX_AHEAD:

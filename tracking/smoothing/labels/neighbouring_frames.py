@@ -26,8 +26,7 @@ def next_to(mask: Bools) -> Bools:
 
 
 def isolated(count: Ints) -> Bools:
-    """(T,): frames with one or two labelled spots, next to a frame without any, that the other neighbour does not
-    support.
+    """(T,): frames with one or two spots next to a frame without any, that the other neighbour does not support.
 
     count (T,): labelled spots per frame. The other neighbour supports them unless it has none either, or many more.
     Such labels are rather false points than the last or first visible spots: all of some ten that were measured in

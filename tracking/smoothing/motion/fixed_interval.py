@@ -124,10 +124,10 @@ def log_likelihood(ref: Reference, info: RunInformation, jerk: Array) -> float:
 
 
 @compiled
-def noise_root(dt: float, jerk: float, jump: float, unsteady: float) -> Array:
+def noise_root(dt: float, jerk: float, velocity_jump: float, acceleration_jump: float) -> Array:
     """Lower triangular root (3, 3) of one axis' process noise."""
     Q = np.empty((3, 3))
-    Q[0, 0], Q[0, 1], Q[0, 2], Q[1, 1], Q[1, 2], Q[2, 2] = process_noise(dt, jerk, jump, unsteady)
+    Q[0, 0], Q[0, 1], Q[0, 2], Q[1, 1], Q[1, 2], Q[2, 2] = process_noise(dt, jerk, velocity_jump, acceleration_jump)
     Q[1, 0], Q[2, 0], Q[2, 1] = Q[0, 1], Q[0, 2], Q[1, 2]
     return cholesky(Q)
 

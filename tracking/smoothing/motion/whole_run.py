@@ -77,6 +77,9 @@ def estimate(
 
     Spots of frames that are not trusted (T,), or farther than max_distance (frames) from any measured frame, are not
     used; 0: only measured frames are. Frames before the first used one and after the last are extrapolated.
+
+    Raises:
+        FloatingPointError: The first Gauss-Newton step is not finite.
     """
     measured = measured & trusted
     far = ~largest_near(measured, max_distance)
