@@ -1,4 +1,4 @@
-"""Pictures of spots with known truth, for tests and the benchmark. Shares no code with what it tests.
+"""Rendered pictures of spots with known truth, for tests and the benchmark. Shares no code with what it tests.
 
 A spot is integrated over each pixel by Gauss-Legendre nodes (4 x 4 per pixel; exact to 1e-5 of the peak at sigma 0.5).
 """
@@ -42,7 +42,7 @@ class Scene:
     size: tuple[int, int] = (1280, 1024)  # width, height
     background: float = 12.0  # DN at the centre
     gradient: tuple[float, float] = (0.0, 0.0)  # DN over the width, over the height
-    reflections: list[Spot] = field(default_factory=list)  # smooth humps
+    reflections: list[Spot] = field(default_factory=list)  # smooth, wide spots
     hot: int = 0
     gain: float = 30.0  # e-/DN
     read: float = 1.5  # DN
@@ -50,7 +50,7 @@ class Scene:
 
 
 def light(spot: Spot, size: tuple[int, int]) -> tuple[NDArray, tuple[slice, slice]]:
-    """Pixel means of a spot and where they go."""
+    """Mean values of the pixels of a spot, and their place in the picture (rows, columns)."""
     width, height = size
     reach = int(np.ceil(6 * max(spot.major, spot.minor) + spot.streak / 2 + 2))
     u0, u1 = max(int(spot.u) - reach, 0), min(int(spot.u) + reach + 1, width)
@@ -72,7 +72,7 @@ def light(spot: Spot, size: tuple[int, int]) -> tuple[NDArray, tuple[slice, slic
 
 
 def expected(scene: Scene, rng: np.random.Generator | None = None) -> NDArray:
-    """The picture without noise, DN (h, w)."""
+    """The picture without noise (h, w), DN."""
     width, height = scene.size
     gu, gv = scene.gradient
     u, v = np.linspace(-0.5, 0.5, width), np.linspace(-0.5, 0.5, height)
@@ -87,6 +87,7 @@ def expected(scene: Scene, rng: np.random.Generator | None = None) -> NDArray:
 
 
 def grains(shape: tuple[int, ...], contrast: float, rng: np.random.Generator) -> NDArray:
+    """Multiplicative texture (h, w) with mean 1 and this contrast."""
     x = np.arange(-4, 5)
     kernel = np.exp(-0.5 * x**2)
     noise = rng.normal(size=(shape[0] + 8, shape[1] + 8))
@@ -96,7 +97,7 @@ def grains(shape: tuple[int, ...], contrast: float, rng: np.random.Generator) ->
 
 
 def photograph(scene: Scene, rng: np.random.Generator, bits: int = 8) -> NDArray:
-    """The picture as a camera gives it, uint8 or uint16."""
+    """The picture as a camera records it, uint8 or uint16."""
     return expose(expected(scene, rng), scene, rng, bits)
 
 
@@ -114,21 +115,21 @@ def bound(spot: Spot, scene: Scene, mean: NDArray, saturation: float = np.inf, s
     """Cramer-Rao bound (2, 2), px^2, for the centre: flux, shape and background plane unknown too, noise known.
 
     `mean` is expected(scene). Numerical derivatives of the rendered spot; variance per pixel = level/gain + read^2 +
-    1/12; pixels whose expected value clips tell nothing.
+    1/12; pixels whose expected value is saturated give no information.
     """
     base, where = light(spot, scene.size)
     level = mean[where]
     variance = np.maximum(level, 0) / scene.gain + scene.read**2 + 1 / 12
     weight = np.where(level < saturation, 1 / variance, 0.0)
 
-    def moved(**change: float) -> NDArray:
+    def spot_with(**change: float) -> NDArray:
         wider = Spot(**{**spot.__dict__, **{k: getattr(spot, k) + d for k, d in change.items()}})
         cells, there = light(wider, scene.size)
         whole = np.zeros((scene.size[1], scene.size[0]))
         whole[there] = cells
         return whole[where]
 
-    rows = [(moved(**{k: step}) - moved(**{k: -step})) / (2 * step) for k in ("u", "v", "major", "minor")]
+    rows = [(spot_with(**{k: step}) - spot_with(**{k: -step})) / (2 * step) for k in ("u", "v", "major", "minor")]
     a = np.radians(spot.angle)
     vv, uu = np.mgrid[where]
     p = (uu - spot.u) * np.cos(a) + (vv - spot.v) * np.sin(a)

@@ -1,4 +1,4 @@
-"""Recordings as points, tracked and looked at again, and how far off the answers are. For the tests."""
+"""Recordings as points, the answers of tracker and smoother, and their errors. For the tests."""
 
 from __future__ import annotations
 
@@ -29,6 +29,7 @@ NEAR_THE_ORIGIN = PriorRegion((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.3, 15.0)
 
 
 def prior_of(run: PointRun) -> PosePrior:
+    """The prior that the recording states."""
     p = run.prior
     centre = Pose.from_ypr(np.deg2rad(p.yaw_pitch_roll_deg), np.array(p.position_m))
     return PosePrior(centre, p.within_m, float(np.deg2rad(p.within_deg)))
@@ -49,7 +50,7 @@ def tracked(
     covariance: RigCovariance | None = None,
     prior: PosePrior | None = None,
 ) -> list[TrackedFrame]:
-    """What the rigid tracker says of a recording; rig: the one it believes in."""
+    """The rigid tracker's answers for a recording; rig: the one given to the tracker, if not the true one."""
     tracker = RigidTracker(rig or run.rig, parameters, prior or prior_of(run), covariance)
     return [tracker.step(dt_of(run, k), found_in(run, k)) for k in range(len(run.frame))]
 
@@ -61,7 +62,7 @@ def looked_at_again(
     rig: Rig | None = None,
     covariance: RigCovariance | None = None,
 ) -> tuple[list[TrackedFrame], Smoothed]:
-    """The smoother's answers after the tracker's."""
+    """The smoother's answers, from the tracker's."""
     recording = TrackedRecording(rig or run.rig, parameters, covariance)
     for k, frame in enumerate(frames):
         recording.append(dt_of(run, k), found_in(run, k), frame)
@@ -71,31 +72,32 @@ def looked_at_again(
 
 @dataclass(frozen=True, slots=True)
 class Judged:
-    """Answers against truth: T frames, n views."""
+    """Answers compared with the truth: T frames, n views."""
 
-    labelled: Bools  # (T, n) a detection was named
-    right: Bools  # (T, n) and is the spot's
-    shining: Bools  # (T, n) there was one to be named
+    labelled: Bools  # (T, n) a detection was labelled
+    right: Bools  # (T, n) and is that spot
+    visible: Bools  # (T, n) the spot was detected
     errors: Array  # (T, 6) of the poses; nan without
-    nees: Array  # (T,) e^T P^-1 e of the poses; nan without
-    bound: Array  # (T, 6) Cramer-Rao variances from the frame's own spots; nan where they give no pose
-    prediction: Array  # (T, n, 2) px, error of the predicted places
+    nees: Array  # (T,) e^T P^-1 e of the poses (normalised estimation error squared); nan without
+    bound: Array  # (T, 6) Cramer-Rao variances from the frame's own spots; nan where they do not determine the pose
+    prediction: Array  # (T, n, 2) px: errors of the predicted pixels
 
     @property
     def identity(self) -> float:
-        return float(np.sum(self.right & self.shining) / np.sum(self.shining))
+        """Share of the visible spots that are labelled correctly."""
+        return float(np.sum(self.right & self.visible) / np.sum(self.visible))
 
     @property
     def wrong(self) -> int:
         return int(np.sum(self.labelled & ~self.right))
 
     @property
-    def lit(self) -> Bools:
-        """Frames that give a pose by themselves, after the start."""
+    def observable(self) -> Bools:
+        """Frames that determine the pose by themselves, after the start."""
         return ~np.isnan(self.bound[:, 0]) & ~np.isnan(self.errors[:, 0]) & (np.arange(len(self.nees)) >= START)
 
     def missed(self) -> int:
-        return int(np.sum(self.shining & ~self.right))
+        return int(np.sum(self.visible & ~self.right))
 
 
 def judged(run: PointRun, frames: list[TrackedFrame]) -> Judged:
@@ -104,20 +106,20 @@ def judged(run: PointRun, frames: list[TrackedFrame]) -> Judged:
     labelled = np.array([f.point != UNMATCHED for f in frames])
     for k, v in zip(*np.nonzero(labelled), strict=True):
         origin[k, v] = run.origin[k][run.model.camera_of[v]][frames[k].point[v]]
-    shining = (run.in_view == SHINING) & run.has_image[:, run.model.camera_of]
+    visible = (run.in_view == SHINING) & run.has_image[:, run.model.camera_of]
     _, J = run.model.project(run.poses)
     errors, nees, bound = np.full((shape[0], 6), np.nan), np.full(shape[0], np.nan), np.full((shape[0], 6), np.nan)
     for k, f in enumerate(frames):
-        A = J[k][shining[k]].reshape(-1, 6) / run.noise_px
+        A = J[k][visible[k]].reshape(-1, 6) / run.noise_px
         scale = np.maximum(np.linalg.norm(A, axis=0), 1e-9)
-        if shining[k].sum() >= 3 and np.linalg.cond(A / scale) < 1e4:
+        if visible[k].sum() >= 3 and np.linalg.cond(A / scale) < 1e4:
             bound[k] = np.diagonal(np.linalg.inv(A.T @ A))
         if f.pose is not None and f.pose_covariance is not None:
             errors[k] = run.poses[k].minus(f.pose)
             nees[k] = errors[k] @ np.linalg.solve(f.pose_covariance, errors[k])
     prediction = np.array([f.predicted_px for f in frames]) - run.uv_px
     views = np.arange(shape[1])
-    return Judged(labelled, labelled & (origin == views), shining, errors, nees, bound, prediction)
+    return Judged(labelled, labelled & (origin == views), visible, errors, nees, bound, prediction)
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,37 +130,37 @@ class Pooled:
 
     @property
     def identity(self) -> float:
-        return float(sum(np.sum(j.right & j.shining) for j in self.some) / sum(np.sum(j.shining) for j in self.some))
+        return float(sum(np.sum(j.right & j.visible) for j in self.some) / sum(np.sum(j.visible) for j in self.some))
 
     @property
     def wrong_share(self) -> float:
         return sum(j.wrong for j in self.some) / sum(int(np.sum(j.labelled)) for j in self.some)
 
-    def nees(self, lit: bool = False) -> float:
-        """Mean NEES / 6 of all poses, or of those in the light."""
-        values = np.concatenate([j.nees[j.lit] if lit else j.nees for j in self.some])
+    def nees(self, observable: bool = False) -> float:
+        """Mean NEES / 6 of all poses, or of those in observable frames."""
+        values = np.concatenate([j.nees[j.observable] if observable else j.nees for j in self.some])
         return float(np.nanmean(values) / 6)
 
     def over_bound(self, rotation: bool = True) -> float:
-        """Root mean square error over the single-frame bound's, of the attitude or the position."""
+        """Ratio of the root mean square error of attitude or position to that of the single-frame bound."""
         part = slice(3, 6) if rotation else slice(0, 3)
-        squares = sum((np.sum(j.errors[j.lit][:, part] ** 2, axis=0) for j in self.some), np.zeros(3))
-        bounds = sum((np.sum(j.bound[j.lit][:, part], axis=0) for j in self.some), np.zeros(3))
+        squares = sum((np.sum(j.errors[j.observable][:, part] ** 2, axis=0) for j in self.some), np.zeros(3))
+        bounds = sum((np.sum(j.bound[j.observable][:, part], axis=0) for j in self.some), np.zeros(3))
         return float(np.sqrt(np.mean(squares / bounds)))
 
     def prediction_px(self) -> Array:
-        """(2,) root mean square error per axis of the places predicted for shining spots, after the start."""
-        values = np.concatenate([j.prediction[START:][j.shining[START:] & j.right[START:]] for j in self.some])
+        """Root mean square errors (2,) per axis of the pixels predicted for visible spots, after the start."""
+        values = np.concatenate([j.prediction[START:][j.visible[START:] & j.right[START:]] for j in self.some])
         return np.asarray(np.sqrt(np.nanmean(values**2, axis=0)))
 
 
-def around_bends(run: PointRun, which: str, frames: int, seed: int) -> Bools:
-    """What to hide (T, n): for so many frames about each bend `one` spot, `two`, a `screen` or `all`."""
+def around_jumps(run: PointRun, which: str, frames: int, seed: int) -> Bools:
+    """Occlusions (T, n) of so many frames about each velocity jump: of `one` spot, `two`, a `screen` or `all`."""
     rng = np.random.default_rng([seed, 7])
     hide = np.zeros(run.in_view.shape, dtype=bool)
     views, free = np.arange(hide.shape[1]), START
-    for bend in np.flatnonzero(run.turned).tolist():
-        first = bend - frames // 2 - int(rng.integers(0, 2))
+    for jump in np.flatnonzero(run.turned).tolist():
+        first = jump - frames // 2 - int(rng.integers(0, 2))
         if first < free:
             continue
         free = first + frames + START
@@ -180,15 +182,15 @@ def filmed(
     hide: Bools | None = None,
     prior: PriorRegion = NEAR_THE_ORIGIN,
 ) -> PointRun:
-    """A recording of a motion (T poses at t_s) as points, without false ones. hide (T, n): spots that do not shine."""
+    """A recording of a motion (T poses at t_s) as points, without false ones. hide (T, n): occluded spots."""
     model, frames = SpotModel.of(rig), len(t_s)
     uv = model.project(poses)[0]
     rng = np.random.default_rng([seed, 3])
-    shines = model.in_picture(uv) & ~(np.zeros(uv.shape[:2], dtype=bool) if hide is None else hide)
+    detected = model.in_picture(uv) & ~(np.zeros(uv.shape[:2], dtype=bool) if hide is None else hide)
     noisy = uv + noise_px * rng.normal(size=uv.shape)
     detections, origin = [], []
     for k in range(frames):
-        rows = [np.flatnonzero(shines[k] & (model.camera_of == c)) for c in range(len(model.camera_names))]
+        rows = [np.flatnonzero(detected[k] & (model.camera_of == c)) for c in range(len(model.camera_names))]
         cov = noise_px**2 * np.eye(2)
         detections.append(tuple(Detections.at(noisy[k, r], np.tile(cov, (len(r), 1, 1))) for r in rows))
         origin.append(tuple(rows))
@@ -204,7 +206,7 @@ def filmed(
         t_s=t_s,
         poses=poses,
         uv_px=uv,
-        in_view=np.where(model.in_picture(uv), np.where(shines, SHINING, HIDDEN), OUTSIDE),
+        in_view=np.where(model.in_picture(uv), np.where(detected, SHINING, HIDDEN), OUTSIDE),
         has_image=np.ones((frames, len(model.camera_names)), dtype=bool),
         turned=np.zeros(frames, dtype=bool) if turned is None else turned,
         detections=tuple(detections),
@@ -215,27 +217,28 @@ def filmed(
 def zig_zag(
     seed: int, frames: int, frame_rate_hz: float, every: int, rate_rad_s: float, start: Pose
 ) -> tuple[Pose, Array, Bools]:
-    """Poses (T), times (T,) and frames after a corner (T,): uniform motion between corners at random moments of a step.
+    """Uniform motion between corners at random moments of a step: poses (T), times (T,), frames after a corner (T,).
 
-    A corner every so many frames, forth and back; rate_rad_s: 1 sigma of each axis' angular rate, in m/s a third of it.
+    A corner every so many frames, forth and back; rate_rad_s: 1 sigma of the angular rate about each axis; that of the
+    velocities is a third of it, m/s.
     """
     rng = np.random.default_rng([seed, 5])
     t_s = np.arange(frames) / frame_rate_hz
     before = np.arange(every, frames - every // 2, every)  # the corner lies between this frame and the next
     knots = np.concatenate([[0.0], (before + rng.random(len(before))) / frame_rate_hz])
-    pace = rate_rad_s * rng.normal(size=(len(knots), 6)) * np.repeat([1 / 3, 1.0], 3)
-    pace = np.abs(pace) * np.sign(pace[0]) * (-1.0) ** np.arange(len(knots))[:, None]
+    velocities = rate_rad_s * rng.normal(size=(len(knots), 6)) * np.repeat([1 / 3, 1.0], 3)
+    velocities = np.abs(velocities) * np.sign(velocities[0]) * (-1.0) ** np.arange(len(knots))[:, None]
     at_knots = [start]
-    for length, velocity in zip(np.diff(knots), pace, strict=False):
+    for length, velocity in zip(np.diff(knots), velocities, strict=False):
         at_knots.append(at_knots[-1].plus(velocity * length))
     piece = np.searchsorted(knots, t_s, side="right") - 1
-    poses = [at_knots[i].plus(pace[i] * (t - knots[i])) for t, i in zip(t_s, piece, strict=True)]
+    poses = [at_knots[i].plus(velocities[i] * (t - knots[i])) for t, i in zip(t_s, piece, strict=True)]
     turned = np.isin(np.arange(frames), before + 1)
     return Pose(np.stack([p.rotation for p in poses]), np.stack([p.translation for p in poses])), t_s, turned
 
 
 def some_frames(run: PointRun, frames: Ints) -> PointRun:
-    """The same recording with only these frames: those between were never taken."""
+    """The same recording with only these frames, as if the others had been dropped."""
     return replace(
         run,
         frame=run.frame[frames],

@@ -1,4 +1,4 @@
-"""How many false points there are where spots are looked for, learnt as the run goes on."""
+"""Online estimate of the density of false points near the expected spots."""
 
 from __future__ import annotations
 
@@ -6,36 +6,37 @@ import numpy as np
 
 from geometry.arrays import Array, Ints
 from geometry.forward_model import SpotModel
+from tracking.rigid_body.association.frame_detections import CLUTTER_RADIUS_PX
 
-RADIUS_PX = 15.0  # of the discs around the expected spots in which false points are counted
-AREA_PX2 = np.pi * RADIUS_PX**2
+AREA_PX2 = np.pi * CLUTTER_RADIUS_PX**2
 START_PER_PX2 = 2e-4  # the paper's 20 % of false points within 15 px of a spot
-MEMORY = 300.0  # discs looked at
-LEAST_COUNT = 0.5  # false points that a picture is taken to have when it shows none
+MEMORY = 300.0  # discs: time constant of the estimate
+MIN_COUNT = 0.5  # false points that a picture without any is assumed to have
 
 
 class ClutterNearSpots:
-    """The density of false points, by camera: near spots as counted, or in the whole picture if that is more."""
+    """Density of false points by camera: as counted near spots, or that of the whole picture if it is higher."""
 
-    def __init__(self, model: SpotModel, least_per_px2: float) -> None:
+    def __init__(self, model: SpotModel, min_per_px2: float) -> None:
         self._camera_of = model.camera_of
         cameras = len(model.camera_names)
         self._area = np.array(
             [np.prod(model.image_size_px[model.camera_of == c][0]) if np.any(model.camera_of == c) else np.inf
              for c in range(cameras)]
         )  # fmt: skip
-        self._least = least_per_px2
+        self._min = min_per_px2
         self._near = np.full(cameras, START_PER_PX2)
 
     def log_density(self, first: Ints) -> tuple[Array, Array]:
-        """(n,) of each view, log of 1/px^2, in a frame whose cameras' detections begin at `first` (cameras + 1,): of
-        false points near spots, and the log of how much denser they are there than in the whole picture.
+        """Log density (n,) of false points near each view's spot, 1/px^2; its log ratio (n,) to the whole picture's.
+
+        first (cameras + 1,): where the rows of each camera begin among the frame's detections.
         """
-        whole = np.maximum(np.diff(first), LEAST_COUNT) / self._area
-        density = np.maximum(np.maximum(self._near, whole), self._least)
+        whole = np.maximum(np.diff(first), MIN_COUNT) / self._area
+        density = np.maximum(np.maximum(self._near, whole), self._min)
         return np.log(density)[self._camera_of], np.log(density / whole)[self._camera_of]
 
-    def learn(self, near: Array, discs: Array) -> None:
-        """Of one frame: how many false points (cameras,) lay within RADIUS_PX of how many expected spots (cameras,)."""
+    def update(self, false_points: Array, discs: Array) -> None:
+        """Take one frame: false points (cameras,) within CLUTTER_RADIUS_PX of so many expected spots (cameras,)."""
         share = discs / MEMORY
-        self._near += share * (near / (np.maximum(discs, 1.0) * AREA_PX2) - self._near)
+        self._near += share * (false_points / (np.maximum(discs, 1.0) * AREA_PX2) - self._near)

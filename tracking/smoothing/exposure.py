@@ -1,4 +1,4 @@
-"""What an exposure does to spots that move: a picture shows the mean of a path, a pose is asked for at mid-exposure."""
+"""Effect of the exposure time on moving spots: a picture shows the mean of a path, the pose is that at mid-exposure."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ import numpy as np
 from geometry.arrays import Array, Bools
 from geometry.compiled_projection import Views, project_all
 from geometry.pose import Pose
-from tracking.smoothing.fixed_interval import Reference
+from tracking.smoothing.motion.reference import Reference
 
 
 def exposure_offsets(views: Views, motion: Reference, exposure_s: float, steady: Bools) -> Array:
-    """Mean place of each view's spot over the exposure less its place in the middle (T, n, 2), px; 0 where unknown.
+    """Mean pixel of each view's spot over the exposure less that at its middle (T, n, 2); 0 where unknown.
 
-    motion: of T frames, at mid-exposure. A path with a steady acceleration a in the picture has its mean a T^2 / 24
-    beside its middle: Simpson's rule on the path of the spot, so that turning and the lens are in it. steady (T,):
-    frames whose velocity does not jump within the exposure; the others are left as they are. Ours.
+    motion: T frames, at mid-exposure. With a constant acceleration a in the picture the mean lies a T^2 / 24 from the
+    middle; Simpson's rule on the spot's path includes rotation and lens distortion. steady (T,): frames whose
+    velocities do not jump within the exposure; the others get 0. Source: ours.
     """
     frames = len(motion.t)
     out = np.zeros((frames, len(views), 2))
@@ -29,13 +29,13 @@ def exposure_offsets(views: Views, motion: Reference, exposure_s: float, steady:
         moved = pose.plus(step)
         ends += project_all(views, moved.rotation, moved.translation)[0]
     offset = (ends - 2 * middle) / 6
-    good = np.isfinite(offset).all(axis=-1) & steady[:, None]
-    out[good] = offset[good]
+    valid = np.isfinite(offset).all(axis=-1) & steady[:, None]
+    out[valid] = offset[valid]
     return out
 
 
-def moved_by(views: Views, motion: Reference, offsets: Array) -> Array:
-    """Pose errors (T, 6) that such offsets (T, n, 2), px, make: the least-squares fit to them."""
+def pose_shift(views: Views, motion: Reference, offsets: Array) -> Array:
+    """Pose errors (T, 6) that pixel offsets (T, n, 2) cause: their least-squares fit."""
     _, J = project_all(views, motion.R, motion.t)
     out = np.zeros((len(motion.t), 6))
     for k in np.flatnonzero(np.any(offsets != 0, axis=(1, 2))).tolist():

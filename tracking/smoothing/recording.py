@@ -1,4 +1,4 @@
-"""A run as the smoother wants it: detections and causal labels of all frames, compact."""
+"""A tracked run as the smoother's input: detections and causal labels of all frames."""
 
 from __future__ import annotations
 
@@ -14,15 +14,16 @@ from geometry.uncertainty.rig_parameters import RigCovariance
 from geometry.uncertainty.rig_uncertainty import CalibrationSpread
 from tracking.detections import UNMATCHED, Detections
 from tracking.parameters import TrackerParameters
-from tracking.rigid_body.association import BLENDED
+from tracking.rigid_body.association.frame_detections import BLENDED
+from tracking.smoothing.motion.run_detections import RunDetections
 from tracking.statuses import PoseStatus, SpotStatus
 from tracking.tracked_frame import TrackedFrame
 
 
 def assigned_in_one_list(tracked: TrackedFrame, start: Ints) -> Ints:
-    """The labels (n,) of a frame as rows of all its detections in one list, plus BLENDED; -1 without.
+    """A frame's labels as an assignment (n,): rows in the list of all cameras' detections, plus BLENDED; -1 without.
 
-    start (n,): where the detections of each view's camera begin.
+    start (n,): where the rows of each view's camera begin.
     """
     assigned = np.where(tracked.point == UNMATCHED, -1, tracked.point + start)
     if tracked.used_in_pose is not None:
@@ -31,7 +32,7 @@ def assigned_in_one_list(tracked: TrackedFrame, start: Ints) -> Ints:
 
 
 class TrackedRecording:
-    """Feed it each frame with what the causal tracker said of it; about 1 kB per frame is kept."""
+    """Collects each frame and the causal tracker's answer; keeps about 1 kB per frame."""
 
     def __init__(
         self,
@@ -40,7 +41,7 @@ class TrackedRecording:
         covariance: RigCovariance | None = None,
         exposure_s: float = 0.0,
     ) -> None:
-        """covariance: of the rig's calibration, where it is known. exposure_s: of each picture; 0: a moment."""
+        """covariance: of the rig's calibration, if known. exposure_s: of each picture; 0: an instant."""
         self.rig = rig
         self.model = SpotModel.of(rig)
         self.parameters = parameters
@@ -53,7 +54,7 @@ class TrackedRecording:
         self._first: list[Ints] = []
         self._has_image: list[Bools] = []
         self._assigned: list[Ints] = []
-        self._bent: list[bool] = []
+        self._jumped: list[bool] = []
         self._measured: list[bool] = []
         self._pose: list[Array] = []
 
@@ -61,7 +62,7 @@ class TrackedRecording:
         return len(self._dt)
 
     def append(self, dt_s: float, found: Sequence[Detections | None], tracked: TrackedFrame) -> None:
-        """One frame; dt_s since the one before (0 for the first)."""
+        """Add a frame; dt_s: time since the one before (0 for the first)."""
         counts = [0 if f is None else len(f) for f in found]
         first = np.zeros(len(found) + 1, dtype=np.int64)
         np.cumsum(counts, out=first[1:])
@@ -74,7 +75,7 @@ class TrackedRecording:
         self._first.append(first)
         self._has_image.append(np.array([f is not None for f in found]))
         self._assigned.append(assigned_in_one_list(tracked, first[self.model.camera_of]))
-        self._bent.append(SpotStatus.TURNED in tracked.status)
+        self._jumped.append(SpotStatus.TURNED in tracked.status)
         self._measured.append(tracked.pose_status is PoseStatus.MEASURED)
         pose = np.full((4, 3), np.nan)
         if tracked.pose is not None:
@@ -83,7 +84,7 @@ class TrackedRecording:
 
     @property
     def dt_s(self) -> Array:
-        """(T,)"""
+        """(T,) time since the frame before."""
         return np.array(self._dt)
 
     @property
@@ -97,17 +98,17 @@ class TrackedRecording:
         return np.array(self._measured, dtype=bool)
 
     @property
-    def bent(self) -> Bools:
-        """(T,): frames in which the tracker saw the trajectory bend."""
-        return np.array(self._bent, dtype=bool)
+    def jumped(self) -> Bools:
+        """(T,): frames in which the tracker found that the velocities had jumped in the step before."""
+        return np.array(self._jumped, dtype=bool)
 
     @property
     def assigned(self) -> Ints:
-        """(T, n): row in the frame's detections (all cameras in one list), plus BLENDED; -1 without."""
+        """(T, n): row in the list of all cameras' detections of the frame, plus BLENDED; -1 without."""
         return np.array(self._assigned, dtype=np.int64).reshape(len(self), len(self.model))
 
     def found(self, k: int) -> list[Detections | None]:
-        """Frame k's detections by camera, None without a picture, as a tracker wants them; without brightness."""
+        """Frame k's detections by camera as a tracker's input, None without a picture; without brightness."""
         uv, cov, size, first, has_image = self.detections(k)
         out: list[Detections | None] = []
         for c, there in enumerate(has_image):
@@ -117,7 +118,27 @@ class TrackedRecording:
         return out
 
     def detections(self, k: int) -> tuple[Array, Array, Array, Ints, Bools]:
-        """Of frame k: pixels (m, 2), covariances (m, 2, 2), larger half axes (m,), px, nan where not known; where each
-        camera's begin (cameras + 1,), which cameras have a picture.
+        """Frame k's m detections, sorted by camera.
+
+        Pixels (m, 2), covariances (m, 2, 2), larger half axes (m,), px, nan where not known; where the rows of each
+        camera begin (cameras + 1,); which cameras have a picture (cameras,).
         """
         return self._uv[k], self._cov[k], self._size[k], self._first[k], self._has_image[k]
+
+    def run_detections(self) -> RunDetections:
+        """All detections of the run."""
+        frames = [self.detections(k) for k in range(len(self))]
+        counts = [len(f[0]) for f in frames]
+        cameras = len(self.model.camera_names)
+        size = np.concatenate([np.zeros(0), *[f[2] for f in frames]])
+        return RunDetections(
+            uv=np.concatenate([np.zeros((0, 2)), *[f[0] for f in frames]]),
+            cov=np.concatenate([np.zeros((0, 2, 2)), *[f[1] for f in frames]]),
+            blend_px=np.where(np.isnan(size), 0.0, self.parameters.blend_px),
+            begin=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
+            first=np.array([f[3] for f in frames], dtype=np.int64).reshape(-1, cameras + 1),
+            has_image=np.array([f[4] for f in frames], dtype=bool).reshape(-1, cameras),
+            log_static=np.full(len(size), -np.inf),
+            size_px=size,
+            usual_size_px=np.full(len(self.model), np.nan),
+        )

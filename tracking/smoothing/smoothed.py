@@ -1,4 +1,4 @@
-"""What the second look at a run says of it, frame by frame."""
+"""Result of the smoothing pass, and its answer for each frame."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from tracking.detections import UNMATCHED, Detections
 from tracking.parameters import TrackerParameters
-from tracking.rigid_body.association import BLENDED
+from tracking.rigid_body.association.frame_detections import BLENDED
 from tracking.smoothing.error_scale import width_covariance
 from tracking.statuses import PoseStatus, SpotStatus, view_statuses
 from tracking.tracked_frame import Event, MotionEstimate, TrackedFrame
@@ -21,40 +21,40 @@ from tracking.tracked_frame import Event, MotionEstimate, TrackedFrame
 
 @dataclass(frozen=True, slots=True)
 class Smoothed:
-    """A run's motion and labels given all its frames: T frames, n views."""
+    """A run's motion and labels given all of its frames: T frames, n views."""
 
     model: SpotModel
     parameters: TrackerParameters
     poses: Pose  # (T,) at mid-exposure
-    exposure_px: Array  # (T, n, 2) mean place of a spot over the exposure less its place in the middle
+    exposure_px: Array  # (T, n, 2) mean pixel of a spot over the exposure less that at its middle
     velocities: Array  # (T, 6): m/s in world, rad/s in body
-    covariance: Array  # (T, 6, 6) of the poses, of noise and of errors that stay in their place
-    place_share: float  # of the spots' error variance that stays in its place (tracking/smoothing/place_errors.py)
-    systematic: Array  # (T or 1, 6, 6) and the calibration's share to be added
+    covariance: Array  # (T, 6, 6) of the poses, from noise and from errors that belong to places
+    place_share: float  # share of the spots' error variance that belongs to places (place_errors.py)
+    systematic: Array  # (T or 1, 6, 6) the calibration's share, to be added
     motion_covariance: Array  # (T, 6, 6) of the velocities
-    known: Bools  # (T,): the pose says something
+    known: Bools  # (T,): the pose is not lost
     measured: Bools  # (T,): the pose is observable from this frame's spots alone
-    assigned: Ints  # (T, n): row in the frame's detections (all cameras in one list), plus BLENDED; -1 without
-    probability: Array  # (T, n) of the best label, given or left open; nan without
-    first: Ints  # (T, cameras + 1): where each camera's detections begin
-    rms_px: Array  # (T,) of the frame's own fit
+    assigned: Ints  # (T, n): row in the list of all cameras' detections of the frame, plus BLENDED; -1 without
+    probability: Array  # (T, n) of the best label, given or left open; nan without one
+    first: Ints  # (T, cameras + 1): where the rows of each camera begin
+    rms_px: Array  # (T,) residuals of the frame's spots, per axis
     jerk: Array  # (2,) m/s^3 and rad/s^3 per sqrt(Hz), of translation and rotation
-    iterations: int  # rounds of smoothing and labelling
+    iterations: int  # rounds of motion and labels
     relabelled: int  # labels that differ from the causal ones
-    width_share: float  # errors beyond the claims, as a share of the spots' sigmas
-    noise_scale: float  # how much larger than claimed the spots' errors are
-    calibration_cov: Array  # (n, 2, 2) of the calibration's errors, on the expected pixels
+    width_share: float  # errors beyond the stated ones, as a share of the spots' widths (1 sigma)
+    noise_scale: float  # ratio of the spots' errors to their stated sigmas
+    calibration_cov: Array  # (n, 2, 2) px^2: covariance of the expected pixels due to calibration errors
 
     @property
     def frames(self) -> int:
-        """T"""
+        """Number of frames T."""
         return len(self.known)
 
     def frame(self, k: int, causal: TrackedFrame, found: Sequence[Detections | None]) -> TrackedFrame:
-        """Frame k as the causal tracker's, with what the whole run says of labels, pose and motion.
+        """The causal tracker's answer for frame k with the smoothed labels, pose and motion.
 
-        `predicted_px` and `gain` stay: they are about what was known before. Events of the search stay, those about
-        labels left open are replaced.
+        `predicted_px` and `gain` stay: they concern what was known before the frame. Events of the search stay; those
+        about labels left open are replaced.
         """
         model = self.model
         known = bool(self.known[k])
@@ -72,8 +72,8 @@ class Smoothed:
             assert points is not None
             uv_px[v] = points.uv_px[point[v]] - self.exposure_px[k, v]
             row = point[v : v + 1]
-            claimed = (points.cov_px2[row] + width_covariance(points.major_px[row], self.width_share))[0]
-            cov_px2[v] = claimed * self.noise_scale**2
+            stated = (points.cov_px2[row] + width_covariance(points.major_px[row], self.width_share))[0]
+            cov_px2[v] = stated * self.noise_scale**2
             cov_px2[v] += self.parameters.sigma_model_px**2 * np.eye(2)
             if assigned[v] >= BLENDED:
                 cov_px2[v] += (self.parameters.blend_px / 2) ** 2 * np.eye(2)
@@ -108,8 +108,9 @@ class Smoothed:
         )
 
     def _label_probability(self, k: int, causal: TrackedFrame, known: bool) -> Array | None:
-        """(n,) that each label is right; nan without a label. The labels of `method: spots` stay as that tracker gave
-        them, and so does what it says of them (None: it estimates no probability).
+        """Probability (n,) of each label; nan without a label.
+
+        The labels of `method: spots` stay as that tracker gave them, and so do its probabilities (None: it has none).
         """
         if self.parameters.method != "rigid":
             return causal.label_probability
@@ -124,7 +125,7 @@ class Smoothed:
                 for v in np.flatnonzero((p < self.parameters.min_label_probability) & (point == UNMATCHED))
             ]
             events += [
-                Event("changed", "the frames after it show that it was another point of light", int(v))
+                Event("changed", "later frames show that it was another point of light", int(v))
                 for v in np.flatnonzero((point != causal.point) & (causal.point != UNMATCHED))
             ]
         return tuple(events)

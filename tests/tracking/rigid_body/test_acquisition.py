@@ -18,7 +18,7 @@ ANGLES_DEG = (-5.0, 5.0)
 
 
 def two_beams(focal_px: float) -> Rig:
-    """Two beams 10 deg apart, both ends seen, screens 2.5 m away on either side: spots 44 cm apart."""
+    """Two beams 10 deg apart with both ends visible on screens 2.5 m away on either side: spots 44 cm apart."""
     like = fan()
     cameras = {}
     for name, camera in like.cameras.items():
@@ -53,15 +53,15 @@ def test_a_vehicle_at_rest_with_two_beams_is_found_in_the_first_frames(focal_px,
         causal = tracked(run)
         of = judged(run, causal)
         assert of.wrong == 0
-        assert of.shining.sum() >= 0.8 * of.shining.size
-        assert np.array_equal(of.right[3:], of.shining[3:])
+        assert of.visible.sum() >= 0.8 * of.visible.size
+        assert np.array_equal(of.right[3:], of.visible[3:])
         assert all(f.pose_status is PoseStatus.MEASURED for f in causal[3:])
         again, _ = looked_at_again(run, causal)
         assert judged(run, again).identity == 1.0
 
 
-def test_a_vehicle_is_found_at_once_when_light_returns_wherever_the_prediction_has_drifted():
-    """A swing that is cut off in full motion: after a second in the dark the prediction shows no spot any more."""
+def test_a_vehicle_is_found_at_once_after_an_occlusion_wherever_the_prediction_has_drifted():
+    """A swing that is occluded in full motion: after a second the prediction puts no spot on the screens any more."""
     for seed in range(3):
         frames, rate = 90, 30.0
         t = np.arange(frames) / rate
@@ -70,10 +70,10 @@ def test_a_vehicle_is_found_at_once_when_light_returns_wherever_the_prediction_h
             np.stack([yaw, 0.5 * yaw, 0 * yaw], axis=1), np.stack([0.02 * yaw, yaw * 0.3, 0 * yaw], 1)
         )
         run = filmed(two_beams(1500.0), poses, t, 0.05, seed)
-        dark = np.zeros_like(run.in_view, dtype=bool)
-        dark[30:62] = True
-        run = hidden(run, dark)
+        occluded = np.zeros_like(run.in_view, dtype=bool)
+        occluded[30:62] = True
+        run = hidden(run, occluded)
         of = judged(run, tracked(run))
         assert of.wrong == 0
-        assert np.array_equal(of.right[63:], of.shining[63:])
-        assert of.shining[63:].sum() > 60
+        assert np.array_equal(of.right[63:], of.visible[63:])
+        assert of.visible[63:].sum() > 60

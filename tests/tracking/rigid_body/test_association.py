@@ -1,4 +1,4 @@
-"""Which detection is which spot: the joint search against trying every assignment."""
+"""Data association: the joint search against all assignments."""
 
 from __future__ import annotations
 
@@ -13,29 +13,26 @@ from geometry.arrays import Array, Ints
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from lab.simulate.rigs import RIGS
-from tracking.rigid_body.association import (
-    BEHIND,
+from tracking.rigid_body.association.frame_detections import (
     BLENDED,
-    CROWD_PX,
-    GATE,
-    NOT_LOOKED_FOR,
+    CLUTTER_RADIUS_PX,
+    NOT_SEARCHED,
     DetectionModel,
     FrameDetections,
+    Observation,
     ViewTable,
-    associate,
     distinct_spots,
-    in_picture,
-    is_blended,
-    log_clutter_ratio,
 )
-from tracking.rigid_body.occlusion import MISSED
+from tracking.rigid_body.association.joint_search import BEAM_PRUNE_NATS, GATE_CHI2, associate
+from tracking.rigid_body.association.likelihood import is_blended, log_clutter_ratio, p_in_picture
+from tracking.rigid_body.models.occlusion import MISSED
 
 RIG = RIGS["fan"]()
 MODEL = SpotModel.of(RIG)
 N = len(MODEL)
-SIGHTS = ViewTable.of(RIG, MODEL)
-CHANCES = DetectionModel(0.95, 0.01)
-SHOWN = np.full(N, 0.97)
+VIEW_TABLE = ViewTable.of(RIG, MODEL)
+DETECTION_MODEL = DetectionModel(0.95, 0.01)
+P_UNOCCLUDED = np.full(N, 0.97)
 POSE = Pose.from_ypr(np.deg2rad([7.0, 0.0, 0.0]), np.zeros(3))
 EXPECTED, JACOBIAN = MODEL.project(POSE)
 # A pose known to 0.5 mm and 0.3 mrad: spots to about a pixel, against a noise of 0.1 px.
@@ -46,7 +43,7 @@ LOG_CLUTTER = float(np.log(1e-3))
 
 @dataclass(frozen=True)
 class Found:
-    """What the search says, best first."""
+    """Result of the search, best first."""
 
     assigned: Ints
     score: Array
@@ -54,30 +51,32 @@ class Found:
 
 
 def frame_of(
-    points: list[Array], has_image: tuple[bool, bool] = (True, True), blend_px: float = 0.0, grown: float = 1.0
+    points: list[Array], has_image: tuple[bool, bool] = (True, True), blend_px: float = 0.0, widening: float = 1.0
 ) -> FrameDetections:
-    """A frame with these pixels (k, 2) per camera; grown: how much wider than usual each point is."""
+    """A frame with these pixels (k, 2) per camera; widening: ratio of each point's size to the usual one."""
     uv = np.concatenate([np.zeros((0, 2)), *points])
     first = np.concatenate([[0], np.cumsum([len(p) for p in points])]).astype(np.int64)
     cov = np.tile(SIGMA_PX**2 * np.eye(2), (len(uv), 1, 1))
     m = len(uv)
     return FrameDetections(
         uv, cov, np.full(m, blend_px), first, np.array(has_image), np.full(N, LOG_CLUTTER),
-        np.full(m, -np.inf), np.full(m, 2.0 * grown), np.full(N, 2.0), np.zeros(N),
+        np.full(m, -np.inf), np.full(m, 2.0 * widening), np.full(N, 2.0), np.zeros(N),
     )  # fmt: skip
+
+
+def observed(frame: FrameDetections, calibration_cov: Array | None = None) -> Observation:
+    cov = np.zeros((N, 2, 2)) if calibration_cov is None else calibration_cov
+    return Observation(MODEL.numbers, VIEW_TABLE, DETECTION_MODEL, cov, frame)
 
 
 def search(frame: FrameDetections, P: Array = P_NEAR, pose: Pose = POSE, calibration_cov: Array | None = None) -> Found:
-    none = np.zeros((N, 2, 2))
-    found = associate(
-        MODEL.numbers, SIGHTS, frame, CHANCES, np.ascontiguousarray(pose.rotation), pose.translation, P, SHOWN,
-        none if calibration_cov is None else calibration_cov,
-    )  # fmt: skip
+    R, t = np.ascontiguousarray(pose.rotation), pose.translation
+    found = associate(observed(frame, calibration_cov), R, t, P, P_UNOCCLUDED)
     return Found(*found[:3])
 
 
 def injections(views: Ints, points: range) -> Iterator[tuple[int, ...]]:
-    """All ways to give each of some views another point or none."""
+    """All ways to assign to each of some views a different point or none."""
     for k in range(min(len(views), len(points)) + 1):
         for some in combinations(range(len(views)), k):
             for chosen in permutations(points, k):
@@ -88,12 +87,14 @@ def injections(views: Ints, points: range) -> Iterator[tuple[int, ...]]:
 
 
 def log_likelihood(frame: FrameDetections, views: Ints, assigned: tuple[int, ...], P: Array) -> tuple[float, float]:
-    """One Gaussian of all pixels together, against false points; and the largest squared distance of a spot from what
-    the others of this assignment and the prior say, which a gate would look at last.
+    """Log-likelihood with one Gaussian of all pixels together, against false points.
+
+    Also the largest squared Mahalanobis distance of a spot from its prediction by the prior and all other spots of the
+    assignment, which is what the search's last gate sees.
     """
     score, rows, at = 0.0, [], []
     for v, d in zip(views, assigned, strict=True):
-        p = CHANCES.detect * SHOWN[v]
+        p = DETECTION_MODEL.p_detect * P_UNOCCLUDED[v]
         score += np.log(1 - p) if d == MISSED else np.log(p) - LOG_CLUTTER
         if d != MISSED:
             rows.append(v)
@@ -103,12 +104,12 @@ def log_likelihood(frame: FrameDetections, views: Ints, assigned: tuple[int, ...
     H = JACOBIAN[rows].reshape(-1, 6)
     S = H @ P @ H.T + SIGMA_PX**2 * np.eye(len(H))
     y = (frame.uv[at] - EXPECTED[rows]).ravel()
-    # Of each spot given the others: its block of the inverse.
+    # Each spot given the others: from its block of the inverse.
     inverse = np.linalg.inv(S)
     z = (inverse @ y).reshape(-1, 2)
-    far = [z[i] @ np.linalg.solve(inverse[2 * i : 2 * i + 2, 2 * i : 2 * i + 2], z[i]) for i in range(len(rows))]
+    distances2 = [z[i] @ np.linalg.solve(inverse[2 * i : 2 * i + 2, 2 * i : 2 * i + 2], z[i]) for i in range(len(rows))]
     gaussian = -0.5 * float(y @ z.ravel() + np.linalg.slogdet(2 * np.pi * S)[1])
-    return score + gaussian, max(far)
+    return score + gaussian, max(distances2)
 
 
 def scattered(rng: np.random.Generator, cameras: tuple[bool, bool], most: int) -> FrameDetections:
@@ -129,8 +130,8 @@ ONE, BOTH = (True, False), (True, True)
 
 
 @pytest.mark.parametrize(("cameras", "most", "seeds"), [(ONE, 4, range(60)), (BOTH, 3, range(60, 70))])
-def test_the_best_assignment_is_the_best_of_all(cameras, most, seeds):
-    judged = 0
+def test_the_search_finds_the_best_of_all_assignments(cameras, most, seeds):
+    compared = 0
     for seed in seeds:
         frame = scattered(np.random.default_rng(seed), cameras, most)
         by_camera = []
@@ -141,14 +142,14 @@ def test_the_best_assignment_is_the_best_of_all(cameras, most, seeds):
         scores = {}
         for parts in product(*(some for _, some in by_camera)):
             assigned = sum(parts, ())
-            score, far = log_likelihood(frame, views, assigned, P_NEAR)
-            if far < 0.9 * GATE:  # the search's gates see some of the others only, and are narrower or as wide
+            score, distance2 = log_likelihood(frame, views, assigned, P_NEAR)
+            if distance2 < 0.9 * GATE_CHI2:  # the search's earlier gates, with fewer spots, are at least as wide
                 scores[assigned] = score
         found = search(frame)
         assert np.all(np.diff(found.score) <= 0)
         elsewhere = np.setdiff1d(np.arange(N), views)
-        assert np.all(found.assigned[:, elsewhere] == NOT_LOOKED_FOR)
-        # 0.03 nats: over a pixel the projection is straight to a thousandth of one.
+        assert np.all(found.assigned[:, elsewhere] == NOT_SEARCHED)
+        # 0.03 nats: over a pixel the projection is linear to a thousandth of a pixel.
         best = max(scores, key=lambda a: scores[a])
         assert found.score[0] == pytest.approx(scores[best], abs=0.03)
         for row, score in zip(found.assigned[:, views], found.score, strict=True):
@@ -156,20 +157,20 @@ def test_the_best_assignment_is_the_best_of_all(cameras, most, seeds):
                 assert score == pytest.approx(scores[tuple(row)], abs=0.03)
         rivals = [s for s in scores.values() if s > scores[best] - 0.1]
         if len(rivals) == 1:
-            judged += 1
+            compared += 1
             assert tuple(found.assigned[0, views]) == best
-    assert judged >= 0.8 * len(seeds)
+    assert compared >= 0.8 * len(seeds)
 
 
-def test_the_gaussian_terms_can_be_taken_out_of_a_score():
+def test_the_score_is_also_given_without_its_gaussian_terms():
     frame = frame_of([EXPECTED[MODEL.camera_of == c] for c in range(2)])
     found = search(frame)
     np.testing.assert_array_equal(found.assigned[0], np.argsort(np.argsort(MODEL.camera_of, kind="stable")))
-    assert found.counted[0] == pytest.approx(N * (np.log(CHANCES.detect * SHOWN[0]) - LOG_CLUTTER))
+    assert found.counted[0] == pytest.approx(N * (np.log(DETECTION_MODEL.p_detect * P_UNOCCLUDED[0]) - LOG_CLUTTER))
 
 
-def test_a_false_point_in_the_first_gate_is_not_taken_once_the_other_spots_have_narrowed_it():
-    # A pose known to 5 mm and 3 mrad leaves a spot a gate of dozens of pixels; five others leave it less than one.
+def test_a_false_point_in_the_first_gate_is_rejected_once_the_other_spots_have_narrowed_it():
+    # A pose known to 5 mm and 3 mrad gives a spot a gate of dozens of pixels; five other spots reduce it below one.
     P = 100 * P_NEAR
     view = 2
     wide = JACOBIAN[view] @ P @ JACOBIAN[view].T
@@ -180,15 +181,15 @@ def test_a_false_point_in_the_first_gate_is_not_taken_once_the_other_spots_have_
     camera = MODEL.camera_of[view]
     alone = [false[None] if c == camera else np.zeros((0, 2)) for c in range(2)]
     taken = search(frame_of(alone), P).assigned[0]
-    assert np.count_nonzero(taken >= 0) == 1  # by itself it may be a spot ...
+    assert np.count_nonzero(taken >= 0) == 1  # alone it may be a spot ...
     together = [np.concatenate([others[c], alone[c]]) for c in range(2)]
     found = search(frame_of(together), P).assigned[0]
-    assert found[view] == MISSED  # ... and among the others it is none
+    assert found[view] == MISSED  # ... but not with the others
     assert np.all(np.delete(found, view) >= 0)
 
 
 def test_errors_of_the_calibration_widen_the_gates():
-    # A spot whose own calibration is a pixel off, where all others fit.
+    # One spot is a pixel off through its calibration; all others fit.
     shifted = EXPECTED.copy()
     shifted[4] += [1.0, -0.5]
     frame = frame_of([shifted[MODEL.camera_of == c] for c in range(2)])
@@ -198,21 +199,21 @@ def test_errors_of_the_calibration_widen_the_gates():
     assert search(frame, 1e-4 * P_NEAR, calibration_cov=calibration_cov).assigned[0, 4] >= 0
 
 
-def test_a_spot_that_melted_into_a_neighbour_keeps_its_label_but_costs_what_that_is_worth():
+def test_a_spot_that_has_merged_with_a_neighbour_stays_labelled_at_the_cost_of_its_improbability():
     shifted = EXPECTED.copy()
     shifted[4] += [2.0, 0.0]
     points = [shifted[MODEL.camera_of == c] for c in range(2)]
     assert search(frame_of(points), 1e-4 * P_NEAR).assigned[0, 4] == MISSED
-    found = search(frame_of(points, blend_px=3.0, grown=1.2), 1e-4 * P_NEAR)
+    found = search(frame_of(points, blend_px=3.0, widening=1.2), 1e-4 * P_NEAR)
     assert found.assigned[0, 4] >= BLENDED
-    honest = search(
-        frame_of([EXPECTED[MODEL.camera_of == c] for c in range(2)], blend_px=3.0, grown=1.2), 1e-4 * P_NEAR
+    separate = search(
+        frame_of([EXPECTED[MODEL.camera_of == c] for c in range(2)], blend_px=3.0, widening=1.2), 1e-4 * P_NEAR
     )
-    assert honest.score[0] > found.score[0] + 4
+    assert separate.score[0] > found.score[0] + 4
 
 
 def at_the_border(past_px: float) -> tuple[Pose, int]:
-    """A pose that puts one spot so far beyond its picture's left or right border, and the spot."""
+    """A pose that puts one spot this far outside the left or right border of its picture, and the view."""
     view, pose = 2, POSE
     width = float(MODEL.image_size_px[view, 0])
     for _ in range(20):
@@ -223,21 +224,21 @@ def at_the_border(past_px: float) -> tuple[Pose, int]:
     return pose, view
 
 
-def chance_in_picture(view: int, pose: Pose, P: Array) -> float:
+def probability_in_picture(view: int, pose: Pose, P: Array) -> float:
     uv, J = MODEL.project(pose)
     S = J[view] @ P @ J[view].T
     width, height = MODEL.image_size_px[view]
-    return in_picture(uv[view, 0], uv[view, 1], S[0, 0], S[1, 1], float(width), float(height))
+    return p_in_picture(uv[view, 0], uv[view, 1], S[0, 0], S[1, 1], float(width), float(height))
 
 
 def only(view: int, points: Array) -> FrameDetections:
-    """A frame in whose picture there is nothing but these points."""
+    """A frame whose only points are these, in the picture of a view."""
     camera = MODEL.camera_of[view]
     return frame_of([points if c == camera else np.zeros((0, 2)) for c in range(2)])
 
 
-def test_a_spot_at_the_pictures_border_is_taken_if_it_is_there_and_hardly_missed_if_it_is_not():
-    for past, chance in ((-30.0, 1.0), (0.0, 0.5), (30.0, 0.0)):
+def test_a_spot_at_the_pictures_border_is_found_if_it_is_there_and_its_miss_costs_little_if_not():
+    for past, probability in ((-30.0, 1.0), (0.0, 0.5), (30.0, 0.0)):
         pose, view = at_the_border(past)
         uv, J = MODEL.project(pose)
         P = 4 * P_NEAR
@@ -246,24 +247,24 @@ def test_a_spot_at_the_pictures_border_is_taken_if_it_is_there_and_hardly_missed
         found = search(only(view, inside[None]), P, pose)
         none = search(only(view, np.zeros((0, 2))), P, pose)
         if past > 0:
-            assert none.assigned[0, view] == NOT_LOOKED_FOR
-            assert found.assigned[0, view] == NOT_LOOKED_FOR
+            assert none.assigned[0, view] == NOT_SEARCHED
+            assert found.assigned[0, view] == NOT_SEARCHED
             continue
         assert found.assigned[0, view] == 0
-        there = [chance_in_picture(i, pose, P) for i in range(N)]
-        assert there[view] == pytest.approx(chance, abs=1e-6)
-        cost = np.log(1 - CHANCES.detect * SHOWN * there)[none.assigned[0] == MISSED].sum()
+        there = [probability_in_picture(i, pose, P) for i in range(N)]
+        assert there[view] == pytest.approx(probability, abs=1e-6)
+        cost = np.log(1 - DETECTION_MODEL.p_detect * P_UNOCCLUDED * there)[none.assigned[0] == MISSED].sum()
         assert none.score[0] == pytest.approx(cost, abs=1e-3)
 
 
-def test_a_camera_without_a_picture_is_not_asked():
+def test_a_camera_without_a_picture_is_not_searched():
     frame = frame_of([EXPECTED[MODEL.camera_of == 0], np.zeros((0, 2))], (True, False))
     found = search(frame)
-    assert np.all(found.assigned[:, MODEL.camera_of == 1] == NOT_LOOKED_FOR)
+    assert np.all(found.assigned[:, MODEL.camera_of == 1] == NOT_SEARCHED)
     assert np.all(found.assigned[0, MODEL.camera_of == 0] >= 0)
 
 
-def test_no_point_is_two_spots_and_no_assignment_is_hopelessly_behind():
+def test_no_point_is_two_spots_and_much_less_likely_assignments_are_dropped():
     rng = np.random.default_rng(8)
     for _ in range(5):
         frame = scattered(rng, (True, True), 4)
@@ -272,49 +273,51 @@ def test_no_point_is_two_spots_and_no_assignment_is_hopelessly_behind():
             taken = row[row >= 0] % BLENDED
             assert len(set(taken.tolist())) == len(taken)
         assert len({tuple(row) for row in found.assigned}) == len(found.assigned)
-        assert found.score[0] - found.score[-1] <= BEHIND
+        assert found.score[0] - found.score[-1] <= BEAM_PRUNE_NATS
 
 
-def crowd_at(frame: FrameDetections, pose: Pose, P: Array = 1e-4 * P_NEAR) -> float:
-    return log_clutter_ratio(MODEL.numbers, SIGHTS, frame, np.ascontiguousarray(pose.rotation), pose.translation, P)
+def clutter_ratio(frame: FrameDetections, pose: Pose, P: Array = 1e-4 * P_NEAR) -> float:
+    return log_clutter_ratio(observed(frame), np.ascontiguousarray(pose.rotation), pose.translation, P)
 
 
 def beside_the_spots(px: float) -> list[Array]:
     return [EXPECTED[MODEL.camera_of == c] + [px, 0.0] for c in range(2)]
 
 
-def test_only_points_near_a_spots_place_are_expected_to_be_clutter_of_spots():
-    frame = frame_of(beside_the_spots(1.0))._replace(log_crowding=np.full(N, 3.0))
-    # Twice the disc's mean density in its middle.
-    assert crowd_at(frame, POSE) == pytest.approx(N * np.log(1 + 2 * (np.exp(3.0) - 1)), rel=0.01)
-    farther = frame_of(beside_the_spots(CROWD_PX))._replace(log_crowding=np.full(N, 3.0))
-    assert 0 < crowd_at(farther, POSE) < 0.6 * crowd_at(frame, POSE)
-    # A vehicle elsewhere, all of whose spots would be hidden, has none of these points for its own clutter.
+def test_only_points_near_an_expected_spot_count_as_clutter_near_spots():
+    frame = frame_of(beside_the_spots(1.0))._replace(log_clutter_excess=np.full(N, 3.0))
+    # At its centre, twice the mean density of the disc.
+    assert clutter_ratio(frame, POSE) == pytest.approx(N * np.log(1 + 2 * (np.exp(3.0) - 1)), rel=0.01)
+    farther = frame_of(beside_the_spots(CLUTTER_RADIUS_PX))._replace(log_clutter_excess=np.full(N, 3.0))
+    assert 0 < clutter_ratio(farther, POSE) < 0.6 * clutter_ratio(frame, POSE)
+    # None of these points is near the spots of a vehicle elsewhere.
     elsewhere = POSE.plus(np.array([0, 0.3, 0.3, 0, 0, 0]))
-    assert np.nanmin(np.linalg.norm(MODEL.project(elsewhere)[0] - EXPECTED, axis=1)) > 4 * CROWD_PX
-    assert crowd_at(frame, elsewhere) == pytest.approx(0.0, abs=1e-6)
-    # Two points beside one spot count both.
+    assert np.nanmin(np.linalg.norm(MODEL.project(elsewhere)[0] - EXPECTED, axis=1)) > 4 * CLUTTER_RADIUS_PX
+    assert clutter_ratio(frame, elsewhere) == pytest.approx(0.0, abs=1e-6)
+    # Two points near one spot both count.
     points = beside_the_spots(0.0)
-    twice = frame_of([np.concatenate([points[0], points[0] + 1.0]), points[1]])._replace(log_crowding=np.full(N, 3.0))
+    twice = frame_of([np.concatenate([points[0], points[0] + 1.0]), points[1]])._replace(
+        log_clutter_excess=np.full(N, 3.0)
+    )
     beside_two = N + np.count_nonzero(MODEL.camera_of == 0)
-    assert crowd_at(twice, POSE) == pytest.approx(crowd_at(frame, POSE) * beside_two / N, rel=0.01)
+    assert clutter_ratio(twice, POSE) == pytest.approx(clutter_ratio(frame, POSE) * beside_two / N, rel=0.01)
 
 
-def test_false_points_near_spots_count_as_far_as_the_spots_places_are_known():
-    frame = frame_of(beside_the_spots(4.0))._replace(log_crowding=np.full(N, 3.0))
-    sharper_first = [crowd_at(frame, POSE, scale * P_NEAR) for scale in (1e-4, 1e2, 1e3, 1e4, 1e8)]
+def test_false_points_near_spots_count_more_the_better_the_spots_places_are_known():
+    frame = frame_of(beside_the_spots(4.0))._replace(log_clutter_excess=np.full(N, 3.0))
+    sharper_first = [clutter_ratio(frame, POSE, scale * P_NEAR) for scale in (1e-4, 1e2, 1e3, 1e4, 1e8)]
     assert all(a > b > 0 for a, b in pairwise(sharper_first))
     assert sharper_first[-1] < 0.01
 
 
-def test_points_that_stay_in_their_place_are_nobodys_crowd():
-    frame = frame_of(beside_the_spots(1.0))._replace(log_crowding=np.full(N, 3.0))
-    every = crowd_at(frame, POSE)
+def test_static_points_do_not_count_as_clutter_near_spots():
+    frame = frame_of(beside_the_spots(1.0))._replace(log_clutter_excess=np.full(N, 3.0))
+    every = clutter_ratio(frame, POSE)
     frame.log_static[0] = LOG_CLUTTER + 2.0
-    assert crowd_at(frame, POSE) == pytest.approx(every * (N - 1) / N, rel=0.01)
+    assert clutter_ratio(frame, POSE) == pytest.approx(every * (N - 1) / N, rel=0.01)
 
 
-def test_a_point_where_static_ones_are_is_hardly_a_spot():
+def test_a_point_at_a_static_place_is_an_unlikely_spot():
     points = [EXPECTED[MODEL.camera_of == c] for c in range(2)]
     plain, static = frame_of(points), frame_of(points)
     static.log_static[:] = LOG_CLUTTER + 4.0
@@ -323,23 +326,23 @@ def test_a_point_where_static_ones_are_is_hardly_a_spot():
     assert b.score[0] == pytest.approx(a.score[0] - 4.0 * N)
 
 
-def test_without_shapes_no_point_is_taken_for_two_that_melted_into_one():
+def test_without_sizes_no_point_is_taken_for_two_merged_spots():
     shifted = EXPECTED.copy()
     shifted[4] += [2.0, 0.0]
     points = [shifted[MODEL.camera_of == c] for c in range(2)]
-    wide = frame_of(points, blend_px=3.0, grown=1.2)
+    wide = frame_of(points, blend_px=3.0, widening=1.2)
     unknown = np.full(len(wide.uv), np.nan)
     for frame in (
         wide._replace(size_px=unknown),
-        wide._replace(usual_px=np.full(N, np.nan)),
-        frame_of(points, blend_px=3.0),  # as wide as ever
+        wide._replace(usual_size_px=np.full(N, np.nan)),
+        frame_of(points, blend_px=3.0),  # of the usual size
     ):
         assert not any(is_blended(frame, v, d) for v in range(N) for d in range(len(frame.uv)))
         assert not np.any(search(frame, 1e-4 * P_NEAR).assigned >= BLENDED)
     assert is_blended(wide, 4, 0)
 
 
-def test_spots_are_counted_once_however_many_cameras_see_them():
+def test_a_spot_is_counted_once_however_many_cameras_see_it():
     spot = np.array([0, 0, 1, 2, 2, 3])
     rng = np.random.default_rng(0)
     for _ in range(50):

@@ -1,4 +1,4 @@
-"""A camera that stops before the end, or begins late: nothing is confidently wrong, and every covariance is one."""
+"""A camera that stops before the end or begins late: no pose is confidently wrong, and every covariance is valid."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ def test_a_gap_of_a_camera_to_the_end_or_from_the_start_makes_no_pose_confidentl
             assert of.wrong == 0
             known = ~np.isnan(of.nees)
             assert known.sum() > 40
-            # 6 sigmas of one direction, beside the others' mean. 44.0 was measured: smoothed, in the last frame with
-            # one camera, before a bend.
+            # 6 sigmas in one direction plus the mean of the others. 44.0 was measured: smoothed, in the last frame with
+            # one camera, before a velocity jump.
             assert np.all(of.nees[known] < 36 + 9)
             for f in frames:
                 assert f.pose_covariance is None or is_a_covariance(f.pose_covariance)

@@ -1,4 +1,4 @@
-"""Few spots: labelled only where the prediction can check them, and no measured pose that has a mirror solution."""
+"""Few spots: labelled only if the prediction checks them; a pose with a mirror solution is not measured."""
 
 from __future__ import annotations
 
@@ -12,44 +12,48 @@ from lab.simulate.rigs import RIGS, scaled
 from lab.simulate.scenarios import PriorRegion
 from tests.tracking.rigid_runs import RIGID, dt_of, filmed, found_in, judged, prior_of, tracked
 from tracking.detections import UNMATCHED
-from tracking.rigid_body.hypotheses import FEW, VAGUE_PX, widest
-from tracking.rigid_body.motion import predicted
+from tracking.rigid_body.hypotheses.prediction_checks import (
+    MAX_TRACKING_SIGMA_PX,
+    MIN_REDUNDANT_SPOTS,
+    largest_spot_sigma,
+)
+from tracking.rigid_body.models.motion import predicted
 from tracking.rigid_body.rigid_tracker import RigidTracker
 from tracking.statuses import PoseStatus
 
 NONE = np.zeros(2)
 
 
-def dark_then_few(seed: int, dark: int, few: int) -> PointRun:
-    """From frame 60 on everything is hidden, then three spots and false points show."""
-    run = simulate_points("sharp-turns", seed, frames=60 + dark + few, clutter=1.0)
+def occluded_then_few(seed: int, occluded: int, few: int) -> PointRun:
+    """From frame 60 on all spots are occluded, then three spots and false points are visible."""
+    run = simulate_points("sharp-turns", seed, frames=60 + occluded + few, clutter=1.0)
     hide = np.zeros(run.in_view.shape, dtype=bool)
     hide[60:] = True
-    hide[60 + dark :, [0, 1, 4]] = False
+    hide[60 + occluded :, [0, 1, 4]] = False
     return hidden(run, hide)
 
 
-def test_where_the_prediction_is_wide_fewer_than_four_spots_are_not_labelled():
+def test_fewer_than_four_spots_are_not_labelled_if_the_prediction_is_vague():
     labelled = 0
     for seed in (7001, 7002):
-        run = dark_then_few(seed, 25, 30)
+        run = occluded_then_few(seed, 25, 30)
         tracker = RigidTracker(run.rig, RIGID, prior_of(run))
         for k in range(len(run.frame)):
-            before, dt, noise = tracker._hypotheses, dt_of(run, k), tracker.temper.dynamics.jerk
+            before, dt, noise = tracker._hypotheses, dt_of(run, k), tracker.process_noise.dynamics.jerk
             frame = tracker.step(dt, found_in(run, k))
             count = np.count_nonzero(frame.point != UNMATCHED)
             labelled += count
-            if before is None or dt == 0 or not 0 < count < FEW:
+            if before is None or dt == 0 or not 0 < count < MIN_REDUNDANT_SPOTS:
                 continue
-            # No hypothesis of the frame before, moved on without a bend, is wider: with one they are wider still.
+            # Predicted without a velocity jump, which would make them wider.
             sigmas = []
             for h in range(len(before.t)):
                 R, t, _, P, _ = predicted(before.R[h], before.t[h], before.m[h], before.P[h], dt, noise, NONE, NONE)
                 assigned = np.where(frame.point == UNMATCHED, -1, frame.point)
-                sigmas.append(widest(tracker.model.numbers, R, t, P, assigned))
-            assert min(sigmas) <= VAGUE_PX
+                sigmas.append(largest_spot_sigma(tracker.model.numbers, R, t, P, assigned))
+            assert min(sigmas) <= MAX_TRACKING_SIGMA_PX
     assert labelled > 300
-    assert VAGUE_PX > 5
+    assert MAX_TRACKING_SIGMA_PX > 5
 
 
 # A pose whose three spots of the left screen have a second solution 2.9 deg away.
@@ -62,14 +66,14 @@ PLACE = Pose(np.array(ROTATION), np.array([-0.126657502757949, -0.08162926119623
 THREE, MIRROR_DEG, SEEN = np.array([0, 1, 2]), 2.93, 30
 
 
-@pytest.mark.parametrize("dark", [0, 5])
-def test_three_spots_are_measured_only_where_the_motion_excludes_their_mirror_solution(dark):
-    rig = scaled(RIGS["four-skew-beams"](), 0.25)  # 2.9 deg are 16 px: narrow enough for labels
-    frames = SEEN + dark + 5
+@pytest.mark.parametrize("occluded", [0, 5])
+def test_three_spots_are_measured_only_where_the_motion_excludes_their_mirror_solution(occluded):
+    rig = scaled(RIGS["four-skew-beams"](), 0.25)  # 2.9 deg are 16 px: near enough for labels
+    frames = SEEN + occluded + 5
     poses = Pose(np.tile(PLACE.rotation, (frames, 1, 1)), np.tile(PLACE.translation, (frames, 1)))
     hide = np.zeros((frames, 7), dtype=bool)
     hide[SEEN:] = True
-    hide[SEEN + dark :, THREE] = False
+    hide[SEEN + occluded :, THREE] = False
     run = filmed(
         rig, poses, np.arange(frames) / 50.0, 0.01, 1, hide=hide, prior=PriorRegion(within_m=0.5, within_deg=20.0)
     )
@@ -80,14 +84,14 @@ def test_three_spots_are_measured_only_where_the_motion_excludes_their_mirror_so
     causal = tracked(run)
     of = judged(run, causal)
     assert of.wrong == 0
-    # Where three spots after the dark could be either, they wait for some frames.
-    assert of.missed() <= (3 * len(THREE) if dark else 0)
-    first = causal[SEEN + dark]
+    # After an occlusion three spots fit either solution: their labels wait for some frames.
+    assert of.missed() <= (3 * len(THREE) if occluded else 0)
+    first = causal[SEEN + occluded]
     assert first.pose_covariance is not None
     distance2 = mirror @ np.linalg.solve(first.pose_covariance, mirror)
-    if dark:
+    if occluded:
         assert first.pose_status is PoseStatus.PREDICTED
-        assert distance2 < 100  # the covariance allows for the other solution with its share of some per cent
+        assert distance2 < 100  # the covariance covers the other solution with its probability of some per cent
     else:
         assert all(f.pose_status is PoseStatus.MEASURED for f in causal[SEEN:])
         assert distance2 > 1000

@@ -1,4 +1,4 @@
-"""What a frame's spots say of the pose: against differences of the projection, and the ordinary Kalman filter."""
+"""Information of a frame's spots about the pose, against numerical derivatives and the ordinary Kalman filter."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from lab.simulate.rigs import RIGS
 from tracking.rigid_body.frame_summary import inverse
-from tracking.rigid_body.information import controlled, fit_alone, frame_information
-from tracking.rigid_body.motion import STATE, updated
+from tracking.rigid_body.models.information import frame_information, single_frame_pose, well_controlled
+from tracking.rigid_body.models.motion import STATE, updated
 
 MODEL = SpotModel.of(RIGS["fan"]())
 VIEWS = MODEL.numbers
@@ -38,7 +38,7 @@ def chi2(pose: Pose, use: Bools, uv: Array, cov: Array) -> float:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_the_vector_is_the_slope_of_the_squared_residual_and_the_matrix_gauss_newtons(seed):
+def test_the_vector_is_the_gradient_of_the_chi_square_and_the_matrix_that_of_gauss_newton(seed):
     rng = np.random.default_rng(seed)
     pose, uv, cov = some(rng)
     use = rng.random(N) < 0.8
@@ -46,8 +46,8 @@ def test_the_vector_is_the_slope_of_the_squared_residual_and_the_matrix_gauss_ne
     assert misfit == pytest.approx(chi2(pose, use, uv, cov), rel=1e-10)
     assert count == use.sum()
     assert log_det == pytest.approx(np.linalg.slogdet(2 * np.pi * cov[use])[1].sum(), rel=1e-10)
-    slope = numeric_jacobian(lambda d: np.array(chi2(pose.plus(d), use, uv, cov)), np.zeros(6))
-    np.testing.assert_allclose(g, -0.5 * slope, rtol=1e-5, atol=1e-5 * np.abs(g).max())
+    gradient = numeric_jacobian(lambda d: np.array(chi2(pose.plus(d), use, uv, cov)), np.zeros(6))
+    np.testing.assert_allclose(g, -0.5 * gradient, rtol=1e-5, atol=1e-5 * np.abs(g).max())
     J = numeric_jacobian(lambda d: MODEL.project(pose.plus(d))[0][use], np.zeros(6))
     np.testing.assert_allclose(L, np.einsum("nia,nij,njb->ab", J, np.linalg.inv(cov[use]), J), rtol=1e-5, atol=1.0)
 
@@ -89,18 +89,18 @@ def test_an_update_is_the_ordinary_kalman_update_with_all_pixels_in_one_vector(s
     joseph = I_KH @ P @ I_KH.T + K @ C @ K.T
     np.testing.assert_allclose((P1 - joseph) / np.outer(sigma, sigma), 0, atol=1e-9)
     assert log_det == pytest.approx(np.linalg.slogdet(S)[1] - np.linalg.slogdet(C)[1], rel=1e-9)
-    # The misfit of the innovation, y^T S^-1 y, and the part of it that the motion takes.
+    # The innovation's chi-square, y^T S^-1 y, and the part of it that the motion absorbs.
     assert misfit - g @ step == pytest.approx(y @ np.linalg.solve(S, y), rel=1e-8)
     assert step @ np.linalg.solve(P[:6, :6], step) == pytest.approx(
         y @ np.linalg.solve(S, H @ P @ H.T @ np.linalg.solve(S, y)), rel=1e-8
     )
 
 
-def test_a_frame_by_itself_is_fitted_where_no_step_makes_it_better():
+def test_no_small_step_improves_the_pose_of_a_single_frame():
     rng = np.random.default_rng(5)
     pose, uv, cov = some(rng, noise_px=0.2)
     start = pose.plus(rng.normal(size=6) * 2e-3)
-    R, t, L, misfit, count = fit_alone(VIEWS, start.rotation, start.translation, ALL, uv, cov)
+    R, t, L, misfit, count = single_frame_pose(VIEWS, start.rotation, start.translation, ALL, uv, cov)
     assert count == N
     found = Pose(R, t)
     assert misfit == pytest.approx(chi2(found, ALL, uv, cov), rel=1e-9)
@@ -109,7 +109,7 @@ def test_a_frame_by_itself_is_fitted_where_no_step_makes_it_better():
         assert chi2(found.plus(d), ALL, uv, cov) > misfit
 
 
-def test_a_pose_that_two_spots_do_not_give_has_no_covariance():
+def test_a_pose_that_the_spots_do_not_determine_has_an_infinite_covariance():
     pose, uv, cov = some(np.random.default_rng(6))
     L = information(pose, ALL, uv, cov)[0]
     np.testing.assert_allclose(inverse(L), np.linalg.inv(L), rtol=1e-6)
@@ -118,28 +118,30 @@ def test_a_pose_that_two_spots_do_not_give_has_no_covariance():
     assert np.isinf(inverse(np.zeros((6, 6)))).all()
 
 
-def test_a_spot_is_checked_by_the_others_where_its_own_error_would_show():
-    """All six check each other; of three alone none does; a fourth that one far stronger camera sees is not checked."""
+def test_a_spot_is_controlled_by_the_others_if_its_error_would_show_in_its_residual():
+    """All six control each other; three alone do not; a spot that is far more accurate than the others is not
+    controlled.
+    """
     pose, _, _ = some(np.random.default_rng(2))
     cov = np.tile(0.01 * np.eye(2), (N, 1, 1))
     R, t = np.ascontiguousarray(pose.rotation), np.ascontiguousarray(pose.translation)
-    assert controlled(VIEWS, R, t, ALL, cov).all()
+    assert well_controlled(VIEWS, R, t, ALL, cov).all()
     three = np.isin(np.arange(N), [0, 2, 4])
-    assert not controlled(VIEWS, R, t, three, cov).any()
-    vague = cov.copy()
-    vague[1:] *= 100.0**2
-    checked = controlled(VIEWS, R, t, ALL, vague)
-    assert not checked[0]  # by what is a hundred times less exact
+    assert not well_controlled(VIEWS, R, t, three, cov).any()
+    worse = cov.copy()
+    worse[1:] *= 100.0**2
+    checked = well_controlled(VIEWS, R, t, ALL, worse)
+    assert not checked[0]  # by spots that are a hundred times less accurate
     assert not checked[~ALL].any()
 
 
 @pytest.mark.parametrize("view", range(N))
-def test_an_error_of_a_checked_spot_shows_in_its_residual(view):
+def test_an_error_of_a_controlled_spot_shows_in_its_residual(view):
     pose, _, _ = some(np.random.default_rng(view))
     cov = np.tile(0.01 * np.eye(2), (N, 1, 1))
     uv = MODEL.project(pose)[0]
     uv[view] += 5.0 / np.sqrt(2)
     R, t = np.ascontiguousarray(pose.rotation), np.ascontiguousarray(pose.translation)
-    assert controlled(VIEWS, R, t, ALL, cov)[view]
-    *_, misfit, _ = fit_alone(VIEWS, R, t, ALL, uv, cov)
+    assert well_controlled(VIEWS, R, t, ALL, cov)[view]
+    *_, misfit, _ = single_frame_pose(VIEWS, R, t, ALL, uv, cov)
     assert misfit > 25.0

@@ -1,4 +1,4 @@
-"""How a rigid body moves: transition and covariance against differences, an integral and smaller steps."""
+"""Motion model of a rigid body, against numerical derivatives, integrals and smaller steps."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from scipy.linalg import expm
 
 from geometry.arrays import Array, numeric_jacobian
 from geometry.pose import Pose
-from tracking.rigid_body.motion import STATE, predicted, process_noise, updated
+from tracking.rigid_body.models.motion import STATE, predicted, process_noise, updated
 
 JERK = np.repeat([20.0, 60.0], 3) ** 2
 NONE = np.zeros(2)
@@ -23,7 +23,7 @@ def a_state(seed: int, rate: float = 3.0) -> State:
 
 
 def a_covariance(seed: int) -> Array:
-    """Of sizes such as a tracker has: sub-millimetres, tenths of millirads, and what differences make of them."""
+    """A covariance of the size that a tracker has: fractions of a millimetre and of a milliradian."""
     A = np.random.default_rng(seed).normal(size=(STATE, 2 * STATE))
     sigma = np.repeat([3e-4, 2e-4, 0.02, 0.02, 1.0, 1.0], 3)
     return np.asarray(A @ A.T / (2 * STATE) * np.outer(sigma, sigma))
@@ -37,7 +37,7 @@ def stepped(state: State, P: Array, dt: float, steps: int = 1, jerk: Array = JER
 
 
 def in_sigmas(A: Array, B: Array) -> float:
-    """The largest difference of two covariances, in units of B's sigmas."""
+    """Largest difference of two covariances, in units of B's sigmas."""
     sigma = np.sqrt(np.diagonal(B))
     return float(np.abs((A - B) / np.outer(sigma, sigma)).max())
 
@@ -57,7 +57,7 @@ def test_the_transition_is_the_derivative_of_the_motion(rate, dt):
     np.testing.assert_allclose(F, numeric_jacobian(moved, np.zeros(STATE)), atol=1e-8)
 
 
-def test_a_body_with_constant_accelerations_moves_by_the_school_book():
+def test_a_body_with_constant_accelerations_follows_the_textbook_formulas():
     pose, _ = a_state(2)
     m = np.zeros(12)
     m[:3], m[6:9] = [1.0, -2.0, 0.5], [3.0, 0.1, -9.8]
@@ -96,8 +96,8 @@ def test_two_half_steps_of_a_body_that_does_not_turn_are_one_step():
 
 
 @pytest.mark.parametrize("rate", [1.0, 6.0])
-def test_a_turning_body_loses_less_than_the_angle_it_turns_in_a_step_against_many_small_ones(rate):
-    # To first order: what is left out is the turn of the axes within a step, of the noise and of the acceleration.
+def test_the_error_of_one_step_against_many_small_ones_is_less_than_the_angle_of_the_step(rate):
+    # A first-order model: it neglects the rotation of noise and acceleration within a step.
     dt = 0.01
     pose, m = a_state(4, rate)
     m[9:12] = 0.0
@@ -113,7 +113,7 @@ def test_a_covariance_stays_symmetric_and_positive_over_a_thousand_frames():
     R, t = pose.rotation, pose.translation
     for k in range(1000):
         R, t, m, P, _ = predicted(R, t, m, P, 0.01, JERK, NONE, NONE)
-        if k % 50 < 40:  # ten dark frames in fifty
+        if k % 50 < 40:  # ten frames without spots in fifty
             R, t, m, P, _, _ = updated(R, t, m, P, J.T @ J / 0.01, np.zeros(6))
         assert np.array_equal(P, P.T)
     sigma = np.sqrt(np.diagonal(P))
@@ -121,17 +121,17 @@ def test_a_covariance_stays_symmetric_and_positive_over_a_thousand_frames():
     np.testing.assert_allclose(R.T @ R, np.eye(3), atol=1e-12)
 
 
-def test_an_impulse_at_an_unknown_moment_of_a_step_adds_what_drawing_the_moment_adds():
-    """Pose, velocity and acceleration at the step's end, of impulses and steps of the acceleration at any moment."""
+def test_a_jump_at_an_unknown_moment_of_a_step_has_the_covariance_of_random_moments():
+    """Pose, velocity and acceleration at the end of the step, after jumps of velocity or acceleration at any moment."""
     rng, dt, draws = np.random.default_rng(6), 0.02, 200_000
-    jump, unsteady = 4.0, 900.0
+    velocity_jump, acceleration_jump = 4.0, 900.0
     left = dt * rng.random(draws)  # s until the step ends
-    size = np.sqrt(jump) * rng.normal(size=draws)
+    size = np.sqrt(velocity_jump) * rng.normal(size=draws)
     of_jumps = np.stack([size * left, size, np.zeros(draws)])
     left = dt * rng.random(draws)
-    size = np.sqrt(unsteady) * rng.normal(size=draws)
+    size = np.sqrt(acceleration_jump) * rng.normal(size=draws)
     of_steps = np.stack([size * left**2 / 2, size * left, size])
-    for values, args in ((of_jumps, (0.0, jump, 0.0)), (of_steps, (0.0, 0.0, unsteady))):
+    for values, args in ((of_jumps, (0.0, velocity_jump, 0.0)), (of_steps, (0.0, 0.0, acceleration_jump))):
         pp, pv, pa, vv, va, aa = process_noise(dt, *args)
         Q = np.array([[pp, pv, pa], [pv, vv, va], [pa, va, aa]])
         scale = np.sqrt(np.maximum(np.diagonal(Q), 1e-30))
@@ -139,19 +139,21 @@ def test_an_impulse_at_an_unknown_moment_of_a_step_adds_what_drawing_the_moment_
         np.testing.assert_allclose((np.cov(values) - Q) / np.outer(scale, scale), 0, atol=0.02)
 
 
-def test_kinds_of_process_noise_add_up_and_each_axis_has_its_own():
-    dt, jump, unsteady = 0.02, np.array([4.0, 9.0]), np.array([100.0, 400.0])
+def test_the_kinds_of_process_noise_add_up_axis_by_axis():
+    dt, velocity_jump, acceleration_jump = 0.02, np.array([4.0, 9.0]), np.array([100.0, 400.0])
     jerk = np.array([1.0, 4.0, 9.0, 16.0, 25.0, 36.0])
-    P = predicted(np.eye(3), np.zeros(3), np.zeros(12), np.zeros((STATE, STATE)), dt, jerk, jump, unsteady)[3]
+    P = predicted(
+        np.eye(3), np.zeros(3), np.zeros(12), np.zeros((STATE, STATE)), dt, jerk, velocity_jump, acceleration_jump
+    )[3]
     for i in range(6):
         rows = [i, i + 6, i + 12]
-        parts = [(jerk[i], 0.0, 0.0), (0.0, jump[i // 3], 0.0), (0.0, 0.0, unsteady[i // 3])]
+        parts = [(jerk[i], 0.0, 0.0), (0.0, velocity_jump[i // 3], 0.0), (0.0, 0.0, acceleration_jump[i // 3])]
         pp, pv, pa, vv, va, aa = np.sum([process_noise(dt, *part) for part in parts], axis=0)
         np.testing.assert_allclose(P[np.ix_(rows, rows)], [[pp, pv, pa], [pv, vv, va], [pa, va, aa]], rtol=1e-12)
         assert np.all(P[np.ix_(rows, np.setdiff1d(np.arange(STATE), rows))] == 0)
 
 
-def test_a_step_of_no_time_adds_nothing():
+def test_a_step_of_zero_length_changes_nothing():
     P0 = a_covariance(7)
     P = predicted(np.eye(3), np.zeros(3), np.ones(12), P0, 0.0, JERK, np.ones(2), np.ones(2))[3]
     np.testing.assert_array_equal(P, P0)

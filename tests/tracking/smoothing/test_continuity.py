@@ -1,4 +1,4 @@
-"""Labels by continuity: a spot's path in the picture is followed where the pose says little, and no farther."""
+"""Labels by continuity: a spot's path in the picture is followed where the pose is uncertain, and only there."""
 
 from __future__ import annotations
 
@@ -6,31 +6,31 @@ import numpy as np
 import pytest
 
 from geometry.arrays import Array, Bools, Ints
-from tracking.rigid_body.association import BLENDED
-from tracking.smoothing.continuity import LONG_CHAIN, MOST_AHEAD, Surroundings, continued
-from tracking.smoothing.reassociation import AllDetections
+from tracking.rigid_body.association.frame_detections import BLENDED
+from tracking.smoothing.labels.continuity import MAX_AHEAD, MIN_SINGLE_CHAIN, PathContext, continued
+from tracking.smoothing.motion.run_detections import RunDetections
 
 FRAMES, SIGMA_PX, SIDE_PX = 120, 0.05, 1000.0
 GAP = slice(50, 75)
 
 
-def paths(bend_at: int | None = None) -> Array:
-    """(T, 2, 2) px: two spots that swing side by side, 200 px apart; one more bend where it is asked for."""
+def paths(jump_at: int | None = None) -> Array:
+    """Paths (T, 2, 2), px, of two spots that swing 200 px apart, with a velocity jump at a frame if one is given."""
     k = np.arange(FRAMES, dtype=float)
     x = 400 + 120 * np.sin(0.09 * k)
     y = 500 + 60 * np.cos(0.07 * k)
-    if bend_at is not None:
-        y += 3.0 * np.maximum(k - bend_at, 0)
+    if jump_at is not None:
+        y += 3.0 * np.maximum(k - jump_at, 0)
     one = np.stack([x, y], axis=1)
     return np.stack([one, one + np.array([200.0, 0.0])], axis=1)
 
 
-def filmed(uv: Array, shining: Bools, false_points: float, seed: int) -> tuple[AllDetections, Ints]:
-    """One camera's detections, in no order, with false points within 60 px of each spot; and each spot's row (T, n)."""
+def filmed(uv: Array, visible: Bools, false_points: float, seed: int) -> tuple[RunDetections, Ints]:
+    """One camera's detections in random order, with false points within 60 px of the spots; the spots' rows (T, n)."""
     rng = np.random.default_rng(seed)
     rows, places = np.full(uv.shape[:2], -1), []
     for k in range(FRAMES):
-        seen = np.flatnonzero(shining[k])
+        seen = np.flatnonzero(visible[k])
         points = uv[k, seen] + SIGMA_PX * rng.normal(size=(len(seen), 2))
         near = uv[k] + rng.uniform(-60, 60, (uv.shape[1], 2))
         points = np.concatenate([points, near[rng.random(uv.shape[1]) < false_points]])
@@ -39,7 +39,7 @@ def filmed(uv: Array, shining: Bools, false_points: float, seed: int) -> tuple[A
         rows[k, seen] = np.argsort(order)[: len(seen)]
     counts = [len(p) for p in places]
     m = sum(counts)
-    every = AllDetections(
+    every = RunDetections(
         np.concatenate(places), np.tile(SIGMA_PX**2 * np.eye(2), (m, 1, 1)), np.zeros(m),
         np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
         np.stack([np.zeros(FRAMES), counts], axis=1).astype(np.int64), np.ones((FRAMES, 1), dtype=bool),
@@ -48,14 +48,14 @@ def filmed(uv: Array, shining: Bools, false_points: float, seed: int) -> tuple[A
     return every, rows
 
 
-def around(uv: Array, sigma_px: float = 300.0, false_points: float = 0.0) -> Surroundings:
-    """A pose that says next to nothing, in all frames of the gap."""
+def context(uv: Array, sigma_px: float = 300.0, false_points: float = 0.0) -> PathContext:
+    """A very uncertain pose in all frames of the gap."""
     open_frames = np.zeros(FRAMES, dtype=bool)
     open_frames[GAP] = True
     density = max(false_points / 120.0**2, 1e-6)
     spread = np.tile(sigma_px**2 * np.eye(2), (*uv.shape[:2], 1, 1))
     camera = np.zeros(uv.shape[1], dtype=np.int64)
-    return Surroundings(camera, uv + 50.0, spread, np.full(uv.shape[:2], np.log(density)), open_frames)
+    return PathContext(camera, uv + 50.0, spread, np.full(uv.shape[:2], np.log(density)), open_frames)
 
 
 def without(rows: Ints, *frames: slice) -> Ints:
@@ -66,11 +66,11 @@ def without(rows: Ints, *frames: slice) -> Ints:
 
 
 @pytest.mark.parametrize("false_points", [0.0, 0.5, 1.0])
-def test_paths_are_followed_through_frames_whose_pose_is_vague(false_points):
+def test_paths_are_followed_through_frames_with_an_uncertain_pose(false_points):
     uv = paths()
     for seed in range(6):
         every, rows = filmed(uv, np.ones((FRAMES, 2), dtype=bool), false_points, seed)
-        out, probability = continued(every, without(rows, GAP), around(uv, false_points=false_points))
+        out, probability = continued(every, without(rows, GAP), context(uv, false_points=false_points))
         given = out[GAP] >= 0
         assert np.array_equal(out[GAP][given], rows[GAP][given])
         assert given.mean() > 0.97
@@ -78,78 +78,78 @@ def test_paths_are_followed_through_frames_whose_pose_is_vague(false_points):
         assert np.all(probability[GAP][given] >= 0.99)
 
 
-def test_other_frames_stay_as_they_are():
+def test_other_frames_are_not_changed():
     uv = paths()
     every, rows = filmed(uv, np.ones((FRAMES, 2), dtype=bool), 0.5, 1)
     before = without(rows, slice(20, 30), GAP)
-    out, _ = continued(every, before, around(uv, false_points=0.5))
+    out, _ = continued(every, before, context(uv, false_points=0.5))
     outside = np.ones(FRAMES, dtype=bool)
     outside[GAP] = False
     np.testing.assert_array_equal(out[outside], before[outside])
 
 
 @pytest.mark.parametrize("length", [1, 2, 10, 25])
-def test_false_points_where_nothing_shines_are_no_spots(length):
+def test_false_points_are_not_labelled_while_no_spot_is_visible(length):
     uv = paths()
-    dark = slice(GAP.start, GAP.start + length)
+    hidden = slice(GAP.start, GAP.start + length)
     labels = 0
     for seed in range(20):
-        shining = np.ones((FRAMES, 2), dtype=bool)
-        shining[dark] = False
-        every, rows = filmed(uv, shining, 1.0, seed)
-        out, _ = continued(every, without(rows, dark), around(uv, false_points=1.0))
-        labels += int(np.count_nonzero(out[dark] >= 0))
+        visible = np.ones((FRAMES, 2), dtype=bool)
+        visible[hidden] = False
+        every, rows = filmed(uv, visible, 1.0, seed)
+        out, _ = continued(every, without(rows, hidden), context(uv, false_points=1.0))
+        labels += int(np.count_nonzero(out[hidden] >= 0))
     assert labels == 0
 
 
 def test_a_path_that_vanishes_is_not_continued_by_false_points():
-    """One spot goes out within the gap, the other stays: 40 false points for each of 20 runs lie about its path."""
+    """One spot vanishes within the gap, the other stays; in each of 20 runs 40 false points lie near its path."""
     uv = paths()
     wrong = 0
     for seed in range(20):
-        shining = np.ones((FRAMES, 2), dtype=bool)
-        shining[60:, 0] = False
-        every, rows = filmed(uv, shining, 1.0, seed)
-        out, _ = continued(every, without(rows, GAP), around(uv, false_points=1.0))
+        visible = np.ones((FRAMES, 2), dtype=bool)
+        visible[60:, 0] = False
+        every, rows = filmed(uv, visible, 1.0, seed)
+        out, _ = continued(every, without(rows, GAP), context(uv, false_points=1.0))
         wrong += int(np.count_nonzero(out[60:, 0] >= 0))
     assert wrong <= 1
 
 
-def test_a_bend_is_got_over_where_no_other_point_is_near():
-    uv = paths(bend_at=62)
+def test_a_path_is_followed_through_a_velocity_jump_if_no_other_point_is_near():
+    uv = paths(jump_at=62)
     every, rows = filmed(uv, np.ones((FRAMES, 2), dtype=bool), 0.0, 3)
-    out, _ = continued(every, without(rows, GAP), around(uv))
+    out, _ = continued(every, without(rows, GAP), context(uv))
     given = out[GAP] >= 0
     assert np.array_equal(out[GAP][given], rows[GAP][given])
     assert given.mean() > 0.9
 
 
-def test_missed_detections_are_stepped_over():
+def test_a_path_is_followed_over_missed_detections():
     uv = paths()
-    shining = np.ones((FRAMES, 2), dtype=bool)
-    shining[[55, 60, 61, 66], 0] = False
-    every, rows = filmed(uv, shining, 0.0, 4)
-    out, _ = continued(every, without(rows, GAP), around(uv))
+    visible = np.ones((FRAMES, 2), dtype=bool)
+    visible[[55, 60, 61, 66], 0] = False
+    every, rows = filmed(uv, visible, 0.0, 4)
+    out, _ = continued(every, without(rows, GAP), context(uv))
     np.testing.assert_array_equal(out[GAP], rows[GAP])
 
 
-def test_a_pose_that_knows_better_is_believed():
-    """What a path leads to but the pose excludes is another light: its label stays open."""
+def test_a_point_that_the_pose_excludes_is_not_labelled():
+    """A point on the path that the pose excludes is another point of light."""
     uv = paths()
     every, rows = filmed(uv, np.ones((FRAMES, 2), dtype=bool), 0.0, 5)
-    out, _ = continued(every, without(rows, GAP), around(uv, sigma_px=2.0))
+    out, _ = continued(every, without(rows, GAP), context(uv, sigma_px=2.0))
     assert np.all(out[GAP] < 0)
 
 
-def test_one_point_is_never_two_spots():
-    """Two spots that meet and are one point of light for a while: both paths run into it, and neither gets it twice."""
+def test_no_point_is_labelled_as_two_spots():
+    """Two spots meet and are one point of light for some frames, to which both paths lead."""
     uv = paths()
     k = np.arange(FRAMES)
     uv[:, 1] = uv[:, 0] + np.stack([np.abs(k - 62.0) * 3, 0 * k], axis=1)
-    shining = np.ones((FRAMES, 2), dtype=bool)
-    shining[60:65, 1] = False
-    every, rows = filmed(uv, shining, 0.0, 6)
-    out, _ = continued(every, without(rows, GAP), around(uv))
+    visible = np.ones((FRAMES, 2), dtype=bool)
+    visible[60:65, 1] = False
+    every, rows = filmed(uv, visible, 0.0, 6)
+    out, _ = continued(every, without(rows, GAP), context(uv))
     for k in range(FRAMES):
         used = out[k][out[k] >= 0] % BLENDED
         assert len(set(used.tolist())) == len(used)
@@ -158,19 +158,19 @@ def test_one_point_is_never_two_spots():
 
 def test_a_single_spot_is_followed_for_long_or_not_at_all():
     uv = paths()[:, :1]
-    for length in (LONG_CHAIN - 2, LONG_CHAIN + 5):
+    for length in (MIN_SINGLE_CHAIN - 2, MIN_SINGLE_CHAIN + 5):
         every, rows = filmed(uv, np.ones((FRAMES, 1), dtype=bool), 0.0, 7)
         gap = slice(GAP.start, GAP.start + length)
-        out, _ = continued(every, without(rows, gap), around(uv))
-        assert np.all((out[gap] >= 0) == (length >= LONG_CHAIN))
+        out, _ = continued(every, without(rows, gap), context(uv))
+        assert np.all((out[gap] >= 0) == (length >= MIN_SINGLE_CHAIN))
 
 
-def test_the_errors_of_a_path_are_of_its_own_labels():
-    """Without enough labelled frames nothing is known of a path, and nothing is continued."""
+def test_a_path_with_few_labels_is_not_continued():
+    """The errors of its extrapolation cannot be estimated."""
     uv = paths()
     every, rows = filmed(uv, np.ones((FRAMES, 2), dtype=bool), 0.0, 8)
     few = np.full_like(rows, -1)
-    few[GAP.start - 2 * MOST_AHEAD : GAP.start] = rows[GAP.start - 2 * MOST_AHEAD : GAP.start]
-    out, probability = continued(every, few, around(uv))
+    few[GAP.start - 2 * MAX_AHEAD : GAP.start] = rows[GAP.start - 2 * MAX_AHEAD : GAP.start]
+    out, probability = continued(every, few, context(uv))
     np.testing.assert_array_equal(out, few)
     assert np.isnan(probability).all()

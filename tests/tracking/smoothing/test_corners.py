@@ -1,4 +1,4 @@
-"""Corners of the motion between two frames, hard and soft: labels stay, and poses are as good as they claim."""
+"""Corners of the motion between two frames, hard and soft: labels are kept, and the covariances are right."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ PRIOR = PriorRegion((0.0, 0.0, 0.0), (7.0, 0.0, 0.0), 0.3, 15.0)
 # Angular rates, 1 sigma, rad/s. A spot moves by some 1200 px per rad: 12 px per frame, and 0.2 px.
 HARD, SOFT = 1.0, 0.02
 FRAMES, EVERY = 160, 23
-COVERED = 12.592  # chi-square of 6 degrees that 95 % stay below
+COVERED = 12.592  # 95 % quantile of chi-square with 6 degrees of freedom
 
 
 @cache
@@ -42,7 +42,7 @@ def test_corners_between_frames_keep_all_labels(rate):
 
 
 @pytest.mark.parametrize("rate", [HARD, SOFT], ids=["hard", "soft"])
-def test_poses_around_corners_between_frames_are_as_good_as_they_claim(rate):
+def test_covariances_near_corners_between_frames_are_right(rate):
     nees = np.concatenate([both(rate, seed)[2].nees for seed in (1, 2)])
     near = np.concatenate([np.convolve(both(rate, seed)[0].turned, np.ones(5), "same") > 0 for seed in (1, 2)])
     assert 0.7 < np.mean(nees) / 6 < 1.4

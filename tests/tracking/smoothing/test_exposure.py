@@ -1,4 +1,4 @@
-"""A picture shows the mean of a spot's path over the exposure; the pose is asked for in the middle of it."""
+"""A picture shows the mean of a spot's path over the exposure; the reported pose is that at its middle."""
 
 import numpy as np
 import pytest
@@ -6,15 +6,15 @@ import pytest
 from geometry.compiled_projection import project_all
 from geometry.pose import Pose
 from lab.simulate.points import simulate_points
-from tracking.smoothing.exposure import exposure_offsets, moved_by
-from tracking.smoothing.fixed_interval import Reference
+from tracking.smoothing.exposure import exposure_offsets, pose_shift
+from tracking.smoothing.motion.reference import Reference
 
 EXPOSURE_S = 0.02
 
 
 @pytest.fixture(scope="module")
 def turning():
-    """Poses of a run with velocities and accelerations of a vehicle that is shaken."""
+    """Poses of a run, with random velocities and accelerations."""
     run = simulate_points("smooth", 3, frames=12, clutter=0.0)
     rng = np.random.default_rng(4)
     m = rng.normal(0, [0.5] * 3 + [1.5] * 3 + [8.0] * 3 + [20.0] * 3, (12, 12))
@@ -22,7 +22,7 @@ def turning():
 
 
 def mean_over_exposure(model, motion):
-    """(T, n, 2) by many instants."""
+    """Mean pixels (T, n, 2), by quadrature over many instants."""
     nodes, weights = np.polynomial.legendre.leggauss(12)
     out = 0.0
     for node, weight in zip(nodes, weights, strict=True):
@@ -32,7 +32,7 @@ def mean_over_exposure(model, motion):
     return out
 
 
-def test_the_mean_of_a_path_lies_beside_its_middle(turning):
+def test_the_offset_is_the_mean_of_a_path_less_its_middle(turning):
     model, motion = turning
     offsets = exposure_offsets(model.numbers, motion, EXPOSURE_S, np.ones(12, dtype=bool))
     middle, _ = project_all(model.numbers, motion.R, motion.t)
@@ -42,22 +42,22 @@ def test_the_mean_of_a_path_lies_beside_its_middle(turning):
     assert np.abs(offsets - expected)[seen].max() < 0.01 * np.abs(expected[seen]).max()
 
 
-def test_the_pose_in_the_middle_is_found_from_the_mean_pixels(turning):
-    """The pose that fits the means best, less what the offsets make of it, is the pose in the middle."""
+def test_the_pose_at_mid_exposure_follows_from_the_mean_pixels(turning):
+    """It is the pose that fits the means best, less the shift that the offsets cause."""
     model, motion = turning
     offsets = exposure_offsets(model.numbers, motion, EXPOSURE_S, np.ones(12, dtype=bool))
-    shift = moved_by(model.numbers, motion, offsets)
+    shift = pose_shift(model.numbers, motion, offsets)
     _, J = project_all(model.numbers, motion.R, motion.t)
     left = offsets - np.einsum("tnij,tj->tni", J, shift)
     fine = np.isfinite(left).all(axis=-1)
     assert np.sqrt(np.mean(left[fine] ** 2)) < 0.2 * np.sqrt(np.mean(offsets[fine] ** 2))
 
 
-def test_a_jump_within_the_exposure_or_no_exposure_changes_nothing(turning):
+def test_frames_with_a_velocity_jump_and_runs_without_an_exposure_time_have_no_offsets(turning):
     model, motion = turning
     steady = np.arange(12) % 2 == 0
     offsets = exposure_offsets(model.numbers, motion, EXPOSURE_S, steady)
     assert not offsets[~steady].any()
     assert offsets[steady].any()
     assert not exposure_offsets(model.numbers, motion, 0.0, steady).any()
-    assert not moved_by(model.numbers, motion, offsets)[~steady].any()
+    assert not pose_shift(model.numbers, motion, offsets)[~steady].any()

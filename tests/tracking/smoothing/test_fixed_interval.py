@@ -1,4 +1,4 @@
-"""The fixed-interval smoother against one dense Gaussian of the whole run, and what it says of shocks."""
+"""The fixed-interval smoother against one dense Gaussian of the whole run, and its test for velocity jumps."""
 
 from __future__ import annotations
 
@@ -9,17 +9,12 @@ import pytest
 
 from geometry.arrays import Array
 from geometry.pose import Pose
-from tracking.rigid_body.motion import STATE, predicted, updated
-from tracking.smoothing import fixed_interval
-from tracking.smoothing.fixed_interval import (
-    FrameInformation,
-    Reference,
-    leave_one_out_log_likelihood,
-    log_likelihood,
-    shifted,
-    smoothed,
-)
-from tracking.smoothing.whole_run import APART
+from tracking.rigid_body.models.motion import STATE, predicted, updated
+from tracking.smoothing.motion import fixed_interval
+from tracking.smoothing.motion.fixed_interval import RunInformation, log_likelihood, smoothed
+from tracking.smoothing.motion.predictive_cost import leave_one_out_log_likelihood
+from tracking.smoothing.motion.reference import Reference, shifted
+from tracking.smoothing.motion.velocity_jumps import SHOCK_SEPARATION
 
 DT = 0.01
 JERK = np.repeat([20.0, 60.0], 3) ** 2
@@ -27,18 +22,18 @@ JERK = np.repeat([20.0, 60.0], 3) ** 2
 
 @dataclass(frozen=True)
 class Run:
-    """Deviations drawn from the very model, and the evidence that noisy spots would give of them."""
+    """Deviations drawn from the model itself, and the information that noisy spots would give about them."""
 
     ref: Reference
-    ev: FrameInformation
+    info: RunInformation
     jerk: Array  # (T, 6)
     true: Array  # (T, 18)
 
 
-def transition(ref: Reference, ev: FrameInformation, jerk: Array, k: int) -> tuple[Array, Array, Array]:
-    """F, the covariance that step k adds, and how far the reference itself is from moving so."""
-    args = ref.R[k - 1], ref.t[k - 1], ref.m[k - 1], np.zeros((STATE, STATE)), ev.dt[k]
-    R, t, m, Q, F = predicted(*args, jerk[k], ev.jump[k], ev.unsteady[k])
+def transition(ref: Reference, info: RunInformation, jerk: Array, k: int) -> tuple[Array, Array, Array]:
+    """F, the covariance that step k adds, and the deviation of the predicted reference from the reference itself."""
+    args = ref.R[k - 1], ref.t[k - 1], ref.m[k - 1], np.zeros((STATE, STATE)), info.dt[k]
+    R, t, m, Q, F = predicted(*args, jerk[k], info.velocity_jump[k], info.acceleration_jump[k])
     away = Pose(R, t).minus(Pose(ref.R[k], ref.t[k]))
     return F, Q, np.concatenate([away, m - ref.m[k]])
 
@@ -48,28 +43,29 @@ def drawn(
     frames: int,
     jump_at: int | None = None,
     jumps: float = 0.0,
-    dark: slice = slice(0, 0),
+    without_spots: slice = slice(0, 0),
     jerk: Array = JERK,
     moment: float = 0.5,
 ) -> Run:
-    """A run. jumps: variance of the velocities' jumps that the model knows of, in every step; jump_at: one that it
-    does not know of, in the step before that frame, at this moment of it (0 to 1). dark: frames without evidence.
-    jerk (6,) or (T, 6).
+    """A run. jumps: variance of the velocity jumps that the model allows for in every step.
+
+    jump_at: frame before which a jump happens that the model does not allow for, at this moment of the step (0 to 1).
+    without_spots: frames without information. jerk (6,) or (T, 6).
     """
     rng = np.random.default_rng(seed)
     t = 0.1 * np.cumsum(rng.normal(size=(frames, 3)) * DT, axis=0)
     angles = np.cumsum(rng.normal(size=(frames, 3)) * DT, axis=0)
     poses = Pose.from_ypr(angles, t)
     m = rng.normal(size=(frames, 12)) * np.repeat([0.3, 1.0, 1.0, 3.0], 3)
-    ref = Reference(poses.rotation, t, m)  # any motion will do: deviations are about it
+    ref = Reference(poses.rotation, t, m)  # any motion will do, since deviations refer to it
     J = rng.normal(size=(frames, 12, 6)) * [800, 800, 800, 1500, 1500, 1500]  # px per m and rad
     L = np.swapaxes(J, 1, 2) @ J / 0.1**2
-    L[dark] = 0.0
+    L[without_spots] = 0.0
     dt = np.full(frames, DT)
     dt[3 * frames // 4] = 2 * DT  # a frame was dropped
     sizes = np.full((frames, 2), jumps)
     first = np.repeat([0.02, 0.02, 0.5, 0.5, 5.0, 5.0], 3) ** 2
-    ev = FrameInformation(L, np.zeros((frames, 6)), dt, sizes, 100 * sizes, first)
+    info = RunInformation(L, np.zeros((frames, 6)), dt, sizes, 100 * sizes, first)
     jerk = np.array(np.broadcast_to(jerk, (frames, 6)))
     x = np.sqrt(first) * rng.normal(size=STATE)
     true, g = np.empty((frames, STATE)), np.zeros((frames, 6))
@@ -77,26 +73,26 @@ def drawn(
         if k > 0:
             if k == jump_at:
                 jump = np.array([1.0, -0.5, 0.3, 3.0, -2.0, 1.0])
-                x[:6] -= moment * dt[k] * jump  # until then it goes on as before
+                x[:6] -= moment * dt[k] * jump  # until then the old velocity
                 x[6:12] += jump
-            F, Q, away = transition(ref, ev, jerk, k)
+            F, Q, away = transition(ref, info, jerk, k)
             x = F @ x + away + np.linalg.cholesky(Q + 1e-25 * np.eye(STATE)) @ rng.normal(size=STATE)
         true[k] = x
         if L[k].any():
             g[k] = L[k] @ x[:6] + np.linalg.cholesky(L[k]) @ rng.normal(size=6)
-    return Run(ref, ev._replace(vector=g), jerk, true)
+    return Run(ref, info._replace(vector=g), jerk, true)
 
 
 def dense(run: Run, without: int | None = None) -> tuple[Array, Array]:
-    """Mean (T, 18) and covariance (18 T, 18 T) given all evidence, as one Gaussian; without one frame's, if said."""
-    frames = len(run.ev.dt)
-    L, g = run.ev.information.copy(), run.ev.vector.copy()
+    """Mean (T, 18) and covariance (18 T, 18 T) given all information, as one Gaussian; without that of one frame."""
+    frames = len(run.info.dt)
+    L, g = run.info.information.copy(), run.info.vector.copy()
     if without is not None:
         L[without], g[without] = 0.0, 0.0
     mean, P = np.zeros((frames, STATE)), np.zeros((frames, STATE, frames, STATE))
-    P[0, :, 0] = np.diag(run.ev.first)
+    P[0, :, 0] = np.diag(run.info.first_variance)
     for k in range(1, frames):
-        F, Q, away = transition(run.ref, run.ev, run.jerk, k)
+        F, Q, away = transition(run.ref, run.info, run.jerk, k)
         mean[k] = F @ mean[k - 1] + away
         for j in range(k):
             P[k, :, j] = F @ P[k - 1, :, j]
@@ -105,7 +101,7 @@ def dense(run: Run, without: int | None = None) -> tuple[Array, Array]:
     seen = [k for k in range(frames) if L[k].any()]
     rows = np.concatenate([np.arange(6) + STATE * k for k in seen])
     whole = P.reshape(frames * STATE, frames * STATE)
-    # The evidence as measurements L^T/2 x with the covariance 1.
+    # The information as measurements L^(T/2) x with covariance 1.
     H = np.zeros((6 * len(seen), frames * STATE))
     y = np.zeros(6 * len(seen))
     for n, k in enumerate(seen):
@@ -118,33 +114,33 @@ def dense(run: Run, without: int | None = None) -> tuple[Array, Array]:
 
 
 def log_evidence(run: Run, jerk: Array) -> float:
-    """The plain sum over the innovations' Gaussians, of x with noise of covariance L^-1."""
-    x, P, total = np.zeros(STATE), np.diag(run.ev.first), 0.0
-    for k in range(len(run.ev.dt)):
+    """Sum of the log densities of the innovations, for measurements of x with covariance L^-1."""
+    x, P, total = np.zeros(STATE), np.diag(run.info.first_variance), 0.0
+    for k in range(len(run.info.dt)):
         if k > 0:
-            F, Q, away = transition(run.ref, run.ev, jerk, k)
+            F, Q, away = transition(run.ref, run.info, jerk, k)
             x, P = F @ x + away, F @ P @ F.T + Q
-        L = run.ev.information[k]
+        L = run.info.information[k]
         if not L.any():
             continue
         C = np.linalg.inv(L)
-        y, S = C @ run.ev.vector[k] - x[:6], P[:6, :6] + C
+        y, S = C @ run.info.vector[k] - x[:6], P[:6, :6] + C
         total -= 0.5 * (y @ np.linalg.solve(S, y) + np.linalg.slogdet(2 * np.pi * S)[1])
         K = P[:, :6] @ np.linalg.inv(S)
         x, P = x + K @ y, P - K @ P[:6]
     return total
 
 
-def left_out(run: Run, factor: float) -> float:
-    out = smoothed(run.ref, run.ev, factor * run.jerk)
-    return float(leave_one_out_log_likelihood(out.x, out.pose_P, run.ev))
+def leave_one_out(run: Run, factor: float) -> float:
+    out = smoothed(run.ref, run.info, factor * run.jerk)
+    return float(leave_one_out_log_likelihood(out.x, out.pose_P, run.info))
 
 
 RUNS = {
     "steady": lambda: drawn(1, 16),
-    "jumps that are known of": lambda: drawn(2, 16, jumps=0.5),
-    "dark in the middle": lambda: drawn(3, 20, dark=slice(8, 13)),
-    "dark at the end": lambda: drawn(4, 14, dark=slice(10, 14)),
+    "jumps that are allowed for": lambda: drawn(2, 16, jumps=0.5),
+    "no spots in the middle": lambda: drawn(3, 20, without_spots=slice(8, 13)),
+    "no spots at the end": lambda: drawn(4, 14, without_spots=slice(10, 14)),
     "one frame": lambda: drawn(5, 1),
 }
 
@@ -152,8 +148,8 @@ RUNS = {
 @pytest.mark.parametrize("kind", RUNS)
 def test_means_and_covariances_are_those_of_one_dense_gaussian(kind):
     run = RUNS[kind]()
-    frames = len(run.ev.dt)
-    x, pose_P, motion_P, *_ = smoothed(run.ref, run.ev, run.jerk)
+    frames = len(run.info.dt)
+    x, pose_P, motion_P, *_ = smoothed(run.ref, run.info, run.jerk)
     mean, P = dense(run)
     blocks = np.stack([P[STATE * k : STATE * (k + 1), STATE * k : STATE * (k + 1)] for k in range(frames)])
     sigma = np.sqrt(np.diagonal(blocks, axis1=1, axis2=2))
@@ -163,17 +159,19 @@ def test_means_and_covariances_are_those_of_one_dense_gaussian(kind):
     np.testing.assert_allclose((motion_P - blocks[:, 6:12, 6:12]) / scale[:, 6:12, 6:12], 0, atol=1e-6)
 
 
-@pytest.mark.parametrize("kind", ["steady", "jumps that are known of", "dark in the middle", "dark at the end"])
-def test_the_process_noise_of_each_axis_is_what_the_dense_gaussian_says(kind):
-    """Energy w^T Q^-1 w of the noise's mean w, and 3 - tr(Q^-1 cov w): how many of its numbers are determined."""
+@pytest.mark.parametrize(
+    "kind", ["steady", "jumps that are allowed for", "no spots in the middle", "no spots at the end"]
+)
+def test_energy_and_gamma_of_the_process_noise_agree_with_the_dense_gaussian(kind):
+    """Energy w^T Q^-1 w of the noise's mean w, and 3 - tr(Q^-1 cov w), the number of determined components."""
     run = RUNS[kind]()
-    frames = len(run.ev.dt)
-    out = smoothed(run.ref, run.ev, run.jerk)
+    frames = len(run.info.dt)
+    out = smoothed(run.ref, run.info, run.jerk)
     mean, P = dense(run)
     assert np.all(out.energy[0] == 0)  # there is no step before the first frame
     assert np.all(out.gamma[0] == 0)
     for k in range(1, frames):
-        F, Q, away = transition(run.ref, run.ev, run.jerk, k)
+        F, Q, away = transition(run.ref, run.info, run.jerk, k)
         w = mean[k] - F @ mean[k - 1] - away
         step = np.hstack([-F, np.eye(STATE)])
         both = slice(STATE * (k - 1), STATE * (k + 1))
@@ -185,36 +183,36 @@ def test_the_process_noise_of_each_axis_is_what_the_dense_gaussian_says(kind):
             assert out.gamma[k, axis] == pytest.approx(3 - np.trace(inverse @ C[np.ix_(rows, rows)]), abs=1e-4)
 
 
-def test_the_energy_of_the_process_noise_is_on_average_what_is_determined_of_it():
+def test_the_mean_energy_of_the_process_noise_is_the_number_of_determined_components():
     ratio = []
     for seed in range(6):
         run = drawn(300 + seed, 150, jumps=0.01)
-        out = smoothed(run.ref, run.ev, run.jerk)
+        out = smoothed(run.ref, run.info, run.jerk)
         ratio.append(out.energy.sum(axis=0) / out.gamma.sum(axis=0))
-    # Some 6 x 150 steps, each of which determines about one number of every axis' noise: sqrt(2 / 900) = 0.05.
+    # 6 x 150 steps, each of which determines about one component of every axis' noise: sqrt(2 / 900) = 0.05.
     np.testing.assert_allclose(np.mean(ratio, axis=0), 1.0, atol=0.2)
 
 
 @pytest.mark.parametrize("kind", RUNS)
 def test_the_covariances_of_the_ends_are_those_of_the_dense_gaussian(kind):
     run = RUNS[kind]()
-    ends = smoothed(run.ref, run.ev, run.jerk).ends_P
+    ends = smoothed(run.ref, run.info, run.jerk).ends_P
     _, P = dense(run)
     for end, block in zip(ends, (P[:STATE, :STATE], P[-STATE:, -STATE:]), strict=True):
         sigma = np.sqrt(np.diagonal(block))
         np.testing.assert_allclose((end - block) / np.outer(sigma, sigma), 0, atol=1e-6)
 
 
-def test_the_last_frame_is_the_filters():
+def test_the_last_frame_agrees_with_the_filter():
     run = drawn(6, 200)
-    x, pose_P, motion_P, *_ = smoothed(run.ref, run.ev, run.jerk)
-    d, P = np.zeros(STATE), np.diag(run.ev.first)
-    for k in range(len(run.ev.dt)):
+    x, pose_P, motion_P, *_ = smoothed(run.ref, run.info, run.jerk)
+    d, P = np.zeros(STATE), np.diag(run.info.first_variance)
+    for k in range(len(run.info.dt)):
         if k > 0:
-            F, Q, away = transition(run.ref, run.ev, run.jerk, k)
+            F, Q, away = transition(run.ref, run.info, run.jerk, k)
             d, P = F @ d + away, F @ P @ F.T + Q
-        L, g = run.ev.information[k], run.ev.vector[k]
-        # The causal tracker's own update, of a state at rest in the origin: it moves by the deviation's change.
+        L, g = run.info.information[k], run.info.vector[k]
+        # The causal tracker's update of a state at rest in the origin, which moves by the change of the deviation.
         R, t, m, P, _, _ = updated(np.eye(3), np.zeros(3), np.zeros(12), P, L, g - L @ d[:6])
         d = d + np.concatenate([Pose(R, t).minus(Pose.identity()), m])
     sigma = np.sqrt(np.diagonal(P))
@@ -224,22 +222,22 @@ def test_the_last_frame_is_the_filters():
 
 
 @pytest.mark.parametrize("chunk", [1, 7, 12, 24, 25])
-def test_the_frames_in_memory_at_once_do_not_change_the_result(chunk, monkeypatch):
-    run = drawn(7, 24, dark=slice(5, 8))
-    compiled = smoothed(run.ref, run.ev, run.jerk)  # all in one chunk
+def test_the_size_of_the_chunks_does_not_change_the_result(chunk, monkeypatch):
+    run = drawn(7, 24, without_spots=slice(5, 8))
+    compiled = smoothed(run.ref, run.info, run.jerk)  # all in one chunk
     monkeypatch.setattr(fixed_interval, "CHUNK", chunk)
-    for a, b in zip(smoothed.py_func(run.ref, run.ev, run.jerk), compiled, strict=True):
+    for a, b in zip(smoothed.py_func(run.ref, run.info, run.jerk), compiled, strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-18)
 
 
-def test_a_run_of_more_frames_than_are_in_memory_is_smooth_where_the_chunks_meet():
+def test_a_run_of_several_chunks_has_no_error_where_they_meet():
     run = drawn(8, fixed_interval.CHUNK + 40)
-    x, pose_P, *_ = smoothed(run.ref, run.ev, run.jerk)
+    x, pose_P, *_ = smoothed(run.ref, run.info, run.jerk)
     meet = fixed_interval.CHUNK
-    # The frames about the seam by themselves: what lies 70 frames away has no say beyond a thousandth of a sigma.
+    # The frames near the seam by themselves: frames 70 frames away change less than a thousandth of a sigma.
     part = slice(meet - 100, meet + 40)
-    ev = FrameInformation(*(a[part] for a in run.ev[:5]), run.ev.first)
-    alone_x, alone_P, *_ = smoothed(Reference(*(a[part] for a in run.ref)), ev, run.jerk[part])
+    info = RunInformation(*(a[part] for a in run.info[:5]), run.info.first_variance)
+    alone_x, alone_P, *_ = smoothed(Reference(*(a[part] for a in run.ref)), info, run.jerk[part])
     sigma = np.sqrt(np.diagonal(pose_P, axis1=1, axis2=2))[part]
     seam = slice(70, 135)
     np.testing.assert_allclose((alone_x[:, :6] - x[part, :6])[seam] / sigma[seam], 0, atol=1e-3)
@@ -247,10 +245,10 @@ def test_a_run_of_more_frames_than_are_in_memory_is_smooth_where_the_chunks_meet
 
 
 def test_the_likelihood_is_the_product_of_the_innovations_gaussians():
-    run = drawn(9, 25, dark=slice(9, 12))
+    run = drawn(9, 25, without_spots=slice(9, 12))
 
     def both(factor: float) -> Array:
-        return np.array([log_likelihood(run.ref, run.ev, factor * run.jerk), log_evidence(run, factor * run.jerk)])
+        return np.array([log_likelihood(run.ref, run.info, factor * run.jerk), log_evidence(run, factor * run.jerk)])
 
     at_truth = both(1.0)
     for factor in (0.01, 0.3, 5.0, 1000.0):
@@ -258,81 +256,81 @@ def test_the_likelihood_is_the_product_of_the_innovations_gaussians():
         assert ours == pytest.approx(plain, abs=1e-5)
 
 
-def test_the_jerk_that_moved_the_run_is_the_likeliest():
+def test_the_true_jerk_is_the_likeliest():
     run = drawn(10, 400)
     factors = np.array([0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0])
-    values = [log_likelihood(run.ref, run.ev, f * run.jerk) for f in factors]
+    values = [log_likelihood(run.ref, run.info, f * run.jerk) for f in factors]
     assert factors[int(np.argmax(values))] == 1.0
-    likelihoods = [left_out(run, f) for f in factors]
+    likelihoods = [leave_one_out(run, f) for f in factors]
     assert factors[int(np.argmax(likelihoods))] in (0.3, 1.0, 3.0)
 
 
-def test_what_the_others_tell_is_each_frames_likelihood_with_that_frame_left_out():
-    run = drawn(11, 10, dark=slice(4, 6))
+def test_the_leave_one_out_likelihood_agrees_with_leaving_each_frame_out():
+    run = drawn(11, 10, without_spots=slice(4, 6))
 
-    def plainly(factor: float) -> float:
+    def directly(factor: float) -> float:
         total = 0.0
         for k in range(10):
-            L = run.ev.information[k]
+            L = run.info.information[k]
             if not L.any():
                 continue
-            mean, P = dense(Run(run.ref, run.ev, factor * run.jerk, run.true), without=k)
+            mean, P = dense(Run(run.ref, run.info, factor * run.jerk, run.true), without=k)
             own = slice(STATE * k, STATE * k + 6)
             C = np.linalg.inv(L)
-            y, S = C @ run.ev.vector[k] - mean[k, :6], P[own, own] + C
+            y, S = C @ run.info.vector[k] - mean[k, :6], P[own, own] + C
             total -= 0.5 * (y @ np.linalg.solve(S, y) + np.linalg.slogdet(S)[1])
         return total
 
-    ours = [left_out(run, f) for f in (1.0, 0.1, 50.0)]
-    plain = [plainly(f) for f in (1.0, 0.1, 50.0)]
+    ours = [leave_one_out(run, f) for f in (1.0, 0.1, 50.0)]
+    plain = [directly(f) for f in (1.0, 0.1, 50.0)]
     np.testing.assert_allclose(np.array(ours) - ours[0], np.array(plain) - plain[0], atol=1e-4)
 
 
-def test_a_smoothed_state_is_as_far_off_as_it_claims():
+def test_the_covariances_of_smoothed_states_are_right():
     chi2, motion = [], []
     for seed in range(6):
-        run = drawn(100 + seed, 150, dark=slice(70, 80))
-        x, pose_P, motion_P, *_ = smoothed(run.ref, run.ev, run.jerk)
+        run = drawn(100 + seed, 150, without_spots=slice(70, 80))
+        x, pose_P, motion_P, *_ = smoothed(run.ref, run.info, run.jerk)
         d = x - run.true
         chi2 += [d[k, :6] @ np.linalg.solve(pose_P[k], d[k, :6]) / 6 for k in range(0, 150, 10)]
         motion += [d[k, 6:12] @ np.linalg.solve(motion_P[k], d[k, 6:12]) / 6 for k in range(0, 150, 10)]
-    # 90 states, each ten frames from the next: the mean of a chi-square over 6 scatters by 0.06.
+    # 90 states ten frames apart: the mean of chi-square / 6 scatters by 0.06.
     assert np.mean(chi2) == pytest.approx(1.0, abs=0.2)
     assert np.mean(motion) == pytest.approx(1.0, abs=0.25)
 
 
-def test_a_jump_of_the_velocities_is_found_at_its_step_and_none_where_there_is_none():
+def test_a_velocity_jump_is_found_at_its_step_and_none_in_steady_motion():
     shocks = []
     for seed in range(8):
         run = drawn(200 + seed, 120)
-        steady = smoothed(run.ref, run.ev, run.jerk)[3]
+        steady = smoothed(run.ref, run.info, run.jerk)[3]
         assert steady[0] == 0.0  # there is no step before the first frame
         shocks.append(steady[1:-5])
         run = drawn(200 + seed, 120, jump_at=61)
-        bent = smoothed(run.ref, run.ev, run.jerk)[3]
-        assert int(np.argmax(bent)) == 61
-        assert bent[61] > 200
-        for moment in (0.05, 0.95):  # at either end of its step it may as well be in the step beside it
+        jumped = smoothed(run.ref, run.info, run.jerk)[3]
+        assert int(np.argmax(jumped)) == 61
+        assert jumped[61] > 200
+        for moment in (0.05, 0.95):  # near an end of its step it may be found in the next one
             run = drawn(200 + seed, 120, jump_at=61, moment=moment)
-            bent = smoothed(run.ref, run.ev, run.jerk)[3]
-            assert abs(int(np.argmax(bent)) - 61) <= APART
-            assert np.max(bent) > 200
+            jumped = smoothed(run.ref, run.info, run.jerk)[3]
+            assert abs(int(np.argmax(jumped)) - 61) <= SHOCK_SEPARATION
+            assert np.max(jumped) > 200
     alarms = np.concatenate(shocks)
-    # Chi-square of 6 degrees: its mean is 6, and 45 is exceeded five times in 10^8.
+    # Chi-square of 6 degrees of freedom: its mean is 6, and it exceeds 45 five times in 10^8.
     assert np.mean(alarms) == pytest.approx(6.0, abs=1.0)
     assert np.max(alarms) < 45
 
 
-def test_a_jump_that_the_motion_allows_for_is_no_shock():
+def test_a_jump_that_the_model_allows_for_is_not_a_shock():
     run = drawn(12, 80, jump_at=41)
-    assert smoothed(run.ref, run.ev, run.jerk)[3][41] > 200
-    run.ev.jump[41], run.ev.unsteady[41] = 16.0, 100.0
-    shock = smoothed(run.ref, run.ev, run.jerk)[3]
+    assert smoothed(run.ref, run.info, run.jerk)[3][41] > 200
+    run.info.velocity_jump[41], run.info.acceleration_jump[41] = 16.0, 100.0
+    shock = smoothed(run.ref, run.info, run.jerk)[3]
     assert shock[41] < 20
     assert np.max(shock) < 45
 
 
-def test_a_reference_is_shifted_by_the_contracts_pose_error():
+def test_a_reference_is_shifted_by_pose_errors_as_defined_in_the_contract():
     run = drawn(13, 5)
     there = shifted(run.ref, 10 * run.true)
     np.testing.assert_allclose(

@@ -1,4 +1,4 @@
-"""Errors that belong to a place on the screen: a vehicle at rest shows them in every frame; no mean lessens them."""
+"""Errors that belong to a place on the screen, which averaging over a vehicle at rest does not reduce."""
 
 from dataclasses import replace
 
@@ -14,7 +14,7 @@ WIDTH_PX = 2.0
 
 
 def textured(run: PointRun, place_px: float, white_px: float, seed: int) -> PointRun:
-    """The recording with other errors: white ones, and a smooth field over each picture for each spot."""
+    """The recording with other errors: white noise, and for each spot a smooth random field over its picture."""
     rng = np.random.default_rng(seed)
     waves, n = 48, run.uv_px.shape[1]
     k_vectors = rng.normal(0, 1 / np.sqrt(2) / WIDTH_PX, (n, 2, waves, 2))
@@ -39,7 +39,7 @@ def textured(run: PointRun, place_px: float, white_px: float, seed: int) -> Poin
 
 @pytest.mark.parametrize(("scenario", "least", "most"), [("static", 0.1, 3.0), ("huo2015", 0.5, 1.6)])
 def test_sigmas_stay_right_where_texture_shifts_the_spots(scenario, least, most):
-    """White noise alone would make the pose at rest 10 times as sure as it is: 100 in the squares."""
+    """Taken for white noise, they would make the sigmas at rest 10 times too small: a NEES of 100."""
     nees, shares = [], []
     for seed in range(2):
         run = textured(simulate_points(scenario, seed, frames=120, noise_px=0.05, clutter=0.0), 0.03, 0.01, seed)
@@ -60,8 +60,8 @@ def test_white_noise_is_averaged_over_a_vehicle_at_rest():
         assert frames[60].pose_covariance[0, 0] < one[0] / 20
 
 
-def test_errors_are_alike_as_far_as_the_spot_is_wide():
-    """The mean over a Gaussian of white texture, in two places: the overlap of the two Gaussians."""
+def test_the_correlation_length_of_the_errors_is_the_width_of_the_spot():
+    """Means over a Gaussian of white texture in two places: their correlation is the overlap of the two Gaussians."""
     rng = np.random.default_rng(5)
     width, shift = 3.0, 4.0
     x = np.arange(-20, 21)
@@ -70,7 +70,7 @@ def test_errors_are_alike_as_far_as_the_spot_is_wide():
     assert np.corrcoef(means.T)[0, 1] == pytest.approx(float(correlation(np.array(shift), width)), abs=0.03)
 
 
-def test_calibration_errors_that_are_known_are_no_errors_of_places():
+def test_known_calibration_errors_are_not_taken_for_errors_of_places():
     rng = np.random.default_rng(6)
     residual = np.tile(rng.standard_normal((1, 6, 2)), (80, 1, 1))
     uv, width, averaged = np.zeros((80, 6, 2)), np.full(6, 2.0), np.full(80, 80.0)
@@ -78,7 +78,7 @@ def test_calibration_errors_that_are_known_are_no_errors_of_places():
     assert place_errors(residual, uv, width, averaged, np.ones(6)).share == 0.0
 
 
-def test_nothing_labelled_says_nothing():
+def test_a_run_without_labels_has_no_errors_of_places():
     nothing = place_errors(
         np.full((5, 4, 2), np.nan), np.full((5, 4, 2), np.nan), np.full(4, np.nan), np.ones(5), np.zeros(4)
     )
@@ -87,7 +87,7 @@ def test_nothing_labelled_says_nothing():
 
 
 def test_a_pose_of_one_frame_keeps_its_covariance():
-    """It holds the whole error of its spots already."""
+    """It includes the whole error of its spots already."""
     errors = PlaceErrors(0.7, np.full(3, 50.0), np.full(6, 2.0))
     assert errors.factor(np.ones(3)) == pytest.approx(1.0)
     assert errors.factor(np.full(3, 1e6)) == pytest.approx(1 + 0.7 * 49)

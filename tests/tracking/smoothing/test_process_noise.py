@@ -1,4 +1,4 @@
-"""The strength of the jerk is learnt by axis and by time, and where nothing tells it stays where it is."""
+"""The strength of the jerk is estimated by axis and by time, and kept where the data do not determine it."""
 
 from __future__ import annotations
 
@@ -6,80 +6,80 @@ import numpy as np
 
 from geometry.arrays import Array
 from tests.tracking.smoothing.test_fixed_interval import Run, drawn
-from tracking.smoothing.fixed_interval import smoothed
-from tracking.smoothing.process_noise import LOG_RANGE, next_log_density
-from tracking.smoothing.whole_run import GLOBAL_PASSES
+from tracking.smoothing.motion.fixed_interval import smoothed
+from tracking.smoothing.motion.process_noise import LOG_RANGE, next_log_density
+from tracking.smoothing.motion.whole_run import GLOBAL_PASSES
 
 FRAMES = 300
 START = np.full((FRAMES, 6), 2 * np.log(30.0))
 
 
-def learnt(run: Run, passes: int = 14, whole_run_first: int = GLOBAL_PASSES) -> tuple[Array, float]:
-    """The logarithms (T, 6) of the strengths after so many passes, and the largest change of the last one."""
+def estimated(run: Run, passes: int = 14, whole_run_first: int = GLOBAL_PASSES) -> tuple[Array, float]:
+    """Logarithms (T, 6) of the strengths after so many passes, and the largest change of the last pass."""
     log_density, change = START, np.inf
     usable = np.arange(len(START)) > 0
     for number in range(passes):
         before = log_density
-        out = smoothed(run.ref, run.ev, np.exp(before))
+        out = smoothed(run.ref, run.info, np.exp(before))
         assert np.isfinite(out.x).all()
         log_density = next_log_density(before, out, usable, local=number >= whole_run_first)
         change = float(np.abs(log_density - before).max())
     return log_density, change
 
 
-def test_each_axis_settles_at_the_jerk_that_moved_it():
-    # From 2 m/s^3 to 500 rad/s^3 per sqrt(Hz): all that the spots of this run determine.
+def test_each_axis_converges_to_its_true_jerk():
+    # From 5 m/s^3 to 500 rad/s^3 per sqrt(Hz): the range that the spots of this run determine.
     jerk = np.array([5.0, 50.0, 200.0, 20.0, 500.0, 100.0]) ** 2
-    of = [np.median(learnt(drawn(seed, FRAMES, jerk=jerk))[0], axis=0) for seed in range(3)]
-    # 12 determined numbers per window make the logarithm good to 0.4, a run of 300 frames to 0.15.
+    of = [np.median(estimated(drawn(seed, FRAMES, jerk=jerk))[0], axis=0) for seed in range(3)]
+    # With 12 determined components the sigma of the logarithm is 0.4 per window, and 0.15 for a run of 300 frames.
     np.testing.assert_allclose(np.mean(of, axis=0), np.log(jerk), atol=0.5)
 
 
-def test_one_strength_for_the_whole_run_settles_at_the_jerk_that_moved_it():
+def test_one_strength_for_the_whole_run_converges_to_the_true_jerk():
     jerk = np.array([5.0, 50.0, 200.0, 20.0, 500.0, 100.0]) ** 2
-    of = [np.median(learnt(drawn(seed, FRAMES, jerk=jerk), 20, 20)[0], axis=0) for seed in range(3)]
+    of = [np.median(estimated(drawn(seed, FRAMES, jerk=jerk), 20, 20)[0], axis=0) for seed in range(3)]
     np.testing.assert_allclose(np.mean(of, axis=0), np.log(jerk), atol=0.4)
 
 
-def test_more_passes_do_not_make_the_strengths_of_one_steady_motion_drift_apart():
+def test_with_more_passes_the_strengths_of_one_steady_motion_do_not_drift_apart():
     run = drawn(1, FRAMES, jerk=np.repeat([20.0, 60.0], 3) ** 2)
-    few, many = learnt(run, 14)[0], learnt(run, 40)[0]
-    # Windows of 12 determined numbers: their logarithms scatter by 0.4, with pseudo-counts a little less.
+    few, many = estimated(run, 14)[0], estimated(run, 40)[0]
+    # Windows of 12 determined components: their logarithms scatter by 0.4, with pseudo-counts a little less.
     assert np.all(np.std(many, axis=0) < np.std(few, axis=0) + 0.8)
     np.testing.assert_allclose(np.median(many, axis=0), np.log(run.jerk[0]), atol=0.8)
 
 
 def test_each_half_of_a_run_has_its_own_jerk():
-    quiet, lively = np.repeat([10.0, 30.0], 3) ** 2, np.repeat([200.0, 600.0], 3) ** 2
-    jerk = np.where(np.arange(FRAMES)[:, None] < FRAMES // 2, quiet, lively)
-    log_density, _ = learnt(drawn(4, FRAMES, jerk=jerk))
+    weak, strong = np.repeat([10.0, 30.0], 3) ** 2, np.repeat([200.0, 600.0], 3) ** 2
+    jerk = np.where(np.arange(FRAMES)[:, None] < FRAMES // 2, weak, strong)
+    log_density, _ = estimated(drawn(4, FRAMES, jerk=jerk))
     first, second = np.median(log_density[20:130], axis=0), np.median(log_density[170:280], axis=0)
-    np.testing.assert_allclose(first, np.log(quiet), atol=1.0)
-    np.testing.assert_allclose(second, np.log(lively), atol=1.0)
+    np.testing.assert_allclose(first, np.log(weak), atol=1.0)
+    np.testing.assert_allclose(second, np.log(strong), atol=1.0)
 
 
-def test_a_uniform_motion_lets_the_jerk_fall_until_the_evidence_cannot_tell():
+def test_in_uniform_motion_the_jerk_falls_until_the_data_no_longer_determine_it():
     run = drawn(5, FRAMES, jerk=np.zeros(6))
-    log_density, _ = learnt(run)
+    log_density, _ = estimated(run)
     assert np.all(log_density > LOG_RANGE[0])
     assert np.all(log_density < START)
-    out = smoothed(run.ref, run.ev, np.exp(log_density))
+    out = smoothed(run.ref, run.info, np.exp(log_density))
     d = out.x - run.true
     chi2 = [d[k, :6] @ np.linalg.solve(out.pose_P[k], d[k, :6]) / 6 for k in range(0, FRAMES, 10)]
-    # One uniform motion: all frames share some 18 errors.
+    # In uniform motion all frames share some 18 errors.
     assert np.mean(chi2) < 2.5
 
 
-def test_a_run_without_evidence_keeps_its_jerk():
-    run = drawn(6, FRAMES, dark=slice(0, FRAMES))
-    np.testing.assert_array_equal(learnt(run, 8)[0], START)
+def test_a_run_without_spots_keeps_its_jerk():
+    run = drawn(6, FRAMES, without_spots=slice(0, FRAMES))
+    np.testing.assert_array_equal(estimated(run, 8)[0], START)
 
 
-def test_steps_with_a_bend_say_nothing_of_the_steady_motion():
+def test_steps_with_a_velocity_jump_are_left_out():
     run = drawn(7, FRAMES, jump_at=150)
-    out = smoothed(run.ref, run.ev, np.exp(START))
+    out = smoothed(run.ref, run.info, np.exp(START))
     usable = np.arange(FRAMES) > 0
-    taught = next_log_density(START, out, usable, local=True)
+    with_jump = next_log_density(START, out, usable, local=True)
     usable[140:160] = False
-    spared = next_log_density(START, out, usable, local=True)
-    assert np.all(taught[150] > spared[150])
+    without_jump = next_log_density(START, out, usable, local=True)
+    assert np.all(with_jump[150] > without_jump[150])

@@ -1,4 +1,4 @@
-"""The second look at a run: better poses that say how good they are, and names that the causal look left open."""
+"""The smoothing pass: better poses with correct covariances, and labels that the causal pass left open."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.tracking.rigid_runs import (
     RIGID,
     Judged,
     Pooled,
-    around_bends,
+    around_jumps,
     found_in,
     judged,
     looked_at_again,
@@ -30,21 +30,21 @@ from tracking.smoothing.smoother import smooth
 from tracking.statuses import PoseStatus, SpotStatus
 from tracking.tracked_frame import TrackedFrame
 
-Looks = tuple[PointRun, list[TrackedFrame], list[TrackedFrame], Smoothed]
+Passes = tuple[PointRun, list[TrackedFrame], list[TrackedFrame], Smoothed]
 
 
 @cache
-def both_looks(scenario: str, seed: int, frames: int = 200, hide: tuple[str, int] | None = None) -> Looks:
-    """A recording, the causal answers, the smoothed ones, and what the smoother says of the run."""
+def both_passes(scenario: str, seed: int, frames: int = 200, hide: tuple[str, int] | None = None) -> Passes:
+    """A recording, the causal answers, the smoothed ones, and the smoother's result for the run."""
     run = simulate_points(scenario, seed, frames=frames)
     if hide is not None:
-        run = hidden(run, around_bends(run, *hide, seed))
+        run = hidden(run, around_jumps(run, *hide, seed))
     causal = tracked(run)
     return run, causal, *looked_at_again(run, causal)
 
 
-def judged_both(looks: Looks) -> tuple[Judged, Judged]:
-    return judged(looks[0], looks[1]), judged(looks[0], looks[2])
+def judged_both(passes: Passes) -> tuple[Judged, Judged]:
+    return judged(passes[0], passes[1]), judged(passes[0], passes[2])
 
 
 CASES: list[tuple[str, tuple[str, int] | None]] = [
@@ -57,38 +57,38 @@ CASES: list[tuple[str, tuple[str, int] | None]] = [
 
 
 @pytest.mark.parametrize(("scenario", "hide"), CASES)
-def test_the_second_look_names_no_fewer_spots_and_none_wrongly(scenario, hide):
-    causal, again = judged_both(both_looks(scenario, 7001, 200, hide))
+def test_the_smoothing_pass_labels_no_fewer_spots_and_none_wrongly(scenario, hide):
+    causal, again = judged_both(both_passes(scenario, 7001, 200, hide))
     assert again.missed() <= causal.missed() + 1
     assert again.missed() <= 3
     assert again.wrong == 0
 
 
-def test_the_second_look_takes_no_false_points_for_spots_of_a_hidden_screen():
-    _, again = judged_both(both_looks("sharp-turns", 7001, 200, ("screen", 10)))
+def test_the_smoothing_pass_labels_no_false_points_on_an_occluded_screen():
+    _, again = judged_both(both_passes("sharp-turns", 7001, 200, ("screen", 10)))
     assert again.wrong == 0
     assert np.nanmax(again.nees) / 6 < 6
 
 
-def test_the_second_look_names_no_fewer_spots_where_a_screen_was_hidden():
-    causal, again = judged_both(both_looks("sharp-turns", 7001, 200, ("screen", 10)))
+def test_the_smoothing_pass_labels_no_fewer_spots_where_a_screen_was_occluded():
+    causal, again = judged_both(both_passes("sharp-turns", 7001, 200, ("screen", 10)))
     assert again.missed() <= causal.missed() + 1
 
 
-def test_all_frames_together_know_the_pose_better_than_each_and_claim_no_more_than_they_know():
-    of = [judged_both(both_looks("smooth", seed)) for seed in (7001, 7002)]
+def test_smoothed_poses_are_better_than_causal_ones_and_their_covariances_are_right():
+    of = [judged_both(both_passes("smooth", seed)) for seed in (7001, 7002)]
     causal, again = Pooled([c for c, _ in of]), Pooled([a for _, a in of])
     assert again.over_bound() < 0.6 * causal.over_bound()
     assert again.over_bound() < 0.55
     assert again.over_bound(rotation=False) < 0.4
-    # Errors of neighbours are the same error: some 20 frames of 380 are independent.
+    # Errors of neighbouring frames are correlated: some 20 frames of 380 are independent.
     assert 0.6 < again.nees() < 1.5
 
 
 @pytest.mark.parametrize("scenario", ["smooth", "sharp-turns"])
-def test_its_claims_are_not_larger_than_the_causal_ones(scenario):
-    """Except in a frame or two before a bend: that it may lie a step earlier only the frames after it can say."""
-    _, causal, again, _ = both_looks(scenario, 7001)
+def test_smoothed_covariances_are_not_larger_than_causal_ones(scenario):
+    """Except in one or two frames before a velocity jump: only later frames show that it may have happened earlier."""
+    _, causal, again, _ = both_passes(scenario, 7001)
     ratio = []
     for a, b in zip(causal[20:], again[20:], strict=True):
         assert a.pose_covariance is not None
@@ -98,22 +98,22 @@ def test_its_claims_are_not_larger_than_the_causal_ones(scenario):
     assert max(ratio) < 2.0
 
 
-def test_bends_are_neither_rounded_nor_invented():
-    """At a bend the error stays within what is claimed, and the steady frames do not pay for it."""
-    of = [both_looks("sharp-turns", seed) for seed in (7001, 7002)]
-    at_bends, steady = [], []
+def test_velocity_jumps_are_neither_smoothed_away_nor_invented():
+    """At a jump the covariance covers the error, and the steady frames are not affected."""
+    of = [both_passes("sharp-turns", seed) for seed in (7001, 7002)]
+    at_jumps, steady = [], []
     for run, _, again, _ in of:
         near = np.convolve(run.turned, np.ones(5), "same") > 0
         j = judged(run, again)
-        at_bends.append(j.nees[near])
+        at_jumps.append(j.nees[near])
         steady.append(j.nees[~near])
-    # White jerk with a jump stands for a bend within one frame that this simulation rounds nowhere.
-    assert np.mean(np.concatenate(at_bends)) / 6 < 1.7
+    # White jerk with a jump is the model of a corner that the simulation puts within one step.
+    assert np.mean(np.concatenate(at_jumps)) / 6 < 1.7
     assert 0.6 < np.mean(np.concatenate(steady)) / 6 < 1.4
 
 
-def test_velocity_and_rate_are_told_with_their_own_sigmas():
-    run, causal, again, _ = both_looks("smooth", 7001)
+def test_the_covariances_of_velocity_and_rate_are_right():
+    run, causal, again, _ = both_passes("smooth", 7001)
     chi2 = []
     for k in range(20, 180):
         true = run.poses[k + 1].minus(run.poses[k - 1]) / (run.t_s[k + 1] - run.t_s[k - 1])
@@ -126,8 +126,8 @@ def test_velocity_and_rate_are_told_with_their_own_sigmas():
     assert 0.3 < np.mean(chi2) / 6 < 2.5
 
 
-def test_with_the_jerk_set_by_hand_the_last_frame_is_the_trackers():
-    """The same motion, the same evidence, nothing later: the filter and the smoother are one there."""
+def test_with_the_jerk_set_by_hand_the_last_frame_agrees_with_the_tracker():
+    """With the same motion model, the same spots and no later frame, filter and smoother agree."""
     by_hand = TrackerParameters(learn_jerk=False, jerk_m_s3=3.0, jerk_rad_s3=8.0, p_manoeuvre=1e-9)
     run = simulate_points("smooth", 7003, frames=150, clutter=0.0)
     causal = tracked(run, by_hand)
@@ -147,16 +147,16 @@ def test_with_the_jerk_set_by_hand_the_last_frame_is_the_trackers():
     assert np.abs((b.motion.rate - a.motion.rate) / v[3:]).max() < 5e-3
 
 
-def test_time_has_no_direction_in_the_second_look():
-    """The run backwards, with the same names: the same poses, the velocities turned round."""
-    run, causal, _, _ = both_looks("smooth", 7001)
+def test_smoothing_does_not_depend_on_the_direction_of_time():
+    """The reversed run with the same labels has the same poses and the opposite velocities."""
+    run, causal, _, _ = both_passes("smooth", 7001)
     whole = slice(None, None, -1)
     back = some_frames(run, np.arange(len(run.frame))[whole])
     back = replace(back, t_s=-back.t_s)
     by_hand = TrackerParameters(learn_jerk=False, jerk_m_s3=3.0, jerk_rad_s3=8.0)
     forth, _ = looked_at_again(run, causal, by_hand)
     turned, _ = looked_at_again(back, causal[whole], by_hand)
-    middle = range(40, 160)  # the ends have their own beginnings
+    middle = range(40, 160)  # the priors at the ends differ
     for k in middle:
         a, b = forth[k], turned[len(turned) - 1 - k]
         assert a.pose is not None
@@ -170,15 +170,15 @@ def test_time_has_no_direction_in_the_second_look():
 
 
 def test_the_strength_of_the_jerk_follows_the_motion():
-    slow, fast = both_looks("smooth", 7001)[3].jerk, both_looks("very-fast", 7001)[3].jerk
-    assert np.all(fast > 8 * slow)  # eight times as fast is 512 times the jerk, some of it in the same second
+    slow, fast = both_passes("smooth", 7001)[3].jerk, both_passes("very-fast", 7001)[3].jerk
+    assert np.all(fast > 8 * slow)  # eight times as fast is 512 times the jerk
 
 
-def test_what_is_hidden_is_told_from_both_sides():
-    run, causal, again, _ = both_looks("sharp-turns", 7001, 200, ("all", 3))
-    dark = ~((run.in_view == 1).any(axis=1))
+def test_poses_in_an_occlusion_follow_from_both_sides():
+    run, causal, again, _ = both_passes("sharp-turns", 7001, 200, ("all", 3))
+    occluded = ~((run.in_view == 1).any(axis=1))
     c, a = judged(run, causal), judged(run, again)
-    inside = dark & ~np.isnan(c.errors[:, 0])
+    inside = occluded & ~np.isnan(c.errors[:, 0])
     assert inside.sum() >= 9
     for part in (slice(0, 3), slice(3, 6)):  # position and attitude
         rms = [np.sqrt(np.mean(j.errors[inside, part] ** 2)) for j in (c, a)]
@@ -188,17 +188,17 @@ def test_what_is_hidden_is_told_from_both_sides():
         assert again[k].pose_status is PoseStatus.PREDICTED
 
 
-def test_a_bend_in_the_middle_of_a_dark_stretch_is_within_what_is_claimed():
+def test_the_covariance_covers_a_velocity_jump_in_the_middle_of_an_occlusion():
     nees = []
     for seed in (7001, 7002):
-        run, _, again, _ = both_looks("sharp-turns", seed, 200, ("all", 10))
-        dark = ~((run.in_view == 1).any(axis=1))
-        nees.append(judged(run, again).nees[dark])
+        run, _, again, _ = both_passes("sharp-turns", seed, 200, ("all", 10))
+        occluded = ~((run.in_view == 1).any(axis=1))
+        nees.append(judged(run, again).nees[occluded])
     assert np.nanmean(np.concatenate(nees)) / 6 < 2.0
 
 
-def test_a_start_that_the_tracker_did_not_see_is_named_from_later():
-    """For 15 frames beams A and B alone fit B and C as well; once C shines all is told, those frames too."""
+def test_a_start_that_the_tracker_could_not_label_is_labelled_from_later_frames():
+    """For 15 frames beams A and B alone fit B and C as well; beam C then decides, for those frames too."""
     run = simulate_points("static", 7004, frames=60, clutter=0.0)
     hide = np.zeros(run.in_view.shape, dtype=bool)
     hide[:15, [2, 5]] = True
@@ -211,10 +211,10 @@ def test_a_start_that_the_tracker_did_not_see_is_named_from_later():
     assert np.all(j.nees[:15] / 6 < 4)
 
 
-def test_a_label_changed_or_left_open_is_told():
+def test_labels_that_are_changed_or_left_open_have_events():
     seen = 0
     for seed in (7001, 7002):
-        _, causal, again, smoothed = both_looks("very-fast", seed)
+        _, causal, again, smoothed = both_passes("very-fast", seed)
         changed = 0
         for a, b in zip(causal, again, strict=True):
             other = (b.point != a.point) & (a.point != UNMATCHED)
@@ -242,7 +242,7 @@ def test_a_gap_of_one_camera_is_bridged_from_both_sides():
 
 
 @pytest.mark.parametrize("frames", [1, 2, 3])
-def test_very_short_runs_have_a_second_look_too(frames):
+def test_very_short_runs_are_smoothed_too(frames):
     run = simulate_points("smooth", 7001, frames=frames)
     again, smoothed = looked_at_again(run, tracked(run))
     assert smoothed.frames == frames
@@ -251,7 +251,7 @@ def test_very_short_runs_have_a_second_look_too(frames):
     assert np.all(judged(run, again).nees / 6 < 4)
 
 
-def test_of_a_run_without_light_nothing_is_known():
+def test_nothing_is_known_of_a_run_without_visible_spots():
     run = simulate_points("smooth", 7006, frames=20, clutter=0.5)
     run = hidden(run, np.ones(run.in_view.shape, dtype=bool))
     again, smoothed = looked_at_again(run, tracked(run))
@@ -262,7 +262,7 @@ def test_of_a_run_without_light_nothing_is_known():
         assert np.all(f.point == UNMATCHED)
 
 
-def test_labels_of_the_paper_s_tracker_are_left_as_they_are():
+def test_labels_of_the_papers_tracker_are_not_changed():
     run = simulate_points("smooth", 7007, frames=60)
     spots = TrackerParameters(method="spots")
     causal = tracked(run)
@@ -277,7 +277,7 @@ def test_labels_of_the_paper_s_tracker_are_left_as_they_are():
     assert 0.5 < np.mean(j.nees) / 6 < 2.0
 
 
-def test_sigmas_three_times_too_small_are_found_out():
+def test_sigmas_three_times_too_small_are_corrected():
     run = simulate_points("smooth", 7008, frames=150)
     small = replace(run, detections=tuple(tuple(replace(d, cov_px2=d.cov_px2 / 9) for d in f) for f in run.detections))
     again, smoothed = looked_at_again(small, tracked(small))
@@ -287,8 +287,8 @@ def test_sigmas_three_times_too_small_are_found_out():
     assert j.missed() <= 3
 
 
-def test_the_poses_between_are_on_the_way():
-    """Of a dark stretch on a straight way: the middle is the mean of its two ends."""
+def test_poses_in_an_occlusion_at_rest_stay_where_they_are():
+    """Their errors are within their sigmas, which are not smaller than before the occlusion."""
     run = simulate_points("static", 7009, frames=60, clutter=0.0)
     hide = np.zeros(run.in_view.shape, dtype=bool)
     hide[30:35] = True
@@ -320,16 +320,16 @@ SEEDS = range(8200, 8208)  # no parameter was chosen on them
         ("very-fast", None),
     ],
 )
-def test_over_eight_runs_of_600_frames_the_second_look_is_better_and_honest(scenario, hide):
+def test_over_eight_runs_of_600_frames_the_smoothing_pass_is_better_with_correct_covariances(scenario, hide):
     causal, again = [], []
     for seed in SEEDS:
-        looks = both_looks(scenario, seed, 600, hide)
-        for into, j in zip((causal, again), judged_both(looks), strict=True):
+        passes = both_passes(scenario, seed, 600, hide)
+        for into, j in zip((causal, again), judged_both(passes), strict=True):
             into.append(j)
     first, second = Pooled(causal), Pooled(again)
     assert second.identity >= first.identity - 1e-4
     assert second.wrong_share <= 2e-4
-    assert 0.85 < second.nees(lit=True) < 1.15
+    assert 0.85 < second.nees(observable=True) < 1.15
     assert second.nees() <= 1.5
     assert second.over_bound() < first.over_bound()
     if scenario == "smooth":

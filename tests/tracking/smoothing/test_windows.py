@@ -1,4 +1,4 @@
-"""Moving windows against scipy.ndimage, which would take too long to import."""
+"""Moving windows against scipy.ndimage."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy.ndimage import maximum_filter1d, uniform_filter1d
 
-from tracking.smoothing.windows import largest_near, window_mean
+from tracking.smoothing.motion.windows import largest_near, window_mean
 
 
 @pytest.mark.parametrize("frames", [1, 2, 7, 50, 301])
 @pytest.mark.parametrize("half", [0, 1, 2, 3, 7, 20, 1000])
-def test_the_largest_near_is_scipys(frames, half):
+def test_the_moving_maximum_is_scipys(frames, half):
     rng = np.random.default_rng(frames)
     for values in (rng.normal(size=frames), rng.normal(size=(frames, 3))):
         np.testing.assert_array_equal(
@@ -24,13 +24,13 @@ def test_the_largest_near_is_scipys(frames, half):
     np.testing.assert_array_equal(got, wanted)
 
 
-def test_of_nothing_the_largest_is_nothing():
+def test_the_moving_maximum_of_an_empty_series_is_empty():
     assert largest_near(np.empty(0), 3).shape == (0,)
 
 
 @pytest.mark.parametrize("frames", [1, 2, 7, 50, 301])
 @pytest.mark.parametrize("width", [1, 2, 3, 4, 9, 50])
-def test_the_window_mean_is_scipys_to_the_last_bit(frames, width):
+def test_the_moving_mean_is_bit_identical_to_scipys(frames, width):
     if width > frames:
         pytest.skip("no wider than the series")
     values = 10 ** np.random.default_rng(width).uniform(-5, 5, frames)

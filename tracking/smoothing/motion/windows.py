@@ -1,6 +1,6 @@
-"""Maxima and means over a moving window of a series.
+"""Moving maximum and mean of a series.
 
-scipy.ndimage has both; importing it takes 0.1 s of a run that must be ready in half a second. The tests compare.
+scipy.ndimage has both, but its import takes 0.1 s of a run that must start in half a second. The tests compare with it.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ Values = TypeVar("Values", Array, Bools)
 
 
 def largest_near(values: Values, half: int) -> Values:
-    """The largest of the values (T, ...) at most `half` places away along the first axis, of those that there are.
+    """Moving maximum (T, ...) of values (T, ...) over at most `half` places on either side along the first axis.
 
-    Maxima over 1, 2, 4 ... places, of which the last two that overlap make the window.
+    From maxima over 1, 2, 4 ... places; the last two, which overlap, make the window.
     """
     frames = len(values)
     half = min(half, frames)
@@ -34,9 +34,9 @@ def largest_near(values: Values, half: int) -> Values:
 
 
 def window_mean(values: Array, width: int) -> Array:
-    """Means of the values (T,) over `width` places about each, width // 2 of them before it; 0 beyond the ends.
+    """Moving mean (T,) of values (T,) over `width` places, width // 2 of them before each; zeros beyond the ends.
 
-    By a running sum: as scipy.ndimage.uniform_filter1d, bit by bit.
+    A running sum, bit-identical to scipy.ndimage.uniform_filter1d.
     """
     padded = np.concatenate([np.zeros(width // 2), values, np.zeros(width - width // 2 - 1)])
     first = np.cumsum(padded[:width])[-1:]

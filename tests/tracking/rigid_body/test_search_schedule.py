@@ -1,0 +1,75 @@
+"""When the rigid tracker searches a frame for the whole vehicle."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from geometry.forward_model import SpotModel
+from lab.simulate.rigs import RIGS
+from tracking.detections import Detections
+from tracking.rigid_body.models.occlusion import MISSED
+from tracking.rigid_body.search_schedule import SEARCH_AT, SearchSchedule
+
+MODEL = SpotModel.of(RIGS["fan"]())
+N = len(MODEL)
+MIN_SPOTS = 4
+FOUND_ALL = np.arange(N)
+
+
+def points(*counts: int) -> list[Detections]:
+    """So many points per camera."""
+    return [Detections.at(np.zeros((n, 2)), np.tile(np.eye(2), (n, 1, 1))) for n in counts]
+
+
+def searched(schedule: SearchSchedule, best: np.ndarray | None, vague: bool, frames: int, counts=(3, 3)) -> list[int]:
+    """The numbers of the searched frames, beginning with 1."""
+    out = []
+    for k in range(1, frames + 1):
+        schedule.next_frame()
+        if schedule.due(best, points(*counts), lambda: vague):
+            out.append(k)
+    return out
+
+
+def tracking() -> SearchSchedule:
+    """A schedule long after the vehicle was found."""
+    schedule = SearchSchedule(MODEL, MIN_SPOTS)
+    searched(schedule, FOUND_ALL, False, 10)
+    return schedule
+
+
+def test_without_a_hypothesis_searches_become_less_frequent():
+    frames = searched(SearchSchedule(MODEL, MIN_SPOTS), None, False, 130)
+    assert frames[:20] == list(range(1, 21))
+    assert frames[20:22] == [22, 24]
+    assert frames[-3:] == [120, 125, 130]
+
+
+def test_more_points_than_before_are_searched_at_once():
+    schedule = SearchSchedule(MODEL, MIN_SPOTS)
+    searched(schedule, None, False, 121)
+    assert schedule.due(None, points(4, 4), lambda: False)
+
+
+def test_a_frame_with_too_few_points_is_not_searched():
+    assert searched(SearchSchedule(MODEL, MIN_SPOTS), None, True, 5, counts=(2, 1)) == []
+
+
+def test_a_hypothesis_that_explains_the_frame_needs_no_search():
+    assert searched(tracking(), FOUND_ALL, False, 100) == []
+
+
+def test_after_a_search_has_found_the_vehicle_vague_predictions_are_searched():
+    schedule = tracking()
+    schedule.found()
+    assert searched(schedule, FOUND_ALL, True, 10) == [1, 2, 3, 4, 5]
+
+
+def test_frames_that_contradict_the_hypothesis_are_searched_at_increasing_intervals():
+    nothing = np.full(N, MISSED)
+    assert searched(tracking(), nothing, False, 45) == [*SEARCH_AT, 20, 40]
+
+
+def test_few_spots_that_nothing_contradicts_are_searched_seldom():
+    one_camera = np.where(MODEL.camera_of == 0, FOUND_ALL, -2)
+    assert searched(tracking(), one_camera, False, 110) == [50, 100]

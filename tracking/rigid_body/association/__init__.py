@@ -1,0 +1,1 @@
+"""Data association: the joint assignment of one frame's detections to all spots."""

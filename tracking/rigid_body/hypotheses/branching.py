@@ -1,0 +1,255 @@
+"""Branching of the hypotheses over motion models and assignments, compiled.
+
+A multiple hypothesis tracker (Reid 1979) whose only target is the vehicle. Each hypothesis is predicted with the steady
+motion and, where the frame suggests it, with a manoeuvre, that is a jump of the velocities. For each prediction the
+frame's detections are assigned jointly (association/joint_search.py). Each assignment gives one child, with an exact
+update of its own; the children of all hypotheses compete by their likelihood. Source: ours.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from geometry.arrays import Array, Ints
+from geometry.compilation.jit import compiled
+from geometry.compiled_linalg import block
+from tracking.rigid_body.association.frame_detections import BLENDED, Observation
+from tracking.rigid_body.association.joint_search import associate
+from tracking.rigid_body.association.likelihood import log_clutter_ratio
+from tracking.rigid_body.hypotheses.hypothesis_set import (
+    Children,
+    Dynamics,
+    Hypotheses,
+    State,
+    add_child,
+    empty_children,
+)
+from tracking.rigid_body.hypotheses.iterated_update import Update, iterated_update
+from tracking.rigid_body.hypotheses.prediction_checks import (
+    MAX_THREE_SPOT_SIGMA_PX,
+    MAX_TRACKING_SIGMA_PX,
+    MIN_CONFIRMING_SPOTS,
+    MIN_REDUNDANT_SPOTS,
+    largest_spot_sigma,
+)
+from tracking.rigid_body.hypotheses.pruning import PRUNE_NATS
+from tracking.rigid_body.models.motion import predicted
+from tracking.rigid_body.models.occlusion import MISSED, joint_log_likelihood, marginal, predict, update
+
+MANOEUVRE_PRUNE_NATS = 6.0  # a hypothesis that is this much less likely than the best is not tried with a manoeuvre
+# Excess of the chi-square over its expectation, in its standard deviations, from which on a manoeuvre is tried although
+# every spot is found.
+UNEXPECTED_SIGMAS = 3.5
+# Probability of a manoeuvre in a frame that does not determine the pose:
+P_MANOEUVRE_SUDDEN = 0.5  # if visible spots are suddenly not where they are expected
+P_MANOEUVRE_OCCLUDED = 0.05  # at least, else: occlusions and manoeuvres often coincide
+
+
+class _Step(NamedTuple):
+    """The hypotheses of the frame before and the step that leads to this frame."""
+
+    old: Hypotheses
+    dynamics: Dynamics
+    dt: float  # s
+
+
+@compiled
+def branch(obs: Observation, dynamics: Dynamics, dt: float, old: Hypotheses) -> tuple[Children, int]:
+    """The children of all hypotheses after a frame that comes dt (s) later, and their number."""
+    n = obs.view_table.camera.shape[0]
+    step = _Step(old, dynamics, dt)
+    children = empty_children(n, old.p_visible.shape[1] - n)
+    count = 0
+    best = -np.inf
+    for h in range(old.t.shape[0]):
+        if old.log_weight[h] < -PRUNE_NATS:
+            continue
+        p_visible = predict(old.p_visible[h], n) if dt > 0.0 else old.p_visible[h]
+        count, best, suspected = _branch_steady(obs, step, h, p_visible, children, count, best)
+        if suspected:
+            count, best = _branch_manoeuvre(obs, step, h, p_visible, children, count, best)
+    return children, count
+
+
+@compiled
+def _predicted_state(step: _Step, h: int, manoeuvre: bool) -> State:
+    """Hypothesis h predicted with the steady motion or with a manoeuvre."""
+    old, dynamics = step.old, step.dynamics
+    if step.dt > 0.0:
+        none = np.zeros(2)
+        R, t, m, P, _ = predicted(
+            old.R[h], old.t[h], old.m[h], old.P[h], step.dt, dynamics.jerk,
+            dynamics.velocity_jump if manoeuvre else none, dynamics.acceleration_jump if manoeuvre else none,
+        )  # fmt: skip
+        return State(R, t, m, P)
+    return State(old.R[h], old.t[h], old.m[h], old.P[h])
+
+
+@compiled
+def _max_clutter_ratio(obs: Observation) -> float:
+    """Upper bound of `log_clutter_ratio`: no child is dropped before its likelihood is known."""
+    out = 0.0
+    for i in range(obs.frame.log_clutter_excess.shape[0]):
+        out += obs.frame.log_clutter_excess[i]
+    return out
+
+
+@compiled
+def _branch_steady(
+    obs: Observation, step: _Step, h: int, p_visible: Array, children: Children, count: int, best: float
+) -> tuple[int, float, bool]:
+    """Add the children of hypothesis h that moves steadily.
+
+    p_visible (n + groups,): predicted. best: largest log-weight so far. Returns the number of children, the largest
+    log-weight, and whether the likeliest assignment suggests a manoeuvre.
+    """
+    old, dynamics, dt, group = step.old, step.dynamics, step.dt, obs.view_table.group
+    steady = _predicted_state(step, h, False)
+    p_unoccluded = marginal(p_visible, group)
+    log_prior = old.log_weight[h] + np.log(1 - dynamics.p_manoeuvre)
+    assigned, score, counted, R, t, b = associate(obs, steady.R, steady.t, block(steady.P, 6), p_unoccluded)
+    bound = _max_clutter_ratio(obs)
+    suspected = False
+    for k in range(b):
+        if log_prior + score[k] + bound < best - PRUNE_NATS or (k > 0 and score[k] < score[0] - PRUNE_NATS):
+            continue
+        labelled = _labelled(assigned[k])
+        # Visible spots that are not found have become occluded, or the vehicle has turned.
+        sudden = _misses_expected_spot(assigned[k], p_unoccluded)
+        prior = steady
+        if dt > 0.0 and labelled < MIN_CONFIRMING_SPOTS:
+            prior = _with_either_motion(step, h, steady, sudden)
+        result = iterated_update(obs, prior, assigned[k], R[k], t[k])
+        log_likelihood, chi2 = result.log_likelihood, result.chi2
+        if 0 < labelled < MIN_CONFIRMING_SPOTS and dt > 0.0:
+            # The mixture is at least as likely as its steady part; otherwise a false third spot would seem likelier.
+            narrow = iterated_update(obs, steady, assigned[k], R[k], t[k])
+            chi2 = narrow.chi2
+            p_steady = 1.0 - (P_MANOEUVRE_SUDDEN if sudden else P_MANOEUVRE_OCCLUDED)
+            log_likelihood = max(log_likelihood, narrow.log_likelihood + np.log(p_steady))
+        if k == 0 and dt > 0.0 and old.log_weight[h] > -MANOEUVRE_PRUNE_NATS:
+            dof = 2 * result.spots
+            suspected = (
+                chi2 > dof + UNEXPECTED_SIGMAS * np.sqrt(2.0 * max(dof, 1))
+                or (labelled < MIN_CONFIRMING_SPOTS and sudden)
+                or _misses_whole_screen(assigned[k], p_unoccluded, group)
+            )
+        if dt > 0.0 and MIN_CONFIRMING_SPOTS <= labelled < MIN_REDUNDANT_SPOTS:
+            prior = _with_either_motion(step, h, steady, sudden)
+        state = _state_if_determined(obs, prior, result, assigned[k], labelled)
+        log_weight = _log_weight(obs, log_prior + counted[k] + log_likelihood, p_visible, assigned[k], state)
+        if np.isfinite(log_weight):
+            best = max(best, log_weight)
+            after = update(p_visible, group, assigned[k], obs.detection_model.p_detect)
+            count, _ = add_child(children, count, state, log_weight, after, assigned[k], False, h)
+    return count, best, suspected
+
+
+@compiled
+def _branch_manoeuvre(
+    obs: Observation, step: _Step, h: int, p_visible: Array, children: Children, count: int, best: float
+) -> tuple[int, float]:
+    """Add the children of hypothesis h with a manoeuvre; arguments and results as in `_branch_steady`.
+
+    Assignments with fewer than MIN_CONFIRMING_SPOTS are left out: they would fit a manoeuvre wherever the spots lie,
+    and the mixture of both motions in `_branch_steady` covers them.
+    """
+    old, dynamics, group = step.old, step.dynamics, obs.view_table.group
+    prior = _predicted_state(step, h, True)
+    p_unoccluded = marginal(p_visible, group)
+    log_prior = old.log_weight[h] + np.log(dynamics.p_manoeuvre)
+    assigned, score, counted, R, t, b = associate(obs, prior.R, prior.t, block(prior.P, 6), p_unoccluded)
+    bound = _max_clutter_ratio(obs)
+    for k in range(b):
+        if log_prior + score[k] + bound < best - PRUNE_NATS or (k > 0 and score[k] < score[0] - PRUNE_NATS):
+            continue
+        labelled = _labelled(assigned[k])
+        if labelled < MIN_CONFIRMING_SPOTS:
+            continue
+        result = iterated_update(obs, prior, assigned[k], R[k], t[k])
+        state = _state_if_determined(obs, prior, result, assigned[k], labelled)
+        log_weight = _log_weight(obs, log_prior + counted[k] + result.log_likelihood, p_visible, assigned[k], state)
+        if np.isfinite(log_weight):
+            best = max(best, log_weight)
+            after = update(p_visible, group, assigned[k], obs.detection_model.p_detect)
+            count, _ = add_child(children, count, state, log_weight, after, assigned[k], True, h)
+    return count, best
+
+
+@compiled
+def _labelled(assigned: Ints) -> int:
+    """Number of labelled views of an assignment (n,), without blended detections."""
+    out = 0
+    for i in range(assigned.shape[0]):
+        out += 1 if 0 <= assigned[i] < BLENDED else 0
+    return out
+
+
+@compiled
+def _state_if_determined(obs: Observation, prior: State, result: Update, assigned: Ints, labelled: int) -> State:
+    """The updated state; the predicted one where so few labelled spots are predicted so badly that false points fit."""
+    limit = MAX_TRACKING_SIGMA_PX if labelled < MIN_CONFIRMING_SPOTS else MAX_THREE_SPOT_SIGMA_PX
+    if (
+        0 < labelled < MIN_REDUNDANT_SPOTS
+        and largest_spot_sigma(obs.views, prior.R, prior.t, prior.P, assigned) > limit
+    ):
+        return prior
+    return result.state
+
+
+@compiled
+def _log_weight(obs: Observation, log_weight: float, p_visible: Array, assigned: Ints, state: State) -> float:
+    """A child's log-weight with the terms for common occlusion and for the concentration of clutter near spots."""
+    log_weight += joint_log_likelihood(p_visible, obs.view_table.group, assigned, obs.detection_model.p_detect)
+    return log_weight + log_clutter_ratio(obs, state.R, state.t, state.P)
+
+
+@compiled
+def _with_either_motion(step: _Step, h: int, steady: State, sudden: bool) -> State:
+    """Hypothesis h predicted with the mixture of steady motion and manoeuvre, whose means are equal.
+
+    For frames whose spots do not determine the pose and so cannot separate the two motions. sudden: visible spots are
+    missing.
+    """
+    manoeuvre = _predicted_state(step, h, True)
+    p = P_MANOEUVRE_SUDDEN if sudden else max(step.dynamics.p_manoeuvre, P_MANOEUVRE_OCCLUDED)
+    return State(steady.R, steady.t, steady.m, _mixture(steady.P, manoeuvre.P, p))
+
+
+@compiled
+def _mixture(P: Array, other: Array, p: float) -> Array:
+    """(1 - p) P + p other, of matrices."""
+    out = np.empty_like(P)
+    for i in range(P.shape[0]):
+        for j in range(P.shape[1]):
+            out[i, j] = (1 - p) * P[i, j] + p * other[i, j]
+    return out
+
+
+@compiled
+def _misses_expected_spot(assigned: Ints, p_unoccluded: Array) -> bool:
+    """Whether a spot that is probably not occluded was not found, or only blended."""
+    misses = False
+    for i in range(assigned.shape[0]):
+        misses |= (assigned[i] == MISSED or assigned[i] >= BLENDED) and p_unoccluded[i] > 0.5
+    return misses
+
+
+@compiled
+def _misses_whole_screen(assigned: Ints, p_unoccluded: Array, group: Ints) -> bool:
+    """Whether none of the spots of a screen was found although one of them is probably not occluded.
+
+    After frames with one screen only, the gates of its spots are narrow and those of the other screen's spots are not.
+    Then a manoeuvre looks like an occlusion of the other screen, however many spots of the first are found.
+    """
+    for i in range(assigned.shape[0]):
+        if assigned[i] != MISSED or p_unoccluded[i] <= 0.5:
+            continue
+        none = True
+        for j in range(assigned.shape[0]):
+            none = none and (group[j] != group[i] or assigned[j] < 0)
+        if none:
+            return True
+    return False

@@ -1,0 +1,146 @@
+"""Update of a predicted state by one assignment, linearised at its own optimum (iterated Kalman filter); compiled.
+
+Source: Bell & Cathey (1993), "The iterated Kalman filter update as a Gauss-Newton method"; with halved steps and with
+the linearisation error of poorly observed directions: ours.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from geometry.arrays import Array, Bools, Ints
+from geometry.compilation.jit import compiled
+from geometry.compiled_linalg import apply, block, dot, pose_minus, pose_plus, posterior, solve
+from geometry.compiled_projection import Views
+from tracking.rigid_body.association.frame_detections import BLENDED, FrameDetections, Observation
+from tracking.rigid_body.hypotheses.hypothesis_set import State
+from tracking.rigid_body.models.information import add_curvature_covariance, frame_information, quadratic_form
+from tracking.rigid_body.models.motion import updated
+
+MAX_STEPS, MAX_HALVINGS = 8, 5  # of Gauss-Newton, and of one step
+MAX_UPDATE_SIGMA = 0.06  # m, rad: a frame that leaves its widest direction less certain does not update the state
+
+
+class Update(NamedTuple):
+    """A state after an update by one assignment."""
+
+    state: State
+    log_likelihood: float  # its Gaussian part, nats
+    chi2: float  # misfit of the spots and of the prior at the optimum
+    spots: int  # number of spots in the update
+
+
+class _Mode(NamedTuple):
+    """Mode of the posterior of a pose."""
+
+    R: Array  # (3, 3)
+    t: Array  # (3,)
+    P: Array  # (6, 6)
+    information: Array  # (6, 6) the spots' normal matrix at the mode
+    vector: Array  # (6,) the spots' vector, about the prior's pose
+    log_likelihood: float
+    chi2: float
+    converged: bool
+
+
+@compiled
+def chosen_points(frame: FrameDetections, assigned: Ints, calibration_cov: Array) -> tuple[Bools, Array, Array]:
+    """Detections of one assignment (n,): views used in the pose (n,), pixels (n, 2) and covariances (n, 2, 2)."""
+    n = assigned.shape[0]
+    use, uv, cov = np.zeros(n, np.bool_), np.empty((n, 2)), np.empty((n, 2, 2))
+    for i in range(n):
+        d = assigned[i]
+        if 0 <= d < BLENDED:
+            use[i] = True
+            for a in range(2):
+                uv[i, a] = frame.uv[d, a]
+                for b in range(2):
+                    cov[i, a, b] = frame.cov[d, a, b] + calibration_cov[i, a, b]
+    return use, uv, cov
+
+
+@compiled
+def iterated_update(obs: Observation, prior: State, assigned: Ints, R: Array, t: Array) -> Update:
+    """Update a predicted state by one assignment (n,); the iteration starts at the pose (R, t).
+
+    A spot that the resulting pose does not project makes the likelihood 0. An update that does not converge leaves the
+    state as it was, with the misfit that was reached.
+    """
+    use, uv, cov = chosen_points(obs.frame, assigned, obs.calibration_cov)
+    count = 0
+    for i in range(use.shape[0]):
+        count += 1 if use[i] else 0
+    if count == 0:
+        return Update(State(prior.R, prior.t, prior.m.copy(), prior.P.copy()), 0.0, 0.0, 0)
+    pose_P = block(prior.P, 6)
+    mode = _posterior_mode(obs.views, (prior.R, prior.t, pose_P), use, uv, cov, (R, t))
+    if mode.log_likelihood == -np.inf:
+        unchanged = State(prior.R, prior.t, prior.m.copy(), prior.P.copy())
+        return Update(unchanged, mode.log_likelihood, mode.chi2, count)
+    # Along a poorly observed direction the spots' paths are not straight. Their linearisation error must not make that
+    # direction look observed: it is added to their covariances, and the update is repeated.
+    sigma = add_curvature_covariance(obs.views, use, cov, mode.R, mode.t, mode.P)
+    if sigma > 0.0:
+        mode = _posterior_mode(obs.views, (prior.R, prior.t, pose_P), use, uv, cov, (mode.R, mode.t))
+    if not mode.converged or sigma > MAX_UPDATE_SIGMA:
+        # Few spots of a vehicle that may be anywhere: nothing that a linearisation could represent.
+        unchanged = State(prior.R, prior.t, prior.m.copy(), prior.P.copy())
+        return Update(unchanged, mode.log_likelihood, mode.chi2, count)
+    out_R, out_t, out_m, out_P, _, _ = updated(prior.R, prior.t, prior.m, prior.P, mode.information, mode.vector)
+    return Update(State(out_R, out_t, out_m, out_P), mode.log_likelihood, mode.chi2, count)
+
+
+@compiled
+def _posterior_mode(
+    views: Views, prior: tuple[Array, Array, Array], use: Bools, uv: Array, cov: Array, start: tuple[Array, Array]
+) -> _Mode:
+    """Most probable pose given a prior (R, t, P of the pose) and the used spots: Gauss-Newton with halved steps.
+
+    use (n,), uv (n, 2), px, cov (n, 2, 2), px^2; start: R, t.
+    """
+    R0, t0, P0 = prior
+    R, t = start
+    spots = 0
+    for i in range(use.shape[0]):
+        spots += 1 if use[i] else 0
+    eye = np.zeros((6, 6))
+    for i in range(6):
+        eye[i, i] = 1.0
+    prior_information, _ = solve(P0, eye)
+    delta = pose_minus(R, t, R0, t0)
+    L, g, chi2, count, log_norm = frame_information(views, R, t, use, uv, cov)
+    cost = chi2 + quadratic_form(prior_information, delta) if count == spots else np.inf
+    P, r, log_det, converged = P0, np.zeros(6), 0.0, False
+    for _ in range(MAX_STEPS):
+        r = apply(L, delta)
+        for i in range(6):
+            r[i] += g[i]
+        P, log_det = posterior(P0, L)
+        step = apply(P, r)
+        for i in range(6):
+            step[i] -= delta[i]
+        # A hundredth of the pose's own sigma is accurate enough.
+        converged = count == spots and dot(step, apply(L, step)) < 1e-4
+        better = False
+        for _ in range(MAX_HALVINGS):
+            if converged:
+                break
+            delta_new = np.empty(6)
+            for i in range(6):
+                delta_new[i] = delta[i] + step[i]
+                step[i] *= 0.5
+            R_new, t_new = pose_plus(R0, t0, delta_new)
+            L_new, g_new, chi2_new, count_new, norm_new = frame_information(views, R_new, t_new, use, uv, cov)
+            cost_new = chi2_new + quadratic_form(prior_information, delta_new)
+            if count_new == spots and cost_new < cost:
+                R, t, delta, cost, better = R_new, t_new, delta_new, cost_new, True
+                L, g, chi2, count, log_norm = L_new, g_new, chi2_new, count_new, norm_new
+                break
+        if not better:
+            break
+    # Rounding can make the misfit negative where the prior is wide; a likelihood must not exceed that of a perfect fit.
+    misfit = max(cost, 0.0)
+    log_likelihood = -0.5 * (log_norm + log_det + misfit) if np.isfinite(misfit) else -np.inf
+    return _Mode(R, t, P, L, r, log_likelihood, misfit, converged)

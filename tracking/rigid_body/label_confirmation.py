@@ -1,0 +1,152 @@
+"""Which labels of a frame are confirmed: by the motion, by the frame's other spots, or by their probability."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from geometry.arrays import Array, Bools, Ints
+from geometry.forward_model import SpotModel
+from tracking.parameters import TrackerParameters
+from tracking.rigid_body.association.frame_detections import BLENDED, Observation, distinct_spots
+from tracking.rigid_body.hypotheses.hypothesis_set import Children, Dynamics, Hypotheses
+from tracking.rigid_body.hypotheses.iterated_update import chosen_points
+from tracking.rigid_body.hypotheses.prediction_checks import (
+    MAX_THREE_SPOT_SIGMA_PX,
+    MIN_CONFIRMING_SPOTS,
+    MIN_REDUNDANT_SPOTS,
+    SURE_PROBABILITY,
+    largest_spot_sigma,
+    unchecked_by_prediction,
+)
+from tracking.rigid_body.hypotheses.pruning import unweighted_spread
+from tracking.rigid_body.models.information import well_controlled
+from tracking.rigid_body.pose_candidates import predicted_hypothesis
+
+MANY_SPOTS = 6  # with so many, an uncontrolled spot concerns only its own label
+# Of a first acquisition against "all points are false"; false points reach it with exp(-7) = 1e-3 per frame.
+MIN_EVIDENCE_NATS = 7.0
+
+
+@dataclass(frozen=True, slots=True)
+class FrameHypotheses:
+    """The hypotheses of one frame after pruning, n views."""
+
+    dt_s: float
+    before: Hypotheses | None  # of the frame before
+    now: Hypotheses  # best first
+    children: Children
+    kept: Ints  # (h,) indices of `now` among the children
+    probability: Array  # (n,) of the best hypothesis' choice for each view
+    spread: Array  # (6, 6) of the other hypotheses' poses about the best
+    searched: Mapping[int, str]  # children that only a search proposed, with the names of their spots
+    first: bool  # no pose has been measured yet
+    evidence_nats: float  # of the best hypothesis against "all points are false", until a pose is measured
+
+    @property
+    def best(self) -> int:
+        """Index of the best child."""
+        return int(self.kept[0])
+
+    @property
+    def assigned(self) -> Ints:
+        """(n,): its assignment."""
+        return self.children.assigned[self.best]
+
+    @property
+    def parent(self) -> int:
+        """Index among `before` of the hypothesis that it continues; -1: none."""
+        return int(self.children.parent[self.best])
+
+    @property
+    def manoeuvre(self) -> bool:
+        """Whether its velocities have jumped."""
+        return bool(self.children.manoeuvre[self.best])
+
+
+@dataclass(frozen=True, slots=True)
+class Confirmation:
+    """Result of the checks of one frame."""
+
+    min_probability: float  # labels need at least this probability
+    confirmed: bool  # else labels and pose wait for the next frame
+    spread: Array  # (6, 6) to be added to the pose's covariance
+
+
+class LabelConfirmation:
+    """Checks of the labels, with what they need from the frame before."""
+
+    def __init__(self, model: SpotModel, parameters: TrackerParameters) -> None:
+        self._model, self._parameters = model, parameters
+        self._found_before = np.zeros(len(model), dtype=bool)  # spots of the best hypothesis in the frame before
+        self._unconfirmed = False  # labels have been left open, and no frame with enough spots has followed
+
+    def check(self, obs: Observation, h: FrameHypotheses, dynamics: Dynamics) -> Confirmation:
+        """Check the best hypothesis of the next frame."""
+        p, model, assigned = self._parameters, self._model, h.assigned
+        # A pose from a search alone must lead as in first_labels.py: odds of 5 to 1 are still a tie.
+        from_search = h.first or h.best in h.searched
+        least = max(p.min_label_probability, 1 / (1 + np.exp(-p.labels.lead_nats)) if from_search else 0.0)
+        doubtful = (assigned >= 0) & (h.probability < SURE_PROBABILITY)
+        sure = int(distinct_spots((assigned >= 0) & ~doubtful, model.spot_of))
+        if sure < MIN_REDUNDANT_SPOTS:
+            least = max(least, SURE_PROBABILITY)  # the others do not check a label
+        out = Confirmation(least, not h.first or h.evidence_nats >= MIN_EVIDENCE_NATS, h.spread)
+        spots = int(distinct_spots(assigned >= 0, model.spot_of))
+        if spots and h.before is not None and h.dt_s > 0 and h.parent >= 0:
+            out = self._check_by_motion(obs, h, dynamics, out, spots, sure, doubtful)
+        elif h.best in h.searched and not h.first:
+            use, _, cov = chosen_points(obs.frame, assigned, obs.calibration_cov)
+            controlled = well_controlled(model.numbers, h.now.R[0], h.now.t[0], use, cov)
+            if distinct_spots(controlled, model.spot_of) < MIN_REDUNDANT_SPOTS:
+                # If the others leave a direction of the pose open, some false point fits: the next frame must agree.
+                out = self._postpone(h, out.min_probability)
+        self._found_before = assigned >= 0
+        return out
+
+    def _postpone(self, h: FrameHypotheses, min_probability: float) -> Confirmation:
+        """Labels that wait for the next frame; until then the covariance covers all hypotheses."""
+        self._unconfirmed = True
+        return Confirmation(min_probability, False, unweighted_spread(h.children, h.kept))
+
+    def _check_by_motion(
+        self,
+        obs: Observation,
+        h: FrameHypotheses,
+        dynamics: Dynamics,
+        before: Confirmation,
+        spots: int,
+        sure: int,
+        doubtful: Bools,
+    ) -> Confirmation:
+        """Checks of a hypothesis that continues one of the frame before: the prediction checks the labels.
+
+        spots, sure: number of labelled spots, and of those with a sure label; doubtful (n,): labels that are not sure.
+        """
+        model, assigned = self._model, h.assigned
+        assert h.before is not None
+        R, t, _, P = predicted_hypothesis(h.before, h.parent, h.dt_s, dynamics, h.manoeuvre)
+        used = np.where(assigned < BLENDED, assigned, -1)
+        unchecked = unchecked_by_prediction(model.numbers, R, t, P, used)
+        again = (assigned >= 0) & self._found_before & ~unchecked
+        if self._unconfirmed and (h.parent > 0 or distinct_spots(again, model.spot_of) < MIN_CONFIRMING_SPOTS):
+            # Labels that nothing has checked do not check later ones, until enough spots are found again.
+            unchecked |= used >= 0
+        self._unconfirmed = False
+        if not unchecked.any():
+            return before
+        # The motion does not check some label: the frame's other spots must, or it must be beyond doubt.
+        least = max(before.min_probability, SURE_PROBABILITY)
+        use, _, cov = chosen_points(obs.frame, assigned, obs.calibration_cov)
+        uncontrolled = use & ~well_controlled(model.numbers, h.now.R[0], h.now.t[0], use, cov)
+        # A spot that the frame before showed as well confirms itself. A single spot that reappears where it may be
+        # anywhere waits for the next frame.
+        new = unchecked & ~self._found_before
+        single = np.count_nonzero(new) == 1 and (uncontrolled if spots >= MANY_SPOTS else uncontrolled.any()) & new
+        far = largest_spot_sigma(model.numbers, R, t, P, used) > MAX_THREE_SPOT_SIGMA_PX
+        too_few = sure < MIN_REDUNDANT_SPOTS and (uncontrolled.any() or far or doubtful.any())
+        if too_few or np.any(single):
+            return self._postpone(h, least)
+        return Confirmation(least, before.confirmed, before.spread)

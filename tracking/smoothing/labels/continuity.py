@@ -1,0 +1,215 @@
+"""Labels by continuity of each spot's path in the picture, where too few spots are visible to determine the pose.
+
+If only two or three spots are visible for long, the pose becomes uncertain, and with it the predicted places of the
+spots, although each spot's own path in the picture continues. Each view's labelled path is extrapolated into such
+frames from both of its ends, as a tracker of single spots does. These labels do not contribute to the pose.
+
+Source: ours; the prediction from a spot's own last places is that of Huo, Yang & Yang (2015) in its simplest form. Its
+accuracy is measured on the labelled part of the same path.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+
+from geometry.arrays import Array, Bools, Ints
+from tracking.rigid_body.association.frame_detections import BLENDED
+from tracking.smoothing.motion.run_detections import RunDetections
+
+POLYNOMIALS = ((1, 2), (1, 4), (2, 3), (2, 5))  # in time: degree, number of points that they are fitted to
+MAX_AHEAD = 4  # frames that a path is extrapolated over
+REACH = 8  # frames, within which a polynomial's points must lie
+MIN_HISTORY = 12  # errors that a polynomial's scale is estimated from
+# The errors' distribution is modelled as a mixture: the weight of each component, and the quantile of the measured
+# errors that gives its sigma. Smooth motion makes the first component, velocity jumps the last.
+COMPONENTS = ((0.6, 0.5), (0.35, 0.95), (0.05, 0.995))
+P_GONE = 0.1  # probability per frame that the spot is not visible any more
+POSE_GATE_CHI2 = 25.0  # squared Mahalanobis distance from the place that the pose predicts
+MIN_PROBABILITY = 0.99  # of a label; and where the path from the other side does not lead to the point:
+MIN_ONE_SIDED_PROBABILITY = 0.995
+MIN_SINGLE_CHAIN = 5  # frames in a row in which a single spot is followed; shorter chains are dropped
+
+
+class PathContext(NamedTuple):
+    """What is known of a run besides its labels: T frames, n views."""
+
+    camera: Ints  # (n,)
+    expected: Array  # (T, n, 2) px: pixels of the spots at the smoothed poses; nan without a projection
+    expected_cov: Array  # (T, n, 2, 2) px^2
+    log_clutter: Array  # (T, n) log density of false points, 1/px^2
+    open: Bools  # (T,) frames that may get labels
+
+
+def continued(detections: RunDetections, assigned: Ints, context: PathContext) -> tuple[Ints, Array]:
+    """Assignments (T, n) with the labels that continuity adds, and the probabilities (T, n) of these; nan of others."""
+    out, probability = assigned.copy(), np.full(assigned.shape, np.nan)
+    for view in range(assigned.shape[1]):
+        path = _Path.of(detections, assigned, context, view)
+        if path is None:
+            continue
+        ahead, back = path.chain(1), path.chain(-1)
+        for k in ahead.keys() | back.keys():
+            # Where both ends reach, they must agree, or one must be more certain; None: searched without success.
+            sides = [side[k] for side in (ahead, back) if k in side]
+            found = [s for s in sides if s is not None]
+            p = max((p for _, p in found), default=0.0)
+            if len({row for row, _ in found}) == 1 and (len(found) == len(sides) or p >= MIN_ONE_SIDED_PROBABILITY):
+                out[k, view], probability[k, view] = found[0][0], p
+    _drop_shared(out, probability, assigned)
+    isolated = _isolated(out, assigned)
+    out[isolated], probability[isolated] = assigned[isolated], np.nan
+    return out, probability
+
+
+def _isolated(out: Ints, before: Ints) -> Bools:
+    """(T, n): new labels that are the only one of their frame, except in chains of MIN_SINGLE_CHAIN frames.
+
+    If all spots are occluded for a frame or two, a false point near one of the paths is not rare.
+    """
+    new = out != before
+    alone = new & (np.count_nonzero(out >= 0, axis=1) == 1)[:, None]
+    for view in range(new.shape[1]):
+        for run in np.split(np.arange(len(new)), np.flatnonzero(np.diff(new[:, view].astype(np.int8))) + 1):
+            if len(run) >= MIN_SINGLE_CHAIN:
+                alone[run, view] = False
+    return np.asarray(alone)
+
+
+def _drop_shared(out: Ints, probability: Array, before: Ints) -> None:
+    """Drop new labels that would give one point to two spots, in place."""
+    for k in np.flatnonzero(np.any(out != before, axis=1)):
+        for i in np.flatnonzero(out[k] != before[k]):
+            others = (np.arange(out.shape[1]) != i) & (out[k] >= 0)
+            if np.any(out[k][others] % BLENDED == out[k, i]):
+                out[k, i], probability[k, i] = before[k, i], np.nan
+
+
+class _Prediction(NamedTuple):
+    """Prediction of a spot by one polynomial."""
+
+    at: Array  # (2,) px
+    sigma: Array  # (components,) px per axis, of the errors
+
+    def density(self, place: Array, cov: Array) -> Array:
+        """Density (m,), 1/px^2, of the spot at places (m, 2) with covariances (m, 2, 2)."""
+        S = cov[:, None] + self.sigma[:, None, None] ** 2 * np.eye(2)  # (m, components, 2, 2)
+        e = place - self.at
+        d2 = np.einsum("mi,mpij,mj->mp", e, np.linalg.inv(S), e)
+        densities = np.exp(-0.5 * d2) / (2 * np.pi * np.sqrt(np.linalg.det(S)))
+        return np.asarray(densities @ np.array([w for w, _ in COMPONENTS]))
+
+
+class _Path:
+    """Path of one view's spot in its picture."""
+
+    def __init__(self, detections: RunDetections, assigned: Ints, context: PathContext, view: int) -> None:
+        self.detections, self.assigned, self.context, self.view = detections, assigned, context, view
+        self.camera = int(context.camera[view])
+        k = np.flatnonzero((assigned[:, view] >= 0) & (assigned[:, view] < BLENDED))
+        self.uv = np.full((len(assigned), 2), np.nan)
+        self.uv[k] = detections.uv[detections.begin[k] + assigned[k, view]]
+        self.sigmas = [[_error_sigmas(self.uv, *form, h) for h in range(1, MAX_AHEAD + 1)] for form in POLYNOMIALS]
+
+    @staticmethod
+    def of(detections: RunDetections, assigned: Ints, context: PathContext, view: int) -> _Path | None:
+        """The path of a view; None where there is nothing to continue."""
+        missing = (assigned[:, view] < 0) & context.open & detections.has_image[:, context.camera[view]]
+        if not missing.any() or np.count_nonzero(assigned[:, view] >= 0) < MIN_HISTORY:
+            return None
+        return _Path(detections, assigned, context, view)
+
+    def chain(self, direction: int) -> dict[int, tuple[int, float] | None]:
+        """Row and probability of new labels by frame, along the direction of time (1) or against it (-1).
+
+        None where the path leads through a frame but no point lies on it. The last label of a path that ends is
+        dropped: a point found just where a spot vanished may be false.
+        """
+        out: dict[int, tuple[int, float] | None] = {}
+        uv, latest = self.uv.copy(), -1
+        frames = range(len(uv)) if direction == 1 else range(len(uv) - 1, -1, -1)
+        for k in frames:
+            if np.isfinite(self.uv[k, 0]):
+                latest = -1  # the chain has reached a label, which confirms it
+                continue
+            if self.assigned[k, self.view] < 0 and self.context.open[k]:
+                predicted = self._predicted(k, uv, direction)
+                if predicted:
+                    out[k] = found = self._found(k, predicted)
+                    if found is not None:
+                        uv[k] = self.detections.uv[self.detections.begin[k] + found[0]]
+                        latest = k
+                        continue
+            if latest >= 0 and abs(k - latest) >= MAX_AHEAD:
+                out[latest] = None
+                latest = -1
+        if latest >= 0:
+            out[latest] = None
+        return out
+
+    def _found(self, k: int, predicted: list[_Prediction]) -> tuple[int, float] | None:
+        """Row of the point of frame k that continues a path, and its probability; None: there is none."""
+        detections, context, view = self.detections, self.context, self.view
+        rows = np.arange(detections.first[k, self.camera], detections.first[k, self.camera + 1])
+        rows = rows[~np.isin(rows, self.assigned[k][self.assigned[k] >= 0] % BLENDED)]
+        if not len(rows):
+            return None
+        place, cov = detections.uv[detections.begin[k] + rows], detections.cov[detections.begin[k] + rows]
+        likelihood = np.mean([p.density(place, cov) for p in predicted], axis=0)
+        false = np.exp(np.maximum(context.log_clutter[k, view], detections.log_static[detections.begin[k] + rows]))
+        odds = likelihood * (1 - P_GONE) / false
+        best = int(np.argmax(odds))
+        p = float(odds[best] / (odds.sum() + P_GONE))
+        y = place[best] - context.expected[k, view]
+        chi2 = y @ np.linalg.solve(context.expected_cov[k, view] + cov[best], y)
+        if p < MIN_PROBABILITY or not chi2 < POSE_GATE_CHI2:
+            return None
+        return int(rows[best]), p
+
+    def _predicted(self, k: int, uv: Array, direction: int) -> list[_Prediction]:
+        """Predictions for frame k: short polynomials suit the time after a velocity jump, long ones a smooth path."""
+        near = k - direction * np.arange(1, REACH + MAX_AHEAD)
+        near = near[(near >= 0) & (near < len(uv))]
+        near = near[np.isfinite(uv[near, 0])]
+        if not len(near) or abs(k - near[0]) > MAX_AHEAD:
+            return []
+        ahead = int(abs(k - near[0]))
+        out = []
+        for (degree, points), sigmas in zip(POLYNOMIALS, self.sigmas, strict=True):
+            sigma = sigmas[ahead - 1]
+            if sigma is None or len(near) < points or abs(near[points - 1] - near[0]) >= REACH:
+                continue
+            weights = _weights(tuple(np.abs(k - near[:points]).tolist()), degree)
+            consecutive = _weights(tuple(range(ahead, ahead + points)), degree)
+            # The sigmas hold for consecutive points; points farther apart have larger weights, and so larger errors.
+            wider = max(float(np.linalg.norm(weights) / np.linalg.norm(consecutive)), 1.0)
+            out.append(_Prediction(weights @ uv[near[:points]], sigma * wider))
+        return out
+
+
+@cache
+def _weights(ago: tuple[int, ...], degree: int) -> Array:
+    """Weights (m,) of points so many frames ago for the present value of a polynomial fitted to them."""
+    at = -np.array(ago, dtype=float)
+    return np.asarray(np.linalg.pinv(np.vander(at, degree + 1, increasing=True))[0])
+
+
+def _error_sigmas(uv: Array, degree: int, points: int, ahead: int) -> Array | None:
+    """Sigmas (components,) per axis, px, of predictions so many frames ahead along a labelled path uv (T, 2).
+
+    None if there are too few labels.
+    """
+    weights = _weights(tuple(range(ahead, ahead + points)), degree)
+    n = len(uv) - ahead - points + 1
+    if n < MIN_HISTORY:
+        return None
+    predicted = sum(w * uv[points - 1 - j : points - 1 - j + n] for j, w in enumerate(weights))
+    squared = np.sum((uv[points - 1 + ahead :][:n] - predicted) ** 2, axis=1)
+    squared = squared[np.isfinite(squared)]
+    if len(squared) < MIN_HISTORY:
+        return None
+    # The squared distance of a two-dimensional Gaussian is exponentially distributed; the tail's sigma is its quantile.
+    core = [np.quantile(squared, q) / (-2 * np.log(1 - q)) for _, q in COMPONENTS[:-1]]
+    return np.asarray(np.sqrt([*core, np.quantile(squared, COMPONENTS[-1][1]) / 2]))

@@ -1,0 +1,302 @@
+"""Reassociation: labels of each frame from the motion that all other frames give; compiled.
+
+The pose of a frame without its own spots is the smoothed one with their information removed. The frame's detections are
+assigned from there. Where that leaves something open, further explanations compete: a velocity jump at the frame, and a
+wrong motion. Source: ours.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from geometry.arrays import Array, Ints
+from geometry.compilation.jit import compiled
+from geometry.compiled_linalg import apply, block, column, hstack, multiply, pose_plus, solve, symmetrise
+from geometry.compiled_projection import Views, inside
+from tracking.rigid_body.association.frame_detections import (
+    BLENDED,
+    DetectionModel,
+    FrameDetections,
+    Observation,
+    ViewTable,
+)
+from tracking.rigid_body.association.joint_search import associate
+from tracking.rigid_body.association.likelihood import detection_log_likelihood, predicted_pixel
+from tracking.rigid_body.hypotheses.hypothesis_set import State
+from tracking.rigid_body.hypotheses.iterated_update import chosen_points, iterated_update
+from tracking.rigid_body.models.information import frame_information, single_frame_pose
+from tracking.rigid_body.models.motion import STATE
+from tracking.rigid_body.models.occlusion import joint_log_likelihood, marginal
+from tracking.smoothing.motion.reference import Reference
+from tracking.smoothing.motion.run_detections import RunDetections, labelled_points
+
+# Probability that a spot is not occluded if its screen is visible, by the neighbouring frames in which the screen was
+# visible: the spot was labelled in none of them, in one of two, in all.
+P_VISIBLE = np.array([0.2, 0.6, 0.98])
+# Probability that a screen is visible, by the number of neighbouring frames that show spots of it.
+P_SCREEN_VISIBLE = np.array([0.01, 0.3, 0.995])
+RIVAL_NATS = 9.0  # assignments that are this much less likely than the best do not count in its probability
+MAX_PREDICTION_SIGMA_PX = 60.0  # a frame whose spots the others predict worse keeps its labels
+P_JUMP = 0.02  # probability of a velocity jump at a frame although none has been detected
+P_WRONG_MOTION = 1e-4  # probability that the other frames are wrong about this one; then its pose is within
+WRONG_MOTION_M, WRONG_MOTION_RAD = 0.3, 0.3  # (1 sigma) of their prediction
+MIN_SPOTS_AGAINST_MOTION = 5  # labelled spots whose own pose may contradict the other frames
+KEEP_NATS = 3.0  # in favour of the current labels of a frame with fewer spots
+# Excess of the chi-square over its expectation, in its standard deviations, below which the first explanation suffices.
+EXPECTED_SIGMAS = 3.5
+MAX_TRIED = 300  # assignments of one frame
+
+
+class RunObservation(NamedTuple):
+    """All detections of a run together with what their likelihood depends on besides the motion; n views."""
+
+    views: Views  # (n,)
+    view_table: ViewTable
+    detection_model: DetectionModel
+    calibration_cov: Array  # (n, 2, 2) px^2: covariance of the expected pixels due to calibration errors
+    detections: RunDetections
+
+
+class _Case(NamedTuple):
+    """One frame: its prediction without its own spots, and its current labels."""
+
+    obs: Observation
+    R: Array  # (3, 3)
+    t: Array  # (3,)
+    p_visible: Array  # (n + groups,) as in occlusion.py
+    p_unoccluded: Array  # (n,)
+    current: Ints  # (n,) the assignment that it has
+    labels: int  # number of current labels that are used in the pose
+
+
+class _Tried(NamedTuple):
+    """Room for MAX_TRIED assignments of one frame."""
+
+    assigned: Ints  # (c, n)
+    score: Array  # (c,) log-likelihoods, nats
+
+
+@compiled
+def reassociated(
+    run: RunObservation, assigned: Ints, ref: Reference, pose_P: Array, log_clutter: Array, jump_sigma: Array
+) -> tuple[Ints, Array, Array]:
+    """Assignments (T, n), their probabilities (T, n), and how well the other frames predict the spots of each (T,).
+
+    assigned (T, n): the current labels, which ref and pose_P (T, 6, 6), the smoothed motion, are based on. log_clutter
+    (T, n), 1/px^2. jump_sigma (T, 6): sigmas of the pose, m and rad, that a velocity jump at the frame would add. The
+    third result is the largest sigma of a spot, px. A frame that the others predict too badly keeps its labels.
+    """
+    frames, n = assigned.shape
+    detections = run.detections
+    out, probability = assigned.copy(), np.ones((frames, n))
+    sigma_px = np.zeros(frames)
+    groups = 0
+    for i in range(n):
+        groups = max(groups, run.view_table.group[i] + 1)
+    no_excess = np.zeros(n)
+    for k in range(frames):
+        P, R, t, sigma_px[k] = _prediction_without(run, assigned, ref, pose_P, k)
+        if not sigma_px[k] < MAX_PREDICTION_SIGMA_PX:
+            continue
+        a, b = detections.begin[k], detections.begin[k + 1]
+        frame = FrameDetections(
+            detections.uv[a:b], detections.cov[a:b], detections.blend_px[a:b], detections.first[k],
+            detections.has_image[k], log_clutter[k], detections.log_static[a:b], detections.size_px[a:b],
+            detections.usual_size_px, no_excess,
+        )  # fmt: skip
+        obs = Observation(run.views, run.view_table, run.detection_model, run.calibration_cov, frame)
+        p_visible = _visibility_from_neighbours(assigned, run.view_table.group, groups, k)
+        current = np.empty(n, np.int64)
+        labels = 0
+        for i in range(n):
+            current[i] = max(assigned[k, i], -1)
+            labels += 1 if 0 <= current[i] < BLENDED else 0
+        case = _Case(obs, R, t, p_visible, marginal(p_visible, run.view_table.group), current, labels)
+        tried = _explanations(case, P, jump_sigma[k])
+        _choose(tried, out[k], probability[k])
+    return out, probability, sigma_px
+
+
+@compiled
+def _choose(tried: _Tried, out: Ints, probability: Array) -> None:
+    """Write the likeliest assignment into out (n,) and the probability of each of its choices into probability (n,)."""
+    n = out.shape[0]
+    best = 0
+    for j in range(tried.score.shape[0]):
+        if tried.score[j] > tried.score[best]:
+            best = j
+    total = 0.0
+    share = np.zeros(n)
+    for j in range(tried.score.shape[0]):
+        if tried.score[j] > tried.score[best] - RIVAL_NATS:
+            p = np.exp(tried.score[j] - tried.score[best])
+            total += p
+            for i in range(n):
+                if _same_point(tried.assigned[j, i], tried.assigned[best, i]):
+                    share[i] += p
+    for i in range(n):
+        out[i] = tried.assigned[best, i] if tried.assigned[best, i] >= 0 else -1
+        probability[i] = share[i] / total
+
+
+@compiled
+def _same_point(a: int, b: int) -> bool:
+    """Whether two choices for a view are the same detection, or both none."""
+    return (a < 0 and b < 0) or (a >= 0 and b >= 0 and a % BLENDED == b % BLENDED)
+
+
+@compiled
+def _prediction_without(
+    run: RunObservation, assigned: Ints, ref: Reference, pose_P: Array, k: int
+) -> tuple[Array, Array, Array, float]:
+    """Prediction of frame k from all others: covariance (6, 6), R, t; and the largest sigma of a spot, px."""
+    use, uv, cov = labelled_points(run.detections, k, assigned[k], run.calibration_cov)
+    L, g, _, _, _ = frame_information(run.views, ref.R[k], ref.t[k], use, uv, cov)
+    P = pose_P[k]
+    A, step = multiply(P, L), apply(P, g)
+    for i in range(6):
+        step[i] = -step[i]
+        for j in range(6):
+            A[i, j] = -A[i, j]
+        A[i, i] += 1.0
+    x, _ = solve(A, hstack(P, step))
+    P_without = block(x, 6)
+    symmetrise(P_without)
+    unknown = False
+    for i in range(6):
+        unknown |= not 0.0 < P_without[i, i] < 1.0
+    if unknown:
+        return P_without, ref.R[k], ref.t[k], np.inf
+    R, t = pose_plus(ref.R[k], ref.t[k], column(x, 6))
+    at, J = np.empty(2), np.empty((2, 6))
+    largest = 0.0
+    for i in range(assigned.shape[1]):
+        if not run.detections.has_image[k, run.view_table.camera[i]]:
+            continue
+        projected, a, _, c = predicted_pixel(run.views, i, R, t, P_without, at, J)
+        if projected and inside(at, run.view_table.size[i]):
+            largest = max(largest, 0.5 * (a + c))
+    return P_without, R, t, np.sqrt(largest)
+
+
+@compiled
+def _explanations(case: _Case, P: Array, jump_sigma: Array) -> _Tried:
+    """Assignments of one frame with their log-likelihoods, under up to three explanations.
+
+    The prediction from the other frames, with covariance P (6, 6); the same with a velocity jump at the frame, which
+    adds jump_sigma (6,); and a wrong motion. The current labels compete under each, even if they lie outside the gates.
+    """
+    n = case.current.shape[0]
+    tried = _Tried(np.empty((MAX_TRIED, n), np.int64), np.empty(MAX_TRIED))
+    prior = _widened(case, P, np.zeros(6))
+    count, expected = _try_assignments(case, prior, np.log(1.0 - P_JUMP), tried, 0)
+    if not expected:
+        if case.labels > 0:
+            count = _try_current(case, prior, np.log(1.0 - P_JUMP), case.R, case.t, tried, count)
+        prior = _widened(case, P, jump_sigma)
+        count, _ = _try_assignments(case, prior, np.log(P_JUMP), tried, count)
+        if case.labels > 0:
+            count = _try_current(case, prior, np.log(P_JUMP), case.R, case.t, tried, count)
+        if case.labels >= MIN_SPOTS_AGAINST_MOTION:
+            sigma = np.empty(6)
+            for i in range(6):
+                sigma[i] = WRONG_MOTION_M if i < 3 else WRONG_MOTION_RAD
+            prior = _widened(case, P, sigma)
+            use, uv, cov = chosen_points(case.obs.frame, case.current, case.obs.calibration_cov)
+            R, t, _, _, _ = single_frame_pose(case.obs.views, case.R, case.t, use, uv, cov)
+            count = _try_current(case, prior, np.log(P_WRONG_MOTION), R, t, tried, count)
+    return _Tried(tried.assigned[:count], tried.score[:count])
+
+
+@compiled
+def _widened(case: _Case, P: Array, sigma: Array) -> State:
+    """The prediction with the covariance P (6, 6) plus independent errors of these sigmas (6,), as a state at rest."""
+    whole = np.zeros((STATE, STATE))
+    for i in range(6):
+        for j in range(6):
+            whole[i, j] = P[i, j]
+        whole[i, i] += sigma[i] * sigma[i]
+    return State(case.R, case.t, np.zeros(12), whole)
+
+
+@compiled
+def _score(case: _Case, log_prior: float, log_likelihood: float, assigned: Ints, R: Array, t: Array) -> float:
+    """Log-likelihood of an assignment (n,) with its Gaussian part, at a pose, nats."""
+    obs = case.obs
+    return (
+        log_prior
+        + log_likelihood
+        + detection_log_likelihood(obs, case.p_unoccluded, assigned, R, t)
+        + joint_log_likelihood(case.p_visible, obs.view_table.group, assigned, obs.detection_model.p_detect)
+    )
+
+
+@compiled
+def _bonus(case: _Case) -> float:
+    """Nats in favour of the current labels."""
+    return KEEP_NATS if case.labels < MIN_SPOTS_AGAINST_MOTION else 0.0
+
+
+@compiled
+def _try_assignments(case: _Case, prior: State, log_prior: float, tried: _Tried, count: int) -> tuple[int, bool]:
+    """Add the assignments of a joint search from a prediction.
+
+    Returns their number, and whether the likeliest one confirms the current labels with an expected misfit.
+    """
+    n = case.current.shape[0]
+    found, rough, _, R, t, found_count = associate(case.obs, prior.R, prior.t, block(prior.P, 6), case.p_unoccluded)
+    expected = False
+    for j in range(found_count):
+        if rough[j] < rough[0] - 2 * RIVAL_NATS or count == MAX_TRIED - 4:
+            break
+        result = iterated_update(case.obs, prior, found[j], R[j], t[j])
+        same = True
+        for i in range(n):
+            tried.assigned[count, i] = found[j, i]
+            same &= (found[j, i] < 0 and case.current[i] < 0) or found[j, i] == case.current[i]
+        score = _score(case, log_prior, result.log_likelihood, found[j], result.state.R, result.state.t)
+        tried.score[count] = score + (_bonus(case) if same else 0.0)
+        if j == 0:
+            limit = 2 * result.spots + EXPECTED_SIGMAS * np.sqrt(4.0 * max(result.spots, 1))
+            expected = same and result.chi2 <= limit
+        count += 1
+    return count, expected
+
+
+@compiled
+def _try_current(case: _Case, prior: State, log_prior: float, R: Array, t: Array, tried: _Tried, count: int) -> int:
+    """Add the current labels, with an update that starts at the pose (R, t); returns the number of assignments."""
+    result = iterated_update(case.obs, prior, case.current, R, t)
+    for i in range(case.current.shape[0]):
+        tried.assigned[count, i] = case.current[i]
+    score = _score(case, log_prior, result.log_likelihood, case.current, result.state.R, result.state.t)
+    tried.score[count] = score + _bonus(case)
+    return count + 1
+
+
+@compiled
+def _visibility_from_neighbours(assigned: Ints, group: Ints, groups: int, k: int) -> Array:
+    """Probabilities (n + groups,), as in occlusion.py, of frame k from the labels (T, n) of the frames next to it."""
+    frames, n = assigned.shape
+    out = np.empty(n + groups)
+    neighbours, labelled = np.zeros(n), np.zeros(n)
+    for g in range(groups):
+        visible_neighbours = 0
+        for other in (k - 1, k + 1):
+            if not 0 <= other < frames:
+                visible_neighbours += 1
+                continue
+            visible = False
+            for i in range(n):
+                visible |= group[i] == g and assigned[other, i] >= 0
+            visible_neighbours += 1 if visible else 0
+            for i in range(n):
+                if visible and group[i] == g:
+                    neighbours[i] += 1
+                    labelled[i] += 1 if assigned[other, i] >= 0 else 0
+        out[n + g] = P_SCREEN_VISIBLE[visible_neighbours]
+    for i in range(n):
+        out[i] = P_VISIBLE[2] if labelled[i] == neighbours[i] else P_VISIBLE[1 if labelled[i] > 0 else 0]
+    return out

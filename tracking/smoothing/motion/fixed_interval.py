@@ -1,0 +1,348 @@
+"""Fixed-interval smoother, compiled: the motion at each frame given the whole run.
+
+A two-filter smoother. Deviations (18) from a reference motion are filtered forward; an information filter runs
+backward; each frame's result combines the two. Every covariance is a product of triangular factors
+(geometry/compiled_linalg.py: posterior), so that it is positive definite whatever the rounding. Repeated about the
+resulting motion it is Gauss-Newton on the whole run at the cost of a filter. Sources: Fraser & Potter (1969), "The
+optimum linear smoother as a combination of two optimum linear filters"; the iteration: Bell (1994), "The iterated
+Kalman smoother as a Gauss-Newton method"; on a manifold, and with measurements as information: ours.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from geometry.arrays import Array
+from geometry.compilation.jit import compiled
+from geometry.compiled_linalg import (
+    apply,
+    cholesky,
+    copy_into,
+    copy_matrix_into,
+    multiply,
+    pose_minus,
+    posterior,
+    solve,
+    symmetrise,
+    transposed_apply,
+    transposed_multiply,
+)
+from tracking.rigid_body.models.motion import STATE, predicted, process_noise, propagated, transition
+from tracking.smoothing.motion.reference import Reference
+
+CHUNK = 512  # frames whose covariances are in memory at once; the forward filter runs twice instead
+
+
+class RunInformation(NamedTuple):
+    """Information of T frames' spots about the poses at a reference, and the process noise of the steps."""
+
+    information: Array  # (T, 6, 6) normal matrices J^T C^-1 J; 0 without spots
+    vector: Array  # (T, 6) J^T C^-1 (measured - expected)
+    dt: Array  # (T,) s since the frame before
+    velocity_jump: Array  # (T, 2) variances of the velocities' jump in that step, (m/s)^2 and (rad/s)^2
+    acceleration_jump: Array  # (T, 2) variances of the accelerations' jump
+    first_variance: Array  # (18,) variances of the first frame's deviation
+
+
+class Interval(NamedTuple):
+    """Result of the fixed-interval smoother for T frames."""
+
+    x: Array  # (T, 18) deviations from the reference
+    pose_P: Array  # (T, 6, 6)
+    motion_P: Array  # (T, 6, 6) covariances of the velocities
+    shock: Array  # (T,) chi-square (6 degrees) of a velocity jump in the step before, beyond the allowed noise
+    energy: Array  # (T, 6) by axis, of the step before: r^T Q r, where r is the score of the process noise ...
+    gamma: Array  # (T, 6) ... and its expectation tr(Q N): the number of noise components that the data determine
+    ends_P: Array  # (2, 18, 18) covariance of the whole state at the first and at the last frame
+
+
+@compiled
+def _predict(ref: Reference, info: RunInformation, jerk: Array, k: int, x: Array, P: Array) -> tuple[Array, Array]:
+    """Prediction from frame k - 1 to frame k: deviation (18,) and covariance (18, 18)."""
+    R, t, m, P_new, F = predicted(
+        ref.R[k - 1],
+        ref.t[k - 1],
+        ref.m[k - 1],
+        P,
+        info.dt[k],
+        jerk[k],
+        info.velocity_jump[k],
+        info.acceleration_jump[k],
+    )
+    x_new = apply(F, x)
+    d = pose_minus(R, t, ref.R[k], ref.t[k])
+    for i in range(6):
+        x_new[i] += d[i]
+    for i in range(12):
+        x_new[6 + i] += m[i] - ref.m[k, i]
+    return x_new, P_new
+
+
+@compiled
+def _update(info: RunInformation, k: int, x: Array, P: Array) -> tuple[Array, Array, float]:
+    """Measurement update of frame k: deviation and covariance after it, and its log-likelihood up to a constant."""
+    L, g = info.information[k], info.vector[k]
+    if L[0, 0] == 0.0 and L[3, 3] == 0.0:
+        return x, P, 0.0
+    out, log_det = posterior(P, L)
+    r = apply(L, x[:6])
+    misfit = 0.0
+    for i in range(6):
+        misfit += x[i] * (r[i] - 2 * g[i])
+        r[i] = g[i] - r[i]
+    x_new = x.copy()
+    for i in range(STATE):
+        for j in range(6):
+            x_new[i] += out[i, j] * r[j]
+    for i in range(6):
+        misfit -= r[i] * (x_new[i] - x[i])
+    return x_new, out, -0.5 * (log_det + misfit)
+
+
+@compiled
+def _first_prior(info: RunInformation) -> tuple[Array, Array]:
+    """Prior of the first frame's deviation (18,) and its covariance (18, 18)."""
+    P = np.zeros((STATE, STATE))
+    for i in range(STATE):
+        P[i, i] = info.first_variance[i]
+    return np.zeros(STATE), P
+
+
+@compiled
+def log_likelihood(ref: Reference, info: RunInformation, jerk: Array) -> float:
+    """Log-likelihood of the run for a motion with this jerk (T, 6), nats, up to a constant."""
+    x, P = _first_prior(info)
+    total = 0.0
+    for k in range(info.dt.shape[0]):
+        if k > 0:
+            x, P = _predict(ref, info, jerk, k, x, P)
+        x, P, gained = _update(info, k, x, P)
+        total += gained
+    return total
+
+
+@compiled
+def noise_root(dt: float, jerk: float, velocity_jump: float, acceleration_jump: float) -> Array:
+    """Lower triangular root (3, 3) of one axis' process noise."""
+    Q = np.empty((3, 3))
+    Q[0, 0], Q[0, 1], Q[0, 2], Q[1, 1], Q[1, 2], Q[2, 2] = process_noise(dt, jerk, velocity_jump, acceleration_jump)
+    Q[1, 0], Q[2, 0], Q[2, 1] = Q[0, 1], Q[0, 2], Q[1, 2]
+    return cholesky(Q)
+
+
+@compiled
+def _subtract_noise(Y: Array, y: Array, axis: int, root: Array) -> None:
+    """Information about x - w from that about x, in place: (Y^-1 + Q)^-1, Q = root root^T of one axis of noise w."""
+    n = Y.shape[0]
+    Z, A, b = np.zeros((n, 3)), np.zeros((3, 3)), np.zeros((3, 1))
+    for a in range(3):
+        row = axis + 6 * a
+        for c in range(a + 1):
+            q = root[a, c]
+            if q != 0.0:
+                b[c, 0] += q * y[row]
+                for i in range(n):
+                    Z[i, c] += Y[i, row] * q
+    for a in range(3):
+        row = axis + 6 * a
+        for c in range(a + 1):
+            for e in range(3):
+                A[c, e] += root[a, c] * Z[row, e]
+    for c in range(3):
+        A[c, c] += 1.0
+        for e in range(c):
+            A[c, e] = 0.5 * (A[c, e] + A[e, c])
+            A[e, c] = A[c, e]
+    # With W W^T = A, subtract Z W^-T (Z W^-T)^T.
+    W = cholesky(A)
+    for c in range(3):
+        for e in range(c):
+            w = W[c, e]
+            for i in range(n):
+                Z[i, c] -= Z[i, e] * w
+            b[c, 0] -= b[e, 0] * w
+        for i in range(n):
+            Z[i, c] /= W[c, c]
+        b[c, 0] /= W[c, c]
+    for i in range(n):
+        z0, z1, z2 = Z[i, 0], Z[i, 1], Z[i, 2]
+        y[i] -= z0 * b[0, 0] + z1 * b[1, 0] + z2 * b[2, 0]
+        for j in range(i + 1):
+            Y[i, j] -= z0 * Z[j, 0] + z1 * Z[j, 1] + z2 * Z[j, 2]
+            Y[j, i] = Y[i, j]
+
+
+@compiled
+def _predict_backward(
+    ref: Reference, info: RunInformation, jerk: Array, k: int, Y: Array, y: Array
+) -> tuple[Array, Array]:
+    """Information about frame k - 1 from all frames from k on, given that about frame k; overwrites Y and y."""
+    for axis in range(6):
+        _subtract_noise(
+            Y,
+            y,
+            axis,
+            noise_root(
+                info.dt[k], jerk[k, axis], info.velocity_jump[k, axis // 3], info.acceleration_jump[k, axis // 3]
+            ),
+        )
+    F, turn = transition(ref.m[k - 1], info.dt[k])
+    R, t, m = propagated(ref.R[k - 1], ref.t[k - 1], ref.m[k - 1], info.dt[k], turn)
+    away = np.empty(STATE)
+    copy_into(away, pose_minus(R, t, ref.R[k], ref.t[k]))
+    for i in range(12):
+        away[6 + i] = m[i] - ref.m[k, i]
+    shift = apply(Y, away)
+    for i in range(STATE):
+        y[i] -= shift[i]
+    out = transposed_multiply(F, multiply(Y, F))
+    symmetrise(out)
+    return out, transposed_apply(F, y)
+
+
+@compiled
+def smoothed(ref: Reference, info: RunInformation, jerk: Array) -> Interval:
+    """Fixed-interval smoother: deviations and covariances of all frames, and test quantities of the process noise.
+
+    jerk (T, 6): spectral densities, as in motion.py, of the step before each frame. The shock is the test of de Jong &
+    Penzer (1998), "Diagnosing shocks in time series", for an impulse in the middle of the step. energy and gamma are
+    the two sides of the fixed point of MacKay (1992), "Bayesian interpolation", for the strength of the noise.
+    """
+    frames = info.dt.shape[0]
+    out = _empty_interval(frames)
+    chunks = (frames + CHUNK - 1) // CHUNK
+    start_x, start_P = _filter_checkpoints(ref, info, jerk, CHUNK)
+    room = min(CHUNK, frames)
+    xs, Ps = np.empty((room, STATE)), np.empty((room, STATE, STATE))
+    Y, y = np.zeros((STATE, STATE)), np.zeros(STATE)  # information about a frame from the frames after it
+    for chunk in range(chunks - 1, -1, -1):
+        begin, end = chunk * CHUNK, min((chunk + 1) * CHUNK, frames)
+        x, P = start_x[chunk].copy(), start_P[chunk].copy()
+        for k in range(begin, end):
+            if k > begin:
+                x, P = _predict(ref, info, jerk, k, x, P)
+            x, P, _ = _update(info, k, x, P)
+            copy_into(xs[k - begin], x)
+            copy_matrix_into(Ps[k - begin], P)
+        for k in range(end - 1, begin - 1, -1):
+            P = _combine(out, k, xs[k - begin], Ps[k - begin], Y, y)
+            if k == 0:
+                break
+            for a in range(6):
+                y[a] += info.vector[k, a]
+                for b in range(6):
+                    Y[a, b] += info.information[k, a, b]
+            _test_process_noise(info, jerk, k, Y, y, P, out)
+            Y, y = _predict_backward(ref, info, jerk, k, Y, y)
+    return out
+
+
+@compiled
+def _empty_interval(frames: int) -> Interval:
+    return Interval(
+        np.empty((frames, STATE)),
+        np.empty((frames, 6, 6)),
+        np.empty((frames, 6, 6)),
+        np.zeros(frames),
+        np.zeros((frames, 6)),
+        np.zeros((frames, 6)),
+        np.empty((2, STATE, STATE)),
+    )
+
+
+@compiled
+def _filter_checkpoints(ref: Reference, info: RunInformation, jerk: Array, chunk: int) -> tuple[Array, Array]:
+    """Forward filter: predicted deviations (c, 18) and covariances (c, 18, 18) at the start of each chunk of frames."""
+    frames = info.dt.shape[0]
+    chunks = (frames + chunk - 1) // chunk
+    start_x, start_P = np.zeros((chunks, STATE)), np.zeros((chunks, STATE, STATE))
+    x, P = _first_prior(info)
+    for k in range(frames):
+        if k > 0:
+            x, P = _predict(ref, info, jerk, k, x, P)
+        if k % chunk == 0:
+            copy_into(start_x[k // chunk], x)
+            copy_matrix_into(start_P[k // chunk], P)
+        x, P, _ = _update(info, k, x, P)
+    return start_x, start_P
+
+
+@compiled
+def _combine(out: Interval, k: int, x: Array, filtered_P: Array, Y: Array, y: Array) -> Array:
+    """Write frame k's result: its filtered state x, P combined with the information of the later frames Y, y.
+
+    Returns the smoothed covariance (18, 18).
+    """
+    P, _ = posterior(filtered_P, Y)
+    score = apply(Y, x)
+    for i in range(STATE):
+        score[i] = y[i] - score[i]
+    change = apply(P, score)
+    for i in range(STATE):
+        out.x[k, i] = x[i] + change[i]
+    for a in range(6):
+        for b in range(6):
+            out.pose_P[k, a, b] = P[a, b]
+            out.motion_P[k, a, b] = P[6 + a, 6 + b]
+    if k == out.x.shape[0] - 1:
+        copy_matrix_into(out.ends_P[1], P)
+    if k == 0:
+        copy_matrix_into(out.ends_P[0], P)
+    return P
+
+
+@compiled
+def _test_process_noise(info: RunInformation, jerk: Array, k: int, Y: Array, y: Array, P: Array, out: Interval) -> None:
+    """Write row k of `out.shock`, `out.energy` and `out.gamma`: tests of the process noise of the step before frame k.
+
+    They follow from the score r = y - Y x of the noise and its covariance N = Y - Y P Y. Y, y: information of frame k
+    and all later ones; x = out.x[k], P (18, 18): the smoothed state.
+    """
+    r, N = apply(Y, out.x[k]), multiply(Y, multiply(P, Y))
+    for i in range(STATE):
+        r[i] = y[i] - r[i]
+        for j in range(STATE):
+            N[i, j] = Y[i, j] - N[i, j]
+    dt = info.dt[k]
+    B, b = np.empty((6, 6)), np.empty(6)
+    h = 0.5 * dt
+    for i in range(6):
+        pp, pv, pa, vv, va, aa = process_noise(
+            dt, jerk[k, i], info.velocity_jump[k, i // 3], info.acceleration_jump[k, i // 3]
+        )
+        p, v, a = r[i], r[6 + i], r[12 + i]
+        out.energy[k, i] = pp * p * p + vv * v * v + aa * a * a + 2 * (pv * p * v + pa * p * a + va * v * a)
+        out.gamma[k, i] = max(
+            pp * N[i, i]
+            + vv * N[6 + i, 6 + i]
+            + aa * N[12 + i, 12 + i]
+            + 2 * (pv * N[i, 6 + i] + pa * N[i, 12 + i] + va * N[6 + i, 12 + i]),
+            0.0,
+        )
+        b[i] = h * p + v
+        for j in range(6):
+            B[i, j] = h * h * N[i, j] + h * (N[6 + i, j] + N[i, 6 + j]) + N[6 + i, 6 + j]
+    symmetrise(B)
+    out.shock[k] = _chi_square(B, b)
+
+
+@compiled
+def _chi_square(L: Array, x: Array) -> float:
+    """x^T L^-1 x of information L (6, 6), scaled to a unit diagonal; 0 if some axis has no information."""
+    A, b, scale = np.empty((6, 6)), np.empty((6, 1)), np.empty(6)
+    for i in range(6):
+        if not L[i, i] > 1e-12:
+            return 0.0
+        scale[i] = np.sqrt(L[i, i])
+    for i in range(6):
+        b[i, 0] = x[i] / scale[i]
+        for j in range(6):
+            A[i, j] = L[i, j] / (scale[i] * scale[j])
+        A[i, i] += 1e-6
+    z, _ = solve(A, b)
+    total = 0.0
+    for i in range(6):
+        total += b[i, 0] * z[i, 0]
+    return total

@@ -1,0 +1,68 @@
+"""All detections of a run, and the information of its labelled spots about the motion; compiled."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from geometry.arrays import Array, Bools, Ints
+from geometry.compilation.jit import compiled
+from geometry.compiled_linalg import copy_into, copy_matrix_into
+from geometry.compiled_projection import Views
+from tracking.rigid_body.association.frame_detections import BLENDED
+from tracking.rigid_body.models.information import frame_information
+from tracking.smoothing.motion.reference import Reference
+
+
+class RunDetections(NamedTuple):
+    """m detections of T frames and n views; those of frame k are the rows begin[k] to begin[k + 1], sorted by camera.
+
+    `blend_px`, `log_static`, `size_px` and `usual_size_px` are as in FrameDetections.
+    """
+
+    uv: Array  # (m, 2) px
+    cov: Array  # (m, 2, 2) px^2
+    blend_px: Array  # (m,)
+    begin: Ints  # (T + 1,)
+    first: Ints  # (T, cameras + 1) where the rows of each camera begin within the frame
+    has_image: Bools  # (T, cameras)
+    log_static: Array  # (m,)
+    size_px: Array  # (m,)
+    usual_size_px: Array  # (n,)
+
+
+@compiled
+def labelled_points(
+    detections: RunDetections, k: int, assigned: Ints, calibration_cov: Array
+) -> tuple[Bools, Array, Array]:
+    """Frame k's labelled detections: views used in the pose (n,), pixels (n, 2) and covariances (n, 2, 2)."""
+    n = assigned.shape[0]
+    use, uv, cov = np.zeros(n, np.bool_), np.zeros((n, 2)), np.zeros((n, 2, 2))
+    for i in range(n):
+        if 0 <= assigned[i] < BLENDED:
+            d = detections.begin[k] + assigned[i]
+            use[i] = True
+            for a in range(2):
+                uv[i, a] = detections.uv[d, a]
+                for b in range(2):
+                    cov[i, a, b] = detections.cov[d, a, b] + calibration_cov[i, a, b]
+    return use, uv, cov
+
+
+@compiled
+def spot_information(
+    views: Views, detections: RunDetections, assigned: Ints, calibration_cov: Array, ref: Reference, start: int
+) -> tuple[Array, Array, Array]:
+    """Normal matrices (F, 6, 6), vectors (F, 6) and chi-squares (F,) of the labelled spots at a reference motion.
+
+    assigned (T, n); ref: F frames from frame `start` on.
+    """
+    frames = ref.t.shape[0]
+    L, g, chi2 = np.empty((frames, 6, 6)), np.empty((frames, 6)), np.empty(frames)
+    for k in range(frames):
+        use, uv, cov = labelled_points(detections, start + k, assigned[start + k], calibration_cov)
+        L_k, g_k, chi2[k], _, _ = frame_information(views, ref.R[k], ref.t[k], use, uv, cov)
+        copy_matrix_into(L[k], L_k)
+        copy_into(g[k], g_k)
+    return L, g, chi2

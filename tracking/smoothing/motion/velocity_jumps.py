@@ -1,0 +1,62 @@
+"""Velocity jumps (corners of the motion) in the steps of a run: which steps may have one, how large, and new ones."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from geometry.arrays import Array, Bools
+from tracking.rigid_body.adaptive_process_noise import jump_variance
+from tracking.smoothing.motion.reference import Reference, speeds
+from tracking.smoothing.motion.windows import largest_near
+
+SHOCK_CHI2 = 20.0  # chi-square of 6 degrees (p = 3e-3) above which a step gets a velocity jump
+SHOCK_SEPARATION = 2  # frames: of shocks this close to each other only the largest becomes a jump
+P_JUMP_OCCLUDED = 0.05  # probability of a jump in each step at a frame that does not determine the pose
+P_JUMP_SHARED = 0.3  # least probability of a known jump in each of several steps between which little is observed
+# Log determinant of a frame's information below the run's usual one: sigmas of the pose half as large again.
+WEAK_LOG_DET = 2 * 6 * np.log(1.5)
+SPEED_WINDOW_S = 0.5  # s: the size of a jump follows from the fastest motion within this time of it
+
+
+def jump_variances(ref: Reference, information: Array, measured: Bools, jumped: Bools, dt: Array) -> Array:
+    """Variances (T, 2) of the velocities' jump in each step, (m/s)^2 and (rad/s)^2, weighted with its probability.
+
+    information (T, 6, 6): of the spots; measured (T,): frames whose spots determine the pose; jumped (T,): steps with a
+    known jump; dt (T,), s.
+    """
+    usual = float(np.median(dt[dt > 0])) if np.any(dt > 0) else SPEED_WINDOW_S
+    window = max(1, min(round(SPEED_WINDOW_S / usual), len(dt)))
+    size = jump_variance(largest_near(np.where(measured[:, None], speeds(ref.m), 0.0), window))
+    # The first measured frame after a gap does not show when a jump happened, and the second one does not show whether
+    # it happened between the two.
+    unobserved = ~measured
+    unobserved[1:] |= ~measured[:-1]
+    unobserved[2:] |= ~measured[:-2]
+    probability = np.where(unobserved, P_JUMP_OCCLUDED, 0.0)
+    jumps = np.flatnonzero(jumped)
+    weak = ~measured | _weak(information, measured) if len(jumps) else measured
+    for k in jumps:
+        first, last = k, k
+        while first > 1 and weak[first - 1]:
+            first -= 1
+        while last < len(dt) - 1 and weak[last]:
+            last += 1
+        # The jump is in one of the steps between the frames that determine the pose well.
+        share = 1.0 if first == last else max(1.0 / (last + 1 - first), P_JUMP_SHARED)
+        probability[first : last + 1] = np.maximum(probability[first : last + 1], share)
+        probability[k] = 1.0
+    return np.asarray(probability[:, None] * size)
+
+
+def new_jumps(shock: Array, jumped: Bools) -> Bools:
+    """(T,): steps with a velocity jump that is not known yet (jumped (T,)): local maxima of the shock (T,)."""
+    peak = shock >= largest_near(np.where(jumped, 0.0, shock), SHOCK_SEPARATION)
+    return np.asarray(peak & (shock > SHOCK_CHI2) & ~jumped)
+
+
+def _weak(information: Array, measured: Bools) -> Bools:
+    """(T,): frames with much less information about the pose than is usual in the run."""
+    sign, log_det = np.linalg.slogdet(information)
+    log_det = np.where(sign > 0, log_det, -np.inf)
+    usual = float(np.median(log_det[measured])) if measured.any() else 0.0
+    return np.asarray(log_det < usual - WEAK_LOG_DET)

@@ -1,0 +1,309 @@
+"""Most probable motion given all labelled spots of a run, with its covariance and its process noise.
+
+Gauss-Newton on the whole run (fixed_interval.py) with Levenberg's damping; the true cost decides which steps are taken.
+Between the steps the strength of the jerk (process_noise.py) and the velocity jumps (velocity_jumps.py) are estimated.
+Source: ours.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from geometry.arrays import Array, Bools, Ints
+from geometry.compiled_projection import Views
+from tracking.rigid_body.adaptive_process_noise import MANOEUVRE_S, jump_variance
+from tracking.rigid_body.models.motion import STATE, predicted
+from tracking.smoothing.motion.fixed_interval import Interval, RunInformation, log_likelihood, smoothed
+from tracking.smoothing.motion.predictive_cost import leave_one_out_log_likelihood, motion_cost
+from tracking.smoothing.motion.process_noise import next_log_density
+from tracking.smoothing.motion.reference import Reference, shifted, speeds
+from tracking.smoothing.motion.run_detections import RunDetections, spot_information
+from tracking.smoothing.motion.velocity_jumps import jump_variances, new_jumps
+from tracking.smoothing.motion.windows import largest_near
+from tracking.statuses import LOST_SIGMA_M, LOST_SIGMA_RAD
+
+MAX_PASSES = 25
+ROUNDING_NATS = 10.0  # by which rounding may raise the cost
+GLOBAL_PASSES = 5  # with one strength of the jerk for the whole run; then each window has its own
+FIRST_ADAPTING_PASSES, LATER_ADAPTING_PASSES = 14, 2  # after which the strength is kept: in the first and later rounds
+NO_JUMPS_BEFORE = 2  # passes: before that the strength of the jerk is too uncertain to detect jumps
+CONVERGED_SIGMAS = 0.02  # a Gauss-Newton step below this is negligible
+CONVERGED_LOG_DENSITY = 0.3  # change of log q, weighted by its determined components, below which the strength is kept
+DAMPING = (np.inf, 0.1, 0.01, 1e-3)  # m and rad: tried in turn until the cost falls; inf: none
+PARTIAL_WEIGHT = 0.25  # of the spots of a frame that does not determine the pose
+P_JUMP_OUTSIDE = 0.15  # probability of a velocity jump in each frame that is extrapolated
+MAX_DISTANCE = 12  # frames: spots farther from any measured frame are not used
+INTERPOLATION_OFFSETS = (-2.0, -4.0, -6.0)  # of log q: tried for the interpolation between frames
+
+
+@dataclass(frozen=True, slots=True)
+class WholeRun:
+    """What stays the same while the motion is estimated: T frames, n views."""
+
+    views: Views
+    detections: RunDetections
+    calibration_cov: Array  # (n, 2, 2) px^2: covariance of the expected pixels due to calibration errors
+    dt: Array  # (T,) s
+    exposure_s: float
+    adapt_jerk: bool  # estimate the strength of the jerk; else it is kept
+
+
+@dataclass(frozen=True, slots=True)
+class SmoothedMotion:
+    """The estimate, T frames."""
+
+    ref: Reference
+    log_density: Array | None  # (T, 6) logarithms of the jerk's spectral densities; None: not estimated yet
+    interpolation_offset: float  # to be added to them for the interpolation between frames
+    jumped: Bools  # (T,) the velocities jumped in the step before
+    pose_P: Array  # (T, 6, 6)
+    motion_P: Array  # (T, 6, 6) of the velocities
+    known: Bools  # (T,) the pose is not lost
+
+    @staticmethod
+    def begin(ref: Reference, jumped: Bools, log_density: Array | None) -> SmoothedMotion:
+        """The motion before the first estimate."""
+        frames = len(ref.t)
+        zero = np.zeros((frames, 6, 6))
+        return SmoothedMotion(ref, log_density, 0.0, jumped, zero, zero, np.zeros(frames, dtype=bool))
+
+
+def estimate(
+    run: WholeRun, assigned: Ints, measured: Bools, motion: SmoothedMotion, max_distance: int, trusted: Bools
+) -> SmoothedMotion:
+    """The motion given labels (T, n). measured (T,): frames whose own spots determine the pose.
+
+    Spots of frames that are not trusted (T,), or farther than max_distance (frames) from any measured frame, are not
+    used; 0: only measured frames are. Frames before the first used one and after the last are extrapolated.
+
+    Raises:
+        FloatingPointError: The first Gauss-Newton step is not finite.
+    """
+    measured = measured & trusted
+    far = ~largest_near(measured, max_distance)
+    used = ~far & trusted & (assigned >= 0).any(axis=1)
+    if not measured.any():
+        return replace(motion, known=np.zeros(len(run.dt), dtype=bool))
+    at = np.flatnonzero(used)
+    core = slice(int(at[0]), int(at[-1]) + 1)
+    return _Estimator(run, assigned, measured, used, core, motion).run_passes()
+
+
+class _Estimator:
+    """Passes over the core of one run: the frames from the first used one to the last."""
+
+    def __init__(
+        self, run: WholeRun, assigned: Ints, measured: Bools, used: Bools, core: slice, motion: SmoothedMotion
+    ) -> None:
+        self.run, self.assigned, self.used, self.core, self.motion = run, assigned, used, core, motion
+        self.measured = measured[core]
+        self.ref = Reference(*(np.ascontiguousarray(a[core]) for a in motion.ref))
+        self.jumped = motion.jumped[core].copy()
+        self.jumped[0] = False
+        self.dt = np.ascontiguousarray(run.dt[core])
+        self.fresh = motion.log_density is None
+        self.log_density = self._first_density() if motion.log_density is None else motion.log_density[core].copy()
+        self.interpolation_offset = motion.interpolation_offset
+
+    def run_passes(self) -> SmoothedMotion:
+        """Passes until nothing changes."""
+        adapting = self.run.adapt_jerk
+        first = 0 if self.fresh else GLOBAL_PASSES
+        out: Interval | None = None
+        for number in range(first, first + MAX_PASSES):
+            density = self._density(out, interpolating=not adapting)
+            result, moved = self._step(density)
+            if not (np.isfinite(result.x).all() and np.isfinite(result.pose_P).all()):
+                if out is None:
+                    raise FloatingPointError("the smoothing pass has no finite first step")
+                break
+            out = result
+            sd = np.sqrt(np.maximum(np.diagonal(out.pose_P, axis1=1, axis2=2), 1e-30))
+            converged = bool(np.all(np.abs(moved[:, :6]) < CONVERGED_SIGMAS * sd))
+            new = np.zeros_like(self.jumped)
+            if (adapting or not self.run.adapt_jerk) and number >= NO_JUMPS_BEFORE:
+                new = new_jumps(out.shock, self.jumped)
+                self.jumped |= new
+            if adapting:
+                adapting = not self._adapt(out, number, number - first + 1, bool(new.any()))
+            elif converged and not new.any():
+                break
+        assert out is not None
+        return self._extrapolated(out)
+
+    def _adapt(self, out: Interval, number: int, passes: int, new_jump: bool) -> bool:
+        """Update the strength of the jerk after a pass; whether it is the last time."""
+        before = self.log_density
+        steady = ~self.jumped
+        steady[0] = False
+        self.log_density = next_log_density(before, out, steady, local=number >= GLOBAL_PASSES)
+        weight = np.minimum(out.gamma, 1.0)
+        change = float(np.max(np.abs(self.log_density - before) * np.sqrt(weight), initial=0.0))
+        settled = number >= GLOBAL_PASSES + 1 and change < CONVERGED_LOG_DENSITY and not new_jump
+        last = settled or passes >= (FIRST_ADAPTING_PASSES if self.fresh else LATER_ADAPTING_PASSES)
+        if last and self.fresh:
+            self.interpolation_offset = self._best_interpolation_offset(out)
+        return last
+
+    # -- strength of the jerk -----------------------------------------------------------------------------------------
+
+    def _first_density(self) -> Array:
+        """The most likely strength on a coarse grid, the same for all axes of translation, and of rotation."""
+        info, _ = self._information(self.ref)
+        steps = np.log(10.0) * np.arange(-4.0, 7.0, 2.0)
+        grid = [np.repeat([a, a + 2 * np.log(3.0)], 3) for a in steps]
+
+        def likelihood(log_density: Array) -> float:
+            value = log_likelihood(self.ref, info, np.broadcast_to(np.exp(log_density), (len(self.dt), 6)).copy())
+            return value if np.isfinite(value) else -np.inf
+
+        return np.tile(max(grid, key=likelihood), (len(self.dt), 1))
+
+    def _density(self, out: Interval | None, interpolating: bool) -> Array:
+        """Spectral densities (T, 6): the estimated ones, or those for interpolation well inside measured stretches.
+
+        The estimated strength is the best predictor. Between frames a motion without jerk at high frequencies, as of
+        all heavy bodies, is smoother than white jerk of that strength; near the ends of a run, a gap or a velocity jump
+        the lower strength would smooth too far.
+        """
+        if not interpolating or out is None or self.interpolation_offset == 0.0:
+            return np.exp(self.log_density)
+        return np.exp(self.log_density + self.interpolation_offset * self._interior(out)[:, None])
+
+    def _interior(self, out: Interval) -> Bools:
+        """(T,): frames farther than twice the smoother's memory from any gap, jump or end."""
+        info, _ = self._information(self.ref)
+        share = np.einsum("kij,kji->k", out.pose_P, info.information)[self.measured]
+        usual = float(np.median(share)) / 6 if len(share) else 1.0
+        memory = int(np.clip(np.ceil(2 / max(usual, 1e-3)), 3, 200))
+        edge: Bools = np.concatenate([[True], ~self.measured | self.jumped, [True]])
+        near: Bools = largest_near(edge, memory)[1:-1]
+        return ~near
+
+    def _best_interpolation_offset(self, out: Interval) -> float:
+        """Offset of log q with the largest leave-one-out likelihood: each frame predicted by all others."""
+        info, _ = self._information(self.ref)
+        interior = self._interior(out)
+        if not interior.any():
+            return 0.0
+        best, value = 0.0, self._leave_one_out(info, 0.0, interior)
+        for offset in INTERPOLATION_OFFSETS:
+            likelihood = self._leave_one_out(info, offset, interior)
+            if likelihood < value:
+                break
+            best, value = offset, likelihood
+        for offset in (best - 1.0, best + 1.0):
+            likelihood = self._leave_one_out(info, offset, interior) if offset < 0 else -np.inf
+            if likelihood > value:
+                best, value = offset, likelihood
+        return best
+
+    def _leave_one_out(self, info: RunInformation, offset: float, interior: Bools) -> float:
+        out = smoothed(self.ref, info, np.exp(self.log_density + offset * interior[:, None]))
+        value = float(leave_one_out_log_likelihood(out.x, out.pose_P, info))
+        return value if np.isfinite(value) else -np.inf
+
+    # -- Gauss-Newton -------------------------------------------------------------------------------------------------
+
+    def _step(self, density: Array) -> tuple[Interval, Array]:
+        """One damped Gauss-Newton step, which moves the reference.
+
+        Returns the undamped smoother's result at the reference before the step, and how far each frame moved (T, 18).
+        """
+        info, chi2 = self._information(self.ref)
+        cost = 0.5 * chi2 + motion_cost(self.ref, info, density)
+        out = smoothed(self.ref, info, density)
+        for damping in DAMPING:
+            x = out.x if np.isinf(damping) else smoothed(self.ref, _damped(info, damping), density).x
+            if not np.isfinite(x).all():
+                continue
+            moved = shifted(self.ref, x)
+            cost_moved = 0.5 * float(self._spot_information(moved)[2].sum()) + motion_cost(moved, info, density)
+            # Damping is against steps that leave the linear region; rounding alone makes some nats.
+            if cost_moved <= cost + ROUNDING_NATS * (1 + 1e-3 * abs(cost)):
+                self.ref = moved
+                return out, x
+        return out, np.zeros_like(out.x)
+
+    def _information(self, ref: Reference) -> tuple[RunInformation, float]:
+        """The frames' information at a reference, with the allowed velocity jumps; and the spots' chi-square."""
+        measured, jumped = self.measured, self.jumped
+        L, g, chi2 = self._spot_information(ref)
+        if self.run.exposure_s > 0:
+            for k in np.flatnonzero(jumped[1:] & measured[1:] & measured[:-1]):
+                # An exposure in which the velocities jump has its mean beside the corner, by up to an eighth of the
+                # exposure times the jump: the same for all spots, as if the vehicle were there.
+                b = (ref.m[k + 1, :6] - ref.m[k, :6]) * self.run.exposure_s / 8
+                Lb = L[k] @ b
+                share = 1 / (1 + b @ Lb)
+                g[k] -= Lb * (b @ g[k]) * share
+                L[k] -= np.outer(Lb, Lb) * share
+        jump = jump_variances(ref, L, measured, jumped, self.dt)
+        first = _first_variance(ref, self.dt, bool(measured[0]))
+        return RunInformation(L, g, self.dt, jump, jump / MANOEUVRE_S**2, first), float(chi2.sum())
+
+    def _spot_information(self, ref: Reference) -> tuple[Array, Array, Array]:
+        """Information of the used spots at a reference: normal matrices (T, 6, 6), vectors (T, 6), chi-squares (T,)."""
+        run = self.run
+        L, g, chi2 = spot_information(
+            run.views, run.detections, self.assigned, run.calibration_cov, ref, self.core.start
+        )
+        unused = ~self.used[self.core]
+        L[unused], g[unused], chi2[unused] = 0.0, 0.0, 0.0
+        # Along a direction that the spots leave open their paths are not straight, with the same sign in every frame.
+        for a in (L, g, chi2):
+            a[~self.measured] *= PARTIAL_WEIGHT
+        return L, g, chi2
+
+    # -- result -------------------------------------------------------------------------------------------------------
+
+    def _extrapolated(self, out: Interval) -> SmoothedMotion:
+        """The motion of all frames: the core's, and the prediction from its ends, forward and backward in time."""
+        core, dt, frames = self.core, self.run.dt, len(self.run.dt)
+        R, t, m = (np.array(a) for a in self.motion.ref)
+        R[core], t[core], m[core] = self.ref
+        pose_P, motion_P = np.empty((frames, 6, 6)), np.empty((frames, 6, 6))
+        pose_P[core], motion_P[core] = out.pose_P, out.motion_P
+        log_density = np.empty((frames, 6))
+        log_density[core] = self.log_density
+        log_density[: core.start], log_density[core.stop :] = self.log_density[0], self.log_density[-1]
+        jump = P_JUMP_OUTSIDE * jump_variance(speeds(self.ref.m[[0, -1]]))  # at the core's first frame, and at its last
+        last = core.stop - 1
+        forward = [(k, dt[k]) for k in range(core.stop, frames)]
+        backward = [(k, dt[k + 1]) for k in range(core.start - 1, -1, -1)]
+        for start, P, steps, sign, size in (
+            (last, out.ends_P[1], forward, 1.0, jump[1]),
+            (core.start, out.ends_P[0], backward, -1.0, jump[0]),
+        ):
+            flip = np.ones(STATE)
+            flip[6:12] = sign  # time reversed: velocities change sign, accelerations do not
+            at = (R[start].copy(), t[start].copy(), m[start] * flip[6:], P * np.outer(flip, flip))
+            density = np.exp(log_density[start])
+            for k, step in steps:
+                R_k, t_k, m_k, P_k, _ = predicted(*at, step, density, size, size / MANOEUVRE_S**2)
+                at = (R_k, t_k, m_k, P_k)
+                R[k], t[k], m[k] = at[0], at[1], at[2] * flip[6:]
+                pose_P[k], motion_P[k] = at[3][:6, :6], at[3][6:12, 6:12]
+        sd = np.sqrt(np.diagonal(pose_P, axis1=1, axis2=2))
+        known = (sd[:, :3].max(axis=1) < LOST_SIGMA_M) & (sd[:, 3:].max(axis=1) < LOST_SIGMA_RAD)
+        jumped = self.motion.jumped.copy()
+        jumped[core] = self.jumped
+        return SmoothedMotion(
+            Reference(R, t, m), log_density, self.interpolation_offset, jumped, pose_P, motion_P, known
+        )
+
+
+def _damped(info: RunInformation, damping: float) -> RunInformation:
+    """Levenberg's damping: as if each frame's pose had been measured at the reference, with this sigma (m and rad)."""
+    return info._replace(information=info.information + np.eye(6) / damping**2)
+
+
+def _first_variance(ref: Reference, dt: Array, measured: bool) -> Array:
+    """Variances (18,) of the first frame's deviation: wide compared with the run's motion."""
+    speed = np.abs(ref.m[:, :6]).reshape(-1, 2, 3).max(axis=(0, 2), initial=0.0)
+    change = np.abs(np.diff(ref.m[:, :6], axis=0)) / np.maximum(dt[1:, None], 1e-9)
+    acceleration = change.reshape(-1, 2, 3).max(axis=(0, 2), initial=0.0)
+    pose = [0.1, 0.1] if measured else [1.0, 1.0]
+    return np.asarray(np.repeat([*pose, *(2 * speed + 0.1), *(2 * acceleration + 1.0)], 3) ** 2)
