@@ -1,10 +1,11 @@
-"""What the lens model itself may be wrong by: residuals that go together over the picture, and models that fit as well.
+"""Error of the lens model itself, from correlated residuals and from rival models that predict equally well.
 
-A covariance knows the corners' noise and nothing of a lens that the model cannot follow. Two things tell of that. The
-mean residuals in cells of the picture: of a lens that follows they are noise. And the other models that predict
-held-out photographs as well as the chosen one does: where these draw the same ray elsewhere, the photographs do not
-decide between them. What both make is added to the claim. Ours; the second is the spread between models of Bayesian
-model averaging (Hoeting et al. 1999, Statistical Science 14), with the largest difference in place of its mean.
+The covariance of the parameters contains the noise of the corners, but not the error of a model that cannot describe
+the lens. Two figures show such an error. First, the mean residuals in cells of the picture, which are noise if the
+model is right. Second, other models that predict held-out photographs as well as the chosen one: where their rays
+differ, the photographs do not decide between the models. Both are added to the stated uncertainty. Ours; the second is
+the between-model variance of Bayesian model averaging (Hoeting et al. 1999, Statistical Science 14), with the largest
+difference in place of the mean.
 """
 
 from __future__ import annotations
@@ -17,35 +18,40 @@ from calibration.lens.fit.corner_table import CornerTable
 from calibration.lens.fit.coverage import seen_at
 from calibration.lens.fit.lens_fit import LensFit
 from calibration.lens.fit.lens_models import LensModel, undistorted
-from calibration.lens.fit.model_selection import Ladder, leaves_something
+from calibration.lens.fit.model_selection import ModelSelection, leaves_systematic_residuals
 from calibration.lens.fit.projection_map import ProjectionMap
 from calibration.lens.fit.residual_cells import beyond_noise, cell_means
 from geometry.arrays import Array, Ints
 from geometry.camera import project_points_full
 
-AS_GOOD_SE = 2.0  # standard errors of held-out error within which the photographs do not decide between two models
+AS_GOOD_SE = 2.0  # standard errors of the hold-out error within which two models count as equally good
 
 
 @dataclass(frozen=True, slots=True)
 class ModelDoubt:
-    """How far the model may be off, beyond its numbers' covariance."""
+    """Model error beyond the covariance of the parameters."""
 
-    cell_px: Array  # (rows, columns, 2): mean residual in each cell of the picture, projected less measured; nan: none
+    cell_px: Array  # (rows, columns, 2): mean residual per cell of the picture, projected minus measured; nan: empty
     cell_count: Ints  # (rows, columns)
-    p_value: float  # of residuals whose means are as large, if they were noise
-    left_px: float  # RMS per coordinate of what goes together in them beyond noise; 0 where not significant
-    other: LensModel | None  # of the models that predict as well, the one that draws most differently
-    between_px: float  # how far it differs where corners were seen, RMS, less where it predicts worse; 0: no other
-    factor: float  # on the sigmas of the lens, so that the claim holds both
+    p_value: float  # of mean residuals at least as large, if they are noise
+    left_px: float  # RMS per coordinate of correlated residuals beyond noise; 0 where not significant
+    other: LensModel | None  # the most different of the models that predict equally well
+    between_px: float  # RMS difference to it where corners were seen, reduced if it predicts worse; 0: no other
+    factor: float  # on the sigmas of the lens, so that they include both
 
 
 def model_doubt(
-    table: CornerTable, found: LensFit, ladder: Ladder, at: ProjectionMap, covariance: Array, scatter: float = 1.0
+    table: CornerTable,
+    found: LensFit,
+    ladder: ModelSelection,
+    at: ProjectionMap,
+    covariance: Array,
+    scatter: float = 1.0,
 ) -> ModelDoubt:
-    """Of a lens with the covariance (p, p) of its numbers, over the part of the picture where corners were seen.
+    """Model error of a lens with parameter covariance (p, p), over the part of the picture where corners were seen.
 
-    scatter: factor by which photographs scatter more than noise explains: errors that go together within a photograph
-    make means of cells larger as well, and are in the covariance already.
+    scatter: factor by which photographs scatter more than noise explains. Errors that are correlated within a
+    photograph also enlarge the means of cells, and are already in the covariance.
     """
     noise = min([found.sigma_px, *(r.fit.sigma_px for r in ladder.candidates if r.fit is not None)])
     cells, count = cell_means(table, found)
@@ -53,22 +59,27 @@ def model_doubt(
     inside = seen_at(table, found.used, at.pixels) & np.isfinite(at.by_parameter).all(axis=(2, 3))
     other, between = None, 0.0
     chosen = ladder.chosen
-    for rung in ladder.candidates:
-        as_good = not rung.refused and rung.behind_px2 <= AS_GOOD_SE * rung.standard_error_px2
-        if rung.fit is None or rung.model == found.model or not as_good or leaves_something(rung, chosen):
+    for candidate in ladder.candidates:
+        as_good = not candidate.refused and candidate.excess_px2 <= AS_GOOD_SE * candidate.standard_error_px2
+        if (
+            candidate.fit is None
+            or candidate.model == found.model
+            or not as_good
+            or leaves_systematic_residuals(candidate, chosen)
+        ):
             continue
-        behind = rung.behind_px2 / rung.standard_error_px2 if rung.behind_px2 > 0 else 0.0
-        # Weighed by the chance that held-out error leaves it: two standard errors behind, a third counts.
-        apart = _apart(at.pixels[inside], found, rung.fit) * float(np.exp(-(behind**2) / 4))
-        if apart > between:
-            other, between = rung.model, apart
+        excess_se = candidate.excess_px2 / candidate.standard_error_px2 if candidate.excess_px2 > 0 else 0.0
+        # Weight by the probability of the hold-out error: 1/e at two standard errors.
+        difference_px = _difference_px(at.pixels[inside], found, candidate.fit) * float(np.exp(-(excess_se**2) / 4))
+        if difference_px > between:
+            other, between = candidate.model, difference_px
     claimed = float(np.mean(np.trace(at.covariance_px2(covariance)[inside], axis1=-2, axis2=-1))) if inside.any() else 0
     factor = float(np.sqrt(1 + (between**2 + 2 * left**2) / claimed)) if claimed > 0 else 1.0
     return ModelDoubt(cells, count, p, left, other, between, factor)
 
 
-def _apart(pixels: Array, first: LensFit, second: LensFit) -> float:
-    """How far off (RMS, px) another lens draws the rays of the first at pixels (n, 2), the best turn taken out."""
+def _difference_px(pixels: Array, first: LensFit, second: LensFit) -> float:
+    """RMS difference (px) at pixels (n, 2) between the rays of two lenses, after the best-fitting rotation."""
     flat = undistorted(pixels, first.lens, first.model.fisheye)
     rays = np.concatenate([flat, np.ones((len(flat), 1))], axis=1)
     wide = np.asarray(second.model.fisheye)

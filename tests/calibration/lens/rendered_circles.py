@@ -9,8 +9,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.boards.board_detection import BoardView, find_board
+from calibration.boards.board_detection import find_board
 from calibration.boards.board_types import CircleGrid
+from calibration.boards.board_view import BoardView
 from calibration.boards.circle_detection import fit_ellipses
 from calibration.lens.fit.corner_table import CircleAreas, CornerTable
 from geometry.arrays import Array

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from calibration.lens.fit.corner_table import CornerTable
-from calibration.lens.fit.lens_fit import AS_STATED, robust_fit
+from calibration.lens.fit.lens_fit import robust_fit
+from calibration.lens.fit.lens_parameters import AS_STATED
 from calibration.lens.fit.lens_start import StartError, start
 from tests.calibration.lens.lens_scenes import SIZE, TRUTH, WIDE, Scene, board_points, photographs
 

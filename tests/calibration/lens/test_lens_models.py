@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from calibration.lens.fit.hold_out import HeldOut, folds_of
-from calibration.lens.fit.lens_fit import AS_STATED, robust_fit
+from calibration.lens.fit.lens_fit import robust_fit
 from calibration.lens.fit.lens_models import LADDER, LensModel, folds_in_picture, named
+from calibration.lens.fit.lens_parameters import AS_STATED
 from calibration.lens.fit.lens_start import start
 from calibration.lens.fit.model_selection import ModelCandidate, choose
 from calibration.lens.fit.projection_map import difference, projection_map
@@ -22,26 +23,26 @@ def lens_of(numbers: tuple[float, ...]) -> Array:
     return np.array([*numbers, *[0.0] * (18 - len(numbers))])
 
 
-def rung(title: str, errors_px2: list[float], refused: str = "") -> ModelCandidate:
+def candidate(title: str, errors_px2: list[float], refused: str = "") -> ModelCandidate:
     errors = np.array(errors_px2)
     return ModelCandidate(named(title), None, HeldOut(errors, (), float(np.sqrt(errors.mean()))), refused=refused)
 
 
 def test_the_smaller_model_is_taken_where_the_larger_one_gains_within_its_standard_error():
-    ladder = choose([rung("4", [1.0, 1.2, 0.9, 1.1]), rung("5", [0.9, 1.25, 0.92, 1.1])])
+    ladder = choose([candidate("4", [1.0, 1.2, 0.9, 1.1]), candidate("5", [0.9, 1.25, 0.92, 1.1])])
     assert ladder.chosen.model.title == "4"
     assert "within one standard error" in ladder.why
 
 
 def test_a_small_gain_in_every_view_counts_as_a_gain():
     """Pairs tell: the views differ by far more than the two models do."""
-    ladder = choose([rung("4", [1.0, 5.2, 0.3, 9.1]), rung("5", [0.9, 5.1, 0.2, 9.0])])
+    ladder = choose([candidate("4", [1.0, 5.2, 0.3, 9.1]), candidate("5", [0.9, 5.1, 0.2, 9.0])])
     assert ladder.chosen.model.title == "5"
     assert "every smaller usable model errs more" in ladder.why
 
 
 def test_a_refused_model_is_never_chosen_however_well_it_predicts():
-    ladder = choose([rung("4", [1.0, 1.2, 0.9]), rung("8", [0.1, 0.1, 0.1], refused="it folds")])
+    ladder = choose([candidate("4", [1.0, 1.2, 0.9]), candidate("8", [0.1, 0.1, 0.1], refused="it folds")])
     assert ladder.chosen.model.title == "4"
 
 

@@ -8,8 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
-from calibration.boards.board_detection import BoardView, find_board
+from calibration.boards.board_detection import find_board
 from calibration.boards.board_types import Chessboard
+from calibration.boards.board_view import BoardView
 from calibration.screens.network import Dots, Network, PointObservations
 from calibration.screens.screens import ScreenSetup, calibrate
 from calibration.terms.board_on_screen import BoardOnScreenTerm
