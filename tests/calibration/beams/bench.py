@@ -74,7 +74,7 @@ def drawn(rig: Rig, rng: np.random.Generator, turn_rad: float = 0.02, shift_m: f
 
 
 def errors(rig: Rig, found: Rig) -> np.ndarray:
-    """Errors (beams, 4) of the estimated beams: direction (rad) and point (m), in the basis of the estimated directions.
+    """Errors (beams, 4) of the estimated beams: direction (rad) and point (m), in the basis of the estimates.
 
     The covariance is in the same basis. Bases of nearly equal directions may differ by a right angle.
     """
