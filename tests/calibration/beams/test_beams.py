@@ -154,8 +154,8 @@ def test_with_yaw_alone_the_height_and_yaw_of_the_stand_are_undetermined():
     spots = recorded(rng, rig, poses)
     found = calibrate_beams(drawn(rig, rng, 1e-3, 1e-3), spots, unknown_place(poses))
     assert list(found.undetermined) == [
-        "all beams relative to the stand: a shift along z",
         "all beams relative to the stand: a rotation about z",
+        "all beams relative to the stand: a shift along z",
     ]
     assert found.motion.remedy() == "add positions turned by 10 deg or more about the stand's x and y"
     assert calibrate_beams(rig, spots, exact(poses)).undetermined == []  # determined by the known pose of the stand
@@ -254,8 +254,8 @@ def tally(cases) -> tuple[float, float, float]:
 @pytest.mark.parametrize("known", ["known", "unknown"])
 def test_errors_agree_with_the_covariance(known):
     # Shares within a sigma need many seeds, because the 24 errors of one are correlated; see the slow test.
-    _, nees, _ = tally(simulated(s, known) for s in range(3))
-    lo, hi = chi2.ppf([0.001, 0.999], 3 * 24) / (3 * 24)
+    _, nees, _ = tally(simulated(s, known) for s in range(2))
+    lo, hi = chi2.ppf([0.001, 0.999], 2 * 24) / (2 * 24)
     assert lo < nees < hi
 
 

@@ -22,11 +22,15 @@ DRAWN = drawn(RIG, np.random.default_rng(3), 0.005, 0.003)
     ("written", "words"),
     [
         (Pose.from_quaternion(np.roll(POSES.quaternion_wxyz, -1, axis=1), POSES.translation), "the order x, y, z, w"),
-        (POSES.inverse(), "inverted"),
-        (Pose(np.swapaxes(POSES.rotation, 1, 2), POSES.translation), "their rotations inverted"),
-        (Pose(POSES.rotation, 1e3 * POSES.translation), "millimetres were written"),
+        pytest.param(POSES.inverse(), "inverted", marks=pytest.mark.slow),
+        pytest.param(
+            Pose(np.swapaxes(POSES.rotation, 1, 2), POSES.translation),
+            "their rotations inverted",
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(Pose(POSES.rotation, 1e3 * POSES.translation), "millimetres were written", marks=pytest.mark.slow),
         (POSES[np.roll(np.arange(20), 3)], "3 rows below"),
-        (POSES[np.roll(np.arange(20), -1)], "1 row above"),
+        pytest.param(POSES[np.roll(np.arange(20), -1)], "1 row above", marks=pytest.mark.slow),
     ],
 )
 def test_a_common_mistake_in_the_stands_record_is_identified(written, words):

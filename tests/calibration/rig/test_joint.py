@@ -91,7 +91,7 @@ def test_outliers_of_spots_and_dots_are_excluded_and_do_not_change_the_result():
 
 
 def test_a_stand_ten_times_less_accurate_than_stated_is_detected():
-    q = replace(SMALL, positions=20, stand_m=3e-4, stand_deg=0.03)
+    q = replace(SMALL, positions=12, dots=(4, 3), stand_m=3e-4, stand_deg=0.03)
     c = draw_campaign(2, "fan", q)
     network, setups, stand = as_measured(c)
     found = calibrate_in_steps(calibrate(network, setups), c.spots, replace(stand, pose_sigmas=stand.pose_sigmas / 10))

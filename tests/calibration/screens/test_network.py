@@ -235,7 +235,7 @@ def near_truth(error=0.1):
     ],
 )
 def test_approximate_camera_positions_reveal_exchanged_axes_and_wrong_units(spoil, words):
-    network = measured(1, dots=6)
+    network = measured(1, dots=5)
     spoilt = replace(network, dots=replace(network.dots, xyz=spoil(network.dots.xyz)))
     result = calibrate(spoilt, PLAIN, near_truth())
     assert any(f.level == Level.FAIL for f in near_findings(result, near_truth()))
