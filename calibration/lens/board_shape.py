@@ -175,7 +175,7 @@ def _accepted(
     if wanted == AS_STATED:
         return flat, np.nan, np.nan
     freed = fit(table, flat.used, flat.model, flat.values, wanted)
-    if flat_held is None:  # the user asked for it
+    if flat_held is None:  # requested by the user
         return freed, np.nan, np.nan
     gain, error = hold_out(table, freed, options.folds).better_than(flat_held)
     if gain >= -error:

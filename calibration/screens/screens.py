@@ -11,7 +11,7 @@ from calibration.least_squares.parameter_blocks import Poses, Vectors
 from calibration.least_squares.priors import Prior
 from calibration.screens.flatness import Flatness, Surface, assess_flatness
 from calibration.screens.network import Network, NetworkFit, adjust
-from calibration.screens.network_start import CameraOnDots, boards_seen, camera_on_dots, chain, start_of
+from calibration.screens.network_start import CameraOnDots, ChainedPoses, boards_seen, camera_on_dots, chain, start_of
 from calibration.screens.resection import ResectedPose
 from calibration.screens.screen_frame import frame_of_dots, frame_of_extent
 from geometry.arrays import Array, Bools, Ints
@@ -71,9 +71,8 @@ class ScreensResult:
     fit: NetworkFit
     screens: tuple[ScreenResult, ...]
     on_dots: Mapping[int, CameraOnDots] = field(default_factory=dict)
-    second_poses: Mapping[int, ResectedPose] = field(
-        default_factory=dict
-    )  # camera -> a second pose that fits nearly as well
+    # camera -> a second pose that fits nearly as well
+    second_poses: Mapping[int, ResectedPose] = field(default_factory=dict)
 
 
 def calibrate(
@@ -101,6 +100,27 @@ def calibrate(
     problems = {c: found.problem for c, found in on_dots.items()}
     placed = {c: p.camera_from_world for c, p in chosen.items()}
     chained = chain(network, placed, boards, held_screen, held_camera, problems)
+    complete, frames, bows, results = _screen_starts(network, setups, chained)
+    start = start_of(
+        complete,
+        chained,
+        frames,
+        bows,
+        None if surveyed or held_screen is not None else held_camera,
+        None if surveyed else _board_on(network, held_screen),
+    )
+    fit = adjust(complete, start)
+    results = [_in_final_frame(r, complete, fit, k) for k, r in enumerate(results)]
+    second_poses = {
+        c: r for c, found in on_dots.items() for r in [_second_pose(found, chosen.get(c), near.get(c))] if r is not None
+    }
+    return ScreensResult(complete, fit, tuple(results), on_dots, second_poses)
+
+
+def _screen_starts(
+    network: Network, setups: Sequence[ScreenSetup], chained: ChainedPoses
+) -> tuple[Network, dict[int, Pose], Array, list[ScreenResult]]:
+    """Frame, bow (screens, 3) and flatness of each screen with a scan or dots; and the network with their priors."""
     observed = [c.screen for c in network.rig.cameras.values()]
     frames: dict[int, Pose] = {}
     results: list[ScreenResult] = []
@@ -139,20 +159,7 @@ def calibrate(
         bent=frozenset(bent),
         screen_priors=(*network.screen_priors, *priors),
     )
-    start = start_of(
-        complete,
-        chained,
-        frames,
-        bows,
-        None if surveyed or held_screen is not None else held_camera,
-        None if surveyed else _board_on(network, held_screen),
-    )
-    fit = adjust(complete, start)
-    results = [_in_final_frame(r, complete, fit, k) for k, r in enumerate(results)]
-    second_poses = {
-        c: r for c, found in on_dots.items() for r in [_second_pose(found, chosen.get(c), near.get(c))] if r is not None
-    }
-    return ScreensResult(complete, fit, tuple(results), on_dots, second_poses)
+    return complete, frames, bows, results
 
 
 def _board_on(network: Network, screen: int | None) -> int | None:

@@ -124,7 +124,7 @@ def test_effects_agree_with_complete_solutions(rig, errors):
         if i % 4 == 0 and errors.move_sigmas[i] > 0:
             found = solved_error(rig, errors, errors.moves[:, i], np.zeros((6, 2)))
             size = np.abs(planned.effects[0]).max(axis=1)  # of the largest effect on each axis
-            # The true rig differs by the move, so that the pose error has the opposite sign: estimate = truth + G S (-move).
+            # The true rig differs by the move; the pose error has the opposite sign: estimate = truth + G S (-move).
             np.testing.assert_allclose(found, -planned.effects[0, :, i], atol=0.01 * size.max(), err_msg=name)
 
 

@@ -1,4 +1,4 @@
-"""One lens model fitted to one camera's corners: the least squares, and what is thrown out as not being the board."""
+"""Fit of a lens model to the corners of one camera, with rejection of outliers."""
 
 from __future__ import annotations
 
