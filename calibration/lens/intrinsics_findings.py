@@ -93,7 +93,8 @@ def _lens(c: Intrinsics) -> Finding:
             "Two directions would map to the same pixel.",
             _MORE,
         )
-    return Finding(Level.PASS, f"Lens: {c.model.words}: {c.ladder.why}.")
+    why = c.ladder.why
+    return Finding(Level.PASS, f"Lens: {c.model.words}: {why}.")
 
 
 def _noise(c: Intrinsics, limits: FindingLimits) -> Finding:

@@ -175,7 +175,7 @@ def _contradiction(steps: RigSteps, limits: RigLimits) -> list[Finding]:
 def _outliers(steps: RigSteps, positions: Sequence[str], limits: RigLimits) -> list[Finding]:
     joint, measured = steps.joint, steps.measured
     views = joint.rig.views()
-    dots, cameras = measured.network.dots.names, list(joint.rig.cameras)
+    names, cameras = measured.network.dots.names, list(joint.rig.cameras)
     out = []
     for name, kept in joint.kept.items():
         wrong: list[int] = np.flatnonzero(~kept).tolist()
@@ -187,7 +187,8 @@ def _outliers(steps: RigSteps, positions: Sequence[str], limits: RigLimits) -> l
                      for i in wrong]  # fmt: skip
         elif name == DOTS:
             s = measured.network.sightings
-            which = [f"{dots[s.dot_of[i]]} in camera {cameras[s.camera_of[i]]}" for i in wrong]
+            seen = [(names[p], cameras[c]) for p, c in zip(s.dot_of[wrong], s.camera_of[wrong], strict=True)]
+            which = [f"{dot} in camera {camera}" for dot, camera in seen]
         else:
             which = []
         share = len(wrong) / len(kept)

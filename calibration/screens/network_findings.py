@@ -172,8 +172,9 @@ def _dots(result: ScreensResult, limits: ScreenLimits) -> list[Finding]:
                     "check names and coordinates, and that the lens belongs to this camera at this focus",
                 )
             )
-    if len(network.sightings) and not wrong:
-        out.append(Finding(Level.PASS, f"all {len(network.sightings)} pixels of dots are consistent with their names"))
+    count = len(network.sightings)
+    if count and not wrong:
+        out.append(Finding(Level.PASS, f"all {count} pixels of dots are consistent with their names"))
     return out
 
 
@@ -184,12 +185,12 @@ def _surfaces(result: ScreensResult, limits: ScreenLimits) -> list[Finding]:
             continue
         chosen, flat = screen.flatness.chosen, screen.flatness.flat
         for k in np.flatnonzero(~screen.used):
-            whose = f"dot {result.network.dots.names[screen.dots[k]]!r}" if screen.dots else "a scanned patch"
             if screen.dots:
+                dot = result.network.dots.names[screen.dots[k]]
                 out.append(
                     Finding(
                         Level.WARN,
-                        f"screen {name!r}: {whose} is {1e3 * chosen.heights_m[k]:+.1f} mm off its surface",
+                        f"screen {name!r}: dot {dot!r} is {1e3 * chosen.heights_m[k]:+.1f} mm off its surface",
                         "it was excluded from the surface",
                         "survey it again, or correct the column `screen`",
                     )

@@ -179,12 +179,13 @@ def screen_of_dots(
         ValueError: the dots do not determine its plane.
     """
     xyz, C = network.dots.xyz[dots], network.dots.covariance[dots]
-    if len(dots) < 3:
-        raise ValueError(f"screen {name!r}: {len(dots)} surveyed dots, expected 3 or more; 8 show whether it is flat")
+    count = len(dots)
+    if count < 3:
+        raise ValueError(f"screen {name!r}: {count} surveyed dots, expected 3 or more; 8 show whether it is flat")
     s = np.linalg.svd(xyz - xyz.mean(axis=0), compute_uv=False)
     if s[1] < 0.02 * s[0]:
         raise ValueError(
-            f"screen {name!r}: its {len(dots)} dots are collinear within {1e3 * s[1] / np.sqrt(len(dots)):.3g} mm;"
+            f"screen {name!r}: its {count} dots are collinear within {1e3 * s[1] / np.sqrt(count):.3g} mm;"
             " a plane requires dots off that line"
         )
     if setup.frame_dots is None:
