@@ -7,7 +7,7 @@ import numpy as np
 from calibration.findings import Finding, Level, unless_pass
 from calibration.lens.intrinsics_result import Intrinsics
 
-DOUBTFUL = 2.0  # factor on the sigmas, from disagreeing lens models and correlated residuals, above which to warn
+UNCERTAIN_MODEL = 2.0  # factor on the sigmas, from rival models and correlated residuals, above which to warn
 OUT_OF_SCALE = 0.001  # relative scale difference of rows and columns above which to warn: printers reach .1 %
 UNDETERMINED = 0.002  # relative, of that difference and of fx / fy: above it the two cannot be distinguished
 OTHER_CIRCLE = 0.03  # relative difference from the stated diameter above which to warn
@@ -29,8 +29,8 @@ def doubt_finding(c: Intrinsics) -> Finding | None:
     if not parts:
         return None
     return unless_pass(
-        Level.WARN if d.factor > DOUBTFUL or d.left_px > 0 else Level.PASS,
-        f"Doubt about the lens model: {' and '.join(parts)}; all sigmas have been multiplied by {d.factor:.2f}.",
+        Level.WARN if d.factor > UNCERTAIN_MODEL or d.left_px > 0 else Level.PASS,
+        f"Uncertainty of the lens model: {' and '.join(parts)}; all sigmas have been multiplied by {d.factor:.2f}.",
         "The lens distorts in a way that no available model describes, or the photographs cannot distinguish between"
         " the models.",
         "Take more photographs with the board near the border of the picture, where lens models differ; name the lens"

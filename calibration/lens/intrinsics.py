@@ -22,7 +22,7 @@ from calibration.lens.fit.model_selection import ModelCandidate, inliers_of_rich
 from calibration.lens.fit.projection_map import Difference, ProjectionMap, difference, projection_map
 from calibration.lens.intrinsics_findings import findings_of
 from calibration.lens.intrinsics_result import Intrinsics, Origins
-from calibration.lens.model_doubt import model_doubt
+from calibration.lens.model_uncertainty import estimate_model_uncertainty
 from geometry.arrays import Ints
 
 FEWEST_VIEWS = 4
@@ -83,7 +83,7 @@ def _calibrated(table: CornerTable, options: IntrinsicsOptions) -> Intrinsics:
     noise = max(1.0, spread.factor) if spread.p_value < SCATTER_SIGNIFICANT else 1.0
     distance = options.distance_m or _typical_depth(table, found)
     pixel_map = projection_map(found.model, found.lens, table.image_size_px, distance)
-    doubt = model_doubt(table, found, ladder, pixel_map, found.covariance * noise**2, noise)
+    doubt = estimate_model_uncertainty(table, found, ladder, pixel_map, found.covariance * noise**2, noise)
     out = Intrinsics(
         table=table,
         model=found.model,

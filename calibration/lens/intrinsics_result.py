@@ -15,7 +15,7 @@ from calibration.lens.fit.lens_fit import LensFit
 from calibration.lens.fit.lens_models import LensModel
 from calibration.lens.fit.model_selection import ModelSelection
 from calibration.lens.fit.projection_map import Difference, ProjectionMap
-from calibration.lens.model_doubt import ModelDoubt
+from calibration.lens.model_uncertainty import ModelUncertainty
 from geometry.arrays import Array
 
 
@@ -36,7 +36,7 @@ class Intrinsics:
     fit: LensFit
     parameters: tuple[str, ...]  # fx, fy, cx, cy, k1 ...
     covariance: Array  # (p, p) in that order, inflated by scatter between photographs and by model error
-    doubt: ModelDoubt
+    doubt: ModelUncertainty
     correlated_noise: float  # factor on the sigmas from that scatter; 1 where it is not significant
     scatter: Scatter
     held: HeldOut

@@ -28,7 +28,7 @@ AS_GOOD_SE = 2.0  # standard errors of the hold-out error within which two model
 
 
 @dataclass(frozen=True, slots=True)
-class ModelDoubt:
+class ModelUncertainty:
     """Model error beyond the covariance of the parameters."""
 
     cell_px: Array  # (rows, columns, 2): mean residual per cell of the picture, projected minus measured; nan: empty
@@ -40,14 +40,14 @@ class ModelDoubt:
     factor: float  # on the sigmas of the lens, so that they include both
 
 
-def model_doubt(
+def estimate_model_uncertainty(
     table: CornerTable,
     found: LensFit,
     ladder: ModelSelection,
     at: ProjectionMap,
     covariance: Array,
     scatter: float = 1.0,
-) -> ModelDoubt:
+) -> ModelUncertainty:
     """Model error of a lens with parameter covariance (p, p), over the part of the picture where corners were seen.
 
     scatter: factor by which photographs scatter more than noise explains. Errors that are correlated within a
@@ -75,7 +75,7 @@ def model_doubt(
             other, between = candidate.model, difference_px
     claimed = float(np.mean(np.trace(at.covariance_px2(covariance)[inside], axis1=-2, axis2=-1))) if inside.any() else 0
     factor = float(np.sqrt(1 + (between**2 + 2 * left**2) / claimed)) if claimed > 0 else 1.0
-    return ModelDoubt(cells, count, p, left, other, between, factor)
+    return ModelUncertainty(cells, count, p, left, other, between, factor)
 
 
 def _difference_px(pixels: Array, first: LensFit, second: LensFit) -> float:
