@@ -172,7 +172,7 @@ def _resection(camera: Camera, screen: Screen, expected: ExpectedErrors) -> tupl
 
     None if the camera sees too little of the screen.
     """
-    points = _dots(camera, screen, expected)
+    points = dots_on_screen(camera, screen, expected)
     if len(points) < _FEWEST_DOTS:
         return None
     in_camera = camera.camera_from_world.apply(points)
@@ -193,7 +193,7 @@ def _resection(camera: Camera, screen: Screen, expected: ExpectedErrors) -> tupl
     return symmetric(noise), -noise @ np.einsum("mia,mij,mjb->ab", A, W, B)
 
 
-def _dots(camera: Camera, screen: Screen, expected: ExpectedErrors) -> Array:
+def dots_on_screen(camera: Camera, screen: Screen, expected: ExpectedErrors) -> Array:
     """Points (m, 3) of the screen, in world, spread over the camera's picture."""
     columns = max(round(float(np.sqrt(1.25 * expected.dots))), 1)
     rows = max(round(expected.dots / columns), 1)

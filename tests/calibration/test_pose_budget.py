@@ -10,8 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from calibration.budget import expected_errors as module
-from calibration.budget.expected_errors import ExpectedErrors, expected_errors
+from calibration.budget.expected_errors import ExpectedErrors, dots_on_screen, expected_errors
 from calibration.budget.pose_budget import (
     BEAM_DIRECTIONS,
     CAMERA_POSES,
@@ -27,6 +26,7 @@ from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.pose_solver.gauss_newton import fit_pose
 from geometry.rig import Rig
+from geometry.uncertainty.rig_parameters import POSE as POSE_NAMES
 from geometry.uncertainty.rig_parameters import RigCovariance, Sensitivity, moved
 from geometry.uncertainty.rig_uncertainty import CalibrationSpread
 from tests.geometry.scenes import LENSES, paper_rig
@@ -211,7 +211,7 @@ def test_the_pose_error_from_a_lens_error_agrees_with_opencvs_resection(rig):
     expected = ExpectedErrors(dot_survey_m=0.0)  # all dots have the same weight, as in solvePnP
     errors, _ = expected_errors(rig, expected)
     camera = rig.cameras["left"]
-    dots = module._dots(camera, rig.screens["left"], expected)
+    dots = dots_on_screen(camera, rig.screens["left"], expected)
     pixels = camera.project(dots)
     for lens in ("fx", "cy", "k1", "p2"):
         move = errors.moves[:, errors.names.index(f"cameras.left.{lens}")]
@@ -224,7 +224,7 @@ def test_the_pose_error_from_a_lens_error_agrees_with_opencvs_resection(rig):
             rvec.copy(), camera.camera_from_world.translation.copy(), True, cv2.SOLVEPNP_ITERATIVE,
         )  # fmt: skip
         found = Pose(Rotation.from_rotvec(rvec.ravel()).as_matrix(), tvec.ravel()).minus(camera.camera_from_world)
-        planned = np.array([move[errors.names.index(f"cameras.left.{n}")] for n in module.POSE])
+        planned = np.array([move[errors.names.index(f"cameras.left.{n}")] for n in POSE_NAMES])
         assert np.abs(found).max() > 1e-6
         np.testing.assert_allclose(found, planned, atol=0.02 * np.abs(found).max(), err_msg=lens)
 
