@@ -171,7 +171,7 @@ def test_without_poses_only_the_shape_is_found_and_that_is_said(campaign, tmp_pa
     assert outcome.level == Level.WARN
     assert "3 beams from 40 positions of which nothing is known, angles between beams to" in outcome.line()
     words = " ".join(f.what for f in outcome.findings)
-    assert "6 numbers stay undetermined, the place (3) and the attitude (3) of the body frame" in words
+    assert "6 parameters remain undetermined, the position (3) and the attitude (3) of the body frame" in words
     angles = table(tmp_path / "out" / "angles.csv")
     assert float(angles[0]["angle_deg"]) == pytest.approx(18.0, abs=0.01)
     assert "laid so that the beams found are" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
