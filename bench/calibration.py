@@ -20,7 +20,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from bench.rig_calibration import bench_figures
 from calibration.boards.board_types import parse
 from calibration.findings import Level
-from calibration.lens.fit.lens_fit import AS_STATED, robust_fit
+from calibration.lens.fit.lens_fit import robust_fit
+from calibration.lens.fit.lens_parameters import AS_STATED
 from calibration.lens.fit.lens_start import start
 from calibration.lens.intrinsics import IntrinsicsError, calibrate_intrinsics
 from lab.simulate.rigs import RIGS

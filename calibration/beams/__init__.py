@@ -1,1 +1,1 @@
-"""The lasers' lines in the vehicle."""
+"""Calibration of the lasers' lines in the vehicle."""

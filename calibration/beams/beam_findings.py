@@ -1,4 +1,4 @@
-"""What a calibration of beams concludes about itself, in words for the person who can act on it."""
+"""Findings of a beam calibration."""
 
 from __future__ import annotations
 
@@ -8,53 +8,53 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.beams.beam_figures import OneLine
+from calibration.beams.beam_figures import CollinearityTest
 from calibration.beams.beams import BeamCalibration
-from calibration.beams.label_swaps import exchanged_pairs
+from calibration.beams.label_swaps import swapped_pairs
 from calibration.findings import Finding, Level
 from geometry.arrays import Array
 from geometry.rig import Rig
 
 ARCSEC = np.deg2rad(1 / 3600)
-_P_TWO_LINES = 1e-3  # of a straight pair to be told to be two lines
+_P_NOT_COLLINEAR = 1e-3  # p-value below which opposed beams are not collinear
 _WORST_NAMED = 6
-UNDETERMINED = "the positions leave undetermined"  # how that finding begins
-# Positions below which nothing can be trusted: a fifth of them held out leaves six, as many as a pose has numbers; with
-# fewer, a single wrong record or label moves the beams as much as it misfits, and no residual shows it.
+UNDETERMINED = "the positions leave undetermined"  # start of that finding's text
+# Positions required for a trustworthy result. Without a fifth of eight, six remain, the number of parameters of a pose;
+# with fewer, a single wrong record or label moves the beams without increasing the residuals.
 FEWEST_POSITIONS = 8
 
 
 @dataclass(frozen=True, slots=True)
 class BeamGoals:
-    """When beams count as well known."""
+    """Thresholds of the findings."""
 
-    direction: float = 15 * ARCSEC  # rad, RMS over both axes and all beams: beyond, a warning
+    direction: float = 15 * ARCSEC  # rad, RMS over both axes and all beams: above it a warning
     direction_unusable: float = 200 * ARCSEC  # rad, of one beam: 2.4 mm on a screen 2.5 m away
-    drawing: float = np.deg2rad(2.0)  # rad that a beam may differ from its drawing before labels are doubted
-    wrong_share: float = 0.1  # of the spots left out
-    noise_scale: float = 1.5  # times the told sigmas that the spots may scatter
+    drawing: float = np.deg2rad(2.0)  # rad, deviation of a beam from its drawing, above which its label is doubtful
+    wrong_share: float = 0.1  # of excluded spots
+    noise_scale: float = 1.5  # scatter of the spots over their stated sigmas
 
 
 def beam_findings(
     c: BeamCalibration, drawing: Rig | None, positions: Sequence[str], goals: BeamGoals = BeamGoals()
 ) -> list[Finding]:
-    """All findings; drawing: the nominal rig, None where there is none. positions: a name for each."""
+    """All findings; drawing: the nominal rig, None if there is none. positions: their names."""
     out = [*_determined(c, positions), *_wrong_spots(c, positions, goals), _noise(c, goals)]
     if not c.undetermined:
         out.append(_sigmas(c, goals))
     if drawing is not None:
         out += _against_the_drawing(c, drawing, goals)
-    out += [_one_line(pair) for pair in c.one_line]
+    out += [_collinearity(pair) for pair in c.one_line]
     return out
 
 
 def direction_sigmas(c: BeamCalibration) -> Array:
-    """Of each beam (k,), rad: RMS of the two axes across it."""
+    """Sigma of each beam's direction (k,), rad: RMS of the two axes across it."""
     return _across(c, 0)
 
 
 def offset_sigmas(c: BeamCalibration) -> Array:
-    """Of each beam (k,), m: RMS of the two axes across it, at the point nearest to the body's origin."""
+    """Sigma of each beam's offset (k,), m: RMS of the two axes across it, at the point nearest to the body's origin."""
     return _across(c, 2)
 
 
@@ -71,8 +71,8 @@ def _determined(c: BeamCalibration, positions: Sequence[str]) -> list[Finding]:
         out.append(
             Finding(
                 Level.WARN,
-                f"{len(c.dropped)} positions left out: {names}{' …' if len(c.dropped) > _WORST_NAMED else ''}",
-                "too few of their spots were seen to find the vehicle's pose, which no record gives",
+                f"{len(c.dropped)} positions excluded: {names}{' …' if len(c.dropped) > _WORST_NAMED else ''}",
+                "too few of their spots were detected to determine the vehicle's pose, which is not recorded either",
                 "keep spots of both screens in view",
             )
         )
@@ -81,7 +81,7 @@ def _determined(c: BeamCalibration, positions: Sequence[str]) -> list[Finding]:
             Finding(
                 Level.FAIL,
                 f"only {count} position{'' if count == 1 else 's'}, expected {FEWEST_POSITIONS} or more",
-                "so few cannot show a wrong record or label: it would move the beams unseen",
+                "with so few, a wrong record or label cannot be detected and biases the beams",
                 "record 20 positions or more, turned about all axes",
             )
         )
@@ -91,7 +91,7 @@ def _determined(c: BeamCalibration, positions: Sequence[str]) -> list[Finding]:
             Finding(
                 Level.FAIL,
                 f"{UNDETERMINED}: {'; '.join(c.undetermined)} ({c.motion})",
-                "along these motions no spot moves: what is written of them would be the start value",
+                "along these motions no spot moves: their values would be those of the start",
                 c.motion.remedy() + (", or give world_from_stand with its sigmas" if known else ""),
             )
         )
@@ -103,12 +103,12 @@ def _determined(c: BeamCalibration, positions: Sequence[str]) -> list[Finding]:
         out.append(
             Finding(
                 Level.WARN,
-                f"no position of the stand is known: {c.frame_free} numbers stay undetermined, the place (3) and the"
-                " attitude (3) of the body frame; the body frame was laid so that all beams together are nearest to"
-                " the drawing",
-                "angles between beams and the shape of the rig are measured; the attitude of the vehicle is one"
-                " against this chosen frame, not against its own axes",
-                "for the vehicle's own axes record some positions at known attitudes",
+                f"no position of the stand is known: {c.frame_free} parameters remain undetermined, the position (3)"
+                " and the attitude (3) of the body frame; the body frame is the one in which all beams together are"
+                " nearest to the drawing",
+                "angles between beams and the shape of the rig are measured; attitudes of the vehicle refer to this"
+                " body frame, not to the vehicle's own axes",
+                "record some positions at known attitudes to determine the vehicle's own axes",
             )
         )
     return out
@@ -117,7 +117,7 @@ def _determined(c: BeamCalibration, positions: Sequence[str]) -> list[Finding]:
 def _wrong_spots(c: BeamCalibration, positions: Sequence[str], goals: BeamGoals) -> list[Finding]:
     wrong = np.flatnonzero(~c.fit.kept)
     if not len(wrong):
-        return [Finding(Level.PASS, f"all {len(c.spots)} spots agree with each other")]
+        return [Finding(Level.PASS, f"all {len(c.spots)} spots are consistent")]
     views = c.rig.views()
     used = [p for i, p in enumerate(positions) if i not in set(c.dropped)]
     size = np.linalg.norm(c.fit.residuals_px, axis=1)
@@ -132,20 +132,20 @@ def _wrong_spots(c: BeamCalibration, positions: Sequence[str], goals: BeamGoals)
     out = [
         Finding(
             Level.WARN if share > goals.wrong_share else Level.PASS,
-            f"{len(wrong)} of {len(c.spots)} spots left out as wrong ({named})",
-            "reflections, wrong labels or blinded spots; they take no part in the result" if share else "",
-            "look at these pictures; mend the labels or the light" if share > goals.wrong_share else "",
+            f"{len(wrong)} of {len(c.spots)} spots excluded as outliers ({named})",
+            "reflections, wrong labels or saturated spots; they do not affect the result" if share else "",
+            "inspect these pictures; correct the labels or the light" if share > goals.wrong_share else "",
         )
     ]
     cameras = list(c.rig.cameras)
     camera_of = np.array([cameras.index(views[v][0]) for v in c.spots.view])
-    for i, j in exchanged_pairs(c.spots, c.fit.kept, c.fit.residuals_px, camera_of)[:_WORST_NAMED]:
+    for i, j in swapped_pairs(c.spots, c.fit.kept, c.fit.residuals_px, camera_of)[:_WORST_NAMED]:
         (camera, first), (_, second) = views[c.spots.view[i]], views[c.spots.view[j]]
         out.append(
             Finding(
                 Level.WARN,
                 f"position {used[c.spots.position[i]]}: spots {first} and {second} of camera {camera!r} are exchanged",
-                "each lies where the other should be; both were left out",
+                "each is at the place of the other; both were excluded",
                 "exchange the two names at this position in the table of spots",
             )
         )
@@ -157,8 +157,8 @@ def _wrong_spots(c: BeamCalibration, positions: Sequence[str], goals: BeamGoals)
         out.append(
             Finding(
                 Level.WARN,
-                f"most spots of {'position' if len(bad) == 1 else 'positions'} {names} were left out",
-                "when all spots of a position are off together, its recorded pose or its labels are wrong",
+                f"most spots of {'position' if len(bad) == 1 else 'positions'} {names} were excluded",
+                "if all spots of a position have large residuals, its recorded pose or its labels are wrong",
                 "check the stand's record there",
             )
         )
@@ -171,15 +171,16 @@ def _noise(c: BeamCalibration, goals: BeamGoals) -> Finding:
     if c.fit.scale > goals.noise_scale:
         return Finding(
             Level.WARN,
-            f"the spots scatter {c.fit.scale:.2g} times as much as their sigmas say (RMS {rms:.3g} px per axis); all"
-            " sigmas were widened by that",
-            "something is not in the model: screens that are not flat, cameras that moved, a stand that is less exact"
-            " than told, beams that wander while they warm up",
-            "see the residuals by screen and position below; calibrate cameras and screens again, warm the lasers up",
+            f"the spots scatter by {c.fit.scale:.2g} times their sigmas (RMS {rms:.3g} px per axis); all sigmas were"
+            " multiplied by this factor",
+            "an error that the model does not contain: screens that are not flat, cameras that moved, a stand less"
+            " accurate than stated, beams that drift while they warm up",
+            "see the residuals by screen and position below; calibrate cameras and screens again, warm up the lasers",
         )
-    words = f"the spots fit to {rms:.3g} px RMS per axis, as their sigmas say"
+    words = f"residuals of the spots: {rms:.3g} px RMS per axis, consistent with their sigmas"
     if c.fit.scale > 1:
-        words = f"the spots fit to {rms:.3g} px RMS per axis, {c.fit.scale:.2f} times their sigmas, which were widened"
+        words = f"residuals of the spots: {rms:.3g} px RMS per axis, {c.fit.scale:.2f} times their sigmas, which were"
+        words += " increased accordingly"
     return Finding(Level.PASS, words)
 
 
@@ -192,22 +193,22 @@ def _sigmas(c: BeamCalibration, goals: BeamGoals) -> Finding:
         f" {each[worst] / ARCSEC:.3g} arcsec; offsets to {1e3 * float(np.sqrt(np.mean(offset_sigmas(c) ** 2))):.2g} mm"
     )
     if c.world_from_stand is None:
-        words += ", both against the body frame that was laid by the drawing"
-    if rms <= 1.003 * goals.direction:  # as far as the figures in words go
+        words += ", both relative to the body frame chosen by the drawing"
+    if rms <= 1.003 * goals.direction:  # equal at the displayed precision
         return Finding(Level.PASS, words)
     between = np.sqrt(np.mean([a.sigma**2 for a in c.angles])) if c.angles else rms
     times = int(np.ceil((rms / goals.direction) ** 2))
-    why = "direction and offset errors that go together cancel near the distances of the calibration, no farther"
+    why = "correlated direction and offset errors cancel at the distances of the calibration, but not farther away"
     remedy = (
-        "a beam's direction is told by spots at different distances along it: shift the vehicle farther along its"
+        "a beam's direction is determined by spots at different distances along it: shift the vehicle farther along its"
         f" beams, or record {times} times as many positions"
     )
     if c.world_from_stand is not None and between < 0.5 * rms:
         why = (
-            f"the angles between beams are known to {between / ARCSEC:.3g} arcsec: it is the whole target against the"
-            f" stand that is not; the stand's positions: {c.motion}"
+            f"the angles between beams are known to {between / ARCSEC:.3g} arcsec: the orientation of the whole target"
+            f" relative to the stand is uncertain; the stand's positions: {c.motion}"
         )
-        remedy = "measure world_from_stand better"
+        remedy = "measure world_from_stand more accurately"
         remedy = f"{c.motion.remedy()}, or {remedy}" if c.motion.flat else remedy
     return Finding(
         Level.FAIL if each[worst] > goals.direction_unusable else Level.WARN,
@@ -222,48 +223,48 @@ def _against_the_drawing(c: BeamCalibration, drawing: Rig, goals: BeamGoals) -> 
     names = list(c.rig.beams)
     found = np.array([c.rig.beams[n].direction for n in names])
     drawn = np.array([drawing.beams[n].direction for n in names])
-    away = np.arccos(np.clip(found @ drawn.T, -1, 1))
+    angles = np.arccos(np.clip(found @ drawn.T, -1, 1))
     for i, n in enumerate(names):
-        nearest = int(np.argmin(away[i]))
-        if nearest != i and away[i, nearest] < 0.5 * away[i, i] and away[i, i] > goals.drawing:
+        nearest = int(np.argmin(angles[i]))
+        if nearest != i and angles[i, nearest] < 0.5 * angles[i, i] and angles[i, i] > goals.drawing:
             out.append(
                 Finding(
                     Level.WARN,
-                    f"beam {n} lies {np.rad2deg(away[i, i]):.1f} deg from its drawing and"
-                    f" {np.rad2deg(away[i, nearest]):.1f} deg from that of beam {names[nearest]}",
-                    "labels that are swapped everywhere agree with each other and are found only so",
-                    f"check which laser is {n} and which {names[nearest]}: cover one",
+                    f"beam {n} is {np.rad2deg(angles[i, i]):.1f} deg from its drawing and"
+                    f" {np.rad2deg(angles[i, nearest]):.1f} deg from that of beam {names[nearest]}",
+                    "labels that are exchanged in all pictures are consistent; only the drawing reveals them",
+                    f"check which laser is {n} and which is {names[nearest]}: cover one",
                 )
             )
-        elif away[i, i] > goals.drawing:
+        elif angles[i, i] > goals.drawing:
             out.append(
                 Finding(
                     Level.WARN,
-                    f"beam {n} lies {np.rad2deg(away[i, i]):.1f} deg from its drawing",
-                    "mounting errors are smaller; a wrong label, or a body frame other than the drawing's, looks so",
-                    "check labels and the carriage's axes; if both are right, update the drawing",
+                    f"beam {n} is {np.rad2deg(angles[i, i]):.1f} deg from its drawing",
+                    "mounting errors are smaller; the cause is a wrong label, or a body frame other than the drawing's",
+                    "check the labels and the carriage's axes; if both are right, update the drawing",
                 )
             )
     if not out:
-        largest = float(np.max(np.diagonal(away)))
-        out.append(Finding(Level.PASS, f"all beams lie within {np.rad2deg(largest):.2g} deg of their drawing"))
+        largest = float(np.max(np.diagonal(angles)))
+        out.append(Finding(Level.PASS, f"all beams are within {np.rad2deg(largest):.2g} deg of their drawing"))
     return out
 
 
-def _one_line(pair: OneLine) -> Finding:
+def _collinearity(pair: CollinearityTest) -> Finding:
     turn, turn_sigma = pair.turn / ARCSEC, pair.turn_sigma / ARCSEC
     words = (
         f"{pair.first} and {pair.second} are {turn:.0f} ± {turn_sigma:.0f} arcsec and {1e3 * pair.gap:.2f} ±"
         f" {1e3 * pair.gap_sigma:.2f} mm apart"
     )
     p = f"p = {pair.p:.2g}" if pair.p > 1e-6 else "p < 1e-6"
-    if pair.p >= _P_TWO_LINES:
-        return Finding(Level.PASS, f"{words}: one line fits both ({p})")
+    if pair.p >= _P_NOT_COLLINEAR:
+        return Finding(Level.PASS, f"{words}: consistent with one line ({p})")
     if " end " in pair.first:
         return Finding(
             Level.WARN,
-            f"{words}: the two ends are not one line ({p})",
-            "as one beam, each end is wrong by half of that",
+            f"{words}: the two ends are not collinear ({p})",
+            "described as one beam, each end is wrong by half of that",
             "describe them in target.beams as two beams with one spot each, and calibrate again",
         )
     return Finding(Level.PASS, f"{words}: two beams, as described ({p})")

@@ -1,4 +1,4 @@
-"""Where an adjustment of beams may start: lines through spots, poses of a nominal rig, the stand's place."""
+"""Start values of a beam adjustment: lines through spots, poses from a nominal rig, and the stand's pose."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from geometry.pose_solver.closed_form import pose_from_lines
 from geometry.pose_solver.gauss_newton import PoseFit, fit_pose
 from geometry.rig import Beam, Rig
 
-_MOST_FOR_PAIRS = 60  # spots of a beam whose pairs are all tried
-_NEAR_M = 0.02  # m from the line, at least: spots that take part in it
-# Turns of the vehicle to try where nothing is known: the 24 of a cube leave no attitude farther than 63 deg.
-_CUBE = Rotation.create_group("O")
+_MOST_FOR_PAIRS = 60  # spots of a beam of which all pairs are tried
+_NEAR_M = 0.02  # m from the line: spots at least this near are inliers
+# Start attitudes for an unknown vehicle: the 24 rotations of a cube are within 63 deg of every attitude.
+_START_ATTITUDES = Rotation.create_group("O")
 
 
 def world_points(rig: Rig, spots: SpotPixels) -> Array:
-    """Where on their screens the spots lie, (N, 3), m, in world, by the calibrated cameras; flat screens."""
+    """Positions (N, 3), m, of the spots on their screens, in world, from the calibrated cameras; flat screens."""
     out = np.full((len(spots), 3), np.nan)
     for v, (camera, spot) in enumerate(rig.views()):
         rows = spots.view == v
@@ -35,9 +35,9 @@ def world_points(rig: Rig, spots: SpotPixels) -> Array:
 
 
 def beams_through_spots(rig: Rig, spots: SpotPixels, world_from_body: Pose) -> dict[str, Beam]:
-    """Each beam as the line through its spots, brought into the body; beams whose spots give none are left out.
+    """Each beam as the line through its spots in the body frame; beams without such a line are missing.
 
-    world_from_body: (P,) of the stand's positions. A line needs two spots at two places along it: at positions of
+    world_from_body: (P,) of the stand's positions. A line requires spots at two places along it: at positions of
     different distance from the screen, or at both ends.
     """
     points = world_from_body[spots.position].inverse().apply(world_points(rig, spots))
@@ -49,17 +49,17 @@ def beams_through_spots(rig: Rig, spots: SpotPixels, world_from_body: Pose) -> d
         if line is not None:
             point, direction = line
             foot = point - (point @ direction) * direction
-            # Spots of the end "+" lie ahead of the point, the others behind.
+            # Spots of the end "+" are ahead of the point, the others behind it.
             ahead = np.sum(model.sign[spots.view[rows]] * ((points[rows] - foot) @ direction))
             out[name] = Beam(name, direction if ahead >= 0 else -direction, foot)
     return out
 
 
 def line_through(points: Array) -> tuple[Array, Array] | None:
-    """A point and the direction of the line near most of the points (m, 3); None where they lie in one place.
+    """A point and the direction of the line near most of the points (m, 3); None if the points coincide.
 
-    The pair of points with the least median distance of the others gives the line; those near it refine it. Up to half
-    of the points may be wrong.
+    The line is that of the pair with the least median distance of the other points, refined by its inliers. Up to half
+    of the points may be outliers.
     """
     few = points[:: max(1, -(-len(points) // _MOST_FOR_PAIRS))]
     if len(few) < 2:
@@ -70,8 +70,8 @@ def line_through(points: Array) -> tuple[Array, Array] | None:
     if not long.any():
         return None
     i, direction = i[long], normalised(direction[long])
-    away = np.linalg.norm(np.cross(few[None] - few[i][:, None], direction[:, None]), axis=2)
-    middle = np.median(away, axis=1)
+    distances = np.linalg.norm(np.cross(few[None] - few[i][:, None], direction[:, None]), axis=2)
+    middle = np.median(distances, axis=1)
     best = int(np.argmin(middle))
     far = np.linalg.norm(np.cross(points - few[i[best]], direction[best]), axis=1)
     near = points[far <= max(3 * float(middle[best]), _NEAR_M)]
@@ -82,8 +82,7 @@ def line_through(points: Array) -> tuple[Array, Array] | None:
 def body_poses(rig: Rig, spots: SpotPixels, count: int, world_from_body: Pose | None = None) -> list[PoseFit | None]:
     """world_from_body at each of the stand's `count` positions, fitted with the rig's beams; None where it fails.
 
-    world_from_body: starts (P,), where something is known. Spots are taken as they come; wrong ones spoil their
-    position.
+    world_from_body: start values (P,), if known. Spots are not checked for outliers; a wrong one affects its position.
     """
     model = SpotModel.of(rig)
     points = world_points(rig, spots)
@@ -93,11 +92,11 @@ def body_poses(rig: Rig, spots: SpotPixels, count: int, world_from_body: Pose | 
         rows = np.flatnonzero(spots.position == k)
         here = spots.pick(rows)
         starts = [] if world_from_body is None else [world_from_body[k]]
-        starts += [p for p in (_of_whole_beams(rig, here, points[rows]), last) if p is not None]
+        starts += [p for p in (_pose_from_whole_beams(rig, here, points[rows]), last) if p is not None]
         fit = _best(model, here, starts)
         if fit is None or not fit.observable or (last is None and fit.dof > 0 and fit.chi2 > 1e3 * fit.dof):
             middle = np.mean([s.world_from_screen.translation for s in rig.screens.values()], axis=0)
-            turned = _best(model, here, [Pose(R, middle) for R in _CUBE.as_matrix()])
+            turned = _best(model, here, [Pose(R, middle) for R in _START_ATTITUDES.as_matrix()])
             if turned is not None and (fit is None or not fit.observable or turned.chi2 < fit.chi2):
                 fit = turned
         good = fit is not None and fit.observable
@@ -108,14 +107,14 @@ def body_poses(rig: Rig, spots: SpotPixels, count: int, world_from_body: Pose | 
 
 
 def stand_of(world_from_body: Pose, stand_from_body: Pose) -> Pose:
-    """world_from_stand that most of the positions (m,) agree on: the one nearest to the others by the median."""
+    """The world_from_stand of the position (m,) with the least median difference from the others."""
     each = world_from_body @ stand_from_body.inverse()
     gaps = np.array([np.linalg.norm(each.minus(each[i]), axis=-1) for i in range(len(each.translation))])
     return each[int(np.argmin(np.median(gaps, axis=1)))]
 
 
 def _best(model: SpotModel, spots: SpotPixels, starts: list[Pose]) -> PoseFit | None:
-    """The fit of least misfit; two of the same misfit are told apart by nothing here."""
+    """The fit with the least chi-square."""
     if len(spots) < 3:
         return None
     fits = [_fit(model, spots.view, spots, s) for s in starts]
@@ -127,8 +126,8 @@ def _fit(model: SpotModel, rows: Ints, spots: SpotPixels, start: Pose) -> PoseFi
     return fit_pose(model, rows, spots.pixels, spots.covariance, start)
 
 
-def _of_whole_beams(rig: Rig, spots: SpotPixels, points: Array) -> Pose | None:
-    """The pose from the beams both of whose ends are seen; None for fewer than two. points (N, 3) in world."""
+def _pose_from_whole_beams(rig: Rig, spots: SpotPixels, points: Array) -> Pose | None:
+    """The pose from the beams with both spots detected; None for fewer than two. points (N, 3) in world."""
     views = rig.views()
     ends: dict[str, dict[int, Array]] = {}
     for v, p in zip(spots.view, points, strict=True):

@@ -1,7 +1,7 @@
-"""Each laser's own direction and offset in the vehicle, from spots at known positions of a stand, or from none.
+"""Calibration of the lasers' directions and offsets in the vehicle, from spots at known or unknown stand positions.
 
-The body frame is the stand's carriage: `stand_from_body` as it was recorded. Where no position is known, only the shape
-of the rig of beams can be found, and the body frame is laid as near as possible to the nominal one.
+The body frame is that of the stand's carriage: `stand_from_body` as recorded. If no position is known, only the shape
+of the set of beams can be determined, and the body frame is chosen so that the beams are nearest to the nominal ones.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import block_diag
 
-from calibration.beams.beam_figures import Between, OneLine, angles_between, opposed_pairs
+from calibration.beams.beam_figures import BeamAngle, CollinearityTest, angles_between, opposed_pairs
 from calibration.beams.beam_start import beams_through_spots, body_poses, stand_of
 from calibration.beams.body_gauge import BodyGauge
 from calibration.beams.excitation import StandMotion, in_words, without_frame
@@ -29,38 +29,38 @@ from geometry.pose import Pose
 from geometry.rig import Beam, Rig, Spot
 from geometry.uncertainty.rig_parameters import RigCovariance
 
-_FOR_THE_STAND = 15  # positions from which its place is first guessed
+_FOR_THE_STAND = 15  # positions used for the start value of its pose
 
 
 @dataclass(frozen=True, slots=True)
 class StandModel:
-    """What is known of the stand that carried the vehicle."""
+    """Recorded poses of the stand that carried the vehicle, with their uncertainty."""
 
     stand_from_body: Pose  # (P,) as recorded: the carriage, which is the body frame
     pose_sigmas: Array  # (6,) or (P, 6) of each record: m along the stand's axes, rad about the body's; 0: exact
-    world_from_stand: Pose | None  # None: found from the nominal beams
-    stand_covariance: Array | None  # (6, 6) of the error of world_from_stand; None: solved for, nothing known
+    world_from_stand: Pose | None  # None: estimated from the nominal beams
+    stand_covariance: Array | None  # (6, 6) of the error of world_from_stand; None: estimated without a prior
 
 
 @dataclass(frozen=True, slots=True)
 class BeamCalibration:
-    """Beams as found, with all that their errors depend on."""
+    """Calibrated beams, with their covariance and diagnostics."""
 
-    rig: Rig  # with the beams found, and cameras and screens as the spots moved them within their priors
-    covariance: RigCovariance  # joint: beams, and cameras and screens where they came with errors
+    rig: Rig  # with the estimated beams, and cameras and screens as adjusted within their priors
+    covariance: RigCovariance  # joint: beams, and cameras and screens if these have errors
     lines: Lines  # the beams, points nearest to the body's origin
     lines_covariance: Array  # (4 k, 4 k) of their errors
-    angles: Sequence[Between]
-    one_line: Sequence[OneLine]  # opposed beams, and the two ends of a beam that has both
+    angles: Sequence[BeamAngle]
+    one_line: Sequence[CollinearityTest]  # opposed beams, and the two ends of a beam that has both
     world_from_stand: Pose | None  # None where no position is known
     stand_covariance: Array | None  # (6, 6)
-    world_from_body: Pose  # (P,) at the positions, as found
-    spots: SpotPixels  # the ones given
+    world_from_body: Pose  # (P,) at the positions, estimated
+    spots: SpotPixels  # the input
     fit: SpotFit
     motion: StandMotion
-    undetermined: Sequence[str]  # empty, or what no spot tells, in words; sigmas are then those of the rest
-    frame_free: int  # undetermined directions that are motions of the body frame: 6 where no position is known
-    dropped: Sequence[int]  # positions with too few spots to find their pose
+    undetermined: Sequence[str]  # undetermined motions in words, or empty; sigmas are then of the determined part
+    frame_free: int  # number of undetermined motions of the body frame: 6 if no position is known
+    dropped: Sequence[int]  # positions with too few spots to determine their pose
 
 
 def calibrate_beams(
@@ -68,9 +68,11 @@ def calibrate_beams(
 ) -> BeamCalibration:
     """Beams from spots at recorded positions of a stand.
 
-    rig: cameras and screens as calibrated, beams as drawn (nominal; False: their numbers mean nothing and the start
-    comes from the spots alone). knowledge: joint errors of cameras and screens; None: taken as exact. Raises
-    AdjustmentError where the spots do not agree, or no start is found.
+    rig: cameras and screens as calibrated, beams as drawn (nominal; if False, their values are not used and the start
+    is from the spots alone). knowledge: joint errors of cameras and screens; None: exact.
+
+    Raises:
+        AdjustmentError: the spots are inconsistent, or no start is found.
     """
     start = _start(rig, spots, stand, nominal)
     values = {
@@ -96,18 +98,21 @@ def calibrate_beams(
 def self_calibrate(
     rig: Rig, spots: SpotPixels, positions: int, knowledge: RigCovariance | None = None
 ) -> BeamCalibration:
-    """The shape of the rig of beams from spots at positions of which nothing is known.
+    """The shape of the set of beams from spots at unknown positions.
 
-    rig: its beams are the start, and the body frame is laid so that the beams found are, together, as near to them as
-    can be (see BodyGauge; points are compared where either is nearest to the origin): a choice, no measurement.
-    Positions whose pose the spots do not determine are left out. Raises AdjustmentError where fewer than two remain.
+    rig: its beams are the start. The body frame is chosen so that the estimated beams are, together, nearest to these
+    (see BodyGauge; points are compared at the points nearest to the origin): a definition, not a measurement. Positions
+    whose pose the spots do not determine are excluded.
+
+    Raises:
+        AdjustmentError: fewer than two positions remain.
     """
     fits = body_poses(rig, spots, positions)
     usable = [k for k, f in enumerate(fits) if f is not None]
     if len(usable) < 2:
         raise AdjustmentError(
-            f"the vehicle's pose can be found at {len(usable)} of {positions} positions, two or more are needed: each"
-            " needs spots of two or more beams, and nominal beams to start from"
+            f"the vehicle's pose can be determined at {len(usable)} of {positions} positions, two or more are needed:"
+            " each requires spots of two or more beams, and nominal beams to start from"
         )
     place = np.full(positions, -1, dtype=np.int64)
     place[usable] = np.arange(len(usable))
@@ -123,12 +128,12 @@ def self_calibrate(
 
 
 def _start(rig: Rig, spots: SpotPixels, stand: StandModel, nominal: bool) -> tuple[Rig, Pose]:
-    """The rig with beams to start from, and world_from_stand."""
+    """The rig with start values of the beams, and world_from_stand."""
     world_from_stand = stand.world_from_stand
     if world_from_stand is None:
         if not nominal:
             raise AdjustmentError(
-                "neither the stand's place in the world nor nominal beams are known: give one of the two to start from"
+                "neither world_from_stand nor nominal beams are known: give one of the two as a start value"
             )
         count = len(stand.stand_from_body.translation)
         few = np.unique(np.linspace(0, count - 1, min(count, _FOR_THE_STAND)).round().astype(np.int64))
@@ -139,8 +144,8 @@ def _start(rig: Rig, spots: SpotPixels, stand: StandModel, nominal: bool) -> tup
         usable = [int(few[i]) for i, f in enumerate(fits) if f is not None]
         if not usable:
             raise AdjustmentError(
-                "the stand's place cannot be found: at no position do the spots fit the nominal beams; check the spots'"
-                " labels, or give world_from_stand"
+                "the stand's pose cannot be determined: at no position do the spots fit the nominal beams; check the"
+                " labels of the spots, or give world_from_stand"
             )
         bodies = Poses.of([f.world_from_body for f in fits if f is not None]).pose
         world_from_stand = stand_of(bodies, stand.stand_from_body[np.array(usable)])
@@ -149,8 +154,8 @@ def _start(rig: Rig, spots: SpotPixels, stand: StandModel, nominal: bool) -> tup
         without = [b for b in rig.beams if b not in found]
         if without:
             raise AdjustmentError(
-                f"beam {without[0]}: its spots lie in one place of it, so that they give no direction to start from;"
-                " add nominal beams, or positions at which the screen cuts it elsewhere"
+                f"beam {without[0]}: its spots are all at the same place along it and do not determine its direction;"
+                " add nominal beams, or positions with another distance to the screen"
             )
         return replace(rig, beams={b: found[b] for b in rig.beams}), world_from_stand
     from_spots = replace(rig, beams={**rig.beams, **found})
@@ -163,14 +168,14 @@ def _start(rig: Rig, spots: SpotPixels, stand: StandModel, nominal: bool) -> tup
 
 
 def _cost_per_beam(rig: Rig, spots: SpotPixels, at: dict[str, Poses]) -> Array:
-    """How badly the spots fit, (beams,), wrong ones fading; spots that cannot be predicted count most."""
+    """Robust cost of the spots per beam, (beams,); spots that cannot be predicted have a very large residual."""
     r = SpotTerm(rig, spots).linearise({**stacks_of(rig), **at}).residuals
     s = np.nan_to_num(np.sum(r**2, axis=1), nan=1e12)
     return np.bincount(SpotModel.of(rig).beam_of[spots.view], Cauchy().cost(s), len(rig.beams)).astype(float)
 
 
 def _known(rig: Rig, knowledge: RigCovariance | None) -> tuple[list[Term], dict[str, bool | Bools]]:
-    """What is known of cameras and screens, as terms, and what of them is free."""
+    """Priors of cameras and screens, and their free parameters."""
     if knowledge is None:
         return [], {}
     of_the_lab = np.array([not n.startswith("beams.") for n in knowledge.names], dtype=bool)
@@ -188,30 +193,30 @@ def _finished(
     stand: StandModel | None,
     dropped: Sequence[int],
 ) -> BeamCalibration:
-    """Adjust, and say how well."""
+    """Adjust, and compute covariance and diagnostics."""
     fit = fit_spots(rig, spots, values, others, free)
     kept = spots.pick(np.flatnonzero(fit.kept))
     kept = replace(kept, covariance=kept.covariance * fit.scale**2)
     values = fit.adjusted.values
     lines, slide = at_feet(lines_in(values))
     beams: list[At] = [(BEAMS, i) for i in range(len(lines))]
-    asked = beams + ([(STAND, 0)] if STAND in free else [])
+    parameters = beams + ([(STAND, 0)] if STAND in free else [])
     gauge = [t for t in others if isinstance(t, BodyGauge)]
     loose = fit.adjusted
     if gauge:
         loose = solve(values, [SpotTerm(rig, kept), *(t for t in others if t not in gauge)], free)
-    directions = loose.undetermined(asked)
+    directions = loose.undetermined(parameters)
     undetermined: list[str] = []
     if len(directions) > (6 if gauge else 0):
         world_from_stand = pose_of(values, STAND)[0] if STAND in free else None
-        told = without_frame(directions, lines_in(values)) if gauge else directions
-        undetermined = in_words(told, list(rig.beams), lines_in(values), world_from_stand)
-        at, joint = asked, _of_the_rest(loose, asked)
+        motions = without_frame(directions, lines_in(values)) if gauge else directions
+        undetermined = in_words(motions, list(rig.beams), lines_in(values), world_from_stand)
+        at, joint = parameters, _determined_covariance(loose, parameters)
     else:
-        at = asked + [(s, i) for s in _of_the_lab(free) for i in range(len(values[s]))]
+        at = parameters + [(s, i) for s in _lab_blocks(free) for i in range(len(values[s]))]
         joint = fit.adjusted.covariance(at)
     for t in gauge:
-        slide = slide @ t.held_exactly(lines_in(values))
+        slide = slide @ t.projection(lines_in(values))
     K = block_diag(slide, np.eye(len(joint) - len(slide)))
     joint = K @ joint @ K.T
     values = {**values, BEAMS: lines}
@@ -220,7 +225,7 @@ def _finished(
     matrix = T @ joint[np.ix_(in_rig, in_rig)] @ T.T
     of_lines = joint[: len(slide), : len(slide)]
     poses = pose_of(values, STAND)[0] @ pose_of(values, POSES)
-    one_line = opposed_pairs(list(rig.beams), lines, of_lines) + _ends(rig, kept, values, others, free)
+    one_line = opposed_pairs(list(rig.beams), lines, of_lines) + _end_collinearity(rig, kept, values, others, free)
     named = np.diagonal(matrix) > 0
     return BeamCalibration(
         rig=rig_of(rig, values),
@@ -241,34 +246,34 @@ def _finished(
     )
 
 
-def _of_the_lab(free: dict[str, bool | Bools]) -> list[str]:
+def _lab_blocks(free: dict[str, bool | Bools]) -> list[str]:
     return [s for s in free if s not in (BEAMS, STAND, POSES)]
 
 
 def at_feet(lines: Lines) -> tuple[Lines, Array]:
-    """The lines with their points nearest to the origin, and what that does to their errors, (4 k, 4 k)."""
+    """The lines with their points next to the origin, and the Jacobian (4 k, 4 k) of their errors by the given ones."""
     along = -np.sum(lines.points * lines.directions, axis=1)
     blocks = []
     for s in along:
         block = np.eye(4)
-        block[2:, :2] = s * np.eye(2)  # a point farther along moves with the direction
+        block[2:, :2] = s * np.eye(2)  # a point at a distance moves with the direction
         blocks.append(block)
     return Lines(lines.points + along[:, None] * lines.directions, lines.directions), block_diag(*blocks)
 
 
-def _of_the_rest(adjusted: Adjusted, asked: Sequence[At]) -> Array:
-    """Covariance of the determined part of some unknowns: 0 along the directions that are not."""
-    S = adjusted.reduced_normal(asked)
+def _determined_covariance(adjusted: Adjusted, parameters: Sequence[At]) -> Array:
+    """Covariance of the determined part of some parameters: 0 along the undetermined directions."""
+    S = adjusted.reduced_normal(parameters)
     scale = 1.0 / np.sqrt(np.maximum(np.diagonal(S), 1e-300))
     return np.linalg.pinv(S * np.outer(scale, scale), rcond=1e-8, hermitian=True) * np.outer(scale, scale)
 
 
-def _ends(
+def _end_collinearity(
     rig: Rig, spots: SpotPixels, values: Values, others: list[Term], free: dict[str, bool | Bools]
-) -> list[OneLine]:
-    """Whether each beam with spots at both ends is one line: adjusted again with every end as a beam of its own.
+) -> list[CollinearityTest]:
+    """Collinearity tests of the beams with spots at both ends, by an adjustment with every end as a separate beam.
 
-    Empty where there are none, or where the ends alone are not determined.
+    Empty if there are none, or if the ends alone are not determined.
     """
     seen = {rig.views()[v][1] for v in spots.view}
     ends = {(s.beam, s.sign) for n, s in rig.spots.items() if n in seen}
@@ -283,12 +288,14 @@ def _ends(
             name = f"{b} end {'+' if sign > 0 else '-'}" if b in both else b
             beams[name] = Beam(name, sign * lines.directions[i], lines.points[i])
             of_end[b, sign] = name
-    apart = {n: Spot(n, of_end[s.beam, s.sign], 1, s.screen) if s.beam in both else s for n, s in rig.spots.items()}
-    split = replace(rig, beams=beams, spots=apart)
-    its = {**values, BEAMS: stacks_of(split)[BEAMS]}
-    terms = [BodyGauge(at_feet(lines_in(its))[0]) if isinstance(t, BodyGauge) else t for t in others]
+    split_spots = {
+        n: Spot(n, of_end[s.beam, s.sign], 1, s.screen) if s.beam in both else s for n, s in rig.spots.items()
+    }
+    split = replace(rig, beams=beams, spots=split_spots)
+    split_values = {**values, BEAMS: stacks_of(split)[BEAMS]}
+    terms = [BodyGauge(at_feet(lines_in(split_values))[0]) if isinstance(t, BodyGauge) else t for t in others]
     try:
-        found = solve(its, [SpotTerm(split, spots), *terms], free)
+        found = solve(split_values, [SpotTerm(split, spots), *terms], free)
         covariance = found.covariance([(BEAMS, i) for i in range(len(beams))])
     except AdjustmentError:
         return []

@@ -1,4 +1,4 @@
-"""A body frame for beams of which only the shape can be known."""
+"""Definition of the body frame (gauge) for beams of which only the shape can be determined."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from calibration.least_squares.parameter_blocks import Lines
 from calibration.terms.rig_blocks import BEAMS, lines_in
 from geometry.arrays import Array
 
-# m and rad to which the frame is held. It does not compete with the spots, which say nothing of it, so the number is of
-# no account to the values. Much smaller ones make a valley that is bent and so narrow that steps along it end: with
-# 1e-7 one of 200 simulated calibrations did not settle.
-_HELD_TO = 1e-4
+# m and rad: sigma of the gauge constraint. It does not compete with the spots, which do not determine the frame, so
+# that its value does not affect the result. Much smaller values make a curved valley in which steps become too short:
+# with 1e-7 one of 200 simulated calibrations did not converge.
+_GAUGE_SIGMA = 1e-4
 
 
 @dataclass(frozen=True, slots=True)
 class BodyGauge:
-    """Holds the six of the body frame so that the beams stay, together, nearest to where they were drawn.
+    """Inner constraints that fix the six parameters of the body frame: the beams stay nearest to the nominal ones.
 
-    The errors of the lines from the nominal ones (a radian counting like a metre) have no part along a motion of the
-    whole frame: the inner constraints of a free network (Triggs et al. 2000, "Bundle adjustment: a modern synthesis",
-    section 9).
+    The differences between the lines and the nominal ones (a radian weighted like a metre) have no component along a
+    motion of the whole frame: the inner constraints of a free network (Triggs et al. 2000, "Bundle adjustment: a modern
+    synthesis", section 9).
     """
 
     nominal: Lines
@@ -37,34 +37,34 @@ class BodyGauge:
     def linearise(self, values: Values) -> Linearised:
         """One residual of six numbers."""
         lines = lines_in(values)
-        held = self._frame() / _HELD_TO
-        away = lines.minus(self.nominal)
-        J = held @ self._compared(lines)
+        held = self._frame() / _GAUGE_SIGMA
+        difference = lines.minus(self.nominal)
+        J = held @ self._difference_jacobian(lines)
         parts = [Part(BEAMS, np.array([i]), J[None, :, 4 * i : 4 * i + 4]) for i in range(len(lines))]
-        return Linearised((held @ away.ravel())[None], parts)
+        return Linearised((held @ difference.ravel())[None], parts)
 
-    def held_exactly(self, lines: Lines) -> Array:
-        """What errors (4 k) of the lines become, (4 k, 4 k), when the frame is laid by them without any error.
+    def projection(self, lines: Lines) -> Array:
+        """Projection (4 k, 4 k) of errors of the lines onto those with an exactly fixed frame.
 
-        Removes from a covariance what the frame is free within; the part of the shape stays.
+        It removes from a covariance the freedom of the frame and keeps that of the shape.
         """
-        A = self._frame() @ self._compared(lines)
+        A = self._frame() @ self._difference_jacobian(lines)
         N = body_motion(lines)
         return np.eye(len(N)) - N @ np.linalg.solve(A @ N, A)
 
     def _frame(self) -> Array:
-        """(6, 4 k): an orthonormal basis of what motions of the frame do to the nominal lines."""
+        """(6, 4 k): an orthonormal basis of the motions of the frame, as changes of the nominal lines."""
         return np.linalg.qr(body_motion(self.nominal))[0].T
 
-    def _compared(self, lines: Lines) -> Array:
+    def _difference_jacobian(self, lines: Lines) -> Array:
         """d(lines.minus(nominal)) / d(errors of the lines), (4 k, 4 k)."""
-        return block_diag(*(_turned(lines, self.nominal, i) for i in range(len(lines))))
+        return block_diag(*(_line_jacobian(lines, self.nominal, i) for i in range(len(lines))))
 
 
-def _turned(lines: Lines, nominal: Lines, i: int) -> Array:
-    """d(lines.minus(nominal)) / d(error of the line), (4, 4), to first order in how far the two are apart."""
+def _line_jacobian(lines: Lines, nominal: Lines, i: int) -> Array:
+    """d(lines.minus(nominal)) / d(error of the line), (4, 4), to first order in their difference."""
     across = nominal.basis[i].T @ lines.basis[i]
-    # Offsets are compared across from the nominal point, to which the line's own point is slid.
+    # Offsets are compared across the nominal line, at its nominal point.
     slide = (nominal.points[i] - lines.points[i]) @ nominal.directions[i]
     J = np.zeros((4, 4))
     J[:2, :2] = J[2:, 2:] = across

@@ -1,8 +1,8 @@
-"""Recordings that fit nothing: which one usual mistake in the stand's record, or in the spots' labels, explains it.
+"""Diagnosis of inconsistent recordings: a common mistake in the stand's record or in the spots' labels.
 
-The spots of a position give the vehicle's pose by the beams as drawn, without the stand's record. So a changed record
-is judged by whether it moves as these poses do, which is fast; and labels by whether the poses fit their own spots.
-What looks right is then calibrated with: only a calibration that most spots agree with is a diagnosis.
+The spots of a position and the nominal beams give the vehicle's pose without the stand's record. A changed record is
+therefore scored by its agreement with these poses, which is fast; changed labels by the residuals of the poses' own
+spots. The best candidates are then used in a calibration: only if most spots agree with it is the mistake reported.
 """
 
 from __future__ import annotations
@@ -23,29 +23,29 @@ from geometry.pose import Pose
 from geometry.rig import Rig
 from geometry.uncertainty.rig_parameters import RigCovariance
 
-_MOST_POSITIONS = 60  # looked at: more tell no more
+_MOST_POSITIONS = 60  # positions used; more do not improve the diagnosis
 _FOR_LABELS = 12  # positions whose spots are fitted with each exchange of labels
-_FAR_BETTER = 0.3  # times the misfit now, at most, for a change to be tried in earnest
-_AGREE = 0.8  # share of the spots that must agree once the mistake is mended
-_TRIED = 4  # changes tried in earnest, the most likely first
+_FAR_BETTER = 0.3  # misfit of a candidate over the present one, below which it is used in a calibration
+_AGREE = 0.8  # share of spots that must agree after the correction
+_TRIED = 4  # candidates used in a calibration
 _FEWEST = 6  # positions that a shifted record must share with the spots
 
 
 @dataclass(frozen=True, slots=True)
 class SuspectPose:
-    """A mistake that, once mended, lets the spots agree."""
+    """A mistake whose correction makes the spots consistent."""
 
-    in_labels: bool  # or else in the stand's record
-    words: str  # what was done so that they fit
+    in_labels: bool  # otherwise in the stand's record
+    words: str  # the correction
     remedy: str
 
 
 def suspect(
     rig: Rig, spots: SpotPixels, stand: StandModel, knowledge: RigCovariance | None = None
 ) -> SuspectPose | None:
-    """The mistake that explains why the spots do not agree; None where none of the usual ones does.
+    """The mistake that explains inconsistent spots; None if none of the common ones does.
 
-    Arguments as of calibrate_beams, which did not find enough spots that agree. rig: beams as drawn, which are needed.
+    Arguments as of calibrate_beams, which found too few consistent spots. rig: beams as drawn, which are required.
     """
     likely = [*_of_records(rig, spots, stand), *_of_labels(rig, spots, stand)]
     likely.sort(key=lambda change: change.misfit)
@@ -55,15 +55,15 @@ def suspect(
 
 
 @dataclass(frozen=True, slots=True)
-class _Change:
+class _Candidate:
     of: SuspectPose
-    misfit: float  # against the one as it is
+    misfit: float  # relative to the present one
     spots: SpotPixels
     stand: StandModel
 
 
-def _agreeing(rig: Rig, change: _Change, knowledge: RigCovariance | None) -> float:
-    """Share of the spots that agree after a change; 0 where nothing is found."""
+def _agreeing(rig: Rig, change: _Candidate, knowledge: RigCovariance | None) -> float:
+    """Share of the spots that agree after a change; 0 if the calibration fails."""
     try:
         return float(np.mean(calibrate_beams(rig, change.spots, change.stand, knowledge).fit.kept))
     except AdjustmentError:
@@ -73,36 +73,36 @@ def _agreeing(rig: Rig, change: _Change, knowledge: RigCovariance | None) -> flo
 # The stand's record -----------------------------------------------------------------------------------------------
 
 
-def _of_records(rig: Rig, spots: SpotPixels, stand: StandModel) -> list[_Change]:
+def _of_records(rig: Rig, spots: SpotPixels, stand: StandModel) -> list[_Candidate]:
     count = len(stand.stand_from_body.translation)
-    looked = np.arange(min(count, _MOST_POSITIONS))
-    fits = body_poses(rig, spots.pick(spots.position < len(looked)), len(looked))
-    usable = np.array([k for k in looked if fits[k] is not None], dtype=np.int64)
+    tried = np.arange(min(count, _MOST_POSITIONS))
+    fits = body_poses(rig, spots.pick(spots.position < len(tried)), len(tried))
+    usable = np.array([k for k in tried if fits[k] is not None], dtype=np.int64)
     if len(usable) < _FEWEST:
         return []
     bodies = Poses.of([f.world_from_body for f in fits if f is not None]).pose
-    now = _apart(bodies, stand.stand_from_body[usable])
+    present = _median_difference(bodies, stand.stand_from_body[usable])
     out = []
     for of, poses in _other_records(stand.stand_from_body):
-        miss = _apart(bodies, poses[usable])
-        if miss < _FAR_BETTER * now:
-            out.append(_Change(of, miss / now, spots, replace(stand, stand_from_body=poses)))
+        misfit = _median_difference(bodies, poses[usable])
+        if misfit < _FAR_BETTER * present:
+            out.append(_Candidate(of, misfit / present, spots, replace(stand, stand_from_body=poses)))
     sigmas = np.broadcast_to(np.asarray(stand.pose_sigmas, dtype=float), (count, 6))
     for n in _shifts(count):
         both = (usable + n >= 0) & (usable + n < count)
         if np.sum(both) < _FEWEST:
             continue
-        miss = _apart(bodies[both], stand.stand_from_body[usable[both] + n])
-        if miss < _FAR_BETTER * now:
+        misfit = _median_difference(bodies[both], stand.stand_from_body[usable[both] + n])
+        if misfit < _FAR_BETTER * present:
             there = (spots.position + n >= 0) & (spots.position + n < count)
             moved = spots.pick(there)
             moved = replace(moved, position=moved.position + n)
-            out.append(_Change(_shifted(n), miss / now, moved, replace(stand, pose_sigmas=sigmas)))
+            out.append(_Candidate(_shifted(n), misfit / present, moved, replace(stand, pose_sigmas=sigmas)))
     return out
 
 
 def _other_records(poses: Pose) -> Iterator[tuple[SuspectPose, Pose]]:
-    """The record with a usual mistake mended."""
+    """The record with each common mistake corrected."""
     q, t = poses.quaternion_wxyz, poses.translation
     yield (
         SuspectPose(
@@ -116,7 +116,7 @@ def _other_records(poses: Pose) -> Iterator[tuple[SuspectPose, Pose]]:
     )
     turned = np.swapaxes(poses.rotation, -1, -2)
     yield (
-        SuspectPose(False, "with their turns reversed", "write quaternions that turn from the body into the stand"),
+        SuspectPose(False, "with their rotations inverted", "write quaternions that rotate from the body to the stand"),
         Pose(turned, t),
     )
     for factor, unit in ((1e-3, "millimetres"), (1e-2, "centimetres"), (1e3, "kilometres")):
@@ -133,49 +133,49 @@ def _shifted(n: int) -> SuspectPose:
     rows = f"{abs(n)} row{'' if abs(n) == 1 else 's'} {'above' if n < 0 else 'below'}"
     return SuspectPose(
         False,
-        f"when each position takes the pose {rows}",
-        "the positions' numbers in spots and poses are shifted against each other: number both alike",
+        f"when each position has the pose {rows}",
+        "the numbering of positions differs between spots and poses: number both alike",
     )
 
 
-def _apart(bodies: Pose, records: Pose) -> float:
-    """How far the poses by the spots are from the records, by the median, m and rad together; the stand anywhere."""
-    away = (stand_of(bodies, records) @ records).minus(bodies)
-    return float(np.median(np.linalg.norm(away, axis=-1)))
+def _median_difference(bodies: Pose, records: Pose) -> float:
+    """Median difference between poses from spots and records, m and rad combined, with a free stand pose."""
+    differences = (stand_of(bodies, records) @ records).minus(bodies)
+    return float(np.median(np.linalg.norm(differences, axis=-1)))
 
 
 # Labels -----------------------------------------------------------------------------------------------------------
 
 
-def _of_labels(rig: Rig, spots: SpotPixels, stand: StandModel) -> list[_Change]:
-    """Pairs of spots whose labels are exchanged in every picture of one camera."""
+def _of_labels(rig: Rig, spots: SpotPixels, stand: StandModel) -> list[_Candidate]:
+    """Pairs of spots with labels exchanged in every picture of one camera."""
     few = spots.pick(spots.position < _FOR_LABELS)
     count = min(_FOR_LABELS, len(stand.stand_from_body.translation))
-    now = _own_misfit(rig, few, count)
+    present = _own_misfit(rig, few, count)
     views, out = rig.views(), []
     for a, b in combinations(range(len(views)), 2):
         if views[a][0] != views[b][0]:
             continue
-        miss = _own_misfit(rig, exchanged(few, a, b), count)
-        if miss < _FAR_BETTER * now:
+        misfit = _own_misfit(rig, swap_views(few, a, b), count)
+        if misfit < _FAR_BETTER * present:
             camera, first, second = views[a][0], views[a][1], views[b][1]
             of = SuspectPose(
                 True,
                 f"with the labels {first} and {second} of camera {camera!r} exchanged everywhere",
                 "exchange them in the table of spots, or in target.spots",
             )
-            out.append(_Change(of, miss / now, exchanged(spots, a, b), stand))
+            out.append(_Candidate(of, misfit / present, swap_views(spots, a, b), stand))
     return out
 
 
-def exchanged(spots: SpotPixels, a: int, b: int) -> SpotPixels:
+def swap_views(spots: SpotPixels, a: int, b: int) -> SpotPixels:
     """The spots with two views exchanged."""
     view: Ints = np.where(spots.view == a, b, np.where(spots.view == b, a, spots.view))
     return replace(spots, view=view)
 
 
 def _own_misfit(rig: Rig, spots: SpotPixels, count: int) -> float:
-    """How badly the spots of a position fit the beams as drawn, by the median position, sigmas; inf for not at all."""
+    """Median misfit, sigmas, of the spots of a position with the nominal beams; inf if no pose is found."""
     fits = body_poses(rig, spots, count)
     each: Array = np.array([np.inf if f is None or f.dof <= 0 else np.sqrt(f.chi2 / f.dof) for f in fits])
     return float(np.median(each)) if len(each) else float("inf")

@@ -1,8 +1,7 @@
-"""What a stand's positions tell and what they do not: how they move the vehicle, and names for undetermined directions.
+"""Excitation by a stand's positions: how far they move the vehicle, and descriptions of undetermined motions.
 
-A direction of the unknowns along which nothing changes any spot is an eigenvector of eigenvalue 0 of the information
-matrix. As numbers it says nothing to a person; here it becomes a motion: of the whole target against the stand, or of
-one beam.
+An undetermined direction of the parameters, which changes no spot, is an eigenvector of eigenvalue 0 of the normal
+matrix. Here it is described as a motion of the whole target relative to the stand, or of one beam.
 """
 
 from __future__ import annotations
@@ -17,21 +16,21 @@ from geometry import rotations
 from geometry.arrays import Array, cross, normalised
 from geometry.pose import Pose
 
-_SHARE = 0.98  # of a direction's length that a motion of the whole target must explain to be called one
-_TURN_RMS = np.deg2rad(2.0)  # about an axis: less does not excite it
-_SHIFT_RMS = 0.02  # m
+_SHARE = 0.98  # of a direction's length that a motion of the whole target must explain
+_TURN_RMS = np.deg2rad(2.0)  # about an axis: smaller rotations do not excite it
+_SHIFT_RMS = 0.02  # m, likewise along an axis
 
 
 @dataclass(frozen=True, slots=True)
 class StandMotion:
-    """How much a stand's positions differ: root mean square about their mean, along and about its three axes."""
+    """Variation of a stand's positions: RMS about their mean, along and about its three axes."""
 
     turns: Array  # (3,) rad, about x, y, z of the stand
     shifts: Array  # (3,) m, along them
 
     @staticmethod
     def of(stand_from_body: Pose) -> StandMotion:
-        """Of positions (P,)."""
+        """The variation of positions (P,)."""
         shifts = np.sqrt(np.mean((stand_from_body.translation - stand_from_body.translation.mean(axis=0)) ** 2, axis=0))
         mean = stand_from_body.rotation.mean(axis=0)
         U, _, V = np.linalg.svd(mean)
@@ -42,15 +41,15 @@ class StandMotion:
     def __str__(self) -> str:
         turns = ", ".join(f"{a} {np.rad2deg(t):.1f} deg" for a, t in zip("xyz", self.turns, strict=True))
         shifts = ", ".join(f"{a} {s * 1e3:.0f} mm" for a, s in zip("xyz", self.shifts, strict=True))
-        return f"RMS turns about {turns}; RMS shifts along {shifts}"
+        return f"RMS rotations about {turns}; RMS shifts along {shifts}"
 
     @property
     def flat(self) -> list[str]:
-        """The axes about which the positions hardly turn."""
+        """The axes with too little rotation about them."""
         return [a for a, t in zip("xyz", self.turns, strict=True) if t < _TURN_RMS]
 
     def remedy(self) -> str:
-        """Which positions to add."""
+        """Positions to add, in words."""
         if self.flat:
             return f"add positions turned by 10 deg or more about the stand's {_and(self.flat)}"
         still = [a for a, s in zip("xyz", self.shifts, strict=True) if s < _SHIFT_RMS]
@@ -60,9 +59,9 @@ class StandMotion:
 
 
 def body_motion(lines: Lines) -> Array:
-    """What a small motion of the body frame [shift (m), turn (rad)] does to the errors of k lines: (4 k, 6).
+    """Change (4 k, 6) of the errors of k lines by a small motion of the body frame [shift (m), rotation (rad)].
 
-    The lines stay in place and the frame moves against them, or the other way round: the sign is of no account here.
+    The sign (lines relative to the frame, or the reverse) is irrelevant here.
     """
     G = np.zeros((len(lines), 4, 6))
     B_t = np.swapaxes(lines.basis, 1, 2)
@@ -74,16 +73,16 @@ def body_motion(lines: Lines) -> Array:
 
 
 def without_frame(directions: Array, lines: Lines) -> Array:
-    """What is left (m - 6, 4 k) of undetermined directions (m, 4 k) without the motions of the body frame."""
+    """Undetermined directions (m, 4 k) without the motions of the body frame, (m - 6, 4 k)."""
     frame = np.linalg.qr(body_motion(lines))[0]
     rest = directions - directions @ frame @ frame.T
     return np.linalg.svd(rest)[2][: max(len(directions) - 6, 0)]
 
 
 def in_words(directions: Array, beam_names: Sequence[str], lines: Lines, world_from_stand: Pose | None) -> list[str]:
-    """Undetermined directions (m, 4 k) or, with the stand's six at the end, (m, 4 k + 6), each as a motion.
+    """Descriptions of undetermined directions (m, 4 k) or, with the six of the stand at the end, (m, 4 k + 6).
 
-    world_from_stand: None where the stand was not asked for. Pure shifts are told apart from turns.
+    world_from_stand: None if the stand is not estimated. Pure shifts are distinguished from rotations.
     """
     if not len(directions):
         return []
@@ -94,7 +93,7 @@ def in_words(directions: Array, beam_names: Sequence[str], lines: Lines, world_f
         if np.all(np.linalg.norm(stand, axis=1) > 0.05 * np.linalg.norm(directions, axis=1)):
             shifts = stand[:, :3] @ world_from_stand.rotation
             found = _motions(np.concatenate([shifts, stand[:, 3:]], axis=1))
-            return [f"all beams against the stand: {w}" for w in found]
+            return [f"all beams relative to the stand: {w}" for w in found]
     motions = np.linalg.lstsq(G, directions[:, :beams].T, rcond=None)[0].T
     explained = motions @ G.T
     rigid = np.linalg.norm(explained, axis=1) > _SHARE * np.linalg.norm(directions[:, :beams], axis=1)
@@ -103,23 +102,23 @@ def in_words(directions: Array, beam_names: Sequence[str], lines: Lines, world_f
         each = direction[:beams].reshape(-1, 4)
         size = np.linalg.norm(each, axis=1)
         most = 0.2 * float(np.max(size))
-        told = [f"beam {n}: {_of_beam(e)}" for n, e, s in zip(beam_names, each, size, strict=True) if s > most]
-        out.append("; ".join(told))
+        moving = [f"beam {n}: {_beam_motion(e)}" for n, e, s in zip(beam_names, each, size, strict=True) if s > most]
+        out.append("; ".join(moving))
     return out
 
 
 def briefly(undetermined: Sequence[str]) -> str:
-    """What is undetermined, short enough for a line: the first two, and how many more."""
+    """A one-line summary: the first two undetermined motions and the number of others."""
     more = len(undetermined) - 2
     return "; ".join(undetermined[:2]) + (f"; and {more} more" if more > 0 else "")
 
 
 def _motions(motions: Array) -> list[str]:
-    """Shifts and turns (m, 6) as words, recombined so that as few as possible are turns."""
+    """Descriptions of shifts and rotations (m, 6), recombined so that as few as possible are rotations."""
     out = []
     for row in np.linalg.svd(motions[:, 3:], full_matrices=True)[0].T @ motions:
         is_turn = np.linalg.norm(row[3:]) > 1e-3 * np.linalg.norm(row)
-        out.append(f"a turn about {_axis(row[3:])}" if is_turn else f"a shift along {_axis(row[:3])}")
+        out.append(f"a rotation about {_axis(row[3:])}" if is_turn else f"a shift along {_axis(row[:3])}")
     return sorted(set(out))
 
 
@@ -132,13 +131,13 @@ def _axis(vector: Array) -> str:
     return f"({u[0]:.2f}, {u[1]:.2f}, {u[2]:.2f})"
 
 
-def _of_beam(four: Array) -> str:
+def _beam_motion(four: Array) -> str:
     turn, shift = np.linalg.norm(four[:2]), np.linalg.norm(four[2:])
     if shift < 0.02 * turn:
         return "its direction"
     if turn < 0.02 * shift:
         return "its offset"
-    return "direction and offset, one against the other"
+    return "direction and offset, coupled"
 
 
 def _and(words: Sequence[str]) -> str:

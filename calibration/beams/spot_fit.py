@@ -1,7 +1,7 @@
-"""An adjustment to spots of which some are wrong: outliers fade, then are left out and named.
+"""Robust adjustment to spots: outliers are detected with a Cauchy loss and then excluded.
 
-A Cauchy loss finds the bulk; what lies off it is left out, and plain least squares on the rest gives the values and
-their covariance, so that neither a wrong spot nor a fading weight takes part in what is claimed.
+The final values and their covariance are from plain least squares on the inliers, so that neither outliers nor
+down-weighted spots affect them.
 """
 
 from __future__ import annotations
@@ -17,31 +17,34 @@ from calibration.terms.spot_term import SpotPixels, SpotTerm
 from geometry.arrays import Array, Bools
 from geometry.rig import Rig
 
-P_OUTLIER = 1e-4  # of a good spot to be left out: one in 10 000
-_MEDIAN_CHI2 = 2 * np.log(2)  # of squared sigmas of two numbers
-_P_MISFIT = 1e-3  # of a right fit to be said to misfit
+P_OUTLIER = 1e-4  # probability that a correct spot is excluded
+_MEDIAN_CHI2 = 2 * np.log(2)  # median of the chi-square with 2 degrees of freedom
+_P_MISFIT = 1e-3  # p-value of chi-square below which the sigmas are increased
 _ROUNDS = 8
-# With weights that change from step to step the last digits settle slowly, and it is only a start.
+# With changing weights the last digits converge slowly; for a start value less is sufficient.
 _ROUGHLY = Limits(steps=120, small_step_sigmas=0.1)
-_MOST_SCALE = 10.0  # told sigmas may be so much too small; what scatters more was not made by these beams
+_MOST_SCALE = 10.0  # largest factor on the stated sigmas; spots that scatter more are not of these beams
 
 
 @dataclass(frozen=True, slots=True)
 class SpotFit:
-    """N spots adjusted."""
+    """Adjustment of N spots."""
 
     adjusted: Adjusted  # terms: the kept spots first, then the others
-    kept: Bools  # (N,)
-    residuals_px: Array  # (N, 2) found minus predicted, of all spots
-    sigmas: Array  # (N,) size of each residual in the sigmas that were told, of two numbers
-    scale: float  # what the told sigmas were multiplied with, since the spots scatter more; 1 where they do not
+    kept: Bools  # (N,): inliers
+    residuals_px: Array  # (N, 2) measured minus predicted, of all spots
+    sigmas: Array  # (N,) length of each residual in its stated sigmas
+    scale: float  # factor on the stated sigmas from the scatter of the spots; 1 if they are consistent
 
 
 def fit_spots(rig: Rig, spots: SpotPixels, values: Values, others: Sequence[Term], free: Free) -> SpotFit:
-    """Values that fit the spots and the other terms best. Raises AdjustmentError where that does not settle.
+    """The adjustment to the spots and the other terms.
 
-    Where the kept spots scatter significantly more than their sigmas say, these are scaled up, never down: too large
-    ones are a user's safety margin.
+    If the inliers scatter significantly more than their sigmas, these are scaled up. They are never scaled down: larger
+    ones are a safety margin of the user.
+
+    Raises:
+        AdjustmentError: fewer than half of the spots agree, or the adjustment does not converge.
     """
     every = SpotTerm(rig, spots)
     robust = solve(values, [SpotTerm(rig, spots, Cauchy()), *others], free, _ROUGHLY)
@@ -50,7 +53,7 @@ def fit_spots(rig: Rig, spots: SpotPixels, values: Values, others: Sequence[Term
     for _ in range(_ROUNDS):
         if 2 * np.sum(kept) < len(spots):
             raise AdjustmentError(
-                f"only {int(np.sum(kept))} of {len(spots)} spots agree with each other: labels, stand positions or the"
+                f"only {int(np.sum(kept))} of {len(spots)} spots are consistent: labels, stand positions or the"
                 " calibration of cameras and screens are wrong"
             )
         found = solve(now, [SpotTerm(rig, spots.pick(kept)), *others], free)
@@ -71,7 +74,7 @@ def fit_spots(rig: Rig, spots: SpotPixels, values: Values, others: Sequence[Term
 
 
 def _near(term: SpotTerm, values: Values) -> Bools:
-    """Which spots lie where a good one may, by the scatter of the better half."""
+    """Inliers, relative to the scatter of the better half of the spots."""
     s = np.sum(term.linearise(values).residuals ** 2, axis=1)
     unit = float(np.clip(np.median(s) / _MEDIAN_CHI2, 1.0, _MOST_SCALE**2))
     return s < unit * chdtri(2, P_OUTLIER)

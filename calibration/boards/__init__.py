@@ -1,1 +1,1 @@
-"""Calibration boards: what they are, and how they are drawn and found."""
+"""Types of calibration boards, their printed patterns and their detection."""

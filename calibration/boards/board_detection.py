@@ -1,11 +1,11 @@
-"""Find a calibration board in a picture: its points to a hundredth of a pixel, or the reason why it is not there.
+"""Detection of a calibration board in a picture: its points to a hundredth of a pixel, or the reason for a failure.
 
-The order of the points is the same in all pictures of a board as far as its pattern allows, and never that of a mirror
-image. What a pattern cannot tell is settled by the picture: of the `symmetry` orders that look the same, the one whose
-rows point most to the right. For one camera that does no harm, since a turned order is the same board in another pose;
-for several cameras that see one board at once it does as soon as one of them is rolled by more than 90 deg against the
-others, so take a board of symmetry 1 there. That a picture is mirrored can be seen on ChArUco boards and on asymmetric
-grids with an even number of rows; chessboards and other grids are their own mirror images.
+The points are in the same order in all pictures of a board as far as its pattern determines it, and never in that of a
+mirror image. Of the `symmetry` equivalent orders, the one whose rows point most to the right is taken. This is harmless
+for one camera, since a turned order is the same board in another pose. It is not for several cameras that see one board
+at once, if one of them is rolled by more than 90 deg against the others: use a board of symmetry 1 there. Mirrored
+pictures are detected with ChArUco boards and with asymmetric grids that have an even number of rows; chessboards and
+other grids are their own mirror images.
 """
 
 from __future__ import annotations
@@ -13,19 +13,20 @@ from __future__ import annotations
 import numpy as np
 
 from calibration.boards.board_types import Board, Charuco, Chessboard
-from calibration.boards.board_view import NO_CLOSE_LOOK, BoardView, GreyImage, NotFound
+from calibration.boards.board_view import BoardView, GreyImage, NotFound
 from calibration.boards.charuco_detection import find_charuco
 from calibration.boards.chessboard_detection import find_chessboard
 from calibration.boards.circle_detection import find_circles
 
-__all__ = ["NO_CLOSE_LOOK", "BoardView", "NotFound", "find_board"]
-
 
 def find_board(image: GreyImage, board: Board, closely: bool = True) -> BoardView | NotFound:
-    """The board in a grey picture (h, w) of 8 bits. Raises ValueError for another kind of picture.
+    """The board in a grey picture (h, w) of 8 bits.
 
-    closely: else only the quick ways are tried, and no cause is looked for (NO_CLOSE_LOOK): of 1280x1024 pixels without
-    the board a close look takes 2 to 5 s, a quick one 0.02 to 0.3 s.
+    closely: if False, only the fast methods are used, and the reason for a failure is not determined (NO_CLOSE_LOOK).
+    For 1280x1024 pixels without a board, a thorough search takes 2 to 5 s, a quick one 0.02 to 0.3 s.
+
+    Raises:
+        ValueError: the picture has another type.
     """
     if image.ndim != 2 or image.dtype != np.uint8:
         raise ValueError(f"expected a grey picture (h, w) of 8 bits, got {image.shape} of {image.dtype}")

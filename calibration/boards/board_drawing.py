@@ -1,7 +1,7 @@
-"""What is ink on a board and what is paper: as shapes for a printer, and as a shade at any point.
+"""The printed pattern of a board: as shapes for a printer, and as ink density at any point.
 
-Drawings have their own frame: the top left corner of the printed area, x right, y down, m. `BoardShapes.first_point`
-says where the board's frame begins in it.
+Drawings have their own frame: origin at the top left corner of the printed area, x right, y down, m.
+`BoardShapes.first_point` is the origin of the board's frame in it.
 """
 
 from __future__ import annotations
@@ -11,15 +11,16 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from calibration.boards.board_types import DICTIONARIES, Board, Charuco, CircleGrid
+from calibration.boards.board_types import Board, Charuco, CircleGrid
+from calibration.boards.marker_dictionaries import DICTIONARIES
 from geometry.arrays import Array, Bools, Ints
 
 
 @dataclass(frozen=True, slots=True)
 class Layer:
-    """Shapes of one shade, painted over the layers before. Shapes of one layer may touch: paint them as ONE path.
+    """Shapes of one colour, painted over the previous layers. Paint the shapes of a layer as ONE path.
 
-    Squares painted one by one leave hair lines between them in most programs that show a PDF.
+    Touching squares that are painted one by one show hairlines between them in most PDF viewers.
     """
 
     dark: bool
@@ -37,7 +38,7 @@ class BoardShapes:
 
 
 def draw(board: Board) -> BoardShapes:
-    """The shapes of a board, at their size in the world."""
+    """The shapes of a board in real size."""
     none = np.empty((0, 4))
     if isinstance(board, CircleGrid):
         start = np.full(2, board.diameter_m / 2)
@@ -46,11 +47,11 @@ def draw(board: Board) -> BoardShapes:
     s, (columns, rows) = board.square_m, squares(board)
     start = np.array([s, s])
     j, i = np.meshgrid(np.arange(columns), np.arange(rows))
-    dark = is_dark_square(board, j, i)
-    ink = ~dark if isinstance(board, Charuco) and board.inverted else dark
+    black = is_black_square(board, j, i)
+    ink = ~black if isinstance(board, Charuco) and board.inverted else black
     layers = [Layer(True, _cells(j[ink], i[ink], s, np.zeros(2)), np.empty((0, 3)))]
     if isinstance(board, Charuco):
-        markers, cells = _marker_cells(board, j[~dark], i[~dark])
+        markers, cells = _marker_cells(board, j[~black], i[~black])
         layers.append(Layer(not board.inverted, markers, np.empty((0, 3))))
         layers.append(Layer(board.inverted, cells, np.empty((0, 3))))
     return BoardShapes(board.size_m, start, tuple(layers))
@@ -63,20 +64,20 @@ def squares(board: Board) -> tuple[int, int]:
     return board.columns + 1, board.rows + 1
 
 
-def is_dark_square(board: Board, column: Ints, row: Ints) -> Bools:
-    """Whether squares (...), counted from the outer top left one, are dark (before inversion)."""
+def is_black_square(board: Board, column: Ints, row: Ints) -> Bools:
+    """Whether squares (...), counted from the outer top left one, are black (before inversion)."""
     light_first = isinstance(board, Charuco) and board.light_first
     return (column + row + light_first) % 2 == 0
 
 
 def marker_bits(dictionary: str, number: int) -> Bools:
-    """The cells (n + 2, n + 2) of a marker with its border: True where it is black."""
+    """The modules (n + 2, n + 2) of a marker with its border: True where black."""
     known = cv2.aruco.getPredefinedDictionary(DICTIONARIES[dictionary])
     return np.asarray(cv2.aruco.generateImageMarker(known, number, int(known.markerSize) + 2)) < 128
 
 
 def ink_at(board: Board, xy: Array) -> Array:
-    """How dark a board is at points (..., 2), m, of its frame: 1 ink, 0 paper; paper outside the printed area."""
+    """Ink density of a board at points (..., 2), m, of its frame: 1 ink, 0 paper; 0 outside the printed area."""
     if isinstance(board, CircleGrid):
         return _circle_ink(board, xy)
     s, (columns, rows) = board.square_m, squares(board)
@@ -84,7 +85,7 @@ def ink_at(board: Board, xy: Array) -> Array:
     square = np.floor(np.where(np.isfinite(place), place, -1.0)).astype(np.int64)
     j, i = square[..., 0], square[..., 1]
     on_board = (j >= 0) & (i >= 0) & (j < columns) & (i < rows)
-    ink = is_dark_square(board, j, i) & on_board
+    ink = is_black_square(board, j, i) & on_board
     if isinstance(board, Charuco):
         ink |= _marker_ink(board, place, j, i, on_board & ~ink)
         if board.inverted:
@@ -93,7 +94,7 @@ def ink_at(board: Board, xy: Array) -> Array:
 
 
 def _circle_ink(board: CircleGrid, xy: Array) -> Array:
-    """The nearest centre is one of the rows on either side; within a row, the nearest column."""
+    """Ink of the nearest circle: its row is one of the two adjacent ones, its column the nearest in that row."""
     x, y = np.nan_to_num(xy[..., 0], nan=-1e9), np.nan_to_num(xy[..., 1], nan=-1e9)
     ink = np.zeros(x.shape, dtype=bool)
     pitch = board.spacing_m * (2 if board.asymmetric else 1)
@@ -108,7 +109,7 @@ def _circle_ink(board: CircleGrid, xy: Array) -> Array:
 def _marker_ink(board: Charuco, place: Array, j: Ints, i: Ints, light: Bools) -> Bools:
     numbers = np.full((board.rows, board.columns), -1)
     jj, ii = np.meshgrid(np.arange(board.columns), np.arange(board.rows))
-    numbers[~is_dark_square(board, jj, ii)] = np.arange(board.markers)
+    numbers[~is_black_square(board, jj, ii)] = np.arange(board.markers)
     bits = np.stack([marker_bits(board.dictionary, k) for k in range(board.markers)])
     cells = bits.shape[-1]
     share = board.marker_m / board.square_m
@@ -128,7 +129,7 @@ def _cells(j: Ints, i: Ints, step: float, start: Array) -> Array:
 
 
 def _marker_cells(board: Charuco, j: Ints, i: Ints) -> tuple[Array, Array]:
-    """Whole markers in black, and what is white within them. OpenCV numbers markers row by row, as here."""
+    """The whole markers in black, and the white modules in them. Numbered row by row, as in OpenCV."""
     margin = (board.square_m - board.marker_m) / 2
     corners = np.column_stack([j, i]) * board.square_m + margin
     black = np.column_stack([corners, np.full((len(j), 2), board.marker_m)])

@@ -1,61 +1,44 @@
-"""The boards that cameras are calibrated with: what is printed on them, and the short text that names one.
+"""The types of calibration boards.
 
-All boards share one frame: the origin is the first point, x runs along the columns to the last point of the first row,
-y down the rows, z = x cross y INTO the board, away from who looks at its printed side (OpenCV's convention). All points
-have z = 0. Seen from the front with the first point at the top left, x points right and y down.
+All boards use the same kind of frame: the origin is the first point, x points along the columns to the last point of
+the first row, y down the rows, and z = x cross y INTO the board, away from a viewer of its printed side (OpenCV's
+convention). All points have z = 0. Seen from the front with the first point at the top left, x points right and y down.
 """
 
 from __future__ import annotations
 
 import difflib
 import math
-import re
 from dataclasses import dataclass
 from typing import TypeAlias
 
 import cv2
 import numpy as np
 
+from calibration.boards.board_text import in_mm, read_count, read_length
+from calibration.boards.marker_dictionaries import DICTIONARIES, DictionaryError, dictionary_name, dictionary_size
 from geometry.arrays import Array, Ints
 
 EXAMPLES = {
     "chessboard": "chessboard:9x6:25mm (inner corners, side of a square)",
-    "circles": "circles:10x10:12mm (circles, distance of neighbours; then perhaps their diameter, :6mm)",
-    "acircles": "acircles:4x11:20mm (circles in a row, rows, distance of two rows; then perhaps their diameter, :14mm)",
+    "circles": "circles:10x10:12mm (circles, distance of neighbours; optionally their diameter, :6mm)",
+    "acircles": "acircles:4x11:20mm (circles in a row, rows, distance of two rows; optionally their diameter, :14mm)",
     "charuco": "charuco:5x7:40mm:20mm:DICT_4X4_50 (squares, side of a square, side of a marker, dictionary;"
-    " then :inverted for white markers, :legacy for OpenCV's pattern before 4.6)",
+    " optionally :inverted for white markers, :legacy for OpenCV's pattern before 4.6)",
 }
-_FEWEST = 3  # points along each side: with two, a board's outline cannot be told from its neighbourhood
+_FEWEST = 3  # points along each side: with two, a board cannot be distinguished from its surroundings
 _MOST = 200
-# Share of the distance to the nearest neighbour that is ink. With less white between them blur runs circles together;
-# smaller circles have fewer edge pixels to measure.
+# Diameter of printed circles over the distance of neighbours. Larger circles merge when blurred; smaller ones have
+# fewer edge pixels to measure.
 _INK = 0.5
-
-
-_FAMILIES = "DICT_4X4_50 (_100, _250, _1000), likewise DICT_5X5_, DICT_6X6_ and DICT_7X7_, and DICT_APRILTAG_36h11"
-
-
-class _DictionaryError(ValueError):
-    """A dictionary that is not there."""
-
-
-def _dictionaries() -> dict[str, int]:
-    """OpenCV's predefined dictionaries by name. Of names for one dictionary (36H11, 36h11) the printed one stays."""
-    by_number: dict[int, str] = {}
-    for name in sorted(n for n in dir(cv2.aruco) if n.startswith("DICT_")):  # upper case sorts first
-        by_number[int(getattr(cv2.aruco, name))] = name
-    return {by_number[number]: number for number in sorted(by_number)}
-
-
-DICTIONARIES = _dictionaries()  # name -> OpenCV's number, in OpenCV's order
 
 
 @dataclass(frozen=True, slots=True)
 class Chessboard:
-    """A plain chessboard. The square above and left of the first inner corner is dark.
+    """A plain chessboard. The square above and left of the first inner corner is black.
 
-    That fixes the first corner where columns + rows is odd. Where it is even, the board looks the same after half a
-    turn (`symmetry` 2), and after a quarter turn if it is square with even sides (4).
+    This determines the first corner if columns + rows is odd. If it is even, the board looks the same after half a turn
+    (`symmetry` 2), and after a quarter turn if it is square with even sides (4).
     """
 
     columns: int  # inner corners
@@ -63,7 +46,7 @@ class Chessboard:
     square_m: float
 
     def __post_init__(self) -> None:
-        _check_count("chessboard", "inner corners", self.columns, self.rows)
+        _check_count("inner corners", self.columns, self.rows)
         _check_length("chessboard", "square", self.square_m)
 
     @property
@@ -78,7 +61,7 @@ class Chessboard:
 
     @property
     def middle(self) -> Array:
-        """(3,), m: about which a bent board is described."""
+        """(3,), m: origin of the warp polynomial."""
         return _middle(self.points)
 
     @property
@@ -93,19 +76,19 @@ class Chessboard:
 
     @property
     def symmetry(self) -> int:
-        """In how many ways the board can be turned in its plane and look the same: 1, 2 or 4."""
+        """Number of rotations in its plane under which the board looks the same: 1, 2 or 4."""
         if self.columns == self.rows and self.columns % 2 == 0:
             return 4
         return 1 if (self.columns + self.rows) % 2 else 2
 
     def describe(self) -> str:
         """The text that `parse` reads."""
-        return f"chessboard:{self.columns}x{self.rows}:{_mm(self.square_m)}"
+        return f"chessboard:{self.columns}x{self.rows}:{in_mm(self.square_m)}"
 
 
 @dataclass(frozen=True, slots=True)
 class CircleGrid:
-    """Dark circles on white, in rows and columns, or asymmetric: every other row shifted by half a step.
+    """Black circles on white, in rows and columns, or asymmetric: every second row shifted by half a step.
 
     spacing_m is the distance of neighbours, or for an asymmetric grid that of two ROWS; circles of one row are then
     2 spacing_m apart and neighbours sqrt(2) spacing_m (OpenCV's convention: x = (2 j + i % 2) spacing, y = i spacing).
@@ -115,23 +98,23 @@ class CircleGrid:
     rows: int
     spacing_m: float
     asymmetric: bool = False
-    stated_diameter_m: float | None = None  # of the circles; None: not said, and measured in the pictures
+    stated_diameter_m: float | None = None  # of the circles; None: not stated
 
     def __post_init__(self) -> None:
-        _check_count(self.kind, "circles", self.columns, self.rows)
+        _check_count("circles", self.columns, self.rows)
         _check_length(self.kind, "spacing", self.spacing_m)
         if self.stated_diameter_m is not None:
             _check_length(self.kind, "diameter", self.stated_diameter_m)
             if self.stated_diameter_m >= self.neighbours_m:
                 raise ValueError(
                     f"{self.kind}: expected circles smaller than the {1000 * self.neighbours_m:.4g} mm between"
-                    f" neighbours, got a diameter of {_mm(self.stated_diameter_m)}; the spacing comes first; example:"
+                    f" neighbours, got a diameter of {in_mm(self.stated_diameter_m)}; the spacing comes first; example:"
                     f" {EXAMPLES[self.kind]}"
                 )
 
     @property
     def kind(self) -> str:
-        """The first word of its text."""
+        """The first word of the board's text."""
         return "acircles" if self.asymmetric else "circles"
 
     @property
@@ -150,7 +133,7 @@ class CircleGrid:
 
     @property
     def middle(self) -> Array:
-        """(3,), m: about which a bent board is described."""
+        """(3,), m: origin of the warp polynomial."""
         return _middle(self.points)
 
     @property
@@ -160,33 +143,33 @@ class CircleGrid:
 
     @property
     def diameter_m(self) -> float:
-        """Of the circles as stated, or as beampose prints them. Calibrations measure it and do not rely on it."""
+        """Diameter as stated, or as beampose prints it. Calibrations measure it and do not rely on this value."""
         return _INK * self.neighbours_m if self.stated_diameter_m is None else self.stated_diameter_m
 
     @property
     def size_m(self) -> tuple[float, float]:
-        """Width and height of the ink."""
+        """Width and height of the printed area."""
         span = np.ptp(self.points, axis=0)
         return float(span[0]) + self.diameter_m, float(span[1]) + self.diameter_m
 
     @property
     def symmetry(self) -> int:
-        """In how many ways the board can be turned in its plane and look the same: 1, 2 or 4."""
+        """Number of rotations in its plane under which the board looks the same: 1, 2 or 4."""
         if self.asymmetric:
             return 2 if self.rows % 2 == 0 else 1
         return 4 if self.columns == self.rows else 2
 
     def describe(self) -> str:
         """The text that `parse` reads."""
-        text = f"{self.kind}:{self.columns}x{self.rows}:{_mm(self.spacing_m)}"
-        return text if self.stated_diameter_m is None else f"{text}:{_mm(self.stated_diameter_m)}"
+        text = f"{self.kind}:{self.columns}x{self.rows}:{in_mm(self.spacing_m)}"
+        return text if self.stated_diameter_m is None else f"{text}:{in_mm(self.stated_diameter_m)}"
 
 
 @dataclass(frozen=True, slots=True)
 class Charuco:
-    """A chessboard with an ArUco marker in each light square; its points are the inner chessboard corners.
+    """A chessboard with an ArUco marker in each white square; its points are the inner chessboard corners.
 
-    Marker numbers tell where a corner is, so that a part of the board is enough and no symmetry is left.
+    The markers identify the corners, so that a part of the board is sufficient and there is no symmetry.
     """
 
     columns: int  # SQUARES, as in OpenCV
@@ -194,17 +177,17 @@ class Charuco:
     square_m: float
     marker_m: float
     dictionary: str  # OpenCV's name
-    inverted: bool = False  # printed with dark and light exchanged
-    legacy: bool = False  # OpenCV's pattern before 4.6: it differs where the rows are even
+    inverted: bool = False  # printed with black and white exchanged
+    legacy: bool = False  # OpenCV's pattern before 4.6, which differs if the number of rows is even
 
     def __post_init__(self) -> None:
-        _check_count("charuco", "squares", self.columns, self.rows)
+        _check_count("squares", self.columns, self.rows)
         _check_length("charuco", "square", self.square_m)
         _check_length("charuco", "marker", self.marker_m)
         if self.marker_m >= self.square_m:
             raise ValueError(
-                f"charuco: expected markers smaller than the squares, got {_mm(self.marker_m)} in"
-                f" {_mm(self.square_m)}; the square comes first: {EXAMPLES['charuco']}"
+                f"charuco: expected markers smaller than the squares, got {in_mm(self.marker_m)} in"
+                f" {in_mm(self.square_m)}; the square comes first: {EXAMPLES['charuco']}"
             )
         object.__setattr__(self, "dictionary", dictionary_name(self.dictionary))
         kept = dictionary_size(self.dictionary)
@@ -216,26 +199,26 @@ class Charuco:
 
     @property
     def markers(self) -> int:
-        """How many markers there are: numbers 0 to markers - 1."""
-        return self.columns * self.rows // 2  # an odd board begins and ends with a dark square
+        """Number of markers; they are numbered from 0."""
+        return self.columns * self.rows // 2  # a board with an odd number of squares starts and ends with a black one
 
     @property
     def rim_modules(self) -> float:
-        """White rim between a marker and the dark squares about it, in modules (its dots)."""
+        """White rim between a marker and the black squares around it, in modules (cells of the marker)."""
         return (self.square_m - self.marker_m) / 2 / (self.marker_m / self._modules)
 
     def marker_with_rim_m(self, rim_modules: float) -> float:
-        """Side of the marker that leaves a rim of so many modules."""
+        """Side of a marker that leaves a rim of this many modules."""
         return self.square_m / (1 + 2 * rim_modules / self._modules)
 
     @property
     def _modules(self) -> int:
-        """Of a marker's side, its dark border included."""
+        """Modules along a marker's side, including its black border."""
         return int(cv2.aruco.getPredefinedDictionary(DICTIONARIES[self.dictionary]).markerSize) + 2
 
     @property
     def light_first(self) -> bool:
-        """Whether the top left square holds a marker (before inversion)."""
+        """Whether the top left square contains a marker (before inversion)."""
         return self.legacy and self.rows % 2 == 0
 
     @property
@@ -250,7 +233,7 @@ class Charuco:
 
     @property
     def middle(self) -> Array:
-        """(3,), m: about which a bent board is described."""
+        """(3,), m: origin of the warp polynomial."""
         return _middle(self.points)
 
     @property
@@ -265,12 +248,12 @@ class Charuco:
 
     @property
     def symmetry(self) -> int:
-        """1: markers leave no doubt."""
+        """Number of rotations in its plane under which the board looks the same: 1, because of the markers."""
         return 1
 
     def describe(self) -> str:
         """The text that `parse` reads."""
-        text = f"charuco:{self.columns}x{self.rows}:{_mm(self.square_m)}:{_mm(self.marker_m)}:{self.dictionary}"
+        text = f"charuco:{self.columns}x{self.rows}:{in_mm(self.square_m)}:{in_mm(self.marker_m)}:{self.dictionary}"
         return text + (":inverted" if self.inverted else "") + (":legacy" if self.legacy else "")
 
 
@@ -278,11 +261,14 @@ Board: TypeAlias = Chessboard | CircleGrid | Charuco
 
 
 def parse(text: str) -> Board:
-    """The board that a text names. Raises ValueError: one line with an example.
+    """The board described by a text.
 
     chessboard:9x6:25mm, circles:10x10:12mm[:DIAMETER], acircles:4x11:20mm[:DIAMETER],
     charuco:5x7:40mm:20mm:DICT_4X4_50[:inverted][:legacy];
     lengths in mm, cm or m.
+
+    Raises:
+        ValueError: the text is not valid; the message is one line with an example.
     """
     kind, *parts = [part.strip() for part in text.strip().split(":")]
     kind = kind.lower()
@@ -295,7 +281,7 @@ def parse(text: str) -> Board:
         )
     try:
         return _board_of(kind, parts)
-    except _DictionaryError as error:  # a whole example beside the families would only hide them
+    except DictionaryError as error:  # this message lists the dictionaries instead of an example
         raise ValueError(f"board {text!r}: {error}") from None
     except ValueError as error:
         hint = "" if EXAMPLES[kind] in str(error) else f"; example: {EXAMPLES[kind]}"
@@ -308,12 +294,12 @@ def _board_of(kind: str, parts: list[str]) -> Board:
     if len(parts) < wanted or (kind != "charuco" and len(parts) > wanted + round_ones):
         most = f"{wanted} or {wanted + 1}" if round_ones else f"{wanted}"
         raise ValueError(f"expected {most} parts after {kind!r}, got {len(parts)}")
-    columns, rows = _read_count(parts[0])
+    columns, rows = read_count(parts[0])
     if kind == "chessboard":
-        return Chessboard(columns, rows, _read_length(parts[1]))
+        return Chessboard(columns, rows, read_length(parts[1]))
     if kind != "charuco":
-        diameter = _read_length(parts[2]) if len(parts) > 2 else None
-        return CircleGrid(columns, rows, _read_length(parts[1]), kind == "acircles", diameter)
+        diameter = read_length(parts[2]) if len(parts) > 2 else None
+        return CircleGrid(columns, rows, read_length(parts[1]), kind == "acircles", diameter)
     words = [word.lower() for word in parts[4:]]
     for word in words:
         if word not in ("inverted", "legacy"):
@@ -321,47 +307,15 @@ def _board_of(kind: str, parts: list[str]) -> Board:
     return Charuco(
         columns,
         rows,
-        _read_length(parts[1]),
-        _read_length(parts[2]),
+        read_length(parts[1]),
+        read_length(parts[2]),
         parts[3],
         inverted="inverted" in words,
         legacy="legacy" in words,
     )
 
 
-def _read_count(text: str) -> tuple[int, int]:
-    found = re.fullmatch(r"(\d{1,4})\s*[xX×]\s*(\d{1,4})", text)
-    if found is None:
-        raise ValueError(f"expected columns x rows such as 9x6, got {text!r}")
-    return int(found[1]), int(found[2])
-
-
-def _read_length(text: str) -> float:
-    found = re.fullmatch(r"(\d+\.?\d*|\.\d+)\s*(mm|cm|m)", text, flags=re.IGNORECASE)
-    if found is None:
-        raise ValueError(f"expected a length with its unit such as 25mm, got {text!r}")
-    # Division, since 25 / 1000 is the double nearest to 0.025 and 25 * 0.001 is not.
-    return float(found[1]) / {"mm": 1000.0, "cm": 100.0, "m": 1.0}[found[2].lower()]
-
-
-def dictionary_name(text: str) -> str:
-    """OpenCV's name of a dictionary of ArUco markers, whatever the case. Raises ValueError with what is near."""
-    by_lower = {name.lower(): name for name in DICTIONARIES}
-    if text.lower() in by_lower:
-        return by_lower[text.lower()]
-    if f"dict_{text.lower()}" in by_lower:
-        return by_lower[f"dict_{text.lower()}"]
-    near = difflib.get_close_matches(text.lower(), by_lower, n=2, cutoff=0.6)
-    hint = f"did you mean {' or '.join(by_lower[n] for n in near)}? " if near else ""
-    raise _DictionaryError(f"expected one of OpenCV's dictionaries, got {text!r}; {hint}there are {_FAMILIES}")
-
-
-def dictionary_size(name: str) -> int:
-    """How many markers a dictionary has."""
-    return len(cv2.aruco.getPredefinedDictionary(DICTIONARIES[name]).bytesList)
-
-
-def _check_count(kind: str, what: str, columns: int, rows: int) -> None:
+def _check_count(what: str, columns: int, rows: int) -> None:
     if min(columns, rows) < _FEWEST or max(columns, rows) > _MOST:
         raise ValueError(f"expected {_FEWEST} to {_MOST} {what} along each side, got {columns}x{rows}")
 
@@ -380,7 +334,3 @@ def _lattice(columns: int, rows: int, step: float) -> Array:
 
 def _middle(points: Array) -> Array:
     return (points.min(axis=0) + points.max(axis=0)) / 2
-
-
-def _mm(length_m: float) -> str:
-    return f"{round(length_m * 1000, 9):.12g}mm"

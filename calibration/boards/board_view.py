@@ -1,4 +1,4 @@
-"""What a picture shows of a board: its points, or the reason why not."""
+"""The result of searching a picture for a board: its points, or the reason why it was not found."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ GreyImage = NDArray[np.uint8]  # (h, w)
 
 @dataclass(frozen=True, slots=True)
 class BoardView:
-    """The points of a board in one picture, in the order of their numbers.
+    """The points of a board in one picture, in ascending order of their numbers.
 
-    Rows of the board run to the right and columns down when its printed side is looked at: the pixels are never in the
-    order of a mirror image.
+    With the printed side towards the viewer, rows run to the right and columns down: the order of the pixels is never
+    that of a mirror image.
     """
 
-    ids: Ints  # (n,), ascending: which of the board's points
+    ids: Ints  # (n,), ascending: indices of the board's points
     pixels: Array  # (n, 2), distorted; of circles the centroids of their blobs, not the images of their centres
     spacing_px: float  # median distance of neighbouring points
-    blur_px: float  # sigma of the edges, a pixel's own width included; nan where it could not be measured
-    contrast_dn: float  # light minus dark
-    notes: tuple[str, ...] = ()  # what the user should know of this picture
-    areas_px2: Array | None = None  # (n,), of the blobs that circles are seen as; None for other boards
+    blur_px: float  # sigma of the edges, including the width of a pixel; nan where it could not be measured
+    contrast_dn: float  # white minus black
+    notes: tuple[str, ...] = ()  # remarks for the user about this picture
+    areas_px2: Array | None = None  # (n,), areas of the blobs of circles; None for other boards
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -34,28 +34,28 @@ class BoardView:
 
 @dataclass(frozen=True, slots=True)
 class NotFound:
-    """There is no usable view of the board in a picture: why, and what to do."""
+    """No usable view of the board in a picture, with the reason and the remedy."""
 
     reason: str
 
 
-NO_CLOSE_LOOK = NotFound("no board at a quick look")  # its cause was not looked for
-BLUR_LIMIT = 0.2  # sigma of the edges in spacings: beyond it neighbouring corners run together
+NO_CLOSE_LOOK = NotFound("no board found in a quick search")  # the cause was not determined
+BLUR_LIMIT = 0.2  # sigma of the edges in spacings: above it neighbouring corners merge
 
 
 def too_blurred(blur: float, apart: float) -> NotFound:
-    """The refusal of a view out of focus or moving. blur: sigma of its edges, apart: its points' spacing; px."""
+    """The rejection of a blurred view. blur: sigma of its edges, px; apart: spacing of its points, px."""
     return NotFound(
-        f"too blurred: edges are smeared by {blur:.1f} px (1 sigma) with points {apart:.0f} px apart; focus,"
-        " hold the board still or expose for a shorter time"
+        f"too blurred: edges have a width of {blur:.1f} px (1 sigma) with points {apart:.0f} px apart; focus,"
+        " hold the board still or use a shorter exposure"
     )
 
 
 def low_contrast(image: GreyImage) -> NotFound | None:
-    """The refusal of a picture that shows nothing at all, or None."""
+    """The rejection of a picture without contrast, or None."""
     low, high = np.percentile(image, [1, 99])
     if high - low >= 15:
         return None
     return NotFound(
-        f"hardly any contrast: nearly all grey values lie from {low:.0f} to {high:.0f}; more light on the board"
+        f"hardly any contrast: 98 % of the grey values are within {low:.0f} to {high:.0f}; put more light on the board"
     )

@@ -1,4 +1,4 @@
-"""ChArUco boards in pictures: also inverted, older and partly hidden ones, and what is wrong where one does not fit."""
+"""Detection of ChArUco boards, also inverted, legacy and partly hidden ones, and the reasons for a failure."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from calibration.boards import corner_refinement
-from calibration.boards.board_types import DICTIONARIES, Charuco, dictionary_size
+from calibration.boards.board_types import Charuco
 from calibration.boards.board_view import (
     BLUR_LIMIT,
     NO_CLOSE_LOOK,
@@ -18,12 +18,13 @@ from calibration.boards.board_view import (
     low_contrast,
     too_blurred,
 )
+from calibration.boards.marker_dictionaries import DICTIONARIES, dictionary_size
 from calibration.boards.pyramid import scaled, scales
 from geometry.arrays import Array, Ints
 
-_FEWEST = 6  # corners, not all on one line: a pose from fewer says nothing about the lens
-_FITS = 0.7  # share of the markers that lie where the board has them; of a wrong board at most half do
-_LARGEST = (  # one dictionary of each family, the others being its first markers
+_FEWEST = 6  # corners that do not all lie on one line: fewer do not contribute to the lens
+_FITS = 0.7  # share of the markers at their places on the board; of a wrong board at most half are
+_LARGEST = (  # one dictionary of each family; the others consist of its first markers
     "DICT_4X4_1000",
     "DICT_5X5_1000",
     "DICT_6X6_1000",
@@ -46,9 +47,9 @@ class Markers:
 
 
 def find_charuco(image: GreyImage, board: Charuco, closely: bool = True) -> BoardView | NotFound:
-    """The inner corners that can be seen, or the reason why there are too few. A part of the board is enough.
+    """The visible inner corners, or the reason why there are too few. A part of the board is sufficient.
 
-    closely: else the cause is not looked for where no marker is seen.
+    closely: if False, the reason for missing markers is not determined.
     """
     printed, markers = _as_printed(image, board)
     if len(markers.ids) == 0:
@@ -58,32 +59,34 @@ def find_charuco(image: GreyImage, board: Charuco, closely: bool = True) -> Boar
         return _mirrored(image, board, len(markers.ids)) or true
     notes = []
     if printed != board.inverted:
-        notes.append("the board is inverted (white markers)" if printed else "the board is not inverted (dark markers)")
+        notes.append(
+            "the board is inverted (white markers)" if printed else "the board is not inverted (black markers)"
+        )
     if true.legacy != board.legacy:
         notes.append(f"the board has OpenCV's {'older pattern (legacy)' if true.legacy else 'pattern since 4.6'}")
     if share is not None and abs(share - board.marker_m / board.square_m) > 0.08:
         notes.append(
-            f"markers measure {share:.2f} of a square, the board's text says {board.marker_m / board.square_m:.2f}"
+            f"markers measure {share:.2f} of a square, according to the text {board.marker_m / board.square_m:.2f}"
         )
         true = replace(true, marker_m=share * true.square_m)
     return _corners(255 - image if printed else image, true, markers, tuple(notes))
 
 
 def _as_printed(image: GreyImage, board: Charuco) -> tuple[bool, Markers]:
-    """Whether the board shows white markers, and those found: as expected, unless the other way there are more."""
-    told = find_markers(255 - image if board.inverted else image, board.dictionary, board.markers)
-    if len(told.ids) >= 4:
-        return board.inverted, told
+    """Whether the board has white markers, and the markers found: as stated, unless more are found the other way."""
+    stated = find_markers(255 - image if board.inverted else image, board.dictionary, board.markers)
+    if len(stated.ids) >= 4:
+        return board.inverted, stated
     other = find_markers(image if board.inverted else 255 - image, board.dictionary, board.markers)
-    if len(other.ids) > len(told.ids):
+    if len(other.ids) > len(stated.ids):
         return not board.inverted, other
-    return board.inverted, told
+    return board.inverted, stated
 
 
 def find_markers(image: GreyImage, dictionary: str, below: int | None = None) -> Markers:
-    """Dark markers of a dictionary, each number once, numbers under `below` only."""
+    """Black markers of a dictionary that occur once in the picture, with numbers under `below` only."""
     parameters = cv2.aruco.DetectorParameters()
-    # Of 120 markers of 24 px with a blur of 1 to 1.5 px 113 are read with these two, 99 with OpenCV's 4 and 0.13.
+    # Of 120 markers of 24 px with a blur of 1 to 1.5 px, 113 are read with these two, 99 with OpenCV's 4 and 0.13.
     parameters.perspectiveRemovePixelPerCell = 10
     parameters.perspectiveRemoveIgnoredMarginPerCell = 0.25
     detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(DICTIONARIES[dictionary]), parameters)
@@ -98,47 +101,47 @@ def find_markers(image: GreyImage, dictionary: str, below: int | None = None) ->
 
 
 def _fitting(board: Charuco, markers: Markers) -> tuple[Charuco | NotFound, float | None]:
-    """The board as the markers lie (its pattern may be the other of the two), and marker side over square side.
+    """The board with the pattern (current or legacy) that the markers fit, and the side of a marker over a square's.
 
-    A few markers that do not lie as on the board are mostly none: a bookshelf looks like 4x4 bits now and then.
+    A few markers that do not fit the board are mostly false: bookshelves sometimes resemble 4x4 bits.
     """
     if len(markers.ids) < 2:
-        return NotFound(f"only one marker of {board.dictionary} seen: the board is mostly hidden, or not there"), None
-    told = _fit(board, markers)
-    if told.share >= _FITS:
-        return board, told.marker_over_square
+        return NotFound(f"only one marker of {board.dictionary} found: the board is mostly hidden, or absent"), None
+    stated = _fit(board, markers)
+    if stated.share >= _FITS:
+        return board, stated.marker_over_square
     other = replace(board, legacy=not board.legacy)
     fit = _fit(other, markers)
     if fit.share >= _FITS:
         return other, fit.marker_over_square
     if len(markers.ids) < 4:
-        return NotFound(f"no board: {len(markers.ids)} things look like markers of it, but do not lie as on it"), None
-    words = f"{len(markers.ids)} markers of {board.dictionary} are there but do not lie as on this board"
+        return NotFound(f"no board: {len(markers.ids)} shapes resemble its markers but are not arranged as on it"), None
+    words = f"{len(markers.ids)} markers of {board.dictionary} were found but are not arranged as on this board"
     if board.columns != board.rows:
         for legacy in (False, True):
             turned = replace(board, columns=board.rows, rows=board.columns, legacy=legacy)
             if _fit(turned, markers).share >= _FITS:
-                return NotFound(f"{words}: they do on {turned.columns}x{turned.rows} squares; exchange the two"), None
+                return NotFound(f"{words}: they fit {turned.columns}x{turned.rows} squares; exchange the two"), None
     return NotFound(f"{words}; check the number of columns and rows of squares"), None
 
 
 @dataclass(frozen=True, slots=True)
 class _Fit:
-    share: float  # of the markers that lie as on the board
+    share: float  # of the markers that are at their places on the board
     marker_over_square: float | None
 
 
 def _fit(board: Charuco, markers: Markers) -> _Fit:
-    """How well markers lie as on a board: their centres by a homography that most agree on, within 0.3 squares.
+    """How well markers fit a board: RANSAC homography of their centres, with a tolerance of 0.3 squares.
 
-    Centres, since they do not depend on how large the markers are.
+    Centres do not depend on the size of the markers.
     """
     squares, corners = _marker_places(board)
     known = markers.ids < len(squares)
     if known.sum() < 2:
         return _Fit(0.0, None)
     seen, on_board = markers.corners[known], squares[markers.ids[known]]
-    if known.sum() < 4:  # few centres fit anywhere: their corners decide
+    if known.sum() < 4:  # few centres fit any board, so that the corners are used
         from_px, to = seen.reshape(-1, 2), (on_board[:, None] + corners).reshape(-1, 2)
     else:
         from_px, to = seen.mean(axis=1), on_board
@@ -152,7 +155,7 @@ def _fit(board: Charuco, markers: Markers) -> _Fit:
     if good.sum() < 2:
         return _Fit(0.0, None)
     shape = _mapped(H, seen[good].reshape(-1, 2)).reshape(-1, 4, 2)
-    # The corners must go round as on the board: a mirrored order of the numbers has another homography.
+    # The corners must be in the board's sense of rotation; a mirrored numbering has another homography.
     way = shape - shape.mean(axis=1, keepdims=True)
     agree = np.sum(way * corners, axis=(1, 2)) / (np.linalg.norm(way, axis=(1, 2)) * np.linalg.norm(corners))
     sides = np.linalg.norm(np.roll(shape, -1, axis=1) - shape, axis=-1)
@@ -191,7 +194,7 @@ def _corners(image: GreyImage, board: Charuco, markers: Markers, notes: tuple[st
     grid = np.full((rows, columns, 2), np.nan)
     if ids is not None and len(ids):
         grid.reshape(-1, 2)[np.asarray(ids).ravel()] = np.asarray(corners, dtype=float).reshape(-1, 2)
-    # The window must not reach the markers, which stand (square - marker) / 2 away from the corner. Measured with
+    # The window must not include the markers, at a distance of (square - marker) / 2 from the corner. Measured with
     # markers of 0.5, 0.7 and 0.8 squares: 1.3 times that distance gives 2 to 20 times the error, 0.8 times up to 1.3.
     reach = min(0.4, (1 - board.marker_m / board.square_m) / 2)
     fine = corner_refinement.refined(image, grid, np.isfinite(grid).all(axis=-1), reach)
@@ -199,8 +202,8 @@ def _corners(image: GreyImage, board: Charuco, markers: Markers, notes: tuple[st
     places = board.points[seen, :2] / board.square_m
     if seen.sum() < _FEWEST or np.linalg.matrix_rank(places - places.mean(axis=0), tol=0.1) < 2:
         return NotFound(
-            f"only {seen.sum()} of {columns * rows} corners seen, {_FEWEST} that span an area are needed: the board is"
-            " mostly hidden or outside the picture, too far away, blurred, or not there"
+            f"only {seen.sum()} of {columns * rows} corners found, {_FEWEST} that span an area are needed: the board is"
+            " mostly hidden or outside the picture, too far away, blurred, or absent"
         )
     apart = corner_refinement.spacing(fine)
     blur, contrast = corner_refinement.edge_blur(image, fine, reach=0.7 * reach)
@@ -210,15 +213,15 @@ def _corners(image: GreyImage, board: Charuco, markers: Markers, notes: tuple[st
 
 
 def _mirrored(image: GreyImage, board: Charuco, seen: int) -> NotFound | None:
-    """The refusal of a mirrored picture: its mirror image shows far more of the board's markers than the `seen` ones.
+    """The rejection of a mirrored picture: its mirror image shows many more of the board's markers than `seen`.
 
-    Among 4x4 bits some mirrored markers look like others: of 37 to 49 markers up to 4 did in rendered photographs.
+    Some mirrored markers of 4x4 bits resemble others: of 37 to 49 markers up to 4 did in rendered photographs.
     """
     for inverted in (board.inverted, not board.inverted):
         shown = 255 - image if inverted else image
         flipped = np.ascontiguousarray(shown[:, ::-1])
         if len(find_markers(flipped, board.dictionary, board.markers).ids) >= max(3, 3 * seen):
-            return NotFound("the board is seen as in a mirror: switch off the mirroring of the camera or its software")
+            return NotFound("the picture is mirrored: switch off the mirroring of the camera or its software")
     return None
 
 
@@ -239,8 +242,8 @@ def _why_no_markers(image: GreyImage, board: Charuco) -> NotFound:
                 best, name, most = len(found.ids), other, int(found.ids.max())
     if best >= 4 and name.rsplit("_", 1)[0] == board.dictionary.rsplit("_", 1)[0]:
         return NotFound(
-            f"{best} markers of the right kind with numbers up to {most}, but of this board's 0 to {board.markers - 1}"
-            " none: another board, or more columns and rows than said"
+            f"{best} markers of this dictionary with numbers up to {most}, but none of this board's 0 to"
+            f" {board.markers - 1}: another board, or more columns and rows than stated"
         )
     if best >= 4:
         return NotFound(
@@ -249,12 +252,12 @@ def _why_no_markers(image: GreyImage, board: Charuco) -> NotFound:
         )
     for scale in scales(image)[1:]:
         if len(find_markers(scaled(image, scale), board.dictionary, board.markers).ids) >= 3:
-            return NotFound("too blurred for markers to be read; focus, hold the board still or expose for less time")
-    return NotFound(f"no marker of {board.dictionary} seen: no board, or it is too far away, blurred or in glare")
+            return NotFound("too blurred for reading markers; focus, hold the board still or use a shorter exposure")
+    return NotFound(f"no marker of {board.dictionary} found: no board, or it is too far away, blurred or in glare")
 
 
 def _smallest(name: str, number: int) -> str:
-    """The smallest dictionary of the same family that has this marker."""
+    """The smallest dictionary of the same family that contains this marker."""
     family = [n for n in DICTIONARIES if n.rsplit("_", 1)[0] == name.rsplit("_", 1)[0]]
     enough = [n for n in family if dictionary_size(n) > number]
     return min(enough, key=dictionary_size) if name.endswith("_1000") and enough else name

@@ -1,4 +1,4 @@
-"""Plain chessboards in pictures."""
+"""Detection of plain chessboards."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from calibration.boards.board_view import (
 from calibration.boards.pyramid import at_full_size, scaled, scales
 from geometry.arrays import Array
 
-_ALTERNATING = 0.9  # share of neighbouring squares that differ as they should; real boards reach 1
-_QUICK_PX = 1000  # longer side of the picture in which a board is looked for first
+_ALTERNATING = 0.9  # share of neighbouring squares that alternate in colour; real boards reach 1
+_QUICK_PX = 1000  # longer side of the picture that is searched first
 _CLASSIC = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
 _SECTORS = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
 
 
 def find_chessboard(image: GreyImage, board: Chessboard, closely: bool = True) -> BoardView | NotFound:
-    """All inner corners of a chessboard, or the reason why they cannot be had. A part of it is not enough.
+    """All inner corners of a chessboard, or the reason why they were not found. A part of it is not sufficient.
 
-    closely: else only the classical finder looks, and no cause is looked for.
+    closely: if False, only the classical detector is used, and the reason for a failure is not determined.
     """
     pale = low_contrast(image)
     if pale is not None:
@@ -47,13 +47,13 @@ def find_chessboard(image: GreyImage, board: Chessboard, closely: bool = True) -
         turned = largest.shape[:2] != (board.rows, board.columns)
         found = _measured(image, np.swapaxes(largest, 0, 1) if turned else largest, board)
         return found or NotFound(
-            "too blurred or noisy: the board is there, but its corners cannot be measured; focus, hold it still"
+            "too blurred or noisy: the board was found, but its corners cannot be measured; focus, hold it still"
         )
     return _other_size(largest, board)
 
 
 def _measured(image: GreyImage, grid: Array, board: Chessboard) -> BoardView | NotFound | None:
-    """The view that rough corners (rows, columns, 2) lead to; None where they are no chessboard after all."""
+    """The view from approximate corners (rows, columns, 2); None if they are not of a chessboard."""
     fine = corner_refinement.refined(image, grid)
     if not np.isfinite(fine).all() or not _is_sheet(fine):
         return None
@@ -62,10 +62,10 @@ def _measured(image: GreyImage, grid: Array, board: Chessboard) -> BoardView | N
 
 
 def _grids(image: GreyImage, columns: int, rows: int) -> Iterator[Array]:
-    """Candidates (rows, columns, 2), px, quick ways first.
+    """Candidates (rows, columns, 2), px, from the fastest methods first.
 
-    The classical finder needs 0.03 s for 1920x1080 and cv2.findChessboardCornersSB 0.9 to 1.9 s; of 41 real pictures
-    the first finds 39, the second 39, and not the same. Smaller copies serve pictures out of focus.
+    The classical detector takes 0.03 s for 1920x1080 and cv2.findChessboardCornersSB 0.9 to 1.9 s; of 41 real pictures
+    each finds 39, not the same ones. Smaller copies serve for pictures out of focus.
     """
     size = (columns, rows)
     sizes = scales(image)
@@ -83,9 +83,9 @@ def _grids(image: GreyImage, columns: int, rows: int) -> Iterator[Array]:
 
 
 def _quick_grids(image: GreyImage, columns: int, rows: int) -> Iterator[Array]:
-    """Candidates of the classical finder in copies of up to 1000 px, given up early where nothing is like a board.
+    """Candidates of the classical detector in copies of up to 1000 px, with an early exit if nothing resembles a board.
 
-    0.01 s for 1280x1024 without the board, in which the ways above take 5 s; it sees 45 of 48 real boards, they 47.
+    0.01 s for 1280x1024 without a board, where `_grids` takes 5 s; it finds 45 of 48 real boards, `_grids` 47.
     """
     sizes = scales(image)
     for scale in [s for s in sizes if s * max(image.shape) <= _QUICK_PX] or sizes[-1:]:
@@ -102,7 +102,7 @@ def _as_grid(answer: Any, columns: int, rows: int, scale: float) -> Iterator[Arr
 
 
 def _is_sheet(grid: Array) -> bool:
-    """Whether all cells turn the same way round: the order of a sheet that is not folded."""
+    """Whether all cells have the same sense of rotation, as on a sheet that is not folded."""
     turn = _cell_turns(grid)
     return bool(np.all(turn > 0) or np.all(turn < 0))
 
@@ -113,7 +113,7 @@ def _cell_turns(grid: Array) -> Array:
 
 
 def orders(grid: Array) -> list[Array]:
-    """The ways to number a grid (rows, columns, 2) that keep its shape and are not mirrored, px with v down."""
+    """The numberings of a grid (rows, columns, 2), px with v down, that keep its shape and are not mirrored."""
     ways = [grid, grid[::-1], grid[:, ::-1], grid[::-1, ::-1]]
     if grid.shape[0] == grid.shape[1]:
         ways += [np.swapaxes(w, 0, 1) for w in ways]
@@ -121,30 +121,29 @@ def orders(grid: Array) -> list[Array]:
 
 
 def upright(ways: list[Array]) -> Array:
-    """Of orders that the board cannot tell apart, the one whose rows point most to the right in the picture."""
+    """Of equivalent numberings of the board, the one whose rows point most to the right in the picture."""
     return max(ways, key=lambda w: float(np.sum(w[:, -1, 0] - w[:, 0, 0]) / max(np.ptp(w[..., 0]), 1e-9)))
 
 
 def oriented(image: GreyImage, grid: Array) -> Array | None:
-    """The grid numbered from the corner whose outer square is dark, the same way in all pictures where that can be.
+    """The grid numbered from the corner whose outer square is black, consistently over all pictures where possible.
 
-    None where the squares do not alternate: what only looks like a chessboard.
+    None if the squares do not alternate, as on things that resemble a chessboard.
     """
     ways = orders(grid)
     shades = [alternation(image, way) for way in ways]
     if max(abs(shade) for shade in shades) < _ALTERNATING:
         return None
-    # Both corners light (a board with an even sum, printed the other way round): then any of them, but always upright.
-    dark_first = [way for way, shade in zip(ways, shades, strict=True) if shade > 0] or ways
-    return upright(dark_first)
+    # Both corners white (a board with an even sum, printed with the colours exchanged): any of them, but upright.
+    black_first = [way for way, shade in zip(ways, shades, strict=True) if shade > 0] or ways
+    return upright(black_first)
 
 
 def alternation(image: GreyImage, grid: Array) -> float:
-    """1 where every square between the corners differs from its neighbours as on a chessboard whose first square is
-    dark, -1 where it is light, near 0 for other patterns.
+    """1 if all squares alternate in colour and the first one is black, -1 if it is white, near 0 for other patterns.
 
-    The square between the first four corners has the colour of that outside the first corner. Each is read at five
-    places, as the markers of other boards also have their dark and light parts.
+    The square between the first four corners has the colour of that outside the first corner. Each is sampled at five
+    places, because the markers of other boards also have black and white parts.
     """
     a, b, c, d = grid[:-1, :-1], grid[1:, :-1], grid[:-1, 1:], grid[1:, 1:]
     middle = (a + b + c + d) / 4
@@ -164,7 +163,7 @@ def _checked(image: GreyImage, grid: Array, board: Chessboard) -> BoardView | No
     larger = _goes_on(image, grid)
     if larger:
         return NotFound(
-            f"the chessboard goes on {larger} beyond {board.columns}x{board.rows} inner corners; count the inner"
+            f"the chessboard continues {larger} beyond {board.columns}x{board.rows} inner corners; count the inner"
             " corners along both sides again"
         )
     blur, contrast = corner_refinement.edge_blur(image, grid)
@@ -175,11 +174,11 @@ def _checked(image: GreyImage, grid: Array, board: Chessboard) -> BoardView | No
 
 
 def _goes_on(image: GreyImage, grid: Array) -> str:
-    """On which side more corners follow: 'to the right', ...; empty where the board ends.
+    """Sides on which more corners follow: 'to the right', ...; empty where the board ends.
 
-    Where the next corner would be, told by the homography of the three outer rows, four squares must meet again: the
-    two on one diagonal are darker than the others by the board's contrast. At the end of a board two of the four are
-    its margin, which gives half of that; outermost squares that are cut narrower give nothing.
+    At the next corner, predicted by the homography of the three outer rows, four squares must meet: the two on one
+    diagonal are darker than the others by the board's contrast. At the end of a board two of the four are its margin,
+    which halves the difference; outermost squares that are cut narrower give no difference.
     """
     sides = {"above": grid, "below": grid[::-1], "to the left": np.swapaxes(grid, 0, 1)}
     sides["to the right"] = np.swapaxes(grid[:, ::-1], 0, 1)
@@ -199,7 +198,7 @@ def _goes_on(image: GreyImage, grid: Array) -> str:
 
 
 def _crossing(image: GreyImage, H: Array, n: int, row: int) -> Array:
-    """By how much (n,) one diagonal of the four squares at each corner of a row is darker, DN; nan outside."""
+    """Difference (n,), DN, by which one diagonal of the four squares at each corner of a row is darker; nan outside."""
     total = np.zeros(n)
     for dj, di in ((-1, -1), (1, 1), (-1, 1), (1, -1)):
         places = np.column_stack([np.arange(n) + 0.22 * dj, np.full(n, row + 0.22 * di), np.ones(n)]) @ H.T
@@ -211,10 +210,10 @@ def _crossing(image: GreyImage, H: Array, n: int, row: int) -> Array:
 
 
 def _largest_grid(image: GreyImage) -> Array | None:
-    """The chessboard (rows, columns, 2), px, of whatever size with the most corners; None where there is none.
+    """The chessboard (rows, columns, 2), px, of any size with the most corners; None if there is none.
 
-    Neither way of searching nor size of picture always sees a whole board: of nine pictures each of the four finds the
-    whole in six or seven, and together in all.
+    No method and no picture size always finds a whole board: in nine pictures each of the four combinations finds the
+    whole one in six or seven, and together they find all.
     """
     best: Array | None = None
     small = [s for s in scales(image) if s * max(image.shape) <= _QUICK_PX][:2]
@@ -227,22 +226,22 @@ def _largest_grid(image: GreyImage) -> Array | None:
                 continue
             grid = at_full_size(corners.reshape(*meta.shape[:2], 2).astype(float), scale)
             if min(grid.shape[:2]) < 4 or abs(alternation(image, grid)) < _ALTERNATING:
-                continue  # 3x3 corners are found in many a room
+                continue  # 3x3 corners occur by chance in many pictures
             if best is None or grid.size > best.size:
                 best = grid
     return best
 
 
 def _other_size(grid: Array | None, board: Chessboard) -> NotFound:
-    """What to say of a chessboard that is not the one wanted."""
+    """The message about a chessboard of another size than the expected one."""
     if grid is None:
-        return NotFound("no chessboard seen: it must lie wholly in the picture, with a light margin and no glare on it")
+        return NotFound("no chessboard found: it must lie wholly in the picture, with a white margin and without glare")
     columns, rows = sorted(grid.shape[:2], reverse=board.columns >= board.rows)
     wide, high = sorted((board.columns, board.rows), reverse=board.columns >= board.rows)
     if columns <= wide and rows <= high:
         return NotFound(
-            f"only {columns}x{rows} of the {board.columns}x{board.rows} inner corners can be seen: the board is partly"
-            " hidden, in glare or outside the picture, or it has fewer corners than said"
+            f"only {columns}x{rows} of the {board.columns}x{board.rows} inner corners are visible: the board is partly"
+            " hidden, in glare or outside the picture, or it has fewer corners than stated"
         )
     return NotFound(
         f"a chessboard of {columns}x{rows} inner corners, not {board.columns}x{board.rows}; count the inner corners"

@@ -1,7 +1,8 @@
-"""Grids of circles in pictures: centres and areas of the ellipses that they are seen as.
+"""Detection of grids of circles: centres and areas of the ellipses in the picture.
 
-A centre is that of the blob, not the image of the circle's centre: the two differ by tenths of a pixel, which the
-calibration's model takes into account (calibration/terms/circle_images.py) and for which it needs the areas.
+A centre is the centroid of the blob, not the image of the circle's centre. The two differ by tenths of a pixel; the
+observation equation of the calibration contains this difference (calibration/terms/circle_images.py) and requires the
+areas.
 """
 
 from __future__ import annotations
@@ -27,27 +28,27 @@ from calibration.boards.chessboard_detection import upright
 from calibration.boards.pyramid import at_full_size, scaled, scales
 from geometry.arrays import Array
 
-_BIG_DOT = 1.35  # area of a corner's circle over what its neighbours have, from which it marks the origin
-_STRAY = 100  # blobs beside three times the board's: among thousands OpenCV searches for many minutes
-_LATTICE = 0.25  # share of blobs that must lie as in a lattice: a board among twice as many strays still does
-_INK = 0.5  # diameter over distance of neighbours where no blob tells it
-_FIT_PX = 0.08  # of the spacing: how well a grid must follow a homography (strong lenses bend it by less than that)
+_BIG_DOT = 1.35  # relative area of a corner circle, above which it marks the origin
+_STRAY = 100  # blobs allowed besides three times the board's: among thousands OpenCV searches for many minutes
+_LATTICE = 0.25  # share of blobs arranged as in a lattice: boards among twice as many other blobs have more
+_INK = 0.5  # diameter over distance of neighbours where no blob gives it
+_FIT_PX = 0.08  # of the spacing: residual of a grid against a homography (strong lenses cause less than that)
 
 
 @dataclass(frozen=True, slots=True)
 class Ellipses:
-    """Fitted images of circles; nan where no ellipse fits."""
+    """Fitted ellipses; nan where none fits."""
 
     centres: Array  # (n, 2), px
     areas: Array  # (n,), px^2
-    slopes: Array  # (n,), DN/px: the steepest
+    slopes: Array  # (n,), DN/px: the steepest on the outline
     contrasts: Array  # (n,), DN
 
 
 def find_circles(image: GreyImage, board: CircleGrid, closely: bool = True) -> BoardView | NotFound:
-    """All centres of a grid of circles, with the blobs' areas, or the reason why they cannot be had.
+    """All centres of a grid of circles, with the areas of the blobs, or the reason why they were not found.
 
-    closely: else no cause is looked for.
+    closely: if False, the reason is not determined.
     """
     blobs = np.empty((0, 3))
     for scale in scales(image):
@@ -62,11 +63,11 @@ def find_circles(image: GreyImage, board: CircleGrid, closely: bool = True) -> B
 
 
 def _detector(image: GreyImage) -> cv2.SimpleBlobDetector:
-    """Dark blobs, round to within a tilt of 75 deg, from 3 px across to a quarter of the picture."""
+    """Detector of black blobs, with a tilt up to 75 deg, from 3 px across to a quarter of the picture."""
     p = cv2.SimpleBlobDetector.Params()
     p.filterByColor, p.blobColor = True, 0
     p.filterByArea, p.minArea, p.maxArea = True, 7.0, image.size / 16
-    p.filterByCircularity = False  # a tilted circle is none
+    p.filterByCircularity = False  # the image of a tilted circle is not circular
     p.filterByInertia, p.minInertiaRatio = True, 0.05
     p.filterByConvexity, p.minConvexity = True, 0.8
     p.minDistBetweenBlobs = 3.0
@@ -81,7 +82,7 @@ def _blobs(image: GreyImage) -> Array:
 
 
 def _grid(image: GreyImage, board: CircleGrid, size: tuple[int, int] | None = None) -> Array | None:
-    """Rough centres (rows, columns, 2), px, in OpenCV's order, or None."""
+    """Approximate centres (rows, columns, 2), px, in OpenCV's order, or None."""
     columns, rows = size or (board.columns, board.rows)
     blobs = _blobs(image)
     if not columns * rows <= len(blobs) <= 3 * columns * rows + _STRAY or _lattice_share(blobs) < _LATTICE:
@@ -95,9 +96,9 @@ def _grid(image: GreyImage, board: CircleGrid, size: tuple[int, int] | None = No
 
 
 def _lattice_share(blobs: Array) -> float:
-    """Share of blobs (n, 3) that have another one opposite to their nearest neighbour, as points of a lattice have.
+    """Share of blobs (n, 3) that have another one opposite to their nearest neighbour, like the points of a lattice.
 
-    About 0.1 for blobs at random, in which OpenCV's search for a grid does not end; 0.7 and more for boards alone.
+    About 0.1 for random blobs, for which OpenCV's search for a grid does not end; 0.7 and more for boards alone.
     """
     if len(blobs) < 3:
         return 0.0
@@ -115,7 +116,8 @@ def _measured(image: GreyImage, grid: Array, board: CircleGrid, light: bool) -> 
     more = _goes_on(ordered, board, blobs)
     if more:
         return NotFound(
-            f"the grid goes on {more} beyond {board.columns}x{board.rows} circles; count again (circles in a row, rows)"
+            f"the grid continues {more} beyond {board.columns}x{board.rows} circles; count again (circles in a row,"
+            " rows)"
         )
     ellipses = fit_ellipses(image, ordered.reshape(-1, 2), _radii(ordered, board, blobs))
     lost = np.isnan(ellipses.areas)
@@ -132,15 +134,15 @@ def _measured(image: GreyImage, grid: Array, board: CircleGrid, light: bool) -> 
     apart = corner_refinement.spacing(centres.reshape(ordered.shape))
     if blur > BLUR_LIMIT * apart:
         return too_blurred(blur, apart)
-    notes = ("light circles on a dark ground",) if light else ()
+    notes = ("white circles on a black ground",) if light else ()
     return BoardView(board.ids, centres, apart, blur, contrast, notes, ellipses.areas)
 
 
 def _radii(grid: Array, board: CircleGrid, blobs: Array) -> Array:
-    """Radii (n,), px, at rough centres (rows, columns, 2) from the blobs (m, 3) there.
+    """Radii (n,), px, at approximate centres (rows, columns, 2), from the blobs (m, 3) there.
 
-    All circles of a board are alike, so that one radius serves them all; only a blob that is markedly larger keeps its
-    own: the dot that marks an origin. Single blobs can be far too small where the ink is lighter within.
+    All circles of a board have the same size, so that one radius is used for all; only a markedly larger blob, the dot
+    that marks the origin, keeps its own. Single blobs can be much too small where the ink is paler inside.
     """
     centres = grid.reshape(-1, 2)
     H = homography(board.points[:, :2], centres)
@@ -159,19 +161,19 @@ def _radii(grid: Array, board: CircleGrid, blobs: Array) -> Array:
 
 
 def fit_ellipses(image: GreyImage, centres: Array, radii: Array) -> Ellipses:
-    """The ellipse around each rough centre (n, 2) of a dark circle of about this radius (n,), px.
+    """The ellipse around each approximate centre (n, 2) of a black circle of about this radius (n,), px.
 
     Every pixel on the outline gives a tangent l = (g_x, g_y, -g . p) by its gradient g; the tangents of an ellipse
-    satisfy l^T D l = 0 with its dual conic D, which is solved for by least squares with the weight |g|^2. A blur alike
-    in all directions does not move the centre. Source: Ouellet and Hebert (2009), "Precise ellipse estimation without
-    contour point extraction", Machine Vision and Applications 21.
+    satisfy l^T D l = 0 with its dual conic D, which is solved for by least squares with the weight |g|^2. An isotropic
+    blur does not move the centre. Source: Ouellet and Hebert (2009), "Precise ellipse estimation without contour point
+    extraction", Machine Vision and Applications 21.
     """
     out = np.full((len(centres), 5), np.nan)
     smooth = np.asarray(cv2.GaussianBlur(image.astype(np.float64), (0, 0), 0.7), dtype=float)
     gx, gy = (np.asarray(cv2.Scharr(smooth, cv2.CV_64F, *d) / 32, dtype=float) for d in ((1, 0), (0, 1)))
     height, width = image.shape
     for n, (centre, radius) in enumerate(zip(centres, radii, strict=True)):
-        for _ in range(2):  # the second time about the first fit's centre
+        for _ in range(2):  # the second pass is about the centre from the first
             reach = 1.5 * radius + 1.5
             first = np.maximum(np.floor(centre - reach), 0).astype(int)
             last = np.minimum(np.ceil(centre + reach), [width - 1, height - 1]).astype(int)
@@ -188,11 +190,11 @@ def fit_ellipses(image: GreyImage, centres: Array, radii: Array) -> Ellipses:
 
 
 def _ellipse(gx: Array, gy: Array, grey: Array, centre: Array, reach: float) -> Array | None:
-    """Centre x, y, area, steepest slope, contrast (5,) in a patch; None if it is no ellipse."""
+    """Centre x, y, area, steepest slope, contrast (5,) in a patch; None if it is not an ellipse."""
     v, u = np.indices(gx.shape)
     x, y = u - centre[0], v - centre[1]
     strength = np.hypot(gx, gy)
-    # Only slopes that rise outwards, as those of a dark circle do; a neighbour's do not.
+    # Only slopes that rise outwards, as on a black circle; those of a neighbour do not.
     edge = (gx * x + gy * y > 0) & (strength > 0.2 * strength.max())
     edge &= np.hypot(x, y) < reach
     if edge.sum() < 8:
@@ -203,7 +205,7 @@ def _ellipse(gx: Array, gy: Array, grey: Array, centre: Array, reach: float) -> 
     rows = np.column_stack([a * a, a * b, b * b, a * c, b * c])
     (A, B, C, D, E), *_ = np.linalg.lstsq(rows, -c * c, rcond=None)
     place = np.array([D / 2, E / 2])
-    # With the centre taken off, D's upper block is -1 times the ellipse's shape matrix.
+    # With the centre subtracted, D's upper block is -1 times the ellipse's shape matrix.
     shape = np.outer(place, place) - np.array([[A, B / 2], [B / 2, C]])
     det = np.linalg.det(shape)
     if not (det > 0 and np.trace(shape) > 0):
@@ -215,11 +217,15 @@ def _ellipse(gx: Array, gy: Array, grey: Array, centre: Array, reach: float) -> 
 
 
 def homography(from_xy: Array, to_xy: Array) -> Array:
-    """H (3, 3) with to = H from, least squares over points (n, 2). Raises ValueError if there is none."""
+    """H (3, 3) with to = H from, least squares over points (n, 2).
+
+    Raises:
+        ValueError: the points do not determine a homography.
+    """
     scale = 1.0 / max(float(np.ptp(from_xy)), 1e-12)
     H, _ = cv2.findHomography(from_xy * scale, to_xy, 0)
     if H is None:
-        raise ValueError("these points have no homography")
+        raise ValueError("these points do not determine a homography")
     return np.asarray(H, dtype=float) @ np.diag([scale, scale, 1.0])
 
 
@@ -230,16 +236,16 @@ def mapped(H: Array, xy: Array) -> Array:
 
 
 def _jacobian_determinants(H: Array, xy: Array) -> Array:
-    """By how much H enlarges areas at points (n, 2): det H / w^3."""
+    """Area magnification of H at points (n, 2): det H / w^3."""
     w = xy @ H[2, :2] + H[2, 2]
     return np.linalg.det(H) / w**3
 
 
 def _ordered(grid: Array, board: CircleGrid) -> Array | NotFound:
-    """The grid in the board's order: as it fits, not mirrored, rows to the right where several orders fit."""
+    """The grid numbered as on the board and not mirrored; of several such numberings the upright one."""
     ways = [grid, grid[::-1], grid[:, ::-1], grid[::-1, ::-1]]
     if board.asymmetric and board.rows % 2 == 0:
-        # OpenCV gives the two rows of each pair in the wrong order where the rows are even.
+        # OpenCV swaps the two rows of each pair if the number of rows is even.
         paired = grid.reshape(board.rows // 2, 2, board.columns, 2)[:, ::-1].reshape(grid.shape)
         ways += [paired, paired[::-1], paired[:, ::-1], paired[::-1, ::-1]]
     if board.columns == board.rows and not board.asymmetric:
@@ -256,12 +262,14 @@ def _ordered(grid: Array, board: CircleGrid) -> Array | NotFound:
     if fitting:
         return upright(fitting)
     if mirrored:
-        return NotFound("the board is seen as in a mirror: switch off the mirroring of the camera or its software")
-    return NotFound("circles are there, but do not lie as on this board; check circles or acircles, columns and rows")
+        return NotFound("the picture is mirrored: switch off the mirroring of the camera or its software")
+    return NotFound(
+        "circles were found, but not arranged as on this board; check circles or acircles, columns and rows"
+    )
 
 
 def _goes_on(grid: Array, board: CircleGrid, blobs: Array) -> str:
-    """On which side more circles of the pattern follow: 'above', ...; empty where the grid ends."""
+    """Sides on which more circles of the pattern follow: 'above', ...; empty where the grid ends."""
     if len(blobs) == 0:
         return ""
     step = 2 if board.asymmetric else 1  # rows of the same kind
@@ -271,7 +279,7 @@ def _goes_on(grid: Array, board: CircleGrid, blobs: Array) -> str:
         "to the left": 2 * grid[:, 0] - grid[:, 1],
         "to the right": 2 * grid[:, -1] - grid[:, -2],
     }
-    if board.asymmetric:  # the row next to the last one, not the next of its kind
+    if board.asymmetric:  # the adjacent row, not the next one with the same shift
         sides["above"], sides["below"] = grid[1] + grid[0] - grid[2], grid[-2] + grid[-1] - grid[-3]
     limit = 0.25 * corner_refinement.spacing(grid)
     names = []
@@ -283,9 +291,9 @@ def _goes_on(grid: Array, board: CircleGrid, blobs: Array) -> str:
 
 
 def _by_big_dot(grid: Array, areas: Array, board: CircleGrid) -> Array | None:
-    """The grid turned so that a markedly larger corner circle comes first; None where there is no such circle.
+    """The grid turned so that a markedly larger corner circle comes first; None if there is no such circle.
 
-    On boards with unlike sides a large dot that only a mirror could bring to the first place comes last in the first
+    On boards with unequal sides, a large dot that could come first only by mirroring becomes the last one of the first
     row.
     """
     if board.asymmetric:
@@ -312,13 +320,13 @@ def _why_not(image: GreyImage, board: CircleGrid, blobs: Array) -> NotFound:
     wanted = board.columns * board.rows
     if len(blobs) > 3 * wanted + _STRAY or (len(blobs) >= wanted and _lattice_share(blobs) < _LATTICE):
         return NotFound(
-            f"no grid of circles: {len(blobs)} round dark blobs lie about without order; the board must lie wholly in"
-            " the picture, before a plain ground"
+            f"no grid of circles: {len(blobs)} round black blobs without a regular arrangement; the board must lie"
+            " wholly in the picture, before a plain background"
         )
     other = CircleGrid(board.columns, board.rows, board.spacing_m, not board.asymmetric)
     if _grid(image, other) is not None:
         return NotFound(
-            f"the circles lie {'in shifted rows' if other.asymmetric else 'in straight columns'}: write {other.kind}"
+            f"the circles are {'in shifted rows' if other.asymmetric else 'in straight columns'}: write {other.kind}"
             f" instead of {board.kind}"
         )
     for count in range(len(blobs), max(len(blobs) - 3, 8), -1):
@@ -331,9 +339,9 @@ def _why_not(image: GreyImage, board: CircleGrid, blobs: Array) -> NotFound:
                 )
     if len(blobs) < 0.5 * wanted:
         return NotFound(
-            f"no grid of circles: {len(blobs)} round dark blobs of {wanted}; the board must lie wholly in the picture"
+            f"no grid of circles: {len(blobs)} round black blobs of {wanted}; the board must lie wholly in the picture"
         )
     return NotFound(
-        f"no {board.columns}x{board.rows} grid among {len(blobs)} round dark blobs: a circle is hidden, in glare or"
-        " outside the picture, or the numbers of columns and rows are others"
+        f"no {board.columns}x{board.rows} grid among {len(blobs)} round black blobs: a circle is hidden, in glare or"
+        " outside the picture, or the numbers of columns and rows are wrong"
     )

@@ -1,9 +1,9 @@
-"""Chessboard corners to a hundredth of a pixel, and how sharp the edges between them are.
+"""Refinement of chessboard corners to a hundredth of a pixel, and the sharpness of the edges between them.
 
 Measured on rendered boards (640x480, 54 corners 22 to 52 px apart, blur sigma 0.5 to 2.5 px), RMS error per coordinate:
 cv2.findChessboardCornersSB with CALIB_CB_ACCURACY 0.03 to 0.18 px without noise and 0.04 to 0.13 px with noise of 4 DN;
-cv2.cornerSubPix in a window of 0.4 spacings 0.01 to 0.04 px and 0.03 to 0.07 px. Hence corners of every origin are
-refined here; how wide the window is matters more than how the corners were found.
+cv2.cornerSubPix in a window of 0.4 spacings 0.01 to 0.04 px and 0.03 to 0.07 px. Therefore corners from every detector
+are refined here; the width of the window matters more than the detector.
 """
 
 from __future__ import annotations
@@ -14,16 +14,16 @@ import numpy as np
 from calibration.boards.board_view import GreyImage
 from geometry.arrays import Array, Bools
 
-_REACH = 0.4  # half of the window, in distances of the nearest parallel edge: beyond 0.5 that edge comes in
-_MOST_PX = 20  # half of the window: more adds curved edges and time, and no accuracy
+_REACH = 0.4  # half of the window, in distances of the nearest parallel edge, which would be included from 0.5 on
+_MOST_PX = 20  # half of the window: a larger one includes curved edges and takes longer without being more accurate
 _STOP = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 60, 1e-4)
 
 
 def refined(image: GreyImage, grid: Array, known: Bools | None = None, reach: float = _REACH) -> Array:
-    """Corners (rows, columns, 2), px, moved to where four squares meet; those that stray keep nan.
+    """Corners (rows, columns, 2), px, refined to the point where four squares meet; nan if not converged.
 
-    known (rows, columns): which corners there are, None for all. reach: half of the window in distances of parallel
-    edges; smaller where something else is printed in the squares.
+    known (rows, columns): which corners exist, None for all. reach: half of the window in distances of parallel edges;
+    smaller if something else is printed in the squares.
     """
     rows, columns = grid.shape[:2]
     known = np.ones((rows, columns), dtype=bool) if known is None else known
@@ -45,7 +45,7 @@ def refined(image: GreyImage, grid: Array, known: Bools | None = None, reach: fl
 def edge_distance(grid: Array, known: Bools) -> Array:
     """Distance (rows, columns), px, of a corner to the nearest edge that does not pass through it; nan where unknown.
 
-    The height of the parallelogram of a corner's two neighbours; the smallest of up to four.
+    The height of the parallelogram spanned by a corner's two neighbours; the smallest of up to four.
     """
     g = np.where(known[..., None], grid, np.nan)
     out = np.full(g.shape[:2], np.nan)
@@ -73,9 +73,9 @@ def spacing(grid: Array) -> float:
 def edge_blur(image: GreyImage, grid: Array, reach: float = 0.4) -> tuple[float, float]:
     """Sigma, px, of the edges between neighbouring corners (rows, columns, 2), and their contrast, DN; nan if unknown.
 
-    Every edge gives a profile across its middle; the mean of all, which takes the noise out, is a step blurred by a
-    Gaussian whose steepest slope is contrast / (sigma sqrt(2 pi)). Taken off: the variance 1/6 px^2 of reading the
-    picture between its pixels.
+    Every edge gives a profile across its middle. Their mean, which suppresses noise, is a step blurred by a Gaussian
+    whose steepest slope is contrast / (sigma sqrt(2 pi)). The variance 1/6 px^2 of the interpolation between pixels is
+    subtracted.
     """
     pairs = np.concatenate(
         [
@@ -104,7 +104,7 @@ def edge_blur(image: GreyImage, grid: Array, reach: float = 0.4) -> tuple[float,
 
 
 def sampled(image: GreyImage, where: Array) -> Array:
-    """Grey values (..., ) between the pixels at (..., 2), bilinear; the border goes on outside."""
+    """Grey values (...) at (..., 2) by bilinear interpolation; outside, those of the border."""
     flat = np.nan_to_num(where, nan=-1.0).reshape(-1, 2).astype(np.float32)
     out = np.empty(len(flat))
     for first in range(0, len(flat), 30_000):  # cv2.remap's maps have at most 32767 rows

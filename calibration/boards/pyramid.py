@@ -1,4 +1,4 @@
-"""Smaller copies of a picture: boards are found there that are too large, blurred or noisy in the original."""
+"""Image pyramid: in smaller copies boards are found that are too large, blurred or noisy in the original."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ import numpy as np
 from calibration.boards.board_view import GreyImage
 from geometry.arrays import Array
 
-_LEAST_PX = 250  # longer side: smaller copies show no board
+_LEAST_PX = 250  # longer side: boards cannot be found in smaller copies
 
 
 def scales(image: GreyImage) -> list[float]:
-    """1, 1/2, 1/4, 1/8, as far as they are worth a look."""
+    """Scales of the pyramid: 1, 1/2, 1/4, 1/8, as far as the copies are large enough."""
     return [s for s in (1.0, 0.5, 0.25, 0.125) if s == 1.0 or s * max(image.shape) >= _LEAST_PX]
 
 
 def scaled(image: GreyImage, scale: float) -> GreyImage:
-    """The picture, smaller by area means."""
+    """The picture reduced by averaging over areas."""
     if scale == 1.0:
         return image
     size = (int(image.shape[1] * scale), int(image.shape[0] * scale))
@@ -25,5 +25,5 @@ def scaled(image: GreyImage, scale: float) -> GreyImage:
 
 
 def at_full_size(pixels: Array, scale: float) -> Array:
-    """Pixels of the smaller copy in the picture itself. The middle of the first 2x2 block is at 0.5."""
+    """Pixel coordinates of a smaller copy in the original. The centre of the first 2x2 block is at 0.5."""
     return (pixels + 0.5) / scale - 0.5

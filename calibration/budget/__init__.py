@@ -1,1 +1,1 @@
-"""What errors to expect before a rig is built."""
+"""Expected errors and error budget of a rig before it is built."""

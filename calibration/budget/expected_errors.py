@@ -1,9 +1,9 @@
-"""The errors that the calibrations of a rig can be expected to leave, before any has been made.
+"""Expected calibration errors of a rig that has not been built yet.
 
-Each camera is taken to be calibrated in the usual order: its lens with a board, then its pose by resection on surveyed
-dots of its own screen, with the lens as it was found. So an error of the lens comes with the pose that hides most of
-it: of what a wrong principal point does to the attitude, a fortieth remains. Screens, beams and lenses of different
-cameras err independently. Source: ours; propagation to first order.
+The usual procedure is assumed: the lens of each camera is calibrated with a board, then the camera's pose by resection
+on surveyed dots of its own screen, with the calibrated lens. The error of a lens is therefore correlated with that of
+the pose, which compensates for most of it: of the effect of a wrong principal point on the attitude, a fortieth
+remains. Screens, beams and lenses of different cameras have independent errors. Source: ours; first-order propagation.
 """
 
 from __future__ import annotations
@@ -30,22 +30,22 @@ from geometry.uncertainty.rig_parameters import (
     split,
 )
 
-_FEWEST_DOTS = 4  # below it the resection is not tried: three dots fix a pose four ways
+_FEWEST_DOTS = 4  # required for a resection: three dots allow four poses
 
 
 @dataclass(frozen=True, slots=True)
 class ExpectedErrors:
-    """Standard deviations, each what a careful calibration reaches."""
+    """Standard deviations reached by a careful calibration."""
 
     focal_relative: float = 2e-4  # of fx and of fy: 25 tilted boards with corners to 0.1 px
     centre_px: float = 0.3  # of cx and of cy: the same boards
-    distortion_px: float = 0.2  # all distortion numbers together, at the picture's corners: the same boards
-    dots: int = 20  # on a screen, evenly over the camera's picture, for the camera's pose
+    distortion_px: float = 0.2  # all distortion coefficients together, at the picture's corners: the same boards
+    dots: int = 20  # on a screen, evenly spread over the camera's picture, for the camera's pose
     dot_px: float = 0.1  # of a dot's centre in the picture
-    dot_survey_m: float = 0.0002  # of a dot's place, per axis: total station
-    camera_position_m: float = 0.002  # per axis, only for a camera whose screen gives no dots: by measuring tape and
-    camera_rotation_deg: float = 0.05  # ... a board
-    screen_position_m: float = 0.0001  # per axis: a plane through 20 surveyed dots of 0.2 mm, and some flatness error
+    dot_survey_m: float = 0.0002  # of a dot's position, per axis: total station
+    camera_position_m: float = 0.002  # per axis, only for a camera without dots on its screen: by measuring tape
+    camera_rotation_deg: float = 0.05  # likewise: by a board
+    screen_position_m: float = 0.0001  # per axis: a plane through 20 surveyed dots of 0.2 mm, with some flatness error
     screen_rotation_deg: float = 0.004  # per axis: the same dots over 3 m
     beam_direction_arcsec: float = 15.0  # per axis across the beam: 40 stand poses, spots to 0.2 mm
     beam_point_m: float = 0.0001  # per axis across the beam: the same
@@ -54,32 +54,32 @@ class ExpectedErrors:
 def expected_errors(
     rig: Rig, expected: ExpectedErrors, stated: RigCovariance | None = None, whole: bool = False
 ) -> tuple[RigErrors, dict[str, str]]:
-    """The errors of a rig's numbers, and for each group where it is from: `rig file` or `assumed`.
+    """The errors of a rig's parameters, and the source of each group: `rig file` or `assumed`.
 
-    stated: what the rig file says. A group of which it says anything is taken from there as it stands; the others are
-    assumed, unless it is the whole truth.
+    stated: covariance in the rig file. A group with any parameter in it is taken from there; the others are assumed,
+    unless the stated covariance is complete (whole).
     """
     names = rig_names(rig)
     if stated is not None:
         names += tuple(n for n in stated.names if n not in names)
     at = {name: i for i, name in enumerate(names)}
     p = len(names)
-    told = {group_of(n) for n in stated.names} if stated else set()
+    stated_groups = {group_of(n) for n in stated.names} if stated else set()
     groups = {g: np.zeros((p, p)) for g in GROUPS}
     if stated is not None:
-        for group in told:
+        for group in stated_groups:
             own = [i for i, n in enumerate(stated.names) if group_of(n) == group]
             place = [at[stated.names[i]] for i in own]
             groups[group][np.ix_(place, place)] = stated.matrix[np.ix_(own, own)]
     if not whole:
         for members, C in _alone(rig, expected):
-            if group_of(members[0]) not in told:
+            if group_of(members[0]) not in stated_groups:
                 place = [at[n] for n in members]
                 groups[group_of(members[0])][np.ix_(place, place)] = C
     joint = _joint(stated, at, p) if stated else np.zeros((p, p))
-    # How the numbers move together with an error of one of them: by itself, but a lens takes its camera's pose along.
+    # Joint effect of one parameter's error: the parameter itself and, for a lens, the pose of its camera.
     follow = np.eye(p)
-    if not whole and CAMERA_POSES not in told:
+    if not whole and CAMERA_POSES not in stated_groups:
         for name, camera in rig.cameras.items():
             lens_at = [at[f"cameras.{name}.{n}"] for n in (*PINHOLE, *distortion_names(camera))]
             pose_at = [at[f"cameras.{name}.{n}"] for n in POSE]
@@ -101,11 +101,11 @@ def expected_errors(
         move_sigmas=sigmas,
         things=things,
     )
-    return errors, {g: "rig file" if g in told else "assumed" for g in kept}
+    return errors, {g: "rig file" if g in stated_groups else "assumed" for g in kept}
 
 
 def _things(names: Sequence[str], groups: dict[str, Array], follow: Array) -> list[tuple[str, str, Array]]:
-    """The groups' covariances cut up by camera, screen and beam; lenses take their cameras' poses along."""
+    """The groups' covariances split by camera, screen and beam; those of lenses include their effect on the pose."""
     owner = np.array([".".join(split(n)[:2]) for n in names])
     out = []
     for group, C in groups.items():
@@ -118,7 +118,7 @@ def _things(names: Sequence[str], groups: dict[str, Array], follow: Array) -> li
 
 
 def _joint(stated: RigCovariance, at: dict[str, int], p: int) -> Array:
-    """What a stated covariance says of numbers of different groups together (p, p)."""
+    """Covariance between parameters of different groups (p, p)."""
     group = np.array([group_of(n) for n in stated.names])
     place = [at[n] for n in stated.names]
     out = np.zeros((p, p))
@@ -127,7 +127,7 @@ def _joint(stated: RigCovariance, at: dict[str, int], p: int) -> Array:
 
 
 def _alone(rig: Rig, expected: ExpectedErrors) -> list[tuple[list[str], Array]]:
-    """Names and covariances of what is independent of all else, camera poses as without dots."""
+    """Names and covariances of independent parameters, with camera poses as without dots."""
     parts: list[tuple[list[str], Array]] = []
     placed = [expected.camera_position_m] * 3 + [float(np.deg2rad(expected.camera_rotation_deg))] * 3
     for name, camera in rig.cameras.items():
@@ -141,7 +141,7 @@ def _alone(rig: Rig, expected: ExpectedErrors) -> list[tuple[list[str], Array]]:
     parts += [([f"screens.{name}.{n}" for n in POSE], np.diag(np.square(placed))) for name in rig.screens]
     direction = np.deg2rad(expected.beam_direction_arcsec / 3600)
     for name, beam in rig.beams.items():
-        # Along the beam neither means anything: the covariances are flat there.
+        # Errors along the beam have no effect: the covariances are singular in this direction.
         across = np.eye(3) - np.outer(beam.direction, beam.direction)
         parts.append(([f"beams.{name}.{n}" for n in DIRECTION], direction**2 * across))
         parts.append(([f"beams.{name}.{n}" for n in POINT], expected.beam_point_m**2 * across))
@@ -149,9 +149,9 @@ def _alone(rig: Rig, expected: ExpectedErrors) -> list[tuple[list[str], Array]]:
 
 
 def _distortion_sigmas(camera: Camera, at_corner_px: float) -> Array:
-    """A sigma for each distortion number (d,), so that all together move the picture's corners by so many px.
+    """A sigma for each distortion coefficient (d,), which together displace the picture's corners by this many px.
 
-    Each has the same share: an independent sigma of k3 itself would mean nothing to anybody.
+    Each has the same share: an independent sigma of, for instance, k3 would have no practical meaning.
     """
     count = len(camera.distortion)
     if count == 0:
@@ -159,7 +159,7 @@ def _distortion_sigmas(camera: Camera, at_corner_px: float) -> Array:
     corners = _picture_grid(camera, 2, 2, inset=0.0)
     _, rays = camera.rays(corners)
     good = np.isfinite(rays).all(axis=-1)
-    # Where the lens model ends before the corners, its own optical axis says nothing: take what half-way out says.
+    # If the lens model is not valid at the corners, its effect is evaluated half-way to them.
     half_way = np.append(0.25 * np.array(camera.image_size_px) / pinhole_numbers(camera)[:2], 1.0)[None]
     points = rays[good] @ camera.camera_from_world.rotation.T if good.any() else half_way
     projected = _projected(camera, points)
@@ -170,9 +170,9 @@ def _distortion_sigmas(camera: Camera, at_corner_px: float) -> Array:
 def _resection(camera: Camera, screen: Screen, expected: ExpectedErrors) -> tuple[Array, Array] | None:
     """The covariance (6, 6) of a camera's pose from dots of its screen, and d(pose)/d(lens) (6, 4 + d).
 
-    None where the camera sees too little of the screen.
+    None if the camera sees too little of the screen.
     """
-    points = _dots(camera, screen, expected)
+    points = dots_on_screen(camera, screen, expected)
     if len(points) < _FEWEST_DOTS:
         return None
     in_camera = camera.camera_from_world.apply(points)
@@ -193,7 +193,7 @@ def _resection(camera: Camera, screen: Screen, expected: ExpectedErrors) -> tupl
     return symmetric(noise), -noise @ np.einsum("mia,mij,mjb->ab", A, W, B)
 
 
-def _dots(camera: Camera, screen: Screen, expected: ExpectedErrors) -> Array:
+def dots_on_screen(camera: Camera, screen: Screen, expected: ExpectedErrors) -> Array:
     """Points (m, 3) of the screen, in world, spread over the camera's picture."""
     columns = max(round(float(np.sqrt(1.25 * expected.dots))), 1)
     rows = max(round(expected.dots / columns), 1)
@@ -207,7 +207,7 @@ def _dots(camera: Camera, screen: Screen, expected: ExpectedErrors) -> Array:
 
 
 def _picture_grid(camera: Camera, columns: int, rows: int, inset: float) -> Array:
-    """Pixels (columns * rows, 2) evenly over a picture, from `inset` of its size inside the edges."""
+    """Pixels (columns * rows, 2) on a regular grid, from `inset` of the picture's size inside the edges."""
     width, height = camera.image_size_px
     u = np.linspace(inset * width, (1 - inset) * width, columns) - 0.5
     v = np.linspace(inset * height, (1 - inset) * height, rows) - 0.5

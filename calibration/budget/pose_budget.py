@@ -1,10 +1,10 @@
-"""What a pose measured with a rig would be known to, and which error makes how much of it: noise, and each calibration.
+"""Error budget of a pose measured with a rig: noise, and each group of calibration errors.
 
-For designing a rig before it stands. The pose is taken to be solved as geometry/pose_solver/gauss_newton.py does it, by
-least squares with the spots' noise and the calibration's errors weighed together: with J = d(pixels)/d(pose), S =
-d(pixels)/d(rig) and the rig's covariance C, the pixels err by V = sigma^2 I + S C S^T, the solution is G = (J^T V^-1
-J)^-1 J^T V^-1, and the pose errs by G of whatever the pixels err by. Source: ours; generalised least squares, error
-propagation to first order.
+For the design of a rig. The pose is estimated as in geometry/pose_solver/gauss_newton.py, by least squares with the
+spots' noise and the calibration's errors weighted together: with J = d(pixels)/d(pose), S = d(pixels)/d(rig) and the
+rig's covariance C, the pixels have the covariance V = sigma^2 I + S C S^T, the estimator is
+G = (J^T V^-1 J)^-1 J^T V^-1, and the pose error is G times the error of the pixels. Source: ours; generalised least
+squares, first-order error propagation.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ GROUPS = (INTRINSICS, CAMERA_POSES, SCREEN_POSES, SCREEN_SHAPES, BEAM_DIRECTIONS
 
 
 def group_of(name: str) -> str:
-    """Which of `GROUPS` a rig's parameter belongs to."""
+    """The group of `GROUPS` that a rig's parameter belongs to."""
     kind, _, parameter = split(name)
     if kind == "cameras":
         return CAMERA_POSES if parameter in POSE else INTRINSICS
@@ -38,39 +38,39 @@ def group_of(name: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class RigErrors:
-    """What the p numbers of a rig are known to, and which sources of error make it."""
+    """Uncertainty of the p parameters of a rig, by source."""
 
     names: tuple[str, ...]  # (p,) as in geometry/uncertainty/rig_parameters.py
     covariance: Array  # (p, p)
-    groups: Mapping[str, Array]  # by group (p, p): its share of the covariance; what joins groups is in none of them
-    moves: Array  # (p, q) how the numbers move together when one of q errors is one sigma
+    groups: Mapping[str, Array]  # by group (p, p): its part of the covariance; cross-covariance is not included
+    moves: Array  # (p, q) joint change of the parameters by one sigma of each of q errors
     move_names: tuple[str, ...]  # (q,)
     move_sigmas: Array  # (q,) in the units of the names
-    things: Sequence[tuple[str, str, Array]]  # `cameras.left`, its group, (p, p): the groups' shares thing by thing
+    things: Sequence[tuple[str, str, Array]]  # `cameras.left`, its group, (p, p): the groups' parts by device
 
 
 @dataclass(frozen=True, slots=True)
 class Budget:
-    """Of k poses. Covariances are of [dt (m, world), dtheta (rad, body)]; nan where the pose is not observable."""
+    """Error budgets of k poses. Covariances are of [dt (m, world), dtheta (rad, body)]; nan if not observable."""
 
     pixels: Array  # (k, n, 2) of the n views; nan where there is no projection
-    seen: Bools  # (k, n) in the picture, clear of its edge
+    seen: Bools  # (k, n) in the picture, not at its edge
     observable: Bools  # (k,)
-    condition: Array  # (k,) largest over least singular value of J, each column at length 1; inf where not observable
+    condition: Array  # (k,) condition number of J with columns of length 1; inf where not observable
     total: Array  # (k, 6, 6)
     noise: Array  # (k, 6, 6) from the spots' noise
-    groups: Array  # (k, g, 6, 6) from each group alone; what joins groups is in the total only
-    effects: Array  # (k, 6, q) what one sigma of each error alone does
-    things: Array  # (k, t, 6, 6) from each thing's errors of one group alone
+    groups: Array  # (k, g, 6, 6) from each group alone; cross-covariance of groups is in the total only
+    effects: Array  # (k, 6, q) effect of one sigma of each error alone
+    things: Array  # (k, t, 6, 6) from each device's errors of one group alone
 
 
 class PoseBudget:
-    """Asked for poses, answers with budgets. Prepared once per rig and its errors."""
+    """Computes the budgets of poses for one rig and its errors."""
 
     def __init__(
         self, model: SpotModel, sensitivity: Sensitivity, errors: RigErrors, sigma_px: float, edge_px: float
     ) -> None:
-        """sigma_px: of a spot's coordinates. edge_px: a spot nearer to its picture's edge does not count as seen.
+        """sigma_px: of a spot's coordinates. edge_px: distance from the edge below which a spot is not visible.
 
         sensitivity: of the errors' names, in their order.
         """
@@ -78,12 +78,12 @@ class PoseBudget:
         self._sigma_px, self._edge_px = sigma_px, edge_px
 
     def of(self, poses: Pose) -> Budget:
-        """The budgets of a stack (k,) of poses."""
+        """The budgets of a batch (k,) of poses."""
         derivatives = self._model.derivatives(poses)
         pixels = derivatives.pixels
         seen: Bools = in_picture(pixels, self._model.image_size_px, -self._edge_px)
         k, n = seen.shape
-        # A view that is not seen says nothing: its rows vanish, and its own noise stays as a harmless 1.
+        # A view without a visible spot does not contribute: its rows are 0, and its noise is 1.
         J = np.where(seen[..., None, None], derivatives.pose, 0.0).reshape(k, 2 * n, 6) / self._sigma_px
         S = np.where(seen[..., None, None], self._sensitivity.of(derivatives), 0.0).reshape(k, 2 * n, -1)
         S = S / self._sigma_px
@@ -122,7 +122,7 @@ def _carried(K: Array, covariances: Sequence[Array]) -> Array:
 
 
 def _rank(J: Array) -> tuple[Bools, Array]:
-    """Whether Jacobians (k, 2n, 6) have full rank, by the solver's own tolerance; and their scaled condition (k,)."""
+    """Whether Jacobians (k, 2n, 6) have full rank, with the solver's tolerance; and their scaled condition (k,)."""
     H = np.swapaxes(J, -1, -2) @ J
     eigenvalues = np.linalg.eigvalsh(symmetric(H))
     observable: Bools = eigenvalues[:, 0] > RANK_TOLERANCE**2 * eigenvalues[:, -1]
@@ -134,7 +134,7 @@ def _rank(J: Array) -> tuple[Bools, Array]:
 
 
 def worst_direction(covariance: Array) -> tuple[Array, Array]:
-    """The largest sigma (k,) of covariances (k, 3, 3), and its direction (k, 3), unit; nan stay nan.
+    """The largest sigma (k,) of covariances (k, 3, 3), and its direction (k, 3), a unit vector; nan for nan.
 
     The direction's largest coordinate is positive.
     """

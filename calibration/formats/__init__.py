@@ -1,1 +1,1 @@
-"""Other programs' camera files: text or parsed YAML to camera models and back. Nothing that is read is executed."""
+"""Camera files of other programs: text or parsed YAML to camera models and back. File contents are never executed."""

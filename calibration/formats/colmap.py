@@ -1,7 +1,7 @@
-"""COLMAP's cameras.txt: a line for each camera: CAMERA_ID MODEL WIDTH HEIGHT PARAMS[].
+"""COLMAP's cameras.txt, with one line per camera: CAMERA_ID MODEL WIDTH HEIGHT PARAMS[].
 
-In COLMAP the centre of the top-left pixel is (0.5, 0.5), in OpenCV (0, 0): a principal point is 0.5 px more there in
-both coordinates, and is changed here on the way in and out. Source: COLMAP's documentation, "Output Format" and
+In COLMAP the centre of the top-left pixel is (0.5, 0.5), in OpenCV (0, 0). Principal points are therefore larger by
+0.5 px in COLMAP, and are converted when reading and writing. Source: COLMAP's documentation, "Output Format" and
 src/colmap/sensor/models.h (the models and the order of their parameters).
 """
 
@@ -25,7 +25,7 @@ from geometry.camera import FISHEYE, PERSPECTIVE
 NAME = "colmap"
 HOLDS_MANY = True
 PIXEL_CENTRE = 0.5  # px: COLMAP's coordinate of the centre of pixel 0
-# Whether fx and fy are one number, how many distortion numbers follow cx, cy, and the lens.
+# Whether there is a single focal length, number of distortion coefficients after cx, cy, and the lens.
 _MODELS = {
     "SIMPLE_PINHOLE": (True, 0, PERSPECTIVE),
     "PINHOLE": (False, 0, PERSPECTIVE),
@@ -41,7 +41,7 @@ _WRITTEN = {(PERSPECTIVE, 0): "PINHOLE", (PERSPECTIVE, 4): "OPENCV", (PERSPECTIV
 
 
 def looks_like(text: str) -> bool:
-    """Whether the first line that is no comment has the form of a camera's."""
+    """Whether the first line that is not a comment has the form of a camera's line."""
     for line in text.splitlines():
         words = line.split()
         if words and not words[0].startswith("#"):
@@ -50,7 +50,11 @@ def looks_like(text: str) -> bool:
 
 
 def read(text: str, name: str) -> Read:
-    """The cameras of a file, called by their numbers; `name` is not needed. Raises FormatError."""
+    """The cameras of a file, named by their numbers; `name` is not used.
+
+    Raises:
+        FormatError: the file is not valid.
+    """
     cameras: list[CameraModel] = []
     for i, line in enumerate(text.splitlines(), start=1):
         words = line.split()
@@ -70,7 +74,7 @@ def _camera(words: list[str], where: str) -> CameraModel:
         raise FormatError(f"{where}: expected `CAMERA_ID MODEL WIDTH HEIGHT PARAMS`, got {' '.join(words)!r}")
     identity, model, *rest = words
     if model not in _MODELS:
-        raise FormatError(f"{where}: expected one of {', '.join(_MODELS)}, got {model}; COLMAP can refine one of those")
+        raise FormatError(f"{where}: expected one of {', '.join(_MODELS)}, got {model}; COLMAP can convert to these")
     one_focal, n_distortion, lens = _MODELS[model]
     try:
         values = [float(w) for w in rest]
@@ -95,7 +99,11 @@ def _camera(words: list[str], where: str) -> CameraModel:
 
 
 def write(cameras: Sequence[CameraModel]) -> Written:
-    """The file of some cameras, numbered from 1 in their order. Raises FormatError."""
+    """The file of several cameras, numbered from 1 in their order.
+
+    Raises:
+        FormatError: the format cannot hold a lens.
+    """
     lines = [
         "# Camera list with one line of data per camera:",
         "#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]",

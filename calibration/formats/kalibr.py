@@ -1,8 +1,8 @@
-"""Kalibr's camchain.yaml: one or several pinhole cameras, each with its pose against the one before.
+"""Kalibr's camchain.yaml: one or several pinhole cameras, each with its pose relative to the previous one.
 
-Source: Kalibr's wiki, "Yaml formats" and "Supported models". radtan is OpenCV's k1, k2, p1, p2, equidistant its
-fisheye model. As mrcal does, a T_cn_cnm1 of cam0 is read and written as its pose against the common reference; Kalibr
-itself has none there and starts at cam0.
+Source: Kalibr's wiki, "Yaml formats" and "Supported models". radtan is OpenCV's k1, k2, p1, p2, and equidistant its
+fisheye model. As in mrcal, a T_cn_cnm1 of cam0 is its pose relative to the common reference; Kalibr itself has none
+there, its reference is cam0.
 """
 
 from __future__ import annotations
@@ -37,15 +37,17 @@ _KNOWN = {
     "camera_model", "intrinsics", "distortion_model", "distortion_coeffs", "resolution", "rostopic", "T_cn_cnm1",
     "cam_overlaps",
 }  # fmt: skip
-# How far a rotation's rows may be from orthonormal: what six written digits allow.
+# Deviation of a rotation's rows from orthonormal that six written digits cause.
 ROTATION_TOLERANCE = 1e-5
 
 
 def read(content: Mapping[str, Any], name: str) -> Read:
-    """The cameras of a parsed camchain, in the chain's order.
+    """The cameras of a parsed camchain, in the order of the chain.
 
-    A camera is called as its rostopic says (`/left/image_raw` is left), else cam0, cam1, ...; `name` is not needed.
-    Raises FormatError.
+    A camera is named by its rostopic (`/left/image_raw` gives left), otherwise cam0, cam1, ...; `name` is not used.
+
+    Raises:
+        FormatError: the file is not valid.
     """
     keys = sorted((k for k in content if re.fullmatch(r"cam\d+", k)), key=lambda k: int(k[3:]))
     if not keys:
@@ -65,7 +67,7 @@ def read(content: Mapping[str, Any], name: str) -> Read:
         elif i == 0:
             poses.append(Pose.identity() if several else None)
         else:
-            raise FormatError(f"{key}.T_cn_cnm1: expected the pose against {keys[i - 1]}, got nothing; add it")
+            raise FormatError(f"{key}.T_cn_cnm1: expected the pose relative to {keys[i - 1]}, got nothing; add it")
     cameras = tuple(_camera(k, n, b, p) for k, n, b, p in zip(keys, names, blocks, poses, strict=True))
     ignored = sorted({f for b in blocks for f in b} - _KNOWN)
     notes = (f"not read: {', '.join(ignored)} (beampose has no IMU)",) if ignored else ()
@@ -105,13 +107,17 @@ def _pose(value: object, where: str) -> Pose:
 
 
 def write(cameras: Sequence[CameraModel]) -> Written:
-    """The camchain of some cameras, in their order. Raises FormatError."""
+    """The camchain of several cameras, in their order.
+
+    Raises:
+        FormatError: the format cannot hold a lens, or a camera of several has no pose.
+    """
     placed = [c.camera_from_reference is not None for c in cameras]
     if len(cameras) > 1 and not all(placed):
         missing = [c.name for c, p in zip(cameras, placed, strict=True) if not p]
         raise FormatError(
-            f"a camchain needs every camera's pose against the one before; {', '.join(missing)} has none:"
-            " write one camera to a file"
+            f"a camchain contains every camera's pose relative to the previous one; {', '.join(missing)} has none:"
+            " write each camera to a file of its own"
         )
     lines: list[str] = []
     before: Pose | None = None

@@ -1,7 +1,8 @@
-"""One camera as the exchange formats see it, and what each format can hold.
+"""One camera as represented by the exchange formats, and the lenses that each format can hold.
 
-Lenses are OpenCV's: the perspective model with 0, 4, 5, 8, 12 or 14 numbers (k1, k2, p1, p2, k3, k4, k5, k6, s1 ... s4,
-tau_x, tau_y), or the fisheye model with k1 ... k4. Pixels are OpenCV's too: (0, 0) is the centre of the top-left pixel.
+Lenses are OpenCV's: the perspective model with 0, 4, 5, 8, 12 or 14 coefficients (k1, k2, p1, p2, k3, k4, k5, k6,
+s1 ... s4, tau_x, tau_y), or the fisheye model with k1 ... k4. Pixels are OpenCV's too: (0, 0) is the centre of the
+top-left pixel.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from geometry.camera import FISHEYE, LENSES, PERSPECTIVE
 from geometry.lens import ALLOWED_LENGTHS
 from geometry.pose import Pose
 
-# The lengths of distortion that a format can write, perspective and fisheye.
+# Numbers of distortion coefficients that a format can hold, perspective and fisheye.
 ROOM: Mapping[str, Mapping[str, tuple[int, ...]]] = {
     "opencv": {PERSPECTIVE: (4, 5, 8, 12, 14), FISHEYE: (4,)},
     "kalibr": {PERSPECTIVE: (4,), FISHEYE: (4,)},
@@ -30,19 +31,19 @@ ROOM: Mapping[str, Mapping[str, tuple[int, ...]]] = {
 
 
 class FormatError(ValueError):
-    """What a file should have had and what it has, or what a format cannot hold. The message starts with the field."""
+    """A file is not valid, or a format cannot hold a camera. The message starts with the field."""
 
 
 @dataclass(frozen=True, slots=True)
 class CameraModel:
-    """A camera's lens, and where it stands if the file tells."""
+    """A camera's lens, and its pose if the file contains it."""
 
     name: str
     image_size_px: tuple[int, int]  # width, height
     pinhole: tuple[float, float, float, float]  # fx, fy, cx, cy, px
     distortion: tuple[float, ...] = ()
     lens: str = PERSPECTIVE
-    camera_from_reference: Pose | None = None  # the reference is whatever the file's cameras have in common
+    camera_from_reference: Pose | None = None  # the reference is common to the cameras of a file
 
     def __post_init__(self) -> None:
         where = f"camera {self.name!r}"
@@ -57,12 +58,12 @@ class CameraModel:
         allowed = (0, 4) if self.lens == FISHEYE else ALLOWED_LENGTHS
         if len(self.distortion) not in allowed:
             words = ", ".join(map(str, allowed[:-1])) + f" or {allowed[-1]}"
-            raise FormatError(f"{where}: expected {words} distortion numbers ({self.lens}), got {len(self.distortion)}")
+            raise FormatError(f"{where}: expected {words} coefficients ({self.lens}), got {len(self.distortion)}")
 
 
 @dataclass(frozen=True, slots=True)
 class Read:
-    """What a file holds. The notes say what of it is not in the models, a line each."""
+    """The contents of a file. The notes list what was not read, one per line."""
 
     cameras: tuple[CameraModel, ...]
     notes: tuple[str, ...] = ()
@@ -70,17 +71,19 @@ class Read:
 
 @dataclass(frozen=True, slots=True)
 class Written:
-    """A file's text. The notes say what of the cameras is not in it, a line each."""
+    """The text of a file. The notes list what was not written, one per line."""
 
     text: str
     notes: tuple[str, ...] = ()
 
 
 def fitted(camera: CameraModel, format_name: str) -> tuple[float, ...]:
-    """A camera's distortion in the length that it has or, where a format lacks that, the least that loses nothing.
+    """A camera's distortion, with as many coefficients as it has or as the format can hold without loss.
 
-    Zeros are added or taken away at the end, as they change nothing. Raises FormatError, naming the formats that
-    could hold this lens.
+    Zeros are added or removed at the end, which does not change the lens.
+
+    Raises:
+        FormatError: the format cannot hold this lens; the message lists the formats that can.
     """
     needed, room = len(significant(camera.distortion)), ROOM[format_name][camera.lens]
     if len(camera.distortion) in room:
@@ -90,13 +93,13 @@ def fitted(camera: CameraModel, format_name: str) -> tuple[float, ...]:
             return (*camera.distortion, *(0.0,) * length)[:length]
     others = [name for name, room in ROOM.items() if any(length >= needed for length in room[camera.lens])]
     raise FormatError(
-        f"camera {camera.name!r}: {format_name} cannot hold this lens ({camera.lens}, {needed} distortion numbers);"
+        f"camera {camera.name!r}: {format_name} cannot hold this lens ({camera.lens}, {needed} coefficients);"
         f" {', '.join(others)} or beampose can"
     )
 
 
 def significant(distortion: Sequence[float]) -> tuple[float, ...]:
-    """The numbers up to the last that is not zero."""
+    """The coefficients up to the last one that is not zero."""
     values = list(distortion)
     while values and values[-1] == 0:
         values.pop()
@@ -104,23 +107,27 @@ def significant(distortion: Sequence[float]) -> tuple[float, ...]:
 
 
 def lost_poses(cameras: Sequence[CameraModel], format_name: str) -> tuple[str, ...]:
-    """A note where cameras have poses that a format has no place for."""
+    """A note if cameras have poses, which the format cannot hold."""
     lost = [c.name for c in cameras if c.camera_from_reference is not None]
-    return (f"{format_name} has no place for a pose: where {', '.join(lost)} stands is left out",) if lost else ()
+    return (f"{format_name} cannot hold poses: the pose of {', '.join(lost)} is not written",) if lost else ()
 
 
 # Parts of files ---------------------------------------------------------------------------------------------------
 
 
 def number(value: object, where: str) -> float:
-    """A finite number. Raises FormatError naming the field."""
+    """A finite number.
+
+    Raises:
+        FormatError: it is not one; the message starts with the field. The same holds for the functions below.
+    """
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise FormatError(f"{where}: expected a finite number, got {shown(value)}")
     return float(value)
 
 
 def numbers(value: object, where: str, count: int | None = None) -> tuple[float, ...]:
-    """A list of finite numbers, so many if told."""
+    """A list of finite numbers, with `count` entries unless None."""
     if not isinstance(value, list | tuple):
         words = "a list of numbers" if count is None else f"a list of {count} numbers"
         raise FormatError(f"{where}: expected {words}, got {shown(value)}")
@@ -130,7 +137,7 @@ def numbers(value: object, where: str, count: int | None = None) -> tuple[float,
 
 
 def picture_size(width: object, height: object, where: str) -> tuple[int, int]:
-    """Width and height, px, as whole numbers."""
+    """Width and height, px, as integers."""
     sizes = [number(v, where) for v in (width, height)]
     if any(v != int(v) or v < 1 for v in sizes):
         raise FormatError(f"{where}: expected a width and a height in whole pixels, got {sizes}")
@@ -161,20 +168,20 @@ def matrix(value: object, where: str) -> Array:
 
 
 def pinhole_of(K: Array, where: str) -> tuple[float, float, float, float]:
-    """fx, fy, cx, cy of a camera matrix (3, 3) without skew; nine numbers in a row are taken for one."""
+    """fx, fy, cx, cy of a camera matrix (3, 3) without skew, or of its nine entries in a row."""
     if K.size != 9:
         raise FormatError(f"{where}: expected a 3 x 3 matrix, got {' x '.join(map(str, K.shape))}")
     K = K.reshape(3, 3)
     rest = np.array([K[0, 1], K[1, 0], K[2, 0], K[2, 1], K[2, 2] - 1])
     if np.any(rest != 0):
         raise FormatError(
-            f"{where}: expected [fx, 0, cx, 0, fy, cy, 0, 0, 1], got {K.ravel().tolist()}; a skew has no place here"
+            f"{where}: expected [fx, 0, cx, 0, fy, cy, 0, 0, 1], got {K.ravel().tolist()}; skew is not supported"
         )
     return float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
 
 
 def shown(value: object) -> str:
-    """A value as a message shows it: short."""
+    """A value as shown in a message, shortened."""
     if value is None:
         return "nothing"
     text = repr(value)
@@ -182,7 +189,7 @@ def shown(value: object) -> str:
 
 
 def exact(value: float) -> str:
-    """A number's text that reads back to the same bits, and that YAML 1.1 takes for a number: `1.0e-05`."""
+    """The shortest text of a number that reads back to the same bits and is a number in YAML 1.1: `1.0e-05`."""
     text = repr(float(value))
     if "e" in text and "." not in text:
         text = text.replace("e", ".0e")
@@ -195,5 +202,5 @@ def exact_list(values: Sequence[float] | Array) -> str:
 
 
 def quoted(text: str) -> str:
-    """A text in double quotes, as YAML and JSON read it."""
+    """A text in double quotes, valid in YAML and JSON."""
     return json.dumps(text, ensure_ascii=False)

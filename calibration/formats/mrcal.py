@@ -1,8 +1,8 @@
-"""mrcal's .cameramodel: a Python-like dictionary of literals, read as such and never executed.
+"""mrcal's .cameramodel: a Python-like dictionary of literals, parsed and never executed.
 
-The lens models that are OpenCV's are read and written: LENSMODEL_PINHOLE and LENSMODEL_OPENCV4, 5, 8 and 12, under the
-current and the older keys. The pose is `rt_cam_ref` (`extrinsics` in older files): a rotation vector, rad, and a
-translation, m, which take the reference's coordinates to the camera's. mrcal's pixels are OpenCV's. Source: mrcal,
+Reads and writes the lens models of OpenCV: LENSMODEL_PINHOLE and LENSMODEL_OPENCV4, 5, 8 and 12, under the current and
+the older keys. The pose is `rt_cam_ref` (`extrinsics` in older files): a rotation vector, rad, and a translation, m,
+from the reference's coordinates to the camera's. mrcal's pixels are OpenCV's. Source: mrcal,
 "Camera model representation in memory and on disk" and "Lens models".
 """
 
@@ -43,7 +43,11 @@ def looks_like(text: str) -> bool:
 
 
 def read(text: str, name: str) -> Read:
-    """The camera of a file, under this name, since the file gives none. Raises FormatError."""
+    """The camera of a file, which gets this name because the file contains none.
+
+    Raises:
+        FormatError: the file is not valid.
+    """
     content = _dictionary(text)
     model = next((content[k] for k in _LENS_KEYS if k in content), None)
     lens = str(model).replace("DISTORTION_NONE", _MODELS[0]).replace("DISTORTION_", "LENSMODEL_")
@@ -72,7 +76,7 @@ def read(text: str, name: str) -> Read:
 
 
 def _dictionary(text: str) -> dict[str, Any]:
-    """The literals of a file. Anything that would have to be run is a mistake."""
+    """The literals of a file. Expressions are an error."""
     try:
         content = ast.literal_eval(text.strip())
     except SyntaxError as error:
@@ -80,16 +84,20 @@ def _dictionary(text: str) -> dict[str, Any]:
     except (ValueError, TypeError):
         raise FormatError("expected a Python dictionary of numbers, texts and lists, got an expression") from None
     except (RecursionError, MemoryError):
-        raise FormatError("expected a Python dictionary, got a nesting too deep to read") from None
+        raise FormatError("expected a Python dictionary, got one that is nested too deeply") from None
     if not isinstance(content, dict) or not all(isinstance(k, str) for k in content):
         raise FormatError(f"expected a Python dictionary, got {shown(content)}")
     return content
 
 
 def write(cameras: Sequence[CameraModel]) -> Written:
-    """The file of one camera. Raises FormatError.
+    """The file of one camera.
 
-    The pose is written under both keys, as releases before 2.5 need the older. Without a pose it is the identity.
+    The pose is written under both keys, because releases before 2.5 read the older one. A missing pose is written as
+    the identity.
+
+    Raises:
+        FormatError: the format cannot hold the lens.
     """
     (camera,) = cameras
     distortion = fitted(camera, NAME)
@@ -110,9 +118,9 @@ def write(cameras: Sequence[CameraModel]) -> Written:
         f"    'imagersize': [ {camera.image_size_px[0]}, {camera.image_size_px[1]} ]",
         "}",
     ]
-    notes = [f"mrcal's file has no place for the name {camera.name}: name the file so"]
+    notes = [f"mrcal's format has no camera name: name the file {camera.name}"]
     if pose is None:
-        notes.append("mrcal wants a pose: the identity is written")
+        notes.append("mrcal requires a pose: the identity is written")
     return Written("\n".join(lines) + "\n", tuple(notes))
 
 

@@ -1,8 +1,9 @@
 """OpenCV's FileStorage YAML with one camera, as its calibration samples write it.
 
-Both heads are read, `%YAML:1.0` (OpenCV up to 4) and `%YAML 1.2` (5), and matrices as `opencv-matrix` and, as OpenCV 5
-writes one-dimensional arrays, `opencv-nd-matrix`. Written is the old head with distortion as 1 x N, which all releases
-read. Source: OpenCV, samples/cpp/tutorial_code/calib3d/camera_calibration (the keys), core/persistence (the syntax).
+Reads both headers, `%YAML:1.0` (OpenCV up to 4) and `%YAML 1.2` (5), and matrices as `opencv-matrix` or, as OpenCV 5
+writes one-dimensional arrays, `opencv-nd-matrix`. Writes the old header, and the distortion as a 1 x N matrix, which
+all releases read. Source: OpenCV, samples/cpp/tutorial_code/calib3d/camera_calibration (the keys), core/persistence
+(the syntax).
 """
 
 from __future__ import annotations
@@ -37,7 +38,11 @@ _HEIGHT = ("image_height", "image_Height", "height")
 
 
 def read(content: Mapping[str, Any], name: str) -> Read:
-    """The camera of a parsed file; `name` where the file gives none. Raises FormatError."""
+    """The camera of a parsed file; `name` is used if the file contains none.
+
+    Raises:
+        FormatError: the file is not valid.
+    """
     K = matrix(_first(content, _MATRIX), _MATRIX[0])
     distortion = tuple(matrix(_first(content, _DISTORTION), _DISTORTION[0]).ravel().tolist())
     size = picture_size(_first(content, _WIDTH), _first(content, _HEIGHT), "image_width, image_height")
@@ -55,7 +60,7 @@ def read(content: Mapping[str, Any], name: str) -> Read:
 
 
 def _lens(content: Mapping[str, Any]) -> str:
-    """The lens model: OpenCV's own flag, or ROS's word in a file that mixes both styles."""
+    """The lens model, from OpenCV's flag, or from ROS's key in a file that mixes both styles."""
     if number(content.get("fisheye_model", 0), "fisheye_model"):
         return FISHEYE
     word = content.get("distortion_model", "plumb_bob")
@@ -65,7 +70,7 @@ def _lens(content: Mapping[str, Any]) -> str:
 
 
 def _first(content: Mapping[str, Any], keys: Sequence[str]) -> Any:
-    """The value of the first of some spellings of a key that is there."""
+    """The value of the first of several alternative keys that is present."""
     for key in keys:
         if key in content:
             return content[key]
@@ -73,7 +78,11 @@ def _first(content: Mapping[str, Any], keys: Sequence[str]) -> Any:
 
 
 def write(cameras: Sequence[CameraModel]) -> Written:
-    """The file of one camera. Raises FormatError."""
+    """The file of one camera.
+
+    Raises:
+        FormatError: the format cannot hold the lens.
+    """
     (camera,) = cameras
     fx, fy, cx, cy = camera.pinhole
     distortion = fitted(camera, NAME)
@@ -93,7 +102,7 @@ def write(cameras: Sequence[CameraModel]) -> Written:
 
 def _matrix(key: str, rows: int, values: Sequence[float]) -> list[str]:
     columns = len(values) // rows
-    # FileStorage reads lines of any length, but people do not.
+    # FileStorage reads lines of any length; short ones are easier to read.
     rows_of_text = [", ".join(exact(v) for v in values[i : i + 4]) for i in range(0, len(values), 4)]
     data = ",\n       ".join(rows_of_text)
     return [

@@ -1,8 +1,8 @@
 """ROS's camera_info: the YAML file of camera_calibration_parsers, or a printed CameraInfo message.
 
 Source: ROS, sensor_msgs/CameraInfo (plumb_bob: k1, k2, p1, p2, k3; rational_polynomial: eight numbers) and
-image_geometry (equidistant: OpenCV's fisheye). Rectification and projection matrices describe a picture made from the
-camera's, not the camera; they are written as those of a camera on its own and not read.
+image_geometry (equidistant: OpenCV's fisheye). Rectification and projection matrices describe a rectified
+picture, not the camera; they are not read, and written as those of a single camera.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from geometry.camera import FISHEYE, PERSPECTIVE
 NAME = "ros"
 HOLDS_MANY = False
 _LENGTHS = {"plumb_bob": (0, 4, 5), "rational_polynomial": (8,), "equidistant": (4,)}
-# The file's key, and the message's in ROS 1 and 2.
+# Key in the file, and in the message of ROS 1 and 2.
 _KEYS = {
     "image_width": ("image_width", "width"),
     "image_height": ("image_height", "height"),
@@ -42,7 +42,11 @@ _KEYS = {
 
 
 def read(content: Mapping[str, Any], name: str) -> Read:
-    """The camera of a parsed file; `name` where the file gives none. Raises FormatError."""
+    """The camera of a parsed file; `name` is used if the file contains none.
+
+    Raises:
+        FormatError: the file is not valid.
+    """
     found = {ours: next((content[k] for k in keys if k in content), None) for ours, keys in _KEYS.items()}
     for key in ("image_width", "image_height", "camera_matrix", "distortion_coefficients"):
         if found[key] is None:
@@ -51,7 +55,7 @@ def read(content: Mapping[str, Any], name: str) -> Read:
     model = content.get("distortion_model")
     if model is None:
         model = "plumb_bob"
-        notes.append("distortion_model is missing: taken for plumb_bob, as ROS does")
+        notes.append("distortion_model is missing: plumb_bob is assumed, as in ROS")
     if model not in _LENGTHS:
         raise FormatError(f"distortion_model: expected {', '.join(_LENGTHS)}, got {shown(model)}")
     distortion = tuple(matrix(found["distortion_coefficients"], "distortion_coefficients").ravel().tolist())
@@ -61,7 +65,7 @@ def read(content: Mapping[str, Any], name: str) -> Read:
     if found["rectification_matrix"] is not None:
         R = matrix(found["rectification_matrix"], "rectification_matrix")
         if R.size == 9 and not np.array_equal(R.reshape(3, 3), np.eye(3)):
-            notes.append("rectification_matrix is not read: it turns the picture, not the camera")
+            notes.append("rectification_matrix is not read: it rotates the picture, not the camera")
     camera = CameraModel(
         name=str(content.get("camera_name", name)),
         image_size_px=picture_size(found["image_width"], found["image_height"], "image_width, image_height"),
@@ -73,7 +77,11 @@ def read(content: Mapping[str, Any], name: str) -> Read:
 
 
 def write(cameras: Sequence[CameraModel]) -> Written:
-    """The file of one camera. Raises FormatError."""
+    """The file of one camera.
+
+    Raises:
+        FormatError: the format cannot hold the lens.
+    """
     (camera,) = cameras
     fx, fy, cx, cy = camera.pinhole
     distortion = fitted(camera, NAME)

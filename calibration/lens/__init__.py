@@ -1,1 +1,1 @@
-"""The lens of one camera from photographs of a board."""
+"""Intrinsic calibration of a camera from photographs of a board."""

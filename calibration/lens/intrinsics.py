@@ -1,4 +1,4 @@
-"""A camera's own numbers from photographs of a board: lens model, parameters with their covariance, and how good."""
+"""Intrinsic calibration of a camera from photographs of a board: lens model, parameters, covariance and findings."""
 
 from __future__ import annotations
 
@@ -10,60 +10,54 @@ import numpy as np
 
 from calibration.least_squares.adjustment import AdjustmentError
 from calibration.least_squares.parameter_blocks import Poses
-from calibration.lens.board_shape import Asked, BoardTest, board_test
+from calibration.lens.board_shape import BoardShapeOptions, BoardTest, board_test
 from calibration.lens.fit.corner_table import CornerTable
 from calibration.lens.fit.coverage import coverage_of, spread_deg
 from calibration.lens.fit.hold_out import HeldOut, Scatter, hold_out, scatter
-from calibration.lens.fit.lens_fit import (
-    AS_STATED,
-    BOARD_STACKS,
-    FEWEST_CORNERS,
-    BoardFreedom,
-    LensFit,
-    Values,
-    board_as_stated,
-    fit,
-    robust_fit,
-    used_views,
-)
+from calibration.lens.fit.lens_fit import FEWEST_CORNERS, LensFit, fit, robust_fit, used_views
 from calibration.lens.fit.lens_models import LensModel
+from calibration.lens.fit.lens_parameters import AS_STATED, BOARD_BLOCKS, BoardFreedom, Values, board_as_stated
 from calibration.lens.fit.lens_start import StartError, start
-from calibration.lens.fit.model_selection import ModelCandidate, select_model, union_of_used
+from calibration.lens.fit.model_selection import ModelCandidate, inliers_of_rich_models, select_model
 from calibration.lens.fit.projection_map import Difference, ProjectionMap, difference, projection_map
 from calibration.lens.intrinsics_findings import findings_of
 from calibration.lens.intrinsics_result import Intrinsics, Origins
-from calibration.lens.model_doubt import model_doubt
+from calibration.lens.model_uncertainty import estimate_model_uncertainty
 from geometry.arrays import Ints
 
 FEWEST_VIEWS = 4
-# Boards whose normals all lie within this of one another fix the focal length only together with the distance.
+# With a smaller angle between the boards' normals, focal length and distance cannot be separated.
 LEAST_TILT_DEG = 5.0
-# Scatter between photographs this unlikely raises the covariance. Of right models one in a hundred does.
+# Scatter between photographs with a smaller p-value inflates the covariance; 1 % of correct models are affected.
 SCATTER_SIGNIFICANT = 0.01
 
 
 class IntrinsicsError(ValueError):
-    """These photographs cannot give a calibration: what is wrong with them, and what to do."""
+    """The photographs do not allow a calibration; the message gives the cause and the remedy."""
 
 
 class TooFewViewsError(IntrinsicsError):
-    """Fewer photographs than a calibration needs."""
+    """Fewer photographs than a calibration requires."""
 
 
 @dataclass(frozen=True, slots=True)
 class IntrinsicsOptions:
-    """What the user may decide."""
+    """Options of the calibration."""
 
     distance_m: float | None = None  # of the screen, for figures in mm; None: the median distance of the boards
     lens: LensModel | None = None  # None: chosen by hold-out error
     warp: bool | None = None  # whether to correct a bent board; None: where it is significant
     stretch: bool | None = None  # whether to correct rows and columns that are not to scale; None: where significant
     folds: int | None = None  # of the hold-out; None: five, or one view each up to ten views
-    origins: tuple[str, ...] = ()  # of each view: those of unlike origin may be of two cameras; empty: nothing known
+    origins: tuple[str, ...] = ()  # of each view; different origins may mean different cameras; empty: unknown
 
 
 def calibrate_intrinsics(table: CornerTable, options: IntrinsicsOptions | None = None) -> Intrinsics:
-    """The whole calibration of one camera. Raises IntrinsicsError where the photographs cannot give one."""
+    """The complete calibration of one camera.
+
+    Raises:
+        IntrinsicsError: the photographs do not allow a calibration.
+    """
     options = IntrinsicsOptions() if options is None else options
     _check_enough(table)
     try:
@@ -79,17 +73,17 @@ def calibrate_intrinsics(table: CornerTable, options: IntrinsicsOptions | None =
 
 def _calibrated(table: CornerTable, options: IntrinsicsOptions) -> Intrinsics:
     starts = _starts(table, options.lens)
-    used, rich = union_of_used(table, starts, options.lens)
+    used, rich = inliers_of_rich_models(table, starts, options.lens)
     shape = _shape(table, rich[0], options)
     free = AS_STATED if shape is None else shape.free
     as_found = (rich[0] if shape is None else shape.fit).values
-    board = {name: as_found[name] for name in BOARD_STACKS} if shape else board_as_stated(len(table.board_points))
+    board = {name: as_found[name] for name in BOARD_BLOCKS} if shape else board_as_stated(len(table.board_points))
     ladder = select_model(table, used, rich, board, replace(free, points=False), options.folds, options.lens)
     found, held, spread = _final(table, ladder.chosen, free, options.folds)
     noise = max(1.0, spread.factor) if spread.p_value < SCATTER_SIGNIFICANT else 1.0
     distance = options.distance_m or _typical_depth(table, found)
     pixel_map = projection_map(found.model, found.lens, table.image_size_px, distance)
-    doubt = model_doubt(table, found, ladder, pixel_map, found.covariance * noise**2, noise)
+    doubt = estimate_model_uncertainty(table, found, ladder, pixel_map, found.covariance * noise**2, noise)
     out = Intrinsics(
         table=table,
         model=found.model,
@@ -112,16 +106,16 @@ def _calibrated(table: CornerTable, options: IntrinsicsOptions) -> Intrinsics:
 
 
 def _check_enough(table: CornerTable) -> None:
-    able = int(np.sum(table.counts() >= FEWEST_CORNERS))
-    if able < FEWEST_VIEWS:
+    usable = int(np.sum(table.counts() >= FEWEST_CORNERS))
+    if usable < FEWEST_VIEWS:
         raise TooFewViewsError(
-            f"expected {FEWEST_VIEWS} photographs or more with a board in them, got {able}; take 15 to 30, the board"
+            f"expected {FEWEST_VIEWS} photographs or more with a board in them, got {usable}; take 15 to 30, the board"
             " tilted by 20 to 45 deg to all sides and moved into the picture's corners"
         )
 
 
 def _starts(table: CornerTable, lens: LensModel | None) -> list[tuple[LensModel, Values]]:
-    """A start for each kind of lens that is asked for."""
+    """Start values for each kind of lens that may be chosen."""
     kinds = (False, True) if lens is None else (lens.fisheye,)
     out: list[tuple[LensModel, Values]] = []
     errors = []
@@ -138,7 +132,7 @@ def _starts(table: CornerTable, lens: LensModel | None) -> list[tuple[LensModel,
 
 
 def _check_tilts(values: Values) -> None:
-    """Raises IntrinsicsError where all boards lie parallel: that holds whatever the focal length."""
+    """Raises IntrinsicsError if all boards are parallel: they fit any focal length."""
     boards = values["boards"]
     assert isinstance(boards, Poses)
     normals = boards.pose.rotation[..., 2]
@@ -146,7 +140,7 @@ def _check_tilts(values: Values) -> None:
     spread = spread_deg(normals)
     if spread < LEAST_TILT_DEG:
         raise IntrinsicsError(
-            f"the board lies parallel to itself in all {len(normals)} photographs (within {spread:.1f} deg), so that"
+            f"the board has the same orientation in all {len(normals)} photographs (within {spread:.1f} deg), so that"
             " the focal length is not determined: a longer lens farther away gives the same pictures; tilt the board"
             " by 20 to 45 deg to all sides"
         )
@@ -154,7 +148,7 @@ def _check_tilts(values: Values) -> None:
 
 def _shape(table: CornerTable, rich: LensFit, options: IntrinsicsOptions) -> BoardTest | None:
     try:
-        return board_test(table, rich, Asked(options.warp, options.stretch, options.folds))
+        return board_test(table, rich, BoardShapeOptions(options.warp, options.stretch, options.folds))
     except AdjustmentError:
         if options.warp or options.stretch:
             raise
@@ -164,7 +158,7 @@ def _shape(table: CornerTable, rich: LensFit, options: IntrinsicsOptions) -> Boa
 def _final(
     table: CornerTable, chosen: ModelCandidate, board: BoardFreedom, folds: int | None
 ) -> tuple[LensFit, HeldOut, Scatter]:
-    """The chosen model once more from all corners: what is no corner is judged by the lens that stays."""
+    """The chosen model fitted again to all corners, with outliers determined by this model."""
     assert chosen.fit is not None
     assert chosen.held is not None
     assert chosen.scatter is not None
@@ -183,25 +177,25 @@ def _typical_depth(table: CornerTable, found: LensFit) -> float:
 
 
 def _halves(table: CornerTable, found: LensFit, at: ProjectionMap) -> Difference | None:
-    """Every other view against the rest."""
+    """Odd and even views compared."""
     views = used_views(found, table)
-    return _apart(table, found, at, views[::2], views[1::2])
+    return _difference_of_fits(table, found, at, views[::2], views[1::2])
 
 
 def _origins(table: CornerTable, found: LensFit, at: ProjectionMap, origins: Sequence[str]) -> Origins | None:
-    """The views of the two commonest origins against each other; None where a second one has too few."""
+    """The views of the two most frequent origins compared; None where the second one has too few views."""
     views = used_views(found, table)
     of_views = [origins[v] for v in views] if origins else []
     common = [(name, count) for name, count in Counter(of_views).most_common(2) if count >= FEWEST_VIEWS]
     if len(common) < 2:
         return None
     names = (common[0][0], common[1][0])
-    difference = _apart(table, found, at, *(views[[o == name for o in of_views]] for name in names))
+    difference = _difference_of_fits(table, found, at, *(views[[o == name for o in of_views]] for name in names))
     return None if difference is None else Origins(names, difference)
 
 
-def _apart(table: CornerTable, found: LensFit, at: ProjectionMap, *views: Ints) -> Difference | None:
-    """How two sets of views differ, the board's bend as found from all: it is one board."""
+def _difference_of_fits(table: CornerTable, found: LensFit, at: ProjectionMap, *views: Ints) -> Difference | None:
+    """The difference between fits to two sets of views, with the board's shape as estimated from all views."""
     try:
         first, second = (
             fit(table, found.used & np.isin(table.view, some), found.model, found.values, AS_STATED) for some in views

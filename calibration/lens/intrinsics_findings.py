@@ -1,4 +1,4 @@
-"""What a camera's calibration says of itself: each test with its figures, what they mean, and the remedy."""
+"""Findings of a camera's calibration: each test with its figures, their meaning and the remedy."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _MORE = "take more photographs, the board tilted by 20 to 45 deg to all sides an
 
 @dataclass(frozen=True, slots=True)
 class FindingLimits:
-    """From where on a figure earns a warning, and a failure."""
+    """Thresholds of the findings; pairs are (warning, failure)."""
 
     noise_px: tuple[float, float] = (0.35, 1.0)  # of a corner; sharp photographs of flat boards give 0.03 to 0.25
     rejected: tuple[float, float] = (0.05, 0.3)  # share of the corners
@@ -26,20 +26,20 @@ class FindingLimits:
     filled: tuple[float, float] = (0.6, 0.25)  # share of the picture within some board
     aspect: tuple[float, float] = (0.005, 0.03)  # |fx/fy - 1|: pixels of today's sensors are square to 0.1 %
     off_centre: tuple[float, float] = (0.08, 0.2)  # principal point from the middle, share of the width or height
-    focal: tuple[float, float] = (0.003, 0.02)  # sigma of the focal length over itself
-    overfit: tuple[float, float] = (1.5, 3.0)  # held-out error over the noise
+    focal: tuple[float, float] = (0.003, 0.02)  # relative sigma of the focal length
+    overfit: tuple[float, float] = (1.5, 3.0)  # hold-out error over the noise
     views: int = 8
     p_value: float = 0.01  # of the halves' difference, and of the scatter between photographs
     halves_px: float = 1.0  # a significant difference larger than this fails
-    map_px: tuple[float, float] = (0.5, 3.0)  # projection uncertainty that a tenth of the picture exceeds
-    warp_m: float = 0.002  # a board this bent is more than a quadratic surface
+    map_px: tuple[float, float] = (0.5, 3.0)  # projection uncertainty, 90 % quantile over the picture
+    warp_m: float = 0.002  # a larger bend is not described by a quadratic surface
 
 
 LIMITS = FindingLimits()
 
 
 def findings_of(c: Intrinsics, limits: FindingLimits = LIMITS) -> tuple[Finding, ...]:
-    """All tests, in the order in which a reader asks."""
+    """All tests, in the order of the report."""
     found = [
         _lens(c),
         _noise(c, limits),
@@ -65,14 +65,14 @@ def findings_of(c: Intrinsics, limits: FindingLimits = LIMITS) -> tuple[Finding,
 
 
 def _level(value: float, limits: tuple[float, float]) -> Level:
-    """By two limits: rising ones for what should be small, falling ones for what should be large."""
+    """Level by (warning, failure) limits: ascending for values that should be small, descending for large ones."""
     warn, fail = limits
     sign = 1.0 if fail > warn else -1.0
     return Level.FAIL if sign * value > sign * fail else Level.WARN if sign * value > sign * warn else Level.PASS
 
 
 def _two(value: float) -> str:
-    """Two significant digits, never with an exponent: 0.29, 3.9, 240."""
+    """Two significant digits without an exponent: 0.29, 3.9, 240."""
     if not np.isfinite(value) or value == 0:
         return f"{value:g}"
     digits = 1 - int(np.floor(np.log10(abs(value))))
@@ -80,7 +80,7 @@ def _two(value: float) -> str:
 
 
 def _mm(c: Intrinsics, px: float) -> str:
-    """px and what it is on the screen."""
+    """A length in px, and in mm on the screen."""
     per_px = float(np.nanmedian(np.abs(np.linalg.det(c.map.mm_per_px))) ** 0.5)
     return f"{px:.3g} px ({_two(px * per_px)} mm at {c.distance_m:.3g} m)"
 
@@ -89,20 +89,21 @@ def _lens(c: Intrinsics) -> Finding:
     if folds_in_picture(c.fit.lens, c.model.fisheye, c.table.image_size_px):
         return Finding(
             Level.FAIL,
-            f"{c.model.words}: it folds inside the picture",
-            "Two directions would share a pixel.",
+            f"{c.model.words}: the mapping folds inside the picture",
+            "Two directions would map to the same pixel.",
             _MORE,
         )
-    return Finding(Level.PASS, f"Lens: {c.model.words}: {c.ladder.why}.")
+    why = c.ladder.why
+    return Finding(Level.PASS, f"Lens: {c.model.words}: {why}.")
 
 
 def _noise(c: Intrinsics, limits: FindingLimits) -> Finding:
     return unless_pass(
         _level(c.fit.sigma_px, limits.noise_px),
-        f"Corners miss the model by {_mm(c, c.fit.sigma_px)} per coordinate (1 sigma; RMS {c.rms_px:.3g} px).",
+        f"Corner residuals: {_mm(c, c.fit.sigma_px)} per coordinate (1 sigma; RMS {c.rms_px:.3g} px).",
         "Sharp photographs of a flat board give 0.03 to 0.25 px. Larger residuals mean blur, a board that is not flat"
-        " or not what was said, or a lens that no model here follows.",
-        "Look at the residuals below; fix the board to glass or a thick plate, hold it still, light it well, and check"
+        " or not as stated, or a lens that no available model describes.",
+        "See the residuals below; fix the board to glass or a thick plate, hold it still, light it well, and check"
         " its measures.",
     )
 
@@ -111,15 +112,15 @@ def _rejected(c: Intrinsics, limits: FindingLimits) -> Finding:
     lost = int(np.sum(~c.fit.used))
     share = lost / len(c.table)
     dropped = len(c.fit.dropped)
-    text = f"{lost} of {len(c.table)} corners left out ({share:.1%})"
+    text = f"{lost} of {len(c.table)} corners excluded ({share:.1%})"
     if dropped:
         text += f", among them {dropped} whole view{'s' if dropped > 1 else ''}"
     return unless_pass(
         _level(share, limits.rejected),
         text + ".",
-        "What lies off the model by more than 4.5 sigmas is taken for a false corner; so many false ones leave a doubt"
-        " about the others.",
-        "Look at the views that are marked below; take them again, sharp and without glare.",
+        "A corner more than 4.5 sigmas from the model counts as an outlier; with so many outliers the other corners"
+        " are doubtful too.",
+        "See the views marked below; photograph them again, sharp and without glare.",
     )
 
 
@@ -128,7 +129,7 @@ def _views(c: Intrinsics, limits: FindingLimits) -> Finding:
     return unless_pass(
         Level.WARN if count < limits.views else Level.PASS,
         f"{count} photographs used, {int(c.fit.used.sum())} corners.",
-        "With few photographs neither the lens model nor its errors can be checked against others.",
+        "With few photographs neither the lens model nor its errors can be checked.",
         "Take 15 to 30 photographs.",
     )
 
@@ -136,8 +137,8 @@ def _views(c: Intrinsics, limits: FindingLimits) -> Finding:
 def _tilts(c: Intrinsics, limits: FindingLimits) -> Finding:
     return unless_pass(
         _level(c.coverage.spread_deg, limits.spread_deg),
-        f"The boards' directions differ by up to {c.coverage.spread_deg:.0f} deg.",
-        "Without tilted boards the focal length can hardly be told from the distance.",
+        f"The orientations of the boards differ by up to {c.coverage.spread_deg:.0f} deg.",
+        "Without tilted boards the focal length can hardly be separated from the distance.",
         _TILTED[0].upper() + _TILTED[1:] + ".",
     )
 
@@ -145,12 +146,13 @@ def _tilts(c: Intrinsics, limits: FindingLimits) -> Finding:
 def _coverage(c: Intrinsics, limits: FindingLimits) -> Finding:
     gaps = c.coverage.gaps
     level = max(_level(c.coverage.filled, limits.filled), Level.WARN if gaps else Level.PASS)
-    where = f"; none came near the {_listed(gaps)} of it" if gaps else ""
+    where = f"; none came near its {_listed(gaps)}" if gaps else ""
     return unless_pass(
         level,
         f"Boards covered {c.coverage.filled:.0%} of the picture{where}.",
-        "Where no corner was, the lens is extrapolated, and its uncertainty map holds only if the model does.",
-        "Add photographs with the board there, cut off by the picture's border if the board allows that.",
+        "In areas without corners the lens model is extrapolated, and the uncertainty map is valid only if the model"
+        " is.",
+        "Add photographs with the board in these areas, cut off by the border of the picture if the board allows it.",
     )
 
 
@@ -180,9 +182,11 @@ def _aspect(c: Intrinsics, limits: FindingLimits) -> Finding:
     return unless_pass(
         level,
         f"fx / fy = {fx / fy:.4f} ± {sigma:.1g}.",
-        "Pixels are square on nearly every sensor: two focal lengths mean that the board's rows and columns are not as"
-        " far apart as was said, that the pictures were stretched, or that the views do not determine them.",
-        "Measure the board along both directions; photograph it turned by 90 deg as well; check the pictures' scaling.",
+        "Pixels are square on nearly every sensor: two focal lengths mean that the spacing of the board's rows or"
+        " columns differs from the stated one, that the pictures were stretched, or that the views do not determine"
+        " them.",
+        "Measure the board along both directions; photograph it turned by 90 deg as well; check the scaling of the"
+        " pictures.",
     )
 
 
@@ -194,9 +198,9 @@ def _principal_point(c: Intrinsics, limits: FindingLimits) -> Finding:
     level = _level(share, limits.off_centre)
     return unless_pass(
         level,
-        f"Principal point {away[0]:+.1f}, {away[1]:+.1f} px from the middle"
+        f"Principal point {away[0]:+.1f}, {away[1]:+.1f} px from the centre"
         f" (± {_two(c.sigmas[2])}, {_two(c.sigmas[3])}).",
-        "Far off the middle it is that of a cropped or shifted picture"
+        "A large offset indicates a cropped or shifted picture"
         + (" (the uncertainty does not explain it)." if sure else "; here the views hardly determine it."),
         "Check that the pictures are not cropped; photograph the board turned by 90 deg in its plane as well.",
     )
@@ -206,8 +210,8 @@ def _overfit(c: Intrinsics, limits: FindingLimits) -> Finding:
     ratio = c.held.rms_px / c.fit.sigma_px
     return unless_pass(
         _level(ratio, limits.overfit),
-        f"Held-out photographs are predicted to {_mm(c, c.held.rms_px)}, {ratio:.2f} times the corners' own noise.",
-        "The lens follows the photographs that it was made from, not others.",
+        f"Hold-out error: {_mm(c, c.held.rms_px)}, {ratio:.2f} times the corners' own noise.",
+        "The lens is fitted to the noise of its own photographs.",
         _MORE[0].upper() + _MORE[1:] + ".",
     )
 
@@ -217,18 +221,18 @@ def _halves(c: Intrinsics, limits: FindingLimits) -> Finding:
     if d is None:
         return Finding(
             Level.WARN,
-            "Halves of the photographs do not determine the lens, so that they cannot be compared.",
-            "Nothing then tells of errors of the model, which no covariance knows.",
+            "Half of the photographs do not determine the lens, so that two halves cannot be compared.",
+            "Errors of the model, which the covariance does not contain, remain undetected.",
             _MORE[0].upper() + _MORE[1:] + ".",
         )
     return unless_pass(
         _disagreement(d, limits),
         f"Two halves of the photographs differ by {d.rms_px:.3g} px ({_two(d.rms_mm)} mm at {c.distance_m:.3g} m), RMS"
-        f" over the picture; their sigmas let expect {d.expected_rms_px:.3g} px (p = {d.p_value:.2g}).",
-        "They should differ by their sigmas only. More means that the lens model, the board or the corners are wrong in"
-        " a way that noise does not explain.",
-        "Use a stiffer board, check its measures, take more and more varied photographs; where two cameras took them or"
-        " focus or zoom was changed between, calibrate each set by itself.",
+        f" over the picture; {d.expected_rms_px:.3g} px are expected from their sigmas (p = {d.p_value:.2g}).",
+        "A larger difference than expected means that the lens model, the board or the corners have errors that noise"
+        " does not explain.",
+        "Use a stiffer board, check its measures, take more and more varied photographs; if the photographs are from"
+        " two cameras, or focus or zoom was changed, calibrate each set separately.",
     )
 
 
@@ -245,9 +249,9 @@ def _origins(c: Intrinsics, limits: FindingLimits) -> Finding | None:
     return unless_pass(
         _disagreement(d, limits),
         f"The photographs {first!r} and {second!r} give lenses that differ by {d.rms_px:.3g} px, RMS over the picture;"
-        f" their sigmas let expect {d.expected_rms_px:.3g} px (p = {d.p_value:.2g}).",
-        "They look like photographs of two cameras, or of one whose focus or zoom was changed between.",
-        "Calibrate each set by itself; fix focus and zoom before the first photograph.",
+        f" {d.expected_rms_px:.3g} px are expected from their sigmas (p = {d.p_value:.2g}).",
+        "The photographs seem to be from two cameras, or focus or zoom was changed in between.",
+        "Calibrate each set separately; fix focus and zoom before the first photograph.",
     )
 
 
@@ -255,14 +259,15 @@ def _scatter(c: Intrinsics) -> Finding:
     if c.correlated_noise == 1:
         return Finding(
             Level.PASS,
-            f"From photograph to photograph the lens scatters {c.scatter.factor:.2f} times what the corners' noise"
-            f" explains (p = {c.scatter.p_value:.2g}).",
+            f"The lens parameters scatter from photograph to photograph by {c.scatter.factor:.2f} times what the"
+            f" corners' noise explains (p = {c.scatter.p_value:.2g}).",
         )
     return Finding(
         Level.WARN,
-        f"From photograph to photograph the lens scatters {c.scatter.factor:.2f} times what the corners' noise explains"
-        f" (p = {c.scatter.p_value:.1g}); all sigmas have been raised by that.",
-        "Corners of one photograph err together: a bending board, blur, glare, or a lens that no model here follows.",
+        f"The lens parameters scatter from photograph to photograph by {c.scatter.factor:.2f} times what the corners'"
+        f" noise explains (p = {c.scatter.p_value:.1g}); all sigmas have been multiplied by it.",
+        "Errors of the corners within one photograph are correlated: a board that bends, blur, glare, or a lens that"
+        " no available model describes.",
         "Use a stiffer board, hold it still, and take more photographs.",
     )
 
@@ -272,10 +277,10 @@ def _map(c: Intrinsics, limits: FindingLimits) -> Finding:
     (half, most, worst), (half_mm, most_mm, worst_mm) = (np.nanquantile(m, [0.5, 0.9, 1.0]) for m in (px, mm))
     return unless_pass(
         _level(float(most), limits.map_px),
-        f"A pixel's direction is known to {_two(half)} px ({_two(half_mm)} mm at {c.distance_m:.3g} m) or better in"
-        f" half of the picture, to {_two(most)} px ({_two(most_mm)} mm) in nine tenths, to {_two(worst)} px"
-        f" ({_two(worst_mm)} mm) at its worst place (1 sigma).",
-        "Every spot there carries this error, the same in all frames: averaging does not remove it.",
+        f"The direction of a pixel is known to {_two(half)} px ({_two(half_mm)} mm at {c.distance_m:.3g} m) or better"
+        f" in half of the picture, to {_two(most)} px ({_two(most_mm)} mm) in 90 %, and to {_two(worst)} px"
+        f" ({_two(worst_mm)} mm) at the worst place (1 sigma).",
+        "Every spot at such a place has this error, the same in all frames: averaging does not reduce it.",
         "Add photographs with the board where the uncertainty map is worst.",
     )
 
@@ -284,13 +289,13 @@ def _warp(c: Intrinsics, limits: FindingLimits) -> Finding | None:
     w = c.warp
     if w is None:
         return None
-    text = f"The board looks bent by {1000 * w.rise_m:.2f} mm (p = {w.p_value:.1g} if it were flat): {w.why}"
+    text = f"The board is bent by {1000 * w.rise_m:.2f} mm (p = {w.p_value:.1g} for a flat board): {w.why}"
     if not w.corrected:
         return Finding(Level.PASS, text + "; taken as flat.")
     return unless_pass(
         Level.WARN if w.rise_m > limits.warp_m else Level.PASS,
         text + "; corrected.",
-        "A board bent so much is no longer the smooth surface that the correction assumes, and may bend differently"
+        "A board bent this much is no longer the smooth surface that the correction assumes, and may bend differently"
         " each time it is held.",
         "Glue it to glass or a thick plate.",
     )

@@ -1,4 +1,4 @@
-"""What a camera's calibration results in: the lens, its covariance, and the evidence of how good they are."""
+"""The result of a camera's calibration: the lens, its covariance and the quality figures."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from calibration.lens.fit.coverage import Coverage
 from calibration.lens.fit.hold_out import HeldOut, Scatter
 from calibration.lens.fit.lens_fit import LensFit
 from calibration.lens.fit.lens_models import LensModel
-from calibration.lens.fit.model_selection import Ladder
+from calibration.lens.fit.model_selection import ModelSelection
 from calibration.lens.fit.projection_map import Difference, ProjectionMap
-from calibration.lens.model_doubt import ModelDoubt
+from calibration.lens.model_uncertainty import ModelUncertainty
 from geometry.arrays import Array
 
 
 @dataclass(frozen=True, slots=True)
 class Origins:
-    """Photographs of two origins (folders, videos, first parts of names) against each other."""
+    """Comparison of photographs of two origins (folders, videos, first parts of names)."""
 
     names: tuple[str, str]
     difference: Difference
@@ -29,21 +29,21 @@ class Origins:
 
 @dataclass(frozen=True, slots=True)
 class Intrinsics:
-    """A calibrated lens and what is known of its quality."""
+    """A calibrated lens with its quality figures."""
 
     table: CornerTable
     model: LensModel
     fit: LensFit
     parameters: tuple[str, ...]  # fx, fy, cx, cy, k1 ...
-    covariance: Array  # (p, p) in that order, scatter between photographs and the model's own doubt included
-    doubt: ModelDoubt
+    covariance: Array  # (p, p) in that order, inflated by scatter between photographs and by model error
+    doubt: ModelUncertainty
     correlated_noise: float  # factor on the sigmas from that scatter; 1 where it is not significant
     scatter: Scatter
     held: HeldOut
-    ladder: Ladder
-    board: BoardTest | None  # the board as the photographs show it; None where they do not determine its bend
-    halves: Difference | None  # None where a half does not determine the lens
-    origins: Origins | None  # None where all photographs are of one origin
+    ladder: ModelSelection
+    board: BoardTest | None  # None where the photographs do not determine the board's bend
+    halves: Difference | None  # None where one half does not determine the lens
+    origins: Origins | None  # None where all photographs have the same origin
     map: ProjectionMap
     distance_m: float
     coverage: Coverage
@@ -51,12 +51,12 @@ class Intrinsics:
 
     @property
     def warp(self) -> WarpTest | None:
-        """The board's bend; None where the views do not determine it."""
+        """The test for a bent board; None where the views do not determine it."""
         return None if self.board is None else self.board.warp
 
     @property
     def verdict(self) -> Level:
-        """The gravest finding."""
+        """The level of the most severe finding."""
         return verdict(self.findings)
 
     @property
@@ -67,7 +67,7 @@ class Intrinsics:
 
     @property
     def distortion(self) -> tuple[float, ...]:
-        """OpenCV's order, as many as the model has."""
+        """Distortion coefficients in OpenCV's order, as many as the model has."""
         return tuple(float(v) for v in self.fit.lens[4 : 4 + self.model.coefficients])
 
     @property
@@ -77,15 +77,15 @@ class Intrinsics:
 
     @property
     def map_covariance_px2(self) -> Array:
-        """(rows, columns, 2, 2): of a pixel's direction over the picture, all that is known to be uncertain."""
+        """(rows, columns, 2, 2): total covariance of a pixel's direction over the picture."""
         return self.map.covariance_px2(self.covariance)
 
     @property
     def rms_px(self) -> float:
-        """Of the used corners' residuals, per coordinate."""
+        """RMS of the residuals of the used corners, per coordinate."""
         return float(np.sqrt(np.mean(self.fit.residuals[self.fit.used] ** 2)))
 
     @property
     def rms_2d_px(self) -> float:
-        """The same per corner, as OpenCV reports it: sqrt(2) larger."""
+        """RMS per corner, as OpenCV reports it: sqrt(2) times larger."""
         return self.rms_px * float(np.sqrt(2))

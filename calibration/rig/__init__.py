@@ -1,1 +1,1 @@
-"""Cameras, screens and beams in one solve."""
+"""Joint calibration of cameras, screens and beams."""

@@ -1,7 +1,7 @@
-"""One joint adjustment of a whole rig: lenses, cameras, screens, dots, boards, beams, the stand and its positions.
+"""Joint adjustment of a whole rig: lenses, cameras, screens, control points, boards, beams and the stand.
 
-The single steps (calibration/screens, calibration/beams) give the start. Here nothing is held that is not exact: what
-one kind of measurement says of another's unknowns is heard, and the covariance that comes out is the whole truth.
+The single steps (calibration/screens, calibration/beams) give the start values. Every parameter with an uncertainty is
+free, so that each measurement contributes to all parameters, and the covariance is complete.
 """
 
 from __future__ import annotations
@@ -29,29 +29,29 @@ from geometry.camera import FISHEYE
 from geometry.rig import Rig
 from geometry.uncertainty.rig_parameters import RigCovariance
 
-# The kinds of measurement, in words that a report can use.
+# The kinds of measurement, named as in reports.
 LENSES, SURVEY, DOTS, SURFACES = "lens calibrations", "survey", "pixels of dots", "screen surfaces"
 CORNERS, FIXED, SCANS = "board corners", "boards on screens", "scans"
 FLAT_BOARDS = "flatness of boards"
 SPOTS, RECORDS, PLACE, FRAMES = "spots", "stand positions", "place of the stand", "screen axes"
 LOST = "positions without a record"
-P_OUTLIER = 1e-4  # of a good measurement to be left out: one in 10 000
-P_MISFIT = 1e-3  # of a right fit to be called a misfit
+P_OUTLIER = 1e-4  # probability that a correct measurement is excluded
+P_MISFIT = 1e-3  # p-value of chi-square below which a kind of measurement misfits
 _ROUNDS = 8
-# With weights that change from step to step the last digits settle slowly, and it is only a start.
+# With changing weights the last digits converge slowly; for a start value less is sufficient.
 _ROUGHLY = Limits(steps=120, small_step_sigmas=0.1)
-_ANYWHERE = 0.1  # m, rad: about where a position is whose record was left out
-_SETTLED = 0.02  # relative: a scale is found when the next round changes it by less
-_MOST_SCALE = 10.0  # told sigmas may be so much too small; what scatters more was not measured of this rig
-_RESCALED = (SPOTS, DOTS, CORNERS, SURVEY, RECORDS, SURFACES)  # kinds whose sigmas may be widened
+_LOST_SIGMA = 0.1  # m, rad: sigma of a position whose record was excluded
+_CONVERGED = 0.02  # relative change of a scale in one round below which it has converged
+_MOST_SCALE = 10.0  # largest factor on the stated sigmas; measurements that scatter more are not of this rig
+_RESCALED = (SPOTS, DOTS, CORNERS, SURVEY, RECORDS, SURFACES)  # kinds whose sigmas may be increased
 
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """All that was measured, and the starts of what is looked for."""
+    """All measurements, and the start values of the parameters."""
 
-    network: Network  # cameras, screens, dots, boards; its rig holds the nominal or found beams and the spots
-    screens: NetworkFit  # the single step: its values start the joint one
+    network: Network  # cameras, screens, control points, boards; its rig holds the nominal or found beams and the spots
+    screens: NetworkFit  # result of the single step, with the start values
     spots: SpotPixels
     stand: StandModel
     beams: Values  # of the single step: "beams", "stand", "poses"
@@ -59,43 +59,46 @@ class Measured:
 
 @dataclass(frozen=True, slots=True)
 class Joint:
-    """A rig found by one adjustment of everything."""
+    """Result of the joint adjustment of a rig."""
 
     rig: Rig
-    covariance: RigCovariance  # of everything in it that was free
+    covariance: RigCovariance  # of all free parameters of the rig
     values: Values
     adjusted: Adjusted
     unknowns: Unknowns
     all_covariance: Array  # (size, size) of all unknowns
-    terms: Mapping[str, tuple[Term, ...]]  # as adjusted at last: kept ones, sigmas widened
-    informations: Mapping[str, Array]  # (size, size) what each kind knows
-    groups: Mapping[str, GroupFit]  # how each kind fitted with the sigmas that were told
-    settled: Mapping[str, GroupFit]  # and how with the widened ones
-    scales: Mapping[str, float]  # what sigmas of a kind were multiplied with; kinds not named: 1
-    kept: Mapping[str, Bools]  # of the kinds that may be left out, row by row
-    every: Mapping[str, Term]  # the same kinds with all rows and the told sigmas
+    terms: Mapping[str, tuple[Term, ...]]  # of the final adjustment: inliers, with increased sigmas
+    informations: Mapping[str, Array]  # (size, size) normal matrix of each kind
+    groups: Mapping[str, GroupFit]  # fit of each kind with the stated sigmas
+    settled: Mapping[str, GroupFit]  # the same with the increased ones
+    scales: Mapping[str, float]  # factor on the sigmas of a kind; missing kinds: 1
+    kept: Mapping[str, Bools]  # inliers of the kinds that may have outliers, row by row
+    every: Mapping[str, Term]  # the same kinds with all rows and the stated sigmas
 
     def effect(self, at: Sequence[At], jacobian: Array) -> Array:
-        """d(result)/d(all unknowns) (k, size), from that by the unknowns `at`, stacked (k, p)."""
+        """d(result)/d(all unknowns) (k, size), from the derivatives (k, p) by the unknowns `at`."""
         out = np.zeros((len(jacobian), self.unknowns.size))
         out[:, self.unknowns.of_several(at)] = jacobian
         return out
 
     @property
     def rig_at(self) -> tuple[At, ...]:
-        """The unknowns that are numbers of the rig."""
+        """The unknowns that are parameters of the rig."""
         return tuple(a for a in self.unknowns.at if a[0] in (INTRINSICS, CAMERAS, SCREENS, BOWS, BEAMS))
 
 
 def calibrate_jointly(measured: Measured, *, without: Bools | None = None, start: Joint | None = None) -> Joint:
-    """The one adjustment. Raises AdjustmentError where it does not settle or leaves something undetermined.
+    """The joint adjustment.
 
-    without (spots): spots that take no part, for a hold-out. start: an earlier result of the same measurements, whose
+    without (spots): spots that are excluded, for a hold-out. start: an earlier result of the same measurements, whose
     outliers and sigmas are then kept.
+
+    Raises:
+        AdjustmentError: the adjustment does not converge or leaves something undetermined.
     """
     values: Values = {**measured.screens.values, **measured.beams} if start is None else start.values
-    free = free_of(measured)
-    every, fixed = _kinds(measured)
+    free = free_parameters(measured)
+    every, fixed = _terms_by_kind(measured)
     kept = {name: np.ones(rows_of(term), dtype=bool) for name, term in every.items()}
     if without is not None:
         kept[SPOTS] &= ~without
@@ -103,13 +106,13 @@ def calibrate_jointly(measured: Measured, *, without: Bools | None = None, start
     groups: dict[str, GroupFit] = {}
     if start is None:
         found, kept = _robust(measured, values, free, every, fixed, kept)
-        told = _told(every, fixed, kept)
-        groups = _fits(found, told, {}, unknowns)
-        scales = _scales(found, told, unknowns, free)
+        stated = _inlier_terms(every, fixed, kept)
+        groups = _group_fits(found, stated, {}, unknowns)
+        scales = _scales(found, stated, unknowns, free)
     else:
         kept = {name: rows & start.kept[name] for name, rows in kept.items()}
-        found, told, scales = start.adjusted, _told(every, fixed, kept), dict(start.scales)
-    final = {n: tuple(widened(t, scales.get(n, 1.0)) for t in ts) for n, ts in told.items()}
+        found, stated, scales = start.adjusted, _inlier_terms(every, fixed, kept), dict(start.scales)
+    final = {n: tuple(widened(t, scales.get(n, 1.0)) for t in ts) for n, ts in stated.items()}
     if start is not None or scales:
         found = solve(found.values, [t for ts in final.values() for t in ts], free)
     C = found.covariance(unknowns.at)
@@ -130,32 +133,32 @@ def calibrate_jointly(measured: Measured, *, without: Bools | None = None, start
         terms=final,
         informations=informations,
         groups=groups,
-        settled=_fits(found, final, {}, unknowns) if scales and start is None else groups,
+        settled=_group_fits(found, final, {}, unknowns) if scales and start is None else groups,
         scales=scales,
         kept=kept,
         every=every,
     )
 
 
-def free_of(measured: Measured) -> dict[str, bool | Bools]:
-    """Which numbers may move."""
+def free_parameters(measured: Measured) -> dict[str, bool | Bools]:
+    """The free parameters, by block."""
     stand = measured.stand
     count = len(stand.stand_from_body.translation)
-    place: bool | Bools = True
+    stand_free: bool | Bools = True
     if stand.stand_covariance is not None:
-        place = np.diagonal(stand.stand_covariance)[None] > 0
-    # Of the lab what was free in its own step: that also holds the world's frame where no survey does.
-    of_the_lab = {n: measured.screens.adjusted.is_free(n) for n in measured.screens.values if n != BEAMS}
+        stand_free = np.diagonal(stand.stand_covariance)[None] > 0
+    # Parameters of cameras and screens are free as in their own step, which also fixes the frame without a survey.
+    lab_blocks = {n: measured.screens.adjusted.is_free(n) for n in measured.screens.values if n != BEAMS}
     return {
-        **of_the_lab,
+        **lab_blocks,
         BEAMS: True,
-        STAND: place,
+        STAND: stand_free,
         POSES: np.broadcast_to(np.asarray(stand.pose_sigmas) > 0, (count, 6)),
     }
 
 
-def _kinds(measured: Measured) -> tuple[dict[str, Term], dict[str, tuple[Term, ...]]]:
-    """Terms of which rows may be left out, one per kind; and the others."""
+def _terms_by_kind(measured: Measured) -> tuple[dict[str, Term], dict[str, tuple[Term, ...]]]:
+    """Terms by kind: those whose rows may be excluded, and the others."""
     network, stand = measured.network, measured.stand
     dots, s = network.dots, network.sightings
     fisheye = np.array([c.lens == FISHEYE for c in network.rig.cameras.values()], dtype=bool)
@@ -201,84 +204,86 @@ def _robust(
     fixed: Mapping[str, tuple[Term, ...]],
     allowed: Mapping[str, Bools],
 ) -> tuple[Adjusted, dict[str, Bools]]:
-    """Outliers fade, then are left out until the same ones stay out; the rest is adjusted with full weights."""
+    """Detect outliers with a Cauchy loss, then exclude them and adjust again until the inliers do not change."""
     rest = [t for ts in fixed.values() for t in ts]
     first = [picked(t, allowed[n], Cauchy()) for n, t in every.items()]
     found = solve(values, [*first, *rest], free, _ROUGHLY)
-    kept = _near(measured, every, found.values, allowed)
+    kept = _inliers(measured, every, found.values, allowed)
     for _ in range(_ROUNDS):
-        terms = [t for ts in _told(every, fixed, kept).values() for t in ts]
+        terms = [t for ts in _inlier_terms(every, fixed, kept).values() for t in ts]
         found = solve(found.values, terms, free)
-        again = _near(measured, every, found.values, allowed)
+        again = _inliers(measured, every, found.values, allowed)
         if all(np.array_equal(again[n], kept[n]) for n in kept):
             break
         kept = again
     return found, kept
 
 
-def _near(
+def _inliers(
     measured: Measured, every: Mapping[str, Term], values: Values, allowed: Mapping[str, Bools]
 ) -> dict[str, Bools]:
-    """Which rows of each kind lie where good ones may, by the scatter of the better half."""
+    """Inliers of each kind, relative to the scatter of the better half."""
     out = {}
     for name, term in every.items():
         if name == DOTS:
-            # Against the survey, not the adjusted dot: one that a single camera sees follows its wrong pixel.
+            # Relative to the survey, not to the adjusted point, which follows a wrong pixel if one camera sees it only.
             s = sighting_sigmas(measured.network, values) ** 2
             d = 2
         else:
             r = term.linearise(values).residuals
             s, d = np.sum(r**2, axis=1), r.shape[1]
         some = s[allowed[name] & np.isfinite(s)]
-        middle = float(np.median(some)) / chdtri(d, 0.5) if some.size else 1.0
-        unit = float(np.clip(middle, 1.0, _MOST_SCALE**2))
+        median = float(np.median(some)) / chdtri(d, 0.5) if some.size else 1.0
+        unit = float(np.clip(median, 1.0, _MOST_SCALE**2))
         out[name] = allowed[name] & (s < unit * chdtri(d, P_OUTLIER))
     return out
 
 
-def _told(
+def _inlier_terms(
     every: Mapping[str, Term], fixed: Mapping[str, tuple[Term, ...]], kept: Mapping[str, Bools]
 ) -> dict[str, tuple[Term, ...]]:
-    """The kept measurements with the sigmas that came with them."""
+    """The inlier measurements with their stated sigmas."""
     out = {n: (picked(t, kept[n]),) for n, t in every.items()} | dict(fixed)
     if RECORDS in every and not kept[RECORDS].all():
-        # A position without its record must not run away where its spots do not determine it.
+        # A weak prior keeps a position without its record finite where its spots do not determine it.
         lost = picked(every[RECORDS], ~kept[RECORDS])
         assert isinstance(lost, RecordTerm)
-        out[LOST] = (replace(lost, sigmas=np.where(lost.sigmas > 0, _ANYWHERE, 0.0)),)
+        out[LOST] = (replace(lost, sigmas=np.where(lost.sigmas > 0, _LOST_SIGMA, 0.0)),)
     return out
 
 
-def _fits(
-    found: Adjusted, told: Mapping[str, tuple[Term, ...]], scales: Mapping[str, float], unknowns: Unknowns
+def _group_fits(
+    found: Adjusted, stated: Mapping[str, tuple[Term, ...]], scales: Mapping[str, float], unknowns: Unknowns
 ) -> dict[str, GroupFit]:
-    """How well each kind fits, its sigmas widened by `scales`."""
+    """Fit of each kind, with its sigmas multiplied by `scales`."""
     C = found.covariance(unknowns.at)
     out = {}
-    for name, terms in told.items():
+    for name, terms in stated.items():
         these = [widened(t, scales.get(name, 1.0)) for t in terms]
         out[name] = group_fit(name, *information(these, found.values, unknowns), C)
     return out
 
 
-def _scales(found: Adjusted, told: Mapping[str, tuple[Term, ...]], unknowns: Unknowns, free: Free) -> dict[str, float]:
-    """What the told sigmas of each kind are too small by, kind by kind (variance components, Foerstner 1979).
+def _scales(
+    found: Adjusted, stated: Mapping[str, tuple[Term, ...]], unknowns: Unknowns, free: Free
+) -> dict[str, float]:
+    """Factors by which the stated sigmas of each kind are too small (variance components, Foerstner 1979).
 
-    Only where the residuals say so beyond chance, never smaller: too large ones are a user's safety margin. A kind
-    that misfits drags others along, so the worst one is widened first, and the fit is looked at again.
+    Only where the residuals are significantly too large, and never below 1: larger sigmas are a safety margin of the
+    user. Because a misfit of one kind affects others, the worst one is scaled first, and the fit is then repeated.
     """
     scales: dict[str, float] = {}
     for _ in range(3 * len(_RESCALED)):
-        fits = _fits(found, told, scales, unknowns)
+        fits = _group_fits(found, stated, scales, unknowns)
         loose = {
             n: f
             for n, f in fits.items()
-            if n in _RESCALED and (f.p < P_MISFIT or (n in scales and abs(f.scale - 1) > _SETTLED))
+            if n in _RESCALED and (f.p < P_MISFIT or (n in scales and abs(f.scale - 1) > _CONVERGED))
         }
         if not loose:
             break
         worst = max(loose, key=lambda n: abs(np.log(loose[n].scale)))
         scales[worst] = max(scales.get(worst, 1.0) * loose[worst].scale, 1.0)
-        terms = [widened(t, scales.get(n, 1.0)) for n, ts in told.items() for t in ts]
+        terms = [widened(t, scales.get(n, 1.0)) for n, ts in stated.items() for t in ts]
         found = solve(found.values, terms, free)
     return {n: s for n, s in scales.items() if s > 1.0}

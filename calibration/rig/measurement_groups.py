@@ -1,10 +1,10 @@
-"""How well each kind of measurement fits a joint adjustment, and how much of the result's uncertainty it makes.
+"""Consistency of each kind of measurement in a joint adjustment, and its share of the result's uncertainty.
 
-For a group g of whitened residuals v with Jacobian J and the covariance C of all unknowns, A_g = J^T J is what the
-group knows. v spreads as Q = I - J C J^T: its squared length is tr(Q) on average, the group's redundancy, with a
-variance of 2 tr(Q^2). Of C itself the group makes C A_g C, and over all groups these sum up to C, the inverse of
-the sum of all A_g. Source: Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sections 4.2.4 and 4.6.2;
-the test by a scaled chi-square of the same two moments is Satterthwaite's (1946), Biometrics Bulletin 2(6).
+For a group g of whitened residuals v with Jacobian J and the covariance C of all unknowns, A_g = J^T J is the group's
+normal matrix. v has the covariance Q = I - J C J^T: its squared length is tr(Q) on average, the group's redundancy,
+with a variance of 2 tr(Q^2). The group contributes C A_g C to C, and the sum of these over all groups is C, the inverse
+of the sum of all A_g. Source: Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sections 4.2.4 and 4.6.2;
+the test by a scaled chi-square with the same two moments is Satterthwaite's (1946), Biometrics Bulletin 2(6).
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from geometry.arrays import Array, Ints
 
 @dataclass(frozen=True, slots=True)
 class Unknowns:
-    """Where each unknown stands in one long vector of errors."""
+    """Positions of the unknowns in one long vector."""
 
     at: tuple[At, ...]
-    start: Mapping[str, int]  # per stack that has something free
+    start: Mapping[str, int]  # per block with free parameters
     dof: Mapping[str, int]
     size: int
 
     @staticmethod
     def of(values: Values, free: Free) -> Unknowns:
-        """All unknowns of the stacks of which something is free, the fixed ones among them too."""
+        """All unknowns of the blocks with free parameters, including their fixed ones."""
         at: list[At] = []
         start, dof, size = {}, {}, 0
         for name, stack in values.items():
@@ -42,40 +42,40 @@ class Unknowns:
         return Unknowns(tuple(at), start, dof, size)
 
     def places(self, stack: str, element: int) -> Ints:
-        """Where the numbers of one unknown stand."""
+        """Positions of the parameters of one unknown."""
         return self.start[stack] + element * self.dof[stack] + np.arange(self.dof[stack])
 
     def of_several(self, at: Sequence[At]) -> Ints:
-        """Where the numbers of several stand, in order."""
+        """Positions of the parameters of several unknowns, in order."""
         return np.concatenate([self.places(*a) for a in at])
 
 
 @dataclass(frozen=True, slots=True)
 class GroupFit:
-    """One kind of measurement in an adjustment."""
+    """Consistency of one kind of measurement with an adjustment."""
 
     name: str
-    numbers: int  # residuals
-    redundancy: float  # how many of them check the others: 0 where they fix what nothing else knows
+    numbers: int  # of residuals
+    redundancy: float  # 0 if the kind alone determines some parameters and checks nothing else
     chi2: float  # of the whitened residuals
-    p: float  # chance of a misfit as large if its sigmas are right; nan where there is next to no redundancy
+    p: float  # p-value of chi2 if its sigmas are right; nan without enough redundancy
 
     @property
     def scale(self) -> float:
-        """What its sigmas would have to be multiplied with to fit the residuals; nan: nothing is known."""
+        """Factor on its sigmas that explains the residuals; nan without enough redundancy."""
         return float(np.sqrt(self.chi2 / self.redundancy)) if self.redundancy > LEAST_REDUNDANCY else float("nan")
 
 
-LEAST_REDUNDANCY = 2.0  # below it, residuals say nothing about sigmas
+LEAST_REDUNDANCY = 2.0  # below it, residuals do not determine sigmas
 
 
 def joint_covariance(adjusted: Adjusted, unknowns: Unknowns) -> Array:
-    """(size, size); 0 for what was held fixed. AdjustmentError where something is not determined."""
+    """(size, size); 0 for fixed parameters. Raises AdjustmentError if something is undetermined."""
     return adjusted.covariance(unknowns.at)
 
 
 def jacobian(term: Term, values: Values, unknowns: Unknowns) -> tuple[Array, sparse.csr_array]:
-    """Residuals (m,) of a term, and their derivatives (m, size) by the long vector."""
+    """Residuals (m,) of a term, and their derivatives (m, size) by all unknowns."""
     line = term.linearise(values)
     n, d = line.residuals.shape
     rows, columns, entries = [], [], []
@@ -97,7 +97,7 @@ def jacobian(term: Term, values: Values, unknowns: Unknowns) -> tuple[Array, spa
 
 
 def information(terms: Sequence[Term], values: Values, unknowns: Unknowns) -> tuple[Array, float, int]:
-    """What some terms know (size, size), the squared length of their residuals, and how many these are."""
+    """Normal matrix (size, size) of some terms, the squared length of their residuals, and the number of residuals."""
     A, chi2, count = np.zeros((unknowns.size, unknowns.size)), 0.0, 0
     for r, J in (jacobian(t, values, unknowns) for t in terms):
         A += (J.T @ J).toarray()
@@ -107,7 +107,7 @@ def information(terms: Sequence[Term], values: Values, unknowns: Unknowns) -> tu
 
 
 def group_fit(name: str, A: Array, chi2: float, count: int, C: Array) -> GroupFit:
-    """How well a group fits, from what it knows and the covariance of all unknowns."""
+    """Consistency of a group, from its normal matrix and the covariance of all unknowns."""
     AC = A @ C
     redundancy = count - float(np.trace(AC))
     variance = 2 * (count - 2 * float(np.trace(AC)) + float(np.sum(AC * AC.T)))
@@ -118,7 +118,7 @@ def group_fit(name: str, A: Array, chi2: float, count: int, C: Array) -> GroupFi
 
 
 def shares(informations: Mapping[str, Array], C: Array, effect: Array) -> dict[str, Array]:
-    """What each group's errors make of the covariance of a result: (k, k) each, in sum effect C effect^T.
+    """Share of each group in the covariance of a result: (k, k) each, with the sum effect C effect^T.
 
     effect (k, size): d(result) / d(unknowns).
     """

@@ -1,4 +1,4 @@
-"""What a jointly calibrated rig is worth: the pose to expect, whose errors make it, and positions held out."""
+"""Quality figures of a jointly calibrated rig: expected pose uncertainty by source, and hold-out of positions."""
 
 from __future__ import annotations
 
@@ -20,50 +20,50 @@ from geometry.pose import Pose
 from geometry.pose_solver.gauss_newton import fit_pose
 from geometry.uncertainty.rig_parameters import Sensitivity
 
-FOLDS = 5  # parts into which the positions are divided; each is predicted by the other four
+FOLDS = 5  # groups of positions; each is predicted from the other four
 
 
 @dataclass(frozen=True, slots=True)
 class ExpectedPose:
-    """What one frame would tell of the vehicle at one pose. Covariances are of [dt (m, world), dtheta (rad, body)]."""
+    """Uncertainty of a pose from one frame. Covariances are of [dt (m, world), dtheta (rad, body)]."""
 
     world_from_body: Pose
-    views: int  # spots in the pictures there
+    views: int  # spots in the pictures at this pose
     total: Array  # (6, 6)
-    noise: Array  # (6, 6): of the spots in that frame; averaging lessens it
+    noise: Array  # (6, 6): of the spots in that frame; reduced by averaging
     systematic: Array  # (6, 6): of the calibration; the same in every frame
-    shares: Mapping[str, Array]  # (6, 6) of the systematic part, by kind of measurement whose errors made it
+    shares: Mapping[str, Array]  # (6, 6) of the systematic part, by kind of measurement
 
 
 @dataclass(frozen=True, slots=True)
 class HoldOut:
-    """Positions predicted by a calibration that had not seen their spots."""
+    """Positions predicted by a calibration without their spots."""
 
     positions: Ints  # (n,)
-    errors: Array  # (n, 6): recorded pose less the one measured with the spots, [dt (m, world), dtheta (rad, body)]
-    sigmas: Array  # (n,): size of each position's misfit against what is expected, 1 where that is right
-    chi2: float  # of the held-out spots against their prediction, all errors counted
+    errors: Array  # (n, 6): recorded pose minus the one measured with the spots, [dt (m, world), dtheta (rad, body)]
+    sigmas: Array  # (n,): RMS of each position's normalised residuals; 1 is expected
+    chi2: float  # of the held-out spots against their prediction, with all uncertainties
     dof: int
     p: float
 
     @property
     def attitude_rms(self) -> float:
-        """Rad, per axis."""
+        """RMS attitude error, rad, per axis."""
         return float(np.sqrt(np.mean(self.errors[:, 3:] ** 2)))
 
     @property
     def position_rms(self) -> float:
-        """m, per axis."""
+        """RMS position error, m, per axis."""
         return float(np.sqrt(np.mean(self.errors[:, :3] ** 2)))
 
     @property
     def ratio(self) -> float:
-        """How many times larger the misfits are than expected."""
+        """Ratio of actual to expected errors."""
         return float(np.sqrt(self.chi2 / self.dof))
 
 
 def central_pose(joint: Joint) -> Pose:
-    """world_from_body in the middle of the stand's positions."""
+    """world_from_body at the centre of the stand's positions."""
     poses = pose_of(joint.values, POSES)
     U, _, V = np.linalg.svd(poses.rotation.mean(axis=0))
     middle = Pose(U @ np.diag([1.0, 1.0, np.linalg.det(U @ V)]) @ V, poses.translation.mean(axis=0))
@@ -71,9 +71,9 @@ def central_pose(joint: Joint) -> Pose:
 
 
 def expected_pose(joint: Joint, world_from_body: Pose, spot_sigma_px: float) -> ExpectedPose | None:
-    """The covariance of a pose measured from one frame with the calibrated rig; None where too few spots are seen.
+    """The covariance of a pose measured from one frame with the calibrated rig; None if too few spots are visible.
 
-    The solution weighs noise and calibration together as geometry/pose_solver/gauss_newton.py does.
+    Noise and calibration are weighted together as in geometry/pose_solver/gauss_newton.py.
     """
     model = SpotModel.of(joint.rig)
     d = model.derivatives(world_from_body)
@@ -100,7 +100,7 @@ def expected_pose(joint: Joint, world_from_body: Pose, spot_sigma_px: float) -> 
 
 
 def spot_sigma(joint: Joint) -> float:
-    """The usual sigma (px) of one coordinate of a spot, as widened."""
+    """The median sigma (px) of one coordinate of a spot, including its scale factor."""
     term = joint.terms[SPOTS][0]
     assert isinstance(term, SpotTerm)
     spots = term.spots
@@ -108,10 +108,13 @@ def spot_sigma(joint: Joint) -> float:
 
 
 def hold_out(measured: Measured, joint: Joint, seed: int = 0) -> HoldOut | None:
-    """Calibrate without a fifth of the positions' spots, predict them, and so for each fifth; None where too few.
+    """Five-fold cross-validation of the positions: calibrate without a fifth of their spots and predict them.
 
-    The held-out spots are compared with where rig, stand and record put them; the expected size counts the errors of
-    all three. Raises AdjustmentError where a part is not determined by the others.
+    None if there are too few positions. The held-out spots are compared with their prediction from rig, stand and
+    record; the expected error includes the uncertainties of all three.
+
+    Raises:
+        AdjustmentError: a fold is not determined by the others.
     """
     count = len(measured.stand.stand_from_body.translation)
     if count < FEWEST_POSITIONS:

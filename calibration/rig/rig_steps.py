@@ -1,4 +1,4 @@
-"""A whole rig from its measurements: the single steps one after the other, then the joint adjustment from there."""
+"""Calibration of a whole rig: the single steps in sequence, then the joint adjustment from their results."""
 
 from __future__ import annotations
 
@@ -15,30 +15,34 @@ from calibration.terms.spot_term import SpotPixels
 
 @dataclass(frozen=True, slots=True)
 class RigSteps:
-    """What each step found."""
+    """Results of the steps."""
 
-    screens: ScreensResult  # lenses, cameras, screens, dots and boards: all but the spots
-    beams: BeamCalibration  # the spots, with what the first step knew
+    screens: ScreensResult  # lenses, cameras, screens, control points and boards: all but the spots
+    beams: BeamCalibration  # from the spots and the result of the first step
     measured: Measured
-    joint: Joint  # everything at once
+    joint: Joint  # the joint adjustment
 
 
 def calibrate_in_steps(
     screens: ScreensResult, spots: SpotPixels, stand: StandModel, *, nominal: bool = True
 ) -> RigSteps:
-    """Screens, beams, then all together.
+    """Calibrate screens, then beams, then all together.
 
     screens: of screens/screens.py, the first step; its network's rig holds nominal beams and the spots too. nominal:
-    as in beams/beams.py. Raises what the others raise: AdjustmentError, ValueError.
+    as in beams/beams.py.
+
+    Raises:
+        AdjustmentError: the spots are inconsistent, or a parameter is undetermined.
+        ValueError: as raised by the steps.
     """
     try:
         beams = calibrate_beams(screens.fit.rig, spots, stand, screens.fit.covariance, nominal=nominal)
     except AdjustmentError as error:
-        # Along a direction that nothing determines the steps may wander instead of ending.
+        # The iteration may diverge along an undetermined direction.
         motion = StandMotion.of(stand.stand_from_body)
         if not motion.flat:
             raise
-        raise AdjustmentError(f"{error}; the stand's positions do not tell all ({motion}): {motion.remedy()}") from None
+        raise AdjustmentError(f"{error}; the stand's positions do not suffice ({motion}): {motion.remedy()}") from None
     if beams.undetermined:
         raise AdjustmentError(
             f"the stand's positions leave undetermined: {briefly(beams.undetermined)}: {beams.motion.remedy()}"

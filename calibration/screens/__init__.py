@@ -1,1 +1,1 @@
-"""Where screens and cameras stand: surveyed dots, boards, scans."""
+"""Calibration of screens and cameras from surveyed dots, boards and scans."""

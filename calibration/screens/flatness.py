@@ -1,8 +1,8 @@
-"""How flat a screen is: a plane or a bent surface through measured points, and what is left of them.
+"""Flatness of a screen: a plane or a bent surface fitted to measured points, with the residual scatter.
 
-In a frame that lies nearly in the screen a surface is a polynomial of the height z over x and y, and its fit linear:
-z = h + p x + q y [+ a x^2 + b x y + c y^2]. Ours; the scatter beyond the points' own sigmas is found as in Paule and
-Mandel (1982), "Consensus values and weighting factors", J. Res. NBS 87(5), eq. 8.
+In a frame nearly in the plane of the screen, a surface is a polynomial of the height z over x and y, and its fit is
+linear: z = h + p x + q y [+ a x^2 + b x y + c y^2]. Ours; scatter in excess of the points' sigmas is estimated as in
+Paule and Mandel (1982), "Consensus values and weighting factors", J. Res. NBS 87(5), eq. 8.
 """
 
 from __future__ import annotations
@@ -15,29 +15,29 @@ from scipy.stats import chi2, f
 
 from geometry.arrays import Array, Bools
 
-SIGNIFICANT = 0.01  # chance at which a flat screen is called bent, or a good survey worse than its sigmas
-OUTLIER_SIGMAS = 5.0  # a point farther off, of its own sigma and the surface's, was not on the screen
-_MOST_OUTLIERS = 0.3  # of all points; with more there is no telling what is the screen
-_MANY = 60  # points beyond which a wrong one hardly bends the surface, and judging each by the others takes long
+SIGNIFICANT = 0.01  # p-value below which a screen is bent, or a survey is worse than its sigmas
+OUTLIER_SIGMAS = 5.0  # of a point's own sigma and the surface's, above which the point is not on the screen
+_MOST_OUTLIERS = 0.3  # of all points; with more outliers the screen cannot be identified
+_MANY = 60  # points above which an outlier hardly bends the surface, and leave-one-out tests take too long
 _SMALLEST_SIGMA_M = 2e-5  # m: no painted screen is smoother
 
 
 @dataclass(frozen=True, slots=True)
 class Surface:
-    """A polynomial surface over the x-y plane and what the points say of it."""
+    """A polynomial surface over the x-y plane, fitted to points."""
 
     bent: bool
-    coefficients: Array  # (6,): h (m), p, q (rad, nearly), a, b, c (1/m); the last three 0 where it is flat
-    covariance: Array  # (6, 6); 0 for the last three where it is flat
-    heights_m: Array  # (n,): points over the surface
-    sigma_m: Array  # (n,): of a point's height: its own, and the surface's scatter
-    scatter_m: float  # sigma of the surface about the polynomial, beyond what the points' own sigmas explain
-    used: Bools  # (n,): False for points that are not on the screen
-    p_fits: float  # chance of a misfit as large as found where nothing but the points' own sigmas acts
+    coefficients: Array  # (6,): h (m), p, q (rad, nearly), a, b, c (1/m); the last three are 0 for a plane
+    covariance: Array  # (6, 6); 0 for the last three of a plane
+    heights_m: Array  # (n,): of the points over the surface
+    sigma_m: Array  # (n,): of a point's height, including the scatter of the surface
+    scatter_m: float  # sigma of the surface about the polynomial, in excess of the points' sigmas
+    used: Bools  # (n,): False for outliers, which are not on the screen
+    p_fits: float  # p-value of the misfit, if the points' own sigmas are its only cause
 
     @property
     def rms_m(self) -> float:
-        """Of the used points' heights."""
+        """RMS of the used points' heights."""
         return float(np.sqrt(np.mean(self.heights_m[self.used] ** 2)))
 
     @property
@@ -48,23 +48,23 @@ class Surface:
 
 @dataclass(frozen=True, slots=True)
 class Flatness:
-    """The plane, the bent surface where one can be fitted, and which of them the points ask for."""
+    """The plane, the bent surface if there are enough points, and the chosen one of them."""
 
     flat: Surface
     bent: Surface | None  # None: too few points
-    p_flat: float  # chance that a flat screen would look as bent as this one; nan where nothing can be said
+    p_flat: float  # p-value of the bend, if the screen is flat; nan if unknown
     chosen: Surface
 
 
-def judge_flatness(xyz: Array, sigma_m: Array, bow: str = "auto", scatter_m: float | None = None) -> Flatness:
-    """The surface that points ask for.
+def assess_flatness(xyz: Array, sigma_m: Array, bow: str = "auto", scatter_m: float | None = None) -> Flatness:
+    """The surface that fits the points: a plane, or a bent surface if its bend is significant.
 
-    xyz (n, 3), m, in a frame that lies in the screen to a few degrees; sigma_m (n,): of z. bow: "auto" takes the bent
-    surface where it is significant, "always" and "never" do not ask. scatter_m: of the surface, where known.
+    xyz (n, 3), m, in a frame within a few degrees of the screen; sigma_m (n,): of z. bow: "auto" tests the bend,
+    "always" and "never" do not. scatter_m: of the surface, if known.
     """
-    # What does not fit even a bent surface is no part of the screen; a bow must not be taken for outliers.
+    # Outliers are those that do not even fit a bent surface, so that a bow does not cause any.
     enough = len(xyz) >= 9
-    used = _on_surface(xyz, sigma_m, bent=enough and bow != "never", scatter_m=scatter_m)
+    used = _inliers_of_surface(xyz, sigma_m, bent=enough and bow != "never", scatter_m=scatter_m)
     flat = fit_surface(xyz, sigma_m, False, scatter_m, used)
     bent = fit_surface(xyz, sigma_m, True, scatter_m, used) if np.sum(used) >= 7 else None
     p_flat = float("nan") if bent is None else _p_flat(flat, bent, sigma_m, scatter_m)
@@ -77,9 +77,10 @@ def judge_flatness(xyz: Array, sigma_m: Array, bow: str = "auto", scatter_m: flo
 def fit_surface(
     xyz: Array, sigma_m: Array, bent: bool, scatter_m: float | None = None, used: Bools | None = None
 ) -> Surface:
-    """Weighted least squares. scatter_m None: as large as the points ask for, 0 where their sigmas explain them.
+    """Weighted least squares. scatter_m None: estimated, 0 if the points' sigmas explain the residuals.
 
-    Raises ValueError where the used points do not determine the surface.
+    Raises:
+        ValueError: the used points do not determine the surface.
     """
     use = np.ones(len(xyz), dtype=bool) if used is None else used
     A = _polynomial(xyz[:, :2], bent)
@@ -106,7 +107,7 @@ def fit_surface(
 
 
 def smallest_scatter(scatter_m: float) -> float:
-    """The scatter that a screen's surface is given at least."""
+    """A screen's surface scatter, limited from below."""
     return max(scatter_m, _SMALLEST_SIGMA_M)
 
 
@@ -117,13 +118,13 @@ def _polynomial(xy: Array, bent: bool) -> Array:
 
 
 def _balanced(A: Array) -> Array:
-    """Columns of length one, so that a rank does not depend on units."""
+    """The matrix with columns of length one, so that its rank does not depend on units."""
     length = np.linalg.norm(A, axis=0)
     return A / np.where(length > 0, length, 1.0)
 
 
 def _least_squares(A: Array, z: Array, sigma: Array) -> tuple[Array, Array]:
-    """Covariance of the coefficients and what is left of z."""
+    """Covariance of the coefficients, and the residuals of z."""
     W = A / sigma[:, None]
     scale = np.linalg.norm(W, axis=0)
     inverse = np.linalg.inv((W / scale).T @ (W / scale)) / np.outer(scale, scale)
@@ -131,9 +132,9 @@ def _least_squares(A: Array, z: Array, sigma: Array) -> tuple[Array, Array]:
 
 
 def _p_flat(flat: Surface, bent: Surface, sigma_m: Array, scatter_m: float | None) -> float:
-    """Chance of a gain by three more numbers as large as found, if the screen is flat."""
+    """P-value of the improvement by three more parameters, if the screen is flat."""
     use = flat.used
-    # The same sigmas for both, those of the better surface: else the plane's misfit is called scatter.
+    # Both with the sigmas of the bent surface: otherwise the plane's misfit would count as scatter.
     sigma = bent.sigma_m[use] if scatter_m is None else np.hypot(sigma_m[use], scatter_m)
     gain = float(np.sum((flat.heights_m[use] / sigma) ** 2) - np.sum((bent.heights_m[use] / sigma) ** 2))
     dof = int(np.sum(use)) - 6
@@ -142,14 +143,14 @@ def _p_flat(flat: Surface, bent: Surface, sigma_m: Array, scatter_m: float | Non
     return float(f.sf(max(gain, 0.0) / 3, 3, dof))
 
 
-def _on_surface(xyz: Array, sigma_m: Array, bent: bool, scatter_m: float | None) -> Bools:
-    """Which points lie on the screen: the worst one goes while it is far off what the others say of it.
+def _inliers_of_surface(xyz: Array, sigma_m: Array, bent: bool, scatter_m: float | None) -> Bools:
+    """Which points lie on the screen, by removing the worst outlier repeatedly.
 
-    Each is judged by the surface through the others, since one wrong point of six bends the surface through all.
+    Each is tested against the surface through the others, because one outlier of six bends the surface through all.
     """
     used = np.ones(len(xyz), dtype=bool)
     if len(xyz) > _MANY:
-        return _near_most(xyz, sigma_m, bent)
+        return _robust_inliers(xyz, sigma_m, bent)
     fewest = 8 if bent else 5
     while np.sum(used) > max(fewest, (1 - _MOST_OUTLIERS) * len(xyz)):
         worst, largest = -1, OUTLIER_SIGMAS
@@ -159,10 +160,10 @@ def _on_surface(xyz: Array, sigma_m: Array, bent: bool, scatter_m: float | None)
             try:
                 surface = fit_surface(xyz, sigma_m, bent, scatter_m, rest)
             except ValueError:
-                continue  # the others do not determine a surface: nothing can be said of this point
+                continue  # the others do not determine a surface, so that this point cannot be tested
             row = _polynomial(xyz[i : i + 1, :2], bent)[0]
             C = surface.covariance[: len(row), : len(row)]
-            # Few others give an uncertain scatter: a Student's t of few degrees has wide tails.
+            # With few points the scatter is uncertain: Student's t has wide tails for few degrees of freedom.
             wide = 1.0 if surface.scatter_m == 0 else np.sqrt(1 + 6 / max(int(np.sum(rest)) - len(row), 1))
             off = abs(surface.heights_m[i]) / (wide * np.sqrt(surface.sigma_m[i] ** 2 + row @ C @ row))
             if off > largest:
@@ -173,8 +174,8 @@ def _on_surface(xyz: Array, sigma_m: Array, bent: bool, scatter_m: float | None)
     return used
 
 
-def _near_most(xyz: Array, sigma_m: Array, bent: bool) -> Bools:
-    """Which of many points lie within five of their common scatter, as their median distance shows it."""
+def _robust_inliers(xyz: Array, sigma_m: Array, bent: bool) -> Bools:
+    """Which of many points are within five sigmas of the surface, by a robust sigma from their median distance."""
     used = np.ones(len(xyz), dtype=bool)
     for _ in range(10):
         surface = fit_surface(xyz, sigma_m, bent, 0.0, used)

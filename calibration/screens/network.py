@@ -1,8 +1,8 @@
-"""Cameras and screens in one world: one bundle adjustment over surveyed dots, boards and the screens' surfaces.
+"""Bundle adjustment of cameras and screens with surveyed control points, boards and the screens' surfaces.
 
-Source: Triggs et al. (2000), "Bundle adjustment: a modern synthesis"; the factor by which sigmas are widened where the
-measurements agree less well than they claim is geodesy's a-posteriori variance factor (Foerstner and Wrobel 2016,
-Photogrammetric Computer Vision, eq. 4.91).
+Source: Triggs et al. (2000), "Bundle adjustment: a modern synthesis"; the factor on the sigmas, if the residuals are
+larger than stated, is geodesy's a-posteriori variance factor (Foerstner and Wrobel 2016, Photogrammetric Computer
+Vision, eq. 4.91).
 """
 
 from __future__ import annotations
@@ -28,19 +28,19 @@ from geometry.pose import Pose
 from geometry.rig import Rig
 from geometry.uncertainty.rig_parameters import RigCovariance
 
-OUTLIER_SIGMAS = 5.0  # in two dimensions one right point of 270 000 lies farther off
-WARP_SIGMA_M = 1e-3  # by how much a board may be bent at its edge
-SIGNIFICANT = 0.001  # chance at which measurements that fit their sigmas are called worse than these
+OUTLIER_SIGMAS = 5.0  # in two dimensions one correct point of 270 000 exceeds it
+WARP_SIGMA_M = 1e-3  # sigma of a board's bend at its edge
+SIGNIFICANT = 0.001  # p-value of chi-square below which the sigmas are increased
 
 
 @dataclass(frozen=True, slots=True)
 class Dots:
-    """Surveyed points: p of them."""
+    """Surveyed control points: p of them."""
 
     names: tuple[str, ...]
     xyz: Array  # (p, 3), m, world
     covariance: Array  # (p, 3, 3), m^2
-    screen_of: Ints  # (p,): index of the screen that a point lies on; -1: on none
+    screen_of: Ints  # (p,): index of the screen on which a point lies; -1: none
 
     def __len__(self) -> int:
         return len(self.names)
@@ -48,7 +48,7 @@ class Dots:
 
 @dataclass(frozen=True, slots=True)
 class PointObservations:
-    """Where cameras see dots: n of them."""
+    """Observations of control points in pictures: n of them."""
 
     camera_of: Ints  # (n,)
     dot_of: Ints  # (n,)
@@ -61,66 +61,68 @@ class PointObservations:
 
 @dataclass(frozen=True, slots=True)
 class Network:
-    """What was measured. The rig gives cameras with their lenses, and screens; its poses are not used."""
+    """All measurements. The rig gives cameras with their lenses, and screens; its poses are not used."""
 
     rig: Rig
     dots: Dots
     sightings: PointObservations
     corners: CornerTerm | None = None  # of boards that were carried about, and of boards fixed to screens
-    placements: tuple[str, ...] = ()  # names of the boards' places, as the corners count them
+    placements: tuple[str, ...] = ()  # names of the boards' positions, in the numbering of the corners
     fixed: BoardOnScreenTerm | None = None
-    surface_scatter_m: Mapping[int, float] = field(default_factory=dict)  # screen -> its own scatter, where dots say
-    off_surface: Bools | None = None  # (p,): dots that do not lie on their screen, though named for it
-    bent: frozenset[int] = frozenset()  # screens whose bow is asked for
-    screen_priors: tuple[Prior, ...] = ()  # what scans say of screens
+    surface_scatter_m: Mapping[int, float] = field(default_factory=dict)  # screen -> its scatter, if it has dots
+    off_surface: Bools | None = None  # (p,): control points assigned to a screen that do not lie on it
+    bent: frozenset[int] = frozenset()  # screens with a free bow
+    screen_priors: tuple[Prior, ...] = ()  # of screens from scans
     lens_priors: tuple[Prior, ...] = ()
-    warp_sigma_m: float = WARP_SIGMA_M  # by how much a board may be bent at its edge; 0: not at all
+    warp_sigma_m: float = WARP_SIGMA_M  # sigma of a board's bend at its edge; 0: flat
     radii_m: Array | None = None  # (boards,): of their circles, 0 for boards of corners; None: no circles
-    lens_free: Bools | None = None  # (cameras, 18): which lens numbers may move; None: none
+    lens_free: Bools | None = None  # (cameras, 18): free lens parameters; None: none
 
 
 @dataclass(frozen=True, slots=True)
 class Start:
-    """Where the adjustment begins, and what holds its frame."""
+    """Start values of the adjustment, and the elements that fix its frame."""
 
-    camera_from_world: Pose  # a stack, one per camera
-    world_from_screen: Pose  # a stack, one per screen: its axes within the plane stay as they are here
-    world_from_board: Pose  # a stack, one per placement
+    camera_from_world: Pose  # batch, one per camera
+    world_from_screen: Pose  # batch, one per screen: the axes within the plane keep these directions
+    world_from_board: Pose  # batch, one per placement
     bow: Array  # (screens, 3), 1/m
-    # Where no survey gives the world: the camera, or the place of the board fixed to a screen, that stays where it is.
+    # If no survey defines the world: the camera, or the board fixed to a screen, whose pose is held.
     held_camera: int | None = None
     held_board: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class NetworkFit:
-    """Cameras and screens in the world, with the joint covariance of their errors."""
+    """Adjusted cameras and screens, with the joint covariance of their errors."""
 
     rig: Rig
     values: Values
-    covariance: RigCovariance  # widened by the variance factor
-    variance_factor: float  # 1 where the measurements fit their sigmas
-    p_fits: float  # chance of a misfit as large as found if all sigmas are right
+    covariance: RigCovariance  # multiplied by the variance factor
+    variance_factor: float  # 1 if the residuals are consistent with the sigmas
+    p_fits: float  # p-value of chi-square, if all sigmas are right
     dof: int
-    sighting_errors_px: Array  # (n, 2): measured less predicted
+    sighting_errors_px: Array  # (n, 2): measured minus predicted
     sighting_sigmas: Array  # (n,): their length in sigmas
-    used: Bools  # (n,) sightings
-    dot_shifts_m: Array  # (p, 3): adjusted less surveyed
-    corners: CornerTerm | None  # those that were used, with the sigma that their residuals show
-    corner_errors_px: Array  # (corners, 2): measured less predicted
+    used: Bools  # (n,) observations that are inliers
+    dot_shifts_m: Array  # (p, 3): adjusted minus surveyed
+    corners: CornerTerm | None  # the inliers, with the sigma of their residuals
+    corner_errors_px: Array  # (corners, 2): measured minus predicted
     adjusted: Adjusted
 
 
 def adjust(network: Network, start: Start) -> NetworkFit:
-    """The one adjustment of everything.
+    """The adjustment of all measurements.
 
-    Sightings and corners that lie more than 5 sigmas off what the others say are left out; corners weigh by what their
-    residuals show. Raises AdjustmentError where the start is too far off or something is not
-    determined.
+    Observations and corners more than 5 sigmas from the prediction are excluded; corners are weighted by the scatter of
+    their residuals.
+
+    Raises:
+        AdjustmentError: the start is too far from the solution, or a parameter is not determined.
     """
     values, free, at = _unknowns(network, start)
-    corners = None if network.corners is None else _weighed_corners(network, start, values, free)
-    rest = _terms_but_sightings(network, start, corners)
+    corners = None if network.corners is None else _weighted_corners(network, start, values, free)
+    rest = _other_terms(network, start, corners)
     used = np.ones(len(network.sightings), dtype=bool)
     robust = solve(values, [_point_term(network, used, Cauchy()), *rest], free)
     used = _inliers(network, robust.values, used)
@@ -170,7 +172,7 @@ def _unknowns(network: Network, start: Start) -> tuple[Values, dict[str, bool | 
     return values, free, at
 
 
-def _terms_but_sightings(network: Network, start: Start, corners: CornerTerm | None) -> list[Term]:
+def _other_terms(network: Network, start: Start, corners: CornerTerm | None) -> list[Term]:
     dots = network.dots
     every = np.arange(len(dots))
     out: list[Term] = [*network.lens_priors, *network.screen_priors]
@@ -192,7 +194,7 @@ def _terms_but_sightings(network: Network, start: Start, corners: CornerTerm | N
 
 
 def flat_boards(corners: CornerTerm, sigma_m: float = WARP_SIGMA_M) -> Sequence[Prior]:
-    """That boards are flat to about so much at their edges; how they are bent is found with the rest."""
+    """The prior that boards are flat to about `sigma_m` at their edges; their bend is estimated."""
     if sigma_m == 0:
         return []
     count = int(corners.board.max(initial=-1)) + 1
@@ -212,23 +214,23 @@ def _fisheye(rig: Rig) -> Bools:
 
 
 def sighting_errors(network: Network, values: Values) -> Array:
-    """Measured less predicted pixel (n, 2) of all sightings, the dots where the SURVEY has them.
+    """Measured minus predicted pixel (n, 2) of all observations, with control points at their SURVEYED positions.
 
-    Not where the adjustment moved them: a dot that only one camera sees follows a wrong pixel as far as its survey
-    lets it, and would hide it. inf where there is no projection.
+    Not at the adjusted ones: a point seen by one camera only follows a wrong pixel as far as its survey sigma allows,
+    which would conceal the error. inf where there is no projection.
     """
     s = network.sightings
     cameras = list(rig_of(network.rig, values).cameras.values())
     out = np.full((len(s), 2), np.inf)
     for k, camera in enumerate(cameras):
         mine = np.flatnonzero(s.camera_of == k)
-        away = s.pixels[mine] - camera.project(network.dots.xyz[s.dot_of[mine]])
-        out[mine] = np.where(np.isfinite(away), away, np.inf)
+        errors = s.pixels[mine] - camera.project(network.dots.xyz[s.dot_of[mine]])
+        out[mine] = np.where(np.isfinite(errors), errors, np.inf)
     return out
 
 
 def sighting_sigmas(network: Network, values: Values) -> Array:
-    """How many sigmas each sighting is off (n,): of its pixel's and its survey's errors together."""
+    """Length of each observation's error in sigmas (n,), of pixel and survey combined."""
     s = network.sightings
     errors = sighting_errors(network, values)
     term = _point_term(network, np.ones(len(s), dtype=bool))
@@ -243,7 +245,7 @@ def sighting_sigmas(network: Network, values: Values) -> Array:
 
 
 def _inliers(network: Network, values: Values, used: Bools) -> Bools:
-    """Which sightings agree with the others, by their own scatter where it is more than their sigmas say."""
+    """Observations that are inliers, relative to their own scatter if it exceeds their sigmas."""
     if not len(network.sightings):
         return used
     off = sighting_sigmas(network, values)
@@ -253,20 +255,20 @@ def _inliers(network: Network, values: Values, used: Bools) -> Bools:
     return off < OUTLIER_SIGMAS * scale
 
 
-def _weighed_corners(network: Network, start: Start, values: Values, free: Mapping[str, bool | Bools]) -> CornerTerm:
-    """The corners that agree with the others, each with the sigma that their residuals show."""
+def _weighted_corners(network: Network, start: Start, values: Values, free: Mapping[str, bool | Bools]) -> CornerTerm:
+    """The inlier corners, with the sigma of their residuals."""
     term = replace(network.corners, loss=Cauchy()) if network.corners is not None else None
     assert term is not None
     everything = [
         _point_term(network, np.ones(len(network.sightings), dtype=bool), Cauchy()),
-        *_terms_but_sightings(network, start, term),
+        *_other_terms(network, start, term),
     ]
     found = solve(values, everything, free)
     residuals = found.residuals[next(i for i, t in enumerate(everything) if t is term)]
     length = np.linalg.norm(residuals, axis=1)
     # The median of a two-dimensional Gaussian's length is 1.177 sigmas.
     good = length < OUTLIER_SIGMAS * float(np.median(length)) / 1.177
-    # Each placement takes six numbers of the corners, each camera of a chain six more.
+    # Six parameters per placement of a board, and six per further camera.
     spent = 6 * (len(network.placements) + len(network.rig.cameras) - 1)
     dof = max(2 * int(good.sum()) - spent, int(good.sum()) // 2)
     factor = max(float(np.sqrt(np.sum(residuals[good] ** 2) / dof)), 0.1)
@@ -288,7 +290,7 @@ def _fit(
     factor = chi2 / dof if dof > 0 and p_fits < SIGNIFICANT else 1.0
     names, T = named_errors(rig, found.values, list(at))
     covariance = T @ found.covariance(list(at)) @ T.T * factor
-    # Lens numbers that were held have no error here, and no place among those that do.
+    # Fixed lens parameters have no error and are omitted.
     known = np.diagonal(covariance) > 0
     names = tuple(n for n, k in zip(names, known, strict=True) if k)
     covariance = covariance[np.ix_(known, known)]

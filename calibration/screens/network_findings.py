@@ -1,4 +1,4 @@
-"""What a network says of itself: dots that were mixed up, how flat its screens are, how well it fits."""
+"""Findings of a network adjustment: exchanged control points, flatness of the screens, and residuals."""
 
 from __future__ import annotations
 
@@ -16,58 +16,60 @@ from geometry.camera import Camera
 from geometry.planes import meet_plane
 from geometry.rig import Screen
 
-_LIKE_ANOTHER_DOT = 0.15  # of the distance of neighbouring dots: nearer than this a pixel is taken for another dot's
+_SAME_POSITION = 0.15  # tolerance of another dot's position, as a share of the distance of neighbouring dots
 
 
 @dataclass(frozen=True, slots=True)
 class ScreenLimits:
-    """When a network is called poor."""
+    """Thresholds of the findings."""
 
-    sigma_spot_warn_m: float = 0.5e-3  # of the surface along its normal, where a spot lands: the goal for a pose
+    sigma_spot_warn_m: float = 0.5e-3  # of the surface along its normal, at the spots: the goal for a pose
     sigma_spot_fail_m: float = 3e-3
-    scatter_warn_m: float = 0.5e-3  # of the surface about its shape: a spot is displaced by about as much at 45 deg
+    scatter_warn_m: float = 0.5e-3  # of the surface about its shape: displaces a spot by about as much at 45 deg
     scatter_fail_m: float = 3e-3
-    factor_warn: float = 1.3  # times that measurements miss by more than their sigmas
+    factor_warn: float = 1.3  # residuals over their sigmas
     factor_fail: float = 4.0
     outliers_fail: float = 0.25  # share of a camera's dots
 
 
 @dataclass(frozen=True, slots=True)
-class Misplaced:
-    """One sighting that lies far off what the others say."""
+class Outlier:
+    """An outlier among the observations, with its probable cause."""
 
     sighting: int
     camera: str
     dot: str
-    away_px: float
-    away_m: Array  # (2,), on the dot's screen along its x, y; nan where the dot is on none
-    instead: str  # the dot whose place it is at; empty: none's
-    swapped: bool  # and that dot's pixel is at this one's place
+    error_px: float
+    error_m: Array  # (2,), on the dot's screen along its x, y; nan if the dot is not on a screen
+    at_place_of: str  # the dot at this position; empty: none
+    swapped: bool  # whether that dot's pixel is at this dot's position
 
 
-def misplaced(network: Network, fit: NetworkFit) -> tuple[Misplaced, ...]:
-    """The sightings that the adjustment left out, and what they may be."""
+def classify_outliers(network: Network, fit: NetworkFit) -> tuple[Outlier, ...]:
+    """The observations that the adjustment excluded, with their probable cause."""
     s, dots = network.sightings, network.dots
     cameras, screens = list(fit.rig.cameras.values()), list(fit.rig.screens.values())
-    out: list[Misplaced] = []
+    out: list[Outlier] = []
     for i in np.flatnonzero(~fit.used):
         camera, dot = cameras[s.camera_of[i]], int(s.dot_of[i])
         everywhere = camera.project(dots.xyz)
-        apart = np.linalg.norm(everywhere - s.pixels[i], axis=1)
-        apart[~np.isfinite(apart)] = np.inf
-        apart[dot] = np.inf
-        nearest = int(np.argmin(apart))
+        distances = np.linalg.norm(everywhere - s.pixels[i], axis=1)
+        distances[~np.isfinite(distances)] = np.inf
+        distances[dot] = np.inf
+        nearest = int(np.argmin(distances))
         spacing = np.linalg.norm(everywhere - everywhere[nearest], axis=1)
         spacing[nearest] = np.inf
-        limit = max(_LIKE_ANOTHER_DOT * float(np.nanmin(spacing)), 5 * float(s.sigma_px[i]))
-        instead = dots.names[nearest] if apart[nearest] < limit else ""
+        limit = max(_SAME_POSITION * float(np.nanmin(spacing)), 5 * float(s.sigma_px[i]))
+        at_place_of = dots.names[nearest] if distances[nearest] < limit else ""
         back = np.flatnonzero((s.camera_of == s.camera_of[i]) & (s.dot_of == nearest) & ~fit.used)
-        swapped = bool(instead) and any(np.linalg.norm(everywhere[dot] - s.pixels[b]) < limit for b in back.tolist())
-        away_m = np.full(2, np.nan)
+        swapped = bool(at_place_of) and any(
+            np.linalg.norm(everywhere[dot] - s.pixels[b]) < limit for b in back.tolist()
+        )
+        error_m = np.full(2, np.nan)
         if dots.screen_of[dot] >= 0:
-            away_m = _on_screen(camera, screens[dots.screen_of[dot]], s.pixels[i], dots.xyz[dot])
-        away_px = float(np.linalg.norm(fit.sighting_errors_px[i]))
-        out.append(Misplaced(int(i), camera.name, dots.names[dot], away_px, away_m, instead, swapped))
+            error_m = _on_screen(camera, screens[dots.screen_of[dot]], s.pixels[i], dots.xyz[dot])
+        error_px = float(np.linalg.norm(fit.sighting_errors_px[i]))
+        out.append(Outlier(int(i), camera.name, dots.names[dot], error_px, error_m, at_place_of, swapped))
     return tuple(out)
 
 
@@ -79,15 +81,15 @@ def _on_screen(camera: Camera, screen: Screen, pixel: Array, dot: Array) -> Arra
 def findings(
     result: ScreensResult, limits: ScreenLimits = ScreenLimits(), *, names_doubted: bool = False
 ) -> list[Finding]:
-    """Everything that was tested; of equal level, causes before what they cause.
+    """All findings; of equal level, causes before their effects.
 
-    names_doubted: cameras stand far from where they should; that pixels fit their names is then not claimed.
+    names_doubted: cameras are far from their approximate positions; the pass finding about dots is then omitted.
     """
     out = [_agreement(result, limits)]
     out += [f for f in _dots(result, limits) if not (names_doubted and f.level == Level.PASS)]
     out += _surfaces(result, limits)
     out += _sigmas(result, limits)
-    out += _rivals(result)
+    out += _second_poses(result)
     return out
 
 
@@ -98,24 +100,24 @@ def _agreement(result: ScreensResult, limits: ScreenLimits) -> Finding:
         return Finding(
             Level.WARN,
             "no measurement is redundant",
-            "a wrong dot or a wrong coordinate cannot be noticed",
+            "a wrong dot or a wrong coordinate cannot be detected",
             "survey more dots: eight or more per screen, all of them seen by its camera",
         )
     if factor == 1.0:
-        return Finding(Level.PASS, f"the measurements agree within their sigmas ({fit.dof} redundant numbers)")
+        return Finding(Level.PASS, f"the residuals are consistent with their sigmas (redundancy {fit.dof})")
     level = Level.FAIL if factor > limits.factor_fail else Level.WARN if factor > limits.factor_warn else Level.PASS
     return Finding(
         level,
-        f"the measurements agree {factor:.2g} times worse than their sigmas say ({fit.dof} redundant numbers)",
-        "all sigmas of the result were widened by that; what causes it may also shift the result",
+        f"the residuals are {factor:.2g} times larger than their sigmas (redundancy {fit.dof})",
+        "all sigmas of the result were multiplied by this factor; the cause may also bias the result",
         ""
         if level is Level.PASS
-        else f"check the sigmas of survey and pixels and the dots' names{_lens_to_doubt(result)}",
+        else f"check the sigmas of survey and pixels and the dots' names{_doubtful_lens(result)}",
     )
 
 
-def _lens_to_doubt(result: ScreensResult) -> str:
-    """Of which camera the lens calibration may be another's: the one whose dots misfit most."""
+def _doubtful_lens(result: ScreensResult) -> str:
+    """The camera with the largest residuals, whose lens calibration may be another camera's."""
     s, fit = result.network.sightings, result.fit
     if not len(s):
         return ""
@@ -127,37 +129,37 @@ def _lens_to_doubt(result: ScreensResult) -> str:
         if rows.any()
     }
     worst = max(misfit, key=lambda n: misfit[n], default="")
-    return f"; the dots of camera {worst!r} misfit most: its lens calibration may be another camera's" if worst else ""
+    return f"; camera {worst!r} has the largest residuals: its lens may be that of another camera" if worst else ""
 
 
 def _dots(result: ScreensResult, limits: ScreenLimits) -> list[Finding]:
     network, out = result.network, []
-    wrong = misplaced(network, result.fit)
-    told: set[tuple[str, str]] = set()
+    wrong = classify_outliers(network, result.fit)
+    reported: set[tuple[str, str]] = set()
     by_dot = {m.dot: [n for n in wrong if n.dot == m.dot] for m in wrong}
     for m in wrong:
-        if (m.camera, m.dot) in told:
+        if (m.camera, m.dot) in reported:
             continue
-        told.add((m.camera, m.dot))
-        where = f"camera {m.camera!r}: dot {m.dot!r} is {m.away_px:.1f} px from where the others put it"
-        if np.isfinite(m.away_m).all():
-            where += f" ({1e3 * m.away_m[0]:+.1f}, {1e3 * m.away_m[1]:+.1f} mm along x, y of its screen)"
+        reported.add((m.camera, m.dot))
+        where = f"camera {m.camera!r}: dot {m.dot!r} is {m.error_px:.1f} px from its predicted position"
+        if np.isfinite(m.error_m).all():
+            where += f" ({1e3 * m.error_m[0]:+.1f}, {1e3 * m.error_m[1]:+.1f} mm along x, y of its screen)"
         seen = int(np.sum(network.sightings.dot_of == network.dots.names.index(m.dot)))
         if m.swapped:
-            told.add((m.camera, m.instead))
-            what = f"camera {m.camera!r}: dots {m.dot!r} and {m.instead!r} are swapped ({m.away_px:.1f} px)"
-            remedy = "swap the two names in the table of points, or in the survey"
-        elif m.instead:
-            what, remedy = f"{where}, where dot {m.instead!r} is", "mend the name in the table of points"
+            reported.add((m.camera, m.at_place_of))
+            what = f"camera {m.camera!r}: dots {m.dot!r} and {m.at_place_of!r} are exchanged ({m.error_px:.1f} px)"
+            remedy = "exchange the two names in the table of points, or in the survey"
+        elif m.at_place_of:
+            what, remedy = f"{where}, where dot {m.at_place_of!r} is", "correct the name in the table of points"
         elif len(by_dot[m.dot]) == seen and seen > 1:
-            what = f"{where}; all {seen} cameras that see it say so"
+            what = f"{where}; the same holds for all {seen} cameras that see it"
             remedy = "survey it again: its coordinates are wrong, or it has moved"
         else:
             what, remedy = (
                 where,
-                "look at the picture: another point of light was taken for it, or it was surveyed wrongly",
+                "inspect the picture: another point of light was measured, or the survey of the dot is wrong",
             )
-        out.append(Finding(Level.WARN, what, "it was left out", remedy))
+        out.append(Finding(Level.WARN, what, "it was excluded", remedy))
     for c, name in enumerate(network.rig.cameras):
         mine = network.sightings.camera_of == c
         if mine.any() and np.mean(~result.fit.used[mine]) > limits.outliers_fail:
@@ -165,13 +167,14 @@ def _dots(result: ScreensResult, limits: ScreenLimits) -> list[Finding]:
             out.append(
                 Finding(
                     Level.FAIL,
-                    f"camera {name!r}: {bad} of {n} dots do not fit its place",
-                    "with so many wrong the others may be right by chance",
+                    f"camera {name!r}: {bad} of {n} dots do not fit its pose",
+                    "with so many outliers the others may fit by chance",
                     "check names and coordinates, and that the lens belongs to this camera at this focus",
                 )
             )
-    if len(network.sightings) and not wrong:
-        out.append(Finding(Level.PASS, f"all {len(network.sightings)} pixels of dots fit their names"))
+    count = len(network.sightings)
+    if count and not wrong:
+        out.append(Finding(Level.PASS, f"all {count} pixels of dots are consistent with their names"))
     return out
 
 
@@ -182,13 +185,13 @@ def _surfaces(result: ScreensResult, limits: ScreenLimits) -> list[Finding]:
             continue
         chosen, flat = screen.flatness.chosen, screen.flatness.flat
         for k in np.flatnonzero(~screen.used):
-            whose = f"dot {result.network.dots.names[screen.dots[k]]!r}" if screen.dots else "a scanned patch"
             if screen.dots:
+                dot = result.network.dots.names[screen.dots[k]]
                 out.append(
                     Finding(
                         Level.WARN,
-                        f"screen {name!r}: {whose} lies {1e3 * chosen.heights_m[k]:+.1f} mm off its surface",
-                        "it was not used for the surface",
+                        f"screen {name!r}: dot {dot!r} is {1e3 * chosen.heights_m[k]:+.1f} mm off its surface",
+                        "it was excluded from the surface",
                         "survey it again, or correct the column `screen`",
                     )
                 )
@@ -198,7 +201,7 @@ def _surfaces(result: ScreensResult, limits: ScreenLimits) -> list[Finding]:
                 Finding(
                     Level.WARN,
                     f"screen {name!r}: {n} dots",
-                    "too few to tell a bent screen from a wrong dot",
+                    "too few to distinguish a bent screen from a wrong dot",
                     "survey eight or more, spread to the screen's edges",
                 )
             )
@@ -208,9 +211,9 @@ def _surfaces(result: ScreensResult, limits: ScreenLimits) -> list[Finding]:
             out.append(
                 Finding(
                     Level.WARN,
-                    f"screen {name!r} is bent by {bulge:.2g} mm over its dots: as a plane it misses them by"
-                    f" {1e3 * flat.rms_m:.2g} mm RMS, bent by {rms:.2g} mm",
-                    "spots are computed on the bent surface; outside of the dots it is a guess",
+                    f"screen {name!r} is bent by {bulge:.2g} mm over its dots: residuals of the dots"
+                    f" {1e3 * flat.rms_m:.2g} mm RMS for a plane, {rms:.2g} mm for the bent surface",
+                    "spots are computed on the bent surface, which is extrapolated beyond the dots",
                     "flatten the screen, or survey dots to its edges",
                 )
             )
@@ -221,7 +224,7 @@ def _surfaces(result: ScreensResult, limits: ScreenLimits) -> list[Finding]:
                     level,
                     f"screen {name!r}: the surface scatters by {1e3 * chosen.scatter_m:.2g} mm (1 sigma) about its"
                     f" {'bent shape' if chosen.bent else 'plane'}, up to {largest:.2g} mm",
-                    "a spot that falls obliquely is displaced by about as much; no shape describes it",
+                    "spots at oblique incidence are displaced by about as much; no smooth shape describes it",
                     "flatten the screen, or survey more dots so that a bow can be fitted",
                 )
             )
@@ -235,7 +238,7 @@ def _surfaces(result: ScreensResult, limits: ScreenLimits) -> list[Finding]:
 
 
 def _bulge(bow: Array, xyz: Array) -> float:
-    """Largest less least height, m, of a bent surface over the points (n, 3) of the screen."""
+    """Peak-to-valley height, m, of a bent surface over the points (n, 3) of the screen."""
     x, y = xyz[:, 0], xyz[:, 1]
     z = bow[0] * x * x + bow[1] * x * y + bow[2] * y * y
     return float(np.ptp(z))
@@ -247,7 +250,7 @@ def _sigmas(result: ScreensResult, limits: ScreenLimits) -> list[Finding]:
         known = f"screen {name!r}: its surface is known to {{}} (1 sigma, worst place)"
         out.append(_sigma_finding(known, float(np.max(spot_sigmas(result, k))), limits))
     for name, sigma in pointing_sigmas_m(result).items():
-        good = f"camera {name!r}: its place is good for {{}} at its screen's middle (1 sigma)"
+        good = f"camera {name!r}: its pose is known to {{}} at the centre of its screen (1 sigma)"
         out.append(_sigma_finding(good, sigma, limits))
     return out
 
@@ -259,36 +262,36 @@ def _sigma_finding(words: str, sigma_m: float, limits: ScreenLimits) -> Finding:
     return Finding(
         Level.FAIL if sigma_m > limits.sigma_spot_fail_m else Level.WARN,
         what,
-        "every pose that is measured with it carries this error",
+        "every pose measured with it has this error",
         "survey more dots, farther apart, with smaller sigmas; let the camera see all of them",
     )
 
 
-def _rivals(result: ScreensResult) -> list[Finding]:
+def _second_poses(result: ScreensResult) -> list[Finding]:
     names = list(result.network.rig.cameras)
     return [
         Finding(
             Level.WARN,
-            f"camera {names[c]!r}: a second place fits its dots nearly as well ({rival.rms_px:.2g} px RMS)",
-            "dots of one plane, seen small, leave two places; the better one was taken",
-            "add `near_m` (its place by tape measure) to this camera, or dots off the screen's plane",
+            f"camera {names[c]!r}: a second pose fits its dots nearly as well ({second.rms_px:.2g} px RMS)",
+            "coplanar dots that appear small in the picture allow two poses; the better one was used",
+            "add `near_m` (its position by tape measure) to this camera, or dots off the screen's plane",
         )
-        for c, rival in result.rivals.items()
+        for c, second in result.second_poses.items()
     ]
 
 
 def near_findings(result: ScreensResult, near: Mapping[int, Near]) -> list[Finding]:
-    """Whether cameras stand where a tape measure says."""
+    """Whether cameras are at their approximate positions, measured by tape."""
     out = []
     for c, n in near.items():
         name, camera = list(result.fit.rig.cameras.items())[c]
-        away = float(np.linalg.norm(camera.camera_from_world.inverse().translation - n.position_m))
-        what = f"camera {name!r} stands {away:.2f} m from its `near_m`, {n.within_m:g} m were allowed"
-        if away <= n.within_m:
+        distance = float(np.linalg.norm(camera.camera_from_world.inverse().translation - n.position_m))
+        what = f"camera {name!r} is {distance:.2f} m from its `near_m`, {n.within_m:g} m were allowed"
+        if distance <= n.within_m:
             out.append(Finding(Level.PASS, what))
         else:
             remedy = "check near_m, the survey's columns, the pixels' u and v, and the cameras' names"
-            why = "the survey may have swapped axes or another unit, pixels may be mirrored, or cameras exchanged"
+            why = "the survey may have exchanged axes or another unit, pixels may be mirrored, or cameras exchanged"
             out.append(
                 Finding(
                     Level.FAIL,

@@ -1,4 +1,4 @@
-"""What the covariance of a network means where spots land: millimetres on the screens."""
+"""Uncertainty of spots on the screens, in metres, from the covariance of a network."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from geometry.uncertainty.rig_parameters import BOW, POSE
 
 
 def spot_sigmas(result: ScreensResult, screen: int) -> Array:
-    """Sigma, m, of the screen's surface along its normal at its points (m,): where a spot lands on it."""
+    """Sigma, m, of the screen's surface along its normal at its points (m,)."""
     name = list(result.network.rig.screens)[screen]
     C, names = result.fit.covariance.matrix, result.fit.covariance.names
     xyz = result.screens[screen].xyz
@@ -31,7 +31,7 @@ def spot_sigmas(result: ScreensResult, screen: int) -> Array:
 
 
 def camera_sigmas(result: ScreensResult) -> dict[str, tuple[float, float]]:
-    """Per camera the sigma of its position (m) and of its attitude (rad), each the root of the sum over three axes."""
+    """Sigmas of each camera's position (m) and attitude (rad), each the root of the sum over three axes."""
     names, C = result.fit.covariance.names, np.diagonal(result.fit.covariance.matrix)
     out = {}
     for camera in result.network.rig.cameras:
@@ -41,7 +41,7 @@ def camera_sigmas(result: ScreensResult) -> dict[str, tuple[float, float]]:
 
 
 def pointing_sigmas_m(result: ScreensResult) -> dict[str, float]:
-    """Per camera how far, m (1 sigma, RMS of both directions), its place shifts what it sees on its screen's middle."""
+    """Displacement, m (1 sigma, RMS of both directions), of the centre of each camera's screen by the pose's error."""
     out = {}
     names, C = result.fit.covariance.names, result.fit.covariance.matrix
     for name, camera in result.fit.rig.cameras.items():

@@ -1,4 +1,4 @@
-"""Starts of a network: every camera, board and screen in one world, by chaining what shares points."""
+"""Start values of a network: poses of cameras, boards and screens in one world, by chaining relative poses."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibration.screens.network import Network, Start
-from calibration.screens.places import FEWEST, Place, on_a_line, places
+from calibration.screens.resection import FEWEST, ResectedPose, are_collinear, resect
 from geometry.arrays import Array
 from geometry.pose import Pose
 
@@ -17,36 +17,36 @@ WORLD = "the survey"
 
 @dataclass(frozen=True, slots=True)
 class CameraOnDots:
-    """What the surveyed dots say of one camera's place."""
+    """Poses of one camera from its surveyed dots."""
 
-    places: tuple[Place, ...]  # the best first; a second one where the dots leave two
-    problem: str = ""  # why there is none
+    poses: tuple[ResectedPose, ...]  # the best first; two if the dots allow two
+    problem: str = ""  # the reason if there is none
 
 
 @dataclass(frozen=True, slots=True)
-class Chained:
-    """Everything in one world."""
+class ChainedPoses:
+    """Poses of all cameras, boards and screens in one world."""
 
     camera_from_world: Mapping[int, Pose]
     world_from_board: Mapping[int, Pose]
-    world_from_screen: Mapping[int, Pose]  # only those that a fixed board gave; dots give theirs apart
+    world_from_screen: Mapping[int, Pose]  # only from boards fixed to screens; those from dots are separate
 
 
 class NotConnectedError(ValueError):
-    """Parts of a network that share nothing. The message names them."""
+    """Parts of a network are not connected. The message lists them."""
 
 
 def camera_on_dots(network: Network, camera: int, within_px: float) -> CameraOnDots:
-    """Poses of one camera by the dots that it sees."""
+    """Poses of one camera from the dots that it observes."""
     s = network.sightings
     mine = np.flatnonzero(s.camera_of == camera)
     if len(mine) < FEWEST:
         return CameraOnDots((), f"sees {len(mine)} surveyed dots, expected {FEWEST} or more")
     points = network.dots.xyz[s.dot_of[mine]]
-    if on_a_line(points):
+    if are_collinear(points):
         return CameraOnDots((), f"sees {len(mine)} surveyed dots that all lie on one line")
-    found = places(list(network.rig.cameras.values())[camera], points, s.pixels[mine], within_px)
-    return CameraOnDots(tuple(found), "" if found else "no place fits four of the surveyed dots that it sees")
+    found = resect(list(network.rig.cameras.values())[camera], points, s.pixels[mine], within_px)
+    return CameraOnDots(tuple(found), "" if found else "has no pose that fits four of the surveyed dots that it sees")
 
 
 def chain(
@@ -56,12 +56,14 @@ def chain(
     held_screen: int | None = None,
     held_camera: int | None = None,
     problems: Mapping[int, str] | None = None,
-) -> Chained:
-    """Walk from the world to every camera and board.
+) -> ChainedPoses:
+    """Propagate poses from the world to every camera and board.
 
-    on_dots: camera -> camera_from_world by surveyed dots; boards: (camera, placement) -> camera_from_board. Where there
-    is no survey the world is held_screen's frame or else held_camera's. problems: camera -> why its dots give no place.
-    Raises NotConnectedError: what shares nothing.
+    on_dots: camera -> camera_from_world by surveyed dots; boards: (camera, placement) -> camera_from_board. Without a
+    survey the world is the frame of held_screen or else of held_camera. problems: camera -> why its dots give no pose.
+
+    Raises:
+        NotConnectedError: some cameras are not connected with the others.
     """
     cameras: dict[int, Pose] = dict(on_dots)
     if not cameras and held_camera is not None:
@@ -81,7 +83,7 @@ def chain(
     while True:
         before = len(cameras) + len(placed) + len(screens)
         for p, (s, screen_from_board) in fixed.items():
-            if s in screens and p not in placed and not _any_seen(boards, p, cameras):
+            if s in screens and p not in placed and not _is_observed(boards, p, cameras):
                 placed[p] = screens[s] @ screen_from_board
             elif p in placed and s not in screens:
                 screens[s] = placed[p] @ screen_from_board.inverse()
@@ -97,22 +99,24 @@ def chain(
     if lost:
         reached = [n for i, n in enumerate(names) if i in cameras]
         why = [f"camera {names[c]!r} {words}" for c, words in (problems or {}).items() if c not in cameras and words]
-        raise NotConnectedError("; ".join([_apart_in_words(lost, reached, boards, names), *why]))
-    return Chained(cameras, placed, screens)
+        raise NotConnectedError("; ".join([_unconnected(lost, reached, boards, names), *why]))
+    return ChainedPoses(cameras, placed, screens)
 
 
 def start_of(
     network: Network,
-    chained: Chained,
+    chained: ChainedPoses,
     frames: Mapping[int, Pose],
     bow: Array,
     held_camera: int | None = None,
     held_board: int | None = None,
 ) -> Start:
-    """The chained poses as an adjustment's start. frames: screen -> world_from_screen by its dots or its scan.
+    """The start values of an adjustment. frames: screen -> world_from_screen from its dots or its scan.
 
-    held_camera, held_board: which of them stays where it is, where there is no survey. Raises NotConnectedError for a
-    screen that nothing was measured of.
+    held_camera, held_board: element whose pose is fixed if there is no survey.
+
+    Raises:
+        NotConnectedError: a screen or a board has no pose.
     """
     screens = {**chained.world_from_screen, **frames}
     names = list(network.rig.screens)
@@ -120,12 +124,12 @@ def start_of(
     if missing:
         raise NotConnectedError(
             f"screen {missing[0]!r}: expected three or more surveyed dots, a board fixed to it or a scan, found none;"
-            " name the dots that lie on it in the survey's column `screen`"
+            " assign dots to it in the survey's column `screen`"
         )
     order = sorted(chained.world_from_board)
     if order != list(range(len(network.placements))):
         lost = [p for i, p in enumerate(network.placements) if i not in chained.world_from_board]
-        raise NotConnectedError(f"board at {lost[0]!r}: no camera that sees it is in the network")
+        raise NotConnectedError(f"board at {lost[0]!r}: it is not seen by any camera of the network")
     return Start(
         camera_from_world=_stack([chained.camera_from_world[i] for i in range(len(network.rig.cameras))]),
         world_from_screen=_stack([screens[i] for i in range(len(names))]),
@@ -137,7 +141,7 @@ def start_of(
 
 
 def boards_seen(network: Network, within_px: float) -> dict[tuple[int, int], Pose]:
-    """camera_from_board (camera, placement) of every view of a board with four or more corners."""
+    """camera_from_board by (camera, placement), for every view of a board with four or more corners."""
     corners = network.corners
     out: dict[tuple[int, int], Pose] = {}
     if corners is None:
@@ -145,22 +149,22 @@ def boards_seen(network: Network, within_px: float) -> dict[tuple[int, int], Pos
     cameras = list(network.rig.cameras.values())
     for c, p in sorted(set(zip(corners.camera.tolist(), corners.placement.tolist(), strict=True))):
         mine = np.flatnonzero((corners.camera == c) & (corners.placement == p))
-        if len(mine) < FEWEST or on_a_line(corners.points[mine]):
+        if len(mine) < FEWEST or are_collinear(corners.points[mine]):
             continue
-        found = places(cameras[c], corners.points[mine], corners.pixels[mine], within_px)
+        found = resect(cameras[c], corners.points[mine], corners.pixels[mine], within_px)
         if found:
             out[c, p] = found[0].camera_from_world
     return out
 
 
 def _screen_from_board(middle: Array, offset_m: float) -> Pose:
-    """A board's place in the frame of the screen that it gives: the origin beneath its middle, x along its x, z up."""
+    """Pose of a board in the frame of the screen that it defines: origin below its middle, x along its x, z out."""
     R = np.diag([1.0, -1.0, -1.0])
     return Pose(R, np.array([0.0, 0.0, offset_m]) - R @ middle)
 
 
-def _any_seen(boards: Mapping[tuple[int, int], Pose], placement: int, cameras: Mapping[int, Pose]) -> bool:
-    """Whether a camera that has its place sees the board: its place is then better known from there."""
+def _is_observed(boards: Mapping[tuple[int, int], Pose], placement: int, cameras: Mapping[int, Pose]) -> bool:
+    """Whether a camera with a known pose sees the board, from which the board's pose is more accurate."""
     return any(p == placement and c in cameras for c, p in boards)
 
 
@@ -171,10 +175,8 @@ def _stack(poses: list[Pose]) -> Pose:
     )
 
 
-def _apart_in_words(
-    lost: list[str], reached: list[str], boards: Mapping[tuple[int, int], Pose], names: list[str]
-) -> str:
-    """Which cameras share nothing with which, in groups."""
+def _unconnected(lost: list[str], reached: list[str], boards: Mapping[tuple[int, int], Pose], names: list[str]) -> str:
+    """Groups of cameras without connections to the others, in words."""
     group = {n: {n} for n in lost}
     for placement in {p for _, p in boards}:
         together = [names[c] for c, p in boards if p == placement and names[c] in group]
@@ -182,11 +184,11 @@ def _apart_in_words(
         for n in merged:
             group[n] = merged
     parts = sorted({tuple(sorted(g)) for g in group.values()})
-    words = "; ".join(f"{_listed(p)} share{'s' if len(p) == 1 else ''} nothing with the others" for p in parts)
-    rest = f" ({_listed(tuple(reached))} have a place)" if reached else ""
+    words = "; ".join(f"{_listed(p)} {'is' if len(p) == 1 else 'are'} not connected with the others" for p in parts)
+    rest = f" ({_listed(tuple(reached))} have a pose)" if reached else ""
     return (
         f"camera {words}{rest}: give each of them four surveyed dots, or a photograph of a board that another camera"
-        " sees in the same place"
+        " sees at the same position"
     )
 
 

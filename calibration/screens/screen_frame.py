@@ -1,7 +1,8 @@
-"""Where a screen's frame lies: its origin and axes, which no plane has by itself.
+"""Definition of a screen's frame: its origin and axes.
 
-Named dots fix it; without them the origin is the middle of the dots' extent, z points to the side of the cameras that
-look at it, y as near to the world's z as the plane allows (to its y where the screen lies flat), x = y x z.
+It is defined by named dots. Without them the origin is the centre of the dots' extent, z points to the side of the
+cameras that observe the screen, y as close to the world's z as the plane allows (to its y if the screen is
+horizontal), and x = y x z.
 """
 
 from __future__ import annotations
@@ -23,9 +24,9 @@ def plane_through(points: Array) -> tuple[Array, Array, Array]:
 
 
 def frame_of_extent(points: Array, seen_from: Array | None = None, up: Array | None = None) -> Pose:
-    """world_from_screen from points (n, 3), m, of the screen; z towards `seen_from` (3,) where that is given.
+    """world_from_screen from points (n, 3), m, of the screen; z towards `seen_from` (3,) if given.
 
-    up (3,): where y points, the world's z where None.
+    up (3,): direction of y, projected into the plane; None: the world's z.
     """
     middle, normal, _ = plane_through(points)
     if seen_from is not None:
@@ -33,7 +34,7 @@ def frame_of_extent(points: Array, seen_from: Array | None = None, up: Array | N
     elif normal[np.argmax(np.abs(normal))] < 0:
         normal = -normal
     upward = np.array([0.0, 0.0, 1.0]) if up is None else up
-    if abs(normal @ upward) > 0.9:  # lies flat: within 26 deg of level the world's z no longer tells a direction
+    if abs(normal @ upward) > 0.9:  # within 26 deg of horizontal the world's z hardly defines a direction
         upward = np.array([0.0, 1.0, 0.0])
     y = normalised(upward - (upward @ normal) * normal)
     R = np.stack([cross(y, normal), y, normal], axis=1)
@@ -45,8 +46,10 @@ def frame_of_extent(points: Array, seen_from: Array | None = None, up: Array | N
 def frame_of_dots(points: Array, origin: Array, along_x: Array, on_y_side: Array, origin_at: Array) -> Pose:
     """world_from_screen from three named dots (3,) each, m: `origin` has the coordinates `origin_at` (2,), m.
 
-    x runs from it towards `along_x`; `on_y_side` tells on which side y is positive. ValueError where the three lie on
-    one line.
+    x points from it towards `along_x`; y is positive on the side of `on_y_side`.
+
+    Raises:
+        ValueError: the three dots are collinear.
     """
     _, normal, _ = plane_through(points)
     x = along_x - origin

@@ -1,4 +1,4 @@
-"""Screens and cameras from what was measured of them: starts, frames, flatness, then the one adjustment of all."""
+"""Calibration of screens and cameras: start values, frames, flatness, then the joint adjustment."""
 
 from __future__ import annotations
 
@@ -9,45 +9,45 @@ import numpy as np
 
 from calibration.least_squares.parameter_blocks import Poses, Vectors
 from calibration.least_squares.priors import Prior
-from calibration.screens.flatness import Flatness, Surface, judge_flatness
+from calibration.screens.flatness import Flatness, Surface, assess_flatness
 from calibration.screens.network import Network, NetworkFit, adjust
-from calibration.screens.network_start import CameraOnDots, boards_seen, camera_on_dots, chain, start_of
-from calibration.screens.places import Place
+from calibration.screens.network_start import CameraOnDots, ChainedPoses, boards_seen, camera_on_dots, chain, start_of
+from calibration.screens.resection import ResectedPose
 from calibration.screens.screen_frame import frame_of_dots, frame_of_extent
 from geometry.arrays import Array, Bools, Ints
 from geometry.pose import Pose
 
-WITHIN_PX = 8.0  # how far off its place a right dot's pixel may lie in a start: lenses are known, dots not mixed up
-GAUGE = 1e-6  # m and rad: to which the axes of a screen are held within its plane, as in FrameTerm
-_NEARER_TO_THE_LINE = 3.0  # the second pose of a plane is no rival where its misfit is so many times as large
+WITHIN_PX = 8.0  # largest reprojection error of an inlier in the start: lenses are calibrated
+GAUGE = 1e-6  # m and rad: sigma of the gauge constraint of a screen's axes within its plane, as in FrameTerm
+_RULED_OUT = 3.0  # ratio of misfits from which the second pose of coplanar points is ruled out
 
 
 @dataclass(frozen=True, slots=True)
 class Scan:
-    """A screen's surface from a scanned cloud of points, in world."""
+    """A screen's surface from a scanned point cloud, in world."""
 
     world_from_screen: Pose
     flatness: Flatness
-    covariance: Array  # (9, 9): of the error of world_from_screen and of the bow; bow rows 0 where it is flat
+    covariance: Array  # (9, 9): of the error of world_from_screen and of the bow; bow rows 0 for a plane
     xyz: Array  # (m, 3), m: the points of the flatness map, in the frame of world_from_screen
-    size_m: tuple[float, float]  # extent of what lies on the plane
-    words: str = ""  # how many points, how many of them on the plane
+    size_m: tuple[float, float]  # extent of the points on the plane
+    words: str = ""  # numbers of points and of points on the plane, in words
 
 
 @dataclass(frozen=True, slots=True)
 class ScreenSetup:
-    """How one screen is to be described."""
+    """Options of one screen."""
 
-    frame_dots: tuple[int, int, int] | None = None  # dots: origin, towards x, on y's side
-    origin_at: tuple[float, float] = (0.0, 0.0)  # m: where the first of them lies in the screen's frame
+    frame_dots: tuple[int, int, int] | None = None  # dots: origin, on the x axis, on the side of positive y
+    origin_at: tuple[float, float] = (0.0, 0.0)  # m: coordinates of the first of them in the screen's frame
     bow: str = "auto"  # auto, always or never
-    scatter_m: float | None = None  # of the surface, where known
+    scatter_m: float | None = None  # of the surface, if known
     scan: Scan | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Near:
-    """Where a camera stands by tape measure."""
+    """Approximate position of a camera, measured by tape."""
 
     position_m: Array  # (3,), world
     within_m: float
@@ -55,23 +55,24 @@ class Near:
 
 @dataclass(frozen=True, slots=True)
 class ScreenResult:
-    """What is known of one screen's surface, apart from its pose."""
+    """Surface of one screen, apart from its pose."""
 
-    flatness: Flatness | None  # None: from a fixed board alone
-    xyz: Array  # (m, 3), m: the points that it was judged by, in the screen's final frame; m = 0 without
+    flatness: Flatness | None  # None: the screen has only a fixed board
+    xyz: Array  # (m, 3), m: the points of the surface fit, in the screen's final frame; m = 0 without
     used: Bools  # (m,)
-    dots: tuple[int, ...]  # which dots these are; empty for a scan
+    dots: tuple[int, ...]  # indices of the dots; empty for a scan
 
 
 @dataclass(frozen=True, slots=True)
 class ScreensResult:
-    """All of it."""
+    """Result of the calibration of screens and cameras."""
 
     network: Network
     fit: NetworkFit
     screens: tuple[ScreenResult, ...]
     on_dots: Mapping[int, CameraOnDots] = field(default_factory=dict)
-    rivals: Mapping[int, Place] = field(default_factory=dict)  # camera -> a second pose that fits nearly as well
+    # camera -> a second pose that fits nearly as well
+    second_poses: Mapping[int, ResectedPose] = field(default_factory=dict)
 
 
 def calibrate(
@@ -81,20 +82,45 @@ def calibrate(
     held_screen: int | None = None,
     held_camera: int | None = None,
 ) -> ScreensResult:
-    """Poses of all cameras and screens, their bows where needed, and the joint covariance.
+    """Poses of all cameras and screens, their bows where significant, and the joint covariance.
 
-    setups: one per screen. near: camera -> where it stands roughly, which chooses between two poses. Where there is no
-    survey, the world is the frame that held_screen gets from the board fixed to it, or held_camera's. Raises
-    NotConnectedError, AdjustmentError, or ValueError where dots cannot tell a screen's plane.
+    setups: one per screen. near: camera -> approximate position, which decides between two poses. Without a survey, the
+    world is the frame that held_screen gets from the board fixed to it, or that of held_camera.
+
+    Raises:
+        NotConnectedError: some cameras or screens are not connected with the others.
+        AdjustmentError: the adjustment fails.
+        ValueError: the dots do not determine a screen's plane.
     """
     near = {} if near is None else near
     on_dots = {c: camera_on_dots(network, c, WITHIN_PX) for c in range(len(network.rig.cameras))}
-    chosen = {c: _choose(found, near.get(c)) for c, found in on_dots.items() if found.places}
+    chosen = {c: _choose(found, near.get(c)) for c, found in on_dots.items() if found.poses}
     boards = boards_seen(network, WITHIN_PX)
     surveyed = bool(chosen) or (bool(np.any(network.dots.screen_of >= 0)) and not boards)
     problems = {c: found.problem for c, found in on_dots.items()}
     placed = {c: p.camera_from_world for c, p in chosen.items()}
     chained = chain(network, placed, boards, held_screen, held_camera, problems)
+    complete, frames, bows, results = _screen_starts(network, setups, chained)
+    start = start_of(
+        complete,
+        chained,
+        frames,
+        bows,
+        None if surveyed or held_screen is not None else held_camera,
+        None if surveyed else _board_on(network, held_screen),
+    )
+    fit = adjust(complete, start)
+    results = [_in_final_frame(r, complete, fit, k) for k, r in enumerate(results)]
+    second_poses = {
+        c: r for c, found in on_dots.items() for r in [_second_pose(found, chosen.get(c), near.get(c))] if r is not None
+    }
+    return ScreensResult(complete, fit, tuple(results), on_dots, second_poses)
+
+
+def _screen_starts(
+    network: Network, setups: Sequence[ScreenSetup], chained: ChainedPoses
+) -> tuple[Network, dict[int, Pose], Array, list[ScreenResult]]:
+    """Frame, bow (screens, 3) and flatness of each screen with a scan or dots; and the network with their priors."""
     observed = [c.screen for c in network.rig.cameras.values()]
     frames: dict[int, Pose] = {}
     results: list[ScreenResult] = []
@@ -133,24 +159,11 @@ def calibrate(
         bent=frozenset(bent),
         screen_priors=(*network.screen_priors, *priors),
     )
-    start = start_of(
-        complete,
-        chained,
-        frames,
-        bows,
-        None if surveyed or held_screen is not None else held_camera,
-        None if surveyed else _board_on(network, held_screen),
-    )
-    fit = adjust(complete, start)
-    results = [_in_final_frame(r, complete, fit, k) for k, r in enumerate(results)]
-    rivals = {
-        c: r for c, found in on_dots.items() for r in [_rival(found, chosen.get(c), near.get(c))] if r is not None
-    }
-    return ScreensResult(complete, fit, tuple(results), on_dots, rivals)
+    return complete, frames, bows, results
 
 
 def _board_on(network: Network, screen: int | None) -> int | None:
-    """The place of the first board that is fixed to a screen; its frame, laid on the screen, is then the world's."""
+    """The placement of the first board fixed to a screen, which then defines the world."""
     if screen is None or network.fixed is None:
         return None
     mine = np.flatnonzero(network.fixed.screen_of == screen)
@@ -160,29 +173,34 @@ def _board_on(network: Network, screen: int | None) -> int | None:
 def screen_of_dots(
     network: Network, dots: Ints, setup: ScreenSetup, seen_from: Array | None, name: str
 ) -> tuple[Pose, Flatness]:
-    """A screen's frame and flatness from its surveyed dots alone. ValueError where they cannot tell its plane."""
+    """A screen's frame and flatness from its surveyed dots alone.
+
+    Raises:
+        ValueError: the dots do not determine its plane.
+    """
     xyz, C = network.dots.xyz[dots], network.dots.covariance[dots]
-    if len(dots) < 3:
-        raise ValueError(f"screen {name!r}: {len(dots)} surveyed dots, expected 3 or more; 8 show whether it is flat")
+    count = len(dots)
+    if count < 3:
+        raise ValueError(f"screen {name!r}: {count} surveyed dots, expected 3 or more; 8 show whether it is flat")
     s = np.linalg.svd(xyz - xyz.mean(axis=0), compute_uv=False)
     if s[1] < 0.02 * s[0]:
         raise ValueError(
-            f"screen {name!r}: its {len(dots)} dots lie on one line, within {1e3 * s[1] / np.sqrt(len(dots)):.3g} mm;"
-            " a plane needs dots off that line"
+            f"screen {name!r}: its {count} dots are collinear within {1e3 * s[1] / np.sqrt(count):.3g} mm;"
+            " a plane requires dots off that line"
         )
     if setup.frame_dots is None:
         frame = frame_of_extent(xyz, seen_from)
     else:
         o, x, y = (network.dots.xyz[i] for i in setup.frame_dots)
         frame = frame_of_dots(xyz, o, x, y, np.array(setup.origin_at))
-    # Twice, so that the frame lies in the surface that was chosen and dots off the screen no longer tilt it.
-    flatness = judge_flatness(*_heights(frame, xyz, C), setup.bow, setup.scatter_m)
-    frame = laid_on(frame, flatness.chosen)
-    return frame, judge_flatness(*_heights(frame, xyz, C), setup.bow, setup.scatter_m)
+    # Repeated in the frame of the chosen surface, whose tilt is not affected by dots off the screen.
+    flatness = assess_flatness(*_heights(frame, xyz, C), setup.bow, setup.scatter_m)
+    frame = moved_to_surface(frame, flatness.chosen)
+    return frame, assess_flatness(*_heights(frame, xyz, C), setup.bow, setup.scatter_m)
 
 
 def facing(scan: Scan, seen_from: Array | None) -> Scan:
-    """The scan with its z axis towards a point (3,), world: turned by half a turn about its y axis where need be."""
+    """The scan with its z axis towards a point (3,), world: rotated by 180 deg about its y axis if necessary."""
     pose = scan.world_from_screen
     if seen_from is None or pose.rotation[:, 2] @ (seen_from - pose.translation) >= 0:
         return scan
@@ -207,16 +225,16 @@ def facing(scan: Scan, seen_from: Array | None) -> Scan:
     )
 
 
-def laid_on(frame: Pose, surface: Surface) -> Pose:
-    """The frame moved along its normal and tilted so that it lies in the surface at its origin."""
+def moved_to_surface(frame: Pose, surface: Surface) -> Pose:
+    """The frame shifted along its normal and tilted so that it is tangent to the surface at its origin."""
     h, p, q = surface.coefficients[:3]
     return frame.plus(np.concatenate([frame.rotation[:, 2] * h, [q, -p, 0.0]]))
 
 
 def pose_covariance(frame: Pose, surface: Surface) -> Array:
-    """(9, 9): of the error of a frame that lies in a surface, and of the surface's bow; 0 rows for no bow.
+    """(9, 9): covariance of the errors of a frame in a surface, and of the surface's bow; 0 rows for a plane.
 
-    Within the plane the frame is held by definition, to `GAUGE`.
+    Within the plane the frame is fixed by definition, with the sigma `GAUGE`.
     """
     J = np.zeros((9, 6))
     J[:3, 0] = frame.rotation[:, 2]
@@ -243,25 +261,25 @@ def _scan_prior(screen: int, scan: Scan) -> Prior:
     return Prior((("screens", screen), ("bow", screen)), (poses, Vectors(bow[None])), scan.covariance)
 
 
-def _choose(found: CameraOnDots, near: Near | None) -> Place:
-    """The place that fits best, among those near enough where something is known."""
+def _choose(found: CameraOnDots, near: Near | None) -> ResectedPose:
+    """The best pose, of those near the approximate position if there is one."""
     if near is None:
-        return found.places[0]
-    return min(found.places, key=lambda p: (distance_from(p, near) > near.within_m, -int(p.fits.sum()), p.rms_px))
+        return found.poses[0]
+    return min(found.poses, key=lambda p: (distance_from(p, near) > near.within_m, -int(p.inliers.sum()), p.rms_px))
 
 
-def distance_from(place: Place, near: Near) -> float:
-    """How far a place is from where the camera stands, m."""
+def distance_from(place: ResectedPose, near: Near) -> float:
+    """Distance, m, of a pose's camera centre from the approximate position."""
     return float(np.linalg.norm(place.camera_from_world.inverse().translation - near.position_m))
 
 
-def _rival(found: CameraOnDots, chosen: Place | None, near: Near | None) -> Place | None:
-    if chosen is None or len(found.places) < 2:
+def _second_pose(found: CameraOnDots, chosen: ResectedPose | None, near: Near | None) -> ResectedPose | None:
+    if chosen is None or len(found.poses) < 2:
         return None
-    other = found.places[1] if found.places[0] is chosen else found.places[0]
+    other = found.poses[1] if found.poses[0] is chosen else found.poses[0]
     if near is not None and distance_from(other, near) > near.within_m >= distance_from(chosen, near):
         return None
-    return other if other.rms_px < _NEARER_TO_THE_LINE * max(chosen.rms_px, 0.05) else None
+    return other if other.rms_px < _RULED_OUT * max(chosen.rms_px, 0.05) else None
 
 
 def _in_final_frame(result: ScreenResult, network: Network, fit: NetworkFit, screen: int) -> ScreenResult:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from calibration.budget.expected_errors import expected_errors
+from calibration.budget.pose_grid import plan_grid
 from calibration.findings import Level, verdict
 from lab.errors import QUALITY_GATE_FAILED
 from lab.files.rig.rig_covariance import TARGET, joint_covariance
@@ -13,8 +14,7 @@ from lab.files.rig.rig_file import load_rig_file
 from lab.files.text.atomic_write import atomic_folder, refuse_foreign
 from lab.number_format import angle, length, percent
 from lab.plan.plan_findings import findings, median_sigma
-from lab.plan.plan_grid import Plan, plan_grid
-from lab.plan.plan_options import PlanOptions
+from lab.plan.plan_options import Plan, PlanOptions
 from lab.plan.plan_page import write_plan_page
 from lab.plan.plan_tables import write_effects, write_plan
 

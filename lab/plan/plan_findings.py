@@ -15,10 +15,11 @@ from calibration.budget.pose_budget import (
     SCREEN_POSES,
     SCREEN_SHAPES,
 )
+from calibration.budget.pose_grid import NOISE
 from calibration.findings import Finding, Level
 from geometry.arrays import Array, Bools
 from lab.number_format import angle, length, percent
-from lab.plan.plan_grid import NOISE, Plan
+from lab.plan.plan_options import Plan
 
 FEWEST_MEASURED = 0.5  # share of the grid below which the rig is not fit for it
 FEWEST_IN_VIEW = 0.8  # share of the grid in which a spot should be in its picture

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from itertools import product
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from calibration.budget.expected_errors import ExpectedErrors
+from calibration.budget.pose_grid import GridPlan
 from geometry.arrays import Array
-from geometry.pose import Pose
 from lab.errors import InputError
 from lab.files.text.fields import dataclass_from_yaml
 from lab.files.text.yaml_text import did_you_mean
@@ -82,6 +82,9 @@ class PlanOptions:
         return np.array(list(product(*(r.values() for r in self.ranges.values()))))
 
 
+Plan: TypeAlias = GridPlan[PlanOptions]
+
+
 def _check_size(name: str, value: float | None) -> None:
     """Raises InputError for a number below 0, or none at all."""
     if value is not None and not (np.isfinite(value) and value >= 0):
@@ -95,11 +98,6 @@ def _check_range(name: str, r: Range) -> None:
         raise InputError(f"{name}: expected a count of 1 or more, got {r.count}")
     if r.last < r.first or (r.last == r.first and r.count > 1):
         raise InputError(f"{name}: expected the first end below the last, got {r.first:g} and {r.last:g}")
-
-
-def poses_of(coordinates: Array) -> Pose:
-    """world_from_body (k,) of coordinates (k, 6): x, y, z (m), yaw, pitch, roll (deg)."""
-    return Pose.from_ypr(np.deg2rad(coordinates[:, 3:]), coordinates[:, :3])
 
 
 def options_of(

@@ -9,14 +9,14 @@ from typing import Any
 
 import numpy as np
 
+from calibration.budget.pose_grid import AXES, STATUS, plan_grid, poses_of
 from calibration.findings import Finding, verdict
 from geometry.arrays import Array
 from lab import number_format
 from lab.number_format import angle, length, percent
 from lab.plan.plan_drawings import cell_map, share_bars
 from lab.plan.plan_findings import JOINED, TOGETHER, advice, axis_words, budget_lines, median_sigma, worst_first
-from lab.plan.plan_grid import AXES, STATUS, Plan, plan_grid
-from lab.plan.plan_options import Range, poses_of
+from lab.plan.plan_options import Plan, Range
 from lab.report.calibration.calibration_maps import heat_map
 from lab.report.calibration.calibration_page import (
     CalibrationReport,

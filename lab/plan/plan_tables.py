@@ -24,8 +24,9 @@ from pathlib import Path
 import numpy as np
 
 from calibration.budget.pose_budget import group_of
+from calibration.budget.pose_grid import AXES, STATUS
 from lab.files.text.yaml_text import atomic_write_text
-from lab.plan.plan_grid import AXES, STATUS, Plan
+from lab.plan.plan_options import Plan
 
 _DIRECTIONS = tuple(f"worst_{what}_axis_{a}" for what in ("position", "attitude") for a in "xyz")
 

@@ -1,4 +1,4 @@
-"""Other programs' camera files: what is written reads back, OpenCV itself agrees, and what cannot be said is refused.
+"""Camera files of other programs: round trips, agreement with OpenCV, and errors.
 
 The texts follow the layouts that each program's documentation shows; their numbers are ours.
 """
@@ -25,7 +25,7 @@ MODULES = {m.NAME: m for m in (opencv_yaml, kalibr, ros, colmap, mrcal)}
 
 
 def parsed(module: ModuleType, text: str, name: str = "left") -> Read:
-    """What a format's reader makes of a text."""
+    """The result of a format's reader."""
     is_text = module.NAME in ("colmap", "mrcal")
     return module.read(text if is_text else parse_mapping(text, "file", module.NAME == "opencv"), name)
 
@@ -39,7 +39,7 @@ def some_camera(rng: np.random.Generator, name: str, count: int, lens: str, plac
 
 
 def assert_same(a: CameraModel, b: CameraModel, with_pose: bool) -> None:
-    """1e-12 relative, the issue's figure; a rotation's entries to that of 1."""
+    """Equal to 1e-12, relative; entries of a rotation relative to 1."""
     assert (a.image_size_px, a.lens) == (b.image_size_px, b.lens)
     np.testing.assert_allclose(b.pinhole, a.pinhole, rtol=1e-12)
     np.testing.assert_allclose(significant(b.distortion), significant(a.distortion), rtol=1e-12)
@@ -52,7 +52,7 @@ def assert_same(a: CameraModel, b: CameraModel, with_pose: bool) -> None:
 @pytest.mark.parametrize("format_name", MODULES)
 @settings(max_examples=40, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), data=st.data())
-def test_there_and_back_keeps_a_camera(format_name, seed, data):
+def test_a_camera_survives_a_round_trip(format_name, seed, data):
     lens = data.draw(st.sampled_from([k for k, v in ROOM[format_name].items() if v]))
     most = max(ROOM[format_name][lens])
     allowed = (0, 4) if lens == FISHEYE else tuple(n for n in (0, 4, 5, 8, 12, 14) if n <= most)
@@ -65,13 +65,13 @@ def test_there_and_back_keeps_a_camera(format_name, seed, data):
 
 @settings(max_examples=40, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), count=st.integers(2, 5))
-def test_a_chain_of_cameras_keeps_every_pose(seed, count):
+def test_the_poses_of_a_chain_survive_a_round_trip(seed, count):
     rng = np.random.default_rng(seed)
     cameras = [some_camera(rng, f"c{i}", 4, FISHEYE if i % 2 else PERSPECTIVE, True) for i in range(count)]
     back = parsed(kalibr, kalibr.write(cameras).text).cameras
     assert [c.name for c in back] == [c.name for c in cameras]
     for a, b in zip(cameras, back, strict=True):
-        # A chain adds up rounding of the largest translation in it.
+        # Rounding errors of the largest translation accumulate along a chain.
         size = max(float(np.linalg.norm(c.camera_from_reference.translation)) for c in cameras)
         assert_same(a, b, with_pose=False)
         np.testing.assert_allclose(b.camera_from_reference.rotation, a.camera_from_reference.rotation, atol=1e-12)
@@ -86,7 +86,7 @@ def test_a_chain_of_cameras_keeps_every_pose(seed, count):
 @pytest.mark.parametrize("old_head", [True, False])
 @pytest.mark.parametrize("flat", [True, False])
 @pytest.mark.parametrize("count", [4, 5, 8, 12, 14])
-def test_what_opencv_writes_is_read_to_the_last_bit(old_head, flat, count):
+def test_files_of_opencv_are_read_exactly(old_head, flat, count):
     if old_head and not hasattr(cv2, "FILE_STORAGE_FORMAT_YAML_1_0"):
         pytest.skip("this OpenCV writes one head only")
     rng = np.random.default_rng(count)
@@ -107,7 +107,7 @@ def test_what_opencv_writes_is_read_to_the_last_bit(old_head, flat, count):
 
 @settings(max_examples=30, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), count=st.sampled_from([0, 4, 5, 8, 12, 14]))
-def test_opencv_reads_what_we_write_to_the_last_bit(seed, count):
+def test_opencv_reads_our_files_exactly(seed, count):
     camera = some_camera(np.random.default_rng(seed), 'le"ft: 1', count, PERSPECTIVE, False)
     text = opencv_yaml.write([camera]).text
     storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
@@ -121,8 +121,8 @@ def test_opencv_reads_what_we_write_to_the_last_bit(seed, count):
 
 
 @pytest.mark.parametrize("format_name", ["kalibr", "ros"])
-def test_a_reader_of_yaml_1_1_finds_numbers_where_we_write_numbers(format_name):
-    """Kalibr and ROS read with YAML 1.1, to which 1e-05 is a word."""
+def test_numbers_are_valid_in_yaml_1_1(format_name):
+    """Kalibr and ROS read YAML 1.1, where 1e-05 is a string."""
     camera = CameraModel("left", (640, 480), (500.0, 1e22, 1e-05, 240.0), (1e-05, -3e-12, 1e-300, 0.0))
     content = yaml.safe_load(MODULES[format_name].write([camera]).text)
     values = content["cam0"] if format_name == "kalibr" else content["distortion_coefficients"]
@@ -216,7 +216,7 @@ def test_a_camchain_as_kalibr_writes_it():
     left, right = found.cameras
     assert (left.name, left.pinhole, left.lens) == ("cam0", (461.5, 460.25, 362.5, 246.0), PERSPECTIVE)
     assert (right.lens, right.distortion) == (FISHEYE, (0.01, 0.02, -0.03, 0.004))
-    # T_cn_cnm1 takes coordinates of cam0 to cam1: the origin of cam0 lies 0.11 m to the left of cam1.
+    # T_cn_cnm1 takes coordinates of cam0 to cam1: the origin of cam0 is 0.11 m to the left of cam1.
     np.testing.assert_array_equal(right.camera_from_reference.apply([0, 0, 0]), [-0.11, 0, 0.001])
     assert found.notes == ("not read: T_cam_imu, timeshift_cam_imu (beampose has no IMU)",)
 
@@ -236,7 +236,7 @@ def test_a_printed_camera_info_message():
     assert camera.pinhole == (500, 501, 320, 240)
 
 
-def test_colmaps_pixels_begin_half_a_pixel_earlier():
+def test_colmaps_principal_point_is_shifted_by_half_a_pixel():
     """A principal point in the middle of a 3072 x 2304 picture is (1536, 1152) for COLMAP, (1535.5, 1151.5) for us."""
     simple, _, radial = parsed(colmap, CAMERAS_TXT).cameras
     assert simple.pinhole == (2559.5, 2559.5, 1535.5, 1151.5)
@@ -258,7 +258,7 @@ def test_a_cameramodel_as_mrcal_writes_it():
     )
 
 
-# What is refused --------------------------------------------------------------------------------------------------
+# Errors ----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -272,15 +272,15 @@ def test_a_cameramodel_as_mrcal_writes_it():
         ("mrcal", 4, FISHEYE, "opencv, kalibr, ros, colmap or beampose can"),
     ],
 )
-def test_a_lens_without_room_is_refused_and_told_where_there_is_room(format_name, count, lens, others):
+def test_an_unsupported_lens_raises_and_lists_the_formats_that_support_it(format_name, count, lens, others):
     camera = CameraModel("left", (640, 480), (500, 500, 320, 240), (0.1,) * count, lens)
     with pytest.raises(FormatError) as caught:
         MODULES[format_name].write([camera])
-    assert f"{format_name} cannot hold this lens ({lens}, {count} distortion numbers)" in str(caught.value)
+    assert f"{format_name} cannot hold this lens ({lens}, {count} coefficients)" in str(caught.value)
     assert others in str(caught.value)
 
 
-def test_zeros_at_the_end_are_no_reason_to_refuse_a_lens():
+def test_trailing_zeros_are_dropped_to_fit_a_format():
     camera = CameraModel("left", (640, 480), (500, 500, 320, 240), (0.1, 0.2, 0.3, 0.4, 0, 0, 0, 0))
     assert parsed(kalibr, kalibr.write([camera]).text).cameras[0].distortion == (0.1, 0.2, 0.3, 0.4)
 
@@ -289,7 +289,7 @@ WRONG = [
     (kalibr, CAMCHAIN, "camera_model: pinhole", "camera_model: omni", "cam0.camera_model: expected 'pinhole'"),
     (kalibr, CAMCHAIN, "camera_model: pinhole", "camera_model: ds", "cam0.camera_model: expected 'pinhole', got 'ds'"),
     (kalibr, CAMCHAIN, "radtan", "fov", "cam0.distortion_model: expected 'radtan', 'equidistant' or 'none', got 'fov'"),
-    (kalibr, CAMCHAIN, "T_cn_cnm1", "T_c1_c0", "cam1.T_cn_cnm1: expected the pose against cam0, got nothing"),
+    (kalibr, CAMCHAIN, "T_cn_cnm1", "T_c1_c0", "cam1.T_cn_cnm1: expected the pose relative to cam0, got nothing"),
     (kalibr, CAMCHAIN, "[1.0, 0.0, 0.0, -0.11]", "[1.1, 0.0, 0.0, -0.11]", "cam1.T_cn_cnm1: expected a rotation"),
     (kalibr, CAMCHAIN, "[461.5, ", "[", "cam0.intrinsics: expected 4 numbers, got 3"),
     (kalibr, CAMCHAIN, "[752, 480]", "[752.5, 480]", "cam0.resolution: expected a width and a height in whole pixels"),
@@ -312,14 +312,14 @@ WRONG = [
 
 
 @pytest.mark.parametrize(("module", "text", "old", "new", "words"), WRONG)
-def test_a_file_that_is_wrong_is_told_where(module, text, old, new, words):
+def test_an_invalid_file_raises_with_the_field(module, text, old, new, words):
     assert old in text
     with pytest.raises(FormatError) as caught:
         parsed(module, text.replace(old, new, 1))
     assert words in str(caught.value)
 
 
-def test_cameras_without_poses_do_not_make_a_chain():
+def test_a_chain_requires_poses():
     cameras = [CameraModel(n, (640, 480), (500, 500, 320, 240)) for n in ("left", "right")]
-    with pytest.raises(FormatError, match="left, right has none: write one camera to a file"):
+    with pytest.raises(FormatError, match="left, right has none: write each camera to a file of its own"):
         kalibr.write(cameras)

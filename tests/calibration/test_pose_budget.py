@@ -1,4 +1,4 @@
-"""A planned sigma is a claim: rigs drawn with the planned errors and solved by the program scatter as it says."""
+"""Planned sigmas against the scatter of pose errors of simulated rigs."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from calibration.budget import expected_errors as module
-from calibration.budget.expected_errors import ExpectedErrors, expected_errors
+from calibration.budget.expected_errors import ExpectedErrors, dots_on_screen, expected_errors
 from calibration.budget.pose_budget import (
     BEAM_DIRECTIONS,
     CAMERA_POSES,
@@ -27,6 +26,7 @@ from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.pose_solver.gauss_newton import fit_pose
 from geometry.rig import Rig
+from geometry.uncertainty.rig_parameters import POSE as POSE_NAMES
 from geometry.uncertainty.rig_parameters import RigCovariance, Sensitivity, moved
 from geometry.uncertainty.rig_uncertainty import CalibrationSpread
 from tests.geometry.scenes import LENSES, paper_rig
@@ -51,7 +51,7 @@ def root(C: np.ndarray) -> np.ndarray:
 
 
 def solved_error(rig: Rig, errors: RigErrors, delta: np.ndarray, noise: np.ndarray) -> np.ndarray:
-    """The pose's error (6,) where the rig is truly off by delta (p,) and each pixel by noise (n, 2)."""
+    """The pose error (6,) for rig errors delta (p,) and pixel errors noise (n, 2)."""
     model = SpotModel.of(rig)
     true_pixels, _ = SpotModel.of(moved(rig, errors.names, delta)).project(POSE)
     spread = CalibrationSpread(rig, model, RigCovariance(errors.names, errors.covariance))
@@ -62,7 +62,7 @@ def solved_error(rig: Rig, errors: RigErrors, delta: np.ndarray, noise: np.ndarr
 
 
 def squared_sigmas(errors: np.ndarray, covariance: np.ndarray) -> tuple[float, int]:
-    """The sum of squares (N, 6) in sigmas over the directions that the covariance has, and their number."""
+    """The sum of squares (N, 6) in sigmas over the range of the covariance, and its rank."""
     size = np.sqrt(np.diagonal(covariance))
     values, vectors = np.linalg.eigh(covariance / np.outer(size, size))
     real = values > 1e-9 * values[-1]
@@ -71,7 +71,7 @@ def squared_sigmas(errors: np.ndarray, covariance: np.ndarray) -> tuple[float, i
 
 
 def assert_in_band(total: float, count: int) -> None:
-    """Within the 99.9 % band of the chi-square: once in a thousand seeds a right claim fails."""
+    """Within the 99.9 % band of the chi-square."""
     lo, hi = chi2.ppf([0.0005, 0.9995], count)
     assert lo < total < hi, f"{total / count:.3f} per direction, allowed {lo / count:.3f} to {hi / count:.3f}"
 
@@ -87,7 +87,7 @@ def errors(rig) -> RigErrors:
 
 
 def scatter(rig, errors, C, noise_px, count, seed):
-    """Pose errors (count, 6) over rigs whose numbers err by C (p, p) and pixels by noise_px."""
+    """Pose errors (count, 6) for rig errors with covariance C (p, p) and pixel noise noise_px."""
     rng = np.random.default_rng(seed)
     A, views = root(C), len(SpotModel.of(rig))
     return np.array(
@@ -98,44 +98,44 @@ def scatter(rig, errors, C, noise_px, count, seed):
     )
 
 
-def test_poses_of_rigs_drawn_at_random_scatter_as_planned(rig, errors):
+def test_pose_errors_of_random_rigs_agree_with_the_plan(rig, errors):
     planned = budget_of(rig, errors).of(stacked(POSE))
     found = scatter(rig, errors, errors.covariance, SIGMA_PX, 150, seed=1)
     assert_in_band(*squared_sigmas(found, planned.total[0]))
 
 
-def test_poses_with_noise_alone_scatter_as_the_noise_part_says(rig, errors):
+def test_pose_errors_from_noise_alone_agree_with_the_noise_part(rig, errors):
     planned = budget_of(rig, errors).of(stacked(POSE))
     found = scatter(rig, errors, np.zeros_like(errors.covariance), SIGMA_PX, 120, seed=2)
     assert_in_band(*squared_sigmas(found, planned.noise[0]))
 
 
 @pytest.mark.parametrize("group", [INTRINSICS, CAMERA_POSES, SCREEN_POSES, BEAM_DIRECTIONS])
-def test_poses_with_one_kind_of_calibration_error_scatter_as_its_part_says(group, rig, errors):
+def test_pose_errors_from_one_group_agree_with_its_part(group, rig, errors):
     planned = budget_of(rig, errors).of(stacked(POSE))
     found = scatter(rig, errors, errors.groups[group], 0.0, 60, seed=3)
     assert_in_band(*squared_sigmas(found, planned.groups[0, list(errors.groups).index(group)]))
 
 
-def test_what_one_error_does_is_its_effect(rig, errors):
-    """The effects against whole solutions: they are linear to the second order of a sigma, some 1e-3 of it."""
+def test_effects_agree_with_complete_solutions(rig, errors):
+    """The effects are linear; second-order terms of a sigma are about 1e-3 of it."""
     planned = budget_of(rig, errors).of(stacked(POSE))
     for i, name in enumerate(errors.move_names):
         if i % 4 == 0 and errors.move_sigmas[i] > 0:
             found = solved_error(rig, errors, errors.moves[:, i], np.zeros((6, 2)))
             size = np.abs(planned.effects[0]).max(axis=1)  # of the largest effect on each axis
-            # The true rig is off by the move, so the pose is off the other way: estimate = truth + G S (-move).
+            # The true rig differs by the move; the pose error has the opposite sign: estimate = truth + G S (-move).
             np.testing.assert_allclose(found, -planned.effects[0, :, i], atol=0.01 * size.max(), err_msg=name)
 
 
-def test_the_parts_add_up_to_the_whole(rig, errors):
+def test_the_parts_sum_to_the_total(rig, errors):
     poses = stacked(POSE, Pose.identity())
     b = budget_of(rig, errors).of(poses)
     np.testing.assert_allclose(b.noise + b.groups.sum(axis=1), b.total, rtol=1e-7, atol=1e-18)
 
 
-def test_what_joins_groups_is_in_the_whole_only(rig):
-    """A lens error that comes with an opposite error of the camera's pose, as the rig file says it."""
+def test_covariance_between_groups_is_in_the_total_only(rig):
+    """A lens error that is compensated by an error of the camera's pose, as stated in the rig file."""
     names = ("cameras.left.cx", "cameras.left.rot_y_rad")
     C = np.array([[0.09, 0.99 * 0.3 * 2.5e-4], [0.99 * 0.3 * 2.5e-4, 2.5e-4**2]])
     stated = RigCovariance(names, C)
@@ -148,7 +148,7 @@ def test_what_joins_groups_is_in_the_whole_only(rig):
     assert_in_band(*squared_sigmas(found, b.total[0]))
 
 
-def test_a_pose_counts_as_observable_where_the_solver_says_so(rig, errors):
+def test_a_pose_is_observable_if_the_solver_reports_it(rig, errors):
     rng = np.random.default_rng(5)
     model = SpotModel.of(rig)
     poses = Pose.from_ypr(np.deg2rad(rng.uniform(-70, 70, (120, 3))), rng.uniform(-1.2, 1.2, (120, 3)))
@@ -163,8 +163,8 @@ def test_a_pose_counts_as_observable_where_the_solver_says_so(rig, errors):
         assert np.isfinite(b.condition[i]) == b.observable[i]
 
 
-def test_the_plan_is_the_covariance_that_the_solver_will_state(rig, errors):
-    """Also where some spots are out of the picture: their rows must say nothing, and neither must their errors."""
+def test_the_plan_agrees_with_the_covariance_of_the_solver(rig, errors):
+    """Also if some spots are out of the picture, which must not contribute."""
     rng = np.random.default_rng(7)
     model = SpotModel.of(rig)
     poses = Pose.from_ypr(np.deg2rad(rng.uniform(-25, 25, (30, 3))), rng.uniform(-0.5, 0.5, (30, 3)))
@@ -182,7 +182,7 @@ def test_the_plan_is_the_covariance_that_the_solver_will_state(rig, errors):
         )
 
 
-def test_a_spot_near_the_edge_is_not_counted(rig, errors):
+def test_a_spot_near_the_edge_is_not_visible(rig, errors):
     wide, near = (budget_of(rig, errors, edge).of(stacked(Pose.identity())) for edge in (0.0, 250.0))
     gap = np.min(np.minimum(wide.pixels + 0.5, SpotModel.of(rig).image_size_px - 0.5 - wide.pixels), axis=-1)
     assert wide.seen.all()
@@ -203,15 +203,15 @@ def test_the_worst_direction_is_that_of_the_largest_variance():
     assert np.isnan(nothing[1]).all()
 
 
-# The errors to expect ---------------------------------------------------------------------------------------------
+# Expected errors --------------------------------------------------------------------------------------------------
 
 
-def test_a_lens_error_takes_the_pose_along_that_opencvs_resection_finds(rig):
-    """The whole chain a second way: dots seen by the true lens, cv2.solvePnP with the wrong one."""
-    expected = ExpectedErrors(dot_survey_m=0.0)  # every dot weighs the same, as in solvePnP
+def test_the_pose_error_from_a_lens_error_agrees_with_opencvs_resection(rig):
+    """Independent check: dots projected with the true lens, cv2.solvePnP with the wrong one."""
+    expected = ExpectedErrors(dot_survey_m=0.0)  # all dots have the same weight, as in solvePnP
     errors, _ = expected_errors(rig, expected)
     camera = rig.cameras["left"]
-    dots = module._dots(camera, rig.screens["left"], expected)
+    dots = dots_on_screen(camera, rig.screens["left"], expected)
     pixels = camera.project(dots)
     for lens in ("fx", "cy", "k1", "p2"):
         move = errors.moves[:, errors.names.index(f"cameras.left.{lens}")]
@@ -224,19 +224,19 @@ def test_a_lens_error_takes_the_pose_along_that_opencvs_resection_finds(rig):
             rvec.copy(), camera.camera_from_world.translation.copy(), True, cv2.SOLVEPNP_ITERATIVE,
         )  # fmt: skip
         found = Pose(Rotation.from_rotvec(rvec.ravel()).as_matrix(), tvec.ravel()).minus(camera.camera_from_world)
-        planned = np.array([move[errors.names.index(f"cameras.left.{n}")] for n in module.POSE])
+        planned = np.array([move[errors.names.index(f"cameras.left.{n}")] for n in POSE_NAMES])
         assert np.abs(found).max() > 1e-6
         np.testing.assert_allclose(found, planned, atol=0.02 * np.abs(found).max(), err_msg=lens)
 
 
-def test_a_camera_whose_screen_gives_no_dots_gets_the_coarse_pose(rig):
+def test_a_camera_without_dots_has_the_approximate_pose(rig):
     small = {n: replace(s, size_m=(0.05, 0.05)) for n, s in rig.screens.items()}
     errors, _ = expected_errors(replace(rig, screens=small), ExpectedErrors())
     sigma = errors.move_sigmas[errors.names.index("cameras.left.x_m")]
     assert sigma == pytest.approx(ExpectedErrors().camera_position_m)
 
 
-def test_all_distortion_numbers_together_move_the_corner_by_what_was_asked(rig):
+def test_all_distortion_coefficients_together_displace_the_corner_by_the_stated_sigma(rig):
     camera = rig.cameras["left"]
     errors, _ = expected_errors(rig, ExpectedErrors(distortion_px=0.2))
     names = [f"cameras.left.{n}" for n in ("k1", "k2", "p1", "p2", "k3")]
@@ -250,7 +250,7 @@ def test_all_distortion_numbers_together_move_the_corner_by_what_was_asked(rig):
     assert np.sqrt(squares) == pytest.approx(0.2, rel=0.1)  # each is scaled at its own worst corner
 
 
-def test_what_the_rig_file_states_of_a_group_stands_in_place_of_what_is_assumed(rig):
+def test_stated_groups_replace_assumed_ones(rig):
     names = tuple(f"beams.{b}.direction_{a}" for b in "ABC" for a in "xyz")
     stated = RigCovariance(names, 1e-10 * np.eye(9))
     errors, sources = expected_errors(rig, ExpectedErrors(), stated)
@@ -263,7 +263,7 @@ def test_what_the_rig_file_states_of_a_group_stands_in_place_of_what_is_assumed(
     assert np.count_nonzero(whole.covariance) == 9
 
 
-def test_a_beam_is_not_said_to_err_along_itself(rig):
+def test_a_beam_has_no_error_along_itself(rig):
     errors, _ = expected_errors(rig, ExpectedErrors())
     for name, beam in rig.beams.items():
         for kind in ("direction_", "point_"):

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from calibration.budget.expected_errors import ExpectedErrors
+from calibration.budget.pose_grid import AXES, NOISE, STATUS, plan_grid, poses_of
 from calibration.findings import Level
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose, ypr_sigmas
@@ -19,8 +20,7 @@ from lab.files.rig.rig_file import RigFile, load_rig_file, save_rig
 from lab.plan.plan import plan_of, plan_rig
 from lab.plan.plan_drawings import cell_map, share_bars
 from lab.plan.plan_findings import JOINED, TOGETHER, advice, axis_words, budget_lines, findings, worst_first
-from lab.plan.plan_grid import AXES, NOISE, STATUS, plan_grid
-from lab.plan.plan_options import PlanOptions, Range, poses_of
+from lab.plan.plan_options import PlanOptions, Range
 from lab.plan.plan_page import fine_map
 from lab.plan.plan_tables import effect_columns, plan_columns
 from tests.geometry.scenes import LENSES, paper_rig
@@ -229,7 +229,7 @@ def test_nothing_is_written_when_the_rig_is_wrong_or_the_folder_is_not_ours(rig_
 
 def test_the_same_plan_in_pieces_of_any_size(rig_path, monkeypatch):
     whole = plan_of(rig_path, SMALL)
-    monkeypatch.setattr("lab.plan.plan_grid._POSES_AT_ONCE", 7)
+    monkeypatch.setattr("calibration.budget.pose_grid._POSES_AT_ONCE", 7)
     pieces = plan_grid(whole.rig, whole.errors, whole.sources, SMALL)
     for name in ("sigma", "parts", "worst_parts", "effect_median", "thing_largest", "margin_px"):
         np.testing.assert_allclose(getattr(pieces, name), getattr(whole, name), rtol=1e-5, atol=1e-12)

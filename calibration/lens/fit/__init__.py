@@ -1,1 +1,1 @@
-"""Fitting lens models to board corners, and choosing one."""
+"""Fit of lens models to board corners, and model selection."""

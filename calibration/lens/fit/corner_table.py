@@ -1,4 +1,4 @@
-"""What the photographs of one board by one camera gave: the table of corners that the intrinsics are solved from."""
+"""The table of board corners detected in the photographs of one camera: the observations of its calibration."""
 
 from __future__ import annotations
 
@@ -12,28 +12,28 @@ from geometry.arrays import Array, Bools, Ints
 
 @dataclass(frozen=True, slots=True)
 class CircleAreas:
-    """That the points are circles, whose centroids were seen, and what tells their size."""
+    """Marks the points as circles, of which centroids were detected, with the data on their size."""
 
     areas_px2: Array | None = None  # (N,), of their blobs; None: not measured
-    diameter_m: float | None = None  # as stated; None: not said
+    diameter_m: float | None = None  # as stated; None: not stated
 
 
 @dataclass(frozen=True, slots=True)
 class CornerTable:
     """N corners, or centroids of circles, in V views of one board with P points."""
 
-    view: Ints  # (N,): in which photograph, 0 ... V - 1; in ascending order
-    point: Ints  # (N,): which point of the board
+    view: Ints  # (N,): index of the photograph, 0 ... V - 1; in ascending order
+    point: Ints  # (N,): index of the board point
     pixels: Array  # (N, 2)
     board_points: Array  # (P, 3), m
-    middle: Array  # (3,), m: about which a bent board is described
+    middle: Array  # (3,), m: origin of the warp polynomial
     views: int
     image_size_px: tuple[int, int]
-    circles: CircleAreas | None = None  # None: the points are points
+    circles: CircleAreas | None = None  # None: the points are not circles
 
     def __post_init__(self) -> None:
         if not np.isfinite(self.pixels).all():
-            raise ValueError("expected finite pixels for every corner, got nan or infinity; drop what was not found")
+            raise ValueError("expected finite pixels for every corner, got nan or infinity; drop undetected corners")
         if len(self.point) and (self.point.min() < 0 or self.point.max() >= len(self.board_points)):
             raise ValueError(f"expected points of the board, 0 to {len(self.board_points) - 1}, got {self.point.max()}")
 
@@ -45,7 +45,7 @@ class CornerTable:
         image_size_px: tuple[int, int],
         circles: CircleAreas | None = None,
     ) -> CornerTable:
-        """From (ids (n,), pixels (n, 2)) per photograph; the circles' areas in the order of the views."""
+        """From (ids (n,), pixels (n, 2)) per photograph; the areas of circles are in the order of the views."""
         sizes = [len(ids) for ids, _ in views]
         return CornerTable(
             view=np.repeat(np.arange(len(views)), sizes),
@@ -63,22 +63,22 @@ class CornerTable:
 
     @property
     def points(self) -> Array:
-        """(N, 3), m: each corner on the board."""
+        """(N, 3), m: position of each corner on the board."""
         return self.board_points[self.point]
 
     def counts(self, used: Bools | None = None) -> Ints:
-        """(V,): corners of each view, of the used ones alone if given (N,)."""
+        """(V,): number of corners of each view; of the used ones (N,) only, if given."""
         view = self.view if used is None else self.view[used]
         return np.bincount(view, minlength=self.views)
 
     def mean_per_view(self, values: Array, used: Bools) -> Array:
-        """(V,): the mean of values (N,) over the used corners of each view; nan where it has none."""
+        """(V,): mean of values (N,) over the used corners of each view; nan for a view without any."""
         count = self.counts(used)
         total = np.bincount(self.view[used], weights=values[used], minlength=self.views)
         return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
     def only_views(self, views: Ints) -> CornerTable:
-        """The same table with some of its views, renumbered in the given order."""
+        """The table reduced to some of its views, renumbered in the given order."""
         number = np.full(self.views, -1)
         number[views] = np.arange(len(views))
         mine = np.flatnonzero(number[self.view] >= 0)
@@ -101,6 +101,6 @@ class CornerTable:
 
     @property
     def spacing_m(self) -> float:
-        """Distance of the nearest points of the board."""
+        """Distance of neighbouring points of the board."""
         xy = self.board_points[:, :2]
         return float(np.min(np.linalg.norm(xy[1:] - xy[0], axis=1)))

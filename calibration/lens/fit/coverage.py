@@ -1,4 +1,4 @@
-"""Which parts of the sensor a board was seen on, and how variously it was tilted."""
+"""Coverage of the sensor by the board, and the range of its tilts."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from calibration.lens.fit.corner_table import CornerTable
 from geometry.arrays import Array, Bools
 from geometry.pose import Pose
 
-_CELLS = 96  # across the picture, for the share that is filled
-_NEAR_CORNER = 0.18  # of the diagonal: a board's point this near to the picture's corner tells of the lens there
+_CELLS = 96  # across the picture, for the covered share
+_NEAR_CORNER = 0.18  # of the diagonal: a board point this near to the picture's corner determines the lens there
 _NEAR_SIDE = 0.12  # of the picture's width or height
 
 
 @dataclass(frozen=True, slots=True)
 class Coverage:
-    """Where on the sensor, and from which directions, the board was seen."""
+    """Areas of the sensor and directions from which the board was seen."""
 
-    filled: float  # share of the picture's area within the corners of some view
-    gaps: tuple[str, ...]  # sides and corners of the picture that no board came near
+    filled: float  # share of the picture's area inside the corners of some view
+    gaps: tuple[str, ...]  # sides and corners of the picture without board points near them
     tilt_deg: Array  # (V,): of the board's normal against the optical axis; nan where not used
-    azimuth_deg: Array  # (V,): towards which it leaned
+    azimuth_deg: Array  # (V,): direction of that tilt
     spread_deg: float  # the largest angle between two boards' normals
 
 
 def coverage_of(table: CornerTable, used: Bools, camera_from_board: Pose) -> Coverage:
-    """Of the used corners (N,), with the V poses of the board."""
+    """Coverage by the used corners (N,), with the V poses of the board."""
     in_use = table.counts(used) > 0
     normals = camera_from_board.rotation[..., 2]
     tilt = np.degrees(np.arccos(np.clip(normals[:, 2], -1, 1)))
@@ -43,7 +43,7 @@ def coverage_of(table: CornerTable, used: Bools, camera_from_board: Pose) -> Cov
 
 
 def spread_deg(normals: Array) -> float:
-    """The largest angle between two of some unit vectors (n, 3); 0 for fewer than two."""
+    """The largest angle between any two unit vectors (n, 3); 0 for fewer than two."""
     if len(normals) < 2:
         return 0.0
     return float(np.degrees(np.arccos(np.clip(normals @ normals.T, -1, 1).min())))
@@ -54,7 +54,7 @@ def _filled(table: CornerTable, used: Bools) -> float:
 
 
 def seen_at(table: CornerTable, used: Bools, pixels: Array) -> Bools:
-    """Which pixels (..., 2) lie within the corners of some view; nan ones do not."""
+    """Which pixels (..., 2) lie inside the corners of some view; False for nan."""
     mask = _mask(table, used)
     scale = _CELLS / table.image_size_px[0]
     cell = np.nan_to_num((pixels + 0.5) * scale, nan=-1.0)
@@ -65,7 +65,7 @@ def seen_at(table: CornerTable, used: Bools, pixels: Array) -> Bools:
 
 
 def _mask(table: CornerTable, used: Bools) -> Bools:
-    """(rows, _CELLS): the parts of the picture within the corners of some view."""
+    """(rows, _CELLS): the parts of the picture inside the corners of some view."""
     width, height = table.image_size_px
     scale = _CELLS / width
     mask = np.zeros((max(1, round(height * scale)), _CELLS), dtype=np.uint8)
@@ -92,7 +92,7 @@ def _gaps(pixels: Array, size: tuple[int, int]) -> tuple[str, ...]:
         ("bottom left corner", 0, height),
         ("bottom right corner", width, height),
     ):
-        told = any(word in name for side in empty for word in side.split()[:1])
-        if not told and np.hypot(u - x, v - y).min() / diagonal > _NEAR_CORNER:
+        side_is_empty = any(word in name for side in empty for word in side.split()[:1])
+        if not side_is_empty and np.hypot(u - x, v - y).min() / diagonal > _NEAR_CORNER:
             empty.append(name)
     return tuple(empty)

@@ -1,4 +1,4 @@
-"""The rungs of the lens ladder: which distortion numbers a model has, and whether a lens draws the whole picture."""
+"""The candidate lens models: which distortion coefficients each has, and whether a lens maps the whole picture."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from geometry.arrays import Array, Bools
 from geometry.camera import FISHEYE, PERSPECTIVE
 from geometry.uncertainty.rig_parameters import DISTORTION, FISHEYE_DISTORTION, PINHOLE
 
-_BORDER = 25  # pixels asked of along each side of the picture; between them a lens bends by little
+_BORDER = 25  # sampled pixels along each side of the picture; distortion varies little between them
 
 
 @dataclass(frozen=True, slots=True)
 class LensModel:
-    """Which kind of lens, and how many distortion numbers are free."""
+    """Kind of lens, and number of free distortion coefficients."""
 
     coefficients: int  # 0, 4, 5, 8 or 12; of a fisheye 4
     lens: str = PERSPECTIVE
@@ -29,12 +29,12 @@ class LensModel:
 
     @property
     def fisheye(self) -> bool:
-        """Whether the numbers are those of OpenCV's fisheye model."""
+        """Whether the coefficients are those of OpenCV's fisheye model."""
         return self.lens == FISHEYE
 
     @property
     def title(self) -> str:
-        """`5` or `fisheye`: how reports and options name it."""
+        """`5` or `fisheye`: the name in reports and options."""
         return FISHEYE if self.fisheye else str(self.coefficients)
 
     @property
@@ -44,22 +44,22 @@ class LensModel:
 
     @property
     def free(self) -> Bools:
-        """(18,): which of fx, fy, cx, cy and the fourteen distortion numbers a solve may move."""
+        """(18,): which of fx, fy, cx, cy and the fourteen distortion coefficients are free in a fit."""
         return np.arange(INTRINSICS) < 4 + self.coefficients
 
     def cut(self, numbers: Array) -> Array:
-        """The lens (18,) without what this model does not have."""
+        """The lens (18,) with the coefficients that this model does not have set to 0."""
         return np.where(self.free, numbers, 0.0)
 
     @property
     def parameters(self) -> tuple[str, ...]:
-        """Names of the free numbers, in order."""
+        """Names of the free parameters, in order."""
         names = FISHEYE_DISTORTION if self.fisheye else DISTORTION
         return (*PINHOLE, *names[: self.coefficients])
 
 
-# From the least to the most that a model can take up. Fisheye stands before the rational model: it has as many numbers
-# as the second rung, but bends even with all of them 0.
+# In ascending order of flexibility. Fisheye stands before the rational model: it has as many coefficients as the
+# second model, but distorts even with all of them 0.
 LADDER = (
     LensModel(0),
     LensModel(4),
@@ -71,7 +71,11 @@ LADDER = (
 
 
 def named(title: str) -> LensModel:
-    """The model that `title` names. Raises ValueError with the known names."""
+    """The model with this title.
+
+    Raises:
+        ValueError: no model has it; the message lists the titles.
+    """
     for model in LADDER:
         if model.title == title:
             return model
@@ -79,7 +83,7 @@ def named(title: str) -> LensModel:
 
 
 def rational_of_fisheye(numbers: Array, widest_rad: float) -> Array:
-    """The perspective lens (18,) with k1 ... k6 that draws about what a fisheye (18,) does up to an angle off its axis.
+    """The perspective lens (18,) with k1 ... k6 closest to a fisheye lens (18,) up to an angle off the optical axis.
 
     Linear least squares over the radius: of d = r N / D, the equation N - (d / r) D = 0.
     """
@@ -99,16 +103,16 @@ def rational_of_fisheye(numbers: Array, widest_rad: float) -> Array:
 
 
 def fold_r2(numbers: Array, fisheye: bool) -> float:
-    """The squared normalised radius up to which a lens (18,) is one to one along every ray from the middle."""
+    """The squared normalised radius up to which the mapping of a lens (18,) is one to one along every ray."""
     coefficients = tuple(float(v) for v in numbers[4:])
     return lens.fisheye_fold_limit(coefficients[:4]) if fisheye else lens.fold_limit(coefficients)
 
 
 def folds_in_picture(numbers: Array, fisheye: bool, image_size_px: tuple[int, int]) -> bool:
-    """Whether some pixel of the picture's border is one that the lens (18,) draws nothing to, or draws twice.
+    """Whether a pixel on the border of the picture has no ray, or two rays, through the lens (18,).
 
-    Inside the border it then holds as well: a radial model that reaches the corners has grown all the way there.
-    A fisheye that grows up to 90 deg off its axis does not fold; its pixels farther out see nothing in front.
+    If no border pixel does, no pixel inside does: the radial mapping increases monotonically up to the corners. A
+    fisheye lens that increases up to 90 deg off its axis does not fold; pixels farther out have no ray to the front.
     """
     if fisheye and np.isinf(fold_r2(numbers, fisheye)):
         return False
@@ -127,5 +131,5 @@ def folds_in_picture(numbers: Array, fisheye: bool, image_size_px: tuple[int, in
 
 def undistorted(pixels: Array, numbers: Array, fisheye: bool) -> Array:
     """Normalised image points X/Z, Y/Z (n, 2) of pixels (n, 2) through a lens (18,); nan where there is none."""
-    bent = (pixels - numbers[2:4]) / numbers[:2]
-    return lens.undistort(bent, numbers[4:], fold_r2(numbers, fisheye), fisheye)
+    distorted = (pixels - numbers[2:4]) / numbers[:2]
+    return lens.undistort(distorted, numbers[4:], fold_r2(numbers, fisheye), fisheye)

@@ -1,7 +1,7 @@
-"""Start values for a camera of which nothing is known: focal lengths tried, poses of the board from them.
+"""Start values for an unknown camera: trial focal lengths, and the board poses that follow from them.
 
-Several starts, and the best one after a short solve on some of the views: OpenCV's solvers have been seen to end in bad
-minima without a start (4.13: 22 of 300 strongly distorted sets), with a seeded focal length in none.
+Of several starts, the best after a short fit to some of the views is taken. OpenCV's solvers end in bad minima when no
+start is given (4.13: 22 of 300 strongly distorted sets), and in none of these sets with a given focal length.
 """
 
 from __future__ import annotations
@@ -13,27 +13,30 @@ import numpy as np
 
 from calibration.least_squares.adjustment import AdjustmentError, Cauchy
 from calibration.lens.fit.corner_table import CornerTable
-from calibration.lens.fit.lens_fit import AS_STATED, FEWEST_CORNERS, Values, adjust, lens_of, term_of, values_of
+from calibration.lens.fit.lens_adjustment import FitSettings, adjust, term_of
+from calibration.lens.fit.lens_fit import FEWEST_CORNERS
 from calibration.lens.fit.lens_models import LensModel, folds_in_picture, undistorted
+from calibration.lens.fit.lens_parameters import AS_STATED, Values, lens_of, values_of
 from calibration.terms.corners import INTRINSICS
 from geometry.arrays import Array, Bools, Ints
 from geometry.camera import FISHEYE
 from geometry.pose import Pose
 
-TRIAL_VIEWS = 25  # enough to tell a good start from a bad one
+TRIAL_VIEWS = 25  # enough to distinguish good starts from bad ones
 _PERSPECTIVE_GUESSES = (0.5, 0.9, 1.8)  # focal lengths over the longer side: 90, 58 and 31 deg across
 _FISHEYE_GUESSES = (1 / np.pi, 0.5, 0.9)  # 180, 115 and 64 deg across
-_WIDEST = np.deg2rad(75.0)  # off the axis: beyond it the normalised image that a pose is found in stretches without end
+_WIDEST = np.deg2rad(75.0)  # off the axis: beyond it normalised image points, from which poses are found, diverge
 
 
 class StartError(ValueError):
-    """No start explains the corners: the words say what was wrong with them."""
+    """No start explains the corners; the message gives the cause."""
 
 
 def start(table: CornerTable, fisheye: bool) -> tuple[LensModel, Values]:
     """The best start of a kind of lens, with a pose for every view (nan where none explains its corners).
 
-    Raises StartError where no start can be made, or where the board is seen as in a mirror.
+    Raises:
+        StartError: no start can be found, or the board is mirrored.
     """
     model = LensModel(4, FISHEYE) if fisheye else LensModel(5)
     trial = table.only_views(_spread_out(table))
@@ -53,7 +56,7 @@ def start(table: CornerTable, fisheye: bool) -> tuple[LensModel, Values]:
         except AdjustmentError:
             continue
         left = np.linalg.norm(term_of(trial, trusted, fisheye).project(values) - trial.pixels[trusted], axis=1)
-        # Half of the corners may be wrong without a say in which start is best; a view without a pose counts as bad.
+        # The median tolerates up to half of the corners being wrong; a view without a pose counts as infinitely bad.
         error = float(np.median(np.concatenate([left, np.full(len(trial) - len(left), np.inf)])))
         lens = lens_of(values)
         if folds_in_picture(lens, fisheye, table.image_size_px):
@@ -61,9 +64,9 @@ def start(table: CornerTable, fisheye: bool) -> tuple[LensModel, Values]:
         if best is None or error < best[0]:
             best = error, lens
     if mirrored > len(guesses) * trial.views / 2:
-        raise StartError("the board is seen as in a mirror: its points run the wrong way round")
+        raise StartError("the picture of the board is mirrored: its points are in the opposite sense of rotation")
     if best is None:
-        raise StartError("no focal length and no position of the board explain the corners")
+        raise StartError("no focal length and no pose of the board explain the corners")
     poses, _ = _poses(table, best[1], fisheye)
     return model, values_of(best[1], poses, len(table.board_points))
 
@@ -74,15 +77,15 @@ def board_poses(table: CornerTable, lens: Array, fisheye: bool) -> Pose:
 
 
 def _spread_out(table: CornerTable) -> Ints:
-    """Some of the views, evenly over the sequence, those with enough corners."""
-    able = np.flatnonzero(table.counts() >= FEWEST_CORNERS)
-    if not len(able):
+    """Indices of trial views with enough corners, spread evenly over the sequence."""
+    usable = np.flatnonzero(table.counts() >= FEWEST_CORNERS)
+    if not len(usable):
         raise StartError(f"no view has {FEWEST_CORNERS} corners or more")
-    return able[np.unique(np.linspace(0, len(able) - 1, TRIAL_VIEWS).round().astype(np.int64))]
+    return usable[np.unique(np.linspace(0, len(usable) - 1, TRIAL_VIEWS).round().astype(np.int64))]
 
 
 def _guesses(table: CornerTable, fisheye: bool) -> Sequence[float]:
-    """Focal lengths, px: Zhang's from the homographies where it makes sense, and fixed shares of the picture."""
+    """Focal lengths, px: Zhang's from the homographies if plausible, and fixed multiples of the picture's width."""
     longer = max(table.image_size_px)
     guesses = [g * longer for g in (_FISHEYE_GUESSES if fisheye else _PERSPECTIVE_GUESSES)]
     if fisheye:
@@ -104,18 +107,18 @@ def _first_lens(focal: float, image_size_px: tuple[int, int]) -> Array:
 
 
 def _short_solve(table: CornerTable, used: Bools, model: LensModel, values: Values) -> Values:
-    """Focal lengths and the first distortion numbers alone, then the rest: from far off, all at once may run away."""
-    gentle = np.zeros(INTRINSICS, dtype=bool)
-    gentle[[0, 1, 4]] = True
-    for lens_free in (gentle, model.free):
+    """First focal lengths and k1 alone, then the rest: from a bad start, all parameters together may diverge."""
+    few_parameters = np.zeros(INTRINSICS, dtype=bool)
+    few_parameters[[0, 1, 4]] = True
+    for lens_free in (few_parameters, model.free):
         term = term_of(table, used, model.fisheye)
         sigma = max(float(np.median(np.linalg.norm(term.project(values) - term.pixels, axis=1))), 0.05)
-        values = adjust(table, used, model, values, AS_STATED, sigma, Cauchy(), lens_free).values
+        values = adjust(table, used, model, values, AS_STATED, FitSettings(sigma, Cauchy()), lens_free).values
     return values
 
 
 def _poses(table: CornerTable, lens: Array, fisheye: bool) -> tuple[Pose, int]:
-    """camera_from_board of every view (V), nan where there is none, and how many boards are seen from behind."""
+    """camera_from_board of every view (V), nan where there is none; and the number of boards seen from behind."""
     rotation, translation = np.full((table.views, 3, 3), np.nan), np.full((table.views, 3), np.nan)
     flat, in_reach = _flattened(table, lens, fisheye)
     points = table.points
@@ -136,7 +139,7 @@ def _poses(table: CornerTable, lens: Array, fisheye: bool) -> tuple[Pose, int]:
 
 def _planar_pose(points: Array, flat: Array) -> Pose | None:
     """camera_from_board from points (n, 3) of a plane and normalised image points (n, 2); None where there is none."""
-    # IPPE knows a plane through the origin of its frame best; the corners' own middle makes it so for parts of boards.
+    # IPPE is most accurate for a plane through the origin; centring the corners achieves it for parts of boards.
     origin = points.mean(axis=0)
     try:
         good, rotvec, t = cv2.solvePnP(points - origin, flat, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE)
@@ -151,9 +154,9 @@ def _planar_pose(points: Array, flat: Array) -> Pose | None:
 def _flattened(table: CornerTable, lens: Array, fisheye: bool) -> tuple[Array, Bools]:
     """Normalised image points (N, 2) without distortion, and which of them are usable."""
     fx, fy, cx, cy = lens[:4]
-    bent = (table.pixels - [cx, cy]) / [fx, fy]
+    distorted = (table.pixels - [cx, cy]) / [fx, fy]
     if not lens[4:].any() and not fisheye:
-        return bent, np.ones(len(bent), dtype=bool)
+        return distorted, np.ones(len(distorted), dtype=bool)
     flat = undistorted(table.pixels, lens, fisheye)
     with np.errstate(invalid="ignore"):
         good = np.hypot(*flat.T) < np.tan(_WIDEST)

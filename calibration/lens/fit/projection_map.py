@@ -1,9 +1,9 @@
-"""What errors of a lens' numbers do to pixels, all over the picture: its uncertainty map, and two lenses compared.
+"""Effect of lens errors on pixels over the picture: the uncertainty map, and the difference between two lenses.
 
-A small turn of the camera and a change of its lens look much alike, and where the camera stands is always solved for
-through the same lens later on. So every change is compared after the turn of the camera that undoes most of it: the
-one with the smallest sum of squares over the picture. That is what mrcal does by way of the board poses ("A tour of
-mrcal", sections on projection uncertainty and on differencing); a uniform weight over the picture is ours.
+A small rotation of the camera and a change of its lens have similar effects, and the camera's pose is always solved for
+with the same lens afterwards. So every change is compared after the rotation of the camera that minimises its sum of
+squares over the picture. mrcal does this through the board poses ("A tour of mrcal", sections on projection
+uncertainty and on differencing); the uniform weight over the picture is ours.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from geometry.camera import project_points_full
 
 @dataclass(frozen=True, slots=True)
 class ProjectionMap:
-    """How pixels on a grid over the picture follow the lens' numbers.
+    """Derivatives of pixels on a grid over the picture by the lens parameters.
 
     nan where the lens has no ray for a pixel.
     """
 
     pixels: Array  # (rows, columns, 2)
-    by_parameter: Array  # (rows, columns, 2, p), px per unit of the model's free parameters, best turn taken out
+    by_parameter: Array  # (rows, columns, 2, p), px per unit of the model's free parameters, best rotation removed
     mm_per_px: Array  # (rows, columns, 2, 2): on a screen that faces the camera at the distance
 
     def covariance_px2(self, covariance: Array) -> Array:
-        """(rows, columns, 2, 2) of a covariance (p, p) of the parameters."""
+        """(rows, columns, 2, 2) from a covariance (p, p) of the parameters."""
         return self.by_parameter @ covariance @ np.swapaxes(self.by_parameter, -1, -2)
 
     def sigma_px(self, covariance: Array) -> Array:
@@ -39,7 +39,7 @@ class ProjectionMap:
         return _largest_axis(self.covariance_px2(covariance))
 
     def sigma_mm(self, covariance: Array) -> Array:
-        """(rows, columns): the same on the screen."""
+        """(rows, columns): 1 sigma in the worst direction on the screen, mm."""
         C = self.covariance_px2(covariance)
         return _largest_axis(self.mm_per_px @ C @ np.swapaxes(self.mm_per_px, -1, -2))
 
@@ -47,7 +47,7 @@ class ProjectionMap:
 def projection_map(
     model: LensModel, lens: Array, image_size_px: tuple[int, int], distance_m: float, columns: int = 32
 ) -> ProjectionMap:
-    """The map of a lens (18,): `columns` points across the picture, from border to border."""
+    """The map of a lens (18,), with `columns` points across the picture from border to border."""
     width, height = image_size_px
     rows = max(2, round(columns * height / width))
     u, v = np.meshgrid(np.linspace(-0.5, width - 0.5, columns), np.linspace(-0.5, height - 0.5, rows))
@@ -59,7 +59,7 @@ def projection_map(
         rays, lens[:4], lens[4:], np.asarray(fold_r2(lens, model.fisheye)), np.asarray(model.fisheye)
     )
     by_lens = np.concatenate([seen.d_pinhole, seen.d_distortion], axis=-1)[..., model.free]
-    # A turn by omega moves the ray x by omega x x: d(pixel) = D (omega x x) = (x x D_row) . omega.
+    # A rotation by omega moves the ray x by omega x x: d(pixel) = D (omega x x) = (x x D_row) . omega.
     by_turn = np.cross(rays[:, None, :], seen.d_point)
     A, B = by_turn[good].reshape(-1, 3), by_lens[good].reshape(-1, by_lens.shape[-1])
     left = by_lens - by_turn @ np.linalg.lstsq(A, B, rcond=None)[0]
@@ -72,23 +72,27 @@ def projection_map(
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """Two lenses solved from different photographs, compared over the picture."""
+    """Difference over the picture between two lenses fitted to different photographs."""
 
     pixels: Array  # (rows, columns, 2)
-    moved_px: Array  # (rows, columns, 2): second less first
+    moved_px: Array  # (rows, columns, 2): second minus first
     rms_px: float
-    expected_rms_px: float  # by the two covariances
+    expected_rms_px: float  # from the two covariances
     rms_mm: float
-    p_value: float  # of a difference as large or larger, if model and noise were right
+    p_value: float  # of a difference at least as large, if model and noise are right
 
     @property
     def ratio(self) -> float:
-        """Found over expected."""
+        """Actual over expected difference."""
         return self.rms_px / self.expected_rms_px
 
 
 def difference(at: ProjectionMap, first: LensFit, second: LensFit) -> Difference:
-    """Of two independent fits of the same model, to first order about the lens of the map. AdjustmentError."""
+    """Difference of two independent fits of the same model, to first order about the lens of the map.
+
+    Raises:
+        AdjustmentError: a covariance does not exist.
+    """
     free = first.model.free
     delta = (second.lens - first.lens)[free]
     C = first.covariance + second.covariance
@@ -99,7 +103,7 @@ def difference(at: ProjectionMap, first: LensFit, second: LensFit) -> Difference
     M = gram @ C
     expected = float(np.trace(M))
     found = float(delta @ gram @ delta)
-    # The mean square is a sum of chi-squares with unequal weights: Satterthwaite's chi-square of the same two moments.
+    # The mean square is a weighted sum of chi-squares: Satterthwaite's chi-square has the same two moments.
     dof = expected**2 / float(np.trace(M @ M))
     mm = (at.mm_per_px @ moved[..., None])[..., 0]
     return Difference(

@@ -1,4 +1,4 @@
-"""Mean residuals in cells of the picture: of a lens that a model follows they are noise."""
+"""Mean residuals in cells of the picture, which are noise if the lens model is right."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from calibration.lens.fit.corner_table import CornerTable
 from calibration.lens.fit.lens_fit import LensFit
 from geometry.arrays import Array, Ints
 
-SIGNIFICANT = 1e-3  # of noise whose means go together as much
+SIGNIFICANT = 1e-3  # p-value of the mean residuals below which the lens model is wrong
 _CORNERS_PER_CELL = 12
 _MOST_COLUMNS = 16
 
 
 def cell_means(table: CornerTable, found: LensFit) -> tuple[Array, Ints]:
-    """Mean residuals (rows, columns, 2), px, and how many there are."""
+    """Mean residuals (rows, columns, 2), px, and the number of residuals in each cell."""
     width, height = table.image_size_px
     pixels, residuals = table.pixels[found.used], found.residuals[found.used]
     columns = int(np.clip(np.sqrt(len(pixels) / _CORNERS_PER_CELL * width / height), 3, _MOST_COLUMNS))
@@ -29,7 +29,7 @@ def cell_means(table: CornerTable, found: LensFit) -> tuple[Array, Ints]:
 
 
 def beyond_noise(cells: Array, count: Ints, noise_px: float) -> tuple[float, float]:
-    """The chance of such means from noise, and what is left of them beyond it (RMS per coordinate, px)."""
+    """P-value of such means if they are noise, and the RMS (per coordinate, px) of what exceeds it."""
     full = count > 0
     score = float(np.sum(count[full, None] * cells[full] ** 2)) / noise_px**2
     dof = 2 * int(full.sum())

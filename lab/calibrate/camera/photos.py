@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.boards.board_detection import NO_CLOSE_LOOK, BoardView, NotFound, find_board
+from calibration.boards.board_detection import find_board
 from calibration.boards.board_types import Board, Chessboard
-from calibration.boards.board_view import GreyImage
+from calibration.boards.board_view import NO_CLOSE_LOOK, BoardView, GreyImage, NotFound
 from lab.errors import InputError
 from lab.pictures.opencv import quiet_cv2
 from lab.pictures.picture_file import SUFFIXES, UNREADABLE, Grey, Missing, checked, read_picture

@@ -8,8 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.boards.board_detection import BoardView, NotFound, find_board
+from calibration.boards.board_detection import find_board
 from calibration.boards.board_types import Board
+from calibration.boards.board_view import BoardView, NotFound
 from calibration.terms.board_on_screen import BoardOnScreenTerm
 from calibration.terms.circle_images import radius_by_areas
 from calibration.terms.corners import CornerTerm

@@ -13,7 +13,7 @@ from calibration.screens.clouds import MissingOpen3DError, scan_of
 from calibration.screens.network import Dots, Network, PointObservations
 from calibration.screens.registration import register
 from calibration.screens.screens import Near, Scan, ScreenSetup
-from calibration.screens.survey_suspects import wrong_unit
+from calibration.screens.survey_diagnosis import wrong_unit
 from calibration.terms.rig_blocks import prior_of
 from geometry.arrays import Array, Bools, Ints
 from geometry.pose import Pose

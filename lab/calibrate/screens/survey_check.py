@@ -13,12 +13,12 @@ from calibration.findings import Finding, Level
 from calibration.least_squares.adjustment import AdjustmentError
 from calibration.screens.network_start import NotConnectedError
 from calibration.screens.screens import ScreensResult, calibrate
-from calibration.screens.survey_suspects import SurveySuspect, misfit_of, suspects
+from calibration.screens.survey_diagnosis import SurveySuspect, misfit_of, suspects
 from lab.calibrate.screens.screen_inputs import ScreenInputs
 from lab.errors import CalibrationError, InputError
 from lab.files.project.project import Project
 
-_SUSPICIOUS = 4.0  # misfit (see survey_suspects.py) from which swapped axes and wrong units are looked for
+_SUSPICIOUS = 4.0  # misfit (see survey_diagnosis.py) from which swapped axes and wrong units are looked for
 _CURED = 2.0  # misfit up to which a change to the survey counts as what was wrong
 
 

@@ -1,4 +1,4 @@
-"""A stand for the tests: spots of a rig at known positions, with noise."""
+"""A simulated stand: spots of a rig at known positions, with noise."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ def positions(
     turn_deg: float = 30.0,
     shift_m: tuple[float, float, float] = (0.2, 0.2, 0.2),
 ) -> Pose:
-    """stand_from_body at so many positions: yaw, pitch, roll and shifts drawn evenly within these."""
+    """stand_from_body at `count` positions: uniform yaw, pitch, roll and shifts within these limits."""
     turns = rng.uniform(-1, 1, (count, 3)) * np.deg2rad(turn_deg)
     return Pose.from_ypr(turns, rng.uniform(-1, 1, (count, 3)) * np.asarray(shift_m))
 
 
 def recorded(rng: np.random.Generator, rig: Rig, stand_from_body: Pose, sigma_px: float = SIGMA_PX) -> SpotPixels:
-    """The spots that are in the pictures, found with noise."""
+    """The spots inside the pictures, with noise."""
     model = SpotModel.of(rig)
     pixels, _ = model.project(WORLD_FROM_STAND @ stand_from_body)
     position, view = np.nonzero(model.in_picture(pixels))
@@ -41,31 +41,31 @@ def recorded(rng: np.random.Generator, rig: Rig, stand_from_body: Pose, sigma_px
 
 
 def exact(stand_from_body: Pose) -> StandModel:
-    """A stand whose place and positions are known without error."""
+    """A stand with exactly known pose and positions."""
     return StandModel(stand_from_body, np.zeros(6), WORLD_FROM_STAND, np.zeros((6, 6)))
 
 
 def unknown_place(stand_from_body: Pose) -> StandModel:
-    """A stand of which only the positions are known."""
+    """A stand with known positions and an unknown pose."""
     return StandModel(stand_from_body, np.zeros(6), None, None)
 
 
 def opposed(rig: Rig, rng: np.random.Generator, turn_rad: float = 2e-3, shift_m: float = 2e-3) -> Rig:
-    """The rig with every beam of two ends as two lasers back to back, nearly on one line."""
+    """The rig with every beam of two ends replaced by two nearly collinear, opposed lasers."""
     beams, spots = {}, {}
     for name, b in rig.beams.items():
         for sign in (1, -1):
             of_end = [s for s in rig.spots.values() if s.beam == name and s.sign == sign]
             if of_end:
                 laser = f"{name}{'+' if sign > 0 else '-'}"
-                away = rng.normal(size=(2, 3)) * [[turn_rad], [shift_m]]
-                beams[laser] = Beam(laser, sign * b.direction + away[0], b.point + away[1])
+                offset = rng.normal(size=(2, 3)) * [[turn_rad], [shift_m]]
+                beams[laser] = Beam(laser, sign * b.direction + offset[0], b.point + offset[1])
                 spots |= {s.name: Spot(s.name, laser, 1, s.screen) for s in of_end}
     return replace(rig, beams=beams, spots={n: spots[n] for n in rig.spots})
 
 
 def drawn(rig: Rig, rng: np.random.Generator, turn_rad: float = 0.02, shift_m: float = 0.01) -> Rig:
-    """The rig with nominal beams: as drawn, which is not as mounted."""
+    """The rig with nominal beams, which differ from the mounted ones."""
     beams = {
         n: Beam(n, b.direction + rng.normal(0, turn_rad, 3), b.point + rng.normal(0, shift_m, 3))
         for n, b in rig.beams.items()
@@ -74,8 +74,8 @@ def drawn(rig: Rig, rng: np.random.Generator, turn_rad: float = 0.02, shift_m: f
 
 
 def errors(rig: Rig, found: Rig) -> np.ndarray:
-    """Errors (beams, 4) of the beams found: direction (rad) and point (m), across each, in the basis of those found.
+    """Errors (beams, 4) of the estimated beams: direction (rad) and point (m), in the basis of the estimates.
 
-    The covariance is in that basis too. Two directions that are nearly the same may have bases a right angle apart.
+    The covariance is in the same basis. Bases of nearly equal directions may differ by a right angle.
     """
     return -lines_in(stacks_of(rig)).minus(lines_in(stacks_of(found)))

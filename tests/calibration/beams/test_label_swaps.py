@@ -1,4 +1,4 @@
-"""Labels exchanged in one picture are told from spots that are merely wrong."""
+"""Labels exchanged in one picture are distinguished from outliers."""
 
 from __future__ import annotations
 
@@ -19,31 +19,31 @@ SPOTS = recorded(RNG, RIG, POSES)
 DRAWN = drawn(RIG, RNG, 0.005, 0.003)
 
 
-def told(spots, poses=POSES):
+def findings_of(spots, poses=POSES):
     names = [f"P{k}" for k in range(len(poses.translation))]
     return beam_findings(calibrate_beams(DRAWN, spots, exact(poses)), DRAWN, names)
 
 
-def test_two_spots_exchanged_at_one_position_are_named():
+def test_two_labels_exchanged_at_one_position_are_identified():
     (i,) = np.flatnonzero((SPOTS.position == 4) & (SPOTS.view == 0))
     (j,) = np.flatnonzero((SPOTS.position == 4) & (SPOTS.view == 1))
     view = SPOTS.view.copy()
     view[i], view[j] = view[j], view[i]
     (camera, first), (_, second) = RIG.views()[0], RIG.views()[1]
-    found = {f.what: f.level for f in told(replace(SPOTS, view=view))}
+    found = {f.what: f.level for f in findings_of(replace(SPOTS, view=view))}
     assert found[f"position P4: spots {second} and {first} of camera {camera!r} are exchanged"] == Level.WARN
 
 
-def test_two_wrong_spots_of_one_picture_are_not_called_exchanged():
+def test_two_outliers_of_one_picture_are_not_exchanged_labels():
     pixels = SPOTS.pixels.copy()
     pixels[(SPOTS.position == 4) & (SPOTS.view < 2)] += 30.0
-    found = told(replace(SPOTS, pixels=pixels))
+    found = findings_of(replace(SPOTS, pixels=pixels))
     assert any(f.what.startswith("2 of ") for f in found)
     assert not any("exchanged" in f.what for f in found)
 
 
-def test_too_few_positions_must_not_be_used():
-    few = told(SPOTS.pick(SPOTS.position < 7), POSES[np.arange(7)])
+def test_fewer_than_8_positions_fail():
+    few = findings_of(SPOTS.pick(SPOTS.position < 7), POSES[np.arange(7)])
     assert any(f.level == Level.FAIL and f.what.startswith("only 7 positions, expected 8") for f in few)
-    enough = told(SPOTS.pick(SPOTS.position < 8), POSES[np.arange(8)])
+    enough = findings_of(SPOTS.pick(SPOTS.position < 8), POSES[np.arange(8)])
     assert not any(f.level == Level.FAIL for f in enough)

@@ -1,4 +1,4 @@
-"""The shape of a rig of beams from positions of which nothing is known, and what then cannot be known."""
+"""Self-calibration of beams from unknown positions, with the body frame as a free gauge."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def angles(rig: Rig) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", RIGS)
-def test_exactly_the_six_of_the_body_frame_stay_undetermined(name):
+def test_exactly_the_six_parameters_of_the_body_frame_are_undetermined(name):
     rng = np.random.default_rng(1)
     rig = RIGS[name]()
     poses = positions(rng, 20)
@@ -39,19 +39,19 @@ def test_exactly_the_six_of_the_body_frame_stay_undetermined(name):
     assert np.all(np.abs(angles(found.rig) - angles(rig)) < 4 * sigma)
 
 
-def test_the_frame_is_laid_nearest_to_the_drawing():
+def test_the_frame_is_chosen_nearest_to_the_drawing():
     rng = np.random.default_rng(2)
     rig = RIGS["four-skew-beams"]()
     nominal = drawn(rig, rng)
     found = self_calibrate(nominal, recorded(rng, rig, positions(rng, 20)), 20)
     as_drawn = at_feet(lines_in(stacks_of(nominal)))[0]
     G = body_motion(as_drawn)
-    away = lines_in(stacks_of(found.rig)).minus(as_drawn).ravel()
-    assert np.linalg.norm(away) > 1e-3  # the drawing was off
-    np.testing.assert_allclose(np.linalg.qr(G)[0].T @ away, 0, atol=1e-6)
+    difference = lines_in(stacks_of(found.rig)).minus(as_drawn).ravel()
+    assert np.linalg.norm(difference) > 1e-3  # the drawing differs
+    np.testing.assert_allclose(np.linalg.qr(G)[0].T @ difference, 0, atol=1e-6)
 
 
-def test_where_along_a_beam_its_drawing_puts_the_point_changes_neither_frame_nor_sigmas():
+def test_the_position_of_the_nominal_point_along_the_beam_does_not_change_frame_or_sigmas():
     rng = np.random.default_rng(10)
     rig = RIGS["four-skew-beams"]()
     spots = recorded(rng, rig, positions(rng, 20))
@@ -62,7 +62,7 @@ def test_where_along_a_beam_its_drawing_puts_the_point_changes_neither_frame_nor
     np.testing.assert_allclose(sigmas[0], sigmas[1], rtol=1e-3)
 
 
-def test_what_only_the_choice_of_frame_decides_has_no_variance():
+def test_motions_of_the_chosen_frame_have_no_variance():
     rng = np.random.default_rng(7)
     rig = RIGS["four-skew-beams"]()
     found = self_calibrate(rig, recorded(rng, rig, positions(rng, 20)), 20)
@@ -71,7 +71,7 @@ def test_what_only_the_choice_of_frame_decides_has_no_variance():
     assert variances.max() < 1e-6 * np.diagonal(found.lines_covariance).max()
 
 
-def test_derivatives_of_the_frame_are_differences_also_where_points_lie_elsewhere_along_their_beams():
+def test_derivatives_of_the_gauge_agree_with_finite_differences_for_any_points_of_the_beams():
     rng = np.random.default_rng(8)
     nominal = lines_in(stacks_of(RIGS["four-skew-beams"]()))
     turned = nominal.plus(rng.normal(0, 1e-5, (4, 4)))
@@ -85,7 +85,7 @@ def test_derivatives_of_the_frame_are_differences_also_where_points_lie_elsewher
     np.testing.assert_allclose(got, expected, rtol=1e-3, atol=1e-4 * np.abs(expected).max())
 
 
-def test_more_than_the_frame_is_told_apart_from_the_frame():
+def test_other_undetermined_motions_are_separated_from_those_of_the_frame():
     rng = np.random.default_rng(9)
     lines = lines_in(stacks_of(RIGS["four-skew-beams"]()))
     loose = np.zeros(16)
@@ -97,7 +97,7 @@ def test_more_than_the_frame_is_told_apart_from_the_frame():
     assert abs(rest @ expected) / np.linalg.norm(expected) > 1 - 1e-9
 
 
-def test_a_drawing_in_another_frame_turns_the_result_and_no_angle():
+def test_a_drawing_in_another_frame_does_not_change_angles():
     rng = np.random.default_rng(3)
     rig = RIGS["four-skew-beams"]()
     spots = recorded(rng, rig, positions(rng, 20))
@@ -106,10 +106,10 @@ def test_a_drawing_in_another_frame_turns_the_result_and_no_angle():
     one, two = (self_calibrate(r, spots, 20) for r in (rig, other))
     np.testing.assert_allclose(angles(one.rig), angles(two.rig), atol=0.02 * ARCSEC)
     sigmas = [np.array([a.sigma for a in c.angles]) for c in (one, two)]
-    np.testing.assert_allclose(sigmas[0], sigmas[1], rtol=1e-3)  # a choice of frame changes no angle's sigma
+    np.testing.assert_allclose(sigmas[0], sigmas[1], rtol=1e-3)  # independent of the frame
 
 
-def test_positions_with_too_few_spots_are_left_out_and_counted():
+def test_positions_with_too_few_spots_are_excluded():
     rng = np.random.default_rng(4)
     rig = RIGS["fan"]()
     spots = recorded(rng, rig, positions(rng, 12))
@@ -126,7 +126,7 @@ def test_one_position_is_not_enough():
         self_calibrate(rig, recorded(rng, rig, Pose(np.eye(3)[None], np.zeros((1, 3)))), 1)
 
 
-def test_known_positions_never_know_the_angles_less():
+def test_known_positions_never_increase_the_sigmas_of_angles():
     rng = np.random.default_rng(6)
     rig = opposed(RIGS["unequal-fan"](), rng)
     poses = positions(rng)
@@ -136,7 +136,7 @@ def test_known_positions_never_know_the_angles_less():
 
 
 def shape_scatter(seeds: range) -> tuple[float, float, float]:
-    """Share of angles within 1 sigma, the mean NEES per number of the shape, the RMS error of the angles (rad)."""
+    """Share of angles within 1 sigma, the mean NEES per parameter of the shape, the RMS error of the angles (rad)."""
     within, nees, sizes = [], [], []
     for seed in seeds:
         rng = np.random.default_rng(1000 + seed)
@@ -146,11 +146,11 @@ def shape_scatter(seeds: range) -> tuple[float, float, float]:
         off = angles(found.rig) - angles(rig)
         within.append(np.abs(off) < [a.sigma for a in found.angles])
         sizes.append(np.mean(off**2))
-        # The shape alone: what is left of the errors and their covariance once the frame's six are taken out.
+        # Errors and covariance without the six motions of the frame.
         G = body_motion(found.lines)
         shape = np.linalg.svd(G)[0][:, 6:]
         e = shape.T @ errors(rig, found.rig).ravel()
-        # The frame was laid by a drawing that is off: to second order its turn leaks into the shape, so it is undone.
+        # The frame is that of an inexact drawing; its rotation, which affects the shape to second order, is removed.
         nees.append(_nees_in_shape(rig, found, shape, e))
     return float(np.mean(within)), float(np.mean(nees)), float(np.sqrt(np.mean(sizes)))
 
@@ -167,7 +167,7 @@ def _nees_in_shape(rig: Rig, found, shape: np.ndarray, e: np.ndarray) -> float:
     return float(e @ np.linalg.solve(shape.T @ found.lines_covariance @ shape, e)) / len(e)
 
 
-def test_errors_of_the_shape_are_as_large_as_claimed():
+def test_errors_of_the_shape_agree_with_the_covariance():
     within, nees, size = shape_scatter(range(3))
     lo, hi = chi2.ppf([0.001, 0.999], 3 * 10) / (3 * 10)
     assert lo < nees < hi
@@ -176,7 +176,7 @@ def test_errors_of_the_shape_are_as_large_as_claimed():
 
 
 @pytest.mark.slow
-def test_errors_of_200_shapes_are_as_large_as_claimed():
+def test_errors_of_200_shapes_agree_with_the_covariance():
     within, nees, size = shape_scatter(range(200))
     lo, hi = chi2.ppf([0.025, 0.975], 200 * 10) / (200 * 10)
     print(f"within 1 sigma {within:.3f}, NEES {nees:.3f} ({lo:.3f} to {hi:.3f}), {size / ARCSEC:.1f} arcsec RMS")

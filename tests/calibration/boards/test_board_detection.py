@@ -1,4 +1,4 @@
-"""Boards in rendered pictures, where the truth is known, and in real ones, where the right number or reason is."""
+"""Detection of boards in rendered pictures with known truth and in real ones with known counts or reasons."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 
 from calibration.boards import charuco_detection, chessboard_detection, corner_refinement
-from calibration.boards.board_detection import NO_CLOSE_LOOK, BoardView, NotFound, find_board
+from calibration.boards.board_detection import find_board
 from calibration.boards.board_types import Board, CircleGrid, parse
+from calibration.boards.board_view import NO_CLOSE_LOOK, BoardView, NotFound
 from calibration.terms.circle_images import radius_by_areas
 from geometry import rotations
 from geometry.camera import FISHEYE, PERSPECTIVE, Camera
@@ -33,25 +34,25 @@ def camera(lens: str = PERSPECTIVE) -> Camera:
     return Camera("c", "s", (480, 360), matrix, numbers, Pose.identity(), lens=lens)
 
 
-def held(board: Board, turn: tuple[float, float, float], away: float = 1.9) -> Pose:
-    """A board turned about its middle, `away` of its own sizes from the camera."""
+def board_pose(board: Board, turn: tuple[float, float, float], distance: float = 1.9) -> Pose:
+    """camera_from_board of a board turned about its middle, at a distance in multiples of its size."""
     R = rotations.exp(np.array(turn))
-    return Pose(R, np.array([0, 0, away * max(board.size_m)]) - R @ board.middle)
+    return Pose(R, np.array([0, 0, distance * max(board.size_m)]) - R @ board.middle)
 
 
 @cache
 def shot(text: str, turn=(0.4, -0.3, 0.15), look: Look = CLEAN, **more) -> tuple[Board, BoardPhoto]:
     board = parse(text)
-    return board, photograph(board, camera(), held(board, turn), look=look, **more)
+    return board, photograph(board, camera(), board_pose(board, turn), look=look, **more)
 
 
-def seen(image, board: Board) -> BoardView:
+def view_of(image, board: Board) -> BoardView:
     found = find_board(image, board)
     assert isinstance(found, BoardView), found
     return found
 
 
-def refused(image, board: Board) -> str:
+def reason_of(image, board: Board) -> str:
     found = find_board(image, board)
     assert isinstance(found, NotFound), "found"
     return found.reason
@@ -62,18 +63,18 @@ def rms(view: BoardView, photo: BoardPhoto) -> float:
 
 
 def centroids(board: Board, turn: tuple[float, float, float]) -> tuple[np.ndarray, np.ndarray]:
-    """Where the blobs of a board's circles truly lie (n, 2), px, and their areas, from fine outlines."""
+    """True centroids (n, 2), px, and areas of a board's circles in the picture, from finely sampled outlines."""
     assert isinstance(board, CircleGrid)
     angle = np.linspace(0, 2 * np.pi, 300, endpoint=False)
     ring = board.diameter_m / 2 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
-    out = camera().project(held(board, turn).apply(board.points[:, None] + ring))
+    out = camera().project(board_pose(board, turn).apply(board.points[:, None] + ring))
     before = np.roll(out, 1, axis=1)
     twice = before[..., 0] * out[..., 1] - out[..., 0] * before[..., 1]
     area = twice.sum(axis=1)
     return np.sum((before + out) * twice[..., None], axis=1) / (3 * area[:, None]), np.abs(area) / 2
 
 
-# How near to the truth ------------------------------------------------------------------------------------------
+# Accuracy ------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -84,9 +85,9 @@ def centroids(board: Board, turn: tuple[float, float, float]) -> tuple[np.ndarra
         ("charuco:5x8:40mm:20mm:DICT_4X4_50:inverted:legacy", 0.04),
     ],
 )
-def test_points_are_found_where_they_truly_are(text, within):
+def test_points_are_detected_at_their_true_positions(text, within):
     board, photo = shot(text)
-    view = seen(photo.image, board)
+    view = view_of(photo.image, board)
     assert len(view) == len(board.ids)
     assert rms(view, photo) < within * px
     assert np.abs(np.mean(view.pixels - photo.pixels, axis=0)).max() < 0.015 * px  # no common shift
@@ -94,32 +95,35 @@ def test_points_are_found_where_they_truly_are(text, within):
 
 
 @pytest.mark.parametrize("text", [CHESS, "circles:9x7:25mm", CHARUCO])
-def test_noise_and_blur_cost_less_than_a_tenth_of_a_pixel(text):
+def test_errors_from_noise_and_blur_are_below_a_tenth_of_a_pixel(text):
     board, photo = shot(text, look=Look(blur_px=1.2, noise_dn=4, gradient=0.4, samples=9), seed=3)
-    view = seen(photo.image, board)
+    view = view_of(photo.image, board)
     assert len(view) >= 0.9 * len(board.ids)
     assert rms(view, photo) < 0.1 * px
 
 
-def test_a_bent_board_in_a_fisheye_picture_is_found_too():
+def test_a_bent_board_in_a_fisheye_picture_is_detected():
     board = parse(CHESS)
     lens = camera(FISHEYE)
-    photo = photograph(board, lens, held(board, (0.2, 0.3, 0.1), 1.0), np.array([0.3, -0.1, 0.2]), CLEAN)
-    assert rms(seen(photo.image, board), photo) < 0.04 * px
+    photo = photograph(board, lens, board_pose(board, (0.2, 0.3, 0.1), 1.0), np.array([0.3, -0.1, 0.2]), CLEAN)
+    assert rms(view_of(photo.image, board), photo) < 0.04 * px
 
 
 @pytest.mark.parametrize(
     ("text", "turn"),
     [
         ("circles:9x7:25mm", (0.4, -0.3, 0.15)),
-        ("circles:7x5:30mm:18mm", (0.0, 0.95, 0.0)),  # steep: there the circles' centres lie .1 px and more away
+        (
+            "circles:7x5:30mm:18mm",
+            (0.0, 0.95, 0.0),
+        ),  # steep: the images of the centres are .1 px and more from the centroids
         ("acircles:4x11:20mm", (0.4, -0.3, 0.15)),
         ("acircles:5x8:25mm", (0.4, -0.3, 0.15)),
     ],
 )
-def test_blobs_of_circles_are_found_where_they_truly_are_with_their_areas(text, turn):
+def test_centroids_and_areas_of_circles_are_correct(text, turn):
     board, photo = shot(text, turn=turn)
-    view = seen(photo.image, board)
+    view = view_of(photo.image, board)
     places, areas = centroids(board, turn)
     assert np.sqrt(np.mean((view.pixels - places) ** 2)) < 0.02 * px
     assert np.abs(np.mean(view.pixels - places, axis=0)).max() < 0.008 * px
@@ -132,7 +136,7 @@ def test_blobs_of_circles_are_found_where_they_truly_are_with_their_areas(text, 
 @pytest.mark.parametrize("blur", [0.6, 1.0, 1.8])
 def test_blur_is_measured(blur):
     board, photo = shot(CHESS, look=Look(blur_px=blur, noise_dn=2, samples=9))
-    assert seen(photo.image, board).blur_px == pytest.approx(np.hypot(blur, 12**-0.5), abs=0.1)
+    assert view_of(photo.image, board).blur_px == pytest.approx(np.hypot(blur, 12**-0.5), abs=0.1)
 
 
 # The order of the points ----------------------------------------------------------------------------------------
@@ -140,10 +144,10 @@ def test_blur_is_measured(blur):
 
 @pytest.mark.parametrize("text", [CHESS, "chessboard:5x5:30mm", "acircles:4x11:20mm", CHARUCO])
 @pytest.mark.parametrize("roll", [0.0, -1.7, 3.0])
-def test_the_first_point_stays_the_first_however_the_camera_is_rolled(text, roll):
-    """5x5 corners look the same after half a turn: there the rows point to the right."""
+def test_the_first_point_is_the_same_for_every_roll_of_the_camera(text, roll):
+    """5x5 corners look the same after half a turn; their rows point to the right."""
     board, photo = shot(text, turn=(0.25, 0.2, roll), look=Look(samples=9))
-    view = seen(photo.image, board)
+    view = view_of(photo.image, board)
     miss = np.linalg.norm(view.pixels - photo.pixels[view.ids], axis=1).max()
     if board.symmetry == 1 or abs(roll) < 1.5:
         assert miss < 0.3 * px
@@ -151,67 +155,67 @@ def test_the_first_point_stays_the_first_however_the_camera_is_rolled(text, roll
         np.testing.assert_allclose(view.pixels, photo.pixels[::-1], atol=0.3 * px)
 
 
-def test_corners_in_any_wrong_order_come_out_right():
-    """Releases of OpenCV differ in the order they give: every order of a grid must lead to the one."""
+def test_corners_in_any_order_are_renumbered_correctly():
+    """Releases of OpenCV differ in the order of the corners."""
     _, photo = shot(CHESS)
     true = photo.pixels.reshape(6, 9, 2)
     for given in (true, true[::-1], true[:, ::-1], true[::-1, ::-1]):
         np.testing.assert_array_equal(chessboard_detection.oriented(photo.image, given), true)
 
 
-def test_a_larger_dot_in_a_corner_becomes_the_first():
+def test_a_larger_circle_in_a_corner_becomes_the_first_point():
     board, photo = shot("circles:6x6:30mm", turn=(0.2, 0.2, 0.1))
     for corner in (0, 5, 30, 35):
         image = photo.image.copy()
         u, v = np.round(photo.pixels[corner]).astype(int)
         cv2.circle(image, (int(u), int(v)), 19, 35, -1, cv2.LINE_AA)
-        assert np.linalg.norm(seen(image, board).pixels[0] - [u, v]) < 1.5 * px
+        assert np.linalg.norm(view_of(image, board).pixels[0] - [u, v]) < 1.5 * px
 
 
-# What is said when there is no view -----------------------------------------------------------------------------
+# Reasons for a failure ------------------------------------------------------------------------------------------
 
 
-def test_an_empty_wall_and_a_dark_picture_say_so():
+def test_an_empty_wall_and_an_unlit_picture_give_a_reason():
     wall = np.random.default_rng(0).integers(60, 190, (360, 480)).astype(np.uint8)
-    assert "no chessboard seen" in refused(wall, parse(CHESS))
-    assert "no marker of DICT_5X5_100 seen" in refused(wall, parse(CHARUCO))
-    assert "circles" in refused(wall, parse("circles:9x7:25mm"))
+    assert "no chessboard found" in reason_of(wall, parse(CHESS))
+    assert "no marker of DICT_5X5_100 found" in reason_of(wall, parse(CHARUCO))
+    assert "circles" in reason_of(wall, parse("circles:9x7:25mm"))
     for text in (CHESS, CHARUCO, "circles:9x7:25mm"):
-        assert "hardly any contrast" in refused(np.full((360, 480), 7, dtype=np.uint8), parse(text))
+        assert "hardly any contrast" in reason_of(np.full((360, 480), 7, dtype=np.uint8), parse(text))
 
 
-def test_a_board_of_another_size_is_named():
+def test_the_reason_gives_the_actual_size_of_a_chessboard():
     board, photo = shot(CHESS)
-    assert "9x6" in refused(photo.image, parse("chessboard:7x7:25mm"))
-    assert refused(photo.image, parse("chessboard:8x6:25mm")).startswith(
-        ("the chessboard goes on", "a chessboard of 9x6 inner corners, not 8x6")
+    assert "9x6" in reason_of(photo.image, parse("chessboard:7x7:25mm"))
+    assert reason_of(photo.image, parse("chessboard:8x6:25mm")).startswith(
+        ("the chessboard continues", "a chessboard of 9x6 inner corners, not 8x6")
     )
-    assert "only 9x6 of the 11x6" in refused(photo.image, parse("chessboard:11x6:25mm"))
-    assert len(seen(photo.image, parse("chessboard:6x9:25mm"))) == len(board.ids)  # the same board, held upright
+    assert "only 9x6 of the 11x6" in reason_of(photo.image, parse("chessboard:11x6:25mm"))
+    assert len(view_of(photo.image, parse("chessboard:6x9:25mm"))) == len(board.ids)  # the same board, held upright
 
 
-def test_a_grid_of_another_size_or_kind_is_named():
+def test_the_reason_gives_the_actual_size_or_kind_of_a_grid():
     _, photo = shot("circles:9x7:25mm")
-    assert "9x7 circles, not 10x8" in refused(photo.image, parse("circles:10x8:25mm"))
-    assert "goes on" in refused(photo.image, parse("circles:8x7:25mm"))
+    assert "9x7 circles, not 10x8" in reason_of(photo.image, parse("circles:10x8:25mm"))
+    assert "continues" in reason_of(photo.image, parse("circles:8x7:25mm"))
     _, photo = shot("acircles:4x11:20mm")
-    assert "write acircles instead of circles" in refused(photo.image, parse("circles:4x11:20mm"))
+    assert "write acircles instead of circles" in reason_of(photo.image, parse("circles:4x11:20mm"))
 
 
-def test_a_charuco_board_is_told_from_its_neighbours():
+def test_the_reason_gives_the_difference_from_a_similar_charuco_board():
     _, photo = shot(CHARUCO)
-    assert "do on 7x5 squares; exchange the two" in refused(photo.image, parse("charuco:5x7:35mm:24mm:DICT_5X5_100"))
-    assert "of DICT_5X5_50 with numbers up to 16; check the dictionary" in refused(
+    assert "fit 7x5 squares; exchange the two" in reason_of(photo.image, parse("charuco:5x7:35mm:24mm:DICT_5X5_100"))
+    assert "of DICT_5X5_50 with numbers up to 16; check the dictionary" in reason_of(
         photo.image, parse("charuco:7x5:35mm:24mm:DICT_6X6_250")
     )
-    assert "do not lie as on this board; check the number of columns and rows" in refused(
+    assert "not arranged as on this board; check the number of columns and rows" in reason_of(
         photo.image, parse("charuco:8x6:35mm:24mm:DICT_5X5_100")
     )
 
 
-def test_an_inverted_or_older_charuco_board_is_found_all_the_same_and_said_to_be_one():
+def test_an_inverted_or_legacy_charuco_board_is_detected_with_a_note():
     _, photo = shot("charuco:6x8:30mm:20mm:DICT_4X4_50:inverted:legacy")
-    view = seen(photo.image, parse("charuco:6x8:30mm:20mm:DICT_4X4_50"))
+    view = view_of(photo.image, parse("charuco:6x8:30mm:20mm:DICT_4X4_50"))
     assert rms(view, photo) < 0.05 * px
     assert len(view) == 35
     assert view.notes == (
@@ -220,31 +224,31 @@ def test_an_inverted_or_older_charuco_board_is_found_all_the_same_and_said_to_be
     )
 
 
-def test_markers_of_another_size_than_said_are_measured():
+def test_markers_of_another_size_than_stated_are_measured():
     _, photo = shot("charuco:7x5:35mm:24mm:DICT_5X5_100")
-    (note,) = seen(photo.image, parse("charuco:7x5:35mm:17mm:DICT_5X5_100")).notes
+    (note,) = view_of(photo.image, parse("charuco:7x5:35mm:17mm:DICT_5X5_100")).notes
     assert note.startswith("markers measure 0.6")
-    assert note.endswith("of a square, the board's text says 0.49")
+    assert note.endswith("of a square, according to the text 0.49")
 
 
 @pytest.mark.parametrize("text", [CHARUCO, CHARUCO + ":inverted"])
-def test_a_mirrored_picture_is_refused_where_the_pattern_can_tell(text):
+def test_a_mirrored_picture_of_a_charuco_board_is_rejected(text):
     board, photo = shot(text)
-    seen(photo.image, board)
-    assert "mirror" in refused(np.ascontiguousarray(photo.image[:, ::-1]), board)
+    view_of(photo.image, board)
+    assert "mirror" in reason_of(np.ascontiguousarray(photo.image[:, ::-1]), board)
 
 
-def test_a_mirrored_board_of_4x4_bits_says_so_although_some_of_its_markers_look_like_others():
+def test_a_mirrored_board_of_4x4_bits_is_rejected_although_some_markers_resemble_others():
     board = parse("charuco:11x9:36mm:27mm:DICT_4X4_100")
     larger = replace(camera(), image_size_px=(800, 600), matrix=np.diag([5 / 3, 5 / 3, 1]) @ camera().matrix)
-    photo = photograph(board, larger, held(board, (0.2, 0.1, 0.1), 1.6), look=Look(blur_px=0.7, samples=4))
+    photo = photograph(board, larger, board_pose(board, (0.2, 0.1, 0.1), 1.6), look=Look(blur_px=0.7, samples=4))
     mirrored = np.ascontiguousarray(photo.image[:, ::-1])
     assert len(charuco_detection.find_markers(mirrored, board.dictionary, board.markers).ids) >= 2
-    assert "mirror" in refused(mirrored, board)
+    assert "mirror" in reason_of(mirrored, board)
 
 
 @pytest.mark.parametrize("text", [CHESS, "circles:9x7:25mm", CHARUCO])
-def test_a_quick_look_sees_a_board_and_looks_for_no_cause(text):
+def test_a_quick_search_finds_a_board_and_gives_no_reason(text):
     board, photo = shot(text)
     view = find_board(photo.image, board, closely=False)
     assert isinstance(view, BoardView)
@@ -253,40 +257,40 @@ def test_a_quick_look_sees_a_board_and_looks_for_no_cause(text):
     assert find_board(wall, board, closely=False) is NO_CLOSE_LOOK
 
 
-def test_a_mirrored_chessboard_is_its_own_mirror_image_but_its_order_is_not_mirrored():
+def test_corners_of_a_mirrored_chessboard_are_not_in_mirrored_order():
     board, photo = shot(CHESS)
-    grid = seen(np.ascontiguousarray(photo.image[:, ::-1]), board).pixels.reshape(6, 9, 2)
+    grid = view_of(np.ascontiguousarray(photo.image[:, ::-1]), board).pixels.reshape(6, 9, 2)
     right, down = grid[0, 1] - grid[0, 0], grid[1, 0] - grid[0, 0]
     assert right[0] * down[1] - right[1] * down[0] > 0
 
 
-def test_a_picture_out_of_focus_says_so():
+def test_a_picture_out_of_focus_is_rejected_as_blurred():
     board, photo = shot(CHESS)
     blurred = cv2.GaussianBlur(photo.image, (0, 0), 9)
-    assert "too blurred" in refused(blurred, board)
+    assert "too blurred" in reason_of(blurred, board)
     board, photo = shot(CHARUCO)
-    assert "blurred" in refused(cv2.GaussianBlur(photo.image, (0, 0), 5), board)
+    assert "blurred" in reason_of(cv2.GaussianBlur(photo.image, (0, 0), 5), board)
 
 
-def test_a_part_of_a_chessboard_is_refused_and_a_part_of_a_charuco_board_used():
+def test_a_part_of_a_chessboard_is_rejected_and_a_part_of_a_charuco_board_accepted():
     board, photo = shot(CHESS)
     image = photo.image.copy()
     image[:, : int(photo.pixels[2, 0])] = 110
-    assert "only" in refused(image, board)
+    assert "only" in reason_of(image, board)
     board, photo = shot(CHARUCO)
     image = photo.image.copy()
     image[:, : int(photo.pixels[2, 0])] = 110
-    view = seen(image, board)
+    view = view_of(image, board)
     assert 6 <= len(view) < len(board.ids)
     assert rms(view, photo) < 0.05 * px
 
 
-def test_other_kinds_of_picture_are_a_mistake_of_the_caller():
+def test_a_picture_of_another_type_raises():
     with pytest.raises(ValueError, match="expected a grey picture"):
         find_board(np.zeros((100, 100, 3), dtype=np.uint8), parse(CHESS))
 
 
-def test_refinement_keeps_away_from_edges_that_do_not_meet_in_the_corner():
+def test_edge_distance_is_that_of_the_nearest_parallel_edge():
     grid = np.stack(np.meshgrid(np.arange(4) * 30.0, np.arange(3) * 12.0), axis=-1)
     np.testing.assert_allclose(corner_refinement.edge_distance(grid, np.ones((3, 4), dtype=bool)), 12.0)
 
@@ -295,10 +299,10 @@ def test_refinement_keeps_away_from_edges_that_do_not_meet_in_the_corner():
 
 
 def counts(pattern: str, text: str) -> Counter[str]:
-    """How often what was said of real pictures."""
+    """Number of real pictures per result."""
     files = sorted(DATA.glob(pattern))
     if not files:
-        pytest.skip(f"the real pictures are not here: {pattern.split('/')[0]} is missing")
+        pytest.skip(f"the real pictures are not available: {pattern.split('/')[0]} is missing")
     out: Counter[str] = Counter()
     for path in files:
         found = find_board(np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), dtype=np.uint8), parse(text))
@@ -312,48 +316,48 @@ def counts(pattern: str, text: str) -> Counter[str]:
         ("chessboard_stereo_opencv/*.jpg", CHESS, 14, 14),
         ("chessboard_webcam_c920/*.jpg", "chessboard:9x7:24.4mm", 7, 7),
         ("chessboard_lowquality_400x300/*.png", CHESS, 13, 13),
-        pytest.param(  # in one the board stands on edge
+        pytest.param(  # in one the board is seen edge-on
             *("chessboard_portrait_cams/*/*.jpg", "chessboard:4x7:60mm", 13, 14), marks=pytest.mark.slow
         ),
         ("charuco_aruco_stills/ch*.jpg", "charuco:5x7:40mm:20mm:DICT_6X6_250", 2, 2),
     ],
 )
 def test_real_boards_are_found(pattern, text, found, all_):
-    said = counts(pattern, text)
-    assert (said["found"], sum(said.values())) == (found, all_)
-    assert all(reason == "found" or reason.startswith("no chessboard seen") for reason in said)
+    results = counts(pattern, text)
+    assert (results["found"], sum(results.values())) == (found, all_)
+    assert all(reason == "found" or reason.startswith("no chessboard found") for reason in results)
 
 
 @pytest.mark.parametrize(
     ("pattern", "text", "words"),
     [
-        ("chessboard_stereo_opencv/left*.jpg", "chessboard:8x6:25mm", "the chessboard goes on"),
+        ("chessboard_stereo_opencv/left*.jpg", "chessboard:8x6:25mm", "the chessboard continues"),
         ("chessboard_webcam_c920/*4.jpg", "chessboard:9x6:25mm", "9x7 inner corners, not 9x6|beyond 9x6 inner"),
         ("charuco_aruco_stills/chor*.jpg", "charuco:5x7:40mm:20mm:DICT_5X5_100", "of DICT_6X6_50 with numbers up to"),
-        ("charuco_aruco_stills/chor*.jpg", "charuco:7x5:40mm:20mm:DICT_6X6_250", "they do on 5x7 squares"),
+        ("charuco_aruco_stills/chor*.jpg", "charuco:7x5:40mm:20mm:DICT_6X6_250", "they fit 5x7 squares"),
         ("charuco_aruco_stills/single*.jpg", "charuco:5x7:40mm:20mm:DICT_6X6_250", "another board"),
-        ("charuco_aruco_stills/gb*.jpg", "chessboard:4x6:40mm", "no chessboard seen"),
-        ("circlegrid_robot_wrist/images/[02].png", "circles:9x10:20mm", "the grid goes on to the right"),
+        ("charuco_aruco_stills/gb*.jpg", "chessboard:4x6:40mm", "no chessboard found"),
+        ("circlegrid_robot_wrist/images/[02].png", "circles:9x10:20mm", "the grid continues to the right"),
     ],
 )
-def test_what_is_wrong_with_real_pictures_is_said(pattern, text, words):
-    said = counts(pattern, text)
-    assert all(re.search(words, reason) for reason in said), said
+def test_real_pictures_are_rejected_with_the_right_reason(pattern, text, words):
+    results = counts(pattern, text)
+    assert all(re.search(words, reason) for reason in results), results
 
 
-def test_the_large_dot_of_the_robots_target_is_first_in_all_its_pictures():
+def test_the_large_circle_of_the_robots_target_is_first_in_all_its_pictures():
     board = parse("circles:10x10:20mm")
     files = sorted((DATA / "circlegrid_robot_wrist" / "images").glob("*.png"))
     if not files:
-        pytest.skip("the real pictures are not here: circlegrid_robot_wrist is missing")
+        pytest.skip("the real pictures are not available: circlegrid_robot_wrist is missing")
     assert len(files) == 6
     for path in files:
         image = np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), dtype=np.uint8)
-        view = seen(image, board)
+        view = view_of(image, board)
         (u, v), reach = np.round(view.pixels[0]).astype(int), int(0.4 * view.spacing_px)
         other = np.round(view.pixels[99]).astype(int)
-        dark = [
+        black_share = [
             np.mean(image[max(y - reach, 0) : y + reach, max(x - reach, 0) : x + reach] < 90)
             for x, y in ((u, v), other)
         ]
-        assert dark[0] > 1.8 * dark[1]
+        assert black_share[0] > 1.8 * black_share[1]

@@ -1,4 +1,4 @@
-"""Boards: where their points are, what they are called, and what is ink on them."""
+"""Boards: positions of their points, their texts, and the printed pattern."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from calibration.boards.board_drawing import draw, ink_at
-from calibration.boards.board_types import DICTIONARIES, Charuco, Chessboard, CircleGrid, parse
+from calibration.boards.board_types import Charuco, Chessboard, CircleGrid, parse
+from calibration.boards.marker_dictionaries import DICTIONARIES
 
 mm = 1e-3
 TEXTS = [
@@ -25,7 +26,7 @@ TEXTS = [
 
 
 @pytest.mark.parametrize("text", TEXTS)
-def test_a_board_is_what_its_text_says_and_says_it_again(text):
+def test_parsing_and_describing_are_inverse(text):
     board = parse(text)
     assert board.describe() == text
     assert parse(board.describe()) == board
@@ -35,7 +36,7 @@ lengths = st.floats(0.5, 500.0).map(lambda v: round(v, 3))
 
 
 @given(st.integers(3, 50), st.integers(3, 50), lengths, st.booleans())
-def test_every_board_comes_back_from_its_own_words(columns, rows, length_mm, asymmetric):
+def test_every_board_is_restored_from_its_text(columns, rows, length_mm, asymmetric):
     for board in (
         Chessboard(columns, rows, length_mm / 1000),
         CircleGrid(columns, rows, length_mm / 1000, asymmetric),
@@ -60,17 +61,17 @@ def test_points_run_row_by_row_from_the_first_corner():
 
 @pytest.mark.parametrize(("columns", "rows"), [(5, 7), (5, 8), (6, 8), (8, 5), (4, 5)])
 @pytest.mark.parametrize("legacy", [False, True])
-def test_charuco_corners_and_markers_lie_where_opencv_has_them(columns, rows, legacy):
+def test_charuco_corners_and_markers_are_placed_as_in_opencv(columns, rows, legacy):
     board = Charuco(columns, rows, 0.04, 0.03, "DICT_4X4_250", legacy=legacy)
     theirs = cv2.aruco.CharucoBoard(
         (columns, rows), 0.04, 0.03, cv2.aruco.getPredefinedDictionary(DICTIONARIES["DICT_4X4_250"])
     )
     theirs.setLegacyPattern(legacy)
     corners = np.array(theirs.getChessboardCorners()).reshape(-1, 3)
-    first = np.array([0.04, 0.04, 0])  # theirs starts at the outer corner
+    first = np.array([0.04, 0.04, 0])  # OpenCV's frame starts at the outer corner
     np.testing.assert_allclose(board.points + first, corners, atol=1e-8)
     assert board.markers == len(theirs.getIds())
-    # The picture that OpenCV prints, 40 px a square, against ours at the pixels' centres.
+    # The picture that OpenCV prints, 40 px a square, against `ink_at` at the centres of the pixels.
     picture = theirs.generateImage((40 * columns, 40 * rows), marginSize=0) < 128
     v, u = np.indices(picture.shape)
     ours = ink_at(board, np.stack([u + 0.5, v + 0.5], axis=-1) / 1000 - 0.04) > 0.5
@@ -78,7 +79,7 @@ def test_charuco_corners_and_markers_lie_where_opencv_has_them(columns, rows, le
 
 
 @pytest.mark.parametrize("text", TEXTS)
-def test_shapes_to_print_and_shades_at_points_are_one_pattern(text):
+def test_printed_shapes_and_ink_density_agree(text):
     board = parse(text)
     drawing = draw(board)
     rng = np.random.default_rng(0)
@@ -108,7 +109,7 @@ def test_shapes_to_print_and_shades_at_points_are_one_pattern(text):
         ("charuco:5x7:40mm:20mm:DICT_4X4_50", 1),
     ],
 )
-def test_symmetry_counts_the_turns_after_which_the_ink_is_the_same(text, symmetry):
+def test_symmetry_is_the_number_of_rotations_that_preserve_the_pattern(text, symmetry):
     board = parse(text)
     at = np.random.default_rng(1).uniform(-0.6, 0.6, (5000, 2)) * max(board.size_m)
     middle, ink = board.middle[:2], ink_at(board, at + board.middle[:2])
@@ -139,12 +140,12 @@ def test_symmetry_counts_the_turns_after_which_the_ink_is_the_same(text, symmetr
         ("charuco:5x7:40mm:20mm:DICT_4X4_50:invert", "expected 'inverted' or 'legacy' at the end, got 'invert'"),
     ],
 )
-def test_a_wrong_text_is_answered_in_one_line_with_an_example(text, complaint):
+def test_an_invalid_text_gives_a_one_line_message_with_an_example(text, complaint):
     with pytest.raises(ValueError, match=complaint) as caught:
         parse(text)
     assert "\n" not in str(caught.value)
     assert ("example" in str(caught.value)) or (":9x6:" in str(caught.value)) or ("charuco:5x7" in str(caught.value))
 
 
-def test_a_dictionary_may_be_named_in_any_case_and_without_its_first_word():
+def test_a_dictionary_name_may_be_in_any_case_and_without_its_prefix():
     assert parse("charuco:5x7:40mm:20mm:apriltag_36H11").dictionary == "DICT_APRILTAG_36h11"

@@ -1,5 +1,4 @@
-"""Synthetic calibrations with truth: one camera that sees a board in many poses. Corners come from OpenCV's projection,
-not from ours."""
+"""Synthetic corners with known truth: one camera that sees a board in many poses, projected by OpenCV."""
 
 from __future__ import annotations
 
@@ -19,15 +18,15 @@ WIDE = (500.0, 501.0, 640.0, 505.0, 0.02, -0.01, 0.002, 0.0)
 
 @dataclass(frozen=True)
 class Scene:
-    """How the photographs are taken."""
+    """Camera, board and poses of a set of photographs."""
 
-    lens: tuple[float, ...] = TRUTH  # fx, fy, cx, cy and distortion numbers
+    lens: tuple[float, ...] = TRUTH  # fx, fy, cx, cy and distortion coefficients
     fisheye: bool = False
     views: int = 15
     sigma_px: float = 0.2
     warp: tuple[float, float, float] = (0.0, 0.0, 0.0)  # 1/m
     tilt_rad: float = 0.5  # the largest about x and y
-    lean_rad: tuple[float, float] = (0.0, 0.0)  # about x and y, added to all
+    lean_rad: tuple[float, float] = (0.0, 0.0)  # about x and y, added to every pose
     roll_rad: float = 0.3  # the largest about z
     distance_m: tuple[float, float] = (0.35, 0.7)
     columns: int = 9
@@ -43,7 +42,7 @@ def board_points(scene: Scene) -> Array:
 
 
 def photographs(scene: Scene, seed: int) -> CornerTable:
-    """The corners that the camera sees, with normal errors; of a view only those in the picture."""
+    """The corners that lie in the picture, with normal errors."""
     rng = np.random.default_rng(seed)
     flat = board_points(scene)
     middle = flat.mean(axis=0)

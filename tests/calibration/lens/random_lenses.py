@@ -1,8 +1,7 @@
-"""Cameras of any lens from a pinhole to 120 deg, with the corners that they see and how far a calibration errs.
+"""Random lenses from a pinhole to 120 deg, with simulated corners and the error of their calibration.
 
-The lenses are drawn by formulas of their own, not by the code under test: OpenCV's models through OpenCV, and radial
-lenses r = tan(a t) / a (a = 1 a pinhole, 1/2 stereographic, 0 equidistant; sin for the other side), which none of the
-models is.
+The projection is independent of the code under test: OpenCV's models through OpenCV, and radial lenses r = tan(a t) / a
+(a = 1 is a pinhole, 1/2 stereographic, 0 equidistant; sin for negative a), which none of the models describes exactly.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ KINDS = ("pinhole", "plain", "rational", "fisheye", "radial")
 
 @dataclass(frozen=True)
 class TrueLens:
-    """How a camera draws points (n, 3) of its frame, in px, and what it is."""
+    """A lens with its projection of points (n, 3) in the camera frame to pixels (n, 2)."""
 
     kind: str
     fov_deg: float  # from corner to corner
@@ -35,7 +34,7 @@ class TrueLens:
 
 
 def radial(a: float) -> Callable[[Array], Array]:
-    """Distance from the middle at an angle off the axis, of focal length 1."""
+    """Radial distance as a function of the angle off the axis, for the focal length 1."""
 
     def r(t: Array) -> Array:
         if abs(a) < 1e-6:
@@ -46,7 +45,7 @@ def radial(a: float) -> Callable[[Array], Array]:
 
 
 def random_lens(seed: int, kind: str | None = None) -> TrueLens:
-    """A lens of a random kind, field of view and middle; the wide kinds start at 80 deg."""
+    """A lens of random kind, field of view and principal point; the wide kinds start at 80 deg."""
     rng = np.random.default_rng([seed, 77])
     kind = kind or KINDS[seed % len(KINDS)]
     low, high = {"pinhole": (25, 75), "plain": (40, 85)}.get(kind, (80, 120))
@@ -88,7 +87,7 @@ def _radial_pixels(points: Array, r: Callable[[Array], Array], K: Array, p: Arra
 
 
 def _opencv_numbers(kind: str, a: float, half: float, rng: np.random.Generator) -> Array:
-    """k1 ... k6 that follow the radial lens up to the picture's corner, or k1, k2, k3 alone; exact for themselves."""
+    """k1 ... k6, or k1, k2, k3 alone, that approximate the radial lens up to the corner of the picture."""
     d = np.zeros(8)
     if kind == "pinhole":
         return d
@@ -99,14 +98,14 @@ def _opencv_numbers(kind: str, a: float, half: float, rng: np.random.Generator) 
     if kind == "plain":
         d[[0, 1, 4]] = np.linalg.lstsq(powers, s - 1, rcond=1e-8)[0] * rng.uniform(0.8, 1.2)
         return d
-    # The denominator is drawn, the numerator follows it: k1 to k6 all matter.
+    # The denominator is random and the numerator is fitted, so that k1 to k6 are all significant.
     d[5:8] = np.array([1.0, 0.3, 0.02]) * rng.uniform(0.3, 1.5, 3)
     d[[0, 1, 4]] = np.linalg.lstsq(powers, s * (1 + powers @ d[5:8]) - 1, rcond=1e-10)[0]
     return d
 
 
 def corners_of(true: TrueLens, seed: int, views: int = 20, sigma_px: float = 0.1) -> CornerTable:
-    """A 12 x 8 chessboard all over the picture, tilted to all sides; corners outside the picture are not seen."""
+    """Corners of a 12 x 8 chessboard all over the picture, tilted to all sides."""
     rng = np.random.default_rng([seed, 78])
     x, y = np.meshgrid(np.arange(12) * 0.03, np.arange(8) * 0.03)
     board = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
@@ -131,7 +130,7 @@ def corners_of(true: TrueLens, seed: int, views: int = 20, sigma_px: float = 0.1
 
 
 def within_boards(c: Intrinsics, pixels: Array) -> Array:
-    """Which pixels (n, 2) lie within the corners of some view."""
+    """Which pixels (n, 2) lie inside the corners of some view."""
     inside = np.zeros(len(pixels), dtype=bool)
     for v in np.flatnonzero(c.table.counts(c.fit.used) > 2):
         hull = cv2.convexHull(c.table.pixels[c.fit.used & (c.table.view == v)].astype(np.float32))
@@ -140,15 +139,15 @@ def within_boards(c: Intrinsics, pixels: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class Judged:
-    """How far a calibrated lens errs where corners were seen, and what it claims, RMS, px."""
+class LensError:
+    """Actual and stated error (RMS, px) of a calibrated lens where corners were seen."""
 
     error_px: float
-    claimed_px: float
+    stated_px: float
 
 
-def judged(true: TrueLens, c: Intrinsics) -> Judged:
-    """Pixels on a grid, drawn by the true lens along the calibrated rays, after the turn that explains most."""
+def lens_error(true: TrueLens, c: Intrinsics) -> LensError:
+    """Error of the true projection of the calibrated rays of grid pixels, after the best-fitting rotation."""
     grid = c.map.pixels.reshape(-1, 2)
     near = within_boards(c, grid)
     flat = undistorted(grid[near], c.fit.lens, c.model.fisheye)
@@ -158,5 +157,5 @@ def judged(true: TrueLens, c: Intrinsics) -> Judged:
         return (true.project(rays @ exp(turn).T) - grid[near]).ravel()
 
     left = least_squares(off, np.zeros(3), x_scale=1e-3).fun
-    claimed = np.trace(c.map_covariance_px2, axis1=-2, axis2=-1).reshape(-1)[near]
-    return Judged(float(np.sqrt(np.sum(left**2) / near.sum())), float(np.sqrt(np.nanmean(claimed))))
+    stated = np.trace(c.map_covariance_px2, axis1=-2, axis2=-1).reshape(-1)[near]
+    return LensError(float(np.sqrt(np.sum(left**2) / near.sum())), float(np.sqrt(np.nanmean(stated))))

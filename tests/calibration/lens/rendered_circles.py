@@ -1,5 +1,7 @@
-"""Photographs of circle grids, drawn by code that shares nothing with the model: rays through OpenCV's lens, cast on
-the board, many to a pixel; then blur, noise and whole grey values."""
+"""Rendered photographs of circle grids: several rays per pixel through OpenCV's lens, then blur, noise and rounding.
+
+Independent of the code under test.
+"""
 
 from __future__ import annotations
 
@@ -9,8 +11,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.boards.board_detection import BoardView, find_board
+from calibration.boards.board_detection import find_board
 from calibration.boards.board_types import CircleGrid
+from calibration.boards.board_view import BoardView
 from calibration.boards.circle_detection import fit_ellipses
 from calibration.lens.fit.corner_table import CircleAreas, CornerTable
 from geometry.arrays import Array
@@ -19,38 +22,38 @@ from geometry.rotations import exp
 SIZE = (1280, 1024)
 LENS = (1000.0, 1003.0, 630.0, 520.0, -0.2, 0.08, 0.001, -0.0008, -0.03)
 _SAMPLES = 5  # along each side of a pixel
-_MARGIN = 7  # px about a blob
+_MARGIN = 7  # px around a blob
 
 
 @dataclass(frozen=True)
 class CircleScene:
-    """How the photographs are taken."""
+    """Camera, board and poses of a set of photographs."""
 
     board: CircleGrid
-    lens: tuple[float, ...] = LENS  # fx, fy, cx, cy and distortion numbers
+    lens: tuple[float, ...] = LENS  # fx, fy, cx, cy and distortion coefficients
     fisheye: bool = False
     views: int = 15
     blur_px: float = 0.7
     noise_dn: float = 2.0
     tilt_rad: float = 0.6
     fill: tuple[float, float] = (0.35, 0.7)  # the board's longer side over the picture's width
-    diameter_m: float | None = None  # as printed; None: as the board says
+    diameter_m: float | None = None  # as printed; None: that of the board
     size_px: tuple[int, int] = SIZE
 
 
 @dataclass(frozen=True)
 class Shot:
-    """A picture of a board and where it was."""
+    """A picture of a board with its true pose."""
 
     image: NDArray[np.uint8]
     rotation: Array
     translation: Array
     centres: Array  # (P, 2), px: images of the circles' centres
-    radii_px: Array  # (P,), about
+    radii_px: Array  # (P,), approximate
 
 
 def shots(scene: CircleScene, seed: int) -> list[Shot]:
-    """Pictures in which the whole board is seen."""
+    """Pictures that contain the whole board."""
     rng = np.random.default_rng(seed)
     points, size = scene.board.points, np.array(scene.size_px)
     out: list[Shot] = []
@@ -108,7 +111,7 @@ def _shot(scene: CircleScene, R: Array, t: Array, around: Array, rng: np.random.
 
 
 def _ink(scene: CircleScene, R: Array, t: Array, centre: Array, first: Array, last: Array) -> Array:
-    """Share (h, w) of each pixel that a circle covers: rays at the pixels' corners, straight lines between them."""
+    """Share (h, w) of each pixel covered by a circle, with rays interpolated linearly between the pixels' corners."""
     u, v = np.meshgrid(np.arange(first[0], last[0] + 2) - 0.5, np.arange(first[1], last[1] + 2) - 0.5)
     pixels = np.stack([u.ravel(), v.ravel()], axis=1)
     K, d = _matrix(scene)
@@ -119,7 +122,7 @@ def _ink(scene: CircleScene, R: Array, t: Array, centre: Array, first: Array, la
     eye = -R.T @ t
     xy = (eye[:2] - eye[2] / rays[:, 2:] * rays[:, :2]).reshape(*u.shape, 2) - centre
     covered = np.zeros((u.shape[0] - 1, u.shape[1] - 1))
-    # A sample at the edge counts as far as its own small square is covered: hard samples shift blobs by 4e-3 px.
+    # Samples on the edge count partially: binary samples would shift blobs by 4e-3 px.
     along, down = xy[:-1, 1:] - xy[:-1, :-1], xy[1:, :-1] - xy[:-1, :-1]
     steps = (np.arange(_SAMPLES) + 0.5) / _SAMPLES
     for a in steps:
@@ -136,15 +139,15 @@ def _ink(scene: CircleScene, R: Array, t: Array, centre: Array, first: Array, la
 def table_of(scene: CircleScene, seed: int, searched: bool = False) -> CornerTable:
     """Blobs as detected in the pictures.
 
-    searched: by the whole search for the board; else by its measurement alone, at about the true places, which is much
-    faster and ends in the same numbers.
+    searched: detect the board; otherwise the ellipses are fitted near their true positions, which is much faster and
+    gives the same values.
     """
     board = scene.board
     views, areas = [], []
     for shot in shots(scene, seed):
         if searched:
             view = find_board(shot.image, board)
-            if not isinstance(view, BoardView):  # as a person would leave out a picture
+            if not isinstance(view, BoardView):  # a user would drop the picture
                 continue
             assert view.areas_px2 is not None
             ids, pixels, area = view.ids, view.pixels, view.areas_px2

@@ -1,4 +1,4 @@
-"""Boards that are not as stated: solved for where the photographs show it, and named."""
+"""Boards that differ from the stated ones: the deviation is estimated and reported."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ FIVE = IntrinsicsOptions(lens=LensModel(5), folds=2)
 
 
 def stated(table: CornerTable, points: np.ndarray) -> CornerTable:
-    """The same photographs, the board said to be another one."""
+    """The same photographs with another stated board."""
     return replace(table, board_points=points, middle=(points.min(axis=0) + points.max(axis=0)) / 2)
 
 
-def misses(c) -> np.ndarray:
+def errors_in_sigmas(c) -> np.ndarray:
     return np.abs((c.fit.lens[:9] - np.array(TRUTH)) / c.sigmas)
 
 
-def test_a_board_printed_longer_along_x_is_named_and_does_not_bend_the_lens():
+def test_a_board_printed_longer_along_x_is_reported_and_does_not_bias_the_lens():
     table = photographs(Scene(views=12), 22)
     wrong = stated(table, table.board_points / [1.005, 1, 1])
     c = calibrate_intrinsics(wrong, FIVE)
@@ -33,9 +33,9 @@ def test_a_board_printed_longer_along_x_is_named_and_does_not_bend_the_lens():
     assert c.board.stretch is not None
     assert c.board.stretch.corrected
     assert abs(c.board.stretch.stretch - 0.005) < 4 * c.board.stretch.sigma[0]
-    assert np.all(misses(c) < 3.5)
+    assert np.all(errors_in_sigmas(c) < 3.5)
     assert c.verdict < Level.FAIL
-    about = next(f for f in c.findings if "longer than was said" in f.what)
+    about = next(f for f in c.findings if "longer than stated" in f.what)
     assert about.level is Level.WARN
     assert "Measure the board" in about.remedy
     taken_as_stated = calibrate_intrinsics(wrong, replace(FIVE, stretch=False))
@@ -52,12 +52,12 @@ def test_a_true_board_is_taken_as_stated():
 
 
 @pytest.mark.slow
-def test_points_printed_out_of_place_are_solved_for():
+def test_displaced_points_are_solved_for():
     table = photographs(Scene(), 23)
     off = np.random.default_rng(3).normal(0, 3e-4, table.board_points.shape) * [1, 1, 0]
     c = calibrate_intrinsics(stated(table, table.board_points + off), IntrinsicsOptions(lens=LensModel(5)))
     assert c.board is not None
     assert c.board.points.corrected
     assert c.board.points.rms_m == pytest.approx(3e-4 * np.sqrt(2), rel=0.25)
-    assert np.all(misses(c) < 3.5)
+    assert np.all(errors_in_sigmas(c) < 3.5)
     assert c.fit.sigma_px == pytest.approx(0.2, rel=0.1)

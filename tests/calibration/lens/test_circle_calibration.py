@@ -1,4 +1,4 @@
-"""Cameras from grids of circles: the blobs' centroids are not the images of the circles' centres, and that is known."""
+"""Calibration from grids of circles, whose centroids are not the images of the circles' centres."""
 
 from __future__ import annotations
 
@@ -32,45 +32,45 @@ def nees(c: Intrinsics) -> float:
     return float(off @ np.linalg.solve(c.covariance, off)) / len(off)
 
 
-def test_a_lens_from_circles_errs_by_its_sigmas_and_the_circles_are_measured():
+def test_lens_and_circle_size_are_estimated_within_their_sigmas():
     c = calibrate_intrinsics(pictures(), QUICK)
-    assert nees(c) < 2.9  # of nine numbers: one set in 500 lies beyond
+    assert nees(c) < 2.9  # of nine parameters: exceeded with probability 1/500
     assert 2 * c.fit.radius_m == pytest.approx(SCENE.board.diameter_m, rel=0.005)
     assert 0 < c.fit.radius_sigma_m < 0.006 * c.fit.radius_m
     assert c.fit.sigma_px < 0.01
 
 
-def test_circles_taken_for_points_would_bias_the_lens_far_beyond_its_sigmas():
+def test_circles_treated_as_points_would_bias_the_lens_far_beyond_its_sigmas():
     c = calibrate_intrinsics(replace(pictures(), circles=None), QUICK)
-    assert nees(c) > 8  # though the scatter between photographs has raised the sigmas
+    assert nees(c) > 8  # although scatter between photographs has inflated the sigmas
 
 
-def test_a_size_that_nothing_tells_is_solved_for():
+def test_an_unknown_circle_size_is_estimated():
     c = calibrate_intrinsics(replace(pictures(), circles=CircleAreas()), QUICK)
     assert nees(c) < 2.9
     assert abs(2 * c.fit.radius_m - SCENE.board.diameter_m) < 4 * 2 * c.fit.radius_sigma_m
-    assert c.fit.radius_sigma_m > 0.005 * c.fit.radius_m  # less is known than with areas
+    assert c.fit.radius_sigma_m > 0.005 * c.fit.radius_m  # less precise than with areas
 
 
 @pytest.mark.slow
-def test_a_stated_size_that_the_pictures_contradict_is_named_and_not_used():
+def test_a_stated_size_that_the_pictures_contradict_is_reported_and_not_used():
     areas = pictures().circles
     assert areas is not None
     c = calibrate_intrinsics(replace(pictures(), circles=replace(areas, diameter_m=0.012)), QUICK)
     assert nees(c) < 2.9
-    about = next(f for f in c.findings if f.what.startswith("The circles measure"))
+    about = next(f for f in c.findings if f.what.startswith("The circles have a diameter"))
     assert about.level is Level.WARN
     assert "against the 12 mm stated" in about.what
 
 
 @pytest.mark.slow
-def test_a_stated_size_serves_where_areas_are_not_known():
+def test_a_stated_size_is_used_if_areas_are_unknown():
     c = calibrate_intrinsics(replace(pictures(), circles=CircleAreas(None, SCENE.board.diameter_m)), QUICK)
     assert nees(c) < 2.9
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("text", ["acircles:4x11:20mm", "circles:9x7:25mm"])
-def test_claims_of_circle_calibrations_are_honest(text):
+def test_the_covariance_of_circle_calibrations_is_correct(text):
     found = [nees(calibrate_intrinsics(table_of(CircleScene(parse(text)), seed), QUICK)) for seed in range(50, 58)]
-    assert 0.6 < np.mean(found) < 1.5  # 72 numbers: one mean in 1000 lies beyond
+    assert 0.6 < np.mean(found) < 1.5  # 72 numbers: exceeded with probability 1/1000

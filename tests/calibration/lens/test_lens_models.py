@@ -1,4 +1,4 @@
-"""The ladder's choice, lenses that fold, and what errors of a lens do over the picture."""
+"""Model selection, lenses that fold, and the effect of lens errors over the picture."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from calibration.lens.fit.hold_out import HeldOut, folds_of
-from calibration.lens.fit.lens_fit import AS_STATED, robust_fit
+from calibration.lens.fit.lens_fit import robust_fit
 from calibration.lens.fit.lens_models import LADDER, LensModel, folds_in_picture, named
+from calibration.lens.fit.lens_parameters import AS_STATED
 from calibration.lens.fit.lens_start import start
 from calibration.lens.fit.model_selection import ModelCandidate, choose
 from calibration.lens.fit.projection_map import difference, projection_map
@@ -22,30 +23,30 @@ def lens_of(numbers: tuple[float, ...]) -> Array:
     return np.array([*numbers, *[0.0] * (18 - len(numbers))])
 
 
-def rung(title: str, errors_px2: list[float], refused: str = "") -> ModelCandidate:
+def candidate(title: str, errors_px2: list[float], refused: str = "") -> ModelCandidate:
     errors = np.array(errors_px2)
     return ModelCandidate(named(title), None, HeldOut(errors, (), float(np.sqrt(errors.mean()))), refused=refused)
 
 
-def test_the_smaller_model_is_taken_where_the_larger_one_gains_within_its_standard_error():
-    ladder = choose([rung("4", [1.0, 1.2, 0.9, 1.1]), rung("5", [0.9, 1.25, 0.92, 1.1])])
+def test_the_smaller_model_is_chosen_if_the_gain_is_within_its_standard_error():
+    ladder = choose([candidate("4", [1.0, 1.2, 0.9, 1.1]), candidate("5", [0.9, 1.25, 0.92, 1.1])])
     assert ladder.chosen.model.title == "4"
     assert "within one standard error" in ladder.why
 
 
-def test_a_small_gain_in_every_view_counts_as_a_gain():
-    """Pairs tell: the views differ by far more than the two models do."""
-    ladder = choose([rung("4", [1.0, 5.2, 0.3, 9.1]), rung("5", [0.9, 5.1, 0.2, 9.0])])
+def test_a_small_gain_in_every_view_is_significant():
+    """The comparison is paired: views differ much more than the two models do."""
+    ladder = choose([candidate("4", [1.0, 5.2, 0.3, 9.1]), candidate("5", [0.9, 5.1, 0.2, 9.0])])
     assert ladder.chosen.model.title == "5"
     assert "every smaller usable model errs more" in ladder.why
 
 
-def test_a_refused_model_is_never_chosen_however_well_it_predicts():
-    ladder = choose([rung("4", [1.0, 1.2, 0.9]), rung("8", [0.1, 0.1, 0.1], refused="it folds")])
+def test_a_refused_model_is_never_chosen():
+    ladder = choose([candidate("4", [1.0, 1.2, 0.9]), candidate("8", [0.1, 0.1, 0.1], refused="it folds")])
     assert ladder.chosen.model.title == "4"
 
 
-def test_folds_deal_out_every_view_once():
+def test_every_view_is_in_exactly_one_fold():
     for count in (5, 10, 23):
         views = np.arange(count) * 2
         folds = folds_of(views)
@@ -53,27 +54,27 @@ def test_folds_deal_out_every_view_once():
         assert len(folds) == (count if count <= 10 else 5)
 
 
-def test_a_lens_that_shrinks_again_before_the_corner_folds_in_the_picture():
+def test_a_radial_mapping_that_decreases_before_the_corner_folds_in_the_picture():
     assert not folds_in_picture(lens_of(TRUTH), False, SIZE)
     assert folds_in_picture(lens_of((1000.0, 1000, 640, 512, -0.8)), False, SIZE)
     assert not folds_in_picture(lens_of(WIDE), True, SIZE)
     assert folds_in_picture(lens_of((500.0, 500, 640, 512, -0.3)), True, SIZE)
 
 
-def test_only_the_numbers_of_the_model_stay():
+def test_only_the_coefficients_of_the_model_are_kept():
     everything = np.arange(1.0, 19.0)
     assert np.count_nonzero(LensModel(4).cut(everything)) == 8
     assert [int(m.free.sum()) for m in LADDER] == [4, 8, 9, 8, 12, 16]
 
 
-def test_a_turn_of_the_camera_makes_no_difference_on_the_map():
-    """Pixels move alike when the principal point moves and when the camera turns, near the middle of a long lens."""
+def test_the_map_excludes_rotations_of_the_camera():
+    """Near the centre of a long lens, a shift of the principal point has the effect of a rotation of the camera."""
     model, lens = LensModel(0), lens_of((20000.0, 20000, 640, 512))
     at = projection_map(model, lens, SIZE, 1.0)
     by_cx, by_fx = at.by_parameter[..., 2], at.by_parameter[..., 0]
     assert np.abs(by_cx).max() < 0.002  # of the 1 px that cx moves every pixel
-    assert np.abs(by_fx).max() > 0.03  # no turn does what a focal length does
-    # The turn that undoes it, done: pixels of turned rays with the other lens are the old ones.
+    assert np.abs(by_fx).max() > 0.03  # a change of focal length is not a rotation
+    # This rotation compensates for a shift of cx by 1 px.
     turn = exp(np.array([0.0, -1.0 / 20000, 0.0]))
     assert (turn @ [0, 0, 1])[0] * 20000 + 641 == pytest.approx(640, abs=1e-6)
 
@@ -85,10 +86,10 @@ def test_sigmas_on_the_screen_are_those_in_the_picture_times_the_distance_over_t
     np.testing.assert_allclose(at.sigma_mm(C), at.sigma_px(C) * 2.5, rtol=1e-9)
 
 
-def test_the_map_foretells_how_far_pixels_scatter_between_calibrations():
-    """Independent sets of photographs: the pixels of one direction, best turn taken out, against the map's sigmas."""
+def test_the_map_predicts_the_scatter_of_pixels_between_calibrations():
+    """Pixel differences of independent calibrations, after the best rotation, against the sigmas of the map."""
     fits = []
-    for seed in range(8):
+    for seed in range(6):
         table = photographs(Scene(views=8), 50 + seed)
         _, values = start(table, False)
         fits.append(robust_fit(table, LensModel(4), values, AS_STATED))

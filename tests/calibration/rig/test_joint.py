@@ -1,4 +1,4 @@
-"""The joint adjustment of a whole rig, against simulated campaigns whose truth is known."""
+"""Joint adjustment of a whole rig, against simulated campaigns with known truth."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ def calibrated_from(c: Campaign, **changed):
     return calibrate_in_steps(calibrate(network, setups), c.spots, replace(stand, **changed))
 
 
-def words(of):
+def findings_of(of):
     positions = [str(k) for k in range(len(of.measured.stand.stand_from_body.translation))]
     return joint_findings(of, positions, expected_pose(of.joint, central_pose(of.joint), 0.05), None)
 
 
-def test_measurements_without_noise_lead_back_to_the_rig_that_made_them():
+def test_noise_free_measurements_give_the_true_rig():
     exact = Quality(
         positions=12, dots=(4, 3), survey_m=3e-8, dot_px=1e-5, stand_m=1e-9, stand_deg=1e-7, spot_px=1e-5,
         lens_corner_px=1e-5,
@@ -53,25 +53,25 @@ def test_measurements_without_noise_lead_back_to_the_rig_that_made_them():
     rng = np.random.default_rng(0)
     poses = Pose.from_ypr(rng.uniform(-0.2, 0.2, (4, 3)), rng.uniform(-0.1, 0.1, (4, 3)))
     errors, _, _ = measured_with(joint.rig, joint.covariance, c.truth, poses, 1e-5, rng)
-    # A hundred-thousandth of a pixel is 2e-9 rad; the rig was mounted 0.3 deg and millimetres off its drawing.
+    # 1e-5 px is 2e-9 rad; the rig differs by 0.3 deg and millimetres from its drawing.
     assert np.abs(errors[:, 3:]).max() < np.deg2rad(1e-5)
     assert np.abs(errors[:, :3]).max() < 1e-6
 
 
-def test_the_errors_of_all_numbers_together_are_as_large_as_their_joint_covariance_says():
+def test_parameter_errors_agree_with_the_joint_covariance():
     _, nees = parameter_errors(steps().joint, campaign().truth)
     # 36 or so numbers: sigma of a mean of squares is sqrt(2 / 36) = 0.24.
     assert 0.3 < nees < 1.8
 
 
-def test_it_knows_all_that_the_single_steps_knew_and_more():
+def test_the_joint_adjustment_is_at_least_as_accurate_as_the_single_steps():
     joint, alone = steps().joint, steps().beams
     at = joint.unknowns.of_several([("beams", i) for i in range(3)])
     now, before = joint.all_covariance[np.ix_(at, at)], alone.lines_covariance
     assert np.trace(now[:2, :2]) <= 1.05 * np.trace(before[:2, :2])
 
 
-def test_wrong_spots_and_dots_are_left_out_and_move_nothing():
+def test_outliers_of_spots_and_dots_are_excluded_and_do_not_change_the_result():
     c = campaign()
     rng = np.random.default_rng(5)
     spots, dots = c.spots.pixels.copy(), c.seen_pixels.copy()
@@ -86,43 +86,43 @@ def test_wrong_spots_and_dots_are_left_out_and_move_nothing():
     rows = good.unknowns.of_several(good.rig_at)
     sigma = np.sqrt(np.diagonal(good.all_covariance)[rows])
     real = sigma > 3e-6
-    # Four of some eighty spots and two of forty dots are gone, and with them what they knew.
+    # Four of some eighty spots and two of forty dots are excluded.
     assert np.sqrt(np.mean((moved[real] / sigma[real]) ** 2)) < 0.5
 
 
-def test_a_stand_that_is_ten_times_less_exact_than_told_is_found_out_and_named():
-    q = replace(SMALL, positions=20, stand_m=3e-4, stand_deg=0.03)
+def test_a_stand_ten_times_less_accurate_than_stated_is_detected():
+    q = replace(SMALL, positions=12, dots=(4, 3), stand_m=3e-4, stand_deg=0.03)
     c = draw_campaign(2, "fan", q)
     network, setups, stand = as_measured(c)
     found = calibrate_in_steps(calibrate(network, setups), c.spots, replace(stand, pose_sigmas=stand.pose_sigmas / 10))
     assert 4 < found.joint.scales[RECORDS] < 20
     assert SPOTS not in found.joint.scales
-    (told,) = [f for f in words(found) if f.what.startswith(RECORDS) and "sigmas" in f.what]
-    assert told.level >= Level.WARN
-    assert "stand" in told.remedy
-    # With the sigmas widened the result is honest again.
+    (finding,) = [f for f in findings_of(found) if f.what.startswith(RECORDS) and "sigmas" in f.what]
+    assert finding.level >= Level.WARN
+    assert "stand" in finding.remedy
+    # With the increased sigmas the covariance is correct.
     _, nees = parameter_errors(found.joint, c.truth)
     assert nees < 2
 
 
-def test_a_lens_that_was_refocused_since_its_calibration_is_named():
+def test_a_lens_refocused_since_its_calibration_is_detected():
     c = campaign()
     left = c.lenses["left"]
     matrix = left.camera.matrix + np.diag([9.0, 9.0, 0.0])  # 20 sigmas and more
     found = calibrated(
         replace(c, lenses={**c.lenses, "left": replace(left, camera=replace(left.camera, matrix=matrix))})
     )
-    (told,) = [f for f in words(found) if f.what.startswith(LENSES)]
-    assert told.level >= Level.WARN
-    assert "refocused" in told.why
+    (finding,) = [f for f in findings_of(found) if f.what.startswith(LENSES)]
+    assert finding.level >= Level.WARN
+    assert "refocused" in finding.why
 
 
-def test_right_measurements_pass_and_kinds_fit():
+def test_correct_measurements_pass():
     assert steps().joint.scales == {}
-    assert all(f.level == Level.PASS for f in words(steps()) if "held out" not in f.what)
+    assert all(f.level == Level.PASS for f in findings_of(steps()) if "held out" not in f.what)
 
 
-def test_the_expected_covariance_splits_into_noise_and_what_each_kind_of_measurement_makes():
+def test_the_expected_covariance_is_the_sum_of_noise_and_the_shares_of_each_kind():
     joint = steps().joint
     e = expected_pose(joint, central_pose(joint), spot_sigma(joint))
     np.testing.assert_allclose(e.noise + e.systematic, e.total, rtol=1e-6, atol=1e-14)
@@ -130,7 +130,7 @@ def test_the_expected_covariance_splits_into_noise_and_what_each_kind_of_measure
     assert np.trace(e.shares[FRAMES]) < 1e-9 * np.trace(e.systematic)
 
 
-def test_held_out_positions_are_predicted_as_well_as_the_covariance_promises():
+def test_errors_of_held_out_positions_agree_with_the_covariance():
     h = hold_out(steps().measured, steps().joint)
     assert sorted(h.positions) == list(range(15))
     assert 0.8 < h.ratio < 1.2
@@ -138,19 +138,19 @@ def test_held_out_positions_are_predicted_as_well_as_the_covariance_promises():
 
 
 @pytest.mark.slow
-def test_a_hold_out_sees_spots_that_move_from_position_to_position_beyond_their_sigmas():
+def test_a_hold_out_detects_spots_that_move_between_positions_beyond_their_sigmas():
     c = campaign()
     rng = np.random.default_rng(8)
-    # All spots of a position go together, as when the vehicle rocks on its carriage: 0.5 px in one direction.
+    # All spots of a position move together by 0.5 px, as if the vehicle rocked on its carriage.
     rock = rng.normal(0, 0.5, (15, 2))[c.spots.position]
     rocking = calibrated(replace(c, spots=replace(c.spots, pixels=c.spots.pixels + rock)))
-    # Their own scatter tells it in the joint fit: sigmas of the spots or of the stand are widened by much.
+    # In the joint adjustment the sigmas of the spots or of the stand are increased strongly.
     assert max(rocking.joint.scales.values()) > 3
-    told = hold_out(rocking.measured, rocking.joint)
-    assert told.attitude_rms > 3 * hold_out(steps().measured, steps().joint).attitude_rms
+    held_out = hold_out(rocking.measured, rocking.joint)
+    assert held_out.attitude_rms > 3 * hold_out(steps().measured, steps().joint).attitude_rms
 
 
-def test_a_stand_that_only_turns_about_one_axis_is_refused_with_the_motions_that_stay_open():
+def test_a_stand_that_rotates_about_one_axis_only_raises_with_the_remedy():
     c = campaign()
     about_z = np.zeros((15, 3))
     about_z[:, 0] = np.linspace(-0.4, 0.4, 15)
@@ -160,7 +160,7 @@ def test_a_stand_that_only_turns_about_one_axis_is_refused_with_the_motions_that
         calibrated(replace(c, spots=spots, stand_recorded=flat))
 
 
-def test_a_calibration_without_some_positions_keeps_its_outliers_and_sigmas():
+def test_a_calibration_without_some_positions_keeps_outliers_and_sigmas():
     measured, joint = steps().measured, steps().joint
     without = measured.spots.position < 3
     part = calibrate_jointly(measured, without=without, start=joint)
@@ -170,7 +170,7 @@ def test_a_calibration_without_some_positions_keeps_its_outliers_and_sigmas():
 
 
 def boards_before(c: Campaign, sigma_px=0.08):
-    """Corners of a board that was held before the left camera at four places."""
+    """Corners of a board before the left camera at four positions."""
     camera = c.truth.cameras["left"]
     x, y = np.meshgrid(np.arange(7) * 0.1, np.arange(5) * 0.1)
     board = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=-1)
@@ -188,7 +188,7 @@ def boards_before(c: Campaign, sigma_px=0.08):
     )  # fmt: skip
 
 
-def test_boards_that_were_photographed_too_take_part_and_make_the_lens_better_known():
+def test_photographed_boards_improve_the_lens():
     c = campaign()
     network, setups, stand = as_measured(c)
     with_boards = replace(network, corners=boards_before(c), placements=("1", "2", "3", "4"))
@@ -204,13 +204,13 @@ def test_boards_that_were_photographed_too_take_part_and_make_the_lens_better_kn
 
 
 @pytest.mark.slow
-def test_forty_campaigns_attitude_within_a_hundredth_of_a_degree_and_covariances_honest():
+def test_forty_campaigns_have_attitudes_within_a_hundredth_of_a_degree_and_correct_covariances():
     figures = bench_figures(range(40))
     assert figures["attitude_worst_axis_rms_deg"] <= 0.01
     assert figures["position_worst_axis_rms_mm"] <= 0.5
-    # 40 campaigns of 6 numbers, poses of one campaign nearly alike: sigma of the mean is sqrt(2 / 6 / 40) = 0.09.
+    # 40 campaigns of 6 numbers, with correlated poses in each campaign: sigma of the mean is sqrt(2 / 6 / 40) = 0.09.
     assert 0.85 <= figures["nees_per_number"] <= 1.15
-    # As if the calibration were exact the same errors are far outside.
+    # With an assumed exact calibration the errors exceed the covariance.
     assert figures["nees_noise_alone"] > 1.4
     assert 62 <= figures["coverage_percent"] <= 75
     assert 0.85 <= figures["joint_nees_per_number"] <= 1.15

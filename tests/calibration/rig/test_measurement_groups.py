@@ -1,4 +1,4 @@
-"""Kinds of measurement: how well each fits, and whose errors make a result's."""
+"""Consistency of each kind of measurement, and its share in the covariance of a result."""
 
 from __future__ import annotations
 
@@ -39,27 +39,27 @@ def adjusted(rng, counts=(30, 12), truth=(1.0, -2.0, 0.5), sigmas=(1.0, 1.0)):
     return terms, found, unknowns, C
 
 
-def test_redundancies_of_all_kinds_add_up_to_the_numbers_less_the_unknowns():
+def test_redundancies_of_all_kinds_sum_to_residuals_minus_unknowns():
     terms, found, unknowns, C = adjusted(np.random.default_rng(1))
     fits = [group_fit("", *information([t], found.values, unknowns), C) for t in terms]
     assert sum(f.redundancy for f in fits) == pytest.approx(42 - 3)
     assert sum(f.chi2 for f in fits) == pytest.approx(found.chi2)
 
 
-def test_the_test_of_a_kind_is_fair_where_sigmas_are_right_and_sees_where_they_are_not():
+def test_p_values_are_uniform_for_correct_sigmas_and_small_for_wrong_ones():
     rng = np.random.default_rng(2)
     right, wrong = [], []
-    for _ in range(120):
+    for _ in range(60):
         terms, found, unknowns, C = adjusted(rng)
         right.append(group_fit("", *information([terms[1]], found.values, unknowns), C).p)
         terms, found, unknowns, C = adjusted(rng, sigmas=(1.0, 2.5))
         wrong.append(group_fit("", *information([terms[1]], found.values, unknowns), C).p)
-    # Uniform: the share below 0.1 is 0.1 give or take sqrt(0.09 / 120) = 0.027.
-    assert 0.03 < np.mean(np.array(right) < 0.1) < 0.18
+    # Uniform: the share below 0.1 is 0.1 with a sigma of sqrt(0.09 / 60) = 0.039.
+    assert 0.02 < np.mean(np.array(right) < 0.1) < 0.2
     assert np.mean(np.array(wrong) < 0.1) > 0.9
 
 
-def test_the_chance_of_a_misfit_follows_from_the_residuals_own_covariance():
+def test_the_p_value_follows_from_the_covariance_of_the_residuals():
     terms, found, unknowns, C = adjusted(np.random.default_rng(4), counts=(4, 5))
     fit = group_fit("", *information([terms[1]], found.values, unknowns), C)
     Q = np.eye(5) - terms[1].A @ C @ terms[1].A.T
@@ -68,7 +68,7 @@ def test_the_chance_of_a_misfit_follows_from_the_residuals_own_covariance():
     assert fit.p == pytest.approx(chi2.sf(2 * mean / variance * fit.chi2, 2 * mean**2 / variance))
 
 
-def test_what_is_measured_just_once_has_no_redundancy_and_no_verdict():
+def test_parameters_measured_once_have_no_redundancy_and_no_p_value():
     once = Lines(np.eye(3), np.array([5.0, 6.0, 7.0]))
     found = solve({"x": Vectors(np.zeros((1, 3)))}, [once], {"x": True})
     unknowns = Unknowns.of(found.values, {"x": True})
@@ -78,7 +78,7 @@ def test_what_is_measured_just_once_has_no_redundancy_and_no_verdict():
     assert np.isnan(fit.scale)
 
 
-def test_shares_are_what_each_kinds_noise_does_to_the_result():
+def test_shares_agree_with_the_simulated_effect_of_noise():
     rng = np.random.default_rng(3)
     terms, found, unknowns, C = adjusted(rng)
     effect = np.array([[1.0, 2.0, -1.0]])

@@ -1,4 +1,4 @@
-"""Measured networks of cameras and screens with their truth."""
+"""Simulated networks of cameras and screens with known truth."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def lab(bow=0.0):
 
 
 def measured(seed=0, bow=0.0, dots=12, rig=None):
-    """Dots on each screen, surveyed and seen, with noise."""
+    """Dots on each screen, surveyed and observed with noise."""
     rng = np.random.default_rng(seed)
     rig = lab(bow) if rig is None else rig
     names, places, on = [], [], []
@@ -78,7 +78,7 @@ def measured(seed=0, bow=0.0, dots=12, rig=None):
 
 
 def corners_of(rig, boards, sigma_px=0.1, seed=0):
-    """Corners of boards (world_from_board by placement) that the cameras see whole."""
+    """Corners of boards (world_from_board by placement) in the pictures that contain the whole board."""
     rng = np.random.default_rng(seed)
     rows = {"pixels": [], "points": [], "camera": [], "placement": []}
     for p, world_from_board in enumerate(boards):
@@ -102,7 +102,7 @@ def corners_of(rig, boards, sigma_px=0.1, seed=0):
 
 
 def fixed_to(screens, placements, offset_m=0.003):
-    """Boards fixed to screens, of that thickness."""
+    """Boards of thickness offset_m fixed to screens."""
     n = len(screens)
     return BoardOnScreenTerm(
         np.array(screens),
@@ -120,7 +120,7 @@ def lying_on(screen, x, y, offset_m=0.003):
 
 
 def without_dots(network):
-    """The same with nothing surveyed."""
+    """The network without a survey."""
     none = np.empty(0, dtype=np.int64)
     return replace(
         network,

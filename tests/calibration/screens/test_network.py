@@ -1,4 +1,4 @@
-"""Networks of cameras and screens against truth: values, covariances, mixed-up dots, boards, wrong surveys."""
+"""Network adjustments against truth: values, covariances, exchanged dots, boards, wrong surveys."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import pytest
 
 from calibration.findings import Level
 from calibration.screens.network import Dots, PointObservations
-from calibration.screens.network_findings import findings, misplaced, near_findings
+from calibration.screens.network_findings import classify_outliers, findings, near_findings
 from calibration.screens.network_sigmas import pointing_sigmas_m, spot_sigmas
 from calibration.screens.network_start import NotConnectedError
 from calibration.screens.screens import Near, ScreenSetup, calibrate
-from calibration.screens.survey_suspects import misfit_of, suspects, wrong_unit
+from calibration.screens.survey_diagnosis import misfit_of, suspects, wrong_unit
 from geometry.pose import Pose
 from geometry.rig import Rig
 from tests.calibration.screens.networks import (
@@ -43,11 +43,11 @@ def camera_errors(fit, truth):
 
 
 def plane_errors(fit, truth, name):
-    """Height at the found origin and tilts about x, y of a screen's found plane, with their covariance (3, 3)."""
+    """Errors of a screen's plane: height at its origin and tilts about x, y, with their covariance (3, 3)."""
     found, true = fit.rig.screens[name].world_from_screen, truth.screens[name].world_from_screen
     normal = true.rotation[:, 2] * np.sign(true.rotation[:, 2] @ found.rotation[:, 2])
     height = (found.translation - true.translation) @ normal
-    tilt = found.rotation.T @ normal  # in the found frame: (theta_y, -theta_x, 1) of the turn that is missing
+    tilt = found.rotation.T @ normal  # in the found frame: (theta_y, -theta_x, 1) of the remaining rotation
     T = np.zeros((3, 6))
     T[0, :3] = found.rotation[:, 2]
     T[1, 3] = T[2, 4] = 1.0
@@ -70,9 +70,9 @@ def scores(seeds):
     return np.array(cameras), np.array(planes), np.array(nees_c), np.array(nees_p)
 
 
-def test_cameras_and_screens_come_out_within_their_sigmas():
+def test_cameras_and_screens_are_estimated_within_their_sigmas():
     cameras, planes, nees_c, nees_p = scores(range(12))
-    # 144 and 72 numbers: a share of 68 % within one sigma has a sigma of 6 %, errors of a seed being tied.
+    # 144 and 72 numbers: a share of 68 % within one sigma has a sigma of 6 %, as errors of a seed are correlated.
     assert 0.5 < np.mean(cameras < 1) < 0.86
     assert 0.5 < np.mean(planes < 1) < 0.86
     assert 0.55 < np.mean(nees_c) < 1.6
@@ -90,7 +90,7 @@ def test_coverage_and_normalised_errors_over_200_networks():
     assert abs(np.mean(nees_p) - 1) < 2 * np.sqrt(2 / 3 / 400)
 
 
-def test_the_surface_and_the_place_are_better_known_than_a_single_dot():
+def test_surfaces_and_cameras_are_known_more_accurately_than_a_single_dot():
     result = calibrate(measured(0), PLAIN)
     assert max(np.max(spot_sigmas(result, k)) for k in range(2)) < 3e-4
     assert max(pointing_sigmas_m(result).values()) < 3e-4
@@ -98,50 +98,50 @@ def test_the_surface_and_the_place_are_better_known_than_a_single_dot():
     assert result.fit.variance_factor == 1.0
 
 
-def test_swapped_names_are_found_and_named_and_do_not_shift_the_camera():
+def test_exchanged_names_are_identified_and_do_not_bias_the_camera():
     network = measured(1)
     of = network.sightings.dot_of.copy()
     of[[2, 5]] = of[[5, 2]]
     result = calibrate(replace(network, sightings=replace(network.sightings, dot_of=of)), PLAIN)
     words = [f.what for f in findings(result) if f.level == Level.WARN]
     assert len(words) == 1
-    assert "camera 'left': dots 'L6' and 'L3' are swapped" in words[0]
+    assert "camera 'left': dots 'L6' and 'L3' are exchanged" in words[0]
     clean = calibrate(network, PLAIN)
     sigmas = np.sqrt(np.diagonal(block(clean.fit, "cameras.left", "cameras.right")))
-    # Two dots of twelve less: the result moves, by what those two told.
+    # Without two dots of twelve the result changes slightly.
     assert np.all(np.abs(camera_errors(result.fit, clean.fit.rig)) < 2 * sigmas)
 
 
-def test_a_dot_named_as_another_one_is_told_whose_place_it_has():
+def test_a_dot_with_the_name_of_another_one_is_identified():
     network = measured(1)
     pixels = network.sightings.pixels.copy()
     pixels[3] = pixels[7] + 0.1
     result = calibrate(replace(network, sightings=replace(network.sightings, pixels=pixels)), PLAIN)
-    (wrong,) = misplaced(result.network, result.fit)
-    assert (wrong.dot, wrong.instead, wrong.swapped) == ("L4", "L8", False)
+    (wrong,) = classify_outliers(result.network, result.fit)
+    assert (wrong.dot, wrong.at_place_of, wrong.swapped) == ("L4", "L8", False)
 
 
-def test_a_wrong_point_of_light_is_left_out_and_its_distance_told_in_millimetres():
+def test_a_wrong_point_of_light_is_excluded_and_its_error_given_in_metres():
     network = measured(1)
     pixels = network.sightings.pixels.copy()
     pixels[3] += [25.0, 5.0]
     result = calibrate(replace(network, sightings=replace(network.sightings, pixels=pixels)), PLAIN)
-    (wrong,) = misplaced(result.network, result.fit)
+    (wrong,) = classify_outliers(result.network, result.fit)
     assert wrong.dot == "L4"
-    assert wrong.instead == ""
-    assert wrong.away_px == pytest.approx(np.hypot(25, 5), abs=1.0)
-    assert 0.05 < np.linalg.norm(wrong.away_m) < 0.3  # 25 px at 4.4 m and 1180 px: 95 mm, more where seen obliquely
+    assert wrong.at_place_of == ""
+    assert wrong.error_px == pytest.approx(np.hypot(25, 5), abs=1.0)
+    assert 0.05 < np.linalg.norm(wrong.error_m) < 0.3  # 25 px at 4.4 m and 1180 px: 95 mm, more at oblique view
 
 
-def test_a_dot_surveyed_off_its_screen_is_named_with_its_distance():
+def test_a_dot_surveyed_off_its_screen_is_reported_with_its_height():
     network = measured(1)
     xyz = network.dots.xyz.copy()
     xyz[3, 0] += 0.02
     result = calibrate(replace(network, dots=replace(network.dots, xyz=xyz)), PLAIN)
-    assert any("dot 'L4' lies +20" in f.what for f in findings(result))
+    assert any("dot 'L4' is +20" in f.what for f in findings(result))
 
 
-def test_sigmas_that_are_too_small_are_noticed_and_widened():
+def test_sigmas_that_are_too_small_are_increased():
     network = measured(2)
     rng = np.random.default_rng(0)
     pixels = network.sightings.pixels + 0.6 * rng.normal(size=network.sightings.pixels.shape)
@@ -149,10 +149,10 @@ def test_sigmas_that_are_too_small_are_noticed_and_widened():
     rough = replace(rough, dots=replace(rough.dots, covariance=rough.dots.covariance / 9))
     result = calibrate(rough, PLAIN)
     assert result.fit.variance_factor > 2
-    assert any(f.level >= Level.WARN and "worse than their sigmas" in f.what for f in findings(result))
+    assert any(f.level >= Level.WARN and "larger than their sigmas" in f.what for f in findings(result))
 
 
-def test_a_board_carried_before_two_cameras_ties_one_without_dots_to_the_world():
+def test_a_board_seen_by_two_cameras_connects_one_without_dots_to_the_world():
     rig = lab()
     extra = replace(rig.cameras["left"], name="extra", camera_from_world=look_at((1.2, -0.6, 1.2), (-2.5, 0.0, 0.0)))
     whole = Rig(rig.screens, {**rig.cameras, "extra": extra}, {}, {})
@@ -177,13 +177,13 @@ def test_a_board_carried_before_two_cameras_ties_one_without_dots_to_the_world()
     assert np.linalg.norm(centre) < 0.01
 
 
-def test_cameras_that_share_nothing_are_named():
+def test_unconnected_cameras_are_reported():
     network = measured(3)
     some = network.sightings.camera_of == 0
     s = network.sightings
     lone = PointObservations(s.camera_of[some], s.dot_of[some], s.pixels[some], s.sigma_px[some])
     with pytest.raises(
-        NotConnectedError, match=r"camera 'right' shares nothing with the others \('left' have a place\)"
+        NotConnectedError, match=r"camera 'right' is not connected with the others \('left' have a pose\)"
     ):
         calibrate(replace(network, sightings=lone), PLAIN)
 
@@ -209,7 +209,7 @@ def test_a_board_fixed_to_the_screen_gives_its_plane_without_a_survey():
     assert "cameras.left.x_m" in result.fit.covariance.names
 
 
-def test_a_screen_that_nothing_was_measured_of_is_named():
+def test_a_screen_without_measurements_is_reported():
     network = measured(0)
     off = replace(network, dots=replace(network.dots, screen_of=np.where(network.dots.screen_of == 1, -1, 0)))
     with pytest.raises(NotConnectedError, match="screen 'right': expected three or more surveyed dots"):
@@ -225,17 +225,17 @@ def near_truth(error=0.1):
 @pytest.mark.parametrize(
     ("spoil", "words"),
     [
-        (lambda xyz: xyz[:, [0, 2, 1]], "the survey with its columns y and z swapped"),
+        (lambda xyz: xyz[:, [0, 2, 1]], "the survey with its columns y and z exchanged"),
         pytest.param(
             lambda xyz: 1000 * xyz,
             "the survey times 0.001 (metres were expected and millimetres written)",
             marks=pytest.mark.slow,
         ),
-        pytest.param(lambda xyz: xyz * [1, -1, 1], "the survey with the sign of y turned", marks=pytest.mark.slow),
+        pytest.param(lambda xyz: xyz * [1, -1, 1], "the survey with the sign of y reversed", marks=pytest.mark.slow),
     ],
 )
-def test_where_cameras_stand_tells_which_axes_were_swapped_and_which_unit_was_meant(spoil, words):
-    network = measured(1, dots=6)
+def test_approximate_camera_positions_reveal_exchanged_axes_and_wrong_units(spoil, words):
+    network = measured(1, dots=5)
     spoilt = replace(network, dots=replace(network.dots, xyz=spoil(network.dots.xyz)))
     result = calibrate(spoilt, PLAIN, near_truth())
     assert any(f.level == Level.FAIL for f in near_findings(result, near_truth()))
@@ -244,19 +244,19 @@ def test_where_cameras_stand_tells_which_axes_were_swapped_and_which_unit_was_me
     assert found[0].factor < 2 < found[1].factor
 
 
-def test_a_survey_that_is_right_makes_nobody_suspicious():
+def test_a_correct_survey_passes():
     result = calibrate(measured(1), PLAIN, near_truth())
     assert misfit_of(result, near_truth()) < 1.5
     assert all(f.level == Level.PASS for f in near_findings(result, near_truth()))
 
 
 @pytest.mark.parametrize(("extent", "words"), [(2900.0, "millimetres"), (114.0, "inches"), (9.5, "feet"), (2.6, "")])
-def test_a_size_tells_the_unit(extent, words):
+def test_a_size_reveals_the_unit(extent, words):
     assert words in wrong_unit(extent, 2.9)
     assert bool(wrong_unit(extent, 2.9)) == bool(words)
 
 
-def test_dots_on_one_line_give_no_camera():
+def test_collinear_dots_give_no_camera_pose():
     network = measured(0)
     t = np.linspace(-1, 1, len(network.dots))
     line = np.stack([np.full_like(t, -2.5), t, 0.3 * t], axis=1)

@@ -1,4 +1,4 @@
-"""Two real cameras tied by a board that was carried before them: OpenCV's stereo sample."""
+"""Two real cameras connected by a board that both see: OpenCV's stereo sample."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
-from calibration.boards.board_detection import BoardView, find_board
+from calibration.boards.board_detection import find_board
 from calibration.boards.board_types import Chessboard
+from calibration.boards.board_view import BoardView
 from calibration.screens.network import Dots, Network, PointObservations
 from calibration.screens.screens import ScreenSetup, calibrate
 from calibration.terms.board_on_screen import BoardOnScreenTerm
@@ -21,16 +22,16 @@ from tests.paths import DATA
 
 DATA = DATA / "chessboard_stereo_opencv"
 BOARD = Chessboard(9, 6, 0.025)
-# intrinsics.yml of the set: a joint stereo result of a flat board, px. It comes without a sigma; the set's other file,
-# of the same photographs, tells an error of 0.393 px per corner, so corners that are so many times worse than ours.
+# intrinsics.yml of the set: a joint stereo result for a flat board, px, without a sigma. Another file of the set, for
+# the same photographs, gives an error of 0.393 px per corner, from which the sigma is derived.
 PUBLISHED_FX, PUBLISHED_ERROR = 534.80, 0.393
 
-pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason="the stereo photographs are not at hand")
+pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason="the stereo photographs are not available")
 
 
 @pytest.fixture(scope="module")
 def stereo():
-    """The network (its first board gives the world) and OpenCV's own distance of the cameras, m."""
+    """The network (its first board defines the world) and OpenCV's distance of the cameras, m."""
     found = {
         side: [find_board(cv2.imread(str(DATA / f"{side}{n:02d}.jpg"), 0), BOARD) for n in range(1, 8)]
         for side in ("left", "right")
@@ -102,7 +103,7 @@ def figures(fit):
     )
 
 
-def test_with_a_flat_board_the_cameras_are_as_opencv_publishes_them(stereo):
+def test_with_a_flat_board_the_cameras_agree_with_the_published_ones(stereo):
     network, opencv_m = stereo
     fit = calibrate(replace(network, warp_sigma_m=0.0), [ScreenSetup()], held_screen=0).fit
     distance, sigma, fx, sigma_fx = figures(fit)
@@ -110,12 +111,12 @@ def test_with_a_flat_board_the_cameras_are_as_opencv_publishes_them(stereo):
     assert per_corner < 0.22
     published_sigma = sigma_fx * PUBLISHED_ERROR / per_corner
     assert abs(fx - PUBLISHED_FX) < 2 * np.hypot(sigma_fx, published_sigma)
-    assert np.hypot(sigma_fx, published_sigma) < 2.0  # or the test would say nothing
+    assert np.hypot(sigma_fx, published_sigma) < 2.0  # otherwise the test is not significant
     assert abs(distance - opencv_m) < 2 * sigma
     assert sigma < 1e-3
 
 
-def test_the_printed_board_was_bent_more_than_chance_would_have_it(stereo):
+def test_the_printed_board_is_significantly_bent(stereo):
     network, _ = stereo
     flat = calibrate(replace(network, warp_sigma_m=0.0), [ScreenSetup()], held_screen=0).fit
     bent = calibrate(network, [ScreenSetup()], held_screen=0).fit

@@ -1,4 +1,4 @@
-"""One screen at a time: its frame, how flat it is, wrong dots, scans, targets."""
+"""Single screens: frame, flatness, outliers, scans and targets."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from calibration.screens import clouds
-from calibration.screens.flatness import fit_surface, judge_flatness
-from calibration.screens.places import places
+from calibration.screens.flatness import assess_flatness, fit_surface
 from calibration.screens.registration import register
+from calibration.screens.resection import resect
 from calibration.screens.screen_frame import frame_of_dots, frame_of_extent
-from calibration.screens.screens import ScreenSetup, facing, laid_on, pose_covariance, screen_of_dots
+from calibration.screens.screens import ScreenSetup, facing, moved_to_surface, pose_covariance, screen_of_dots
 from geometry.arrays import numeric_jacobian
 from geometry.pose import Pose
 from geometry.rotations import exp
@@ -27,16 +27,16 @@ SIGMA = 3e-4
 
 
 def dots(rng, n, bow=(0.0, 0.0, 0.0)):
-    """Points of a 4 m x 3 m screen, in a frame a little off it, and the sigma of each."""
+    """Points of a 4 m x 3 m screen, in a slightly tilted frame, and the sigma of each."""
     x, y = rng.uniform(-2, 2, n), rng.uniform(-1.5, 1.5, n)
     z = 0.002 + 0.01 * x - 0.02 * y + bow[0] * x * x + bow[1] * x * y + bow[2] * y * y
     return np.column_stack([x, y, z + SIGMA * rng.normal(size=n)]), np.full(n, SIGMA)
 
 
-def test_a_flat_screen_is_seldom_called_bent_and_its_plane_is_as_good_as_claimed():
+def test_a_flat_screen_is_rarely_bent_and_its_covariance_is_correct():
     bent, squares = 0, []
     for seed in range(150):
-        flatness = judge_flatness(*dots(np.random.default_rng(seed), 12))
+        flatness = assess_flatness(*dots(np.random.default_rng(seed), 12))
         bent += flatness.chosen.bent
         e = flatness.chosen.coefficients[:3] - [0.002, 0.01, -0.02]
         squares.append(e @ np.linalg.solve(flatness.chosen.covariance[:3, :3], e) / 3)
@@ -44,40 +44,40 @@ def test_a_flat_screen_is_seldom_called_bent_and_its_plane_is_as_good_as_claimed
     assert abs(np.mean(squares) - 1) < 4 * np.sqrt(2 / 3 / 150)
 
 
-def test_a_bow_of_four_millimetres_is_found_as_large_as_it_is():
-    found = [judge_flatness(*dots(np.random.default_rng(s), 12, (1e-3, 0, 0))).chosen for s in range(40)]
+def test_a_bow_of_four_millimetres_is_estimated_within_its_sigma():
+    found = [assess_flatness(*dots(np.random.default_rng(s), 12, (1e-3, 0, 0))).chosen for s in range(40)]
     assert np.mean([f.bent for f in found]) > 0.9
     off = [(f.coefficients[3] - 1e-3) / np.sqrt(f.covariance[3, 3]) for f in found if f.bent]
     assert np.sqrt(np.mean(np.square(off))) < 1.5
 
 
-def test_a_rough_screen_gets_the_scatter_that_it_has():
+def test_the_scatter_of_a_rough_screen_is_estimated():
     rng = np.random.default_rng(1)
     xyz, sigma = dots(rng, 60)
     xyz[:, 2] += 2e-3 * rng.normal(size=60)
-    chosen = judge_flatness(xyz, sigma).chosen
+    chosen = assess_flatness(xyz, sigma).chosen
     assert chosen.scatter_m == pytest.approx(2e-3, rel=0.3)
     assert chosen.used.all()
 
 
 @pytest.mark.parametrize("n", [6, 9, 14])
-def test_one_dot_thirty_millimetres_off_is_the_one_left_out(n):
+def test_a_dot_thirty_millimetres_off_is_excluded(n):
     right = 0
     for seed in range(30):
         xyz, sigma = dots(np.random.default_rng(seed), n)
         xyz[2, 2] += 0.03
-        right += np.array_equal(np.flatnonzero(~judge_flatness(xyz, sigma).chosen.used), [2])
+        right += np.array_equal(np.flatnonzero(~assess_flatness(xyz, sigma).chosen.used), [2])
     assert right >= 26
 
 
-def test_two_dots_on_a_line_through_a_third_determine_no_plane():
+def test_three_collinear_dots_determine_no_plane():
     with pytest.raises(ValueError, match="do not determine a plane"):
         fit_surface(np.array([[0.0, 0, 0], [1, 1, 0], [2, 2, 0]]), np.full(3, SIGMA), bent=False)
 
 
 @settings(max_examples=30)
 @given(seed=st.integers(0, 10**6))
-def test_a_frame_lies_in_the_plane_faces_the_eye_and_has_its_origin_in_the_middle(seed):
+def test_a_frame_is_in_the_plane_faces_the_camera_and_has_its_origin_at_the_centre(seed):
     rng = np.random.default_rng(seed)
     world_from_screen = Pose(exp(rng.normal(size=3)), rng.normal(size=3))
     flat = np.column_stack([rng.uniform(-2, 2, (9, 2)), np.zeros(9)])
@@ -90,7 +90,7 @@ def test_a_frame_lies_in_the_plane_faces_the_eye_and_has_its_origin_in_the_middl
     assert np.linalg.det(frame.rotation) == pytest.approx(1)
 
 
-def test_named_dots_fix_the_frame():
+def test_named_dots_define_the_frame():
     world_from_screen = Pose(exp(np.array([0.3, -0.2, 0.5])), np.array([1.0, 2, 3]))
     flat = np.array([[0.4, -0.3, 0], [2.4, -0.3, 0], [0.5, 0.7, 0], [2.4, 0.7, 0]])
     p = world_from_screen.apply(flat)
@@ -102,35 +102,35 @@ def test_named_dots_fix_the_frame():
 
 
 def test_the_covariance_of_a_frame_is_that_of_its_surface():
-    surface = judge_flatness(*dots(np.random.default_rng(5), 30, (2e-3, 0, 0)), bow="always").chosen
+    surface = assess_flatness(*dots(np.random.default_rng(5), 30, (2e-3, 0, 0)), bow="always").chosen
     frame = Pose(exp(np.array([0.3, -0.2, 0.5])), np.array([1.0, 2, 3]))
 
     def error(delta):
-        """Of the frame laid on a surface whose coefficients change by a small delta."""
+        """Error of the frame of a surface whose coefficients change by a small delta."""
         h, p, q = delta[:3]
         return np.concatenate([frame.rotation[:, 2] * h, [q, -p, 0.0], delta[3:]])
 
     J = numeric_jacobian(error, np.zeros(6))
     expected = J @ surface.covariance @ J.T
     got = pose_covariance(frame, surface)
-    np.testing.assert_allclose(got, expected, atol=2e-12)  # a micrometre and a microradian are held by definition
-    # And laid_on moves a frame as this error does.
-    moved = laid_on(frame, surface)
+    np.testing.assert_allclose(got, expected, atol=2e-12)  # the gauge has sigmas of a micrometre and a microradian
+    # moved_to_surface moves a frame in the same way.
+    moved = moved_to_surface(frame, surface)
     np.testing.assert_allclose(moved.minus(frame)[:6], error(surface.coefficients)[:6], atol=1e-12)
     lifted = frame.apply(np.array([0.0, 0.0, surface.coefficients[0]]))
     np.testing.assert_allclose(moved.translation, lifted)
 
 
-def test_the_laid_frame_has_the_surface_s_slope():
+def test_a_frame_moved_to_its_surface_has_no_remaining_slope():
     rng = np.random.default_rng(2)
     xyz, sigma = dots(rng, 200)
-    frame = laid_on(Pose.identity(), judge_flatness(xyz, sigma).chosen)
-    again = judge_flatness(frame.inverse().apply(xyz), sigma).chosen
+    frame = moved_to_surface(Pose.identity(), assess_flatness(xyz, sigma).chosen)
+    again = assess_flatness(frame.inverse().apply(xyz), sigma).chosen
     np.testing.assert_allclose(again.coefficients[:3], 0, atol=2e-5)  # of second order in a slope of 0.02
 
 
-@pytest.mark.parametrize(("count", "words"), [(2, "2 surveyed dots, expected 3 or more"), (12, "lie on one line")])
-def test_dots_that_tell_no_plane_are_refused(count, words):
+@pytest.mark.parametrize(("count", "words"), [(2, "2 surveyed dots, expected 3 or more"), (12, "are collinear")])
+def test_dots_that_determine_no_plane_raise(count, words):
     t = np.linspace(-1, 1, count)
     line = np.stack([np.full(count, -2.5), t, 0.2 * t], axis=1)
     plain = measured(0)
@@ -139,21 +139,21 @@ def test_dots_that_tell_no_plane_are_refused(count, words):
         screen_of_dots(replace(plain, dots=dots), np.arange(count), ScreenSetup(), None, "left")
 
 
-def test_a_camera_s_place_is_found_with_a_third_of_the_names_wrong():
+def test_resection_tolerates_a_third_of_wrong_names():
     network, rig = measured(4), lab()
     mine = network.sightings.camera_of == 0
     points, pixels = network.dots.xyz[network.sightings.dot_of[mine]], network.sightings.pixels[mine]
     mixed = pixels[[1, 2, 0, 4, 3, *range(5, 12)]]
-    found = places(rig.cameras["left"], points, mixed, 8.0)[0]
-    np.testing.assert_array_equal(np.flatnonzero(~found.fits), range(5))
-    away = found.camera_from_world.inverse().translation - rig.cameras["left"].camera_from_world.inverse().translation
-    assert np.linalg.norm(away) < 0.05
+    found = resect(rig.cameras["left"], points, mixed, 8.0)[0]
+    np.testing.assert_array_equal(np.flatnonzero(~found.inliers), range(5))
+    offset = found.camera_from_world.inverse().translation - rig.cameras["left"].camera_from_world.inverse().translation
+    assert np.linalg.norm(offset) < 0.05
 
 
-def test_a_small_plane_seen_from_afar_leaves_two_places():
+def test_a_small_plane_at_a_distance_allows_two_poses():
     rig = lab()
     points = np.array([[-2.5, y, z] for y in (-0.1, 0.1) for z in (-0.1, 0.1)])
-    found = places(rig.cameras["left"], points, rig.cameras["left"].project(points) + 0.2, 8.0)
+    found = resect(rig.cameras["left"], points, rig.cameras["left"].project(points) + 0.2, 8.0)
     assert len(found) == 2
 
 
@@ -161,7 +161,7 @@ def test_a_small_plane_seen_from_afar_leaves_two_places():
 
 
 def scan_points(seed=0, bow=0.0, sigma=1e-3, n=12_000):
-    """A 4 m x 3 m screen before a wall, with clutter; its true pose."""
+    """The true pose of a 4 m x 3 m screen before a wall, and a point cloud with clutter."""
     rng = np.random.default_rng(seed)
     turn = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
     pose = Pose(turn @ exp(0.05 * rng.normal(size=3)), np.array([-2.5, 0.1, 0.2]))
@@ -176,7 +176,7 @@ def scan_points(seed=0, bow=0.0, sigma=1e-3, n=12_000):
 
 @needs_open3d
 @pytest.mark.parametrize("bow", [0.0, 1e-3])
-def test_a_scanned_screen_is_found_before_a_larger_wall_by_its_size(bow):
+def test_a_scanned_screen_before_a_larger_wall_is_found_by_its_size(bow):
     pose, points = scan_points(1, bow)
     scan = clouds.scan_of(points, (4.0, 3.0), seen_from=np.zeros(3))
     found, n = scan.world_from_screen, pose.rotation[:, 2]
@@ -185,11 +185,11 @@ def test_a_scanned_screen_is_found_before_a_larger_wall_by_its_size(bow):
     assert scan.flatness.chosen.bent == (bow > 0)
     assert scan.flatness.chosen.coefficients[3] == pytest.approx(bow, abs=1e-4)
     np.testing.assert_allclose(scan.size_m, (4, 3), rtol=0.04)
-    assert 1e-4 < np.sqrt(scan.covariance[0, 0]) < 1e-3  # what the whole scan shares does not average out
+    assert 1e-4 < np.sqrt(scan.covariance[0, 0]) < 1e-3  # errors common to the whole scan do not average out
 
 
 @needs_open3d
-def test_without_a_size_the_plane_with_most_points_is_taken_and_a_size_that_fits_none_is_refused():
+def test_without_a_size_the_largest_plane_is_used_and_a_size_that_fits_none_raises():
     pose, points = scan_points(2)
     scan = clouds.scan_of(points)
     assert (scan.world_from_screen.translation - pose.translation) @ pose.rotation[:, 2] == pytest.approx(
@@ -199,12 +199,12 @@ def test_without_a_size_the_plane_with_most_points_is_taken_and_a_size_that_fits
         clouds.scan_of(points, (9.0, 2.0))
 
 
-def test_a_cloud_of_few_points_is_refused():
+def test_a_cloud_of_few_points_raises():
     with pytest.raises(ValueError, match="50 points, expected 200"):
         clouds.scan_of(np.zeros((50, 3)))
 
 
-def test_without_open3d_the_message_says_how_to_get_it(monkeypatch):
+def test_without_open3d_the_message_describes_its_installation(monkeypatch):
     monkeypatch.setitem(sys.modules, "open3d", None)
     with pytest.raises(clouds.MissingOpen3DError, match=r"make pointcloud.*pip install 'beampose\[pointcloud\]'"):
         clouds.planes(np.random.default_rng(0).normal(size=(300, 3)))
@@ -235,7 +235,7 @@ def targets(seed=0, n=6):
     return pose, world, pose.inverse().apply(world), [f"T{i}" for i in range(n)]
 
 
-def test_targets_put_a_scan_into_the_world_within_the_claimed_covariance():
+def test_the_covariance_of_a_registration_is_correct():
     squares = []
     for seed in range(60):
         pose, world, cloud, names = targets(seed)
@@ -244,7 +244,7 @@ def test_targets_put_a_scan_into_the_world_within_the_claimed_covariance():
         found = register(names, cloud + 2e-3 * rng.normal(size=(6, 3)), world + 1e-3 * rng.normal(size=(6, 3)), C, 2e-3)
         e = found.world_from_cloud.minus(pose)
         squares.append(e @ np.linalg.solve(found.covariance, e) / 6)
-    assert 0.7 < np.mean(squares) < 1.2  # the widening by the misfit makes it a little cautious
+    assert 0.7 < np.mean(squares) < 1.2  # scaling by the residuals makes it slightly conservative
 
 
 @pytest.mark.parametrize(
@@ -257,7 +257,7 @@ def test_targets_put_a_scan_into_the_world_within_the_claimed_covariance():
         (lambda c: np.outer(np.arange(6.0), [1, 2, 3]), "one line"),
     ],
 )
-def test_targets_that_cannot_be_right_are_refused(spoil, words):
+def test_invalid_targets_raise(spoil, words):
     _, world, cloud, names = targets()
     spoilt = spoil(cloud)
     n = len(spoilt)

@@ -171,7 +171,7 @@ def test_without_poses_only_the_shape_is_found_and_that_is_said(campaign, tmp_pa
     assert outcome.level == Level.WARN
     assert "3 beams from 40 positions of which nothing is known, angles between beams to" in outcome.line()
     words = " ".join(f.what for f in outcome.findings)
-    assert "6 numbers stay undetermined, the place (3) and the attitude (3) of the body frame" in words
+    assert "6 parameters remain undetermined, the position (3) and the attitude (3) of the body frame" in words
     angles = table(tmp_path / "out" / "angles.csv")
     assert float(angles[0]["angle_deg"]) == pytest.approx(18.0, abs=0.01)
     assert "laid so that the beams found are" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
@@ -188,7 +188,7 @@ def test_a_stand_that_only_yaws_fails_with_the_cure_and_writes_no_rig(tmp_path):
     outcome = calibrate_beams(project, tmp_path / "out")
     assert (outcome.level, outcome.exit_status, outcome.rig) == (Level.FAIL, 3, None)
     (bad,) = [f for f in outcome.findings if f.level == Level.FAIL]
-    assert "all beams against the stand: a turn about z" in bad.what
+    assert "all beams relative to the stand: a rotation about z" in bad.what
     assert bad.remedy.startswith("add positions turned by 10 deg or more about the stand's x and y")
     assert not (tmp_path / "out" / "rig.yaml").exists()
     assert {b["sigma_direction_arcsec"] for b in table(tmp_path / "out" / "beams.csv")} == {""}
@@ -224,7 +224,7 @@ def test_a_wrong_stand_record_is_named(campaign, tmp_path):
     lines[8] = ",".join(fields)
     (tmp_path / "poses.csv").write_text("\n".join(lines) + "\n")
     outcome = calibrate_beams(project, tmp_path / "out")
-    assert any(f.what == "most spots of position 7 were left out" for f in outcome.findings)
+    assert any(f.what == "most spots of position 7 were excluded" for f in outcome.findings)
     file = load_rig_file(tmp_path / "out" / "rig.yaml")
     assert np.abs(errors(rig, file.rig)[:, :2]).max() < 40 * ARCSEC
 
@@ -238,7 +238,7 @@ def test_beams_that_are_swapped_against_the_drawing_are_told(campaign, tmp_path)
     )
     (tmp_path / "spots.csv").write_text(swapped)
     outcome = calibrate_beams(project, tmp_path / "out")
-    assert any("check which laser is A and which B" in f.remedy for f in outcome.findings)
+    assert any("check which laser is A and which is B" in f.remedy for f in outcome.findings)
 
 
 @pytest.mark.parametrize(

@@ -10,8 +10,9 @@ import cv2
 import numpy as np
 import pytest
 
-from calibration.boards.board_detection import BoardView, find_board
+from calibration.boards.board_detection import find_board
 from calibration.boards.board_types import parse
+from calibration.boards.board_view import BoardView
 from lab.calibrate.board.board import write_board
 from lab.calibrate.board.board_page import as_pdf, lay_out
 from lab.errors import InputError

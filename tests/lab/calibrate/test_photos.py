@@ -8,8 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
-from calibration.boards.board_detection import NO_CLOSE_LOOK, find_board
+from calibration.boards.board_detection import find_board
 from calibration.boards.board_types import parse
+from calibration.boards.board_view import NO_CLOSE_LOOK
 from geometry.camera import Camera
 from geometry.pose import Pose
 from lab.calibrate.camera import photos as photos_module

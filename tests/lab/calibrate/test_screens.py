@@ -197,7 +197,7 @@ def test_swapped_axes_are_named_where_the_cameras_places_are_known(tmp_path):
     for name, place in places.items():
         changed(path, **{f"cameras__{name}__near_m": [float(v) for v in place]})
     rewritten(tmp_path / "p" / "survey.csv", lambda r: {**r, "y_m": r["z_m"], "z_m": r["y_m"]})
-    with pytest.raises(InputError, match=r"survey.csv: does not fit .* with its columns y and z swapped does"):
+    with pytest.raises(InputError, match=r"survey.csv: does not fit .* with its columns y and z exchanged does"):
         calibrate_screen(path, tmp_path / "out")
 
 

@@ -125,7 +125,8 @@ def test_every_example_rig_can_be_calibrated_by_its_campaign(rig):
 
 @pytest.mark.slow
 def test_board_photographs_show_the_board_that_the_folder_names(tmp_path, monkeypatch):
-    from calibration.boards.board_detection import NotFound, find_board
+    from calibration.boards.board_detection import find_board
+    from calibration.boards.board_view import NotFound
     from lab.files.rig.board_file import load_board
     from lab.pictures.picture_file import read_picture
     from lab.simulate import campaign_files

@@ -1,8 +1,8 @@
-"""Surveys with swapped axes or a wrong unit: found by what makes everything fit.
+"""Diagnosis of surveys with exchanged axes or a wrong unit, by trying changes to the survey.
 
-Pixels alone cannot tell everything. Dots of ONE plane look the same mirrored, from its other side; the scale of a
-survey shows only against boards, a screen's size or a camera's place by tape measure. And all mirrored surveys are the
-same one turned: which axes were swapped shows only where something else knows the world.
+Pixels alone do not determine everything. Coplanar dots look like their mirror image from the other side; the scale of a
+survey is determined only by boards, a screen's size or a camera's approximate position. All mirrored surveys differ by
+a rotation only: which axes were exchanged is determined only if the world is known otherwise.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ UNITS: Mapping[float, str] = {
     0.3048: "metres were expected and feet written",
     1e3: "the numbers were divided by 1000 too often (kilometres, or metres taken for millimetres)",
 }
-_UNIT_MATCH = 0.2  # how near a ratio of sizes must come to a unit's
+_UNIT_MATCH = 0.2  # tolerance of the logarithm of a ratio of sizes
 
 
 def wrong_unit(extent_m: float, expected_m: float) -> str:
-    """Which unit explains that something is so large and not as expected; empty where none does."""
+    """The wrong unit that explains an extent other than the expected one; empty if there is none."""
     ratio = expected_m / extent_m
     for factor, words in UNITS.items():
         if abs(np.log(ratio / factor)) < _UNIT_MATCH:
@@ -40,10 +40,10 @@ def wrong_unit(extent_m: float, expected_m: float) -> str:
 
 @dataclass(frozen=True, slots=True)
 class SurveySuspect:
-    """A change to the survey that makes everything fit."""
+    """A change to the survey that makes the measurements consistent."""
 
-    words: str  # what was done to the survey to mend it
-    factor: float  # by which the measurements then miss their sigmas
+    words: str  # the correction of the survey
+    factor: float  # residuals over their sigmas after the correction
 
 
 def suspects(
@@ -53,21 +53,21 @@ def suspects(
     held_screen: int | None,
     current: float,
 ) -> list[SurveySuspect]:
-    """Changes to the survey with which everything fits much better than with the survey as it is, the best first.
+    """Changes with which the measurements fit much better than with the survey as it is, the best first.
 
-    current: by how much the measurements miss their sigmas now (inf where nothing was found at all).
+    current: present misfit (inf if there is no solution).
     """
     out = []
     for words, change in _changes(network):
         trial = replace(network, dots=replace(network.dots, xyz=change(network.dots.xyz)))
-        miss = misfit(trial, setups, near, held_screen)
-        if miss < 0.3 * current:
-            out.append(SurveySuspect(words, miss))
+        misfit_now = misfit(trial, setups, near, held_screen)
+        if misfit_now < 0.3 * current:
+            out.append(SurveySuspect(words, misfit_now))
     return sorted(out, key=lambda s: s.factor)
 
 
 def misfit(network: Network, setups: Sequence[ScreenSetup], near: Mapping[int, Near], held_screen: int | None) -> float:
-    """How badly a network fits together: sigmas, outliers, distances from where cameras stand; inf for not at all."""
+    """Misfit of a network: residuals over sigmas, outliers and distances from approximate positions; inf on failure."""
     try:
         result = calibrate(network, setups, near, held_screen)
     except (AdjustmentError, NotConnectedError, ValueError):
@@ -76,7 +76,7 @@ def misfit(network: Network, setups: Sequence[ScreenSetup], near: Mapping[int, N
 
 
 def misfit_of(result: ScreensResult, near: Mapping[int, Near]) -> float:
-    """The same of a result."""
+    """Misfit of a result, as in `misfit`."""
     out = float(np.sqrt(result.fit.variance_factor))
     if len(result.fit.used):
         out += 20.0 * float(np.mean(~result.fit.used))
@@ -87,7 +87,7 @@ def misfit_of(result: ScreensResult, near: Mapping[int, Near]) -> float:
 
 
 def _changes(network: Network) -> list[tuple[str, Callable[[Array], Array]]]:
-    """Ways in which a survey's columns get mixed up, of the whole survey and of the dots of one screen."""
+    """Common mistakes in a survey's columns, for the whole survey and for the dots of one screen."""
     axes = "xyz"
     out: list[tuple[str, Callable[[Array], Array]]] = []
     screens = list(network.rig.screens)
@@ -103,11 +103,11 @@ def _changes(network: Network) -> list[tuple[str, Callable[[Array], Array]]]:
             words = f"{whose} with its columns in the order {', '.join(axes[o] for o in order)}"
             if sum(a == b for a, b in enumerate(order)) == 1:
                 i, j = (k for k, o in enumerate(order) if k != o)
-                words = f"{whose} with its columns {axes[i]} and {axes[j]} swapped"
+                words = f"{whose} with its columns {axes[i]} and {axes[j]} exchanged"
             out.append((words, _changed(some, np.eye(3)[list(order)])))
         for k in range(3):
             turned = np.diag(np.where(np.arange(3) == k, -1.0, 1.0))
-            out.append((f"{whose} with the sign of {axes[k]} turned", _changed(some, turned)))
+            out.append((f"{whose} with the sign of {axes[k]} reversed", _changed(some, turned)))
         for factor, unit in UNITS.items():
             out.append((f"{whose} times {factor:g} ({unit})", _changed(some, factor * np.eye(3))))
     return out

@@ -1,72 +1,91 @@
-"""A rig's sight and error budget over a grid of poses: the numbers that a plan's tables and page are made from."""
+"""Visibility of spots and error budget of a rig over a grid of poses."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 
 from calibration.budget.pose_budget import Budget, PoseBudget, RigErrors, along, worst_direction
 from geometry.arrays import Array, Bools, Ints
 from geometry.forward_model import SpotModel
+from geometry.pose import Pose
 from geometry.pose_solver.gauss_newton import SolveLimits
 from geometry.rig import Rig
 from geometry.rotations import ypr_jacobian
 from geometry.uncertainty.rig_parameters import Sensitivity
-from lab.plan.plan_options import PlanOptions, poses_of
 
 NOISE = "noise"
 MEASURED, VAGUE, NOT_OBSERVABLE = "measured", "vague", "not observable"
-_POSES_AT_ONCE = 1000  # bounds the memory: 1000 poses of 6 views and 60 parameters are 6 MB, of 40 and 300 200 MB
+_POSES_AT_ONCE = 1000  # limits the memory: 6 MB for 6 views and 60 parameters, 200 MB for 40 and 300
 AXES = ("x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg")
 
 
+class GridOptions(Protocol):
+    """The grid of poses and the noise of a spot."""
+
+    @property
+    def sigma_px(self) -> float:
+        """Sigma of a spot's coordinates."""
+
+    @property
+    def edge_px(self) -> float:
+        """Distance from the edge of the picture below which a spot is not visible."""
+
+    def coordinates(self) -> Array:
+        """The grid (k, 6): x, y, z (m), yaw, pitch, roll (deg)."""
+
+
+Options = TypeVar("Options", bound=GridOptions)
+
+
 @dataclass(frozen=True, slots=True)
-class Plan:
+class GridPlan(Generic[Options]):
     """k poses of a grid, n views, c contributors (noise, then groups of calibration errors), q errors of the rig.
 
     Sigmas are along `AXES`: m, deg. nan where a pose is not observable.
     """
 
     rig: Rig
-    options: PlanOptions
-    errors: RigErrors  # that were planned with
+    options: Options
+    errors: RigErrors
     sources: Mapping[str, str]  # of each group: `rig file` or `assumed`
     views: tuple[tuple[str, str], ...]  # (n,) camera, spot
     contributors: tuple[str, ...]  # (c,)
     coordinates: Array  # (k, 6) x, y, z (m), yaw, pitch, roll (deg)
     status: Ints  # (k,) index into STATUS
     seen: Bools  # (k, n)
-    margin_px: Array  # (k, n) distance to the picture's edge, negative outside; nan without projection
-    closest_px: Array  # (k,) between two seen spots of one camera; inf where no camera sees two
+    margin_px: Array  # (k, n) distance to the edge of the picture, negative outside; nan without projection
+    closest_px: Array  # (k,) smallest distance of two visible spots of one camera; inf if no camera sees two
     condition: Array  # (k,)
-    sigma: Array  # (k, 6) of everything together
+    sigma: Array  # (k, 6) total
     parts: Array  # (k, c, 6) from each contributor alone
     worst: Array  # (k, 2) largest sigma of any direction: position (m), attitude (deg)
     worst_axis: Array  # (k, 2, 3) its direction: in world, and in body
-    worst_parts: Array  # (k, c, 2) variances along that direction, m^2 and deg^2; their sum lacks what joins groups
+    worst_parts: Array  # (k, c, 2) variances along it, m^2 and deg^2; covariance between groups is not in their sum
     effect_median: Array  # (q, 6) of one sigma of each error, over the observable poses
     effect_largest: Array  # (q, 6)
-    thing_median: Array  # (t, 6) of all errors of one group that one thing has, over the observable poses
+    thing_median: Array  # (t, 6) of all errors of one camera, screen or beam in one group, over observable poses
     thing_largest: Array  # (t, 6)
 
     @property
     def observable(self) -> Bools:
-        """(k,) whether the pose can be solved at all."""
+        """(k,) whether the pose is observable."""
         return np.asarray(self.status != STATUS.index(NOT_OBSERVABLE))
 
     @property
     def measured(self) -> Bools:
-        """(k,) whether the program would call it measured."""
+        """(k,) whether a run would report the pose as measured."""
         return np.asarray(self.status == STATUS.index(MEASURED))
 
 
 STATUS = (MEASURED, VAGUE, NOT_OBSERVABLE)
 
 
-def plan_grid(rig: Rig, errors: RigErrors, sources: Mapping[str, str], options: PlanOptions) -> Plan:
-    """Everything about every pose of the options' grid."""
+def plan_grid(rig: Rig, errors: RigErrors, sources: Mapping[str, str], options: Options) -> GridPlan[Options]:
+    """Visibility and error budget at every pose of the grid."""
     model = SpotModel.of(rig)
     budget = PoseBudget(model, Sensitivity(rig, model, errors.names), errors, options.sigma_px, options.edge_px)
     coordinates = options.coordinates()
@@ -74,7 +93,7 @@ def plan_grid(rig: Rig, errors: RigErrors, sources: Mapping[str, str], options: 
     columns = {name: np.concatenate([c[name] for c in chunks]) for name in chunks[0]}
     effects, things = columns.pop("effects"), columns.pop("things")
     solved = columns["status"] != STATUS.index(NOT_OBSERVABLE)
-    return Plan(
+    return GridPlan(
         rig=rig,
         options=options,
         errors=errors,
@@ -90,13 +109,18 @@ def plan_grid(rig: Rig, errors: RigErrors, sources: Mapping[str, str], options: 
     )
 
 
+def poses_of(coordinates: Array) -> Pose:
+    """world_from_body (k,) of coordinates (k, 6): x, y, z (m), yaw, pitch, roll (deg)."""
+    return Pose.from_ypr(np.deg2rad(coordinates[:, 3:]), coordinates[:, :3])
+
+
 def _chunks(coordinates: Array) -> Iterator[Array]:
     for start in range(0, len(coordinates), _POSES_AT_ONCE):
         yield coordinates[start : start + _POSES_AT_ONCE]
 
 
 def _of_chunk(model: SpotModel, b: Budget, coordinates: Array) -> dict[str, Array]:
-    """The columns of a plan for some of its poses, and effects (k, 6, q) and things (k, t, 6), in half the memory."""
+    """The columns of a plan for some of its poses, with effects (k, 6, q) and things (k, t, 6) in single precision."""
     # From [dt, dtheta] to x, y, z (m), yaw, pitch, roll (deg), and for directions to m and deg.
     turn = np.rad2deg(ypr_jacobian(poses_of(coordinates).rotation))
     to_axes = np.zeros((len(coordinates), 6, 6))
@@ -130,7 +154,7 @@ def _of_chunk(model: SpotModel, b: Budget, coordinates: Array) -> dict[str, Arra
 
 
 def _over_poses(of: Callable[..., Array], values: Array) -> Array:
-    """The median or the largest over the first axis; nan where there is no pose."""
+    """The median or the maximum over the first axis; nan if there is no pose."""
     if not len(values):
         return np.full(values.shape[1:], np.nan)
     return of(values, axis=0).astype(float)
@@ -147,7 +171,7 @@ def _margins(pixels: Array, sizes_px: Array) -> Array:
 
 
 def _closest(pixels: Array, seen: Bools, camera_of: Ints) -> Array:
-    """The least distance (k,), px, of two seen spots in one camera's picture."""
+    """Smallest distance (k,), px, of two visible spots in the picture of a camera."""
     out = np.full(len(pixels), np.inf)
     for camera in np.unique(camera_of):
         views = np.flatnonzero(camera_of == camera)

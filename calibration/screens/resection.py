@@ -1,7 +1,7 @@
-"""Where a camera stands, from points that it sees: a start for an adjustment that wrong points do not spoil.
+"""Robust resection: the pose of a camera from points with outliers, as start value of an adjustment.
 
-Perspective-n-point solvers of OpenCV on few points at a time (Fischler and Bolles 1981, "Random sample consensus");
-both of a plane's two poses are tried (Collins and Bartoli 2014, "Infinitesimal plane-based pose estimation").
+OpenCV's perspective-n-point solvers on small sets of points (Fischler and Bolles 1981, "Random sample consensus"); both
+poses of coplanar points are tried (Collins and Bartoli 2014, "Infinitesimal plane-based pose estimation").
 """
 
 from __future__ import annotations
@@ -18,67 +18,71 @@ from geometry.camera import FISHEYE, Camera, pinhole_numbers, project_points
 from geometry.lens import padded
 from geometry.pose import Pose
 
-FEWEST = 4  # points: three leave up to four poses
-_COPLANAR = 0.01  # of the middle extent: flatter sets are taken for planes
-_ON_A_LINE = 0.02  # of the largest extent: narrower sets are taken for lines
-_POLISHED = 12  # of the poses tried, the best ones: outliers can make a wrong one look better at first
-_MOST_SETS = 80  # of four points tried: with a third of the points wrong one in five is good, none with 0.8^80 = 1e-8
+FEWEST = 4  # points: three allow up to four poses
+_COPLANAR = 0.01  # third over second extent, below which a set counts as coplanar
+_COLLINEAR = 0.02  # second over largest extent, below which a set counts as collinear
+_REFINED = 12  # best poses that are refined: with outliers the right one need not be first
+_MOST_SETS = 80  # sets of four points: with a third of outliers, one in five is free of them, and none is with 0.8^80
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
-    """One pose that explains most points."""
+class ResectedPose:
+    """A pose with its inliers."""
 
     camera_from_world: Pose
-    errors_px: Array  # (n,): distance of each point from where it should be; inf behind the camera
-    fits: Bools  # (n,): which points it explains
-    rms_px: float  # of those
+    errors_px: Array  # (n,): reprojection error of each point; inf behind the camera
+    inliers: Bools  # (n,): inliers
+    rms_px: float  # of the inliers
 
 
-def places(camera: Camera, points: Array, pixels: Array, within_px: float) -> list[Place]:
-    """Poses of a camera from points (n, 3), m, of world and their pixels (n, 2), the best first; at most two.
+def resect(camera: Camera, points: Array, pixels: Array, within_px: float) -> list[ResectedPose]:
+    """Poses of a camera from points (n, 3), m, in world and their pixels (n, 2), the best first; at most two.
 
-    within_px: how far a right point's pixel may lie from where the pose puts it. A second pose is given where it
-    explains as many points: few points of a plane, seen small, leave two. Empty where nothing is found. ValueError
-    where the points cannot tell: fewer than four, or on one line.
+    within_px: largest reprojection error of an inlier. A second pose is returned if it has as many inliers, as with few
+    coplanar points that appear small in the picture. Empty if no pose is found.
+
+    Raises:
+        ValueError: fewer than four points, or all on one line.
     """
     if len(points) < FEWEST:
         raise ValueError(f"{len(points)} points, expected {FEWEST} or more")
-    if on_a_line(points):
+    if are_collinear(points):
         raise ValueError("all points lie on one line")
     xy = normalised_image(camera, pixels)
     known: Bools = np.asarray(np.isfinite(xy).all(axis=1))
-    polished: list[Place] = []
+    refined: list[ResectedPose] = []
     for stage in (_all_known(known), _sets_of_four(points, known)):
-        # Where all points agree no four of them need to be tried: a tenth of the time.
-        if polished and min(polished, key=_rank).fits.all():
+        # If all points are inliers, sets of four are not tried, which takes a tenth of the time.
+        if refined and min(refined, key=_rank).inliers.all():
             break
-        tried: list[Place] = []
+        tried: list[ResectedPose] = []
         for some in stage:
-            tried += [_judged(camera, pose, points, pixels, within_px) for pose in _solutions(points[some], xy[some])]
-        best = sorted(tried, key=_rank)[:_POLISHED]
-        polished += [_polished(camera, start, points, pixels, xy, within_px) for start in best]
-    polished.sort(key=_rank)
-    out: list[Place] = []
-    for p in polished:
-        if np.sum(p.fits) < FEWEST or (out and np.sum(p.fits) < np.sum(out[0].fits)):
+            tried += [
+                _evaluated(camera, pose, points, pixels, within_px) for pose in _solutions(points[some], xy[some])
+            ]
+        best = sorted(tried, key=_rank)[:_REFINED]
+        refined += [_refined(camera, start, points, pixels, xy, within_px) for start in best]
+    refined.sort(key=_rank)
+    out: list[ResectedPose] = []
+    for p in refined:
+        if np.sum(p.inliers) < FEWEST or (out and np.sum(p.inliers) < np.sum(out[0].inliers)):
             continue
-        if all(_apart(p, q, points) for q in out) and len(out) < 2:
+        if all(_are_distinct(p, q, points) for q in out) and len(out) < 2:
             out.append(p)
     return out
 
 
 def normalised_image(camera: Camera, pixels: Array) -> Array:
-    """X/Z, Y/Z (n, 2) of the rays of pixels (n, 2) in the camera's own frame; nan where the lens maps nothing there."""
+    """X/Z, Y/Z (n, 2) of the rays of pixels (n, 2) in the camera frame; nan where the lens has no ray."""
     rays = replace(camera, camera_from_world=Pose.identity()).rays(pixels)[1]
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.where(rays[:, 2:] > 1e-3, rays[:, :2] / rays[:, 2:], np.nan)
 
 
-def on_a_line(points: Array) -> bool:
-    """Whether points (n, 3) lie on one line, or all in one place."""
+def are_collinear(points: Array) -> bool:
+    """Whether points (n, 3) are collinear or coincide."""
     s = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-    return bool(len(s) < 2 or s[1] <= _ON_A_LINE * s[0])
+    return bool(len(s) < 2 or s[1] <= _COLLINEAR * s[0])
 
 
 def _all_known(known: Bools) -> Iterator[Ints]:
@@ -88,7 +92,7 @@ def _all_known(known: Bools) -> Iterator[Ints]:
 
 
 def _sets_of_four(points: Array, known: Bools) -> Iterator[Ints]:
-    """Sets of four points that do not lie on a line: all sets, or so many by chance."""
+    """Sets of four points that are not collinear: all of them, or a random selection."""
     usable = np.flatnonzero(known)
     combinations = list(itertools.combinations(range(len(usable)), FEWEST)) if len(usable) <= 9 else None
     rng = np.random.default_rng(0)
@@ -99,21 +103,21 @@ def _sets_of_four(points: Array, known: Bools) -> Iterator[Ints]:
         combinations = [combinations[int(i)] for i in order]
     for chosen in combinations:
         some = usable[list(chosen)]
-        if not on_a_line(points[some]):
+        if not are_collinear(points[some]):
             yield some
 
 
 def _solutions(points: Array, xy: Array) -> list[Pose]:
-    """Poses of a pinhole of focal length 1 that sees points (n, 3) at xy (n, 2)."""
+    """Poses of a pinhole camera of focal length 1 from points (n, 3) at xy (n, 2)."""
     middle = points.mean(axis=0)
     _, s, axes = np.linalg.svd(points - middle, full_matrices=True)
     axes = axes * np.sign(np.linalg.det(axes))
-    # About their middle and by their size: a survey's coordinates can be kilometres, the solvers' limits are absolute.
+    # Centred and scaled: a survey's coordinates may be kilometres, and the solvers have absolute thresholds.
     size = s[0] / np.sqrt(len(points))
     own = (points - middle) @ axes.T / size
     method = cv2.SOLVEPNP_SQPNP
     if len(s) < 3 or s[2] < _COPLANAR * s[1]:
-        method, own[:, 2] = cv2.SOLVEPNP_IPPE, 0.0  # which takes points a thousandth off a plane for none of its kind
+        method, own[:, 2] = cv2.SOLVEPNP_IPPE, 0.0  # IPPE rejects points a thousandth off a plane
     try:
         answer = cv2.solvePnPGeneric(own.reshape(-1, 1, 3), xy.reshape(-1, 1, 2), np.eye(3), None, flags=method)
     except cv2.error:
@@ -127,8 +131,8 @@ def _solutions(points: Array, xy: Array) -> list[Pose]:
     return out
 
 
-def _judged(camera: Camera, pose: Pose, points: Array, pixels: Array, within_px: float) -> Place:
-    # As camera.project, without a new camera for each of hundreds of poses.
+def _evaluated(camera: Camera, pose: Pose, points: Array, pixels: Array, within_px: float) -> ResectedPose:
+    # As camera.project, without creating a camera for each of hundreds of poses.
     seen, _ = project_points(
         pose.apply(points),
         pinhole_numbers(camera),
@@ -136,19 +140,21 @@ def _judged(camera: Camera, pose: Pose, points: Array, pixels: Array, within_px:
         np.asarray(camera.fold_r2),
         np.asarray(camera.lens == FISHEYE),
     )
-    away = np.linalg.norm(seen - pixels, axis=1)
-    errors = np.where(np.isfinite(away), away, np.inf)
-    fits = errors < within_px
-    rms = float(np.sqrt(np.mean(errors[fits] ** 2))) if fits.any() else float("inf")
-    return Place(pose, errors, fits, rms)
+    distances = np.linalg.norm(seen - pixels, axis=1)
+    errors = np.where(np.isfinite(distances), distances, np.inf)
+    inliers = errors < within_px
+    rms = float(np.sqrt(np.mean(errors[inliers] ** 2))) if inliers.any() else float("inf")
+    return ResectedPose(pose, errors, inliers, rms)
 
 
-def _polished(camera: Camera, start: Place, points: Array, pixels: Array, xy: Array, within_px: float) -> Place:
-    """Least squares over the points that fit, until these stay the same. Starts with the nearer half at least."""
+def _refined(
+    camera: Camera, start: ResectedPose, points: Array, pixels: Array, xy: Array, within_px: float
+) -> ResectedPose:
+    """Least squares over the inliers, repeated until they do not change. At least the better half is used."""
     best = start
     for _ in range(5):
         nearest = np.argsort(best.errors_px)[: max(FEWEST, len(points) // 2)]
-        some = np.union1d(np.flatnonzero(best.fits), nearest)
+        some = np.union1d(np.flatnonzero(best.inliers), nearest)
         some = some[np.isfinite(xy[some]).all(axis=1) & np.isfinite(best.errors_px[some])]
         if len(some) < FEWEST:
             break
@@ -169,20 +175,20 @@ def _polished(camera: Camera, start: Place, points: Array, pixels: Array, xy: Ar
         R = np.asarray(cv2.Rodrigues(rvec)[0], dtype=float)
         if not (np.isfinite(R).all() and np.isfinite(tvec).all()):
             break
-        new = _judged(camera, Pose(R, tvec.ravel() * size - R @ middle), points, pixels, within_px)
+        new = _evaluated(camera, Pose(R, tvec.ravel() * size - R @ middle), points, pixels, within_px)
         if _rank(new) >= _rank(best):
             break
         best = new
     return best
 
 
-def _rank(place: Place) -> tuple[int, float]:
-    """Smaller is better: more points explained, then less error."""
-    return -int(np.sum(place.fits)), place.rms_px
+def _rank(place: ResectedPose) -> tuple[int, float]:
+    """Sort key: more inliers, then the smaller error."""
+    return -int(np.sum(place.inliers)), place.rms_px
 
 
-def _apart(a: Place, b: Place, points: Array) -> bool:
-    """Whether two poses are not one found twice: the camera stands elsewhere by a hundredth of its distance."""
+def _are_distinct(a: ResectedPose, b: ResectedPose, points: Array) -> bool:
+    """Whether two poses are distinct: the centres differ by a hundredth of the distance, or the axes by 2.6 deg."""
     centres = [p.camera_from_world.inverse().translation for p in (a, b)]
     distance = np.linalg.norm(centres[0] - points.mean(axis=0))
     turned = normalised(a.camera_from_world.rotation[2]) @ normalised(b.camera_from_world.rotation[2])
