@@ -16,7 +16,7 @@ from lab.calibrate.camera.camera import (
     CORNERS,
     FAILED,
     CameraOptions,
-    Outcome,
+    CameraOutcome,
     calibrate_camera,
 )
 from lab.errors import CalibrationError, InputError
@@ -30,7 +30,7 @@ needs_stereo = pytest.mark.skipif(not STEREO.is_dir(), reason="the chessboard pa
 
 
 @pytest.fixture(scope="module")
-def left(tmp_path_factory: pytest.TempPathFactory) -> Outcome:
+def left(tmp_path_factory: pytest.TempPathFactory) -> CameraOutcome:
     """The left camera of the stereo pairs, quickly: one lens model, a flat board."""
     if not STEREO.is_dir():
         pytest.skip("the chessboard pairs of OpenCV's samples are not here")
