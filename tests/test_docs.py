@@ -96,6 +96,8 @@ def test_a_command_that_does_not_exist_is_found(text):
     assert [p for m in mentions(text) if (p := problem(m))]
 
 
-@pytest.mark.parametrize("text", ["`beampose calibrate check`.", "    beampose run X --out Y  # --any", "beampose reads"])
+@pytest.mark.parametrize(
+    "text", ["`beampose calibrate check`.", "    beampose run X --out Y  # --any", "beampose reads"]
+)
 def test_a_text_without_a_mistake_passes(text):
     assert not [p for m in mentions(text) if (p := problem(m))]
