@@ -17,9 +17,9 @@ from lab.files.text.yaml_text import did_you_mean
 
 FORMATS = ("pdf", "svg", "png")
 DESCRIPTION = "board.yaml"
-# Smallest white rim around a marker, in marker modules. Measured on rendered boards of 7x5 squares of 36 mm, 960x720 px,
-# blur 0.7 and 1.2 px: with a rim of 0.05 no marker is detected; corner errors are 0.1 to 0.7 px with 0.2, 0.05 to 0.3 px
-# with 0.4, and 0.03 to 0.06 px from 0.7 on. OpenCV recommends 0.7 too.
+# Smallest white rim around a marker, in marker modules. Measured on rendered boards of 7x5 squares of 36 mm, 960x720
+# px, blur 0.7 and 1.2 px: with a rim of 0.05 no marker is detected; corner errors are 0.1 to 0.7 px with 0.2, 0.05 to
+# 0.3 px with 0.4, and 0.03 to 0.06 px from 0.7 on. OpenCV recommends 0.7 too.
 MIN_RIM_MODULES = 0.7
 
 
@@ -110,7 +110,7 @@ def _check_rim(board: Board) -> None:
         largest_mm = math.floor(10_000 * board.marker_with_rim_m(MIN_RIM_MODULES)) / 10
         raise InputError(
             f"{board.describe()}: the white rim around the markers is only {board.rim_modules:.2f} marker modules wide,"
-            f" {MIN_RIM_MODULES:g} or more are needed to find the corners; make the markers {largest_mm:g} mm or smaller"
+            f" at least {MIN_RIM_MODULES:g} are needed to find the corners; make the markers {largest_mm:g} mm or less"
         )
 
 

@@ -14,7 +14,7 @@ from calibration.screens.network_findings import near_findings
 from calibration.screens.network_sigmas import pointing_sigmas_m, spot_sigmas
 from calibration.screens.screens import ScreensResult
 from geometry.rig import Rig
-from lab.calibrate.calibration_day import day_of, expired, last_day
+from lab.calibrate.calibration_date import calibration_date, expiry_date, expiry_findings
 from lab.calibrate.screens.screen_inputs import screen_inputs
 from lab.calibrate.screens.screen_tables import DOTS, RESIDUALS, write_tables
 from lab.calibrate.screens.survey_check import adjusted_screens, survey_findings
@@ -72,7 +72,7 @@ def calibrate_screen(project_path: Path, out: Path, today: datetime.date | None 
     """
     refuse_foreign(out, _is_ours)
     project = load_project(Path(project_path))
-    day = day_of(project, today)
+    day = calibration_date(project, today)
     inputs = screen_inputs(project)
     result = adjusted_screens(project, inputs)
     placed = near_findings(result, inputs.near)
@@ -80,7 +80,7 @@ def calibrate_screen(project_path: Path, out: Path, today: datetime.date | None 
         *placed,
         *network_findings(result, names_doubted=verdict(placed) > Level.PASS),
         *survey_findings(project, result),
-        *expired(project, day, today),
+        *expiry_findings(project, day, today),
         *(Finding(Level.WARN, note) for note in inputs.notes),
     ]
     level = verdict(found)
@@ -106,7 +106,7 @@ def _is_ours(folder: Path) -> bool:
 
 
 def _save(project: Project, outcome: ScreensOutcome, day: datetime.date, folder: Path) -> None:
-    until = last_day(project, day)
+    until = expiry_date(project, day)
     reasons = tuple(f.what for f in outcome.findings if f.level > Level.PASS)
     state = CalibrationState(day, outcome.level.name, until, reasons, project.notes)
     fit = outcome.result.fit
