@@ -1,4 +1,4 @@
-"""`beampose calibrate rig`: joint calibration of lenses, cameras, screens and beams from all measurements of a project."""
+"""`beampose calibrate rig`: joint calibration of lenses, cameras, screens and beams of a project."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How the calibration of a rig ended."""
+"""Result of a rig calibration."""
 
 from __future__ import annotations
 

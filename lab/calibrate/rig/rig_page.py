@@ -64,9 +64,7 @@ def _key_figures(o: RigOutcome) -> list[tuple[str, str, str]]:
     joint, out = o.steps.joint, []
     if o.expected is not None:
         e = o.expected
-        out.append(
-            ("attitude, one frame", f"{in_degrees(e.total):.2g} deg", "expected 1 sigma per axis, central pose")
-        )
+        out.append(("attitude, one frame", f"{in_degrees(e.total):.2g} deg", "expected 1 sigma per axis, central pose"))
         out.append(("position, one frame", f"{in_mm(e.total):.2g} mm", "expected 1 sigma per axis, central pose"))
         words = f"{in_degrees(e.systematic):.2g} deg · {in_mm(e.systematic):.2g} mm"
         out.append(("part of the calibration", words, "not reduced by averaging"))
@@ -81,7 +79,7 @@ def _key_figures(o: RigOutcome) -> list[tuple[str, str, str]]:
         s = o.steps.measured.network.sightings
         px = joint.every[DOTS].linearise(joint.values).residuals * s.sigma_px[:, None]
         rms = float(np.sqrt(np.mean(px[joint.kept[DOTS]] ** 2)))
-        out.append(("dots", f"{short(rms, 3)} px", "RMS residual per axis"))
+        out.append(("control points", f"{short(rms, 3)} px", "RMS residual per axis"))
     sigma = rig_page_lab.beam_sigmas(joint)[0] / rig_page_lab.ARCSEC
     out.append(("beam directions", f"{short(float(np.sqrt(np.mean(sigma**2))), 3)} arcsec", "1 sigma per axis"))
     return out
@@ -186,8 +184,9 @@ def _groups(o: RigOutcome) -> Section:
         )
     heads = ("kind", "numbers", "redundant", "misfit / sigma", "p", "excluded", "sigmas multiplied by")
     words = [
-        "Deviation of each kind of measurement from the prediction by all others, in units of its sigmas; 1 is expected."
-        " Numbers without redundancy determine parameters that no other measurement determines, and cannot be tested.",
+        "Deviation of each kind of measurement from the prediction by all others, in units of its sigmas; the expected"
+        " value is 1. Measurements without redundancy are the only ones that determine some parameter, and cannot be"
+        " tested.",
         "If the misfit of a kind is significant (p below 0.001), its sigmas were increased until it fits.",
     ]
     return Section("Consistency of the measurements", words, (), PageTable(heads, rows))
@@ -205,7 +204,8 @@ def _residuals(o: RigOutcome) -> Section:
     if DOTS in joint.every:
         s = measured.network.sightings
         r = joint.every[DOTS].linearise(joint.values).residuals
-        drawings += _fields(o, "dots", s.pixels, -r * s.sigma_px[:, None], s.camera_of, joint.kept[DOTS])
+        residuals_px = -r * s.sigma_px[:, None]
+        drawings += _fields(o, "control points", s.pixels, residuals_px, s.camera_of, joint.kept[DOTS])
     drawings.append(
         PageDrawing(residual_histogram(spots[joint.kept[SPOTS]], "Spots: normalised residuals", "sigma", sigma=1.0))
     )

@@ -156,7 +156,7 @@ def correlations(o: RigOutcome) -> Section:
     shown.sort(key=lambda i: ("beams", "screens", "cameras").index(split(C.names[i])[0]))
     names = [_short_name(C.names[i]) for i in shown]
     picture = correlation_matrix(names, C.matrix[np.ix_(shown, shown)], "Correlations of the rig's parameters")
-    words = "Correlated errors partly cancel in the pose: without the correlations the attitude sigma would be too large."
+    words = "Correlated errors partly cancel in the pose: without the correlations its sigma would be too large."
     return Section("Correlations", words, [PageDrawing(picture, wide=True)])
 
 

@@ -1,4 +1,4 @@
-"""Boards of a calibration project: carried about or fixed to a screen, found in their photographs."""
+"""Corners of the boards of a calibration project, both portable boards and boards fixed to a screen."""
 
 from __future__ import annotations
 
@@ -21,35 +21,38 @@ from lab.errors import CalibrationError
 from lab.files.project.project import FixedBoard, Project
 from lab.pictures.picture_file import Missing, read_picture
 
-START_CORNER_SIGMA_PX = 0.2  # until their residuals say better
+START_CORNER_SIGMA_PX = 0.2  # initial value; the adjustment estimates it from the residuals
 
 
 @dataclass(frozen=True, slots=True)
 class BoardViews:
-    """The corners that cameras saw, and which of the boards lie on screens."""
+    """Measured board corners, and the boards that are fixed to screens."""
 
     corners: CornerTerm | None  # None: no board
-    placements: tuple[str, ...]  # the boards' places by name, as the corners count them
+    placements: tuple[str, ...]  # names of the board placements, indexed by `corners.placement`
     fixed: BoardOnScreenTerm | None
     photo_of: Mapping[tuple[int, int], Path]  # (camera, placement) -> photograph
-    notes: tuple[str, ...]  # photographs that were left out, and why
-    radii_m: Array | None = None  # (boards,): of the circles of each, 0 for boards of corners; None: no circles
+    notes: tuple[str, ...]  # excluded photographs, each with the reason
+    radii_m: Array | None = None  # (boards,) radius of each board's circles, 0 for other boards; None: no circles
 
 
 def board_views(project: Project, rig: Rig) -> BoardViews:
-    """Corners of all boards of a project in their photographs.
+    """Detect the boards of a project in their photographs.
 
-    A photograph without its board is noted and left out; CalibrationError where it is of a board fixed to a screen.
+    A photograph of a portable board without the board is noted and excluded.
+
+    Raises:
+        CalibrationError: if a board that is fixed to a screen is not found in its photograph.
     """
-    places: list[tuple[str, Board, Mapping[str, Path], int]] = []  # name, board, photos, which physical board
+    places: list[tuple[str, Board, Mapping[str, Path], int]] = []  # name, board, photos, index of the physical board
     for i, shared in enumerate(project.boards):
         places += [(f"boards.{i}.{p}", shared.board, photos, i) for p, photos in shared.photos.items()]
-    carried, physical = len(places), len(project.boards)
+    n_portable, physical = len(places), len(project.boards)
     fixed_rows: list[tuple[int, int, FixedBoard]] = []
     for k, screen in enumerate(project.screens.values()):
-        for i, lying in enumerate(screen.boards):
-            fixed_rows.append((len(places), k, lying))
-            places.append((f"screens.{screen.name}.boards.{i}", lying.board, lying.photos, physical))
+        for i, mounted in enumerate(screen.boards):
+            fixed_rows.append((len(places), k, mounted))
+            places.append((f"screens.{screen.name}.boards.{i}", mounted.board, mounted.photos, physical))
             physical += 1
     cameras = list(rig.cameras)
     pixels, points, middle, camera_of, placement_of, board_of = [], [], [], [], [], []
@@ -62,22 +65,23 @@ def board_views(project: Project, rig: Rig) -> BoardViews:
         for camera, path in photos.items():
             view = _view(path, board, rig.cameras[camera].image_size_px)
             if isinstance(view, str):
-                if p >= carried:
+                if p >= n_portable:
                     raise CalibrationError(f"{path}: {view}; a board that is fixed to a screen must be found")
                 notes.append(f"{path}: {view}")
             else:
                 views[camera] = view
-        if not views or (p < carried and len(views) < 2):
+        if not views or (p < n_portable and len(views) < 2):
             if views:
-                notes.append(f"{name}: only one camera shows this board: it says nothing of the cameras' places")
+                notes.append(f"{name}: only one camera sees this board: it does not constrain the cameras' poses")
             continue
         for camera, view in views.items():
-            ids, found = view.ids, view.pixels
+            ids = view.ids
             rows = np.searchsorted(board.ids, ids)
-            pixels.append(found)
+            pixels.append(view.pixels)
             if view.areas_px2 is not None:
-                seen_radius = radius_by_areas(board.points[rows][:, :2], found, view.areas_px2, rig.cameras[camera])
-                radii.setdefault(which, []).append(seen_radius)
+                xy = board.points[rows][:, :2]
+                radius = radius_by_areas(xy, view.pixels, view.areas_px2, rig.cameras[camera])
+                radii.setdefault(which, []).append(radius)
             points.append(board.points[rows])
             middle.append(board.points[rows][:, :2] - board.middle[:2])
             camera_of.append(np.full(len(ids), cameras.index(camera)))
@@ -116,7 +120,7 @@ def _fisheye(rig: Rig) -> Bools:
 
 
 def _view(path: Path, board: Board, size_px: tuple[int, int]) -> BoardView | str:
-    """A board's points in a photograph, or why there are none."""
+    """The view of a board in a photograph, or the reason why there is none."""
     picture = read_picture(path, size_px)
     if isinstance(picture, Missing):
         return picture.reason.replace("the rig says", "the camera's calibration says")

@@ -23,7 +23,7 @@ from lab.number_format import short
 from lab.report.html import environment
 
 FILE_NAME = "report.html"
-KINDS = ("Camera", "Board", "Screens", "Beams", "Rig", "Daily check", "Plan")
+KINDS = ("Camera", "Board", "Screens", "Beams", "Rig", "Drift check", "Plan")
 LARGEST_BYTES = 5_000_000  # a report that a mail carries and a browser opens at once
 _LONG_TABLE = 40  # rows beyond which a table is folded away
 _CSS = {Level.PASS: "pass", Level.WARN: "check", Level.FAIL: "fail"}  # the classes of style.css
@@ -116,7 +116,7 @@ def provenance(inputs: Iterable[Path] = (), made: date | None = None) -> Provena
     return Provenance((made or date.today()).isoformat(), version, tuple(lines))
 
 
-def telling_views(rms_px: Array, worst: int = 4) -> list[tuple[int, str]]:
+def representative_views(rms_px: Array, worst: int = 4) -> list[tuple[int, str]]:
     """Which of n views to show as pictures: the worst few, the median and the best, each once, with that word.
 
     rms_px (n,): nan for a view that was not used; such views come last and are never shown.

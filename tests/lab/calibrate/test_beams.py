@@ -20,7 +20,7 @@ from geometry.pose import Pose
 from geometry.rig import Rig
 from geometry.uncertainty.rig_parameters import RigCovariance, rig_names
 from lab.calibrate.beams.beams import calibrate_beams
-from lab.calibrate.beams.recordings import read_recordings, spread
+from lab.calibrate.beams.recordings import limit_frames, read_recordings
 from lab.calibrate.beams.stationary_frames import SpotRows, average, mean_of_frames, positions_at_rest
 from lab.errors import CalibrationError, InputError
 from lab.files.project.project import load_project
@@ -365,7 +365,7 @@ def test_of_very_many_frames_without_a_pose_some_are_used_and_that_is_noted():
     frames = np.repeat(np.arange(500), 6)
     rows = SpotRows(frames, np.tile(np.arange(6), 500), np.zeros((3000, 2)), np.zeros((3000, 2, 2)))
     notes: list[str] = []
-    used = np.unique(spread(rows, notes).frame)
+    used = np.unique(limit_frames(rows, notes).frame)
     assert (len(used), used[0], used[-1]) == (200, 0, 499)
     assert notes == ["of 500 frames without a pose 200 were used, evenly spread"]
 

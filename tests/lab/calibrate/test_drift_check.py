@@ -18,10 +18,10 @@ from geometry.pose import Pose
 from geometry.rig import Rig
 from geometry.rotations import exp
 from geometry.uncertainty.rig_parameters import RigCovariance, moved, rig_names
-from lab.calibrate.drift_check.drift_check import COLUMNS, DailyLimits, check_drift
+from lab.calibrate.drift_check.drift_check import COLUMNS, DriftLimits, check_drift
 from lab.calibrate.drift_check.drift_expected import compare_points
 from lab.calibrate.drift_check.drift_history import read_history
-from lab.calibrate.drift_check.drift_inputs import read_points
+from lab.calibrate.drift_check.drift_inputs import DriftInputs, read_points
 from lab.errors import InputError
 from lab.files.rig.calibration_state import CalibrationState
 from lab.files.rig.rig_covariance import joint_covariance
@@ -36,7 +36,7 @@ def check(folder: Path, today, seed: int = 0, *, state=scenes.STATE, day=scenes.
     """The outcome of a check of the lab as it is today."""
     rig = scenes.write_rig(folder, RIG, COVARIANCE, state)
     pixels, survey = scenes.write_points(folder, today, np.random.default_rng(seed), **points)
-    return check_drift(rig, folder / "out", pixels, today=day, survey=survey, history=history)
+    return check_drift(rig, folder / "out", DriftInputs(pixels, survey=survey), today=day, history=history)
 
 
 def of(outcome, camera: str):
@@ -111,10 +111,9 @@ def test_the_calibrations_own_uncertainty_is_no_drift(tmp_path):
     off = scenes.true_rig(RIG, replace(COVARIANCE, matrix=25 * COVARIANCE.matrix), np.random.default_rng(3))
     pixels, survey = scenes.write_points(tmp_path, off, np.random.default_rng(0))
     wide = replace(COVARIANCE, matrix=25 * COVARIANCE.matrix)
-    known = check_drift(scenes.write_rig(tmp_path, RIG, wide), tmp_path / "a", pixels, today=scenes.DAY, survey=survey)
-    unknown = check_drift(
-        scenes.write_rig(tmp_path, RIG, None), tmp_path / "b", pixels, today=scenes.DAY, survey=survey
-    )
+    inputs = DriftInputs(pixels, survey=survey)
+    known = check_drift(scenes.write_rig(tmp_path, RIG, wide), tmp_path / "a", inputs, today=scenes.DAY)
+    unknown = check_drift(scenes.write_rig(tmp_path, RIG, None), tmp_path / "b", inputs, today=scenes.DAY)
     assert all(c.change is None for c in known.cameras)
     assert any(c.change is not None for c in unknown.cameras)
     assert any("no covariance" in f.what for f in unknown.findings)
@@ -132,7 +131,7 @@ def test_a_poor_survey_is_no_drift_as_long_as_it_says_so(tmp_path):
             place = np.array([float(x), float(y), float(z)]) + off[i]
             rows.append(f"{name},{place[0]},{place[1]},{place[2]},{sigma},{sigma},{sigma}")
         survey.write_text("\n".join(rows))
-        outcome = check_drift(rig, tmp_path / "out", pixels, today=scenes.DAY, survey=survey)
+        outcome = check_drift(rig, tmp_path / "out", DriftInputs(pixels, survey=survey), today=scenes.DAY)
         assert any("p = " in f.what or f.level == Level.FAIL for f in outcome.findings) == alarm
 
 
@@ -140,7 +139,7 @@ def test_a_camera_without_points_is_said_to_be_unchecked(tmp_path):
     rig = scenes.write_rig(tmp_path, RIG, COVARIANCE)
     pixels, survey = scenes.write_points(tmp_path, TRUE, np.random.default_rng(0))
     pixels.write_text("\n".join(line for line in pixels.read_text().splitlines() if not line.startswith("right")))
-    outcome = check_drift(rig, tmp_path / "out", pixels, today=scenes.DAY, survey=survey)
+    outcome = check_drift(rig, tmp_path / "out", DriftInputs(pixels, survey=survey), today=scenes.DAY)
     assert outcome.level == Level.WARN
     words = "camera right not checked: nothing was measured in it"
     assert any(words in f.what for f in outcome.findings)
@@ -148,7 +147,7 @@ def test_a_camera_without_points_is_said_to_be_unchecked(tmp_path):
     knocked = scenes.turned(TRUE, "left", 0.05)
     pixels, survey = scenes.write_points(tmp_path, knocked, np.random.default_rng(0))
     pixels.write_text("\n".join(line for line in pixels.read_text().splitlines() if not line.startswith("right")))
-    outcome = check_drift(rig, tmp_path / "out", pixels, today=scenes.DAY, survey=survey)
+    outcome = check_drift(rig, tmp_path / "out", DriftInputs(pixels, survey=survey), today=scenes.DAY)
     assert outcome.level == Level.FAIL  # a graver finding does not hide that the other camera is unknown
     assert f"; WARN: {words}" in outcome.line()
 
@@ -186,7 +185,7 @@ def still(folder: Path, today, with_pose: bool = True, **kind):
     rig = scenes.write_rig(folder, RIG, COVARIANCE)
     run = scenes.write_still(folder / "run", today, AT_REST, np.random.default_rng(5), **kind)
     pose = run / "pose.csv" if with_pose else None
-    return check_drift(rig, folder / "out", run=run, today=scenes.DAY, pose=pose)
+    return check_drift(rig, folder / "out", DriftInputs(run=run, pose=pose), today=scenes.DAY)
 
 
 def test_a_vehicle_at_a_known_pose_finds_a_turned_camera(tmp_path):
@@ -219,8 +218,8 @@ def test_a_stand_is_believed_only_as_far_as_its_sigma_goes(tmp_path):
     run = scenes.write_still(tmp_path / "run", TRUE, beside, np.random.default_rng(5))
     stated = scenes.write_still(tmp_path / "stated", TRUE, AT_REST, np.random.default_rng(5)) / "pose.csv"
     for sigma_m, alarm in ((5e-5, True), (1e-3, False)):
-        limits = DailyLimits(pose_sigma_m=sigma_m)
-        outcome = check_drift(rig, tmp_path / "out", run=run, today=scenes.DAY, pose=stated, limits=limits)
+        limits = DriftLimits(pose_sigma_m=sigma_m)
+        outcome = check_drift(rig, tmp_path / "out", DriftInputs(run=run, pose=stated), today=scenes.DAY, limits=limits)
         assert any(f.level == Level.FAIL or "p = " in f.what for f in outcome.findings) == alarm
 
 
@@ -259,8 +258,7 @@ def test_a_check_that_fails_to_read_leaves_everything_as_it_was(tmp_path):
         check_drift(
             tmp_path / "rig.yaml",
             tmp_path / "out",
-            tmp_path / "points.csv",
-            survey=tmp_path / "survey.csv",
+            DriftInputs(tmp_path / "points.csv", survey=tmp_path / "survey.csv"),
             history=history,
         )
     assert {p: p.read_bytes() for p in [history, *(tmp_path / "out").iterdir()]} == before
@@ -314,7 +312,7 @@ def test_a_bad_table_is_named_with_its_line_and_what_to_do(tmp_path, points, sur
         if text is not None:
             (tmp_path / name).write_bytes(text.encode("latin-1"))
     with pytest.raises(InputError, match=words) as caught:
-        check_drift(rig, tmp_path / "out", tmp_path / "points.csv", survey=tmp_path / "survey.csv")
+        check_drift(rig, tmp_path / "out", DriftInputs(tmp_path / "points.csv", survey=tmp_path / "survey.csv"))
     assert len(str(caught.value).splitlines()) == 1
     assert not (tmp_path / "out").exists()
 
@@ -323,7 +321,7 @@ def test_points_need_places(tmp_path):
     rig = scenes.write_rig(tmp_path, RIG, COVARIANCE)
     (tmp_path / "p.csv").write_text(POINTS)
     with pytest.raises(InputError, match=r"expected the places of its points.*--survey"):
-        check_drift(rig, tmp_path / "out", tmp_path / "p.csv")
+        check_drift(rig, tmp_path / "out", DriftInputs(tmp_path / "p.csv"))
 
 
 def test_a_check_has_points_or_a_run_never_neither_or_both(tmp_path):
@@ -335,29 +333,29 @@ def test_a_check_has_points_or_a_run_never_neither_or_both(tmp_path):
         ({"points": tmp_path, "pose": tmp_path}, "--pose together with --run"),
     ):
         with pytest.raises(InputError, match=words):
-            check_drift(rig, tmp_path / "out", **kind)
+            check_drift(rig, tmp_path / "out", DriftInputs(**kind))
 
 
 def test_bad_runs_poses_and_histories_are_named(tmp_path):
     rig = scenes.write_rig(tmp_path, RIG, COVARIANCE)
     with pytest.raises(InputError, match="found nothing"):
-        check_drift(rig, tmp_path / "out", run=tmp_path / "no")
+        check_drift(rig, tmp_path / "out", DriftInputs(run=tmp_path / "no"))
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match=r"expected a run.yaml or a spots.csv in this folder"):
-        check_drift(rig, tmp_path / "out", run=tmp_path / "empty")
+        check_drift(rig, tmp_path / "out", DriftInputs(run=tmp_path / "empty"))
     run = scenes.write_still(tmp_path / "run", TRUE, AT_REST, np.random.default_rng(0))
     text = (run / "spots.csv").read_text()
     (run / "spots.csv").write_text(text.replace(",left,", ",lfet,"))
     with pytest.raises(InputError, match=r"got 'lfet'; did you mean 'left'\?"):
-        check_drift(rig, tmp_path / "out", run=run)
+        check_drift(rig, tmp_path / "out", DriftInputs(run=run))
     (run / "spots.csv").write_text(text)
     (run / "attitude.csv").unlink()
     with pytest.raises(InputError, match=r"expected an attitude.csv beside spots.csv, or the pose"):
-        check_drift(rig, tmp_path / "out", run=run)
+        check_drift(rig, tmp_path / "out", DriftInputs(run=run))
     rows = (run / "pose.csv").read_text() + "1,0.01,0.5,0.02,-0.03,1,0,0,0\n"
     (run / "pose.csv").write_text(rows)
     with pytest.raises(InputError, match="expected one constant pose"):
-        check_drift(rig, tmp_path / "out", run=run, pose=run / "pose.csv")
+        check_drift(rig, tmp_path / "out", DriftInputs(run=run, pose=run / "pose.csv"))
     history = tmp_path / "h.csv"
     history.write_text("a,b\n")
     with pytest.raises(InputError, match="name another --history"):
@@ -371,7 +369,7 @@ def test_bad_runs_poses_and_histories_are_named(tmp_path):
 @pytest.mark.parametrize("bad", [{"p_false_alarm": 0.0}, {"fail_mm": 0.1, "warn_mm": 0.2}, {"point_sigma_px": -1.0}])
 def test_limits_that_make_no_sense_are_refused(bad):
     with pytest.raises(ValueError, match="expected"):
-        DailyLimits(**bad)
+        DriftLimits(**bad)
 
 
 def test_the_wrong_one_of_five_points_is_named(tmp_path):
@@ -404,7 +402,7 @@ def test_a_run_folder_is_processed_first(tmp_path):
         "  within_m: 0.2\n  within_deg: 10.0\n"
     )
     pose = scenes.write_still(tmp_path / "stated", TRUE, AT_REST, rng) / "pose.csv"
-    outcome = check_drift(rig, tmp_path / "out", run=run, today=scenes.DAY, pose=pose)
+    outcome = check_drift(rig, tmp_path / "out", DriftInputs(run=run, pose=pose), today=scenes.DAY)
     assert of(outcome, "left").change.kind == TURNED
     assert of(outcome, "right").level == Level.PASS
 
@@ -421,7 +419,7 @@ def test_the_calibrations_share_is_that_of_numeric_derivatives(tmp_path, on_scre
     one = compare_points(rig, known, RigCovariance(names, np.diag(sigma**2)), pixels)[0]
     mine = [i for i, c in enumerate(known.camera) if c == "left"]
 
-    def foretold(delta: np.ndarray) -> np.ndarray:
+    def predicted(delta: np.ndarray) -> np.ndarray:
         lab = moved(rig, names, delta)
         screen, out = lab.screens["left"], []
         for i in mine:
@@ -433,8 +431,8 @@ def test_the_calibrations_share_is_that_of_numeric_derivatives(tmp_path, on_scre
         return np.array(out)
 
     J = np.stack(
-        [(foretold(e) - foretold(-e)) / 2e-3 for e in 1e-3 * np.diag(sigma)], axis=-1
+        [(predicted(e) - predicted(-e)) / 2e-3 for e in 1e-3 * np.diag(sigma)], axis=-1
     )  # per sigma of each number
     expected = np.sqrt(np.sum(J**2, axis=-1).mean(axis=1))
     np.testing.assert_allclose(one.calibration_sigma_px, expected, rtol=1e-5)
-    np.testing.assert_allclose(one.foretold, foretold(np.zeros(len(names))), atol=1e-9)
+    np.testing.assert_allclose(one.predicted, predicted(np.zeros(len(names))), atol=1e-9)

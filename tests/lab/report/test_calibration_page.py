@@ -26,7 +26,7 @@ from lab.report.calibration.calibration_page import (
     cell,
     page,
     provenance,
-    telling_views,
+    representative_views,
     write_calibration_report,
 )
 from lab.report.calibration.calibration_scene import CAMERA_VIEWS
@@ -202,9 +202,9 @@ def test_a_report_of_400_views_stays_below_5_mb_and_keeps_its_table():
 
 def test_the_views_worth_a_picture_are_the_worst_the_median_and_the_best():
     rms = np.array([0.5, 0.1, 0.9, np.nan, 0.3, 0.7])
-    assert dict(telling_views(rms, 2)) == {2: "worst", 5: "2. worst", 0: "median", 1: "best"}
-    assert telling_views(np.full(3, np.nan)) == []
-    assert [i for i, _ in telling_views(np.array([0.2]))] == [0]
+    assert dict(representative_views(rms, 2)) == {2: "worst", 5: "2. worst", 0: "median", 1: "best"}
+    assert representative_views(np.full(3, np.nan)) == []
+    assert [i for i, _ in representative_views(np.array([0.2]))] == [0]
 
 
 def test_the_file_is_written_whole_and_names_its_inputs(tmp_path: Path):
