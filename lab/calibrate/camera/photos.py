@@ -48,7 +48,7 @@ class PhotoSet:
         """One line for the terminal, with the most frequent reason if pictures were refused."""
         total = len(self.views) + len(self.refused)
         text = f"{self.board.describe()}: found in {len(self.views)} of {total} pictures"
-        return text + (f"; {commonest(self.refused)}" if self.refused else "")
+        return text + (f"; {most_frequent_reason(self.refused)}" if self.refused else "")
 
 
 def load_photos(paths: Iterable[Path | str]) -> tuple[Path, ...]:
@@ -132,7 +132,7 @@ def find_in_photos(
         if progress is not None:
             progress(done, max(total, done), name)
     if not sizes:
-        raise InputError(f"none of {len(refused)} pictures can be read; {commonest(refused)}")
+        raise InputError(f"none of {len(refused)} pictures can be read; {most_frequent_reason(refused)}")
     if len(sizes) > 1:
         raise InputError(_mixed(sizes))
     if views and quick and isinstance(board, Chessboard):  # some show the board: search the others thoroughly too
@@ -221,7 +221,7 @@ def _frames(path: Path) -> Iterator[tuple[int, Grey | Missing]]:
         video.release()
 
 
-def commonest(refused: Sequence[tuple[str, str]]) -> str:
+def most_frequent_reason(refused: Sequence[tuple[str, str]]) -> str:
     """The most frequent reason among (name, reason), ignoring numbers, with its count and the first picture."""
     if not refused:
         return "no picture was refused"
@@ -270,9 +270,9 @@ def _mixed(sizes: dict[tuple[int, int], list[str]]) -> str:
 def _refuse_too_few(views: Sequence[object], refused: Sequence[tuple[str, str]], board: Board, fewest: int) -> None:
     total = len(views) + len(refused)
     if not views:
-        raise InputError(f"{board.describe()}: found in none of {total} pictures; {commonest(refused)}")
+        raise InputError(f"{board.describe()}: found in none of {total} pictures; {most_frequent_reason(refused)}")
     if len(views) < fewest:
-        tail = f"; {commonest(refused)}" if refused else "; take more pictures"
+        tail = f"; {most_frequent_reason(refused)}" if refused else "; take more pictures"
         raise InputError(
             f"{board.describe()}: found in {len(views)} of {total} pictures, {fewest} or more are needed{tail}"
         )
