@@ -28,7 +28,7 @@ from lab.report.calibration.calibration_page import (
     PageTable,
     Section,
     provenance,
-    representative_views,
+    telling_views,
     write_calibration_report,
 )
 
@@ -198,7 +198,7 @@ def _residuals(outcome: CameraOutcome) -> Section:
         ),
     ]
     rms = _rms_per_view(r)
-    for v, word in representative_views(rms, worst=_WORST_VIEWS):
+    for v, word in telling_views(rms, worst=_WORST_VIEWS):
         name, _ = outcome.photos.views[v]
         mine = t.view == v
         drawings.append(
