@@ -66,6 +66,15 @@ class KnownPoints:
 
 
 @dataclass(frozen=True, slots=True)
+class _Place:
+    """Position of a known point."""
+
+    xyz: tuple[float, ...]  # m: in world, or x, y, 0 in the frame of `screen`
+    sigma_m: tuple[float, ...]  # of each coordinate
+    screen: str  # empty: world
+
+
+@dataclass(frozen=True, slots=True)
 class StillSpots:
     """Mean pixels of a vehicle at rest: n views."""
 
@@ -125,10 +134,10 @@ def read_points(path: Path, survey: Path | None, rig: Rig, default_sigma_px: flo
         one = _number(path, line, row, "sigma_px") if row.get("sigma_px") else default_sigma_px
         refuse_sigmas(path, [line], "sigma_px", np.array([one]), SIGMAS_PX, "px")
         sigma.append(one)
-        p, s, on = coordinates[row["point"]]
-        xyz.append(p)
-        sigma_m.append(s)
-        screen.append(on)
+        place = coordinates[row["point"]]
+        xyz.append(place.xyz)
+        sigma_m.append(place.sigma_m)
+        screen.append(place.screen)
     sizes = {name: c.image_size_px for name, c in rig.cameras.items()}
     refuse_far_pixels(path, [line for line, _ in rows], camera, np.array(pixels), sizes)
     return KnownPoints(
@@ -184,14 +193,12 @@ def _number(path: Path, line: int, row: Mapping[str, str], column: str) -> float
     return value
 
 
-def _coordinates(
-    path: Path, rows: Sequence[tuple[int, Mapping[str, str]]], rig: Rig
-) -> dict[str, tuple[list[float], list[float], str]]:
-    """Coordinates (m), sigmas (m) and screen (empty: world) of each named point."""
+def _coordinates(path: Path, rows: Sequence[tuple[int, Mapping[str, str]]], rig: Rig) -> dict[str, _Place]:
+    """The position of each named point."""
     on_screens = "z_m" not in rows[0][1]
     if on_screens and "screen" not in rows[0][1]:
         raise InputError(f"{path}: expected a column 'z_m' (world) or 'screen' (x_m,y_m on a screen), got neither")
-    out: dict[str, tuple[list[float], list[float], str]] = {}
+    out: dict[str, _Place] = {}
     for line, row in rows:
         names = ("x_m", "y_m") if on_screens else ("x_m", "y_m", "z_m")
         xyz = [_number(path, line, row, c) for c in names]
@@ -212,8 +219,8 @@ def _coordinates(
                 f"{path}: line {line}: screen: expected a screen of the rig, got {screen!r}"
                 f"{did_you_mean(screen, rig.screens)}"
             )
-        fill = [0.0] * (3 - len(xyz))
-        entry = (xyz + fill, sigma + fill, screen)
+        fill = (0.0,) * (3 - len(xyz))
+        entry = _Place((*xyz, *fill), (*sigma, *fill), screen)
         if out.setdefault(row["point"], entry) != entry:
             raise InputError(
                 f"{path}: line {line}: point {row['point']!r} has two different positions; give them different names"
