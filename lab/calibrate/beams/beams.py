@@ -17,7 +17,7 @@ from calibration.findings import Finding, Level, verdict
 from calibration.least_squares.adjustment import AdjustmentError
 from geometry.uncertainty.rig_parameters import RigCovariance
 from lab.calibrate.beams.beam_tables import BEAMS, write_tables
-from lab.calibrate.beams.recording_check import refuse_known_mistakes, refuse_repeated
+from lab.calibrate.beams.recording_check import check_no_duplicates, diagnose_failed_fit
 from lab.calibrate.beams.recordings import Recordings, read_recordings, stand_of
 from lab.calibrate.calibration_date import calibration_date, expiry_date, expiry_findings
 from lab.errors import CalibrationError, InputError
@@ -87,7 +87,7 @@ def calibrate_beams(
     refuse_foreign(out, _is_ours)
     project = load_project(Path(project_path), lab_known=True)
     day = calibration_date(project, today)
-    refuse_repeated(project)
+    check_no_duplicates(project)
     rig_path = Path(rig) if rig is not None else project.path.parent / RIG
     file, lab_covariance = _calibrated_lab(project, rig_path)
     recordings = read_recordings(project, file.rig)
@@ -98,7 +98,7 @@ def calibrate_beams(
             found = solve_beams(file.rig, recordings.spots, stand_of(project, recordings), lab_covariance)
     except AdjustmentError as error:
         if recordings.stand_from_body is not None:
-            refuse_known_mistakes(project, file.rig, recordings, lab_covariance)
+            diagnose_failed_fit(project, file.rig, recordings, lab_covariance)
         raise CalibrationError(f"{project.path}: the beams cannot be calibrated: {error}") from None
     findings = [
         *beam_findings(found, file.rig, recordings.names, BeamGoals()),

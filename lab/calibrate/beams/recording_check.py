@@ -12,7 +12,7 @@ from lab.errors import InputError
 from lab.files.project.project import Project
 
 
-def refuse_known_mistakes(
+def diagnose_failed_fit(
     project: Project, rig: Rig, recordings: Recordings, lab_covariance: RigCovariance | None = None
 ) -> None:
     """Look for a common mistake in poses or labels that explains why the calibration failed.
@@ -32,7 +32,7 @@ def refuse_known_mistakes(
     raise InputError(f"{where}: {subject} only {found.words}; {found.remedy}")
 
 
-def refuse_repeated(project: Project) -> None:
+def check_no_duplicates(project: Project) -> None:
     """Refuse a recording that is listed twice: its spots would count twice and all sigmas would be too small.
 
     Raises:

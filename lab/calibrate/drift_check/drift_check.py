@@ -29,9 +29,9 @@ from geometry.arrays import Array
 from geometry.camera import Camera
 from geometry.planes import meet_plane
 from geometry.rig import Rig
-from lab.calibrate.drift_check.drift_expected import Compared, compare_points, compare_still, refuse_moving
+from lab.calibrate.drift_check.drift_comparison import PixelComparison, check_at_rest, compare_points, compare_still
 from lab.calibrate.drift_check.drift_history import HistoryRow, read_history, write_history
-from lab.calibrate.drift_check.drift_inputs import DriftInputs, read_points, read_still, read_still_pose
+from lab.calibrate.drift_check.drift_inputs import DriftInputs, read_points, read_still_pose, read_still_spots
 from lab.calibrate.drift_check.drift_messages import camera_findings, other_findings, state_findings
 from lab.calibrate.drift_check.drift_page import write_page
 from lab.calibrate.drift_check.drift_result import (
@@ -58,10 +58,10 @@ COLUMNS = (
 
 
 @dataclass(frozen=True, slots=True)
-class Comparison:
+class CheckData:
     """Measured and predicted pixels of a check, and how they were obtained."""
 
-    compared: list[Compared]
+    comparisons: list[PixelComparison]
     with_covariance: bool  # whether rig.yaml has a covariance
     sigma_given: bool  # whether the points' file states sigmas
     pose_free: bool  # whether the vehicle's pose was fitted
@@ -89,8 +89,8 @@ def check_drift(
     today = today or datetime.date.today()
     rig_path = Path(rig_path)
     file = load_rig_file(rig_path)
-    comparison = _compare(file, rig_path, inputs, limits)
-    cameras, others, findings = judge(file, comparison, limits, today)
+    data = _compare(file, rig_path, inputs, limits)
+    cameras, others, findings = judge(file, data, limits, today)
     earlier = read_history(history) if history is not None else []
     rows = [HistoryRow(today, c.camera, c.drift_px, c.noise_px, c.drift_mm, c.level) for c in cameras]
     outcome = DriftOutcome(
@@ -104,7 +104,7 @@ def check_drift(
     with atomic_folder(Path(out), may_replace=_is_ours) as work:
         write_drift_table(cameras, work / TABLE)
         files = [rig_path, *inputs.files()]
-        write_page(outcome, file, comparison.compared, [*earlier, *rows], limits, today, files, work)
+        write_page(outcome, file, data.comparisons, [*earlier, *rows], limits, today, files, work)
     if history is not None:
         write_history([*earlier, *rows], history)
     return outcome
@@ -114,19 +114,19 @@ def _is_ours(folder: Path) -> bool:
     return (folder / TABLE).is_file()
 
 
-def _compare(file: RigFile, rig_path: Path, inputs: DriftInputs, limits: DriftLimits) -> Comparison:
+def _compare(file: RigFile, rig_path: Path, inputs: DriftInputs, limits: DriftLimits) -> CheckData:
     """Read the measurements and compare them with the prediction by the rig."""
     covariance = joint_covariance(file.rig, file.covariances, rig_path)
     if inputs.points is not None:
         known = read_points(inputs.points, inputs.survey, file.rig, limits.point_sigma_px)
         compared = compare_points(file.rig, known, covariance, inputs.points)
-        return Comparison(compared, covariance is not None, known.sigma_given, pose_free=False)
+        return CheckData(compared, covariance is not None, known.sigma_given, pose_free=False)
     assert inputs.run is not None
-    still = read_still(inputs.run, file.rig)
-    refuse_moving(still, limits.still_px, inputs.run)
+    still = read_still_spots(inputs.run, file.rig)
+    check_at_rest(still, limits.still_px, inputs.run)
     pose = None if inputs.pose is None else (read_still_pose(inputs.pose), _pose_covariance(limits))
     compared = [compare_still(file.rig, still, covariance, pose, limits.floor_px, inputs.run)]
-    return Comparison(compared, covariance is not None, sigma_given=True, pose_free=pose is None)
+    return CheckData(compared, covariance is not None, sigma_given=True, pose_free=pose is None)
 
 
 def _pose_covariance(limits: DriftLimits) -> Array:
@@ -134,19 +134,19 @@ def _pose_covariance(limits: DriftLimits) -> Array:
 
 
 def judge(
-    file: RigFile, comparison: Comparison, limits: DriftLimits, today: datetime.date
+    file: RigFile, data: CheckData, limits: DriftLimits, today: datetime.date
 ) -> tuple[list[CameraDrift], list[OtherChange], list[Finding]]:
-    """Judge a comparison: the drift of each camera, wrong points and moved lasers, and the findings."""
-    p_each = limits.p_false_alarm / max(len(comparison.compared), 1)
+    """Judge a check: the drift of each camera, wrong points and moved lasers, and the findings."""
+    p_each = limits.p_false_alarm / max(len(data.comparisons), 1)
     cameras: list[CameraDrift] = []
     others: list[OtherChange] = []
     findings = state_findings(file.calibration, today, limits.expiry_warning_days)
-    for one in comparison.compared:
+    for one in data.comparisons:
         verdicts = find_changes(one.misfit, one.columns, one.others, p_each)
         drifts = [_camera_drift(file.rig, name, one, verdicts, limits, p_each) for name in one.columns]
         cameras += drifts
         others += [_other(file.rig, one, c) for c in verdicts.changes if c.kind not in CAMERA_KINDS]
-        findings += [f for c in drifts for f in camera_findings(c, limits, comparison.pose_free)]
+        findings += [f for c in drifts for f in camera_findings(c, limits, data.pose_free)]
     findings += other_findings(others, limits)
     unchecked = _unchecked(file.rig, cameras)
     if unchecked:
@@ -158,7 +158,7 @@ def judge(
                 "measure known points in every camera",
             )
         )
-    if not comparison.with_covariance:
+    if not data.with_covariance:
         findings.append(
             Finding(
                 Level.WARN,
@@ -167,7 +167,7 @@ def judge(
                 "calibrate with beampose, which writes the covariance",
             )
         )
-    if not comparison.sigma_given:
+    if not data.sigma_given:
         findings.append(
             Finding(Level.PASS, f"the points' file has no sigma_px: {limits.point_sigma_px:g} px is assumed")
         )
@@ -180,7 +180,7 @@ def _unchecked(rig: Rig, cameras: Sequence[CameraDrift]) -> tuple[str, ...]:
 
 
 def _camera_drift(
-    rig: Rig, name: str, one: Compared, verdicts: Verdicts, limits: DriftLimits, p_false_alarm: float
+    rig: Rig, name: str, one: PixelComparison, verdicts: Verdicts, limits: DriftLimits, p_false_alarm: float
 ) -> CameraDrift:
     camera, rows = rig.cameras[name], one.rows_of(name)
     of_rows = np.stack([2 * rows, 2 * rows + 1], axis=1).ravel()
@@ -252,7 +252,7 @@ def mm_at_screen(rig: Rig, camera: Camera, pixels: Array, displacement_px: Array
     return 1e3 * float(np.sqrt(squared.mean())) if len(squared) else float("nan")
 
 
-def _other(rig: Rig, one: Compared, change: Change) -> OtherChange:
+def _other(rig: Rig, one: PixelComparison, change: Change) -> OtherChange:
     moved = change.displacement.reshape(-1, 2)
     rows = np.flatnonzero(np.abs(moved).max(axis=1) > 0)
     camera = rig.cameras[one.camera[rows[0] if len(rows) else 0]]

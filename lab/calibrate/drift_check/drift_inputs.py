@@ -146,7 +146,7 @@ def read_points(path: Path, survey: Path | None, rig: Rig, default_sigma_px: flo
     )  # fmt: skip
 
 
-def refuse_other_points(known: KnownPoints, predicted: Array, path: Path) -> None:
+def check_points_match(known: KnownPoints, predicted: Array, path: Path) -> None:
     """Raise InputError if the pixels are so far from the predicted ones (n, 2) that no drift explains it."""
     for i, name in enumerate(known.point):
         where = f"{path}: point {name!r} of camera {known.camera[i]!r}"
@@ -228,7 +228,7 @@ def _coordinates(path: Path, rows: Sequence[tuple[int, Mapping[str, str]]], rig:
     return out
 
 
-def read_still(run: Path, rig: Rig) -> StillSpots:
+def read_still_spots(run: Path, rig: Rig) -> StillSpots:
     """Mean spots of a vehicle at rest, from a folder of results, its spots.csv, or a run folder (processed first).
 
     Raises:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from geometry.arrays import Array
-from lab.calibrate.drift_check.drift_expected import Compared
+from lab.calibrate.drift_check.drift_comparison import PixelComparison
 from lab.calibrate.drift_check.drift_history import HistoryRow
 from lab.calibrate.drift_check.drift_messages import describe_change, size
 from lab.calibrate.drift_check.drift_result import CameraDrift, DriftLimits, DriftOutcome, OtherChange, is_weak
@@ -31,7 +31,7 @@ from lab.report.calibration.calibration_scene import Dot, rig_things, scene_view
 def write_page(
     outcome: DriftOutcome,
     file: RigFile,
-    compared: Sequence[Compared],
+    compared: Sequence[PixelComparison],
     history: Sequence[HistoryRow],
     limits: DriftLimits,
     today: datetime.date,
@@ -77,7 +77,7 @@ def _key_figures(
 
 
 def _drift_section(
-    cameras: Sequence[CameraDrift], compared: Sequence[Compared], limits: DriftLimits, file: RigFile
+    cameras: Sequence[CameraDrift], compared: Sequence[PixelComparison], limits: DriftLimits, file: RigFile
 ) -> Section:
     labels = {name: [one.label[i] for i in one.rows_of(name)] for one in compared for name in one.columns}
     heads = (
@@ -146,7 +146,7 @@ def _history_section(history: Sequence[HistoryRow], limits: DriftLimits, file: R
 
 
 def _points_section(
-    compared: Sequence[Compared], others: Sequence[OtherChange], cameras: Sequence[CameraDrift]
+    compared: Sequence[PixelComparison], others: Sequence[OtherChange], cameras: Sequence[CameraDrift]
 ) -> Section:
     by_camera = {c.camera: c for c in cameras}
     heads = (
@@ -169,7 +169,7 @@ def _points_section(
     return Section("Points", words, (), PageTable(heads, rows))
 
 
-def _scene_section(file: RigFile, compared: Sequence[Compared]) -> Section:
+def _scene_section(file: RigFile, compared: Sequence[PixelComparison]) -> Section:
     things = rig_things(file.rig)
     marks: dict[str, Dot] = {}
     for one in compared:

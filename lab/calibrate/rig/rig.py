@@ -19,7 +19,7 @@ from calibration.screens.network_findings import ScreenLimits, near_findings
 from calibration.screens.network_findings import findings as network_findings
 from calibration.screens.screens import ScreensResult
 from geometry.rig import Rig
-from lab.calibrate.beams.recording_check import refuse_known_mistakes, refuse_repeated
+from lab.calibrate.beams.recording_check import check_no_duplicates, diagnose_failed_fit
 from lab.calibrate.beams.recordings import Recordings, read_recordings, stand_of
 from lab.calibrate.calibration_date import calibration_date, expiry_date, expiry_findings
 from lab.calibrate.rig.rig_outcome import RigOutcome
@@ -55,7 +55,7 @@ def calibrate_rig(
     refuse_foreign(out, _is_ours)
     project = load_project(Path(project_path))
     day = calibration_date(project, today)
-    refuse_repeated(project)
+    check_no_duplicates(project)
     if not project.beams or not project.spots:
         raise InputError(
             f"{project.path}: target: expected the nominal beams and spots, got none; add them, or calibrate only the"
@@ -112,7 +112,7 @@ def _solved(project: Project, screens: ScreensResult, recordings: Recordings) ->
     try:
         return calibrate_in_steps(screens, recordings.spots, stand_of(project, recordings))
     except (AdjustmentError, ValueError) as error:
-        refuse_known_mistakes(project, screens.fit.rig, recordings, screens.fit.covariance)
+        diagnose_failed_fit(project, screens.fit.rig, recordings, screens.fit.covariance)
         raise CalibrationError(f"{project.path}: the rig cannot be calibrated: {error}") from None
 
 

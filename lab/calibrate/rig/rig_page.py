@@ -15,7 +15,7 @@ from geometry.arrays import Array, Bools, Ints
 from geometry.pose import ypr_sigmas
 from geometry.rig import Rig
 from lab.calibrate.beams.recordings import Recordings
-from lab.calibrate.rig import rig_page_lab
+from lab.calibrate.rig import rig_page_sections
 from lab.calibrate.rig.rig_outcome import RigOutcome
 from lab.number_format import short
 from lab.report.calibration.calibration_charts import residual_histogram
@@ -42,11 +42,11 @@ def write_page(
         _held_out(outcome, recordings.names),
         _groups(outcome),
         _residuals(outcome),
-        rig_page_lab.screens(outcome),
-        rig_page_lab.beams(outcome, nominal),
-        rig_page_lab.cameras(outcome),
-        rig_page_lab.correlations(outcome),
-        rig_page_lab.lab(outcome),
+        rig_page_sections.screens_section(outcome),
+        rig_page_sections.beams_section(outcome, nominal),
+        rig_page_sections.cameras_section(outcome),
+        rig_page_sections.correlations_section(outcome),
+        rig_page_sections.lab_section(outcome),
     ]
     report = CalibrationReport(
         "Rig",
@@ -80,7 +80,7 @@ def _key_figures(o: RigOutcome) -> list[tuple[str, str, str]]:
         px = joint.every[DOTS].linearise(joint.values).residuals * s.sigma_px[:, None]
         rms = float(np.sqrt(np.mean(px[joint.kept[DOTS]] ** 2)))
         out.append(("control points", f"{short(rms, 3)} px", "RMS residual per axis"))
-    sigma = rig_page_lab.beam_sigmas(joint)[0] / rig_page_lab.ARCSEC
+    sigma = rig_page_sections.beam_sigmas(joint)[0] / rig_page_sections.ARCSEC
     out.append(("beam directions", f"{short(float(np.sqrt(np.mean(sigma**2))), 3)} arcsec", "1 sigma per axis"))
     return out
 

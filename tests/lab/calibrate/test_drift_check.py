@@ -19,7 +19,7 @@ from geometry.rig import Rig
 from geometry.rotations import exp
 from geometry.uncertainty.rig_parameters import RigCovariance, moved, rig_names
 from lab.calibrate.drift_check.drift_check import COLUMNS, DriftLimits, check_drift
-from lab.calibrate.drift_check.drift_expected import compare_points
+from lab.calibrate.drift_check.drift_comparison import compare_points
 from lab.calibrate.drift_check.drift_history import read_history
 from lab.calibrate.drift_check.drift_inputs import DriftInputs, read_points
 from lab.errors import InputError

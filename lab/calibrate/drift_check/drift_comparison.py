@@ -25,12 +25,12 @@ from geometry.pose import Pose
 from geometry.pose_solver.gauss_newton import fit_pose
 from geometry.rig import Rig
 from geometry.uncertainty.rig_parameters import BOW, PINHOLE, POSE, RigCovariance, Sensitivity, distortion_names, split
-from lab.calibrate.drift_check.drift_inputs import KnownPoints, StillSpots, refuse_other_points
+from lab.calibrate.drift_check.drift_inputs import KnownPoints, StillSpots, check_points_match
 from lab.errors import InputError
 
 
 @dataclass(frozen=True, slots=True)
-class Compared:
+class PixelComparison:
     """n measured and predicted pixels, and the effect of each possible change on them. 2n rows: u, v of each pixel."""
 
     camera: tuple[str, ...]  # (n,)
@@ -49,7 +49,7 @@ class Compared:
         return np.flatnonzero([c == camera for c in self.camera])
 
 
-def compare_points(rig: Rig, known: KnownPoints, covariance: RigCovariance | None, path: Path) -> list[Compared]:
+def compare_points(rig: Rig, known: KnownPoints, covariance: RigCovariance | None, path: Path) -> list[PixelComparison]:
     """Compare the points of each camera with the rig: one comparison per camera, in the rig's order.
 
     Raises:
@@ -59,7 +59,7 @@ def compare_points(rig: Rig, known: KnownPoints, covariance: RigCovariance | Non
     for i in range(len(known.point)):
         world[i] = _world(rig, known, i)
         predicted[i] = rig.cameras[known.camera[i]].project(world[i])
-    refuse_other_points(known, predicted, path)
+    check_points_match(known, predicted, path)
     out = []
     for name, camera in rig.cameras.items():
         rows = np.flatnonzero([c == name for c in known.camera])
@@ -84,7 +84,7 @@ def _on_surface(xyz: Array, bow: tuple[float, float, float]) -> Array:
 
 def _compare_camera(
     rig: Rig, camera: Camera, known: KnownPoints, rows: Ints, world: Array, covariance: RigCovariance | None
-) -> Compared:
+) -> PixelComparison:
     """Compare the points of one camera. rows: (k,) indices into `known`; world: (k, 3), m."""
     in_camera = camera.camera_from_world.apply(world)
     lens = project_points_full(
@@ -109,7 +109,7 @@ def _compare_camera(
     pixels = known.pixels[rows]
     columns = camera_columns(in_camera, lens.d_point, lens.d_pinhole, pinhole_numbers(camera)[:2])
     labels = tuple(known.point[i] for i in rows)
-    return Compared(
+    return PixelComparison(
         camera=(camera.name,) * n,
         label=labels,
         pixels=pixels,
@@ -175,7 +175,7 @@ def compare_still(
     pose: tuple[Pose, Array] | None,
     floor_px: float,
     path: Path,
-) -> Compared:
+) -> PixelComparison:
     """Compare the mean spots of a vehicle at rest with the rig.
 
     pose: its pose with covariance (6, 6); None: unknown. floor_px: error of a mean spot that averaging over frames does
@@ -204,7 +204,7 @@ def compare_still(
         C = C + by_pose @ pose[1] @ by_pose.T
     hits = part.hits(world_from_body)[0]
     residual = (still.pixels - d.pixels).ravel()
-    return Compared(
+    return PixelComparison(
         camera=tuple(c for c, _ in part.views),
         label=tuple(s for _, s in part.views),
         pixels=still.pixels,
@@ -260,7 +260,7 @@ def _changes_of_spots(rig: Rig, part: SpotModel, d: SpotDerivatives) -> dict[tup
     return changes
 
 
-def refuse_moving(still: StillSpots, limit_px: float, path: Path) -> None:
+def check_at_rest(still: StillSpots, limit_px: float, path: Path) -> None:
     """Raise InputError if the spots move during the run: the check needs a vehicle at rest."""
     sigma = np.sqrt(still.scatter_px**2 * 4 / still.frames[:, None])
     drifting = np.abs(still.drift_px) > np.maximum(limit_px, 5 * sigma)

@@ -24,7 +24,7 @@ ARCSEC = np.deg2rad(1 / 3600)
 _GAUGE_SIGMA = 3e-6  # m, rad: parameters with smaller sigmas are fixed by convention, not measured
 
 
-def screens(o: RigOutcome) -> Section | None:
+def screens_section(o: RigOutcome) -> Section | None:
     """Section on the poses and the flatness of the screens; None if the project has no screens."""
     joint = o.steps.joint
     drawings, rows = [], []
@@ -66,7 +66,7 @@ def screens(o: RigOutcome) -> Section | None:
     return Section("Screens", words, drawings, PageTable(heads, rows))
 
 
-def beams(o: RigOutcome, nominal: Rig) -> Section:
+def beams_section(o: RigOutcome, nominal: Rig) -> Section:
     """Section on the beams, compared with the nominal ones, and on the pose of the stand."""
     joint = o.steps.joint
     direction, offset = beam_sigmas(joint)
@@ -102,7 +102,7 @@ def beams(o: RigOutcome, nominal: Rig) -> Section:
     return Section("Beams", words, (), PageTable(heads, rows))
 
 
-def cameras(o: RigOutcome) -> Section:
+def cameras_section(o: RigOutcome) -> Section:
     """Section on the poses of the cameras and the change of their focal lengths."""
     joint = o.steps.joint
     sigmas = dict(zip(joint.covariance.names, np.sqrt(np.diagonal(joint.covariance.matrix)), strict=True))
@@ -143,7 +143,7 @@ def _centre_jacobian(R: Array, t: Array) -> Array:
     return np.array([[0, -c[2], c[1]], [c[2], 0, -c[0]], [-c[1], c[0], 0]])
 
 
-def correlations(o: RigOutcome) -> Section:
+def correlations_section(o: RigOutcome) -> Section:
     """Section on the correlations of the parameters."""
     C = o.steps.joint.covariance
     sigma = np.sqrt(np.diagonal(C.matrix))
@@ -161,13 +161,13 @@ def correlations(o: RigOutcome) -> Section:
 
 
 def _short_name(name: str) -> str:
-    """`camera left fx` for `cameras.left.fx`."""
+    """`camera left fx` for `cameras_section.left.fx`."""
     kind, thing, parameter = split(name)
     bare = parameter.removesuffix("_per_m").removesuffix("_rad").removesuffix("_m")
     return f"{kind.removesuffix('s')} {thing} {bare}"
 
 
-def lab(o: RigOutcome) -> Section:
+def lab_section(o: RigOutcome) -> Section:
     """Section with three views of the lab."""
     joint = o.steps.joint
     body = (
