@@ -523,7 +523,7 @@ def rig(project: Path, out: Path) -> None:
 )
 @click.option("--pose", type=_ANY_PATH, help="... at a pose that is known: a CSV like truth/pose.csv.")
 @click.option("--history", type=_ANY_PATH, help="A CSV that this check is added to, for the trend.")
-def daily(
+def check_calibration(
     rig: Path,
     out: Path,
     points: Path | None,
@@ -539,8 +539,9 @@ def daily(
         beampose calibrate check results/rig/rig.yaml --points points.csv --survey survey.csv --out results/today
     """
     from lab.calibrate.drift_check.drift_check import check_drift
+    from lab.calibrate.drift_check.drift_inputs import DriftInputs
 
-    _concluded(check_drift(rig, out, points, run_folder, survey=survey, pose=pose, history=history))
+    _concluded(check_drift(rig, out, DriftInputs(points, run_folder, survey, pose), history=history))
 
 
 @calibrate.command()

@@ -1,1 +1,1 @@
-"""The calibration workflow: files in, calibrations and their reports out."""
+"""Calibration commands: each reads files, calibrates, and writes the result with a report."""

@@ -1,1 +1,1 @@
-"""`beampose plan`: what a rig will see and how well it will measure."""
+"""`beampose plan`: visibility and expected uncertainty of a rig before it is built."""

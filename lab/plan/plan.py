@@ -1,4 +1,4 @@
-"""What a rig will see and how well it will measure, before it is built: `beampose plan`."""
+"""`beampose plan`: visibility and expected uncertainty of a rig before it is built."""
 
 from __future__ import annotations
 
@@ -23,22 +23,22 @@ TABLE, EFFECTS, REPORT = "plan.csv", "effects.csv", "report.html"
 
 @dataclass(frozen=True, slots=True)
 class PlanOutcome:
-    """What was planned, and where it is written."""
+    """Result of a plan."""
 
     verdict: Level
     poses: int
-    measured: float  # share of the poses
-    sigma_m: float  # along the worst direction, median over the solved poses
-    sigma_deg: float
+    measured: float  # share of the poses that can be measured
+    sigma_m: float  # position, along the worst direction, median over the observable poses
+    sigma_deg: float  # attitude, likewise
     out: Path
 
     @property
     def exit_status(self) -> int:
-        """0, or 4 where the rig is not fit for the range: a gate, as of a run."""
+        """0, or 4 if the rig does not suit the range of poses (as the quality gate of a run)."""
         return QUALITY_GATE_FAILED if self.verdict is Level.FAIL else 0
 
     def line(self) -> str:
-        """For the command line."""
+        """One line for the terminal."""
         sigmas = f"sigma {angle(self.sigma_deg)} and {length(self.sigma_m)} (worst direction, median of the poses)"
         return (
             f"plan: {self.verdict.name}, {percent(self.measured)} of {self.poses} poses can be measured, {sigmas};"
@@ -47,10 +47,12 @@ class PlanOutcome:
 
 
 def plan_rig(rig_path: Path, out: Path, options: PlanOptions | None = None) -> PlanOutcome:
-    """Plan a rig into the folder `out`: plan.csv, effects.csv and report.html.
+    """Plan a rig; write plan.csv, effects.csv and report.html into the folder `out`.
 
-    The rig file's covariance is used where it has one, else the errors that the options expect. Raises InputError for a
-    rig that cannot be read, options that make no sense, or a folder with something else in it.
+    Calibration errors come from the rig file's covariance, or from the options where the file states none.
+
+    Raises:
+        InputError: for a rig that cannot be read, invalid options, or a folder with other files in it.
     """
     options = PlanOptions() if options is None else options
     refuse_foreign(out, _is_ours)
@@ -69,10 +71,10 @@ def _is_ours(folder: Path) -> bool:
 
 
 def plan_of(rig_path: Path, options: PlanOptions) -> Plan:
-    """The plan of a rig file. Raises InputError."""
+    """The plan of a rig file. Raises InputError if the file cannot be read."""
     file = load_rig_file(Path(rig_path))
     stated = joint_covariance(file.rig, file.covariances, rig_path)
     target = file.covariances.get(TARGET)
-    whole = target is not None and any(n.startswith(("cameras.", "screens.")) for n in target.parameters)
-    errors, sources = expected_errors(file.rig, options.expected, stated, whole)
+    is_joint = target is not None and any(n.startswith(("cameras.", "screens.")) for n in target.parameters)
+    errors, sources = expected_errors(file.rig, options.expected, stated, is_joint)
     return plan_grid(file.rig, errors, sources, options)

@@ -1,4 +1,4 @@
-"""Drawings of a plan: a value for each cell of a grid, and shares as bars."""
+"""Drawings of a plan: values on a grid as coloured cells, and shares as bars."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from lab.report.plot import svg
 from lab.report.plot.axes import number
 
 _LEFT, _TOP, _WIDE, _HIGH = 58.0, 24.0, 468.0, 224.0
-_MOST_NUMBERED = 15  # columns: in more there is no room for a number in a cell
+_MAX_LABELLED_COLUMNS = 15  # with more columns the cells are too small for a number
 
 
 def cell_map(
@@ -26,22 +26,22 @@ def cell_map(
     *,
     x_name: str,
     y_name: str,
-    dark_is_low: bool = False,
+    low_is_bad: bool = False,
 ) -> str:
-    """A coloured cell with its number for each place of a grid.
+    """Values on a grid as coloured cells with their numbers.
 
-    values (rows, columns): at y (rows,), growing upwards, and x (columns,); nan is left empty, with a cross. Dark is
-    bad: large values, or small ones with `dark_is_low`.
+    values (rows, columns): at y (rows,), increasing upwards, and x (columns,); nan is an empty cell with a cross. Deep
+    colours mark bad values: large ones, or small ones with `low_is_bad`.
     """
     rows, columns = values.shape
     wide, high = _WIDE / columns, _HIGH / rows
     finite = values[np.isfinite(values)]
     lo, hi = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
-    if lo > 0 and hi > 6 * lo:  # else the few largest would leave all others in one colour
+    if lo > 0 and hi > 6 * lo:  # logarithmic, otherwise a few large values would give all others the same colour
         share = np.log(values / lo) / np.log(hi / lo)
     else:
         share = (values - lo) / (hi - lo) if hi > lo else np.zeros_like(values)
-    share = 0.12 + 0.76 * (1 - share if dark_is_low and hi > lo else share)  # no cell at the very ends of the colours
+    share = 0.12 + 0.76 * (1 - share if low_is_bad and hi > lo else share)  # avoids the ends of the colour scale
     out = [svg.text(_LEFT, 15, title, "title")]
     for j in range(rows):
         top = _TOP + (rows - 1 - j) * high
@@ -55,7 +55,7 @@ def cell_map(
                 continue
             fill = hex_colour(colours(np.array(share[j, i])))
             out.append(f'<rect {box} fill="{fill}" stroke="var(--line)" stroke-width="0.5"/>')
-            if columns <= _MOST_NUMBERED:
+            if columns <= _MAX_LABELLED_COLUMNS:
                 ink = "#fff" if share[j, i] > 0.5 else "#1c2126"
                 out.append(svg.text(*middle, _cell(value), "mid", f"fill:{ink}"))
     bottom = _TOP + _HIGH
@@ -74,7 +74,7 @@ def cell_map(
 
 
 def share_bars(parts: Sequence[tuple[str, float]], title: str) -> str:
-    """Names and shares (of 1; below 0 drawn paler) as bars, in the given order."""
+    """Named shares (fractions; negative ones are drawn paler) as bars, in the given order."""
     left, wide, step = 132.0, 330.0, 22.0
     out = [svg.text(8, 14, title, "title")]
     scale = wide / max(max((abs(s) for _, s in parts), default=1.0), 1e-9)

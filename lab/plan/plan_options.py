@@ -1,4 +1,4 @@
-"""What a plan of a rig assumes: the poses, the noise of a spot, and what calibrations usually reach."""
+"""Options of a plan: the grid of poses, the noise of a spot, the goals and the expected calibration errors."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from lab.errors import InputError
 from lab.files.text.fields import dataclass_from_yaml
 from lab.files.text.yaml_text import did_you_mean
 
-MOST_POSES = 100_000  # some 300 MB of memory and a table of 70 MB
+MAX_POSES = 100_000  # some 300 MB of memory and a table of 70 MB
 
 
 @dataclass(frozen=True, slots=True)
 class Range:
-    """Evenly spaced values of one coordinate, both ends included; one value is the middle."""
+    """Evenly spaced values of one coordinate, both ends included; a single value is the middle."""
 
     first: float
     last: float
     count: int
 
     def values(self) -> Array:
-        """(count,)"""
+        """The values (count,)."""
         return np.linspace(self.first, self.last, self.count) if self.count > 1 else np.array([self.middle])
 
     @property
@@ -39,21 +39,20 @@ class Range:
 
 @dataclass(frozen=True, slots=True)
 class PlanOptions:
-    """A plan's poses, the noise of a spot, what the rig is meant for, and the calibration errors to expect."""
+    """Options of a plan."""
 
-    x_m: Range = Range(-0.3, 0.3, 5)  # of the body's origin in world
+    x_m: Range = Range(-0.3, 0.3, 5)  # position of the body's origin in world
     y_m: Range = Range(-0.3, 0.3, 5)
     z_m: Range = Range(-0.3, 0.3, 3)
     yaw_deg: Range = Range(-20.0, 20.0, 7)
     pitch_deg: Range = Range(-20.0, 20.0, 7)
     roll_deg: Range = Range(-20.0, 20.0, 3)
-    sigma_px: float = 0.1  # of a spot's coordinates: clean spots are found to 0.05 px, speckled ones to 0.1
-    edge_px: float = 4.0  # nearer to the edge a spot of the usual 1 px sigma is cut: not counted as seen
-    goal_deg: float | None = None  # attitude sigma, worst direction, that the rig is meant to reach ...
+    sigma_px: float = 0.1  # of a spot's coordinates: 0.05 px for clean spots, 0.1 px with speckle
+    edge_px: float = 4.0  # minimum distance to the picture's edge: nearer, a spot of the usual 1 px sigma is truncated
+    goal_deg: float | None = None  # required attitude sigma along the worst direction ...
     goal_m: float | None = None  # ... and position sigma
-    expected: ExpectedErrors = field(
-        default_factory=ExpectedErrors
-    )  # of the calibrations, where the rig file states no covariance
+    # Calibration errors where the rig file states no covariance.
+    expected: ExpectedErrors = field(default_factory=ExpectedErrors)
 
     def __post_init__(self) -> None:
         for name, r in self.ranges.items():
@@ -64,8 +63,8 @@ class PlanOptions:
             _check_size(f"expected.{f.name}", getattr(self.expected, f.name))
         if self.sigma_px <= 0:
             raise InputError(f"sigma_px: expected a number above 0, got {self.sigma_px}")
-        if self.count > MOST_POSES:
-            raise InputError(f"expected at most {MOST_POSES} poses, got {self.count}: lower some counts")
+        if self.count > MAX_POSES:
+            raise InputError(f"expected at most {MAX_POSES} poses, got {self.count}: reduce some counts")
 
     @property
     def ranges(self) -> dict[str, Range]:
@@ -74,11 +73,11 @@ class PlanOptions:
 
     @property
     def count(self) -> int:
-        """How many poses the grid has."""
+        """Number of poses of the grid."""
         return int(np.prod([r.count for r in self.ranges.values()]))
 
     def coordinates(self) -> Array:
-        """The grid (count, 6): x, y, z (m), yaw, pitch, roll (deg), the last running fastest."""
+        """The grid (count, 6): x, y, z (m), yaw, pitch, roll (deg), the last varying fastest."""
         return np.array(list(product(*(r.values() for r in self.ranges.values()))))
 
 
@@ -86,7 +85,7 @@ Plan: TypeAlias = GridPlan[PlanOptions]
 
 
 def _check_size(name: str, value: float | None) -> None:
-    """Raises InputError for a number below 0, or none at all."""
+    """Raise InputError for a number that is negative or not finite."""
     if value is not None and not (np.isfinite(value) and value >= 0):
         raise InputError(f"{name}: expected a number of 0 or more, got {value}")
 
@@ -108,18 +107,19 @@ def options_of(
     goal_m: float | None = None,
     expected: Mapping[str, Any] | None = None,
 ) -> PlanOptions:
-    """Options from what a command gives: ranges (first, last, count) by name, the rest where it is not None.
+    """Options from the values of the command line: ranges (first, last, count) by name; None keeps a default.
 
-    Raises InputError for a name or a number that does not fit.
+    Raises:
+        InputError: for an unknown name or an invalid number.
     """
-    usual = PlanOptions()
+    default = PlanOptions()
     for name in ranges:
-        if name not in usual.ranges:
-            raise InputError(f"--range: expected a coordinate, got {name!r}{did_you_mean(name, usual.ranges)}")
-    chosen: dict[str, Any] = {**usual.ranges, **{name: Range(*r) for name, r in ranges.items()}}
+        if name not in default.ranges:
+            raise InputError(f"--range: expected a coordinate, got {name!r}{did_you_mean(name, default.ranges)}")
+    chosen: dict[str, Any] = {**default.ranges, **{name: Range(*r) for name, r in ranges.items()}}
     return PlanOptions(
         **chosen,
-        sigma_px=usual.sigma_px if sigma_px is None else sigma_px,
+        sigma_px=default.sigma_px if sigma_px is None else sigma_px,
         goal_deg=goal_deg,
         goal_m=goal_m,
         expected=dataclass_from_yaml(ExpectedErrors, dict(expected or {}), "--expect"),

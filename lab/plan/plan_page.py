@@ -1,4 +1,4 @@
-"""The page of a plan: what is in view, what sigma to expect where, and what makes it."""
+"""Report of a plan: visibility, expected sigmas over the range of poses, and the error budget."""
 
 from __future__ import annotations
 
@@ -15,7 +15,15 @@ from geometry.arrays import Array
 from lab import number_format
 from lab.number_format import angle, length, percent
 from lab.plan.plan_drawings import cell_map, share_bars
-from lab.plan.plan_findings import JOINED, TOGETHER, advice, axis_words, budget_lines, median_sigma, worst_first
+from lab.plan.plan_findings import (
+    CORRELATION,
+    TOTAL_CALIBRATION,
+    advice,
+    axis_words,
+    budget_lines,
+    median_sigma,
+    worst_first,
+)
 from lab.plan.plan_options import Plan, Range
 from lab.report.calibration.calibration_maps import heat_map
 from lab.report.calibration.calibration_page import (
@@ -29,8 +37,8 @@ from lab.report.calibration.calibration_page import (
 from lab.report.calibration.calibration_scene import rig_things, scene_views
 
 _WORST_ROWS, _EFFECT_ROWS = 24, 20
-_FINE = 41  # places along each side of a smooth map
-# Pairs of coordinates with a map: first across, second up.
+_FINE = 41  # grid points along each side of a smooth map
+# Pairs of coordinates with maps: horizontal and vertical axis.
 _PLANES = (("yaw_deg", "pitch_deg"), ("x_m", "y_m"), ("x_m", "z_m"))
 
 
@@ -43,10 +51,10 @@ def write_plan_page(plan: Plan, found: Sequence[Finding], rig_path: Path, folder
         findings=found,
         key_figures=_key_figures(plan),
         sections=[
-            Section("What to improve first", advice(plan) or "No pose can be solved: there is nothing to weigh yet."),
+            Section("What to improve first", advice(plan) or "No pose is observable: there is no error budget."),
             _budget(plan),
             *_maps(plan),
-            _sight(plan),
+            _visibility(plan),
             _worst(plan),
             _effects(plan),
             _scene(plan),
@@ -61,7 +69,7 @@ def _key_figures(plan: Plan) -> list[tuple[str, str, str]]:
     m, deg = median_sigma(plan)
     solved = plan.worst[plan.observable]
     top = solved.max(axis=0).tolist() if len(solved) else [np.nan, np.nan]
-    lines = [line for line in budget_lines(plan) if line.name != JOINED]
+    lines = [line for line in budget_lines(plan) if line.name != CORRELATION]
     figures = [
         ("Measurable", percent(float(plan.measured.mean())), f"of {len(plan.status)} poses"),
         ("Attitude", angle(deg), f"median of 1 sigma; up to {angle(top[1])}"),
@@ -82,22 +90,25 @@ def _budget(plan: Plan) -> Section:
         ]
         for line in lines
     ]  # fmt: skip
-    rows.append(["all together", "", 1e3 * deg, "100 %", None, 1e3 * m, "100 %", None])
+    rows.append(["total", "", 1e3 * deg, "100 %", None, 1e3 * m, "100 %", None])
     heads = (
-        "contributor", "from", "attitude sigma (mdeg)", "share", "all if halved (mdeg)", "position sigma (mm)",
-        "share", "all if halved (mm)",
+        "contribution", "source", "attitude sigma (mdeg)", "share", "total if halved (mdeg)", "position sigma (mm)",
+        "share", "total if halved (mm)",
     )  # fmt: skip
     words = [
-        "Sigmas along the direction in which each pose is known worst: the median over the poses that can be solved."
-        " Shares are of the variance, mean over the poses; a part's sigma is its share of the median, and parts add as"
+        "Sigmas along the worst direction of each pose, median over the observable poses. Shares are of the variance,"
+        " mean over the poses; the sigma of a contribution is its share of the median, and contributions add as"
         " squares."
     ]
-    if any(line.name == JOINED for line in lines):
-        words.append(f"{JOINED[0].upper()}{JOINED[1:]}: covariance between groups, below zero where errors cancel.")
-    if any(line.name == TOGETHER for line in lines):
+    if any(line.name == CORRELATION for line in lines):
         words.append(
-            "The rig file comes from a joint calibration: its errors of lenses, places and beams cancel each other in"
-            " large part, so that single shares would say nothing."
+            f"{CORRELATION[0].upper()}{CORRELATION[1:]}: from the covariance between groups, negative where errors"
+            " cancel."
+        )
+    if any(line.name == TOTAL_CALIBRATION for line in lines):
+        words.append(
+            "The rig file comes from a joint calibration: its errors of lenses, poses and beams mostly cancel each"
+            " other, so that shares of single groups have no meaning."
         )
     drawings = [
         PageDrawing(share_bars([(x.name, x.share_deg) for x in lines], "Attitude: shares of the variance")),
@@ -118,7 +129,7 @@ def _maps(plan: Plan) -> list[Section]:
 
 
 def _plane(plan: Plan, across: int, up: int) -> Section:
-    """Maps over two of the six coordinates: a fine one with the others at their middle, and the worst of the others."""
+    """Maps over two of the six coordinates: a fine one with the others at their middle, and the worst over them."""
     names, ranges = list(plan.options.ranges), list(plan.options.ranges.values())
     a, b = ranges[across], ranges[up]
     short = [n.split("_")[0] for n in names]
@@ -129,7 +140,7 @@ def _plane(plan: Plan, across: int, up: int) -> Section:
     def smooth(k: int, what: str, unit: str) -> PageDrawing:
         values = 1e3 * fine[..., k]
         extent = (a.first, a.last, b.first, b.last)
-        title = f"{what} sigma ({unit}), the others in the middle of their ranges"
+        title = f"{what} sigma ({unit}), other coordinates in the middle"
         return PageDrawing(
             heat_map(
                 values, extent, title, unit, x_name=x_name, y_name=y_name, y_down=False, equal=False,
@@ -137,35 +148,35 @@ def _plane(plan: Plan, across: int, up: int) -> Section:
             )
         )  # fmt: skip
 
-    def cells(values: Array, how: str, title: str, dark_is_low: bool = False) -> PageDrawing:
-        grid = _gathered(plan, values, across, up, how)
+    def cells(values: Array, statistic: str, title: str, low_is_bad: bool = False) -> PageDrawing:
+        grid = _reduced(plan, values, across, up, statistic)
         return PageDrawing(
-            cell_map(grid, a.values(), b.values(), title, x_name=x_name, y_name=y_name, dark_is_low=dark_is_low)
+            cell_map(grid, a.values(), b.values(), title, x_name=x_name, y_name=y_name, low_is_bad=low_is_bad)
         )
 
     spots = plan.seen.sum(axis=1).astype(float)
     drawings = [
         smooth(1, "Attitude", "mdeg"),
         smooth(0, "Position", "mm"),
-        cells(plan.worst[:, 1] * 1e3, "largest", "Attitude sigma (mdeg), the worst of all others"),
-        cells(plan.worst[:, 0] * 1e3, "largest", "Position sigma (mm), the worst of all others"),
+        cells(plan.worst[:, 1] * 1e3, "largest", "Attitude sigma (mdeg), maximum over the other coordinates"),
+        cells(plan.worst[:, 0] * 1e3, "largest", "Position sigma (mm), maximum over the other coordinates"),
     ]
-    words = ["1 sigma along the worst direction. Hatched or crossed: no pose there can be solved."]
-    fewest = _gathered(plan, spots, across, up, "least")
+    words = ["1 sigma along the worst direction. Hatched or crossed: not observable."]
+    fewest = _reduced(plan, spots, across, up, "least")
     if fewest.min() < fewest.max():
-        drawings.append(cells(spots, "least", "Spots in view, the fewest of all others", dark_is_low=True))
+        drawings.append(cells(spots, "least", "Spots in view, minimum over the other coordinates", low_is_bad=True))
     else:
         words.append(
-            f"Everywhere here some pose sees no more than {fewest.min():.0f} spots, of {len(plan.views)} views."
+            f"The minimum number of spots in view is {fewest.min():.0f} everywhere, of {len(plan.views)} views."
         )
     if not plan.measured.all():
         share = np.where(plan.measured, 100.0, 0.0)
-        drawings.append(cells(share, "mean", "Poses that can be measured (%)", dark_is_low=True))
+        drawings.append(cells(share, "mean", "Poses that can be measured (%)", low_is_bad=True))
     return Section(f"Over {short[across]} and {short[up]}", words, drawings)
 
 
 def _limits(values: Array) -> tuple[float, float] | None:
-    """The range of the colours: never less than a quarter of the value, so that what hardly varies looks so."""
+    """Range of the colours: at least a quarter of the value, so that small variations are not exaggerated."""
     finite = values[np.isfinite(values)]
     if not finite.size or finite.max() > 1.25 * finite.min():
         return None
@@ -175,28 +186,28 @@ def _limits(values: Array) -> tuple[float, float] | None:
 def fine_map(plan: Plan, across: int, up: int) -> Array:
     """Position (m) and attitude (deg) sigma (rows, columns, 2) over two coordinates, the others in the middle.
 
-    Rows run over coordinate `up`, columns over `across`.
+    Rows are values of coordinate `up`, columns of `across`.
     """
     fixed: dict[str, Any] = {
         name: replace(r, count=_FINE) if i in (across, up) else Range(r.middle, r.middle, 1)
         for i, (name, r) in enumerate(plan.options.ranges.items())
     }
     fine = plan_grid(plan.rig, plan.errors, plan.sources, replace(plan.options, **fixed))
-    values = fine.worst.reshape(_FINE, _FINE, 2)  # the later of the two coordinates runs along the second axis
+    values = fine.worst.reshape(_FINE, _FINE, 2)  # the later of the two coordinates varies along the second axis
     return np.swapaxes(values, 0, 1) if across < up else values
 
 
-def _gathered(plan: Plan, values: Array, across: int, up: int, how: str) -> Array:
-    """Values (k,) of all poses as a map (rows of `up`, columns of `across`); nan where there is none."""
+def _reduced(plan: Plan, values: Array, across: int, up: int, statistic: str) -> Array:
+    """A statistic of values (k,) of all poses over the other coordinates: a map (`up`, `across`); nan: no value."""
     counts = [r.count for r in plan.options.ranges.values()]
     cube = np.moveaxis(values.reshape(counts), (up, across), (0, 1)).reshape(counts[up], counts[across], -1)
     empty = np.asarray(np.isnan(cube).all(axis=-1))
     safe = np.where(empty[..., None], 0.0, cube)
-    ways: dict[str, Callable[..., Array]] = {"largest": np.nanmax, "least": np.nanmin, "mean": np.nanmean}
-    return np.where(empty, np.nan, ways[how](safe, axis=-1))
+    functions: dict[str, Callable[..., Array]] = {"largest": np.nanmax, "least": np.nanmin, "mean": np.nanmean}
+    return np.where(empty, np.nan, functions[statistic](safe, axis=-1))
 
 
-def _sight(plan: Plan) -> Section:
+def _visibility(plan: Plan) -> Section:
     rows: list[list[object]] = []
     for i, (camera, spot) in enumerate(plan.views):
         known = plan.margin_px[:, i][np.isfinite(plan.margin_px[:, i])]
@@ -204,11 +215,11 @@ def _sight(plan: Plan) -> Section:
         off = float(np.isnan(plan.margin_px[:, i]).mean())
         rows.append([camera, spot, percent(float(plan.seen[:, i].mean())), percent(off), *margins])
     words = (
-        f"A spot is in view where it lies {plan.options.edge_px:g} px or more inside its picture. Margins are to the"
-        " picture's edge, negative outside: by so much a lens or a pose of the camera must give way."
+        f"A spot is in view if it is at least {plan.options.edge_px:g} px inside of its picture. A margin is the"
+        " distance to the picture's edge, negative outside."
     )
-    heads = ("camera", "spot", "in view", "without projection", "median margin (px)", "least margin (px)")
-    return Section("What is in view", words, (), PageTable(heads, rows))
+    heads = ("camera", "spot", "in view", "without projection", "median margin (px)", "smallest margin (px)")
+    return Section("Visibility", words, (), PageTable(heads, rows))
 
 
 def _worst(plan: Plan) -> Section:
@@ -226,10 +237,10 @@ def _worst(plan: Plan) -> Section:
             ]
         )  # fmt: skip
     heads = (
-        "x y z (m)", "yaw pitch roll (deg)", "status", "spots", "least margin (px)", "attitude", "about (body)",
+        "x y z (m)", "yaw pitch roll (deg)", "status", "spots", "smallest margin (px)", "attitude", "about (body)",
         "position", "along (world)", "condition",
     )  # fmt: skip
-    words = "Those that cannot be solved first, then by attitude sigma. All poses are in plan.csv."
+    words = "Poses that are not observable first, then by attitude sigma. All poses are in plan.csv."
     return Section("Worst poses", words, (), PageTable(heads, rows))
 
 
@@ -238,19 +249,19 @@ def _three(values: Sequence[float], decimals: int) -> str:
 
 
 def _effects(plan: Plan) -> Section:
-    size = np.linalg.norm(plan.thing_median[:, 3:], axis=1)
+    attitude = np.linalg.norm(plan.thing_median[:, 3:], axis=1)
     rows: list[list[object]] = []
-    for i in np.argsort(-size, kind="stable").tolist()[:_EFFECT_ROWS]:
+    for i in np.argsort(-attitude, kind="stable").tolist()[:_EFFECT_ROWS]:
         thing, group, _ = plan.errors.things[i]
         kind, name = thing.split(".", 1)
         rows.append([f"{kind.removesuffix('s')} {name}", group, *(float(v) * 1e3 for v in plan.thing_median[i])])
-    heads = ("of", "errors", *(f"{a.split('_')[0]} ({_milli(a)})" for a in AXES))
+    heads = ("part", "errors", *(f"{a.split('_')[0]} ({_milli(a)})" for a in AXES))
     words = (
-        "What the errors of one camera, screen or beam do to the pose, median over the poses, the largest"
-        " effects on the attitude first. A lens's errors take its camera's pose along where that is to come from a"
-        " resection. The effect of every single number is in effects.csv."
+        "Effect of the errors of one camera, screen or beam on the pose, median over the poses, the largest effects on"
+        " the attitude first. If a camera's pose comes from a resection, the errors of its lens include their effect on"
+        " this pose. effects.csv lists the effect of every parameter."
     )
-    return Section("What each calibration error does", words, (), PageTable(heads, rows))
+    return Section("Effects of the calibration errors", words, (), PageTable(heads, rows))
 
 
 def _milli(axis: str) -> str:
@@ -272,20 +283,19 @@ def _assumptions(plan: Plan) -> Section:
     )  # fmt: skip
     words = [
         f"Poses (world_from_body): {ranges}.",
-        f"A spot's coordinates err by {options.sigma_px:g} px (1 sigma), independently. The pose is taken to be solved"
-        " as a run does it, with noise and calibration errors weighed together; errors are carried to first order.",
+        f"The coordinates of a spot have independent errors of {options.sigma_px:g} px (1 sigma). The pose is estimated"
+        " as in a run, weighted by noise and calibration errors; errors are propagated to first order.",
     ]
-    told = [g for g, source in plan.sources.items() if source == "rig file"]
-    if told:
-        words.append(f"From the rig file's covariance: {', '.join(told)}.")
+    stated = [g for g, source in plan.sources.items() if source == "rig file"]
+    if stated:
+        words.append(f"From the rig file's covariance: {', '.join(stated)}.")
     if any(source == "assumed" for source in plan.sources.values()):
         words.append(
-            f"Assumed, where the rig file states nothing: focal lengths to {e.focal_relative:g} of themselves,"
-            f" principal points to {e.centre_px:g} px, distortion to {e.distortion_px:g} px at the corners; each"
-            f" camera's pose by resection on {e.dots} dots of its screen, surveyed to {e.dot_survey_m * 1e3:g} mm"
-            f" and seen to {e.dot_px:g} px; screens to {e.screen_position_m * 1e3:g} mm and"
-            f" {e.screen_rotation_deg:g}°; beams to {e.beam_direction_arcsec:g}″ and"
-            f" {e.beam_point_m * 1e3:g} mm. Independent of each other, except that a"
-            " lens's error is partly taken up by its camera's resection."
+            f"Assumed sigmas where the rig file states none: focal length {e.focal_relative:g} (relative), principal"
+            f" point {e.centre_px:g} px, distortion {e.distortion_px:g} px at the corners; pose of each camera by"
+            f" resection on {e.dots} control points of its screen, surveyed to {e.dot_survey_m * 1e3:g} mm and measured"
+            f" to {e.dot_px:g} px; screens {e.screen_position_m * 1e3:g} mm and {e.screen_rotation_deg:g}°; beams"
+            f" {e.beam_direction_arcsec:g}″ and {e.beam_point_m * 1e3:g} mm. These errors are independent, except that"
+            " the resection of a camera compensates part of the error of its lens."
         )
-    return Section("What was assumed", words)
+    return Section("Assumptions", words)

@@ -1,17 +1,17 @@
-"""A plan's tables: plan.csv, a row for each pose, and effects.csv, a row for each error of the calibration.
+"""Tables of a plan: plan.csv, a row for each pose, and effects.csv, a row for each error of the calibration.
 
-plan.csv: pose; x_m ... roll_deg, the grid; status (measured, vague: observable, but beyond what a run accepts, or not
-observable); spots_in_view; least_margin_px, of the spots in view to their picture's edge; closest_spots_px; condition
-(no unit: largest over least singular value of the whitened Jacobian with columns of length 1); sigma_x_m ...
-sigma_roll_deg, all errors together; worst_position_m, worst_attitude_deg and their axes (in world; in body); for each
-contributor the same six sigmas from it alone (noise_x_m, camera_intrinsics_x_m, ...); margin_CAMERA_SPOT_px, the
-distance to the picture's edge, negative outside, empty without projection.
+plan.csv: pose; x_m ... roll_deg, the grid; status (measured; vague: observable, but too uncertain for a run; not
+observable); spots_in_view; least_margin_px, smallest distance of a spot in view to its picture's edge;
+closest_spots_px; condition (no unit: ratio of the largest to the smallest singular value of the whitened Jacobian with
+columns of length 1); sigma_x_m ... sigma_roll_deg, from all errors; worst_position_m, worst_attitude_deg and their axes
+(in world; in body); for each contribution the same six sigmas from it alone (noise_x_m, camera_intrinsics_x_m, ...);
+margin_CAMERA_SPOT_px, the distance to the picture's edge, negative outside, empty without projection.
 
-effects.csv: parameter; group; sigma and its unit; median_x_m ... median_roll_deg, what that error alone does to the
-pose, median over the poses that can be solved; largest_x_m ..., the largest. First a row for each camera, screen and
-beam (`cameras.left`) with all its errors of one group together, without a sigma; then a row for each single number, as
-rig.yaml's covariance blocks name them. A lens's error takes its camera's pose along where that is to come from a
-resection. Single errors of one camera's pose hang together: each alone does more than all of them do.
+effects.csv: parameter; group; sigma and its unit; median_x_m ... median_roll_deg, effect of this error alone on the
+pose, median over the observable poses; largest_x_m ..., the maximum. First a row for each camera, screen and beam
+(`cameras.left`) with all its errors of one group combined, without a sigma; then a row for each parameter, named as in
+the covariance blocks of rig.yaml. If a camera's pose comes from a resection, the errors of its lens include their
+effect on this pose. The errors of one camera's pose are correlated: each alone has a larger effect than all combined.
 """
 
 from __future__ import annotations
@@ -56,24 +56,22 @@ def effect_columns() -> tuple[str, ...]:
 
 
 def write_plan(plan: Plan, path: Path) -> None:
-    """Write plan.csv, complete or not at all. Numbers that do not exist are empty."""
+    """Write plan.csv atomically. Undefined numbers are empty."""
     _write(path, plan_columns(plan), _plan_rows(plan))
 
 
 def write_effects(plan: Plan, path: Path) -> None:
-    """Write effects.csv, complete or not at all; errors that are not there (sigma 0) have no row."""
+    """Write effects.csv atomically; errors with sigma 0 have no row."""
     _write(path, effect_columns(), _effect_rows(plan))
 
 
 def _plan_rows(plan: Plan) -> Iterator[list[str]]:
     least = np.where(plan.seen, plan.margin_px, np.inf).min(axis=1)
-    left = [plan.coordinates]
-    middle = [least[:, None], plan.closest_px[:, None], plan.condition[:, None], plan.sigma, plan.worst]
-    middle += [plan.worst_axis.reshape(len(least), 6), plan.parts.reshape(len(least), -1), plan.margin_px]
-    before = np.concatenate(left, axis=1).tolist()
-    after = np.concatenate(middle, axis=1).tolist()
+    columns = [least[:, None], plan.closest_px[:, None], plan.condition[:, None], plan.sigma, plan.worst]
+    columns += [plan.worst_axis.reshape(len(least), 6), plan.parts.reshape(len(least), -1), plan.margin_px]
+    results = np.concatenate(columns, axis=1).tolist()
     spots = plan.seen.sum(axis=1).tolist()
-    for i, (coordinates, numbers) in enumerate(zip(before, after, strict=True)):
+    for i, (coordinates, numbers) in enumerate(zip(plan.coordinates.tolist(), results, strict=True)):
         yield [str(i), *map(_shown, coordinates), STATUS[plan.status[i]], str(spots[i]), *map(_shown, numbers)]
 
 
@@ -91,7 +89,7 @@ def _effect_rows(plan: Plan) -> Iterator[list[str]]:
 
 
 def unit_of(name: str) -> str:
-    """The unit of a rig's parameter; 1 for none."""
+    """Unit of a rig parameter; 1 if it has none."""
     parameter = name.rsplit(".", 1)[1]
     if parameter.endswith("_per_m"):
         return "1/m"
@@ -101,7 +99,7 @@ def unit_of(name: str) -> str:
 
 
 def _shown(value: float) -> str:
-    """Six digits: a planned sigma is not known to more."""
+    """A number with six digits, which exceeds the precision of a planned sigma; empty if not finite."""
     return f"{value:.6g}" if np.isfinite(value) else ""
 
 

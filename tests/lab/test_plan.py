@@ -1,4 +1,4 @@
-"""A plan of a rig: its tables are what the geometry says, its words follow from them, and bad input is told plainly."""
+"""Plan of a rig: tables that agree with the geometry, findings that follow from them, and refused input."""
 
 from __future__ import annotations
 
@@ -19,7 +19,15 @@ from lab.files.rig.camera_block import Covariance
 from lab.files.rig.rig_file import RigFile, load_rig_file, save_rig
 from lab.plan.plan import plan_of, plan_rig
 from lab.plan.plan_drawings import cell_map, share_bars
-from lab.plan.plan_findings import JOINED, TOGETHER, advice, axis_words, budget_lines, findings, worst_first
+from lab.plan.plan_findings import (
+    CORRELATION,
+    TOTAL_CALIBRATION,
+    advice,
+    axis_words,
+    budget_lines,
+    findings,
+    worst_first,
+)
 from lab.plan.plan_options import PlanOptions, Range
 from lab.plan.plan_page import fine_map
 from lab.plan.plan_tables import effect_columns, plan_columns
@@ -57,13 +65,13 @@ def test_a_plan_is_two_tables_and_a_page(rig_path, tmp_path):
     assert outcome.line().startswith("plan: PASS, 100 % of 162 poses can be measured, sigma ")
     assert (outcome.verdict, outcome.exit_status) == (Level.PASS, 0)
     page = (tmp_path / "plan" / "report.html").read_text()
-    for title in ("What to improve first", "Error budget", "Over yaw and pitch", "Over x and y", "What is in view",
-                  "Worst poses", "What each calibration error does", "What was assumed"):  # fmt: skip
+    for title in ("What to improve first", "Error budget", "Over yaw and pitch", "Over x and y", "Visibility",
+                  "Worst poses", "Effects of the calibration errors", "Assumptions"):  # fmt: skip
         assert f"<h2>{title}</h2>" in page
     assert "http" not in page.replace("http://www.w3.org", "")
 
 
-def test_a_row_says_what_the_geometry_says_of_its_pose(rig_path, tmp_path):
+def test_a_row_agrees_with_the_geometry_of_its_pose(rig_path, tmp_path):
     plan_rig(rig_path, tmp_path / "plan", SMALL)
     rig = load_rig_file(rig_path).rig
     model = SpotModel.of(rig)
@@ -83,7 +91,7 @@ def test_a_row_says_what_the_geometry_says_of_its_pose(rig_path, tmp_path):
         assert float(row["closest_spots_px"]) == pytest.approx(min(gaps), rel=1e-5)
 
 
-def test_noise_alone_gives_the_solvers_own_covariance(rig_path):
+def test_without_calibration_errors_the_sigmas_are_those_of_the_pose_solver(rig_path):
     plan = plan_of(rig_path, replace(SMALL, expected=NO_ERRORS))
     model = SpotModel.of(plan.rig)
     for i in range(0, len(plan.status), 31):
@@ -96,7 +104,7 @@ def test_noise_alone_gives_the_solvers_own_covariance(rig_path):
         assert plan.worst[i, 1] == pytest.approx(np.rad2deg(np.sqrt(np.linalg.eigvalsh(C[3:, 3:])[-1])), rel=1e-6)
 
 
-def test_squares_of_parts_and_of_things_add_up(rig_path):
+def test_the_variances_of_contributions_and_of_parts_of_the_rig_add_up(rig_path):
     plan = plan_of(rig_path, replace(SMALL, x_m=Range(0, 0, 1), y_m=Range(0, 0, 1), yaw_deg=Range(7, 7, 1),
                                      pitch_deg=Range(3, 3, 1), roll_deg=Range(0, 0, 1)))  # fmt: skip
     np.testing.assert_allclose((plan.parts**2).sum(axis=1), plan.sigma**2, rtol=1e-6)
@@ -109,16 +117,16 @@ def test_squares_of_parts_and_of_things_add_up(rig_path):
     assert sum(line.share_m for line in budget_lines(plan)) == pytest.approx(1)
 
 
-def test_the_advice_names_the_largest_contributor(rig_path):
-    loud = plan_of(rig_path, replace(SMALL, sigma_px=1.0))
-    assert advice(loud)[0].startswith("Attitude: noise makes 9")
-    bent = plan_of(rig_path, replace(SMALL, expected=ExpectedErrors(beam_direction_arcsec=300)))
-    assert advice(bent)[0].startswith("Attitude: beam directions makes 9")
-    assert "Calibrate the beams at more stand attitudes" in advice(bent)[0]
+def test_the_advice_names_the_largest_contribution(rig_path):
+    noisy = plan_of(rig_path, replace(SMALL, sigma_px=1.0))
+    assert advice(noisy)[0].startswith("Attitude: noise contributes 9")
+    poor_beams = plan_of(rig_path, replace(SMALL, expected=ExpectedErrors(beam_direction_arcsec=300)))
+    assert advice(poor_beams)[0].startswith("Attitude: beam directions contributes 9")
+    assert "Calibrate the beams at more stand attitudes" in advice(poor_beams)[0]
 
 
-def test_halving_the_largest_contributor_does_what_the_budget_says(rig_path):
-    """Within 3 %: the spots are weighed anew, and the median moves to another pose."""
+def test_halving_the_largest_contribution_has_the_effect_stated_in_the_budget(rig_path):
+    """Within 3 %: the weights of the spots change, and the median moves to another pose."""
     expected = ExpectedErrors(beam_direction_arcsec=60)
     before = budget_lines(plan_of(rig_path, replace(SMALL, expected=expected)))[0]
     assert before.name == "beam directions"
@@ -126,7 +134,7 @@ def test_halving_the_largest_contributor_does_what_the_budget_says(rig_path):
     assert np.median(after.worst[:, 1]) == pytest.approx(before.halved_deg, rel=0.03)
 
 
-def test_a_rigs_own_covariance_is_planned_with(rig_path):
+def test_the_covariance_of_the_rig_file_is_used(rig_path):
     file = load_rig_file(rig_path)
     names = tuple(f"beams.{b}.direction_{a}" for b in "ABC" for a in "xyz")
     joint = (*names, "cameras.left.cx", "cameras.left.rot_y_rad")
@@ -136,31 +144,31 @@ def test_a_rigs_own_covariance_is_planned_with(rig_path):
     plan = plan_of(rig_path, SMALL)
     assert set(plan.sources.values()) == {"rig file"}
     lines = {line.name: line for line in budget_lines(plan)}
-    assert set(lines) == {NOISE, "beam directions", "camera intrinsics", "camera poses", JOINED}
+    assert set(lines) == {NOISE, "beam directions", "camera intrinsics", "camera poses", CORRELATION}
     assert sum(line.share_m for line in lines.values()) == pytest.approx(1)
     save_rig(RigFile(file.rig, {"target": Covariance(names, C[:9, :9])}), rig_path)
     assert plan_of(rig_path, SMALL).sources["beam directions"] == "rig file"
     assert plan_of(rig_path, SMALL).sources["camera poses"] == "assumed"
 
 
-def test_groups_that_a_joint_calibration_ties_together_make_one_line(rig_path):
+def test_strongly_correlated_groups_are_combined_into_one_line(rig_path):
     file = load_rig_file(rig_path)
     joint = tuple(f"cameras.{c}.{p}" for c in ("left", "right") for p in ("cx", "rot_y_rad"))
     one = np.array([[9.0, 0.999 * 3.0 * 2.5e-3], [0.999 * 3.0 * 2.5e-3, 6.25e-6]])  # px and rad that cancel
     save_rig(RigFile(file.rig, {"target": Covariance(joint, np.kron(np.eye(2), one))}), rig_path)
     lines = {line.name: line for line in budget_lines(plan_of(rig_path, SMALL))}
-    assert set(lines) == {NOISE, TOGETHER}
+    assert set(lines) == {NOISE, TOTAL_CALIBRATION}
     assert sum(line.share_deg for line in lines.values()) == pytest.approx(1)
-    assert lines[TOGETHER].share_deg > 0.05
+    assert lines[TOTAL_CALIBRATION].share_deg > 0.05
 
 
-def test_poses_out_of_sight_are_said_plainly(rig_path, tmp_path):
+def test_unobservable_poses_are_reported(rig_path, tmp_path):
     wide = replace(SMALL, yaw_deg=Range(-80, 80, 9))
     found = findings(plan_of(rig_path, wide))
     assert found[0].level in (Level.WARN, Level.FAIL)
     assert "are not observable" in found[0].what
     assert "the share is largest at yaw −80° (100 %)" in found[0].what
-    assert advice(plan_of(rig_path, wide))[0].startswith("Sight before all: ")
+    assert advice(plan_of(rig_path, wide))[0].startswith("Visibility: ")
     plan = plan_of(rig_path, wide)
     assert np.isnan(plan.worst[~plan.observable]).all()
     first, *_ = worst_first(plan, 9)
@@ -174,25 +182,25 @@ def test_a_rig_that_sees_nothing_of_the_range_fails(rig_path, tmp_path):
     outcome = plan_rig(rig_path, tmp_path / "plan", away)
     assert (outcome.verdict, outcome.measured, outcome.exit_status) == (Level.FAIL, 0.0, 4)
     page = (tmp_path / "plan" / "report.html").read_text()
-    assert "No pose of the grid puts enough spots into the pictures." in page
-    assert "No pose can be solved" in page
+    assert "At no pose of the grid are enough spots in the pictures." in page
+    assert "No pose is observable" in page
     assert rows_of(tmp_path / "plan" / "plan.csv")[0]["sigma_x_m"] == ""
 
 
 @pytest.mark.parametrize(
     ("goal", "level"), [(1.0, Level.PASS), (1e-6, Level.FAIL)]
 )  # deg: reached by all, and by no pose
-def test_a_goal_is_weighed(goal, level, rig_path):
+def test_a_goal_is_tested(goal, level, rig_path):
     last = findings(plan_of(rig_path, replace(SMALL, goal_deg=goal)))[-1]
-    assert last.what.startswith("Attitude sigma is within ")
+    assert last.what.startswith("The attitude sigma is within ")
     assert last.level is level
 
 
-def test_spots_that_come_close_are_warned_of(rig_path):
+def test_close_spots_have_a_warning(rig_path):
     file = load_rig_file(rig_path)
     beams = {**file.rig.beams, "B": replace(file.rig.beams["A"], name="B", point=np.array([0, 0.002, 0]))}
     save_rig(replace(file.rig, beams=beams), rig_path)
-    assert any("come within 10 px of each other in 100 %" in f.what for f in findings(plan_of(rig_path, SMALL)))
+    assert any("are within 10 px of each other in 100 %" in f.what for f in findings(plan_of(rig_path, SMALL)))
 
 
 @pytest.mark.parametrize(
@@ -207,13 +215,13 @@ def test_spots_that_come_close_are_warned_of(rig_path):
         ({"x_m": Range(0, 1, 1000), "y_m": Range(0, 1, 1000)}, "expected at most 100000 poses"),
     ],
 )
-def test_options_that_make_no_sense_are_refused(options, words):
+def test_invalid_options_are_refused(options, words):
     with pytest.raises(InputError) as caught:
         PlanOptions(**options)
     assert words in str(caught.value)
 
 
-def test_nothing_is_written_when_the_rig_is_wrong_or_the_folder_is_not_ours(rig_path, tmp_path):
+def test_nothing_is_written_for_an_invalid_rig_or_into_another_folder(rig_path, tmp_path):
     (tmp_path / "bad.yaml").write_text("schema: beampose/rig/1\n")
     with pytest.raises(InputError, match="screens: expected a value"):
         plan_rig(tmp_path / "bad.yaml", tmp_path / "plan", SMALL)
@@ -227,7 +235,7 @@ def test_nothing_is_written_when_the_rig_is_wrong_or_the_folder_is_not_ours(rig_
     assert len(rows_of(tmp_path / "plan" / "plan.csv")) == 81
 
 
-def test_the_same_plan_in_pieces_of_any_size(rig_path, monkeypatch):
+def test_the_plan_does_not_depend_on_the_number_of_poses_computed_at_once(rig_path, monkeypatch):
     whole = plan_of(rig_path, SMALL)
     monkeypatch.setattr("calibration.budget.pose_grid._POSES_AT_ONCE", 7)
     pieces = plan_grid(whole.rig, whole.errors, whole.sources, SMALL)
@@ -237,7 +245,7 @@ def test_the_same_plan_in_pieces_of_any_size(rig_path, monkeypatch):
 
 
 @pytest.mark.parametrize(("across", "up"), [(3, 4), (4, 3), (0, 3)])
-def test_a_smooth_map_has_its_coordinates_where_the_axes_say(across, up, rig_path):
+def test_the_axes_of_a_smooth_map_are_its_coordinates(across, up, rig_path):
     plan = plan_of(rig_path, SMALL)
     values = fine_map(plan, across, up)
     ranges = list(SMALL.ranges.items())
@@ -248,25 +256,25 @@ def test_a_smooth_map_has_its_coordinates_where_the_axes_say(across, up, rig_pat
             place[name] = Range(*2 * (r.values()[end],), 1)
         alone = plan_of(rig_path, replace(SMALL, **place))
         np.testing.assert_allclose(values[row, column], alone.worst[0], rtol=1e-9)
-    assert abs(values[0, -1, 1] / values[-1, 0, 1] - 1) > 1e-4  # so that a swap would show
+    assert abs(values[0, -1, 1] / values[-1, 0, 1] - 1) > 1e-4  # otherwise swapped axes would pass
 
 
-def test_a_pose_too_vague_for_a_run_is_not_called_measured(rig_path):
+def test_a_pose_too_uncertain_for_a_run_does_not_count_as_measured(rig_path):
     plan = plan_of(rig_path, replace(SMALL, sigma_px=200.0))
     assert {STATUS[i] for i in plan.status} == {"vague"}
     assert plan.observable.all()
     first = findings(plan)[0]
-    assert "0 are not observable, 162 too vague to count as measured" in first.what
+    assert "0 are not observable, 162 are too uncertain to count as measured" in first.what
     assert first.level is Level.FAIL
 
 
-def test_directions_read_as_words():
+def test_directions_in_words():
     assert axis_words(np.array([0.02, 0.99, 0.0])) == "y"
     assert axis_words(np.array([0.8, 0.0, -0.6])) == "0.8 x − 0.6 z"
     assert axis_words(np.full(3, np.nan)) == "–"
 
 
-def test_drawings_show_every_number_and_cross_out_what_is_not_there():
+def test_drawings_show_every_number_and_cross_out_missing_ones():
     grid = np.array([[1.0, 2.0], [np.nan, 3000.0]])
     text = cell_map(grid, np.array([0.0, 1.0]), np.array([5.0, 6.0]), "a < b", x_name="x (m)", y_name="y (m)")
     assert all(f">{word}</text>" in text for word in ("1", "2", "3000", "×", "5", "6", "a &lt; b"))
@@ -275,7 +283,7 @@ def test_drawings_show_every_number_and_cross_out_what_is_not_there():
 
 @pytest.mark.slow
 def test_ten_thousand_poses_take_seconds(rig_path, tmp_path):
-    """2.6 s on two slow cores that are idle; the limit leaves room for others' work."""
+    """2.6 s on two idle cores; the limit allows for a busy machine."""
     start = time.perf_counter()
     assert plan_rig(rig_path, tmp_path / "plan").poses == 11025
     assert time.perf_counter() - start < 40

@@ -1,1 +1,1 @@
-"""`beampose calibrate beams`: recordings at stand positions to the lines of the beams."""
+"""`beampose calibrate beams`: the lines of the beams from recordings at stand positions."""

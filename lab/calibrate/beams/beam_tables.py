@@ -1,4 +1,4 @@
-"""The tables that a calibration of beams writes: beams.csv, angles.csv, residuals.csv."""
+"""Tables of a beam calibration: beams.csv, angles.csv, residuals.csv."""
 
 from __future__ import annotations
 
@@ -27,19 +27,19 @@ RESIDUAL_COLUMNS = (
 )  # fmt: skip
 
 
-def write_tables(c: BeamCalibration, drawing: Rig, positions: Sequence[str], folder: Path) -> None:
-    """Write the three. drawing: the rig with nominal beams; positions: the names of all positions."""
-    atomic_write_text(_beam_table(c, drawing), folder / BEAMS)
+def write_tables(c: BeamCalibration, nominal: Rig, positions: Sequence[str], folder: Path) -> None:
+    """Write the three tables. nominal: the rig with the beams as designed; positions: names of all positions."""
+    atomic_write_text(_beam_table(c, nominal), folder / BEAMS)
     atomic_write_text(_angle_table(c), folder / ANGLES)
     atomic_write_text(_residual_table(c, positions), folder / RESIDUALS)
 
 
-def _beam_table(c: BeamCalibration, drawing: Rig) -> str:
+def _beam_table(c: BeamCalibration, nominal: Rig) -> str:
     rows = []
-    away = from_drawing(c, drawing)
+    off = difference_from_nominal(c, nominal)
     for i, name in enumerate(c.rig.beams):
         numbers = [*c.lines.directions[i], *c.lines.points[i]]
-        figures = [direction_sigmas(c)[i] / ARCSEC, 1e3 * offset_sigmas(c)[i], away[i, 0] / ARCSEC, 1e3 * away[i, 1]]
+        figures = [direction_sigmas(c)[i] / ARCSEC, 1e3 * offset_sigmas(c)[i], off[i, 0] / ARCSEC, 1e3 * off[i, 1]]
         if c.undetermined:
             figures[:2] = [np.nan, np.nan]
         rows.append([csv_word(name), *(f"{v:.12g}" for v in numbers), *(_short(v) for v in figures)])
@@ -68,20 +68,20 @@ def _residual_table(c: BeamCalibration, positions: Sequence[str]) -> str:
 
 
 def used_positions(c: BeamCalibration, positions: Sequence[str]) -> list[str]:
-    """The names of the positions that the calibration counts, in its order."""
+    """Names of the positions that the calibration uses, in its order."""
     return [p for i, p in enumerate(positions) if i not in set(c.dropped)]
 
 
 def residuals_mm(c: BeamCalibration) -> Array:
-    """(N,): how far each spot lies from where it should, on its screen, mm."""
-    should = replace(c.spots, pixels=c.spots.pixels - c.fit.residuals_px)
-    return 1e3 * np.linalg.norm(world_points(c.rig, c.spots) - world_points(c.rig, should), axis=1)
+    """Distance (N,) on the screen between each measured spot and its prediction, mm."""
+    predicted = replace(c.spots, pixels=c.spots.pixels - c.fit.residuals_px)
+    return 1e3 * np.linalg.norm(world_points(c.rig, c.spots) - world_points(c.rig, predicted), axis=1)
 
 
-def from_drawing(c: BeamCalibration, drawing: Rig) -> Array:
-    """(k, 2): angle (rad) between each beam and its drawing, and the distance (m) across at the foot point."""
+def difference_from_nominal(c: BeamCalibration, nominal: Rig) -> Array:
+    """Difference (k, 2) of each beam from its design: angle (rad), and distance (m) across the beam at its point."""
     out = []
-    for i, b in enumerate(drawing.beams.values()):
+    for i, b in enumerate(nominal.beams.values()):
         d = c.lines.directions[i]
         gap = np.cross(c.lines.points[i] - b.point, b.direction)
         out.append((np.arctan2(np.linalg.norm(np.cross(d, b.direction)), d @ b.direction), np.linalg.norm(gap)))

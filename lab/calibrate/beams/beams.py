@@ -1,4 +1,4 @@
-"""`beampose calibrate beams`: each laser's own direction and offset, from recordings at positions of a stand."""
+"""`beampose calibrate beams`: direction and offset of each laser from recordings at positions of a stand."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ import numpy as np
 
 from calibration.beams.beam_findings import ARCSEC, UNDETERMINED, BeamGoals, beam_findings, direction_sigmas
 from calibration.beams.beams import BeamCalibration, self_calibrate
-from calibration.beams.beams import calibrate_beams as find_beams
+from calibration.beams.beams import calibrate_beams as solve_beams
 from calibration.beams.excitation import briefly
 from calibration.findings import Finding, Level, verdict
 from calibration.least_squares.adjustment import AdjustmentError
 from geometry.uncertainty.rig_parameters import RigCovariance
 from lab.calibrate.beams.beam_tables import BEAMS, write_tables
-from lab.calibrate.beams.recording_check import refuse_known_mistakes, refuse_repeated
+from lab.calibrate.beams.recording_check import check_no_duplicates, diagnose_failed_fit
 from lab.calibrate.beams.recordings import Recordings, read_recordings, stand_of
-from lab.calibrate.calibration_day import day_of, expired
+from lab.calibrate.calibration_date import calibration_date, expiry_date, expiry_findings
 from lab.errors import CalibrationError, InputError
 from lab.files.project.project import Project, load_project
 from lab.files.rig.calibration_state import CalibrationState
@@ -34,7 +34,7 @@ RIG = "rig.yaml"
 
 @dataclass(frozen=True, slots=True)
 class BeamsOutcome:
-    """How a calibration of beams ended."""
+    """Result of a beam calibration."""
 
     name: str
     out: Path
@@ -45,7 +45,7 @@ class BeamsOutcome:
 
     @property
     def exit_status(self) -> int:
-        """0, or 3 where the calibration must not be used."""
+        """0, or 3 if the calibration must not be used."""
         return CalibrationError.exit_status if self.level == Level.FAIL else 0
 
     def line(self) -> str:
@@ -56,11 +56,11 @@ class BeamsOutcome:
         what = f"{len(c.lines)} beams from {len(c.world_from_body.translation)} positions"
         if c.world_from_stand is None and c.angles:
             between = float(np.sqrt(np.mean([a.sigma**2 for a in c.angles]))) / ARCSEC
-            what += f" of which nothing is known, angles between beams to {between:.3g} arcsec RMS"
+            what += f" at unknown poses, angles between beams to {between:.3g} arcsec RMS"
         elif not c.undetermined:
             what += f", directions to {sigma:.3g} arcsec RMS"
         if not c.fit.kept.all():
-            what += f", {int(np.sum(~c.fit.kept))} of {len(c.fit.kept)} spots left out"
+            what += f", {int(np.sum(~c.fit.kept))} of {len(c.fit.kept)} spots excluded"
         warnings = sum(f.level == Level.WARN for f in self.findings)
         reason = f"; {warnings} warning{'s' if warnings > 1 else ''}, see report.html" if warnings else ""
         if self.level == Level.FAIL:
@@ -74,34 +74,36 @@ class BeamsOutcome:
 def calibrate_beams(
     project_path: Path, out: Path, rig: Path | None = None, today: datetime.date | None = None
 ) -> BeamsOutcome:
-    """Calibrate the beams of a project; writes rig.yaml (not where it fails), three tables and report.html into `out`.
+    """Calibrate the beams of a project; write three tables, report.html and, unless the verdict is FAIL, rig.yaml.
 
-    rig: the rig.yaml or screens.yaml with cameras and screens as calibrated and their covariances (None: `rig.yaml`
-    beside the project). The project need not state cameras, screens and target again: those of the rig serve; a target
-    in it is replaced by the project's, if that has one. A FAIL does not replace an
-    earlier calibration: it then goes to `OUT-failed`. Raises InputError for what is wrong with the files,
-    CalibrationError where the spots give no calibration at all; `out` is then as it was.
+    rig: the rig.yaml or screens.yaml with the calibrated cameras and screens and their covariances (None: `rig.yaml`
+    beside the project). The project need not repeat cameras, screens and target; if it has a target, this replaces
+    the rig's. A FAIL never replaces an earlier calibration: its results go to `OUT-failed`.
+
+    Raises:
+        InputError: for errors in the files.
+        CalibrationError: if the spots do not determine a calibration. `out` is left unchanged.
     """
     refuse_foreign(out, _is_ours)
     project = load_project(Path(project_path), lab_known=True)
-    day = day_of(project, today)
-    refuse_repeated(project)
+    day = calibration_date(project, today)
+    check_no_duplicates(project)
     rig_path = Path(rig) if rig is not None else project.path.parent / RIG
-    file, knowledge = _calibrated_lab(project, rig_path)
+    file, lab_covariance = _calibrated_lab(project, rig_path)
     recordings = read_recordings(project, file.rig)
     try:
         if recordings.stand_from_body is None:
-            found = self_calibrate(file.rig, recordings.spots, len(recordings.names), knowledge)
+            found = self_calibrate(file.rig, recordings.spots, len(recordings.names), lab_covariance)
         else:
-            found = find_beams(file.rig, recordings.spots, stand_of(project, recordings), knowledge)
+            found = solve_beams(file.rig, recordings.spots, stand_of(project, recordings), lab_covariance)
     except AdjustmentError as error:
         if recordings.stand_from_body is not None:
-            refuse_known_mistakes(project, file.rig, recordings, knowledge)
+            diagnose_failed_fit(project, file.rig, recordings, lab_covariance)
         raise CalibrationError(f"{project.path}: the beams cannot be calibrated: {error}") from None
     findings = [
         *beam_findings(found, file.rig, recordings.names, BeamGoals()),
-        *expired(project, day, today),
-        *_findings_of_inputs(project, recordings, knowledge is not None, file.calibration, rig_path),
+        *expiry_findings(project, day, today),
+        *_input_findings(project, recordings, lab_covariance is not None, file.calibration, rig_path),
     ]
     level = verdict(findings)
     folder = beside_a_good_one(out, level == Level.FAIL, RIG)
@@ -112,7 +114,7 @@ def calibrate_beams(
         write_tables(found, file.rig, recordings.names, work)
         if level != Level.FAIL:
             save_rig(_rig_file(file, found, project, findings, day), work / RIG)
-        from lab.calibrate.beams.beams_page import write_page  # the template engine: only for those who write a report
+        from lab.calibrate.beams.beams_page import write_page  # imports the template engine
 
         inputs = [rig_path, *project.inputs]
         write_page(project.name, found, findings, file.rig, recordings.names, inputs, day, work)
@@ -124,40 +126,40 @@ def _is_ours(folder: Path) -> bool:
 
 
 def _calibrated_lab(project: Project, rig_path: Path) -> tuple[RigFile, RigCovariance | None]:
-    """Cameras and screens as calibrated, with the project's target, and what is known of their errors."""
+    """The calibrated cameras and screens with the project's target, and the covariance of cameras and screens."""
     if not rig_path.is_file():
         raise InputError(
-            f"{rig_path}: expected a rig.yaml with cameras and screens as calibrated, found none; run"
+            f"{rig_path}: expected a rig.yaml with calibrated cameras and screens, found no file; run"
             f" `beampose calibrate screen {project.path}` first and give its rig.yaml with --rig"
         )
-    file, knowledge = _lab_file(rig_path)
-    for kind, asked, there in (
+    file, lab_covariance = _lab_file(rig_path)
+    for kind, wanted, calibrated in (
         ("camera", project.cameras, file.rig.cameras),
         ("screen", project.screens, file.rig.screens),
     ):
-        for name in asked:
-            if name not in there:
+        for name in wanted:
+            if name not in calibrated:
                 raise InputError(
-                    f"{rig_path}: expected {kind} {name!r} of {project.path.name}, got {', '.join(there)}"
-                    f"{did_you_mean(name, there)}; calibrate it first (`beampose calibrate screen`)"[:300]
+                    f"{rig_path}: expected {kind} {name!r} of {project.path.name}, got {', '.join(calibrated)}"
+                    f"{did_you_mean(name, calibrated)}; calibrate it first (`beampose calibrate screen`)"[:300]
                 )
     if not project.beams and not file.rig.beams:
         raise InputError(
-            f"{project.path}: target: expected beams and spots as drawn, got none; add them: their names, ends and"
-            " screens are needed, directions and points only roughly"
+            f"{project.path}: target: expected the nominal beams and spots, got none; add them: names, ends and"
+            " screens are needed, approximate directions and points are enough"
         )
     if not project.beams:
-        return file, knowledge
+        return file, lab_covariance
     for name, spot in project.spots.items():
         if spot.screen not in file.rig.screens:
             raise InputError(
                 f"{project.path}: target.spots.{name}.screen: expected a screen of {rig_path}, got {spot.screen!r}"
             )
-    return replace(file, rig=replace(file.rig, beams=project.beams, spots=project.spots)), knowledge
+    return replace(file, rig=replace(file.rig, beams=project.beams, spots=project.spots)), lab_covariance
 
 
 def _lab_file(path: Path) -> tuple[RigFile, RigCovariance | None]:
-    """Cameras and screens of a rig.yaml or a screens.yaml, and what is known of their errors."""
+    """Cameras and screens of a rig.yaml or a screens.yaml, and their covariance where the file states it."""
     if str(read_mapping(path).get("schema", "")).startswith("beampose/screens/"):
         screens = load_screens(path)
         return RigFile(screens.rig, {}, screens.calibration), screens.covariance
@@ -165,16 +167,17 @@ def _lab_file(path: Path) -> tuple[RigFile, RigCovariance | None]:
     return file, joint_covariance(file.rig, file.covariances, path)
 
 
-def _findings_of_inputs(
-    project: Project, recordings: Recordings, with_covariance: bool, of_lab: CalibrationState | None, rig_path: Path
+def _input_findings(
+    project: Project, recordings: Recordings, with_covariance: bool, lab_state: CalibrationState | None, rig_path: Path
 ) -> list[Finding]:
     out = [Finding(Level.PASS, note) for note in recordings.notes]
-    if of_lab is not None and of_lab.verdict != Level.PASS.name:
+    if lab_state is not None and lab_state.verdict != Level.PASS.name:
         out.append(
             Finding(
-                Level[of_lab.verdict],
-                f"{rig_path.name} ends in {of_lab.verdict}: {'; '.join(of_lab.reasons) or 'no reason given'}",
-                "what is wrong with cameras and screens is wrong with the beams found by them",
+                Level[lab_state.verdict],
+                f"{rig_path.name} has the verdict {lab_state.verdict}:"
+                f" {'; '.join(lab_state.reasons) or 'no reason given'}",
+                "errors of cameras and screens carry over to the beams",
                 "see the report beside it",
             )
         )
@@ -193,17 +196,17 @@ def _findings_of_inputs(
         out.append(
             Finding(
                 Level.WARN,
-                "stand.world_from_stand has no sigma: it is taken as exact",
-                "its error goes into the boresight of all beams unseen",
-                "give stand.sigma_m and stand.sigma_deg, or leave world_from_stand out and let it be found",
+                "stand.world_from_stand has no sigma: it is assumed exact",
+                "its error goes unnoticed into the boresight of all beams",
+                "give stand.sigma_m and stand.sigma_deg, or omit world_from_stand so that it is estimated",
             )
         )
     if recordings.stand_from_body is not None and not np.any(recordings.pose_sigmas):
         out.append(
             Finding(
                 Level.PASS,
-                "the stand's positions are taken as exact; give stand.pose_sigma_m and pose_sigma_deg where their"
-                " encoders are not much better than the spots",
+                "the stand's positions are assumed exact; give stand.pose_sigma_m and pose_sigma_deg unless its"
+                " encoders are much more precise than the spots",
             )
         )
     return out
@@ -212,9 +215,8 @@ def _findings_of_inputs(
 def _rig_file(
     file: RigFile, c: BeamCalibration, project: Project, findings: Sequence[Finding], day: datetime.date
 ) -> RigFile:
-    lab = file.calibration  # of cameras and screens: what they warn of, and when they end, holds for the whole
-    ends = [] if lab is None or lab.valid_until is None else [lab.valid_until]
-    ends += [] if project.valid_days is None else [day + datetime.timedelta(days=project.valid_days)]
+    lab = file.calibration  # of cameras and screens: the new rig.yaml expires no later than they do
+    expiry = [d for d in (lab.valid_until if lab is not None else None, expiry_date(project, day)) if d is not None]
     reasons = [f.what for f in findings if f.level > Level.PASS]
-    state = CalibrationState(day, verdict(findings).name, min(ends, default=None), tuple(reasons), project.notes)
+    state = CalibrationState(day, verdict(findings).name, min(expiry, default=None), tuple(reasons), project.notes)
     return RigFile(c.rig, blocks_of(c.covariance), state)

@@ -1,4 +1,4 @@
-"""The report of a calibration of beams."""
+"""Report of a beam calibration."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from calibration.findings import Finding, verdict
 from geometry.arrays import Array, Bools
 from geometry.pose import ypr_sigmas
 from geometry.rig import Rig
-from lab.calibrate.beams.beam_tables import from_drawing, residuals_mm, used_positions
+from lab.calibrate.beams.beam_tables import difference_from_nominal, residuals_mm, used_positions
 from lab.number_format import short
 from lab.report.calibration.calibration_charts import residual_histogram
 from lab.report.calibration.calibration_drawings import coverage_map, residual_field
@@ -33,22 +33,22 @@ def write_page(
     name: str,
     c: BeamCalibration,
     findings: Sequence[Finding],
-    drawing: Rig,
+    nominal: Rig,
     positions: Sequence[str],
     inputs: Sequence[Path],
     day: datetime.date,
     folder: Path,
 ) -> Path:
-    """Write report.html. drawing: the rig with nominal beams; positions: the names of all positions."""
+    """Write report.html. nominal: the rig with the beams as designed; positions: names of all positions."""
     sections = [
-        _beams(c, drawing),
+        _beams(c, nominal),
         _between(c),
         _body_frame(c),
         _positions(c, positions),
         _residuals(c),
         Section(
             "The lab",
-            "The vehicle stands where it stood at the first position; the beams are the ones found.",
+            "The vehicle at the first position, with the calibrated beams.",
             [PageDrawing(view) for view in scene_views(rig_things(c.rig, c.world_from_body[0]))],
         ),
     ]
@@ -74,22 +74,23 @@ def _key_figures(c: BeamCalibration) -> list[tuple[str, str, str]]:
         worst = list(c.rig.beams)[int(np.argmax(direction))]
         rms = float(np.sqrt(np.mean(direction**2))) / ARCSEC
         note = f"1 sigma per axis, RMS over beams; worst: {worst} with {short(float(direction.max()) / ARCSEC, 3)}"
-        note += "; in the frame of the drawing" if c.world_from_stand is None else ""
-        out.append(("directions known to", f"{short(rms, 3)} arcsec", note))
+        note += "; in the frame of the nominal beams" if c.world_from_stand is None else ""
+        out.append(("sigma of directions", f"{short(rms, 3)} arcsec", note))
         rms = 1e3 * float(np.sqrt(np.mean(offset**2)))
-        out.append(("offsets known to", f"{short(rms, 3)} mm", "1 sigma per axis, nearest to the body's origin"))
+        out.append(("sigma of offsets", f"{short(rms, 3)} mm", "per axis, at the point nearest to the body's origin"))
     if c.angles:
         angles = float(np.sqrt(np.mean([a.sigma**2 for a in c.angles]))) / ARCSEC
-        out.append(("angles between beams", f"± {short(angles, 3)} arcsec", "RMS over pairs; free of the body frame"))
-    out.append(("residuals", f"{short(rms_px, 3)} px · {short(rms_mm, 3)} mm", "RMS per axis, on the screens in mm"))
-    out.append(("spots", f"{int(kept.sum())} of {len(kept)}", "used; the others were left out as wrong"))
+        note = "RMS over pairs; independent of the body frame"
+        out.append(("angles between beams", f"± {short(angles, 3)} arcsec", note))
+    out.append(("residuals", f"{short(rms_px, 3)} px · {short(rms_mm, 3)} mm", "RMS per axis, mm on the screens"))
+    out.append(("spots", f"{int(kept.sum())} of {len(kept)}", "used; the others were rejected as outliers"))
     count = len(c.world_from_body.translation)
-    out.append(("positions", str(count), "known" if c.world_from_stand is not None else "of which nothing is known"))
+    out.append(("positions", str(count), "known poses" if c.world_from_stand is not None else "unknown poses"))
     return out
 
 
-def _beams(c: BeamCalibration, drawing: Rig) -> Section:
-    away = from_drawing(c, drawing)
+def _beams(c: BeamCalibration, nominal: Rig) -> Section:
+    off = difference_from_nominal(c, nominal)
     direction, offset = direction_sigmas(c) / ARCSEC, 1e3 * offset_sigmas(c)
     if c.undetermined:
         direction, offset = np.full_like(direction, np.nan), np.full_like(offset, np.nan)
@@ -105,23 +106,23 @@ def _beams(c: BeamCalibration, drawing: Rig) -> Section:
             _three(1e3 * c.lines.points[i], 2),
             float(direction[i]),
             float(offset[i]),
-            float(np.rad2deg(away[i, 0]) * 60),
-            float(1e3 * away[i, 1]),
+            float(np.rad2deg(off[i, 0]) * 60),
+            float(1e3 * off[i, 1]),
         )
         for i, name in enumerate(c.rig.beams)
     ]
     heads = (
         "beam", "ends", "direction", "offset (mm)", "sigma direction (arcsec)", "sigma offset (mm)",
-        "from drawing (arcmin)", "from drawing (mm)",
+        "off nominal (arcmin)", "off nominal (mm)",
     )  # fmt: skip
     words = [
-        "Each laser in the body frame. The offset is the beam's point nearest to the body's origin; sigmas are RMS of"
-        " the two axes across the beam.",
-        "Direction and offset errors go together, since a beam is best known where its spots fell: rig.yaml holds their"
-        " joint covariance, which tells more than the sigmas alone.",
+        "Each laser in the body frame. The offset is the point of the beam nearest to the body's origin; sigmas are the"
+        " RMS over the two axes across the beam.",
+        "Errors of direction and offset are correlated, since a beam is known best where its spots were: use the joint"
+        " covariance in rig.yaml rather than the sigmas alone.",
     ]
     if c.undetermined:
-        words[1] = "These numbers are not determined by the recordings: no rig.yaml was written."
+        words[1] = "The recordings do not determine these numbers: no rig.yaml was written."
     return Section("Beams", words, (), PageTable(heads, rows))
 
 
@@ -131,7 +132,7 @@ def _three(vector: Array, digits: int) -> str:
 
 def _between(c: BeamCalibration) -> Section:
     rows = [(a.first, a.second, f"{np.rad2deg(a.angle):.5f}", a.sigma / ARCSEC) for a in c.angles]
-    words = ["What a turn or shift of the body frame does not change."]
+    words = ["These angles do not depend on the choice of the body frame."]
     return Section(
         "Angles between beams", words, (), PageTable(("first", "second", "angle (deg)", "sigma (arcsec)"), rows)
     )
@@ -142,11 +143,11 @@ def _body_frame(c: BeamCalibration) -> Section:
         return Section(
             "The body frame",
             [
-                "No position of the stand was known. Turning or shifting the body frame, with the vehicle's poses the"
-                f" other way, moves no spot: {c.frame_free} numbers of the {4 * len(c.lines)} of the beams cannot be"
-                " found, the place (3) and the attitude (3) of the body frame.",
-                "It was laid so that the beams found are, all together, nearest to the drawing (least squares, a radian"
-                " counting like a metre). The sigmas of the beams above are against that frame. Angles and distances"
+                "No pose of the stand was known. A change of the body frame that is compensated by the vehicle's poses"
+                f" moves no spot: {c.frame_free} of the {4 * len(c.lines)} parameters of the beams cannot be estimated,"
+                " the position (3) and the attitude (3) of the body frame.",
+                "The body frame is the one in which the estimated beams are closest to the nominal ones (least squares,"
+                " one radian weighted like one metre). The sigmas above refer to that frame. Angles and distances"
                 " between beams do not depend on this choice.",
             ],
         )
@@ -163,7 +164,8 @@ def _body_frame(c: BeamCalibration) -> Section:
         ("roll (deg)", float(roll), float(turns[2])),
     ]
     words = [
-        "The body frame is the stand's carriage, as its positions were recorded. The stand's place in the world:",
+        "The body frame is the frame of the stand's carriage, as its poses were recorded. Pose of the stand in the"
+        " world:",
     ]
     if c.undetermined:
         words.append(f"Not determined: {'; '.join(c.undetermined)}. {c.motion.remedy().capitalize()}.")
@@ -176,27 +178,28 @@ def _positions(c: BeamCalibration, positions: Sequence[str]) -> Section:
     rows = []
     for k, name in enumerate(names):
         here = c.spots.position == k
-        good = here & c.fit.kept
-        rms = float(np.sqrt(np.mean(c.fit.residuals_px[good] ** 2))) if good.any() else float("nan")
+        used = here & c.fit.kept
+        rms = float(np.sqrt(np.mean(c.fit.residuals_px[used] ** 2))) if used.any() else float("nan")
         yaw, pitch, roll = np.rad2deg(c.world_from_body[k].ypr)
         x, y, z = 1e3 * c.world_from_body[k].translation
         rows.append(
             (name, float(yaw), float(pitch), float(roll), float(x), float(y), float(z), int(here.sum()),
-             int(here.sum() - good.sum()), rms)
+             int(here.sum() - used.sum()), rms)
         )  # fmt: skip
     heads = (
-        "position", "yaw (deg)", "pitch (deg)", "roll (deg)", "x (mm)", "y (mm)", "z (mm)", "spots", "left out",
+        "position", "yaw (deg)", "pitch (deg)", "roll (deg)", "x (mm)", "y (mm)", "z (mm)", "spots", "excluded",
         "RMS (px)",
     )  # fmt: skip
     coverage = [
         PageDrawing(
-            coverage_map(c.rig.cameras[n].image_size_px, pixels, f"Camera {n}: where spots were", things="spots")
+            coverage_map(c.rig.cameras[n].image_size_px, pixels, f"Camera {n}: coverage by spots", things="spots")
         )
         for n, pixels in _by_camera(c, c.spots.pixels).items()
     ]
     words = [
-        f"The vehicle's pose in the world at each position. {str(c.motion)[0].upper()}{str(c.motion)[1:]}.",
-        "A direction is told by spots at different distances along its beam: turns and shifts towards the screens.",
+        f"Pose of the vehicle in the world at each position. {str(c.motion)[0].upper()}{str(c.motion)[1:]}.",
+        "Spots at different distances along a beam determine its direction: rotations, and translations towards the"
+        " screens.",
     ]
     return Section("Positions", words, coverage, PageTable(heads, rows))
 
@@ -209,17 +212,18 @@ def _residuals(c: BeamCalibration) -> Section:
                 c.rig.cameras[n].image_size_px,
                 pixels,
                 _by_camera(c, c.fit.residuals_px, kept)[n],
-                f"Camera {n}: found − predicted",
+                f"Camera {n}: measured − predicted",
                 things="spots",
             ),
-            "Arrows that turn slowly with the place: lens or screen. All of one position alike: the stand."
+            "Arrows that vary slowly over the picture indicate an error of the lens or the screen; equal arrows at all"
+            " spots of one position indicate an error of the stand."
             if i == 0
             else "",
         )
         for i, (n, pixels) in enumerate(_by_camera(c, c.spots.pixels, kept).items())
     ]
     whitened = c.fit.adjusted.residuals[0]
-    drawings.append(PageDrawing(residual_histogram(whitened, "Residuals in sigmas", "sigma", sigma=1.0)))
+    drawings.append(PageDrawing(residual_histogram(whitened, "Normalised residuals", "sigma", sigma=1.0)))
     views = c.rig.views()
     rows = []
     mm = residuals_mm(c)
@@ -228,17 +232,17 @@ def _residuals(c: BeamCalibration) -> Section:
         if here.any():
             px = float(np.sqrt(np.mean(c.fit.residuals_px[here] ** 2)))
             on_screen = float(np.sqrt(np.nanmean(mm[here] ** 2) / 2))
-            left_out = int(((c.spots.view == v) & ~kept).sum())
-            rows.append((camera, spot, c.rig.spots[spot].beam, int(here.sum()), left_out, px, on_screen))
-    heads = ("camera", "spot", "beam", "spots used", "left out", "RMS (px)", "RMS on the screen (mm)")
-    words = "RMS is per axis. The curve is what residuals of the stated sigmas follow."
+            excluded = int(((c.spots.view == v) & ~kept).sum())
+            rows.append((camera, spot, c.rig.spots[spot].beam, int(here.sum()), excluded, px, on_screen))
+    heads = ("camera", "spot", "beam", "spots used", "excluded", "RMS (px)", "RMS on the screen (mm)")
+    words = "RMS is per axis. The curve is the normal distribution for the stated sigmas."
     if c.fit.scale > 1:
-        words += f" The sigmas were widened by {c.fit.scale:.3g}, since the spots scattered more than told."
+        words += f" The sigmas were multiplied by {c.fit.scale:.3g}, since the spots scatter more than stated."
     return Section("Residuals", words, drawings, PageTable(heads, rows))
 
 
 def _by_camera(c: BeamCalibration, values: Array, rows: Bools | None = None) -> dict[str, Array]:
-    """Rows of values (N, 2) by camera, cameras without any left out."""
+    """Rows of values (N, 2) by camera; cameras without rows are omitted."""
     camera = np.array([name for name, _ in c.rig.views()])[c.spots.view]
     used = np.ones(len(c.spots), dtype=bool) if rows is None else rows
     out = {n: values[(camera == n) & used] for n in c.rig.cameras}

@@ -1,4 +1,4 @@
-"""Labelled spots of a run folder that was recorded to calibrate beams."""
+"""Labelled spots from a run folder that was recorded for a beam calibration."""
 
 from __future__ import annotations
 
@@ -22,20 +22,23 @@ from lab.runs.frames.pipeline import FrameRecord, Pipeline
 from tracking.detections import Detections
 from tracking.statuses import SpotStatus
 
-# How far a beam may be from its drawing for its spots to be found: at 2.5 m from the vehicle together 64 mm on the
-# screen. Spots of different beams that lie nearer to each other may be mistaken; the robust fit then leaves them out.
-DRAWN_WITHIN_RAD = np.deg2rad(1.0)
-DRAWN_WITHIN_M = 0.02
+# Largest difference of a beam from its nominal line for which its spots are found: together 64 mm on a screen at 2.5 m
+# from the vehicle. Spots of different beams closer than this may be confused; the robust fit then excludes them.
+MAX_NOMINAL_ERROR_RAD = np.deg2rad(1.0)
+MAX_NOMINAL_ERROR_M = 0.02
 Labelled = list[tuple[int, Array, Array]]  # view, pixel (2,), covariance (2, 2)
 _MEASURED = (SpotStatus.MATCHED, SpotStatus.TURNED)
 
 
 def spots_of_run(folder: Path, rig: Rig, known: StandPoses | None, world_from_stand: Pose | None) -> SpotRows:
-    """The spots of a run's frames, named.
+    """Labelled spots of all frames of a run.
 
-    rig: cameras and screens as calibrated, beams as drawn; that of the run.yaml is not used. Where the stand's place
-    and poses are known, each frame's detections get the names of the spots that the drawing puts there. Else the
-    tracker names them, from the run's own prior. Frames without a pose are passed over. Raises InputError.
+    rig: calibrated cameras and screens with nominal beams, used in place of the rig in run.yaml. If the stand's place
+    and its poses are known, each detection gets the label of the nearest spot predicted by the nominal beams.
+    Otherwise the tracker labels the detections, starting from the run's own prior. Frames without a pose are skipped.
+
+    Raises:
+        InputError: if the run cannot be read or has a camera that is not in `rig`.
     """
     run = load_run(folder)
     missing = [c for c in run.cameras if c not in rig.cameras]
@@ -44,11 +47,11 @@ def spots_of_run(folder: Path, rig: Rig, known: StandPoses | None, world_from_st
             f"{run.path}: cameras.{missing[0]}: expected a camera of the calibration, got {missing[0]!r}; it has"
             f" {', '.join(rig.cameras)}"
         )
-    seen = dataclasses.replace(rig, cameras={n: c for n, c in rig.cameras.items() if n in run.cameras})
-    run = dataclasses.replace(run, rig=seen, covariance=None)
-    places = {view: i for i, view in enumerate(rig.views())}
-    model = SpotModel.of(seen)
-    view_of = np.array([places[v] for v in model.views], dtype=np.int64)
+    rig_of_run = dataclasses.replace(rig, cameras={n: c for n, c in rig.cameras.items() if n in run.cameras})
+    run = dataclasses.replace(run, rig=rig_of_run, covariance=None)
+    view_index = {view: i for i, view in enumerate(rig.views())}
+    model = SpotModel.of(rig_of_run)
+    view_of = np.array([view_index[v] for v in model.views], dtype=np.int64)
     poses: dict[int, Pose] = {}
     if known is not None:
         poses = {int(f): known.stand_from_body[i] for i, f in enumerate(known.frames)}
@@ -72,27 +75,28 @@ def spots_of_run(folder: Path, rig: Rig, known: StandPoses | None, world_from_st
 
 
 def label(model: SpotModel, world_from_body: Pose, detections: tuple[Detections | None, ...]) -> Labelled:
-    """View, pixel and covariance of the detections (one entry per camera) that lie where the drawing puts a spot.
+    """Assign detections (one entry per camera) to the spots that the nominal beams predict at a pose.
 
-    Within a camera the pairs of least total distance are taken, each in units of how far its spot may be off.
+    Returns view, pixel and covariance of each assigned detection. The assignment of a camera has the least total
+    distance, where each distance is divided by the largest error that its spot may have from the nominal beam.
     """
     d = model.derivatives(world_from_body)
-    reach = np.hypot(
-        DRAWN_WITHIN_RAD * np.linalg.norm(d.direction, axis=(-2, -1)),
-        DRAWN_WITHIN_M * np.linalg.norm(d.point, axis=(-2, -1)),
+    gate_px = np.hypot(
+        MAX_NOMINAL_ERROR_RAD * np.linalg.norm(d.direction, axis=(-2, -1)),
+        MAX_NOMINAL_ERROR_M * np.linalg.norm(d.point, axis=(-2, -1)),
     )
     out = []
     for c, found in enumerate(detections):
         views = np.flatnonzero((model.camera_of == c) & np.isfinite(d.pixels).all(axis=1))
         if found is None or not len(found) or not len(views):
             continue
-        away = np.linalg.norm(found.uv_px[None] - d.pixels[views][:, None], axis=2) / reach[views][:, None]
-        # A pair out of reach costs more than any that is not, so that it is made only where nothing else is left.
-        rows, columns = linear_sum_assignment(np.minimum(away, 1e3))
+        distance = np.linalg.norm(found.uv_px[None] - d.pixels[views][:, None], axis=2) / gate_px[views][:, None]
+        # Distances are capped well above the gate: pairs outside of it are assigned last, and dropped below.
+        rows, columns = linear_sum_assignment(np.minimum(distance, 1e3))
         out += [
             (int(views[r]), found.uv_px[k], found.cov_px2[k])
             for r, k in zip(rows, columns, strict=True)
-            if away[r, k] <= 1.0
+            if distance[r, k] <= 1.0
         ]
     return out
 
@@ -100,7 +104,7 @@ def label(model: SpotModel, world_from_body: Pose, detections: tuple[Detections 
 def _labelled(
     pipeline: Pipeline, model: SpotModel, poses: dict[int, Pose], world_from_stand: Pose | None
 ) -> Iterator[tuple[int, Labelled]]:
-    """Frame numbers and their labelled spots."""
+    """Frame numbers with their labelled spots: from known poses, else from the tracker."""
     if poses and world_from_stand is not None:
         for number, detections in pipeline.detections():
             if number in poses:
@@ -116,5 +120,5 @@ def _tracked(record: FrameRecord) -> Labelled:
 
 
 def _starting_at(run: Run, world_from_body: Pose) -> Run:
-    """The run with its tracker starting there; what the tracker then says is not used."""
+    """The run with its tracker's prior replaced by a pose (sigma 0.1 m, 10 deg)."""
     return dataclasses.replace(run, prior=PosePrior(world_from_body, 0.1, float(np.deg2rad(10.0))))

@@ -1,4 +1,4 @@
-"""Recordings whose spots do not agree: the usual mistake behind it, in words, or that there is no calibration."""
+"""Checks of recordings: spots that do not fit the poses or labels, and recordings listed twice."""
 
 from __future__ import annotations
 
@@ -12,14 +12,18 @@ from lab.errors import InputError
 from lab.files.project.project import Project
 
 
-def refuse_known_mistakes(
-    project: Project, rig: Rig, recordings: Recordings, knowledge: RigCovariance | None = None
+def diagnose_failed_fit(
+    project: Project, rig: Rig, recordings: Recordings, lab_covariance: RigCovariance | None = None
 ) -> None:
-    """Where no calibration was found: InputError if one usual mistake in poses or labels explains it.
+    """Look for a common mistake in poses or labels that explains why the calibration failed.
 
-    rig: cameras and screens as calibrated, beams as drawn; knowledge: of their errors. Positions must be known.
+    rig: calibrated cameras and screens with nominal beams; lab_covariance: of cameras and screens. The stand positions
+    must be known.
+
+    Raises:
+        InputError: if a single known mistake explains the failure.
     """
-    found = suspect(rig, recordings.spots, stand_of(project, recordings), knowledge)
+    found = suspect(rig, recordings.spots, stand_of(project, recordings), lab_covariance)
     if found is None:
         return
     files = [r.spots or r.run if found.in_labels else r.poses for r in project.recordings]
@@ -28,8 +32,12 @@ def refuse_known_mistakes(
     raise InputError(f"{where}: {subject} only {found.words}; {found.remedy}")
 
 
-def refuse_repeated(project: Project) -> None:
-    """InputError for a recording that is listed twice: its spots would count twice, and all sigmas be too small."""
+def check_no_duplicates(project: Project) -> None:
+    """Refuse a recording that is listed twice: its spots would count twice and all sigmas would be too small.
+
+    Raises:
+        InputError: names both entries.
+    """
     seen: dict[Path, int] = {}
     for k, recording in enumerate(project.recordings):
         path = recording.spots or recording.run
@@ -38,6 +46,6 @@ def refuse_repeated(project: Project) -> None:
         first = seen.setdefault(path.resolve(), k)
         if first != k:
             raise InputError(
-                f"{project.path}: recordings.{k}: expected another recording than recordings.{first}, got {path.name}"
-                " again; list each once, or its spots count twice"
+                f"{project.path}: recordings.{k}: {path.name} is already listed as recordings.{first}; list each"
+                " recording once, otherwise its spots count twice"
             )

@@ -1,4 +1,4 @@
-"""Spots recorded at positions of a stand: from tables or run folders, labelled, frames at rest averaged."""
+"""Labelled spots at positions of a stand, from tables or run folders; frames at rest are averaged."""
 
 from __future__ import annotations
 
@@ -26,24 +26,24 @@ if TYPE_CHECKING:
     import pandas as pd
 
 SPOTS = ("camera", "spot", "u_px", "v_px")
-DEFAULT_SPOT_SIGMA_PX = 0.1  # px: where the table gives none; a laser spot on a matt screen, speckle included
-MOST_FREE = 200  # positions of which nothing is known: more say little and cost six unknowns each
-_USED = ("matched", "turned")  # statuses of a spots.csv that are measurements
+DEFAULT_SPOT_SIGMA_PX = 0.1  # px, if the table states none: a laser spot on a matt screen, speckle included
+MAX_UNKNOWN_POSES = 200  # positions without a pose that are used: each adds six unknowns, more add little information
+_USED = ("matched", "turned")  # statuses in spots.csv that are measurements
 
 
 @dataclass(frozen=True, slots=True)
 class Recordings:
-    """All recordings of a project, as positions of the stand."""
+    """All recordings of a project: P positions of the stand."""
 
-    names: tuple[str, ...]  # P, for messages: recording and frames
+    names: tuple[str, ...]  # (P,) recording and frames, for messages
     spots: SpotPixels
-    stand_from_body: Pose | None  # (P,); None where no position is known
+    stand_from_body: Pose | None  # (P,); None if the poses are unknown
     pose_sigmas: Array  # (P, 6): m, rad
-    notes: tuple[str, ...]  # what was assumed
+    notes: tuple[str, ...]  # assumptions made while reading
 
 
 def stand_of(project: Project, recordings: Recordings) -> StandModel:
-    """The stand of recordings whose positions are known, for the solve."""
+    """The stand model of recordings whose positions are known."""
     assert recordings.stand_from_body is not None
     stand = project.stand
     if stand is None or stand.world_from_stand is None:
@@ -53,9 +53,10 @@ def stand_of(project: Project, recordings: Recordings) -> StandModel:
 
 
 def read_recordings(project: Project, rig: Rig) -> Recordings:
-    """The recordings of a project. rig: cameras and screens as calibrated, beams as drawn, spots by name.
+    """Read all recordings of a project. rig: calibrated cameras and screens with nominal beams and spots.
 
-    Raises InputError in one line: file, line, what was expected and what was found.
+    Raises:
+        InputError: with file, line, the expected and the found content.
     """
     if not project.recordings:
         raise InputError(
@@ -66,7 +67,7 @@ def read_recordings(project: Project, rig: Rig) -> Recordings:
     if any(with_poses) and not all(with_poses):
         raise InputError(
             f"{project.path}: recordings.{with_poses.index(False)}.poses: expected poses for all recordings or for"
-            " none; without poses only the shape of the rig can be found, and mixing hides which was used"
+            " none; without poses only the angles between the beams can be found, so the two cannot be combined"
         )
     names: list[str] = []
     notes: list[str] = []
@@ -77,17 +78,16 @@ def read_recordings(project: Project, rig: Rig) -> Recordings:
         known = None if recording.poses is None else read_poses(recording.poses)
         rows = _rows(recording, known, project, rig, notes)
         if known is None:
-            rows = spread(rows, notes)
+            rows = limit_frames(rows, notes)
         frames = np.unique(rows.frame)
-        first: Pose | None = None
         if known is not None:
             at = np.searchsorted(known.frames, frames)
-            first = known.stand_from_body[at]
-            told = _pose_sigmas(known, project)[at]
-            position_of = positions_at_rest(first, told)
+            recorded = known.stand_from_body[at]
+            recorded_sigmas = _pose_sigmas(known, project)[at]
+            position_of = positions_at_rest(recorded, recorded_sigmas)
             starts = np.unique(position_of, return_index=True)[1]
-            poses.append(first[starts])
-            sigmas.append(told[starts])
+            poses.append(recorded[starts])
+            sigmas.append(recorded_sigmas[starts])
         else:
             position_of = np.arange(len(frames))
         averaged = average(rows, position_of[np.searchsorted(frames, rows.frame)])
@@ -122,30 +122,33 @@ def _rows(
                     f"{f' and {len(without) - 1} more' if len(without) > 1 else ''}"
                 )
         return rows
-    from lab.calibrate.beams.recorded_runs import spots_of_run  # detection and tracking: only for those who need them
+    from lab.calibrate.beams.recorded_runs import spots_of_run  # imports detection and tracking
 
     assert recording.run is not None
     place = None if project.stand is None else project.stand.world_from_stand
     rows = spots_of_run(recording.run, rig, known, place)
     if not len(rows.frame):
         raise InputError(
-            f"{recording.run}: expected spots that fit the beams as drawn, found none; check target.beams, the stand's"
-            " poses and the pictures"
+            f"{recording.run}: expected spots near those of the nominal beams, found none; check target.beams, the"
+            " stand's poses and the pictures"
         )
     return rows
 
 
 def read_spot_table(path: Path, rig: Rig, notes: list[str]) -> SpotRows:
-    """Spots from `position,camera,spot,u_px,v_px[,sigma_px]`, or from a run's spots.csv (`frame`, matched spots only).
+    """Read spots from a table `position,camera,spot,u_px,v_px[,sigma_px]` or from a run's spots.csv.
 
-    notes: what was assumed is added. Raises InputError.
+    Of a spots.csv (column `frame`) only matched spots are used. Assumptions are appended to `notes`.
+
+    Raises:
+        InputError: with file, line, the expected and the found content.
     """
     numbers = ("position", "frame", "u_px", "v_px", "sigma_px", "sigma_u_px", "sigma_v_px", "cov_uv_px2")
     table = read_table(path, SPOTS, numbers=numbers)
     if not len(table):
         raise InputError(f"{path}: expected rows position,camera,spot,u_px,v_px below the header, got none")
     if table.attrs["malformed"]:
-        raise InputError(f"{path}: {table.attrs['malformed']} lines have more fields than the header; mend them")
+        raise InputError(f"{path}: {table.attrs['malformed']} lines have more fields than the header; correct them")
     key = "position" if "position" in table else "frame"
     if key not in table:
         raise InputError(
@@ -170,8 +173,8 @@ def read_spot_table(path: Path, rig: Rig, notes: list[str]) -> SpotRows:
                 )
         if (camera, spot) not in views:
             raise InputError(
-                f"{path}: line {lines[i]}: camera {camera!r} observes screen {rig.cameras[camera].screen!r}, spot"
-                f" {spot!r} falls on {rig.spots[spot].screen!r}; one of the two names is wrong"
+                f"{path}: line {lines[i]}: camera {camera!r} observes screen {rig.cameras[camera].screen!r}, but spot"
+                f" {spot!r} is on {rig.spots[spot].screen!r}; one of the two names is wrong"
             )
         view[i] = views[camera, spot]
     pixels = np.stack([numbers_in(table, name, path) for name in ("u_px", "v_px")], axis=1)
@@ -189,7 +192,7 @@ def read_spot_table(path: Path, rig: Rig, notes: list[str]) -> SpotRows:
 
 
 def _covariances(path: Path, table: pd.DataFrame, notes: list[str]) -> Array:
-    """(n, 2, 2), px^2, from whichever columns there are."""
+    """Covariances (n, 2, 2), px^2, from the sigma columns of the table, with the default sigma for missing values."""
     out = np.zeros((len(table), 2, 2))
     columns = ("sigma_u_px", "sigma_v_px") if "sigma_u_px" in table and "sigma_v_px" in table else ("sigma_px",) * 2
     for k, name in enumerate(columns):
@@ -203,7 +206,7 @@ def _covariances(path: Path, table: pd.DataFrame, notes: list[str]) -> Array:
         out[:, k, k] = np.where(np.isnan(given), DEFAULT_SPOT_SIGMA_PX, given) ** 2
         if k == 0 and np.isnan(given).any():
             notes.append(
-                f"{path.name}: {int(np.isnan(given).sum())} spots without a sigma: {DEFAULT_SPOT_SIGMA_PX:g} px is"
+                f"{path.name}: {int(np.isnan(given).sum())} spots have no sigma: {DEFAULT_SPOT_SIGMA_PX:g} px is"
                 " assumed"
             )
     if "cov_uv_px2" in table and columns[0] != columns[1]:
@@ -214,23 +217,24 @@ def _covariances(path: Path, table: pd.DataFrame, notes: list[str]) -> Array:
 
 
 def _pose_sigmas(known: StandPoses, project: Project) -> Array:
-    """(n, 6): the table's, else the stand's, else 0."""
+    """Sigmas (n, 6), m and rad, of the recorded poses: from the table, else from the stand, else 0."""
     stand = project.stand
-    general = [0.0] * 6 if stand is None else [stand.pose_sigma_m] * 3 + [stand.pose_sigma_rad] * 3
-    return np.where(np.isnan(known.sigmas), np.array(general), known.sigmas)
+    default = [0.0] * 6 if stand is None else [stand.pose_sigma_m] * 3 + [stand.pose_sigma_rad] * 3
+    return np.where(np.isnan(known.sigmas), np.array(default), known.sigmas)
 
 
-def spread(rows: SpotRows, notes: list[str]) -> SpotRows:
-    """At most MOST_FREE frames, evenly spread."""
+def limit_frames(rows: SpotRows, notes: list[str]) -> SpotRows:
+    """The rows of at most MAX_UNKNOWN_POSES evenly spaced frames."""
     frames = np.unique(rows.frame)
-    if len(frames) <= MOST_FREE:
+    if len(frames) <= MAX_UNKNOWN_POSES:
         return rows
-    notes.append(f"of {len(frames)} frames without a pose {MOST_FREE} were used, evenly spread")
-    used = np.isin(rows.frame, frames[np.linspace(0, len(frames) - 1, MOST_FREE).round().astype(np.int64)])
+    notes.append(f"{MAX_UNKNOWN_POSES} of {len(frames)} frames without a pose were used, evenly spaced")
+    used = np.isin(rows.frame, frames[np.linspace(0, len(frames) - 1, MAX_UNKNOWN_POSES).round().astype(np.int64)])
     return SpotRows(rows.frame[used], rows.view[used], rows.pixels[used], rows.covariance[used])
 
 
 def _names(recording: RecordingEntry, frames: Ints, position_of: Ints, several: bool) -> list[str]:
+    """Names of the positions: the frames, preceded by the recording's name if the project has several recordings."""
     label = ""
     if several:
         path = recording.run or recording.spots

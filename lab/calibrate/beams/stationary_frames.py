@@ -1,4 +1,4 @@
-"""Frames of a vehicle at rest: which belong together, and what their mean is worth."""
+"""Frames of a vehicle at rest: grouping by stand position, and mean with covariance."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from calibration.terms.spot_term import SpotPixels
 from geometry.arrays import Array, Ints
 from geometry.pose import Pose
 
-AT_REST = 1e-7  # m and rad, or half the record's sigma: poses that differ less are one position of the stand
+AT_REST = 1e-7  # m and rad: poses that differ by less than this, or by less than half their sigma, are one position
 
 
 @dataclass(frozen=True, slots=True)
 class SpotRows:
-    """n labelled spots of single frames."""
+    """n labelled spots, each from one frame."""
 
     frame: Ints  # (n,)
     view: Ints  # (n,) in the order of Rig.views()
@@ -24,25 +24,27 @@ class SpotRows:
 
 
 def positions_at_rest(stand_from_body: Pose, sigmas: Array) -> Ints:
-    """Which position of the stand each of n frames belongs to (n,): a new one where the record moves.
+    """Index (n,) of the stand position of each of n frames; a new position starts where the recorded pose changes.
 
-    sigmas (n, 6) of each record. Frames of one position share the stand's error, so they are one measurement of it.
+    sigmas: (n, 6), m and rad, of each recorded pose. Frames of one position share the stand's error and count as one
+    measurement of the stand.
     """
     out = np.zeros(len(sigmas), dtype=np.int64)
     start = 0
     for k in range(1, len(out)):
-        away = np.abs(stand_from_body[k].minus(stand_from_body[start]))
-        moved = bool(np.any(away > np.maximum(AT_REST, 0.5 * sigmas[k])))
+        change = np.abs(stand_from_body[k].minus(stand_from_body[start]))
+        moved = bool(np.any(change > np.maximum(AT_REST, 0.5 * sigmas[k])))
         out[k] = out[k - 1] + moved
         start = k if moved else start
     return out
 
 
 def average(rows: SpotRows, position: Ints) -> SpotPixels:
-    """One spot per position and view, of n rows at positions (n,), with a covariance that frames alone do not shrink.
+    """Average the rows of each stand position and view.
 
-    What scatters between frames averages out, less where neighbours go together. What a frame's own covariance claims
-    beyond that scatter (speckle, pixel locking, blooming stand still with the vehicle) is common to all and stays.
+    rows: n rows; position: (n,) index of the stand position of each row. Averaging reduces only the part of the noise
+    that varies between frames, and less so where successive frames are correlated. The rest of the stated covariance
+    (speckle, pixel locking, blooming, which are constant while the vehicle is at rest) remains.
     """
     keys, which = np.unique(np.stack([position, rows.view], axis=1), axis=0, return_inverse=True)
     pixels, covariance = np.empty((len(keys), 2)), np.empty((len(keys), 2, 2))
@@ -54,22 +56,24 @@ def average(rows: SpotRows, position: Ints) -> SpotPixels:
 
 
 def mean_of_frames(pixels: Array, covariance: Array) -> tuple[Array, Array]:
-    """The mean (2,) of a spot at rest over n frames (n, 2) in their order, and its covariance (2, 2)."""
+    """Mean (2,) of a spot at rest and its covariance (2, 2).
+
+    pixels: (n, 2) in the order of the frames; covariance: (n, 2, 2), stated for each frame. Ours.
+    """
     n = len(pixels)
-    claimed = covariance.mean(axis=0)
+    stated = covariance.mean(axis=0)
     if n < 3:
-        return pixels.mean(axis=0), claimed
-    # One wild frame (a passing hand) must not move the mean.
-    middle = np.median(pixels, axis=0)
-    away = np.linalg.norm(pixels - middle, axis=1)
-    good = away <= max(5 * float(np.median(away)), 5 * float(np.sqrt(np.trace(claimed))))
-    used = pixels[good]
+        return pixels.mean(axis=0), stated
+    # Exclude single outliers, such as a hand in front of the camera.
+    distance = np.linalg.norm(pixels - np.median(pixels, axis=0), axis=1)
+    inlier = distance <= max(5 * float(np.median(distance)), 5 * float(np.sqrt(np.trace(stated))))
+    used = pixels[inlier]
     n = len(used)
     residual = used - used.mean(axis=0)
     scatter = residual.T @ residual / max(n - 1, 1)
     variance = float(np.trace(scatter))
-    together = float(np.sum(residual[1:] * residual[:-1])) / max(float(np.sum(residual**2)), 1e-30)
-    rho = float(np.clip(together + 1 / n, 0.0, 0.95))  # the mean's own noise makes the estimate low by 1 / n
+    lag_one = float(np.sum(residual[1:] * residual[:-1])) / max(float(np.sum(residual**2)), 1e-30)
+    rho = float(np.clip(lag_one + 1 / n, 0.0, 0.95))  # subtracting the mean biases the autocorrelation by -1 / n
     varying = scatter * (1 + rho) / (1 - rho) / n
-    common = claimed * max(1.0 - variance / float(np.trace(claimed)), 0.0)
+    common = stated * max(1.0 - variance / float(np.trace(stated)), 0.0)
     return used.mean(axis=0), varying + common

@@ -1,1 +1,1 @@
-"""`beampose calibrate board`: boards to print."""
+"""`beampose calibrate board`: printable calibration boards."""

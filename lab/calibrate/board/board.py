@@ -1,4 +1,4 @@
-"""`calibrate board`: a calibration board to print, with its description."""
+"""`calibrate board`: writes a calibration board for printing, with its description."""
 
 from __future__ import annotations
 
@@ -17,21 +17,22 @@ from lab.files.text.yaml_text import did_you_mean
 
 FORMATS = ("pdf", "svg", "png")
 DESCRIPTION = "board.yaml"
-# Rendered boards, 7x5 squares of 36 mm, 960x720 px, blur 0.7 and 1.2 px: with a rim of 0.05 modules no marker is seen,
-# with 0.2 corners err by 0.1 to 0.7 px, with 0.4 by 0.05 to 0.3, from 0.7 on by 0.03 to 0.06. OpenCV asks for 0.7 too.
-LEAST_RIM = 0.7
+# Smallest white rim around a marker, in marker modules. Measured on rendered boards of 7x5 squares of 36 mm, 960x720
+# px, blur 0.7 and 1.2 px: with a rim of 0.05 no marker is detected; corner errors are 0.1 to 0.7 px with 0.2, 0.05 to
+# 0.3 px with 0.4, and 0.03 to 0.06 px from 0.7 on. OpenCV recommends 0.7 too.
+MIN_RIM_MODULES = 0.7
 
 
 @dataclass(frozen=True, slots=True)
 class BoardOutcome:
-    """What was written."""
+    """Result of `write_board`: the board, the files written and the page format."""
 
     board: Board
     files: tuple[Path, ...]
     page: str
 
     def line(self) -> str:
-        """One line for the user."""
+        """One line for the terminal."""
         names = ", ".join(path.name for path in self.files)
         return (
             f"{self.board.describe()} on {self.page}: {names} in {self.files[0].parent};"
@@ -40,7 +41,7 @@ class BoardOutcome:
 
     @property
     def exit_status(self) -> int:
-        """0: a board that could not be written is an error."""
+        """Always 0: a board that cannot be written raises InputError."""
         return 0
 
 
@@ -51,9 +52,13 @@ def write_board(
     page: str = "A4",
     dpi: float = 300.0,
 ) -> BoardOutcome:
-    """Write a board as board.pdf, .svg, .png and board.yaml into the folder `out`, or as the one file that it names.
+    """Write board.pdf, board.svg, board.png and board.yaml into the folder `out`.
 
-    board: a value, its text, or the path of a board.yaml. Everything is written or nothing. Raises InputError.
+    If `out` names a file with one of these suffixes, only that format and its description are written. All files are
+    written or none. board: a value, its text, or the path of a board.yaml.
+
+    Raises:
+        InputError: for an unknown format, a board that does not fit on the page, or files that cannot be written.
     """
     if isinstance(board, str | Path):
         board = board_of(board)
@@ -67,7 +72,7 @@ def write_board(
     if out.suffix and not out.is_dir() and not (single in FORMATS or _is_number(single)):
         raise InputError(
             f"{out}: expected a folder, or a file ending in .{', .'.join(FORMATS)}, got {out.suffix};"
-            " choose one of them"
+            " use one of these suffixes"
         )
     _check_rim(board)
     layout = lay_out(board, page)
@@ -80,7 +85,7 @@ def write_board(
     if single in FORMATS and not out.is_dir():
         description = out.with_suffix(".yaml")
         if description.exists() and load_board(description) != board:
-            raise InputError(f"{description}: describes another board; choose another name")
+            raise InputError(f"{description}: describes a different board; choose another file name")
         _write_bytes(contents[single], out)
         save_board(board, description)
         return BoardOutcome(board, (out, description), layout.name)
@@ -92,20 +97,20 @@ def write_board(
 
 
 def _is_number(suffix: str) -> bool:
-    """Whether what follows the last dot belongs to a folder's name: boards-v1.2, 2026.11.21."""
+    """Whether the part after the last dot belongs to a folder name, as in boards-v1.2 or 2026.11.21."""
     return suffix[:1].isdigit()
 
 
 def _check_rim(board: Board) -> None:
-    """Raises InputError for a ChArUco board whose markers nearly touch the squares: such boards are not to be printed.
+    """Raise InputError for a ChArUco board whose markers nearly touch the squares.
 
-    Boards that are there already are another matter: photographs of them show whether they can be read.
+    Only printing is refused. Photographs of existing boards show by themselves whether the markers can be read.
     """
-    if isinstance(board, Charuco) and board.rim_modules < LEAST_RIM * (1 - 1e-9):
-        most = math.floor(10_000 * board.marker_with_rim_m(LEAST_RIM)) / 10
+    if isinstance(board, Charuco) and board.rim_modules < MIN_RIM_MODULES * (1 - 1e-9):
+        largest_mm = math.floor(10_000 * board.marker_with_rim_m(MIN_RIM_MODULES)) / 10
         raise InputError(
-            f"{board.describe()}: the white rim about the markers is only {board.rim_modules:.2f} of a marker's dots"
-            f" wide, {LEAST_RIM:g} or more are needed to find its corners; make the markers {most:g} mm or smaller"
+            f"{board.describe()}: the white rim around the markers is only {board.rim_modules:.2f} marker modules wide,"
+            f" at least {MIN_RIM_MODULES:g} are needed to find the corners; make the markers {largest_mm:g} mm or less"
         )
 
 

@@ -1,1 +1,1 @@
-"""`beampose calibrate camera`: photographs of a board to a lens."""
+"""`beampose calibrate camera`: lens calibration from photographs of a board."""

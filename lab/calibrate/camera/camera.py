@@ -1,4 +1,4 @@
-"""`calibrate camera`: photographs of a board in, camera.yaml with its covariance and a report out."""
+"""`calibrate camera`: calibrates a camera from photographs of a board; writes camera.yaml and a report."""
 
 from __future__ import annotations
 
@@ -33,22 +33,22 @@ from lab.files.text.atomic_write import atomic_folder, beside_a_good_one, refuse
 from lab.files.text.yaml_text import did_you_mean
 
 CAMERA, FAILED, CORNERS = "camera.yaml", "camera.failed.yaml", "corners.csv"
-CORNER_COLUMNS = ("view", "id", "u_px", "v_px", "residual_u_px", "residual_v_px", "used")  # residual: found less model
+CORNER_COLUMNS = ("view", "id", "u_px", "v_px", "residual_u_px", "residual_v_px", "used")  # measured minus model
 LENSES = ("auto", *(m.title for m in LADDER))
 WARPS = {"auto": None, "on": True, "off": False}
 
 
 @dataclass(frozen=True, slots=True)
 class CameraOptions:
-    """What the user may decide."""
+    """Options of a camera calibration."""
 
     name: str = "camera"
-    distance_m: float | None = None  # of the screen, for figures in mm; None: the median distance of the boards
-    valid_days: int | None = 365  # after that a run warns; None: for ever. A year: mounts and lenses creep
-    folds: int | None = None  # of the hold-out; None: five, or one view each up to ten views
-    lens: str = "auto"  # or 0, 4, 5, 8, 12, fisheye: the model, whatever the hold-out says
-    warp: str = "auto"  # or on, off: whether the board's bend is solved for
-    stretch: str = "auto"  # or on, off: whether its rows and columns are taken as to scale, and its points as in place
+    distance_m: float | None = None  # distance of the screen, for figures in mm; None: median distance of the boards
+    valid_days: int | None = 365  # a run warns after that; None: no expiry. One year: mounts and lenses creep
+    folds: int | None = None  # of the cross-validation; None: five, or leave-one-out up to ten views
+    lens: str = "auto"  # or 0, 4, 5, 8, 12, fisheye: fixed lens model in place of the selected one
+    warp: str = "auto"  # or on, off: estimation of the board's bend
+    stretch: str = "auto"  # or on, off: estimation of the board's scale along rows and columns, and of its point errors
 
     def __post_init__(self) -> None:
         if self.lens not in LENSES:
@@ -66,7 +66,7 @@ class CameraOptions:
             raise InputError(f"valid days: expected 1 or more, got {self.valid_days}")
 
     def intrinsics(self, origins: tuple[str, ...] = ()) -> IntrinsicsOptions:
-        """The same for the solve, and where each view comes from."""
+        """The options of the solver. origins: source of each view, see `origins_of`."""
         lens = None if self.lens == "auto" else named(self.lens)
         warp, stretch = WARPS[self.warp], WARPS[self.stretch]
         return IntrinsicsOptions(self.distance_m, lens, warp, stretch, self.folds, origins)
@@ -82,10 +82,13 @@ def calibrate_camera(
 ) -> CameraOutcome:
     """Calibrate a camera from photographs (files, folders, patterns, videos) of a board (value, text or board.yaml).
 
-    Writes camera.yaml (camera.failed.yaml where the verdict is FAIL, so that nothing reads it by mistake), corners.csv
-    and report.html into the folder `out`, whole or not at all; a FAIL does not replace an earlier calibration, it then
-    goes to `OUT-failed`. Raises InputError for pictures or a board that cannot be used, CalibrationError where the
-    photographs do not determine the camera.
+    Writes camera.yaml, corners.csv and report.html into the folder `out`, all or none. If the verdict is FAIL, the
+    camera file is called camera.failed.yaml so that no program reads it by mistake; a FAIL never replaces an earlier
+    calibration, its results go to `OUT-failed`.
+
+    Raises:
+        InputError: for pictures or a board that cannot be used.
+        CalibrationError: if the photographs do not determine the camera.
     """
     options = options or CameraOptions()
     refuse_foreign(out, _is_ours)
@@ -105,16 +108,14 @@ def calibrate_camera(
     with atomic_folder(folder, may_replace=_is_ours) as work:
         save_camera(file, work / (FAILED if outcome.level == Level.FAIL else CAMERA))
         _write_corners(outcome, work / CORNERS)
-        from lab.calibrate.camera.camera_page import (
-            write_page,  # the template engine: only for those who write a report
-        )
+        from lab.calibrate.camera.camera_page import write_page  # imports the template engine
 
         write_page(outcome, file, day, work)
     return outcome
 
 
 def corner_table(photos: PhotoSet) -> CornerTable:
-    """What the photographs gave, for the solve."""
+    """The corners of all views, as input of the solver."""
     board = photos.board
     views = [view for _, view in photos.views]
     circles = None
@@ -131,7 +132,7 @@ def _is_ours(folder: Path) -> bool:
 
 
 def camera_file(outcome: CameraOutcome, options: CameraOptions, day: datetime.date) -> CameraFile:
-    """What camera.yaml holds."""
+    """The content of camera.yaml."""
     r = outcome.result
     failed = outcome.level == Level.FAIL
     until = "" if options.valid_days is None or failed else (day + datetime.timedelta(options.valid_days)).isoformat()
@@ -161,7 +162,7 @@ def camera_file(outcome: CameraOutcome, options: CameraOptions, day: datetime.da
 
 
 def figures_of(r: Intrinsics) -> dict[str, float]:
-    """Further key figures of camera.yaml, by name with unit."""
+    """Further key figures for camera.yaml, by name with unit."""
     px, mm = r.map.sigma_px(r.covariance), r.map.sigma_mm(r.covariance)
     out = {
         "uncertainty_median_px": float(np.nanmedian(px)),
@@ -192,14 +193,14 @@ def figures_of(r: Intrinsics) -> dict[str, float]:
 
 
 def _write_corners(outcome: CameraOutcome, path: Path) -> None:
-    """A row per corner; residuals are empty in views that were left out."""
+    """Write corners.csv, one row per corner; residuals are empty in excluded views."""
     r, names = outcome.result, [name for name, _ in outcome.photos.views]
     ids = outcome.photos.board.ids
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(CORNER_COLUMNS)
         for k in range(len(r.table)):
-            miss = ["" if np.isnan(v) else f"{-v:.4f}" for v in r.fit.residuals[k].tolist()]
+            residual = ["" if np.isnan(v) else f"{-v:.4f}" for v in r.fit.residuals[k].tolist()]
             u, v = r.table.pixels[k].tolist()
             point = int(ids[r.table.point[k]])
-            writer.writerow([names[r.table.view[k]], point, f"{u:.4f}", f"{v:.4f}", *miss, int(r.fit.used[k])])
+            writer.writerow([names[r.table.view[k]], point, f"{u:.4f}", f"{v:.4f}", *residual, int(r.fit.used[k])])

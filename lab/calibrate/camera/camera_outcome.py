@@ -1,4 +1,4 @@
-"""How a camera's calibration ended."""
+"""Result of a camera calibration."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from lab.number_format import short
 
 @dataclass(frozen=True, slots=True)
 class CameraOutcome:
-    """How a camera's calibration ended."""
+    """Result of a camera calibration."""
 
     name: str
     out: Path
@@ -30,7 +30,7 @@ class CameraOutcome:
 
     @property
     def exit_status(self) -> int:
-        """0, or 3 where the calibration must not be used."""
+        """0, or 3 if the calibration must not be used."""
         return CalibrationError.exit_status if self.level == Level.FAIL else 0
 
     def line(self) -> str:

@@ -1,4 +1,4 @@
-"""The report of a camera's calibration."""
+"""Report of a camera calibration."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from lab.report.calibration.calibration_page import (
     write_calibration_report,
 )
 
-_WORST_VIEWS = 3  # of them as pictures, besides the median and the best
+_WORST_VIEWS = 3  # views with the largest residuals that are shown as pictures, besides the median and the best
 
 
 def write_page(outcome: CameraOutcome, file: CameraFile, day: datetime.date, folder: Path) -> Path:
@@ -66,15 +66,15 @@ def _key_figures(r: Intrinsics, file: CameraFile) -> list[tuple[str, str, str]]:
     failed = r.verdict is Level.FAIL
     return [
         ("focal length fx", f"{r.fit.lens[0]:.2f} ± {short(r.sigmas[0], 2)} px", f"{r.sigmas[0] / r.fit.lens[0]:.2%}"),
-        ("lens", r.model.words, "smallest that predicts new photographs as well as the best"),
+        ("lens model", r.model.words, "smallest that predicts new photographs as well as the best"),
         (
             "direction of a pixel, median",
             f"{short(np.nanmedian(px), 2)} px · {short(np.nanmedian(mm), 2)} mm",
             f"1 sigma, {at}",
         ),
-        ("at the worst place", f"{short(np.nanmax(px), 2)} px · {short(np.nanmax(mm), 2)} mm", f"1 sigma, {at}"),
-        ("corners' RMS", f"{r.rms_px:.3f} px", f"per coordinate; {r.rms_2d_px:.3f} px per corner, as OpenCV counts"),
-        ("in photographs held out", f"{r.held.rms_px:.3f} px · {short(held, 2)} mm", f"per coordinate, {at}"),
+        ("direction, maximum", f"{short(np.nanmax(px), 2)} px · {short(np.nanmax(mm), 2)} mm", f"1 sigma, {at}"),
+        ("RMS of corners", f"{r.rms_px:.3f} px", f"per coordinate; {r.rms_2d_px:.3f} px per corner, as in OpenCV"),
+        ("RMS in held-out photographs", f"{r.held.rms_px:.3f} px · {short(held, 2)} mm", f"per coordinate, {at}"),
         ("valid until", "must not be used" if failed else until or "no expiry date", ""),
     ]
 
@@ -90,25 +90,25 @@ def _numbers(r: Intrinsics) -> Section:
         for name, value, sigma in zip(r.parameters, free.tolist(), r.sigmas.tolist(), strict=True)
     ]
     words = [
-        "fx, fy, cx and cy are in pixels, the distortion numbers in OpenCV's order and units. Sigmas come from the"
-        " corners' own scatter"
+        "fx, fy, cx and cy are in pixels, the distortion coefficients in OpenCV's order and units. Sigmas follow from"
+        " the scatter of the corners"
         + (
-            f", raised by {r.correlated_noise:.2f} for what whole photographs scatter beyond it."
+            f", multiplied by {r.correlated_noise:.2f} for the additional scatter between photographs."
             if r.correlated_noise > 1
             else "."
         ),
-        "Numbers that go together (dark squares) are uncertain together: their errors cancel in part, and only the"
-        " whole covariance, as in camera.yaml, says how a pixel's direction is known.",
+        "Errors of correlated parameters (saturated colours) partly cancel: the uncertainty of a pixel's direction"
+        " follows only from the full covariance in camera.yaml.",
     ]
-    drawing = PageDrawing(correlation_matrix(r.parameters, r.covariance), "How the errors of the numbers go together.")
-    return Section("The numbers", words, [drawing], PageTable(("parameter", "value", "sigma", "value / sigma"), rows))
+    drawing = PageDrawing(correlation_matrix(r.parameters, r.covariance), "Correlations of the parameters.")
+    return Section("Parameters", words, [drawing], PageTable(("parameter", "value", "sigma", "value / sigma"), rows))
 
 
 def _model(r: Intrinsics) -> Section:
     candidates = [x for x in r.ladder.candidates if x.held is not None]
     held = np.array([np.nan if x.held is None else x.held.rms_px for x in candidates])
     fitted = np.array([np.nan if x.fit is None else x.fit.sigma_px for x in candidates])
-    # Of the difference to the best, which is far better known than each error alone.
+    # Standard error of the difference to the best model, which is much smaller than that of each error alone.
     spread = np.array([x.standard_error_px2 for x in candidates]) / (2 * held)
     chosen = next(k for k, x in enumerate(candidates) if x.model == r.ladder.chosen.model)
     chart = lens_ladder([_label(x.model) for x in candidates], held, chosen, fit_rms_px=fitted, sigma_px=spread)
@@ -117,29 +117,28 @@ def _model(r: Intrinsics) -> Section:
             x.model.words,
             np.nan if x.fit is None else x.fit.sigma_px,
             np.nan if x.held is None else x.held.rms_px,
-            "chosen" if x.model == r.ladder.chosen.model else x.refused or "errs more, or gains nothing",
+            "chosen" if x.model == r.ladder.chosen.model else x.refused or "larger error, or no improvement",
         )
         for x in r.ladder.candidates
     ]
     words = [
-        f"Each model was solved {len(r.held.folds)} times more, each time without some of the photographs, and then"
-        " asked to predict those (only the board's place in them was solved for). Residuals of the photographs that a"
-        " model was made from shrink with every coefficient; these do not.",
+        f"Cross-validation with {len(r.held.folds)} folds: each model was fitted without some of the photographs and"
+        " then used to predict these (only the pose of the board was fitted in them). Residuals of the fitted"
+        " photographs decrease with every coefficient; residuals of held-out photographs do not.",
         f"Chosen: {r.model.words}: {r.ladder.why}.",
     ]
     if r.warp is not None:
         bend = ", ".join(f"{w:.3g} ± {s:.1g}" for w, s in zip(r.warp.warp, r.warp.sigma, strict=True))
         words.append(
-            f"Board: {'corrected for its bend' if r.warp.corrected else 'taken as flat'} ({r.warp.why}). Its bend,"
-            f" solved for: {bend} per metre along x², xy, y²: {1000 * r.warp.rise_m:.2f} mm from its lowest to its"
-            " highest point."
+            f"Board: {'corrected for its bend' if r.warp.corrected else 'assumed flat'} ({r.warp.why}). Estimated bend:"
+            f" {bend} per metre for x², xy, y²; {1000 * r.warp.rise_m:.2f} mm between the lowest and the highest point."
         )
     words += [f.what for f in (stretch_finding(r), points_finding(r), circles_finding(r), doubt_finding(r)) if f]
     caption = (
-        "Bars: error on photographs held out; whiskers: of the difference to the best; ticks: on those solved from."
+        "Bars: error on held-out photographs; whiskers: sigma of the difference to the best; ticks: fitted photographs."
     )
-    table = PageTable(("model", "on its own photographs (px)", "on held-out ones (px)", "outcome"), rows)
-    return Section("Which lens model", words, [PageDrawing(chart, caption)], table)
+    table = PageTable(("model", "fitted photographs (px)", "held-out photographs (px)", "result"), rows)
+    return Section("Selection of the lens model", words, [PageDrawing(chart, caption)], table)
 
 
 def _label(model: LensModel) -> str:
@@ -156,7 +155,7 @@ def _uncertainty(r: Intrinsics) -> Section:
     drawings = [
         PageDrawing(
             heat_map(r.map.sigma_px(r.covariance), extent, "Uncertainty of a pixel's direction", "px"),
-            "1 sigma in its worst direction, after the best small turn of the camera.",
+            "1 sigma along the worst direction, after the best-fitting small rotation of the camera.",
         ),
         PageDrawing(
             heat_map(r.map.sigma_mm(r.covariance), extent, f"The same on a screen {at}", "mm"),
@@ -164,38 +163,38 @@ def _uncertainty(r: Intrinsics) -> Section:
         ),
     ]
     words = [
-        "What the lens' uncertainty does to a spot, all over the picture. It is the same in every frame: averaging does"
-        " not remove it. A turn of the camera looks much like a shift of its lens and is solved for through the same"
-        " lens when the camera is mounted; so the part that a turn undoes is left out here.",
+        "Effect of the lens uncertainty on a spot, over the picture. It is the same in every frame and is not reduced"
+        " by averaging. The part that a rotation of the camera compensates is left out: the attitude of the mounted"
+        " camera is estimated with this lens and takes up that part.",
     ]
     if r.halves is None:
-        words.append("Two halves could not be compared: one of them does not determine the lens.")
+        words.append("The two halves of the photographs cannot be compared: one of them does not determine the lens.")
     else:
         d = r.halves
         size = np.linalg.norm(d.moved_px, axis=-1)
         drawings.append(
             PageDrawing(
-                heat_map(size, extent, "Two halves of the photographs: how far they differ", "px"),
-                f"RMS {short(d.rms_px)} px ({short(d.rms_mm, 2)} mm {at}); expected from their sigmas"
+                heat_map(size, extent, "Difference between the two halves of the photographs", "px"),
+                f"RMS {short(d.rms_px)} px ({short(d.rms_mm, 2)} mm {at}); expected from the sigmas"
                 f" {short(d.expected_rms_px)} px (p = {d.p_value:.2g}).",
             )
         )
         words.append(
-            "A covariance knows nothing of a wrong model. The second test does: every other photograph against the"
-            " rest, solved apart. They should differ by what their sigmas let expect."
+            "The covariance does not contain errors of the lens model. A second test does: every other photograph and"
+            " the rest are calibrated separately and should differ only by as much as their sigmas allow."
         )
-    return Section("How well a pixel's direction is known", words, drawings)
+    return Section("Uncertainty of a pixel's direction", words, drawings)
 
 
 def _residuals(outcome: CameraOutcome) -> Section:
     r = outcome.result
     t, used = r.table, r.fit.used
-    found_less_model = -r.fit.residuals
+    residuals = -r.fit.residuals  # measured minus model
     drawings = [
-        PageDrawing(residual_field(t.image_size_px, t.pixels[used], found_less_model[used]), "Found less model."),
+        PageDrawing(residual_field(t.image_size_px, t.pixels[used], residuals[used]), "Measured minus model."),
         PageDrawing(
-            residual_histogram(found_less_model[used], sigma=r.fit.sigma_px),
-            "Per coordinate, used corners; the curve is that of normal errors.",
+            residual_histogram(residuals[used], sigma=r.fit.sigma_px),
+            "Per coordinate, used corners; the curve is the normal distribution.",
         ),
     ]
     rms = _rms_per_view(r)
@@ -207,7 +206,7 @@ def _residuals(outcome: CameraOutcome) -> Section:
                 corners_overlay(
                     t.image_size_px,
                     t.pixels[mine],
-                    found_less_model[mine],
+                    residuals[mine],
                     f"{name} ({word}): RMS {rms[v]:.3f} px",
                     picture=_picture(outcome, name),
                     rejected=~used[mine],
@@ -215,21 +214,21 @@ def _residuals(outcome: CameraOutcome) -> Section:
             )
         )
     words = (
-        "Single residuals are noise; what goes the same way all over a part of the picture (red) is what the model"
-        " cannot bend. Corners that miss by more than 4.5 sigmas, and views whose corners miss three times as far as"
-        " those of the median view, are left out."
+        "Single residuals are noise; a common direction in a part of the picture (red) is an error of the lens model."
+        " Corners with residuals beyond 4.5 sigma, and views with residuals three times those of the median view, are"
+        " excluded."
     )
-    return Section("What the model misses", words, drawings)
+    return Section("Residuals", words, drawings)
 
 
 def _rms_per_view(r: Intrinsics) -> Array:
-    """(V,): RMS per coordinate of the used corners; nan where a view was not used."""
+    """RMS (V,) per coordinate of the used corners of each view; nan for an unused view."""
     squared = np.sum(r.fit.residuals**2, axis=1) / 2
     return np.sqrt(r.table.mean_per_view(squared, r.fit.used))
 
 
 def _picture(outcome: CameraOutcome, name: str) -> NDArray[np.uint8] | None:
-    """The photograph for the eye, 8 bits; None where it can no longer be read."""
+    """The photograph as 8 bits for display; None if it can no longer be read."""
     path = outcome.photos.paths[name]
     if path.suffix.lower() in VIDEO_SUFFIXES:
         video = cv2.VideoCapture(str(path))
@@ -255,20 +254,20 @@ def _coverage(r: Intrinsics) -> Section:
         cv2.convexHull(t.pixels[used & (t.view == v)].astype(np.float32)).reshape(-1, 2).astype(float)
         for v in np.flatnonzero(t.counts(used) > 2)
     ]
-    good = np.isfinite(r.coverage.tilt_deg)
+    known = np.isfinite(r.coverage.tilt_deg)
     drawings = [
         PageDrawing(coverage_map(t.image_size_px, t.pixels[used], outlines_px=outlines), "Used corners and outlines."),
         PageDrawing(
-            tilt_polar(r.coverage.tilt_deg[good], r.coverage.azimuth_deg[good]),
-            "Boards tilted to all sides, by 20 deg and more, tell the focal length.",
+            tilt_polar(r.coverage.tilt_deg[known], r.coverage.azimuth_deg[known]),
+            "Boards tilted by 20 deg and more in all directions determine the focal length.",
         ),
     ]
-    gaps = f" None came near the {', '.join(r.coverage.gaps)}." if r.coverage.gaps else ""
+    gaps = f" No board was near the {', '.join(r.coverage.gaps)}." if r.coverage.gaps else ""
     words = (
-        f"Boards covered {r.coverage.filled:.0%} of the picture, and their directions differ by up to"
-        f" {r.coverage.spread_deg:.0f} deg.{gaps} Where no corner was, the lens is only extrapolated."
+        f"The boards cover {r.coverage.filled:.0%} of the picture, and their directions differ by up to"
+        f" {r.coverage.spread_deg:.0f} deg.{gaps} Where there are no corners, the lens model is extrapolated."
     )
-    return Section("Where the boards were", words, drawings)
+    return Section("Coverage by the boards", words, drawings)
 
 
 def _views(outcome: CameraOutcome) -> Section:
@@ -277,10 +276,10 @@ def _views(outcome: CameraOutcome) -> Section:
     depth = r.fit.poses.apply(r.table.middle)[:, 2]
     rows: list[tuple[object, ...]] = []
     for v, (name, view) in enumerate(outcome.photos.views):
-        why = r.fit.dropped.get(v, "")
-        note = f"left out: {why}" if why else "; ".join(view.notes)
-        where = (np.nan, np.nan) if why else (float(depth[v]), float(r.coverage.tilt_deg[v]))
-        rows.append((name, f"{counts[v]} of {len(view)}", float(rms[v]), *where, note))
+        reason = r.fit.dropped.get(v, "")
+        note = f"excluded: {reason}" if reason else "; ".join(view.notes)
+        distance_tilt = (np.nan, np.nan) if reason else (float(depth[v]), float(r.coverage.tilt_deg[v]))
+        rows.append((name, f"{counts[v]} of {len(view)}", float(rms[v]), *distance_tilt, note))
     rows += [(name, "none", np.nan, np.nan, np.nan, reason) for name, reason in outcome.photos.refused]
     heads = ("photograph", "corners used", "RMS (px)", "distance (m)", "tilt (deg)", "remarks")
     return Section("The photographs", outcome.photos.line() + ".", (), PageTable(heads, rows))

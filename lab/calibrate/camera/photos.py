@@ -1,4 +1,4 @@
-"""Photographs of a calibration board: files, folders, patterns and videos, read one picture at a time."""
+"""Photographs of a calibration board from files, folders, patterns and videos; one picture is in memory at a time."""
 
 from __future__ import annotations
 
@@ -20,40 +20,42 @@ from lab.pictures.opencv import quiet_cv2
 from lab.pictures.picture_file import SUFFIXES, UNREADABLE, Grey, Missing, checked, read_picture
 
 VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".webm")
-VIDEO_PICTURES = 120  # of one video at most, evenly spread: neighbouring frames show the same pose again
-_SHOWN = 3  # names in one line of an error
-# So many pictures without the board, and none with it, get a close look, that takes seconds; then a quick one must do
-# until a picture shows the board. A wrong kind of board or dictionary is wrong in all pictures.
-_CLOSE_LOOKS = 2
-# Of boards other than chessboards a quick look misses none: it only spares the cause, which of so many is enough. A
-# video of 111 frames, 63 without the board, then takes 6 s, not 25.
-_CAUSES = 10
-_TWIN = "the same picture as "
+VIDEO_PICTURES = 120  # largest number of frames used of one video, evenly spaced: neighbouring frames differ little
+_MAX_NAMES = 3  # file names shown in an error message
+# Number of pictures without the board that get the thorough search, which takes seconds, while no picture has shown the
+# board. After that the quick search is used until a picture shows it: a wrong type or dictionary fails in all pictures.
+_THOROUGH_SEARCHES = 2
+# Number of pictures without the board that get the thorough search once a board has been found, except for chessboards.
+# For the other types the quick search misses no board; it only gives no reason, and ten reasons are enough. A video of
+# 111 frames, 63 of them without the board, takes 6 s instead of 25.
+_REASONS = 10
+_DUPLICATE = "the same picture as "
 
-Progress = Callable[[int, int, str], None]  # pictures done, pictures in all, name of the last
+Progress = Callable[[int, int, str], None]  # pictures processed, number of pictures, name of the last picture
 
 
 @dataclass(frozen=True, slots=True)
 class PhotoSet:
-    """What a set of photographs of one camera shows of a board."""
+    """Views of a board in the photographs of one camera."""
 
     board: Board
     image_size_px: tuple[int, int]  # width, height, of every picture
-    views: tuple[tuple[str, BoardView], ...]  # by name, in the pictures' order
-    refused: tuple[tuple[str, str], ...]  # name and reason
-    paths: dict[str, Path]  # where the picture of a name is (a video's path for its frames)
+    views: tuple[tuple[str, BoardView], ...]  # picture name and view, in the order of the pictures
+    refused: tuple[tuple[str, str], ...]  # picture name and reason
+    paths: dict[str, Path]  # file of each picture name (for a frame, the video's path)
 
     def line(self) -> str:
-        """One line for the user, with the commonest reason where pictures were refused."""
+        """One line for the terminal, with the most frequent reason if pictures were refused."""
         total = len(self.views) + len(self.refused)
         text = f"{self.board.describe()}: found in {len(self.views)} of {total} pictures"
-        return text + (f"; {commonest(self.refused)}" if self.refused else "")
+        return text + (f"; {most_frequent_reason(self.refused)}" if self.refused else "")
 
 
 def load_photos(paths: Iterable[Path | str]) -> tuple[Path, ...]:
-    """The picture and video files that files, folders and patterns (`shots/*.png`) name, each once, in natural order.
+    """Picture and video files named by files, folders and patterns (`shots/*.png`), each once, in natural order.
 
-    Raises InputError where a path names nothing, or there is none.
+    Raises:
+        InputError: if a path matches no file, or no path is given.
     """
     found: list[Path] = []
     for given in paths:
@@ -69,8 +71,8 @@ def _files_of(path: Path) -> list[Path]:
         inside = sorted((p for p in path.iterdir() if _is_picture(p)), key=_natural)
         if not inside:
             below = [p.name for p in sorted(path.iterdir()) if p.is_dir() and any(map(_is_picture, p.iterdir()))]
-            hint = f"; its folders {', '.join(below[:_SHOWN])} do, name one of them" if below else ""
-            raise InputError(f"{path}: the folder holds no pictures ({', '.join(s[1:] for s in SUFFIXES)}){hint}")
+            hint = f"; give one of its folders with pictures: {', '.join(below[:_MAX_NAMES])}" if below else ""
+            raise InputError(f"{path}: the folder has no pictures ({', '.join(s[1:] for s in SUFFIXES)}){hint}")
         return inside
     if path.exists():
         return [path]
@@ -80,7 +82,7 @@ def _files_of(path: Path) -> list[Path]:
         if not files:
             raise InputError(f"{path}: no picture matches this pattern")
         return files
-    raise InputError(f"{path}: expected a picture, a folder or a pattern, found nothing; check the path")
+    raise InputError(f"{path}: expected a picture, a folder or a pattern, found no such file; check the path")
 
 
 def _is_picture(path: Path) -> bool:
@@ -88,7 +90,7 @@ def _is_picture(path: Path) -> bool:
 
 
 def _natural(path: Path) -> tuple[str, list[tuple[int, str]]]:
-    """shot-2 before shot-10."""
+    """Sort key in natural order: shot-2 before shot-10."""
     parts = re.split(r"(\d+)", path.name)
     return str(path.parent), [(int(p), "") if p.isdigit() else (-1, p.lower()) for p in parts]
 
@@ -96,31 +98,31 @@ def _natural(path: Path) -> tuple[str, list[tuple[int, str]]]:
 def find_in_photos(
     paths: Iterable[Path | str], board: Board, progress: Progress | None = None, fewest: int = 3
 ) -> PhotoSet:
-    """Look for a board in every photograph. One picture at a time is held in memory.
+    """Detect a board in every photograph. One picture at a time is held in memory.
 
-    Raises InputError where there is no readable picture, where sizes differ, and where fewer than `fewest` pictures
-    show the board.
+    Raises:
+        InputError: if no picture can be read, sizes differ, or fewer than `fewest` pictures show the board.
     """
     files = load_photos(paths)
     names = _names(files)
     total = sum(_frame_count(path) for path in files)
     views: list[tuple[str, BoardView]] = []
     refused: list[tuple[str, str]] = []
-    quick: set[str] = set()
-    where: dict[str, Path] = {}
+    quick: set[str] = set()  # pictures without a board after the quick search alone
+    path_of: dict[str, Path] = {}
     sizes: dict[tuple[int, int], list[str]] = {}
-    seen: dict[bytes, str] = {}
+    first_of: dict[bytes, str] = {}
     for done, (name, path, picture) in enumerate(_pictures(files, names), 1):
-        where[name] = path
+        path_of[name] = path
         if isinstance(picture, Missing):
             refused.append((name, picture.reason))
         else:
             sizes.setdefault((picture.shape[1], picture.shape[0]), []).append(name)
-            twin = seen.setdefault(hashlib.sha256(picture.tobytes()).digest(), name)
-            if twin != name:
-                refused.append((name, f"{_TWIN}{twin}: it would count twice"))
-            elif len(sizes) == 1:  # with two sizes there will be no calibration: only sizes are still collected
-                found = find_board(as_8_bit(picture), board, _closely(board, bool(views), refused))
+            original = first_of.setdefault(hashlib.sha256(picture.tobytes()).digest(), name)
+            if original != name:
+                refused.append((name, f"{_DUPLICATE}{original}: it would count twice"))
+            elif len(sizes) == 1:  # pictures of different sizes are an error: only their sizes are collected
+                found = find_board(as_8_bit(picture), board, _search_thoroughly(board, bool(views), refused))
                 if found is NO_CLOSE_LOOK:
                     quick.add(name)
                 elif isinstance(found, NotFound):
@@ -130,10 +132,10 @@ def find_in_photos(
         if progress is not None:
             progress(done, max(total, done), name)
     if not sizes:
-        raise InputError(f"none of {len(refused)} pictures can be read; {commonest(refused)}")
+        raise InputError(f"none of {len(refused)} pictures can be read; {most_frequent_reason(refused)}")
     if len(sizes) > 1:
         raise InputError(_mixed(sizes))
-    if views and quick and isinstance(board, Chessboard):  # it is in some: so the others are looked at closely too
+    if views and quick and isinstance(board, Chessboard):  # some show the board: search the others thoroughly too
         for name, _, picture in _pictures(files, names):
             if name in quick and not isinstance(picture, Missing):
                 found = find_board(as_8_bit(picture), board)
@@ -143,15 +145,15 @@ def find_in_photos(
                     views.append((name, found))
     else:
         refused += [(name, NO_CLOSE_LOOK.reason) for name in quick]
-    order = {name: k for k, name in enumerate(where)}
+    order = {name: k for k, name in enumerate(path_of)}
     views.sort(key=lambda view: order[view[0]])
     refused.sort(key=lambda item: order[item[0]])
-    _enough(views, refused, board, fewest)
-    return PhotoSet(board, next(iter(sizes)), tuple(views), tuple(refused), where)
+    _refuse_too_few(views, refused, board, fewest)
+    return PhotoSet(board, next(iter(sizes)), tuple(views), tuple(refused), path_of)
 
 
 def as_8_bit(picture: Grey) -> GreyImage:
-    """A picture of 16 bits stretched by its own range; one pixel in a thousand may lie outside on each side."""
+    """A picture as 8 bits; 16 bits are scaled from the 0.1 to the 99.9 percentile of the picture."""
     if picture.dtype == np.uint8:
         return np.asarray(picture, dtype=np.uint8)
     low, high = np.percentile(picture, [0.1, 99.9])
@@ -160,19 +162,19 @@ def as_8_bit(picture: Grey) -> GreyImage:
 
 
 def origins_of(photos: PhotoSet) -> tuple[str, ...]:
-    """Of each view, what its file's name tells of the camera: folder and name without the running number, or video."""
+    """Source of each view, from its file name: folder and name without the running number, or the video's name."""
     paths = [photos.paths[name] for name, _ in photos.views]
     one_folder = len({path.parent for path in paths}) < 2
     out = []
     for path in paths:
-        # cam0_001 is of cam0, left01 of left, IMG_0001_left of IMG_left: a number's own digits are two, or at the end.
+        # cam0_001 becomes cam0, left01 left, IMG_0001_left IMG_left: a running number has two digits or is at the end.
         word = path.name if path.suffix.lower() in VIDEO_SUFFIXES else re.sub(r"_?\d{2,}|\d+$", "", path.stem)
         out.append(word if one_folder else f"{path.resolve().parent.name}/{word}")
     return tuple(out)
 
 
 def _names(files: Sequence[Path]) -> dict[Path, str]:
-    """File names; with as many of the folders above as tell equal names apart."""
+    """File names, with as many parent folders as are needed to make the names unique."""
     for depth in range(1, 20):
         names = {path: "/".join(path.resolve().parts[-depth:]) for path in files}
         if len(set(names.values())) == len(files):
@@ -199,7 +201,7 @@ def _frame_count(path: Path) -> int:
 
 
 def _frames(path: Path) -> Iterator[tuple[int, Grey | Missing]]:
-    """Evenly spread frames of a video with their numbers."""
+    """Evenly spaced frames of a video with their numbers."""
     cv2 = quiet_cv2()
     video = cv2.VideoCapture(str(path))
     try:
@@ -214,26 +216,26 @@ def _frames(path: Path) -> Iterator[tuple[int, Grey | Missing]]:
                     yield number, checked(grey, None)
             number += 1
         if number == 0:
-            yield 0, Missing("unreadable: no video, or of a kind that OpenCV cannot decode")
+            yield 0, Missing("unreadable: not a video, or in a format that OpenCV cannot decode")
     finally:
         video.release()
 
 
-def commonest(refused: Sequence[tuple[str, str]]) -> str:
-    """The commonest reason among (name, reason), how often it came, and where first. Numbers in it may differ."""
+def most_frequent_reason(refused: Sequence[tuple[str, str]]) -> str:
+    """The most frequent reason among (name, reason), ignoring numbers, with its count and the first picture."""
     if not refused:
-        return "nothing was refused"
-    twins = [item for item in refused if item[1].startswith(_TWIN)]
+        return "no picture was refused"
+    duplicates = [item for item in refused if item[1].startswith(_DUPLICATE)]
     quick = [item for item in refused if item[1] == NO_CLOSE_LOOK.reason]
-    telling = [item for item in refused if item not in twins and item not in quick] or quick or twins
-    kinds = Counter(_kind(reason) for _, reason in telling)
+    specific = [item for item in refused if item not in duplicates and item not in quick] or quick or duplicates
+    kinds = Counter(_kind(reason) for _, reason in specific)
     kind, count = kinds.most_common(1)[0]
-    name, reason = next((n, r) for n, r in telling if _kind(r) == kind)
-    text = f"refused most often ({count} of {len(telling)}, first {name}): {reason}"
-    if quick and telling is not quick:
-        text += f"; in {len(quick)} more no board was seen at a quick look"
-    if twins and telling is not twins:
-        text += f"; {len(twins)} more are copies of others"
+    name, reason = next((n, r) for n, r in specific if _kind(r) == kind)
+    text = f"most frequent reason ({count} of {len(specific)}, first {name}): {reason}"
+    if quick and specific is not quick:
+        text += f"; in {len(quick)} more the quick search found no board"
+    if duplicates and specific is not duplicates:
+        text += f"; {len(duplicates)} more are copies of others"
     return text
 
 
@@ -242,33 +244,35 @@ def _kind(reason: str) -> str:
     return re.sub(r"\d+(\.\d+)?", "#", reason)
 
 
-def _closely(board: Board, seen: bool, refused: Sequence[tuple[str, str]]) -> bool:
-    """Whether the next picture deserves a close look. seen: the board is in some picture."""
-    if seen and isinstance(board, Chessboard):
+def _search_thoroughly(board: Board, found_before: bool, refused: Sequence[tuple[str, str]]) -> bool:
+    """Whether the next picture gets the thorough search. found_before: an earlier picture shows the board."""
+    if found_before and isinstance(board, Chessboard):
         return True
-    looked_at = sum(not reason.startswith((_TWIN, UNREADABLE)) for _, reason in refused)
-    return looked_at < (_CAUSES if seen else _CLOSE_LOOKS)
+    searched = sum(not reason.startswith((_DUPLICATE, UNREADABLE)) for _, reason in refused)
+    return searched < (_REASONS if found_before else _THOROUGH_SEARCHES)
 
 
 def _mixed(sizes: dict[tuple[int, int], list[str]]) -> str:
+    """The message for pictures of different sizes."""
     by_count = sorted(sizes.items(), key=lambda item: -len(item[1]))
     parts = []
     for (width, height), names in by_count:
-        more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
-        parts.append(f"{width}x{height} ({', '.join(names[:_SHOWN])}{more})")
-    turned = {(w, h) for w, h in sizes} == {(h, w) for w, h in sizes}
-    remedy = "; some are turned on their side: keep the camera's own orientation" if turned else ""
+        more = f" and {len(names) - _MAX_NAMES} more" if len(names) > _MAX_NAMES else ""
+        parts.append(f"{width}x{height} ({', '.join(names[:_MAX_NAMES])}{more})")
+    rotated = {(w, h) for w, h in sizes} == {(h, w) for w, h in sizes}
+    remedy = "; some are rotated by 90 degrees: keep the camera's own orientation" if rotated else ""
     return (
-        f"the pictures have different sizes: {', '.join(parts)}; one calibration is for one camera at one size{remedy}"
+        f"the pictures have different sizes: {', '.join(parts)}; a calibration needs pictures of one camera at one"
+        f" size{remedy}"
     )
 
 
-def _enough(views: Sequence[object], refused: Sequence[tuple[str, str]], board: Board, fewest: int) -> None:
+def _refuse_too_few(views: Sequence[object], refused: Sequence[tuple[str, str]], board: Board, fewest: int) -> None:
     total = len(views) + len(refused)
     if not views:
-        raise InputError(f"{board.describe()}: found in none of {total} pictures; {commonest(refused)}")
+        raise InputError(f"{board.describe()}: found in none of {total} pictures; {most_frequent_reason(refused)}")
     if len(views) < fewest:
-        tail = f"; {commonest(refused)}" if refused else "; take more pictures"
+        tail = f"; {most_frequent_reason(refused)}" if refused else "; take more pictures"
         raise InputError(
             f"{board.describe()}: found in {len(views)} of {total} pictures, {fewest} or more are needed{tail}"
         )

@@ -1,1 +1,1 @@
-"""`beampose calibrate check`: whether a stored calibration still holds."""
+"""`beampose calibrate check`: checks a stored calibration for drift."""

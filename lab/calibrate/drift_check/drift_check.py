@@ -1,14 +1,15 @@
-"""`beampose calibrate check`: does the stored calibration still hold today?
+"""`beampose calibrate check`: checks a stored calibration for drift.
 
-Known points, or a vehicle that stands still, are compared with what rig.yaml foretells. What the calibration itself
-leaves uncertain counts as uncertainty here, so that only a change since then is called drift. (Points that the
-calibration was made from make the check milder than it says: their own errors are in both.)
+The pixels of known points, or of a vehicle at rest, are compared with the prediction by rig.yaml. The covariance of the
+calibration is part of the test, so that only a change since the calibration counts as drift. (With points that were
+used in the calibration, the test is less sensitive than stated: their errors are in the calibration too.)
 """
 
 from __future__ import annotations
 
 import datetime
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -28,21 +29,20 @@ from geometry.arrays import Array
 from geometry.camera import Camera
 from geometry.planes import meet_plane
 from geometry.rig import Rig
-from lab.calibrate.drift_check.drift_expected import Compared, compare_points, compare_still, refuse_moving
+from lab.calibrate.drift_check.drift_comparison import PixelComparison, check_at_rest, compare_points, compare_still
 from lab.calibrate.drift_check.drift_history import HistoryRow, read_history, write_history
-from lab.calibrate.drift_check.drift_inputs import read_points, read_still, read_still_pose
+from lab.calibrate.drift_check.drift_inputs import DriftInputs, read_points, read_still_pose, read_still_spots
 from lab.calibrate.drift_check.drift_messages import camera_findings, other_findings, state_findings
 from lab.calibrate.drift_check.drift_page import write_page
 from lab.calibrate.drift_check.drift_result import (
     CameraDrift,
-    DailyLimits,
+    DriftLimits,
     DriftOutcome,
     OtherChange,
     is_weak,
     level_of,
     not_checked,
 )
-from lab.errors import InputError
 from lab.files.rig.rig_covariance import joint_covariance
 from lab.files.rig.rig_file import RigFile, load_rig_file
 from lab.files.text.atomic_write import atomic_folder, refuse_foreign
@@ -57,58 +57,54 @@ COLUMNS = (
 )  # fmt: skip
 
 
+@dataclass(frozen=True, slots=True)
+class CheckData:
+    """Measured and predicted pixels of a check, and how they were obtained."""
+
+    comparisons: list[PixelComparison]
+    with_covariance: bool  # whether rig.yaml has a covariance
+    sigma_given: bool  # whether the points' file states sigmas
+    pose_free: bool  # whether the vehicle's pose was fitted
+
+
 def check_drift(
     rig_path: Path,
     out: Path,
-    points: Path | None = None,
-    run: Path | None = None,
+    inputs: DriftInputs,
     today: datetime.date | None = None,
     *,
-    survey: Path | None = None,
-    pose: Path | None = None,
     history: Path | None = None,
-    limits: DailyLimits | None = None,
+    limits: DriftLimits | None = None,
 ) -> DriftOutcome:
-    """Compare known points or a still vehicle with the stored calibration; write report.html and drift.csv into `out`.
+    """Compare known points or a vehicle at rest with the stored calibration; write report.html and drift.csv to `out`.
 
-    points: CSV camera,point,u_px,v_px[,sigma_px], places in it or in `survey` (daily_inputs.read_points). run: a run
-    folder, a folder of results or a spots.csv of a vehicle at rest, whose pose is free or read from `pose`. history: a
-    CSV that this check's rows are added to. Raises InputError.
+    history: a CSV to which the rows of this check are appended.
+
+    Raises:
+        InputError: for errors in the files.
     """
     refuse_foreign(out, _is_ours)
-    limits = limits or DailyLimits()
+    inputs.check()
+    limits = limits or DriftLimits()
     today = today or datetime.date.today()
     rig_path = Path(rig_path)
-    if (points is None) == (run is None):
-        got = "neither" if points is None else "both"
-        raise InputError(f"expected either known points (--points) or a static run (--run), got {got}")
-    if points is None and survey is not None:
-        raise InputError("expected --survey together with --points: a static run needs no surveyed points")
-    if run is None and pose is not None:
-        raise InputError("expected --pose together with --run: known points need no pose")
     file = load_rig_file(rig_path)
-    covariance = joint_covariance(file.rig, file.covariances, rig_path)
-    if points is not None:
-        points = Path(points)
-        known = read_points(points, None if survey is None else Path(survey), file.rig, limits.point_sigma_px)
-        compared = compare_points(file.rig, known, covariance, points)
-        sigma_given, pose_free = known.sigma_given, False
-    else:
-        assert run is not None
-        still = read_still(run, file.rig)
-        refuse_moving(still, limits.still_px, Path(run))
-        stands = None if pose is None else (read_still_pose(Path(pose)), _pose_covariance(limits))
-        compared = [compare_still(file.rig, still, covariance, stands, limits.floor_px, Path(run))]
-        sigma_given, pose_free = True, pose is None
-    cameras, others, findings = judge(file, compared, limits, today, covariance is not None, sigma_given, pose_free)
+    data = _compare(file, rig_path, inputs, limits)
+    cameras, others, findings = judge(file, data, limits, today)
     earlier = read_history(history) if history is not None else []
     rows = [HistoryRow(today, c.camera, c.drift_px, c.noise_px, c.drift_mm, c.level) for c in cameras]
-    inputs = [rig_path, *(p for p in (points, survey, pose) if p is not None)]
-    inputs += [Path(run)] if run is not None and Path(run).is_file() else []
-    outcome = DriftOutcome(Path(out), verdict(findings), tuple(cameras), tuple(findings), _unchecked(file.rig, cameras))
+    outcome = DriftOutcome(
+        Path(out),
+        verdict(findings),
+        tuple(cameras),
+        tuple(findings),
+        tuple(others),
+        _unchecked(file.rig, cameras),
+    )
     with atomic_folder(Path(out), may_replace=_is_ours) as work:
         write_drift_table(cameras, work / TABLE)
-        write_page(outcome, file, compared, others, [*earlier, *rows], limits, today, inputs, work)
+        files = [rig_path, *inputs.files()]
+        write_page(outcome, file, data.comparisons, [*earlier, *rows], limits, today, files, work)
     if history is not None:
         write_history([*earlier, *rows], history)
     return outcome
@@ -118,54 +114,62 @@ def _is_ours(folder: Path) -> bool:
     return (folder / TABLE).is_file()
 
 
-def _pose_covariance(limits: DailyLimits) -> Array:
+def _compare(file: RigFile, rig_path: Path, inputs: DriftInputs, limits: DriftLimits) -> CheckData:
+    """Read the measurements and compare them with the prediction by the rig."""
+    covariance = joint_covariance(file.rig, file.covariances, rig_path)
+    if inputs.points is not None:
+        known = read_points(inputs.points, inputs.survey, file.rig, limits.point_sigma_px)
+        compared = compare_points(file.rig, known, covariance, inputs.points)
+        return CheckData(compared, covariance is not None, known.sigma_given, pose_free=False)
+    assert inputs.run is not None
+    still = read_still_spots(inputs.run, file.rig)
+    check_at_rest(still, limits.still_px, inputs.run)
+    pose = None if inputs.pose is None else (read_still_pose(inputs.pose), _pose_covariance(limits))
+    compared = [compare_still(file.rig, still, covariance, pose, limits.floor_px, inputs.run)]
+    return CheckData(compared, covariance is not None, sigma_given=True, pose_free=pose is None)
+
+
+def _pose_covariance(limits: DriftLimits) -> Array:
     return np.diag([limits.pose_sigma_m**2] * 3 + [np.deg2rad(limits.pose_sigma_deg) ** 2] * 3)
 
 
 def judge(
-    file: RigFile,
-    compared: list[Compared],
-    limits: DailyLimits,
-    today: datetime.date,
-    with_covariance: bool = True,
-    sigma_given: bool = True,
-    pose_free: bool = False,
+    file: RigFile, data: CheckData, limits: DriftLimits, today: datetime.date
 ) -> tuple[list[CameraDrift], list[OtherChange], list[Finding]]:
-    """What the comparisons say: of each camera, of points and lasers, and in words."""
-    each = limits.p_false_alarm / max(len(compared), 1)
+    """Judge a check: the drift of each camera, wrong points and moved lasers, and the findings."""
+    p_each = limits.p_false_alarm / max(len(data.comparisons), 1)
     cameras: list[CameraDrift] = []
     others: list[OtherChange] = []
     findings = state_findings(file.calibration, today, limits.expiry_warning_days)
-    for one in compared:
-        verdicts = find_changes(one.misfit, one.columns, one.others, each)
-        found = [_camera_drift(file.rig, name, one, verdicts, limits, each) for name in one.columns]
-        apart = [_other(file.rig, one, c) for c in verdicts.changes if c.kind not in CAMERA_KINDS]
-        cameras += found
-        others += apart
-        findings += [f for c in found for f in camera_findings(c, limits, pose_free)]
+    for one in data.comparisons:
+        verdicts = find_changes(one.misfit, one.columns, one.others, p_each)
+        drifts = [_camera_drift(file.rig, name, one, verdicts, limits, p_each) for name in one.columns]
+        cameras += drifts
+        others += [_other(file.rig, one, c) for c in verdicts.changes if c.kind not in CAMERA_KINDS]
+        findings += [f for c in drifts for f in camera_findings(c, limits, data.pose_free)]
     findings += other_findings(others, limits)
-    unseen = _unchecked(file.rig, cameras)
-    if unseen:
+    unchecked = _unchecked(file.rig, cameras)
+    if unchecked:
         findings.append(
             Finding(
                 Level.WARN,
-                not_checked(unseen),
-                "its drift, if any, is not known",
+                not_checked(unchecked),
+                "a drift of it would not be noticed",
                 "measure known points in every camera",
             )
         )
-    if not with_covariance:
+    if not data.with_covariance:
         findings.append(
             Finding(
                 Level.WARN,
-                "rig.yaml holds no covariance: the calibration's own errors count as drift here",
-                "the false-alarm rate is not what it says",
+                "rig.yaml has no covariance: the calibration's own errors count as drift here",
+                "false alarms are more frequent than stated",
                 "calibrate with beampose, which writes the covariance",
             )
         )
-    if not sigma_given:
+    if not data.sigma_given:
         findings.append(
-            Finding(Level.PASS, f"the points' file gives no sigma_px: {limits.point_sigma_px:g} px is taken for each")
+            Finding(Level.PASS, f"the points' file has no sigma_px: {limits.point_sigma_px:g} px is assumed")
         )
     return cameras, others, findings
 
@@ -176,13 +180,13 @@ def _unchecked(rig: Rig, cameras: Sequence[CameraDrift]) -> tuple[str, ...]:
 
 
 def _camera_drift(
-    rig: Rig, name: str, one: Compared, verdicts: Verdicts, limits: DailyLimits, p_false_alarm: float
+    rig: Rig, name: str, one: PixelComparison, verdicts: Verdicts, limits: DriftLimits, p_false_alarm: float
 ) -> CameraDrift:
     camera, rows = rig.cameras[name], one.rows_of(name)
     of_rows = np.stack([2 * rows, 2 * rows + 1], axis=1).ravel()
     model = one.columns[name].model
     own = next((c for c in verdicts.changes if c.kind in CAMERA_KINDS and c.subject == name), None)
-    # The numbers are of what is left when all other changes are explained.
+    # The figures are computed after removing all other changes.
     misfit = one.misfit.without(c for c in verdicts.changes if c is not own)
     fit = misfit.fit(TURNED_ZOOMED, name, one.columns[name].kinds(UsualSizes())[TURNED_ZOOMED])
     drift = (own or fit).displacement[of_rows].reshape(-1, 2)
@@ -192,14 +196,14 @@ def _camera_drift(
     ways[of_rows[::2], 0] = ways[of_rows[1::2], 1] = 1.0
     tests = limits_share(p_false_alarm, len(one.columns))
     detectable = misfit.detectable(ways, model, tests, limits.power)
-    foretold = one.foretold[rows]
-    mm_per_px = mm_at_screen(rig, camera, foretold, np.full_like(foretold, np.sqrt(0.5)))
+    predicted = one.predicted[rows]
+    mm_per_px = mm_at_screen(rig, camera, predicted, np.full_like(predicted, np.sqrt(0.5)))
     left = np.full((len(rows), 2), np.nan)
     if verdicts.unexplained:
         left = (verdicts.left.factor @ verdicts.left.white)[of_rows].reshape(-1, 2)
-    px, mm = rms_length(drift), mm_at_screen(rig, camera, foretold, drift)
+    px, mm = rms_length(drift), mm_at_screen(rig, camera, predicted, drift)
     left_px = rms_length(left)
-    left_mm = mm_at_screen(rig, camera, foretold, left) if verdicts.unexplained else float("nan")
+    left_mm = mm_at_screen(rig, camera, predicted, left) if verdicts.unexplained else float("nan")
     level = Level.PASS
     if own is not None:
         level = level_of(px, mm, limits)
@@ -210,7 +214,7 @@ def _camera_drift(
     return CameraDrift(
         camera=name,
         pixels=one.pixels[rows],
-        residual_px=(one.pixels - one.foretold)[rows],
+        residual_px=(one.pixels - one.predicted)[rows],
         explained_px=drift if own is not None else np.zeros_like(drift),
         drift_px=px,
         noise_px=expected_rms(model[of_rows], fit.noise),
@@ -232,14 +236,14 @@ def _camera_drift(
 
 
 def limits_share(p_false_alarm: float, n_cameras: int) -> float:
-    """The false-alarm rate of one camera's own test, as find_changes spends it."""
+    """Share of the false-alarm rate that `find_changes` gives to the test of one camera."""
     return p_false_alarm / 2 / max(n_cameras, 1)
 
 
 def mm_at_screen(rig: Rig, camera: Camera, pixels: Array, displacement_px: Array) -> float:
-    """RMS length, mm, on the camera's screen of displacements (n, 2), px, at pixels (n, 2); nan where all rays miss.
+    """RMS length on the camera's screen, mm, of displacements (n, 2), px, at pixels (n, 2); nan if all rays miss it.
 
-    Taken along the ray at half the displacement to either side; the screen's bow, a few mm, changes nothing here.
+    Distance between the points of the screen at half the displacement to either side; its bow, a few mm, is neglected.
     """
     screen = rig.screens[camera.screen].world_from_screen
     ends = [meet_plane(*camera.rays(pixels + sign * displacement_px / 2), screen) for sign in (-1, 1)]
@@ -248,16 +252,16 @@ def mm_at_screen(rig: Rig, camera: Camera, pixels: Array, displacement_px: Array
     return 1e3 * float(np.sqrt(squared.mean())) if len(squared) else float("nan")
 
 
-def _other(rig: Rig, one: Compared, change: Change) -> OtherChange:
+def _other(rig: Rig, one: PixelComparison, change: Change) -> OtherChange:
     moved = change.displacement.reshape(-1, 2)
     rows = np.flatnonzero(np.abs(moved).max(axis=1) > 0)
     camera = rig.cameras[one.camera[rows[0] if len(rows) else 0]]
-    mm = mm_at_screen(rig, camera, one.foretold[rows[:1]], moved[rows[:1]]) if len(rows) else 0.0
+    mm = mm_at_screen(rig, camera, one.predicted[rows[:1]], moved[rows[:1]]) if len(rows) else 0.0
     return OtherChange(change, rms_length(moved[rows].ravel()), mm)
 
 
 def write_drift_table(cameras: list[CameraDrift], path: Path) -> None:
-    """drift.csv: a row per camera."""
+    """Write drift.csv, a row per camera."""
     lines = [",".join(COLUMNS)]
     for c in cameras:
         numbers = [

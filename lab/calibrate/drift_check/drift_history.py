@@ -1,4 +1,4 @@
-"""drift_history.csv: one row per camera and check, so that a slow drift is seen before it is a fault."""
+"""Drift history: a CSV with one row per camera and check, which shows a slow drift before it exceeds a limit."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ COLUMNS = ("date", "camera", "drift_px", "noise_px", "drift_mm", "verdict")
 
 @dataclass(frozen=True, slots=True)
 class HistoryRow:
-    """One camera at one check."""
+    """Drift of one camera in one check."""
 
     date: datetime.date
     camera: str
@@ -31,7 +31,11 @@ class HistoryRow:
 
 
 def read_history(path: Path) -> list[HistoryRow]:
-    """The rows so far; none where there is no file yet. Raises InputError for a file that is something else."""
+    """Rows of earlier checks; none if the file does not exist.
+
+    Raises:
+        InputError: for a file that is not a drift history.
+    """
     path = Path(path)
     if not path.exists():
         return []
@@ -56,7 +60,7 @@ def read_history(path: Path) -> list[HistoryRow]:
         except (ValueError, KeyError):
             raise InputError(
                 f"{path}: line {number}: expected {','.join(COLUMNS)}, got {shown_line(','.join(fields)[:80])};"
-                " mend or delete it"
+                " correct or delete the line"
             ) from None
         rows.append(row)
     return rows
@@ -67,7 +71,7 @@ def _float(text: str) -> float:
 
 
 def write_history(rows: Sequence[HistoryRow], path: Path) -> None:
-    """Write all rows, whole or not at all: a check that is stopped leaves the history as it was."""
+    """Write all rows atomically: an interrupted check leaves the history unchanged."""
     lines = [",".join(COLUMNS)]
     for r in rows:
         numbers = ["" if math.isnan(v) else f"{v:.6g}" for v in (r.drift_px, r.noise_px, r.drift_mm)]

@@ -1,4 +1,4 @@
-"""A daily check's findings in words: what has changed, what it means, what to do."""
+"""Findings of a drift check in words: the change, its consequence and the remedy."""
 
 from __future__ import annotations
 
@@ -9,27 +9,30 @@ import numpy as np
 
 from calibration.drift import ALL_CHANGED, LASER_MOVED, MOVED, TURNED, TURNED_ZOOMED, ZOOMED
 from calibration.findings import Finding, Level
-from lab.calibrate.drift_check.drift_result import CameraDrift, DailyLimits, OtherChange, is_weak, level_of
+from lab.calibrate.drift_check.drift_result import CameraDrift, DriftLimits, OtherChange, is_weak, level_of
 from lab.files.rig.calibration_state import CalibrationState
 from lab.number_format import short
 
-_RECALIBRATE = {
-    TURNED: "Look for a knocked or loose mount; fix it, then find the camera's place anew (`calibrate rig`).",
-    MOVED: "Look for a knocked or loose mount; fix it, then find the camera's place anew (`calibrate rig`).",
-    ZOOMED: "Check the focus and zoom rings and the lens mount, lock them, then calibrate this camera's lens anew.",
-    TURNED_ZOOMED: "Check mount, focus and zoom rings; lock them, then calibrate the lens and the camera's place anew.",
-    ALL_CHANGED: "Check mount, focus and zoom rings; lock them, then calibrate the lens and the camera's place anew.",
+_CHECK_MOUNT = "Look for a displaced or loose mount; fix it, then recalibrate the camera's pose (`calibrate rig`)."
+_CHECK_LENS = "Check the focus and zoom rings and the lens mount, lock them, then recalibrate this camera's lens."
+_CHECK_BOTH = "Check the mount and the focus and zoom rings, lock them, then recalibrate the camera's lens and pose."
+_REMEDIES = {
+    TURNED: _CHECK_MOUNT,
+    MOVED: _CHECK_MOUNT,
+    ZOOMED: _CHECK_LENS,
+    TURNED_ZOOMED: _CHECK_BOTH,
+    ALL_CHANGED: _CHECK_BOTH,
 }
 
 
 def state_findings(state: CalibrationState | None, today: datetime.date, warning_days: int) -> list[Finding]:
-    """What rig.yaml says of its own calibration."""
+    """Findings on the date, verdict and expiry of the calibration in rig.yaml."""
     if state is None:
         return [
             Finding(
                 Level.WARN,
-                "rig.yaml does not say when it was calibrated (no block `calibration`)",
-                "nobody can tell whether it is out of date",
+                "rig.yaml does not state when it was calibrated (no block `calibration`)",
+                "it may be out of date",
                 "Calibrate with beampose, or add calibration: {date: ..., verdict: PASS, valid_until: ...}.",
             )
         ]
@@ -39,8 +42,8 @@ def state_findings(state: CalibrationState | None, today: datetime.date, warning
             Finding(
                 Level.FAIL,
                 f"the calibration of {state.date} failed: {state.reasons[0] if state.reasons else 'no reason given'}",
-                "it must not be used, whatever today's drift",
-                "Put the cause right and calibrate again.",
+                "it must not be used, even without drift",
+                "Correct the cause and calibrate again.",
             )
         )
     if state.date > today:
@@ -48,7 +51,7 @@ def state_findings(state: CalibrationState | None, today: datetime.date, warning
             Finding(
                 Level.WARN,
                 f"the calibration is dated {state.date}, after today ({today})",
-                "its age cannot be judged",
+                "its age is unknown",
                 "Check the clock of this computer and the date in rig.yaml.",
             )
         )
@@ -61,8 +64,8 @@ def state_findings(state: CalibrationState | None, today: datetime.date, warning
             Finding(
                 Level.FAIL,
                 f"the calibration expired on {state.valid_until}, {_days(-left)} ago",
-                "mounts and lenses creep; the lab has set this date",
-                "Calibrate again, or, if the drift below is within its limits, set a new valid_until in rig.yaml.",
+                "mounts and lenses creep; this date was set for the calibration",
+                "Calibrate again, or, if the drift is within the limits, set a new valid_until in rig.yaml.",
             )
         )
     elif left <= warning_days:
@@ -70,7 +73,7 @@ def state_findings(state: CalibrationState | None, today: datetime.date, warning
             Finding(
                 Level.WARN,
                 f"the calibration expires on {state.valid_until}, in {_days(left)}",
-                "after that day runs are refused",
+                "later runs will be refused",
                 "Plan a new calibration.",
             )
         )
@@ -84,57 +87,59 @@ def _days(count: int) -> str:
 
 
 def size(px: float, mm: float) -> str:
-    """`0.52 px (1.5 mm at the screen)`."""
+    """An amount of drift in words: `0.52 px (1.5 mm at the screen)`."""
     return f"{short(px)} px" + (
-        f" ({short(mm)} mm at the screen)" if np.isfinite(mm) else " (its rays miss its screen)"
+        f" ({short(mm)} mm at the screen)" if np.isfinite(mm) else " (the rays miss the screen)"
     )
 
 
-def camera_findings(c: CameraDrift, limits: DailyLimits, pose_free: bool) -> list[Finding]:
-    """What a check found in one camera."""
+def camera_findings(c: CameraDrift, limits: DriftLimits, pose_free: bool) -> list[Finding]:
+    """Findings on one camera. pose_free: whether the pose of the vehicle was fitted."""
     out = []
     name = f"camera {c.camera}"
     if c.change is not None:
         level = level_of(c.drift_px, c.drift_mm, limits)
         limit = limits.fail_mm if level == Level.FAIL else limits.warn_mm
         why = {
-            Level.PASS: f"it is sure but small: below {limits.warn_mm:g} mm it is lost in the spots' own noise",
-            Level.WARN: f"beyond {limit:g} mm it shows in the pose; the stated sigmas are too small by it",
-            Level.FAIL: f"beyond {limit:g} mm the pose is wrong by more than it claims",
+            Level.PASS: f"it is significant but small: below {limits.warn_mm:g} mm it is less than the spots' noise",
+            Level.WARN: f"beyond {limit:g} mm it affects the pose, and the stated sigmas do not include it",
+            Level.FAIL: f"beyond {limit:g} mm the error of the pose exceeds the stated sigmas",
         }[level]
-        also = " An unknown vehicle pose may hide part of the change." if pose_free else ""
-        remedy = "" if level == Level.PASS else _RECALIBRATE[c.change.kind]
-        what = f"{name} {told(c)}: its picture is off by {size(c.drift_px, c.drift_mm)}, p = {_p(c.change.p_value)}"
+        also = " The fit of the unknown vehicle pose may absorb part of the change." if pose_free else ""
+        remedy = "" if level == Level.PASS else _REMEDIES[c.change.kind]
+        change = describe_change(c)
+        what = f"{name} {change}: its picture is off by {size(c.drift_px, c.drift_mm)}, p = {_p(c.change.p_value)}"
         out.append(Finding(level, what, why + "." + also if also else why, remedy))
     if np.isfinite(c.unexplained_px):
         out.append(
             Finding(
                 level_of(c.unexplained_px, c.unexplained_mm, limits),
-                f"{name}: pixels are off by {size(c.unexplained_px, c.unexplained_mm)} in a way that neither a turned"
-                " or moved camera, a changed focus nor a few wrong points explain",
-                "the points, the screen or the lens model are not what the calibration says",
-                "Check the points' names and places; if they are right, calibrate again.",
+                f"{name}: pixels are off by {size(c.unexplained_px, c.unexplained_mm)} in a way that a turned or moved"
+                " camera, a changed focus or a few wrong points do not explain",
+                "the points, the screen or the lens differ from the calibration",
+                "Check the names and coordinates of the points; if they are correct, calibrate again.",
             )
         )
     if out:
         return out
     weak = is_weak(c.detectable_mm, limits)
-    seen = "a common shift of its picture could not have been found"
+    detectable = "a common shift of its picture is not detectable"
     if np.isfinite(c.detectable_px):
-        seen = f"a shift of {size(c.detectable_px, c.detectable_mm)} would have been found"
+        detectable = f"the smallest detectable shift is {size(c.detectable_px, c.detectable_mm)}"
     state = "shows no change, but this check is weak" if weak else "has not changed"
-    what = f"{name} {state}: drift {size(c.drift_px, c.drift_mm)}, by noise alone {short(c.noise_px)} px; {seen}"
+    what = f"{name} {state}: drift {size(c.drift_px, c.drift_mm)}, expected from noise {short(c.noise_px)} px"
+    what += f"; {detectable}"
     if not weak:
         return [Finding(Level.PASS, what)]
-    remedy = "Measure more points, spread over the picture, or with a smaller sigma."
+    remedy = "Measure more points, distributed over the picture, or with a smaller sigma."
     if pose_free:
-        remedy = "A vehicle at an unknown pose hides such shifts: give its pose (--pose) or measure known points."
-    why = f"a drift far beyond {limits.fail_mm:g} mm, where it must not be used, could have been missed"
+        remedy = "An unknown vehicle pose absorbs such shifts: give the pose (--pose) or measure known points."
+    why = f"the check can miss a drift far beyond {limits.fail_mm:g} mm, the limit for use"
     return [Finding(Level.WARN, what, why, remedy)]
 
 
-def told(c: CameraDrift) -> str:
-    """What a camera did, with its figures."""
+def describe_change(c: CameraDrift) -> str:
+    """The change of a camera in words, with its figures."""
     assert c.change is not None
     kind = c.change.kind
     if kind == ZOOMED:
@@ -156,19 +161,20 @@ def told(c: CameraDrift) -> str:
     return words + (", and its focal length changed" if kind == ALL_CHANGED else "")
 
 
-def other_findings(others: Sequence[OtherChange], limits: DailyLimits) -> list[Finding]:
-    """Points that are wrong, lasers that moved."""
+def other_findings(others: Sequence[OtherChange], limits: DriftLimits) -> list[Finding]:
+    """Findings on wrong points and moved lasers."""
     out = []
     for o in others:
         level = level_of(o.px, o.mm, limits)
         if o.change.kind == LASER_MOVED:
-            what = f"laser {o.change.subject} points elsewhere: its spots are off by {size(o.px, o.mm)}"
-            why, remedy = "its direction in rig.yaml no longer holds", "Fix its mount, then calibrate the beams again."
+            what = f"laser {o.change.subject} has moved: its spots are off by {size(o.px, o.mm)}"
+            why = "its direction in rig.yaml is no longer correct"
+            remedy = "Fix its mount, then calibrate the beams again."
         else:
-            what = f"one point is wrong: {o.change.subject} is off by {size(o.px, o.mm)}; the others do not follow it"
-            why = "the point moved, or was mistaken; the cameras are judged without it"
-            remedy = "Look at the point, measure it again, and leave it out of the file if it is lost."
-            level = min(level, Level.WARN)  # it accuses the point, not the calibration
+            what = f"one point is wrong: {o.change.subject} is off by {size(o.px, o.mm)}, the others are not"
+            why = "the point has moved or was confused with another; the cameras are judged without it"
+            remedy = "Inspect the point and measure it again; remove it from the file if it is lost."
+            level = min(level, Level.WARN)  # an error of the point, not of the calibration
         out.append(Finding(level, what + f", p = {_p(o.change.p_value)}", why, remedy if level > Level.PASS else ""))
     return out
 

@@ -1,4 +1,4 @@
-"""The report of a daily check."""
+"""Report of a drift check."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from geometry.arrays import Array
-from lab.calibrate.drift_check.drift_expected import Compared
+from lab.calibrate.drift_check.drift_comparison import PixelComparison
 from lab.calibrate.drift_check.drift_history import HistoryRow
-from lab.calibrate.drift_check.drift_messages import size, told
-from lab.calibrate.drift_check.drift_result import CameraDrift, DailyLimits, DriftOutcome, OtherChange, is_weak
+from lab.calibrate.drift_check.drift_messages import describe_change, size
+from lab.calibrate.drift_check.drift_result import CameraDrift, DriftLimits, DriftOutcome, OtherChange, is_weak
 from lab.files.rig.rig_file import RigFile
 from lab.number_format import short
 from lab.report.calibration.calibration_charts import DriftLine, drift_chart
@@ -31,21 +31,20 @@ from lab.report.calibration.calibration_scene import Dot, rig_things, scene_view
 def write_page(
     outcome: DriftOutcome,
     file: RigFile,
-    compared: Sequence[Compared],
-    others: Sequence[OtherChange],
+    compared: Sequence[PixelComparison],
     history: Sequence[HistoryRow],
-    limits: DailyLimits,
+    limits: DriftLimits,
     today: datetime.date,
     inputs: Sequence[Path],
     folder: Path,
 ) -> Path:
-    """Write report.html of a check. history: all checks so far, this one included."""
+    """Write report.html of a check. history: all checks up to and including this one."""
     sections = [_drift_section(outcome.cameras, compared, limits, file)]
     if len({r.date for r in history}) > 1:
         sections.append(_history_section(history, limits, file))
-    sections += [_points_section(compared, others, outcome.cameras), _scene_section(file, compared)]
+    sections += [_points_section(compared, outcome.others, outcome.cameras), _scene_section(file, compared)]
     report = CalibrationReport(
-        "Daily check",
+        "Drift check",
         f"check of {today.isoformat()}",
         outcome.level,
         outcome.findings,
@@ -57,14 +56,14 @@ def write_page(
 
 
 def _key_figures(
-    cameras: Sequence[CameraDrift], file: RigFile, limits: DailyLimits, today: datetime.date
+    cameras: Sequence[CameraDrift], file: RigFile, limits: DriftLimits, today: datetime.date
 ) -> list[tuple[str, str, str]]:
     out = []
     for c in cameras:
         value = f"{short(c.drift_px)} px · {short(c.drift_mm)} mm"
-        state = told(c) if c.change is not None else f"by noise alone {short(c.noise_px, 2)} px"
+        state = describe_change(c) if c.change is not None else f"expected from noise: {short(c.noise_px, 2)} px"
         if c.change is None and is_weak(c.detectable_mm, limits):
-            state = f"a weak check: shifts below {short(c.detectable_px, 2)} px can hide"
+            state = f"weak check: shifts below {short(c.detectable_px, 2)} px are not detected"
         out.append((f"drift of camera {c.camera}", value, state))
     if file.calibration is not None:
         until = file.calibration.valid_until
@@ -73,17 +72,17 @@ def _key_figures(
             days = (until - today).days
             left += f", {days} days left" if days >= 0 else f", expired {-days} days ago"
         out.append(("calibrated on", file.calibration.date.isoformat(), left))
-    out.append(("limits", f"{limits.warn_mm:g} / {limits.fail_mm:g} mm", "warning / not to be used, at the screen"))
+    out.append(("limits", f"{limits.warn_mm:g} / {limits.fail_mm:g} mm", "warning / failure, at the screen"))
     return out
 
 
 def _drift_section(
-    cameras: Sequence[CameraDrift], compared: Sequence[Compared], limits: DailyLimits, file: RigFile
+    cameras: Sequence[CameraDrift], compared: Sequence[PixelComparison], limits: DriftLimits, file: RigFile
 ) -> Section:
     labels = {name: [one.label[i] for i in one.rows_of(name)] for one in compared for name in one.columns}
     heads = (
-        "camera", "verdict", "points", "drift (px)", "drift (mm)", "noise alone (px)", "p", "found at (px)",
-        "found at (mm)", "shift u, v (px)", "turn x, y, z (deg)", "scale (ppm)",
+        "camera", "verdict", "points", "drift (px)", "drift (mm)", "noise (px)", "p", "detectable (px)",
+        "detectable (mm)", "shift u, v (px)", "rotation x, y, z (deg)", "scale (ppm)",
     )  # fmt: skip
     rows = [
         (
@@ -99,35 +98,35 @@ def _drift_section(
                 file.rig.cameras[c.camera].image_size_px,
                 c.pixels,
                 c.residual_px,
-                f"Camera {c.camera}: measured − foretold",
+                f"Camera {c.camera}: measured − predicted",
                 labels=labels[c.camera],
             ),
-            "Arrows that all point one way: the camera turned. Round a middle: it rolled. From a middle: focus or"
-            " zoom. One alone: that point is wrong."
+            "Parallel arrows: the camera turned. Arrows around a centre: it rolled. Arrows away from a centre: focus or"
+            " zoom changed. A single arrow: this point is wrong."
             if i == 0
             else "",
         )
         for i, c in enumerate(cameras)
     ]
     words = [
-        "Drift: the similarity (turn of the camera and change of its focal length) that today's pixels ask for, RMS"
-        " over the points. Its sigmas hold the pixels' noise, the survey's and the calibration's own uncertainty.",
-        f"A drift counts where it is both sure (a false alarm in {1 / limits.p_false_alarm:,.0f} checks) and large:"
-        f" warning beyond {limits.warn_mm:g} mm at the screen, not to be used beyond {limits.fail_mm:g} mm. “Found at”:"
-        f" the shift that this check finds in {100 * limits.power:.0f} of 100 cases.",
+        "Drift: the rotation of the camera and change of its focal length that fit today's pixels, as RMS displacement"
+        " over the points. The sigmas include the uncertainties of the pixels, the survey and the calibration.",
+        f"A drift is reported if it is significant (one false alarm in {1 / limits.p_false_alarm:,.0f} checks) and"
+        f" large: a warning beyond {limits.warn_mm:g} mm at the screen, a failure beyond {limits.fail_mm:g} mm."
+        f" Detectable: the shift that this check finds with a probability of {100 * limits.power:.0f} %.",
     ]
     return Section("Drift per camera", words, drawings, PageTable(heads, rows))
 
 
 def _plus_minus(values: Array, sigmas: Array) -> str:
-    """Values to the place that the largest of their sigmas reaches, and that sigma."""
+    """Values rounded to the precision of their largest sigma, and that sigma."""
     sigma = float(np.max(sigmas))
     decimals = int(np.clip(1 - np.floor(np.log10(sigma)), 0, 6)) if sigma > 0 else 3
     words = ", ".join(f"{v:.{decimals}f}" for v in values.tolist())
     return f"{words} ± {short(sigma, 2)}".replace("-", "−")
 
 
-def _history_section(history: Sequence[HistoryRow], limits: DailyLimits, file: RigFile) -> Section:
+def _history_section(history: Sequence[HistoryRow], limits: DriftLimits, file: RigFile) -> Section:
     def lines(unit: str) -> dict[str, DriftLine]:
         out = {}
         for camera in dict.fromkeys(r.camera for r in history):
@@ -142,17 +141,17 @@ def _history_section(history: Sequence[HistoryRow], limits: DailyLimits, file: R
         lines("mm"), "Drift at the screen", "mm", warn=limits.warn_mm, fail=limits.fail_mm, expires=until
     )
     drawings = [PageDrawing(in_mm), PageDrawing(drift_chart(lines("px"), "Drift in the picture", "px", expires=until))]
-    words = "Each check so far. A slow rise is a mount that creeps or a hall that warms up; a step is a knock."
+    words = "All checks so far. A slow increase indicates a creeping mount or a change of temperature, a step a shock."
     return Section("Drift over time", words, drawings)
 
 
 def _points_section(
-    compared: Sequence[Compared], others: Sequence[OtherChange], cameras: Sequence[CameraDrift]
+    compared: Sequence[PixelComparison], others: Sequence[OtherChange], cameras: Sequence[CameraDrift]
 ) -> Section:
     by_camera = {c.camera: c for c in cameras}
     heads = (
-        "camera", "point", "u (px)", "v (px)", "measured − foretold u (px)", "v (px)", "after the camera's change (px)",
-        "sigma of the pixel (px)", "sigma of the calibration (px)",
+        "camera", "point", "u (px)", "v (px)", "residual u (px)", "residual v (px)",
+        "without the camera's change (px)", "sigma of the pixel (px)", "sigma of the calibration (px)",
     )  # fmt: skip
     rows = []
     for one in compared:
@@ -167,13 +166,13 @@ def _points_section(
                     )
                 )  # fmt: skip
     words = [f"{o.change.subject}: {o.change.kind}, {size(o.px, o.mm)}." for o in others]
-    return Section("Point by point", words, (), PageTable(heads, rows))
+    return Section("Points", words, (), PageTable(heads, rows))
 
 
-def _scene_section(file: RigFile, compared: Sequence[Compared]) -> Section:
+def _scene_section(file: RigFile, compared: Sequence[PixelComparison]) -> Section:
     things = rig_things(file.rig)
     marks: dict[str, Dot] = {}
     for one in compared:
-        for label, place in zip(one.label, one.place, strict=True):
-            marks.setdefault(label, Dot(label, place))
-    return Section("Where the points are", (), scene_views([*things, *marks.values()], "Cameras, screens and points"))
+        for label, xyz in zip(one.label, one.xyz, strict=True):
+            marks.setdefault(label, Dot(label, xyz))
+    return Section("The lab", (), scene_views([*things, *marks.values()], "Cameras, screens and points"))

@@ -1,4 +1,4 @@
-"""What a daily check says of each camera, of points and lasers, and by which limits it is judged."""
+"""Result of a drift check for cameras, points and lasers, and the limits that decide on its verdict."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from geometry.arrays import Array
 
 
 @dataclass(frozen=True, slots=True)
-class DailyLimits:
-    """When a drift is one, and when it is too large."""
+class DriftLimits:
+    """Limits and assumptions of a drift check."""
 
-    p_false_alarm: float = 0.002  # per check that nothing has changed and it says so: once in two years of working days
-    warn_mm: float = 0.2  # mm at the screen, RMS: what a good spot is known to; smaller drifts are lost in its noise
+    p_false_alarm: float = 0.002  # probability per check of a false alarm: once in two years of working days
+    warn_mm: float = 0.2  # mm at the screen, RMS: the error of a good spot; smaller drifts are lost in its noise
     fail_mm: float = 0.5  # mm at the screen: at 2.5 m from the vehicle 0.011 deg, more than the goal of 0.01 deg
-    weak_mm: float = 2.0  # mm: a check that could miss such a shift (0.05 deg at 2.5 m) is no proof of anything
-    fail_px: float = 1.0  # px, where no mm can be told as the camera's rays miss its screen
-    point_sigma_px: float = 0.1  # px, of a known point whose file gives no sigma: a dot of some 10 px, centre fitted
-    floor_px: float = 0.02  # px, of a mean spot: pixel-locking and speckle stand still when the vehicle does
-    still_px: float = 0.3  # px that a spot may wander in a static run: more is a vehicle that moves
+    weak_mm: float = 2.0  # mm: a check that can miss such a shift (0.05 deg at 2.5 m) is too weak to confirm anything
+    fail_px: float = 1.0  # px, if there is no value in mm because the camera's rays miss its screen
+    point_sigma_px: float = 0.1  # px, of a known point without a stated sigma: a mark of some 10 px, centre fitted
+    floor_px: float = 0.02  # px, of a mean spot: pixel locking and speckle do not average out while the vehicle rests
+    still_px: float = 0.3  # px: largest motion of a spot in a static run; beyond it the vehicle moves
     pose_sigma_m: float = 5e-5  # m, of each coordinate of a stand's known pose: a good mechanical seat
     pose_sigma_deg: float = 0.003  # deg, about each axis: 11 arcsec, a good turntable
-    power: float = 0.9  # with which a drift of the "detectable" size is found
-    expiry_warning_days: int = 14  # days before the last valid one on which a new calibration should be planned
+    power: float = 0.9  # probability with which a drift of the "detectable" size is found
+    expiry_warning_days: int = 14  # days before the expiry date from which the check warns
 
     def __post_init__(self) -> None:
         for name in ("p_false_alarm", "power"):
@@ -52,67 +52,68 @@ class DailyLimits:
 
 @dataclass(frozen=True, slots=True)
 class OtherChange:
-    """A point that is wrong or a laser that moved."""
+    """A wrong point or a moved laser."""
 
     change: Change
-    px: float
-    mm: float
+    px: float  # RMS displacement of its pixels
+    mm: float  # the same at the screen
 
 
 @dataclass(frozen=True, slots=True)
 class CameraDrift:
-    """What a check says of one camera, n points."""
+    """Result of a check for one camera with n points."""
 
     camera: str
     pixels: Array  # (n, 2)
-    residual_px: Array  # (n, 2), measured minus foretold
-    explained_px: Array  # (n, 2), what the camera's own change makes of it (0 where it has none)
-    drift_px: float  # RMS over the points of the fitted drift
-    noise_px: float  # of what it would be if nothing had changed
-    drift_mm: float  # at the camera's screen; nan where its rays miss it
-    shift_px: Array  # (2,), mean of the fitted drift
+    residual_px: Array  # (n, 2) measured minus predicted
+    explained_px: Array  # (n, 2) part of the residual due to the camera's own change; 0 if it has none
+    drift_px: float  # RMS of the fitted drift over the points
+    noise_px: float  # expected RMS of the fitted drift without any change
+    drift_mm: float  # at the camera's screen; nan if its rays miss it
+    shift_px: Array  # (2,) mean of the fitted drift
     sigma_shift_px: Array  # (2,)
-    turn_deg: Array  # (3,), about the camera's x, y, z, of what it sees
+    turn_deg: Array  # (3,) rotation of the scene about the camera's x, y, z
     sigma_turn_deg: Array  # (3,)
-    scale_ppm: float
+    scale_ppm: float  # change of the focal length
     sigma_scale_ppm: float
-    p_value: float  # of so large a drift when nothing has changed
-    detectable_px: float  # shift that the check finds nearly always
+    p_value: float  # probability of a drift of this size without any change
+    detectable_px: float  # common shift that the check finds with probability DriftLimits.power
     detectable_mm: float
-    change: Change | None  # the explanation, where there is something to explain
-    unexplained_px: float  # RMS of what no explanation takes away; nan where that is not significant
+    change: Change | None  # the explanation of the residuals; None if nothing is significant
+    unexplained_px: float  # RMS of the residuals that no explanation removes; nan if not significant
     unexplained_mm: float
     level: Level
 
 
 @dataclass(frozen=True, slots=True)
 class DriftOutcome:
-    """How a daily check ended."""
+    """Result of a drift check."""
 
     out: Path
     level: Level
     cameras: tuple[CameraDrift, ...]
     findings: tuple[Finding, ...]
-    unchecked: tuple[str, ...] = ()  # cameras of the rig of which nothing was measured
+    others: tuple[OtherChange, ...] = ()  # wrong points and moved lasers
+    unchecked: tuple[str, ...] = ()  # cameras of the rig without measurements
 
     def line(self) -> str:
         """One line for the terminal."""
         worst = max(self.findings, key=lambda f: f.level)
         drifts = ", ".join(f"{c.camera} {_number(c.drift_px)} px / {_number(c.drift_mm)} mm" for c in self.cameras)
         reason = f": {worst.what}" if worst.level > Level.PASS else ""
-        left_out = ""
+        unchecked = ""
         if self.unchecked and worst.what != not_checked(self.unchecked):
-            left_out = f"; WARN: {not_checked(self.unchecked)}"
-        return f"{self.level.name}: drift {drifts}{reason}{left_out}; report in {self.out}"
+            unchecked = f"; WARN: {not_checked(self.unchecked)}"
+        return f"{self.level.name}: drift {drifts}{reason}{unchecked}; report in {self.out}"
 
     @property
     def exit_status(self) -> int:
-        """0: may be used (PASS, WARN); 3: must not."""
+        """0 if the calibration may be used (PASS, WARN), else 3."""
         return 3 if self.level == Level.FAIL else 0
 
 
 def not_checked(cameras: Sequence[str]) -> str:
-    """That nothing is known of these cameras, as the line and the report say it."""
+    """The message on cameras without measurements, for the terminal and the report."""
     return f"camera {', '.join(cameras)} not checked: nothing was measured in {'it' if len(cameras) == 1 else 'them'}"
 
 
@@ -120,13 +121,13 @@ def _number(value: float) -> str:
     return "?" if not np.isfinite(value) else f"{value:.2f}"
 
 
-def is_weak(detectable_mm: float, limits: DailyLimits) -> bool:
-    """Whether a check could miss so much that finding nothing proves nothing."""
-    return not detectable_mm <= limits.weak_mm  # so that nan counts as weak
+def is_weak(detectable_mm: float, limits: DriftLimits) -> bool:
+    """Whether a check can miss so large a drift that a result without drift does not confirm the calibration."""
+    return not detectable_mm <= limits.weak_mm  # nan counts as weak
 
 
-def level_of(px: float, mm: float, limits: DailyLimits) -> Level:
-    """How grave a significant change of this size is. Where no mm can be told, pixels decide."""
+def level_of(px: float, mm: float, limits: DriftLimits) -> Level:
+    """Verdict on a significant change of this size, by its mm at the screen, else (mm is nan) by its pixels."""
     if np.isfinite(mm):
         return Level.FAIL if mm > limits.fail_mm else Level.WARN if mm > limits.warn_mm else Level.PASS
     return Level.FAIL if px > limits.fail_px else Level.WARN

@@ -1,1 +1,1 @@
-"""`beampose calibrate rig`: the joint calibration of a whole project."""
+"""`beampose calibrate rig`: joint calibration of cameras, screens and beams."""

@@ -1,4 +1,4 @@
-"""`beampose calibrate rig`: lenses, cameras, screens and beams together, from everything that a project measured."""
+"""`beampose calibrate rig`: joint calibration of lenses, cameras, screens and beams of a project."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from calibration.screens.network_findings import ScreenLimits, near_findings
 from calibration.screens.network_findings import findings as network_findings
 from calibration.screens.screens import ScreensResult
 from geometry.rig import Rig
-from lab.calibrate.beams.recording_check import refuse_known_mistakes, refuse_repeated
+from lab.calibrate.beams.recording_check import check_no_duplicates, diagnose_failed_fit
 from lab.calibrate.beams.recordings import Recordings, read_recordings, stand_of
-from lab.calibrate.calibration_day import day_of, expired, last_day
+from lab.calibrate.calibration_date import calibration_date, expiry_date, expiry_findings
 from lab.calibrate.rig.rig_outcome import RigOutcome
 from lab.calibrate.rig.rig_tables import RESIDUALS, write_residuals
 from lab.calibrate.screens.screen_inputs import ScreenInputs, screen_inputs
@@ -34,29 +34,32 @@ from lab.files.rig.rig_file import RigFile, save_rig
 from lab.files.text.atomic_write import atomic_folder, beside_a_good_one, refuse_foreign
 
 RIG = "rig.yaml"
-FAILED_RIG = "rig.failed.yaml"  # its name where the verdict is FAIL, so that nothing reads it by mistake
-_ANY_FIT = ScreenLimits(np.inf, np.inf, factor_warn=np.inf, factor_fail=np.inf)
-_ANY_SIGMA = BeamGoals(direction=np.inf, direction_unusable=np.inf, wrong_share=np.inf, noise_scale=np.inf)
+FAILED_RIG = "rig.failed.yaml"  # file name if the verdict is FAIL, so that no program reads it by mistake
+_NO_FIT_LIMITS = ScreenLimits(np.inf, np.inf, factor_warn=np.inf, factor_fail=np.inf)
+_NO_SIGMA_LIMITS = BeamGoals(direction=np.inf, direction_unusable=np.inf, wrong_share=np.inf, noise_scale=np.inf)
 
 
 def calibrate_rig(
     project_path: Path, out: Path, today: datetime.date | None = None, limits: RigLimits | None = None
 ) -> RigOutcome:
-    """Calibrate a whole rig; writes rig.yaml, residuals.csv and report.html into the folder `out`.
+    """Calibrate a whole rig; write rig.yaml, residuals.csv and report.html into the folder `out`.
 
-    rig.yaml carries the joint covariance of everything (in the target's block; excerpts at cameras and screens) and the
-    verdict. A FAIL is named rig.failed.yaml and does not replace an earlier calibration: it then goes to `OUT-failed`.
-    Raises InputError for what is wrong with the files, CalibrationError where the measurements give no calibration at
-    all; nothing is then written.
+    rig.yaml holds the verdict and the joint covariance of all parameters (in the target's block; cameras and screens
+    hold their own parts of it). If the verdict is FAIL, the file is called rig.failed.yaml; a FAIL never replaces an
+    earlier calibration, its results go to `OUT-failed`.
+
+    Raises:
+        InputError: for errors in the files.
+        CalibrationError: if the measurements do not determine a calibration. Nothing is written.
     """
     refuse_foreign(out, _is_ours)
     project = load_project(Path(project_path))
-    day = day_of(project, today)
-    refuse_repeated(project)
+    day = calibration_date(project, today)
+    check_no_duplicates(project)
     if not project.beams or not project.spots:
         raise InputError(
-            f"{project.path}: target: expected beams and spots as designed, got none; add them, or calibrate the"
-            " screens alone (`beampose calibrate screen`)"
+            f"{project.path}: target: expected the nominal beams and spots, got none; add them, or calibrate only the"
+            " screens (`beampose calibrate screen`)"
         )
     inputs = screen_inputs(project)
     rig = replace(inputs.network.rig, beams=project.beams, spots=project.spots)
@@ -74,9 +77,9 @@ def calibrate_rig(
         *near_findings(screens, inputs.near),
         *joint_findings(steps, recordings.names, expected, held_out, limits or RigLimits()),
         *survey_findings(project, screens),
-        *_of_the_steps(steps, rig, recordings.names),
-        *expired(project, day, today),
-        *_of_the_inputs(project, recordings, inputs, day),
+        *_step_findings(steps, rig, recordings.names),
+        *expiry_findings(project, day, today),
+        *_input_findings(project, recordings, inputs, day),
     ]
     level = verdict(findings)
     folder = beside_a_good_one(out, level == Level.FAIL, RIG)
@@ -84,7 +87,7 @@ def calibrate_rig(
     with atomic_folder(folder, may_replace=_is_ours) as work:
         save_rig(_rig_file(outcome, project, day), work / (FAILED_RIG if level == Level.FAIL else RIG))
         write_residuals(steps, recordings.names, work / RESIDUALS)
-        from lab.calibrate.rig.rig_page import write_page  # the template engine: only for those who write a report
+        from lab.calibrate.rig.rig_page import write_page  # imports the template engine
 
         write_page(outcome, rig, recordings, project.inputs, day, work)
     return outcome
@@ -95,12 +98,12 @@ def _is_ours(folder: Path) -> bool:
 
 
 def _recordings(project: Project, lab: Rig) -> Recordings:
-    """The recordings with their positions. lab: cameras and screens as surveyed, which label frames of runs."""
+    """The recordings with known stand positions. lab: surveyed cameras and screens, used to label frames of runs."""
     recordings = read_recordings(project, lab)
     if recordings.stand_from_body is None:
         raise InputError(
-            f"{project.path}: recordings: expected poses of the stand, got none; add `poses` to each recording, or find"
-            " the angles between the beams alone (`beampose calibrate beams`)"
+            f"{project.path}: recordings: expected poses of the stand, got none; add `poses` to each recording, or"
+            " calibrate only the angles between the beams (`beampose calibrate beams`)"
         )
     return recordings
 
@@ -109,21 +112,23 @@ def _solved(project: Project, screens: ScreensResult, recordings: Recordings) ->
     try:
         return calibrate_in_steps(screens, recordings.spots, stand_of(project, recordings))
     except (AdjustmentError, ValueError) as error:
-        refuse_known_mistakes(project, screens.fit.rig, recordings, screens.fit.covariance)
+        diagnose_failed_fit(project, screens.fit.rig, recordings, screens.fit.covariance)
         raise CalibrationError(f"{project.path}: the rig cannot be calibrated: {error}") from None
 
 
-def _of_the_steps(steps: RigSteps, drawing: Rig, positions: Sequence[str]) -> list[Finding]:
-    """What the single steps warn of in the measurements; how well they fit is the joint adjustment's to say."""
+def _step_findings(steps: RigSteps, nominal: Rig, positions: Sequence[str]) -> list[Finding]:
+    """Warnings of the single steps about the measurements. The quality of the fit is judged on the joint adjustment."""
     beams = steps.beams
     if steps.joint.scales:
-        # Whether two ends are one line was tested with sigmas that turned out too small.
+        # The test whether two ends form one line used the original sigmas, which turned out too small.
         beams = replace(beams, one_line=())
-    out = network_findings(steps.screens, _ANY_FIT) + beam_findings(beams, drawing, positions, _ANY_SIGMA)
+    out = network_findings(steps.screens, _NO_FIT_LIMITS) + beam_findings(beams, nominal, positions, _NO_SIGMA_LIMITS)
     return [f for f in out if f.level > Level.PASS]
 
 
-def _of_the_inputs(project: Project, recordings: Recordings, inputs: ScreenInputs, day: datetime.date) -> list[Finding]:
+def _input_findings(
+    project: Project, recordings: Recordings, inputs: ScreenInputs, day: datetime.date
+) -> list[Finding]:
     out = [Finding(Level.PASS, note) for note in (*inputs.notes, *recordings.notes)]
     for name, camera in project.cameras.items():
         state = camera.lens.calibration
@@ -132,8 +137,8 @@ def _of_the_inputs(project: Project, recordings: Recordings, inputs: ScreenInput
             out.append(
                 Finding(
                     Level.FAIL,
-                    f"camera {name!r}: {camera.lens_path.name} says FAIL of its lens{why}",
-                    "a lens that is wrong bends every measurement",
+                    f"camera {name!r}: the lens calibration {camera.lens_path.name} has the verdict FAIL{why}",
+                    "an error of the lens distorts every measurement of the camera",
                     "calibrate the lens again (`beampose calibrate camera`)",
                 )
             )
@@ -141,8 +146,8 @@ def _of_the_inputs(project: Project, recordings: Recordings, inputs: ScreenInput
             out.append(
                 Finding(
                     Level.WARN,
-                    f"camera {name!r}: {camera.lens_path.name} held until {state.valid_until}",
-                    "lenses move with time and temperature",
+                    f"camera {name!r}: the lens calibration {camera.lens_path.name} expired on {state.valid_until}",
+                    "lenses change with time and temperature",
                     "calibrate the lens again (`beampose calibrate camera`)",
                 )
             )
@@ -150,9 +155,9 @@ def _of_the_inputs(project: Project, recordings: Recordings, inputs: ScreenInput
             out.append(
                 Finding(
                     Level.WARN,
-                    f"camera {name!r}: {camera.lens_path.name} holds no covariance: its lens is taken as exact",
-                    "the sigmas of everything are too small by what the lens is wrong",
-                    "calibrate the lens with beampose, which writes its covariance",
+                    f"camera {name!r}: {camera.lens_path.name} has no covariance: its lens is assumed exact",
+                    "all sigmas are too small, since the error of the lens is missing in them",
+                    "calibrate the lens with beampose, which writes the covariance",
                 )
             )
     stand = project.stand
@@ -160,17 +165,17 @@ def _of_the_inputs(project: Project, recordings: Recordings, inputs: ScreenInput
         out.append(
             Finding(
                 Level.WARN,
-                "stand.world_from_stand has no sigma: it is taken as exact",
-                "its error goes into the boresight of all beams unseen",
-                "give stand.sigma_m and stand.sigma_deg, or leave world_from_stand out and let it be found",
+                "stand.world_from_stand has no sigma: it is assumed exact",
+                "its error goes unnoticed into the boresight of all beams",
+                "give stand.sigma_m and stand.sigma_deg, or omit world_from_stand so that it is estimated",
             )
         )
     if not np.any(recordings.pose_sigmas):
         out.append(
             Finding(
                 Level.PASS,
-                "the stand's positions are taken as exact; give stand.pose_sigma_m and pose_sigma_deg where its"
-                " encoders are not much better than the spots",
+                "the stand's positions are assumed exact; give stand.pose_sigma_m and pose_sigma_deg unless its"
+                " encoders are much more precise than the spots",
             )
         )
     return out
@@ -178,7 +183,7 @@ def _of_the_inputs(project: Project, recordings: Recordings, inputs: ScreenInput
 
 def _rig_file(outcome: RigOutcome, project: Project, day: datetime.date) -> RigFile:
     joint = outcome.steps.joint
-    until = last_day(project, day)
+    until = expiry_date(project, day)
     worst_first = sorted(outcome.findings, key=lambda f: -f.level)
     reasons = tuple(f.what for f in worst_first if f.level > Level.PASS)
     state = CalibrationState(day, outcome.level.name, until, reasons, project.notes)

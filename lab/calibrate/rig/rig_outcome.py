@@ -1,4 +1,4 @@
-"""How the calibration of a rig ended."""
+"""Result of a rig calibration."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from lab.errors import CalibrationError
 
 @dataclass(frozen=True, slots=True)
 class RigOutcome:
-    """How the calibration of a rig ended."""
+    """Result of a rig calibration."""
 
     name: str
-    out: Path  # where the results are; beside the folder asked for where a FAIL would have replaced a good one
+    out: Path  # folder of the results: `OUT-failed` if a FAIL would have replaced a valid calibration
     level: Level
     findings: tuple[Finding, ...]
     steps: RigSteps
@@ -29,7 +29,7 @@ class RigOutcome:
 
     @property
     def exit_status(self) -> int:
-        """0, or 3 where the calibration must not be used."""
+        """0, or 3 if the calibration must not be used."""
         return CalibrationError.exit_status if self.level == Level.FAIL else 0
 
     def line(self) -> str:
@@ -43,7 +43,7 @@ class RigOutcome:
             what += f"; held out: {deg:.2g} deg, {mm:.2g} mm"
         kept = self.steps.joint.kept[SPOTS]
         if not kept.all():
-            what += f"; {int(np.sum(~kept))} of {len(kept)} spots left out"
+            what += f"; {int(np.sum(~kept))} of {len(kept)} spots excluded"
         worst = max(self.findings, key=lambda f: f.level)
         reason = "" if self.level == Level.PASS else f": {worst.what}"
         return f"{self.name}: {self.level.name}: {what}{reason} -> {self.out}"

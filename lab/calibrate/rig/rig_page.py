@@ -1,4 +1,4 @@
-"""The report of a joint calibration of a rig."""
+"""Report of a joint rig calibration."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from geometry.arrays import Array, Bools, Ints
 from geometry.pose import ypr_sigmas
 from geometry.rig import Rig
 from lab.calibrate.beams.recordings import Recordings
-from lab.calibrate.rig import rig_page_lab
+from lab.calibrate.rig import rig_page_sections
 from lab.calibrate.rig.rig_outcome import RigOutcome
 from lab.number_format import short
 from lab.report.calibration.calibration_charts import residual_histogram
@@ -29,24 +29,24 @@ from lab.report.calibration.calibration_page import (
     write_calibration_report,
 )
 
-_WORST = 10  # held-out positions in the table
+_TABLE_ROWS = 10  # held-out positions in the table
 
 
 def write_page(
-    outcome: RigOutcome, drawing: Rig, recordings: Recordings, inputs: Sequence[Path], day: datetime.date, folder: Path
+    outcome: RigOutcome, nominal: Rig, recordings: Recordings, inputs: Sequence[Path], day: datetime.date, folder: Path
 ) -> Path:
-    """Write report.html. drawing: the rig with nominal beams."""
+    """Write report.html. nominal: the rig with the beams as designed."""
     sections = [
         _expected(outcome),
         _shares(outcome),
         _held_out(outcome, recordings.names),
         _groups(outcome),
         _residuals(outcome),
-        rig_page_lab.screens(outcome),
-        rig_page_lab.beams(outcome, drawing),
-        rig_page_lab.cameras(outcome),
-        rig_page_lab.correlations(outcome),
-        rig_page_lab.lab(outcome),
+        rig_page_sections.screens_section(outcome),
+        rig_page_sections.beams_section(outcome, nominal),
+        rig_page_sections.cameras_section(outcome),
+        rig_page_sections.correlations_section(outcome),
+        rig_page_sections.lab_section(outcome),
     ]
     report = CalibrationReport(
         "Rig",
@@ -64,16 +64,14 @@ def _key_figures(o: RigOutcome) -> list[tuple[str, str, str]]:
     joint, out = o.steps.joint, []
     if o.expected is not None:
         e = o.expected
-        out.append(
-            ("attitude, one frame", f"{in_degrees(e.total):.2g} deg", "1 sigma per axis, expected in the middle")
-        )
-        out.append(("position, one frame", f"{in_mm(e.total):.2g} mm", "1 sigma per axis, expected in the middle"))
+        out.append(("attitude, one frame", f"{in_degrees(e.total):.2g} deg", "expected 1 sigma per axis, central pose"))
+        out.append(("position, one frame", f"{in_mm(e.total):.2g} mm", "expected 1 sigma per axis, central pose"))
         words = f"{in_degrees(e.systematic):.2g} deg · {in_mm(e.systematic):.2g} mm"
-        out.append(("of it calibration", words, "no averaging lessens it"))
+        out.append(("part of the calibration", words, "not reduced by averaging"))
     if o.held_out is not None:
         h = o.held_out
         words = f"{np.rad2deg(h.attitude_rms):.2g} deg · {1e3 * h.position_rms:.2g} mm"
-        out.append(("held-out positions", words, f"RMS per axis, {h.ratio:.2f} times what is expected"))
+        out.append(("held-out positions", words, f"RMS per axis, {h.ratio:.2f} times the expected value"))
     spots = joint.every[SPOTS].linearise(joint.values).residuals
     px = _spot_pixels(o, spots)[joint.kept[SPOTS]]
     out.append(("spots", f"{short(float(np.sqrt(np.mean(px**2))), 3)} px", "RMS residual per axis"))
@@ -81,8 +79,8 @@ def _key_figures(o: RigOutcome) -> list[tuple[str, str, str]]:
         s = o.steps.measured.network.sightings
         px = joint.every[DOTS].linearise(joint.values).residuals * s.sigma_px[:, None]
         rms = float(np.sqrt(np.mean(px[joint.kept[DOTS]] ** 2)))
-        out.append(("dots", f"{short(rms, 3)} px", "RMS residual per axis"))
-    sigma = rig_page_lab.beam_sigmas(joint)[0] / rig_page_lab.ARCSEC
+        out.append(("control points", f"{short(rms, 3)} px", "RMS residual per axis"))
+    sigma = rig_page_sections.beam_sigmas(joint)[0] / rig_page_sections.ARCSEC
     out.append(("beam directions", f"{short(float(np.sqrt(np.mean(sigma**2))), 3)} arcsec", "1 sigma per axis"))
     return out
 
@@ -102,12 +100,12 @@ def _expected(o: RigOutcome) -> Section | None:
         rows.append((name, *(float(v) for v in ypr), *(float(v) for v in mm)))
     heads = ("part", "yaw (deg)", "pitch (deg)", "roll (deg)", "x (mm)", "y (mm)", "z (mm)")
     words = [
-        f"1 sigma of a pose measured from one frame in the middle of the stand's positions, {e.views} spots in the"
-        " pictures.",
-        "The noise differs from frame to frame and averages out. The calibration's part is the same in every frame: no"
-        " averaging lessens it; between two poses that are near to each other it cancels.",
+        f"Expected 1 sigma of a pose measured from one frame, in the middle of the stand's positions, with {e.views}"
+        " spots in the pictures.",
+        "The noise differs from frame to frame and is reduced by averaging. The part of the calibration is the same in"
+        " every frame and is not reduced; it cancels in the difference of two similar poses.",
     ]
-    return Section("What one frame will tell", words, (), PageTable(heads, rows))
+    return Section("Expected uncertainty of one frame", words, (), PageTable(heads, rows))
 
 
 def _shares(o: RigOutcome) -> Section | None:
@@ -129,11 +127,11 @@ def _shares(o: RigOutcome) -> Section | None:
     rows.sort(key=lambda r: -float(r[3]))
     heads = ("errors of", "attitude (deg)", "position (mm)", "% of attitude variance", "% of position variance")
     words = [
-        "Whose errors make the calibration's part: each kind of measurement carried through the joint adjustment to the"
-        " pose. The variances add up to the whole.",
-        f"Improve {rows[0][0]} first: better sigmas there, or more of them." if rows else "",
+        "Contribution of each kind of measurement to the calibration's part, propagated through the joint adjustment to"
+        " the pose. The variances add up to the total.",
+        f"Improve {rows[0][0]} first: use more precise measurements, or more of them." if rows else "",
     ]
-    return Section("What contributes most", words, (), PageTable(heads, rows))
+    return Section("Largest contributions", words, (), PageTable(heads, rows))
 
 
 def _held_out(o: RigOutcome, positions: Sequence[str]) -> Section | None:
@@ -145,21 +143,22 @@ def _held_out(o: RigOutcome, positions: Sequence[str]) -> Section | None:
         (positions[k], *(f"{v:.4f}" for v in deg[i]), *(f"{v:.3f}" for v in mm[i]), f"{h.sigmas[i]:.2f}")
         for i, k in enumerate(h.positions)
     ]
-    rows = sorted(rows, key=lambda r: -float(r[-1]))[:_WORST]
+    rows = sorted(rows, key=lambda r: -float(r[-1]))[:_TABLE_ROWS]
     heads = (
         "position", "about x (deg)", "about y (deg)", "about z (deg)", "x (mm)", "y (mm)", "z (mm)",
         "misfit / expected",
     )  # fmt: skip
     drawings = [
-        PageDrawing(residual_histogram(deg, "Attitude of held-out positions, per axis", "deg")),
-        PageDrawing(residual_histogram(mm, "Position of held-out positions, per axis", "mm")),
+        PageDrawing(residual_histogram(deg, "Attitude error of held-out positions, per axis", "deg")),
+        PageDrawing(residual_histogram(mm, "Position error of held-out positions, per axis", "mm")),
     ]
     words = (
-        "Each fifth of the positions was measured with a calibration that had not seen its spots, and compared with the"
-        " stand's record: what a user's own recording will meet, the stand's errors included. The table has the worst"
-        f" {min(_WORST, len(rows))}; x, y, z are the body's axes in the attitude, the world's in the position."
+        "Cross-validation with five folds: the poses of each fifth of the positions were measured with a calibration"
+        " made without their spots and compared with the recorded poses of the stand. These are the errors to expect in"
+        f" use, including the errors of the stand. The table lists the {min(_TABLE_ROWS, len(rows))} largest; x, y, z"
+        " are the axes of the body for the attitude and of the world for the position."
     )
-    return Section("Positions held out", words, drawings, PageTable(heads, rows))
+    return Section("Held-out positions", words, drawings, PageTable(heads, rows))
 
 
 def _groups(o: RigOutcome) -> Section:
@@ -183,13 +182,14 @@ def _groups(o: RigOutcome) -> Section:
                 f"{joint.scales.get(name, 1.0):.2f}",
             )
         )
-    heads = ("kind", "numbers", "redundant", "misfit / sigma", "p", "left out", "sigmas widened by")
+    heads = ("kind", "numbers", "redundant", "misfit / sigma", "p", "excluded", "sigmas multiplied by")
     words = [
-        "How far each kind of measurement lies from what all the others say, in its own sigmas: 1 is right. Numbers"
-        " that are not redundant fix what nothing else knows, and cannot be tested.",
-        "Where a kind misfits beyond chance (p below 0.001) its sigmas were widened until it fits.",
+        "Deviation of each kind of measurement from the prediction by all others, in units of its sigmas; the expected"
+        " value is 1. Measurements without redundancy are the only ones that determine some parameter, and cannot be"
+        " tested.",
+        "If the misfit of a kind is significant (p below 0.001), its sigmas were increased until it fits.",
     ]
-    return Section("How the measurements fit together", words, (), PageTable(heads, rows))
+    return Section("Consistency of the measurements", words, (), PageTable(heads, rows))
 
 
 def _residuals(o: RigOutcome) -> Section:
@@ -204,13 +204,15 @@ def _residuals(o: RigOutcome) -> Section:
     if DOTS in joint.every:
         s = measured.network.sightings
         r = joint.every[DOTS].linearise(joint.values).residuals
-        drawings += _fields(o, "dots", s.pixels, -r * s.sigma_px[:, None], s.camera_of, joint.kept[DOTS])
+        residuals_px = -r * s.sigma_px[:, None]
+        drawings += _fields(o, "control points", s.pixels, residuals_px, s.camera_of, joint.kept[DOTS])
     drawings.append(
-        PageDrawing(residual_histogram(spots[joint.kept[SPOTS]], "Spots: residuals in sigmas", "sigma", sigma=1.0))
+        PageDrawing(residual_histogram(spots[joint.kept[SPOTS]], "Spots: normalised residuals", "sigma", sigma=1.0))
     )
     words = (
-        "Found less predicted, of what was kept. Arrows that turn slowly with the place tell of a lens or a screen; all"
-        " of one position alike, of the stand. residuals.csv has every one."
+        "Measured minus predicted, without excluded measurements. Arrows that vary slowly over the picture indicate an"
+        " error of the lens or the screen; equal arrows at all spots of one position indicate an error of the stand."
+        " residuals.csv lists all residuals."
     )
     return Section("Residuals", words, drawings)
 
@@ -222,7 +224,7 @@ def _fields(
     for c, (name, camera) in enumerate(o.steps.joint.rig.cameras.items()):
         here = (camera_of == c) & kept
         if here.any():
-            title = f"Camera {name}: {what}, found − predicted"
+            title = f"Camera {name}: {what}, measured − predicted"
             out.append(
                 PageDrawing(residual_field(camera.image_size_px, pixels[here], residuals[here], title, things=what))
             )
@@ -230,6 +232,6 @@ def _fields(
 
 
 def _spot_pixels(o: RigOutcome, residuals: Array) -> Array:
-    """Residuals of spots (N, 2) in px, from those in sigmas."""
+    """Residuals of spots (N, 2) in px, from normalised residuals (N, 2)."""
     roots = np.linalg.cholesky(o.steps.measured.spots.covariance)
     return np.asarray((roots @ residuals[..., None])[..., 0])

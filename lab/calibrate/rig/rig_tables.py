@@ -1,4 +1,4 @@
-"""residuals.csv of a joint calibration: every measurement, and how far it lies from what all the others say."""
+"""residuals.csv of a joint calibration: the residual of every measurement."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _AXES = ("x", "y", "z", "rot_x", "rot_y", "rot_z")
 
 
 def write_residuals(steps: RigSteps, positions: Sequence[str], path: Path) -> None:
-    """Write the table: measured less adjusted, one row per number. sigmas: against the sigma that was told."""
+    """Write the table, measured minus adjusted, one row per number. Column sigmas: in units of the stated sigma."""
     lines = [",".join(COLUMNS)]
     for kind, name, camera, axis, residual, unit, sigmas, used in _rows(steps, positions):
         lines.append(f"{kind},{csv_word(name)},{camera},{axis},{residual:.6g},{unit},{sigmas:.4g},{int(used)}")
@@ -37,23 +37,23 @@ def _rows(steps: RigSteps, positions: Sequence[str]) -> Iterator[_Row]:
     cameras, views = list(joint.rig.cameras), joint.rig.views()
     network = measured.network
     if SPOTS in joint.every:
-        at = measured.spots
-        roots = np.linalg.cholesky(at.covariance)
-        whole = joint.every[SPOTS].linearise(joint.values).residuals
-        for i, (r, root) in enumerate(zip(whole, roots, strict=True)):
-            camera, spot = views[at.view[i]]
-            name = f"position {positions[at.position[i]]} spot {spot}"
+        spots = measured.spots
+        roots = np.linalg.cholesky(spots.covariance)
+        residuals = joint.every[SPOTS].linearise(joint.values).residuals
+        for i, (r, root) in enumerate(zip(residuals, roots, strict=True)):
+            camera, spot = views[spots.view[i]]
+            name = f"position {positions[spots.position[i]]} spot {spot}"
             yield from _pixel("spot", name, camera, -(root @ r), r, bool(joint.kept[SPOTS][i]))
     if DOTS in joint.every:
         s = network.sightings
-        whole = joint.every[DOTS].linearise(joint.values).residuals
-        for i, r in enumerate(whole):
+        residuals = joint.every[DOTS].linearise(joint.values).residuals
+        for i, r in enumerate(residuals):
             name = network.dots.names[s.dot_of[i]]
             yield from _pixel("dot", name, cameras[s.camera_of[i]], -r * s.sigma_px[i], r, bool(joint.kept[DOTS][i]))
     if len(network.dots):
-        away = network.dots.xyz - array_of(joint.values, "points")
+        errors = network.dots.xyz - array_of(joint.values, "points")
         sigma = np.sqrt(np.diagonal(network.dots.covariance, axis1=1, axis2=2))
-        for name, e, s1 in zip(network.dots.names, away, sigma, strict=True):
+        for name, e, s1 in zip(network.dots.names, errors, sigma, strict=True):
             for k in range(3):
                 yield "survey", name, "", _AXES[k], float(1e3 * e[k]), "mm", float(e[k] / s1[k]), True
     records = joint.every.get(RECORDS)
@@ -73,11 +73,11 @@ def _pixel(kind: str, name: str, camera: str, px: Array, sigmas: Array, used: bo
 
 
 def _records(term: RecordTerm, joint: Joint, positions: Sequence[str]) -> Iterator[_Row]:
-    told = term.sigmas
+    stated = term.sigmas
     for k, r in enumerate(term.linearise(joint.values).residuals):
         for axis in range(6):
-            if np.isfinite(told[k, axis]) and told[k, axis] > 0:
-                value = -r[axis] * told[k, axis]
+            if np.isfinite(stated[k, axis]) and stated[k, axis] > 0:
+                value = -r[axis] * stated[k, axis]
                 value, unit = (1e3 * value, "mm") if axis < 3 else (np.rad2deg(value), "deg")
                 name = f"position {positions[k]}"
                 yield "stand", name, "", _AXES[axis], float(value), unit, float(-r[axis]), bool(joint.kept[RECORDS][k])

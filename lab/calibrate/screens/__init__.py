@@ -1,1 +1,1 @@
-"""`beampose calibrate screen`: where screens and cameras are."""
+"""`beampose calibrate screen`: poses of screens and cameras."""

@@ -1,4 +1,4 @@
-"""`beampose calibrate screen`: where screens and cameras are, how flat screens are, and how well all that is known."""
+"""`beampose calibrate screen`: poses of screens and cameras and flatness of the screens, with their covariance."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from calibration.screens.network_findings import near_findings
 from calibration.screens.network_sigmas import pointing_sigmas_m, spot_sigmas
 from calibration.screens.screens import ScreensResult
 from geometry.rig import Rig
-from lab.calibrate.calibration_day import day_of, expired, last_day
+from lab.calibrate.calibration_date import calibration_date, expiry_date, expiry_findings
 from lab.calibrate.screens.screen_inputs import screen_inputs
 from lab.calibrate.screens.screen_tables import DOTS, RESIDUALS, write_tables
 from lab.calibrate.screens.survey_check import adjusted_screens, survey_findings
@@ -31,7 +31,7 @@ SCREENS, RIG = "screens.yaml", "rig.yaml"
 
 @dataclass(frozen=True, slots=True)
 class ScreensOutcome:
-    """How a calibration of screens ended."""
+    """Result of a screen calibration."""
 
     name: str
     out: Path
@@ -41,7 +41,7 @@ class ScreensOutcome:
 
     @property
     def exit_status(self) -> int:
-        """0, or 3 where the calibration must not be used."""
+        """0, or 3 if the calibration must not be used."""
         return CalibrationError.exit_status if self.level == Level.FAIL else 0
 
     def line(self) -> str:
@@ -63,16 +63,19 @@ def _counted(n: int, what: str) -> str:
 
 
 def calibrate_screen(project_path: Path, out: Path, today: datetime.date | None = None) -> ScreensOutcome:
-    """Calibrate the screens and the cameras' places of a project.
+    """Calibrate the screens and the poses of the cameras of a project.
 
-    Writes into `out`: screens.yaml; rig.yaml with the beams as drawn, where the project has a target; residuals.csv,
-    dots.csv and report.html. Neither YAML is written where the verdict is FAIL, which does not replace an earlier
-    calibration: it then goes to `OUT-failed`. Raises InputError for what is wrong with the files, CalibrationError
-    where they give no calibration at all; `out` is then as it was.
+    Writes into `out`: screens.yaml; rig.yaml with the nominal beams, if the project has a target; residuals.csv,
+    dots.csv and report.html. If the verdict is FAIL, no YAML file is written and an earlier calibration is kept: the
+    results go to `OUT-failed`.
+
+    Raises:
+        InputError: for errors in the files.
+        CalibrationError: if the measurements do not determine a calibration. `out` is left unchanged.
     """
     refuse_foreign(out, _is_ours)
     project = load_project(Path(project_path))
-    day = day_of(project, today)
+    day = calibration_date(project, today)
     inputs = screen_inputs(project)
     result = adjusted_screens(project, inputs)
     placed = near_findings(result, inputs.near)
@@ -80,7 +83,7 @@ def calibrate_screen(project_path: Path, out: Path, today: datetime.date | None 
         *placed,
         *network_findings(result, names_doubted=verdict(placed) > Level.PASS),
         *survey_findings(project, result),
-        *expired(project, day, today),
+        *expiry_findings(project, day, today),
         *(Finding(Level.WARN, note) for note in inputs.notes),
     ]
     level = verdict(found)
@@ -90,9 +93,7 @@ def calibrate_screen(project_path: Path, out: Path, today: datetime.date | None 
         if level != Level.FAIL:
             _save(project, outcome, day, work)
         write_tables(result, work)
-        from lab.calibrate.screens.screen_page import (
-            write_page,  # the template engine: only for those who write a report
-        )
+        from lab.calibrate.screens.screen_page import write_page  # imports the template engine
 
         write_page(result, found, project, inputs, day, work)
     return outcome
@@ -106,7 +107,7 @@ def _is_ours(folder: Path) -> bool:
 
 
 def _save(project: Project, outcome: ScreensOutcome, day: datetime.date, folder: Path) -> None:
-    until = last_day(project, day)
+    until = expiry_date(project, day)
     reasons = tuple(f.what for f in outcome.findings if f.level > Level.PASS)
     state = CalibrationState(day, outcome.level.name, until, reasons, project.notes)
     fit = outcome.result.fit
@@ -118,7 +119,7 @@ def _save(project: Project, outcome: ScreensOutcome, day: datetime.date, folder:
             rig = replace(rig, screens={**rig.screens, name: replace(screen, size_m=(width, height))})
     save_screens(ScreensFile(project.name, rig, fit.covariance, state), folder / SCREENS)
     if project.beams:
-        note = "the beams are as drawn, not calibrated: run `beampose calibrate beams`"
+        note = "the beams are nominal, not calibrated: run `beampose calibrate beams`"
         state = replace(state, verdict=max(outcome.level, Level.WARN).name, reasons=(note, *reasons))
         whole = Rig(rig.screens, rig.cameras, project.beams, project.spots)
         save_rig(RigFile(whole, blocks_of(fit.covariance), state), folder / RIG)

@@ -1,4 +1,4 @@
-"""From a calibration project to the network that the adjustment solves: tables and scans read and checked."""
+"""Reads and checks the tables, boards and scans of a calibration project and builds the network to be adjusted."""
 
 from __future__ import annotations
 
@@ -27,27 +27,32 @@ from lab.files.project.project import Cloud, Project, ScreenEntry
 from lab.files.text.range_checks import FARTHEST_IN_SCAN
 from lab.files.text.yaml_text import did_you_mean
 
-LARGEST_SCREEN_M = 100.0  # a "screen" beyond it is one in another unit
+LARGEST_SCREEN_M = 100.0  # a larger screen is taken for an error of the unit
 SMALLEST_SCREEN_M = 0.02
-_TOO_LARGE = 1.3  # times that dots may reach beyond a screen's size before a unit is suspected
-_TARGET_SIGMA_M = 0.001  # m: of a target's coordinate in a scan, where the project gives no point_sigma_m
+_MAX_EXTENT = 1.3  # extent of the control points relative to the screen's diagonal above which the unit is suspect
+_TARGET_SIGMA_M = 0.001  # m: coordinate of a target in a scan, if the project gives no point_sigma_m
 
 
 @dataclass(frozen=True, slots=True)
 class ScreenInputs:
-    """All that `calibrate screen` adjusts, and what was noticed on the way."""
+    """Input of the screen adjustment, with notes for the report."""
 
     network: Network
     setups: tuple[ScreenSetup, ...]  # one per screen
     near: Mapping[int, Near]
-    held_screen: int | None  # whose frame is the world's, where there is no survey
-    notes: tuple[str, ...]  # assumptions and things left out: the user should know
-    remarks: tuple[str, ...] = ()  # what the scans say of themselves
+    held_screen: int | None  # screen whose frame defines the world frame if there is no survey
+    notes: tuple[str, ...]  # assumptions and exclusions, shown as warnings
+    remarks: tuple[str, ...] = ()  # properties of the scans
     photo_of: Mapping[tuple[int, int], Path] = field(default_factory=dict)  # (camera, placement) -> photograph
 
 
 def screen_inputs(project: Project) -> ScreenInputs:
-    """Read everything that a project measured of its screens. Raises InputError, CalibrationError."""
+    """Read all measurements of a project's screens.
+
+    Raises:
+        InputError: for errors in the files.
+        CalibrationError: if a board that is fixed to a screen is not found.
+    """
     survey = read_survey(project.survey, project.screens)
     observations = read_observations(
         project.points, {n: c.lens.image_size_px for n, c in project.cameras.items()}, survey.names
@@ -58,22 +63,22 @@ def screen_inputs(project: Project) -> ScreenInputs:
         beams={},
         spots={},
     )
-    screen_of = _screens_of_dots(project, survey, observations)
-    _check_sizes(project, survey, screen_of)
-    dots = Dots(survey.names, survey.xyz, survey.covariance, screen_of)
+    screen_of = _screens_of_points(project, survey, observations)
+    _check_extent(project, survey, screen_of)
+    control_points = Dots(survey.names, survey.xyz, survey.covariance, screen_of)
     cameras, index = list(rig.cameras), {n: i for i, n in enumerate(survey.names)}
-    sightings = PointObservations(
+    point_observations = PointObservations(
         np.array([cameras.index(c) for c in observations.camera], dtype=np.int64),
         np.array([index[p] for p in observations.point], dtype=np.int64),
         observations.pixels,
         observations.sigma_px,
     )
     boards = board_views(project, rig)
-    prior, lens_free = _lens_knowledge(project, rig)
+    prior, lens_free = _lens_prior(project, rig)
     network = Network(
         rig=rig,
-        dots=dots,
-        sightings=sightings,
+        dots=control_points,
+        sightings=point_observations,
         corners=boards.corners,
         placements=boards.placements,
         fixed=boards.fixed,
@@ -81,7 +86,7 @@ def screen_inputs(project: Project) -> ScreenInputs:
         lens_priors=() if prior is None else (prior,),
         lens_free=lens_free,
     )
-    held = None if len(dots) and len(sightings) else _held_screen(project)
+    held = None if len(control_points) and len(point_observations) else _held_screen(project)
     scans = {n: _scan(s.cloud, s, survey, project) for n, s in project.screens.items() if s.cloud is not None}
     setups = tuple(_setup(s, survey, project, scans.get(n)) for n, s in project.screens.items())
     near = {i: Near(c.near_m, c.within_m) for i, c in enumerate(project.cameras.values()) if c.near_m is not None}
@@ -90,26 +95,29 @@ def screen_inputs(project: Project) -> ScreenInputs:
     return ScreenInputs(network, setups, near, held, noted, tuple(scan_notes), boards.photo_of)
 
 
-def _screens_of_dots(project: Project, survey: Survey, observations: Observations) -> Ints:
-    """The screen of each dot: its column `screen`, else the one screen of all cameras that see it, else none."""
+def _screens_of_points(project: Project, survey: Survey, observations: Observations) -> Ints:
+    """Screen index (n,) of each control point, -1 for none.
+
+    From the column `screen`; else the screen of the cameras that observe the point, if they share one.
+    """
     names = list(project.screens)
     out = np.full(len(survey.names), -1, dtype=np.int64)
-    seen: dict[str, set[str]] = {}
+    observed_on: dict[str, set[str]] = {}
     for camera, point in zip(observations.camera, observations.point, strict=True):
-        seen.setdefault(point, set()).add(project.cameras[camera].screen)
+        observed_on.setdefault(point, set()).add(project.cameras[camera].screen)
     for i, (name, screen) in enumerate(zip(survey.names, survey.screen, strict=True)):
-        watched = seen.get(name, set())
+        candidates = observed_on.get(name, set())
         if screen:
             out[i] = names.index(screen)
-        elif len(watched) == 1:
-            out[i] = names.index(next(iter(watched)))
+        elif len(candidates) == 1:
+            out[i] = names.index(next(iter(candidates)))
         elif len(names) == 1 and not any(survey.screen):
             out[i] = 0
     return out
 
 
-def _check_sizes(project: Project, survey: Survey, screen_of: Ints) -> None:
-    """Refuses surveys in another unit: told by the screen's size, or by what no screen is."""
+def _check_extent(project: Project, survey: Survey, screen_of: Ints) -> None:
+    """Raise InputError for a survey in a wrong unit: its extent does not match the screen's size, or any screen."""
     for k, (name, screen) in enumerate(project.screens.items()):
         mine = np.flatnonzero(screen_of == k)
         if len(mine) < 3:
@@ -119,23 +127,23 @@ def _check_sizes(project: Project, survey: Survey, screen_of: Ints) -> None:
         reach = float(np.max(np.linalg.norm(xyz[:, None] - xyz[None], axis=2)))
         if screen.size_m is not None:
             diagonal = float(np.hypot(*screen.size_m))
-            if reach > _TOO_LARGE * diagonal or reach < 0.02 * diagonal:
-                # Dots rarely reach the corners: of a typical 60 to 100 % of the diagonal the middle is taken.
+            if reach > _MAX_EXTENT * diagonal or reach < 0.02 * diagonal:
+                # Control points rarely reach the corners: typically they span 50 to 90 % of the diagonal.
                 unit = next((u for s in (0.9, 0.7, 0.5) for u in [wrong_unit(reach, s * diagonal)] if u), "")
-                hint = f"; {unit}?" if unit else "; check the unit, size_m and which dots lie on it"
+                hint = f"; {unit}?" if unit else "; check the unit, size_m and which points lie on it"
                 raise InputError(
-                    f"{where}: the dots of screen {name!r} reach over {reach:.4g} m, its size_m is"
+                    f"{where}: the control points of screen {name!r} extend over {reach:.4g} m, its size_m is"
                     f" {screen.size_m[0]:g} m x {screen.size_m[1]:g} m{hint}"
                 )
         elif not SMALLEST_SCREEN_M < reach < LARGEST_SCREEN_M:
             raise InputError(
-                f"{where}: the dots of screen {name!r} reach over {reach:.4g} m; expected"
+                f"{where}: the control points of screen {name!r} extend over {reach:.4g} m; expected"
                 f" {SMALLEST_SCREEN_M:g} to {LARGEST_SCREEN_M:g} m: are they in millimetres? coordinates are in metres"
             )
 
 
-def _lens_knowledge(project: Project, rig: Rig) -> tuple[Prior | None, Bools | None]:
-    """What the camera calibrations know of their lenses' errors: priors, and which numbers they free."""
+def _lens_prior(project: Project, rig: Rig) -> tuple[Prior | None, Bools | None]:
+    """Prior on the lens parameters from the camera calibrations, and which parameters are free in the adjustment."""
     names: list[str] = []
     blocks: list[Array] = []
     for name, entry in project.cameras.items():
@@ -158,15 +166,15 @@ def _lens_knowledge(project: Project, rig: Rig) -> tuple[Prior | None, Bools | N
 
 
 def _held_screen(project: Project) -> int:
-    """Whose frame is the world's where no surveyed dot is seen."""
+    """Index of the screen whose frame defines the world frame if no surveyed point is observed."""
     names = list(project.screens)
     if project.world is not None:
         return names.index(project.world)
     with_boards = [n for n, s in project.screens.items() if s.boards]
     if not with_boards:
         raise InputError(
-            f"{project.path}: nothing ties the cameras to the screens: expected a survey with `points`, or boards fixed"
-            " to screens (`screens.NAME.boards`)"
+            f"{project.path}: no measurement connects the cameras to the screens: expected a survey with `points`, or"
+            " boards fixed to screens (`screens.NAME.boards`)"
         )
     return names.index(with_boards[0])
 
@@ -192,7 +200,7 @@ def _setup(entry: ScreenEntry, survey: Survey, project: Project, scan: tuple[Sca
 
 
 def _scan(cloud: Cloud, entry: ScreenEntry, survey: Survey, project: Project) -> tuple[Scan, list[str]]:
-    """The screen in its scanned cloud, in world."""
+    """The scan of a screen in the world frame, and notes on it."""
     points, notes = read_cloud(cloud.path, cloud.unit_m)
     pose, covariance, words = cloud.world_from_cloud, None, list(notes)
     try:

@@ -1,4 +1,4 @@
-"""The report of a calibration of screens."""
+"""Report of a screen calibration."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ from lab.report.calibration.calibration_page import (
     provenance,
     write_calibration_report,
 )
-from lab.report.calibration.calibration_scene import LAB_VIEWS, Dot, Frustum, Rectangle, Thing, frustum_of, scene_views
+from lab.report.calibration.calibration_scene import LAB_VIEWS, Dot, Rectangle, Thing, frustum_of, scene_views
 
-_MOST_DOTS = 400  # rows of the table of dots; dots.csv has all
+_MAX_ROWS = 400  # rows in the table of observations; residuals.csv has all
 
 
 def write_page(
@@ -44,8 +44,8 @@ def write_page(
         _places(result),
         *(_screen(result, project, k) for k in range(len(result.screens))),
         _pixels(result),
-        _dots(result),
-        Section("The lab", "Cameras, screens and surveyed dots in the world's frame.", _scene(result)),
+        _observations(result),
+        Section("The lab", "Cameras, screens and surveyed control points in the world frame.", _scene(result)),
         _correlations(result),
     ]
     if inputs.remarks:
@@ -68,35 +68,38 @@ def _key_figures(result: ScreensResult) -> list[tuple[str, str, str]]:
     for k, name in enumerate(fit.rig.screens):
         sigma = 1e3 * float(np.max(spot_sigmas(result, k)))
         flatness = result.screens[k].flatness
-        note = "1 sigma along its normal, worst place"
+        note = "1 sigma along its normal, maximum"
         if flatness is not None:
-            shape = "bent" if flatness.chosen.bent else "flat"
-            note += f"; {shape}, misses {short(1e3 * flatness.chosen.rms_m, 2)} mm RMS"
+            shape = "curved" if flatness.chosen.bent else "flat"
+            note += f"; {shape}, residual {short(1e3 * flatness.chosen.rms_m, 2)} mm RMS"
         out.append((f"Surface of screen {name}", f"{short(sigma, 2)} mm", note))
     for name, sigma_m in pointing_sigmas_m(result).items():
         px = sigma_m * float(pinhole_numbers(fit.rig.cameras[name])[0]) / _distance(result, name)
-        note = f"1 sigma at its screen's middle; {short(px, 2)} px"
-        out.append((f"Place of camera {name}", f"{short(1e3 * sigma_m, 2)} mm", note))
+        note = f"1 sigma at the centre of its screen; {short(px, 2)} px"
+        out.append((f"Pose of camera {name}", f"{short(1e3 * sigma_m, 2)} mm", note))
     used = fit.sighting_errors_px[fit.used]
     if len(used):
         rms = float(np.sqrt(np.mean(used**2)))
         out.append(
             (
-                "Dots' pixels",
+                "Control points",
                 f"{short(rms, 3)} px",
-                f"RMS per axis of {len(used)}, {len(fit.used) - len(used)} left out",
+                f"RMS per axis of {len(used)} observations, {len(fit.used) - len(used)} excluded",
             )
         )
     if len(fit.corner_errors_px):
         rms = float(np.sqrt(np.mean(fit.corner_errors_px**2)))
         out.append(("Corners of boards", f"{short(rms, 3)} px", f"RMS per axis of {len(fit.corner_errors_px)}"))
     factor = float(np.sqrt(fit.variance_factor))
-    note = "times the sigmas that were given; " + ("they hold" if factor == 1 else "all sigmas here are widened by it")
-    out.append(("Misfit", short(factor, 3), f"{note} ({fit.dof} redundant numbers)"))
+    note = (
+        "the stated sigmas are correct" if factor == 1 else "times the stated sigmas; all sigmas are multiplied by it"
+    )
+    out.append(("Misfit", short(factor, 3), f"{note} ({fit.dof} degrees of freedom)"))
     return out
 
 
 def _distance(result: ScreensResult, camera: str) -> float:
+    """Distance of a camera from the origin of its screen, m."""
     c = result.fit.rig.cameras[camera]
     screen = result.fit.rig.screens[c.screen].world_from_screen
     return float(np.linalg.norm(c.camera_from_world.apply(screen.translation)))
@@ -115,12 +118,12 @@ def _places(result: ScreensResult) -> Section:
         place = [name, c.screen, f"{x:.4f}, {y:.4f}, {z:.4f}", 1e3 * position, float(np.degrees(attitude))]
         rows.append([*place, 1e3 * pointing[name], f"{int(np.sum(fit.used & mine))} of {int(mine.sum())}", boards])
     words = (
-        "A camera's position and attitude err together: what counts is how far both shift what it sees on its screen."
-        " The joint covariance in screens.yaml has that; the two sigmas alone would overstate it."
+        "Errors of a camera's position and attitude are correlated and partly cancel on its screen. The column “on its"
+        " screen” is the combined effect, from the joint covariance in screens.yaml."
     )
     heads = [
         "camera", "screen", "position in world (m)", "sigma of position (mm)", "sigma of attitude (°)",
-        "on its screen (mm)", "dots used", "boards",
+        "on its screen (mm)", "control points used", "boards",
     ]  # fmt: skip
     return Section("Cameras", words, table=PageTable(heads, rows))
 
@@ -131,28 +134,28 @@ def _screen(result: ScreensResult, project: Project, k: int) -> Section:
     normal, origin = screen.world_from_screen.rotation[:, 2], screen.world_from_screen.translation
     x_axis = screen.world_from_screen.rotation[:, 0]
     words = [
-        f"Origin at {_vector(origin, 4)} m of world, normal (z) along {_vector(normal, 5)},"
-        f" x along {_vector(x_axis, 5)}."
-        " Within the plane the axes are a choice"
-        + (", fixed by the named dots." if project.screens[name].frame else ": the middle of what was measured on it.")
+        f"Origin at {_vector(origin, 4)} m in the world, normal (z) along {_vector(normal, 5)},"
+        f" x along {_vector(x_axis, 5)}. The axes within the plane are a convention"
+        + (", defined by the named points." if project.screens[name].frame else ": the centre of its measurements.")
     ]
     drawings = []
     if about.flatness is None:
-        words.append("Known from a board fixed to it alone: nothing tells how flat it is.")
+        words.append("Its pose comes from a fixed board alone: its flatness is not known.")
     else:
         f = about.flatness
-        sigma = float(np.median(np.sqrt(np.maximum(f.flat.sigma_m**2 - f.flat.scatter_m**2, 0))))  # the points' own
+        # The points' own sigma, without the scatter of the surface.
+        sigma = float(np.median(np.sqrt(np.maximum(f.flat.sigma_m**2 - f.flat.scatter_m**2, 0))))
         on = f.chosen.used
         if not on.all():
-            words.append(f"{int(np.sum(~on))} of {len(on)} points lie far off it and are not drawn: see the warnings.")
-        over = "its dots" if about.dots else "patches of the scan (medians of their points)"
+            words.append(f"{int(np.sum(~on))} of {len(on)} points are far off it and are not drawn: see the warnings.")
+        over = "the control points" if about.dots else "patches of the scan (medians of their points)"
         words.append(
-            f"As a plane it misses {over} by {short(1e3 * f.flat.rms_m, 3)} mm RMS"
+            f"The best plane has residuals of {short(1e3 * f.flat.rms_m, 3)} mm RMS at {over}"
             + (
-                "; too few to tell whether it is bent."
+                "; there are too few of them to test for a curvature."
                 if f.bent is None
-                else f", as a bent surface by {short(1e3 * f.bent.rms_m, 3)} mm; were it flat, chance alone would make"
-                f" it look so bent with a probability of {f.p_flat:.2g}."
+                else f", the best curved surface {short(1e3 * f.bent.rms_m, 3)} mm; the probability of so large an"
+                f" improvement on a flat screen is {f.p_flat:.2g}."
             )
         )
         a, b, c = screen.bow
@@ -166,15 +169,15 @@ def _screen(result: ScreensResult, project: Project, k: int) -> Section:
                     bow=(a, b, c) if f.chosen.bent else None,
                     sigma_m=sigma,
                 ),
-                "Height along the normal. A smooth pattern is a bow; one without order, a rough screen or survey.",
+                "Height along the normal. A smooth pattern is a bow; a random pattern is roughness or survey noise.",
             )
         )
         if f.chosen.bent:
             drawings.append(
                 PageDrawing(
-                    flatness_map(about.xyz[on, :2], f.chosen.heights_m[on], f"Screen {name}: what the bow leaves",
+                    flatness_map(about.xyz[on, :2], f.chosen.heights_m[on], f"Screen {name}: residuals after the bow",
                                  size_m=screen.size_m, sigma_m=sigma),
-                    "The same after the bow: this should be noise.",
+                    "Height above the curved surface: only noise should remain.",
                 )
             )  # fmt: skip
     return Section(f"Screen {name}", words, drawings)
@@ -189,21 +192,22 @@ def _pixels(result: ScreensResult) -> Section:
     drawings = []
     for i, (name, c) in enumerate(fit.rig.cameras.items()):
         mine = network.sightings.camera_of == i
-        found, error = network.sightings.pixels[mine], fit.sighting_errors_px[mine]
+        pixels, error = network.sightings.pixels[mine], fit.sighting_errors_px[mine]
         rejected = ~fit.used[mine]
         if fit.corners is not None:
             its = fit.corners.camera == i
-            found = np.concatenate([found, fit.corners.pixels[its]])
+            pixels = np.concatenate([pixels, fit.corners.pixels[its]])
             error = np.concatenate([error, fit.corner_errors_px[its]])
             rejected = np.concatenate([rejected, np.zeros(int(its.sum()), dtype=bool)])
-        if len(found):
-            title = f"Camera {name}: measured less predicted"
-            drawings.append(PageDrawing(corners_overlay(c.image_size_px, found, error, title, rejected=rejected)))
-    words = "Arrows that all point one way in a part of a picture show a lens that changed since its calibration."
+        if len(pixels):
+            title = f"Camera {name}: measured − predicted"
+            drawings.append(PageDrawing(corners_overlay(c.image_size_px, pixels, error, title, rejected=rejected)))
+    words = "Arrows with a common direction in a part of a picture indicate a lens that changed since its calibration."
     return Section("Pixels", words, drawings)
 
 
-def _dots(result: ScreensResult) -> Section:
+def _observations(result: ScreensResult) -> Section:
+    """Section with the table of the observations, the largest residuals first."""
     network, fit = result.network, result.fit
     screens = list(fit.rig.screens)
     s = network.sightings
@@ -212,12 +216,16 @@ def _dots(result: ScreensResult) -> Section:
         d = int(s.dot_of[i])
         k = int(network.dots.screen_of[d])
         names = [list(fit.rig.cameras)[s.camera_of[i]], network.dots.names[d], screens[k] if k >= 0 else ""]
-        pixel, miss = [f"{v:.2f}" for v in s.pixels[i]], [f"{v:+.3f}" for v in fit.sighting_errors_px[i]]
-        rows.append([*names, *pixel, *miss, f"{fit.sighting_sigmas[i]:.2f}", bool(fit.used[i])])
+        pixel, residual = [f"{v:.2f}" for v in s.pixels[i]], [f"{v:+.3f}" for v in fit.sighting_errors_px[i]]
+        rows.append([*names, *pixel, *residual, f"{fit.sighting_sigmas[i]:.2f}", bool(fit.used[i])])
     rows = [rows[int(i)] for i in np.argsort(-fit.sighting_sigmas, kind="stable")]
-    heads = ["camera", "dot", "screen", "u (px)", "v (px)", "misses u (px)", "misses v (px)", "in sigmas", "used"]
-    words = "The worst first. Sigmas hold the pixel's and the survey's errors together; beyond 5 a pixel is left out."
-    return Section("Dots", words, table=PageTable(heads, rows[:_MOST_DOTS]))
+    heads = [
+        "camera", "point", "screen", "u (px)", "v (px)", "residual u (px)", "residual v (px)", "in sigmas", "used",
+    ]  # fmt: skip
+    words = (
+        "Largest residuals first. Sigmas combine the errors of pixel and survey; beyond 5 sigma a pixel is excluded."
+    )
+    return Section("Observations of control points", words, table=PageTable(heads, rows[:_MAX_ROWS]))
 
 
 def _scene(result: ScreensResult) -> list[PageDrawing]:
@@ -229,11 +237,9 @@ def _scene(result: ScreensResult) -> list[PageDrawing]:
             half = np.abs(result.screens[k].xyz[:, :2]).max(axis=0, initial=0.4) * 1.1
             size = (2 * float(half[0]), 2 * float(half[1]))
         things.append(Rectangle(f"screen {name}", screen.world_from_screen, size))
-    for c in fit.rig.cameras.values():
-        f: Frustum = frustum_of(c)
-        things.append(f)
-    things += [Dot("", p) for p in network.dots.xyz[: 5 * _MOST_DOTS]]
-    return [PageDrawing(view) for view in scene_views(things, "Cameras, screens and dots", LAB_VIEWS)]
+    things += [frustum_of(c) for c in fit.rig.cameras.values()]
+    things += [Dot("", p) for p in network.dots.xyz[: 5 * _MAX_ROWS]]
+    return [PageDrawing(view) for view in scene_views(things, "Cameras, screens and control points", LAB_VIEWS)]
 
 
 def _correlations(result: ScreensResult) -> Section:
@@ -247,7 +253,7 @@ def _correlations(result: ScreensResult) -> Section:
     labels = [names[i].split(".", 1)[1] for i in rows]
     drawing = correlation_matrix(labels, result.fit.covariance.matrix[np.ix_(rows, rows)])
     words = (
-        f"Of camera {first} ({len(block.parameters)} numbers) and its screen. Errors that are so tied must be carried"
-        " together; screens.yaml holds the whole matrix."
+        f"Parameters of camera {first} ({len(block.parameters)}) and its screen. Use the joint covariance in"
+        " screens.yaml, which has these correlations for the whole lab."
     )
-    return Section("What errs together", words, [PageDrawing(drawing)])
+    return Section("Correlations", words, [PageDrawing(drawing)])

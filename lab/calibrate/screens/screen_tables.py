@@ -1,4 +1,4 @@
-"""The tables that `calibrate screen` writes: what each pixel and each dot misses."""
+"""Tables of `calibrate screen`: residuals of pixels and control points."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ DOT_COLUMNS = ("point", "screen", "x_m", "y_m", "z_m", "shift_x_m", "shift_y_m",
 
 
 def write_tables(result: ScreensResult, folder: Path) -> None:
-    """residuals.csv (a row per pixel of a dot, and per corner of a board) and dots.csv (a row per surveyed dot).
+    """Write residuals.csv (a row per observation and per board corner) and dots.csv (a row per control point).
 
-    Residuals are measured less predicted; a corner's `point` is its board's place. Shifts are adjusted less surveyed;
-    height_m is that over the screen's surface, `used` whether a pixel or a dot took part.
+    Residuals are measured minus predicted; the `point` of a corner is the name of its board placement. Shifts are
+    adjusted minus surveyed; height_m is the height above the screen's surface, `used` whether the row was used.
     """
     network, fit = result.network, result.fit
     cameras, screens = list(fit.rig.cameras), list(fit.rig.screens)
@@ -31,10 +31,11 @@ def write_tables(result: ScreensResult, folder: Path) -> None:
         rows.append([*names, *s.pixels[i].round(4), *fit.sighting_errors_px[i].round(4), sigmas, int(fit.used[i])])
     if fit.corners is not None:
         c = fit.corners
-        off = np.linalg.norm(fit.corner_errors_px, axis=1) / c.sigma_px
+        in_sigmas = np.linalg.norm(fit.corner_errors_px, axis=1) / c.sigma_px
         for i in range(len(c)):
             names = [cameras[c.camera[i]], network.placements[c.placement[i]]]
-            rows.append([*names, *c.pixels[i].round(4), *fit.corner_errors_px[i].round(4), round(float(off[i]), 3), 1])
+            residual = fit.corner_errors_px[i].round(4)
+            rows.append([*names, *c.pixels[i].round(4), *residual, round(float(in_sigmas[i]), 3), 1])
     _write_csv(folder / RESIDUALS, RESIDUAL_COLUMNS, rows)
     height = np.full(len(network.dots), np.nan)
     used = np.ones(len(network.dots), dtype=bool)
@@ -42,13 +43,13 @@ def write_tables(result: ScreensResult, folder: Path) -> None:
         if screen.dots and screen.flatness is not None:
             height[list(screen.dots)] = screen.flatness.chosen.heights_m
             used[list(screen.dots)] = screen.used
-    places = network.dots.xyz + fit.dot_shifts_m
-    dots: list[list[object]] = []
+    xyz = network.dots.xyz + fit.dot_shifts_m
+    points: list[list[object]] = []
     for i, (name, k) in enumerate(zip(network.dots.names, network.dots.screen_of, strict=True)):
-        over = "" if np.isnan(height[i]) else round(float(height[i]), 7)
+        height_m = "" if np.isnan(height[i]) else round(float(height[i]), 7)
         screen_name = "" if k < 0 else screens[k]
-        dots.append([name, screen_name, *places[i].round(7), *fit.dot_shifts_m[i].round(7), over, int(used[i])])
-    _write_csv(folder / DOTS, DOT_COLUMNS, dots)
+        points.append([name, screen_name, *xyz[i].round(7), *fit.dot_shifts_m[i].round(7), height_m, int(used[i])])
+    _write_csv(folder / DOTS, DOT_COLUMNS, points)
 
 
 def _write_csv(path: Path, columns: Sequence[str], rows: Sequence[Sequence[object]]) -> None:

@@ -1,6 +1,6 @@
-"""Whether a survey can be right: swapped axes, other units, cameras far from their `near_m`, dots off their screens.
+"""Checks of a survey: swapped axes, wrong units, cameras far from their `near_m`, points that are not on their screen.
 
-Pixels alone let a turned or mirrored world pass; so both `calibrate screen` and `calibrate rig` begin here.
+The pixels alone cannot detect a rotated or mirrored world frame; `calibrate screen` and `calibrate rig` start here.
 """
 
 from __future__ import annotations
@@ -18,63 +18,64 @@ from lab.calibrate.screens.screen_inputs import ScreenInputs
 from lab.errors import CalibrationError, InputError
 from lab.files.project.project import Project
 
-_SUSPICIOUS = 4.0  # misfit (see survey_diagnosis.py) from which swapped axes and wrong units are looked for
-_CURED = 2.0  # misfit up to which a change to the survey counts as what was wrong
+_SUSPICIOUS_MISFIT = 4.0  # misfit (see survey_diagnosis.py) above which swapped axes and wrong units are tested
+_ACCEPTED_MISFIT = 2.0  # misfit below which a change to the survey is accepted as the explanation
 
 
 def adjusted_screens(project: Project, inputs: ScreenInputs) -> ScreensResult:
-    """The adjustment of cameras and screens by the survey; where nothing fits, what about the survey may be wrong.
+    """Adjust cameras and screens to the survey; if they do not fit, find the mistake in the survey.
 
-    Raises InputError for a survey that fits with other axes, signs or units and for parts that share nothing,
-    CalibrationError where the measurements give no calibration.
+    Raises:
+        InputError: for a survey that fits with other axes, signs or units, or parts without common measurements.
+        CalibrationError: if the measurements do not determine a calibration.
     """
     where = ", ".join(str(p) for p in project.survey) or str(project.path)
     problem: Exception | None = None
-    miss = float("inf")
+    misfit = float("inf")
     try:
         result = calibrate(inputs.network, inputs.setups, inputs.near, inputs.held_screen)
-        miss = misfit_of(result, inputs.near)
+        misfit = misfit_of(result, inputs.near)
     except (NotConnectedError, AdjustmentError, ValueError) as error:
         problem = error
     enough = len(inputs.network.sightings) >= 4
-    if enough and miss > _SUSPICIOUS and not _plainly_missing(inputs, problem):
-        changes = suspects(inputs.network, inputs.setups, inputs.near, inputs.held_screen, miss)
-        remedies = [c for c in changes if c.factor < _CURED]
-        if remedies:
-            raise InputError(_suspicion(where, remedies))
+    if enough and misfit > _SUSPICIOUS_MISFIT and not _too_few_points(problem):
+        changes = suspects(inputs.network, inputs.setups, inputs.near, inputs.held_screen, misfit)
+        explanations = [c for c in changes if c.factor < _ACCEPTED_MISFIT]
+        if explanations:
+            raise InputError(_explained(where, explanations))
     if isinstance(problem, AdjustmentError):
-        raise CalibrationError(f"{project.path}: the measurements give no calibration: {problem}") from None
+        raise CalibrationError(f"{project.path}: the measurements do not determine a calibration: {problem}") from None
     if problem is not None:
         raise InputError(f"{where}: {problem}") from None
     return result
 
 
-def _plainly_missing(inputs: ScreenInputs, problem: Exception | None) -> bool:
-    """Whether a camera has too few dots, or a screen: no other axes or unit would mend that."""
+def _too_few_points(problem: Exception | None) -> bool:
+    """Whether a camera or a screen has too few control points, which no change of axes or unit can correct."""
     text = str(problem or "")
     return any(words in text for words in ("expected 4 or more", "expected 3 or more", "on one line", "found none"))
 
 
-def _suspicion(where: str, remedies: Sequence[SurveySuspect]) -> str:
-    """What the survey's columns seem to hold."""
-    best = remedies[0]
-    others = [c for c in remedies[1:] if c.factor < 1.2 * best.factor]
+def _explained(where: str, explanations: Sequence[SurveySuspect]) -> str:
+    """The message that names the change with which the survey fits."""
+    best = explanations[0]
+    others = [c for c in explanations[1:] if c.factor < 1.2 * best.factor]
     text = f"{where}: does not fit the pixels as it is, but {best.words} does"
     if others:
         text += (
-            f" (so do {len(others)} other changes, such as {others[0].words}: a mirrored survey looks the same"
-            " whichever axes are swapped; give a camera's place as `near_m` to tell)"
+            f" (so do {len(others)} other changes, such as {others[0].words}: a mirrored survey fits the same with any"
+            " two axes swapped; give a camera's position as `near_m` to distinguish them)"
         )
-    return f"{text}; mend the file"
+    return f"{text}; correct the file"
 
 
 def survey_findings(project: Project, result: ScreensResult) -> list[Finding]:
-    """Whether the dots lie on their screens and reach over them, and every camera has a lens calibration of its own."""
+    """Findings on shared lens files, and on control points that are off their screens or cover too little of them."""
     return [*_shared_lenses(project), *_coverage(project, result)]
 
 
 def _shared_lenses(project: Project) -> list[Finding]:
-    """Two cameras with one file of a lens: their lenses are never the same."""
+    """Warnings for two cameras with the same lens calibration: two lenses are never identical."""
     out = []
     names = list(project.cameras)
     for i, first in enumerate(names):
@@ -86,15 +87,15 @@ def _shared_lenses(project: Project) -> list[Finding]:
                     Finding(
                         Level.WARN,
                         f"cameras {first!r} and {second!r} share the lens calibration {a.lens_path.name}",
-                        "lenses of one type differ by far more than their calibrations' errors",
-                        "give each camera the file of its own calibration",
+                        "two lenses of one type differ by much more than the errors of a calibration",
+                        "give each camera its own lens calibration",
                     )
                 )
     return out
 
 
 def _coverage(project: Project, result: ScreensResult) -> list[Finding]:
-    """Whether the dots reach over the screens, and lie on them."""
+    """Warnings for control points outside of their screen, and for screens that the points cover only partly."""
     out = []
     for (name, entry), screen in zip(project.screens.items(), result.screens, strict=True):
         if entry.size_m is None or not screen.dots:
@@ -103,14 +104,14 @@ def _coverage(project: Project, result: ScreensResult) -> list[Finding]:
         reach = np.abs(screen.xyz[:, :2])
         beyond = np.flatnonzero((reach > half + 0.01).any(axis=1))
         if beyond.size:
-            dot = result.network.dots.names[screen.dots[int(beyond[0])]]
+            point = result.network.dots.names[screen.dots[int(beyond[0])]]
+            count = "1 point" if len(beyond) == 1 else f"{len(beyond)} points"
             out.append(
                 Finding(
                     Level.WARN,
-                    f"screen {name!r}: dot {dot!r} lies outside its size_m "
-                    f"({len(beyond)} dot{' does' if len(beyond) == 1 else 's do'})",
-                    "spots beyond size_m count as off the screen",
-                    "correct size_m, or fix the screen's frame by named dots (`frame`)",
+                    f"screen {name!r}: control point {point!r} is outside of size_m ({count} in all)",
+                    "spots outside of size_m count as off the screen",
+                    "correct size_m, or define the screen's frame by three named points (`frame`)",
                 )
             )
         share = np.ptp(screen.xyz[screen.used, :2], axis=0) / np.array(entry.size_m)
@@ -118,11 +119,11 @@ def _coverage(project: Project, result: ScreensResult) -> list[Finding]:
             out.append(
                 Finding(
                     Level.WARN,
-                    f"screen {name!r}: its dots reach over {100 * share[0]:.0f} % of its width and"
+                    f"screen {name!r}: the control points cover {100 * share[0]:.0f} % of its width and"
                     f" {100 * share[1]:.0f} % of its height",
-                    "beyond the dots its shape is a guess"
-                    + ("" if entry.frame else ", and the middle of the dots is taken for the screen's middle"),
-                    "survey dots near its corners" + ("" if entry.frame else ", or name three dots in `frame`"),
+                    "outside of the control points its shape is extrapolated"
+                    + ("" if entry.frame else ", and the centre of the points is taken as the centre of the screen"),
+                    "survey points near its corners" + ("" if entry.frame else ", or name three points in `frame`"),
                 )
             )
     return out

@@ -1,1 +1,1 @@
-"""Reports of calibrations: the page and its charts, maps and scenes."""
+"""Reports of calibrations: page, charts, maps and 3-D views."""

@@ -1,4 +1,4 @@
-"""The report of a calibration: verdict, findings, key figures and pictures in one HTML file that needs nothing else."""
+"""Report of a calibration: verdict, findings, key figures and drawings in one self-contained HTML file."""
 
 from __future__ import annotations
 
@@ -23,25 +23,25 @@ from lab.number_format import short
 from lab.report.html import environment
 
 FILE_NAME = "report.html"
-KINDS = ("Camera", "Board", "Screens", "Beams", "Rig", "Daily check", "Plan")
-LARGEST_BYTES = 5_000_000  # a report that a mail carries and a browser opens at once
-_LONG_TABLE = 40  # rows beyond which a table is folded away
+KINDS = ("Camera", "Board", "Screens", "Beams", "Rig", "Drift check", "Plan")
+LARGEST_BYTES = 5_000_000  # limit for e-mail, and for a browser to open the report without delay
+_LONG_TABLE = 40  # number of rows above which a table is collapsed
 _CSS = {Level.PASS: "pass", Level.WARN: "check", Level.FAIL: "fail"}  # the classes of style.css
 _SENTENCE = {
-    Level.PASS: "This may be used.",
-    Level.WARN: "This may be used; know the warnings below.",
-    Level.FAIL: "This must not be used as it is.",
+    Level.PASS: "The result may be used.",
+    Level.WARN: "The result may be used; note the warnings below.",
+    Level.FAIL: "The result must not be used.",
 }
 _PLAN_SENTENCE = {
     Level.PASS: "This rig suits the range of poses.",
-    Level.WARN: "This rig can be built; know the warnings below.",
+    Level.WARN: "This rig can be built; note the warnings below.",
     Level.FAIL: "This rig does not suit the range of poses.",
 }
 
 
 @dataclass(frozen=True, slots=True)
 class PageTable:
-    """A table. Cells are text, or numbers, which are shown with four significant digits (nan: a dash)."""
+    """A table. Cells are text or numbers; numbers are shown with four significant digits, nan as a dash."""
 
     heads: Sequence[str]  # with units: "drift (px)"
     rows: Sequence[Sequence[object]]  # each as long as heads
@@ -54,16 +54,16 @@ class PageTable:
 
 @dataclass(frozen=True, slots=True)
 class PageDrawing:
-    """A picture as SVG or HTML text, trusted as it is, and what it shows, in plain words."""
+    """A drawing as SVG or HTML text, which is not escaped, with its caption."""
 
     picture: str
     caption: str = ""
-    wide: bool = False  # over the whole page instead of half
+    wide: bool = False  # full width of the page instead of half
 
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """One subject of a report: words, then pictures, then a table."""
+    """One section of a report: text, then drawings, then a table."""
 
     title: str
     words: str | Sequence[str] = ()  # one paragraph or several; plain text
@@ -73,16 +73,16 @@ class Section:
 
 @dataclass(frozen=True, slots=True)
 class Provenance:
-    """When, with what program and from what a calibration was made."""
+    """Date, program version and input files of a calibration."""
 
     date: str  # ISO
     version: str
-    inputs: tuple[str, ...] = ()  # a line each: name and fingerprint
+    inputs: tuple[str, ...] = ()  # one line per file: name and checksum
 
 
 @dataclass(frozen=True, slots=True)
 class CalibrationReport:
-    """All that a calibration says of itself."""
+    """Content of a calibration's report."""
 
     kind: str  # one of KINDS
     name: str
@@ -98,13 +98,14 @@ class CalibrationReport:
 
 
 def provenance(inputs: Iterable[Path] = (), made: date | None = None) -> Provenance:
-    """Today's date (or the given one), this program's version and the SHA-256 of the input files.
+    """The given date (default: today), the version of the program and the SHA-256 of the input files.
 
-    Raises InputError for an input that cannot be read.
+    Raises:
+        InputError: for an input that cannot be read.
     """
     try:
         version = metadata.version("beampose")
-    except metadata.PackageNotFoundError:  # run from a checkout that was never installed
+    except metadata.PackageNotFoundError:  # run from a checkout that is not installed
         version = "not installed as a package"
     lines = []
     for path in inputs:
@@ -117,9 +118,9 @@ def provenance(inputs: Iterable[Path] = (), made: date | None = None) -> Provena
 
 
 def telling_views(rms_px: Array, worst: int = 4) -> list[tuple[int, str]]:
-    """Which of n views to show as pictures: the worst few, the median and the best, each once, with that word.
+    """Indices of the views to show as pictures, each with its rank: the worst ones, the median and the best.
 
-    rms_px (n,): nan for a view that was not used; such views come last and are never shown.
+    rms_px (n,): nan for an unused view, which is never shown. worst: number of the worst views.
     """
     rms = np.asarray(rms_px, dtype=float)
     order = [int(i) for i in np.argsort(rms, kind="stable") if np.isfinite(rms[i])]
@@ -133,9 +134,9 @@ def telling_views(rms_px: Array, worst: int = 4) -> list[tuple[int, str]]:
 
 
 def write_calibration_report(report: CalibrationReport, folder: Path) -> Path:
-    """Write report.html into a folder, whole or not at all; returns its path.
+    """Write report.html into a folder atomically; return its path.
 
-    Where it would be larger than 5 MB its largest pictures are left out, each with a line that says so.
+    If it would exceed 5 MB, its largest pictures are each replaced by a note.
     """
     path = Path(folder) / FILE_NAME
     atomic_write_text(page(report), path)
@@ -143,7 +144,7 @@ def write_calibration_report(report: CalibrationReport, folder: Path) -> Path:
 
 
 def page(report: CalibrationReport) -> str:
-    """The HTML text of a report, at most 5 MB unless its tables alone are larger."""
+    """HTML text of a report, at most 5 MB unless its tables alone are larger."""
     drawn = [[_drawing(d) for d in s.drawings] for s in report.sections]
     html = _rendered(report, drawn)
     by_size = sorted(
@@ -156,9 +157,9 @@ def page(report: CalibrationReport) -> str:
     for size, i, k in by_size:
         if excess <= 0:
             break
-        left_out = '<p class="empty">Picture left out: the report would have passed 5 MB.</p>'
-        drawn[i][k] = replace(drawn[i][k], picture=left_out)
-        excess -= size - len(left_out)
+        note = '<p class="empty">Picture omitted: the report would have exceeded 5 MB.</p>'
+        drawn[i][k] = replace(drawn[i][k], picture=note)
+        excess -= size - len(note)
     return _rendered(report, drawn)
 
 
@@ -187,7 +188,7 @@ def _rendered(report: CalibrationReport, drawn: list[list[PageDrawing]]) -> str:
 
 
 def section_context(section: Section) -> dict[str, Any]:
-    """A section as the template sections.html.j2 takes it."""
+    """A section as context of the template sections.html.j2."""
     return _section(section, [_drawing(d) for d in section.drawings])
 
 
@@ -211,7 +212,7 @@ def _counted(findings: Sequence[Finding]) -> str:
 
 
 def cell(value: object) -> str:
-    """A table's cell as text: numbers with four significant digits, none and nan as a dash."""
+    """A cell as text: numbers with four significant digits, None and nan as a dash."""
     if value is None:
         return "–"
     if isinstance(value, bool | np.bool_):
@@ -227,7 +228,7 @@ _NUMBER_TEXT = re.compile(r"^[-+−±]?[\d.,]+(\s*[×%°].*)?(\s*±.*)?$|^[–�
 
 
 def _numeric(table: PageTable) -> list[bool]:
-    """Which columns hold numbers alone: those stand flush right."""
+    """Whether each column holds only numbers, which are aligned to the right."""
     return [
         bool(table.rows) and all(_NUMBER_TEXT.match(cell(row[k])) is not None for row in table.rows)
         for k in range(len(table.heads))

@@ -1,4 +1,4 @@
-"""A calibrated lab for the daily check: a rig with an honest covariance, the lab as it truly is, its dots and spots."""
+"""A simulated lab for the drift check: a stored rig with its covariance, the true rig, control points and spots."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from tests.geometry.scenes import LENSES, paper_rig
 
 DAY = datetime.date(2026, 5, 1)
 STATE = CalibrationState(datetime.date(2026, 3, 1), "PASS", datetime.date(2026, 9, 1))
-DOT_SIGMA_M = 1e-4
+POINT_SIGMA_M = 1e-4
 
 
 def rig_and_covariance() -> tuple[Rig, Covariance]:
-    """The stored rig, and what a calibration from 60 dots of 0.15 px per camera leaves uncertain.
+    """The stored rig, and the covariance of a calibration from 60 control points per camera measured to 0.15 px.
 
-    Numeric derivatives of the projection, so that nothing here shares code with the check.
+    Computed by numeric derivatives of the projection, independently of the code of the check.
     """
     rig = paper_rig(LENSES[5], (4.0, 3.0))
     names: list[str] = []
@@ -33,15 +33,15 @@ def rig_and_covariance() -> tuple[Rig, Covariance]:
     for name, camera in rig.cameras.items():
         own = [f"cameras.{name}.{p}" for p in camera_names(camera)]
         x, y = np.meshgrid(np.linspace(-1.8, 1.8, 10), np.linspace(-1.3, 1.3, 6))
-        # Dots on two planes, as a calibration with boards has them: one plane alone leaves the focal length open.
+        # Points on two planes, as in a calibration with boards: a single plane does not determine the focal length.
         z = 0.8 * ((np.arange(x.size) % 2) - 0.5)
         pose = rig.screens[camera.screen].world_from_screen
-        dots = pose.apply(np.stack([x.ravel(), y.ravel(), z], axis=-1))
-        J = np.empty((dots.shape[0] * 2, len(own)))
+        xyz = pose.apply(np.stack([x.ravel(), y.ravel(), z], axis=-1))
+        J = np.empty((xyz.shape[0] * 2, len(own)))
         for k, parameter in enumerate(own):
             step = np.zeros(len(own))
             step[k] = 1e-3 if parameter.endswith((".fx", ".fy", ".cx", ".cy")) else 1e-6
-            ends = [moved(rig, own, s * step).cameras[name].project(dots).ravel() for s in (1, -1)]
+            ends = [moved(rig, own, s * step).cameras[name].project(xyz).ravel() for s in (1, -1)]
             J[:, k] = (ends[0] - ends[1]) / (2 * step[k])
         names += own
         blocks.append(np.linalg.inv(J.T @ J / 0.15**2))
@@ -55,13 +55,13 @@ def rig_and_covariance() -> tuple[Rig, Covariance]:
 
 
 def true_rig(rig: Rig, covariance: Covariance, rng: np.random.Generator) -> Rig:
-    """The rig as it really is: the stored one is off by what its covariance says."""
+    """The true rig: it differs from the stored one by a random error with the stated covariance."""
     values, vectors = np.linalg.eigh(covariance.matrix)
     return moved(rig, covariance.parameters, vectors @ (np.sqrt(np.maximum(values, 0)) * rng.normal(size=len(values))))
 
 
 def turned(rig: Rig, camera: str, degrees: float, axis: int = 1) -> Rig:
-    """With a camera turned about one of its own axes."""
+    """The rig with a camera rotated about one of its own axes."""
     old = rig.cameras[camera]
     turn = np.zeros(3)
     turn[axis] = np.deg2rad(degrees)
@@ -69,14 +69,14 @@ def turned(rig: Rig, camera: str, degrees: float, axis: int = 1) -> Rig:
     return Rig(rig.screens, {**rig.cameras, camera: new}, rig.beams, rig.spots)
 
 
-def dots(rig: Rig) -> dict[str, tuple[str, np.ndarray]]:
-    """Five dots on each screen: name, the screen, its place on the screen (2,), m."""
+def control_points(rig: Rig) -> dict[str, tuple[str, np.ndarray]]:
+    """Five control points on each screen, by name: the screen and the coordinates on it (2,), m."""
     places = [(-1.0, -0.8), (1.0, -0.8), (1.0, 0.8), (-1.0, 0.8), (0.1, 0.0)]
     return {f"{s[0].upper()}{i}": (s, np.array(p)) for s in rig.screens for i, p in enumerate(places, 1)}
 
 
 def write_rig(folder: Path, rig: Rig, covariance: Covariance | None, state: CalibrationState | None = STATE) -> Path:
-    """rig.yaml of a calibrated lab."""
+    """Write rig.yaml of a calibrated lab; return its path."""
     path = folder / "rig.yaml"
     save_rig(RigFile(rig, {} if covariance is None else {"target": covariance}, state), path)
     return path
@@ -91,24 +91,24 @@ def write_points(
     on_screens: bool = False,
     sigma_px: float = 0.1,
 ) -> tuple[Path, Path]:
-    """points.csv and survey.csv of a check on a day on which the lab is `today`; wrong: px that dots are off by."""
+    """Write points.csv and survey.csv of a check of the true rig `today`. wrong: errors of single points, px."""
     pixels, survey = ["camera,point,u_px,v_px,sigma_px"], []
     survey.append("point,screen,x_m,y_m,sigma_x_m,sigma_y_m" if on_screens else
                   "point,x_m,y_m,z_m,sigma_x_m,sigma_y_m,sigma_z_m")  # fmt: skip
-    for name, (screen, place) in dots(today).items():
+    for name, (screen, xy) in control_points(today).items():
         pose = today.screens[screen].world_from_screen
-        error = rng.normal(0, DOT_SIGMA_M, 3)
+        error = rng.normal(0, POINT_SIGMA_M, 3)
         if on_screens:
-            real = pose.apply(np.array([*(place + error[:2]), 0.0]))
-            survey.append(f"{name},{screen},{place[0]:.7f},{place[1]:.7f},{DOT_SIGMA_M},{DOT_SIGMA_M}")
+            true = pose.apply(np.array([*(xy + error[:2]), 0.0]))
+            survey.append(f"{name},{screen},{xy[0]:.7f},{xy[1]:.7f},{POINT_SIGMA_M},{POINT_SIGMA_M}")
         else:
-            told = pose.apply(np.array([*place, 0.0]))
-            real = told + error
-            survey.append(f"{name}," + ",".join(f"{v:.7f}" for v in told) + f",{DOT_SIGMA_M}" * 3)
+            surveyed = pose.apply(np.array([*xy, 0.0]))
+            true = surveyed + error
+            survey.append(f"{name}," + ",".join(f"{v:.7f}" for v in surveyed) + f",{POINT_SIGMA_M}" * 3)
         for camera in today.cameras.values():
             if camera.screen != screen:
                 continue
-            uv = camera.project(real) + rng.normal(0, sigma_px, 2) + np.array((wrong or {}).get(name, (0.0, 0.0)))
+            uv = camera.project(true) + rng.normal(0, sigma_px, 2) + np.array((wrong or {}).get(name, (0.0, 0.0)))
             pixels.append(f"{camera.name},{name},{uv[0]:.5f},{uv[1]:.5f},{sigma_px}")
     (folder / "points.csv").write_text("\n".join(pixels) + "\n")
     (folder / "survey.csv").write_text("\n".join(survey) + "\n")
@@ -127,7 +127,7 @@ ATTITUDE_HEADER = (
 def write_still(
     folder: Path, today: Rig, pose: Pose, rng: np.random.Generator, *, frames: int = 50, wander_px: float = 0.0
 ) -> Path:
-    """spots.csv, attitude.csv and pose.csv of a vehicle at rest, seen with 0.05 px noise."""
+    """Write spots.csv, attitude.csv and pose.csv of a vehicle at rest with 0.05 px noise; return the folder."""
     folder.mkdir(parents=True, exist_ok=True)
     model = SpotModel.of(today)
     uv = model.derivatives(pose).pixels

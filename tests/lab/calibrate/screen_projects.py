@@ -1,4 +1,4 @@
-"""Calibration projects of screens on disk, measured from the `fan` example rig, with their truth."""
+"""Simulated screen calibration projects on disk, measured with the `fan` example rig, and the true rig."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ def truth(bow: float = 0.0) -> Rig:
     return Rig(screens, rig.cameras, {}, {})
 
 
-def write_project(folder: Path, seed: int = 0, bow: float = 0.0, dots: int = 16, **extra: object) -> Path:
-    """A calibration.yaml with lenses, survey.csv and points.csv. extra: further keys of the file; returns its path."""
+def write_project(folder: Path, seed: int = 0, bow: float = 0.0, points_each: int = 16, **extra: object) -> Path:
+    """Write calibration.yaml with lenses, survey.csv and points.csv; return its path. extra: further keys of it."""
     rng = np.random.default_rng(seed)
     rig = truth(bow)
     folder.mkdir(parents=True, exist_ok=True)
@@ -36,17 +36,17 @@ def write_project(folder: Path, seed: int = 0, bow: float = 0.0, dots: int = 16,
             CameraFile(name, camera.image_size_px, camera.matrix, camera.distortion), folder / f"{name}-camera.yaml"
         )
         done = 0
-        while done < dots:
+        while done < points_each:
             x, y = rng.uniform(-1, 1, 2) * np.array(SIZE_M) / 2 * 0.95
-            place = screen.world_from_screen.apply(np.array([x, y, bow * x * x]))
-            pixel = camera.project(place)
+            xyz = screen.world_from_screen.apply(np.array([x, y, bow * x * x]))
+            pixel = camera.project(xyz)
             if not camera.sees(pixel):
                 continue
-            dot = f"{name[0].upper()}{done + 1}"
-            measured = place + SURVEY_SIGMA_M * rng.normal(size=3)
+            point = f"{name[0].upper()}{done + 1}"
+            measured = xyz + SURVEY_SIGMA_M * rng.normal(size=3)
             u, v = pixel + PIXEL_SIGMA_PX * rng.normal(size=2)
-            survey.append(",".join([dot, *(f"{c:.6f}" for c in measured), *[str(SURVEY_SIGMA_M)] * 3, screen.name]))
-            points.append(f"{name},{dot},{u:.4f},{v:.4f},{PIXEL_SIGMA_PX}")
+            survey.append(",".join([point, *(f"{c:.6f}" for c in measured), *[str(SURVEY_SIGMA_M)] * 3, screen.name]))
+            points.append(f"{name},{point},{u:.4f},{v:.4f},{PIXEL_SIGMA_PX}")
             done += 1
     (folder / "survey.csv").write_text("\n".join(survey) + "\n")
     (folder / "points.csv").write_text("\n".join(points) + "\n")

@@ -1,4 +1,4 @@
-"""`calibrate beams`: tables and runs in, rig.yaml, tables and report out, mistakes in plain words."""
+"""`calibrate beams` from tables or runs to rig.yaml, tables and report, and its error messages."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from geometry.pose import Pose
 from geometry.rig import Rig
 from geometry.uncertainty.rig_parameters import RigCovariance, rig_names
 from lab.calibrate.beams.beams import calibrate_beams
-from lab.calibrate.beams.recordings import read_recordings, spread
+from lab.calibrate.beams.recordings import limit_frames, read_recordings
 from lab.calibrate.beams.stationary_frames import SpotRows, average, mean_of_frames, positions_at_rest
 from lab.errors import CalibrationError, InputError
 from lab.files.project.project import load_project
@@ -47,7 +47,7 @@ STAND = {
 
 
 def lab_covariance(rig: Rig) -> RigCovariance:
-    """Small errors of cameras and screens, so that what is written has them."""
+    """Small errors of cameras and screens, as a covariance to be propagated."""
     names = [n for n in rig_names(rig) if n.startswith(("cameras.", "screens.")) and n.endswith(("_m", "_rad", "fx"))]
     sigma = [0.5 if n.endswith("fx") else 1e-4 if n.endswith("_m") else 3e-5 for n in names]
     return RigCovariance(tuple(names), np.diag(np.square(sigma)))
@@ -70,7 +70,7 @@ def write_spots(path: Path, rig: Rig, spots: SpotPixels) -> None:
 
 
 def write_project(folder: Path, rig: Rig, nominal: Rig, stand: dict | None, recordings: list[dict]) -> Path:
-    """A project whose cameras and screens are calibrated already (rig.yaml) and whose target is the drawing."""
+    """A project with calibrated cameras and screens (rig.yaml) and the nominal beams as its target."""
     save_rig(
         RigFile(rig, {k: v for k, v in blocks_of(lab_covariance(rig)).items() if k != "target"}), folder / "rig.yaml"
     )
@@ -95,7 +95,7 @@ def write_project(folder: Path, rig: Rig, nominal: Rig, stand: dict | None, reco
 
 @pytest.fixture(scope="module")
 def first_campaign(tmp_path_factory) -> Path:
-    """A project with 40 recorded positions of a rig whose beams are not as drawn."""
+    """A project with 40 recorded positions of a rig whose beams differ from the nominal ones."""
     folder = tmp_path_factory.mktemp("campaign")
     rng = np.random.default_rng(1)
     rig = RIGS["unequal-fan"]()
@@ -112,7 +112,7 @@ def first_campaign(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def campaign(first_campaign, tmp_path) -> tuple[Rig, Path]:
-    """The rig as mounted, and a project of it to change, in tmp_path."""
+    """The true rig, and a copy of its project in tmp_path."""
     shutil.copytree(first_campaign, tmp_path, dirs_exist_ok=True)
     return RIGS["unequal-fan"](), tmp_path / "calibration.yaml"
 
@@ -122,20 +122,20 @@ def table(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def test_recorded_positions_become_a_rig_with_the_joint_covariance_of_its_beams(campaign, tmp_path):
+def test_recorded_positions_give_a_rig_with_the_joint_covariance_of_its_beams(campaign, tmp_path):
     rig, project = campaign
     outcome = calibrate_beams(project, tmp_path / "out")
     assert outcome.level == Level.PASS
     assert outcome.exit_status == 0
     assert outcome.line().startswith("beams in march: PASS: 3 beams from 40 positions, directions to ")
     file = load_rig_file(tmp_path / "out" / "rig.yaml")
-    assert np.abs(errors(rig, file.rig)[:, :2]).max() < 40 * ARCSEC  # 5 sigmas of the stand's place and the spots
+    assert np.abs(errors(rig, file.rig)[:, :2]).max() < 40 * ARCSEC  # 5 sigma of the stand's pose and the spots
     joint = joint_covariance(file.rig, file.covariances, "rig.yaml")
     kinds = {n.split(".")[0] for n in joint.names}
     assert kinds == {"beams", "cameras", "screens"}
     beams = np.array([n.startswith("beams.") for n in joint.names])
     assert np.linalg.matrix_rank(joint.matrix[np.ix_(beams, beams)], tol=1e-14, hermitian=True) == 12
-    assert np.abs(joint.matrix[np.ix_(beams, ~beams)]).max() > 0  # what beams owe to cameras and screens is kept
+    assert np.abs(joint.matrix[np.ix_(beams, ~beams)]).max() > 0  # correlations with cameras and screens are kept
     for name, beam in file.rig.beams.items():
         along = np.array([n.startswith(f"beams.{name}.direction") for n in joint.names])
         assert np.abs(joint.matrix[along][:, along] @ beam.direction).max() < 1e-12
@@ -143,7 +143,7 @@ def test_recorded_positions_become_a_rig_with_the_joint_covariance_of_its_beams(
     assert (state.verdict, (state.valid_until - state.date).days) == ("PASS", 90)
 
 
-def test_the_tables_say_what_was_found(campaign, tmp_path):
+def test_the_tables_hold_the_calibrated_beams_angles_and_residuals(campaign, tmp_path):
     _, project = campaign
     outcome = calibrate_beams(project, tmp_path / "out")
     beams = table(tmp_path / "out" / "beams.csv")
@@ -157,27 +157,27 @@ def test_the_tables_say_what_was_found(campaign, tmp_path):
     residuals = table(tmp_path / "out" / "residuals.csv")
     assert len(residuals) == len(table(tmp_path / "spots.csv"))
     rms = np.sqrt(np.mean([float(r["residual_mm"]) ** 2 for r in residuals]) / 2)
-    assert 0.15 < rms < 0.3  # mm: the noise that was put in, larger where the camera looks askew
+    assert 0.15 < rms < 0.3  # mm: the simulated noise, larger where the camera sees the screen at an angle
     page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
     for words in ("beams in march", "Angles between beams", "The stand", "Positions", "Residuals"):
         assert words in page
 
 
-def test_without_poses_only_the_shape_is_found_and_that_is_said(campaign, tmp_path):
+def test_without_poses_only_the_angles_are_found_and_the_result_says_so(campaign, tmp_path):
     _, project = campaign
     text = project.read_text()
     project.write_text(re.sub(r", poses: poses.csv|\n\s+poses: poses.csv", "", text))
     outcome = calibrate_beams(project, tmp_path / "out")
     assert outcome.level == Level.WARN
-    assert "3 beams from 40 positions of which nothing is known, angles between beams to" in outcome.line()
+    assert "3 beams from 40 positions at unknown poses, angles between beams to" in outcome.line()
     words = " ".join(f.what for f in outcome.findings)
     assert "6 parameters remain undetermined, the position (3) and the attitude (3) of the body frame" in words
     angles = table(tmp_path / "out" / "angles.csv")
     assert float(angles[0]["angle_deg"]) == pytest.approx(18.0, abs=0.01)
-    assert "laid so that the beams found are" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert "closest to the nominal ones" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
 
 
-def test_a_stand_that_only_yaws_fails_with_the_cure_and_writes_no_rig(tmp_path):
+def test_a_stand_that_only_yaws_fails_with_the_remedy_and_writes_no_rig(tmp_path):
     rng = np.random.default_rng(3)
     rig = RIGS["unequal-fan"]()
     yaw = np.deg2rad(np.linspace(-25, 25, 20))
@@ -202,8 +202,8 @@ def test_recordings_are_joined_position_by_position_each_with_its_own_sigma(camp
     (tmp_path / "late.csv").write_text("\n".join([lines[0], *second]) + "\n")
     (tmp_path / "spots.csv").write_text("\n".join(s for s in lines if s not in second) + "\n")
     poses = (tmp_path / "poses.csv").read_text().splitlines()
-    told = [f"{poses[0]},sigma_x_m,sigma_rot_z_deg", *(f"{p},0.001,0.5" for p in poses[1:])]
-    (tmp_path / "worse.csv").write_text("\n".join(told) + "\n")
+    with_sigmas = [f"{poses[0]},sigma_x_m,sigma_rot_z_deg", *(f"{p},0.001,0.5" for p in poses[1:])]
+    (tmp_path / "worse.csv").write_text("\n".join(with_sigmas) + "\n")
     head = project.read_text().split("recordings:")[0]
     both = "[{spots: spots.csv, poses: poses.csv}, {spots: late.csv, poses: worse.csv}]"
     stand = project.read_text()[project.read_text().index("stand:") :] if "stand:" not in head else ""
@@ -216,11 +216,11 @@ def test_recordings_are_joined_position_by_position_each_with_its_own_sigma(camp
     np.testing.assert_allclose(found.pose_sigmas[30:], np.tile([1e-3, *general[1:5], np.radians(0.5)], (10, 1)))
 
 
-def test_a_wrong_stand_record_is_named(campaign, tmp_path):
+def test_a_wrong_recorded_pose_is_reported_by_its_position(campaign, tmp_path):
     rig, project = campaign
     lines = (tmp_path / "poses.csv").read_text().splitlines()
     fields = lines[8].split(",")
-    fields[3] = repr(float(fields[3]) + 0.02)  # position 7, 20 mm beside where it was
+    fields[3] = repr(float(fields[3]) + 0.02)  # position 7, off by 20 mm
     lines[8] = ",".join(fields)
     (tmp_path / "poses.csv").write_text("\n".join(lines) + "\n")
     outcome = calibrate_beams(project, tmp_path / "out")
@@ -229,7 +229,7 @@ def test_a_wrong_stand_record_is_named(campaign, tmp_path):
     assert np.abs(errors(rig, file.rig)[:, :2]).max() < 40 * ARCSEC
 
 
-def test_beams_that_are_swapped_against_the_drawing_are_told(campaign, tmp_path):
+def test_beams_that_are_swapped_against_the_design_are_reported(campaign, tmp_path):
     _, project = campaign
     text = (tmp_path / "spots.csv").read_text()
     swapped = text.replace(",left,1,", ",left,@,").replace(",left,2,", ",left,1,").replace(",left,@,", ",left,2,")
@@ -248,7 +248,7 @@ def test_beams_that_are_swapped_against_the_drawing_are_told(campaign, tmp_path)
             lambda t: t.replace("0,left,1,", "0,lfet,1,", 1),
             "line 2: camera: expected a calibrated camera, got",
         ),
-        (lambda t: t.replace("0,left,1,", "0,left,4,", 1), "observes screen 'left', spot '4' falls on 'right'"),
+        (lambda t: t.replace("0,left,1,", "0,left,4,", 1), "observes screen 'left', but spot '4' is on 'right'"),
         (
             lambda t: t.replace("0,left,1,", "77,left,1,", 1),
             "expected a pose for each of 41 positions of spots.csv",
@@ -264,7 +264,7 @@ def test_beams_that_are_swapped_against_the_drawing_are_told(campaign, tmp_path)
         (lambda t: "", "got an empty file"),
     ],
 )
-def test_a_mistake_in_the_spots_is_told_by_line(campaign, tmp_path, change, words):
+def test_a_mistake_in_the_spots_is_reported_with_its_line(campaign, tmp_path, change, words):
     _, project = campaign
     path = tmp_path / "spots.csv"
     path.write_text(change(path.read_text()))
@@ -280,10 +280,11 @@ def test_without_calibrated_cameras_the_next_command_is_named(campaign, tmp_path
         calibrate_beams(project, tmp_path / "out")
 
 
-def test_spots_that_fit_nothing_are_no_calibration_and_touch_no_result(campaign, tmp_path):
+def test_spots_without_a_common_solution_raise_an_error_and_leave_earlier_results_unchanged(campaign, tmp_path):
     _, project = campaign
     out = tmp_path / "out"
-    calibrate_beams(project, out)
+    out.mkdir()
+    (out / "beams.csv").write_text("an earlier result")
     before = {p.name: p.read_bytes() for p in out.iterdir()}
     lines = (tmp_path / "spots.csv").read_text().splitlines()
     order = np.random.default_rng(0).permutation(len(lines) - 1)
@@ -294,7 +295,7 @@ def test_spots_that_fit_nothing_are_no_calibration_and_touch_no_result(campaign,
     assert {p.name: p.read_bytes() for p in out.iterdir()} == before
 
 
-def test_missing_recordings_are_asked_for(campaign, tmp_path):
+def test_a_project_without_recordings_is_refused(campaign, tmp_path):
     _, project = campaign
     project.write_text(project.read_text().split("recordings:")[0])
     with pytest.raises(InputError, match="recordings: expected spots at positions of the stand, got none; add"):
@@ -307,7 +308,7 @@ def detections_run(folder: Path, rig: Rig, nominal: Rig, poses: Pose, rng: np.ra
     pixels, _ = model.project(WORLD_FROM_STAND @ poses)
     lines = ["frame,camera,u_px,v_px,sigma_u_px,sigma_v_px,flux,peak,major_px,minor_px,angle_deg,cov_uv_px2"]
     stands = ["frame,t_s,x_m,y_m,z_m,qw,qx,qy,qz"]
-    speckle = rng.normal(0, 0.05, pixels.shape)  # px: stands still while the vehicle does
+    speckle = rng.normal(0, 0.05, pixels.shape)  # px: constant while the vehicle is at rest
     for k in range(len(pixels) * repeats):
         p = k // repeats
         numbers = [*poses.translation[p], *poses.quaternion_wxyz[p]]
@@ -327,7 +328,7 @@ def detections_run(folder: Path, rig: Rig, nominal: Rig, poses: Pose, rng: np.ra
     save_run({"rig": "rig.yaml", "frame_rate_hz": 50.0, "cameras": cameras}, folder)
 
 
-def test_an_unlabelled_run_is_labelled_by_the_drawing_and_its_frames_at_rest_are_averaged(tmp_path):
+def test_an_unlabelled_run_is_labelled_by_the_nominal_beams_and_its_frames_at_rest_are_averaged(tmp_path):
     rng = np.random.default_rng(5)
     rig = RIGS["unequal-fan"]()
     nominal = drawn(rig, rng, 0.003, 0.003)
@@ -338,17 +339,17 @@ def test_an_unlabelled_run_is_labelled_by_the_drawing_and_its_frames_at_rest_are
     c = outcome.calibration
     assert len(c.world_from_body.translation) == 20
     assert c.fit.kept.mean() > 0.97
-    assert c.fit.scale < 1.3  # the speckle that frames share was in the sigmas
+    assert c.fit.scale < 1.3  # the sigmas include the speckle, which is common to the frames
     assert np.abs(errors(rig, c.rig)[:, :2]).max() < 60 * ARCSEC
 
 
-def test_a_run_of_which_no_pose_is_known_is_labelled_by_the_tracker_and_gives_the_shape(tmp_path):
+def test_a_run_without_known_poses_is_labelled_by_the_tracker_and_gives_the_angles(tmp_path):
     rng = np.random.default_rng(8)
     rig = RIGS["unequal-fan"]()
     t = np.arange(60) / 50.0
     turns = np.deg2rad(np.stack([15 * np.sin(5 * t), 9 * np.sin(7 * t), 12 * np.sin(3 * t)], axis=1))
     shifts = 0.1 * np.stack([np.sin(4 * t), np.sin(2 * t), np.cos(5 * t)], axis=1)
-    nominal = drawn(rig, rng, 2e-4, 2e-4)  # the tracker needs a drawing that fits the spots
+    nominal = drawn(rig, rng, 2e-4, 2e-4)  # the tracker needs nominal beams that fit the spots
     detections_run(tmp_path / "recorded", rig, nominal, Pose.from_ypr(turns, shifts), rng, 1)
     at_start = {"position_m": [0, 0, 0], "yaw_pitch_roll_deg": [0, 0, 0], "within_m": 0.3, "within_deg": 10.0}
     cameras = {c: {"detections": "detections.csv"} for c in rig.cameras}
@@ -356,37 +357,37 @@ def test_a_run_of_which_no_pose_is_known_is_labelled_by_the_tracker_and_gives_th
     project = write_project(tmp_path, rig, nominal, None, [{"run": "recorded"}])
     outcome = calibrate_beams(project, tmp_path / "out")
     c = outcome.calibration
-    assert len(c.world_from_body.translation) >= 59  # the tracker may be unsure of a frame of its first ones
+    assert len(c.world_from_body.translation) >= 59  # the tracker may be uncertain in one of its first frames
     off = np.array([a.angle for a in c.angles]) - np.deg2rad([18.0, 41.0, 23.0])
     assert np.all(np.abs(off) < 5 * np.array([a.sigma for a in c.angles]))
 
 
-def test_of_very_many_frames_without_a_pose_some_are_used_and_that_is_noted():
+def test_the_number_of_frames_without_a_pose_is_limited_with_a_note():
     frames = np.repeat(np.arange(500), 6)
     rows = SpotRows(frames, np.tile(np.arange(6), 500), np.zeros((3000, 2)), np.zeros((3000, 2, 2)))
     notes: list[str] = []
-    used = np.unique(spread(rows, notes).frame)
+    used = np.unique(limit_frames(rows, notes).frame)
     assert (len(used), used[0], used[-1]) == (200, 0, 499)
-    assert notes == ["of 500 frames without a pose 200 were used, evenly spread"]
+    assert notes == ["200 of 500 frames without a pose were used, evenly spaced"]
 
 
-def test_frames_with_the_same_record_are_one_position():
+def test_frames_with_the_same_recorded_pose_are_one_position():
     poses = Pose.from_ypr(np.deg2rad([[0, 0, 0], [0, 0, 0], [5, 0, 0], [5, 0, 0], [0, 0, 0]]), np.zeros((5, 3)))
     assert positions_at_rest(poses, np.zeros((5, 6))).tolist() == [0, 0, 1, 1, 2]
 
 
-def test_what_frames_share_does_not_average_out():
+def test_an_error_common_to_all_frames_does_not_average_out():
     rng = np.random.default_rng(6)
-    claimed = np.broadcast_to(np.eye(2) * 0.05**2, (400, 2, 2))
-    still = rng.normal(0, 0.05, 2) + rng.normal(0, 1e-4, (400, 2))
-    free = rng.normal(0, 0.05, (400, 2))
-    assert np.sqrt(np.trace(mean_of_frames(still, claimed)[1]) / 2) == pytest.approx(0.05, rel=0.01)
-    assert np.sqrt(np.trace(mean_of_frames(free, claimed)[1]) / 2) < 0.02
+    stated = np.broadcast_to(np.eye(2) * 0.05**2, (400, 2, 2))
+    constant = rng.normal(0, 0.05, 2) + rng.normal(0, 1e-4, (400, 2))
+    white = rng.normal(0, 0.05, (400, 2))
+    assert np.sqrt(np.trace(mean_of_frames(constant, stated)[1]) / 2) == pytest.approx(0.05, rel=0.01)
+    assert np.sqrt(np.trace(mean_of_frames(white, stated)[1]) / 2) < 0.02
     slow = np.repeat(rng.normal(0, 0.05, (20, 2)), 20, axis=0) + rng.normal(0, 0.01, (400, 2))
-    assert np.sqrt(np.trace(mean_of_frames(slow, claimed)[1]) / 2) > 0.008  # 20 free values, not 400
+    assert np.sqrt(np.trace(mean_of_frames(slow, stated)[1]) / 2) > 0.008  # 20 independent values, not 400
 
 
-def test_one_wild_frame_does_not_move_the_mean():
+def test_an_outlier_does_not_move_the_mean():
     rng = np.random.default_rng(7)
     pixels = rng.normal(0, 0.05, (30, 2))
     pixels[11] += 200.0
@@ -394,7 +395,7 @@ def test_one_wild_frame_does_not_move_the_mean():
     assert np.linalg.norm(mean) < 0.05
 
 
-def test_averages_keep_positions_and_views_apart():
+def test_positions_and_views_are_averaged_separately():
     rows = SpotRows(
         np.array([0, 0, 1, 1, 2]),
         np.array([0, 3, 0, 3, 0]),
@@ -407,7 +408,7 @@ def test_averages_keep_positions_and_views_apart():
     np.testing.assert_allclose(spots.pixels[:, 0], [2, 6, 9])
 
 
-def test_screens_alone_with_their_warnings_and_last_day_go_into_the_rig(campaign, tmp_path):
+def test_warnings_and_expiry_of_screens_yaml_go_into_the_rig(campaign, tmp_path):
     rig, project = campaign
     lab = replace(rig, beams={}, spots={})
     state = CalibrationState(date(2026, 3, 1), "WARN", date(2026, 4, 1), ("the left screen is bent by 2 mm",))
@@ -415,20 +416,20 @@ def test_screens_alone_with_their_warnings_and_last_day_go_into_the_rig(campaign
     outcome = calibrate_beams(project, tmp_path / "out", tmp_path / "screens.yaml", date(2026, 3, 14))
     assert outcome.level == Level.WARN
     written = load_rig_file(tmp_path / "out" / "rig.yaml").calibration
-    assert (written.verdict, written.valid_until) == ("WARN", date(2026, 4, 1))  # sooner than the beams' own 90 days
+    assert (written.verdict, written.valid_until) == ("WARN", date(2026, 4, 1))  # before the 90 days of the beams
     assert "the left screen is bent by 2 mm" in written.reasons[0]
 
 
-def test_a_lab_and_a_project_without_beams_are_asked_for_them(campaign, tmp_path):
+def test_a_lab_and_a_project_without_beams_are_refused(campaign, tmp_path):
     rig, project = campaign
     save_screens(ScreensFile("the lab", replace(rig, beams={}, spots={}), None, None), tmp_path / "screens.yaml")
     text = project.read_text()
     project.write_text(text[: text.index("target:")] + text[text.index("recordings:") :])
-    with pytest.raises(InputError, match="target: expected beams and spots as drawn, got none; add them"):
+    with pytest.raises(InputError, match="target: expected the nominal beams and spots, got none; add them"):
         calibrate_beams(project, tmp_path / "out", tmp_path / "screens.yaml")
 
 
-def test_cameras_screens_and_target_of_a_rig_need_not_be_stated_again(campaign, tmp_path):
+def test_the_project_need_not_repeat_cameras_screens_and_target_of_the_rig(campaign, tmp_path):
     _, project = campaign
     content = yaml.safe_load(project.read_text())
     whole = calibrate_beams(project, tmp_path / "whole")
@@ -436,20 +437,20 @@ def test_cameras_screens_and_target_of_a_rig_need_not_be_stated_again(campaign, 
     lean.mkdir()
     for name in ("spots.csv", "poses.csv"):
         shutil.copy(tmp_path / name, lean / name)
-    drawing = {k: content[k] for k in ("schema", "name", "valid_days", "target", "recordings", "stand")}
-    write_mapping(drawing, lean / "calibration.yaml")
+    without_lab = {k: content[k] for k in ("schema", "name", "valid_days", "target", "recordings", "stand")}
+    write_mapping(without_lab, lean / "calibration.yaml")
     found = calibrate_beams(lean / "calibration.yaml", tmp_path / "out", tmp_path / "rig.yaml")
     np.testing.assert_array_equal(found.calibration.lines.directions, whole.calibration.lines.directions)
-    # With the target in the rig not even that is needed.
+    # With the target in the rig, the project need not state it either.
     both = replace(load_rig_file(tmp_path / "rig.yaml"))
     target = load_project(project)
     save_rig(replace(both, rig=replace(both.rig, beams=target.beams, spots=target.spots)), tmp_path / "known.yaml")
-    write_mapping({k: v for k, v in drawing.items() if k != "target"}, lean / "calibration.yaml")
+    write_mapping({k: v for k, v in without_lab.items() if k != "target"}, lean / "calibration.yaml")
     found = calibrate_beams(lean / "calibration.yaml", tmp_path / "again", tmp_path / "known.yaml")
     np.testing.assert_allclose(found.calibration.lines.directions, whole.calibration.lines.directions, atol=1e-9)
 
 
-def test_a_spot_on_a_screen_that_the_rig_does_not_have_is_named(campaign, tmp_path):
+def test_a_spot_on_an_unknown_screen_is_reported_by_name(campaign, tmp_path):
     _, project = campaign
     content = yaml.safe_load(project.read_text())
     del content["cameras"], content["screens"]
@@ -460,7 +461,7 @@ def test_a_spot_on_a_screen_that_the_rig_does_not_have_is_named(campaign, tmp_pa
         calibrate_beams(project, tmp_path / "out")
 
 
-def test_screens_alone_still_ask_for_cameras_and_say_who_does_not(campaign, tmp_path):
+def test_a_project_without_cameras_names_the_command_that_needs_none(campaign, tmp_path):
     _, project = campaign
     content = yaml.safe_load(project.read_text())
     del content["cameras"]

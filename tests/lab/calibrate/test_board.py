@@ -1,4 +1,4 @@
-"""Printed boards are to scale, described by a file that says the same, and complete or absent."""
+"""Printed boards are true to scale, agree with their description, and are written completely or not at all."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from lab.files.rig.board_file import board_of, load_board
 TEXTS = ["chessboard:9x6:25mm", "acircles:4x11:20mm", "charuco:5x7:36mm:27mm:DICT_4X4_50:inverted"]
 
 
-@pytest.mark.parametrize("text", TEXTS)
-def test_a_printed_picture_shows_the_board_at_its_size(tmp_path, text):
-    outcome = write_board(text, tmp_path / "b", dpi=300)
+@pytest.mark.parametrize(("text", "dpi"), list(zip(TEXTS, (300, 150, 300), strict=True)))
+def test_a_printed_picture_shows_the_board_at_its_size(tmp_path, text, dpi):
+    outcome = write_board(text, tmp_path / "b", dpi=dpi)
     data = (tmp_path / "b" / "board.png").read_bytes()
     at = data.index(b"pHYs")
     per_metre, same, unit = struct.unpack(">IIB", data[at + 4 : at + 13])
@@ -44,17 +44,24 @@ def test_the_pdf_holds_the_same_shapes_in_millimetres(text):
     page = lay_out(parse(text))
     pdf = as_pdf(page)
     content = zlib.decompress(re.search(rb"stream\n(.*?)\nendstream", pdf, re.DOTALL)[1]).decode()
-    scale = float(content.split()[0])
-    assert scale == pytest.approx(72 / 25.4)
+    mm = 25.4 / 72
+    transforms = re.findall(r"(\S+) (\S+) (\S+) (\S+) (\S+) (\S+) cm", content)
+    assert len(set(transforms)) == 1
+    np.testing.assert_allclose(
+        np.array(transforms[0], dtype=float) * mm, [mm, 0, 0, -mm, 0, page.size_mm[1]], atol=1e-4
+    )
     found = np.array([[float(v) for v in row] for row in re.findall(r"(\S+) (\S+) (\S+) (\S+) re", content)])
     wanted = [page.rectangles_mm(layer) for layer in page.drawing.layers] + [page.bar_parts_mm()]
-    np.testing.assert_allclose(found, np.concatenate(wanted), atol=1e-5)
-    for number, place in enumerate(re.findall(rb"(\d{10}) 00000 n", pdf), 1):
-        assert pdf[int(place) :].startswith(b"%d 0 obj" % number)
+    np.testing.assert_allclose(found * mm, np.concatenate(wanted), atol=1e-4)
+    circles = np.concatenate([page.circles_mm(layer) for layer in page.drawing.layers])
+    curves = re.findall(r"(\S+) (\S+) m \S+ \S+ \S+ \S+ (\S+) (\S+) c", content)  # the first quarter of each circle
+    start, end = np.split(np.array(curves, dtype=float).reshape(-1, 4) * mm, 2, axis=1)
+    np.testing.assert_allclose(np.hypot(*(start - end).T), np.sqrt(2) * circles[:, 2], atol=2e-4)
+    assert b"/PrintScaling /None" in pdf
 
 
-def test_a_board_too_large_for_the_page_is_refused_with_the_cure(tmp_path):
-    with pytest.raises(InputError, match=r"300 x 210 mm do not fit on A4; take A3 .*, or make 25\.1 mm of the 30 mm"):
+def test_a_board_too_large_for_the_page_is_refused_with_the_remedy(tmp_path):
+    with pytest.raises(InputError, match=r"300 x 210 mm do not fit on A4; use A3 .*, or reduce the 30 mm to 25\.1 mm"):
         write_board("chessboard:9x6:30mm", tmp_path / "b")
     assert list(tmp_path.iterdir()) == []
     assert write_board("chessboard:9x6:30mm", tmp_path / "b", page="fit").page == "fit"
@@ -67,7 +74,7 @@ def test_a_folder_with_something_else_in_it_is_left_alone(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["thesis.tex"]
 
 
-def test_a_file_with_mistakes_is_answered_with_its_field(tmp_path):
+def test_a_file_with_mistakes_is_refused_with_its_field(tmp_path):
     path = tmp_path / "board.yaml"
     path.write_text("schema: beampose/board/1\nkind: chessboard\ncolumns: 9\nrows: 6\nspacing_m: 0.025\n")
     with pytest.raises(InputError, match=r"board\.yaml: expected square_m for a board of kind 'chessboard'"):
@@ -88,8 +95,8 @@ def test_a_folder_may_have_a_dot_in_its_name(tmp_path):
     assert (tmp_path / "boards-v1.2" / "board.svg").is_file()
 
 
-def test_a_marker_too_large_for_its_square_is_not_printed_and_the_largest_one_is_told(tmp_path):
-    with pytest.raises(InputError, match=r"only 0\.01 of a marker's dots .* make the markers 29\.1 mm or smaller"):
+def test_a_marker_too_large_for_its_square_is_not_printed_and_the_largest_size_is_reported(tmp_path):
+    with pytest.raises(InputError, match=r"only 0\.01 marker modules .* make the markers 29\.1 mm or less"):
         write_board("charuco:5x7:36mm:35.9mm:DICT_4X4_50", tmp_path / "b")
     assert list(tmp_path.iterdir()) == []
     write_board("charuco:5x7:36mm:29.1mm:DICT_4X4_50", tmp_path / "b", ["svg"])

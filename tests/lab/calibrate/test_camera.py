@@ -1,4 +1,4 @@
-"""`calibrate camera` from photographs to files: real sets with what is known of them, and pictures that cannot do."""
+"""`calibrate camera` from photographs to files: real sets with published values, and pictures that are refused."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from lab.calibrate.camera.camera import (
     CORNERS,
     FAILED,
     CameraOptions,
-    Outcome,
+    CameraOutcome,
     calibrate_camera,
 )
 from lab.errors import CalibrationError, InputError
@@ -30,7 +30,7 @@ needs_stereo = pytest.mark.skipif(not STEREO.is_dir(), reason="the chessboard pa
 
 
 @pytest.fixture(scope="module")
-def left(tmp_path_factory: pytest.TempPathFactory) -> Outcome:
+def left(tmp_path_factory: pytest.TempPathFactory) -> CameraOutcome:
     """The left camera of the stereo pairs, quickly: one lens model, a flat board."""
     if not STEREO.is_dir():
         pytest.skip("the chessboard pairs of OpenCV's samples are not here")
@@ -42,8 +42,7 @@ def left(tmp_path_factory: pytest.TempPathFactory) -> Outcome:
 def test_real_photographs_give_the_published_focal_length_within_two_sigmas(left):
     """Published with the photographs: fx = fy = 534.80 (both cameras) and 535.92 (13 photos, mean error 0.39 px).
 
-    The second has an error of its own, which was not published: half a pixel is what 13 photographs at that error
-    give by our covariance.
+    The error of the second value was not published: our covariance for 13 photographs at that error gives 0.5 px.
     """
     fx, sigma = left.result.fit.lens[0], left.result.sigmas[0]
     assert sigma < 2
@@ -52,7 +51,7 @@ def test_real_photographs_give_the_published_focal_length_within_two_sigmas(left
     assert left.result.rms_2d_px < 0.22
 
 
-def test_what_is_written_reads_back_and_says_how_good_it_is(left):
+def test_camera_yaml_reads_back_and_states_its_uncertainty(left):
     assert sorted(p.name for p in left.out.iterdir()) == [CAMERA, CORNERS, "report.html"]
     file = load_camera(left.out / CAMERA)
     assert file.name == "left"
@@ -72,7 +71,7 @@ def test_what_is_written_reads_back_and_says_how_good_it_is(left):
     assert file.calibration.figures["uncertainty_worst_mm"] > file.calibration.figures["uncertainty_median_mm"] > 0
 
 
-def test_the_table_of_corners_has_a_row_for_each_and_its_residuals_make_the_rms(left):
+def test_the_table_of_corners_has_a_row_per_corner_and_its_residuals_give_the_rms(left):
     with (left.out / CORNERS).open() as file:
         rows = list(csv.DictReader(file))
     assert tuple(rows[0]) == CORNER_COLUMNS
@@ -88,7 +87,7 @@ def test_the_line_and_the_report_agree_on_the_verdict(left):
     assert left.line().startswith("left: WARN: fx 53")
     assert "mm at 2 m" in left.line()
     html = (left.out / "report.html").read_text(encoding="utf-8")
-    for words in ("WARN", "Which lens model", "Two halves", "left01.jpg"):
+    for words in ("WARN", "Selection of the lens model", "two halves", "left01.jpg"):
         assert words in html
     assert "http://" not in html.replace("http://www.w3.org", "")
 
@@ -102,7 +101,7 @@ def test_the_same_photographs_give_the_same_file_again(left, tmp_path):
 @pytest.mark.slow
 @needs_stereo
 @pytest.mark.parametrize("side", ["left", "right"])
-def test_the_whole_calibration_of_the_stereo_pairs_stays_with_the_published_values(side, tmp_path):
+def test_the_full_calibration_of_the_stereo_pairs_agrees_with_the_published_values(side, tmp_path):
     outcome = calibrate_camera([STEREO / f"{side}*.jpg"], BOARD, tmp_path / side, CameraOptions(name=side), DAY)
     assert outcome.level is Level.WARN
     assert abs(outcome.result.fit.lens[0] - 534.80) < 2 * outcome.result.sigmas[0]
@@ -119,7 +118,7 @@ SETS = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", list(SETS))
-def test_every_real_set_earns_the_verdict_that_it_deserves(name, tmp_path):
+def test_each_real_set_gets_the_expected_verdict(name, tmp_path):
     folders, board, least, words = SETS[name]
     if not (DATA / name).is_dir():
         pytest.skip(f"{name} is not here")
@@ -127,13 +126,13 @@ def test_every_real_set_earns_the_verdict_that_it_deserves(name, tmp_path):
     assert outcome.level >= least
     assert any(words in f.what and f.level >= Level.WARN for f in outcome.result.findings)
     assert outcome.exit_status == (3 if outcome.level is Level.FAIL else 0)
-    # Numbers that must not be used lie under a name that nothing reads.
+    # A failed calibration has a file name that no program reads.
     assert (outcome.out / FAILED).is_file() == (outcome.level is Level.FAIL)
     assert (outcome.out / CAMERA).is_file() == (outcome.level is not Level.FAIL)
 
 
 @needs_stereo
-def test_a_wrong_board_size_is_told_and_nothing_is_written(tmp_path):
+def test_a_wrong_board_size_is_reported_and_nothing_is_written(tmp_path):
     out = tmp_path / "out"
     with pytest.raises(InputError, match="chessboard:8x5:25mm: found in none of 1 pictures"):
         calibrate_camera([STEREO / "left01.jpg"], "chessboard:8x5:25mm", out)
@@ -149,12 +148,12 @@ def test_three_photographs_are_too_few_and_an_earlier_calibration_stays(tmp_path
     photos = [STEREO / f"left0{k}.jpg" for k in (1, 2, 3)]
     with pytest.raises(InputError, match="found in 3 of 3 pictures, 4 or more are needed") as error:
         calibrate_camera(photos, BOARD, out)
-    assert error.value.exit_status == 2  # too little given, as where none is; 3 is for a calibration that failed
+    assert error.value.exit_status == 2  # an input error; 3 is for a calibration that failed
     assert (out / CAMERA).read_text() == "good\n"
 
 
 @needs_stereo
-def test_one_photograph_under_other_names_is_still_one(tmp_path):
+def test_copies_of_one_photograph_count_once(tmp_path):
     for k in range(5):
         (tmp_path / f"{k}.jpg").write_bytes((STEREO / "left01.jpg").read_bytes())
     with pytest.raises(InputError, match=r"the same picture as 0\.jpg: it would count twice"):
@@ -162,25 +161,25 @@ def test_one_photograph_under_other_names_is_still_one(tmp_path):
 
 
 @needs_stereo
-def test_photographs_of_two_cameras_in_one_set_are_told_by_their_names(tmp_path):
+def test_photographs_of_two_cameras_in_one_set_are_detected_by_their_names(tmp_path):
     outcome = calibrate_camera([STEREO / "*.jpg"], BOARD, tmp_path / "out", CameraOptions(lens="4", warp="off"))
-    (told,) = [f for f in outcome.result.findings if "'left' and 'right'" in f.what]
-    assert told.level > Level.PASS
-    assert "two cameras" in told.why
+    (finding,) = [f for f in outcome.result.findings if "'left' and 'right'" in f.what]
+    assert finding.level > Level.PASS
+    assert "two cameras" in finding.why
     assert any("two cameras" in f.remedy for f in outcome.result.findings if "Two halves" in f.what)
 
 
 @needs_stereo
-def test_boards_that_lie_parallel_are_told(tmp_path):
-    """One photograph, shifted: the board is parallel to itself."""
+def test_parallel_boards_are_refused(tmp_path):
+    """Shifted copies of one photograph: the board is parallel to itself."""
     picture = cv2.imread(str(STEREO / "left03.jpg"), cv2.IMREAD_GRAYSCALE)
     for k in range(5):
         cv2.imwrite(str(tmp_path / f"{k}.png"), np.roll(picture, (4 * k, 6 * k), axis=(0, 1)))
     with pytest.raises(CalibrationError, match="same orientation in all 5 photographs"):
-        calibrate_camera([tmp_path], BOARD, tmp_path / "out")
+        calibrate_camera([tmp_path], BOARD, tmp_path / "out", CameraOptions(lens="4", warp="off"))
 
 
-def test_empty_and_damaged_files_are_told(tmp_path):
+def test_empty_and_damaged_files_are_refused(tmp_path):
     (tmp_path / "a.png").write_bytes(b"")
     (tmp_path / "b.png").write_bytes(b"no picture")
     with pytest.raises(InputError, match="none of 2 pictures can be read"):
@@ -188,7 +187,7 @@ def test_empty_and_damaged_files_are_told(tmp_path):
 
 
 @needs_stereo
-def test_mixed_sizes_are_told(tmp_path):
+def test_mixed_sizes_are_refused(tmp_path):
     picture = cv2.imread(str(STEREO / "left01.jpg"))
     cv2.imwrite(str(tmp_path / "a.png"), picture)
     cv2.imwrite(str(tmp_path / "b.png"), picture[:, :600])
@@ -206,6 +205,6 @@ def test_mixed_sizes_are_told(tmp_path):
         ({"valid_days": 0}, "valid days: expected 1 or more, got 0"),
     ],
 )
-def test_options_that_mean_nothing_are_told(option, words):
+def test_invalid_options_are_refused(option, words):
     with pytest.raises(InputError, match=words):
         CameraOptions(**option)

@@ -1,4 +1,4 @@
-"""The daily check tells a drift from noise and says what it was; bad inputs each get their own words."""
+"""The drift check distinguishes drift from noise and names its cause; bad input is refused with its reason."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from geometry.pose import Pose
 from geometry.rig import Rig
 from geometry.rotations import exp
 from geometry.uncertainty.rig_parameters import RigCovariance, moved, rig_names
-from lab.calibrate.drift_check.drift_check import COLUMNS, DailyLimits, check_drift
-from lab.calibrate.drift_check.drift_expected import compare_points
+from lab.calibrate.drift_check.drift_check import COLUMNS, DriftLimits, check_drift
+from lab.calibrate.drift_check.drift_comparison import compare_points
 from lab.calibrate.drift_check.drift_history import read_history
-from lab.calibrate.drift_check.drift_inputs import read_points
+from lab.calibrate.drift_check.drift_inputs import DriftInputs, read_points
 from lab.errors import InputError
 from lab.files.rig.calibration_state import CalibrationState
 from lab.files.rig.rig_covariance import joint_covariance
@@ -33,17 +33,17 @@ AT_REST = Pose(exp(np.array([0.02, -0.03, 0.05])), np.array([0.05, 0.02, -0.03])
 
 
 def check(folder: Path, today, seed: int = 0, *, state=scenes.STATE, day=scenes.DAY, history=None, **points):
-    """The outcome of a check of the lab as it is today."""
+    """Result of a check with control points. today: the true rig."""
     rig = scenes.write_rig(folder, RIG, COVARIANCE, state)
     pixels, survey = scenes.write_points(folder, today, np.random.default_rng(seed), **points)
-    return check_drift(rig, folder / "out", pixels, today=day, survey=survey, history=history)
+    return check_drift(rig, folder / "out", DriftInputs(pixels, survey=survey), today=day, history=history)
 
 
 def of(outcome, camera: str):
     return next(c for c in outcome.cameras if c.camera == camera)
 
 
-# What is found ------------------------------------------------------------------------------------------------------
+# Control points -----------------------------------------------------------------------------------------------------
 
 
 def test_a_lab_that_has_not_changed_passes(tmp_path):
@@ -68,7 +68,7 @@ def test_a_camera_turned_by_a_twentieth_of_a_degree_must_not_be_used(tmp_path, o
     assert any("turned by" in f.what and "vertical axis" in f.what for f in outcome.findings)
 
 
-def test_a_touched_focus_ring_is_told_from_a_knock(tmp_path):
+def test_a_changed_focus_is_distinguished_from_a_rotation(tmp_path):
     outcome = check(tmp_path, moved(TRUE, ["cameras.left.fx", "cameras.left.fy"], np.array([4.0, 4.0])))
     assert of(outcome, "left").change.kind == ZOOMED
     assert outcome.exit_status == 3
@@ -94,7 +94,7 @@ def test_one_wrong_point_is_a_warning_and_the_camera_is_judged_without_it(tmp_pa
 
 @pytest.mark.parametrize(("p_false_alarm", "checks"), [(0.05, 200)])
 def test_false_alarms_come_at_the_stated_rate_over_many_labs(tmp_path, p_false_alarm, checks):
-    """Each time another calibration error, survey and noise: the check must take all three into account."""
+    """Each check has another calibration error, survey and noise: the test must take all three into account."""
     covariance = joint_covariance(RIG, {"target": COVARIANCE}, "rig.yaml")
     rng = np.random.default_rng(2)
     alarms = 0
@@ -107,20 +107,19 @@ def test_false_alarms_come_at_the_stated_rate_over_many_labs(tmp_path, p_false_a
 
 
 def test_the_calibrations_own_uncertainty_is_no_drift(tmp_path):
-    """Without the covariance the same lab would be accused: that is what it is read for."""
+    """Without the covariance of the calibration, the same lab has a drift."""
     off = scenes.true_rig(RIG, replace(COVARIANCE, matrix=25 * COVARIANCE.matrix), np.random.default_rng(3))
     pixels, survey = scenes.write_points(tmp_path, off, np.random.default_rng(0))
     wide = replace(COVARIANCE, matrix=25 * COVARIANCE.matrix)
-    known = check_drift(scenes.write_rig(tmp_path, RIG, wide), tmp_path / "a", pixels, today=scenes.DAY, survey=survey)
-    unknown = check_drift(
-        scenes.write_rig(tmp_path, RIG, None), tmp_path / "b", pixels, today=scenes.DAY, survey=survey
-    )
+    inputs = DriftInputs(pixels, survey=survey)
+    known = check_drift(scenes.write_rig(tmp_path, RIG, wide), tmp_path / "a", inputs, today=scenes.DAY)
+    unknown = check_drift(scenes.write_rig(tmp_path, RIG, None), tmp_path / "b", inputs, today=scenes.DAY)
     assert all(c.change is None for c in known.cameras)
     assert any(c.change is not None for c in unknown.cameras)
     assert any("no covariance" in f.what for f in unknown.findings)
 
 
-def test_a_poor_survey_is_no_drift_as_long_as_it_says_so(tmp_path):
+def test_a_poor_survey_is_no_drift_if_it_states_its_sigmas(tmp_path):
     rig = scenes.write_rig(tmp_path, RIG, COVARIANCE)
     pixels, survey = scenes.write_points(tmp_path, TRUE, np.random.default_rng(0))
     off = np.random.default_rng(1).normal(0, 3e-3, (99, 3))
@@ -129,18 +128,18 @@ def test_a_poor_survey_is_no_drift_as_long_as_it_says_so(tmp_path):
         rows = [lines[0]]
         for i, line in enumerate(lines[1:]):
             name, x, y, z, *_ = line.split(",")
-            place = np.array([float(x), float(y), float(z)]) + off[i]
-            rows.append(f"{name},{place[0]},{place[1]},{place[2]},{sigma},{sigma},{sigma}")
+            xyz = np.array([float(x), float(y), float(z)]) + off[i]
+            rows.append(f"{name},{xyz[0]},{xyz[1]},{xyz[2]},{sigma},{sigma},{sigma}")
         survey.write_text("\n".join(rows))
-        outcome = check_drift(rig, tmp_path / "out", pixels, today=scenes.DAY, survey=survey)
+        outcome = check_drift(rig, tmp_path / "out", DriftInputs(pixels, survey=survey), today=scenes.DAY)
         assert any("p = " in f.what or f.level == Level.FAIL for f in outcome.findings) == alarm
 
 
-def test_a_camera_without_points_is_said_to_be_unchecked(tmp_path):
+def test_a_camera_without_points_is_reported_as_not_checked(tmp_path):
     rig = scenes.write_rig(tmp_path, RIG, COVARIANCE)
     pixels, survey = scenes.write_points(tmp_path, TRUE, np.random.default_rng(0))
     pixels.write_text("\n".join(line for line in pixels.read_text().splitlines() if not line.startswith("right")))
-    outcome = check_drift(rig, tmp_path / "out", pixels, today=scenes.DAY, survey=survey)
+    outcome = check_drift(rig, tmp_path / "out", DriftInputs(pixels, survey=survey), today=scenes.DAY)
     assert outcome.level == Level.WARN
     words = "camera right not checked: nothing was measured in it"
     assert any(words in f.what for f in outcome.findings)
@@ -148,8 +147,8 @@ def test_a_camera_without_points_is_said_to_be_unchecked(tmp_path):
     knocked = scenes.turned(TRUE, "left", 0.05)
     pixels, survey = scenes.write_points(tmp_path, knocked, np.random.default_rng(0))
     pixels.write_text("\n".join(line for line in pixels.read_text().splitlines() if not line.startswith("right")))
-    outcome = check_drift(rig, tmp_path / "out", pixels, today=scenes.DAY, survey=survey)
-    assert outcome.level == Level.FAIL  # a graver finding does not hide that the other camera is unknown
+    outcome = check_drift(rig, tmp_path / "out", DriftInputs(pixels, survey=survey), today=scenes.DAY)
+    assert outcome.level == Level.FAIL  # the failure does not hide that the other camera was not checked
     assert f"; WARN: {words}" in outcome.line()
 
 
@@ -168,11 +167,13 @@ def test_a_camera_without_points_is_said_to_be_unchecked(tmp_path):
         (replace(scenes.STATE, valid_until=None), Level.PASS, "without an expiry date"),
         (replace(scenes.STATE, verdict="FAIL", reasons=("lens loose",)), Level.FAIL, "failed: lens loose"),
         (replace(scenes.STATE, date=datetime.date(2027, 1, 1)), Level.WARN, "after today"),
-        (None, Level.WARN, "does not say when"),
+        (None, Level.WARN, "does not state when"),
     ],
-    ids=["expired", "last day", "for ever", "failed", "from the future", "unknown"],
+    ids=["expired", "last day", "no expiry", "failed", "from the future", "unknown"],
 )
-def test_the_calibrations_own_dates_are_read(tmp_path, state: CalibrationState | None, level, words):
+def test_the_dates_and_the_verdict_of_the_calibration_are_checked(
+    tmp_path, state: CalibrationState | None, level, words
+):
     outcome = check(tmp_path, TRUE, state=state)
     assert outcome.level == level
     assert outcome.exit_status == (3 if level == Level.FAIL else 0)
@@ -186,7 +187,7 @@ def still(folder: Path, today, with_pose: bool = True, **kind):
     rig = scenes.write_rig(folder, RIG, COVARIANCE)
     run = scenes.write_still(folder / "run", today, AT_REST, np.random.default_rng(5), **kind)
     pose = run / "pose.csv" if with_pose else None
-    return check_drift(rig, folder / "out", run=run, today=scenes.DAY, pose=pose)
+    return check_drift(rig, folder / "out", DriftInputs(run=run, pose=pose), today=scenes.DAY)
 
 
 def test_a_vehicle_at_a_known_pose_finds_a_turned_camera(tmp_path):
@@ -200,11 +201,11 @@ def test_a_vehicle_at_rest_finds_a_laser_that_moved(tmp_path):
     names = ["beams.A.direction_y", "beams.A.direction_z"]
     for with_pose in (True, False):
         outcome = still(tmp_path, moved(TRUE, names, np.array([1e-3, 1e-3])), with_pose)
-        assert any("laser A points elsewhere" in f.what for f in outcome.findings)
+        assert any("laser A has moved" in f.what for f in outcome.findings)
         assert all(c.change is None for c in outcome.cameras)
 
 
-def test_nothing_is_found_where_nothing_changed_and_an_unknown_pose_is_a_weak_check(tmp_path):
+def test_an_unchanged_lab_passes_and_an_unknown_pose_makes_a_weak_check(tmp_path):
     assert still(tmp_path, TRUE).level == Level.PASS
     weak = still(tmp_path, TRUE, with_pose=False)
     assert weak.level == Level.WARN
@@ -212,24 +213,24 @@ def test_nothing_is_found_where_nothing_changed_and_an_unknown_pose_is_a_weak_ch
     assert any("this check is weak" in f.what and "--pose" in f.remedy for f in weak.findings)
 
 
-def test_a_stand_is_believed_only_as_far_as_its_sigma_goes(tmp_path):
-    """Half a millimetre beside its stated place: ten sigma of a good seat, half a sigma of a poor one."""
+def test_the_pose_of_the_stand_is_weighted_by_its_sigma(tmp_path):
+    """Half a millimetre from its stated position: ten sigma of a good seat, half a sigma of a poor one."""
     rig = scenes.write_rig(tmp_path, RIG, COVARIANCE)
     beside = Pose(AT_REST.rotation, AT_REST.translation + np.array([0, 5e-4, 0]))
     run = scenes.write_still(tmp_path / "run", TRUE, beside, np.random.default_rng(5))
     stated = scenes.write_still(tmp_path / "stated", TRUE, AT_REST, np.random.default_rng(5)) / "pose.csv"
     for sigma_m, alarm in ((5e-5, True), (1e-3, False)):
-        limits = DailyLimits(pose_sigma_m=sigma_m)
-        outcome = check_drift(rig, tmp_path / "out", run=run, today=scenes.DAY, pose=stated, limits=limits)
+        limits = DriftLimits(pose_sigma_m=sigma_m)
+        outcome = check_drift(rig, tmp_path / "out", DriftInputs(run=run, pose=stated), today=scenes.DAY, limits=limits)
         assert any(f.level == Level.FAIL or "p = " in f.what for f in outcome.findings) == alarm
 
 
 def test_a_vehicle_that_moves_is_refused(tmp_path):
-    with pytest.raises(InputError, match=r"at rest, got spot .* wandered by .* px during the run"):
+    with pytest.raises(InputError, match=r"at rest, got spot .* drifted by .* px during the run"):
         still(tmp_path, TRUE, wander_px=3.0)
 
 
-# What is written ------------------------------------------------------------------------------------------------------
+# Output ---------------------------------------------------------------------------------------------------------------
 
 
 def test_the_table_has_a_row_per_camera_and_the_history_grows(tmp_path):
@@ -250,7 +251,7 @@ def test_the_table_has_a_row_per_camera_and_the_history_grows(tmp_path):
     assert "http" not in report
 
 
-def test_a_check_that_fails_to_read_leaves_everything_as_it_was(tmp_path):
+def test_a_check_with_bad_input_leaves_earlier_results_unchanged(tmp_path):
     history = tmp_path / "h.csv"
     check(tmp_path, TRUE, history=history)
     before = {p: p.read_bytes() for p in [history, *(tmp_path / "out").iterdir()]}
@@ -259,8 +260,7 @@ def test_a_check_that_fails_to_read_leaves_everything_as_it_was(tmp_path):
         check_drift(
             tmp_path / "rig.yaml",
             tmp_path / "out",
-            tmp_path / "points.csv",
-            survey=tmp_path / "survey.csv",
+            DriftInputs(tmp_path / "points.csv", survey=tmp_path / "survey.csv"),
             history=history,
         )
     assert {p: p.read_bytes() for p in [history, *(tmp_path / "out").iterdir()]} == before
@@ -295,8 +295,8 @@ SURVEY = "point,x_m,y_m,z_m\nL1,-2.5,-1.0,-0.8\n"
         (POINTS.encode("utf-16").decode("latin-1"), SURVEY, "points.csv: .* not text in UTF-8; save it as CSV"),
         (POINTS.replace("250", "250,9"), SURVEY, "line 2: expected 4 fields, got 5"),
         (POINTS.replace("left", "lef"), SURVEY, "expected a camera of the rig, got 'lef'; did you mean 'left'?"),
-        (POINTS.replace("L1", "L11"), SURVEY, "expected a place of point 'L11' .* got none; did you mean 'L1'?"),
-        (POINTS + "left,L1,301,251\n", SURVEY, "each point once per camera, got 'L1' of 'left' again .line 2 has it"),
+        (POINTS.replace("L1", "L11"), SURVEY, "expected the coordinates of point 'L11' .* got none; did you mean 'L1'"),
+        (POINTS + "left,L1,301,251\n", SURVEY, "each point once per camera, got 'L1' of 'left' again .first in line 2"),
         (POINTS.replace("v_px", "v_px,sigma_px").replace("250", "250,0"), SURVEY, "sigma_px: expected a number above"),
         (POINTS, None, "survey.csv: expected a table with columns .*, found no file"),
         (POINTS, SURVEY.replace("-2.5,-1.0,-0.8", "-2500,-1000,-800"), "expected metres, got -2500; are these milli"),
@@ -304,60 +304,60 @@ SURVEY = "point,x_m,y_m,z_m\nL1,-2.5,-1.0,-0.8\n"
         (POINTS, SURVEY.replace("z_m", "depth"), "expected a column 'z_m' .world. or 'screen'"),
         (POINTS, "point,screen,x_m,y_m\nL1,lefft,1,1\n", "screen: expected a screen of the rig, got 'lefft'; did you"),
         (POINTS, SURVEY.replace("-2.5,-1.0,-0.8", "-1.0,-2.5,-0.8"), "check the survey's unit, axes and frame"),
-        (POINTS, SURVEY.replace("-2.5,-1.0", "-8.5,-1.0"), "cannot be seen by this camera"),
-        (POINTS, SURVEY + "L1,0,0,0\n", "'L1' has two different places"),
+        (POINTS, SURVEY.replace("-2.5,-1.0", "-8.5,-1.0"), "this camera cannot see the point"),
+        (POINTS, SURVEY + "L1,0,0,0\n", "'L1' has two different positions"),
     ],
 )  # fmt: skip
-def test_a_bad_table_is_named_with_its_line_and_what_to_do(tmp_path, points, survey, words):
+def test_a_bad_table_is_refused_with_its_line_and_the_remedy(tmp_path, points, survey, words):
     rig = scenes.write_rig(tmp_path, RIG, COVARIANCE)
     for name, text in (("points.csv", points), ("survey.csv", survey)):
         if text is not None:
             (tmp_path / name).write_bytes(text.encode("latin-1"))
     with pytest.raises(InputError, match=words) as caught:
-        check_drift(rig, tmp_path / "out", tmp_path / "points.csv", survey=tmp_path / "survey.csv")
+        check_drift(rig, tmp_path / "out", DriftInputs(tmp_path / "points.csv", survey=tmp_path / "survey.csv"))
     assert len(str(caught.value).splitlines()) == 1
     assert not (tmp_path / "out").exists()
 
 
-def test_points_need_places(tmp_path):
+def test_points_need_coordinates(tmp_path):
     rig = scenes.write_rig(tmp_path, RIG, COVARIANCE)
     (tmp_path / "p.csv").write_text(POINTS)
-    with pytest.raises(InputError, match=r"expected the places of its points.*--survey"):
-        check_drift(rig, tmp_path / "out", tmp_path / "p.csv")
+    with pytest.raises(InputError, match=r"expected the coordinates of its points.*--survey"):
+        check_drift(rig, tmp_path / "out", DriftInputs(tmp_path / "p.csv"))
 
 
-def test_a_check_has_points_or_a_run_never_neither_or_both(tmp_path):
+def test_a_check_needs_either_points_or_a_run(tmp_path):
     rig = scenes.write_rig(tmp_path, RIG, COVARIANCE)
     for kind, words in (
         ({}, "got neither"),
         ({"points": tmp_path, "run": tmp_path}, "got both"),
-        ({"run": tmp_path, "survey": tmp_path}, "--survey together with --points"),
-        ({"points": tmp_path, "pose": tmp_path}, "--pose together with --run"),
+        ({"run": tmp_path, "survey": tmp_path}, "--survey only together with --points"),
+        ({"points": tmp_path, "pose": tmp_path}, "--pose only together with --run"),
     ):
         with pytest.raises(InputError, match=words):
-            check_drift(rig, tmp_path / "out", **kind)
+            check_drift(rig, tmp_path / "out", DriftInputs(**kind))
 
 
-def test_bad_runs_poses_and_histories_are_named(tmp_path):
+def test_bad_runs_poses_and_histories_are_refused(tmp_path):
     rig = scenes.write_rig(tmp_path, RIG, COVARIANCE)
     with pytest.raises(InputError, match="found nothing"):
-        check_drift(rig, tmp_path / "out", run=tmp_path / "no")
+        check_drift(rig, tmp_path / "out", DriftInputs(run=tmp_path / "no"))
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match=r"expected a run.yaml or a spots.csv in this folder"):
-        check_drift(rig, tmp_path / "out", run=tmp_path / "empty")
+        check_drift(rig, tmp_path / "out", DriftInputs(run=tmp_path / "empty"))
     run = scenes.write_still(tmp_path / "run", TRUE, AT_REST, np.random.default_rng(0))
     text = (run / "spots.csv").read_text()
     (run / "spots.csv").write_text(text.replace(",left,", ",lfet,"))
     with pytest.raises(InputError, match=r"got 'lfet'; did you mean 'left'\?"):
-        check_drift(rig, tmp_path / "out", run=run)
+        check_drift(rig, tmp_path / "out", DriftInputs(run=run))
     (run / "spots.csv").write_text(text)
     (run / "attitude.csv").unlink()
     with pytest.raises(InputError, match=r"expected an attitude.csv beside spots.csv, or the pose"):
-        check_drift(rig, tmp_path / "out", run=run)
+        check_drift(rig, tmp_path / "out", DriftInputs(run=run))
     rows = (run / "pose.csv").read_text() + "1,0.01,0.5,0.02,-0.03,1,0,0,0\n"
     (run / "pose.csv").write_text(rows)
     with pytest.raises(InputError, match="expected one constant pose"):
-        check_drift(rig, tmp_path / "out", run=run, pose=run / "pose.csv")
+        check_drift(rig, tmp_path / "out", DriftInputs(run=run, pose=run / "pose.csv"))
     history = tmp_path / "h.csv"
     history.write_text("a,b\n")
     with pytest.raises(InputError, match="name another --history"):
@@ -369,12 +369,12 @@ def test_bad_runs_poses_and_histories_are_named(tmp_path):
 
 
 @pytest.mark.parametrize("bad", [{"p_false_alarm": 0.0}, {"fail_mm": 0.1, "warn_mm": 0.2}, {"point_sigma_px": -1.0}])
-def test_limits_that_make_no_sense_are_refused(bad):
+def test_invalid_limits_are_refused(bad):
     with pytest.raises(ValueError, match="expected"):
-        DailyLimits(**bad)
+        DriftLimits(**bad)
 
 
-def test_the_wrong_one_of_five_points_is_named(tmp_path):
+def test_the_wrong_point_among_five_is_identified(tmp_path):
     pixels, survey = scenes.write_points(tmp_path, TRUE, np.random.default_rng(0), wrong={"R3": (-3.0, 0.0)})
     covariance = joint_covariance(RIG, {"target": COVARIANCE}, "rig.yaml")
     one = compare_points(RIG, read_points(pixels, survey, RIG, 0.1), covariance, pixels)[1]
@@ -383,7 +383,7 @@ def test_the_wrong_one_of_five_points_is_named(tmp_path):
 
 
 def test_a_run_folder_is_processed_first(tmp_path):
-    """Detections of a vehicle at rest, labelled and tracked by the program itself."""
+    """The detections of a vehicle at rest are labelled and tracked before the check."""
     rig = scenes.write_rig(tmp_path, RIG, COVARIANCE, replace(scenes.STATE, valid_until=None))
     rng = np.random.default_rng(8)
     run = tmp_path / "run"
@@ -404,14 +404,14 @@ def test_a_run_folder_is_processed_first(tmp_path):
         "  within_m: 0.2\n  within_deg: 10.0\n"
     )
     pose = scenes.write_still(tmp_path / "stated", TRUE, AT_REST, rng) / "pose.csv"
-    outcome = check_drift(rig, tmp_path / "out", run=run, today=scenes.DAY, pose=pose)
+    outcome = check_drift(rig, tmp_path / "out", DriftInputs(run=run, pose=pose), today=scenes.DAY)
     assert of(outcome, "left").change.kind == TURNED
     assert of(outcome, "right").level == Level.PASS
 
 
 @pytest.mark.parametrize("on_screens", [False, True], ids=["surveyed", "screen coordinates"])
-def test_the_calibrations_share_is_that_of_numeric_derivatives(tmp_path, on_screens):
-    """Every number of a camera and a bent screen, moved one by one; dots given on a screen move with it."""
+def test_the_sigma_of_the_prediction_agrees_with_numeric_derivatives(tmp_path, on_screens):
+    """Every parameter of a camera and a curved screen is varied; points given on the screen move with it."""
     bent = replace(RIG.screens["left"], bow=(2e-3, -1e-3, 1e-3))
     rig = Rig({**RIG.screens, "left": bent}, RIG.cameras, RIG.beams, RIG.spots)
     names = tuple(n for n in rig_names(rig, bow=True) if n.startswith(("cameras.left.", "screens.left.")))
@@ -421,11 +421,11 @@ def test_the_calibrations_share_is_that_of_numeric_derivatives(tmp_path, on_scre
     one = compare_points(rig, known, RigCovariance(names, np.diag(sigma**2)), pixels)[0]
     mine = [i for i, c in enumerate(known.camera) if c == "left"]
 
-    def foretold(delta: np.ndarray) -> np.ndarray:
+    def predicted(delta: np.ndarray) -> np.ndarray:
         lab = moved(rig, names, delta)
         screen, out = lab.screens["left"], []
         for i in mine:
-            x, y, z = known.place[i]
+            x, y, z = known.xyz[i]
             a, b, c = screen.bow
             local = np.array([x, y, a * x * x + b * x * y + c * y * y])
             world = screen.world_from_screen.apply(local) if on_screens else np.array([x, y, z])
@@ -433,8 +433,8 @@ def test_the_calibrations_share_is_that_of_numeric_derivatives(tmp_path, on_scre
         return np.array(out)
 
     J = np.stack(
-        [(foretold(e) - foretold(-e)) / 2e-3 for e in 1e-3 * np.diag(sigma)], axis=-1
-    )  # per sigma of each number
+        [(predicted(e) - predicted(-e)) / 2e-3 for e in 1e-3 * np.diag(sigma)], axis=-1
+    )  # per sigma of each parameter
     expected = np.sqrt(np.sum(J**2, axis=-1).mean(axis=1))
     np.testing.assert_allclose(one.calibration_sigma_px, expected, rtol=1e-5)
-    np.testing.assert_allclose(one.foretold, foretold(np.zeros(len(names))), atol=1e-9)
+    np.testing.assert_allclose(one.predicted, predicted(np.zeros(len(names))), atol=1e-9)

@@ -1,4 +1,4 @@
-"""`calibrate screen` from files to files."""
+"""`calibrate screen` from files to results, and its error messages."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ needs_open3d = pytest.mark.skipif(importlib.util.find_spec("open3d") is None, re
 
 
 def rewritten(path, change):
-    """A CSV file with each row (a dict) changed; None leaves it out."""
+    """Rewrite a CSV file with each row (a dict) changed; None removes a row."""
     with path.open() as file:
         rows = list(csv.DictReader(file))
     changed_rows = [r for r in map(change, rows) if r is not None]
@@ -61,18 +61,17 @@ def good(tmp_path_factory):
     return folder / "out", calibrate_screen(path, folder / "out", datetime.date(2026, 3, 14))
 
 
-def test_a_good_survey_passes_and_says_how_good(good):
+def test_a_good_survey_passes_and_the_line_states_the_uncertainty(good):
     out, outcome = good
     assert outcome.level in (Level.PASS, Level.WARN)
-    warned = [f.what for f in outcome.findings if f.level == Level.WARN]
-    # The made-up lab has one lens file for all its cameras, which a real one has not.
-    assert all("reach over" in w or "share the lens calibration" in w for w in warned), warned
+    warnings = [f.what for f in outcome.findings if f.level == Level.WARN]
+    assert all("control points cover" in w for w in warnings), warnings
     assert outcome.exit_status == 0
     assert outcome.line().startswith(f"bay 3: {outcome.level.name}: 2 cameras, 2 screens, surfaces to 0.")
     assert files_below(out) == ["dots.csv", "report.html", "residuals.csv", "rig.yaml", "screens.yaml"]
 
 
-def test_what_is_written_is_near_the_truth_and_reads_back_the_same(good):
+def test_the_written_poses_are_near_the_truth_and_read_back_unchanged(good):
     out, outcome = good
     file = load_screens(out / "screens.yaml")
     for name, camera in truth().cameras.items():
@@ -89,7 +88,7 @@ def test_what_is_written_is_near_the_truth_and_reads_back_the_same(good):
     assert (again.calibration, again.name) == (file.calibration, file.name)
 
 
-def test_rig_yaml_holds_the_drawn_beams_and_says_that_they_are_not_calibrated(good):
+def test_rig_yaml_holds_the_nominal_beams_and_states_that_they_are_not_calibrated(good):
     out, _ = good
     file = load_rig_file(out / "rig.yaml")
     assert list(file.rig.beams) == ["A", "B"]
@@ -98,7 +97,7 @@ def test_rig_yaml_holds_the_drawn_beams_and_says_that_they_are_not_calibrated(go
     assert "cameras.left.x_m" in file.covariances["target"].parameters
 
 
-def test_the_tables_have_a_row_per_pixel_and_per_dot(good):
+def test_the_tables_have_a_row_per_observation_and_per_control_point(good):
     out, _ = good
     for name, columns in (("residuals.csv", RESIDUAL_COLUMNS), ("dots.csv", DOT_COLUMNS)):
         with (out / name).open() as file:
@@ -110,13 +109,13 @@ def test_the_tables_have_a_row_per_pixel_and_per_dot(good):
 def test_the_report_shows_screens_pixels_and_the_lab(good):
     out, _ = good
     text = (out / "report.html").read_text()
-    for words in ("bay 3", "Screen left", "flat", "Cameras, screens and dots", "What errs together", "survey.csv"):
+    for words in ("bay 3", "Screen left", "flat", "Cameras, screens and control points", "Correlations", "survey.csv"):
         assert words in text
     assert len(text) < 2_000_000
 
 
-def test_a_result_is_replaced_and_another_folder_never(good, tmp_path):
-    path = write_project(tmp_path / "p", dots=8)
+def test_an_earlier_result_is_replaced_but_no_other_folder(good, tmp_path):
+    path = write_project(tmp_path / "p", points_each=8)
     calibrate_screen(path, tmp_path / "out")
     calibrate_screen(path, tmp_path / "out")
     (tmp_path / "mine").mkdir()
@@ -134,7 +133,7 @@ def test_a_bent_screen_is_a_warning_and_its_bow_is_written(tmp_path):
     assert "screens.left.bow_xx_per_m" in outcome.result.fit.covariance.names
 
 
-def test_a_rough_screen_fails_with_exit_status_3_and_no_calibration_is_written(tmp_path):
+def test_a_rough_screen_fails_with_exit_status_3_and_no_yaml_is_written(tmp_path):
     path = write_project(tmp_path / "p")
     rng = np.random.default_rng(0)
     rewritten(tmp_path / "p" / "survey.csv", lambda r: {**r, "x_m": float(r["x_m"]) + 0.008 * rng.normal()})
@@ -145,8 +144,8 @@ def test_a_rough_screen_fails_with_exit_status_3_and_no_calibration_is_written(t
     assert "FAIL" in (tmp_path / "out" / "report.html").read_text()
 
 
-def test_a_lens_covariance_is_carried_into_the_result(tmp_path):
-    path = write_project(tmp_path / "p", dots=10)
+def test_a_lens_covariance_is_propagated_to_the_result(tmp_path):
+    path = write_project(tmp_path / "p", points_each=10)
     lens = tmp_path / "p" / "left-camera.yaml"
     file = load_camera(lens)
     save_camera(replace(file, covariance=Covariance(("fx", "fy"), np.diag([0.25, 0.25]))), lens)
@@ -163,7 +162,7 @@ def test_a_lens_covariance_is_carried_into_the_result(tmp_path):
     [
         (
             lambda p: rewritten(p / "survey.csv", scaled(1000)),
-            r"reach over .* m, its size_m is 2.4 m x 2 m; .*millimetres",
+            r"extend over .* m, its size_m is 2.4 m x 2 m; .*millimetres",
         ),
         (lambda p: rewritten(p / "survey.csv", scaled(1 / 0.0254)), "inches"),
         (
@@ -177,11 +176,11 @@ def test_a_lens_covariance_is_carried_into_the_result(tmp_path):
         (lambda p: rewritten(p / "survey.csv", lambda r: {**r, "y_m": 0.0}), "on one line"),
         (lambda p: rewritten(p / "survey.csv", lambda r: {**r, "z_m": "nan"}), "line 2: z_m: expected a number"),
         (lambda p: (p / "points.csv").write_text(""), "got an empty file"),
-        (lambda p: changed(p / "calibration.yaml", points=[]), "nothing ties the cameras to the screens"),
+        (lambda p: changed(p / "calibration.yaml", points=[]), "no measurement connects the cameras to the screens"),
     ],
 )
-def test_bad_input_gets_its_own_line_and_nothing_is_overwritten(tmp_path, spoil, words):
-    path = write_project(tmp_path / "p", dots=6)
+def test_bad_input_has_its_own_message_and_nothing_is_overwritten(tmp_path, spoil, words):
+    path = write_project(tmp_path / "p", points_each=6)
     spoil(tmp_path / "p")
     (tmp_path / "out").mkdir()
     with pytest.raises(InputError, match=words) as caught:
@@ -190,10 +189,17 @@ def test_bad_input_gets_its_own_line_and_nothing_is_overwritten(tmp_path, spoil,
     assert files_below(tmp_path / "out") == []
 
 
+def test_two_cameras_with_one_lens_file_have_a_warning(tmp_path):
+    path = write_project(tmp_path / "p", points_each=6)
+    changed(path, cameras__right__intrinsics="left-camera.yaml")
+    outcome = calibrate_screen(path, tmp_path / "out")
+    assert any("share the lens calibration left-camera.yaml" in f.what for f in outcome.findings)
+
+
 @pytest.mark.slow
-def test_swapped_axes_are_named_where_the_cameras_places_are_known(tmp_path):
+def test_swapped_axes_are_reported_if_the_cameras_positions_are_known(tmp_path):
     places = {n: c.camera_from_world.inverse().translation for n, c in truth().cameras.items()}
-    path = write_project(tmp_path / "p", dots=6)
+    path = write_project(tmp_path / "p", points_each=6)
     for name, place in places.items():
         changed(path, **{f"cameras__{name}__near_m": [float(v) for v in place]})
     rewritten(tmp_path / "p" / "survey.csv", lambda r: {**r, "y_m": r["z_m"], "z_m": r["y_m"]})
@@ -204,7 +210,7 @@ def test_swapped_axes_are_named_where_the_cameras_places_are_known(tmp_path):
 def board_project(folder, seen=True):
     """One screen, one camera, a board of 3 mm fixed to the screen, photographed."""
     rig = truth()
-    # Without distortion: to undo it for all pixels of the photograph takes 3 s.
+    # Without distortion: rendering a photograph with distortion takes 3 s.
     camera, screen = replace(rig.cameras["left"], distortion=()), rig.screens["left"]
     folder.mkdir()
     save_camera(CameraFile("left", camera.image_size_px, camera.matrix, camera.distortion), folder / "left.yaml")
@@ -225,7 +231,7 @@ def board_project(folder, seen=True):
     return folder / "calibration.yaml", rig
 
 
-def test_a_board_fixed_to_the_screen_is_enough_for_one_camera(tmp_path):
+def test_a_board_fixed_to_the_screen_is_sufficient_for_one_camera(tmp_path):
     path, rig = board_project(tmp_path / "p")
     outcome = calibrate_screen(path, tmp_path / "out")
     found = outcome.result.fit.rig
@@ -236,7 +242,7 @@ def test_a_board_fixed_to_the_screen_is_enough_for_one_camera(tmp_path):
     assert np.median(np.abs(outcome.result.fit.corner_errors_px)) < 0.1
 
 
-def test_a_photograph_without_the_fixed_board_says_so(tmp_path):
+def test_a_photograph_without_the_fixed_board_is_refused(tmp_path):
     path, _ = board_project(tmp_path / "p", seen=False)
     with pytest.raises(CalibrationError, match=r"board.png: .*a board that is fixed to a screen must be found"):
         calibrate_screen(path, tmp_path / "out")
@@ -255,9 +261,9 @@ def write_ply(path, points):
 
 @needs_open3d
 @pytest.mark.parametrize("kind", ["ply", "xyz"])
-def test_a_scan_replaces_the_dots_of_a_screen(tmp_path, kind):
+def test_a_scan_replaces_the_control_points_of_a_screen(tmp_path, kind):
     rng = np.random.default_rng(0)
-    path = write_project(tmp_path / "p", dots=10)
+    path = write_project(tmp_path / "p", points_each=10)
     screen = truth().screens["right"]
     flat = np.column_stack([rng.uniform(-1.2, 1.2, 4000), rng.uniform(-1, 1, 4000), 1e-3 * rng.normal(size=4000)])
     points = 1000 * screen.world_from_screen.apply(flat)
@@ -276,9 +282,9 @@ def test_a_scan_replaces_the_dots_of_a_screen(tmp_path, kind):
 
 
 @needs_open3d
-def test_a_scan_in_another_unit_is_told(tmp_path):
+def test_a_scan_in_another_unit_is_reported(tmp_path):
     rng = np.random.default_rng(0)
-    path = write_project(tmp_path / "p", dots=8)
+    path = write_project(tmp_path / "p", points_each=8)
     points = np.column_stack([rng.uniform(-1200, 1200, 3000), rng.uniform(-1000, 1000, 3000), rng.normal(size=3000)])
     np.savetxt(tmp_path / "p" / "scan.xyz", points, fmt="%.3f")
     changed(path, screens__right__cloud={"file": "scan.xyz"})
@@ -296,20 +302,20 @@ def test_a_scan_in_another_unit_is_told(tmp_path):
         ("scan.xyz", "nan nan nan\n", "none with three finite numbers"),
     ],
 )
-def test_clouds_that_cannot_be_read_say_why(tmp_path, name, text, words):
+def test_an_unreadable_cloud_is_refused_with_the_reason(tmp_path, name, text, words):
     (tmp_path / name).write_text(text)
     with pytest.raises(InputError, match=words):
         read_cloud(tmp_path / name, 1.0)
 
 
-def test_points_without_a_return_are_left_out_and_counted(tmp_path):
+def test_points_without_a_return_are_excluded_and_counted(tmp_path):
     (tmp_path / "scan.xyz").write_text("X Y Z\n1,2,3\nnan,nan,nan\n4,5,6\n")
     points, notes = read_cloud(tmp_path / "scan.xyz", 1e-3)
     np.testing.assert_allclose(points, [[0.001, 0.002, 0.003], [0.004, 0.005, 0.006]])
     assert notes == ("scan.xyz: 1 of 3 points left out: not finite",)
 
 
-def test_without_open3d_a_ply_file_says_how_to_get_it(tmp_path, monkeypatch):
+def test_without_open3d_the_error_for_a_ply_file_explains_the_installation(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "open3d", None)
     write_ply(tmp_path / "scan.ply", np.eye(3))
     with pytest.raises(InputError, match=r"scan.ply: point clouds need Open3D.*make pointcloud"):
@@ -321,10 +327,10 @@ def test_without_open3d_a_ply_file_says_how_to_get_it(tmp_path, monkeypatch):
 STEREO = DATA / "chessboard_stereo_opencv"
 
 
-@pytest.mark.skipif(not STEREO.is_dir(), reason="the stereo photographs are not at hand")
-def test_real_photographs_of_a_carried_board_tie_two_cameras(tmp_path):
+@pytest.mark.skipif(not STEREO.is_dir(), reason="the stereo photographs are not available")
+def test_real_photographs_of_a_portable_board_connect_two_cameras(tmp_path):
     board = "chessboard:9x6:25mm"
-    # The left camera's lens is read from the set's own file; for the right one it has none that fits its photographs.
+    # The set has a lens file for the left camera only; the right camera's lens is calibrated here by OpenCV.
     seen = [find_board(cv2.imread(str(STEREO / f"right{n:02d}.jpg"), 0), parse(board)) for n in range(1, 8)]
     flat = [parse(board).points.astype(np.float32)] * 7
     _, K, lens, _, _ = cv2.calibrateCamera(flat, [v.pixels.astype(np.float32) for v in seen], (640, 480), None, None)
@@ -352,8 +358,8 @@ def test_real_photographs_of_a_carried_board_tie_two_cameras(tmp_path):
     assert (tmp_path / "out" / "residuals.csv").read_text().count("\n") > 600
 
 
-def test_a_camera_far_from_its_place_is_told_first_and_no_name_is_called_right(tmp_path):
-    path = write_project(tmp_path / "p", dots=6)
+def test_a_camera_far_from_its_near_m_is_reported_first_and_no_name_is_confirmed(tmp_path):
+    path = write_project(tmp_path / "p", points_each=6)
     for name, camera in truth().cameras.items():
         place = camera.camera_from_world.inverse().translation
         changed(path, **{f"cameras__{name}__near_m": [float(v) for v in place * [-1, -1, 1]]})

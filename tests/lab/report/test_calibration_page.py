@@ -1,4 +1,4 @@
-"""A calibration's report is one file that opens anywhere, says all it found, and stays small; so do its drawings."""
+"""A calibration's report is one self-contained file of limited size with all findings; its drawings are well-formed."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ def report(sections: list[Section], findings: list[Finding] | None = None) -> Ca
 
 
 @pytest.mark.parametrize("name", DRAWINGS)
-def test_a_drawing_is_well_formed_and_says_what_it_shows(name):
+def test_a_drawing_is_well_formed_and_has_a_title(name):
     root = ET.fromstring(DRAWINGS[name])
     assert root.tag == "svg"
     assert root.get("aria-label")
@@ -119,7 +119,7 @@ def test_a_drawing_is_well_formed_and_says_what_it_shows(name):
 
 
 @pytest.mark.parametrize("name", DRAWINGS)
-def test_a_drawing_stays_within_its_frame_and_holds_no_endless_text(name):
+def test_the_text_of_a_drawing_is_within_its_frame(name):
     _, _, width, height = (float(v) for v in ET.fromstring(DRAWINGS[name]).get("viewBox").split())
     assert 300 <= width <= 1200
     assert 60 <= height <= 800
@@ -130,7 +130,7 @@ def test_a_drawing_stays_within_its_frame_and_holds_no_endless_text(name):
 
 
 class _Tags(HTMLParser):
-    """Whether every tag that opens is closed, in order, and what the page would load."""
+    """Checks that all tags are closed in order, and collects the resources that the page loads."""
 
     VOID = frozenset({"meta", "br", "link", "img", "input", "hr"})
 
@@ -152,7 +152,7 @@ class _Tags(HTMLParser):
         assert self.open.pop() == tag
 
 
-def test_the_page_is_balanced_and_loads_nothing_from_anywhere():
+def test_the_page_is_balanced_and_loads_no_external_resource():
     table = PageTable(("a", "b (px)"), [("x", 1.5), ("y", float("nan"))])
     html = page(report([Section("s", ["w"], [*map(PageDrawing, DRAWINGS.values()), "<p>plain</p>"], table)]))
     tags = _Tags()
@@ -164,7 +164,7 @@ def test_the_page_is_balanced_and_loads_nothing_from_anywhere():
     assert not re.search(r"https?://|url\(|@import|<script", outside)
 
 
-def test_every_finding_is_shown_the_worst_first_with_its_reason_and_its_cure():
+def test_all_findings_are_shown_with_reason_and_remedy_the_worst_first():
     findings = [
         Finding(Level.PASS, "what-pass"),
         Finding(Level.WARN, "what-warn", "why-warn", "remedy-warn"),
@@ -180,7 +180,7 @@ def test_every_finding_is_shown_the_worst_first_with_its_reason_and_its_cure():
     assert "<title>FAIL" in html
 
 
-def test_names_and_words_are_escaped_everywhere():
+def test_all_names_and_texts_are_escaped():
     evil = "<script>alert(1)</script>"
     finding = Finding(Level.WARN, evil, evil, evil)
     section = Section(evil, evil, [PageDrawing("<svg></svg>", evil)], PageTable((evil,), [(evil,)]))
@@ -195,19 +195,19 @@ def test_a_report_of_400_views_stays_below_5_mb_and_keeps_its_table():
     rows = [(f"photograph-{i}", 0.2) for i in range(400)]
     html = page(report([Section("views", (), views, PageTable(("view", "RMS (px)"), rows))]))
     assert len(html.encode()) <= LARGEST_BYTES
-    assert html.count("Picture left out") > 100
-    assert "<svg" in html  # and some pictures are still there
+    assert html.count("Picture omitted") > 100
+    assert "<svg" in html  # some pictures remain
     assert all(f"photograph-{i}<" in html for i in range(400))
 
 
-def test_the_views_worth_a_picture_are_the_worst_the_median_and_the_best():
+def test_the_representative_views_are_the_worst_the_median_and_the_best():
     rms = np.array([0.5, 0.1, 0.9, np.nan, 0.3, 0.7])
     assert dict(telling_views(rms, 2)) == {2: "worst", 5: "2. worst", 0: "median", 1: "best"}
     assert telling_views(np.full(3, np.nan)) == []
     assert [i for i, _ in telling_views(np.array([0.2]))] == [0]
 
 
-def test_the_file_is_written_whole_and_names_its_inputs(tmp_path: Path):
+def test_the_file_is_written_atomically_and_lists_its_inputs(tmp_path: Path):
     data = tmp_path / "photo.png"
     data.write_bytes(b"123")
     made = provenance([data], datetime.date(2026, 5, 1))
@@ -223,7 +223,7 @@ def test_the_file_is_written_whole_and_names_its_inputs(tmp_path: Path):
         provenance([tmp_path / "missing.png"])
 
 
-def test_what_a_report_cannot_be_is_refused():
+def test_an_unknown_kind_of_report_and_an_uneven_table_are_refused():
     with pytest.raises(ValueError, match="kind of report"):
         CalibrationReport("Kamera", "x", Level.PASS, [], [], [])
     with pytest.raises(ValueError, match="2 cells"):

@@ -1,4 +1,4 @@
-"""What a stored calibration foretells for known points or a still vehicle, and how far today's pixels are from it."""
+"""Pixels predicted by a stored calibration for known points or a vehicle at rest, compared with the measured ones."""
 
 from __future__ import annotations
 
@@ -19,46 +19,47 @@ from calibration.drift import (
 )
 from geometry.arrays import Array, Ints, skew
 from geometry.camera import FISHEYE, Camera, Projected, pinhole_numbers, project_points_full
-from geometry.forward_model import SpotModel
+from geometry.forward_model import SpotDerivatives, SpotModel
 from geometry.lens import padded
 from geometry.pose import Pose
 from geometry.pose_solver.gauss_newton import fit_pose
 from geometry.rig import Rig
 from geometry.uncertainty.rig_parameters import BOW, PINHOLE, POSE, RigCovariance, Sensitivity, distortion_names, split
-from lab.calibrate.drift_check.drift_inputs import KnownPoints, StillSpots, refuse_other_points
+from lab.calibrate.drift_check.drift_inputs import KnownPoints, StillSpots, check_points_match
 from lab.errors import InputError
 
 
 @dataclass(frozen=True, slots=True)
-class Compared:
-    """n pixels measured and foretold, and what each possible change would do to them. Rows: u, v of each in turn."""
+class PixelComparison:
+    """n measured and predicted pixels, and the effect of each possible change on them. 2n rows: u, v of each pixel."""
 
     camera: tuple[str, ...]  # (n,)
-    label: tuple[str, ...]  # (n,) the point or the spot
-    pixels: Array  # (n, 2)
-    foretold: Array  # (n, 2)
-    place: Array  # (n, 3), m, in world
+    label: tuple[str, ...]  # (n,) name of the point or spot
+    pixels: Array  # (n, 2) measured
+    predicted: Array  # (n, 2)
+    xyz: Array  # (n, 3), m, in world
     misfit: ExcessResidual
     columns: Mapping[str, CameraColumns]  # by camera, over all 2n rows
-    others: Mapping[tuple[str, str], ChangeCandidate]  # as find_changes takes them
-    measured_sigma_px: Array  # (n,) of the measurement alone
-    calibration_sigma_px: Array  # (n,) of what the calibration foretells
+    others: Mapping[tuple[str, str], ChangeCandidate]  # changes of points and lasers, for find_changes
+    measured_sigma_px: Array  # (n,) of the measurement
+    calibration_sigma_px: Array  # (n,) of the prediction
 
     def rows_of(self, camera: str) -> Ints:
-        """(k,) which of the n pixels are this camera's."""
+        """Indices (k,) of this camera's pixels."""
         return np.flatnonzero([c == camera for c in self.camera])
 
 
-def compare_points(rig: Rig, known: KnownPoints, covariance: RigCovariance | None, path: Path) -> list[Compared]:
-    """Each camera's points against the rig: one comparison per camera, in the rig's order.
+def compare_points(rig: Rig, known: KnownPoints, covariance: RigCovariance | None, path: Path) -> list[PixelComparison]:
+    """Compare the points of each camera with the rig: one comparison per camera, in the rig's order.
 
-    Raises InputError where the pixels cannot be those of these points.
+    Raises:
+        InputError: if the pixels cannot be those of these points.
     """
-    world, foretold = np.zeros((len(known.point), 3)), np.full((len(known.point), 2), np.nan)
+    world, predicted = np.zeros((len(known.point), 3)), np.full((len(known.point), 2), np.nan)
     for i in range(len(known.point)):
         world[i] = _world(rig, known, i)
-        foretold[i] = rig.cameras[known.camera[i]].project(world[i])
-    refuse_other_points(known, foretold, path)
+        predicted[i] = rig.cameras[known.camera[i]].project(world[i])
+    check_points_match(known, predicted, path)
     out = []
     for name, camera in rig.cameras.items():
         rows = np.flatnonzero([c == name for c in known.camera])
@@ -68,20 +69,23 @@ def compare_points(rig: Rig, known: KnownPoints, covariance: RigCovariance | Non
 
 
 def _world(rig: Rig, known: KnownPoints, i: int) -> Array:
+    """World coordinates (3,), m, of known point i."""
     if not known.screen[i]:
-        return known.place[i]
+        return known.xyz[i]
     screen = rig.screens[known.screen[i]]
-    return screen.world_from_screen.apply(_on_surface(known.place[i], screen.bow))
+    return screen.world_from_screen.apply(_on_surface(known.xyz[i], screen.bow))
 
 
-def _on_surface(place: Array, bow: tuple[float, float, float]) -> Array:
-    x, y = float(place[0]), float(place[1])
+def _on_surface(xyz: Array, bow: tuple[float, float, float]) -> Array:
+    """The point (3,), m, of a curved screen at x and y, in the screen's frame."""
+    x, y = float(xyz[0]), float(xyz[1])
     return np.array([x, y, bow[0] * x * x + bow[1] * x * y + bow[2] * y * y])
 
 
 def _compare_camera(
     rig: Rig, camera: Camera, known: KnownPoints, rows: Ints, world: Array, covariance: RigCovariance | None
-) -> Compared:
+) -> PixelComparison:
+    """Compare the points of one camera. rows: (k,) indices into `known`; world: (k, 3), m."""
     in_camera = camera.camera_from_world.apply(world)
     lens = project_points_full(
         in_camera,
@@ -94,8 +98,8 @@ def _compare_camera(
     R_c = camera.camera_from_world.rotation
     noise = np.zeros((n, 2, n, 2))
     axes_of = [rig.screens[s].world_from_screen.rotation if s else np.eye(3) for s in (known.screen[i] for i in rows)]
-    d_place = lens.d_point @ R_c @ np.array(axes_of)  # px per m along the axes in which the place is given
-    survey = (d_place * known.sigma_m[rows][:, None, :] ** 2) @ np.swapaxes(d_place, -1, -2)
+    d_xyz = lens.d_point @ R_c @ np.array(axes_of)  # px per m along the axes of the given coordinates
+    survey = (d_xyz * known.sigma_m[rows][:, None, :] ** 2) @ np.swapaxes(d_xyz, -1, -2)
     noise[np.arange(n), :, np.arange(n)] = survey + known.sigma_px[rows][:, None, None] ** 2 * np.eye(2)
     C_noise = noise.reshape(2 * n, 2 * n)
     C_calibration = np.zeros((2 * n, 2 * n))
@@ -105,12 +109,12 @@ def _compare_camera(
     pixels = known.pixels[rows]
     columns = camera_columns(in_camera, lens.d_point, lens.d_pinhole, pinhole_numbers(camera)[:2])
     labels = tuple(known.point[i] for i in rows)
-    return Compared(
+    return PixelComparison(
         camera=(camera.name,) * n,
         label=labels,
         pixels=pixels,
-        foretold=lens.pixels,
-        place=world,
+        predicted=lens.pixels,
+        xyz=world,
         misfit=ExcessResidual.of((pixels - lens.pixels).ravel(), C_noise + C_calibration),
         columns={camera.name: columns},
         others={(WRONG_POINT, label): _one_point(n, i) for i, label in enumerate(labels)},
@@ -120,11 +124,12 @@ def _compare_camera(
 
 
 def _sigma(covariance: Array) -> Array:
-    """(n,) the RMS over u and v of the sigmas on a diagonal (2n, 2n)."""
+    """RMS over u and v (n,) of the sigmas on the diagonal of a covariance (2n, 2n)."""
     return np.sqrt(np.diagonal(covariance).reshape(-1, 2).mean(axis=1))
 
 
 def _one_point(n: int, i: int) -> ChangeCandidate:
+    """The change that moves only pixel i of n."""
     out = np.zeros((2 * n, 2))
     out[2 * i, 0] = out[2 * i + 1, 1] = 1.0
     return ChangeCandidate(out, np.full(2, UsualSizes().point_px))
@@ -133,7 +138,7 @@ def _one_point(n: int, i: int) -> ChangeCandidate:
 def _by_parameters(
     rig: Rig, camera: Camera, known: KnownPoints, rows: Ints, world: Array, lens: Projected, names: tuple[str, ...]
 ) -> Array:
-    """d(pixels)/d(parameters) (2n, p) of points at known places, in the order of the names."""
+    """d(pixels)/d(parameters) (2n, p) of points with known coordinates, in the order of the names."""
     n, R_c = len(rows), camera.camera_from_world.rotation
     pose = np.concatenate([lens.d_point, lens.d_point @ -(R_c @ skew(world))], axis=-1)
     screens = {}
@@ -141,7 +146,7 @@ def _by_parameters(
         screen = rig.screens[name]
         here = np.array([known.screen[i] == name for i in rows])
         R_s = screen.world_from_screen.rotation
-        local = np.array([_on_surface(known.place[i], screen.bow) for i in rows])
+        local = np.array([_on_surface(known.xyz[i], screen.bow) for i in rows])
         x, y = local[:, 0], local[:, 1]
         moves = np.concatenate([np.broadcast_to(np.eye(3), (n, 3, 3)), -(R_s @ skew(local))], axis=-1)
         bulge = R_s[:, 2:] * np.stack([x * x, x * y, y * y], axis=-1)[:, None, :]
@@ -170,38 +175,25 @@ def compare_still(
     pose: tuple[Pose, Array] | None,
     floor_px: float,
     path: Path,
-) -> Compared:
-    """A still vehicle's mean spots against the rig. pose: where it stands, with covariance (6, 6); None: unknown.
+) -> PixelComparison:
+    """Compare the mean spots of a vehicle at rest with the rig.
 
-    floor_px: what averaging over frames cannot remove of a spot's centre. Where the pose is unknown it is free, and a
-    change that looks like another pose cannot be seen. Raises InputError.
+    pose: its pose with covariance (6, 6); None: unknown. floor_px: error of a mean spot that averaging over frames does
+    not reduce. An unknown pose is fitted, and a change that has the same effect as another pose is not detected.
+
+    Raises:
+        InputError: if the spots do not determine an unknown pose, or a spot is not visible at the pose.
     """
     model = SpotModel.of(rig)
     rows = np.array([model.views.index(v) for v in still.views], dtype=np.int64)
     part = model.subset(rows)
     n = len(rows)
     variance = np.maximum(still.scatter_px, still.sigma_px) ** 2 / still.frames[:, None] + floor_px**2
-    if pose is None:
-        if 2 * n <= 6:
-            raise InputError(
-                f"{path}: expected four spots or more of a vehicle at an unknown pose, got {n}; give --pose"
-            )
-        if still.start is None:
-            raise InputError(f"{path}: expected an attitude.csv beside spots.csv, or the pose (--pose); got neither")
-        each = np.zeros((n, 2, 2))
-        each[:, 0, 0], each[:, 1, 1] = variance.T
-        fit = fit_pose(part, np.arange(n), still.pixels, each, still.start)
-        if fit is None:
-            raise InputError(f"{path}: no pose fits these spots; check that this is the right rig.yaml")
-        stands = fit.world_from_body
-    else:
-        stands = pose[0]
-    d = part.derivatives(stands)
+    world_from_body = _fitted_pose(part, still, variance, path) if pose is None else pose[0]
+    d = part.derivatives(world_from_body)
     if not np.isfinite(d.pixels).all():
         missing = part.views[int(np.flatnonzero(~np.isfinite(d.pixels).all(axis=1))[0])]
-        raise InputError(
-            f"{path}: at this pose spot {missing[1]!r} is not seen by camera {missing[0]!r}; check the pose"
-        )
+        raise InputError(f"{path}: at this pose camera {missing[0]!r} does not see spot {missing[1]!r}; check the pose")
     C_calibration = np.zeros((2 * n, 2 * n))
     if covariance is not None:
         J = Sensitivity(rig, part, covariance.names).of(d).reshape(2 * n, -1)
@@ -210,52 +202,77 @@ def compare_still(
     by_pose = d.pose.reshape(2 * n, 6)
     if pose is not None:
         C = C + by_pose @ pose[1] @ by_pose.T
-    place = part.hits(stands)[0]
-    columns = {}
-    for name, camera in rig.cameras.items():
-        mine = np.array([c == name for c, _ in part.views])
-        if not mine.any():
-            continue
-        in_camera = camera.camera_from_world.apply(place)
-        d_point = d.camera[..., :3] * mine[:, None, None]
-        one = camera_columns(in_camera, d_point, d.pinhole * mine[:, None, None], pinhole_numbers(camera)[:2])
-        columns[name] = one
-    labels = tuple(s for _, s in part.views)
-    others = {(WRONG_POINT, f"{s} ({c})"): _one_point(n, i) for i, (c, s) in enumerate(part.views)}
-    laser = np.repeat([UsualSizes().laser_rad, UsualSizes().laser_m], 3)
-    for b, beam in enumerate(rig.beams):
-        on_beam = (part.beam_of == b)[:, None, None]
-        moves = np.concatenate([d.direction * on_beam, d.point * on_beam], axis=-1).reshape(2 * n, 6)
-        if on_beam.sum() > 1:  # a laser of one view is that view's own wrong point
-            others[(LASER_MOVED, beam)] = ChangeCandidate(moves, laser)
+    hits = part.hits(world_from_body)[0]
     residual = (still.pixels - d.pixels).ravel()
-    return Compared(
+    return PixelComparison(
         camera=tuple(c for c, _ in part.views),
-        label=labels,
+        label=tuple(s for _, s in part.views),
         pixels=still.pixels,
-        foretold=d.pixels,
-        place=place,
+        predicted=d.pixels,
+        xyz=hits,
         misfit=ExcessResidual.of(residual, C, by_pose if pose is None else None),
-        columns=columns,
-        others=others,
+        columns=_columns_of_cameras(rig, part, d, hits),
+        others=_changes_of_spots(rig, part, d),
         measured_sigma_px=np.sqrt(variance.mean(axis=1)),
         calibration_sigma_px=_sigma(C_calibration),
     )
 
 
-def refuse_moving(still: StillSpots, limit_px: float, path: Path) -> None:
-    """Raise InputError where the spots wander in the run: a vehicle that moves tells nothing of the calibration."""
+def _fitted_pose(part: SpotModel, still: StillSpots, variance: Array, path: Path) -> Pose:
+    """Pose of a vehicle at rest from its mean spots. variance: (n, 2), px^2. Raises InputError if none fits."""
+    n = len(part)
+    if 2 * n <= 6:
+        raise InputError(f"{path}: expected four spots or more of a vehicle at an unknown pose, got {n}; give --pose")
+    if still.start is None:
+        raise InputError(f"{path}: expected an attitude.csv beside spots.csv, or the pose (--pose); got neither")
+    each = np.zeros((n, 2, 2))
+    each[:, 0, 0], each[:, 1, 1] = variance.T
+    fit = fit_pose(part, np.arange(n), still.pixels, each, still.start)
+    if fit is None:
+        raise InputError(f"{path}: no pose fits these spots; check that this is the right rig.yaml")
+    return fit.world_from_body
+
+
+def _columns_of_cameras(rig: Rig, part: SpotModel, d: SpotDerivatives, hits: Array) -> dict[str, CameraColumns]:
+    """Effect of a change of each camera on the spots of a vehicle at rest. hits: (n, 3), m, spots in world."""
+    columns = {}
+    for name, camera in rig.cameras.items():
+        mine = np.array([c == name for c, _ in part.views])
+        if not mine.any():
+            continue
+        in_camera = camera.camera_from_world.apply(hits)
+        d_point = d.camera[..., :3] * mine[:, None, None]
+        one = camera_columns(in_camera, d_point, d.pinhole * mine[:, None, None], pinhole_numbers(camera)[:2])
+        columns[name] = one
+    return columns
+
+
+def _changes_of_spots(rig: Rig, part: SpotModel, d: SpotDerivatives) -> dict[tuple[str, str], ChangeCandidate]:
+    """The candidates besides the cameras: one wrong spot, or one moved laser."""
+    n = len(part)
+    changes = {(WRONG_POINT, f"{s} ({c})"): _one_point(n, i) for i, (c, s) in enumerate(part.views)}
+    laser = np.repeat([UsualSizes().laser_rad, UsualSizes().laser_m], 3)
+    for b, beam in enumerate(rig.beams):
+        on_beam = (part.beam_of == b)[:, None, None]
+        moves = np.concatenate([d.direction * on_beam, d.point * on_beam], axis=-1).reshape(2 * n, 6)
+        if on_beam.sum() > 1:  # a laser with a single view is the same candidate as the wrong point of this view
+            changes[(LASER_MOVED, beam)] = ChangeCandidate(moves, laser)
+    return changes
+
+
+def check_at_rest(still: StillSpots, limit_px: float, path: Path) -> None:
+    """Raise InputError if the spots move during the run: the check needs a vehicle at rest."""
     sigma = np.sqrt(still.scatter_px**2 * 4 / still.frames[:, None])
-    wandering = np.abs(still.drift_px) > np.maximum(limit_px, 5 * sigma)
-    jumping = still.scatter_px > np.maximum(limit_px, 10 * still.sigma_px)
+    drifting = np.abs(still.drift_px) > np.maximum(limit_px, 5 * sigma)
+    scattering = still.scatter_px > np.maximum(limit_px, 10 * still.sigma_px)
     for kind, amount, bad in (
-        ("wandered by", np.abs(still.drift_px), wandering),
-        ("jittered by", still.scatter_px, jumping),
+        ("drifted by", np.abs(still.drift_px), drifting),
+        ("scattered by", still.scatter_px, scattering),
     ):
         if bad.any():
             i = int(np.argmax(np.where(bad, amount, 0).max(axis=1)))
             camera, spot = still.views[i]
             raise InputError(
                 f"{path}: expected a vehicle at rest, got spot {spot!r} of camera {camera!r} that {kind}"
-                f" {amount[i].max():.2f} px during the run (limit {limit_px:g} px); record it standing still"
+                f" {amount[i].max():.2f} px during the run (limit {limit_px:g} px); record the vehicle at rest"
             )

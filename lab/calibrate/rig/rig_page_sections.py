@@ -1,4 +1,4 @@
-"""The report of a calibrated rig: its screens, beams and cameras, and how their errors go together."""
+"""Report of a rig calibration: sections on screens, beams, cameras and the correlations of their errors."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from lab.report.calibration.calibration_page import (
 from lab.report.calibration.calibration_scene import rig_things, scene_views
 
 ARCSEC = np.deg2rad(1 / 3600)
-_GAUGE = 3e-6  # m, rad: sigmas below it are of axes that were chosen, not measured
+_GAUGE_SIGMA = 3e-6  # m, rad: parameters with smaller sigmas are fixed by convention, not measured
 
 
-def screens(o: RigOutcome) -> Section | None:
-    """Where the screens are, and how flat."""
+def screens_section(o: RigOutcome) -> Section | None:
+    """Section on the poses and the flatness of the screens; None if the project has no screens."""
     joint = o.steps.joint
     drawings, rows = [], []
     sigmas = dict(zip(joint.covariance.names, np.sqrt(np.diagonal(joint.covariance.matrix)), strict=True))
@@ -38,7 +38,7 @@ def screens(o: RigOutcome) -> Section | None:
                     flatness_map(
                         result.xyz[:, :2],
                         result.xyz[:, 2],
-                        f"Screen {name}: height of the dots over its plane",
+                        f"Screen {name}: height of the control points over its plane",
                         size_m=screen.size_m,
                         bow=screen.bow if any(screen.bow) else None,
                         sigma_m=sigma,
@@ -60,17 +60,17 @@ def screens(o: RigOutcome) -> Section | None:
     heads = ("screen", "origin (m)", "sigma along its normal (mm)", "sigma of its tilt (deg)", "surface",
              "sigma of the bow (1/km)")  # fmt: skip
     words = (
-        "Where the screens are. Origin and axes within a plane are a choice, no measurement; what counts is how far and"
-        " how tilted it is."
+        "Poses of the screens. The origin and the axes within the plane are a convention and have no error; the sigmas"
+        " are those of the distance along the normal and of the tilt."
     )
     return Section("Screens", words, drawings, PageTable(heads, rows))
 
 
-def beams(o: RigOutcome, drawing: Rig) -> Section:
-    """The beams against their drawing, and where the stand stands."""
+def beams_section(o: RigOutcome, nominal: Rig) -> Section:
+    """Section on the beams, compared with the nominal ones, and on the pose of the stand."""
     joint = o.steps.joint
     direction, offset = beam_sigmas(joint)
-    away = lines_in(joint.values).minus(lines_in(stacks_of(drawing)))
+    off = lines_in(joint.values).minus(lines_in(stacks_of(nominal)))
     rows = [
         (
             name,
@@ -78,32 +78,32 @@ def beams(o: RigOutcome, drawing: Rig) -> Section:
             ", ".join(f"{1e3 * v:.2f}" for v in joint.rig.beams[name].point),
             float(direction[i] / ARCSEC),
             float(1e3 * offset[i]),
-            float(np.rad2deg(np.linalg.norm(away[i, :2])) * 60),
-            float(1e3 * np.linalg.norm(away[i, 2:])),
+            float(np.rad2deg(np.linalg.norm(off[i, :2])) * 60),
+            float(1e3 * np.linalg.norm(off[i, 2:])),
         )
         for i, name in enumerate(joint.rig.beams)
     ]
     heads = (
-        "beam", "direction", "offset (mm)", "sigma direction (arcsec)", "sigma offset (mm)", "from drawing (arcmin)",
-        "from drawing (mm)",
+        "beam", "direction", "offset (mm)", "sigma direction (arcsec)", "sigma offset (mm)", "off nominal (arcmin)",
+        "off nominal (mm)",
     )  # fmt: skip
-    pose, place = pose_of(joint.values, STAND)[0], joint.unknowns
-    words = ["Each laser in the body frame, which is the stand's carriage as its positions were recorded."]
-    if STAND in place.start:
-        rows_of = place.places(STAND, 0)
-        C = joint.all_covariance[np.ix_(rows_of, rows_of)]
+    pose, unknowns = pose_of(joint.values, STAND)[0], joint.unknowns
+    words = ["Each laser in the body frame, the frame of the stand's carriage as its poses were recorded."]
+    if STAND in unknowns.start:
+        at = unknowns.places(STAND, 0)
+        C = joint.all_covariance[np.ix_(at, at)]
         mm = ", ".join(
             f"{1e3 * t:.2f} ± {1e3 * s:.2f}" for t, s in zip(pose.translation, np.sqrt(np.diagonal(C)[:3]), strict=True)
         )
         deg = ", ".join(
             f"{v:.4f} ± {s:.4f}" for v, s in zip(np.rad2deg(pose.ypr), np.rad2deg(ypr_sigmas(pose, C)), strict=True)
         )
-        words.append(f"The stand in the world: x, y, z {mm} mm; yaw, pitch, roll {deg} deg.")
+        words.append(f"Pose of the stand in the world: x, y, z {mm} mm; yaw, pitch, roll {deg} deg.")
     return Section("Beams", words, (), PageTable(heads, rows))
 
 
-def cameras(o: RigOutcome) -> Section:
-    """Where the cameras stand, and what became of their lenses."""
+def cameras_section(o: RigOutcome) -> Section:
+    """Section on the poses of the cameras and the change of their focal lengths."""
     joint = o.steps.joint
     sigmas = dict(zip(joint.covariance.names, np.sqrt(np.diagonal(joint.covariance.matrix)), strict=True))
     before = o.steps.measured.network.rig
@@ -111,9 +111,9 @@ def cameras(o: RigOutcome) -> Section:
     for i, (name, camera) in enumerate(joint.rig.cameras.items()):
         at = joint.unknowns.places("cameras", i)
         C = joint.all_covariance[np.ix_(at, at)]
-        # Where it stands: x_w = R^T (x_c - t); errors of t come through R^T, those of the attitude by the lever.
+        # Camera centre in world: -R^T t. Errors of t act through R^T, those of the attitude through d(centre)/d(theta).
         R, t = camera.camera_from_world.rotation, camera.camera_from_world.translation
-        J = np.concatenate([-R.T, _lever(R, t)], axis=1)
+        J = np.concatenate([-R.T, _centre_jacobian(R, t)], axis=1)
         place = np.sqrt(np.mean(np.maximum(np.diagonal(J @ C @ J.T), 0.0)))
         centre = camera.camera_from_world.inverse().translation
         rows.append(
@@ -127,47 +127,48 @@ def cameras(o: RigOutcome) -> Section:
                 float(camera.matrix[0, 0] - before.cameras[name].matrix[0, 0]),
             )
         )
-    heads = ("camera", "stands at (m)", "sigma of that (mm)", "sigma of its attitude (deg)", "fx (px)",
-             "sigma (px)", "moved from its lens calibration (px)")  # fmt: skip
+    heads = ("camera", "position (m)", "sigma of position (mm)", "sigma of attitude (deg)", "fx (px)",
+             "sigma of fx (px)", "change of fx since the lens calibration (px)")  # fmt: skip
     words = (
-        "Lens and place of a camera are known better together than each alone: a focal length that is too long looks"
-        " like a camera that stands farther off. rig.yaml holds the joint covariance."
+        "The errors of a camera's lens and pose are correlated: a longer focal length has nearly the same effect as a"
+        " more distant camera. rig.yaml holds the joint covariance."
     )
     return Section("Cameras", words, (), PageTable(heads, rows))
 
 
-def _lever(R: Array, t: Array) -> Array:
+def _centre_jacobian(R: Array, t: Array) -> Array:
     """d(centre)/d(theta) (3, 3) for camera_from_world R Exp(theta), t: the centre is -(R Exp(theta))^T t."""
     c = -R.T @ t
     # Exp(-theta) c = c - theta x c
     return np.array([[0, -c[2], c[1]], [c[2], 0, -c[0]], [-c[1], c[0], 0]])
 
 
-def correlations(o: RigOutcome) -> Section:
-    """Which errors go together."""
+def correlations_section(o: RigOutcome) -> Section:
+    """Section on the correlations of the parameters."""
     C = o.steps.joint.covariance
     sigma = np.sqrt(np.diagonal(C.matrix))
     shown = [
         i
         for i, n in enumerate(C.names)
-        if split(n)[0] == "beams" or (sigma[i] > _GAUGE and not split(n)[2].startswith(("k", "p1", "p2", "s", "tau")))
+        if split(n)[0] == "beams"
+        or (sigma[i] > _GAUGE_SIGMA and not split(n)[2].startswith(("k", "p1", "p2", "s", "tau")))
     ]
     shown.sort(key=lambda i: ("beams", "screens", "cameras").index(split(C.names[i])[0]))
     names = [_short_name(C.names[i]) for i in shown]
-    picture = correlation_matrix(names, C.matrix[np.ix_(shown, shown)], "Correlations of the rig's numbers")
-    words = "Errors that go together. Taken one by one they would promise a worse attitude than the rig gives."
+    picture = correlation_matrix(names, C.matrix[np.ix_(shown, shown)], "Correlations of the rig's parameters")
+    words = "Correlated errors partly cancel in the pose: without the correlations its sigma would be too large."
     return Section("Correlations", words, [PageDrawing(picture, wide=True)])
 
 
 def _short_name(name: str) -> str:
-    """`camera left fx` of `cameras.left.fx`."""
+    """`camera left fx` for `cameras_section.left.fx`."""
     kind, thing, parameter = split(name)
     bare = parameter.removesuffix("_per_m").removesuffix("_rad").removesuffix("_m")
     return f"{kind.removesuffix('s')} {thing} {bare}"
 
 
-def lab(o: RigOutcome) -> Section:
-    """The lab from three sides."""
+def lab_section(o: RigOutcome) -> Section:
+    """Section with three views of the lab."""
     joint = o.steps.joint
     body = (
         o.expected.world_from_body
@@ -176,13 +177,13 @@ def lab(o: RigOutcome) -> Section:
     )
     return Section(
         "The lab",
-        "Cameras, screens and beams as found; the vehicle stands in the middle of the stand's positions.",
+        "Calibrated cameras, screens and beams, with the vehicle in the middle of the stand's positions.",
         [PageDrawing(view) for view in scene_views(rig_things(joint.rig, body))],
     )
 
 
 def beam_sigmas(joint: Joint) -> tuple[Array, Array]:
-    """Of each beam: direction (rad) and offset (m), RMS of the two axes across it."""
+    """Sigmas of each beam's direction (rad) and offset (m), RMS over the two axes across the beam."""
     variances = np.array(
         [np.diagonal(joint.all_covariance)[joint.unknowns.places("beams", i)] for i in range(len(joint.rig.beams))]
     )

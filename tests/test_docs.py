@@ -1,0 +1,103 @@
+"""Every command and option that messages, docstrings, reports and documents mention exists."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import click
+import pytest
+
+from cli import main
+from tests.paths import ROOT
+
+PACKAGES = ("geometry", "tracking", "calibration", "lab")
+MENTIONS = (
+    re.compile(r"`(beampose [^`]+)`"),  # a command in backticks
+    re.compile(r"`(calibrate [a-z][^`]*)`"),  # ... without the program's name
+    re.compile(r"^(?: {4,}|\$ )(beampose .+)$", re.MULTILINE),  # a line of example code
+    re.compile(r"(beampose calibrate [a-z-]+)"),  # in running text
+)
+OPTION = re.compile(r"(?<!\S)(--[a-z][a-z-]*)")
+
+
+def strings_of(code: str) -> Iterator[str]:
+    """The string literals of a Python source; the values in an f-string are replaced by a capital letter."""
+    tree = ast.parse(code)
+    parts = {id(part) for node in ast.walk(tree) if isinstance(node, ast.JoinedStr) for part in node.values}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in parts:
+            yield node.value
+        elif isinstance(node, ast.JoinedStr):
+            yield "".join(str(v.value) if isinstance(v, ast.Constant) else "X" for v in node.values)
+
+
+def texts(root: Path) -> Iterator[tuple[str, str]]:
+    """File name and text of all messages, docstrings, templates and documents of the project."""
+    for path in [root / "cli.py", *(p for name in PACKAGES for p in sorted((root / name).rglob("*.py")))]:
+        for text in strings_of(path.read_text(encoding="utf-8")):
+            yield str(path.relative_to(root)), text
+    documents = [*sorted(root.glob("*.md")), *sorted((root / "docs").rglob("*.md")), *sorted(root.rglob("*.j2"))]
+    for path in documents:
+        yield str(path.relative_to(root)), path.read_text(encoding="utf-8")
+
+
+def mentions(text: str) -> Iterator[str]:
+    """The commands that a text names, without the program's name and shell comments."""
+    for pattern in MENTIONS:
+        for found in pattern.findall(text):
+            yield found.removeprefix("beampose ").split(" #")[0].strip()
+
+
+def problem(mention: str) -> str | None:
+    """Why a command cannot be run as it is mentioned; None where it can."""
+    command: click.Command = main
+    words = mention.split()
+    while isinstance(command, click.Group) and words and re.fullmatch(r"[a-z][a-z-]*[.,;:)]?", words[0]):
+        word = words.pop(0).rstrip(".,;:)")
+        if word not in command.commands:
+            return f"`{mention}`: {command.name} has no command {word!r}"
+        command = command.commands[word]
+    known = {"--help", "--version", *(name for p in command.params for name in (*p.opts, *p.secondary_opts))}
+    unknown = [name for name in OPTION.findall(mention) if name not in known]
+    return f"`{mention}`: no option {unknown[0]}" if unknown else None
+
+
+def problems(root: Path) -> list[str]:
+    """All mentions that name no existing command or option."""
+    found = ((name, problem(mention)) for name, text in texts(root) for mention in mentions(text))
+    return sorted({f"{name}: {wrong}" for name, wrong in found if wrong is not None})
+
+
+def test_every_command_that_a_text_names_exists():
+    assert problems(ROOT) == []
+
+
+def test_the_texts_of_the_project_are_read():
+    named = {mention for _, text in texts(ROOT) for mention in mentions(text)}
+    assert len(named) >= 30
+    assert any(mention.startswith("calibrate check") for mention in named)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "run `beampose calibrate daily` again",
+        "find the camera's place again (`calibrate daily`)",
+        "    beampose calibrate check rig.yaml --pionts points.csv",
+        "give it to beampose calibrate screens",
+        "`beampose runs`",
+        "`beampose calibrate beams X --rigs Y`",
+    ],
+)
+def test_a_command_that_does_not_exist_is_found(text):
+    assert [p for m in mentions(text) if (p := problem(m))]
+
+
+@pytest.mark.parametrize(
+    "text", ["`beampose calibrate check`.", "    beampose run X --out Y  # --any", "beampose reads"]
+)
+def test_a_text_without_a_mistake_passes(text):
+    assert not [p for m in mentions(text) if (p := problem(m))]
