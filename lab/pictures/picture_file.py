@@ -7,6 +7,7 @@ Checksums are verified where a format has them. What a library writes to standar
 from __future__ import annotations
 
 import re
+import struct
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeAlias, cast
@@ -15,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lab.pictures.opencv import quiet_cv2
-from lab.pictures.picture_headers import DamagedError, Header, read_header
+from lab.pictures.picture_headers import JPEG_SCAN, DamagedError, Header, jpeg_segments, read_header
 
 SUFFIXES = (".png", ".tif", ".tiff", ".bmp", ".pgm", ".jpg", ".jpeg")
 UNREADABLE = "unreadable"
@@ -127,20 +128,13 @@ def _require_jpeg_end(data: NDArray[np.uint8]) -> None:
     Decoders take the upper part of a file that was cut short for the picture. Within a scan the byte FF is always
     followed by 00 or a restart marker, so FF D9 there is the end and nothing else.
     """
-    view, at = data.data, 2
-    while at + 4 <= len(view):
-        if view[at] != 0xFF:
-            raise DamagedError("damaged (no marker where one must be)")
-        marker = view[at + 1]
-        if marker == 0xFF:  # a fill byte
-            at += 1
-            continue
-        at += 2 + int.from_bytes(view[at + 2 : at + 4], "big")
-        if marker == 0xDA:
-            if bytes(view[at:]).find(b"\xff\xd9") >= 0:
-                return
-            break
-    raise DamagedError("cut short")
+    view = data.data
+    try:
+        *_, (marker, _, end) = jpeg_segments(view)
+    except (struct.error, IndexError):
+        raise DamagedError("cut short") from None
+    if marker != JPEG_SCAN or bytes(view[end:]).find(b"\xff\xd9") < 0:
+        raise DamagedError("cut short")
 
 
 def _tiff(data: NDArray[np.uint8], header: Header) -> NDArray[np.generic]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 import struct
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -20,6 +21,7 @@ Bytes: TypeAlias = memoryview  # of a file's content
 
 MOST_PIXELS = 2**28  # of one picture: the largest sensors have 2^27.3; a header that promises more is wrong
 PNG_MARK = b"\x89PNG\r\n\x1a\n"
+JPEG_END, JPEG_SCAN = 0xD9, 0xDA  # EOI, SOS
 _JPEG_FRAMES = {0xC0 + k for k in range(16)} - {0xC4, 0xC8, 0xCC}  # SOF0 to SOF15 without DHT, JPG, DAC
 _PNM_WORD = re.compile(rb"(?:\s|#[^\r\n]*[\r\n])+([0-9]+)")
 
@@ -83,8 +85,12 @@ def _png(view: Bytes) -> Header:
     return Header("png", width, height)
 
 
-def _jpeg(view: Bytes) -> Header:
-    """Walks the segments to the frame header. Source: ITU T.81, B.2.2."""
+def jpeg_segments(view: Bytes) -> Iterator[tuple[int, int, int]]:
+    """Marker, first byte of the content and end of each segment of a JPEG up to the first scan.
+
+    Source: ITU T.81, B.1.1.4. Raises IndexError or struct.error where the file ends within a segment, DamagedError
+    where a marker is missing.
+    """
     at = 2
     while True:
         if view[at] != 0xFF:
@@ -93,12 +99,20 @@ def _jpeg(view: Bytes) -> Header:
         if marker == 0xFF:  # a fill byte
             at += 1
             continue
+        end = at + 2 + struct.unpack_from(">H", view, at + 2)[0]
+        yield marker, at + 4, end
+        if marker in (JPEG_END, JPEG_SCAN):
+            return
+        at = end
+
+
+def _jpeg(view: Bytes) -> Header:
+    """The frame header. Source: ITU T.81, B.2.2."""
+    for marker, at, _ in jpeg_segments(view):
         if marker in _JPEG_FRAMES:
-            bits, height, width, components = struct.unpack_from(">BHHB", view, at + 4)
+            bits, height, width, components = struct.unpack_from(">BHHB", view, at)
             return Header("jpeg", width, height, "" if bits in (8, 16) else f"{bits} bit", jpeg_components=components)
-        if marker in (0xD9, 0xDA):
-            raise DamagedError("damaged (no frame header before the first scan)")
-        at += 2 + struct.unpack_from(">H", view, at + 2)[0]
+    raise DamagedError("damaged (no frame header before the first scan)")
 
 
 def _tiff(view: Bytes) -> Header:

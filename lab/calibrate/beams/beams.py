@@ -27,7 +27,8 @@ from lab.files.rig.rig_covariance import blocks_of, joint_covariance
 from lab.files.rig.rig_file import RigFile, load_rig_file, save_rig
 from lab.files.rig.screens_file import load_screens
 from lab.files.text.atomic_write import atomic_folder, beside_a_good_one, refuse_foreign
-from lab.files.text.yaml_text import did_you_mean, read_mapping
+from lab.files.text.error_text import did_you_mean
+from lab.files.text.yaml_text import read_mapping
 
 RIG = "rig.yaml"
 

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import csv
-import math
 import tempfile
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,12 +13,13 @@ from geometry.pose import Pose
 from geometry.rig import Rig
 from lab.errors import InputError
 from lab.files.run.results import read_poses, read_spots
-from lab.files.run.truth import load_pose_table
-from lab.files.text.csv_text import check_header, table_bytes
+from lab.files.run.truth import read_true_poses
+from lab.files.text.csv_text import Table, read_table
+from lab.files.text.error_text import did_you_mean
 from lab.files.text.range_checks import SIGMAS_PX, refuse_far_pixels, refuse_sigmas
-from lab.files.text.yaml_text import did_you_mean, shown
 
 PIXELS = ("camera", "point", "u_px", "v_px")
+PLACES = ("x_m", "y_m", "z_m", "sigma_x_m", "sigma_y_m", "sigma_z_m")
 _METRES = 500.0  # a coordinate beyond it is taken for millimetres: no lab is that large
 _LARGEST_GAP_PX = 200.0  # a point that far from where it should be is another point, or another rig
 
@@ -59,53 +57,45 @@ def read_points(path: Path, survey: Path | None, rig: Rig, default_sigma_px: flo
     The places come from `survey` (point,x_m,y_m,z_m[,sigma_x_m,sigma_y_m,sigma_z_m], or point,screen,x_m,y_m for
     coordinates on a screen), or from the same columns of the pixel file itself. Raises InputError.
     """
-    rows = _rows(path, PIXELS)
+    table = read_table(path, PIXELS, ("sigma_px", *PLACES, "screen"))
+    table.require_rows(PIXELS)
     if survey is not None:
-        places = _places(survey, _rows(survey, ("point", "x_m", "y_m")), rig)
-    elif "x_m" in rows[0][1]:
-        places = _places(path, rows, rig)
+        places = _places(_survey_table(survey), rig)
+    elif "x_m" in table:
+        places = _places(table, rig)
     else:
         raise InputError(
             f"{path}: expected the places of its points: columns x_m,y_m,z_m (or screen,x_m,y_m) in this file, or a"
             " survey file beside it (--survey); got neither"
         )
-    camera, point, pixels, sigma, place, sigma_m, screen = [], [], [], [], [], [], []
+    cameras, points = table.names("camera"), table.names("point")
+    pixels = np.stack([table.finite(c) for c in ("u_px", "v_px")], axis=1)
     seen: dict[tuple[str, str], int] = {}
-    for line, row in rows:
-        name = row["camera"]
-        if name not in rig.cameras:
-            raise InputError(
-                f"{path}: line {line}: camera: expected a camera of the rig, got {name!r}"
-                + did_you_mean(name, rig.cameras)
+    for i, (camera, point) in enumerate(zip(cameras, points, strict=True)):
+        if camera not in rig.cameras:
+            raise table.error(
+                i, f"camera: expected a camera of the rig, got {camera!r}{did_you_mean(camera, rig.cameras)}"
             )
-        if row["point"] not in places:
-            near = did_you_mean(row["point"], places)
+        if point not in places:
             raise InputError(
-                f"{survey or path}: expected a place of point {row['point']!r} ({path.name}, line {line}), got none"
-                + near
+                f"{survey or path}: expected a place of point {point!r} ({path.name}, line {table.lines[i]}), got none"
+                + did_you_mean(point, places)
             )
-        key = (name, row["point"])
-        if key in seen:
-            raise InputError(
-                f"{path}: line {line}: expected each point once per camera, got {row['point']!r} of {name!r} again"
-                f" (line {seen[key]} has it); give the mean of repeated readings"
+        if (camera, point) in seen:
+            raise table.error(
+                i,
+                f"expected each point once per camera, got {point!r} of {camera!r} again (line {seen[camera, point]}"
+                " has it); give the mean of repeated readings",
             )
-        seen[key] = line
-        camera.append(name)
-        point.append(row["point"])
-        pixels.append([_number(path, line, row, c) for c in ("u_px", "v_px")])
-        one = _number(path, line, row, "sigma_px") if row.get("sigma_px") else default_sigma_px
-        refuse_sigmas(path, [line], "sigma_px", np.array([one]), SIGMAS_PX, "px")
-        sigma.append(one)
-        p, s, on = places[row["point"]]
-        place.append(p)
-        sigma_m.append(s)
-        screen.append(on)
-    sizes = {name: c.image_size_px for name, c in rig.cameras.items()}
-    refuse_far_pixels(path, [line for line, _ in rows], camera, np.array(pixels), sizes)
+        seen[camera, point] = int(table.lines[i])
+    sigma = table.optional("sigma_px")
+    refuse_sigmas(table, "sigma_px", SIGMAS_PX, "px")
+    refuse_far_pixels(table, {name: c.image_size_px for name, c in rig.cameras.items()})
+    found = [places[point] for point in points]
     return KnownPoints(
-        tuple(camera), tuple(point), np.array(pixels), np.array(sigma), np.array(place), np.array(sigma_m),
-        tuple(screen), "sigma_px" in rows[0][1],
+        tuple(cameras), tuple(points), pixels, np.where(np.isnan(sigma), default_sigma_px, sigma),
+        np.array([place for place, _, _ in found]), np.array([sigma_m for _, sigma_m, _ in found]),
+        tuple(screen for _, _, screen in found), "sigma_px" in table,
     )  # fmt: skip
 
 
@@ -128,66 +118,48 @@ def refuse_other_points(known: KnownPoints, foretold: Array, path: Path) -> None
         )
 
 
-def _rows(path: Path, required: Sequence[str]) -> list[tuple[int, dict[str, str]]]:
-    """Line number and fields, stripped, of each row of a CSV file; one or more. Raises InputError."""
-    text = table_bytes(path, required).decode("utf-8-sig").lstrip("\r\n")
-    check_header(path, text.splitlines()[0], required)
-    lines = list(csv.reader(text.splitlines(), skipinitialspace=True))
-    header = [f.strip() for f in lines[0]]
-    rows = []
-    for number, fields in enumerate(lines[1:], 2):
-        if not any(f.strip() for f in fields):
-            continue
-        if len(fields) != len(header):
-            raise InputError(f"{path}: line {number}: expected {len(header)} fields, got {len(fields)}")
-        rows.append((number, dict(zip(header, (f.strip() for f in fields), strict=True))))
-    if not rows:
-        raise InputError(f"{path}: expected one or more points below the header, got none")
-    return rows
+def _survey_table(path: Path) -> Table:
+    required = ("point", "x_m", "y_m")
+    table = read_table(path, required, (*PLACES, "screen"))
+    table.require_rows(required)
+    return table
 
 
-def _number(path: Path, line: int, row: Mapping[str, str], column: str) -> float:
-    try:
-        value = float(row[column])
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise InputError(f"{path}: line {line}: {column}: expected a finite number, got {shown(row[column] or None)}")
-    return value
-
-
-def _places(
-    path: Path, rows: Sequence[tuple[int, Mapping[str, str]]], rig: Rig
-) -> dict[str, tuple[list[float], list[float], str]]:
+def _places(table: Table, rig: Rig) -> dict[str, tuple[list[float], list[float], str]]:
     """Place, sigmas and screen (empty: world) of each named point."""
-    on_screens = "z_m" not in rows[0][1]
-    if on_screens and "screen" not in rows[0][1]:
-        raise InputError(f"{path}: expected a column 'z_m' (world) or 'screen' (x_m,y_m on a screen), got neither")
+    on_screens = "z_m" not in table
+    if on_screens and "screen" not in table:
+        raise InputError(
+            f"{table.path}: expected a column 'z_m' (world) or 'screen' (x_m,y_m on a screen), got neither"
+        )
+    names = ("x_m", "y_m") if on_screens else ("x_m", "y_m", "z_m")
+    places = np.stack([table.finite(c) for c in names], axis=1)
+    sigmas = np.nan_to_num(np.stack([table.optional(f"sigma_{name}") for name in names], axis=1))
+    screens = table.names("screen", may_be_empty=True) if on_screens else [""] * len(table)
+    fill = [0.0] * (3 - len(names))
     out: dict[str, tuple[list[float], list[float], str]] = {}
-    for line, row in rows:
-        names = ("x_m", "y_m") if on_screens else ("x_m", "y_m", "z_m")
-        place = [_number(path, line, row, c) for c in names]
+    for i, point in enumerate(table.names("point")):
+        place, sigma = places[i].tolist(), sigmas[i].tolist()
         if max(map(abs, place)) > _METRES:
-            raise InputError(
-                f"{path}: line {line}: {','.join(names)}: expected metres, got {max(place, key=abs):g};"
-                " are these millimetres? divide by 1000"
+            raise table.error(
+                i,
+                f"{','.join(names)}: expected metres, got {max(place, key=abs):g}; are these millimetres? divide by"
+                " 1000",
             )
-        sigma = [_number(path, line, row, f"sigma_{c}") if row.get(f"sigma_{c}") else 0.0 for c in names]
         if not 0 <= min(sigma) <= max(sigma) <= _METRES:
-            raise InputError(
-                f"{path}: line {line}: expected sigmas in metres, 0 to {_METRES:g}, got"
-                f" {min(sigma) if min(sigma) < 0 else max(sigma):g}; correct it, or leave the field empty"
+            raise table.error(
+                i,
+                f"expected sigmas in metres, 0 to {_METRES:g}, got {min(sigma) if min(sigma) < 0 else max(sigma):g};"
+                " correct it, or leave the field empty",
             )
-        screen = row["screen"] if on_screens else ""
-        if on_screens and screen not in rig.screens:
-            raise InputError(
-                f"{path}: line {line}: screen: expected a screen of the rig, got {screen!r}"
-                f"{did_you_mean(screen, rig.screens)}"
+        if on_screens and screens[i] not in rig.screens:
+            raise table.error(
+                i,
+                f"screen: expected a screen of the rig, got {screens[i]!r}{did_you_mean(screens[i], rig.screens)}",
             )
-        fill = [0.0] * (3 - len(place))
-        entry = (place + fill, sigma + fill, screen)
-        if out.setdefault(row["point"], entry) != entry:
-            raise InputError(f"{path}: line {line}: point {row['point']!r} has two different places; name them apart")
+        entry = (place + fill, sigma + fill, screens[i])
+        if out.setdefault(point, entry) != entry:
+            raise table.error(i, f"point {point!r} has two different places; name them apart")
     return out
 
 
@@ -253,12 +225,11 @@ def _still(results: Path, rig: Rig, named: Path) -> StillSpots:
 
 def read_still_pose(path: Path) -> Pose:
     """The pose of a vehicle that stands still, from a pose.csv (columns of truth/pose.csv). Raises InputError."""
-    table = load_pose_table(path)
-    if not len(table):
+    true = read_true_poses(path)
+    if not len(true.frame):
         raise InputError(f"{path}: expected one or more rows, got none")
-    positions = table[["x_m", "y_m", "z_m"]].to_numpy(dtype=float)
-    turns = table[["qw", "qx", "qy", "qz"]].to_numpy(dtype=float)
-    poses = Pose.from_quaternion(turns / np.linalg.norm(turns, axis=1, keepdims=True), positions)
+    turns = true.quaternion_wxyz
+    poses = Pose.from_quaternion(turns / np.linalg.norm(turns, axis=1, keepdims=True), true.position_m)
     apart = poses[0].minus(poses)
     if np.abs(apart[:, :3]).max() > 1e-4 or np.abs(apart[:, 3:]).max() > 1e-4:
         raise InputError(

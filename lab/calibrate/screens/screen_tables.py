@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import csv
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from calibration.screens.screens import ScreensResult
+from lab.files.text.csv_text import write_table
 
 RESIDUALS, DOTS = "residuals.csv", "dots.csv"
 RESIDUAL_COLUMNS = ("camera", "point", "u_px", "v_px", "residual_u_px", "residual_v_px", "sigmas", "used")
@@ -35,7 +34,7 @@ def write_tables(result: ScreensResult, folder: Path) -> None:
         for i in range(len(c)):
             names = [cameras[c.camera[i]], network.placements[c.placement[i]]]
             rows.append([*names, *c.pixels[i].round(4), *fit.corner_errors_px[i].round(4), round(float(off[i]), 3), 1])
-    _write_csv(folder / RESIDUALS, RESIDUAL_COLUMNS, rows)
+    write_table(folder / RESIDUALS, RESIDUAL_COLUMNS, rows)
     height = np.full(len(network.dots), np.nan)
     used = np.ones(len(network.dots), dtype=bool)
     for screen in result.screens:
@@ -48,11 +47,4 @@ def write_tables(result: ScreensResult, folder: Path) -> None:
         over = "" if np.isnan(height[i]) else round(float(height[i]), 7)
         screen_name = "" if k < 0 else screens[k]
         dots.append([name, screen_name, *places[i].round(7), *fit.dot_shifts_m[i].round(7), over, int(used[i])])
-    _write_csv(folder / DOTS, DOT_COLUMNS, dots)
-
-
-def _write_csv(path: Path, columns: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
-    with path.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(columns)
-        writer.writerows(rows)
+    write_table(folder / DOTS, DOT_COLUMNS, dots)

@@ -28,6 +28,7 @@ from lab.files.rig.calibration_state import Day
 from lab.files.rig.camera_file import CameraFile, load_camera
 from lab.files.rig.interchange import read_cameras
 from lab.files.rig.rig_file import PoseBlock, TargetBlock, no_such
+from lab.files.text.error_text import FileError, did_you_mean
 from lab.files.text.fields import (
     Block,
     FromZero,
@@ -45,7 +46,7 @@ from lab.files.text.fields import (
     validated,
     wrong,
 )
-from lab.files.text.yaml_text import FileError, did_you_mean, read_mapping
+from lab.files.text.yaml_text import read_mapping
 
 SCHEMA = "beampose/calibration/1"
 BOW = ("auto", "always", "never")

@@ -22,6 +22,7 @@ from lab.files.rig.camera_block import (
     covariance_mistake,
     lens_mapping,
 )
+from lab.files.text.error_text import did_you_mean
 from lab.files.text.fields import (
     Block,
     FromZero,
@@ -35,7 +36,7 @@ from lab.files.text.fields import (
     validated,
     wrong,
 )
-from lab.files.text.yaml_text import did_you_mean, read_mapping, write_mapping
+from lab.files.text.yaml_text import read_mapping, write_mapping
 
 SCHEMA = "beampose/camera/1"
 

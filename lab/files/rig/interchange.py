@@ -18,7 +18,9 @@ from lab.files.rig.camera_block import Covariance
 from lab.files.rig.camera_file import CameraFile, load_camera, save_camera
 from lab.files.rig.rig_file import SCHEMA as RIG_SCHEMA
 from lab.files.rig.rig_file import RigFile, load_rig_file
-from lab.files.text.yaml_text import atomic_write_text, did_you_mean, parse_mapping, read_text
+from lab.files.text.atomic_write import atomic_write_text
+from lab.files.text.error_text import did_you_mean
+from lab.files.text.yaml_text import parse_mapping, read_text
 
 BEAMPOSE, RIG = "beampose", "beampose-rig"
 _FOREIGN: Mapping[str, ModuleType] = {m.NAME: m for m in (opencv_yaml, kalibr, ros, colmap, mrcal)}

@@ -14,8 +14,9 @@ from lab.files.rig.calibration_state import CalibrationState, CalibrationStateBl
 from lab.files.rig.camera_block import Covariance, CovarianceBlock, covariance_mapping
 from lab.files.rig.rig_covariance import TARGET, joint_covariance
 from lab.files.rig.rig_file import CameraBlock, ScreenBlock, camera_mapping, no_such, screen_mapping
+from lab.files.text.error_text import FileError
 from lab.files.text.fields import Block, Word, one_of, validated
-from lab.files.text.yaml_text import FileError, read_mapping, write_mapping
+from lab.files.text.yaml_text import read_mapping, write_mapping
 
 SCHEMA = "beampose/screens/1"
 

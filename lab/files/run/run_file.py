@@ -21,6 +21,7 @@ from lab.files.rig.calibration_state import CalibrationState, OptionalDay
 from lab.files.rig.rig_covariance import joint_covariance
 from lab.files.rig.rig_file import load_rig_file
 from lab.files.run.times import Times, load_times
+from lab.files.text.error_text import FileError, did_you_mean
 from lab.files.text.fields import (
     Block,
     FromZero,
@@ -34,7 +35,7 @@ from lab.files.text.fields import (
     validated,
     wrong,
 )
-from lab.files.text.yaml_text import FileError, did_you_mean, read_mapping, write_mapping
+from lab.files.text.yaml_text import read_mapping, write_mapping
 from lab.pictures.picture_file import SUFFIXES
 from tracking.parameters import TrackerParameters
 

@@ -18,7 +18,7 @@ import pydantic
 from pydantic_core import PydanticCustomError
 
 from lab.errors import InputError
-from lab.files.text.yaml_text import FileError, did_you_mean, shown
+from lab.files.text.error_text import FileError, did_you_mean, shown
 
 T = TypeVar("T")
 M = TypeVar("M", bound="Block")

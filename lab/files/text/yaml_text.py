@@ -7,53 +7,17 @@ spots `1` and `"1"` are the same spot.
 
 from __future__ import annotations
 
-import difflib
 import math
-import os
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from lab.errors import InputError
-
-
-class FileError(InputError):
-    """What is wrong in one file: a line for each mistake. The message shows the first and counts the rest."""
-
-    def __init__(self, lines: Iterable[str]) -> None:
-        self.lines = tuple(lines)
-        more = len(self.lines) - 1
-        tail = f"\n(and {more} more in this file: `beampose check` lists them)" if more else ""
-        super().__init__(self.lines[0] + tail)
-
-
-def did_you_mean(word: object, known: Iterable[str]) -> str:
-    """`; did you mean 'frames'?` or, where nothing is near, `; known: ...`; empty where nothing is known."""
-    known = [str(k) for k in known]
-    near = difflib.get_close_matches(str(word), known, n=1, cutoff=0.6)
-    if not near:
-        lowered = {k.lower(): k for k in known}
-        near = [lowered[str(word).lower()]] if str(word).lower() in lowered else []
-    if near:
-        return f"; did you mean {near[0]!r}?"
-    return f"; known: {', '.join(known)}" if known else ""
-
-
-def shown(value: object) -> str:
-    """A value as an error line shows it: short, and in the file's terms."""
-    if value is None:
-        return "nothing"
-    if isinstance(value, Mapping):
-        return f"a mapping with {', '.join(map(str, value)) or 'no keys'}"[:70]
-    if isinstance(value, bool):
-        return str(value).lower()
-    text = repr(value)
-    if len(text) > 50 and isinstance(value, list):
-        return f"a list of {len(value)}"
-    return text if len(text) <= 50 else text[:46] + " ..."
+from lab.files.text.atomic_write import atomic_write_text
+from lab.files.text.error_text import shown
 
 
 class _StrictLoader(yaml.SafeLoader):
@@ -197,26 +161,3 @@ _Writer.add_representer(dict, _represent_dict)
 def write_mapping(content: Mapping[str, Any], path: Path) -> None:
     """Write plain values as YAML: floats to the last bit, complete or not at all."""
     atomic_write_text(yaml.dump(dict(content), Dumper=_Writer, sort_keys=False, allow_unicode=True, width=120), path)
-
-
-_WRITE_CURES = {
-    IsADirectoryError: "; name a file in it",
-    FileNotFoundError: "; make its folder first",
-    NotADirectoryError: "; choose another place",
-    PermissionError: "; choose another place, or ask for the right to write there",
-}
-
-
-def atomic_write_text(text: str, path: Path) -> None:
-    """Write a text file so that `path` is either the whole new file or what it was before."""
-    beside = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        with beside.open("w", encoding="utf-8", newline="\n") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        beside.replace(path)
-    except OSError as error:
-        beside.unlink(missing_ok=True)
-        remedy = next((text for kind, text in _WRITE_CURES.items() if isinstance(error, kind)), "")
-        raise InputError(f"{path}: cannot be written: {error.strerror}{remedy}") from None

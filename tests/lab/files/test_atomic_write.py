@@ -195,7 +195,7 @@ def test_a_free_place_and_earlier_results_are_no_mistake_and_nothing_is_made(tmp
         lambda out: importlib.import_module("lab.calibrate.beams.beams").calibrate_beams(Path("none.yaml"), out),
         lambda out: importlib.import_module("lab.calibrate.rig.rig").calibrate_rig(Path("none.yaml"), out),
         lambda out: importlib.import_module("lab.calibrate.camera.camera").calibrate_camera([], "none", out),
-        lambda out: importlib.import_module("lab.calibrate.drift_check.drift_check").daily_check(
+        lambda out: importlib.import_module("lab.calibrate.drift_check.drift_check").check_drift(
             Path("none.yaml"), out
         ),
         lambda out: importlib.import_module("lab.plan.plan").plan_rig(Path("none.yaml"), out),

@@ -69,15 +69,15 @@ def test_without_sigmas_a_tenth_of_a_pixel_is_assumed_and_said(tmp_path):
 
 AGAIN = "the same point a second time, or one less than 0.05 px from it"
 BAD_ROWS = [
-    (row(1.5, "left", 1, 2), "the frame is no whole number", "frame 1.5"),
-    (row("", "left", 1, 2), "the frame is no whole number", "frame nothing"),
-    (row("1e300", "left", 1, 2), "the frame is no whole number", "frame 1e+300"),
-    (row("one", "left", 1, 2), "the frame is no whole number", "frame 'one'"),
+    (row(1.5, "left", 1, 2), "the frame is not a whole number", "frame 1.5"),
+    (row("", "left", 1, 2), "the frame is not a whole number", "frame nothing"),
+    (row("1e300", "left", 1, 2), "the frame is not a whole number", "frame 1e+300"),
+    (row("one", "left", 1, 2), "the frame is not a whole number", "frame 'one'"),
     (row(-1, "left", 1, 2), "the frame is negative; frames count from 0", "frame -1"),
     (row(1, "", 1, 2), "no camera is named", ""),
-    (row(1, "left", "nan", 2), "u_px or v_px is no finite number", "u_px 'nan' and v_px 2"),
-    (row(1, "left", 1, "inf"), "u_px or v_px is no finite number", "u_px 1 and v_px inf"),
-    (row(1, "left", 1, "12;5"), "u_px or v_px is no finite number", "u_px 1 and v_px '12;5'"),
+    (row(1, "left", "nan", 2), "u_px or v_px is not a finite number", "u_px 'nan' and v_px 2"),
+    (row(1, "left", 1, "inf"), "u_px or v_px is not a finite number", "u_px 1 and v_px inf"),
+    (row(1, "left", 1, "12;5"), "u_px or v_px is not a finite number", "u_px 1 and v_px '12;5'"),
     (row(1, "left", -1e12, 2), "u_px or v_px is beyond 1000000 px: no picture is so wide", "u_px -1e+12 and v_px 2"),
     (row(1, "left", 1, 2, sigma=0), "a sigma is not above 0", "sigma_u_px 0 and sigma_v_px 0"),
     (row(1, "left", 1, 2, sigma=-0.1), "a sigma is not above 0", "sigma_u_px -0.1 and sigma_v_px -0.1"),
@@ -91,7 +91,7 @@ BAD_ROWS = [
     (row(0, " left", 5, 6), AGAIN, "u_px 5 and v_px 6"),
     (row(0, "left", 5.02, 5.98), AGAIN, "u_px 5.02 and v_px 5.98"),
     # the last line of a writer that was killed
-    ("1,le", "u_px or v_px is no finite number", "u_px nothing and v_px nothing"),
+    ("1,le", "u_px or v_px is not a finite number", "u_px nothing and v_px nothing"),
 ]  # fmt: skip
 
 
@@ -102,13 +102,13 @@ def test_a_row_that_cannot_be_used_is_left_out_and_said(bad, why, found, tmp_pat
     assert len(file.cameras["left"].points) == 1
     assert (file.first, file.last) == (0, 0)
     shown = f", with {found}" if found else ""
-    assert [n.split(": ", 1)[1] for n in file.notes] == [f"1 of 2 rows left out: {why} (the first near line 3{shown})"]
+    assert [n.split(": ", 1)[1] for n in file.notes] == [f"1 of 2 rows left out: {why} (the first in line 3{shown})"]
 
 
 def test_a_line_with_too_many_fields_is_left_out_and_said(tmp_path):
     file = read_detections(table(tmp_path, row(0, "left", 5, 6), row(1, "left", 5, 6) + ",7,8", row(2, "left", 5, 6)))
     assert list(file.cameras["left"].frames) == [0, 2]
-    assert file.notes[0].endswith("1 lines left out: more fields than the header has")
+    assert file.notes[0].endswith("1 line left out: more fields than the header has")
 
 
 @pytest.mark.parametrize(
@@ -216,7 +216,7 @@ def test_a_few_frames_far_from_all_others_are_left_out_and_the_run_is_kept(tmp_p
     folder = points_for_right(tmp_path / "a", *rows)
     reader = open_frames(load_run(folder))
     assert (reader.first, reader.last) == (0, 599)
-    far = "1 of 601 rows left out: the frame is more than 10000 numbers away from the others (the first near line 302,"
+    far = "1 of 601 rows left out: the frame is more than 10000 numbers away from the others (the first in line 302,"
     assert any(far in n and n.endswith("with frame 1e+09)") for n in reader.notes)
 
 
@@ -253,7 +253,7 @@ def test_a_camera_of_whose_rows_none_can_be_used_is_refused_with_the_reason(tmp_
     rows = [row(f, "right", 5, 6, sigma=0) for f in range(3)]
     folder = points_for_right(tmp_path / "a", *rows, row(0, "left", 5, 6))
     words = (
-        r"camera 'right': expected rows that can be used, got none: a sigma is not above 0 \(the first near line 2,"
+        r"camera 'right': expected rows that can be used, got none: a sigma is not above 0 \(the first in line 2,"
         r" with sigma_u_px 0 and sigma_v_px 0\); put them right, or leave 'right' out of `cameras` in .*run\.yaml"
     )
     with pytest.raises(InputError, match=words):

@@ -162,7 +162,7 @@ SURVEY = "point,x_m,y_m,z_m,sigma_x_m,sigma_y_m,sigma_z_m,screen\n"
         (SURVEY.replace(",", ";"), "expected columns separated by commas, got semicolons; separate columns"),
         (SURVEY.encode("utf-16"), "not text in UTF-8; save it as CSV"),
         (b"\x89PNG\r\n\0\0", "not text in UTF-8; save it as CSV"),
-        (SURVEY.encode() + b"P\xfcnkt,0,0,0,,,,\n", "line 2: expected text in UTF-8, got a byte that is none; save"),
+        (SURVEY.encode() + b"P\xfcnkt,0,0,0,,,,\n", "line 2: expected text in UTF-8, got an invalid byte; save"),
         (
             SURVEY + "P1,0,0,0,,,,\nP1,1,0,0,,,,\n",
             r"line 3: .* each point once, got 'P1' again \(first in survey.csv, line 2\)",
@@ -170,7 +170,7 @@ SURVEY = "point,x_m,y_m,z_m,sigma_x_m,sigma_y_m,sigma_z_m,screen\n"
         (SURVEY + "P1,0,0,0,0,1,1,\n", "line 2: sigma_x_m: expected a number above 0, got 0"),
         (SURVEY + "P1,0,0,0,,,,lefd\n", "line 2: screen: .* got 'lefd'; did you mean 'left'"),
         (SURVEY + ",0,0,0,,,,\n", "line 2: point: expected a name"),
-        (SURVEY + "P1,0,0,0,,,,\nP2,1,5,0,0,1,1,1,left,9\n", "more fields than the header"),
+        (SURVEY + "P1,0,0,0,,,,\nP2,1,5,0,0,1,1,1,left,9\n", "line 3: expected 8 fields as in the header, got more"),
     ],
 )
 def test_surveys_that_cannot_be_used_say_which_line_and_why(tmp_path, text, words):
@@ -260,7 +260,7 @@ def test_poses_of_a_stand_are_read_with_the_sigmas_that_they_have(tmp_path):
             "0,0,0,0,0,1,1,0,0\n",
             "line 2: .*quaternion of length 1, got one of length 1.414214; give all digits, or divide",
         ),
-        ("0,0,0,0,0,0,0,0,0\n", "line 2: .*got one of length 0; where nothing is turned it is 1,0,0,0"),
+        ("0,0,0,0,0,0,0,0,0\n", "line 2: .*got one of length 0; without rotation it is 1,0,0,0"),
         ("0,0,0,inf,0,1,0,0,0\n", "line 2: y_m: expected a number, got inf"),
         ("0,0,0,1e300,0,1,0,0,0\n", "line 2: y_m: expected metres, within 10 km"),
         ("0,later,0,0,0,1,0,0,0\n", "line 2: t_s: expected seconds, got 'later'"),
