@@ -21,7 +21,8 @@ from lab.calibrate.beams.recording_check import refuse_known_mistakes, refuse_re
 from lab.calibrate.beams.recordings import Recordings, read_recordings, stand_of
 from lab.calibrate.calibration_day import day_of, expired
 from lab.errors import CalibrationError, InputError
-from lab.files.project.project import Project, load_project
+from lab.files.project.project import load_project
+from lab.files.project.project_types import Project
 from lab.files.rig.calibration_state import CalibrationState
 from lab.files.rig.rig_covariance import blocks_of, joint_covariance
 from lab.files.rig.rig_file import RigFile, load_rig_file, save_rig

@@ -23,7 +23,7 @@ from lab.calibrate.screens.screen_boards import board_views
 from lab.errors import InputError
 from lab.files.project.cloud_file import read_cloud
 from lab.files.project.point_files import Observations, Survey, read_observations, read_survey
-from lab.files.project.project import Cloud, Project, ScreenEntry
+from lab.files.project.project_types import Cloud, Project, ScreenEntry
 from lab.files.text.error_text import did_you_mean
 from lab.files.text.range_checks import FARTHEST_IN_SCAN
 

@@ -16,7 +16,7 @@ from calibration.screens.screens import ScreensResult, calibrate
 from calibration.screens.survey_suspects import SurveySuspect, misfit_of, suspects
 from lab.calibrate.screens.screen_inputs import ScreenInputs
 from lab.errors import CalibrationError, InputError
-from lab.files.project.project import Project
+from lab.files.project.project_types import Project
 
 _SUSPICIOUS = 4.0  # misfit (see survey_suspects.py) from which swapped axes and wrong units are looked for
 _CURED = 2.0  # misfit up to which a change to the survey counts as what was wrong
