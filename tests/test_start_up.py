@@ -1,4 +1,4 @@
-"""What a command imports: nobody waits for a library that has no part in it."""
+"""What a command imports: start-up does not load libraries that the command does not use."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ except SystemExit:
     pass
 print("LOADED", *sorted(sys.modules))
 """
-# Imports modules as usual, and says which were there when the tables were begun.
+# Imports modules as usual, and prints those that were loaded when the tables were opened.
 WATCHED = """
 import sys
 import lab.runs.tables
@@ -59,7 +59,7 @@ def loaded(code: str, *arguments: str, word: str = "LOADED") -> set[str]:
         ("calibrate", "rig", "--help"),
     ],
 )
-def test_help_and_version_import_no_library_but_the_command_lines(arguments):
+def test_help_and_version_import_no_library_but_click(arguments):
     heavy = {"numpy", "scipy", "cv2", "pandas", "numba", "pydantic", "yaml", "jinja2", "rich"}
     assert heavy & loaded(REPORT, *arguments) == set()
 

@@ -18,7 +18,8 @@ from lab.calibrate.beams.stationary_frames import SpotRows, average, positions_a
 from lab.errors import InputError
 from lab.files.project.point_files import StandPoses, read_poses
 from lab.files.project.project_types import Project, RecordingEntry
-from lab.files.text.csv_text import Table, read_table
+from lab.files.text.csv_table import Table
+from lab.files.text.csv_text import read_table
 from lab.files.text.error_text import did_you_mean, shown_line
 from lab.files.text.range_checks import SIGMAS_PX, refuse_far_pixels, refuse_sigmas
 

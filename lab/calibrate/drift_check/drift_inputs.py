@@ -14,7 +14,8 @@ from geometry.rig import Rig
 from lab.errors import InputError
 from lab.files.run.results import read_poses, read_spots
 from lab.files.run.truth import read_true_poses
-from lab.files.text.csv_text import Table, read_table
+from lab.files.text.csv_table import Table
+from lab.files.text.csv_text import read_table
 from lab.files.text.error_text import did_you_mean
 from lab.files.text.range_checks import SIGMAS_PX, refuse_far_pixels, refuse_sigmas
 

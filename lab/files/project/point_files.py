@@ -12,7 +12,8 @@ from geometry.arrays import Array, Ints
 from geometry.pose import Pose
 from lab.files.run.truth import refuse_other_lengths
 from lab.files.text import columns
-from lab.files.text.csv_text import Table, read_table
+from lab.files.text.csv_table import Table
+from lab.files.text.csv_text import read_table
 from lab.files.text.error_text import did_you_mean
 from lab.files.text.range_checks import (
     FARTHEST_M,

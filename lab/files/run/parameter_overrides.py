@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
-from lab.files.text.fields import dataclass_from_yaml
+from lab.files.text.dataclass_fields import dataclass_from_yaml
 from tracking.parameters import TrackerParameters
 
 

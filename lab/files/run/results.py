@@ -15,7 +15,8 @@ from geometry.pose import Pose
 from lab.errors import InputError
 from lab.files.text import columns
 from lab.files.text.columns import CAUSAL
-from lab.files.text.csv_text import Categorical, Table, read_table
+from lab.files.text.csv_table import Categorical, Table
+from lab.files.text.csv_text import read_table
 from tracking.statuses import PoseStatus, SpotStatus
 
 SPOT_STATUSES = tuple(SpotStatus)

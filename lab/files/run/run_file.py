@@ -21,6 +21,7 @@ from lab.files.rig.calibration_state import CalibrationState, OptionalDay
 from lab.files.rig.rig_covariance import joint_covariance
 from lab.files.rig.rig_file import load_rig_file
 from lab.files.run.times import Times, load_times
+from lab.files.text.dataclass_fields import dataclass_from_yaml
 from lab.files.text.error_text import FileError, did_you_mean
 from lab.files.text.fields import (
     Block,
@@ -29,7 +30,6 @@ from lab.files.text.fields import (
     Text,
     Vector3,
     Word,
-    dataclass_from_yaml,
     one_of,
     unexpected,
     validated,

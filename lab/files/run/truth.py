@@ -18,7 +18,8 @@ from geometry.rig import Rig
 from lab.files.rig.rig_file import QUATERNION_TOLERANCE
 from lab.files.run.run_file import Run
 from lab.files.text import columns
-from lab.files.text.csv_text import Categorical, Table, read_table
+from lab.files.text.csv_table import Categorical, Table
+from lab.files.text.csv_text import read_table
 from lab.files.text.error_text import did_you_mean
 
 COMPARED = 500  # frames at most that `largest_disagreement_px` compares, evenly spread: enough to show a wrong rig

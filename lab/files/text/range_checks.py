@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from lab.files.text.csv_text import Table
+from lab.files.text.csv_table import Table
 
 FARTHEST_M = 10_000.0  # m from the origin: coordinates of a national grid must be transformed to a local frame first
 FARTHEST_IN_SCAN = 1e8  # units of a scanned cloud, which may be millimetres and in a national grid

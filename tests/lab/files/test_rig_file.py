@@ -367,7 +367,7 @@ def test_a_file_that_is_not_there_or_no_text_is_told_so(tmp_path):
     with pytest.raises(InputError, match="cannot be read: Is a directory"):
         load_rig(tmp_path)
     (tmp_path / "rig.yaml").write_bytes("name: Prüfstand".encode("latin-1"))
-    with pytest.raises(InputError, match="expected UTF-8 text, got a byte that is none at position 8"):
+    with pytest.raises(InputError, match="expected UTF-8 text, got an invalid byte at position 8"):
         load_rig(tmp_path / "rig.yaml")
 
 
