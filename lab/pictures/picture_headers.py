@@ -1,6 +1,6 @@
-"""What the header of a picture file promises: its kind, size and depth, known before anything is decoded.
+"""Headers of picture files: kind, size and depth, read before anything is decoded.
 
-A few bytes can promise a picture of any size: a PNG of 0.9 MB that holds 30000x30000 px takes 3.7 GB to decode.
+A small file can declare a picture of any size: a PNG of 0.9 MB with 30000x30000 px needs 3.7 GB to decode.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from lab.pictures.inflate import crc32
 from lab.pictures.tiff import KNOWN_COMPRESSIONS, TIFF_MARKS, Tiff
 
-Bytes: TypeAlias = memoryview  # of a file's content
+Bytes: TypeAlias = memoryview  # content of a file
 
-MOST_PIXELS = 2**28  # of one picture: the largest sensors have 2^27.3; a header that promises more is wrong
+MOST_PIXELS = 2**28  # of one picture: the largest sensors have 2^27.3; a header with more is wrong
 PNG_MARK = b"\x89PNG\r\n\x1a\n"
 JPEG_END, JPEG_SCAN = 0xD9, 0xDA  # EOI, SOS
 _JPEG_FRAMES = {0xC0 + k for k in range(16)} - {0xC4, 0xC8, 0xCC}  # SOF0 to SOF15 without DHT, JPG, DAC
@@ -27,36 +27,35 @@ _PNM_WORD = re.compile(rb"(?:\s|#[^\r\n]*[\r\n])+([0-9]+)")
 
 
 class DamagedError(Exception):
-    """A picture that cannot be used. The message is the reason, as it follows `unreadable: `."""
+    """A picture that cannot be used. The message is the reason, to follow `unreadable: `."""
 
 
 @dataclass(frozen=True, slots=True)
 class Header:
-    """What a picture file says of itself."""
+    """The header of a picture file."""
 
     kind: str  # "png", "jpeg", "tiff", "bmp", "pnm"
     width: int  # px
     height: int  # px
-    numbers: str = ""  # what a sample is where that is neither 8 nor 16 bits without sign, such as "float32"
+    numbers: str = ""  # sample type such as "float32"; empty: unsigned, 16 bits or fewer
     tiff: Tiff | None = None
     pnm: tuple[int, int, int] = (0, 0, 0)  # digit after the P, largest value, first byte of the content
     jpeg_components: int = 0
 
     def require_sound(self) -> None:
-        """Raises DamagedError where no picture of this size and depth can be used, whatever the rig says."""
+        """Raises DamagedError for a size or depth that no camera of a rig can have."""
         if self.width < 1 or self.height < 1:
             raise DamagedError(f"damaged (the header says {self.width}x{self.height} px)")
         if self.width * self.height > MOST_PIXELS:
             raise DamagedError(
-                f"the header says {self.width}x{self.height} px, more than the {MOST_PIXELS / 1e6:.0f} million that"
-                " a picture may have"
+                f"the header says {self.width}x{self.height} px, more than the limit of {MOST_PIXELS / 1e6:.0f} million"
             )
         if self.numbers:
             raise DamagedError(f"{self.numbers} numbers, expected 8 or 16 bits without sign")
 
 
 def read_header(data: NDArray[np.uint8]) -> Header:
-    """The header of a picture file, (n,) bytes. Raises DamagedError where it is none, or is cut short."""
+    """The header of a picture file, (n,) bytes. Raises DamagedError where it is not a picture, or truncated."""
     view = data.data
     start = bytes(view[:8])
     try:
@@ -70,7 +69,7 @@ def read_header(data: NDArray[np.uint8]) -> Header:
             return _bmp(view)
         if re.match(rb"P[1-6]\s", start):
             return _pnm(view)
-    except (struct.error, IndexError):  # ends within the header
+    except (struct.error, IndexError):  # the file ends within the header
         raise DamagedError("cut short") from None
     raise DamagedError("damaged, or no picture (PNG, TIFF, BMP, PGM or JPEG)")
 
@@ -99,7 +98,7 @@ def jpeg_segments(view: Bytes) -> Iterator[tuple[int, int, int]]:
         if marker == 0xFF:  # a fill byte
             at += 1
             continue
-        end = at + 2 + struct.unpack_from(">H", view, at + 2)[0]
+        end = at + 2 if marker == JPEG_END else at + 2 + struct.unpack_from(">H", view, at + 2)[0]
         yield marker, at + 4, end
         if marker in (JPEG_END, JPEG_SCAN):
             return
@@ -120,7 +119,7 @@ def _tiff(view: Bytes) -> Header:
     if tiff.tile is not None and tiff.tile[0] * tiff.tile[1] > MOST_PIXELS:
         raise DamagedError(f"damaged (tiles of {tiff.tile[0]}x{tiff.tile[1]} px)")
     if tiff.compression not in KNOWN_COMPRESSIONS:
-        raise DamagedError(f"packed by a method that is not known (TIFF compression {tiff.compression})")
+        raise DamagedError(f"unknown compression (TIFF compression {tiff.compression})")
     signs = {1: "uint", 2: "int", 3: "float"}
     usual = tiff.sample_format in (1, 4) and tiff.bits in (1, 4, 8, 10, 12, 14, 16)  # 4: not said
     numbers = "" if usual else f"{signs.get(tiff.sample_format, 'unknown')}{tiff.bits}"
@@ -134,7 +133,7 @@ def _bmp(view: Bytes) -> Header:
         width, height = struct.unpack_from("<HH", view, 18)
     else:
         width, height = struct.unpack_from("<ii", view, 18)
-    return Header("bmp", width, abs(height))  # a negative height: the rows stand from top to bottom
+    return Header("bmp", width, abs(height))  # a negative height: rows from top to bottom
 
 
 def _pnm(view: Bytes) -> Header:

@@ -1,7 +1,7 @@
-"""LZW and PackBits, in which TIFF files pack their strips; compiled.
+"""LZW and PackBits decompression of TIFF strips; compiled.
 
-For 8 bits: where a strip cannot be unpacked OpenCV makes zeros of it and says so on standard error only. Of 16 bits it
-gives no picture then, in two thirds of the time (LZW: 6 ms against 9 for 1280x1024).
+For 8 bits only: from a damaged strip OpenCV returns zeros, with a message on standard error only. For 16 bits it
+returns no picture, and is faster (LZW: 6 ms, here 9 ms, for 1280x1024).
 """
 
 from __future__ import annotations
@@ -15,24 +15,25 @@ from geometry.compilation.jit import compiled_for_threads
 
 Bytes: TypeAlias = NDArray[np.uint8]
 
-CLEAR, END, FIRST = 256, 257, 258  # codes of LZW: empty the table, end, the first of the table
-LONGEST = 4096  # codes
-_BEYOND = 8  # bytes that may be written behind the end
+CLEAR, END, FIRST = 256, 257, 258  # LZW codes: clear the table, end of data, first table entry
+LONGEST = 4096  # table size, codes
+_BEYOND = 8  # bytes that may be written after the end
 
 
 def unpacked_lzw(packed: Bytes, size: int) -> Bytes | None:
-    """Unpack LZW to `size` bytes; None where a code is impossible, or it ends before. Source: TIFF 6.0, section 13."""
+    """Decompress LZW to `size` bytes; None where a code is invalid or data are missing. Source: TIFF 6.0, section 13."""
     out = np.empty(CLEAR + size + _BEYOND, np.uint8)
     return out[CLEAR : CLEAR + size] if _unpack_lzw(packed, out, size) == size else None
 
 
 @compiled_for_threads
 def _unpack_lzw(packed: Bytes, out: Bytes, size: int) -> int:
-    """Unpack LZW behind the first 256 bytes of `out`; returns the number of bytes, or -1 where a code is impossible.
+    """Decompress LZW into `out` after its first 256 bytes; returns the number of bytes, or -1 for an invalid code.
 
-    Codes of 9 to 12 bits, the highest bit first; one bit more as soon as one entry less than fits is in the table. An
-    entry is a piece of `out`: where it stands, and its length. The single bytes stand before all others. The entry that
-    a code makes, the string before it and its own first byte, is there before that byte is, so it may name itself.
+    Codes have 9 to 12 bits, highest bit first; the width grows one entry before the table is full for it. A table entry
+    is a range of `out`: start and length. The first 256 bytes of `out` are the single-byte entries. The entry that a
+    code adds is the previous string and the first byte of its own string; it is added before that byte is written, so
+    that a code may refer to its own entry.
     """
     start, length = np.zeros(LONGEST, np.int64), np.ones(LONGEST, np.int64)
     for k in range(CLEAR):
@@ -64,7 +65,7 @@ def _unpack_lzw(packed: Bytes, out: Bytes, size: int) -> int:
         if code >= entries or (code >= CLEAR and code < FIRST):
             return -1
         begin, count = int(start[code]), int(length[code])
-        for k in range(_BEYOND):  # most are shorter: a fixed number is copied faster than a small unknown one
+        for k in range(_BEYOND):  # most strings are shorter; copying a fixed number is faster
             out[done + k] = out[begin + k]
         if count > _BEYOND:
             count = min(count, end - done)
@@ -77,7 +78,7 @@ def _unpack_lzw(packed: Bytes, out: Bytes, size: int) -> int:
 
 @compiled_for_threads
 def unpacked_bits(packed: Bytes, out: Bytes) -> int:
-    """Unpack PackBits into `out`; returns the number of bytes, or -1 where they are not enough.
+    """Decompress PackBits into `out`; returns the number of bytes, or -1 where data are missing.
 
     Source: TIFF 6.0 (1992), section 9.
     """

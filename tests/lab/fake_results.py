@@ -1,4 +1,4 @@
-"""A results folder in the contract's form, made from the forward model: truth plus noise, no tracker involved.
+"""A results folder in the format of the contract, from the forward model: truth plus noise, without a tracker.
 
 The noise is drawn from the covariances that the tables state, so a score of them is known in advance: NEES 6, sigmas
 that fit, every label right.
@@ -52,7 +52,7 @@ def fake_rig(n_cameras: int = 2) -> Rig:
 
 @dataclass(frozen=True)
 class Fake:
-    """Where the folders are, and the truth behind them."""
+    """The folders and their truth."""
 
     results: Path
     run_folder: Path
@@ -72,7 +72,7 @@ def make(
     causal: bool = False,
     seed: int = 1,
 ) -> Fake:
-    """Write folder/run and folder/results. causal: also the poses known at each instant, twice as uncertain."""
+    """Write folder/run and folder/results. causal: also causal poses, with twice the sigmas."""
     rng = np.random.default_rng(seed)
     rig = fake_rig(n_cameras)
     model = SpotModel.of(rig)
@@ -172,7 +172,7 @@ def make(
     motion_error = MOTION_SIGMA * rng.normal(size=motion.shape)
 
     def write_poses(which: str, times: float) -> None:
-        """Attitude and covariance with errors and sigmas so many times as large."""
+        """Attitude and covariance with errors and sigmas scaled by a factor."""
         wrong = times * delta  # truth = estimate plus delta; the estimate is therefore the truth minus it
         estimate = Pose(pose.rotation @ rotations.exp(-wrong[:, 3:]), pose.translation - wrong[:, :3])
         C = times**2 * cov
@@ -252,7 +252,7 @@ def without_added_columns(results: Path, folder: Path) -> Path:
 
 
 def _path(t: Array) -> tuple[Array, Pose]:
-    """The vehicle's way: the triangle of its yaw, whose corners are bends, and the poses."""
+    """The motion of the vehicle: a triangle wave of yaw, whose corners are bends, and the poses."""
     triangle = 2 / np.pi * np.arcsin(np.sin(2 * np.pi * t / 3.0))
     ypr = np.radians(np.stack([19 * triangle, 6 * np.sin(1.3 * t), 8 * np.cos(0.9 * t)], -1))
     return triangle, Pose.from_ypr(ypr, np.stack([0.3 * np.sin(t), 0.2 * np.cos(0.7 * t), 0.1 * np.sin(2 * t)], -1))
@@ -297,7 +297,7 @@ def _summary(run_folder: Path, status: Array, word: Array, model: SpotModel) -> 
 
 
 def _pictures(run_folder: Path, model: SpotModel, true_uv: Array, in_view: Array, rng: np.random.Generator) -> None:
-    """Grey pictures with Gaussian spots; the ninth file of the first camera is cut short."""
+    """Grey pictures with Gaussian spots; the ninth file of the first camera is truncated."""
     v, u = np.mgrid[-20:21, -20:21]
     for c, name in enumerate(dict.fromkeys(camera for camera, _ in model.views)):
         (run_folder / "frames" / name).mkdir(parents=True, exist_ok=True)

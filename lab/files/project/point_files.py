@@ -1,4 +1,4 @@
-"""The tables of a calibration project: surveyed points, their pixels, poses of the stand."""
+"""Tables of a calibration project: surveyed points, their pixels, and poses of the stand."""
 
 from __future__ import annotations
 
@@ -35,19 +35,19 @@ DEFAULT_POINT_SIGMA_PX = 0.2  # px, where the table gives none: a printed dot's 
 
 @dataclass(frozen=True, slots=True)
 class Survey:
-    """Surveyed points of one or several files."""
+    """Surveyed points from one or several files."""
 
     names: tuple[str, ...]  # n, each once
     xyz: Array  # (n, 3), m, world
     covariance: Array  # (n, 3, 3), m^2
     screen: tuple[str, ...]  # n: the screen on which a point lies; empty: none, or not stated
     source: tuple[str, ...]  # n: the file of each point
-    notes: tuple[str, ...] = ()  # what was assumed
+    notes: tuple[str, ...] = ()  # assumptions made
 
 
 @dataclass(frozen=True, slots=True)
 class Observations:
-    """Pixels of points, of one or several files."""
+    """Pixels of points from one or several files."""
 
     camera: tuple[str, ...]  # n
     point: tuple[str, ...]  # n
@@ -156,7 +156,7 @@ def read_observations(
 
 
 def read_poses(path: Path) -> StandPoses:
-    """Poses of the stand: the columns of truth/pose.csv, and POSE_SIGMAS where known.
+    """Poses of the stand: the columns of truth/pose.csv, and optionally POSE_SIGMAS.
 
     Raises InputError in one line.
     """

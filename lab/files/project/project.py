@@ -48,8 +48,10 @@ from lab.files.text.yaml_text import read_mapping
 def load_project(path: Path, lab_known: bool = False) -> Project:
     """Read and check a calibration.yaml and the lenses that it names; tables and photographs are not opened.
 
-    path may be the folder of it. lab_known: cameras and screens come from a rig.yaml and may be left out.
-    Raises InputError: file, field, what was expected and what was found.
+    path: the file or its folder. lab_known: cameras and screens come from a rig.yaml and may be left out.
+
+    Raises:
+        InputError: with file, field, what was expected and what was found; FileError for several mistakes.
     """
     path = Path(path)
     if path.is_dir():
@@ -83,7 +85,7 @@ def load_project(path: Path, lab_known: bool = False) -> Project:
 
 @dataclass(frozen=True, slots=True)
 class _Reader:
-    """Turns blocks into values, and notes what is wrong instead of stopping at the first."""
+    """Converts blocks to values, and collects all mistakes instead of stopping at the first."""
 
     folder: Path
     content: ProjectBlock
@@ -100,7 +102,7 @@ class _Reader:
         return path
 
     def files(self, names: Sequence[str], where: str) -> tuple[Path, ...]:
-        """Several files, or the only one, which messages name without a number."""
+        """Several files. In messages they are numbered, unless there is only one."""
         return tuple(self.file(p, where if len(names) == 1 else f"{where}.{i}") for i, p in enumerate(names))
 
     def camera(self, name: str, block: CameraBlock) -> CameraEntry | None:
@@ -155,11 +157,11 @@ class _Reader:
                 if camera in of_camera:
                     self.mistakes.append(
                         f"{where}.photos.{camera}: expected one photograph per placement, got {of_camera[camera].name}"
-                        f" and {path.name} for {placement_of(path)!r}; the number at the end of a name tells it"
+                        f" and {path.name} for {placement_of(path)!r}; the last number of a name is the placement"
                     )
                 of_camera[camera] = path
-        nothing = board_types.Chessboard(3, 3, 1.0)  # never used: a mistake has been noted
-        return SharedBoard(nothing if board is None else board, dict(sorted(photos.items())))
+        placeholder = board_types.Chessboard(3, 3, 1.0)  # not used: the mistake is noted
+        return SharedBoard(placeholder if board is None else board, dict(sorted(photos.items())))
 
     def _pictures(self, patterns: Sequence[str], where: str) -> list[Path]:
         out: list[Path] = []
@@ -197,33 +199,33 @@ class _Reader:
 
 
 def placement_of(photo: Path) -> str:
-    """What tells that photographs of different cameras show a board in the same place: the last number of the name.
+    """The placement of the board in a photograph: the last number of its name, or the name if it has no number.
 
-    left01.jpg and right01.jpg share placement 1; names without a number are compared whole.
+    left01.jpg and right01.jpg show placement 1.
     """
     numbers = re.findall(r"\d+", photo.stem)
     return str(int(numbers[-1])).zfill(6) if numbers else photo.stem
 
 
 def lens_of(path: Path, name: str | None = None) -> CameraFile:
-    """One camera's lens from our camera.yaml or any exchange format. Raises InputError.
+    """The lens of one camera from a camera.yaml or any exchange format. Raises InputError.
 
-    name: which one, where a file holds several.
+    name: the camera, where the file has several.
     """
     cameras = read_cameras(path)
     if name is None and len(cameras) != 1:
         names = ", ".join(c.name for c in cameras)
-        raise InputError(f"{path}: expected one camera, got {len(cameras)} ({names}); say which with `camera: NAME`")
+        raise InputError(f"{path}: expected one camera, got {len(cameras)} ({names}); choose one with `camera: NAME`")
     known = {c.name: c for c in cameras}
     if name is not None and name not in known:
         raise InputError(f"{path}: expected a camera of this file, got {name!r}{did_you_mean(name, known)}")
     model = cameras[0] if name is None else known[name]
-    if len(cameras) == 1 and _is_ours(path):
+    if len(cameras) == 1 and _is_camera_yaml(path):
         return load_camera(path)
     fx, fy, cx, cy = model.pinhole
     matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
     return CameraFile(model.name, model.image_size_px, matrix, model.distortion, model.lens)
 
 
-def _is_ours(path: Path) -> bool:
+def _is_camera_yaml(path: Path) -> bool:
     return re.search(r"^schema:\s*['\"]?beampose/camera/", path.read_text(encoding="utf-8"), re.MULTILINE) is not None

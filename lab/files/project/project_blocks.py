@@ -1,4 +1,4 @@
-"""The blocks of a calibration.yaml: which fields it may have, and which names must exist in it."""
+"""The schema of a calibration.yaml: its fields, and the names that must exist in it."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ _BoardText = Annotated[str, pydantic.PlainValidator(_board)]
 class CameraBlock(Block):
     intrinsics: Word
     screen: Word
-    camera: Word | None = None  # which camera of a file that holds several
+    camera: Word | None = None  # the camera, where the file has several
     near_m: Vector3 | None = None
     within_m: Positive = 0.5
 
@@ -178,7 +178,7 @@ class ProjectBlock(Block):
 
 
 def broken_references(content: ProjectBlock, lab_known: bool) -> list[str]:
-    """Names that nothing in the file bears. lab_known: what is not in it may be in a rig.yaml."""
+    """Mistakes of names that do not exist in the file. lab_known: cameras and screens may be in a rig.yaml instead."""
     out: list[str] = []
     if not lab_known:
         empty = [what for what in ("cameras", "screens") if not getattr(content, what)]
@@ -201,7 +201,7 @@ def broken_references(content: ProjectBlock, lab_known: bool) -> list[str]:
         out += [no_such("camera", c, f"{where}.{c}", content.cameras) for c in photos if c not in content.cameras]
     if content.world is not None and content.world not in content.screens and not elsewhere:
         out.append(no_such("screen", content.world, "world", content.screens))
-    if content.target is not None:  # `calibrate beams` asks the rig for the spots' screens
+    if content.target is not None:  # `calibrate beams` checks the screens of the spots against the rig
         named = {s.screen for s in content.target.spots.values()} if elsewhere else content.screens
         out += content.target.mistakes(named)
     return out

@@ -1,4 +1,4 @@
-"""What the files say of one camera, and of errors: the blocks that rig.yaml and camera.yaml share."""
+"""Blocks that rig.yaml and camera.yaml share: the lens of a camera, and covariances."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from geometry.arrays import Array, symmetric
 from geometry.camera import FISHEYE, LENSES, PERSPECTIVE
 from lab.files.text.fields import Block, Number, Positive, a_number, an_integer, numbers, one_of, unexpected, wrong
 
-# Against the diagonal: what sums in double precision, written with all digits, may miss.
+# Tolerance of symmetry and of eigenvalues, relative to the diagonal: rounding of sums in double precision.
 COVARIANCE_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
 class Covariance:
-    """What a calibration knows of the errors of one camera, one screen or the target."""
+    """Covariance of the parameters of one camera, one screen or the target."""
 
     parameters: tuple[str, ...]  # n names
     matrix: Array  # (n, n), symmetric, in the parameters' units
@@ -72,14 +72,14 @@ class CovarianceBlock(Block):
 
 
 def covariance_mistake(covariance: Covariance) -> str:
-    """What is wrong with a matrix that is no covariance, in a line's words; empty where nothing is."""
+    """The mistake of a matrix that is not a covariance, as text of a message; empty for a covariance."""
     C, names = covariance.matrix, covariance.parameters
     variances = np.diagonal(C)
     if not len(C):
         return ""
     if np.any(variances < 0):
         worst = int(np.argmin(variances))
-        return f"expected variances from zero up on the diagonal, got {variances[worst]:.6g} for {names[worst]}"
+        return f"expected variances of 0 or more on the diagonal, got {variances[worst]:.6g} for {names[worst]}"
     unit = np.sqrt(np.where(variances > 0, variances, 1.0))
     scaled = C / np.outer(unit, unit)
     apart = np.abs(scaled - scaled.T)
@@ -90,7 +90,7 @@ def covariance_mistake(covariance: Covariance) -> str:
             f" for {names[j]}, {names[i]}"
         )
     if np.linalg.eigvalsh(symmetric(scaled))[0] < -COVARIANCE_TOLERANCE * len(C):
-        return "expected a covariance, got a matrix with a negative eigenvalue: correlations that no errors can have"
+        return "expected a covariance, got a matrix with a negative eigenvalue: impossible correlations"
     return ""
 
 
@@ -102,7 +102,7 @@ class _MatrixBlock(Block):
 
 
 class LensBlock(Block):
-    """How a camera draws: picture size, camera matrix, distortion and which model its numbers belong to."""
+    """The lens of a camera: picture size, camera matrix, distortion and lens model."""
 
     image_size_px: Annotated[list[int], pydantic.PlainValidator(_image_size)]
     camera_matrix: _MatrixBlock
@@ -128,7 +128,7 @@ class LensBlock(Block):
 def lens_mapping(
     image_size_px: tuple[int, int], matrix: Array, distortion: tuple[float, ...], lens_name: str
 ) -> dict[str, Any]:
-    """The plain mapping that a `LensBlock` reads back to the same numbers. matrix (3, 3), px."""
+    """The plain mapping from which a `LensBlock` reads the same numbers. matrix (3, 3), px."""
     out: dict[str, Any] = {
         "image_size_px": [int(v) for v in image_size_px],
         "camera_matrix": {
@@ -145,7 +145,7 @@ def lens_mapping(
 
 
 def covariance_mapping(covariance: Covariance) -> dict[str, Any]:
-    """The plain mapping that a `CovarianceBlock` reads back to the same numbers."""
+    """The plain mapping from which a `CovarianceBlock` reads the same numbers."""
     return {
         "parameters": list(covariance.parameters),
         "matrix": [floats(row) for row in covariance.matrix],
@@ -153,5 +153,5 @@ def covariance_mapping(covariance: Covariance) -> dict[str, Any]:
 
 
 def floats(values: Array) -> list[float]:
-    """Plain numbers for a file, without a minus before a zero."""
+    """Plain numbers for a file, without negative zeros."""
     return [float(v) + 0.0 for v in values]

@@ -1,4 +1,4 @@
-"""rig.yaml: what is mounted in the lab, read, checked and written."""
+"""rig.yaml: screens, cameras, and the beams and spots of the vehicle; read, checked and written."""
 
 from __future__ import annotations
 
@@ -34,28 +34,28 @@ from lab.files.text.fields import (
 from lab.files.text.yaml_text import read_mapping, write_mapping
 
 SCHEMA = "beampose/rig/1"
-QUATERNION_TOLERANCE = 1e-6  # what a quaternion written with seven digits may miss of length 1
+QUATERNION_TOLERANCE = 1e-6  # deviation from length 1 of a quaternion written with seven digits
 
 
 @dataclass(frozen=True, slots=True)
 class RigFile:
-    """A rig and what else its file holds. The keys of `covariances` are `cameras.NAME`, `screens.NAME`, `target`.
+    """The content of a rig.yaml. The keys of `covariances` are `cameras.NAME`, `screens.NAME`, `target`.
 
-    lab/files/rig/rig_covariance.py makes one covariance of them.
+    `joint_covariance` (lab/files/rig/rig_covariance.py) combines them.
     """
 
     rig: Rig
     covariances: Mapping[str, Covariance] = field(default_factory=dict)
-    calibration: CalibrationState | None = None  # None: nobody says when and how well it was calibrated
+    calibration: CalibrationState | None = None  # None: not stated
 
 
 def load_rig(path: Path) -> Rig:
-    """The rig that a rig.yaml describes. Raises InputError: one line for a mistake, naming file and field."""
+    """The rig of a rig.yaml. Raises InputError: one line for each mistake, with file and field."""
     return load_rig_file(path).rig
 
 
 def load_rig_file(path: Path) -> RigFile:
-    """The rig of a rig.yaml with its covariance blocks. Raises InputError."""
+    """The rig of a rig.yaml with its covariance blocks and the state of its calibration. Raises InputError."""
     path = Path(path)
     content = validated(_RigBlock, read_mapping(path), path)
     mistakes = _broken_references(content)
@@ -80,7 +80,7 @@ def save_rig(rig: Rig | RigFile, path: Path) -> None:
     write_mapping(content, Path(path))
 
 
-# What the file may hold -----------------------------------------------------------------------------------------
+# The schema of the file ----------------------------------------------------------------------------------------------
 
 
 def _unit_quaternion(value: Any) -> list[float]:
@@ -94,7 +94,7 @@ def _unit_quaternion(value: Any) -> list[float]:
 def _direction(value: Any) -> list[float]:
     d = numbers(3)(value)
     if np.linalg.norm(d) < 1e-9:
-        raise unexpected("a direction, which has a length", value)
+        raise unexpected("a direction, not the zero vector", value)
     return d
 
 
@@ -180,10 +180,12 @@ class TargetBlock(Block):
         return {name: Spot(name, s.beam, 1 if s.end == "+" else -1, s.screen) for name, s in self.spots.items()}
 
     def mistakes(self, screens: Collection[str]) -> list[str]:
-        """What no field alone can tell: too few things, and names that nothing bears."""
+        """Mistakes across fields: too few entries, and names that do not exist."""
         out = []
         if len(self.beams) < 2:
-            out.append(f"target.beams: expected two or more, got {len(self.beams)}; one line cannot fix an attitude")
+            out.append(
+                f"target.beams: expected two or more, got {len(self.beams)}; one line does not determine an attitude"
+            )
         if not self.spots:
             out.append("target.spots: expected one or more, got none")
         ends: dict[tuple[str, str], str] = {}
@@ -210,7 +212,7 @@ class _RigBlock(Block):
 
 
 def _broken_references(content: _RigBlock) -> list[str]:
-    """What no field alone can tell: too few things, and names that nothing bears."""
+    """Mistakes across fields: too few entries, and names that do not exist."""
     out = []
     for name, block in (("screens", content.screens), ("cameras", content.cameras)):
         if not block:
@@ -222,7 +224,7 @@ def _broken_references(content: _RigBlock) -> list[str]:
 
 
 def no_such(kind: str, name: str, where: str, known: Collection[str]) -> str:
-    """The mistake of a name that nothing in the file bears."""
+    """The message for a name that does not exist in the file."""
     return f"{where}: expected a {kind} of this file, got {name!r}{did_you_mean(name, known)}"
 
 
@@ -242,11 +244,11 @@ def _rig_of(content: _RigBlock) -> Rig:
     )
 
 
-# From values to the file ----------------------------------------------------------------------------------------
+# Writing -------------------------------------------------------------------------------------------------------------
 
 
 def as_mapping(file: RigFile) -> dict[str, Any]:
-    """The plain mapping that rig.yaml holds."""
+    """The content of rig.yaml as a plain mapping."""
     rig = file.rig
     screens = {name: screen_mapping(screen) for name, screen in rig.screens.items()}
     cameras = {name: camera_mapping(camera) for name, camera in rig.cameras.items()}
@@ -271,7 +273,7 @@ def as_mapping(file: RigFile) -> dict[str, Any]:
 
 
 def screen_mapping(screen: Screen) -> dict[str, Any]:
-    """The plain mapping that a `ScreenBlock` reads back to the same numbers."""
+    """The plain mapping from which a `ScreenBlock` reads the same screen."""
     out: dict[str, Any] = {"world_from_screen": pose_mapping(screen.world_from_screen)}
     if screen.size_m is not None:
         out["size_m"] = [float(v) for v in screen.size_m]
@@ -281,7 +283,7 @@ def screen_mapping(screen: Screen) -> dict[str, Any]:
 
 
 def camera_mapping(camera: Camera) -> dict[str, Any]:
-    """The plain mapping that a `CameraBlock` reads back to the same numbers."""
+    """The plain mapping from which a `CameraBlock` reads the same camera."""
     out: dict[str, Any] = {
         "screen": camera.screen,
         **lens_mapping(camera.image_size_px, camera.matrix, camera.distortion, camera.lens),
@@ -298,7 +300,7 @@ def camera_mapping(camera: Camera) -> dict[str, Any]:
 
 
 def pose_mapping(pose: Pose) -> dict[str, Any]:
-    """The plain mapping that a `PoseBlock` reads back to the same transform."""
+    """The plain mapping from which a `PoseBlock` reads the same transform, its rotation matrix to 4e-16."""
     return {
         "quaternion_wxyz": floats(quaternion_from_matrix(pose.rotation)),
         "translation_m": floats(pose.translation),

@@ -1,4 +1,4 @@
-"""screens.yaml: cameras and screens in one world, with the joint covariance of their errors."""
+"""screens.yaml: cameras and screens in one world frame, with their joint covariance."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SCHEMA = "beampose/screens/1"
 
 @dataclass(frozen=True, slots=True)
 class ScreensFile:
-    """A lab without its vehicle: the rig has no beams and no spots."""
+    """Cameras and screens; the rig has no beams and no spots."""
 
     name: str
     rig: Rig
@@ -41,7 +41,7 @@ class _ScreensBlock(Block):
 
 
 def load_screens(path: Path) -> ScreensFile:
-    """The cameras and screens of a screens.yaml. Raises InputError: one line for a mistake, naming file and field."""
+    """The cameras and screens of a screens.yaml. Raises InputError: one line for each mistake, with file and field."""
     path = Path(path)
     content = validated(_ScreensBlock, read_mapping(path), path)
     mistakes = [
@@ -64,7 +64,7 @@ def load_screens(path: Path) -> ScreensFile:
 
 
 def save_screens(file: ScreensFile, path: Path) -> None:
-    """Write a screens.yaml, complete or not at all; it reads back to the same numbers."""
+    """Write a screens.yaml, atomically; it reads back to the same rig as with `save_rig`. Raises InputError."""
     content: dict[str, Any] = {
         "schema": SCHEMA,
         "name": file.name,

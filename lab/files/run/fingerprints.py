@@ -1,4 +1,4 @@
-"""What went into a run, so that a result can be tied to its inputs."""
+"""Fingerprints of the inputs of a run, recorded with its results."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from typing import Any
 
 from lab.files.run.run_file import FramesFolder, LiveDevice, Run
 
-LARGEST_FILE = 64 * 2**20  # bytes: a video beyond it is tied by its first so many bytes and its size
+LARGEST_FILE = 64 * 2**20  # bytes: of a larger file (a video), only this many bytes and the size are used
 _BLOCK = 2**20
 
 
 def fingerprints(run: Run) -> list[dict[str, Any]]:
     """Path, SHA-256 and size of every input.
 
-    A folder of pictures has one entry: its digest is over the names and sizes of its files, which costs no second
-    reading of gigabytes; `covers` says what each digest covers.
+    A folder of pictures has one entry, with a digest of the names and sizes of its files: reading gigabytes a second
+    time would take too long. `covers` describes what each digest covers.
     """
     files = [run.path, run.rig_path]
     if run.times_path is not None:

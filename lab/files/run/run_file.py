@@ -1,4 +1,4 @@
-"""A run folder: run.yaml, and where its pictures or points lie."""
+"""A run folder: run.yaml, and the location of its pictures or detected points."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ SCHEMA = "beampose/run/1"
 
 @dataclass(frozen=True, slots=True)
 class FramesFolder:
-    """A folder of pictures; the number in a picture's name is its frame."""
+    """A folder of pictures; the number in the name of a picture is its frame number."""
 
     path: Path
 
@@ -58,20 +58,20 @@ class VideoFile:
 
 @dataclass(frozen=True, slots=True)
 class DetectionsTable:
-    """A detections.csv: points found already."""
+    """A detections.csv: points detected earlier."""
 
     path: Path
 
 
 @dataclass(frozen=True, slots=True)
 class LiveDevice:
-    """A camera that OpenCV opens, for `beampose watch`; frames are numbered from 0 at the frame rate of run.yaml."""
+    """A camera that OpenCV opens, for `beampose watch`. Frames count from 0 at the frame rate of run.yaml."""
 
     device: int | str  # its number, or a name such as /dev/video0 or an address of a stream
 
     @property
     def path(self) -> Path:
-        """What messages call it."""
+        """The name in messages."""
         return Path(f"device {self.device}")
 
 
@@ -80,35 +80,36 @@ Source = FramesFolder | VideoFile | DetectionsTable | LiveDevice
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """One recording and all that is known of it before a picture is looked at."""
+    """One recording, before its pictures are opened."""
 
     folder: Path
     name: str
-    rig: Rig  # of the rig file, the cameras that this run has
+    rig: Rig  # with the cameras of this run only
     rig_path: Path
     frame_rate_hz: float
     exposure_s: float | None
     times: Times
     times_path: Path | None  # the timestamps file, where the run has one
     cameras: Mapping[str, Source]  # in the rig's order
-    left_out: tuple[str, ...]  # cameras of the rig that this run has nothing of
-    prior: PosePrior | None  # where the vehicle is at the first frame
+    left_out: tuple[str, ...]  # cameras of the rig that this run does not have
+    prior: PosePrior | None  # pose of the vehicle in the first frame
     tracker: TrackerParameters
     notes: str
     covariance: RigCovariance | None = None  # of the rig's calibration
-    calibration: CalibrationState | None = None  # when it was made, and how good it is
+    calibration: CalibrationState | None = None  # date and verdict
     recorded: datetime.date | None = None  # the day of the recording
 
     @property
     def path(self) -> Path:
-        """The run.yaml itself."""
+        """Path of run.yaml."""
         return self.folder / "run.yaml"
 
 
 def load_run(run_folder: Path) -> Run:
-    """Read and check a run folder's run.yaml, its rig and its timestamps; pictures are not opened.
+    """Read and check run.yaml of a run folder, its rig and its timestamps; pictures are not opened.
 
-    Raises InputError: file, field, what was expected and what was found.
+    Raises:
+        InputError: with file, field, what was expected and what was found; FileError for several mistakes.
     """
     folder = Path(run_folder)
     if folder.name == "run.yaml" and not folder.is_dir():
@@ -165,9 +166,9 @@ def load_run(run_folder: Path) -> Run:
 
 
 def save_run(content: Mapping[str, Any], run_folder: Path) -> Path:
-    """Write run.yaml from the plain mapping that it shall hold, checked as the reader checks it; returns its path.
+    """Write run.yaml from a plain mapping, checked as by the reader; returns its path.
 
-    `schema` may be left out. Paths within the mapping are relative to the run folder. Raises InputError.
+    `schema` may be left out. Paths in the mapping are relative to the run folder. Raises InputError.
     """
     path = Path(run_folder) / "run.yaml"
     full = {"schema": SCHEMA, **content}
@@ -177,7 +178,7 @@ def save_run(content: Mapping[str, Any], run_folder: Path) -> Path:
     return path
 
 
-# What the file may hold -----------------------------------------------------------------------------------------
+# The schema of the file ----------------------------------------------------------------------------------------------
 
 
 def _a_device(value: Any) -> int | str:

@@ -31,7 +31,7 @@ _ROWS_AT_ONCE = 1_500  # bounds the memory of the text (1 MB): a long table is r
 _MOST_TEXTS = 1000  # kept per column, of fields that are not numbers
 
 
-# Reading ----------------------------------------------------------------------------------------------------------
+# Reading -------------------------------------------------------------------------------------------------------------
 
 
 def read_table(path: Path, required: Iterable[str], optional: Iterable[str] = (), damaged: bool = False) -> Table:
@@ -228,7 +228,7 @@ def _as_numbers(fields: list[str], lines: list[int], texts: dict[int, str]) -> A
     return values
 
 
-# Writing ----------------------------------------------------------------------------------------------------------
+# Writing -------------------------------------------------------------------------------------------------------------
 
 
 def csv_word(text: str) -> str:

@@ -1,4 +1,4 @@
-"""rig.yaml: what is read is what the file says, what is written reads back, and each mistake has its line."""
+"""rig.yaml: values, saving and loading, and a line for each mistake."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def written(folder: Path, text: str) -> Path:
     return path
 
 
-def test_a_rig_is_what_its_file_says(tmp_path):
+def test_a_rig_has_the_values_of_its_file(tmp_path):
     rig = load_rig(written(tmp_path, RIG))
     assert list(rig.cameras) == ["left", "right"]
     assert list(rig.spots) == ["1", "2", "3", "4", "5", "6"]
@@ -73,7 +73,7 @@ def test_a_rig_that_is_saved_and_loaded_is_the_same_rig(tmp_path):
 
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
-def test_there_and_back_changes_no_number_of_any_rig(seed, tmp_path_factory):
+def test_saving_and_loading_changes_no_number_of_a_rig(seed, tmp_path_factory):
     """All plain numbers to the last bit; rotation matrices to ROUNDING, as they are written as quaternions."""
     rng = np.random.default_rng(seed)
 
@@ -109,7 +109,7 @@ def test_there_and_back_changes_no_number_of_any_rig(seed, tmp_path_factory):
         np.testing.assert_allclose(back.beams[name].direction, rig.beams[name].direction, rtol=0, atol=ROUNDING)
 
 
-def test_covariance_blocks_are_read_past_and_kept(tmp_path):
+def test_covariance_blocks_are_loaded_and_saved(tmp_path):
     block = "    covariance: {parameters: [fx, fy], matrix: [[1.0, 0.1], [0.1, 2.0]]}\n"
     text = RIG.replace("    noise: {gain", block + "    noise: {gain")
     text += "  covariance: {parameters: [A.x], matrix: [[1e-8]]}\n"
@@ -123,7 +123,7 @@ def test_covariance_blocks_are_read_past_and_kept(tmp_path):
     same(load_rig(tmp_path / "again.yaml"), load_rig(written(tmp_path, RIG)))
 
 
-def test_a_file_that_cannot_be_finished_leaves_the_old_one(tmp_path, monkeypatch):
+def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
     path = written(tmp_path, RIG)
     rig = load_rig(path)
 
@@ -163,7 +163,7 @@ def test_a_rig_that_could_not_be_loaded_is_not_saved(tmp_path):
         ("\n", "\r\n"),
     ],
 )
-def test_other_spellings_mean_the_same(old, new, tmp_path):
+def test_equivalent_spellings_give_the_same_rig(old, new, tmp_path):
     assert old in RIG
     (tmp_path / "rig.yaml").write_bytes(RIG.replace(old, new).encode())
     rig, plain = load_rig(tmp_path / "rig.yaml"), load_rig(written(tmp_path, RIG))
@@ -176,7 +176,7 @@ def test_other_spellings_mean_the_same(old, new, tmp_path):
         assert np.abs(turn).max() < 1e-6
 
 
-def test_names_that_look_like_numbers_or_switches_stay_names(tmp_path):
+def test_names_like_numbers_or_booleans_stay_names(tmp_path):
     text = RIG.replace("screen: right", "screen: on").replace("  right:\n    world", "  on:\n    world")
     text = text.replace("beam: A", "beam: 007").replace("    A: {", "    007: {")
     rig = load_rig(written(tmp_path, text))
@@ -260,7 +260,7 @@ BROKEN = [
     (
         BEAM_A,
         "A: {direction: [0, 0, 0], point_m: [0, 0, 0]}",
-        "target.beams.A.direction: expected a direction, which has a length",
+        "target.beams.A.direction: expected a direction, not the zero vector",
     ),
     (BEAM_A, "A: {direction: [1, 0, 0]}", "target.beams.A.point_m: expected a value, got nothing"),
     (BEAM_A, "A:", "target.beams.A: expected a mapping with direction, point_m, got nothing"),
@@ -293,7 +293,7 @@ BROKEN = [
 
 
 @pytest.mark.parametrize(("old", "new", "words"), BROKEN)
-def test_a_mistake_gets_one_line_that_names_field_expected_and_found(old, new, words, tmp_path):
+def test_a_mistake_is_one_line_with_field_expected_and_found(old, new, words, tmp_path):
     assert old in RIG
     path = written(tmp_path, RIG.replace(old, new, 1))
     with pytest.raises(InputError) as caught:
@@ -331,7 +331,7 @@ def test_a_mistake_gets_one_line_that_names_field_expected_and_found(old, new, w
         ("    screen: left\n", "", "cameras.left.screen: expected a value, got nothing"),
     ],
 )
-def test_a_mistake_made_twice_is_told_once_and_the_rest_counted(old, new, words, tmp_path):
+def test_the_first_of_several_mistakes_is_shown_and_the_rest_counted(old, new, words, tmp_path):
     assert old in RIG
     with pytest.raises(FileError) as caught:
         load_rig(written(tmp_path, RIG.replace(old, new)))
@@ -355,13 +355,13 @@ def test_a_mistake_made_twice_is_told_once_and_the_rest_counted(old, new, words,
         ("[" * 5000, "rig.yaml: expected YAML, found a nesting too deep to read"),
     ],
 )
-def test_a_file_that_is_no_rig_is_told_so(text, words, tmp_path):
+def test_a_file_that_is_not_a_rig_is_refused(text, words, tmp_path):
     with pytest.raises(InputError) as caught:
         load_rig(written(tmp_path, text))
     assert words in str(caught.value).replace(f"{tmp_path}/", "")
 
 
-def test_a_file_that_is_not_there_or_no_text_is_told_so(tmp_path):
+def test_a_missing_file_and_a_binary_file_are_refused(tmp_path):
     with pytest.raises(InputError, match=r"rig\.yaml: expected a file, found none; check the path"):
         load_rig(tmp_path / "rig.yaml")
     with pytest.raises(InputError, match="cannot be read: Is a directory"):
@@ -376,7 +376,7 @@ def test_fewer_than_two_beams_are_refused(count, tmp_path):
     head, _ = RIG.split("  beams:\n")
     beams = "  beams: {" + "A: {direction: [1, 0, 0], point_m: [0, 0, 0]}" * count + "}\n"
     spots = '  spots: {1: {beam: A, end: "+", screen: right}}\n'
-    with pytest.raises(InputError, match=f"target.beams: expected two or more, got {count}; one line cannot fix"):
+    with pytest.raises(InputError, match=f"target.beams: expected two or more, got {count}; one line does not"):
         load_rig(written(tmp_path, head + beams + spots))
 
 
