@@ -21,7 +21,7 @@ _BEYOND = 8  # bytes that may be written after the end
 
 
 def unpacked_lzw(packed: Bytes, size: int) -> Bytes | None:
-    """Decompress LZW to `size` bytes; None where a code is invalid or data are missing. Source: TIFF 6.0, section 13."""
+    """Decompress LZW to `size` bytes; None for an invalid code or missing data. Source: TIFF 6.0, section 13."""
     out = np.empty(CLEAR + size + _BEYOND, np.uint8)
     return out[CLEAR : CLEAR + size] if _unpack_lzw(packed, out, size) == size else None
 

@@ -10,18 +10,18 @@ import numpy as np
 
 from geometry.arrays import Array, Ints
 from geometry.pose import Pose
-from lab.files.run.truth import refuse_other_lengths
+from lab.files.run.truth import check_unit_quaternions
 from lab.files.text import columns
 from lab.files.text.csv_table import Table
 from lab.files.text.csv_text import read_table
 from lab.files.text.error_text import did_you_mean
 from lab.files.text.range_checks import (
     FARTHEST_M,
-    SIGMAS_DEG,
-    SIGMAS_M,
+    SIGMA_RANGE_DEG,
+    SIGMA_RANGE_M,
     SIGMAS_PX,
+    check_coordinates,
     refuse_far_pixels,
-    refuse_far_places,
     refuse_sigmas,
 )
 
@@ -85,7 +85,7 @@ def read_survey(paths: Sequence[Path], screens: Collection[str], farthest_m: flo
                 raise table.error(i, f"point: expected each point once, got {name!r} again (first in {where[name]})")
             where[name] = f"{path.name}, line {table.lines[i]}"
         coordinates = _finite(table, SURVEY[1:])
-        refuse_far_places(table, SURVEY[1:], farthest_m)
+        check_coordinates(table, SURVEY[1:], farthest_m)
         sigmas, note = _survey_sigmas(table)
         notes += note
         on = table.names("screen", may_be_empty=True) if "screen" in table else [""] * len(table)
@@ -171,14 +171,14 @@ def read_poses(path: Path) -> StandPoses:
         )
     table.finite("t_s", "seconds", may_be_empty=True)
     xyz = _finite(table, ("x_m", "y_m", "z_m"))
-    refuse_far_places(table, ("x_m", "y_m", "z_m"))
+    check_coordinates(table, ("x_m", "y_m", "z_m"))
     q = _finite(table, ("qw", "qx", "qy", "qz"))
-    refuse_other_lengths(table)
+    check_unit_quaternions(table)
     sigmas = np.full((len(table), 6), np.nan)
     for k, name in enumerate(POSE_SIGMAS):
         if name in table:
             value = table.finite(name, "0 or more", may_be_empty=True)
-            allowed, unit = ((0.0, SIGMAS_M[1]), "m") if k < 3 else (SIGMAS_DEG, "deg")
+            allowed, unit = ((0.0, SIGMA_RANGE_M[1]), "m") if k < 3 else (SIGMA_RANGE_DEG, "deg")
             refuse_sigmas(table, name, allowed, unit)
             sigmas[:, k] = value if k < 3 else np.radians(value)
     return StandPoses(frames, Pose.from_quaternion(q, xyz), sigmas)
@@ -210,7 +210,7 @@ def _survey_sigmas(table: Table) -> tuple[Array, list[str]]:
     for k, name in enumerate(SURVEY_SIGMAS):
         if name in table:
             sigmas[:, k] = table.finite(name, "a number above 0", may_be_empty=True)
-            refuse_sigmas(table, name, SIGMAS_M, "m")
+            refuse_sigmas(table, name, SIGMA_RANGE_M, "m")
     none = np.isnan(sigmas)
     if not none.any():
         return sigmas, []

@@ -11,22 +11,22 @@ import pydantic
 from calibration.boards import board_types
 from lab.files.project.project_types import ScreenFrame, Stand
 from lab.files.rig.calibration_state import Day
-from lab.files.rig.rig_file import PoseBlock, TargetBlock, no_such
+from lab.files.rig.rig_file import PoseBlock, TargetBlock, unknown_name
 from lab.files.text.fields import (
     Block,
-    FromZero,
+    NonNegative,
     Number,
     Positive,
     Text,
     Vector3,
     Word,
-    a_truth_value,
-    a_word,
+    boolean,
+    field_error,
     numbers,
     one_of,
     positive_numbers,
-    unexpected,
-    wrong,
+    unexpected_value,
+    word,
 )
 
 SCHEMA = "beampose/calibration/1"
@@ -37,13 +37,13 @@ CLOUD_UNITS: Mapping[str, float] = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.02
 def _paths(value: Any) -> list[str]:
     values = [value] if isinstance(value, str) else value
     if not isinstance(values, list) or not all(isinstance(v, str) and v.strip() for v in values):
-        raise unexpected("a file or a list of files", value)
+        raise unexpected_value("a file or a list of files", value)
     return values
 
 
 def _board(value: Any) -> str:
     if not isinstance(value, str) or not value.strip():
-        raise unexpected(f"a board such as {board_types.EXAMPLES['chessboard']}", value)
+        raise unexpected_value(f"a board such as {board_types.EXAMPLES['chessboard']}", value)
     return value
 
 
@@ -51,14 +51,14 @@ def _days(value: Any) -> int | None:
     if value is None:
         return None
     if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-        raise unexpected("a whole number of days, 1 or more", value)
+        raise unexpected_value("a whole number of days, 1 or more", value)
     return value
 
 
 def _name(value: Any) -> str:
-    name = a_word(value)
+    name = word(value)
     if any(c in name for c in "/\\") or not name.isprintable():
-        raise unexpected("a name without / and \\", value)
+        raise unexpected_value("a name without / and \\", value)
     return name
 
 
@@ -93,7 +93,7 @@ class CloudBlock(Block):
     @pydantic.model_validator(mode="after")
     def _one_of_them(self) -> CloudBlock:
         if self.world_from_cloud is not None and self.targets is not None:
-            raise wrong("expected world_from_cloud or targets, got both; keep one")
+            raise field_error("expected world_from_cloud or targets, got both; keep one")
         return self
 
 
@@ -123,15 +123,17 @@ class SharedBoardBlock(Block):
 
 class StandBlock(Block):
     world_from_stand: PoseBlock | None = None
-    sigma_m: FromZero | None = None
-    sigma_deg: FromZero | None = None
-    pose_sigma_m: FromZero = 0.0
-    pose_sigma_deg: FromZero = 0.0
+    sigma_m: NonNegative | None = None
+    sigma_deg: NonNegative | None = None
+    pose_sigma_m: NonNegative = 0.0
+    pose_sigma_deg: NonNegative = 0.0
 
     @pydantic.model_validator(mode="after")
     def _known_or_not(self) -> StandBlock:
         if self.world_from_stand is None and (self.sigma_m is not None or self.sigma_deg is not None):
-            raise wrong("sigma_m, sigma_deg: expected world_from_stand with them, got none; add it or leave them out")
+            raise field_error(
+                "sigma_m, sigma_deg: expected world_from_stand with them, got none; add it or leave them out"
+            )
         return self
 
     def value(self) -> Stand:
@@ -149,14 +151,14 @@ class RecordingBlock(Block):
     run: Word | None = None
     spots: Word | None = None
     poses: Word | None = None
-    use_truth: Annotated[bool, pydantic.PlainValidator(a_truth_value)] = False
+    use_truth: Annotated[bool, pydantic.PlainValidator(boolean)] = False
 
     @pydantic.model_validator(mode="after")
     def _one_of_them(self) -> RecordingBlock:
         if (self.run is None) == (self.spots is None):
-            raise wrong(f"expected run or spots, got {'both; keep one' if self.run else 'neither'}")
+            raise field_error(f"expected run or spots, got {'both; keep one' if self.run else 'neither'}")
         if self.use_truth and (self.run is None or self.poses is not None):
-            raise wrong("use_truth: expected with a run and without poses: it means the run's own truth/pose.csv")
+            raise field_error("use_truth: expected with a run and without poses: it means the run's own truth/pose.csv")
         return self
 
 
@@ -188,7 +190,7 @@ def broken_references(content: ProjectBlock, lab_known: bool) -> list[str]:
     elsewhere = lab_known and not content.screens
     for name, camera in content.cameras.items():
         if camera.screen not in content.screens and not elsewhere:
-            out.append(no_such("screen", camera.screen, f"cameras.{name}.screen", content.screens))
+            out.append(unknown_name("screen", camera.screen, f"cameras.{name}.screen", content.screens))
     places: list[tuple[str, Mapping[str, Any]]] = [
         (f"screens.{s}.boards.{i}.photos", b.photos)
         for s, block in content.screens.items()
@@ -198,9 +200,9 @@ def broken_references(content: ProjectBlock, lab_known: bool) -> list[str]:
     for where, photos in places:
         if not photos:
             out.append(f"{where}: expected a photograph per camera, got none")
-        out += [no_such("camera", c, f"{where}.{c}", content.cameras) for c in photos if c not in content.cameras]
+        out += [unknown_name("camera", c, f"{where}.{c}", content.cameras) for c in photos if c not in content.cameras]
     if content.world is not None and content.world not in content.screens and not elsewhere:
-        out.append(no_such("screen", content.world, "world", content.screens))
+        out.append(unknown_name("screen", content.world, "world", content.screens))
     if content.target is not None:  # `calibrate beams` checks the screens of the spots against the rig
         named = {s.screen for s in content.target.spots.values()} if elsewhere else content.screens
         out += content.target.mistakes(named)

@@ -9,12 +9,12 @@ import pydantic
 
 from calibration.boards.board_types import Board, Charuco, Chessboard, CircleGrid, parse
 from lab.errors import InputError
-from lab.files.text.fields import Block, Integer, Positive, Word, a_truth_value, one_of, validated, wrong
+from lab.files.text.fields import Block, Integer, Positive, Word, boolean, field_error, one_of, validated
 from lab.files.text.yaml_text import read_mapping, write_mapping
 
 SCHEMA = "beampose/board/1"
 CHESSBOARD, CIRCLES, CHARUCO = "chessboard", "circles", "charuco"
-_TruthValue = Annotated[bool, pydantic.PlainValidator(a_truth_value)]
+_TruthValue = Annotated[bool, pydantic.PlainValidator(boolean)]
 
 
 def board_of(text_or_path: str | Path) -> Board:
@@ -82,13 +82,13 @@ class _BoardBlock(Block):
         must, may = _FIELDS[self.kind]
         given = {name for name in self.model_fields_set if name not in ("schema_", "kind", "columns", "rows")}
         for name in sorted(must - given):
-            raise wrong(f"expected {name} for a board of kind {self.kind!r}, got nothing; add it")
+            raise field_error(f"expected {name} for a board of kind {self.kind!r}, got nothing; add it")
         for name in sorted(given - must - may):
-            raise wrong(f"unexpected {name} for a board of kind {self.kind!r}; remove it")
+            raise field_error(f"unexpected {name} for a board of kind {self.kind!r}; remove it")
         try:
             self.board()
         except ValueError as error:
-            raise wrong(str(error)) from None
+            raise field_error(str(error)) from None
         return self
 
     def board(self) -> Board:

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import pydantic
 
 from lab.errors import CalibrationError
-from lab.files.text.fields import Block, Lines, Text, one_of, unexpected
+from lab.files.text.fields import Block, Lines, Text, one_of, unexpected_value
 
 VERDICTS = ("PASS", "WARN", "FAIL")
 
@@ -33,7 +33,7 @@ def iso_date(value: Any) -> datetime.date:
             return datetime.datetime.fromisoformat(value.strip()).date()
         except ValueError:
             pass
-    raise unexpected("a date such as 2026-03-14", value)
+    raise unexpected_value("a date such as 2026-03-14", value)
 
 
 def _day_or_none(value: Any) -> datetime.date | None:

@@ -11,7 +11,17 @@ import pydantic
 from geometry import lens
 from geometry.arrays import Array, symmetric
 from geometry.camera import FISHEYE, LENSES, PERSPECTIVE
-from lab.files.text.fields import Block, Number, Positive, a_number, an_integer, numbers, one_of, unexpected, wrong
+from lab.files.text.fields import (
+    Block,
+    Number,
+    Positive,
+    field_error,
+    finite_number,
+    numbers,
+    one_of,
+    unexpected_value,
+    whole_number,
+)
 
 # Tolerance of symmetry and of eigenvalues, relative to the diagonal: rounding of sums in double precision.
 COVARIANCE_TOLERANCE = 1e-6
@@ -27,31 +37,31 @@ class Covariance:
 
 def _image_size(value: Any) -> list[int]:
     numbers(2)(value)
-    size = [an_integer(v) for v in value]
+    size = [whole_number(v) for v in value]
     if min(size) < 1:
-        raise unexpected("a width and a height of at least 1 pixel", value)
+        raise unexpected_value("a width and a height of at least 1 pixel", value)
     return size
 
 
 def _distortion(value: Any) -> list[float]:
     words = "0, 4, 5, 8, 12 or 14 numbers"
     if not isinstance(value, list):
-        raise unexpected(f"a list of {words}", value)
+        raise unexpected_value(f"a list of {words}", value)
     if len(value) not in lens.ALLOWED_LENGTHS:
-        raise wrong(f"expected {words}, got {len(value)}")
-    return [a_number(v) for v in value]
+        raise field_error(f"expected {words}, got {len(value)}")
+    return [finite_number(v) for v in value]
 
 
 def _parameter_names(value: Any) -> list[str]:
     if not isinstance(value, list) or not all(isinstance(v, str) for v in value):
-        raise unexpected("a list of parameter names", value)
+        raise unexpected_value("a list of parameter names", value)
     return value
 
 
 def _matrix(value: Any) -> list[list[float]]:
     if not isinstance(value, list) or not all(isinstance(row, list) and len(row) == len(value) for row in value):
-        raise unexpected("a square matrix, as a list of rows", value)
-    return [[a_number(v) for v in row] for row in value]
+        raise unexpected_value("a square matrix, as a list of rows", value)
+    return [[finite_number(v) for v in row] for row in value]
 
 
 class CovarianceBlock(Block):
@@ -63,7 +73,9 @@ class CovarianceBlock(Block):
     @pydantic.model_validator(mode="after")
     def _same_size(self) -> CovarianceBlock:
         if len(self.matrix) != len(self.parameters):
-            raise wrong(f"expected a matrix row for each of {len(self.parameters)} parameters, got {len(self.matrix)}")
+            raise field_error(
+                f"expected a matrix row for each of {len(self.parameters)} parameters, got {len(self.matrix)}"
+            )
         return self
 
     def value(self) -> Covariance:
@@ -71,7 +83,7 @@ class CovarianceBlock(Block):
         return Covariance(tuple(self.parameters), np.array(self.matrix, dtype=float).reshape(len(self.matrix), -1))
 
 
-def covariance_mistake(covariance: Covariance) -> str:
+def covariance_error(covariance: Covariance) -> str:
     """The mistake of a matrix that is not a covariance, as text of a message; empty for a covariance."""
     C, names = covariance.matrix, covariance.parameters
     variances = np.diagonal(C)
@@ -112,7 +124,9 @@ class LensBlock(Block):
     @pydantic.model_validator(mode="after")
     def _numbers_of_the_model(self) -> LensBlock:
         if self.lens == FISHEYE and len(self.distortion) not in (0, 4):
-            raise wrong(f"expected 4 distortion numbers (or none) for lens {FISHEYE!r}, got {len(self.distortion)}")
+            raise field_error(
+                f"expected 4 distortion numbers (or none) for lens {FISHEYE!r}, got {len(self.distortion)}"
+            )
         return self
 
     def size(self) -> tuple[int, int]:

@@ -18,23 +18,23 @@ from lab.files.rig.camera_block import (
     Covariance,
     CovarianceBlock,
     LensBlock,
+    covariance_error,
     covariance_mapping,
-    covariance_mistake,
     lens_mapping,
 )
 from lab.files.text.error_text import did_you_mean
 from lab.files.text.fields import (
     Block,
-    FromZero,
     Integer,
     Lines,
+    NonNegative,
     Number,
     Positive,
     Text,
     Word,
+    field_error,
     one_of,
     validated,
-    wrong,
 )
 from lab.files.text.yaml_text import read_mapping, write_mapping
 
@@ -149,9 +149,9 @@ def _calibration_mapping(calibration: CameraCalibration) -> dict[str, Any]:
 class _CalibrationBlock(Block):
     date: Text = ""
     verdict: Annotated[str, pydantic.PlainValidator(one_of((*VERDICTS, "")))] = ""
-    rms_px: FromZero | None = None
-    sigma_px: FromZero | None = None
-    hold_out_rms_px: FromZero | None = None
+    rms_px: NonNegative | None = None
+    sigma_px: NonNegative | None = None
+    hold_out_rms_px: NonNegative | None = None
     views: Integer | None = None
     corners: Integer | None = None
     board: Text = ""
@@ -182,11 +182,11 @@ class _CameraFileBlock(LensBlock):
         seen: set[str] = set()
         for name in self.covariance.parameters:
             if name not in known:
-                raise wrong(f"covariance.parameters: unknown parameter {name!r}{did_you_mean(name, known)}")
+                raise field_error(f"covariance.parameters: unknown parameter {name!r}{did_you_mean(name, known)}")
             if name in seen:
-                raise wrong(f"covariance.parameters: expected each name once, got {name!r} a second time")
+                raise field_error(f"covariance.parameters: expected each name once, got {name!r} a second time")
             seen.add(name)
-        mistake = covariance_mistake(self.covariance.value())
+        mistake = covariance_error(self.covariance.value())
         if mistake:
-            raise wrong(f"covariance.matrix: {mistake}")
+            raise field_error(f"covariance.matrix: {mistake}")
         return self

@@ -11,7 +11,7 @@ from geometry.arrays import Array, symmetric
 from geometry.rig import Rig
 from geometry.uncertainty.rig_parameters import RigCovariance, is_known, split
 from lab.errors import InputError
-from lab.files.rig.camera_block import Covariance, covariance_mistake
+from lab.files.rig.camera_block import Covariance, covariance_error
 
 TARGET = "target"
 
@@ -39,7 +39,7 @@ def joint_covariance(rig: Rig, blocks: Mapping[str, Covariance], path: Path | st
         if not known:
             continue
         matrix = block.matrix[np.ix_(known, known)]
-        mistake = covariance_mistake(Covariance(tuple(block.parameters[i] for i in known), matrix))
+        mistake = covariance_error(Covariance(tuple(block.parameters[i] for i in known), matrix))
         if mistake:
             raise InputError(f"{path}: {where}.covariance.matrix: {mistake}")
         names += [full[i] for i in known]

@@ -19,17 +19,17 @@ from lab.files.rig.camera_block import Covariance, CovarianceBlock, LensBlock, c
 from lab.files.text.error_text import FileError, did_you_mean
 from lab.files.text.fields import (
     Block,
-    FromZero,
+    NonNegative,
     Number,
     Positive,
     Vector3,
     Word,
+    field_error,
     numbers,
     one_of,
     positive_numbers,
-    unexpected,
+    unexpected_value,
     validated,
-    wrong,
 )
 from lab.files.text.yaml_text import read_mapping, write_mapping
 
@@ -87,14 +87,16 @@ def _unit_quaternion(value: Any) -> list[float]:
     q = numbers(4)(value)
     length = float(np.linalg.norm(q))
     if abs(length - 1) > QUATERNION_TOLERANCE:
-        raise wrong(f"expected a quaternion of length 1, got one of length {length:.7g}; divide its numbers by that")
+        raise field_error(
+            f"expected a quaternion of length 1, got one of length {length:.7g}; divide its numbers by that"
+        )
     return q
 
 
 def _direction(value: Any) -> list[float]:
     d = numbers(3)(value)
     if np.linalg.norm(d) < 1e-9:
-        raise unexpected("a direction, not the zero vector", value)
+        raise unexpected_value("a direction, not the zero vector", value)
     return d
 
 
@@ -126,7 +128,7 @@ class ScreenBlock(Block):
 
 class _NoiseBlock(Block):
     gain_e_per_dn: Positive
-    read_noise_e: FromZero
+    read_noise_e: NonNegative
     black_dn: Number = 0.0
 
 
@@ -191,9 +193,9 @@ class TargetBlock(Block):
         ends: dict[tuple[str, str], str] = {}
         for name, spot in self.spots.items():
             if spot.beam not in self.beams:
-                out.append(no_such("beam", spot.beam, f"target.spots.{name}.beam", self.beams))
+                out.append(unknown_name("beam", spot.beam, f"target.spots.{name}.beam", self.beams))
             if spot.screen not in screens:
-                out.append(no_such("screen", spot.screen, f"target.spots.{name}.screen", screens))
+                out.append(unknown_name("screen", spot.screen, f"target.spots.{name}.screen", screens))
             other = ends.setdefault((spot.beam, spot.end), name)
             if other != name:
                 out.append(
@@ -219,11 +221,11 @@ def _broken_references(content: _RigBlock) -> list[str]:
             out.append(f"{name}: expected one or more, got none")
     for name, camera in content.cameras.items():
         if camera.screen not in content.screens:
-            out.append(no_such("screen", camera.screen, f"cameras.{name}.screen", content.screens))
+            out.append(unknown_name("screen", camera.screen, f"cameras.{name}.screen", content.screens))
     return out + content.target.mistakes(content.screens)
 
 
-def no_such(kind: str, name: str, where: str, known: Collection[str]) -> str:
+def unknown_name(kind: str, name: str, where: str, known: Collection[str]) -> str:
     """The message for a name that does not exist in the file."""
     return f"{where}: expected a {kind} of this file, got {name!r}{did_you_mean(name, known)}"
 

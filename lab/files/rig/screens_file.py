@@ -13,7 +13,7 @@ from geometry.uncertainty.rig_parameters import RigCovariance
 from lab.files.rig.calibration_state import CalibrationState, CalibrationStateBlock, state_mapping
 from lab.files.rig.camera_block import Covariance, CovarianceBlock, covariance_mapping
 from lab.files.rig.rig_covariance import TARGET, joint_covariance
-from lab.files.rig.rig_file import CameraBlock, ScreenBlock, camera_mapping, no_such, screen_mapping
+from lab.files.rig.rig_file import CameraBlock, ScreenBlock, camera_mapping, screen_mapping, unknown_name
 from lab.files.text.error_text import FileError
 from lab.files.text.fields import Block, Word, one_of, validated
 from lab.files.text.yaml_text import read_mapping, write_mapping
@@ -45,7 +45,7 @@ def load_screens(path: Path) -> ScreensFile:
     path = Path(path)
     content = validated(_ScreensBlock, read_mapping(path), path)
     mistakes = [
-        no_such("screen", c.screen, f"cameras.{n}.screen", content.screens)
+        unknown_name("screen", c.screen, f"cameras.{n}.screen", content.screens)
         for n, c in content.cameras.items()
         if c.screen not in content.screens
     ]

@@ -19,11 +19,13 @@ from tracking.input_validation import LARGEST_PX, LEAST_SIGMA_PX, TWIN_PX, twins
 REQUIRED = ("frame", "camera", "u_px", "v_px")
 DEFAULT_SIGMA_PX = 0.1  # px, where the file gives no sigma: about the centroid noise of a clean laser spot
 SHAPE = ("flux", "peak", "major_px", "minor_px", "angle_deg")
-SPARSEST = 1000  # frame numbers per picture; more than that indicates a stray number, or time stamps as frame numbers
-MANY = 100_000  # frame numbers: a run that spans fewer may be sparser
+MAX_NUMBERS_PER_PICTURE = (
+    1000  # frame numbers per picture; more than that indicates a stray number, or time stamps as frame numbers
+)
+LONG_SPAN = 100_000  # frame numbers: a run that spans fewer may be sparser
 LONGEST_GAP = 10_000  # frame numbers, 100 s at 100 Hz: after a longer gap, MOST_ALONE pictures or fewer are strays
-MOST_ALONE = 3
-STRAY = 0.1  # largest share of the frames that is left out as strays; with more the run is refused
+MAX_STRAY_FRAMES = 3
+MAX_STRAY_SHARE = 0.1  # largest share of the frames that is left out as strays; with more the run is refused
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,7 +179,7 @@ class _Rows:
 
 def too_sparse(span: int, pictures: int) -> bool:
     """Whether a span of frame numbers is too long for its pictures: the output has a row per frame number."""
-    return span > MANY and span > SPARSEST * pictures
+    return span > LONG_SPAN and span > MAX_NUMBERS_PER_PICTURE * pictures
 
 
 def far_off(numbers: Array | Ints) -> Bools:
@@ -188,7 +190,7 @@ def far_off(numbers: Array | Ints) -> Bools:
     long = np.diff(numbers) > max(LONGEST_GAP, len(numbers))
     piece = np.concatenate([np.zeros(1, dtype=np.int64), np.cumsum(long)])[: len(numbers)]
     sizes = np.bincount(piece, minlength=1)
-    few = sizes <= max(1, min(MOST_ALONE, int(0.01 * len(numbers))))
+    few = sizes <= max(1, min(MAX_STRAY_FRAMES, int(0.01 * len(numbers))))
     few[int(np.argmax(sizes))] = False
     return np.asarray(few[piece])
 
@@ -202,9 +204,9 @@ def _stray(frame: Array, good: Bools) -> Bools:
     if not too_sparse(int(numbers[-1] - numbers[0]) + 1, numbers.size):
         out[good] = np.isin(frame[good], numbers[far_off(numbers)])
         return out
-    pieces = np.split(numbers, np.flatnonzero(np.diff(numbers) > MANY) + 1)
+    pieces = np.split(numbers, np.flatnonzero(np.diff(numbers) > LONG_SPAN) + 1)
     longest = max(pieces, key=len)
-    if longest.size < (1 - STRAY) * numbers.size:
+    if longest.size < (1 - MAX_STRAY_SHARE) * numbers.size:
         return out  # refused by the reader of the run
     out[good] = (frame[good] < longest[0]) | (frame[good] > longest[-1])
     return out

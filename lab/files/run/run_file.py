@@ -25,15 +25,15 @@ from lab.files.text.dataclass_fields import dataclass_from_yaml
 from lab.files.text.error_text import FileError, did_you_mean
 from lab.files.text.fields import (
     Block,
-    FromZero,
+    NonNegative,
     Positive,
     Text,
     Vector3,
     Word,
+    field_error,
     one_of,
-    unexpected,
+    unexpected_value,
     validated,
-    wrong,
 )
 from lab.files.text.yaml_text import read_mapping, write_mapping
 from lab.pictures.picture_file import SUFFIXES
@@ -186,7 +186,7 @@ def _a_device(value: Any) -> int | str:
         return value
     if isinstance(value, str) and value.strip():
         return value
-    raise unexpected("a camera's number from 0, or the name of a device", value)
+    raise unexpected_value("a camera's number from 0, or the name of a device", value)
 
 
 class _SourceBlock(Block):
@@ -198,30 +198,30 @@ class _SourceBlock(Block):
     def _one_of_them(self) -> _SourceBlock:
         given = [n for n in ("frames", "detections", "device") if getattr(self, n) is not None]
         if "device" in given and len(given) > 1:
-            raise wrong(f"expected one of frames, detections and device, got {' and '.join(given)}; keep one")
+            raise field_error(f"expected one of frames, detections and device, got {' and '.join(given)}; keep one")
         if len(given) > 1:
-            raise wrong("expected frames or detections, got both; keep one")
+            raise field_error("expected frames or detections, got both; keep one")
         if not given:
-            raise wrong("expected frames or detections, got neither")
+            raise field_error("expected frames or detections, got neither")
         return self
 
 
 def _an_angle_range(value: Any) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value <= 180:
-        raise unexpected("an angle above 0 and up to 180", value)
+        raise unexpected_value("an angle above 0 and up to 180", value)
     return float(value)
 
 
 class _PriorBlock(Block):
     position_m: Vector3
     yaw_pitch_roll_deg: Vector3
-    within_m: FromZero
+    within_m: NonNegative
     within_deg: Annotated[float, pydantic.PlainValidator(_an_angle_range)]
 
 
 def _some_cameras(value: Any) -> Any:
     if isinstance(value, dict) and not value:
-        raise wrong("expected one or more cameras, got none")
+        raise field_error("expected one or more cameras, got none")
     return value
 
 

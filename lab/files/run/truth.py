@@ -87,11 +87,11 @@ def read_true_poses(path: Path) -> TruePoses:
     for i in np.flatnonzero(np.diff(frame) <= 0)[:1] + 1:
         raise table.error(i, f"frame: expected rising numbers, got {frame[i]} after {frame[i - 1]}")
     numbers = {name: table.finite(name) for name in columns.TRUTH_POSE[1:]}
-    refuse_other_lengths(table)
+    check_unit_quaternions(table)
     return TruePoses(frame, numbers["t_s"], table.stack("x_m", "y_m", "z_m"), table.stack("qw", "qx", "qy", "qz"))
 
 
-def refuse_other_lengths(table: Table) -> None:
+def check_unit_quaternions(table: Table) -> None:
     """Raises InputError at the first quaternion (columns qw, qx, qy, qz) whose length is not 1."""
     length = np.linalg.norm(table.stack("qw", "qx", "qy", "qz"), axis=1)
     for i in np.flatnonzero(~(np.abs(length - 1) <= QUATERNION_TOLERANCE))[:1]:

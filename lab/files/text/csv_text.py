@@ -26,7 +26,7 @@ from lab.files.text.error_text import did_you_mean, shown_line
 
 # The columns that hold words; every other column holds numbers.
 WORD_COLUMNS = ("camera", "spot", "beam", "status", "point", "screen", "date", "verdict")
-_LARGE_BYTES = 4_000_000  # pandas reads files of this size and larger
+LARGE_BYTES = 4_000_000  # pandas reads files of this size and larger
 _ROWS_AT_ONCE = 1_500  # bounds the memory of the text (1 MB): a long table is read in pieces
 _MOST_TEXTS = 1000  # kept per column, of fields that are not numbers
 
@@ -48,7 +48,7 @@ def read_table(path: Path, required: Iterable[str], optional: Iterable[str] = ()
     data = _content(path, required, damaged)
     header = _checked_header(path, data, required)
     wanted = tuple(dict.fromkeys((*required, *optional)))
-    table = _read_regular(path, data, header, wanted) if len(data) >= _LARGE_BYTES else None
+    table = _read_regular(path, data, header, wanted) if len(data) >= LARGE_BYTES else None
     if table is None:
         table = _read_any(path, data, header, wanted)
     for name in wanted:

@@ -18,13 +18,13 @@ from lab.files.text.fields import (
     Integer,
     Number,
     Word,
-    a_number,
-    a_truth_value,
+    boolean,
+    field_error,
+    finite_number,
     numbers,
     one_of,
-    unexpected,
+    unexpected_value,
     validated,
-    wrong,
 )
 
 T = TypeVar("T")
@@ -70,7 +70,7 @@ def _model_of(cls: type) -> type[Block]:
         try:
             _value_of(cls, self)
         except ValueError as error:
-            raise wrong(str(error)) from None
+            raise field_error(str(error)) from None
         return self
 
     return pydantic.create_model(
@@ -96,7 +96,7 @@ def _kind_of(hint: Any) -> Any:
     kinds: dict[Any, Any] = {
         float: Number,
         int: Integer,
-        bool: Annotated[bool, pydantic.PlainValidator(a_truth_value)],
+        bool: Annotated[bool, pydantic.PlainValidator(boolean)],
         str: Word,
     }
     if hint not in kinds:
@@ -110,8 +110,8 @@ def _nothing_or(value: Any, inner: Any) -> Any:
 
 def _number_tuple(value: Any) -> tuple[float, ...]:
     if not isinstance(value, list):
-        raise unexpected("a list of numbers", value)
-    return tuple(a_number(v) for v in value)
+        raise unexpected_value("a list of numbers", value)
+    return tuple(finite_number(v) for v in value)
 
 
 def _value_of(cls: type[T], block: Block) -> T:

@@ -19,71 +19,71 @@ from lab.files.text.error_text import FileError, did_you_mean, shown
 M = TypeVar("M", bound="Block")
 
 
-def wrong(text: str) -> PydanticCustomError:
+def field_error(text: str) -> PydanticCustomError:
     """The error that a validator raises for a mistake, with this text."""
     return PydanticCustomError("mistake", "{text}", {"text": text})
 
 
-def unexpected(expected: str, found: object) -> PydanticCustomError:
+def unexpected_value(expected: str, found: object) -> PydanticCustomError:
     """The error `expected ..., got ...`."""
-    return wrong(f"expected {expected}, got {shown(found)}")
+    return field_error(f"expected {expected}, got {shown(found)}")
 
 
-def a_number(value: Any) -> float:
+def finite_number(value: Any) -> float:
     """A finite number."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise unexpected("a finite number", value)
+        raise unexpected_value("a finite number", value)
     return float(value)
 
 
-def a_positive_number(value: Any) -> float:
+def positive_number(value: Any) -> float:
     """A finite number above zero."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not (math.isfinite(value) and value > 0):
-        raise unexpected("a number above 0", value)
+        raise unexpected_value("a number above 0", value)
     return float(value)
 
 
-def a_number_from_zero(value: Any) -> float:
+def non_negative_number(value: Any) -> float:
     """A finite number, zero or above."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not (math.isfinite(value) and value >= 0):
-        raise unexpected("a number of 0 or more", value)
+        raise unexpected_value("a number of 0 or more", value)
     return float(value)
 
 
-def an_integer(value: Any) -> int:
+def whole_number(value: Any) -> int:
     """A whole number; 3.0 counts as one."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value) or value != int(value):
-        raise unexpected("a whole number", value)
+        raise unexpected_value("a whole number", value)
     return int(value)
 
 
-def a_truth_value(value: Any) -> bool:
+def boolean(value: Any) -> bool:
     """true or false."""
     if not isinstance(value, bool):
-        raise unexpected("true or false", value)
+        raise unexpected_value("true or false", value)
     return value
 
 
-def a_word(value: Any) -> str:
+def word(value: Any) -> str:
     """A text that is not empty; a bare number or true/false counts as its text."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, int | float):
         return str(value)
     if not isinstance(value, str) or not value.strip():
-        raise unexpected("a word", value)
+        raise unexpected_value("a word", value)
     return value
 
 
 def free_text(value: Any) -> str:
     """A text, possibly empty."""
-    return "" if value is None else value if value == "" else a_word(value)
+    return "" if value is None else value if value == "" else word(value)
 
 
 def lines_of_text(value: Any) -> list[str]:
     """A list of lines of text."""
     if not isinstance(value, list) or not all(isinstance(v, str) for v in value):
-        raise unexpected("a list of lines of text", value)
+        raise unexpected_value("a list of lines of text", value)
     return value
 
 
@@ -92,10 +92,10 @@ def numbers(count: int) -> Callable[[Any], list[float]]:
 
     def check(value: Any) -> list[float]:
         if not isinstance(value, list):
-            raise unexpected(f"a list of {count} numbers", value)
+            raise unexpected_value(f"a list of {count} numbers", value)
         if len(value) != count:
-            raise wrong(f"expected {count} numbers, got {len(value)}")
-        return [a_number(v) for v in value]
+            raise field_error(f"expected {count} numbers, got {len(value)}")
+        return [finite_number(v) for v in value]
 
     return check
 
@@ -104,7 +104,7 @@ def positive_numbers(count: int) -> Callable[[Any], list[float]]:
     """A validator of lists of `count` finite numbers above zero."""
 
     def check(value: Any) -> list[float]:
-        return [a_positive_number(v) for v in numbers(count)(value)]
+        return [positive_number(v) for v in numbers(count)(value)]
 
     return check
 
@@ -119,7 +119,9 @@ def one_of(allowed: tuple[Any, ...]) -> Callable[[Any], Any]:
             ", ".join(repr(a) for a in allowed[:-1]) + f" or {allowed[-1]!r}" if len(allowed) > 1 else repr(*allowed)
         )
         suggestion = did_you_mean(value, [a for a in allowed if isinstance(a, str)])
-        raise wrong(f"expected {words}, got {shown(value)}" + (suggestion if "did you mean" in suggestion else ""))
+        raise field_error(
+            f"expected {words}, got {shown(value)}" + (suggestion if "did you mean" in suggestion else "")
+        )
 
     return check
 
@@ -128,11 +130,11 @@ def _plain(check: Callable[[Any], Any]) -> pydantic.PlainValidator:
     return pydantic.PlainValidator(check)
 
 
-Number = Annotated[float, _plain(a_number)]
-Positive = Annotated[float, _plain(a_positive_number)]
-FromZero = Annotated[float, _plain(a_number_from_zero)]
-Integer = Annotated[int, _plain(an_integer)]
-Word = Annotated[str, _plain(a_word)]
+Number = Annotated[float, _plain(finite_number)]
+Positive = Annotated[float, _plain(positive_number)]
+NonNegative = Annotated[float, _plain(non_negative_number)]
+Integer = Annotated[int, _plain(whole_number)]
+Word = Annotated[str, _plain(word)]
 Text = Annotated[str, _plain(free_text)]
 Vector3 = Annotated[list[float], _plain(numbers(3))]
 Lines = Annotated[list[str], _plain(lines_of_text)]
@@ -148,10 +150,10 @@ class Block(pydantic.BaseModel):
     def _keys(cls, value: Any) -> Any:
         names = {f.alias or n: f for n, f in cls.model_fields.items()}
         if not isinstance(value, dict):
-            raise unexpected(f"a mapping with {', '.join(names)}", value)
+            raise unexpected_value(f"a mapping with {', '.join(names)}", value)
         for key in value:
             if key not in names:
-                raise wrong(f"unknown key {key!r}{did_you_mean(key, names)}")
+                raise field_error(f"unknown key {key!r}{did_you_mean(key, names)}")
         return value
 
 

@@ -11,12 +11,12 @@ from lab.files.text.csv_table import Table
 FARTHEST_M = 10_000.0  # m from the origin: coordinates of a national grid must be transformed to a local frame first
 FARTHEST_IN_SCAN = 1e8  # units of a scanned cloud, which may be millimetres and in a national grid
 MARGIN_PICTURES = 1.0  # how far outside the picture, in picture widths, a pixel is accepted: predictions lie there
-SIGMAS_M = (1e-9, FARTHEST_M)
+SIGMA_RANGE_M = (1e-9, FARTHEST_M)
 SIGMAS_PX = (1e-6, 1e5)
-SIGMAS_DEG = (0.0, 360.0)
+SIGMA_RANGE_DEG = (0.0, 360.0)
 
 
-def refuse_far_places(table: Table, names: Sequence[str], farthest_m: float = FARTHEST_M) -> None:
+def check_coordinates(table: Table, names: Sequence[str], farthest_m: float = FARTHEST_M) -> None:
     """Raises InputError at the first coordinate, m, of the columns `names` that lies outside any lab."""
     xyz = table.stack(*names)
     for i, k in np.argwhere(~(np.abs(xyz) <= farthest_m))[:1]:

@@ -24,7 +24,7 @@ COLUMNS = ("frame", "a", "b", "camera")
 
 def both_ways(path, monkeypatch, required=COLUMNS, optional=()):
     small = read_table(path, required, optional)
-    monkeypatch.setattr(csv_text, "_LARGE_BYTES", 0)
+    monkeypatch.setattr(csv_text, "LARGE_BYTES", 0)
     used = []
     real = csv_text._read_regular
     monkeypatch.setattr(csv_text, "_read_regular", lambda *a: used.append(real(*a)) or used[-1])

@@ -26,7 +26,7 @@ def png(
     content: bytes | None = None,
     split: int = 1000,
 ) -> bytes:
-    """A PNG of samples (h, w) or (h, w, channels). filters: of the rows in turn. size, content: overrides of the true ones."""
+    """A PNG of samples (h, w) or (h, w, channels). filters: of the rows in turn. size, content: false values."""
     height, width = samples.shape[:2]
     bits = bits or 8 * samples.dtype.itemsize
     raw = b"".join(_rows(samples[top::down, left::across], bits, filters) for left, top, across, down in ADAM7)
