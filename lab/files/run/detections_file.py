@@ -19,11 +19,10 @@ from tracking.input_validation import LARGEST_PX, LEAST_SIGMA_PX, TWIN_PX, twins
 REQUIRED = ("frame", "camera", "u_px", "v_px")
 DEFAULT_SIGMA_PX = 0.1  # px, where the file gives no sigma: about the centroid noise of a clean laser spot
 SHAPE = ("flux", "peak", "major_px", "minor_px", "angle_deg")
-MAX_NUMBERS_PER_PICTURE = (
-    1000  # frame numbers per picture; more than that indicates a stray number, or time stamps as frame numbers
-)
+# More frame numbers per picture indicate a stray number, or time stamps as frame numbers.
+MAX_NUMBERS_PER_PICTURE = 1000
 LONG_SPAN = 100_000  # frame numbers: a run that spans fewer may be sparser
-LONGEST_GAP = 10_000  # frame numbers, 100 s at 100 Hz: after a longer gap, MOST_ALONE pictures or fewer are strays
+LONGEST_GAP = 10_000  # frame numbers, 100 s at 100 Hz: after a longer gap, MAX_STRAY_FRAMES or fewer are strays
 MAX_STRAY_FRAMES = 3
 MAX_STRAY_SHARE = 0.1  # largest share of the frames that is left out as strays; with more the run is refused
 
@@ -130,7 +129,7 @@ class _Rows:
         """Leaves out rows without a valid frame or camera."""
         self._leave_out(~is_whole(frame), "the frame is not a whole number", "frame")
         self._leave_out(frame < 0, "the frame is negative; frames count from 0", "frame")
-        self._leave_out(self.camera == "", "no camera is named")
+        self._leave_out(self.camera == "", "the camera is empty")
         far = f"the frame is more than {LONGEST_GAP} numbers away from the others"
         self._leave_out(_stray(frame, self.good), far, "frame")
 

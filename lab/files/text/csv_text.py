@@ -153,13 +153,17 @@ def _all_lines_are_equal(data: bytes, columns: int) -> bool:
 
 def _records(path: Path, data: bytes) -> Iterator[tuple[int, list[str]]]:
     """Line number and fields of each line that is not blank. Raises InputError."""
-    reader = csv.reader(io.StringIO(data.decode("utf-8", errors="replace"), newline=""), skipinitialspace=True)
+    reader = csv.reader(
+        io.StringIO(data.decode("utf-8", errors="replace"), newline=""), skipinitialspace=True, strict=True
+    )
     try:
         for fields in reader:
             if fields and (len(fields) > 1 or fields[0].strip()):
                 yield reader.line_num, fields
     except csv.Error as error:
-        raise InputError(f"{path}: line {reader.line_num}: expected a CSV table, got {error}") from None
+        raise InputError(
+            f"{path}: line {reader.line_num}: expected a CSV table, got unbalanced quotes ({error})"
+        ) from None
 
 
 def _read_any(path: Path, data: bytes, header: tuple[str, ...], wanted: Sequence[str]) -> Table:

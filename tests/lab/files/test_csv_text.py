@@ -96,6 +96,14 @@ def test_lines_count_blank_lines_quoted_line_breaks_and_lines_left_out(newline, 
     assert (table.long_lines, table.short_lines) == ((5,), (10,))
 
 
+@pytest.mark.parametrize("rows", ['1,2,3,"x\n2,2,3,y\n', '1,2,3,x\n2,2,3,"y"z\n'])
+def test_unbalanced_quotes_are_refused(rows, tmp_path):
+    path = tmp_path / "t.csv"
+    path.write_text("frame,a,b,camera\n" + rows)
+    with pytest.raises(InputError, match=r"line 3: expected a CSV table, got unbalanced quotes"):
+        read_table(path, COLUMNS)
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [

@@ -74,7 +74,7 @@ BAD_ROWS = [
     (row("1e300", "left", 1, 2), "the frame is not a whole number", "frame 1e+300"),
     (row("one", "left", 1, 2), "the frame is not a whole number", "frame 'one'"),
     (row(-1, "left", 1, 2), "the frame is negative; frames count from 0", "frame -1"),
-    (row(1, "", 1, 2), "no camera is named", ""),
+    (row(1, "", 1, 2), "the camera is empty", ""),
     (row(1, "left", "nan", 2), "u_px or v_px is not a finite number", "u_px 'nan' and v_px 2"),
     (row(1, "left", 1, "inf"), "u_px or v_px is not a finite number", "u_px 1 and v_px inf"),
     (row(1, "left", 1, "12;5"), "u_px or v_px is not a finite number", "u_px 1 and v_px '12;5'"),

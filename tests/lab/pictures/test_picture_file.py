@@ -240,6 +240,14 @@ def test_a_damaged_jpeg_is_unreadable_but_padding_before_a_marker_is_allowed(cap
     assert capfd.readouterr() == ("", "")
 
 
+def test_a_jpeg_without_an_end_marker_or_a_frame_header_is_unreadable(capfd):
+    data = cv2.imencode(".jpg", noise())[1].tobytes()
+    assert decode(data[:-2], SIZE) == Missing("unreadable: cut short")
+    assert decode(b"\xff\xd8\xff\xd9", SIZE) == Missing("unreadable: damaged (no frame header before the first scan)")
+    assert decode(data[:20], SIZE) == Missing("unreadable: cut short")
+    assert capfd.readouterr() == ("", "")
+
+
 # Hostile headers ------------------------------------------------------------------------------------------------
 
 
