@@ -10,7 +10,7 @@ crc32 = isal_zlib.crc32
 _Damaged = cast("type[Exception]", isal_zlib.error)
 
 
-def inflated(data: object, size: int) -> bytes | None:
+def decompress(data: object, size: int) -> bytes | None:
     """The content of a zlib stream of exactly `size` bytes; None where it is damaged, longer or shorter.
 
     The checksum (Adler-32) is verified. At most `size` + 1 bytes are decompressed, whatever the stream contains. The

@@ -21,8 +21,8 @@ from lab.pictures.picture_headers import JPEG_SCAN, DamagedError, Header, jpeg_s
 SUFFIXES = (".png", ".tif", ".tiff", ".bmp", ".pgm", ".jpg", ".jpeg")
 UNREADABLE = "unreadable"
 DROPPED = "dropped"
-_PADDING = 16  # bytes that some cameras add before the end of a JPEG; damage leaves about fifty or more
-_LARGE = 1 << 26  # bytes: a larger file is mapped, not read, since its header may show that it is unusable
+_MAX_PADDING_BYTES = 16  # bytes that some cameras add before the end of a JPEG; damage leaves about fifty or more
+_LARGE_BYTES = 1 << 26  # bytes: a larger file is mapped, not read, since its header may show that it is unusable
 
 Grey: TypeAlias = NDArray[np.uint8] | NDArray[np.uint16]  # (h, w), DN
 
@@ -65,7 +65,7 @@ def _content(path: Path) -> NDArray[np.uint8]:
     """The bytes of a file; writing to them does not change the file. Raises OSError."""
     with open(path, "rb", buffering=0) as file:
         size = file.seek(0, 2)
-        if size > _LARGE:
+        if size > _LARGE_BYTES:
             return np.memmap(file, np.uint8, "c", shape=(size,))
         file.seek(0)
         data = np.empty(size, np.uint8)
@@ -112,7 +112,7 @@ def _jpeg(data: NDArray[np.uint8], header: Header) -> NDArray[np.generic]:
         picture = simplejpeg.decode_jpeg(data, "GRAY" if grey else "CMYK", strict=True)
     except ValueError as error:
         left_over = re.search(r"(\d+) extraneous bytes", str(error))
-        if left_over is None or int(left_over[1]) > _PADDING:
+        if left_over is None or int(left_over[1]) > _MAX_PADDING_BYTES:
             raise DamagedError(f"damaged ({_first_line(error)})") from None
         picture = simplejpeg.decode_jpeg(data, "GRAY" if grey else "CMYK", strict=False)
     return picture[..., 0] if grey else _by_opencv(data)

@@ -15,12 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lab.pictures.inflate import crc32
-from lab.pictures.tiff import KNOWN_COMPRESSIONS, TIFF_MARKS, Tiff
+from lab.pictures.tiff import KNOWN_COMPRESSIONS, TIFF_SIGNATURES, Tiff
 
 Bytes: TypeAlias = memoryview  # content of a file
 
-MOST_PIXELS = 2**28  # of one picture: the largest sensors have 2^27.3; a header with more is wrong
-PNG_MARK = b"\x89PNG\r\n\x1a\n"
+MAX_PIXELS = 2**28  # of one picture: the largest sensors have 2^27.3; a header with more is wrong
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 JPEG_END, JPEG_SCAN = 0xD9, 0xDA  # EOI, SOS
 _JPEG_FRAMES = {0xC0 + k for k in range(16)} - {0xC4, 0xC8, 0xCC}  # SOF0 to SOF15 without DHT, JPG, DAC
 _PNM_WORD = re.compile(rb"(?:\s|#[^\r\n]*[\r\n])+([0-9]+)")
@@ -46,9 +46,9 @@ class Header:
         """Raises DamagedError for a size or depth that no camera of a rig can have."""
         if self.width < 1 or self.height < 1:
             raise DamagedError(f"damaged (the header says {self.width}x{self.height} px)")
-        if self.width * self.height > MOST_PIXELS:
+        if self.width * self.height > MAX_PIXELS:
             raise DamagedError(
-                f"the header says {self.width}x{self.height} px, more than the limit of {MOST_PIXELS / 1e6:.0f} million"
+                f"the header says {self.width}x{self.height} px, more than the limit of {MAX_PIXELS / 1e6:.0f} million"
             )
         if self.numbers:
             raise DamagedError(f"{self.numbers} numbers, expected 8 or 16 bits without sign")
@@ -59,11 +59,11 @@ def read_header(data: NDArray[np.uint8]) -> Header:
     view = data.data
     start = bytes(view[:8])
     try:
-        if start == PNG_MARK:
+        if start == PNG_SIGNATURE:
             return _png(view)
         if start.startswith(b"\xff\xd8"):
             return _jpeg(view)
-        if start[:4] in TIFF_MARKS:
+        if start[:4] in TIFF_SIGNATURES:
             return _tiff(view)
         if start.startswith(b"BM"):
             return _bmp(view)
@@ -116,7 +116,7 @@ def _jpeg(view: Bytes) -> Header:
 
 def _tiff(view: Bytes) -> Header:
     tiff = Tiff.read(view)
-    if tiff.tile is not None and tiff.tile[0] * tiff.tile[1] > MOST_PIXELS:
+    if tiff.tile is not None and tiff.tile[0] * tiff.tile[1] > MAX_PIXELS:
         raise DamagedError(f"damaged (tiles of {tiff.tile[0]}x{tiff.tile[1]} px)")
     if tiff.compression not in KNOWN_COMPRESSIONS:
         raise DamagedError(f"unknown compression (TIFF compression {tiff.compression})")

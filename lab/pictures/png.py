@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.compilation.jit import compiled_for_threads
-from lab.pictures.inflate import crc32, inflated
-from lab.pictures.picture_headers import PNG_MARK, DamagedError
+from lab.pictures.inflate import crc32, decompress
+from lab.pictures.picture_headers import PNG_SIGNATURE, DamagedError
 
 Bytes: TypeAlias = NDArray[np.uint8]
 
@@ -43,7 +43,7 @@ class Png:
     @staticmethod
     def read(data: NDArray[np.uint8]) -> Png:
         """From a file's bytes. Raises DamagedError."""
-        view, at = data.data, len(PNG_MARK)
+        view, at = data.data, len(PNG_SIGNATURE)
         before, parts = [], []
         while True:
             if at + 12 > len(view):
@@ -71,7 +71,7 @@ class Png:
 
     def rows(self) -> NDArray[np.uint8]:
         """The decompressed content: the rows, each preceded by its filter byte. Raises DamagedError."""
-        unpacked = inflated(self.content, self._size())
+        unpacked = decompress(self.content, self._size())
         if unpacked is None:
             raise DamagedError("damaged (its content cannot be unpacked)")
         return np.frombuffer(unpacked, np.uint8)
@@ -110,7 +110,7 @@ class Png:
         """
         content = b"IDAT" + zlib.compress(self.rows().data, 0)  # stored: decompressing twice would take 8 ms
         idat = struct.pack(">I", len(content) - 4) + content + struct.pack(">I", crc32(content))
-        return PNG_MARK + self.before + idat + b"\0\0\0\0IEND\xaeB`\x82"
+        return PNG_SIGNATURE + self.before + idat + b"\0\0\0\0IEND\xaeB`\x82"
 
 
 @compiled_for_threads

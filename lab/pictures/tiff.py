@@ -13,14 +13,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lab.pictures.inflate import inflated
+from lab.pictures.inflate import decompress
 
-TIFF_MARKS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")  # the last two: BigTIFF
+TIFF_SIGNATURES = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")  # the last two: BigTIFF
 _TYPES = {1: "B", 3: "H", 4: "I", 16: "Q"}  # BYTE, SHORT, LONG, LONG8
 _ORIENTATION = 274
-_MOST_SEGMENTS = 1 << 20  # strips or tiles: one per row is 65536 at most
+_MAX_SEGMENTS = 1 << 20  # strips or tiles: one per row is 65536 at most
 PLAIN, LZW, DEFLATE, PACK_BITS, OLD_DEFLATE = 1, 5, 8, 32773, 32946
-_READ_HERE = (PLAIN, LZW, DEFLATE, PACK_BITS, OLD_DEFLATE)
+_OWN_COMPRESSIONS = (PLAIN, LZW, DEFLATE, PACK_BITS, OLD_DEFLATE)
 # Compressions of OpenCV's libtiff: CCITT (2, 3, 4), LZW, JPEG, PackBits, LZMA, Zstandard. For others it returns zeros.
 KNOWN_COMPRESSIONS = (PLAIN, 2, 3, 4, LZW, 7, DEFLATE, PACK_BITS, OLD_DEFLATE, 34925, 50000)
 
@@ -85,7 +85,7 @@ class Tiff:
             and self.sample_format in (1, 4)
             and self.photometric == 1
             and self.fill_order == 1
-            and self.compression in ((PLAIN, DEFLATE, OLD_DEFLATE) if self.bits == 16 else _READ_HERE)
+            and self.compression in ((PLAIN, DEFLATE, OLD_DEFLATE) if self.bits == 16 else _OWN_COMPRESSIONS)
             and self.predictor in (1, 2)
             and min(self.tile or (1, self.rows_per_strip)) >= 1
             and len(self.offsets) == len(self.counts) == self._across * self._down
@@ -140,17 +140,17 @@ class Tiff:
         if self.compression == PLAIN:
             return piece[:size] if len(piece) >= size else None
         if self.compression in (DEFLATE, OLD_DEFLATE):
-            unpacked = inflated(piece, size)
+            unpacked = decompress(piece, size)
             return None if unpacked is None else np.frombuffer(unpacked, np.uint8)
         from lab.pictures.tiff_packing import (  # compiled code: imported only where needed
-            unpacked_bits,
-            unpacked_lzw,
+            decompress_lzw,
+            decompress_pack_bits,
         )
 
         if self.compression == LZW:
-            return unpacked_lzw(piece, size)
+            return decompress_lzw(piece, size)
         out = np.empty(size, np.uint8)
-        return out if unpacked_bits(piece, out) == size else None
+        return out if decompress_pack_bits(piece, out) == size else None
 
     def as_stored(self, data: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """The bytes of the file with orientation "as stored"; a copy where that changes them."""
@@ -197,7 +197,7 @@ def _numbers(
 ) -> tuple[int, ...]:
     """The values of a tag; the default where it is absent or not integer."""
     kind, count, at = tags.get(tag, (0, 0, 0))
-    if kind not in _TYPES or not 1 <= count <= _MOST_SEGMENTS:
+    if kind not in _TYPES or not 1 <= count <= _MAX_SEGMENTS:
         return default
     size = count * struct.calcsize(_TYPES[kind])
     if size > (8 if big else 4):

@@ -162,10 +162,10 @@ def covariance_mapping(covariance: Covariance) -> dict[str, Any]:
     """The plain mapping from which a `CovarianceBlock` reads the same numbers."""
     return {
         "parameters": list(covariance.parameters),
-        "matrix": [floats(row) for row in covariance.matrix],
+        "matrix": [plain_floats(row) for row in covariance.matrix],
     }
 
 
-def floats(values: Array) -> list[float]:
+def plain_floats(values: Array) -> list[float]:
     """Plain numbers for a file, without negative zeros."""
     return [float(v) + 0.0 for v in values]

@@ -35,7 +35,7 @@ _LABELS = {
     "colmap": "COLMAP cameras.txt",
     "mrcal": "mrcal .cameramodel",
 }
-ROUND_TRIP = 1e-12  # relative tolerance between a camera and the camera that is read from the written file
+ROUND_TRIP_TOLERANCE = 1e-12  # relative tolerance between a camera and the camera that is read from the written file
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +77,7 @@ def convert(
     """
     source, destination = Path(source), Path(destination)
     text = read_text(source)
-    origin = _known(from_format, READABLE, "--from") if from_format else recognise(text, source)
+    origin = _known(from_format, READABLE, "--from") if from_format else recognised_format(text, source)
     target = _known(to_format, FORMATS, "--to") if to_format else _format_of_name(destination)
     found, covariances = _read(text, source, origin)
     models = _chosen(found.cameras, camera, source, target)
@@ -93,14 +93,14 @@ def read_cameras(path: Path, from_format: str | None = None) -> tuple[CameraMode
     """The cameras of a file of any known format. Raises InputError."""
     path = Path(path)
     text = read_text(path)
-    origin = _known(from_format, READABLE, "--from") if from_format else recognise(text, path)
+    origin = _known(from_format, READABLE, "--from") if from_format else recognised_format(text, path)
     return _read(text, path, origin)[0].cameras
 
 
 # Formats -------------------------------------------------------------------------------------------------------------
 
 
-def recognise(text: str, path: Path) -> str:
+def recognised_format(text: str, path: Path) -> str:
     """The format of a file, from its text. Raises InputError, with the known formats, where it is none of them."""
     body = text.lstrip("\ufeff \t\r\n")
     if body.startswith(("<?xml", "<opencv_storage")):
@@ -233,7 +233,7 @@ def _check_destination(source: Path, destination: Path, target: str) -> None:
         return
     try:
         text = read_text(destination)
-        there = recognise(text, destination)
+        there = recognised_format(text, destination)
         if there == target:
             _read(text, destination, target)
     except InputError:
@@ -280,9 +280,11 @@ def _check_round_trip(models: Sequence[CameraModel], text: str, path: Path, targ
 
 
 def same_lens(a: CameraModel, b: CameraModel) -> bool:
-    """Whether two models are equal: picture size, and pinhole and distortion parameters to `ROUND_TRIP`."""
+    """Whether two models are equal: picture size, and pinhole and distortion parameters to `ROUND_TRIP_TOLERANCE`."""
     if (a.image_size_px, a.lens) != (b.image_size_px, b.lens):
         return False
     numbers = [np.array([*m.pinhole, *significant(m.distortion)]) for m in (a, b)]
     scale = np.maximum(np.abs(numbers[0]), [1.0] * 4 + [0.0] * (len(numbers[0]) - 4))
-    return len(numbers[0]) == len(numbers[1]) and bool(np.all(np.abs(numbers[0] - numbers[1]) <= ROUND_TRIP * scale))
+    return len(numbers[0]) == len(numbers[1]) and bool(
+        np.all(np.abs(numbers[0] - numbers[1]) <= ROUND_TRIP_TOLERANCE * scale)
+    )

@@ -15,7 +15,14 @@ from geometry.pose import Pose
 from geometry.rig import Beam, Rig, Screen, Spot
 from geometry.rotations import quaternion_from_matrix
 from lab.files.rig.calibration_state import CalibrationState, CalibrationStateBlock, state_mapping
-from lab.files.rig.camera_block import Covariance, CovarianceBlock, LensBlock, covariance_mapping, floats, lens_mapping
+from lab.files.rig.camera_block import (
+    Covariance,
+    CovarianceBlock,
+    LensBlock,
+    covariance_mapping,
+    lens_mapping,
+    plain_floats,
+)
 from lab.files.text.error_text import FileError, did_you_mean
 from lab.files.text.fields import (
     Block,
@@ -256,7 +263,8 @@ def as_mapping(file: RigFile) -> dict[str, Any]:
     cameras = {name: camera_mapping(camera) for name, camera in rig.cameras.items()}
     target = {
         "beams": {
-            name: {"direction": floats(b.direction), "point_m": floats(b.point)} for name, b in rig.beams.items()
+            name: {"direction": plain_floats(b.direction), "point_m": plain_floats(b.point)}
+            for name, b in rig.beams.items()
         },
         "spots": {
             name: {"beam": s.beam, "end": "+" if s.sign > 0 else "-", "screen": s.screen}
@@ -304,6 +312,6 @@ def camera_mapping(camera: Camera) -> dict[str, Any]:
 def pose_mapping(pose: Pose) -> dict[str, Any]:
     """The plain mapping from which a `PoseBlock` reads the same transform, its rotation matrix to 4e-16."""
     return {
-        "quaternion_wxyz": floats(quaternion_from_matrix(pose.rotation)),
-        "translation_m": floats(pose.translation),
+        "quaternion_wxyz": plain_floats(quaternion_from_matrix(pose.rotation)),
+        "translation_m": plain_floats(pose.translation),
     }

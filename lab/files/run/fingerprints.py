@@ -8,7 +8,7 @@ from typing import Any
 
 from lab.files.run.run_file import FramesFolder, LiveDevice, Run
 
-LARGEST_FILE = 64 * 2**20  # bytes: of a larger file (a video), only this many bytes and the size are used
+MAX_HASHED_BYTES = 64 * 2**20  # bytes: of a larger file (a video), only this many bytes and the size are used
 _BLOCK = 2**20
 
 
@@ -34,12 +34,12 @@ def fingerprints(run: Run) -> list[dict[str, Any]]:
 def _of_file(path: Path) -> dict[str, Any]:
     size = path.stat().st_size
     digest = hashlib.sha256()
-    left = min(size, LARGEST_FILE)
+    left = min(size, MAX_HASHED_BYTES)
     with path.open("rb") as file:
         while left > 0 and (block := file.read(min(_BLOCK, left))):
             digest.update(block)
             left -= len(block)
-    covers = "contents" if size <= LARGEST_FILE else f"the first {LARGEST_FILE} bytes"
+    covers = "contents" if size <= MAX_HASHED_BYTES else f"the first {MAX_HASHED_BYTES} bytes"
     return {"path": str(path), "sha256": digest.hexdigest(), "bytes": size, "covers": covers}
 
 

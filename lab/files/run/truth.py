@@ -22,7 +22,7 @@ from lab.files.text.csv_table import Categorical, Table
 from lab.files.text.csv_text import read_table
 from lab.files.text.error_text import did_you_mean
 
-COMPARED = 500  # frames at most that `largest_disagreement_px` compares, evenly spread: enough to show a wrong rig
+MAX_COMPARED_FRAMES = 500  # by `largest_disagreement_px`, evenly spread: enough to show a wrong rig
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,7 +149,7 @@ def largest_disagreement_px(truth: TruthTables, rig: Rig) -> tuple[float, int] |
     shared = np.intersect1d(truth.pose.frame, truth.spots.frame)
     if not shared.size:
         return None
-    frames: Ints = shared[np.unique(np.linspace(0, len(shared) - 1, COMPARED).astype(np.int64))]
+    frames: Ints = shared[np.unique(np.linspace(0, len(shared) - 1, MAX_COMPARED_FRAMES).astype(np.int64))]
     at = np.searchsorted(truth.pose.frame, frames)
     model = SpotModel.of(rig)
     pixels, _ = model.project(Pose.from_quaternion(truth.pose.quaternion_wxyz[at], truth.pose.position_m[at]))

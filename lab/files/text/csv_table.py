@@ -13,7 +13,7 @@ from geometry.arrays import Array, Bools, Ints
 from lab.errors import InputError
 from lab.files.text.error_text import shown
 
-LARGEST_FRAME = 2**53  # a larger number read as float is not exact
+MAX_EXACT_INTEGER = 2**53  # a larger number read as float is not exact
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,4 +131,4 @@ class Table:
 def is_whole(values: Array) -> Bools:
     """Which floats (n,) are whole numbers that an integer can hold exactly."""
     with np.errstate(invalid="ignore"):
-        return np.isfinite(values) & (np.abs(values) < LARGEST_FRAME) & (values == np.round(values))
+        return np.isfinite(values) & (np.abs(values) < MAX_EXACT_INTEGER) & (values == np.round(values))

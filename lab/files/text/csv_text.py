@@ -28,7 +28,7 @@ from lab.files.text.error_text import did_you_mean, shown_line
 WORD_COLUMNS = ("camera", "spot", "beam", "status", "point", "screen", "date", "verdict")
 LARGE_BYTES = 4_000_000  # pandas reads files of this size and larger
 _ROWS_AT_ONCE = 1_500  # bounds the memory of the text (1 MB): a long table is read in pieces
-_MOST_TEXTS = 1000  # kept per column, of fields that are not numbers
+_MAX_TEXTS = 1000  # kept per column, of fields that are not numbers
 
 
 # Reading -------------------------------------------------------------------------------------------------------------
@@ -227,7 +227,7 @@ def _as_numbers(fields: list[str], lines: list[int], texts: dict[int, str]) -> A
             values[i] = math.nan if "_" in text else float(text or "nan")
         except ValueError:
             values[i] = math.nan
-        if text and math.isnan(values[i]) and len(texts) < _MOST_TEXTS:
+        if text and math.isnan(values[i]) and len(texts) < _MAX_TEXTS:
             texts[lines[i]] = text
     return values
 

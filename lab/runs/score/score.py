@@ -76,6 +76,8 @@ def score(results: Path, run_folder: Path) -> dict[str, Any] | None:
 
     Pixels, metres and degrees as the names say; None where there is nothing to count.
     """
+    if not (run_folder / "truth").is_dir():
+        return None
     spots, poses = read_spots(results), read_poses(results)
     truth = read_truth(run_folder, spots, poses)
     causal = read_poses(results, causal=True) if has_causal(results) else None

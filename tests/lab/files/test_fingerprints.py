@@ -74,7 +74,7 @@ def test_a_table_of_both_cameras_is_listed_once(tmp_path):
 
 
 def test_the_digest_of_a_huge_file_covers_its_start_and_size(tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "LARGEST_FILE", 1000)
+    monkeypatch.setattr(module, "MAX_HASHED_BYTES", 1000)
     folder = write_run(tmp_path / "run")
     rig = folder / "rig.yaml"
     rig.write_text(rig.read_text() + "# " + "x" * 2000 + "\n")

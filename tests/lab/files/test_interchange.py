@@ -10,7 +10,7 @@ import pytest
 from lab.errors import InputError
 from lab.files.rig.camera_block import Covariance
 from lab.files.rig.camera_file import CameraFile, load_camera, save_camera
-from lab.files.rig.interchange import FORMATS, convert, read_cameras, recognise, same_lens
+from lab.files.rig.interchange import FORMATS, convert, read_cameras, recognised_format, same_lens
 from lab.files.rig.rig_file import RigFile, load_rig_file, save_rig
 from tests.lab.run_folders import RIG
 
@@ -180,5 +180,5 @@ def test_a_destination_with_an_unknown_name_needs_a_format(source, tmp_path):
 def test_every_format_is_recognised_by_its_content_alone(source, tmp_path):
     for name in FORMATS:
         convert(source, tmp_path / "anything.dat", to_format=name)
-        assert recognise((tmp_path / "anything.dat").read_text(), tmp_path / "anything.dat") == name
+        assert recognised_format((tmp_path / "anything.dat").read_text(), tmp_path / "anything.dat") == name
         (tmp_path / "anything.dat").unlink()
