@@ -1,10 +1,10 @@
-"""What can go wrong, with the exit status that it means. cli.py turns these into one or two plain lines."""
+"""The errors of the program and their exit statuses. The command line prints them as one or two plain lines."""
 
 from __future__ import annotations
 
 
 class BeamposeError(Exception):
-    """An error that the user can act on. The message names the thing, what was expected, what was found, what to do."""
+    """An error that the user can correct. The message names the object, what was expected and found, and the remedy."""
 
     exit_status = 1
 
@@ -27,4 +27,4 @@ class CalibrationError(BeamposeError):
     exit_status = 3
 
 
-QUALITY_GATE_FAILED = 4  # processed, but a quality gate failed: a verdict, not an exception
+QUALITY_GATE_FAILED = 4  # processed, but a quality gate failed; not an exception

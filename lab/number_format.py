@@ -6,7 +6,7 @@ import numpy as np
 
 
 def short(value: float | None, digits: int = 3) -> str:
-    """A number with so many significant digits, without exponent where it is of ordinary size; a dash for none."""
+    """A number with `digits` significant digits, without exponent from 1e-4 to 1e6; a dash for None, nan and inf."""
     if value is None or not np.isfinite(value):
         return "\u2013"
     if value == 0:
@@ -19,7 +19,7 @@ def short(value: float | None, digits: int = 3) -> str:
 
 
 def plus_minus(value: float, sigma: float, signed: bool = False) -> str:
-    """`0.350 ± 0.012`: the sigma to one digit, to two where that is a 1, and the value to as many decimals."""
+    """`0.350 ± 0.012`: the sigma to one digit (two digits where the first is 1), the value to as many decimals."""
     if not np.isfinite(value):
         return "\u2013"
     if not (np.isfinite(sigma) and sigma > 0):
@@ -31,7 +31,7 @@ def plus_minus(value: float, sigma: float, signed: bool = False) -> str:
 
 
 def percent(share: float | None) -> str:
-    """A share as a percentage that does not round up to 100 what is not all."""
+    """A share as a percentage. 0 % and 100 % mean exactly none and all: other shares get enough decimals."""
     if share is None or not np.isfinite(share):
         return "\u2013"
     if share in (0.0, 1.0):

@@ -15,7 +15,7 @@ from lab.calibrate.rig.rig import RIG, calibrate_rig
 from lab.simulate.campaign_files import PROJECT, simulate_calibration
 from lab.simulate.write import simulate
 
-# Light "quiet" (an unlit room and a low-noise sensor) keeps the files small: most pixels show the black level. A picture of
+# Light "quiet" (unlit room, low-noise sensor) keeps the files small: most pixels show the black level. A picture of
 # the light "lab" is thirty times as large, so of that kind there are few, and at half the size.
 SAMPLES: dict[str, dict[str, Any]] = {
     "huo2015": {"scenario": "huo2015", "seed": 19, "frames": 220, "light": "quiet"},

@@ -1,4 +1,4 @@
-"""The command line as a user meets it: help whose examples work; plain words and an exit status for every mistake."""
+"""The command line: help with examples that work; a plain message and an exit status for every mistake."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ import yaml
 from click.testing import CliRunner, Result
 
 from cli import main
+from lab.commands.common import PIPE_CLOSED
 from lab.errors import CalibrationError, InputError, RunError
 from lab.runs import batch, process
 from lab.simulate.scenarios import SCENARIOS
@@ -32,6 +33,7 @@ from tests.paths import ROOT
 
 SAMPLE = ROOT / "sample_runs" / "huo2015"
 PICTURES = 40  # of each camera of the sample run, enough for every file of a result; `-m slow` takes all 220
+PROGRAM = f"import sys; sys.path.insert(0, {str(ROOT)!r}); from cli import main; main(prog_name='beampose')"
 EXAMPLE = re.compile(r"^\s*beampose (.+)$", flags=re.MULTILINE)
 
 pytestmark = pytest.mark.skipif(not SAMPLE.is_dir(), reason="a source distribution has no sample runs")
@@ -40,11 +42,10 @@ pytestmark = pytest.mark.skipif(not SAMPLE.is_dir(), reason="a source distributi
 def beampose(cwd: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     """The program in a process of its own, without a terminal; `python -P` keeps cwd out of its modules.
 
-    To start one costs 0.7 s, ten times what most commands need: the other tests type into this process.
+    Starting a process takes 0.7 s, ten times as long as most commands: most tests use `typed` instead.
     """
-    program = f"import sys; sys.path.insert(0, {str(ROOT)!r}); from cli import main; main(prog_name='beampose')"
     return subprocess.run(
-        [sys.executable, "-P", "-c", program, *arguments], cwd=cwd, capture_output=True, text=True, check=False
+        [sys.executable, "-P", "-c", PROGRAM, *arguments], cwd=cwd, capture_output=True, text=True, check=False
     )
 
 
@@ -66,7 +67,7 @@ def help_of(name: str) -> str:
 
 
 def example(name: str) -> list[str]:
-    """What the command's help tells the user to type, after `beampose`."""
+    """The arguments of the example in the help of a command."""
     return shlex.split(EXAMPLE.findall(help_of(name))[0])
 
 
@@ -81,7 +82,7 @@ def typed(*arguments: str | Path, cwd: Path | str = ".") -> Result:
 
 @pytest.fixture(scope="module")
 def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder that looks like a clone to the examples, with less of the sample run, which has been processed."""
+    """A working folder for the examples: like a clone, with fewer pictures of the sample run, which is processed."""
     folder = tmp_path_factory.mktemp("desk")
     (folder / "sample_runs").mkdir()
     for path in (ROOT / "sample_runs").iterdir():
@@ -103,7 +104,7 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def works(desk: Path, capfd: pytest.CaptureFixture[str]) -> Callable[..., str]:
-    """Types a command at the desk, which must end well and without a word on stderr, be it one of C's; its stdout."""
+    """Runs a command at the desk and returns its stdout; it must succeed, with nothing on stderr (also from C code)."""
 
     def type_in(*arguments: str) -> str:
         done = typed(*arguments, cwd=desk)
@@ -113,7 +114,7 @@ def works(desk: Path, capfd: pytest.CaptureFixture[str]) -> Callable[..., str]:
     return type_in
 
 
-def test_there_are_the_commands_of_the_contract():
+def test_the_commands_are_those_of_the_contract():
     assert set(main.commands) == {
         "run",
         "batch",
@@ -131,7 +132,7 @@ def test_there_are_the_commands_of_the_contract():
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_every_command_says_what_it_does_and_shows_one_example_of_itself(name):
+def test_every_command_has_a_description_and_an_example(name):
     assert len(COMMANDS[name].get_short_help_str(200)) > 20
     assert " ".join(example(name)).startswith(name)
 
@@ -201,7 +202,7 @@ def test_the_examples_of_calibrate_lead_from_a_campaign_to_a_rig_that_is_checked
 
 
 @pytest.mark.parametrize("name", ["calibrate board", "calibrate convert", "plan"])
-def test_the_example_works_without_anything_before_it(works, name):
+def test_the_example_works_without_preparation(works, name):
     arguments = example(name)
     if name == "plan":
         arguments += ["--range", "yaw_deg=-10:10:3", "--range", "roll_deg=0:0:1", "--range", "x_m=0:0:1"]
@@ -217,7 +218,7 @@ def test_the_example_of_batch_has_a_row_for_every_run_and_an_index(desk, works):
     assert (out / "index.html").is_file()
 
 
-def test_a_run_that_fails_costs_the_batch_only_itself_and_the_status_says_so(desk):
+def test_a_run_that_fails_does_not_stop_the_batch_and_sets_its_status(desk):
     done = typed("batch", "nowhere", "sample_runs/four-skew-beams", "--out", "results/one-fails", cwd=desk)
     assert done.exit_code == 1
     assert (desk / "results/one-fails/four-skew-beams/attitude.csv").is_file()
@@ -298,7 +299,7 @@ def test_the_version_is_that_of_the_installed_package():
     assert installed in typed("--version").stdout
 
 
-# -- in this process: what can go wrong inside a command --------------------------------------------------------------
+# -- in this process: errors inside a command --------------------------------------------------------------
 
 
 def points_run(folder: Path) -> Path:
@@ -332,7 +333,7 @@ def test_every_kind_of_error_is_a_plain_line_with_its_exit_status(tmp_path, monk
     assert done.stdout.strip() == ""
 
 
-def test_a_failed_quality_gate_is_exit_status_4_and_the_report_says_the_same(tmp_path):
+def test_a_failed_quality_gate_is_exit_status_4_in_summary_and_report(tmp_path):
     done = typed("run", write_run(tmp_path / "grey"), "--out", tmp_path / "out")
     assert done.exit_code == 4
     assert done.stdout.startswith("small: FAIL: 0 of 5 frames measured (the vehicle was never found")
@@ -367,7 +368,7 @@ def test_parameters_are_read_as_yaml_and_reach_the_run(tmp_path):
     assert (tracker["curve_switch"], tracker["g1_scale"]) == (False, "paper")
 
 
-def test_causal_leaves_out_the_second_pass(tmp_path):
+def test_causal_skips_the_smoothing_pass(tmp_path):
     folder = points_run(tmp_path / "run")
     assert typed("run", folder, "--out", tmp_path / "one", "--causal").exit_code == 0
     assert typed("batch", folder, "--out", tmp_path / "many", "--causal").exit_code == 0
@@ -376,8 +377,8 @@ def test_causal_leaves_out_the_second_pass(tmp_path):
         assert not (out / "attitude_causal.csv").exists()
 
 
-def test_a_run_without_a_prior_is_processed_and_a_symmetric_rig_is_not_guessed(tmp_path):
-    """The fan of equal angles is the same after half a turn: FAIL, and the check has said what would resolve it."""
+def test_a_run_without_a_prior_is_processed_and_a_symmetric_rig_fails(tmp_path):
+    """The fan of equal angles is symmetric under half a turn: FAIL, and the check names the remedy."""
     folder = points_run(tmp_path / "run")
     content = yaml.safe_load((folder / "run.yaml").read_text())
     del content["prior"]
@@ -392,7 +393,7 @@ def test_a_run_without_a_prior_is_processed_and_a_symmetric_rig_is_not_guessed(t
     assert "Add prior: {position_m:" in checked.stdout
 
 
-def test_a_batch_says_what_became_of_each_and_ends_with_the_worst(tmp_path):
+def test_a_batch_reports_every_run_and_ends_with_the_worst_status(tmp_path):
     good, grey = points_run(tmp_path / "good"), write_run(tmp_path / "grey")
     for runs, status in (([good], 0), ([good, grey], 4), ([grey, tmp_path / "nowhere", good], 1)):
         done = typed("batch", *runs, "--out", tmp_path / f"out{status}")
@@ -409,7 +410,7 @@ def test_a_misspelt_parameter_stops_a_batch_before_its_first_run(tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_a_batch_that_is_stopped_says_so(tmp_path, monkeypatch):
+def test_a_stopped_batch_reports_it(tmp_path, monkeypatch):
     def stop(*_, **__):
         raise KeyboardInterrupt
 
@@ -419,10 +420,9 @@ def test_a_batch_that_is_stopped_says_so(tmp_path, monkeypatch):
     assert done.stderr.strip() == "beampose: stopped"
 
 
-def test_ctrl_c_ends_the_recording_that_is_watched_with_its_results(tmp_path):
+def test_ctrl_c_ends_a_watched_recording_and_writes_its_results(tmp_path):
     simulate("smooth", tmp_path / "run", seed=5, frames=8, picture_scale=0.25)
-    program = f"import sys; sys.path.insert(0, {str(ROOT)!r}); from cli import main; main(prog_name='beampose')"
-    command = [sys.executable, "-P", "-c", program, "watch", "run", "--out", "out"]
+    command = [sys.executable, "-P", "-c", PROGRAM, "watch", "run", "--out", "out"]
     with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as watching:
         until, table = time.monotonic() + 60, tmp_path / "out/attitude_live.csv"
         while time.monotonic() < until and not (table.is_file() and len(table.read_text().splitlines()) == 9):
@@ -446,8 +446,46 @@ def test_a_foreign_folder_is_not_replaced(tmp_path):
     assert (tmp_path / "thesis/chapter.tex").read_text() == "years"
 
 
+@pytest.mark.parametrize("arguments", [("check", str(SAMPLE)), ("--help",), ("simulate", "list")])
+def test_output_into_a_closed_pipe_ends_quietly_with_the_status_of_a_closed_pipe(arguments, tmp_path):
+    command = [sys.executable, "-P", "-c", PROGRAM, *arguments]
+    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as started:
+        started.stdout.close()
+        errors = started.stderr.read()
+    assert (started.returncode, errors) == (PIPE_CLOSED, b"")
+
+
+@pytest.mark.parametrize("arguments", [("rnu",), ("run", "nowhere", "--out", "out")])
+def test_an_error_message_into_a_closed_pipe_ends_quietly_too(arguments, tmp_path):
+    command = [sys.executable, "-P", "-c", PROGRAM, *arguments]
+    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as started:
+        started.stderr.close()
+        started.stdout.read()
+    assert started.returncode == PIPE_CLOSED
+
+
+@pytest.mark.parametrize("closed", ["2>&-", ">&-", ">&- 2>&-", "<&- >&- 2>&-"])
+def test_closed_standard_streams_change_no_exit_status(closed, tmp_path):
+    program = shlex.join([sys.executable, "-P", "-c", PROGRAM, "check", str(SAMPLE / "rig.yaml")])
+    done = subprocess.run(["sh", "-c", f"{program} {closed}"], cwd=tmp_path, capture_output=True, check=False)
+    assert (done.returncode, done.stderr) == (0, b"")
+    program = shlex.join([sys.executable, "-P", "-c", PROGRAM, "check", "nowhere"])
+    assert subprocess.run(["sh", "-c", f"{program} {closed}"], cwd=tmp_path, capture_output=True).returncode == 2
+
+
+def test_a_setting_is_read_as_in_a_file(tmp_path):
+    """YAML 1.2, as in run.yaml: 1e-3 is a number, 1:30 is a word."""
+    folder = points_run(tmp_path / "run")
+    done = typed("run", folder, "--out", tmp_path / "out", "--set", "r1_px=1e1")
+    assert done.exit_code == 0, done.stderr
+    assert json.loads((tmp_path / "out/summary.json").read_text())["parameters"]["tracker"]["r1_px"] == 10
+    done = typed("run", folder, "--out", tmp_path / "out", "--set", "r1_px=1:30")
+    assert done.exit_code == 2
+    assert "r1_px: expected a finite number, got '1:30'" in done.stderr
+
+
 @pytest.mark.parametrize(("terminal", "words"), [(True, "beampose: compiling\n"), (False, "")])
-def test_what_the_floors_below_tell_is_shown_on_a_terminal_only(monkeypatch, capsys, terminal, words):
+def test_log_messages_are_shown_on_a_terminal_only(monkeypatch, capsys, terminal, words):
     logger = logging.getLogger("beampose")
     monkeypatch.setattr(logger, "handlers", [])
     monkeypatch.setattr(logger, "level", logging.NOTSET)

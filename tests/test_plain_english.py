@@ -58,7 +58,9 @@ def test_no_word_of_the_list_occurs():
     assert lines == []
 
 
-@pytest.mark.parametrize("text", ["It was Told.", "told_by_the_others = 1", "def isTold(): ...", "MOST_DARK = 2", "a cure"])
+@pytest.mark.parametrize(
+    "text", ["It was Told.", "told_by_the_others = 1", "def isTold(): ...", "MOST_DARK = 2", "a cure"]
+)
 def test_a_word_is_found_in_prose_and_in_identifiers(text):
     assert len(found_in(text)) == 1
 

@@ -19,7 +19,7 @@ from bench.peers.rows import Tracked
 from bench.peers.scenes import HIDDEN, OUTSIDE, SCENES, Scene
 from bench.peers.trackers import ENTRIES, Entry
 from bench.peers.unseen import score_unseen
-from lab.files.text.yaml_text import atomic_write_text
+from lab.files.text.atomic_write import atomic_write_text
 
 SHARED = ("numpy", "scipy", "numba")
 NAN = math.nan

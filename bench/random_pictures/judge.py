@@ -24,7 +24,7 @@ from bench.random_scenes.nuisances import FalsePoints
 from bench.random_scenes.oracle import ask_oracle
 from bench.random_scenes.scene import OUTSIDE, SHINING, Scene, composed
 from geometry.arrays import Array, Bools
-from lab.files.run.results import read_spots, read_summary, read_table
+from lab.files.run.results import read_result_table, read_spots, read_summary
 from lab.runs.verdict.evidence import Kind
 
 LEAST_SNR = 8.0
@@ -181,10 +181,10 @@ def judge(renderer: Renderer, results: Path, exit_status: int, seconds: tuple[fl
 def detections_against(renderer: Renderer, results: Path, asked: Bools, limit: Array) -> tuple[float, float]:
     """Share of the asked pairs that have a detection at their place, and detections per picture far from any light."""
     scene = renderer.ps.scene
-    table = read_table(results / "detections.csv", ("frame", "u_px", "v_px"), ("camera",))
+    table = read_result_table(results / "detections.csv", ("frame", "camera", "u_px", "v_px"))
     cameras = list(scene.rig.cameras)
     frame, uv = table.numbers["frame"], table.stack("u_px", "v_px")
-    camera = table.texts["camera"].recoded(tuple(cameras))
+    camera = table.words["camera"].recoded(tuple(cameras))
     found = false = 0
     for c in range(len(cameras)):
         mine = np.flatnonzero(scene.camera_of == c)

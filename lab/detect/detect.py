@@ -19,9 +19,10 @@ from lab.errors import InputError
 from lab.files.run.parameter_overrides import overridden
 from lab.files.text import columns
 from lab.files.text.atomic_write import atomic_folder
+from lab.files.text.csv_text import csv_word
 from lab.files.text.json_text import write_json
 from lab.pictures.picture_file import Missing
-from lab.runs.tables import csv_word, detection_rows
+from lab.runs.tables import detection_rows
 from lab.versions import versions
 from tracking.parameters import DetectParameters, TrackerParameters
 

@@ -14,7 +14,7 @@ from lab.detect.contact_sheet import ContactSheet
 from lab.detect.detect_charts import counts_chart, noise_chart, places_chart
 from lab.detect.findings import SizeGroup
 from lab.detect.work import Work
-from lab.files.text.yaml_text import atomic_write_text
+from lab.files.text.atomic_write import atomic_write_text
 from lab.number_format import short
 from lab.pictures.picture_file import Grey
 from lab.report.calibration.calibration_page import PageDrawing, PageTable, Section, section_context

@@ -1,4 +1,4 @@
-"""Inflating with a limit, by Intel's ISA-L: 2.0 ms for a grey 1280x1024 PNG where zlib takes 6.2 (one core)."""
+"""Decompression of zlib streams with a size limit, by Intel's ISA-L: 2.0 ms for a grey 1280x1024 PNG (zlib: 6.2)."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ crc32 = isal_zlib.crc32
 _Damaged = cast("type[Exception]", isal_zlib.error)
 
 
-def inflated(data: object, size: int) -> bytes | None:
+def decompress(data: object, size: int) -> bytes | None:
     """The content of a zlib stream of exactly `size` bytes; None where it is damaged, longer or shorter.
 
-    Its checksum (Adler-32) is verified. No more than one byte beyond `size` is ever made, whatever the stream says.
-    The GIL is released.
+    The checksum (Adler-32) is verified. At most `size` + 1 bytes are decompressed, whatever the stream contains. The
+    GIL is released.
     """
     stream = isal_zlib.decompressobj()
     try:

@@ -1,4 +1,4 @@
-"""OpenCV for reading pictures and videos: loaded when first needed, without remarks on standard error."""
+"""OpenCV for reading pictures and videos: imported when first needed, silent on standard error."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from types import ModuleType
 
 @cache
 def quiet_cv2() -> ModuleType:
-    """The module cv2; from now on neither it nor FFmpeg writes to standard error about damage that we report ourselves.
+    """The module cv2, set so that neither it nor FFmpeg writes to standard error about damage that beampose reports.
 
-    For the rest of the process: the level is one for all threads, and a picture may be decoded in any of them.
+    The setting holds for the rest of the process: the log level is shared by all threads, and any of them may decode.
     """
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # read by OpenCV when the first video is opened
     import cv2

@@ -1,12 +1,13 @@
-"""One picture file: decoded to grey, or the reason why it cannot be.
+"""Decodes one picture file to grey, or gives the reason why it cannot be used.
 
-The header is read first: what is of another size than the rig says, or promises an absurd one, is never decoded.
-Checksums are verified where a format has them. What a library writes to standard error about damage never gets there.
+The header is read first: a picture of another size than the rig's, or of an absurd size, is not decoded. Checksums are
+verified where a format has them. Libraries do not write about damage to standard error.
 """
 
 from __future__ import annotations
 
 import re
+import struct
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeAlias, cast
@@ -15,28 +16,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lab.pictures.opencv import quiet_cv2
-from lab.pictures.picture_headers import DamagedError, Header, read_header
+from lab.pictures.picture_headers import JPEG_SCAN, DamagedError, Header, jpeg_segments, read_header
 
 SUFFIXES = (".png", ".tif", ".tiff", ".bmp", ".pgm", ".jpg", ".jpeg")
 UNREADABLE = "unreadable"
 DROPPED = "dropped"
-_PADDING = 16  # bytes that some cameras leave before the end of a JPEG; damage leaves some fifty and more
-_LARGE = 1 << 26  # bytes of a file: a larger one is mapped, not read, since its header may show that it is of no use
+_MAX_PADDING_BYTES = 16  # bytes that some cameras add before the end of a JPEG; damage leaves about fifty or more
+_LARGE_BYTES = 1 << 26  # bytes: a larger file is mapped, not read, since its header may show that it is unusable
 
 Grey: TypeAlias = NDArray[np.uint8] | NDArray[np.uint16]  # (h, w), DN
 
 
 @dataclass(frozen=True, slots=True)
 class Missing:
-    """There is no usable picture: why."""
+    """The reason why there is no usable picture."""
 
     reason: str  # "dropped", "unreadable: ...", "wrong size ..."
 
 
 def read_picture(path: Path, size_px: tuple[int, int] | None) -> Grey | Missing:
-    """The picture in a file as grey (h, w), 8 or 16 bit; Missing where it is damaged or not of this (width, height).
+    """The picture in a file as grey (h, w), 8 or 16 bit; Missing where it is damaged or has another (width, height).
 
-    size_px None: of any size. The array is the caller's own. May be called in any thread.
+    size_px None: any size. The caller owns the array. Thread-safe.
     """
     try:
         data = _content(path)
@@ -46,12 +47,12 @@ def read_picture(path: Path, size_px: tuple[int, int] | None) -> Grey | Missing:
 
 
 def decode(data: bytes, size_px: tuple[int, int] | None) -> Grey | Missing:
-    """As `read_picture`, from the bytes of a file."""
+    """As `read_picture`, from the content of a file."""
     return _decoded(np.frombuffer(bytearray(data), np.uint8), size_px)
 
 
 def checked(picture: NDArray[np.generic], size_px: tuple[int, int] | None) -> Grey | Missing:
-    """The picture itself, if it has this width and height and 8 or 16 bits."""
+    """The picture itself if it has this width and height and 8 or 16 bits; else Missing."""
     height, width = picture.shape[:2]
     if size_px is not None and (width, height) != size_px:
         return Missing(_wrong_size(width, height, size_px))
@@ -61,10 +62,10 @@ def checked(picture: NDArray[np.generic], size_px: tuple[int, int] | None) -> Gr
 
 
 def _content(path: Path) -> NDArray[np.uint8]:
-    """A file's bytes, that may be written to without changing the file. Raises OSError."""
+    """The bytes of a file; writing to them does not change the file. Raises OSError."""
     with open(path, "rb", buffering=0) as file:
         size = file.seek(0, 2)
-        if size > _LARGE:
+        if size > _LARGE_BYTES:
             return np.memmap(file, np.uint8, "c", shape=(size,))
         file.seek(0)
         data = np.empty(size, np.uint8)
@@ -102,7 +103,7 @@ def _png(data: NDArray[np.uint8], header: Header) -> NDArray[np.generic]:
 
 
 def _jpeg(data: NDArray[np.uint8], header: Header) -> NDArray[np.generic]:
-    """By libjpeg-turbo, which tells of damage where OpenCV writes it to standard error and goes on."""
+    """By libjpeg-turbo, which reports damage; OpenCV writes it to standard error and continues."""
     import simplejpeg
 
     _require_jpeg_end(data)
@@ -111,7 +112,7 @@ def _jpeg(data: NDArray[np.uint8], header: Header) -> NDArray[np.generic]:
         picture = simplejpeg.decode_jpeg(data, "GRAY" if grey else "CMYK", strict=True)
     except ValueError as error:
         left_over = re.search(r"(\d+) extraneous bytes", str(error))
-        if left_over is None or int(left_over[1]) > _PADDING:
+        if left_over is None or int(left_over[1]) > _MAX_PADDING_BYTES:
             raise DamagedError(f"damaged ({_first_line(error)})") from None
         picture = simplejpeg.decode_jpeg(data, "GRAY" if grey else "CMYK", strict=False)
     return picture[..., 0] if grey else _by_opencv(data)
@@ -124,23 +125,16 @@ def _first_line(error: Exception) -> str:
 def _require_jpeg_end(data: NDArray[np.uint8]) -> None:
     """Raises DamagedError unless an end marker comes after the first scan. Source: ITU T.81, B.1.
 
-    Decoders take the upper part of a file that was cut short for the picture. Within a scan the byte FF is always
-    followed by 00 or a restart marker, so FF D9 there is the end and nothing else.
+    Decoders accept a truncated file and return its upper part. Within a scan the byte FF is always followed by 00 or a
+    restart marker, so FF D9 is the end marker.
     """
-    view, at = data.data, 2
-    while at + 4 <= len(view):
-        if view[at] != 0xFF:
-            raise DamagedError("damaged (no marker where one must be)")
-        marker = view[at + 1]
-        if marker == 0xFF:  # a fill byte
-            at += 1
-            continue
-        at += 2 + int.from_bytes(view[at + 2 : at + 4], "big")
-        if marker == 0xDA:
-            if bytes(view[at:]).find(b"\xff\xd9") >= 0:
-                return
-            break
-    raise DamagedError("cut short")
+    view = data.data
+    try:
+        *_, (marker, _, end) = jpeg_segments(view)
+    except (struct.error, IndexError):
+        raise DamagedError("cut short") from None
+    if marker != JPEG_SCAN or bytes(view[end:]).find(b"\xff\xd9") < 0:
+        raise DamagedError("cut short")
 
 
 def _tiff(data: NDArray[np.uint8], header: Header) -> NDArray[np.generic]:
@@ -155,7 +149,7 @@ def _tiff(data: NDArray[np.uint8], header: Header) -> NDArray[np.generic]:
 
 
 def _pnm(data: NDArray[np.uint8], header: Header) -> NDArray[np.generic]:
-    """Grey pictures with their values as stored, whatever the largest may be. Source: netpbm's pgm(5)."""
+    """Grey pictures with their values as stored, whatever the stated maximum. Source: netpbm's pgm(5)."""
     kind, largest, start = header.pnm
     dtype, shape = np.dtype(np.uint8 if largest < 256 else ">u2"), (header.height, header.width)
     count = header.height * header.width
@@ -165,15 +159,15 @@ def _pnm(data: NDArray[np.uint8], header: Header) -> NDArray[np.generic]:
             raise DamagedError("cut short")
         if dtype.itemsize == 1:
             return stored.reshape(shape)
-        pixels = np.frombuffer(stored.tobytes(), dtype)  # aligned: the header has any length
+        pixels = np.frombuffer(stored.tobytes(), dtype)  # a copy is aligned: the header can have any length
         return pixels.astype(np.uint16).reshape(shape)
     if kind == 2:
-        return _written_out(bytes(data[start - 1 :]), largest, count).reshape(shape)
+        return _plain_numbers(bytes(data[start - 1 :]), largest, count).reshape(shape)
     return _by_opencv(data)
 
 
-def _written_out(text: bytes, largest: int, count: int) -> NDArray[np.uint8] | NDArray[np.uint16]:
-    """The first `count` numbers of a text."""
+def _plain_numbers(text: bytes, largest: int, count: int) -> NDArray[np.uint8] | NDArray[np.uint16]:
+    """The first `count` numbers of a plain PGM. Raises DamagedError."""
     words = text.split(None, count)[:count]
     if len(words) < count:
         raise DamagedError("cut short")
@@ -191,8 +185,8 @@ def _bmp(data: NDArray[np.uint8], header: Header) -> NDArray[np.generic]:
 
 
 def _by_opencv(data: NDArray[np.uint8]) -> NDArray[np.generic]:
-    """Colour becomes grey by OpenCV's weights. A turn that the file wishes for display (EXIF) is not applied: a
-    camera's pixels are where the sensor has them.
+    """Decoded by OpenCV; colour is converted to grey with its weights. An EXIF orientation is not applied: pixels stay
+    where the sensor has them. Raises DamagedError.
     """
     cv2 = quiet_cv2()
     as_stored = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION

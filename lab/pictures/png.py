@@ -1,7 +1,7 @@
-"""PNG files: every checksum verified, grey ones decoded here, the others made safe for OpenCV.
+"""PNG files: every checksum is verified; grey ones are decoded here, the others re-packed for OpenCV.
 
-Measured on 1280x1024 grey pictures of the simulator, process time of one core: cv2.imdecode 7.1 ms, libspng 6.8,
-zlib-ng 5.0 and libdeflate 3.0 for inflating alone, ISA-L 2.0; undoing the filters 0.1 (none) to 1.9 ms (Paeth).
+Measured on simulated 1280x1024 grey pictures, process time of one core: cv2.imdecode 7.1 ms, libspng 6.8;
+decompression alone: zlib-ng 5.0, libdeflate 3.0, ISA-L 2.0; reversing the filters: 0.1 (none) to 1.9 ms (Paeth).
 Source: PNG (third edition), ISO 15948.
 """
 
@@ -16,34 +16,34 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.compilation.jit import compiled_for_threads
-from lab.pictures.inflate import crc32, inflated
-from lab.pictures.picture_headers import PNG_MARK, DamagedError
+from lab.pictures.inflate import crc32, decompress
+from lab.pictures.picture_headers import PNG_SIGNATURE, DamagedError
 
 Bytes: TypeAlias = NDArray[np.uint8]
 
 GREY = 0  # a colour type
-_CHANNELS = {GREY: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # of each colour type
-_NEEDED = (b"IHDR", b"PLTE", b"tRNS")  # before the content; other chunks do not change a stored value
-# Adam7: first column, first row, step of columns and of rows of each pass.
+_CHANNELS = {GREY: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # by colour type
+_NEEDED = (b"IHDR", b"PLTE", b"tRNS")  # kept chunks before the content; the others do not change stored values
+# Adam7: first column, first row, column step and row step of each pass.
 _PASSES = ((0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4), (0, 2, 2, 4), (1, 0, 2, 2), (0, 1, 1, 2))
 
 
 @dataclass(frozen=True, slots=True)
 class Png:
-    """The chunks of a PNG file whose checksums are right."""
+    """The chunks of a PNG file; their checksums are correct."""
 
     width: int
     height: int
     bits: int  # per sample
     colour_type: int
     interlaced: bool
-    before: bytes  # the chunks that the content needs, as they stand in the file
+    before: bytes  # the chunks that the content needs, as in the file
     content: bytes | memoryview  # compressed
 
     @staticmethod
     def read(data: NDArray[np.uint8]) -> Png:
         """From a file's bytes. Raises DamagedError."""
-        view, at = data.data, len(PNG_MARK)
+        view, at = data.data, len(PNG_SIGNATURE)
         before, parts = [], []
         while True:
             if at + 12 > len(view):
@@ -70,14 +70,14 @@ class Png:
         return Png(width, height, bits, colour_type, interlace == 1, b"".join(before), content)
 
     def rows(self) -> NDArray[np.uint8]:
-        """The content unpacked: rows one after the other, each with its filter first. Raises DamagedError."""
-        unpacked = inflated(self.content, self._size())
+        """The decompressed content: the rows, each preceded by its filter byte. Raises DamagedError."""
+        unpacked = decompress(self.content, self._size())
         if unpacked is None:
             raise DamagedError("damaged (its content cannot be unpacked)")
         return np.frombuffer(unpacked, np.uint8)
 
     def _size(self) -> int:
-        """Bytes of the content, unpacked."""
+        """Bytes of the decompressed content."""
         bits = self.bits * _CHANNELS[self.colour_type]
         passes = _PASSES if self.interlaced else ((0, 0, 1, 1),)
         total = 0
@@ -89,14 +89,14 @@ class Png:
 
     @property
     def is_simple(self) -> bool:
-        """Whether `grey` decodes it."""
+        """Whether `grey` can decode it."""
         return self.colour_type == GREY and self.bits in (8, 16) and not self.interlaced
 
     def grey(self) -> NDArray[np.uint8] | NDArray[np.uint16]:
         """The pixels (height, width) of a file that `is_simple`. Raises DamagedError."""
         size = self.bits // 8
         out = np.empty((self.height, self.width * size), np.uint8)
-        if unfiltered(self.rows().reshape(self.height, -1), out, size) >= 0:
+        if reverse_filters(self.rows().reshape(self.height, -1), out, size) >= 0:
             raise DamagedError("damaged (an unknown filter)")
         if size == 1:
             return out
@@ -104,76 +104,76 @@ class Png:
         return pixels if np.dtype(">u2").isnative else pixels.byteswap(inplace=True)
 
     def plain_file(self) -> bytes:
-        """The same picture as a file that libpng has nothing to remark on: it writes remarks to standard error.
+        """The same picture as a file without the chunks about which libpng writes warnings to standard error.
 
-        Raises DamagedError where the content cannot be unpacked.
+        Raises DamagedError where the content cannot be decompressed.
         """
-        content = b"IDAT" + zlib.compress(self.rows().data, 0)  # stored as it is: unpacking twice would take 8 ms
+        content = b"IDAT" + zlib.compress(self.rows().data, 0)  # stored: decompressing twice would take 8 ms
         idat = struct.pack(">I", len(content) - 4) + content + struct.pack(">I", crc32(content))
-        return PNG_MARK + self.before + idat + b"\0\0\0\0IEND\xaeB`\x82"
+        return PNG_SIGNATURE + self.before + idat + b"\0\0\0\0IEND\xaeB`\x82"
 
 
 @compiled_for_threads
-def unfiltered(rows: Bytes, out: Bytes, step: int) -> int:
-    """Undo the filters of a PNG's rows. The GIL is released.
+def reverse_filters(rows: Bytes, out: Bytes, step: int) -> int:
+    """Reverse the filters of the rows of a PNG. The GIL is released.
 
-    rows: (h, 1 + n) u8, each row's filter first. out: (h, n) u8, filled. step: bytes per pixel. Returns the first row
-    of an unknown filter, or -1. Source: PNG, ISO 15948, 9.2.
+    rows: (h, 1 + n) u8, the filter type first in each row. out: (h, n) u8, filled. step: bytes per pixel. Returns the
+    index of the first row with an unknown filter, or -1. Source: PNG, ISO 15948, 9.2.
 
-    The left neighbour is kept in a register: read back from `out` it costs as much as the whole filter.
+    The left neighbour is kept in a register: reading it back from `out` would take as long as the rest of the filter.
     """
-    nothing = np.zeros(out.shape[1], np.uint8)  # above the first row
+    zeros = np.zeros(out.shape[1], np.uint8)  # the row above the first one
     for y in range(out.shape[0]):
-        kind = rows[y, 0]
-        line, here = rows[y, 1:], out[y]
-        above = out[y - 1] if y > 0 else nothing
-        if kind == 0:
-            here[:] = line
-        elif kind == 1:
-            _unsub(line, here, step)
-        elif kind == 2:
-            for x in range(line.size):
-                here[x] = line[x] + above[x]
-        elif kind == 3:
-            _unaverage(line, above, here, step)
-        elif kind == 4:
-            _unpaeth(line, above, here, step)
+        filter_type = rows[y, 0]
+        row, decoded = rows[y, 1:], out[y]
+        above = out[y - 1] if y > 0 else zeros
+        if filter_type == 0:
+            decoded[:] = row
+        elif filter_type == 1:
+            _reverse_sub(row, decoded, step)
+        elif filter_type == 2:
+            for x in range(row.size):
+                decoded[x] = row[x] + above[x]
+        elif filter_type == 3:
+            _reverse_average(row, above, decoded, step)
+        elif filter_type == 4:
+            _reverse_paeth(row, above, decoded, step)
         else:
             return y
     return -1
 
 
 @compiled_for_threads
-def _unsub(line: Bytes, here: Bytes, step: int) -> None:
+def _reverse_sub(row: Bytes, decoded: Bytes, step: int) -> None:
     """Each byte is the difference to its left neighbour."""
     for first in range(step):
         left = 0
-        for x in range(first, line.size, step):
-            left = (left + line[x]) & 255
-            here[x] = left
+        for x in range(first, row.size, step):
+            left = (left + row[x]) & 255
+            decoded[x] = left
 
 
 @compiled_for_threads
-def _unaverage(line: Bytes, above: Bytes, here: Bytes, step: int) -> None:
+def _reverse_average(row: Bytes, above: Bytes, decoded: Bytes, step: int) -> None:
     """Each byte is the difference to the mean of its left and upper neighbour."""
     for first in range(step):
         left = 0
-        for x in range(first, line.size, step):
-            left = (line[x] + ((left + above[x]) >> 1)) & 255
-            here[x] = left
+        for x in range(first, row.size, step):
+            left = (row[x] + ((left + above[x]) >> 1)) & 255
+            decoded[x] = left
 
 
 @compiled_for_threads
-def _unpaeth(line: Bytes, above: Bytes, here: Bytes, step: int) -> None:
-    """Each byte is the difference to that neighbour (left, up, corner) which is nearest to left + up - corner."""
+def _reverse_paeth(row: Bytes, above: Bytes, decoded: Bytes, step: int) -> None:
+    """Each byte is the difference to the neighbour (left, up or corner) that is nearest to left + up - corner."""
     for first in range(step):
         left = corner = np.int64(0)
-        for x in range(first, line.size, step):
+        for x in range(first, row.size, step):
             up = np.int64(above[x])
             from_left, from_up = up - corner, left - corner
             to_left, to_up, to_corner = abs(from_left), abs(from_up), abs(from_left + from_up)
             nearest = up if to_up <= to_corner else corner
             nearest = left if to_left <= to_up and to_left <= to_corner else nearest
-            left = (line[x] + nearest) & 255
-            here[x] = left
+            left = (row[x] + nearest) & 255
+            decoded[x] = left
             corner = up

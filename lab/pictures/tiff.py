@@ -1,8 +1,8 @@
-"""TIFF files: their first picture's tags, and grey content as most cameras store it.
+"""TIFF files: the tags of the first picture, and grey content in the usual encodings.
 
-OpenCV reads the others (colour, palettes, JPEG and other packings). Of 8-bit content that cannot be unpacked it makes
-zeros and says so on standard error alone. It applies the turn that a file wishes for display
-even with IMREAD_IGNORE_ORIENTATION (5.0.0), so that tag is set to "as stored" before.
+OpenCV reads the others (colour, palettes, JPEG and other compressions). From damaged 8-bit content it returns zeros,
+with a message on standard error only. It applies the orientation tag even with IMREAD_IGNORE_ORIENTATION (5.0.0), so
+that tag is set to "as stored" before.
 """
 
 from __future__ import annotations
@@ -13,32 +13,32 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lab.pictures.inflate import inflated
+from lab.pictures.inflate import decompress
 
-TIFF_MARKS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")  # the last two: BigTIFF
+TIFF_SIGNATURES = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")  # the last two: BigTIFF
 _TYPES = {1: "B", 3: "H", 4: "I", 16: "Q"}  # BYTE, SHORT, LONG, LONG8
 _ORIENTATION = 274
-_MOST_SEGMENTS = 1 << 20  # strips or tiles: one per row is 65536 at most
+_MAX_SEGMENTS = 1 << 20  # strips or tiles: one per row is 65536 at most
 PLAIN, LZW, DEFLATE, PACK_BITS, OLD_DEFLATE = 1, 5, 8, 32773, 32946
-_READ_HERE = (PLAIN, LZW, DEFLATE, PACK_BITS, OLD_DEFLATE)
-# What OpenCV's libtiff unpacks: CCITT (2, 3, 4), LZW, JPEG, PackBits, LZMA, Zstandard. Of any other OpenCV makes zeros.
+_OWN_COMPRESSIONS = (PLAIN, LZW, DEFLATE, PACK_BITS, OLD_DEFLATE)
+# Compressions of OpenCV's libtiff: CCITT (2, 3, 4), LZW, JPEG, PackBits, LZMA, Zstandard. For others it returns zeros.
 KNOWN_COMPRESSIONS = (PLAIN, 2, 3, 4, LZW, 7, DEFLATE, PACK_BITS, OLD_DEFLATE, 34925, 50000)
 
 
 @dataclass(frozen=True, slots=True)
 class Tiff:
-    """What the first directory of a TIFF file says. Source: TIFF 6.0 (1992), section 8; BigTIFF for long offsets."""
+    """The first directory of a TIFF file. Source: TIFF 6.0 (1992), section 8; BigTIFF for long offsets."""
 
     width: int
     height: int
     bits: int  # per sample
     samples: int  # per pixel
-    sample_format: int  # 1 without sign, 2 with sign, 3 floating point, 4 not said
+    sample_format: int  # 1 unsigned, 2 signed, 3 floating point, 4 undefined
     compression: int
     photometric: int  # 1: 0 is black
-    predictor: int  # 2: differences along the rows
+    predictor: int  # 2: horizontal differences
     fill_order: int
-    orientation_at: int  # byte where a turn for display stands; 0: none is wished
+    orientation_at: int  # position, bytes, of the value of an orientation tag other than "as stored"; 0: none
     order: str  # "<" or ">"
     tile: tuple[int, int] | None  # width and height; None: strips
     rows_per_strip: int
@@ -47,7 +47,7 @@ class Tiff:
 
     @staticmethod
     def read(view: memoryview) -> Tiff:
-        """From a file's content. Raises struct.error or IndexError where it ends within the directory."""
+        """From the content of a file. Raises struct.error or IndexError where it ends within the directory."""
         order = "<" if view[0] == ord("I") else ">"
         big = bytes(view[2:4]) in (b"+\0", b"\0+")
         tags = _directory(view, order, big)
@@ -78,14 +78,14 @@ class Tiff:
 
     @property
     def is_simple(self) -> bool:
-        """Whether `content` reads it: one grey sample of 8 or 16 bits, packed in a usual way or not at all."""
+        """Whether `content` reads it: one grey sample of 8 or 16 bits, uncompressed or in a usual compression."""
         return (
             self.samples == 1
             and self.bits in (8, 16)
             and self.sample_format in (1, 4)
             and self.photometric == 1
             and self.fill_order == 1
-            and self.compression in ((PLAIN, DEFLATE, OLD_DEFLATE) if self.bits == 16 else _READ_HERE)
+            and self.compression in ((PLAIN, DEFLATE, OLD_DEFLATE) if self.bits == 16 else _OWN_COMPRESSIONS)
             and self.predictor in (1, 2)
             and min(self.tile or (1, self.rows_per_strip)) >= 1
             and len(self.offsets) == len(self.counts) == self._across * self._down
@@ -105,9 +105,9 @@ class Tiff:
         return -(-self.height // self._segment[1])
 
     def content(self, data: NDArray[np.uint8]) -> NDArray[np.uint8] | NDArray[np.uint16] | None:
-        """The pixels (height, width) of a file that `is_simple`; None where a strip or tile is not whole.
+        """The pixels (height, width) of a file that `is_simple`; None where a strip or tile is incomplete.
 
-        Where one strip follows the other in the file, 8-bit pixels are a view of `data`.
+        Where the strips are contiguous in the file, 8-bit pixels are a view of `data`.
         """
         wide, high = self._segment
         dtype = np.dtype(f"{self.order}u{self.bits // 8}")
@@ -136,24 +136,24 @@ class Tiff:
         return list(self.offsets[1:]) == ends
 
     def _stored(self, piece: NDArray[np.uint8], size: int) -> NDArray[np.uint8] | None:
-        """The content of a strip or tile, unpacked; None where it is not of this many bytes."""
+        """The decompressed content of a strip or tile; None where it does not have `size` bytes."""
         if self.compression == PLAIN:
             return piece[:size] if len(piece) >= size else None
         if self.compression in (DEFLATE, OLD_DEFLATE):
-            unpacked = inflated(piece, size)
+            unpacked = decompress(piece, size)
             return None if unpacked is None else np.frombuffer(unpacked, np.uint8)
-        from lab.pictures.tiff_packing import (  # compiled code: only where there are such pictures
-            unpacked_bits,
-            unpacked_lzw,
+        from lab.pictures.tiff_packing import (  # compiled code: imported only where needed
+            decompress_lzw,
+            decompress_pack_bits,
         )
 
         if self.compression == LZW:
-            return unpacked_lzw(piece, size)
+            return decompress_lzw(piece, size)
         out = np.empty(size, np.uint8)
-        return out if unpacked_bits(piece, out) == size else None
+        return out if decompress_pack_bits(piece, out) == size else None
 
     def as_stored(self, data: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The file's bytes without a turn for display; a copy where there was one."""
+        """The bytes of the file with orientation "as stored"; a copy where that changes them."""
         if not self.orientation_at:
             return data
         out = data.copy()
@@ -162,14 +162,14 @@ class Tiff:
 
 
 def _native(pixels: NDArray[np.generic]) -> NDArray[np.uint8] | NDArray[np.uint16]:
-    """In this machine's byte order, aligned."""
+    """In the byte order of the machine, aligned."""
     if pixels.dtype.itemsize == 1:
         return pixels.view(np.uint8)
     return np.require(pixels, np.uint16, ["C", "ALIGNED", "WRITEABLE"])
 
 
 def _directory(view: memoryview, order: str, big: bool) -> dict[int, tuple[int, int, int]]:
-    """Tags of the first directory: type, count, and byte where the value (or its offset) stands."""
+    """Tags of the first directory: type, count, and position of the value (or of its offset), bytes."""
     if big:
         (at,) = struct.unpack_from(f"{order}Q", view, 8)
         (count,) = struct.unpack_from(f"{order}Q", view, at)
@@ -179,7 +179,7 @@ def _directory(view: memoryview, order: str, big: bool) -> dict[int, tuple[int, 
         (count,) = struct.unpack_from(f"{order}H", view, at)
         at, size, entry = at + 2, 12, f"{order}HHI"
     if count > 65535:
-        raise struct.error("a directory of more tags than there are")
+        raise struct.error("a directory with more tags than exist")
     tags: dict[int, tuple[int, int, int]] = {}
     for k in range(count):
         tag, kind, number = struct.unpack_from(entry, view, at + k * size)
@@ -195,9 +195,9 @@ def _numbers(
     big: bool,
     default: tuple[int, ...],
 ) -> tuple[int, ...]:
-    """The values of a tag; the default where it is absent or not of whole numbers."""
+    """The values of a tag; the default where it is absent or not integer."""
     kind, count, at = tags.get(tag, (0, 0, 0))
-    if kind not in _TYPES or not 1 <= count <= _MOST_SEGMENTS:
+    if kind not in _TYPES or not 1 <= count <= _MAX_SEGMENTS:
         return default
     size = count * struct.calcsize(_TYPES[kind])
     if size > (8 if big else 4):

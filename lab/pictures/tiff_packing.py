@@ -1,7 +1,7 @@
-"""LZW and PackBits, in which TIFF files pack their strips; compiled.
+"""LZW and PackBits decompression of TIFF strips; compiled.
 
-For 8 bits: where a strip cannot be unpacked OpenCV makes zeros of it and says so on standard error only. Of 16 bits it
-gives no picture then, in two thirds of the time (LZW: 6 ms against 9 for 1280x1024).
+For 8 bits only: from a damaged strip OpenCV returns zeros, with a message on standard error only. For 16 bits it
+returns no picture, and is faster (LZW: 6 ms, here 9 ms, for 1280x1024).
 """
 
 from __future__ import annotations
@@ -15,26 +15,27 @@ from geometry.compilation.jit import compiled_for_threads
 
 Bytes: TypeAlias = NDArray[np.uint8]
 
-CLEAR, END, FIRST = 256, 257, 258  # codes of LZW: empty the table, end, the first of the table
-LONGEST = 4096  # codes
-_BEYOND = 8  # bytes that may be written behind the end
+CLEAR, END, FIRST = 256, 257, 258  # LZW codes: clear the table, end of data, first table entry
+TABLE_SIZE = 4096  # table size, codes
+_OVERRUN = 8  # bytes that may be written after the end
 
 
-def unpacked_lzw(packed: Bytes, size: int) -> Bytes | None:
-    """Unpack LZW to `size` bytes; None where a code is impossible, or it ends before. Source: TIFF 6.0, section 13."""
-    out = np.empty(CLEAR + size + _BEYOND, np.uint8)
-    return out[CLEAR : CLEAR + size] if _unpack_lzw(packed, out, size) == size else None
+def decompress_lzw(packed: Bytes, size: int) -> Bytes | None:
+    """Decompress LZW to `size` bytes; None for an invalid code or missing data. Source: TIFF 6.0, section 13."""
+    out = np.empty(CLEAR + size + _OVERRUN, np.uint8)
+    return out[CLEAR : CLEAR + size] if _decompress_lzw(packed, out, size) == size else None
 
 
 @compiled_for_threads
-def _unpack_lzw(packed: Bytes, out: Bytes, size: int) -> int:
-    """Unpack LZW behind the first 256 bytes of `out`; returns the number of bytes, or -1 where a code is impossible.
+def _decompress_lzw(packed: Bytes, out: Bytes, size: int) -> int:
+    """Decompress LZW into `out` after its first 256 bytes; returns the number of bytes, or -1 for an invalid code.
 
-    Codes of 9 to 12 bits, the highest bit first; one bit more as soon as one entry less than fits is in the table. An
-    entry is a piece of `out`: where it stands, and its length. The single bytes stand before all others. The entry that
-    a code makes, the string before it and its own first byte, is there before that byte is, so it may name itself.
+    Codes have 9 to 12 bits, highest bit first; the width grows one entry before the table is full for it. A table entry
+    is a range of `out`: start and length. The first 256 bytes of `out` are the single-byte entries. The entry that a
+    code adds is the previous string and the first byte of its own string; it is added before that byte is written, so
+    that a code may refer to its own entry.
     """
-    start, length = np.zeros(LONGEST, np.int64), np.ones(LONGEST, np.int64)
+    start, length = np.zeros(TABLE_SIZE, np.int64), np.ones(TABLE_SIZE, np.int64)
     for k in range(CLEAR):
         out[k], start[k] = k, k
     entries, bits, fresh = FIRST, 9, True
@@ -56,7 +57,7 @@ def _unpack_lzw(packed: Bytes, out: Bytes, size: int) -> int:
             return done - CLEAR
         if fresh:
             fresh = False
-        elif entries < LONGEST:
+        elif entries < TABLE_SIZE:
             start[entries], length[entries] = last_start, last_length + 1
             entries += 1
             if entries + 1 >= 1 << bits and bits < 12:
@@ -64,11 +65,11 @@ def _unpack_lzw(packed: Bytes, out: Bytes, size: int) -> int:
         if code >= entries or (code >= CLEAR and code < FIRST):
             return -1
         begin, count = int(start[code]), int(length[code])
-        for k in range(_BEYOND):  # most are shorter: a fixed number is copied faster than a small unknown one
+        for k in range(_OVERRUN):  # most strings are shorter; copying a fixed number is faster
             out[done + k] = out[begin + k]
-        if count > _BEYOND:
+        if count > _OVERRUN:
             count = min(count, end - done)
-            for k in range(_BEYOND, count):
+            for k in range(_OVERRUN, count):
                 out[done + k] = out[begin + k]
         last_start, last_length = done, count
         done += count
@@ -76,8 +77,8 @@ def _unpack_lzw(packed: Bytes, out: Bytes, size: int) -> int:
 
 
 @compiled_for_threads
-def unpacked_bits(packed: Bytes, out: Bytes) -> int:
-    """Unpack PackBits into `out`; returns the number of bytes, or -1 where they are not enough.
+def decompress_pack_bits(packed: Bytes, out: Bytes) -> int:
+    """Decompress PackBits into `out`; returns the number of bytes, or -1 where data are missing.
 
     Source: TIFF 6.0 (1992), section 9.
     """

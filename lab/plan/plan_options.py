@@ -13,8 +13,8 @@ from calibration.budget.expected_errors import ExpectedErrors
 from calibration.budget.pose_grid import GridPlan
 from geometry.arrays import Array
 from lab.errors import InputError
-from lab.files.text.fields import dataclass_from_yaml
-from lab.files.text.yaml_text import did_you_mean
+from lab.files.text.dataclass_fields import dataclass_from_yaml
+from lab.files.text.error_text import did_you_mean
 
 MAX_POSES = 100_000  # some 300 MB of memory and a table of 70 MB
 

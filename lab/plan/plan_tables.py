@@ -16,16 +16,14 @@ effect on this pose. The errors of one camera's pose are correlated: each alone 
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Iterator
-from io import StringIO
 from pathlib import Path
 
 import numpy as np
 
 from calibration.budget.pose_budget import group_of
 from calibration.budget.pose_grid import AXES, STATUS
-from lab.files.text.yaml_text import atomic_write_text
+from lab.files.text.csv_text import write_table
 from lab.plan.plan_options import Plan
 
 _DIRECTIONS = tuple(f"worst_{what}_axis_{a}" for what in ("position", "attitude") for a in "xyz")
@@ -56,13 +54,13 @@ def effect_columns() -> tuple[str, ...]:
 
 
 def write_plan(plan: Plan, path: Path) -> None:
-    """Write plan.csv atomically. Undefined numbers are empty."""
-    _write(path, plan_columns(plan), _plan_rows(plan))
+    """Write plan.csv, complete or not at all. Numbers that do not exist are empty."""
+    write_table(path, plan_columns(plan), _plan_rows(plan))
 
 
 def write_effects(plan: Plan, path: Path) -> None:
-    """Write effects.csv atomically; errors with sigma 0 have no row."""
-    _write(path, effect_columns(), _effect_rows(plan))
+    """Write effects.csv, complete or not at all; errors that are not there (sigma 0) have no row."""
+    write_table(path, effect_columns(), _effect_rows(plan))
 
 
 def _plan_rows(plan: Plan) -> Iterator[list[str]]:
@@ -101,11 +99,3 @@ def unit_of(name: str) -> str:
 def _shown(value: float) -> str:
     """A number with six digits, which exceeds the precision of a planned sigma; empty if not finite."""
     return f"{value:.6g}" if np.isfinite(value) else ""
-
-
-def _write(path: Path, columns: tuple[str, ...], rows: Iterator[list[str]]) -> None:
-    text = StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(columns)
-    writer.writerows(rows)
-    atomic_write_text(text.getvalue(), path)

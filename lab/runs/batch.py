@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +9,7 @@ from typing import Any
 
 from lab.errors import QUALITY_GATE_FAILED, BeamposeError, CalibrationError, InputError, RunError
 from lab.files.run.parameter_overrides import overridden
+from lab.files.text.csv_text import write_table
 from lab.runs.process import RunOutcome, process_run
 from lab.runs.smoothing_pass import Progress
 from tracking.parameters import TrackerParameters
@@ -74,7 +73,8 @@ def process_batch(
             row = _failed(folder, name, error)
             tell(f"{name}: ERROR: {row['message']}")
         rows.append(row)
-        _write_table(rows, out / "batch.csv")  # after every run: what is done is not lost if the next one is killed
+        # After every run: if the next one is killed, the rows so far are kept.
+        write_table(out / "batch.csv", COLUMNS, [[row[c] for c in COLUMNS] for row in rows])
     from lab.report.run.index import write_index
 
     index = write_index(rows, out)
@@ -122,12 +122,3 @@ def _failed(folder: Path, name: str, error: BeamposeError) -> dict[str, Any]:
         "results": "",
         "message": " | ".join(str(error).splitlines()),
     }
-
-
-def _write_table(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
-    part = path.with_name(f".{path.name}.part-{os.getpid()}")
-    with part.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
-    part.replace(path)

@@ -23,8 +23,8 @@ from lab.files.rig.calibration_state import CalibrationState, require_usable
 from lab.files.rig.rig_covariance import joint_covariance
 from lab.files.rig.rig_file import load_rig_file
 from lab.files.run.run_file import Run, load_run
-from lab.files.run.truth import largest_disagreement_px, load_truth
-from lab.files.text.yaml_text import FileError
+from lab.files.run.truth import largest_disagreement_px, load_run_truth
+from lab.files.text.error_text import FileError
 from lab.pictures.picture_file import DROPPED, UNREADABLE, Missing
 from lab.runs.frames.frames import FrameReader, open_frames
 from tracking.detections import Detections
@@ -274,7 +274,7 @@ def _check_times(findings: _Findings, run: Run, frames: Ints) -> None:
 
 def _check_truth(findings: _Findings, run: Run, frames: Ints) -> None:
     try:
-        truth = load_truth(run.folder, run.rig)
+        truth = load_run_truth(run)
     except InputError as error:
         findings.problems += _lines_of(error)
         return
@@ -284,7 +284,7 @@ def _check_truth(findings: _Findings, run: Run, frames: Ints) -> None:
     for name, table in (("pose.csv", truth.pose), ("spots.csv", truth.spots)):
         if table is None:
             continue
-        known = np.unique(table["frame"].to_numpy())
+        known = np.unique(table.frame)
         if not len(known):
             findings.remarks.append(f"{run.folder / 'truth' / name}: no rows")
             continue
@@ -295,8 +295,8 @@ def _check_truth(findings: _Findings, run: Run, frames: Ints) -> None:
                 f"{run.folder / 'truth' / name}: says nothing of {without.size} of {len(frames)} frames"
                 f" (the first is {without[0]})"
             )
-    if truth.pose is not None and len(truth.pose):
-        off = np.abs(truth.pose["t_s"].to_numpy() - run.times.t_s(truth.pose["frame"].to_numpy()))
+    if truth.pose is not None and len(truth.pose.frame):
+        off = np.abs(truth.pose.t_s - run.times.t_s(truth.pose.frame))
         if off.max() > 0.5 / run.frame_rate_hz:
             findings.remarks.append(
                 f"{run.folder / 'truth' / 'pose.csv'}: t_s: up to {off.max():.4g} s from the run's own times"

@@ -20,6 +20,7 @@ from lab.files.rig.calibration_state import require_usable, state_mapping
 from lab.files.run.fingerprints import fingerprints
 from lab.files.run.parameter_overrides import overridden
 from lab.files.run.run_file import Run, load_run
+from lab.files.run.truth import load_run_truth
 from lab.files.text.atomic_write import atomic_folder
 from lab.files.text.json_text import write_json
 from lab.runs.frames.pipeline import FrameRecord, Pipeline
@@ -148,6 +149,7 @@ def ready_run(run_folder: Path, overrides: Mapping[str, Any] | None = None) -> R
         run = dataclasses.replace(run, tracker=overridden(run.tracker, overrides))
     recorded = datetime.date.today() if run.recorded is None else run.recorded
     require_usable(run.calibration, run.rig_path, recorded, "today" if run.recorded is None else "the recording's day")
+    load_run_truth(run)  # a mistake in it stops the run before the processing, not after it
     return run
 
 

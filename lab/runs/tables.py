@@ -17,6 +17,7 @@ from geometry.rig import Rig
 from lab.errors import RunError
 from lab.files.text import columns
 from lab.files.text.columns import CAUSAL
+from lab.files.text.csv_text import csv_word
 from tracking.detections import Detections
 
 if TYPE_CHECKING:
@@ -265,8 +266,3 @@ def _exact(values: Array) -> str:
 def _number(value: float) -> str:
     """A number as a field; nothing for nan."""
     return "" if value != value else f"{value:.10g}"
-
-
-def csv_word(text: str) -> str:
-    """A name as a CSV field, quoted where it holds a comma, a quote or a line break."""
-    return '"' + text.replace('"', '""') + '"' if any(c in text for c in ',"\n\r') else text

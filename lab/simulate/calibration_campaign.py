@@ -18,7 +18,7 @@ from geometry.pose import Pose
 from geometry.rig import Beam, Rig, Screen
 from geometry.uncertainty.rig_parameters import PINHOLE, distortion_names
 from lab.errors import InputError
-from lab.files.text.yaml_text import did_you_mean
+from lab.files.text.error_text import did_you_mean
 from lab.simulate.rigs import RIGS
 
 # One stream of random numbers per subject, so that more dots do not change the stand's positions.

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
 import os
-from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
@@ -19,13 +17,14 @@ from geometry.camera import Camera
 from geometry.pose import Pose
 from lab.errors import InputError
 from lab.files.project.point_files import POINTS, POSE_SIGMAS, SURVEY, SURVEY_SIGMAS
-from lab.files.project.project import SCHEMA
+from lab.files.project.project_blocks import SCHEMA
 from lab.files.rig.board_file import save_board
 from lab.files.rig.camera_block import Covariance
 from lab.files.rig.camera_file import CameraCalibration, CameraFile, save_camera
 from lab.files.rig.rig_file import RigFile, as_mapping, pose_mapping, save_rig
 from lab.files.text import columns
 from lab.files.text.atomic_write import atomic_folder
+from lab.files.text.csv_text import write_table
 from lab.files.text.yaml_text import write_mapping
 from lab.simulate.board_photo import Look, photograph
 from lab.simulate.calibration_campaign import Campaign, LensDraw, Quality, board_poses, draw_campaign
@@ -78,15 +77,15 @@ def write_campaign(c: Campaign, folder: Path) -> None:
         (name, *_metres(xyz), *[_short(c.quality.survey_m)] * 3, screens[k])
         for name, xyz, k in zip(c.dot_names, c.dots_surveyed, c.dot_screen, strict=True)
     ]
-    _table(folder / "survey.csv", (*SURVEY, *SURVEY_SIGMAS, "screen"), survey)
+    write_table(folder / "survey.csv", (*SURVEY, *SURVEY_SIGMAS, "screen"), survey)
     cameras = list(c.truth.cameras)
     points = [
         (cameras[k], c.dot_names[d], *_pixels(uv), _short(c.quality.dot_px))
         for k, d, uv in zip(c.seen_camera, c.seen_dot, c.seen_pixels, strict=True)
     ]
-    _table(folder / "points.csv", (*POINTS, "sigma_px"), points)
+    write_table(folder / "points.csv", (*POINTS, "sigma_px"), points)
     sigmas = [*[_short(c.quality.stand_m)] * 3, *[_short(c.quality.stand_deg)] * 3]
-    _table(
+    write_table(
         folder / "poses.csv",
         (*columns.TRUTH_POSE, *POSE_SIGMAS),
         [(*row, *sigmas) for row in _pose_rows(c.stand_recorded)],
@@ -96,11 +95,11 @@ def write_campaign(c: Campaign, folder: Path) -> None:
         (k, *views[v], *_pixels(uv), _short(c.quality.spot_px))
         for k, v, uv in zip(c.spots.position, c.spots.view, c.spots.pixels, strict=True)
     ]
-    _table(folder / "spots.csv", ("frame", "camera", "spot", "u_px", "v_px", "sigma_px"), spots)
+    write_table(folder / "spots.csv", ("frame", "camera", "spot", "u_px", "v_px", "sigma_px"), spots)
     (folder / "truth").mkdir()
     save_rig(c.truth, folder / "truth" / "rig.yaml")
     in_world = c.world_from_stand @ c.stand_from_body
-    _table(folder / "truth" / "poses.csv", columns.TRUTH_POSE, _pose_rows(in_world))
+    write_table(folder / "truth" / "poses.csv", columns.TRUTH_POSE, _pose_rows(in_world))
     write_mapping(_project(c), folder / PROJECT)
 
 
@@ -166,13 +165,6 @@ def _pose_rows(poses: Pose) -> list[tuple[object, ...]]:
         (k, k, *_metres(t), *(f"{v:.12f}" for v in q))
         for k, (t, q) in enumerate(zip(poses.translation, poses.quaternion_wxyz, strict=True))
     ]
-
-
-def _table(path: Path, header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
-    with path.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(header)
-        writer.writerows(rows)
 
 
 def _metres(xyz: Array) -> list[str]:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import csv
 import os
-import shutil
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -19,6 +17,8 @@ from lab.errors import InputError
 from lab.files.rig.rig_file import RigFile, load_rig_file, save_rig
 from lab.files.run.run_file import save_run
 from lab.files.text import columns
+from lab.files.text.atomic_write import atomic_folder
+from lab.files.text.csv_text import write_table
 from lab.simulate.picture import Picture, Powers, Sensor, laser_powers, make_sensor, take
 from lab.simulate.points import simulate_points
 from lab.simulate.scenarios import LIGHTS, Scenario
@@ -96,9 +96,7 @@ def simulate(
     scene = compose(scenario, seed, frames, picture_scale, true_rig)
     if known is not None and SpotModel.of(known.rig).views != scene.model.views:
         raise InputError(f"{known_rig}: expected the cameras and spots of the rig that is recorded, got others")
-    part = out_folder.with_name(f".{out_folder.name}.{os.getpid()}.part")
-    part.mkdir(parents=True)
-    try:
+    with atomic_folder(out_folder, lambda _: False) as part:
         save_rig(scene.rig if known is None else known, part / "rig.yaml")
         write_truth(scene, part / "truth")
         if detections_only:
@@ -109,11 +107,6 @@ def simulate(
         else:
             sources = _write_pictures(scene, part, noisy, threads, progress)
         save_run(_run_mapping(scene, sources, known), part)
-        if out_folder.is_dir():
-            out_folder.rmdir()  # empty; os.replace onto it works on POSIX only
-        os.replace(part, out_folder)
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
     return out_folder
 
 
@@ -143,7 +136,7 @@ def write_truth(scene: Scene, folder: Path) -> None:
     """truth/pose.csv and truth/spots.csv: every frame, also those whose pictures are missing."""
     folder.mkdir(parents=True)
     quaternions = scene.poses.quaternion_wxyz
-    _write_table(
+    write_table(
         folder / "pose.csv",
         columns.TRUTH_POSE,
         (
@@ -151,7 +144,7 @@ def write_truth(scene: Scene, folder: Path) -> None:
             for k, t, p, q in zip(scene.frame, scene.t_s, scene.poses.translation, quaternions, strict=True)
         ),
     )
-    _write_table(
+    write_table(
         folder / "spots.csv",
         columns.TRUTH_SPOTS,
         (
@@ -160,13 +153,6 @@ def write_truth(scene: Scene, folder: Path) -> None:
             for i, (camera, spot) in enumerate(scene.model.views)
         ),
     )
-
-
-def _write_table(path: Path, header: Iterable[str], rows: Iterable[tuple[object, ...]]) -> None:
-    with path.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(header)
-        writer.writerows(rows)
 
 
 def _write_detections(scene: Scene, noise_px: float, picture_scale: float, rig: Rig | None, path: Path) -> None:
@@ -182,7 +168,7 @@ def _write_detections(scene: Scene, noise_px: float, picture_scale: float, rig: 
                     numbers = (f"{uv[0]:.5f}", f"{uv[1]:.5f}", f"{sigmas[0]:.5g}", f"{sigmas[1]:.5g}")
                     yield (k, camera, *numbers, "", "", "", "", "", f"{cov[0, 1]:.5g}")
 
-    _write_table(path, columns.DETECTIONS, rows())
+    write_table(path, columns.DETECTIONS, rows())
 
 
 def _workers(threads: int | None) -> int:

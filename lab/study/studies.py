@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import csv
 from dataclasses import dataclass
 from pathlib import Path
 
 from lab.files.text.atomic_write import atomic_folder
+from lab.files.text.csv_text import write_table
 from lab.study.experiment_huo2015 import repeat_huo2015
 from lab.study.study_page import write_study
 
@@ -26,12 +26,9 @@ def study_huo2015(out: Path, seed: int = 1, frames: int = 600) -> StudyOutcome:
     """Repeat section 5.1 into the folder `out`: figures.csv and report.html. Raises InputError if `out` is in use."""
     study = repeat_huo2015(seed, frames)
     with atomic_folder(out, may_replace=lambda folder: (folder / "figures.csv").is_file()) as work:
-        with (work / "figures.csv").open("w", encoding="utf-8", newline="") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(COLUMNS)
-            for row in study.rows:
-                values = [getattr(row, name) for name in COLUMNS]
-                writer.writerow(["" if v is None else f"{v:.6g}" if isinstance(v, float) else v for v in values])
+        values = [[getattr(row, name) for name in COLUMNS] for row in study.rows]
+        rows = [["" if v is None else f"{v:.6g}" if isinstance(v, float) else v for v in row] for row in values]
+        write_table(work / "figures.csv", COLUMNS, rows)
         write_study(study, work)
     lines = tuple(
         f"{row.quantity} ({row.unit}): paper {_shown(row.paper)}, conventional {_shown(row.conventional)},"

@@ -9,7 +9,7 @@ import numpy as np
 from markupsafe import Markup
 
 from geometry.arrays import Array
-from lab.files.text.yaml_text import atomic_write_text
+from lab.files.text.atomic_write import atomic_write_text
 from lab.report.html import environment
 from lab.report.plot import svg
 from lab.report.plot.svg import Line, Scale, Shade

@@ -1,4 +1,4 @@
-"""A small lab to write to disk: two screens at x = -2.5 and 2.5 m, three coplanar beams, two cameras of 64x48 px."""
+"""A small lab as files: two screens at x = -2.5 and 2.5 m, three coplanar beams, two cameras of 64x48 px."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ prior:
 
 
 def picture_of(frame: int, dtype: type = np.uint8) -> np.ndarray:
-    """A picture that no other frame has: (48, 64), all its grey values the same."""
+    """The uniform picture (48, 64) of a frame; each frame has another grey value."""
     return np.full((48, 64), frame + 1, dtype=dtype)
 
 
@@ -79,7 +79,7 @@ def write_run(folder: Path, frames: int = 5) -> Path:
 
 
 def edit(path: Path, old: str, new: str) -> None:
-    """Replace the one place where a text stands in a file."""
+    """Replace a text that occurs once in a file."""
     text = path.read_text()
     assert text.count(old) == 1, f"{old!r} stands {text.count(old)} times in {path.name}"
     path.write_text(text.replace(old, new))

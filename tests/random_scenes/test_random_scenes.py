@@ -24,7 +24,7 @@ from bench.random_scenes.write_folder import write_run_folder
 from geometry.forward_model import SpotModel
 from geometry.pose_solver.gauss_newton import fit_pose
 from lab.files.run.run_file import load_run
-from lab.files.run.truth import load_truth
+from lab.files.run.truth import load_run_truth
 from lab.pictures.picture_file import Missing
 from lab.runs.frames.frames import open_frames
 from tracking.detections import Detections
@@ -229,10 +229,10 @@ def test_a_written_run_folder_reads_back_as_the_scene(tmp_path: Path):
     np.testing.assert_allclose(uv[inside], scene.uv_px[inside], rtol=0, atol=1e-8 * px)
     assert run.prior is not None
     assert run.prior.holds(scene.poses[0])
-    truth = load_truth(tmp_path / "run", run.rig)
+    truth = load_run_truth(run)
     assert truth is not None
     assert truth.spots is not None
-    assert set(truth.spots["in_view"]) <= {OUTSIDE, SHINING, HIDDEN}
+    assert set(truth.spots.in_view.tolist()) <= {OUTSIDE, SHINING, HIDDEN}
     for k, frames in enumerate(open_frames(run)):
         for c, name in enumerate(scene.rig.cameras):
             picture = frames.images[name]

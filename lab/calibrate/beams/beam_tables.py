@@ -13,8 +13,8 @@ from calibration.beams.beam_start import world_points
 from calibration.beams.beams import BeamCalibration
 from geometry.arrays import Array
 from geometry.rig import Rig
-from lab.files.text.yaml_text import atomic_write_text
-from lab.runs.tables import csv_word
+from lab.files.text.atomic_write import atomic_write_text
+from lab.files.text.csv_text import csv_text
 
 BEAMS, ANGLES, RESIDUALS = "beams.csv", "angles.csv", "residuals.csv"
 BEAM_COLUMNS = (
@@ -42,16 +42,13 @@ def _beam_table(c: BeamCalibration, nominal: Rig) -> str:
         figures = [direction_sigmas(c)[i] / ARCSEC, 1e3 * offset_sigmas(c)[i], off[i, 0] / ARCSEC, 1e3 * off[i, 1]]
         if c.undetermined:
             figures[:2] = [np.nan, np.nan]
-        rows.append([csv_word(name), *(f"{v:.12g}" for v in numbers), *(_short(v) for v in figures)])
-    return _csv(BEAM_COLUMNS, rows)
+        rows.append([name, *(f"{v:.12g}" for v in numbers), *(_short(v) for v in figures)])
+    return csv_text(BEAM_COLUMNS, rows)
 
 
 def _angle_table(c: BeamCalibration) -> str:
-    rows = [
-        [csv_word(a.first), csv_word(a.second), f"{np.rad2deg(a.angle):.9g}", _short(a.sigma / ARCSEC)]
-        for a in c.angles
-    ]
-    return _csv(ANGLE_COLUMNS, rows)
+    rows = [[a.first, a.second, f"{np.rad2deg(a.angle):.9g}", _short(a.sigma / ARCSEC)] for a in c.angles]
+    return csv_text(ANGLE_COLUMNS, rows)
 
 
 def _residual_table(c: BeamCalibration, positions: Sequence[str]) -> str:
@@ -62,9 +59,9 @@ def _residual_table(c: BeamCalibration, positions: Sequence[str]) -> str:
     for i in range(len(c.spots)):
         camera, spot = views[c.spots.view[i]]
         numbers = [*c.spots.pixels[i], *c.fit.residuals_px[i], mm[i], c.fit.sigmas[i]]
-        words = [csv_word(names[c.spots.position[i]]), csv_word(camera), csv_word(spot)]
+        words = [names[c.spots.position[i]], camera, spot]
         rows.append([*words, *(_short(v) for v in numbers), "yes" if c.fit.kept[i] else "no"])
-    return _csv(RESIDUAL_COLUMNS, rows)
+    return csv_text(RESIDUAL_COLUMNS, rows)
 
 
 def used_positions(c: BeamCalibration, positions: Sequence[str]) -> list[str]:
@@ -86,10 +83,6 @@ def difference_from_nominal(c: BeamCalibration, nominal: Rig) -> Array:
         gap = np.cross(c.lines.points[i] - b.point, b.direction)
         out.append((np.arctan2(np.linalg.norm(np.cross(d, b.direction)), d @ b.direction), np.linalg.norm(gap)))
     return np.array(out)
-
-
-def _csv(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    return "\n".join([",".join(heads), *(",".join(r) for r in rows)]) + "\n"
 
 
 def _short(value: float) -> str:

@@ -21,13 +21,15 @@ from lab.calibrate.beams.recording_check import check_no_duplicates, diagnose_fa
 from lab.calibrate.beams.recordings import Recordings, read_recordings, stand_of
 from lab.calibrate.calibration_date import calibration_date, expiry_date, expiry_findings
 from lab.errors import CalibrationError, InputError
-from lab.files.project.project import Project, load_project
+from lab.files.project.project import load_project
+from lab.files.project.project_types import Project
 from lab.files.rig.calibration_state import CalibrationState
 from lab.files.rig.rig_covariance import blocks_of, joint_covariance
 from lab.files.rig.rig_file import RigFile, load_rig_file, save_rig
 from lab.files.rig.screens_file import load_screens
 from lab.files.text.atomic_write import atomic_folder, beside_a_good_one, refuse_foreign
-from lab.files.text.yaml_text import did_you_mean, read_mapping
+from lab.files.text.error_text import did_you_mean
+from lab.files.text.yaml_text import read_mapping
 
 RIG = "rig.yaml"
 

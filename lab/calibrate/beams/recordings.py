@@ -17,13 +17,14 @@ from geometry.rig import Rig
 from lab.calibrate.beams.stationary_frames import SpotRows, average, positions_at_rest
 from lab.errors import InputError
 from lab.files.project.point_files import StandPoses, read_poses
-from lab.files.project.project import Project, RecordingEntry
-from lab.files.text.csv_text import numbers_in, read_table, shown_line, whole_numbers
+from lab.files.project.project_types import Project, RecordingEntry
+from lab.files.text.csv_table import Table
+from lab.files.text.csv_text import read_table
+from lab.files.text.error_text import did_you_mean, shown_line
 from lab.files.text.range_checks import SIGMAS_PX, refuse_far_pixels, refuse_sigmas
-from lab.files.text.yaml_text import did_you_mean
 
 if TYPE_CHECKING:
-    import pandas as pd
+    pass
 
 SPOTS = ("camera", "spot", "u_px", "v_px")
 DEFAULT_SPOT_SIGMA_PX = 0.1  # px, if the table states none: a laser spot on a matt screen, speckle included
@@ -143,74 +144,67 @@ def read_spot_table(path: Path, rig: Rig, notes: list[str]) -> SpotRows:
     Raises:
         InputError: with file, line, the expected and the found content.
     """
-    numbers = ("position", "frame", "u_px", "v_px", "sigma_px", "sigma_u_px", "sigma_v_px", "cov_uv_px2")
-    table = read_table(path, SPOTS, numbers=numbers)
-    if not len(table):
-        raise InputError(f"{path}: expected rows position,camera,spot,u_px,v_px below the header, got none")
-    if table.attrs["malformed"]:
-        raise InputError(f"{path}: {table.attrs['malformed']} lines have more fields than the header; correct them")
+    optional = ("position", "frame", "sigma_px", "sigma_u_px", "sigma_v_px", "cov_uv_px2", "status")
+    table = read_table(path, SPOTS, optional)
+    table.require_rows(("position", *SPOTS))
     key = "position" if "position" in table else "frame"
     if key not in table:
-        raise InputError(
-            f"{path}: expected a column 'position' (or 'frame'), got {shown_line(','.join(table.columns))}"
-        )
-    whole = whole_numbers(table, key, path)
-    table = table.assign(**{key: whole}, line=np.arange(len(table)) + 2)
+        raise InputError(f"{path}: expected a column 'position' (or 'frame'), got {shown_line(','.join(table.header))}")
+    table.whole(key)
     if "status" in table:
-        table = table[table["status"].isin(_USED)]
+        table = table.select(np.isin(table.words["status"].tolist(), _USED))
         if not len(table):
             raise InputError(f"{path}: status: expected spots that are {' or '.join(_USED)}, got none")
     views = {view: i for i, view in enumerate(rig.views())}
     view = np.empty(len(table), dtype=np.int64)
-    lines = table["line"].to_numpy()
+    whole = table.whole(key)
+    cameras, spots = table.words["camera"].tolist(), table.words["spot"].tolist()
     wanted = {"camera": "a calibrated camera", "spot": "a spot of the target"}
-    for i, (camera, spot) in enumerate(zip(table["camera"], table["spot"], strict=True)):
+    for i, (camera, spot) in enumerate(zip(cameras, spots, strict=True)):
         for kind, name, names in (("camera", camera, rig.cameras), ("spot", spot, rig.spots)):
             if name not in names:
-                raise InputError(
-                    f"{path}: line {lines[i]}: {kind}: expected {wanted[kind]}, got {name!r}"
-                    f"{did_you_mean(name, names)}"[:240]
-                )
+                raise table.error(i, f"{kind}: expected {wanted[kind]}, got {name!r}{did_you_mean(name, names)}"[:200])
         if (camera, spot) not in views:
-            raise InputError(
-                f"{path}: line {lines[i]}: camera {camera!r} observes screen {rig.cameras[camera].screen!r}, but spot"
-                f" {spot!r} is on {rig.spots[spot].screen!r}; one of the two names is wrong"
+            raise table.error(
+                i,
+                f"camera {camera!r} observes screen {rig.cameras[camera].screen!r}, spot {spot!r} falls on"
+                f" {rig.spots[spot].screen!r}; one of the two names is wrong",
             )
         view[i] = views[camera, spot]
-    pixels = np.stack([numbers_in(table, name, path) for name in ("u_px", "v_px")], axis=1)
+    pixels = np.stack([table.finite(name) for name in ("u_px", "v_px")], axis=1)
     sizes = {name: c.image_size_px for name, c in rig.cameras.items()}
-    refuse_far_pixels(path, lines.tolist(), table["camera"].tolist(), pixels, sizes)
-    pairs = np.stack([table[key].to_numpy(), view], axis=1)
+    refuse_far_pixels(table, sizes)
+    pairs = np.stack([whole, view], axis=1)
     _, first, count = np.unique(pairs, axis=0, return_index=True, return_counts=True)
     if key == "frame" and np.any(count > 1):
         i = first[np.argmax(count > 1)]
-        raise InputError(
-            f"{path}: line {lines[i]}: expected one row per frame, camera and spot, got spot"
-            f" {table['spot'].iloc[i]!r} in frame {whole[i]} more than once"
+        raise table.error(
+            i,
+            f"expected one row per frame, camera and spot, got spot {spots[i]!r} in frame {whole[i]} more than once",
         )
-    return SpotRows(table[key].to_numpy(dtype=np.int64), view, pixels, _covariances(path, table, notes))
+    return SpotRows(whole, view, pixels, _covariances(table, notes))
 
 
-def _covariances(path: Path, table: pd.DataFrame, notes: list[str]) -> Array:
-    """Covariances (n, 2, 2), px^2, from the sigma columns of the table, with the default sigma for missing values."""
+def _covariances(table: Table, notes: list[str]) -> Array:
+    """(n, 2, 2), px^2, from whichever columns there are."""
     out = np.zeros((len(table), 2, 2))
     columns = ("sigma_u_px", "sigma_v_px") if "sigma_u_px" in table and "sigma_v_px" in table else ("sigma_px",) * 2
     for k, name in enumerate(columns):
         if name not in table:
             if k == 0:
-                notes.append(f"{path.name}: no column sigma_px: {DEFAULT_SPOT_SIGMA_PX:g} px is assumed")
+                notes.append(f"{table.path.name}: no column sigma_px: {DEFAULT_SPOT_SIGMA_PX:g} px is assumed")
             out[:, k, k] = DEFAULT_SPOT_SIGMA_PX**2
             continue
-        given = numbers_in(table, name, path, "a number above 0", may_be_empty=True)
-        refuse_sigmas(path, table["line"].tolist(), name, given, SIGMAS_PX, "px")
+        given = table.finite(name, "a number above 0", may_be_empty=True)
+        refuse_sigmas(table, name, SIGMAS_PX, "px")
         out[:, k, k] = np.where(np.isnan(given), DEFAULT_SPOT_SIGMA_PX, given) ** 2
         if k == 0 and np.isnan(given).any():
             notes.append(
-                f"{path.name}: {int(np.isnan(given).sum())} spots have no sigma: {DEFAULT_SPOT_SIGMA_PX:g} px is"
-                " assumed"
+                f"{table.path.name}: {int(np.isnan(given).sum())} spots without a sigma: {DEFAULT_SPOT_SIGMA_PX:g} px"
+                " is assumed"
             )
     if "cov_uv_px2" in table and columns[0] != columns[1]:
-        cov = np.nan_to_num(numbers_in(table, "cov_uv_px2", path, may_be_empty=True))
+        cov = np.nan_to_num(table.finite("cov_uv_px2", may_be_empty=True))
         bound = 0.99 * np.sqrt(out[:, 0, 0] * out[:, 1, 1])
         out[:, 0, 1] = out[:, 1, 0] = np.clip(cov, -bound, bound)
     return out

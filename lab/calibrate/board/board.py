@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,8 +11,8 @@ from calibration.boards.board_types import Board, Charuco
 from lab.calibrate.board.board_page import as_pdf, as_png, as_svg, lay_out
 from lab.errors import InputError
 from lab.files.rig.board_file import board_of, load_board, save_board
-from lab.files.text.atomic_write import atomic_folder
-from lab.files.text.yaml_text import did_you_mean
+from lab.files.text.atomic_write import atomic_folder, atomic_write_bytes
+from lab.files.text.error_text import did_you_mean
 
 FORMATS = ("pdf", "svg", "png")
 DESCRIPTION = "board.yaml"
@@ -85,8 +84,9 @@ def write_board(
     if single in FORMATS and not out.is_dir():
         description = out.with_suffix(".yaml")
         if description.exists() and load_board(description) != board:
-            raise InputError(f"{description}: describes a different board; choose another file name")
-        _write_bytes(contents[single], out)
+            raise InputError(f"{description}: describes another board; choose another name")
+        out.parent.mkdir(parents=True, exist_ok=True)
+        atomic_write_bytes(contents[single], out)
         save_board(board, description)
         return BoardOutcome(board, (out, description), layout.name)
     with atomic_folder(out, _holds_boards_only) as work:
@@ -117,14 +117,3 @@ def _check_rim(board: Board) -> None:
 def _holds_boards_only(folder: Path) -> bool:
     known = {DESCRIPTION, *(f"board.{name}" for name in FORMATS)}
     return {path.name for path in folder.iterdir()} <= known
-
-
-def _write_bytes(data: bytes, path: Path) -> None:
-    beside = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        beside.write_bytes(data)
-        beside.replace(path)
-    except OSError as error:
-        beside.unlink(missing_ok=True)
-        raise InputError(f"{path}: cannot be written: {error.strerror}") from None

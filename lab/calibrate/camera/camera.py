@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import datetime
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -30,7 +29,8 @@ from lab.files.rig.board_file import board_of
 from lab.files.rig.camera_block import Covariance
 from lab.files.rig.camera_file import CameraCalibration, CameraFile, save_camera
 from lab.files.text.atomic_write import atomic_folder, beside_a_good_one, refuse_foreign
-from lab.files.text.yaml_text import did_you_mean
+from lab.files.text.csv_text import write_table
+from lab.files.text.error_text import did_you_mean
 
 CAMERA, FAILED, CORNERS = "camera.yaml", "camera.failed.yaml", "corners.csv"
 CORNER_COLUMNS = ("view", "id", "u_px", "v_px", "residual_u_px", "residual_v_px", "used")  # measured minus model
@@ -196,11 +196,10 @@ def _write_corners(outcome: CameraOutcome, path: Path) -> None:
     """Write corners.csv, one row per corner; residuals are empty in excluded views."""
     r, names = outcome.result, [name for name, _ in outcome.photos.views]
     ids = outcome.photos.board.ids
-    with path.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(CORNER_COLUMNS)
-        for k in range(len(r.table)):
-            residual = ["" if np.isnan(v) else f"{-v:.4f}" for v in r.fit.residuals[k].tolist()]
-            u, v = r.table.pixels[k].tolist()
-            point = int(ids[r.table.point[k]])
-            writer.writerow([names[r.table.view[k]], point, f"{u:.4f}", f"{v:.4f}", *residual, int(r.fit.used[k])])
+    rows = []
+    for k in range(len(r.table)):
+        miss = ["" if np.isnan(v) else f"{-v:.4f}" for v in r.fit.residuals[k].tolist()]
+        u, v = r.table.pixels[k].tolist()
+        point = int(ids[r.table.point[k]])
+        rows.append([names[r.table.view[k]], point, f"{u:.4f}", f"{v:.4f}", *miss, int(r.fit.used[k])])
+    write_table(path, CORNER_COLUMNS, rows)

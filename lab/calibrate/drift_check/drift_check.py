@@ -46,7 +46,7 @@ from lab.calibrate.drift_check.drift_result import (
 from lab.files.rig.rig_covariance import joint_covariance
 from lab.files.rig.rig_file import RigFile, load_rig_file
 from lab.files.text.atomic_write import atomic_folder, refuse_foreign
-from lab.runs.tables import csv_word
+from lab.files.text.csv_text import csv_word
 
 TABLE = "drift.csv"
 COLUMNS = (

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import datetime
 import math
 from collections.abc import Sequence
@@ -11,9 +10,9 @@ from pathlib import Path
 
 from calibration.findings import Level
 from lab.errors import InputError
-from lab.files.text.csv_text import shown_line
-from lab.files.text.yaml_text import atomic_write_text
-from lab.runs.tables import csv_word
+from lab.files.text.atomic_write import atomic_write_text
+from lab.files.text.csv_text import csv_word, read_table
+from lab.files.text.error_text import shown_line
 
 COLUMNS = ("date", "camera", "drift_px", "noise_px", "drift_mm", "verdict")
 
@@ -40,34 +39,22 @@ def read_history(path: Path) -> list[HistoryRow]:
     if not path.exists():
         return []
     try:
-        lines = list(csv.reader(path.read_text(encoding="utf-8").splitlines()))
-    except UnicodeDecodeError:
-        raise InputError(
-            f"{path}: expected a history, got a file that is not text in UTF-8; name another --history"
-        ) from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}; name another --history") from None
-    if not lines or tuple(lines[0]) != COLUMNS:
-        found = shown_line(",".join(lines[0])[:80]) if lines else "an empty file"
-        raise InputError(f"{path}: expected columns {','.join(COLUMNS)}, got {found}; name another --history")
+        table = read_table(path, COLUMNS)
+        table.refuse_long_lines()
+    except InputError as error:
+        raise InputError(f"{error}; name another --history") from None
+    dates, cameras, verdicts = (table.words[c].tolist() for c in ("date", "camera", "verdict"))
+    drift, noise, drift_mm = (table.optional(c).tolist() for c in ("drift_px", "noise_px", "drift_mm"))
     rows = []
-    for number, fields in enumerate(lines[1:], 2):
+    for i, (date, verdict) in enumerate(zip(dates, verdicts, strict=True)):
         try:
-            day, camera, px, noise, mm, word = fields
-            row = HistoryRow(
-                datetime.date.fromisoformat(day), camera, _float(px), _float(noise), _float(mm), Level[word]
-            )
+            day, level = datetime.date.fromisoformat(date), Level[verdict]
         except (ValueError, KeyError):
-            raise InputError(
-                f"{path}: line {number}: expected {','.join(COLUMNS)}, got {shown_line(','.join(fields)[:80])};"
-                " correct or delete the line"
+            raise table.error(
+                i, f"expected a date and a verdict, got {shown_line(f'{date}, {verdict}')}; correct or delete the row"
             ) from None
-        rows.append(row)
+        rows.append(HistoryRow(day, cameras[i], drift[i], noise[i], drift_mm[i], level))
     return rows
-
-
-def _float(text: str) -> float:
-    return float(text) if text else math.nan
 
 
 def write_history(rows: Sequence[HistoryRow], path: Path) -> None:

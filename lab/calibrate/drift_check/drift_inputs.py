@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import csv
-import math
 import tempfile
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,12 +13,14 @@ from geometry.pose import Pose
 from geometry.rig import Rig
 from lab.errors import InputError
 from lab.files.run.results import read_poses, read_spots
-from lab.files.run.truth import load_pose_table
-from lab.files.text.csv_text import check_header, table_bytes
+from lab.files.run.truth import read_true_poses
+from lab.files.text.csv_table import Table
+from lab.files.text.csv_text import read_table
+from lab.files.text.error_text import did_you_mean
 from lab.files.text.range_checks import SIGMAS_PX, refuse_far_pixels, refuse_sigmas
-from lab.files.text.yaml_text import did_you_mean, shown
 
 PIXELS = ("camera", "point", "u_px", "v_px")
+PLACES = ("x_m", "y_m", "z_m", "sigma_x_m", "sigma_y_m", "sigma_z_m")
 _MAX_COORDINATE_M = 500.0  # larger coordinates are taken for millimetres: no lab is that large
 _MAX_RESIDUAL_PX = 200.0  # a median residual above this means other points or another rig
 
@@ -66,15 +65,6 @@ class KnownPoints:
 
 
 @dataclass(frozen=True, slots=True)
-class _Place:
-    """Position of a known point."""
-
-    xyz: tuple[float, ...]  # m: in world, or x, y, 0 in the frame of `screen`
-    sigma_m: tuple[float, ...]  # of each coordinate
-    screen: str  # empty: world
-
-
-@dataclass(frozen=True, slots=True)
 class StillSpots:
     """Mean pixels of a vehicle at rest: n views."""
 
@@ -96,53 +86,45 @@ def read_points(path: Path, survey: Path | None, rig: Rig, default_sigma_px: flo
     Raises:
         InputError: with file, line, the expected and the found content.
     """
-    rows = _rows(path, PIXELS)
+    table = read_table(path, PIXELS, ("sigma_px", *PLACES, "screen"))
+    table.require_rows(PIXELS)
     if survey is not None:
-        coordinates = _coordinates(survey, _rows(survey, ("point", "x_m", "y_m")), rig)
-    elif "x_m" in rows[0][1]:
-        coordinates = _coordinates(path, rows, rig)
+        coordinates = _coordinates(_survey_table(survey), rig)
+    elif "x_m" in table:
+        coordinates = _coordinates(table, rig)
     else:
         raise InputError(
             f"{path}: expected the coordinates of its points: columns x_m,y_m,z_m (or screen,x_m,y_m) in this file, or"
             " a survey file (--survey); got neither"
         )
-    camera, point, pixels, sigma, xyz, sigma_m, screen = [], [], [], [], [], [], []
-    line_of: dict[tuple[str, str], int] = {}
-    for line, row in rows:
-        name = row["camera"]
-        if name not in rig.cameras:
-            raise InputError(
-                f"{path}: line {line}: camera: expected a camera of the rig, got {name!r}"
-                + did_you_mean(name, rig.cameras)
+    cameras, points = table.names("camera"), table.names("point")
+    pixels = np.stack([table.finite(c) for c in ("u_px", "v_px")], axis=1)
+    seen: dict[tuple[str, str], int] = {}
+    for i, (camera, point) in enumerate(zip(cameras, points, strict=True)):
+        if camera not in rig.cameras:
+            raise table.error(
+                i, f"camera: expected a camera of the rig, got {camera!r}{did_you_mean(camera, rig.cameras)}"
             )
-        if row["point"] not in coordinates:
-            near = did_you_mean(row["point"], coordinates)
+        if point not in coordinates:
             raise InputError(
-                f"{survey or path}: expected the coordinates of point {row['point']!r} ({path.name}, line {line}),"
-                f" got none{near}"
+                f"{survey or path}: expected the coordinates of point {point!r} ({path.name}, line {table.lines[i]}),"
+                " got none" + did_you_mean(point, coordinates)
             )
-        key = (name, row["point"])
-        if key in line_of:
-            raise InputError(
-                f"{path}: line {line}: expected each point once per camera, got {row['point']!r} of {name!r} again"
-                f" (first in line {line_of[key]}); give the mean of repeated measurements"
+        if (camera, point) in seen:
+            raise table.error(
+                i,
+                f"expected each point once per camera, got {point!r} of {camera!r} again (first in line"
+                f" {seen[camera, point]}); give the mean of repeated measurements",
             )
-        line_of[key] = line
-        camera.append(name)
-        point.append(row["point"])
-        pixels.append([_number(path, line, row, c) for c in ("u_px", "v_px")])
-        one = _number(path, line, row, "sigma_px") if row.get("sigma_px") else default_sigma_px
-        refuse_sigmas(path, [line], "sigma_px", np.array([one]), SIGMAS_PX, "px")
-        sigma.append(one)
-        place = coordinates[row["point"]]
-        xyz.append(place.xyz)
-        sigma_m.append(place.sigma_m)
-        screen.append(place.screen)
-    sizes = {name: c.image_size_px for name, c in rig.cameras.items()}
-    refuse_far_pixels(path, [line for line, _ in rows], camera, np.array(pixels), sizes)
+        seen[camera, point] = int(table.lines[i])
+    sigma = table.optional("sigma_px")
+    refuse_sigmas(table, "sigma_px", SIGMAS_PX, "px")
+    refuse_far_pixels(table, {name: c.image_size_px for name, c in rig.cameras.items()})
+    found = [coordinates[point] for point in points]
     return KnownPoints(
-        tuple(camera), tuple(point), np.array(pixels), np.array(sigma), np.array(xyz), np.array(sigma_m),
-        tuple(screen), "sigma_px" in rows[0][1],
+        tuple(cameras), tuple(points), pixels, np.where(np.isnan(sigma), default_sigma_px, sigma),
+        np.array([xyz for xyz, _, _ in found]), np.array([sigma_m for _, sigma_m, _ in found]),
+        tuple(screen for _, _, screen in found), "sigma_px" in table,
     )  # fmt: skip
 
 
@@ -165,66 +147,48 @@ def check_points_match(known: KnownPoints, predicted: Array, path: Path) -> None
         )
 
 
-def _rows(path: Path, required: Sequence[str]) -> list[tuple[int, dict[str, str]]]:
-    """Line number and stripped fields of each row of a CSV file. Raises InputError if there is none."""
-    text = table_bytes(path, required).decode("utf-8-sig").lstrip("\r\n")
-    check_header(path, text.splitlines()[0], required)
-    lines = list(csv.reader(text.splitlines(), skipinitialspace=True))
-    header = [f.strip() for f in lines[0]]
-    rows = []
-    for number, fields in enumerate(lines[1:], 2):
-        if not any(f.strip() for f in fields):
-            continue
-        if len(fields) != len(header):
-            raise InputError(f"{path}: line {number}: expected {len(header)} fields, got {len(fields)}")
-        rows.append((number, dict(zip(header, (f.strip() for f in fields), strict=True))))
-    if not rows:
-        raise InputError(f"{path}: expected one or more points below the header, got none")
-    return rows
+def _survey_table(path: Path) -> Table:
+    required = ("point", "x_m", "y_m")
+    table = read_table(path, required, (*PLACES, "screen"))
+    table.require_rows(required)
+    return table
 
 
-def _number(path: Path, line: int, row: Mapping[str, str], column: str) -> float:
-    try:
-        value = float(row[column])
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise InputError(f"{path}: line {line}: {column}: expected a finite number, got {shown(row[column] or None)}")
-    return value
-
-
-def _coordinates(path: Path, rows: Sequence[tuple[int, Mapping[str, str]]], rig: Rig) -> dict[str, _Place]:
-    """The position of each named point."""
-    on_screens = "z_m" not in rows[0][1]
-    if on_screens and "screen" not in rows[0][1]:
-        raise InputError(f"{path}: expected a column 'z_m' (world) or 'screen' (x_m,y_m on a screen), got neither")
-    out: dict[str, _Place] = {}
-    for line, row in rows:
-        names = ("x_m", "y_m") if on_screens else ("x_m", "y_m", "z_m")
-        xyz = [_number(path, line, row, c) for c in names]
-        if max(map(abs, xyz)) > _MAX_COORDINATE_M:
-            raise InputError(
-                f"{path}: line {line}: {','.join(names)}: expected metres, got {max(xyz, key=abs):g};"
-                " are these millimetres? divide by 1000"
+def _coordinates(table: Table, rig: Rig) -> dict[str, tuple[list[float], list[float], str]]:
+    """Coordinates, sigmas and screen (empty: world) of each named point."""
+    on_screens = "z_m" not in table
+    if on_screens and "screen" not in table:
+        raise InputError(
+            f"{table.path}: expected a column 'z_m' (world) or 'screen' (x_m,y_m on a screen), got neither"
+        )
+    names = ("x_m", "y_m") if on_screens else ("x_m", "y_m", "z_m")
+    places = np.stack([table.finite(c) for c in names], axis=1)
+    sigmas = np.nan_to_num(np.stack([table.optional(f"sigma_{name}") for name in names], axis=1))
+    screens = table.names("screen", may_be_empty=True) if on_screens else [""] * len(table)
+    fill = [0.0] * (3 - len(names))
+    out: dict[str, tuple[list[float], list[float], str]] = {}
+    for i, point in enumerate(table.names("point")):
+        place, sigma = places[i].tolist(), sigmas[i].tolist()
+        if max(map(abs, place)) > _MAX_COORDINATE_M:
+            raise table.error(
+                i,
+                f"{','.join(names)}: expected metres, got {max(place, key=abs):g}; are these millimetres? divide by"
+                " 1000",
             )
-        sigma = [_number(path, line, row, f"sigma_{c}") if row.get(f"sigma_{c}") else 0.0 for c in names]
         if not 0 <= min(sigma) <= max(sigma) <= _MAX_COORDINATE_M:
-            raise InputError(
-                f"{path}: line {line}: expected sigmas in metres, 0 to {_MAX_COORDINATE_M:g}, got"
-                f" {min(sigma) if min(sigma) < 0 else max(sigma):g}; correct it, or leave the field empty"
+            raise table.error(
+                i,
+                f"expected sigmas in metres, 0 to {_MAX_COORDINATE_M:g}, got"
+                f" {min(sigma) if min(sigma) < 0 else max(sigma):g}; correct it, or leave the field empty",
             )
-        screen = row["screen"] if on_screens else ""
-        if on_screens and screen not in rig.screens:
-            raise InputError(
-                f"{path}: line {line}: screen: expected a screen of the rig, got {screen!r}"
-                f"{did_you_mean(screen, rig.screens)}"
+        if on_screens and screens[i] not in rig.screens:
+            raise table.error(
+                i,
+                f"screen: expected a screen of the rig, got {screens[i]!r}{did_you_mean(screens[i], rig.screens)}",
             )
-        fill = (0.0,) * (3 - len(xyz))
-        entry = _Place((*xyz, *fill), (*sigma, *fill), screen)
-        if out.setdefault(row["point"], entry) != entry:
-            raise InputError(
-                f"{path}: line {line}: point {row['point']!r} has two different positions; give them different names"
-            )
+        entry = (place + fill, sigma + fill, screens[i])
+        if out.setdefault(point, entry) != entry:
+            raise table.error(i, f"point {point!r} has two different positions; give them different names")
     return out
 
 
@@ -295,12 +259,11 @@ def read_still_pose(path: Path) -> Pose:
     Raises:
         InputError: if the file has no row or the pose is not constant.
     """
-    table = load_pose_table(path)
-    if not len(table):
+    true = read_true_poses(path)
+    if not len(true.frame):
         raise InputError(f"{path}: expected one or more rows, got none")
-    positions = table[["x_m", "y_m", "z_m"]].to_numpy(dtype=float)
-    turns = table[["qw", "qx", "qy", "qz"]].to_numpy(dtype=float)
-    poses = Pose.from_quaternion(turns / np.linalg.norm(turns, axis=1, keepdims=True), positions)
+    turns = true.quaternion_wxyz
+    poses = Pose.from_quaternion(turns / np.linalg.norm(turns, axis=1, keepdims=True), true.position_m)
     change = poses[0].minus(poses)
     if np.abs(change[:, :3]).max() > 1e-4 or np.abs(change[:, 3:]).max() > 1e-4:
         raise InputError(

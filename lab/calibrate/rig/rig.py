@@ -27,7 +27,8 @@ from lab.calibrate.rig.rig_tables import RESIDUALS, write_residuals
 from lab.calibrate.screens.screen_inputs import ScreenInputs, screen_inputs
 from lab.calibrate.screens.survey_check import adjusted_screens, survey_findings
 from lab.errors import CalibrationError, InputError
-from lab.files.project.project import Project, load_project
+from lab.files.project.project import load_project
+from lab.files.project.project_types import Project
 from lab.files.rig.calibration_state import CalibrationState
 from lab.files.rig.rig_covariance import blocks_of
 from lab.files.rig.rig_file import RigFile, save_rig

@@ -13,8 +13,8 @@ from calibration.terms.corners import CornerTerm
 from calibration.terms.pose_records import RecordTerm
 from calibration.terms.surveyed import array_of
 from geometry.arrays import Array
-from lab.files.text.yaml_text import atomic_write_text
-from lab.runs.tables import csv_word
+from lab.files.text.atomic_write import atomic_write_text
+from lab.files.text.csv_text import csv_word
 
 RESIDUALS = "residuals.csv"
 COLUMNS = ("kind", "name", "camera", "axis", "residual", "unit", "sigmas", "used")

@@ -19,7 +19,8 @@ from lab.calibrate.screens.screen_inputs import screen_inputs
 from lab.calibrate.screens.screen_tables import DOTS, RESIDUALS, write_tables
 from lab.calibrate.screens.survey_check import adjusted_screens, survey_findings
 from lab.errors import CalibrationError
-from lab.files.project.project import Project, load_project
+from lab.files.project.project import load_project
+from lab.files.project.project_types import Project
 from lab.files.rig.calibration_state import CalibrationState
 from lab.files.rig.rig_covariance import blocks_of
 from lab.files.rig.rig_file import RigFile, save_rig

@@ -23,9 +23,9 @@ from lab.calibrate.screens.screen_boards import board_views
 from lab.errors import InputError
 from lab.files.project.cloud_file import read_cloud
 from lab.files.project.point_files import Observations, Survey, read_observations, read_survey
-from lab.files.project.project import Cloud, Project, ScreenEntry
+from lab.files.project.project_types import Cloud, Project, ScreenEntry
+from lab.files.text.error_text import did_you_mean
 from lab.files.text.range_checks import FARTHEST_IN_SCAN
-from lab.files.text.yaml_text import did_you_mean
 
 LARGEST_SCREEN_M = 100.0  # a larger screen is taken for an error of the unit
 SMALLEST_SCREEN_M = 0.02

@@ -13,7 +13,7 @@ from calibration.screens.network_sigmas import camera_sigmas, pointing_sigmas_m,
 from calibration.screens.screens import ScreensResult
 from geometry.camera import pinhole_numbers
 from lab.calibrate.screens.screen_inputs import ScreenInputs
-from lab.files.project.project import Project
+from lab.files.project.project_types import Project
 from lab.files.rig.rig_covariance import blocks_of
 from lab.number_format import short
 from lab.report.calibration.calibration_drawings import corners_overlay

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import csv
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from calibration.screens.screens import ScreensResult
+from lab.files.text.csv_text import write_table
 
 RESIDUALS, DOTS = "residuals.csv", "dots.csv"
 RESIDUAL_COLUMNS = ("camera", "point", "u_px", "v_px", "residual_u_px", "residual_v_px", "sigmas", "used")
@@ -34,9 +33,10 @@ def write_tables(result: ScreensResult, folder: Path) -> None:
         in_sigmas = np.linalg.norm(fit.corner_errors_px, axis=1) / c.sigma_px
         for i in range(len(c)):
             names = [cameras[c.camera[i]], network.placements[c.placement[i]]]
-            residual = fit.corner_errors_px[i].round(4)
-            rows.append([*names, *c.pixels[i].round(4), *residual, round(float(in_sigmas[i]), 3), 1])
-    _write_csv(folder / RESIDUALS, RESIDUAL_COLUMNS, rows)
+            rows.append(
+                [*names, *c.pixels[i].round(4), *fit.corner_errors_px[i].round(4), round(float(in_sigmas[i]), 3), 1]
+            )
+    write_table(folder / RESIDUALS, RESIDUAL_COLUMNS, rows)
     height = np.full(len(network.dots), np.nan)
     used = np.ones(len(network.dots), dtype=bool)
     for screen in result.screens:
@@ -49,11 +49,4 @@ def write_tables(result: ScreensResult, folder: Path) -> None:
         height_m = "" if np.isnan(height[i]) else round(float(height[i]), 7)
         screen_name = "" if k < 0 else screens[k]
         points.append([name, screen_name, *xyz[i].round(7), *fit.dot_shifts_m[i].round(7), height_m, int(used[i])])
-    _write_csv(folder / DOTS, DOT_COLUMNS, points)
-
-
-def _write_csv(path: Path, columns: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
-    with path.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(columns)
-        writer.writerows(rows)
+    write_table(folder / DOTS, DOT_COLUMNS, points)

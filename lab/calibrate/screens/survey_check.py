@@ -16,7 +16,7 @@ from calibration.screens.screens import ScreensResult, calibrate
 from calibration.screens.survey_diagnosis import SurveySuspect, misfit_of, suspects
 from lab.calibrate.screens.screen_inputs import ScreenInputs
 from lab.errors import CalibrationError, InputError
-from lab.files.project.project import Project
+from lab.files.project.project_types import Project
 
 _SUSPICIOUS_MISFIT = 4.0  # misfit (see survey_diagnosis.py) above which swapped axes and wrong units are tested
 _ACCEPTED_MISFIT = 2.0  # misfit below which a change to the survey is accepted as the explanation

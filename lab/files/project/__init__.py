@@ -1,1 +1,1 @@
-"""calibration.yaml and the tables of a calibration project."""
+"""Files of a calibration project: calibration.yaml, its tables and scanned point clouds."""

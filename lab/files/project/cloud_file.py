@@ -1,4 +1,4 @@
-"""Files of scanned points: PLY and PCD by Open3D, XYZ as plain text."""
+"""Files of scanned point clouds: PLY and PCD by Open3D, XYZ as plain text."""
 
 from __future__ import annotations
 
@@ -16,15 +16,16 @@ AS_TEXT = (".xyz", ".txt", ".csv", ".asc")
 
 
 def read_cloud(path: Path, unit_m: float) -> tuple[Array, tuple[str, ...]]:
-    """The points (n, 3), m, of a scan and what was left out, in words. unit_m: metres in one unit of the file.
+    """The points (n, 3), m, of a scan, and notes of what was left out. unit_m: metres in one unit of the file.
 
-    Raises InputError: no such kind of file, empty, damaged, no finite point.
+    Raises:
+        InputError: an unknown kind of file, an empty or damaged one, or no finite point.
     """
     path = Path(path)
     kind = path.suffix.lower()
     if kind not in (*BY_OPEN3D, *AS_TEXT):
         known = ", ".join(k[1:] for k in (*BY_OPEN3D, *AS_TEXT))
-        raise InputError(f"{path}: expected a cloud of points ({known}), got {kind or 'no ending'}; export it as PLY")
+        raise InputError(f"{path}: expected a point cloud ({known}), got {kind or 'no ending'}; export it as PLY")
     try:
         if path.stat().st_size == 0:
             raise InputError(f"{path}: expected points, got an empty file; export the scan again")
@@ -70,7 +71,7 @@ def _as_text(path: Path) -> Array:
 
 
 def _numbers(line: str) -> list[float] | None:
-    """The first three numbers of a line; None where it does not begin with three."""
+    """The first three numbers of a line; None where it does not start with three numbers."""
     try:
         values = [float(w) for w in line.replace(",", " ").replace(";", " ").split()[:3]]
     except ValueError:

@@ -1,1 +1,1 @@
-"""Files about the rig: rig.yaml, camera.yaml, screens.yaml, board.yaml, other programs' formats."""
+"""Files of the rig: rig.yaml, camera.yaml, screens.yaml, board.yaml, and formats of other programs."""

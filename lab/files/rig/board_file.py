@@ -1,4 +1,4 @@
-"""board.yaml: a calibration board in words; or the short text that names one, whichever the user has."""
+"""board.yaml: the description of a calibration board. A short text such as chessboard:9x6:25mm may replace it."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ import pydantic
 
 from calibration.boards.board_types import Board, Charuco, Chessboard, CircleGrid, parse
 from lab.errors import InputError
-from lab.files.text.fields import Block, Integer, Positive, Word, a_truth_value, one_of, validated, wrong
+from lab.files.text.fields import Block, Integer, Positive, Word, boolean, field_error, one_of, validated
 from lab.files.text.yaml_text import read_mapping, write_mapping
 
 SCHEMA = "beampose/board/1"
 CHESSBOARD, CIRCLES, CHARUCO = "chessboard", "circles", "charuco"
-_TruthValue = Annotated[bool, pydantic.PlainValidator(a_truth_value)]
+_TruthValue = Annotated[bool, pydantic.PlainValidator(boolean)]
 
 
 def board_of(text_or_path: str | Path) -> Board:
-    """The board of a board.yaml, or of a text such as chessboard:9x6:25mm. Raises InputError in one line."""
+    """The board of a board.yaml, or of a text such as chessboard:9x6:25mm. Raises InputError, in one line."""
     text = str(text_or_path)
     if Path(text).suffix.lower() in (".yaml", ".yml") or Path(text).is_file():
         return load_board(Path(text))
@@ -29,18 +29,18 @@ def board_of(text_or_path: str | Path) -> Board:
 
 
 def load_board(path: Path) -> Board:
-    """The board that a board.yaml describes. Raises InputError: one line for each mistake, naming file and field."""
+    """The board of a board.yaml. Raises InputError: one line for each mistake, with file and field."""
     path = Path(path)
     return validated(_BoardBlock, read_mapping(path), path).board()
 
 
 def save_board(board: Board, path: Path) -> None:
-    """Write a board.yaml, complete or not at all."""
+    """Write a board.yaml, atomically. Raises InputError."""
     write_mapping(as_mapping(board), Path(path))
 
 
 def as_mapping(board: Board) -> dict[str, Any]:
-    """The plain mapping that board.yaml holds."""
+    """The content of board.yaml as a plain mapping."""
     content: dict[str, Any] = {"schema": SCHEMA}
     if isinstance(board, Chessboard):
         content |= {"kind": CHESSBOARD, "columns": board.columns, "rows": board.rows, "square_m": board.square_m}
@@ -56,7 +56,7 @@ def as_mapping(board: Board) -> dict[str, Any]:
     return content
 
 
-_FIELDS = {  # of each kind: those it must have, those it may have
+_FIELDS = {  # kind: required fields, optional fields
     CHESSBOARD: ({"square_m"}, set()),
     CIRCLES: ({"spacing_m"}, {"asymmetric", "diameter_m"}),
     CHARUCO: ({"square_m", "marker_m", "dictionary"}, {"inverted", "legacy"}),
@@ -66,12 +66,12 @@ _FIELDS = {  # of each kind: those it must have, those it may have
 class _BoardBlock(Block):
     schema_: Annotated[str, pydantic.PlainValidator(one_of((SCHEMA,)))] = pydantic.Field(alias="schema")
     kind: Annotated[str, pydantic.PlainValidator(one_of((CHESSBOARD, CIRCLES, CHARUCO)))]
-    columns: Integer  # inner corners, circles in a row, or squares of a ChArUco board
+    columns: Integer  # inner corners, circles per row, or squares of a ChArUco board
     rows: Integer
     square_m: Positive | None = None
     spacing_m: Positive | None = None
     asymmetric: _TruthValue | None = None
-    diameter_m: Positive | None = None  # of the circles; left out: measured in the photographs
+    diameter_m: Positive | None = None  # of the circles; without it, measured in the photographs
     marker_m: Positive | None = None
     dictionary: Word | None = None
     inverted: _TruthValue | None = None
@@ -82,13 +82,13 @@ class _BoardBlock(Block):
         must, may = _FIELDS[self.kind]
         given = {name for name in self.model_fields_set if name not in ("schema_", "kind", "columns", "rows")}
         for name in sorted(must - given):
-            raise wrong(f"expected {name} for a board of kind {self.kind!r}, got nothing; add it")
+            raise field_error(f"expected {name} for a board of kind {self.kind!r}, got nothing; add it")
         for name in sorted(given - must - may):
-            raise wrong(f"unexpected {name} for a board of kind {self.kind!r}; remove it")
+            raise field_error(f"unexpected {name} for a board of kind {self.kind!r}; remove it")
         try:
             self.board()
         except ValueError as error:
-            raise wrong(str(error)) from None
+            raise field_error(str(error)) from None
         return self
 
     def board(self) -> Board:

@@ -1,4 +1,4 @@
-"""The state of a calibration: when it was made, until when it holds, what it says of itself; and who may use it."""
+"""The state of a calibration: its date, validity and verdict, and whether it may be used."""
 
 from __future__ import annotations
 
@@ -10,30 +10,30 @@ from typing import Annotated, Any
 import pydantic
 
 from lab.errors import CalibrationError
-from lab.files.text.fields import Block, Lines, Text, one_of, unexpected
+from lab.files.text.fields import Block, Lines, Text, one_of, unexpected_value
 
 VERDICTS = ("PASS", "WARN", "FAIL")
 
 
 @dataclass(frozen=True, slots=True)
 class CalibrationState:
-    """What a calibrated file says of its own making."""
+    """Date, verdict and validity of a calibration."""
 
     date: datetime.date
     verdict: str  # one of VERDICTS
-    valid_until: datetime.date | None = None  # the last day on which it holds; None: for ever
+    valid_until: datetime.date | None = None  # the last valid day; None: no limit
     reasons: tuple[str, ...] = ()  # a line for each finding that is not a PASS
     notes: str = ""
 
 
 def iso_date(value: Any) -> datetime.date:
-    """A day written as 2026-03-14; a time of day after it is dropped."""
+    """A date written as 2026-03-14; a time of day after it is ignored."""
     if isinstance(value, str):
         try:
             return datetime.datetime.fromisoformat(value.strip()).date()
         except ValueError:
             pass
-    raise unexpected("a date such as 2026-03-14", value)
+    raise unexpected_value("a date such as 2026-03-14", value)
 
 
 def _day_or_none(value: Any) -> datetime.date | None:
@@ -59,7 +59,7 @@ class CalibrationStateBlock(Block):
 
 
 def state_mapping(state: CalibrationState) -> dict[str, Any]:
-    """The plain mapping that a `CalibrationStateBlock` reads back to the same value."""
+    """The plain mapping from which a `CalibrationStateBlock` reads the same value."""
     out: dict[str, Any] = {"date": state.date.isoformat(), "verdict": state.verdict}
     if state.valid_until is not None:
         out["valid_until"] = state.valid_until.isoformat()
@@ -71,16 +71,19 @@ def state_mapping(state: CalibrationState) -> dict[str, Any]:
 
 
 def require_usable(state: CalibrationState | None, path: Path, on: datetime.date, what: str = "today") -> None:
-    """Raise CalibrationError (exit status 3) where a calibration must not be used on a day; None may.
+    """Checks that a calibration may be used on the day `on`; None (state unknown) may.
 
-    what: how the message names that day.
+    what: the name of that day in the message.
+
+    Raises:
+        CalibrationError: the verdict is FAIL, or the calibration is out of date (exit status 3).
     """
     if state is None:
         return
     if state.verdict == "FAIL":
         why = f" ({state.reasons[0]})" if state.reasons else ""
         raise CalibrationError(
-            f"{path}: calibration.verdict: FAIL{why}: this calibration must not be used; put the cause right and"
+            f"{path}: calibration.verdict: FAIL{why}: this calibration must not be used; correct the cause and"
             " calibrate again (`beampose calibrate rig`)"
         )
     if state.valid_until is not None and on > state.valid_until:

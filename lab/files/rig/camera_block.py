@@ -1,4 +1,4 @@
-"""What the files say of one camera, and of errors: the blocks that rig.yaml and camera.yaml share."""
+"""Blocks that rig.yaml and camera.yaml share: the lens of a camera, and covariances."""
 
 from __future__ import annotations
 
@@ -11,15 +11,25 @@ import pydantic
 from geometry import lens
 from geometry.arrays import Array, symmetric
 from geometry.camera import FISHEYE, LENSES, PERSPECTIVE
-from lab.files.text.fields import Block, Number, Positive, a_number, an_integer, numbers, one_of, unexpected, wrong
+from lab.files.text.fields import (
+    Block,
+    Number,
+    Positive,
+    field_error,
+    finite_number,
+    numbers,
+    one_of,
+    unexpected_value,
+    whole_number,
+)
 
-# Against the diagonal: what sums in double precision, written with all digits, may miss.
+# Tolerance of symmetry and of eigenvalues, relative to the diagonal: rounding of sums in double precision.
 COVARIANCE_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
 class Covariance:
-    """What a calibration knows of the errors of one camera, one screen or the target."""
+    """Covariance of the parameters of one camera, one screen or the target."""
 
     parameters: tuple[str, ...]  # n names
     matrix: Array  # (n, n), symmetric, in the parameters' units
@@ -27,31 +37,31 @@ class Covariance:
 
 def _image_size(value: Any) -> list[int]:
     numbers(2)(value)
-    size = [an_integer(v) for v in value]
+    size = [whole_number(v) for v in value]
     if min(size) < 1:
-        raise unexpected("a width and a height of at least 1 pixel", value)
+        raise unexpected_value("a width and a height of at least 1 pixel", value)
     return size
 
 
 def _distortion(value: Any) -> list[float]:
     words = "0, 4, 5, 8, 12 or 14 numbers"
     if not isinstance(value, list):
-        raise unexpected(f"a list of {words}", value)
+        raise unexpected_value(f"a list of {words}", value)
     if len(value) not in lens.ALLOWED_LENGTHS:
-        raise wrong(f"expected {words}, got {len(value)}")
-    return [a_number(v) for v in value]
+        raise field_error(f"expected {words}, got {len(value)}")
+    return [finite_number(v) for v in value]
 
 
 def _parameter_names(value: Any) -> list[str]:
     if not isinstance(value, list) or not all(isinstance(v, str) for v in value):
-        raise unexpected("a list of parameter names", value)
+        raise unexpected_value("a list of parameter names", value)
     return value
 
 
 def _matrix(value: Any) -> list[list[float]]:
     if not isinstance(value, list) or not all(isinstance(row, list) and len(row) == len(value) for row in value):
-        raise unexpected("a square matrix, as a list of rows", value)
-    return [[a_number(v) for v in row] for row in value]
+        raise unexpected_value("a square matrix, as a list of rows", value)
+    return [[finite_number(v) for v in row] for row in value]
 
 
 class CovarianceBlock(Block):
@@ -63,7 +73,9 @@ class CovarianceBlock(Block):
     @pydantic.model_validator(mode="after")
     def _same_size(self) -> CovarianceBlock:
         if len(self.matrix) != len(self.parameters):
-            raise wrong(f"expected a matrix row for each of {len(self.parameters)} parameters, got {len(self.matrix)}")
+            raise field_error(
+                f"expected a matrix row for each of {len(self.parameters)} parameters, got {len(self.matrix)}"
+            )
         return self
 
     def value(self) -> Covariance:
@@ -71,15 +83,15 @@ class CovarianceBlock(Block):
         return Covariance(tuple(self.parameters), np.array(self.matrix, dtype=float).reshape(len(self.matrix), -1))
 
 
-def covariance_mistake(covariance: Covariance) -> str:
-    """What is wrong with a matrix that is no covariance, in a line's words; empty where nothing is."""
+def covariance_error(covariance: Covariance) -> str:
+    """The mistake of a matrix that is not a covariance, as text of a message; empty for a covariance."""
     C, names = covariance.matrix, covariance.parameters
     variances = np.diagonal(C)
     if not len(C):
         return ""
     if np.any(variances < 0):
         worst = int(np.argmin(variances))
-        return f"expected variances from zero up on the diagonal, got {variances[worst]:.6g} for {names[worst]}"
+        return f"expected variances of 0 or more on the diagonal, got {variances[worst]:.6g} for {names[worst]}"
     unit = np.sqrt(np.where(variances > 0, variances, 1.0))
     scaled = C / np.outer(unit, unit)
     apart = np.abs(scaled - scaled.T)
@@ -90,7 +102,7 @@ def covariance_mistake(covariance: Covariance) -> str:
             f" for {names[j]}, {names[i]}"
         )
     if np.linalg.eigvalsh(symmetric(scaled))[0] < -COVARIANCE_TOLERANCE * len(C):
-        return "expected a covariance, got a matrix with a negative eigenvalue: correlations that no errors can have"
+        return "expected a covariance, got a matrix with a negative eigenvalue: impossible correlations"
     return ""
 
 
@@ -102,7 +114,7 @@ class _MatrixBlock(Block):
 
 
 class LensBlock(Block):
-    """How a camera draws: picture size, camera matrix, distortion and which model its numbers belong to."""
+    """The lens of a camera: picture size, camera matrix, distortion and lens model."""
 
     image_size_px: Annotated[list[int], pydantic.PlainValidator(_image_size)]
     camera_matrix: _MatrixBlock
@@ -112,7 +124,9 @@ class LensBlock(Block):
     @pydantic.model_validator(mode="after")
     def _numbers_of_the_model(self) -> LensBlock:
         if self.lens == FISHEYE and len(self.distortion) not in (0, 4):
-            raise wrong(f"expected 4 distortion numbers (or none) for lens {FISHEYE!r}, got {len(self.distortion)}")
+            raise field_error(
+                f"expected 4 distortion numbers (or none) for lens {FISHEYE!r}, got {len(self.distortion)}"
+            )
         return self
 
     def size(self) -> tuple[int, int]:
@@ -128,7 +142,7 @@ class LensBlock(Block):
 def lens_mapping(
     image_size_px: tuple[int, int], matrix: Array, distortion: tuple[float, ...], lens_name: str
 ) -> dict[str, Any]:
-    """The plain mapping that a `LensBlock` reads back to the same numbers. matrix (3, 3), px."""
+    """The plain mapping from which a `LensBlock` reads the same numbers. matrix (3, 3), px."""
     out: dict[str, Any] = {
         "image_size_px": [int(v) for v in image_size_px],
         "camera_matrix": {
@@ -145,13 +159,13 @@ def lens_mapping(
 
 
 def covariance_mapping(covariance: Covariance) -> dict[str, Any]:
-    """The plain mapping that a `CovarianceBlock` reads back to the same numbers."""
+    """The plain mapping from which a `CovarianceBlock` reads the same numbers."""
     return {
         "parameters": list(covariance.parameters),
-        "matrix": [floats(row) for row in covariance.matrix],
+        "matrix": [plain_floats(row) for row in covariance.matrix],
     }
 
 
-def floats(values: Array) -> list[float]:
-    """Plain numbers for a file, without a minus before a zero."""
+def plain_floats(values: Array) -> list[float]:
+    """Plain numbers for a file, without negative zeros."""
     return [float(v) + 0.0 for v in values]

@@ -18,50 +18,51 @@ from lab.files.rig.camera_block import (
     Covariance,
     CovarianceBlock,
     LensBlock,
+    covariance_error,
     covariance_mapping,
-    covariance_mistake,
     lens_mapping,
 )
+from lab.files.text.error_text import did_you_mean
 from lab.files.text.fields import (
     Block,
-    FromZero,
     Integer,
     Lines,
+    NonNegative,
     Number,
     Positive,
     Text,
     Word,
+    field_error,
     one_of,
     validated,
-    wrong,
 )
-from lab.files.text.yaml_text import did_you_mean, read_mapping, write_mapping
+from lab.files.text.yaml_text import read_mapping, write_mapping
 
 SCHEMA = "beampose/camera/1"
 
 
 @dataclass(frozen=True, slots=True)
 class CameraCalibration:
-    """Where a camera's numbers come from, and how good they are. What is not known is None, or empty."""
+    """Origin and quality of a camera's calibration. Unknown values are None or empty."""
 
     date: str = ""  # ISO 8601: 2026-03-14, with a time if wanted
-    verdict: str = ""  # PASS, WARN or FAIL; empty for numbers that nobody judged, such as converted ones
+    verdict: str = ""  # PASS, WARN or FAIL; empty without a verdict, such as for converted cameras
     rms_px: float | None = None  # of the corners' residuals, per axis
-    sigma_px: float | None = None  # of one corner's coordinate, as the solve estimates it
-    hold_out_rms_px: float | None = None  # of corners that the solve did not use
+    sigma_px: float | None = None  # of one corner's coordinate, estimated by the solve
+    hold_out_rms_px: float | None = None  # of corners not used by the solve
     views: int | None = None  # photographs used
     corners: int | None = None  # corners used
-    board: str = ""  # the board in words, or its file
-    distance_m: float | None = None  # at which figures in millimetres hold
-    valid_until: str = ""  # ISO 8601; empty: for ever
+    board: str = ""  # description of the board, or its file
+    distance_m: float | None = None  # distance for figures in millimetres
+    valid_until: str = ""  # ISO 8601; empty: no limit
     reasons: tuple[str, ...] = ()  # a line for each finding that is not a PASS
-    figures: Mapping[str, float] = field(default_factory=dict)  # further key figures, their unit in the name
+    figures: Mapping[str, float] = field(default_factory=dict)  # further figures, with their unit in the name
     notes: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class CameraFile:
-    """What a camera.yaml holds."""
+    """The content of a camera.yaml."""
 
     name: str
     image_size_px: tuple[int, int]  # width, height
@@ -73,17 +74,17 @@ class CameraFile:
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
-        """The names of the camera's numbers, in order: fx, fy, cx, cy and as many distortion numbers as it has."""
+        """Names of the camera's parameters, in order: fx, fy, cx, cy and its distortion coefficients."""
         return (*PINHOLE, *distortion_names(self.camera()))
 
     def camera(self, screen: str = "", camera_from_world: Pose | None = None) -> Camera:
-        """The camera as the geometry knows it; without a pose it stands at the world's origin."""
+        """The camera as a value of the geometry; without a pose, at the origin of the world."""
         pose = Pose.identity() if camera_from_world is None else camera_from_world
         return Camera(self.name, screen, self.image_size_px, self.camera_matrix, self.distortion, pose, lens=self.lens)
 
 
 def load_camera(path: Path) -> CameraFile:
-    """The camera that a camera.yaml describes. Raises InputError: one line for a mistake, naming file and field."""
+    """The camera of a camera.yaml. Raises InputError: one line for each mistake, with file and field."""
     path = Path(path)
     content = validated(_CameraFileBlock, read_mapping(path), path)
     return CameraFile(
@@ -98,9 +99,10 @@ def load_camera(path: Path) -> CameraFile:
 
 
 def save_camera(file: CameraFile, path: Path) -> None:
-    """Write a camera.yaml, complete or not at all; it reads back to the last bit.
+    """Write a camera.yaml, atomically; it reads back to the last bit.
 
-    Raises InputError for a camera that could not be loaded again; the file is then what it was before.
+    Raises:
+        InputError: the camera could not be loaded again, or the file cannot be written; an old file stays as it was.
     """
     content = as_mapping(file)
     validated(_CameraFileBlock, content, path)
@@ -108,7 +110,7 @@ def save_camera(file: CameraFile, path: Path) -> None:
 
 
 def as_mapping(file: CameraFile) -> dict[str, Any]:
-    """The plain mapping that camera.yaml holds."""
+    """The content of camera.yaml as a plain mapping."""
     content: dict[str, Any] = {
         "schema": SCHEMA,
         "name": file.name,
@@ -122,12 +124,12 @@ def as_mapping(file: CameraFile) -> dict[str, Any]:
 
 
 def _calibration_mapping(calibration: CameraCalibration) -> dict[str, Any]:
-    """The fields that say something; those left at their default are left out."""
-    nothing = CameraCalibration()
+    """The fields that differ from their default."""
+    default = CameraCalibration()
     out: dict[str, Any] = {}
     for name in CameraCalibration.__slots__:
         value = getattr(calibration, name)
-        if value == getattr(nothing, name):
+        if value == getattr(default, name):
             continue
         if name == "reasons":
             value = list(value)
@@ -141,15 +143,15 @@ def _calibration_mapping(calibration: CameraCalibration) -> dict[str, Any]:
     return out
 
 
-# What the file may hold -----------------------------------------------------------------------------------------
+# The schema of the file ----------------------------------------------------------------------------------------------
 
 
 class _CalibrationBlock(Block):
     date: Text = ""
     verdict: Annotated[str, pydantic.PlainValidator(one_of((*VERDICTS, "")))] = ""
-    rms_px: FromZero | None = None
-    sigma_px: FromZero | None = None
-    hold_out_rms_px: FromZero | None = None
+    rms_px: NonNegative | None = None
+    sigma_px: NonNegative | None = None
+    hold_out_rms_px: NonNegative | None = None
     views: Integer | None = None
     corners: Integer | None = None
     board: Text = ""
@@ -180,11 +182,11 @@ class _CameraFileBlock(LensBlock):
         seen: set[str] = set()
         for name in self.covariance.parameters:
             if name not in known:
-                raise wrong(f"covariance.parameters: unknown parameter {name!r}{did_you_mean(name, known)}")
+                raise field_error(f"covariance.parameters: unknown parameter {name!r}{did_you_mean(name, known)}")
             if name in seen:
-                raise wrong(f"covariance.parameters: expected each name once, got {name!r} a second time")
+                raise field_error(f"covariance.parameters: expected each name once, got {name!r} a second time")
             seen.add(name)
-        mistake = covariance_mistake(self.covariance.value())
+        mistake = covariance_error(self.covariance.value())
         if mistake:
-            raise wrong(f"covariance.matrix: {mistake}")
+            raise field_error(f"covariance.matrix: {mistake}")
         return self

@@ -1,4 +1,4 @@
-"""Cameras from one file format into another: ours, OpenCV's, Kalibr's, ROS's, COLMAP's, mrcal's."""
+"""Converts cameras between file formats: beampose, OpenCV, Kalibr, ROS, COLMAP, mrcal."""
 
 from __future__ import annotations
 
@@ -18,11 +18,13 @@ from lab.files.rig.camera_block import Covariance
 from lab.files.rig.camera_file import CameraFile, load_camera, save_camera
 from lab.files.rig.rig_file import SCHEMA as RIG_SCHEMA
 from lab.files.rig.rig_file import RigFile, load_rig_file
-from lab.files.text.yaml_text import atomic_write_text, did_you_mean, parse_mapping, read_text
+from lab.files.text.atomic_write import atomic_write_text
+from lab.files.text.error_text import did_you_mean
+from lab.files.text.yaml_text import parse_mapping, read_text
 
 BEAMPOSE, RIG = "beampose", "beampose-rig"
 _FOREIGN: Mapping[str, ModuleType] = {m.NAME: m for m in (opencv_yaml, kalibr, ros, colmap, mrcal)}
-FORMATS = (BEAMPOSE, *_FOREIGN)  # that can be written
+FORMATS = (BEAMPOSE, *_FOREIGN)  # writable
 READABLE = (BEAMPOSE, RIG, *_FOREIGN)
 _LABELS = {
     BEAMPOSE: "beampose camera.yaml",
@@ -33,7 +35,7 @@ _LABELS = {
     "colmap": "COLMAP cameras.txt",
     "mrcal": "mrcal .cameramodel",
 }
-ROUND_TRIP = 1e-12  # relative: what a written file, read again, may differ by
+ROUND_TRIP_TOLERANCE = 1e-12  # relative tolerance between a camera and the camera that is read from the written file
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,12 +47,12 @@ class ConvertOutcome:
     from_format: str
     to_format: str
     cameras: tuple[str, ...]
-    notes: tuple[str, ...]  # what is not in the destination, a line each
+    notes: tuple[str, ...]  # what the destination does not contain, a line each
 
     exit_status = 0
 
     def line(self) -> str:
-        """For the command line: what became what, and below it what was left out."""
+        """For the command line: the conversion, and below it a line for each note."""
         names = ", ".join(self.cameras)
         first = f"{names}: {_LABELS[self.from_format]} -> {_LABELS[self.to_format]}, {self.destination}"
         return "\n".join([first, *(f"  note: {note}" for note in self.notes)])
@@ -65,14 +67,17 @@ def convert(
 ) -> ConvertOutcome:
     """Write the cameras of one file into another.
 
-    Formats: beampose (camera.yaml), opencv, kalibr, ros, colmap, mrcal, and as a source beampose-rig (rig.yaml). The
-    source's is told by its content, the destination's by its name, where they are not given. camera: the one to
-    convert; without it all are, if the destination holds several. Raises InputError; the destination is then what it
-    was before. What the destination has no place for is an error (a lens), or a note (a pose, a covariance).
+    Formats: beampose (camera.yaml), opencv, kalibr, ros, colmap, mrcal, and as a source beampose-rig (rig.yaml). By
+    default the content determines the format of the source, and the name that of the destination. camera: the camera
+    to convert; by default all, if the format of the destination allows several. What the destination cannot hold is
+    an error (a lens), or a note (a pose, a covariance).
+
+    Raises:
+        InputError: a file cannot be read, converted or written; the destination stays as it was.
     """
     source, destination = Path(source), Path(destination)
     text = read_text(source)
-    origin = _known(from_format, READABLE, "--from") if from_format else recognise(text, source)
+    origin = _known(from_format, READABLE, "--from") if from_format else recognised_format(text, source)
     target = _known(to_format, FORMATS, "--to") if to_format else _format_of_name(destination)
     found, covariances = _read(text, source, origin)
     models = _chosen(found.cameras, camera, source, target)
@@ -85,18 +90,18 @@ def convert(
 
 
 def read_cameras(path: Path, from_format: str | None = None) -> tuple[CameraModel, ...]:
-    """The cameras that a file of any known format holds. Raises InputError."""
+    """The cameras of a file of any known format. Raises InputError."""
     path = Path(path)
     text = read_text(path)
-    origin = _known(from_format, READABLE, "--from") if from_format else recognise(text, path)
+    origin = _known(from_format, READABLE, "--from") if from_format else recognised_format(text, path)
     return _read(text, path, origin)[0].cameras
 
 
-# Which format -----------------------------------------------------------------------------------------------------
+# Formats -------------------------------------------------------------------------------------------------------------
 
 
-def recognise(text: str, path: Path) -> str:
-    """The format of a file's text. Raises InputError naming those that are known."""
+def recognised_format(text: str, path: Path) -> str:
+    """The format of a file, from its text. Raises InputError, with the known formats, where it is none of them."""
     body = text.lstrip("\ufeff \t\r\n")
     if body.startswith(("<?xml", "<opencv_storage")):
         raise InputError(f"{path}: expected YAML, got OpenCV's XML; save it as .yml from OpenCV")
@@ -134,7 +139,7 @@ def _known(name: str, allowed: Sequence[str], option: str) -> str:
 
 
 def _format_of_name(path: Path) -> str:
-    """The format that a file's name tells. Raises InputError where it tells none."""
+    """The format that a file name indicates. Raises InputError where it indicates none."""
     name = path.name.lower()
     for ending, format_name in ((".cameramodel", "mrcal"), (".txt", "colmap"), (".yml", "opencv")):
         if name.endswith(ending):
@@ -142,14 +147,14 @@ def _format_of_name(path: Path) -> str:
     for part, format_name in (("camchain", "kalibr"), ("camera_info", "ros"), ("camera.yaml", BEAMPOSE)):
         if part in name:
             return format_name
-    raise InputError(f"{path}: the name does not tell the format; add --to with one of {', '.join(FORMATS)}")
+    raise InputError(f"{path}: the name does not indicate the format; add --to with one of {', '.join(FORMATS)}")
 
 
-# In ---------------------------------------------------------------------------------------------------------------
+# Reading -------------------------------------------------------------------------------------------------------------
 
 
 def _read(text: str, path: Path, origin: str) -> tuple[Read, dict[str, Covariance]]:
-    """The cameras of a file, and what is known of their numbers' errors."""
+    """The cameras of a file, and the covariances of their parameters."""
     if origin == RIG:
         return _from_rig(load_rig_file(path))
     if origin == BEAMPOSE:
@@ -172,7 +177,7 @@ def _model_of(camera: Camera, placed: bool) -> CameraModel:
 
 
 def _from_rig(file: RigFile) -> tuple[Read, dict[str, Covariance]]:
-    """A rig's cameras; of the joint covariance each camera's own share."""
+    """The cameras of a rig, each with its block of the joint covariance."""
     covariances = {}
     for name in file.rig.cameras:
         joint = file.covariances.get("target")
@@ -186,7 +191,7 @@ def _from_rig(file: RigFile) -> tuple[Read, dict[str, Covariance]]:
 
 
 def _share(covariance: Covariance, prefix: str) -> Covariance | None:
-    """The block of the lens's numbers: those with the prefix that are no part of the pose. None where there is none."""
+    """The covariance of the lens parameters: with the prefix, not the pose's; None where there are none."""
     own = [
         i
         for i, name in enumerate(covariance.parameters)
@@ -199,7 +204,7 @@ def _share(covariance: Covariance, prefix: str) -> Covariance | None:
 
 
 def _chosen(models: Sequence[CameraModel], camera: str | None, path: Path, target: str) -> tuple[CameraModel, ...]:
-    """The cameras to write. Raises InputError where the destination holds one and the file has several."""
+    """The cameras to write. Raises InputError where the file has several and the destination can hold only one."""
     names = [m.name for m in models]
     if camera is not None:
         if camera not in names:
@@ -208,16 +213,16 @@ def _chosen(models: Sequence[CameraModel], camera: str | None, path: Path, targe
     holds_many = target != BEAMPOSE and _FOREIGN[target].HOLDS_MANY
     if len(models) > 1 and not holds_many:
         raise InputError(
-            f"{path}: holds cameras {', '.join(names)}, {_LABELS[target]} one; choose with --camera {names[0]}"
+            f"{path}: has cameras {', '.join(names)}, but {_LABELS[target]} holds one; choose with --camera {names[0]}"
         )
     return tuple(models)
 
 
-# Out --------------------------------------------------------------------------------------------------------------
+# Writing -------------------------------------------------------------------------------------------------------------
 
 
 def _check_destination(source: Path, destination: Path, target: str) -> None:
-    """Raises InputError where writing would destroy the source or anything but cameras in the format to be written."""
+    """Raises InputError where writing would overwrite the source, or anything but cameras in that format."""
     if not destination.exists():
         return
     if destination.is_dir():
@@ -228,23 +233,23 @@ def _check_destination(source: Path, destination: Path, target: str) -> None:
         return
     try:
         text = read_text(destination)
-        there = recognise(text, destination)
+        there = recognised_format(text, destination)
         if there == target:
             _read(text, destination, target)
     except InputError:
-        there = ""  # the format alone is not enough: a board.yaml is ours too, and OpenCV stores anything as YAML
+        there = ""  # a board.yaml is beampose's too, and OpenCV stores anything as YAML: the file must contain cameras
     if there == RIG:
-        raise InputError(f"{destination}: is a rig, which one camera must not replace; choose another name")
+        raise InputError(f"{destination}: is a rig; a camera must not replace it; choose another name")
     if there != target:
         raise InputError(
-            f"{destination}: exists and is no {_LABELS[target]}; choose another name, or remove that file first"
+            f"{destination}: exists and is not {_LABELS[target]}; choose another name, or remove that file first"
         )
 
 
 def _write(
     models: tuple[CameraModel, ...], covariances: Mapping[str, Covariance], path: Path, target: str
 ) -> tuple[str, ...]:
-    """Write and return what was left out."""
+    """Write, and return notes of what the file does not contain."""
     if target == BEAMPOSE:
         return _write_ours(models[0], covariances.get(models[0].name), path)
     written: Written = _FOREIGN[target].write(models)
@@ -266,18 +271,20 @@ def _write_ours(model: CameraModel, covariance: Covariance | None, path: Path) -
 
 
 def _check_round_trip(models: Sequence[CameraModel], text: str, path: Path, target: str) -> None:
-    """Raises InputError unless a text, read again, gives the same lenses: a last guard before anything is written."""
+    """Raises InputError unless the text reads back to the same lenses; called before the file is written."""
     content = text if target in ("colmap", "mrcal") else parse_mapping(text, path, opencv=target == "opencv")
-    again: Read = _FOREIGN[target].read(content, path.stem)
-    for before, after in zip(models, again.cameras, strict=True):
+    reread: Read = _FOREIGN[target].read(content, path.stem)
+    for before, after in zip(models, reread.cameras, strict=True):
         if not same_lens(before, after):
             raise InputError(f"{path}: {before.name} read back from {target} is another lens; please report this")
 
 
 def same_lens(a: CameraModel, b: CameraModel) -> bool:
-    """Whether two models draw the same picture: sizes, pinhole and distortion alike to `ROUND_TRIP`."""
+    """Whether two models are equal: picture size, and pinhole and distortion parameters to `ROUND_TRIP_TOLERANCE`."""
     if (a.image_size_px, a.lens) != (b.image_size_px, b.lens):
         return False
     numbers = [np.array([*m.pinhole, *significant(m.distortion)]) for m in (a, b)]
     scale = np.maximum(np.abs(numbers[0]), [1.0] * 4 + [0.0] * (len(numbers[0]) - 4))
-    return len(numbers[0]) == len(numbers[1]) and bool(np.all(np.abs(numbers[0] - numbers[1]) <= ROUND_TRIP * scale))
+    return len(numbers[0]) == len(numbers[1]) and bool(
+        np.all(np.abs(numbers[0] - numbers[1]) <= ROUND_TRIP_TOLERANCE * scale)
+    )

@@ -1,4 +1,4 @@
-"""The covariance blocks of a rig.yaml as one joint covariance of the rig's numbers."""
+"""The covariance blocks of a rig.yaml as one joint covariance of the rig's parameters."""
 
 from __future__ import annotations
 
@@ -11,17 +11,20 @@ from geometry.arrays import Array, symmetric
 from geometry.rig import Rig
 from geometry.uncertainty.rig_parameters import RigCovariance, is_known, split
 from lab.errors import InputError
-from lab.files.rig.camera_block import Covariance, covariance_mistake
+from lab.files.rig.camera_block import Covariance, covariance_error
 
 TARGET = "target"
 
 
 def joint_covariance(rig: Rig, blocks: Mapping[str, Covariance], path: Path | str) -> RigCovariance | None:
-    """All that the blocks say of numbers which this rig has; None where they say nothing.
+    """The joint covariance of the parameters of this rig in the blocks; None where there are none.
 
-    blocks: by `cameras.NAME`, `screens.NAME`, `target`. The target's block may name cameras' and screens' numbers too
-    (a joint solve writes it so): it is then the whole truth, and the other blocks are excerpts of it. Names that are
-    not ours are passed over, as the files' contract has it. Raises InputError for a matrix that is no covariance.
+    blocks: by `cameras.NAME`, `screens.NAME`, `target`. The target's block may also name parameters of cameras and
+    screens (as a joint solve writes it): then it is complete, and the other blocks, excerpts of it, are not used.
+    Unknown names are ignored, as the contract of the files defines.
+
+    Raises:
+        InputError: a matrix is not a covariance.
     """
     target = blocks.get(TARGET)
     if target is not None and any(n.startswith(("cameras.", "screens.")) for n in target.parameters):
@@ -36,7 +39,7 @@ def joint_covariance(rig: Rig, blocks: Mapping[str, Covariance], path: Path | st
         if not known:
             continue
         matrix = block.matrix[np.ix_(known, known)]
-        mistake = covariance_mistake(Covariance(tuple(block.parameters[i] for i in known), matrix))
+        mistake = covariance_error(Covariance(tuple(block.parameters[i] for i in known), matrix))
         if mistake:
             raise InputError(f"{path}: {where}.covariance.matrix: {mistake}")
         names += [full[i] for i in known]
@@ -52,7 +55,7 @@ def joint_covariance(rig: Rig, blocks: Mapping[str, Covariance], path: Path | st
 
 
 def blocks_of(covariance: RigCovariance) -> dict[str, Covariance]:
-    """A joint covariance as the blocks of a rig.yaml: whole in the target's, an excerpt for each camera and screen."""
+    """A joint covariance as blocks of a rig.yaml: complete for the target, an excerpt for each camera and screen."""
     out: dict[str, Covariance] = {}
     of: dict[str, list[int]] = {}
     for i, name in enumerate(covariance.names):

@@ -1,4 +1,4 @@
-"""screens.yaml: cameras and screens in one world, with the joint covariance of their errors."""
+"""screens.yaml: cameras and screens in one world frame, with their joint covariance."""
 
 from __future__ import annotations
 
@@ -13,16 +13,17 @@ from geometry.uncertainty.rig_parameters import RigCovariance
 from lab.files.rig.calibration_state import CalibrationState, CalibrationStateBlock, state_mapping
 from lab.files.rig.camera_block import Covariance, CovarianceBlock, covariance_mapping
 from lab.files.rig.rig_covariance import TARGET, joint_covariance
-from lab.files.rig.rig_file import CameraBlock, ScreenBlock, camera_mapping, no_such, screen_mapping
+from lab.files.rig.rig_file import CameraBlock, ScreenBlock, camera_mapping, screen_mapping, unknown_name
+from lab.files.text.error_text import FileError
 from lab.files.text.fields import Block, Word, one_of, validated
-from lab.files.text.yaml_text import FileError, read_mapping, write_mapping
+from lab.files.text.yaml_text import read_mapping, write_mapping
 
 SCHEMA = "beampose/screens/1"
 
 
 @dataclass(frozen=True, slots=True)
 class ScreensFile:
-    """A lab without its vehicle: the rig has no beams and no spots."""
+    """Cameras and screens; the rig has no beams and no spots."""
 
     name: str
     rig: Rig
@@ -40,11 +41,11 @@ class _ScreensBlock(Block):
 
 
 def load_screens(path: Path) -> ScreensFile:
-    """The cameras and screens of a screens.yaml. Raises InputError: one line for a mistake, naming file and field."""
+    """The cameras and screens of a screens.yaml. Raises InputError: one line for each mistake, with file and field."""
     path = Path(path)
     content = validated(_ScreensBlock, read_mapping(path), path)
     mistakes = [
-        no_such("screen", c.screen, f"cameras.{n}.screen", content.screens)
+        unknown_name("screen", c.screen, f"cameras.{n}.screen", content.screens)
         for n, c in content.cameras.items()
         if c.screen not in content.screens
     ]
@@ -63,7 +64,7 @@ def load_screens(path: Path) -> ScreensFile:
 
 
 def save_screens(file: ScreensFile, path: Path) -> None:
-    """Write a screens.yaml, complete or not at all; it reads back to the same numbers."""
+    """Write a screens.yaml, atomically; it reads back to the same rig as with `save_rig`. Raises InputError."""
     content: dict[str, Any] = {
         "schema": SCHEMA,
         "name": file.name,

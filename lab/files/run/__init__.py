@@ -1,1 +1,1 @@
-"""Files of a run: run.yaml, detections, truth, and its results read back."""
+"""Files of a run: run.yaml, timestamps, detections, truth, and the tables of its results."""

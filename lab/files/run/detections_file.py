@@ -1,57 +1,55 @@
-"""detections.csv: the points of light of all cameras and frames, read in one go."""
+"""detections.csv: the detected points of all cameras and frames, read at once."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from geometry.arrays import Array, Bools, Ints
 from lab.errors import InputError
-from lab.files.text.csv_text import found_at, is_whole, read_table
+from lab.files.text.csv_table import Table, is_whole
+from lab.files.text.csv_text import read_table
 from tracking.detections import Detections
 from tracking.input_validation import LARGEST_PX, LEAST_SIGMA_PX, TWIN_PX, twins
 
-if TYPE_CHECKING:
-    import pandas as pd
-
 REQUIRED = ("frame", "camera", "u_px", "v_px")
-DEFAULT_SIGMA_PX = 0.1  # px: where the file gives no sigma; a centroid of a clean laser spot is about this good
+DEFAULT_SIGMA_PX = 0.1  # px, where the file gives no sigma: about the centroid noise of a clean laser spot
 SHAPE = ("flux", "peak", "major_px", "minor_px", "angle_deg")
-SPARSEST = 1000  # frame numbers per picture: more than that is a stray number, or a number that holds a time
-MANY = 100_000  # frame numbers that a run may span however sparse it is
-LONGEST_GAP = 10_000  # frame numbers, 100 s at 100 Hz: behind a longer one so few pictures are strays ...
-MOST_ALONE = 3
-STRAY = 0.1  # of the frames: a few far from all others are left out, but who shall say which half of a run is wrong?
+# More frame numbers per picture indicate a stray number, or time stamps as frame numbers.
+MAX_NUMBERS_PER_PICTURE = 1000
+LONG_SPAN = 100_000  # frame numbers: a run that spans fewer may be sparser
+LONGEST_GAP = 10_000  # frame numbers, 100 s at 100 Hz: after a longer gap, MAX_STRAY_FRAMES or fewer are strays
+MAX_STRAY_FRAMES = 3
+MAX_STRAY_SHARE = 0.1  # largest share of the frames that is left out as strays; with more the run is refused
 
 
 @dataclass(frozen=True, slots=True)
 class CameraPoints:
-    """One camera's points, all frames after one another."""
+    """One camera's points of all frames, concatenated."""
 
-    frames: Ints  # (m,) increasing: frames with a point
+    frames: Ints  # (m,) increasing: frames with points
     starts: Ints  # (m + 1,) rows of frame i: starts[i] to starts[i + 1]
-    points: Detections  # within a frame brightest first
-    spoilt: Ints  # increasing: frames that have rows, of which none can be used
+    points: Detections  # within a frame: brightest first
+    spoilt: Ints  # increasing: frames that have rows, none of them usable
 
     def at(self, frame: int) -> Detections:
-        """The points of one frame, which may be none."""
+        """The points of one frame, possibly none."""
         i = int(np.searchsorted(self.frames, frame))
         if i == len(self.frames) or self.frames[i] != frame:
             return Detections.none()
         return self.points[slice(int(self.starts[i]), int(self.starts[i + 1]))]
 
     def says_nothing_of(self, frame: int) -> bool:
-        """Whether there are rows of a frame, but none that can be used."""
+        """Whether a frame has rows, none of them usable."""
         i = int(np.searchsorted(self.spoilt, frame))
         return i < len(self.spoilt) and self.spoilt[i] == frame
 
     def without(self, rows: Bools) -> CameraPoints:
-        """The same without some of the points (m,). A frame that has none left is still one with a picture."""
+        """The same without some of the points: rows (m,). A frame without points left still has a picture."""
         kept = np.concatenate([[0], np.cumsum(~rows)])
         return CameraPoints(self.frames, kept[self.starts], self.points[~rows], self.spoilt)
 
@@ -61,32 +59,34 @@ class DetectionsFile:
     """A whole detections.csv."""
 
     cameras: Mapping[str, CameraPoints]
-    first: int  # the least and the largest frame number of any camera
+    first: int  # the smallest and the largest frame number of all cameras
     last: int
-    notes: tuple[str, ...]  # what was left out or assumed, in plain words
-    spoilt: Mapping[str, str]  # cameras of whose rows not one can be used, and why the first of them
+    notes: tuple[str, ...]  # what was left out or assumed
+    spoilt: Mapping[str, str]  # cameras without a usable row -> the reason of the first one
 
 
 def read_detections(path: Path) -> DetectionsFile:
     """The points of a detections.csv.
 
-    Rows may stand in any order. Those that cannot be used are left out and counted in `notes`, each reason with its
-    first example. Raises InputError where the file is no table, lacks a column of REQUIRED, or has no usable row.
+    Rows may be in any order. Unusable rows are left out and counted in `notes`, each reason with its first example.
+
+    Raises:
+        InputError: the file is not a table, lacks a column of REQUIRED, or has no usable row.
     """
     optional = ("sigma_u_px", "sigma_v_px", "cov_uv_px2", *SHAPE)
-    table = read_table(path, REQUIRED, numbers=("frame", "u_px", "v_px", *optional), damaged=True)
+    table = read_table(path, REQUIRED, optional, damaged=True)
     n = len(table)
 
     def column(name: str, default: float) -> Array:
-        return table[name].to_numpy(dtype=float) if name in table else np.full(n, default)
+        return table.numbers[name] if name in table else np.full(n, default)
 
-    rows = _Rows(path, table, table["camera"].str.strip().to_numpy(), np.ones(n, dtype=bool))
+    rows = _Rows(path, table, np.array(table.words["camera"].tolist(), dtype=object), np.ones(n, dtype=bool))
     missing = [c for c in ("sigma_u_px", "sigma_v_px") if c not in table]
     if missing:
         rows.notes.append(f"{path}: no column {' and '.join(missing)}: {DEFAULT_SIGMA_PX} px is assumed")
     frame, uv = column("frame", np.nan), np.stack([column("u_px", np.nan), column("v_px", np.nan)], -1)
     sigma = np.stack([column("sigma_u_px", DEFAULT_SIGMA_PX), column("sigma_v_px", DEFAULT_SIGMA_PX)], -1)
-    # An empty field of an optional column means what the column's absence means.
+    # An empty field of an optional column has the same meaning as a missing column.
     shared = column("cov_uv_px2", 0.0)
     shared = np.where(np.isnan(shared), 0.0, shared)
 
@@ -94,8 +94,9 @@ def read_detections(path: Path) -> DetectionsFile:
     placed = rows.good.copy()
     rows.leave_out_unmeasured(uv, sigma, shared)
     rows.leave_out_repeated(frame, uv, sigma)
-    if table.attrs["malformed"]:
-        rows.notes.append(f"{path}: {table.attrs['malformed']} lines left out: more fields than the header has")
+    if table.long_lines:
+        count = len(table.long_lines)
+        rows.notes.append(f"{path}: {count} line{'s' if count > 1 else ''} left out: more fields than the header has")
     if not rows.good.any():
         because = "".join(f"; {note.removeprefix(f'{path}: ')}" for note in rows.notes[len(missing) > 0 :])
         raise InputError(f"{path}: expected rows with {', '.join(REQUIRED)}, got none that can be used{because}")
@@ -115,27 +116,27 @@ def read_detections(path: Path) -> DetectionsFile:
 
 @dataclass(slots=True)
 class _Rows:
-    """The n rows of a table, of which fewer and fewer are good."""
+    """The n rows of a table. Each check marks further rows as unusable."""
 
     path: Path
-    table: pd.DataFrame
+    table: Table
     camera: np.ndarray  # (n,) names
     good: Bools  # (n,)
     notes: list[str] = field(default_factory=list)
-    why_of: dict[str, str] = field(default_factory=dict)  # by camera: what is wrong with its first bad row
+    why_of: dict[str, str] = field(default_factory=dict)  # by camera: the reason of its first bad row
 
     def leave_out_misplaced(self, frame: Array) -> None:
-        """Rows of which it is not known of what picture they are."""
-        self._leave_out(~is_whole(frame), "the frame is no whole number", "frame")
+        """Leaves out rows without a valid frame or camera."""
+        self._leave_out(~is_whole(frame), "the frame is not a whole number", "frame")
         self._leave_out(frame < 0, "the frame is negative; frames count from 0", "frame")
-        self._leave_out(self.camera == "", "no camera is named")
+        self._leave_out(self.camera == "", "the camera is empty")
         far = f"the frame is more than {LONGEST_GAP} numbers away from the others"
         self._leave_out(_stray(frame, self.good), far, "frame")
 
     def leave_out_unmeasured(self, uv: Array, sigma: Array, shared: Array) -> None:
-        """Rows whose point or covariance is none: uv (n, 2) px, sigma (n, 2) px, shared (n,) px^2."""
+        """Leaves out rows without a valid point or covariance: uv (n, 2) px, sigma (n, 2) px, shared (n,) px^2."""
         with np.errstate(invalid="ignore", over="ignore"):
-            self._leave_out(~np.isfinite(uv).all(-1), "u_px or v_px is no finite number", "u_px", "v_px")
+            self._leave_out(~np.isfinite(uv).all(-1), "u_px or v_px is not a finite number", "u_px", "v_px")
             far = f"u_px or v_px is beyond {LARGEST_PX:.0f} px: no picture is so wide"
             self._leave_out((np.abs(uv) >= LARGEST_PX).any(-1), far, "u_px", "v_px")
             both = ("sigma_u_px", "sigma_v_px")
@@ -148,7 +149,7 @@ class _Rows:
             self._leave_out(singular, "cov_uv_px2 is not below the product of the sigmas", "cov_uv_px2")
 
     def leave_out_repeated(self, frame: Array, uv: Array, sigma: Array) -> None:
-        """Rows of a spot that has another row in the same picture: its label would be shared between them."""
+        """Leaves out repeated rows of one spot in a picture: they would share its label."""
         rows = np.flatnonzero(self.good)
         if not rows.size:
             return
@@ -162,13 +163,13 @@ class _Rows:
         self._leave_out(again, why, "u_px", "v_px")
 
     def _leave_out(self, which: ArrayLike, why: str, *fields: str) -> None:
-        """These rows (n,), if they were good until now. fields: what the example shows."""
+        """Leaves out these rows (n,), if not done already. fields: shown in the example."""
         new = np.flatnonzero(np.asarray(which, dtype=bool) & self.good)
         if not new.size:
             return
         first = int(new[0])
-        shown = " and ".join(f"{f} {found_at(self.table, f, first)}" for f in fields if f in self.table)
-        example = f"the first near line {first + 2}{', with ' if shown else ''}{shown}"
+        shown = " and ".join(f"{f} {self.table.found(f, first)}" for f in fields if f in self.table)
+        example = f"the first in line {self.table.lines[first]}{', with ' if shown else ''}{shown}"
         self.notes.append(f"{self.path}: {new.size} of {len(self.good)} rows left out: {why} ({example})")
         for name in dict.fromkeys(self.camera[new]):
             self.why_of.setdefault(str(name), f"{why} ({example})")
@@ -176,25 +177,25 @@ class _Rows:
 
 
 def too_sparse(span: int, pictures: int) -> bool:
-    """Whether so many frame numbers for so few pictures cannot be a run: each of them would be written out."""
-    return span > MANY and span > SPARSEST * pictures
+    """Whether a span of frame numbers is too long for its pictures: the output has a row per frame number."""
+    return span > LONG_SPAN and span > MAX_NUMBERS_PER_PICTURE * pictures
 
 
 def far_off(numbers: Array | Ints) -> Bools:
-    """Which of the rising frame numbers (n,) are strays: a few behind a gap longer than all that is recorded.
+    """Which of the rising frame numbers (n,) are strays: a few, separated by a gap longer than the recording.
 
-    Every number in the gap would cost what a frame costs: a file named 090000.png beside 300 pictures, 90 s.
+    Every number in the gap costs as much as a frame: a file named 090000.png beside 300 pictures costs 90 s.
     """
     long = np.diff(numbers) > max(LONGEST_GAP, len(numbers))
     piece = np.concatenate([np.zeros(1, dtype=np.int64), np.cumsum(long)])[: len(numbers)]
     sizes = np.bincount(piece, minlength=1)
-    few = sizes <= max(1, min(MOST_ALONE, int(0.01 * len(numbers))))
+    few = sizes <= max(1, min(MAX_STRAY_FRAMES, int(0.01 * len(numbers))))
     few[int(np.argmax(sizes))] = False
     return np.asarray(few[piece])
 
 
 def _stray(frame: Array, good: Bools) -> Bools:
-    """Which rows (n,) stand for a few frames so far from all the others that the run would be too sparse with them."""
+    """Which rows (n,) belong to a few frames so far from all others that they would make the run too sparse."""
     out = np.zeros(len(frame), dtype=bool)
     numbers = np.unique(frame[good])
     if not numbers.size:
@@ -202,18 +203,18 @@ def _stray(frame: Array, good: Bools) -> Bools:
     if not too_sparse(int(numbers[-1] - numbers[0]) + 1, numbers.size):
         out[good] = np.isin(frame[good], numbers[far_off(numbers)])
         return out
-    pieces = np.split(numbers, np.flatnonzero(np.diff(numbers) > MANY) + 1)
+    pieces = np.split(numbers, np.flatnonzero(np.diff(numbers) > LONG_SPAN) + 1)
     longest = max(pieces, key=len)
-    if longest.size < (1 - STRAY) * numbers.size:
-        return out  # the reader of the run says that it cannot be
+    if longest.size < (1 - MAX_STRAY_SHARE) * numbers.size:
+        return out  # refused by the reader of the run
     out[good] = (frame[good] < longest[0]) | (frame[good] > longest[-1])
     return out
 
 
 def _camera_points(rows: Ints, frame: Array, points: Detections, placed: Array) -> CameraPoints:
-    """Sorts a camera's rows by frame, then by flux, the brightest first; without flux the file's order stays.
+    """Sorts a camera's rows by frame, then by flux, brightest first; without flux in the order of the file.
 
-    placed: the frames of all the camera's rows, usable or not.
+    placed: the frames of all rows of the camera, usable or not.
     """
     order = rows[np.lexsort((np.nan_to_num(-points.flux[rows], nan=np.inf), frame[rows]))]
     frames, starts = np.unique(frame[order].astype(np.int64), return_index=True)

@@ -1,4 +1,4 @@
-"""What went into a run, so that a result can be tied to its inputs."""
+"""Fingerprints of the inputs of a run, recorded with its results."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from typing import Any
 
 from lab.files.run.run_file import FramesFolder, LiveDevice, Run
 
-LARGEST_FILE = 64 * 2**20  # bytes: a video beyond it is tied by its first so many bytes and its size
+MAX_HASHED_BYTES = 64 * 2**20  # bytes: of a larger file (a video), only this many bytes and the size are used
 _BLOCK = 2**20
 
 
 def fingerprints(run: Run) -> list[dict[str, Any]]:
     """Path, SHA-256 and size of every input.
 
-    A folder of pictures has one entry: its digest is over the names and sizes of its files, which costs no second
-    reading of gigabytes; `covers` says what each digest covers.
+    A folder of pictures has one entry, with a digest of the names and sizes of its files: reading gigabytes a second
+    time would take too long. `covers` describes what each digest covers.
     """
     files = [run.path, run.rig_path]
     if run.times_path is not None:
@@ -34,12 +34,12 @@ def fingerprints(run: Run) -> list[dict[str, Any]]:
 def _of_file(path: Path) -> dict[str, Any]:
     size = path.stat().st_size
     digest = hashlib.sha256()
-    left = min(size, LARGEST_FILE)
+    left = min(size, MAX_HASHED_BYTES)
     with path.open("rb") as file:
         while left > 0 and (block := file.read(min(_BLOCK, left))):
             digest.update(block)
             left -= len(block)
-    covers = "contents" if size <= LARGEST_FILE else f"the first {LARGEST_FILE} bytes"
+    covers = "contents" if size <= MAX_HASHED_BYTES else f"the first {MAX_HASHED_BYTES} bytes"
     return {"path": str(path), "sha256": digest.hexdigest(), "bytes": size, "covers": covers}
 
 

@@ -1,4 +1,4 @@
-"""Parameters from the command line (--set NAME=VALUE) in place of those of a file or the defaults."""
+"""Parameters of the command line (--set NAME=VALUE), which replace those of a file and the defaults."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
-from lab.files.text.fields import dataclass_from_yaml
+from lab.files.text.dataclass_fields import dataclass_from_yaml
 from tracking.parameters import TrackerParameters
 
 
 def overridden(parameters: TrackerParameters, overrides: Mapping[str, Any]) -> TrackerParameters:
-    """Parameters with some replaced, checked like those of a file; dotted names reach the inner blocks."""
+    """The parameters with overrides, checked as in a file. Dotted names address inner blocks. Raises InputError."""
     content = dataclasses.asdict(parameters)
     for name, value in overrides.items():
         *blocks, last = name.split(".")
@@ -23,5 +23,5 @@ def overridden(parameters: TrackerParameters, overrides: Mapping[str, Any]) -> T
         else:
             inner[last] = value
             continue
-        content[name] = value  # no such block: the checker says so
+        content[name] = value  # there is no such block, which the check reports
     return dataclass_from_yaml(TrackerParameters, content, "--set")

@@ -1,4 +1,4 @@
-"""A run folder: run.yaml, and where its pictures or points lie."""
+"""A run folder: run.yaml, and the location of its pictures or detected points."""
 
 from __future__ import annotations
 
@@ -21,20 +21,21 @@ from lab.files.rig.calibration_state import CalibrationState, OptionalDay
 from lab.files.rig.rig_covariance import joint_covariance
 from lab.files.rig.rig_file import load_rig_file
 from lab.files.run.times import Times, load_times
+from lab.files.text.dataclass_fields import dataclass_from_yaml
+from lab.files.text.error_text import FileError, did_you_mean
 from lab.files.text.fields import (
     Block,
-    FromZero,
+    NonNegative,
     Positive,
     Text,
     Vector3,
     Word,
-    dataclass_from_yaml,
+    field_error,
     one_of,
-    unexpected,
+    unexpected_value,
     validated,
-    wrong,
 )
-from lab.files.text.yaml_text import FileError, did_you_mean, read_mapping, write_mapping
+from lab.files.text.yaml_text import read_mapping, write_mapping
 from lab.pictures.picture_file import SUFFIXES
 from tracking.parameters import TrackerParameters
 
@@ -43,7 +44,7 @@ SCHEMA = "beampose/run/1"
 
 @dataclass(frozen=True, slots=True)
 class FramesFolder:
-    """A folder of pictures; the number in a picture's name is its frame."""
+    """A folder of pictures; the number in the name of a picture is its frame number."""
 
     path: Path
 
@@ -57,20 +58,20 @@ class VideoFile:
 
 @dataclass(frozen=True, slots=True)
 class DetectionsTable:
-    """A detections.csv: points found already."""
+    """A detections.csv: points detected earlier."""
 
     path: Path
 
 
 @dataclass(frozen=True, slots=True)
 class LiveDevice:
-    """A camera that OpenCV opens, for `beampose watch`; frames are numbered from 0 at the frame rate of run.yaml."""
+    """A camera that OpenCV opens, for `beampose watch`. Frames count from 0 at the frame rate of run.yaml."""
 
     device: int | str  # its number, or a name such as /dev/video0 or an address of a stream
 
     @property
     def path(self) -> Path:
-        """What messages call it."""
+        """The name in messages."""
         return Path(f"device {self.device}")
 
 
@@ -79,35 +80,36 @@ Source = FramesFolder | VideoFile | DetectionsTable | LiveDevice
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """One recording and all that is known of it before a picture is looked at."""
+    """One recording, before its pictures are opened."""
 
     folder: Path
     name: str
-    rig: Rig  # of the rig file, the cameras that this run has
+    rig: Rig  # with the cameras of this run only
     rig_path: Path
     frame_rate_hz: float
     exposure_s: float | None
     times: Times
     times_path: Path | None  # the timestamps file, where the run has one
     cameras: Mapping[str, Source]  # in the rig's order
-    left_out: tuple[str, ...]  # cameras of the rig that this run has nothing of
-    prior: PosePrior | None  # where the vehicle is at the first frame
+    left_out: tuple[str, ...]  # cameras of the rig that this run does not have
+    prior: PosePrior | None  # pose of the vehicle in the first frame
     tracker: TrackerParameters
     notes: str
     covariance: RigCovariance | None = None  # of the rig's calibration
-    calibration: CalibrationState | None = None  # when it was made, and how good it is
+    calibration: CalibrationState | None = None  # date and verdict
     recorded: datetime.date | None = None  # the day of the recording
 
     @property
     def path(self) -> Path:
-        """The run.yaml itself."""
+        """Path of run.yaml."""
         return self.folder / "run.yaml"
 
 
 def load_run(run_folder: Path) -> Run:
-    """Read and check a run folder's run.yaml, its rig and its timestamps; pictures are not opened.
+    """Read and check run.yaml of a run folder, its rig and its timestamps; pictures are not opened.
 
-    Raises InputError: file, field, what was expected and what was found.
+    Raises:
+        InputError: with file, field, what was expected and what was found; FileError for several mistakes.
     """
     folder = Path(run_folder)
     if folder.name == "run.yaml" and not folder.is_dir():
@@ -164,9 +166,9 @@ def load_run(run_folder: Path) -> Run:
 
 
 def save_run(content: Mapping[str, Any], run_folder: Path) -> Path:
-    """Write run.yaml from the plain mapping that it shall hold, checked as the reader checks it; returns its path.
+    """Write run.yaml from a plain mapping, checked as by the reader; returns its path.
 
-    `schema` may be left out. Paths within the mapping are relative to the run folder. Raises InputError.
+    `schema` may be left out. Paths in the mapping are relative to the run folder. Raises InputError.
     """
     path = Path(run_folder) / "run.yaml"
     full = {"schema": SCHEMA, **content}
@@ -176,7 +178,7 @@ def save_run(content: Mapping[str, Any], run_folder: Path) -> Path:
     return path
 
 
-# What the file may hold -----------------------------------------------------------------------------------------
+# The schema of the file ----------------------------------------------------------------------------------------------
 
 
 def _a_device(value: Any) -> int | str:
@@ -184,7 +186,7 @@ def _a_device(value: Any) -> int | str:
         return value
     if isinstance(value, str) and value.strip():
         return value
-    raise unexpected("a camera's number from 0, or the name of a device", value)
+    raise unexpected_value("a camera's number from 0, or the name of a device", value)
 
 
 class _SourceBlock(Block):
@@ -196,30 +198,30 @@ class _SourceBlock(Block):
     def _one_of_them(self) -> _SourceBlock:
         given = [n for n in ("frames", "detections", "device") if getattr(self, n) is not None]
         if "device" in given and len(given) > 1:
-            raise wrong(f"expected one of frames, detections and device, got {' and '.join(given)}; keep one")
+            raise field_error(f"expected one of frames, detections and device, got {' and '.join(given)}; keep one")
         if len(given) > 1:
-            raise wrong("expected frames or detections, got both; keep one")
+            raise field_error("expected frames or detections, got both; keep one")
         if not given:
-            raise wrong("expected frames or detections, got neither")
+            raise field_error("expected frames or detections, got neither")
         return self
 
 
 def _an_angle_range(value: Any) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value <= 180:
-        raise unexpected("an angle above 0 and up to 180", value)
+        raise unexpected_value("an angle above 0 and up to 180", value)
     return float(value)
 
 
 class _PriorBlock(Block):
     position_m: Vector3
     yaw_pitch_roll_deg: Vector3
-    within_m: FromZero
+    within_m: NonNegative
     within_deg: Annotated[float, pydantic.PlainValidator(_an_angle_range)]
 
 
 def _some_cameras(value: Any) -> Any:
     if isinstance(value, dict) and not value:
-        raise wrong("expected one or more cameras, got none")
+        raise field_error("expected one or more cameras, got none")
     return value
 
 

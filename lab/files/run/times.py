@@ -1,4 +1,4 @@
-"""When each frame was taken."""
+"""Times of the frames: a constant rate, or a table of timestamps."""
 
 from __future__ import annotations
 
@@ -10,32 +10,32 @@ import numpy as np
 from geometry.arrays import Array, Ints
 from lab.errors import InputError
 from lab.files.text import columns
-from lab.files.text.csv_text import numbers_in, read_table, whole_numbers
+from lab.files.text.csv_text import read_table
 
 
 @dataclass(frozen=True, slots=True)
 class Times:
-    """Seconds since frame 0, at mid-exposure."""
+    """Time of each frame: seconds since frame 0, at mid-exposure."""
 
     frame_rate_hz: float
-    frames: Ints | None = None  # (n,) increasing: those with a time of their own; None: a constant rate
+    frames: Ints | None = None  # (n,) increasing: the frames with a timestamp; None: a constant rate
     times_s: Array | None = None  # (n,) increasing
 
     def t_s(self, frames: int | Ints) -> Array:
         """Times (...), s, of frame numbers (...).
 
-        A frame without a timestamp of its own (a dropped one) lies evenly between its neighbours; before the first and
-        after the last timestamp the nominal frame rate holds.
+        The time of a frame without a timestamp (a dropped frame) is interpolated linearly between its neighbours;
+        before the first and after the last timestamp the nominal frame rate is used.
         """
-        asked = np.asarray(frames, dtype=float)
+        numbers = np.asarray(frames, dtype=float)
         if self.frames is None or self.times_s is None:
-            return asked / self.frame_rate_hz
-        inside = np.interp(asked, self.frames, self.times_s)
-        beyond = asked - np.clip(asked, self.frames[0], self.frames[-1])
+            return numbers / self.frame_rate_hz
+        inside = np.interp(numbers, self.frames, self.times_s)
+        beyond = numbers - np.clip(numbers, self.frames[0], self.frames[-1])
         return inside + beyond / self.frame_rate_hz
 
     def without_time(self, frames: Ints) -> Ints:
-        """Those of the frame numbers (n,) that have no timestamp of their own; none where the rate is constant."""
+        """The frame numbers, of (n,) given, without a timestamp; none where the rate is constant."""
         if self.frames is None:
             return np.zeros(0, dtype=np.int64)
         return np.setdiff1d(np.asarray(frames, dtype=np.int64), self.frames)
@@ -44,20 +44,17 @@ class Times:
 def load_times(path: Path, frame_rate_hz: float) -> Times:
     """The timestamps file of a run. Raises InputError in one line."""
     table = read_table(path, columns.TIMES)
-    if table.empty:
+    if not len(table):
         raise InputError(f"{path}: expected a row per frame, got none")
-    frames = whole_numbers(table, "frame", path)
-    times_s = numbers_in(table, "t_s", path, "seconds")
-    bad = np.flatnonzero(np.diff(frames) <= 0)
-    if bad.size:
-        raise InputError(
-            f"{path}: line {bad[0] + 3}: frame: expected increasing numbers, got {frames[bad[0] + 1]}"
-            f" after {frames[bad[0]]}"
-        )
-    bad = np.flatnonzero(np.diff(times_s) <= 0)
-    if bad.size:
-        raise InputError(
-            f"{path}: line {bad[0] + 3}: t_s: expected increasing times, got {times_s[bad[0] + 1]:g} s of frame"
-            f" {frames[bad[0] + 1]} after {times_s[bad[0]]:g} s of frame {frames[bad[0]]}"
+    table.refuse_long_lines()
+    frames = table.whole("frame")
+    times_s = table.finite("t_s", "seconds")
+    for i in np.flatnonzero(np.diff(frames) <= 0)[:1] + 1:
+        raise table.error(i, f"frame: expected increasing numbers, got {frames[i]} after {frames[i - 1]}")
+    for i in np.flatnonzero(np.diff(times_s) <= 0)[:1] + 1:
+        raise table.error(
+            i,
+            f"t_s: expected increasing times, got {times_s[i]:g} s of frame {frames[i]} after {times_s[i - 1]:g} s of"
+            f" frame {frames[i - 1]}",
         )
     return Times(frame_rate_hz, frames, times_s)

@@ -1,134 +1,165 @@
-"""What really happened, where a run folder says so: truth/pose.csv and truth/spots.csv, checked."""
+"""The truth of a run folder: truth/pose.csv and truth/spots.csv, read and checked.
+
+A simulation or the record of a turntable provides it. `check`, `run`, the score and the report use this reader.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from geometry.arrays import Array, Ints
+from geometry.arrays import Array, Bools, Ints
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.rig import Rig
-from lab.errors import InputError
 from lab.files.rig.rig_file import QUATERNION_TOLERANCE
+from lab.files.run.run_file import Run
 from lab.files.text import columns
-from lab.files.text.csv_text import found_at, numbers_in, read_table, whole_numbers
-from lab.files.text.yaml_text import did_you_mean
+from lab.files.text.csv_table import Categorical, Table
+from lab.files.text.csv_text import read_table
+from lab.files.text.error_text import did_you_mean
 
-if TYPE_CHECKING:
-    import pandas as pd
+MAX_COMPARED_FRAMES = 500  # by `largest_disagreement_px`, evenly spread: enough to show a wrong rig
 
-COMPARED = 500  # frames at most that `largest_disagreement_px` looks at, spread evenly: enough to show a wrong rig
+
+@dataclass(frozen=True, slots=True)
+class TruePoses:
+    """truth/pose.csv, n rows."""
+
+    frame: Ints  # (n,) rising
+    t_s: Array  # (n,)
+    position_m: Array  # (n, 3), of the body origin, in world
+    quaternion_wxyz: Array  # (n, 4), world_from_body, of length 1 within QUATERNION_TOLERANCE
+
+
+@dataclass(frozen=True, slots=True)
+class TrueSpots:
+    """truth/spots.csv, n rows: one per frame, camera and spot, in any order."""
+
+    frame: Ints  # (n,)
+    camera: Categorical  # (n,)
+    spot: Categorical  # (n,)
+    uv_px: Array  # (n, 2), distorted pixels; nan where no projection exists
+    in_view: Ints  # (n,): 1 in the picture, 2 hidden, 0 outside it
 
 
 @dataclass(frozen=True, slots=True)
 class TruthTables:
-    """The tables of a truth folder, columns as in lab/files/text/columns.py; one of them may be missing."""
+    """The tables of a truth folder; one of them may be missing."""
 
-    pose: pd.DataFrame | None  # TRUTH_POSE, rising frames, every field a number
-    spots: pd.DataFrame | None  # TRUTH_SPOTS; u_px, v_px are nan where no projection exists
+    pose: TruePoses | None
+    spots: TrueSpots | None
 
 
-def load_truth(run_folder: Path, rig: Rig | None = None) -> TruthTables | None:
-    """The truth of a run folder; None where it has none. With a rig, names that it does not have are mistakes.
+def load_run_truth(run: Run) -> TruthTables | None:
+    """The truth of a run, with the names of its rig. Cameras that the run leaves out may be in it.
+
+    Raises InputError as `load_truth`.
+    """
+    return load_truth(run.folder, (*run.rig.cameras, *run.left_out), tuple(run.rig.spots))
+
+
+def load_truth(
+    run_folder: Path, cameras: Collection[str] | None = None, spots: Collection[str] | None = None
+) -> TruthTables | None:
+    """The truth of a run folder; None where it has none. cameras, spots: the rig's; other names are mistakes.
 
     Raises InputError in one line: file, line, column, what was expected and what was found.
     """
     folder = Path(run_folder) / "truth"
-    pose, spots = folder / "pose.csv", folder / "spots.csv"
-    if not pose.exists() and not spots.exists():
+    pose_path, spots_path = folder / "pose.csv", folder / "spots.csv"
+    if not pose_path.exists() and not spots_path.exists():
         return None
     return TruthTables(
-        load_pose_table(pose) if pose.exists() else None, _load_spots(spots, rig) if spots.exists() else None
+        read_true_poses(pose_path) if pose_path.exists() else None,
+        _read_true_spots(spots_path, {"camera": cameras, "spot": spots}) if spots_path.exists() else None,
     )
 
 
-def load_pose_table(path: Path) -> pd.DataFrame:
+def read_true_poses(path: Path) -> TruePoses:
     """A table of poses, columns TRUTH_POSE. Raises InputError in one line."""
     table = read_table(path, columns.TRUTH_POSE)
-    frames = whole_numbers(table, "frame", path)
-    _refuse(path, np.diff(frames, prepend=frames[:1] - 1) <= 0, "frame: expected rising numbers", frames)
-    for name in columns.TRUTH_POSE[1:]:
-        numbers_in(table, name, path)
-    refuse_other_lengths(path, range(2, len(table) + 2), table[["qw", "qx", "qy", "qz"]].to_numpy())
-    return table.assign(frame=frames)
+    table.refuse_long_lines()
+    frame = table.whole("frame")
+    for i in np.flatnonzero(np.diff(frame) <= 0)[:1] + 1:
+        raise table.error(i, f"frame: expected rising numbers, got {frame[i]} after {frame[i - 1]}")
+    numbers = {name: table.finite(name) for name in columns.TRUTH_POSE[1:]}
+    check_unit_quaternions(table)
+    return TruePoses(frame, numbers["t_s"], table.stack("x_m", "y_m", "z_m"), table.stack("qw", "qx", "qy", "qz"))
 
 
-def refuse_other_lengths(path: Path, lines: Sequence[int], quaternions: Array) -> None:
-    """Raises InputError at the first of the quaternions (n, 4) whose length is not 1."""
-    length = np.linalg.norm(quaternions, axis=1)
-    bad = np.flatnonzero(~(np.abs(length - 1) <= QUATERNION_TOLERANCE))
-    if bad.size:
-        found = length[bad[0]]
+def check_unit_quaternions(table: Table) -> None:
+    """Raises InputError at the first quaternion (columns qw, qx, qy, qz) whose length is not 1."""
+    length = np.linalg.norm(table.stack("qw", "qx", "qy", "qz"), axis=1)
+    for i in np.flatnonzero(~(np.abs(length - 1) <= QUATERNION_TOLERANCE))[:1]:
         remedy = "give all digits, or divide each of the four numbers by that length"
-        if found == 0:
-            remedy = "where nothing is turned it is 1,0,0,0"
-        raise InputError(
-            f"{path}: line {lines[bad[0]]}: qw,qx,qy,qz: expected a quaternion of length 1, got one of length"
-            f" {found:.7g}; {remedy}"
+        if length[i] == 0:
+            remedy = "without rotation it is 1,0,0,0"
+        raise table.error(
+            i, f"qw,qx,qy,qz: expected a quaternion of length 1, got one of length {length[i]:.7g}; {remedy}"
         )
 
 
-def _load_spots(path: Path, rig: Rig | None) -> pd.DataFrame:
+def _read_true_spots(path: Path, known: dict[str, Collection[str] | None]) -> TrueSpots:
+    """truth/spots.csv. known: the rig's names by column; None: any name."""
     table = read_table(path, columns.TRUTH_SPOTS)
-    frames = whole_numbers(table, "frame", path)
-    in_view = table["in_view"].to_numpy()
+    table.refuse_long_lines()
+    frame = table.whole("frame")
+    in_view = table.numbers["in_view"]
     for i in np.flatnonzero(~np.isin(in_view, (0, 1, 2)))[:1]:
-        raise InputError(f"{path}: line {i + 2}: in_view: expected 0, 1 or 2, got {found_at(table, 'in_view', i)}")
+        raise table.error(i, f"in_view: expected 0, 1 or 2, got {table.found('in_view', i)}")
     for name in ("u_px", "v_px"):
-        for i in np.flatnonzero(~np.isfinite(table[name].to_numpy()) & (in_view > 0))[:1]:
-            raise InputError(
-                f"{path}: line {i + 2}: {name}: expected a number where in_view is 1 or 2, got"
-                f" {found_at(table, name, i)}"
-            )
-    if rig is not None:
-        for name, known in (("camera", rig.cameras), ("spot", rig.spots)):
-            for word in table[name].unique():
-                if word not in known:
-                    raise InputError(
-                        f"{path}: {name}: expected a {name} of the rig, got {word!r}{did_you_mean(word, known)}"
-                    )
-    twice = table.duplicated(["frame", "camera", "spot"]).to_numpy()
-    _refuse(path, twice, "expected one row per frame, camera and spot, a second one for frame", frames)
-    return table.assign(frame=frames, in_view=in_view.astype(np.int64))
+        for i in np.flatnonzero(~np.isfinite(table.numbers[name]) & (in_view > 0))[:1]:
+            raise table.error(i, f"{name}: expected a number where in_view is 1 or 2, got {table.found(name, i)}")
+    for column, names in known.items():
+        words = table.words[column]
+        for code, word in enumerate(words.words):
+            if names is not None and word not in names:
+                i = int(np.argmax(words.codes == code))
+                raise table.error(
+                    i, f"{column}: expected a {column} of the rig, got {word!r}{did_you_mean(word, names)}"
+                )
+    spots = TrueSpots(
+        frame, table.words["camera"], table.words["spot"], table.stack("u_px", "v_px"), in_view.astype(np.int64)
+    )
+    for i in np.flatnonzero(_repeated(spots))[:1]:
+        raise table.error(i, f"expected one row per frame, camera and spot, got a second one for frame {frame[i]}")
+    return spots
 
 
-def _refuse(path: Path, wrong: np.ndarray, expected: str, found: np.ndarray) -> None:
-    """Raises InputError for the first row that is wrong."""
-    bad = np.flatnonzero(wrong)
-    if bad.size:
-        raise InputError(f"{path}: line {bad[0] + 2}: {expected}, got {found[bad[0]]}")
+def _repeated(spots: TrueSpots) -> Bools:
+    """(n,): an earlier row has the same frame, camera and spot."""
+    keys = np.stack([spots.frame, spots.camera.codes, spots.spot.codes], axis=1)
+    order = np.lexsort(keys.T[::-1])  # stable
+    again = np.zeros(len(keys), dtype=bool)
+    again[order[1:]] = np.all(keys[order[1:]] == keys[order[:-1]], axis=1)
+    return again
 
 
 def largest_disagreement_px(truth: TruthTables, rig: Rig) -> tuple[float, int] | None:
-    """How far, px, the true spots lie from where the true poses put them through the rig, and in which frame.
+    """Largest distance, px, between the true spots and the projections of the true poses by the rig, and its frame.
 
-    None where the two tables share nothing. Zero but for rounding if the truth was made with this rig.
+    None where the two tables have nothing in common. Zero except for rounding if the truth was made with this rig.
     """
     if truth.pose is None or truth.spots is None:
         return None
-    shared = np.intersect1d(truth.pose["frame"], truth.spots["frame"])
+    shared = np.intersect1d(truth.pose.frame, truth.spots.frame)
     if not shared.size:
         return None
-    frames: Ints = shared[np.unique(np.linspace(0, len(shared) - 1, COMPARED).astype(np.int64))]
-    poses = truth.pose.set_index("frame").loc[frames]
+    frames: Ints = shared[np.unique(np.linspace(0, len(shared) - 1, MAX_COMPARED_FRAMES).astype(np.int64))]
+    at = np.searchsorted(truth.pose.frame, frames)
     model = SpotModel.of(rig)
-    pixels, _ = model.project(
-        Pose.from_quaternion(
-            poses[["qw", "qx", "qy", "qz"]].to_numpy(dtype=float), poses[["x_m", "y_m", "z_m"]].to_numpy(dtype=float)
-        )
-    )
+    pixels, _ = model.project(Pose.from_quaternion(truth.pose.quaternion_wxyz[at], truth.pose.position_m[at]))
     given: Array = np.full_like(pixels, np.nan)
     places = {view: i for i, view in enumerate(model.views)}
-    rows = truth.spots[truth.spots["frame"].isin(frames)]
-    at = [places.get(view, -1) for view in zip(rows["camera"], rows["spot"], strict=True)]
-    known = np.array(at) >= 0
-    frame_at = np.searchsorted(frames, rows["frame"].to_numpy())
-    given[frame_at[known], np.array(at)[known]] = rows[["u_px", "v_px"]].to_numpy()[known]
+    spots = truth.spots
+    views = zip(spots.camera.tolist(), spots.spot.tolist(), strict=True)
+    place = np.array([places.get(view, -1) for view in views], dtype=np.int64)
+    rows = np.flatnonzero((place >= 0) & np.isin(spots.frame, frames))
+    given[np.searchsorted(frames, spots.frame[rows]), place[rows]] = spots.uv_px[rows]
     distance = np.linalg.norm(pixels - given, axis=-1)
     if not np.isfinite(distance).any():
         return None

@@ -1,1 +1,1 @@
-"""YAML, CSV and JSON text, their fields and columns, and writing a file whole or not at all."""
+"""YAML, CSV and JSON text, field types and checks, error texts, and atomic writing."""

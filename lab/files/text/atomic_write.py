@@ -1,4 +1,4 @@
-"""A result folder that is complete or absent: written beside its place and renamed."""
+"""Atomic writing: a result folder or a file is either complete or as it was before."""
 
 from __future__ import annotations
 
@@ -10,11 +10,39 @@ from pathlib import Path
 
 from lab.errors import InputError
 
+_REMEDIES = {
+    IsADirectoryError: "; name a file in it",
+    FileNotFoundError: "; make its folder first",
+    NotADirectoryError: "; choose another place",
+    PermissionError: "; choose another place, or request write permission there",
+}
+
+
+def atomic_write_text(text: str, path: Path) -> None:
+    """Write a UTF-8 text file, complete or not at all. Raises InputError."""
+    atomic_write_bytes(text.encode("utf-8"), path)
+
+
+def atomic_write_bytes(content: bytes, path: Path) -> None:
+    """Write a file so that `path` is either the whole new file or what it was before. Raises InputError."""
+    path = Path(path)
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        with part.open("wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        part.replace(path)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        remedy = next((text for kind, text in _REMEDIES.items() if isinstance(error, kind)), "")
+        raise InputError(f"{path}: cannot be written: {error.strerror}{remedy}") from None
+
 
 def refuse_foreign(target: Path, may_replace: Callable[[Path], bool]) -> None:
-    """Raises InputError where no results could go to `target`; nothing is made.
+    """Raises InputError where results cannot be written to the folder `target`. Creates nothing.
 
-    For the beginning of what takes long: a mistake in --out then shows before the work and not after it.
+    To be called before long work, so that a mistake in --out is reported before the work and not after it.
     """
     target = Path(target)
     if target.is_symlink() and not target.exists():
@@ -24,12 +52,12 @@ def refuse_foreign(target: Path, may_replace: Callable[[Path], bool]) -> None:
     above = next(p for p in (target, *target.absolute().parents) if p.exists())
     if not above.is_dir():
         raise InputError(f"{target}: the folder cannot be made: {above} is a file; choose another --out")
-    # An existing target is replaced by a rename, for which its parent must allow writing.
+    # An existing target is replaced by a rename, which needs write permission in its parent.
     place = target.absolute().parent if above == target else above
     if not os.access(place, os.W_OK | os.X_OK):
         raise InputError(
-            f"{target}: the folder cannot be made: {place} may not be written to; choose another --out, or ask for the"
-            " right to write there"
+            f"{target}: the folder cannot be made: no write permission in {place}; choose another --out, or request"
+            " write permission there"
         )
     if target.is_dir() and any(target.iterdir()) and not may_replace(target):
         raise InputError(f"{target}: the folder holds something other than earlier results; choose another --out")
@@ -37,10 +65,12 @@ def refuse_foreign(target: Path, may_replace: Callable[[Path], bool]) -> None:
 
 @contextmanager
 def atomic_folder(target: Path, may_replace: Callable[[Path], bool]) -> Iterator[Path]:
-    """Yields an empty folder beside `target`, which takes its place when the block ends well, and vanishes when not.
+    """Yields an empty folder beside `target`. It replaces `target` when the block succeeds and is deleted otherwise.
 
-    An existing target is replaced only if it is empty or `may_replace` says so of it. Raises InputError otherwise:
-    a folder with something else in it is never deleted.
+    An existing target is replaced only if it is empty or `may_replace(target)` is true.
+
+    Raises:
+        InputError: the folder cannot be made, or `target` holds something that must not be deleted.
     """
     target = Path(target)
     refuse_foreign(target, may_replace)
@@ -60,7 +90,7 @@ def atomic_folder(target: Path, may_replace: Callable[[Path], bool]) -> Iterator
 
 
 def replace_folder(work: Path, target: Path) -> None:
-    """Rename, with an old target out of the way only for the moment between two renames, and then deleted."""
+    """Rename `work` to `target`. An old target is renamed first, restored if the second rename fails, then deleted."""
     if not target.exists():
         work.rename(target)
         return
@@ -75,6 +105,6 @@ def replace_folder(work: Path, target: Path) -> None:
 
 
 def beside_a_good_one(target: Path, failed: bool, good: str) -> Path:
-    """Where results go: `target`, or `target-failed` where they failed and `target` holds good ones (a file `good`)."""
+    """The folder for results: `target`, or `target-failed` where they failed and `target` holds the file `good`."""
     target = Path(target)
     return target.with_name(f"{target.name}-failed") if failed and (target / good).is_file() else target

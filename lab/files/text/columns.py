@@ -1,4 +1,4 @@
-"""The columns of every table that a run reads or writes, in order; writers and readers take them from here."""
+"""The columns of every table that a run reads or writes, in order."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ ATTITUDE = (
     "sigma_velocity_x_m_s", "sigma_velocity_y_m_s", "sigma_velocity_z_m_s",
     "sigma_rate_x_rad_s", "sigma_rate_y_rad_s", "sigma_rate_z_rad_s",
 )  # fmt: skip
-POSE = ATTITUDE[2:18]  # of these the pose itself: position, quaternion, angles and the sigmas
+POSE = ATTITUDE[2:18]  # the pose: position, quaternion, angles and their sigmas
 MOTION = ATTITUDE[21:]  # velocity of the body origin, in world; rate about the body's axes; their sigmas
 COVARIANCE = ("frame", *(f"c{i}{j}" for i in range(6) for j in range(i, 6)))
 TRUTH_POSE = ("frame", "t_s", "x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
 TRUTH_SPOTS = ("frame", "camera", "spot", "u_px", "v_px", "in_view")
 TIMES = ("frame", "t_s")
-CAUSAL = "_causal"  # in the names of tables of what was known at each instant, beside those of the whole run's view
-ADDED = ("label_probability", *MOTION)  # what results from before the rigid tracker do not have
+CAUSAL = "_causal"  # suffix of the tables of the causal filter; the tables without it are smoothed
+ADDED = ("label_probability", *MOTION)  # columns that results of versions before the rigid tracker do not have

@@ -1,4 +1,4 @@
-"""JSON out: summaries that any JSON reader takes, from values of Python and numpy."""
+"""Writes JSON from values of Python and numpy."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def write_json(content: Any, path: Path) -> None:
 
 
 def plain(value: Any) -> Any:
-    """The value with numpy's numbers as Python's and None for nan and infinity, which JSON does not have."""
+    """The value with Python numbers instead of numpy's, and None for nan and infinity, which JSON does not have."""
     if isinstance(value, Mapping):
         return {str(k): plain(v) for k, v in value.items()}
     if isinstance(value, list | tuple):

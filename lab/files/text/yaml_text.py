@@ -1,63 +1,27 @@
-"""YAML in and out: read safely and strictly, each mistake told in one line, written whole or not at all.
+"""YAML files: read safely and strictly, each mistake reported in one line; written atomically.
 
-Only YAML 1.2's core types are read (null, true/false, integers, decimal and exponent floats): `on`, `no`, `1:30` and
-dates stay words, and `1e-3` is a number, unlike in YAML 1.1. Every key is the text that the file shows, so that the
-spots `1` and `"1"` are the same spot.
+Only the core types of YAML 1.2 are read (null, true/false, integers, decimal and exponent floats): `on`, `no`, `1:30`
+and dates are words, and `1e-3` is a number, unlike in YAML 1.1. A key is the text in the file, so that the spots `1`
+and `"1"` are the same spot. Why PyYAML and not ruamel.yaml: docs/decisions/yaml-reader.md.
 """
 
 from __future__ import annotations
 
-import difflib
 import math
-import os
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from lab.errors import InputError
-
-
-class FileError(InputError):
-    """What is wrong in one file: a line for each mistake. The message shows the first and counts the rest."""
-
-    def __init__(self, lines: Iterable[str]) -> None:
-        self.lines = tuple(lines)
-        more = len(self.lines) - 1
-        tail = f"\n(and {more} more in this file: `beampose check` lists them)" if more else ""
-        super().__init__(self.lines[0] + tail)
-
-
-def did_you_mean(word: object, known: Iterable[str]) -> str:
-    """`; did you mean 'frames'?` or, where nothing is near, `; known: ...`; empty where nothing is known."""
-    known = [str(k) for k in known]
-    near = difflib.get_close_matches(str(word), known, n=1, cutoff=0.6)
-    if not near:
-        lowered = {k.lower(): k for k in known}
-        near = [lowered[str(word).lower()]] if str(word).lower() in lowered else []
-    if near:
-        return f"; did you mean {near[0]!r}?"
-    return f"; known: {', '.join(known)}" if known else ""
-
-
-def shown(value: object) -> str:
-    """A value as an error line shows it: short, and in the file's terms."""
-    if value is None:
-        return "nothing"
-    if isinstance(value, Mapping):
-        return f"a mapping with {', '.join(map(str, value)) or 'no keys'}"[:70]
-    if isinstance(value, bool):
-        return str(value).lower()
-    text = repr(value)
-    if len(text) > 50 and isinstance(value, list):
-        return f"a list of {len(value)}"
-    return text if len(text) <= 50 else text[:46] + " ..."
+from lab.files.text.atomic_write import atomic_write_text
+from lab.files.text.error_text import shown
 
 
 class _StrictLoader(yaml.SafeLoader):
-    """Safe YAML with YAML 1.2's core types only, keys as written, no key twice."""
+    """Safe loader with the core types of YAML 1.2 only, keys as written, and no repeated key."""
 
     yaml_implicit_resolvers: dict[str, list[tuple[str, re.Pattern[str]]]] = {}  # noqa: RUF012 - replaces the base's
 
@@ -111,7 +75,7 @@ _StrictLoader.add_constructor("tag:yaml.org,2002:float", _construct_float)
 
 
 class _OpenCVLoader(_StrictLoader):
-    """As the strict loader, with OpenCV's matrices as the mappings that they are."""
+    """The strict loader, with OpenCV's matrices as mappings."""
 
 
 def _construct_tagged(loader: _OpenCVLoader, _suffix: str, node: yaml.MappingNode) -> dict[Any, Any]:
@@ -122,12 +86,12 @@ _OpenCVLoader.add_multi_constructor("tag:yaml.org,2002:opencv-", _construct_tagg
 
 
 def read_text(path: Path) -> str:
-    """The text of a UTF-8 file. Raises InputError in one line."""
+    """The text of a UTF-8 file. Raises InputError, in one line."""
     try:
         return path.read_bytes().decode("utf-8")
     except UnicodeDecodeError as error:
         raise InputError(
-            f"{path}: expected UTF-8 text, got a byte that is none at position {error.start}; save it as UTF-8"
+            f"{path}: expected UTF-8 text, got an invalid byte at position {error.start}; save it as UTF-8"
         ) from None
     except FileNotFoundError:
         raise InputError(f"{path}: expected a file, found none; check the path") from None
@@ -138,12 +102,12 @@ def read_text(path: Path) -> str:
 
 
 def read_mapping(path: Path) -> dict[str, Any]:
-    """The mapping that a YAML file holds; keys are words. Raises InputError in one line, with the line's number."""
+    """The mapping in a YAML file; keys are words. Raises InputError, in one line, with the line number."""
     return parse_mapping(read_text(path), path)
 
 
 def parse_mapping(text: str, path: Path | str, opencv: bool = False) -> dict[str, Any]:
-    """As `read_mapping`, of a text that is there already; with `opencv`, OpenCV's own head and tags are read too."""
+    """As `read_mapping`, from a text. opencv: OpenCV's own head and tags are accepted. path: for the messages."""
     if opencv:
         text = re.sub(r"\A\ufeff?%YAML:1\.0[^\n]*", "", text)
     try:
@@ -169,8 +133,13 @@ def parse_mapping(text: str, path: Path | str, opencv: bool = False) -> dict[str
     return content
 
 
+def parse_value(text: str, name: str) -> Any:
+    """A single value written as in a file, such as 1e-3 or [0, 1]. name: in the message. Raises InputError."""
+    return parse_mapping(f"value: {text}", name)["value"]
+
+
 class _Writer(yaml.SafeDumper):
-    """Short lists on one line, keys in the given order, no aliases."""
+    """Lists of plain values on one line, keys in the given order, no aliases."""
 
     def ignore_aliases(self, data: Any) -> bool:
         return True
@@ -186,7 +155,7 @@ def _represent_dict(writer: _Writer, values: dict[Any, Any]) -> yaml.Node:
     return writer.represent_mapping("tag:yaml.org,2002:map", values.items(), flow_style=flow and len(values) > 1)
 
 
-# What YAML 1.1 reads as a word but this reader as a number must be quoted as well.
+# Words that this reader would read as numbers must be quoted; YAML 1.1 does not quote them.
 _Writer.add_implicit_resolver(
     "tag:yaml.org,2002:float", re.compile(r"^[-+]?[0-9]+[eE][-+]?[0-9]+$"), list("-+0123456789")
 )
@@ -195,28 +164,5 @@ _Writer.add_representer(dict, _represent_dict)
 
 
 def write_mapping(content: Mapping[str, Any], path: Path) -> None:
-    """Write plain values as YAML: floats to the last bit, complete or not at all."""
+    """Write plain values as YAML, atomically; floats read back to the last bit. Raises InputError."""
     atomic_write_text(yaml.dump(dict(content), Dumper=_Writer, sort_keys=False, allow_unicode=True, width=120), path)
-
-
-_WRITE_CURES = {
-    IsADirectoryError: "; name a file in it",
-    FileNotFoundError: "; make its folder first",
-    NotADirectoryError: "; choose another place",
-    PermissionError: "; choose another place, or ask for the right to write there",
-}
-
-
-def atomic_write_text(text: str, path: Path) -> None:
-    """Write a text file so that `path` is either the whole new file or what it was before."""
-    beside = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        with beside.open("w", encoding="utf-8", newline="\n") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        beside.replace(path)
-    except OSError as error:
-        beside.unlink(missing_ok=True)
-        remedy = next((text for kind, text in _WRITE_CURES.items() if isinstance(error, kind)), "")
-        raise InputError(f"{path}: cannot be written: {error.strerror}{remedy}") from None

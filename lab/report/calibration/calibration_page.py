@@ -18,7 +18,7 @@ from markupsafe import Markup
 from calibration.findings import Finding, Level
 from geometry.arrays import Array
 from lab.errors import InputError
-from lab.files.text.yaml_text import atomic_write_text
+from lab.files.text.atomic_write import atomic_write_text
 from lab.number_format import short
 from lab.report.html import environment
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from lab.files.text.yaml_text import atomic_write_text
+from lab.files.text.atomic_write import atomic_write_text
 from lab.number_format import short
 from lab.report.html import environment
 from lab.report.run.verdict import WORDS

@@ -7,7 +7,7 @@ from typing import Any
 
 from markupsafe import Markup
 
-from lab.files.text.yaml_text import atomic_write_text
+from lab.files.text.atomic_write import atomic_write_text
 from lab.report.html import environment
 from lab.report.run import figures, pose_curves, tables, uncertainty
 from lab.report.run.model_fit import HEADS as MODEL_FIT_HEADS

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from geometry.arrays import Array
 from lab.errors import BeamposeError
-from lab.files.run.results import SPOT_STATUSES, read_table
+from lab.files.run.results import SPOT_STATUSES, read_result_table
 from lab.files.run.run_file import DetectionsTable, LiveDevice, VideoFile
 from lab.pictures.picture_file import Grey, Missing
 from lab.report.plot import svg
@@ -163,8 +163,8 @@ def _detections(path: Path, frames: set[int]) -> dict[tuple[int, str], Array]:
     """Detected points (n, 2), px, of some frames, by frame and camera."""
     if not path.exists() or not frames:
         return {}
-    table = read_table(path, ("frame", "u_px", "v_px"), ("camera",))
-    frame, camera = table.numbers["frame"], table.texts["camera"]
+    table = read_result_table(path, ("frame", "camera", "u_px", "v_px"))
+    frame, camera = table.numbers["frame"], table.words["camera"]
     out = {}
     for f in frames:
         rows = np.flatnonzero(frame == f)

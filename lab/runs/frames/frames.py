@@ -16,7 +16,7 @@ from geometry.arrays import Bools, Ints
 from lab.errors import InputError
 from lab.files.run.detections_file import CameraPoints, DetectionsFile, far_off, read_detections, too_sparse
 from lab.files.run.run_file import DetectionsTable, FramesFolder, LiveDevice, Run, VideoFile
-from lab.files.text.yaml_text import did_you_mean
+from lab.files.text.error_text import did_you_mean
 from lab.pictures.picture_file import DROPPED, Grey, Missing
 from lab.runs.frames.frame_sources import (
     Asked,

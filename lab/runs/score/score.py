@@ -22,8 +22,8 @@ from lab.files.run.results import (
     pose_stack,
     read_poses,
     read_spots,
-    read_table,
 )
+from lab.files.run.truth import load_truth
 from lab.runs.score.motion_score import motion_scores
 from tracking.statuses import PoseStatus, SpotStatus
 
@@ -49,27 +49,25 @@ class TruthArrays:
 
 
 def read_truth(run_folder: Path, spots: SpotGrid, poses: PoseTrack) -> TruthArrays | None:
-    """The truth of a run folder at the frames and views of its results; None where it has none."""
-    spots_file, pose_file = run_folder / "truth" / "spots.csv", run_folder / "truth" / "pose.csv"
+    """The truth of a run folder at the frames and views of its results; None where it has none. Raises InputError."""
+    tables = load_truth(run_folder)
+    if tables is None:
+        return None
     uv = in_view = world_from_body = None
-    if spots_file.exists():
-        table = read_table(spots_file, ("frame", "u_px", "v_px", "in_view"), ("camera", "spot"))
-        frame, camera, spot = table.numbers["frame"], table.texts["camera"], table.texts["spot"]
-        rows, i, j = on_grid(frame, camera, spot, spots.views, spots.frames)
+    if tables.spots is not None:
+        true = tables.spots
+        rows, i, j = on_grid(true.frame, true.camera, true.spot, spots.views, spots.frames)
         uv = np.full(spots.uv_px.shape, np.nan)
         in_view = np.full(spots.status.shape, -1, dtype=np.int64)
-        uv[i, j] = table.stack("u_px", "v_px")[rows]
-        in_view[i, j] = table.numbers["in_view"][rows].astype(np.int64)
-    if pose_file.exists():
-        table = read_table(pose_file, ("frame", "x_m", "y_m", "z_m", "qw", "qx", "qy", "qz"))
-        at = np.searchsorted(poses.frames, table.numbers["frame"])
+        uv[i, j] = true.uv_px[rows]
+        in_view[i, j] = true.in_view[rows]
+    if tables.pose is not None:
+        at = np.searchsorted(poses.frames, tables.pose.frame)
         here = at < len(poses.frames)
-        here[here] = poses.frames[at[here]] == table.numbers["frame"][here]
+        here[here] = poses.frames[at[here]] == tables.pose.frame[here]
         numbers = np.full((len(poses.frames), 7), np.nan)
-        numbers[at[here]] = table.stack("x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")[here]
+        numbers[at[here]] = np.concatenate([tables.pose.position_m, tables.pose.quaternion_wxyz], axis=1)[here]
         world_from_body = pose_stack(numbers[:, :3], numbers[:, 3:])
-    if in_view is None and world_from_body is None:
-        return None
     return TruthArrays(uv, in_view, world_from_body)
 
 

@@ -1,4 +1,4 @@
-"""A result folder is complete or absent, and what is not ours is never deleted."""
+"""A result folder is complete or absent, and foreign files are never deleted."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def names(folder: Path) -> list[str]:
     return sorted(p.name for p in folder.iterdir())
 
 
-def test_nothing_stands_at_the_target_until_the_block_has_ended(tmp_path):
+def test_the_target_appears_only_when_the_block_has_ended(tmp_path):
     target = tmp_path / "results"
     with atomic_folder(target, never) as work:
         (work / "a.csv").write_text("1")
@@ -35,7 +35,7 @@ def test_nothing_stands_at_the_target_until_the_block_has_ended(tmp_path):
 
 
 @pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt, SystemExit])
-def test_whatever_ends_the_block_early_leaves_nothing(tmp_path, error):
+def test_a_block_that_ends_with_an_exception_leaves_nothing(tmp_path, error):
     target = tmp_path / "results"
 
     def write_half():
@@ -48,7 +48,7 @@ def test_whatever_ends_the_block_early_leaves_nothing(tmp_path, error):
     assert names(tmp_path) == []
 
 
-def test_earlier_results_stay_when_the_new_ones_fail_and_go_when_they_come(tmp_path):
+def test_earlier_results_are_replaced_only_when_the_new_ones_are_complete(tmp_path):
     target = tmp_path / "results"
     target.mkdir()
     (target / "old.csv").write_text("old")
@@ -80,7 +80,7 @@ def test_a_folder_with_something_else_in_it_is_refused_and_untouched(tmp_path):
     assert names(tmp_path) == ["thesis"]
 
 
-def test_an_empty_folder_is_taken(tmp_path):
+def test_an_empty_folder_is_replaced(tmp_path):
     target = tmp_path / "results"
     target.mkdir()
     with atomic_folder(target, never) as work:
@@ -88,7 +88,7 @@ def test_an_empty_folder_is_taken(tmp_path):
     assert names(target) == ["a"]
 
 
-def test_a_file_in_its_place_is_refused(tmp_path):
+def test_a_file_as_target_is_refused(tmp_path):
     target = tmp_path / "results"
     target.write_text("a file")
     with (
@@ -99,14 +99,14 @@ def test_a_file_in_its_place_is_refused(tmp_path):
     assert target.read_text() == "a file"
 
 
-def test_folders_on_the_way_are_made(tmp_path):
+def test_missing_parent_folders_are_made(tmp_path):
     with atomic_folder(tmp_path / "a" / "b" / "results", never) as work:
         (work / "x").write_text("1")
     assert names(tmp_path / "a" / "b" / "results") == ["x"]
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
-def test_a_place_where_nothing_can_be_made_is_a_plain_error(tmp_path):
+def test_a_folder_without_write_permission_is_a_plain_error(tmp_path):
     closed = tmp_path / "closed"
     closed.mkdir(mode=0o500)
     with pytest.raises(InputError, match="the folder cannot be made"), atomic_folder(closed / "results", never):
@@ -122,7 +122,7 @@ def test_a_parent_that_is_a_file_is_a_plain_error(tmp_path):
         pytest.fail("the block must not begin")
 
 
-def test_what_a_killed_run_left_beside_is_cleared_away(tmp_path):
+def test_the_working_folder_of_a_killed_run_is_removed(tmp_path):
     left = tmp_path / f".results.part-{os.getpid()}"
     left.mkdir()
     (left / "a.csv").write_text("half of long ago")
@@ -131,7 +131,7 @@ def test_what_a_killed_run_left_beside_is_cleared_away(tmp_path):
     assert names(tmp_path / "results") == ["b.csv"]
 
 
-def test_the_old_results_come_back_when_the_last_rename_fails(tmp_path, monkeypatch):
+def test_old_results_are_restored_when_the_last_rename_fails(tmp_path, monkeypatch):
     target = tmp_path / "results"
     target.mkdir()
     (target / "old").write_text("1")
@@ -153,7 +153,7 @@ def test_the_old_results_come_back_when_the_last_rename_fails(tmp_path, monkeypa
     assert names(tmp_path) == ["results"]
 
 
-def test_failed_results_go_beside_good_ones_and_anywhere_else_where_asked(tmp_path):
+def test_failed_results_do_not_replace_good_ones(tmp_path):
     good = tmp_path / "left"
     assert beside_a_good_one(good, True, "camera.yaml") == good
     good.mkdir()
@@ -163,7 +163,7 @@ def test_failed_results_go_beside_good_ones_and_anywhere_else_where_asked(tmp_pa
     assert beside_a_good_one(good, True, "rig.yaml") == good
 
 
-def test_a_wrong_place_is_told_before_any_work_and_with_a_cure(tmp_path):
+def test_an_unusable_target_is_reported_before_any_work_with_a_remedy(tmp_path):
     foreign = tmp_path / "letters"
     foreign.mkdir()
     (foreign / "letter.txt").write_text("dear")
@@ -180,7 +180,7 @@ def test_a_wrong_place_is_told_before_any_work_and_with_a_cure(tmp_path):
     assert names(tmp_path) == ["file", "letters", "link"]
 
 
-def test_a_free_place_and_earlier_results_are_no_mistake_and_nothing_is_made(tmp_path):
+def test_a_usable_target_is_accepted_and_nothing_is_made(tmp_path):
     (tmp_path / "old").mkdir()
     (tmp_path / "old" / "a.csv").write_text("1")
     refuse_foreign(tmp_path / "old", always)
@@ -202,7 +202,7 @@ def test_a_free_place_and_earlier_results_are_no_mistake_and_nothing_is_made(tmp
     ],
     ids=["screen", "beams", "rig", "camera", "check", "plan"],
 )
-def test_every_long_work_looks_at_its_place_first(work, tmp_path):
+def test_every_long_command_checks_its_target_first(work, tmp_path):
     (tmp_path / "letter.txt").write_text("dear")
     with pytest.raises(InputError, match="choose another --out"):
         work(tmp_path)

@@ -1,4 +1,4 @@
-"""detections.csv: every good point comes back where it belongs, and bad rows are counted, not fatal."""
+"""detections.csv: good rows are read, bad rows are left out and counted."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def row(
     return f"{frame},{camera},{u},{v},{sigma},{sigma},{flux},2.0,1.5,1.2,30.0,{cov}"
 
 
-def test_a_point_comes_back_with_all_that_the_file_says(tmp_path):
+def test_a_point_has_all_values_of_its_row(tmp_path):
     path = table(tmp_path, "3,left,10.25,-7.5,0.1,0.2,900,50,1.5,1.25,30,0.005")
     file = read_detections(path)
     assert (file.first, file.last, file.notes) == (3, 3, ())
@@ -46,7 +46,7 @@ def test_a_point_comes_back_with_all_that_the_file_says(tmp_path):
     )  # fmt: skip
 
 
-def test_rows_in_any_order_come_by_camera_and_frame_the_brightest_first(tmp_path):
+def test_rows_are_sorted_by_camera_and_frame_brightest_first(tmp_path):
     rng = np.random.default_rng(1)
     truth = [(f, c, rng.uniform(0, 64), rng.uniform(1, 9)) for f in range(30) for c in "ab" for _ in range(3)]
     order = rng.permutation(len(truth))
@@ -60,7 +60,7 @@ def test_rows_in_any_order_come_by_camera_and_frame_the_brightest_first(tmp_path
     assert len(file.cameras["a"].at(30)) == 0
 
 
-def test_without_sigmas_a_tenth_of_a_pixel_is_assumed_and_said(tmp_path):
+def test_without_sigmas_a_tenth_of_a_pixel_is_assumed_and_noted(tmp_path):
     file = read_detections(table(tmp_path, "0,left,1,2", header="frame,camera,u_px,v_px"))
     np.testing.assert_allclose(file.cameras["left"].at(0).cov_px2, [np.eye(2) * 0.01])
     assert np.isnan(file.cameras["left"].at(0).flux[0])
@@ -69,15 +69,15 @@ def test_without_sigmas_a_tenth_of_a_pixel_is_assumed_and_said(tmp_path):
 
 AGAIN = "the same point a second time, or one less than 0.05 px from it"
 BAD_ROWS = [
-    (row(1.5, "left", 1, 2), "the frame is no whole number", "frame 1.5"),
-    (row("", "left", 1, 2), "the frame is no whole number", "frame nothing"),
-    (row("1e300", "left", 1, 2), "the frame is no whole number", "frame 1e+300"),
-    (row("one", "left", 1, 2), "the frame is no whole number", "frame 'one'"),
+    (row(1.5, "left", 1, 2), "the frame is not a whole number", "frame 1.5"),
+    (row("", "left", 1, 2), "the frame is not a whole number", "frame nothing"),
+    (row("1e300", "left", 1, 2), "the frame is not a whole number", "frame 1e+300"),
+    (row("one", "left", 1, 2), "the frame is not a whole number", "frame 'one'"),
     (row(-1, "left", 1, 2), "the frame is negative; frames count from 0", "frame -1"),
-    (row(1, "", 1, 2), "no camera is named", ""),
-    (row(1, "left", "nan", 2), "u_px or v_px is no finite number", "u_px 'nan' and v_px 2"),
-    (row(1, "left", 1, "inf"), "u_px or v_px is no finite number", "u_px 1 and v_px inf"),
-    (row(1, "left", 1, "12;5"), "u_px or v_px is no finite number", "u_px 1 and v_px '12;5'"),
+    (row(1, "", 1, 2), "the camera is empty", ""),
+    (row(1, "left", "nan", 2), "u_px or v_px is not a finite number", "u_px 'nan' and v_px 2"),
+    (row(1, "left", 1, "inf"), "u_px or v_px is not a finite number", "u_px 1 and v_px inf"),
+    (row(1, "left", 1, "12;5"), "u_px or v_px is not a finite number", "u_px 1 and v_px '12;5'"),
     (row(1, "left", -1e12, 2), "u_px or v_px is beyond 1000000 px: no picture is so wide", "u_px -1e+12 and v_px 2"),
     (row(1, "left", 1, 2, sigma=0), "a sigma is not above 0", "sigma_u_px 0 and sigma_v_px 0"),
     (row(1, "left", 1, 2, sigma=-0.1), "a sigma is not above 0", "sigma_u_px -0.1 and sigma_v_px -0.1"),
@@ -91,24 +91,24 @@ BAD_ROWS = [
     (row(0, " left", 5, 6), AGAIN, "u_px 5 and v_px 6"),
     (row(0, "left", 5.02, 5.98), AGAIN, "u_px 5.02 and v_px 5.98"),
     # the last line of a writer that was killed
-    ("1,le", "u_px or v_px is no finite number", "u_px nothing and v_px nothing"),
+    ("1,le", "u_px or v_px is not a finite number", "u_px nothing and v_px nothing"),
 ]  # fmt: skip
 
 
 @pytest.mark.parametrize(("bad", "why", "found"), BAD_ROWS)
-def test_a_row_that_cannot_be_used_is_left_out_and_said(bad, why, found, tmp_path):
+def test_an_unusable_row_is_left_out_and_noted(bad, why, found, tmp_path):
     file = read_detections(table(tmp_path, row(0, "left", 5, 6), bad))
     assert list(file.cameras) == ["left"]
     assert len(file.cameras["left"].points) == 1
     assert (file.first, file.last) == (0, 0)
     shown = f", with {found}" if found else ""
-    assert [n.split(": ", 1)[1] for n in file.notes] == [f"1 of 2 rows left out: {why} (the first near line 3{shown})"]
+    assert [n.split(": ", 1)[1] for n in file.notes] == [f"1 of 2 rows left out: {why} (the first in line 3{shown})"]
 
 
-def test_a_line_with_too_many_fields_is_left_out_and_said(tmp_path):
+def test_a_line_with_too_many_fields_is_left_out_and_noted(tmp_path):
     file = read_detections(table(tmp_path, row(0, "left", 5, 6), row(1, "left", 5, 6) + ",7,8", row(2, "left", 5, 6)))
     assert list(file.cameras["left"].frames) == [0, 2]
-    assert file.notes[0].endswith("1 lines left out: more fields than the header has")
+    assert file.notes[0].endswith("1 line left out: more fields than the header has")
 
 
 @pytest.mark.parametrize(
@@ -120,7 +120,7 @@ def test_a_line_with_too_many_fields_is_left_out_and_said(tmp_path):
         ("frame,camera,u_px,v_px,u_px\n0,left,1,2,3\n", "expected each column once, got 'u_px' twice"),
     ],
 )
-def test_a_table_without_its_columns_is_told_so(text, words, tmp_path):
+def test_a_table_without_its_columns_is_refused(text, words, tmp_path):
     path = tmp_path / "detections.csv"
     path.write_text(text)
     with pytest.raises(InputError) as caught:
@@ -139,7 +139,7 @@ def test_a_table_without_a_usable_row_stops_the_run_with_a_plain_line(rows, tmp_
         open_frames(load_run(folder))
 
 
-def test_pictures_of_one_camera_and_points_of_the_other_come_together(tmp_path):
+def test_pictures_of_one_camera_and_points_of_the_other_can_be_combined(tmp_path):
     folder = write_run(tmp_path / "a")
     table(folder, row(1, "right", 3, 4), row(3, "right", 5, 6), row(3, "right", 7, 8), row(3, "middle", 1, 1))
     edit(folder / "run.yaml", "{frames: frames/right}", "{detections: detections.csv}")
@@ -154,14 +154,14 @@ def test_pictures_of_one_camera_and_points_of_the_other_come_together(tmp_path):
 
 
 def points_for_right(folder: Path, *rows: str) -> Path:
-    """A run of which camera `right` has points, and `left` its five pictures."""
+    """A run where camera `right` has detected points, and `left` five pictures."""
     write_run(folder)
     table(folder, *rows)
     edit(folder / "run.yaml", "{frames: frames/right}", "{detections: detections.csv}")
     return folder
 
 
-def test_columns_in_another_order_and_further_ones_change_nothing(tmp_path):
+def test_the_order_of_columns_and_unknown_columns_do_not_matter(tmp_path):
     usual = read_detections(table(tmp_path, row(0, "left", 5, 6, sigma=0.2), row(2, "left", 7, 8)))
     header = "v_px,quality,camera,sigma_v_px,u_px,frame,sigma_u_px"
     other = read_detections(table(tmp_path, "8,good,left,0.1,7,2,0.1", "6,bad,left,0.2,5,0,0.2", header=header))
@@ -176,7 +176,7 @@ def test_columns_in_another_order_and_further_ones_change_nothing(tmp_path):
     seed=st.integers(0, 2**32 - 1),
 )
 @settings(max_examples=20, deadline=None, derandomize=True)
-def test_bad_rows_anywhere_never_touch_the_good_ones(bad, seed, tmp_path_factory):
+def test_bad_rows_do_not_affect_good_ones(bad, seed, tmp_path_factory):
     rng = np.random.default_rng(seed)
     # the frames 0 and 1 have other points than BAD_ROWS are beside
     good = [row(f, "left", round(u, 3), 40.0 + k) for f in range(4) for k, u in enumerate(rng.uniform(9, 60, 3))]
@@ -193,7 +193,7 @@ def test_bad_rows_anywhere_never_touch_the_good_ones(bad, seed, tmp_path_factory
         np.testing.assert_array_equal(uv[~beside], expected.at(frame).uv_px)
 
 
-def test_of_two_points_of_one_spot_the_better_measured_stays(tmp_path):
+def test_of_two_points_of_one_spot_the_more_precise_one_is_kept(tmp_path):
     rows = [
         row(0, "left", 5, 6, sigma=0.3),
         row(0, "left", 5.03, 6.03, sigma=0.1),
@@ -205,7 +205,7 @@ def test_of_two_points_of_one_spot_the_better_measured_stays(tmp_path):
     assert (len(file.cameras["left"].at(1)), len(file.cameras["right"].at(1))) == (1, 1)
 
 
-def test_two_spots_a_tenth_of_a_pixel_apart_both_stay(tmp_path):
+def test_two_spots_a_tenth_of_a_pixel_apart_are_both_kept(tmp_path):
     file = read_detections(table(tmp_path, row(0, "left", 5, 6), row(0, "left", 5.1, 6), row(0, "left", 5, 6.1)))
     assert len(file.cameras["left"].at(0)) == 3
 
@@ -216,11 +216,11 @@ def test_a_few_frames_far_from_all_others_are_left_out_and_the_run_is_kept(tmp_p
     folder = points_for_right(tmp_path / "a", *rows)
     reader = open_frames(load_run(folder))
     assert (reader.first, reader.last) == (0, 599)
-    far = "1 of 601 rows left out: the frame is more than 10000 numbers away from the others (the first near line 302,"
+    far = "1 of 601 rows left out: the frame is more than 10000 numbers away from the others (the first in line 302,"
     assert any(far in n and n.endswith("with frame 1e+09)") for n in reader.notes)
 
 
-def test_one_row_behind_a_gap_longer_than_the_recording_is_left_out_too(tmp_path):
+def test_one_row_after_a_gap_longer_than_the_recording_is_left_out_too(tmp_path):
     rows = [row(f, "right", 5 + f % 50, 6) for f in range(600)]
     folder = points_for_right(tmp_path / "a", *rows, row(90000, "right", 9, 9))
     reader = open_frames(load_run(folder))
@@ -228,20 +228,20 @@ def test_one_row_behind_a_gap_longer_than_the_recording_is_left_out_too(tmp_path
     assert any("1 of 601 rows left out: the frame is more than 10000 numbers away" in n for n in reader.notes)
 
 
-def test_frame_numbers_that_hold_a_time_are_refused_before_a_thousand_million_rows_are_written(tmp_path):
+def test_time_stamps_as_frame_numbers_are_refused(tmp_path):
     folder = points_for_right(tmp_path / "a", *(row(f * 10_000_000, "right", 5, 6) for f in range(100)))
     with pytest.raises(InputError, match="expected frame numbers without gaps of many thousands, got 105 pictures"):
         open_frames(load_run(folder))
 
 
-def test_rows_of_a_misspelt_camera_are_refused_with_the_name_that_was_meant(tmp_path):
+def test_rows_of_a_misspelt_camera_are_refused_with_a_suggestion(tmp_path):
     folder = points_for_right(tmp_path / "a", row(0, "rigth", 5, 6))
     words = "camera: expected rows of 'right', got none, but rows of 'rigth', which the rig does not have; did you mean"
     with pytest.raises(InputError, match=words + r" 'right'\?$"):
         open_frames(load_run(folder))
 
 
-def test_a_camera_without_rows_in_a_table_that_both_share_has_found_nothing_and_it_is_said(tmp_path):
+def test_a_camera_without_rows_in_a_shared_table_has_no_spots_which_is_noted(tmp_path):
     folder = points_for_right(tmp_path / "a", row(0, "right", 5, 6))
     edit(folder / "run.yaml", "{frames: frames/left}", "{detections: detections.csv}")
     reader = open_frames(load_run(folder))
@@ -249,18 +249,18 @@ def test_a_camera_without_rows_in_a_table_that_both_share_has_found_nothing_and_
     assert [len(s.images["left"]) for s in reader] == [0]
 
 
-def test_a_camera_of_whose_rows_none_can_be_used_is_refused_with_the_reason(tmp_path):
+def test_a_camera_without_a_usable_row_is_refused_with_the_reason(tmp_path):
     rows = [row(f, "right", 5, 6, sigma=0) for f in range(3)]
     folder = points_for_right(tmp_path / "a", *rows, row(0, "left", 5, 6))
     words = (
-        r"camera 'right': expected rows that can be used, got none: a sigma is not above 0 \(the first near line 2,"
+        r"camera 'right': expected rows that can be used, got none: a sigma is not above 0 \(the first in line 2,"
         r" with sigma_u_px 0 and sigma_v_px 0\); put them right, or leave 'right' out of `cameras` in .*run\.yaml"
     )
     with pytest.raises(InputError, match=words):
         open_frames(load_run(folder))
 
 
-def test_a_picture_of_which_no_row_can_be_used_is_unreadable_and_not_one_without_spots(tmp_path):
+def test_a_picture_without_a_usable_row_is_unreadable_not_empty(tmp_path):
     rows = [row(0, "right", 5, 6), row(1, "right", 5, 6, sigma="nan"), row(2, "right", 5, 6, sigma="nan")]
     folder = points_for_right(tmp_path / "a", *rows, row(2, "right", 9, 9), row(4, "right", 5, 6))
     reader = open_frames(load_run(folder))
@@ -285,7 +285,7 @@ def test_points_far_outside_the_picture_are_left_out_and_a_table_of_them_is_refu
         open_frames(load_run(folder))
 
 
-def test_a_picture_full_of_points_is_kept_and_said(tmp_path):
+def test_a_picture_full_of_points_is_kept_and_noted(tmp_path):
     many = [row(2, "right", 5 + i % 100 / 2, 1 + i // 100 / 4) for i in range(10_000)]
     reader = open_frames(load_run(points_for_right(tmp_path / "a", row(0, "right", 5, 6), *many)))
     assert [len(s.images["right"]) for s in reader if s.frame in (0, 2)] == [1, 10_000]

@@ -1,4 +1,4 @@
-"""A result can be tied to what went in: a changed input has another fingerprint, the same input the same."""
+"""Fingerprints identify the inputs of a run: a changed input has another fingerprint."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def test_every_input_has_one_entry_with_its_digest_and_size(tmp_path):
     assert entries["frames/left"]["covers"] == "names and sizes"
 
 
-def test_the_same_inputs_have_the_same_fingerprints_wherever_they_lie(tmp_path):
+def test_fingerprints_do_not_depend_on_the_location(tmp_path):
     one, other = (by_name(write_run(tmp_path / name / "run")) for name in ("a", "b"))
     assert {n: e["sha256"] for n, e in one.items()} == {n: e["sha256"] for n, e in other.items()}
 
@@ -73,8 +73,8 @@ def test_a_table_of_both_cameras_is_listed_once(tmp_path):
     assert list(by_name(folder)) == ["run.yaml", "rig.yaml", "detections.csv"]
 
 
-def test_of_a_huge_file_the_beginning_and_the_size_are_covered(tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "LARGEST_FILE", 1000)
+def test_the_digest_of_a_huge_file_covers_its_start_and_size(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "MAX_HASHED_BYTES", 1000)
     folder = write_run(tmp_path / "run")
     rig = folder / "rig.yaml"
     rig.write_text(rig.read_text() + "# " + "x" * 2000 + "\n")

@@ -1,4 +1,4 @@
-"""Conversion between camera files: each format is recognised, nothing is lost in silence, nothing is destroyed."""
+"""Conversion between camera files: formats are recognised, losses are noted, and no other file is overwritten."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 from lab.errors import InputError
 from lab.files.rig.camera_block import Covariance
 from lab.files.rig.camera_file import CameraFile, load_camera, save_camera
-from lab.files.rig.interchange import FORMATS, convert, read_cameras, recognise, same_lens
+from lab.files.rig.interchange import FORMATS, convert, read_cameras, recognised_format, same_lens
 from lab.files.rig.rig_file import RigFile, load_rig_file, save_rig
 from tests.lab.run_folders import RIG
 
@@ -33,7 +33,7 @@ def source(tmp_path):
 
 
 @pytest.mark.parametrize(("first", "second"), list(itertools.permutations(NAMES, 2)))
-def test_a_lens_comes_through_any_two_formats(first, second, source, tmp_path):
+def test_a_lens_survives_any_two_conversions(first, second, source, tmp_path):
     a, b, back = tmp_path / "a", tmp_path / "b", tmp_path / "back" / "camera.yaml"
     for folder in (a, b, back.parent):
         folder.mkdir()
@@ -46,7 +46,7 @@ def test_a_lens_comes_through_any_two_formats(first, second, source, tmp_path):
     np.testing.assert_allclose(load_camera(back).camera_matrix, K, rtol=1e-12)
 
 
-def test_the_line_says_what_became_what_and_what_was_left_out(source, tmp_path):
+def test_the_line_names_both_formats_and_what_was_left_out(source, tmp_path):
     save_camera(
         CameraFile("left", (1280, 1024), K, (), covariance=Covariance(("fx", "fy"), np.eye(2))), tmp_path / "c.yaml"
     )
@@ -62,7 +62,7 @@ def rig(tmp_path):
     return tmp_path / "rig.yaml"
 
 
-def test_a_rig_gives_all_its_cameras_with_their_poses(rig, tmp_path):
+def test_all_cameras_of_a_rig_are_converted_with_their_poses(rig, tmp_path):
     outcome = convert(rig, tmp_path / "camchain.yaml", camera="left")
     assert outcome.cameras == ("left",)
     bent = rig.read_text().replace("[-0.05, 0.01, 1e-3, 0.0, 0.0]", "[-0.05, 0.01, 1e-3, 0, 0]")
@@ -80,8 +80,10 @@ def test_a_rig_gives_all_its_cameras_with_their_poses(rig, tmp_path):
     )
 
 
-def test_a_format_for_one_camera_asks_which(rig, tmp_path):
-    with pytest.raises(InputError, match=r"holds cameras left, right, ROS camera_info one; choose with --camera left"):
+def test_a_format_for_one_camera_requires_a_choice(rig, tmp_path):
+    with pytest.raises(
+        InputError, match="has cameras left, right, but ROS camera_info holds one; choose with --camera"
+    ):
         convert(rig, tmp_path / "camera_info.yaml")
     with pytest.raises(InputError, match=r"expected a camera 'lft', found none; did you mean 'left'\?"):
         convert(rig, tmp_path / "camera_info.yaml", camera="lft")
@@ -89,7 +91,7 @@ def test_a_format_for_one_camera_asks_which(rig, tmp_path):
 
 
 @pytest.mark.parametrize("joint", [True, False])
-def test_a_rigs_camera_keeps_the_covariance_of_its_own_numbers(joint, rig, tmp_path):
+def test_a_camera_of_a_rig_keeps_the_covariance_of_its_lens(joint, rig, tmp_path):
     prefix = "cameras.right." if joint else ""
     names = tuple(prefix + n for n in ("fx", "x_m", "k1", "rot_x_rad"))
     C = np.diag([4.0, 9.0, 16.0, 25.0]) + 0.5
@@ -112,7 +114,7 @@ def test_a_rigs_camera_keeps_the_covariance_of_its_own_numbers(joint, rig, tmp_p
         ("cam0: [\n", "expected one of beampose camera.yaml"),
     ],
 )
-def test_a_file_of_no_known_format_is_told_so(text, words, tmp_path):
+def test_a_file_of_unknown_format_is_refused(text, words, tmp_path):
     (tmp_path / "x.dat").write_text(text)
     with pytest.raises(InputError) as caught:
         convert(tmp_path / "x.dat", tmp_path / "camera.yaml")
@@ -120,7 +122,7 @@ def test_a_file_of_no_known_format_is_told_so(text, words, tmp_path):
     assert not (tmp_path / "camera.yaml").exists()
 
 
-def test_a_failed_conversion_leaves_what_was_there(source, tmp_path):
+def test_a_failed_conversion_leaves_the_destination_as_it_was(source, tmp_path):
     save_camera(CameraFile("left", (1280, 1024), K, (0.1,) * 12), source)
     old = tmp_path / "camchain.yaml"
     save_camera(CameraFile("right", (1280, 1024), K, (0.1, 0.0, 0.0, 0.0)), tmp_path / "right.yaml")
@@ -135,12 +137,12 @@ def test_a_failed_conversion_leaves_what_was_there(source, tmp_path):
     "text",
     ["my notes\n", "%YAML:1.0\n---\nbackground: 7\n", "schema: beampose/board/1\nboard: x\n", b"\x89PNG\0\xff"],
 )
-def test_only_cameras_of_the_same_format_are_written_over(source, tmp_path, text):
+def test_only_cameras_of_the_same_format_are_overwritten(source, tmp_path, text):
     old = tmp_path / "existing.yml"
     old.write_bytes(text if isinstance(text, bytes) else text.encode())
     before = old.read_bytes()
     for target in ("opencv", "beampose"):
-        with pytest.raises(InputError, match=r"exists and is no .*; choose another name, or remove that file first"):
+        with pytest.raises(InputError, match=r"exists and is not .*; choose another name, or remove that file first"):
             convert(source, old, to_format=target)
     assert old.read_bytes() == before
     old.write_text("")
@@ -149,7 +151,7 @@ def test_only_cameras_of_the_same_format_are_written_over(source, tmp_path, text
     assert "opencv-matrix" in old.read_text()
 
 
-def test_a_folder_is_no_place_for_a_conversion_and_that_is_said_with_the_cure(source, tmp_path):
+def test_a_folder_as_destination_is_refused_with_a_remedy(source, tmp_path):
     (tmp_path / "a.yml").mkdir()
     with pytest.raises(InputError, match="expected a file to write, found a folder; name a file in it"):
         convert(source, tmp_path / "a.yml")
@@ -159,16 +161,16 @@ def test_a_folder_is_no_place_for_a_conversion_and_that_is_said_with_the_cure(so
         convert(source, tmp_path / "none" / "b.yml")
 
 
-def test_neither_the_source_nor_a_rig_is_written_over(rig, source):
+def test_the_source_and_a_rig_are_not_overwritten(rig, source):
     with pytest.raises(InputError, match="source and destination are the same file"):
         convert(source, source, to_format="opencv")
-    with pytest.raises(InputError, match="is a rig, which one camera must not replace"):
+    with pytest.raises(InputError, match="is a rig; a camera must not replace it"):
         convert(source, rig, to_format="beampose")
     assert rig.read_text() == RIG
 
 
-def test_a_destination_whose_name_says_nothing_needs_a_format(source, tmp_path):
-    with pytest.raises(InputError, match=r"the name does not tell the format; add --to with one of beampose, opencv"):
+def test_a_destination_with_an_unknown_name_needs_a_format(source, tmp_path):
+    with pytest.raises(InputError, match="the name does not indicate the format; add --to with one of beampose"):
         convert(source, tmp_path / "left.yaml")
     with pytest.raises(InputError, match=r"--to: expected .*, got 'kalib'; did you mean 'kalibr'\?"):
         convert(source, tmp_path / "left.yaml", to_format="kalib")
@@ -178,5 +180,5 @@ def test_a_destination_whose_name_says_nothing_needs_a_format(source, tmp_path):
 def test_every_format_is_recognised_by_its_content_alone(source, tmp_path):
     for name in FORMATS:
         convert(source, tmp_path / "anything.dat", to_format=name)
-        assert recognise((tmp_path / "anything.dat").read_text(), tmp_path / "anything.dat") == name
+        assert recognised_format((tmp_path / "anything.dat").read_text(), tmp_path / "anything.dat") == name
         (tmp_path / "anything.dat").unlink()

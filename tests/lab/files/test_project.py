@@ -1,4 +1,4 @@
-"""calibration.yaml and its tables: what is read, and how each mistake is told."""
+"""calibration.yaml and its tables: values and error messages."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def changed(path, **changes):
     return path
 
 
-def test_a_project_says_what_it_holds(tmp_path):
+def test_a_project_has_the_values_of_its_file(tmp_path):
     (tmp_path / "poses.csv").write_text("frame,t_s,x_m,y_m,z_m,qw,qx,qy,qz\n0,0,0,0,0,1,0,0,0\n")
     (tmp_path / "spots.csv").write_text("frame,camera,spot,u_px,v_px\n")
     path = write_project(
@@ -104,7 +104,7 @@ def board(photos):
         ),
     ],
 )
-def test_mistakes_name_file_and_field_and_what_to_do(tmp_path, changes, words):
+def test_mistakes_name_file_field_and_remedy(tmp_path, changes, words):
     path = changed(write_project(tmp_path), **changes)
     with pytest.raises(InputError, match=words) as caught:
         load_project(path)
@@ -135,7 +135,7 @@ def test_lenses_come_from_exchange_formats_too(tmp_path):
 @pytest.mark.parametrize(
     ("name", "placement"), [("left07.jpg", "000007"), ("cam1-shot12.png", "000012"), ("a.png", "a")]
 )
-def test_the_last_number_of_a_name_tells_the_placement(tmp_path, name, placement):
+def test_the_last_number_of_a_name_is_the_placement(tmp_path, name, placement):
     assert placement_of(tmp_path / name) == placement
 
 
@@ -162,7 +162,7 @@ SURVEY = "point,x_m,y_m,z_m,sigma_x_m,sigma_y_m,sigma_z_m,screen\n"
         (SURVEY.replace(",", ";"), "expected columns separated by commas, got semicolons; separate columns"),
         (SURVEY.encode("utf-16"), "not text in UTF-8; save it as CSV"),
         (b"\x89PNG\r\n\0\0", "not text in UTF-8; save it as CSV"),
-        (SURVEY.encode() + b"P\xfcnkt,0,0,0,,,,\n", "line 2: expected text in UTF-8, got a byte that is none; save"),
+        (SURVEY.encode() + b"P\xfcnkt,0,0,0,,,,\n", "line 2: expected text in UTF-8, got an invalid byte; save"),
         (
             SURVEY + "P1,0,0,0,,,,\nP1,1,0,0,,,,\n",
             r"line 3: .* each point once, got 'P1' again \(first in survey.csv, line 2\)",
@@ -170,10 +170,10 @@ SURVEY = "point,x_m,y_m,z_m,sigma_x_m,sigma_y_m,sigma_z_m,screen\n"
         (SURVEY + "P1,0,0,0,0,1,1,\n", "line 2: sigma_x_m: expected a number above 0, got 0"),
         (SURVEY + "P1,0,0,0,,,,lefd\n", "line 2: screen: .* got 'lefd'; did you mean 'left'"),
         (SURVEY + ",0,0,0,,,,\n", "line 2: point: expected a name"),
-        (SURVEY + "P1,0,0,0,,,,\nP2,1,5,0,0,1,1,1,left,9\n", "more fields than the header"),
+        (SURVEY + "P1,0,0,0,,,,\nP2,1,5,0,0,1,1,1,left,9\n", "line 3: expected 8 fields as in the header, got more"),
     ],
 )
-def test_surveys_that_cannot_be_used_say_which_line_and_why(tmp_path, text, words):
+def test_an_unusable_survey_is_refused_with_line_and_reason(tmp_path, text, words):
     path = tmp_path / "survey.csv"
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
     with pytest.raises(InputError, match=words) as caught:
@@ -181,7 +181,7 @@ def test_surveys_that_cannot_be_used_say_which_line_and_why(tmp_path, text, word
     assert str(caught.value).isprintable()  # nothing of a binary file goes to the terminal
 
 
-def test_only_an_empty_sigma_means_that_none_is_known(tmp_path):
+def test_only_an_empty_sigma_counts_as_unknown(tmp_path):
     (tmp_path / "points.csv").write_text(POINTS + "left,P1,2560,1,\nleft,P2,-1280,1,0.3\n")
     with pytest.raises(InputError, match="of the survey, which has none, got 'P1'; add `survey`"):
         read_observations([tmp_path / "points.csv"], {"left": (1280, 1024)}, [])
@@ -200,7 +200,7 @@ def test_targets_of_a_scan_may_be_millimetres_in_a_national_grid(tmp_path):
         read_survey([path], [])
 
 
-def test_a_survey_without_sigmas_is_given_a_millimetre_and_says_so(tmp_path):
+def test_a_survey_without_sigmas_gets_a_millimetre_which_is_noted(tmp_path):
     path = tmp_path / "survey.csv"
     path.write_text("point,x_m,y_m,z_m\n1,0,0,0\n2,1,0,0\n")
     survey = read_survey([path], [])
@@ -232,7 +232,7 @@ POINTS = "camera,point,u_px,v_px,sigma_px\n"
         (POINTS + "left,P1,2561,1,0.1\n", "line 2: u_px: expected a pixel in or near the picture"),
     ],
 )
-def test_points_that_cannot_be_used_say_which_line_and_why(tmp_path, text, words):
+def test_unusable_points_are_refused_with_line_and_reason(tmp_path, text, words):
     path = tmp_path / "points.csv"
     path.write_text(text)
     with pytest.raises(InputError, match=words):
@@ -242,7 +242,7 @@ def test_points_that_cannot_be_used_say_which_line_and_why(tmp_path, text, words
 POSES = "frame,t_s,x_m,y_m,z_m,qw,qx,qy,qz"
 
 
-def test_poses_of_a_stand_are_read_with_the_sigmas_that_they_have(tmp_path):
+def test_poses_of_a_stand_are_read_with_their_sigmas(tmp_path):
     path = tmp_path / "poses.csv"
     path.write_text(f"{POSES},sigma_rot_z_deg\n3,0,1,2,3,1,0,0,0,0.1\n5,1,1,2,3,0,0,0,1,\n")
     poses = read_poses(path)
@@ -260,13 +260,13 @@ def test_poses_of_a_stand_are_read_with_the_sigmas_that_they_have(tmp_path):
             "0,0,0,0,0,1,1,0,0\n",
             "line 2: .*quaternion of length 1, got one of length 1.414214; give all digits, or divide",
         ),
-        ("0,0,0,0,0,0,0,0,0\n", "line 2: .*got one of length 0; where nothing is turned it is 1,0,0,0"),
+        ("0,0,0,0,0,0,0,0,0\n", "line 2: .*got one of length 0; without rotation it is 1,0,0,0"),
         ("0,0,0,inf,0,1,0,0,0\n", "line 2: y_m: expected a number, got inf"),
         ("0,0,0,1e300,0,1,0,0,0\n", "line 2: y_m: expected metres, within 10 km"),
         ("0,later,0,0,0,1,0,0,0\n", "line 2: t_s: expected seconds, got 'later'"),
     ],
 )
-def test_poses_that_are_none_are_refused(tmp_path, rows, words):
+def test_invalid_poses_are_refused(tmp_path, rows, words):
     path = tmp_path / "poses.csv"
     path.write_text(f"{POSES}\n{rows}")
     with pytest.raises(InputError, match=words):

@@ -1,4 +1,4 @@
-"""The covariance blocks of a rig file as one covariance, and a calibration's state: who may use it, and until when."""
+"""The covariance blocks of a rig file as one covariance, and the validity of a calibration."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from lab.simulate.rigs import RIGS
 RIG = RIGS["fan"]()
 
 
-def test_blocks_of_single_things_stand_beside_each_other():
+def test_separate_blocks_are_uncorrelated():
     blocks = {
         "cameras.left": Covariance(("fx", "cx"), np.array([[4.0, 1.0], [1.0, 9.0]])),
         "screens.right": Covariance(("x_m",), np.array([[1e-6]])),
@@ -31,7 +31,7 @@ def test_blocks_of_single_things_stand_beside_each_other():
     np.testing.assert_array_equal(joint.matrix, expected)
 
 
-def test_a_joint_block_of_the_target_is_the_whole_truth():
+def test_a_joint_block_of_the_target_is_complete():
     blocks = {
         "cameras.left": Covariance(("fx",), np.array([[4.0]])),
         "target": Covariance(("cameras.left.fx", "beams.A.direction_x"), np.array([[4.0, 1e-5], [1e-5, 1e-8]])),
@@ -41,7 +41,7 @@ def test_a_joint_block_of_the_target_is_the_whole_truth():
     assert joint.matrix[0, 1] == 1e-5
 
 
-def test_names_of_others_are_passed_over():
+def test_unknown_names_are_ignored():
     blocks = {"target": Covariance(("A.x", "beams.A.point_x_m", "B.y"), np.diag([-1.0, 4e-8, np.pi]))}
     joint = joint_covariance(RIG, blocks, "rig.yaml")
     assert joint.names == ("beams.A.point_x_m",)
@@ -54,16 +54,16 @@ def test_names_of_others_are_passed_over():
     [
         ([[1.0, 0.5], [0.1, 1.0]], "expected a symmetric matrix"),
         ([[1.0, 2.0], [2.0, 1.0]], "negative eigenvalue"),
-        ([[-1.0, 0.0], [0.0, 1.0]], "expected variances from zero up"),
+        ([[-1.0, 0.0], [0.0, 1.0]], "expected variances of 0 or more"),
     ],
 )
-def test_what_is_no_covariance_is_refused_with_its_place(matrix, words):
+def test_a_matrix_that_is_not_a_covariance_is_refused_with_its_field(matrix, words):
     blocks = {"cameras.left": Covariance(("fx", "fy"), np.array(matrix))}
     with pytest.raises(InputError, match=f"rig.yaml: cameras.left.covariance.matrix: .*{words}"):
         joint_covariance(RIG, blocks, "rig.yaml")
 
 
-def test_state_bow_and_joint_covariance_come_back_from_the_file(tmp_path):
+def test_state_bow_and_joint_covariance_are_saved_and_loaded(tmp_path):
     import dataclasses
 
     names = rig_names(RIG)
@@ -94,19 +94,19 @@ def test_a_calibration_may_be_used_up_to_its_last_day_and_not_after(tmp_path):
     assert "calibrate check" in str(caught.value)
 
 
-def test_a_failed_calibration_is_never_used_and_says_why(tmp_path):
+def test_a_failed_calibration_is_refused_with_the_reason(tmp_path):
     state = CalibrationState(DAY, "FAIL", None, ("the stand did not roll",))
     with pytest.raises(CalibrationError, match=r"FAIL \(the stand did not roll\)"):
         require_usable(state, tmp_path / "rig.yaml", DAY)
 
 
-def test_what_says_nothing_of_its_calibration_may_be_used(tmp_path):
+def test_a_rig_without_a_calibration_state_may_be_used(tmp_path):
     require_usable(None, tmp_path / "rig.yaml", DAY)
     require_usable(CalibrationState(DAY, "WARN"), tmp_path / "rig.yaml", DAY)
 
 
 @pytest.mark.parametrize("date", ["yesterday", "14.3.2026", "2026-13-01", "7"])
-def test_a_date_that_is_none_is_refused(tmp_path, date):
+def test_an_invalid_date_is_refused(tmp_path, date):
     save_rig(RigFile(RIG, {}, CalibrationState(DAY, "PASS")), tmp_path / "rig.yaml")
     text = (tmp_path / "rig.yaml").read_text().replace("2026-03-14", date)
     (tmp_path / "rig.yaml").write_text(text)

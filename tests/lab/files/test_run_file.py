@@ -1,4 +1,4 @@
-"""run.yaml and times.csv: what is read is what the file says, and each mistake has its line."""
+"""run.yaml and times.csv: values, and a line for each mistake."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from geometry import rotations
 from lab.errors import InputError
 from lab.files.run.run_file import DetectionsTable, FramesFolder, VideoFile, load_run, save_run
 from lab.files.run.times import Times
-from lab.files.text.fields import dataclass_from_yaml
+from lab.files.text.dataclass_fields import dataclass_from_yaml
 from tests.lab.run_folders import RUN, edit, write_run
 from tracking.parameters import DetectParameters, TrackerParameters
 
 
-def test_a_run_is_what_its_file_says(tmp_path):
+def test_a_run_has_the_values_of_its_file(tmp_path):
     run = load_run(write_run(tmp_path / "a"))
     assert (run.name, run.frame_rate_hz, run.exposure_s, run.notes) == ("small", 100.0, None, "")
     assert run.cameras == {
@@ -32,7 +32,7 @@ def test_a_run_is_what_its_file_says(tmp_path):
     assert load_run(tmp_path / "a" / "run.yaml").name == "small"
 
 
-def test_the_prior_is_in_radians_and_turns_in_the_contracts_order(tmp_path):
+def test_the_prior_is_in_radians_with_the_angles_of_the_contract(tmp_path):
     folder = write_run(tmp_path / "a")
     edit(folder / "run.yaml", "yaw_pitch_roll_deg: [0.0, 0.0, 0.0]", "yaw_pitch_roll_deg: [90, 0, 20]")
     edit(folder / "run.yaml", "position_m: [0.0, 0.0, 0.0]", "position_m: [1, 2, 3]")
@@ -44,7 +44,7 @@ def test_the_prior_is_in_radians_and_turns_in_the_contracts_order(tmp_path):
     np.testing.assert_allclose(rotations.angle(rotations.exp(np.array([prior.within_rad, 0, 0]))), np.deg2rad(10))
 
 
-def test_a_camera_may_be_left_out_and_then_is_not_in_the_runs_rig(tmp_path):
+def test_a_camera_that_is_left_out_is_not_in_the_rig_of_the_run(tmp_path):
     folder = write_run(tmp_path / "a")
     edit(folder / "run.yaml", "  right: {frames: frames/right}\n", "")
     run = load_run(folder)
@@ -53,7 +53,7 @@ def test_a_camera_may_be_left_out_and_then_is_not_in_the_runs_rig(tmp_path):
     assert set(run.rig.spots) == {"1", "2", "3", "4", "5", "6"}
 
 
-def test_what_a_camera_has_is_told_by_what_lies_there(tmp_path):
+def test_the_kind_of_source_follows_from_the_path(tmp_path):
     folder = write_run(tmp_path / "a")
     (folder / "left.avi").write_bytes(b"x")
     (folder / "found.csv").write_text("frame,camera,u_px,v_px\n")
@@ -64,7 +64,7 @@ def test_what_a_camera_has_is_told_by_what_lies_there(tmp_path):
     assert cameras["right"] == DetectionsTable(folder / "found.csv")
 
 
-def test_tracker_settings_are_read_into_their_type_and_the_rest_keeps_its_default(tmp_path):
+def test_tracker_parameters_are_read_and_others_keep_their_default(tmp_path):
     folder = write_run(tmp_path / "a")
     with (folder / "run.yaml").open("a") as file:
         file.write("tracker: {method: spots, r1_px: 7, detect: {max_detections: 9, saturation_dn: null}}\n")
@@ -115,7 +115,7 @@ def test_parameters_of_every_kind_are_read():
         (["rigid"], "t: expected a mapping, got ['rigid']"),
     ],
 )
-def test_a_wrong_parameter_is_told_where_it_stands(block, words):
+def test_a_wrong_parameter_is_reported_with_its_field(block, words):
     with pytest.raises(InputError) as caught:
         dataclass_from_yaml(_Outer, block, "run.yaml", "t")
     assert str(caught.value) == f"run.yaml: {words}"
@@ -163,7 +163,7 @@ BROKEN = [
 
 
 @pytest.mark.parametrize(("old", "new", "words"), BROKEN)
-def test_a_mistake_gets_one_line_that_names_field_expected_and_found(old, new, words, tmp_path):
+def test_a_mistake_is_one_line_with_field_expected_and_found(old, new, words, tmp_path):
     folder = write_run(tmp_path / "a", frames=1)
     edit(folder / "run.yaml", old, new)
     with pytest.raises(InputError) as caught:
@@ -189,13 +189,13 @@ def test_a_mistake_in_the_rig_names_the_rig(tmp_path):
 
 
 @pytest.mark.parametrize(("make", "words"), [(Path.touch, "found a file"), (lambda p: None, "found nothing")])
-def test_a_path_that_is_no_folder_is_told_so(make, words, tmp_path):
+def test_a_path_that_is_not_a_folder_is_refused(make, words, tmp_path):
     make(tmp_path / "a")
     with pytest.raises(InputError, match=f"expected a run folder, {words}"):
         load_run(tmp_path / "a")
 
 
-def test_what_is_saved_is_what_is_loaded(tmp_path):
+def test_a_saved_run_loads_to_the_same_values(tmp_path):
     folder = write_run(tmp_path / "a")
     content = {
         "name": "1e-3",
@@ -212,7 +212,7 @@ def test_what_is_saved_is_what_is_loaded(tmp_path):
     assert run.prior is None
 
 
-def test_nothing_is_saved_that_could_not_be_loaded(tmp_path):
+def test_a_run_that_could_not_be_loaded_is_not_saved(tmp_path):
     folder = write_run(tmp_path / "a")
     with pytest.raises(InputError, match=r"run\.yaml: tracker: unknown key 'r3_px'"):
         save_run({"rig": "rig.yaml", "frame_rate_hz": 1.0, "cameras": {"left": {"frames": "x"}},
@@ -223,7 +223,7 @@ def test_nothing_is_saved_that_could_not_be_loaded(tmp_path):
 # Times ----------------------------------------------------------------------------------------------------------
 
 
-def test_timestamps_hold_where_given_and_a_dropped_frame_lies_between():
+def test_times_of_dropped_frames_are_interpolated():
     times = Times(10.0, np.array([2, 3, 6]), np.array([1.0, 1.2, 2.1]))
     np.testing.assert_allclose(times.t_s(np.array([2, 3, 4, 5, 6])), [1.0, 1.2, 1.5, 1.8, 2.1])
     np.testing.assert_allclose(times.t_s(np.array([0, 8])), [0.8, 2.3])  # beyond: the nominal rate
@@ -246,7 +246,7 @@ def test_timestamps_hold_where_given_and_a_dropped_frame_lies_between():
         ("", "times.csv: expected columns frame,t_s, got an empty file"),
     ],
 )
-def test_wrong_timestamps_are_told_with_their_line(text, words, tmp_path):
+def test_wrong_timestamps_are_reported_with_their_line(text, words, tmp_path):
     folder = write_run(tmp_path / "a", frames=1)
     edit(folder / "run.yaml", "name: small", "name: small\ntimestamps: times.csv")
     (folder / "times.csv").write_text(text)

@@ -1,4 +1,4 @@
-"""Truth tables: good ones are read, wrong ones told with their line, and a rig that made them is recognised."""
+"""Truth tables: mistakes are reported with their line, and the rig that made them is recognised."""
 
 from __future__ import annotations
 
@@ -12,7 +12,10 @@ from geometry.pose import Pose
 from geometry.rig import Rig
 from lab.errors import InputError
 from lab.files.rig.rig_file import load_rig
-from lab.files.run.truth import largest_disagreement_px, load_truth
+from lab.files.run.run_file import load_run
+from lab.files.run.truth import largest_disagreement_px, load_run_truth, load_truth
+from lab.runs.check import check
+from lab.runs.process import ready_run
 from tests.lab.run_folders import edit, write_run
 
 POSE = "frame,t_s,x_m,y_m,z_m,qw,qx,qy,qz\n"
@@ -39,11 +42,11 @@ def write_truth(folder: Path, rig: Rig, count: int = 5) -> None:
 def test_truth_made_with_this_rig_agrees_with_it_and_with_no_other(tmp_path):
     folder = write_run(tmp_path / "a")
     rig = load_rig(folder / "rig.yaml")
-    assert load_truth(folder, rig) is None
+    assert load_truth(folder) is None
     write_truth(folder, rig)
-    truth = load_truth(folder, rig)
-    assert len(truth.pose) == 5
-    assert len(truth.spots) == 30
+    truth = load_truth(folder, rig.cameras, rig.spots)
+    assert len(truth.pose.frame) == 5
+    assert len(truth.spots.frame) == 30
     assert largest_disagreement_px(truth, rig)[0] < 1e-9
     edit(folder / "rig.yaml", "[-0.05, 0.01, 1e-3, 0, 0]", "[-0.06, 0.01, 1e-3, 0, 0]")
     worst, frame = largest_disagreement_px(truth, load_rig(folder / "rig.yaml"))
@@ -55,8 +58,8 @@ def test_the_frame_that_disagrees_is_named(tmp_path):
     folder = write_run(tmp_path / "a")
     rig = load_rig(folder / "rig.yaml")
     write_truth(folder, rig)
-    truth = load_truth(folder, rig)
-    truth.spots.loc[truth.spots["frame"] == 3, "u_px"] += 0.5
+    truth = load_truth(folder, rig.cameras, rig.spots)
+    truth.spots.uv_px[truth.spots.frame == 3, 0] += 0.5
     worst, frame = largest_disagreement_px(truth, rig)
     np.testing.assert_allclose(worst, 0.5, atol=1e-9)
     assert frame == 3
@@ -79,18 +82,22 @@ def test_the_frame_that_disagrees_is_named(tmp_path):
         (
             "spots.csv",
             SPOTS + "0,lft,1,1,2,1\n",
-            "camera: expected a camera of the rig, got 'lft'; did you mean 'left'?",
+            "line 2: camera: expected a camera of the rig, got 'lft'; did you mean 'left'?",
         ),
-        ("spots.csv", SPOTS + "0,left,9,1,2,1\n", "spot: expected a spot of the rig, got '9'; known: 1, 2, 3"),
-        ("spots.csv", SPOTS + "0,left,1,1,2,1\n" * 2, "line 3: expected one row per frame, camera and spot, a second"),
+        ("spots.csv", SPOTS + "0,left,9,1,2,1\n", "line 2: spot: expected a spot of the rig, got '9'; known: 1, 2, 3"),
+        (
+            "spots.csv",
+            SPOTS + "0,left,1,1,2,1\n" * 2,
+            "line 3: expected one row per frame, camera and spot, got a second one for frame 0",
+        ),
     ],
 )
-def test_a_mistake_in_the_truth_is_told_with_its_line(name, text, words, tmp_path):
+def test_a_mistake_in_the_truth_is_reported_with_its_line(name, text, words, tmp_path):
     folder = write_run(tmp_path / "a", frames=1)
     (folder / "truth").mkdir()
     (folder / "truth" / name).write_text(text)
     with pytest.raises(InputError) as caught:
-        load_truth(folder, load_rig(folder / "rig.yaml"))
+        load_run_truth(load_run(folder))
     assert words in str(caught.value)
 
 
@@ -98,6 +105,35 @@ def test_a_spot_without_projection_may_be_empty_outside_the_picture(tmp_path):
     folder = write_run(tmp_path / "a", frames=1)
     (folder / "truth").mkdir()
     (folder / "truth" / "spots.csv").write_text(SPOTS + "0,left,1,,,0\n")
-    truth = load_truth(folder, load_rig(folder / "rig.yaml"))
+    truth = load_run_truth(load_run(folder))
     assert truth.pose is None
-    assert np.isnan(truth.spots["u_px"][0])
+    assert np.isnan(truth.spots.uv_px[0, 0])
+
+
+def test_check_and_run_accept_truth_of_a_camera_that_the_run_leaves_out(tmp_path):
+    folder = write_run(tmp_path / "a")
+    write_truth(folder, load_rig(folder / "rig.yaml"))
+    edit(folder / "run.yaml", "  right: {frames: frames/right}\n", "")
+    run = load_run(folder)
+    assert run.left_out == ("right",)
+    assert load_run_truth(run).spots.camera.words == ("left", "right")
+    assert not any("truth" in line for line in check(folder).lines if "problem" in line)
+    assert any("Truth: pose.csv frames 0 to 4" in line for line in check(folder).lines)
+    ready_run(folder)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("pose.csv", POSE.encode() + b"0,0,0,0,0,1,0,0,0\n\xff", "pose.csv: line 3: expected text in UTF-8"),
+        ("spots.csv", SPOTS.encode() + b"0,left,9,1,2,1\n", "line 2: spot: expected a spot of the rig, got '9'"),
+    ],
+)
+def test_check_and_run_refuse_the_same_truth_before_anything_is_processed(name, content, words, tmp_path):
+    folder = write_run(tmp_path / "a")
+    (folder / "truth").mkdir()
+    (folder / "truth" / name).write_bytes(content)
+    assert any(words in line for line in check(folder).lines)
+    with pytest.raises(InputError) as caught:
+        ready_run(folder)
+    assert words in str(caught.value)

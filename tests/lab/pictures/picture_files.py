@@ -1,4 +1,4 @@
-"""Picture files made by hand, with whatever a test wants to be in them: PNG and TIFF."""
+"""Writers of PNG and TIFF files with freely chosen contents, for tests."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def png(
     content: bytes | None = None,
     split: int = 1000,
 ) -> bytes:
-    """A PNG of samples (h, w) or (h, w, channels). filters: of the rows in turn. size, content: what it pretends."""
+    """A PNG of samples (h, w) or (h, w, channels). filters: of the rows in turn. size, content: false values."""
     height, width = samples.shape[:2]
     bits = bits or 8 * samples.dtype.itemsize
     raw = b"".join(_rows(samples[top::down, left::across], bits, filters) for left, top, across, down in ADAM7)
@@ -39,7 +39,7 @@ def png(
 
 
 def _rows(samples: np.ndarray, bits: int, filters: tuple[int, ...]) -> bytes:
-    """Filtered rows. Source: PNG, ISO 15948, 9.2, written as it stands there."""
+    """Filtered rows. Source: PNG, ISO 15948, 9.2, implemented literally."""
     if not samples.size:
         return b""
     channels = 1 if samples.ndim == 2 else samples.shape[2]

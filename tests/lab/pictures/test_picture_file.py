@@ -1,4 +1,4 @@
-"""Picture files of every kind: right to the last bit where they are sound, a plain reason where they are not."""
+"""Picture files of every kind: decoded to the last bit where intact, a reason where damaged."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import pytest
 
-from lab.pictures.inflate import inflated
+from lab.pictures.inflate import decompress
 from lab.pictures.picture_file import Missing, decode, read_picture
 from tests.lab.pictures.picture_files import chunk, png, tiff
 
@@ -58,7 +58,7 @@ def test_a_grey_png_of_every_filter_is_read_to_the_last_bit(dtype, filters):
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 @pytest.mark.parametrize(("colour_type", "channels"), [(0, 1), (2, 3), (4, 2), (6, 4)])
 @pytest.mark.parametrize("interlaced", [False, True])
-def test_every_other_png_is_what_opencv_makes_of_it(dtype, colour_type, channels, interlaced):
+def test_other_pngs_are_decoded_as_by_opencv(dtype, colour_type, channels, interlaced):
     data = png(noise(dtype, channels), colour_type=colour_type, interlaced=interlaced, filters=(0, 4))
     assert_same(data, as_opencv(data))
     if channels < 3:
@@ -72,7 +72,7 @@ def test_pixels_of_less_than_a_byte_fill_the_range_of_8_bits(bits):
 
 
 @pytest.mark.parametrize("transparent", [b"", chunk(b"tRNS", bytes(range(16)))])
-def test_a_palette_is_looked_up_and_becomes_grey_as_colour_does(transparent):
+def test_a_palette_is_applied_and_converted_to_grey(transparent):
     colours = np.random.default_rng(1).integers(0, 256, (16, 3)).astype(np.uint8)
     data = png(noise(largest=15), colour_type=3, bits=4, before=chunk(b"PLTE", colours.tobytes()) + transparent)
     assert_same(data, as_opencv(data))
@@ -80,13 +80,13 @@ def test_a_palette_is_looked_up_and_becomes_grey_as_colour_does(transparent):
     assert np.abs(decode(data, SIZE) - (0.299 * red + 0.587 * green + 0.114 * blue)).max() <= 1
 
 
-def test_what_a_png_says_of_gamma_colour_or_transparency_changes_no_stored_value():
+def test_gamma_colour_and_transparency_chunks_change_no_stored_value():
     remarks = chunk(b"gAMA", struct.pack(">I", 10)) + chunk(b"sBIT", b"\x05") + chunk(b"tRNS", b"\x00\x07")
     assert_same(png(noise(), before=remarks), noise())
 
 
 @pytest.mark.parametrize("colour_type", [0, 2])
-def test_a_png_with_right_checksums_and_damaged_content_is_unreadable_without_a_remark(colour_type, capfd):
+def test_a_png_with_correct_checksums_and_damaged_content_is_unreadable_without_output(colour_type, capfd):
     samples = noise(channels={0: 1, 2: 3}[colour_type])
     packed = bytearray(zlib.compress(samples.tobytes()))
     too_short, too_long = zlib.compress(bytes(100)), zlib.compress(bytes(10**5))
@@ -98,14 +98,14 @@ def test_a_png_with_right_checksums_and_damaged_content_is_unreadable_without_a_
     assert capfd.readouterr() == ("", "")
 
 
-def test_a_filter_that_there_is_not_is_damage(capfd):
+def test_an_unknown_filter_is_damage(capfd):
     rows = np.full((29, 38), 5, np.uint8)
     assert decode(png(noise(), content=zlib.compress(rows.tobytes())), SIZE).reason.endswith("(an unknown filter)")
     assert capfd.readouterr() == ("", "")
 
 
 @pytest.mark.parametrize(("bits", "colour_type"), [(3, 0), (16, 7), (8, 1), (32, 0)])
-def test_a_png_header_of_no_kind_of_picture_is_damage(bits, colour_type, capfd):
+def test_an_impossible_png_header_is_damage(bits, colour_type, capfd):
     data = png(noise(), colour_type=colour_type)
     header = struct.pack(">IIBBBBB", *SIZE, bits, colour_type, 0, 0, 0)
     data = data[:8] + chunk(b"IHDR", header) + data[33:]
@@ -134,8 +134,8 @@ def test_a_tiff_that_opencv_wrote_is_read_to_the_last_bit(compression):
         assert_same(data, noise(dtype))
 
 
-def test_packed_bytes_of_every_length_and_kind_come_back():
-    """Long runs, strings that name themselves, tables that fill up and are emptied, by OpenCV's own packers."""
+def test_packed_bytes_of_every_length_and_kind_are_decompressed():
+    """Long runs, self-referring strings, full and cleared code tables, compressed by OpenCV."""
     rng = np.random.default_rng(2)
     for picture in (
         np.zeros((300, 400), np.uint8),
@@ -149,7 +149,7 @@ def test_packed_bytes_of_every_length_and_kind_come_back():
             np.testing.assert_array_equal(got, picture)
 
 
-def test_an_8_bit_strip_that_cannot_be_unpacked_is_no_picture_of_zeros(capfd):
+def test_a_damaged_8_bit_strip_is_not_a_picture_of_zeros(capfd):
     data = cv2.imencode(".tif", noise(), [cv2.IMWRITE_TIFF_COMPRESSION, 5])[1].tobytes()
     at = data.index(b"\x80", 8)  # the first code of LZW empties the table
     beyond = data[: at + 40] + b"\xff\xff\xff" + data[at + 43 :]  # a code that is not in the table yet
@@ -159,7 +159,7 @@ def test_an_8_bit_strip_that_cannot_be_unpacked_is_no_picture_of_zeros(capfd):
 
 
 @pytest.mark.parametrize("order", ["<", ">"])
-def test_the_turn_that_a_tiff_wishes_for_display_is_not_applied(order):
+def test_the_orientation_tag_of_a_tiff_is_not_applied(order):
     assert_same(tiff(noise(), order=order, tags={274: 3}), noise())
     black_is_one = decode(tiff(noise(), order=order, tags={274: 6, 262: 0}), SIZE)  # by OpenCV
     np.testing.assert_array_equal(black_is_one, 255 - noise())
@@ -168,7 +168,7 @@ def test_the_turn_that_a_tiff_wishes_for_display_is_not_applied(order):
 @pytest.mark.parametrize(
     ("dtype", "name"), [(np.float32, "float32"), (np.float64, "float64"), (np.int16, "int16"), (np.uint32, "uint32")]
 )
-def test_numbers_that_no_camera_makes_are_refused_before_decoding(dtype, name):
+def test_sample_types_that_no_camera_has_are_refused_before_decoding(dtype, name):
     assert decode(tiff(noise().astype(dtype)), SIZE).reason.startswith(f"unreadable: {name} numbers, expected 8 or 16")
 
 
@@ -185,7 +185,7 @@ def test_a_tiff_whose_directory_contradicts_its_content_is_unreadable(changes, c
 
 @pytest.mark.parametrize("largest", [1, 100, 255, 256, 1023, 4095, 65535])
 @pytest.mark.parametrize("head", ["P{} 37 29 {}\n", "P{}\n# by a camera\n37 # wide\n29\n{}\n", "P{}\n37\t29\r{} "])
-def test_a_pgm_has_its_values_as_stored_whatever_the_largest_may_be(largest, head):
+def test_a_pgm_has_its_stored_values_whatever_the_stated_maximum(largest, head):
     dtype = np.uint8 if largest < 256 else np.uint16
     picture = noise(dtype, largest=largest)
     assert_same(head.format(5, largest).encode() + picture.astype(picture.dtype.newbyteorder(">")).tobytes(), picture)
@@ -208,30 +208,30 @@ def test_a_pgm_has_its_values_as_stored_whatever_the_largest_may_be(largest, hea
         (b"P5 37", "cut short"),
     ],
 )
-def test_a_pgm_that_is_none_says_why(data, reason):
+def test_an_invalid_pgm_is_refused_with_the_reason(data, reason):
     assert decode(data, SIZE) == Missing(f"unreadable: {reason}")
 
 
-def test_a_bitmap_of_one_bit_and_one_in_colour_are_what_opencv_makes_of_them():
+def test_pbm_and_colour_ppm_are_decoded_as_by_opencv():
     for data in (b"P4 37 29\n" + bytes(range(5 * 29)), b"P6 37 29 255\n" + noise(channels=3).tobytes()):
         assert_same(data, as_opencv(data))
 
 
 @pytest.mark.parametrize("channels", [1, 3])
-def test_a_bmp_is_what_opencv_makes_of_it(channels):
+def test_a_bmp_is_decoded_as_by_opencv(channels):
     data = cv2.imencode(".bmp", noise(channels=channels))[1].tobytes()
     assert_same(data, as_opencv(data))
 
 
 @pytest.mark.parametrize("channels", [1, 3])
 @pytest.mark.parametrize("progressive", [0, 1])
-def test_a_jpeg_is_what_opencv_makes_of_it(channels, progressive):
+def test_a_jpeg_is_decoded_as_by_opencv(channels, progressive):
     flags = [cv2.IMWRITE_JPEG_QUALITY, 90, cv2.IMWRITE_JPEG_PROGRESSIVE, progressive]
     data = cv2.imencode(".jpg", noise(channels=channels), flags)[1].tobytes()
     assert_same(data, as_opencv(data))
 
 
-def test_a_jpeg_that_is_damaged_inside_is_unreadable_and_one_with_bytes_before_a_marker_is_not(capfd):
+def test_a_damaged_jpeg_is_unreadable_but_padding_before_a_marker_is_allowed(capfd):
     data = cv2.imencode(".jpg", noise())[1].tobytes()
     half = len(data) // 2
     assert decode(data[:half] + data[half + 30 :], SIZE).reason.startswith("unreadable: damaged (")
@@ -240,11 +240,19 @@ def test_a_jpeg_that_is_damaged_inside_is_unreadable_and_one_with_bytes_before_a
     assert capfd.readouterr() == ("", "")
 
 
+def test_a_jpeg_without_an_end_marker_or_a_frame_header_is_unreadable(capfd):
+    data = cv2.imencode(".jpg", noise())[1].tobytes()
+    assert decode(data[:-2], SIZE) == Missing("unreadable: cut short")
+    assert decode(b"\xff\xd8\xff\xd9", SIZE) == Missing("unreadable: damaged (no frame header before the first scan)")
+    assert decode(data[:20], SIZE) == Missing("unreadable: cut short")
+    assert capfd.readouterr() == ("", "")
+
+
 # Hostile headers ------------------------------------------------------------------------------------------------
 
 
 def of_size(kind: str, width: int, height: int) -> bytes:
-    """The smallest file of a kind whose header says this size."""
+    """The smallest file of a kind with this size in its header."""
     if kind == "png":
         return png(noise(), size=(width, height))
     if kind == "colour png":
@@ -269,7 +277,7 @@ KINDS = ["png", "colour png", "tiff", "deflated tiff", "pgm", "ascii pgm", "bmp"
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_another_size_than_the_rig_says_is_seen_in_the_header_and_nothing_is_decoded(kind, monkeypatch):
+def test_a_picture_of_another_size_than_the_rig_has_is_not_decoded(kind, monkeypatch):
     def never(*_):
         raise AssertionError("decoded")
 
@@ -285,14 +293,14 @@ def test_another_size_than_the_rig_says_is_seen_in_the_header_and_nothing_is_dec
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_size_that_the_content_does_not_fill_is_unreadable_without_a_remark(kind, capfd):
+def test_content_smaller_than_the_stated_size_is_unreadable_without_output(kind, capfd):
     got = decode(of_size(kind, 37, 3000), (37, 3000))
     assert isinstance(got, Missing)
     assert capfd.readouterr() == ("", "")
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_whatever_a_file_ends_with_or_holds_it_is_a_picture_or_missing_and_never_an_exception(kind, capfd):
+def test_any_truncated_or_changed_file_is_a_picture_or_missing_never_an_exception(kind, capfd):
     whole = of_size(kind, *SIZE)
     rng = np.random.default_rng(11)
     for end in {*range(min(len(whole), 120)), *rng.integers(0, len(whole), 30).tolist()}:
@@ -305,11 +313,11 @@ def test_whatever_a_file_ends_with_or_holds_it_is_a_picture_or_missing_and_never
     assert capfd.readouterr() == ("", "")
 
 
-def test_a_stream_that_unpacks_to_gigabytes_is_given_up_at_the_size_of_the_picture():
+def test_a_stream_of_gigabytes_is_decompressed_only_to_the_size_of_the_picture():
     packer = zlib.compressobj()
     bomb = b"".join(packer.compress(bytes(1 << 20)) for _ in range(500)) + packer.flush()
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    assert inflated(bomb, 30 * 37) is None
+    assert decompress(bomb, 30 * 37) is None
     assert isinstance(decode(png(noise(), content=bomb), SIZE), Missing)
     grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
     assert grown <= 50_000 * (1024 if sys.platform == "darwin" else 1)
@@ -342,8 +350,8 @@ def test_pictures_are_the_same_for_any_number_of_threads(suffix, tmp_path):
                 np.testing.assert_array_equal(a, b)
 
 
-def test_other_threads_go_on_while_a_png_is_decoded():
-    """The GIL is released: a thread that counts is not held up for the time that one picture takes."""
+def test_other_threads_run_while_a_png_is_decoded():
+    """The GIL is released: a counting thread continues during the decoding."""
     big = np.random.default_rng(0).integers(0, 3, (3000, 4000)).astype(np.uint8)
     data = cv2.imencode(".png", big, [cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_PAETH])[1].tobytes()
     decode(data, None)
@@ -370,7 +378,7 @@ for line in sys.stdin.buffer.read().split(b"=====")[:-1]:
 """
 
 
-def test_nothing_reaches_standard_error_in_a_process_of_its_own():
+def test_a_process_writes_nothing_to_standard_error():
     files = [of_size(kind, 37, 300) for kind in KINDS]
     out = subprocess.run(
         [sys.executable, "-c", CHATTER], input=b"".join(f + b"=====" for f in files), capture_output=True, check=True

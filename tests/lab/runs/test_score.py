@@ -283,7 +283,7 @@ def test_a_table_without_a_column_is_an_error_that_names_file_and_column(quiet, 
     fake = make(tmp_path, 3)
     path = fake.results / "spots.csv"
     path.write_text(path.read_text().replace("predicted_u_px", "predicted_x"))
-    with pytest.raises(InputError, match=r"spots\.csv: expected a column 'predicted_u_px', found frame, t_s"):
+    with pytest.raises(InputError, match=r"spots\.csv: expected a column 'predicted_u_px', got frame,t_s"):
         read_spots(fake.results)
 
 
@@ -291,7 +291,7 @@ def test_a_table_with_a_word_for_a_number_is_an_error_that_names_the_file(tmp_pa
     fake = make(tmp_path, 3)
     path = fake.results / "attitude.csv"
     path.write_text(path.read_text().replace("0.01", "oh", 1))
-    with pytest.raises(InputError, match=r"attitude\.csv: expected rows of equal length and numbers"):
+    with pytest.raises(InputError, match=r"attitude\.csv: line \d+: expected \d+ fields as in the header, and numbers"):
         read_poses(fake.results)
 
 

@@ -53,8 +53,10 @@ def test_the_truth_beside_it_explains_every_spot_and_every_dot_to_their_sigmas(f
     model = SpotModel.of(truth)
     pixels, _ = model.project(poses.stand_from_body)
     spots = read_table(folder / "spots.csv", ("frame", "camera", "spot", "u_px", "v_px"))
-    view = [model.views.index(v) for v in zip(spots["camera"], spots["spot"], strict=True)]
-    away = spots[["u_px", "v_px"]].to_numpy() - pixels[spots["frame"].to_numpy(dtype=int), view]
+    view = [
+        model.views.index(v) for v in zip(spots.words["camera"].tolist(), spots.words["spot"].tolist(), strict=True)
+    ]
+    away = spots.stack("u_px", "v_px") - pixels[spots.whole("frame"), view]
     # Some 90 numbers: their RMS scatters by 7 %.
     assert np.sqrt(np.mean(away**2)) == pytest.approx(0.054, rel=0.25)
 

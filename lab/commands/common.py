@@ -1,0 +1,153 @@
+"""Common parts of all commands: error messages and exit statuses, argument types, --set, the progress bar."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import click
+
+from lab.errors import BeamposeError
+
+FOLDER = click.Path(file_okay=False, path_type=Path)
+ANY_PATH = click.Path(path_type=Path)
+PIPE_CLOSED = 141  # 128 + SIGPIPE: the status that a shell reports for a program whose reader has gone
+
+
+class _StderrHandler(logging.Handler):
+    """Shows log messages of the libraries below, such as that they compile, as lines on stderr."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        print(f"beampose: {record.getMessage()}", file=sys.stderr)  # not by click, which writes into a progress bar
+
+
+def _show_log_on_a_terminal() -> None:
+    """Shows log messages where a progress bar is shown. Elsewhere, any line on stderr indicates a problem."""
+    logger = logging.getLogger("beampose")
+    if sys.stderr.isatty() and not logger.handlers:
+        logger.addHandler(_StderrHandler())
+        logger.setLevel(logging.INFO)
+
+
+def _open_standard_streams() -> None:
+    """Opens the null device in place of standard streams that the caller closed.
+
+    Otherwise Python sets them to None, and the next file that is opened gets their number: what a library writes to
+    standard error would then end up in that file.
+    """
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, mode, encoding="utf-8"))  # noqa: SIM115 - open until the end
+
+
+@contextlib.contextmanager
+def _quiet_when_the_reader_has_gone() -> Iterator[None]:
+    """Ends the program without a message where the reader of stdout or stderr has gone (`beampose ... | head`)."""
+    try:
+        yield
+    except BrokenPipeError:
+        # Python writes what is left in its buffers at exit: it must go somewhere.
+        null = os.open(os.devnull, os.O_WRONLY)
+        for stream in (sys.stdout, sys.stderr):
+            with contextlib.suppress(OSError, ValueError):
+                os.dup2(null, stream.fileno())
+        sys.exit(PIPE_CLOSED)
+
+
+class Commands(click.Group):
+    """A group whose errors (the lab's own and click's) end as one or two plain lines and an exit status."""
+
+    def main(self, *args: Any, **kwargs: Any) -> Any:
+        _open_standard_streams()
+        _show_log_on_a_terminal()
+        with _quiet_when_the_reader_has_gone():
+            try:
+                sys.exit(super().main(*args, **{**kwargs, "standalone_mode": False}))
+            except click.exceptions.NoArgsIsHelpError as error:
+                error.show()
+                sys.exit(error.exit_code)
+            except click.UsageError as error:
+                click.echo(f"beampose: {error.format_message()}", err=True)
+                if error.ctx:
+                    click.echo(f"Help: {error.ctx.command_path} --help", err=True)
+                sys.exit(error.exit_code)
+            except click.Abort:
+                click.echo("beampose: stopped", err=True)
+                sys.exit(1)
+
+    def make_context(self, *args: Any, **kwargs: Any) -> click.Context:
+        with _quiet_when_the_reader_has_gone():  # --help and --version are printed here
+            return super().make_context(*args, **kwargs)
+
+    def invoke(self, ctx: click.Context) -> Any:
+        with _quiet_when_the_reader_has_gone():
+            try:
+                return super().invoke(ctx)
+            except BrokenPipeError:
+                raise
+            except BeamposeError as error:
+                click.echo(f"beampose: {error}", err=True)
+                sys.exit(error.exit_status)
+            except MemoryError:
+                click.echo("beampose: out of memory", err=True)
+                sys.exit(1)
+            except OSError as error:
+                where = f"{error.filename}: " if error.filename else ""
+                click.echo(f"beampose: {where}{error.strerror or error}", err=True)
+                sys.exit(1)
+
+
+def read_settings(ctx: click.Context, parameter: click.Parameter, values: Sequence[str]) -> dict[str, Any]:
+    """NAME=VALUE pairs; a value is read as in run.yaml."""
+    from lab.files.text.yaml_text import parse_value  # only where there are such options
+
+    out: dict[str, Any] = {}
+    for text in values:
+        name, equals, value = text.partition("=")
+        if not equals or not name.strip():
+            raise click.BadParameter(f"expected NAME=VALUE, got {text!r}", ctx=ctx, param=parameter)
+        try:
+            out[name.strip()] = parse_value(value, name.strip())
+        except BeamposeError as error:
+            raise click.BadParameter(str(error), ctx=ctx, param=parameter) from None
+    return out
+
+
+set_option = click.option(
+    "--set",
+    "settings",
+    multiple=True,
+    metavar="NAME=VALUE",
+    callback=read_settings,
+    help="A tracker parameter in place of run.yaml's, e.g. --set r1_px=12 or --set detect.threshold_sigma=5.",
+)
+
+
+@contextlib.contextmanager
+def progress_bar(name: str) -> Iterator[Callable[..., None] | None]:
+    """A progress bar on a terminal, None elsewhere. Its arguments: items done, items in all, stage."""
+    if not sys.stderr.isatty():
+        yield None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    parts = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*parts, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(name, total=None)
+
+        def update(done: int, total: int | None, stage: str = "") -> None:
+            bar.update(task, completed=done, total=total, description=f"{name}: {stage}" if stage else name)
+
+        yield update
+
+
+def conclude(outcome: Any) -> None:
+    """Prints an outcome and ends with its exit status."""
+    click.echo(outcome.line())
+    sys.exit(outcome.exit_status)

@@ -1,0 +1,147 @@
+"""`beampose plan` and `simulate`: before anything is recorded."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import click
+
+from lab.commands.common import ANY_PATH, FOLDER, conclude, progress_bar, read_settings
+
+
+@click.command()
+@click.argument("scenario")
+@click.option("--out", type=FOLDER, help="The run folder to write; it must not exist yet.")
+@click.option(
+    "--seed", default=0, show_default=True, type=click.IntRange(min=0), help="The same seed gives the same bytes."
+)
+@click.option("--frames", type=click.IntRange(min=1), help="Number of frames; default: that of the scenario.")
+@click.option("--video", is_flag=True, help="One lossless video per camera instead of PNG files.")
+@click.option("--points", is_flag=True, help="No pictures: a detections.csv with noise of --noise-px.")
+@click.option(
+    "--noise-px",
+    default=0.1,
+    show_default=True,
+    type=click.FloatRange(min=0),
+    help="With --points: noise of a spot, 1 sigma.",
+)
+@click.option("--clutter", type=click.FloatRange(0, 1), help="Probability of a false spot near each spot.")
+@click.option("--light", help="A preset of light and sensor instead of the scenario's.")
+@click.option(
+    "--scale", default=1.0, show_default=True, type=click.FloatRange(0.1, 1), help="0.5: pictures half as wide."
+)
+@click.option("--rig", type=ANY_PATH, help="A rig.yaml with the true rig, instead of the scenario's.")
+@click.option(
+    "--known-rig", type=ANY_PATH, help="The rig.yaml for the run folder, such as a calibration of the true rig."
+)
+def simulate(
+    scenario: str,
+    out: Path | None,
+    seed: int,
+    frames: int | None,
+    video: bool,
+    points: bool,
+    noise_px: float,
+    clutter: float | None,
+    light: str | None,
+    scale: float,
+    rig: Path | None,
+    known_rig: Path | None,
+) -> None:
+    """Write a simulated recording with its truth; SCENARIO `list` lists all scenarios.
+
+    \b
+    Example:
+        beampose simulate sharp-turns --frames 50 --out runs/sharp-turns
+    """
+    from lab.simulate.scenarios import LIGHTS, SCENARIOS
+    from lab.simulate.write import simulate as write_run
+
+    if scenario == "list":
+        for listed in SCENARIOS.values():
+            click.echo(f"{listed.name:24s}{listed.summary}")
+        click.echo(f"{'lights:':24s}{', '.join(LIGHTS)}")
+        return
+    if out is None:
+        raise click.UsageError("Missing option '--out'.")
+    with progress_bar(scenario) as progress:
+        folder = write_run(
+            scenario,
+            out,
+            seed=seed,
+            frames=frames,
+            video=video,
+            detections_only=points,
+            light=light,
+            clutter=clutter,
+            noise_px=noise_px,
+            picture_scale=scale,
+            rig=rig,
+            known_rig=known_rig,
+            progress=None if progress is None else lambda done, total: progress(done, total),
+        )
+    click.echo(f"run: {folder}")
+
+
+def _ranges(
+    ctx: click.Context, parameter: click.Parameter, values: Sequence[str]
+) -> dict[str, tuple[float, float, int]]:
+    """--range name=first:last:count."""
+    out: dict[str, tuple[float, float, int]] = {}
+    for text in values:
+        name, _, value = text.partition("=")
+        try:
+            first, last, count = value.split(":")
+            out[name.strip()] = float(first), float(last), int(count)
+        except ValueError:
+            raise click.BadParameter(
+                f"expected NAME=FIRST:LAST:COUNT, got {text!r}", ctx=ctx, param=parameter
+            ) from None
+    return out
+
+
+@click.command()
+@click.argument("rig", type=ANY_PATH)
+@click.option("--out", required=True, type=FOLDER, help="Gets plan.csv, effects.csv and report.html.")
+@click.option(
+    "--range",
+    "ranges",
+    multiple=True,
+    metavar="NAME=FIRST:LAST:COUNT",
+    callback=_ranges,
+    help="Of x_m, y_m, z_m, yaw_deg, pitch_deg, roll_deg; e.g. --range yaw_deg=-30:30:13.",
+)
+@click.option("--sigma-px", type=click.FloatRange(min=0, min_open=True), help="Noise of a spot, 1 sigma.")
+@click.option("--goal-deg", type=click.FloatRange(min=0, min_open=True), help="The attitude sigma to reach.")
+@click.option("--goal-mm", type=click.FloatRange(min=0, min_open=True), help="The position sigma to reach.")
+@click.option(
+    "--expect",
+    "settings",
+    multiple=True,
+    metavar="NAME=VALUE",
+    callback=read_settings,
+    help="An expected calibration sigma, where the rig file has none; e.g. --expect beam_direction_arcsec=10.",
+)
+def plan(
+    rig: Path,
+    out: Path,
+    ranges: dict[str, tuple[float, float, int]],
+    sigma_px: float | None,
+    goal_deg: float | None,
+    goal_mm: float | None,
+    settings: dict[str, Any],
+) -> None:
+    """Predict which spots a planned rig will see, and how well it will measure.
+
+    \b
+    Example:
+        beampose plan sample_runs/huo2015/rig.yaml --out results/plan
+    """
+    from lab.plan.plan import plan_rig
+    from lab.plan.plan_options import options_of
+
+    goal_m = None if goal_mm is None else goal_mm / 1000
+    options = options_of(ranges, sigma_px=sigma_px, goal_deg=goal_deg, goal_m=goal_m, expected=settings)
+    conclude(plan_rig(rig, out, options))

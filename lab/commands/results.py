@@ -1,0 +1,66 @@
+"""`beampose check`, `report` and `study`: inputs checked, results shown, a published experiment repeated."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import click
+
+from lab.commands.common import ANY_PATH, FOLDER
+from lab.errors import InputError
+
+
+@click.command()
+@click.argument("path", type=ANY_PATH)
+def check(path: Path) -> None:
+    """Check a rig.yaml or a run folder, and report which spots the cameras can see.
+
+    \b
+    Example:
+        beampose check sample_runs/huo2015
+    """
+    from lab.runs.check import check as check_path
+
+    result = check_path(path)
+    for line in result.lines:
+        click.echo(line)
+    sys.exit(result.exit_status)
+
+
+@click.command()
+@click.argument("results", type=click.Path(exists=True, file_okay=False, path_type=Path))
+@click.option("--run", "run_folder", type=FOLDER, help="The run folder, if it has moved.")
+def report(results: Path, run_folder: Path | None) -> None:
+    """Write report.html of a result folder again.
+
+    \b
+    Example:
+        beampose report results/huo2015
+    """
+    from lab.report.run.page import write_report
+    from lab.runs.process import are_results
+
+    if not are_results(results):
+        raise InputError(f"{results}: expected a folder that `beampose run` wrote, found no summary.json of one")
+    click.echo(f"report: {write_report(results, run_folder)}")
+
+
+@click.command()
+@click.argument("name", type=click.Choice(["huo2015"]))
+@click.option("--out", required=True, type=FOLDER, help="Gets report.html, figures.csv and the run.")
+@click.option("--seed", default=1, show_default=True, type=click.IntRange(min=0))
+def study(name: str, out: Path, seed: int) -> None:
+    """Repeat a published experiment and compare with its printed figures.
+
+    \b
+    Example:
+        beampose study huo2015 --out results/study
+    """
+    from lab.study.studies import study_huo2015
+
+    outcome = study_huo2015(out, seed=seed)
+    for line in outcome.lines:
+        click.echo(line)
+    click.echo(f"table: {outcome.table}")
+    click.echo(f"report: {outcome.report}")

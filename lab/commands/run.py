@@ -1,0 +1,144 @@
+"""`beampose run`, `batch`, `watch` and `detect`: from pictures to results."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import click
+
+from lab.commands.common import ANY_PATH, FOLDER, conclude, progress_bar, set_option
+
+_causal_option = click.option(
+    "--causal", is_flag=True, help="No smoothing pass: attitude.csv has the poses as known at each instant."
+)
+
+
+@click.command()
+@click.argument("run_folder", metavar="RUN", type=ANY_PATH)
+@click.option("--out", required=True, type=FOLDER, help="Where the results go; earlier results there are replaced.")
+@_causal_option
+@set_option
+def run(run_folder: Path, out: Path, causal: bool, settings: dict[str, Any]) -> None:
+    """Process one run folder: tables, summary.json and report.html.
+
+    \b
+    Example:
+        beampose run sample_runs/huo2015 --out results/huo2015
+    """
+    from lab.runs.process import process_run
+
+    with progress_bar(run_folder.name) as progress:
+        outcome = process_run(run_folder, out, overrides=settings, causal=causal, progress=progress)
+    click.echo(outcome.line())
+    sys.exit(outcome.exit_status)
+
+
+@click.command()
+@click.argument("run_folders", metavar="RUN...", nargs=-1, required=True, type=ANY_PATH)
+@click.option("--out", required=True, type=FOLDER, help="Gets one folder per run, batch.csv and index.html.")
+@_causal_option
+@set_option
+def batch(run_folders: tuple[Path, ...], out: Path, causal: bool, settings: dict[str, Any]) -> None:
+    """Process many run folders; a run that fails does not stop the others.
+
+    \b
+    Example:
+        beampose batch sample_runs/huo2015 sample_runs/damaged --out results/all
+    """
+    from lab.runs.batch import process_batch
+
+    outcome = process_batch(run_folders, out, overrides=settings, causal=causal, tell=click.echo)
+    click.echo(f"table: {outcome.table}")
+    click.echo(f"index: {outcome.index}")
+    sys.exit(outcome.exit_status)
+
+
+@click.command()
+@click.argument("pictures", metavar="IMAGES_OR_VIDEO...", nargs=-1, required=True, type=ANY_PATH)
+@click.option("--out", required=True, type=FOLDER, help="Gets detections.csv, contact-sheet.png and report.html.")
+@click.option("--camera", help="The camera's name in the table; default: that of the folder or file.")
+@click.option("--every", default=1, show_default=True, type=click.IntRange(min=1), help="Use every N-th picture only.")
+@click.option("--limit", type=click.IntRange(min=1), help="Use at most this many pictures.")
+@set_option
+def detect(
+    pictures: tuple[Path, ...],
+    out: Path,
+    camera: str | None,
+    every: int,
+    limit: int | None,
+    settings: dict[str, Any],
+) -> None:
+    """Find the spots in pictures or a video, without a rig: table, contact sheet, noise, sizes and signal.
+
+    A folder of pictures, picture files, a pattern such as 'shots/*.png', or one video.
+
+    \b
+    Example:
+        beampose detect sample_runs/huo2015/frames/left --every 10 --out results/spots
+    """
+    from lab.detect.detect import DetectOptions, detect_pictures
+
+    options = DetectOptions(camera, every, limit, settings)
+    with progress_bar("pictures") as progress:
+        outcome = detect_pictures(list(pictures), out, options, progress)
+    conclude(outcome)
+
+
+@click.command()
+@click.argument("run_folder", metavar="RUN", type=ANY_PATH)
+@click.option(
+    "--out", required=True, type=FOLDER, help="Gets attitude_live.csv during the recording, and the results at the end."
+)
+@click.option("--udp", metavar="HOST:PORT", help="Also send each frame there, as a line of JSON.")
+@click.option(
+    "--idle",
+    default=10.0,
+    show_default=True,
+    type=click.FloatRange(min=0.1),
+    help="Seconds without a new picture after which the recording has ended.",
+)
+@click.option(
+    "--timeout",
+    default=0.25,
+    show_default=True,
+    type=click.FloatRange(min=0.001),
+    help="Seconds for which a frame waits for a camera whose picture is missing.",
+)
+@click.option("--reprocess", is_flag=True, help="At the end, process the finished folders as `run` does.")
+@set_option
+def watch(
+    run_folder: Path,
+    out: Path,
+    udp: str | None,
+    idle: float,
+    timeout: float,
+    reprocess: bool,
+    settings: dict[str, Any],
+) -> None:
+    """Process a run while it is recorded: the pose of every frame as it arrives.
+
+    RUN is a run folder whose frame folders receive pictures, or whose run.yaml names a `device` for a camera (a number
+    or name that OpenCV opens). Each pose is appended to attitude_live.csv in the folder --out. When the recording
+    ends (--idle, Ctrl-C, end of the device), the results of `run` are written from the received pictures.
+
+    \b
+    Example:
+        beampose watch runs/today --out results/today --udp 127.0.0.1:5005
+    """
+    from lab.watch.live_frames import WatchOptions
+    from lab.watch.watch import stopped_by_ctrl_c, watch_run
+
+    with progress_bar(run_folder.name) as progress, stopped_by_ctrl_c() as stop:
+        outcome = watch_run(
+            run_folder,
+            out,
+            udp=udp,
+            reprocess=reprocess,
+            options=WatchOptions(idle, timeout),
+            overrides=settings,
+            progress=progress,
+            stop=stop,
+        )
+    conclude(outcome)

@@ -1,0 +1,127 @@
+"""Parameter dataclasses from blocks of YAML files (docs/decisions/parameters-from-files.md)."""
+
+from __future__ import annotations
+
+import dataclasses
+import types
+import typing
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+import pydantic
+
+from lab.errors import InputError
+from lab.files.text.error_text import shown
+from lab.files.text.fields import (
+    Block,
+    Integer,
+    Number,
+    Word,
+    boolean,
+    field_error,
+    finite_number,
+    numbers,
+    one_of,
+    unexpected_value,
+    validated,
+)
+
+T = TypeVar("T")
+
+
+def dataclass_from_yaml(cls: type[T], mapping: Any, path: Path | str, inside: str = "") -> T:
+    """A frozen parameter dataclass from a block of a file; fields that the block does not have keep their default.
+
+    The dataclass's fields are floats, ints, bools, strings, Literals, tuples of floats, other such dataclasses, or
+    optional ones of these.
+
+    Raises:
+        FileError: unknown keys, wrong types, and values that the dataclass itself refuses.
+    """
+    model = _model_of(cls)
+    return _value_of(cls, validated(model, {} if mapping is None else _as_mapping(mapping, path, inside), path, inside))
+
+
+def _as_mapping(value: Any, path: Path | str, inside: str) -> Mapping[str, Any]:
+    if not isinstance(value, Mapping):
+        raise InputError(f"{path}: {inside}: expected a mapping, got {shown(value)}")
+    return value
+
+
+def _model_of(cls: type) -> type[Block]:
+    """A strict pydantic model with the fields of a dataclass."""
+    hints = typing.get_type_hints(cls)
+    fields: dict[str, Any] = {}
+    for field in dataclasses.fields(cls):
+        if not field.init:
+            continue
+        if field.default is not dataclasses.MISSING:
+            default = field.default
+        elif field.default_factory is not dataclasses.MISSING:
+            default = field.default_factory()
+        else:
+            default = ...
+        fields[field.name] = (_kind_of(hints[field.name]), default)
+    made = pydantic.create_model(cls.__name__, __base__=Block, **fields)
+
+    def build(self: Block) -> Any:
+        """The dataclass's own checks, run while pydantic knows the position in the file."""
+        try:
+            _value_of(cls, self)
+        except ValueError as error:
+            raise field_error(str(error)) from None
+        return self
+
+    return pydantic.create_model(
+        cls.__name__,
+        __base__=made,
+        __validators__={"build": typing.cast(Any, pydantic.model_validator(mode="after")(build))},
+    )
+
+
+def _kind_of(hint: Any) -> Any:
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (typing.Union, types.UnionType):
+        inner = next(a for a in arguments if a is not type(None))
+        return Annotated[_kind_of(inner) | None, pydantic.WrapValidator(_nothing_or)]
+    if origin is typing.Literal:
+        return Annotated[Any, pydantic.PlainValidator(one_of(arguments))]
+    if origin is tuple:
+        if arguments[-1] is Ellipsis:
+            return Annotated[Any, pydantic.PlainValidator(_number_tuple)]
+        return Annotated[Any, pydantic.PlainValidator(lambda v: tuple(numbers(len(arguments))(v)))]
+    if dataclasses.is_dataclass(hint):
+        return _model_of(typing.cast(type, hint))
+    kinds: dict[Any, Any] = {
+        float: Number,
+        int: Integer,
+        bool: Annotated[bool, pydantic.PlainValidator(boolean)],
+        str: Word,
+    }
+    if hint not in kinds:
+        raise TypeError(f"a parameter of type {hint} cannot be read from a file")
+    return kinds[hint]
+
+
+def _nothing_or(value: Any, inner: Any) -> Any:
+    return None if value is None else inner(value)
+
+
+def _number_tuple(value: Any) -> tuple[float, ...]:
+    if not isinstance(value, list):
+        raise unexpected_value("a list of numbers", value)
+    return tuple(finite_number(v) for v in value)
+
+
+def _value_of(cls: type[T], block: Block) -> T:
+    """The dataclass of a validated block."""
+    hints = typing.get_type_hints(cls)
+    values = {}
+    for name in type(block).model_fields:
+        value = getattr(block, name)
+        if isinstance(value, Block):
+            inner = [a for a in (hints[name], *typing.get_args(hints[name])) if dataclasses.is_dataclass(a)]
+            value = _value_of(typing.cast(type, inner[0]), value)
+        values[name] = value
+    return cls(**values)
