@@ -17,7 +17,6 @@ from lab.plan.plan_drawings import cell_map, share_bars
 from lab.plan.plan_findings import JOINED, TOGETHER, advice, axis_words, budget_lines, median_sigma, worst_first
 from lab.plan.plan_grid import AXES, STATUS, Plan, plan_grid
 from lab.plan.plan_options import Range, poses_of
-from lab.report.calibration.calibration_maps import heat_map
 from lab.report.calibration.calibration_page import (
     CalibrationReport,
     PageDrawing,
@@ -27,6 +26,7 @@ from lab.report.calibration.calibration_page import (
     write_calibration_report,
 )
 from lab.report.calibration.calibration_scene import rig_things, scene_views
+from lab.report.plot.maps import heat_map
 
 _WORST_ROWS, _EFFECT_ROWS = 24, 20
 _FINE = 41  # places along each side of a smooth map

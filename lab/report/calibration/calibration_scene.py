@@ -13,8 +13,9 @@ from geometry.camera import Camera, pinhole_numbers
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.rig import Rig
-from lab.report.plot.axes import Plane, dots, number, polyline, round_size, segments, svg_of
-from lab.report.plot.svg import BLUE, GREEN, ORANGE, PURPLE, VERMILLION, Scale, text
+from lab.report.plot.axes import Plane, svg_of
+from lab.report.plot.scales import Scale, number, round_size
+from lab.report.plot.svg import BLUE, GREEN, ORANGE, PURPLE, VERMILLION, dots, polyline, segments, text
 
 
 @dataclass(frozen=True, slots=True)
