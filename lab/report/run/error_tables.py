@@ -49,7 +49,7 @@ def pixel_rows(e: TruthErrors | None) -> list[tuple[str, ...]]:
         ("prediction at true bends", prediction("bends"), "where the true path bends by more than 2 px"),
         ("prediction at the start", prediction("start"), "the first two frames of a track: the speed is not yet known"),
         ("measured place", s.measured_px, "of correctly labelled spots"),
-        ("out of view", s.out_of_view_px, "solved from the other beams"),
+        ("out of view", s.out_of_view_px, "computed from the other spots"),
         ("occluded", s.occluded_px, "the estimate while no detection was accepted"),
     )
     return [

@@ -61,8 +61,8 @@ def model_fit(block: Mapping[str, Any] | None) -> ModelFit | None:
     sizes = block.get("image_sizes_px")
     drawings = [
         drawn
-        for camera, size in (sizes.items() if isinstance(sizes, Mapping) else ())
-        if (drawn := _drawing(str(camera), size, _mappings(block.get("views"))))
+        for i, (camera, size) in enumerate(sizes.items() if isinstance(sizes, Mapping) else ())
+        if (drawn := _drawing(i, str(camera), size, _mappings(block.get("views"))))
     ]
     return ModelFit(_sentence(block, findings), findings, tuple(rows), tuple(drawings))
 
@@ -117,7 +117,7 @@ def _signed(value: float) -> str:
     return "–" if not np.isfinite(value) else ("+" if value > 0 else "") + short(value, 2)
 
 
-def _drawing(camera: str, size: Any, views: list[Mapping[str, Any]]) -> str:
+def _drawing(index: int, camera: str, size: Any, views: list[Mapping[str, Any]]) -> str:
     """Mean residuals as arrows over the image, with circles of 3 sigma of chance and calibration together."""
     own = [v for v in views if str(v.get("name")).rpartition("/")[0] == camera]
     place = np.array([_pair(v, "place_px") for v in own]).reshape(-1, 2)
@@ -129,7 +129,13 @@ def _drawing(camera: str, size: Any, views: list[Mapping[str, Any]]) -> str:
     plane = image_plane((int(size[0]), int(size[1])))
     longest = float(np.linalg.norm(mean[known], axis=1).max())
     factor = round_size(_LONGEST * float(size[0]) / max(longest, 1e-6))
-    parts = [frame(plane), heading(plane, f"camera {camera}: mean residual of each spot")]
+    left, top, wide, high = plane.box
+    clip = f"clip-residuals-{index}"
+    parts = [
+        heading(plane, f"camera {camera}: mean residual of each spot"),
+        f'<clipPath id="{clip}"><rect x="{left:.1f}" y="{top:.1f}" width="{wide:.1f}" height="{high:.1f}"/></clipPath>',
+        f'<g clip-path="url(#{clip})">',
+    ]
     scale = abs(plane.X.b - plane.X.a) / abs(plane.X.hi - plane.X.lo)
     for v, at, r, s, good in zip(own, place, mean, chance, known, strict=True):
         if not good:
@@ -145,5 +151,7 @@ def _drawing(camera: str, size: Any, views: list[Mapping[str, Any]]) -> str:
             f'<path d="{segments(start, end)}" stroke="{colour}" stroke-width="2"/>'
             f'<path d="{dots(start, 3)}" fill="{colour}"/>{text(start[0, 0] + 7, start[0, 1] - 7, spot, "label")}</g>'
         )
-    parts.append(note(plane, f"arrows magnified {number(factor)} times; longest {short(longest, 2)} px"))
+    times = f"{factor:,.0f}".replace(",", "\u202f") if factor >= 1 else number(factor)
+    parts += ["</g>", frame(plane)]
+    parts.append(note(plane, f"arrows magnified {times} times; longest {short(longest, 2)} px"))
     return svg_of(plane, f"mean residuals in camera {camera}", parts)
