@@ -1,4 +1,4 @@
-"""The judgements of scenes in pictures as a table, as a summary, and one scene's figures in full."""
+"""The scores of scenes in pictures as a table and as a summary, and all figures of one scene."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ WORST = 12
 
 
 def crashed(renderer: Renderer, asked: int, trace: str) -> PictureJudgement:
-    """The judgement of a scene on which the program raised an exception."""
+    """The scores of a scene on which the program raised an exception."""
     nan, ps = float("nan"), renderer.ps
     return PictureJudgement(
         seed=ps.seed, family=ps.family or "mixed", counts=True, why_not="", classes=("crash",), asked=asked, right=0.0,
@@ -27,7 +27,7 @@ def crashed(renderer: Renderer, asked: int, trace: str) -> PictureJudgement:
 
 
 def write_rows(rows: Sequence[PictureJudgement], path: Path) -> None:
-    """One row per scene; the noise models' ratios of its cameras in one field each."""
+    """Write one row per scene; the ratios of the noise models of its cameras share a field."""
     names = [f.name for f in fields(PictureJudgement) if f.name not in ("noise", "classes", "wrong_diagnoses")]
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
@@ -46,7 +46,7 @@ def write_rows(rows: Sequence[PictureJudgement], path: Path) -> None:
 
 
 def line(row: PictureJudgement) -> str:
-    """One line about a scene."""
+    """One line for a scene."""
     noise = ", ".join(f"{n.background:.2g}/{n.half:.2g}" for n in row.noise)
     return (
         f"{row.family} {row.seed}: {', '.join(row.classes) or 'clean'}; right {row.right:.4f} of {row.asked}, recall"
@@ -56,7 +56,7 @@ def line(row: PictureJudgement) -> str:
 
 
 def details(row: PictureJudgement) -> str:
-    """All of one scene."""
+    """All figures of one scene."""
     out = [line(row) + ("" if row.counts else f" (left out: {row.why_not})"), f"  {row.text}"]
     out.append(
         f"  measured {row.measured:.1%}, confidently wrong {row.wrong_poses}, NEES/6 at most {row.nees_max:.3g}, rms"

@@ -1,7 +1,6 @@
-"""A results folder in the contract's form, made from the forward model: truth plus noise, no tracker involved.
+"""A results folder in the documented formats from the forward model: truth plus noise, without a tracker.
 
-The noise is drawn from the covariances that the tables state, so a score of them is known in advance: NEES 6, sigmas
-that fit, every label right.
+The noise is drawn from the stated covariances, so the scores are known: NEES 6, correct sigmas, correct labels.
 """
 
 from __future__ import annotations
@@ -34,10 +33,10 @@ def fake_rig(n_cameras: int = 2) -> Rig:
     turn = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])  # screen x, y, z = world y, z, x
     screens = {n: Screen(n, Pose(turn, np.array([x, 0.0, 0.0]))) for n, x in (("left", -2.5), ("right", 2.5))}
     K = np.array([[1180.0, 0, 639.5], [0, 1180, 511.5], [0, 0, 1]])
-    looks = {"left": [[0, 1, 0], [0, 0, -1], [-1, 0, 0]], "right": [[0, -1, 0], [0, 0, -1], [1, 0, 0]]}
+    axes = {"left": [[0, 1, 0], [0, 0, -1], [-1, 0, 0]], "right": [[0, -1, 0], [0, 0, -1], [1, 0, 0]]}
     cameras = {}
-    for name, side in list(zip(looks, (1.0, -1.0), strict=True))[:n_cameras]:
-        R = np.array(looks[name], dtype=float)
+    for name, side in list(zip(axes, (1.0, -1.0), strict=True))[:n_cameras]:
+        R = np.array(axes[name], dtype=float)
         cameras[name] = Camera(
             name, name, (1280, 1024), K, (-0.08, 0.01, 0.0, 0.0, 0.0), Pose(R, -R @ [side * 1.1, 0.1, 0.2])
         )
@@ -52,7 +51,7 @@ def fake_rig(n_cameras: int = 2) -> Rig:
 
 @dataclass(frozen=True)
 class Fake:
-    """Where the folders are, and the truth behind them."""
+    """The folders, and the truth."""
 
     results: Path
     run_folder: Path
@@ -72,7 +71,7 @@ def make(
     causal: bool = False,
     seed: int = 1,
 ) -> Fake:
-    """Write folder/run and folder/results. causal: also the poses known at each instant, twice as uncertain."""
+    """Write folder/run and folder/results. causal: also the causal poses, twice as uncertain."""
     rng = np.random.default_rng(seed)
     rig = fake_rig(n_cameras)
     model = SpotModel.of(rig)
@@ -172,8 +171,8 @@ def make(
     motion_error = MOTION_SIGMA * rng.normal(size=motion.shape)
 
     def write_poses(which: str, times: float) -> None:
-        """Attitude and covariance with errors and sigmas so many times as large."""
-        wrong = times * delta  # truth = estimate plus delta; the estimate is therefore the truth minus it
+        """Attitude and covariance with errors and sigmas multiplied by `times`."""
+        wrong = times * delta  # truth = estimate plus delta
         estimate = Pose(pose.rotation @ rotations.exp(-wrong[:, 3:]), pose.translation - wrong[:, :3])
         C = times**2 * cov
         Jypr = rotations.ypr_jacobian(estimate.rotation)
@@ -237,7 +236,7 @@ def make(
 
 
 def without_added_columns(results: Path, folder: Path) -> Path:
-    """A copy of a results folder as it was written before tables had the columns of columns.ADDED."""
+    """A copy of a results folder without the columns of columns.ADDED, as in older versions."""
     folder.mkdir()
     for path in results.iterdir():
         if path.suffix != ".csv":
@@ -252,7 +251,7 @@ def without_added_columns(results: Path, folder: Path) -> Path:
 
 
 def _path(t: Array) -> tuple[Array, Pose]:
-    """The vehicle's way: the triangle of its yaw, whose corners are bends, and the poses."""
+    """The motion of the vehicle: the triangle wave of its yaw, whose corners are bends, and the poses."""
     triangle = 2 / np.pi * np.arcsin(np.sin(2 * np.pi * t / 3.0))
     ypr = np.radians(np.stack([19 * triangle, 6 * np.sin(1.3 * t), 8 * np.cos(0.9 * t)], -1))
     return triangle, Pose.from_ypr(ypr, np.stack([0.3 * np.sin(t), 0.2 * np.cos(0.7 * t), 0.1 * np.sin(2 * t)], -1))

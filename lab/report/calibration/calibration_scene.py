@@ -1,4 +1,4 @@
-"""Cameras, screens, boards and beams in space, as still drawings from fixed directions."""
+"""Cameras, screens, boards and beams in space, drawn from fixed directions."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from lab.report.plot.svg import BLUE, GREEN, ORANGE, PURPLE, VERMILLION, dots, p
 
 @dataclass(frozen=True, slots=True)
 class Frustum:
-    """A camera, drawn as its field of view."""
+    """The field of view of a camera."""
 
     name: str
     camera_from_world: Pose
-    half_width: tuple[float, float]  # tangents of half the angle of view, across and down
+    half_width: tuple[float, float]  # tangents of half the angle of view, horizontal and vertical
     colour: str = BLUE
 
 
@@ -35,14 +35,14 @@ class Rectangle:
     name: str
     world_from_rectangle: Pose
     size_m: tuple[float, float]
-    centred: bool = True  # whether its origin is its middle, else its corner
+    centred: bool = True  # its origin is its centre, otherwise its corner
     colour: str = GREEN
     faint: bool = False  # one of many boards: thin, without a name
 
 
 @dataclass(frozen=True, slots=True)
 class Ray:
-    """A beam from its source to where it ends."""
+    """A beam from its source to its end."""
 
     name: str
     start: Array  # (3,), m, in world
@@ -52,7 +52,7 @@ class Ray:
 
 @dataclass(frozen=True, slots=True)
 class Dot:
-    """A point: a spot, a surveyed mark, a body's origin."""
+    """A point: a spot, a surveyed mark, the origin of a body."""
 
     name: str
     place: Array  # (3,), m, in world
@@ -61,7 +61,7 @@ class Dot:
 
 Thing = Frustum | Rectangle | Ray | Dot
 
-# World to drawing: which way is right, which is up. z is up in a lab's world; in a camera's own frame y is down.
+# The directions to the right and up in a drawing. z points up in the world frame, y down in the frame of a camera.
 VIEWS: dict[str, tuple[Array, Array]] = {
     "seen obliquely": (np.array([0.82, 0.57, 0.0]), np.array([-0.285, 0.41, 0.866])),
     "from above (along −z)": (np.array([1.0, 0, 0]), np.array([0, 1.0, 0])),
@@ -72,20 +72,20 @@ VIEWS: dict[str, tuple[Array, Array]] = {
     "from beside the camera": (np.array([0, 0, 1.0]), np.array([0, -1.0, 0])),
 }
 LAB_VIEWS = tuple(VIEWS)[:3]
-CAMERA_VIEWS = tuple(VIEWS)[4:]  # for things in a camera's own frame
+CAMERA_VIEWS = tuple(VIEWS)[4:]  # for things in the frame of a camera
 
 
 def frustum_of(camera: Camera, colour: str = BLUE) -> Frustum:
-    """A calibrated camera as drawn; its lens is taken as straight."""
+    """The field of view of a calibrated camera, without the distortion of its lens."""
     fx, fy, _, _ = pinhole_numbers(camera)
     half = (0.5 * camera.image_size_px[0] / fx, 0.5 * camera.image_size_px[1] / fy)
     return Frustum(camera.name, camera.camera_from_world, half, colour)
 
 
 def rig_things(rig: Rig, world_from_body: Pose | None = None) -> list[Thing]:
-    """The cameras and screens of a rig and, where the vehicle's pose is given, its beams and spots.
+    """The cameras and screens of a rig and, if the pose of the vehicle is given, its beams and spots.
 
-    A screen without a size is drawn as large as its spots and the place that its camera looks at ask for, at least 1 m.
+    A screen without a size is drawn large enough for its spots, at least 1 m.
     """
     things: list[Thing] = []
     model = SpotModel.of(rig)
@@ -115,12 +115,14 @@ def rig_things(rig: Rig, world_from_body: Pose | None = None) -> list[Thing]:
 def scene_views(
     things: Sequence[Thing], title: str = "Cameras, screens and beams", views: Sequence[str] = LAB_VIEWS
 ) -> list[str]:
-    """The same things from several directions: LAB_VIEWS, or CAMERA_VIEWS for boards before a single camera."""
+    """The things from several directions: LAB_VIEWS, or CAMERA_VIEWS for boards in front of a camera."""
     return [scene_view(things, f"{title}, {name}", name) for name in views]
 
 
 def scene_view(things: Sequence[Thing], title: str, view: str = LAB_VIEWS[0]) -> str:
-    """Things in space by parallel projection. view: one of VIEWS. Metres keep their length along the drawing's axes."""
+    """Things in space by parallel projection. view: one of VIEWS. All directions in the plane of the drawing have the
+    same scale.
+    """
     right, up = VIEWS[view]
     to_drawing = np.stack([right / np.linalg.norm(right), up / np.linalg.norm(up)])
     reach = _frustum_length(things)
@@ -159,7 +161,7 @@ def scene_view(things: Sequence[Thing], title: str, view: str = LAB_VIEWS[0]) ->
 
 
 def _frustum_length(things: Sequence[Thing]) -> float:
-    """How long the fields of view are drawn: a seventh of the scene."""
+    """Length of the drawn fields of view: a seventh of the scene."""
     points = [t.camera_from_world.inverse().translation for t in things if isinstance(t, Frustum)]
     points += [p for t in things if not isinstance(t, Frustum) for p in _outline(t, 0.0)]
     cloud = np.array(points).reshape(-1, 3)
@@ -171,7 +173,7 @@ def _outline(thing: Thing, reach: float) -> Array:
     """The corners of a thing (k, 3), m, in world."""
     if isinstance(thing, Frustum):
         a, b = thing.half_width
-        # An angle of view beyond 120 degrees would be drawn as a wall.
+        # Larger angles of view than 120 degrees are cut, since they would cover the drawing.
         a, b = min(a, 1.7) * reach, min(b, 1.7) * reach
         body = np.array([[0, 0, 0], [-a, -b, reach], [a, -b, reach], [a, b, reach], [-a, b, reach]])
         return thing.camera_from_world.inverse().apply(body)
@@ -185,25 +187,25 @@ def _outline(thing: Thing, reach: float) -> Array:
 
 
 def _drawn(thing: Thing, p: Plane, at: Array) -> tuple[str, tuple[float, float, str, str] | None]:
-    """A thing's shapes, and its label: x, y, words, colour."""
+    """The shapes of a thing, and its label: x, y, words, colour."""
     c = thing.colour
-    told = f"<title>{escape(thing.name)}</title>"
+    name = f"<title>{escape(thing.name)}</title>"
     if isinstance(thing, Frustum):
         d = polyline(at[1:], closed=True) + segments(np.repeat(at[:1], 4, axis=0), at[1:])
-        shape = f'<path d="{d}" fill="{c}" fill-opacity="0.13" stroke="{c}" stroke-width="1.3">{told}</path>'
+        shape = f'<path d="{d}" fill="{c}" fill-opacity="0.13" stroke="{c}" stroke-width="1.3">{name}</path>'
         return shape + f'<path d="{dots(at[:1], 3)}" fill="{c}"/>', (*_pair(at[0]), thing.name, c)
     if isinstance(thing, Rectangle):
         width, opacity = (0.6, 0.03) if thing.faint else (1.5, 0.12)
         d = polyline(at, closed=True)
-        shape = f'<path d="{d}" fill="{c}" fill-opacity="{opacity}" stroke="{c}" stroke-width="{width}">{told}</path>'
+        shape = f'<path d="{d}" fill="{c}" fill-opacity="{opacity}" stroke="{c}" stroke-width="{width}">{name}</path>'
         topmost = at[int(np.argmin(at[:, 1]))]
         return shape, None if thing.faint else (*_pair(topmost), thing.name, c)
     if isinstance(thing, Ray):
         return (
-            f'<path d="{segments(at[:1], at[1:])}" stroke="{c}" stroke-width="1.1" stroke-opacity="0.85">{told}</path>',
+            f'<path d="{segments(at[:1], at[1:])}" stroke="{c}" stroke-width="1.1" stroke-opacity="0.85">{name}</path>',
             None,
         )
-    shape = f'<path d="{dots(at, 3.2)}" fill="{c}" stroke="var(--paper)" stroke-width="0.6">{told}</path>'
+    shape = f'<path d="{dots(at, 3.2)}" fill="{c}" stroke="var(--paper)" stroke-width="0.6">{name}</path>'
     return shape, (*_pair(at[0]), thing.name, c)
 
 
@@ -212,7 +214,7 @@ def _pair(at: Array) -> tuple[float, float]:
 
 
 def _placed(labels: list[tuple[float, float, str, str]], p: Plane) -> list[str]:
-    """Labels beside their things, moved down or up until none covers another; those that fit nowhere are left out."""
+    """Labels beside their things, moved down or up to avoid overlaps; those without a free place are omitted."""
     out: list[str] = []
     taken: list[tuple[float, float, float, float]] = []
     for x, y, words, _ in labels[:60]:
@@ -231,7 +233,7 @@ def _placed(labels: list[tuple[float, float, str, str]], p: Plane) -> list[str]:
 
 
 def _axis_cross(p: Plane, to_drawing: Array) -> list[str]:
-    """Which way the world's axes run, bottom left; an axis that points at the reader is left out."""
+    """The directions of the world axes, bottom left; an axis along the line of sight is omitted."""
     out = []
     origin = np.array([34.0, p.height - 30.0])
     for axis, name in zip(np.eye(3), "xyz", strict=True):

@@ -414,7 +414,7 @@ class TestIndex:
         {"name": "a-pass", "status": "pass", "results": "a-pass", "frames": 600, "message": ""},
         {"name": "b-error", "status": "error", "results": "", "frames": "", "message": "no <rig> & no run"},
         {"name": "c-fail", "status": "fail", "results": "c-fail", "frames": 20, "message": "lost"},
-        {"name": "d-check", "status": "check", "results": "d-check", "frames": 20, "message": "look"},
+        {"name": "d-check", "status": "check", "results": "d-check", "frames": 20, "message": "few spots"},
     )
 
     def write(self, out: Path) -> str:
