@@ -154,7 +154,7 @@ def false_points_only(frames: int) -> Iterator[Row]:
 
 
 def any_rig(kind: str, f_px: float, rng: np.random.Generator) -> tuple[Rig, float]:
-    """A rig with beams that fill the pictures of two oblique cameras of this focal length; and its widest angle, deg."""
+    """A rig with beams that fill the pictures of two oblique cameras of this focal length; its widest angle, deg."""
     screens = {
         name: Screen(name, Pose.from_quaternion(np.full(4, 0.5), np.array([x, 0.0, 0.0])))
         for name, x in (("left", -2.5), ("right", 2.5))

@@ -12,7 +12,7 @@ from bench.random_pictures.sensors import Sensor, draw_sensor
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """The appearance of the pictures of a scene. Light is a share of the range of the sensor from black to full scale."""
+    """The appearance of the pictures of a scene. Light is a share of the sensor range from black to full scale."""
 
     sensor: Sensor
     sigma_px: float  # of the spots, with lens, beam and pixel

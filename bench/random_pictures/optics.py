@@ -41,7 +41,7 @@ class BeamShape:
         return np.asarray(np.hypot(self.sigma_m, self.divergence * along_m))
 
     def irradiance(self, across_1: Array, across_2: Array, along_m: Array) -> Array:
-        """Relative to the axis at the waist; across, along in m, any shape. The power does not depend on the distance."""
+        """Relative to the axis at the waist; across, along in m, any shape. Power is independent of distance."""
         sigma = self.sigma_at(along_m)
         c, s = np.cos(self.turn_rad), np.sin(self.turn_rad)
         p = (c * across_1 + s * across_2) / sigma

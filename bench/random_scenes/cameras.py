@@ -63,7 +63,7 @@ def draw_camera(
 
 
 def _draw_distortion(rng: np.random.Generator, width: int, height: int, focal: float) -> tuple[tuple[float, ...], str]:
-    """k1, k2, p1, p2, k3 that move the corner of the picture by up to 25 % of its radius, monotonic over the picture."""
+    """k1, k2, p1, p2, k3 that move the corner of the picture by up to 25 % of its radius; monotonic in the picture."""
     corner = np.hypot(width, height) / 2 / focal
     kind = rng.random()
     if kind < 0.15:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import os
-import shutil
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -19,6 +18,7 @@ from lab.errors import InputError
 from lab.files.rig.rig_file import RigFile, load_rig_file, save_rig
 from lab.files.run.run_file import save_run
 from lab.files.text import columns
+from lab.files.text.atomic_write import atomic_folder
 from lab.simulate.picture import Picture, Powers, Sensor, laser_powers, make_sensor, take
 from lab.simulate.points import simulate_points
 from lab.simulate.scenarios import LIGHTS, Scenario
@@ -75,49 +75,47 @@ def simulate(
     """
     if picture_scale != 1.0 and (rig is not None or known_rig is not None):
         raise InputError("the pictures of a rig file keep its size: omit the scale or the rig")
+    if not 0.05 <= picture_scale <= 4.0:
+        raise InputError(f"picture_scale: expected 0.05 to 4, got {picture_scale:g}")
     true_rig = None if rig is None else load_rig_file(rig).rig
     known = None if known_rig is None else load_rig_file(known_rig)
-    scenario = with_overrides(scenario, clutter=clutter, miss_probability=miss_probability)
-    if light is not None:
-        if light not in LIGHTS:
-            raise InputError(f"light: expected one of {', '.join(LIGHTS)}, got {light!r}")
-        scenario = replace(scenario, light=LIGHTS[light])
-    if video and detections_only:
+    scenario = _with_light(with_overrides(scenario, clutter=clutter, miss_probability=miss_probability), light)
+    if video:
+        _check_video(scenario, detections_only)
+    with atomic_folder(Path(out_folder), lambda _: False) as folder:
+        scene = compose(scenario, seed, frames, picture_scale, true_rig)
+        if known is not None and SpotModel.of(known.rig).views != scene.model.views:
+            raise InputError(f"{known_rig}: expected the cameras and spots of the rig that is recorded, got others")
+        save_rig(scene.rig if known is None else known, folder / "rig.yaml")
+        write_truth(scene, folder / "truth")
+        if detections_only:
+            _write_detections(scene, noise_px, picture_scale, true_rig, folder / "detections.csv")
+            sources = {name: {"detections": "detections.csv"} for name in scene.model.camera_names}
+        else:
+            write = _write_videos if video else _write_pictures
+            sources = write(scene, folder, noisy, threads, progress)
+        save_run(_run_mapping(scene, sources, known), folder)
+    return Path(out_folder)
+
+
+def _with_light(scenario: Scenario, light: str | None) -> Scenario:
+    """The scenario with a light of LIGHTS; None: with its own."""
+    if light is None:
+        return scenario
+    if light not in LIGHTS:
+        raise InputError(f"light: expected one of {', '.join(LIGHTS)}, got {light!r}")
+    return replace(scenario, light=LIGHTS[light])
+
+
+def _check_video(scenario: Scenario, detections_only: bool) -> None:
+    if detections_only:
         raise InputError("a recording is a video or points, not both; choose one")
-    if video and scenario.faults:
+    if scenario.faults:
         raise InputError(
             f"scenario {scenario.name!r} has missing or damaged pictures, which a video cannot contain; write PNG files"
         )
-    if video and scenario.light.bits > 8:
+    if scenario.light.bits > 8:
         raise InputError("a video contains 8-bit pictures; write pictures with more bits as PNG files")
-    if not 0.05 <= picture_scale <= 4.0:
-        raise InputError(f"picture_scale: expected 0.05 to 4, got {picture_scale:g}")
-    out_folder = Path(out_folder)
-    if out_folder.exists() and (not out_folder.is_dir() or any(out_folder.iterdir())):
-        raise InputError(f"{out_folder}: expected a folder that does not exist yet; choose another or remove it")
-
-    scene = compose(scenario, seed, frames, picture_scale, true_rig)
-    if known is not None and SpotModel.of(known.rig).views != scene.model.views:
-        raise InputError(f"{known_rig}: expected the cameras and spots of the rig that is recorded, got others")
-    part = out_folder.with_name(f".{out_folder.name}.{os.getpid()}.part")
-    part.mkdir(parents=True)
-    try:
-        save_rig(scene.rig if known is None else known, part / "rig.yaml")
-        write_truth(scene, part / "truth")
-        if detections_only:
-            _write_detections(scene, noise_px, picture_scale, true_rig, part / "detections.csv")
-            sources = {name: {"detections": "detections.csv"} for name in scene.model.camera_names}
-        elif video:
-            sources = _write_videos(scene, part, noisy, threads, progress)
-        else:
-            sources = _write_pictures(scene, part, noisy, threads, progress)
-        save_run(_run_mapping(scene, sources, known), part)
-        if out_folder.is_dir():
-            out_folder.rmdir()  # empty; os.replace onto it works on POSIX only
-        os.replace(part, out_folder)
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
-    return out_folder
 
 
 def _run_mapping(scene: Scene, sources: dict[str, dict[str, str]], known: RigFile | None) -> dict[str, object]:

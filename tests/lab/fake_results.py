@@ -1,4 +1,4 @@
-"""A results folder in the documented formats from the forward model: truth plus noise, without a tracker.
+"""A results folder in the format of the contract, from the forward model: truth plus noise, without a tracker.
 
 The noise is drawn from the stated covariances, so the scores are known: NEES 6, correct sigmas, correct labels.
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import csv
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -51,12 +51,44 @@ def fake_rig(n_cameras: int = 2) -> Rig:
 
 @dataclass(frozen=True)
 class Fake:
-    """The folders, and the truth."""
+    """The folders and their truth."""
 
     results: Path
     run_folder: Path
     model: SpotModel
     true_uv: Array  # (F, V, 2)
+
+
+@dataclass(frozen=True)
+class _Truth:
+    """The true motion of F frames and its projection to V views."""
+
+    t: Array  # (F,) s
+    triangle: Array  # (F,) the wave of the yaw
+    pose: Pose  # (F,)
+    motion: Array  # (F, 6) m/s and rad/s
+    uv: Array  # (F, V, 2)
+    J: Array  # (F, V, 2, 6) of the projection
+
+
+@dataclass(frozen=True)
+class _States:
+    """The status of each spot and pose."""
+
+    spot: Array  # (F, V) words
+    in_view: Array  # (F, V) as in truth/spots.csv
+    predicted: Array  # (F,)
+    lost: Array  # (F,)
+
+    @property
+    def measured(self) -> Array:
+        """(F, V): the spot is measured."""
+        return np.isin(self.spot, ["matched", "turned"])
+
+    @property
+    def pose(self) -> Array:
+        """(F,) the words of the poses."""
+        return np.where(self.lost, "lost", np.where(self.predicted, "predicted", "measured"))
 
 
 def make(
@@ -71,38 +103,61 @@ def make(
     causal: bool = False,
     seed: int = 1,
 ) -> Fake:
-    """Write folder/run and folder/results. causal: also the causal poses, twice as uncertain."""
+    """Write folder/run and folder/results. causal: also causal poses, with twice the sigmas."""
     rng = np.random.default_rng(seed)
     rig = fake_rig(n_cameras)
     model = SpotModel.of(rig)
-    V = len(model)
-    frame = np.arange(n_frames)
-    t = frame / RATE_HZ
+    true = _true_motion(model, n_frames)
+    states = _states(model, true, eventful and n_frames >= 100, all_lost, rng)
+    results, run_folder = folder / "results", folder / "run"
+    results.mkdir(parents=True, exist_ok=True)
+    run_folder.mkdir(parents=True, exist_ok=True)
+    _write_spots(results, model, true, states, rng)
+    states, covariance = _pose_covariance(true, states)
+    _write_poses(results, true, states, covariance, causal, rng)
+    if truth:
+        _write_truth(run_folder / "truth", model, true, states)
+    summary = _summary(run_folder, states.spot, states.pose, model)
+    (results / "summary.json").write_text(json.dumps(summary), encoding="utf-8")
+    if pictures:
+        _pictures(run_folder, model, true.uv, states.in_view, rng)
+    (run_folder / "detections.csv").write_bytes((results / "detections.csv").read_bytes())
+    save_rig(rig, run_folder / "rig.yaml")
+    sources = {n: {"frames": f"frames/{n}"} if pictures else {"detections": "detections.csv"} for n in rig.cameras}
+    content = {"name": "fake <yaw & bend>", "rig": "rig.yaml", "frame_rate_hz": RATE_HZ, "cameras": sources}
+    save_run({"schema": "beampose/run/1", **content, "notes": "Notes of the run & more."}, run_folder)
+    return Fake(results, run_folder, model, true.uv)
+
+
+def _true_motion(model: SpotModel, n_frames: int) -> _Truth:
+    t = np.arange(n_frames) / RATE_HZ
     triangle, pose = _path(t)
     moment = 1e-4
     motion = _path(t + moment)[1].minus(_path(t - moment)[1]) / (2 * moment)
-    true_uv = np.empty((n_frames, V, 2))
-    J = np.empty((n_frames, V, 2, 6))
+    uv, J = np.empty((n_frames, len(model), 2)), np.empty((n_frames, len(model), 2, 6))
     for k in range(0, n_frames, 2000):
-        true_uv[k : k + 2000], J[k : k + 2000] = model.project(pose[slice(k, k + 2000)])
+        uv[k : k + 2000], J[k : k + 2000] = model.project(pose[slice(k, k + 2000)])
+    return _Truth(t, triangle, pose, motion, uv, J)
 
-    inside = model.in_picture(true_uv)
-    status = np.where(inside, "matched", np.where(np.isnan(true_uv[..., 0]), "off_screen", "out_of_view"))
+
+def _states(model: SpotModel, true: _Truth, eventful: bool, all_lost: bool, rng: np.random.Generator) -> _States:
+    """Turns, occlusions, missing pictures, and predicted and lost poses."""
+    n_frames = len(true.t)
+    inside = model.in_picture(true.uv)
+    status = np.where(inside, "matched", np.where(np.isnan(true.uv[..., 0]), "off_screen", "out_of_view"))
     status = status.astype(object)
     in_view = inside.astype(int)
-    lost = np.zeros(n_frames, dtype=bool)
-    predicted = np.zeros(n_frames, dtype=bool)
-    if eventful and n_frames >= 100:
-        slope = np.sign(np.diff(triangle, prepend=triangle[0] - 1e-3))
-        bends = np.flatnonzero(np.diff(slope) != 0) + 1
-        for k in bends:
+    lost, predicted = np.zeros(n_frames, dtype=bool), np.zeros(n_frames, dtype=bool)
+    if eventful:
+        slope = np.sign(np.diff(true.triangle, prepend=true.triangle[0] - 1e-3))
+        for k in np.flatnonzero(np.diff(slope) != 0) + 1:
             status[k][inside[k]] = "turned"
-        for j in range(V):
+        for j in range(len(model)):
             for start in rng.integers(0, n_frames, size=max(1, n_frames // 150)):
                 rows = slice(start, start + int(rng.integers(3, 20)))
-                hidden = inside[rows, j]
-                status[rows, j][hidden] = "occluded"
-                in_view[rows, j][hidden] = 2
+                occluded = inside[rows, j]
+                status[rows, j][occluded] = "occluded"
+                in_view[rows, j][occluded] = 2
         f = int(0.31 * n_frames)
         status[f : f + 3, model.camera_of == 0] = "no_image"
         predicted[int(0.55 * n_frames) : int(0.55 * n_frames) + 14] = True
@@ -111,128 +166,109 @@ def make(
         lost[:] = True
     status[predicted & ~lost] = np.where(inside[predicted & ~lost], "occluded", status[predicted & ~lost])
     in_view[predicted & inside.any(1)] *= 2
-    in_view = np.minimum(in_view, 2)
     status[lost] = "lost"
-    status[:, ~np.isfinite(true_uv).any(axis=(0, 2))] = "off_screen"
-    measured = np.isin(status, ["matched", "turned"])
+    status[:, ~np.isfinite(true.uv).any(axis=(0, 2))] = "off_screen"
+    return _States(status, np.minimum(in_view, 2), predicted, lost)
 
+
+def _write_spots(results: Path, model: SpotModel, true: _Truth, states: _States, rng: np.random.Generator) -> None:
+    """spots.csv and detections.csv with measured and predicted positions."""
+    measured, absent = states.measured, np.isin(states.spot, ["lost", "off_screen"])
     sigma = np.where(measured, NOISE_PX, 0.4)
-    uv = true_uv + sigma[..., None] * rng.normal(size=true_uv.shape)
-    early = true_uv + 0.2 * rng.normal(size=true_uv.shape)
-    early[status == "turned"] += 8.0
-    uv[np.isin(status, ["lost", "off_screen"])] = np.nan
-    early[np.isin(status, ["lost", "off_screen"])] = np.nan
+    uv = true.uv + sigma[..., None] * rng.normal(size=true.uv.shape)
+    predicted = true.uv + 0.2 * rng.normal(size=true.uv.shape)
+    predicted[states.spot == "turned"] += 8.0
+    uv[absent] = predicted[absent] = np.nan
     sigma[np.isnan(uv[..., 0])] = np.nan
+    cells = [(k, j) for k in range(len(true.t)) for j in range(len(model))]
+    spots = [
+        [
+            k, _number(true.t[k]), *model.views[j], *map(_number, uv[k, j]), _number(sigma[k, j]),
+            _number(sigma[k, j]), states.spot[k, j], *map(_number, predicted[k, j]),
+            "0.97" if measured[k, j] else "", "0" if np.isfinite(sigma[k, j]) else "",
+            "0.999" if measured[k, j] else "",
+        ]
+        for k, j in cells
+    ]  # fmt: skip
+    _write(results / "spots.csv", columns.SPOTS, spots)
+    other = ("0.1", "0.1", "5000", "300", "2.1", "1.8", "12", "0")
+    detected = [[k, model.views[j][0], *map(_number, uv[k, j]), *other] for k, j in cells if measured[k, j]]
+    _write(results / "detections.csv", columns.DETECTIONS, detected)
 
-    information = np.einsum("fv,fvij,fvik->fjk", measured.astype(float), np.nan_to_num(J), np.nan_to_num(J))
-    # Spots of one screen lie on a line: without both screens there is no pose to measure.
+
+def _pose_covariance(true: _Truth, states: _States) -> tuple[_States, Array]:
+    """The covariances (F, 6, 6) of the poses; a frame whose spots determine no pose becomes predicted."""
+    J = np.nan_to_num(true.J)
+    information = np.einsum("fv,fvij,fvik->fjk", states.measured.astype(float), J, J)
+    # The spots of one screen lie on a line: without both screens no pose is determined.
     shrunk = information + 1e-9 * np.eye(6)
-    predicted |= ~lost & (NOISE_PX**2 * np.linalg.inv(shrunk)[:, range(3), range(3)].max(axis=1) > 0.05**2)
-    information[predicted | lost] = np.eye(6) * NOISE_PX**2
-    cov = np.linalg.inv(information / NOISE_PX**2)
-    since = np.zeros(n_frames)
+    weak = NOISE_PX**2 * np.linalg.inv(shrunk)[:, range(3), range(3)].max(axis=1) > 0.05**2
+    predicted = states.predicted | (~states.lost & weak)
+    information[predicted | states.lost] = np.eye(6) * NOISE_PX**2
+    covariance = np.linalg.inv(information / NOISE_PX**2)
+    since = np.zeros(len(true.t))
     for k in np.flatnonzero(predicted):
         since[k] = since[k - 1] + 1 if k else 1
     grown = (since[:, None] * np.array([2e-3] * 3 + [1e-3] * 3)) ** 2
-    cov[predicted] = np.eye(6) * grown[predicted][:, None, :]
-    delta = (np.linalg.cholesky(cov) @ rng.normal(size=(n_frames, 6, 1)))[..., 0]
-    delta[lost] = 0
+    covariance[predicted] = np.eye(6) * grown[predicted][:, None, :]
+    return replace(states, predicted=predicted), covariance
 
-    results, run_folder = folder / "results", folder / "run"
-    results.mkdir(parents=True, exist_ok=True)
-    run_folder.mkdir(parents=True, exist_ok=True)
 
-    def number(x: float) -> str:
-        return "" if np.isnan(x) else f"{x:.6f}"
-
-    def write(path: Path, header: tuple[str, ...], rows: list[list[object]]) -> None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("w", newline="") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(header)
-            writer.writerows(rows)
-
-    write(
-        results / "spots.csv",
-        columns.SPOTS,
-        [
-            [
-                frame[k], number(t[k]), *model.views[j], *map(number, uv[k, j]), number(sigma[k, j]),
-                number(sigma[k, j]), status[k, j], *map(number, early[k, j]),
-                "0.97" if measured[k, j] else "", "0" if np.isfinite(sigma[k, j]) else "",
-                "0.999" if measured[k, j] else "",
-            ]
-            for k in range(n_frames)
-            for j in range(V)
-        ],
-    )  # fmt: skip
+def _write_poses(
+    results: Path, true: _Truth, states: _States, covariance: Array, causal: bool, rng: np.random.Generator
+) -> None:
+    """attitude.csv and covariance.csv; of the causal poses with twice the errors and sigmas."""
+    n_frames = len(true.t)
+    delta = (np.linalg.cholesky(covariance) @ rng.normal(size=(n_frames, 6, 1)))[..., 0]
+    delta[states.lost] = 0
     rms = np.abs(NOISE_PX * (1 + 0.2 * rng.normal(size=n_frames)))
-    word = np.where(lost, "lost", np.where(predicted, "predicted", "measured"))
-    motion_error = MOTION_SIGMA * rng.normal(size=motion.shape)
-
-    def write_poses(which: str, times: float) -> None:
-        """Attitude and covariance with errors and sigmas multiplied by `times`."""
+    motion_error = MOTION_SIGMA * rng.normal(size=true.motion.shape)
+    words, count, upper = states.pose, states.measured.sum(axis=1), np.triu_indices(6)
+    for which, times in (("", 1.0), (columns.CAUSAL, 2.0))[: 1 + causal]:
         wrong = times * delta  # truth = estimate plus delta
-        estimate = Pose(pose.rotation @ rotations.exp(-wrong[:, 3:]), pose.translation - wrong[:, :3])
-        C = times**2 * cov
+        estimate = Pose(true.pose.rotation @ rotations.exp(-wrong[:, 3:]), true.pose.translation - wrong[:, :3])
+        C = times**2 * covariance
         Jypr = rotations.ypr_jacobian(estimate.rotation)
         s_ypr = np.degrees(np.sqrt(np.einsum("fij,fjk,fik->fi", Jypr, C[:, 3:, 3:], Jypr)))
         s_xyz = np.sqrt(np.diagonal(C, axis1=1, axis2=2)[:, :3])
         table = np.concatenate(
             [estimate.translation, estimate.quaternion_wxyz, np.degrees(estimate.ypr), s_xyz, s_ypr], axis=1
         )
-        moving = np.concatenate([motion - times * motion_error, np.full((n_frames, 6), times) * MOTION_SIGMA], axis=1)
+        sigmas = np.full((n_frames, 6), times) * MOTION_SIGMA
+        moving = np.concatenate([true.motion - times * motion_error, sigmas], axis=1)
         rows = []
         for k in range(n_frames):
-            rms_text = number(rms[k]) if word[k] == "measured" else ""
-            fields = [""] * 16 if lost[k] else [f"{x:.9f}" for x in table[k]]
-            last = [""] * 12 if lost[k] else [f"{x:.9f}" for x in moving[k]]
-            rows.append([frame[k], number(t[k]), *fields, int(measured[k].sum()), rms_text, word[k], *last])
-        write(results / f"attitude{which}.csv", columns.ATTITUDE, rows)
-        upper = np.triu_indices(6)
-        write(
-            results / f"covariance{which}.csv",
-            columns.COVARIANCE,
-            [[frame[k], *(f"{x:.9e}" for x in C[k][upper])] for k in np.flatnonzero(~lost)],
-        )
+            rms_text = _number(rms[k]) if words[k] == "measured" else ""
+            fields = [""] * 16 if states.lost[k] else [f"{x:.9f}" for x in table[k]]
+            last = [""] * 12 if states.lost[k] else [f"{x:.9f}" for x in moving[k]]
+            rows.append([k, _number(true.t[k]), *fields, int(count[k]), rms_text, words[k], *last])
+        _write(results / f"attitude{which}.csv", columns.ATTITUDE, rows)
+        known = [[k, *(f"{x:.9e}" for x in C[k][upper])] for k in np.flatnonzero(~states.lost)]
+        _write(results / f"covariance{which}.csv", columns.COVARIANCE, known)
 
-    write_poses("", 1.0)
-    if causal:
-        write_poses(columns.CAUSAL, 2.0)
-    detected = [
-        [
-            frame[k], model.views[j][0], *map(number, uv[k, j]), "0.1", "0.1", "5000", "300", "2.1", "1.8", "12", "0",
-        ]
-        for k in range(n_frames)
-        for j in range(V)
-        if measured[k, j]
-    ]  # fmt: skip
-    write(results / "detections.csv", columns.DETECTIONS, detected)
-    if truth:
-        true_q = pose.quaternion_wxyz
-        write(
-            run_folder / "truth" / "pose.csv",
-            columns.TRUTH_POSE,
-            [[frame[k], t[k], *pose.translation[k], *true_q[k]] for k in range(n_frames)],
-        )
-        write(
-            run_folder / "truth" / "spots.csv",
-            columns.TRUTH_SPOTS,
-            [
-                [frame[k], *model.views[j], *map(number, true_uv[k, j]), in_view[k, j]]
-                for k in range(n_frames)
-                for j in range(V)
-            ],
-        )
-    (results / "summary.json").write_text(json.dumps(_summary(run_folder, status, word, model)), encoding="utf-8")
-    if pictures:
-        _pictures(run_folder, model, true_uv, in_view, rng)
-    (run_folder / "detections.csv").write_bytes((results / "detections.csv").read_bytes())
-    save_rig(rig, run_folder / "rig.yaml")
-    sources = {n: {"frames": f"frames/{n}"} if pictures else {"detections": "detections.csv"} for n in rig.cameras}
-    content = {"name": "fake <yaw & bend>", "rig": "rig.yaml", "frame_rate_hz": RATE_HZ, "cameras": sources}
-    save_run({"schema": "beampose/run/1", **content, "notes": "Notes of the run & more."}, run_folder)
-    return Fake(results, run_folder, model, true_uv)
+
+def _write_truth(folder: Path, model: SpotModel, true: _Truth, states: _States) -> None:
+    q = true.pose.quaternion_wxyz
+    poses = [[k, true.t[k], *true.pose.translation[k], *q[k]] for k in range(len(q))]
+    _write(folder / "pose.csv", columns.TRUTH_POSE, poses)
+    spots = [
+        [k, *model.views[j], *map(_number, true.uv[k, j]), states.in_view[k, j]]
+        for k in range(len(q))
+        for j in range(len(model))
+    ]
+    _write(folder / "spots.csv", columns.TRUTH_SPOTS, spots)
+
+
+def _number(x: float) -> str:
+    return "" if np.isnan(x) else f"{x:.6f}"
+
+
+def _write(path: Path, header: tuple[str, ...], rows: list[list[object]]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(header)
+        writer.writerows(rows)
 
 
 def without_added_columns(results: Path, folder: Path) -> Path:
@@ -251,7 +287,7 @@ def without_added_columns(results: Path, folder: Path) -> Path:
 
 
 def _path(t: Array) -> tuple[Array, Pose]:
-    """The motion of the vehicle: the triangle wave of its yaw, whose corners are bends, and the poses."""
+    """The motion of the vehicle: a triangle wave of yaw, whose corners are bends, and the poses."""
     triangle = 2 / np.pi * np.arcsin(np.sin(2 * np.pi * t / 3.0))
     ypr = np.radians(np.stack([19 * triangle, 6 * np.sin(1.3 * t), 8 * np.cos(0.9 * t)], -1))
     return triangle, Pose.from_ypr(ypr, np.stack([0.3 * np.sin(t), 0.2 * np.cos(0.7 * t), 0.1 * np.sin(2 * t)], -1))
@@ -296,7 +332,7 @@ def _summary(run_folder: Path, status: Array, word: Array, model: SpotModel) -> 
 
 
 def _pictures(run_folder: Path, model: SpotModel, true_uv: Array, in_view: Array, rng: np.random.Generator) -> None:
-    """Grey pictures with Gaussian spots; the ninth file of the first camera is cut short."""
+    """Grey pictures with Gaussian spots; the ninth file of the first camera is truncated."""
     v, u = np.mgrid[-20:21, -20:21]
     for c, name in enumerate(dict.fromkeys(camera for camera, _ in model.views)):
         (run_folder / "frames" / name).mkdir(parents=True, exist_ok=True)

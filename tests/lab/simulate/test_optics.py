@@ -160,9 +160,8 @@ def test_the_ellipse_in_the_picture_agrees_with_rays_traced_through_opencv(pose,
     covariance = traced(view, pose, 0.0055)[2]
     found = appearance(MODEL, pose, 0.0055, 0.0).covariance_px2[view]
     np.testing.assert_allclose(found, covariance, atol=1e-3 * np.trace(covariance))
-    assert (
-        np.linalg.eigvalsh(found)[1] > 1.05 * np.linalg.eigvalsh(found)[0]
-    )  # not a circle, for which the angle would not be tested
+    # Not a circle, for which the angle would not be tested.
+    assert np.linalg.eigvalsh(found)[1] > 1.05 * np.linalg.eigvalsh(found)[0]
 
 
 @pytest.mark.parametrize("pose", POSES)

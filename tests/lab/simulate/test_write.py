@@ -196,7 +196,7 @@ def test_progress_counts_every_picture(tmp_path):
 
 def test_existing_files_are_never_overwritten(tmp_path):
     (tmp_path / "mine.txt").write_text("precious")
-    with pytest.raises(InputError, match="expected a folder that does not exist yet"):
+    with pytest.raises(InputError, match="choose another --out"):
         simulate("huo2015", tmp_path, frames=1)
     assert (tmp_path / "mine.txt").read_text() == "precious"
 
