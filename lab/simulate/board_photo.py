@@ -22,8 +22,8 @@ _MARGIN = 1.0  # width of the white margin around the outermost squares or circl
 class Look:
     """Light, blur, noise and sampling of a photograph of a board."""
 
-    light_dn: float = 205.0  # paper
-    dark_dn: float = 35.0  # ink
+    paper_dn: float = 205.0  # paper
+    ink_dn: float = 35.0  # ink
     background_dn: float = 110.0  # outside the paper
     gradient: float = 0.0  # relative decrease of the light from left to right
     blur_px: float = 0.7  # sigma of the blur of the lens, without the integration over pixels
@@ -149,6 +149,6 @@ def _piece_with_paper(board: Board, corners: Array) -> tuple[slice, slice] | Non
 
 def _shade(board: Board, xy: Array, look: Look) -> Array:
     paper = _on_paper(board, xy)
-    shade = np.where(paper, look.light_dn, look.background_dn)
-    shade[paper] -= (look.light_dn - look.dark_dn) * ink_at(board, xy[paper])
+    shade = np.where(paper, look.paper_dn, look.background_dn)
+    shade[paper] -= (look.paper_dn - look.ink_dn) * ink_at(board, xy[paper])
     return shade

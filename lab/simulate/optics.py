@@ -18,7 +18,7 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(4)
 
 
 @dataclass(frozen=True, slots=True)
-class Spots:
+class SpotImages:
     """The images of n spots at one instant."""
 
     uv_px: Array  # (n, 2) centre: the image of the axis of the beam
@@ -40,7 +40,7 @@ def on_screen_covariance(direction: Array, axes: Array, sigma_m: float) -> Array
     return sigma_m**2 * (np.eye(2) + b[..., :, None] * b[..., None, :] / slack[..., None, None])
 
 
-def appearance(model: SpotModel, world_from_body: Pose, sigma_m: float, blur_px: float) -> Spots:
+def spot_images(model: SpotModel, world_from_body: Pose, sigma_m: float, blur_px: float) -> SpotImages:
     """The spots of all views for one pose: ellipses on the screens, mapped to the picture by the local affine map.
 
     sigma_m: of the beam, half its 1/e^2 radius. blur_px: sigma of the blur of the lens. nan where there is no
@@ -61,7 +61,7 @@ def appearance(model: SpotModel, world_from_body: Pose, sigma_m: float, blur_px:
     normal = (model.camera_rotation @ model.screen_rotation[..., 2:])[..., 0]
     cosine = np.abs(np.sum(normal * in_camera, axis=-1)) / distance
     light = np.where(seen, cosine / distance**2, np.nan)
-    return Spots(uv, np.where(seen[:, None, None], covariance, np.nan), light)
+    return SpotImages(uv, np.where(seen[:, None, None], covariance, np.nan), light)
 
 
 @dataclass(frozen=True, slots=True)

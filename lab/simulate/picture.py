@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from geometry.arrays import Array
 from geometry.camera import SensorNoise
 from geometry.pose import Pose
-from lab.simulate.optics import appearance, exposure_instants, spot_patch
+from lab.simulate.optics import exposure_instants, spot_images, spot_patch
 from lab.simulate.scenarios import Light
 from lab.simulate.scene import LIGHT, PIXELS, SHINING, Scene
 
@@ -87,34 +87,34 @@ def _noise_sigma(light_dn: Floats32, noise: SensorNoise) -> Floats32:
 
 
 @dataclass(frozen=True, slots=True)
-class Powers:
+class LaserPowers:
     """The powers of the lasers, scaled so that a spot has `peak_dn` with the vehicle at the world origin."""
 
     flux_dn_per_light: Array  # (n,) DN summed over the spot, per unit of optics.Spots.light
 
 
-def laser_powers(scene: Scene) -> Powers:
+def laser_powers(scene: Scene) -> LaserPowers:
     """The powers, drawn once per recording. The two ends of one beam are two lasers."""
     light, model = scene.scenario.light, scene.model
-    at_origin = appearance(model, Pose.identity(), light.beam_radius_m / 2, light.blur_px)
+    at_origin = spot_images(model, Pose.identity(), light.beam_radius_m / 2, light.blur_px)
     area = 2 * np.pi * np.sqrt(np.linalg.det(at_origin.covariance_px2))
     # All spots share the exposure, so their mean peak is that of the scenario; nan: no spot from the origin.
     flux = np.nanmean(light.peak_dn * area / at_origin.light) * 2.0 ** (light.bits - 8)
     rng = np.random.default_rng([scene.seed, LIGHT, 1_000])
     spread = np.exp(light.power_spread * rng.standard_normal(len(model.spot_names)))
-    return Powers(flux * spread[model.spot_of])
+    return LaserPowers(flux * spread[model.spot_of])
 
 
-def expose(scene: Scene, sensor: Sensor, powers: Powers, k: int) -> Floats32:
+def expected_light(scene: Scene, sensor: Sensor, powers: LaserPowers, k: int) -> Floats32:
     """The light of frame k in one camera, DN above black, before noise, hot pixels and rounding: (h, w)."""
     return _lit(scene, sensor, powers, k)[0]
 
 
-def _lit(scene: Scene, sensor: Sensor, powers: Powers, k: int) -> tuple[Floats32, list[tuple[slice, slice]]]:
+def _lit(scene: Scene, sensor: Sensor, powers: LaserPowers, k: int) -> tuple[Floats32, list[tuple[slice, slice]]]:
     """The light, and the regions of the picture in which it exceeds the background."""
     light, model = scene.scenario.light, scene.model
     views = np.flatnonzero(model.camera_of == sensor.camera)
-    spots = appearance(model.subset(views), scene.poses[k], light.beam_radius_m / 2, light.blur_px)
+    spots = spot_images(model.subset(views), scene.poses[k], light.beam_radius_m / 2, light.blur_px)
     paths, weights = _paths(scene, views, float(scene.t_s[k]), spots.covariance_px2)
     rng = np.random.default_rng([scene.seed, LIGHT, sensor.camera, k + 1])
     picture = sensor.background.copy()
@@ -136,7 +136,7 @@ def _lit(scene: Scene, sensor: Sensor, powers: Powers, k: int) -> tuple[Floats32
         occluded = scene.in_view[k, view] not in (SHINING, 0)
         if not occluded and np.isfinite(paths[:, i]).all():
             add(paths[:, i], weights, spots.covariance_px2[i], float(powers.flux_dn_per_light[view] * spots.light[i]))
-    false = scene.false_spots
+    false = scene.clutter_points
     for row in range(*np.searchsorted(false.frame, [k, k + 1])):
         if false.camera[row] == sensor.camera and np.isfinite(typical_flux):
             add(false.uv_px[row][None], np.ones(1), shape, float(false.strength[row]) * typical_flux)
@@ -171,7 +171,7 @@ def _speckle(rng: np.random.Generator, shape: tuple[int, int], light: Light) -> 
     return np.exp(factor * grain.astype(np.float64) - sigma**2 / 2)
 
 
-def take(scene: Scene, sensor: Sensor, powers: Powers, k: int, *, noisy: bool = True) -> Picture:
+def render(scene: Scene, sensor: Sensor, powers: LaserPowers, k: int, *, noisy: bool = True) -> Picture:
     """The picture of frame k: (h, w), uint8 up to 8 bits, otherwise uint16."""
     value, pieces = _lit(scene, sensor, powers, k)
     if noisy:

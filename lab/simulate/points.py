@@ -63,7 +63,7 @@ def simulate_points(
     """
     overridden = with_overrides(scenario, clutter=clutter, miss_probability=miss_probability)
     scene = compose(overridden, seed, frames, picture_scale, rig)
-    model, false = scene.model, scene.false_spots
+    model, false = scene.model, scene.clutter_points
     n, cameras = len(model), range(len(model.camera_names))
     first_false = np.searchsorted(false.frame, np.arange(len(scene.frame) + 1))
     covariance = max(noise_px, _LEAST_SIGMA_PX) ** 2 * np.eye(2)

@@ -34,7 +34,7 @@ SHINING, HIDDEN, OUTSIDE = 1, 2, 0  # in_view of truth/spots.csv
 
 
 @dataclass(frozen=True, slots=True)
-class FalseSpots:
+class ClutterPoints:
     """The clutter of a whole recording: m false points, by frame."""
 
     frame: Ints  # (m,)
@@ -59,10 +59,10 @@ class Scene:
     in_view: Ints  # (T, n) SHINING, HIDDEN or OUTSIDE
     has_image: Bools  # (T, cameras) a usable picture exists
     turned: Bools  # (T,) the motion bends between the frame before and this one
-    false_spots: FalseSpots
+    clutter_points: ClutterPoints
 
 
-def named(scenario: str | Scenario) -> Scenario:
+def scenario_named(scenario: str | Scenario) -> Scenario:
     """The scenario of this name.
 
     Raises:
@@ -89,7 +89,7 @@ def compose(
     Raises:
         InputError: an unknown scenario, no frames, or a motion that does not meet the conditions of the scenario.
     """
-    scenario = named(scenario)
+    scenario = scenario_named(scenario)
     count = scenario.frames if frames is None else frames
     if count < 1:
         raise InputError(f"frames: expected at least 1, got {count}")
@@ -106,11 +106,11 @@ def compose(
     uv = model.project(poses)[0]
     bend_frames = np.floor(motion.bends_s(float(t_s[-1]) + 1.0) * scenario.frame_rate_hz + 1e-6).astype(np.int64)
     turned = np.isin(frame, bend_frames + 1)
-    occluded, false_spots = _occlusions_and_clutter(scenario, model, uv, bend_frames, seed)
+    occluded, clutter_points = _occlusions_and_clutter(scenario, model, uv, bend_frames, seed)
     in_view = np.where(model.in_picture(uv), np.where(occluded, HIDDEN, SHINING), OUTSIDE)
     return Scene(
         scenario, seed, rig, model, motion, frame, t_s, poses, uv, in_view,
-        _usable_pictures(scenario, model, count), turned, false_spots,
+        _usable_pictures(scenario, model, count), turned, clutter_points,
     )  # fmt: skip
 
 
@@ -159,7 +159,7 @@ def _valid_views(scenario: Scenario, model: SpotModel, motion: Motion) -> bool:
 
 def _occlusions_and_clutter(
     scenario: Scenario, model: SpotModel, uv_px: Array, bend_frames: Ints, seed: int
-) -> tuple[Bools, FalseSpots]:
+) -> tuple[Bools, ClutterPoints]:
     """Occlusion of each view (T, n), and the clutter."""
     clutter, occlusion = scenario.clutter, scenario.occlusion
     count, n = uv_px.shape[:2]
@@ -183,8 +183,10 @@ def _occlusions_and_clutter(
                 for u, v, s in rng.random((rng.poisson(clutter.per_image), 3)):
                     found.append((k, camera, u * size[0] - 0.5, v * size[1] - 0.5, low + (high - low) * s))
     table = np.array(found, dtype=float).reshape(-1, 5)
-    false_spots = FalseSpots(table[:, 0].astype(np.int64), table[:, 1].astype(np.int64), table[:, 2:4], table[:, 4])
-    return occluded_spots[:, model.spot_of], false_spots
+    clutter_points = ClutterPoints(
+        table[:, 0].astype(np.int64), table[:, 1].astype(np.int64), table[:, 2:4], table[:, 4]
+    )
+    return occluded_spots[:, model.spot_of], clutter_points
 
 
 def _occluded_spots(scenario: Scenario, n_spots: int, count: int, bend_frames: Ints, seed: int) -> Bools:
@@ -221,7 +223,7 @@ def with_overrides(
     Raises:
         InputError: an unknown scenario, or a probability outside 0 to 1.
     """
-    scenario = named(scenario)
+    scenario = scenario_named(scenario)
     if clutter is not None:
         if not 0.0 <= clutter <= 1.0:
             raise InputError(f"clutter: expected a probability per spot and frame, 0 to 1, got {clutter:g}")

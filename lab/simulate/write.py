@@ -19,7 +19,7 @@ from lab.files.rig.rig_file import RigFile, load_rig_file, save_rig
 from lab.files.run.run_file import save_run
 from lab.files.text import columns
 from lab.files.text.atomic_write import atomic_folder
-from lab.simulate.picture import Picture, Powers, Sensor, laser_powers, make_sensor, take
+from lab.simulate.picture import LaserPowers, Picture, Sensor, laser_powers, make_sensor, render
 from lab.simulate.points import simulate_points
 from lab.simulate.scenarios import LIGHTS, Scenario
 from lab.simulate.scene import Scene, compose, with_overrides
@@ -190,7 +190,7 @@ def _workers(threads: int | None) -> int:
     return threads if threads is not None else min(4, os.cpu_count() or 1)
 
 
-def _sensors(scene: Scene) -> tuple[list[Sensor], Powers]:
+def _sensors(scene: Scene) -> tuple[list[Sensor], LaserPowers]:
     return [make_sensor(scene, c) for c in range(len(scene.model.camera_names))], laser_powers(scene)
 
 
@@ -210,7 +210,7 @@ def _write_pictures(
         fault = faults.get((k, name))
         if fault == "dropped":
             return
-        picture = take(scene, sensor, powers, k, noisy=noisy)
+        picture = render(scene, sensor, powers, k, noisy=noisy)
         if fault == "wrong size":
             picture = picture[: picture.shape[0] // 2, : picture.shape[1] // 2]
         data = cv2.imencode(".png", picture, _PNG)[1].tobytes()
@@ -247,7 +247,7 @@ def _write_videos(
                 raise InputError(f"{path.name}: this OpenCV cannot write {_VIDEO_CODEC} video; write PNG files instead")
 
             def picture(k: int, sensor: Sensor = sensor) -> Picture:
-                return take(scene, sensor, powers, k, noisy=noisy)
+                return render(scene, sensor, powers, k, noisy=noisy)
 
             try:
                 for first in range(0, len(scene.frame), _BATCH):

@@ -59,7 +59,7 @@ class Row:
 
 
 @dataclass(frozen=True, slots=True)
-class Tracked:
+class TrackedRun:
     """The output of a tracker for the recording, T frames, n views."""
 
     uv_px: Array  # (T, n, 2)
@@ -76,9 +76,9 @@ class Study:
     seed: int
     run: PointRun
     rows: tuple[Row, ...]
-    same_spots: dict[str, Array]  # name of a filter: (T, n, 2) prediction error on the same spots
+    prediction_errors: dict[str, Array]  # name of a filter: (T, n, 2) prediction error on the same spots
     outside_px: dict[str, Array]  # name of a method: (T, n) error of spots out of view; nan elsewhere
-    trackers: dict[str, Tracked]
+    trackers: dict[str, TrackedRun]
     bends: Bools  # (T,)
 
 
@@ -87,7 +87,7 @@ def repeat_huo2015(seed: int, frames: int) -> Study:
     run = simulate_points("huo2015", seed, frames=frames, noise_px=NOISE_PX)
     bends = _bends(run)
     same = {
-        f"{kind}, {name}": same_spots(run, sigma_a, switch)
+        f"{kind}, {name}": prediction_errors(run, sigma_a, switch)
         for name, sigma_a in (("stiff", STIFF_PX_S2), ("loose", LOOSE_PX_S2))
         for kind, switch in (("conventional", False), ("curve switching", True))
     }
@@ -96,7 +96,9 @@ def repeat_huo2015(seed: int, frames: int) -> Study:
         "curve switching": track(run, PAPER),
         "beampose": track(run, TrackerParameters(method="spots")),
     }
-    outside = {f"{way}, {noise:g} px": outside_error(run, way, noise) for noise in (0.0, NOISE_PX) for way in METHODS}
+    outside = {
+        f"{way}, {noise:g} px": out_of_view_errors(run, way, noise) for noise in (0.0, NOISE_PX) for way in METHODS
+    }
     rows = (*_filter_rows(run, same, bends), *_outside_rows(run, outside), *_tracker_rows(run, trackers, bends))
     return Study(seed, run, rows, same, outside, trackers, bends)
 
@@ -112,7 +114,7 @@ def _bends(run: PointRun) -> Bools:
 # The two filters on the same spots (Figs. 5 and 6) ----------------------------------------------------------------
 
 
-def same_spots(run: PointRun, sigma_a_px_s2: float, switch: bool) -> Array:
+def prediction_errors(run: PointRun, sigma_a_px_s2: float, switch: bool) -> Array:
     """(T, n, 2): prediction error, px, of filters that get the noisy position of their own spot, without clutter.
 
     Only the filters differ. With `switch`, a filter is restarted by eq. (6) if its innovation exceeds r1 or is not
@@ -149,7 +151,7 @@ def same_spots(run: PointRun, sigma_a_px_s2: float, switch: bool) -> Array:
 # The whole trackers (Figs. 8 and 9, eq. 15) -----------------------------------------------------------------------
 
 
-def track(run: PointRun, parameters: TrackerParameters) -> Tracked:
+def track(run: PointRun, parameters: TrackerParameters) -> TrackedRun:
     """The output of the tracker with these parameters."""
     p = run.prior
     centre = Pose.from_ypr(np.deg2rad(p.yaw_pitch_roll_deg), np.array(p.position_m))
@@ -162,7 +164,7 @@ def track(run: PointRun, parameters: TrackerParameters) -> Tracked:
     origin = np.full(point.shape, NO_POINT)
     for k, v in zip(*np.nonzero(point >= 0), strict=True):
         origin[k, v] = run.origin[k][run.model.camera_of[v]][point[k, v]]
-    return Tracked(
+    return TrackedRun(
         uv_px=np.array([f.uv_px for f in frames]),
         prediction_error_px=np.array([f.predicted_px for f in frames]) - run.uv_px,
         right=(point >= 0) & (origin == np.arange(point.shape[1])),
@@ -176,7 +178,7 @@ def track(run: PointRun, parameters: TrackerParameters) -> Tracked:
 METHODS = ("quadratic", "rigid")
 
 
-def outside_error(run: PointRun, way: str, noise_px: float) -> Array:
+def out_of_view_errors(run: PointRun, way: str, noise_px: float) -> Array:
     """(T, n): error, px, of the computed positions of spots outside the picture; nan elsewhere.
 
     The other spots have noise and correct labels. way: `quadratic`: eqs. (10) to (14) from two beams; `rigid`:
@@ -260,7 +262,7 @@ def _outside_rows(run: PointRun, outside: dict[str, Array]) -> list[Row]:
     return out
 
 
-def _tracker_rows(run: PointRun, trackers: dict[str, Tracked], bends: Bools) -> list[Row]:
+def _tracker_rows(run: PointRun, trackers: dict[str, TrackedRun], bends: Bools) -> list[Row]:
     use = _steady(run, bends)
     visible = run.in_view == 1
     exists = ~np.isnan(run.uv_px[..., 0])
@@ -268,7 +270,7 @@ def _tracker_rows(run: PointRun, trackers: dict[str, Tracked], bends: Bools) -> 
     def row(quantity: str, unit: str, printed: float | None, of: dict[str, float], note: str) -> Row:
         return Row(quantity, unit, printed, of["conventional"], of["curve switching"], of["beampose"], note)
 
-    def largest(t: Tracked) -> float:
+    def largest(t: TrackedRun) -> float:
         return float(np.nanmax(np.linalg.norm(t.uv_px - run.uv_px, axis=-1)[START_FRAMES:]))
 
     prediction = {name: _rms(t.prediction_error_px, use & t.right) for name, t in trackers.items()}
@@ -313,6 +315,6 @@ def _tracker_rows(run: PointRun, trackers: dict[str, Tracked], bends: Bools) -> 
     ]
 
 
-def _outside_rms(run: PointRun, t: Tracked) -> float:
+def _outside_rms(run: PointRun, t: TrackedRun) -> float:
     gap = np.linalg.norm(t.uv_px - run.uv_px, axis=-1)[t.outside & (run.in_view == 0)]
     return float(np.sqrt(np.mean(gap**2))) if len(gap) else float("nan")

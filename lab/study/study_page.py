@@ -52,7 +52,7 @@ def _figures(study: Study) -> list[tuple[str, str, str]]:
     out = []
     spot_1 = next(i for i, (_, spot) in enumerate(n.views) if spot == "1")
     for name in ("stiff", "loose"):
-        errors = [study.same_spots[f"{kind}, {name}"][:, spot_1] for kind in ("conventional", "curve switching")]
+        errors = [study.prediction_errors[f"{kind}, {name}"][:, spot_1] for kind in ("conventional", "curve switching")]
         y_range = robust_range(np.concatenate(errors), 0.5)
         panels = [
             _panel(t, f"{kind}, {name}: predicted − true, spot 1", e, shade, y_range)

@@ -7,7 +7,7 @@ import csv
 import numpy as np
 import pytest
 
-from lab.study.experiment_huo2015 import NOISE_PX, repeat_huo2015, same_spots
+from lab.study.experiment_huo2015 import NOISE_PX, prediction_errors, repeat_huo2015
 from lab.study.studies import COLUMNS, study_huo2015
 
 FRAMES = 200  # a bend, and spots 3 and 6 leave the picture
@@ -37,7 +37,7 @@ def test_the_rigid_body_is_at_least_as_accurate_out_of_view_as_the_quadratic_equ
 def test_a_filter_with_low_process_noise_recovers_from_a_bend_faster_with_a_restart(study):
     after = np.flatnonzero(study.run.turned)[0] + np.arange(2, 12)
     conventional, switching = (
-        np.sqrt(np.nanmean(same_spots(study.run, 300.0, switch)[after] ** 2)) for switch in (False, True)
+        np.sqrt(np.nanmean(prediction_errors(study.run, 300.0, switch)[after] ** 2)) for switch in (False, True)
     )
     assert switching < 0.7 * conventional
 

@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 from lab.number_format import angle, length, percent, short
-from lab.report.run.tables import Key, counted, pixels
+from lab.report.run.tables import KeyFigure, counted, pixels
 from lab.report.run.truth_errors import MotionErrors, PoseSpread, SpotErrors, TruthErrors
 
 
-def truth_figures(e: TruthErrors | None) -> list[Key]:
+def truth_figures(e: TruthErrors | None) -> list[KeyFigure]:
     """The key figures of the errors against truth."""
     keys = []
     if e is not None and e.spots is not None:
         s, smooth = e.spots, e.spots.prediction_px.get("smooth")
         outside = s.out_of_view_px
         keys += [
-            Key("right in view", percent(s.in_view_identity), "of visible spots"),
-            Key("wrong labels", counted(s.wrong_labels), "measured rows"),
-            Key("prediction error", pixels(None if smooth is None else smooth.rms), "RMS without true bends"),
-            Key(
+            KeyFigure("right in view", percent(s.in_view_identity), "of visible spots"),
+            KeyFigure("wrong labels", counted(s.wrong_labels), "measured rows"),
+            KeyFigure("prediction error", pixels(None if smooth is None else smooth.rms), "RMS without true bends"),
+            KeyFigure(
                 "out-of-view error",
                 pixels(None if outside is None else outside.rms),
                 f"RMS; largest {pixels(outside.max)}" if outside else "no spot was out of view",
@@ -30,9 +30,9 @@ def truth_figures(e: TruthErrors | None) -> list[Key]:
             shown = angle(causal.rotation_deg.rms), length(causal.position_m.rms)
             notes = [f"RMS, smoothed; causal {value}" for value in shown]
         keys += [
-            Key("rotation error", angle(measured.rotation_deg.rms), notes[0]),
-            Key("position error", length(measured.position_m.rms), notes[1]),
-            Key("NEES", short(measured.nees_mean), "mean; 6 if σ is correct"),
+            KeyFigure("rotation error", angle(measured.rotation_deg.rms), notes[0]),
+            KeyFigure("position error", length(measured.position_m.rms), notes[1]),
+            KeyFigure("NEES", short(measured.nees_mean), "mean; 6 if σ is correct"),
         ]
     return keys
 

@@ -14,7 +14,7 @@ from lab.report.run.events import ShownEvent, events, selected
 from lab.report.run.model_fit import HEADS as MODEL_FIT_HEADS
 from lab.report.run.model_fit import model_fit
 from lab.report.run.pictures import pictures
-from lab.report.run.report_data import ReportData, gather
+from lab.report.run.report_data import ReportData, read_report_data
 from lab.report.run.tracks import POSE_COLOURS, SPOT_COLOURS, timeline_figure, tracks_figure
 from tracking.statuses import PoseStatus, SpotStatus
 
@@ -32,7 +32,7 @@ def write_report(results: Path, run_folder: Path | None = None) -> Path:
         InputError: the tables cannot be read.
     """
     path = results / FILE_NAME
-    atomic_write_text(page(gather(results, run_folder), results), path)
+    atomic_write_text(page(read_report_data(results, run_folder), results), path)
     return path
 
 

@@ -61,7 +61,7 @@ class ReportData:
         return self.poses.t_s if self.time_name != "frame" else self.poses.frames.astype(float)
 
 
-def gather(results: Path, run_folder: Path | None) -> ReportData:
+def read_report_data(results: Path, run_folder: Path | None) -> ReportData:
     """Read a results folder, and what is there of its run folder.
 
     run_folder: None: the folder that summary.json names. If it is missing or damaged, only the data from it are left

@@ -15,7 +15,7 @@ from tracking.statuses import PoseStatus, SpotStatus
 
 
 @dataclass(frozen=True, slots=True)
-class Key:
+class KeyFigure:
     """One key figure."""
 
     name: str
@@ -43,7 +43,7 @@ def counted(value: int | None) -> str:
     return "\u2013" if value is None else str(value)
 
 
-def key_figures(m: ReportData) -> list[Key]:
+def key_figures(m: ReportData) -> list[KeyFigure]:
     """The key figures from the results alone."""
     n = len(m.spots.frames)
     p = m.poses
@@ -59,12 +59,12 @@ def key_figures(m: ReportData) -> list[Key]:
         causal_m = _median(np.linalg.norm(m.causal.sigma_position_m[causal], axis=1))
         position_note = f"median, smoothed; causal {length(causal_m)}"
     return [
-        Key("frames", f"{n:,}".replace(",", "\u202f"), f"{short(span)} s" if m.time_name != "frame" else ""),
-        Key("pose measured", percent(float(measured.mean()) if len(measured) else None), "of all frames"),
-        Key("spots found", percent(found), "of the spots expected in view"),
-        Key("σ of yaw", angle(_median(p.sigma_ypr_deg[measured, 0])), yaw_note),
-        Key("σ of position", length(sigma_m), position_note),
-        Key("residual", pixels(_median(p.rms_px[measured])), "median RMS of the pose"),
+        KeyFigure("frames", f"{n:,}".replace(",", "\u202f"), f"{short(span)} s" if m.time_name != "frame" else ""),
+        KeyFigure("pose measured", percent(float(measured.mean()) if len(measured) else None), "of all frames"),
+        KeyFigure("spots found", percent(found), "of the spots expected in view"),
+        KeyFigure("σ of yaw", angle(_median(p.sigma_ypr_deg[measured, 0])), yaw_note),
+        KeyFigure("σ of position", length(sigma_m), position_note),
+        KeyFigure("residual", pixels(_median(p.rms_px[measured])), "median RMS of the pose"),
     ]
 
 

@@ -21,7 +21,7 @@ from lab.report.run.events import MOST_PICTURES, events, selected
 from lab.report.run.index import write_index
 from lab.report.run.page import write_report
 from lab.report.run.pictures import _arrow
-from lab.report.run.report_data import gather
+from lab.report.run.report_data import read_report_data
 from lab.report.run.summary import summary_of, verdict_of
 from tests.lab.fake_results import Fake, make, without_added_columns
 from tracking.statuses import PoseStatus, SpotStatus
@@ -197,7 +197,7 @@ def test_the_report_counts_doubtful_and_changed_labels(fake, tmp_path):
 
 
 def test_residuals_are_compared_with_their_variance_after_the_fit_of_the_pose(fake):
-    material = gather(fake.results, None)
+    material = read_report_data(fake.results, None)
     shares = (material.residual_px / material.spots.sigma_px) ** 2
     # These poses are drawn independently of the measured places: residuals are larger than after a fit.
     assert np.nanmean(shares) > 1.0
@@ -287,7 +287,7 @@ def test_a_damaged_picture_is_shown_as_such(filmed):
 
 
 def test_at_most_eight_pictures_include_every_kind_of_event(fake):
-    material = gather(fake.results, None)
+    material = read_report_data(fake.results, None)
     found = events(material)
     selection = selected(material, found)
     assert len(selection) <= MOST_PICTURES
@@ -302,7 +302,7 @@ def test_events_recorded_by_the_run_are_listed_and_pictured(fake, tmp_path):
     assert "<td>33</td><td>0.330</td><td>left</td><td>two labels fit &lt;equally&gt;</td>" in write_report(
         tmp_path / "results"
     ).read_text(encoding="utf-8")
-    material = gather(tmp_path / "results", fake.run_folder)
+    material = read_report_data(tmp_path / "results", fake.run_folder)
     assert "tie" in {e.kind for e in selected(material, events(material))}
 
 

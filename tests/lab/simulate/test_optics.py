@@ -12,8 +12,8 @@ from geometry.camera import Camera
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.rig import Rig
-from lab.simulate.optics import appearance, exposure_instants, on_screen_covariance, spot_patch
-from lab.simulate.picture import expose, laser_powers, make_sensor
+from lab.simulate.optics import exposure_instants, on_screen_covariance, spot_images, spot_patch
+from lab.simulate.picture import expected_light, laser_powers, make_sensor
 from lab.simulate.rigs import fan, look_at
 from lab.simulate.scenarios import LIGHTS, SCENARIOS, Clutter
 from lab.simulate.scene import compose
@@ -52,7 +52,7 @@ def errors_px(scene, half, expected_px=None):
     for camera, name in enumerate(scene.model.camera_names):
         sensor = make_sensor(scene, camera)
         for k in scene.frame:
-            picture = expose(scene, sensor, powers, k)
+            picture = expected_light(scene, sensor, powers, k)
             inside = scene.rig.cameras[name].sees(scene.uv_px[k], -half - 1.0) & (scene.model.camera_of == camera)
             out.extend(fitted_centre(picture, scene.uv_px[k, i], half) - expected[k, i] for i in np.flatnonzero(inside))
     return np.array(out)
@@ -158,7 +158,7 @@ POSES = [
 @pytest.mark.parametrize("view", [0, 1, 3, 4])
 def test_the_ellipse_in_the_picture_agrees_with_rays_traced_through_opencv(pose, view):
     covariance = traced(view, pose, 0.0055)[2]
-    found = appearance(MODEL, pose, 0.0055, 0.0).covariance_px2[view]
+    found = spot_images(MODEL, pose, 0.0055, 0.0).covariance_px2[view]
     np.testing.assert_allclose(found, covariance, atol=1e-3 * np.trace(covariance))
     # Not a circle, for which the angle would not be tested.
     assert np.linalg.eigvalsh(found)[1] > 1.05 * np.linalg.eigvalsh(found)[0]
@@ -184,7 +184,7 @@ def test_the_light_of_a_spot_at_twice_the_distance_is_a_quarter():
             RIG.cameras["left"], look_at(np.array([-2.5 + distance_m, 0, 0.0]), np.array([-2.5, 0, 0.0]))
         )
         rig = Rig(RIG.screens, {"left": camera}, RIG.beams, RIG.spots)
-        return appearance(SpotModel.of(rig), Pose.identity(), 0.005, 0.5).light[1]
+        return spot_images(SpotModel.of(rig), Pose.identity(), 0.005, 0.5).light[1]
 
     assert light_at(2.0) / light_at(4.0) == pytest.approx(4.0)
 

@@ -82,8 +82,8 @@ def test_less_clutter_is_a_subset_of_more_clutter_with_the_same_motion():
         compose(replace(few_s, clutter=replace(few_s.clutter, per_spot=p)), 4, 50)
         for few_s, p in ((SCENARIOS["huo2015"], 0.2), (SCENARIOS["huo2015"], 1.0))
     )
-    few_set = {tuple(uv) for uv in few_scene.false_spots.uv_px}
-    many_set = {tuple(uv) for uv in many_scene.false_spots.uv_px}
+    few_set = {tuple(uv) for uv in few_scene.clutter_points.uv_px}
+    many_set = {tuple(uv) for uv in many_scene.clutter_points.uv_px}
     assert few_set < many_set
 
 

@@ -14,7 +14,7 @@ from lab.errors import InputError
 from lab.files.rig.rig_file import load_rig, save_rig
 from lab.files.run.detections_file import read_detections
 from lab.runs.check import check
-from lab.simulate.picture import expose, laser_powers, make_sensor, take
+from lab.simulate.picture import expected_light, laser_powers, make_sensor, render
 from lab.simulate.points import simulate_points
 from lab.simulate.scenarios import LIGHTS, SCENARIOS, Clutter, Hiding, Light
 from lab.simulate.scene import compose
@@ -128,7 +128,7 @@ def test_a_12_bit_picture_is_the_same_scene_with_finer_grey_values(tmp_path):
 
 def test_a_saturated_spot_has_the_largest_grey_value():
     scene = compose(replace(SCENARIOS["static"], light=replace(LIGHTS["clean"], peak_dn=2000.0)), 0, 1)
-    picture = take(scene, make_sensor(scene, 0), laser_powers(scene), 0)
+    picture = render(scene, make_sensor(scene, 0), laser_powers(scene), 0)
     assert picture.max() == 255
     assert (picture == 255).sum() > 30
 
@@ -143,8 +143,8 @@ def test_only_visible_spots_give_light():
     scene = compose(occluded, 0, 2)
     sensor, powers = make_sensor(scene, 0), laser_powers(scene)
     assert (scene.in_view[1] == 2).all()
-    np.testing.assert_array_equal(expose(scene, sensor, powers, 1), sensor.background)
-    lit = expose(scene, sensor, powers, 0) - sensor.background
+    np.testing.assert_array_equal(expected_light(scene, sensor, powers, 1), sensor.background)
+    lit = expected_light(scene, sensor, powers, 0) - sensor.background
     for view in np.flatnonzero(scene.model.camera_of == 0):
         u, v = np.round(scene.uv_px[0, view]).astype(int)
         assert lit[v, u] > 50
@@ -157,7 +157,9 @@ def test_speckle_has_the_given_contrast():
         compose(replace(SCENARIOS["static"], light=light, clutter=Clutter(per_spot=0.0)), 0, 1)
         for light in (grainy, even)
     )
-    a, b = (expose(s, make_sensor(s, 0), laser_powers(s), 0) - make_sensor(s, 0).background for s in (rough, smooth))
+    a, b = (
+        expected_light(s, make_sensor(s, 0), laser_powers(s), 0) - make_sensor(s, 0).background for s in (rough, smooth)
+    )
     ratio = (a / np.maximum(b, 1e-9))[b > 0.3 * b.max()]
     assert ratio.mean() == pytest.approx(1.0, abs=0.02)
     assert ratio.std() == pytest.approx(0.2, rel=0.1)
@@ -170,7 +172,7 @@ def test_a_wider_beam_has_a_lower_peak_and_the_same_power():
     sums, peaks = zip(
         *(
             (float(light.sum(dtype=np.float64)), float(light.max()))
-            for light in (expose(s, sensor, powers, 0) - sensor.background for s in (scene, wide))
+            for light in (expected_light(s, sensor, powers, 0) - sensor.background for s in (scene, wide))
         ),
         strict=True,
     )
