@@ -79,8 +79,8 @@ def judged(run: PointRun, out: list[TrackedFrame], ms: float) -> Judged:
 
 def _delays(run: PointRun, out: list[TrackedFrame], shining: Bools) -> Iterator[int]:
     """For each blackout, the number of frames after it until all visible spots are labelled."""
-    dark = ~shining.any(axis=1)
-    for end in np.flatnonzero(dark[:-1] & ~dark[1:]) + 1:
+    blackout = ~shining.any(axis=1)
+    for end in np.flatnonzero(blackout[:-1] & ~blackout[1:]) + 1:
         complete = [np.all(out[k].point[shining[k]] != UNMATCHED) for k in range(end, min(end + 30, len(out)))]
         yield int(np.argmax(complete)) if any(complete) else 99
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import cv2
 
-from bench.random_pictures.judge import PictureJudgement, asked_pairs, judge
+from bench.random_pictures.judge import PictureJudgement, counted_pairs, judge
 from bench.random_pictures.looks import FAMILIES
 from bench.random_pictures.render import Renderer
 from bench.random_pictures.report import crashed, details, summary, write_rows
@@ -48,7 +48,7 @@ def judged(job: PictureJob) -> PictureJudgement:
         except Exception as error:
             plain = isinstance(error, BeamposeError)
             trace = f"{type(error).__name__}: {error}" if plain else traceback.format_exc()
-            return crashed(renderer, int(asked_pairs(renderer).sum()), trace)
+            return crashed(renderer, int(counted_pairs(renderer).sum()), trace)
         ran = time.process_time()
         return judge(renderer, place / "out", outcome.exit_status, (rendered - start, ran - rendered))
 

@@ -56,7 +56,7 @@ class PictureJudgement:
     counts: bool
     why_not: str
     classes: tuple[str, ...]
-    asked: int  # pairs
+    pairs: int  # number of counted pairs
     right: float  # share of the pairs that are measured and correct
     recall: float  # share of the pairs with a detection at the correct position
     false_per_picture: float  # detections without a light of the scene near them
@@ -113,7 +113,7 @@ def other_lights(renderer: Renderer, k: int, camera: int, but: int = -1) -> Arra
     return np.concatenate([spots, details, clutter])
 
 
-def asked_pairs(renderer: Renderer) -> Bools:
+def counted_pairs(renderer: Renderer) -> Bools:
     """(T, n): the pairs that count."""
     scene = renderer.ps.scene
     out = visible(renderer)
@@ -136,18 +136,18 @@ def judge(renderer: Renderer, results: Path, exit_status: int, seconds: tuple[fl
     scene = ps.scene
     answer = pass_of_files(scene, results, causal=False)
     summary = read_summary(results)
-    asked, limit = asked_pairs(renderer), tolerances(renderer)
+    pairs, limit = counted_pairs(renderer), tolerances(renderer)
     error = answer.uv_px - scene.uv_px
     away = np.linalg.norm(error, axis=-1)
     right = answer.labelled & (away <= limit)
     wrong = int((answer.labelled & ~(away <= limit)).sum())
     nees = np.sum(whitened_errors(scene, answer) ** 2, axis=1)
     good = (answer.status != LOST) & ~np.isnan(nees)
-    recall, false = detections_against(renderer, results, asked, limit)
+    recall, false = detections_against(renderer, results, pairs, limit)
     oracle = ask_oracle(oracle_scene(renderer))
     diagnoses = wrong_diagnoses(renderer, summary) if oracle.counts else ()
-    share = float((right & asked).sum() / max(asked.sum(), 1))
-    chosen = right & asked
+    share = float((right & pairs).sum() / max(pairs.sum(), 1))
+    chosen = right & pairs
     sigma = _claimed(scene, results)
     wrong_poses = int((nees[good] > CONFIDENTLY_WRONG).sum())
     mean_nees = float(nees[good].mean()) / 6 if good.any() else float("nan")
@@ -168,7 +168,7 @@ def judge(renderer: Renderer, results: Path, exit_status: int, seconds: tuple[fl
         classes.append("NEES")
     return PictureJudgement(
         seed=ps.seed, family=ps.family or "mixed", counts=oracle.counts, why_not=oracle.why_not, classes=tuple(classes),
-        asked=int(asked.sum()), right=share, recall=recall, false_per_picture=false, wrong=wrong,
+        pairs=int(pairs.sum()), right=share, recall=recall, false_per_picture=false, wrong=wrong,
         measured=float((answer.status == MEASURED).mean()), wrong_poses=wrong_poses, nees=mean_nees,
         nees_max=float(nees[good].max(initial=0.0)) / 6,
         scatter=_rms(error[chosen] / sigma[chosen]), error_px=_rms(error[chosen]),
@@ -178,7 +178,7 @@ def judge(renderer: Renderer, results: Path, exit_status: int, seconds: tuple[fl
     )  # fmt: skip
 
 
-def detections_against(renderer: Renderer, results: Path, asked: Bools, limit: Array) -> tuple[float, float]:
+def detections_against(renderer: Renderer, results: Path, pairs: Bools, limit: Array) -> tuple[float, float]:
     """Share of the pairs with a detection at their position, and detections per picture far from any light."""
     scene = renderer.ps.scene
     table = read_table(results / "detections.csv", ("frame", "u_px", "v_px"), ("camera",))
@@ -191,13 +191,13 @@ def detections_against(renderer: Renderer, results: Path, asked: Bools, limit: A
         for k in np.flatnonzero(scene.has_image[:, c]):
             points = uv[(frame == k) & (camera == c)]
             points = points[np.isfinite(points).all(axis=1)]
-            for i in mine[asked[k, mine]]:
+            for i in mine[pairs[k, mine]]:
                 found += bool(np.any(np.linalg.norm(points - scene.uv_px[k, i], axis=1) <= limit[k, i]))
             lights = other_lights(renderer, int(k), c)
             gap = np.linalg.norm(points[:, None] - lights[None, :, :2], axis=-1)
             near = gap < np.maximum(5 * lights[:, 2], 5.0)
             false += int((~near.any(axis=1)).sum())
-    return found / max(int(asked.sum()), 1), false / max(int(scene.has_image.sum()), 1)
+    return found / max(int(pairs.sum()), 1), false / max(int(scene.has_image.sum()), 1)
 
 
 def wrong_diagnoses(renderer: Renderer, summary: Mapping[str, Any]) -> tuple[str, ...]:
@@ -250,9 +250,9 @@ def compared(renderer: Renderer, camera: int, name: str, model: Any) -> NoiseFig
     """A model compared with the sensor, at the level of the background and at half of full scale."""
     look, still = renderer.ps.look, renderer.still[camera]
     rng = np.random.default_rng([*renderer.ps.key, 31, camera])
-    dark = float(np.median((still.ambient_e + still.steady_e)[::4, ::4]))
+    unlit = float(np.median((still.ambient_e + still.steady_e)[::4, ::4]))
     ratios, levels = [], []
-    for light in (dark, 0.5 * look.sensor.full_well_e):
+    for light in (unlit, 0.5 * look.sensor.full_well_e):
         level, variance = true_noise(look.sensor, light, rng)
         levels.append(level)
         # Rounding limits the observable noise: a constant 8-bit background may have no variance at all.

@@ -34,7 +34,7 @@ class Look:
     flicker: float  # of the ambient light, share
     drift: float  # of the ambient light over the recording, share
     reflections: int  # wide humps per picture
-    details: int  # small bright or dark details per picture
+    details: int  # small bright or black details per picture
     screen_edge: bool
     hot_pixels: int  # per picture
     clutter: int  # moving false spots per picture
@@ -158,7 +158,7 @@ FAMILIES: dict[str, Callable[[np.random.Generator, Look], Look]] = {
     "mjpg": lambda r, k: replace(k, sensor=draw_sensor(r, "mjpg")),
     "12-bit-in-16": lambda r, k: replace(k, sensor=draw_sensor(r, "12in16"), texture=0.04 * r.random()),
     "16-bit": lambda r, k: replace(k, sensor=draw_sensor(r, "16"), texture=0.04 * r.random()),
-    "dark-clipped": lambda r, k: replace(k, sensor=draw_sensor(r, "clipped"), background=float(r.uniform(0, 0.004))),
+    "black-clipped": lambda r, k: replace(k, sensor=draw_sensor(r, "clipped"), background=float(r.uniform(0, 0.004))),
     "bright-background": lambda r, k: replace(
         k, background=float(r.uniform(0.2, 0.31)), gradient=0.6, texture=float(r.uniform(0, 0.04)), most_peak=0.6
     ),

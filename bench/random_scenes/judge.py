@@ -179,8 +179,8 @@ def figures(scene: Scene, answer: Pass, solvable: Bools) -> PassFigures:
 def _locked_in(found: Bools, solvable: Bools) -> int:
     """The first found frame (T,) after which most solvable ones of the next LASTS frames are also found."""
     for k in np.flatnonzero(found):
-        asked = solvable[k : k + LASTS]
-        if (found[k : k + LASTS] & asked).sum() >= LEAST_LASTING * asked.sum():
+        expected = solvable[k : k + LASTS]
+        if (found[k : k + LASTS] & expected).sum() >= LEAST_LASTING * expected.sum():
             return int(k)
     return -1
 
@@ -302,10 +302,10 @@ def _after_darkness(scene: Scene, oracle: Oracle, answer: Pass) -> bool:
     """
     missing = oracle.solvable & (answer.status != MEASURED)
     shining = scene.shining.sum(axis=1)
-    dark = ~oracle.solvable | (shining < 0.5 * np.median(shining))
+    occluded = ~oracle.solvable | (shining < 0.5 * np.median(shining))
     after = np.zeros(len(scene), dtype=bool)
     for k in range(1, len(scene)):
-        after[k] = missing[k] and (dark[k - 1] or after[k - 1])
+        after[k] = missing[k] and (occluded[k - 1] or after[k - 1])
     return bool(missing.any() and after.sum() > 0.5 * missing.sum())
 
 

@@ -9,8 +9,8 @@ from lab.report.plot.axes import Plane
 from lab.report.plot.scales import Scale, tick_texts, ticks
 from lab.report.plot.svg import text
 
-# Anchors of the colour maps, light to dark, so that the order is kept in print and for all colour vision. Sequential:
-# cividis (Nunez, Anderton & Renslow 2018); diverging: blue to vermillion of Okabe & Ito through light grey.
+# Anchors of the colour maps. The lightness is monotonic, so that the order is kept in print and for all colour vision.
+# Sequential: cividis (Nunez, Anderton & Renslow 2018); diverging: blue to vermillion of Okabe & Ito through light grey.
 _SEQUENTIAL = (
     (253, 234, 69),
     (203, 186, 105),

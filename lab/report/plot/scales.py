@@ -24,7 +24,7 @@ class Scale:
 
 
 def ticks(lo: float, hi: float, about: int) -> Array:
-    """About so many round numbers between lo and hi, in steps of 1, 2 or 5 times a power of ten."""
+    """Round numbers between lo and hi, roughly `about` of them, in steps of 1, 2 or 5 times a power of ten."""
     raw = (hi - lo) / max(about, 1)
     power = 10.0 ** np.floor(np.log10(raw))
     step = power * min((m for m in (1, 2, 5, 10) if m * power >= raw * 0.999), default=10)
@@ -40,7 +40,7 @@ def tick_texts(values: Array) -> list[str]:
 
 
 def number(value: float, digits: int = 3) -> str:
-    """A number with at most so many significant digits, without trailing zeros, and a true minus sign."""
+    """A number with at most `digits` significant digits, without trailing zeros, and a true minus sign."""
     return f"{value:.{digits}g}".replace("-", "\u2212")
 
 
