@@ -1,7 +1,7 @@
-"""How good calibrations are, and whether they know it: `python -m bench.calibration [seeds] [first seed] [PART]`.
+"""Accuracy of calibrations and of their stated uncertainty: `python -m bench.calibration [seeds] [first seed] [PART]`.
 
-Each figure on fresh seeds, with the goal beside it. 200 seeds take about a quarter of an hour on one core; the real
-photographs are used where they are at hand. PART: lenses, circles or random_lenses alone.
+Each figure is printed with its goal. 200 seeds take about 15 minutes on one core. PART: only lenses, circles or
+random_lenses.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def lenses(seeds: range) -> Iterator[tuple[str, str, str]]:
 
 
 def circles(seeds: range) -> Iterator[tuple[str, str, str]]:
-    """Grids of circles in rendered photographs: 15 of 1280 x 1024, noise of 2 DN; of two seeds the whole search."""
+    """Grids of circles in 15 rendered photographs of 1280 x 1024, noise 2 DN; for two seeds with the whole search."""
     for text in ("acircles:4x11:20mm", "circles:9x7:25mm"):
         z, error, claim = [], [], []
         for seed in seeds:
@@ -65,11 +65,11 @@ def circles(seeds: range) -> Iterator[tuple[str, str, str]]:
             f"{inside:.0f} % ({each.min():.0f} to {each.max():.0f})",
             "60 to 76 %",
         )
-        yield f"{kind}: projection error / claimed", f"{np.sqrt(np.mean(error) / np.mean(claim)):.2f}", "0.8 to 1.25"
+        yield f"{kind}: projection error / stated", f"{np.sqrt(np.mean(error) / np.mean(claim)):.2f}", "0.8 to 1.25"
 
 
 def random_lenses(seeds: range) -> Iterator[tuple[str, str, str]]:
-    """Lenses of all kinds up to 120 deg, some of which no model follows; where corners were seen."""
+    """Lenses of all kinds up to 120 deg, some of which no model describes; errors in the calibrated area."""
     ratios, silent, grave = [], 0, []
     for seed in seeds:
         true = random_lens(seed)
@@ -83,18 +83,18 @@ def random_lenses(seeds: range) -> Iterator[tuple[str, str, str]]:
         ratios.append(ratio)
         silent += ratio > 1.3 and c.verdict == Level.PASS
         print(
-            f"  {seed} {true.kind} {true.fov_deg:.0f} deg -> {c.model.title}: error {j.error_px:.3f} px, claimed"
+            f"  {seed} {true.kind} {true.fov_deg:.0f} deg -> {c.model.title}: error {j.error_px:.3f} px, stated"
             f" {j.claimed_px:.3f}, ratio {ratio:.2f}, {c.verdict.name}",
             flush=True,
         )
     good = int(np.sum(np.array(ratios) <= 1.3))
-    found = f"{good} of {len(seeds)}; {silent} beyond it without a warning; {len(grave)} refused"
-    yield "random lenses: error / claimed <= 1.3", found, "18 of 20; 0"
+    found = f"{good} of {len(seeds)}; {silent} above without a warning; {len(grave)} refused"
+    yield "random lenses: error / stated <= 1.3", found, "18 of 20; 0"
     yield "random lenses: median and worst ratio", f"{np.median(ratios):.2f}, {np.max(ratios):.2f}", ""
 
 
 def bent_boards(seeds: range) -> Iterator[tuple[str, str, str]]:
-    """A board that is bowed by 1.5 mm over 0.33 m, and OpenCV's plain solve beside ours."""
+    """A board bowed by 1.5 mm over 0.33 m, calibrated by us and by OpenCV for a plane board."""
     ours, plain = [], []
     for seed in seeds:
         scene = Scene(views=10, warp=bowed(0.0015, 0.33), columns=12, rows=8, distance_m=(0.45, 0.9))
@@ -113,11 +113,11 @@ def bent_boards(seeds: range) -> Iterator[tuple[str, str, str]]:
     off, claimed = np.mean(plain, axis=0)
     found = f"{np.mean(ours):+.2f} sigma (of one set up to {np.abs(ours).max():.1f})"
     yield "bowed board: focal bias", found, "2 sigma"
-    yield "bowed board: plain OpenCV", f"{off:+.0f} px at a claimed {claimed:.1f} px", ""
+    yield "bowed board: plain OpenCV", f"{off:+.0f} px at a stated sigma of {claimed:.1f} px", ""
 
 
 def wrong_corners(seeds: range) -> Iterator[tuple[str, str, str]]:
-    """Four corners of one view off by 8 px."""
+    """Four corners of one view with an error of 8 px."""
     worst = 0.0
     for seed in seeds:
         table = photographs(Scene(), seed)
@@ -133,12 +133,12 @@ def wrong_corners(seeds: range) -> Iterator[tuple[str, str, str]]:
 
 
 def many_views() -> Iterator[tuple[str, str, str]]:
-    """400 photographs, everything but finding the corners: process time."""
+    """Process time for 400 photographs without the detection of corners."""
     table = photographs(Scene(views=400), 5)
     clock = time.process_time()
     calibrate_intrinsics(table)
     ours = time.process_time() - clock
-    yield "400 views, ladder, hold-out and halves", f"{ours:.1f} s", "20 s"
+    yield "400 views: model selection, hold-out and halves", f"{ours:.1f} s", "20 s"
 
 
 def beams(seeds: range) -> Iterator[tuple[str, str, str]]:
@@ -146,11 +146,11 @@ def beams(seeds: range) -> Iterator[tuple[str, str, str]]:
     for name, known in (("known", exact), ("unknown", unknown_place)):
         within, nees, size = tally(bench_case(s, known, RIGS["unequal-fan"]()) for s in seeds)
         text = f"{size / ARCSEC:.1f} arcsec; {100 * within:.0f} % within 1 sigma, NEES {nees:.2f}"
-        yield f"beam directions, stand's place {name}", text, "15 arcsec"
+        yield f"beam directions, pose of the stand {name}", text, "15 arcsec"
 
 
 def rigs(seeds: range) -> Iterator[tuple[str, str, str]]:
-    """Whole campaigns calibrated jointly, then new frames measured with the result."""
+    """Campaigns calibrated jointly, then new frames measured with the result."""
     f = bench_figures(seeds)
     yield (
         "attitude and position with a calibrated rig, one frame",
@@ -158,7 +158,7 @@ def rigs(seeds: range) -> Iterator[tuple[str, str, str]]:
         "0.01 deg, 0.5 mm",
     )
     yield (
-        "NEES/6 of those poses; by the noise alone",
+        "NEES/6 of these poses; of the noise alone",
         (f"{f['nees_per_number']:.2f}; {f['nees_noise_alone']:.2f}"),
         "0.85 to 1.15",
     )

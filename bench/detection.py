@@ -1,4 +1,4 @@
-"""How well and how fast spots are found: `python bench/detection.py [frames per set] [first seed]` prints the table."""
+"""Accuracy and cost of detection: `python bench/detection.py [frames per set] [first seed]` prints the table."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def scene_of(kind: str, rng: np.random.Generator) -> Scene:
 
 @dataclass(frozen=True)
 class Row:
-    """What one set gave."""
+    """The figures of one set."""
 
     kind: str
     frames: int
@@ -71,8 +71,8 @@ class Row:
     rms_px: float
     worst_px: float
     bound_px: float
-    of_bound: float  # rms of error over each spot's own bound: every spot weighs the same
-    honesty: float  # rms of error over claimed sigma
+    of_bound: float  # rms of error over the bound of each spot
+    of_sigma: float  # rms of error over stated sigma
     false_per_frame: float
     time_ms: float
     read_ms: float
@@ -80,7 +80,7 @@ class Row:
     def line(self) -> str:
         return (
             f"{self.kind:10} {self.frames:6} {self.spots:8} {self.recall:8.4f} {self.rms_px:8.4f} {self.worst_px:8.3f}"
-            f" {self.rms_px / self.bound_px:8.3f} {self.of_bound:8.3f} {self.honesty:8.3f}"
+            f" {self.rms_px / self.bound_px:8.3f} {self.of_bound:8.3f} {self.of_sigma:8.3f}"
             f" {self.false_per_frame:9.3f} {self.time_ms:8.2f}"
             f" {self.time_ms / self.read_ms:8.2f}"
         )
@@ -118,7 +118,7 @@ def measured(kind: str, frames: int, seed: int) -> Row:
         false += len(found) - len(taken)
     e, C, B = np.array(errors).reshape(-1, 2), np.array(claimed).reshape(-1, 2, 2), np.array(crlb).reshape(-1, 2, 2)
     with np.errstate(invalid="ignore"), warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # a set without spots has no errors to average
+        warnings.simplefilter("ignore", RuntimeWarning)  # mean of an empty set of errors
         return Row(
             kind,
             frames,

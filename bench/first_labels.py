@@ -1,8 +1,8 @@
-"""First labels of single frames, with a prior and without: `python -m bench.first_labels` prints the table.
+"""First labels of single frames, with and without a prior: `python -m bench.first_labels` prints the table.
 
-Monte Carlo on simulated points with fresh seeds. A frame has at least four spots in the pictures; 2 % of them are not
-found, a false point lies within 15 px of every fifth, and there are so many more anywhere. The frames of the last rows
-are those that four found spots determine (sigmas of the pose below 0.2 m and 4 deg).
+Monte Carlo on simulated points. A frame has at least four spots in the pictures; 2 % of them are missed, 20 % have a
+false point within 15 px, and further false points are anywhere. The last rows use frames whose pose is determined by
+four spots (sigmas below 0.2 m and 4 deg).
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ GOAL = ">= 0.97; <= 0.01; <= 3 s"
 
 @dataclass(slots=True)
 class Count:
-    """What became of the frames."""
+    """Counts of the results over the frames."""
 
     right: int = 0
     wrong: int = 0
@@ -42,7 +42,7 @@ class Count:
     spent: list[float] | None = None
 
     def take(self, result: LabelResult, model: SpotModel, origin: dict[str, Array], seconds: float) -> None:
-        """Add a frame; origin: by camera, the view that each point is of."""
+        """Add a frame; origin: by camera, the view of each point."""
         self.spent = [*(self.spent or []), seconds]
         if result.chosen is not None:
             good = _right(result.chosen.point_of, model, origin)
@@ -76,7 +76,7 @@ def labelled(
     false_points: int = 5,
     noise_px: float = 0.1,
 ) -> Count:
-    """So many frames of a rig."""
+    """The results for a number of frames of a rig."""
     model, rng, out = SpotModel.of(rig), np.random.default_rng(seed), Count()
     done = 0
     while done < count:
@@ -111,7 +111,7 @@ def _determined(J: Array, noise_px: float) -> bool:
 
 
 def figures(poses: int) -> Iterator[Row]:
-    """The rows that the project has goals for, and the time with a narrow prior."""
+    """The rows with goals, and the time with a narrow prior."""
     for name in ("unequal-fan", "four-skew-beams"):
         rig = RIGS[name]()
         count = labelled(rig, lambda rng: random_poses(rng, 1, 1.0, 30.0)[0], lambda _: None, poses, FIRST_SEED + 10)
@@ -133,7 +133,7 @@ def figures(poses: int) -> Iterator[Row]:
         yield Row(f"{name}, prior 0.1 m, 6 deg, one false point", str(count), "")
 
 
-def nothing(frames: int) -> Iterator[Row]:
+def false_points_only(frames: int) -> Iterator[Row]:
     """Frames in which all points are false."""
     rig = RIGS["unequal-fan"]()
     model = SpotModel.of(rig)
@@ -154,7 +154,7 @@ def nothing(frames: int) -> Iterator[Row]:
 
 
 def any_rig(kind: str, f_px: float, rng: np.random.Generator) -> tuple[Rig, float]:
-    """A rig whose beams fill the pictures of two oblique cameras with this focal length; and its widest angle, deg."""
+    """A rig with beams that fill the pictures of two oblique cameras of this focal length; its widest angle, deg."""
     screens = {
         name: Screen(name, Pose.from_quaternion(np.full(4, 0.5), np.array([x, 0.0, 0.0])))
         for name, x in (("left", -2.5), ("right", 2.5))
@@ -217,7 +217,7 @@ def main() -> None:
     parser.add_argument("--poses", type=int, default=1000)
     a = parser.parse_args()
     print("| what | measured | goal |\n| --- | --- | --- |")
-    for part in (figures(a.poses), nothing(a.poses), variety(max(1, a.poses // 10))):
+    for part in (figures(a.poses), false_points_only(a.poses), variety(max(1, a.poses // 10))):
         for row in part:
             print(f"| {row.what} | {row.measured} | {row.goal} |", flush=True)
 

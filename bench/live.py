@@ -1,9 +1,9 @@
-"""How late the poses of `beampose watch` are: `python -m bench.live [--frames 1000] [--rate 100] [--format pgm]`.
+"""Latency of the poses of `beampose watch`: `python -m bench.live [--frames 1000] [--rate 100] [--format pgm]`.
 
-A process of its own writes simulated pictures of two 1280x1024 cameras into the frame folders at the given rate, whole
-files under their own names, as a recorder does (the pictures are made once and kept in build/live). The latency is what
-summary.json says: from the arrival of a frame's last picture until its pose is written. The load of the machine is
-printed beside it: the figure is for two free cores.
+A second process writes simulated pictures of two 1280x1024 cameras into the frame folders at the given rate, as a
+recorder does (the pictures are made once and kept in build/live). The latency is that of summary.json: from the arrival
+of the last picture of a frame until its pose is written. The load of the machine is printed as well: the figure is for
+two free cores.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from bench.throughput.folders import run_folder
 from lab.watch.live_frames import WatchOptions
 from lab.watch.watch import watch_run
 
-KEPT = 300  # frames on disk behind the latest: older ones are deleted, as in a recorder's ring
+KEPT = 300  # latest frames kept on disk; older ones are deleted, as in a ring buffer
 
 
 def feed(source: Path, target: Path, frames: int, rate_hz: float, begin: Event) -> None:
@@ -47,7 +47,7 @@ def feed(source: Path, target: Path, frames: int, rate_hz: float, begin: Event) 
 
 
 def measure(kept: Path, work: Path, kind: str, frames: int, rate_hz: float, scenario: str) -> dict[str, object]:
-    """Feed and watch one run; what summary.json says of the latency."""
+    """Feed and watch one run; returns the latency in summary.json."""
     source = run_folder(kept, kind, min(frames, 100), scenario)
     target = work / "run"
     for camera in sorted(p.name for p in (source / "frames").iterdir()):

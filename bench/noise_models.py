@@ -1,8 +1,8 @@
-"""Noise models estimated from pictures against the sensors: `python -m bench.noise_models --scenes 200`.
+"""Noise models estimated from pictures, compared with the true sensors: `python -m bench.noise_models --scenes 200`.
 
-Each scene of bench/random_pictures gives one camera's pictures: a still background and moving spots, at the frames that
-a run would take. Estimated over true variance, at the background's level and at half of full scale; the truth is
-measured on exposures of flat fields, with clipping, rounding and compression in it.
+Each scene of bench/random_pictures gives the pictures of one camera with a constant background and moving spots, at the
+frames that a run uses. The figure is estimated over true variance, at the level of the background and at half of full
+scale. The truth is measured on exposures of flat fields, including saturation, rounding and compression.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ WORST = 15
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One camera's model."""
+    """The model of one camera."""
 
     seed: int
     family: str
@@ -45,7 +45,7 @@ class Row:
 
     @property
     def off(self) -> float:
-        """How far off, in units of the goals, on a logarithmic scale; inf after an exception."""
+        """The error in units of the goals on a logarithmic scale; inf after an exception."""
         if self.error:
             return np.inf
         return float(
@@ -62,7 +62,7 @@ class Job:
 
 
 def measured(job: Job) -> Row:
-    """One scene's estimate; cameras take turns with the seeds."""
+    """The estimate of one scene; the camera alternates with the seed."""
     cv2.setNumThreads(1)
     renderer = Renderer(picture_scene(job.seed, job.family))
     ps = renderer.ps
@@ -92,7 +92,7 @@ def measured(job: Job) -> Row:
 
 
 def line(row: Row) -> str:
-    """One line about a scene."""
+    """One line for a scene."""
     if row.error:
         return f"{row.family} {row.seed}: {row.error} | {row.text}"
     return f"{row.family} {row.seed}: background {row.background:.3g}, half {row.half:.3g} | {row.text}"
@@ -137,7 +137,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="bench.noise_models", description=__doc__)
     parser.add_argument("--scenes", type=int, default=200, help="default 200")
     parser.add_argument("--first", type=int, default=1, metavar="SEED", help="default 1")
-    parser.add_argument("--family", choices=["all", *FAMILIES], help="one look (all: in turn) instead of mixed ones")
+    parser.add_argument("--family", choices=["all", *FAMILIES], help="one family (all: in turn) instead of mixed ones")
     parser.add_argument("--jobs", type=int, default=1, help="processes (default 1)")
     parser.add_argument("-v", "--verbose", action="store_true", help="a line per scene")
     a = parser.parse_args()

@@ -1,7 +1,7 @@
-"""Draws what the detector finds in real pictures: `python bench/real_pictures.py DATA_FOLDER OUT_FOLDER`.
+"""Detections drawn over real pictures: `python bench/real_pictures.py DATA_FOLDER OUT_FOLDER`.
 
-DATA_FOLDER holds laser_beam_series_t, laser_beam_modes, laser_spot_room, laser_spot_saturated, star_fields and
-particles_trackpy_reference; missing ones are passed over. Every spot is drawn as its 2-sigma ellipse with its rank.
+DATA_FOLDER contains laser_beam_series_t, laser_beam_modes, laser_spot_room, laser_spot_saturated, star_fields and
+particles_trackpy_reference; missing ones are skipped. Every spot is drawn as its 2-sigma ellipse with its rank.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ SUFFIXES = {".pgm", ".jpg", ".png", ".tiff"}
 
 
 def grey(path: Path) -> np.ndarray:
-    """A picture as the detector wants it; dark particles are turned into bright ones."""
+    """A picture for the detector; pictures with black particles are inverted."""
     image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
     if image is None:
         raise SystemExit(f"{path}: not a picture")
@@ -30,7 +30,7 @@ def grey(path: Path) -> np.ndarray:
 
 
 def overlay(image: np.ndarray, found: Detections, zoom: int) -> np.ndarray:
-    """The picture, stretched in contrast, with ellipses and ranks; `zoom` times as large."""
+    """The picture, enlarged `zoom` times and stretched in contrast, with ellipses and ranks."""
     low, high = np.percentile(image, [1, 99.9])
     shown = np.clip((image - low) / max(high - low, 1) * 255, 0, 255).astype(np.uint8)
     canvas = cv2.cvtColor(
@@ -50,6 +50,7 @@ def overlay(image: np.ndarray, found: Detections, zoom: int) -> np.ndarray:
 
 
 def main() -> None:
+    """Draw and print the detections of all sets."""
     if len(sys.argv) != 3:
         raise SystemExit(__doc__)
     data, out = Path(sys.argv[1]), Path(sys.argv[2])

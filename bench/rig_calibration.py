@@ -1,11 +1,11 @@
-"""How good calibrated rigs are, and whether they know it: campaigns with truth, calibrated, then measured with.
+"""Accuracy of calibrated rigs and of their stated uncertainty, from simulated campaigns.
 
     python -m bench.rig_calibration [campaigns] [first seed]
 
-Each campaign is drawn anew (mounting, lens calibrations, survey, stand, spots), calibrated by the joint adjustment, and
-a new recording of the true rig is processed with the result: one frame at each of some poses. Printed: errors of
-attitude and position, their NEES (normalised error squared, 1 per number where the covariance is honest), and how often
-parameters lie within one sigma.
+Each campaign is drawn (mounting, lens calibrations, survey, stand, spots) and calibrated by the joint adjustment. A new
+recording of the true rig is processed with the result: one frame at each of some poses. Printed: errors of attitude and
+position, their NEES (normalised estimation error squared, 1 per component if the covariance is correct), and the share
+of parameters within one sigma.
 """
 
 from __future__ import annotations
@@ -33,25 +33,25 @@ from geometry.uncertainty.rig_parameters import RigCovariance
 from geometry.uncertainty.rig_uncertainty import CalibrationSpread
 from lab.simulate.calibration_campaign import Campaign, Quality, draw_campaign, spots_at
 
-POSES_PER_CAMPAIGN = 5  # of the new recording; they share the calibration's errors
+POSES_PER_CAMPAIGN = 5  # of the new recording; they share the errors of the calibration
 
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """One campaign and what its calibration made of it."""
+    """One campaign and the errors of its calibration."""
 
     seed: int
-    errors: Array  # (k, 6): [dt (m, world), dtheta (rad, body)] of the poses measured with it
+    errors: Array  # (k, 6): [dt (m, world), dtheta (rad, body)] of the poses measured with the calibrated rig
     nees: Array  # (k,): e^T C^-1 e / 6
-    noise_nees: Array  # (k,): the same with the noise's covariance alone, as if the calibration were exact
-    normalised: dict[str, float]  # error of each rig parameter that is determined by more than a definition, in sigmas
-    joint_nees: float  # of all of the rig's independent errors together, per number
+    noise_nees: Array  # (k,): the same with the covariance of the noise only, as if the calibration were exact
+    normalised: dict[str, float]  # error of each rig parameter that is not a convention, in sigmas
+    joint_nees: float  # of all independent errors of the rig, per component
     scales: dict[str, float]
     seconds: float
 
 
 def as_measured(c: Campaign) -> tuple[Network, list[ScreenSetup], StandModel]:
-    """What a campaign hands to a calibration, as arrays: without the way over files."""
+    """The input of a calibration from a campaign as arrays, without files."""
     rig = replace(
         c.nominal,
         cameras={
@@ -76,13 +76,13 @@ def as_measured(c: Campaign) -> tuple[Network, list[ScreenSetup], StandModel]:
 
 
 def calibrated(c: Campaign) -> RigSteps:
-    """The campaign's rig by the joint adjustment."""
+    """The rig of the campaign by the joint adjustment."""
     network, setups, stand = as_measured(c)
     return calibrate_in_steps(calibrate(network, setups), c.spots, stand)
 
 
 def trial(seed: int, rig: str = "fan", quality: Quality | None = None) -> Trial:
-    """Draw, calibrate, measure with it."""
+    """Draw a campaign, calibrate its rig, and measure with it."""
     c = draw_campaign(seed, rig, quality)
     start = time.perf_counter()
     joint = calibrated(c).joint
@@ -98,7 +98,7 @@ def trial(seed: int, rig: str = "fan", quality: Quality | None = None) -> Trial:
 def measured_with(
     rig: Rig, covariance: RigCovariance, truth: Rig, poses: Pose, spot_px: float, rng: np.random.Generator
 ) -> tuple[Array, Array, Array]:
-    """Errors (k, 6) of poses measured with a calibrated rig, NEES/6 (k,), and NEES/6 by the noise alone (k,)."""
+    """Errors (k, 6) of poses measured with a calibrated rig, NEES/6 (k,), and NEES/6 of the noise alone (k,)."""
     model = SpotModel.of(rig)
     spread = CalibrationSpread(rig, model, covariance)
     spots = spots_at(truth, poses, spot_px, rng)
@@ -116,10 +116,10 @@ def measured_with(
 
 
 def parameter_errors(joint: Joint, truth: Rig) -> tuple[dict[str, float], float]:
-    """Errors of the rig's numbers in sigmas, by name; and NEES of all independent ones together, per number.
+    """Errors of the rig parameters in sigmas, by name; and NEES of all independent ones, per component.
 
-    A screen's axes within its plane are a choice, and so is the point of a beam along it: the truth is described with
-    the same choice before it is compared.
+    The axes of a screen within its plane and the point of a beam along it are conventions: the truth is expressed in
+    the same convention before the comparison.
     """
     same = _described_alike(truth, joint.rig)
     true, found = stacks_of(same), joint.values
@@ -139,9 +139,9 @@ def parameter_errors(joint: Joint, truth: Rig) -> tuple[dict[str, float], float]
 
 
 def _described_alike(truth: Rig, found: Rig) -> Rig:
-    """The true rig with its screens' axes laid where the found ones are.
+    """The true rig with the axes of its screens moved to the estimated ones.
 
-    A bent surface keeps its curvature and gets the frame that touches it below the found origin.
+    A bent surface keeps its curvature; its frame is tangent to it below the estimated origin.
     """
     screens = {}
     for name, s in truth.screens.items():
@@ -154,7 +154,7 @@ def _described_alike(truth: Rig, found: Rig) -> Rig:
         z = z if z @ now.rotation[:, 2] > 0 else -z
         x = normalised(now.rotation[:, 0] - (now.rotation[:, 0] @ z) * z)
         R = np.stack([x, np.cross(z, x), z], axis=1)
-        # The same bulge seen along the new axes, and from the other side where z was turned round.
+        # The same curvature along the new axes, with the opposite sign where z is reversed.
         turn = (s.world_from_screen.rotation.T @ R)[:2, :2]
         side = np.sign(z @ s.world_from_screen.rotation[:, 2])
         M = side * turn.T @ np.array([[a, b / 2], [b / 2, c]]) @ turn
@@ -164,12 +164,12 @@ def _described_alike(truth: Rig, found: Rig) -> Rig:
 
 
 def bench_figures(seeds: Iterable[int], rig: str = "fan", quality: Quality | None = None) -> dict[str, float]:
-    """The figures of issue 3 over some campaigns."""
+    """The figures over some campaigns."""
     return figures([trial(s, rig, quality) for s in seeds])
 
 
 def figures(trials: Sequence[Trial]) -> dict[str, float]:
-    """What some trials say together."""
+    """The figures of several trials."""
     errors = np.concatenate([t.errors for t in trials])
     inside = np.array([abs(v) <= 1 for t in trials for v in t.normalised.values()])
     shared = set.intersection(*(set(t.normalised) for t in trials))
@@ -185,7 +185,7 @@ def figures(trials: Sequence[Trial]) -> dict[str, float]:
         "nees_per_number": float(np.mean([t.nees.mean() for t in trials])),
         "nees_noise_alone": float(np.mean([t.noise_nees.mean() for t in trials])),
         "joint_nees_per_number": float(np.mean([t.joint_nees for t in trials])),
-        # Where covariances are right, 95 of 100 such means lie within this of 1.
+        # Half width of the 95 % interval of this mean about 1 if the covariances are correct.
         "joint_nees_95_percent_band": float(1.96 * np.sqrt(2 / numbers)),
         "coverage_percent": float(100 * inside.mean()),
         "coverage_of_single_parameters_least": float(100 * each.min()),

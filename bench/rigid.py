@@ -1,7 +1,7 @@
 """The accuracy and cost of the rigid tracker and the smoother: `python -m bench.rigid` prints the table.
 
 Every row is a Monte Carlo on simulated points (lab/simulate/points.py), 8 recordings of 600 frames with 0.1 px noise
-and 20 % clutter unless said, with fresh seeds that no parameter was chosen on (those were 100 to 110 and 200 to 214).
+and 20 % clutter unless stated. No parameter was chosen with these seeds (but with 100 to 110 and 200 to 214).
 """
 
 from __future__ import annotations
@@ -23,23 +23,23 @@ from tracking.smoothing.smoother import smooth
 from tracking.tracked_frame import TrackedFrame
 
 FIRST_SEED = 9100
-CLEAN_FRAMES = 10  # at the start: the velocities are not known yet
+CLEAN_FRAMES = 10  # at the start: the velocities are not yet known
 RIGID = TrackerParameters()
 
 
 @dataclass(frozen=True, slots=True)
 class Judged:
-    """One recording with one tracker's answers."""
+    """The errors of one tracker for one recording."""
 
     tally: Tally
-    squares: Array  # (6,) sums of squared pose errors, [m in world, rad in body], over the lit frames
-    bounds: Array  # (6,) sums of the single-frame bound's variances over the same frames
-    lit: int  # how many these are
+    squares: Array  # (6,) sums of squared pose errors, [m in world, rad in body], over the frames with light
+    bounds: Array  # (6,) sums of the variances of the single-frame bound over the same frames
+    lit: int  # number of these frames
     nees: Array  # (k,) of all frames with a pose ...
-    nees_lit: Array  # ... and of those that are lit
-    outside2: float  # squared errors of the places outside the picture, px^2 ...
-    outside_bound2: float  # ... and the bound's
-    delays: tuple[int, ...]  # frames of light until every shining spot is labelled, per blackout
+    nees_lit: Array  # ... and of those with light
+    outside2: float  # squared errors of the positions outside the picture, px^2 ...
+    outside_bound2: float  # ... and of the bound
+    delays: tuple[int, ...]  # frames after each blackout until every visible spot is labelled
 
     @property
     def ms(self) -> float:
@@ -48,7 +48,7 @@ class Judged:
 
 
 def judged(run: PointRun, out: list[TrackedFrame], ms: float) -> Judged:
-    """Errors of poses and places against truth and the single-frame Cramer-Rao bound."""
+    """Errors of poses and positions against truth and the single-frame Cramer-Rao bound."""
     projected, J = run.model.project(run.poses)
     shining = (run.in_view == 1) & run.has_image[:, run.model.camera_of]
     squares, bounds, nees, nees_lit = np.zeros(6), np.zeros(6), [], []
@@ -78,15 +78,15 @@ def judged(run: PointRun, out: list[TrackedFrame], ms: float) -> Judged:
 
 
 def _delays(run: PointRun, out: list[TrackedFrame], shining: Bools) -> Iterator[int]:
-    """Of each blackout, how many frames of light it took until all shining spots were labelled."""
-    dark = ~shining.any(axis=1)
-    for end in np.flatnonzero(dark[:-1] & ~dark[1:]) + 1:
+    """For each blackout, the number of frames after it until all visible spots are labelled."""
+    blackout = ~shining.any(axis=1)
+    for end in np.flatnonzero(blackout[:-1] & ~blackout[1:]) + 1:
         complete = [np.all(out[k].point[shining[k]] != UNMATCHED) for k in range(end, min(end + 30, len(out)))]
         yield int(np.argmax(complete)) if any(complete) else 99
 
 
 def second_look(run: PointRun, out: list[TrackedFrame]) -> tuple[list[TrackedFrame], float]:
-    """The smoother's answers, and its process time per frame, ms."""
+    """The output of the smoother, and its process time per frame, ms."""
     start = time.process_time()
     recording = TrackedRecording(run.rig, RIGID)
     for k, frame in enumerate(out):
@@ -97,7 +97,7 @@ def second_look(run: PointRun, out: list[TrackedFrame]) -> tuple[list[TrackedFra
 
 
 def around_bends(run: PointRun, which: str, frames: int, rng: np.random.Generator) -> Bools:
-    """What to hide (T, n): for so many frames around each bend one spot, two, a screen or all."""
+    """The occlusions (T, n): one spot, two, a screen or all for some frames around each bend."""
     hide = np.zeros(run.in_view.shape, dtype=bool)
     free = CLEAN_FRAMES
     for bend in np.flatnonzero(run.turned):
@@ -137,7 +137,7 @@ CASES: tuple[tuple[str, str, dict[str, float], tuple[str, int] | None, str], ...
 
 
 def rows(seeds: int, frames: int, only: str = "") -> Iterator[Row]:
-    """Causal and smoothed, case by case."""
+    """The rows of each case, causal and smoothed."""
     for name, scenario, options, hide, goal in CASES:
         if only not in name:
             continue
@@ -170,7 +170,7 @@ def pooled(some: list[Judged], predictions: bool = True) -> str:
         f"NEES/6 {np.concatenate([j.nees_lit for j in some]).mean() / 6:.2f} lit,"
         f" {np.concatenate([j.nees for j in some]).mean() / 6:.2f} all",
         f"outside {outside:.2f} x bound, max {max(x.outside_max for x in t):.2f} px" if outside > 0 else "",
-        f"found again after {max(delays)} frames of light at most" if delays and predictions else "",
+        f"found again at most {max(delays)} frames after it" if delays and predictions else "",
         f"{np.median([j.ms for j in some]):.2f} ms",
     ]
     return "; ".join(p for p in parts if p)
@@ -185,9 +185,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=8)
     parser.add_argument("--frames", type=int, default=600)
-    parser.add_argument("--only", default="", help="a part of the case's name")
+    parser.add_argument("--only", default="", help="a part of the name of a case")
     a = parser.parse_args()
-    warm = simulate_points("blackout", 1, frames=170)  # compiles, where that has not been done yet
+    warm = simulate_points("blackout", 1, frames=170)  # compiles if necessary
     second_look(warm, track(warm, replace(RIGID))[0])
     print("| what | measured | goal |\n| --- | --- | --- |")
     for row in rows(a.seeds, a.frames, a.only):

@@ -1,9 +1,9 @@
 """The accuracy table of single frames and of the `spots` tracker: `python -m bench.tracking` prints it.
 
-bench/rigid.py has that of the rigid tracker and the smoother; `make bench-tracking` prints both.
+bench/rigid.py prints that of the rigid tracker and the smoother, `make bench-tracking` both.
 
-Every row is a Monte Carlo on simulated points (lab/simulate/points.py) with fresh seeds that no parameter was chosen on
-(parameters were looked at with seeds 100 to 103). Nothing here needs pictures; bench/throughput has those rows.
+Every row is a Monte Carlo on simulated points (lab/simulate/points.py). No parameter was chosen with these seeds (but
+with 100 to 103). bench/throughput has the rows for pictures.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ from tracking.statuses import PoseStatus, SpotStatus
 from tracking.tracked_frame import TrackedFrame
 
 FIRST_SEED = 9000
-START_FRAMES = 2  # no rate is known yet: there is no prediction to judge
-TURN_FRAMES = 2  # the bend itself and the next frame, whose rate still straddles it
+START_FRAMES = 2  # the rate is not yet known, so there is no prediction
+TURN_FRAMES = 2  # the bend and the next frame, whose rate includes it
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,11 +66,11 @@ def found_in(run: PointRun, k: int) -> list[Detections | None]:
 
 @dataclass(frozen=True, slots=True)
 class Tally:
-    """Sums over one recording, so that recordings can be pooled."""
+    """Sums over one recording, to be pooled."""
 
-    seen: int  # spot-frames in the picture and shining
-    right: int  # of them with the right detection
-    wrong: int  # detections taken for a spot that they are not of
+    seen: int  # spot-frames with a visible spot in the picture
+    right: int  # these with the correct detection
+    wrong: int  # detections with a wrong label
     prediction2: Array  # (2,) sum of squared errors per axis
     predictions: int
     outside2: float
@@ -120,7 +120,7 @@ def tally(run: PointRun, out: list[TrackedFrame], ms: float) -> Tally:
 
 
 def tracker_rows(seeds: int, frames: int) -> Iterator[Row]:
-    """Identity and prediction of the `spots` tracker; goals where the project has set one."""
+    """Identity and prediction of the `spots` tracker, with goals where there are any."""
     spots = TrackerParameters(method="spots")
     paper = TrackerParameters(method="spots", rigid_check=False, estimate="prediction", out_of_view="quadratic")
     cases: list[tuple[str, str, TrackerParameters, dict[str, float], str]] = [
@@ -128,12 +128,12 @@ def tracker_rows(seeds: int, frames: int) -> Iterator[Row]:
         ("sharp turns, 20 % clutter", "sharp-turns", spots, {}, "<= 0.40 px; >= 0.995"),
         ("sharp turns, 100 % clutter", "sharp-turns", spots, {"clutter": 1.0}, ""),
         ("smooth, 0.3 px noise", "smooth", spots, {"noise_px": 0.3}, ""),
-        ("one spot hidden 10 frames in a turn", "hidden-in-turn", spots, {}, ""),
-        ("everything hidden 10 frames", "blackout", spots, {}, ""),
+        ("one spot occluded 10 frames in a turn", "hidden-in-turn", spots, {}, ""),
+        ("all spots occluded 10 frames", "blackout", spots, {}, ""),
         ("four times as fast", "fast", spots, {}, ""),
         ("four skew beams", "four-skew-beams", spots, {}, ""),
-        ("the paper's way alone, smooth", "smooth", paper, {}, ""),
-        ("the paper's way alone, sharp turns", "sharp-turns", paper, {}, ""),
+        ("the method of the paper alone, smooth", "smooth", paper, {}, ""),
+        ("the method of the paper alone, sharp turns", "sharp-turns", paper, {}, ""),
     ]
     for name, scenario, parameters, options, goal in cases:
         all_of = []
@@ -159,7 +159,7 @@ def pooled(all_of: list[Tally]) -> str:
 
 
 def random_poses(rng: np.random.Generator, count: int, within_m: float, within_deg: float) -> Pose:
-    """Uniform in the cube of positions and in the ball of rotation vectors."""
+    """Poses uniform in the cube of positions and in the ball of rotation vectors."""
     axis = rng.normal(size=(count, 3))
     axis /= np.linalg.norm(axis, axis=1, keepdims=True)
     angle = np.deg2rad(within_deg) * rng.random((count, 1)) ** (1 / 3)
@@ -167,7 +167,7 @@ def random_poses(rng: np.random.Generator, count: int, within_m: float, within_d
 
 
 def out_of_view_rows(poses: int) -> Iterator[Row]:
-    """The paper's quadratic and the rigid solution for a spot that is not seen, from four others."""
+    """The quadratic equation of the paper and the rigid solution for an invisible spot, from four others."""
     rig = RIGS["fan"]()
     model = SpotModel.of(rig)
     rows = np.array([0, 1, 3, 4])
@@ -199,7 +199,7 @@ def out_of_view_rows(poses: int) -> Iterator[Row]:
 
 
 def single_frame_row(poses: int) -> Row:
-    """The pose of one frame against the Cramer-Rao bound, six spots with 0.1 px."""
+    """The pose of one frame compared with the Cramer-Rao bound, six spots with 0.1 px."""
     model = SpotModel.of(RIGS["fan"]())
     rng = np.random.default_rng(FIRST_SEED + 1)
     rows, covariances = np.arange(6), np.tile(np.eye(2) * 0.01, (6, 1, 1))
@@ -269,7 +269,7 @@ def one_picture(
     false_points: int = 5,
     clutter: float = 0.2,
 ) -> tuple[Array, Array]:
-    """Noisy points of one picture in random order, and the view that each is of (NO_POINT: none)."""
+    """Noisy points of one picture in random order, and the view of each (NO_POINT: none)."""
     points, of = [], []
     for v in np.flatnonzero(visible):
         if rng.random() < 0.98:

@@ -1,1 +1,1 @@
-"""The tracking bench with peers: other people's trackers and ours on the same points."""
+"""Comparison of trackers: those of other packages and ours on the same points."""

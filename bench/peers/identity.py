@@ -1,7 +1,7 @@
-"""Who kept whose identity: shares of right labels, gaps and re-entries, from a scene's truth.
+"""Identity scores from the truth of a scene: correct labels, gaps and re-entries.
 
-A tracker may use any identities. An identity is taken for a spot if it fits that spot most often in the first frames;
-from then on only rows under that identity count: a spot that comes back under a new one is wrong for ever.
+A tracker may use any identities. The identity that matches a spot most often in the first frames is its label; later
+only rows with this identity count, so that a spot that returns with a new identity stays wrong.
 """
 
 from __future__ import annotations
@@ -14,42 +14,42 @@ from bench.peers.rows import Tracked
 from bench.peers.scenes import CAMERA_OF, DETECTED, OUTSIDE, SPOTS, Scene
 from geometry.arrays import Array, Bools, Ints
 
-NEAR_PX = 5.0  # a row within this of a spot's true place is of that spot: 33 sigmas, an eighth of the clutter's reach
-NAMING_FRAMES = 20  # the first labels are read from these; they are not scored
-GAP_FRAMES = 5  # shorter gaps within the picture are bridged by everyone
-AFTER_FRAMES = 20  # within so many frames after a gap ...
-AFTER_SEEN = 10  # ... the first so many in which the spot is detected tell whether it kept its identity ...
-LEAST_AFTER = 5  # ... of which there must be so many
-NOBODY = -1
+NEAR_PX = 5.0  # largest distance of a row from its spot: 33 sigmas, an eighth of the radius of the clutter
+NAMING_FRAMES = 20  # frames that define the first labels; they are not scored
+GAP_FRAMES = 5  # shorter gaps within the picture are bridged by all trackers
+AFTER_FRAMES = 20  # in this number of frames after a gap ...
+AFTER_SEEN = 10  # ... the first detections of the spot, at most this number, decide whether it kept its identity ...
+LEAST_AFTER = 5  # ... and at least this number is needed
+NO_IDENTITY = -1
 
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """Counts over one scene, detected spots after the naming frames only."""
+    """Counts over one scene, for detected spots after the naming frames."""
 
     detected: int  # spot-frames
-    right: int  # of them within NEAR_PX of a row under the spot's first label
-    labelled: int  # rows under a spot's first label that claim a detection
-    wrong: int  # of them farther than NEAR_PX from the spot, or where it was not detected at all
-    gaps: int  # times that a spot was hidden in the picture for GAP_FRAMES or longer
-    gaps_kept: int  # of them with the same identity before and after
-    reentries: int  # times that a spot left the picture and came back
+    right: int  # spot-frames within NEAR_PX of a row with the first label of the spot
+    labelled: int  # rows with the first label of a spot and a detection
+    wrong: int  # these rows farther than NEAR_PX from the spot, or without a detection of it
+    gaps: int  # occlusions of a spot in the picture for GAP_FRAMES or more
+    gaps_kept: int  # gaps with the same identity before and after
+    reentries: int  # times that a spot left the picture and returned
     reentries_kept: int
 
     @property
     def share(self) -> float:
-        """Identity under the first label, 0 to 1."""
+        """Share of spot-frames with the first label, 0 to 1."""
         return self.right / self.detected if self.detected else float("nan")
 
 
 def distances(scene: Scene, rows: Tracked) -> Array:
-    """From each row to the true places of all spots, (m, 6), px; inf to those of the other camera."""
+    """Distances of each row from the true positions of all spots, (m, 6), px; inf for the other camera."""
     gap = np.linalg.norm(rows.uv_px[:, None] - scene.uv_px[rows.frame], axis=-1)
     return np.where(rows.camera[:, None] == CAMERA_OF, gap, np.inf)
 
 
 def first_labels(scene: Scene, rows: Tracked) -> list[int | None]:
-    """The identity that fits each spot most often in the naming frames; None where none does."""
+    """The identity that matches each spot most often in the naming frames; None without a match."""
     near = (distances(scene, rows) < NEAR_PX) & (rows.measured & (rows.frame < NAMING_FRAMES))[:, None]
     labels: list[int | None] = []
     for s in range(SPOTS):
@@ -81,11 +81,11 @@ def score_identity(scene: Scene, rows: Tracked) -> Identity:
 
 
 def _nearest_identity(rows: Tracked, gap: Array, frames: int) -> Ints:
-    """(T, 6): the identity of the measured row nearest to each spot, within NEAR_PX; NOBODY without."""
-    out = np.full((frames, SPOTS), NOBODY)
+    """(T, 6): the identity of the measured row nearest to each spot, within NEAR_PX; NO_IDENTITY without one."""
+    out = np.full((frames, SPOTS), NO_IDENTITY)
     for s in range(SPOTS):
         near = np.flatnonzero(rows.measured & (gap[:, s] < NEAR_PX))
-        near = near[np.argsort(-gap[near, s])]  # the nearest is written last and stays
+        near = near[np.argsort(-gap[near, s])]  # the nearest is written last
         out[rows.frame[near], s] = rows.identity[near]
     return out
 
@@ -100,7 +100,7 @@ def _kept(detected: Bools, outside: Bools, identity: Ints) -> tuple[int, int, in
             if len(after) < LEAST_AFTER or not (left or end - first >= GAP_FRAMES):
                 continue
             before = identity[max(0, first - GAP_FRAMES) : first, s]
-            before = before[before != NOBODY]
+            before = before[before != NO_IDENTITY]
             kept = len(before) > 0 and bool(np.mean(identity[after, s] == before[-1]) >= 0.5)
             count[left][0] += 1
             count[left][1] += kept
@@ -108,7 +108,7 @@ def _kept(detected: Bools, outside: Bools, identity: Ints) -> tuple[int, int, in
 
 
 def _absences(detected: Bools) -> list[tuple[int, int]]:
-    """First frame and end of every stretch without the spot, (T,), that begins after a frame with it."""
+    """First frame and end of every interval without the spot, (T,), that starts after a frame with it."""
     change = np.diff(detected.astype(int))
     starts = np.flatnonzero(change < 0) + 1
     ends = np.flatnonzero(change > 0) + 1

@@ -1,4 +1,4 @@
-"""What the two linkers, trackpy and laptrack, share: a table of points in, linked pieces out."""
+"""Input and output of the two linkers, trackpy and laptrack: a table of points, and linked tracks."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pandas as pd
 
 from bench.peers.scenes import Scene
 
-SHORTEST = 3  # frames: shorter pieces are taken for clutter
+SHORTEST = 3  # frames: shorter tracks count as clutter
 
 
 def points_table(scene: Scene, camera: int) -> pd.DataFrame:
@@ -19,7 +19,7 @@ def points_table(scene: Scene, camera: int) -> pd.DataFrame:
 
 
 def named_rows(linked: pd.DataFrame, camera: int) -> list[tuple[int, int, int, float, float]]:
-    """Rows of the pieces that are long enough, from columns frame, piece, x, y."""
+    """Rows of the tracks that are long enough, from columns frame, piece, x, y."""
     long_enough = linked.groupby("piece")["piece"].transform("size") >= SHORTEST
     kept = linked[long_enough]
     columns = (kept[name].tolist() for name in ("frame", "piece", "x", "y"))

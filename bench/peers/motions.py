@@ -1,4 +1,4 @@
-"""How the vehicle moves in the bench's scenes: smooth sums of sines, or straight pieces with sudden reversals."""
+"""Motions of the vehicle in the scenes: smooth sums of sines, or straight segments with abrupt reversals."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ def smooth(
 ) -> tuple[Array, list[int]]:
     """Two sines per coordinate, the second with a random phase.
 
-    speed multiplies the frequencies. stay_out: yaw rests near its ends, so that a pair of spots is out of view for
-    hundreds of frames. Returns x, y, z (m), yaw, pitch, roll (rad) as (frames, 6), and the frames where yaw turns.
+    speed: factor on the frequencies. stay_out: yaw stays near its extremes, so that a pair of spots is out of view for
+    hundreds of frames. Returns x, y, z (m), yaw, pitch, roll (rad) as (frames, 6), and the frames where yaw reverses.
     """
     t = np.arange(frames) / RATE_HZ
     slow_hz = np.array([0.11, 0.17, 0.13, 0.29, 0.23, 0.15]) * speed
@@ -42,9 +42,9 @@ def smooth(
 
 
 def reversals(frames: int, rng: np.random.Generator) -> tuple[Array, list[int]]:
-    """Straight pieces of 18 to 59 frames, each towards the other side: the velocity flips within one frame.
+    """Straight segments of 18 to 59 frames, each towards the other side: the velocity reverses within one frame.
 
-    Returns as `smooth`; the frames are those of the flips.
+    Returns as `smooth`; the frames are those of the reversals.
     """
     flips = [0]
     while flips[-1] < frames:

@@ -14,11 +14,11 @@ from bench.peers.scenes import CAMERA_OF, CAMERAS, DETECTED, Scene
 
 @dataclass(frozen=True, slots=True)
 class MultiObject:
-    """Over all frames of a scene, its start too."""
+    """Figures over all frames of a scene, including its start."""
 
-    idf1: float  # harmonic mean of identity precision and recall, under the best single naming
-    switches: int  # times that a spot is matched to another identity than before
-    mota: float  # 1 - (misses + false rows + switches) / detected spots; below 0 where false rows abound
+    idf1: float  # harmonic mean of identity precision and recall for the best assignment of identities
+    switches: int  # changes of the identity that is matched to a spot
+    mota: float  # 1 - (misses + false rows + switches) / detected spots; may be below 0
 
 
 def score_multi_object(scene: Scene, rows: Tracked) -> MultiObject:

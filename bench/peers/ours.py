@@ -1,4 +1,4 @@
-"""beampose's own trackers on the bench's points. They know the rig and a prior, and get no labels."""
+"""The trackers of beampose. They get the rig and a prior, but no labels."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ PRIOR = PosePrior(Pose.identity(), within_m=1.0, within_rad=float(np.deg2rad(35.
 
 
 def track(scene: Scene, method: Literal["rigid", "spots"], smoothed: bool = False) -> Tracked:
-    """Frame after frame, as in a run of the lab; with the second look at the whole run, if smoothed."""
+    """Track frame by frame as in a run; `smoothed`: with the smoothing pass."""
     parameters = TrackerParameters(method=method)
     tracker = RigidTracker(rig(), parameters, PRIOR) if method == "rigid" else SpotTracker(rig(), parameters, PRIOR)
     recording = TrackedRecording(rig(), parameters) if smoothed else None
@@ -44,7 +44,7 @@ def track(scene: Scene, method: Literal["rigid", "spots"], smoothed: bool = Fals
 
 
 def named(scene: Scene, frames: Sequence[TrackedFrame], spent_s: float) -> Tracked:
-    """Rows of all spots: with their detection where there is one, else with the estimate, unless nothing is known."""
+    """Rows of all spots: with their detection if there is one, otherwise with the estimate if it is known."""
     point = np.array([f.point for f in frames])
     uv = np.array([f.uv_px for f in frames])
     measured = point != UNMATCHED

@@ -1,4 +1,4 @@
-"""One tracker on one scene: its figures, and the file that keeps them."""
+"""The figures of one tracker on one scene, and the file with all of them."""
 
 from __future__ import annotations
 
@@ -27,42 +27,42 @@ NAN = math.nan
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """A line of results.csv. nan (empty in the file): not known, or there is none."""
+    """A line of results.csv. nan (empty in the file): unknown or not applicable."""
 
     tracker: str
     scene: str
     seed: int
     frames: int
     frames_per_s: float  # in process time of the tracking loop; a frame is both cameras
-    of_rigid: float  # its time over that of `rigid` on the same points in the same run
-    identity: float  # share of detected spot-frames under the first label
+    of_rigid: float  # time relative to `rigid` on the same points in the same run
+    identity: float  # share of detected spot-frames with the first label
     idf1: float
     switches: float
     mota: float
-    labelled: int  # rows under a first label that claim a detection
-    wrong: int  # of them not on their spot
+    labelled: int  # rows with a first label and a detection
+    wrong: int  # these rows that are not at their spot
     gaps_kept: int
     gaps: int
     reentries_kept: int
     reentries: int
     hidden_rms_px: float
     hidden_max_px: float
-    outside_covered: float  # share of spot-frames out of view that got a position
+    outside_covered: float  # share of spot-frames out of view with a position
     outside_rms_px: float
     outside_p95_px: float
     outside_max_px: float
     library: str
-    beside: str  # versions of Python and of the libraries that all share
-    measured: str  # day and time at which the run of the bench began
+    beside: str  # versions of Python and of the common libraries
+    measured: str  # start of the run of the bench
 
     @property
     def key(self) -> tuple[str, str, int, int]:
-        """What a newer measurement replaces."""
+        """The key by which a new measurement replaces an old one."""
         return self.tracker, self.scene, self.seed, self.frames
 
 
 def judged(entry: Entry, scene: Scene, rows: Tracked, rigid_s: float, measured: str) -> Result:
-    """All figures. rigid_s: process time of `rigid` on this scene, nan where it was not run."""
+    """All figures. rigid_s: process time of `rigid` on this scene; nan if it was not run."""
     identity = score_identity(scene, rows)
     hidden, outside = score_unseen(scene, rows, HIDDEN), score_unseen(scene, rows, OUTSIDE)
     idf1 = switches = mota = NAN
@@ -101,7 +101,11 @@ def judged(entry: Entry, scene: Scene, rows: Tracked, rigid_s: float, measured: 
 
 
 def read_results(path: Path) -> list[Result]:
-    """What the file holds; nothing where there is none. Raises ValueError where its columns are not ours."""
+    """The content of the file; empty without a file.
+
+    Raises:
+        ValueError: the file has other columns.
+    """
     if not path.exists():
         return []
     readers: dict[str, Callable[[str], Any]] = {"str": str, "int": int, "float": _number}
@@ -116,7 +120,7 @@ def read_results(path: Path) -> list[Result]:
 
 
 def merged(old: Iterable[Result], new: Iterable[Result]) -> list[Result]:
-    """All of them, a newer one in place of the older of the same tracker, scene, seed and length."""
+    """All results; a new one replaces the old one of the same tracker, scene, seed and length."""
     by_key = {result.key: result for result in (*old, *new)}
     place = {name: i for i, name in enumerate((*ENTRIES, *SCENES))}
 
@@ -127,7 +131,7 @@ def merged(old: Iterable[Result], new: Iterable[Result]) -> list[Result]:
 
 
 def write_results(results: Iterable[Result], path: Path) -> None:
-    """The whole file, complete or not at all."""
+    """Write the whole file atomically."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(f.name for f in dataclasses.fields(Result))

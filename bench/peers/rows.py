@@ -1,4 +1,4 @@
-"""What every tracker of the bench gives back: named points, and the process time of its loop."""
+"""The output of every tracker: labelled points, and the process time of its loop."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from geometry.arrays import Array, Bools, Ints
 
 @dataclass(frozen=True, slots=True)
 class Tracked:
-    """m rows over one scene. Identities are a tracker's own, of any value; spots are told from them by scoring."""
+    """m rows over one scene. Identities are those of the tracker, with any values; scoring assigns them to spots."""
 
     frame: Ints  # (m,)
     camera: Ints  # (m,)
     identity: Ints  # (m,)
     uv_px: Array  # (m, 2)
-    measured: Bools  # (m,) a detection of this frame stands behind it; else it is a prediction
+    measured: Bools  # (m,) True: a detection of this frame; False: a prediction
     spent_s: float  # process time of the tracking loop: from arrays of points to identities, without imports
 
     @staticmethod

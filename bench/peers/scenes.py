@@ -1,16 +1,16 @@
-"""The five scenes of the bench: six spots, two cameras, points only, with truth.
+"""The five scenes of the comparison: six spots, two cameras, points only, with truth.
 
 | scene | motion | nuisance |
 | --- | --- | --- |
-| standard | smooth, median 3 px per frame, up to 11 | 20 % clutter within 40 px of every spot, hidden ones too; |
-|          | | 2 % misses; spots hidden for 5 to 20 frames, often where yaw turns; 3 and 6 leave and come back |
+| standard | smooth, median 3 px per frame, up to 11 | 20 % clutter within 40 px of every spot, also occluded ones; |
+|          | | 2 % misses; spots occluded for 5 to 20 frames, often where yaw reverses; 3 and 6 leave and return |
 | fast | four times as fast: median 12, up to 46 px per frame | the same |
-| reversal | straight pieces, the velocity flips within one frame | the same, hidden at the flips |
+| reversal | straight segments, the velocity reverses within one frame | the same, occluded at the reversals |
 | longout | smooth, 3 and 6 out of view for hundreds of frames | the same |
 | dense | smooth | one false point per spot, six anywhere and two fixed ones per camera; |
-|       |        | 5 % misses; spots hidden for 10 to 40 frames |
+|       |        | 5 % misses; spots occluded for 10 to 40 frames |
 
-The projection here is the scenes' own, from the rig's numbers: truth must not come from the code that is judged.
+The scenes have their own projection from the rig parameters: the truth must not come from the tested code.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ from lab.simulate.rigs import look_at
 FRAME_S = 1 / motions.RATE_HZ
 NOISE_PX = 0.15  # 1 sigma per axis
 SPOTS, CAMERAS = 6, 2
-CAMERA_OF = np.array([0, 0, 0, 1, 1, 1])  # spots 1 to 3 fall on the left screen, 4 to 6 on the right one
+CAMERA_OF = np.array([0, 0, 0, 1, 1, 1])  # spots 1 to 3 are on the left screen, 4 to 6 on the right one
 DETECTED, HIDDEN, OUTSIDE = 1, 0, -1
-CLUTTER = -1  # origin of a point that is no spot
+CLUTTER = -1  # origin of a false point
 CLUTTER_RADIUS_PX = 40.0
-CLEAN_START_FRAMES = 30  # nothing is missed or hidden: trackers without a rig take their labels from here
+CLEAN_START_FRAMES = 30  # without misses and occlusions: trackers without a rig get their labels from here
 
 SIZE_PX = np.array([1280, 1024])
 FOCAL_PX, RADIAL = 1090.0, -0.04
 SCREEN_X_M = np.array([-2.5, 2.5])
-FAN = np.deg2rad([-20.0, 0.0, 20.0])  # beams in body's x-y plane, from x towards y
+FAN = np.deg2rad([-20.0, 0.0, 20.0])  # beams in the x-y plane of body, from x towards y
 CAMERA_AT_M = np.array([[3.0, 0.6, 1.5], [-3.0, -0.6, 1.5]])
 CAMERA_TOWARDS_M = np.array([[-2.5, 0.55, 0.0], [2.5, -0.55, 0.0]])
 
@@ -59,11 +59,11 @@ class Scene:
     name: str
     seed: int
     detections: tuple[tuple[Array, ...], ...]  # per frame and camera (n, 2), px, in random order
-    origin: tuple[tuple[Ints, ...], ...]  # per frame and camera (n,): the spot (0 to 5) that it is of, or CLUTTER
+    origin: tuple[tuple[Ints, ...], ...]  # per frame and camera (n,): the spot (0 to 5) of each point, or CLUTTER
     uv_px: Array  # (T, 6, 2) noise-free, also outside the picture
     state: Ints  # (T, 6) DETECTED, HIDDEN (or missed) or OUTSIDE
     poses: Pose  # (T,) world_from_body
-    start_px: Array  # (6, 2) the measured points of frame 0: labels for trackers that know no rig
+    start_px: Array  # (6, 2) the measured points of frame 0: labels for trackers without a rig
 
     def __len__(self) -> int:
         return len(self.detections)
@@ -71,12 +71,12 @@ class Scene:
 
 @dataclass(frozen=True, slots=True)
 class Nuisance:
-    """How often a spot is missed, hidden, and imitated."""
+    """Frequency of misses, occlusions and clutter."""
 
     missed: float  # probability per frame
     hidden_frames: tuple[int, int]  # shortest and longest
-    around: Callable[[np.random.Generator], int]  # how many false points near one spot
-    anywhere: float  # mean of how many false points in a picture, beside two fixed ones; 0: none of either
+    around: Callable[[np.random.Generator], int]  # number of false points near one spot
+    anywhere: float  # mean number of false points in a picture besides two fixed ones; 0: neither
 
 
 USUAL = Nuisance(0.02, (5, 20), lambda rng: int(rng.random() < 0.20), 0.0)
@@ -100,7 +100,7 @@ def rig() -> Rig:
 
 
 def spot_pixels(q: Array) -> Array:
-    """Pixels (T, 6, 2) of the spots for x, y, z (m), yaw, pitch, roll (rad) (T, 6), in the picture or not."""
+    """Pixels (T, 6, 2) of the spots, also outside the picture, for x, y, z (m), yaw, pitch, roll (rad) (T, 6)."""
     cy, cp, cr = np.cos(q[:, 3:].T)
     sy, sp, sr = np.sin(q[:, 3:].T)
     body_x = np.stack([cy * cp, sy * cp, -sp], axis=-1)  # in world: the first two columns of Rz(yaw) Ry(pitch) Rx(roll)
@@ -119,7 +119,7 @@ def spot_pixels(q: Array) -> Array:
 
 
 def make_scene(name: str, seed: int, frames: int = 2000) -> Scene:
-    """One of SCENES. The same name, seed and length give the same points; another length draws others."""
+    """One of SCENES. The points depend on name, seed and length."""
     rng = np.random.default_rng([seed, sum(map(ord, name))])
     q, bends = MOTIONS[name](frames, rng)
     nuisance = DENSE if name == "dense" else USUAL
@@ -150,7 +150,7 @@ _Point = tuple[int, float, float, int]  # camera, u, v, origin
 
 
 def _seen(inside: Bools, bends: list[int], nuisance: Nuisance, rng: np.random.Generator) -> Bools:
-    """Which spots (T, 6) are detected: in the picture, not missed, not hidden."""
+    """The detected spots (T, 6): in the picture, not missed, not occluded."""
     shortest, longest = nuisance.hidden_frames
 
     def duration() -> int:
@@ -178,7 +178,7 @@ def _seen(inside: Bools, bends: list[int], nuisance: Nuisance, rng: np.random.Ge
 def _near_spots(
     uv: Array, noisy: Array, inside: Bools, seen: Bools, nuisance: Nuisance, rng: np.random.Generator
 ) -> list[_Point]:
-    """The detected spots of one frame, and false points near all spots; half as often near one out of the picture."""
+    """The detected spots of one frame and false points near all spots, half as often near those out of the picture."""
     points: list[_Point] = []
     for s in range(SPOTS):
         camera = int(CAMERA_OF[s])
@@ -195,7 +195,7 @@ def _near_spots(
 
 
 def _anywhere(fixed: list[Array], mean: float, rng: np.random.Generator) -> list[_Point]:
-    """False points of one frame: at random places, and at the fixed ones of each camera (2, 2) nine times of ten."""
+    """False points of one frame: at random places, and with a probability of 0.9 at the fixed ones (2, 2)."""
     points: list[_Point] = []
     for c in range(CAMERAS):
         points += [(c, *rng.uniform([0, 0], SIZE_PX - 1), CLUTTER) for _ in range(rng.poisson(mean))]

@@ -16,7 +16,7 @@ SPEED_SCENES = ("standard", "dense")
 
 
 def markdown(results: Sequence[Result], names: Sequence[str]) -> str:
-    """The trackers `names` in their order; one without results is there with the reason."""
+    """The table of the trackers `names` in this order; one without results has the reason instead."""
     columns = [
         "tracker",
         "seeds",
@@ -71,6 +71,6 @@ def _cells(name: str, mine: Sequence[Result], width: int) -> list[str]:
 
 
 def _form(values: Sequence[float], form: str) -> str:
-    """The mean of those that are known."""
+    """The mean of the known values."""
     known = [v for v in values if not np.isnan(v)]
     return format(float(np.mean(known)), form) if known else NOTHING

@@ -1,7 +1,7 @@
-"""The trackers of the bench by name: ours, and other people's with the parameters that they do best with.
+"""The compared trackers by name: ours, and those of other packages with their best parameters.
 
-The peers' parameters were chosen by IDF1 among two or three settings each, on 700 frames of standard, fast and reversal
-of seed 3, and then left alone. Slow ones take only the first seeds of a run.
+The parameters of the other trackers were chosen by IDF1 among two or three settings each, on 700 frames of standard,
+fast and reversal of seed 3. Slow trackers run with the first seeds only.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ class Entry:
 
     name: str
     module: str  # of bench.peers, with track(scene, **options)
-    library: str | None = None  # what must be installed; None: ours
+    library: str | None = None  # required package; None: ours
     options: Mapping[str, object] = field(default_factory=dict)
-    seeds: int | None = None  # at most so many of the seeds asked for; None: all
+    seeds: int | None = None  # largest number of the given seeds; None: all
 
     @property
     def installed(self) -> bool:
-        """Whether the library is there; ours always are."""
+        """Whether the package is installed; ours always are."""
         return self.library is None or find_spec(self.library) is not None
 
     @property
     def library_version(self) -> str:
-        """As in `norfair 2.3.0`; for ours the program's own."""
+        """The name and version of the package, such as `norfair 2.3.0`; for ours those of the program."""
         name = self.library or "beampose"
         try:
             return f"{name} {version(name)}"
@@ -43,7 +43,7 @@ class Entry:
             return name
 
     def track(self, scene: Scene) -> Tracked:
-        """Its rows over one scene. Raises whatever the library raises."""
+        """The rows of one scene. Exceptions of the package are not caught."""
         tracked: Tracked = import_module(f"bench.peers.{self.module}").track(scene, **self.options)
         return tracked
 
@@ -53,7 +53,7 @@ ENTRIES = {
     for entry in (
         Entry("rigid", "ours", options={"method": "rigid"}),
         Entry("rigid-smoothed", "ours", options={"method": "rigid", "smoothed": True}),
-        # On dense, `spots` looks for the vehicle anew in a third of the frames: 0.13 s each, minutes for a scene.
+        # On dense, `spots` searches for the vehicle again in a third of the frames: 0.13 s each, minutes for a scene.
         Entry("spots", "ours", options={"method": "spots"}, seeds=1),
         Entry("pyrecest-jpda", "with_pyrecest", "pyrecest", {"association": "jpda", "q": 2.0}, seeds=2),
         Entry("pyrecest-gnn", "with_pyrecest", "pyrecest", {"association": "gnn", "q": 2.0}, seeds=2),

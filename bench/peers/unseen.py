@@ -1,4 +1,4 @@
-"""How well a tracker places spots that it does not see: hidden ones, and ones outside the picture."""
+"""Errors of the positions of invisible spots: occluded, or outside the picture."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from bench.peers.scenes import Scene
 
 @dataclass(frozen=True, slots=True)
 class Unseen:
-    """Errors of the positions given without a detection, for spots in one state; nan where there are none."""
+    """Errors of the positions without a detection, for spots in one state; nan where there are none."""
 
-    covered: float  # share of such spot-frames that got a position under the spot's first label
+    covered: float  # share of these spot-frames that have a position with the first label of the spot
     rms_px: float
     p95_px: float
     max_px: float
 
 
 def score_unseen(scene: Scene, rows: Tracked, state: int) -> Unseen:
-    """state: HIDDEN or OUTSIDE."""
+    """The errors in one scene; state: HIDDEN or OUTSIDE."""
     gap = distances(scene, rows)
     errors = [
         gap[~rows.measured & (rows.identity == label) & (scene.state[rows.frame, s] == state), s]

@@ -1,4 +1,4 @@
-"""ByteTrack of the package `trackers`: it knows boxes only, so every point is the middle of a square."""
+"""ByteTrack of the package `trackers`: it tracks boxes, so every point is the centre of a square."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from bench.peers.scenes import CAMERAS, Scene
 
 
 def track(scene: Scene, half_px: float = 40.0, frames_kept: int = 25) -> Tracked:
-    """One tracker per camera. half_px: of the square, whose overlap is the gate."""
+    """One tracker per camera. half_px: half the side of the square, whose overlap is the gate."""
     start = process_time()
     trackers = [
         ByteTrackTracker(

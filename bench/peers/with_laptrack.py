@@ -1,4 +1,4 @@
-"""laptrack: assignment from frame to frame, then of the pieces' ends across gaps; offline, without a motion model."""
+"""laptrack: assignment from frame to frame, then of track ends across gaps; offline, without a motion model."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from bench.peers.scenes import CAMERAS, Scene
 
 
 def track(scene: Scene, gate_px: float = 45.0, gap_px: float = 150.0, frames_kept: int = 20) -> Tracked:
-    """Both cameras, one after the other. gap_px: how far a piece may begin from where another ended."""
+    """Both cameras, one after the other. gap_px: largest distance of the start of a track from the end of another."""
     start = process_time()
     rows = []
     for c in range(CAMERAS):

@@ -11,7 +11,7 @@ from bench.peers.scenes import CAMERAS, Scene
 
 
 def track(scene: Scene, gate_px: float = 25.0, frames_kept: int = 25, R: float = 4.0, Q: float = 0.1) -> Tracked:
-    """One tracker per camera. R, Q: norfair's measurement and process noise."""
+    """One tracker per camera. R, Q: measurement and process noise of norfair."""
     start = process_time()
     trackers = [
         Tracker(

@@ -1,6 +1,6 @@
 """PyRecEst: three fixed targets per camera, associated by JPDA or by a global nearest neighbour.
 
-Its trackers have neither births nor deaths, so they are given what no other tracker is: the true labels of frame 0.
+Its trackers have neither births nor deaths; therefore, unlike the others, they get the true labels of frame 0.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from bench.peers.scenes import CAMERA_OF, CAMERAS, Scene
 from geometry.arrays import Array
 
 SIGMA_PX, SIGMA_RATE = 0.3, 12.0  # px and px per frame: of a measurement, and of the velocity at frame 0
-NEAR_PX = 3.0  # the detection nearest to an estimate, within this, is taken for the one that it follows
+NEAR_PX = 3.0  # largest distance of the detection that is assigned to an estimate
 DETECTED, CLUTTER_PER_PX2 = 0.93, 4e-5
 
 
 def track(scene: Scene, association: str = "jpda", q: float = 2.0) -> Tracked:
     """Both cameras, one after the other. association: jpda or gnn; q: white acceleration, px per frame^2."""
-    logging.getLogger("pyrecest").setLevel(logging.CRITICAL)  # a line for every target of every frame
+    logging.getLogger("pyrecest").setLevel(logging.CRITICAL)  # one line per target and frame
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         start = process_time()
@@ -36,7 +36,7 @@ def track(scene: Scene, association: str = "jpda", q: float = 2.0) -> Tracked:
 
 
 def _estimates(scene: Scene, camera: int, association: str, q: float) -> list[Array]:
-    """The three targets' positions (3, 2), px, after every frame."""
+    """The positions (3, 2), px, of the three targets after every frame."""
     F = np.kron(np.eye(2), [[1.0, 1.0], [0.0, 1.0]])
     Q = np.kron(np.eye(2), q**2 * np.array([[0.25, 0.5], [0.5, 1.0]]))
     H = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0]])
@@ -61,7 +61,7 @@ def _estimates(scene: Scene, camera: int, association: str, q: float) -> list[Ar
 
 
 def _named(scene: Scene, estimates: list[list[Array]], spent_s: float) -> Tracked:
-    """Rows with the detections that the estimates follow; where there is none the estimate is a prediction."""
+    """Rows with the detections assigned to the estimates; without one the estimate is a prediction."""
     rows, measured = [], []
     for c, of_camera in enumerate(estimates):
         for k, positions in enumerate(of_camera):

@@ -1,4 +1,4 @@
-"""Stone Soup: a Kalman filter per target and a 2-D assignment of each frame's points; built as in its tutorials."""
+"""Stone Soup: a Kalman filter per target and a 2-D assignment of the points of each frame, as in its tutorials."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from stonesoup.updater.kalman import KalmanUpdater
 from bench.peers.rows import Tracked
 from bench.peers.scenes import CAMERAS, Scene
 
-SIGMA_PX, SIGMA_RATE = 0.3, 12.0  # px and px per frame: of a measurement, and of a new target's velocity
-FIRST_TIME = datetime.datetime(2024, 1, 1)  # Stone Soup counts dates; a frame is a second of them
+SIGMA_PX, SIGMA_RATE = 0.3, 12.0  # px and px per frame: of a measurement, and of the velocity of a new target
+FIRST_TIME = datetime.datetime(2024, 1, 1)  # Stone Soup uses dates; a frame is one second
 
 
 def track(scene: Scene, q: float = 3.0, frames_kept: int = 25, gate_sigmas: float = 5.0) -> Tracked:
-    """Both cameras, one after the other. q: the constant-velocity model's diffusion, px^2 per frame^3."""
+    """Both cameras, one after the other. q: diffusion of the constant-velocity model, px^2 per frame^3."""
     start = process_time()
     rows = []
     names: dict[str, int] = {}

@@ -1,4 +1,4 @@
-"""trackpy: Crocker and Grier's linking, each particle predicted with its nearest neighbour's velocity."""
+"""trackpy: linking by Crocker and Grier, with the velocity of the nearest neighbour as prediction."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Recordings drawn at random as pictures: `python -m bench.random_scenes --pictures`. The renderer is its own.
+"""Random recordings as pictures: `python -m bench.random_scenes --pictures`, with an independent renderer.
 
-Nothing here uses the detector's model of a spot or lab/simulate.
+It does not use the spot model of the detector or lab/simulate.
 """

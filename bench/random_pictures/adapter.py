@@ -1,4 +1,4 @@
-"""The only place that knows how the program estimates a camera's noise, and how it reports the model."""
+"""Access to the noise estimate of the program and to the model that it reports."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tracking.noise_estimation.photon_transfer import estimate_noise
 
 
 def model_of_pictures(frames: int, picture: Callable[[int], Picture]) -> NoiseModel:
-    """The noise model that a run without a stated noise starts with, from a recording of so many pictures."""
+    """The initial noise model of a run without a stated noise, from a recording with this number of pictures."""
     return estimate_noise([picture(k) for k in frames_to_learn_from(frames)]).model
 
 
@@ -28,5 +28,5 @@ def reported_model(block: Mapping[str, Any]) -> NoiseModel:
 
 
 def variance_at(model: NoiseModel, level_dn: float) -> float:
-    """Variance, DN^2 of the file's numbers, that a model expects at a level."""
+    """The variance of a model at a level, DN^2 of the values in the file."""
     return float(np.asarray(model.variance(level_dn)))

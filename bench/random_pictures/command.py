@@ -1,4 +1,4 @@
-"""Draw, render, run and judge scenes in pictures: what `python -m bench.random_scenes --pictures` does."""
+"""Draw, render, run and score scenes in pictures, for `python -m bench.random_scenes --pictures`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pathlib import Path
 
 import cv2
 
-from bench.random_pictures.judge import PictureJudgement, asked_pairs, judge
+from bench.random_pictures.judge import PictureJudgement, counted_pairs, judge
 from bench.random_pictures.looks import FAMILIES
 from bench.random_pictures.render import Renderer
 from bench.random_pictures.report import crashed, details, summary, write_rows
@@ -30,12 +30,12 @@ class PictureJob:
     seed: int
     family: str | None
     frames: int | None
-    keep: Path | None  # where its run folder and its results stay
-    state_noise: bool  # in rig.yaml: for diagnosis only
+    keep: Path | None  # folder for its run folder and its results
+    state_noise: bool  # the true noise is stated in rig.yaml, for diagnosis only
 
 
 def judged(job: PictureJob) -> PictureJudgement:
-    """One scene; an exception of the program is a class of failure, not the end of the bench."""
+    """Run and score one scene; an exception of the program counts as a class of failure."""
     cv2.setNumThreads(1)
     start = time.process_time()
     renderer = Renderer(picture_scene(job.seed, job.family, job.frames))
@@ -48,13 +48,13 @@ def judged(job: PictureJob) -> PictureJudgement:
         except Exception as error:
             plain = isinstance(error, BeamposeError)
             trace = f"{type(error).__name__}: {error}" if plain else traceback.format_exc()
-            return crashed(renderer, int(asked_pairs(renderer).sum()), trace)
+            return crashed(renderer, int(counted_pairs(renderer).sum()), trace)
         ran = time.process_time()
         return judge(renderer, place / "out", outcome.exit_status, (rendered - start, ran - rendered))
 
 
 def run_all(jobs: list[PictureJob], workers: int) -> Iterator[PictureJudgement]:
-    """In the order of the jobs."""
+    """The results in the order of the jobs."""
     if workers == 1:
         yield from map(judged, jobs)
         return

@@ -1,8 +1,8 @@
-"""What a run says of pictures against their truth: spots, labels, poses, noise model, and the words of its verdict.
+"""The results of a run on pictures compared with the truth: spots, labels, poses, noise model and verdict.
 
-A pair (view, frame) is asked for where the spot shines, its matched-filter SNR is at least LEAST_SNR, its centre is in
-the picture, and no other light of the scene lies within the widths of both. It is right where the reported place is
-within max(3 px, 5 sigma / SNR) of the truth. Only scenes count that the true labels solve with points of that quality.
+A pair (view, frame) counts if the spot is visible with a matched-filter SNR of at least LEAST_SNR, its centre is in the
+picture, and no other light of the scene lies within the widths of both. It is correct if the reported position is
+within max(3 px, 5 sigma / SNR) of the truth. Only scenes count that can be solved with the true labels and such points.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ from lab.runs.verdict.evidence import Kind
 
 LEAST_SNR = 8.0
 SAME_SPOT_PX, SAME_SPOT_SIGMAS = 3.0, 5.0
-APART_WIDTHS = 4.0  # sigmas of both lights, within which two lights are not asked for
+APART_WIDTHS = 4.0  # sigmas of both lights, within which two lights do not count
 LEAST_RIGHT, MOST_NEES = 0.97, 2.0  # of a good scene; NEES/6
-SEEN = 0.5  # share of a camera's pictures with a spot in them, from which "nothing detected" is wrong
+SEEN = 0.5  # share of pictures of a camera with a spot, above which "nothing detected" is wrong
 
 CLASSES = ("crash", "nothing measured", "confidently wrong", "wrong labels", "spots missing", "wrong diagnosis",
            "exit status", "NEES")  # fmt: skip
@@ -39,7 +39,7 @@ CLASSES = ("crash", "nothing measured", "confidently wrong", "wrong labels", "sp
 
 @dataclass(frozen=True, slots=True)
 class NoiseFigures:
-    """One camera's noise model: estimated over true variance."""
+    """The noise model of one camera: estimated over true variance."""
 
     camera: str
     background_dn: float  # true level
@@ -49,23 +49,23 @@ class NoiseFigures:
 
 @dataclass(frozen=True, slots=True)
 class PictureJudgement:
-    """A scene's verdict; ratios are nan where there is nothing to take them of."""
+    """The scores of a scene; ratios are nan where they are undefined."""
 
     seed: int
     family: str
     counts: bool
     why_not: str
     classes: tuple[str, ...]
-    asked: int  # pairs
-    right: float  # share of them, measured and right
-    recall: float  # share of them with a detection at the right place
-    false_per_picture: float  # detections without any light of the scene near them
+    pairs: int  # number of counted pairs
+    right: float  # share of the pairs that are measured and correct
+    recall: float  # share of the pairs with a detection at the correct position
+    false_per_picture: float  # detections without a light of the scene near them
     wrong: int  # labels
     measured: float  # share of the frames
     wrong_poses: int  # confidently
     nees: float  # smoothed NEES/6, mean over measured and predicted poses
     nees_max: float
-    scatter: float  # rms of the asked pairs' errors over their claimed sigmas, per coordinate
+    scatter: float  # rms of the errors of the pairs over their stated sigmas, per coordinate
     error_px: float  # rms, per coordinate
     noise: tuple[NoiseFigures, ...]
     exit_status: int
@@ -82,13 +82,13 @@ class PictureJudgement:
 
 
 def visible(renderer: Renderer) -> Bools:
-    """(T, n): shining with LEAST_SNR in a picture that exists."""
+    """(T, n): visible with LEAST_SNR in an existing picture."""
     scene = renderer.ps.scene
     return scene.shining & (np.nan_to_num(renderer.snr) >= LEAST_SNR)
 
 
 def oracle_scene(renderer: Renderer) -> Scene:
-    """The recording as points: those of visible spots, with the noise that their light allows."""
+    """The recording as points: the visible spots, with the noise of their light."""
     ps = renderer.ps
     scene, seen = ps.scene, visible(renderer)
     sigma = np.full(len(scene.camera_of), 0.05)
@@ -103,7 +103,7 @@ def oracle_scene(renderer: Renderer) -> Scene:
 
 
 def other_lights(renderer: Renderer, k: int, camera: int, but: int = -1) -> Array:
-    """(m, 3) u, v, width (px) of everything in a picture that looks like a spot, without the view `but`."""
+    """(m, 3) u, v, width (px) of everything in a picture that resembles a spot, without the view `but`."""
     scene = renderer.ps.scene
     views = np.flatnonzero((scene.camera_of == camera) & (scene.in_view[k] == SHINING))
     views = views[views != but]
@@ -113,8 +113,8 @@ def other_lights(renderer: Renderer, k: int, camera: int, but: int = -1) -> Arra
     return np.concatenate([spots, details, clutter])
 
 
-def asked_pairs(renderer: Renderer) -> Bools:
-    """(T, n): the pairs that are asked for."""
+def counted_pairs(renderer: Renderer) -> Bools:
+    """(T, n): the pairs that count."""
     scene = renderer.ps.scene
     out = visible(renderer)
     for k, i in zip(*np.nonzero(out), strict=True):
@@ -125,7 +125,7 @@ def asked_pairs(renderer: Renderer) -> Bools:
 
 
 def tolerances(renderer: Renderer) -> Array:
-    """(T, n) px, within which a place is right."""
+    """(T, n): largest error, px, of a correct position."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(np.fmax(SAME_SPOT_PX, SAME_SPOT_SIGMAS * renderer.width_px / np.fmax(renderer.snr, 1.0)))
 
@@ -136,18 +136,18 @@ def judge(renderer: Renderer, results: Path, exit_status: int, seconds: tuple[fl
     scene = ps.scene
     answer = pass_of_files(scene, results, causal=False)
     summary = read_summary(results)
-    asked, limit = asked_pairs(renderer), tolerances(renderer)
+    pairs, limit = counted_pairs(renderer), tolerances(renderer)
     error = answer.uv_px - scene.uv_px
     away = np.linalg.norm(error, axis=-1)
     right = answer.labelled & (away <= limit)
     wrong = int((answer.labelled & ~(away <= limit)).sum())
     nees = np.sum(whitened_errors(scene, answer) ** 2, axis=1)
     good = (answer.status != LOST) & ~np.isnan(nees)
-    recall, false = detections_against(renderer, results, asked, limit)
+    recall, false = detections_against(renderer, results, pairs, limit)
     oracle = ask_oracle(oracle_scene(renderer))
     diagnoses = wrong_diagnoses(renderer, summary) if oracle.counts else ()
-    share = float((right & asked).sum() / max(asked.sum(), 1))
-    chosen = right & asked
+    share = float((right & pairs).sum() / max(pairs.sum(), 1))
+    chosen = right & pairs
     sigma = _claimed(scene, results)
     wrong_poses = int((nees[good] > CONFIDENTLY_WRONG).sum())
     mean_nees = float(nees[good].mean()) / 6 if good.any() else float("nan")
@@ -168,7 +168,7 @@ def judge(renderer: Renderer, results: Path, exit_status: int, seconds: tuple[fl
         classes.append("NEES")
     return PictureJudgement(
         seed=ps.seed, family=ps.family or "mixed", counts=oracle.counts, why_not=oracle.why_not, classes=tuple(classes),
-        asked=int(asked.sum()), right=share, recall=recall, false_per_picture=false, wrong=wrong,
+        pairs=int(pairs.sum()), right=share, recall=recall, false_per_picture=false, wrong=wrong,
         measured=float((answer.status == MEASURED).mean()), wrong_poses=wrong_poses, nees=mean_nees,
         nees_max=float(nees[good].max(initial=0.0)) / 6,
         scatter=_rms(error[chosen] / sigma[chosen]), error_px=_rms(error[chosen]),
@@ -178,8 +178,8 @@ def judge(renderer: Renderer, results: Path, exit_status: int, seconds: tuple[fl
     )  # fmt: skip
 
 
-def detections_against(renderer: Renderer, results: Path, asked: Bools, limit: Array) -> tuple[float, float]:
-    """Share of the asked pairs that have a detection at their place, and detections per picture far from any light."""
+def detections_against(renderer: Renderer, results: Path, pairs: Bools, limit: Array) -> tuple[float, float]:
+    """Share of the pairs with a detection at their position, and detections per picture far from any light."""
     scene = renderer.ps.scene
     table = read_result_table(results / "detections.csv", ("frame", "camera", "u_px", "v_px"))
     cameras = list(scene.rig.cameras)
@@ -191,20 +191,20 @@ def detections_against(renderer: Renderer, results: Path, asked: Bools, limit: A
         for k in np.flatnonzero(scene.has_image[:, c]):
             points = uv[(frame == k) & (camera == c)]
             points = points[np.isfinite(points).all(axis=1)]
-            for i in mine[asked[k, mine]]:
+            for i in mine[pairs[k, mine]]:
                 found += bool(np.any(np.linalg.norm(points - scene.uv_px[k, i], axis=1) <= limit[k, i]))
             lights = other_lights(renderer, int(k), c)
             gap = np.linalg.norm(points[:, None] - lights[None, :, :2], axis=-1)
             near = gap < np.maximum(5 * lights[:, 2], 5.0)
             false += int((~near.any(axis=1)).sum())
-    return found / max(int(asked.sum()), 1), false / max(int(scene.has_image.sum()), 1)
+    return found / max(int(pairs.sum()), 1), false / max(int(scene.has_image.sum()), 1)
 
 
 def wrong_diagnoses(renderer: Renderer, summary: Mapping[str, Any]) -> tuple[str, ...]:
-    """Reasons of the verdict that the truth contradicts; rig, prior, lasers and cameras of a scene are in order.
+    """The reasons of the verdict that contradict the truth; rig, prior, lasers and cameras of a scene are correct.
 
-    Pictures that are missing, hidden spots and few measured frames of these may be named, and that the spots' errors
-    are larger than claimed. That the rig or the prior is wrong, or that nothing shines, may not.
+    Correct reasons: missing pictures, occluded spots, few measured frames because of these, and errors of the spots
+    above their stated sigmas. Wrong reasons: an incorrect rig or prior, or lasers without light.
     """
     scene, seen = renderer.ps.scene, visible(renderer)
     out = []
@@ -226,7 +226,7 @@ def wrong_diagnoses(renderer: Renderer, summary: Mapping[str, Any]) -> tuple[str
 
 
 def _about_noise_or_hidden(what: str, scene: Scene, seen: Bools) -> bool:
-    """Whether a finding of the model check is about sigmas that are too small, or about a spot that is hardly seen."""
+    """The finding of the model check is about sigmas that are too small, or about a barely visible spot."""
     if what.startswith("the spots' residuals are"):
         return True
     named = re.match(r"spot (\S+) in camera `(.+)` was measured in", what)
@@ -237,7 +237,7 @@ def _about_noise_or_hidden(what: str, scene: Scene, seen: Bools) -> bool:
 
 
 def noise_figures(renderer: Renderer, summary: Mapping[str, Any]) -> tuple[NoiseFigures, ...]:
-    """Of each camera whose model the run reports."""
+    """The ratios of each camera with a model in the results."""
     blocks = summary.get("parameters", {}).get("noise", {})
     return tuple(
         compared(renderer, c, name, reported_model(blocks[name]))
@@ -247,15 +247,15 @@ def noise_figures(renderer: Renderer, summary: Mapping[str, Any]) -> tuple[Noise
 
 
 def compared(renderer: Renderer, camera: int, name: str, model: Any) -> NoiseFigures:
-    """A model against the sensor, at the level of the background and at half of full scale."""
+    """A model compared with the sensor, at the level of the background and at half of full scale."""
     look, still = renderer.ps.look, renderer.still[camera]
     rng = np.random.default_rng([*renderer.ps.key, 31, camera])
-    dark = float(np.median((still.ambient_e + still.steady_e)[::4, ::4]))
+    unlit = float(np.median((still.ambient_e + still.steady_e)[::4, ::4]))
     ratios, levels = [], []
-    for light in (dark, 0.5 * look.sensor.full_well_e):
+    for light in (unlit, 0.5 * look.sensor.full_well_e):
         level, variance = true_noise(look.sensor, light, rng)
         levels.append(level)
-        # Rounding bounds what can be seen of a noise: a flat 8-bit background may not scatter at all.
+        # Rounding limits the observable noise: a constant 8-bit background may have no variance at all.
         floor = 4.0**look.sensor.shift / 12
         ratios.append(variance_at(model, level) / max(variance, floor))
     return NoiseFigures(name, levels[0], ratios[0], ratios[1])

@@ -1,4 +1,4 @@
-"""What a recording looks like: light, surface, defects, sensor and motion, drawn at random or as one of FAMILIES."""
+"""The appearance of a recording: light, surface, defects, sensor and motion, random or of one of FAMILIES."""
 
 from __future__ import annotations
 
@@ -12,42 +12,42 @@ from bench.random_pictures.sensors import Sensor, draw_sensor
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """One scene's pictures. Light is given as a share of the sensor's range from black to full scale."""
+    """The appearance of the pictures of a scene. Light is a share of the sensor range from black to full scale."""
 
     sensor: Sensor
-    sigma_px: float  # of the spots: lens, beam and pixel together
+    sigma_px: float  # of the spots, with lens, beam and pixel
     blur_px: float  # of the lens
     ratio: float  # of the beams' axes
-    flat: int  # 1 Gaussian, else a flat top
+    flat: int  # 1: Gaussian, otherwise a flat top
     halo: float  # share of the peak
-    divergence: float  # share of the beam's width on the screen that it gets from divergence
+    divergence: float  # share of the width of the beam on the screen due to divergence
     peak_snr: float  # of the median spot at rest, over the noise of the background with its texture
-    most_peak: float  # but at most so much light
-    power_spread: float  # beams differ by up to this share
+    most_peak: float  # upper limit of the light of a peak
+    power_spread: float  # largest relative difference of the beams
     background: float  # at the middle of the picture
     gradient: float  # share, from edge to edge
     vignetting: float  # share lost in the corners
     texture: float  # contrast of the surface
     texture_grain_px: float
-    speckle: float  # contrast, on laser light alone
+    speckle: float  # contrast, for laser light only
     speckle_grain_px: float
     flicker: float  # of the ambient light, share
     drift: float  # of the ambient light over the recording, share
     reflections: int  # wide humps per picture
-    details: int  # small bright or dark details per picture
+    details: int  # small bright or black details per picture
     screen_edge: bool
     hot_pixels: int  # per picture
-    clutter: int  # moving spots per picture that are none
+    clutter: int  # moving false spots per picture
     exposure_share: float  # of the frame interval
     fastest_px: float  # per frame
     least_streak_px: float = 0.0  # of the longest streak
     motion: str = ""  # of bench.random_scenes.motions; empty: any
-    hidden: bool = True  # spots are hidden now and then, pictures are missing
-    plain_rig: bool = False  # the paper's rig at 1280 x 1024
+    hidden: bool = True  # with occlusions and missing pictures
+    plain_rig: bool = False  # the rig of the paper at 1280 x 1024
 
     @property
     def text(self) -> str:
-        """In a few words."""
+        """A short description."""
         parts = [
             f"sigma {self.sigma_px:.2g} px (lens {self.blur_px:.2g})",
             f"peak {self.peak_snr:.3g} x noise, <= {self.most_peak:.2g} of scale",
@@ -73,13 +73,13 @@ def _log(rng: np.random.Generator, low: float, high: float) -> float:
 
 
 def _sometimes(rng: np.random.Generator, chance: float, low: float, high: float) -> float:
-    """Zero, or with this chance something between."""
+    """Zero, or with this probability a value between the limits."""
     value = float(rng.uniform(low, high))
     return value if rng.random() < chance else 0.0
 
 
 def mixed_look(rng: np.random.Generator) -> Look:
-    """Everything at random, independently."""
+    """All properties random and independent."""
     sigma = _log(rng, 0.5, 20.0) if rng.random() < 0.6 else _log(rng, 0.8, 3.0)
     full = rng.random() < 0.15
     return Look(
@@ -113,7 +113,7 @@ def mixed_look(rng: np.random.Generator) -> Look:
 
 
 def plain_look(rng: np.random.Generator) -> Look:
-    """What families start from: 8 bits, clear spots of 1 to 3 px, little else; the family adds its difficulty."""
+    """The base of the families: 8 bits, clear spots of 1 to 3 px, few disturbances; a family adds its difficulty."""
     return replace(
         mixed_look(rng),
         sensor=replace(draw_sensor(rng, "8"), row_e=0.0),
@@ -126,7 +126,7 @@ def plain_look(rng: np.random.Generator) -> Look:
 
 
 def _issue(rng: np.random.Generator, look: Look) -> Look:
-    """1280 x 1024, peaks of 150 DN on 18 DN, noise 1 DN: the pictures that defeated the first noise estimate."""
+    """1280 x 1024, peaks of 150 DN on 18 DN, noise 1 DN: the first noise estimate failed on such pictures."""
     full_well = float(rng.uniform(6_000, 12_000))  # with 2 to 4 electrons of read noise: about 1 DN at the background
     sensor = Sensor(8, full_well, 0.7 * full_well / 255, 8 / 255)
     return replace(
@@ -158,7 +158,7 @@ FAMILIES: dict[str, Callable[[np.random.Generator, Look], Look]] = {
     "mjpg": lambda r, k: replace(k, sensor=draw_sensor(r, "mjpg")),
     "12-bit-in-16": lambda r, k: replace(k, sensor=draw_sensor(r, "12in16"), texture=0.04 * r.random()),
     "16-bit": lambda r, k: replace(k, sensor=draw_sensor(r, "16"), texture=0.04 * r.random()),
-    "dark-clipped": lambda r, k: replace(k, sensor=draw_sensor(r, "clipped"), background=float(r.uniform(0, 0.004))),
+    "black-clipped": lambda r, k: replace(k, sensor=draw_sensor(r, "clipped"), background=float(r.uniform(0, 0.004))),
     "bright-background": lambda r, k: replace(
         k, background=float(r.uniform(0.2, 0.31)), gradient=0.6, texture=float(r.uniform(0, 0.04)), most_peak=0.6
     ),
@@ -178,7 +178,7 @@ FAMILIES: dict[str, Callable[[np.random.Generator, Look], Look]] = {
 
 
 def draw_look(rng: np.random.Generator, family: str | None) -> Look:
-    """A look of a family, or without one everything at random."""
+    """The appearance of a family, or a random one without a family."""
     if family is None:
         return mixed_look(rng)
     return FAMILIES[family](rng, plain_look(rng))

@@ -1,7 +1,7 @@
-"""The light of one beam in a camera's picture: a beam cut by the screen, seen through a lens, integrated by pixels.
+"""The light of one beam in the picture of a camera: intersection with the screen, lens, integration over pixels.
 
-The irradiance is evaluated on the screen from the beam's geometry, so that a divergent beam on an oblique screen makes
-an asymmetric spot whose centroid is beside the axis. The truth of a spot is the image of the axis (projection.py).
+The irradiance is evaluated on the screen from the geometry of the beam, so that a divergent beam on an oblique screen
+gives an asymmetric spot with its centroid beside the axis. The true position is the image of the axis (projection.py).
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from geometry.arrays import Array
 from geometry.camera import Camera
 from geometry.rig import Screen
 
-REACH = 5.0  # sigmas beyond which a spot is dark: 4e-6 of its peak
+REACH = 5.0  # sigmas, beyond which the light of a spot is neglected: 4e-6 of its peak
 _ORDER = 5  # of the polynomial from pixels to the screen, over one patch
-_NODES = 9  # per side, that it is fitted to
+_NODES = 9  # points per side for its fit
 MOST_SAMPLES = 32  # per pixel and axis: beams down to a sigma of 0.022 px
 HALO_WIDTH = 4.0  # of the halo's sigma over the beam's
 
@@ -37,11 +37,11 @@ class BeamShape:
     halo: float = 0.0  # share of the peak
 
     def sigma_at(self, along_m: Array) -> Array:
-        """Major sigma, m, so far from the waist."""
+        """Major sigma, m, at a distance from the waist."""
         return np.asarray(np.hypot(self.sigma_m, self.divergence * along_m))
 
     def irradiance(self, across_1: Array, across_2: Array, along_m: Array) -> Array:
-        """Relative to the axis at the waist; across, along in m, any shape. Power is the same at every distance."""
+        """Relative to the axis at the waist; across, along in m, any shape. Power is independent of distance."""
         sigma = self.sigma_at(along_m)
         c, s = np.cos(self.turn_rad), np.sin(self.turn_rad)
         p = (c * across_1 + s * across_2) / sigma
@@ -99,7 +99,7 @@ def _in_world(screen: Screen, xy_m: Array) -> Array:
 def screen_points(
     camera: Camera, screen: Screen, middle_m: Array, u_px: Array, v_px: Array
 ) -> tuple[Array, Array] | None:
-    """Screen x and y (m), each (len(v), len(u)), seen at a grid of pixels that lies about the image of `middle_m`.
+    """Screen x and y (m), each (len(v), len(u)), at a grid of pixels around the image of `middle_m`.
 
     The projection is inverted by a polynomial over the grid, fitted to projected screen points. None beyond the lens.
     """
@@ -130,12 +130,12 @@ def screen_points(
 
 
 def fine_pixels(first: int, count: int, parts: int) -> Array:
-    """Places of `parts` samples in each of `count` pixels; a pixel's centre is a whole number."""
+    """Positions of `parts` samples in each of `count` pixels; pixel centres are integers."""
     return first - 0.5 + (np.arange(count * parts) + 0.5) / parts
 
 
 def blurred(fine: Light, blur_px: float, parts: int) -> Light:
-    """Convolved with the lens's point spread function, a Gaussian; the light beyond the patch is dark."""
+    """The patch convolved with the Gaussian point spread function of the lens; no light outside the patch."""
     sigma = blur_px * parts
     if sigma < 0.2:
         return fine
@@ -154,10 +154,10 @@ def pixel_means(fine: Light, parts: int) -> Light:
 
 
 def samples_per_pixel(light_px: float, beam_px: float) -> int:
-    """Enough for light of a least sigma of `light_px`, lens included, from a beam whose own is `beam_px`.
+    """Samples per pixel and axis for light of a smallest sigma `light_px`, with the lens, from a beam of `beam_px`.
 
-    Means of samples miss a pixel's second moment by 1 / (12 parts^2) px^2; samples of a Gaussian that lie 1.4 sigma
-    apart sum to its integral within 1e-4.
+    The second moment of the mean of samples is 1 / (12 parts^2) px^2 below that of a pixel; the sum over samples of a
+    Gaussian 1.4 sigma apart equals its integral within 1e-4.
     """
     enough = next((parts for below, parts in ((0.7, 6), (1.5, 4), (3.0, 3), (6.0, 2)) if light_px < below), 1)
     return int(np.clip(np.ceil(1 / (1.4 * max(beam_px, 1e-3))), enough, MOST_SAMPLES))

@@ -1,4 +1,4 @@
-"""A recording's pictures, one after the other, and how well each spot can be seen in them."""
+"""The pictures of a recording, one after the other, and the signal-to-noise ratio of each spot."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from bench.random_pictures.surroundings import Surroundings, draw_surroundings, 
 from bench.random_scenes.scene import SHINING
 from geometry.arrays import Array
 
-LEAST_SNR = 11.0  # of the median spot at rest in a matched filter; the looks' peaks are raised to it
+LEAST_SNR = 11.0  # smallest SNR of the median spot at rest in a matched filter; peaks are raised to it
 SURROUNDINGS, AMPLITUDE, CLUTTER, NOISE, FLICKER = range(21, 26)  # streams of random numbers
 
 
 @dataclass(slots=True)
 class Renderer:
-    """Gives `picture(frame, camera)`; `snr` and `width_px` are filled as the pictures are made."""
+    """Renders `picture(frame, camera)`; `snr` and `width_px` are filled with each picture."""
 
     ps: PictureScene
     still: list[Surroundings] = field(init=False)
-    peak_e: Array = field(init=False)  # (c,) electrons that a patch of 1 and a power of 1 stand for
+    peak_e: Array = field(init=False)  # (c,) electrons of a patch of 1 with a power of 1
     clutter_uv: Array = field(init=False)  # (c, m, T, 2) px
     clutter_light: Array = field(init=False)  # (c, m, 2) sigma (px) and electrons at the peak
     ambient: Array = field(init=False)  # (T, c) relative
@@ -56,7 +56,7 @@ class Renderer:
         return np.random.default_rng([*self.ps.key, *purpose])
 
     def _draw_light(self, frames: int, views: int) -> None:
-        """Flicker: mains light that beats with the frames, and a random part; drift: straight on. Lasers: 1 %."""
+        """Flicker: mains light aliased with the frame rate, and a random part; linear drift. Lasers: 1 %."""
         look, rng = self.ps.look, self._rng(FLICKER)
         t = np.arange(frames)
         cameras = len(self.still)
@@ -66,7 +66,7 @@ class Renderer:
         self.laser = 1 + 0.01 * rng.normal(size=(frames, views))
 
     def noise_e(self, camera: int, patch: Patch | None = None) -> Array:
-        """Sigma of the background's pixels with their texture, electrons: of a patch, or one number for the picture."""
+        """Sigma of the pixels of the background with texture, electrons: of a patch, or one value for the picture."""
         look, still = self.ps.look, self.still[camera]
         if patch is None:
             light: Array = np.array(float(np.median(still.ambient_e[::8, ::8])))
@@ -76,7 +76,7 @@ class Renderer:
         return np.asarray(np.sqrt(look.sensor.variance_e2(light) + texture + self.compression_e2[camera]))
 
     def _draw_amplitudes(self) -> None:
-        """Light so that the median spot of each camera, at rest, has the look's peak."""
+        """The light for which the median spot of each camera at rest has the given peak."""
         ps, look, scene = self.ps, self.ps.look, self.ps.scene
         self.peak_e = np.zeros(len(self.still))
         for c in range(len(self.still)):
@@ -99,7 +99,7 @@ class Renderer:
             self.peak_e[c] = max(wanted, LEAST_SNR * noise / float(np.median(norms)))
 
     def _draw_clutter(self) -> None:
-        """Moving false spots: half of them beside a spot and as it moves, half on a straight path."""
+        """Moving false spots: half of them beside a spot with its motion, half on a straight path."""
         ps, look, rng = self.ps, self.ps.look, self._rng(CLUTTER)
         frames, cameras = len(ps), len(self.still)
         self.clutter_uv = np.zeros((cameras, look.clutter, frames, 2))
@@ -135,7 +135,7 @@ class Renderer:
         return Patch(patch.u0, patch.v0, patch.light * np.float32(strength) * self.still[c].response[patch.where])
 
     def expected(self, k: int, camera: int) -> Light:
-        """Electrons that the pixels expect, (h, w); fills `snr` of this frame's views."""
+        """The expected electrons of the pixels, (h, w); fills `snr` of the views of this frame."""
         still, scene = self.still[camera], self.ps.scene
         light = still.ambient_e * np.float32(self.ambient[k, camera])
         light += still.steady_e
@@ -154,14 +154,14 @@ class Renderer:
         return light
 
     def _snr(self, camera: int, patch: Patch) -> float:
-        """Of a matched filter over the background's noise and texture; light beyond full scale does not count."""
+        """SNR of a matched filter over noise and texture of the background; light above full scale does not count."""
         still, look = self.still[camera], self.ps.look
         background = still.ambient_e[patch.where] + still.steady_e[patch.where]
         signal = np.minimum(patch.light, np.maximum(look.sensor.full_well_e - background, 0.0))
         return float(np.sqrt(np.sum((signal / self.noise_e(camera, patch)) ** 2)))
 
     def raw(self, k: int, camera: int) -> Picture:
-        """Frame k as the sensor gives it, before lossy compression."""
+        """Frame k as read from the sensor, before lossy compression."""
         light, rng = self.expected(k, camera), self._rng(NOISE, 1 + k, camera)
         for row, column, charge in self.still[camera].blinking:
             if rng.random() < 0.5:
@@ -169,5 +169,5 @@ class Renderer:
         return expose(self.ps.look.sensor, light, rng)
 
     def picture(self, k: int, camera: int) -> Picture:
-        """Frame k as the program gets it."""
+        """Frame k as read by the program."""
         return compressed(self.ps.look.sensor, self.raw(k, camera))

@@ -1,4 +1,4 @@
-"""The judgements of scenes in pictures as a table, as a summary, and one scene's figures in full."""
+"""The scores of scenes in pictures as a table and as a summary, and all figures of one scene."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from bench.random_pictures.render import Renderer
 WORST = 12
 
 
-def crashed(renderer: Renderer, asked: int, trace: str) -> PictureJudgement:
-    """The judgement of a scene on which the program raised an exception."""
+def crashed(renderer: Renderer, pairs: int, trace: str) -> PictureJudgement:
+    """The scores of a scene on which the program raised an exception."""
     nan, ps = float("nan"), renderer.ps
     return PictureJudgement(
-        seed=ps.seed, family=ps.family or "mixed", counts=True, why_not="", classes=("crash",), asked=asked, right=0.0,
+        seed=ps.seed, family=ps.family or "mixed", counts=True, why_not="", classes=("crash",), pairs=pairs, right=0.0,
         recall=0.0, false_per_picture=nan, wrong=0, measured=0.0, wrong_poses=0, nees=nan, nees_max=nan, scatter=nan,
         error_px=nan, noise=(), exit_status=1, verdict=trace, wrong_diagnoses=(), render_s=nan, run_s=nan, text=ps.text,
     )  # fmt: skip
 
 
 def write_rows(rows: Sequence[PictureJudgement], path: Path) -> None:
-    """One row per scene; the noise models' ratios of its cameras in one field each."""
+    """Write one row per scene; the ratios of the noise models of its cameras share a field."""
     names = [f.name for f in fields(PictureJudgement) if f.name not in ("noise", "classes", "wrong_diagnoses")]
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
@@ -46,17 +46,17 @@ def write_rows(rows: Sequence[PictureJudgement], path: Path) -> None:
 
 
 def line(row: PictureJudgement) -> str:
-    """One line about a scene."""
+    """One line for a scene."""
     noise = ", ".join(f"{n.background:.2g}/{n.half:.2g}" for n in row.noise)
     return (
-        f"{row.family} {row.seed}: {', '.join(row.classes) or 'clean'}; right {row.right:.4f} of {row.asked}, recall"
+        f"{row.family} {row.seed}: {', '.join(row.classes) or 'clean'}; right {row.right:.4f} of {row.pairs}, recall"
         f" {row.recall:.4f}, false {row.false_per_picture:.2f}, wrong {row.wrong}, NEES/6 {row.nees:.2f}, err/sigma"
         f" {row.scatter:.2f}, noise {noise}, status {row.exit_status}"
     )
 
 
 def details(row: PictureJudgement) -> str:
-    """All of one scene."""
+    """All figures of one scene."""
     out = [line(row) + ("" if row.counts else f" (left out: {row.why_not})"), f"  {row.text}"]
     out.append(
         f"  measured {row.measured:.1%}, confidently wrong {row.wrong_poses}, NEES/6 at most {row.nees_max:.3g}, rms"
@@ -95,16 +95,16 @@ def summary(rows: Sequence[PictureJudgement]) -> str:
 def _figures(rows: Sequence[PictureJudgement]) -> list[str]:
     n = len(rows)
     right = np.array([r.right for r in rows])
-    asked = np.array([r.asked for r in rows])
+    pairs = np.array([r.pairs for r in rows])
     wrong = sum(bool(r.wrong_diagnoses) for r in rows)
     background = np.array([f.background for r in rows for f in r.noise])
     half = np.array([f.half for r in rows for f in r.noise])
     return [
         f"clean: {sum(not r.classes for r in rows)} of {n}",
-        f"measured and right, share of {asked.sum()} pairs: {_quantiles(right)}, least {right.min():.4f}, pooled"
-        f" {np.sum(right * asked) / max(asked.sum(), 1):.4f}",
+        f"measured and right, share of {pairs.sum()} pairs: {_quantiles(right)}, least {right.min():.4f}, pooled"
+        f" {np.sum(right * pairs) / max(pairs.sum(), 1):.4f}",
         f"recall: {_quantiles(np.array([r.recall for r in rows]))}, pooled"
-        f" {np.sum([r.recall * r.asked for r in rows]) / max(asked.sum(), 1):.4f};"
+        f" {np.sum([r.recall * r.pairs for r in rows]) / max(pairs.sum(), 1):.4f};"
         f" false points per picture: {_quantiles(np.array([r.false_per_picture for r in rows]))}",
         f"wrong labels {sum(r.wrong for r in rows)} in {sum(r.wrong > 0 for r in rows)} scenes; confidently wrong poses"
         f" {sum(r.wrong_poses for r in rows)} in {sum(r.wrong_poses > 0 for r in rows)} scenes; scenes with a wrong"

@@ -1,4 +1,4 @@
-"""One recording in pictures, drawn at random: rig and motion as in bench.random_scenes, light as in looks.py."""
+"""One random recording in pictures: rig and motion as in bench.random_scenes, light as in looks.py."""
 
 from __future__ import annotations
 
@@ -35,19 +35,19 @@ from geometry.pose import Pose
 FRAMES = 48
 SIZES_PX = ((640, 512), (800, 600), (1024, 768), (1280, 1024))
 MOST_HIDDEN, LEAST_PICTURES = 0.2, 0.85
-LOOK, LIGHT = 11, 12  # streams of random numbers beside those of bench.random_scenes.scene
+LOOK, LIGHT = 11, 12  # streams of random numbers besides those of bench.random_scenes.scene
 MOST_PARTS = 65  # sub-exposures
 
 
 @dataclass(frozen=True, slots=True)
 class PictureScene:
-    """A recording with its truth, and all that its pictures are rendered from."""
+    """A recording with its truth and the data for rendering its pictures."""
 
     seed: int
     family: str | None
     key: list[int]
     look: Look
-    scene: Scene  # rig, truth, what is hidden and missing; its points are not used
+    scene: Scene  # rig, truth, occlusions and missing pictures; its points are not used
     hidden: Bools  # (T, n)
     exposures: Pose  # (T * S,) world_from_body at the middles of the S parts of each exposure
     parts: int  # S, odd: the middle one is at mid-exposure
@@ -59,11 +59,11 @@ class PictureScene:
 
     @property
     def text(self) -> str:
-        """In one line."""
+        """A description in one line."""
         return f"{self.family or 'mixed'}: {self.look.text}; {self.scene.text}"
 
     def during(self, k: int) -> Pose:
-        """(S,) the poses during frame k's exposure."""
+        """(S,) the poses during the exposure of frame k."""
         return self.exposures[k * self.parts : (k + 1) * self.parts]
 
 
@@ -73,7 +73,7 @@ def picture_scene(
     frames: int | None = None,
     sizes_px: Sequence[tuple[int, int]] = SIZES_PX,
 ) -> PictureScene:
-    """The scene of a seed; of other sizes of pictures it is another scene."""
+    """The scene of a seed; it depends on the size of the pictures."""
     name = 0 if family is None else zlib.crc32(family.encode())
     for attempt in range(1000):
         made = _attempt([seed, name, attempt], seed, family, FRAMES if frames is None else frames, sizes_px)
@@ -125,8 +125,8 @@ def _motion(look: Look, seed: int, times: Array) -> Motion:
 def _during(lab: Lab, look: Look, seed: int, motion: Motion, q: Array, times: Array, parts: int) -> Array:
     """x, y, z, yaw, pitch, roll (T * S, 6) at the middles of the parts of each exposure.
 
-    A motion draws its random numbers by its first two times and its last one only, so that the same motion can be had
-    at other times between those.
+    The random numbers of a motion depend only on its first two times and the last one, so that the same motion can be
+    evaluated at other times between these.
     """
     frame_s = times[1] - times[0]
     inside = (times[:, None] + look.exposure_share * frame_s * ((np.arange(parts) + 0.5) / parts - 0.5)).reshape(-1)
@@ -142,7 +142,7 @@ def _during(lab: Lab, look: Look, seed: int, motion: Motion, q: Array, times: Ar
 def _disturbances(
     key: list[int], look: Look, frames: int, camera_of: Ints, spot_of: Ints, corner_frames: Array
 ) -> tuple[Bools, Bools, str]:
-    """Hidden views (T, n), pictures (T, c), and a few words; a video has all its pictures."""
+    """Occluded views (T, n), existing pictures (T, c), and a description; a video has all pictures."""
     rng = np.random.default_rng([*key, NUISANCE])
     cameras = int(camera_of.max()) + 1
     nothing = np.zeros((frames, len(camera_of)), dtype=bool), np.ones((frames, cameras), dtype=bool)
@@ -160,7 +160,7 @@ def _disturbances(
 
 
 def _beam_ends(rng: np.random.Generator, look: Look, scene: Scene) -> tuple[tuple[BeamEnd, ...] | None, Array]:
-    """The views' light; the median view has the look's width. None where a view has no place to take it from."""
+    """The light of the views; the median view has the given width. None if a view has no valid position."""
     rig = scene.rig
     speckles: dict[str, Light | None] = {
         name: draw_speckle(rng, look.speckle, look.speckle_grain_px) for name in rig.cameras

@@ -1,4 +1,4 @@
-"""Sensors drawn at random: light in electrons becomes a picture of 8 or 16 bits, in a file of some format."""
+"""Random sensors: from light in electrons to a picture of 8 or 16 bits in one of several file formats."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from geometry.arrays import Array
 Picture: TypeAlias = NDArray[np.uint8] | NDArray[np.uint16]
 Light: TypeAlias = NDArray[np.float32]
 
-_SKEWED_BELOW_E = 2_000.0  # fewer electrons: the third cumulant of the shot noise is rendered too
+_SKEWED_BELOW_E = 2_000.0  # below this number of electrons the third cumulant of the shot noise is rendered as well
 
 
 @dataclass(frozen=True, slots=True)
 class Sensor:
-    """A camera's sensor, and what its files do to its numbers."""
+    """The sensor of a camera and the format of its files."""
 
     bits: int  # of the converter
-    full_well_e: float  # electrons that take the level from black to full scale
+    full_well_e: float  # electrons from black to full scale
     read_e: float  # read noise, electrons
     black_share: float  # black level, share of full scale
     row_e: float = 0.0  # noise common to a row of one picture, electrons
-    shift: int = 0  # the file's numbers are shifted left by so many bits
+    shift: int = 0  # left shift of the values in the file, bits
     file_format: str = "png"  # png, jpg or mjpg
     quality: int = 95  # of jpg and mjpg
 
@@ -47,17 +47,17 @@ class Sensor:
 
     @property
     def lossy(self) -> bool:
-        """Whether the file is compressed with loss."""
+        """The file has lossy compression."""
         return self.file_format != "png"
 
     def variance_e2(self, light_e: Array | Light) -> Array:
-        """Variance of a pixel that expects so many electrons, rounding included, without clipping or compression."""
+        """Variance of a pixel with these expected electrons, with rounding, without saturation and compression."""
         shot = np.maximum(light_e, 0.0)
         return np.asarray(shot + self.read_e**2 + self.row_e**2 + self.gain_e_per_dn**2 / 12)
 
     @property
     def text(self) -> str:
-        """In a few words."""
+        """A short description."""
         kind = f"{self.bits} bit" + (f" shifted by {self.shift}" if self.shift else "")
         how = "" if not self.lossy else f" {self.file_format} quality {self.quality}"
         row = f", rows {self.row_e:.1f} e" if self.row_e else ""
@@ -98,7 +98,7 @@ def expose(sensor: Sensor, light_e: Light, rng: np.random.Generator) -> Picture:
 
 
 def compressed(sensor: Sensor, picture: Picture) -> Picture:
-    """The picture as the program gets it: through JPEG where the files are compressed with loss."""
+    """The picture as read by the program: through JPEG for files with lossy compression."""
     if not sensor.lossy:
         return picture
     good, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, sensor.quality])
@@ -107,9 +107,10 @@ def compressed(sensor: Sensor, picture: Picture) -> Picture:
 
 
 def true_noise(sensor: Sensor, light_e: float, rng: np.random.Generator) -> tuple[float, float]:
-    """Mean level (file DN) and variance over time (file DN^2) of a pixel on a flat field of so much light.
+    """Mean level (file DN) and variance over time (file DN^2) of a pixel on a flat field with this light.
 
-    Measured on 24 exposures of 128 x 128 pixels, so that clipping, rounding and compression are in it: good to 0.5 %.
+    Measured on 24 exposures of 128 x 128 pixels, so that saturation, rounding and compression are included; its error
+    is 0.5 %.
     """
     flat = np.full((128, 128), light_e, dtype=np.float32)
     stack = np.stack([compressed(sensor, expose(sensor, flat, rng)) for _ in range(24)]).astype(np.float64)

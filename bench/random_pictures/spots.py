@@ -29,7 +29,7 @@ from geometry.rig import Beam, Screen, Spot
 
 @dataclass(frozen=True, slots=True)
 class BeamEnd:
-    """One shining end of a beam, and the camera and screen that show it."""
+    """One end of a beam that emits light, with its camera and screen."""
 
     camera: Camera
     screen: Screen
@@ -50,7 +50,9 @@ class BeamEnd:
         return R @ self.beam.point + world_from_body.translation, R @ along, np.einsum("sij,kj->ski", R, across)
 
     def hits(self, world_from_body: Pose) -> tuple[Array, Array]:
-        """Where the axis meets the screen: (S, 2) m on the screen, and its distance from the start (S,), m."""
+        """The intersection of the axis with the screen: (S, 2) m on the screen, and its distance from the start (S,),
+        m.
+        """
         start, along, _ = self.rays(world_from_body)
         R, origin = self.screen.world_from_screen.rotation, self.screen.world_from_screen.translation
         reach = ((origin - start) @ R[:, 2]) / (along @ R[:, 2])
@@ -119,7 +121,7 @@ class BeamEnd:
                 return np.asarray(x_m * (R[:, 0] @ along) + y_m * (R[:, 1] @ along) + shift @ along)
 
             a, b, z = component(first), component(second), component(axis)
-            # The light spreads: beside the axis its direction is axis + across / R(z), R the wavefront's radius.
+            # Divergence: beside the axis the direction is axis + across / R(z) with the radius R of the wavefront.
             bend = self.shape.divergence**2 * z / self.shape.sigma_at(z) ** 2
             incidence = np.abs(normal @ axis + bend * (a * (normal @ first) + b * (normal @ second)))
             total += self.shape.irradiance(a, b, z) * incidence

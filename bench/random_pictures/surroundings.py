@@ -1,4 +1,4 @@
-"""Everything in a camera's picture but the beams: ambient light on a textured screen, details, defects, false spots."""
+"""The background of a picture: ambient light on a textured screen, details, defects, false spots."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ from geometry.arrays import Array
 from geometry.camera import Camera
 from geometry.rig import Screen
 
-_NODE_PX = 16  # between the pixels at which the screen's place is computed; cubic between them
+_NODE_PX = 16  # spacing of the pixels at which the position on the screen is computed; cubic interpolation between them
 _TILE = 1024  # samples of the periodic texture
 
 
 @dataclass(frozen=True, slots=True)
 class Surroundings:
-    """One camera's still picture, electrons, and what multiplies laser light."""
+    """The constant background of one camera, electrons, and the factor on laser light."""
 
     ambient_e: Light  # (h, w), of light that flickers
-    steady_e: Light  # (h, w), of lamps of their own, dark current
+    steady_e: Light  # (h, w), of constant lamps, and leakage current
     response: Light  # (h, w): surface and vignetting, of laser light; about 1
     blinking: tuple[tuple[int, int, float], ...]  # row, column, electrons: on in half of the pictures
-    bright: Array  # (m, 3): u, v, radius (px) of details that look like spots
+    bright: Array  # (m, 3): u, v, radius (px) of details that resemble spots
 
 
 def draw_surroundings(rng: np.random.Generator, look: Look, camera: Camera, screen: Screen) -> Surroundings:
-    """The surroundings of one camera."""
+    """The background of one camera."""
     width, height = camera.image_size_px
     full = look.sensor.full_well_e
     x, y = _screen_places(camera, screen)
@@ -77,7 +77,7 @@ def gaussian_patch(u: float, v: float, sigma: float, size_px: tuple[int, int]) -
 
 
 def _screen_places(camera: Camera, screen: Screen) -> tuple[Light, Light]:
-    """Screen x and y (m), each (h, w), seen by the pixels; nan where they see none. The lens is undone by iteration."""
+    """Screen x and y (m), each (h, w), seen by the pixels; nan where they see none. Undistorts by iteration."""
     width, height = camera.image_size_px
     u = np.arange(-2 * _NODE_PX, width + 2 * _NODE_PX + 1, _NODE_PX)
     v = np.arange(-2 * _NODE_PX, height + 2 * _NODE_PX + 1, _NODE_PX)
@@ -164,7 +164,7 @@ def _hump(rng: np.random.Generator, width: int, height: int) -> Light:
 
 
 def _detail(rng: np.random.Generator, look: Look, ambient: Light, steady: Light) -> tuple[float, float, float] | None:
-    """Adds one detail; its place and radius where it looks like a spot."""
+    """Add one detail; returns its position and radius if it resembles a spot."""
     height, width = ambient.shape
     u, v = float(rng.uniform(0, width - 1)), float(rng.uniform(0, height - 1))
     kind = str(rng.choice(["lamp", "screw", "mark", "line"]))

@@ -1,4 +1,4 @@
-"""A scene in pictures as a run folder in the form of the files' contract; rig.yaml states no noise, unless asked."""
+"""A scene in pictures as a run folder in the documented file formats; rig.yaml states the noise only on request."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from geometry.rig import Rig
 from lab.files.rig.rig_file import RigFile, save_rig
 from lab.files.run.run_file import save_run
 
-# Noise does not compress: 11 ms for 1280x1024 in place of 27 at level 1 with filters, and no larger.
+# Noise does not compress: 11 ms for 1280x1024 instead of 27 at level 1 with filters, and no larger file.
 _FAST_PNG = (
     cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_NONE,
     cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY,
@@ -24,10 +24,10 @@ _FAST_PNG = (
 
 
 def write_pictures(renderer: Renderer, folder: Path, state_noise: bool = False) -> Path:
-    """rig.yaml, run.yaml, truth and the pictures: a folder of PNG or JPEG files per camera, or a video in MJPG.
+    """Write rig.yaml, run.yaml, truth and the pictures: PNG or JPEG files per camera, or an MJPG video.
 
-    state_noise: rig.yaml states the sensor's true noise (without what a lossy file adds), to tell errors of the noise
-    estimate from those of the detector.
+    state_noise: rig.yaml states the true noise of the sensor (without that of lossy compression), to distinguish errors
+    of the noise estimate from those of the detector.
     """
     ps = renderer.ps
     scene, sensor = ps.scene, ps.look.sensor
@@ -54,7 +54,7 @@ def write_pictures(renderer: Renderer, folder: Path, state_noise: bool = False) 
 
 
 def _with_noise(rig: Rig, sensor: Sensor) -> Rig:
-    """The rig with the sensor in every camera, in the numbers of its files."""
+    """The rig with the noise of the sensor in every camera, in units of its files."""
     scale = float(1 << sensor.shift)
     read_e = float(np.hypot(sensor.read_e, sensor.row_e))
     noise = SensorNoise(sensor.gain_e_per_dn / scale, read_e, sensor.black_dn * scale)
@@ -67,7 +67,7 @@ def _write_files(renderer: Renderer, camera: int, folder: Path) -> None:
     how = [cv2.IMWRITE_JPEG_QUALITY, sensor.quality] if sensor.lossy else list(_FAST_PNG)
     for k in range(len(scene)):
         if not scene.has_image[k, camera]:
-            renderer.expected(k, camera)  # how well spots could be seen
+            renderer.expected(k, camera)  # the SNR of the spots
             continue
         path = folder / f"{k:06}.{'jpg' if sensor.lossy else 'png'}"
         if not cv2.imwrite(str(path), renderer.raw(k, camera), how):
@@ -76,7 +76,7 @@ def _write_files(renderer: Renderer, camera: int, folder: Path) -> None:
 
 def _write_video(renderer: Renderer, camera: int, path: Path) -> None:
     size = list(renderer.ps.scene.rig.cameras.values())[camera].image_size_px
-    # OpenCV's own writer: through FFmpeg the quality cannot be set. Its grey videos are damaged (5.0.0), so in colour.
+    # The built-in writer of OpenCV: FFmpeg ignores the quality. In colour: its grey videos are damaged (5.0.0).
     writer = cv2.VideoWriter(
         str(path), cv2.CAP_OPENCV_MJPEG, cv2.VideoWriter.fourcc(*"MJPG"), 25.0, size,
         [cv2.VIDEOWRITER_PROP_IS_COLOR, 1, cv2.VIDEOWRITER_PROP_QUALITY, renderer.ps.look.sensor.quality],

@@ -1,1 +1,1 @@
-"""Recordings drawn at random, as points with truth, and how beampose does on them: `python -m bench.random_scenes`."""
+"""Random recordings as points with truth, and the errors of beampose on them: `python -m bench.random_scenes`."""

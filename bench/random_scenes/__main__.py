@@ -1,8 +1,8 @@
-"""`python -m bench.random_scenes --seeds 1:301`: random scenes through the program, and how many are clean.
+"""`python -m bench.random_scenes --seeds 1:301`: process random scenes and count the clean ones.
 
-One scene to look at: `--seeds N -v`, and `--keep DIR` writes its run folder. `--family NAME`: see families.py.
+One scene in detail: `--seeds N -v`; `--keep DIR` writes its run folder. `--family NAME`: see families.py.
 
-`--pictures`: scenes as pictures, through detection too (bench/random_pictures; its families are in looks.py).
+`--pictures`: scenes as pictures, including detection (bench/random_pictures; its families are in looks.py).
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def make_scene(job: Job) -> Scene:
 
 
 def judged(job: Job) -> Judgement:
-    """Draw, run and judge one scene; an exception of the program is a class of failure, not the end of the bench."""
+    """Draw, run and score one scene; an exception of the program counts as a class of failure."""
     scene = make_scene(job)
     if job.keep is not None:
         write_run_folder(scene, job.keep / f"seed-{job.seed}")
@@ -63,7 +63,7 @@ def judged(job: Job) -> Judgement:
 
 
 def run_all(jobs: list[Job], workers: int) -> Iterator[Judgement]:
-    """In the order of the jobs."""
+    """The results in the order of the jobs."""
     if workers == 1:
         yield from map(judged, jobs)
         return
@@ -81,7 +81,7 @@ def main() -> None:
     """Run the seeds and print the summary."""
     parser = argparse.ArgumentParser(prog="bench.random_scenes", description=__doc__)
     parser.add_argument("--seeds", type=seed_range, metavar="A:B", help="default 1:301, of pictures 1:61")
-    parser.add_argument("--family", metavar="NAME", help="one difficulty instead of everything at random")
+    parser.add_argument("--family", metavar="NAME", help="one difficulty instead of all at random")
     parser.add_argument("--pictures", action="store_true", help="render pictures; --family all: one of each per seed")
     parser.add_argument("--state-noise", action="store_true", help="of pictures: rig.yaml states the true noise")
     parser.add_argument("--frames", type=int, help="default 200, in pictures 48; each family has its own")

@@ -1,4 +1,4 @@
-"""What the program answers to a scene, through the same code as `beampose run`: in memory, or through files."""
+"""The output of the program for a scene, by the code of `beampose run`: in memory, or through files."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ _STATUS = {PoseStatus.LOST: LOST, PoseStatus.PREDICTED: PREDICTED, PoseStatus.ME
 
 @dataclass(frozen=True, slots=True)
 class Pass:
-    """The answers of the causal pass, or of both: T frames, n views."""
+    """The output of the causal or of the smoothing pass: T frames, n views."""
 
     labelled: Bools  # (T, n)
-    uv_px: Array  # (T, n, 2) of the points that were given a label; nan without
+    uv_px: Array  # (T, n, 2) of the labelled points; nan without a label
     status: Array  # (T,) LOST, PREDICTED or MEASURED
     poses: Pose  # (T,), nan where lost
     covariance: Array  # (T, 6, 6), nan where lost
@@ -45,13 +45,13 @@ class Pass:
 
 @dataclass(frozen=True, slots=True)
 class Answers:
-    """Everything that a run says, and what it cost."""
+    """The output of a run, and its process time."""
 
     smoothed: Pass
-    causal: Pass | None  # labels are not in the files, so through files there are none
+    causal: Pass | None  # None through files, which do not contain the labels
     exit_status: int
     reasons: tuple[str, ...]  # of the verdict
-    warnings: tuple[str, ...]  # numeric ones, each text once
+    warnings: tuple[str, ...]  # numeric warnings, each text once
     warnings_count: int
     ms_per_frame: float  # process time, tracking and smoothing
     ms_causal: float  # of the causal pass, median over frames ...
@@ -68,11 +68,11 @@ class TimedTracker:
 
     @property
     def noise_scale(self) -> float:
-        """The tracker's own."""
+        """Of the tracker."""
         return self._tracker.noise_scale
 
     def step(self, dt_s: float, found: Sequence[Detections | None]) -> TrackedFrame:
-        """One frame."""
+        """Track one frame."""
         start = time.process_time()
         tracked = self._tracker.step(dt_s, found)
         self.ms.append((time.process_time() - start) * 1e3)
@@ -83,7 +83,7 @@ class TimedTracker:
 
 
 class PointReader:
-    """The frames of a scene as lab/runs/frames/frames.py gives those of a run folder."""
+    """The frames of a scene in the form of lab/runs/frames/frames.py."""
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
@@ -99,9 +99,7 @@ class PointReader:
 
 
 def answers_in_memory(scene: Scene, parameters: TrackerParameters | None = None) -> Answers:
-    """Track, smooth, write the tables and judge as lab/runs/process.py does, without reading files and without a
-    report.
-    """
+    """Track, smooth, write the tables and give a verdict as lab/runs/process.py, without input files and report."""
     run = Run(
         folder=Path(),
         name=f"seed {scene.seed}",
@@ -123,14 +121,14 @@ def answers_in_memory(scene: Scene, parameters: TrackerParameters | None = None)
     with recorded_warnings() as caught, tempfile.TemporaryDirectory() as name:
         work = Path(name)
         tracker = TimedTracker(tracker_of(run))
-        # PointReader and TimedTracker have what Pipeline uses of a reader and a tracker, and no more.
+        # PointReader and TimedTracker have only the members of a reader and a tracker that Pipeline uses.
         pipeline = Pipeline(run, PointReader(scene), tracker, {})  # type: ignore[arg-type]
         seconds = 0.0
         start = time.process_time()
 
         def on_frame(record: FrameRecord, then: FrameRecord | None) -> None:
             nonlocal seconds
-            assert then is not None, "both passes were asked for"
+            assert then is not None, "expected the output of both passes, got the causal one"
             smoothed.append(record)
             causal.append(then)
             seconds = time.process_time() - start
@@ -152,7 +150,7 @@ def answers_in_memory(scene: Scene, parameters: TrackerParameters | None = None)
 
 
 def answers_through_files(scene: Scene, run_folder: Path) -> Answers:
-    """What `beampose run` makes of a written run folder (write_folder.py), read back from its tables."""
+    """The results of `beampose run` for a written run folder (write_folder.py), read from its tables."""
     with recorded_warnings() as caught, tempfile.TemporaryDirectory() as name:
         out = Path(name) / "out"
         start = time.process_time()
@@ -167,7 +165,7 @@ def answers_through_files(scene: Scene, run_folder: Path) -> Answers:
 
 @contextlib.contextmanager
 def recorded_warnings() -> Iterator[list[str]]:
-    """The texts of all warnings raised meanwhile."""
+    """The texts of all warnings raised in the context."""
     texts: list[str] = []
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -195,7 +193,7 @@ def _pass(scene: Scene, records: list[FrameRecord]) -> Pass:
 
 
 def pass_of_files(scene: Scene, results: Path, causal: bool) -> Pass:
-    """The answers in the tables of a results folder."""
+    """The output in the tables of a results folder."""
     spots, poses = read_spots(results), read_poses(results, causal=causal)
     frames, views = len(scene), scene.rig.views()
     labelled, uv = np.zeros((frames, len(views)), dtype=bool), np.full((frames, len(views), 2), np.nan)

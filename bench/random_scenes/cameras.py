@@ -1,4 +1,4 @@
-"""Cameras drawn at random, aimed at where the spots fall on a screen."""
+"""Random cameras, aimed at the spots on a screen."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from geometry.rig import Screen
 
 SIZES_PX = ((640, 480), (800, 600), (1280, 1024), (1280, 720), (1600, 1200), (1936, 1216), (2048, 2048), (2448, 2048))
 FOCAL_PX = (300.0, 6000.0)
-DISTANCE_M = (0.6, 15.0)  # of a camera from the spots that it films
+DISTANCE_M = (0.6, 15.0)  # of a camera from its spots
 
 
 def draw_camera(
@@ -29,9 +29,9 @@ def draw_camera(
     focal_px: tuple[float, float],
     sizes_px: Sequence[tuple[int, int]] = SIZES_PX,
 ) -> tuple[Camera, str]:
-    """A camera that films a disc on its screen; `centre` (3,), `radius` in m, in base."""
+    """A camera that sees a disc on its screen; `centre` (3,), `radius` in m, in base."""
     width, height = sizes_px[rng.integers(len(sizes_px))]
-    fill = rng.uniform(0.75, 1.15) * 0.45 * min(width, height)  # px that the radius takes
+    fill = rng.uniform(0.75, 1.15) * 0.45 * min(width, height)  # length of the radius, px
     shortest = max(focal_px[0], 0.5 * max(width, height))  # a field of view of 90 deg
     for _ in range(50):
         focal = float(np.exp(rng.uniform(*np.log(focal_px))))
@@ -63,7 +63,7 @@ def draw_camera(
 
 
 def _draw_distortion(rng: np.random.Generator, width: int, height: int, focal: float) -> tuple[tuple[float, ...], str]:
-    """k1, k2, p1, p2, k3 that bend the picture's corner by up to 25 % of its radius and grow all over the picture."""
+    """k1, k2, p1, p2, k3 that move the corner of the picture by up to 25 % of its radius; monotonic in the picture."""
     corner = np.hypot(width, height) / 2 / focal
     kind = rng.random()
     if kind < 0.15:

@@ -1,4 +1,4 @@
-"""What the families of scenes share: a scene in the making, rigs, zig-zags with stated bends, hiding across corners."""
+"""Common parts of the families of scenes: drafts, rigs, zig-zags with given bends, occlusions across corners."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from geometry.pose import Pose
 from geometry.rig import Screen
 from lab.simulate.rigs import RIGS
 
-SCREENS_M = 2.5  # of the rigs made for a family
+SCREENS_M = 2.5  # of the rigs for a family
 
 
 @dataclass(frozen=True, slots=True)
 class Draw:
-    """What a family makes a scene from."""
+    """The input of a family of scenes."""
 
     seed: int
     frames: int
@@ -36,7 +36,7 @@ class Draw:
 
 @dataclass(slots=True)
 class Draft:
-    """A scene in the making: what most families share, to be changed before `scene` is called."""
+    """A scene before its points are drawn; a family changes it before `scene` is called."""
 
     draw: Draw
     lab: Lab
@@ -61,7 +61,7 @@ class Draft:
         self.has_image = np.ones((len(self.q), len(self.lab.rig.cameras)), dtype=bool)
 
     def scene(self) -> Scene:
-        """The scene with all that was set."""
+        """The scene of this draft."""
         step = np.nanmedian(np.linalg.norm(np.diff(self.uv, axis=0), axis=-1))
         text = (
             f"{self.text}; {self.rate_hz:.0f} Hz, {step:.2g} px/frame, noise {self.noise_px:.2g} px, {self.false.text}"
@@ -83,19 +83,19 @@ class Draft:
 
 
 def paper_lab(name: str = "fan", reach_m: float = 0.5) -> Lab:
-    """One of the project's example rigs, with the vehicle about its origin."""
+    """One of the example rigs, with the vehicle near its origin."""
     return Lab(RIGS[name](), Pose.identity(), Pose.identity(), np.zeros(6), reach_m, SCREENS_M, f"{name} rig")
 
 
 def usual_lab(draw: Draw) -> Lab:
-    """The paper's for even seeds, one drawn at random for odd ones."""
+    """The rig of the paper for even seeds, a random one for odd seeds."""
     return paper_lab() if draw.seed % 2 == 0 else rigs.draw_lab(draw.rng(scene.LAB))
 
 
 def fan_lab(
     rng: np.random.Generator, angles_deg: Array, reach_m: float, focal_px: tuple[float, float], name: str
 ) -> Lab:
-    """A fan whose beams are seen at both ends, screens at SCREENS_M, cameras drawn for it."""
+    """A fan of beams visible at both ends, with screens at SCREENS_M and random cameras."""
     angles = np.deg2rad(angles_deg)
     names = [chr(ord("A") + i) for i in range(len(angles))]
     beams = {n: (np.array([np.cos(a), np.sin(a), 0.0]), np.zeros(3)) for n, a in zip(names, angles, strict=True)}
@@ -114,15 +114,15 @@ def fan_lab(
 
 
 def false_points(lab: Lab, beside: float = 0.0, anywhere: float = 0.0) -> FalsePoints:
-    """None but those beside spots and anywhere, as stated: no reflections."""
+    """False points beside spots and anywhere, as given, without reflections."""
     return FalsePoints(beside, (15.0, 40.0), anywhere, tuple(np.zeros((0, 2)) for _ in lab.rig.cameras))
 
 
 def corners_between(rng: np.random.Generator, frames: int, apart: tuple[float, float]) -> tuple[Array, Motion]:
-    """A zig-zag over `frames` with corners so many frames apart, at random moments between frames.
+    """A zig-zag over `frames` with corners at this distance in frames, at random times between frames.
 
-    In half of the scenes it goes from one random place to the next, in the others back and forth at one speed. Returns
-    the corners in frames and the motion over times in frames.
+    In half of the scenes it connects random poses, in the others it goes back and forth at constant speed. Returns the
+    corners in frames and the motion over times in frames.
     """
     corners = [-rng.uniform(1, apart[0])]
     while corners[-1] < frames:
@@ -140,7 +140,7 @@ def corners_between(rng: np.random.Generator, frames: int, apart: tuple[float, f
 
 
 def bends_px(uv: Array, corner_frames: Array) -> Array:
-    """(k,): the largest change of any spot's step from before a corner to after it, px."""
+    """(k,): the largest change of the step of any spot at each corner, px."""
     out = []
     for corner in corner_frames:
         k = int(np.floor(corner))
@@ -170,7 +170,7 @@ def zigzag_with_bends(
 def hide_across(
     draft: Draft, rng: np.random.Generator, length: tuple[int, int], which: tuple[str, ...], share: float = 0.6
 ) -> None:
-    """Hide spots for some frames across corners; the gaps do not touch each other."""
+    """Occlude spots for some frames across corners, in separate intervals."""
     free = CLEAN_FRAMES + 2
     spots = np.unique(draft.spot_of)
     for corner in draft.corner_frames:

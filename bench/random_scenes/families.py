@@ -1,7 +1,7 @@
 """Fixed families of scenes, each for one difficulty: `python -m bench.random_scenes --family NAME --seeds 1:101`.
 
-Where a family does not say otherwise, scenes with even seeds use the paper's rig (three beams of a fan, screens at
-2.5 m, 1280x1024 px) and those with odd seeds a rig drawn at random.
+Unless a family states otherwise, scenes with even seeds use the rig of the paper (a fan of three beams, screens at 2.5
+m, 1280x1024 px) and those with odd seeds a random rig.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ from geometry.uncertainty.rig_parameters import RigCovariance, moved, rig_names,
 
 @dataclass(frozen=True, slots=True)
 class Family:
-    """A named way of making scenes."""
+    """A named family of scenes."""
 
-    make: Callable[[Draw], Scene | None]  # None: these draws do not fit, try others
+    make: Callable[[Draw], Scene | None]  # None: the draws are not suitable; others are tried
     frames: int
     goal: str
 
@@ -243,7 +243,7 @@ def _no_prior(draw: Draw) -> Scene | None:
     return replace(draft.scene(), prior=None)
 
 
-# One sigma of each kind of number, as a careful lab reaches them: the spots move by some tenths of a pixel.
+# One sigma of each kind of parameter after a careful calibration: the spots move by some tenths of a pixel.
 RIG_SIGMAS = {
     "fx": 0.4, "fy": 0.4, "cx": 0.6, "cy": 0.6, "k1": 3e-4, "k2": 1e-3, "p1": 5e-5, "p2": 5e-5, "k3": 1e-3,
     "direction_x": 7e-5, "direction_y": 7e-5, "direction_z": 7e-5,
@@ -252,7 +252,7 @@ RIG_SIGMAS = {
 
 
 def rig_covariance(rig: Rig) -> RigCovariance:
-    """Errors of all numbers of a rig, correlated within each camera, screen and beam."""
+    """Errors of all parameters of a rig, correlated within each camera, screen and beam."""
     names = rig_names(rig)
     sigma = np.array([RIG_SIGMAS.get(split(n)[2], 1e-4 if n.endswith("_rad") else 3e-4) for n in names])
     things = [split(n)[:2] for n in names]

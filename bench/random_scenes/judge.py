@@ -1,11 +1,11 @@
-"""The answers to a scene against its truth: identity, wrong labels, covariances, and the class of a failure.
+"""The output for a scene compared with its truth: identity, wrong labels, covariances, and the class of a failure.
 
-A label is right if its point is the spot's own, or lies within SAME_SPOT_PX or SAME_SPOT_SIGMAS of the spot's true
-place with no other spot nearer (the rule of lab/runs/score/score.py). Identity counts spots that shine and have a
-picture, except where another point lies within TOGETHER_SIGMAS of the spot's true place: there either may be the spot.
+A label is correct if its point is that of the spot, or lies within SAME_SPOT_PX or SAME_SPOT_SIGMAS of its true
+position and no other spot is nearer (the rule of lab/runs/score/score.py). Identity counts visible spots with a
+picture, except where another point lies within TOGETHER_SIGMAS of the true position, since either may be the spot.
 
-A pose is confidently wrong if its Mahalanobis distance from the truth is above 10 (NEES above 100; of 1e9 right poses
-with 6 degrees of freedom none is).
+A pose is confidently wrong if its Mahalanobis distance from the truth is above 10 (NEES above 100; with 6 degrees of
+freedom and correct covariances this does not occur in 1e9 poses).
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ TOGETHER_SIGMAS, TOGETHER_PX = 6.0, 0.1
 CONFIDENTLY_WRONG = 100.0  # NEES
 CHI2_95 = 12.592  # of 6 degrees of freedom
 LEAST_IDENTITY, MOST_NEES = 0.995, 12.0
-LASTS, LEAST_LASTING = 10, 0.8  # a track is locked in if this share of so many frames is found
-LEAST_LOCKED = 0.5  # identity below which the tracker is not locked at all
-SAME_POINT_PX = 1e-3  # between a label's point and the detection: files round
+LASTS, LEAST_LASTING = 10, 0.8  # a track is locked in if this share of this number of frames is found
+LEAST_LOCKED = 0.5  # identity below which the tracker counts as never locked
+SAME_POINT_PX = 1e-3  # between the point of a label and the detection, since files round
 
 CLASSES = (
     "crash",
@@ -45,10 +45,10 @@ CLEAN = "clean"
 
 @dataclass(frozen=True, slots=True)
 class PassFigures:
-    """One pass (causal or smoothed) against truth."""
+    """One pass (causal or smoothed) compared with truth."""
 
     identity: float
-    countable: int  # spot-frames that identity is of
+    countable: int  # spot-frames that count for identity
     wrong: int  # labels on another spot or on clutter
     near: int  # labels on another point, within SAME_SPOT_PX of the spot but beyond SAME_SPOT_SIGMAS
     measured: int  # frames
@@ -59,28 +59,28 @@ class PassFigures:
     nees_measured: float  # ... and of each
     nees_predicted: float
     nees_max: float
-    poses: int  # that NEES is of ...
-    independent: float  # ... and as how many independent ones their mean scatters
+    poses: int  # number of poses with NEES ...
+    independent: float  # ... and the equivalent number of independent poses
     coverage: float  # share of poses inside the 95 % ellipsoid
     wrong_measured: int  # confidently wrong poses
     wrong_predicted: int
-    beyond_6: int  # poses of which one of the six components is off by more than 6 of its sigmas
+    beyond_6: int  # poses with an error above 6 sigma in one of the six components
     not_definite: int  # covariances that are not positive definite
     first_labels: int  # the first frame with a label; -1: none ...
-    first_wrong: int  # ... and how many of its labels are wrong
-    locked_in: int  # the first frame with a measured pose that is not confidently wrong, and that lasts; -1: none
+    first_wrong: int  # ... and its number of wrong labels
+    locked_in: int  # the first frame of a lasting series of measured poses that are not confidently wrong; -1: none
     worst_deg: float  # largest attitude error of a measured pose
     worst_m: float
 
 
 @dataclass(frozen=True, slots=True)
 class Judgement:
-    """A scene's verdict."""
+    """The scores of a scene."""
 
     seed: int
     counts: bool
     why_not: str
-    classes: tuple[str, ...]  # of the failure, the first is the leading one; empty: clean
+    classes: tuple[str, ...]  # classes of failure, the first is the leading one; empty: clean
     smoothed: PassFigures
     causal: PassFigures | None
     oracle_nees: float  # /6
@@ -98,7 +98,7 @@ class Judgement:
 
     @property
     def clean(self) -> bool:
-        """Whether nothing is wrong."""
+        """No class of failure applies."""
         return not self.classes
 
     @property
@@ -135,7 +135,7 @@ def judge(scene: Scene, oracle: Oracle, answers: Answers) -> Judgement:
 
 
 def figures(scene: Scene, answer: Pass, solvable: Bools) -> PassFigures:
-    """One pass against truth. solvable (T,): frames whose own spots give a pose."""
+    """One pass compared with truth. solvable (T,): frames whose spots determine a pose."""
     right, wrong, near = label_verdicts(scene, answer)
     countable = scene.shining & ~_together(scene)
     whitened = whitened_errors(scene, answer)
@@ -177,16 +177,16 @@ def figures(scene: Scene, answer: Pass, solvable: Bools) -> PassFigures:
 
 
 def _locked_in(found: Bools, solvable: Bools) -> int:
-    """The first of the found frames (T,) from which on most solvable ones of the next LASTS frames are found too."""
+    """The first found frame (T,) after which most solvable ones of the next LASTS frames are also found."""
     for k in np.flatnonzero(found):
-        asked = solvable[k : k + LASTS]
-        if (found[k : k + LASTS] & asked).sum() >= LEAST_LASTING * asked.sum():
+        expected = solvable[k : k + LASTS]
+        if (found[k : k + LASTS] & expected).sum() >= LEAST_LASTING * expected.sum():
             return int(k)
     return -1
 
 
 def label_verdicts(scene: Scene, answer: Pass) -> tuple[Bools, Bools, Bools]:
-    """Of each label (T, n): right; wrong; and on another point that is too near to be called wrong."""
+    """For each label (T, n): correct; wrong; and on another point too near to be called wrong."""
     frames, views = answer.labelled.shape
     right, wrong, near = (np.zeros((frames, views), dtype=bool) for _ in range(3))
     for k, v in zip(*np.nonzero(answer.labelled), strict=True):
@@ -210,7 +210,7 @@ def label_verdicts(scene: Scene, answer: Pass) -> tuple[Bools, Bools, Bools]:
 
 
 def _together(scene: Scene) -> Bools:
-    """(T, n): another point lies where the spot is."""
+    """(T, n): another point lies at the position of the spot."""
     out = np.zeros(scene.in_view.shape, dtype=bool)
     limit = np.maximum(TOGETHER_SIGMAS * scene.sigma_px, TOGETHER_PX)
     for k in range(len(scene)):
@@ -227,7 +227,7 @@ def nees_of(scene: Scene, answer: Pass) -> Array:
 
 
 def whitened_errors(scene: Scene, answer: Pass) -> Array:
-    """(T, 6): errors of the poses with unit covariance if theirs is right; nan as in `nees_of`."""
+    """(T, 6): whitened errors of the poses, with unit covariance if theirs is correct; nan as in `nees_of`."""
     delta = scene.poses.minus(answer.poses)
     out = np.full((len(scene), 6), np.nan)
     for k in np.flatnonzero(answer.status != LOST):
@@ -239,16 +239,16 @@ def whitened_errors(scene: Scene, answer: Pass) -> Array:
         C = P / np.outer(scale, scale)
         values, vectors = np.linalg.eigh(C)
         if values[0] > 0:
-            # The symmetric root: it changes smoothly with C, so that neighbouring frames can be compared.
+            # The symmetric root varies smoothly with C, so that the errors of successive frames can be compared.
             out[k] = vectors @ ((vectors.T @ (delta[k] / scale)) / np.sqrt(values))
     return out
 
 
 def independent_poses(whitened: Array) -> float:
-    """How many independent errors (T, 6) hold: T over the sum of their autocorrelation, to its first zero.
+    """The number of independent errors in (T, 6): T over the sum of their autocorrelation up to its first zero.
 
-    A smoothed pose at rest has nearly the same error in all frames, and the mean NEES of a scene then scatters as that
-    of one or two poses.
+    A smoothed pose at rest has nearly the same error in all frames; the mean NEES of such a scene scatters like that of
+    one or two poses.
     """
     w = whitened[~np.isnan(whitened).any(axis=1)]
     power = float(np.mean(np.sum(w**2, axis=1))) if len(w) else 0.0
@@ -266,10 +266,10 @@ def independent_poses(whitened: Array) -> float:
 def classes_of(
     scene: Scene, oracle: Oracle, answers: Answers, smoothed: PassFigures, causal: PassFigures | None
 ) -> tuple[str, ...]:
-    """What is wrong, gravest cause first; empty for a clean scene.
+    """The classes of failure, most serious first; empty for a clean scene.
 
-    never locked: no pose, or less than half of the labels without an occlusion that explains it. lost after occlusion:
-    most frames that lack a pose, though their spots give one, follow directly on dark ones.
+    never locked: no pose, or less than half of the labels without an occlusion as the cause. lost after occlusion: most
+    frames without a pose whose spots determine one follow directly on occluded ones.
     """
     found = []
     labels_missing = smoothed.identity < LEAST_IDENTITY
@@ -296,16 +296,16 @@ def classes_of(
 
 
 def _after_darkness(scene: Scene, oracle: Oracle, answer: Pass) -> bool:
-    """Whether most frames without a measured pose, though the oracle has one, follow directly on a dark frame.
+    """Most frames without a measured pose, but with one of the oracle, follow directly on an occluded frame.
 
-    Dark: the oracle has no pose, or less than half of the usual number of spots shine.
+    Occluded: the oracle has no pose, or less than half of the usual number of spots are visible.
     """
     missing = oracle.solvable & (answer.status != MEASURED)
     shining = scene.shining.sum(axis=1)
-    dark = ~oracle.solvable | (shining < 0.5 * np.median(shining))
+    occluded = ~oracle.solvable | (shining < 0.5 * np.median(shining))
     after = np.zeros(len(scene), dtype=bool)
     for k in range(1, len(scene)):
-        after[k] = missing[k] and (dark[k - 1] or after[k - 1])
+        after[k] = missing[k] and (occluded[k - 1] or after[k - 1])
     return bool(missing.any() and after.sum() > 0.5 * missing.sum())
 
 

@@ -1,4 +1,4 @@
-"""How the vehicle moves: shapes (T, 6) between -1 and 1 over time, and the times of their corners."""
+"""Motions of the vehicle: shapes (T, 6) between -1 and 1 over time, and the times of their corners."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def draw_motion(rng: np.random.Generator, t_s: Array) -> Motion:
 
 
 def sines(rng: np.random.Generator, t_s: Array) -> Motion:
-    """Two sines per number, all within two octaves."""
+    """Two sines per coordinate, all within two octaves."""
     middle = float(np.exp(rng.uniform(np.log(0.05), np.log(8.0))))
     return Motion(_sines(rng, t_s, middle), np.zeros(0), f"sines about {middle:.2g} Hz")
 
@@ -39,7 +39,7 @@ def _sines(rng: np.random.Generator, t_s: Array, middle_hz: float) -> Array:
 
 
 def zigzag(rng: np.random.Generator, t_s: Array) -> Motion:
-    """Straight pieces in all six numbers; corners at random times, in one of five scenes at frames."""
+    """Straight segments in all six coordinates; corners at random times, in one of five scenes at frames."""
     frame_s = t_s[1] - t_s[0]
     mean = float(np.exp(rng.uniform(np.log(6), np.log(70))))
     at_frames = rng.random() < 0.2
@@ -56,7 +56,7 @@ def zigzag(rng: np.random.Generator, t_s: Array) -> Motion:
 
 
 def rest_then_motion(rng: np.random.Generator, t_s: Array) -> Motion:
-    """At rest for 15 to 70 % of the time; then straight on, or a swing, abruptly or eased."""
+    """At rest for 15 to 70 % of the time; then a straight motion or a swing, abrupt or eased."""
     start = rng.uniform(0.15, 0.7) * t_s[-1]
     since = np.maximum(t_s - start, 0.0)
     way = rng.uniform(-1, 1, 6)
@@ -76,7 +76,7 @@ def rest_then_motion(rng: np.random.Generator, t_s: Array) -> Motion:
 
 
 def excursions(rng: np.random.Generator, t_s: Array) -> Motion:
-    """Out and back, now and then."""
+    """Occasional excursions."""
     frame_s = t_s[1] - t_s[0]
     shape = np.zeros((len(t_s), 6))
     abrupt = rng.random() < 0.4
@@ -93,7 +93,7 @@ def excursions(rng: np.random.Generator, t_s: Array) -> Motion:
 
 
 def steps(rng: np.random.Generator, t_s: Array) -> Motion:
-    """A turntable that steps: it holds, turns quickly, holds again; about one axis, or all a little."""
+    """A stepping turntable, which turns fast between stops; about one axis, or slightly about all."""
     frame_s = t_s[1] - t_s[0]
     lead = np.full(6, 0.0 if rng.random() < 0.5 else 0.1)
     lead[3 + rng.integers(3)] = 1.0
@@ -120,13 +120,13 @@ def steps(rng: np.random.Generator, t_s: Array) -> Motion:
 
 
 def uniform(rng: np.random.Generator, t_s: Array) -> Motion:
-    """Exactly uniform from end to end."""
+    """Uniform motion."""
     a, b = rng.uniform(-1, 1, (2, 6))
     return Motion(a + (t_s / t_s[-1])[:, None] * (b - a), np.zeros(0), "uniform")
 
 
 def rest(rng: np.random.Generator, t_s: Array) -> Motion:
-    """At rest all the time."""
+    """Always at rest."""
     return Motion(np.zeros((len(t_s), 6)) + rng.uniform(-1, 1, 6), np.zeros(0), "at rest")
 
 

@@ -1,4 +1,4 @@
-"""What disturbs a recording: hidden spots, missing pictures, false points and static reflections."""
+"""Disturbances of a recording: occlusions, missing pictures, false points and static reflections."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ import numpy as np
 from geometry.arrays import Array, Bools, Ints
 from geometry.rig import Rig
 
-CLEAN_FRAMES = 10  # at the start: nothing is hidden, no picture is missing
+CLEAN_FRAMES = 10  # at the start: no occlusions and no missing pictures
 
 
 @dataclass(frozen=True, slots=True)
 class FalsePoints:
-    """How many points are no spots."""
+    """The frequency of false points."""
 
-    beside: float  # probability of one beside each spot in the picture, hidden or not, in each frame
-    beside_px: tuple[float, float]  # at least and at most so far from it
+    beside: float  # probability of one beside each spot in the picture, visible or not, in each frame
+    beside_px: tuple[float, float]  # smallest and largest distance from it
     anywhere: float  # mean number anywhere in each picture, at most MOST_ANYWHERE
-    reflections: tuple[Array, ...]  # by camera (m, 2), px: points that stay where they are
+    reflections: tuple[Array, ...]  # by camera (m, 2), px: fixed points
     reflection_seen: float = 0.97  # probability in each frame
-    exactly: int | None = None  # so many anywhere in each picture, in place of the mean
+    exactly: int | None = None  # number anywhere in each picture, instead of the mean
 
     @property
     def text(self) -> str:
-        """In a few words."""
+        """A short description."""
         parts = [f"clutter {self.beside:.0%}"] if self.beside else []
         parts += [f"{self.anywhere:.1f} anywhere"] if self.anywhere else []
         parts += [f"{self.exactly} anywhere"] if self.exactly else []
@@ -58,7 +58,7 @@ def draw_reflections(
     near: bool,
     at_frame: int | None = None,
 ) -> Array:
-    """Points (count, 2), px, that stay: 10 to 80 px from a spot's median place (or its place in a frame), or anywhere.
+    """Fixed points (count, 2), px: 10 to 80 px from the median position of a spot (or that in a frame), or anywhere.
 
     uv_px (T, m, 2): the camera's spots.
     """
@@ -79,9 +79,9 @@ def draw_reflections(
 def draw_hidden(
     rng: np.random.Generator, frames: int, camera_of: Ints, spot_of: Ints, corner_frames: Array
 ) -> tuple[Bools, str]:
-    """Which views (T, n) are hidden when, and a few words.
+    """The occluded views (T, n), and a short description.
 
-    corner_frames: where corners of the motion lie, in frames and fractions. A spot's shadow shows in all cameras.
+    corner_frames: corners of the motion, in frames and fractions. An occluded spot is invisible to all cameras.
     """
     hidden = np.zeros((frames, len(camera_of)), dtype=bool)
     words = []
@@ -112,7 +112,7 @@ def draw_hidden(
 
 
 def draw_missing(rng: np.random.Generator, frames: int, cameras: int) -> tuple[Bools, str]:
-    """Which pictures (T, cameras) there are, and a few words: in one of five scenes some are missing for a while."""
+    """The existing pictures (T, cameras), and a short description; in one of five scenes some are missing."""
     has_image = np.ones((frames, cameras), dtype=bool)
     if rng.random() > 0.2:
         return has_image, ""

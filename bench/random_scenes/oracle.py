@@ -1,4 +1,4 @@
-"""What the true labels allow: each frame's pose by itself, and whether the first frame has one answer only."""
+"""The result with the true labels: the pose of each frame, and whether the first frame has a unique solution."""
 
 from __future__ import annotations
 
@@ -14,30 +14,30 @@ from geometry.pose_solver.gauss_newton import SolveLimits, fit_pose, good_enough
 from tracking.detections import Detections
 from tracking.labelling.first_labels import find_labels
 
-FIRST_FRAMES = 3  # each of these must give a pose ...
-LEAST_SPOTS = 4  # ... from so many spots at least
-LEAST_SOLVABLE = 0.5  # share of all frames that must give one
-EXACT_SIGMA = 0.005  # px, of the points that are searched for a tie
+FIRST_FRAMES = 3  # first frames, each of which must determine a pose ...
+LEAST_SPOTS = 4  # ... from at least this number of spots
+LEAST_SOLVABLE = 0.5  # share of all frames that must determine one
+EXACT_SIGMA = 0.005  # px, noise of the points that are searched for a tie
 TIE_CHI2 = 30.0  # of a wrong pose that the first frame's noise cannot exclude
 
 
 @dataclass(frozen=True, slots=True)
 class Oracle:
-    """What can be asked of a tracker."""
+    """The result that a tracker can be expected to reach."""
 
-    solvable: Bools  # (T,) the frame's own spots give a pose
+    solvable: Bools  # (T,) the spots of the frame determine a pose
     nees: Array  # (T,) of that pose; nan without
-    tie: bool  # the first frame admits another pose within the prior
-    first_solvable: bool  # or they need not be
+    tie: bool  # the first frame has another solution within the prior
+    first_solvable: bool  # or this is not required
 
     @property
     def counts(self) -> bool:
-        """Whether the scene is one that a tracker can be asked to solve."""
+        """A tracker can be expected to solve the scene."""
         return self.first_solvable and not self.tie and float(self.solvable.mean()) >= LEAST_SOLVABLE
 
     @property
     def why_not(self) -> str:
-        """Why the scene does not count; empty where it does."""
+        """The reason why the scene does not count; empty if it counts."""
         if not self.first_solvable:
             return "first frames give no pose"
         if self.solvable.mean() < LEAST_SOLVABLE:
@@ -68,7 +68,7 @@ def ask_oracle(scene: Scene) -> Oracle:
 
 
 def measured_pixels(scene: Scene, k: int) -> Array:
-    """The detected place of each view (n, 2), px; nan without a point."""
+    """The detected position of each view (n, 2), px; nan without a point."""
     out = np.full((len(scene.camera_of), 2), np.nan)
     for found, origin in zip(scene.detections[k], scene.origin[k], strict=True):
         of_spot = origin != CLUTTER
@@ -77,7 +77,7 @@ def measured_pixels(scene: Scene, k: int) -> Array:
 
 
 def _ties(scene: Scene, model: SpotModel) -> bool:
-    """Whether the noise-free first frame without false points has another answer that its noise cannot exclude."""
+    """The noise-free first frame without false points has another solution that its noise cannot exclude."""
     if scene.prior is None:
         return False
     return another_pose(scene, model, scene.prior)

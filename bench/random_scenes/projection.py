@@ -1,6 +1,6 @@
-"""Pixels of the spots from the rig's numbers: the scenes' own projection, independent of the code that is judged.
+"""Projection of the spots from the rig parameters, independent of the tested code.
 
-Source: section 1 of the files' contract (frames, units) and OpenCV's lens model with k1, k2, p1, p2, k3.
+Source: section 1 of the file formats (frames, units) and the lens model of OpenCV with k1, k2, p1, p2, k3.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from geometry.rig import Rig
 def spot_pixels(rig: Rig, world_from_body: Pose) -> Array:
     """Distorted pixels (T, n, 2) of all views, in the order of Rig.views(), for a stack of poses (T,).
 
-    nan where the beam misses its screen, or the point lies behind the camera or beyond the lens model's fold.
+    nan where the beam misses its screen, or the point lies behind the camera or beyond the fold of the lens model.
     """
     views = rig.views()
     out = np.full((len(world_from_body.translation), len(views), 2), np.nan)
@@ -54,7 +54,7 @@ def camera_pixels(camera: Camera, points_world: Array) -> tuple[Array, Bools]:
 
 
 def fold_radius(radial: tuple[float, float, float]) -> float:
-    """The normalised radius at which r (1 + k1 r^2 + k2 r^4 + k3 r^6) stops growing; inf where it always grows."""
+    """The normalised radius of the maximum of r (1 + k1 r^2 + k2 r^4 + k3 r^6); inf if it always increases."""
     k1, k2, k3 = radial
     roots = np.roots([7 * k3, 5 * k2, 3 * k1, 1.0])  # in r^2; np.roots drops leading zeros
     real = roots.real[(np.abs(roots.imag) < 1e-9 * np.abs(roots)) & (roots.real > 0)]
@@ -62,5 +62,5 @@ def fold_radius(radial: tuple[float, float, float]) -> float:
 
 
 def in_picture(uv_px: Array, size_px: Array) -> Bools:
-    """Which pixels (..., 2) lie in pictures of size (..., 2): -0.5 <= u < width - 0.5; nan does not."""
+    """Pixels (..., 2) that lie in pictures of size (..., 2): -0.5 <= u < width - 0.5; False for nan."""
     return np.all((uv_px >= -0.5) & (uv_px < size_px - 0.5), axis=-1)

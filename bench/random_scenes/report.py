@@ -1,4 +1,4 @@
-"""The judgements of many scenes as a table, as a summary, and one scene's figures in full."""
+"""The scores of many scenes as a table and as a summary, and all figures of one scene."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def nothing() -> PassFigures:
 
 
 def crashed(scene: Scene, oracle: Oracle, trace: str) -> Judgement:
-    """The judgement of a scene on which the program raised an exception."""
+    """The scores of a scene on which the program raised an exception."""
     return Judgement(
         scene.seed, oracle.counts, oracle.why_not, ("crash",), nothing(), None, float("nan"),
         float(oracle.solvable.mean()), int(oracle.solvable.sum()), 1, trace.strip().splitlines()[-1], 0, trace,
@@ -40,7 +40,7 @@ def crashed(scene: Scene, oracle: Oracle, trace: str) -> Judgement:
 
 
 def write_rows(rows: Sequence[Judgement], path: Path) -> None:
-    """One row per scene: every field, those of the two passes with a prefix."""
+    """Write one row per scene with all fields; those of the two passes have a prefix."""
     flat = [_flat(row) for row in rows]
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.DictWriter(file, list(flat[0]) if flat else ["seed"], lineterminator="\n")
@@ -120,7 +120,7 @@ def summary(rows: Sequence[Judgement]) -> str:
 
 
 def line(row: Judgement) -> str:
-    """One line about a scene."""
+    """One line for a scene."""
     s = row.smoothed
     what = ", ".join(row.classes) or CLEAN
     return (
@@ -182,7 +182,7 @@ def _distributions(figures: Sequence[PassFigures]) -> list[str]:
 
 
 def _pooled(means: Array, counts: Array) -> float:
-    """The mean over all poses, from those of scenes."""
+    """The mean over all poses, from the means of scenes."""
     some = counts > 0
     return float(np.sum(means[some] * counts[some]) / max(counts[some].sum(), 1))
 

@@ -1,7 +1,7 @@
-"""Rigs drawn at random: screens, a vehicle with beams, and cameras that are aimed at where the spots fall.
+"""Random rigs: screens, a vehicle with beams, and cameras aimed at the spots.
 
-All is laid out in a base frame (x from the left screen to the right one, z up) and a vehicle frame; at the end the
-whole lab is moved to a world frame and the beams to a body frame of their own.
+The rig is laid out in a base frame (x from the left screen to the right one, z up) and a vehicle frame; at the end it
+is transformed to a random world frame and body frame.
 """
 
 from __future__ import annotations
@@ -29,23 +29,23 @@ THIRD_SIDES = {
 
 @dataclass(frozen=True, slots=True)
 class Lab:
-    """A rig, and what a motion needs to stay in its pictures."""
+    """A rig, and the data that a motion needs to keep the spots in its pictures."""
 
     rig: Rig
     world_from_base: Pose
     vehicle_from_body: Pose
     rest: Array  # (6,) x, y, z (m), yaw, pitch, roll (rad) of the vehicle in base, about which it moves
-    reach_m: float  # how far the spots may move on the screens
+    reach_m: float  # range of the spots on the screens, m
     lever_m: float  # the distance of the screens
     text: str
 
     def poses(self, q: Array) -> Pose:
-        """world_from_body (T,) of the vehicle's x, y, z (m), yaw, pitch, roll (rad) in base, (T, 6)."""
+        """world_from_body (T,) from x, y, z (m), yaw, pitch, roll (rad) of the vehicle in base, (T, 6)."""
         return self.world_from_base @ Pose.from_ypr(q[:, 3:], q[:, :3]) @ self.vehicle_from_body
 
 
 def draw_lab(rng: np.random.Generator, sizes_px: Sequence[tuple[int, int]] = SIZES_PX) -> Lab:
-    """A lab with at least LEAST_SPOTS spots on its screens when the vehicle rests; sizes_px: of its pictures."""
+    """A lab with at least LEAST_SPOTS spots on its screens with the vehicle at rest; sizes_px: of its pictures."""
     while True:
         lab = _attempt(rng, sizes_px)
         if lab is not None:
@@ -77,7 +77,7 @@ def assembled(
     plain_frames: bool = False,
     sizes_px: Sequence[tuple[int, int]] = SIZES_PX,
 ) -> Lab | None:
-    """Cameras for the screens, and all of it in one world and body; None where too few spots fall on the screens.
+    """The lab with cameras for the screens, in one world and body frame; None with too few spots on the screens.
 
     plain_frames: world is the base frame and body the vehicle frame.
     """
@@ -131,7 +131,7 @@ def draw_screens(rng: np.random.Generator) -> tuple[dict[str, Screen], str]:
 
 
 def _screen(rng: np.random.Generator, name: str, at: Array) -> Screen:
-    """A screen across the line from base's origin to `at`, turned a little in half of the scenes."""
+    """A screen across the line from the base origin to `at`, slightly rotated in half of the scenes."""
     normal = at / np.linalg.norm(at) * (1 if rng.random() < 0.5 else -1)
     second = np.array([0.0, 1.0, 0.0]) if abs(normal[2]) > 0.5 else np.array([0.0, 0.0, 1.0])
     first = np.cross(second, normal)
@@ -147,7 +147,7 @@ def _towards(screen: Screen) -> Array:
 
 
 def _with_size(rng: np.random.Generator, screen: Screen, centre: Array, radius: float) -> Screen:
-    """The screen with an extent in half of the scenes; it is moved along itself to lie about the spots."""
+    """The screen, in half of the scenes with a size; it is shifted within its plane to be centred on the spots."""
     if rng.random() < 0.5:
         return screen
     size = tuple((2 * radius * rng.uniform(0.95, 1.6, 2)).tolist())
@@ -162,7 +162,7 @@ def random_rotation(rng: np.random.Generator, limit: float) -> Array:
 
 
 def _hits(screens: dict[str, Screen], vehicle: Vehicle, rest: Array) -> list[Array | None]:
-    """Where the ends fall on their screens at rest, in base, m; None where they do not, or too obliquely."""
+    """The spots of the beam ends at rest, in base, m; None where they miss their screen, or are too oblique."""
     place = Pose.from_ypr(rest[3:], rest[:3])
     out: list[Array | None] = []
     for name, sign, screen_name in vehicle.ends:

@@ -1,4 +1,4 @@
-"""One recording drawn at random: T frames, n views (camera and spot, in the order of Rig.views()), c cameras."""
+"""One random recording: T frames, n views (camera and spot, in the order of Rig.views()), c cameras."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from geometry.rig import Rig
 from geometry.uncertainty.rig_parameters import RigCovariance
 from tracking.detections import Detections
 
-# Independent streams of random numbers: a change of one kind of draw leaves the others as they were.
+# Independent streams of random numbers, so that the kinds of draws do not affect each other.
 LAB, MOTION, NUISANCE, POINTS, PRIOR = range(5)
 OUTSIDE, SHINING, HIDDEN = 0, 1, 2
-CLUTTER = -1  # the origin of a point that is no spot
-FASTEST_PX = (30.0, 100.0)  # px per frame that no spot exceeds: usually, and in one scene of seven
+CLUTTER = -1  # origin of a false point
+FASTEST_PX = (30.0, 100.0)  # largest speed of a spot, px per frame: usually, and in one scene of seven
 LEAST_IN_VIEW = 0.7
 
 
@@ -39,21 +39,21 @@ class Scene:
     """A recording with its truth."""
 
     seed: int
-    rig: Rig  # as it is
-    known_rig: Rig  # as the program believes it to be
-    covariance: RigCovariance | None  # what is claimed of the difference
+    rig: Rig  # the true rig
+    known_rig: Rig  # the rig given to the program
+    covariance: RigCovariance | None  # stated covariance of the difference
     prior: PosePrior | None
     frame_rate_hz: float
     poses: Pose  # (T,) true world_from_body
     uv_px: Array  # (T, n, 2) true, also outside the picture; nan where there is none
     in_view: Ints  # (T, n) SHINING, HIDDEN (or missed) or OUTSIDE
     has_image: Bools  # (T, c)
-    sigma_px: Array  # (n,) 1 sigma per axis of each view's point
+    sigma_px: Array  # (n,) 1 sigma per axis of the points of each view
     detections: tuple[tuple[Detections, ...], ...]  # [frame][camera], in random order; none without a picture
-    origin: tuple[tuple[Ints, ...], ...]  # [frame][camera] (rows,): the view that each point is of, or CLUTTER
-    corner_frames: Array  # (k,) where the motion has corners, in frames and fractions
+    origin: tuple[tuple[Ints, ...], ...]  # [frame][camera] (rows,): the view of each point, or CLUTTER
+    corner_frames: Array  # (k,) corners of the motion, in frames and fractions
     text: str
-    late_start: bool = False  # the first frames need not give a pose
+    late_start: bool = False  # the first frames need not determine a pose
     camera_of: Ints = field(init=False)  # (n,)
     spot_of: Ints = field(init=False)  # (n,)
 
@@ -88,7 +88,7 @@ def view_indices(rig: Rig) -> tuple[Ints, Ints]:
 
 
 def random_scene(seed: int, frames: int = 200) -> Scene:
-    """The scene of a seed. Another number of frames gives another scene."""
+    """The scene of a seed; it depends on the number of frames."""
     attempt = 0
     while True:
         scene = _attempt([seed, attempt], seed, frames)
@@ -146,7 +146,7 @@ def composed(
     text: str,
     prior: PosePrior | None,
 ) -> Scene:
-    """The points and truth of a motion seen by a rig."""
+    """The points and the truth of a motion with a rig."""
     uv = spot_pixels(rig, poses)
     camera_of, _ = view_indices(rig)
     sizes = np.array([c.image_size_px for c in rig.cameras.values()], dtype=float)
@@ -192,7 +192,7 @@ def _one_picture(
     size: Array,
     false: FalsePoints,
 ) -> tuple[Detections, Ints]:
-    """The points of one picture in random order, and the views that they are of."""
+    """The points of one picture in random order, and their views."""
     mine = np.flatnonzero((camera_of == camera) & (in_view != OUTSIDE))
     shining = mine[in_view[mine] == SHINING]
     typical = float(np.median(sigma_px[camera_of == camera]))
@@ -215,7 +215,7 @@ def _one_picture(
 
 
 def draw_amplitudes(rng: np.random.Generator, lab: Lab) -> Array:
-    """(6,) m and rad: a random mixture whose parts each move the spots by up to about the lab's reach."""
+    """(6,) m and rad: random amplitudes, each of which moves the spots by up to about the reach of the lab."""
     weight = rng.uniform(0.05, 1.0, 6) * (rng.random(6) > 0.15)
     if not weight.any():
         weight[3] = 1.0
@@ -223,7 +223,7 @@ def draw_amplitudes(rng: np.random.Generator, lab: Lab) -> Array:
 
 
 def fitted_motion(lab: Lab, motion: Motion, amplitudes: Array, fastest_px: float, least_in_view: float) -> Array | None:
-    """x, y, z, yaw, pitch, roll (T, 6) with amplitudes reduced until spots stay in view and are not too fast.
+    """x, y, z, yaw, pitch, roll (T, 6) with amplitudes reduced until enough spots are in view and not too fast.
 
     None where even a small motion does not show LEAST_SPOTS spots in the first frames.
     """
@@ -244,7 +244,7 @@ def fitted_motion(lab: Lab, motion: Motion, amplitudes: Array, fastest_px: float
 
 
 def draw_prior(rng: np.random.Generator, first: Pose) -> PosePrior:
-    """A prior that holds the first pose."""
+    """A prior that contains the first pose."""
     within_m, within_rad = rng.uniform(0.3, 1.0), np.deg2rad(rng.uniform(10, 30))
     axis = rng.normal(size=3)
     turn = axis / np.linalg.norm(axis) * within_rad * rng.uniform(0, 0.95)

@@ -1,4 +1,4 @@
-"""Vehicles drawn at random: two to six beams and the ends that shine."""
+"""Random vehicles: two to six beams, and the ends that emit light."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ LEAST_SPOTS = 4
 
 @dataclass(frozen=True, slots=True)
 class Vehicle:
-    """Beams in the vehicle frame and the ends that shine: (beam, sign, screen)."""
+    """Beams in the vehicle frame and the ends that emit light: (beam, sign, screen)."""
 
     beams: dict[str, tuple[Array, Array]]  # direction (3,), point (3,), m
     ends: tuple[tuple[str, int, str], ...]
@@ -77,7 +77,7 @@ def _lines(rng: np.random.Generator, kind: str, count: int) -> tuple[list[Array]
 
 
 def _closest(directions: list[Array]) -> float:
-    """The least angle between two lines, rad."""
+    """The smallest angle between two lines, rad."""
     D = np.array(directions)
     c = np.abs(D @ D.T) - np.eye(len(D))
     return float(np.arccos(np.clip(c.max(), 0, 1)))

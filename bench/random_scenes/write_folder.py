@@ -1,4 +1,4 @@
-"""A scene as a run folder in the form of the files' contract."""
+"""A scene as a run folder in the documented file formats."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from lab.files.text import columns
 
 
 def write_run_folder(scene: Scene, folder: Path) -> Path:
-    """rig.yaml, run.yaml, detections.csv, truth/pose.csv and truth/spots.csv.
+    """Write rig.yaml, run.yaml, detections.csv, truth/pose.csv and truth/spots.csv.
 
-    A picture that is missing has one row without a place: within a table the contract has no other way to say so.
+    A missing picture has one row without a position, the only form that the file format has for it.
     """
     folder.mkdir(parents=True, exist_ok=True)
     covariances = {} if scene.covariance is None else blocks_of(scene.covariance)
@@ -52,7 +52,7 @@ def prior_block(scene: Scene) -> dict[str, object]:
 
 
 def write_truth(scene: Scene, folder: Path) -> None:
-    """truth/pose.csv and truth/spots.csv of a run folder."""
+    """Write truth/pose.csv and truth/spots.csv of a run folder."""
     (folder / "truth").mkdir(exist_ok=True)
     quaternions = scene.poses.quaternion_wxyz
     pose_rows = (

@@ -1,1 +1,1 @@
-"""What a run costs, stage by stage."""
+"""Process time and memory of a run, by stage."""

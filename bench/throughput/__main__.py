@@ -1,8 +1,8 @@
-"""What a run costs: `python -m bench.throughput` prints process time per frame, stage by stage, and peak memory.
+"""Cost of a run: `python -m bench.throughput` prints process time per frame of each stage, and peak memory.
 
-Two simulated cameras of 1280x1024, 8 bit. ms per frame of user + system time, of all threads, beside cv2.imread
-(IMREAD_UNCHANGED, one thread) over the same files, each job in a process of its own, the least of some repeats. The
-pictures are made once and kept in build/throughput (0.3 GB per format; longer runs link to them).
+Two simulated cameras of 1280x1024, 8 bit. User and system time of all threads, ms per frame, compared with cv2.imread
+(IMREAD_UNCHANGED, one thread) over the same files. Each job runs in its own process; the minimum of some repeats
+counts. The pictures are made once and kept in build/throughput (0.3 GB per format; longer runs link to them).
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from typing import Any
 from bench.throughput.folders import FORMATS, run_folder
 
 COLUMNS = ("decode", "detect", "track", "smooth", "tables", "model check", "report")
-ONCE = ("start-up", "load compiled", "compile")  # s, whatever the length
+ONCE = ("start-up", "load compiled", "compile")  # s, independent of the length
 
 
 def job(*arguments: object) -> dict[str, Any]:
-    """What bench.throughput.stages prints of one job."""
-    environment = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}  # a start-up as users have it
+    """The output of bench.throughput.stages for one job."""
+    environment = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}  # as for users
     command = [sys.executable, "-m", "bench.throughput.stages", *map(str, arguments)]
     done = subprocess.run(command, stdout=subprocess.PIPE, check=True, env=environment)
     out: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
@@ -32,18 +32,18 @@ def job(*arguments: object) -> dict[str, Any]:
 
 
 def least(repeats: int, *arguments: object) -> dict[str, Any]:
-    """The cheapest of some repeats of a job."""
+    """The repeat of a job with the lowest total."""
     return min((job(*arguments) for _ in range(repeats)), key=lambda result: float(result["total"]))
 
 
 def measure(kind: str, folder: Path, frames: int, out: Path, repeats: int) -> None:
-    """Print one row."""
+    """Measure one format and length, and print its row."""
     reading = None
     if kind != "points":
         ours = least(repeats, "read", folder)["stages"]["read"]
         theirs = least(repeats, "video" if kind == "mjpeg" else "imread", folder)["stages"]["read"]
         reading = (1e3 * ours / frames, 1e3 * theirs / frames)
-    job("run", folder, out)  # compiles where nothing is compiled yet
+    job("run", folder, out)  # compiles if necessary
     run = least(repeats, "run", folder, out)
     again = least(repeats, "report", out)["stages"]["report"]
     stages = run["stages"]
@@ -70,7 +70,7 @@ def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--frames", type=int, nargs="+", default=[300, 3000])
-    parser.add_argument("--long", action="store_true", help="30,000 frames, too (no video)")
+    parser.add_argument("--long", action="store_true", help="also 30,000 frames (no video)")
     parser.add_argument("--formats", nargs="+", choices=FORMATS, default=list(FORMATS))
     parser.add_argument("--repeats", type=int, default=2)
     parser.add_argument("--scenario", default="huo2015")

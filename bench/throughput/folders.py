@@ -1,4 +1,4 @@
-"""Run folders of any length and format from one set of simulated pictures, made once and kept."""
+"""Run folders of any length and format from one set of simulated pictures, which is kept."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ import numpy as np
 
 from lab.simulate.write import simulate
 
-PICTURES = 300  # simulated; longer runs go through them forwards and backwards, so that the motion stays one
+PICTURES = 300  # simulated; longer runs repeat them forwards and backwards, so that the motion is continuous
 SEED = 9100
 FORMATS = ("png", "tiff", "pgm", "mjpeg", "points")
 
 
 def run_folder(kept: Path, kind: str, frames: int, scenario: str) -> Path:
-    """A run folder of so many frames of a format, made where it is not there yet."""
+    """A run folder with this format and number of frames; it is written if it does not exist."""
     folder = kept / f"{scenario}-{kind}-{frames}"
     if (folder / "run.yaml").is_file():
         return folder
@@ -61,7 +61,7 @@ def _to_and_fro(pictures: int, frames: int) -> Iterator[int]:
 
 
 def _converted(folder: Path, picture: Path, suffix: str, write: Callable[[Path, np.ndarray], None] | None) -> Path:
-    """The same picture in another format, written where it is not there yet."""
+    """The picture in another format; it is written if it does not exist."""
     if write is None:
         return picture
     path = folder / f"{picture.stem}{suffix}"
@@ -72,7 +72,7 @@ def _converted(folder: Path, picture: Path, suffix: str, write: Callable[[Path, 
 
 
 def _write_tiff(path: Path, picture: np.ndarray) -> None:
-    cv2.imwrite(str(path), picture, [cv2.IMWRITE_TIFF_COMPRESSION, 1])  # as it is
+    cv2.imwrite(str(path), picture, [cv2.IMWRITE_TIFF_COMPRESSION, 1])  # uncompressed
 
 
 def _write_pgm(path: Path, picture: np.ndarray) -> None:

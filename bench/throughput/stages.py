@@ -1,9 +1,8 @@
-"""Run one job in this process and print, as JSON, the process time of each of its stages and the largest memory.
+"""Run one job in this process and print the process time of each stage and the peak memory as JSON.
 
 `python -m bench.throughput.stages run RUN OUT`, `report OUT`, `read RUN`, `imread RUN`, `video RUN`. A stage is a
-function of the program (STAGES), whose time is that of the thread which calls it, without what another stage takes
-inside. "start-up" is all that happens before the first picture is asked for, and all imports, but not the loading of
-compiled code.
+function of the program (STAGES). Its time is that of the calling thread, without other stages called inside. "start-up"
+is everything before the first picture is read, and all imports, but not the loading of compiled code.
 """
 
 from __future__ import annotations
@@ -37,7 +36,7 @@ STAGES = (
 
 
 class Clock:
-    """Adds up what stages take, each without those inside it."""
+    """Sums of the times of the stages, each without the stages inside it."""
 
     def __init__(self) -> None:
         self.spent: Counter[str] = Counter()
@@ -45,7 +44,7 @@ class Clock:
         self._inside = threading.local()
 
     def timed(self, stage: str, function: Callable[..., Any]) -> Callable[..., Any]:
-        """The same function, whose time is counted."""
+        """The function with its time counted."""
 
         @functools.wraps(function)
         def wrapped(*args: Any, **kwargs: Any) -> Any:
@@ -64,7 +63,11 @@ class Clock:
 
 
 def watch(clock: Clock) -> None:
-    """Count the time of all STAGES from now on. Raises AttributeError where a function has another name by now."""
+    """Count the time of all STAGES from now on.
+
+    Raises:
+        AttributeError: a function was renamed.
+    """
     for stage, module, name in STAGES:
         owner: Any = importlib.import_module(module)
         *classes, last = name.split(".")
@@ -78,16 +81,16 @@ def _run(folder: Path, out: Path) -> Counter[str]:
     from lab.runs.frames import frames
 
     clock = Clock()
-    watch(clock)  # imports the report and the model check, too, which a run imports at its end
+    watch(clock)  # also imports the report and the model check, which a run imports at its end
     started: list[float] = []
     reading = frames.FrameReader.__iter__
 
-    def first_asked(reader: frames.FrameReader) -> Any:
+    def first_read(reader: frames.FrameReader) -> Any:
         loaded = clock.spent["load compiled"] + clock.spent["compile"]
         started.append(time.process_time() - loaded)
         return reading(reader)
 
-    frames.FrameReader.__iter__ = first_asked  # type: ignore[method-assign]  # to time the original
+    frames.FrameReader.__iter__ = first_read  # type: ignore[method-assign]  # to time the original
     process.process_run(folder, out)
     return clock.spent + Counter({"start-up": started[0]})
 
@@ -101,7 +104,7 @@ def _report(out: Path) -> Counter[str]:
 
 
 def _read(folder: Path) -> Counter[str]:
-    """Only the pictures, read ahead in threads as in a run."""
+    """Read the pictures only, ahead in threads as in a run."""
     from lab.files.run.run_file import load_run
     from lab.runs.frames.frames import open_frames
 
@@ -141,7 +144,7 @@ JOBS = {"run": _run, "report": _report, "read": _read, "imread": _imread, "video
 
 
 def main() -> None:
-    """See the module."""
+    """Run the job of the command line."""
     job, *paths = sys.argv[1:]
     begun = time.perf_counter()
     spent = JOBS[job](*map(Path, paths))

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lab.pictures.picture_file import Grey
-from lab.report.run.pictures import grey_limits, stretched
+from lab.report.plot.image import grey_limits, stretched
 from tracking.detections import Detections
 
 Colour: TypeAlias = NDArray[np.uint8]  # (h, w, 3), BGR

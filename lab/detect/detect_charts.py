@@ -8,8 +8,9 @@ import numpy as np
 
 from geometry.arrays import Array, Bools
 from lab.number_format import short
-from lab.report.plot.axes import Plane, axes, dots, frame, image_plane, note, plane, polyline, svg_of
-from lab.report.plot.svg import BLUE, ORANGE, VERMILLION, line_path, text, ticks
+from lab.report.plot.axes import Plane, axes, frame, image_plane, note, plane, svg_of
+from lab.report.plot.scales import ticks
+from lab.report.plot.svg import BLUE, ORANGE, VERMILLION, dots, line_path, polyline, text
 from tracking.noise_estimation.levels import LevelVariances
 from tracking.noise_estimation.photon_transfer import NoiseEstimate
 

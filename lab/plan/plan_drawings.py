@@ -10,9 +10,9 @@ import numpy as np
 from geometry.arrays import Array
 from lab import number_format
 from lab.number_format import percent
-from lab.report.calibration.calibration_maps import colours, hex_colour
 from lab.report.plot import svg
-from lab.report.plot.axes import number
+from lab.report.plot.colour_map import colours, hex_colour
+from lab.report.plot.scales import number
 
 _LEFT, _TOP, _WIDE, _HIGH = 58.0, 24.0, 468.0, 224.0
 _MAX_LABELLED_COLUMNS = 15  # with more columns the cells are too small for a number

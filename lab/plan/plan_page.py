@@ -25,7 +25,6 @@ from lab.plan.plan_findings import (
     worst_first,
 )
 from lab.plan.plan_options import Plan, Range
-from lab.report.calibration.calibration_maps import heat_map
 from lab.report.calibration.calibration_page import (
     CalibrationReport,
     PageDrawing,
@@ -35,6 +34,7 @@ from lab.report.calibration.calibration_page import (
     write_calibration_report,
 )
 from lab.report.calibration.calibration_scene import rig_things, scene_views
+from lab.report.plot.maps import heat_map
 
 _WORST_ROWS, _EFFECT_ROWS = 24, 20
 _FINE = 41  # grid points along each side of a smooth map

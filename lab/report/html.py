@@ -1,4 +1,4 @@
-"""The template engine of all reports: each is one HTML file that needs nothing else."""
+"""The template engine of all reports: each is one self-contained HTML file."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import jinja2
 
 @cache
 def environment() -> jinja2.Environment:
-    """The templates of lab/report/templates/; text that is not marked as HTML is escaped."""
+    """The templates in lab/report/templates/; text that is not marked as HTML is escaped."""
     return jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent / "templates"),
         autoescape=True,

@@ -1,4 +1,4 @@
-"""Photographs of a calibration board through our own camera model, with the true places of its points."""
+"""Photographs of a calibration board by our own camera model, with the true positions of its points."""
 
 from __future__ import annotations
 
@@ -15,33 +15,33 @@ from geometry.arrays import Array, Bools, Ints
 from geometry.camera import Camera
 from geometry.pose import Pose
 
-_MARGIN = 1.0  # spacings of white paper around the points' outermost squares or circles
+_MARGIN = 1.0  # width of the white margin around the outermost squares or circles, in spacings
 
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """How a board is lit and how the camera draws it."""
+    """Light, blur, noise and sampling of a photograph of a board."""
 
-    light_dn: float = 205.0  # paper
-    dark_dn: float = 35.0  # ink
-    background_dn: float = 110.0  # what is not paper
-    gradient: float = 0.0  # share by which the light falls from left to right
-    blur_px: float = 0.7  # sigma of the lens' blur; the sum over each pixel's area comes on top
+    paper_dn: float = 205.0  # paper
+    ink_dn: float = 35.0  # ink
+    background_dn: float = 110.0  # outside the paper
+    gradient: float = 0.0  # relative decrease of the light from left to right
+    blur_px: float = 0.7  # sigma of the blur of the lens, without the integration over pixels
     noise_dn: float = 0.0  # 1 sigma
     samples: int = 64  # rays per pixel
 
 
 @dataclass(frozen=True, slots=True)
 class BoardPhoto:
-    """A picture and its truth."""
+    """A photograph and its truth."""
 
     image: NDArray[np.uint8]  # (h, w)
     ids: Ints  # (N,)
-    pixels: Array  # (N, 2), where the board's points truly are; nan where there is no projection
+    pixels: Array  # (N, 2), true positions of the points of the board; nan where there is no projection
 
 
 def warped(board: Board, warp: Array, xy: Array) -> Array:
-    """Points (..., 3), m, of the bent board at (..., 2) of its frame: z = a dx^2 + b dx dy + c dy^2 about its middle.
+    """Points (..., 3), m, of the bent board at (..., 2) of its frame: z = a dx^2 + b dx dy + c dy^2 about its centre.
 
     warp (3,): a, b, c, 1/m.
     """
@@ -58,7 +58,7 @@ def photograph(
     look: Look | None = None,
     seed: int = 0,
 ) -> BoardPhoto:
-    """A picture of a board, which lies where `world_from_board` says and is bent by `warp` (3,), 1/m."""
+    """A photograph of a board at `world_from_board`, bent by `warp` (3,), 1/m."""
     bend = np.zeros(3) if warp is None else np.asarray(warp, dtype=float)
     look = Look() if look is None else look
     width, height = camera.image_size_px
@@ -81,7 +81,7 @@ def photograph(
 
 
 def _board_coordinates(board: Board, camera: Camera, world_from_board: Pose, warp: Array) -> Array:
-    """Where the rays through the CORNERS of all pixels meet the board: (h + 1, w + 1, 2), m; nan where they do not."""
+    """Intersections (h + 1, w + 1, 2), m, of the rays through the CORNERS of all pixels with the board; nan: none."""
     lens = (camera.image_size_px, np.asarray(camera.matrix, dtype=float).tobytes(), camera.distortion, camera.lens)
     board_from_camera = world_from_board.inverse() @ camera.camera_from_world.inverse()
     o, d = board_from_camera.translation, _corner_rays(*lens) @ board_from_camera.rotation.T
@@ -95,7 +95,7 @@ def _board_coordinates(board: Board, camera: Camera, world_from_board: Pose, war
             slope = d[..., 2] - (2 * a * x + b * y) * d[..., 0] - (b * x + 2 * c * y) * d[..., 1]
             t = t - f / slope
         xy = o[:2] + t[..., None] * d[..., :2]
-    # Seen from behind or behind the camera: nothing.
+    # No intersection on the back of the board or behind the camera.
     return np.where(((t > 0) & (d[..., 2] > 0))[..., None], xy, np.nan)
 
 
@@ -103,7 +103,7 @@ def _board_coordinates(board: Board, camera: Camera, world_from_board: Pose, war
 def _corner_rays(size_px: tuple[int, int], matrix: bytes, distortion: tuple[float, ...], lens: str) -> Array:
     """Directions (h + 1, w + 1, 3) in the camera's frame through the corners of all pixels.
 
-    Kept, since a lens is undone in 3 s for a picture of 1280 x 1024, and dozens of photographs share one.
+    Cached, since undistorting all corners takes 3 s for 1280 x 1024 pixels and many photographs share a lens.
     """
     camera = Camera("", "", size_px, np.frombuffer(matrix).reshape(3, 3), distortion, Pose.identity(), lens=lens)
     u, v = np.meshgrid(np.arange(size_px[0] + 1) - 0.5, np.arange(size_px[1] + 1) - 0.5)
@@ -111,7 +111,7 @@ def _corner_rays(size_px: tuple[int, int], matrix: bytes, distortion: tuple[floa
 
 
 def _between(corners: Array, shift: Array) -> Array:
-    """Values (h, w, 2) within each pixel at (x, y) in [0, 1], bilinear: the map bends by less than 1e-3 px in one."""
+    """Values (h, w, 2) within each pixel at (x, y) in [0, 1], bilinear; the error is below 1e-3 px."""
     x, y = shift
     top = (1 - x) * corners[:-1, :-1] + x * corners[:-1, 1:]
     bottom = (1 - x) * corners[1:, :-1] + x * corners[1:, 1:]
@@ -119,8 +119,10 @@ def _between(corners: Array, shift: Array) -> Array:
 
 
 def _lattice(n: int) -> Array:
-    """n points (n, 2) in the unit square of which no two share an x or a y, so that edges along the rows of pixels
-    are drawn as finely as others: Fibonacci's lattice, centred."""
+    """The centred Fibonacci lattice of n points (n, 2) in the unit square.
+
+    No two points share an x or a y, so that edges along the rows of pixels are sampled as finely as others.
+    """
     k = np.arange(n)
     rank = np.argsort(np.argsort((k * 0.6180339887498949) % 1))
     return np.stack([(k + 0.5) / n, (rank + 0.5) / n], axis=-1)
@@ -134,7 +136,7 @@ def _on_paper(board: Board, xy: Array) -> Bools:
 
 
 def _piece_with_paper(board: Board, corners: Array) -> tuple[slice, slice] | None:
-    """The rows and columns of pixels that may show paper; None where none does. corners (h + 1, w + 1, 2)."""
+    """The rows and columns of pixels that may show paper; None if there are none. corners (h + 1, w + 1, 2)."""
     rows, columns = np.nonzero(_on_paper(board, corners))
     if len(rows) == 0:
         return None
@@ -147,6 +149,6 @@ def _piece_with_paper(board: Board, corners: Array) -> tuple[slice, slice] | Non
 
 def _shade(board: Board, xy: Array, look: Look) -> Array:
     paper = _on_paper(board, xy)
-    shade = np.where(paper, look.light_dn, look.background_dn)
-    shade[paper] -= (look.light_dn - look.dark_dn) * ink_at(board, xy[paper])
+    shade = np.where(paper, look.paper_dn, look.background_dn)
+    shade[paper] -= (look.paper_dn - look.ink_dn) * ink_at(board, xy[paper])
     return shade

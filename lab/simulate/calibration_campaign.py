@@ -1,4 +1,4 @@
-"""A calibration campaign with truth: a rig as it was really mounted, and everything that a lab would measure of it."""
+"""A simulated calibration campaign: the true rig, and the measurements of it that a laboratory makes."""
 
 from __future__ import annotations
 
@@ -21,53 +21,53 @@ from lab.errors import InputError
 from lab.files.text.error_text import did_you_mean
 from lab.simulate.rigs import RIGS
 
-# One stream of random numbers per subject, so that more dots do not change the stand's positions.
+# One stream of random numbers per subject, so that the positions of the stand do not depend on the number of dots.
 _MOUNTING, _LENSES, _DOTS, _PIXELS, _STAND, _SPOTS, _WRONG = range(7)
-_EDGE_PX = 12.0  # a spot or dot nearer to the picture's edge is not taken
+_EDGE_PX = 12.0  # spots and dots closer to the edge of the picture are not used
 
 
 @dataclass(frozen=True, slots=True)
 class Quality:
-    """How rough the mounting is and how good the measurements are; sigmas, per coordinate."""
+    """Sigmas, per coordinate, of the mounting and of the measurements."""
 
-    camera_m: float = 0.004  # mounting: how far cameras stand from the drawing ...
+    camera_m: float = 0.004  # mounting: deviation of the cameras from the drawing ...
     camera_deg: float = 0.3
     screen_m: float = 0.004
     screen_deg: float = 0.2
     beam_deg: float = 0.3
     beam_m: float = 0.003
-    focal_px: float = 8.0  # lenses: how far they are from the data sheet
+    focal_px: float = 8.0  # lenses: deviation from the data sheet
     centre_px: float = 5.0
-    distortion_share: float = 0.03  # of each distortion number
-    bow_per_m: float = 0.0  # how bent screens are
-    lens_corner_px: float = 0.08  # of a board corner, in the lens calibration that came before
-    dots: tuple[int, int] = (6, 5)  # surveyed dots per screen: columns, rows; those that no camera sees are left out
+    distortion_share: float = 0.03  # of each distortion coefficient
+    bow_per_m: float = 0.0  # of the bow of the screens
+    lens_corner_px: float = 0.08  # of a board corner in the preceding lens calibration
+    dots: tuple[int, int] = (6, 5)  # surveyed dots per screen: columns, rows; without those that no camera sees
     survey_m: float = 0.0003  # total station on good targets
-    dot_px: float = 0.07  # of a dot's centre in the picture
+    dot_px: float = 0.07  # of the centre of a dot in the picture
     positions: int = 40  # of the stand
-    turn_deg: float = 25.0  # it turns by up to this about each axis ...
-    shift_m: float = 0.2  # ... and shifts by up to this along each
-    stand_m: float = 2e-5  # its own error, per position
+    turn_deg: float = 25.0  # its largest rotation about each axis ...
+    shift_m: float = 0.2  # ... and its largest shift along each axis
+    stand_m: float = 2e-5  # its error, per position
     stand_deg: float = 0.002
-    place_known: bool = False  # whether the survey measured the stand's place
+    place_known: bool = False  # the survey also measured the pose of the stand
     place_m: float = 0.0003
     place_deg: float = 0.01
     spot_px: float = 0.054  # 0.2 mm on the screen, 4.4 m from a camera of 1180 px focal length
-    wrong: float = 0.0  # share of dots' pixels and of spots that are far off
+    wrong: float = 0.0  # share of outliers among the pixels of dots and of spots
 
 
 @dataclass(frozen=True, slots=True)
 class LensDraw:
-    """What a lens calibration would have said of one camera."""
+    """The result of a lens calibration of one camera."""
 
-    camera: Camera  # its lens numbers; the pose is not used
+    camera: Camera  # its lens parameters; the pose is not used
     names: tuple[str, ...]
     covariance: Array  # (p, p)
 
 
 @dataclass(frozen=True, slots=True)
 class Campaign:
-    """The truth and everything measured."""
+    """The truth and all measurements."""
 
     name: str
     seed: int
@@ -83,11 +83,11 @@ class Campaign:
     seen_dot: Ints  # (k,)
     seen_pixels: Array  # (k, 2)
     world_from_stand: Pose  # truth
-    stand_surveyed: Pose  # what the survey says of it
+    stand_surveyed: Pose  # as measured by the survey
     stand_from_body: Pose  # (p,) truth
-    stand_recorded: Pose  # (p,) what the stand says
+    stand_recorded: Pose  # (p,) as reported by the stand
     spots: SpotPixels
-    wrong_dots: Bools  # (k,): pixels that were put far off
+    wrong_dots: Bools  # (k,): pixels made outliers
     wrong_spots: Bools  # (n spots,)
 
     @property
@@ -102,9 +102,12 @@ class Campaign:
 
 
 def draw_campaign(seed: int, rig: str | Rig = "fan", quality: Quality | None = None) -> Campaign:
-    """Everything that happens in one campaign, from a seed.
+    """The truth and the measurements of one campaign, from a seed.
 
-    rig: a name of RIGS, or a rig. Raises InputError for other names.
+    rig: a name of RIGS, or a rig.
+
+    Raises:
+        InputError: no rig has this name.
     """
     q = Quality() if quality is None else quality
     if isinstance(rig, str) and rig not in RIGS:
@@ -117,7 +120,7 @@ def draw_campaign(seed: int, rig: str | Rig = "fan", quality: Quality | None = N
     names, of_screen, dots = _dots(truth, q)
     rng = np.random.default_rng([seed, _DOTS])
     surveyed = dots + rng.normal(0, q.survey_m, dots.shape)
-    camera, dot, pixels = _sightings(truth, of_screen, dots)
+    camera, dot, pixels = _observations(truth, of_screen, dots)
     pixels = pixels + np.random.default_rng([seed, _PIXELS]).normal(0, q.dot_px, pixels.shape)
     rng = np.random.default_rng([seed, _STAND])
     world_from_stand = Pose.from_ypr(np.deg2rad(rng.normal(0, 2.0, 3)), rng.normal(0, 0.03, 3))
@@ -156,7 +159,7 @@ def draw_campaign(seed: int, rig: str | Rig = "fan", quality: Quality | None = N
 
 
 def as_mounted(nominal: Rig, q: Quality, rng: np.random.Generator) -> Rig:
-    """The rig as it would really stand: every pose, lens, beam and screen a little off the drawing."""
+    """The rig with random deviations of every pose, lens, beam and screen from the drawing."""
 
     def off(m: float, deg: float) -> Array:
         return rng.normal(size=6) * np.repeat([m, np.deg2rad(deg)], 3)
@@ -182,7 +185,7 @@ def as_mounted(nominal: Rig, q: Quality, rng: np.random.Generator) -> Rig:
 
 
 def spots_at(rig: Rig, world_from_body: Pose, sigma_px: float, rng: np.random.Generator) -> SpotPixels:
-    """The spots in the pictures at poses (p,), with noise. The noise is drawn for all views, seen or not."""
+    """The spots in the pictures at poses (p,), with noise, which is drawn for all views, visible or not."""
     model = SpotModel.of(rig)
     pixels, _ = model.project(world_from_body)
     noise = rng.normal(0, sigma_px, pixels.shape)
@@ -192,7 +195,7 @@ def spots_at(rig: Rig, world_from_body: Pose, sigma_px: float, rng: np.random.Ge
 
 
 def board_poses(count: int, seed: int = 5) -> Pose:
-    """camera_from_board (count,) of a board of 0.4 m x 0.3 m held before a camera: all over the picture, tilted."""
+    """camera_from_board (count,) of a tilted board of 0.4 m x 0.3 m, distributed over the picture."""
     rng = np.random.default_rng(seed)
     turns = np.deg2rad(rng.uniform([-20, -35, -35], [20, 35, 35], (count, 3)))
     z = rng.uniform(0.9, 1.6, count)
@@ -202,7 +205,7 @@ def board_poses(count: int, seed: int = 5) -> Pose:
 
 
 def lens_covariance(camera: Camera, corner_px: float, views: int = 30) -> Array:
-    """What a lens calibration of so many board photographs would know: (p, p), fx, fy, cx, cy and the distortion."""
+    """The covariance (p, p) of fx, fy, cx, cy and the distortion after a calibration with `views` board photographs."""
     x, y = np.meshgrid(np.linspace(0, 0.4, 9), np.linspace(0, 0.3, 7))
     board = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=-1)
     poses = board_poses(views)
@@ -237,7 +240,7 @@ def _lens(true: Camera, q: Quality, rng: np.random.Generator) -> LensDraw:
 
 
 def _dots(rig: Rig, q: Quality) -> tuple[tuple[str, ...], Ints, Array]:
-    """Names, screens and true places of the dots that some camera sees."""
+    """Names, screens and true positions of the dots that at least one camera sees."""
     names, of_screen, xyz = [], [], []
     columns, rows = q.dots
     for k, screen in enumerate(rig.screens.values()):
@@ -257,8 +260,8 @@ def _dots(rig: Rig, q: Quality) -> tuple[tuple[str, ...], Ints, Array]:
     return tuple(names), np.array(of_screen, dtype=np.int64), np.array(xyz)
 
 
-def _sightings(rig: Rig, of_screen: Ints, dots: Array) -> tuple[Ints, Ints, Array]:
-    """Which camera sees which dot, and where: only dots of the screen that it observes."""
+def _observations(rig: Rig, of_screen: Ints, dots: Array) -> tuple[Ints, Ints, Array]:
+    """Camera, dot and pixel of each observation; each camera sees the dots of its own screen."""
     camera_of, dot_of, pixels = [], [], []
     screens = list(rig.screens)
     for c, camera in enumerate(rig.cameras.values()):
@@ -277,7 +280,7 @@ def _in(camera: Camera, pixels: Array) -> Bools:
 
 
 def _some_wrong(pixels: Array, share: float, rng: np.random.Generator) -> tuple[Bools, Array]:
-    """Some of the pixels put 4 to 40 px off."""
+    """A share of the pixels, moved by 4 to 40 px."""
     wrong = rng.uniform(size=len(pixels)) < share
     angle, far = rng.uniform(0, 2 * np.pi, len(pixels)), rng.uniform(4, 40, len(pixels))
     off = far[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)

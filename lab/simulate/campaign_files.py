@@ -1,4 +1,4 @@
-"""A simulated calibration campaign as a folder: all that `beampose calibrate rig` reads, and the truth beside it."""
+"""A simulated calibration campaign as a folder: the input of `beampose calibrate rig`, and the truth."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ from lab.simulate.board_photo import Look, photograph
 from lab.simulate.calibration_campaign import Campaign, LensDraw, Quality, board_poses, draw_campaign
 
 PROJECT = "calibration.yaml"
-BOARD = "charuco:11x9:36mm:27mm:DICT_4X4_100"  # its corners count also where the board leaves the picture
+BOARD = "charuco:11x9:36mm:27mm:DICT_4X4_100"  # usable also where part of the board is outside the picture
 PHOTOS = 24  # per camera
-_PHOTO_POSES = 11  # seed of the board's places: not those that the lens covariance is made with
-_DATE = "2026-01-15"  # of all that is measured; a fixed day, so that the same seed gives the same bytes
+_PHOTO_POSES = 11  # seed of the poses of the board, other than those of the lens covariance
+_DATE = "2026-01-15"  # of all measurements; fixed, so that the same seed gives the same bytes
 
 
 def simulate_calibration(
@@ -46,14 +46,17 @@ def simulate_calibration(
     photos: bool = False,
     quality: Quality | None = None,
 ) -> Path:
-    """Write a whole calibration campaign into a new folder; returns the folder, complete.
+    """Write a complete calibration campaign into a new folder; returns the folder.
 
     calibration.yaml, a camera.yaml per camera, survey.csv, points.csv, poses.csv, spots.csv, and truth/: rig.yaml (as
     mounted), poses.csv (world_from_body at the positions). The same arguments give the same bytes.
 
-    rig: a name of RIGS. positions: of the stand. wrong: share of dots' pixels and of spots that are far off. photos:
-    board photographs of each camera too, for `beampose calibrate camera`. quality: sigmas of mounting and measurement.
-    Raises InputError where an argument does not fit, or the folder exists.
+    rig: a name of RIGS. positions: of the stand. wrong: share of outliers among the pixels of control points and spots.
+    photos: also board photographs of each camera, for `beampose calibrate camera`. quality: sigmas of mounting and
+    measurement.
+
+    Raises:
+        InputError: an argument is not valid, or the folder exists.
     """
     if not 0 <= wrong < 0.3:
         raise InputError(f"wrong: expected a share from 0 up to 0.3, got {wrong:g}")
@@ -69,7 +72,7 @@ def simulate_calibration(
 
 
 def write_campaign(c: Campaign, folder: Path) -> None:
-    """The files of a campaign, into an existing folder."""
+    """Write the files of a campaign into an existing folder."""
     for name, lens in c.lenses.items():
         save_camera(_camera_file(name, lens), folder / f"camera-{name}.yaml")
     screens = list(c.truth.screens)
@@ -142,7 +145,7 @@ def _camera_file(name: str, lens: LensDraw) -> CameraFile:
 
 
 def _write_photos(c: Campaign, folder: Path) -> None:
-    """Pictures of a board before each camera, and the board's name in a file beside them."""
+    """Write photographs of a board by each camera, and board.yaml."""
     board = boards.parse(BOARD)
     save_board(board, folder / "board.yaml")
     for i, (name, camera) in enumerate(c.truth.cameras.items()):

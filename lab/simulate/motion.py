@@ -1,4 +1,4 @@
-"""Motions of the vehicle as formulas in time, so that any instant within an exposure has its exact pose."""
+"""Motions of the vehicle as functions of time, which give the exact pose at any instant of an exposure."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from geometry.pose import Pose
 AXES = ("x", "y", "z", "yaw", "pitch", "roll")
 SHAPES = ("sine", "triangle", "plateau", "steps")
 _STEPNESS = 2.5  # of "plateau": tanh(2.5 sin) stays within 10 % of its end value for two thirds of each half cycle
-_STEPS = 6  # of "steps": so many stops from end to end
-_MOVING = 0.4  # of "steps": the share of each step's time that is spent in motion
+_STEPS = 6  # of "steps": number of steps from end to end
+_MOVING = 0.4  # of "steps": share of the time of each step in motion
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,7 +21,7 @@ class Wave:
     """One periodic part of the motion of one axis."""
 
     axis: str  # one of AXES
-    amplitude: float  # half the swing: m for x, y, z; deg for yaw, pitch, roll
+    amplitude: float  # m for x, y, z; deg for yaw, pitch, roll
     frequency_hz: float
     shape: str = "sine"  # one of SHAPES
     phase: float | None = None  # cycles at t = 0; None: drawn per seed
@@ -36,7 +36,7 @@ class Wave:
 
 
 def _unit_wave(shape: str, cycles: Array) -> Array:
-    """A wave between -1 and 1 with period 1. All begin at 0 or -1 and rise."""
+    """A wave between -1 and 1 with period 1. All start at 0 or -1 and rise."""
     if shape == "sine":
         return np.sin(2 * np.pi * cycles)
     if shape == "plateau":
@@ -46,14 +46,14 @@ def _unit_wave(shape: str, cycles: Array) -> Array:
         return 2 * up_and_down - 1
     level = up_and_down * _STEPS
     whole = np.floor(level)
-    # Each step: rest, then a move whose speed rises and falls as a sine, so that it starts and ends without a jerk.
+    # Each step: rest, then a move with a sinusoidal speed, so that the speed has no jumps.
     moved = np.clip((level - whole - (1 - _MOVING) / 2) / _MOVING, 0.0, 1.0)
     return 2 * (whole + 0.5 * (1 - np.cos(np.pi * moved))) / _STEPS - 1
 
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """The sum of waves about a middle pose."""
+    """The sum of waves about a mean pose."""
 
     middle: tuple[float, float, float, float, float, float]  # x, y, z (m), yaw, pitch, roll (deg)
     waves: tuple[Wave, ...]
@@ -61,8 +61,8 @@ class Motion:
     def drawn(self, rng: np.random.Generator, frame_rate_hz: float) -> Motion:
         """This motion with the missing phases drawn.
 
-        The corners of triangles fall on frames: then just one frame after each corner is badly predicted by a
-        constant velocity.
+        The corners of triangles coincide with frames, so that a constant-velocity prediction fails in exactly one frame
+        after each corner.
         """
         waves = []
         for w in self.waves:
@@ -92,7 +92,7 @@ class Motion:
         return Pose.from_ypr(q[..., 3:], q[..., :3])
 
     def bends_s(self, end_s: float) -> Array:
-        """The times (n,) in (0, end_s], sorted, at which a triangle turns back: velocity jumps."""
+        """The sorted times (n,) in (0, end_s] of the corners of triangles, where the velocity jumps."""
         times = [np.zeros(0)]
         for w in self.waves:
             if w.shape == "triangle":

@@ -1,4 +1,4 @@
-"""The shape and brightness of a laser spot in a picture, and its light summed over pixels and over the exposure."""
+"""Shape and brightness of a laser spot in a picture, and its light integrated over pixels and exposure."""
 
 from __future__ import annotations
 
@@ -11,39 +11,40 @@ from geometry.camera import project_points
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 
-_REACH = 5.0  # sigmas that are drawn: a 150 DN spot ends below 0.001 DN
-# Gauss-Legendre nodes within a pixel, per axis. With four, the sum over a pixel of a Gaussian with sigma 0.5 px is
-# right to 1e-6 of its peak; three would do from 0.8 px on.
+_REACH = 5.0  # sigmas that are drawn: a spot of 150 DN ends below 0.001 DN
+# Gauss-Legendre nodes within a pixel, per axis. With four, the integral over a pixel of a Gaussian with sigma 0.5 px
+# has an error of 1e-6 of its peak; three suffice from 0.8 px on.
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(4)
 
 
 @dataclass(frozen=True, slots=True)
-class Spots:
-    """How n spots look at one instant. `lab.simulate.optics.appearance` makes it."""
+class SpotImages:
+    """The images of n spots at one instant."""
 
-    uv_px: Array  # (n, 2) centre: the image of the beam's axis
-    covariance_px2: Array  # (n, 2, 2) of the Gaussian in the picture, before the sum over pixels
-    light: Array  # (n,) what the camera gathers, relative: inverse square of the distance times cosine at the screen
+    uv_px: Array  # (n, 2) centre: the image of the axis of the beam
+    covariance_px2: Array  # (n, 2, 2) of the Gaussian in the picture, before the integration over pixels
+    light: Array  # (n,) relative light received by the camera: cosine at the screen over squared distance
 
 
 def on_screen_covariance(direction: Array, axes: Array, sigma_m: float) -> Array:
-    """The Gaussian (..., 2, 2), m^2, that a beam leaves on a screen which cuts it obliquely.
+    """The covariance (..., 2, 2), m^2, of the Gaussian spot of a beam on an oblique screen.
 
-    direction (..., 3): unit, of the beam; axes (..., 3, 2): the screen's x and y axes, in the same frame. Across the
-    beam the light falls as exp(-r^2 / 2 sigma^2), r the distance from the axis; for a point s of the screen, r^2 =
-    s^T B^T (I - d d^T) B s = s^T (I - b b^T) s with b = B^T d, so the covariance is the inverse of that times sigma^2:
-    I + b b^T / (1 - b^T b), by Sherman and Morrison. The beam's divergence across the spot is neglected.
+    direction (..., 3): unit vector d of the beam; axes (..., 3, 2): the x and y axes B of the screen, in the same
+    frame. The light is proportional to exp(-r^2 / 2 sigma^2) with the distance r from the axis of the beam. For a point
+    s of the screen, r^2 = s^T B^T (I - d d^T) B s = s^T (I - b b^T) s with b = B^T d, so the covariance is sigma^2
+    times the inverse of I - b b^T, which is I + b b^T / (1 - b^T b) (Sherman-Morrison). The divergence of the beam is
+    neglected.
     """
     b = np.einsum("...ij,...i->...j", axes, direction)
-    slack = np.maximum(1.0 - np.sum(b * b, axis=-1), 1e-4)  # cos^2 of the incidence; a grazing beam stays finite
+    slack = np.maximum(1.0 - np.sum(b * b, axis=-1), 1e-4)  # cos^2 of the incidence; limited for grazing beams
     return sigma_m**2 * (np.eye(2) + b[..., :, None] * b[..., None, :] / slack[..., None, None])
 
 
-def appearance(model: SpotModel, world_from_body: Pose, sigma_m: float, blur_px: float) -> Spots:
-    """The spots of all views for one pose: each an ellipse on its screen, taken to the picture by the lens' local
-    affine map. nan where there is no projection.
+def spot_images(model: SpotModel, world_from_body: Pose, sigma_m: float, blur_px: float) -> SpotImages:
+    """The spots of all views for one pose: ellipses on the screens, mapped to the picture by the local affine map.
 
-    sigma_m: of the beam's light across it, half its 1/e^2 radius. blur_px: sigma of the lens' blur.
+    sigma_m: of the beam, half its 1/e^2 radius. blur_px: sigma of the blur of the lens. nan where there is no
+    projection.
     """
     hit = model.hits(world_from_body)[0]
     uv = model.project(world_from_body)[0]
@@ -55,12 +56,12 @@ def appearance(model: SpotModel, world_from_body: Pose, sigma_m: float, blur_px:
     J = project_points(in_camera, model.pinhole, model.distortion, model.fold_r2)[1]
     A = J @ (model.camera_rotation @ axes)  # (n, 2, 2) px per m of the screen
     covariance = A @ on_screen_covariance(direction, axes, sigma_m) @ np.swapaxes(A, -1, -2) + blur_px**2 * np.eye(2)
-    # A matt screen: the camera gathers the lit spot's power times cosine over square of the distance.
+    # A diffuse (Lambertian) screen: the camera receives power times cosine over squared distance.
     distance = np.linalg.norm(in_camera, axis=-1)
     normal = (model.camera_rotation @ model.screen_rotation[..., 2:])[..., 0]
     cosine = np.abs(np.sum(normal * in_camera, axis=-1)) / distance
     light = np.where(seen, cosine / distance**2, np.nan)
-    return Spots(uv, np.where(seen[:, None, None], covariance, np.nan), light)
+    return SpotImages(uv, np.where(seen[:, None, None], covariance, np.nan), light)
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,10 +74,10 @@ class Patch:
 
 
 def spot_patch(path_px: Array, weights: Array, covariance_px2: Array, size_px: tuple[int, int]) -> Patch | None:
-    """A Gaussian spot of flux 1 that moves during the exposure, summed over each pixel; None outside the picture.
+    """A Gaussian spot of flux 1 that moves during the exposure, integrated over pixels; None outside the picture.
 
-    path_px (m, 2): centres at m instants; weights (m,): the shares of the exposure that they stand for.
-    covariance_px2 (2, 2): kept during the exposure. size_px: width, height.
+    path_px (m, 2): centres at m instants; weights (m,): their shares of the exposure. covariance_px2 (2, 2): constant
+    during the exposure. size_px: width, height.
     """
     reach = _REACH * np.sqrt(np.diagonal(covariance_px2)) + 1.0
     first = np.maximum(np.floor(path_px.min(axis=0) - reach), 0).astype(int)
@@ -101,10 +102,10 @@ def spot_patch(path_px: Array, weights: Array, covariance_px2: Array, size_px: t
 
 
 def exposure_instants(length_px: float, sigma_px: float) -> tuple[Array, Array]:
-    """Instants (m,) in [-0.5, 0.5] of the exposure and their weights (m,), enough for a streak of this length.
+    """Instants (m,) in [-0.5, 0.5] of the exposure and their weights (m,) for a streak of this length.
 
-    Gauss-Legendre, with nodes about one sigma of the spot apart: then the sum differs from the integral by less than
-    1e-6 of the peak. A still spot needs one.
+    Gauss-Legendre quadrature with nodes about one sigma of the spot apart: its error is below 1e-6 of the peak. A
+    stationary spot needs one instant.
     """
     if length_px < 1e-3 * sigma_px:
         return np.zeros(1), np.ones(1)

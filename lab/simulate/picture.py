@@ -1,4 +1,4 @@
-"""One picture of a scene: background, spots, clutter, noise and the sensor's limits."""
+"""One picture of a scene: background, spots, clutter, noise, saturation and rounding."""
 
 from __future__ import annotations
 
@@ -11,40 +11,44 @@ from numpy.typing import NDArray
 from geometry.arrays import Array
 from geometry.camera import SensorNoise
 from geometry.pose import Pose
-from lab.simulate.optics import appearance, exposure_instants, spot_patch
+from lab.simulate.optics import exposure_instants, spot_images, spot_patch
 from lab.simulate.scenarios import Light
 from lab.simulate.scene import LIGHT, PIXELS, SHINING, Scene
 
 Floats32 = NDArray[np.float32]
 Picture = NDArray[np.uint8 | np.uint16]
 
-_GRAIN_SIGMAS_PX = (1.2, 9.0)  # of the screen's paint: fine grain and broad clouds, half of the variance each
+_GRAIN_SIGMAS_PX = (1.2, 9.0)  # of the reflectivity of the screen: fine and coarse, half of the variance each
 
 
 @dataclass(frozen=True, slots=True)
 class Sensor:
-    """What is the same in all pictures of one camera. Light in DN above black."""
+    """The constant properties of the pictures of one camera. Light in DN above black."""
 
     camera: int  # index into model.camera_names
     size_px: tuple[int, int]
     noise: SensorNoise
-    full_dn: float  # grey value at which it clips
+    full_dn: float  # grey value of saturation
     albedo: Floats32  # (h, w) reflectivity of the screen, mean 1
     background: Floats32  # (h, w) with reflections, without hot pixels
-    sigma: Floats32  # (h, w) DN, noise where only the background shines
+    sigma: Floats32  # (h, w) DN, noise of the background alone
     hot_rows: NDArray[np.int64]
     hot_columns: NDArray[np.int64]
     hot_dn: Floats32
 
 
 def make_sensor(scene: Scene, camera: int) -> Sensor:
-    """Paint, gradient, reflections and hot pixels of one camera, drawn from the scene's seed."""
+    """Reflectivity, gradient, reflections and hot pixels of one camera, drawn from the seed of the scene.
+
+    Raises:
+        ValueError: the camera has no sensor noise.
+    """
     light = scene.scenario.light
     name = scene.model.camera_names[camera]
     width, height = scene.rig.cameras[name].image_size_px
     noise = scene.rig.cameras[name].noise
     if noise is None:
-        raise ValueError(f"camera {name!r}: a picture needs the sensor's noise")
+        raise ValueError(f"camera {name!r}: expected the noise of its sensor, got none")
     deeper = 2.0 ** (light.bits - 8)
     rng = np.random.default_rng([scene.seed, LIGHT, camera])
     u = np.linspace(-0.5, 0.5, width, dtype=np.float32)
@@ -77,41 +81,40 @@ def make_sensor(scene: Scene, camera: int) -> Sensor:
 
 
 def _noise_sigma(light_dn: Floats32, noise: SensorNoise) -> Floats32:
-    """Shot and read noise, 1 sigma in DN, of light in DN above black: var = (light gain + read^2) / gain^2, in
-    electrons the light's own count plus the square of the read noise."""
+    """Shot and read noise, 1 sigma in DN, of light in DN above black: variance (light * gain + read^2) / gain^2."""
     electrons = np.maximum(light_dn, 0) * np.float32(noise.gain_e_per_dn) + np.float32(noise.read_noise_e**2)
     return np.sqrt(electrons, dtype=np.float32) / np.float32(noise.gain_e_per_dn)
 
 
 @dataclass(frozen=True, slots=True)
-class Powers:
-    """What each laser sends, relative: (n,) per view, so that a spot of `peak_dn` comes out at the world's origin."""
+class LaserPowers:
+    """The powers of the lasers, scaled so that a spot has `peak_dn` with the vehicle at the world origin."""
 
     flux_dn_per_light: Array  # (n,) DN summed over the spot, per unit of optics.Spots.light
 
 
-def laser_powers(scene: Scene) -> Powers:
-    """Drawn once per recording. The two ends of one beam are two lasers."""
+def laser_powers(scene: Scene) -> LaserPowers:
+    """The powers, drawn once per recording. The two ends of one beam are two lasers."""
     light, model = scene.scenario.light, scene.model
-    at_origin = appearance(model, Pose.identity(), light.beam_radius_m / 2, light.blur_px)
+    at_origin = spot_images(model, Pose.identity(), light.beam_radius_m / 2, light.blur_px)
     area = 2 * np.pi * np.sqrt(np.linalg.det(at_origin.covariance_px2))
-    # One camera's exposure fits all its spots, so the mean peak is the scenario's; nan: not lit from the origin.
+    # All spots share the exposure, so their mean peak is that of the scenario; nan: no spot from the origin.
     flux = np.nanmean(light.peak_dn * area / at_origin.light) * 2.0 ** (light.bits - 8)
     rng = np.random.default_rng([scene.seed, LIGHT, 1_000])
     spread = np.exp(light.power_spread * rng.standard_normal(len(model.spot_names)))
-    return Powers(flux * spread[model.spot_of])
+    return LaserPowers(flux * spread[model.spot_of])
 
 
-def expose(scene: Scene, sensor: Sensor, powers: Powers, k: int) -> Floats32:
+def expected_light(scene: Scene, sensor: Sensor, powers: LaserPowers, k: int) -> Floats32:
     """The light of frame k in one camera, DN above black, before noise, hot pixels and rounding: (h, w)."""
     return _lit(scene, sensor, powers, k)[0]
 
 
-def _lit(scene: Scene, sensor: Sensor, powers: Powers, k: int) -> tuple[Floats32, list[tuple[slice, slice]]]:
-    """The light, and the pieces of the picture in which it is more than background."""
+def _lit(scene: Scene, sensor: Sensor, powers: LaserPowers, k: int) -> tuple[Floats32, list[tuple[slice, slice]]]:
+    """The light, and the regions of the picture in which it exceeds the background."""
     light, model = scene.scenario.light, scene.model
     views = np.flatnonzero(model.camera_of == sensor.camera)
-    spots = appearance(model.subset(views), scene.poses[k], light.beam_radius_m / 2, light.blur_px)
+    spots = spot_images(model.subset(views), scene.poses[k], light.beam_radius_m / 2, light.blur_px)
     paths, weights = _paths(scene, views, float(scene.t_s[k]), spots.covariance_px2)
     rng = np.random.default_rng([scene.seed, LIGHT, sensor.camera, k + 1])
     picture = sensor.background.copy()
@@ -130,10 +133,10 @@ def _lit(scene: Scene, sensor: Sensor, powers: Powers, k: int) -> tuple[Floats32
     shape = np.nanmedian(spots.covariance_px2, axis=0)
     typical_flux = float(np.nanmedian(powers.flux_dn_per_light[views] * spots.light))
     for i, view in enumerate(views):
-        hidden = scene.in_view[k, view] not in (SHINING, 0)
-        if not hidden and np.isfinite(paths[:, i]).all():
+        occluded = scene.in_view[k, view] not in (SHINING, 0)
+        if not occluded and np.isfinite(paths[:, i]).all():
             add(paths[:, i], weights, spots.covariance_px2[i], float(powers.flux_dn_per_light[view] * spots.light[i]))
-    false = scene.false_spots
+    false = scene.clutter_points
     for row in range(*np.searchsorted(false.frame, [k, k + 1])):
         if false.camera[row] == sensor.camera and np.isfinite(typical_flux):
             add(false.uv_px[row][None], np.ones(1), shape, float(false.strength[row]) * typical_flux)
@@ -141,7 +144,7 @@ def _lit(scene: Scene, sensor: Sensor, powers: Powers, k: int) -> tuple[Floats32
 
 
 def _paths(scene: Scene, views: NDArray[np.int64], t_s: float, covariance_px2: Array) -> tuple[Array, Array]:
-    """Centres (m, n, 2) of these views at m instants of the exposure about t_s, and the instants' weights (m,)."""
+    """Centres (m, n, 2) of these views at m instants of the exposure about t_s, and the weights (m,)."""
     half = scene.scenario.light.exposure_s / 2
     model = scene.model.subset(views)
 
@@ -157,19 +160,19 @@ def _paths(scene: Scene, views: NDArray[np.int64], t_s: float, covariance_px2: A
 
 
 def _speckle(rng: np.random.Generator, shape: tuple[int, int], light: Light) -> Array | float:
-    """A positive grain with mean 1 (log-normal), correlated over `speckle_grain_px`."""
+    """Log-normal speckle with mean 1, correlated over `speckle_grain_px`."""
     if light.speckle_contrast <= 0:
         return 1.0
     white = rng.standard_normal(shape, dtype=np.float32)
     grain = cv2.GaussianBlur(white, (0, 0), light.speckle_grain_px, borderType=cv2.BORDER_REFLECT)
-    # A Gaussian blur of sigma s leaves 1 / (2 sqrt(pi) s) of white noise.
+    # A Gaussian blur of sigma s reduces the sigma of white noise by the factor 1 / (2 sqrt(pi) s).
     sigma = np.sqrt(np.log1p(light.speckle_contrast**2))
     factor = float(sigma * 2 * np.sqrt(np.pi) * light.speckle_grain_px)
     return np.exp(factor * grain.astype(np.float64) - sigma**2 / 2)
 
 
-def take(scene: Scene, sensor: Sensor, powers: Powers, k: int, *, noisy: bool = True) -> Picture:
-    """Picture of frame k: (h, w), uint8 up to 8 bits, else uint16."""
+def render(scene: Scene, sensor: Sensor, powers: LaserPowers, k: int, *, noisy: bool = True) -> Picture:
+    """The picture of frame k: (h, w), uint8 up to 8 bits, otherwise uint16."""
     value, pieces = _lit(scene, sensor, powers, k)
     if noisy:
         rng = np.random.Generator(np.random.SFC64([scene.seed, PIXELS, sensor.camera, k]))

@@ -1,4 +1,4 @@
-"""A recording as points only: truth and noisy detections without pictures. For studies with many runs."""
+"""A recording as truth and noisy detections without pictures, for studies with many runs."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from lab.simulate.scenarios import PriorRegion, Scenario
 from lab.simulate.scene import HIDDEN, POINT_NOISE, SHINING, compose, with_overrides
 from tracking.detections import Detections
 
-CLUTTER = -1  # the origin of a detection that is no spot
-_LEAST_SIGMA_PX = 1e-3  # the covariance that noise-free detections claim: a weight must stay finite
+CLUTTER = -1  # origin of a false detection
+_LEAST_SIGMA_PX = 1e-3  # stated sigma of noise-free detections, so that their weight is finite
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,11 +33,11 @@ class PointRun:
     t_s: Array  # (T,)
     poses: Pose  # (T,) true world_from_body
     uv_px: Array  # (T, n, 2) true, also outside the picture; nan where there is none
-    in_view: Ints  # (T, n) 1 in the picture and shining, 2 in the picture but hidden, 0 outside
-    has_image: Bools  # (T, c); where not, there are no detections
-    turned: Bools  # (T,) the motion bent abruptly between the frame before and this one
+    in_view: Ints  # (T, n) 1 visible in the picture, 2 occluded, 0 outside
+    has_image: Bools  # (T, c); False: no detections
+    turned: Bools  # (T,) the motion bends between the frame before and this one
     detections: tuple[tuple[Detections, ...], ...]  # [frame][camera], in random order
-    origin: tuple[tuple[Ints, ...], ...]  # [frame][camera] (rows,): the view that each detection is of, or CLUTTER
+    origin: tuple[tuple[Ints, ...], ...]  # [frame][camera] (rows,): the view of each detection, or CLUTTER
 
 
 def simulate_points(
@@ -53,13 +53,17 @@ def simulate_points(
 ) -> PointRun:
     """One recording of a scenario as points.
 
-    noise_px: 1 sigma per axis, also of clutter. clutter: probability of a false spot near each spot in the picture
-    (default: the scenario's). miss_probability: of each spot in each frame. The motion depends on scenario and seed
-    only; the clutter of a lower probability is part of that of a higher one. picture_scale, rig: as in `compose`.
+    noise_px: 1 sigma per axis, also of clutter. clutter: probability of a false point near each spot in the picture
+    (default: that of the scenario). miss_probability: of each spot in each frame. The motion depends on scenario and
+    seed only; the clutter of a lower probability is a subset of that of a higher one. picture_scale, rig: as in
+    `compose`.
+
+    Raises:
+        InputError: an unknown scenario, or an argument out of range.
     """
     overridden = with_overrides(scenario, clutter=clutter, miss_probability=miss_probability)
     scene = compose(overridden, seed, frames, picture_scale, rig)
-    model, false = scene.model, scene.false_spots
+    model, false = scene.model, scene.clutter_points
     n, cameras = len(model), range(len(model.camera_names))
     first_false = np.searchsorted(false.frame, np.arange(len(scene.frame) + 1))
     covariance = max(noise_px, _LEAST_SIGMA_PX) ** 2 * np.eye(2)
@@ -67,7 +71,7 @@ def simulate_points(
     for k in range(len(scene.frame)):
         some = slice(first_false[k], first_false[k + 1])
         rng = np.random.default_rng([seed, POINT_NOISE, k])
-        # Noise is drawn for all views, seen or not, so that hiding one spot leaves the others as they were.
+        # Noise is drawn for all views, so that it does not depend on which spots are occluded.
         uv = np.concatenate([scene.uv_px[k], false.uv_px[some]])
         uv = uv + noise_px * rng.standard_normal(uv.shape)
         of = np.concatenate([np.arange(n), np.full(len(uv) - n, CLUTTER)])
@@ -98,7 +102,7 @@ def simulate_points(
 
 
 def hidden(run: PointRun, hide: Bools) -> PointRun:
-    """The same recording with spots taken away: hide (T, n), those of a view in a frame. False points stay."""
+    """The recording with the spots of `hide` (T, n) occluded. False points are not changed."""
     detections, origins = [], []
     for k in range(len(run.frame)):
         keep = [np.array([o == CLUTTER or not hide[k, o] for o in of], dtype=bool) for of in run.origin[k]]

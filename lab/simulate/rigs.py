@@ -1,4 +1,4 @@
-"""Example rigs by name: screens, cameras and a vehicle as a lab might mount them."""
+"""Example rigs by name: typical arrangements of screens, cameras and a vehicle."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from geometry.rig import Beam, Rig, Screen, Spot
 
 IMAGE_SIZE_PX = (1280, 1024)  # the paper's, section 5.1
 FOCAL_PX = 1180.0
-# Barrel, mild, and without a fold: 1 - 3 * 0.12 r^2 + 5 * 0.05 r^4 has no real root, so that a spot far outside the
-# picture still has a pixel.
+# Mild barrel distortion without a fold: 1 - 3 * 0.12 r^2 + 5 * 0.05 r^4 has no real root, so that a spot far outside
+# the picture still has pixel coordinates.
 DISTORTION = (-0.12, 0.05, 3e-4, -2e-4, 0.0)
 SCREEN_X_M = 2.5  # distance of either screen from the world's origin
 
 
 def look_at(position_m: Array, target_m: Array) -> Pose:
-    """camera_from_world of a camera at `position_m` (3,) that looks at `target_m` (3,), world z up in its picture."""
+    """camera_from_world of a camera at `position_m` (3,) aimed at `target_m` (3,), with world z up in its picture."""
     z = normalised(np.asarray(target_m, dtype=float) - position_m)
     x = normalised(cross(z, np.array([0.0, 0.0, 1.0])))
     R = np.stack([x, cross(z, x), z])
@@ -29,9 +29,9 @@ def look_at(position_m: Array, target_m: Array) -> Pose:
 
 
 def scaled(rig: Rig, scale: float) -> Rig:
-    """The same rig with pictures of another size: `scale` 0.5 halves width, height and focal length.
+    """The rig with pictures of another size: `scale` 0.5 halves width, height and focal length.
 
-    Pixel centres are whole numbers, so the principal point follows (c + 0.5) scale - 0.5. The noise is kept.
+    Pixel centres are integers, so the principal point c becomes (c + 0.5) scale - 0.5. The noise is unchanged.
     """
     cameras = {}
     for name, c in rig.cameras.items():
@@ -44,7 +44,7 @@ def scaled(rig: Rig, scale: float) -> Rig:
 
 
 def with_noise(rig: Rig, noise: SensorNoise) -> Rig:
-    """The same rig with another sensor in every camera."""
+    """The rig with this sensor noise in every camera."""
     cameras = {
         n: Camera(n, c.screen, c.image_size_px, c.matrix, c.distortion, c.camera_from_world, noise)
         for n, c in rig.cameras.items()
@@ -60,7 +60,7 @@ def _camera(name: str, screen: str, position_m: Sequence[float], target_m: Seque
 
 
 def _screens(size_m: tuple[float, float] | None) -> dict[str, Screen]:
-    """Two screens across the world's x axis; screen x, y, z = world y, z, x."""
+    """Two screens perpendicular to the world x axis; screen x, y, z = world y, z, x."""
     turn = np.array([0.5, 0.5, 0.5, 0.5])
     return {
         name: Screen(name, Pose.from_quaternion(turn, np.array([x, 0.0, 0.0])), size_m)
@@ -71,8 +71,8 @@ def _screens(size_m: tuple[float, float] | None) -> dict[str, Screen]:
 def _two_cameras() -> dict[str, Camera]:
     """One oblique camera per screen, 4.4 m away and above the vehicle.
 
-    Each is aimed off the screen's middle to the side away from beam C (see `fan`), so that A and B stay in the
-    picture while C leaves it.
+    Each is aimed beside the centre of the screen, away from beam C (see `fan`), so that A and B stay in the picture
+    while C leaves it.
     """
     return {
         "left": _camera("left", "left", (1.6, 0.6, 1.5), (-2.5, 0.35, 0.0)),
@@ -89,9 +89,9 @@ def _both_ends(beams: dict[str, Beam]) -> dict[str, Spot]:
 
 
 def fan(angles_deg: tuple[float, float, float] = (-20.0, 0.0, 20.0)) -> Rig:
-    """Three beams A, B, C through the body's origin, in its x-y plane at these angles from x towards y.
+    """Three beams A, B, C through the body origin, in its x-y plane at these angles from x towards y.
 
-    The paper's cooperation target (Huo et al. 2015, Fig. 1) with 20 deg between neighbours; screens without an end.
+    The cooperation target of Huo et al. (2015), Fig. 1, with 20 deg between neighbours; unlimited screens.
     """
     beams = {
         name: Beam(name, np.array([np.cos(a), np.sin(a), 0.0]), np.zeros(3))
@@ -101,12 +101,12 @@ def fan(angles_deg: tuple[float, float, float] = (-20.0, 0.0, 20.0)) -> Rig:
 
 
 def unequal_fan() -> Rig:
-    """As `fan`, with 18 and 23 deg between neighbours: two visible beams already tell which two they are."""
+    """As `fan`, with 18 and 23 deg between neighbours: two visible beams can be identified."""
     return fan((-18.0, 0.0, 23.0))
 
 
 def two_cameras_per_screen() -> Rig:
-    """As `fan`, each screen watched by two cameras from different sides: twelve views of six spots."""
+    """As `fan`, each screen observed by two cameras from different sides: twelve views of six spots."""
     rig = fan()
     cameras = {
         "left-a": _camera("left-a", "left", (1.6, 0.6, 1.5), (-2.5, 0.35, 0.0)),
@@ -118,7 +118,7 @@ def two_cameras_per_screen() -> Rig:
 
 
 def four_skew_beams() -> Rig:
-    """Four beams that neither meet nor lie in one plane, at unequal angles; D shines to the right only.
+    """Four skew beams at unequal angles; D points to the right only.
 
     Screens of 6 m x 5 m: a beam can miss them.
     """

@@ -1,4 +1,4 @@
-"""Named scenarios: what moves, what is filmed and what goes wrong, as frozen values."""
+"""Named scenarios as frozen values: motion, images, clutter, occlusions and faults."""
 
 from __future__ import annotations
 
@@ -10,54 +10,54 @@ from lab.simulate.motion import Motion, Wave
 
 @dataclass(frozen=True, slots=True)
 class Light:
-    """What pictures look like. DN are those of an 8-bit picture; deeper pictures have 2^(bits - 8) times as many."""
+    """Light, lens and sensor. DN are those of an 8-bit picture; others have 2^(bits - 8) times as many."""
 
     exposure_s: float = 0.0005  # centred on the frame's time; a moving spot leaves a streak
-    bits: int = 8  # of the sensor: 8, or up to 16 in a 16-bit file; it clips at 2^bits - 1
-    gain_e_per_dn: float = 38.0  # these three go into rig.yaml
+    bits: int = 8  # of the sensor: 8, or up to 16 in a 16-bit file; it saturates at 2^bits - 1
+    gain_e_per_dn: float = 38.0  # this and the next two are written to rig.yaml
     read_noise_e: float = 30.0
     black_dn: float = 8.0
-    beam_radius_m: float = 0.011  # 1/e^2 radius of the beam (two sigmas), measured across it at the screen
-    blur_px: float = 0.6  # sigma of the lens' own blur
-    peak_dn: float = 150.0  # of a spot above the background, with the vehicle at the origin of world; its power is kept
+    beam_radius_m: float = 0.011  # 1/e^2 radius of the beam (two sigmas), perpendicular to it at the screen
+    blur_px: float = 0.6  # sigma of the blur of the lens
+    peak_dn: float = 150.0  # of a spot above the background, with the vehicle at the world origin; defines its power
     power_spread: float = 0.15  # relative 1-sigma spread of the lasers' powers
     background_dn: float = 6.0  # above black, at its mean
-    gradient_dn: float = 6.0  # by how much the background differs between two opposite sides or corners
-    texture: float = 0.005  # relative 1-sigma unevenness of the screen's paint: it modulates background and spots
-    hot_pixels: int = 12  # per camera, at the same places all along
-    reflections: int = 2  # diffuse, 15 to 40 px wide, per camera, at the same places all along
+    gradient_dn: float = 6.0  # difference of the background between two opposite sides or corners
+    texture: float = 0.005  # relative 1-sigma variation of the reflectivity of the screen, in background and spots
+    hot_pixels: int = 12  # per camera, at fixed places
+    reflections: int = 2  # diffuse, 15 to 40 px wide, per camera, at fixed places
     reflection_dn: float = 12.0
-    # Relative 1-sigma of a spot's speckle, new in every frame. It moves a centroid by contrast * sqrt(A / 8 pi), A =
-    # 4 pi grain^2 its correlation area: 0.007 px here, as much as the photons of a bright spot do.
+    # Relative 1-sigma of the speckle of a spot, drawn for every frame. It moves a centroid by contrast * sqrt(A / 8 pi)
+    # with the correlation area A = 4 pi grain^2: 0.007 px here, as much as the photon noise of a bright spot.
     speckle_contrast: float = 0.01
-    speckle_grain_px: float = 1.0  # sigma of the speckle's correlation
+    speckle_grain_px: float = 1.0  # sigma of the correlation of the speckle
 
 
 @dataclass(frozen=True, slots=True)
 class Clutter:
-    """Points of light that are no spots, a new draw in every frame."""
+    """False detections, drawn for every frame."""
 
-    per_spot: float = 0.2  # probability, for each spot in the picture, of a false one near it (the paper's 20 %)
-    within_px: float = 15.0  # of the spot; uniform over that disc
-    per_image: float = 0.0  # mean number of false ones anywhere in a picture (Poisson)
-    strength: tuple[float, float] = (0.3, 1.2)  # of its flux against a spot's, uniform
+    per_spot: float = 0.2  # probability of a false point near each spot in the picture (Huo 2015: 20 %)
+    within_px: float = 15.0  # radius around the spot; uniform over the disc
+    per_image: float = 0.0  # mean number of false points anywhere in a picture (Poisson)
+    strength: tuple[float, float] = (0.3, 1.2)  # flux relative to a spot, uniform
 
 
 @dataclass(frozen=True, slots=True)
 class Hiding:
-    """What stands between a beam and its screen: a hidden spot is hidden from every camera."""
+    """Obstacles between a beam and its screen: an occluded spot is invisible to every camera."""
 
-    miss_probability: float = 0.0  # of each spot in each frame, by itself
-    at_bends_frames: int = 0  # for so many frames around each bend ...
-    at_bends_spots: int = 1  # ... so many spots are hidden, drawn anew for each bend
+    miss_probability: float = 0.0  # of each spot in each frame, independently
+    at_bends_frames: int = 0  # frames of occlusion around each bend ...
+    at_bends_spots: int = 1  # ... and number of occluded spots, drawn for each bend
     blackout_every: int = 0  # frames between the starts of blackouts; 0: none
-    blackout_frames: int = 0  # so long all spots are hidden
-    clean_start: int = 10  # nothing is hidden in the first frames
+    blackout_frames: int = 0  # duration, in which all spots are occluded
+    clean_start: int = 10  # first frames without occlusions
 
 
 @dataclass(frozen=True, slots=True)
 class RecordingFault:
-    """One picture that did not arrive as it should."""
+    """One missing or damaged picture."""
 
     frame: int
     kind: str  # "dropped": no file; "truncated": its second half is missing; "wrong size": half as wide and high
@@ -70,7 +70,7 @@ class RecordingFault:
 
 @dataclass(frozen=True, slots=True)
 class PriorRegion:
-    """Where the vehicle is at the first frame, as run.yaml tells it. The drawn motion begins within it."""
+    """The region of the first pose, as written to run.yaml. The drawn motion starts within it."""
 
     position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     yaw_pitch_roll_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -80,27 +80,27 @@ class PriorRegion:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scenario:
-    """One kind of recording. A seed makes one recording of it."""
+    """One kind of recording; a seed selects one recording."""
 
     name: str
-    summary: str  # what to see in it: one sentence, also the notes of its run.yaml
+    summary: str  # one sentence; also the notes of its run.yaml
     rig: str = "fan"  # a name of lab.simulate.rigs.RIGS
     motion: Motion
     frames: int = 600
     frame_rate_hz: float = 100.0  # the paper's 10 ms
     prior: PriorRegion = PriorRegion()
-    # The phases of the motion are drawn until these hold:
+    # The phases of the motion are drawn until these conditions hold:
     all_in_view_at_start: bool = True
-    always_in_view: tuple[str, ...] = ()  # spots that never leave the picture, in any camera, however long the run is
-    leaves_and_returns: tuple[str, ...] = ()  # spots that do so at least once within the scenario's own frames
+    always_in_view: tuple[str, ...] = ()  # spots that never leave the picture of any camera, for any length of run
+    leaves_and_returns: tuple[str, ...] = ()  # spots that do so at least once within `frames`
     clutter: Clutter = Clutter()
     occlusion: Hiding = Hiding()
     faults: tuple[RecordingFault, ...] = ()
     light: Light = Light()
 
 
-# Every frequency below is a multiple of 0.05 Hz, so that each motion repeats after 20 s and a property that holds for
-# 20 s holds for ever. lab.simulate.scene checks just that long.
+# Every frequency below is a multiple of 0.05 Hz, so that each motion repeats after 20 s and a condition that holds for
+# 20 s always holds. lab.simulate.scene checks this period.
 _SWAY = (Wave("x", 0.7, 0.15), Wave("y", 0.5, 0.2), Wave("z", 0.35, 0.25), Wave("x", 0.28, 0.35), Wave("roll", 24, 0.2))
 _SMOOTH = Motion(
     (0.0, 0.0, 0.0, 7.0, 0.0, 0.0),
@@ -120,12 +120,12 @@ _SHARP = Motion(
 LIGHTS: MappingProxyType[str, Light] = MappingProxyType(
     {
         "lab": Light(),
-        # Nothing but the noise.
+        # Noise only.
         "clean": Light(
             texture=0.0, hot_pixels=0, reflections=0, speckle_contrast=0.0, gradient_dn=3.0, power_spread=0.1
         ),
-        # A dark room, a filter for the lasers' colour, a quiet sensor: nearly all pixels show the black level, so that
-        # the files are small.
+        # An unlit room, a filter for the lasers' wavelength, a sensor with low noise: nearly all pixels are at the
+        # black level, so that the files are small.
         "quiet": Light(
             read_noise_e=6.0, black_dn=4.0, background_dn=0.0, gradient_dn=0.0, reflections=1,
             reflection_dn=6.0,
@@ -168,7 +168,7 @@ _ALL = (
     replace(
         _SMOOTH_SCENARIO,
         name="clean",
-        summary="As smooth, without clutter, speckle, texture, hot pixels, reflections: what the noise alone allows.",
+        summary="As smooth, without clutter, speckle, texture, hot pixels, reflections: errors by noise only.",
         clutter=Clutter(per_spot=0.0),
         light=LIGHTS["clean"],
     ),
@@ -176,7 +176,7 @@ _ALL = (
     replace(
         _SHARP_TURNS,
         name="hidden-in-turn",
-        summary="As sharp-turns, and around every bend one spot is hidden for ten frames.",
+        summary="As sharp-turns, with one spot occluded for ten frames around every bend.",
         occlusion=Hiding(at_bends_frames=10),
     ),
     replace(
@@ -193,7 +193,7 @@ _ALL = (
     ),
     Scenario(
         name="static",
-        summary="The vehicle stands still: what scatters is the measurement.",
+        summary="The vehicle stands still: all scatter is measurement noise.",
         motion=Motion((0.2, -0.1, 0.1, 3.0, 5.0, -8.0), ()),
         always_in_view=("1", "2", "3", "4", "5", "6"),
     ),
@@ -214,20 +214,20 @@ _ALL = (
     replace(
         _HUO2015,
         name="unequal-fan",
-        summary="As huo2015, with 18 and 23 deg between the beams: two beams in view already tell which two they are.",
+        summary="As huo2015, with 18 and 23 deg between the beams: two visible beams can be identified.",
         rig="unequal-fan",
     ),
     replace(
         _SMOOTH_SCENARIO,
         name="two-cameras-per-screen",
-        summary="As smooth, each screen watched by two cameras: pair 3/6 often leaves one of them only.",
+        summary="As smooth, each screen observed by two cameras: pair 3/6 often leaves only one of them.",
         rig="two-cameras-per-screen",
         always_in_view=(),
         leaves_and_returns=(),
     ),
     Scenario(
         name="long-out",
-        summary="The vehicle looks to one side for seconds: pair 3/6 is out of the picture for hundreds of frames.",
+        summary="The vehicle is turned to one side for seconds: pair 3/6 is out of the picture for hundreds of frames.",
         motion=Motion(
             (0.0, 0.0, 0.0, 7.0, 0.0, 0.0),
             (
@@ -242,7 +242,7 @@ _ALL = (
     replace(
         _SMOOTH_SCENARIO,
         name="blackout",
-        summary="As smooth, and every 150 frames all spots are hidden for ten.",
+        summary="As smooth, with all spots occluded for ten frames every 150 frames.",
         occlusion=Hiding(blackout_every=150, blackout_frames=10),
     ),
     replace(

@@ -1,7 +1,7 @@
-"""What happens in one recording, before anyone films it: motion, true spots, what hides them, what pretends to be one.
+"""The truth of one recording: motion, true spots, occlusions and clutter.
 
-Both the points (lab.simulate.points) and the pictures (lab.simulate.write) are made from a scene, so that they tell
-the same story for the same seed.
+Both the points (lab.simulate.points) and the pictures (lab.simulate.write) are made from a scene, so that they agree
+for the same seed.
 """
 
 from __future__ import annotations
@@ -22,25 +22,25 @@ from lab.simulate.rigs import RIGS, scaled, with_noise
 from lab.simulate.scenarios import SCENARIOS, Scenario
 
 # Every random number comes from a generator seeded by (seed, purpose, frame, ...): frame 7 is the same in a recording
-# of ten frames and of a thousand, and the clutter does not change when the noise does.
-MOTION, NUISANCES, BENDS, POINT_NOISE, LIGHT, PIXELS = range(6)
+# of ten frames and of a thousand, and the clutter does not depend on the noise.
+MOTION, CLUTTER_AND_MISSES, BENDS, POINT_NOISE, LIGHT, PIXELS = range(6)
 
-CHECKED_S = 20.0  # the period of every scenario's motion
+CHECKED_S = 20.0  # period of the motion of every scenario
 _CHECKED_EVERY_S = 0.05
-_MARGIN_PX = 12.0  # "always in view" keeps so far from the border: the whole spot is seen
+_MARGIN_PX = 12.0  # distance from the border of a spot in view, so that the whole spot is visible
 _MAX_DRAWS = 3000
 
 SHINING, HIDDEN, OUTSIDE = 1, 2, 0  # in_view of truth/spots.csv
 
 
 @dataclass(frozen=True, slots=True)
-class FalseSpots:
-    """Clutter of a whole recording: m false spots, by frame."""
+class ClutterPoints:
+    """The clutter of a whole recording: m false points, by frame."""
 
     frame: Ints  # (m,)
     camera: Ints  # (m,) index into model.camera_names
     uv_px: Array  # (m, 2), inside the picture
-    strength: Array  # (m,) flux against a true spot's
+    strength: Array  # (m,) flux relative to a true spot
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,19 +51,23 @@ class Scene:
     seed: int
     rig: Rig
     model: SpotModel
-    motion: Motion  # with its phases drawn
+    motion: Motion  # with drawn phases
     frame: Ints  # (T,) 0, 1, ...
     t_s: Array  # (T,) mid-exposure
     poses: Pose  # (T,) world_from_body
     uv_px: Array  # (T, n, 2) true projection, also outside the picture; nan where there is none
     in_view: Ints  # (T, n) SHINING, HIDDEN or OUTSIDE
     has_image: Bools  # (T, cameras) a usable picture exists
-    turned: Bools  # (T,) the motion bent between the frame before and this one
-    false_spots: FalseSpots
+    turned: Bools  # (T,) the motion bends between the frame before and this one
+    clutter_points: ClutterPoints
 
 
-def named(scenario: str | Scenario) -> Scenario:
-    """A scenario by its name. InputError names the known ones."""
+def scenario_named(scenario: str | Scenario) -> Scenario:
+    """The scenario of this name.
+
+    Raises:
+        InputError: no scenario has this name.
+    """
     if isinstance(scenario, Scenario):
         return scenario
     if scenario not in SCENARIOS:
@@ -78,11 +82,14 @@ def compose(
     picture_scale: float = 1.0,
     rig: Rig | None = None,
 ) -> Scene:
-    """One recording of a scenario: everything that happens in `frames` frames (default: the scenario's own).
+    """One recording of a scenario.
 
-    rig: in place of the scenario's.
+    frames: default: those of the scenario. rig: default: that of the scenario.
+
+    Raises:
+        InputError: an unknown scenario, no frames, or a motion that does not meet the conditions of the scenario.
     """
-    scenario = named(scenario)
+    scenario = scenario_named(scenario)
     count = scenario.frames if frames is None else frames
     if count < 1:
         raise InputError(f"frames: expected at least 1, got {count}")
@@ -90,7 +97,7 @@ def compose(
     motion = draw_motion(scenario, SpotModel.of(rig), seed)
     if picture_scale != 1.0:
         rig = scaled(rig, picture_scale)
-    light, deeper = scenario.light, 2.0 ** (scenario.light.bits - 8)  # grey values for the same electrons
+    light, deeper = scenario.light, 2.0 ** (scenario.light.bits - 8)  # more grey values for the same electrons
     rig = with_noise(rig, SensorNoise(light.gain_e_per_dn / deeper, light.read_noise_e, light.black_dn * deeper))
     model = SpotModel.of(rig)
     frame = np.arange(count)
@@ -99,26 +106,30 @@ def compose(
     uv = model.project(poses)[0]
     bend_frames = np.floor(motion.bends_s(float(t_s[-1]) + 1.0) * scenario.frame_rate_hz + 1e-6).astype(np.int64)
     turned = np.isin(frame, bend_frames + 1)
-    hidden, false_spots = _nuisances(scenario, model, uv, bend_frames, seed)
-    in_view = np.where(model.in_picture(uv), np.where(hidden, HIDDEN, SHINING), OUTSIDE)
+    occluded, clutter_points = _occlusions_and_clutter(scenario, model, uv, bend_frames, seed)
+    in_view = np.where(model.in_picture(uv), np.where(occluded, HIDDEN, SHINING), OUTSIDE)
     return Scene(
         scenario, seed, rig, model, motion, frame, t_s, poses, uv, in_view,
-        _pictures_that_arrive(scenario, model, count), turned, false_spots,
+        _usable_pictures(scenario, model, count), turned, clutter_points,
     )  # fmt: skip
 
 
 def draw_motion(scenario: Scenario, model: SpotModel, seed: int) -> Motion:
-    """The first draw of phases for which everything holds that the scenario promises."""
+    """The first draw of phases that meets all conditions of the scenario.
+
+    Raises:
+        InputError: no draw of many meets them.
+    """
     rng = np.random.default_rng([seed, MOTION])
     for _ in range(_MAX_DRAWS):
         motion = scenario.motion.drawn(rng, scenario.frame_rate_hz)
-        if _starts_well(scenario, model, motion) and _keeps_its_promises(scenario, model, motion):
+        if _valid_start(scenario, model, motion) and _valid_views(scenario, model, motion):
             return motion
-    raise InputError(f"scenario {scenario.name!r}: none of {_MAX_DRAWS} motions keeps the spots where it says")
+    raise InputError(f"scenario {scenario.name!r}: none of {_MAX_DRAWS} motions keeps the spots in view as it requires")
 
 
-def _starts_well(scenario: Scenario, model: SpotModel, motion: Motion) -> bool:
-    """The first pose lies within the prior, and all spots in the picture if the scenario wants that."""
+def _valid_start(scenario: Scenario, model: SpotModel, motion: Motion) -> bool:
+    """The first pose lies within the prior, with all spots in the picture if the scenario requires it."""
     prior, start = scenario.prior, motion.pose(np.zeros(()))
     guess = Pose.from_ypr(np.deg2rad(prior.yaw_pitch_roll_deg), np.array(prior.position_m))
     away = start.minus(guess)
@@ -129,13 +140,14 @@ def _starts_well(scenario: Scenario, model: SpotModel, motion: Motion) -> bool:
     return not scenario.all_in_view_at_start or bool(model.in_picture(model.project(start)[0], -_MARGIN_PX).all())
 
 
-def _keeps_its_promises(scenario: Scenario, model: SpotModel, motion: Motion) -> bool:
+def _valid_views(scenario: Scenario, model: SpotModel, motion: Motion) -> bool:
+    """The spots stay in view, or leave and return, as the scenario requires."""
     spot = np.array([name for _, name in model.views])
     own = np.arange(scenario.frames) / scenario.frame_rate_hz
     if scenario.leaves_and_returns:
         views = np.isin(spot, scenario.leaves_and_returns)
         seen = model.subset(views).in_picture(model.subset(views).project(motion.pose(own[::4]))[0])
-        # All begin in view, so whoever is out and then in again has left and returned.
+        # All spots start in view: one that is out of view and later in view has left and returned.
         if not np.all((~seen).any(axis=0) & (seen & (np.cumsum(~seen, axis=0) > 0)).any(axis=0)):
             return False
     if scenario.always_in_view:
@@ -145,22 +157,22 @@ def _keeps_its_promises(scenario: Scenario, model: SpotModel, motion: Motion) ->
     return True
 
 
-def _nuisances(
+def _occlusions_and_clutter(
     scenario: Scenario, model: SpotModel, uv_px: Array, bend_frames: Ints, seed: int
-) -> tuple[Bools, FalseSpots]:
-    """Which views are hidden (T, n), and the clutter."""
+) -> tuple[Bools, ClutterPoints]:
+    """Occlusion of each view (T, n), and the clutter."""
     clutter, occlusion = scenario.clutter, scenario.occlusion
     count, n = uv_px.shape[:2]
     n_spots, n_cameras = len(model.spot_names), len(model.camera_names)
     in_picture = model.in_picture(uv_px)
-    hidden_spots = _hidden_spots(scenario, n_spots, count, bend_frames, seed)
+    occluded_spots = _occluded_spots(scenario, n_spots, count, bend_frames, seed)
     found: list[tuple[int, int, float, float, float]] = []
     low, high = clutter.strength
     for k in range(count):
-        rng = np.random.default_rng([seed, NUISANCES, k])
+        rng = np.random.default_rng([seed, CLUTTER_AND_MISSES, k])
         missed, chance, share, turn, strength = rng.random((5, n))
         if k >= occlusion.clean_start:
-            hidden_spots[k, model.spot_of] |= missed[model.spot_of] < occlusion.miss_probability
+            occluded_spots[k, model.spot_of] |= missed[model.spot_of] < occlusion.miss_probability
         radius = clutter.within_px * np.sqrt(share)
         around = uv_px[k] + radius[:, None] * np.stack([np.cos(2 * np.pi * turn), np.sin(2 * np.pi * turn)], -1)
         near = np.flatnonzero((chance < clutter.per_spot) & in_picture[k] & model.in_picture(around))
@@ -171,41 +183,47 @@ def _nuisances(
                 for u, v, s in rng.random((rng.poisson(clutter.per_image), 3)):
                     found.append((k, camera, u * size[0] - 0.5, v * size[1] - 0.5, low + (high - low) * s))
     table = np.array(found, dtype=float).reshape(-1, 5)
-    false_spots = FalseSpots(table[:, 0].astype(np.int64), table[:, 1].astype(np.int64), table[:, 2:4], table[:, 4])
-    return hidden_spots[:, model.spot_of], false_spots
+    clutter_points = ClutterPoints(
+        table[:, 0].astype(np.int64), table[:, 1].astype(np.int64), table[:, 2:4], table[:, 4]
+    )
+    return occluded_spots[:, model.spot_of], clutter_points
 
 
-def _hidden_spots(scenario: Scenario, n_spots: int, count: int, bend_frames: Ints, seed: int) -> Bools:
-    """(T, spots): hidden at bends and in blackouts. Single misses come on top."""
+def _occluded_spots(scenario: Scenario, n_spots: int, count: int, bend_frames: Ints, seed: int) -> Bools:
+    """(T, spots): occluded at bends and in blackouts, without the misses of single spots."""
     occlusion = scenario.occlusion
-    hidden = np.zeros((count, n_spots), dtype=bool)
+    occluded = np.zeros((count, n_spots), dtype=bool)
     if occlusion.at_bends_frames:
         for i, bend in enumerate(bend_frames):
             spots = np.random.default_rng([seed, BENDS, i]).permutation(n_spots)[: occlusion.at_bends_spots]
             first = max(0, int(bend) + 1 - occlusion.at_bends_frames // 2)
-            hidden[first : first + occlusion.at_bends_frames, spots] = True
+            occluded[first : first + occlusion.at_bends_frames, spots] = True
     if occlusion.blackout_every:
-        dark = np.arange(count) % occlusion.blackout_every < occlusion.blackout_frames
-        hidden[dark & (np.arange(count) >= occlusion.blackout_every)] = True
-    hidden[: occlusion.clean_start] = False
-    return hidden
+        blackout = np.arange(count) % occlusion.blackout_every < occlusion.blackout_frames
+        occluded[blackout & (np.arange(count) >= occlusion.blackout_every)] = True
+    occluded[: occlusion.clean_start] = False
+    return occluded
 
 
-def _pictures_that_arrive(scenario: Scenario, model: SpotModel, count: int) -> Bools:
-    """(T, cameras)."""
-    arrive = np.ones((count, len(model.camera_names)), dtype=bool)
+def _usable_pictures(scenario: Scenario, model: SpotModel, count: int) -> Bools:
+    """(T, cameras): no fault affects the picture."""
+    usable = np.ones((count, len(model.camera_names)), dtype=bool)
     for fault in scenario.faults:
         if fault.frame < count:
             which = slice(None) if fault.camera is None else model.camera_names.index(fault.camera)
-            arrive[fault.frame, which] = False
-    return arrive
+            usable[fault.frame, which] = False
+    return usable
 
 
 def with_overrides(
     scenario: str | Scenario, *, clutter: float | None = None, miss_probability: float | None = None
 ) -> Scenario:
-    """The scenario with another clutter probability per spot, or another chance that a spot is missed."""
-    scenario = named(scenario)
+    """The scenario with another clutter probability per spot, or another probability of a missed spot.
+
+    Raises:
+        InputError: an unknown scenario, or a probability outside 0 to 1.
+    """
+    scenario = scenario_named(scenario)
     if clutter is not None:
         if not 0.0 <= clutter <= 1.0:
             raise InputError(f"clutter: expected a probability per spot and frame, 0 to 1, got {clutter:g}")

@@ -1,4 +1,4 @@
-"""A scenario as a run folder on disk: rig.yaml, run.yaml, pictures (or a video, or points) and truth."""
+"""A scenario as a run folder on disk: rig.yaml, run.yaml, pictures (or videos, or points) and truth."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ from lab.files.run.run_file import save_run
 from lab.files.text import columns
 from lab.files.text.atomic_write import atomic_folder
 from lab.files.text.csv_text import write_table
-from lab.simulate.picture import Picture, Powers, Sensor, laser_powers, make_sensor, take
+from lab.simulate.picture import LaserPowers, Picture, Sensor, laser_powers, make_sensor, render
 from lab.simulate.points import simulate_points
 from lab.simulate.scenarios import LIGHTS, Scenario
 from lab.simulate.scene import Scene, compose, with_overrides
 
-# Noise leaves a predictor nothing to predict, and filters only spread what few pixels differ. A 1280x1024 picture with
-# 1 DN of noise: 414 kB in 13 ms so, 385 kB in 19 ms with OpenCV's own choice of filters; one of light "quiet": 44 kB in
-# 3 ms, against 60 kB in 180 ms with filters and zlib's level 9.
+# PNG filters do not help with noisy or nearly constant pictures. A 1280x1024 picture with 1 DN of noise: 414 kB in
+# 13 ms with these options, 385 kB in 19 ms with the default filters of OpenCV; one of light "quiet": 44 kB in 3 ms,
+# against 60 kB in 180 ms with filters and zlib level 9.
 _PNG = (
     cv2.IMWRITE_PNG_COMPRESSION, 1,
     cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE,
     cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_NONE,
 )  # fmt: skip
 _VIDEO_CODEC = "FFV1"  # lossless
-_BATCH = 8  # pictures that wait to be written into the videos
+_BATCH = 8  # pictures rendered in parallel before they are written to a video
 
 Progress = Callable[[int, int], None]  # pictures done, pictures in all
 
@@ -60,59 +60,67 @@ def simulate(
     """Write one recording of a scenario into a new folder; returns the folder, complete.
 
     The same arguments give the same bytes (with the same versions of numpy and OpenCV), and the first frames do not
-    depend on how many follow.
+    depend on the number of frames.
 
-    scenario: a name of SCENARIOS, or a value. frames: default the scenario's. video: one lossless video per camera in
-    place of PNG files. detections_only: no pictures, but a detections.csv with `noise_px` (1 sigma per axis). light: a
-    name of LIGHTS in place of the scenario's. clutter, miss_probability: as in simulate_points. picture_scale: 0.5
-    gives pictures half as wide and high. noisy: False leaves out shot and read noise (rounding stays). threads: that
-    make and write pictures. progress: called after each picture. rig: a rig.yaml in place of the scenario's rig.
-    known_rig: the rig.yaml that the run gets, such as a calibration of that rig; default: the true one. Raises
-    InputError where an argument does not fit, or the folder exists.
+    scenario: a name of SCENARIOS, or a value. frames: default: those of the scenario. video: one lossless video per
+    camera instead of PNG files. detections_only: no pictures, but a detections.csv with `noise_px` (1 sigma per axis).
+    light: a name of LIGHTS instead of the light of the scenario. clutter, miss_probability: as in simulate_points.
+    picture_scale: 0.5 gives pictures of half the width and height. noisy: False: no shot and read noise, only rounding.
+    threads: number of threads that render and write pictures. progress: called after each picture. rig: a rig.yaml
+    instead of the rig of the scenario. known_rig: the rig.yaml written to the run folder, such as a calibration of
+    that rig; default: the true one.
+
+    Raises:
+        InputError: an argument is not valid, or the folder exists.
     """
     if picture_scale != 1.0 and (rig is not None or known_rig is not None):
-        raise InputError("the pictures of a rig file keep its size: leave out the scale, or the rig")
-    true_rig = None if rig is None else load_rig_file(rig).rig
-    known = None if known_rig is None else load_rig_file(known_rig)
-    scenario = with_overrides(scenario, clutter=clutter, miss_probability=miss_probability)
-    if light is not None:
-        if light not in LIGHTS:
-            raise InputError(f"light: expected one of {', '.join(LIGHTS)}, got {light!r}")
-        scenario = replace(scenario, light=LIGHTS[light])
-    if video and detections_only:
-        raise InputError("a recording is a video or points, not both; choose one")
-    if video and scenario.faults:
-        raise InputError(
-            f"scenario {scenario.name!r} drops or damages pictures, which a video cannot; write it as PNG files"
-        )
-    if video and scenario.light.bits > 8:
-        raise InputError("a video holds 8-bit pictures; write deeper ones as PNG files")
+        raise InputError("the pictures of a rig file keep its size: omit the scale or the rig")
     if not 0.05 <= picture_scale <= 4.0:
         raise InputError(f"picture_scale: expected 0.05 to 4, got {picture_scale:g}")
-    out_folder = Path(out_folder)
-    if out_folder.exists() and (not out_folder.is_dir() or any(out_folder.iterdir())):
-        raise InputError(f"{out_folder}: expected a folder that does not exist yet; choose another or remove it")
-
-    scene = compose(scenario, seed, frames, picture_scale, true_rig)
-    if known is not None and SpotModel.of(known.rig).views != scene.model.views:
-        raise InputError(f"{known_rig}: expected the cameras and spots of the rig that is recorded, got others")
-    with atomic_folder(out_folder, lambda _: False) as part:
-        save_rig(scene.rig if known is None else known, part / "rig.yaml")
-        write_truth(scene, part / "truth")
+    true_rig = None if rig is None else load_rig_file(rig).rig
+    known = None if known_rig is None else load_rig_file(known_rig)
+    scenario = _with_light(with_overrides(scenario, clutter=clutter, miss_probability=miss_probability), light)
+    if video:
+        _check_video(scenario, detections_only)
+    with atomic_folder(Path(out_folder), lambda _: False) as folder:
+        scene = compose(scenario, seed, frames, picture_scale, true_rig)
+        if known is not None and SpotModel.of(known.rig).views != scene.model.views:
+            raise InputError(f"{known_rig}: expected the cameras and spots of the rig that is recorded, got others")
+        save_rig(scene.rig if known is None else known, folder / "rig.yaml")
+        write_truth(scene, folder / "truth")
         if detections_only:
-            _write_detections(scene, noise_px, picture_scale, true_rig, part / "detections.csv")
+            _write_detections(scene, noise_px, picture_scale, true_rig, folder / "detections.csv")
             sources = {name: {"detections": "detections.csv"} for name in scene.model.camera_names}
-        elif video:
-            sources = _write_videos(scene, part, noisy, threads, progress)
         else:
-            sources = _write_pictures(scene, part, noisy, threads, progress)
-        save_run(_run_mapping(scene, sources, known), part)
-    return out_folder
+            write = _write_videos if video else _write_pictures
+            sources = write(scene, folder, noisy, threads, progress)
+        save_run(_run_mapping(scene, sources, known), folder)
+    return Path(out_folder)
+
+
+def _with_light(scenario: Scenario, light: str | None) -> Scenario:
+    """The scenario with a light of LIGHTS; None: with its own."""
+    if light is None:
+        return scenario
+    if light not in LIGHTS:
+        raise InputError(f"light: expected one of {', '.join(LIGHTS)}, got {light!r}")
+    return replace(scenario, light=LIGHTS[light])
+
+
+def _check_video(scenario: Scenario, detections_only: bool) -> None:
+    if detections_only:
+        raise InputError("a recording is a video or points, not both; choose one")
+    if scenario.faults:
+        raise InputError(
+            f"scenario {scenario.name!r} has missing or damaged pictures, which a video cannot contain; write PNG files"
+        )
+    if scenario.light.bits > 8:
+        raise InputError("a video contains 8-bit pictures; write pictures with more bits as PNG files")
 
 
 def _run_mapping(scene: Scene, sources: dict[str, dict[str, str]], known: RigFile | None) -> dict[str, object]:
     prior = scene.scenario.prior
-    # A simulation has no day of its own: it takes place when its rig was calibrated.
+    # The date of a simulated run is that of the calibration of its rig.
     state = None if known is None else known.calibration
     day = {} if state is None else {"recorded": state.date.isoformat()}
     return {
@@ -133,7 +141,7 @@ def _run_mapping(scene: Scene, sources: dict[str, dict[str, str]], known: RigFil
 
 
 def write_truth(scene: Scene, folder: Path) -> None:
-    """truth/pose.csv and truth/spots.csv: every frame, also those whose pictures are missing."""
+    """Write truth/pose.csv and truth/spots.csv with every frame, also those without pictures."""
     folder.mkdir(parents=True)
     quaternions = scene.poses.quaternion_wxyz
     write_table(
@@ -175,14 +183,14 @@ def _workers(threads: int | None) -> int:
     return threads if threads is not None else min(4, os.cpu_count() or 1)
 
 
-def _sensors(scene: Scene) -> tuple[list[Sensor], Powers]:
+def _sensors(scene: Scene) -> tuple[list[Sensor], LaserPowers]:
     return [make_sensor(scene, c) for c in range(len(scene.model.camera_names))], laser_powers(scene)
 
 
 def _write_pictures(
     scene: Scene, folder: Path, noisy: bool, threads: int | None, progress: Progress | None
 ) -> dict[str, dict[str, str]]:
-    """frames/CAMERA/NNNNNN.png, with the scenario's faults."""
+    """Write frames/CAMERA/NNNNNN.png with the faults of the scenario."""
     sensors, powers = _sensors(scene)
     names = scene.model.camera_names
     for name in names:
@@ -195,7 +203,7 @@ def _write_pictures(
         fault = faults.get((k, name))
         if fault == "dropped":
             return
-        picture = take(scene, sensor, powers, k, noisy=noisy)
+        picture = render(scene, sensor, powers, k, noisy=noisy)
         if fault == "wrong size":
             picture = picture[: picture.shape[0] // 2, : picture.shape[1] // 2]
         data = cv2.imencode(".png", picture, _PNG)[1].tobytes()
@@ -218,7 +226,7 @@ def _write_pictures(
 def _write_videos(
     scene: Scene, folder: Path, noisy: bool, threads: int | None, progress: Progress | None
 ) -> dict[str, dict[str, str]]:
-    """CAMERA.avi, frame n being its n-th picture."""
+    """Write CAMERA.avi; its n-th picture is frame n."""
     sensors, powers = _sensors(scene)
     names = scene.model.camera_names
     done = 0
@@ -232,7 +240,7 @@ def _write_videos(
                 raise InputError(f"{path.name}: this OpenCV cannot write {_VIDEO_CODEC} video; write PNG files instead")
 
             def picture(k: int, sensor: Sensor = sensor) -> Picture:
-                return take(scene, sensor, powers, k, noisy=noisy)
+                return render(scene, sensor, powers, k, noisy=noisy)
 
             try:
                 for first in range(0, len(scene.frame), _BATCH):

@@ -1,4 +1,4 @@
-"""Section 5.1 of Huo, Yang & Yang (2015) repeated on simulated points: the figures, each beside the printed one."""
+"""Repetition of Huo, Yang & Yang (2015), section 5.1, on simulated points, compared with the published figures."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from tracking.parameters import TrackerParameters
 from tracking.statuses import SpotStatus
 from tracking.tracked_frame import TrackedFrame
 
-NOISE_PX = 0.1  # the paper states none; its 0.68 px of prediction error fits 0.1 to 0.3
-STIFF_PX_S2, LOOSE_PX_S2 = 300.0, 5000.0  # a filter that trusts straight lines, and one that does not
-R1_PX = 10.0  # the first search radius: beyond it the trajectory counts as bent
-BEND_FRAMES = 2  # the bend and the frame after it, which the paper's RMS leaves out as well
+NOISE_PX = 0.1  # not stated in the paper; its prediction error of 0.68 px is consistent with 0.1 to 0.3
+STIFF_PX_S2, LOOSE_PX_S2 = 300.0, 5000.0  # small and large process noise of the filter
+R1_PX = 10.0  # the first search radius; a larger innovation counts as a bend
+BEND_FRAMES = 2  # the bend and the frame after it, excluded from the RMS in the paper as well
 START_FRAMES = 5
 
 PAPER = TrackerParameters(
@@ -47,7 +47,7 @@ CONVENTIONAL = TrackerParameters(
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One line of figures.csv; None where a column has no such figure."""
+    """One line of figures.csv; None where a column has no value."""
 
     quantity: str
     unit: str
@@ -59,35 +59,35 @@ class Row:
 
 
 @dataclass(frozen=True, slots=True)
-class Tracked:
-    """A tracker's way through the recording, T frames, n views."""
+class TrackedRun:
+    """The output of a tracker for the recording, T frames, n views."""
 
     uv_px: Array  # (T, n, 2)
     prediction_error_px: Array  # (T, n, 2), predicted minus true
-    right: Bools  # (T, n) the detection taken is that spot's
-    taken: Bools  # (T, n) some detection was taken
+    right: Bools  # (T, n) the label is correct
+    taken: Bools  # (T, n) a detection has the label
     outside: Bools  # (T, n) reported out of view
 
 
 @dataclass(frozen=True, slots=True)
 class Study:
-    """Everything that the page shows."""
+    """The content of the page."""
 
     seed: int
     run: PointRun
     rows: tuple[Row, ...]
-    same_spots: dict[str, Array]  # name of a filter: (T, n, 2) prediction error on the same spots
-    outside_px: dict[str, Array]  # name of a way: (T, n) error of spots out of view; nan elsewhere
-    trackers: dict[str, Tracked]
+    prediction_errors: dict[str, Array]  # name of a filter: (T, n, 2) prediction error on the same spots
+    outside_px: dict[str, Array]  # name of a method: (T, n) error of spots out of view; nan elsewhere
+    trackers: dict[str, TrackedRun]
     bends: Bools  # (T,)
 
 
 def repeat_huo2015(seed: int, frames: int) -> Study:
-    """The experiment itself, on points with 0.1 px noise and 20 % clutter; deterministic by seed."""
+    """The experiment on points with 0.1 px noise and 20 % clutter; the seed determines the result."""
     run = simulate_points("huo2015", seed, frames=frames, noise_px=NOISE_PX)
     bends = _bends(run)
     same = {
-        f"{kind}, {name}": same_spots(run, sigma_a, switch)
+        f"{kind}, {name}": prediction_errors(run, sigma_a, switch)
         for name, sigma_a in (("stiff", STIFF_PX_S2), ("loose", LOOSE_PX_S2))
         for kind, switch in (("conventional", False), ("curve switching", True))
     }
@@ -96,13 +96,15 @@ def repeat_huo2015(seed: int, frames: int) -> Study:
         "curve switching": track(run, PAPER),
         "beampose": track(run, TrackerParameters(method="spots")),
     }
-    outside = {f"{way}, {noise:g} px": outside_error(run, way, noise) for noise in (0.0, NOISE_PX) for way in WAYS}
+    outside = {
+        f"{way}, {noise:g} px": out_of_view_errors(run, way, noise) for noise in (0.0, NOISE_PX) for way in METHODS
+    }
     rows = (*_filter_rows(run, same, bends), *_outside_rows(run, outside), *_tracker_rows(run, trackers, bends))
     return Study(seed, run, rows, same, outside, trackers, bends)
 
 
 def _bends(run: PointRun) -> Bools:
-    """(T,) the frames of bends, which the RMS leaves out."""
+    """(T,) the frames of bends, which are excluded from the RMS."""
     out = np.zeros(len(run.frame), dtype=bool)
     for later in range(BEND_FRAMES):
         out[later:] |= run.turned[: len(out) - later]
@@ -112,11 +114,11 @@ def _bends(run: PointRun) -> Bools:
 # The two filters on the same spots (Figs. 5 and 6) ----------------------------------------------------------------
 
 
-def same_spots(run: PointRun, sigma_a_px_s2: float, switch: bool) -> Array:
-    """(T, n, 2): prediction error, px, of filters that are given each spot's own noisy position, without clutter.
+def prediction_errors(run: PointRun, sigma_a_px_s2: float, switch: bool) -> Array:
+    """(T, n, 2): prediction error, px, of filters that get the noisy position of their own spot, without clutter.
 
-    So nothing but the filter differs. With `switch` a spot beyond r1 from its prediction, or beyond what its covariance
-    allows, restarts its filter by eq. (6). A spot out of the picture is not given; its filter starts anew on return.
+    Only the filters differ. With `switch`, a filter is restarted by eq. (6) if its innovation exceeds r1 or is not
+    consistent with its covariance. A spot outside the picture is not measured; its filter starts again on return.
     """
     rng = np.random.default_rng([run.seed, 51])
     z = run.uv_px + run.noise_px * rng.standard_normal(run.uv_px.shape)
@@ -124,22 +126,22 @@ def same_spots(run: PointRun, sigma_a_px_s2: float, switch: bool) -> Array:
     R = np.tile(np.eye(2) * run.noise_px**2, (n, 1, 1))
     error = np.full((T, n, 2), np.nan)
     x, P = np.zeros((n, 4)), np.tile(np.eye(4), (n, 1, 1))
-    age = np.zeros(n, dtype=int)  # positions taken since the filter began; two make a velocity
+    age = np.zeros(n, dtype=int)  # measurements since the start of the filter; two give a velocity
     for k in range(T):
         dt = float(run.t_s[k] - run.t_s[k - 1]) if k else 0.0
         if k:
             x, P = kalman.predict(x, P, dt, np.full(n, sigma_a_px_s2))
         seen = run.in_view[k] == 1
-        told = seen & (age >= 2)
-        error[k, told] = x[told, :2] - run.uv_px[k, told]
+        predicted = seen & (age >= 2)
+        error[k, predicted] = x[predicted, :2] - run.uv_px[k, predicted]
         _, _, nis = kalman.innovation(x, P, np.where(seen[:, None], z[k], x[:, :2]), R)
         bent = (np.linalg.norm(z[k] - x[:, :2], axis=-1) > R1_PX) | (nis > BENT_NIS)
-        anew = seen & ((age == 1) | ((age >= 2) & bent & switch))
-        go = seen & (age >= 2) & ~anew
-        if anew.any():
-            x[anew], P[anew] = kalman.restart(z[k, anew], R[anew], z[k - 1, anew], R[anew], dt)
-        if go.any():
-            x[go], P[go] = kalman.update(x[go], P[go], z[k, go], R[go])
+        restart = seen & ((age == 1) | ((age >= 2) & bent & switch))
+        update = seen & (age >= 2) & ~restart
+        if restart.any():
+            x[restart], P[restart] = kalman.restart(z[k, restart], R[restart], z[k - 1, restart], R[restart], dt)
+        if update.any():
+            x[update], P[update] = kalman.update(x[update], P[update], z[k, update], R[update])
         first = seen & (age == 0)
         x[first, :2], x[first, 2:] = z[k, first], 0.0
         age = np.where(seen, age + 1, 0)
@@ -149,8 +151,8 @@ def same_spots(run: PointRun, sigma_a_px_s2: float, switch: bool) -> Array:
 # The whole trackers (Figs. 8 and 9, eq. 15) -----------------------------------------------------------------------
 
 
-def track(run: PointRun, parameters: TrackerParameters) -> Tracked:
-    """A tracker's way through the recording."""
+def track(run: PointRun, parameters: TrackerParameters) -> TrackedRun:
+    """The output of the tracker with these parameters."""
     p = run.prior
     centre = Pose.from_ypr(np.deg2rad(p.yaw_pitch_roll_deg), np.array(p.position_m))
     tracker = SpotTracker(run.rig, parameters, PosePrior(centre, p.within_m, float(np.deg2rad(p.within_deg))))
@@ -162,7 +164,7 @@ def track(run: PointRun, parameters: TrackerParameters) -> Tracked:
     origin = np.full(point.shape, NO_POINT)
     for k, v in zip(*np.nonzero(point >= 0), strict=True):
         origin[k, v] = run.origin[k][run.model.camera_of[v]][point[k, v]]
-    return Tracked(
+    return TrackedRun(
         uv_px=np.array([f.uv_px for f in frames]),
         prediction_error_px=np.array([f.predicted_px for f in frames]) - run.uv_px,
         right=(point >= 0) & (origin == np.arange(point.shape[1])),
@@ -173,14 +175,14 @@ def track(run: PointRun, parameters: TrackerParameters) -> Tracked:
 
 # Positions out of view (Figs. 7 and 12) ---------------------------------------------------------------------------
 
-WAYS = ("quadratic", "rigid")
+METHODS = ("quadratic", "rigid")
 
 
-def outside_error(run: PointRun, way: str, noise_px: float) -> Array:
-    """(T, n): distance, px, of spots outside the picture from where they are solved to be; nan elsewhere.
+def out_of_view_errors(run: PointRun, way: str, noise_px: float) -> Array:
+    """(T, n): error, px, of the computed positions of spots outside the picture; nan elsewhere.
 
-    The other spots are given rightly labelled, with the noise. quadratic: eqs. (10) to (14) from two beams; rigid: the
-    pose of all seen spots, projected.
+    The other spots have noise and correct labels. way: `quadratic`: eqs. (10) to (14) from two beams; `rigid`:
+    projection from the pose of all visible spots.
     """
     rng = np.random.default_rng([run.seed, 52])
     T, n = run.in_view.shape
@@ -213,7 +215,7 @@ def _rms(error: Array, use: Bools) -> tuple[float, float]:
 
 
 def _steady(run: PointRun, bends: Bools) -> Bools:
-    """(T, n): shining spots, bends and the start apart."""
+    """(T, n): visible spots, without bends and the start."""
     use = (run.in_view == 1) & ~bends[:, None]
     use[:START_FRAMES] = False
     return np.asarray(use)
@@ -233,8 +235,8 @@ def _filter_rows(run: PointRun, same: dict[str, Array], bends: Bools) -> list[Ro
                     conventional[axis],
                     switching[axis],
                     None,
-                    f"sigma_a {STIFF_PX_S2 if name == 'stiff' else LOOSE_PX_S2:g} px/s^2; bends apart; printed for the"
-                    " switching filter only",
+                    f"sigma_a {STIFF_PX_S2 if name == 'stiff' else LOOSE_PX_S2:g} px/s^2; without bends; published for"
+                    " the switching filter only",
                 )
             )
     return out
@@ -245,7 +247,7 @@ def _outside_rows(run: PointRun, outside: dict[str, Array]) -> list[Row]:
     for noise in (0.0, NOISE_PX):
         for name, printed in (("3", 0.05), ("6", 0.05)):
             views = [i for i, (_, spot) in enumerate(run.model.views) if spot == name]
-            worst = {way: float(np.nanmax(outside[f"{way}, {noise:g} px"][:, views])) for way in WAYS}
+            worst = {way: float(np.nanmax(outside[f"{way}, {noise:g} px"][:, views])) for way in METHODS}
             out.append(
                 Row(
                     f"largest out-of-view error, spot {name}, {noise:g} px noise",
@@ -254,21 +256,21 @@ def _outside_rows(run: PointRun, outside: dict[str, Array]) -> list[Row]:
                     None,
                     worst["quadratic"],
                     worst["rigid"],
-                    "quadratic | rigid body (column beampose); printed: 0.05 simulated, 2.5 on the bench",
+                    "quadratic | rigid body (column beampose); published: 0.05 simulated, 2.5 measured",
                 )
             )
     return out
 
 
-def _tracker_rows(run: PointRun, trackers: dict[str, Tracked], bends: Bools) -> list[Row]:
+def _tracker_rows(run: PointRun, trackers: dict[str, TrackedRun], bends: Bools) -> list[Row]:
     use = _steady(run, bends)
-    shining = run.in_view == 1
+    visible = run.in_view == 1
     exists = ~np.isnan(run.uv_px[..., 0])
 
     def row(quantity: str, unit: str, printed: float | None, of: dict[str, float], note: str) -> Row:
         return Row(quantity, unit, printed, of["conventional"], of["curve switching"], of["beampose"], note)
 
-    def largest(t: Tracked) -> float:
+    def largest(t: TrackedRun) -> float:
         return float(np.nanmax(np.linalg.norm(t.uv_px - run.uv_px, axis=-1)[START_FRAMES:]))
 
     prediction = {name: _rms(t.prediction_error_px, use & t.right) for name, t in trackers.items()}
@@ -280,39 +282,39 @@ def _tracker_rows(run: PointRun, trackers: dict[str, Tracked], bends: Bools) -> 
             "px",
             2.5,
             {n: largest(t) for n, t in trackers.items()},
-            "any spot, in or out of view; printed for the bench",
+            "any spot, in or out of view; published value is measured",
         ),
         row(
             "recognition rate, eq. (15)",
             "%",
             65.97,
             {n: 100 * float(t.right.sum() / exists.sum()) for n, t in trackers.items()},
-            "every out-of-view estimate counts as wrong, as it seems to in the paper: this hides the two next rows",
+            "every out-of-view estimate counts as wrong, as apparently in the paper; this dominates the two next rows",
         ),
         row(
             "right identity of spots in view",
             "%",
             None,
-            {n: 100 * float((t.right & shining).sum() / shining.sum()) for n, t in trackers.items()},
-            "of spots that shine in the picture",
+            {n: 100 * float((t.right & visible).sum() / visible.sum()) for n, t in trackers.items()},
+            "of visible spots in the picture",
         ),
         row(
             "wrong labels",
             "%",
             None,
             {n: 100 * float((t.taken & ~t.right).sum() / max(t.taken.sum(), 1)) for n, t in trackers.items()},
-            "of all detections taken",
+            "of all labelled detections",
         ),
         row(
             "out-of-view RMS while tracking",
             "px",
             None,
             {n: _outside_rms(run, t) for n, t in trackers.items()},
-            "spots 3 and 6, from the tracker's own labels",
+            "spots 3 and 6, with the labels of the tracker",
         ),
     ]
 
 
-def _outside_rms(run: PointRun, t: Tracked) -> float:
+def _outside_rms(run: PointRun, t: TrackedRun) -> float:
     gap = np.linalg.norm(t.uv_px - run.uv_px, axis=-1)[t.outside & (run.in_view == 0)]
     return float(np.sqrt(np.mean(gap**2))) if len(gap) else float("nan")

@@ -1,4 +1,4 @@
-"""Published experiments repeated, as tables and pages."""
+"""Repetitions of published experiments, written as tables and pages."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ COLUMNS = ("quantity", "unit", "paper", "conventional", "curve_switching", "beam
 
 @dataclass(frozen=True, slots=True)
 class StudyOutcome:
-    """What was written, and lines for the command line."""
+    """The files written, and the lines printed."""
 
     lines: tuple[str, ...]
     table: Path
@@ -23,7 +23,11 @@ class StudyOutcome:
 
 
 def study_huo2015(out: Path, seed: int = 1, frames: int = 600) -> StudyOutcome:
-    """Repeat section 5.1 into the folder `out`: figures.csv and report.html. Raises InputError if `out` is in use."""
+    """Repeat section 5.1 of Huo (2015); write figures.csv and report.html into the folder `out`.
+
+    Raises:
+        InputError: `out` contains other files.
+    """
     study = repeat_huo2015(seed, frames)
     with atomic_folder(out, may_replace=lambda folder: (folder / "figures.csv").is_file()) as work:
         values = [[getattr(row, name) for name in COLUMNS] for row in study.rows]

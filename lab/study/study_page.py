@@ -1,8 +1,7 @@
-"""The page of a repeated experiment: its table beside the printed figures, and the curves."""
+"""The page of a repeated experiment: its table beside the published figures, and its curves."""
 
 from __future__ import annotations
 
-from html import escape
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +10,14 @@ from markupsafe import Markup
 from geometry.arrays import Array
 from lab.files.text.atomic_write import atomic_write_text
 from lab.report.html import environment
-from lab.report.plot import svg
-from lab.report.plot.svg import Line, Scale, Shade
+from lab.report.plot.axes import axes, plane, svg_of
+from lab.report.plot.scales import robust_range
+from lab.report.plot.series import Line, Shade, time_panel
+from lab.report.plot.svg import BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILLION, line_path, text
 from lab.study.experiment_huo2015 import Study
 
-U_COLOUR, V_COLOUR = "#0072b2", "#d55e00"
-_TRACK_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")  # told apart by all eyes
+U_COLOUR, V_COLOUR = BLUE, VERMILLION
+_TRACK_COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY)
 
 
 def write_study(study: Study, folder: Path) -> Path:
@@ -51,8 +52,8 @@ def _figures(study: Study) -> list[tuple[str, str, str]]:
     out = []
     spot_1 = next(i for i, (_, spot) in enumerate(n.views) if spot == "1")
     for name in ("stiff", "loose"):
-        errors = [study.same_spots[f"{kind}, {name}"][:, spot_1] for kind in ("conventional", "curve switching")]
-        y_range = svg.robust_range(np.concatenate(errors), 0.5)
+        errors = [study.prediction_errors[f"{kind}, {name}"][:, spot_1] for kind in ("conventional", "curve switching")]
+        y_range = robust_range(np.concatenate(errors), 0.5)
         panels = [
             _panel(t, f"{kind}, {name}: predicted − true, spot 1", e, shade, y_range)
             for kind, e in zip(("conventional", "curve switching"), errors, strict=True)
@@ -60,8 +61,8 @@ def _figures(study: Study) -> list[tuple[str, str, str]]:
         out.append(
             (
                 f"Prediction by the conventional and the curve-switching filter, {name} (Figs. 5 and 6)",
-                "Both are given the same noisy positions. After a bend the conventional filter needs long to come back"
-                " when it trusts straight lines; a loose one hardly needs the switch.",
+                "Both filters get the same noisy positions. After a bend the conventional filter needs many frames to"
+                " converge if its process noise is small; with a large process noise switching has little effect.",
                 "".join(panels),
             )
         )
@@ -74,20 +75,21 @@ def _figures(study: Study) -> list[tuple[str, str, str]]:
             for way, colour in (("quadratic", V_COLOUR), ("rigid", U_COLOUR))
         )
         panels.append(
-            svg.time_panel(t, f"spot {spot}: distance from truth, {study.run.noise_px:g} px noise", "px", lines=lines)
+            time_panel(t, f"spot {spot}: distance from truth, {study.run.noise_px:g} px noise", "px", lines=lines)
         )
     out.append(
         (
             "Spots out of view (Figs. 7 and 12)",
-            "Solved from the other spots by the paper's quadratic, and from the pose of all seen spots. Without noise"
-            " both are right to rounding; the printed 0.05 px means an input noise of about 0.004 px.",
+            "Solved from the other spots by the paper's quadratic equation, and from the pose of all visible spots."
+            " Without noise both are exact to rounding; the published 0.05 px corresponds to an input noise of about"
+            " 0.004 px.",
             "".join(panels),
         )
     )
     out.append(
         (
             "Trajectories (Fig. 8)",
-            "As tracked by beampose; the frame is the picture, beyond it positions are solved.",
+            "As tracked by beampose. The rectangle is the edge of the picture; positions outside are solved.",
             "".join(_tracks(study, c) for c in range(len(n.camera_names))),
         )
     )
@@ -95,39 +97,33 @@ def _figures(study: Study) -> list[tuple[str, str, str]]:
     for i, (camera, spot) in enumerate(n.views):
         e = study.trackers["beampose"].uv_px[:, i] - study.run.uv_px[:, i]
         outside = (Shade(study.run.in_view[:, i] == 0, "outside", "out of view"),)
-        panels.append(_panel(t, f"spot {spot} ({camera}): estimate − true", e, outside, svg.robust_range(e, 0.5)))
-    out.append(("Tracking error (Figs. 9 and 13)", "Measured in view, solved outside (shaded).", "".join(panels)))
+        panels.append(_panel(t, f"spot {spot} ({camera}): estimate − true", e, outside, robust_range(e, 0.5)))
+    out.append(("Tracking error (Figs. 9 and 13)", "Measured in view, solved out of view (shaded).", "".join(panels)))
     return out
 
 
 def _panel(t: Array, title: str, error: Array, shades: tuple[Shade, ...], y_range: tuple[float, float]) -> str:
     lines = (Line(error[:, 0], U_COLOUR, "x (u)"), Line(error[:, 1], V_COLOUR, "y (v)"))
-    return svg.time_panel(t, title, "px", lines=lines, shades=shades, y_range=y_range)
+    return time_panel(t, title, "px", lines=lines, shades=shades, y_range=y_range)
 
 
 def _tracks(study: Study, camera: int) -> str:
-    """The ways of one camera's spots over its picture."""
+    """The tracks of one camera's spots with the edge of its picture."""
     model, uv = study.run.model, study.trackers["beampose"].uv_px
     views = np.flatnonzero(model.camera_of == camera)
-    width, height = model.image_size_px[views[0]]
-    all_u, all_v = uv[:, views, 0], uv[:, views, 1]
-    lo = np.minimum([np.nanmin(all_u), np.nanmin(all_v)], 0.0) - 20
-    hi = np.maximum([np.nanmax(all_u), np.nanmax(all_v)], [width, height]) + 20
-    scale = 540 / (hi[0] - lo[0])
-    X = Scale(lo[0], hi[0], 0, 540)
-    Y = Scale(lo[1], hi[1], 20, 20 + scale * (hi[1] - lo[1]))
-    out = [svg.text(0, 12, f"camera {model.camera_names[camera]}", "title")]
-    x, y = X(np.array([0.0, width])), Y(np.array([0.0, height]))
-    box = f'x="{x[0]:.1f}" y="{y[0]:.1f}" width="{x[1] - x[0]:.1f}" height="{y[1] - y[0]:.1f}"'
+    size = np.array(model.image_size_px[views[0]], dtype=float)
+    lo = np.minimum(np.nanmin(uv[:, views], axis=(0, 1)), 0.0) - 20
+    hi = np.maximum(np.nanmax(uv[:, views], axis=(0, 1)), size) + 20
+    p = plane((lo[0], hi[0]), (lo[1], hi[1]), equal=True, y_down=True, bottom=38)
+    title = f"camera {model.camera_names[camera]}"
+    out = axes(p, title, "u (px)", "v (px)", grid=False)
+    (x0, y0), (x1, y1) = p.at(np.array([[0.0, 0.0], size])).tolist()
+    box = f'x="{x0:.1f}" y="{y0:.1f}" width="{x1 - x0:.1f}" height="{y1 - y0:.1f}"'
     out.append(f'<rect {box} fill="none" stroke="currentColor" stroke-width="1"/>')
     for v in views:
         colour = _TRACK_COLOURS[int(model.spot_of[v]) % len(_TRACK_COLOURS)]
-        path = svg.line_path(X(uv[:, v, 0]), Y(uv[:, v, 1]))
-        out.append(f'<path d="{path}" fill="none" stroke="{colour}" stroke-width="1.3"/>')
-        k = int(np.flatnonzero(~np.isnan(uv[:, v, 0]))[0])
-        out.append(
-            svg.text(float(X(uv[k, v, 0])) + 5, float(Y(uv[k, v, 1])) - 5, model.views[v][1], "", f"fill:{colour}")
-        )
-    size = f"0 0 540 {Y.b + 5:.0f}"
-    name = escape(f"tracks of camera {model.camera_names[camera]}")
-    return f'<svg viewBox="{size}" role="img" aria-label="{name}">{"".join(out)}</svg>'
+        at = p.at(uv[:, v])
+        out.append(f'<path d="{line_path(at[:, 0], at[:, 1])}" fill="none" stroke="{colour}" stroke-width="1.3"/>')
+        x, y = at[int(np.flatnonzero(~np.isnan(at[:, 0]))[0])].tolist()
+        out.append(text(x + 5, y - 5, model.views[v][1], "", f"fill:{colour}"))
+    return svg_of(p, f"tracks of {title}", out)

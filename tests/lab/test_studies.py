@@ -1,4 +1,4 @@
-"""The repeated experiment: what it must show of the paper, and that its files are whole."""
+"""The repeated experiment shows the effects of the paper, and its files are complete."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import csv
 import numpy as np
 import pytest
 
-from lab.study.experiment_huo2015 import NOISE_PX, repeat_huo2015, same_spots
+from lab.study.experiment_huo2015 import NOISE_PX, prediction_errors, repeat_huo2015
 from lab.study.studies import COLUMNS, study_huo2015
 
 FRAMES = 200  # a bend, and spots 3 and 6 leave the picture
@@ -22,27 +22,27 @@ def value(study, quantity, column):
     return next(getattr(row, column) for row in study.rows if row.quantity == quantity)
 
 
-def test_without_noise_both_ways_put_a_spot_out_of_view_where_it_is(study):
+def test_without_noise_both_methods_are_exact_out_of_view(study):
     for way in ("quadratic", "rigid"):
         error = study.outside_px[f"{way}, 0 px"]
         assert np.isfinite(error).any(), "spots 3 and 6 leave the picture in this recording"
         assert np.nanmax(error) < 1e-6
 
 
-def test_the_rigid_body_is_no_worse_outside_than_the_quadratic(study):
+def test_the_rigid_body_is_at_least_as_accurate_out_of_view_as_the_quadratic_equation(study):
     quadratic, rigid = (study.outside_px[f"{way}, {NOISE_PX:g} px"] for way in ("quadratic", "rigid"))
     assert np.sqrt(np.nanmean(rigid**2)) <= np.sqrt(np.nanmean(quadratic**2))
 
 
-def test_a_stiff_filter_recovers_from_a_bend_sooner_when_it_restarts(study):
+def test_a_filter_with_low_process_noise_recovers_from_a_bend_faster_with_a_restart(study):
     after = np.flatnonzero(study.run.turned)[0] + np.arange(2, 12)
     conventional, switching = (
-        np.sqrt(np.nanmean(same_spots(study.run, 300.0, switch)[after] ** 2)) for switch in (False, True)
+        np.sqrt(np.nanmean(prediction_errors(study.run, 300.0, switch)[after] ** 2)) for switch in (False, True)
     )
     assert switching < 0.7 * conventional
 
 
-def test_the_paper_s_rate_counts_out_of_view_estimates_as_wrong_and_the_identity_in_view_does_not(study):
+def test_only_the_recognition_rate_of_the_paper_counts_out_of_view_estimates_as_wrong(study):
     rate = value(study, "recognition rate, eq. (15)", "beampose")
     identity = value(study, "right identity of spots in view", "beampose")
     outside = 100 * np.mean(study.run.in_view == 0)
@@ -50,7 +50,7 @@ def test_the_paper_s_rate_counts_out_of_view_estimates_as_wrong_and_the_identity
     assert rate == pytest.approx(identity * (100 - outside) / 100, abs=0.5)
 
 
-def test_the_same_seed_gives_the_same_table_and_the_files_are_whole(tmp_path, study):
+def test_the_same_seed_gives_the_same_table_and_the_files_are_complete(tmp_path, study):
     outcome = study_huo2015(tmp_path / "study", seed=3, frames=FRAMES)
     with outcome.table.open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))

@@ -13,8 +13,8 @@ import pytest
 from bench.random_pictures.adapter import model_of_pictures, variance_at
 from bench.random_pictures.judge import (
     LEAST_SNR,
-    asked_pairs,
     compared,
+    counted_pairs,
     judge,
     oracle_scene,
     visible,
@@ -94,14 +94,14 @@ def test_a_spot_beside_another_light_is_not_asked_for():
     for k in range(4):
         for c in range(len(renderer.still)):
             renderer.expected(k, c)
-    asked = asked_pairs(renderer)
-    k, view = np.argwhere(asked)[0]
+    pairs = counted_pairs(renderer)
+    k, view = np.argwhere(pairs)[0]
     c = renderer.ps.scene.camera_of[view]
     u, v = renderer.ps.scene.uv_px[k, view]
     beside = u + 3 * renderer.width_px[view] + 2
     renderer.still[c] = replace(renderer.still[c], bright=np.array([[beside, v, 1.0]]))
-    assert not asked_pairs(renderer)[k, view]
-    assert asked_pairs(renderer).sum() < asked.sum()
+    assert not counted_pairs(renderer)[k, view]
+    assert counted_pairs(renderer).sum() < pairs.sum()
 
 
 @pytest.fixture(scope="module")
@@ -120,7 +120,7 @@ def test_a_right_answer_is_judged_right(solved):
     renderer, out = solved
     row = judge(renderer, out, 0, (0.0, 0.0))
     assert row.counts
-    assert row.asked > 0.8 * visible(renderer).sum()
+    assert row.pairs > 0.8 * visible(renderer).sum()
     assert row.right == 1.0
     assert row.recall == 1.0
     assert row.wrong == row.wrong_poses == 0

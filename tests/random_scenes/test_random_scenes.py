@@ -133,10 +133,10 @@ def test_the_oracle_finds_its_own_poses_consistent(scenes):
 
 def test_the_oracle_leaves_out_what_shows_no_pose(easy):
     assert ask_oracle(easy).counts
-    dark = replace(easy, in_view=np.where(easy.camera_of == 0, HIDDEN, easy.in_view))
+    occluded = replace(easy, in_view=np.where(easy.camera_of == 0, HIDDEN, easy.in_view))
     found = tuple((Detections.none(), frame[1]) for frame in easy.detections)
     origin = tuple((np.zeros(0, dtype=np.int64), frame[1]) for frame in easy.origin)
-    oracle = ask_oracle(replace(dark, detections=found, origin=origin))
+    oracle = ask_oracle(replace(occluded, detections=found, origin=origin))
     assert not oracle.counts
     assert oracle.why_not == "first frames give no pose"
 

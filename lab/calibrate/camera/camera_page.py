@@ -21,7 +21,7 @@ from lab.number_format import short
 from lab.pictures.picture_file import Missing, decode
 from lab.report.calibration.calibration_charts import lens_ladder, residual_histogram
 from lab.report.calibration.calibration_drawings import corners_overlay, coverage_map, residual_field, tilt_polar
-from lab.report.calibration.calibration_maps import correlation_matrix, heat_map
+from lab.report.calibration.calibration_maps import correlation_matrix
 from lab.report.calibration.calibration_page import (
     CalibrationReport,
     PageDrawing,
@@ -31,6 +31,7 @@ from lab.report.calibration.calibration_page import (
     telling_views,
     write_calibration_report,
 )
+from lab.report.plot.maps import heat_map
 
 _WORST_VIEWS = 3  # views with the largest residuals that are shown as pictures, besides the median and the best
 

@@ -1,8 +1,7 @@
-"""Drawings of what a camera saw of its boards: corners, residuals, coverage. The other drawings of a calibration are
-here by name as well: maps (calibration_maps), charts (calibration_charts), the 3-D view (calibration_scene).
+"""Drawings over a camera's image: board corners, residuals, coverage; and the tilt of the boards.
 
-Every function returns one `<svg>` as text, about 540 units wide: half a page. Pixels as in OpenCV: (0, 0) is the centre
-of the top-left pixel.
+Every function returns one `<svg>` as text, 540 units wide: half a page. Pixels as in OpenCV: (0, 0) is the centre of
+the top-left pixel.
 """
 
 from __future__ import annotations
@@ -13,72 +12,12 @@ import cv2
 import numpy as np
 
 from geometry.arrays import Array, Bools
-from lab.report.calibration.calibration_charts import (
-    DriftLine,
-    drift_chart,
-    error_ellipses,
-    lens_ladder,
-    residual_histogram,
-)
-from lab.report.calibration.calibration_maps import correlation_matrix, flatness_map, heat_map
-from lab.report.calibration.calibration_scene import (
-    CAMERA_VIEWS,
-    LAB_VIEWS,
-    Dot,
-    Frustum,
-    Ray,
-    Rectangle,
-    frustum_of,
-    rig_things,
-    scene_view,
-    scene_views,
-)
-from lab.report.plot.axes import (
-    INK,
-    Plane,
-    axes,
-    dots,
-    frame,
-    image_plane,
-    number,
-    picture_uri,
-    polyline,
-    round_size,
-    segments,
-    svg_of,
-)
-from lab.report.plot.axes import (
-    note as foot,
-)
-from lab.report.plot.svg import BLUE, ORANGE, VERMILLION, Scale, text
+from lab.report.plot.axes import Plane, axes, frame, image_plane, note, svg_of
+from lab.report.plot.scales import Scale, number, round_size
+from lab.report.plot.svg import BLUE, INK, ORANGE, VERMILLION, dots, picture_uri, polyline, segments, text
 
-__all__ = [
-    "CAMERA_VIEWS",
-    "LAB_VIEWS",
-    "Dot",
-    "DriftLine",
-    "Frustum",
-    "Ray",
-    "Rectangle",
-    "corners_overlay",
-    "correlation_matrix",
-    "coverage_map",
-    "drift_chart",
-    "error_ellipses",
-    "flatness_map",
-    "frustum_of",
-    "heat_map",
-    "lens_ladder",
-    "residual_field",
-    "residual_histogram",
-    "rig_things",
-    "scene_view",
-    "scene_views",
-    "tilt_polar",
-]
-
-_MOST_VECTORS = 2000  # of a residual field: more only make ink
-_ARROW = 24.0  # drawing units: how long the 95th percentile of the residuals is drawn
+_MOST_VECTORS = 2000  # in a residual field: more cover each other
+_ARROW = 24.0  # drawing units: length of the 95th percentile of the residuals
 _LONGEST = 70.0  # drawing units: longer vectors are cut
 _PICTURE_WIDTH = 720  # px of an embedded photograph
 _JPEG_QUALITY = 72
@@ -94,11 +33,11 @@ def corners_overlay(
     rejected: Bools | None = None,
     labels: Sequence[str] | None = None,
 ) -> str:
-    """One view: its corners and how far the model misses each, magnified.
+    """One view: its corners and their residuals, magnified.
 
-    found_px, residual_px (n, 2), px: where each corner was found, and found minus model. picture (height, width) or
-    (height, width, 3): the photograph, drawn under it smaller and as JPEG. rejected (n,): corners that were not used.
-    labels (n,): names of the corners, where they have some.
+    found_px, residual_px (n, 2), px: detected place of each corner, and detected minus model. picture (height, width)
+    or (height, width, 3): the photograph, embedded beneath as a smaller JPEG. rejected (n,): corners that were not
+    used. labels (n,): names of the corners, if any.
     """
     p = image_plane(size_px)
     out = axes(p, title, "u (px)", "v (px)", grid=picture is None)
@@ -111,7 +50,7 @@ def corners_overlay(
     ends = starts + _capped(residual * stretch)
     for colour, some, radius in ((BLUE, ~bad, 2.2), (VERMILLION, bad, 3.0)):
         vectors, places = segments(starts[some], ends[some]), dots(starts[some], radius)
-        # A light line beneath the coloured one keeps it visible on any photograph.
+        # A light line beneath keeps the coloured line visible on any photograph.
         out.append(f'<path d="{vectors}" stroke="#fff" stroke-width="3.4" stroke-opacity="0.75" fill="none"/>')
         out.append(f'<path d="{vectors}" stroke="{ORANGE}" stroke-width="1.6" fill="none"/>')
         out.append(f'<path d="{places}" fill="{colour}" stroke="#fff" stroke-width="0.7"/>')
@@ -119,7 +58,7 @@ def corners_overlay(
         out.append(text(place[0] - 5, place[1] + 13, label, "end"))
     out.append(_scale_bar(p, stretch, bar))
     if bad.any():
-        out.append(foot(p, f"{bad.sum()} corners not used (red); their vectors are cut"))
+        out.append(note(p, f"{bad.sum()} corners not used (red); their vectors are cut"))
     return svg_of(p, title, [*out, frame(p)])
 
 
@@ -132,11 +71,11 @@ def residual_field(
     cells: int = 16,
     things: str = "corners",
 ) -> str:
-    """The residuals of all views over the sensor: single ones faint, the mean of each cell bold.
+    """The residuals of all views over the sensor: single residuals faint, the mean of each cell bold.
 
-    found_px, residual_px (n, 2), px. A good lens model leaves means about nought; means that turn with the place show
-    what it cannot bend. A mean is drawn where its cell has 5 or more corners. `cells` over the width.
-    things: what they are called.
+    found_px, residual_px (n, 2), px. With a suitable lens model the means are about zero; means that vary
+    systematically over the sensor show distortion that the model cannot describe. A mean is drawn where its cell has 5
+    or more points. cells: over the width. things: the name of the points in the text.
     """
     found, residual = np.asarray(found_px, dtype=float), np.asarray(residual_px, dtype=float)
     good = np.isfinite(found).all(axis=1) & np.isfinite(residual).all(axis=1)
@@ -148,7 +87,7 @@ def residual_field(
     stretch, bar = _magnification(residual)
     kept = np.arange(len(found))
     if len(found) > _MOST_VECTORS:
-        # Every k-th, and the largest ones: these are what somebody looks for.
+        # Every k-th residual, and the largest ones, which the user must be able to see.
         largest = np.argsort(np.linalg.norm(residual, axis=1))[-_MOST_VECTORS // 10 :]
         kept = np.union1d(np.linspace(0, len(found) - 1, _MOST_VECTORS).astype(np.int64), largest)
     starts = p.at(found)
@@ -162,15 +101,14 @@ def residual_field(
     out.append(f'<path d="{dots(p.at(middle), 1.7)}" fill="{VERMILLION}"/>')
     out.append(_scale_bar(p, stretch, bar))
     counted = f"{len(found)} {things}" + (f", {len(kept)} drawn" if len(kept) < len(found) else "")
-    note = f"blue: {counted}; red: mean of a cell, twice as long"
-    out.append(foot(p, note))
+    out.append(note(p, f"blue: {counted}; red: mean of a cell, twice as long"))
     return svg_of(p, title, [*out, frame(p)])
 
 
 def cell_means(
     size_px: tuple[int, int], places_px: Array, values: Array, cells: int, at_least: int = 5
 ) -> tuple[Array, Array, Array]:
-    """Middles (m, 2), means (m, k) and counts (m,) of the square cells of a sensor that hold enough values (n, k)."""
+    """Centres (m, 2), means (m, k) and counts (m,) of the square cells of a sensor with enough of the values (n, k)."""
     side = size_px[0] / cells
     column = np.clip((places_px[:, 0] + 0.5) // side, 0, cells - 1).astype(np.int64)
     rows = max(1, round(size_px[1] / side))
@@ -192,10 +130,10 @@ def coverage_map(
     things: str = "corners",
     outlines_px: list[Array] | None = None,
 ) -> str:
-    """How many corners each part of the sensor had; parts with none are hatched.
+    """Number of corners in each cell of the sensor; cells without any are crossed out.
 
     corners_px (n, 2), px, of all views. outlines_px: a closed outline (k, 2) per view, drawn thin (60 at most).
-    things: what they are called.
+    things: the name of the points in the text.
     """
     corners = np.asarray(corners_px, dtype=float)
     corners = corners[np.isfinite(corners).all(axis=1)]
@@ -209,7 +147,7 @@ def coverage_map(
         right, low = p.at(np.array([x + side[0] / 2, y + side[1] / 2])).tolist()
         box = f'x="{left:.1f}" y="{top:.1f}" width="{right - left:.1f}" height="{low - top:.1f}"'
         if n:
-            # The square root, since a cell with 5 corners must be told from an empty one beside one with 500.
+            # The square root, so that a cell with 5 corners beside one with 500 does not look empty.
             out.append(f'<rect {box} fill="{BLUE}" fill-opacity="{0.12 + 0.8 * np.sqrt(n / most):.2f}"/>')
         else:
             slope = f"M{left:.1f} {low:.1f}L{right:.1f} {top:.1f}M{left:.1f} {top:.1f}L{right:.1f} {low:.1f}"
@@ -223,18 +161,18 @@ def coverage_map(
         d = polyline(p.at(outline), closed=True)
         out.append(f'<path d="{d}" fill="none" stroke="{ORANGE}" stroke-width="0.8" stroke-opacity="0.7"/>')
     share = float((count > 0).mean())
-    note = f"{len(corners)} {things}; {100 * share:.0f} % of the sensor's cells have some; crossed out: none"
-    out.append(foot(p, note))
+    words = f"{len(corners)} {things} in {100 * share:.0f} % of the cells of the sensor; crossed out: none"
+    out.append(note(p, words))
     return svg_of(p, title, [*out, frame(p)])
 
 
 def tilt_polar(
     tilts_deg: Array, azimuths_deg: Array, title: str = "How the boards were tilted", *, wanted_deg: float = 20.0
 ) -> str:
-    """Each view's tilt against the sensor: from the middle how much, round it towards where.
+    """The tilt of the board in each view as a polar plot: radius the angle, direction the azimuth.
 
-    tilts_deg (n,) angle between the board's normal and the optical axis; azimuths_deg (n,) where the normal leans, from
-    +u towards +v. Views within `wanted_deg` of facing the camera tell little of the focal length.
+    tilts_deg (n,): angle between the normal of the board and the optical axis; azimuths_deg (n,): direction of the tilt
+    from +u towards +v. Views tilted by less than `wanted_deg` contribute little to the focal length.
     """
     tilts, azimuths = np.asarray(tilts_deg, dtype=float), np.radians(np.asarray(azimuths_deg, dtype=float))
     finite = tilts[np.isfinite(tilts)]
@@ -272,7 +210,7 @@ def _magnification(residual: Array) -> tuple[float, float]:
 
 
 def _capped(vectors: Array) -> Array:
-    """Vectors (n, 2), drawing units, of at most the longest length: an outlier must not cross the whole page."""
+    """Vectors (n, 2), drawing units, cut to the largest length, so that an outlier does not cross the whole plot."""
     length = np.linalg.norm(vectors, axis=1, keepdims=True)
     return vectors * np.minimum(1.0, _LONGEST / np.maximum(length, 1e-9))
 
@@ -288,7 +226,7 @@ def _scale_bar(p: Plane, stretch: float, bar: float) -> str:
 
 
 def _photograph(p: Plane, picture: np.ndarray) -> str:
-    """The picture inside the axes, pale, as JPEG."""
+    """The photograph inside the axes, as JPEG."""
     if picture.dtype != np.uint8:
         top = max(float(picture.max()), 1.0)
         picture = (picture.astype(float) * (255 / top)).astype(np.uint8)

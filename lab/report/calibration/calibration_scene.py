@@ -13,13 +13,14 @@ from geometry.camera import Camera, pinhole_numbers
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.rig import Rig
-from lab.report.plot.axes import Plane, dots, number, polyline, round_size, segments, svg_of
-from lab.report.plot.svg import BLUE, GREEN, ORANGE, PURPLE, VERMILLION, Scale, text
+from lab.report.plot.axes import Plane, svg_of
+from lab.report.plot.scales import Scale, number, round_size
+from lab.report.plot.svg import BLUE, GREEN, ORANGE, PURPLE, VERMILLION, dots, polyline, segments, text
 
 
 @dataclass(frozen=True, slots=True)
 class Frustum:
-    """A camera, drawn as its field of view."""
+    """The field of view of a camera."""
 
     name: str
     camera_from_world: Pose
@@ -71,7 +72,7 @@ VIEWS: dict[str, tuple[Array, Array]] = {
     "from beside the camera": (np.array([0, 0, 1.0]), np.array([0, -1.0, 0])),
 }
 LAB_VIEWS = tuple(VIEWS)[:3]
-CAMERA_VIEWS = tuple(VIEWS)[4:]  # for things in a camera's own frame
+CAMERA_VIEWS = tuple(VIEWS)[4:]  # for things in the frame of a camera
 
 
 def frustum_of(camera: Camera, colour: str = BLUE) -> Frustum:

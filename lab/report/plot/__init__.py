@@ -1,1 +1,1 @@
-"""Plots in SVG text: axes, lines, bands, shading."""
+"""Plots as SVG text: elements, scales, axes, series over time, histograms, maps with contour lines."""

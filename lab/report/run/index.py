@@ -1,4 +1,4 @@
-"""The index of a batch: one line per run, the worst first, each with a link to its report."""
+"""The index of a batch: one line per run with a link to its report, failed runs first."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from urllib.parse import quote
 from lab.files.text.atomic_write import atomic_write_text
 from lab.number_format import short
 from lab.report.html import environment
-from lab.report.run.verdict import WORDS
+from lab.report.run.summary import VERDICTS
 
 FILE_NAME = "index.html"
 _ORDER = {"error": 0, "fail": 1, "check": 2, "pass": 3}
-_FIRST = ("name", "run", "run_folder")  # any of these names a run
+_NAME = ("name", "run", "run_folder")  # keys of a row, in order of preference
 _VERDICT = ("verdict", "status")
 _LINK = ("report", "results")
 
@@ -22,18 +22,18 @@ def write_index(rows: list[dict[str, Any]], out: Path) -> Path:
     """Write index.html into the batch's folder `out`; returns its path.
 
     rows: those of batch.csv, a mapping per run. Known keys: `name`, `run` (its folder), `verdict` (or `status`): pass,
-    check, fail or error, `report` or `results` (a path relative to `out`; without it, the folder of the run's name).
-    Every other key is a column.
+    check, fail or error, `report` or `results` (a path relative to `out`; default: the folder of the run's name).
+    Every other key becomes a column.
     """
-    known = {*_FIRST, *_VERDICT, *_LINK}
+    known = {*_NAME, *_VERDICT, *_LINK}
     heads = list(dict.fromkeys(key for row in rows for key in row if key not in known))
     lines = [
         {
-            "name": _first(row, _FIRST) or "unnamed",
-            "folder": _first(row, _FIRST[1:]),
+            "name": _first(row, _NAME) or "unnamed",
+            "folder": _first(row, _NAME[1:]),
             "href": _href(row, out),
             "status": (status := _status(row)),
-            "word": WORDS[status][0] if status in WORDS else status.upper(),
+            "word": VERDICTS[status][0] if status in VERDICTS else status.upper(),
             "rank": _ORDER.get(status, 0),
             "cells": [_cell(row.get(head)) for head in heads],
         }
@@ -60,9 +60,9 @@ def _status(row: dict[str, Any]) -> str:
 
 
 def _href(row: dict[str, Any], out: Path) -> str:
-    """The report's address relative to the index, or nothing where there is no such file."""
-    place = _first(row, _LINK) or _first(row, _FIRST)
-    path = Path(place) if place.endswith(".html") else Path(place) / "report.html"
+    """The address of the report relative to the index; empty where there is no such file."""
+    named = _first(row, _LINK) or _first(row, _NAME)
+    path = Path(named) if named.endswith(".html") else Path(named) / "report.html"
     if path.is_absolute():
         path = path.relative_to(out.resolve()) if path.is_relative_to(out.resolve()) else path
     if not (out / path).is_file():
@@ -71,7 +71,7 @@ def _href(row: dict[str, Any], out: Path) -> str:
 
 
 def _cell(value: Any) -> tuple[str, str]:
-    """What to show, and by what to sort."""
+    """The text of a cell, and its sort key."""
     if value is None or value == "":
         return "", ""
     if isinstance(value, bool):

@@ -1,4 +1,4 @@
-"""Does the rig fit the recording? The report's part on it, from summary.json alone."""
+"""The report's section on the model check: does the rig fit the recording? From summary.json alone."""
 
 from __future__ import annotations
 
@@ -11,16 +11,17 @@ import numpy as np
 
 from geometry.arrays import Array
 from lab.number_format import plus_minus, short
-from lab.report.plot.axes import dots, frame, image_plane, note, number, round_size, segments, svg_of
-from lab.report.plot.svg import BLUE, VERMILLION, text
+from lab.report.plot.axes import frame, heading, image_plane, note, svg_of
+from lab.report.plot.scales import number, round_size
+from lab.report.plot.svg import BLUE, VERMILLION, dots, segments, text
 
 HEADS = (
-    "spot", "camera", "frames", "mean u (px)", "mean v (px)", "u, v in σ", "calibration allows (px)", "scatter",
+    "spot", "camera", "frames", "mean u (px)", "mean v (px)", "u, v in σ", "calibration sigma (px)", "scatter",
     "NIS/2 (95 %)", "outliers",
 )  # fmt: skip
-_LONGEST = 0.1  # of the picture's width: the longest arrow
-_SURE = 3.0  # sigmas: the circle that chance and the calibration explain
-_WORDS = {"PASS": "small", "WARN": "check", "FAIL": "fail"}
+_LONGEST = 0.1  # length of the longest arrow, as a share of the image width
+_SIGNIFICANT = 3.0  # sigmas of chance and calibration: radius of the circles
+_LEVELS = {"PASS": "small", "WARN": "check", "FAIL": "fail"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,21 +36,20 @@ class FindingRow:
 
 @dataclass(frozen=True, slots=True)
 class ModelFit:
-    """What the section shows."""
+    """The content of the section."""
 
-    sentence: str  # the answer
+    sentence: str  # the answer to the question
     findings: tuple[FindingRow, ...]
     rows: tuple[tuple[str, ...], ...]  # under HEADS: views, then cameras, then beams
     drawings: tuple[str, ...]  # SVG, one per camera
 
 
-def model_fit(summary: Mapping[str, Any]) -> ModelFit | None:
-    """The section of a summary; None where it holds no model check."""
-    block = summary.get("model_check")
-    if not isinstance(block, Mapping):
+def model_fit(block: Mapping[str, Any] | None) -> ModelFit | None:
+    """The section from the block `model_check` of summary.json; None without one."""
+    if block is None:
         return None
     findings = tuple(
-        FindingRow(_WORDS.get(str(f.get("level")), "check"), *(str(f.get(k) or "") for k in ("what", "why", "remedy")))
+        FindingRow(_LEVELS.get(str(f.get("level")), "check"), *(str(f.get(k) or "") for k in ("what", "why", "remedy")))
         for f in _mappings(block.get("findings"))
     )
     rows = []
@@ -61,8 +61,8 @@ def model_fit(summary: Mapping[str, Any]) -> ModelFit | None:
     sizes = block.get("image_sizes_px")
     drawings = [
         drawn
-        for camera, size in (sizes.items() if isinstance(sizes, Mapping) else ())
-        if (drawn := _drawing(str(camera), size, _mappings(block.get("views"))))
+        for i, (camera, size) in enumerate(sizes.items() if isinstance(sizes, Mapping) else ())
+        if (drawn := _drawing(i, str(camera), size, _mappings(block.get("views"))))
     ]
     return ModelFit(_sentence(block, findings), findings, tuple(rows), tuple(drawings))
 
@@ -70,12 +70,12 @@ def model_fit(summary: Mapping[str, Any]) -> ModelFit | None:
 def _sentence(block: Mapping[str, Any], findings: tuple[FindingRow, ...]) -> str:
     if not block.get("tested"):
         return f"Not tested: {block.get('why_not') or 'no reason is given'}."
-    used = f"{block.get('frames_for_culprits')} frames, evenly chosen"
+    used = f"{block.get('frames_for_culprits')} frames, evenly spaced"
     if not findings:
-        return f"Yes: no camera, screen, beam or clock is found off ({used})."
+        return f"Yes: no deviation of a camera, screen, beam or clock was found ({used})."
     if all(f.level == "small" for f in findings):
-        return f"Nearly: what is off is lost in the stated uncertainty ({used})."
-    return f"No, or so it seems ({used}):"
+        return f"Nearly: the deviations found are within the stated uncertainty ({used})."
+    return f"Probably not ({used}):"
 
 
 def _mappings(value: Any) -> list[Mapping[str, Any]]:
@@ -97,10 +97,10 @@ def _numbers(g: Mapping[str, Any]) -> tuple[str, ...]:
     allowed = _pair(g, "calibration_px")
     means = [plus_minus(m, s, signed=True) for m, s in zip(mean.tolist(), sigma.tolist(), strict=True)]
     nis = g.get("nis")
-    told = "–"
+    nis_text = "–"
     if isinstance(nis, Mapping):
         low, high = short(_float(nis.get("low"))), short(_float(nis.get("high")))
-        told = f"{short(_float(nis.get('mean')))} ({low} to {high})"
+        nis_text = f"{short(_float(nis.get('mean')))} ({low} to {high})"
     share = _float(g.get("outliers"))
     return (
         str(g.get("frames")),
@@ -108,7 +108,7 @@ def _numbers(g: Mapping[str, Any]) -> tuple[str, ...]:
         ", ".join(f"{s:+.2f}".replace("-", "\u2212") for s in sigmas) if np.isfinite(sigmas).all() else "–",
         f"{short(allowed[0], 2)}, {short(allowed[1], 2)}" if np.any(allowed > 0) else "–",
         short(_float(g.get("scatter"))),
-        told,
+        nis_text,
         "–" if not np.isfinite(share) else f"{100 * share:.2g} %",
     )
 
@@ -117,8 +117,8 @@ def _signed(value: float) -> str:
     return "–" if not np.isfinite(value) else ("+" if value > 0 else "") + short(value, 2)
 
 
-def _drawing(camera: str, size: Any, views: list[Mapping[str, Any]]) -> str:
-    """Mean residuals as arrows over the picture, with circles of what chance and the calibration explain."""
+def _drawing(index: int, camera: str, size: Any, views: list[Mapping[str, Any]]) -> str:
+    """Mean residuals as arrows over the image, with circles of 3 sigma of chance and calibration together."""
     own = [v for v in views if str(v.get("name")).rpartition("/")[0] == camera]
     place = np.array([_pair(v, "place_px") for v in own]).reshape(-1, 2)
     mean = np.array([_pair(v, "mean_px") for v in own]).reshape(-1, 2)
@@ -129,15 +129,20 @@ def _drawing(camera: str, size: Any, views: list[Mapping[str, Any]]) -> str:
     plane = image_plane((int(size[0]), int(size[1])))
     longest = float(np.linalg.norm(mean[known], axis=1).max())
     factor = round_size(_LONGEST * float(size[0]) / max(longest, 1e-6))
-    parts = [frame(plane), text(plane.box[0], 15, f"camera {camera}: mean residual of each spot", "title")]
+    left, top, wide, high = plane.box
+    clip = f"clip-residuals-{index}"
+    parts = [
+        heading(plane, f"camera {camera}: mean residual of each spot"),
+        f'<clipPath id="{clip}"><rect x="{left:.1f}" y="{top:.1f}" width="{wide:.1f}" height="{high:.1f}"/></clipPath>',
+        f'<g clip-path="url(#{clip})">',
+    ]
     scale = abs(plane.X.b - plane.X.a) / abs(plane.X.hi - plane.X.lo)
     for v, at, r, s, good in zip(own, place, mean, chance, known, strict=True):
         if not good:
             continue
-        radius = _SURE * float(np.sqrt(np.mean(s**2)))
-        sure = bool(np.linalg.norm(r) > radius)
+        radius = _SIGNIFICANT * float(np.sqrt(np.mean(s**2)))
         start, end = plane.at(at[None]), plane.at((at + factor * r)[None])
-        colour = VERMILLION if sure else BLUE
+        colour = VERMILLION if np.linalg.norm(r) > radius else BLUE
         spot = str(v.get("name")).rpartition("/")[2]
         words = escape(f"spot {spot}: {_signed(r[0])}, {_signed(r[1])} px")
         parts.append(
@@ -146,7 +151,7 @@ def _drawing(camera: str, size: Any, views: list[Mapping[str, Any]]) -> str:
             f'<path d="{segments(start, end)}" stroke="{colour}" stroke-width="2"/>'
             f'<path d="{dots(start, 3)}" fill="{colour}"/>{text(start[0, 0] + 7, start[0, 1] - 7, spot, "label")}</g>'
         )
-    parts.append(
-        note(plane, f"arrows {number(factor)} times as long as in the picture; longest {short(longest, 2)} px")
-    )
+    times = f"{factor:,.0f}".replace(",", "\u202f") if factor >= 1 else number(factor)
+    parts += ["</g>", frame(plane)]
+    parts.append(note(plane, f"arrows magnified {times} times; longest {short(longest, 2)} px"))
     return svg_of(plane, f"mean residuals in camera {camera}", parts)

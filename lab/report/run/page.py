@@ -1,4 +1,4 @@
-"""The report of one run: a single HTML file that needs nothing else."""
+"""The report of one run: a single self-contained HTML file."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from markupsafe import Markup
 
 from lab.files.text.atomic_write import atomic_write_text
 from lab.report.html import environment
-from lab.report.run import figures, pose_curves, tables, uncertainty
+from lab.report.run import error_tables, figures, pose_curves, tables, uncertainty
+from lab.report.run.events import ShownEvent, events, selected
 from lab.report.run.model_fit import HEADS as MODEL_FIT_HEADS
 from lab.report.run.model_fit import model_fit
-from lab.report.run.pictures import ShownEvent, chosen, events, pictures
-from lab.report.run.report_data import ReportData, gather
+from lab.report.run.pictures import pictures
+from lab.report.run.report_data import ReportData, read_report_data
 from lab.report.run.tracks import POSE_COLOURS, SPOT_COLOURS, timeline_figure, tracks_figure
-from lab.report.run.verdict import verdict_of
 from tracking.statuses import PoseStatus, SpotStatus
 
 FILE_NAME = "report.html"
@@ -25,12 +25,14 @@ _MOST_EVENTS = 200
 def write_report(results: Path, run_folder: Path | None = None) -> Path:
     """Write report.html into a results folder, from its tables alone; returns its path.
 
-    Where the run folder can be reached (the one given, or the one that summary.json names), pictures, residuals and
-    errors against truth are added. Raises InputError if the tables cannot be read.
+    Where the run folder can be read (the one given, or the one that summary.json names), pictures, residuals and
+    errors against truth are added.
+
+    Raises:
+        InputError: the tables cannot be read.
     """
-    material = gather(results, run_folder)
     path = results / FILE_NAME
-    atomic_write_text(page(material, results), path)
+    atomic_write_text(page(read_report_data(results, run_folder), results), path)
     return path
 
 
@@ -39,24 +41,25 @@ def page(m: ReportData, results: Path) -> str:
     found = events(m)
     listed = _event_rows(m, found)
     heads, rows = tables.spot_rows(m)
-    fit = model_fit(m.summary)
+    fit = model_fit(m.summary.model_check)
+    method, details = m.summary.method, m.summary.details
     context: dict[str, Any] = {
         "name": m.name,
-        "verdict": verdict_of(m.summary),
+        "verdict": m.summary.verdict,
         "keys": tables.key_figures(m),
-        "truth_keys": tables.truth_figures(m.errors),
-        "pixel_rows": tables.pixel_rows(m.errors),
+        "truth_keys": error_tables.truth_figures(m.errors),
+        "pixel_rows": error_tables.pixel_rows(m.errors),
         "run_line": _run_line(m),
         "pose_figure": Markup(pose_curves.pose_figure(m)),
         "motion_figure": Markup(pose_curves.motion_figure(m)),
         "smoothed": m.causal is not None,
-        "method": tables.at(m.summary, "parameters", "tracker", "method") or "spots",
+        "method": method,
         "budget_heads": uncertainty.HEADS,
         "budget_rows": uncertainty.budget_rows(m),
         "budget_words": uncertainty.words(m),
         "tracks": [Markup(t) for c in m.spots.cameras if (t := tracks_figure(m, c))],
         "timeline": Markup(timeline_figure(m)) if len(m.spots.frames) and m.spots.views else "",
-        "spot_legend": [(str(s), SPOT_COLOURS[s], s.meaning) for s in SpotStatus],
+        "spot_legend": [(str(s), SPOT_COLOURS[s], s.meaning_for(method)) for s in SpotStatus],
         "pose_legend": [(str(s), POSE_COLOURS[s], s.meaning) for s in PoseStatus],
         "truth_grid": Markup(figures.error_grid(m, columns)) if (columns := figures.truth_columns(m)) else "",
         "nees_figure": Markup(figures.nees_figure(m)),
@@ -66,32 +69,26 @@ def page(m: ReportData, results: Path) -> str:
         "model_fit": fit,
         "model_fit_heads": MODEL_FIT_HEADS,
         "model_fit_drawings": [] if fit is None else [Markup(d) for d in fit.drawings],
-        "error_rows": tables.error_rows(m.errors),
+        "error_rows": error_tables.error_rows(m.errors),
         "has_truth": m.errors is not None,
         "spot_heads": heads,
         "spot_rows": rows,
-        "pictures": [Markup(p) for p in pictures(m, results, chosen(m, found))],
+        "pictures": [Markup(p) for p in pictures(m, results, selected(m, found))],
         "events": listed[:_MOST_EVENTS],
         "label_words": tables.label_words(m),
         "more_events": max(len(listed) - _MOST_EVENTS, 0),
         "no_image": tables.no_image_ranges(m),
-        "notes": [str(n) for n in _listed(m.summary.get("notes"))],
+        "notes": m.summary.notes,
         "run_notes": "" if m.run is None else m.run.notes,
         "missing": _missing(m),
-        "parameters": tables.flattened(m.summary.get("parameters") or {}),
-        "smoother": tables.flattened(m.summary.get("smoother") or {}),
-        "timings": tables.flattened(m.summary.get("timings") or {}),
-        "rates": tables.flattened(m.summary.get("rates") or {}),
-        "versions": tables.flattened(m.summary.get("versions") or {}),
-        "inputs": [i for i in _listed(m.summary.get("inputs")) if isinstance(i, dict)],
+        "parameters": details["parameters"],
+        "smoother": details["smoother"],
+        "timings": details["timings"],
+        "rates": details["rates"],
+        "versions": details["versions"],
+        "inputs": m.summary.inputs,
     }
     return environment().get_template("report.html.j2").render(context)
-
-
-def _listed(value: Any) -> list[Any]:
-    if value is None:
-        return []
-    return value if isinstance(value, list) else [value]
 
 
 def _run_line(m: ReportData) -> str:
@@ -103,31 +100,30 @@ def _run_line(m: ReportData) -> str:
     cameras = m.spots.cameras
     parts.append(f"{len(cameras)} camera{'s' if len(cameras) != 1 else ''} ({', '.join(cameras)})" if cameras else "")
     parts.append(f"{len(dict.fromkeys(s for _, s in m.spots.views))} spots")
-    method = tables.at(m.summary, "parameters", "tracker", "method") or tables.at(m.summary, "parameters", "method")
-    if method:
-        parts.append(f"tracker: {method}")
+    if m.summary.stated_method:
+        parts.append(f"tracker: {m.summary.stated_method}")
     return " · ".join(p for p in parts if p)
 
 
 def _event_rows(m: ReportData, found: list[ShownEvent]) -> list[tuple[str, str, str, str]]:
-    """Frame, time, camera and what happened. Hidden spots are in the status figure; they would bury the rest here."""
+    """Frame, time, camera and text of each event, without occlusions: they are many and in the status figure."""
     clock = m.time_name != "frame"
     return [
         (str(m.spots.frames[e.index]), f"{m.t_s[e.index]:.3f}" if clock else "", e.camera, e.text)
         for e in found
-        if e.kind != "hidden"
+        if e.kind != "occluded"
     ]
 
 
 def _missing(m: ReportData) -> list[str]:
-    """What this report could not show, and why."""
+    """The parts that are missing from this report, with the reason."""
     out = []
-    if not m.summary:
+    if not m.summary.present:
         out.append("summary.json is missing: no verdict, parameters, versions or fingerprints.")
     if m.run_folder is None:
-        out.append("The run folder could not be reached: no pictures, no residuals per spot, no errors against truth.")
+        out.append("The run folder could not be read: no pictures, no residuals per spot, no errors against truth.")
     elif m.run is None:
         out.append("The run folder's run.yaml or its rig cannot be read: no pictures and no residuals per spot.")
     if m.run_folder is not None and m.errors is None:
-        out.append("The run has no truth: no errors against it.")
+        out.append("The run has no truth: no errors against truth.")
     return out

@@ -1,4 +1,4 @@
-"""The pose and its motion over time: a row for each number, its value on the left and its uncertainty on the right."""
+"""Pose, velocity and angular rate over time: value on the left, uncertainty on the right."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ from geometry import rotations
 from geometry.arrays import Array, Bools
 from geometry.pose import Pose
 from lab.files.run.results import PoseTrack
-from lab.report.plot import svg
-from lab.report.plot.svg import Band, Line
+from lab.report.plot.scales import padded_range, robust_range
+from lab.report.plot.series import Band, Line, time_panel
+from lab.report.plot.svg import BLUE, GREY, SKY, VERMILLION
 from lab.report.run.figures import pose_shades
 from lab.report.run.report_data import ReportData
 from lab.runs.score.motion_score import differenced
@@ -22,16 +23,16 @@ _CAUSAL_WIDTH = 0.6
 
 @dataclass(frozen=True, slots=True)
 class _Curve:
-    """One number over F frames."""
+    """One component of pose or motion over F frames."""
 
     name: str
     unit: str
-    small_unit: str  # a thousandth of it, for the uncertainty ...
-    large: float  # ... unless that is more than this, in `unit`
+    small_unit: str  # a thousandth of `unit`, used for uncertainties up to ...
+    large: float  # ... this value, in `unit`
     value: Array  # (F,)
     sigma: Array  # (F,)
     error: Array | None  # (F,) estimate minus truth
-    causal: Array | None  # (F,) the causal filter's error, or its difference to `value` where there is no truth
+    causal: Array | None  # (F,) error of the causal filter, or its difference to `value` where there is no truth
 
 
 def pose_figure(m: ReportData) -> str:
@@ -61,7 +62,10 @@ def pose_figure(m: ReportData) -> str:
 
 
 def motion_figure(m: ReportData) -> str:
-    """Velocity and angular rate beside their uncertainty; empty where neither is known. Truth: differences of poses."""
+    """Velocity and angular rate beside their uncertainty; empty where neither is known.
+
+    Truth: differences of the true poses.
+    """
     values, sigmas = _motion(m.poses)
     if not np.isfinite(values).any():
         return ""
@@ -78,7 +82,7 @@ def motion_figure(m: ReportData) -> str:
                 values[:, i],
                 sigmas[:, i],
                 None if errors is None else errors[:, i],
-                None,  # ten times as uncertain: beside it nothing else could be seen
+                None,  # ten times as uncertain: it would cover the other curves
             )
             for i, name in enumerate(names)
         ],
@@ -92,7 +96,7 @@ def _motion(p: PoseTrack) -> tuple[Array, Array]:
 
 
 def _causal(m: ReportData, true: Pose | None) -> Array | None:
-    """(F, 6) as `_minus`: the causal filter's poses minus the truth, or minus the smoothed ones; None without them."""
+    """(F, 6) as `_minus`: causal minus true poses (smoothed ones without truth); None without causal poses."""
     return None if m.causal is None else _minus(m.causal, m.poses.world_from_body if true is None else true)
 
 
@@ -108,22 +112,21 @@ def _minus(poses: PoseTrack, true: Pose | None) -> Array | None:
 
 def _rows(m: ReportData, curves: list[_Curve]) -> str:
     measured = m.poses.has(PoseStatus.MEASURED)
-    parts = [_row(m, curve, measured, curve is curves[-1]) for curve in curves]
-    return "".join(parts)
+    return "".join(_row(m, curve, measured, curve is curves[-1]) for curve in curves)
 
 
 def _row(m: ReportData, c: _Curve, measured: Bools, last: bool) -> str:
-    """Two panels: the value with its band, and the uncertainty with the errors that are known."""
+    """Two panels: the value with its band, and the uncertainty with the known errors."""
     t, shades, height = m.pose_times, pose_shades(m), 128 if last else 104
-    value = svg.time_panel(
+    value = time_panel(
         t,
         c.name,
         c.unit,
-        lines=(Line(c.value, svg.BLUE, c.name, 1.3),),
-        bands=(Band(c.value - 3 * c.sigma, c.value + 3 * c.sigma, svg.SKY, "\u00b13\u03c3", 0.45),),
+        lines=(Line(c.value, BLUE, c.name, 1.3),),
+        bands=(Band(c.value - 3 * c.sigma, c.value + 3 * c.sigma, SKY, "\u00b13\u03c3", 0.45),),
         shades=shades,
-        # Of the bands only those of measured poses count: a long prediction would flatten the rest.
-        y_range=svg.plain_range(
+        # Only the bands of measured poses set the range: that of a long prediction would flatten the rest.
+        y_range=padded_range(
             np.concatenate([c.value, (c.value - 3 * c.sigma)[measured], (c.value + 3 * c.sigma)[measured]])
         ),
         height=height,
@@ -132,26 +135,26 @@ def _row(m: ReportData, c: _Curve, measured: Bools, last: bool) -> str:
     )
     shown = c.sigma[measured] if measured.any() else c.sigma
     unit, factor = (c.unit, 1.0) if np.nanmax(shown, initial=0.0) > c.large else (c.small_unit, 1000.0)
-    limit = 1.25 * svg.robust_range(3 * factor * shown)[1]
+    limit = 1.25 * robust_range(3 * factor * shown)[1]
     lines: list[Line] = []
     reference = "truth" if c.error is not None else "smoothed"
     for errors, colour, width, name in (
-        (c.causal, svg.GREY, _CAUSAL_WIDTH, f"{c.name}: causal minus {reference}"),
-        (c.error, svg.VERMILLION, 0.9, f"{c.name}: estimate minus truth"),
+        (c.causal, GREY, _CAUSAL_WIDTH, f"{c.name}: causal minus {reference}"),
+        (c.error, VERMILLION, 0.9, f"{c.name}: estimate minus truth"),
     ):
         if errors is not None:
             lines.append(Line(factor * errors, colour, name, width))
             if np.isfinite(errors[measured]).any():
-                limit = max(limit, svg.robust_range(factor * errors[measured])[1])
+                limit = max(limit, robust_range(factor * errors[measured])[1])
     s = factor * c.sigma
-    uncertainty = svg.time_panel(
+    uncertainty = time_panel(
         t,
         f"{c.name}: \u00b1\u03c3, \u00b13\u03c3" + (" and error" if c.error is not None else ""),
         unit,
         lines=tuple(lines),
         bands=(
-            Band(-3 * s, 3 * s, svg.SKY, "\u00b13\u03c3", 0.35),
-            Band(-s, s, svg.BLUE, "\u00b1\u03c3", 0.35),
+            Band(-3 * s, 3 * s, SKY, "\u00b13\u03c3", 0.35),
+            Band(-s, s, BLUE, "\u00b1\u03c3", 0.35),
         ),
         shades=shades,
         y_range=(-limit, limit),

@@ -1,10 +1,9 @@
-"""Everything that a report is made from, gathered: the tables, and what of the run folder can be reached."""
+"""The data of a report: the tables of a results folder, and what can be read of its run folder."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -13,6 +12,8 @@ from geometry.forward_model import SpotModel
 from lab.errors import BeamposeError
 from lab.files.run.results import PoseTrack, SpotGrid, has_causal, read_poses, read_spots, read_summary
 from lab.files.run.run_file import Run, load_run
+from lab.report.run.summary import RunSummary, summary_of
+from lab.report.run.truth_errors import TruthErrors, errors_of
 from lab.runs.score.score import TruthArrays, pose_errors, read_truth, score_against
 from tracking.statuses import PoseStatus
 
@@ -21,25 +22,25 @@ _FRAMES_AT_ONCE = 2000  # bounds the memory of projecting all poses with their J
 
 @dataclass(frozen=True, slots=True)
 class ReportData:
-    """What a results folder says, and the run it came from where that is still there."""
+    """The content of a results folder, and its run where the run folder can still be read."""
 
     name: str
-    summary: dict[str, Any]
+    summary: RunSummary
     spots: SpotGrid
     poses: PoseTrack
-    causal: PoseTrack | None  # as they were known at each instant, where `poses` are smoothed; of the same frames
-    t_s: Array  # (F,), of the spots' frames; frame numbers where times are missing
+    causal: PoseTrack | None  # of the causal filter, where `poses` are smoothed; of the same frames
+    t_s: Array  # (F,) of the spots' frames; frame numbers where times are missing
     time_name: str
     run: Run | None
     run_folder: Path | None
     truth: TruthArrays | None
-    errors: dict[str, Any] | None  # lab.runs.score.score.score
-    residual_px: Array | None  # (F, V, 2), measured minus projected from the frame's pose; None without a rig
-    residual_share: float | None  # of a spot's variance that residuals should have: the pose has taken up the rest
+    errors: TruthErrors | None
+    residual_px: Array | None  # (F, V, 2) measured minus projected from the pose of the frame; None without a rig
+    residual_share: float | None  # expected variance of a residual over that of the spot; the fit takes up the rest
 
     @property
     def picture_sizes(self) -> dict[str, tuple[int, int]]:
-        """Width and height, px, of each camera that is known."""
+        """Width and height, px, of each known camera."""
         return {} if self.run is None else {n: c.image_size_px for n, c in self.run.rig.cameras.items()}
 
     @property
@@ -49,24 +50,27 @@ class ReportData:
 
     @property
     def pose_errors(self) -> Array | None:
-        """(F', 6): estimate minus truth, [m in world, rad in body]; the sign a reader expects of an error."""
+        """(F', 6): estimate minus truth, [m in world, rad in body]."""
         if self.truth is None or self.truth.world_from_body is None:
             return None
         return -pose_errors(self.poses, self.truth.world_from_body)
 
     @property
     def pose_times(self) -> Array:
-        """(F',): time, or the frame number where times are missing, of the poses' rows."""
+        """(F',): time of each pose, or the frame number where times are missing."""
         return self.poses.t_s if self.time_name != "frame" else self.poses.frames.astype(float)
 
 
-def gather(results: Path, run_folder: Path | None) -> ReportData:
-    """Read a results folder, and of its run folder what is there.
+def read_report_data(results: Path, run_folder: Path | None) -> ReportData:
+    """Read a results folder, and what is there of its run folder.
 
-    Without `run_folder`, the one that summary.json names is tried. Raises InputError if the results cannot be read; a
-    run folder that is gone or damaged only leaves out what comes from it.
+    run_folder: None: the folder that summary.json names. If it is missing or damaged, only the data from it are left
+    out.
+
+    Raises:
+        InputError: the results cannot be read.
     """
-    summary = read_summary(results)
+    summary = summary_of(read_summary(results))
     spots, poses = read_spots(results), read_poses(results)
     causal = read_poses(results, causal=True) if has_causal(results) else None
     if causal is not None and not np.array_equal(causal.frames, poses.frames):
@@ -82,11 +86,11 @@ def gather(results: Path, run_folder: Path | None) -> ReportData:
             truth = read_truth(folder, spots, poses)
         except BeamposeError:
             truth = None
-    errors = score_against(spots, poses, truth, causal) if truth is not None else summary.get("errors")
+    score = score_against(spots, poses, truth, causal) if truth is not None else summary.errors
     times_known = bool(len(spots.t_s)) and bool(np.isfinite(spots.t_s).all())
     residual_px, residual_share = (None, None) if run is None else _residuals(spots, poses, run)
     return ReportData(
-        name=str(summary.get("name") or results.resolve().name),
+        name=summary.name or results.resolve().name,
         summary=summary,
         spots=spots,
         poses=poses,
@@ -96,27 +100,26 @@ def gather(results: Path, run_folder: Path | None) -> ReportData:
         run=run,
         run_folder=folder,
         truth=truth,
-        errors=errors if isinstance(errors, dict) else None,
+        errors=errors_of(score),
         residual_px=residual_px,
         residual_share=residual_share,
     )
 
 
-def _reachable(results: Path, run_folder: Path | None, summary: dict[str, Any]) -> Path | None:
+def _reachable(results: Path, run_folder: Path | None, summary: RunSummary) -> Path | None:
+    """The run folder given or named by summary.json, where it exists."""
     if run_folder is not None:
         return run_folder if run_folder.is_dir() else None
-    named = summary.get("run_folder")
-    if not isinstance(named, str) or not named:
-        return None
-    return next((p for p in (Path(named), results / named) if p.is_dir()), None)
+    named = summary.run_folder
+    return next((p for p in (Path(named), results / named) if named and p.is_dir()), None)
 
 
 def _residuals(spots: SpotGrid, poses: PoseTrack, run: Run) -> tuple[Array | None, float | None]:
-    """(F, V, 2): measured pixel minus the pixel that the frame's measured pose gives, nan elsewhere; and their share.
+    """(F, V, 2): measured pixel minus projection from the frame's measured pose, or nan; and `residual_share`.
 
-    Of a measurement with covariance R in a pose of covariance P that was made with it, the residual has R - J P J^T,
-    be the pose of one frame, filtered or smoothed. The share is its mean over R; the calibration's part of P takes up
-    no noise.
+    The residual of a measurement with covariance R that was used for a pose of covariance P has the covariance
+    R - J P J^T, for a pose from one frame, filtered or smoothed. The share is its mean ratio to R. The calibration's
+    part of P is excluded, since it takes up no noise.
     """
     model = SpotModel.of(run.rig)
     place = {view: i for i, view in enumerate(model.views)}
@@ -126,14 +129,14 @@ def _residuals(spots: SpotGrid, poses: PoseTrack, run: Run) -> tuple[Array | Non
     out = np.full(spots.uv_px.shape, np.nan)
     use: Bools = poses.known & poses.has(PoseStatus.MEASURED)
     noise = poses.covariance - np.nan_to_num(poses.systematic)
-    taken, count = 0.0, 0
+    removed, count = 0.0, 0
     for start in range(0, len(spots.frames), _FRAMES_AT_ONCE):
         part = start + np.flatnonzero(use[start : start + _FRAMES_AT_ONCE])
         if len(part):
             projected, J = rows.project(poses.world_from_body[part])
             out[part] = np.where(spots.measured[part][..., None], spots.uv_px[part] - projected, np.nan)
-            with np.errstate(invalid="ignore"):  # a view without a projection has none of this either
+            with np.errstate(invalid="ignore"):  # nan for views without a projection
                 shares = np.einsum("fvij,fjk,fvik->fvi", J, noise[part], J) / spots.sigma_px[part] ** 2
             shares = shares[np.isfinite(shares) & np.isfinite(out[part])]
-            taken, count = taken + float(np.minimum(shares, 1.0).sum()), count + len(shares)
-    return out, 1.0 - taken / count if count else None
+            removed, count = removed + float(np.minimum(shares, 1.0).sum()), count + len(shares)
+    return out, 1.0 - removed / count if count else None

@@ -1,4 +1,4 @@
-"""Where a run's uncertainty comes from: what differs from frame to frame, and what the calibration leaves."""
+"""The uncertainty budget of a run: noise of the frames, and the systematic part from the calibration."""
 
 from __future__ import annotations
 
@@ -11,13 +11,14 @@ from lab.report.run.report_data import ReportData
 from tracking.statuses import PoseStatus
 
 AVERAGED = 100  # frames of the example
-HEADS = ("", "one frame", "of it noise", "of it calibration", f"mean of {AVERAGED} frames", "mean of endless frames")
+HEADS = ("", "one frame", "noise part", "calibration part", f"mean of {AVERAGED} frames", "mean of infinitely many")
 
 
 def budget_rows(m: ReportData) -> list[tuple[str, ...]]:
-    """A row per number of the pose: medians over the measured frames of 1-sigma; empty where nothing is stated.
+    """A row per component of the pose: medians of the 1-sigma uncertainty over the measured frames.
 
-    Noise is taken for independent from frame to frame, as the frames' own covariances claim it.
+    Empty where the results state no systematic part. Noise is assumed independent from frame to frame, as stated by the
+    covariances of the frames.
     """
     measured = m.poses.has(PoseStatus.MEASURED) & np.all(np.isfinite(m.poses.systematic), axis=(-2, -1))
     if not measured.any():
@@ -36,7 +37,7 @@ def budget_rows(m: ReportData) -> list[tuple[str, ...]]:
 
 
 def _variances(R: Array, covariance: Array) -> Array:
-    """Of x, y, z (m^2) and yaw, pitch, roll (deg^2), (F, 6), of rotations (F, 3, 3) and covariances (F, 6, 6)."""
+    """Variances (F, 6), m^2 and deg^2, of x, y, z, yaw, pitch, roll from R (F, 3, 3) and covariances (F, 6, 6)."""
     J = np.rad2deg(ypr_jacobian(R))
     angles = J @ covariance[:, 3:, 3:] @ np.swapaxes(J, -1, -2)
     both = [np.diagonal(c, axis1=-2, axis2=-1) for c in (covariance[:, :3, :3], angles)]
@@ -44,16 +45,16 @@ def _variances(R: Array, covariance: Array) -> Array:
 
 
 def words(m: ReportData) -> str:
-    """What the reader must know of the calibration's share."""
+    """How to read the systematic part."""
     if m.run is None or m.run.covariance is not None:
         return (
-            "Noise differs from frame to frame, and a mean over frames lessens it. Errors of the calibration are the"
-            " same in every frame at a pose: no mean lessens them, only a better calibration does. In differences"
-            " between two near poses most of them cancel. The table covariance.csv holds both together,"
-            " systematic.csv the calibration's part."
+            "Noise differs from frame to frame, so averaging over frames reduces it. Errors of the calibration are the"
+            " same in every frame at the same pose: averaging does not reduce them, only a better calibration does. In"
+            " differences between two similar poses most of them cancel. covariance.csv contains the sum of both,"
+            " systematic.csv the calibration part."
         )
     return (
-        "The rig file states no covariance of its calibration: the sigmas hold the noise of the pictures alone. What"
-        " the calibration is off comes on top, is the same in every frame, and no mean over frames lessens it."
-        " `beampose calibrate rig` writes the covariance."
+        "The rig file states no covariance of its calibration: the sigmas contain the noise of the pictures only."
+        " Errors of the calibration are additional and the same in every frame, so averaging over frames does not"
+        " reduce them. `beampose calibrate rig` writes the covariance."
     )

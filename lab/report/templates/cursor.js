@@ -1,4 +1,4 @@
-// One cursor through all plots over time: where the mouse is in one, a line stands in every other.
+// A common cursor for all plots over time: the time under the mouse is marked in every plot.
 (() => {
   const plots = [...document.querySelectorAll("svg[data-t]")].map((svg) => {
     const [lo, hi, left, right] = svg.dataset.t.split(" ").map(Number);

@@ -14,9 +14,10 @@ import pytest
 from calibration.findings import Finding, Level
 from geometry.pose import Pose
 from lab.errors import InputError
+from lab.report.calibration import calibration_charts as charts
 from lab.report.calibration import calibration_drawings as draw
-from lab.report.calibration.calibration_charts import DriftLine
-from lab.report.calibration.calibration_maps import contour, contour_levels, value_range
+from lab.report.calibration import calibration_maps as maps
+from lab.report.calibration import calibration_scene as scene
 from lab.report.calibration.calibration_page import (
     LARGEST_BYTES,
     CalibrationReport,
@@ -29,7 +30,8 @@ from lab.report.calibration.calibration_page import (
     telling_views,
     write_calibration_report,
 )
-from lab.report.calibration.calibration_scene import CAMERA_VIEWS
+from lab.report.plot.colour_map import value_range
+from lab.report.plot.maps import contour_levels, contour_lines, heat_map
 from tests.geometry.scenes import paper_rig
 
 SIZE = (640, 480)
@@ -48,7 +50,7 @@ def all_drawings() -> dict[str, str]:
     rig = paper_rig()
     days = [datetime.date(2026, 1, 1 + 3 * i) for i in range(5)]
     rejected = np.arange(300) % 50 == 0
-    things = draw.rig_things(rig, Pose.identity())
+    things = scene.rig_things(rig, Pose.identity())
     A = RNG.normal(size=(6, 6))
     covariance = A @ A.T
     covariance[2] = covariance[:, 2] = 0.0
@@ -64,37 +66,33 @@ def all_drawings() -> dict[str, str]:
         "coverage with holes": draw.coverage_map(SIZE, HOLED),
         "coverage of none": draw.coverage_map(SIZE, CORNERS[:0]),
         "tilt": draw.tilt_polar(np.array([10.0, 40, np.nan]), np.array([0.0, 90, 10])),
-        "map": draw.heat_map(holed, (0, 640, 0, 480), "uncertainty <px>", "px"),
-        "signed map": draw.heat_map(MAP - 1, (-1, 1, -1, 1), "t", "mm", diverging=True, y_down=False, levels=[0.0]),
-        "map of nothing": draw.heat_map(np.full((3, 4), np.nan), (0, 1, 0, 1), "t", "px"),
-        "histogram": draw.residual_histogram(RESIDUALS, sigma=0.2),
-        "histogram of none": draw.residual_histogram(RESIDUALS[:0]),
-        "ladder": draw.lens_ladder(
+        "map": heat_map(holed, (0, 640, 0, 480), "uncertainty <px>", "px"),
+        "signed map": heat_map(MAP - 1, (-1, 1, -1, 1), "t", "mm", diverging=True, y_down=False, levels=[0.0]),
+        "map of nothing": heat_map(np.full((3, 4), np.nan), (0, 1, 0, 1), "t", "px"),
+        "histogram": charts.residual_histogram(RESIDUALS, sigma=0.2),
+        "histogram of none": charts.residual_histogram(RESIDUALS[:0]),
+        "ladder": charts.lens_ladder(
             ["4 <&>", "5", "fisheye"], np.array([0.3, 0.2, np.nan]), 1, fit_rms_px=np.array([0.3, 0.1, np.nan])
         ),
-        "ellipses": draw.error_ellipses(
-            RNG.normal(size=(2, 2)), np.array([np.eye(2)] * 2) * 1e-8, ["<a>", "b"], "m", "t"
-        ),
-        "one ellipse": draw.error_ellipses(np.zeros((1, 2)), np.eye(2)[None], ["a"], "px", "t"),
-        "flatness": draw.flatness_map(
+        "flatness": maps.flatness_map(
             RNG.normal(size=(40, 2)), RNG.normal(0, 1e-3, 40), size_m=(4, 3), bow=(1e-3, 0, 0)
         ),
-        "correlations": draw.correlation_matrix(["fx", "<k1>", "fixed", "a", "b", "c"], covariance),
-        "drift": draw.drift_chart(
-            {"left": DriftLine(days, np.array([0.1, np.nan, 0.2, 0.1, 0.3]), np.full(5, 0.1))},
+        "correlations": maps.correlation_matrix(["fx", "<k1>", "fixed", "a", "b", "c"], covariance),
+        "drift": charts.drift_chart(
+            {"left": charts.DriftLine(days, np.array([0.1, np.nan, 0.2, 0.1, 0.3]), np.full(5, 0.1))},
             warn=0.2,
             fail=0.5,
             expires=datetime.date(2026, 2, 1),
         ),
-        "one check": draw.drift_chart({"l & r": DriftLine(days[:1], np.array([0.1]))}),
-        **{f"scene {i}": s for i, s in enumerate(draw.scene_views(things))},
-        "boards": draw.scene_view(
+        "one check": charts.drift_chart({"l & r": charts.DriftLine(days[:1], np.array([0.1]))}),
+        **{f"scene {i}": s for i, s in enumerate(scene.scene_views(things))},
+        "boards": scene.scene_view(
             [
-                draw.Frustum("<c>", Pose.identity(), (0.5, 0.4)),
-                draw.Rectangle("b", Pose.identity(), (1, 1), faint=True),
+                scene.Frustum("<c>", Pose.identity(), (0.5, 0.4)),
+                scene.Rectangle("b", Pose.identity(), (1, 1), faint=True),
             ],
             "a <scene>",
-            CAMERA_VIEWS[0],
+            scene.CAMERA_VIEWS[0],
         ),
     }
 
@@ -241,10 +239,19 @@ def test_contours_of_a_cone_lie_on_its_circles():
     x, y = np.linspace(-1, 1, 81), np.linspace(-1, 1, 61)
     X, Y = np.meshgrid(x, y)
     for level in (0.3, 0.6):
-        starts, ends = contour(np.hypot(X, Y), x, y, level)
-        radii = np.linalg.norm(np.concatenate([starts, ends]), axis=1)
-        assert np.abs(radii - level).max() < 2e-3  # chords of cells of 1/40
-        assert np.linalg.norm(ends - starts, axis=1).sum() == pytest.approx(2 * np.pi * level, rel=5e-3)
+        (line,) = contour_lines(np.hypot(X, Y), x, y, level)
+        assert np.array_equal(line[0], line[-1])
+        assert np.abs(np.linalg.norm(line, axis=1) - level).max() < 2e-3  # chords of cells of 1/40
+        assert np.linalg.norm(np.diff(line, axis=0), axis=1).sum() == pytest.approx(2 * np.pi * level, rel=5e-3)
+
+
+def test_a_contour_line_ends_at_cells_without_a_value():
+    x = y = np.arange(5.0)
+    values = np.tile(x, (5, 1))
+    values[2, 2] = np.nan
+    lines = contour_lines(values, x, y, 1.5)
+    assert sorted(float(np.ptp(line[:, 1])) for line in lines) == [1.0, 1.0]
+    assert contour_lines(values[:1], x, y[:1], 1.5) == []
 
 
 def test_levels_of_a_steep_map_crowd_where_it_is_low():

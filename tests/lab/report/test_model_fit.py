@@ -1,4 +1,4 @@
-"""The report's answer to whether the rig fits the recording: complete, and readable whatever a summary holds."""
+"""The report's section on the model check is complete, and is written for damaged summaries too."""
 
 from __future__ import annotations
 
@@ -10,13 +10,14 @@ import pytest
 
 from lab.report.run.model_fit import HEADS, model_fit
 from lab.report.run.page import write_report
+from lab.report.run.summary import summary_of
 from lab.runs.model_check.check import check_model
 from tests.lab.fake_results import make
 from tests.lab.runs.model_scenes import changed, recorded
 
 
 def block(really=None, frames: int = 300) -> dict[str, object]:
-    """What summary.json says of a recording, read back."""
+    """The content of summary.json on a recording, read back."""
     run, recording = recorded("smooth", 5, frames=frames, really=really, predicted=True)
     return {"model_check": json.loads(json.dumps(check_model(run.rig, recording).as_mapping()))}
 
@@ -26,10 +27,10 @@ def moved_screen() -> dict[str, object]:
     return block(changed("screens.right.x_m", 8e-3))
 
 
-def test_the_findings_stand_first_and_every_spot_camera_and_beam_has_a_row(moved_screen):
-    fit = model_fit(moved_screen)
+def test_findings_come_first_and_every_spot_camera_and_beam_has_a_row(moved_screen):
+    fit = model_fit(moved_screen["model_check"])
     assert fit is not None
-    assert fit.sentence == "No, or so it seems (300 frames, evenly chosen):"
+    assert fit.sentence == "Probably not (300 frames, evenly spaced):"
     assert [f.level for f in fit.findings] == ["fail"]
     assert "screen `right` may have moved" in fit.findings[0].what
     assert [row[:2] for row in fit.rows[:6]] == [(s, "left" if int(s) < 4 else "right") for s in "123456"]
@@ -39,8 +40,8 @@ def test_the_findings_stand_first_and_every_spot_camera_and_beam_has_a_row(moved
     assert all(len(row) == len(HEADS) for row in fit.rows)
 
 
-def test_each_camera_has_a_drawing_whose_arrows_point_where_the_residuals_do(moved_screen):
-    fit = model_fit(moved_screen)
+def test_each_camera_has_a_drawing_with_arrows_along_the_mean_residuals(moved_screen):
+    fit = model_fit(moved_screen["model_check"])
     assert fit is not None
     assert len(fit.drawings) == 2
     views = {v["name"]: v for v in moved_screen["model_check"]["views"]}
@@ -51,15 +52,15 @@ def test_each_camera_has_a_drawing_whose_arrows_point_where_the_residuals_do(mov
     assert drawn @ mean / np.linalg.norm(drawn) / np.linalg.norm(mean) > 0.99
 
 
-def test_a_right_rig_is_said_to_fit():
-    fit = model_fit(block())
+def test_a_correct_rig_is_reported_to_fit():
+    fit = model_fit(block()["model_check"])
     assert fit is not None
     assert fit.sentence.startswith("Yes: ")
     assert fit.findings == ()
 
 
-def test_what_was_not_tested_says_why():
-    fit = model_fit(block(frames=20))
+def test_the_reason_is_given_if_the_model_was_not_tested():
+    fit = model_fit(block(frames=20)["model_check"])
     assert fit is not None
     assert fit.sentence == "Not tested: 20 frames have 3 and more spots measured; the test needs 30."
 
@@ -78,16 +79,16 @@ def test_what_was_not_tested_says_why():
         },
     ],
 )
-def test_a_damaged_summary_makes_a_poorer_section_and_no_error(summary):
-    assert model_fit(summary) is not None
+def test_a_damaged_summary_gives_an_incomplete_section_and_no_error(summary):
+    assert model_fit(summary_of(summary).model_check) is not None
 
 
 def test_a_summary_of_an_older_run_has_no_section():
-    assert model_fit({}) is None
-    assert model_fit({"model_check": None}) is None
+    assert model_fit(summary_of({}).model_check) is None
+    assert model_fit(summary_of({"model_check": None}).model_check) is None
 
 
-def test_the_section_is_in_the_report_and_not_in_that_of_an_older_run(tmp_path: Path, moved_screen):
+def test_the_section_is_in_the_report_but_not_in_that_of_older_results(tmp_path: Path, moved_screen):
     fake = make(tmp_path, 60)
     title = "Does the rig fit the recording?"
     assert title not in write_report(fake.results).read_text(encoding="utf-8")

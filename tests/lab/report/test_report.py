@@ -1,4 +1,4 @@
-"""A report is one file that opens anywhere, leaves nothing out, and survives poor results."""
+"""A report is one self-contained, complete file, and is written for incomplete or poor results too."""
 
 from __future__ import annotations
 
@@ -12,12 +12,17 @@ import numpy as np
 import pytest
 
 from lab import number_format
-from lab.report.plot import svg
+from lab.report.plot import thinning
+from lab.report.plot.image import grey_limits, stretched
+from lab.report.plot.scales import tick_texts, ticks
+from lab.report.plot.series import Line, Shade, time_panel
+from lab.report.plot.svg import BLUE, line_path
+from lab.report.run.events import MOST_PICTURES, events, selected
 from lab.report.run.index import write_index
 from lab.report.run.page import write_report
-from lab.report.run.pictures import MOST_PICTURES, _arrow, chosen, events, grey_limits, stretched
-from lab.report.run.report_data import gather
-from lab.report.run.verdict import verdict_of
+from lab.report.run.pictures import _arrow
+from lab.report.run.report_data import read_report_data
+from lab.report.run.summary import summary_of, verdict_of
 from tests.lab.fake_results import Fake, make, without_added_columns
 from tracking.statuses import PoseStatus, SpotStatus
 
@@ -73,7 +78,7 @@ def assert_well_formed(html: str) -> None:
     assert parser.open == []
 
 
-def test_a_report_asks_for_nothing_outside_itself(filmed):
+def test_a_report_loads_nothing_from_outside(filmed):
     html = filmed[1]
     for found in re.findall(r"""(?:src|href|url|action)\s*[=(]\s*["']?([^"')\s>]+)""", html):
         assert found.startswith(("data:image/", "#")), found
@@ -83,23 +88,23 @@ def test_a_report_asks_for_nothing_outside_itself(filmed):
 
 def test_a_report_has_every_part(page):
     for head in ("Attitude and position", "Spots over the picture", "Status over time", "Residuals", "Events",
-                 "Errors against truth", "How this was made", "Input fingerprints", "Method"):  # fmt: skip
+                 "Errors against truth", "Provenance", "Input fingerprints", "Method"):  # fmt: skip
         assert head in page
-    for status in (*SpotStatus, *PoseStatus):
-        assert status.meaning in page.replace("&#39;", "'")
+    meanings = [s.meaning_for("spots") for s in SpotStatus] + [s.meaning for s in PoseStatus]
+    assert all(meaning in page.replace("&#39;", "'") for meaning in meanings)
     assert "ab" * 32 in page
     assert "tracker.r1_px" in page
     assert_well_formed(page)
 
 
-def test_a_users_words_are_shown_and_not_obeyed(page):
+def test_markup_in_the_users_texts_is_escaped(page):
     assert "fake &lt;yaw &amp; bend&gt;" in page
     assert "A note with &lt;b&gt;markup&lt;/b&gt; &amp; an ampersand." in page
     assert "<yaw" not in page
     assert "<b>markup" not in page
 
 
-def test_names_of_spots_and_cameras_are_shown_and_not_obeyed(fake, tmp_path):
+def test_markup_in_names_of_spots_and_cameras_is_escaped(fake, tmp_path):
     shutil.copytree(fake.results, tmp_path / "results")
     path = tmp_path / "results" / "spots.csv"
     path.write_text(path.read_text().replace(",left,1,", ",left,<script>1,"))
@@ -125,26 +130,26 @@ def test_the_same_results_give_the_same_report(fake, page):
     ids=["one frame", "three frames", "no truth", "all lost", "one camera"],
 )
 @pytest.mark.filterwarnings("error")
-def test_a_report_is_made_of_poor_results_too(tmp_path, kind, words):
+def test_a_report_is_written_for_poor_results_too(tmp_path, kind, words):
     html = write_report(make(tmp_path, **kind).results).read_text(encoding="utf-8")
     assert words in html
     assert_well_formed(html)
     assert not re.search(r'[ "M]-?(nan|inf)\b', re.sub(r"<title>.*?</title>", "", html))
 
 
-def test_a_report_is_made_from_the_tables_alone_and_says_what_is_missing(tmp_path):
+def test_a_report_is_written_from_the_tables_alone_and_names_what_is_missing(tmp_path):
     fake = make(tmp_path, 50)
     shutil.rmtree(fake.run_folder)
-    for told in (None, fake.run_folder):
-        html = write_report(fake.results, told).read_text(encoding="utf-8")
-        assert "The run folder could not be reached" in html
+    for given in (None, fake.run_folder):
+        html = write_report(fake.results, given).read_text(encoding="utf-8")
+        assert "The run folder could not be read" in html
     (fake.results / "summary.json").unlink()
     html = write_report(fake.results).read_text(encoding="utf-8")
     assert "NO VERDICT" in html
     assert "summary.json is missing" in html
 
 
-def test_a_smoothed_run_shows_what_was_known_at_the_instant_as_a_thin_line_beside_it(tmp_path, page):
+def test_the_report_of_a_smoothed_run_also_shows_the_causal_errors(tmp_path, page):
     html = write_report(make(tmp_path, 120, causal=True).results).read_text(encoding="utf-8")
     assert html.count("causal minus truth</title>") == 6
     assert "median, smoothed; causal" in html
@@ -162,7 +167,7 @@ def test_velocity_and_rate_have_a_panel_and_a_band_each(fake, page):
     assert "against differences of the true poses" in page
 
 
-def test_a_report_is_made_of_results_from_before_there_were_velocities(fake, tmp_path):
+def test_a_report_is_written_for_older_results_without_velocities(fake, tmp_path):
     html = write_report(without_added_columns(fake.results, tmp_path / "older")).read_text(encoding="utf-8")
     assert "Velocity and angular rate" not in html
     assert "label left open" not in html.split("<h2>Residuals")[0].split("Status over time")[1]
@@ -170,13 +175,13 @@ def test_a_report_is_made_of_results_from_before_there_were_velocities(fake, tmp
     assert_well_formed(html)
 
 
-def test_what_became_of_doubtful_labels_is_told(fake, tmp_path):
+def test_the_report_counts_doubtful_and_changed_labels(fake, tmp_path):
     shutil.copytree(fake.results, tmp_path / "results")
     spots = tmp_path / "results" / "spots.csv"
     lines = spots.read_text().splitlines()
     doubtful = [i for i, line in enumerate(lines) if ",occluded," in line][:3]
     for i in doubtful:
-        lines[i] += "0.6"  # a detection was there, but not likely enough to be this spot
+        lines[i] += "0.6"  # there was a detection, but its label was not likely enough
     spots.write_text("\n".join(lines) + "\n")
     path = tmp_path / "results" / "summary.json"
     summary = json.loads(path.read_text())
@@ -185,23 +190,54 @@ def test_what_became_of_doubtful_labels_is_told(fake, tmp_path):
     path.write_text(json.dumps(summary | {"events": [open_for_long]}))
     html = write_report(tmp_path / "results").read_text(encoding="utf-8")
     assert len(doubtful) == 3
-    assert "Labels: 3 left open: no label was likely enough to be given; 4 changed by the smoothing pass" in html
+    assert "Labels: 3 left open: no label was likely enough; 4 changed by the smoothing pass" in html
     assert "1 ties, in which" in html
     assert "2 times the vehicle was found again" in html
     assert "<td>spot 1: open, for 5 frames</td>" in html
 
 
-def test_residuals_are_judged_by_what_the_pose_leaves_of_them(fake):
-    material = gather(fake.results, None)
+def test_residuals_are_compared_with_their_variance_after_the_fit_of_the_pose(fake):
+    material = read_report_data(fake.results, None)
     shares = (material.residual_px / material.spots.sigma_px) ** 2
-    # These poses were drawn without looking at the measured places: residuals are larger than a fit's.
+    # These poses are drawn independently of the measured places: residuals are larger than after a fit.
     assert np.nanmean(shares) > 1.0
-    assert material.residual_share == pytest.approx(1 - 6 / 12, abs=0.1)  # as a fit of six numbers to six spots leaves
+    assert material.residual_share == pytest.approx(
+        1 - 6 / 12, abs=0.1
+    )  # a fit of 6 parameters to 6 spots, 12 coordinates
 
 
 def test_frames_without_a_picture_are_listed_as_ranges(fake, page):
     first, last = json.loads((fake.results / "summary.json").read_text())["counts"]["no_image"]["left"][0]
     assert f"Camera left has no usable picture for frames {first}\u2013{last} (3 in all)." in page
+
+
+@pytest.mark.parametrize(("method", "own", "other"), [("rigid", "rigid", "spots"), ("spots", "spots", "rigid")])
+def test_the_status_meanings_are_those_of_the_tracker_method(tmp_path, method, own, other):
+    fake = make(tmp_path, 30)
+    path = fake.results / "summary.json"
+    summary = json.loads(path.read_text())
+    summary["parameters"]["tracker"]["method"] = method
+    path.write_text(json.dumps(summary))
+    html = write_report(fake.results).read_text(encoding="utf-8").replace("&#39;", "'")
+    for status in (SpotStatus.MATCHED, SpotStatus.OCCLUDED, SpotStatus.OUT_OF_VIEW):
+        assert status.meaning_for(own) in html
+        assert status.meaning_for(other) not in html
+    assert ("matching step 1" in html) == (method == "spots")
+
+
+@pytest.mark.parametrize("tree", [{"parameters": None}, {"parameters": {"tracker": {"method": "a newer one"}}}])
+def test_a_summary_without_a_known_tracker_method_has_the_meanings_of_the_oldest(tree):
+    assert summary_of(tree).method == "spots"
+
+
+def test_damaged_parts_of_a_summary_are_left_out():
+    odd = {"counts": {"events": {"tie": "many"}, "no_image": 3}, "events": ["odd", {"frame": 4}], "errors": [],
+           "inputs": [{"path": "a", "bytes": "?"}, {"path": "b"}], "notes": "one"}  # fmt: skip
+    summary = summary_of(odd)
+    assert (summary.event_counts, summary.no_image, summary.errors) == ({}, {}, None)
+    assert [(e.frame, e.kind) for e in summary.events] == [(4, "noted")]
+    assert [i.path for i in summary.inputs] == ["b"]
+    assert summary.notes == ("one",)
 
 
 @pytest.mark.parametrize(("status", "word"), [("pass", "PASS"), ("check", "CHECK"), ("fail", "FAIL")])
@@ -216,7 +252,7 @@ def test_the_verdict_is_that_of_the_summary_with_all_its_reasons(tmp_path, statu
     assert "<li>one thing</li><li>another</li>" in html
 
 
-def test_each_reason_stands_at_the_top_with_its_remedy(tmp_path):
+def test_each_reason_is_at_the_top_with_its_remedy(tmp_path):
     make(tmp_path, 40)
     path = tmp_path / "results/summary.json"
     evidence = [
@@ -233,7 +269,7 @@ def test_each_reason_stands_at_the_top_with_its_remedy(tmp_path):
 
 
 @pytest.mark.parametrize("summary", [{}, {"verdict": None}, {"verdict": "good"}, {"verdict": {"status": "splendid"}}])
-def test_a_verdict_that_is_not_there_is_not_made_up(summary):
+def test_without_a_valid_verdict_the_report_says_so(summary):
     verdict = verdict_of(summary)
     assert (verdict.word, verdict.status) == ("NO VERDICT", "unknown")
 
@@ -250,15 +286,15 @@ def test_a_damaged_picture_is_shown_as_such(filmed):
     assert "no usable picture, for 1 frame" in filmed[1]
 
 
-def test_at_most_eight_pictures_with_every_kind_of_event_among_them(fake):
-    material = gather(fake.results, None)
+def test_at_most_eight_pictures_include_every_kind_of_event(fake):
+    material = read_report_data(fake.results, None)
     found = events(material)
-    selection = chosen(material, found)
+    selection = selected(material, found)
     assert len(selection) <= MOST_PICTURES
     assert {e.kind for e in found} <= {e.kind for e in selection}
 
 
-def test_what_the_run_itself_noted_is_listed_and_pictured(fake, tmp_path):
+def test_events_recorded_by_the_run_are_listed_and_pictured(fake, tmp_path):
     shutil.copytree(fake.results, tmp_path / "results")
     path = tmp_path / "results" / "summary.json"
     noted = {"frame": 33, "kind": "tie", "camera": None, "spot": None, "text": "two labels fit <equally>"}
@@ -266,21 +302,21 @@ def test_what_the_run_itself_noted_is_listed_and_pictured(fake, tmp_path):
     assert "<td>33</td><td>0.330</td><td>left</td><td>two labels fit &lt;equally&gt;</td>" in write_report(
         tmp_path / "results"
     ).read_text(encoding="utf-8")
-    material = gather(tmp_path / "results", fake.run_folder)
-    assert "tie" in {e.kind for e in chosen(material, events(material))}
+    material = read_report_data(tmp_path / "results", fake.run_folder)
+    assert "tie" in {e.kind for e in selected(material, events(material))}
 
 
-def test_a_faint_spot_on_a_dark_picture_is_shown_bright_and_a_dark_picture_stays_dark():
+def test_a_faint_spot_in_a_black_picture_is_shown_bright_and_the_background_stays_black():
     rng = np.random.default_rng(1)
-    dark = 8 + rng.normal(scale=1, size=(512, 640))
-    faint = dark.copy()
+    black = 8 + rng.normal(scale=1, size=(512, 640))
+    faint = black.copy()
     faint[250:256, 300:306] += 30
     faint[10, 10] = 255.0  # a hot pixel
     assert stretched(faint, *grey_limits(faint))[253, 303] > 200
-    assert np.median(stretched(dark, *grey_limits(dark))) < 128
+    assert np.median(stretched(black, *grey_limits(black))) < 128
 
 
-def test_a_spot_far_outside_is_named_with_its_distance_and_an_arrow_at_the_border():
+def test_a_spot_far_outside_gets_an_arrow_at_the_border_and_a_name_inside():
     x, y, d = _arrow(np.array([1500.0, 300.0]), (1280, 1024), 2.0)
     tip = [float(v) for v in d[1:].split("L")[0].split()]
     assert tip == pytest.approx([1275, 300])  # two units inside the border
@@ -292,7 +328,7 @@ class TestDrawing:
     def test_a_spike_of_one_frame_survives_thinning(self):
         t, y = np.arange(100_000.0), np.zeros(100_000)
         y[51_234] = 7.0
-        x, thin = svg.envelope(t, y, 500)
+        x, thin = thinning.envelope(t, y, 500)
         assert len(x) <= 1000
         assert x[np.argmax(thin)] == 51_234
         assert thin.max() == 7.0
@@ -301,52 +337,52 @@ class TestDrawing:
     def test_a_gap_survives_thinning(self):
         t, y = np.arange(10_000.0), np.ones(10_000)
         y[4000:6000] = np.nan
-        x, thin = svg.envelope(t, y, 100)
+        x, thin = thinning.envelope(t, y, 100)
         assert np.isnan(thin[(x > 4200) & (x < 5800)]).all()
         assert np.isfinite(thin[(x < 3900) | (x > 6100)]).all()
 
-    def test_a_band_keeps_its_widest_place(self):
+    def test_thinning_keeps_the_extremes_of_a_band(self):
         t = np.arange(10_000.0)
         low, high = -np.ones(10_000), np.ones(10_000)
         high[777], low[778] = 5.0, -6.0
-        _, thin_low, thin_high = svg.band_envelope(t, low, high, 100)
+        _, thin_low, thin_high = thinning.band_envelope(t, low, high, 100)
         assert (thin_low.min(), thin_high.max()) == (-6.0, 5.0)
 
     def test_a_plot_of_a_hundred_thousand_frames_stays_small(self):
         rng = np.random.default_rng(5)
         t = np.arange(100_000) / 100
-        panel = svg.time_panel(t, "noise", "px", lines=(svg.Line(rng.normal(size=100_000), svg.BLUE, "noise"),))
+        panel = time_panel(t, "noise", "px", lines=(Line(rng.normal(size=100_000), BLUE, "noise"),))
         assert len(panel) < 30_000
 
-    def test_one_frame_that_is_lost_among_a_hundred_thousand_is_still_shaded(self):
+    def test_one_lost_frame_among_a_hundred_thousand_is_shaded(self):
         t, lost = np.arange(100_000.0), np.zeros(100_000, dtype=bool)
         lost[31_415] = True
-        panel = svg.time_panel(t, "x", "m", lines=(), shades=(svg.Shade(lost, "lost", "lost"),))
+        panel = time_panel(t, "x", "m", lines=(), shades=(Shade(lost, "lost", "lost"),))
         assert panel.count('class="lost"') == 1
 
-    def test_what_lies_beyond_the_axis_is_marked_and_named(self):
+    def test_values_beyond_the_axis_are_marked_and_the_largest_is_given(self):
         y = np.zeros(500)
         y[100] = 40.0
-        panel = svg.time_panel(np.arange(500.0), "x", "px", lines=(svg.Line(y, svg.BLUE, "x"),), y_range=(-1.0, 1.0))
+        panel = time_panel(np.arange(500.0), "x", "px", lines=(Line(y, BLUE, "x"),), y_range=(-1.0, 1.0))
         assert "up to 40.0 px" in panel
         assert "h6l-3 -5z" in panel
 
-    def test_a_lone_value_between_gaps_is_drawn(self):
-        assert svg.line_path(np.array([1.0, 2, 3]), np.array([np.nan, 5.0, np.nan])) == "M2.0 5.0h0"
+    def test_an_isolated_value_between_gaps_is_drawn(self):
+        assert line_path(np.array([1.0, 2, 3]), np.array([np.nan, 5.0, np.nan])) == "M2.0 5.0h0"
 
-    def test_ticks_are_round_inside_and_without_minus_nought(self):
+    def test_ticks_are_round_within_the_range_and_without_negative_zero(self):
         for lo, hi in ((-0.3, 0.4), (-2e-5, 1e-6), (19_990.0, 20_010.0), (-7.0, -6.9)):
-            values = svg.ticks(lo, hi, 5)
+            values = ticks(lo, hi, 5)
             assert 2 <= len(values) <= 7
             assert ((values >= lo - 1e-9) & (values <= hi + 1e-9)).all()
-            texts = svg.tick_texts(values)
+            texts = tick_texts(values)
             assert len(set(texts)) == len(texts)
             assert not any(re.fullmatch("\u22120(\\.0+)?", t) for t in texts)
             np.testing.assert_allclose([float(t.replace("\u2212", "-")) for t in texts], values, atol=1e-3 * (hi - lo))
 
 
 class TestNumbers:
-    def test_a_share_under_one_never_reads_as_all(self):
+    def test_a_share_below_one_is_never_shown_as_100_percent(self):
         assert number_format.percent(0.99996) != "100.0 %"
         assert number_format.percent(0.99996).startswith("99.99")
         assert number_format.percent(1.0) == "100 %"
@@ -366,7 +402,7 @@ class TestNumbers:
     def test_numbers_are_short_and_plain(self, value, words):
         assert number_format.short(value) == words
 
-    def test_lengths_and_angles_choose_their_unit(self):
+    def test_lengths_and_angles_have_a_suitable_unit(self):
         assert number_format.length(0.00046) == "0.460 mm"
         assert number_format.length(1.5) == "1.50 m"
         assert number_format.angle(0.0027) == "2.70 mdeg"
@@ -378,7 +414,7 @@ class TestIndex:
         {"name": "a-pass", "status": "pass", "results": "a-pass", "frames": 600, "message": ""},
         {"name": "b-error", "status": "error", "results": "", "frames": "", "message": "no <rig> & no run"},
         {"name": "c-fail", "status": "fail", "results": "c-fail", "frames": 20, "message": "lost"},
-        {"name": "d-check", "status": "check", "results": "d-check", "frames": 20, "message": "look"},
+        {"name": "d-check", "status": "check", "results": "d-check", "frames": 20, "message": "few spots"},
     )
 
     def write(self, out: Path) -> str:
@@ -392,18 +428,18 @@ class TestIndex:
         assert re.findall(r'class="badge (\w+)"', html) == ["error", "fail", "check", "pass"]
         assert_well_formed(html)
 
-    def test_links_lead_to_the_reports_that_are_there(self, tmp_path):
+    def test_only_existing_reports_are_linked(self, tmp_path):
         html = self.write(tmp_path)
         links = re.findall(r'<a href="([^"]+)"', html)
         assert links == ["./c-fail/report.html", "./a-pass/report.html"]
         assert all((tmp_path / link).is_file() for link in links)
 
-    def test_messages_are_shown_and_not_obeyed(self, tmp_path):
+    def test_markup_in_messages_is_escaped(self, tmp_path):
         html = self.write(tmp_path)
         assert "no &lt;rig&gt; &amp; no run" in html
         assert "<rig>" not in html
 
-    def test_a_batch_of_nothing_says_so(self, tmp_path):
+    def test_the_index_of_an_empty_batch_says_so(self, tmp_path):
         assert "The batch has no runs." in write_index([], tmp_path).read_text(encoding="utf-8")
 
 

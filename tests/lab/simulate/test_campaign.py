@@ -1,4 +1,4 @@
-"""Simulated calibration campaigns: folders that the program reads, with a truth that explains them."""
+"""Simulated calibration campaigns are valid projects, and their measurements agree with their truth."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def sizes(project):
     return {name: camera.lens.image_size_px for name, camera in project.cameras.items()}
 
 
-def test_the_folder_is_a_project_that_reads_without_a_mistake(folder):
+def test_the_folder_is_a_valid_project(folder):
     project = load_project(folder)
     survey = read_survey(project.survey, project.screens)
     seen = read_observations(project.points, sizes(project), survey.names)
@@ -39,14 +39,14 @@ def test_the_folder_is_a_project_that_reads_without_a_mistake(folder):
     assert project.stand.world_from_stand is None
 
 
-def test_the_truth_beside_it_explains_every_spot_and_every_dot_to_their_sigmas(folder):
+def test_spots_and_dots_agree_with_the_truth_within_their_sigmas(folder):
     truth, project = load_rig(folder / "truth" / "rig.yaml"), load_project(folder)
     survey = read_survey(project.survey, project.screens)
     seen = read_observations(project.points, sizes(project), survey.names)
     for name, camera in truth.cameras.items():
         mine = np.array([c == name for c in seen.camera])
         at = survey.xyz[[survey.names.index(p) for p, m in zip(seen.point, mine, strict=True) if m]]
-        # 0.3 mm of the survey are 0.08 px at 4.4 m and 0.14 px at 2.5 m; the pixel's own 0.07 px come on top.
+        # The survey error of 0.3 mm is 0.08 px at 4.4 m and 0.14 px at 2.5 m; that of the pixels is 0.07 px.
         rms = np.sqrt(np.mean((camera.project(at) - seen.pixels[mine]) ** 2))
         assert 0.07 < rms < 0.16
     poses = read_poses(folder / "truth" / "poses.csv")
@@ -61,13 +61,13 @@ def test_the_truth_beside_it_explains_every_spot_and_every_dot_to_their_sigmas(f
     assert np.sqrt(np.mean(away**2)) == pytest.approx(0.054, rel=0.25)
 
 
-def test_the_stand_is_recorded_as_well_as_its_sigmas_say():
+def test_errors_of_the_recorded_stand_positions_agree_with_their_sigmas():
     c = draw_campaign(3, quality=Quality(positions=400))
     errors = c.stand_recorded.minus(c.stand_from_body) / c.record_sigmas
     assert np.sqrt(np.mean(errors**2)) == pytest.approx(1.0, abs=0.05)
 
 
-def test_the_rig_is_mounted_off_its_drawing_by_what_mounting_by_eye_leaves():
+def test_the_mounted_rig_deviates_from_its_drawing_by_mounting_tolerances():
     c = draw_campaign(0)
     for name, camera in c.truth.cameras.items():
         drawn = c.nominal.cameras[name]
@@ -76,7 +76,7 @@ def test_the_rig_is_mounted_off_its_drawing_by_what_mounting_by_eye_leaves():
         assert np.deg2rad(0.02) < np.linalg.norm(apart[3:]) < np.deg2rad(2)
 
 
-def test_lenses_come_with_errors_as_large_as_their_covariance_says():
+def test_lens_errors_agree_with_their_covariance():
     sizes = []
     for seed in range(12):
         c = draw_campaign(seed, quality=Quality(positions=3, dots=(2, 2)))
@@ -88,17 +88,17 @@ def test_lenses_come_with_errors_as_large_as_their_covariance_says():
                 ] + list(np.array(lens.camera.distortion) - true.distortion)
             )  # fmt: skip
             sizes.append(e @ np.linalg.solve(lens.covariance, e) / len(e))
-    # 24 lenses of 9 numbers: sqrt(2 / 216) = 0.1.
+    # 24 lenses of 9 parameters: relative sigma sqrt(2 / 216) = 0.1.
     assert np.mean(sizes) == pytest.approx(1.0, abs=0.3)
 
 
-def test_more_board_photographs_make_a_lens_better_known():
+def test_more_board_photographs_reduce_the_lens_covariance():
     camera = RIGS["fan"]().cameras["left"]
     few, many = lens_covariance(camera, 0.1, views=10), lens_covariance(camera, 0.1, views=40)
     assert np.all(np.diagonal(many) < np.diagonal(few))
 
 
-def test_the_same_seed_gives_the_same_bytes_and_another_one_does_not(folder, tmp_path):
+def test_the_same_seed_gives_the_same_bytes_and_another_seed_does_not(folder, tmp_path):
     again = simulate_calibration(tmp_path / "again", seed=7, positions=8)
     other = simulate_calibration(tmp_path / "other", seed=5, positions=8)
     names = sorted(p.relative_to(folder) for p in folder.rglob("*") if p.is_file())
@@ -107,7 +107,7 @@ def test_the_same_seed_gives_the_same_bytes_and_another_one_does_not(folder, tmp
     assert not filecmp.cmp(folder / "spots.csv", other / "spots.csv", shallow=False)
 
 
-def test_wrong_measurements_are_as_many_as_asked_for_and_far_off():
+def test_outliers_have_the_given_share_and_large_errors():
     c = draw_campaign(6, quality=Quality(wrong=0.1))
     good = draw_campaign(6)
     assert 0.04 < c.wrong_spots.mean() < 0.18
@@ -117,9 +117,9 @@ def test_wrong_measurements_are_as_many_as_asked_for_and_far_off():
 
 
 @pytest.mark.parametrize("rig", sorted(RIGS))
-def test_every_example_rig_can_be_calibrated_by_its_campaign(rig):
+def test_every_example_rig_can_be_calibrated_with_its_campaign(rig):
     c = draw_campaign(1, rig, Quality(positions=10))
-    # Each camera needs four dots, each position five numbers.
+    # Each camera needs four dots, each position five coordinates.
     assert np.bincount(c.seen_camera).min() >= 8
     assert np.bincount(c.spots.position).min() >= 3
     assert {c.truth.spots[s].beam for _, s in c.truth.views()} == set(c.truth.beams)
@@ -148,18 +148,18 @@ def test_board_photographs_show_the_board_that_the_folder_names(tmp_path, monkey
         ({"wrong": 0.5}, "wrong: expected a share from 0 up to 0.3, got 0.5"),
     ],
 )
-def test_arguments_that_do_not_fit_are_refused_and_nothing_is_left(tmp_path, arguments, words):
+def test_invalid_arguments_are_rejected_and_nothing_is_written(tmp_path, arguments, words):
     with pytest.raises(InputError, match=words):
         simulate_calibration(tmp_path / "none", **arguments)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_existing_folder_is_not_written_over(folder):
+def test_an_existing_folder_is_not_overwritten(folder):
     with pytest.raises(InputError, match="choose another --out"):
         simulate_calibration(folder, seed=9)
 
 
-def test_a_known_place_of_the_stand_is_told_with_its_sigmas(tmp_path):
+def test_a_known_pose_of_the_stand_is_written_with_its_sigmas(tmp_path):
     quality = Quality(place_known=True)
     stand = load_project(simulate_calibration(tmp_path / "known", seed=2, positions=3, quality=quality)).stand
     c = draw_campaign(2, quality=Quality(place_known=True, positions=3))

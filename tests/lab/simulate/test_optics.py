@@ -1,4 +1,4 @@
-"""Where rendered spots lie, and what shape they have, seen by other means than the renderer's own."""
+"""Position and shape of rendered spots, checked by methods independent of the renderer."""
 
 from dataclasses import replace
 
@@ -12,8 +12,8 @@ from geometry.camera import Camera
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.rig import Rig
-from lab.simulate.optics import appearance, exposure_instants, on_screen_covariance, spot_patch
-from lab.simulate.picture import expose, laser_powers, make_sensor
+from lab.simulate.optics import exposure_instants, on_screen_covariance, spot_images, spot_patch
+from lab.simulate.picture import expected_light, laser_powers, make_sensor
 from lab.simulate.rigs import fan, look_at
 from lab.simulate.scenarios import LIGHTS, SCENARIOS, Clutter
 from lab.simulate.scene import compose
@@ -23,7 +23,7 @@ MODEL = SpotModel.of(RIG)
 
 
 def fitted_centre(picture, near_px, half):
-    """Centre of an elliptical Gaussian on a constant, by least squares: knows nothing of how the picture was made."""
+    """The centre of an elliptical Gaussian on a constant by least squares, independent of the renderer."""
     u0, v0 = np.round(near_px).astype(int)
     v, u = np.mgrid[v0 - half : v0 + half + 1, u0 - half : u0 + half + 1]
     data = picture[v0 - half : v0 + half + 1, u0 - half : u0 + half + 1].astype(float)
@@ -39,20 +39,20 @@ def fitted_centre(picture, near_px, half):
 
 
 def recording(**light):
-    """Three frames without anything but spots on an even background."""
+    """Three frames with only spots on a uniform background."""
     even = replace(LIGHTS["clean"], gradient_dn=0.0, **light)
     return compose(replace(SCENARIOS["very-fast"], clutter=Clutter(per_spot=0.0), light=even), seed=3, frames=3)
 
 
 def errors_px(scene, half, expected_px=None):
-    """Fitted centre minus `expected_px` (T, n, 2), the truth where not given, of all spots well inside the pictures."""
+    """Fitted centre minus `expected_px` (T, n, 2), by default the truth, of all spots well inside the pictures."""
     powers = laser_powers(scene)
     expected = scene.uv_px if expected_px is None else expected_px
     out = []
     for camera, name in enumerate(scene.model.camera_names):
         sensor = make_sensor(scene, camera)
         for k in scene.frame:
-            picture = expose(scene, sensor, powers, k)
+            picture = expected_light(scene, sensor, powers, k)
             inside = scene.rig.cameras[name].sees(scene.uv_px[k], -half - 1.0) & (scene.model.camera_of == camera)
             out.extend(fitted_centre(picture, scene.uv_px[k, i], half) - expected[k, i] for i in np.flatnonzero(inside))
     return np.array(out)
@@ -63,25 +63,27 @@ def errors_px(scene, half, expected_px=None):
     [(0.004, 6), (0.011, 12), (0.060, 50)],
     ids=["narrow, sigma about 1 px", "sigma 2 px", "wide, sigma 9 px"],
 )
-def test_spots_lie_at_the_truth(beam_radius_m, half):
+def test_spots_are_rendered_at_their_true_positions(beam_radius_m, half):
     errors = errors_px(recording(beam_radius_m=beam_radius_m, exposure_s=1e-9), half)
     assert len(errors) >= 15
     assert np.abs(errors).max() < 2e-3
 
 
-def test_a_streak_lies_where_the_spot_was_on_average_over_the_exposure():
-    """That is the truth of mid-exposure plus acceleration * exposure^2 / 24: 0.004 px at 100 px per frame and 1 ms."""
+def test_the_centre_of_a_streak_is_the_mean_position_over_the_exposure():
+    """The mean is the position at mid-exposure plus acceleration * exposure^2 / 24: 0.004 px at 100 px per frame and 1
+    ms.
+    """
     scene = recording(exposure_s=1e-3)
     instants = (np.arange(1000) + 0.5) / 1000 - 0.5
     mean = np.array([scene.model.project(scene.motion.pose(t + 1e-3 * instants))[0].mean(axis=0) for t in scene.t_s])
     moved = scene.model.project(scene.motion.pose(scene.t_s + 0.5e-3))[0]
     assert np.linalg.norm(moved - scene.uv_px, axis=-1).max() > 3.0  # half a streak
-    # A streak whose speed changes is a little skew, which moves a Gaussian's fit by another 0.002 px.
+    # A streak with changing speed is slightly skewed, which moves the fit of a Gaussian by another 0.002 px.
     assert np.abs(errors_px(scene, 22, mean)).max() < 3e-3
     assert np.abs(mean - scene.uv_px).max() < 6e-3
 
 
-def test_a_streak_is_as_long_as_the_path():
+def test_a_streak_has_the_length_of_the_path():
     instants, weights = exposure_instants(12.0, 1.5)
     path = np.array([40.0, 30.0]) + instants[:, None] * np.array([12.0, 0.0])
     patch = spot_patch(path, weights, 1.5**2 * np.eye(2), (80, 60))
@@ -96,7 +98,7 @@ def test_a_streak_is_as_long_as_the_path():
 
 
 @pytest.mark.parametrize("sigma_px", [0.5, 1.0, 4.0])
-def test_light_is_summed_over_whole_pixels(sigma_px):
+def test_light_is_integrated_over_pixels(sigma_px):
     centre = np.array([20.3, 17.8])
     patch = spot_patch(centre[None], np.ones(1), sigma_px**2 * np.eye(2), (48, 40))
     u = patch.column + np.arange(patch.values.shape[1])
@@ -107,7 +109,7 @@ def test_light_is_summed_over_whole_pixels(sigma_px):
     np.testing.assert_allclose(patch.values, np.outer(exact_v, exact_u), atol=3e-6)
 
 
-def test_a_spot_beside_the_picture_leaves_only_its_rim_in_it():
+def test_only_the_edge_of_a_spot_beside_the_picture_is_in_it():
     whole = spot_patch(np.array([[50.0, 50.0]]), np.ones(1), 4 * np.eye(2), (100, 100)).values.sum()
     rim = spot_patch(np.array([[-1.5, 50.0]]), np.ones(1), 4 * np.eye(2), (100, 100)).values.sum()
     assert whole == pytest.approx(1.0, abs=1e-5)
@@ -115,7 +117,7 @@ def test_a_spot_beside_the_picture_leaves_only_its_rim_in_it():
     assert spot_patch(np.array([[-40.0, 50.0]]), np.ones(1), 4 * np.eye(2), (100, 100)) is None
 
 
-def test_a_beam_that_meets_the_screen_at_60_degrees_leaves_an_ellipse_twice_as_long_as_wide():
+def test_a_beam_with_60_degrees_of_incidence_gives_an_ellipse_with_axes_in_the_ratio_2():
     direction = np.array([np.sin(np.pi / 3), 0.0, np.cos(np.pi / 3)])
     axes = np.eye(3)[:, :2]
     C = on_screen_covariance(direction, axes, 0.01)
@@ -125,8 +127,8 @@ def test_a_beam_that_meets_the_screen_at_60_degrees_leaves_an_ellipse_twice_as_l
 def traced(view, pose, sigma_m):
     """A spot traced through OpenCV's camera on a grid of rays across the beam.
 
-    Returns its middle without and with the fall of light across the spot (cosine and square of the distance), (2,)
-    each, and its covariance (2, 2), px.
+    Returns its centroid without and with the variation of light over the spot (cosine and squared distance), (2,) each,
+    and its covariance (2, 2), px.
     """
     camera = RIG.cameras[MODEL.views[view][0]]
     camera_from_world = camera.camera_from_world
@@ -154,19 +156,20 @@ POSES = [
 
 @pytest.mark.parametrize("pose", POSES)
 @pytest.mark.parametrize("view", [0, 1, 3, 4])
-def test_the_ellipse_in_the_picture_is_that_of_rays_traced_through_opencv(pose, view):
+def test_the_ellipse_in_the_picture_agrees_with_rays_traced_through_opencv(pose, view):
     covariance = traced(view, pose, 0.0055)[2]
-    found = appearance(MODEL, pose, 0.0055, 0.0).covariance_px2[view]
+    found = spot_images(MODEL, pose, 0.0055, 0.0).covariance_px2[view]
     np.testing.assert_allclose(found, covariance, atol=1e-3 * np.trace(covariance))
-    assert np.linalg.eigvalsh(found)[1] > 1.05 * np.linalg.eigvalsh(found)[0]  # no circle, which would hide an angle
+    # Not a circle, for which the angle would not be tested.
+    assert np.linalg.eigvalsh(found)[1] > 1.05 * np.linalg.eigvalsh(found)[0]
 
 
 @pytest.mark.parametrize("pose", POSES)
 @pytest.mark.parametrize("view", [0, 1, 3, 4])
-def test_what_the_affine_spot_leaves_out_moves_its_middle_by_thousandths_of_a_pixel(pose, view):
+def test_effects_beyond_the_affine_spot_move_its_centroid_by_thousandths_of_a_pixel(pose, view):
     """Perspective and distortion across the spot: below 1e-3 px for the default beam (sigma 5.5 mm, 2 px in the
-    picture). With the light that falls with distance and obliquity: 0.003 px, at most 0.006. Both grow with the
-    square of the beam's radius (sigma 30 mm: 0.02 and 0.16 px)."""
+    picture). With the variation of light by distance and obliquity: 0.003 px, at most 0.006. Both are proportional to
+    the square of the beam radius (sigma 30 mm: 0.02 and 0.16 px)."""
     perspective, with_light, _ = traced(view, pose, 0.0055)
     uv = MODEL.project(pose)[0][view]
     assert np.linalg.norm(perspective - uv) < 1e-3
@@ -175,13 +178,13 @@ def test_what_the_affine_spot_leaves_out_moves_its_middle_by_thousandths_of_a_pi
     assert np.linalg.norm(four_times - uv) == pytest.approx(4 * np.linalg.norm(perspective - uv), rel=0.02)
 
 
-def test_a_spot_seen_from_twice_as_far_gathers_a_quarter_of_the_light():
+def test_the_light_of_a_spot_at_twice_the_distance_is_a_quarter():
     def light_at(distance_m):
         camera = replace_pose(
             RIG.cameras["left"], look_at(np.array([-2.5 + distance_m, 0, 0.0]), np.array([-2.5, 0, 0.0]))
         )
         rig = Rig(RIG.screens, {"left": camera}, RIG.beams, RIG.spots)
-        return appearance(SpotModel.of(rig), Pose.identity(), 0.005, 0.5).light[1]
+        return spot_images(SpotModel.of(rig), Pose.identity(), 0.005, 0.5).light[1]
 
     assert light_at(2.0) / light_at(4.0) == pytest.approx(4.0)
 

@@ -1,4 +1,4 @@
-"""The scenarios keep their promises, and points tell what they claim."""
+"""Scenarios meet their conditions, and simulated points have the stated noise and clutter."""
 
 import time
 from dataclasses import replace
@@ -18,14 +18,14 @@ HIDDEN = 2
 
 
 def speeds_px(run):
-    """How far each view moves per frame (T - 1, n) while it is in the picture; 0 elsewhere."""
+    """Motion of each view per frame (T - 1, n), px, while it is in the picture; 0 elsewhere."""
     moved = np.linalg.norm(np.diff(run.uv_px, axis=0), axis=-1)
     return np.where((run.in_view[1:] > 0) & (run.in_view[:-1] > 0), moved, 0.0)
 
 
 @pytest.mark.parametrize("name", SCENARIOS)
 @pytest.mark.parametrize("seed", [0, 1])
-def test_the_vehicle_starts_within_the_prior_and_all_spots_are_seen(name, seed):
+def test_the_vehicle_starts_within_the_prior_with_all_spots_in_view(name, seed):
     scene = compose(name, seed, frames=2)
     prior = scene.scenario.prior
     guess = Pose.from_ypr(np.deg2rad(prior.yaw_pitch_roll_deg), np.array(prior.position_m))
@@ -35,7 +35,7 @@ def test_the_vehicle_starts_within_the_prior_and_all_spots_are_seen(name, seed):
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_the_papers_scenario_is_the_papers(seed):
+def test_the_scenario_huo2015_has_the_properties_of_the_paper(seed):
     run = simulate_points("huo2015", seed)
     spot = np.array([s for _, s in run.model.views])
     assert len(run.frame) == 600
@@ -56,7 +56,7 @@ def test_the_papers_scenario_is_the_papers(seed):
     np.testing.assert_allclose(np.rad2deg(np.arccos(np.diagonal(directions @ directions.T, 1))), 20.0)
 
 
-def test_clutter_comes_with_its_probability_within_its_distance_of_spots_in_the_picture():
+def test_clutter_has_its_probability_and_its_distance_from_spots_in_the_picture():
     run = simulate_points("huo2015", 0, noise_px=0.0)
     false = [
         (k, c, uv)
@@ -72,7 +72,7 @@ def test_clutter_comes_with_its_probability_within_its_distance_of_spots_in_the_
         assert np.linalg.norm(run.uv_px[k, own] - uv, axis=-1).min() <= 15.0
 
 
-def test_less_clutter_is_part_of_more_clutter_and_the_motion_is_the_same():
+def test_less_clutter_is_a_subset_of_more_clutter_with_the_same_motion():
     few, many = (
         simulate_points("huo2015", 4, clutter=0.2, frames=50),
         simulate_points("huo2015", 4, clutter=1.0, frames=50),
@@ -82,13 +82,13 @@ def test_less_clutter_is_part_of_more_clutter_and_the_motion_is_the_same():
         compose(replace(few_s, clutter=replace(few_s.clutter, per_spot=p)), 4, 50)
         for few_s, p in ((SCENARIOS["huo2015"], 0.2), (SCENARIOS["huo2015"], 1.0))
     )
-    few_set = {tuple(uv) for uv in few_scene.false_spots.uv_px}
-    many_set = {tuple(uv) for uv in many_scene.false_spots.uv_px}
+    few_set = {tuple(uv) for uv in few_scene.clutter_points.uv_px}
+    many_set = {tuple(uv) for uv in many_scene.clutter_points.uv_px}
     assert few_set < many_set
 
 
 @pytest.mark.parametrize("noise_px", [0.05, 0.3])
-def test_detections_scatter_about_the_truth_by_the_noise_that_they_claim(noise_px):
+def test_detections_scatter_about_the_truth_by_their_stated_noise(noise_px):
     run = simulate_points("smooth", 5, noise_px=noise_px)
     errors = []
     for k, pictures in enumerate(run.detections):
@@ -101,7 +101,7 @@ def test_detections_scatter_about_the_truth_by_the_noise_that_they_claim(noise_p
     assert rms == pytest.approx(noise_px, rel=0.05)
 
 
-def test_order_tells_nothing_of_identity():
+def test_the_order_of_detections_is_independent_of_identity():
     run = simulate_points("static", 0, frames=300, clutter=0.0)
     first = np.array([run.origin[k][0][0] for k in range(300)])
     assert {0, 1, 2} == set(first)
@@ -109,9 +109,9 @@ def test_order_tells_nothing_of_identity():
 
 
 @pytest.mark.parametrize("name", ["huo2015", "sharp-turns"])
-def test_frames_after_a_bend_are_flagged_and_no_others(name):
+def test_only_frames_after_a_bend_are_flagged(name):
     run = simulate_points(name, 2)
-    # What a constant velocity mispredicts without noise. Between bends it is the acceleration, a fraction of a pixel.
+    # The error of a constant-velocity prediction without noise: between bends the acceleration, below a pixel.
     missed = np.linalg.norm(np.diff(run.uv_px, 2, axis=0), axis=-1).max(axis=1)
     missed = np.concatenate([[0, 0], missed])
     assert run.turned.sum() >= 5
@@ -122,13 +122,13 @@ def test_frames_after_a_bend_are_flagged_and_no_others(name):
     ("name", "least", "most"),
     [("smooth", 8, 18), ("sharp-turns", 18, 28), ("fast", 45, 80), ("very-fast", 90, 160), ("static", 0, 0)],
 )
-def test_spots_move_as_fast_as_the_scenario_says(name, least, most):
+def test_spots_have_the_speed_of_the_scenario(name, least, most):
     fastest = [speeds_px(simulate_points(name, seed, frames=400)).max() for seed in range(3)]
     assert least <= min(fastest)
     assert max(fastest) <= most
 
 
-def test_a_turntable_stops_and_goes():
+def test_a_turntable_moves_and_stops():
     still = speeds_px(simulate_points("turntable", 0)).max(axis=1) < 1e-9
     starts = np.flatnonzero(np.diff(still.astype(int)) == -1)
     assert 0.4 < still.mean() < 0.8
@@ -142,7 +142,7 @@ def test_a_long_exit_lasts_for_hundreds_of_frames():
     assert (edges[1::2] - edges[::2]).max() >= 200
 
 
-def test_a_hidden_spot_is_in_view_but_not_detected():
+def test_an_occluded_spot_is_in_view_but_not_detected():
     run = simulate_points("hidden-in-turn", 1, clutter=0.0)
     assert (run.in_view == HIDDEN).any()
     for k, pictures in enumerate(run.origin):
@@ -153,13 +153,13 @@ def test_a_hidden_spot_is_in_view_but_not_detected():
             assert np.all((run.in_view[k - 5 : k + 5] != SHINING).any(axis=1) | (run.in_view[k] == 0).any())
 
 
-def test_nothing_shines_in_a_blackout_and_all_shines_again_after_it():
+def test_a_blackout_has_no_detections_and_ends_for_all_spots():
     run = simulate_points("blackout", 0, clutter=0.0)
     assert all(len(d) == 0 for k in range(150, 160) for d in run.detections[k])
     assert not (run.in_view[160] == HIDDEN).any()
 
 
-def test_a_dropped_picture_has_no_detections_but_a_truth():
+def test_a_dropped_picture_has_truth_but_no_detections():
     run = simulate_points("damaged", 0)
     assert not run.has_image[20].any()
     assert not run.has_image[31, 0]
@@ -168,25 +168,25 @@ def test_a_dropped_picture_has_no_detections_but_a_truth():
     assert np.isfinite(run.uv_px[31]).all()
 
 
-def test_the_first_frames_do_not_depend_on_how_many_follow():
+def test_the_first_frames_do_not_depend_on_the_number_of_frames():
     short, long = simulate_points("huo2015", 9, frames=20), simulate_points("huo2015", 9, frames=400)
     for k in range(20):
         for a, b in zip(short.detections[k], long.detections[k], strict=True):
             np.testing.assert_array_equal(a.uv_px, b.uv_px)
 
 
-def test_another_seed_is_another_recording():
+def test_another_seed_gives_another_recording():
     assert not np.allclose(simulate_points("smooth", 0, frames=5).uv_px, simulate_points("smooth", 1, frames=5).uv_px)
 
 
-def test_six_hundred_frames_take_well_under_a_second():
+def test_six_hundred_frames_take_less_than_a_second():
     simulate_points("huo2015", 0, frames=5)
     start = time.process_time()
     simulate_points("huo2015", 1)
     assert time.process_time() - start < 0.6  # measured 0.08 s
 
 
-def test_skew_beams_neither_meet_nor_share_a_plane():
+def test_skew_beams_neither_intersect_nor_lie_in_one_plane():
     rig = simulate_points("four-skew-beams", 0, frames=2).rig
     beams = list(rig.beams.values())
     directions = np.array([b.direction for b in beams])
@@ -208,7 +208,7 @@ def test_corners_of_triangles_fall_on_frames():
 
 
 @pytest.mark.parametrize("shape", ["sine", "triangle", "plateau", "steps"])
-def test_waves_swing_from_minus_one_to_one_without_jumps(shape):
+def test_waves_range_from_minus_one_to_one_without_jumps(shape):
     t = np.linspace(0, 1, 20_001)
     values = Wave("x", 1.0, 1.0, shape).at(t)
     assert values.min() == pytest.approx(-1.0, abs=1e-6)
@@ -216,7 +216,7 @@ def test_waves_swing_from_minus_one_to_one_without_jumps(shape):
     assert np.abs(np.diff(values)).max() < 2e-3
 
 
-def test_mistakes_are_told_in_words():
+def test_invalid_arguments_are_rejected_with_a_message():
     with pytest.raises(InputError, match=r"scenario: expected one of huo2015, .*got 'huo'"):
         simulate_points("huo", 0)
     with pytest.raises(InputError, match=r"clutter: expected a probability .* got 2"):
@@ -227,14 +227,14 @@ def test_mistakes_are_told_in_words():
         RecordingFault(3, "lost")
 
 
-def test_a_scenario_that_cannot_keep_its_promise_says_so(monkeypatch):
+def test_a_scenario_with_impossible_conditions_is_rejected(monkeypatch):
     monkeypatch.setattr("lab.simulate.scene._MAX_DRAWS", 20)
     impossible = replace(SCENARIOS["static"], leaves_and_returns=("3",))
     with pytest.raises(InputError, match="'static': none of 20 motions"):
         simulate_points(impossible, 0, frames=2)
 
 
-def test_misses_hide_single_spots():
+def test_misses_occlude_single_spots():
     missing = replace(SCENARIOS["static"], occlusion=Hiding(miss_probability=0.3))
     share = (simulate_points(missing, 0).in_view == HIDDEN).mean()
     assert share == pytest.approx(0.3, abs=0.05)

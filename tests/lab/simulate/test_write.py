@@ -1,4 +1,4 @@
-"""Run folders that the simulator writes: what is on disk is what the scene says."""
+"""Simulated run folders agree with their scene."""
 
 import csv
 import itertools
@@ -14,7 +14,7 @@ from lab.errors import InputError
 from lab.files.rig.rig_file import load_rig, save_rig
 from lab.files.run.detections_file import read_detections
 from lab.runs.check import check
-from lab.simulate.picture import expose, laser_powers, make_sensor, take
+from lab.simulate.picture import expected_light, laser_powers, make_sensor, render
 from lab.simulate.points import simulate_points
 from lab.simulate.scenarios import LIGHTS, SCENARIOS, Clutter, Hiding, Light
 from lab.simulate.scene import compose
@@ -34,7 +34,7 @@ def pictures_of(folder, camera):
 
 
 @pytest.mark.parametrize("name", SCENARIOS)
-def test_a_run_folder_is_complete_and_agrees_with_itself(name, tmp_path):
+def test_a_run_folder_is_complete_and_consistent(name, tmp_path):
     folder = simulate(name, tmp_path / "run", seed=1, frames=3, **SMALL)
     result = check(folder)
     assert result.exit_status == 0
@@ -42,7 +42,7 @@ def test_a_run_folder_is_complete_and_agrees_with_itself(name, tmp_path):
     assert sorted(p.name for p in folder.iterdir()) == ["frames", "rig.yaml", "run.yaml", "truth"]
 
 
-def test_the_same_seed_gives_the_same_bytes_whatever_the_threads(tmp_path):
+def test_the_same_seed_gives_the_same_bytes_with_any_number_of_threads(tmp_path):
     one = simulate("huo2015", tmp_path / "one", seed=7, frames=4, threads=1, **SMALL)
     two = simulate("huo2015", tmp_path / "two", seed=7, frames=4, threads=3, **SMALL)
     assert files_of(one) == files_of(two)
@@ -51,14 +51,14 @@ def test_the_same_seed_gives_the_same_bytes_whatever_the_threads(tmp_path):
     assert same == {"rig.yaml"}
 
 
-def test_the_first_pictures_do_not_depend_on_how_many_follow(tmp_path):
+def test_the_first_pictures_do_not_depend_on_the_number_of_frames(tmp_path):
     few = files_of(simulate("damaged", tmp_path / "few", seed=2, frames=3, **SMALL))
     many = files_of(simulate("damaged", tmp_path / "many", seed=2, frames=9, **SMALL))
     for name in (f"frames/{c}/{k:06d}.png" for c in ("left", "right") for k in range(3)):
         assert few[name] == many[name]
 
 
-def test_faults_are_where_the_scenario_says(tmp_path):
+def test_faults_are_in_the_frames_of_the_scenario(tmp_path):
     folder = simulate("damaged", tmp_path / "run", seed=0, frames=57, **SMALL)
     numbers = {c: {int(p.stem) for p in (folder / "frames" / c).iterdir()} for c in ("left", "right")}
     assert set(range(57)) - numbers["left"] == {20, 31, 32, 33}
@@ -72,7 +72,7 @@ def test_faults_are_where_the_scenario_says(tmp_path):
         assert {int(row["frame"]) for row in csv.DictReader(file)} == set(range(57))
 
 
-def test_a_video_holds_the_pictures_of_the_files_without_loss(tmp_path):
+def test_a_video_contains_the_pictures_without_loss(tmp_path):
     files = simulate("turntable", tmp_path / "files", seed=3, frames=10, **SMALL)
     video = simulate("turntable", tmp_path / "video", seed=3, frames=10, video=True, **SMALL)
     assert check(video).exit_status == 0
@@ -84,7 +84,7 @@ def test_a_video_holds_the_pictures_of_the_files_without_loss(tmp_path):
             np.testing.assert_array_equal(a, b[..., 0])
 
 
-def test_points_on_disk_are_those_of_simulate_points(tmp_path):
+def test_written_detections_are_those_of_simulate_points(tmp_path):
     folder = simulate("huo2015", tmp_path / "run", seed=5, frames=20, detections_only=True, noise_px=0.3)
     run = simulate_points("huo2015", 5, frames=20, noise_px=0.3)
     table = read_detections(folder / "detections.csv")
@@ -97,7 +97,7 @@ def test_points_on_disk_are_those_of_simulate_points(tmp_path):
 
 
 @pytest.mark.parametrize("bits", [8, 12])
-def test_pixels_scatter_as_the_rig_file_says(bits, tmp_path):
+def test_pixels_have_the_noise_of_the_rig_file(bits, tmp_path):
     bright = Light(
         bits=bits, background_dn=60.0, gradient_dn=100.0, hot_pixels=0, texture=0.0, reflections=0, read_noise_e=60.0
     )
@@ -115,7 +115,7 @@ def test_pixels_scatter_as_the_rig_file_says(bits, tmp_path):
         assert variance[some].mean() / claimed[some].mean() == pytest.approx(1.0, abs=0.02)
 
 
-def test_a_deep_picture_is_the_same_scene_with_finer_grey_values(tmp_path):
+def test_a_12_bit_picture_is_the_same_scene_with_finer_grey_values(tmp_path):
     scenario = replace(SCENARIOS["static"], light=LIGHTS["clean"])
     deep = replace(scenario, light=replace(LIGHTS["clean"], bits=12))
     a, b = (
@@ -126,51 +126,53 @@ def test_a_deep_picture_is_the_same_scene_with_finer_grey_values(tmp_path):
     assert np.abs(b / 16.0 - a).max() <= 0.5 + 0.5 / 16
 
 
-def test_a_saturated_spot_stops_at_the_largest_grey_value():
+def test_a_saturated_spot_has_the_largest_grey_value():
     scene = compose(replace(SCENARIOS["static"], light=replace(LIGHTS["clean"], peak_dn=2000.0)), 0, 1)
-    picture = take(scene, make_sensor(scene, 0), laser_powers(scene), 0)
+    picture = render(scene, make_sensor(scene, 0), laser_powers(scene), 0)
     assert picture.max() == 255
     assert (picture == 255).sum() > 30
 
 
-def test_a_hidden_spot_leaves_no_light_and_a_shining_one_does():
-    dark = replace(
+def test_only_visible_spots_give_light():
+    occluded = replace(
         SCENARIOS["static"],
         light=LIGHTS["clean"],
         clutter=Clutter(per_spot=0.0),
         occlusion=Hiding(blackout_every=1, blackout_frames=1, clean_start=1),
     )
-    scene = compose(dark, 0, 2)
+    scene = compose(occluded, 0, 2)
     sensor, powers = make_sensor(scene, 0), laser_powers(scene)
     assert (scene.in_view[1] == 2).all()
-    np.testing.assert_array_equal(expose(scene, sensor, powers, 1), sensor.background)
-    lit = expose(scene, sensor, powers, 0) - sensor.background
+    np.testing.assert_array_equal(expected_light(scene, sensor, powers, 1), sensor.background)
+    lit = expected_light(scene, sensor, powers, 0) - sensor.background
     for view in np.flatnonzero(scene.model.camera_of == 0):
         u, v = np.round(scene.uv_px[0, view]).astype(int)
         assert lit[v, u] > 50
 
 
-def test_speckle_has_the_contrast_that_is_asked_for():
+def test_speckle_has_the_given_contrast():
     grainy = replace(LIGHTS["clean"], speckle_contrast=0.2, beam_radius_m=0.1)
     even = replace(grainy, speckle_contrast=0.0)
     rough, smooth = (
         compose(replace(SCENARIOS["static"], light=light, clutter=Clutter(per_spot=0.0)), 0, 1)
         for light in (grainy, even)
     )
-    a, b = (expose(s, make_sensor(s, 0), laser_powers(s), 0) - make_sensor(s, 0).background for s in (rough, smooth))
+    a, b = (
+        expected_light(s, make_sensor(s, 0), laser_powers(s), 0) - make_sensor(s, 0).background for s in (rough, smooth)
+    )
     ratio = (a / np.maximum(b, 1e-9))[b > 0.3 * b.max()]
     assert ratio.mean() == pytest.approx(1.0, abs=0.02)
     assert ratio.std() == pytest.approx(0.2, rel=0.1)
 
 
-def test_spots_gather_less_light_where_the_beam_is_spread_but_keep_their_power():
+def test_a_wider_beam_has_a_lower_peak_and_the_same_power():
     scene = compose(replace(SCENARIOS["static"], light=LIGHTS["clean"], clutter=Clutter(per_spot=0.0)), 0, 1)
     sensor, powers = make_sensor(scene, 0), laser_powers(scene)
     wide = replace(scene, scenario=replace(scene.scenario, light=replace(LIGHTS["clean"], beam_radius_m=0.03)))
     sums, peaks = zip(
         *(
             (float(light.sum(dtype=np.float64)), float(light.max()))
-            for light in (expose(s, sensor, powers, 0) - sensor.background for s in (scene, wide))
+            for light in (expected_light(s, sensor, powers, 0) - sensor.background for s in (scene, wide))
         ),
         strict=True,
     )
@@ -178,7 +180,7 @@ def test_spots_gather_less_light_where_the_beam_is_spread_but_keep_their_power()
     assert peaks[1] < 0.3 * peaks[0]
 
 
-def test_a_simulation_that_is_broken_off_leaves_nothing(tmp_path):
+def test_an_interrupted_simulation_leaves_no_files(tmp_path):
     def stop(done, total):
         if done == 3:
             raise KeyboardInterrupt
@@ -194,9 +196,9 @@ def test_progress_counts_every_picture(tmp_path):
     assert seen == [(n, 8) for n in range(1, 9)]
 
 
-def test_what_is_there_is_never_overwritten(tmp_path):
+def test_existing_files_are_never_overwritten(tmp_path):
     (tmp_path / "mine.txt").write_text("precious")
-    with pytest.raises(InputError, match="expected a folder that does not exist yet"):
+    with pytest.raises(InputError, match="choose another --out"):
         simulate("huo2015", tmp_path, frames=1)
     assert (tmp_path / "mine.txt").read_text() == "precious"
 
@@ -204,20 +206,20 @@ def test_what_is_there_is_never_overwritten(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ({"light": "dark"}, r"light: expected one of lab, .*got 'dark'"),
+        ({"light": "dim"}, r"light: expected one of lab, .*got 'dim'"),
         ({"video": True, "detections_only": True}, "a video or points, not both"),
-        ({"scenario": "damaged", "video": True}, "which a video cannot"),
+        ({"scenario": "damaged", "video": True}, "which a video cannot contain"),
         ({"light": "deep", "video": True}, "8-bit"),
         ({"picture_scale": 0.0}, "picture_scale: expected 0.05 to 4, got 0"),
     ],
 )
-def test_what_cannot_be_is_told_in_words_and_writes_nothing(arguments, words, tmp_path):
+def test_invalid_arguments_are_rejected_and_nothing_is_written(arguments, words, tmp_path):
     with pytest.raises(InputError, match=words):
         simulate(**{"scenario": "huo2015", "out_folder": tmp_path / "run", "frames": 1, **arguments})
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_run_file_says_where_the_vehicle_starts_and_what_to_see(tmp_path):
+def test_the_run_file_contains_the_prior_and_the_summary(tmp_path):
     folder = simulate("huo2015", tmp_path / "run", seed=6, frames=1, **SMALL)
     content = yaml.safe_load((folder / "run.yaml").read_text())
     assert content["prior"]["within_m"] == 1.0
@@ -227,8 +229,8 @@ def test_the_run_file_says_where_the_vehicle_starts_and_what_to_see(tmp_path):
     assert "leaves the picture and returns" in content["notes"]
 
 
-def test_a_recording_of_another_rig_is_given_what_is_known_of_it(tmp_path):
-    """The true rig makes the spots, its calibration lies in the run folder; only the simulation knows both."""
+def test_the_run_folder_of_a_given_rig_contains_its_calibration(tmp_path):
+    """The spots are those of the true rig; the run folder contains its calibration."""
     true = simulate("clean", tmp_path / "first", seed=1, frames=2, detections_only=True) / "rig.yaml"
     rig = load_rig(true)
     off = moved(rig, ["cameras.left.fx", "beams.A.direction_y"], np.array([3.0, 1e-3]))
@@ -239,7 +241,7 @@ def test_a_recording_of_another_rig_is_given_what_is_known_of_it(tmp_path):
     )  # fmt: skip
     assert load_rig(folder / "rig.yaml").cameras["left"].matrix[0, 0] == rig.cameras["left"].matrix[0, 0]
     (line,) = [line for line in check(folder).lines if "poses and spots agree" in line]
-    assert float(line.split()[-2]) > 0.1  # px: the rig that is known is not the one that was recorded
+    assert float(line.split()[-2]) > 0.1  # px: the given rig is not the recorded one
     with pytest.raises(InputError, match="keep its size"):
         simulate("clean", tmp_path / "no", rig=true, picture_scale=0.5)
     save_rig(load_rig(simulate("four-skew-beams", tmp_path / "x", frames=1) / "rig.yaml"), tmp_path / "four.yaml")

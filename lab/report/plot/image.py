@@ -1,0 +1,43 @@
+"""Embedded images: grey values brought to eight bits and encoded."""
+
+from __future__ import annotations
+
+from typing import TypeAlias
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from geometry.arrays import Array
+from lab.report.plot.svg import picture_uri
+
+Bytes: TypeAlias = NDArray[np.uint8]
+_JPEG_QUALITY = 72
+
+
+def grey_limits(picture: Array) -> tuple[float, float]:
+    """The grey values shown as black and as white; white saturates in 3 of 10,000 pixels.
+
+    They differ by at least eight times the spread of the background, so that an unlit image does not show as noise.
+    """
+    low, usual, high = np.percentile(picture, [1.0, 50.0, 99.97])
+    return float(low), float(max(high, low + 8.0 * (usual - low), low + 8.0))
+
+
+def stretched(picture: Array, low: float, high: float) -> Bytes:
+    """Eight bits on a square-root scale: the background is just visible and not all spots saturate."""
+    shares = np.clip((picture - low) / max(high - low, 1.0), 0.0, 1.0)
+    return (255 * np.sqrt(shares)).astype(np.uint8)
+
+
+def image_uri(picture: Bytes, kind: str) -> str:
+    """Pixels (h, w), (h, w, 3) BGR or (h, w, 4) BGRA as a data URI; kind: png or jpeg.
+
+    Raises:
+        ValueError: OpenCV cannot encode pixels of this shape.
+    """
+    options = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY] if kind == "jpeg" else [cv2.IMWRITE_PNG_COMPRESSION, 9]
+    done, data = cv2.imencode(f".{kind}", picture, options)
+    if not done:
+        raise ValueError(f"an image of shape {picture.shape} cannot be written as {kind}")
+    return picture_uri(data.tobytes(), kind)

@@ -1,0 +1,138 @@
+"""Maps of a quantity over a plane: colours, contour lines and a colour bar."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from contourpy import contour_generator
+
+from geometry.arrays import Array
+from lab.report.plot.axes import Plane, axes, frame, note, plane, svg_of
+from lab.report.plot.colour_map import BAR_WIDTH, colour_bar, colours, value_range
+from lab.report.plot.scales import number, ticks
+from lab.report.plot.svg import picture_uri, polyline, text
+
+
+def heat_map(
+    values: Array,
+    extent: tuple[float, float, float, float],
+    title: str,
+    unit: str,
+    *,
+    x_name: str = "u (px)",
+    y_name: str = "v (px)",
+    y_down: bool = True,
+    diverging: bool = False,
+    levels: Sequence[float] | None = None,
+    limits: tuple[float, float] | None = None,
+    equal: bool = True,
+) -> str:
+    """A quantity over a plane, with contour lines and a colour bar.
+
+    values (rows, columns): at evenly spaced places from the first to the last of extent = (x_first, x_last, y_first,
+    y_last), row 0 at y_first; nan where there is none (hatched). levels: of the contours; None: round ones. limits:
+    of the colours; None: of the values. equal: one unit has the same length in x and y.
+    """
+    values = np.asarray(values, dtype=float)
+    lo, hi = limits or value_range(values, diverging)
+    x0, x1, y0, y1 = extent
+    p = plane((x0, x1), (y0, y1), equal=equal, y_down=y_down, right=BAR_WIDTH)
+    out = [*axes(p, title, x_name, y_name, grid=False), _hatched(*p.box)]
+    out.append(_image(p, _enlarged(values if y_down else values[::-1]), lo, hi, diverging))
+    marks = np.asarray(levels, dtype=float) if levels is not None else contour_levels(lo, hi)
+    grid_x, grid_y = np.linspace(x0, x1, values.shape[1]), np.linspace(y0, y1, values.shape[0])
+    for level in marks.tolist():
+        lines = [p.at(line) for line in contour_lines(values, grid_x, grid_y, level)]
+        if not lines:
+            continue
+        d = "".join(map(polyline, lines))
+        out.append(f'<path d="{d}" stroke="#000" stroke-opacity="0.35" stroke-width="2.4" fill="none"/>')
+        out.append(f'<path d="{d}" stroke="#fff" stroke-width="1.1" fill="none"/>')
+        if place := label_place(p, lines):
+            style = "fill:#fff;font-weight:600;paint-order:stroke;stroke:#000a;stroke-width:2.6px"
+            out.append(text(place[0], place[1] + 3.5, number(level), "mid", style))
+    finite = values[np.isfinite(values)]
+    out.append(colour_bar(p, lo, hi, unit, diverging))
+    if finite.size:
+        spread = f"{number(float(finite.min()))} to {number(float(finite.max()))} {unit}"
+        out.append(note(p, f"{spread}, median {number(float(np.median(finite)))}"))
+    return svg_of(p, title, [*out, frame(p)])
+
+
+def contour_levels(lo: float, hi: float) -> Array:
+    """Round levels: evenly spaced, or 1, 2, 5, 10 ... where the values span more than a factor of 6.
+
+    An uncertainty grows steeply towards the corners of an image: with even levels the whole usable part would lie
+    inside the first contour.
+    """
+    if lo > 0 and hi > 6 * lo:
+        powers = 10.0 ** np.arange(np.floor(np.log10(lo)), np.ceil(np.log10(hi)) + 1)
+        steps = (powers[:, None] * [1, 2, 5]).ravel()
+        return steps[(steps > lo) & (steps < hi)]
+    return ticks(lo, hi, 5)
+
+
+def contour_lines(values: Array, x: Array, y: Array, level: float) -> list[Array]:
+    """The contour lines of a surface at a level, each (n, 2); a closed line ends at its first point.
+
+    values (rows, columns) over y (rows,) and x (columns,). Cells with a nan have none.
+    """
+    if min(values.shape) < 2:
+        return []
+    generator = contour_generator(x, y, np.ma.masked_invalid(values), corner_mask=False)
+    return [np.asarray(line) for line in generator.lines(level)]
+
+
+def label_place(p: Plane, lines: list[Array]) -> tuple[float, float] | None:
+    """The place for the label of contour lines, drawing coordinates: their point nearest the diagonal of the plot.
+
+    This spreads the labels of different levels. None where all points are too close to the edge for a label.
+    """
+    at = np.concatenate(lines)
+    left, top, wide, high = p.box
+    middle, room = np.array([left + wide / 2, top + high / 2]), np.array([wide / 2 - 16, high / 2 - 9])
+    at = at[(np.abs(at - middle) < room).all(axis=1)]
+    if not len(at):
+        return None
+    off = np.abs((at[:, 0] - left) / wide - (at[:, 1] - top) / high)
+    x, y = at[int(np.argmin(off))].tolist()
+    return x, y
+
+
+def _image(p: Plane, values: Array, lo: float, hi: float, diverging: bool) -> str:
+    """The colours of values (rows, columns) over the plot area as an embedded PNG, transparent at nan."""
+    rgb = colours((values - lo) / (hi - lo), diverging)
+    alpha = np.where(np.isfinite(values), 255, 0).astype(np.uint8)
+    done, data = cv2.imencode(".png", np.dstack([rgb[..., ::-1], alpha]), [cv2.IMWRITE_PNG_COMPRESSION, 9])
+    if not done:
+        raise ValueError(f"a map of shape {values.shape} cannot be written as PNG")
+    left, top, wide, high = p.box
+    box = f'x="{left:.1f}" y="{top:.1f}" width="{wide:.1f}" height="{high:.1f}"'
+    return f'<image {box} preserveAspectRatio="none" href="{picture_uri(data.tobytes(), "png")}"/>'
+
+
+def _enlarged(values: Array) -> Array:
+    """The map interpolated to at least 160 columns; nan stay."""
+    rows, columns = values.shape
+    times = max(1, -(-160 // columns))
+    # The first and the last value lie on the edges of the plot, as `extent` defines.
+    across = np.linspace(0, columns - 1, min(columns * times, 320), dtype=np.float32)
+    down = np.linspace(0, rows - 1, min(rows * times, 320), dtype=np.float32)
+    map_x, map_y = np.meshgrid(across, down)
+    filled = np.where(np.isfinite(values), values, 0.0).astype(np.float32)
+    weight = np.isfinite(values).astype(np.float32)
+    smooth = cv2.remap(filled, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    known = cv2.remap(weight, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.where(known > 0.5, smooth / np.maximum(known, 1e-3), np.nan).astype(float)
+
+
+def _hatched(left: float, top: float, wide: float, high: float) -> str:
+    """Slanted lines over an area, visible where a map has no value."""
+    out, step = [], 9.0
+    for s in np.arange(step, wide + high, step):
+        x0, y0 = (left + s, top) if s <= wide else (left + wide, top + s - wide)
+        x1, y1 = (left, top + s) if s <= high else (left + s - high, top + high)
+        out.append(f"M{x0:.1f} {y0:.1f}L{x1:.1f} {y1:.1f}")
+    return f'<path class="grid" d="{"".join(out)}"/>'

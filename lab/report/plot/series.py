@@ -1,0 +1,146 @@
+"""Plots of series over time: lines, bands and shaded intervals with a common time axis."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from html import escape
+
+import numpy as np
+
+from geometry.arrays import Array, Bools
+from lab.number_format import short
+from lab.report.plot.axes import Plane, frame, heading, x_ticks, y_ticks
+from lab.report.plot.scales import Scale, padded_range, tick_texts, ticks
+from lab.report.plot.svg import area_path, figure, line_path, text
+from lab.report.plot.thinning import band_envelope, envelope, true_shares
+
+_NAME_WIDTH = 46  # viewBox units at the right end of a time axis that its name takes
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """A line over time."""
+
+    y: Array  # (n,)
+    colour: str
+    name: str
+    width: float = 1.1
+    dash: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Band:
+    """An area over time."""
+
+    low: Array  # (n,)
+    high: Array  # (n,)
+    colour: str
+    name: str
+    opacity: float = 0.25
+
+
+@dataclass(frozen=True, slots=True)
+class Shade:
+    """Intervals of time with a background colour."""
+
+    where: Bools  # (n,)
+    css: str
+    name: str
+
+
+def time_panel(
+    t: Array,
+    title: str,
+    unit: str,
+    *,
+    lines: tuple[Line, ...] = (),
+    bands: tuple[Band, ...] = (),
+    shades: tuple[Shade, ...] = (),
+    y_range: tuple[float, float] | None = None,
+    width: int = 540,
+    height: int = 118,
+    with_time: bool = True,
+    time_name: str = "time (s)",
+) -> str:
+    """One plot over times t (n,), increasing.
+
+    Values beyond y_range are drawn at its edge with a mark, and the largest one is given in the corner.
+    """
+    values = np.concatenate(
+        [np.zeros(0), *(line.y for line in lines), *(b.low for b in bands), *(b.high for b in bands)]
+    )
+    lo, hi = y_range or padded_range(values)
+    bottom = height - (30.0 if with_time else 8.0)
+    p = Plane(time_scale(t, 54.0, width - 10.0), Scale(lo, hi, bottom, 20.0), width, height)
+    bins = int(p.X.b - p.X.a)
+    marks = ticks(lo, hi, max(5, int((bottom - 20.0) / 22)))
+    out = [*_shaded(p, shades, len(t)), y_ticks(p, marks, tick_texts(marks), grid=True)]
+    out.append(time_ticks(p, time_name if with_time else ""))
+    for band in bands:
+        x, low, high = band_envelope(t, band.low, band.high, bins)
+        d = area_path(p.X(x), p.Y(np.clip(low, lo, hi)), p.Y(np.clip(high, lo, hi)))
+        out.append(
+            f'<path d="{d}" fill="{band.colour}" opacity="{band.opacity}"><title>{escape(band.name)}</title></path>'
+        )
+    beyond = 0.0
+    for line in lines:
+        x, y = envelope(t, line.y, bins)
+        dash = f' stroke-dasharray="{line.dash}"' if line.dash else ""
+        out.append(
+            f'<path class="line" d="{line_path(p.X(x), p.Y(np.clip(y, lo, hi)))}" stroke="{line.colour}"'
+            f' stroke-width="{line.width}"{dash}><title>{escape(line.name)}</title></path>'
+        )
+        out.append(_marks_beyond(p, x, y, line.colour))
+        outside = line.y[(line.y < lo) | (line.y > hi)]
+        beyond = max(beyond, float(np.abs(outside).max()) if outside.size else 0.0)
+    out.append(heading(p, f"{title} ({unit})" if unit else title))
+    if beyond:
+        out.append(text(p.X.b, 12, f"▲▼ up to {short(beyond)} {unit}", "end"))
+    return figure(width, height, title, [*out, frame(p, closed=False)], data=time_data(p.X))
+
+
+def time_scale(t: Array, left: float, right: float, margin: float = 0.0) -> Scale:
+    """A scale for times (n,) between two drawing coordinates; margin: time added at both ends."""
+    lo, hi = float(t[0]), float(t[-1])
+    if hi <= lo:
+        lo, hi = lo - 0.5, hi + 0.5
+    return Scale(lo - margin, hi + margin, left, right)
+
+
+def time_data(X: Scale) -> str:
+    """The attribute from which cursor.js knows the time axis of a drawing."""
+    return f' data-t="{X.lo!r} {X.hi!r} {X.a} {X.b}"'
+
+
+def time_ticks(p: Plane, name: str) -> str:
+    """Ticks of a time axis; with a name also the labels and, at the right end, the name."""
+    values = ticks(p.X.lo, p.X.hi, 6)
+    free = p.X(values) < p.X.b - _NAME_WIDTH
+    labels = [label if name and ok else "" for label, ok in zip(tick_texts(values), free.tolist(), strict=True)]
+    _, top, _, high = p.box
+    return x_ticks(p, values, labels) + (text(p.X.b, top + high + 15, name, "end") if name else "")
+
+
+def _shaded(p: Plane, shades: tuple[Shade, ...], n: int) -> list[str]:
+    """Rectangles behind the intervals, each from half a frame before its first to half a frame after its last frame."""
+    left, top, wide, high = p.box
+    half = 0.5 / max(n - 1, 1)
+    out = []
+    for shade in shades:
+        for start, stop in true_shares(shade.where, int(wide)):
+            x0 = left + wide * max(start * (1 + 2 * half) - half, 0.0)
+            x1 = left + wide * min(stop * (1 + 2 * half) - half, 1.0)
+            out.append(
+                f'<rect class="{shade.css}" x="{x0:.1f}" y="{top}" width="{max(x1 - x0, 1.0):.1f}"'
+                f' height="{high:.1f}"><title>{escape(shade.name)}</title></rect>'
+            )
+    return out
+
+
+def _marks_beyond(p: Plane, x: Array, y: Array, colour: str) -> str:
+    """Small triangles where a line leaves the axes, at most one in five units of width."""
+    out = []
+    for outside, edge, tip in ((y > p.Y.hi, p.Y.b, -5), (y < p.Y.lo, p.Y.a, 5)):
+        places = np.unique(np.round(p.X(x[outside]) / 5) * 5)
+        out += [f"M{at - 3:.1f} {edge}h6l-3 {tip}z" for at in places.tolist()]
+    return f'<path d="{"".join(out)}" fill="{colour}"/>' if out else ""
