@@ -160,7 +160,7 @@ def batch(run_folders: tuple[Path, ...], out: Path, causal: bool, settings: dict
     """
     from lab.runs.batch import process_batch
 
-    outcome = process_batch(run_folders, out, overrides=settings, causal=causal, tell=click.echo)
+    outcome = process_batch(run_folders, out, overrides=settings, causal=causal, report=click.echo)
     click.echo(f"table: {outcome.table}")
     click.echo(f"index: {outcome.index}")
     sys.exit(outcome.exit_status)
@@ -332,7 +332,7 @@ def check(path: Path) -> None:
     Example:
         beampose check sample_runs/huo2015
     """
-    from lab.runs.check import check as check_path
+    from lab.runs.input_check.check import check as check_path
 
     result = check_path(path)
     for line in result.lines:

@@ -70,7 +70,7 @@ def model_fit(summary: Mapping[str, Any]) -> ModelFit | None:
 def _sentence(block: Mapping[str, Any], findings: tuple[FindingRow, ...]) -> str:
     if not block.get("tested"):
         return f"Not tested: {block.get('why_not') or 'no reason is given'}."
-    used = f"{block.get('frames_for_culprits')} frames, evenly chosen"
+    used = f"{block.get('frames_for_diagnosis')} frames, evenly chosen"
     if not findings:
         return f"Yes: no camera, screen, beam or clock is found off ({used})."
     if all(f.level == "small" for f in findings):

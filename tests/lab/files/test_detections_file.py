@@ -14,8 +14,8 @@ from lab.errors import InputError
 from lab.files.run.detections_file import read_detections
 from lab.files.run.run_file import load_run
 from lab.files.text import columns
-from lab.runs.check import check
 from lab.runs.frames.frames import Missing, open_frames
+from lab.runs.input_check.check import check
 from tests.lab.run_folders import edit, write_run
 from tracking.detections import Detections
 

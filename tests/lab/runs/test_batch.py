@@ -29,7 +29,7 @@ def mixed(tmp_path_factory):
     folder = tmp_path_factory.mktemp("batch")
     runs = [points_run(folder / "good"), folder / "nothing", write_run(folder / "grey"), points_run(folder / "last", 6)]
     told: list[str] = []
-    return process_batch(runs, folder / "out", tell=told.append), told
+    return process_batch(runs, folder / "out", report=told.append), told
 
 
 def test_the_batch_goes_on_after_a_bad_run_and_every_run_has_a_row(mixed):

@@ -25,7 +25,7 @@ from lab.runs.batch import process_batch
 from lab.runs.frames.pipeline import FrameRecord, Pipeline
 from lab.runs.process import are_results, process_run
 from lab.runs.score.score import normalised_squares
-from lab.runs.smoothing_pass import SMOOTHING, TRACKING, WRITING, TwoPasses
+from lab.runs.smoothing_pass import SMOOTHING, TRACKING, WRITING, TrackingAndSmoothing
 from lab.runs.verdict.quality import LEAST_MEASURED
 from lab.simulate.scenarios import SCENARIOS, RecordingFault
 from lab.simulate.write import simulate
@@ -550,7 +550,9 @@ def test_frames_wait_on_disk_and_not_in_memory(tmp_path):
                 yield copy
 
     left = []
-    passes = TwoPasses(Watched(), tmp_path, lambda done, total, stage: left.append(stage == SMOOTHING and still()))
+    passes = TrackingAndSmoothing(
+        Watched(), tmp_path, lambda done, total, stage: left.append(stage == SMOOTHING and still())
+    )
 
     def still():
         return sum(ref() is not None for ref in alive)
@@ -565,7 +567,7 @@ def test_what_waits_between_the_passes_is_gone_when_nobody_reads_on(tmp_path):
     pipeline = Pipeline.of(load_run(points_run(tmp_path / "run", frames=6)))
     work = tmp_path / "work"
     work.mkdir()
-    records = TwoPasses(pipeline, work).records()
+    records = TrackingAndSmoothing(pipeline, work).records()
     next(records)
     records.close()
     assert names(work) == []

@@ -11,7 +11,7 @@ from geometry.pose import Pose
 from lab.runs.frames.pipeline import FrameRecord
 from lab.runs.verdict.frame_checks import CONTRADICTION
 from lab.runs.verdict.frame_ranges import FrameRanges
-from lab.runs.verdict.run_facts import CameraFacts, Cause, RunFacts
+from lab.runs.verdict.run_statistics import CameraStatistics, Cause, RunStatistics
 from tracking.detections import Detections
 from tracking.statuses import PoseStatus, SpotStatus
 from tracking.tracked_frame import Event, TrackedFrame
@@ -44,8 +44,8 @@ def a_record(
     return FrameRecord(frame, 0.01 * frame, 0.01, found, ("", ""), tracked)
 
 
-def facts_of(*records: FrameRecord, causal: list[FrameRecord] | None = None) -> RunFacts:
-    facts = RunFacts({"left": CameraFacts(), "right": CameraFacts()}, (0, 0, 0, 1, 1, 1))
+def facts_of(*records: FrameRecord, causal: list[FrameRecord] | None = None) -> RunStatistics:
+    facts = RunStatistics({"left": CameraStatistics(), "right": CameraStatistics()}, (0, 0, 0, 1, 1, 1))
     for k, record in enumerate(records):
         facts.add(record, None if causal is None else causal[k])
     return facts
@@ -134,6 +134,6 @@ def test_ranges_of_frames_count_and_read_well():
         ranges.add(frame)
     assert len(ranges) == 8
     assert ranges.ranges == [[3, 5], [9, 9], [11, 12], [20, 20], [30, 30]]
-    assert ranges.in_words() == "3 to 5, 9, 11 to 12 and 2 more ranges"
-    assert ranges.in_words(4) == "3 to 5, 9, 11 to 12, 20 and 1 more range"
-    assert ranges.in_words(9) == "3 to 5, 9, 11 to 12, 20, 30"
+    assert ranges.as_text() == "3 to 5, 9, 11 to 12 and 2 more ranges"
+    assert ranges.as_text(4) == "3 to 5, 9, 11 to 12, 20 and 1 more range"
+    assert ranges.as_text(9) == "3 to 5, 9, 11 to 12, 20, 30"
