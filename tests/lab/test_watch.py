@@ -45,7 +45,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def run_of_first_pictures(run: Path, out: Path, causal: bool = False) -> Path:
     """The results of `beampose run`, its noise learnt from the first pictures, as a watch must."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sensor_noise, "frames_to_learn_from", lambda pictures: list(range(min(FIRST, pictures))))
+        patch.setattr(sensor_noise, "noise_estimation_frames", lambda pictures: list(range(min(FIRST, pictures))))
         patch.setattr(sensor_noise, "VIDEO_PICTURES", tuple(range(FIRST)))
         return process_run(run, out, causal=causal).out
 

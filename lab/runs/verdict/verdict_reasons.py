@@ -44,8 +44,8 @@ REMEDIES = {
     " and bright enough? If spots are visible, lower the detection threshold or state the camera's noise.",
     ReasonKind.FEW_POINTS: "Make more spots visible: check light, exposure and the cameras' fields of view, or keep the"
     " vehicle where the cameras see its spots.",
-    ReasonKind.NOT_ACQUIRED: "Check the prior (position, attitude, within_m, within_deg), that each camera's pictures are"
-    " in its own folder, and that rig.yaml is the rig of this recording (`beampose calibrate check`).",
+    ReasonKind.NOT_ACQUIRED: "Check the prior (position, attitude, within_m, within_deg), that each camera's pictures"
+    " are in its own folder, and that rig.yaml is the rig of this recording (`beampose calibrate check`).",
     ReasonKind.NOT_CONFIRMED: "Use attitude_causal.csv with care, and report this run: the two passes disagree.",
     ReasonKind.AMBIGUOUS: "Make the prior narrower around the right candidate, start where another spot can be seen, or"
     " use a fan with unequal angles.",

@@ -380,7 +380,7 @@ def test_a_file_that_is_no_video_is_told_in_one_line(content, video_run):
 
 
 def test_a_video_whose_header_promises_more_is_noted(video_run, monkeypatch):
-    monkeypatch.setattr(frames, "promised_pictures", lambda path: 20)
+    monkeypatch.setattr(frames, "header_picture_count", lambda path: 20)
     reader = open_frames(load_run(video_run))
     assert len(list(reader)) == 12
     assert reader.notes[0].endswith("left.avi: ended after 12 pictures; its header says 20")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from geometry.camera import SensorNoise
-from lab.runs.frames.sensor_noise import CameraNoise, frames_to_learn_from
+from lab.runs.frames.sensor_noise import CameraNoise, noise_estimation_frames
 from tests.tracking.rendering import Scene, Spot, photograph
 from tracking.parameters import DetectParameters
 
@@ -62,7 +62,7 @@ def test_a_dark_camera_stays_dark():
 
 @pytest.mark.parametrize("count", [1, 2, 3, 7, 500])
 def test_pictures_to_learn_from_are_pairs_of_neighbours(count):
-    chosen = frames_to_learn_from(count)
+    chosen = noise_estimation_frames(count)
     assert chosen == sorted(set(chosen))
     assert chosen[0] == 0
     assert chosen[-1] == count - 1
