@@ -432,8 +432,8 @@ def test_ctrl_c_ends_the_recording_that_is_watched_with_its_results(tmp_path):
     assert (watching.returncode, errors) == (0, "")
     assert out.startswith("smooth-5: PASS: 8 of 8 frames measured")
     assert json.loads((tmp_path / "out/summary.json").read_text())["notes"] == [
-        "left: 8 pictures were there before the watch began",
-        "right: 8 pictures were there before the watch began",
+        "left: 8 pictures existed before the watch began",
+        "right: 8 pictures existed before the watch began",
     ]
 
 

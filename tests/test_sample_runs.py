@@ -56,6 +56,7 @@ def test_the_calibration_is_reproduced_byte_for_byte(tmp_path):
         assert (made / path).read_bytes() == (FOLDER / "calibration" / path).read_bytes()
 
 
+@pytest.mark.slow
 def test_the_calibrated_rig_is_reproduced_and_its_covariance_is_correct(tmp_path):
     outcome = calibrate_rig(FOLDER / "calibration", tmp_path / "rig")
     assert outcome.exit_status == 0

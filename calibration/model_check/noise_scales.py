@@ -19,7 +19,7 @@ UNEVEN = 1.5  # ratio of the cameras' largest to smallest noise scale from which
 # Share of the squared residual scale that linearisation may leave of a fault in one camera. Measured: a camera 10 and
 # 30 ms late in a motion with sharp turns leaves 0.5 and 0.9 %.
 _LINEARISATION_SHARE = 0.02
-_MOST_ITERATIONS, _CONVERGED = 5, 1.1  # a factor by which the noise scales change no more
+_MOST_ITERATIONS, _CONVERGED = 5, 1.1  # converged: no noise scale changes by more than this factor
 
 
 @dataclass(frozen=True, slots=True)

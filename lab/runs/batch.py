@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-import os
+import io
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +11,7 @@ from typing import Any
 
 from lab.errors import QUALITY_GATE_FAILED, BeamposeError, CalibrationError, InputError, RunError
 from lab.files.run.parameter_overrides import overridden
+from lab.files.text.yaml_text import atomic_write_text
 from lab.runs.process import RunOutcome, process_run
 from lab.runs.smoothing_pass import Progress
 from tracking.parameters import TrackerParameters
@@ -128,9 +129,8 @@ def _failed(folder: Path, name: str, error: BeamposeError) -> dict[str, Any]:
 
 
 def _write_table(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
-    part = path.with_name(f".{path.name}.part-{os.getpid()}")
-    with part.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
-    part.replace(path)
+    text = io.StringIO(newline="")
+    writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    atomic_write_text(text.getvalue(), path)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
@@ -17,6 +16,18 @@ LASTING = ("undecided", "changed", "contradiction", "not_a_covariance")
 
 
 @dataclass(slots=True)
+class ListedEvent:
+    """An event as summary.json lists it; one that continues in the next frames has a later last frame."""
+
+    frame: int
+    last_frame: int
+    kind: str
+    camera: str | None
+    spot: str | None
+    text: str
+
+
+@dataclass(slots=True)
 class RunTally:
     """Counts of spots and events. Memory does not grow with the number of frames."""
 
@@ -25,11 +36,11 @@ class RunTally:
     spot_status: list[Counter[str]] = field(default_factory=list)  # by view
     detections: Counter[str] = field(default_factory=Counter)  # by camera
     missing_reasons: dict[str, Counter[str]] = field(default_factory=dict)  # by camera: why there is no picture
-    events: list[dict[str, Any]] = field(default_factory=list)
+    events: list[ListedEvent] = field(default_factory=list)
     event_kinds: Counter[str] = field(default_factory=Counter)
     unlisted: int = 0  # events beyond MOST_EVENTS
     labels_left_open: int = 0  # rows of spots.csv with a detection whose label is too uncertain
-    _lasting: dict[tuple[str, int | None], dict[str, Any]] = field(default_factory=dict)  # latest, by kind and view
+    _lasting: dict[tuple[str, int | None], ListedEvent] = field(default_factory=dict)  # the latest, by kind and view
 
     def add(self, record: FrameRecord) -> None:
         """Count the next frame."""
@@ -52,20 +63,11 @@ class RunTally:
     def _add_event(self, frame: int, event: Event) -> None:
         self.event_kinds[event.kind] += 1
         same = self._lasting.get((event.kind, event.view))
-        if event.kind in LASTING and same is not None and same["last_frame"] == frame - 1:
-            same["last_frame"] = frame
+        if event.kind in LASTING and same is not None and same.last_frame == frame - 1:
+            same.last_frame = frame
         elif len(self.events) < MOST_EVENTS:
             camera, spot = ("", "") if event.view is None else self.views[event.view].split("/", 1)
-            self.events.append(
-                {
-                    "frame": frame,
-                    "last_frame": frame,
-                    "kind": event.kind,
-                    "camera": camera or None,
-                    "spot": spot or None,
-                    "text": event.text,
-                }
-            )
+            self.events.append(ListedEvent(frame, frame, event.kind, camera or None, spot or None, event.text))
             self._lasting[event.kind, event.view] = self.events[-1]
         else:
             self.unlisted += 1

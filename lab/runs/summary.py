@@ -75,7 +75,7 @@ def summary_of(pipeline: Pipeline, results: RunResults, wall_s: float) -> dict[s
         },
         "inputs": fingerprints(run),
         "notes": _notes(pipeline, results.tally),
-        "events": results.tally.events,
+        "events": [dataclasses.asdict(event) for event in results.tally.events],
     }
 
 

@@ -115,7 +115,7 @@ class FolderCamera:
         try:
             state = os.stat(file.path)
         except OSError as error:
-            self._give(number, Missing(f"{UNREADABLE}: {error.strerror}"), None)
+            self._put(number, Missing(f"{UNREADABLE}: {error.strerror}"), None)
             return True
         stamp = (state.st_size, state.st_mtime_ns)
         waited_s = time.perf_counter() - file.tried_s
@@ -131,12 +131,12 @@ class FolderCamera:
         if file.incomplete_s is not None:
             # The modification time is the most precise one; it is clipped since a copy may keep that of its original.
             arrived_s = min(max(state.st_mtime_ns / 1e9, file.incomplete_s), time.time())
-        self._give(number, content, arrived_s)
+        self._put(number, content, arrived_s)
         return True
 
-    def _give(self, number: int, content: NDArray | Missing, arrived_s: float | None) -> None:
+    def _put(self, number: int, content: NDArray | Missing, arrived_s: float | None) -> None:
         del self._pending[number]
-        self.inbox.give(self.name, number, content, arrived_s)
+        self.inbox.put(self.name, number, content, arrived_s)
 
 
 class Capture(Protocol):
@@ -187,9 +187,9 @@ class DeviceCamera:
                 arrived_s = time.time()
                 number = self.clock.number(time.perf_counter()) if self.endless else self.clock.count()
                 if not self.inbox.has_room(self.name):
-                    self.inbox.refuse(self.name)
+                    self.inbox.count_refused(self.name)
                     continue
-                self.inbox.give(self.name, number, self._decoded(), arrived_s)
+                self.inbox.put(self.name, number, self._decoded(), arrived_s)
         finally:
             self.capture.release()
 

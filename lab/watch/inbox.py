@@ -33,12 +33,12 @@ class Waiting:
 
 
 @dataclass(slots=True)
-class CameraBox:
+class CameraQueue:
     """The queue of one camera."""
 
     pictures: dict[int, Waiting] = field(default_factory=dict)
     incomplete: dict[int, tuple[float, str]] = field(default_factory=dict)  # since when (perf_counter), and why
-    asleep: bool = False  # a frame has timed out for this camera, and nothing has come since
+    timed_out: bool = False  # a frame has timed out for this camera, and nothing has come since
     ended: bool = False  # no more pictures will come
     late: int = 0  # pictures that came after their frame was closed
     refused: int = 0  # pictures dropped because the queue was full
@@ -54,8 +54,8 @@ class CameraBox:
 
 
 def is_complete(
-    frame: int, boxes: Sequence[CameraBox], now_s: float, since_s: float, timeout_s: float, interval_s: float
-) -> tuple[bool, list[CameraBox]]:
+    frame: int, queues: Sequence[CameraQueue], now_s: float, since_s: float, timeout_s: float, interval_s: float
+) -> tuple[bool, list[CameraQueue]]:
     """Whether a frame can be processed now, and the cameras that have timed out for it.
 
     The wait for a camera ends when it has delivered the frame's picture, or has had a later one for a frame interval
@@ -64,18 +64,18 @@ def is_complete(
     """
     waited_for = []
     first = []
-    for box in boxes:
-        if frame in box.pictures:
-            if isinstance(box.pictures[frame].content, np.ndarray):
+    for queue in queues:
+        if frame in queue.pictures:
+            if isinstance(queue.pictures[frame].content, np.ndarray):
                 return False, []  # its points are being detected
-            first.append(box.pictures[frame].seen_s)
+            first.append(queue.pictures[frame].seen_s)
             continue
-        later = box.later_s(frame)
+        later = queue.later_s(frame)
         if later is not None:
             first.append(later)
         passed = later is not None and now_s - later >= interval_s
-        if frame in box.incomplete or not (box.ended or box.asleep or passed):
-            waited_for.append(box)
+        if frame in queue.incomplete or not (queue.ended or queue.timed_out or passed):
+            waited_for.append(queue)
     if not first:
         return False, []
     if waited_for and now_s - max(min(first), since_s) < timeout_s:
@@ -87,7 +87,7 @@ class Inbox:
     """The queues of all cameras behind one lock. Times are time.perf_counter() unless stated otherwise."""
 
     def __init__(self, cameras: Sequence[str], interval_s: float, timeout_s: float) -> None:
-        self.boxes = {name: CameraBox() for name in cameras}
+        self.queues = {name: CameraQueue() for name in cameras}
         self.changed = threading.Condition()
         self.stopping = threading.Event()  # set to stop the cameras
         self.wanted = threading.Event()  # set to start devices; folders are polled from the start
@@ -97,11 +97,10 @@ class Inbox:
         self._interval_s, self._timeout_s = interval_s, timeout_s
 
     def has_room(self, camera: str) -> bool:
-        """Whether a camera may add another picture. Only its own thread adds to its queue, so the answer stays valid.
-        """
-        return len(self.boxes[camera].pictures) < MOST_WAITING
+        """Whether a camera may add another picture. Only its own thread adds pictures, so the answer stays valid."""
+        return len(self.queues[camera].pictures) < MOST_WAITING
 
-    def find_with(self, finders: Mapping[str, Finder]) -> None:
+    def set_finders(self, finders: Mapping[str, Finder]) -> None:
         """Detect the points of each camera's pictures from now on, in the camera's own thread."""
         with self.changed:
             self._finders = finders
@@ -109,58 +108,58 @@ class Inbox:
 
     def catch_up(self, camera: str) -> None:
         """Detect the points of pictures that came before there was a finder. Called in the camera's own thread."""
-        box = self.boxes[camera]
-        if not (box.grey and self._finders):
+        queue = self.queues[camera]
+        if not (queue.grey and self._finders):
             return
         with self.changed:
-            grey = sorted(n for n, w in box.pictures.items() if isinstance(w.content, np.ndarray))
+            grey = sorted(n for n, w in queue.pictures.items() if isinstance(w.content, np.ndarray))
         for number in grey:
-            waiting = box.pictures[number]  # still here: no frame is taken before its points are detected
+            waiting = queue.pictures[number]  # still here: no frame is taken before its points are detected
             assert isinstance(waiting.content, np.ndarray)
             found = self._finders[camera](waiting.content)
             with self.changed:
                 waiting.content = found
                 self.changed.notify_all()
-        box.grey = False
+        queue.grey = False
 
     def finish(self, camera: str) -> None:
         """End a camera's thread: wait for the finders, and catch up."""
         with self.changed:
-            self.boxes[camera].ended = True
+            self.queues[camera].ended = True
             self.changed.notify_all()
             while self._finders is None and not self.stopping.is_set():
                 self.changed.wait(0.05)
         self.catch_up(camera)
 
-    def give(self, camera: str, number: int, content: Content, arrived_s: float | None) -> None:
+    def put(self, camera: str, number: int, content: Content, arrived_s: float | None) -> None:
         """Add a camera's picture, or the reason why there is none."""
         self.catch_up(camera)
         if isinstance(content, np.ndarray):
             if self._finders is None:
-                self.boxes[camera].grey = True
+                self.queues[camera].grey = True
             else:
                 content = self._finders[camera](content)
         with self.changed:
-            box = self.boxes[camera]
-            box.incomplete.pop(number, None)
-            if self._accepts(box, number):
-                box.pictures[number] = Waiting(content, arrived_s, time.perf_counter())
-                box.given += 1
+            queue = self.queues[camera]
+            queue.incomplete.pop(number, None)
+            if self._accepts(queue, number):
+                queue.pictures[number] = Waiting(content, arrived_s, time.perf_counter())
+                queue.given += 1
             self.changed.notify_all()
 
     def announce(self, camera: str, number: int, why: str) -> None:
         """Announce a camera's picture that is not complete yet."""
         with self.changed:
-            box = self.boxes[camera]
-            if self._accepts(box, number, count=False):
-                since = box.incomplete[number][0] if number in box.incomplete else time.perf_counter()
-                box.incomplete[number] = (since, why)
+            queue = self.queues[camera]
+            if self._accepts(queue, number, count=False):
+                since = queue.incomplete[number][0] if number in queue.incomplete else time.perf_counter()
+                queue.incomplete[number] = (since, why)
             self.changed.notify_all()
 
-    def refuse(self, camera: str) -> None:
+    def count_refused(self, camera: str) -> None:
         """Count a camera's picture that is dropped because its queue is full."""
         with self.changed:
-            self.boxes[camera].refused += 1
+            self.queues[camera].refused += 1
 
     def take(self, frame: int) -> tuple[dict[str, Content], float | None]:
         """Take a frame's pictures by camera, and close the frame.
@@ -169,9 +168,9 @@ class Inbox:
         """
         out: dict[str, Content] = {}
         arrived: list[float] = []
-        for name, box in self.boxes.items():
-            waiting = box.pictures.pop(frame, None)
-            since_and_why = box.incomplete.pop(frame, None)
+        for name, queue in self.queues.items():
+            waiting = queue.pictures.pop(frame, None)
+            since_and_why = queue.incomplete.pop(frame, None)
             if waiting is not None:
                 out[name] = waiting.content
                 if waiting.arrived_s is not None:
@@ -183,20 +182,20 @@ class Inbox:
 
     def has_later(self, frame: int) -> bool:
         """Whether any camera has a picture of a later frame."""
-        return any(box.later_s(frame) is not None for box in self.boxes.values())
+        return any(queue.later_s(frame) is not None for queue in self.queues.values())
 
-    def _accepts(self, box: CameraBox, number: int, count: bool = True) -> bool:
+    def _accepts(self, queue: CameraQueue, number: int, count: bool = True) -> bool:
         """Register the arrival of a picture; False if its frame is closed, or so far ahead that it is a stray file."""
         self.last_seen_s = time.perf_counter()
-        box.asleep = False
+        queue.timed_out = False
         if self.next_frame is None:
             return True
         if number < self.next_frame:
-            box.late += count
+            queue.late += count
             # A camera that lags by more than the timeout would delay every frame by it.
-            box.asleep = (self.next_frame - number) * self._interval_s > self._timeout_s
+            queue.timed_out = (self.next_frame - number) * self._interval_s > self._timeout_s
             return False
         if number > self.next_frame + LONGEST_GAP:
-            box.strays += [number] * count
+            queue.strays += [number] * count
             return False
         return True

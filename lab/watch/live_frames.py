@@ -18,7 +18,7 @@ from lab.pictures.picture_file import Grey, Missing
 from lab.runs.frames.frames import FrameSet
 from lab.watch.cameras import DeviceCamera, FolderCamera, LiveCamera, in_thread, open_device
 from lab.watch.folder_poll import FolderPoll
-from lab.watch.inbox import CameraBox, Inbox, is_complete
+from lab.watch.inbox import CameraQueue, Inbox, is_complete
 
 FIRST = 6  # pictures of each camera for the estimate of the noise
 _START_S = 0.5  # longest wait for them, or the time of eight frames if that is more
@@ -82,17 +82,17 @@ class LiveFrames:
     def notes(self) -> list[str]:
         """Notes for the user of the results."""
         out = [note for camera in self._cameras.values() for note in camera.notes]
-        for name, box in self.inbox.boxes.items():
+        for name, queue in self.inbox.queues.items():
             out += [f"{name}: {count} frames {reason}" for reason, count in self._reasons[name].items()]
-            if box.late:
+            if queue.late:
                 out.append(
-                    f"{name}: {box.late} pictures came after their frame had been closed and were not used; `beampose"
+                    f"{name}: {queue.late} pictures came after their frame had been closed and were not used; `beampose"
                     " run` on the finished folder uses them"
                 )
-            if box.refused:
-                out.append(f"{name}: {box.refused} pictures were left out: they came faster than they are processed")
-            if box.strays:
-                out.append(f"{name}: pictures with numbers far beyond all others were left out: {_some(box.strays)}")
+            if queue.refused:
+                out.append(f"{name}: {queue.refused} pictures were left out: they came faster than they are processed")
+            if queue.strays:
+                out.append(f"{name}: pictures with numbers far beyond all others were left out: {_some(queue.strays)}")
         return out
 
     def begin(self) -> Mapping[str, list[Grey]]:
@@ -109,11 +109,11 @@ class LiveFrames:
         with self.inbox.changed:
             while True:
                 self._raise_failure()
-                counts = [self._usable(box) for box in self.inbox.boxes.values()]
-                if begun is None and any(box.pictures for box in self.inbox.boxes.values()):
+                counts = [self._usable(queue) for queue in self.inbox.queues.values()]
+                if begun is None and any(queue.pictures for queue in self.inbox.queues.values()):
                     begun = time.perf_counter()
                 waited = 0.0 if begun is None else time.perf_counter() - begun
-                over = self.stop.is_set() or all(box.ended for box in self.inbox.boxes.values())
+                over = self.stop.is_set() or all(queue.ended for queue in self.inbox.queues.values())
                 if min(len(c) for c in counts) >= FIRST or waited > patience or over:
                     break
                 self.inbox.changed.wait(0.05)
@@ -138,33 +138,33 @@ class LiveFrames:
 
     def _wait_for(self, frame: int, since: float) -> bool:
         """Wait until a frame can be processed; False: the recording has ended before it."""
-        boxes = list(self.inbox.boxes.values())
+        queues = list(self.inbox.queues.values())
         with self.inbox.changed:
             while True:
                 self._raise_failure()
                 now = time.perf_counter()
                 timeout = 0.0 if self.stop.is_set() else self.options.timeout_s
-                complete, given_up = is_complete(frame, boxes, now, since, timeout, 1 / self.run.frame_rate_hz)
+                complete, now_timed_out = is_complete(frame, queues, now, since, timeout, 1 / self.run.frame_rate_hz)
                 if complete:
-                    for box in given_up:
-                        box.asleep = True
+                    for queue in now_timed_out:
+                        queue.timed_out = True
                     return True
-                if not self._anything_from(frame, boxes) and self._is_over(now, boxes):
+                if not self._anything_from(frame, queues) and self._is_over(now, queues):
                     return False
                 self.inbox.changed.wait(0.005)
 
-    def _is_over(self, now: float, boxes: list[CameraBox]) -> bool:
+    def _is_over(self, now: float, queues: list[CameraQueue]) -> bool:
         seen = self.inbox.last_seen_s
         idle = seen is not None and now - seen > self.options.idle_s
-        return self.stop.is_set() or idle or all(box.ended for box in boxes)
+        return self.stop.is_set() or idle or all(queue.ended for queue in queues)
 
     @staticmethod
-    def _anything_from(frame: int, boxes: list[CameraBox]) -> bool:
+    def _anything_from(frame: int, queues: list[CameraQueue]) -> bool:
         """Whether any camera has a complete picture of this frame or a later one."""
-        return any(number >= frame for box in boxes for number in box.pictures)
+        return any(number >= frame for queue in queues for number in queue.pictures)
 
     def _first_pictures(self) -> dict[str, list[Grey]]:
-        numbers = sorted({n for box in self.inbox.boxes.values() for n in (*box.pictures, *box.incomplete)})
+        numbers = sorted({n for queue in self.inbox.queues.values() for n in (*queue.pictures, *queue.incomplete)})
         if not numbers:
             return {}
         gaps = np.diff(numbers)
@@ -175,11 +175,11 @@ class LiveFrames:
                 " contain a time?"
             )
         self._first = self.inbox.next_frame = numbers[0]
-        return {name: self._usable(box)[:FIRST] for name, box in self.inbox.boxes.items()}
+        return {name: self._usable(queue)[:FIRST] for name, queue in self.inbox.queues.items()}
 
     @staticmethod
-    def _usable(box: CameraBox) -> list[Grey]:
-        contents = [waiting.content for _, waiting in sorted(box.pictures.items(), key=lambda item: item[0])]
+    def _usable(queue: CameraQueue) -> list[Grey]:
+        contents = [waiting.content for _, waiting in sorted(queue.pictures.items(), key=lambda item: item[0])]
         return [content for content in contents if isinstance(content, np.ndarray)]
 
     def _failed(self, error: BaseException) -> None:

@@ -117,7 +117,7 @@ def _started(run: Run, frames: LiveFrames, output: LiveOutput) -> tuple[Pipeline
         list(pool.map(lambda name: noise[name].estimate_from(first[name]), first))
     pipeline = Pipeline(run, frames, tracker_of(run), noise, output.write)
     finders = {name: _Finder(pipeline, name) for name in noise}
-    frames.inbox.find_with(finders)
+    frames.inbox.set_finders(finders)
     return pipeline, finders
 
 

@@ -352,14 +352,14 @@ def test_an_incomplete_picture_is_read_again_and_a_damaged_one_is_reported(recor
     for name in ("0.png", "1.png"):
         (tmp_path / name).write_bytes(whole[: len(whole) // 3])
     camera.poll_once()
-    assert set(inbox.boxes["left"].incomplete) == {0, 1}
+    assert set(inbox.queues["left"].incomplete) == {0, 1}
     (tmp_path / "0.png").write_bytes(whole)
     time.sleep(0.06)
     camera.poll_once()
-    box = inbox.boxes["left"]
-    assert not box.incomplete
-    assert np.array_equal(box.pictures[0].content, read_picture(recorded / "frames/left/000000.png", None))
-    assert box.pictures[1].content == Missing("unreadable: cut short")
+    queue = inbox.queues["left"]
+    assert not queue.incomplete
+    assert np.array_equal(queue.pictures[0].content, read_picture(recorded / "frames/left/000000.png", None))
+    assert queue.pictures[1].content == Missing("unreadable: cut short")
 
 
 # -- when a frame is complete -----------------------------------------------------------------------------------------
@@ -367,59 +367,59 @@ def test_an_incomplete_picture_is_read_again_and_a_damaged_one_is_reported(recor
 FOUND = Detections.none()
 
 
-def boxes_with(*given: tuple[str, int]) -> Inbox:
+def inbox_with(*given: tuple[str, int]) -> Inbox:
     inbox = Inbox(("a", "b"), interval_s=0.01, timeout_s=0.2)
     for camera, frame in given:
-        inbox.give(camera, frame, FOUND, None)
+        inbox.put(camera, frame, FOUND, None)
     return inbox
 
 
 def complete(inbox: Inbox, frame: int, waited_s: float) -> tuple[bool, list[str]]:
     now = time.perf_counter()
-    names = {id(box): name for name, box in inbox.boxes.items()}
-    done, given_up = is_complete(frame, list(inbox.boxes.values()), now + waited_s, now, 0.2, 0.01)
-    return done, [names[id(box)] for box in given_up]
+    names = {id(queue): name for name, queue in inbox.queues.items()}
+    done, now_timed_out = is_complete(frame, list(inbox.queues.values()), now + waited_s, now, 0.2, 0.01)
+    return done, [names[id(queue)] for queue in now_timed_out]
 
 
 def test_a_frame_is_complete_when_all_cameras_have_delivered_it():
-    assert complete(boxes_with(("a", 0), ("b", 0)), 0, 0.0) == (True, [])
-    assert complete(boxes_with(("a", 0)), 0, 0.0) == (False, [])
+    assert complete(inbox_with(("a", 0), ("b", 0)), 0, 0.0) == (True, [])
+    assert complete(inbox_with(("a", 0)), 0, 0.0) == (False, [])
 
 
 def test_a_camera_with_a_later_frame_for_a_frame_interval_has_dropped_this_one():
-    inbox = boxes_with(("a", 0), ("b", 1))
+    inbox = inbox_with(("a", 0), ("b", 1))
     assert complete(inbox, 0, 0.0) == (False, [])
     assert complete(inbox, 0, 0.011) == (True, [])
 
 
 def test_a_silent_camera_times_out_once():
-    inbox = boxes_with(("a", 0), ("a", 1))
+    inbox = inbox_with(("a", 0), ("a", 1))
     assert complete(inbox, 0, 0.19) == (False, [])
     assert complete(inbox, 0, 0.21) == (True, ["b"])
-    inbox.boxes["b"].asleep = True
+    inbox.queues["b"].timed_out = True
     assert complete(inbox, 1, 0.0) == (True, [])
     inbox.next_frame = 1
-    inbox.give("b", 0, FOUND, None)  # it is late, but there again
-    assert inbox.boxes["b"].late == 1
+    inbox.put("b", 0, FOUND, None)  # it is late, but there again
+    assert inbox.queues["b"].late == 1
     assert complete(inbox, 1, 0.0) == (False, [])
 
 
 def test_a_camera_that_lags_by_more_than_the_timeout_is_not_waited_for():
-    inbox = boxes_with(("a", 100))
-    inbox.next_frame, inbox.boxes["b"].asleep = 100, True
-    inbox.give("b", 70, FOUND, None)
+    inbox = inbox_with(("a", 100))
+    inbox.next_frame, inbox.queues["b"].timed_out = 100, True
+    inbox.put("b", 70, FOUND, None)
     assert complete(inbox, 100, 0.0) == (True, [])
 
 
 def test_no_frame_is_complete_before_any_camera_has_a_picture():
-    assert complete(boxes_with(), 0, 100.0) == (False, [])
+    assert complete(inbox_with(), 0, 100.0) == (False, [])
 
 
 def test_a_stray_number_is_ignored():
-    inbox = boxes_with(("a", 5))
+    inbox = inbox_with(("a", 5))
     inbox.next_frame = 5
-    inbox.give("a", 90_000, FOUND, None)
-    assert (inbox.boxes["a"].strays, set(inbox.boxes["a"].pictures)) == ([90_000], {5})
+    inbox.put("a", 90_000, FOUND, None)
+    assert (inbox.queues["a"].strays, set(inbox.queues["a"].pictures)) == ([90_000], {5})
 
 
 # -- devices ----------------------------------------------------------------------------------------------------------
@@ -466,9 +466,9 @@ def test_a_device_that_is_faster_than_the_processing_loses_pictures(shape):
     camera = DeviceCamera("left", capture, (6, 4), inbox, FrameClock(100.0))
     inbox.wanted.set()
     camera.run()
-    box = inbox.boxes["left"]
-    assert (len(box.pictures), box.refused, capture.released) == (MOST_WAITING, 5, True)
-    assert all(np.array_equal(w.content, np.full((4, 6), 7)) for w in box.pictures.values())
+    queue = inbox.queues["left"]
+    assert (len(queue.pictures), queue.refused, capture.released) == (MOST_WAITING, 5, True)
+    assert all(np.array_equal(w.content, np.full((4, 6), 7)) for w in queue.pictures.values())
 
 
 def test_the_live_table_has_the_columns_of_the_contract(followed):

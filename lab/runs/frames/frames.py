@@ -166,7 +166,7 @@ class FrameReader:
             raise InputError(
                 f"{self._run.path}: cameras: expected frame numbers without gaps of many thousands, got {pictures}"
                 f" pictures between frame {self.first} and frame {self.last}; is a stray {stray} among them, or do the"
-                f" {holders} hold a time?"
+                f" {holders} contain a time?"
             )
         self._check_strays()
 

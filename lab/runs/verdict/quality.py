@@ -81,7 +81,7 @@ def judge(statistics: RunStatistics, findings: Sequence[Finding] = (), noise_sca
         return Verdict(status, tuple(e.what for e in found), tuple(found))
     share = statistics.measured / statistics.frames
     return Verdict(
-        "pass", (f"{share:.1%} of the frames have a measured pose, and the residuals are what the sigmas allow",)
+        "pass", (f"{share:.1%} of the frames have a measured pose, and the residuals agree with the stated sigmas",)
     )
 
 

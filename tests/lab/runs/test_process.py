@@ -580,7 +580,7 @@ def test_consecutive_frames_with_an_uncertain_label_are_one_event():
     for frame in (3, 4, 5, 9):
         events = (Event("undecided", "label left open", 0), Event("dropped", "contradicts", 1))
         tally.add(FrameRecord(frame, 0.0, 0.0, (None,), ("dropped",), replace(tracked, events=events)))
-    listed = [(e["frame"], e["last_frame"], e["kind"], e["spot"]) for e in tally.events]
+    listed = [(e.frame, e.last_frame, e.kind, e.spot) for e in tally.events]
     assert listed == [
         (3, 5, "undecided", "1"), (3, 3, "dropped", "2"), (4, 4, "dropped", "2"), (5, 5, "dropped", "2"),
         (9, 9, "undecided", "1"), (9, 9, "dropped", "2"),

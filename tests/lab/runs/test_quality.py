@@ -53,7 +53,9 @@ def kinds(verdict: Verdict) -> list[ReasonKind]:
 def test_a_clean_run_passes_and_gives_the_reason():
     verdict = judge(statistics_of())
     assert (verdict.status, verdict.exit_status, verdict.reasons) == ("pass", 0, ())
-    assert verdict.texts == ("100.0% of the frames have a measured pose, and the residuals are what the sigmas allow",)
+    assert verdict.texts == (
+        "100.0% of the frames have a measured pose, and the residuals agree with the stated sigmas",
+    )
 
 
 @pytest.mark.parametrize(
