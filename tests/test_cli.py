@@ -388,7 +388,7 @@ def test_a_run_without_a_prior_is_processed_and_a_symmetric_rig_is_not_guessed(t
     assert json.loads((tmp_path / "out/summary.json").read_text())["parameters"]["prior"] is None
     checked = typed("check", folder)
     assert checked.exit_code == 0
-    assert "after a turn of 180 deg: the first labels stay a tie" in checked.stdout
+    assert "a rotation by 180 deg maps the beams onto each other: the first labels remain ambiguous" in checked.stdout
     assert "Add prior: {position_m:" in checked.stdout
 
 

@@ -122,7 +122,7 @@ def open_inputs(given: Sequence[Path], camera: str | None = None) -> PictureFile
 
 def _files_of(path: Path) -> list[Path]:
     if path.is_dir():
-        raise InputError(f"{path}: expected a folder alone, or files, got a folder among others; give one at a time")
+        raise InputError(f"{path}: expected a folder alone, or files, got a folder among others; name one at a time")
     if path.exists():
         return [path]
     if any(c in str(path) for c in "*?["):
@@ -143,7 +143,7 @@ def _pictures_in(folder: Path) -> list[Path]:
     if pictures:
         return pictures
     below = [p.name for p in names if p.is_dir() and any(q.suffix.lower() in SUFFIXES for q in p.iterdir())]
-    hint = f"; its folders {', '.join(below[:_SHOWN])} do: give one of them" if below else ""
+    hint = f"; its folders {', '.join(below[:_SHOWN])} do: name one of them" if below else ""
     among = f" among {len(names)} files" if names and not below else ""
     raise InputError(f"{folder}: the folder holds no pictures ({', '.join(s[1:] for s in SUFFIXES)}){among}{hint}")
 

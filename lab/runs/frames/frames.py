@@ -216,8 +216,8 @@ class FrameReader:
             return
         if name in table.spoilt:
             raise InputError(
-                f"{path}: camera {name!r}: expected rows that can be used, got none: {table.spoilt[name]}; correct"
-                f" them, or leave {name!r} out of `cameras` in {self._run.path}"
+                f"{path}: camera {name!r}: expected rows that can be used, got none: {table.spoilt[name]}; put"
+                f" them right, or leave {name!r} out of `cameras` in {self._run.path}"
             )
         unknown = self._unknown(table)
         if unknown:

