@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -47,6 +47,14 @@ class FrameSet:
     images: Mapping[str, Picture]  # by camera: grey (h, w) u8 or u16, detected points, or Missing
 
 
+@dataclass(slots=True)
+class _MissingFrames:
+    """The frames that one camera lacks for one reason."""
+
+    count: int = 0
+    first: list[int] = field(default_factory=list)  # the first NAMED of them
+
+
 class FrameReader:
     """Iterates over all frame numbers from the first to the last of any camera. It can be iterated repeatedly.
 
@@ -58,7 +66,7 @@ class FrameReader:
         self._listings: dict[str, FolderListing] = {}
         self._tables: dict[str, DetectionsFile] = {}
         self._notes: list[str] = []
-        self._problems: dict[str, dict[str, tuple[int, list[int]]]] = {}  # by camera and reason: count, first frames
+        self._missing: dict[tuple[str, str], _MissingFrames] = {}  # by camera and reason
         self._ended: dict[str, str] = {}
         self._stated_counts: dict[str, int | None] = {}
         opened: dict[Path, DetectionsFile] = {}
@@ -104,14 +112,15 @@ class FrameReader:
     def notes(self) -> list[str]:
         """Notes for the user of the results; complete once the iteration has ended."""
         out = list(self._notes) + list(self._ended.values())
-        for camera, reasons in self._problems.items():
-            for reason, (count, frames) in reasons.items():
-                some = ", ".join(map(str, frames)) + (", ..." if count > len(frames) else "")
-                out.append(f"{camera}: {count} frame{'s' if count > 1 else ''} {reason} ({some})")
+        for camera in self._run.cameras:
+            for (of, reason), missing in self._missing.items():
+                if of == camera:
+                    some = ", ".join(map(str, missing.first)) + (", ..." if missing.count > NAMED else "")
+                    out.append(f"{camera}: {missing.count} frame{'s' if missing.count > 1 else ''} {reason} ({some})")
         return out
 
     def __iter__(self) -> Iterator[FrameSet]:
-        self._problems, self._ended = {c: {} for c in self._run.cameras}, {}
+        self._missing, self._ended = {}, {}
         with ExitStack() as stack:
             pool = ThreadPoolExecutor(THREADS, thread_name_prefix="decode")
             stack.callback(pool.shutdown, cancel_futures=True)
@@ -266,8 +275,10 @@ class FrameReader:
     def _count(self, frame: int, images: Mapping[str, Picture]) -> None:
         for camera, picture in images.items():
             if isinstance(picture, Missing):
-                count, frames = self._problems[camera].get(picture.reason, (0, []))
-                self._problems[camera][picture.reason] = (count + 1, [*frames, frame][:NAMED])
+                missing = self._missing.setdefault((camera, picture.reason), _MissingFrames())
+                missing.count += 1
+                if len(missing.first) < NAMED:
+                    missing.first.append(frame)
 
 
 def open_frames(run: Run) -> FrameReader:

@@ -32,7 +32,9 @@ class CameraNoise:
     stated: SensorNoise | None = None
     notes: list[str] = field(default_factory=list)
     estimate: NoiseEstimate | None = field(default=None, init=False)
-    model: NoiseModel | None = field(default=None, init=False)  # in use; None before the first picture
+    model: NoiseModel | None = field(
+        default=None, init=False
+    )  # in use; None before the first estimate if none is stated
     _overruled: bool = field(default=False, init=False)  # the stated noise misses visible spots
     _blank: int = field(default=0, init=False)  # consecutive pictures without any point
     _recent: deque[Picture] = field(default_factory=lambda: deque(maxlen=2), init=False)
