@@ -389,7 +389,7 @@ def test_a_run_without_a_prior_is_processed_and_a_symmetric_rig_fails(tmp_path):
     assert json.loads((tmp_path / "out/summary.json").read_text())["parameters"]["prior"] is None
     checked = typed("check", folder)
     assert checked.exit_code == 0
-    assert "after a turn of 180 deg: the first labels stay a tie" in checked.stdout
+    assert "a rotation by 180 deg maps the beams onto each other: the first labels remain ambiguous" in checked.stdout
     assert "Add prior: {position_m:" in checked.stdout
 
 
@@ -432,8 +432,8 @@ def test_ctrl_c_ends_a_watched_recording_and_writes_its_results(tmp_path):
     assert (watching.returncode, errors) == (0, "")
     assert out.startswith("smooth-5: PASS: 8 of 8 frames measured")
     assert json.loads((tmp_path / "out/summary.json").read_text())["notes"] == [
-        "left: 8 pictures were there before the watch began",
-        "right: 8 pictures were there before the watch began",
+        "left: 8 pictures existed before the watch began",
+        "right: 8 pictures existed before the watch began",
     ]
 
 

@@ -10,14 +10,14 @@ import numpy as np
 
 from bench.random_pictures.sensors import Picture
 from geometry.camera import SensorNoise
-from lab.runs.frames.sensor_noise import frames_to_learn_from
+from lab.runs.frames.sensor_noise import noise_estimation_frames
 from tracking.noise import NoiseModel
 from tracking.noise_estimation.photon_transfer import estimate_noise
 
 
 def model_of_pictures(frames: int, picture: Callable[[int], Picture]) -> NoiseModel:
     """The initial noise model of a run without a stated noise, from a recording with this number of pictures."""
-    return estimate_noise([picture(k) for k in frames_to_learn_from(frames)]).model
+    return estimate_noise([picture(k) for k in noise_estimation_frames(frames)]).model
 
 
 def reported_model(block: Mapping[str, Any]) -> NoiseModel:

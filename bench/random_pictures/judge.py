@@ -25,7 +25,7 @@ from bench.random_scenes.oracle import ask_oracle
 from bench.random_scenes.scene import OUTSIDE, SHINING, Scene, composed
 from geometry.arrays import Array, Bools
 from lab.files.run.results import read_result_table, read_spots, read_summary
-from lab.runs.verdict.evidence import Kind
+from lab.runs.verdict.verdict_reasons import ReasonKind
 
 LEAST_SNR = 8.0
 SAME_SPOT_PX, SAME_SPOT_SIGMAS = 3.0, 5.0
@@ -210,16 +210,25 @@ def wrong_diagnoses(renderer: Renderer, summary: Mapping[str, Any]) -> tuple[str
     out = []
     for item in summary.get("verdict", {}).get("evidence", []):
         kind, camera = item["kind"], item.get("numbers", {}).get("camera")
-        false = kind in (Kind.MISFIT, Kind.MODEL, Kind.NOT_ACQUIRED, Kind.FEW_POINTS, Kind.NEVER_FOUND, Kind.INTERNAL)
-        if kind == Kind.MODEL:
+        false = kind in (
+            ReasonKind.NOISE_SCALE,
+            ReasonKind.MODEL,
+            ReasonKind.NOT_ACQUIRED,
+            ReasonKind.FEW_POINTS,
+            ReasonKind.NEVER_FOUND,
+            ReasonKind.INTERNAL,
+        )
+        if kind == ReasonKind.MODEL:
             false = not _about_noise_or_hidden(item["what"], scene, seen)
         if camera in scene.rig.cameras:
             c = list(scene.rig.cameras).index(camera)
             mine = np.asarray(seen[:, scene.camera_of == c].any(axis=1))
             pictures = scene.has_image[:, c]
-            false |= kind == Kind.NOTHING_DETECTED and float(mine[pictures].mean()) > SEEN
-            false |= kind == Kind.NO_PICTURES and bool(pictures.any())
-            false |= kind in (Kind.CAMERA_LATE, Kind.CAMERA_STOPPED, Kind.MISSING_PICTURES) and bool(pictures.all())
+            false |= kind == ReasonKind.NOTHING_DETECTED and float(mine[pictures].mean()) > SEEN
+            false |= kind == ReasonKind.NO_PICTURES and bool(pictures.any())
+            false |= kind in (ReasonKind.CAMERA_LATE, ReasonKind.CAMERA_STOPPED, ReasonKind.MISSING_PICTURES) and bool(
+                pictures.all()
+            )
         if false:
             out.append(f"{kind}: {item['what']}")
     return tuple(out)

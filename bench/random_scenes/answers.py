@@ -22,7 +22,7 @@ from lab.pictures.picture_file import DROPPED, Missing
 from lab.runs import process
 from lab.runs.frames.frames import FrameSet
 from lab.runs.frames.pipeline import FrameRecord, Pipeline, Tracker, tracker_of
-from lab.runs.smoothing_pass import TwoPasses
+from lab.runs.smoothing_pass import TrackingAndSmoothing
 from tracking.detections import UNMATCHED, Detections
 from tracking.parameters import TrackerParameters
 from tracking.statuses import PoseStatus
@@ -133,7 +133,7 @@ def answers_in_memory(scene: Scene, parameters: TrackerParameters | None = None)
             causal.append(then)
             seconds = time.process_time() - start
 
-        passes = TwoPasses(pipeline, work)
+        passes = TrackingAndSmoothing(pipeline, work)
         _, _, verdict = process.write_tables(pipeline, passes, work, on_frame=on_frame)
     return Answers(
         _pass(scene, smoothed),

@@ -28,7 +28,7 @@ STAGES = (
     ("smooth", "tracking.smoothing.smoothed", "Smoothed.frame"),
     ("tables", "lab.runs.tables", "TableWriter.write"),
     ("tables", "lab.runs.tables", "TableWriter.__exit__"),
-    ("model check", "lab.runs.model_check.check", "check_kept"),
+    ("model check", "lab.runs.model_check.check", "check_sampled_frames"),
     ("report", "lab.report.run.page", "write_report"),
     ("load compiled", "numba.core.caching", "Cache.load_overload"),
     ("compile", "numba.core.dispatcher", "_FunctionCompiler.compile"),

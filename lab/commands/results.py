@@ -20,7 +20,7 @@ def check(path: Path) -> None:
     Example:
         beampose check sample_runs/huo2015
     """
-    from lab.runs.check import check as check_path
+    from lab.runs.input_check.check import check as check_path
 
     result = check_path(path)
     for line in result.lines:

@@ -49,7 +49,7 @@ def batch(run_folders: tuple[Path, ...], out: Path, causal: bool, settings: dict
     """
     from lab.runs.batch import process_batch
 
-    outcome = process_batch(run_folders, out, overrides=settings, causal=causal, tell=click.echo)
+    outcome = process_batch(run_folders, out, overrides=settings, causal=causal, report=click.echo)
     click.echo(f"table: {outcome.table}")
     click.echo(f"index: {outcome.index}")
     sys.exit(outcome.exit_status)

@@ -1,1 +1,1 @@
-"""Spots in any pictures, without a rig: what a detector sees, and with what noise."""
+"""`beampose detect`: spots and sensor noise of any pictures, without a rig."""

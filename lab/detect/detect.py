@@ -1,4 +1,4 @@
-"""Spots of a folder of pictures, a picture or a video: table, contact sheet, noise, sizes and signal to noise."""
+"""Detects the spots of a folder of pictures, a picture or a video; writes table, contact sheet, page and summary."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import numpy as np
 
 from lab.detect.contact_sheet import ContactSheet
 from lab.detect.inputs import PictureFiles, Video, open_inputs
-from lab.detect.work import Work
+from lab.detect.picture_series import PictureSeries
 from lab.errors import InputError
 from lab.files.run.parameter_overrides import overridden
 from lab.files.text import columns
@@ -28,22 +28,26 @@ from tracking.parameters import DetectParameters, TrackerParameters
 
 SCHEMA = "beampose/detect/1"
 SHEET = "contact-sheet.png"
-_NAMED = 5  # frames of one trouble that are named
+_NAMED = 5  # frames that a note names for each kind of problem
 
-Progress = Callable[[int, int | None], None]  # pictures done, pictures in all where known
+Progress = Callable[[int, int | None], None]  # pictures done, total number of pictures where known
 
 
 @dataclass(frozen=True, slots=True)
 class DetectOptions:
-    """What to look at, and how."""
+    """Which pictures to search, and with which parameters."""
 
     camera: str | None = None  # name in the table; None: the folder's or file's
-    every: int = 1  # one picture of so many
-    limit: int | None = None  # at most so many pictures
+    every: int = 1  # search every n-th picture
+    limit: int | None = None  # largest number of pictures
     overrides: Mapping[str, Any] = field(default_factory=dict)  # of TrackerParameters, such as detect.threshold_sigma
 
     def parameters(self) -> DetectParameters:
-        """Raises InputError for a parameter that is none of detection."""
+        """The parameters of the detection.
+
+        Raises:
+            InputError: an override is not a parameter of the detection.
+        """
         others = [name for name in self.overrides if not name.startswith("detect.")]
         if others:
             raise InputError(
@@ -55,7 +59,7 @@ class DetectOptions:
 
 @dataclass(frozen=True, slots=True)
 class DetectOutcome:
-    """What was found."""
+    """The outcome of one call."""
 
     camera: str
     out: Path
@@ -76,30 +80,32 @@ def detect_pictures(
 ) -> DetectOutcome:
     """Search pictures for spots, and write detections.csv, a contact sheet, report.html and summary.json into `out`.
 
-    Positions are those of the light's centre: without a rig nothing is known of beams. Raises InputError where the
-    pictures or an option cannot be used, or none of the pictures can be read; `out` is then as it was before.
+    Positions are centroids of the light: without a rig they cannot be corrected to the beams' axes.
+
+    Raises:
+        InputError: the pictures or an option cannot be used, or no picture can be read; `out` is then unchanged.
     """
     started = time.perf_counter()
     parameters = options.parameters()
     inputs = open_inputs(given, options.camera)
     source = str(inputs.path if isinstance(inputs, Video) else given[0] if len(given) == 1 else f"{len(given)} files")
-    work = Work(inputs.camera, source, parameters, notes=list(inputs.notes))
+    series = PictureSeries(inputs.camera, source, parameters, notes=list(inputs.notes))
     with atomic_folder(out, may_replace=are_detections) as folder:
-        work.learn([p for p in inputs.to_learn_from() if not isinstance(p, Missing)])
+        series.estimate_noise([p for p in inputs.noise_pictures() if not isinstance(p, Missing)])
         sheet = ContactSheet(_total(inputs, options))
-        _search_all(inputs, work, sheet, folder / "detections.csv", options, progress)
-        _conclude(work)
+        _search_all(inputs, series, sheet, folder / "detections.csv", options, progress)
+        _add_notes(series)
         sheet.write(folder / SHEET)
-        from lab.detect.detect_page import write_detect_page  # the template engine: only when there is a result
+        from lab.detect.detect_page import write_detect_page  # imports the template engine, needed only here
 
-        write_json(_summary(work, options, time.perf_counter() - started), folder / "summary.json")
-        write_detect_page(work, sheet, folder)
-    bad = sum(map(len, work.unreadable.values()))
-    return DetectOutcome(work.camera, Path(out), work.pictures, bad, work.spots.total)
+        write_json(_summary(series, options, time.perf_counter() - started), folder / "summary.json")
+        write_detect_page(series, sheet, folder)
+    bad = sum(map(len, series.unreadable.values()))
+    return DetectOutcome(series.camera, Path(out), series.pictures, bad, series.spots.total)
 
 
 def are_detections(folder: Path) -> bool:
-    """Whether a folder holds what an earlier call wrote."""
+    """Whether a folder holds the results of an earlier call."""
     try:
         return bool(json.loads((folder / "summary.json").read_text("utf-8")).get("schema") == SCHEMA)
     except (OSError, ValueError, AttributeError):
@@ -108,21 +114,21 @@ def are_detections(folder: Path) -> bool:
 
 def _search_all(
     inputs: PictureFiles | Video,
-    work: Work,
+    series: PictureSeries,
     sheet: ContactSheet,
     table: Path,
     options: DetectOptions,
     progress: Progress | None,
 ) -> None:
-    total, camera = _total(inputs, options), csv_word(work.camera)
+    total, camera = _total(inputs, options), csv_word(series.camera)
     with table.open("w", encoding="utf-8", newline="") as file:
         file.write(",".join(columns.DETECTIONS) + "\n")
         pictures = islice(inputs.pictures(options.every), options.limit)
         for done, (frame, picture) in enumerate(pictures, start=1):
             if isinstance(picture, Missing):
-                work.unreadable.setdefault(picture.reason, []).append(frame)
+                series.unreadable.setdefault(picture.reason, []).append(frame)
             else:
-                found = work.search(frame, picture)
+                found = series.search(frame, picture)
                 file.writelines(detection_rows(frame, camera, found))
                 sheet.offer(done - 1, frame, picture, found)
             if progress is not None:
@@ -134,26 +140,26 @@ def _total(inputs: PictureFiles | Video, options: DetectOptions) -> int | None:
     return count if count is None or options.limit is None else min(count, options.limit)
 
 
-def _conclude(work: Work) -> None:
-    """Say what is unusual. Raises InputError where there is no picture at all."""
-    if not work.pictures:
-        commonest = max(work.unreadable, key=lambda r: len(work.unreadable[r]), default="")
-        why = f": {commonest}" if commonest else ""
-        raise InputError(f"{work.source}: expected pictures, got none that can be read{why}")
-    for reason, frames in work.unreadable.items():
+def _add_notes(series: PictureSeries) -> None:
+    """Add notes on unreadable pictures and mixed kinds. Raises InputError if no picture could be read."""
+    if not series.pictures:
+        most_frequent = max(series.unreadable, key=lambda r: len(series.unreadable[r]), default="")
+        why = f": {most_frequent}" if most_frequent else ""
+        raise InputError(f"{series.source}: expected pictures, got none that can be read{why}")
+    for reason, frames in series.unreadable.items():
         some = ", ".join(map(str, frames[:_NAMED])) + (", ..." if len(frames) > _NAMED else "")
-        work.notes.append(f"{_counted(len(frames))} {reason} (frame {some})")
-    if len(work.groups) > 1:
-        most = sorted(work.groups.values(), key=lambda g: -g.pictures)
-        kinds = "; ".join(f"{_counted(g.pictures)} of {g.words()}" for g in most[:6])
+        series.notes.append(f"{_counted(len(frames))} {reason} (frame {some})")
+    if len(series.groups) > 1:
+        most = sorted(series.groups.values(), key=lambda g: -g.pictures)
+        kinds = "; ".join(f"{_counted(g.pictures)} of {g.text()}" for g in most[:6])
         more = f"; and {len(most) - 6} further kinds" if len(most) > 6 else ""
-        work.notes.append(f"pictures of different sizes or depths, each kind with its own noise model: {kinds}{more}")
-    work.notes += list(dict.fromkeys(note for g in work.groups.values() for note in g.noise.notes))
+        series.notes.append(f"pictures of different sizes or depths, each kind with its own noise model: {kinds}{more}")
+    series.notes += list(dict.fromkeys(note for g in series.groups.values() for note in g.noise.notes))
 
 
-def _summary(work: Work, options: DetectOptions, wall_s: float) -> dict[str, Any]:
-    table = work.spots.table()
-    counts = np.array([n for _, n in work.spots.per_frame])
+def _summary(series: PictureSeries, options: DetectOptions, wall_s: float) -> dict[str, Any]:
+    table = series.spots.table()
+    counts = np.array([n for _, n in series.spots.per_frame])
 
     def quantiles(values: np.ndarray) -> dict[str, float] | None:
         if not len(values):
@@ -162,12 +168,12 @@ def _summary(work: Work, options: DetectOptions, wall_s: float) -> dict[str, Any
 
     return {
         "schema": SCHEMA,
-        "camera": work.camera,
-        "source": work.source,
+        "camera": series.camera,
+        "source": series.source,
         "counts": {
-            "pictures": work.pictures,
-            "unreadable": {reason: len(frames) for reason, frames in work.unreadable.items()},
-            "spots": work.spots.total,
+            "pictures": series.pictures,
+            "unreadable": {reason: len(frames) for reason, frames in series.unreadable.items()},
+            "spots": series.spots.total,
             "spots_per_picture": quantiles(counts),
             "pictures_without_spots": int(np.count_nonzero(counts == 0)),
         },
@@ -175,12 +181,12 @@ def _summary(work: Work, options: DetectOptions, wall_s: float) -> dict[str, Any
         "snr": quantiles(table[:, 5]),
         "noise": [
             {"size_px": g.size_px, "bits": g.bits, "pictures": g.pictures, **g.noise.as_mapping()}
-            for g in work.groups.values()
+            for g in series.groups.values()
         ],
-        "parameters": {"detect": asdict(work.parameters), "every": options.every, "limit": options.limit},
+        "parameters": {"detect": asdict(series.parameters), "every": options.every, "limit": options.limit},
         "timings": {"wall_s": wall_s},
         "versions": versions(),
-        "notes": work.notes,
+        "notes": series.notes,
     }
 
 

@@ -1,4 +1,4 @@
-"""Charts of spots and noise: counts over a logarithmic axis, places in the picture, variance over grey level."""
+"""Charts of spots and noise: histograms on a logarithmic axis, positions in the picture, variance over grey level."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ _COLOURS = (BLUE, ORANGE)
 
 
 def counts_chart(series: Sequence[tuple[str, Array]], title: str, x_name: str, *, mark: float | None = None) -> str:
-    """How often values (n,) > 0 occur, over a logarithmic axis; several series as lines over each other.
+    """Histograms of positive values (n,) on a logarithmic axis, several series in one chart.
 
-    mark: a value that is marked by a line.
+    mark: a value that is marked by a vertical line.
     """
     good = [(name, values[np.isfinite(values) & (values > 0)]) for name, values in series]
     everything = np.concatenate([v for _, v in good])
@@ -55,20 +55,20 @@ def counts_chart(series: Sequence[tuple[str, Array]], title: str, x_name: str, *
 
 
 def places_chart(uv_px: Array, size_px: tuple[int, int]) -> str:
-    """Where spots (n, 2) are in the picture; of very many an even choice."""
+    """Positions of spots (n, 2) in the picture; evenly thinned if there are very many."""
     p = image_plane(size_px)
     shown = uv_px[:: max(1, -(-len(uv_px) // _MOST_DOTS))]
-    out = axes(p, "Places of the spots", "u (px)", "v (px)", grid=False)
+    out = axes(p, "Positions of the spots", "u (px)", "v (px)", grid=False)
     out.append(f'<path d="{dots(p.at(shown), 1.6 if len(shown) > 300 else 2.6)}" fill="{BLUE}" fill-opacity="0.45"/>')
     some = "" if len(shown) == len(uv_px) else f", {len(shown)} of them shown"
     out.append(note(p, f"{len(uv_px)} spots{some}"))
-    return svg_of(p, "Places of the spots", [*out, frame(p)])
+    return svg_of(p, "Positions of the spots", [*out, frame(p)])
 
 
 def noise_chart(estimate: NoiseEstimate, measured: LevelVariances | None, name: str) -> str:
-    """Photon transfer: a pixel's variance over its grey level, as measured and as modelled with its 1-sigma band.
+    """Photon transfer: variance of a pixel over its grey level, measured and modelled with its 1-sigma band.
 
-    Measured levels far above the line stand as triangles at the top.
+    Measured variances far above the model are drawn as triangles at the top.
     """
     model = estimate.model
     top = model.black_dn + 10.0
@@ -84,7 +84,7 @@ def noise_chart(estimate: NoiseEstimate, measured: LevelVariances | None, name: 
     below, above = (model.floor_dn2 * f + model.slope_dn * s * rise for f, s in spread)
     highest = float(line.max()) * 1.3
     if measured is not None and len(measured.variance):
-        # What rises far above the line is light that changed between the pictures, such as spots that moved.
+        # Variances far above the line come from light that changed between the pictures, such as spots that moved.
         highest = max(highest, float(np.minimum(measured.variance + measured.sigma, 2 * highest).max()) * 1.08)
     p = plane((bottom, top), (0.0, highest), height=280)
     title = f"Variance of a pixel: {name}"

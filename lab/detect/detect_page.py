@@ -1,4 +1,4 @@
-"""The page of `beampose detect`: contact sheet, spots over frames and places, sizes, signal, the sensor's noise."""
+"""The page of `beampose detect`: contact sheet, spots over frames, positions, sizes, signal to noise, sensor noise."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from geometry.arrays import Array
 from lab.detect.contact_sheet import ContactSheet
 from lab.detect.detect_charts import counts_chart, noise_chart, places_chart
 from lab.detect.findings import SizeGroup
-from lab.detect.work import Work
+from lab.detect.picture_series import PictureSeries
 from lab.files.text.atomic_write import atomic_write_text
 from lab.number_format import short
 from lab.pictures.picture_file import Grey
@@ -24,40 +24,40 @@ from lab.report.plot.svg import BLUE, picture_uri
 from lab.versions import versions
 from tracking.noise_estimation.levels import LevelVariances, level_variances
 
-_MOST_KINDS = 4  # sizes and depths of pictures whose noise is drawn
-_MOST_ROWS = 20  # ... and that are listed
+_MOST_KINDS = 4  # kinds of pictures (size and depth) whose noise is drawn
+_MOST_ROWS = 20  # kinds of pictures whose noise is listed
 
 
-def write_detect_page(work: Work, sheet: ContactSheet, folder: Path) -> Path:
-    """Write report.html into a folder; returns its path."""
-    table = work.spots.table()
-    groups = sorted(work.groups.values(), key=lambda g: -g.pictures)
+def write_detect_page(series: PictureSeries, sheet: ContactSheet, folder: Path) -> Path:
+    """Write report.html into a folder. Returns its path."""
+    table = series.spots.table()
+    groups = sorted(series.groups.values(), key=lambda g: -g.pictures)
     sections = [
         _sheet(sheet),
-        _spots(work, table),
+        _spots(series, table),
         *([_places(table, groups)] if len(table) else []),
-        _noise(work, groups),
+        _noise(series, groups),
     ]
     context: dict[str, Any] = {
-        "name": work.camera,
-        "source": work.source,
-        "key_figures": _key_figures(work, table, groups),
-        "notes": work.notes,
+        "name": series.camera,
+        "source": series.source,
+        "key_figures": _key_figures(series, table, groups),
+        "notes": series.notes,
         "sections": [section_context(section) for section in sections],
-        "made": _made(work),
+        "made": _made(series),
     }
     path = folder / "report.html"
     atomic_write_text(environment().get_template("detect.html.j2").render(context), path)
     return path
 
 
-def _key_figures(work: Work, table: Array, groups: list[SizeGroup]) -> list[tuple[str, str, str]]:
-    counts = np.array([n for _, n in work.spots.per_frame])
-    bad = sum(map(len, work.unreadable.values()))
+def _key_figures(series: PictureSeries, table: Array, groups: list[SizeGroup]) -> list[tuple[str, str, str]]:
+    counts = np.array([n for _, n in series.spots.per_frame])
+    bad = sum(map(len, series.unreadable.values()))
     each = f"{counts.min()} to {counts.max()}, median {np.median(counts):.0f}"
     figures = [
-        ("Pictures", str(work.pictures), f"{bad} more cannot be read" if bad else groups[0].words()),
-        ("Spots", str(work.spots.total), f"{each} in a picture" if work.pictures > 1 else "in the picture"),
+        ("Pictures", str(series.pictures), f"{bad} more cannot be read" if bad else groups[0].text()),
+        ("Spots", str(series.spots.total), f"{each} in a picture" if series.pictures > 1 else "in the picture"),
     ]
     if len(table):
         low, middle, high = np.percentile(table[:, 3], [5, 50, 95])
@@ -80,16 +80,16 @@ def _sheet(sheet: ContactSheet) -> Section:
     jpeg = cv2.imencode(".jpg", sheet.drawn(), [cv2.IMWRITE_JPEG_QUALITY, 82])[1].tobytes()
     picture = f'<img src="{picture_uri(jpeg, "jpeg")}" alt="contact sheet: pictures with the spots found in them">'
     caption = (
-        "Evenly chosen pictures, grey values stretched. Rings: spots found, numbered by brightness, as the rows of a"
-        " frame in detections.csv. The same without loss: contact-sheet.png."
+        "Evenly spaced pictures with stretched grey values. Rings: detected spots, numbered by brightness, in the order"
+        " of the rows of a frame in detections.csv. Without compression loss: contact-sheet.png."
     )
     return Section("Contact sheet", (), [PageDrawing(picture, caption, wide=True)])
 
 
-def _spots(work: Work, table: Array) -> Section:
+def _spots(series: PictureSeries, table: Array) -> Section:
     drawings = []
-    if len(work.spots.per_frame) > 1:
-        frame, count = np.array(work.spots.per_frame, dtype=float).T
+    if len(series.spots.per_frame) > 1:
+        frame, count = np.array(series.spots.per_frame, dtype=float).T
         drawings.append(
             PageDrawing(
                 time_panel(
@@ -107,32 +107,32 @@ def _spots(work: Work, table: Array) -> Section:
             PageDrawing(
                 counts_chart(
                     [("signal to noise", table[:, 5])], "Signal to noise behind a matched filter", "ratio",
-                    mark=work.parameters.threshold_sigma,
+                    mark=series.parameters.threshold_sigma,
                 ),
-                "The flux over its noise if the background were all of it. Spots left of the line, which is the"
-                " threshold, would not be looked for.",
+                "Flux over its noise, with the noise of the background only. Spots below the threshold (dashed line)"
+                " are not detected.",
             ),
         ]  # fmt: skip
-    words = (
-        "Positions are those of the light's centre."
-        if work.spots.total
-        else "No spot was found. Is the light in the pictures? A lower threshold (--set detect.threshold_sigma=4) finds"
-        " fainter spots, and more false ones."
+    description = (
+        "Positions are centroids of the light."
+        if series.spots.total
+        else "No spot was found. Are the spots in the pictures? A lower threshold (--set detect.threshold_sigma=4)"
+        " finds fainter spots, and more false ones."
     )
-    return Section("Spots", words, drawings)
+    return Section("Spots", description, drawings)
 
 
 def _places(table: Array, groups: list[SizeGroup]) -> Section:
     width = max(g.size_px[0] for g in groups)
     height = max(g.size_px[1] for g in groups)
-    words = (
-        "All spots of all pictures. What stays in its place while others move (a reflection, a hot pixel) shows as one"
-        " dark dot."
+    description = (
+        "All spots of all pictures. A spot that does not move while others do (a reflection, a hot pixel) appears as"
+        " one dense dot."
     )
-    return Section("Where they are", words, [PageDrawing(places_chart(table[:, 1:3], (width, height)))])
+    return Section("Positions", description, [PageDrawing(places_chart(table[:, 1:3], (width, height)))])
 
 
-def _noise(work: Work, groups: list[SizeGroup]) -> Section:
+def _noise(series: PictureSeries, groups: list[SizeGroup]) -> Section:
     rows: list[list[object]] = []
     for g in groups[:_MOST_ROWS]:
         e = g.noise.estimate
@@ -141,36 +141,36 @@ def _noise(work: Work, groups: list[SizeGroup]) -> Section:
         m = e.model
         rows.append(
             [
-                g.words(), e.pictures, "in time" if e.temporal else "within pictures", m.black_dn,
+                g.text(), e.pictures, "in time" if e.temporal else "within pictures", m.black_dn,
                 _with_sigma(math.sqrt(m.floor_dn2), e.floor_sigma / 2), _with_sigma(1 / m.slope_dn, e.slope_sigma),
                 100 * m.texture, "not seen" if e.saturation_dn is None else e.saturation_dn, e.step_dn,
             ]
         )  # fmt: skip
     heads = (
-        "pictures", "learnt from", "differences", "background (DN)", "noise there (DN)", "electrons per DN",
+        "pictures", "estimated from", "differences", "background (DN)", "noise there (DN)", "electrons per DN",
         "texture (%)", "clips at (DN)", "grey step (DN)",
     )  # fmt: skip
     drawings = []
     for g in groups[:_MOST_KINDS]:
-        measured = _levels(work.learnt.get((g.size_px, g.bits), []), g)
+        measured = _levels(series.noise_pictures.get((g.size_px, g.bits), []), g)
         if g.noise.estimate is not None:
-            drawings.append(PageDrawing(noise_chart(g.noise.estimate, measured, g.words()), _caption(measured)))
-    words = [
-        "The variance of a pixel grows in a straight line with the light: its level at the background is read noise,"
-        " rounding and the background's own shot noise; its slope is one over the electrons per grey value.",
-        "Where the pictures hold little that is bright and still, the slope is what usual sensors have, and its sigma"
-        " says so.",
+            drawings.append(PageDrawing(noise_chart(g.noise.estimate, measured, g.text()), _caption(measured)))
+    description = [
+        "The variance of a pixel is a linear function of the light: its value at the background is read noise, rounding"
+        " and the background's own shot noise; its slope is one over the electrons per grey value.",
+        "Where the pictures have few bright and stationary regions, the slope is that of usual sensors, with a large"
+        " sigma.",
     ]
-    return Section("Noise of the sensor", words, drawings, PageTable(heads, rows))
+    return Section("Noise of the sensor", description, drawings, PageTable(heads, rows))
 
 
 def _caption(measured: LevelVariances | None) -> str:
-    """What the dots and lines of a noise chart are."""
+    """Explains the dots and lines of a noise chart."""
     line = "Line: the model in use, with its 1-sigma band."
     if measured is None or not len(measured.level):
-        return f"{line} No grey level has enough pixels to be measured by itself."
+        return f"{line} No grey level has enough pixels for a measurement."
     how = "from differences in time" if measured.temporal else "within pictures"
-    return f"{line} Dots: measured {how}; triangles: more than that, where the light itself changed."
+    return f"{line} Dots: measured {how}; triangles: larger variances, where the light itself changed."
 
 
 def _levels(pictures: list[Grey], group: SizeGroup) -> LevelVariances | None:
@@ -183,7 +183,7 @@ def _levels(pictures: list[Grey], group: SizeGroup) -> LevelVariances | None:
 
 
 def _with_sigma(value: float, relative: float) -> str:
-    """A value with the sigma of its logarithm as a factor, where that is large, or as a share."""
+    """A value with the sigma of its logarithm: as a factor if that is large, else as a percentage."""
     return (
         f"{short(value)} ×/÷ {math.exp(relative):.2f}"
         if relative > 0.15
@@ -191,8 +191,8 @@ def _with_sigma(value: float, relative: float) -> str:
     )
 
 
-def _made(work: Work) -> list[tuple[str, str]]:
-    p = work.parameters
+def _made(series: PictureSeries) -> list[tuple[str, str]]:
+    p = series.parameters
     own = versions()
     return [
         ("detection", f"threshold {p.threshold_sigma:g} sigma, at most {p.max_detections} spots in a picture"),

@@ -1,4 +1,4 @@
-"""What is kept of the spots of many pictures: their sizes, brightnesses and places, in bounded memory."""
+"""Sizes, brightnesses and positions of the spots of many pictures, in bounded memory."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from geometry.arrays import Array
 from lab.runs.frames.sensor_noise import CameraNoise
 from tracking.detections import Detections
 
-MOST_KEPT = 400_000  # spots of which sizes and places are kept for figures; beyond, every second one, and so on
+MOST_KEPT = 400_000  # spots kept for figures; beyond that every second one is dropped, repeatedly
 
 
 def matched_snr(found: Detections, background_dn: float) -> Array:
-    """Signal to noise (n,) of spots behind a filter of their own shape: what decides whether a faint spot is found.
+    """Signal-to-noise ratio (n,) of spots after a matched filter, which decides whether a faint spot is found.
 
-    background_dn: noise of a pixel of the background, 1 sigma. A Gaussian of flux F and axes a, b has F / (2 sqrt(pi a
-    b) sigma); shot noise of the spot itself is left out. Source: Turin (1960), "An introduction to matched filters",
+    background_dn: noise of a background pixel, 1 sigma. A Gaussian of flux F and axes a, b has F / (2 sqrt(pi a b)
+    sigma); shot noise of the spot itself is not included. Source: Turin (1960), "An introduction to matched filters",
     IRE Trans. IT-6, for a two-dimensional Gaussian in white noise.
     """
     area = np.maximum(found.major_px * found.minor_px, 1e-12)
@@ -26,15 +26,15 @@ def matched_snr(found: Detections, background_dn: float) -> Array:
 
 @dataclass(slots=True)
 class SizeGroup:
-    """Pictures of one size and depth: they share a noise model."""
+    """Pictures of one size and depth, which share a noise model."""
 
     size_px: tuple[int, int]  # width, height
-    bits: int  # of the type: 8 or 16
+    bits: int  # of the data type: 8 or 16
     noise: CameraNoise
     pictures: int = 0
 
-    def words(self) -> str:
-        """Such as 1280x1024, 8 bit."""
+    def text(self) -> str:
+        """`1280x1024, 8 bit`."""
         return f"{self.size_px[0]}x{self.size_px[1]}, {self.bits} bit"
 
 
@@ -43,13 +43,13 @@ class SpotCollection:
     """Spots of many pictures; columns frame, u, v, major, minor, snr, peak."""
 
     total: int = 0
-    per_frame: list[tuple[int, int]] = field(default_factory=list)  # frame, spots found in it
+    per_frame: list[tuple[int, int]] = field(default_factory=list)  # frame, number of its spots
     _kept: list[Array] = field(default_factory=list)
     _rows: int = 0
     _stride: int = 1
 
     def add(self, frame: int, found: Detections, snr: Array) -> None:
-        """Take the spots of one picture."""
+        """Add the spots of one picture."""
         self.per_frame.append((frame, len(found)))
         self.total += len(found)
         shape = (found.uv_px, found.major_px, found.minor_px, snr, found.peak)
@@ -62,5 +62,5 @@ class SpotCollection:
             self._stride *= 2
 
     def table(self) -> Array:
-        """(n, 7): the columns of those that were kept."""
+        """(n, 7): the columns of the kept spots."""
         return np.concatenate([np.zeros((0, 7)), *self._kept])

@@ -1,4 +1,4 @@
-"""The pictures that `beampose detect` was given: a folder, picture files, or a video, with a frame number each."""
+"""Input of `beampose detect`: a folder, picture files, or a video; each picture has a frame number."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from pathlib import Path
 
 from lab.errors import InputError
 from lab.pictures.picture_file import SUFFIXES, Grey, Missing, read_picture
-from lab.runs.frames.frame_sources import VideoSource, number_of, open_video, promised_pictures
+from lab.runs.frames.frame_sources import VideoSource, header_picture_count, number_of, open_video
 from lab.runs.frames.frames import AHEAD, THREADS
-from lab.runs.frames.sensor_noise import VIDEO_PICTURES, frames_to_learn_from
+from lab.runs.frames.sensor_noise import VIDEO_PICTURES, noise_estimation_frames
 
 _HINT = f"a picture ({', '.join(s[1:] for s in SUFFIXES)}), a folder of pictures, or a video"
 _SHOWN = 3  # names in a message
@@ -21,18 +21,18 @@ _SHOWN = 3  # names in a message
 
 @dataclass(frozen=True, slots=True)
 class PictureFiles:
-    """Pictures by rising frame number."""
+    """Pictures by increasing frame number."""
 
     camera: str  # the folder's or the file's name
     files: tuple[tuple[int, Path], ...]
     notes: tuple[str, ...] = ()
 
     def count(self, every: int) -> int | None:
-        """How many pictures there are, of each `every` one."""
+        """Number of pictures if every `every`-th is read."""
         return -(-len(self.files) // every)
 
     def pictures(self, every: int) -> Iterator[tuple[int, Grey | Missing]]:
-        """Every so many pictures with their frame numbers, read ahead in threads."""
+        """Every `every`-th picture with its frame number, read ahead in threads."""
         wanted = iter(self.files[::every])
         waiting: deque[tuple[int, Future[Grey | Missing]]] = deque()
         with ThreadPoolExecutor(THREADS, thread_name_prefix="decode") as pool:
@@ -44,9 +44,9 @@ class PictureFiles:
                 number, later = waiting.popleft()
                 yield number, later.result()
 
-    def to_learn_from(self) -> Iterator[Grey | Missing]:
-        """Pairs of neighbours, from which the noise is learnt."""
-        for i in frames_to_learn_from(len(self.files)):
+    def noise_pictures(self) -> Iterator[Grey | Missing]:
+        """Pairs of neighbouring pictures, for the estimate of the noise."""
+        for i in noise_estimation_frames(len(self.files)):
             yield read_picture(self.files[i][1], None)
 
 
@@ -59,12 +59,12 @@ class Video:
     notes: tuple[str, ...] = ()
 
     def count(self, every: int) -> int | None:
-        """What the header promises; None where it promises nothing."""
-        promised = promised_pictures(self.path)
-        return None if promised is None else -(-promised // every)
+        """Number of pictures if every `every`-th is read, by the header; None where it states none."""
+        stated = header_picture_count(self.path)
+        return None if stated is None else -(-stated // every)
 
     def pictures(self, every: int) -> Iterator[tuple[int, Grey | Missing]]:
-        """Every so many pictures with their frame numbers."""
+        """Every `every`-th picture with its frame number."""
         video = VideoSource(self.path, None)
         try:
             number = 0
@@ -81,8 +81,8 @@ class Video:
         finally:
             video.close()
 
-    def to_learn_from(self) -> Iterator[Grey | Missing]:
-        """Pairs of neighbours at the start."""
+    def noise_pictures(self) -> Iterator[Grey | Missing]:
+        """Pairs of neighbouring pictures at the start, for the estimate of the noise."""
         video = VideoSource(self.path, None)
         try:
             for number in range(VIDEO_PICTURES[-1] + 1):
@@ -96,9 +96,10 @@ class Video:
 
 
 def open_inputs(given: Sequence[Path], camera: str | None = None) -> PictureFiles | Video:
-    """What was given on the command line. camera: a name in place of the folder's or file's own.
+    """Open the paths of the command line. camera: a name instead of the folder's or file's own.
 
-    Raises InputError where something is not there, a folder holds no pictures, or kinds are mixed.
+    Raises:
+        InputError: a path does not exist, a folder has no pictures, or pictures and videos are mixed.
     """
     if len(given) == 1 and given[0].is_dir():
         files = _pictures_in(given[0])
@@ -108,8 +109,8 @@ def open_inputs(given: Sequence[Path], camera: str | None = None) -> PictureFile
     others = [f for f in files if f.suffix.lower() not in SUFFIXES]
     if others and len(files) > 1:
         raise InputError(
-            f"{others[0]}: expected pictures only, or a single video, got it among {len(files)} files; name the"
-            " pictures in one call and each video in its own"
+            f"{others[0]}: expected pictures only, or a single video, got it among {len(files)} files; give the"
+            " pictures in one call and each video in a separate one"
         )
     if others:
         _require_video(others[0])
@@ -155,13 +156,13 @@ def _require_video(path: Path) -> None:
 
 
 def _numbered(files: Sequence[Path], camera: str) -> PictureFiles:
-    """By the numbers in the names, as in runs; by the names' order where these do not tell the pictures apart."""
+    """Numbered by their names, as in runs; in alphabetical order where the names have no distinct numbers."""
     numbers = [number_of(f.name) for f in files]
     known = [n for n in numbers if n is not None]
     if len(set(known)) == len(files):
         return PictureFiles(camera, tuple(sorted(zip(known, files, strict=True))))
     if len(files) == 1:
         return PictureFiles(camera, ((0, files[0]),))
-    why = "some names hold no number" if len(known) < len(files) else "some names hold the same number"
-    note = f"frames are numbered from 0 in the order of the names: {why}"
+    why = "some names have no number" if len(known) < len(files) else "some names have the same number"
+    note = f"frames are numbered from 0 in alphabetical order: {why}"
     return PictureFiles(camera, tuple(enumerate(files)), (note,))

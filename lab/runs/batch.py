@@ -1,4 +1,4 @@
-"""Many runs, one after the other: a folder each, batch.csv and index.html."""
+"""Processes many runs one after the other: a result folder each, batch.csv and index.html."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ COLUMNS = (
 
 @dataclass(frozen=True, slots=True)
 class BatchOutcome:
-    """The rows of batch.csv and where everything lies."""
+    """The rows of batch.csv, and the files written."""
 
     rows: tuple[Mapping[str, Any], ...]
     table: Path
@@ -30,7 +30,7 @@ class BatchOutcome:
 
     @property
     def exit_status(self) -> int:
-        """1 if some run could not be processed, 3 if for no other reason than its calibration; else 4 or 0."""
+        """1 if a run could not be processed, 3 if its calibration is the only reason; else 4 or 0."""
         found = {row["exit_status"] for row in self.rows}
         failed = found - {0, QUALITY_GATE_FAILED}
         if failed:
@@ -44,13 +44,16 @@ def process_batch(
     *,
     overrides: Mapping[str, Any] | None = None,
     causal: bool = False,
-    tell: Callable[[str], None] = lambda line: None,
+    report: Callable[[str], None] = lambda line: None,
     progress: Callable[[str], Progress | None] = lambda name: None,
 ) -> BatchOutcome:
-    """Process runs into out/<name of the run folder>; a run that fails costs only itself.
+    """Process runs into out/<name of the run folder>; a run that fails does not stop the others.
 
-    overrides, causal: as for process_run. tell: gets a line per run. progress: gives, for a run's name, what is told of
-    its frames. Raises InputError where the command as a whole is wrong.
+    overrides, causal: as for process_run. report: called with one line per run. progress: returns, for a run's name,
+    the callback for its frames.
+
+    Raises:
+        InputError: the command as a whole cannot be carried out.
     """
     if not run_folders:
         raise InputError("batch: expected one or more run folders, got none")
@@ -68,10 +71,10 @@ def process_batch(
         try:
             outcome = process_run(folder, out / name, overrides=overrides, causal=causal, progress=progress(name))
             row = _row(folder, outcome)
-            tell(f"{name}: {row['status'].upper()}: {row['message']}")
+            report(f"{name}: {row['status'].upper()}: {row['message']}")
         except BeamposeError as error:
             row = _failed(folder, name, error)
-            tell(f"{name}: ERROR: {row['message']}")
+            report(f"{name}: ERROR: {row['message']}")
         rows.append(row)
         # After every run: if the next one is killed, the rows so far are kept.
         write_table(out / "batch.csv", COLUMNS, [[row[c] for c in COLUMNS] for row in rows])
@@ -82,7 +85,7 @@ def process_batch(
 
 
 def _names(folders: Sequence[Path]) -> list[str]:
-    """One result folder's name per run: the run folder's own, with the parent's before it where two are alike."""
+    """The name of each run's result folder: that of the run folder, with the parent's before it where two are equal."""
     resolved = [Path(f).resolve() for f in folders]
     twice = [str(f) for f, r in zip(folders, resolved, strict=True) if resolved.count(r) > 1]
     if twice:
@@ -104,7 +107,7 @@ def _row(folder: Path, outcome: RunOutcome) -> dict[str, Any]:
         "measured_share": round(outcome.measured / outcome.frames, 6) if outcome.frames else 0.0,
         "seconds": round(outcome.seconds, 3),
         "results": outcome.out.name,
-        "message": "; ".join(outcome.verdict.reasons),
+        "message": "; ".join(outcome.verdict.texts),
     }
 
 

@@ -1,4 +1,4 @@
-"""The CSV tables of a run, written row by row as the records come."""
+"""The CSV tables of a run, written as the records arrive."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from lab.runs.frames.pipeline import FrameRecord
 
 _UPPER = np.triu_indices(6)
-_TOGETHER = 64  # frames worked out at once
+_BLOCK = 64  # frames converted at once: one by one they take three times as long
 _FILES = {
     "detections.csv": columns.DETECTIONS,
     "spots.csv": columns.SPOTS,
@@ -35,10 +35,10 @@ _FILES = {
 
 
 class TableWriter:
-    """Writes all tables of one run into an existing folder. Use it as a context.
+    """Context manager that writes all tables of one run into an existing folder.
 
-    with_systematic: also systematic.csv, the part of covariance.csv that the calibration's errors make. with_causal:
-    also attitude_causal.csv and covariance_causal.csv, the poses as the causal filter had them.
+    with_systematic: also systematic.csv, the part of covariance.csv that is due to the calibration's errors.
+    with_causal: also attitude_causal.csv and covariance_causal.csv, the poses of the causal pass.
     """
 
     def __init__(self, folder: Path, rig: Rig, with_systematic: bool = False, with_causal: bool = False) -> None:
@@ -74,16 +74,19 @@ class TableWriter:
                 file.close()
 
     def write(self, record: FrameRecord, causal: FrameRecord | None = None) -> None:
-        """The rows of one frame. causal: the same frame as the causal filter had it, where its tables are wanted.
+        """Add the rows of one frame. causal: the same frame of the causal pass, where its tables are written.
 
-        They reach the files some frames later, since what is worked out for many frames together costs a third.
+        The rows reach the files in blocks of frames, or when the context ends.
+
+        Raises:
+            ValueError: the tables are closed.
         """
         if self._open["spots.csv"].closed:
-            raise ValueError("the tables are a closed file by now")
+            raise ValueError("the tables are a closed file")
         self._waiting.append(record)
         if causal is not None:
             self._waiting_causal.append(causal)
-        if len(self._waiting) >= _TOGETHER:
+        if len(self._waiting) >= _BLOCK:
             self._write_waiting()
 
     def _write_waiting(self) -> None:
@@ -130,7 +133,7 @@ class TableWriter:
         self._open["spots.csv"].writelines(rows)
 
     def _poses(self, records: Sequence[FrameRecord], which: str = "") -> None:
-        """The rows of attitude and covariance; `which` is CAUSAL or nothing."""
+        """The rows of attitude and covariance; `which` is CAUSAL or empty."""
         systematic = None if which else self._open.get("systematic.csv")
         covariances, of_calibration = [], []
         for record in records:
@@ -171,13 +174,13 @@ def attitude_rows(records: Sequence[FrameRecord]) -> list[str]:
     """The lines of attitude.csv for some frames."""
     numbers = iter(_numbers_of_poses(records))
     moving = iter(_numbers_of_motions(records))
-    nothing, no_motion = "," * len(columns.POSE), "," * len(columns.MOTION)
+    no_pose, no_motion = "," * len(columns.POSE), "," * len(columns.MOTION)
     rows = []
     for record in records:
         t = record.tracked
         head, status = f"{record.frame},{_number(record.t_s)}", t.pose_status.value
         if t.pose is None or t.pose_covariance is None:
-            rows.append(f"{head}{nothing},{t.spots_used},,{status}{no_motion}\n")
+            rows.append(f"{head}{no_pose},{t.spots_used},,{status}{no_motion}\n")
             continue
         motion = no_motion[1:] if t.motion is None else _joined(next(moving))
         rows.append(f"{head},{_joined(next(numbers))},{t.spots_used},{_number(t.rms_px)},{status},{motion}\n")
@@ -202,7 +205,7 @@ def _numbers_of_poses(records: Sequence[FrameRecord]) -> list[list[float]]:
 
 
 def _numbers_of_motions(records: Sequence[FrameRecord]) -> list[list[float]]:
-    """Of attitude.csv from velocity_x_m_s to the end (12 each): frames that have a pose and a motion, in order."""
+    """The last 12 columns of attitude.csv, from velocity_x_m_s, of the frames with a pose and a motion, in order."""
     known = [
         (r.frame, r.tracked.motion)
         for r in records
@@ -218,10 +221,11 @@ def _numbers_of_motions(records: Sequence[FrameRecord]) -> list[list[float]]:
 
 
 def _sigmas(variances: Array, frames: Sequence[int]) -> Array:
-    """Square roots; nan for nan. A negative variance is an error of the program: lab.runs.verdict.frame_checks comes
-    before.
+    """Square roots of variances (..., k) of these frames, or of one; nan for nan.
 
-    variances: (..., k) of these frames, or of one.
+    Raises:
+        RunError: a variance is negative. This is an error of the program, since lab.runs.verdict.frame_checks comes
+            first.
     """
     if np.any(variances < 0):
         bad = np.any(variances < 0, axis=tuple(range(1, variances.ndim))) if len(frames) > 1 else np.array([True])
@@ -231,7 +235,7 @@ def _sigmas(variances: Array, frames: Sequence[int]) -> Array:
 
 
 def pose_numbers(pose: Pose, covariance: Array) -> Array:
-    """The 16 numbers of attitude.csv from x_m to sigma_roll_deg: (..., 16) of poses with covariances (..., 6, 6)."""
+    """The 16 columns of attitude.csv from x_m to sigma_roll_deg: (..., 16) of poses with covariances (..., 6, 6)."""
     return np.concatenate(
         [
             pose.translation,
@@ -246,23 +250,24 @@ def pose_numbers(pose: Pose, covariance: Array) -> Array:
 
 @cache
 def _format(count: int) -> str:
-    """Ten significant digits each, which is beyond any measurement here."""
+    """Format of `count` fields with ten significant digits each, more than any measurement here has."""
     return ",".join(["%.10g"] * count)
 
 
 def _joined(values: Sequence[float]) -> str:
-    """Numbers as fields; nothing for nan."""
+    """Numbers as fields; empty for nan."""
     text = _format(len(values)) % tuple(values)
     return text.replace("nan", "") if "nan" in text else text
 
 
 def _exact(values: Array) -> str:
-    """As many digits as give the same number when read: rounded to ten, a covariance whose axes differ by 1e5 in size
-    may come back with a negative variance along one of them.
+    """Numbers with as many digits as reproduce them exactly.
+
+    Rounded to ten digits, a covariance whose axes differ by 1e5 in size may have a negative variance along one of them.
     """
     return ",".join(map(repr, values.tolist()))
 
 
 def _number(value: float) -> str:
-    """A number as a field; nothing for nan."""
+    """A number as a field; empty for nan."""
     return "" if value != value else f"{value:.10g}"

@@ -1,7 +1,7 @@
-"""Compile what runs need, so that the first run does not wait: `python -m lab.runs.warm_up`, the end of `make setup`.
+"""Compiles the code that runs need, so that the first run does not wait: `python -m lab.runs.warm_up`.
 
-Two short simulated recordings are processed in a temporary folder, one of points and one of small pictures. What is
-compiled already is only loaded.
+`make setup` calls it last. It processes two short simulated recordings in a temporary folder, one of points and one of
+small pictures. Code that is compiled already is only loaded.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from lab.runs.process import process_run
 from lab.simulate.write import simulate
 
 SCENARIO = "huo2015"
-FRAMES = 60  # of points: with a bend, false points and a spot that leaves the picture
-PICTURES = 6
+FRAMES = 60  # of the recording of points: with a bend, false points and a spot that leaves the picture
+PICTURES = 6  # frames of the recording of pictures
 
 
 def warm_up() -> float:
-    """Process both recordings; returns the seconds that it took."""
+    """Process both recordings. Returns the time taken, s."""
     begun = time.perf_counter()
     with tempfile.TemporaryDirectory(prefix="beampose-") as name:
         folder = Path(name)

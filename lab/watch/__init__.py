@@ -1,1 +1,1 @@
-"""Live: detection and the causal tracker as frames arrive, and the ordinary result at the end."""
+"""`beampose watch`: detection and causal tracking while frames arrive, and the usual results at the end."""

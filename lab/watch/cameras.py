@@ -1,4 +1,4 @@
-"""Cameras that are read while they record, each in a thread of its own: a folder that is being filled, or a device."""
+"""Cameras that are read while they record, each in its own thread: a folder that is being filled, or a device."""
 
 from __future__ import annotations
 
@@ -21,44 +21,44 @@ from lab.watch.folder_poll import FolderPoll
 from lab.watch.frame_clock import FrameClock
 from lab.watch.inbox import Inbox
 
-POLL_S = 0.002  # between two looks into a folder ...
-_POLL_IDLE_S = 0.01  # ... and where nothing has come for a while
+POLL_S = 0.002  # between two polls of a folder ...
+_POLL_IDLE_S = 0.01  # ... and after _IDLE_S without a new picture
 _IDLE_S = 2.0
-_AT_ONCE = 4  # pictures that are read between two looks
-_FAILURES = 5  # of a device in a row: it has gone
+_READS_PER_POLL = 4  # pictures that are read between two polls
+_FAILURES = 5  # consecutive failures after which a device counts as disconnected
 
 
 class LiveCamera(Protocol):
-    """Gives pictures to an inbox until it ends, or the inbox stops."""
+    """Puts pictures into an inbox until the camera ends or the inbox stops."""
 
     name: str
     inbox: Inbox
 
     def run(self) -> None:
-        """Give pictures; for a thread of its own."""
+        """Put pictures into the inbox; runs in its own thread."""
 
     @property
     def notes(self) -> list[str]:
-        """What a reader of the results should know; complete once `run` has ended."""
+        """Notes for the user of the results; complete once `run` has ended."""
 
 
 @dataclass(slots=True)
 class _Pending:
-    """A file that is there, but not yet read to its end."""
+    """A file that exists, but has not been read completely."""
 
     path: Path
-    not_there_s: float | None  # time.time() when it was not there or not complete; None: older than the watch
-    tried: tuple[int, int] | None = None  # its size and time of change when it was read last
-    tried_s: float = 0.0  # time.perf_counter() of that
+    incomplete_s: float | None  # latest time.time() when it was missing or incomplete; None: older than the watch
+    tried: tuple[int, int] | None = None  # its size and modification time at the last attempt to read it
+    tried_s: float = 0.0  # time.perf_counter() of that attempt
 
 
 @dataclass(slots=True)
 class FolderCamera:
     """A folder that a recorder writes pictures into.
 
-    A file that cannot be decoded is read again when it has changed, and taken for damaged when it has not changed for
+    A file that cannot be decoded is read again when it has changed, and counts as damaged when it has not changed for
     `patience_s`. (A recorder that reserves a file's full length before it writes the pixels must write under another
-    name, or in another folder, and rename: nothing shows that such a file is not complete.)
+    name, or in another folder, and rename: such a file cannot be recognised as incomplete.)
     """
 
     name: str
@@ -67,33 +67,33 @@ class FolderCamera:
     inbox: Inbox
     patience_s: float
     _pending: dict[int, _Pending] = field(default_factory=dict)
-    _looked_s: float | None = None  # time.time() of the last look; None: not yet
-    _busy_s: float = field(default_factory=time.perf_counter)  # when something was last to be done
-    _old: int = 0  # pictures that were there at the first look
+    _polled_s: float | None = None  # time.time() of the last poll; None: none yet
+    _busy_s: float = field(default_factory=time.perf_counter)  # when a picture was last read
+    _old: int = 0  # pictures that existed at the first poll
     _failure: str = ""
 
     def run(self) -> None:
-        """Look, read, wait, until the inbox stops."""
+        """Poll, read and wait until the inbox stops."""
         while not self.inbox.stopping.is_set():
             self.inbox.catch_up(self.name)
-            if not self.look():
+            if not self.poll_once():
                 idle = time.perf_counter() - self._busy_s > _IDLE_S
                 self.inbox.stopping.wait(_POLL_IDLE_S if idle else POLL_S)
 
-    def look(self) -> bool:
-        """Find new pictures and read some; whether there was anything to do."""
+    def poll_once(self) -> bool:
+        """Find new pictures and read some of them. Returns whether there were any."""
         now_s = time.time()
         try:
             for number, name in self.poll.new():
-                self._pending[number] = _Pending(self.poll.folder / name, self._looked_s)
-                self._old += self._looked_s is None
+                self._pending[number] = _Pending(self.poll.folder / name, self._polled_s)
+                self._old += self._polled_s is None
             self._failure = ""
-        except OSError as error:  # a drive that is away for a moment
+        except OSError as error:  # a drive that is temporarily unavailable
             self._failure = f"{self.poll.folder}: cannot be read: {error.strerror}"
-        self._looked_s = now_s
+        self._polled_s = now_s
         done = 0
         for number in sorted(self._pending):
-            if done >= _AT_ONCE or not self.inbox.has_room(self.name):
+            if done >= _READS_PER_POLL or not self.inbox.has_room(self.name):
                 break
             done += self._read(number, self._pending[number])
         if done:
@@ -102,18 +102,20 @@ class FolderCamera:
 
     @property
     def notes(self) -> list[str]:
-        """Pictures that were there already, those of one number, and a folder that went away."""
-        out = [f"{self.name}: {self._old} pictures were there before the watch began"] if self._old else []
-        out += [f"{self.poll.folder}: two pictures of one frame: {a} was used, {b} not" for a, b in self.poll.twins[:5]]
+        """Notes on pictures older than the watch, pictures with equal numbers, and an unreadable folder."""
+        out = [f"{self.name}: {self._old} pictures existed before the watch began"] if self._old else []
+        out += [
+            f"{self.poll.folder}: two pictures of one frame: {a} was used, {b} not" for a, b in self.poll.duplicates[:5]
+        ]
         return out + ([self._failure] if self._failure else [])
 
     def _read(self, number: int, file: _Pending) -> bool:
-        """Try to read a picture; whether it is dealt with."""
+        """Try to read a picture. Returns whether it was read or is damaged."""
         begun_s = time.time()
         try:
             state = os.stat(file.path)
         except OSError as error:
-            self._give(number, Missing(f"{UNREADABLE}: {error.strerror}"), None)
+            self._put(number, Missing(f"{UNREADABLE}: {error.strerror}"), None)
             return True
         stamp = (state.st_size, state.st_mtime_ns)
         waited_s = time.perf_counter() - file.tried_s
@@ -122,26 +124,26 @@ class FolderCamera:
         content = read_picture(file.path, self.size_px)
         if isinstance(content, Missing) and content.reason.startswith(UNREADABLE) and stamp != file.tried:
             file.tried, file.tried_s = stamp, time.perf_counter()
-            file.not_there_s = None if file.not_there_s is None else begun_s
+            file.incomplete_s = None if file.incomplete_s is None else begun_s
             self.inbox.announce(self.name, number, content.reason)
             return False
         arrived_s = None
-        if file.not_there_s is not None:
-            # The file's own time is the best, within what was seen: a copy may keep the time of its original.
-            arrived_s = min(max(state.st_mtime_ns / 1e9, file.not_there_s), time.time())
-        self._give(number, content, arrived_s)
+        if file.incomplete_s is not None:
+            # The modification time is the most precise one; it is clipped since a copy may keep that of its original.
+            arrived_s = min(max(state.st_mtime_ns / 1e9, file.incomplete_s), time.time())
+        self._put(number, content, arrived_s)
         return True
 
-    def _give(self, number: int, content: NDArray | Missing, arrived_s: float | None) -> None:
+    def _put(self, number: int, content: NDArray | Missing, arrived_s: float | None) -> None:
         del self._pending[number]
-        self.inbox.give(self.name, number, content, arrived_s)
+        self.inbox.put(self.name, number, content, arrived_s)
 
 
 class Capture(Protocol):
-    """What is used of cv2.VideoCapture."""
+    """The part of cv2.VideoCapture that is used."""
 
     def grab(self) -> bool:
-        """Wait for the next picture; False where none comes."""
+        """Wait for the next picture; False without one."""
 
     def retrieve(self) -> tuple[bool, NDArray | None]:
         """Decode the picture that was grabbed."""
@@ -152,9 +154,9 @@ class Capture(Protocol):
 
 @dataclass(slots=True)
 class DeviceCamera:
-    """A camera that OpenCV reads. Its pictures are counted from 0, with gaps where the clock shows that some are lost.
+    """A camera that OpenCV reads. Its pictures are numbered from 0, with gaps where the clock shows a loss.
 
-    endless: a device, which cannot wait; False: a file or a stream with an end, of which no picture is left out.
+    endless: a device, which cannot wait; False: a file or a stream with an end, which is read completely.
     """
 
     name: str
@@ -165,7 +167,7 @@ class DeviceCamera:
     endless: bool = True
 
     def run(self) -> None:
-        """Give pictures until the device ends or the inbox stops."""
+        """Put pictures into the inbox until the device ends or the inbox stops."""
         failures = 0
         try:
             while not (self.inbox.wanted.wait(0.05) or self.inbox.stopping.is_set()):
@@ -185,32 +187,36 @@ class DeviceCamera:
                 arrived_s = time.time()
                 number = self.clock.number(time.perf_counter()) if self.endless else self.clock.count()
                 if not self.inbox.has_room(self.name):
-                    self.inbox.refuse(self.name)
+                    self.inbox.count_refused(self.name)
                     continue
-                self.inbox.give(self.name, number, self._decoded(), arrived_s)
+                self.inbox.put(self.name, number, self._decoded(), arrived_s)
         finally:
             self.capture.release()
 
     @property
     def notes(self) -> list[str]:
-        """How many numbers were left out."""
-        lost = self.clock.left_out
-        return [f"{self.name}: {lost} pictures lost by the device, as its clock shows"] if lost else []
+        """A note on lost pictures."""
+        lost = self.clock.lost
+        return [f"{self.name}: {lost} pictures lost by the device, according to the clock"] if lost else []
 
     def _decoded(self) -> NDArray | Missing:
         picture = retrieved(self.capture, self.size_px)
-        # The device may use its buffer again.
+        # Copied, since the device may overwrite its buffer.
         return picture if isinstance(picture, Missing) else np.array(picture)
 
 
 def open_device(name: str, device: int | str, size_px: tuple[int, int], inbox: Inbox, rate_hz: float) -> DeviceCamera:
-    """A device, asked for grey pictures of this (width, height) at this rate. Raises InputError where none opens."""
+    """Open a device, and request grey pictures of this (width, height) at this rate.
+
+    Raises:
+        InputError: the device cannot be opened.
+    """
     cv2 = quiet_cv2()
     capture = cv2.VideoCapture(device)
     if not capture.isOpened():
         raise InputError(
-            f"cameras.{name}.device: expected a camera that OpenCV can open, got {device!r}, which it cannot (not"
-            " there, in use, or without the right to read it?)"
+            f"cameras.{name}.device: expected a camera that OpenCV can open, got {device!r}, which it cannot"
+            " open (missing, in use, or without read permission?)"
         )
     endless = not capture.get(cv2.CAP_PROP_FRAME_COUNT) > 0
     if endless:
@@ -222,7 +228,7 @@ def open_device(name: str, device: int | str, size_px: tuple[int, int], inbox: I
 
 
 def in_thread(camera: LiveCamera, failed: Callable[[BaseException], None]) -> threading.Thread:
-    """A thread that runs a camera; failed: called with what went wrong within it."""
+    """Start a thread that runs a camera. failed: called with an exception that is raised in it."""
 
     def work() -> None:
         try:

@@ -1,6 +1,6 @@
-"""Pictures of all cameras that wait to be worked on, and when a frame has waited long enough.
+"""Queues of the pictures of all cameras, and the rule when a frame is complete.
 
-Cameras fill it in threads of their own; one reader takes frame after frame.
+Each camera fills its queue in its own thread; one reader takes frame after frame.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ import numpy as np
 from lab.pictures.picture_file import DROPPED, Grey, Missing
 from tracking.detections import Detections
 
-MOST_WAITING = 64  # pictures of one camera that wait here; of a folder the others wait on disk
-LONGEST_GAP = 10_000  # frame numbers: a picture so far beyond all others is a stray file
+MOST_WAITING = 64  # pictures per camera in memory; those of a folder beyond stay on disk
+LONGEST_GAP = 10_000  # frame numbers: a picture this far ahead of the reader is a stray file
 
 Content: TypeAlias = Grey | Detections | Missing
 Finder: TypeAlias = Callable[[Grey], Detections]
@@ -28,54 +28,54 @@ class Waiting:
     """A picture that has arrived."""
 
     content: Content
-    arrived_s: float | None  # time.time() at which it was complete; None: there before the watch began
-    seen_s: float  # time.perf_counter() at which its camera gave it
+    arrived_s: float | None  # time.time() at which it was complete; None: before the watch began
+    seen_s: float  # time.perf_counter() at which its camera put it here
 
 
 @dataclass(slots=True)
-class CameraBox:
-    """What one camera has given and not yet lost to the reader."""
+class CameraQueue:
+    """The queue of one camera."""
 
     pictures: dict[int, Waiting] = field(default_factory=dict)
     incomplete: dict[int, tuple[float, str]] = field(default_factory=dict)  # since when (perf_counter), and why
-    asleep: bool = False  # it has kept a frame waiting in vain, and given nothing since
-    ended: bool = False  # there will be no more
+    timed_out: bool = False  # a frame has timed out for this camera, and nothing has come since
+    ended: bool = False  # no more pictures will come
     late: int = 0  # pictures that came after their frame was closed
-    refused: int = 0  # pictures that there was no room for
+    refused: int = 0  # pictures dropped because the queue was full
     strays: list[int] = field(default_factory=list)
-    given: int = 0  # pictures in all
-    grey: bool = False  # pictures wait here whose points are not looked for yet
+    given: int = 0  # pictures in total
+    grey: bool = False  # whether pictures without detections are waiting
 
     def later_s(self, frame: int) -> float | None:
-        """Since when (perf_counter) there has been a picture of a later frame; None without any."""
+        """Time (perf_counter) since which there has been a picture of a later frame; None without any."""
         times = [w.seen_s for n, w in self.pictures.items() if n > frame]
         times += [since for n, (since, _) in self.incomplete.items() if n > frame]
         return min(times, default=None)
 
 
 def is_complete(
-    frame: int, boxes: Sequence[CameraBox], now_s: float, since_s: float, timeout_s: float, interval_s: float
-) -> tuple[bool, list[CameraBox]]:
-    """Whether a frame is to be worked on now, and which cameras it gives up waiting for.
+    frame: int, queues: Sequence[CameraQueue], now_s: float, since_s: float, timeout_s: float, interval_s: float
+) -> tuple[bool, list[CameraQueue]]:
+    """Whether a frame can be processed now, and the cameras that have timed out for it.
 
-    A camera is waited for until it has given the frame's picture, or a later one for a frame's time (it has dropped
-    this one), or the timeout has passed since another camera gave the frame (and since `since_s`, when the frame's turn
-    came). A camera that was given up is not waited for again before it gives something.
+    The wait for a camera ends when it has delivered the frame's picture, or has had a later one for a frame interval
+    (this one is dropped), or when the timeout has passed since another camera delivered the frame (and since `since_s`,
+    when the previous frame was taken). After a timeout the camera is not waited for until it delivers something.
     """
     waited_for = []
     first = []
-    for box in boxes:
-        if frame in box.pictures:
-            if isinstance(box.pictures[frame].content, np.ndarray):
-                return False, []  # its points are being looked for
-            first.append(box.pictures[frame].seen_s)
+    for queue in queues:
+        if frame in queue.pictures:
+            if isinstance(queue.pictures[frame].content, np.ndarray):
+                return False, []  # its points are being detected
+            first.append(queue.pictures[frame].seen_s)
             continue
-        later = box.later_s(frame)
+        later = queue.later_s(frame)
         if later is not None:
             first.append(later)
         passed = later is not None and now_s - later >= interval_s
-        if frame in box.incomplete or not (box.ended or box.asleep or passed):
-            waited_for.append(box)
+        if frame in queue.incomplete or not (queue.ended or queue.timed_out or passed):
+            waited_for.append(queue)
     if not first:
         return False, []
     if waited_for and now_s - max(min(first), since_s) < timeout_s:
@@ -84,93 +84,93 @@ def is_complete(
 
 
 class Inbox:
-    """The boxes of all cameras behind one lock. Times are time.perf_counter() where not said otherwise."""
+    """The queues of all cameras behind one lock. Times are time.perf_counter() unless stated otherwise."""
 
     def __init__(self, cameras: Sequence[str], interval_s: float, timeout_s: float) -> None:
-        self.boxes = {name: CameraBox() for name in cameras}
+        self.queues = {name: CameraQueue() for name in cameras}
         self.changed = threading.Condition()
-        self.stopping = threading.Event()  # the cameras shall stop
-        self.wanted = threading.Event()  # devices shall begin; folders are looked into from the start
+        self.stopping = threading.Event()  # set to stop the cameras
+        self.wanted = threading.Event()  # set to start devices; folders are polled from the start
         self.next_frame: int | None = None  # the first that is not closed yet; None: not begun
-        self.last_seen_s: float | None = None  # when something came, of whatever camera
+        self.last_seen_s: float | None = None  # when the latest picture of any camera came
         self._finders: Mapping[str, Finder] | None = None
         self._interval_s, self._timeout_s = interval_s, timeout_s
 
     def has_room(self, camera: str) -> bool:
-        """Whether a camera may give another picture. Only its own thread adds to its box, so the answer holds."""
-        return len(self.boxes[camera].pictures) < MOST_WAITING
+        """Whether a camera may add another picture. Only its own thread adds pictures, so the answer stays valid."""
+        return len(self.queues[camera].pictures) < MOST_WAITING
 
-    def find_with(self, finders: Mapping[str, Finder]) -> None:
-        """From now on the points of each camera's pictures are looked for, in the camera's own thread."""
+    def set_finders(self, finders: Mapping[str, Finder]) -> None:
+        """Detect the points of each camera's pictures from now on, in the camera's own thread."""
         with self.changed:
             self._finders = finders
             self.changed.notify_all()
 
     def catch_up(self, camera: str) -> None:
-        """Look for the points of pictures that were given before there was a finder. By the camera's own thread."""
-        box = self.boxes[camera]
-        if not (box.grey and self._finders):
+        """Detect the points of pictures that came before there was a finder. Called in the camera's own thread."""
+        queue = self.queues[camera]
+        if not (queue.grey and self._finders):
             return
         with self.changed:
-            grey = sorted(n for n, w in box.pictures.items() if isinstance(w.content, np.ndarray))
+            grey = sorted(n for n, w in queue.pictures.items() if isinstance(w.content, np.ndarray))
         for number in grey:
-            waiting = box.pictures[number]  # no frame is taken before its points are found
+            waiting = queue.pictures[number]  # still here: no frame is taken before its points are detected
             assert isinstance(waiting.content, np.ndarray)
             found = self._finders[camera](waiting.content)
             with self.changed:
                 waiting.content = found
                 self.changed.notify_all()
-        box.grey = False
+        queue.grey = False
 
     def finish(self, camera: str) -> None:
-        """The last of a camera's thread: wait for the finders, and catch up."""
+        """End a camera's thread: wait for the finders, and catch up."""
         with self.changed:
-            self.boxes[camera].ended = True
+            self.queues[camera].ended = True
             self.changed.notify_all()
             while self._finders is None and not self.stopping.is_set():
                 self.changed.wait(0.05)
         self.catch_up(camera)
 
-    def give(self, camera: str, number: int, content: Content, arrived_s: float | None) -> None:
-        """A camera gives a picture, or why there is none."""
+    def put(self, camera: str, number: int, content: Content, arrived_s: float | None) -> None:
+        """Add a camera's picture, or the reason why there is none."""
         self.catch_up(camera)
         if isinstance(content, np.ndarray):
             if self._finders is None:
-                self.boxes[camera].grey = True
+                self.queues[camera].grey = True
             else:
                 content = self._finders[camera](content)
         with self.changed:
-            box = self.boxes[camera]
-            box.incomplete.pop(number, None)
-            if self._accepts(box, number):
-                box.pictures[number] = Waiting(content, arrived_s, time.perf_counter())
-                box.given += 1
+            queue = self.queues[camera]
+            queue.incomplete.pop(number, None)
+            if self._accepts(queue, number):
+                queue.pictures[number] = Waiting(content, arrived_s, time.perf_counter())
+                queue.given += 1
             self.changed.notify_all()
 
     def announce(self, camera: str, number: int, why: str) -> None:
-        """A camera has a picture that is not complete yet."""
+        """Announce a camera's picture that is not complete yet."""
         with self.changed:
-            box = self.boxes[camera]
-            if self._accepts(box, number, count=False):
-                since = box.incomplete[number][0] if number in box.incomplete else time.perf_counter()
-                box.incomplete[number] = (since, why)
+            queue = self.queues[camera]
+            if self._accepts(queue, number, count=False):
+                since = queue.incomplete[number][0] if number in queue.incomplete else time.perf_counter()
+                queue.incomplete[number] = (since, why)
             self.changed.notify_all()
 
-    def refuse(self, camera: str) -> None:
-        """A camera could not give a picture since its box was full."""
+    def count_refused(self, camera: str) -> None:
+        """Count a camera's picture that is dropped because its queue is full."""
         with self.changed:
-            self.boxes[camera].refused += 1
+            self.queues[camera].refused += 1
 
     def take(self, frame: int) -> tuple[dict[str, Content], float | None]:
-        """A frame's pictures by camera, and when (time.time()) the last of them arrived; the frame is closed with it.
+        """Take a frame's pictures by camera, and close the frame.
 
-        None where no camera gave one live.
+        Also returns when (time.time()) the last of them arrived; None if all are older than the watch.
         """
         out: dict[str, Content] = {}
         arrived: list[float] = []
-        for name, box in self.boxes.items():
-            waiting = box.pictures.pop(frame, None)
-            since_and_why = box.incomplete.pop(frame, None)
+        for name, queue in self.queues.items():
+            waiting = queue.pictures.pop(frame, None)
+            since_and_why = queue.incomplete.pop(frame, None)
             if waiting is not None:
                 out[name] = waiting.content
                 if waiting.arrived_s is not None:
@@ -181,21 +181,21 @@ class Inbox:
         return out, max(arrived, default=None)
 
     def has_later(self, frame: int) -> bool:
-        """Whether any camera has something of a later frame."""
-        return any(box.later_s(frame) is not None for box in self.boxes.values())
+        """Whether any camera has a picture of a later frame."""
+        return any(queue.later_s(frame) is not None for queue in self.queues.values())
 
-    def _accepts(self, box: CameraBox, number: int, count: bool = True) -> bool:
-        """Notes that a picture came; False where its frame is closed, or so far ahead that it is a stray file."""
+    def _accepts(self, queue: CameraQueue, number: int, count: bool = True) -> bool:
+        """Register the arrival of a picture; False if its frame is closed, or so far ahead that it is a stray file."""
         self.last_seen_s = time.perf_counter()
-        box.asleep = False
+        queue.timed_out = False
         if self.next_frame is None:
             return True
         if number < self.next_frame:
-            box.late += count
-            # A camera that lags by more than the timeout would keep every frame waiting in vain.
-            box.asleep = (self.next_frame - number) * self._interval_s > self._timeout_s
+            queue.late += count
+            # A camera that lags by more than the timeout would delay every frame by it.
+            queue.timed_out = (self.next_frame - number) * self._interval_s > self._timeout_s
             return False
         if number > self.next_frame + LONGEST_GAP:
-            box.strays += [number] * count
+            queue.strays += [number] * count
             return False
         return True

@@ -1,4 +1,4 @@
-"""Frames as they arrive, in the form in which recorded ones are read: the pipeline does not see the difference."""
+"""Frames as they arrive, with the same interface as recorded ones."""
 
 from __future__ import annotations
 
@@ -18,33 +18,33 @@ from lab.pictures.picture_file import Grey, Missing
 from lab.runs.frames.frames import FrameSet
 from lab.watch.cameras import DeviceCamera, FolderCamera, LiveCamera, in_thread, open_device
 from lab.watch.folder_poll import FolderPoll
-from lab.watch.inbox import CameraBox, Inbox, is_complete
+from lab.watch.inbox import CameraQueue, Inbox, is_complete
 
-FIRST = 6  # pictures of each camera that the noise is learnt from
-_START_S = 0.5  # a camera is waited for so long for them, or for the time of eight frames
+FIRST = 6  # pictures of each camera for the estimate of the noise
+_START_S = 0.5  # longest wait for them, or the time of eight frames if that is more
 
 
 @dataclass(frozen=True, slots=True)
 class WatchOptions:
-    """How long to wait for what, s."""
+    """Waiting times, s."""
 
-    idle_s: float = 10.0  # without anything new: the recording has ended
-    timeout_s: float = 0.25  # for a camera whose picture of a frame does not come, or stays damaged
+    idle_s: float = 10.0  # time without a new picture after which the recording has ended
+    timeout_s: float = 0.25  # longest wait for a camera whose picture is missing or damaged
 
 
 @dataclass(slots=True)
 class LiveFrames:
-    """The frames of a run that is being recorded. Use it as a context; iterate once, after `begin`.
+    """The frames of a run that is being recorded. Use it as a context manager; iterate once, after `begin`.
 
-    stop: set it to end the recording, as when the user has pressed Ctrl-C; what has arrived is still given.
+    stop: ends the recording when set, as by Ctrl-C; frames that have arrived are still processed.
     """
 
     run: Run
     options: WatchOptions
     stop: threading.Event = field(default_factory=threading.Event)
     inbox: Inbox = field(init=False)
-    arrived_s: dict[int, float | None] = field(default_factory=dict)  # time.time(), of frames given and not yet asked
-    caught_up: bool = False  # a frame was the newest when it was given: the start's backlog is worked off
+    arrived_s: dict[int, float | None] = field(default_factory=dict)  # time.time(), by frame; removed by the output
+    caught_up: bool = False  # whether the backlog of the start has been processed
     _cameras: dict[str, LiveCamera] = field(init=False)
     _stack: ExitStack = field(default_factory=ExitStack)
     _reasons: dict[str, Counter[str]] = field(default_factory=dict)
@@ -52,14 +52,14 @@ class LiveFrames:
     _first: int = 0
 
     def __post_init__(self) -> None:
-        """Raises InputError where a camera cannot be watched."""
+        """Raises InputError if a camera cannot be watched."""
         interval_s = 1 / self.run.frame_rate_hz
         self.inbox = Inbox(tuple(self.run.cameras), interval_s, self.options.timeout_s)
         self._reasons = {name: Counter() for name in self.run.cameras}
         if self.run.times_path is not None:
             raise InputError(
-                f"{self.run.path}: timestamps: expected none in a run that is watched, since they are not there yet;"
-                " leave them out: t_s is then frame / frame_rate_hz"
+                f"{self.run.path}: timestamps: expected none in a run that is watched, since they do not exist yet;"
+                " remove them: t_s is then frame / frame_rate_hz"
             )
         self._cameras = {name: self._camera(name) for name in self.run.cameras}
 
@@ -75,30 +75,33 @@ class LiveFrames:
 
     @property
     def expected_frames(self) -> int | None:
-        """Nobody knows how long it will go on."""
+        """None: the length of a live recording is unknown."""
         return None
 
     @property
     def notes(self) -> list[str]:
-        """What a reader of the results should know, in plain words."""
+        """Notes for the user of the results."""
         out = [note for camera in self._cameras.values() for note in camera.notes]
-        for name, box in self.inbox.boxes.items():
+        for name, queue in self.inbox.queues.items():
             out += [f"{name}: {count} frames {reason}" for reason, count in self._reasons[name].items()]
-            if box.late:
+            if queue.late:
                 out.append(
-                    f"{name}: {box.late} pictures came after their frame had been closed and were not used; `beampose"
+                    f"{name}: {queue.late} pictures came after their frame had been closed and were not used; `beampose"
                     " run` on the finished folder uses them"
                 )
-            if box.refused:
-                out.append(f"{name}: {box.refused} pictures were left out: they came faster than they are processed")
-            if box.strays:
-                out.append(f"{name}: pictures far beyond all others were left out: {_some(box.strays)}")
+            if queue.refused:
+                out.append(f"{name}: {queue.refused} pictures were left out: they came faster than they are processed")
+            if queue.strays:
+                out.append(f"{name}: pictures with numbers far beyond all others were left out: {_some(queue.strays)}")
         return out
 
     def begin(self) -> Mapping[str, list[Grey]]:
         """Wait for the first pictures of every camera; up to FIRST of each, in the order of their numbers.
 
-        Empty where the recording ended without any. Raises InputError where the names hold no frame numbers.
+        Empty if the recording ended without any.
+
+        Raises:
+            InputError: the file names contain no frame numbers.
         """
         self.inbox.wanted.set()
         begun: float | None = None
@@ -106,11 +109,11 @@ class LiveFrames:
         with self.inbox.changed:
             while True:
                 self._raise_failure()
-                counts = [self._usable(box) for box in self.inbox.boxes.values()]
-                if begun is None and any(box.pictures for box in self.inbox.boxes.values()):
+                counts = [self._usable(queue) for queue in self.inbox.queues.values()]
+                if begun is None and any(queue.pictures for queue in self.inbox.queues.values()):
                     begun = time.perf_counter()
                 waited = 0.0 if begun is None else time.perf_counter() - begun
-                over = self.stop.is_set() or all(box.ended for box in self.inbox.boxes.values())
+                over = self.stop.is_set() or all(queue.ended for queue in self.inbox.queues.values())
                 if min(len(c) for c in counts) >= FIRST or waited > patience or over:
                     break
                 self.inbox.changed.wait(0.05)
@@ -134,34 +137,34 @@ class LiveFrames:
             self.inbox.stopping.set()
 
     def _wait_for(self, frame: int, since: float) -> bool:
-        """Wait until a frame can be worked on; False: the recording has ended before it."""
-        boxes = list(self.inbox.boxes.values())
+        """Wait until a frame can be processed; False: the recording has ended before it."""
+        queues = list(self.inbox.queues.values())
         with self.inbox.changed:
             while True:
                 self._raise_failure()
                 now = time.perf_counter()
                 timeout = 0.0 if self.stop.is_set() else self.options.timeout_s
-                complete, given_up = is_complete(frame, boxes, now, since, timeout, 1 / self.run.frame_rate_hz)
+                complete, now_timed_out = is_complete(frame, queues, now, since, timeout, 1 / self.run.frame_rate_hz)
                 if complete:
-                    for box in given_up:
-                        box.asleep = True
+                    for queue in now_timed_out:
+                        queue.timed_out = True
                     return True
-                if not self._anything_from(frame, boxes) and self._is_over(now, boxes):
+                if not self._anything_from(frame, queues) and self._is_over(now, queues):
                     return False
                 self.inbox.changed.wait(0.005)
 
-    def _is_over(self, now: float, boxes: list[CameraBox]) -> bool:
+    def _is_over(self, now: float, queues: list[CameraQueue]) -> bool:
         seen = self.inbox.last_seen_s
         idle = seen is not None and now - seen > self.options.idle_s
-        return self.stop.is_set() or idle or all(box.ended for box in boxes)
+        return self.stop.is_set() or idle or all(queue.ended for queue in queues)
 
     @staticmethod
-    def _anything_from(frame: int, boxes: list[CameraBox]) -> bool:
-        """Whether any camera has something complete of this frame or a later one."""
-        return any(number >= frame for box in boxes for number in box.pictures)
+    def _anything_from(frame: int, queues: list[CameraQueue]) -> bool:
+        """Whether any camera has a complete picture of this frame or a later one."""
+        return any(number >= frame for queue in queues for number in queue.pictures)
 
     def _first_pictures(self) -> dict[str, list[Grey]]:
-        numbers = sorted({n for box in self.inbox.boxes.values() for n in (*box.pictures, *box.incomplete)})
+        numbers = sorted({n for queue in self.inbox.queues.values() for n in (*queue.pictures, *queue.incomplete)})
         if not numbers:
             return {}
         gaps = np.diff(numbers)
@@ -169,14 +172,14 @@ class LiveFrames:
             raise InputError(
                 f"{self.run.path}: cameras: expected frame numbers without gaps of many thousands, got {numbers[0]} and"
                 f" {numbers[int(np.argmax(gaps)) + 1]} among the first; is a stray file among them, or do the names"
-                " hold a time?"
+                " contain a time?"
             )
         self._first = self.inbox.next_frame = numbers[0]
-        return {name: self._usable(box)[:FIRST] for name, box in self.inbox.boxes.items()}
+        return {name: self._usable(queue)[:FIRST] for name, queue in self.inbox.queues.items()}
 
     @staticmethod
-    def _usable(box: CameraBox) -> list[Grey]:
-        contents = [waiting.content for _, waiting in sorted(box.pictures.items(), key=lambda item: item[0])]
+    def _usable(queue: CameraQueue) -> list[Grey]:
+        contents = [waiting.content for _, waiting in sorted(queue.pictures.items(), key=lambda item: item[0])]
         return [content for content in contents if isinstance(content, np.ndarray)]
 
     def _failed(self, error: BaseException) -> None:

@@ -1,4 +1,4 @@
-"""What leaves a watched run at once: a row of attitude_live.csv and a line of JSON by UDP per frame, and how late."""
+"""Live output of a watched run: a row of attitude_live.csv and a JSON line by UDP per frame, and their latency."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ LIVE_TABLE = "attitude_live.csv"
 
 @dataclass(slots=True)
 class UdpLines:
-    """Sends text to one address; a listener need not be there."""
+    """Sends text to one address, whether or not there is a listener."""
 
     address: str  # HOST:PORT
     failures: int = 0
@@ -35,20 +35,20 @@ class UdpLines:
     _to: Any = field(init=False)
 
     def __post_init__(self) -> None:
-        """Raises InputError where the address is none."""
+        """Raises InputError if the address is invalid."""
         host, colon, port = self.address.rpartition(":")
         if not (colon and host and port.isascii() and port.isdigit() and 0 < int(port) < 65536):
             raise InputError(f"--udp: expected HOST:PORT, such as 127.0.0.1:5005, got {self.address!r}")
         try:
             found = socket.getaddrinfo(host.strip("[]"), int(port), type=socket.SOCK_DGRAM)
         except OSError as error:
-            raise InputError(f"--udp: the host {host!r} is not known: {error.strerror}") from None
+            raise InputError(f"--udp: the host {host!r} is unknown: {error.strerror}") from None
         family, kind, protocol, _, self._to = found[0]
         self._socket = socket.socket(family, kind, protocol)
         self._socket.setblocking(False)
 
     def send(self, line: str) -> None:
-        """Send a line; that it cannot be sent is counted and stops nothing."""
+        """Send a line. A failure is counted and raises no error."""
         try:
             self._socket.sendto(line.encode("utf-8"), self._to)
         except OSError:
@@ -61,10 +61,10 @@ class UdpLines:
 
 @dataclass(slots=True)
 class Latency:
-    """How late poses are: from the arrival of a frame's last picture until its pose is written, ms."""
+    """Latencies from the arrival of a frame's last picture until its pose is written, ms."""
 
-    steady: list[float] = field(default_factory=list)  # once the backlog of the start is worked off
-    start: list[float] = field(default_factory=list)  # before
+    steady: list[float] = field(default_factory=list)  # after the backlog of the start has been processed
+    start: list[float] = field(default_factory=list)  # before that
 
     def as_mapping(self) -> dict[str, Any]:
         """For summary.json."""
@@ -78,7 +78,7 @@ class Latency:
         return out
 
     def line(self) -> str:
-        """In words; empty without a frame."""
+        """One line of text; empty without a frame."""
         if not self.steady:
             return ""
         median, p95, p99 = np.percentile(self.steady, [50, 95, 99])
@@ -90,10 +90,10 @@ class Latency:
 
 @dataclass(slots=True)
 class LiveOutput:
-    """Writes each frame's pose as soon as it is known, into the folder of the results to come.
+    """Writes each frame's pose at once into the future result folder.
 
-    The folder holds the live table alone until the results replace it. Every pose passes the checks of a finished run
-    first: the rows are those that `beampose run --causal` writes.
+    The folder contains only the live table until the results replace it. Every pose passes the same checks as in a
+    finished run: the rows are those that `beampose run --causal` writes.
     """
 
     out: Path
@@ -118,7 +118,7 @@ class LiveOutput:
             self.udp.send(json_line(checked, latency_ms))
 
     def finish(self, work: Path) -> dict[str, Any]:
-        """Put the live table among the results in `work`; what summary.json says of the watch."""
+        """Copy the live table into the results in `work`. Returns the watch's part of summary.json."""
         if self._file is not None:
             self._file.seek(0)
             with (work / LIVE_TABLE).open("w", encoding="utf-8", newline="") as copy:
@@ -134,14 +134,14 @@ class LiveOutput:
         }
 
     def close(self) -> None:
-        """Close what is open."""
+        """Close the file and the socket."""
         if self._file is not None:
             self._file.close()
         if self.udp is not None:
             self.udp.close()
 
     def _opened(self) -> TextIO:
-        """The live table in a folder of its own, in place of earlier results."""
+        """Open the live table in its own folder, which replaces earlier results."""
         new = self.out.parent / f".{self.out.name}.live-{os.getpid()}"
         shutil.rmtree(new, ignore_errors=True)
         new.mkdir(parents=True)
@@ -152,7 +152,7 @@ class LiveOutput:
 
 
 def json_line(record: FrameRecord, latency_ms: float | None) -> str:
-    """One frame as a line of JSON. Units are in the names; null for what is not known."""
+    """One frame as a line of JSON. Units are in the names; unknown values are null."""
     t = record.tracked
     content: dict[str, Any] = {"frame": record.frame, "t_s": record.t_s, "status": t.pose_status.value}
     names = ("position_m", "quaternion_wxyz", "yaw_pitch_roll_deg", "sigma_position_m", "sigma_yaw_pitch_roll_deg")
@@ -167,7 +167,7 @@ def json_line(record: FrameRecord, latency_ms: float | None) -> str:
 
 
 def is_live_table(folder: Path) -> bool:
-    """Whether a folder holds a live table and nothing else: what a watch leaves that was stopped by force."""
+    """Whether a folder contains only a live table, as after a watch that was killed."""
     try:
         return [p.name for p in folder.iterdir()] == [LIVE_TABLE]
     except OSError:

@@ -1,4 +1,4 @@
-"""A run followed while it is recorded: poses as frames arrive, and the ordinary results when the recording ends."""
+"""Processes a run while it is recorded: poses as frames arrive, and the usual results when the recording ends."""
 
 from __future__ import annotations
 
@@ -33,23 +33,23 @@ from lab.watch.live_output import Latency, LiveOutput, UdpLines, is_live_table
 from tracking.detections import Detections
 
 _log = logging.getLogger("beampose")
-_TURN_S = 0.0005
+_SWITCH_INTERVAL_S = 0.0005
 
 
 @dataclass(frozen=True, slots=True)
 class WatchOutcome:
-    """What became of a watched run."""
+    """The outcome of a watched run."""
 
     run: RunOutcome
     latency: Latency
 
     @property
     def exit_status(self) -> int:
-        """That of the finished run."""
+        """The exit status of the finished run."""
         return self.run.exit_status
 
     def line(self) -> str:
-        """What the finished run says, and how late its poses were."""
+        """The line of the finished run, and the latency of its poses."""
         return "\n".join(filter(None, (self.run.line(), self.latency.line())))
 
 
@@ -64,16 +64,17 @@ def watch_run(
     progress: Progress | None = None,
     stop: threading.Event | None = None,
 ) -> WatchOutcome:
-    """Follow a run folder whose cameras are folders that are being filled, or devices.
+    """Process a run folder whose cameras are folders that are being filled, or devices.
 
-    While it goes on, `out` holds attitude_live.csv: a row per frame, flushed, as the causal tracker knows it. udp: a
-    HOST:PORT that gets the same as a line of JSON. The recording ends when nothing has come for `options.idle_s`, when
-    all devices have ended, or when `stop` is set; then `out` gets what `beampose run` writes, made of the detections
-    that were received. They differ from those of a run by what the noise was learnt from (here each camera's first
-    pictures) and by pictures that came too late. reprocess: the results are made from the finished folders instead,
-    as `beampose run` makes them, which takes its time.
+    During the recording `out` contains attitude_live.csv: a row per frame by the causal tracker, flushed at once. udp:
+    HOST:PORT that receives the same as a line of JSON. The recording ends when nothing has come for `options.idle_s`,
+    when all devices have ended, or when `stop` is set; then `out` receives the results of `beampose run`, computed from
+    the received detections. These differ from those of a run by the pictures that the noise is estimated from (here
+    each camera's first ones) and by pictures that came too late. reprocess: computes the results from the finished
+    folders instead, as `beampose run` does, which takes longer.
 
-    Raises a BeamposeError where the run cannot be watched, or no picture came.
+    Raises:
+        BeamposeError: the run cannot be watched, or no picture came.
     """
     started = time.perf_counter()
     run = ready_run(run_folder, overrides)
@@ -88,7 +89,7 @@ def watch_run(
         output = LiveOutput(Path(out), frames, FrameChecks(run.rig, run.covariance), sender)
         stack.callback(output.close)
         with frames, _low_latency():
-            pipeline, finders = _begun(run, frames, output)
+            pipeline, finders = _started(run, frames, output)
             if reprocess:
                 for done, _ in enumerate(pipeline.records(), start=1):
                     if progress is not None:
@@ -104,25 +105,25 @@ def watch_run(
     return WatchOutcome(outcome, output.latency)
 
 
-def _begun(run: Run, frames: LiveFrames, output: LiveOutput) -> tuple[Pipeline, dict[str, _Finder]]:
-    """The pipeline, once the first pictures are here and the noise is known. Raises RunError where none come."""
-    _get_ready(run)
+def _started(run: Run, frames: LiveFrames, output: LiveOutput) -> tuple[Pipeline, dict[str, _Finder]]:
+    """The pipeline, after the noise is estimated from the first pictures. Raises RunError if none come."""
+    _load_compiled_code(run)
     _log.info("ready: waiting for the first picture")
     first = frames.begin()
     if not first:
         raise RunError(f"{run.path}: expected pictures while the run was watched, got none")
     noise = {name: CameraNoise(name, camera.noise) for name, camera in run.rig.cameras.items()}
-    with ThreadPoolExecutor(max(len(first), 1)) as pool:  # pictures pile up meanwhile
-        list(pool.map(lambda name: noise[name].learn(first[name]), first))
+    with ThreadPoolExecutor(max(len(first), 1)) as pool:  # in parallel, since pictures queue up meanwhile
+        list(pool.map(lambda name: noise[name].estimate_from(first[name]), first))
     pipeline = Pipeline(run, frames, tracker_of(run), noise, output.write)
     finders = {name: _Finder(pipeline, name) for name in noise}
-    frames.inbox.find_with(finders)
+    frames.inbox.set_finders(finders)
     return pipeline, finders
 
 
 @dataclass(slots=True)
 class _Finder:
-    """Finds the points of one camera's pictures, in that camera's thread."""
+    """Detects the points of one camera's pictures, in that camera's thread."""
 
     pipeline: Pipeline
     camera: str
@@ -137,13 +138,13 @@ class _Finder:
 
 @contextlib.contextmanager
 def stopped_by_ctrl_c() -> Iterator[threading.Event]:
-    """An event that Ctrl-C sets, once; a second Ctrl-C stops the program as usual."""
+    """An event that the first Ctrl-C sets; a second Ctrl-C stops the program as usual."""
     stop = threading.Event()
 
     def end(*_: object) -> None:
         stop.set()
         signal.signal(signal.SIGINT, before)
-        _log.info("the recording ends; making the results (Ctrl-C again: without results)")
+        _log.info("the recording ends; computing the results (press Ctrl-C again to stop without results)")
 
     before = signal.signal(signal.SIGINT, end)
     try:
@@ -152,15 +153,15 @@ def stopped_by_ctrl_c() -> Iterator[threading.Event]:
         signal.signal(signal.SIGINT, before)
 
 
-def _get_ready(run: Run) -> None:
-    """Load the compiled code before the first picture is here: a few frames of spots, made up, and then forgotten."""
+def _load_compiled_code(run: Run) -> None:
+    """Load the compiled code before the first picture arrives, by processing a few synthetic frames."""
     tracker, model = tracker_of(run), SpotModel.of(run.rig)
     for width, height in {camera.image_size_px for camera in run.rig.cameras.values()}:
         v, u = np.mgrid[:height, :width]
         grey = 8.0 + ((7 * u + 13 * v) % 5) + 90 * np.exp(-((u - width / 2) ** 2 + (v - height / 2) ** 2) / 8)
         pictures = [(grey + k).astype(np.uint8) for k in range(2)]
-        noise = CameraNoise("made up")
-        noise.learn(pictures)
+        noise = CameraNoise("synthetic")
+        noise.estimate_from(pictures)
         noise.detect(pictures[0], run.tracker.detect)
     uv_px, _ = model.project(Pose.identity() if run.prior is None else run.prior.centre)
     seen = np.isfinite(uv_px).all(axis=1) & ((uv_px > 0) & (uv_px < model.image_size_px)).all(axis=1)
@@ -174,16 +175,16 @@ def _get_ready(run: Run) -> None:
 
 @contextlib.contextmanager
 def _low_latency() -> Iterator[None]:
-    """Threads take turns after 0.5 ms, not 5, and the garbage collector leaves alone what is there already.
+    """Threads switch after 0.5 ms instead of 5, and the garbage collector ignores existing objects.
 
-    A thread whose picture is here would else wait for most of a tracking step; a full collection takes several frames.
+    Otherwise a thread with a new picture waits for most of a tracking step, and a full collection takes several frames.
     """
-    turn_s = sys.getswitchinterval()
-    sys.setswitchinterval(_TURN_S)
+    switch_interval_s = sys.getswitchinterval()
+    sys.setswitchinterval(_SWITCH_INTERVAL_S)
     gc.collect()
     gc.freeze()
     try:
         yield
     finally:
         gc.unfreeze()
-        sys.setswitchinterval(turn_s)
+        sys.setswitchinterval(switch_interval_s)

@@ -1,4 +1,4 @@
-"""`beampose detect`: spots of pictures without a rig, whatever the pictures are."""
+"""`beampose detect`: spots of any pictures, without a rig."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SIZE = (160, 120)
 
 
 def picture(frame: int, *, size: tuple[int, int] = SIZE, bits: int = 8, seed: int = 0) -> np.ndarray:
-    """Three spots that move one pixel to the right each frame, on a background with noise of 1 DN (of 8 bit)."""
+    """Three spots that move one pixel to the right per frame, on a background with noise of 1 DN (8 bit)."""
     moved = [Spot(s.u + frame, s.v, s.peak, s.major, s.minor) for s in SPOTS]
     clean = expected(Scene(moved, size=size, background=12.0))
     noisy = clean + np.random.default_rng([seed, frame]).normal(0, 1.0, clean.shape)
@@ -32,10 +32,10 @@ def picture(frame: int, *, size: tuple[int, int] = SIZE, bits: int = 8, seed: in
     return np.clip(np.round(noisy * factor), 0, np.iinfo(dtype).max).astype(dtype)
 
 
-def write_folder(folder: Path, frames: range, suffix: str = ".png", **looks: int) -> Path:
+def write_folder(folder: Path, frames: range, suffix: str = ".png", **options: int) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     for frame in frames:
-        cv2.imwrite(str(folder / f"img_{frame:04d}{suffix}"), picture(frame, **looks))
+        cv2.imwrite(str(folder / f"img_{frame:04d}{suffix}"), picture(frame, **options))
     return folder
 
 
@@ -48,7 +48,7 @@ def summary(out: Path) -> dict:
     return json.loads((out / "summary.json").read_text("utf-8"))
 
 
-def test_the_spots_of_a_folder_are_where_they_were_drawn_and_as_wide(tmp_path):
+def test_the_spots_of_a_folder_have_their_true_positions_and_sizes(tmp_path):
     folder = write_folder(tmp_path / "left", range(7, 19))
     outcome = detect_pictures([folder], tmp_path / "out")
     assert (outcome.pictures, outcome.spots, outcome.exit_status) == (12, 36, 0)
@@ -66,14 +66,14 @@ def test_the_spots_of_a_folder_are_where_they_were_drawn_and_as_wide(tmp_path):
     assert sizes["major"]["median"] == pytest.approx(np.hypot(1.4, 0.29), rel=0.05)
 
 
-def test_the_noise_that_was_drawn_is_found(tmp_path):
+def test_the_estimated_noise_is_the_true_one(tmp_path):
     detect_pictures([write_folder(tmp_path / "cam", range(8))], tmp_path / "out")
     (noise,) = summary(tmp_path / "out")["noise"]
     assert np.sqrt(noise["floor_dn2"]) == pytest.approx(np.sqrt(1 + 1 / 12), rel=0.15)
     assert noise["estimated"]["temporal"]
 
 
-def test_16_bit_pictures_give_the_same_places_and_signal_to_noise(tmp_path):
+def test_16_bit_pictures_give_the_same_positions_and_signal_to_noise(tmp_path):
     shallow = write_folder(tmp_path / "8", range(6))
     deep = write_folder(tmp_path / "16", range(6), ".tif", bits=16)
     for name, folder in (("a", shallow), ("b", deep)):
@@ -85,7 +85,7 @@ def test_16_bit_pictures_give_the_same_places_and_signal_to_noise(tmp_path):
     assert ratio == pytest.approx(1.0, abs=0.2)
 
 
-def test_a_video_gives_what_its_pictures_give(tmp_path):
+def test_a_video_gives_the_same_detections_as_its_pictures(tmp_path):
     folder = write_folder(tmp_path / "pictures", range(20))
     video = cv2.VideoWriter(str(tmp_path / "shot.avi"), cv2.VideoWriter_fourcc(*"FFV1"), 25, SIZE, False)
     for frame in range(20):
@@ -100,21 +100,21 @@ def test_a_video_gives_what_its_pictures_give(tmp_path):
     assert np.allclose([float(r["u_px"]) for r in a], [float(r["u_px"]) for r in b], atol=0.02)
 
 
-def test_pictures_of_mixed_sizes_and_depths_each_have_their_noise_and_the_report_says_so(tmp_path):
+def test_each_size_and_depth_of_pictures_has_its_own_noise_and_a_note_in_the_report(tmp_path):
     folder = write_folder(tmp_path / "mixed", range(3))
     write_folder(folder, range(3, 6), ".tif", bits=16)
     write_folder(folder, range(6, 8), size=(200, 130))
     outcome = detect_pictures([folder], tmp_path / "out")
     assert outcome.pictures == 8
     assert outcome.spots == 24
-    said = summary(tmp_path / "out")
-    assert {(*n["size_px"], n["bits"]): n["pictures"] for n in said["noise"]} == {
+    written = summary(tmp_path / "out")
+    assert {(*n["size_px"], n["bits"]): n["pictures"] for n in written["noise"]} == {
         (160, 120, 8): 3,
         (160, 120, 16): 3,
         (200, 130, 8): 2,
     }
-    assert [n["estimated"]["pictures"] for n in said["noise"]] == [2, 2, 2]
-    assert any("different sizes or depths" in note for note in said["notes"])
+    assert [n["estimated"]["pictures"] for n in written["noise"]] == [2, 2, 2]
+    assert any("different sizes or depths" in note for note in written["notes"])
     assert "different sizes or depths" in (tmp_path / "out/report.html").read_text("utf-8")
 
 
@@ -124,7 +124,7 @@ def test_one_picture_is_enough(tmp_path):
     assert (outcome.camera, outcome.pictures, outcome.spots) == ("screen", 1, 3)
 
 
-def test_several_files_are_numbered_by_their_names_or_else_in_their_order(tmp_path):
+def test_files_are_numbered_by_their_names_or_else_alphabetically(tmp_path):
     folder = write_folder(tmp_path / "shots", range(4, 8))
     files = sorted(folder.iterdir())
     assert detect_pictures(files[::-1], tmp_path / "a").camera == "shots"
@@ -134,10 +134,10 @@ def test_several_files_are_numbered_by_their_names_or_else_in_their_order(tmp_pa
     files[0].rename(folder / "first.png")
     detect_pictures([folder], tmp_path / "b")
     assert {int(r["frame"]) for r in rows(tmp_path / "b")} == {0, 1, 2, 3}
-    assert any("in the order of the names" in note for note in summary(tmp_path / "b")["notes"])
+    assert any("in alphabetical order" in note for note in summary(tmp_path / "b")["notes"])
 
 
-def test_a_damaged_picture_costs_only_itself(tmp_path):
+def test_a_damaged_picture_does_not_affect_the_others(tmp_path):
     folder = write_folder(tmp_path / "cam", range(5))
     whole = (folder / "img_0002.png").read_bytes()
     (folder / "img_0002.png").write_bytes(whole[: len(whole) // 2])
@@ -147,7 +147,7 @@ def test_a_damaged_picture_costs_only_itself(tmp_path):
     assert any("cut short (frame 2)" in note for note in summary(tmp_path / "out")["notes"])
 
 
-def test_pictures_without_a_spot_are_a_result(tmp_path):
+def test_pictures_without_a_spot_are_no_error(tmp_path):
     for frame in range(3):
         grey = np.random.default_rng(frame).normal(20, 1, (60, 80))
         cv2.imwrite(str(tmp_path / f"{frame}.png"), np.round(grey).astype(np.uint8))
@@ -159,20 +159,20 @@ def test_pictures_without_a_spot_are_a_result(tmp_path):
 @pytest.mark.parametrize(
     "names", [["nothing"], ["text.txt"], ["text.png"], ["cam", "text.png"], ["empty"], ["no*.png"]]
 )
-def test_what_is_no_picture_is_a_plain_line(tmp_path, names):
+def test_a_path_without_pictures_is_an_error_of_one_line(tmp_path, names):
     (tmp_path / "text.txt").write_text("words")
     (tmp_path / "text.png").write_text("words")
     (tmp_path / "empty").mkdir()
     write_folder(tmp_path / "cam", range(1))
     with pytest.raises(InputError) as raised:
         detect_pictures([tmp_path / name for name in names], tmp_path / "out")
-    words = str(raised.value)
-    assert "\n" not in words
-    assert names[0].split(".")[0].rstrip("*") in words
+    message = str(raised.value)
+    assert "\n" not in message
+    assert names[0].split(".")[0].rstrip("*") in message
     assert not (tmp_path / "out").exists()
 
 
-def test_a_parameter_that_is_none_of_detection_is_refused(tmp_path):
+def test_a_parameter_that_does_not_belong_to_the_detection_is_an_error(tmp_path):
     folder = write_folder(tmp_path / "cam", range(1))
     with pytest.raises(InputError, match="expected a parameter of detection"):
         detect_pictures([folder], tmp_path / "out", DetectOptions(overrides={"r1_px": 3}))
@@ -208,22 +208,22 @@ def test_a_contact_sheet_shows_pictures_from_the_first_to_the_last(pictures, sho
     sheet = ContactSheet(pictures)
     for k in range(pictures):
         sheet.offer(k, k, np.zeros((3, 4), np.uint8), Detections.none())
-    places = sorted(sheet._kept)
-    assert len(places) == shown
-    assert (places[0], places[-1]) == (0, pictures - 1)
-    assert pictures == 1 or np.ptp(np.diff(places)) <= 1
+    indices = sorted(sheet._kept)
+    assert len(indices) == shown
+    assert (indices[0], indices[-1]) == (0, pictures - 1)
+    assert pictures == 1 or np.ptp(np.diff(indices)) <= 1
 
 
-def test_a_contact_sheet_of_an_unknown_number_of_pictures_is_still_even():
+def test_a_contact_sheet_of_an_unknown_number_of_pictures_is_evenly_spaced():
     sheet = ContactSheet(None)
     for k in range(333):
         sheet.offer(k, k, np.zeros((3, 4), np.uint8), Detections.none())
-    places = sorted(sheet._kept)
-    assert MOST / 2 <= len(places) <= MOST
-    assert np.ptp(np.diff(places)) == 0
+    indices = sorted(sheet._kept)
+    assert MOST / 2 <= len(indices) <= MOST
+    assert np.ptp(np.diff(indices)) == 0
 
 
-def test_a_contact_sheet_rings_the_spots_at_their_places():
+def test_a_contact_sheet_has_rings_around_the_spots():
     sheet = ContactSheet(1)
     found = Detections(np.array([[100.0, 50.0]]), np.eye(2)[None], *(np.array([x]) for x in (1.0, 1.0, 2.0, 2.0, 0.0)))
     sheet.offer(0, 5, np.full((120, 160), 10, np.uint8), found)
@@ -236,8 +236,8 @@ def test_a_contact_sheet_rings_the_spots_at_their_places():
     assert (ring[:, 0].max(), ring[:, 1].min()) == pytest.approx((centre[0] + radius, centre[1] - radius), abs=3)
 
 
-def test_signal_to_noise_is_that_of_a_filter_of_the_spots_own_shape():
-    """A Gaussian filter on a drawn spot and on noise alone says the same."""
+def test_the_signal_to_noise_ratio_is_that_of_a_matched_filter():
+    """Compared with a Gaussian filter applied to a rendered spot and to noise."""
     v, u = np.mgrid[:81, :81] - 40.0
     shape = np.exp(-0.5 * ((u / 2.5) ** 2 + (v / 1.5) ** 2))
     light, sigma = 30 * shape, 2.0
@@ -246,7 +246,7 @@ def test_signal_to_noise_is_that_of_a_filter_of_the_spots_own_shape():
     assert matched_snr(found, sigma)[0] == pytest.approx(response / spread, rel=1e-3)
 
 
-def test_the_memory_for_figures_is_bounded_and_the_total_is_not():
+def test_the_memory_for_figures_is_bounded():
     collection, n = SpotCollection(), MOST_KEPT // 8
     found = Detections(np.zeros((n, 2)), np.zeros((n, 2, 2)), *(np.zeros(n) for _ in range(5)))
     for frame in range(20):

@@ -1,4 +1,4 @@
-"""`beampose watch`: a run followed while it is recorded."""
+"""`beampose watch`: a run that is processed while it is recorded."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from lab.watch.watch import WatchOutcome, watch_run
 from tracking.detections import Detections
 
 FRAMES = 24
-FAST = WatchOptions(idle_s=1.0, timeout_s=5.0)  # this machine may be busy: no camera is given up by chance
+FAST = WatchOptions(idle_s=1.0, timeout_s=5.0)  # long enough that no camera times out on a busy machine
 IMPATIENT = WatchOptions(idle_s=1.5, timeout_s=1.0)
 
 
@@ -43,9 +43,9 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def run_of_first_pictures(run: Path, out: Path, causal: bool = False) -> Path:
-    """The results of `beampose run`, its noise learnt from the first pictures, as a watch must."""
+    """The results of `beampose run` with the noise estimated from the first pictures, as in a watch."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sensor_noise, "frames_to_learn_from", lambda pictures: list(range(min(FIRST, pictures))))
+        patch.setattr(sensor_noise, "noise_estimation_frames", lambda pictures: list(range(min(FIRST, pictures))))
         patch.setattr(sensor_noise, "VIDEO_PICTURES", tuple(range(FIRST)))
         return process_run(run, out, causal=causal).out
 
@@ -76,7 +76,7 @@ def write_picture(source: Path, target: Path, in_two: bool = False) -> None:
 
 
 def feed(recorded: Path, run: Path, given: Callable[[str, int], bool] = lambda camera, frame: True) -> None:
-    """Copy picture after picture, every fourth in two writes."""
+    """Copy the pictures one by one, every fourth in two writes."""
     for frame in range(FRAMES):
         for camera in ("left", "right"):
             name = f"frames/{camera}/{frame:06d}.png"
@@ -86,7 +86,7 @@ def feed(recorded: Path, run: Path, given: Callable[[str, int], bool] = lambda c
 
 
 def watched(run: Path, out: Path, feeder: Callable[[], None], **options: object) -> WatchOutcome:
-    """Watch a run while a thread feeds it."""
+    """Watch a run while a thread writes its pictures."""
     thread = threading.Thread(target=feeder)
     thread.start()
     try:
@@ -102,16 +102,16 @@ def rows(path: Path) -> list[dict[str, str]]:
 
 @pytest.fixture(scope="module")
 def followed(recorded: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[dict]]:
-    """The results of a run that was watched, and what came by UDP meanwhile."""
+    """The results of a watched run, and the lines received by UDP."""
     run, ready = empty_copy(recorded, tmp_path_factory.mktemp("live") / "run"), threading.Event()
-    get_ready = watch._get_ready
+    load_compiled_code = watch._load_compiled_code
 
     def feeder() -> None:
         assert ready.wait(60)
         feed(recorded, run)
 
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener, pytest.MonkeyPatch.context() as patch:
-        patch.setattr(watch, "_get_ready", lambda run: (get_ready(run), ready.set()))
+        patch.setattr(watch, "_load_compiled_code", lambda run: (load_compiled_code(run), ready.set()))
         listener.bind(("127.0.0.1", 0))
         listener.settimeout(0.5)
         address = f"127.0.0.1:{listener.getsockname()[1]}"
@@ -126,7 +126,7 @@ def test_the_results_are_those_of_the_finished_folder(followed, processed, name)
     assert (followed[0] / name).read_bytes() == (processed / name).read_bytes()
 
 
-def test_the_live_table_is_what_a_causal_run_says(followed, recorded, tmp_path):
+def test_the_live_table_is_that_of_a_causal_run(followed, recorded, tmp_path):
     causal = run_of_first_pictures(recorded, tmp_path / "causal", causal=True)
     assert (followed[0] / LIVE_TABLE).read_bytes() == (causal / "attitude.csv").read_bytes()
 
@@ -143,7 +143,7 @@ def test_a_line_of_json_is_sent_for_every_frame(followed):
     assert 0 <= last["latency_ms"] < 10_000
 
 
-def test_the_summary_says_how_late_the_poses_were(followed):
+def test_the_summary_contains_the_latency_of_the_poses(followed):
     live = json.loads((followed[0] / "summary.json").read_text("utf-8"))["live"]
     latency = live["latency_ms"]
     assert latency["frames"] + latency["start_frames"] == FRAMES
@@ -167,7 +167,7 @@ def test_a_camera_that_stops_does_not_stop_the_other(recorded, tmp_path):
     assert (tmp_path / "out/attitude.csv").read_bytes() == (tmp_path / "again/attitude.csv").read_bytes()
 
 
-def test_dropped_and_damaged_pictures_are_what_they_are_in_a_run(recorded, tmp_path):
+def test_dropped_and_damaged_pictures_are_treated_as_in_a_run(recorded, tmp_path):
     run = empty_copy(recorded, tmp_path / "run")
 
     def given(camera: str, frame: int) -> bool:
@@ -181,7 +181,7 @@ def test_dropped_and_damaged_pictures_are_what_they_are_in_a_run(recorded, tmp_p
     assert (tmp_path / "out/attitude.csv").read_bytes() == (tmp_path / "again/attitude.csv").read_bytes()
 
 
-def test_results_that_are_made_from_the_finished_folder_are_those_of_run(recorded, tmp_path):
+def test_reprocessed_results_are_those_of_a_run(recorded, tmp_path):
     run = empty_copy(recorded, tmp_path / "run")
     watched(run, tmp_path / "out", lambda: feed(recorded, run), reprocess=True)
     process_run(recorded, tmp_path / "again")
@@ -190,7 +190,7 @@ def test_results_that_are_made_from_the_finished_folder_are_those_of_run(recorde
     assert len(rows(tmp_path / "out" / LIVE_TABLE)) == FRAMES
 
 
-def test_stopping_ends_the_recording_and_makes_the_results(recorded, tmp_path):
+def test_stopping_ends_the_recording_and_writes_the_results(recorded, tmp_path):
     run, stop = empty_copy(recorded, tmp_path / "run"), threading.Event()
     all_there = []
 
@@ -204,7 +204,7 @@ def test_stopping_ends_the_recording_and_makes_the_results(recorded, tmp_path):
 
     patient = WatchOptions(idle_s=60.0)
     outcome = watched(run, tmp_path / "out", feeder, options=patient, stop=stop)
-    assert all_there == [True]  # the live table has each frame at once, not when a buffer is full
+    assert all_there == [True]  # each frame is in the live table at once, not when a buffer is full
     assert outcome.run.frames == FRAMES
     assert (tmp_path / "out/report.html").is_file()
 
@@ -213,7 +213,7 @@ def _has_rows(path: Path, count: int) -> bool:
     return path.is_file() and len(path.read_text().splitlines()) >= 1 + count
 
 
-def test_a_recording_without_a_picture_is_said_plainly_and_leaves_nothing(recorded, tmp_path):
+def test_a_recording_without_a_picture_is_an_error_and_leaves_nothing(recorded, tmp_path):
     run, stop = empty_copy(recorded, tmp_path / "run"), threading.Event()
     stop.set()
     with pytest.raises(RunError, match="expected pictures while the run was watched, got none"):
@@ -221,7 +221,7 @@ def test_a_recording_without_a_picture_is_said_plainly_and_leaves_nothing(record
     assert {p.name for p in tmp_path.iterdir()} == {"run"}
 
 
-def test_what_a_stopped_watch_left_may_be_replaced_and_nothing_else(recorded, tmp_path):
+def test_only_the_live_table_of_a_killed_watch_may_be_replaced(recorded, tmp_path):
     run = empty_copy(recorded, tmp_path / "run")
     feed(recorded, run)
     (tmp_path / "out").mkdir()
@@ -233,7 +233,7 @@ def test_what_a_stopped_watch_left_may_be_replaced_and_nothing_else(recorded, tm
         watch_run(run, tmp_path / "thesis", options=FAST)
 
 
-def test_a_device_with_an_end_gives_what_its_pictures_give(tmp_path):
+def test_a_device_with_an_end_has_the_results_of_its_pictures(tmp_path):
     recorded = simulate("smooth", tmp_path / "video", seed=3, frames=FRAMES, picture_scale=0.25, video=True)
     content = yaml.safe_load((recorded / "run.yaml").read_text())
     ordinary = run_of_first_pictures(recorded, tmp_path / "ordinary")
@@ -256,7 +256,7 @@ def test_a_device_with_an_end_gives_what_its_pictures_give(tmp_path):
         ({"cameras": {"left": {"device": 0, "frames": "frames/left"}}}, "got frames and device; keep one"),
     ],
 )
-def test_what_cannot_be_watched_is_said_plainly(recorded, tmp_path, change, words):
+def test_a_run_that_cannot_be_watched_is_an_input_error(recorded, tmp_path, change, words):
     run = empty_copy(recorded, tmp_path / "run")
     (run / "times.csv").write_text("frame,t_s\n0,0\n")
     (run / "points.csv").write_text("frame,camera,u_px,v_px\n0,left,1,1\n")
@@ -269,19 +269,19 @@ def test_what_cannot_be_watched_is_said_plainly(recorded, tmp_path, change, word
 
 
 @pytest.mark.parametrize("address", ["5005", "host:", "host:0", "host:70000", "no.such.host.invalid:5005"])
-def test_an_address_that_is_none_is_said_before_anything_is_watched(recorded, tmp_path, address):
+def test_an_invalid_address_is_an_error_before_the_watch_begins(recorded, tmp_path, address):
     run = empty_copy(recorded, tmp_path / "run")
     with pytest.raises(InputError, match="--udp"):
         watch_run(run, tmp_path / "out", udp=address)
 
 
-def test_names_that_hold_a_time_are_refused(recorded, tmp_path):
+def test_file_names_that_contain_a_time_are_an_error(recorded, tmp_path):
     run = empty_copy(recorded, tmp_path / "run")
     for k in range(6):
         for camera in ("left", "right"):
             target = run / f"frames/{camera}/{1_700_000_000_000 + 10_000 * k * k}.png"
             shutil.copy(recorded / f"frames/{camera}/{k:06d}.png", target)
-    with pytest.raises(InputError, match="do the names hold a time"):
+    with pytest.raises(InputError, match="do the names contain a time"):
         watch_run(run, tmp_path / "out", options=FAST)
 
 
@@ -297,7 +297,7 @@ def test_a_device_is_a_number_or_a_name(recorded, tmp_path):
 
 
 def names_of(poll: FolderPoll, until: int) -> dict[int, str]:
-    """All that a poll finds until it has so many, or two seconds have passed."""
+    """All pictures that a poll finds until there are `until`, or two seconds have passed."""
     end = time.monotonic() + 2
     while len(poll.names) < until and time.monotonic() < end:
         poll.new()
@@ -315,7 +315,7 @@ def names_of(poll: FolderPoll, until: int) -> dict[int, str]:
         ("a7.png", ["a6.png", "a9.png", "a8.png"]),
     ],
 )
-def test_pictures_are_found_whatever_their_next_name_is(tmp_path, first, later):
+def test_pictures_are_found_whatever_their_names_are(tmp_path, first, later):
     poll = FolderPoll(tmp_path)
     (tmp_path / first).touch()
     names_of(poll, 1)
@@ -336,7 +336,7 @@ def test_the_next_picture_costs_the_same_in_a_large_folder(tmp_path, monkeypatch
         assert poll.new() == [(k, f"{k:06d}.png")]
 
 
-def test_two_pictures_of_one_number_are_one_and_said(tmp_path):
+def test_of_two_pictures_of_one_number_one_is_used_and_the_other_is_noted(tmp_path):
     poll = FolderPoll(tmp_path)
     for name in ("a1.png", "a1.tif"):
         (tmp_path / name).touch()
@@ -345,21 +345,21 @@ def test_two_pictures_of_one_number_are_one_and_said(tmp_path):
     assert camera.notes == [f"{tmp_path}: two pictures of one frame: a1.png was used, a1.tif not"]
 
 
-def test_a_half_written_picture_is_waited_for_and_a_damaged_one_is_not(recorded, tmp_path):
+def test_an_incomplete_picture_is_read_again_and_a_damaged_one_is_reported(recorded, tmp_path):
     inbox = Inbox(("left",), 0.01, 0.05)
     camera = FolderCamera("left", FolderPoll(tmp_path), (320, 256), inbox, patience_s=0.05)
     whole = (recorded / "frames/left/000000.png").read_bytes()
     for name in ("0.png", "1.png"):
         (tmp_path / name).write_bytes(whole[: len(whole) // 3])
-    camera.look()
-    assert set(inbox.boxes["left"].incomplete) == {0, 1}
+    camera.poll_once()
+    assert set(inbox.queues["left"].incomplete) == {0, 1}
     (tmp_path / "0.png").write_bytes(whole)
     time.sleep(0.06)
-    camera.look()
-    box = inbox.boxes["left"]
-    assert not box.incomplete
-    assert np.array_equal(box.pictures[0].content, read_picture(recorded / "frames/left/000000.png", None))
-    assert box.pictures[1].content == Missing("unreadable: cut short")
+    camera.poll_once()
+    queue = inbox.queues["left"]
+    assert not queue.incomplete
+    assert np.array_equal(queue.pictures[0].content, read_picture(recorded / "frames/left/000000.png", None))
+    assert queue.pictures[1].content == Missing("unreadable: cut short")
 
 
 # -- when a frame is complete -----------------------------------------------------------------------------------------
@@ -367,72 +367,72 @@ def test_a_half_written_picture_is_waited_for_and_a_damaged_one_is_not(recorded,
 FOUND = Detections.none()
 
 
-def boxes_with(*given: tuple[str, int]) -> Inbox:
+def inbox_with(*given: tuple[str, int]) -> Inbox:
     inbox = Inbox(("a", "b"), interval_s=0.01, timeout_s=0.2)
     for camera, frame in given:
-        inbox.give(camera, frame, FOUND, None)
+        inbox.put(camera, frame, FOUND, None)
     return inbox
 
 
 def complete(inbox: Inbox, frame: int, waited_s: float) -> tuple[bool, list[str]]:
     now = time.perf_counter()
-    names = {id(box): name for name, box in inbox.boxes.items()}
-    done, given_up = is_complete(frame, list(inbox.boxes.values()), now + waited_s, now, 0.2, 0.01)
-    return done, [names[id(box)] for box in given_up]
+    names = {id(queue): name for name, queue in inbox.queues.items()}
+    done, now_timed_out = is_complete(frame, list(inbox.queues.values()), now + waited_s, now, 0.2, 0.01)
+    return done, [names[id(queue)] for queue in now_timed_out]
 
 
-def test_a_frame_is_complete_when_all_cameras_have_given_it():
-    assert complete(boxes_with(("a", 0), ("b", 0)), 0, 0.0) == (True, [])
-    assert complete(boxes_with(("a", 0)), 0, 0.0) == (False, [])
+def test_a_frame_is_complete_when_all_cameras_have_delivered_it():
+    assert complete(inbox_with(("a", 0), ("b", 0)), 0, 0.0) == (True, [])
+    assert complete(inbox_with(("a", 0)), 0, 0.0) == (False, [])
 
 
-def test_a_camera_that_has_given_a_later_frame_for_a_frames_time_has_dropped_this_one():
-    inbox = boxes_with(("a", 0), ("b", 1))
+def test_a_camera_with_a_later_frame_for_a_frame_interval_has_dropped_this_one():
+    inbox = inbox_with(("a", 0), ("b", 1))
     assert complete(inbox, 0, 0.0) == (False, [])
     assert complete(inbox, 0, 0.011) == (True, [])
 
 
-def test_a_camera_that_gives_nothing_is_given_up_after_the_timeout_and_not_waited_for_again():
-    inbox = boxes_with(("a", 0), ("a", 1))
+def test_a_silent_camera_times_out_once():
+    inbox = inbox_with(("a", 0), ("a", 1))
     assert complete(inbox, 0, 0.19) == (False, [])
     assert complete(inbox, 0, 0.21) == (True, ["b"])
-    inbox.boxes["b"].asleep = True
+    inbox.queues["b"].timed_out = True
     assert complete(inbox, 1, 0.0) == (True, [])
     inbox.next_frame = 1
-    inbox.give("b", 0, FOUND, None)  # it is late, but there again
-    assert inbox.boxes["b"].late == 1
+    inbox.put("b", 0, FOUND, None)  # it is late, but there again
+    assert inbox.queues["b"].late == 1
     assert complete(inbox, 1, 0.0) == (False, [])
 
 
 def test_a_camera_that_lags_by_more_than_the_timeout_is_not_waited_for():
-    inbox = boxes_with(("a", 100))
-    inbox.next_frame, inbox.boxes["b"].asleep = 100, True
-    inbox.give("b", 70, FOUND, None)
+    inbox = inbox_with(("a", 100))
+    inbox.next_frame, inbox.queues["b"].timed_out = 100, True
+    inbox.put("b", 70, FOUND, None)
     assert complete(inbox, 100, 0.0) == (True, [])
 
 
-def test_nothing_is_complete_before_any_camera_has_something():
-    assert complete(boxes_with(), 0, 100.0) == (False, [])
+def test_no_frame_is_complete_before_any_camera_has_a_picture():
+    assert complete(inbox_with(), 0, 100.0) == (False, [])
 
 
-def test_a_stray_number_is_left_out():
-    inbox = boxes_with(("a", 5))
+def test_a_stray_number_is_ignored():
+    inbox = inbox_with(("a", 5))
     inbox.next_frame = 5
-    inbox.give("a", 90_000, FOUND, None)
-    assert (inbox.boxes["a"].strays, set(inbox.boxes["a"].pictures)) == ([90_000], {5})
+    inbox.put("a", 90_000, FOUND, None)
+    assert (inbox.queues["a"].strays, set(inbox.queues["a"].pictures)) == ([90_000], {5})
 
 
 # -- devices ----------------------------------------------------------------------------------------------------------
 
 
-def test_frames_of_a_device_are_counted_while_they_come_in_time():
+def test_frames_of_a_device_that_loses_none_are_counted():
     clock = FrameClock(100.0)
     jitter = np.random.default_rng(1).normal(0, 0.002, 300)
     assert [clock.number(0.01 * k + float(jitter[k])) for k in range(300)] == list(range(300))
-    assert clock.left_out == 0
+    assert clock.lost == 0
 
 
-def test_pictures_that_a_device_lost_leave_a_gap_and_a_burst_does_not():
+def test_lost_pictures_of_a_device_leave_a_gap_and_a_burst_does_not():
     clock = FrameClock(100.0)
     times = [0.01 * k for k in range(50)]
     burst = [0.55 + 0.0005 * k for k in range(6)]  # 50 to 55 were held back
@@ -440,11 +440,11 @@ def test_pictures_that_a_device_lost_leave_a_gap_and_a_burst_does_not():
     numbers = [clock.number(t) for t in times + burst + lost]
     assert numbers[:70] == list(range(70))
     assert numbers[-1] == 99
-    assert clock.left_out == 3
+    assert clock.lost == 3
 
 
 class FakeCapture:
-    """A device with pictures of one grey value each, all there at once."""
+    """A device with uniform pictures, all available immediately."""
 
     def __init__(self, pictures: int, shape: tuple[int, ...] = (4, 6)) -> None:
         self.left, self.shape, self.released = pictures, shape, False
@@ -461,14 +461,14 @@ class FakeCapture:
 
 
 @pytest.mark.parametrize("shape", [(4, 6), (4, 6, 1), (4, 6, 3)])
-def test_a_device_that_is_not_kept_up_with_loses_pictures_and_ends_by_itself(shape):
+def test_a_device_that_is_faster_than_the_processing_loses_pictures(shape):
     inbox, capture = Inbox(("left",), 0.01, 0.1), FakeCapture(MOST_WAITING + 5, shape)
     camera = DeviceCamera("left", capture, (6, 4), inbox, FrameClock(100.0))
     inbox.wanted.set()
     camera.run()
-    box = inbox.boxes["left"]
-    assert (len(box.pictures), box.refused, capture.released) == (MOST_WAITING, 5, True)
-    assert all(np.array_equal(w.content, np.full((4, 6), 7)) for w in box.pictures.values())
+    queue = inbox.queues["left"]
+    assert (len(queue.pictures), queue.refused, capture.released) == (MOST_WAITING, 5, True)
+    assert all(np.array_equal(w.content, np.full((4, 6), 7)) for w in queue.pictures.values())
 
 
 def test_the_live_table_has_the_columns_of_the_contract(followed):

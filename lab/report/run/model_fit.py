@@ -70,7 +70,7 @@ def model_fit(block: Mapping[str, Any] | None) -> ModelFit | None:
 def _sentence(block: Mapping[str, Any], findings: tuple[FindingRow, ...]) -> str:
     if not block.get("tested"):
         return f"Not tested: {block.get('why_not') or 'no reason is given'}."
-    used = f"{block.get('frames_for_culprits')} frames, evenly spaced"
+    used = f"{block.get('frames_for_diagnosis')} frames, evenly spaced"
     if not findings:
         return f"Yes: no deviation of a camera, screen, beam or clock was found ({used})."
     if all(f.level == "small" for f in findings):

@@ -1,1 +1,1 @@
-"""Frames of a run: read, searched for spots, tracked."""
+"""Frames of a run: reading, sensor noise, detection and tracking."""

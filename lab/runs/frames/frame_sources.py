@@ -1,4 +1,4 @@
-"""Where one camera's pictures come from: a folder, a video, or a table of points found already."""
+"""Sources of one camera's pictures: a folder, a video, or a table of detected points."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ if TYPE_CHECKING:
     import cv2
 
 Picture: TypeAlias = Grey | Detections | Missing
-Asked: TypeAlias = Picture | Future[Grey | Missing] | Future[Grey | Missing | None]
+Requested: TypeAlias = Picture | Future[Grey | Missing] | Future[Grey | Missing | None]
 _LAST_NUMBER = re.compile(r"([0-9]+)[^0-9]*$")
 
 
-def arrived(asked: Asked) -> Picture | None:
-    """The picture that was asked for, waited for; None: the pictures have ended."""
-    return asked.result() if isinstance(asked, Future) else asked
+def result_of(requested: Requested) -> Picture | None:
+    """Wait for a requested picture; None: the pictures have ended."""
+    return requested.result() if isinstance(requested, Future) else requested
 
 
 class Grabbed(Protocol):
@@ -38,7 +38,10 @@ class Grabbed(Protocol):
 
 
 def retrieved(capture: Grabbed, size_px: tuple[int, int] | None) -> Grey | Missing:
-    """The picture that a capture has grabbed, as grey of this (width, height); it may use the buffer again."""
+    """The picture that a capture has grabbed, as grey values of this (width, height).
+
+    The array may be the capture's own buffer, which the next picture overwrites.
+    """
     good, picture = capture.retrieve()
     if not good or picture is None:
         return Missing(f"{UNREADABLE}: damaged")
@@ -49,31 +52,31 @@ def retrieved(capture: Grabbed, size_px: tuple[int, int] | None) -> Grey | Missi
 
 
 class Source(Protocol):
-    """Gives one camera's pictures; asked for every frame number, rising."""
+    """One camera's pictures. Every frame number is requested once, in increasing order."""
 
-    def ask(self, frame: int, pool: ThreadPoolExecutor) -> Asked:
-        """This frame's picture, now or later; a future of None: the pictures have ended."""
+    def request(self, frame: int, pool: ThreadPoolExecutor) -> Requested:
+        """This frame's picture, or a future of it; a future of None: the pictures have ended."""
 
     def close(self) -> None:
-        """Give back files and threads."""
+        """Close files and threads."""
 
 
 @dataclass(frozen=True, slots=True)
 class FolderListing:
-    """The pictures of a folder by their number, and the files that are none."""
+    """The pictures of a folder by frame number, and the files that are not pictures."""
 
     folder: Path
-    names: dict[int, str]  # rising numbers
+    names: dict[int, str]  # by increasing frame number
     ignored: tuple[str, ...]
 
     @property
     def numbers(self) -> Ints:
-        """(n,) rising."""
+        """Frame numbers (n,), increasing."""
         return np.fromiter(self.names, dtype=np.int64, count=len(self.names))
 
 
 def number_of(name: str) -> int | None:
-    """The frame number in a picture's file name: its last group of digits, before the ending. None: no such picture."""
+    """The frame number in a picture's file name: the last group of digits before the suffix. None: not a picture."""
     stem, suffix = os.path.splitext(name)
     match = _LAST_NUMBER.search(stem)
     if name.startswith(".") or suffix.lower() not in SUFFIXES or match is None or len(match[1].lstrip("0")) > 15:
@@ -82,9 +85,10 @@ def number_of(name: str) -> int | None:
 
 
 def list_folder(folder: Path) -> FolderListing:
-    """Find the pictures in a folder: the number is the last group of digits of the name, without its ending.
+    """Find the pictures in a folder, with the frame number from their names (see `number_of`).
 
-    Raises InputError for two pictures of one number, and for a folder without any.
+    Raises:
+        InputError: two pictures have the same number, or the folder has none or cannot be read.
     """
     names: dict[int, str] = {}
     ignored = []
@@ -101,7 +105,7 @@ def list_folder(folder: Path) -> FolderListing:
         if number in names:
             raise InputError(
                 f"{folder}: expected one picture per frame, got {names[number]} and {name} for frame {number};"
-                " take one away"
+                " remove one"
             )
         names[number] = name
     if not names:
@@ -112,12 +116,12 @@ def list_folder(folder: Path) -> FolderListing:
 
 @dataclass(frozen=True, slots=True)
 class FolderSource:
-    """Pictures by number."""
+    """Picture files by frame number."""
 
     listing: FolderListing
     size_px: tuple[int, int]
 
-    def ask(self, frame: int, pool: ThreadPoolExecutor) -> Asked:
+    def request(self, frame: int, pool: ThreadPoolExecutor) -> Requested:
         name = self.listing.names.get(frame)
         if name is None:
             return Missing(DROPPED)
@@ -128,17 +132,17 @@ class FolderSource:
 
 @dataclass(frozen=True, slots=True)
 class TableSource:
-    """Points found already.
+    """Points that another program, or an earlier run, has detected.
 
-    Within the file's range a frame without a row is a picture in which nothing was found; one of whose rows none can be
-    used is a picture that cannot be read.
+    Within the file's range, a frame without rows is a picture without points; a frame whose rows are all invalid is a
+    picture that cannot be read.
     """
 
     points: CameraPoints | None  # None: no row of this camera
     first: int
     last: int
 
-    def ask(self, frame: int, pool: ThreadPoolExecutor) -> Asked:
+    def request(self, frame: int, pool: ThreadPoolExecutor) -> Requested:
         if not self.first <= frame <= self.last:
             return Missing(DROPPED)
         if self.points is None:
@@ -151,16 +155,16 @@ class TableSource:
 
 
 class VideoSource:
-    """A video, decoded one picture after the other in a thread of its own."""
+    """A video, decoded picture by picture in its own thread."""
 
     def __init__(self, path: Path, size_px: tuple[int, int] | None) -> None:
-        """size_px: width and height of its pictures; None: any."""
+        """size_px: width and height of its pictures; None: any size."""
         self._capture = open_video(path)
         self._size_px = size_px
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="video")
-        self.pictures = 0  # read so far
+        self.pictures = 0  # number read so far
 
-    def ask(self, frame: int, pool: ThreadPoolExecutor) -> Asked:
+    def request(self, frame: int, pool: ThreadPoolExecutor) -> Requested:
         return self._thread.submit(self._next) if frame >= 0 else Missing(DROPPED)
 
     def _next(self) -> Grey | Missing | None:
@@ -170,11 +174,11 @@ class VideoSource:
         return retrieved(self._capture, self._size_px)
 
     def skip(self) -> bool:
-        """Pass over one picture; False at the end."""
+        """Skip one picture; False at the end."""
         return bool(self._capture.grab())
 
     def next_picture(self) -> Grey | Missing | None:
-        """The next picture, now; None at the end. Not to be mixed with `ask`."""
+        """The next picture; None at the end. Must not be mixed with `request`."""
         return self._next()
 
     def close(self) -> None:
@@ -183,20 +187,24 @@ class VideoSource:
 
 
 def open_video(path: Path) -> cv2.VideoCapture:
-    """An opened video. Raises InputError where OpenCV cannot read it."""
+    """Open a video.
+
+    Raises:
+        InputError: OpenCV cannot read it.
+    """
     cv2 = quiet_cv2()
     capture = cv2.VideoCapture(str(path))
     if not capture.isOpened():
         raise InputError(
             f"{path}: expected a video that OpenCV can read; it cannot open this file (damaged, no video?)"
         )
-    capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)  # grey videos stay as they are, with 16 bits too; others still come as BGR
-    capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)  # pixels where the sensor has them
+    capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)  # keeps grey videos, of 8 or 16 bits, unchanged; others still come as BGR
+    capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)  # no rotation: pixels stay in the sensor's order
     return capture
 
 
-def promised_pictures(path: Path) -> int | None:
-    """How many pictures the video's header promises; it may be wrong. None where it says nothing."""
+def header_picture_count(path: Path) -> int | None:
+    """Number of pictures by the video's header, which may be wrong; None where it states none."""
     capture = open_video(path)
     count = capture.get(quiet_cv2().CAP_PROP_FRAME_COUNT)
     capture.release()

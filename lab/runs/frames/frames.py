@@ -1,4 +1,4 @@
-"""The pictures of a run by frame number, all cameras together, read ahead of the one who works on them."""
+"""The pictures of a run by frame number, all cameras together, read ahead in threads."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,36 +19,44 @@ from lab.files.run.run_file import DetectionsTable, FramesFolder, LiveDevice, Ru
 from lab.files.text.error_text import did_you_mean
 from lab.pictures.picture_file import DROPPED, Grey, Missing
 from lab.runs.frames.frame_sources import (
-    Asked,
     FolderListing,
     FolderSource,
     Picture,
+    Requested,
     Source,
     TableSource,
     VideoSource,
-    arrived,
+    header_picture_count,
     list_folder,
-    promised_pictures,
+    result_of,
 )
 
 __all__ = ["FrameReader", "FrameSet", "Grey", "Missing", "Picture", "open_frames", "pictures_at"]
 
-AHEAD = 8  # frames read before they are asked for: 21 MB of two 1280x1024 cameras, whatever the run's length
+AHEAD = 8  # frames read before they are requested: 21 MB for two 1280x1024 cameras, whatever the run's length
 THREADS = min(4, os.cpu_count() or 1)  # pictures decoded at once
-BEYOND_PX = 32.0  # a fit may put the centre of a spot that the edge cuts outside the picture, but not so far
-NAMED = 5  # so many frames of each trouble are named in the notes
+BEYOND_PX = 32.0  # a fit may put the centre of a spot at the edge outside the picture, but never farther than this
+NAMED = 5  # frames that a note names for each kind of problem
 
 
 @dataclass(frozen=True, slots=True)
 class FrameSet:
-    """What all cameras have for one frame number."""
+    """The pictures of all cameras for one frame number."""
 
     frame: int
-    images: Mapping[str, Picture]  # by camera: grey (h, w) u8 or u16, the points found already, or Missing
+    images: Mapping[str, Picture]  # by camera: grey (h, w) u8 or u16, detected points, or Missing
+
+
+@dataclass(slots=True)
+class _MissingFrames:
+    """The frames that one camera lacks for one reason."""
+
+    count: int = 0
+    first: list[int] = field(default_factory=list)  # the first NAMED of them
 
 
 class FrameReader:
-    """Iterates over all frame numbers from the first to the last of any camera. May be iterated again.
+    """Iterates over all frame numbers from the first to the last of any camera. It can be iterated repeatedly.
 
     Pictures are read and decoded in threads; at most `AHEAD` frames are in flight.
     """
@@ -58,15 +66,15 @@ class FrameReader:
         self._listings: dict[str, FolderListing] = {}
         self._tables: dict[str, DetectionsFile] = {}
         self._notes: list[str] = []
-        self._trouble: dict[str, dict[str, tuple[int, list[int]]]] = {}  # camera, reason: count, first frames
+        self._missing: dict[tuple[str, str], _MissingFrames] = {}  # by camera and reason
         self._ended: dict[str, str] = {}
-        self._promised: dict[str, int | None] = {}
+        self._stated_counts: dict[str, int | None] = {}
         opened: dict[Path, DetectionsFile] = {}
         for name, source in run.cameras.items():
             if isinstance(source, FramesFolder):
                 self._listings[name] = list_folder(source.path)
             elif isinstance(source, VideoFile):
-                self._promised[name] = promised_pictures(source.path)
+                self._stated_counts[name] = header_picture_count(source.path)
             elif isinstance(source, LiveDevice):
                 raise InputError(
                     f"{run.path}: cameras.{name}.device: expected recorded frames or detections, got a live camera; use"
@@ -83,7 +91,7 @@ class FrameReader:
 
     @property
     def cameras(self) -> tuple[str, ...]:
-        """Their names, in the rig's order."""
+        """Names of the cameras, in the rig's order."""
         return tuple(self._run.cameras)
 
     @property
@@ -93,25 +101,26 @@ class FrameReader:
 
     @property
     def expected_frames(self) -> int | None:
-        """How many frame numbers there will be; of videos what their headers promise. None where nothing tells."""
-        promised = list(self._promised.values())
-        if None in promised:
+        """Number of frame numbers, for videos by their headers; None where unknown."""
+        counts = list(self._stated_counts.values())
+        if None in counts:
             return None
-        ends = [n - 1 for n in promised if n is not None] + ([] if self.last is None else [self.last])
+        ends = [n - 1 for n in counts if n is not None] + ([] if self.last is None else [self.last])
         return max(ends) - self.first + 1
 
     @property
     def notes(self) -> list[str]:
-        """What a reader of the results should know, in plain words; complete once the iteration has ended."""
+        """Notes for the user of the results; complete once the iteration has ended."""
         out = list(self._notes) + list(self._ended.values())
-        for camera, reasons in self._trouble.items():
-            for reason, (count, frames) in reasons.items():
-                some = ", ".join(map(str, frames)) + (", ..." if count > len(frames) else "")
-                out.append(f"{camera}: {count} frame{'s' if count > 1 else ''} {reason} ({some})")
+        for camera in self._run.cameras:
+            for (of, reason), missing in self._missing.items():
+                if of == camera:
+                    some = ", ".join(map(str, missing.first)) + (", ..." if missing.count > NAMED else "")
+                    out.append(f"{camera}: {missing.count} frame{'s' if missing.count > 1 else ''} {reason} ({some})")
         return out
 
     def __iter__(self) -> Iterator[FrameSet]:
-        self._trouble, self._ended = {c: {} for c in self._run.cameras}, {}
+        self._missing, self._ended = {}, {}
         with ExitStack() as stack:
             pool = ThreadPoolExecutor(THREADS, thread_name_prefix="decode")
             stack.callback(pool.shutdown, cancel_futures=True)
@@ -119,19 +128,19 @@ class FrameReader:
             for name in self._run.cameras:
                 sources[name] = self._open(name)
                 stack.callback(sources[name].close)
-            in_flight: deque[tuple[int, dict[str, Asked]]] = deque()
-            asked = self.first
+            in_flight: deque[tuple[int, dict[str, Requested]]] = deque()
+            following = self.first
             while True:
-                while len(in_flight) < AHEAD and (self._promised or self.last is None or asked <= self.last):
-                    in_flight.append((asked, {name: s.ask(asked, pool) for name, s in sources.items()}))
-                    asked += 1
+                while len(in_flight) < AHEAD and (self._stated_counts or self.last is None or following <= self.last):
+                    in_flight.append((following, {name: s.request(following, pool) for name, s in sources.items()}))
+                    following += 1
                 if not in_flight:
                     return
                 frame, waiting = in_flight.popleft()
-                got = {name: arrived(w) for name, w in waiting.items()}
+                got = {name: result_of(w) for name, w in waiting.items()}
                 ended = [name for name, picture in got.items() if picture is None]
                 self._note_ends(ended, frame)
-                if len(ended) == len(self._promised) and (self.last is None or frame > self.last):
+                if len(ended) == len(self._stated_counts) and (self.last is None or frame > self.last):
                     return
                 images = {name: Missing(DROPPED) if picture is None else picture for name, picture in got.items()}
                 self._count(frame, images)
@@ -151,7 +160,7 @@ class FrameReader:
         """First and last frame number; the last as far as it is known without reading videos to their end."""
         firsts = [int(v.numbers[0]) for v in self._listings.values()] + [t.first for t in self._tables.values()]
         lasts = [int(v.numbers[-1]) for v in self._listings.values()] + [t.last for t in self._tables.values()]
-        if self._promised:
+        if self._stated_counts:
             firsts.append(0)
         return min(firsts), max(lasts) if lasts else None
 
@@ -166,12 +175,12 @@ class FrameReader:
             raise InputError(
                 f"{self._run.path}: cameras: expected frame numbers without gaps of many thousands, got {pictures}"
                 f" pictures between frame {self.first} and frame {self.last}; is a stray {stray} among them, or do the"
-                f" {holders} hold a time?"
+                f" {holders} contain a time?"
             )
         self._check_strays()
 
     def _check_strays(self) -> None:
-        """Raises InputError for a few pictures far from all others. (Of tables such rows are left out.)"""
+        """Raises InputError for a few pictures with numbers far from all others. (Tables omit such rows.)"""
         everything: list[Ints] = [v.numbers for v in self._listings.values()]
         everything += [c.frames for t in self._tables.values() for c in t.cameras.values()]
         numbers = np.unique(np.concatenate(everything)) if everything else np.empty(0, np.int64)
@@ -182,7 +191,7 @@ class FrameReader:
                     others = numbers[~strays]
                     raise InputError(
                         f"{listing.folder / listing.names[number]}: expected frame numbers without a long gap, got"
-                        f" {number}, where the others are {others[0]} to {others[-1]}; is it a stray file? Take it away"
+                        f" {number}, where the others are {others[0]} to {others[-1]}; is it a stray file? Remove it"
                     )
 
     def _check_times(self) -> None:
@@ -216,8 +225,8 @@ class FrameReader:
             return
         if name in table.spoilt:
             raise InputError(
-                f"{path}: camera {name!r}: expected rows that can be used, got none: {table.spoilt[name]}; put them"
-                f" right, or leave {name!r} out of `cameras` in {self._run.path}"
+                f"{path}: camera {name!r}: expected rows that can be used, got none: {table.spoilt[name]}; put"
+                f" them right, or leave {name!r} out of `cameras` in {self._run.path}"
             )
         unknown = self._unknown(table)
         if unknown:
@@ -226,10 +235,10 @@ class FrameReader:
                 f" which the rig does not have{did_you_mean(unknown[0], self._run.rig.cameras)}"
             )
         self._tables[name] = table
-        self._notes.append(f"{path}: no rows of camera {name!r}; it is taken to have found nothing")
+        self._notes.append(f"{path}: no rows of camera {name!r}; all its pictures count as empty")
 
     def _in_picture(self, name: str, path: Path, points: CameraPoints) -> CameraPoints:
-        """A camera's points without those far outside its picture. Raises InputError where that is most of them."""
+        """A camera's points without those far outside its picture. Raises InputError if most of them are."""
         size = np.array(self._run.rig.cameras[name].image_size_px)
         uv = points.points.uv_px
         outside: Bools = np.any((uv < -0.5 - BEYOND_PX) | (uv > size - 0.5 + BEYOND_PX), axis=-1)
@@ -238,49 +247,55 @@ class FrameReader:
         if count[fullest] > self._run.tracker.detect.max_detections:
             self._notes.append(
                 f"{path}: camera {name!r}: up to {count[fullest]} points in one picture (frame"
-                f" {points.frames[fullest]}); few spots are sure to be told from so many, and it takes longer"
+                f" {points.frames[fullest]}); among so many, spots are hard to identify, and processing takes longer"
             )
         if not outside.any():
             return points
         row = int(np.flatnonzero(outside)[0])
         frame = int(points.frames[np.searchsorted(points.starts, row, side="right") - 1])
-        told = (
+        text = (
             f"{outside.sum()} of {len(uv)} points more than {BEYOND_PX:g} px outside its picture of"
             f" {size[0]}x{size[1]} px (the first in frame {frame}, at {uv[row, 0]:.7g}, {uv[row, 1]:.7g})"
         )
         if outside.mean() > 0.5:
             raise InputError(
-                f"{path}: camera {name!r}: expected points in the picture, got {told}; are u and v exchanged, or the"
+                f"{path}: camera {name!r}: expected points in the picture, got {text}; are u and v exchanged, or the"
                 " pictures of another size than the rig says?"
             )
-        self._notes.append(f"{path}: camera {name!r}: left out: {told}")
+        self._notes.append(f"{path}: camera {name!r}: left out: {text}")
         return points.without(outside)
 
     def _note_ends(self, ended: Sequence[str], frame: int) -> None:
         for name in ended:
-            promised = self._promised[name]
-            if name not in self._ended and promised is not None and frame < promised:
+            stated = self._stated_counts[name]
+            if name not in self._ended and stated is not None and frame < stated:
                 source = self._run.cameras[name]
-                self._ended[name] = f"{source.path}: ended after {frame} pictures; its header says {promised}"
+                self._ended[name] = f"{source.path}: ended after {frame} pictures; its header states {stated}"
 
     def _count(self, frame: int, images: Mapping[str, Picture]) -> None:
         for camera, picture in images.items():
             if isinstance(picture, Missing):
-                count, frames = self._trouble[camera].get(picture.reason, (0, []))
-                self._trouble[camera][picture.reason] = (count + 1, [*frames, frame][:NAMED])
+                missing = self._missing.setdefault((camera, picture.reason), _MissingFrames())
+                missing.count += 1
+                if len(missing.first) < NAMED:
+                    missing.first.append(frame)
 
 
 def open_frames(run: Run) -> FrameReader:
-    """The reader of a run's pictures.
+    """The reader of a run's pictures. Single damaged pictures are no error: they are Missing.
 
-    Raises InputError where there is nothing to read: an empty folder, two pictures of one number, a video or table that
-    cannot be read, a frame without a timestamp. Damaged single pictures are no error: they come as Missing.
+    Raises:
+        InputError: a folder is empty or has two pictures of one number, a video or table cannot be read, or a frame has
+            no timestamp.
     """
     return FrameReader(run)
 
 
 def pictures_at(run: Run, camera: str, frames: Sequence[int]) -> dict[int, Picture]:
-    """Some pictures of one camera, for looking at; a video is read from its start, so ask once for all."""
+    """Some pictures of one camera, by frame number.
+
+    A video is read from its start, so all pictures should be requested in one call.
+    """
     wanted = sorted(set(frames))
     source, size_px = run.cameras[camera], run.rig.cameras[camera].image_size_px
     out: dict[int, Picture] = {}
@@ -296,14 +311,14 @@ def pictures_at(run: Run, camera: str, frames: Sequence[int]) -> dict[int, Pictu
                 at += 1
                 out[frame] = Missing(DROPPED) if shown is None else shown
         elif isinstance(source, DetectionsTable):
-            out = dict.fromkeys(wanted, Missing("no pictures: points found already"))
+            out = dict.fromkeys(wanted, Missing("no pictures: detected points"))
         elif isinstance(source, LiveDevice):
             out = dict.fromkeys(wanted, Missing("no pictures: a live camera"))
         else:
             folder = FolderSource(list_folder(source.path), size_px)
             pool = stack.enter_context(ThreadPoolExecutor(THREADS))
-            asked = {frame: folder.ask(frame, pool) for frame in wanted}
-            for frame, later in asked.items():
-                picture = arrived(later)
+            requested = {frame: folder.request(frame, pool) for frame in wanted}
+            for frame, later in requested.items():
+                picture = result_of(later)
                 out[frame] = Missing(DROPPED) if picture is None else picture
     return out

@@ -1,4 +1,4 @@
-"""From a run to records, one per frame: pictures in, detection, tracking, pose. A generator: nothing piles up."""
+"""The pipeline from a run's pictures to one record per frame: detection, tracking, pose. It is a generator."""
 
 from __future__ import annotations
 
@@ -23,46 +23,47 @@ from tracking.tracked_frame import TrackedFrame
 
 
 class Tracker(Protocol):
-    """What is fed the detections of one frame after the other, whatever its method."""
+    """A tracker of any method: it processes the detections frame by frame."""
 
     @property
     def noise_scale(self) -> float:
-        """How much larger than claimed the spots' errors are."""
+        """Ratio of the spots' errors to their stated sigmas."""
 
     def step(self, dt_s: float, found: Sequence[Detections | None]) -> TrackedFrame:
-        """One frame. dt_s: time since the frame before (0 for the first); found: per camera, None without a picture."""
+        """Process one frame.
+
+        dt_s: time since the previous frame (0 for the first). found: per camera, None without a picture.
+        """
 
 
 class Frames(Protocol):
-    """Where the pictures of all cameras come from, frame by frame: recorded (lab.runs.frames.frames) or live
-    (lab.watch).
-    """
+    """The pictures of all cameras, frame by frame: recorded (lab.runs.frames.frames) or live (lab.watch)."""
 
     @property
     def notes(self) -> list[str]:
-        """What a reader of the results should know, in plain words; complete once the iteration has ended."""
+        """Notes for the user of the results; complete once the iteration has ended."""
 
     @property
     def expected_frames(self) -> int | None:
-        """How many frames there will be; None where nothing tells."""
+        """Number of frames; None where unknown."""
 
     def __iter__(self) -> Iterator[FrameSet]: ...
 
 
 @dataclass(frozen=True, slots=True)
 class FrameRecord:
-    """All that is known of one frame."""
+    """Detections and tracking result of one frame."""
 
     frame: int
     t_s: float
-    dt_s: float  # since the record before; 0 for the first
+    dt_s: float  # since the previous record; 0 for the first
     detections: tuple[Detections | None, ...]  # per camera of the run; None without a usable picture
-    missing: tuple[str, ...]  # per camera: why there is no picture; "" where there is one
+    missing: tuple[str, ...]  # per camera: the reason why there is no picture; "" where there is one
     tracked: TrackedFrame
 
 
 def tracker_of(run: Run) -> Tracker:
-    """The tracker of the run's method, at its start; without a prior the vehicle may be wherever its spots are seen."""
+    """A new tracker of the run's method; without a prior it starts from all poses that show the spots."""
     prior = PosePrior.everywhere(run.rig) if run.prior is None else run.prior
     if run.tracker.method == "spots":
         return SpotTracker(run.rig, run.tracker, prior, run.covariance)
@@ -71,7 +72,7 @@ def tracker_of(run: Run) -> Tracker:
 
 @dataclass(slots=True)
 class Timings:
-    """Seconds spent, wall clock of the thread that works."""
+    """Wall-clock time spent in the processing thread, s."""
 
     waiting: float = 0.0  # for pictures
     detection: float = 0.0
@@ -81,39 +82,43 @@ class Timings:
 
 @dataclass(slots=True)
 class Pipeline:
-    """One run in work. Iterate over `records()` once; `notes`, `noise` and `timings` are complete afterwards."""
+    """Processes one run. Iterate over `records()` once; `notes`, `noise` and `timings` are complete afterwards."""
 
     run: Run
     reader: Frames
     tracker: Tracker
     noise: dict[str, CameraNoise]  # of cameras with pictures
-    on_record: Callable[[FrameRecord], None] | None = None  # called with each record as soon as it is known
+    on_record: Callable[[FrameRecord], None] | None = None  # called with each record at once
     timings: Timings = field(default_factory=Timings)
     _offsets: dict[str, CentreOffsets] = field(default_factory=dict)
 
     @staticmethod
     def of(run: Run) -> Pipeline:
-        """Open a run. Raises InputError where its pictures cannot be found."""
+        """Open a run.
+
+        Raises:
+            InputError: its pictures cannot be found.
+        """
         reader = open_frames(run)
         return Pipeline(run, reader, tracker_of(run), camera_noises(run, reader))
 
     @property
     def notes(self) -> list[str]:
-        """What a reader of the results should know of the pictures; complete once the iteration has ended."""
+        """Notes on the pictures for the user of the results; complete once the iteration has ended."""
         return self.reader.notes + [note for noise in self.noise.values() for note in noise.notes]
 
     def records(self) -> Iterator[FrameRecord]:
         """One record per frame number, from the first to the last."""
-        before: float | None = None
+        previous_s: float | None = None
         clock = time.perf_counter()
         for frames in self.reader:
             clock = self._spent("waiting", clock)
             t_s = float(self.run.times.t_s(frames.frame))
             found, missing = self._detect(frames)
             clock = self._spent("detection", clock)
-            dt_s = 0.0 if before is None else t_s - before
+            dt_s = 0.0 if previous_s is None else t_s - previous_s
             tracked = self.tracker.step(dt_s, found)
-            before = t_s
+            previous_s = t_s
             self._spent("tracking", clock)
             record = FrameRecord(frames.frame, t_s, dt_s, found, missing, tracked)
             if self.on_record is not None:
@@ -122,12 +127,12 @@ class Pipeline:
             clock = time.perf_counter()
 
     def detections(self) -> Iterator[tuple[int, tuple[Detections | None, ...]]]:
-        """Frame numbers and the points found in each, without tracking them. Instead of `records`, not beside it."""
+        """Frame numbers and the points found in each, without tracking. Not to be used together with `records`."""
         for frames in self.reader:
             yield frames.frame, self._detect(frames)[0]
 
     def spots_in(self, camera: str, picture: Grey) -> Detections:
-        """The points that one picture of a camera shows. For one thread at a time and camera."""
+        """The points in one picture of a camera. Not thread-safe for the same camera."""
         noise = self.noise[camera]
         points = noise.detect(picture, self.run.tracker.detect)
         return on_beam_axes(points, self._offsets_of(camera), noise.model)
@@ -160,7 +165,7 @@ class Pipeline:
 
 
 def on_beam_axes(found: Detections, offsets: CentreOffsets, noise: NoiseModel | None) -> Detections:
-    """Detections (n) with their centres moved from the light's centre to the image of the beam's axis."""
+    """Detections (n) with positions shifted from the light's centroid to the image of the beam's axis."""
     if not len(found) or noise is None:
         return found
     c, s = np.cos(np.radians(found.angle_deg)), np.sin(np.radians(found.angle_deg))

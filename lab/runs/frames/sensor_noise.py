@@ -1,4 +1,4 @@
-"""The noise model that each camera's pictures are searched with: stated in rig.yaml, or estimated from the pictures."""
+"""Noise model of each camera for the detection: stated in rig.yaml, or estimated from the pictures."""
 
 from __future__ import annotations
 
@@ -18,39 +18,36 @@ from tracking.noise import NoiseModel, Picture, guess_noise
 from tracking.noise_estimation.photon_transfer import NoiseEstimate, estimate_noise
 from tracking.parameters import DetectParameters
 
-VIDEO_PICTURES = (0, 1, 8, 9, 16, 17)  # of a video, whose end cannot be read without reading all of it
-_BLANK = 3  # pictures without any point, after which the noise is doubted ...
-_BLANK_AGAIN = 50  # ... and again after so many more
-_CONTRADICTION = 2.0  # factor between a stated and an estimated variance of the background that is worth a note
+VIDEO_PICTURES = (0, 1, 8, 9, 16, 17)  # used for the estimate: the end of a video cannot be read without all of it
+_BLANK = 3  # consecutive pictures without any point after which the noise model is checked
+_BLANK_AGAIN = 50  # it is checked again after this many more
+_CONTRADICTION = 2.0  # ratio of the stated to the estimated background variance from which a note is made
 
 
 @dataclass(slots=True)
 class CameraNoise:
-    """One camera's noise: what it is searched with and where that comes from."""
+    """The noise model of one camera, and its source."""
 
     camera: str
     stated: SensorNoise | None = None
-    estimate: NoiseEstimate | None = None
     notes: list[str] = field(default_factory=list)
-    _overruled: bool = False  # the stated noise finds nothing where there is light
-    _blank: int = 0
-    _recent: deque[Picture] = field(default_factory=lambda: deque(maxlen=2))
+    estimate: NoiseEstimate | None = field(default=None, init=False)
+    model: NoiseModel | None = field(
+        default=None, init=False
+    )  # in use; None before the first estimate if none is stated
+    _overruled: bool = field(default=False, init=False)  # the stated noise misses visible spots
+    _blank: int = field(default=0, init=False)  # consecutive pictures without any point
+    _recent: deque[Picture] = field(default_factory=lambda: deque(maxlen=2), init=False)
 
-    @property
-    def model(self) -> NoiseModel | None:
-        """The model in use; None before the first picture."""
-        seen = None if self.estimate is None else self.estimate.model
-        if self.stated is None or self._overruled:
-            return seen
-        stated = NoiseModel.of(self.stated)
-        # A sensor's data sheet does not know what its pictures show.
-        return stated if seen is None else replace(stated, texture=seen.texture, banding_dn=seen.banding_dn)
+    def __post_init__(self) -> None:
+        self._update_model()
 
-    def learn(self, pictures: Sequence[Picture]) -> None:
-        """Estimate from some pictures, in their order of time; nothing happens without any."""
+    def estimate_from(self, pictures: Sequence[Picture]) -> None:
+        """Estimate the noise from some pictures in temporal order; without any, nothing changes."""
         if not pictures:
             return
         self.estimate = estimate_noise(pictures)
+        self._update_model()
         if self.stated is not None:
             level = self.estimate.model.black_dn
             stated = float(NoiseModel.of(self.stated).variance(level))
@@ -63,9 +60,9 @@ class CameraNoise:
                 )
 
     def detect(self, picture: Picture, parameters: DetectParameters) -> Detections:
-        """The points of one picture. A camera that finds nothing where there is light learns its noise again."""
+        """The points of one picture. After pictures without any point the noise is estimated again."""
         if self.model is None:
-            self.learn([picture])
+            self.estimate_from([picture])
         found = self._search(picture, parameters, self.model)
         if len(found):
             self._blank = 0
@@ -74,7 +71,7 @@ class CameraNoise:
         self._recent.append(picture)
         self._blank += 1
         if self._blank % _BLANK_AGAIN == _BLANK and len(self._search(picture, parameters, guess_noise(picture))):
-            return self._learn_again(picture, parameters)
+            return self._estimate_again(picture, parameters)
         return found
 
     def as_mapping(self) -> dict[str, Any]:
@@ -94,7 +91,18 @@ class CameraNoise:
             parameters = replace(parameters, saturation_dn=self.estimate.saturation_dn)
         return find_spots(picture, parameters, model)
 
-    def _learn_again(self, picture: Picture, parameters: DetectParameters) -> Detections:
+    def _update_model(self) -> None:
+        """Stated values take precedence; texture and banding are always estimated, since a data sheet has none."""
+        estimated = None if self.estimate is None else self.estimate.model
+        if self.stated is None or self._overruled:
+            self.model = estimated
+            return
+        stated = NoiseModel.of(self.stated)
+        if estimated is not None:
+            stated = replace(stated, texture=estimated.texture, banding_dn=estimated.banding_dn)
+        self.model = stated
+
+    def _estimate_again(self, picture: Picture, parameters: DetectParameters) -> Detections:
         estimate = estimate_noise(list(self._recent))
         found = self._search(picture, parameters, estimate.model)
         if len(found):
@@ -107,11 +115,12 @@ class CameraNoise:
                     " show light; the noise of the pictures was used from there on. Correct `noise` in rig.yaml, or"
                     " leave it out"
                 )
+            self._update_model()
         return found
 
 
 def camera_noises(run: Run, reader: FrameReader) -> dict[str, CameraNoise]:
-    """Each camera's noise at the start of a run. Tables of points need none and have no entry."""
+    """Each camera's noise at the start of a run; cameras with tables of points have no entry."""
     out = {}
     for name, camera in run.rig.cameras.items():
         if isinstance(run.cameras[name], DetectionsTable):
@@ -119,17 +128,19 @@ def camera_noises(run: Run, reader: FrameReader) -> dict[str, CameraNoise]:
         out[name] = CameraNoise(name, camera.noise)
         if isinstance(run.cameras[name], FramesFolder):
             numbers = reader.listings[name].numbers
-            wanted = [int(numbers[i]) for i in frames_to_learn_from(len(numbers))]
+            wanted = [int(numbers[i]) for i in noise_estimation_frames(len(numbers))]
         else:
             wanted = list(VIDEO_PICTURES)
         shown = pictures_at(run, name, wanted)
-        out[name].learn([p for _, p in sorted(shown.items()) if isinstance(p, np.ndarray)])
+        out[name].estimate_from([p for _, p in sorted(shown.items()) if isinstance(p, np.ndarray)])
     return out
 
 
-def frames_to_learn_from(pictures: int) -> list[int]:
-    """Pairs of neighbours at the start, in the middle and at the end of so many pictures: the same light, in many
-    places."""
+def noise_estimation_frames(pictures: int) -> list[int]:
+    """Indices of pairs of neighbouring pictures at the start, in the middle and at the end of a recording.
+
+    The light of neighbours is nearly the same; pairs far apart have their spots in different places.
+    """
     last = pictures - 1
     wanted = {0, 1, last // 2, last // 2 + 1, last - 1, last}
     return [i for i in sorted(wanted) if 0 <= i <= last]

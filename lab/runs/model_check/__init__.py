@@ -1,1 +1,1 @@
-"""Whether the rig file fits a recording, and which part of it does not."""
+"""The model check of a run: frames sampled from the run, the test (calibration/model_check), findings and summary."""

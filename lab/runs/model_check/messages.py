@@ -1,65 +1,99 @@
-"""The model check's findings in words: which thing, by how much, what it does to the pose, what to do."""
+"""Findings of the model check: which component is wrong, by how much, the effect on the pose, and the remedy."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
 from calibration.findings import Finding, Level
+from calibration.model_check import faults as f
+from calibration.model_check.check import FEWEST_FRAMES, FEWEST_SPOTS, ModelCheckResult, NotTested
+from calibration.model_check.effect import Effect
+from calibration.model_check.fault_identification import FaultDiagnosis, FittedFault, SuspectedFault
+from calibration.model_check.noise_scales import UNEVEN, is_noisy
+from calibration.model_check.unseen import UnseenView
 from geometry.forward_model import SpotModel
 from lab.number_format import plus_minus, short
-from lab.runs.model_check import faults as f
-from lab.runs.model_check.effect import Effect
-from lab.runs.model_check.fault_identification import Explained, FaultDiagnosis, SuspectedFault
 
-MATTERS_SIGMAS = 0.5  # of a pose's claimed sigmas, or of a spot's: a bias below it is lost in what is claimed anyway
-WRONG_SIGMAS = (
-    5.0  # beyond it the run's claims are untrue; the misfit gate's limit is the same (lab/runs/verdict/quality.py)
-)
-NOISY = 1.5  # factor on the claimed sigmas from which it is reported; the limit of lab/runs/verdict/quality.py
-UNEVEN = 1.5  # the largest over the smallest factor of the cameras, from which each is named
-# Of the squared misfit: what a linear fit may leave of a fault in one camera. Measured: a camera 10 and 30 ms late in a
-# motion with bends leaves 0.5 and 0.9 %.
-_NOT_LINEAR = 0.02
-_ONE_FRAME = 0.1  # of a frame interval: as near as this to a whole number of them, frames are counted wrong
+MATTERS_SIGMAS = 0.5  # in stated sigmas of a pose or a spot: a smaller bias is negligible against the stated sigma
+# A larger bias makes the stated sigmas wrong; the limit of the noise scale in lab/runs/verdict/quality.py is the same.
+WRONG_SIGMAS = 5.0
+_WHOLE_FRAME = 0.1  # of a frame interval: a delay this near to a whole number of frames suggests a wrong frame number
 
 _REMEDIES = {
-    f.CAMERA: "Look for a knocked or loose mount, focus or zoom ring of that camera; fix it, run `calibrate check` to"
-    " make sure, then find its place again (`calibrate rig`).",
-    f.SCREEN: "Measure where that screen is (`calibrate screen`), then calibrate the rig again.",
+    f.CAMERA: "Check the mount, focus ring and zoom ring of that camera for a knock or a loose screw; fix it, run"
+    " `calibrate check` to confirm, then calibrate its pose again (`calibrate rig`).",
+    f.SCREEN: "Measure the pose of that screen (`calibrate screen`), then calibrate the rig again.",
     f.BEAM: "Check that laser's mount on the vehicle, then calibrate the beams again (`calibrate beams`).",
-    f.VIEW: "Look at that spot in the pictures: a reflection, an edge of the screen or a wrong label; then at its"
+    f.VIEW: "Check that spot in the pictures for a reflection, the edge of the screen or a wrong label; then check its"
     " laser.",
-    f.CLOCK: "Check trigger cable, exposure settings and frame numbers of the cameras: one number must be one instant.",
+    f.CLOCK: "Check trigger cable, exposure settings and frame numbers of the cameras: pictures with the same number"
+    " must be taken at the same instant.",
 }
 
 
-def level_of(inquest: FaultDiagnosis, effects: Sequence[Effect]) -> Level:
-    """How grave a significant fault is; effects: of everything that it may be.
+def why_not_tested(result: ModelCheckResult) -> str:
+    """Why a recording was not tested; empty where it was."""
+    match result.not_tested:
+        case NotTested.NO_FRAMES:
+            return "there is no frame"
+        case NotTested.FEW_FRAMES:
+            return (
+                f"{result.frames_used} frames have {FEWEST_SPOTS} and more spots measured; the test needs"
+                f" {FEWEST_FRAMES}"
+            )
+        case NotTested.NO_REDUNDANCY:
+            return "no frame has more spots measured than its pose needs"
+        case None:
+            return ""
 
-    What cannot be told apart fails only if each of it would, and is small only if each of it is.
+
+def findings_of(result: ModelCheckResult, model: SpotModel) -> tuple[Finding, ...]:
+    """All findings, the most severe first."""
+    findings = []
+    diagnosis = result.diagnosis
+    if diagnosis is not None:
+        for suspected, effects in zip(diagnosis.suspected_faults, result.effects, strict=True):
+            findings.append(fault_finding(suspected, effects, diagnosis, model, result.frame_interval_s))
+        if diagnosis.unexplained:
+            findings.append(unexplained_finding(diagnosis))
+        noisy = noise_finding(result, diagnosis)
+        if noisy is not None:
+            findings.append(noisy)
+    findings += [unseen_finding(u, model) for u in result.unseen]
+    return tuple(sorted(findings, key=lambda finding: -finding.level))
+
+
+def level_of(diagnosis: FaultDiagnosis, effects: Sequence[Effect]) -> Level:
+    """How severe a significant fault is. effects: of all its possible explanations.
+
+    Explanations that cannot be distinguished fail only if each of them would, and pass only if each of them would.
     """
 
-    def worst(sigmas: float) -> list[bool]:
+    def above(sigmas: float) -> list[bool]:
         return [e.pose_sigmas > sigmas or e.off_sigmas > sigmas for e in effects]
 
-    if _misfit_of_faults(inquest) > WRONG_SIGMAS or all(worst(WRONG_SIGMAS)):
+    if _scale_of_faults(diagnosis) > WRONG_SIGMAS or all(above(WRONG_SIGMAS)):
         return Level.FAIL
-    return Level.WARN if any(worst(MATTERS_SIGMAS)) else Level.PASS
+    return Level.WARN if any(above(MATTERS_SIGMAS)) else Level.PASS
 
 
-def culprit_finding(
-    culprit: SuspectedFault, effects: Sequence[Effect], inquest: FaultDiagnosis, model: SpotModel, frame_s: float
+def fault_finding(
+    suspected: SuspectedFault,
+    effects: Sequence[Effect],
+    diagnosis: FaultDiagnosis,
+    model: SpotModel,
+    frame_interval_s: float,
 ) -> Finding:
-    """One finding for one culprit. effects: of its explanations, in order; frame_s: the usual time between frames."""
-    level, effect = level_of(inquest, effects), effects[0]
-    told = [_told(e, model, frame_s) for e in culprit.explanations]
-    says = told[0]
-    if len(told) > 1:
-        count = culprit.more_rivals
-        also = f"; or one of {count} more" if count > 1 else "; or one more" if count else ""
-        says = f"{'; or '.join(told)}{also}: this recording cannot tell which"
+    """The finding for one suspected fault. effects: of its explanations, in order."""
+    level, effect = level_of(diagnosis, effects), effects[0]
+    descriptions = [_description(e, model, frame_interval_s) for e in suspected.explanations]
+    text = descriptions[0]
+    if len(descriptions) > 1:
+        count = suspected.more_alternatives
+        more = f"; or one of {count} more" if count > 1 else "; or one more" if count else ""
+        text = f"{'; or '.join(descriptions)}{more}: this recording does not distinguish them"
     where = ""
     if effect.axis >= 0:
         camera, spot = model.views[effect.view]
@@ -67,59 +101,51 @@ def culprit_finding(
             f"spot {spot} in camera `{camera}` lies {short(effect.off_sigmas, 2)} sigma ({short(effect.off_px, 2)} px)"
             f" off in {'uv'[effect.axis]} against the other spots: "
         )
-    what = f"{where}{says}, p {p_text(culprit.best.change.p_value)}"
-    things = list(dict.fromkeys(e.fault.thing for e in culprit.explanations))
-    remedy = " ".join(_REMEDIES[t] for t in things) if level > Level.PASS else ""
-    if culprit.rivals and level > Level.PASS:
-        way = "A new calibration of the beams" if things == [f.BEAM] else "A `calibrate check` with marked points"
-        remedy += f" {way} tells the candidates apart."
+    what = f"{where}{text}, p {p_text(suspected.best.change.p_value)}"
+    components = list(dict.fromkeys(e.fault.component for e in suspected.explanations))
+    remedy = " ".join(_REMEDIES[c] for c in components) if level > Level.PASS else ""
+    if suspected.alternatives and level > Level.PASS:
+        way = "A new calibration of the beams" if components == [f.BEAM] else "A `calibrate check` with marked points"
+        remedy += f" {way} distinguishes the candidates."
     return Finding(level, what, _consequence(effects, level), remedy)
 
 
-def unexplained_finding(inquest: FaultDiagnosis) -> Finding:
-    """What no single fault explains."""
-    level = Level.FAIL if _misfit_of_faults(inquest) > WRONG_SIGMAS else Level.WARN
-    alone = "" if not inquest.culprits else " beyond what is named above"
+def unexplained_finding(diagnosis: FaultDiagnosis) -> Finding:
+    """The finding for residuals that no single fault explains."""
+    level = Level.FAIL if _scale_of_faults(diagnosis) > WRONG_SIGMAS else Level.WARN
+    beyond = "" if not diagnosis.suspected_faults else " beyond what is named above"
     return Finding(
         level,
-        f"the residuals do not fit the rig file{alone}, and no single camera, screen, beam or clock explains it,"
-        f" p {p_text(inquest.p_after)}",
-        f"they are {short(inquest.misfit, 2)} times what the spots' sigmas allow; the stated sigmas of the poses leave"
-        " this out",
-        "Calibrate the rig again; if that does not help, check lens models and the flatness of the screens.",
+        f"the residuals do not fit the rig file{beyond}, and no single camera, screen, beam or clock explains it,"
+        f" p {p_text(diagnosis.p_after)}",
+        f"the residuals are {short(diagnosis.residual_scale, 2)} times as large as the spots' sigmas allow; the stated"
+        " sigmas of the poses do not include this",
+        "Calibrate the rig again; if that does not help, check the lens models and the flatness of the screens.",
     )
 
 
-def is_noisy(factor: float, misfit: float) -> bool:
-    """Whether errors are so much larger than claimed that it is reported.
+def noise_finding(result: ModelCheckResult, diagnosis: FaultDiagnosis) -> Finding | None:
+    """The finding for errors that are larger than stated and that no fault of the rig explains; None where none are.
 
-    misfit: with all faults included. Of a large fault the linear model leaves some in one camera, which is no noise.
+    Random noise widens the poses' covariances, which stay correct, so it is a warning whatever its size. Errors that
+    are correlated over frames do not average out as noise does, so they fail beyond WRONG_SIGMAS.
     """
-    return factor > NOISY and factor**2 - 1 > _NOT_LINEAR * misfit**2
-
-
-def noise_finding(inquest: FaultDiagnosis, of_cameras: Mapping[str, float], misfit: float) -> Finding | None:
-    """Errors larger than claimed that no fault of the rig explains; None where the claims hold well enough.
-
-    Noise changes from frame to frame; the poses' covariances are widened by it and stay right, so it is a warning
-    whatever its size. What lasts over frames is not averaged away as noise is, so it fails beyond WRONG_SIGMAS.
-    of_cameras: how much larger than claimed the errors of each are; misfit: of the claims, faults included.
-    """
+    of_cameras = result.noise_of_cameras
     factor = max(of_cameras.values())
-    if not is_noisy(factor, misfit):
+    if not is_noisy(factor, result.stated_residual_scale):
         return None
     size = f"{short(factor, 2)} times as large as the sigmas of the detections"
     uneven = factor > UNEVEN * min(of_cameras.values())
     each = ", ".join(f"camera `{name}` {short(value, 2)}" for name, value in of_cameras.items())
     where = f" ({each})" if uneven else ""
-    if inquest.lasts:
+    if diagnosis.is_correlated:
         return Finding(
             Level.FAIL if factor > WRONG_SIGMAS else Level.WARN,
-            f"the spots' residuals are {size}{where}, last over about {inquest.correlation_frames:.0f} of the frames"
-            " used, and no constant change of a camera, screen, beam or clock explains them",
-            "errors that last do not average out over frames: the stated sigmas of the poses are too small",
-            "Check lens models, the flatness of the screens and the light (reflections, clipped spots); then calibrate"
-            " the rig again.",
+            f"the spots' residuals are {size}{where}, are correlated over about {diagnosis.correlation_frames:.0f} of"
+            " the frames used, and no constant change of a camera, screen, beam or clock explains them",
+            "correlated errors do not average out over frames: the stated sigmas of the poses are too small",
+            "Check the lens models, the flatness of the screens and the light (reflections, clipped spots); then"
+            " calibrate the rig again.",
         )
     return Finding(
         Level.WARN,
@@ -131,21 +157,34 @@ def noise_finding(inquest: FaultDiagnosis, of_cameras: Mapping[str, float], misf
     )
 
 
-def _misfit_of_faults(inquest: FaultDiagnosis) -> float:
-    """The misfit in units of the recording's own noise: what the rig, not the detections, is responsible for."""
-    return inquest.misfit / inquest.excess_noise
+def unseen_finding(unseen: UnseenView, model: SpotModel) -> Finding:
+    """The finding for a view that is hardly ever measured."""
+    camera, spot = model.views[unseen.view]
+    return Finding(
+        Level.WARN,
+        f"spot {spot} in camera `{camera}` was measured in {unseen.measured} of {unseen.expected} frames in which the"
+        " pose puts it well inside the picture",
+        "its laser is off or occluded, or points so far from where the rig file says that its spot is taken for"
+        " clutter; the pose is computed without it",
+        "Check the pictures where that spot should be; then check its laser's mount, or calibrate the beams again.",
+    )
+
+
+def _scale_of_faults(diagnosis: FaultDiagnosis) -> float:
+    """Residual scale over noise scale: the part that the rig, not the detections, is responsible for."""
+    return diagnosis.residual_scale / diagnosis.excess_noise
 
 
 def _consequence(effects: Sequence[Effect], level: Level) -> str:
     known = [e for e in effects if np.isfinite(e.attitude_deg)]
     if not known:
-        return "no frame alone has a pose, so what it does to them cannot be told"
+        return "no frame alone determines its pose, so the effect on the poses is unknown"
     bias = f"{_range([e.attitude_deg for e in known])} deg and {_range([e.position_mm for e in known])} mm"
     sigmas = [e.pose_sigmas for e in known if np.isfinite(e.pose_sigmas)]
-    of = f", {_range(sigmas)} of its claimed sigmas" if sigmas else ""
+    of = f", {_range(sigmas)} of its stated sigmas" if sigmas else ""
     if level == Level.PASS:
-        return f"it is sure but small: it turns and moves the pose by {bias}{of}"
-    return f"it turns and moves the pose by about {bias}{of}; averaging over frames does not lessen it"
+        return f"it is significant but small: it rotates and shifts the pose by {bias}{of}"
+    return f"it rotates and shifts the pose by about {bias}{of}; averaging over frames does not reduce it"
 
 
 def _range(values: Sequence[float]) -> str:
@@ -154,7 +193,7 @@ def _range(values: Sequence[float]) -> str:
     return short(high, 2) if high <= 1.1 * low else f"{short(low, 2)} to {short(high, 2)}"
 
 
-def _told(e: Explained, model: SpotModel, frame_s: float) -> str:
+def _description(e: FittedFault, model: SpotModel, frame_interval_s: float) -> str:
     """`camera `right` may have turned, by 0.35 ± 0.02 mrad`."""
     fault, delta = e.fault, e.change.delta
     sigma = np.sqrt(np.maximum(np.diagonal(e.change.covariance), 0.0))
@@ -166,49 +205,49 @@ def _told(e: Explained, model: SpotModel, frame_s: float) -> str:
         return f"{plus_minus(factor * length, factor * of)} {unit}"
 
     every = slice(None)
-    thing = f"{fault.thing} `{fault.name}`"
+    subject = f"{fault.component} `{fault.name}`"
     match fault.kind:
         case f.TURNED:
-            return f"{thing} may have turned, by {size(every, 'mrad', 1e3)}"
+            return f"{subject} may have turned, by {size(every, 'mrad', 1e3)}"
         case f.SHIFTED:
-            return f"{thing} may have moved: its picture is shifted by {size(every, 'px', 1.0)}"
+            return f"{subject} may have moved: its picture is shifted by {size(every, 'px', 1.0)}"
         case f.ZOOMED:
-            return f"the focal length of {thing} may have changed, by {size(every, '%', 100.0)}"
+            return f"the focal length of {subject} may have changed, by {size(every, '%', 100.0)}"
         case f.MOVED:
             turn, move = size(slice(3), "mrad", 1e3), size(slice(3, 6), "mm", 1e3)
-            return f"{thing} may have moved, by {move} and {turn}"
+            return f"{subject} may have moved, by {move} and {turn}"
         case f.ALONG_NORMAL:
-            return f"{thing} may have moved, by {size(every, 'mm', 1e3)} along its normal"
+            return f"{subject} may have moved, by {size(every, 'mm', 1e3)} along its normal"
         case f.TILTED:
             turn, move = size(slice(1, 3), "mrad", 1e3), size(slice(1), "mm", 1e3)
-            return f"{thing} may have moved, by {move} along its normal and tilted by {turn}"
-        case f.POINTS_ELSEWHERE:
-            return f"{thing} may point elsewhere, by {size(every, 'deg', float(np.rad2deg(1.0)))}"
-        case f.POINT_OFF:
-            return f"{thing} may have moved beside itself, by {size(every, 'mm', 1e3)}"
+            return f"{subject} may have moved, by {move} along its normal, and tilted by {turn}"
+        case f.DIRECTION_WRONG:
+            return f"the direction of {subject} may be wrong, by {size(every, 'deg', float(np.rad2deg(1.0)))}"
+        case f.POINT_WRONG:
+            return f"{subject} may have shifted sideways, by {size(every, 'mm', 1e3)}"
         case f.LASER_MOVED:
             turn, move = size(slice(2), "deg", float(np.rad2deg(1.0))), size(slice(2, 4), "mm", 1e3)
-            return f"{thing} may have moved, by {move} and {turn}"
+            return f"{subject} may have moved, by {move} and {turn}"
         case f.LATE:
-            return _late(fault.name, float(delta[0]), float(sigma[0]), model, frame_s)
+            return _delay(fault.name, float(delta[0]), float(sigma[0]), model, frame_interval_s)
         case _:
             camera, spot = fault.name.rsplit("/", 1)
-            return f"spot {spot} is seen beside its place in camera `{camera}`, by {size(every, 'px', 1.0)}"
+            return f"spot {spot} has a constant offset in camera `{camera}`, of {size(every, 'px', 1.0)}"
 
 
-def _late(name: str, late_s: float, sigma_s: float, model: SpotModel, frame_s: float) -> str:
-    """Of two cameras the one whose pictures are the later; of more, late or early against the others."""
+def _delay(name: str, late_s: float, sigma_s: float, model: SpotModel, frame_interval_s: float) -> str:
+    """Of two cameras, names the later one; of more, the one that is late or early against the others."""
     filming = [c for i, c in enumerate(model.camera_names) if (model.camera_of == i).any()]
     others, word = "the others", "late" if late_s > 0 else "early"
     if len(filming) == 2:
         other = next(c for c in filming if c != name)
         name, others, word = (name, f"camera `{other}`", "late") if late_s > 0 else (other, f"camera `{name}`", "late")
     size = f"{plus_minus(1e3 * abs(late_s), 1e3 * sigma_s)} ms"
-    says = f"camera `{name}` is about {size} {word} against {others}"
-    count = round(abs(late_s) / frame_s) if frame_s > 0 else 0
-    if count and abs(abs(late_s) / frame_s - count) < _ONE_FRAME:
-        says += f" (that is {count} frame{'s' if count != 1 else ''}: its pictures may be numbered wrong)"
-    return says
+    text = f"camera `{name}` is about {size} {word} against {others}"
+    count = round(abs(late_s) / frame_interval_s) if frame_interval_s > 0 else 0
+    if count and abs(abs(late_s) / frame_interval_s - count) < _WHOLE_FRAME:
+        text += f" (that is {count} frame{'s' if count != 1 else ''}: its pictures may be numbered wrongly)"
+    return text
 
 
 def p_text(p: float) -> str:

@@ -1,1 +1,1 @@
-"""Errors of a result against truth."""
+"""Errors of a run's results against truth."""

@@ -1,4 +1,4 @@
-"""How far a run's results are from the truth, where the run folder has one (a simulation, or a turntable's record)."""
+"""Errors of a run's results against its truth, where the run folder has one (a simulation, or a turntable's record)."""
 
 from __future__ import annotations
 
@@ -27,29 +27,29 @@ from lab.files.run.truth import load_truth
 from lab.runs.score.motion_score import motion_scores
 from tracking.statuses import PoseStatus, SpotStatus
 
-# How far from its true place a spot may be measured and still be that spot: several times the noise of a poor
-# centroid, and a fraction of the distance at which clutter or another spot usually lies.
+# A measured position within this distance of the true spot counts as that spot: several times the noise of a poor
+# centroid, and a fraction of the usual distance to clutter or to another spot.
 SAME_SPOT_PX = 3.0
 SAME_SPOT_SIGMAS = 5.0
-# A spot that returns must be found again within so many frames with a picture.
+# A spot that returns must be found again within this number of frames with a picture.
 RETURN_FRAMES = 5
-# Where the true path departs by more than this from a straight, even continuation of its last two places, it bends
-# there: no constant-velocity prediction can follow. About five times the prediction error on a smooth path.
+# Deviation of the true path from a constant-velocity continuation of its last two positions above which it counts as a
+# sharp turn, which no constant-velocity prediction can follow. About five times the prediction error on a smooth path.
 BEND_PX = 2.0
 HIDDEN, IN_VIEW, OUTSIDE = 2, 1, 0
 
 
 @dataclass(frozen=True, slots=True)
 class TruthArrays:
-    """The truth on the results' own grid: F frames, V views. Either half may be missing (None)."""
+    """The truth on the grid of the results: F frames, V views. Spots or poses may be missing (None)."""
 
-    uv_px: Array | None  # (F, V, 2), nan where no projection exists or the truth is silent
-    in_view: Ints | None  # (F, V): 1 in the picture, 2 hidden, 0 outside it; -1 where the truth is silent
-    world_from_body: Pose | None  # (F',), on the pose table's frames; nan translation where the truth is silent
+    uv_px: Array | None  # (F, V, 2), nan where no projection exists or the truth has no row
+    in_view: Ints | None  # (F, V): 1 in the picture, 2 hidden, 0 outside it; -1 where the truth has no row
+    world_from_body: Pose | None  # (F',), on the pose table's frames; nan translation where the truth has no row
 
 
 def read_truth(run_folder: Path, spots: SpotGrid, poses: PoseTrack) -> TruthArrays | None:
-    """The truth of a run folder at the frames and views of its results; None where it has none. Raises InputError."""
+    """The truth of a run folder at the frames and views of its results; None where it has none."""
     tables = load_truth(run_folder)
     if tables is None:
         return None
@@ -74,7 +74,7 @@ def read_truth(run_folder: Path, spots: SpotGrid, poses: PoseTrack) -> TruthArra
 def score(results: Path, run_folder: Path) -> dict[str, Any] | None:
     """Errors of a results folder against its run's truth, as plain JSON values; None where the run has no truth.
 
-    Pixels, metres and degrees as the names say; None where there is nothing to count.
+    Units are in the names; values without any row are None.
     """
     if not (run_folder / "truth").is_dir():
         return None
@@ -87,10 +87,7 @@ def score(results: Path, run_folder: Path) -> dict[str, Any] | None:
 def score_against(
     spots: SpotGrid, poses: PoseTrack, truth: TruthArrays, causal: PoseTrack | None = None
 ) -> dict[str, Any]:
-    """The same, from tables that are already read.
-
-    causal: poses as they were known at each instant, where `poses` are smoothed; of the same frames.
-    """
+    """`score` from tables that are already read. causal: poses of the causal pass, where `poses` are smoothed."""
     blocks = ("spots", "pose", "pose_causal", "motion_vs_differences", "motion_causal_vs_differences")
     out: dict[str, Any] = dict.fromkeys(blocks)
     if truth.uv_px is not None and truth.in_view is not None:
@@ -105,10 +102,10 @@ def score_against(
 
 
 def right_spot(spots: SpotGrid, true_uv: Array) -> Bools:
-    """(F, V): the position is that of the true spot of its name.
+    """Whether each measured position (F, V) belongs to the true spot of its name.
 
     It lies within SAME_SPOT_PX, or SAME_SPOT_SIGMAS of its own sigma if that is more, and no other true spot of the
-    camera is nearer by more than SAME_SPOT_SIGMAS. (Where two spots cross closer than the noise, nobody can tell.)
+    camera is nearer by more than SAME_SPOT_SIGMAS. (Two spots that cross closer than the noise are indistinguishable.)
     """
     sigma = np.nan_to_num(np.hypot(spots.sigma_px[..., 0], spots.sigma_px[..., 1]) / np.sqrt(2))
     own = np.linalg.norm(spots.uv_px - true_uv, axis=-1)
@@ -125,68 +122,64 @@ def right_spot(spots: SpotGrid, true_uv: Array) -> Bools:
 
 def _spot_scores(spots: SpotGrid, true_uv: Array, in_view: Ints) -> dict[str, Any]:
     measured, right = spots.measured, right_spot(spots, true_uv)
-    told = in_view >= 0
-    # A frame without a picture shows nothing to anybody: it counts neither for nor against.
-    pictured = told & ~spots.has(SpotStatus.NO_IMAGE)
+    has_truth = in_view >= 0
+    # Frames without a picture are not counted.
+    pictured = has_truth & ~spots.has(SpotStatus.NO_IMAGE)
     visible = pictured & (in_view == IN_VIEW)
     found = measured & right & visible
-    wrong = measured & ~right & told
+    wrong = measured & ~right & has_truth
     error = spots.uv_px - true_uv
-    early = spots.predicted_px - true_uv
+    prediction_error = spots.predicted_px - true_uv
     bent = _bends(spots.frames, true_uv)
     starting = _starting(spots)
     close = np.linalg.norm(error, axis=-1) <= SAME_SPOT_PX
-
-    per_spot = []
-    for j, (camera, spot) in enumerate(spots.views):
-        seen = visible[:, j]
-        per_spot.append(
-            {
-                "camera": camera,
-                "spot": spot,
-                "in_view_frames": int(seen.sum()),
-                "identity": _share(found[:, j], seen),
-                "wrong_labels": int(wrong[:, j].sum()),
-                "measured_error_px": _spread(error[:, j][found[:, j]]),
-                "prediction_error_px": _spread(early[:, j][seen & measured[:, j]]),
-                "out_of_view_error_px": _spread(
-                    error[:, j][spots.has(SpotStatus.OUT_OF_VIEW)[:, j] & (in_view[:, j] == OUTSIDE)]
-                ),
-            }
-        )
-    outside_said = spots.has(SpotStatus.OUT_OF_VIEW) & told
+    reported_outside = spots.has(SpotStatus.OUT_OF_VIEW) & has_truth
+    outside = reported_outside & (in_view == OUTSIDE)
+    per_spot = [
+        {
+            "camera": camera,
+            "spot": spot,
+            "in_view_frames": int(visible[:, j].sum()),
+            "identity": _share(found[:, j], visible[:, j]),
+            "wrong_labels": int(wrong[:, j].sum()),
+            "measured_error_px": _spread(error[:, j][found[:, j]]),
+            "prediction_error_px": _spread(prediction_error[:, j][visible[:, j] & measured[:, j]]),
+            "out_of_view_error_px": _spread(error[:, j][outside[:, j]]),
+        }
+        for j, (camera, spot) in enumerate(spots.views)
+    ]
     return {
-        "frames": int(told.any(axis=1).sum()),
+        "frames": int(has_truth.any(axis=1).sum()),
         "in_view_identity": _share(found, visible),
         "in_view_rows": int(visible.sum()),
         "wrong_labels": int(wrong.sum()),
-        "wrong_label_share": _share(wrong, measured & told),
-        # `straight` leaves out the rows that step 2 found, as the paper does; `smooth` goes by the true path instead,
-        # whatever the tracker called it. Both leave out a track's first frames, in which nothing can know its speed;
-        # `all_measured` leaves out nothing.
+        "wrong_label_share": _share(wrong, measured & has_truth),
+        # `straight` excludes the rows of matching step 2, as the paper does; `smooth` excludes sharp turns of the true
+        # path instead, whatever the spot's status. Both exclude a track's first frames, in which its velocity is
+        # unknown; `all_measured` excludes nothing.
         "prediction_px": {
-            "smooth": _spread(early[visible & measured & ~bent & ~starting]),
-            "straight": _spread(early[visible & spots.has(SpotStatus.MATCHED) & ~starting]),
-            "turned": _spread(early[visible & spots.has(SpotStatus.TURNED)]),
-            "bends": _spread(early[visible & bent]),
-            "start": _spread(early[visible & starting]),
-            "all_measured": _spread(early[visible & measured]),
+            "smooth": _spread(prediction_error[visible & measured & ~bent & ~starting]),
+            "straight": _spread(prediction_error[visible & spots.has(SpotStatus.MATCHED) & ~starting]),
+            "turned": _spread(prediction_error[visible & spots.has(SpotStatus.TURNED)]),
+            "bends": _spread(prediction_error[visible & bent]),
+            "start": _spread(prediction_error[visible & starting]),
+            "all_measured": _spread(prediction_error[visible & measured]),
         },
         "measured_px": _spread(error[found]),
-        "out_of_view_px": _spread(error[outside_said & (in_view == OUTSIDE)]),
-        "out_of_view_but_visible_rows": int((outside_said & (in_view == IN_VIEW)).sum()),
+        "out_of_view_px": _spread(error[outside]),
+        "out_of_view_but_visible_rows": int((reported_outside & (in_view == IN_VIEW)).sum()),
         "occluded_px": _spread(error[spots.has(SpotStatus.OCCLUDED) & np.isin(in_view, (IN_VIEW, HIDDEN))]),
         "visible_but_not_found_rows": int((visible & ~measured).sum()),
         "hidden_but_measured_rows": int((measured & pictured & (in_view == HIDDEN)).sum()),
         "re_entries": _returns(in_view, OUTSIDE, measured, right, pictured),
         "after_hiding": _returns(in_view, HIDDEN, measured, right, pictured),
         "recognition_rate_eq15": {
-            # Huo (2015), eq. (15), S_correct / S_total. Its 65.97 % is about 4/6: as if every place solved outside
-            # the picture counted as wrong. So: right detections over all rows; over those in view; and over all
-            # rows, a place within SAME_SPOT_PX being right whether it was seen or solved.
-            "paper": _share(measured & right & told, told),
+            # Huo (2015), eq. (15), S_correct / S_total. Its 65.97 % is about 4/6, as if every position computed
+            # outside the picture counted as wrong. Therefore: correct detections over all rows; over those in view;
+            # and over all rows with any position within SAME_SPOT_PX, measured or computed, counted as correct.
+            "paper": _share(measured & right & has_truth, has_truth),
             "in_view": _share(found, visible),
-            "all_within_tolerance": _share(close & told, told & np.isfinite(true_uv).all(axis=-1)),
+            "all_within_tolerance": _share(close & has_truth, has_truth & np.isfinite(true_uv).all(axis=-1)),
         },
         "status_share": {str(s): _share(spots.status == i, spots.status >= 0) for i, s in enumerate(SPOT_STATUSES)},
         "tolerance_px": SAME_SPOT_PX,
@@ -195,7 +188,7 @@ def _spot_scores(spots: SpotGrid, true_uv: Array, in_view: Ints) -> dict[str, An
 
 
 def _bends(frames: Ints, true_uv: Array) -> Bools:
-    """(F, V): the true path departs there by more than BEND_PX from an even continuation of its last two places."""
+    """(F, V): sharp turns, where the true path deviates by more than BEND_PX from constant velocity."""
     out = np.zeros(true_uv.shape[:2], dtype=bool)
     if len(frames) > 2:
         step = true_uv[2:] - 2 * true_uv[1:-1] + true_uv[:-2]
@@ -205,7 +198,7 @@ def _bends(frames: Ints, true_uv: Array) -> Bools:
 
 
 def _starting(spots: SpotGrid) -> Bools:
-    """(F, V): fewer than two frames lie between this one and the start of the view's track."""
+    """(F, V): the first two frames of each track."""
     known = (spots.status != ABSENT) & ~spots.has(SpotStatus.LOST)
     out = np.ones(known.shape, dtype=bool)
     out[2:] = ~(known[1:-1] & known[:-2])
@@ -213,10 +206,10 @@ def _starting(spots: SpotGrid) -> Bools:
 
 
 def _returns(in_view: Ints, after: int, measured: Bools, right: Bools, pictured: Bools) -> dict[str, Any]:
-    """Of the spots that come (back) into view after state `after`: how many are found again under their own name.
+    """Of the spots that come into view after state `after`: how many are found again under their own name.
 
-    A return is kept when the first row measured within RETURN_FRAMES pictures of it is the right spot, and counts only
-    if there is such a picture with the spot in view. delay: pictures until that row (0: at once).
+    A return is kept if the first row measured within the following RETURN_FRAMES pictures is the correct spot. It
+    counts only if there is such a picture with the spot in view. delay: pictures until that row (0: immediately).
     """
     total = kept = 0
     delays: list[int] = []
@@ -264,10 +257,10 @@ def pose_errors(poses: PoseTrack, truth: Pose) -> Array:
 
 
 def normalised_squares(delta: Array, covariance: Array) -> Array:
-    """NEES (n,): delta^T C^-1 delta of errors (n, 6) and covariances (n, 6, 6); nan where C cannot be inverted.
+    """NEES (n,): delta^T C^-1 delta of errors (n, 6) and covariances (n, 6, 6); nan where C is singular.
 
-    Its mean is 6 where the covariance tells the truth (Bar-Shalom, Li & Kirubarajan, 2001, section 5.4).
-    Metres and radians differ in scale, so each C is brought to unit diagonal first.
+    Its mean is 6 if the covariance is correct (Bar-Shalom, Li & Kirubarajan, 2001, section 5.4). Metres and radians
+    differ in scale, so each C is scaled to unit diagonal first.
     """
     variance = np.diagonal(covariance, axis1=-2, axis2=-1)
     good: Bools = np.all(np.isfinite(covariance), axis=(-2, -1)) & np.all(variance > 0, axis=-1)
@@ -293,14 +286,14 @@ def _pose_spread(delta: Array, covariance: Array) -> dict[str, Any] | None:
         "rotation_rms_deg": dict(zip("xyz", _rms(np.degrees(delta[:, 3:])), strict=True)),  # about the body's axes
         "rotation_deg": _norms(angle),
         "nees_mean": float(nees.mean()) if n else None,
-        # In which the mean of n independent rows lies 95 times in 100; rows of a filter are not independent.
+        # Central 95 % interval of the mean of n independent rows; rows of a filter are not independent.
         "nees_mean_95": [2 * gamma_quantile(1 - p, 3 * n) / n for p in (0.025, 0.975)] if n else None,
         "nees_rows": n,
     }
 
 
 def _spread(error: Array) -> dict[str, Any] | None:
-    """RMS per axis, and of the distance its RMS, median, 99th percentile and maximum, of errors (n, 2), px."""
+    """Of errors (n, 2), px: RMS per axis, and RMS, median, 99th percentile and maximum of their length."""
     error = error[np.isfinite(error).all(axis=-1)]
     if not len(error):
         return None

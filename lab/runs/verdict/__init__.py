@@ -1,1 +1,1 @@
-"""Checks of the results, and the verdict on a run."""
+"""Checks of every frame before it is written, statistics of a run, and the verdict on it."""

@@ -14,8 +14,8 @@ from lab.errors import InputError
 from lab.files.run.detections_file import read_detections
 from lab.files.run.run_file import load_run
 from lab.files.text import columns
-from lab.runs.check import check
 from lab.runs.frames.frames import Missing, open_frames
+from lab.runs.input_check.check import check
 from tests.lab.run_folders import edit, write_run
 from tracking.detections import Detections
 
@@ -245,7 +245,7 @@ def test_a_camera_without_rows_in_a_shared_table_has_no_spots_which_is_noted(tmp
     folder = points_for_right(tmp_path / "a", row(0, "right", 5, 6))
     edit(folder / "run.yaml", "{frames: frames/left}", "{detections: detections.csv}")
     reader = open_frames(load_run(folder))
-    assert any(n.endswith("no rows of camera 'left'; it is taken to have found nothing") for n in reader.notes)
+    assert any(n.endswith("no rows of camera 'left'; all its pictures count as empty") for n in reader.notes)
     assert [len(s.images["left"]) for s in reader] == [0]
 
 

@@ -12,8 +12,8 @@ from lab.report.run.model_fit import HEADS, model_fit
 from lab.report.run.page import write_report
 from lab.report.run.summary import summary_of
 from lab.runs.model_check.check import check_model
+from tests.calibration.model_check.model_scenes import changed, recorded
 from tests.lab.fake_results import make
-from tests.lab.runs.model_scenes import changed, recorded
 
 
 def block(really=None, frames: int = 300) -> dict[str, object]:

@@ -1,4 +1,4 @@
-"""Many runs: a bad one costs only itself, and batch.csv says what became of each."""
+"""A batch of runs: a run that fails does not stop the others, and batch.csv has the outcome of each."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ def rows_of(path: Path) -> list[dict[str, str]]:
 
 @pytest.fixture(scope="module")
 def mixed(tmp_path_factory):
-    """A good run, a folder that is none, a run without spots, another good one."""
+    """A good run, a folder that does not exist, a run without spots, another good run."""
     folder = tmp_path_factory.mktemp("batch")
     runs = [points_run(folder / "good"), folder / "nothing", write_run(folder / "grey"), points_run(folder / "last", 6)]
-    told: list[str] = []
-    return process_batch(runs, folder / "out", tell=told.append), told
+    lines: list[str] = []
+    return process_batch(runs, folder / "out", report=lines.append), lines
 
 
-def test_the_batch_goes_on_after_a_bad_run_and_every_run_has_a_row(mixed):
+def test_the_batch_continues_after_a_bad_run_and_every_run_has_a_row(mixed):
     outcome, _ = mixed
     rows = rows_of(outcome.table)
     assert tuple(rows[0]) == COLUMNS
@@ -51,9 +51,9 @@ def test_the_good_runs_have_their_results_and_the_bad_one_has_none(mixed):
     assert sorted(p.name for p in out.iterdir()) == ["batch.csv", "good", "grey", "index.html", "last"]
 
 
-def test_a_line_is_told_of_every_run_as_it_ends(mixed):
-    _, told = mixed
-    assert [line.split(":")[:2] for line in told] == [
+def test_a_line_is_reported_for_every_run_when_it_ends(mixed):
+    _, lines = mixed
+    assert [line.split(":")[:2] for line in lines] == [
         ["good", " PASS"], ["nothing", " ERROR"], ["grey", " FAIL"], ["last", " PASS"],
     ]  # fmt: skip
 
@@ -75,7 +75,7 @@ def test_the_exit_status_is_that_of_the_worst(mixed, tmp_path):
 
 
 @pytest.mark.parametrize("error", [RunError("gone\nhalf-way"), InputError("wrong"), CalibrationError("out of date")])
-def test_whatever_kind_of_error_a_run_ends_with_is_its_row(tmp_path, monkeypatch, error):
+def test_any_error_of_a_run_becomes_its_row(tmp_path, monkeypatch, error):
     def fail(*_, **__):
         raise error
 
@@ -84,11 +84,11 @@ def test_whatever_kind_of_error_a_run_ends_with_is_its_row(tmp_path, monkeypatch
     (row,) = rows_of(outcome.table)
     assert row["exit_status"] == str(error.exit_status)
     assert row["message"] == str(error).replace("\n", " | ")
-    # section 5: some run could not be processed; the calibration's own status where it alone is the cause
+    # Contract, section 5: 1 if a run could not be processed; 3 if the calibration is the only cause.
     assert outcome.exit_status == (3 if isinstance(error, CalibrationError) else 1)
 
 
-def test_the_table_is_there_after_every_run(tmp_path, monkeypatch):
+def test_the_table_is_written_after_every_run(tmp_path, monkeypatch):
     """A batch that is killed in its second run keeps the first one's row."""
     runs = [points_run(tmp_path / "a"), points_run(tmp_path / "b")]
     process_run = module.process_run
@@ -104,7 +104,7 @@ def test_the_table_is_there_after_every_run(tmp_path, monkeypatch):
     assert [r["run"] for r in rows_of(tmp_path / "out/batch.csv")] == [str(runs[0])]
 
 
-def test_runs_of_the_same_name_get_folders_of_their_own(tmp_path):
+def test_runs_of_the_same_name_get_separate_folders(tmp_path):
     for day in ("monday", "tuesday"):
         (tmp_path / day).mkdir()
     runs = [points_run(tmp_path / "monday/run"), points_run(tmp_path / "tuesday/run", 6)]
@@ -114,32 +114,32 @@ def test_runs_of_the_same_name_get_folders_of_their_own(tmp_path):
     assert [r["results"].split("-")[0] for r in rows] == ["monday", "tuesday"]
 
 
-def test_the_same_run_twice_is_a_mistake(tmp_path):
+def test_giving_the_same_run_twice_is_an_error(tmp_path):
     run = points_run(tmp_path / "a")
     with pytest.raises(InputError, match="given more than once"):
         process_batch([run, tmp_path / "x" / ".." / "a"], tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
-def test_no_run_at_all_is_a_mistake(tmp_path):
+def test_giving_no_run_is_an_error(tmp_path):
     with pytest.raises(InputError, match="expected one or more run folders"):
         process_batch([], tmp_path / "out")
 
 
-def test_a_file_in_place_of_the_out_folder_is_a_mistake(tmp_path):
+def test_a_file_in_place_of_the_out_folder_is_an_error(tmp_path):
     (tmp_path / "out").write_text("")
     with pytest.raises(InputError, match="expected a folder for the results, found a file"):
         process_batch([points_run(tmp_path / "a")], tmp_path / "out")
 
 
-def test_a_batch_may_be_repeated_into_the_same_folder(tmp_path):
+def test_a_batch_can_be_repeated_into_the_same_folder(tmp_path):
     run = points_run(tmp_path / "a")
     first, second = process_batch([run], tmp_path / "out"), process_batch([run], tmp_path / "out")
     keep = [n for n in COLUMNS if n != "seconds"]
     assert [[r[n] for n in keep] for r in first.rows] == [[r[n] for n in keep] for r in second.rows]
 
 
-def test_names_with_commas_survive_in_the_table(tmp_path):
+def test_names_with_commas_are_unchanged_in_the_table(tmp_path):
     run = points_run(tmp_path / "a, b")
     (row,) = rows_of(process_batch([run], tmp_path / "out").table)
     assert row["run"] == str(run)

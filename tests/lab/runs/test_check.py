@@ -1,4 +1,4 @@
-"""`beampose check`: each trouble is named with what to do, and a sound rig or run is called fine."""
+"""`beampose check`: each problem is reported with a remedy, and a correct rig or run is reported as fine."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from geometry.pose_solver import visibility
 from geometry.pose_solver.gauss_newton import SolveLimits
 from lab.files.rig.rig_file import load_rig
 from lab.files.text.error_text import FileError
-from lab.runs.check import check
+from lab.runs.input_check.check import check
 from tests.lab.files.test_truth import write_truth
 from tests.lab.run_folders import edit, picture_of, write_run
 
@@ -26,13 +26,13 @@ def folder(tmp_path) -> Path:
     return write_run(tmp_path / "a")
 
 
-def said(path: Path) -> tuple[str, int]:
+def checked(path: Path) -> tuple[str, int]:
     result = check(path)
     return "\n".join(result.lines), result.exit_status
 
 
-def test_a_sound_run_is_fine_and_its_table_counts_its_pictures(folder):
-    text, status = said(folder)
+def test_a_correct_run_is_fine_and_its_pictures_are_counted(folder):
+    text, status = checked(folder)
     assert status == 0
     assert text.splitlines()[0] == f"{folder} (small): fine"
     assert "left         5  0 to 4        0           0           0  8-bit" in text
@@ -40,18 +40,18 @@ def test_a_sound_run_is_fine_and_its_table_counts_its_pictures(folder):
     assert "within 0.3 m of (0, 0, 0), within 10 deg of yaw, pitch, roll (0, 0, 0)" in text
 
 
-def test_a_sound_rig_is_fine_and_the_guessed_range_is_said(folder):
-    text, status = said(folder / "rig.yaml")
+def test_a_correct_rig_is_fine_and_the_assumed_range_is_reported(folder):
+    text, status = checked(folder / "rig.yaml")
     assert status == 0
     assert text.splitlines()[0] == f"{folder / 'rig.yaml'}: fine"
-    assert "a range assumed for want of a prior: within 0.5 m of (0, 0, 0), within 30 deg" in text
+    assert "an assumed range, since there is no prior: within 0.5 m of (0, 0, 0), within 30 deg" in text
 
 
-def test_all_mistakes_of_a_file_are_listed_at_once(folder):
+def test_all_errors_of_a_file_are_listed_at_once(folder):
     text = (folder / "rig.yaml").read_text().replace("fx: 40.0", "fx: -1").replace("size_m: [4.0", "size_m: [0")
     (folder / "rig.yaml").write_text(text)
     for path in (folder, folder / "rig.yaml"):
-        text, status = said(path)
+        text, status = checked(path)
         assert status == 2
         assert "4 problems" in text
         for field in ("screens.left.size_m", "screens.right.size_m", "left.camera_matrix.fx", "right.camera_matrix.fx"):
@@ -59,27 +59,27 @@ def test_all_mistakes_of_a_file_are_listed_at_once(folder):
 
 
 @pytest.mark.parametrize("name", ["nothing", "run.yaml", "empty"])
-def test_a_path_that_is_no_rig_and_no_run_is_a_problem(name, tmp_path):
+def test_a_path_that_is_neither_a_rig_nor_a_run_is_a_problem(name, tmp_path):
     (tmp_path / "empty").mkdir()
-    text, status = said(tmp_path / name)
+    text, status = checked(tmp_path / name)
     assert status == 2
     assert "1 problem" in text
 
 
-def test_gaps_and_damage_are_remarks_with_which_a_run_goes_on(folder):
+def test_missing_and_damaged_pictures_are_remarks(folder):
     left, right = folder / "frames/left", folder / "frames/right"
     (left / "000002.png").unlink()
     (right / "000003.png").write_bytes((right / "000003.png").read_bytes()[:50])
     cv2.imwrite(str(right / "000004.png"), np.zeros((4, 4), np.uint8))
     (left / "Thumbs.db").write_bytes(b"")
     cv2.imwrite(str(left / "000001.png"), picture_of(1, np.uint16))
-    text, status = said(folder)
+    text, status = checked(folder)
     assert status == 0
     for words in (
         "left: 1 frame dropped (2)",
         "right: 1 frame unreadable: cut short (3)",
         "right: 1 frame wrong size 4x4, the rig says 64x48 (4)",
-        "3 of 5 frames are not there in every camera",
+        "3 of 5 frames are missing in at least one camera",
         "1 files of 'left' are no frames: Thumbs.db",
         "pictures of different kinds: ",
         "left         4  0 to 4        1           0           0  16-bit, 8-bit",
@@ -88,10 +88,10 @@ def test_gaps_and_damage_are_remarks_with_which_a_run_goes_on(folder):
         assert words in text, text
 
 
-def test_a_camera_without_one_usable_picture_is_a_problem(folder):
+def test_a_camera_without_any_usable_picture_is_a_problem(folder):
     text = (folder / "rig.yaml").read_text().replace("image_size_px: [64, 48]", "image_size_px: [640, 480]", 1)
     (folder / "rig.yaml").write_text(text)
-    text, status = said(folder)
+    text, status = checked(folder)
     assert status == 2
     assert "camera 'left' has no usable picture: all are of the wrong size" in text
 
@@ -99,42 +99,42 @@ def test_a_camera_without_one_usable_picture_is_a_problem(folder):
 def test_cameras_without_a_common_frame_are_a_problem(folder):
     for path in sorted((folder / "frames/left").iterdir()):
         path.rename(path.with_name(f"{int(path.stem) + 100:06d}.png"))
-    text, status = said(folder)
+    text, status = checked(folder)
     assert status == 2
-    assert "no frame number is common to all; the same number must be the same instant" in text
+    assert "no frame number is common to all cameras; the same number must mean the same instant" in text
 
 
-def test_black_pictures_are_remarked_on(folder):
+def test_black_pictures_are_remarks(folder):
     for path in (folder / "frames/left").iterdir():
         cv2.imwrite(str(path), np.zeros((48, 64), np.uint8))
-    assert "left: all pictures are black; is the lens covered?" in said(folder)[0]
-    assert "right: all pictures are black" not in said(folder)[0]
+    assert "left: all pictures are black; is the lens covered?" in checked(folder)[0]
+    assert "right: all pictures are black" not in checked(folder)[0]
 
 
-def test_a_run_without_a_prior_or_a_camera_is_told_what_that_means(folder):
+def test_the_consequences_of_a_missing_prior_or_camera_are_reported(folder):
     edit(folder / "run.yaml", "  right: {frames: frames/right}\n", "")
     (folder / "run.yaml").write_text((folder / "run.yaml").read_text().split("prior:")[0])
-    text, status = said(folder)
+    text, status = checked(folder)
     assert status == 0
     assert "camera 'right' of the rig is left out" in text
     assert "Prior: none given; the first pose is searched for among all that show enough spots" in text
 
 
-def test_uneven_timestamps_are_remarked_on_and_missing_ones_a_problem(folder):
+def test_uneven_timestamps_are_a_remark_and_missing_ones_a_problem(folder):
     edit(folder / "run.yaml", "name: small", "name: small\ntimestamps: times.csv")
     (folder / "times.csv").write_text("frame,t_s\n0,0\n1,0.01\n2,0.06\n3,0.07\n4,0.08\n")
-    text, status = said(folder)
+    text, status = checked(folder)
     assert status == 0
-    assert "after frame 1 a frame lasts 5 times what frame_rate_hz (100) says" in text
+    assert "after frame 1 the frame interval is 5 times the nominal one (frame_rate_hz: 100)" in text
     (folder / "times.csv").write_text("frame,t_s\n0,0\n1,0.01\n2,0.02\n3,0.03\n")
-    text, status = said(folder)
+    text, status = checked(folder)
     assert status == 2
     assert "got none for 1 of them (the first is frame 4)" in text
 
 
 def test_truth_is_compared_with_the_frames_the_times_and_the_rig(folder):
     write_truth(folder, load_rig(folder / "rig.yaml"))
-    text, status = said(folder)
+    text, status = checked(folder)
     assert status == 0
     assert "remark" not in text
     assert "Truth: pose.csv frames 0 to 4; spots.csv frames 0 to 4; poses and spots agree through the rig to " in text
@@ -143,20 +143,20 @@ def test_truth_is_compared_with_the_frames_the_times_and_the_rig(folder):
     pose.write_text("\n".join(pose.read_text().splitlines()[:-1]) + "\n")
     edit(folder / "rig.yaml", "translation_m: [-2.5, 0, 0]", "translation_m: [-2.4, 0, 0]")
     edit(folder / "run.yaml", "frame_rate_hz: 100.0", "frame_rate_hz: 50")
-    text, status = said(folder)
+    text, status = checked(folder)
     assert status == 0
-    assert "pose.csv: says nothing of 1 of 5 frames (the first is 4)" in text
-    assert "was the truth made with another rig?" in text
-    assert "pose.csv: t_s: up to 0.03 s from the run's own times" in text
+    assert "pose.csv: has no rows for 1 of 5 frames (the first is 4)" in text
+    assert "does the truth belong to another rig?" in text
+    assert "pose.csv: t_s: differs by up to 0.03 s from the run's own times" in text
 
     pose.write_text("frame,t_s\n")
-    assert said(folder)[1] == 2
+    assert checked(folder)[1] == 2
 
 
 # What the rig can see -------------------------------------------------------------------------------------------
 
 
-def test_a_camera_pose_given_the_wrong_way_round_is_recognised(folder):
+def test_an_inverted_camera_pose_is_recognised(folder):
     pose = load_rig(folder / "rig.yaml").cameras["left"].camera_from_world.inverse()
     q, t = pose.quaternion_wxyz.tolist(), pose.translation.tolist()
     edit(
@@ -164,40 +164,40 @@ def test_a_camera_pose_given_the_wrong_way_round_is_recognised(folder):
         "{quaternion_wxyz: [0.5, -0.5, 0.5, 0.5], translation_m: [0, 0.4, 0]}",
         f"{{quaternion_wxyz: {q}, translation_m: {t}}}",
     )
-    text, status = said(folder)
+    text, status = checked(folder)
     assert status == 2
     assert "cameras.left: never sees a spot; with the inverse of camera_from_world it would in 100.0 %" in text
     assert "is it world_from_camera?" in text
     assert "cameras.right: never" not in text
 
 
-def test_a_spot_given_the_wrong_end_is_recognised(folder):
+def test_a_wrong_end_of_a_beam_is_recognised(folder):
     edit(folder / "rig.yaml", '"1": {beam: A, end: "-", screen: left}', '"1": {beam: A, end: "+", screen: left}')
     edit(folder / "rig.yaml", '"4": {beam: A, end: "+", screen: right}', '"4": {beam: A, end: "-", screen: right}')
-    text, status = said(folder)
+    text, status = checked(folder)
     assert status == 2
-    assert "target.spots.1: never meets its screen 'left'; from the other end of beam 'A' it would" in text
-    assert "target.spots.4: never meets its screen 'right'" in text
+    assert "target.spots.1: never hits its screen 'left'; from the other end of beam 'A' it would" in text
+    assert "target.spots.4: never hits its screen 'right'" in text
 
 
-def test_with_a_guessed_range_the_same_is_a_remark(folder):
+def test_with_an_assumed_range_the_same_is_a_remark(folder):
     edit(folder / "rig.yaml", '"1": {beam: A, end: "-", screen: left}', '"1": {beam: A, end: "+", screen: left}')
     edit(folder / "rig.yaml", '"4": {beam: A, end: "+", screen: right}', '"4": {beam: A, end: "-", screen: right}')
-    text, status = said(folder / "rig.yaml")
+    text, status = checked(folder / "rig.yaml")
     assert status == 0
-    assert "target.spots.1: never meets its screen" in text
+    assert "target.spots.1: never hits its screen" in text
 
 
-def test_one_screen_alone_never_fixes_a_pose(folder):
+def test_one_screen_alone_never_determines_a_pose(folder):
     """Three spots of one screen on coplanar beams are collinear: whatever the pose, it is not observable."""
     edit(folder / "run.yaml", "  right: {frames: frames/right}\n", "")
-    text, status = said(folder)
+    text, status = checked(folder)
     assert status == 2
     assert "the pose is observable in none of 2000 poses of the range" in text
     assert "pose observable from one frame: 0.0 % of the poses" in text
 
 
-def test_shares_are_those_of_a_plain_count_over_the_same_poses(folder):
+def test_shares_equal_a_direct_count_over_the_same_poses(folder):
     rig = load_rig(folder / "rig.yaml")
     prior = PosePrior(Pose.from_ypr(np.array([0.1, 0, 0]), np.array([0.1, 0.2, 0])), 0.8, np.deg2rad(40))
     seen = visibility.visibility_of(rig, prior, SolveLimits(), count=300)
@@ -220,32 +220,32 @@ def test_shares_are_those_of_a_plain_count_over_the_same_poses(folder):
 
 
 @pytest.mark.parametrize("within_deg", [5.0, 60.0, 180.0])
-def test_poses_fill_the_prior_evenly_and_never_leave_it(within_deg):
+def test_poses_fill_the_prior_uniformly_and_never_leave_it(within_deg):
     prior = PosePrior(Pose.from_ypr(np.array([1.0, 0.5, -0.2]), np.array([1.0, 2, 3])), 0.4, np.deg2rad(within_deg))
     poses = visibility.poses_within(prior, 20_000)
     shift = poses.translation - prior.centre.translation
     assert np.abs(shift).max() <= 0.4
-    # a uniform coordinate has the variance w^2 / 3; its estimate from 20,000 scatters by 0.6 %
+    # A uniform coordinate has the variance w^2 / 3; its estimate from 20,000 samples has a scatter of 0.6 %.
     np.testing.assert_allclose(shift.var(axis=0), 0.4**2 / 3, rtol=0.03)
     angle = rotations.angle(prior.centre.rotation.T @ poses.rotation)
     assert angle.max() <= prior.within_rad + 1e-9
-    # evenly over the group: the share of turns below half the angle is the ratio of (a - sin a)
+    # Uniform over the rotation group: the share of rotations below half the angle is the ratio of (a - sin a).
     half = prior.within_rad / 2
     expected = (half - np.sin(half)) / (prior.within_rad - np.sin(prior.within_rad))
     assert abs((angle < half).mean() - expected) < 5 * np.sqrt(expected / 20_000)
 
 
-def test_the_message_of_many_mistakes_shows_the_first_and_counts_the_rest():
+def test_the_message_of_many_errors_shows_the_first_and_counts_the_rest():
     error = FileError(["a: one", "a: two", "a: three"])
     assert str(error) == "a: one\n(and 2 more in this file: `beampose check` lists them)"
     assert str(FileError(["a: one"])) == "a: one"
 
 
-def test_the_calibrations_age_and_covariance_are_told_and_an_expired_one_is_exit_status_3(folder):
-    text, status = said(folder)
+def test_an_expired_calibration_is_exit_status_3_and_its_age_and_covariance_are_reported(folder):
+    text, status = checked(folder)
     assert status == 0
-    assert "does not say when it was calibrated" in text
-    assert "no covariance: sigmas will hold the noise alone" in text
+    assert "does not state when it was calibrated" in text
+    assert "no covariance: sigmas will include the noise only" in text
     block = "    covariance: {parameters: [fx, fy], matrix: [[1.0, 0.1], [0.1, 2.0]]}\n"
     rig = (folder / "rig.yaml").read_text()
     first = rig.index("camera_from_world")
@@ -253,11 +253,11 @@ def test_the_calibrations_age_and_covariance_are_told_and_an_expired_one_is_exit
     dated = rig + "calibration: {date: 2025-01-02, verdict: PASS, valid_until: 2025-07-02}\n"
     (folder / "rig.yaml").write_text(dated)
     for path in (folder, folder / "rig.yaml"):
-        text, status = said(path)
+        text, status = checked(path)
         assert status == 3
         assert "calibrated 2025-01-02: PASS, valid until 2025-07-02" in text
         assert "the calibration is out of date" in text
         assert "covariance of 2 numbers" in text
     with (folder / "run.yaml").open("a") as file:
         file.write("recorded: 2025-07-02\n")
-    assert said(folder)[1] == 0
+    assert checked(folder)[1] == 0

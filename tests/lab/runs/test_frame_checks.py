@@ -1,4 +1,4 @@
-"""No frame is written with a covariance that is none, or with a pose that its spots or the causal pass deny."""
+"""No frame is written with an invalid covariance, or with a pose that contradicts its spots or the causal pass."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ P = np.diag([1e-4**2] * 3 + [5e-5**2] * 3)
 
 
 def a_record(frame: int = 0, off: float = 0.0, spots: int = N, sigma_px: float = 0.1) -> FrameRecord:
-    """A measured frame whose reported pose lies `off` sigmas beside the one that its spots show, in every axis."""
+    """A measured frame whose reported pose differs by `off` sigmas in every axis from the pose by its spots."""
     rng = np.random.default_rng(frame)
     true = Pose.identity()
     uv, _ = MODEL.project(true)
@@ -53,7 +53,7 @@ def changed(record: FrameRecord, **fields: object) -> FrameRecord:
     return replace(record, tracked=replace(record.tracked, **fields))  # type: ignore[arg-type]
 
 
-def test_a_right_frame_stays_as_it_is_but_for_its_residual():
+def test_a_correct_frame_changes_only_in_its_residual():
     record = a_record()
     checks = FrameChecks(RIG)
     ((kept, nothing),) = checks.passed([(record, None)])
@@ -64,7 +64,7 @@ def test_a_right_frame_stays_as_it_is_but_for_its_residual():
     assert (len(checks.own_spots), len(checks.causal), len(checks.invalid)) == (0, 0, 0)
 
 
-def test_frames_come_out_in_order_and_all_of_them():
+def test_all_frames_are_returned_in_order():
     records = [(a_record(k), a_record(k)) for k in range(150)]
     out = list(FrameChecks(RIG).passed(iter(records)))
     assert [(now.frame, then.frame) for now, then in out if then is not None] == [(k, k) for k in range(150)]
@@ -76,7 +76,7 @@ def distance(pose: Pose, of: Pose, covariance: np.ndarray) -> float:
     return float(np.sqrt(gap @ np.linalg.solve(covariance, gap)))
 
 
-def test_a_pose_that_contradicts_its_spots_is_predicted_with_sigmas_that_cover_what_they_show():
+def test_a_pose_that_contradicts_its_spots_is_predicted_with_sigmas_that_cover_the_pose_by_the_spots():
     record = a_record(off=200.0)
     checks = FrameChecks(RIG)
     (_, (kept, _)) = checks.passed([(a_record(3), None), (replace(record, frame=4), None)])
@@ -91,8 +91,8 @@ def test_a_pose_that_contradicts_its_spots_is_predicted_with_sigmas_that_cover_w
     assert checks.own_spots.ranges == [[4, 4]]
 
 
-def test_where_the_spots_may_be_the_wrong_ones_the_sigmas_cover_the_causal_pose_too():
-    """Its three spots put the vehicle 200 sigmas from the reported pose, and the causal pass on the other side."""
+def test_the_sigmas_cover_the_causal_pose_too_since_the_spots_may_be_wrongly_labelled():
+    """The pose by the spots is 200 sigmas from the reported one, and the causal pose is on the other side."""
     record, causal = a_record(off=200.0, spots=4), a_record(off=400.0)
     uv, _ = MODEL.project(causal.tracked.pose)
     causal = changed(causal, uv_px=uv)
@@ -106,7 +106,7 @@ def test_where_the_spots_may_be_the_wrong_ones_the_sigmas_cover_the_causal_pose_
     np.testing.assert_allclose(t.cov_px2[0], record.tracked.cov_px2[0])
 
 
-def test_a_pose_that_two_spots_deny_is_widened_as_far_as_they_ask():
+def test_a_pose_that_two_spots_contradict_is_widened_by_their_chi_square():
     record = a_record(off=200.0, spots=2)
     checks = FrameChecks(RIG)
     ((kept, _),) = checks.passed([(record, None)])
@@ -114,7 +114,7 @@ def test_a_pose_that_two_spots_deny_is_widened_as_far_as_they_ask():
     assert np.all(np.diagonal(kept.tracked.pose_covariance) > 100 * np.diagonal(P))
 
 
-def test_a_smoothed_pose_without_spots_that_the_causal_pass_denies_covers_that_one():
+def test_a_smoothed_pose_without_spots_covers_the_causal_pose_that_it_contradicts():
     smoothed = changed(
         a_record(off=200.0), status=(SpotStatus.OCCLUDED,) * N, point=np.full(N, -1), pose_status=PoseStatus.PREDICTED
     )
@@ -125,7 +125,7 @@ def test_a_smoothed_pose_without_spots_that_the_causal_pass_denies_covers_that_o
     assert kept.tracked.pose_status is PoseStatus.PREDICTED
     assert distance(causal.tracked.pose, kept.tracked.pose, kept.tracked.pose_covariance) < 1
     assert then is not None
-    assert then.tracked.pose_status is PoseStatus.MEASURED  # the causal tables stay what was known then
+    assert then.tracked.pose_status is PoseStatus.MEASURED  # the causal tables are unchanged
     agreeing = changed(smoothed, pose=causal.tracked.pose)
     assert [len(c.causal) for c in [checked(agreeing, causal)]] == [0]
 
@@ -136,7 +136,7 @@ def checked(now: FrameRecord, then: FrameRecord | None = None) -> FrameChecks:
     return checks
 
 
-def test_a_spot_that_a_neighbour_has_pulled_does_not_accuse_the_pose():
+def test_a_spot_that_is_excluded_from_the_pose_does_not_contradict_it():
     record = a_record()
     uv = record.tracked.uv_px.copy()
     uv[2] += 3.0
@@ -144,8 +144,8 @@ def test_a_spot_that_a_neighbour_has_pulled_does_not_accuse_the_pose():
     assert len(checked(changed(record, uv_px=uv, used_in_pose=np.arange(N) != 2)).own_spots) == 0
 
 
-def test_what_the_calibration_allows_is_no_contradiction():
-    """A camera whose principal point is known to 4 px: its spots may all lie 4 px beside the pose's."""
+def test_a_deviation_within_the_calibrations_covariance_is_no_contradiction():
+    """A camera whose principal point has a sigma of 4 px: all its spots may deviate by 4 px."""
     record = a_record()
     uv = record.tracked.uv_px + np.where((MODEL.camera_of == 1)[:, None], 4.0, 0.0)
     off = changed(record, uv_px=uv)
@@ -158,7 +158,7 @@ def test_what_the_calibration_allows_is_no_contradiction():
 NOT_POSITIVE = np.diag([1.0, 1.0, 1.0, 1.0, 1.0, -1e-9])
 
 
-def test_a_pose_whose_covariance_is_none_is_lost_and_its_measured_spots_stay():
+def test_a_pose_with_an_invalid_covariance_is_lost_and_its_measured_spots_stay():
     checks = FrameChecks(RIG)
     record = changed(a_record(spots=4), pose_covariance=NOT_POSITIVE)
     ((kept, _),) = checks.passed([(record, None)])
@@ -173,7 +173,7 @@ def test_a_pose_whose_covariance_is_none_is_lost_and_its_measured_spots_stay():
     assert checks.invalid.ranges == [[0, 0]]
 
 
-def test_velocities_whose_covariance_is_none_are_left_out_and_the_pose_stays():
+def test_velocities_with_an_invalid_covariance_are_omitted_and_the_pose_stays():
     checks = FrameChecks(RIG)
     record = changed(a_record(), motion=MotionEstimate(np.zeros(3), np.zeros(3), NOT_POSITIVE))
     ((kept, _),) = checks.passed([(record, None)])
@@ -182,7 +182,7 @@ def test_velocities_whose_covariance_is_none_are_left_out_and_the_pose_stays():
     assert len(checks.invalid) == 1
 
 
-def test_a_spot_whose_covariance_is_none_has_no_sigmas():
+def test_a_spot_with_an_invalid_covariance_has_no_sigmas():
     record = a_record(spots=4)
     cov = record.tracked.cov_px2.copy()
     cov[5] = np.diag([1.0, -1.0])
@@ -193,7 +193,7 @@ def test_a_spot_whose_covariance_is_none_has_no_sigmas():
     assert len(checks.invalid) == 1
 
 
-def test_an_invalid_covariance_of_the_causal_tables_is_left_out_and_counted_once():
+def test_an_invalid_covariance_of_the_causal_tables_is_omitted_and_counted_once():
     bad = changed(a_record(), pose_covariance=NOT_POSITIVE)
     for now in (bad, a_record()):
         checks = FrameChecks(RIG)

@@ -1,4 +1,4 @@
-"""Frames in: every picture under its own number, and a run goes on whatever is wrong with one of them."""
+"""Reading of frames: every picture has its own number, and a run continues past damaged ones."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ SIZE = (64, 48)
 
 
 def textured(dtype: type = np.uint8, channels: int = 1) -> np.ndarray:
-    """A picture that compresses badly, so that a cut file ends within its content."""
+    """A picture of noise, which compresses badly, so that a truncated file ends within its content."""
     rng = np.random.default_rng(3)
     shape = (48, 64) if channels == 1 else (48, 64, channels)
     return rng.integers(0, np.iinfo(dtype).max, shape).astype(dtype)
@@ -48,7 +48,7 @@ def read_all(folder: Path) -> list[FrameSet]:
     ("suffix", "dtype"),
     [(s, np.uint8) for s in (".png", ".tif", ".bmp", ".pgm")] + [(s, np.uint16) for s in (".png", ".tif", ".pgm")],
 )
-def test_a_lossless_grey_picture_is_read_to_the_last_bit(suffix, dtype):
+def test_a_lossless_grey_picture_is_read_exactly(suffix, dtype):
     picture = textured(dtype)
     got = decode(encoded(suffix, picture), SIZE)
     assert got.dtype == dtype
@@ -63,36 +63,36 @@ def test_a_grey_picture_saved_in_colour_keeps_its_values(suffix, dtype):
     grey = textured(dtype)
     got = decode(encoded(suffix, np.dstack([grey, grey, grey])), SIZE)
     assert got.dtype == dtype
-    # OpenCV's weights of red, green and blue sum to 1 within 2^-14: at 16 bits a value may be off by one
+    # OpenCV's weights of red, green and blue sum to 1 within 2^-14: at 16 bits the error may be one.
     assert np.abs(got.astype(int) - grey).max() <= (0 if dtype == np.uint8 else 1)
 
 
-def test_colour_becomes_grey_by_luminance_and_alpha_counts_for_nothing():
+def test_colour_becomes_grey_by_luminance_and_alpha_is_ignored():
     colour = np.zeros((48, 64, 4), np.uint8)
     colour[..., 2], colour[..., 3] = 100, 7  # red, almost transparent
     assert abs(int(decode(encoded(".png", colour), SIZE)[0, 0]) - 0.299 * 100) <= 1
 
 
-def test_a_jpeg_is_read_to_its_own_accuracy():
+def test_a_jpeg_is_read_to_the_accuracy_of_its_compression():
     smooth = np.tile(np.linspace(20, 200, 64).astype(np.uint8), (48, 1))
     got = decode(cv2.imencode(".jpg", smooth, [cv2.IMWRITE_JPEG_QUALITY, 100])[1].tobytes(), SIZE)
     assert np.abs(got.astype(int) - smooth).max() <= 3
 
 
-def test_the_turn_that_a_jpeg_wishes_for_display_is_not_applied():
+def test_the_display_orientation_of_a_jpeg_is_not_applied():
     picture = np.zeros((48, 64), np.uint8)
     picture[:, :8] = 200
     data = encoded(".jpg", picture)
     exif = b"Exif\0\0II*\0" + struct.pack("<IHHHIHHI", 8, 1, 0x0112, 3, 1, 3, 0, 0)  # orientation 3: upside down
     data = data[:2] + b"\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif + data[2:]
     turned = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
-    assert turned[0, 0] < 50, "the test's file is not turned by a viewer"
+    assert turned[0, 0] < 50, "the test's file is not rotated by a viewer"
     assert decode(data, SIZE)[0, 0] > 150
 
 
 @pytest.mark.parametrize("suffix", [".png", ".tif", ".bmp", ".pgm", ".jpg"])
 @pytest.mark.parametrize("share", [0.02, 0.3, 0.6, 0.9, 0.99])
-def test_a_picture_cut_short_is_unreadable_and_never_half_a_picture(suffix, share, capfd):
+def test_a_truncated_picture_is_unreadable(suffix, share, capfd):
     data = encoded(suffix, textured())
     got = decode(data[: int(len(data) * share)], SIZE)
     assert isinstance(got, Missing)
@@ -100,15 +100,15 @@ def test_a_picture_cut_short_is_unreadable_and_never_half_a_picture(suffix, shar
     assert capfd.readouterr().err == ""
 
 
-def test_opencv_alone_would_give_half_a_jpeg_as_a_whole_one(tmp_path):
-    """Why `decode` looks for the end marker itself, and pictures are not read by cv2.imread."""
+def test_opencv_alone_reads_a_truncated_jpeg_without_error(tmp_path):
+    """The reason why `decode` searches for the end marker, and pictures are not read by cv2.imread."""
     data = encoded(".jpg", textured())
     (tmp_path / "half.jpg").write_bytes(data[: len(data) // 2])
     assert cv2.imread(str(tmp_path / "half.jpg"), cv2.IMREAD_GRAYSCALE) is not None
 
 
 @pytest.mark.parametrize("at", [0.3, 0.5, 0.9])
-def test_one_wrong_byte_in_a_png_is_noticed_by_its_checksum(at, capfd):
+def test_one_wrong_byte_in_a_png_is_detected_by_its_checksum(at, capfd):
     data = bytearray(encoded(".png", textured()))
     data[int(len(data) * at)] ^= 0x10
     assert decode(bytes(data), SIZE).reason.startswith("unreadable: damaged (a checksum")
@@ -116,11 +116,11 @@ def test_one_wrong_byte_in_a_png_is_noticed_by_its_checksum(at, capfd):
 
 
 @pytest.mark.parametrize("tail", [b"", b"\0" * 512, b"camera's own remark \xff\x00"])
-def test_a_jpeg_with_something_behind_its_end_is_whole(tail):
+def test_a_jpeg_with_data_after_its_end_is_complete(tail):
     assert not isinstance(decode(encoded(".jpg", textured()) + tail, SIZE), Missing)
 
 
-def test_a_progressive_jpeg_and_one_with_a_thumbnail_are_judged_by_their_own_end():
+def test_the_end_of_a_progressive_jpeg_with_a_thumbnail_is_recognised():
     data = cv2.imencode(".jpg", textured(), [cv2.IMWRITE_JPEG_PROGRESSIVE, 1, cv2.IMWRITE_JPEG_RST_INTERVAL, 2])[1]
     thumbnail = encoded(".jpg", textured()[:8, :8])
     segment = b"\xff\xe1" + struct.pack(">H", len(thumbnail) + 2) + thumbnail
@@ -130,19 +130,19 @@ def test_a_progressive_jpeg_and_one_with_a_thumbnail_are_judged_by_their_own_end
 
 
 @pytest.mark.parametrize("data", [b"", b"hello", b"\x89PNG\r\n\x1a\n", b"\xff\xd8", b"P5\n999999 999999\n255\n00"])
-def test_no_bytes_at_all_or_no_picture_are_unreadable(data, capfd):
+def test_an_empty_file_or_one_that_is_not_a_picture_is_unreadable(data, capfd):
     assert decode(data, SIZE).reason.startswith("unreadable")
     assert capfd.readouterr().err == ""
 
 
-def test_a_png_that_promises_an_absurd_size_is_unreadable():
+def test_a_png_with_an_absurd_size_in_its_header_is_unreadable():
     header = struct.pack(">IIBBBBB", 2**30, 2**30, 8, 0, 0, 0, 0)
     chunk = lambda kind, body: struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))  # noqa: E731
     data = b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(b"0")) + chunk(b"IEND", b"")
     assert decode(data, SIZE).reason.startswith("unreadable")
 
 
-def test_other_sizes_and_other_numbers_than_8_or_16_bits_are_no_picture_of_this_camera(tmp_path):
+def test_other_sizes_and_other_depths_than_8_or_16_bits_are_rejected(tmp_path):
     assert decode(encoded(".png", textured()), (48, 64)).reason == "wrong size 64x48, the rig says 48x64"
     assert "float32" in decode(encoded(".tif", textured().astype(np.float32)), SIZE).reason
     assert read_picture(tmp_path / "gone.png", SIZE).reason == "unreadable: No such file or directory"
@@ -151,7 +151,7 @@ def test_other_sizes_and_other_numbers_than_8_or_16_bits_are_no_picture_of_this_
 # Folders --------------------------------------------------------------------------------------------------------
 
 
-def test_every_picture_comes_under_its_own_number_in_order(tmp_path):
+def test_every_picture_has_its_own_number_and_comes_in_order(tmp_path):
     sets = read_all(write_run(tmp_path / "a", frames=40))
     assert [s.frame for s in sets] == list(range(40))
     for s in sets:
@@ -159,7 +159,7 @@ def test_every_picture_comes_under_its_own_number_in_order(tmp_path):
             np.testing.assert_array_equal(s.images[camera], picture_of(s.frame))
 
 
-def test_gaps_and_unequal_gaps_are_dropped_frames_of_the_cameras_that_lack_them(tmp_path):
+def test_missing_numbers_are_dropped_frames_of_that_camera(tmp_path):
     folder = write_run(tmp_path / "a", frames=8)
     for camera, number in (("left", 0), ("left", 3), ("right", 3), ("right", 4), ("right", 7)):
         (folder / "frames" / camera / f"{number:06d}.png").unlink()
@@ -171,7 +171,7 @@ def test_gaps_and_unequal_gaps_are_dropped_frames_of_the_cameras_that_lack_them(
     assert (reader.first, reader.last, reader.expected_frames) == (0, 7, 8)
 
 
-def test_the_run_goes_on_past_damaged_empty_and_wrong_sized_pictures(tmp_path, capfd):
+def test_the_run_continues_past_damaged_empty_and_wrong_sized_pictures(tmp_path, capfd):
     folder = write_run(tmp_path / "a", frames=6)
     left = folder / "frames" / "left"
     whole = (left / "000001.png").read_bytes()
@@ -200,14 +200,14 @@ def test_the_number_is_the_last_group_of_digits_of_the_name(tmp_path):
 
 
 @pytest.mark.parametrize("other", ["0.png", "000000.tif", "left_000000.png"])
-def test_two_pictures_of_one_number_are_refused(other, tmp_path):
+def test_two_pictures_of_one_number_are_an_error(other, tmp_path):
     folder = write_run(tmp_path / "a")
     (folder / "frames/left" / other).write_bytes(b"")
-    with pytest.raises(InputError, match=r"expected one picture per frame, got .* for frame 0; take one away"):
+    with pytest.raises(InputError, match=r"expected one picture per frame, got .* for frame 0; remove one"):
         open_frames(load_run(folder))
 
 
-def test_an_empty_folder_is_refused(tmp_path):
+def test_an_empty_folder_is_an_error(tmp_path):
     folder = write_run(tmp_path / "a")
     for path in (folder / "frames/left").iterdir():
         path.rename(path.with_suffix(".raw"))
@@ -215,14 +215,14 @@ def test_an_empty_folder_is_refused(tmp_path):
         open_frames(load_run(folder))
 
 
-def test_a_stray_far_number_is_refused_before_a_million_rows_are_written(tmp_path):
+def test_a_number_far_from_the_others_is_an_error_and_not_a_million_empty_rows(tmp_path):
     folder = write_run(tmp_path / "a")
     (folder / "frames/left/1000000.png").write_bytes(b"")
     with pytest.raises(InputError, match="got 11 pictures between frame 0 and frame 1000000; is a stray file"):
         open_frames(load_run(folder))
 
 
-def test_a_long_gap_of_a_real_recording_is_kept(tmp_path):
+def test_a_long_gap_between_several_pictures_is_kept(tmp_path):
     folder = write_run(tmp_path / "a")
     for camera in ("left", "right"):
         for old, new in ((3, 20000), (4, 20001)):
@@ -232,19 +232,19 @@ def test_a_long_gap_of_a_real_recording_is_kept(tmp_path):
     assert sum(isinstance(s.images["left"], Missing) for s in sets) == 20002 - 5
 
 
-def test_a_single_stray_file_is_refused_before_the_gap_to_it_is_filled(tmp_path):
-    """90,000 rows of nothing cost 95 s."""
+def test_a_single_stray_file_is_an_error_before_the_gap_is_filled(tmp_path):
+    """90,000 empty rows take 95 s."""
     folder = write_run(tmp_path / "a", frames=30)
     (folder / "frames/left/090000.png").write_bytes(b"")
     with pytest.raises(InputError) as refused:
         open_frames(load_run(folder))
     assert str(refused.value) == (
         f"{folder / 'frames/left/090000.png'}: expected frame numbers without a long gap, got 90000, where the others"
-        " are 0 to 29; is it a stray file? Take it away"
+        " are 0 to 29; is it a stray file? Remove it"
     )
 
 
-def test_a_picture_without_a_timestamp_is_refused_and_a_dropped_one_needs_none(tmp_path):
+def test_a_picture_without_a_timestamp_is_an_error_and_a_dropped_one_needs_none(tmp_path):
     folder = write_run(tmp_path / "a")
     edit(folder / "run.yaml", "name: small", "name: small\ntimestamps: times.csv")
     (folder / "times.csv").write_text("frame,t_s\n0,0\n1,0.01\n2,0.02\n4,0.04\n")
@@ -258,7 +258,7 @@ def test_a_picture_without_a_timestamp_is_refused_and_a_dropped_one_needs_none(t
 # Reading ahead --------------------------------------------------------------------------------------------------
 
 
-def test_frames_are_read_ahead_but_only_so_many(tmp_path, monkeypatch):
+def test_a_limited_number_of_frames_is_read_ahead(tmp_path, monkeypatch):
     lock, state = threading.Lock(), {"read": 0}
     real = read_picture
 
@@ -269,7 +269,7 @@ def test_frames_are_read_ahead_but_only_so_many(tmp_path, monkeypatch):
 
     monkeypatch.setattr("lab.runs.frames.frame_sources.read_picture", counted)
     for taken, _ in enumerate(open_frames(load_run(write_run(tmp_path / "a", frames=60))), start=1):
-        if taken == 20:  # while the consumer works on this frame, the threads go on until enough are in flight
+        if taken == 20:  # while the consumer processes this frame, the threads read up to the limit
             until = time.monotonic() + 10
             while state["read"] < 2 * (taken + frames.AHEAD - 1) and time.monotonic() < until:
                 time.sleep(0.01)
@@ -278,7 +278,7 @@ def test_frames_are_read_ahead_but_only_so_many(tmp_path, monkeypatch):
     assert state["read"] == 120
 
 
-def test_an_exception_in_a_thread_reaches_the_one_who_reads(tmp_path, monkeypatch):
+def test_an_exception_in_a_thread_reaches_the_reader(tmp_path, monkeypatch):
     def broken(path, size_px):
         raise RuntimeError(f"boom {path.name}")
 
@@ -288,7 +288,7 @@ def test_an_exception_in_a_thread_reaches_the_one_who_reads(tmp_path, monkeypatc
     assert not [t for t in threading.enumerate() if t.name.startswith("decode")]
 
 
-def test_stopping_early_leaves_no_thread_and_the_reader_starts_anew(tmp_path):
+def test_stopping_early_leaves_no_thread_and_the_reader_can_start_again(tmp_path):
     reader = open_frames(load_run(write_run(tmp_path / "a", frames=40)))
     for frame_set in reader:
         if frame_set.frame == 3:
@@ -303,8 +303,8 @@ def test_stopping_early_leaves_no_thread_and_the_reader_starts_anew(tmp_path):
 MEASURE = """
 import resource, sys
 from pathlib import Path
-from lab.frames import open_frames
-from lab.run_file import load_run
+from lab.files.run.run_file import load_run
+from lab.runs.frames.frames import open_frames
 count = sum(1 for _ in open_frames(load_run(Path(sys.argv[1]))))
 print(count, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
 """
@@ -360,33 +360,33 @@ def test_frame_n_of_a_video_is_its_nth_picture(video_run):
     assert reader.expected_frames == 12
 
 
-def test_a_video_that_ends_before_the_other_camera_is_dropped_from_there(video_run):
+def test_frames_after_the_end_of_a_video_are_dropped(video_run):
     write_video(video_run / "left.avi", 3)
     sets = read_all(video_run)
     assert [isinstance(s.images["left"], Missing) for s in sets] == [False] * 3 + [True] * 2
 
 
-def test_a_video_of_another_size_goes_on_as_wrong_size(video_run):
+def test_pictures_of_a_video_of_another_size_are_missing(video_run):
     text = (video_run / "rig.yaml").read_text().replace("image_size_px: [64, 48]", "image_size_px: [48, 64]", 1)
     (video_run / "rig.yaml").write_text(text)
     assert {s.images["left"].reason for s in read_all(video_run)} == {"wrong size 64x48, the rig says 48x64"}
 
 
 @pytest.mark.parametrize("content", [b"", b"no video at all" * 100])
-def test_a_file_that_is_no_video_is_told_in_one_line(content, video_run):
+def test_a_file_that_is_not_a_video_is_an_input_error(content, video_run):
     (video_run / "left.avi").write_bytes(content)
     with pytest.raises(InputError, match=r"left\.avi: expected a video that OpenCV can read"):
         open_frames(load_run(video_run))
 
 
-def test_a_video_whose_header_promises_more_is_noted(video_run, monkeypatch):
-    monkeypatch.setattr(frames, "promised_pictures", lambda path: 20)
+def test_a_video_that_is_shorter_than_its_header_states_is_noted(video_run, monkeypatch):
+    monkeypatch.setattr(frames, "header_picture_count", lambda path: 20)
     reader = open_frames(load_run(video_run))
     assert len(list(reader)) == 12
-    assert reader.notes[0].endswith("left.avi: ended after 12 pictures; its header says 20")
+    assert reader.notes[0].endswith("left.avi: ended after 12 pictures; its header states 20")
 
 
-def test_single_pictures_can_be_asked_for(video_run):
+def test_single_pictures_can_be_read(video_run):
     run = load_run(video_run)
     got = pictures_at(run, "left", [7, 3, 40, 3])
     assert list(got) == [3, 7, 40]

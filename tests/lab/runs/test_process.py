@@ -1,4 +1,4 @@
-"""From a run folder to its results: every file, every row, honest numbers; complete or absent."""
+"""From a run folder to its results: all files and rows, correct sigmas, and a folder that is complete or absent."""
 
 from __future__ import annotations
 
@@ -24,8 +24,9 @@ from lab.runs import process
 from lab.runs.batch import process_batch
 from lab.runs.frames.pipeline import FrameRecord, Pipeline
 from lab.runs.process import are_results, process_run
+from lab.runs.run_tally import RunTally
 from lab.runs.score.score import normalised_squares
-from lab.runs.smoothing_pass import SMOOTHING, TRACKING, WRITING, TwoPasses
+from lab.runs.smoothing_pass import SMOOTHING, TRACKING, WRITING, TrackingAndSmoothing
 from lab.runs.verdict.quality import LEAST_MEASURED
 from lab.simulate.scenarios import SCENARIOS, RecordingFault
 from lab.simulate.write import simulate
@@ -71,11 +72,11 @@ def points_run(folder: Path, frames: int = 12, seed: int = 5) -> Path:
 
 
 class WeakRecord(FrameRecord):
-    """A record that can be watched: the slots of the plain one leave no room for that."""
+    """A record that supports weak references, unlike its base class with slots."""
 
 
 def a_tracked_frame(n: int) -> TrackedFrame:
-    """A frame in which nothing is known of n views."""
+    """A lost frame of n views."""
     return TrackedFrame(
         np.full((n, 2), np.nan), np.full((n, 2, 2), np.nan), (SpotStatus.OCCLUDED,) * n, np.full((n, 2), np.nan),
         np.full(n, np.nan), np.full(n, -1), PoseStatus.LOST, None, None, 0, float("nan"), (),
@@ -103,11 +104,11 @@ def tables(results) -> dict[str, list[dict[str, str]]]:
 # -- files and rows ---------------------------------------------------------------------------------------------------
 
 
-def test_all_files_of_the_contract_are_there_and_no_other(results):
+def test_the_results_are_exactly_the_files_of_the_contract(results):
     assert names(results) == sorted(FILES)
 
 
-def test_no_half_written_folder_is_left_beside_the_results(results, run_folder):
+def test_no_temporary_folder_is_left_beside_the_results(results, run_folder):
     assert names(results.parent) == ["results", "run"]
 
 
@@ -119,7 +120,7 @@ def test_every_line_has_exactly_the_columns_in_their_order(results, name):
     assert {len(line) for line in lines} == {len(HEADERS[name])}
 
 
-def test_attitude_has_a_row_for_every_frame_number_dropped_ones_too(tables):
+def test_attitude_has_a_row_for_every_frame_number_including_dropped_ones(tables):
     assert [int(r["frame"]) for r in tables["attitude.csv"]] == list(range(FRAMES))
     np.testing.assert_allclose([float(r["t_s"]) for r in tables["attitude.csv"]], np.arange(FRAMES) / 100)
 
@@ -141,20 +142,20 @@ def test_covariance_has_a_row_for_every_frame_with_a_pose(tables):
     assert [r["frame"] for r in tables["covariance.csv"]] == with_pose
 
 
-def test_a_picture_that_is_missing_or_damaged_is_no_image(tables):
+def test_a_missing_or_damaged_picture_has_the_status_no_image(tables):
     gone = {(4, "left"), (4, "right"), (6, "left"), (7, "left"), (9, "right")}
     found = {(int(r["frame"]), r["camera"]) for r in tables["spots.csv"] if r["status"] == "no_image"}
     assert found == gone
     assert gone.isdisjoint({(int(r["frame"]), r["camera"]) for r in tables["detections.csv"]})
 
 
-def test_quaternions_are_unit_and_have_w_not_negative(tables):
+def test_quaternions_have_unit_length_and_w_not_negative(tables):
     q = np.array([[float(r[n]) for n in ("qw", "qx", "qy", "qz")] for r in tables["attitude.csv"] if r["qw"]])
     assert np.all(q[:, 0] >= 0)
     np.testing.assert_allclose(np.linalg.norm(q, axis=1), 1.0, atol=1e-9)
 
 
-def test_statuses_and_numbers_go_together(tables):
+def test_fields_are_empty_exactly_where_the_status_says_so(tables):
     for r in tables["spots.csv"]:
         empty = r["status"] in ("off_screen", "lost")
         assert (r["u_px"] == "") == (r["v_px"] == "") == (r["sigma_u_px"] == "") == empty
@@ -166,7 +167,7 @@ def test_statuses_and_numbers_go_together(tables):
 
 
 @pytest.mark.parametrize("causal", [True, False])
-def test_a_beam_that_misses_its_screen_has_neither_place_nor_sigma(tmp_path, causal):
+def test_a_beam_that_misses_its_screen_has_neither_position_nor_sigma(tmp_path, causal):
     process_run(ROOT / "sample_runs/four-skew-beams", tmp_path / "out", causal=causal)
     rows = [r for r in rows_of(tmp_path / "out/spots.csv") if r["status"] == "off_screen"]
     assert rows
@@ -189,7 +190,7 @@ def test_measured_poses_lie_within_their_sigmas_of_the_truth(tables, run_folder)
 # -- summary ----------------------------------------------------------------------------------------------------------
 
 
-def test_the_summary_counts_what_the_tables_hold(results, tables):
+def test_the_counts_of_the_summary_are_those_of_the_tables(results, tables):
     summary = json.loads((results / "summary.json").read_text("utf-8"))
     counts = summary["counts"]
     assert counts["frames"] == FRAMES
@@ -204,7 +205,7 @@ def test_the_summary_counts_what_the_tables_hold(results, tables):
     assert summary["rates"]["measured_share"] == counts["pose_status"]["measured"] / FRAMES
 
 
-def test_the_summary_says_what_went_in_and_what_was_done(results, run_folder):
+def test_the_summary_lists_inputs_parameters_and_versions(results, run_folder):
     summary = json.loads((results / "summary.json").read_text("utf-8"))
     assert {Path(e["path"]).name for e in summary["inputs"]} == {"run.yaml", "rig.yaml", "left", "right"}
     assert summary["parameters"]["tracker"]["r1_px"] == 10.0
@@ -223,7 +224,7 @@ def test_the_summary_is_strict_json(results):
     json.loads((results / "summary.json").read_text("utf-8"), parse_constant=refuse)
 
 
-def test_a_number_that_does_not_exist_is_null_in_the_summary():
+def test_a_number_that_is_not_finite_is_null_in_the_summary():
     content = {"a": float("nan"), "b": [np.float64("inf"), np.int64(3)], "c": (np.float32(0.5), True, None, "text")}
     assert plain(content) == {"a": None, "b": [None, 3], "c": [0.5, True, None, "text"]}
 
@@ -249,12 +250,12 @@ def test_the_outcome_its_line_and_the_summary_agree(tmp_path):
     assert outcome.verdict.status == summary["verdict"]["status"] == "pass"
     assert outcome.exit_status == summary["verdict"]["exit_status"] == 0
     assert outcome.line() == (
-        f"smooth-5: PASS: 12 of 12 frames measured ({outcome.verdict.reasons[0]}) -> {tmp_path / 'out'}"
+        f"smooth-5: PASS: 12 of 12 frames measured ({outcome.verdict.texts[0]}) -> {tmp_path / 'out'}"
     )
 
 
-def test_a_run_in_which_the_vehicle_is_never_found_is_a_failed_gate_with_all_its_files(tmp_path):
-    """Grey pictures without any spot: processed, and exit status 4."""
+def test_a_run_in_which_the_vehicle_is_never_found_fails_the_gate_and_has_all_its_files(tmp_path):
+    """Grey pictures without any spot are processed, with exit status 4."""
     folder = write_run(tmp_path / "run")
     outcome = process_run(folder, tmp_path / "out")
     assert outcome.exit_status == 4
@@ -268,7 +269,7 @@ def test_a_run_in_which_the_vehicle_is_never_found_is_a_failed_gate_with_all_its
 
 
 def lit(folder: Path, frames: int) -> Path:
-    """A run of 40 frames of which the first so many, and the last, show spots."""
+    """A run of 40 frames with spots in the first `frames` and in the last one."""
     table = points_run(folder, frames=40) / "detections.csv"
     lines = table.read_text().splitlines(keepends=True)
     table.write_text(
@@ -277,66 +278,66 @@ def lit(folder: Path, frames: int) -> Path:
     return folder
 
 
-def evidence_of(out: Path) -> dict[str, dict]:
-    """The evidence of a run's verdict by its kind, as summary.json has it."""
+def reasons_of(out: Path) -> dict[str, dict]:
+    """The reasons of a run's verdict by their kind, from summary.json."""
     return {e["kind"]: e for e in json.loads((out / "summary.json").read_text())["verdict"]["evidence"]}
 
 
-def test_a_run_that_is_dark_for_nearly_all_of_its_frames_fails_the_gate(tmp_path):
+def test_a_run_without_spots_in_nearly_all_of_its_frames_fails_the_gate(tmp_path):
     outcome = process_run(lit(tmp_path / "run", int(40 * LEAST_MEASURED) - 2), tmp_path / "out")
     assert outcome.frames == 40
     assert outcome.exit_status == 4
 
 
-def test_a_run_that_is_dark_for_half_of_its_frames_and_says_so_does_not_fail(tmp_path):
+def test_a_run_without_spots_in_half_of_its_frames_does_not_fail(tmp_path):
     outcome = process_run(lit(tmp_path / "run", 18), tmp_path / "out")
     assert (outcome.measured, outcome.verdict.status, outcome.exit_status) == (19, "check", 0)
-    few = evidence_of(tmp_path / "out")["few_measured"]
+    few = reasons_of(tmp_path / "out")["few_measured"]
     assert few["numbers"]["causes"] == {"hidden": 21}
     assert few["remedy"]
 
 
-def test_a_camera_that_shows_nothing_is_named_with_what_to_do(tmp_path):
+def test_a_camera_without_detections_is_reported_with_a_remedy(tmp_path):
     folder = points_run(tmp_path / "run", frames=20)
     table = folder / "detections.csv"
     table.write_text("".join(ln for ln in table.read_text().splitlines(keepends=True) if ",right," not in ln))
     outcome = process_run(folder, tmp_path / "out")
     assert outcome.exit_status == 4
-    evidence = evidence_of(tmp_path / "out")
-    assert list(evidence) == ["never_found", "nothing_detected"]
-    assert evidence["nothing_detected"]["what"] == "camera right: nothing was detected in any of its 20 pictures"
-    assert evidence["nothing_detected"]["remedy"] in outcome.line()
+    reasons = reasons_of(tmp_path / "out")
+    assert list(reasons) == ["never_found", "nothing_detected"]
+    assert reasons["nothing_detected"]["what"] == "camera right: nothing was detected in any of its 20 pictures"
+    assert reasons["nothing_detected"]["remedy"] in outcome.line()
     page = (tmp_path / "out/report.html").read_text("utf-8")
     assert "nothing was detected in any of its 20 pictures" in page
     assert "are the lasers on, the lens uncovered" in page
 
 
-def test_a_prior_that_is_wrong_is_not_taken_for_darkness(tmp_path):
+def test_a_wrong_prior_is_distinguished_from_missing_spots(tmp_path):
     folder = points_run(tmp_path / "run", frames=20)
     content = yaml.safe_load((folder / "run.yaml").read_text())
     content["prior"] |= {"position_m": [2.0, 1.5, 0.0], "within_m": 0.1, "within_deg": 3.0}
     (folder / "run.yaml").write_text(yaml.safe_dump(content))
     assert process_run(folder, tmp_path / "out").exit_status == 4
-    evidence = evidence_of(tmp_path / "out")
-    assert list(evidence) == ["never_found", "not_acquired"]
-    assert evidence["not_acquired"]["remedy"].startswith("Check the prior")
+    reasons = reasons_of(tmp_path / "out")
+    assert list(reasons) == ["never_found", "not_acquired"]
+    assert reasons["not_acquired"]["remedy"].startswith("Check the prior")
 
 
-def test_a_camera_that_stops_or_starts_late_is_told_in_words(tmp_path):
+def test_a_camera_that_stops_or_starts_late_is_reported(tmp_path):
     gone = tuple(RecordingFault(k, "dropped", camera) for camera, k in (("left", 12), ("left", 13), ("right", 0)))
     scenario = replace(SCENARIOS["smooth"], faults=gone)
     folder = simulate(scenario, tmp_path / "run", seed=5, frames=FRAMES, picture_scale=0.3)
     process_run(folder, tmp_path / "out")
-    evidence = evidence_of(tmp_path / "out")
+    reasons = reasons_of(tmp_path / "out")
     assert (
-        evidence["camera_stopped"]["what"]
+        reasons["camera_stopped"]["what"]
         == "camera left stopped before the end: it has no picture from frame 12 on (2 frames)"
     )
-    assert evidence["camera_late"]["what"] == "camera right starts late: it has no picture of the first 1 frame"
+    assert reasons["camera_late"]["what"] == "camera right starts late: it has no picture of the first 1 frame"
 
 
-def test_a_vehicle_that_the_smoothing_pass_knows_throughout_was_not_lost(tmp_path, monkeypatch):
-    """Searches of the causal pass are events; the verdict counts what is reported."""
+def test_a_vehicle_that_is_lost_only_in_the_causal_pass_is_not_reported_as_lost(tmp_path, monkeypatch):
+    """Searches of the causal pass are events; the verdict counts the reported frames."""
     causal_step = RigidTracker.step
 
     def step(self, dt_s, found):
@@ -353,7 +354,7 @@ def test_a_vehicle_that_the_smoothing_pass_knows_throughout_was_not_lost(tmp_pat
 
 
 @pytest.mark.parametrize("causal", [True, False])
-def test_the_residual_is_that_of_the_reported_pose_against_its_own_spots(tmp_path, causal):
+def test_the_rms_residual_is_that_of_the_reported_pose_against_its_own_spots(tmp_path, causal):
     folder = points_run(tmp_path / "run", frames=40)
     process_run(folder, tmp_path / "out", causal=causal)
     model = SpotModel.of(load_run(folder).rig)
@@ -367,21 +368,21 @@ def test_the_residual_is_that_of_the_reported_pose_against_its_own_spots(tmp_pat
     np.testing.assert_allclose(poses.rms_px[measured], rms[measured], rtol=1e-4)
 
 
-def test_a_smoother_that_goes_astray_is_reported_as_predicted_with_sigmas_that_cover_it(tmp_path, monkeypatch):
-    """A pose 5 mm off for ten frames, at claimed sigmas of 0.1 mm: its spots deny it, and the verdict says so."""
+def test_a_wrong_smoothed_pose_is_reported_as_predicted_with_sigmas_that_cover_the_error(tmp_path, monkeypatch):
+    """A pose with an error of 5 mm for ten frames and stated sigmas of 0.1 mm contradicts its spots."""
     smoothed_frame = Smoothed.frame
 
-    def astray(self, k, causal, found):
+    def wrong_frame(self, k, causal, found):
         tracked = smoothed_frame(self, k, causal, found)
         if not 20 <= k < 30:
             return tracked
         return replace(tracked, pose=tracked.pose.plus(np.array([5e-3, 0, 0, 0, 0, 0])))
 
     folder = points_run(tmp_path / "run", frames=40)
-    monkeypatch.setattr(Smoothed, "frame", astray)
+    monkeypatch.setattr(Smoothed, "frame", wrong_frame)
     outcome = process_run(folder, tmp_path / "out")
-    evidence = evidence_of(tmp_path / "out")["contradiction"]
-    assert evidence["numbers"] == {"frames": [[20, 29]]}
+    reasons = reasons_of(tmp_path / "out")["contradiction"]
+    assert reasons["numbers"] == {"frames": [[20, 29]]}
     assert "contradict their own spots" in outcome.line()
     poses = read_poses(tmp_path / "out")
     assert np.flatnonzero(poses.has(PoseStatus.PREDICTED)).tolist() == list(range(20, 30))
@@ -398,8 +399,8 @@ def test_the_same_run_gives_the_same_tables(tmp_path, run_folder, results):
         assert (tmp_path / "again" / name).read_bytes() == (results / name).read_bytes()
 
 
-def test_detections_that_were_written_can_be_the_input(tmp_path, run_folder, results):
-    """A run from its own detections.csv: the same poses without the pictures, to the digits written."""
+def test_the_written_detections_can_be_the_input_of_a_run(tmp_path, run_folder, results):
+    """A run from its own detections.csv has the same poses, to the digits written."""
     run = yaml.safe_load((run_folder / "run.yaml").read_text())
     other = tmp_path / "run"
     other.mkdir()
@@ -413,7 +414,7 @@ def test_detections_that_were_written_can_be_the_input(tmp_path, run_folder, res
             assert float(a["yaw_deg"]) == pytest.approx(float(b["yaw_deg"]), abs=1e-5)
 
 
-def test_overrides_replace_parameters_of_the_run_and_reach_inner_blocks(tmp_path):
+def test_overrides_replace_parameters_of_the_run_and_of_its_blocks(tmp_path):
     folder = points_run(tmp_path / "run")
     process_run(folder, tmp_path / "out", overrides={"r1_px": 12.0, "labels.p_detect": 0.9, "method": "rigid"})
     tracker = json.loads((tmp_path / "out/summary.json").read_text())["parameters"]["tracker"]
@@ -432,7 +433,7 @@ def test_overrides_replace_parameters_of_the_run_and_reach_inner_blocks(tmp_path
         ({"method": "magic"}, r"--set: method: expected .*rigid.*spots.*'magic'"),
     ],
 )
-def test_a_wrong_override_is_a_plain_error_and_nothing_is_written(tmp_path, overrides, words):
+def test_a_wrong_override_is_an_input_error_and_nothing_is_written(tmp_path, overrides, words):
     folder = points_run(tmp_path / "run", frames=3)
     with pytest.raises(InputError, match=words):
         process_run(folder, tmp_path / "out", overrides=overrides)
@@ -441,7 +442,7 @@ def test_a_wrong_override_is_a_plain_error_and_nothing_is_written(tmp_path, over
 
 @pytest.mark.parametrize("method", ["rigid", "spots"])
 def test_a_run_without_a_prior_gives_the_same_as_with_one(tmp_path, method):
-    """Four skew beams have no symmetry: their first labels need no prior."""
+    """Four skew beams have no symmetry, so their first labels need no prior."""
     folder = simulate("four-skew-beams", tmp_path / "run", seed=5, frames=20, detections_only=True)
     process_run(folder, tmp_path / "with", overrides={"method": method})
     content = yaml.safe_load((folder / "run.yaml").read_text())
@@ -459,31 +460,31 @@ def test_a_run_without_a_prior_gives_the_same_as_with_one(tmp_path, method):
 # -- two passes -------------------------------------------------------------------------------------------------------
 
 
-def test_in_the_last_frame_the_whole_run_is_what_was_known_at_the_instant(tmp_path):
-    """Nothing comes after it. (The jerk is set: learnt from all frames it would differ from what was known then.)"""
+def test_in_the_last_frame_the_smoothed_pose_is_the_causal_one(tmp_path):
+    """No frame follows it. (The jerk is given: an estimate from all frames would differ from the causal one.)"""
     known = {"learn_jerk": False, "jerk_m_s3": 2.0, "jerk_rad_s3": 5.0}
     process_run(points_run(tmp_path / "run", frames=60), tmp_path / "out", overrides=known)
     smoothed, causal = (read_poses(tmp_path / "out", causal=c) for c in (False, True))
     assert np.array_equal(smoothed.frames, causal.frames)
     away = normalised_squares(smoothed.world_from_body.minus(causal.world_from_body), causal.covariance)
-    assert away[-1] < 1e-3**2  # a thousandth of a sigma: about other references both are linear
+    assert away[-1] < 1e-3**2  # a thousandth of a sigma: the two are linearised about different poses
     assert np.median(away[:-5]) > 1.0
     np.testing.assert_allclose(smoothed.sigma_position_m[-1], causal.sigma_position_m[-1], rtol=1e-3)
     np.testing.assert_allclose(smoothed.sigma_ypr_deg[-1], causal.sigma_ypr_deg[-1], rtol=1e-3)
     np.testing.assert_allclose(smoothed.sigma_velocity_m_s[-1], causal.sigma_velocity_m_s[-1], rtol=1e-2)
-    # In the midst the frames that follow tell as much as those before.
+    # In the middle of the run the following frames have as much information as the previous ones.
     inner = [np.median(p.sigma_ypr_deg[10:-10, 0]) for p in (smoothed, causal)]
     assert inner[0] < 0.75 * inner[1]
 
 
-def test_in_the_first_frame_the_whole_run_tells_more_than_the_instant(tmp_path):
+def test_in_the_first_frame_the_smoothed_sigmas_are_smaller_than_the_causal_ones(tmp_path):
     process_run(points_run(tmp_path / "run", frames=30), tmp_path / "out")
     smoothed, causal = (read_poses(tmp_path / "out", causal=c) for c in (False, True))
     assert np.all(smoothed.sigma_position_m[0] < causal.sigma_position_m[0])
     assert np.all(smoothed.sigma_velocity_m_s[0] < 0.1 * causal.sigma_velocity_m_s[0])
 
 
-def test_a_causal_run_is_what_a_smoothed_one_keeps_of_each_instant(tmp_path):
+def test_the_tables_of_a_causal_run_are_the_causal_tables_of_a_smoothed_one(tmp_path):
     folder = points_run(tmp_path / "run")
     process_run(folder, tmp_path / "smoothed")
     process_run(folder, tmp_path / "causal", causal=True)
@@ -495,13 +496,13 @@ def test_a_causal_run_is_what_a_smoothed_one_keeps_of_each_instant(tmp_path):
     summaries = [json.loads((tmp_path / which / "summary.json").read_text()) for which in ("smoothed", "causal")]
     assert [t["attitude"] for t in summaries] == ["smoothed", "causal"]
     assert [t["timings"]["smoothing_s"] > 0 for t in summaries] == [True, False]
-    said = {"jerk_m_s3", "jerk_rad_s3", "iterations", "relabelled", "place_share", "seconds"}
-    assert set(summaries[0]["smoother"]) == said
+    keys = {"jerk_m_s3", "jerk_rad_s3", "iterations", "relabelled", "place_share", "seconds"}
+    assert set(summaries[0]["smoother"]) == keys
     assert summaries[1]["smoother"] is None
     assert [t["errors"]["pose_causal"] is None for t in summaries] == [False, True]
 
 
-def test_what_was_predicted_before_a_frame_is_the_same_in_both_passes(tmp_path):
+def test_the_predictions_are_the_same_in_both_passes(tmp_path):
     folder = points_run(tmp_path / "run")
     process_run(folder, tmp_path / "smoothed")
     process_run(folder, tmp_path / "causal", causal=True)
@@ -519,7 +520,7 @@ def test_the_papers_tracker_is_smoothed_too_and_keeps_its_labels(tmp_path):
     assert (summary["attitude"], summary["smoother"]["relabelled"]) == ("smoothed", 0)
     smoothed, causal = (rows_of(tmp_path / which / "spots.csv") for which in ("smoothed", "causal"))
     assert [r["status"] for r in smoothed] == [r["status"] for r in causal]
-    assert {r["label_probability"] for r in smoothed} == {""}  # nothing estimates it
+    assert {r["label_probability"] for r in smoothed} == {""}  # this tracker does not estimate it
     assert {r["velocity_x_m_s"] for r in rows_of(tmp_path / "causal/attitude.csv")} == {""}  # it has none
     assert "" not in {r["velocity_x_m_s"] for r in rows_of(tmp_path / "smoothed/attitude.csv")}
 
@@ -532,13 +533,13 @@ def test_the_method_chooses_the_tracker(tmp_path):
     assert run.tracker.method == "rigid"  # unless the run says otherwise
 
 
-def test_frames_wait_on_disk_and_not_in_memory(tmp_path):
-    """Between the passes only the recording is held: no record of pass 1 is alive, and memory does not follow them."""
+def test_frames_are_stored_on_disk_between_the_passes(tmp_path):
+    """Between the passes no record of the causal pass is in memory."""
     pipeline = Pipeline.of(load_run(points_run(tmp_path / "run", frames=40)))
     alive = []
 
     class Watched:
-        """A pipeline whose records are watched until they are gone."""
+        """A pipeline with weak references to its records."""
 
         run, reader, timings = pipeline.run, pipeline.reader, pipeline.timings
 
@@ -550,7 +551,9 @@ def test_frames_wait_on_disk_and_not_in_memory(tmp_path):
                 yield copy
 
     left = []
-    passes = TwoPasses(Watched(), tmp_path, lambda done, total, stage: left.append(stage == SMOOTHING and still()))
+    passes = TrackingAndSmoothing(
+        Watched(), tmp_path, lambda done, total, stage: left.append(stage == SMOOTHING and still())
+    )
 
     def still():
         return sum(ref() is not None for ref in alive)
@@ -558,39 +561,39 @@ def test_frames_wait_on_disk_and_not_in_memory(tmp_path):
     assert sum(1 for _ in passes.records()) == 40
     assert len(alive) == 40
     assert max(left) <= 1  # the one that the loop still holds
-    assert names(tmp_path) == ["run"]  # and no file stays
+    assert names(tmp_path) == ["run"]  # no file is left
 
 
-def test_what_waits_between_the_passes_is_gone_when_nobody_reads_on(tmp_path):
+def test_no_temporary_file_is_left_when_the_iteration_stops(tmp_path):
     pipeline = Pipeline.of(load_run(points_run(tmp_path / "run", frames=6)))
     work = tmp_path / "work"
     work.mkdir()
-    records = TwoPasses(pipeline, work).records()
+    records = TrackingAndSmoothing(pipeline, work).records()
     next(records)
     records.close()
     assert names(work) == []
 
 
-def test_labels_that_stay_open_for_long_are_one_event():
-    tally = process._Tally(("left",), ("left/1", "left/2"))
-    nothing = replace(a_tracked_frame(2), label_probability=np.array([0.6, np.nan]))
+def test_consecutive_frames_with_an_uncertain_label_are_one_event():
+    tally = RunTally(("left",), ("left/1", "left/2"))
+    tracked = replace(a_tracked_frame(2), label_probability=np.array([0.6, np.nan]))
     for frame in (3, 4, 5, 9):
         events = (Event("undecided", "label left open", 0), Event("dropped", "contradicts", 1))
-        tally.add(FrameRecord(frame, 0.0, 0.0, (None,), ("dark",), replace(nothing, events=events)))
-    told = [(e["frame"], e["last_frame"], e["kind"], e["spot"]) for e in tally.events]
-    assert told == [
+        tally.add(FrameRecord(frame, 0.0, 0.0, (None,), ("dropped",), replace(tracked, events=events)))
+    listed = [(e.frame, e.last_frame, e.kind, e.spot) for e in tally.events]
+    assert listed == [
         (3, 5, "undecided", "1"), (3, 3, "dropped", "2"), (4, 4, "dropped", "2"), (5, 5, "dropped", "2"),
         (9, 9, "undecided", "1"), (9, 9, "dropped", "2"),
     ]  # fmt: skip
     assert tally.event_kinds == {"undecided": 4, "dropped": 4}
-    assert tally.left_open == 4
+    assert tally.labels_left_open == 4
 
 
 # -- complete or absent -----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("error", [RunError("the disk is full"), KeyboardInterrupt(), RuntimeError("a bug")])
-def test_a_run_that_breaks_in_the_middle_leaves_nothing(tmp_path, monkeypatch, error):
+def test_a_run_that_fails_in_the_middle_leaves_nothing(tmp_path, monkeypatch, error):
     folder = points_run(tmp_path / "run")
     write = process.TableWriter.write
 
@@ -606,7 +609,7 @@ def test_a_run_that_breaks_in_the_middle_leaves_nothing(tmp_path, monkeypatch, e
 
 
 @pytest.mark.parametrize("stage", [TRACKING, SMOOTHING, WRITING])
-def test_a_run_that_is_stopped_in_either_pass_leaves_nothing(tmp_path, stage):
+def test_a_run_that_is_stopped_in_any_stage_leaves_nothing(tmp_path, stage):
     folder = points_run(tmp_path / "run")
 
     def stop(done, total, now):
@@ -618,7 +621,7 @@ def test_a_run_that_is_stopped_in_either_pass_leaves_nothing(tmp_path, stage):
     assert names(tmp_path) == ["run"]
 
 
-def test_a_run_that_breaks_leaves_earlier_results_as_they_were(tmp_path, monkeypatch):
+def test_a_run_that_fails_leaves_earlier_results_unchanged(tmp_path, monkeypatch):
     folder = points_run(tmp_path / "run", frames=4)
     out = tmp_path / "out"
     process_run(folder, out)
@@ -643,7 +646,7 @@ def test_earlier_results_are_replaced_as_a_whole(tmp_path):
     assert len(rows_of(out / "attitude.csv")) == 4
 
 
-def test_a_foreign_folder_is_not_deleted(tmp_path):
+def test_a_folder_with_other_content_is_not_deleted(tmp_path):
     folder = points_run(tmp_path / "run", frames=3)
     foreign = tmp_path / "photos"
     foreign.mkdir()
@@ -657,31 +660,31 @@ def test_a_foreign_folder_is_not_deleted(tmp_path):
 
 
 @pytest.mark.parametrize("content", [None, "", "[]", "3", "{}", '{"schema": "beampose/run/1"}', "\xff"])
-def test_what_is_no_summary_of_ours_is_no_result(tmp_path, content):
+def test_a_folder_without_a_summary_of_this_program_has_no_results(tmp_path, content):
     if content is not None:
         (tmp_path / "summary.json").write_bytes(content.encode("latin-1"))
     assert not are_results(tmp_path)
 
 
-def test_results_are_results(results):
+def test_the_results_of_a_run_are_recognised(results):
     assert are_results(results)
 
 
 @pytest.mark.parametrize("causal", [True, False])
 def test_progress_counts_every_frame_of_every_pass(tmp_path, causal):
-    told = []
+    calls = []
     process_run(
         points_run(tmp_path / "run", frames=7),
         tmp_path / "out",
         causal=causal,
-        progress=lambda *what: told.append(what),
+        progress=lambda *what: calls.append(what),
     )
     tracked = [(done, 7, TRACKING) for done in range(1, 8)]
-    assert [(done, total or 7, stage) for done, total, stage in told[:7]] == tracked
-    assert told[7:] == ([] if causal else [(0, None, SMOOTHING), *((done, 7, WRITING) for done in range(1, 8))])
+    assert [(done, total or 7, stage) for done, total, stage in calls[:7]] == tracked
+    assert calls[7:] == ([] if causal else [(0, None, SMOOTHING), *((done, 7, WRITING) for done in range(1, 8))])
 
 
-def test_a_batch_of_one_is_the_run(tmp_path):
+def test_a_batch_of_one_run_gives_the_tables_of_that_run(tmp_path):
     folder = points_run(tmp_path / "run", frames=4)
     process_run(folder, tmp_path / "one")
     process_batch([folder], tmp_path / "many")

@@ -1,4 +1,4 @@
-"""A rig's calibration in a run: its covariance in the tables and the report, its expiry in the exit status."""
+"""A rig's calibration in a run: its covariance appears in the tables and the report, its expiry in the exit status."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def covariance(rig, sigma=2e-4):
     return {"target": Covariance(names, np.diag([(1.0 if n.endswith((".cx", ".cy")) else sigma) ** 2 for n in names]))}
 
 
-def test_the_calibrations_share_comes_out_in_its_own_table_and_in_the_total(run_folder, tmp_path):
+def test_the_calibrations_covariance_is_in_its_own_table_and_in_the_total(run_folder, tmp_path):
     process_run(run_folder, tmp_path / "without")
     assert not (tmp_path / "without" / "systematic.csv").exists()
     rig = load_rig_file(run_folder / "rig.yaml").rig
@@ -48,7 +48,7 @@ def test_the_calibrations_share_comes_out_in_its_own_table_and_in_the_total(run_
     noise = poses.covariance - poses.systematic
     assert np.linalg.eigvalsh(noise).min() > 0
     assert np.linalg.eigvalsh(poses.systematic).min() > -1e-12
-    # A principal point that is known to a pixel outweighs spots that are known to a tenth.
+    # A principal point with a sigma of 1 px outweighs spots with a sigma of 0.1 px.
     variances, alone = (np.diagonal(p.covariance, axis1=1, axis2=2) for p in (poses, plain))
     assert np.all(variances > 2 * alone)
     with (tmp_path / "with" / "systematic.csv").open() as file:
@@ -68,7 +68,7 @@ def test_an_expired_calibration_stops_a_run_and_leaves_nothing(run_folder, tmp_p
     assert not (tmp_path / "out").exists()
 
 
-def test_the_day_of_the_recording_counts_where_the_run_tells_it(run_folder, tmp_path):
+def test_the_day_of_the_recording_counts_where_the_run_states_it(run_folder, tmp_path):
     change_rig(run_folder, calibration=CalibrationState(DAY, "WARN", DAY, ("a corner of the picture was not covered",)))
     path = run_folder / "run.yaml"
     content = yaml.safe_load(path.read_text())
@@ -88,7 +88,7 @@ def test_a_batch_with_an_expired_calibration_ends_with_status_3(run_folder, tmp_
     assert "FAIL" in (tmp_path / "out" / "batch.csv").read_text()
 
 
-def test_cameras_that_a_run_does_without_do_not_matter(run_folder, tmp_path):
+def test_the_calibration_of_unused_cameras_is_ignored(run_folder, tmp_path):
     file = load_rig_file(run_folder / "rig.yaml")
     extra = dataclasses.replace(file.rig.cameras["left"], name="spare")
     rig = dataclasses.replace(file.rig, cameras={**file.rig.cameras, "spare": extra})

@@ -1,4 +1,4 @@
-"""The verdict on a run: each gate on both sides of its limit, the evidence behind it, and one exit status for it."""
+"""The verdict on a run: each gate on both sides of its limit, its reasons, and its exit status."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from collections import Counter
 import pytest
 
 from calibration.findings import Finding, Level
-from lab.runs.verdict.evidence import REMEDIES, REMEDIES_BY_CAUSE, Kind
 from lab.runs.verdict.frame_ranges import FrameRanges
 from lab.runs.verdict.quality import GOOD_MEASURED, LEAST_MEASURED, LEAST_MEASURED_OF_SHOWN, Verdict, judge
-from lab.runs.verdict.run_facts import MISSED, CameraFacts, Cause, RunFacts
+from lab.runs.verdict.run_statistics import MISSED, CameraStatistics, Cause, RunStatistics
+from lab.runs.verdict.verdict_reasons import REMEDIES, REMEDIES_BY_CAUSE, ReasonKind
 
 FRAMES = 1000
 
@@ -19,41 +19,42 @@ def ranges(*spans: tuple[int, int]) -> FrameRanges:
     return FrameRanges([list(s) for s in spans])
 
 
-def a_camera(**changed: object) -> CameraFacts:
+def a_camera(**changed: object) -> CameraStatistics:
     """A camera with a picture in each frame and three points in each."""
-    facts = CameraFacts(pictures=FRAMES, points=3 * FRAMES, expected=3 * FRAMES, found=3 * FRAMES)
+    camera = CameraStatistics(pictures=FRAMES, points=3 * FRAMES, expected=3 * FRAMES, found=3 * FRAMES)
     for name, value in changed.items():
-        setattr(facts, name, value)
-    return facts
+        setattr(camera, name, value)
+    return camera
 
 
-def facts_of(
+def statistics_of(
     measured: int = FRAMES,
     causes: dict[Cause, int] | None = None,
-    cameras: dict[str, CameraFacts] | None = None,
+    cameras: dict[str, CameraStatistics] | None = None,
     **changed: object,
-) -> RunFacts:
-    """Frames 0 to 999; those not measured are predicted, by default since spots were hidden."""
-    facts = RunFacts(cameras or {"left": a_camera(), "right": a_camera()}, frames=FRAMES, last_frame=FRAMES - 1)
-    facts.pose = Counter({"measured": measured, "predicted": FRAMES - measured})
-    facts._surplus[0] = measured
+) -> RunStatistics:
+    """Frames 0 to 999; those without a measurement are predicted, by default because of hidden spots."""
+    cameras = cameras or {"left": a_camera(), "right": a_camera()}
+    statistics = RunStatistics(cameras, frames=FRAMES, last_frame=FRAMES - 1)
+    statistics.pose = Counter({"measured": measured, "predicted": FRAMES - measured})
+    statistics._surplus[0] = measured
     if causes is None:
         causes = {Cause.HIDDEN: FRAMES - measured} if measured < FRAMES else {}
-    facts._causes.update({(cause, 0): count for cause, count in causes.items()})
+    statistics._causes.update({(cause, 0): count for cause, count in causes.items()})
     for name, value in changed.items():
-        setattr(facts, name, value)
-    return facts
+        setattr(statistics, name, value)
+    return statistics
 
 
-def kinds(verdict: Verdict) -> list[Kind]:
-    return [e.kind for e in verdict.evidence]
+def kinds(verdict: Verdict) -> list[ReasonKind]:
+    return [e.kind for e in verdict.reasons]
 
 
-def test_a_clean_run_passes_and_says_why():
-    verdict = judge(facts_of())
-    assert (verdict.status, verdict.exit_status, verdict.evidence) == ("pass", 0, ())
-    assert verdict.reasons == (
-        "100.0% of the frames have a measured pose, and the residuals are what the sigmas allow",
+def test_a_clean_run_passes_and_gives_the_reason():
+    verdict = judge(statistics_of())
+    assert (verdict.status, verdict.exit_status, verdict.reasons) == ("pass", 0, ())
+    assert verdict.texts == (
+        "100.0% of the frames have a measured pose, and the residuals agree with the stated sigmas",
     )
 
 
@@ -69,42 +70,42 @@ def test_a_clean_run_passes_and_says_why():
     ],
 )
 def test_the_share_of_measured_frames_decides(measured, status):
-    assert judge(facts_of(measured)).status == status
+    assert judge(statistics_of(measured)).status == status
 
 
 @pytest.mark.parametrize("cause", Cause)
-def test_frames_that_show_too_little_do_not_fail_a_run_and_frames_that_were_missed_do(cause):
-    """A long occlusion is honestly reported; spots that are there and that no pose explains are not a measurement."""
+def test_only_missed_frames_fail_a_run_and_frames_with_too_few_spots_do_not(cause):
+    """The results of a long occlusion are correct; visible spots that no pose explains are not a measurement."""
     measured = int(FRAMES * LEAST_MEASURED_OF_SHOWN) - 1
-    verdict = judge(facts_of(measured, {cause: FRAMES - measured}))
+    verdict = judge(statistics_of(measured, {cause: FRAMES - measured}))
     assert verdict.status == ("fail" if cause in MISSED else "check")
-    assert kinds(verdict) == [Kind.FEW_MEASURED]
-    assert cause.meaning in verdict.reasons[0]
-    assert verdict.evidence[0].remedy == REMEDIES_BY_CAUSE[cause]
+    assert kinds(verdict) == [ReasonKind.FEW_MEASURED]
+    assert cause.meaning in verdict.texts[0]
+    assert verdict.reasons[0].remedy == REMEDIES_BY_CAUSE[cause]
 
 
-def test_missed_frames_count_among_those_that_show_enough_only():
-    """200 measured, 190 missed, 610 dark: most of what is shown was measured."""
-    verdict = judge(facts_of(200, {Cause.UNEXPLAINED: 190, Cause.HIDDEN: 610}))
+def test_the_share_of_missed_frames_is_relative_to_the_frames_with_enough_spots():
+    """200 measured, 190 missed, 610 occluded: most frames with visible spots were measured."""
+    verdict = judge(statistics_of(200, {Cause.UNEXPLAINED: 190, Cause.HIDDEN: 610}))
     assert verdict.status == "check"
-    assert "of the others, 610 with hidden spots, 190 with enough points of light" in verdict.reasons[0]
-    assert judge(facts_of(200, {Cause.UNEXPLAINED: 210, Cause.HIDDEN: 590})).exit_status == 4
+    assert "of the others, 610 with hidden spots, 190 with enough points of light" in verdict.texts[0]
+    assert judge(statistics_of(200, {Cause.UNEXPLAINED: 210, Cause.HIDDEN: 590})).exit_status == 4
 
 
 @pytest.mark.parametrize(
-    ("misfit", "status"), [(1.0, "pass"), (1.5, "pass"), (1.6, "check"), (5.0, "check"), (5.1, "fail")]
+    ("noise_scale", "status"), [(1.0, "pass"), (1.5, "pass"), (1.6, "check"), (5.0, "check"), (5.1, "fail")]
 )
-def test_the_misfit_decides_where_the_model_check_could_not(misfit, status):
-    verdict = judge(facts_of(), misfit=misfit)
+def test_the_noise_scale_decides_where_the_model_check_has_not_tested(noise_scale, status):
+    verdict = judge(statistics_of(), noise_scale=noise_scale)
     assert verdict.status == status
     if status != "pass":
-        assert f"{misfit:.1f} times as far" in verdict.reasons[0]
+        assert f"{noise_scale:.1f} times as far" in verdict.texts[0]
 
 
-def test_no_frame_at_all_is_a_failure():
-    verdict = judge(RunFacts({"left": CameraFacts()}))
+def test_a_run_without_frames_is_a_failure():
+    verdict = judge(RunStatistics({"left": CameraStatistics()}))
     assert verdict.status == "fail"
-    assert verdict.reasons == ("there is no frame at all",)
+    assert verdict.texts == ("there is no frame at all",)
 
 
 # -- why the vehicle was never found ----------------------------------------------------------------------------------
@@ -113,66 +114,66 @@ def test_no_frame_at_all_is_a_failure():
 def never(**changed: object) -> Verdict:
     arguments: dict[str, object] = {"causes": {Cause.UNEXPLAINED: FRAMES}} | changed
     # mypy cannot know which argument each keyword is for.
-    verdict = judge(facts_of(0, **arguments))  # type: ignore[arg-type]
+    verdict = judge(statistics_of(0, **arguments))  # type: ignore[arg-type]
     assert verdict.exit_status == 4
-    assert verdict.reasons[0] == "the vehicle was never found: no frame has a measured pose"
-    assert all(e.fails and e.remedy for e in verdict.evidence)
-    assert verdict.remedy == verdict.evidence[1].remedy
+    assert verdict.texts[0] == "the vehicle was never found: no frame has a measured pose"
+    assert all(e.fails and e.remedy for e in verdict.reasons)
+    assert verdict.remedy == verdict.reasons[1].remedy
     return verdict
 
 
-def test_points_that_no_pose_explains_point_at_the_prior_and_the_rig():
+def test_points_that_no_pose_explains_suggest_a_wrong_prior_or_rig():
     verdict = never()
-    assert kinds(verdict) == [Kind.NEVER_FOUND, Kind.NOT_ACQUIRED]
-    assert "3.0 per picture in camera left" in verdict.reasons[1]
+    assert kinds(verdict) == [ReasonKind.NEVER_FOUND, ReasonKind.NOT_ACQUIRED]
+    assert "3.0 per picture in camera left" in verdict.texts[1]
     assert "prior" in verdict.remedy
 
 
-def test_a_camera_that_shows_nothing_is_named_and_is_reason_enough():
-    dark = a_camera(points=0, empty=FRAMES, expected=0, found=0)
-    verdict = never(cameras={"left": a_camera(), "right": dark})
-    assert kinds(verdict) == [Kind.NEVER_FOUND, Kind.NOTHING_DETECTED]
-    assert verdict.reasons[1] == "camera right: nothing was detected in any of its 1000 pictures"
+def test_a_camera_without_any_detection_is_the_only_reason():
+    unlit = a_camera(points=0, empty=FRAMES, expected=0, found=0)
+    verdict = never(cameras={"left": a_camera(), "right": unlit})
+    assert kinds(verdict) == [ReasonKind.NEVER_FOUND, ReasonKind.NOTHING_DETECTED]
+    assert verdict.texts[1] == "camera right: nothing was detected in any of its 1000 pictures"
     assert "lens uncovered" in verdict.remedy
 
 
-def test_a_camera_without_any_picture_is_named():
-    gone = CameraFacts(missing=ranges((0, FRAMES - 1)))
+def test_a_camera_without_any_picture_is_reported():
+    gone = CameraStatistics(missing=ranges((0, FRAMES - 1)))
     verdict = never(cameras={"left": a_camera(), "right": gone}, causes={Cause.NO_PICTURE: FRAMES})
-    assert kinds(verdict) == [Kind.NEVER_FOUND, Kind.NO_PICTURES]
-    assert verdict.reasons[1] == "camera right has no usable picture at all"
+    assert kinds(verdict) == [ReasonKind.NEVER_FOUND, ReasonKind.NO_PICTURES]
+    assert verdict.texts[1] == "camera right has no usable picture at all"
 
 
-def test_too_few_points_are_told_from_points_that_do_not_fit():
+def test_too_few_points_are_distinguished_from_points_that_do_not_fit():
     verdict = never(causes={Cause.FEW_POINTS: 950, Cause.UNEXPLAINED: 50})
-    assert kinds(verdict) == [Kind.NEVER_FOUND, Kind.FEW_POINTS]
-    assert "950 frames of 1000 show fewer than the 4 points" in verdict.reasons[1]
+    assert kinds(verdict) == [ReasonKind.NEVER_FOUND, ReasonKind.FEW_POINTS]
+    assert "950 frames of 1000 show fewer than the 4 points" in verdict.texts[1]
 
 
-def test_a_tie_gives_its_candidates():
+def test_a_tie_is_reported_with_its_candidates():
     verdict = never(ties=ranges((3, 3)), tie_text="spots 1, 2 or spots 2, 3")
-    assert kinds(verdict) == [Kind.NEVER_FOUND, Kind.AMBIGUOUS]
-    assert verdict.reasons[1] == "the spots fit more than one pose: spots 1, 2 or spots 2, 3"
+    assert kinds(verdict) == [ReasonKind.NEVER_FOUND, ReasonKind.AMBIGUOUS]
+    assert verdict.texts[1] == "the spots fit more than one pose: spots 1, 2 or spots 2, 3"
     assert "narrower" in verdict.remedy
 
 
-def test_frames_that_do_not_determine_the_pose_are_the_reason_where_nothing_else_is():
+def test_frames_that_do_not_determine_the_pose_are_the_reason_without_any_other():
     verdict = never(causes={Cause.NOT_DETERMINED: 700, Cause.OUT_OF_VIEW: 300})
-    assert verdict.reasons[1].startswith("of 1000 frames, 700 whose spots do not determine the pose, 300 with fewer")
+    assert verdict.texts[1].startswith("of 1000 frames, 700 whose spots do not determine the pose, 300 with fewer")
     assert "two screens" in verdict.remedy
 
 
-def test_a_run_that_only_the_causal_pass_measured_says_so_and_not_that_it_was_found_again():
+def test_a_run_that_only_the_causal_pass_measured_is_reported_as_not_confirmed():
     verdict = never(causal_measured=98, lost=ranges((0, 999)), found_again=0)
-    assert kinds(verdict)[:2] == [Kind.NEVER_FOUND, Kind.NOT_CONFIRMED]
-    assert "98 of 1000 frames" in verdict.reasons[1]
-    assert not any("found again" in r and "not found again" not in r for r in verdict.reasons)
+    assert kinds(verdict)[:2] == [ReasonKind.NEVER_FOUND, ReasonKind.NOT_CONFIRMED]
+    assert "98 of 1000 frames" in verdict.texts[1]
+    assert not any("found again" in r and "not found again" not in r for r in verdict.texts)
 
 
-# -- doubts -----------------------------------------------------------------------------------------------------------
+# -- points to check --------------------------------------------------------------------------------------------------
 
 
-def with_missing(*spans: tuple[int, int]) -> dict[str, CameraFacts]:
+def with_missing(*spans: tuple[int, int]) -> dict[str, CameraStatistics]:
     missing = ranges(*spans)
     return {"left": a_camera(pictures=FRAMES - len(missing), missing=missing), "right": a_camera()}
 
@@ -180,75 +181,88 @@ def with_missing(*spans: tuple[int, int]) -> dict[str, CameraFacts]:
 @pytest.mark.parametrize(
     ("changed", "kind", "words"),
     [
-        ({"cameras": with_missing((100, 150))}, Kind.MISSING_PICTURES, "camera left has no usable picture in 51 of"),
+        (
+            {"cameras": with_missing((100, 150))},
+            ReasonKind.MISSING_PICTURES,
+            "camera left has no usable picture in 51 of",
+        ),
         (
             {"cameras": with_missing((990, 999))},
-            Kind.CAMERA_STOPPED,
+            ReasonKind.CAMERA_STOPPED,
             "camera left stopped before the end: it has no picture from frame 990 on (10 frames)",
         ),
-        ({"cameras": with_missing((0, 0))}, Kind.CAMERA_LATE, "starts late: it has no picture of the first 1 frame"),
-        ({"ties": ranges((7, 7)), "tie_text": "A or B"}, Kind.AMBIGUOUS, "frame 7 could be explained in more than"),
+        (
+            {"cameras": with_missing((0, 0))},
+            ReasonKind.CAMERA_LATE,
+            "starts late: it has no picture of the first 1 frame",
+        ),
+        (
+            {"ties": ranges((7, 7)), "tie_text": "A or B"},
+            ReasonKind.AMBIGUOUS,
+            "frame 7 could be explained in more than",
+        ),
         (
             {"lost": ranges((10, 12)), "found_again": 1},
-            Kind.LOST,
-            "nothing is known of the vehicle in 3 frames (10 to 12); it was found again",
+            ReasonKind.LOST,
+            "the vehicle was lost in 3 frames (10 to 12); it was found again",
         ),
-        ({"lost": ranges((990, 999))}, Kind.LOST, "10 frames (990 to 999); it was not found again"),
-        ({"own_spots": ranges((5, 6))}, Kind.CONTRADICTION, "2 frames (5 to 6) contradict their own spots"),
-        ({"causal": ranges((5, 5))}, Kind.CONTRADICTION, "1 frame (5) contradict the causal pass"),
-        ({"invalid": ranges((5, 5))}, Kind.INTERNAL, "covariances of 1 frame (5) are not positive definite"),
+        ({"lost": ranges((990, 999))}, ReasonKind.LOST, "10 frames (990 to 999); it was not found again"),
+        ({"own_spots": ranges((5, 6))}, ReasonKind.CONTRADICTION, "2 frames (5 to 6) contradict their own spots"),
+        ({"causal": ranges((5, 5))}, ReasonKind.CONTRADICTION, "1 frame (5) contradict the causal pass"),
+        ({"invalid": ranges((5, 5))}, ReasonKind.INTERNAL, "covariances of 1 frame (5) are not positive definite"),
     ],
 )
-def test_what_wants_looking_at_is_a_doubt_with_a_remedy_and_not_a_failure(changed, kind, words):
-    verdict = judge(facts_of(**changed))
+def test_a_point_to_check_has_a_remedy_and_is_not_a_failure(changed, kind, words):
+    verdict = judge(statistics_of(**changed))
     assert (verdict.status, verdict.exit_status) == ("check", 0)
     assert kinds(verdict) == [kind]
-    assert words in verdict.reasons[0]
-    assert verdict.evidence[0].remedy
+    assert words in verdict.texts[0]
+    assert verdict.reasons[0].remedy
     assert verdict.remedy == ""  # nothing failed
 
 
-def test_a_few_missing_pictures_are_no_doubt():
-    assert judge(facts_of(cameras=with_missing((100, 149)))).status == "pass"
+def test_a_few_missing_pictures_are_not_reported():
+    assert judge(statistics_of(cameras=with_missing((100, 149)))).status == "pass"
 
 
-def test_a_camera_that_goes_dark_where_it_should_see_spots_is_a_doubt():
-    dark = {"empty": 100, "empty_at_end": 100}
-    seen = judge(facts_of(cameras={"left": a_camera(**dark, expected_at_end=300), "right": a_camera()}))
-    assert kinds(seen) == [Kind.NOTHING_DETECTED]
-    assert "in its last 100 pictures, where the pose puts spots inside them" in seen.reasons[0]
-    looking_elsewhere = judge(facts_of(cameras={"left": a_camera(**dark), "right": a_camera()}))
-    assert looking_elsewhere.status == "pass"
+def test_a_camera_without_detections_at_the_end_is_reported_if_spots_are_expected_there():
+    empty = {"empty": 100, "empty_at_end": 100}
+    seen = judge(statistics_of(cameras={"left": a_camera(**empty, expected_at_end=300), "right": a_camera()}))
+    assert kinds(seen) == [ReasonKind.NOTHING_DETECTED]
+    assert "in its last 100 pictures, where the pose puts spots inside them" in seen.texts[0]
+    nothing_expected = judge(statistics_of(cameras={"left": a_camera(**empty), "right": a_camera()}))
+    assert nothing_expected.status == "pass"
 
 
-def test_findings_of_the_model_check_decide_by_their_level_and_bring_their_remedy():
+def test_findings_of_the_model_check_count_by_their_level_and_keep_their_remedy():
     found = [Finding(level, "camera `right` may have moved", "it turns the pose", "Fix it.") for level in Level]
-    verdict = judge(facts_of(), found)
-    assert [(e.kind, e.fails, e.remedy) for e in verdict.evidence] == [
-        (Kind.MODEL, True, "Fix it."),
-        (Kind.MODEL, False, "Fix it."),
+    verdict = judge(statistics_of(), found)
+    assert [(e.kind, e.fails, e.remedy) for e in verdict.reasons] == [
+        (ReasonKind.MODEL, True, "Fix it."),
+        (ReasonKind.MODEL, False, "Fix it."),
     ]
-    assert verdict.reasons[0] == "camera `right` may have moved; it turns the pose"
+    assert verdict.texts[0] == "camera `right` may have moved; it turns the pose"
 
 
-def test_failures_come_before_doubts_and_none_is_left_out():
-    facts = facts_of(300, {Cause.UNEXPLAINED: 700}, lost=ranges((100, 999)), own_spots=ranges((7, 7)))
-    verdict = judge(facts, misfit=6.0)
+def test_failures_come_before_points_to_check():
+    statistics = statistics_of(300, {Cause.UNEXPLAINED: 700}, lost=ranges((100, 999)), own_spots=ranges((7, 7)))
+    verdict = judge(statistics, noise_scale=6.0)
     assert verdict.exit_status == 4
-    assert [e.fails for e in verdict.evidence] == [True, True, False, False]
-    assert [any(word in r for r in verdict.reasons) for word in ("only 30%", "6.0 times", "900", "contradict")] == [
+    assert [e.fails for e in verdict.reasons] == [True, True, False, False]
+    assert [any(word in r for r in verdict.texts) for word in ("only 30%", "6.0 times", "900", "contradict")] == [
         True
     ] * 4
 
 
-def test_every_kind_has_a_remedy_and_every_cause_too():
-    assert set(REMEDIES) == set(Kind) - {Kind.FEW_MEASURED, Kind.MODEL}  # these have one of their own each time
+def test_every_kind_of_reason_and_every_cause_has_a_remedy():
+    with_own_remedies = {ReasonKind.FEW_MEASURED, ReasonKind.MODEL}
+    assert set(REMEDIES) == set(ReasonKind) - with_own_remedies
     assert set(REMEDIES_BY_CAUSE) == set(Cause)
 
 
-def test_the_evidence_is_plain_values():
-    (evidence,) = judge(facts_of(cameras=with_missing((990, 999)))).evidence
-    mapping = evidence.as_mapping()
+def test_a_reason_is_written_as_plain_values():
+    (reason,) = judge(statistics_of(cameras=with_missing((990, 999)))).reasons
+    mapping = reason.as_mapping()
     assert list(mapping) == ["kind", "level", "what", "remedy", "numbers"]
     assert (mapping["kind"], mapping["level"]) == ("camera_stopped", "check")
     assert mapping["numbers"] == {"camera": "left", "missing": [[990, 999]]}

@@ -1,4 +1,4 @@
-"""The score says what is known of a run by construction."""
+"""The score reports the errors that a run has by construction."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tracking.statuses import PoseStatus, SpotStatus
 
 @pytest.fixture(scope="module")
 def quiet(tmp_path_factory: pytest.TempPathFactory) -> Fake:
-    """600 frames in which every spot in the picture was found under its own name."""
+    """600 frames in which every spot in the picture has the correct label."""
     return make(tmp_path_factory.mktemp("quiet"), 600, eventful=False)
 
 
@@ -33,7 +33,7 @@ def eventful(tmp_path_factory: pytest.TempPathFactory) -> Fake:
 
 
 def rewritten(source: Fake, folder: Path, change: Callable[[dict[str, str]], dict[str, str] | None]) -> Path:
-    """A copy of the results with every row of spots.csv passed through `change`; None takes the row out."""
+    """A copy of the results with every row of spots.csv passed through `change`; None removes the row."""
     folder.mkdir(exist_ok=True)
     for path in source.results.iterdir():
         (folder / path.name).write_bytes(path.read_bytes())
@@ -47,7 +47,7 @@ def rewritten(source: Fake, folder: Path, change: Callable[[dict[str, str]], dic
     return folder
 
 
-def test_a_run_with_every_label_right_scores_one_and_its_errors_are_the_noise_put_in(quiet):
+def test_a_run_with_correct_labels_scores_one_and_its_errors_are_the_added_noise(quiet):
     s = score(quiet.results, quiet.run_folder)["spots"]
     assert s["in_view_identity"] == 1.0
     assert s["wrong_labels"] == 0
@@ -59,7 +59,7 @@ def test_a_run_with_every_label_right_scores_one_and_its_errors_are_the_noise_pu
         assert s["prediction_px"]["all_measured"][axis] == pytest.approx(0.2, rel=tolerance)
 
 
-def test_poses_scattered_as_their_covariance_says_have_a_mean_nees_of_six(quiet):
+def test_poses_with_correct_covariances_have_a_mean_nees_of_six(quiet):
     block = score(quiet.results, quiet.run_folder)["pose"]["measured"]
     low, high = block["nees_mean_95"]
     assert low < block["nees_mean"] < high
@@ -76,20 +76,20 @@ def test_half_the_stated_covariance_doubles_the_nees(quiet):
     assert twice == pytest.approx(2 * once, rel=1e-9)
 
 
-def test_nees_weighs_an_error_by_the_whole_covariance_with_its_correlations():
+def test_nees_includes_the_correlations_of_the_covariance():
     rng = np.random.default_rng(3)
-    A = rng.normal(size=(50, 6, 6)) * np.array([1e-3, 1e-3, 1e-3, 1e-5, 1e-5, 1e-5])[:, None]  # metres beside radians
+    A = rng.normal(size=(50, 6, 6)) * np.array([1e-3, 1e-3, 1e-3, 1e-5, 1e-5, 1e-5])[:, None]  # metres and radians
     C, delta = A @ np.swapaxes(A, 1, 2), rng.normal(size=(50, 6)) * 1e-4
     plain = np.einsum("ni,nij,nj->n", delta, np.linalg.inv(C), delta)
     np.testing.assert_allclose(normalised_squares(delta, C), plain, rtol=1e-6)
 
 
-def test_a_covariance_that_cannot_be_inverted_gives_no_nees():
+def test_a_singular_covariance_has_no_nees():
     C = np.stack([np.zeros((6, 6)), np.ones((6, 6)), np.full((6, 6), np.nan)])
     assert np.isnan(normalised_squares(np.ones((3, 6)), C)).all()
 
 
-def test_a_pose_off_by_a_known_turn_and_shift_is_reported_in_body_and_world_axes(quiet):
+def test_a_known_pose_error_is_reported_in_body_and_world_axes(quiet):
     spots, poses = read_spots(quiet.results), read_poses(quiet.results)
     delta = np.array([1e-3, -2e-3, 3e-3, *np.radians([0.1, 0.2, -0.3])])
     truth = TruthArrays(None, None, poses.world_from_body.plus(np.broadcast_to(delta, (len(poses.frames), 6))))
@@ -99,7 +99,7 @@ def test_a_pose_off_by_a_known_turn_and_shift_is_reported_in_body_and_world_axes
     assert list(out["pose"]["measured"]["rotation_rms_deg"].values()) == pytest.approx([0.1, 0.2, 0.3])
 
 
-def test_two_spots_that_swap_names_are_wrong_and_cost_just_those_frames(quiet, tmp_path):
+def test_two_swapped_labels_are_wrong_in_exactly_those_frames(quiet, tmp_path):
     swap = {"1": "2", "2": "1"}
 
     def change(row: dict[str, str]) -> dict[str, str]:
@@ -113,7 +113,7 @@ def test_two_spots_that_swap_names_are_wrong_and_cost_just_those_frames(quiet, t
     assert [r["wrong_labels"] for r in s["per_spot"]] == [10, 10, 0, 0, 0, 0]
 
 
-def test_clutter_beside_a_spot_taken_for_it_is_a_wrong_label(quiet, tmp_path):
+def test_clutter_that_is_labelled_as_a_spot_is_a_wrong_label(quiet, tmp_path):
     def change(row: dict[str, str]) -> dict[str, str]:
         if row["frame"] == "50" and row["spot"] == "5":
             row["u_px"] = str(float(row["u_px"]) + 5.0)
@@ -122,7 +122,7 @@ def test_clutter_beside_a_spot_taken_for_it_is_a_wrong_label(quiet, tmp_path):
     assert score(rewritten(quiet, tmp_path / "results", change), quiet.run_folder)["spots"]["wrong_labels"] == 1
 
 
-def test_spots_that_cross_closer_than_the_noise_are_not_called_swapped():
+def test_spots_that_cross_closer_than_the_noise_do_not_count_as_swapped():
     true_uv = np.array([[[100.0, 100.0], [100.3, 100.0]]])
     measured = SpotGrid(
         frames=np.array([0]), t_s=np.zeros(1), views=(("a", "1"), ("a", "2")), uv_px=true_uv[:, ::-1].copy(),
@@ -130,11 +130,11 @@ def test_spots_that_cross_closer_than_the_noise_are_not_called_swapped():
         label_probability=np.ones((1, 2)),
     )  # fmt: skip
     assert right_spot(measured, true_uv).all()
-    apart = true_uv + np.array([[[0.0, 0.0], [2.0, 0.0]]])  # 2.3 px: well over the noise, under the tolerance
+    apart = true_uv + np.array([[[0.0, 0.0], [2.0, 0.0]]])  # 2.3 px: above the noise, below the tolerance
     assert not right_spot(replace(measured, uv_px=apart[:, ::-1]), apart).any()
 
 
-def test_a_visible_spot_that_is_not_found_costs_identity_but_is_no_wrong_label(quiet, tmp_path):
+def test_a_visible_spot_that_is_not_found_lowers_the_identity_but_is_no_wrong_label(quiet, tmp_path):
     def change(row: dict[str, str]) -> dict[str, str]:
         if row["frame"] == "7" and row["spot"] == "6":
             row["status"] = "occluded"
@@ -146,13 +146,13 @@ def test_a_visible_spot_that_is_not_found_costs_identity_but_is_no_wrong_label(q
     assert s["in_view_identity"] == pytest.approx(1 - 1 / s["in_view_rows"], abs=1e-12)
 
 
-def test_a_row_that_the_results_do_not_have_costs_as_much_as_a_spot_not_found(quiet, tmp_path):
+def test_a_missing_row_counts_as_a_spot_that_is_not_found(quiet, tmp_path):
     results = rewritten(quiet, tmp_path / "results", lambda r: None if (r["frame"], r["spot"]) == ("7", "6") else r)
     assert (read_spots(results).status == ABSENT).sum() == 1
     assert score(results, quiet.run_folder)["spots"]["visible_but_not_found_rows"] == 1
 
 
-def test_a_frame_without_a_picture_counts_neither_for_nor_against(quiet, tmp_path):
+def test_a_frame_without_a_picture_is_not_counted(quiet, tmp_path):
     def change(row: dict[str, str]) -> dict[str, str]:
         if row["frame"] in ("7", "8") and row["camera"] == "right":
             row["status"] = "no_image"
@@ -164,23 +164,23 @@ def test_a_frame_without_a_picture_counts_neither_for_nor_against(quiet, tmp_pat
     assert after["in_view_rows"] == before["in_view_rows"] - 6
 
 
-def test_the_papers_recognition_rate_counts_all_that_is_out_of_view_as_wrong(quiet):
+def test_the_papers_recognition_rate_counts_spots_out_of_view_as_wrong(quiet):
     s = score(quiet.results, quiet.run_folder)["spots"]
     inside = quiet.model.in_picture(quiet.true_uv)
     assert 0.5 < inside.mean() < 1
     assert s["recognition_rate_eq15"]["paper"] == pytest.approx(inside.mean())
     assert s["recognition_rate_eq15"]["in_view"] == 1.0
-    assert s["recognition_rate_eq15"]["all_within_tolerance"] == 1.0  # out of view it is 0.4 px off at 1 sigma
+    assert s["recognition_rate_eq15"]["all_within_tolerance"] == 1.0  # out of view the error is 0.4 px, 1 sigma
 
 
-def test_turned_frames_do_not_enter_the_straight_prediction_error_but_stay_in_the_whole(eventful):
+def test_turned_frames_are_excluded_from_the_straight_prediction_error_only(eventful):
     s = score(eventful.results, eventful.run_folder)["spots"]["prediction_px"]
     assert s["straight"]["max"] < 2
-    assert s["turned"]["rms"] == pytest.approx(8 * np.sqrt(2), rel=0.05)  # what fake_results puts there
+    assert s["turned"]["rms"] == pytest.approx(8 * np.sqrt(2), rel=0.05)  # the error in fake_results
     assert s["all_measured"]["max"] == s["turned"]["max"]
 
 
-def test_bends_of_the_true_path_are_set_apart_whatever_the_tracker_called_them(eventful, tmp_path):
+def test_sharp_turns_of_the_true_path_are_separate_whatever_their_status(eventful, tmp_path):
     def change(row: dict[str, str]) -> dict[str, str]:
         row["status"] = "matched" if row["status"] == "turned" else row["status"]
         return row
@@ -192,9 +192,9 @@ def test_bends_of_the_true_path_are_set_apart_whatever_the_tracker_called_them(e
     assert s["bends"]["rms"] == pytest.approx(8 * np.sqrt(2), rel=0.05)
 
 
-def test_the_first_two_frames_of_a_track_are_set_apart_and_not_lost(quiet, tmp_path):
+def test_the_first_two_frames_of_a_track_are_reported_separately(quiet, tmp_path):
     def change(row: dict[str, str]) -> dict[str, str]:
-        if row["frame"] in ("0", "1"):  # no speed is known yet: the prediction is far behind
+        if row["frame"] in ("0", "1"):  # the velocity is unknown, so the prediction has a large error
             row["predicted_u_px"] = str(float(row["predicted_u_px"]) + 50.0)
         return row
 
@@ -206,7 +206,7 @@ def test_the_first_two_frames_of_a_track_are_set_apart_and_not_lost(quiet, tmp_p
     assert s["all_measured"]["max"] > 49
 
 
-def test_the_out_of_view_error_is_that_put_in_and_takes_only_what_truly_is_outside(eventful):
+def test_the_out_of_view_error_includes_only_spots_that_are_truly_outside(eventful):
     s = score(eventful.results, eventful.run_folder)["spots"]
     block = s["out_of_view_px"]
     assert block["rows"] > 50
@@ -220,7 +220,7 @@ class TestReturns:
     in_view = np.array([[1, 0, 0, 1, 1, 1, 1, 1, 1, 1, 1, 1]]).T
     yes = np.ones((12, 1), dtype=bool)
 
-    def test_a_spot_found_at_once_is_kept_without_delay(self):
+    def test_a_spot_found_immediately_is_kept_without_delay(self):
         out = _returns(self.in_view, 0, self.yes, self.yes, self.yes)
         assert (out["total"], out["kept"], out["max_delay_frames"]) == (1, 1, 0)
 
@@ -251,7 +251,7 @@ def test_a_run_without_truth_has_no_score(tmp_path):
     assert score(fake.results, fake.run_folder) is None
 
 
-def test_a_lost_run_scores_nothing_and_breaks_nothing(tmp_path):
+def test_a_run_without_any_pose_has_a_score_without_errors(tmp_path):
     fake = make(tmp_path, 20, all_lost=True)
     out = score(fake.results, fake.run_folder)
     assert out["spots"]["in_view_identity"] == 0
@@ -263,7 +263,7 @@ def test_a_score_is_plain_json_without_nan(eventful):
     json.dumps(score(eventful.results, eventful.run_folder), allow_nan=False)
 
 
-def test_tables_read_back_what_the_contract_says(eventful):
+def test_tables_are_read_according_to_the_contract(eventful):
     spots, poses = read_spots(eventful.results), read_poses(eventful.results)
     assert spots.views == eventful.model.views
     lost = spots.has(SpotStatus.LOST)
@@ -279,7 +279,7 @@ def test_tables_read_back_what_the_contract_says(eventful):
     assert SPOT_STATUSES[spots.status[0, 0]] in SpotStatus
 
 
-def test_a_table_without_a_column_is_an_error_that_names_file_and_column(quiet, tmp_path):
+def test_a_missing_column_is_an_error_that_names_file_and_column(quiet, tmp_path):
     fake = make(tmp_path, 3)
     path = fake.results / "spots.csv"
     path.write_text(path.read_text().replace("predicted_u_px", "predicted_x"))
@@ -287,7 +287,7 @@ def test_a_table_without_a_column_is_an_error_that_names_file_and_column(quiet, 
         read_spots(fake.results)
 
 
-def test_a_table_with_a_word_for_a_number_is_an_error_that_names_the_file(tmp_path):
+def test_a_text_in_place_of_a_number_is_an_error_that_names_the_file(tmp_path):
     fake = make(tmp_path, 3)
     path = fake.results / "attitude.csv"
     path.write_text(path.read_text().replace("0.01", "oh", 1))
@@ -295,21 +295,21 @@ def test_a_table_with_a_word_for_a_number_is_an_error_that_names_the_file(tmp_pa
         read_poses(fake.results)
 
 
-# -- velocity, rate, and what was known at each instant ---------------------------------------------------------------
+# -- velocity, rate, and the causal pass ------------------------------------------------------------------------------
 
 
-def test_velocities_and_rates_are_off_by_the_noise_put_in_and_bends_are_left_out(quiet):
+def test_errors_of_velocities_and_rates_are_the_added_noise_and_exclude_sharp_turns(quiet):
     s = score(quiet.results, quiet.run_folder)["motion_vs_differences"]
     for name, sigma in (("velocity_m_s", MOTION_SIGMA[:3]), ("rate_rad_s", MOTION_SIGMA[3:])):
         rms = np.array(list(s[name]["rms_axes"].values()))
         np.testing.assert_allclose(rms, sigma, rtol=0.12)  # 600 rows: 3 % per sigma
         assert s[name]["square_over_claimed_mean"] == pytest.approx(1.0, abs=0.12)
-    # The yaw's triangle has four corners in 6 s; of each the frame and the two to either side are left out.
+    # The triangular yaw motion has four corners in 6 s; the frame of each and two on either side are excluded.
     assert s["rows_at_bends_left_out"] == 4 * 5
     assert s["rows"] == 600 - 4 - 4 * 5
 
 
-def test_five_frames_tell_a_smooth_motion_to_a_millionth():
+def test_a_five_point_difference_has_an_error_of_a_millionth_for_a_smooth_motion():
     t = np.arange(200) / 100
     a, b = 0.3 * np.sin(6 * t), 0.4 * np.cos(5 * t)
     poses = Pose.from_ypr(np.stack([a, 0 * t, 0 * t], -1), np.stack([b, a, 0 * t], -1))
@@ -322,7 +322,7 @@ def test_five_frames_tell_a_smooth_motion_to_a_millionth():
 
 
 def test_a_rate_is_about_the_bodys_own_axes():
-    """A vehicle that is pitched by 90 degrees and turns about the world's z turns about its own -x."""
+    """A vehicle with a pitch of 90 degrees that rotates about the world's z rotates about its own -x."""
     t = np.arange(20) / 100
     turn = Rotation.from_rotvec(0.7 * t[:, None] * [0, 0, 1])
     pitched = turn * Rotation.from_rotvec([0, np.pi / 2, 0])
@@ -330,7 +330,7 @@ def test_a_rate_is_about_the_bodys_own_axes():
     np.testing.assert_allclose(motion[5], [0, 0, 0, -0.7, 0, 0], atol=1e-9)
 
 
-def test_across_a_gap_or_a_change_of_the_frame_rate_no_difference_is_taken():
+def test_no_difference_spans_a_gap_or_a_change_of_the_frame_rate():
     t = np.concatenate([np.arange(20), np.arange(20, 40) * 2.0 - 20]) / 100
     poses = Pose.from_ypr(np.zeros((40, 3)), np.stack([0.5 * t, 0 * t, 0 * t], -1))
     gone = poses.translation.copy()
@@ -342,7 +342,7 @@ def test_across_a_gap_or_a_change_of_the_frame_rate_no_difference_is_taken():
     assert not bent.any()
 
 
-def test_poses_known_at_the_instant_are_scored_beside_the_smoothed_ones(tmp_path):
+def test_causal_poses_are_scored_separately_from_smoothed_ones(tmp_path):
     fake = make(tmp_path, 300, causal=True)
     s = score(fake.results, fake.run_folder)
     later, then = (s[name]["measured"] for name in ("pose", "pose_causal"))
@@ -351,7 +351,7 @@ def test_poses_known_at_the_instant_are_scored_beside_the_smoothed_ones(tmp_path
     assert s["motion_causal_vs_differences"]["rows"] == s["motion_vs_differences"]["rows"]
 
 
-def test_results_from_before_there_were_velocities_are_read_and_have_none(quiet, tmp_path):
+def test_results_of_an_older_version_have_no_velocities(quiet, tmp_path):
     older = without_added_columns(quiet.results, tmp_path / "older")
     poses, spots = read_poses(older), read_spots(older)
     assert np.isnan(poses.velocity_m_s).all()
@@ -363,7 +363,7 @@ def test_results_from_before_there_were_velocities_are_read_and_have_none(quiet,
     assert before["pose_causal"] is None
 
 
-def test_a_column_that_was_always_there_is_still_missed(quiet, tmp_path):
+def test_a_column_of_the_oldest_version_is_required(quiet, tmp_path):
     results = tmp_path / "results"
     results.mkdir()
     text = (quiet.results / "attitude.csv").read_text()

@@ -1,4 +1,4 @@
-"""The tables of a run: columns in order, one row for everything, numbers that survive being written and read."""
+"""The tables of a run: columns in order, all rows present, numbers unchanged after writing and reading."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def covariances(rng: np.random.Generator, *shape: int) -> np.ndarray:
 
 
 def a_record(rng: np.random.Generator, frame: int = 7, n_points: int = 4) -> FrameRecord:
-    """A frame full of random numbers; the third view is lost, the second camera has no picture."""
+    """A frame of random numbers; the third view is lost, the second camera has no picture."""
     n = len(VIEWS)
     uv, cov, gain = rng.uniform(-50, 1300, (n, 2)), covariances(rng, n, 2, 2), rng.random(n)
     uv[2], cov[2], gain[3:] = np.nan, np.nan, np.nan
@@ -90,19 +90,19 @@ CONTRACT = {
 
 @pytest.mark.parametrize("name", CONTRACT)
 def test_the_columns_are_those_of_the_contract_in_their_order(tmp_path, name):
-    """Written out here once more: the contract is fixed, whatever lab/files/text/columns.py says."""
+    """The columns are repeated here: the contract is fixed, independently of lab/files/text/columns.py."""
     rng = np.random.default_rng(1)
     written(tmp_path, a_record(rng, 0), lost(a_record(rng, 1)))
     lines = (tmp_path / name).read_text().splitlines()
     assert lines[0] == CONTRACT[name]
-    assert {line.count(",") for line in lines} == {CONTRACT[name].count(",")}  # a lost frame's rows too
+    assert {line.count(",") for line in lines} == {CONTRACT[name].count(",")}  # those of a lost frame too
 
 
-def test_a_run_without_frames_leaves_tables_with_headers(tmp_path):
+def test_a_run_without_frames_has_tables_with_headers(tmp_path):
     assert {name: len(rows) for name, rows in written(tmp_path).items()} == dict.fromkeys(HEADERS, 0)
 
 
-def test_spots_come_back_as_they_were(tmp_path):
+def test_spots_are_read_as_they_were_written(tmp_path):
     record = a_record(np.random.default_rng(2))
     rows = written(tmp_path, record)["spots.csv"]
     t = record.tracked
@@ -120,7 +120,7 @@ def test_spots_come_back_as_they_were(tmp_path):
     assert rows[2]["u_px"] == rows[2]["sigma_u_px"] == rows[2]["cov_uv_px2"] == ""
 
 
-def test_detections_come_back_as_they_were_and_a_camera_without_a_picture_has_none(tmp_path):
+def test_detections_are_read_as_they_were_written_and_a_camera_without_a_picture_has_none(tmp_path):
     record = a_record(np.random.default_rng(3))
     rows = written(tmp_path, record)["detections.csv"]
     found = record.detections[0]
@@ -133,7 +133,7 @@ def test_detections_come_back_as_they_were_and_a_camera_without_a_picture_has_no
             assert number(r[name]) == pytest.approx(getattr(found, name)[i], rel=1e-9)
 
 
-def test_what_is_not_known_of_a_detection_is_an_empty_field(tmp_path):
+def test_an_unknown_value_of_a_detection_is_an_empty_field(tmp_path):
     record = a_record(np.random.default_rng(4))
     record = replace(record, detections=(Detections.at(np.array([[3.5, 4.5]]), np.eye(2)[None]), None))
     assert written(tmp_path, record)["detections.csv"] == [
@@ -141,7 +141,7 @@ def test_what_is_not_known_of_a_detection_is_an_empty_field(tmp_path):
     ]
 
 
-def test_poses_come_back_as_they_were(tmp_path):
+def test_poses_are_read_as_they_were_written(tmp_path):
     rng = np.random.default_rng(5)
     records = [a_record(rng, frame) for frame in range(20)]
     tables = written(tmp_path, *records)
@@ -175,7 +175,7 @@ def test_poses_come_back_as_they_were(tmp_path):
         )
 
 
-def test_beams_are_the_rigs_lines_moved_by_the_pose(tmp_path):
+def test_beams_are_the_rigs_lines_transformed_by_the_pose(tmp_path):
     record = a_record(np.random.default_rng(6))
     rows = written(tmp_path, record)["beams.csv"]
     assert [r["beam"] for r in rows] == list(RIG.beams)
@@ -197,7 +197,7 @@ def test_a_lost_frame_has_a_row_with_empty_pose_fields_and_no_covariance(tmp_pat
     assert [(r["beam"], r["dx"], r["pz_m"], r["status"]) for r in beams] == [(b, "", "", "lost") for b in RIG.beams]
 
 
-def test_a_tracker_that_has_no_velocities_and_no_label_probabilities_leaves_their_fields_empty(tmp_path):
+def test_without_velocities_and_label_probabilities_their_fields_are_empty(tmp_path):
     record = a_record(np.random.default_rng(10))
     record = replace(record, tracked=replace(record.tracked, motion=None, label_probability=None))
     tables = written(tmp_path, record)
@@ -206,11 +206,11 @@ def test_a_tracker_that_has_no_velocities_and_no_label_probabilities_leaves_thei
     assert tables["attitude.csv"][0]["status"] == "measured"
 
 
-def test_what_was_known_at_the_instant_has_tables_of_its_own_with_the_same_columns(tmp_path):
+def test_the_causal_pass_has_its_own_tables_with_the_same_columns(tmp_path):
     rng = np.random.default_rng(11)
-    known_later, known_then = [a_record(rng, 0), a_record(rng, 1)], [a_record(rng, 0), lost(a_record(rng, 1))]
+    smoothed, in_causal_pass = [a_record(rng, 0), a_record(rng, 1)], [a_record(rng, 0), lost(a_record(rng, 1))]
     with TableWriter(tmp_path, RIG, with_causal=True) as tables:
-        for record, causal in zip(known_later, known_then, strict=True):
+        for record, causal in zip(smoothed, in_causal_pass, strict=True):
             tables.write(record, causal)
     for name in ("attitude", "covariance"):
         plain, causal = ((tmp_path / f"{name}{which}.csv").read_text().splitlines() for which in ("", "_causal"))
@@ -218,13 +218,13 @@ def test_what_was_known_at_the_instant_has_tables_of_its_own_with_the_same_colum
         assert {line.count(",") for line in plain + causal} == {plain[0].count(",")}
     rows = list(csv.DictReader((tmp_path / "attitude_causal.csv").open(newline="")))
     assert [r["status"] for r in rows] == ["measured", "lost"]
-    assert float(rows[0]["x_m"]) == pytest.approx(known_then[0].tracked.pose.translation[0], rel=1e-9)
+    assert float(rows[0]["x_m"]) == pytest.approx(in_causal_pass[0].tracked.pose.translation[0], rel=1e-9)
     (row,) = csv.DictReader((tmp_path / "covariance_causal.csv").open(newline=""))
-    assert float(row["c00"]) == pytest.approx(known_then[0].tracked.pose_covariance[0, 0], rel=1e-9)
+    assert float(row["c00"]) == pytest.approx(in_causal_pass[0].tracked.pose_covariance[0, 0], rel=1e-9)
 
 
-def test_a_covariance_of_very_unequal_axes_is_still_one_when_it_is_read_back(tmp_path):
-    """Known to 1 um across and to 1 m along one direction: ten digits would make it negative along another."""
+def test_a_covariance_with_very_unequal_axes_is_positive_definite_after_reading(tmp_path):
+    """Sigmas of 1 m along one direction and 1 um across: with ten digits a variance would become negative."""
     rng = np.random.default_rng(12)
     axes = np.linalg.qr(rng.normal(size=(6, 6)))[0]
     C = axes @ np.diag([1.0, *[1e-12] * 5]) @ axes.T
@@ -243,7 +243,7 @@ def test_a_covariance_of_very_unequal_axes_is_still_one_when_it_is_read_back(tmp
 @pytest.mark.parametrize("what", ["pose", "motion", "spots"])
 @pytest.mark.filterwarnings("error")
 def test_a_negative_variance_is_never_written(tmp_path, what):
-    """The checks of frames take such numbers out; here they are an error of the program, not an empty field."""
+    """The frame checks remove such values; in the writer they are an error of the program, not an empty field."""
     record = a_record(np.random.default_rng(13))
     t, bad = record.tracked, np.diag([1.0, 1.0, 1.0, 1.0, 1.0, -1e-12])
     wrong = {
@@ -265,11 +265,11 @@ def test_the_sixteen_numbers_of_the_pose_are_in_the_order_of_the_columns():
 
 
 @given(st.text(alphabet=st.characters(exclude_categories=("Cs",), exclude_characters="\0"), min_size=1))
-def test_any_name_survives_in_a_field(name):
+def test_any_name_is_unchanged_in_a_field(name):
     assert next(csv.reader(io.StringIO(f"1,{csv_word(name)},2\n", newline=""))) == ["1", name, "2"]
 
 
-def test_names_with_commas_and_quotes_survive_in_the_tables(tmp_path):
+def test_names_with_commas_and_quotes_are_unchanged_in_the_tables(tmp_path):
     rig = paper_rig()
     camera = rig.cameras["left"]
     odd = type(camera)('left, "upper"', "left", camera.image_size_px, camera.matrix, (), camera.camera_from_world)
@@ -282,7 +282,7 @@ def test_names_with_commas_and_quotes_survive_in_the_tables(tmp_path):
     assert [r["beam"] for r in tables["beams.csv"]] == ['A,"1"', "B", "C"]
 
 
-def test_the_files_are_closed_when_the_run_breaks(tmp_path):
+def test_the_files_are_closed_when_the_run_fails(tmp_path):
     tables = TableWriter(tmp_path, RIG)
 
     def break_it():
@@ -296,15 +296,15 @@ def test_the_files_are_closed_when_the_run_breaks(tmp_path):
         tables.write(a_record(np.random.default_rng(9)))
 
 
-def test_rows_are_the_same_whether_frames_are_worked_out_alone_or_together(tmp_path, monkeypatch):
+def test_rows_do_not_depend_on_the_block_size(tmp_path, monkeypatch):
     rng = np.random.default_rng(21)
     records = [a_record(rng, frame, n_points=frame % 5) for frame in range(150)]
     records = [lost(r) if r.frame % 7 == 3 else r for r in records]
     texts = []
-    for together in (64, 1):
-        folder = tmp_path / str(together)
+    for block in (64, 1):
+        folder = tmp_path / str(block)
         folder.mkdir()
-        monkeypatch.setattr("lab.runs.tables._TOGETHER", together)
+        monkeypatch.setattr("lab.runs.tables._BLOCK", block)
         with TableWriter(folder, RIG, with_causal=True) as tables:
             for record in records:
                 tables.write(record, lost(record) if record.frame % 11 == 0 else record)

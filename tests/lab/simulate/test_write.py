@@ -13,7 +13,7 @@ from geometry.uncertainty.rig_parameters import moved
 from lab.errors import InputError
 from lab.files.rig.rig_file import load_rig, save_rig
 from lab.files.run.detections_file import read_detections
-from lab.runs.check import check
+from lab.runs.input_check.check import check
 from lab.simulate.picture import expected_light, laser_powers, make_sensor, render
 from lab.simulate.points import simulate_points
 from lab.simulate.scenarios import LIGHTS, SCENARIOS, Clutter, Hiding, Light

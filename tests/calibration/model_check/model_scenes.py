@@ -1,4 +1,4 @@
-"""Recordings of simulated set-ups, right ones and ones with a known fault, for the tests of the model check."""
+"""Recordings of simulated set-ups, correct ones and ones with a known fault, for the tests of the model check."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from functools import cache
 
 import numpy as np
 
+from calibration.model_check.recording import ModelCheckRecording
 from geometry import rotations
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.rig import Rig
 from geometry.uncertainty.rig_parameters import moved
-from lab.runs.model_check.recording import ModelCheckRecording
 from lab.simulate.scene import Scene, compose
 
 SCENES = ("smooth", "sharp-turns", "huo2015", "two-cameras-per-screen", "four-skew-beams")
@@ -23,7 +23,7 @@ Change = Callable[[Rig], Rig]
 
 
 def turned(camera: str, angle_deg: float, axis: int) -> Change:
-    """A camera turned about its own centre: axis 0 up or down, 1 sideways, 2 about its line of sight."""
+    """A camera turned about its own centre: axis 0 up or down, 1 sideways, 2 about its optical axis."""
 
     def change(rig: Rig) -> Rig:
         place = rig.cameras[camera].camera_from_world
@@ -35,18 +35,18 @@ def turned(camera: str, angle_deg: float, axis: int) -> Change:
 
 
 def changed(name: str, by: float) -> Change:
-    """One number of the rig off, by its name in geometry.uncertainty.rig_parameters."""
+    """One parameter of the rig changed, by its name in geometry.uncertainty.rig_parameters."""
     return lambda rig: moved(rig, [name], np.array([by]))
 
 
 @cache
 def scene_of(scene: str, seed: int) -> Scene:
-    """Drawn once: what the tests have in common takes longer than what they test."""
+    """A scene of 600 frames, cached: composing it takes longer than the tests."""
     return compose(scene, seed, 600)
 
 
 def one_camera(scene: str) -> str:
-    """The camera that the tests accuse."""
+    """The camera that has the fault."""
     return "right-a" if scene == "two-cameras-per-screen" else "right"
 
 
@@ -60,10 +60,10 @@ def recorded(
     claimed_px: float = NOISE_PX,
     predicted: bool = False,
 ) -> tuple[Scene, ModelCheckRecording]:
-    """What a run knows of the first frames of a simulated recording, by the true labels; poses to 1 mm and 0.3 mrad.
+    """The first frames of a simulated recording with the true labels; the poses have errors of 1 mm and 0.3 mrad.
 
-    The run's rig is what is claimed; `really` makes of it the one that the spots come from. late: a camera, and by how
-    many seconds later than told it films. predicted: with predictions that are off by 0.1 px and say so.
+    The run's rig is the stated one; `really` changes it to the one that the spots come from. late: a camera and its
+    delay, s. predicted: with predictions that have an error of 0.1 px and the covariance of that.
     """
     run, some = scene_of(scene, seed), slice(0, frames)
     poses, t_s = run.poses[some], run.t_s[some]

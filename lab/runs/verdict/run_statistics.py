@@ -1,4 +1,4 @@
-"""What a run shows, counted frame by frame: what the verdict is made from. Its size does not grow with the run."""
+"""Statistics of a run, counted frame by frame: the basis of the verdict. Memory does not grow with the run's length."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from lab.runs.verdict.frame_ranges import FrameRanges
 from tracking.detections import UNMATCHED
 from tracking.statuses import PoseStatus, SpotStatus
 
-FEWEST_SPOTS = 3  # that give a pose
-_USUAL_CLUTTER = 0.95  # of the measured frames have no more points without a label than are taken for clutter
-_MOST_POINTS = 50  # more points without a label are counted as so many
+FEWEST_SPOTS = 3  # a pose needs this many
+_USUAL_CLUTTER = 0.95  # quantile, over the measured frames, of the unlabelled points that count as usual clutter
+_MOST_POINTS = 50  # larger numbers of unlabelled points are counted as this number
 
 
 class Cause(StrEnum):
@@ -35,7 +35,7 @@ class Cause(StrEnum):
 
     @property
     def meaning(self) -> str:
-        """What such a frame shows, to follow a number of frames."""
+        """Text that follows a number of such frames."""
         return _MEANINGS[self]
 
 
@@ -43,27 +43,27 @@ _MEANINGS = {
     Cause.NO_PICTURE: "without a picture of some camera",
     Cause.CONTRADICTION: "whose pose contradicts its spots or the causal pass",
     Cause.UNEXPLAINED: "with enough points of light, which no pose explains",
-    Cause.LABELS_OPEN: "with spots whose labels stayed open",
+    Cause.LABELS_OPEN: "with spots whose labels are uncertain",
     Cause.FEW_POINTS: "with too few points of light",
     Cause.OUT_OF_VIEW: f"with fewer than {FEWEST_SPOTS} spots inside the pictures",
     Cause.NOT_DETERMINED: "whose spots do not determine the pose",
     Cause.HIDDEN: "with hidden spots",
 }
-# Frames that show enough to be measured, so that the tracker and not the recording is the reason.
+# Frames with enough visible spots: the tracker, not the recording, is the reason.
 MISSED = (Cause.CONTRADICTION, Cause.UNEXPLAINED, Cause.LABELS_OPEN)
 
 
 @dataclass(slots=True)
-class CameraFacts:
-    """Of one camera."""
+class CameraStatistics:
+    """Counts of one camera."""
 
     pictures: int = 0  # frames with a usable picture
-    empty: int = 0  # of these, without any point of light
-    points: int = 0  # of light, in all of them
-    expected: int = 0  # spots that the pose puts inside these pictures
-    found: int = 0  # of these, measured
-    empty_at_end: int = 0  # pictures without any point since the last one that has one
-    expected_at_end: int = 0  # spots that the pose puts inside these
+    empty: int = 0  # usable pictures without any point of light
+    points: int = 0  # points of light in all pictures
+    expected: int = 0  # spots that the pose puts inside the pictures
+    found: int = 0  # expected spots that were measured
+    empty_at_end: int = 0  # pictures since the last one that has a point of light
+    expected_at_end: int = 0  # spots that the pose puts inside those
     missing: FrameRanges = field(default_factory=FrameRanges)  # frames without a usable picture
 
     def as_mapping(self) -> dict[str, Any]:
@@ -80,10 +80,10 @@ class CameraFacts:
 
 
 @dataclass(slots=True)
-class RunFacts:
-    """Counts of one run; feed it the frames as they are written, in order."""
+class RunStatistics:
+    """Counts of one run. Frames are added in order, as they are written."""
 
-    cameras: dict[str, CameraFacts]
+    cameras: dict[str, CameraStatistics]
     camera_of: tuple[int, ...] = ()  # of each view, index into cameras
     min_spots: int = 4  # points that a first pose needs
     frames: int = 0
@@ -91,40 +91,40 @@ class RunFacts:
     last_frame: int = -1
     pose: Counter[str] = field(default_factory=Counter)  # PoseStatus -> frames
     causal_measured: int | None = None  # frames measured in the causal pass, where the frames are smoothed
-    lost: FrameRanges = field(default_factory=FrameRanges)  # frames of which nothing is known, after the first pose
-    found_again: int = 0  # how often a pose followed upon such a range
-    ties: FrameRanges = field(default_factory=FrameRanges)  # frames with a tie that were not measured in the end either
+    lost: FrameRanges = field(default_factory=FrameRanges)  # frames after the first pose in which the vehicle is lost
+    found_again: int = 0  # number of such ranges that are followed by a pose
+    ties: FrameRanges = field(default_factory=FrameRanges)  # frames with a tie and without a measured pose
     tie_text: str = ""  # of the first of them
     own_spots: FrameRanges = field(default_factory=FrameRanges)  # see lab.runs.verdict.frame_checks.FrameChecks
     causal: FrameRanges = field(default_factory=FrameRanges)
     invalid: FrameRanges = field(default_factory=FrameRanges)
-    _known: bool = False  # a pose has been found
-    _causes: Counter[tuple[Cause, int]] = field(default_factory=Counter)  # with the points that have no label
-    _surplus: Counter[int] = field(default_factory=Counter)  # points without a label, in measured frames
+    _found: bool = False  # whether a pose has been found
+    _causes: Counter[tuple[Cause, int]] = field(default_factory=Counter)  # with the number of unlabelled points
+    _surplus: Counter[int] = field(default_factory=Counter)  # unlabelled points of measured frames
 
     @property
     def measured(self) -> int:
         """Frames with a measured pose."""
         return self.pose[PoseStatus.MEASURED.value]
 
-    def add(self, record: FrameRecord, known_then: FrameRecord | None = None) -> None:
-        """The next frame as it is written, and as the causal pass had it."""
+    def add(self, record: FrameRecord, causal: FrameRecord | None = None) -> None:
+        """Add the next frame, as it is written and as it is in the causal pass."""
         tracked = record.tracked
         self.first_frame = record.frame if self.frames == 0 else self.first_frame
         self.last_frame = record.frame
         self.frames += 1
         self.pose[tracked.pose_status.value] += 1
-        if known_then is not None:
-            now = known_then.tracked.pose_status is PoseStatus.MEASURED
-            self.causal_measured = (self.causal_measured or 0) + now
+        if causal is not None:
+            measured = causal.tracked.pose_status is PoseStatus.MEASURED
+            self.causal_measured = (self.causal_measured or 0) + measured
         self._add_cameras(record)
         if tracked.pose_status is PoseStatus.LOST:
-            if self._known:
+            if self._found:
                 self.lost.add(record.frame)
         else:
             if self.lost.ranges and self.lost.ranges[-1][1] == record.frame - 1:
                 self.found_again += 1
-            self._known = True
+            self._found = True
         points = sum(len(f) for f in record.detections if f is not None)
         surplus = min(points - int(np.count_nonzero(tracked.point != UNMATCHED)), _MOST_POINTS)
         if tracked.pose_status is PoseStatus.MEASURED:
@@ -138,23 +138,23 @@ class RunFacts:
 
     def _add_cameras(self, record: FrameRecord) -> None:
         status = record.tracked.status
-        for c, (facts, found) in enumerate(zip(self.cameras.values(), record.detections, strict=True)):
+        for c, (camera, found) in enumerate(zip(self.cameras.values(), record.detections, strict=True)):
             if found is None:
-                facts.missing.add(record.frame)
+                camera.missing.add(record.frame)
                 continue
-            facts.pictures += 1
-            facts.empty += len(found) == 0
-            facts.points += len(found)
+            camera.pictures += 1
+            camera.empty += len(found) == 0
+            camera.points += len(found)
             if len(found):
-                facts.empty_at_end = facts.expected_at_end = 0
+                camera.empty_at_end = camera.expected_at_end = 0
             else:
-                facts.empty_at_end += 1
+                camera.empty_at_end += 1
             if record.tracked.pose is not None:
-                own = [s for s, camera in zip(status, self.camera_of, strict=True) if camera == c]
-                facts.found += sum(s.measured for s in own)
+                own = [s for s, index in zip(status, self.camera_of, strict=True) if index == c]
+                camera.found += sum(s.measured for s in own)
                 expected = sum(s.measured or s is SpotStatus.OCCLUDED for s in own)
-                facts.expected += expected
-                facts.expected_at_end += expected if facts.empty_at_end else 0
+                camera.expected += expected
+                camera.expected_at_end += expected if camera.empty_at_end else 0
 
     def _cause(self, record: FrameRecord) -> Cause:
         tracked = record.tracked
@@ -175,10 +175,10 @@ class RunFacts:
 
     @property
     def causes(self) -> Mapping[Cause, int]:
-        """Frames without a measured pose by cause, the commonest first.
+        """Number of frames without a measured pose by cause, the most frequent first.
 
-        A frame with more points without a label than is usual in measured frames, by as many as a first pose needs,
-        shows spots that no pose explains, whatever else may be the cause.
+        A frame whose unlabelled points exceed the usual clutter of measured frames by as many as a first pose needs
+        shows spots that no pose explains, whatever its other cause.
         """
         total, usual = sum(self._surplus.values()), 0
         below = 0
@@ -195,6 +195,6 @@ class RunFacts:
 
     @property
     def missed(self) -> int:
-        """Frames that show enough to be measured and were not."""
+        """Number of frames with enough visible spots but without a measured pose."""
         causes = self.causes
         return sum(causes.get(cause, 0) for cause in MISSED)

@@ -1,4 +1,4 @@
-"""A series of pictures in work: each size and depth with its noise, the spots found, what could not be read."""
+"""Detection over a series of pictures: noise by size and depth, the spots, and the unreadable pictures."""
 
 from __future__ import annotations
 
@@ -14,44 +14,44 @@ from tracking.parameters import DetectParameters
 
 
 @dataclass(slots=True)
-class Work:
-    """What is known so far; the report is made of it."""
+class PictureSeries:
+    """The results so far; the page and the summary are made from them."""
 
     camera: str
     source: str
     parameters: DetectParameters
     groups: dict[tuple[tuple[int, int], int], SizeGroup] = field(default_factory=dict)
-    learnt: dict[tuple[tuple[int, int], int], list[Grey]] = field(default_factory=dict)  # pictures behind the noise
+    noise_pictures: dict[tuple[tuple[int, int], int], list[Grey]] = field(default_factory=dict)  # the noise's source
     spots: SpotCollection = field(default_factory=SpotCollection)
     unreadable: dict[str, list[int]] = field(default_factory=dict)  # frames by reason
     notes: list[str] = field(default_factory=list)
 
     @property
     def pictures(self) -> int:
-        """How many were searched."""
+        """Number of pictures searched."""
         return sum(group.pictures for group in self.groups.values())
 
     def group_of(self, picture: Grey) -> SizeGroup:
-        """The group of a picture, made where it is new; its noise is learnt from the picture when that is searched."""
+        """The group of a picture; a new group estimates its noise from the first picture that is searched."""
         key = _kind(picture)
         if key not in self.groups:
             self.groups[key] = SizeGroup(*key, CameraNoise(self.camera))
         return self.groups[key]
 
-    def learn(self, pictures: list[Grey]) -> None:
-        """The noise of each size and depth among some pictures."""
+    def estimate_noise(self, pictures: list[Grey]) -> None:
+        """Estimate the noise of each size and depth among some pictures."""
         for picture in pictures:
-            self.learnt.setdefault(_kind(picture), []).append(picture)
-        for some in self.learnt.values():
-            self.group_of(some[0]).noise.learn(some)
+            self.noise_pictures.setdefault(_kind(picture), []).append(picture)
+        for some in self.noise_pictures.values():
+            self.group_of(some[0]).noise.estimate_from(some)
 
     def search(self, frame: int, picture: Grey) -> Detections:
-        """The spots of a picture, which are counted."""
+        """Detect the spots of a picture and add them to the results."""
         group = self.group_of(picture)
         found = group.noise.detect(picture, self.parameters)
         group.pictures += 1
         model = group.noise.model
-        assert model is not None  # learnt at the latest by the search
+        assert model is not None  # the search has estimated it
         self.spots.add(frame, found, matched_snr(found, float(np.sqrt(model.floor_dn2))))
         return found
 

@@ -1,0 +1,184 @@
+"""Identifies the fault that explains the residuals of a recording, and how significant that is.
+
+The recording is reduced to normal equations over all parameters that may be wrong, with the poses of all frames
+eliminated. They are equivalent to a few uncorrelated pixels y = X theta + noise, one per observable direction of theta;
+`ExcessResidual` of the drift check computes evidence, size and significance from these (calibration/drift.py). The
+calibration's own covariance is part of the noise: a deviation that it allows is no fault.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from calibration.drift import Change, ChangeCandidate, ExcessResidual
+from calibration.model_check.faults import PIXEL_OFFSET, VIEW, PossibleFault
+from calibration.model_check.linearised_frames import LinearisedFrames
+from calibration.model_check.statistics import correlation_time
+from geometry.arrays import Array
+
+P_FALSE_ALARM = 1e-6  # probability that a recording of a correct rig leads to any suspected fault, over all candidates
+DECISIVE = 12.0  # difference of 2 ln(evidence), a factor of 400, at which the less probable fault is ruled out
+# After linearisation a large fault explains its residuals only up to about this share of their chi-square: a smaller
+# difference neither distinguishes two faults nor counts as a second fault. Measured: a camera 10 ms late (46 sigma)
+# leaves 0.02 % of 2.6e6.
+LINEARISATION_SHARE = 0.005
+MOST_FAULTS = 3  # reported at once: where more seem wrong, the whole rig needs a calibration
+MOST_ALTERNATIVES = 2  # reported beside the best
+_LEAST_REDUNDANCY = 10.0  # degrees of freedom of a view: with fewer its noise is unknown
+CORRELATED_FRAMES = 2.0  # correlation time from which errors count as correlated: white noise gives 1.0 to 1.2
+_OBSERVABLE = 1e-10  # of the largest eigenvalue: smaller ones are rounding errors
+
+
+@dataclass(frozen=True, slots=True)
+class FittedFault:
+    """A fault that was fitted to a recording."""
+
+    fault: PossibleFault
+    change: Change
+    log_odds: float  # 2 ln of the posterior odds against "no fault", each component of a type being equally probable
+
+
+@dataclass(frozen=True, slots=True)
+class SuspectedFault:
+    """The best explanation of the residuals, and the best fault of each other component that is as probable."""
+
+    best: FittedFault
+    alternatives: tuple[FittedFault, ...]
+    more_alternatives: int  # number of those not listed
+
+    @property
+    def explanations(self) -> tuple[FittedFault, ...]:
+        """The best one, then the alternatives."""
+        return (self.best, *self.alternatives)
+
+
+@dataclass(frozen=True, slots=True)
+class FaultDiagnosis:
+    """The suspected faults of a recording, and the tests behind them."""
+
+    suspected_faults: tuple[SuspectedFault, ...]
+    p_before: float  # p-value of the residuals under "no fault"
+    p_after: float  # p-value of what the suspected faults leave
+    tests: int  # number of candidates
+    residual_scale: float  # root of the reduced chi-square of all residuals: 1 if rig and sigmas are correct
+    noise_scale: float  # the same of what no constant fault explains: errors over stated sigmas
+    correlation_frames: float  # number of the used frames that count as one independent frame
+    unexplained: bool  # whether a significant residual remains
+    noise_of_views: Array  # (n,) noise_scale of each view; nan where it was not seen, or the poses absorb it
+
+    @property
+    def excess_noise(self) -> float:
+        """The noise scale, at least 1."""
+        return max(self.noise_scale, 1.0) if np.isfinite(self.noise_scale) else 1.0
+
+    @property
+    def is_correlated(self) -> bool:
+        """Whether what no constant fault explains is correlated over several frames, unlike noise."""
+        return self.correlation_frames > CORRELATED_FRAMES
+
+
+def diagnose(
+    lin: LinearisedFrames, jacobian: Array, covariance: Array, faults: Sequence[PossibleFault]
+) -> FaultDiagnosis:
+    """Diagnose K frames. jacobian (K, n, 2, p), whitened; covariance (p, p) of the parameters as stated."""
+    free = lin.residual_part(jacobian)
+    flat = free.reshape(-1, free.shape[-1])
+    left = lin.residual_part(lin.residual)
+    r = left.ravel()
+    X, V = _compressed(flat.T @ flat)
+    y = V @ (flat.T @ r)
+    fitted = (flat @ (V.T @ y)).reshape(left.shape)
+    dof = lin.dof
+    rest_dof = dof - len(y)
+    chi2 = float(r @ r)
+    noise_variance = float(np.sum((left - fitted) ** 2)) / rest_dof if rest_dof > 0 else 1.0
+    series = np.where(lin.used[..., None], left - fitted, np.nan).reshape(len(left), -1)
+    correlation_frames = correlation_time(series)
+    redundancy = np.einsum("knii->n", lin.redundancy())
+    own = redundancy * rest_dof / dof if rest_dof > 0 else np.zeros(lin.used.shape[1])
+    squares = np.sum((left - fitted) ** 2, axis=(0, 2))
+    enough = own > _LEAST_REDUNDANCY
+    noise_of_views = np.where(enough, np.sqrt(squares / np.where(enough, own, 1.0)), np.nan)
+    # Sigmas that are stated too small and correlated errors widen the noise; a noise scale below 1 is not applied.
+    variance = max(noise_variance, 1.0) * correlation_frames
+    root = np.linalg.cholesky(variance * np.eye(len(y)) + X @ covariance @ X.T)
+    # Whitened once for all faults: the many small solves dominate the run time where BLAS runs in threads.
+    start = ExcessResidual.of_white(np.linalg.solve(root, y))
+    suspected, after = _search(start, np.linalg.solve(root, X), faults)
+    return FaultDiagnosis(
+        suspected_faults=suspected,
+        p_before=start.p_value,
+        p_after=after.p_value,
+        tests=len(faults),
+        residual_scale=float(np.sqrt(chi2 / dof)) if dof > 0 else float("nan"),
+        noise_scale=float(np.sqrt(noise_variance)),
+        correlation_frames=correlation_frames,
+        noise_of_views=noise_of_views,
+        unexplained=after.p_value < P_FALSE_ALARM and after.chi2 - after.dof > LINEARISATION_SHARE * start.chi2,
+    )
+
+
+def _compressed(N: Array) -> tuple[Array, Array]:
+    """X (q, p) with X^T X = N (p, p), and V (q, p) with V N = X, where q is the number of observable directions."""
+    scale = np.sqrt(np.maximum(np.diagonal(N), 0.0))
+    safe = np.where(scale > 0, scale, 1.0)
+    values, vectors = np.linalg.eigh(N / np.outer(safe, safe))
+    seen = values > _OBSERVABLE * max(float(values[-1]), 1e-300)
+    root = np.sqrt(values[seen])[:, None]
+    return root * vectors[:, seen].T * scale, vectors[:, seen].T / root / safe
+
+
+def _search(
+    start: ExcessResidual, X: Array, faults: Sequence[PossibleFault]
+) -> tuple[tuple[SuspectedFault, ...], ExcessResidual]:
+    """Adds suspected faults one by one. Returns them and the residual that they leave."""
+    found: list[SuspectedFault] = []
+    left = start
+    while len(found) < MOST_FAULTS:
+        more = _best(left, X, faults, found)
+        if more is None or more.best.change.explained < LINEARISATION_SHARE * start.chi2:
+            break
+        found = [*found, more]
+        if len(found) > 1:  # each is chosen again with the others free: they were unknown when it was chosen
+            for i in range(len(found)):
+                others = found[:i] + found[i + 1 :]
+                again = _best(start.without(c.best.change for c in others), X, faults, others)
+                found[i] = found[i] if again is None else again
+        left = start.without(c.best.change for c in found)
+    found.sort(key=lambda c: -c.best.log_odds)
+    return tuple(found), left
+
+
+def _best(
+    left: ExcessResidual, X: Array, faults: Sequence[PossibleFault], known: Sequence[SuspectedFault]
+) -> SuspectedFault | None:
+    """The best significant explanation with its alternatives; None where none is significant."""
+    taken = {_component(c.best.fault) for c in known}
+    fitted = []
+    for fault in faults:
+        if _component(fault) in taken:
+            continue
+        change = left.fit(fault.kind, fault.name, ChangeCandidate(X @ fault.directions, fault.prior_sigma))
+        alike = len({f.name for f in faults if f.component == fault.component})
+        fitted.append(FittedFault(fault, change, change.evidence - 2 * float(np.log(alike))))
+    significant = [e for e in fitted if e.log_odds > 0 and e.change.p_value < P_FALSE_ALARM / len(faults)]
+    if not significant:
+        return None
+    significant.sort(key=lambda e: -e.log_odds)
+    margin = max(DECISIVE, LINEARISATION_SHARE * significant[0].log_odds)
+    close = [e for e in significant if e.log_odds > significant[0].log_odds - margin]
+    # A pixel offset is a symptom: a component that explains it as well is the cause.
+    close.sort(key=lambda e: e.fault.kind == PIXEL_OFFSET)
+    best_of_component: dict[tuple[str, str], FittedFault] = {}
+    for e in close:
+        best_of_component.setdefault(_component(e.fault), e)
+    best, *others = best_of_component.values()
+    others = [e for e in others if e.fault.component != VIEW or best.fault.component == VIEW]
+    return SuspectedFault(best, tuple(others[:MOST_ALTERNATIVES]), max(len(others) - MOST_ALTERNATIVES, 0))
+
+
+def _component(fault: PossibleFault) -> tuple[str, str]:
+    return fault.component, fault.name
