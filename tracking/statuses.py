@@ -1,4 +1,4 @@
-"""The status words of spots and poses, and what each means. The report and the documentation read them from here."""
+"""The statuses of spots and poses with their meanings. The report and the documentation read them from here."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ LOST_SIGMA_M, LOST_SIGMA_RAD = 1.0, np.deg2rad(60.0)  # a predicted pose with la
 
 
 class SpotStatus(StrEnum):
-    """What is known of one spot in one picture."""
+    """The status of one spot in one picture."""
 
     MATCHED = "matched"
     TURNED = "turned"
@@ -25,17 +25,27 @@ class SpotStatus(StrEnum):
 
     @property
     def meaning(self) -> str:
-        """One sentence for a reader."""
+        """One sentence for the user, true for both tracker methods."""
         return _SPOT_MEANINGS[self]
+
+    def meaning_for(self, method: str) -> str:
+        """One sentence for the user, as the tracker `method` (`rigid` or `spots`) assigns this status.
+
+        Raises:
+            ValueError: for any other method.
+        """
+        if method not in _MEANINGS_BY_METHOD:
+            raise ValueError(f"tracker method: expected one of {', '.join(_MEANINGS_BY_METHOD)}, got {method!r}")
+        return _MEANINGS_BY_METHOD[method].get(self, self.meaning)
 
     @property
     def measured(self) -> bool:
-        """Whether a detection of this picture stands behind the position."""
+        """Whether the position is that of a detection in this picture."""
         return self in (SpotStatus.MATCHED, SpotStatus.TURNED)
 
 
 class PoseStatus(StrEnum):
-    """What is known of the vehicle's pose in one frame."""
+    """The status of the vehicle's pose in one frame."""
 
     MEASURED = "measured"
     PREDICTED = "predicted"
@@ -43,23 +53,40 @@ class PoseStatus(StrEnum):
 
     @property
     def meaning(self) -> str:
-        """One sentence for a reader."""
+        """One sentence for the user."""
         return _POSE_MEANINGS[self]
 
 
 _SPOT_MEANINGS = {
-    SpotStatus.MATCHED: "found in the search region around the prediction (matching step 1)",
-    SpotStatus.TURNED: "found by the second search, around the last position: the trajectory bent (step 2)",
-    SpotStatus.OCCLUDED: "should be in view, no detection accepted: the estimate is used (step 3)",
-    SpotStatus.OUT_OF_VIEW: "outside the image: solved from the other beams",
+    SpotStatus.MATCHED: "a detection of this image has this spot's label",
+    SpotStatus.TURNED: "a detection has this spot's label, and the trajectory bends: it is not where it was predicted",
+    SpotStatus.OCCLUDED: "should be in view, but no detection is accepted: the position is estimated",
+    SpotStatus.OUT_OF_VIEW: "outside the image: the position follows from the other spots",
     SpotStatus.OFF_SCREEN: "the beam is known, but misses its screen or cannot be projected",
-    SpotStatus.NO_IMAGE: "this camera has no usable image for this frame: the position is the estimate",
+    SpotStatus.NO_IMAGE: "this camera has no usable image for this frame: the position is estimated",
     SpotStatus.LOST: "nothing is known",
+}
+
+# Huo, Yang & Yang 2015, section 4.1.2, for `spots`.
+_MEANINGS_BY_METHOD = {
+    "rigid": {
+        SpotStatus.MATCHED: "a detection has this spot's label: the most likely one under the motion of the vehicle",
+        SpotStatus.TURNED: "a detection has this spot's label, and the vehicle's velocity jumped since the last frame",
+        SpotStatus.OCCLUDED: "should be in view, but no detection is accepted: the pose gives the position",
+        SpotStatus.OUT_OF_VIEW: "outside the image: the pose gives the position",
+        SpotStatus.NO_IMAGE: "this camera has no usable image for this frame: the pose gives the position",
+    },
+    "spots": {
+        SpotStatus.MATCHED: "found in the search region around the prediction (matching step 1)",
+        SpotStatus.TURNED: "found by the second search, around the last position: the trajectory bent (step 2)",
+        SpotStatus.OCCLUDED: "should be in view, no detection accepted: the estimate is used (step 3)",
+        SpotStatus.OUT_OF_VIEW: "outside the image: solved from the other beams",
+    },
 }
 
 _POSE_MEANINGS = {
     PoseStatus.MEASURED: "the pose is observable from this frame's matched spots",
-    PoseStatus.PREDICTED: "not observable in this frame: motion model, with a covariance that says so",
+    PoseStatus.PREDICTED: "not observable in this frame: predicted by the motion model, with a larger covariance",
     PoseStatus.LOST: "nothing is known",
 }
 
@@ -67,8 +94,10 @@ _POSE_MEANINGS = {
 def view_statuses(
     seen: Bools, turned: Bools, exists: Bools, inside: Bools, has_image: Sequence[bool] | Bools, known: bool
 ) -> tuple[SpotStatus, ...]:
-    """One word per view, all (n,): a detection is labelled, at a bend; the pose projects it, into the picture; the
-    camera has a picture. known: there is a pose.
+    """The status of every view from a pose; all arguments (n,), except `known`.
+
+    seen: a detection has the label; turned: at a bend; exists: the pose projects the spot; inside: into the image;
+    has_image: its camera has a picture. known: there is a pose.
     """
     out = []
     for i in range(len(seen)):

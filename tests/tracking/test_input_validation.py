@@ -16,6 +16,7 @@ from geometry.arrays import Array, Ints
 from geometry.pose import Pose
 from geometry.pose_prior import PosePrior
 from lab.simulate.points import CLUTTER, PointRun, simulate_points
+from tracking.curve_switching.spot_tracker import SpotTracker
 from tracking.detections import UNMATCHED, Detections
 from tracking.input_validation import TWIN_PX, usable_rows
 from tracking.parameters import TrackerParameters
@@ -34,17 +35,17 @@ def recording() -> PointRun:
     return simulate_points("smooth", 3, frames=40)
 
 
-def rigid_tracker(run: PointRun) -> RigidTracker:
+def new_tracker(run: PointRun, kind: type[RigidTracker | SpotTracker] = RigidTracker) -> RigidTracker | SpotTracker:
     p = run.prior
     centre = Pose.from_ypr(np.deg2rad(p.yaw_pitch_roll_deg), np.array(p.position_m))
-    return RigidTracker(run.rig, TrackerParameters(), PosePrior(centre, p.within_m, float(np.deg2rad(p.within_deg))))
+    return kind(run.rig, TrackerParameters(), PosePrior(centre, p.within_m, float(np.deg2rad(p.within_deg))))
 
 
 class Outcome:
     """What a tracker made of a recording, against the truth."""
 
     def __init__(self, run: PointRun, spoil: Spoil) -> None:
-        tracker = rigid_tracker(run)
+        tracker = new_tracker(run)
         self.frames: list[TrackedFrame] = []
         self.wrong, self.nees, self.seconds = 0, np.full(len(run.frame), np.nan), np.zeros(len(run.frame))
         self.found = np.zeros(len(run.frame), dtype=int)  # right labels
@@ -167,7 +168,7 @@ def test_ten_thousand_false_points_in_a_picture_cost_milliseconds_and_mislead_no
         size = run.model.image_size_px[run.model.camera_of == camera][0]
         return more(d, rng.uniform(-0.5, size - 0.5, (10_000, 2)), np.full(10_000, -1), rng)
 
-    rigid_tracker(run).step(0.0, run.detections[0])  # compiled code is loaded before the clock runs
+    new_tracker(run).step(0.0, run.detections[0])  # compiled code is loaded before the clock runs
     outcome = Outcome(run, spoil)
     shining = np.count_nonzero(run.in_view == 1, axis=1)
     clean = ~np.isin(run.frame, frames)
@@ -225,26 +226,27 @@ def test_a_tie_of_the_first_frame_gives_neither_labels_nor_a_pose():
         d[np.flatnonzero(np.isin(o, seen))]
         for d, o, seen in zip(run.detections[0], run.origin[0], ([1, 2], [3, 4]), strict=True)
     ]
-    out = rigid_tracker(run).step(0.0, first)
+    out = new_tracker(run).step(0.0, first)
     assert "tie" in [e.kind for e in out.events]
     assert out.pose is None
     assert (out.point == UNMATCHED).all()
 
 
 @pytest.mark.parametrize("dt_s", [0.0, -0.01, np.nan, np.inf, -np.inf])
-def test_a_step_that_is_not_forward_in_time_is_refused(dt_s):
+@pytest.mark.parametrize("kind", [RigidTracker, SpotTracker])
+def test_a_step_that_is_not_forward_in_time_is_rejected(kind, dt_s):
     run = recording()
-    tracker = rigid_tracker(run)
+    tracker = new_tracker(run, kind)
     tracker.step(0.0, run.detections[0])
     with pytest.raises(ValueError, match=r"^dt_s: expected the seconds since the frame before, more than 0 .*, got "):
         tracker.step(dt_s, run.detections[1])
-    # what was refused has left no trace
+    # The rejected step has not changed the tracker.
     assert tracker.step(0.01, run.detections[1]).pose_status is PoseStatus.MEASURED
 
 
 def test_a_million_seconds_later_the_vehicle_is_searched_anew():
     run = recording()
-    tracker = rigid_tracker(run)
+    tracker = new_tracker(run)
     for k in range(10):
         tracker.step(0.01 * (k > 0), run.detections[k])
     # A million metres away no spot is on a screen, and no label doubts that: 15 frames of doubt were measured.
@@ -260,10 +262,10 @@ def test_arrays_and_cameras_that_do_not_fit_are_refused():
     run = recording()
     points = run.detections[0][0]
     with pytest.raises(ValueError, match=r"found: expected detections, or None, of each of the cameras left, right"):
-        rigid_tracker(run).step(0.0, [points])
+        new_tracker(run).step(0.0, [points])
     for field, shape in (("cov_px2", (len(points), 2)), ("flux", (len(points) + 1,))):
         with pytest.raises(ValueError, match=f"{field}: expected shape"):
-            rigid_tracker(run).step(0.0, [replace(points, **{field: np.ones(shape)}), None])
+            new_tracker(run).step(0.0, [replace(points, **{field: np.ones(shape)}), None])
 
 
 @given(seed=st.integers(0, 2**32 - 1), count=st.integers(0, 120))
