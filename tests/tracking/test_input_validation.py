@@ -238,7 +238,7 @@ def test_a_step_that_is_not_forward_in_time_is_rejected(kind, dt_s):
     run = recording()
     tracker = new_tracker(run, kind)
     tracker.step(0.0, run.detections[0])
-    with pytest.raises(ValueError, match=r"^dt_s: expected the seconds since the frame before, more than 0 .*, got "):
+    with pytest.raises(ValueError, match=r"^dt_s: expected the seconds since the previous frame, more than 0 .*, got "):
         tracker.step(dt_s, run.detections[1])
     # The rejected step has not changed the tracker.
     assert tracker.step(0.01, run.detections[1]).pose_status is PoseStatus.MEASURED
