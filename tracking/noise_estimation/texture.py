@@ -23,10 +23,10 @@ def texture_of(pictures: Sequence[Picture], noise: NoiseModel) -> float:
     height, width = (n // _BLOCK * _BLOCK for n in pictures[0].shape)
     mean = np.asarray(np.mean([p[:height, :width] for p in pictures], axis=0), dtype=np.float32)
     coarse = cv2.resize(mean, (width // _BLOCK, height // _BLOCK), interpolation=cv2.INTER_AREA)
-    ground = cv2.resize(cv2.medianBlur(coarse, 5), (width, height), interpolation=cv2.INTER_LINEAR)
+    background = cv2.resize(cv2.medianBlur(coarse, 5), (width, height), interpolation=cv2.INTER_LINEAR)
     inner = slice(2 * _BLOCK, -2 * _BLOCK, 3)
-    level = np.maximum(ground[inner, inner].astype(float), 1.0)
-    above = cv2.blur(mean, (_MEAN, _MEAN))[inner, inner] - ground[inner, inner]
+    level = np.maximum(background[inner, inner].astype(float), 1.0)
+    above = cv2.blur(mean, (_MEAN, _MEAN))[inner, inner] - background[inner, inner]
     if not above.size:
         return 0.0
     variance = quantile_variance(np.abs(above / level))
