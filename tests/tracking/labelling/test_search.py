@@ -391,4 +391,4 @@ def test_a_narrow_prior_finds_the_vehicle_among_hundreds_of_points_of_unknown_br
         assert wrong_labels(result, model, picture) == []
     result = find_labels(rig, model, picture.detections, WIDE)
     assert result.chosen is None
-    assert "no flux that tells which may be spots" in result.reason
+    assert "without a flux that shows which may be spots" in result.reason
