@@ -1,4 +1,4 @@
-"""Pictures of spots with known truth, for tests and the benchmark. Shares no code with what it tests.
+"""Pictures of spots with known truth, for tests and the benchmark. Shares no code with the detector.
 
 A spot is integrated over each pixel by Gauss-Legendre nodes (4 x 4 per pixel; exact to 1e-5 of the peak at sigma 0.5).
 """
@@ -38,19 +38,21 @@ class Spot:
 
 @dataclass(frozen=True)
 class Scene:
+    """Spots on a background, and the sensor."""
+
     spots: list[Spot]
     size: tuple[int, int] = (1280, 1024)  # width, height
     background: float = 12.0  # DN at the centre
     gradient: tuple[float, float] = (0.0, 0.0)  # DN over the width, over the height
-    reflections: list[Spot] = field(default_factory=list)  # smooth humps
-    hot: int = 0
+    reflections: list[Spot] = field(default_factory=list)  # wide smooth Gaussians
+    hot: int = 0  # number of hot pixels
     gain: float = 30.0  # e-/DN
     read: float = 1.5  # DN
     speckle: float = 0.0  # contrast of a multiplicative texture with grains of 1 px sigma, on the spots
 
 
 def light(spot: Spot, size: tuple[int, int]) -> tuple[NDArray, tuple[slice, slice]]:
-    """Pixel means of a spot and where they go."""
+    """Pixel means of a spot, DN, and their rows and columns in the picture."""
     width, height = size
     reach = int(np.ceil(6 * max(spot.major, spot.minor) + spot.streak / 2 + 2))
     u0, u1 = max(int(spot.u) - reach, 0), min(int(spot.u) + reach + 1, width)
@@ -87,6 +89,7 @@ def expected(scene: Scene, rng: np.random.Generator | None = None) -> NDArray:
 
 
 def grains(shape: tuple[int, ...], contrast: float, rng: np.random.Generator) -> NDArray:
+    """A multiplicative texture of this shape with a mean of 1 and grains of 1 px sigma."""
     x = np.arange(-4, 5)
     kernel = np.exp(-0.5 * x**2)
     noise = rng.normal(size=(shape[0] + 8, shape[1] + 8))
@@ -96,12 +99,12 @@ def grains(shape: tuple[int, ...], contrast: float, rng: np.random.Generator) ->
 
 
 def photograph(scene: Scene, rng: np.random.Generator, bits: int = 8) -> NDArray:
-    """The picture as a camera gives it, uint8 or uint16."""
+    """The picture of a camera, uint8 or uint16."""
     return expose(expected(scene, rng), scene, rng, bits)
 
 
 def expose(mean: NDArray, scene: Scene, rng: np.random.Generator, bits: int = 8) -> NDArray:
-    """Shot noise, read noise, hot pixels, rounding and clipping on an expected picture (h, w)."""
+    """An expected picture (h, w), DN, with shot noise, read noise, hot pixels, rounding and clipping."""
     electrons = rng.normal(mean, np.sqrt(np.maximum(mean, 0) / scene.gain))
     picture = rng.normal(electrons, scene.read)
     for _ in range(scene.hot):
@@ -111,10 +114,10 @@ def expose(mean: NDArray, scene: Scene, rng: np.random.Generator, bits: int = 8)
 
 
 def bound(spot: Spot, scene: Scene, mean: NDArray, saturation: float = np.inf, step: float = 1e-3) -> NDArray:
-    """Cramer-Rao bound (2, 2), px^2, for the centre: flux, shape and background plane unknown too, noise known.
+    """Cramer-Rao bound (2, 2), px^2, of the centre with unknown flux, shape and background plane, and known noise.
 
     `mean` is expected(scene). Numerical derivatives of the rendered spot; variance per pixel = level/gain + read^2 +
-    1/12; pixels whose expected value clips tell nothing.
+    1/12; pixels with a clipped expected value have no weight.
     """
     base, where = light(spot, scene.size)
     level = mean[where]

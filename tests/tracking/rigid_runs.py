@@ -1,4 +1,4 @@
-"""Recordings as points, tracked and looked at again, and how far off the answers are. For the tests."""
+"""Recordings as points, tracked and smoothed, and their errors against the truth. For the tests."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tracking.smoothing.smoothed import Smoothed
 from tracking.smoothing.smoother import smooth
 from tracking.tracked_frame import TrackedFrame
 
-START = 10  # frames until the velocities are known
+START = 10  # number of frames until the velocities are known
 RIGID = TrackerParameters()
 NEAR_THE_ORIGIN = PriorRegion((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.3, 15.0)
 
@@ -49,7 +49,7 @@ def tracked(
     covariance: RigCovariance | None = None,
     prior: PosePrior | None = None,
 ) -> list[TrackedFrame]:
-    """What the rigid tracker says of a recording; rig: the one it believes in."""
+    """The rigid tracker's results on a recording; rig: as calibrated, if it differs from the true one."""
     tracker = RigidTracker(rig or run.rig, parameters, prior or prior_of(run), covariance)
     return [tracker.step(dt_of(run, k), found_in(run, k)) for k in range(len(run.frame))]
 
@@ -61,7 +61,7 @@ def looked_at_again(
     rig: Rig | None = None,
     covariance: RigCovariance | None = None,
 ) -> tuple[list[TrackedFrame], Smoothed]:
-    """The smoother's answers after the tracker's."""
+    """The smoother's results after those of the tracker, `frames`."""
     recording = TrackedRecording(rig or run.rig, parameters, covariance)
     for k, frame in enumerate(frames):
         recording.append(dt_of(run, k), found_in(run, k), frame)
@@ -71,15 +71,15 @@ def looked_at_again(
 
 @dataclass(frozen=True, slots=True)
 class Judged:
-    """Answers against truth: T frames, n views."""
+    """Results compared with the truth: T frames, n views."""
 
-    labelled: Bools  # (T, n) a detection was named
-    right: Bools  # (T, n) and is the spot's
-    shining: Bools  # (T, n) there was one to be named
-    errors: Array  # (T, 6) of the poses; nan without
-    nees: Array  # (T,) e^T P^-1 e of the poses; nan without
-    bound: Array  # (T, 6) Cramer-Rao variances from the frame's own spots; nan where they give no pose
-    prediction: Array  # (T, n, 2) px, error of the predicted places
+    labelled: Bools  # (T, n) a detection has the label
+    right: Bools  # (T, n) the label is right
+    shining: Bools  # (T, n) the spot is visible
+    errors: Array  # (T, 6) of the poses; nan without a pose
+    nees: Array  # (T,) e^T P^-1 e of the poses; nan without a pose
+    bound: Array  # (T, 6) Cramer-Rao variances from the frame's own spots; nan if they do not determine the pose
+    prediction: Array  # (T, n, 2) px, error of the predicted positions
 
     @property
     def identity(self) -> float:
@@ -91,7 +91,7 @@ class Judged:
 
     @property
     def lit(self) -> Bools:
-        """Frames that give a pose by themselves, after the start."""
+        """Frames whose own spots determine the pose, after the start."""
         return ~np.isnan(self.bound[:, 0]) & ~np.isnan(self.errors[:, 0]) & (np.arange(len(self.nees)) >= START)
 
     def missed(self) -> int:
@@ -135,25 +135,25 @@ class Pooled:
         return sum(j.wrong for j in self.some) / sum(int(np.sum(j.labelled)) for j in self.some)
 
     def nees(self, lit: bool = False) -> float:
-        """Mean NEES / 6 of all poses, or of those in the light."""
+        """Mean NEES / 6 of all poses, or of those in `lit` frames."""
         values = np.concatenate([j.nees[j.lit] if lit else j.nees for j in self.some])
         return float(np.nanmean(values) / 6)
 
     def over_bound(self, rotation: bool = True) -> float:
-        """Root mean square error over the single-frame bound's, of the attitude or the position."""
+        """Ratio of the root mean square error to the single-frame bound, of the attitude or the position."""
         part = slice(3, 6) if rotation else slice(0, 3)
         squares = sum((np.sum(j.errors[j.lit][:, part] ** 2, axis=0) for j in self.some), np.zeros(3))
         bounds = sum((np.sum(j.bound[j.lit][:, part], axis=0) for j in self.some), np.zeros(3))
         return float(np.sqrt(np.mean(squares / bounds)))
 
     def prediction_px(self) -> Array:
-        """(2,) root mean square error per axis of the places predicted for shining spots, after the start."""
+        """(2,) root mean square error per axis of the predicted positions of visible spots, after the start."""
         values = np.concatenate([j.prediction[START:][j.shining[START:] & j.right[START:]] for j in self.some])
         return np.asarray(np.sqrt(np.nanmean(values**2, axis=0)))
 
 
 def around_bends(run: PointRun, which: str, frames: int, seed: int) -> Bools:
-    """What to hide (T, n): for so many frames about each bend `one` spot, `two`, a `screen` or `all`."""
+    """The spots to hide (T, n): `one` spot, `two`, a `screen` or `all`, for a number of frames about each bend."""
     rng = np.random.default_rng([seed, 7])
     hide = np.zeros(run.in_view.shape, dtype=bool)
     views, free = np.arange(hide.shape[1]), START
@@ -180,7 +180,7 @@ def filmed(
     hide: Bools | None = None,
     prior: PriorRegion = NEAR_THE_ORIGIN,
 ) -> PointRun:
-    """A recording of a motion (T poses at t_s) as points, without false ones. hide (T, n): spots that do not shine."""
+    """A recording of a motion (T poses at t_s) as points, without false points. hide (T, n): hidden spots."""
     model, frames = SpotModel.of(rig), len(t_s)
     uv = model.project(poses)[0]
     rng = np.random.default_rng([seed, 3])
@@ -215,13 +215,14 @@ def filmed(
 def zig_zag(
     seed: int, frames: int, frame_rate_hz: float, every: int, rate_rad_s: float, start: Pose
 ) -> tuple[Pose, Array, Bools]:
-    """Poses (T), times (T,) and frames after a corner (T,): uniform motion between corners at random moments of a step.
+    """Poses (T), times (T,) and frames after a bend (T,): uniform motion between bends at random times within a step.
 
-    A corner every so many frames, forth and back; rate_rad_s: 1 sigma of each axis' angular rate, in m/s a third of it.
+    The motion reverses every `every` frames; rate_rad_s: 1 sigma of the angular rate about each axis; a third of it, in
+    m/s, is that of the velocity.
     """
     rng = np.random.default_rng([seed, 5])
     t_s = np.arange(frames) / frame_rate_hz
-    before = np.arange(every, frames - every // 2, every)  # the corner lies between this frame and the next
+    before = np.arange(every, frames - every // 2, every)  # the bend lies between this frame and the next
     knots = np.concatenate([[0.0], (before + rng.random(len(before))) / frame_rate_hz])
     pace = rate_rad_s * rng.normal(size=(len(knots), 6)) * np.repeat([1 / 3, 1.0], 3)
     pace = np.abs(pace) * np.sign(pace[0]) * (-1.0) ** np.arange(len(knots))[:, None]
@@ -235,7 +236,7 @@ def zig_zag(
 
 
 def some_frames(run: PointRun, frames: Ints) -> PointRun:
-    """The same recording with only these frames: those between were never taken."""
+    """The recording with only these frames."""
     return replace(
         run,
         frame=run.frame[frames],
@@ -251,7 +252,7 @@ def some_frames(run: PointRun, frames: Ints) -> PointRun:
 
 
 def without_pictures(run: PointRun, frames: slice, camera: int) -> PointRun:
-    """The same recording, for some frames without this camera's pictures."""
+    """The recording without this camera's pictures in some frames."""
     has_image = run.has_image.copy()
     has_image[frames, camera] = False
     return replace(run, has_image=has_image)
