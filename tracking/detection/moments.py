@@ -56,7 +56,7 @@ def find_moments(image: Pixels, table: Array, cells: Array) -> None:
             read_window(image, window, np.inf, cells[VALUES], cells[STATE])
             background = spot[BACKGROUND]
             if cell > 1:  # the given background, a median over 40 px, is biased by a wide spot
-                background = _median_of_border(window, cells[VALUES], cells[SCRATCH])
+                background = _median_of_border(window, cells[VALUES], cells[STATE], cells[SCRATCH], background)
             _subtract_background(window, table, i, background, cells[VALUES], cells[STATE])
             for _ in range(rounds):
                 spot[FLUX] = cell * cell * _adapt_window(window, cells[VALUES], spot, cells[ROW])
@@ -64,13 +64,17 @@ def find_moments(image: Pixels, table: Array, cells: Array) -> None:
 
 
 @compiled
-def _median_of_border(window: Window, values: Array, scratch: Array) -> float:
+def _median_of_border(window: Window, values: Array, state: Array, scratch: Array, background: float) -> float:
+    """The median of the window's border cells inside the picture; `background` if there are none."""
     n, last = 0, window.rows - 1
     for i in range(window.rows):
         for j in range(window.columns):
-            if i == 0 or j == 0 or i == last or j == window.columns - 1:
-                scratch[n] = values[i * window.columns + j]
+            k = i * window.columns + j
+            if (i == 0 or j == 0 or i == last or j == window.columns - 1) and state[k] != OUTSIDE:
+                scratch[n] = values[k]
                 n += 1
+    if n == 0:
+        return background
     insertion_sort(scratch, n)
     return 0.5 * (scratch[(n - 1) // 2] + scratch[n // 2])
 

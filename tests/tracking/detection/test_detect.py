@@ -146,6 +146,15 @@ def test_the_centre_of_an_exposure_streak_is_that_at_mid_exposure():
     assert np.sqrt(np.mean(np.square(errors))) < 0.05 * px
 
 
+@pytest.mark.parametrize("u", [18.0, 24.0, 142.0])
+def test_a_wide_faint_spot_near_a_corner_is_found(u):
+    """Half of the window for its moments lies outside the picture, where there is no background to measure."""
+    spot = Spot(u, 20.0, 40.0, 4.0, 2.0)
+    found = seen(Scene([spot], SMALL))
+    assert len(found) == 1
+    assert error(found, spot) < 0.3 * px
+
+
 @pytest.mark.parametrize("value", [0, 17, 255])
 @pytest.mark.parametrize("shape", [(1, 1), (1, 40), (4, 4), (5, 5), (7, 9), (33, 31), (128, 160)])
 def test_uniform_pictures_of_any_size_have_no_spots(value, shape):
