@@ -1,1 +1,1 @@
-"""From pictures to labelled spots: detection, the paper's tracker, first labels. Knows no files."""
+"""From pictures to labelled spots and poses: detection, labelling, trackers, smoothing. Reads and writes no files."""

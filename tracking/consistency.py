@@ -1,8 +1,8 @@
-"""Whether reported poses agree with their own labelled spots, and smoothed ones with the causal ones.
+"""Consistency tests of reported poses: against their own labelled spots, and of smoothed against causal poses.
 
-Both tests take the poses as they are reported, not a fit made for the test: a fit of a single frame's spots follows
-these wherever the reported pose is. Pure functions of arrays, T frames and n views. Source: ours; the statistics are
-chi-square tests (Bar-Shalom, Li & Kirubarajan 2001, section 5.4).
+Both tests use the poses as reported, not a fit made for the test, because a fit to a single frame's spots agrees with
+these spots even where the reported pose does not. Pure functions of arrays, T frames and n views. Source: ours; the
+statistics are chi-square tests (Bar-Shalom, Li & Kirubarajan 2001, section 5.4).
 """
 
 from __future__ import annotations
@@ -16,27 +16,27 @@ from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.uncertainty.chi_square import chi2_limit
 
-P_CONTRADICTION = 1e-6  # of one frame, where all is right: of 100,000 frames, 0.1 are accused wrongly, or fewer
-_LEAST_EIGENVALUE = 1e-14  # of a covariance scaled to unit diagonal: below lies the rounding of the scaling itself
+P_CONTRADICTION = 1e-6  # false alarm probability per frame: at most 0.1 false alarms in 100,000 correct frames
+_LEAST_EIGENVALUE = 1e-14  # of a covariance scaled to unit diagonal: smaller ones are rounding errors of the scaling
 
 
 @dataclass(frozen=True, slots=True)
 class SpotAgreement:
-    """Reported poses against their own spots."""
+    """Agreement of reported poses with their own spots."""
 
-    squares: Array  # (T, n) each spot's squared distance from where the pose puts it, in its variances; nan if unused
-    chi2: Array  # (T,) their sum; 0 without spots
-    dof: Ints  # (T,) 2 per spot used: what chi2 is compared with. Its mean is lower where the pose follows the spots
+    squares: Array  # (T, n) squared Mahalanobis distance of each spot from its place in the pose; nan if unused
+    chi2: Array  # (T,) their joint chi-square; 0 without spots
+    dof: Ints  # (T,) 2 per spot used: degrees of freedom of the limit. A pose fitted to the spots has a lower mean chi2
     rms_px: Array  # (T,) root mean square residual per axis; nan without spots
-    contradicts: Bools  # (T,) beyond P_CONTRADICTION
+    contradicts: Bools  # (T,) chi2 is above the limit at P_CONTRADICTION
 
 
 @dataclass(frozen=True, slots=True)
 class CausalAgreement:
-    """Smoothed poses against the causal ones of the same frames."""
+    """Agreement of smoothed poses with the causal poses of the same frames."""
 
-    distance: Array  # (T,) Mahalanobis distance, sigmas of the difference (6 degrees of freedom); nan without either
-    contradicts: Bools  # (T,) beyond P_CONTRADICTION: a distance of 6.2
+    distance: Array  # (T,) Mahalanobis distance (6 degrees of freedom); nan if one of the two poses is missing
+    contradicts: Bools  # (T,) the distance is above the limit at P_CONTRADICTION, 6.2
 
 
 def against_own_spots(
@@ -51,14 +51,15 @@ def against_own_spots(
     """Test poses against the spots that they are reported with.
 
     poses (T,) world_from_body; covariance (T, 6, 6) as reported, [m in world, rad in body]; used (T, n): labelled and
-    part of the pose, not those that a neighbour has pulled; uv_px (T, n, 2); cov_px2 (T, n, 2, 2), px^2: of the
-    measurement, widened by the noise scale, with the calibration's part where there is one. nan where not used. A pose
-    that is nan has no spots.
+    used in the pose, so without merged detections; uv_px (T, n, 2); cov_px2 (T, n, 2, 2), px^2: measurement covariance,
+    scaled by the noise scale, plus the calibration's contribution if known. uv_px and cov_px2 are nan where not used. A
+    pose that is nan has no spots.
 
-    A residual's covariance is taken as R + J P J^T, which holds for a pose made without the spot. A pose made with it
-    has R - J P J^T, so the test is conservative there: it never accuses more than P_CONTRADICTION of right poses, and
-    loses at most a factor 1.4 in sigmas where a frame's own spots make the pose (P of a single frame), nothing where
-    many frames do. To first order: a pose a few degrees off its spots contradicts them however vague it is.
+    The residual covariance is taken as R + J P J^T, which is correct for a pose that was estimated without the spot.
+    For a pose estimated with it the covariance is R - J P J^T, so the test is conservative: the false alarm rate is at
+    most P_CONTRADICTION, and the loss of power is at most a factor of 1.4 in sigmas if the pose comes from the frame's
+    own spots, and none if it comes from many frames. The test is linearised: a pose that is off by a few degrees
+    contradicts its spots even if its covariance is large.
     """
     known = finite(poses.translation, -1)
     safe = Pose(
@@ -70,7 +71,7 @@ def against_own_spots(
     R = np.where(use[..., None, None], cov_px2, np.eye(2))
     gate = limits(2 * use.sum(axis=1), p)
     squares = _squares(residual, R)
-    # R alone gives the larger chi-square: only what fails with it needs the pose's own covariance.
+    # R alone gives the larger chi-square: only frames that fail with it need the pose's covariance as well.
     rows = np.flatnonzero(squares.sum(axis=1) > gate)
     chi2 = squares.sum(axis=1)
     if len(rows):
@@ -92,13 +93,13 @@ def against_own_spots(
 def against_causal(
     poses: Pose, covariance: Array, causal: Pose, causal_covariance: Array, p: float = P_CONTRADICTION
 ) -> CausalAgreement:
-    """Test smoothed poses (T,) against the causal ones; covariances (T, 6, 6) as reported; nan where there is none.
+    """Test smoothed poses (T,) against causal poses; covariances (T, 6, 6) as reported; nan where there is no pose.
 
-    The covariance of the difference is taken as the sum of both. Where both are right and made of the same
-    measurements it is P_causal - P_smoothed, which is smaller, and singular where nothing comes after a frame; with
-    labels that differ between the passes it lies anywhere below the sum. So the test is conservative: it loses a factor
-    1.4 in sigmas at most where both covariances are equal. It does not say which of the two is wrong: a causal pose at
-    a bend that was not seen in time may be, see `contradictory`.
+    The covariance of the difference is taken as the sum of both. If both are correct and use the same measurements it
+    is P_causal - P_smoothed, which is smaller, and singular at the last frame; if the labels of the passes differ it is
+    somewhere below the sum. The test is therefore conservative: it loses at most a factor of 1.4 in sigmas, where both
+    covariances are equal. It does not decide which of the two poses is wrong, see `contradictory`: the causal pose may
+    be wrong at a bend that it detected too late.
     """
     known = _all_finite(poses, covariance) & _all_finite(causal, causal_covariance)
     gap = np.where(known[:, None], poses.minus(causal), 0.0)
@@ -112,22 +113,22 @@ def against_causal(
 def contradictory(
     own: SpotAgreement, measured: Bools, causal: CausalAgreement | None = None, causal_own: SpotAgreement | None = None
 ) -> Bools:
-    """(T,): frames whose reported pose must not be believed.
+    """(T,): frames whose reported pose is rejected.
 
-    Those that contradict their own spots. Those that contradict the causal pose, where spots stand behind that one
-    (causal_own: two or more, which it agrees with; without any it is the motion model's, which knows no bend in an
-    occlusion) and the frame's own spots do not confirm the reported one: measured (T,) from four or more spots, so that
-    one of them could have contradicted.
+    A pose is rejected if it contradicts its own spots, or if it contradicts a causal pose that is supported by spots
+    while its own spots do not confirm it. A causal pose is supported by two or more spots that agree with it
+    (causal_own); without spots it comes from the motion model, which cannot follow a bend during an occlusion. A
+    reported pose is confirmed if it is measured (T,) from four or more spots, so that each of them can contradict it.
     """
     if causal is None or causal_own is None:
         return own.contradicts
     confirmed = measured & (own.dof >= 8) & ~own.contradicts
-    witnessed = (causal_own.dof >= 4) & ~causal_own.contradicts
-    return np.asarray(own.contradicts | (causal.contradicts & witnessed & ~confirmed))
+    supported = (causal_own.dof >= 4) & ~causal_own.contradicts
+    return np.asarray(own.contradicts | (causal.contradicts & supported & ~confirmed))
 
 
 def is_covariance(matrices: Array) -> Bools:
-    """(...,): which of matrices (..., m, m) are finite, symmetric and positive definite, in any units."""
+    """(...,): which matrices (..., m, m) are finite, symmetric and positive definite, in any units."""
     variance = np.diagonal(matrices, axis1=-2, axis2=-1)
     with np.errstate(invalid="ignore"):
         good = finite(matrices, (-2, -1)) & np.asarray((variance > 0).all(axis=-1))
@@ -144,13 +145,13 @@ def finite(values: Array, axes: int | tuple[int, ...]) -> Bools:
 
 
 def limits(dof: Ints, p: float) -> Array:
-    """(T,): chi-square that is exceeded with probability p; inf for 0 degrees of freedom."""
+    """(T,): chi-square limits that are exceeded with probability p; inf for 0 degrees of freedom."""
     table = np.array([np.inf, *(chi2_limit(p, k) for k in range(1, int(dof.max(initial=0)) + 1))])
     return np.asarray(table[dof])
 
 
 def mahalanobis2(gap: Array, covariance: Array) -> Array:
-    """(T,): gap^T C^-1 gap of gap (T, m) and C (T, m, m); metres and radians are brought to one scale first."""
+    """(T,): gap^T C^-1 gap of gap (T, m) and C (T, m, m), computed with C scaled to unit diagonal."""
     sigma = np.sqrt(np.maximum(np.diagonal(covariance, axis1=-2, axis2=-1), 1e-300))
     C = covariance / (sigma[:, :, None] * sigma[:, None, :])
     x = gap / sigma
@@ -167,10 +168,10 @@ def _squares(residual: Array, covariance: Array) -> Array:
 
 
 def _joint(residual: Array, R: Array, J: Array, P: Array) -> Array:
-    """(T,): e^T (R + J P J^T)^-1 e of all spots of a frame; R (T, n, 2, 2), J (T, n, 2, 6), 0 for unused ones.
+    """(T,): e^T (R + J P J^T)^-1 e of all spots of a frame; R (T, n, 2, 2), J (T, n, 2, 6), 0 for unused spots.
 
-    By the matrix inversion lemma in the pose's six numbers, P = F F^T: e^T R^-1 e - g^T (1 + F^T L F)^-1 g with
-    L = J^T R^-1 J and g = F^T J^T R^-1 e.
+    By the matrix inversion lemma with P = F F^T: e^T R^-1 e - g^T (1 + F^T L F)^-1 g, where L = J^T R^-1 J and
+    g = F^T J^T R^-1 e.
     """
     sigma = np.sqrt(np.maximum(np.diagonal(P, axis1=-2, axis2=-1), 0.0))
     safe = np.where(sigma > 0, sigma, 1.0)

@@ -1,4 +1,4 @@
-"""The points of light that were found in one picture."""
+"""The points of light detected in one picture."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ import numpy as np
 
 from geometry.arrays import Array, Bools, Ints
 
-UNMATCHED = -1  # in place of the row of a detection: no detection
+UNMATCHED = -1  # used instead of the row of a detection: no detection
 
 
 @dataclass(frozen=True, slots=True)
 class Detections:
     """n points of light of one picture, brightest first. All arrays have n rows.
 
-    Centres are in distorted pixels, (0, 0) the centre of the top-left pixel.
+    Centres are in distorted pixels; (0, 0) is the centre of the top-left pixel.
     """
 
     uv_px: Array  # (n, 2)
@@ -24,13 +24,13 @@ class Detections:
     peak: Array  # (n,) maximum above the local background, DN
     major_px: Array  # (n,) 1-sigma half axes of the fitted Gaussian
     minor_px: Array  # (n,)
-    angle_deg: Array  # (n,) of the major axis, from +u towards +v, in (-90, 90]
+    angle_deg: Array  # (n,) angle of the major axis, from +u towards +v, in (-90, 90]
 
     def __len__(self) -> int:
         return len(self.uv_px)
 
     def __getitem__(self, rows: Ints | Bools | slice) -> Detections:
-        """Some of the points, in the given order."""
+        """The points of the given rows, in that order."""
         return Detections(*(getattr(self, name)[rows] for name in Detections.__slots__))
 
     @staticmethod
@@ -40,7 +40,7 @@ class Detections:
 
     @staticmethod
     def at(uv_px: Array, cov_px2: Array) -> Detections:
-        """Points of which only position (n, 2) and covariance (n, 2, 2) are known; the rest is nan."""
+        """Points with known position (n, 2), px, and covariance (n, 2, 2), px^2; all other fields are nan."""
         n = len(uv_px)
         unknown = np.full(n, np.nan)
         return Detections(

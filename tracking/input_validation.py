@@ -1,8 +1,8 @@
-"""What a tracker is given, looked at before it is believed: points that are none are taken away, and nothing else.
+"""Validation of a tracker's input: drops invalid and duplicate detections, and rejects invalid calls.
 
-A point that is not a number, or whose covariance is none, would spoil every sum that it enters; one spot detected twice
-would share its label between the two and lose it. Both are left out here. What is wrong with the call itself (a step
-back in time, cameras that do not fit the rig) is an error of the caller and said as one.
+A detection that is not finite, or whose covariance is not one, would invalidate every sum that it enters; a spot
+detected twice would share its label probability between both detections and stay unlabelled. Both are dropped. An
+invalid call (a step that is not positive, cameras that do not match the rig) is a ValueError.
 """
 
 from __future__ import annotations
@@ -17,26 +17,27 @@ from geometry.compilation.jit import compiled
 from tracking.detections import UNMATCHED, Detections
 from tracking.tracked_frame import TrackedFrame
 
-# Two points of one picture nearer than this are one spot detected twice: two spots of a few px width that lie so near
-# melt into one.
+# Two points of one picture nearer than this are one spot detected twice: two different spots a few px wide and so near
+# to each other merge into one detection.
 TWIN_PX = 0.05
-LEAST_SIGMA_PX = 1e-4  # a hundredth of what the best centroids reach: a claim below it is zero, or in another unit
-LARGEST_PX = 1e6  # no picture is so wide; what is farther away overflows squares
-_FEW = 50  # points: of fewer all pairs are sooner looked at than sorted (3 us a picture, against 20)
-_LOOK_BACK = 100  # points compared with each: more of them in a stripe of TWIN_PX is no picture of spots
+LEAST_SIGMA_PX = 1e-4  # a hundredth of the best centroids' sigma: a smaller one is zero, or in another unit
+LARGEST_PX = 1e6  # no picture is as wide; squares of larger coordinates may overflow
+_FEW = 50  # points: up to this number comparing all pairs is faster than sorting (3 us per picture instead of 20)
+_MAX_COMPARED = 100  # preceding points that each point is compared with, in a stripe of TWIN_PX
 
 
 @compiled
 def twins(group: Ints, uv: Array, order: Ints, size: Array) -> Bools:
-    """Which of m points are another one of their group, detected again; of two the one of the larger size (m,) goes.
+    """Which of m points are duplicates of another point of their group; of two the one with the larger `size` (m,).
 
-    uv (m, 2), px; order (m,): the rows sorted by group, then u, then v. Of equal sizes the later in that order goes.
+    uv (m, 2), px; order (m,): the rows sorted by group, then u, then v. Of equal sizes the later one in that order is
+    the duplicate.
     """
     m = len(order)
     out = np.zeros(m, np.bool_)
     for i in range(m):
         a = order[i]
-        for back in range(i - 1, max(-1, i - 1 - _LOOK_BACK), -1):
+        for back in range(i - 1, max(-1, i - 1 - _MAX_COMPARED), -1):
             b = order[back]
             if group[b] != group[a] or uv[a, 0] - uv[b, 0] >= TWIN_PX:
                 break
@@ -51,16 +52,16 @@ def twins(group: Ints, uv: Array, order: Ints, size: Array) -> Bools:
 
 
 @compiled
-def believable(uv_px: Array, cov_px2: Array) -> Bools:
-    """Which points (m, 2) are numbers, with covariances (m, 2, 2) that are covariances."""
+def are_valid(uv_px: Array, cov_px2: Array) -> Bools:
+    """Which points (m, 2) are finite and have a valid covariance (m, 2, 2)."""
     least, largest = LEAST_SIGMA_PX**2, LARGEST_PX**2
     out = np.zeros(len(uv_px), np.bool_)
     for i in range(len(uv_px)):
         a, b, c = cov_px2[i, 0, 0], cov_px2[i, 0, 1], cov_px2[i, 1, 1]
         out[i] = (
-            abs(uv_px[i, 0]) < LARGEST_PX and abs(uv_px[i, 1]) < LARGEST_PX  # not so for nan
+            abs(uv_px[i, 0]) < LARGEST_PX and abs(uv_px[i, 1]) < LARGEST_PX  # false for nan
             and least <= a < largest and least <= c < largest
-            # Beyond this share of its largest value a covariance is singular but for rounding.
+            # With a larger correlation the covariance is singular within rounding.
             and b * b < (1 - 1e-9) ** 2 * a * c
             and abs(b - cov_px2[i, 1, 0]) <= 1e-9 * (a + c)
         )  # fmt: skip
@@ -68,12 +69,12 @@ def believable(uv_px: Array, cov_px2: Array) -> Bools:
 
 
 @compiled
-def _few_and_fine(uv_px: Array, cov_px2: Array) -> bool:
-    """Whether all points (m, 2) can be used, said without sorting them; False of more than a few without a look."""
+def _few_and_valid(uv_px: Array, cov_px2: Array) -> bool:
+    """Whether there are at most _FEW points (m, 2), all valid and without duplicates. Needs no sorting."""
     m = len(uv_px)
     if m > _FEW:
         return False
-    good = believable(uv_px, cov_px2)
+    good = are_valid(uv_px, cov_px2)
     for i in range(m):
         if not good[i]:
             return False
@@ -84,12 +85,12 @@ def _few_and_fine(uv_px: Array, cov_px2: Array) -> bool:
 
 
 def usable_rows(found: Detections) -> Bools | None:
-    """Which points of one picture a tracker may use; None: all of them."""
-    # One type of array, or numba would compile anew for each.
+    """Which points (n,) of one picture a tracker may use; None: all of them."""
+    # One array type, because numba compiles every function again for each type.
     uv, cov = np.ascontiguousarray(found.uv_px, dtype=float), np.ascontiguousarray(found.cov_px2, dtype=float)
-    if _few_and_fine(uv, cov):
+    if _few_and_valid(uv, cov):
         return None
-    good: Bools = believable(uv, cov)
+    good: Bools = are_valid(uv, cov)
     rows = np.flatnonzero(good)
     some = uv[rows]
     size = cov[rows, 0, 0] + cov[rows, 1, 1]
@@ -99,14 +100,18 @@ def usable_rows(found: Detections) -> Bools | None:
 
 @dataclass(frozen=True, slots=True)
 class UsablePoints:
-    """One frame's detections without what cannot be used."""
+    """The valid detections of one frame."""
 
     found: tuple[Detections | None, ...]  # per camera; None without a picture
-    rows: tuple[Ints | None, ...]  # per camera: which of the rows given are these; None: all of them
+    rows: tuple[Ints | None, ...]  # per camera: their rows in the given detections; None: all of them
 
     @staticmethod
     def of(found: Sequence[Detections | None]) -> UsablePoints:
-        """Leave out of each camera's detections what cannot be used. ValueError for an array of a wrong shape."""
+        """Drop invalid and duplicate detections of every camera.
+
+        Raises:
+            ValueError: if an array has a wrong shape.
+        """
         kept: list[Detections | None] = []
         rows: list[Ints | None] = []
         for points in found:
@@ -119,8 +124,8 @@ class UsablePoints:
         return UsablePoints(tuple(kept), tuple(rows))
 
     def as_given(self, tracked: TrackedFrame, camera_of: Ints) -> TrackedFrame:
-        """The tracker's answer, its points' rows counted as they were given. camera_of (n,): of each view."""
-        if all(rows is None for rows in self.rows):  # as nearly always
+        """The tracked frame with `point` as rows of the given detections. camera_of (n,): the camera of each view."""
+        if all(rows is None for rows in self.rows):  # the usual case
             return tracked
         point = tracked.point.copy()
         for camera, rows in enumerate(self.rows):
@@ -131,19 +136,22 @@ class UsablePoints:
 
 
 def check_step(dt_s: float, found: Sequence[Detections | None], cameras: Sequence[str], first: bool) -> None:
-    """Raises ValueError unless a frame comes after the one before and has an entry for each camera.
+    """Check that a frame is later than the previous one and has one entry per camera.
 
-    first: no frame was before, and 0 s have passed.
+    first: this is the first frame, for which dt_s may be 0.
+
+    Raises:
+        ValueError: if dt_s or the number of entries is wrong.
     """
     if not np.isfinite(dt_s) or dt_s < 0 or (dt_s == 0 and not first):
         raise ValueError(
-            f"dt_s: expected the seconds since the frame before, more than 0 (0 for the first), got {dt_s!r};"
-            " give frames in order of time, and all cameras of one instant together"
+            f"dt_s: expected the seconds since the previous frame, more than 0 (0 for the first), got {dt_s!r};"
+            " pass the frames in order of time, and all cameras of one instant together"
         )
     if len(found) != len(cameras):
         raise ValueError(
-            f"found: expected detections, or None, of each of the cameras {', '.join(cameras)} in this order,"
-            f" got {len(found)}"
+            f"found: expected detections, or None, for each of the cameras {', '.join(cameras)} in this order,"
+            f" got {len(found)} entries"
         )
 
 

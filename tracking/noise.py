@@ -1,4 +1,4 @@
-"""How much the grey value of a pixel scatters, as a function of its level."""
+"""The noise model of a sensor: variance of a pixel's grey value as a function of its level."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ Picture: TypeAlias = NDArray[np.uint8] | NDArray[np.uint16]
 
 ROUNDING_DN2 = 1.0 / 12.0  # variance of rounding to whole DN
 
-# Where nothing is known of the gain: a full scale of 15 000 electrons, as small industrial sensors have (5 000 to
-# 60 000). 8 bit: 59 electrons per DN.
+# Electrons at full scale, for sensors with unknown gain: typical of small industrial sensors (5 000 to 60 000). With
+# 8 bits this is 59 electrons per DN.
 FULL_SCALE_E = 15_000.0
 
 NORMAL_68, NORMAL_95 = 0.994457883, 1.959963985  # quantiles 0.68 and 0.95 of |standard normal|
@@ -26,13 +26,13 @@ NORMAL_68, NORMAL_95 = 0.994457883, 1.959963985  # quantiles 0.68 and 0.95 of |s
 class NoiseModel:
     """Variance of one pixel of expected grey value v: floor_dn2 + slope_dn (v - black_dn), the floor below black_dn."""
 
-    floor_dn2: float  # read noise and rounding, DN^2 (estimated: all noise at the background's level)
+    floor_dn2: float  # read noise and rounding, DN^2 (if estimated: all noise at the background's level)
     slope_dn: float  # DN^2 per DN: 1 / (electrons per DN)
-    black_dn: float = 0.0  # level that the floor belongs to
-    texture: float = 0.0  # contrast of the background's fixed structure over a few pixels, share of its level: what a
-    # spot must stand out of beside the noise. Its share in the errors of spots is another matter (place_errors.py)
+    black_dn: float = 0.0  # grey value at which the variance is the floor
+    texture: float = 0.0  # contrast of the background's fixed structure over a few pixels, as a fraction of its level;
+    # used for the detection threshold only. Its effect on the positions of spots is estimated in place_errors.py
 
-    banding_dn: float = 0.0  # sigma of steps of the grey scale that no noise blurs: rounding goes together over pixels
+    banding_dn: float = 0.0  # sigma of rounding errors that neighbouring pixels share, because the noise is small
 
     def __post_init__(self) -> None:
         if not (self.floor_dn2 > 0 and self.slope_dn >= 0):
@@ -42,20 +42,21 @@ class NoiseModel:
 
     @staticmethod
     def of(sensor: SensorNoise) -> NoiseModel:
-        """The model of a sensor whose gain, read noise and black level are known (rig.yaml: cameras.*.noise)."""
+        """The model of a sensor with known gain, read noise and black level (rig.yaml: cameras.*.noise)."""
         read_dn = sensor.read_noise_e / sensor.gain_e_per_dn
         return NoiseModel(read_dn**2 + ROUNDING_DN2, 1.0 / sensor.gain_e_per_dn, sensor.black_dn)
 
     def variance(self, level_dn: ArrayLike) -> Array:
-        """Variance, DN^2, of pixels whose expected grey values are given, any shape."""
+        """Variance, DN^2, of pixels with the given expected grey values, DN, any shape."""
         return self.floor_dn2 + self.slope_dn * np.maximum(np.asarray(level_dn) - self.black_dn, 0.0)
 
 
 def guess_noise(image: Picture) -> NoiseModel:
-    """A quick model from one picture's background (0.3 ms at 1280x1024); the slope is that of a usual sensor.
+    """A quick model from one picture's background (0.3 ms at 1280x1024), with the slope of a typical sensor.
 
-    The floor comes from differences of neighbours in a sparse sample, so the screen's texture counts as noise. Of the
-    68 % and the 95 % quantile the larger one counts: in a picture that is clipped at black most differences are zero.
+    The floor comes from differences of neighbouring pixels in a sparse sample, so the screen's texture counts as noise.
+    The larger estimate of the 68 % and the 95 % quantile is taken, because most differences are zero in a picture that
+    is clipped at black.
     """
     sample = image[2:-2:17, ::2].astype(np.float32) if min(image.shape) > 40 else image.astype(np.float32)
     jump = np.abs(sample[:, 1::4][:, : sample[:, ::4].shape[1]] - sample[:, ::4][:, : sample[:, 1::4].shape[1]])
@@ -65,11 +66,11 @@ def guess_noise(image: Picture) -> NoiseModel:
 
 
 def quantile_variance(scatter: NDArray[np.floating]) -> float:
-    """Variance of normal deviates whose absolute values are given, robust to a few per cent of outliers."""
+    """Variance of normal deviates from their absolute values, robust to a few per cent of outliers."""
     low, high = np.quantile(scatter, [0.68, 0.95])
     return float(max(low / NORMAL_68, high / NORMAL_95) ** 2)
 
 
 def usual_slope(dtype: np.dtype) -> float:
-    """Slope, DN, of a sensor with FULL_SCALE_E electrons at the largest number of the type."""
+    """Slope, DN, of a sensor with FULL_SCALE_E electrons at the largest value of the data type."""
     return float(np.iinfo(dtype).max) / FULL_SCALE_E

@@ -1,4 +1,4 @@
-"""What the tracker says of one frame."""
+"""The results of a tracker for one frame."""
 
 from __future__ import annotations
 
@@ -11,16 +11,17 @@ from tracking.statuses import PoseStatus, SpotStatus
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """Something that the report should tell: labels found, a tie, a re-acquisition, a spot dropped."""
+    """An event for the report."""
 
-    kind: str  # labelled | tie | relabelled (matching failed at a bend) | reacquired (after frames without) | dropped
+    # labelled | tie | relabelled (after a frame with a pose) | reacquired (after frames without one) | dropped
+    kind: str
     text: str
     view: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class MotionEstimate:
-    """How the vehicle moves at one instant."""
+    """The vehicle's velocities at one instant."""
 
     velocity: Array  # (3,), m/s, of the body origin, in world
     rate: Array  # (3,), rad/s, about the body's axes
@@ -29,12 +30,12 @@ class MotionEstimate:
 
 @dataclass(frozen=True, slots=True)
 class TrackedFrame:
-    """What the tracker says of one frame. n views, in the order of the SpotModel."""
+    """The results of a tracker for one frame. n views, in the order of the SpotModel."""
 
-    uv_px: Array  # (n, 2), nan where nothing is known
+    uv_px: Array  # (n, 2), nan if unknown
     cov_px2: Array  # (n, 2, 2)
     status: tuple[SpotStatus, ...]  # (n,)
-    predicted_px: Array  # (n, 2): before this frame's picture was looked at; nan without a track
+    predicted_px: Array  # (n, 2): the prediction from earlier frames alone; nan without a track
     gain: Array  # (n,): g3 of the match; nan without
     point: Ints  # (n,): row of the detection in its camera's list, or UNMATCHED
     pose_status: PoseStatus
@@ -43,10 +44,8 @@ class TrackedFrame:
     spots_used: int
     rms_px: float
     events: tuple[Event, ...]
-    label_probability: Array | None = None  # (n,) that the label is right; nan without a label. None: not reckoned
-    used_in_pose: Bools | None = (
-        None  # (n,): takes part in the pose; a blended detection keeps its label only. None: all
-    )
-    predicted_cov_px2: Array | None = None  # (n, 2, 2) of predicted_px, without the detection's own; None: not reckoned
-    motion: MotionEstimate | None = None  # velocity and rate; None: unknown, or the tracker does not have them
+    label_probability: Array | None = None  # (n,) that the label is right; nan without a label. None: not computed
+    used_in_pose: Bools | None = None  # (n,): used in the pose; a merged detection is labelled but not used. None: all
+    predicted_cov_px2: Array | None = None  # (n, 2, 2) of predicted_px, without the detection's own; None: not computed
+    motion: MotionEstimate | None = None  # velocity and rate; None: unknown, or the tracker does not estimate them
     pose_systematic: Array | None = None  # (6, 6) the calibration's share of the covariance, the same in every frame

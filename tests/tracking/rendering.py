@@ -38,6 +38,8 @@ class Spot:
 
 @dataclass(frozen=True)
 class Scene:
+    """Spots on a background, and the sensor."""
+
     spots: list[Spot]
     size: tuple[int, int] = (1280, 1024)  # width, height
     background: float = 12.0  # DN at the centre
@@ -102,7 +104,7 @@ def photograph(scene: Scene, rng: np.random.Generator, bits: int = 8) -> NDArray
 
 
 def expose(mean: NDArray, scene: Scene, rng: np.random.Generator, bits: int = 8) -> NDArray:
-    """Shot noise, read noise, hot pixels, rounding and clipping on an expected picture (h, w)."""
+    """An expected picture (h, w), DN, with shot noise, read noise, hot pixels, rounding and clipping."""
     electrons = rng.normal(mean, np.sqrt(np.maximum(mean, 0) / scene.gain))
     picture = rng.normal(electrons, scene.read)
     for _ in range(scene.hot):
@@ -112,7 +114,7 @@ def expose(mean: NDArray, scene: Scene, rng: np.random.Generator, bits: int = 8)
 
 
 def bound(spot: Spot, scene: Scene, mean: NDArray, saturation: float = np.inf, step: float = 1e-3) -> NDArray:
-    """Cramer-Rao bound (2, 2), px^2, for the centre: flux, shape and background plane unknown too, noise known.
+    """Cramer-Rao bound (2, 2), px^2, of the centre with unknown flux, shape and background plane, and known noise.
 
     `mean` is expected(scene). Numerical derivatives of the rendered spot; variance per pixel = level/gain + read^2 +
     1/12; pixels whose expected value is saturated give no information.

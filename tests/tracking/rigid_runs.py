@@ -23,7 +23,7 @@ from tracking.smoothing.smoothed import Smoothed
 from tracking.smoothing.smoother import smooth
 from tracking.tracked_frame import TrackedFrame
 
-START = 10  # frames until the velocities are known
+START = 10  # number of frames until the velocities are known
 RIGID = TrackerParameters()
 NEAR_THE_ORIGIN = PriorRegion((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.3, 15.0)
 
@@ -224,7 +224,7 @@ def zig_zag(
     """
     rng = np.random.default_rng([seed, 5])
     t_s = np.arange(frames) / frame_rate_hz
-    before = np.arange(every, frames - every // 2, every)  # the corner lies between this frame and the next
+    before = np.arange(every, frames - every // 2, every)  # the bend lies between this frame and the next
     knots = np.concatenate([[0.0], (before + rng.random(len(before))) / frame_rate_hz])
     velocities = rate_rad_s * rng.normal(size=(len(knots), 6)) * np.repeat([1 / 3, 1.0], 3)
     velocities = np.abs(velocities) * np.sign(velocities[0]) * (-1.0) ** np.arange(len(knots))[:, None]
@@ -254,7 +254,7 @@ def some_frames(run: PointRun, frames: Ints) -> PointRun:
 
 
 def without_pictures(run: PointRun, frames: slice, camera: int) -> PointRun:
-    """The same recording, for some frames without this camera's pictures."""
+    """The recording without this camera's pictures in some frames."""
     has_image = run.has_image.copy()
     has_image[frames, camera] = False
     return replace(run, has_image=has_image)

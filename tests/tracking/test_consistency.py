@@ -1,4 +1,4 @@
-"""Reported poses against their own spots and against the causal pass: right ones are not accused, wrong ones are."""
+"""Consistency of reported poses with their own spots and with the causal pass: false alarms and detection of errors."""
 
 from __future__ import annotations
 
@@ -50,8 +50,8 @@ def fitted(true: Pose, used: np.ndarray, uv: np.ndarray, cov: np.ndarray) -> tup
     return stacked, np.stack([f.covariance for f in fits])
 
 
-def test_right_poses_are_accused_no_more_often_than_stated():
-    """At p = 0.01 instead of 1e-6, so that it can be counted: poses made without the spots, and fits to them."""
+def test_the_false_alarm_rate_of_correct_poses_is_as_stated():
+    """At p = 0.01 instead of 1e-6, to have enough events: poses estimated without the spots, and fits to them."""
     rng = np.random.default_rng(1)
     true, used, uv, cov = frames(rng)
     P = np.diag([3e-4**2] * 3 + [1e-4**2] * 3)
@@ -65,8 +65,8 @@ def test_right_poses_are_accused_no_more_often_than_stated():
 
 
 @pytest.mark.parametrize("sigmas", [15.0, 200.0])
-def test_a_pose_that_left_its_spots_contradicts_them_whatever_they_would_fit(sigmas):
-    """The fit of the frame alone has a small residual; the reported pose is elsewhere, and claims little."""
+def test_a_pose_away_from_its_spots_contradicts_them(sigmas):
+    """The frame's own fit has a small residual, but the reported pose is off, with a small stated covariance."""
     rng = np.random.default_rng(2)
     true, used, uv, cov = frames(rng, 100)
     fit, C = fitted(true, used, uv, cov)
@@ -78,7 +78,7 @@ def test_a_pose_that_left_its_spots_contradicts_them_whatever_they_would_fit(sig
     assert np.all(agreement.rms_px > 3 * NOISE_PX)
 
 
-def test_a_vague_pose_may_lie_far_from_its_spots():
+def test_a_pose_with_a_large_covariance_may_lie_far_from_its_spots():
     rng = np.random.default_rng(3)
     true, used, uv, cov = frames(rng, 50)
     P = np.broadcast_to(np.diag([0.01**2] * 3 + [0.005**2] * 3), (50, 6, 6))  # 5 px
@@ -87,8 +87,8 @@ def test_a_vague_pose_may_lie_far_from_its_spots():
     assert against_own_spots(MODEL, off, P * 1e-6, used, uv, cov).contradicts.all()
 
 
-def test_the_sum_over_the_spots_is_that_of_the_whole_covariance():
-    """A second way to chi-square: the joint covariance of all pixels, inverted as it stands."""
+def test_chi_square_agrees_with_the_inverse_of_the_joint_covariance():
+    """A second computation of chi-square: the joint covariance of all pixels, inverted directly."""
     rng = np.random.default_rng(4)
     true, used, uv, cov = frames(rng, 20)
     A = rng.standard_normal((6, 6)) * np.array([1e-2] * 3 + [3e-3] * 3)[:, None]
@@ -105,7 +105,7 @@ def test_the_sum_over_the_spots_is_that_of_the_whole_covariance():
         assert agreement.rms_px[k] == pytest.approx(np.sqrt(np.mean(e**2)))
 
 
-def test_frames_without_pose_or_spots_say_nothing():
+def test_frames_without_pose_or_spots_never_contradict():
     rng = np.random.default_rng(5)
     true, used, uv, cov = frames(rng, 3)
     true.translation[0] = np.nan
@@ -119,8 +119,8 @@ def test_frames_without_pose_or_spots_say_nothing():
     assert np.isfinite(agreement.chi2).all()
 
 
-def test_smoothed_and_causal_poses_of_the_same_evidence_agree_and_a_departed_one_does_not():
-    """Two estimators of one truth, the better one with half the sigmas and all of the other's evidence."""
+def test_smoothed_and_causal_poses_of_the_same_measurements_agree_and_a_shifted_one_does_not():
+    """Two estimators of one truth; the better one has half the sigmas and uses all measurements of the other."""
     rng = np.random.default_rng(6)
     true = Pose.identity().plus(np.zeros((FRAMES, 6)))
     scale = np.array([1e-3] * 3 + [1e-4] * 3)
@@ -128,8 +128,8 @@ def test_smoothed_and_causal_poses_of_the_same_evidence_agree_and_a_departed_one
     P = np.broadcast_to(np.diag(scale**2), (FRAMES, 6, 6))
     smoothed, causal = true.plus(better), true.plus(better + rest)
     assert against_causal(smoothed, P / 4, causal, P, p=0.01).contradicts.mean() < 0.01
-    departed = smoothed.plus(np.array([8e-3, 0, 0, 0, 0, 0]))
-    agreement = against_causal(departed, P / 4, causal, P)
+    shifted = smoothed.plus(np.array([8e-3, 0, 0, 0, 0, 0]))
+    agreement = against_causal(shifted, P / 4, causal, P)
     assert agreement.contradicts.mean() > 0.7
     assert np.median(agreement.distance) == pytest.approx(8 / np.sqrt(1.25), rel=0.1)
     nowhere = replace(causal, translation=np.full((FRAMES, 3), np.nan))
@@ -143,24 +143,24 @@ def agreement_of(contradicts: bool, spots: int) -> SpotAgreement:
 
 
 @pytest.mark.parametrize(
-    ("own", "measured", "apart", "causal_own", "believed"),
+    ("own", "measured", "disagree", "causal_own", "accepted"),
     [
         ((False, 6), True, False, (False, 6), True),
-        ((True, 6), True, False, (False, 6), False),  # its own spots say otherwise
+        ((True, 6), True, False, (False, 6), False),  # its own spots contradict it
         ((False, 6), True, True, (False, 6), True),  # six spots confirm it: the causal pose was late at a bend
-        ((False, 3), True, True, (False, 3), False),  # three spots fit anything
+        ((False, 3), True, True, (False, 3), False),  # three spots fit any pose
         ((False, 0), False, True, (False, 3), False),  # no spot, and the causal pass has some
-        ((False, 0), False, True, (False, 0), True),  # the causal pose is a motion model's: it knows no bend
+        ((False, 0), False, True, (False, 0), True),  # the causal pose is from the motion model, which has no bends
         ((False, 0), False, True, (True, 3), True),  # the causal pose contradicts its own spots
     ],
 )
-def test_which_frames_must_not_be_believed(own, measured, apart, causal_own, believed):
-    causal = CausalAgreement(np.zeros(1), np.array([apart]))
+def test_which_frames_are_rejected(own, measured, disagree, causal_own, accepted):
+    causal = CausalAgreement(np.zeros(1), np.array([disagree]))
     bad = contradictory(agreement_of(*own), np.array([measured]), causal, agreement_of(*causal_own))
-    assert bad[0] == (not believed)
+    assert bad[0] == (not accepted)
 
 
-def test_without_a_causal_pass_the_spots_alone_decide():
+def test_without_a_causal_pass_only_the_spots_decide():
     assert contradictory(agreement_of(True, 6), np.array([True]))[0]
     assert not contradictory(agreement_of(False, 3), np.array([True]))[0]
 
@@ -177,12 +177,12 @@ def test_without_a_causal_pass_the_spots_alone_decide():
         (np.diag([1.0, np.inf, 1.0]), False),
     ],
 )
-def test_what_is_a_covariance(matrix, valid):
+def test_only_valid_covariances_are_accepted(matrix, valid):
     assert is_covariance(matrix) == valid
     assert is_covariance(np.stack([matrix, np.eye(3)])).tolist() == [valid, True]
 
 
-def test_the_distance_does_not_depend_on_units():
+def test_the_mahalanobis_distance_does_not_depend_on_units():
     rng = np.random.default_rng(7)
     A = rng.standard_normal((50, 6, 6))
     C, gap = A @ np.swapaxes(A, -1, -2), rng.standard_normal((50, 6))

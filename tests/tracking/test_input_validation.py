@@ -1,4 +1,4 @@
-"""Detections that are none, too many, or not in order: the tracker passes them over, and never makes a wrong pose."""
+"""Invalid, duplicate or too many detections: the tracker ignores them and never reports a wrong pose."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from geometry.arrays import Array, Ints
 from geometry.pose import Pose
 from geometry.pose_prior import PosePrior
 from lab.simulate.points import CLUTTER, PointRun, simulate_points
+from tracking.curve_switching.spot_tracker import SpotTracker
 from tracking.detections import UNMATCHED, Detections
 from tracking.input_validation import TWIN_PX, usable_rows
 from tracking.parameters import TrackerParameters
@@ -23,10 +24,9 @@ from tracking.rigid_body.rigid_tracker import RigidTracker
 from tracking.statuses import PoseStatus
 from tracking.tracked_frame import TrackedFrame
 
-# A pose's squared error over its claimed variance, divided by six: more than this once in 300000 poses.
-NEES = 6.0
-BAD = 20  # the first bad frame
-Spoil = Callable[[int, int, Detections], tuple[Detections | None, Ints]]  # frame, camera, points -> points, their rows
+NEES = 6.0  # limit of a pose's squared Mahalanobis error divided by six: exceeded once in 300000 correct poses
+BAD = 20  # the first modified frame
+Modify = Callable[[int, int, Detections], tuple[Detections | None, Ints]]  # frame, camera, points -> points, their rows
 
 
 @cache
@@ -34,22 +34,22 @@ def recording() -> PointRun:
     return simulate_points("smooth", 3, frames=40)
 
 
-def rigid_tracker(run: PointRun) -> RigidTracker:
+def new_tracker(run: PointRun, kind: type[RigidTracker | SpotTracker] = RigidTracker) -> RigidTracker | SpotTracker:
     p = run.prior
     centre = Pose.from_ypr(np.deg2rad(p.yaw_pitch_roll_deg), np.array(p.position_m))
-    return RigidTracker(run.rig, TrackerParameters(), PosePrior(centre, p.within_m, float(np.deg2rad(p.within_deg))))
+    return kind(run.rig, TrackerParameters(), PosePrior(centre, p.within_m, float(np.deg2rad(p.within_deg))))
 
 
-class Outcome:
-    """What a tracker made of a recording, against the truth."""
+class TrackedRun:
+    """A tracker's results on a modified recording, compared with the truth."""
 
-    def __init__(self, run: PointRun, spoil: Spoil) -> None:
-        tracker = rigid_tracker(run)
+    def __init__(self, run: PointRun, modify: Modify) -> None:
+        tracker = new_tracker(run)
         self.frames: list[TrackedFrame] = []
         self.wrong, self.nees, self.seconds = 0, np.full(len(run.frame), np.nan), np.zeros(len(run.frame))
-        self.found = np.zeros(len(run.frame), dtype=int)  # right labels
+        self.found = np.zeros(len(run.frame), dtype=int)  # number of right labels
         for k in range(len(run.frame)):
-            given_rows = [spoil(k, c, d) for c, d in enumerate(run.detections[k])]
+            given_rows = [modify(k, c, d) for c, d in enumerate(run.detections[k])]
             clock = time.process_time()
             out = tracker.step(0.0 if k == 0 else float(run.t_s[k] - run.t_s[k - 1]), [g[0] for g in given_rows])
             self.seconds[k] = time.process_time() - clock
@@ -70,7 +70,7 @@ def rows_of(points: Detections) -> Ints:
 
 
 def changed(points: Detections, rows: Sequence[int], uv: object = None, cov: object = None) -> Detections:
-    """Some rows with another place or covariance."""
+    """The points with another position or covariance in some rows."""
     new_uv, new_cov = points.uv_px.copy(), points.cov_px2.copy()
     if uv is not None:
         new_uv[list(rows)] = uv
@@ -80,38 +80,40 @@ def changed(points: Detections, rows: Sequence[int], uv: object = None, cov: obj
 
 
 def more(points: Detections, uv: Array, rows: Ints, rng: np.random.Generator) -> tuple[Detections, Ints]:
-    """With further points of that claim, in random order; rows: which of the old ones each repeats, -1 none."""
+    """The points and further ones of the same covariance, in random order; rows: the point that each repeats, or -1."""
     uv = np.concatenate([points.uv_px, uv])
     order = rng.permutation(len(uv))
     cov = np.tile(points.cov_px2[:1] if len(points) else 0.01 * np.eye(2), (len(uv), 1, 1))
     return Detections.at(uv[order], cov), np.concatenate([rows_of(points), rows])[order]
 
 
-NO_PLACES = {"nan": np.nan, "infinite": np.inf, "beyond all": 1e200, "a billion px away": [1e9, -1e9]}
-NO_COVARIANCES = {
+INVALID_POSITIONS = {"nan": np.nan, "infinite": np.inf, "overflow": 1e200, "a billion px away": [1e9, -1e9]}
+INVALID_COVARIANCES = {
     "nan": np.nan,
     "infinite": np.inf,
     "zero": 0.0,
     "negative": -0.01 * np.eye(2),
     "more than fully correlated": [[0.01, 0.02], [0.02, 0.01]],
     "fully correlated": [[0.01, 0.01], [0.01, 0.01]],
-    "lopsided": [[0.01, 0.0], [0.005, 0.01]],
-    "a claim that no camera can make": 1e-18 * np.eye(2),
+    "asymmetric": [[0.01, 0.0], [0.005, 0.01]],
+    "impossibly small": 1e-18 * np.eye(2),
 }
 
 
 @pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("how", [*(("uv", k) for k in NO_PLACES), *(("cov", k) for k in NO_COVARIANCES)], ids=str)
-def test_a_point_that_is_none_is_passed_over_and_all_others_keep_their_labels(how):
-    """One point of each camera in five frames running: the others are labelled, by the rows that they were given in."""
+@pytest.mark.parametrize(
+    "how", [*(("uv", k) for k in INVALID_POSITIONS), *(("cov", k) for k in INVALID_COVARIANCES)], ids=str
+)
+def test_an_invalid_point_is_ignored_and_all_others_keep_their_labels(how):
+    """One point of each camera in five consecutive frames: the others are labelled, with their original rows."""
     run, (field, name) = recording(), how
-    value = NO_PLACES[name] if field == "uv" else NO_COVARIANCES[name]
+    value = INVALID_POSITIONS[name] if field == "uv" else INVALID_COVARIANCES[name]
 
-    def spoil(k: int, camera: int, d: Detections) -> tuple[Detections, Ints]:
+    def modify(k: int, camera: int, d: Detections) -> tuple[Detections, Ints]:
         rows = [0] if BAD <= k < BAD + 5 and len(d) else []
         return changed(d, rows, **{field: value}), rows_of(d)
 
-    outcome = Outcome(run, spoil)
+    outcome = TrackedRun(run, modify)
     assert outcome.wrong == 0
     assert np.nanmax(outcome.nees) < NEES
     expected = np.count_nonzero(run.in_view == 1, axis=1)
@@ -122,17 +124,17 @@ def test_a_point_that_is_none_is_passed_over_and_all_others_keep_their_labels(ho
 
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("what", ["nan", "no points", "no pictures"])
-def test_frames_of_which_nothing_can_be_used_are_bridged_and_never_measured(what):
+def test_poses_of_frames_without_usable_points_are_predicted(what):
     run = recording()
 
-    def spoil(k: int, camera: int, d: Detections) -> tuple[Detections | None, Ints]:
+    def modify(k: int, camera: int, d: Detections) -> tuple[Detections | None, Ints]:
         if not BAD <= k < BAD + 5:
             return d, rows_of(d)
         if what == "nan":
             return changed(d, range(len(d)), uv=np.nan, cov=np.nan), rows_of(d)
         return Detections.none() if what == "no points" else None, rows_of(d)
 
-    outcome = Outcome(run, spoil)
+    outcome = TrackedRun(run, modify)
     assert [f.pose_status for f in outcome.frames[BAD : BAD + 5]] == [PoseStatus.PREDICTED] * 5
     assert outcome.wrong == 0
     assert np.nanmax(outcome.nees) < NEES
@@ -141,50 +143,49 @@ def test_frames_of_which_nothing_can_be_used_are_bridged_and_never_measured(what
 
 @pytest.mark.parametrize("apart_px", [0.0, 0.9 * TWIN_PX])
 def test_spots_detected_twice_in_every_frame_keep_their_labels(apart_px):
-    """Without the guard the two share the label's probability, and 238 of 240 labels are left open."""
+    """Without the check both share the label's probability, and 238 of 240 spots stay unlabelled."""
     run, rng = recording(), np.random.default_rng(1)
 
-    def spoil(k: int, camera: int, d: Detections) -> tuple[Detections, Ints]:
+    def modify(k: int, camera: int, d: Detections) -> tuple[Detections, Ints]:
         direction = rng.standard_normal((len(d), 2))
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
         return more(d, d.uv_px + apart_px * direction, rows_of(d), rng)
 
-    outcome = Outcome(run, spoil)
+    outcome = TrackedRun(run, modify)
     assert outcome.wrong == 0
     assert outcome.found.sum() == np.count_nonzero(run.in_view == 1)
-    # the place of a twin is off by less than half the noise of 0.1 px, which its covariance does not know of
+    # A duplicate is off by less than half the noise of 0.1 px, which its covariance does not include.
     assert np.nanmean(outcome.nees) < 1.5
 
 
 @pytest.mark.parametrize("frames", [[BAD], range(BAD, BAD + 15)])
-def test_ten_thousand_false_points_in_a_picture_cost_milliseconds_and_mislead_nobody(frames):
-    """10 ms a frame were measured on one core, for both cameras; the spots are still found among them."""
+def test_ten_thousand_false_points_in_a_picture_cost_milliseconds_and_give_no_wrong_pose(frames):
+    """10 ms per frame were measured on one core, for both cameras; the spots are found among them."""
     run, rng = recording(), np.random.default_rng(2)
 
-    def spoil(k: int, camera: int, d: Detections) -> tuple[Detections, Ints]:
+    def modify(k: int, camera: int, d: Detections) -> tuple[Detections, Ints]:
         if k not in frames:
             return d, rows_of(d)
         size = run.model.image_size_px[run.model.camera_of == camera][0]
         return more(d, rng.uniform(-0.5, size - 0.5, (10_000, 2)), np.full(10_000, -1), rng)
 
-    rigid_tracker(run).step(0.0, run.detections[0])  # compiled code is loaded before the clock runs
-    outcome = Outcome(run, spoil)
+    new_tracker(run).step(0.0, run.detections[0])  # loads the compiled code before the time is measured
+    outcome = TrackedRun(run, modify)
     shining = np.count_nonzero(run.in_view == 1, axis=1)
     clean = ~np.isin(run.frame, frames)
     assert outcome.seconds[~clean].max() < 0.3
     np.testing.assert_array_equal(outcome.found[clean], shining[clean])
-    assert (
-        outcome.wrong <= 1
-    )  # with one false point in 130 px^2, some lie nearer to where a spot should be than it does
+    # With one false point in 130 px^2, some lie nearer to a spot's predicted position than the spot.
+    assert outcome.wrong <= 1
     assert outcome.found[~clean].sum() >= 0.95 * shining[~clean].sum()
     assert np.nanmax(outcome.nees) < NEES
 
 
-def crowd(bright: bool | None, frames: range, run: PointRun) -> Spoil:
-    """400 false points per picture; spots brighter than they, darker than most, or of unknown brightness."""
+def crowd(bright: bool | None, frames: range, run: PointRun) -> Modify:
+    """400 false points per picture; the spots are brighter, dimmer than most, or of unknown brightness."""
     rng = np.random.default_rng(3)
 
-    def spoil(k: int, camera: int, d: Detections) -> tuple[Detections, Ints]:
+    def modify(k: int, camera: int, d: Detections) -> tuple[Detections, Ints]:
         if k not in frames:
             return d, rows_of(d)
         size = run.model.image_size_px[run.model.camera_of == camera][0]
@@ -195,59 +196,60 @@ def crowd(bright: bool | None, frames: range, run: PointRun) -> Spoil:
         order = np.argsort(-flux)
         return replace(points, flux=flux)[order], rows[order]
 
-    return spoil
+    return modify
 
 
-def test_four_hundred_false_points_from_the_first_picture_on_do_not_hide_brighter_spots():
+def test_brighter_spots_are_found_among_four_hundred_false_points():
     run = recording()
-    outcome = Outcome(run, crowd(True, range(40), run))
+    outcome = TrackedRun(run, crowd(True, range(40), run))
     assert outcome.wrong == 0
     assert outcome.found.sum() == np.count_nonzero(run.in_view == 1)
     assert np.nanmax(outcome.nees) < NEES
 
 
-@pytest.mark.parametrize("bright", [False, None], ids=["dark spots", "no brightness"])
-def test_a_start_that_drowns_in_false_points_gives_no_pose_rather_than_a_wrong_one(bright):
-    """Before, of 40 such frames the second gave a pose that four of the sixty brightest false points fit by chance."""
+@pytest.mark.parametrize("bright", [False, None], ids=["dim spots", "no brightness"])
+def test_a_start_with_too_many_false_points_gives_no_pose(bright):
+    """Without the limit, four of the sixty brightest false points fitted a pose by chance in one of 40 frames."""
     run = recording()
-    outcome = Outcome(run, crowd(bright, range(2), run))
+    outcome = TrackedRun(run, crowd(bright, range(2), run))
     assert all(f.pose_status is PoseStatus.LOST for f in outcome.frames[:2])
     assert outcome.wrong == 0
     assert outcome.found[2:].sum() >= 0.95 * np.count_nonzero(run.in_view[2:] == 1)
     if bright is None:
-        assert outcome.seconds[1] < 0.3  # such a search cannot succeed, and is not begun
+        assert outcome.seconds[1] < 0.3  # such a search cannot succeed and is not started
 
 
 def test_a_tie_of_the_first_frame_gives_neither_labels_nor_a_pose():
-    """Two spots of a beam are hidden in turn, and two poses remain that explain the other four equally well."""
+    """One spot per camera is hidden, and two poses explain the other four equally well."""
     run = recording()
     first = [
         d[np.flatnonzero(np.isin(o, seen))]
         for d, o, seen in zip(run.detections[0], run.origin[0], ([1, 2], [3, 4]), strict=True)
     ]
-    out = rigid_tracker(run).step(0.0, first)
+    out = new_tracker(run).step(0.0, first)
     assert "tie" in [e.kind for e in out.events]
     assert out.pose is None
     assert (out.point == UNMATCHED).all()
 
 
 @pytest.mark.parametrize("dt_s", [0.0, -0.01, np.nan, np.inf, -np.inf])
-def test_a_step_that_is_not_forward_in_time_is_refused(dt_s):
+@pytest.mark.parametrize("kind", [RigidTracker, SpotTracker])
+def test_a_step_that_is_not_forward_in_time_is_rejected(kind, dt_s):
     run = recording()
-    tracker = rigid_tracker(run)
+    tracker = new_tracker(run, kind)
     tracker.step(0.0, run.detections[0])
-    with pytest.raises(ValueError, match=r"^dt_s: expected the seconds since the frame before, more than 0 .*, got "):
+    with pytest.raises(ValueError, match=r"^dt_s: expected the seconds since the previous frame, more than 0 .*, got "):
         tracker.step(dt_s, run.detections[1])
-    # what was refused has left no trace
+    # The rejected step has not changed the tracker.
     assert tracker.step(0.01, run.detections[1]).pose_status is PoseStatus.MEASURED
 
 
-def test_a_million_seconds_later_the_vehicle_is_searched_anew():
+def test_after_a_gap_of_a_million_seconds_the_labels_are_searched_again():
     run = recording()
-    tracker = rigid_tracker(run)
+    tracker = new_tracker(run)
     for k in range(10):
         tracker.step(0.01 * (k > 0), run.detections[k])
-    # A million metres away no spot is on a screen, and no label doubts that: 15 frames of doubt were measured.
+    # The predicted pose is a million metres away, where no spot is on a screen. Measured: 15 frames until the search.
     for k in range(10, 30):
         out = tracker.step(1e6 if k == 10 else 0.01, run.detections[k])
         if out.pose is not None:
@@ -256,19 +258,19 @@ def test_a_million_seconds_later_the_vehicle_is_searched_anew():
     assert out.pose_status is PoseStatus.MEASURED
 
 
-def test_arrays_and_cameras_that_do_not_fit_are_refused():
+def test_arrays_of_a_wrong_shape_and_missing_cameras_are_rejected():
     run = recording()
     points = run.detections[0][0]
-    with pytest.raises(ValueError, match=r"found: expected detections, or None, of each of the cameras left, right"):
-        rigid_tracker(run).step(0.0, [points])
+    with pytest.raises(ValueError, match=r"found: expected detections, or None, for each of the cameras left, right"):
+        new_tracker(run).step(0.0, [points])
     for field, shape in (("cov_px2", (len(points), 2)), ("flux", (len(points) + 1,))):
         with pytest.raises(ValueError, match=f"{field}: expected shape"):
-            rigid_tracker(run).step(0.0, [replace(points, **{field: np.ones(shape)}), None])
+            new_tracker(run).step(0.0, [replace(points, **{field: np.ones(shape)}), None])
 
 
 @given(seed=st.integers(0, 2**32 - 1), count=st.integers(0, 120))
 @settings(max_examples=20, deadline=None, derandomize=True)
-def test_of_points_that_crowd_one_place_those_kept_are_apart_and_those_gone_had_a_neighbour(seed, count):
+def test_kept_points_are_no_duplicates_and_dropped_points_had_one(seed, count):
     uv = np.random.default_rng(seed).uniform(0, 0.6, (count, 2))
     points = Detections.at(uv, np.tile(0.01 * np.eye(2), (count, 1, 1)))
     good = usable_rows(points)

@@ -1,8 +1,8 @@
-"""The gains g1, g2, g3 that rate how well a detection continues a track.
+"""The gains g1, g2, g3: scores of how well a detection continues a track.
 
-Source: Huo, Yang & Yang 2015, eqs. (7), (8), (9); g2 after Sethi & Jain 1987. The well-defined forms: vector lengths
-have a floor (at zero displacement (8) and (9) are 0/0), and g1 may be divided by the search radius (over the picture's
-diagonal it changes by 0.006 in 10 px and decides nothing).
+Source: Huo, Yang & Yang 2015, eqs. (7), (8), (9); g2 after Sethi & Jain 1987. Two changes make them well defined:
+vector lengths have a floor, because (8) and (9) are 0/0 at zero displacement, and g1 may be divided by the search
+radius, because divided by the image diagonal it changes by only 0.006 per 10 px and does not affect the result.
 """
 
 from __future__ import annotations
@@ -13,36 +13,43 @@ from geometry.arrays import Array
 
 
 def nearness(predicted: Array, candidates: Array, scale_px: Array | float, p_norm: float = 2.0) -> Array:
-    """g1, eq. (7): 1 - |candidate - predicted|_p / scale, (...). Points (..., 2), px. 1 on the prediction."""
+    """g1, eq. (7): 1 - |candidate - predicted|_p / scale, (...); 1 at the prediction. Points (..., 2), px.
+
+    scale_px: the denominator, the image diagonal (`picture_scale`, the paper) or the search radius r1 (ours).
+    """
     gap = np.sum(np.abs(candidates - predicted) ** p_norm, axis=-1) ** (1 / p_norm)
     return 1 - gap / np.asarray(scale_px)
 
 
 def picture_scale(image_size_px: Array, p_norm: float = 2.0) -> Array:
-    """The paper's denominator of eq. (7): the p-norm of (Sx, Sy), px. Its sqrt(Sx^p + Sy^p) is that for p = 2 only."""
+    """The denominator of eq. (7): the p-norm of the image size (Sx, Sy), px, (...).
+
+    The paper prints sqrt(Sx^p + Sy^p), which is the p-norm for p = 2 only.
+    """
     return np.asarray(np.sum(np.abs(image_size_px) ** p_norm, axis=-1) ** (1 / p_norm))
 
 
 def direction_and_speed(last: Array, predicted: Array, candidates: Array, min_vector_px: float) -> tuple[Array, Array]:
-    """The two halves of eq. (8) for points (..., 2), px: likeness of direction, and of speed, each in [0, 1].
+    """The two terms of eq. (8), each (...) in [0, 1]: similarity of direction and similarity of speed.
 
-    1/2 + cos/2 of the angle between the predicted and the observed displacement, and the ratio of the geometric to the
-    arithmetic mean of their lengths. Below `min_vector_px` a displacement has no direction: 1 for two such.
+    The direction term is 1/2 + cos/2 of the angle between the predicted and the observed displacement; the speed term
+    is the ratio of the geometric to the arithmetic mean of their lengths. Points (..., 2), px. Displacements shorter
+    than `min_vector_px` (ours) have no direction: two such displacements have a direction term of 1.
     """
-    ahead, seen = predicted - last, candidates - last
-    long_a = np.linalg.norm(ahead, axis=-1)
-    long_s = np.linalg.norm(seen, axis=-1)
-    floor_a, floor_s = np.maximum(long_a, min_vector_px), np.maximum(long_s, min_vector_px)
-    # Shorter than the floor, the vector counts as partly along the other one: the cosine goes to 1, not to 0.
-    cosine = np.sum(ahead * seen, axis=-1) / (floor_a * floor_s)
-    cosine = cosine + (1 - long_a / floor_a) + (1 - long_s / floor_s)
+    expected, observed = predicted - last, candidates - last
+    length_e = np.linalg.norm(expected, axis=-1)
+    length_o = np.linalg.norm(observed, axis=-1)
+    floored_e, floored_o = np.maximum(length_e, min_vector_px), np.maximum(length_o, min_vector_px)
+    # A vector shorter than the floor counts as partly parallel to the other one: the cosine tends to 1, not to 0.
+    cosine = np.sum(expected * observed, axis=-1) / (floored_e * floored_o)
+    cosine = cosine + (1 - length_e / floored_e) + (1 - length_o / floored_o)
     direction = 0.5 + 0.5 * np.clip(cosine, -1.0, 1.0)
-    speed = 2 * np.sqrt(floor_a * floor_s) / (floor_a + floor_s)
+    speed = 2 * np.sqrt(floored_e * floored_o) / (floored_e + floored_o)
     return direction, speed
 
 
 def smoothness(last: Array, predicted: Array, candidates: Array, alpha: float, min_vector_px: float) -> Array:
-    """g2, eq. (8), (...): alpha of the direction, 1 - alpha of the speed."""
+    """g2, eq. (8), (...): the direction term weighted by alpha, the speed term by 1 - alpha. Points (..., 2), px."""
     direction, speed = direction_and_speed(last, predicted, candidates, min_vector_px)
     return alpha * direction + (1 - alpha) * speed
 
@@ -56,9 +63,11 @@ def combined(
     min_vector_px: float,
     p_norm: float = 2.0,
 ) -> Array:
-    """g3, eq. (9), (...), with the weights divided by their sum: step 2 sets the first to 0, then they do not add up.
+    """g3, eq. (9), (...): the weighted sum of g1 and the two terms of eq. (8).
 
-    last, predicted, candidates (..., 2), px: where the spot was, should be, and might be.
+    last, predicted, candidates (..., 2), px: the spot's last position, its predicted position and the detections.
+    weights: omega1, omega2, omega3. They are divided by their sum (ours): matching step 2 sets omega1 to 0, and the
+    paper's weights then no longer add up to 1.
     """
     w1, w2, w3 = np.asarray(weights, dtype=float) / sum(weights)
     direction, speed = direction_and_speed(last, predicted, candidates, min_vector_px)

@@ -1,7 +1,9 @@
 """The three-step matching of one camera's detections with its tracks.
 
-Source: Huo, Yang & Yang 2015, section 4.1.2. Where the paper takes the best detection for each track in turn, here a
-detection serves one track and the sum of the gains is largest (scipy's assignment).
+Source: Huo, Yang & Yang 2015, section 4.1.2. Step 1 searches around the prediction with g3 > epsilon1, step 2 around
+the last position with g3 > epsilon2 and omega1 = 0, step 3 leaves the track without a detection. The paper takes the
+best detection for each track in turn; here each detection is assigned to at most one track and the sum of the gains is
+maximal (scipy's linear assignment).
 """
 
 from __future__ import annotations
@@ -18,11 +20,11 @@ from tracking.parameters import TrackerParameters
 
 @dataclass(frozen=True, slots=True)
 class Matches:
-    """For t tracks of one camera: which detection each took."""
+    """The detections matched to t tracks of one camera."""
 
     point: Ints  # (t,) row of the detection, or UNMATCHED
-    step: Ints  # (t,) 1 or 2: the step that found it; 3: none did
-    gain: Array  # (t,) g3 of the match; nan without
+    step: Ints  # (t,) 1 or 2: the matching step that found it; 3: no detection
+    gain: Array  # (t,) g3, eq. (9), of the match; nan without a match
 
 
 def match(
@@ -34,9 +36,10 @@ def match(
     image_size_px: Array,
     parameters: TrackerParameters,
 ) -> Matches:
-    """Match tracks (t) with points (m, 2), px.
+    """Match t tracks with detections at points (m, 2), px: steps 1 to 3 of section 4.1.2.
 
-    last, predicted (t, 2), px: the tracks' last and predicted positions; r1_px, r2_px (t,): their search radii.
+    last, predicted (t, 2), px: the tracks' last and predicted positions; r1_px, r2_px (t,): the search radii of steps
+    1 and 2. image_size_px (2,): width and height, for the paper's scale of g1.
     """
     p = parameters
     t = len(predicted)
@@ -47,7 +50,7 @@ def match(
     weights = (p.omega1, p.omega2, p.omega3)
     first = combined(last[:, None], predicted[:, None], points[None], weights, scale, p.min_vector_px, p.p_norm)
     near = np.linalg.norm(points[None] - predicted[:, None], axis=-1) <= r1_px[:, None]
-    _take(first, near & (first > p.eps1), np.arange(t), np.arange(len(points)), 1, point, step, gain)
+    _assign(first, near & (first > p.eps1), np.arange(t), np.arange(len(points)), Matches(point, step, gain), 1)
 
     tracks = np.flatnonzero(point == UNMATCHED)
     free = np.setdiff1d(np.arange(len(points)), point)
@@ -62,20 +65,19 @@ def match(
             p.p_norm,
         )
         near = np.linalg.norm(points[free][None] - last[tracks][:, None], axis=-1) <= r2_px[tracks][:, None]
-        _take(second, near & (second > p.eps2), tracks, free, 2, point, step, gain)
+        _assign(second, near & (second > p.eps2), tracks, free, Matches(point, step, gain), 2)
     return Matches(point, step, gain)
 
 
-def _take(
-    g: Array, allowed: Array, tracks: Ints, points: Ints, this_step: int, point: Ints, step: Ints, gain: Array
-) -> None:
-    """Assign the allowed pairs of largest total gain, and note them."""
+def _assign(g: Array, allowed: Array, tracks: Ints, points: Ints, matches: Matches, this_step: int) -> None:
+    """Enter the allowed pairs with the largest total gain into `matches`; g, allowed (len(tracks), len(points))."""
     if not allowed.any():
         return
-    from scipy.optimize import linear_sum_assignment  # 0.3 s to import: only where the paper's tracker runs
+    from scipy.optimize import linear_sum_assignment  # 0.3 s to import: loaded only when this tracker runs
 
-    # A match, however poor, is worth more than none: 1 on top of the gain.
+    # The 1 makes as many matches as possible: any allowed match is worth more than no match.
     value = np.where(allowed, 1.0 + g, 0.0)
     for i, j in zip(*linear_sum_assignment(value, maximize=True), strict=True):
         if allowed[i, j]:
-            point[tracks[i]], step[tracks[i]], gain[tracks[i]] = points[j], this_step, g[i, j]
+            row = tracks[i]
+            matches.point[row], matches.step[row], matches.gain[row] = points[j], this_step, g[i, j]

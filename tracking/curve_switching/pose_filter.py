@@ -1,4 +1,4 @@
-"""The vehicle's motion: constant velocity on R3 x SO(3), used where single frames do not give the pose.
+"""The Kalman filter of the vehicle's pose: constant velocity on R3 x SO(3), for frames that do not determine the pose.
 
 Error state (12): [dt (m, world), dtheta (rad, body), dv (m/s, world), domega (rad/s, body)]. Source: ours; the
 error-state form of Sola (2017), "Quaternion kinematics for the error-state Kalman filter", sec. 5, without the inertial
@@ -27,7 +27,7 @@ class RigidMotion:
 
     @property
     def twist(self) -> Array:
-        """(6,): how the pose's error coordinates change per second; times a pixel Jacobian (.., 6) it is px/s."""
+        """(6,): time derivative of the pose's error coordinates; a pixel Jacobian (.., 6) times it is px/s."""
         return np.concatenate([self.velocity, self.rate])
 
     @property
@@ -37,7 +37,7 @@ class RigidMotion:
 
 
 def begin(pose: Pose, covariance: Array, sigma_velocity_m_s: float = 3.0, sigma_rate_rad_s: float = 3.0) -> RigidMotion:
-    """At rest, as far as anyone knows: a pose, its covariance (6, 6), and wide sigmas of the velocities."""
+    """The initial state: a pose with covariance (6, 6), velocities of zero with wide sigmas."""
     P = np.zeros((12, 12))
     P[:6, :6] = covariance
     P[6:9, 6:9] = sigma_velocity_m_s**2 * np.eye(3)
@@ -46,7 +46,7 @@ def begin(pose: Pose, covariance: Array, sigma_velocity_m_s: float = 3.0, sigma_
 
 
 def predict(motion: RigidMotion, dt_s: float, sigma_a_m_s2: float, sigma_a_rad_s2: float) -> RigidMotion:
-    """One step on, with white accelerations that are constant within the step."""
+    """The prediction over one time step, with white accelerations (1 sigma) that are constant within the step."""
     turn = motion.rate * dt_s
     pose = motion.world_from_body.plus(np.concatenate([motion.velocity * dt_s, turn]))
     F = np.eye(12)
@@ -62,8 +62,11 @@ def predict(motion: RigidMotion, dt_s: float, sigma_a_m_s2: float, sigma_a_rad_s
     return RigidMotion(pose, motion.velocity, motion.rate, symmetric(F @ motion.P @ F.T + Q))
 
 
-def corrected(motion: RigidMotion, y: Array, H: Array, R: Array) -> tuple[RigidMotion, Array]:
-    """After a measurement: innovation y (k,), Jacobian H (k, 6) of the pose, covariance R (k, k). Also S (k, k)."""
+def update(motion: RigidMotion, y: Array, H: Array, R: Array) -> tuple[RigidMotion, Array]:
+    """The update with a measurement; also the innovation covariance S (k, k).
+
+    y (k,): innovation; H (k, 6): its Jacobian with respect to the pose; R (k, k): measurement covariance.
+    """
     PH = motion.P[:, :6] @ H.T
     S = H @ PH[:6] + R
     K = np.linalg.solve(S, PH.T).T
@@ -77,8 +80,8 @@ def corrected(motion: RigidMotion, y: Array, H: Array, R: Array) -> tuple[RigidM
     )
 
 
-def corrected_by_pose(motion: RigidMotion, pose: Pose, covariance: Array) -> tuple[RigidMotion, Array, Array]:
-    """After a measured pose with covariance (6, 6); also the innovation (6,) and its covariance (6, 6)."""
+def update_with_pose(motion: RigidMotion, pose: Pose, covariance: Array) -> tuple[RigidMotion, Array, Array]:
+    """The update with a measured pose, covariance (6, 6); also the innovation (6,) and its covariance (6, 6)."""
     y = pose.minus(motion.world_from_body)
-    after, S = corrected(motion, y, np.eye(6), covariance)
+    after, S = update(motion, y, np.eye(6), covariance)
     return after, y, S

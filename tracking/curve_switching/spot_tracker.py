@@ -1,14 +1,14 @@
-"""The paper's tracker: a filter per spot, three-step matching, and what one rigid body adds to it.
+"""The curve-switching tracker: a Kalman filter per spot, three-step matching, and one pose of the rigid body.
 
-Source: Huo, Yang & Yang 2015, fig. 1: predict, recognise (in view: match; out of view: solve from the other beams),
-modify. Ours: the pose from the matched spots is a witness. A match that contradicts the others is dropped, and spots
-that the matching missed are looked for where the pose puts them (`rigid_check`).
+Source: Huo, Yang & Yang 2015, fig. 1: predict, eqs. (1) and (2); recognise, spots in view by matching (section 4.1)
+and spots out of view by solving from the other beams (section 4.2); modify, eqs. (3) to (6). Ours: the pose from the
+matched spots checks every match (rigid_check.py) and predicts the spots that are not matched (vehicle.py).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,37 +16,51 @@ from geometry.arrays import Array, Bools, Ints
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.pose_prior import PosePrior
-from geometry.pose_solver.gauss_newton import (
-    PoseFit,
-    SolveLimits,
-    fit_pose,
-    good_enough,
-    point_covariance,
-)
-from geometry.pose_solver.robust_pose import EXPECTED_GATE, fit_pose_robust
+from geometry.pose_solver.gauss_newton import PoseFit, SolveLimits, good_enough, point_covariance
 from geometry.rig import Rig
 from geometry.uncertainty.rig_parameters import RigCovariance
 from geometry.uncertainty.rig_uncertainty import CalibrationSpread
 from tracking.curve_switching.matching import match
 from tracking.curve_switching.out_of_view import CoplanarViews, quadratic_positions
+from tracking.curve_switching.rigid_check import RigidCheck, matched_pixels, outside_first_search
 from tracking.curve_switching.tracks import Tracks
 from tracking.curve_switching.vehicle import Vehicle
 from tracking.detections import UNMATCHED, Detections
+from tracking.input_validation import check_step
 from tracking.labelling.first_labels import NO_POINT, find_labels
 from tracking.parameters import TrackerParameters
 from tracking.statuses import SpotStatus
 from tracking.tracked_frame import Event, TrackedFrame
 
-RIGID_GATE = 20.0  # squared sigmas: a detection this near to where the pose puts a spot is that spot (p = 5e-5)
+EAGER_SEARCHES = 10  # frames without a pose in which the labels are searched every time, and then only ...
+SEARCH_EVERY = 5  # ... in every fifth: a search that has failed for long is likely to fail again
+
+
+@dataclass(frozen=True, slots=True)
+class _Matches:
+    """The matches of one frame, n views."""
+
+    point: Ints  # (n,) row of the detection in its camera's list, or UNMATCHED
+    turned: Bools  # (n,) found by matching step 2, or far from the prediction
+    gain: Array  # (n,) g3; nan without a match
+
+
+@dataclass(frozen=True, slots=True)
+class _Estimates:
+    """Positions of all views from the other spots."""
+
+    uv: Array  # (n, 2) px; nan where the spot does not exist
+    cov: Array  # (n, 2, 2) px^2
+    exists: Bools  # (n,) the beam meets its screen in front of the camera
 
 
 class SpotTracker:
-    """Feed it the detections of one frame after the other."""
+    """Tracks the spots of one rig, frame by frame."""
 
     def __init__(
         self, rig: Rig, parameters: TrackerParameters, prior: PosePrior, covariance: RigCovariance | None = None
     ) -> None:
-        """covariance: of the rig's calibration, where it is known; poses then carry its share."""
+        """covariance: of the rig's calibration, if known; it then contributes to the covariances of the poses."""
         self.rig = rig
         self.model = SpotModel.of(rig)
         self.calibration = None if covariance is None else CalibrationSpread(rig, self.model, covariance)
@@ -56,64 +70,75 @@ class SpotTracker:
         self.tracks = Tracks.none(len(self.model), parameters.sigma_a_px_s2)
         self.vehicle = Vehicle(parameters)
         self.limits = SolveLimits(parameters.max_sigma_m, np.deg2rad(parameters.max_sigma_deg))
+        self.rigid_check = RigidCheck(self.model, parameters, self.limits, self.calibration)
+        self._started = False
         self._labelled = False
-        self._frames_since_try = 0
-        self._told_tie = False
+        self._searches = 0  # frames since the last pose in which the labels could be searched
+        self._tie_reported = False
 
     @property
     def noise_scale(self) -> float:
-        """How much larger than claimed the spots' errors are."""
+        """Ratio of the spots' actual to their stated sigmas."""
         return self.vehicle.noise_scale
 
     def step(self, dt_s: float, found: Sequence[Detections | None]) -> TrackedFrame:
-        """One frame. dt_s: time since the frame before (0 for the first); found: per camera, None without a picture."""
-        self._predict(dt_s)
+        """Process one frame.
+
+        dt_s: time since the previous frame (0 for the first); found: detections per camera, None without a picture.
+
+        Raises:
+            ValueError: if dt_s is not positive and finite (0 is allowed for the first frame), or if `found` does not
+                have one entry per camera.
+        """
+        check_step(dt_s, found, self.model.camera_names, not self._started)
+        self._started = True
+        if dt_s > 0:
+            self.tracks.predict(dt_s)
+            self.vehicle.predict(dt_s)
         events: list[Event] = []
         predicted = self.tracks.predicted_px
-        n = len(self.model)
-        point, gain = np.full(n, UNMATCHED), np.full(n, np.nan)
-        turned = np.zeros(n, dtype=bool)
-        fit: PoseFit | None = None
-        found = [None if f is None else self._usable(f) for f in found]
+        found = [None if f is None else self._with_model_error(f) for f in found]
+        matches, fit = self._recognise(dt_s, found, events)
+        return self._modify(dt_s, found, predicted, matches, fit, events)
 
-        if not self._labelled:
-            fit, point = self._acquire(found, self.prior, events, "labelled")
-        else:
-            point, turned, gain = self._match(found)
-            fit, point, turned = self._pose(found, point, turned, events)
-            if fit is None and self._should_search(found):
-                kind = "relabelled" if self.vehicle.anchor_age_s <= 1.5 * dt_s else "reacquired"
-                again, points = self._acquire(found, self.vehicle.search_prior(self.prior), events, kind)
-                if again is not None:
-                    fit, point = again, points
-                    turned = self._far_from_prediction(found, point)
-        return self._conclude(dt_s, found, predicted, point, turned, gain, fit, events)
+    # -- recognise: match, check, search ------------------------------------------------------------------------------
 
-    # -- prediction ---------------------------------------------------------------------------------------------------
-
-    def _predict(self, dt_s: float) -> None:
-        if dt_s <= 0:
-            return
-        self.tracks.predict(dt_s)
-        self.vehicle.predict(dt_s)
-
-    # -- matching -----------------------------------------------------------------------------------------------------
-
-    def _usable(self, found: Detections) -> Detections:
-        """Detections with the model's own error in their covariance."""
+    def _with_model_error(self, found: Detections) -> Detections:
+        """Detections with the model's own error added to their covariances."""
         floor = self.parameters.sigma_model_px**2 * np.eye(2)
         return replace(found, cov_px2=found.cov_px2 + floor)
 
-    def _match(self, found: Sequence[Detections | None]) -> tuple[Ints, Bools, Array]:
-        """The paper's matching in every camera: points, whether step 2 found them, gains, each (n,)."""
+    def _recognise(
+        self, dt_s: float, found: Sequence[Detections | None], events: list[Event]
+    ) -> tuple[_Matches, PoseFit | None]:
+        """The matches of one frame and the pose from them; None if the frame does not determine it."""
+        n = len(self.model)
+        if not self._labelled:
+            fit, point = self._acquire(found, self.prior, events, "labelled")
+            return _Matches(point, np.zeros(n, dtype=bool), np.full(n, np.nan)), fit
+        matches = self._match(found)
+        fit, point, turned = self.rigid_check.pose_of_matches(
+            found, matches.point, matches.turned, self.tracks, self.vehicle, self._start_pose(), events
+        )
+        if fit is None and self._should_search(found):
+            kind = "relabelled" if self.vehicle.anchor_age_s <= 1.5 * dt_s else "reacquired"
+            acquired, points = self._acquire(found, self.vehicle.search_prior(self.prior), events, kind)
+            if acquired is not None:
+                fit, point = acquired, points
+                uv, _ = matched_pixels(self.model, found, point)
+                turned = outside_first_search(self.model, self.tracks, self.parameters.r1_px, uv)
+        return _Matches(point, turned, matches.gain), fit
+
+    def _match(self, found: Sequence[Detections | None]) -> _Matches:
+        """The three-step matching of section 4.1.2 in every camera."""
         t, p, model = self.tracks, self.parameters, self.model
         n = len(model)
         point, turned, gain = np.full(n, UNMATCHED), np.zeros(n, dtype=bool), np.full(n, np.nan)
-        spread = np.sqrt(np.maximum(t.P[:, 0, 0], t.P[:, 1, 1]))
-        r1 = np.clip(p.radius_sigmas * spread, p.r1_px, max(p.r1_px, p.max_radius_px))
-        moved = np.linalg.norm(t.x[:, :2] - t.last, axis=-1)
-        r2 = np.clip(1.5 * moved, p.r2_px, max(p.r2_px, p.max_radius_px))
-        margin = p.image_margin_px + np.minimum(3 * spread, p.r1_px)
+        sigma = np.sqrt(np.maximum(t.P[:, 0, 0], t.P[:, 1, 1]))
+        r1 = np.clip(p.radius_sigmas * sigma, p.r1_px, max(p.r1_px, p.max_radius_px))
+        displacement = np.linalg.norm(t.x[:, :2] - t.last, axis=-1)
+        r2 = np.clip(1.5 * displacement, p.r2_px, max(p.r2_px, p.max_radius_px))
+        margin = p.image_margin_px + np.minimum(3 * sigma, p.r1_px)
         in_view = t.alive & model.in_picture(t.x[:, :2], margin)
         for c, points in enumerate(found):
             rows = np.flatnonzero(in_view & (model.camera_of == c))
@@ -121,213 +146,90 @@ class SpotTracker:
                 continue
             m = match(t.last[rows], t.x[rows, :2], r1[rows], r2[rows], points.uv_px, model.image_size_px[rows[0]], p)
             point[rows], turned[rows], gain[rows] = m.point, m.step == 2, m.gain
-        return point, turned, gain
+        return _Matches(point, turned, gain)
 
-    def _far_from_prediction(self, found: Sequence[Detections | None], point: Ints) -> Bools:
-        """Which matched views lie outside their first search region: the trajectory bent, or nobody looked."""
-        uv, _ = self._pixels(found, point)
-        gap = np.linalg.norm(uv - self.tracks.x[:, :2], axis=-1)
-        return (point != UNMATCHED) & ~(self.tracks.alive & (gap <= self.parameters.r1_px))
-
-    def _pixels(self, found: Sequence[Detections | None], point: Ints) -> tuple[Array, Array]:
-        """Positions (n, 2) and covariances (n, 2, 2) of the matched points; nan without."""
-        n = len(self.model)
-        uv, cov = np.full((n, 2), np.nan), np.full((n, 2, 2), np.nan)
-        for c, points in enumerate(found):
-            rows = np.flatnonzero((self.model.camera_of == c) & (point != UNMATCHED))
-            if points is not None and len(rows):
-                uv[rows], cov[rows] = points.uv_px[point[rows]], points.cov_px2[point[rows]]
-        return uv, cov
-
-    # -- the pose as a witness ----------------------------------------------------------------------------------------
-
-    def _start(self) -> Pose:
+    def _start_pose(self) -> Pose:
         return self.vehicle.motion.world_from_body if self.vehicle.motion is not None else self.prior.centre
 
-    def _pose(
-        self, found: Sequence[Detections | None], point: Ints, turned: Bools, events: list[Event]
-    ) -> tuple[PoseFit | None, Ints, Bools]:
-        """The pose from the matches, with the wrong ones dropped and the missed ones added. None: not observable."""
-        rows = np.flatnonzero(point != UNMATCHED)
-        if len(rows) < 3:
-            return None, point, turned
-        uv, cov = self._pixels(found, point)
-        fit = fit_pose_robust(
-            self.model,
-            rows,
-            uv[rows],
-            cov[rows],
-            self._start(),
-            expected=self.vehicle.expected,
-            limits=self.limits,
-            noise_scale=self.vehicle.noise_scale,
-            calibration=self.calibration,
-        )
-        if fit is None:
-            fit = self._blended_fit(rows, uv, cov)
-        if fit is None or not good_enough(fit, self.limits):
-            return None, point, turned
-        if len(rows) < 4 and not self._plausible(fit):
-            return None, point, turned
-        if not self.parameters.rigid_check:
-            return fit, point, turned
-        before, point = point, point.copy()
-        left_out = np.setdiff1d(rows, fit.rows)
-        point[left_out] = UNMATCHED
-        point, new = self._add_missed(found, point, fit)
-        if new:
-            rows = np.union1d(fit.rows, new)
-            now, now_cov = self._pixels(found, point)
-            wider = fit_pose(
-                self.model, rows, now[rows], now_cov[rows], fit.world_from_body, calibration=self.calibration
-            )
-            if wider is not None and wider.consistent(self.limits.p_false_alarm):
-                fit = wider
-                turned = np.where(np.isin(np.arange(len(point)), new), self._far_from_prediction(found, point), turned)
-            else:
-                point[new] = UNMATCHED
-        for view in left_out[point[left_out] == UNMATCHED]:
-            taken = np.any((point == before[view]) & (self.model.camera_of == self.model.camera_of[view]))
-            if not taken and np.linalg.norm(uv[view] - fit.projected_px[view]) < self.parameters.blend_px:
-                # A neighbour that melts into a spot pulls its centre by a pixel or two: still it, but no witness.
-                point[view] = before[view]
-            else:
-                events.append(Event("dropped", "contradicts the other spots: not this spot", int(view)))
-        return fit, point, turned & (point != UNMATCHED)
-
-    def _blended_fit(self, rows: Ints, uv: Array, cov: Array) -> PoseFit | None:
-        """All spots, where none can be singled out but all lie near their places; the frame's own misfit widens it."""
-        fit = fit_pose(self.model, rows, uv[rows], cov[rows], self._start(), calibration=self.calibration)
-        if fit is None or fit.dof <= 0 or np.linalg.norm(fit.residuals_px, axis=-1).max() > self.parameters.blend_px:
-            return None
-        if not self._plausible(fit):
-            return None  # at a bend nothing vouches for such a set: all spots are searched anew
-        return fit.widened(max(1.0, fit.chi2 / fit.dof / self.vehicle.noise_scale**2))
-
-    def _plausible(self, fit: PoseFit) -> bool:
-        """Whether three spots, which fit any labels, give a pose that the motion allows."""
-        expected = self.vehicle.expected
-        if expected is None:
-            return False
-        gap = fit.world_from_body.minus(expected[0])
-        return float(gap @ np.linalg.solve(expected[1] + fit.covariance, gap)) < EXPECTED_GATE
-
-    def _add_missed(self, found: Sequence[Detections | None], point: Ints, fit: PoseFit) -> tuple[Ints, list[int]]:
-        """Detections where the pose puts spots that have none yet."""
-        uv, reach = fit.projected_px, fit.spot_covariances()
-        new: list[int] = []
-        open_views = np.flatnonzero((point == UNMATCHED) & self.model.in_picture(uv, self.parameters.image_margin_px))
-        for view in open_views:
-            c = int(self.model.camera_of[view])
-            points = found[c]
-            if points is None or not len(points):
-                continue
-            taken = point[(self.model.camera_of == c) & (point != UNMATCHED)]
-            gap = points.uv_px - uv[view]
-            S = points.cov_px2 * self.vehicle.noise_scale**2 + reach[view]
-            d2 = np.sum(gap * np.linalg.solve(S, gap[..., None])[..., 0], axis=-1)
-            d2[taken] = np.inf
-            best = int(np.argmin(d2))
-            if d2[best] < RIGID_GATE:
-                point[view] = best
-                new.append(int(view))
-        return point, new
-
-    # -- labels without a track ---------------------------------------------------------------------------------------
-
     def _should_search(self, found: Sequence[Detections | None]) -> bool:
-        """Whether to look for the whole vehicle anew: enough points are there, and the tracks give no pose."""
+        """Whether to search the labels again: there are enough points, and the tracks give no pose."""
         if (
             self.vehicle.anchor is None
             or sum(len(f) for f in found if f is not None) < self.parameters.labels.min_spots
         ):
             return False
-        self._frames_since_try += 1
-        # At once when light returns, then ever more rarely: what fails for long will fail in the next frame too.
-        tries = self._frames_since_try
-        return tries <= 10 or tries % 5 == 0
+        self._searches += 1
+        return self._searches <= EAGER_SEARCHES or self._searches % SEARCH_EVERY == 0
 
     def _acquire(
         self, found: Sequence[Detections | None], prior: PosePrior, events: list[Event], kind: str
     ) -> tuple[PoseFit | None, Ints]:
-        """Labels from a prior alone; the pose is refitted with the points' own covariances."""
+        """Labels from a prior alone; the pose is fitted again with the points' own covariances."""
         nothing = None, np.full(len(self.model), UNMATCHED)
         by_camera = {name: f for name, f in zip(self.model.camera_names, found, strict=True) if f is not None}
         result = find_labels(self.rig, self.model, by_camera, prior, self.parameters.labels, self.calibration)
         if result.chosen is None:
-            if result.tie and not self._told_tie:
+            if result.tie and not self._tie_reported:
                 events.append(Event("tie", result.in_words(self.model)))
-                self._told_tie = True
+                self._tie_reported = True
             return nothing
         point = np.where(result.chosen.point_of == NO_POINT, UNMATCHED, result.chosen.point_of)
         rows = np.flatnonzero(point != UNMATCHED)
-        uv, cov = self._pixels(found, point)
+        uv, cov = matched_pixels(self.model, found, point)
         start = result.chosen.fit.world_from_body
-        fit = fit_pose_robust(
-            self.model,
-            rows,
-            uv[rows],
-            cov[rows],
-            start,
-            limits=self.limits,
-            noise_scale=self.vehicle.noise_scale,
-            calibration=self.calibration,
-        )
+        fit = self.rigid_check.robust_fit(rows, uv, cov, start, self.vehicle)
         if fit is None:
-            # The labels hold within the model's error, the claimed sigmas do not: this frame's own misfit widens it.
-            fit = fit_pose(self.model, rows, uv[rows], cov[rows], start, calibration=self.calibration)
-            if fit is not None and fit.dof > 0:
-                fit = fit.widened(max(1.0, fit.chi2 / fit.dof / self.vehicle.noise_scale**2))
+            # The labels agree within the model's error but not within the stated sigmas.
+            fit = self.rigid_check.widened_fit(rows, uv, cov, start, self.vehicle)
         if fit is None or not good_enough(fit, self.limits):
             return nothing
         names = ", ".join(self.model.views[v][1] for v in rows)
         events.append(Event(kind, f"spots {names} found from the prior alone"))
-        self._told_tie = False
+        self._tie_reported = False
         return fit, point
 
-    # -- modification -------------------------------------------------------------------------------------------------
+    # -- modify: update filters and statuses --------------------------------------------------------------------------
 
-    def _conclude(
+    def _modify(
         self,
         dt_s: float,
         found: Sequence[Detections | None],
         predicted: Array,
-        point: Ints,
-        turned: Bools,
-        gain: Array,
+        matches: _Matches,
         fit: PoseFit | None,
         events: list[Event],
     ) -> TrackedFrame:
-        """Update filters and statuses from what was recognised."""
+        """Update filters and statuses from the recognised spots."""
+        point, turned = matches.point, matches.turned
         if fit is not None:
-            self._labelled, self._frames_since_try = True, 0
-            self.vehicle.measured(fit, dt_s)
+            self._labelled, self._searches = True, 0
+            self.vehicle.update_with_pose(fit, dt_s)
         elif self.vehicle.motion is not None:
-            point = self._believed(found, point)
+            point = self._update_vehicle_with_spots(found, point)
             turned = turned & (point != UNMATCHED)
 
-        uv, cov = self._pixels(found, point)
+        uv, cov = matched_pixels(self.model, found, point)
         seen = point != UNMATCHED
-        cov = self._with_blends(fit, uv, cov, seen)
-        estimate, estimate_cov, exists = self._estimates(fit, uv)
+        cov = _with_merged_spots(fit, uv, cov, seen)
+        estimates = self._estimates(fit, uv)
         used_in_pose = seen if fit is None else np.isin(np.arange(len(self.model)), fit.rows)
-        self._update_tracks(uv, cov, used_in_pose, turned, estimate, estimate_cov, exists, fit is not None)
-        t = self.tracks
+        self._update_tracks(uv, cov, used_in_pose, turned, estimates, fit is not None)
+        t, exists = self.tracks, estimates.exists
         rest = ~seen
-        uv = np.where(rest[:, None], np.where(exists[:, None], estimate, t.x[:, :2]), uv)
-        cov = np.where(rest[:, None, None], np.where(exists[:, None, None], estimate_cov, t.P[:, :2, :2]), cov)
+        uv = np.where(rest[:, None], np.where(exists[:, None], estimates.uv, t.x[:, :2]), uv)
+        cov = np.where(rest[:, None, None], np.where(exists[:, None, None], estimates.cov, t.P[:, :2, :2]), cov)
         status = self._statuses(found, seen, turned, uv, exists, fit)
         unknown = np.array([s in (SpotStatus.LOST, SpotStatus.OFF_SCREEN) for s in status])
         uv = np.where(unknown[:, None], np.nan, uv)
         t.alive = t.alive & ~unknown
-        t.remember(uv, cov)
+        t.store_last(uv, cov)
         pose_status, pose, covariance = self.vehicle.result(fit)
         return TrackedFrame(
             uv_px=uv,
             cov_px2=np.where(unknown[:, None, None], np.nan, cov),
             status=tuple(status),
             predicted_px=predicted,
-            gain=np.where(seen, gain, np.nan),
+            gain=np.where(seen, matches.gain, np.nan),
             point=point,
             pose_status=pose_status,
             pose=pose,
@@ -339,33 +241,21 @@ class SpotTracker:
             used_in_pose=used_in_pose & seen,
         )
 
-    def _believed(self, found: Sequence[Detections | None], point: Ints) -> Ints:
-        """Where the matches do not give the pose they still narrow its prediction; those beyond belief are let go."""
+    def _update_vehicle_with_spots(self, found: Sequence[Detections | None], point: Ints) -> Ints:
+        """Update the vehicle's motion with matches that do not determine the pose; the accepted matches (n,)."""
         rows = np.flatnonzero(point != UNMATCHED)
-        uv, cov = self._pixels(found, point)
-        good = self.vehicle.measured_partly(self.model, rows, uv[rows], cov[rows])
+        uv, cov = matched_pixels(self.model, found, point)
+        good = self.vehicle.update_with_spots(self.model, rows, uv[rows], cov[rows])
         point = point.copy()
         point[rows[~good]] = UNMATCHED
         return point
 
-    def _with_blends(self, fit: PoseFit | None, uv: Array, cov: Array, seen: Bools) -> Array:
-        """Covariances, those of matched spots that the pose fit left out grown by how far they lie from it."""
-        if fit is None:
-            return cov
-        blended = np.setdiff1d(np.flatnonzero(seen), fit.rows)
-        if not len(blended):
-            return cov
-        gap2 = np.sum((uv[blended] - fit.projected_px[blended]) ** 2, axis=-1)
-        cov = cov.copy()
-        cov[blended] += gap2[:, None, None] * np.eye(2)
-        return cov
-
-    def _estimates(self, fit: PoseFit | None, uv: Array) -> tuple[Array, Array, Bools]:
-        """Positions (n, 2) and covariances of all views from the others, and whether they exist."""
+    def _estimates(self, fit: PoseFit | None, uv: Array) -> _Estimates:
+        """Positions of all views from the other spots: by the pose (ours) or by section 4.2; uv (n, 2): matched."""
         n = len(self.model)
         motion = self.vehicle.motion
         if motion is None:
-            return np.full((n, 2), np.nan), np.full((n, 2, 2), np.nan), np.zeros(n, dtype=bool)
+            return _Estimates(np.full((n, 2), np.nan), np.full((n, 2, 2), np.nan), np.zeros(n, dtype=bool))
         if fit is not None:
             position, spread = fit.projected_px, fit.spot_covariances() * self.vehicle.noise_scale**2
         else:
@@ -377,38 +267,31 @@ class SpotTracker:
             outside = exists & ~self.model.in_picture(position) & ~np.isnan(solved[:, 0])
             position = np.where(outside[:, None], solved, position)
         if self.parameters.estimate == "prediction":
-            # The paper: a hidden spot's estimate is its own filter's prediction; outside the picture it is solved.
+            # The paper: the estimate of a hidden spot is its own filter's prediction; outside the image it is solved.
             hidden = self.tracks.alive & self.model.in_picture(position)
             position = np.where(hidden[:, None], self.tracks.x[:, :2], position)
             spread = np.where(hidden[:, None, None], self.tracks.P[:, :2, :2], spread)
-        return position, spread, exists
+        return _Estimates(position, spread, exists)
 
     def _update_tracks(
-        self,
-        uv: Array,
-        cov: Array,
-        seen: Bools,
-        turned: Bools,
-        estimate: Array,
-        estimate_cov: Array,
-        exists: Bools,
-        measured_pose: bool,
+        self, uv: Array, cov: Array, seen: Bools, turned: Bools, estimates: _Estimates, pose_measured: bool
     ) -> None:
-        """Matched: Kalman's update, or eq. (6) at a bend. Not matched: the estimate stands for the measurement."""
+        """Update with the matched positions; unmatched tracks take the estimate as their measurement."""
         t, p, motion = self.tracks, self.parameters, self.vehicle.motion
-        by_estimate = ~seen & exists & measured_pose
+        exists = estimates.exists
+        by_estimate = ~seen & exists & pose_measured
         if p.estimate == "prediction":
-            by_estimate &= ~self.model.in_picture(estimate)
+            by_estimate &= ~self.model.in_picture(estimates.uv)
         use = seen | by_estimate
-        z = np.where(seen[:, None], uv, estimate)
-        R = np.where(seen[:, None, None], cov * self.vehicle.noise_scale**2, estimate_cov)
+        z = np.where(seen[:, None], uv, estimates.uv)
+        R = np.where(seen[:, None, None], cov * self.vehicle.noise_scale**2, estimates.cov)
         new = use & ~t.alive
         t.update(z, R, use, seen, turned, p)
-        # New tracks, and all that the pose filter alone carries, take position and rate from the vehicle's motion.
-        seed = new | (~seen & exists & t.alive & (not measured_pose) & (p.estimate == "rigid"))
+        # New tracks, and tracks that only the pose filter predicts, take position and rate from the vehicle's motion.
+        seed = new | (~seen & exists & t.alive & (not pose_measured) & (p.estimate == "rigid"))
         if seed.any() and motion is not None:
-            t.carry(seed, self.model, motion)
-            at = np.where(use[:, None], z, estimate)
+            t.set_from_motion(seed, self.model, motion)
+            at = np.where(use[:, None], z, estimates.uv)
             here = seed & ~np.isnan(at[:, 0])
             t.x[here, :2], t.alive[here] = at[here], True
 
@@ -421,10 +304,10 @@ class SpotTracker:
         exists: Bools,
         fit: PoseFit | None,
     ) -> list[SpotStatus]:
-        """One word per view."""
+        """The status of every view."""
         model, t = self.model, self.tracks
         inside: Bools = model.in_picture(uv)
-        nothing: Bools = np.asarray(np.isnan(uv).any(axis=-1))
+        no_position: Bools = np.asarray(np.isnan(uv).any(axis=-1))
         known_pose = fit is not None or self.vehicle.known
         out: list[SpotStatus] = []
         for i in range(len(model)):
@@ -434,10 +317,23 @@ class SpotTracker:
                 out.append(SpotStatus.LOST)
             elif known_pose and not exists[i]:
                 out.append(SpotStatus.OFF_SCREEN)
-            elif nothing[i] or not (t.alive[i] and (known_pose or t.unseen_s[i] <= self.parameters.max_coast_s)):
+            elif no_position[i] or not (t.alive[i] and (known_pose or t.unseen_s[i] <= self.parameters.max_coast_s)):
                 out.append(SpotStatus.LOST)
             elif found[int(model.camera_of[i])] is None:
                 out.append(SpotStatus.NO_IMAGE)
             else:
                 out.append(SpotStatus.OCCLUDED if inside[i] else SpotStatus.OUT_OF_VIEW)
         return out
+
+
+def _with_merged_spots(fit: PoseFit | None, uv: Array, cov: Array, seen: Bools) -> Array:
+    """Covariances (n, 2, 2), enlarged by the squared residual for matched spots that are excluded from the pose fit."""
+    if fit is None:
+        return cov
+    merged = np.setdiff1d(np.flatnonzero(seen), fit.rows)
+    if not len(merged):
+        return cov
+    gap2 = np.sum((uv[merged] - fit.projected_px[merged]) ** 2, axis=-1)
+    cov = cov.copy()
+    cov[merged] += gap2[:, None, None] * np.eye(2)
+    return cov

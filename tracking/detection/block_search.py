@@ -1,10 +1,10 @@
-"""A fast look at all pixels: sums of 2x2 pixels, and what is highest in each block of 8x8 pixels.
+"""The fast first pass over all pixels: sums over 2x2 to 8x8 pixels, their maxima and the background per 8x8 block.
 
-All sums are whole numbers below 2^24, exact in float32 for 8 and 16 bits, so a part of a picture gives the same ones as
-the whole. `runs` (n, 3) say which blocks are meant: block row, first block column, the column after the last.
+All sums are integers below 2^24 and therefore exact in float32 for 8 and 16 bits, so a part of a picture gives the same
+sums as the whole. `runs` (n, 3) select the blocks: block row, first block column, the column after the last.
 
-The inner loops work on views of rows, counted from 0, and without numpy's max: only so does the compiler use the
-processor's vector units (a factor of five).
+The inner loops use views of rows, indexed from 0, and no numpy max: otherwise the compiler does not use the processor's
+vector units (a factor of five).
 """
 
 from __future__ import annotations
@@ -16,30 +16,31 @@ from numpy.typing import NDArray
 
 from geometry.arrays import Ints
 from geometry.compilation.jit import compiled, compiled_for_threads
+from tracking.detection.pixels import TEXTURE_SHARE, Noise
 
 BLOCK = 8  # px
-AROUND = 2  # blocks on each side whose median is the background
+BACKGROUND_REACH = 2  # blocks on each side that contribute to the median for the background
 
 Sums = NDArray[np.float32]
 
 
-SUMS, HIGHEST2, HIGHEST4, HIGHEST8, MIDDLE, GROUND = range(6)
+SUMS, HIGHEST2, HIGHEST4, HIGHEST8, ROW_MEDIAN, BACKGROUND = range(6)
 
 
 class Blocks(NamedTuple):
-    """Sums over the pixels of a picture of n x m blocks; only those are up to date that were asked for."""
+    """Sums over the pixels of a picture of n x m blocks. Only the blocks of the last runs are up to date."""
 
     pairs: Sums  # (4n, 4m) of 2x2 pixels
     quads: Sums  # (2n, 2m) of 4x4 pixels
-    # (6, n, m). SUMS: of 8x8 pixels. HIGHEST2: the largest of 2x2 pixels in the block. HIGHEST4, HIGHEST8: of 4x4 and
-    # 8x8 pixels that begin in the block, at every second and fourth pixel. MIDDLE: median of SUMS over five blocks of a
-    # row. GROUND: median of MIDDLE over five rows, the background
+    # (6, n, m). SUMS: sums of 8x8 pixels. HIGHEST2: the largest sum of 2x2 pixels in the block. HIGHEST4, HIGHEST8: the
+    # largest sum of 4x4 and 8x8 pixels that begin in the block, at every second and fourth pixel. ROW_MEDIAN: median of
+    # SUMS over five blocks of a row. BACKGROUND: median of ROW_MEDIAN over five rows
     maps: Sums
-    lines: Sums  # (2, 4m) room to work in
+    lines: Sums  # (2, 4m) workspace
 
     @staticmethod
     def of(width: int, height: int) -> Blocks:
-        """Room for a picture of that size."""
+        """Arrays for a picture of that size, px."""
         n, m = -(-height // BLOCK), -(-width // BLOCK)
         shapes = [(4 * n, 4 * m), (2 * n, 2 * m), (6, n, m), (2, 4 * m)]
         return Blocks(*(np.zeros(shape, np.float32) for shape in shapes))
@@ -60,7 +61,7 @@ def runs_of(boxes: Ints, more_rows: int, more_columns: int, rows: int, columns: 
 
 @compiled_for_threads
 def bin_pixels(image: NDArray, runs: Ints, pairs: Sums) -> None:
-    """Sums of 2x2 pixels of a picture (h, w), u8 or u16; the border's pixels are repeated outside."""
+    """Sums of 2x2 pixels of a picture (h, w), uint8 or uint16; border pixels are repeated outside the picture."""
     height, width = image.shape
     for k in range(runs.shape[0]):
         row, first, last = runs[k, 0], 4 * runs[k, 1], 4 * runs[k, 2]
@@ -80,7 +81,7 @@ def bin_pixels(image: NDArray, runs: Ints, pairs: Sums) -> None:
 
 
 @compiled
-def fold(fine: Sums, runs: Ints, size: int, coarse: Sums) -> None:
+def sum_2x2(fine: Sums, runs: Ints, size: int, coarse: Sums) -> None:
     """Sums of 2x2 entries of `fine`; `size` is the number of entries of `coarse` along a block's side."""
     for k in range(runs.shape[0]):
         row, first, last = runs[k, 0], size * runs[k, 1], size * runs[k, 2]
@@ -92,7 +93,7 @@ def fold(fine: Sums, runs: Ints, size: int, coarse: Sums) -> None:
 
 @compiled
 def find_highest_pairs(blocks: Blocks, runs: Ints) -> None:
-    """HIGHEST2 and HIGHEST4."""
+    """Compute HIGHEST2 and HIGHEST4."""
     rows, columns = blocks.pairs.shape
     for k in range(runs.shape[0]):
         row, first, last = runs[k, 0], 4 * runs[k, 1], 4 * runs[k, 2]
@@ -120,7 +121,7 @@ def find_highest_pairs(blocks: Blocks, runs: Ints) -> None:
 
 @compiled
 def find_highest_quads(blocks: Blocks, runs: Ints) -> None:
-    """HIGHEST8."""
+    """Compute HIGHEST8."""
     rows, columns = blocks.quads.shape
     for k in range(runs.shape[0]):
         row, first, last = runs[k, 0], 2 * runs[k, 1], 2 * runs[k, 2]
@@ -141,79 +142,90 @@ def find_highest_quads(blocks: Blocks, runs: Ints) -> None:
 
 @compiled
 def median5(a: float, b: float, c: float, d: float, e: float) -> float:
-    """The median of five."""
+    """The median of five numbers."""
     a, b = (a, b) if a < b else (b, a)
     c, d = (c, d) if c < d else (d, c)
-    low, high = (c if a < c else a), (b if b < d else d)  # the smallest and the largest of the four are not it
+    low, high = (c if a < c else a), (b if b < d else d)  # drops the smallest and the largest of the four
     low, high = (low, high) if low < high else (high, low)
     return low if e < low else (high if e > high else e)
 
 
 @compiled
-def find_middle(blocks: Blocks, runs: Ints) -> None:
-    """The median of each block and two on each side of it; at the border the outermost blocks are repeated."""
+def find_row_medians(blocks: Blocks, runs: Ints) -> None:
+    """Compute ROW_MEDIAN, over each block and two on each side; the outermost blocks are repeated at the border."""
     columns = blocks.maps.shape[2]
     for k in range(runs.shape[0]):
         row, first, last = runs[k, 0], runs[k, 1], runs[k, 2]
-        x, out = blocks.maps[SUMS, row], blocks.maps[MIDDLE, row]
+        x, out = blocks.maps[SUMS, row], blocks.maps[ROW_MEDIAN, row]
         for j in range(first, last):
-            if j < AROUND or j >= columns - AROUND:
+            if j < BACKGROUND_REACH or j >= columns - BACKGROUND_REACH:
                 left, right = max(j - 1, 0), min(j + 1, columns - 1)
                 out[j] = median5(x[max(j - 2, 0)], x[left], x[j], x[right], x[min(j + 2, columns - 1)])
-        begin = max(first, AROUND)
-        inner = out[begin : max(min(last, columns - AROUND), begin)]
-        x = x[begin - AROUND :]
+        begin = max(first, BACKGROUND_REACH)
+        inner = out[begin : max(min(last, columns - BACKGROUND_REACH), begin)]
+        x = x[begin - BACKGROUND_REACH :]
         for j in range(inner.shape[0]):
             inner[j] = median5(x[j], x[j + 1], x[j + 2], x[j + 3], x[j + 4])
 
 
 @compiled
-def find_ground(blocks: Blocks, runs: Ints) -> None:
-    """The background of each block: the median of five medians of five blocks (`find_middle`).
+def find_background(blocks: Blocks, runs: Ints) -> None:
+    """Compute BACKGROUND: the median of five ROW_MEDIANs.
 
-    Nearly as good as the median of all 25, and ten times as fast.
+    Nearly as accurate as the median of all 25 blocks, and ten times as fast.
     """
     rows = blocks.maps.shape[1]
     for k in range(runs.shape[0]):
         row, first, last = runs[k, 0], runs[k, 1], runs[k, 2]
-        a, b = blocks.maps[MIDDLE, max(row - 2, 0), first:last], blocks.maps[MIDDLE, max(row - 1, 0), first:last]
+        a, b = (
+            blocks.maps[ROW_MEDIAN, max(row - 2, 0), first:last],
+            blocks.maps[ROW_MEDIAN, max(row - 1, 0), first:last],
+        )
         below, last_row = min(row + 1, rows - 1), min(row + 2, rows - 1)
-        d, e = blocks.maps[MIDDLE, below, first:last], blocks.maps[MIDDLE, last_row, first:last]
-        c, out = blocks.maps[MIDDLE, row, first:last], blocks.maps[GROUND, row, first:last]
+        d, e = blocks.maps[ROW_MEDIAN, below, first:last], blocks.maps[ROW_MEDIAN, last_row, first:last]
+        c, out = blocks.maps[ROW_MEDIAN, row, first:last], blocks.maps[BACKGROUND, row, first:last]
         for j in range(out.shape[0]):
             out[j] = median5(a[j], b[j], c[j], d[j], e[j])
 
 
 @compiled
-def find_standing_out(
-    blocks: Blocks, runs: Ints, floor: float, slope: float, black: float, texture: float, banding: float,
-    least_sigmas: float, least_wide: float, searched: NDArray[np.uint8], found: Ints,
-) -> int:  # fmt: skip
-    """Blocks with a sum of 2x2 or 4x4 pixels `least_sigmas` over the background, or of 8x8 pixels `least_wide`.
+def find_bright_blocks(
+    blocks: Blocks,
+    runs: Ints,
+    noise: Noise,
+    min_sigmas: float,
+    min_sigmas_wide: float,
+    searched: NDArray[np.uint8],
+    found: Ints,
+) -> int:
+    """Find blocks with a sum of 2x2 or 4x4 pixels `min_sigmas` above the background, or of 8x8 `min_sigmas_wide`.
 
-    texture, banding: sigma of means over a few pixels by the background's structure, share of its level and DN.
-
-    Those marked in searched (n, m) are passed over, the others become marked. found (most, 3): row, column, and 1 where
-    it was only the 8x8 pixels. Returns how many.
+    Blocks marked in searched (n, m) are skipped, all others become marked. found (most, 3): row, column, and 1 if only
+    the sum of 8x8 pixels is above its threshold. Returns the number of blocks found.
     """
+    floor, slope, black = noise.floor, noise.slope, noise.black
+    texture, banding = TEXTURE_SHARE * noise.texture, TEXTURE_SHARE * noise.banding
     count = 0
-    fine, wide, texture2 = 16.0 * least_sigmas**2, 64.0 * least_wide**2, texture**2
+    fine, wide, texture2 = 16.0 * min_sigmas**2, 64.0 * min_sigmas_wide**2, texture**2
     banding2 = banding**2
     for k in range(runs.shape[0]):
         row, first, last = runs[k, 0], runs[k, 1], runs[k, 2]
-        ground, highest2 = blocks.maps[GROUND, row, first:last], blocks.maps[HIGHEST2, row, first:last]
+        background, highest2 = blocks.maps[BACKGROUND, row, first:last], blocks.maps[HIGHEST2, row, first:last]
         highest4, highest8 = blocks.maps[HIGHEST4, row, first:last], blocks.maps[HIGHEST8, row, first:last]
         excess, excess8 = blocks.lines[0, : last - first], blocks.lines[1, : last - first]
-        for j in range(ground.shape[0]):  # squares over the variance, over their thresholds
-            level = ground[j] / 64.0
-            lit = level - black
-            variance, rough = floor + slope * (lit if lit > 0.0 else 0.0), texture2 * level * level + banding2
+        for j in range(background.shape[0]):  # squared excess relative to the squared threshold
+            level = background[j] / 64.0
+            above_black = level - black
+            variance, structure = (
+                floor + slope * (above_black if above_black > 0.0 else 0.0),
+                texture2 * level * level + banding2,
+            )
             a, b, c = 2.0 * (highest2[j] - 4.0 * level), highest4[j] - 16.0 * level, highest8[j] - 64.0 * level
             a, b, c = (a if a > 0.0 else 0.0), (b if b > 0.0 else 0.0), (c if c > 0.0 else 0.0)
-            a, b = a * a / (fine * (variance + 4.0 * rough)), b * b / (fine * (variance + 16.0 * rough))
+            a, b = a * a / (fine * (variance + 4.0 * structure)), b * b / (fine * (variance + 16.0 * structure))
             excess[j] = a if a > b else b
-            excess8[j] = c * c / (wide * (variance + 64.0 * rough))
-        for j in range(ground.shape[0]):
+            excess8[j] = c * c / (wide * (variance + 64.0 * structure))
+        for j in range(background.shape[0]):
             if searched[row, first + j]:
                 continue
             searched[row, first + j] = 1

@@ -1,8 +1,8 @@
-"""Where in a picture a spot may be: a closer look at the blocks that stand out.
+"""Candidate positions of spots: the peaks in bright blocks.
 
-A candidate is a maximum of the mean of 3x3 pixels. How far it stands out is asked of the means of 3x3, 5x5 and 7x7
-pixels, matched filters for spots of 1 to 3 px sigma that lose an eighth of the signal-to-noise ratio; spots so wide and
-faint that only a mean of 8x8 pixels shows them are looked for apart (`_wide_peak`).
+A candidate is a maximum of the mean of 3x3 pixels. Its significance is tested with the means of 3x3, 5x5 and 7x7
+pixels, which approximate the matched filters of spots of 1 to 3 px sigma with a loss of an eighth of the
+signal-to-noise ratio. Wide faint spots that only a mean of 8x8 pixels detects are found by `_wide_peak`.
 """
 
 from __future__ import annotations
@@ -14,82 +14,64 @@ import numpy as np
 
 from geometry.arrays import Array, Ints
 from geometry.compilation.jit import compiled
-from tracking.detection.block_search import BLOCK, GROUND, HIGHEST8, Blocks
-from tracking.detection.pixels import Pixels, clamped, mean3, mirrored, pixel
+from tracking.detection.block_search import BACKGROUND, BLOCK, HIGHEST8, Blocks
+from tracking.detection.pixels import Noise, Pixels, clamped, mean3, mirrored, pixel, texture_variance, variance
 
-RADIUS = 48  # px: peaks further apart than this never belong to one spot of the largest size
-NEAREST = 4  # brighter peaks that a peak is compared with
+RADIUS = 48  # px: peaks farther apart than this are never parts of one spot of the largest size
+MAX_COMPARED = 4  # number of brighter peaks that a peak is compared with
 DIP = 0.12  # share of the fainter peak by which the light must fall between two spots: speckle falls by less
-HALO = 0.012  # ... and of the brighter peak: rings and halos of real beams have up to 0.009
-HOT = 0.08  # light of the four neighbours over the pixel's: 0.15 for the sharpest spot (1 px wide), 0 for a hot pixel
-HOT_SIGMAS = 4.0  # a pixel must stand out so far of its surroundings to be called hot
-_BESIDE_HOT = 2.0  # sigmas over a hot pixel's neighbours at which the others are cut: hot pixels come in pairs
-_REACH = 4  # px around a block that are looked at with it: 2 for maxima, 2 for the means
+HALO_SHARE = 0.012  # ... and of the brighter peak: rings and halos of real beams have up to 0.009
+# Mean light of the four neighbours relative to the pixel's: 0.15 for the sharpest spot (1 px wide), 0 for a hot pixel.
+HOT_SHARE = 0.08
+HOT_SIGMAS = 4.0  # least excess of a hot pixel over its surroundings
+_BESIDE_HOT = 2.0  # sigmas above a hot pixel's neighbours at which other pixels are clipped: hot pixels occur in pairs
+_REACH = 4  # px around a block that its search uses: 2 for maxima, 2 for the means
 _SIDE = BLOCK + 2 * _REACH
-_WEAK, _WEAK_SHARE = 20.0, 0.7  # sigmas below which a peak must also stand out of the background's curvature; how far
-_WIDE_CLIP = 4.0  # sigmas over the background at which pixels are cut where a wide faint spot is looked for
+_WEAK = 20.0  # sigmas: a weaker peak must also exceed the background's curvature ...
+_WEAK_SHARE = 0.7  # ... by this share of the threshold
+_WIDE_CLIP = 4.0  # sigmas above the background at which pixels are clipped in the search for wide faint spots
 
 
-class Noise(NamedTuple):
-    """tracking.noise.NoiseModel for compiled code."""
-
-    floor: float
-    slope: float
-    black: float
-    texture: float
-    banding: float
-
-
-TEXTURE_SHARE = 5.0 / 6.0  # of the threshold: sigmas of the texture that a spot must stand out by; there are far fewer
-# independent places in it than pixels
-
-
-# Columns of peaks (most, 5), places where a spot may be: px; the mean of 3x3 pixels above the background and that, DN;
-# 1 where it is seen in the mean of 8x8 pixels only
+# Columns of peaks (most, 5): position, px; mean of 3x3 pixels above the background, and the background, DN; 1 if only
+# the mean of 8x8 pixels detects the peak.
 AT_U, AT_V, HEIGHT, LEVEL, WIDE = range(5)
 
 
-def room_for_a_block() -> Array:
-    """Room to work in: pixels; sums of three in a row, of 3x3; a few numbers."""
+def block_workspace() -> Array:
+    """Workspace for one block: pixels; sums of three in a row; sums of 3x3; scratch values."""
     return np.zeros((4, _SIDE, _SIDE))
 
 
-@compiled
-def variance(noise: Noise, level: float) -> float:
-    """Of a pixel of that expected grey value, DN^2."""
-    return noise.floor + noise.slope * max(level - noise.black, 0.0)
+class PeakSearch(NamedTuple):
+    """The arrays of the search for peaks in one picture."""
+
+    image: Pixels
+    noise: Noise
+    blocks: Blocks
+    workspace: Array  # see `block_workspace`
+    peaks: Array  # (most, 5), the peaks found
 
 
 @compiled
-def texture_variance(noise: Noise, level: float) -> float:
-    """Of the mean of a few pixels of a background of that level, by its fixed structure and by rounding, DN^2."""
-    return TEXTURE_SHARE**2 * ((noise.texture * level) ** 2 + noise.banding**2)
-
-
-@compiled
-def find_peaks(
-    image: Pixels, blocks: Blocks, noise: Noise, found: Ints, found_count: int, least_sigmas: float, room: Array,
-    peaks: Array, count: int,
-) -> int:  # fmt: skip
-    """Add the peaks of the blocks `found` to the first `count` ones; returns how many there are then."""
+def find_peaks(search: PeakSearch, found: Ints, found_count: int, min_sigmas: float, count: int) -> int:
+    """Append the peaks of the blocks `found` to the first `count` peaks; returns the new number of peaks."""
+    blocks = search.blocks
     for k in range(found_count):
         row, column = found[k, 0], found[k, 1]
         if not found[k, 2]:
-            level = blocks.maps[GROUND, row, column] / 64.0
-            count = _peaks_of_block(image, BLOCK * column, BLOCK * row, level, noise, least_sigmas, room, peaks, count)
+            level = blocks.maps[BACKGROUND, row, column] / 64.0
+            count = _peaks_of_block(search, BLOCK * column, BLOCK * row, level, min_sigmas, count)
         elif _is_highest_block(blocks, row, column):
-            count = _wide_peak(image, blocks, row, column, noise, least_sigmas, room, peaks, count)
+            count = _wide_peak(search, row, column, min_sigmas, count)
     return count
 
 
 @compiled
-def _peaks_of_block(
-    image: Pixels, left: int, top: int, level: float, noise: Noise, least_sigmas: float, room: Array, peaks: Array,
-    count: int,
-) -> int:  # fmt: skip
-    """Maxima of the mean of 3x3 pixels among 5x5 of them that lie in one block and stand out."""
-    values, lines, sum3, few = room[0], room[1], room[2], room[3, 0]
-    # Mirrored at the border: with repeated pixels the maximum of a spot at the edge would come to lie outside.
+def _peaks_of_block(search: PeakSearch, left: int, top: int, level: float, min_sigmas: float, count: int) -> int:
+    """Append the significant maxima, among 5x5 neighbours, of the mean of 3x3 pixels in one block."""
+    image, noise, peaks, workspace = search.image, search.noise, search.peaks, search.workspace
+    values, lines, sum3, scratch = workspace[0], workspace[1], workspace[2], workspace[3, 0]
+    # Mirrored at the border: with repeated pixels the maximum of a spot at the edge would lie outside the picture.
     for i in range(_SIDE):
         v = mirrored(top + i - _REACH, image.height)
         for j in range(_SIDE):
@@ -102,40 +84,40 @@ def _peaks_of_block(
             sum3[i, j] = lines[i - 1, j] + lines[i, j] + lines[i + 1, j]
     noise2, texture2 = variance(noise, level), texture_variance(noise, level)
     sigma = sqrt(noise2)
-    least3 = least_sigmas * sqrt(noise2 + 9.0 * texture2)
-    least5 = least_sigmas * sqrt(noise2 + 25.0 * texture2)
-    least7 = least_sigmas * sqrt(noise2 + 49.0 * texture2)
+    least3 = min_sigmas * sqrt(noise2 + 9.0 * texture2)
+    least5 = min_sigmas * sqrt(noise2 + 25.0 * texture2)
+    least7 = min_sigmas * sqrt(noise2 + 49.0 * texture2)
     for i in range(_REACH, min(_REACH + BLOCK, image.height - top + _REACH)):
         for j in range(_REACH, min(_REACH + BLOCK, image.width - left + _REACH)):
             if sum3[i, j] <= 9 * level or not _is_maximum(sum3, i, j):
                 continue
-            height3, height5 = sum3[i, j] - 9 * level, _sum_below(values, i, j, 2, np.inf) - 25 * level
-            height7 = _sum_below(values, i, j, 3, np.inf) - 49 * level
+            height3, height5 = sum3[i, j] - 9 * level, _clipped_sum(values, i, j, 2, np.inf) - 25 * level
+            height7 = _clipped_sum(values, i, j, 3, np.inf) - 49 * level
             if height3 / 3 < least3 and height5 / 5 < least5 and height7 / 7 < least7:
                 continue
             u, v = left + j - _REACH, top + i - _REACH
-            limit = _hot_limit(image, u, v, noise, level + height3 / 9, few)
+            limit = _hot_pixel_limit(image, u, v, noise, level + height3 / 9, scratch)
             if limit < np.inf:
-                height3 = _sum_below(values, i, j, 1, limit) - 9 * level
-                height5 = _sum_below(values, i, j, 2, limit) - 25 * level
-                height7 = _sum_below(values, i, j, 3, limit) - 49 * level
+                height3 = _clipped_sum(values, i, j, 1, limit) - 9 * level
+                height5 = _clipped_sum(values, i, j, 2, limit) - 25 * level
+                height7 = _clipped_sum(values, i, j, 3, limit) - 49 * level
             if height3 / 3 < least3 and height5 / 5 < least5 and height7 / 7 < least7:
                 continue
             if height3 <= 0 or count >= peaks.shape[0]:
                 continue
-            if max(height3 / 3, height5 / 5, height7 / 7) < _WEAK * sigma:  # is it the top of a diffuse reflection?
-                more = _level_around(image, u, v, level + _WIDE_CLIP * sigma, few) - level
+            if max(height3 / 3, height5 / 5, height7 / 7) < _WEAK * sigma:  # may be the top of a diffuse reflection
+                more = _background_around(image, u, v, level + _WIDE_CLIP * sigma, scratch) - level
                 higher = max(height3 / 3 - 3 * more, height5 / 5 - 5 * more, height7 / 7 - 7 * more)
-                if higher < _WEAK_SHARE * least_sigmas * sigma:
+                if higher < _WEAK_SHARE * min_sigmas * sigma:
                     continue
-            _add(peaks, count, u, v, height3 / 9, level, 0.0)
+            _store_peak(peaks, count, u, v, height3 / 9, level, 0.0)
             count += 1
     return count
 
 
 @compiled
 def _is_maximum(values: Array, i: int, j: int) -> bool:
-    """Whether no value among the 5x5 around is larger, nor an earlier one as large."""
+    """Whether no value among the 5x5 neighbours is larger, and no earlier one is equal."""
     here = values[i, j]
     for a in range(i - 2, i + 3):
         for b in range(j - 2, j + 3):
@@ -145,8 +127,8 @@ def _is_maximum(values: Array, i: int, j: int) -> bool:
 
 
 @compiled
-def _sum_below(values: Array, i: int, j: int, reach: int, limit: float) -> float:
-    """The sum of the values around one, each cut at the limit."""
+def _clipped_sum(values: Array, i: int, j: int, reach: int, limit: float) -> float:
+    """The sum of the values within `reach` of one, each clipped at the limit."""
     total = 0.0
     for a in range(i - reach, i + reach + 1):
         for b in range(j - reach, j + reach + 1):
@@ -155,11 +137,11 @@ def _sum_below(values: Array, i: int, j: int, reach: int, limit: float) -> float
 
 
 @compiled
-def _hot_limit(image: Pixels, u: int, v: int, noise: Noise, level: float, few: Array) -> float:
-    """If the brightest of 3x3 pixels is hot, how bright light may be beside it, DN; else inf.
+def _hot_pixel_limit(image: Pixels, u: int, v: int, noise: Noise, level: float, scratch: Array) -> float:
+    """The clipping limit, DN, for the neighbours of the brightest of 3x3 pixels if that one is hot; else inf.
 
-    Hot is what stands alone, as no light does that came through a lens. `level`, DN, gives the noise: on the broad top
-    of a wide spot the highest pixel is the luckiest one.
+    A hot pixel is isolated, unlike light that passed through a lens. `level`, DN, sets the noise: at the flat top of a
+    wide spot the value of the highest pixel itself is biased upwards.
     """
     best, bu, bv = -1.0, u, v
     for i in range(max(v - 1, 0), min(v + 2, image.height)):
@@ -172,21 +154,21 @@ def _hot_limit(image: Pixels, u: int, v: int, noise: Noise, level: float, few: A
         row = mirrored(bv + i, image.height)
         for j in range(-2, 3):
             if max(abs(i), abs(j)) == 2:
-                few[n] = pixel(image, mirrored(bu + j, image.width), row)
+                scratch[n] = pixel(image, mirrored(bu + j, image.width), row)
                 n += 1
             elif abs(i) + abs(j) == 1:
                 cross += 0.25 * pixel(image, mirrored(bu + j, image.width), row)
-    sort(few, 16)
-    ring = 0.5 * (few[7] + few[8])
+    insertion_sort(scratch, 16)
+    ring = 0.5 * (scratch[7] + scratch[8])
     above = best - ring
-    if cross - ring < HOT * above and above > HOT_SIGMAS * sqrt(variance(noise, level)):
+    if cross - ring < HOT_SHARE * above and above > HOT_SIGMAS * sqrt(variance(noise, level)):
         return cross + _BESIDE_HOT * sqrt(variance(noise, cross))
     return np.inf
 
 
 @compiled
-def sort(values: Array, n: int) -> None:
-    """Sort the first n values, few of them, in place."""
+def insertion_sort(values: Array, n: int) -> None:
+    """Sort the first n values in place; for small n."""
     for i in range(1, n):
         x, j = values[i], i
         while j > 0 and values[j - 1] > x:
@@ -208,14 +190,12 @@ def _is_highest_block(blocks: Blocks, row: int, column: int) -> bool:
 
 
 @compiled
-def _wide_peak(
-    image: Pixels, blocks: Blocks, row: int, column: int, noise: Noise, least_sigmas: float, room: Array, peaks: Array,
-    count: int,
-) -> int:  # fmt: skip
-    """A peak where 8x8 pixels stand out of the surroundings by more than their curvature explains.
+def _wide_peak(search: PeakSearch, row: int, column: int, min_sigmas: float, count: int) -> int:
+    """Append a peak where the mean of 8x8 pixels exceeds the background by more than the background's curvature.
 
-    Bright pixels are cut, for a hot one is no spot.
+    Bright pixels are clipped, so that a hot pixel does not become a wide spot.
     """
+    image, noise, blocks, peaks = search.image, search.noise, search.blocks, search.peaks
     rows, columns = blocks.quads.shape
     bi, bj, best = 2 * row, 2 * column, -1.0
     for i in range(2 * row, min(2 * row + 2, rows - 1)):
@@ -226,32 +206,32 @@ def _wide_peak(
     u, v = 4 * bj + 4, 4 * bi + 4
     if u >= image.width or v >= image.height:
         return count
-    few = room[3, 0]
-    level = blocks.maps[GROUND, row, column] / 64.0
+    scratch = search.workspace[3, 0]
+    level = blocks.maps[BACKGROUND, row, column] / 64.0
     sigma2 = variance(noise, level)
     top = level + _WIDE_CLIP * sqrt(sigma2)
     here = _mean8(image, u, v, top)
-    height = here - _level_around(image, u, v, top, few)
+    height = here - _background_around(image, u, v, top, scratch)
     # A median of eight has 1.4 times the variance of their mean.
     scatter = sqrt((sigma2 / 64.0 + texture_variance(noise, level)) * (1 + 1.4 / 8 * 17.0 / 9.0))
-    if height < least_sigmas * scatter or count >= peaks.shape[0]:
+    if height < min_sigmas * scatter or count >= peaks.shape[0]:
         return count
-    _add(peaks, count, u, v, height, level, 1.0)
+    _store_peak(peaks, count, u, v, height, level, 1.0)
     return count + 1
 
 
 @compiled
-def _add(peaks: Array, row: int, u: int, v: int, height: float, level: float, wide: float) -> None:
+def _store_peak(peaks: Array, row: int, u: int, v: int, height: float, level: float, wide: float) -> None:
     peak = peaks[row]
     peak[AT_U], peak[AT_V], peak[HEIGHT], peak[LEVEL], peak[WIDE] = u, v, height, level, wide
 
 
 @compiled
-def _level_around(image: Pixels, u: int, v: int, top: float, few: Array) -> float:
-    """The background at a point from what is around it, DN: right on a plane and on a paraboloid.
+def _background_around(image: Pixels, u: int, v: int, top: float, scratch: Array) -> float:
+    """The background at a point from its surroundings, DN: correct for a plane and for a paraboloid.
 
-    It is 4/3 r - 1/3 R with r and R the medians of eight means of 8x8 pixels, cut at `top`, 16 and 32 px away: the
-    curvature of a diffuse reflection falls out.
+    It is 4/3 r - 1/3 R with r and R the medians of eight means of 8x8 pixels, clipped at `top`, 16 and 32 px away,
+    which cancels the curvature of a diffuse reflection. Source: ours.
     """
     level = 0.0
     for k in range(2):
@@ -259,16 +239,16 @@ def _level_around(image: Pixels, u: int, v: int, top: float, few: Array) -> floa
         for i in range(-1, 2):
             for j in range(-1, 2):
                 if i != 0 or j != 0:
-                    few[n] = _mean8(image, u + j * away, v + i * away, top)
+                    scratch[n] = _mean8(image, u + j * away, v + i * away, top)
                     n += 1
-        sort(few, 8)
-        level += (4.0 / 3.0 if k == 0 else -1.0 / 3.0) * 0.5 * (few[3] + few[4])
+        insertion_sort(scratch, 8)
+        level += (4.0 / 3.0 if k == 0 else -1.0 / 3.0) * 0.5 * (scratch[3] + scratch[4])
     return level
 
 
 @compiled
 def _mean8(image: Pixels, u: int, v: int, top: float) -> float:
-    """The mean of 8x8 pixels, cut at `top`, from u - 4, v - 4 on; the border's pixels are repeated outside."""
+    """The mean of 8x8 pixels, clipped at `top`, starting at (u - 4, v - 4); border pixels are repeated outside."""
     total = 0.0
     for i in range(v - 4, v + 4):
         for j in range(u - 4, u + 4):
@@ -277,12 +257,14 @@ def _mean8(image: Pixels, u: int, v: int, top: float) -> float:
 
 
 @compiled
-def find_apart(image: Pixels, peaks: Array, order: Ints, noise: Noise, apart: Ints, near: Ints, gaps: Array) -> int:
-    """Which peaks, brightest first in `order`, are spots of their own; their number, and in `apart` which.
+def find_separate_peaks(
+    image: Pixels, peaks: Array, order: Ints, noise: Noise, separate: Ints, near: Ints, gaps: Array
+) -> int:
+    """The rows of separate spots among the peaks, into `separate`; returns their number. order: brightest peak first.
 
     Between a peak and each of the nearest brighter ones the light must fall by `DIP` of the fainter peak, and by four
-    sigmas of the difference of two means of nine pixels. A wide faint peak must have no other within 16 px. `near`,
-    `gaps` (NEAREST,) are room to work in.
+    sigmas of the difference of two means of nine pixels. A wide faint peak must have no other peak within 16 px.
+    `near`, `gaps` (MAX_COMPARED,) are workspace.
     """
     count = 0
     for place in range(order.shape[0]):
@@ -294,10 +276,10 @@ def find_apart(image: Pixels, peaks: Array, order: Ints, noise: Noise, apart: In
             needed = max(DIP * peaks[i, HEIGHT], 4.0 / 3.0 * sqrt(2.0) * sqrt(variance(noise, peaks[i, LEVEL])))
             for k in range(_nearest_brighter(peaks, order, place, near, gaps)):
                 lowest = _lowest_between(image, peaks, i, near[k]) - peaks[i, LEVEL]
-                least = max(needed, HALO * peaks[near[k], HEIGHT])
+                least = max(needed, HALO_SHARE * peaks[near[k], HEIGHT])
                 alone = alone and peaks[i, HEIGHT] - lowest >= least
         if alone:
-            apart[count] = i
+            separate[count] = i
             count += 1
     return count
 
@@ -317,26 +299,26 @@ def _has_neighbour(peaks: Array, order: Ints, i: int) -> bool:
 
 @compiled
 def _nearest_brighter(peaks: Array, order: Ints, place: int, near: Ints, gaps: Array) -> int:
-    """The nearest peaks, at most NEAREST, before a place in `order`, into `near`; their number."""
+    """The nearest of the peaks before `place` in `order`, at most MAX_COMPARED, into `near`; returns their number."""
     i, filled = order[place], 0
     for before in range(place):
         j = order[before]
         du, dv = peaks[i, AT_U] - peaks[j, AT_U], peaks[i, AT_V] - peaks[j, AT_V]
         gap = du * du + dv * dv
-        if peaks[j, WIDE] or gap >= RADIUS**2 or (filled == NEAREST and gap >= gaps[NEAREST - 1]):
+        if peaks[j, WIDE] or gap >= RADIUS**2 or (filled == MAX_COMPARED and gap >= gaps[MAX_COMPARED - 1]):
             continue
-        k = min(filled, NEAREST - 1)
+        k = min(filled, MAX_COMPARED - 1)
         while k > 0 and gaps[k - 1] > gap:
             gaps[k], near[k] = gaps[k - 1], near[k - 1]
             k -= 1
         gaps[k], near[k] = gap, j
-        filled = min(filled + 1, NEAREST)
+        filled = min(filled + 1, MAX_COMPARED)
     return filled
 
 
 @compiled
 def _lowest_between(image: Pixels, peaks: Array, i: int, j: int) -> float:
-    """The lowest mean of 3x3 pixels on the line between two peaks, at eleven places."""
+    """The lowest mean of 3x3 pixels at eleven points on the line between two peaks."""
     lowest = np.inf
     for k in range(1, 12):
         share = k / 12.0

@@ -1,4 +1,4 @@
-"""From a grey picture to the points of light in it."""
+"""Detection of the points of light in a grey picture."""
 
 from __future__ import annotations
 
@@ -11,19 +11,27 @@ from numpy.typing import ArrayLike
 from geometry.arrays import Array, Ints
 from geometry.camera import SensorNoise
 from tracking.detection.block_search import Blocks, bin_pixels, runs_of
-from tracking.detection.candidates import AT_U, AT_V, HEIGHT, NEAREST, Noise, find_apart, room_for_a_block
+from tracking.detection.candidates import (
+    AT_U,
+    AT_V,
+    HEIGHT,
+    MAX_COMPARED,
+    PeakSearch,
+    block_workspace,
+    find_separate_peaks,
+)
 from tracking.detection.gaussian_fit import reach_of
-from tracking.detection.measuring import DetectionLimits, measure, write_out
-from tracking.detection.pixels import Pixels
-from tracking.detection.regions import MARGIN, NEAR, boxes_of, find_relevant
-from tracking.detection.search import HALO, find_peaks_in
-from tracking.detection.table import ALGEBRA, CELL_ROWS, COLUMNS, MOST_CELLS, SPAN
+from tracking.detection.measuring import DetectionLimits, measure, write_detections
+from tracking.detection.pixels import Noise, Pixels
+from tracking.detection.regions import INITIAL_REACH, MARGIN, boxes_of, find_relevant
+from tracking.detection.search import BORDER_BLOCKS, find_peaks_in
+from tracking.detection.table import ALGEBRA, CELL_ROWS, CELL_SIZE, COLUMNS, MOST_CELLS
 from tracking.detections import Detections
 from tracking.noise import NoiseModel, Picture, guess_noise
 from tracking.parameters import DetectParameters
 
 _EVERYWHERE = np.array([[0.0, 0.0, 1e9]])
-_own = threading.local()  # .finder: each thread's last one
+_thread_local = threading.local()  # .finder: the last finder of each thread
 
 
 def find_spots(
@@ -34,42 +42,43 @@ def find_spots(
 ) -> Detections:
     """The spots of a grey picture (h, w), 8 or 16 bit, brightest (by flux) first.
 
-    Without a noise model the background's noise is taken from the picture itself (0.3 ms more); a run does better to
-    estimate it once, from several pictures (tracking.noise.estimate_noise).
+    Without a noise model the noise of the background is estimated from the picture (0.3 ms more). For a run it is
+    better to estimate it once from several pictures (noise_estimation.photon_transfer.estimate_noise).
 
-    regions (n, 3), px: boxes u, v, half size; only spots in one of them are looked for and returned. They are the same,
-    bit for bit, as those of the whole picture there, as long as that has fewer than max_detections. Boxes with nan or
-    of negative size hold nothing.
+    regions (n, 3), px: boxes u, v, half size; only spots in one of them are searched and returned. They are identical,
+    bit for bit, to those of the whole picture, if that has fewer than max_detections. Boxes with nan or a negative size
+    are empty.
 
-    Errors: ValueError if the picture or the regions are not of that form.
+    Raises:
+        ValueError: if the picture or the regions have another shape or type.
     """
     if image.ndim != 2 or image.dtype not in (np.uint8, np.uint16):
         raise ValueError(f"picture: expected grey (h, w) of uint8 or uint16, got shape {image.shape} of {image.dtype}")
     if not image.size:
         return Detections.none()
-    finder: SpotFinder | None = getattr(_own, "finder", None)
+    finder: SpotFinder | None = getattr(_thread_local, "finder", None)
     if finder is None or (finder.height, finder.width, finder.most) != (*image.shape, parameters.max_detections):
-        finder = _own.finder = SpotFinder(image.shape[1], image.shape[0], parameters.max_detections)
+        finder = _thread_local.finder = SpotFinder(image.shape[1], image.shape[0], parameters.max_detections)
     return finder.find(image, parameters, noise, regions)
 
 
 class SpotFinder:
-    """Finds spots in pictures of one size and keeps the room to work in; for one thread at a time."""
+    """Finds spots in pictures of one size with preallocated arrays; for one thread at a time."""
 
     def __init__(self, width: int, height: int, most: int = 400) -> None:
-        """most: DetectParameters.max_detections of the calls to come."""
+        """most: DetectParameters.max_detections of all later calls."""
         self.width, self.height, self.most = width, height, most
         self._blocks = Blocks.of(width, height)
         rows, columns = self._blocks.maps.shape[1:]
         self._whole = np.array([[0, rows - 1, 0, columns - 1]])
         self._runs = np.zeros((rows + 4, 3), np.int64)
         self._searched = np.zeros((rows, columns), np.uint8)
-        self._standing_out = np.zeros((rows * columns, 3), np.int64)
-        self._room, self._peaks = room_for_a_block(), np.zeros((4 * rows * columns, 5))
-        self._apart, self._near, self._gaps = (
+        self._bright_blocks = np.zeros((rows * columns, 3), np.int64)
+        self._workspace, self._peaks = block_workspace(), np.zeros((4 * rows * columns, 5))
+        self._separate, self._near, self._gaps = (
             np.zeros(4 * most, np.int64),
-            np.zeros(NEAREST, np.int64),
-            np.zeros(NEAREST),
+            np.zeros(MAX_COMPARED, np.int64),
+            np.zeros(MAX_COMPARED),
         )
         self._cells, self._algebra = np.zeros((CELL_ROWS, MOST_CELLS)), np.zeros((ALGEBRA, 9, 10))
         self._table, self._count, self._out = np.zeros((most, COLUMNS)), 0, np.zeros((most, 10))
@@ -81,7 +90,7 @@ class SpotFinder:
         noise: SensorNoise | NoiseModel | None,
         regions: ArrayLike | None = None,
     ) -> Detections:
-        """What find_spots does, for a picture of this size."""
+        """As `find_spots`, for a picture of this size."""
         task = _Task.of(image, parameters, NoiseModel.of(noise) if isinstance(noise, SensorNoise) else noise)
         self._searched[:] = 0
         if regions is None:
@@ -91,51 +100,54 @@ class SpotFinder:
         if boxes.ndim != 2 or boxes.shape[1] != 3:
             raise ValueError(f"regions: expected (n, 3): u, v and half size in px, got shape {boxes.shape}")
         boxes = np.ascontiguousarray(boxes)
-        self._find_near(task, boxes)
+        self._find_in_regions(task, boxes)
         return self._detections(boxes)
 
-    def _find_near(self, task: _Task, regions: Array) -> None:
-        """Measure the peaks in regions and all that bear on them."""
-        room = np.zeros((max(len(regions), 64), 4), np.int64)
-        boxes, count = room[: boxes_of(regions, self.width, self.height, room)], 0
+    def _find_in_regions(self, task: _Task, regions: Array) -> None:
+        """Measure the peaks in the regions and all other peaks that affect them."""
+        workspace = np.zeros((max(len(regions), 64), 4), np.int64)
+        boxes, count = workspace[: boxes_of(regions, self.width, self.height, workspace)], 0
         reach = np.zeros(0)
         while True:
             count = self._search(task, boxes, count)
-            reach = np.concatenate([reach, np.full(count - len(reach), NEAR)])
+            reach = np.concatenate([reach, np.full(count - len(reach), INITIAL_REACH)])
             relevant = np.zeros(count, np.int64)
             more = find_relevant(
-                self._peaks[:count], regions, reach, self._searched, self.width, self.height, relevant, room
+                self._peaks[:count], regions, reach, self._searched, self.width, self.height, relevant, workspace
             )
             if more:
-                boxes = room[:more]
+                boxes = workspace[:more]
                 continue
             chosen = self._measure(task, count, relevant)
-            needed = np.array([reach_of(int(cell)) for cell in self._table[: len(chosen), SPAN]])
+            needed = np.array([reach_of(int(cell)) for cell in self._table[: len(chosen), CELL_SIZE]])
             far = needed + MARGIN > reach[chosen]
             far &= needed > reach_of(1)
             if not far.any():
                 return
             reach[chosen[far]] = needed[far] + MARGIN
-            boxes = room[:0]
+            boxes = workspace[:0]
 
     def _search(self, task: _Task, boxes: Ints, count: int) -> int:
-        """Add the peaks in boxes of blocks to the first `count` ones; their number then."""
+        """Append the peaks in boxes of blocks to the first `count` peaks; returns the new number of peaks."""
         rows, columns = self._blocks.maps.shape[1:]
         needed = int((boxes[:, 1] - boxes[:, 0] + 5).sum())
         if len(self._runs) < needed:
             self._runs = np.zeros((2 * needed, 3), np.int64)
-        bin_pixels(task.image, self._runs[: runs_of(boxes, HALO, HALO, rows, columns, self._runs)], self._blocks.pairs)
-        return find_peaks_in(
-            boxes, task.pixels, self._blocks, task.noise, task.limits.threshold_sigma, self._searched,
-            self._standing_out, self._runs, self._room, self._peaks, count,
-        )  # fmt: skip
+        bin_pixels(
+            task.image,
+            self._runs[: runs_of(boxes, BORDER_BLOCKS, BORDER_BLOCKS, rows, columns, self._runs)],
+            self._blocks.pairs,
+        )
+        search = PeakSearch(task.pixels, task.noise, self._blocks, self._workspace, self._peaks)
+        threshold = task.limits.threshold_sigma
+        return find_peaks_in(boxes, search, threshold, self._searched, self._bright_blocks, self._runs, count)
 
     def _measure(self, task: _Task, count: int, relevant: Ints | None = None) -> Ints:
-        """Measure the relevant ones of the first `count` peaks that are spots of their own: which, row by row."""
+        """Measure the separate spots among the first `count` peaks, as far as relevant; the rows of their peaks."""
         peaks = self._peaks[:count]
-        order = np.lexsort((peaks[:, AT_U], peaks[:, AT_V], -peaks[:, HEIGHT]))[: len(self._apart)]
-        n = find_apart(task.pixels, peaks, order, task.noise, self._apart, self._near, self._gaps)
-        chosen = self._apart[:n]
+        order = np.lexsort((peaks[:, AT_U], peaks[:, AT_V], -peaks[:, HEIGHT]))[: len(self._separate)]
+        n = find_separate_peaks(task.pixels, peaks, order, task.noise, self._separate, self._near, self._gaps)
+        chosen = self._separate[:n]
         if relevant is not None:
             chosen = chosen[relevant[chosen] > 0]
         chosen = chosen[: self.most]
@@ -145,14 +157,14 @@ class SpotFinder:
         return chosen
 
     def _detections(self, regions: Array) -> Detections:
-        """The spots among the candidates measured last that lie in one of the regions."""
-        rows = self._out[: write_out(self._table[: self._count], regions, self._out)]
+        """The spots, among the candidates measured last, that lie in one of the regions."""
+        rows = self._out[: write_detections(self._table[: self._count], regions, self._out)]
         cov = rows[:, [2, 3, 3, 4]].reshape(-1, 2, 2)
         return Detections(rows[:, :2].copy(), cov, *(rows[:, k].copy() for k in range(5, 10)))
 
 
 class _Task(NamedTuple):
-    """One picture and how it is to be searched."""
+    """One picture with the parameters of its search."""
 
     image: Picture
     pixels: Pixels

@@ -1,9 +1,10 @@
-"""Symmetric 2x2 matrices (uu, uv, vv), one at a time, compiled: the shapes of spots."""
+"""The elliptical shapes of spots: symmetric 2x2 matrices (uu, uv, vv) and rows of elliptical Gaussians, compiled."""
 
 from __future__ import annotations
 
-from math import atan2, degrees, hypot, sqrt
+from math import atan2, degrees, exp, hypot, sqrt
 
+from geometry.arrays import Array
 from geometry.compilation.jit import compiled
 
 Entries = tuple[float, float, float]
@@ -11,7 +12,7 @@ Entries = tuple[float, float, float]
 
 @compiled
 def eigenvalues(uu: float, uv: float, vv: float) -> tuple[float, float]:
-    """The smaller and the larger one."""
+    """The smaller and the larger eigenvalue."""
     middle, gap = 0.5 * (uu + vv), hypot(0.5 * (uu - vv), uv)
     return middle - gap, middle + gap
 
@@ -35,14 +36,14 @@ def inverse(uu: float, uv: float, vv: float) -> Entries:
 
 
 @compiled
-def length(du: float, dv: float, uu: float, uv: float, vv: float) -> float:
+def mahalanobis(du: float, dv: float, uu: float, uv: float, vv: float) -> float:
     """Mahalanobis length of a step under a covariance."""
     return sqrt(max((vv * du * du - 2 * uv * du * dv + uu * dv * dv) / (uu * vv - uv * uv), 0.0))
 
 
 @compiled
-def with_eigenvalues(uu: float, uv: float, vv: float, low: float, high: float) -> Entries:
-    """The matrix with its eigenvalues raised to `low` and lowered to `high`."""
+def clip_eigenvalues(uu: float, uv: float, vv: float, low: float, high: float) -> Entries:
+    """The matrix with its eigenvalues clipped to [low, high]."""
     middle, gap = 0.5 * (uu + vv), hypot(0.5 * (uu - vv), uv)
     smaller, larger = middle - gap, middle + gap
     if smaller >= low and larger <= high:
@@ -55,15 +56,43 @@ def with_eigenvalues(uu: float, uv: float, vv: float, low: float, high: float) -
 
 
 @compiled
-def kept_within(shape: Entries, base: Entries, low: float, high: float) -> Entries:
+def clip_in_metric(shape: Entries, base: Entries, low: float, high: float) -> Entries:
     """The matrix `shape` with its eigenvalues in the metric of `base`, positive definite, clipped to [low, high]."""
-    # With base = L L^T: the eigenvalues of L^-1 shape L^-T are meant.
+    # With base = L L^T these are the eigenvalues of L^-1 shape L^-T.
     uu, uv, vv = shape
     l11 = sqrt(base[0])
     l21 = base[1] / l11
     l22 = sqrt(base[2] - l21 * l21)
     p, q = -l21 / (l11 * l22), 1.0 / l22
-    a, b, c = with_eigenvalues(
+    a, b, c = clip_eigenvalues(
         uu / (l11 * l11), (uu * p + uv * q) / l11, p * p * uu + 2 * p * q * uv + q * q * vv, low, high
     )
     return l11 * l11 * a, l11 * (l21 * a + l22 * b), l21 * l21 * a + 2 * l21 * l22 * b + l22 * l22 * c
+
+
+@compiled
+def gaussian_row(a: tuple[float, float, float], u0: float, v: float, step: float, out: Array) -> None:
+    """exp(-d^T A d / 2) at d = (u0 + j step, v), into out (n,); a is A (uu, uv, vv), 1/px^2.
+
+    The ratio of neighbouring values is a geometric sequence in j, so each value costs two products instead of an
+    exponential. The sequence starts at the maximum of the row and decreases in both directions, so errors do not grow.
+    """
+    n = out.shape[0]
+    top = -a[1] * v / a[0]
+    j = int(min(max((top - u0) / step + 0.5, 0.0), n - 1.0))
+    u = u0 + j * step
+    first = exp(-0.5 * (a[0] * u * u + 2.0 * a[1] * u * v + a[2] * v * v))
+    bend = exp(-a[0] * step * step)
+    right = exp(-a[0] * u * step - 0.5 * a[0] * step * step - a[1] * step * v)
+    left = bend / right
+    out[j] = first
+    value = first
+    for i in range(j + 1, n):
+        value *= right
+        right *= bend
+        out[i] = value
+    value = first
+    for i in range(j - 1, -1, -1):
+        value *= left
+        left *= bend
+        out[i] = value

@@ -1,4 +1,4 @@
-"""Measuring candidates: all of a picture are fitted together, each with its neighbours' light taken off."""
+"""The Gaussian fit of all candidates of a picture, each with the light of its neighbours subtracted."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ import numpy as np
 from geometry.arrays import Array
 from geometry.compilation.jit import compiled
 from tracking.detection import ellipse
-from tracking.detection.candidates import Noise
 from tracking.detection.normal_equations import PolynomialFrame, accumulate, add_light, frame_of, solve_normal
-from tracking.detection.pixels import VALID, Pixels, Window, cut, window_around
-from tracking.detection.quality import gain_over_plane, judge
+from tracking.detection.pixels import VALID, Noise, Pixels, Window, read_window, window_around
+from tracking.detection.quality import assess_fit, gain_over_plane
 from tracking.detection.table import (
     ACTIVE,
+    BACKGROUND,
+    CELL_SIZE,
     COV_UV,
     FACTOR,
     FLUX,
     GAIN,
     GAPS,
-    GROUND,
     LEVEL,
     MOMENT_U,
     MOMENT_UU,
@@ -28,8 +28,8 @@ from tracking.detection.table import (
     MOMENT_V,
     MOMENT_VV,
     NEAR,
+    NEIGHBOUR_LIGHT,
     NORMAL,
-    OTHERS,
     RESIDUAL,
     RIGHT_SIDE,
     ROW,
@@ -37,7 +37,6 @@ from tracking.detection.table import (
     SLOPE_U,
     SLOPE_V,
     SOLUTION,
-    SPAN,
     STATE,
     USE,
     UU,
@@ -52,64 +51,64 @@ from tracking.detection.table import (
     V,
 )
 
-_STEPS = 12  # Gauss-Newton converges in three or four; a clipped spot, whose top must be guessed, takes up to ten
-_CONVERGED, _CONVERGED_MOST = 0.1, 0.4  # of the centre's own sigma: after a smaller step there is no other
-_CURVED = 0.02  # the next step, of about step^2 / (2 width), may be a hundredth of the sigma
-_WINDOW = 3.7  # sigmas from centre to the window's side: 3.2 costs 3 % of the accuracy, 2.5 costs 8 %, for the plane
-_WINDOW_WIDE, _WIDE_PX = 3.2, 4.5  # ... of spots wider than this, for which the background is no plane over more
-_LEAST_HALF = 7  # cells from the centre to the side
-_MOST_NEIGHBOURS = 6
-_OUTLIER = 6.0  # sigmas by which a hot or dead pixel sticks out of the fit
-_LONELY = 2.5  # times its neighbours does it
-_LEAST_VARIANCE = 0.02  # px^2: narrower is a point to any sensor
+_STEPS = 12  # Gauss-Newton converges in three or four; a clipped spot, whose top is extrapolated, needs up to ten
+_CONVERGED, _CONVERGED_MOST = 0.1, 0.4  # of the centre's own sigma: a smaller step is the last one
+_CURVED = 0.02  # the next step is about step^2 / (2 width); it may be a hundredth of the sigma
+_WINDOW = 3.7  # sigmas from centre to side of the window: with 3.2 (2.5) the plane costs 3 % (8 %) of the accuracy
+_WINDOW_WIDE, _WIDE_PX = 3.2, 4.5  # ... of spots wider than this, whose background is not a plane over more
+_LEAST_HALF = 7  # cells from the centre to the side of the window
+_MOST_NEIGHBOURS = 6  # neighbours whose light is subtracted
+_OUTLIER = 6.0  # sigmas: least residual of a hot or dead pixel ...
+_ISOLATED = 2.5  # ... and its least ratio to the residuals of the neighbouring pixels
+_LEAST_VARIANCE = 0.02  # px^2: narrower spots cannot be distinguished from a point
 
 
 @compiled
 def fit_all(
-    image: Pixels, table: Array, noise: Noise, saturation: float, widest: float, least_gain: float, cells: Array,
+    image: Pixels, table: Array, noise: Noise, saturation: float, max_sigma: float, min_gain: float, cells: Array,
     algebra: Array,
 ) -> None:  # fmt: skip
-    """Fit all candidates of a picture (n, COLUMNS) together, from their moments, in place.
+    """Fit all candidates of a picture (n, COLUMNS) together, in place, starting from their moments.
 
-    Gauss-Newton as long as the centres move; clipped pixels, pixels outside and hot pixels are left out; the light of
-    the neighbours is taken off. A candidate that grows beyond `widest`, px, walks away, or lowers chi-square by less
-    than `least_gain` is given up: its flux is 0.
+    Gauss-Newton steps until the centres converge; clipped pixels, pixels outside and hot pixels are excluded, and the
+    light of the neighbours is subtracted. A candidate that grows beyond `max_sigma`, px, diverges, or lowers chi-square
+    by less than `min_gain` is rejected: its flux becomes 0.
     """
     n = table.shape[0]
     for i in range(n):
         spot = table[i]
         spot[U], spot[V], spot[UU], spot[UV] = spot[MOMENT_U], spot[MOMENT_V], spot[MOMENT_UU], spot[MOMENT_UV]
-        spot[VV], spot[LEVEL], spot[ACTIVE] = spot[MOMENT_VV], spot[GROUND], 1.0
+        spot[VV], spot[LEVEL], spot[ACTIVE] = spot[MOMENT_VV], spot[BACKGROUND], 1.0
         spot[SLOPE_U] = spot[SLOPE_V] = 0.0
         spot[FLUX] = max(spot[FLUX], 1.0)
-        if _is_lost(spot, widest):  # moments see a spot too wide rather than too narrow
+        if _has_diverged(spot, max_sigma):  # moments overestimate rather than underestimate the width
             spot[FLUX], spot[ACTIVE] = 0.0, 0.0
     for step in range(_STEPS):
-        busy = False
+        changed = False
         for i in range(n):
             spot = table[i]
             if not spot[ACTIVE]:
                 continue
-            spot[ACTIVE], spot[SPAN] = 0.0, max(spot[SPAN], 1.0 * window_of(spot).cell)
+            spot[ACTIVE], spot[CELL_SIZE] = 0.0, max(spot[CELL_SIZE], 1.0 * window_of(spot).cell)
             moved = _step(image, table, i, noise, saturation, step == _STEPS - 1, cells, algebra)
-            # Noise does not become a spot by further steps.
-            if _is_lost(spot, widest) or (step >= 1 and spot[GAIN] < least_gain):
+            # Further steps do not turn noise into a spot.
+            if _has_diverged(spot, max_sigma) or (step >= 1 and spot[GAIN] < min_gain):
                 spot[FLUX] = 0.0
             if spot[FLUX] <= 0.0:
                 moved = True
             elif moved:
                 spot[ACTIVE] = 1.0
             if moved:
-                busy = True
-                _wake_neighbours(table, i)
-        if not busy:
+                changed = True
+                _reactivate_neighbours(table, i)
+        if not changed:
             break
 
 
 @compiled
-def _is_lost(spot: Array, widest: float) -> bool:
-    """Whether a spot has become too wide, or has walked away from its moments."""
-    if ellipse.axes(spot[UU], spot[UV], spot[VV])[0] > 1.5 * widest:
+def _has_diverged(spot: Array, max_sigma: float) -> bool:
+    """Whether a spot has become too wide or too far from its moments."""
+    if ellipse.axes(spot[UU], spot[UV], spot[VV])[0] > 1.5 * max_sigma:
         return True
     away = sqrt((spot[U] - spot[MOMENT_U]) ** 2 + (spot[V] - spot[MOMENT_V]) ** 2)
     return away > 3.0 + 2.0 * ellipse.axes(spot[MOMENT_UU], spot[MOMENT_UV], spot[MOMENT_VV])[0]
@@ -119,18 +118,18 @@ def _is_lost(spot: Array, widest: float) -> bool:
 def _step(
     image: Pixels, table: Array, i: int, noise: Noise, saturation: float, last: bool, cells: Array, algebra: Array
 ) -> bool:
-    """One step of one spot; whether it moved by so much that there must be another."""
+    """One Gauss-Newton step of one spot; whether it needs another one."""
     spot, X, b = table[i], algebra[SOLUTION], algebra[VECTORS, RIGHT_SIDE]
     window = window_of(spot)
-    cut(image, window, saturation, cells[VALUES], cells[STATE])
+    read_window(image, window, saturation, cells[VALUES], cells[STATE])
     for k in range(window.columns * window.rows):
-        cells[OTHERS, k] = 0.0
+        cells[NEIGHBOUR_LIGHT, k] = 0.0
         cells[USE, k] = 1.0 if cells[STATE, k] == VALID else 0.0
     near, gaps = algebra[VECTORS, NEAR], algebra[VECTORS, GAPS]
     for k in range(_neighbours(table, i, window, near, gaps)):
-        add_light(window, table[int(near[k])], cells[ROW], cells[OTHERS])
+        add_light(window, table[int(near[k])], cells[ROW], cells[NEIGHBOUR_LIGHT])
     chi2 = accumulate(window, spot, noise, cells, algebra)
-    if _leave_out_lonely(window, spot, cells):
+    if _exclude_isolated_cells(window, spot, cells):
         chi2 = accumulate(window, spot, noise, cells, algebra)
     frame = frame_of(window, spot)
     if not _solve(frame, algebra):
@@ -145,38 +144,38 @@ def _step(
     spot[GAIN] = gain_over_plane(algebra[NORMAL], b, chi2, after)
     _advance(frame, spot, X)
     du, dv = spot[U] - before_u, spot[V] - before_v
-    moved = _is_far(du, var_u, spot[UU]) or _is_far(dv, var_v, spot[VV])
+    moved = _needs_another_step(du, var_u, spot[UU]) or _needs_another_step(dv, var_v, spot[VV])
     if not moved or last:
         spot[VAR_U], spot[COV_UV], spot[VAR_V], spot[SIGMA_FLUX] = var_u, cov_uv, var_v, sigma_flux
-        judge(window, frame, after, cells, spot)
-        if moved:  # a centre that still moves is known no better than by that
+        assess_fit(window, frame, after, cells, spot)
+        if moved:  # the last step is added to the uncertainty of a centre that has not converged
             spot[VAR_U], spot[COV_UV] = spot[VAR_U] + du * du, spot[COV_UV] + du * dv
             spot[VAR_V] += dv * dv
     return moved and not last
 
 
 @compiled
-def _is_far(step: float, variance: float, width2: float) -> bool:
-    """Whether after this step of Gauss-Newton, whose error falls with its square, there must be another."""
+def _needs_another_step(step: float, variance: float, width2: float) -> bool:
+    """Whether another Gauss-Newton step is needed after this one; the error falls with the square of the step."""
     sigma = sqrt(variance)
     return abs(step) > max(_CONVERGED * sigma, min(_CONVERGED_MOST * sigma, sqrt(_CURVED * sigma * sqrt(width2))))
 
 
 @compiled
 def _half_width(variance: float) -> float:
-    """Half width, px, of the window for a spot: its wings and a ring of background."""
+    """Half width, px, of the window for a spot of this variance, px^2: its wings and a ring of background."""
     sigma = sqrt(variance + 1 / 12.0)
     return max(min(_WINDOW * sigma, _WINDOW * _WIDE_PX), _WINDOW_WIDE * sigma) + 1.0
 
 
 @compiled
 def window_of(spot: Array) -> Window:
-    """The window that a spot (9,) needs. One long in u or v only gets a rectangle."""
+    """The window of a spot (9,): a rectangle, with larger cells for wide spots."""
     half_u, half_v = _half_width(spot[UU]), _half_width(spot[VV])
     half = max(half_u, half_v)
     cell, most = 1, 18
     if half > 18:
-        # A long streak too has cells of two: four would blur its narrow side.
+        # A long streak has cells of two pixels as well, because four would blur its narrow side.
         slim = ellipse.eigenvalues(spot[UU], spot[UV], spot[VV])[0] < 9.0
         cell, most = (2, 36) if half <= 36 or slim else (4, 24)
     columns = ceil(min(max(half_u / cell, _LEAST_HALF), most))
@@ -186,13 +185,13 @@ def window_of(spot: Array) -> Window:
 
 @compiled
 def reach_of(cell: int) -> float:
-    """Pixels from a spot whose windows have such cells at which another one may lie that changes its measurement."""
+    """The largest distance, px, of another spot that affects the measurement of a spot with this cell size."""
     return 40.0 if cell == 1 else (80.0 if cell == 2 else 150.0)
 
 
 @compiled
 def _gap(spot: Array, other: Array, window: Window) -> float:
-    """Pixels between the window of a spot and the light of another one; negative where that shines in."""
+    """Pixels between the window of a spot and the light of another one; negative if the light reaches the window."""
     du, dv = abs(spot[U] - other[U]), abs(spot[V] - other[V])
     if max(du, dv) >= reach_of(window.cell):
         return np.inf
@@ -203,7 +202,7 @@ def _gap(spot: Array, other: Array, window: Window) -> float:
 
 @compiled
 def _neighbours(table: Array, i: int, window: Window, near: Array, gaps: Array) -> int:
-    """The spots whose light reaches into a window most, into `near`; their number."""
+    """The spots whose light reaches farthest into a window, into `near`; returns their number."""
     filled = 0
     for j in range(table.shape[0]):
         if j == i or table[j, FLUX] <= 0.0:
@@ -221,8 +220,8 @@ def _neighbours(table: Array, i: int, window: Window, near: Array, gaps: Array) 
 
 
 @compiled
-def _wake_neighbours(table: Array, i: int) -> None:
-    """A spot has moved: those into whose windows it shines must be fitted again."""
+def _reactivate_neighbours(table: Array, i: int) -> None:
+    """Mark the spots into whose windows spot i shines to be fitted again, because it has moved."""
     for j in range(table.shape[0]):
         spot = table[j]
         if j != i and not spot[ACTIVE] and spot[FLUX] > 0.0 and _gap(spot, table[i], window_of(spot)) < 0:
@@ -230,35 +229,35 @@ def _wake_neighbours(table: Array, i: int) -> None:
 
 
 @compiled
-def _leave_out_lonely(window: Window, spot: Array, cells: Array) -> bool:
-    """Take out cells that stick out of the fit and of all eight neighbours: hot or dead pixels, never a spot's body."""
+def _exclude_isolated_cells(window: Window, spot: Array, cells: Array) -> bool:
+    """Exclude cells with a large residual that all eight neighbours lack: hot or dead pixels, never part of a spot."""
     found = False
-    narrow = min(spot[UU], spot[VV]) < 0.8**2
-    rest, weight = cells[RESIDUAL], cells[WEIGHT]
+    narrow_spot = min(spot[UU], spot[VV]) < 0.8**2
+    residual, weight = cells[RESIDUAL], cells[WEIGHT]
     middle = 0.5 * (window.cell - 1)
     for k in range(window.rows * window.columns):
-        size = rest[k] * rest[k] * weight[k]
+        size = residual[k] * residual[k] * weight[k]
         if size <= _OUTLIER**2:
             continue
         r, c = k // window.columns, k % window.columns
         u = window.left + middle + c * window.cell - spot[U]
         v = window.top + middle + r * window.cell - spot[V]
-        if narrow and u * u + v * v < 1.8**2:  # the middle of a spot about one pixel wide is lonely by nature
+        if narrow_spot and u * u + v * v < 1.8**2:  # the middle of a spot about one pixel wide is always isolated
             continue
         around = 0.0
         for i in range(max(r - 1, 0), min(r + 2, window.rows)):
             for j in range(max(c - 1, 0), min(c + 2, window.columns)):
                 other = i * window.columns + j
                 if other != k:
-                    around = max(around, rest[other] * rest[other] * weight[other])
-        if size > _LONELY**2 * around:
+                    around = max(around, residual[other] * residual[other] * weight[other])
+        if size > _ISOLATED**2 * around:
             cells[USE, k], found = 0.0, True
     return found
 
 
 @compiled
 def _solve(frame: PolynomialFrame, algebra: Array) -> bool:
-    """Into the columns of X: the step, and N^-1 times the directions of the centre's u' and v' and of the flux."""
+    """Fill the columns of X: the step, and N^-1 times the gradients of the centre's u' and v' and of the flux."""
     X = algebra[SOLUTION]
     for p in range(9):
         X[p, 0] = algebra[VECTORS, RIGHT_SIDE, p]
@@ -270,7 +269,7 @@ def _solve(frame: PolynomialFrame, algebra: Array) -> bool:
 
 @compiled
 def _flux_direction(frame: PolynomialFrame, X: Array, column: int) -> None:
-    """How the relative flux depends on the coefficients."""
+    """The gradient of the relative flux with respect to the coefficients."""
     X[0, column] = 1.0
     X[3, column] = frame.S[0] / frame.su**2
     X[4, column] = frame.S[1] / (frame.su * frame.sv)
@@ -291,7 +290,7 @@ def _centre_covariance(frame: PolynomialFrame, X: Array) -> tuple[float, float, 
 
 @compiled
 def _flux_variance(frame: PolynomialFrame, X: Array) -> float:
-    """Of the flux, over its square."""
+    """Relative variance of the flux."""
     relative = (
         X[0, 3]
         + X[3, 3] * frame.S[0] / frame.su**2
@@ -303,9 +302,9 @@ def _flux_variance(frame: PolynomialFrame, X: Array) -> float:
 
 @compiled
 def _advance(frame: PolynomialFrame, spot: Array, X: Array) -> None:
-    """Step, held to one sigma of the spot in length, to a factor 2.5 in its variances and to 5 in its flux.
+    """Apply the step, limited to one sigma of the spot in length, a factor 2.5 in its variances and 5 in its flux.
 
-    With light F (1 + f) and a step d the coefficient of the derivative is (1 + f) d, not d.
+    With light F (1 + f) and a step d of the centre, the coefficient of the derivative is (1 + f) d, not d.
     """
     su, sv, S = frame.su, frame.sv, frame.S
     q3, q4, q5 = X[3, 0] / su**2, 0.5 * X[4, 0] / (su * sv), X[5, 0] / sv**2
@@ -320,10 +319,12 @@ def _advance(frame: PolynomialFrame, spot: Array, X: Array) -> None:
     duu, duv, dvv = 2 * (a * S[0] + b * S[1]), 2 * (a * S[1] + b * S[2]), 2 * (c * S[1] + d * S[2])
     pixel = 1 / 12.0
     base = (spot[UU] + pixel, spot[UV], spot[VV] + pixel)
-    uu, uv, vv = ellipse.kept_within((base[0] + more * duu, base[1] + more * duv, base[2] + more * dvv), base, 0.4, 2.5)
-    short = 1.0 / max(ellipse.length(du, dv, base[0], base[1], base[2]), 1.0)
+    uu, uv, vv = ellipse.clip_in_metric(
+        (base[0] + more * duu, base[1] + more * duv, base[2] + more * dvv), base, 0.4, 2.5
+    )
+    short = 1.0 / max(ellipse.mahalanobis(du, dv, base[0], base[1], base[2]), 1.0)
     du, dv = short * du, short * dv
-    spot[UU], spot[UV], spot[VV] = ellipse.with_eigenvalues(uu - pixel, uv, vv - pixel, _LEAST_VARIANCE, np.inf)
+    spot[UU], spot[UV], spot[VV] = ellipse.clip_eigenvalues(uu - pixel, uv, vv - pixel, _LEAST_VARIANCE, np.inf)
     spot[SLOPE_U] += X[7, 0] / su
     spot[SLOPE_V] += X[8, 0] / sv
     spot[LEVEL] += X[6, 0] + spot[SLOPE_U] * du + spot[SLOPE_V] * dv

@@ -1,4 +1,4 @@
-"""From peaks to spots: all steps after the search, and what counts as a spot."""
+"""From peaks to spots: all steps after the search, and the criteria for a spot."""
 
 from __future__ import annotations
 
@@ -10,28 +10,27 @@ import numpy as np
 from geometry.arrays import Array, Ints
 from geometry.compilation.jit import compiled, compiled_for_threads
 from tracking.detection import candidates, ellipse
-from tracking.detection.candidates import Noise, texture_variance
 from tracking.detection.gaussian_fit import fit_all
 from tracking.detection.moments import find_moments
-from tracking.detection.pixels import Pixels
+from tracking.detection.pixels import Noise, Pixels, texture_variance
 from tracking.detection.regions import in_a_region
-from tracking.detection.saturated_spots import CENTRE_SHARE, height_of_compact
+from tracking.detection.saturated_spots import CENTRE_SHARE, compact_height
 from tracking.detection.table import (
+    ACCEPTED,
     ACTIVE,
+    BACKGROUND,
     CHI2,
     COV_UV,
     EXPLAINED,
-    FEW,
     FLUX,
     GAIN,
-    GOOD,
-    GROUND,
     MOMENT_U,
     MOMENT_UU,
     MOMENT_UV,
     MOMENT_V,
     MOMENT_VV,
     PEAK,
+    SCRATCH,
     SIGMA_FLUX,
     UU,
     UV,
@@ -44,14 +43,16 @@ from tracking.detection.table import (
 )
 
 AT_U, AT_V, LEVEL, WIDE_PEAK = candidates.AT_U, candidates.AT_V, candidates.LEVEL, candidates.WIDE
-# Of threshold^2: by how much a spot lowers chi-square. The maximum of noise over places and shapes is higher than at
-# one place: with 1.0 a picture of 1280x1024 has 0.04 false points, with 1.1 fewer than 0.01.
+# Least decrease of chi-square by a spot, relative to threshold^2. The maximum of noise over positions and shapes is
+# higher than at one position: with 1.0 a picture of 1280x1024 has 0.04 false points, with 1.1 fewer than 0.01.
 _SPOT_GAIN = 1.1
-_CHI2 = 1.3  # per degree of freedom: where it is larger there is more noise, by so much, than the model says
-_SPOT_FLUX = 0.5  # of the threshold: the flux in its own sigmas, which know of misfit; it goes together with the shape
-_LEAST_GAIN = 0.7  # of what a spot must lower chi-square by: with less, the fit stops early
-NARROWER = 0.5  # a spot narrower than so much of another one is not that one found again
-_ONE_LIGHT = 1.5  # sigmas of a brighter spot: in its middle a second one is the same light
+_CHI2 = 1.3  # chi-square per degree of freedom above which the noise is larger than in the model, by this ratio
+_SPOT_FLUX = (
+    0.5  # least flux in its own sigmas, relative to the threshold; lower, because flux and shape are correlated
+)
+_LEAST_GAIN = 0.7  # decrease of chi-square relative to threshold^2 below which the fit stops early
+NARROWER = 0.5  # a spot narrower than this share of another spot is not a duplicate of it
+_SAME_SPOT = 1.5  # sigmas of a brighter spot: a second spot nearer to its centre is a duplicate
 
 
 class DetectionLimits(NamedTuple):
@@ -75,20 +76,22 @@ def measure(
     cells: Array,
     algebra: Array,
 ) -> None:
-    """Measure the chosen peaks (n,), into table (n, COLUMNS)."""
+    """Measure the chosen peaks (n,) and write the results into table (n, COLUMNS)."""
     for k in range(chosen.shape[0]):
         peak, spot = peaks[chosen[k]], table[k]
-        spot[MOMENT_U], spot[MOMENT_V], spot[GROUND] = peak[AT_U], peak[AT_V], peak[LEVEL]
+        spot[MOMENT_U], spot[MOMENT_V], spot[BACKGROUND] = peak[AT_U], peak[AT_V], peak[LEVEL]
         spot[WIDE] = peak[WIDE_PEAK]
     find_moments(image, table, cells)
     least = _LEAST_GAIN * limits.threshold_sigma**2
     fit_all(image, table, noise, limits.saturation, limits.max_sigma, least, cells, algebra)
     for k in range(chosen.shape[0]):
         spot = table[k]
-        spot[GOOD] = (
-            1.0 if _is_spot(image, spot, noise, limits) or _is_compact(image, spot, noise, limits, cells[FEW]) else 0.0
+        spot[ACCEPTED] = (
+            1.0
+            if _is_spot(image, spot, noise, limits) or _is_compact(image, spot, noise, limits, cells[SCRATCH])
+            else 0.0
         )
-    _drop_doubles(table)
+    _drop_duplicates(table)
 
 
 @compiled
@@ -99,7 +102,7 @@ def _is_spot(image: Pixels, spot: Array, noise: Noise, limits: DetectionLimits) 
     sigma_u, sigma_v = sqrt(max(spot[VAR_U], 0.0)), sqrt(max(spot[VAR_V], 0.0))
     amplitude = spot[FLUX] / (2 * pi * (major * minor + 1 / 12))
     return (
-        amplitude > limits.threshold_sigma * sqrt(texture_variance(noise, spot[GROUND]))
+        amplitude > limits.threshold_sigma * sqrt(texture_variance(noise, spot[BACKGROUND]))
         and spot[GAIN] > _SPOT_GAIN * limits.threshold_sigma**2 * max(spot[CHI2] / _CHI2, 1.0)
         and spot[FLUX] > _SPOT_FLUX * limits.threshold_sigma * spot[SIGMA_FLUX]
         and spot[PEAK] > 0.0
@@ -115,18 +118,18 @@ def _is_spot(image: Pixels, spot: Array, noise: Noise, limits: DetectionLimits) 
 
 
 @compiled
-def _is_compact(image: Pixels, spot: Array, noise: Noise, limits: DetectionLimits, few: Array) -> bool:
-    """Whether a candidate that the fit does not explain is light all the same; then its row becomes the moments'."""
+def _is_compact(image: Pixels, spot: Array, noise: Noise, limits: DetectionLimits, scratch: Array) -> bool:
+    """Whether a candidate that is not a Gaussian is a compact light; if so, its row is filled from the moments."""
     uu, uv, vv = spot[MOMENT_UU], spot[MOMENT_UV], spot[MOMENT_VV]
     major, minor, _ = ellipse.axes(uu, uv, vv)
-    # What the fit found to be narrow stays out: a hot pixel is compact and bright, too.
+    # A candidate with a narrow fit is rejected: a hot pixel is compact and bright, too.
     narrow = min(minor, ellipse.axes(spot[UU], spot[UV], spot[VV])[1]) < limits.min_sigma
     if narrow or major > limits.max_sigma:
         return False
     if spot[GAIN] < limits.threshold_sigma**2:
         return False
     u, v = spot[MOMENT_U], spot[MOMENT_V]
-    height = height_of_compact(image, u, v, (uu, uv, vv), noise, limits.threshold_sigma, few)
+    height = compact_height(image, u, v, (uu, uv, vv), noise, limits.threshold_sigma, scratch)
     if height <= 0.0:
         return False
     spot[U], spot[V], spot[UU], spot[UV], spot[VV] = u, v, uu, uv, vv
@@ -139,7 +142,7 @@ def _is_compact(image: Pixels, spot: Array, noise: Noise, limits: DetectionLimit
 
 @compiled
 def _brightest(table: Array) -> int:
-    """The row with the most flux among those that are ACTIVE; -1: there is none."""
+    """The row with the largest flux among the ACTIVE ones; -1 if there is none."""
     best = -1
     for k in range(table.shape[0]):
         if table[k, ACTIVE] and (best < 0 or table[k, FLUX] > table[best, FLUX]):
@@ -148,13 +151,13 @@ def _brightest(table: Array) -> int:
 
 
 @compiled
-def _drop_doubles(table: Array) -> None:
-    """Drop spots in the middle of a brighter one of about their width: one light, found twice.
+def _drop_duplicates(table: Array) -> None:
+    """Drop spots near the centre of a brighter spot of about the same width: one light detected twice.
 
-    Width matters: a laser spot on a wide diffuse reflection has less flux than that, and is no part of it.
+    A much narrower spot is kept: a laser spot on a wide diffuse reflection has less flux, but is not part of it.
     """
     for k in range(table.shape[0]):
-        table[k, ACTIVE] = table[k, GOOD]
+        table[k, ACTIVE] = table[k, ACCEPTED]
     i = _brightest(table)
     while i >= 0:
         spot = table[i]
@@ -165,21 +168,21 @@ def _drop_doubles(table: Array) -> None:
             other = table[k]
             if other[ACTIVE]:
                 du, dv = other[U] - spot[U], other[V] - spot[V]
-                inside = vv * du * du - 2 * uv * du * dv + uu * dv * dv < _ONE_LIGHT**2 * area
+                inside = vv * du * du - 2 * uv * du * dv + uu * dv * dv < _SAME_SPOT**2 * area
                 own = (other[UU] + 1 / 12) * (other[VV] + 1 / 12) - other[UV] ** 2
                 if inside and own > NARROWER**4 * area:
-                    other[GOOD] = other[ACTIVE] = 0.0
+                    other[ACCEPTED] = other[ACTIVE] = 0.0
         i = _brightest(table)
 
 
 @compiled
-def write_out(table: Array, regions: Array, out: Array) -> int:
-    """The spots that lie in a region (n, 3), brightest by flux first; returns how many.
+def write_detections(table: Array, regions: Array, out: Array) -> int:
+    """Write the spots that lie in a region (n, 3) into `out`, largest flux first; returns their number.
 
     Columns of out (most, 10): u, v; cov uu, uv, vv; flux, peak, major, minor, angle.
     """
     for k in range(table.shape[0]):
-        found = table[k, GOOD] and in_a_region(regions, table[k, U], table[k, V], 0.0)
+        found = table[k, ACCEPTED] and in_a_region(regions, table[k, U], table[k, V], 0.0)
         table[k, ACTIVE] = 1.0 if found else 0.0
     count = 0
     i = _brightest(table)

@@ -1,4 +1,4 @@
-"""A first centre and size of each candidate: moments under a Gaussian window that adapts to what it sees."""
+"""A first centre and size of each candidate: moments under an adaptive Gaussian window."""
 
 from __future__ import annotations
 
@@ -7,35 +7,35 @@ import numpy as np
 from geometry.arrays import Array
 from geometry.compilation.jit import compiled
 from tracking.detection import ellipse
-from tracking.detection.candidates import sort
-from tracking.detection.gaussian import gaussian_row
-from tracking.detection.pixels import OUTSIDE, Pixels, Window, cut, window_around
+from tracking.detection.candidates import insertion_sort
+from tracking.detection.ellipse import gaussian_row
+from tracking.detection.pixels import OUTSIDE, Pixels, Window, read_window, window_around
 from tracking.detection.table import (
-    FEW,
+    BACKGROUND,
+    CELL_SIZE,
     FLUX,
-    GROUND,
     MOMENT_U,
     MOMENT_UU,
     MOMENT_UV,
     MOMENT_V,
     MOMENT_VV,
     ROW,
-    SPAN,
+    SCRATCH,
     STATE,
     VALUES,
     WIDE,
 )
 
-# Growing windows: half the number of cells, their size, rounds, and the 1-sigma half axis (px) up to which each serves.
+# Growing windows: half the number of cells, cell size, iterations, and the largest 1-sigma half axis (px) for each.
 _WINDOWS = ((9, 1, 3, 3.5), (18, 2, 5, 9.0), (18, 4, 5, np.inf))
-_START, _START_WIDE = 2.0, 16.0  # px^2: variance of the first window
+_START, _START_WIDE = 2.0, 16.0  # px^2: variance of the first window; of wide faint peaks
 
 
 @compiled
 def find_moments(image: Pixels, table: Array, cells: Array) -> None:
-    """Moments and flux of candidates (n, COLUMNS), starting from MOMENT_U, MOMENT_V, on the background GROUND.
+    """Moments and flux of candidates (n, COLUMNS), starting from MOMENT_U, MOMENT_V, above the BACKGROUND.
 
-    Good to a tenth of a pixel or so, which is enough to start a fit.
+    Accurate to about a tenth of a pixel, which is enough to start a fit.
     Source: Bernstein & Jarvis (2002), "Shapes and shears, stars and smears", Astron. J. 123, section 3.
     """
     for i in range(table.shape[0]):
@@ -46,41 +46,45 @@ def find_moments(image: Pixels, table: Array, cells: Array) -> None:
         half, cell, rounds, limit = _WINDOWS[step]
         for i in range(table.shape[0]):
             spot = table[i]
-            # Who was wide enough for this window at the end of the last one.
+            # Only candidates that have outgrown the previous window are measured in the next one.
             high = ellipse.eigenvalues(spot[MOMENT_UU], spot[MOMENT_UV], spot[MOMENT_VV])[1]
             if (step > 0 and high <= largest) or (step == 0 and spot[WIDE]):
                 continue
-            spot[SPAN] = cell
+            spot[CELL_SIZE] = cell
             window = window_around(spot[MOMENT_U], spot[MOMENT_V], half, half, cell)
-            # Clipped pixels stay in: for a first width and centre a cut top is better than a hole.
-            cut(image, window, np.inf, cells[VALUES], cells[STATE])
-            ground = spot[GROUND]
-            if cell > 1:  # the given background is a median over 40 px: too near to a wide spot
-                ground = _median_of_border(window, cells[VALUES], cells[FEW])
-            _take_ground(window, table, i, ground, cells[VALUES], cells[STATE])
+            # Clipped pixels are used: for a first width and centre a clipped top is better than missing pixels.
+            read_window(image, window, np.inf, cells[VALUES], cells[STATE])
+            background = spot[BACKGROUND]
+            if cell > 1:  # the given background, a median over 40 px, is biased by a wide spot
+                background = _median_of_border(window, cells[VALUES], cells[STATE], cells[SCRATCH], background)
+            _subtract_background(window, table, i, background, cells[VALUES], cells[STATE])
             for _ in range(rounds):
-                spot[FLUX] = cell * cell * _one_round(window, cells[VALUES], spot, cells[ROW])
+                spot[FLUX] = cell * cell * _adapt_window(window, cells[VALUES], spot, cells[ROW])
         largest = limit**2
 
 
 @compiled
-def _median_of_border(window: Window, values: Array, few: Array) -> float:
+def _median_of_border(window: Window, values: Array, state: Array, scratch: Array, background: float) -> float:
+    """The median of the window's border cells inside the picture; `background` if there are none."""
     n, last = 0, window.rows - 1
     for i in range(window.rows):
         for j in range(window.columns):
-            if i == 0 or j == 0 or i == last or j == window.columns - 1:
-                few[n] = values[i * window.columns + j]
+            k = i * window.columns + j
+            if (i == 0 or j == 0 or i == last or j == window.columns - 1) and state[k] != OUTSIDE:
+                scratch[n] = values[k]
                 n += 1
-    sort(few, n)
-    return 0.5 * (few[(n - 1) // 2] + few[n // 2])
+    if n == 0:
+        return background
+    insertion_sort(scratch, n)
+    return 0.5 * (scratch[(n - 1) // 2] + scratch[n // 2])
 
 
 @compiled
-def _take_ground(window: Window, table: Array, i: int, ground: float, values: Array, state: Array) -> None:
-    """Light over the background; none in cells outside and in those nearer to another candidate."""
+def _subtract_background(window: Window, table: Array, i: int, background: float, values: Array, state: Array) -> None:
+    """Subtract the background; cells outside and cells nearer to another candidate become 0."""
     cells = window.rows * window.columns
     for k in range(cells):
-        values[k] = values[k] - ground if state[k] != OUTSIDE else 0.0
+        values[k] = values[k] - background if state[k] != OUTSIDE else 0.0
     reach = 1.0 * window.cell * window.columns
     middle = 0.5 * (window.cell - 1)
     for j in range(table.shape[0]):
@@ -97,10 +101,11 @@ def _take_ground(window: Window, table: Array, i: int, ground: float, values: Ar
 
 
 @compiled
-def _one_round(window: Window, light: Array, spot: Array, row: Array) -> float:
-    """Under a window W a Gaussian S has covariance (1/S + 1/W)^-1; if they are equal, half its offset is seen.
+def _adapt_window(window: Window, light: Array, spot: Array, row: Array) -> float:
+    """One iteration of the adaptive window; returns the flux, DN cells.
 
-    Half its flux, too. Returns the flux, DN cells.
+    Under a window W a Gaussian S has the covariance (1/S + 1/W)^-1. If both are equal, the measured offset and flux are
+    half the true ones, so they are doubled.
     """
     pixel = window.cell**2 / 12.0
     W = (spot[MOMENT_UU] + pixel, spot[MOMENT_UV], spot[MOMENT_VV] + pixel)
@@ -123,12 +128,12 @@ def _one_round(window: Window, light: Array, spot: Array, row: Array) -> float:
         suu, suv, svv = suu + t2, suv + y * t1, svv + y * y * t0
     s0 = max(s0, 1e-9)
     mu, mv = su / s0, sv / s0
-    seen = ellipse.kept_within((suu / s0 - mu * mu, suv / s0 - mu * mv, svv / s0 - mv * mv), W, 0.15, 0.75)
+    seen = ellipse.clip_in_metric((suu / s0 - mu * mu, suv / s0 - mu * mv, svv / s0 - mv * mv), W, 0.15, 0.75)
     a, b, c = ellipse.inverse(*seen)
     a, b, c = ellipse.inverse(a - narrow[0], b - narrow[1], c - narrow[2])
-    short = 2.0 / max(2.0 * ellipse.length(mu, mv, *W), 1.0)
+    short = 2.0 / max(2.0 * ellipse.mahalanobis(mu, mv, *W), 1.0)
     spot[MOMENT_U] += short * mu
     spot[MOMENT_V] += short * mv
-    a, b, c = ellipse.with_eigenvalues(a - pixel, b, c - pixel, 0.1, np.inf)
+    a, b, c = ellipse.clip_eigenvalues(a - pixel, b, c - pixel, 0.1, np.inf)
     spot[MOMENT_UU], spot[MOMENT_UV], spot[MOMENT_VV] = a, b, c
     return 2.0 * s0

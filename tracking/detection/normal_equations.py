@@ -1,9 +1,9 @@
 """The weighted least-squares problem of one spot: an elliptical Gaussian on a background plane, in a window.
 
-Linearised, the model is a Gaussian times a polynomial of second degree in the place (which spans the derivatives by
-centre, shape and flux) and a plane. So the normal matrix consists of moments of weight, weight times light and weight
-times squared light, up to the fourth degree; those are summed row by row, where the row's v is a constant. That takes
-18 products per cell, where nine columns would take 54.
+The linearised model is a Gaussian times a polynomial of second degree in the position (which spans the derivatives with
+respect to centre, shape and flux) plus a plane. The normal matrix therefore consists of moments of weight, weight times
+light and weight times squared light, up to the fourth degree. They are summed row by row, because v is constant within
+a row. This takes 18 products per cell; nine columns of derivatives would take 54. Source: ours.
 """
 
 from __future__ import annotations
@@ -16,16 +16,15 @@ import numpy as np
 from geometry.arrays import Array
 from geometry.compilation.jit import compiled
 from tracking.detection import ellipse
-from tracking.detection.candidates import Noise
-from tracking.detection.gaussian import gaussian_row
-from tracking.detection.pixels import Window
+from tracking.detection.ellipse import gaussian_row
+from tracking.detection.pixels import Noise, Window
 from tracking.detection.table import (
     FLUX,
     LEVEL,
     LIGHT,
+    NEIGHBOUR_LIGHT,
     NODES,
     NORMAL,
-    OTHERS,
     RESIDUAL,
     RIGHT_SIDE,
     ROW,
@@ -42,27 +41,27 @@ from tracking.detection.table import (
     V,
 )
 
-EXACT_PX2 = 0.9**2  # narrower spots are integrated over the pixels numerically
+EXACT_PX2 = 0.9**2  # px^2: narrower spots are integrated over the pixels numerically
 _POWERS_U, _POWERS_V = (0, 1, 0, 2, 1, 0), (0, 0, 1, 0, 1, 2)
-_FOUR_NODES_PX2 = 0.5**2  # narrower: eight nodes each way
-_EDGEWORTH = 0.4  # 1/variance times cell^2 from which the pixels' fourth cumulant shows
+_FOUR_NODES_PX2 = 0.5**2  # px^2: narrower spots need eight instead of four nodes in each direction
+_EDGEWORTH = 0.4  # cell^2 / variance above which the pixels' fourth cumulant is significant
 
-# Gauss-Legendre nodes and weights on [-1/2, 1/2] for 4 and 8 points: exact to 1e-4 of the peak
-# from sigma 0.5 and 0.2 px on.
+# Gauss-Legendre nodes and weights on [-1/2, 1/2] for 4 and 8 points: accurate to 1e-4 of the peak for sigmas of at
+# least 0.5 and 0.2 px.
 _FOUR = np.polynomial.legendre.leggauss(4)
 _EIGHT = np.polynomial.legendre.leggauss(8)
 _NODES4, _WEIGHTS4, _NODES8, _WEIGHTS8 = _FOUR[0] / 2, _FOUR[1] / 2, _EIGHT[0] / 2, _EIGHT[1] / 2
 
 
 class PolynomialFrame(NamedTuple):
-    """What coordinates the polynomial is written in: from the spot's centre, in units of its widths."""
+    """The coordinates of the polynomial: relative to the spot's centre, in units of its widths."""
 
-    u0: float  # px, the first cell's centre from the spot's
+    u0: float  # px, centre of the first cell relative to the spot's centre
     v0: float
-    su: float  # px
+    su: float  # px, the spot's sigma in u and v
     sv: float
-    S: tuple[float, float, float]  # px^2: covariance of what the cells show
-    exact: bool
+    S: tuple[float, float, float]  # px^2: covariance of the light after integration over the cells
+    exact: bool  # the light is integrated over each pixel numerically
 
 
 @compiled
@@ -82,8 +81,8 @@ def frame_of(window: Window, spot: Array) -> PolynomialFrame:
 def accumulate(window: Window, spot: Array, noise: Noise, cells: Array, algebra: Array) -> float:
     """Fill the normal matrix and right side at a spot, and the cells' light, weight and residual; returns chi-square.
 
-    Columns: 1, x, y, x^2, x y, y^2 times the light, then 1, x, y, in the coordinates of `frame_of`. Cells are weighted
-    by the noise at the fitted level: weights from the noisy values would pull the fit down.
+    Columns: 1, x, y, x^2, x y, y^2 times the light, then 1, x, y, in the coordinates of `frame_of`. The weights follow
+    from the noise at the fitted level, because weights from the noisy values would bias the fit towards zero.
     """
     frame = frame_of(window, spot)
     if frame.exact:
@@ -125,33 +124,33 @@ def accumulate(window: Window, spot: Array, noise: Noise, cells: Array, algebra:
 
 @compiled
 def _weigh(window: Window, r: int, frame: PolynomialFrame, spot: Array, noise: Noise, row: Array, cells: Array) -> None:
-    """Light (given in `row`), residual and weight of a row of cells. Without branches: vector units do it."""
+    """Light (given in `row`), residual and weight of a row of cells. Without branches, so that it is vectorised."""
     first, last = r * window.columns, (r + 1) * window.columns
     cell = float(window.cell)
     floor, slope, black = noise.floor, noise.slope, noise.black
     base = spot[LEVEL] + spot[SLOPE_V] * (frame.v0 + r * cell) + spot[SLOPE_U] * frame.u0
     tilt = spot[SLOPE_U] * cell
-    others, values, use = cells[OTHERS, first:last], cells[VALUES, first:last], cells[USE, first:last]
-    light, rest, weight = cells[LIGHT, first:last], cells[RESIDUAL, first:last], cells[WEIGHT, first:last]
+    others, values, use = cells[NEIGHBOUR_LIGHT, first:last], cells[VALUES, first:last], cells[USE, first:last]
+    light, residual, weight = cells[LIGHT, first:last], cells[RESIDUAL, first:last], cells[WEIGHT, first:last]
     for j in range(row.shape[0]):
         level = row[j] + base + tilt * j + others[j]
-        lit = level - black
+        above_black = level - black
         light[j] = row[j]
-        rest[j] = values[j] - level
-        weight[j] = use[j] * (cell * cell) / (floor + slope * (lit if lit > 0.0 else 0.0))
+        residual[j] = values[j] - level
+        weight[j] = use[j] * (cell * cell) / (floor + slope * (above_black if above_black > 0.0 else 0.0))
 
 
 @compiled
 def _sum_row(window: Window, r: int, frame: PolynomialFrame, cells: Array, sums: Array) -> None:
-    """Moments along a row by x: w l^2 (5), w l (4), w (3), w l r (3), w r (2)."""
+    """Moments in x along a row: w l^2 (5), w l (4), w (3), w l r (3), w r (2); w weight, l light, r residual."""
     first, last = r * window.columns, (r + 1) * window.columns
-    light, rest, weight = cells[LIGHT, first:last], cells[RESIDUAL, first:last], cells[WEIGHT, first:last]
+    light, residual, weight = cells[LIGHT, first:last], cells[RESIDUAL, first:last], cells[WEIGHT, first:last]
     x0, dx = frame.u0 / frame.su, window.cell / frame.su
     a0 = a1 = a2 = a3 = a4 = b0 = b1 = b2 = b3 = c0 = c1 = c2 = d0 = d1 = d2 = e0 = e1 = 0.0
     for j in range(light.shape[0]):
         x = x0 + j * dx
         w, l = weight[j], light[j]
-        wr, wl = w * rest[j], w * l
+        wr, wl = w * residual[j], w * l
         wll, wlr = wl * l, wr * l
         a0 += wll
         b0 += wl
@@ -201,10 +200,10 @@ def _fill(A: Array, R: Array, N: Array, b: Array) -> None:
 
 @compiled
 def _integrate_row(a: tuple[float, float, float], u0: float, v: float, cell: float, row: Array) -> None:
-    """Take point values, of a Gaussian that has the pixels' variance already, to the pixels' means.
+    """Convert the point values of a Gaussian, whose covariance includes the pixels' variance, into pixel means.
 
-    The square's fourth cumulant, -cell^4/120, enters as an Edgeworth term. Against the exact integral the error is
-    below 0.05 % of the peak from sigma 0.8 px on (a test says so).
+    The fourth cumulant of a square pixel, -cell^4/120, enters as an Edgeworth term. Against the exact integral the
+    error is below 0.05 % of the peak for sigmas of at least 0.8 px (tested).
     """
     share = cell**4 / 2880.0
     for j in range(row.shape[0]):
@@ -218,7 +217,7 @@ def _integrate_row(a: tuple[float, float, float], u0: float, v: float, cell: flo
 def _accumulate_exact(
     window: Window, frame: PolynomialFrame, spot: Array, noise: Noise, cells: Array, N: Array, b: Array
 ) -> float:
-    """The same for a spot so narrow that its light and the derivatives are integrated over each pixel by nodes."""
+    """`accumulate` for a narrow spot, with light and derivatives integrated over each pixel by quadrature."""
     low = ellipse.eigenvalues(spot[UU], spot[UV], spot[VV])[0]
     nodes, weights = (_NODES4, _WEIGHTS4) if low > _FOUR_NODES_PX2 else (_NODES8, _WEIGHTS8)
     inverse = ellipse.inverse(frame.S[0], frame.S[1], frame.S[2])
@@ -237,10 +236,10 @@ def _accumulate_exact(
             for p in range(6):
                 J[p] = cells[NODES + p, j]
             J[7] = (frame.u0 + j) / frame.su
-            w, rest = cells[WEIGHT, r * window.columns + j], cells[RESIDUAL, r * window.columns + j]
+            w, residual = cells[WEIGHT, r * window.columns + j], cells[RESIDUAL, r * window.columns + j]
             for p in range(9):
                 wp = w * J[p]
-                b[p] += wp * rest
+                b[p] += wp * residual
                 for q in range(p + 1):
                     N[p, q] += wp * J[q]
     for p in range(9):
@@ -295,10 +294,10 @@ def add_light(window: Window, spot: Array, row: Array, out: Array) -> None:
 
 @compiled
 def solve_normal(N: Array, X: Array, right_sides: int, L: Array) -> bool:
-    """Solve N X = B for the first columns of X, in place; X holds the right sides. L (9, 10) is room to work in.
+    """Solve N X = B for the first columns of X, in place; X contains the right sides. L (9, 10) is workspace.
 
-    N is scaled to a unit diagonal, with 1e-9 added to it, which only keeps hopeless cases finite. False if it is not
-    positive definite.
+    N is scaled to a unit diagonal and 1e-9 is added to it, which matters only in degenerate cases. Returns False if N
+    is not positive definite.
     """
     n = 9
     scale = L[:, n]

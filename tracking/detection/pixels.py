@@ -1,6 +1,6 @@
-"""Single pixels and small windows of a picture, for compiled code.
+"""Single pixels and small windows of a picture, and the noise of pixels, for compiled code.
 
-A picture is seen as bytes, so that 8 and 16 bits share one compiled form of everything but the first pass.
+A picture is viewed as bytes, so that 8 and 16 bits share the compiled code of all steps but the first pass.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def pixel(image: Pixels, u: int, v: int) -> float:
 
 @compiled
 def mirrored(i: int, size: int) -> int:
-    """An index outside a row or column of that size, reflected at its outermost pixels."""
+    """An index, reflected at the outermost pixels if it lies outside a row or column of that size."""
     i = abs(i)
     if i > size - 1:
         i = 2 * (size - 1) - i
@@ -44,13 +44,13 @@ def mirrored(i: int, size: int) -> int:
 
 @compiled
 def clamped(i: int, size: int) -> int:
-    """An index outside a row or column of that size, moved to its outermost pixels."""
+    """An index, moved to the outermost pixel if it lies outside a row or column of that size."""
     return min(max(i, 0), size - 1)
 
 
 @compiled
 def mean3(image: Pixels, u: int, v: int) -> float:
-    """The mean of the 3x3 pixels around a whole point; the border's pixels are repeated outside."""
+    """The mean of the 3x3 pixels around a pixel; border pixels are repeated outside the picture."""
     total = 0.0
     for i in range(v - 1, v + 2):
         for j in range(u - 1, u + 2):
@@ -59,7 +59,7 @@ def mean3(image: Pixels, u: int, v: int) -> float:
 
 
 class Window(NamedTuple):
-    """A rectangle of cells, each the mean of cell x cell pixels: a wide spot needs no more cells than a small one."""
+    """A rectangle of cells, each the mean of cell x cell pixels, so that wide spots do not need more cells."""
 
     left: int  # px, first column
     top: int  # px, first row
@@ -70,15 +70,15 @@ class Window(NamedTuple):
 
 @compiled
 def window_around(u: float, v: float, half_columns: int, half_rows: int, cell: int) -> Window:
-    """The window of (2 half + 1) cells each way whose middle is nearest to a point."""
+    """The window of (2 half + 1) cells in each direction whose centre is nearest to a point, px."""
     columns, rows = 2 * half_columns + 1, 2 * half_rows + 1
     left, top = int(np.rint(u - 0.5 * (columns * cell - 1))), int(np.rint(v - 0.5 * (rows * cell - 1)))
     return Window(left, top, columns, rows, cell)
 
 
 @compiled
-def cut(image: Pixels, window: Window, saturation: float, values: Array, state: Array) -> None:
-    """The cells' values (cells,), DN, and state (cells,): OUTSIDE (partly), CLIPPED (one of the pixels) or VALID."""
+def read_window(image: Pixels, window: Window, saturation: float, values: Array, state: Array) -> None:
+    """The cells' values (cells,), DN, and states (cells,): OUTSIDE (at least partly), CLIPPED (any pixel) or VALID."""
     cell = window.cell
     share = 1.0 / (cell * cell)
     for i in range(window.rows):
@@ -100,3 +100,29 @@ def cut(image: Pixels, window: Window, saturation: float, values: Array, state: 
                         most = max(most, x)
             values[k] = total * share
             state[k] = VALID if most < saturation else CLIPPED
+
+
+# Share of the threshold that applies to the sigma of the texture, which has far fewer independent places than pixels.
+TEXTURE_SHARE = 5.0 / 6.0
+
+
+class Noise(NamedTuple):
+    """tracking.noise.NoiseModel for compiled code."""
+
+    floor: float
+    slope: float
+    black: float
+    texture: float
+    banding: float
+
+
+@compiled
+def variance(noise: Noise, level: float) -> float:
+    """Variance of a pixel with the expected grey value `level`, DN^2."""
+    return noise.floor + noise.slope * max(level - noise.black, 0.0)
+
+
+@compiled
+def texture_variance(noise: Noise, level: float) -> float:
+    """Variance, DN^2, of the mean of a few background pixels due to fixed structure and rounding."""
+    return TEXTURE_SHARE**2 * ((noise.texture * level) ** 2 + noise.banding**2)

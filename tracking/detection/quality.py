@@ -1,4 +1,4 @@
-"""What a finished fit says of itself."""
+"""Quality of a finished fit: peak, chi-square, explained share, and the covariance's correction for model errors."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tracking.detection.table import (
     EXPLAINED,
     GAIN,
     LIGHT,
-    OTHERS,
+    NEIGHBOUR_LIGHT,
     PEAK,
     RESIDUAL,
     SIGMA_FLUX,
@@ -26,16 +26,17 @@ from tracking.detection.table import (
     WEIGHT,
 )
 
-_CORE = 0.2  # of the brightest cell's light: clipped cells count there, hot pixels in the wings do not
-_LAGS = 2  # cells
+_CORE = 0.2  # share of the brightest cell's light that limits the core: the peak is searched in the core, with clipped
+# cells but without hot pixels in the wings
+_LAGS = 2  # cells: largest lag of the autocorrelation of the residuals
 
 
 @compiled
-def judge(window: Window, frame: PolynomialFrame, chi2: float, cells: Array, spot: Array) -> None:
-    """Complete what a spot (COLUMNS,) says of itself, which has covariances and GAIN; chi2 is that after its last step.
+def assess_fit(window: Window, frame: PolynomialFrame, chi2: float, cells: Array, spot: Array) -> None:
+    """Fill PEAK, CHI2 and EXPLAINED of a spot (COLUMNS,), which has its covariances and GAIN.
 
-    The covariance given is the Cramer-Rao bound of the model; it
-    and the flux's variance are raised by `_misfit`.
+    chi2: after the last step. The covariance is the Cramer-Rao bound of the model on entry; it and the variance of the
+    flux are scaled by `_covariance_factor`.
     """
     count = window.columns * window.rows
     used, most = 0, 0.0
@@ -48,19 +49,19 @@ def judge(window: Window, frame: PolynomialFrame, chi2: float, cells: Array, spo
         if cells[STATE, k] != OUTSIDE and cells[LIGHT, k] > _CORE * most:
             peak = max(peak, cells[RESIDUAL, k] + cells[LIGHT, k])
     spot[PEAK], spot[CHI2] = peak, chi2 / free
-    # Chi-square scatters by sqrt(2 free): so much in a faint spot's surroundings is no misfit.
+    # Chi-square scatters by sqrt(2 free): twice that is not counted as misfit, for the sake of faint spots.
     noise = min(free + 2.0 * sqrt(2.0 * free), chi2)
     spot[EXPLAINED] = spot[GAIN] / max(chi2 + spot[GAIN] - noise, 1e-9)
-    factor = _misfit(window, frame, cells, used)
+    factor = _covariance_factor(window, frame, cells, used)
     spot[VAR_U], spot[COV_UV], spot[VAR_V] = spot[VAR_U] * factor, spot[COV_UV] * factor, spot[VAR_V] * factor
     spot[SIGMA_FLUX] *= sqrt(factor)
 
 
 @compiled
 def gain_over_plane(N: Array, b: Array, before: float, chi2: float) -> float:
-    """By how much Gaussian and plane together lower chi-square more than a plane alone does.
+    """The decrease of chi-square by the Gaussian and a plane, compared with a plane alone.
 
-    From the normal equations (normal_equations.accumulate) and chi-square before their step and after.
+    N, b: the normal equations (normal_equations.accumulate); before, chi2: chi-square before and after their step.
     """
     y0, y1, y2 = b[6] + N[0, 6], b[7] + N[0, 7], b[8] + N[0, 8]
     d0 = max(N[6, 6], 1e-300)
@@ -75,14 +76,14 @@ def gain_over_plane(N: Array, b: Array, before: float, chi2: float) -> float:
 
 
 @compiled
-def _misfit(window: Window, frame: PolynomialFrame, cells: Array, used: int) -> float:
-    """Factor >= 1 by which the model's faults raise the covariance of the centre.
+def _covariance_factor(window: Window, frame: PolynomialFrame, cells: Array, used: int) -> float:
+    """Factor >= 1 on the covariance of the centre, for errors of the Gaussian model.
 
-    Only the part of the residuals that is odd about the centre can move it: a flat top, a ring or a streak is a bad
-    Gaussian with a good centre. Where the odd part is significantly larger than noise, the factor is its mean square,
-    taken where the centre is read (the slopes), times the number of cells over which it goes together. Spots with few
-    cells to mirror (at the border) are judged by all residuals. Ours, after the sandwich covariance of misspecified
-    models; measured in bench/detection.py (sets streak, speckle).
+    Only the part of the residuals that is odd about the centre can shift it: a spot with a flat top, a ring or a streak
+    is not Gaussian, but its centre is correct. If the odd part is significantly larger than noise, the factor is its
+    mean square, weighted by the sensitivity of the centre (the slopes), times the number of correlated cells. Spots at
+    the border, with few cells in mirrored pairs, use all residuals. Source: ours, after the sandwich covariance of
+    misspecified models; measured in bench/detection.py (sets streak, speckle).
     """
     count = window.columns * window.rows
     both = 0
@@ -105,14 +106,14 @@ def _misfit(window: Window, frame: PolynomialFrame, cells: Array, used: int) -> 
         squares += odd[k] * odd[k]
     if 0.5 * squares / free <= 1.0 + 3.0 * sqrt(2.0 / free):
         return 1.0
-    return _lopsided(window, frame, cells, odd, 2.0 if whole else 1.0)
+    return _odd_misfit_factor(window, frame, cells, odd, 2.0 if whole else 1.0)
 
 
 @compiled
-def _lopsided(window: Window, frame: PolynomialFrame, cells: Array, odd: Array, doubled: float) -> float:
-    """The factor where there is a misfit; `odd` (cells,), residuals in sigmas, is overwritten."""
+def _odd_misfit_factor(window: Window, frame: PolynomialFrame, cells: Array, odd: Array, doubled: float) -> float:
+    """The factor if there is a misfit. odd (cells,): residuals in sigmas, overwritten."""
     count = window.columns * window.rows
-    share = cells[OTHERS]  # no longer needed
+    share = cells[NEIGHBOUR_LIGHT]  # no longer needed
     a, b, c = ellipse.inverse(frame.S[0], frame.S[1], frame.S[2])
     total = 0.0
     for k in range(count):
@@ -128,18 +129,18 @@ def _lopsided(window: Window, frame: PolynomialFrame, cells: Array, odd: Array, 
         square += odd[k] * odd[k] * part / doubled
         crowd += part * part
         odd[k] *= sqrt(part)
-    grain = _grain(window, odd)
-    grains = 1.0 / max(crowd * grain, 1e-12)  # independent ones in the slopes
-    # The fit has bent four parameters to the odd part, so that less of it is left than was.
+    grain = _correlated_cells(window, odd)
+    grains = 1.0 / max(crowd * grain, 1e-12)  # number of independent samples in the slopes
+    # Four fitted parameters are odd, so the residuals contain less of the odd part than the light.
     return max(square * grain * min(grains / max(grains - 4.0, 1e-9), 3.0), 1.0)
 
 
 @compiled
-def _grain(window: Window, z: Array) -> float:
-    """Number of cells over which residuals (cells,) go together: by so much fewer independent ones does the fit have.
+def _correlated_cells(window: Window, z: Array) -> float:
+    """Number of cells over which residuals (cells,) are correlated: the fit has fewer independent cells by this factor.
 
-    Speckle is smooth, so chi2 alone understates what it does to the centre. The sum of the residuals' autocorrelation
-    over lags up to two cells.
+    Speckle is smooth, so chi2 alone underestimates its effect on the centre. The number is the sum of the residuals'
+    autocorrelation over lags of up to two cells.
     """
     power, other = 0.0, 0.0
     for r in range(window.rows):

@@ -1,8 +1,8 @@
-"""Looking into parts of a picture only, with the same result there as from the whole picture.
+"""Search in parts of a picture, with the same results as from the whole picture.
 
-A spot's measurement depends on its neighbours: which peaks are spots of their own is decided with the brighter ones
-within candidates.RADIUS, and light of others within gaussian_fit.reach_of is taken off. So around each peak of a region
-so much is searched too, and around the peaks that this brings to light, until there are no more.
+The measurement of a spot depends on its neighbours: separate peaks are decided with the brighter peaks within
+candidates.RADIUS, and the light of other spots within gaussian_fit.reach_of is subtracted. The search is therefore
+extended around each peak of a region, and around the peaks found in this way, until there are no more.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ from geometry.compilation.jit import compiled
 from tracking.detection.block_search import BLOCK
 from tracking.detection.candidates import AT_U, AT_V, RADIUS
 
-MARGIN = 16  # px: so far from a spot's centre its peak, or that of a neighbour, may lie
+MARGIN = 16  # px: largest distance of a peak from its spot's centre
 
 
 @compiled
 def boxes_of(regions: Array, width: int, height: int, boxes: Ints) -> int:
-    """The blocks (n, 4: first row, last, first column, last) of regions (n, 3: u, v, half size, px), and a margin."""
+    """The blocks (n, 4: first row, last, first column, last) of regions (n, 3: u, v, half size, px) with a margin."""
     count = 0
     for k in range(regions.shape[0]):
         u, v, half = regions[k, 0], regions[k, 1], regions[k, 2]
-        if half >= 0.0 and half < np.inf and abs(u) < np.inf and abs(v) < np.inf:  # not where one is nan
+        if half >= 0.0 and half < np.inf and abs(u) < np.inf and abs(v) < np.inf:  # false for nan
             count = _add_box(u, v, half + MARGIN, width, height, boxes, count)
     return count
 
@@ -55,25 +55,25 @@ def find_relevant(
     peaks: Array, regions: Array, reach: Array, searched: NDArray[np.uint8], width: int, height: int, relevant: Ints,
     boxes: Ints,
 ) -> int:  # fmt: skip
-    """Which peaks (n, 5) bear on the regions (n, 3), and boxes of blocks that must be searched for others that do.
+    """Find the peaks (n, 5) that affect the regions (n, 3), and the boxes of blocks still to be searched for others.
 
-    reach (n,), px, is how far around each peak others matter. relevant (n,) becomes 1 where it does; returns the number
-    of boxes.
+    reach (n,), px: largest distance of other peaks that affect each peak. relevant (n,) becomes positive for the peaks
+    that affect the regions; returns the number of boxes.
     """
     n, count = peaks.shape[0], 0
     for i in range(n):
         relevant[i] = 1 if in_a_region(regions, peaks[i, AT_U], peaks[i, AT_V], MARGIN) else 0
-    busy = True
-    while busy:
-        busy = False
+    changed = True
+    while changed:
+        changed = False
         for i in range(n):
             if relevant[i] != 1:
                 continue
-            relevant[i] = 2  # its neighbours are done
+            relevant[i] = 2  # its neighbours are entered
             for j in range(n):
-                apart = max(abs(peaks[i, AT_U] - peaks[j, AT_U]), abs(peaks[i, AT_V] - peaks[j, AT_V]))
-                if relevant[j] == 0 and apart <= reach[i]:
-                    relevant[j], busy = 1, True
+                distance = max(abs(peaks[i, AT_U] - peaks[j, AT_U]), abs(peaks[i, AT_V] - peaks[j, AT_V]))
+                if relevant[j] == 0 and distance <= reach[i]:
+                    relevant[j], changed = 1, True
     for i in range(n):
         if relevant[i] and count < boxes.shape[0]:
             more = _add_box(peaks[i, AT_U], peaks[i, AT_V], reach[i], width, height, boxes, count)
@@ -91,4 +91,4 @@ def _is_searched(searched: NDArray[np.uint8], box: Ints) -> bool:
     return True
 
 
-NEAR = float(RADIUS)  # px: reach of a peak whose size is not known yet
+INITIAL_REACH = float(RADIUS)  # px: reach of a peak before its size is known

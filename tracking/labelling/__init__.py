@@ -1,1 +1,1 @@
-"""First labels: which point of light is which spot, from one frame and a prior or none."""
+"""First labels: the assignment of points of light to spots from one frame, with or without a prior."""

@@ -1,10 +1,9 @@
-"""Which point of light is which spot, when nothing is known but a prior, or nothing at all: the first frame, and
-after a full occlusion.
+"""Labels of the points of light of one frame without a track: in the first frame, and after a full occlusion.
 
-Candidate poses come from three spots each, in closed form (tracking/first_labels/). Each pose predicts all spots; the
-points near the predictions are its labels. The likelihood of the points given the labels, averaged over the poses of
-the prior, decides; spots that should be seen but are not count against a pose. Where two poses explain the picture
-about equally well both are reported and none is chosen.
+Candidate poses come from three spots each, in closed form (candidates.py). Each pose predicts all spots; the points
+near the predictions get their labels (completion.py). The score is the likelihood of the points given the labels,
+averaged over the poses of the prior (evidence.py); spots that are expected but not found lower it. If two poses explain
+the picture about equally well, both are reported and none is chosen.
 
 Source: ours; the likelihood is the usual one of multi-target data association (Bar-Shalom & Li 1995, sec. 6.2).
 """
@@ -24,7 +23,7 @@ from geometry.pose_solver.robust_pose import fit_pose_robust
 from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import CalibrationSpread
 from tracking.detections import Detections
-from tracking.labelling.candidates import NO_POINT
+from tracking.labelling.points import NO_POINT
 from tracking.labelling.search import Labelling, candidate_labellings, crowd_of_unknown_brightness
 from tracking.labelling.ties import spot_names, what_decides
 from tracking.parameters import LabelParameters
@@ -38,17 +37,18 @@ __all__ = [
     "find_labels",
 ]
 
-# A camera with so many times `max_points` points that may be spots, of unknown brightness, is not searched: the points
-# looked at would be any of them.
-HOPELESS = 2
-# nats: how much likelier a pose must be than that all points are false and the vehicle is not seen. Measured with five
-# and eight false points per picture and no vehicle: a pose in 0.2 and 0.5 % of the frames without a prior, in none of
-# 3000 with one of 1 m and 30 deg. With 3.0: in 0.1 and 0.3 %, and 1 % more of the frames of a vehicle stay unlabelled.
-OVER_NOTHING = 2.0
-CLOSE = 0.2  # of `model_sigma_px`: the model's error where spots agree as their own sigmas claim ...
-P_ODD = 1e-3  # ... or a better one, with this probability
-MELTED_PX = 1.0  # spots nearer to each other than this make one point of light
-SAME_POSE = 0.01  # of the picture's diagonal: poses that put all spots nearer to each other than this are one
+# A frame is not searched if a camera has more than this multiple of `max_points` points of unknown brightness that may
+# be spots: an arbitrary subset would be searched.
+MAX_CROWD = 2
+# nats: least log evidence of a pose against the hypothesis that all points are false and the vehicle is not seen.
+# Measured with five and eight false points per picture and no vehicle: a pose in 0.2 and 0.5 % of the frames without a
+# prior, in none of 3000 with one of 1 m and 30 deg. With 3.0: in 0.1 and 0.3 %, and 1 % more of the frames of a vehicle
+# stay unlabelled.
+MIN_EVIDENCE_NATS = 2.0
+SMALL_MODEL_ERROR = 0.2  # share of `model_sigma_px` with which the spots should agree; a larger misfit ...
+P_ODD = 1e-3  # ... with a probability below this starts the search for false points
+MERGED_PX = 1.0  # spots nearer to each other than this give one point of light
+SAME_POSE = 0.01  # share of the picture's diagonal: poses that move no spot by more than this are the same
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +65,7 @@ class LabelResult:
         return self.chosen is None and len(self.candidates) > 1
 
     def in_words(self, model: SpotModel) -> str:
-        """The reason; each candidate, with the spots that it names and where it puts the vehicle; what would decide."""
+        """The reason, each candidate with its spots and its pose, and what would decide between them."""
         parts = []
         for one in self.candidates:
             ypr = np.rad2deg(one.fit.world_from_body.ypr)
@@ -86,17 +86,18 @@ def find_labels(
     parameters: LabelParameters | None = None,
     calibration: CalibrationSpread | None = None,
 ) -> LabelResult:
-    """Label the points of all cameras of one frame from a prior alone, or from none.
+    """Label the points of all cameras of one frame from a prior alone, or without one.
 
-    As `candidate_labellings`, with the decision: labels, a tie with its candidates, or the reason why there are none.
+    Arguments as of `candidate_labellings`. The result is one labelling, a tie with its candidates, or the reason why
+    there are no labels.
     """
     parameters = LabelParameters() if parameters is None else parameters
-    limit = HOPELESS * parameters.max_points
+    limit = MAX_CROWD * parameters.max_points
     crowd = crowd_of_unknown_brightness(rig, model, detections, prior, parameters, limit)
     if crowd is not None:
         name, points = crowd
         return LabelResult(
-            None, (), f"{points} points of light of camera {name!r}, and no flux that tells which may be spots"
+            None, (), f"{points} points of light of camera {name!r}, without a flux that shows which may be spots"
         )
     count = sum(len(found) for found in detections.values())
     if count < parameters.min_spots:
@@ -105,12 +106,12 @@ def find_labels(
     if not best:
         within = "that the rig can see" if prior is None else "within the prior"
         return LabelResult(None, (), f"no pose {within} explains enough of the points")
-    if best[0].score < OVER_NOTHING:
+    if best[0].score < MIN_EVIDENCE_NATS:
         return LabelResult(
             None, (), f"false points alone would explain the best pose nearly as well (lead {best[0].score:.1f} nats)"
         )
     first = _without_odd_spots(model, detections, best[0], parameters, calibration)
-    return _decided(model, [first, *best[1:]], parameters)
+    return _decide(model, [first, *best[1:]], parameters)
 
 
 def _without_odd_spots(
@@ -120,16 +121,16 @@ def _without_odd_spots(
     parameters: LabelParameters,
     calibration: CalibrationSpread | None,
 ) -> Labelling:
-    """A labelling without a spot or two, where the others then agree as well as their own sigmas claim.
+    """A labelling without its odd spots, if the others then agree within their own sigmas.
 
-    The evidence allows for an error of the model, and so may take a false point a pixel beside a spot that was not
-    found for the spot. Where all but that one agree without such an allowance, its label is left open.
+    The evidence allows for an error of the model, so a false point a pixel beside a spot that was not found may get the
+    spot's label. If all points but that one agree without the allowance, it stays unlabelled.
     """
     rows = np.flatnonzero(one.point_of != NO_POINT)
     found = [detections[model.views[v][0]] for v in rows]
     pixels = np.array([f.uv_px[p] for f, p in zip(found, one.point_of[rows], strict=True)])
     covariances = np.array([f.cov_px2[p] for f, p in zip(found, one.point_of[rows], strict=True)])
-    covariances = covariances + (CLOSE * parameters.model_sigma_px) ** 2 * np.eye(2)
+    covariances = covariances + (SMALL_MODEL_ERROR * parameters.model_sigma_px) ** 2 * np.eye(2)
     W = whiten(covariances)
     misfit = float(np.sum((W @ one.fit.residuals_px[..., None]) ** 2))
     if one.fit.dof <= 2 or misfit <= largest_chi2(P_ODD, one.fit.dof):
@@ -144,8 +145,8 @@ def _without_odd_spots(
     return replace(one, fit=fit, point_of=point_of)
 
 
-def _decided(model: SpotModel, best: Sequence[Labelling], parameters: LabelParameters) -> LabelResult:
-    """Choose, or report a tie. Labellings of about the same pose are no rivals: only their odd spots are left open."""
+def _decide(model: SpotModel, best: Sequence[Labelling], parameters: LabelParameters) -> LabelResult:
+    """Choose the best labelling, or report a tie. Spots that labellings of about the same pose dispute get no label."""
     first = best[0]
     here = model.project(first.fit.world_from_body)[0]
     near: Array = SAME_POSE * np.linalg.norm(model.image_size_px, axis=-1)
@@ -155,8 +156,8 @@ def _decided(model: SpotModel, best: Sequence[Labelling], parameters: LabelParam
         if first.score - other.score >= parameters.lead_nats:
             break
         there = model.project(other.fit.world_from_body)[0]
-        apart = np.linalg.norm(here - there, axis=-1)
-        if np.all(np.isnan(apart) | (apart < near)):
+        distance = np.linalg.norm(here - there, axis=-1)
+        if np.all(np.isnan(distance) | (distance < near)):
             labels[_disputed(model, labels, other.point_of, here)] = NO_POINT
         else:
             rivals.append(other)
@@ -168,12 +169,12 @@ def _decided(model: SpotModel, best: Sequence[Labelling], parameters: LabelParam
 
 
 def _disputed(model: SpotModel, labels: Ints, other: Ints, here: Array) -> Bools:
-    """Which views (n,) have a point in one labelling and not the same in another of about the same pose.
+    """Which views (n,) have a point in one labelling but not the same point in another of about the same pose.
 
-    Of two spots that lie on each other (nearer than a detection can tell) either may have the one point.
+    here (n, 2), px: the projected spots. Two spots that are merged into one point of light are not disputed.
     """
     out = (labels != other) & (labels != NO_POINT)
     for v in np.flatnonzero(out):
         same = (other == labels[v]) & (model.camera_of == model.camera_of[v])
-        out[v] = not np.any(np.linalg.norm(here[same] - here[v], axis=-1) < MELTED_PX)
+        out[v] = not np.any(np.linalg.norm(here[same] - here[v], axis=-1) < MERGED_PX)
     return out

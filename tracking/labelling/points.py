@@ -1,4 +1,4 @@
-"""The points of light of all cameras of one frame, as the search for labels needs them."""
+"""The points of light of all cameras of one frame, prepared for the search for labels."""
 
 from __future__ import annotations
 
@@ -14,18 +14,19 @@ from geometry.surfaces import meet_surface
 from tracking.detections import Detections
 from tracking.parameters import LabelParameters
 
+NO_POINT = -1  # label of a view without a point
 # Sigmas within which points of two cameras that observe the same screen are one point of light.
 SAME_POINT = 6.0
 
 
 class Points(NamedTuple):
-    """m points of light that may be spots, those of a camera together; of a crowded picture the brightest."""
+    """m points of light that may be spots, ordered by camera; only the brightest of a crowded picture."""
 
     uv: Array  # (m, 2) px
-    cov: Array  # (m, 2, 2) px^2, as claimed
+    cov: Array  # (m, 2, 2) px^2, as stated by the detections
     world: Array  # (m, 3) m, on the screen; nan where the line of sight misses it
-    m_per_px: Array  # (m,) how far on the screen a step of one pixel goes, the longer of both axes
-    first: Ints  # (cameras + 1,) where each camera's begin
+    m_per_px: Array  # (m,) m, displacement on the screen for one pixel, the larger of both axes
+    first: Ints  # (cameras + 1,) row of the first point of each camera
     row: Ints  # (m,) row in that camera's detections
     log_density: Array  # (cameras,) log of the density of all points, 1/px^2
     log_unused: Array  # (cameras, most + 1): see `_log_unused`
@@ -38,9 +39,9 @@ def points_of(
     parameters: LabelParameters,
     reached: Callable[[int, Array], Bools],
 ) -> Points:
-    """All cameras' points in one list. The rig is the one that `model` was made of.
+    """The points of all cameras. The rig is the one that `model` was made of.
 
-    reached: which places (k, 3) on the screen of a camera (by number) a spot may light at all.
+    reached: for a camera (by number) and points (k, 3), m, on its screen: which of them any spot may light.
     """
     cameras = len(model.camera_names)
     uv, cov, world, row = [np.zeros((0, 2))], [np.zeros((0, 2, 2))], [np.zeros((0, 3))], [np.zeros(0, dtype=np.int64)]
@@ -59,7 +60,7 @@ def points_of(
                 origin, rays = camera.rays(found.uv_px[order])
                 possible = np.flatnonzero(reached(c, meet_surface(origin, rays, screen.world_from_screen, screen.bow)))
                 brightest = order[possible[: parameters.max_points]]
-                # As many points are as bright as these; a false one may be any of them.
+                # The density of false points is that of all points at least as bright as these.
                 if len(possible) > parameters.max_points:
                     order = order[: possible[parameters.max_points]]
             else:
@@ -91,10 +92,10 @@ def points_of(
 
 
 def _log_unused(count: int, area: float, expected: float, most: int) -> Array:
-    """Log of how much likelier a picture's false points become when k = 0 ... most of its points are no longer false.
+    """Log of the likelihood ratio of a picture's false points if k = 0 ... most of its points are spots instead.
 
-    Under a Poisson density that is not known, with an exponential prior about `expected` false points per picture: j
-    false points of a picture of `area` px^2 have the density j! / area^j mu^j / (1 + mu)^(j + 1).
+    For a Poisson process of unknown density, with an exponential prior of mean mu = `expected` false points per
+    picture: j false points in a picture of `area` px^2 have the density j! / area^j mu^j / (1 + mu)^(j + 1).
     """
     k = np.minimum(np.arange(most + 1), count)
     falling = np.concatenate([[0.0], np.cumsum(np.log(np.maximum(count - np.arange(most), 1.0)))])
@@ -103,16 +104,17 @@ def _log_unused(count: int, area: float, expected: float, most: int) -> Array:
 
 
 class PointsOnScreens(NamedTuple):
-    """The points from which candidate poses are made: a point seen by two cameras of one screen stands once."""
+    """The points that candidate poses are made from: a point seen by two cameras of one screen is entered once."""
 
-    point: Ints  # (k,) index into Points, those of a screen together, the brightest first
+    point: Ints  # (k,) index into Points, ordered by screen, the brightest first
     first: Ints  # (screens + 1,)
 
 
 def on_screens(points: Points, screen_of_camera: Ints, screens: int, sigma_px: float, most: int) -> PointsOnScreens:
-    """screen_of_camera: (cameras,) which of the screens each observes; most: of each camera the brightest so many.
+    """The points of every screen, without duplicates.
 
-    sigma_px: the error that the model adds to a point's own.
+    screen_of_camera (cameras,): the screen that each camera observes; most: number of points per camera, the brightest;
+    sigma_px: the model's error, in addition to a point's own.
     """
     sigma_m = points.m_per_px * np.sqrt(np.trace(points.cov, axis1=1, axis2=2) + 2 * sigma_px**2)
     chosen: list[int] = []

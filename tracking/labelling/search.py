@@ -1,4 +1,4 @@
-"""Candidate labellings of one frame under any prior, or none: the parts of this folder put together."""
+"""Candidate labellings of one frame, with or without a prior: the steps of this folder in sequence."""
 
 from __future__ import annotations
 
@@ -17,20 +17,21 @@ from geometry.rig import Rig
 from geometry.surfaces import meet_surface
 from geometry.uncertainty.rig_uncertainty import CalibrationSpread
 from tracking.detections import Detections
-from tracking.labelling.candidates import NO_POINT, Best, LabelLimits, SpotGeometry, generate
-from tracking.labelling.completion import SHARES, complete_all
-from tracking.labelling.points import Points, PointsOnScreens, on_screens, points_of
+from tracking.labelling.candidates import BestCandidates, generate
+from tracking.labelling.completion import complete_all
+from tracking.labelling.evidence import SHARES
+from tracking.labelling.points import NO_POINT, Points, PointsOnScreens, on_screens, points_of
+from tracking.labelling.problem import LabelLimits, LabelProblem, SpotGeometry
 from tracking.labelling.triples import covering
 from tracking.labelling.visible_poses import VisiblePoses
 from tracking.parameters import LabelParameters
 
-# The largest error of the model that is allowed for, as a multiple of the parameter's: evidence is the mean over
-# several sizes up to this one.
+# The largest model error considered, as a multiple of `model_sigma_px`: the evidence is the mean over several sizes up
+# to this one.
 LARGEST_MODEL_ERROR = 2.0
-# Chance that a right set of labels is refused by its misfit.
-P_MISFIT = 1e-6
-FEWEST_POINTS = 6  # per camera: of a crowd at least so many of the brightest take part
-LEAST_LIKELY = 25.0  # nats: labellings so far behind the best are not reported
+P_MISFIT = 1e-6  # probability that the correct labels are rejected because of their misfit
+FEWEST_POINTS = 6  # least number of points per camera that are used in a crowd; the brightest
+LEAST_LIKELY = 25.0  # nats: labellings with a larger distance to the best are not reported
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,16 +41,16 @@ class Labelling:
     fit: PoseFit
     point_of: Ints  # (n views,) row in its camera's detections, or NO_POINT
     score: float  # log evidence against "all points are false", nats: the likelihood averaged over the prior's poses
-    expected: int  # how many views it puts in the picture
+    expected: int  # number of views that the pose predicts in the picture
 
 
 @dataclass(frozen=True, slots=True)
 class RigPlan:
-    """What the search prepares once for a rig."""
+    """The data of a rig that the search uses, computed once."""
 
     model: SpotModel
     everywhere: PosePrior
-    triples: Ints  # (k, 3) spots: the first `stages[m]` of them serve any m visible spots and more
+    triples: Ints  # (k, 3) spots: the first `stages[m]` of them cover any set of m or more visible spots
     stages: Mapping[int, int]
     screen_of_camera: Ints  # (cameras,)
     spot_screen: Ints  # (spots,)
@@ -58,7 +59,7 @@ class RigPlan:
     spot_ray: Array  # (spots, 3)
     front: Array  # (n, 4) the plane of each view's screen, with the normal towards its camera
     log_volume: float  # m^3 rad^3, of the poses that show at least `min_spots` spots
-    typical: Pose | None  # one that shows as many spots as any
+    typical: Pose | None  # a pose that shows the largest number of spots
 
     @staticmethod
     def of(rig: Rig, model: SpotModel, min_spots: int) -> RigPlan:
@@ -96,7 +97,7 @@ _plans: list[tuple[Rig, int, RigPlan]] = []
 
 
 def plan_of(rig: Rig, model: SpotModel, min_spots: int) -> RigPlan:
-    """The plan of a rig, kept for the rigs last asked for; `model` is made of it."""
+    """The plan of a rig, cached for the last few rigs; `model` is made of the rig."""
     for known, least, plan in _plans:
         if known is rig and least == min_spots:
             return plan
@@ -115,11 +116,11 @@ def candidate_labellings(
     calibration: CalibrationSpread | None = None,
     most: int = 8,
 ) -> list[Labelling]:
-    """The labellings of one frame that explain its points best, best first, without a decision between them.
+    """The at most `most` labellings of one frame that best explain its points, best first.
 
     detections: by camera name; a camera without a picture is absent. The rig is the one that `model` was made of.
-    prior: None for all poses in which the rig can see its spots. calibration: what its errors do to the spots, where
-    that is known. A labelling has at least `parameters.min_spots` spots.
+    prior: None for all poses in which the rig can see its spots. calibration: the effect of the calibration's errors on
+    the spots, if known. A labelling has at least `parameters.min_spots` spots.
     """
     parameters = LabelParameters() if parameters is None else parameters
     plan = plan_of(rig, model, parameters.min_spots)
@@ -127,7 +128,7 @@ def candidate_labellings(
     log_volume = min(prior.log_volume, plan.log_volume)
     points = points_of(rig, model, detections, parameters, partial(_reached_by_any, plan, prior))
     has_image = np.array([model.camera_names[c] in detections for c in model.camera_of])
-    spot_geometry = _sight(plan, points, has_image, parameters, _known_px(plan, calibration))
+    spots = _spot_geometry(plan, points, has_image, parameters, _calibration_cov_px2(plan, calibration))
     limits = LabelLimits(
         np.ascontiguousarray(prior.centre.rotation, dtype=np.float64),
         np.array(prior.centre.translation, dtype=np.float64),
@@ -136,21 +137,22 @@ def candidate_labellings(
         parameters.p_detect,
         parameters.min_spots,
     )
+    problem = LabelProblem(model.numbers, spots, points, limits, plan.front)
     reached = _reached(plan, prior, points.world)
     sigma_px = LARGEST_MODEL_ERROR * parameters.model_sigma_px
-    best = Best.none(parameters.max_refined, len(model))
+    best = BestCandidates.none(parameters.max_refined, len(model))
     brightness_known = all(np.isfinite(found.flux).any() for found in detections.values() if len(found))
-    screens, most_triples = _within_budget(plan, spot_geometry, points, reached, parameters, brightness_known, sigma_px)
+    screens, most_triples = _within_budget(plan, problem, reached, parameters, brightness_known, sigma_px)
     done = 0
     for size, end in plan.stages.items():
-        now = plan.triples[done : min(end, most_triples)]
-        now = np.ascontiguousarray(now[(spot_geometry.spot_screen[now] >= 0).all(axis=1)])
+        stage = plan.triples[done : min(end, most_triples)]
+        stage = np.ascontiguousarray(stage[(spots.spot_screen[stage] >= 0).all(axis=1)])
         done = end
-        generate(model.numbers, spot_geometry, points, screens, reached, limits, now, best)
-        # What is not served yet explains two spots less: it is no rival.
-        if done >= most_triples or _spots_of_best(plan, spot_geometry, points, limits, best) > size:
+        generate(problem, screens, reached, stage, best)
+        # Labellings that are not covered yet explain at least two spots fewer, so they cannot compete.
+        if done >= most_triples or _spots_of_best(plan, problem, best) > size:
             break
-    return _completed(plan, spot_geometry, points, limits, prior, log_volume, best, calibration, most, sigma_px)
+    return _completed(plan, problem, prior, log_volume, best, calibration, most, sigma_px)
 
 
 def crowd_of_unknown_brightness(
@@ -161,7 +163,7 @@ def crowd_of_unknown_brightness(
     parameters: LabelParameters,
     limit: int,
 ) -> tuple[str, int] | None:
-    """A camera with more points than a limit that may be spots under the prior, and no flux; and how many it has."""
+    """A camera with more than `limit` points that may be spots under the prior but have no flux, and their number."""
     crowds = [n for n, found in detections.items() if len(found) > limit and not np.isfinite(found.flux).any()]
     if not crowds:
         return None
@@ -178,39 +180,39 @@ def crowd_of_unknown_brightness(
 
 
 def _reached(plan: RigPlan, prior: PosePrior, places: Array) -> Bools:
-    """Which places (m, 3) each spot may light under a prior: (spots, m)."""
+    """Which places (m, 3), m, each spot may light under a prior: (spots, m)."""
     rays = zip(plan.spot_point, plan.spot_ray, strict=True)
     return np.array([prior.reaches(p, r, places) for p, r in rays], dtype=bool).reshape(-1, len(places))
 
 
 def _reached_by_any(plan: RigPlan, prior: PosePrior, camera: int, places: Array) -> Bools:
-    """Which places (m, 3) on the screen of a camera any of its spots may light."""
+    """Which places (m, 3), m, on the screen of a camera any of its spots may light."""
     mine = plan.view_at[:, camera] >= 0
     return np.asarray(_reached(plan, prior, places)[mine].any(axis=0) & np.isfinite(places).all(axis=-1))
 
 
-def _spots_of_best(plan: RigPlan, spot_geometry: SpotGeometry, points: Points, limits: LabelLimits, best: Best) -> int:
-    """How many spots the likeliest candidate of those made so far explains."""
+def _spots_of_best(plan: RigPlan, problem: LabelProblem, best: BestCandidates) -> int:
+    """The number of spots that the likeliest candidate so far explains."""
     if not best.taken[0]:
         return 0
-    _, _, labels, evidence, _, _ = complete_all(plan.model.numbers, spot_geometry, points, limits, plan.front, best, 1)
+    _, _, labels, evidence, _, _ = complete_all(problem, best, 1)
     return len(set(plan.model.spot_of[labels[0] != NO_POINT])) if evidence[0] > -np.inf else 0
 
 
 def _within_budget(
     plan: RigPlan,
-    spot_geometry: SpotGeometry,
-    points: Points,
+    problem: LabelProblem,
     reached: Bools,
     parameters: LabelParameters,
     brightness_known: bool,
     sigma_px: float,
 ) -> tuple[PointsOnScreens, int]:
-    """The points to make poses from and how many of the plan's triples: at most `max_triples` sets of three points.
+    """The points and the number of the plan's triples to be used: at most `max_triples` sets of three points.
 
-    In a crowd spots are brighter than most: fewer points are used. Where brightness is not known all points are used,
-    and fewer triples of spots, those first that serve most sets of visible spots.
+    In a crowd only the brightest points are used, because spots are brighter than most false points. If the brightness
+    is unknown, all points are used with fewer triples of spots: those that cover most sets of visible spots.
     """
+    points, spot_geometry = problem.points, problem.spots
     most = parameters.max_points
     screen_count = int(plan.screen_of_camera.max()) + 1
     while True:
@@ -227,26 +229,27 @@ def _within_budget(
         most = max(int(0.8 * most), FEWEST_POINTS)
 
 
-_known: list[tuple[CalibrationSpread, RigPlan, Array]] = []
+_calibration_covs: list[tuple[CalibrationSpread, RigPlan, Array]] = []
 
 
-def _known_px(plan: RigPlan, calibration: CalibrationSpread | None) -> Array:
-    """What the calibration's errors make of each view's pixel (n, 2, 2), px^2, in a typical pose; kept."""
+def _calibration_cov_px2(plan: RigPlan, calibration: CalibrationSpread | None) -> Array:
+    """The calibration's covariance of each view's pixel (n, 2, 2), px^2, in a typical pose; cached."""
     n = len(plan.model)
     if calibration is None or plan.typical is None:
         return np.zeros((n, 2, 2))
-    for spread, of, px2 in _known:
+    for spread, of, px2 in _calibration_covs:
         if spread is calibration and of is plan:
             return px2
     px2 = calibration.at(plan.typical).reshape(n, 2, n, 2)[np.arange(n), :, np.arange(n)].copy()
-    _known.insert(0, (calibration, plan, px2))
-    del _known[8:]
+    _calibration_covs.insert(0, (calibration, plan, px2))
+    del _calibration_covs[8:]
     return px2
 
 
-def _sight(
+def _spot_geometry(
     plan: RigPlan, points: Points, has_image: Bools, parameters: LabelParameters, known_cov: Array
 ) -> SpotGeometry:
+    """The views for compiled code; known_cov (n, 2, 2), px^2: of the calibration."""
     model = plan.model
     sigma2 = (LARGEST_MODEL_ERROR * parameters.model_sigma_px) ** 2
     with_points = {
@@ -270,21 +273,17 @@ def _sight(
 
 def _completed(
     plan: RigPlan,
-    spot_geometry: SpotGeometry,
-    points: Points,
-    limits: LabelLimits,
+    problem: LabelProblem,
     prior: PosePrior,
     log_volume: float,
-    best: Best,
+    best: BestCandidates,
     calibration: CalibrationSpread | None,
     most: int,
     sigma_px: float,
 ) -> list[Labelling]:
-    """The best candidates completed, weighed, no two alike, best first."""
-    model = plan.model
-    R, t, labels_of, evidences, shares, expected_of = complete_all(
-        model.numbers, spot_geometry, points, limits, plan.front, best, int(best.taken[0])
-    )
+    """The best candidates completed, without duplicates, best first."""
+    model, points = plan.model, problem.points
+    R, t, labels_of, evidences, shares, expected_of = complete_all(problem, best, int(best.taken[0]))
     evidences = evidences - log_volume
     out: list[Labelling] = []
     kept: list[tuple[Pose, Ints]] = []
@@ -311,10 +310,10 @@ def _consistent_fit(
     model_errors_px: Array,
     calibration: CalibrationSpread | None,
 ) -> PoseFit | None:
-    """The fit to labelled points with the smallest of some model errors, falling, under which all agree.
+    """The fit to labelled points with the smallest model error under which all points agree.
 
-    None where they do not even under the largest. One spot that a neighbour has pulled may misfit by many of its own
-    sigmas while the others are perfect.
+    model_errors_px: in descending order. None if the points do not agree even with the largest one. A spot that is
+    merged with a neighbour may have a residual of many of its own sigmas while all others agree.
     """
     rows = np.flatnonzero(labels != NO_POINT)
     chosen = labels[rows]
@@ -330,5 +329,5 @@ def _consistent_fit(
 
 def _near(one: Pose, other: Pose) -> bool:
     """Whether two poses with the same labels are the same solution."""
-    away = one.minus(other)
-    return bool(np.abs(away[:3]).max() < 0.02 and np.abs(away[3:]).max() < 0.02)
+    difference = one.minus(other)
+    return bool(np.abs(difference[:3]).max() < 0.02 and np.abs(difference[3:]).max() < 0.02)

@@ -1,4 +1,4 @@
-"""What would decide between two poses that explain the same points."""
+"""Explanation of a tie: which observations would decide between two poses that explain the same points."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ from geometry import rotations
 from geometry.arrays import Array, Bools
 from geometry.forward_model import SpotModel
 from geometry.pose_solver.symmetry import lie_on_each_other
-from tracking.labelling.candidates import NO_POINT
+from tracking.labelling.points import NO_POINT
 from tracking.labelling.search import Labelling
 
-FITTED_RAD, FITTED_M = float(np.deg2rad(0.3)), 0.01  # two fitted poses of a symmetric rig differ from it by this
-APART_PX = 5.0  # a spot that is expected farther than this from any of the other pose tells the two apart
+FITTED_RAD, FITTED_M = float(np.deg2rad(0.3)), 0.01  # tolerance of the symmetry of two fitted poses
+APART_PX = 5.0  # a spot expected farther than this from every spot of the other pose distinguishes the two
 
 
 def spot_names(model: SpotModel, views: Bools) -> str:
-    """The spots of some views (n,), each once, in words."""
+    """The names of the spots of some views (n,), each once."""
     return " ".join(dict.fromkeys(model.views[v][1] for v in np.flatnonzero(views)))
 
 
 def what_decides(model: SpotModel, one: Labelling, other: Labelling) -> str:
-    """In words: which spots in view, or which prior, would exclude one of two labellings of the same points."""
+    """A sentence: which spots in view, or which prior, would exclude one of two labellings of the same points."""
     here, there = one.fit.world_from_body, other.fit.world_from_body
     uv_here, uv_there = model.project(here)[0], model.project(there)[0]
     parts = []
@@ -34,7 +34,7 @@ def what_decides(model: SpotModel, one: Labelling, other: Labelling) -> str:
         if places:
             parts.append(f"spot {', '.join(places)}, where only the {which} expects one and none was found (hidden?)")
     if lie_on_each_other(model, here.inverse() @ there, FITTED_RAD, FITTED_M):
-        parts.append("no spot of this rig: turned from one pose to the other it coincides with itself")
+        parts.append("no spot of this rig: it is symmetric under the rotation from one pose to the other")
     elif not parts:
         parts.append("another spot in view")
     shift = float(np.abs(here.translation - there.translation).max())
@@ -50,7 +50,7 @@ def what_decides(model: SpotModel, one: Labelling, other: Labelling) -> str:
 
 
 def _only_here(model: SpotModel, view: int, uv: Array, uv_other: Array) -> bool:
-    """Whether a view is in its picture in one pose (n, 2), and no spot near that place in another (n, 2)."""
+    """Whether a view is in its picture in one pose, uv (n, 2), and no spot is near it in the other, uv_other (n, 2)."""
     if not model.in_picture(uv)[view]:
         return False
     gap = np.linalg.norm(uv_other[model.camera_of == model.camera_of[view]] - uv[view], axis=-1)

@@ -1,4 +1,4 @@
-"""Which sets of three spots to make candidate poses from: enough that any four visible spots hold a good one."""
+"""Selection of the sets of three spots for candidate poses: any set of visible spots contains enough of them."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ import numpy as np
 
 from geometry.arrays import Array, Ints
 
-TIMES = 2  # triples in any set of visible spots, where it has as many that fix the pose: noise may spoil one
-MOST_SETS = 5000  # of one size: of more spots than 12 a sample will do
+TIMES = 2  # triples in any set of visible spots, if it has that many that determine the pose: noise may affect one
+MOST_SETS = 5000  # sets of one size that are considered: a random sample if there are more (above 12 spots)
 
 
 def covering(
     triples: dict[tuple[int, int, int], float], spots: Sequence[int], least: int
 ) -> tuple[Ints, dict[int, int]]:
-    """A few triples (k, 3) such that any `least` spots that hold triples hold TIMES of them; and their stages.
+    """Triples (k, 3) such that any set of at least `least` spots contains TIMES of them, if possible; and stages.
 
-    triples: how well each fixes the pose. The order is such that the larger sets of spots are served first: the
-    first `stages[m]` triples serve all sets of m spots and more. Greedy: next comes the triple that serves most sets
-    which still lack one, of equals the one that fixes the pose best.
+    triples: the quality with which each determines the pose. The larger sets of spots are covered first: the first
+    `stages[m]` triples cover all sets of m or more spots. Greedy set cover: the next triple is the one that covers most
+    of the sets that still lack one; of equals the one with the best quality.
     """
     names = list(triples)
     quality = np.array([triples[t] for t in names])
@@ -31,16 +31,16 @@ def covering(
         sets = [frozenset(s) for s in combinations(spots, size)]
         if len(sets) > MOST_SETS:
             sets = [sets[i] for i in rng.choice(len(sets), MOST_SETS, replace=False)]
-        holds: Array = np.array([[s.issuperset(t) for s in sets] for t in names], dtype=float).reshape(-1, len(sets))
-        lacking = np.minimum(holds.sum(axis=0), TIMES)
-        lacking = np.maximum(lacking - holds[chosen].sum(axis=0), 0.0)
+        covers: Array = np.array([[s.issuperset(t) for s in sets] for t in names], dtype=float).reshape(-1, len(sets))
+        lacking = np.minimum(covers.sum(axis=0), TIMES)
+        lacking = np.maximum(lacking - covers[chosen].sum(axis=0), 0.0)
         while lacking.any():
-            served = holds @ np.minimum(lacking, 1.0)
-            served[chosen] = 0.0
-            best = int(np.argmax(served + 0.5 * quality / quality.max()))
-            if not served[best] > 0:
+            covered = covers @ np.minimum(lacking, 1.0)
+            covered[chosen] = 0.0
+            best = int(np.argmax(covered + 0.5 * quality / quality.max()))
+            if not covered[best] > 0:
                 break
             chosen.append(best)
-            lacking = np.maximum(lacking - holds[best], 0.0)
+            lacking = np.maximum(lacking - covers[best], 0.0)
         stages[size] = len(chosen)
     return np.array([names[i] for i in chosen], dtype=np.int64).reshape(-1, 3), stages

@@ -1,9 +1,9 @@
-"""The poses in which a rig sees enough of its spots: a sample of them, and their volume.
+"""The poses in which a rig sees enough of its spots: their volume, by importance sampling.
 
-Three spots at random pixels of their pictures give poses in closed form. A pose is met so in proportion to |det J|, the
-Jacobian of the three spots' six pixels, and once for each set of three views that shows it: its weight is the inverse.
-Poses drawn from the lab's whole space would hardly ever show a spot to a long lens (one in 1e6 at f = 6000 px).
-Source: ours.
+Three spots at random pixels of their pictures give poses in closed form. A pose is sampled with a density proportional
+to |det J|, the Jacobian of the three spots' six pixels, and by every set of three views that sees it; its weight is the
+inverse. Poses drawn uniformly from the lab's space would hardly ever show a spot to a long lens (one in 1e6 at
+f = 6000 px). Source: ours.
 """
 
 from __future__ import annotations
@@ -22,21 +22,21 @@ from geometry.pose_solver.three_spots import poses_from_three_spots
 from geometry.rig import Rig
 from geometry.surfaces import meet_surface
 
-DRAWN = 4000  # sets of three pixels; the volume is then known to a tenth or two
-FIXES = 1e-4  # least relative size of a singular value of three spots' Jacobian; collinear spots have 1e-12
+DRAWN = 4000  # sets of three pixels; the relative error of the volume is then 0.1 to 0.2
+FIXES = 1e-4  # least ratio of the singular values of three spots' Jacobian; collinear spots have 1e-12
 
 
 @dataclass(frozen=True, slots=True)
 class VisiblePoses:
-    """What a rig can see, with the sets of three spots that fix a pose."""
+    """The volume of visible poses, and the sets of three spots that determine a pose."""
 
-    triples: dict[tuple[int, int, int], float]  # of spots: the median relative size of the least singular value
+    triples: dict[tuple[int, int, int], float]  # spots -> median ratio of the least to the largest singular value
     log_volume: float  # m^3 rad^3, of the poses that show at least `min_spots` spots
-    typical: Pose | None  # one that shows as many spots as any
+    typical: Pose | None  # a pose that shows the largest number of spots
 
     @staticmethod
     def of(rig: Rig, model: SpotModel, everywhere: PosePrior, min_spots: int) -> VisiblePoses:
-        """Of the rig that `model` was made of; the same for the same arguments."""
+        """The visible poses of the rig that `model` was made of; deterministic."""
         rng = np.random.default_rng(0)
         triples = _sets_of_three(model)
         if not triples:
@@ -52,7 +52,7 @@ class VisiblePoses:
         poses = poses[usable]
         pixels, J = model.project(poses)
         seen = model.in_picture(pixels)
-        # (k, spots): in how many pictures each spot is.
+        # (k, spots): the number of pictures that show each spot.
         shown = np.stack([seen[:, rows].sum(axis=1) for rows in views_of], axis=-1)
         enough = np.count_nonzero(shown, axis=1) >= min(min_spots, len({int(s) for s in model.spot_of}))
         at = np.arange(len(source))[:, None]
@@ -69,14 +69,14 @@ class VisiblePoses:
 
 
 def _sets_of_three(model: SpotModel) -> list[tuple[int, int, int]]:
-    """All sets of three spots, but those with two of one beam end (a ray that may meet one of two screens)."""
+    """All sets of three spots, except those with two of one beam end (a ray that may hit one of two screens)."""
     first = {int(s): int(np.flatnonzero(model.spot_of == s)[0]) for s in np.unique(model.spot_of)}
     ends = {s: (int(model.beam_of[v]), float(model.sign[v])) for s, v in first.items()}
     return [t for t in combinations(sorted(first), 3) if len({ends[s] for s in t}) == 3]
 
 
 def _at_random_pixels(rig: Rig, model: SpotModel, views: Ints, rng: np.random.Generator) -> Array:
-    """World points (k, 3, 3), m, at random pixels of the pictures of views (k, 3); nan beside the screen."""
+    """World points (k, 3, 3), m, at random pixels of the pictures of views (k, 3); nan outside the screen."""
     pixels = rng.uniform(-0.5, model.image_size_px[views] - 0.5)
     places = np.full((*views.shape, 3), np.nan)
     for c, name in enumerate(model.camera_names):
@@ -92,7 +92,7 @@ def _at_random_pixels(rig: Rig, model: SpotModel, views: Ints, rng: np.random.Ge
 
 
 def _fixing(triples: Sequence[tuple[int, int, int]], which: Ints, quality: Array, enough: Bools) -> dict[int, float]:
-    """Which sets of three fix a pose where they are seen, by place in the list, and how well."""
+    """The sets of three that determine the pose where they are visible, by index, with their quality."""
     out = {}
     for i in range(len(triples)):
         mine = which == i
@@ -114,7 +114,7 @@ def _weights(
     shown: Array,
     singular: Array,
 ) -> Array:
-    """The volume that each of k poses stands for, times the number of sets; 0 from a set that is not good."""
+    """The volume that each of k poses represents, times the number of sets; 0 for poses from other than good sets."""
     area = np.prod(model.image_size_px, axis=-1)[views].prod(axis=1)
     ways = np.array([np.prod([len(views_of[s]) for s in triples[i]]) for i in which], dtype=float)
     met = sum(np.prod(shown[:, list(triples[i])], axis=1) for i in good)

@@ -1,4 +1,4 @@
-"""What the grey values of a camera's pictures say of their file format: steps, bit depth, clipping."""
+"""Properties of a camera's pictures that follow from their grey values: step, bit depth, clipping."""
 
 from __future__ import annotations
 
@@ -10,27 +10,27 @@ from numpy.typing import NDArray
 from tracking.noise import Picture
 from tracking.noise_estimation.rounding import clipped_normal
 
-_FEWEST_VALUES = 8  # distinct grey values from which their common divisor is a step
-_CLIPPED = 0.02  # share of pixels at zero from which the background counts as clipped
+_FEWEST_VALUES = 8  # distinct grey values needed to take their common divisor as the step
+_CLIPPED = 0.02  # share of pixels at zero above which the background counts as clipped
 
 
 def grey_step(pictures: Sequence[Picture]) -> float:
-    """Greatest common divisor of the grey values, as sampled."""
+    """The step of the grey values, DN: the largest power of two that divides all sampled values; at most 64."""
     divisor, distinct = 0, 0
     for picture in pictures:
         sample = np.unique(picture[::3, ::3]) if picture.size else np.zeros(1, picture.dtype)
         divisor = int(np.gcd.reduce(np.append(sample.astype(np.int64), divisor)))
         distinct = max(distinct, len(sample))
-    # A few values have any divisor; real steps are powers of two.
+    # A few values may have any common divisor; real steps are powers of two.
     few = distinct < _FEWEST_VALUES
     return float(divisor & -divisor) if not few and 0 < divisor & -divisor <= 64 else 1.0
 
 
 def saturation_level(pictures: Sequence[Picture], step_dn: float) -> float | None:
-    """The grey value at which the sensor clips, where the pictures show one; None: only the type's largest number.
+    """The grey value at which the sensor clips, if the pictures show one; None: only the type's largest value.
 
-    Light that is cut off piles up at one value: there are many more pixels at it than one step below. 10 and 12 bits in
-    files of 16 show it at 1023 or 4095, a camera with an offset anywhere.
+    Clipped light accumulates at one value: many more pixels have it than one step below. 10 and 12 bit data in 16 bit
+    files clip at 1023 or 4095, a camera with an offset at any value.
     """
     top = max((int(p.max()) for p in pictures if p.size), default=0)
     if not pictures or top == np.iinfo(pictures[0].dtype).max or top == 0:
@@ -49,8 +49,8 @@ def full_scale(pictures: Sequence[Picture], step_dn: float) -> float:
 
 
 def clipped_background(pictures: Sequence[Picture], step: float) -> tuple[float, float] | None:
-    """Mean and variance before clipping of a background that is partly clipped at zero; None: it is not clipped."""
-    # The darker half of the blocks: the others hold light.
+    """Mean, DN, and variance, DN^2, before clipping of a background partly clipped at zero; None: not clipped."""
+    # Only the darker half of the blocks, which contains no light.
     blocks = np.concatenate([_blocks(p) for p in pictures])
     mean = blocks.mean(axis=1, dtype=np.float64)
     sample = blocks[mean <= np.median(mean)].ravel()

@@ -1,4 +1,4 @@
-"""The variance of pixels as a function of their grey level, from differences in time or within pictures."""
+"""The variance of pixels as a function of their grey level, from differences in time or within a picture."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from tracking.noise_estimation.rounding import rounding_ripple, unrounded
 
 Floats: TypeAlias = NDArray[Any]
 
-SIDE = 15  # px: changes of the light that are smooth over so many pixels are no noise
-LEAST_PIXELS = 200  # of one level
-LEVELS = 12
-_STRIPE = 64  # rows
-_KEPT = 3.5  # sigmas: differences beyond are outliers ...
-_KEPT_VARIANCE = 0.99389  # ... and this is the variance of normal deviates that are cut there
-_LEAST_WHITE = 0.01  # DN^2: changes in time by less are single steps of a few pixels
-_GRAIN = 1.25  # excess of the variance of means over white noise, below which it is taken for white
+SIDE = 15  # px: side of the local mean that removes smooth changes of the light from the noise
+LEAST_PIXELS = 200  # per level
+LEVELS = 12  # largest number of levels
+_STRIPE = 64  # rows per stripe of the sample
+_KEPT = 3.5  # sigmas: larger differences are outliers ...
+_KEPT_VARIANCE = 0.99389  # ... and this is the variance of standard normal deviates truncated there
+_LEAST_WHITE = 0.01  # DN^2: a smaller variance in time comes from single steps of a few pixels
+_GRAIN = 1.25  # ratio of the variance of means to that of white noise up to which the noise counts as white
 _FOURTH_DIFFERENCE = np.array([1.0, -4.0, 6.0, -4.0, 1.0])  # zero for anything cubic; nearly so for a smooth spot
 
 
@@ -35,22 +35,25 @@ class LevelVariances:
     level: Array  # (k,), DN
     variance: Array  # (k,), DN^2
     sigma: Array  # (k,), DN^2, of the variance
-    temporal: bool
+    temporal: bool  # from differences in time
 
     def scaled(self, floor: float) -> LevelVariances:
-        """With all variances larger by so much that the least is near `floor`, where that is larger by _GRAIN."""
+        """All variances scaled so that the least is `floor`, if `floor` is larger by more than the factor _GRAIN."""
         factor = floor / max(float(self.variance.min()), 1e-12) if len(self.variance) else 1.0
         return replace(self, variance=self.variance * factor, sigma=self.sigma * factor) if factor > _GRAIN else self
 
     def nearest(self, level_dn: float) -> float:
-        """The variance at the level next to this one, DN^2; 0 without any."""
+        """The variance, DN^2, of the level nearest to `level_dn`; 0 without levels."""
         return float(self.variance[np.argmin(np.abs(self.level - level_dn))]) if len(self.level) else 0.0
 
 
 def level_variances(pictures: Sequence[Picture], top: float, rounding: float) -> LevelVariances:
-    """Variance as a function of level: in time if the scene stays still, else within the pictures."""
+    """Variance as a function of level: in time if the scene is static, otherwise within the first picture.
+
+    top: grey value at which the sensor clips, DN; rounding: variance of the rounding error, DN^2.
+    """
     within = _binned(*_within(pictures[0], top), rounding)
-    # Noise that goes together over pixels (JPEG, demosaicing) hardly shows in differences of near ones.
+    # Noise correlated between pixels (JPEG, demosaicing) is underestimated by differences of neighbouring pixels.
     within = replace(within, temporal=False).scaled(guess_noise(pictures[0]).floor_dn2)
     samples = [_between(a, b, top) for a, b in _pairs(pictures)]
     if not samples:
@@ -61,12 +64,12 @@ def level_variances(pictures: Sequence[Picture], top: float, rounding: float) ->
     between = _binned(level, difference, rounding)
     at = float(np.median(level))
     if between.nearest(at) > 1.5 * max(within.nearest(at), 2 * rounding):
-        return within  # the camera or the scene shakes
+        return within  # the camera or the scene moves
     return replace(between, variance=between.variance * np.median(grain), sigma=between.sigma * np.median(grain))
 
 
 def _pairs(pictures: Sequence[Picture]) -> list[tuple[Picture, Picture]]:
-    """Neighbours, each picture in one pair (the last of an odd number in two), without a picture and its copy."""
+    """Pairs of consecutive pictures, each picture in one pair (the last but one of an odd number in two); no copies."""
     some = [(pictures[i], pictures[i + 1]) for i in range(0, len(pictures) - 1, 2)]
     if len(pictures) % 2 and len(pictures) > 1:
         some.append((pictures[-2], pictures[-1]))
@@ -74,7 +77,7 @@ def _pairs(pictures: Sequence[Picture]) -> list[tuple[Picture, Picture]]:
 
 
 def _between(a: Picture, b: Picture, top: float) -> tuple[Floats, Floats, Array]:
-    """Levels (m,), differences in time over sqrt 2 (m,), and by how much noise goes together over pixels (1,)."""
+    """Levels (m,), differences in time over sqrt 2 (m,), and the variance ratio of correlated to white noise (1,)."""
     a, b = _stripes(a), _stripes(b)
     x, y = a.astype(np.float32), b.astype(np.float32)
     difference = (y - x) * np.float32(np.sqrt(0.5))
@@ -85,7 +88,7 @@ def _between(a: Picture, b: Picture, top: float) -> tuple[Floats, Floats, Array]
     chosen = _sample(level) & (cv2.dilate(cv2.max(a, b), np.ones((3, 3), np.uint8)) < top) & (cv2.min(a, b) > 0)
     white = trimmed_variance(difference[::4, ::4].ravel())
     grain = 1.0
-    for cell in (2, 4) if white > _LEAST_WHITE else ():  # compressed pictures may not change at all
+    for cell in (2, 4) if white > _LEAST_WHITE else ():  # compressed pictures may be constant in time
         small = cv2.resize(difference, None, fx=1 / cell, fy=1 / cell, interpolation=cv2.INTER_AREA)
         share = cell**2 * trimmed_variance(small[::2, ::2].ravel()) / max(white, 1e-12)
         grain = max(grain, share / (1 - cell**2 / SIDE**2))
@@ -94,14 +97,17 @@ def _between(a: Picture, b: Picture, top: float) -> tuple[Floats, Floats, Array]
 
 
 def _stripes(picture: Picture) -> Picture:
-    """Half of the rows, in stripes: enough pixels, at half of the time."""
+    """Every other stripe of rows: enough pixels in half the time."""
     high = range(0, picture.shape[0], 2 * _STRIPE)
     return np.concatenate([picture[row : row + _STRIPE] for row in high]) if len(high) > 2 else picture
 
 
 def _within(picture: Picture, top: float) -> tuple[Floats, Floats]:
-    """Levels (m,) and fourth differences in u and v (m,), normalised to a pixel's noise. After Immerkaer (1996), "Fast
-    noise variance estimation", Computer Vision and Image Understanding 64, with a higher difference."""
+    """Levels (m,) and fourth differences in u and v (m,), normalised to a pixel's noise.
+
+    Source: after Immerkaer (1996), "Fast noise variance estimation", Computer Vision and Image Understanding 64, with
+    a higher difference.
+    """
     picture = _stripes(picture)
     pixels = picture.astype(np.float32)
     power = float(np.sum(_FOURTH_DIFFERENCE**2))
@@ -113,7 +119,7 @@ def _within(picture: Picture, top: float) -> tuple[Floats, Floats]:
 
 
 def _sample(level: Floats) -> Bools:
-    """A sparse sample of the background, and every pixel that is brighter."""
+    """A sparse sample of the background and all pixels brighter than it."""
     few = level[::8, ::8]
     middle = np.median(few)
     chosen: Bools = level > middle + 4 * max(float(np.percentile(np.abs(few - middle), 68)), 1.0)
@@ -124,22 +130,22 @@ def _sample(level: Floats) -> Bools:
 
 
 def trimmed_variance(deviates: Floats) -> float:
-    """Variance of normal, perhaps rounded, deviates among up to a tenth of outliers."""
+    """Variance of normal deviates, which may be rounded, with up to 10 % of outliers."""
     size = np.abs(deviates)
     variance = quantile_variance(size) if size.size else 0.0
     for _ in range(3):
-        # Rounded differences of little noise are mostly 0, with some of one step.
+        # With little noise, rounded differences are mostly 0 and sometimes one step.
         kept = size[size <= _KEPT * max(np.sqrt(variance), 0.3)]
         variance = float(np.mean(kept.astype(float) ** 2)) / _KEPT_VARIANCE if kept.size else 0.0
     return variance
 
 
 def _binned(level: Floats, deviates: Floats, rounding: float) -> LevelVariances:
-    """Variances of up to `LEVELS` levels with enough pixels each."""
+    """Variances of up to `LEVELS` levels with at least `LEAST_PIXELS` pixels each."""
     if len(level) < LEAST_PIXELS:
         return LevelVariances(np.zeros(0), np.zeros(0), np.zeros(0), temporal=True)
     low, high = np.quantile(level, [0.005, 1.0])
-    # Half of the levels share the background's pixels evenly, the others the range above it.
+    # Half of the levels divide the background's pixels evenly, the others divide the range of values above it.
     middle = np.quantile(level, np.linspace(0.0, 0.95, LEVELS // 2 + 1))
     above = middle[-1] + np.geomspace(1.0, max(high - middle[-1], 0.0) + 2.0, LEVELS // 2 + 1)[1:] - 1.0
     edges = np.unique(np.concatenate([middle, above]))
@@ -148,7 +154,7 @@ def _binned(level: Floats, deviates: Floats, rounding: float) -> LevelVariances:
     rows = [here for here in rows if np.count_nonzero(here) >= LEAST_PIXELS]
     variance = np.array([unrounded(trimmed_variance(deviates[here]), rounding) for here in rows])
     count = np.array([np.count_nonzero(here) for here in rows])
-    # No level is known better than by the statistics' own faults: structure, a few per cent, and rounding.
+    # The systematic errors limit the accuracy of every level: structure, a few per cent, and rounding.
     around = np.convolve(np.pad(variance, 1, mode="edge"), np.full(3, 1 / 3), "valid") if rows else variance
     sigma = np.hypot(variance * np.sqrt(2 / np.maximum(count, 1) + 0.03**2), rounding_ripple(around, rounding))
     return LevelVariances(np.array([np.mean(level[here]) for here in rows]), variance, sigma, temporal=True)

@@ -1,10 +1,10 @@
-"""A sensor's noise from its own pictures: photon transfer on what stays still, bounded by what sensors are like.
+"""A sensor's noise estimated from its own pictures: photon transfer on static pixels, with a prior on the slope.
 
-The variance of a pixel is the variance of the difference of two pictures, halved, where the scene stays still
-(Janesick, Photon Transfer, SPIE 2007, chapter 5; EMVA Standard 1288, release 4.0, 6.6). Texture, edges and spots of a
-vehicle at rest cancel in it. What does not cancel (moving spots, changing light) is removed by its local mean and by
-robust statistics. The evidence for the slope is weighed together with a broad prior, so neither a structure nor a lack
-of bright pixels can lead to a model that no sensor has. The combination is ours.
+The variance of a pixel is half the variance of the difference of two pictures of a static scene (Janesick, Photon
+Transfer, SPIE 2007, chapter 5; EMVA Standard 1288, release 4.0, 6.6). Texture, edges and spots of a vehicle at rest
+cancel in the difference. Moving spots and changing light are removed by subtracting the local mean and by robust
+statistics. The likelihood of the slope is combined with a broad prior, so that neither structure nor a lack of bright
+pixels can lead to an impossible sensor. The combination is ours.
 """
 
 from __future__ import annotations
@@ -24,38 +24,39 @@ from tracking.noise_estimation.spot_residuals import SpotResiduals, residuals_of
 from tracking.noise_estimation.texture import texture_of
 from tracking.parameters import DetectParameters
 
-_WELL_E = (1_000.0, 200_000.0)  # electrons at full scale: what sensors have, from the smallest to the largest
-_WELL_SPREAD = 1.2  # sigma of the logarithm about FULL_SCALE_E: a decade is two sigmas
-_SLOPES = 81
-_READ_E = (0.7, 20.0)  # electrons of read noise, from scientific sensors to old ones
-_LARGEST_MISFIT = 9.0  # squared sigmas: a level that contradicts the line by more is not noise alone
-_SURE = 0.25  # sigma of the slope's logarithm from which spots are not asked: photon transfer is the better evidence
-_MOST_SPOTS = 40  # of one picture: the brightest
-_LEAST_OF_SPOTS, _MOST_OF_SPOTS = 30, 300  # pixels of one brightness; residuals of one spot are not independent
-_CONTRASTS = (0.0, 0.005, 0.01, 0.02, 0.04, 0.08, 0.16, 0.32)  # of the light's grain
-_GRAIN_SIGMA = 0.5  # share of its own variance to which the grain is known
+_WELL_E = (1_000.0, 200_000.0)  # electrons at full scale: range from the smallest to the largest sensors
+_WELL_SPREAD = 1.2  # prior sigma of the logarithm about FULL_SCALE_E: a decade is two sigmas
+_SLOPES = 81  # number of slopes in the grid
+_READ_E = (0.7, 20.0)  # electrons of read noise: range from scientific to old sensors
+_LARGEST_MISFIT = 9.0  # squared sigmas: a level farther from the line has other errors than noise
+_SURE = 0.25  # sigma of the slope's logarithm up to which photon transfer alone is used, without the spots' residuals
+_MOST_SPOTS = 40  # per picture: the brightest
+_LEAST_OF_SPOTS, _MOST_OF_SPOTS = 30, 300  # pixels per brightness class; residuals of one spot are not independent
+_CONTRASTS = (0.0, 0.005, 0.01, 0.02, 0.04, 0.08, 0.16, 0.32)  # contrasts of the light's grain that are tried
+_GRAIN_SIGMA = 0.5  # relative uncertainty of the grain's variance
 
 
 @dataclass(frozen=True, slots=True)
 class NoiseEstimate:
-    """A noise model that was estimated from pictures, with its uncertainty."""
+    """A noise model estimated from pictures, with its uncertainty."""
 
     model: NoiseModel
     floor_sigma: float  # of the floor's logarithm
-    slope_sigma: float  # of the slope's logarithm; 1.2: nothing but the prior
-    saturation_dn: float | None  # level at which the sensor clips, as seen; None: not seen to clip
-    step_dn: float  # grey values are multiples of this: 16 for 12 bits at the upper end of 16
-    pictures: int  # that were looked at
+    slope_sigma: float  # of the slope's logarithm; 1.2: from the prior only
+    saturation_dn: float | None  # level at which the sensor clips in the pictures; None: they do not clip
+    step_dn: float  # grey values are multiples of this: 16 for 12 bits stored in the upper bits of 16
+    pictures: int  # number of pictures used
     temporal: bool  # from differences in time; False: within pictures, where structure counts as noise
 
 
 def estimate_noise(pictures: Sequence[Picture]) -> NoiseEstimate:
-    """The noise of a sensor from pictures (h, w) of one camera in their order of time, best in pairs of neighbours.
+    """The noise of a sensor from pictures (h, w) of one camera in order of time, preferably consecutive in pairs.
 
-    One picture is enough for a usable model; two to six make it right. Pictures of other sizes than the first are left
-    out.
+    One picture gives a usable model, two to six an accurate one. Pictures with another size or type than the first are
+    ignored.
 
-    Errors: ValueError without a picture.
+    Raises:
+        ValueError: without a picture.
     """
     if not pictures:
         raise ValueError("estimate_noise: expected at least one picture, got none")
@@ -67,16 +68,16 @@ def estimate_noise(pictures: Sequence[Picture]) -> NoiseEstimate:
     top = float(np.iinfo(usable[0].dtype).max) if saturation is None else saturation
     background = float(np.median(np.concatenate([p[::8, ::8].ravel() for p in usable]))) if usable[0].size else 0.0
     small = min(usable[0].shape) < 2 * SIDE
-    dark = None if small else clipped_background(usable, step)
+    clipped = None if small else clipped_background(usable, step)
     levels = None if small else level_variances(usable, top, rounding)
-    if levels is None or (dark is None and not len(levels.level)):  # too few pixels for a level
+    if levels is None or (clipped is None and not len(levels.level)):  # too few pixels for a level
         model = NoiseModel(max(_small_picture_variance(usable), rounding), full / FULL_SCALE_E, background)
         return NoiseEstimate(model, 1.0, _WELL_SPREAD, saturation, step, len(usable), temporal=False)
-    lines = _Lines.through(levels, background, full, rounding) if dark is None else _Lines.from_point(*dark, full)
+    lines = _Lines.fit(levels, background, full, rounding) if clipped is None else _Lines.from_point(*clipped, full)
     slope, slope_sigma = lines.slope(rounding)
     first = lines.model(slope, rounding)
     first = replace(first, texture=texture_of(usable, first), banding_dn=banding(first.floor_dn2, rounding))
-    if slope_sigma > _SURE:  # nothing still is bright enough: the spots themselves
+    if slope_sigma > _SURE:  # no static pixel is bright enough: use the spots' residuals
         found = [find_spots(p, DetectParameters(max_detections=_MOST_SPOTS), first) for p in usable]
         lines.add(residuals_of_spots(usable, found, top))
         slope, slope_sigma = lines.slope(rounding)
@@ -92,18 +93,18 @@ def _small_picture_variance(pictures: Sequence[Picture]) -> float:
 
 @dataclass(slots=True)
 class _Lines:
-    """Every slope that a sensor may have (k,), DN, with the floor that goes with it and the belief in the pair."""
+    """A grid of slopes with the best floor for each and the likelihood of the pair."""
 
-    slopes: Array
+    slopes: Array  # (k,), DN
     floor: Array  # (k,), DN^2, variance at `background`
     floor_sigma: Array  # (k,)
     background: float  # DN
-    full: float  # DN
+    full: float  # DN, full scale
     log_likelihood: Array  # (k,)
 
     @staticmethod
-    def through(levels: LevelVariances, background: float, full: float, rounding: float) -> _Lines:
-        """The lines through variances by level, each fitted without the levels that contradict it."""
+    def fit(levels: LevelVariances, background: float, full: float, rounding: float) -> _Lines:
+        """The lines fitted to the variances by level, robust to levels that contradict them."""
         slopes = np.geomspace(full / _WELL_E[1], full / _WELL_E[0], _SLOPES)
         if not len(levels.level):
             unknown = np.full(_SLOPES, rounding)
@@ -113,67 +114,71 @@ class _Lines:
         weight = np.ones_like(rise) / levels.sigma**2
         floor = np.full(_SLOPES, levels.nearest(background))
         for _ in range(4):
-            # Below the background the noise cannot fall under its rounding.
+            # Below the background's level the variance stays above that of rounding.
             expected = np.maximum(floor[:, None] + rise, 0.5 * rounding)
             misfit = ((levels.variance - expected) / levels.sigma) ** 2
-            held = weight / np.maximum(misfit / _LARGEST_MISFIT, 1.0)
-            floor = np.maximum(np.sum(held * (levels.variance - rise), axis=1) / np.sum(held, axis=1), rounding)
-        sigma = 1 / np.sqrt(np.sum(held, axis=1))
-        evidence = -0.5 * np.minimum(misfit, _LARGEST_MISFIT).sum(axis=1) if levels.temporal else np.zeros(_SLOPES)
-        return _Lines(slopes, floor, sigma, background, full, evidence)
+            robust = weight / np.maximum(misfit / _LARGEST_MISFIT, 1.0)
+            floor = np.maximum(np.sum(robust * (levels.variance - rise), axis=1) / np.sum(robust, axis=1), rounding)
+        sigma = 1 / np.sqrt(np.sum(robust, axis=1))
+        log_likelihood = (
+            -0.5 * np.minimum(misfit, _LARGEST_MISFIT).sum(axis=1) if levels.temporal else np.zeros(_SLOPES)
+        )
+        return _Lines(slopes, floor, sigma, background, full, log_likelihood)
 
     @staticmethod
     def from_point(background: float, variance: float, full: float) -> _Lines:
-        """The lines through one point, of a background that is clipped at zero."""
+        """The lines through one point: the background, if it is clipped at zero."""
         slopes = np.geomspace(full / _WELL_E[1], full / _WELL_E[0], _SLOPES)
         floor = np.full(_SLOPES, variance)
         return _Lines(slopes, floor, 0.2 * floor, background, full, np.zeros(_SLOPES))
 
     def add(self, spots: SpotResiduals) -> None:
-        """Take the residuals of fitted spots as evidence, whichever contrast their light's grain has.
+        """Add the likelihood of the residuals of fitted spots, averaged over contrasts of the light's grain.
 
-        The grain of the light (texture, speckle, a spot that is no Gaussian) adds the square of the contrast times the
-        light, known to a share of itself only: where it rules, the residuals say nothing of the slope.
+        The grain of the light (texture, speckle, a spot that is not Gaussian) adds a variance of (contrast times
+        light)^2 with a large uncertainty: where it dominates, the residuals do not constrain the slope.
         """
         if len(spots.square) < LEAST_PIXELS:
             return
         brightest = float(spots.light.max())
         edges = np.geomspace(max(0.03 * brightest, 1e-6), brightest * 1.001, LEVELS)
-        place = np.digitize(spots.light, edges)
-        rows = [here for here in (place == k for k in range(len(edges))) if np.count_nonzero(here) >= _LEAST_OF_SPOTS]
-        seen = np.array([np.mean(np.minimum(spots.square[r], 12 * np.median(spots.square[r]) + 1e-9)) for r in rows])
+        brightness = np.digitize(spots.light, edges)
+        rows = [r for r in (brightness == k for k in range(len(edges))) if np.count_nonzero(r) >= _LEAST_OF_SPOTS]
+        measured = np.array(
+            [np.mean(np.minimum(spots.square[r], 12 * np.median(spots.square[r]) + 1e-9)) for r in rows]
+        )
         light2 = np.array([np.mean(spots.grainy[r] ** 2) for r in rows])
         lift = np.array([np.mean(np.maximum(spots.level[r] - self.background, 0.0)) for r in rows])
         count = np.array([np.count_nonzero(r) for r in rows])
-        belief = np.zeros((len(_CONTRASTS), _SLOPES))
+        log_likelihoods = np.zeros((len(_CONTRASTS), _SLOPES))
         for row, contrast in enumerate(_CONTRASTS):
             grain = contrast**2 * light2
             expected = self.floor[:, None] + self.slopes[:, None] * lift + grain
             known = (2 / np.minimum(count, _MOST_OF_SPOTS) + 0.1**2) * expected**2
             sigma = np.sqrt(known + (_GRAIN_SIGMA * grain) ** 2)
-            misfit = np.minimum(((seen - expected) / sigma) ** 2, _LARGEST_MISFIT)
-            belief[row] = -0.5 * np.sum(misfit + 2 * np.log(sigma), axis=1)
-        self.log_likelihood = self.log_likelihood + np.logaddexp.reduce(belief - belief.max(), axis=0)
+            misfit = np.minimum(((measured - expected) / sigma) ** 2, _LARGEST_MISFIT)
+            log_likelihoods[row] = -0.5 * np.sum(misfit + 2 * np.log(sigma), axis=1)
+        self.log_likelihood = self.log_likelihood + np.logaddexp.reduce(log_likelihoods - log_likelihoods.max(), axis=0)
 
     def slope(self, rounding: float) -> tuple[float, float]:
-        """The slope, DN, as mean of its logarithm, and the logarithm's sigma."""
-        belief = self.log_likelihood + self._log_prior(rounding)
-        weight = np.exp(belief - belief.max())
+        """The slope, DN, as the posterior mean of its logarithm, and the logarithm's sigma."""
+        log_posterior = self.log_likelihood + self._log_prior(rounding)
+        weight = np.exp(log_posterior - log_posterior.max())
         weight /= weight.sum()
         log = np.log(self.slopes)
         mean = float(weight @ log)
         return float(np.exp(mean)), float(np.sqrt(weight @ (log - mean) ** 2))
 
     def model(self, slope: float, rounding: float) -> NoiseModel:
-        """The model of one slope."""
+        """The noise model with this slope and the floor that belongs to it."""
         return NoiseModel(max(float(np.interp(slope, self.slopes, self.floor)), rounding), slope, self.background)
 
     def _log_prior(self, rounding: float) -> Array:
-        """(k,): a usual full well, and a read noise that exists."""
-        belief = -0.5 * (np.log(self.slopes * FULL_SCALE_E / self.full) / _WELL_SPREAD) ** 2
-        # The floor holds read noise and the shot noise of the background's light, which lies between 0 and its level.
+        """(k,): log prior of a usual full well and of a read noise within _READ_E."""
+        full_well = -0.5 * (np.log(self.slopes * FULL_SCALE_E / self.full) / _WELL_SPREAD) ** 2
+        # The floor is read noise plus the shot noise of the background's light, which is between 0 and its level.
         read2 = np.maximum(self.floor - rounding, 0.02 * rounding)
         too_noisy = np.log(np.maximum((_READ_E[0] * self.slopes) ** 2 / read2, 1.0))
         shot = self.slopes * max(self.background, 0.0)
         too_quiet = np.log(np.maximum(read2 / ((_READ_E[1] * self.slopes) ** 2 + shot), 1.0))
-        return np.asarray(belief - 2.0 * (too_noisy**2 + too_quiet**2))
+        return np.asarray(full_well - 2.0 * (too_noisy**2 + too_quiet**2))

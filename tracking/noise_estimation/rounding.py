@@ -1,4 +1,4 @@
-"""Noise of rounded and clipped grey values: what rounding hides in time, and a background that is clipped at zero."""
+"""Noise of rounded and clipped grey values: corrections for rounding in time and for a background clipped at zero."""
 
 from __future__ import annotations
 
@@ -8,14 +8,15 @@ import numpy as np
 
 from geometry.arrays import Array
 
-_LEAST_SHARE, _LARGEST_SHARE = 0.005, 0.98  # of the values above a threshold: more rare ones may be light
+_LEAST_SHARE, _LARGEST_SHARE = 0.005, 0.98  # usable shares of values above a threshold; rarer values may be light
 
 
 def clipped_normal(values: Array) -> tuple[float, float]:
-    """Mean and sigma, in steps, of numbers (m,) that were rounded to whole steps and clipped at 0.
+    """Mean and sigma, in steps, of values (m,) that were rounded to whole steps and clipped at 0.
 
     The share of values of at least k steps is 1 - Phi((k - 1/2 - mean) / sigma): a straight line through the normal
-    quantiles of these shares (probit regression) gives both. With one usable share the mean is taken to be zero. Ours.
+    quantiles of these shares (probit regression) gives both. With one usable share the mean is assumed to be zero.
+    Source: ours.
     """
     thresholds = np.unique(np.quantile(values, np.linspace(0.02, 0.995, 25)).round())
     thresholds = np.unique(np.append(thresholds, [1.0, 2.0, 3.0]))
@@ -33,7 +34,7 @@ def clipped_normal(values: Array) -> tuple[float, float]:
 
 
 def rounding_ripple(variance: Array, rounding: float) -> Array:
-    """By how much the variance of rounded values varies with the level's place between two steps, DN^2.
+    """Amplitude, DN^2, of the variance of rounded values as a function of the level's position between two steps.
 
     The first term of its Fourier series: (1 / pi^2 + 4 s^2) exp(-2 pi^2 s^2) for noise of s steps.
     """
@@ -53,9 +54,9 @@ def banding(variance: float, rounding: float) -> float:
 def unrounded(variance: float, rounding: float) -> float:
     """The variance of noise and rounding, DN^2, from the variance in time of rounded values.
 
-    With little noise a value is rounded to the same number in every picture, and that part of its error does not show
-    in time. Over levels that are spread evenly, the variance in time of noise of sigma s (in steps) is the mean of
-    p (1 - p), p the normal integral: s / sqrt(pi) where s is small, s^2 + 1/12 where it is not.
+    With little noise a value is rounded to the same number in every picture, and that part of its error is constant in
+    time. Averaged over all positions between two steps, the variance in time for noise of sigma s (in steps) is the
+    mean of p (1 - p), with p the normal integral: s / sqrt(pi) for small s, s^2 + 1/12 for large s.
     """
     in_steps = variance / (12 * rounding)
     noise = float(np.interp(in_steps, _IN_TIME, _NOISE_STEPS**2)) if in_steps < _IN_TIME[-1] else in_steps - 1 / 12
@@ -63,7 +64,7 @@ def unrounded(variance: float, rounding: float) -> float:
 
 
 def _variance_in_time(sigma: float) -> float:
-    """Variance of rounded normal deviates of this sigma, in steps, averaged over the place between two steps."""
+    """Variance of rounded normal deviates of this sigma, in steps, averaged over the position between two steps."""
     level = (np.arange(64) + 0.5) / 64
     edges = np.arange(-6, 8) - 0.5
     below = np.array([[NormalDist(mean, sigma).cdf(edge) for edge in edges] for mean in level])

@@ -1,4 +1,4 @@
-"""What errors of a calibration do to the poses, and whether the stated covariance tells: rigs that are a bit off."""
+"""Effect of calibration errors on the poses, and whether the stated covariances account for it."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from tracking.parameters import TrackerParameters
 from tracking.statuses import PoseStatus
 from tracking.tracked_frame import TrackedFrame
 
-# One sigma of each kind of number, as a careful lab reaches them. With these the calibration moves the spots by some
-# tenths of a pixel, several times their noise.
+# 1 sigma of each kind of parameter in a careful calibration. These errors shift the spots by some tenths of a pixel,
+# several times their noise.
 SIGMAS = {
     "fx": 0.4, "fy": 0.4, "cx": 0.6, "cy": 0.6, "k1": 3e-4, "k2": 1e-3, "p1": 5e-5, "p2": 5e-5, "k3": 1e-3,
     "direction_x": 7e-5, "direction_y": 7e-5, "direction_z": 7e-5,
@@ -27,7 +27,7 @@ POSE_SIGMA = {"m": 3e-4, "rad": 1e-4}
 
 
 def covariance_of(rig: Rig, scale: float = 1.0) -> RigCovariance:
-    """Independent kinds of errors, but correlated within each camera as calibrations are."""
+    """The covariance of a calibration with errors that are correlated within each camera and within each beam."""
     names = rig_names(rig)
     sigma = np.array([SIGMAS.get(split(n)[2], POSE_SIGMA["rad" if n.endswith("_rad") else "m"]) for n in names])
     correlation = np.eye(len(names))
@@ -66,7 +66,7 @@ def nees(run: PointRun, frames: list[TrackedFrame], kind: PoseStatus = PoseStatu
 
 
 def mean_nees(scenario: str, seeds: range, stated: bool = True, frames: int = 6) -> tuple[float, float, int]:
-    """Mean NEES / 6 over rigs, the share of frames that are measured, and how often a right spot was dropped."""
+    """Mean NEES / 6 over rigs, the share of measured frames, and how many correct matches were dropped."""
     values, measured, drops = [], 0, 0
     for seed in seeds:
         run = simulate_points(scenario, seed, frames=frames, noise_px=0.05, clutter=0.0)
@@ -82,7 +82,7 @@ def mean_nees(scenario: str, seeds: range, stated: bool = True, frames: int = 6)
 
 
 @pytest.mark.parametrize("scenario", ["clean", "four-skew-beams"])
-def test_the_stated_covariance_holds_the_calibrations_errors(scenario):
+def test_the_stated_covariance_includes_the_calibration_errors(scenario):
     # 12 rigs, and frames of a rig share its errors: the mean of NEES / 6 scatters by 0.16.
     mean, measured, drops = mean_nees(scenario, range(12), frames=4)
     assert 0.55 < mean < 1.45
@@ -92,7 +92,7 @@ def test_the_stated_covariance_holds_the_calibrations_errors(scenario):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("scenario", ["clean", "four-skew-beams"])
-def test_over_200_rigs_the_stated_covariance_is_the_errors_own(scenario):
+def test_over_200_rigs_the_stated_covariance_is_that_of_the_errors(scenario):
     mean, measured, drops = mean_nees(scenario, range(200))
     assert 0.85 < mean < 1.15
     assert measured == 1.0
@@ -101,7 +101,7 @@ def test_over_200_rigs_the_stated_covariance_is_the_errors_own(scenario):
 
 def rigid_nees(scenario: str, seeds: range, frames: int, noise_px: float, stated: bool = True) -> tuple[float, float]:
     """Mean NEES / 6 of the rigid tracker and of the smoother over rigs."""
-    causal, again = [], []
+    causal, smoothed = [], []
     for seed in seeds:
         run = simulate_points(scenario, seed, frames=frames, noise_px=noise_px, clutter=0.0)
         covariance = covariance_of(run.rig)
@@ -110,20 +110,20 @@ def rigid_nees(scenario: str, seeds: range, frames: int, noise_px: float, stated
         first = tracked(run, rig=rig, covariance=known)
         second, _ = looked_at_again(run, first, rig=rig, covariance=known)
         causal.append(judged(run, first))
-        again.append(judged(run, second))
+        smoothed.append(judged(run, second))
         if stated:
-            assert causal[-1].missed() + causal[-1].wrong + again[-1].missed() + again[-1].wrong == 0
-    return Pooled(causal).nees(), Pooled(again).nees()
+            assert causal[-1].missed() + causal[-1].wrong + smoothed[-1].missed() + smoothed[-1].wrong == 0
+    return Pooled(causal).nees(), Pooled(smoothed).nees()
 
 
 @pytest.mark.parametrize("scenario", ["clean", "four-skew-beams"])
-def test_the_rigid_tracker_and_the_smoother_carry_the_calibrations_errors_too(scenario):
-    # A smoothed motion has one rig's errors in all frames: of 7 rigs the mean of NEES / 6 scatters by 0.22.
+def test_covariances_of_the_rigid_tracker_and_the_smoother_include_the_calibration_errors(scenario):
+    # All frames of a smoothed motion share one rig's errors: the mean of NEES / 6 over 7 rigs scatters by 0.22.
     for value in rigid_nees(scenario, range(7), frames=20, noise_px=0.05):
         assert 0.5 < value < 1.7
 
 
-def test_a_calibration_taken_for_perfect_is_far_off():
+def test_without_a_calibration_covariance_the_pose_covariance_is_much_too_small():
     causal, smoothed = rigid_nees("clean", range(3), frames=20, noise_px=0.05, stated=False)
     assert causal > 2
     assert smoothed > 3
@@ -131,10 +131,10 @@ def test_a_calibration_taken_for_perfect_is_far_off():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("scenario", ["clean", "four-skew-beams"])
-def test_over_60_rigs_the_rigid_trackers_and_the_smoothers_covariance_is_the_errors_own(scenario):
+def test_over_60_rigs_the_covariances_of_the_rigid_tracker_and_the_smoother_are_correct(scenario):
     # The mean over 60 rigs scatters by 0.08.
     causal, smoothed = rigid_nees(scenario, range(60), frames=60, noise_px=0.05)
     assert 0.8 < causal < 1.3
-    # Measured 1.45 (clean): its weights hold each spot's calibration errors as if they were independent, and what a
-    # calibration does to the pose is reckoned for the single frame's weights.
+    # Measured 1.45 (clean): the smoother's weights treat the spots' calibration errors as independent, and the
+    # calibration's effect on the pose is computed with the weights of a single frame.
     assert 0.8 < smoothed < 1.6

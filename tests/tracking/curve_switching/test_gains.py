@@ -1,4 +1,4 @@
-"""The gains g1, g2, g3: their bounds, their two ends, and the places where the paper's forms are 0/0."""
+"""The gains g1, g2, g3: their bounds, their limits, and the cases in which the paper's forms are 0/0."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def test_all_gains_lie_between_0_and_1_within_the_search_radius(last, predicted,
 
 
 @given(last=pixel, predicted=pixel)
-def test_on_the_prediction_every_gain_is_1(last, predicted):
+def test_at_the_prediction_every_gain_is_1(last, predicted):
     assert nearness(predicted, predicted, 10.0) == 1
     assert smoothness(last, predicted, predicted, 0.5, FLOOR_PX) == pytest.approx(1, abs=1e-12)
     assert combined(last, predicted, predicted, WEIGHTS, 10.0, FLOOR_PX) == pytest.approx(1, abs=1e-12)
@@ -59,8 +59,8 @@ def test_speed_is_the_geometric_over_the_arithmetic_mean_of_the_lengths():
     assert speed == pytest.approx(8.0 / 10.0)
 
 
-def test_the_numbers_of_equations_7_to_9_by_pencil():
-    """3 px beside the prediction of 4 px ahead: a 3-4-5 triangle."""
+def test_equations_7_to_9_agree_with_a_hand_calculation():
+    """A detection 3 px to the side of a prediction 4 px ahead: a 3-4-5 triangle."""
     last, predicted, candidate = np.zeros(2), np.array([4.0, 0]), np.array([4.0, 3.0])
     g1, direction, speed = 1 - 3 / 10, 0.5 + 0.5 * 0.8, 2 * np.sqrt(20) / 9
     assert nearness(predicted, candidate, 10.0) == pytest.approx(g1)
@@ -69,7 +69,7 @@ def test_the_numbers_of_equations_7_to_9_by_pencil():
     assert g3 == pytest.approx(0.6 * g1 + 0.2 * direction + 0.2 * speed)
 
 
-def test_weights_count_by_their_shares():
+def test_only_the_ratios_of_the_weights_matter():
     args = np.zeros(2), np.array([4.0, 0]), np.array([5.0, 3.0])
     assert combined(*args, (0.6, 0.2, 0.2), 10.0, FLOOR_PX) == pytest.approx(
         combined(*args, (3.0, 1.0, 1.0), 10.0, FLOOR_PX)
@@ -77,24 +77,24 @@ def test_weights_count_by_their_shares():
 
 
 @given(point=pixel, other=pixel)
-def test_no_displacement_is_no_nan(point, other):
-    """Predicted at rest, or found at rest, or both: 0/0 in eqs. (8) and (9)."""
+def test_a_zero_displacement_gives_a_finite_gain(point, other):
+    """Predicted at rest, observed at rest, or both: 0/0 in the paper's eqs. (8) and (9)."""
     for last, predicted, candidate in ((point, point, point), (point, point, other), (point, other, point)):
         g = combined(last, predicted, candidate, WEIGHTS, 10.0, FLOOR_PX)
         assert np.isfinite(g)
         assert np.isfinite(smoothness(last, predicted, candidate, 0.5, FLOOR_PX))
 
 
-def test_a_spot_at_rest_is_not_judged_by_the_direction_of_its_noise():
-    """Predicted 0.1 px to one side, found 0.1 px to the other: no reversal, just noise."""
+def test_the_direction_of_noise_does_not_affect_a_spot_at_rest():
+    """Predicted 0.1 px to one side, detected 0.1 px to the other: noise, not a reversal."""
     last, step = np.array([300.0, 200.0]), np.array([0.1, 0.0])
     direction, speed = direction_and_speed(last, last + step, last - step, FLOOR_PX)
     assert direction == pytest.approx(1.0)
     assert speed == pytest.approx(1.0)
 
 
-def test_the_floor_is_a_smooth_step():
-    """The direction's score of a reversal falls from 1 to 0 as the motion grows from rest to twice the floor."""
+def test_the_direction_term_of_a_reversal_falls_smoothly_with_the_displacement():
+    """It falls from 1 to 0 as the displacement grows from zero to twice the floor."""
     last = np.zeros(2)
     scores = [
         float(direction_and_speed(last, np.array([d, 0]), np.array([-d, 0]), FLOOR_PX)[0])
@@ -106,8 +106,8 @@ def test_the_floor_is_a_smooth_step():
     assert np.abs(np.diff(scores)).max() < 0.05
 
 
-def test_over_the_pictures_diagonal_nearness_decides_nothing():
-    """The paper's scale: 10 px off the prediction costs 0.006; over the search radius it costs all."""
+def test_divided_by_the_image_diagonal_nearness_has_no_effect():
+    """10 px from the prediction lower g1 by 0.006 with the paper's scale, and by 1 with the search radius."""
     scale = picture_scale(np.array([1280.0, 1024.0]))
     assert scale == pytest.approx(1639.2, abs=0.05)
     predicted, beside = np.array([600.0, 500.0]), np.array([610.0, 500.0])
@@ -116,12 +116,12 @@ def test_over_the_pictures_diagonal_nearness_decides_nothing():
 
 
 @pytest.mark.parametrize(("p", "value"), [(1.0, 2304.0), (2.0, 1639.2), (4.0, 1394.7)])
-def test_the_pictures_scale_is_its_p_norm(p, value):
-    """The paper's sqrt(Sx^p + Sy^p) is that for p = 2 only: for p = 1 it would be 48 px."""
+def test_the_scale_of_g1_is_the_p_norm_of_the_image_size(p, value):
+    """The paper's sqrt(Sx^p + Sy^p) is the p-norm for p = 2 only: for p = 1 it would be 48 px."""
     assert picture_scale(np.array([1280.0, 1024.0]), p) == pytest.approx(value, abs=0.1)
 
 
-def test_tracks_and_points_go_in_one_call():
+def test_one_call_gives_the_gains_of_all_tracks_and_points():
     rng = np.random.default_rng(1)
     last, predicted, points = rng.uniform(0, 100, (3, 2)), rng.uniform(0, 100, (3, 2)), rng.uniform(0, 100, (4, 2))
     scale = np.array([5.0, 10.0, 20.0])

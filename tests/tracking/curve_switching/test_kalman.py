@@ -1,4 +1,4 @@
-"""The filter of one spot: where it settles, what it does at a bend, and that rounding cannot break it."""
+"""The Kalman filter of one spot: steady gains, restart at a bend, and numerical stability."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def kalata(index: float) -> tuple[float, float]:
 
 
 @pytest.mark.parametrize("index", [1e-2, 0.1, 1.0, 10.0])
-def test_the_filter_settles_where_kalatas_closed_form_says(index):
+def test_the_steady_gains_agree_with_kalatas_closed_form(index):
     sigma_z = 0.2
     sigma_a = index * sigma_z / DT**2
     x, P = np.zeros(4), np.diag([1.0, 1, 1e4, 1e4])
@@ -38,7 +38,7 @@ def test_the_filter_settles_where_kalatas_closed_form_says(index):
     np.testing.assert_allclose(moved, [alpha, 0.0, beta / DT, 0.0], rtol=1e-6, atol=1e-9)
 
 
-def test_prediction_moves_by_the_rate_and_the_first_two_equations_agree_with_pencil():
+def test_equations_1_and_2_agree_with_a_hand_calculation():
     x = np.array([100.0, 50.0, 30.0, -20.0])
     P = np.diag([1.0, 4.0, 9.0, 16.0])
     moved, grown = kalman.predict(x, P, 0.5, np.array(2.0))
@@ -49,10 +49,10 @@ def test_prediction_moves_by_the_rate_and_the_first_two_equations_agree_with_pen
     assert grown[2, 2] == pytest.approx(10.0)
     assert grown[1, 1] == pytest.approx(4 + 4 + 0.0625)
     np.testing.assert_array_equal(grown, grown.T)
-    assert grown[0, 1] == grown[0, 3] == grown[2, 3] == 0  # the axes know nothing of each other
+    assert grown[0, 1] == grown[0, 3] == grown[2, 3] == 0  # the axes are independent
 
 
-def test_process_noise_is_the_scatter_that_constant_random_accelerations_leave():
+def test_process_noise_is_the_scatter_from_random_accelerations_constant_within_a_step():
     """20,000 draws: variances to 1 %, 1 sigma."""
     rng = np.random.default_rng(1)
     a = 40.0 * rng.standard_normal((20_000, 2))
@@ -72,7 +72,7 @@ def test_two_half_steps_without_acceleration_are_one_step():
     np.testing.assert_allclose(half[1], once[1], atol=1e-14)
 
 
-def test_a_bend_restarts_position_and_rate_as_equation_6_says():
+def test_the_restart_at_a_bend_follows_equation_6():
     z, last = np.array([120.0, 80.0]), np.array([117.0, 84.0])
     R, R_last = np.array([[0.02, 0.005], [0.005, 0.01]]), np.diag([0.03, 0.04])
     x, P = kalman.restart(z, R, last, R_last, DT)
@@ -95,7 +95,7 @@ def test_the_covariance_of_a_restart_is_the_scatter_of_restarts():
     assert np.linalg.eigvalsh(P[0])[0] > 0
 
 
-def test_after_a_gap_the_rate_at_a_bend_is_over_the_whole_gap():
+def test_after_a_gap_the_rate_of_a_restart_is_the_mean_over_the_gap():
     x, P = kalman.restart(np.array([10.0, 0.0]), np.eye(2), np.zeros(2), np.eye(2), 0.05)
     np.testing.assert_allclose(x, [10.0, 0.0, 200.0, 0.0])
     assert P[2, 2] == pytest.approx(2 / 0.05**2)
@@ -119,7 +119,7 @@ def test_josephs_form_keeps_the_covariance_symmetric_and_positive(spread, sigma_
 
 
 def test_an_update_equals_least_squares_on_prior_and_measurement_together():
-    """The textbook's second way: information adds up."""
+    """A second derivation: the information matrices add up."""
     rng = np.random.default_rng(4)
     A, x = rng.normal(size=(4, 4)), rng.normal(size=4)
     P, R, z = A @ A.T, np.array([[0.3, 0.1], [0.1, 0.2]]), rng.normal(size=2)
@@ -131,7 +131,7 @@ def test_an_update_equals_least_squares_on_prior_and_measurement_together():
     np.testing.assert_allclose(covariance, np.linalg.inv(information), atol=1e-10)
 
 
-def test_innovations_are_as_large_as_their_covariance_says():
+def test_innovations_agree_with_their_covariance():
     """Mean y S^-1 y = 2 over a run with the noise that the filter assumes; 2000 of them scatter by 0.045."""
     rng = np.random.default_rng(5)
     sigma_a, R = 3000.0, 0.1**2 * np.eye(2)
@@ -147,7 +147,7 @@ def test_innovations_are_as_large_as_their_covariance_says():
     assert np.mean(nis) == pytest.approx(2.0, abs=0.18)
 
 
-def test_many_spots_in_one_call_are_each_by_itself():
+def test_many_spots_in_one_call_are_filtered_independently():
     rng = np.random.default_rng(6)
     A = rng.normal(size=(5, 4, 4))
     x, P = rng.normal(size=(5, 4)), A @ np.swapaxes(A, 1, 2)

@@ -1,4 +1,4 @@
-"""The vehicle's motion filter: exact on constant velocities, its Jacobians, and a covariance that is honest."""
+"""The vehicle's pose filter: exact for constant velocities, correct Jacobians, a correct covariance."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ DT = 0.01
 
 
 def plus(motion: RigidMotion, delta: np.ndarray) -> RigidMotion:
-    """The motion that is an error state (12,) away."""
+    """The motion plus an error state (12,)."""
     return RigidMotion(
         motion.world_from_body.plus(delta[:6]), motion.velocity + delta[6:9], motion.rate + delta[9:], motion.P
     )
@@ -34,7 +34,7 @@ def some_motion(rng: np.random.Generator, rate: float = 3.0) -> RigidMotion:
 
 
 def test_constant_velocity_and_rate_are_followed_exactly():
-    """A whole turn and a half in 300 steps, against scipy's own rotation."""
+    """One and a half turns in 300 steps, against scipy's rotation."""
     rng = np.random.default_rng(1)
     motion = start = some_motion(rng)
     for _ in range(300):
@@ -45,7 +45,7 @@ def test_constant_velocity_and_rate_are_followed_exactly():
                                start.world_from_body.translation + 3.0 * start.velocity, atol=1e-10)  # fmt: skip
 
 
-def test_a_frame_that_takes_no_time_changes_nothing():
+def test_a_step_of_zero_changes_nothing():
     motion = some_motion(np.random.default_rng(2))
     same = pose_filter.predict(motion, 0.0, 3.0, 6.0)
     np.testing.assert_allclose(minus(same, motion), 0.0, atol=1e-15)
@@ -54,7 +54,7 @@ def test_a_frame_that_takes_no_time_changes_nothing():
 
 @pytest.mark.parametrize("rate", [0.0, 0.5, 20.0])
 @pytest.mark.parametrize("dt", [0.01, 0.2])
-def test_the_covariance_is_carried_by_the_true_jacobian_of_the_prediction(rate, dt):
+def test_the_covariance_is_propagated_by_the_numerical_jacobian_of_the_prediction(rate, dt):
     rng = np.random.default_rng(3)
     motion = some_motion(rng, rate)
     ahead = pose_filter.predict(motion, dt, 0.0, 0.0)
@@ -62,7 +62,7 @@ def test_the_covariance_is_carried_by_the_true_jacobian_of_the_prediction(rate, 
     np.testing.assert_allclose(ahead.P, F @ motion.P @ F.T, atol=1e-9)
 
 
-def test_process_noise_is_that_of_accelerations_constant_within_the_step():
+def test_process_noise_is_that_of_accelerations_constant_within_a_step():
     still = RigidMotion(Pose.identity(), np.zeros(3), np.zeros(3), np.zeros((12, 12)))
     P = pose_filter.predict(still, DT, 2.0, 5.0).P
     for axis, a in ((0, 2.0), (3, 5.0)):
@@ -72,7 +72,7 @@ def test_process_noise_is_that_of_accelerations_constant_within_the_step():
 
 
 def test_twist_times_a_pixel_jacobian_is_the_pixels_rate():
-    """d(pose)/dt in the error's coordinates: after a short while the pose is `plus(twist dt)`."""
+    """d(pose)/dt in error coordinates: after a short time dt the pose is `plus(twist dt)`."""
     motion = some_motion(np.random.default_rng(4))
     ahead = pose_filter.predict(motion, 1e-4, 0.0, 0.0)
     np.testing.assert_allclose(ahead.world_from_body.minus(motion.world_from_body) / 1e-4, motion.twist, atol=1e-7)
@@ -82,13 +82,13 @@ def test_a_measured_pose_without_noise_becomes_the_pose():
     rng = np.random.default_rng(5)
     motion = some_motion(rng)
     measured = motion.world_from_body.plus(rng.normal(0, 1e-3, 6))
-    after, y, S = pose_filter.corrected_by_pose(motion, measured, 1e-18 * np.eye(6))
+    after, y, S = pose_filter.update_with_pose(motion, measured, 1e-18 * np.eye(6))
     assert np.abs(after.world_from_body.minus(measured)).max() < 1e-7
     np.testing.assert_allclose(motion.world_from_body.plus(y).rotation, measured.rotation, atol=1e-12)
     np.testing.assert_allclose(S, motion.covariance, atol=1e-12)
 
 
-def test_velocities_are_learnt_from_poses_alone():
+def test_velocities_are_estimated_from_poses_alone():
     truth = RigidMotion(Pose.identity(), np.array([0.5, -0.2, 0.1]), np.array([0.3, 0.4, -0.5]), np.zeros((12, 12)))
     C = 1e-6 * np.eye(6)
     motion = pose_filter.begin(truth.world_from_body, C)
@@ -96,13 +96,13 @@ def test_velocities_are_learnt_from_poses_alone():
     for _ in range(100):
         truth = pose_filter.predict(truth, DT, 0.0, 0.0)
         motion = pose_filter.predict(motion, DT, 0.1, 0.1)
-        motion, _, _ = pose_filter.corrected_by_pose(motion, truth.world_from_body, C)
+        motion, _, _ = pose_filter.update_with_pose(motion, truth.world_from_body, C)
     np.testing.assert_allclose(motion.velocity, truth.velocity, atol=0.01)
     np.testing.assert_allclose(motion.rate, truth.rate, atol=0.01)
 
 
-def test_the_covariance_is_honest_over_many_motions():
-    """Mean NEES of the twelve numbers after 20 frames: 12, which 200 motions give to 0.35."""
+def test_the_covariance_is_correct_over_many_motions():
+    """The expected NEES of the twelve states after 20 frames is 12; the mean of 200 motions scatters by 0.35."""
     rng = np.random.default_rng(6)
     nees = []
     sigma = np.array([2e-3] * 3 + [1e-3] * 3)
@@ -117,25 +117,25 @@ def test_the_covariance_is_honest_over_many_motions():
             truth = RigidMotion(moved, truth.velocity + a[:3] * DT, truth.rate + a[3:] * DT, truth.P)
             motion = pose_filter.predict(motion, DT, 3.0, 6.0)
             measured = truth.world_from_body.plus(-sigma * rng.standard_normal(6))
-            motion, _, _ = pose_filter.corrected_by_pose(motion, measured, np.diag(sigma**2))
+            motion, _, _ = pose_filter.update_with_pose(motion, measured, np.diag(sigma**2))
         error = minus(truth, motion)
         nees.append(error @ np.linalg.solve(motion.P, error))
     assert np.mean(nees) == pytest.approx(12.0, abs=1.5)
 
 
-def test_some_pixels_narrow_what_they_see_and_leave_the_rest():
-    """One number that sees x only: y and its rate keep their variance exactly."""
+def test_an_update_changes_only_the_observed_variances():
+    """A measurement of x alone: all other variances stay exactly the same."""
     motion = pose_filter.begin(Pose.identity(), 0.01 * np.eye(6))
     H = np.zeros((1, 6))
     H[0, 0] = 100.0  # px per m
-    after, S = pose_filter.corrected(motion, np.array([3.0]), H, np.array([[0.01]]))
+    after, S = pose_filter.update(motion, np.array([3.0]), H, np.array([[0.01]]))
     assert S[0, 0] == pytest.approx(100.0**2 * 0.01 + 0.01)
     assert after.P[0, 0] == pytest.approx(1 / (1 / 0.01 + 100.0**2 / 0.01))
     assert after.world_from_body.translation[0] == pytest.approx(0.03, rel=1e-3)
     np.testing.assert_array_equal(np.diagonal(after.P)[1:], np.diagonal(motion.P)[1:])
 
 
-def test_rotations_stay_proper_over_a_long_run():
+def test_rotation_matrices_stay_orthonormal_over_a_long_run():
     motion = some_motion(np.random.default_rng(7), 10.0)
     for _ in range(5000):
         motion = pose_filter.predict(motion, DT, 1.0, 1.0)

@@ -1,4 +1,4 @@
-"""The tracker on simulated points: who is who, how well it predicts, and what it says of what it cannot see."""
+"""The curve-switching tracker on simulated points: identities, predictions, and the statuses of spots not in view."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from tracking.parameters import TrackerParameters
 from tracking.statuses import PoseStatus, SpotStatus
 from tracking.tracked_frame import TrackedFrame
 
-PAPERS_OWN = TrackerParameters(rigid_check=False, estimate="prediction", out_of_view="quadratic")
-START_FRAMES = 2  # no rate is known yet
-TURN_FRAMES = 2  # the bend itself, and the next frame, whose rate straddles it
+PAPER = TrackerParameters(rigid_check=False, estimate="prediction", out_of_view="quadratic")  # the paper's method
+START_FRAMES = 2  # frames before the first rate is known
+TURN_FRAMES = 2  # the frame after a bend, and the next one, whose rate is a mean over the bend
 
 
 def new_tracker(run: PointRun, parameters: TrackerParameters) -> SpotTracker:
@@ -44,7 +44,7 @@ def track(run: PointRun, parameters: TrackerParameters | None = None) -> list[Tr
 
 @dataclass(frozen=True)
 class Tracked:
-    """A recording and what the tracker made of it: F frames, n views."""
+    """A recording and the tracker's results: F frames, n views."""
 
     run: PointRun
     frames: list[TrackedFrame]
@@ -67,7 +67,7 @@ class Tracked:
 
     @property
     def taken(self) -> np.ndarray:
-        """(F, n): the true origin of the detection that each view took; -9 where it took none."""
+        """(F, n): the true origin of the detection assigned to each view; -9 without one."""
         out = np.full(self.point.shape, -9)
         for k, v in zip(*np.nonzero(self.point != UNMATCHED), strict=True):
             out[k, v] = self.run.origin[k][self.run.model.camera_of[v]][self.point[k, v]]
@@ -78,12 +78,12 @@ class Tracked:
         return self.taken == np.arange(self.point.shape[1])
 
     def identity(self) -> float:
-        """Share of the spots in the picture and shining that were found as themselves."""
+        """Share of the visible spots that have the right label."""
         shining = self.run.in_view == 1
         return float((self.right & shining).sum() / shining.sum())
 
     def prediction_rms(self) -> np.ndarray:
-        """Per axis, px, over spots in view outside the start and the bends."""
+        """RMS prediction error per axis, px, over spots in view, except at the start and at bends."""
         bend = np.zeros(len(self.frames), dtype=bool)
         for later in range(TURN_FRAMES):
             bend[later:] |= self.run.turned[: len(bend) - later]
@@ -94,9 +94,9 @@ class Tracked:
 
 
 @cache
-def tracked(scenario: str, seed: int, frames: int, method: str = "spots") -> Tracked:
+def tracked(scenario: str, seed: int, frames: int) -> Tracked:
     run = simulate_points(scenario, seed, frames=frames)
-    return Tracked(run, track(run, TrackerParameters(method=method)))  # type: ignore[arg-type]
+    return Tracked(run, track(run))
 
 
 # -- identity and prediction ------------------------------------------------------------------------------------------
@@ -104,7 +104,7 @@ def tracked(scenario: str, seed: int, frames: int, method: str = "spots") -> Tra
 
 @pytest.mark.parametrize(("scenario", "identity", "rms_px"), [("smooth", 0.999, 0.30), ("sharp-turns", 0.995, 0.40)])
 @pytest.mark.parametrize("seed", [21, 22])
-def test_spots_keep_their_names_and_are_predicted_as_the_project_promises(scenario, identity, rms_px, seed):
+def test_identity_and_prediction_error_reach_the_projects_goals(scenario, identity, rms_px, seed):
     """20 % clutter, 0.1 px noise, 250 frames."""
     t = tracked(scenario, seed, 250)
     assert t.identity() >= identity
@@ -113,30 +113,25 @@ def test_spots_keep_their_names_and_are_predicted_as_the_project_promises(scenar
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("scenario", "identity", "rms_px"), [("smooth", 0.999, 0.30), ("sharp-turns", 0.995, 0.40)])
-def test_spots_keep_their_names_over_eight_runs_of_600_frames(scenario, identity, rms_px):
+def test_identity_and_prediction_error_reach_the_goals_over_eight_runs_of_600_frames(scenario, identity, rms_px):
     runs = [tracked(scenario, seed, 600) for seed in range(31, 39)]
     assert np.mean([t.identity() for t in runs]) >= identity
     assert np.sqrt(np.mean([t.prediction_rms() ** 2 for t in runs], axis=0)).max() <= rms_px
 
 
 @pytest.mark.parametrize("scenario", ["four-skew-beams", "two-cameras-per-screen", "fast", "static"])
-def test_other_rigs_and_speeds_keep_their_names_too(scenario):
+def test_spots_of_other_rigs_and_speeds_keep_their_labels(scenario):
     assert tracked(scenario, 23, 100).identity() >= 0.995
 
 
-@pytest.mark.parametrize("scenario", ["smooth", "sharp-turns"])
-def test_predicted_by_the_vehicles_motion_spots_keep_their_names_too(scenario):
-    assert tracked(scenario, 24, 150, "rigid").identity() >= 0.998
-
-
-def test_the_papers_way_alone_still_follows_smooth_motion():
+def test_the_papers_method_alone_tracks_smooth_motion():
     run = simulate_points("smooth", 25, frames=150)
-    t = Tracked(run, track(run, PAPERS_OWN))
+    t = Tracked(run, track(run, PAPER))
     assert t.identity() >= 0.99
 
 
-def test_bends_are_found_by_the_second_search_and_named_turned():
-    """What lies within r1 = 10 px of its prediction is matched, what lies beyond has turned; all of it is found."""
+def test_spots_far_from_their_prediction_at_a_bend_are_turned():
+    """Within r1 = 10 px of its prediction a spot is `matched`, beyond that it is `turned`; all of them are found."""
     t = tracked("sharp-turns", 21, 250)
     gap = np.linalg.norm(t.predicted_px - t.run.uv_px, axis=-1)
     near, far = t.right & (gap < 9.5), t.right & (gap > 10.5)
@@ -148,8 +143,8 @@ def test_bends_are_found_by_the_second_search_and_named_turned():
 # -- poses ------------------------------------------------------------------------------------------------------------
 
 
-def test_poses_are_as_good_as_their_covariance_says():
-    """Mean NEES of some 500 measured poses: 6, which correlations aside they give to 0.2."""
+def test_the_covariance_of_measured_poses_is_correct():
+    """The expected NEES is 6; without correlations the mean of 500 poses scatters by 0.2."""
     nees = []
     for scenario in ("smooth", "sharp-turns"):
         t = tracked(scenario, 21, 250)
@@ -161,7 +156,7 @@ def test_poses_are_as_good_as_their_covariance_says():
     assert 5.0 < np.mean(nees) < 7.0
 
 
-def test_a_frame_says_itself_what_it_rests_on():
+def test_the_fields_of_a_frame_agree_with_each_other():
     t = tracked("smooth", 21, 250)
     for f in t.frames:
         matched = sum(s.measured for s in f.status)
@@ -177,7 +172,7 @@ def test_a_frame_says_itself_what_it_rests_on():
 
 
 def with_hidden(run: PointRun, hide: dict[int, set[int]]) -> PointRun:
-    """The recording without the detections of some views: frame -> views."""
+    """The recording without the detections of some views. hide: frame -> views."""
     detections, origin = list(run.detections), list(run.origin)
     in_view = run.in_view.copy()
     for k, views in hide.items():
@@ -188,7 +183,7 @@ def with_hidden(run: PointRun, hide: dict[int, set[int]]) -> PointRun:
     return replace(run, detections=tuple(detections), origin=tuple(origin), in_view=in_view)
 
 
-def test_a_hidden_spot_is_occluded_and_stands_where_the_others_say():
+def test_a_hidden_spot_is_occluded_and_the_others_give_its_position():
     run = with_hidden(simulate_points("smooth", 26, frames=60, clutter=0.0), {k: {1} for k in range(30, 40)})
     t = Tracked(run, track(run))
     assert set(t.status[30:40, 1]) == {SpotStatus.OCCLUDED}
@@ -198,7 +193,7 @@ def test_a_hidden_spot_is_occluded_and_stands_where_the_others_say():
     assert np.all(t.status[30:40][:, others] == SpotStatus.MATCHED)
 
 
-def test_a_spot_outside_the_picture_is_out_of_view_and_known_to_a_pixel():
+def test_a_spot_outside_the_image_is_out_of_view_and_known_to_a_pixel():
     t = tracked("smooth", 21, 250)
     outside = ~t.run.model.in_picture(t.run.uv_px, margin_px=2.0) & np.isfinite(t.run.uv_px[..., 0])
     assert outside.sum() > 20
@@ -211,7 +206,7 @@ def test_a_spot_outside_the_picture_is_out_of_view_and_known_to_a_pixel():
 
 
 def test_a_missing_picture_is_no_image_and_its_spots_are_estimated():
-    """One camera is dark for five frames: the other one's three spots and the motion carry on."""
+    """One camera has no pictures for five frames: the pose is predicted from the other one's spots and the motion."""
     run = simulate_points("static", 27, frames=30)
     gone = run.has_image.copy()
     gone[10:15, 0] = False
@@ -225,7 +220,7 @@ def test_a_missing_picture_is_no_image_and_its_spots_are_estimated():
     assert {f.pose_status for f in t.frames[15:]} == {PoseStatus.MEASURED}
 
 
-def test_a_frame_without_any_picture_is_bridged_by_the_motion():
+def test_the_pose_of_a_frame_without_pictures_is_predicted():
     run = simulate_points("smooth", 28, frames=40)
     gone = run.has_image.copy()
     gone[[15, 20, 21, 22]] = False
@@ -237,15 +232,15 @@ def test_a_frame_without_any_picture_is_bridged_by_the_motion():
         assert np.all(f.point == UNMATCHED)
         assert set(f.status) <= {SpotStatus.NO_IMAGE, SpotStatus.OFF_SCREEN}
         error = run.poses[k].minus(f.pose)
-        assert error @ np.linalg.solve(f.pose_covariance, error) < 40  # 6 on average; the covariance is no lie
-    # The covariance grows while nothing is seen.
+        assert error @ np.linalg.solve(f.pose_covariance, error) < 40  # 6 on average
+    # The covariance grows while there are no pictures.
     sizes = [np.trace(t.frames[k].pose_covariance[:3, :3]) for k in (19, 20, 21, 22)]
     assert np.all(np.diff(sizes) > 0)
     assert {f.pose_status for f in t.frames[23:]} == {PoseStatus.MEASURED}
 
 
 def test_a_beam_that_misses_its_screen_is_off_screen():
-    """Yaw from 0 to 12 deg and back, and a screen that beam C leaves at 6 deg: known, and nowhere."""
+    """Yaw from 0 to 12 deg and back, with a screen that beam C misses beyond 6 deg."""
     yaw = np.deg2rad(12.0) * np.sin(np.linspace(0, np.pi, 80))
     poses = [Pose.from_ypr(np.array([y, 0.0, 0.0]), np.zeros(3)) for y in yaw]
     rig = RIGS["fan"]()
@@ -263,14 +258,14 @@ def test_a_beam_that_misses_its_screen_is_off_screen():
         frames.append(tracker.step(0.01 if frames else 0.0, found))
     off = np.array([f.status[c] is SpotStatus.OFF_SCREEN for f in frames])
     beside = yaw > np.deg2rad(6.0)
-    clear = np.abs(yaw - np.deg2rad(6.0)) > np.deg2rad(0.05)  # at the edge itself it may be either
+    clear = np.abs(yaw - np.deg2rad(6.0)) > np.deg2rad(0.05)  # at the edge either status is right
     assert beside.any()
     np.testing.assert_array_equal(off[clear], beside[clear])
     assert np.isnan([f.uv_px[c] for f, o in zip(frames, off, strict=True) if o]).all()
-    assert frames[-1].status[c] is SpotStatus.MATCHED  # it comes back
+    assert frames[-1].status[c] is SpotStatus.MATCHED  # after the beam has returned to the screen
 
 
-def test_before_the_labels_are_found_everything_is_lost():
+def test_before_the_labels_are_found_all_spots_are_lost():
     run = simulate_points("static", 29, frames=10)
     gone = run.has_image.copy()
     gone[:4] = False
@@ -283,7 +278,7 @@ def test_before_the_labels_are_found_everything_is_lost():
     assert [e.kind for e in t.frames[4].events] == ["labelled"]
 
 
-def test_after_a_long_darkness_the_vehicle_is_lost_and_not_guessed():
+def test_after_many_frames_without_pictures_the_pose_is_lost():
     run = simulate_points("smooth", 30, frames=500, clutter=0.0)
     gone = run.has_image.copy()
     gone[20:] = False
@@ -292,7 +287,7 @@ def test_after_a_long_darkness_the_vehicle_is_lost_and_not_guessed():
     assert poses[25] is PoseStatus.PREDICTED
     assert poses[-1] is PoseStatus.LOST
     last = poses.index(PoseStatus.LOST, 20)
-    assert set(poses[last:]) == {PoseStatus.LOST}  # it does not come back by itself
+    assert set(poses[last:]) == {PoseStatus.LOST}  # it stays lost without new detections
     assert set(t.status[-1]) == {SpotStatus.LOST}
     assert np.isnan(t.uv_px[-1]).all()
 
@@ -300,11 +295,10 @@ def test_after_a_long_darkness_the_vehicle_is_lost_and_not_guessed():
 # -- blackouts, wrong points ------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("method", ["spots", "rigid"])
-def test_a_blackout_of_ten_frames_is_survived(method):
-    t = tracked("blackout", 23, 200, method)
-    dark = (t.run.in_view == 2).any(axis=1) & ~(t.run.in_view == 1).any(axis=1)
-    assert dark[150:160].all()
+def test_after_a_blackout_of_ten_frames_the_spots_are_found_again():
+    t = tracked("blackout", 23, 200)
+    occluded = (t.run.in_view == 2).any(axis=1) & ~(t.run.in_view == 1).any(axis=1)
+    assert occluded[150:160].all()
     assert t.identity() >= 0.99
     after = [f.pose_status for f in t.frames[165:]]
     assert after.count(PoseStatus.MEASURED) >= len(after) - 1
@@ -313,8 +307,8 @@ def test_a_blackout_of_ten_frames_is_survived(method):
             assert np.abs(t.run.poses[k].minus(t.frames[k].pose)).max() < 0.02
 
 
-def test_nothing_is_matched_that_is_no_spot_in_a_blackout_full_of_clutter():
-    scenario = replace(SCENARIOS["blackout"], hiding=Hiding(blackout_every=60, blackout_frames=10),
+def test_clutter_is_not_matched_in_a_blackout():
+    scenario = replace(SCENARIOS["blackout"], occlusion=Hiding(blackout_every=60, blackout_frames=10),
                        clutter=Clutter(per_spot=0.2, per_image=3.0))  # fmt: skip
     wrong = 0
     for seed in (31, 32):
@@ -326,8 +320,8 @@ def test_nothing_is_matched_that_is_no_spot_in_a_blackout_full_of_clutter():
 
 
 @pytest.mark.parametrize("view", [0, 4])
-def test_a_spot_that_a_false_point_replaces_is_dropped_and_stays_where_the_others_put_it(view):
-    """For five frames the spot is gone, and 6 px beside it something shines."""
+def test_a_false_point_in_place_of_a_spot_is_dropped_and_the_others_give_the_position(view):
+    """For five frames the spot is hidden and a false point lies 6 px beside it."""
     run = simulate_points("static", 33, frames=30, clutter=0.0)
     hidden = with_hidden(run, {k: {view} for k in range(10, 15)})
     camera = int(run.model.camera_of[view])
@@ -343,11 +337,11 @@ def test_a_spot_that_a_false_point_replaces_is_dropped_and_stays_where_the_other
     assert set(t.status[10:15, view]) == {SpotStatus.OCCLUDED}
     assert np.abs(t.uv_px[10:15, view] - run.uv_px[10:15, view]).max() < 1.0
     assert any(e.kind == "dropped" and e.view == view for f in t.frames[10:15] for e in f.events)
-    trusting = Tracked(run, track(run, TrackerParameters(rigid_check=False)))
-    assert SpotStatus.MATCHED in set(trusting.status[10:15, view])  # what the check is for
+    unchecked = Tracked(run, track(run, TrackerParameters(rigid_check=False)))
+    assert SpotStatus.MATCHED in set(unchecked.status[10:15, view])  # without the check the false point is matched
 
 
-def test_a_tie_is_told_once_with_both_candidates_and_nothing_is_chosen():
+def test_a_tie_is_reported_once_with_both_candidates_and_none_is_chosen():
     run = simulate_points("static", 34, frames=5, clutter=0.0)
     rig = run.rig
     two = replace(rig, beams={n: b for n, b in rig.beams.items() if n != "B"},
@@ -366,7 +360,7 @@ def test_a_tie_is_told_once_with_both_candidates_and_nothing_is_chosen():
 
 
 @pytest.mark.parametrize("scenario", ["sharp-turns", "blackout"])
-def test_the_order_of_the_detections_changes_nothing(scenario):
+def test_the_order_of_the_detections_does_not_change_the_results(scenario):
     run = simulate_points(scenario, 35, frames=80, clutter=0.5)
     rng = np.random.default_rng(36)
     orders = [[rng.permutation(len(d)) for d in frame] for frame in run.detections]
@@ -384,7 +378,7 @@ def test_the_order_of_the_detections_changes_nothing(scenario):
     np.testing.assert_allclose(one.predicted_px, other.predicted_px, atol=1e-6)
 
 
-def test_the_same_run_twice_is_the_same_to_the_last_bit():
+def test_processing_a_run_twice_gives_identical_results():
     run = simulate_points("sharp-turns", 37, frames=60)
     for a, b in zip(track(run), track(run), strict=True):
         np.testing.assert_array_equal(a.uv_px, b.uv_px)
@@ -392,14 +386,14 @@ def test_the_same_run_twice_is_the_same_to_the_last_bit():
         assert a.events == b.events
 
 
-def test_the_future_does_not_change_the_past():
+def test_later_frames_do_not_change_earlier_results():
     long, short = tracked("sharp-turns", 21, 250), simulate_points("sharp-turns", 21, frames=40)
     for a, b in zip(long.frames[:40], track(short), strict=True):
         np.testing.assert_array_equal(a.uv_px, b.uv_px)
 
 
-def test_the_prediction_is_made_before_the_picture_is_looked_at():
-    """Frame 20 with other points: its prediction is the same, its positions are not."""
+def test_the_prediction_does_not_depend_on_the_frames_own_detections():
+    """Frame 20 with other points: its prediction is the same, its positions differ."""
     run = simulate_points("smooth", 38, frames=21, clutter=0.0)
     moved = list(run.detections)
     moved[20] = tuple(Detections.at(d.uv_px + 0.5, d.cov_px2) for d in moved[20])
@@ -409,8 +403,7 @@ def test_the_prediction_is_made_before_the_picture_is_looked_at():
 
 
 @pytest.mark.parametrize("scenario", ["smooth", "sharp-turns", "blackout", "hidden-in-turn"])
-def test_where_there_is_a_status_there_are_numbers_and_nowhere_else(scenario):
-    """A NaN-free output: u, v and covariance for all but lost and off-screen spots, and none for these."""
+def test_all_spots_have_a_position_and_a_covariance_unless_lost_or_off_screen(scenario):
     t = tracked(scenario, 23 if scenario == "blackout" else 21, 200 if scenario == "blackout" else 250)
     without = np.isin(t.status, [SpotStatus.LOST, SpotStatus.OFF_SCREEN])
     np.testing.assert_array_equal(np.isnan(t.uv_px).any(axis=-1), without)
@@ -423,7 +416,7 @@ def test_where_there_is_a_status_there_are_numbers_and_nowhere_else(scenario):
             assert np.linalg.eigvalsh(f.pose_covariance)[0] > 0
 
 
-def test_no_detection_serves_two_spots():
+def test_no_detection_is_assigned_to_two_spots():
     for scenario in ("smooth", "sharp-turns", "hidden-in-turn"):
         t = tracked(scenario, 21, 250)
         for point in t.point:
@@ -432,8 +425,8 @@ def test_no_detection_serves_two_spots():
                 assert len(set(taken.tolist())) == len(taken)
 
 
-def test_one_point_of_light_is_one_spot_even_where_two_lie_on_top_of_each_other():
-    """A fourth beam a tenth of a millimetre beside A: their spots melt, and one detection is there for two."""
+def test_a_detection_of_two_merged_spots_is_assigned_to_one_of_them():
+    """A fourth beam a tenth of a millimetre beside A: their spots merge into one detection."""
     run = simulate_points("static", 42, frames=30, clutter=0.0)
     rig, a = run.rig, run.rig.beams["A"]
     beams = {**rig.beams, "D": replace(a, name="D", point=a.point + np.array([0.0, 0.0, 1e-4]))}
@@ -446,17 +439,17 @@ def test_one_point_of_light_is_one_spot_even_where_two_lie_on_top_of_each_other(
         assert f.pose_status is PoseStatus.MEASURED
         for c in range(2):
             taken = f.point[(camera_of == c) & (f.point != UNMATCHED)].tolist()
-            assert sorted(taken) == [0, 1, 2]  # each point once, though four spots are there
+            assert sorted(taken) == [0, 1, 2]  # each point once, though there are four spots
 
 
-def test_the_papers_way_puts_spots_outside_the_picture_where_its_quadratic_does():
+def test_with_the_papers_method_positions_outside_the_image_are_those_of_its_quadratic():
     run = simulate_points("smooth", 21, frames=120, clutter=0.0)
-    t = Tracked(run, track(run, PAPERS_OWN))
-    recipes = CoplanarViews.of(run.rig, run.model)
+    t = Tracked(run, track(run, PAPER))
+    coplanar = CoplanarViews.of(run.rig, run.model)
     compared = 0
     for f in t.frames:
         seen = np.where(np.array([s.measured for s in f.status])[:, None], f.uv_px, np.nan)
-        solved = quadratic_positions(run.rig, run.model, recipes, seen)
+        solved = quadratic_positions(run.rig, run.model, coplanar, seen)
         for v in np.flatnonzero([s is SpotStatus.OUT_OF_VIEW for s in f.status]):
             if np.isfinite(solved[v]).all():
                 np.testing.assert_allclose(f.uv_px[v], solved[v], atol=1e-9)
@@ -464,18 +457,18 @@ def test_the_papers_way_puts_spots_outside_the_picture_where_its_quadratic_does(
     assert compared > 10
 
 
-def test_what_is_learnt_of_the_accelerations_makes_predictions_of_a_still_spot_better():
-    """Not 5000 px/s^2 as assumed at the start, but none: after two seconds the prediction is better than one point."""
+def test_estimated_accelerations_improve_the_predictions_of_a_spot_at_rest():
+    """Assumed 5000 px/s^2, actually none: after two seconds the prediction is better than one detection."""
     run = simulate_points("static", 43, frames=300, clutter=0.0)
     late = slice(200, 300)
     rms = []
-    for learn in (True, False):
-        t = Tracked(run, track(run, TrackerParameters(learn_sigma_a=learn)))
+    for estimated in (True, False):
+        t = Tracked(run, track(run, TrackerParameters(learn_sigma_a=estimated)))
         rms.append(np.sqrt(np.mean((t.predicted_px - run.uv_px)[late] ** 2)))
     assert rms[0] < run.noise_px < rms[1]
 
 
-def test_times_between_frames_may_vary():
+def test_the_time_between_frames_may_vary():
     """Frames dropped in both cameras: dt doubles, and the rates are per second, not per frame."""
     run = simulate_points("smooth", 39, frames=120)
     keep = np.sort(np.random.default_rng(40).choice(120, 90, replace=False))

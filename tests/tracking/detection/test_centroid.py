@@ -1,4 +1,4 @@
-"""The parts of the measurement: shapes, pixel integration, the fit's step, what the covariance is raised by."""
+"""The steps of the measurement: shapes, pixel integration, the step of the fit, correction of the covariance."""
 
 import numpy as np
 import pytest
@@ -8,20 +8,19 @@ from scipy.special import erf
 
 from tests.tracking.rendering import Scene, Spot, bound, expected, expose
 from tracking.detection import ellipse
-from tracking.detection.candidates import Noise
-from tracking.detection.gaussian import gaussian_row
+from tracking.detection.ellipse import gaussian_row
 from tracking.detection.gaussian_fit import fit_all
 from tracking.detection.moments import find_moments
 from tracking.detection.normal_equations import accumulate, solve_normal
-from tracking.detection.pixels import CLIPPED, OUTSIDE, Pixels, Window, cut, window_around
+from tracking.detection.pixels import CLIPPED, OUTSIDE, Noise, Pixels, Window, read_window, window_around
 from tracking.detection.table import (
     ALGEBRA,
+    BACKGROUND,
     CELL_ROWS,
     CHI2,
     COLUMNS,
     COV_UV,
     FLUX,
-    GROUND,
     LIGHT,
     MOMENT_U,
     MOMENT_UU,
@@ -59,7 +58,7 @@ def matrix(shape: tuple[float, float, float]) -> np.ndarray:
     return np.array([[shape[0], shape[1]], [shape[1], shape[2]]])
 
 
-def room() -> tuple[np.ndarray, np.ndarray]:
+def workspace() -> tuple[np.ndarray, np.ndarray]:
     cells = np.zeros((CELL_ROWS, MOST_CELLS))
     cells[USE] = 1.0
     return cells, np.zeros((ALGEBRA, 9, 10))
@@ -70,7 +69,7 @@ def pixels(image: np.ndarray) -> Pixels:
 
 
 @given(sigmas, sigmas, st.floats(-89.9, 90))
-def test_axes_and_angle_come_back_from_the_covariance(a, b, angle):
+def test_axes_and_angle_are_recovered_from_the_covariance(a, b, angle):
     major, minor, found = ellipse.axes(*shape_of(max(a, b), min(a, b), angle))
     assert major == pytest.approx(max(a, b), rel=1e-6)
     assert minor == pytest.approx(min(a, b), rel=1e-6, abs=1e-5)
@@ -85,15 +84,15 @@ def test_closed_forms_agree_with_numpy(a, b, turn, c, d, other):
     full = matrix(S)
     np.testing.assert_allclose(matrix(ellipse.inverse(*S)), np.linalg.inv(full), rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(ellipse.eigenvalues(*S), np.linalg.eigvalsh(full), rtol=1e-6, atol=1e-9)
-    raised = ellipse.with_eigenvalues(*S, 1.0, 9.0)
+    raised = ellipse.clip_eigenvalues(*S, 1.0, 9.0)
     np.testing.assert_allclose(
         np.linalg.eigvalsh(matrix(raised)), np.clip(np.linalg.eigvalsh(full), 1, 9), rtol=1e-6, atol=1e-9
     )
-    ratios = np.linalg.eigvals(np.linalg.inv(full) @ matrix(ellipse.kept_within(T, S, 0.4, 2.5))).real
+    ratios = np.linalg.eigvals(np.linalg.inv(full) @ matrix(ellipse.clip_in_metric(T, S, 0.4, 2.5))).real
     assert ratios.min() > 0.4 - 1e-6
     assert ratios.max() < 2.5 + 1e-6
     if (np.abs(np.log(np.linalg.eigvals(np.linalg.inv(full) @ matrix(T)).real)) < np.log(2.4)).all():
-        np.testing.assert_allclose(ellipse.kept_within(T, S, 0.4, 2.5), T, rtol=1e-9)
+        np.testing.assert_allclose(ellipse.clip_in_metric(T, S, 0.4, 2.5), T, rtol=1e-9, atol=1e-12)
 
 
 @given(sigmas, sigmas, st.floats(-90, 90), st.floats(-30, 30), st.floats(-30, 30), st.sampled_from([1.0, 2.0, 4.0]))
@@ -111,8 +110,8 @@ def test_a_row_of_a_gaussian_is_the_exponential_at_each_point(a, b, turn, u0, v,
 )
 @pytest.mark.parametrize("phase", [0.0, 0.23, 0.5])
 def test_pixels_integrate_the_gaussian(sigma, tolerance, phase):
-    """Round spots factorise, and the error function integrates each factor exactly."""
-    cells, algebra = room()
+    """Round spots factorise, so the error function gives the exact integral."""
+    cells, algebra = workspace()
     spot = np.zeros(COLUMNS)
     spot[: SLOPE_V + 1] = [10 + phase, 10.0, sigma**2, 0, sigma**2, 1.0, 0, 0, 0]
     accumulate(Window(0, 0, 21, 21, 1), spot, NOISE, cells, algebra)
@@ -125,25 +124,25 @@ def test_pixels_integrate_the_gaussian(sigma, tolerance, phase):
     assert np.abs(cells[LIGHT, :441] - exact).max() < tolerance * exact.max()
 
 
-def test_cells_of_two_pixels_are_means_of_four_and_know_clipped_and_missing_ones():
+def test_cells_of_two_pixels_are_means_of_four_and_have_states_for_clipped_and_missing_pixels():
     image = np.arange(400, dtype=np.uint16).reshape(20, 20)
     image[6, 6] = 65535
     window = window_around(4.5, 4.5, 3, 3, 2)
     values, state = np.zeros(49), np.zeros(49)
-    cut(pixels(image), window, 65535.0, values, state)
+    read_window(pixels(image), window, 65535.0, values, state)
     u, v = window.left + 6 * 2 + 0.5, window.top + 6 * 2 + 0.5
-    assert values[-1] == pytest.approx(20 * v + u)  # a plane's mean is its value in the middle
+    assert values[-1] == pytest.approx(20 * v + u)  # the mean of a plane is its value at the centre
     assert state[0] == OUTSIDE
     assert (state == CLIPPED).sum() == 1
 
 
 @pytest.mark.parametrize("minor", [0.5, 1.2, 2.0])
-def test_the_normal_equations_are_those_of_the_derivatives(minor):
-    """Against numerical derivatives by the nine parameters: the step and its covariance are the same."""
+def test_the_normal_equations_agree_with_numerical_derivatives(minor):
+    """With derivatives with respect to the nine parameters the decrease of chi-square is the same."""
     rng = np.random.default_rng(0)
     spot = np.zeros(COLUMNS)
     spot[: SLOPE_V + 1] = [9.7, 10.4, *shape_of(2.1, minor, 30.0), 900.0, 12.0, 0.1, -0.2]
-    window, (cells, algebra) = Window(2, 3, 17, 15, 1), room()
+    window, (cells, algebra) = Window(2, 3, 17, 15, 1), workspace()
     n = 17 * 15
     cells[0, :n] = rng.uniform(0, 50, n)
     J = np.zeros((9, n))
@@ -167,14 +166,14 @@ def test_the_normal_equations_are_those_of_the_derivatives(minor):
 
 def start(spot: Spot, background: float) -> np.ndarray:
     table = np.zeros((1, COLUMNS))
-    table[0, [MOMENT_U, MOMENT_V, GROUND]] = np.rint(spot.u), np.rint(spot.v), background
+    table[0, [MOMENT_U, MOMENT_V, BACKGROUND]] = np.rint(spot.u), np.rint(spot.v), background
     return table
 
 
-def test_moments_come_close_and_the_fit_reaches_the_truth_without_noise():
+def test_without_noise_the_moments_are_close_to_the_truth_and_the_fit_reaches_it():
     spot = Spot(40.3, 30.8, 20_000.0, 3.1, 1.7, 25.0)
     image = pixels(np.rint(expected(Scene([spot], (80, 60), 1000.0, (300.0, 200.0)))).astype(np.uint16))
-    cells, algebra = room()
+    cells, algebra = workspace()
     table = start(spot, 1000.0)
     find_moments(image, table, cells)
     assert np.abs(table[0, [MOMENT_U, MOMENT_V]] - [40.3, 30.8]).max() < 0.1 * px
@@ -189,7 +188,7 @@ def fitted(scene: Scene, seed: int, spot: Spot, hot: tuple[int, int] | None = No
     image = expose(expected(scene, rng), scene, rng)
     if hot:
         image[hot[1], hot[0]] = 200
-    cells, algebra = room()
+    cells, algebra = workspace()
     table = start(spot, scene.background)
     find_moments(pixels(image), table, cells)
     fit_all(pixels(image), table, NOISE, 255.0, 20.0, 0.0, cells, algebra)
@@ -197,16 +196,16 @@ def fitted(scene: Scene, seed: int, spot: Spot, hot: tuple[int, int] | None = No
 
 
 @pytest.mark.parametrize("hot", [(34, 30), (32, 27), (30, 31)])
-def test_a_hot_pixel_beside_or_in_a_spot_does_not_pull_it(hot):
+def test_a_hot_pixel_beside_or_in_a_spot_does_not_shift_it(hot):
     spot = Spot(30.3, 29.6, 100.0, 2.2, 2.0)
-    clean, marred = (fitted(Scene([spot], (64, 60)), 5, spot, h) for h in (None, hot))
+    clean, with_hot_pixel = (fitted(Scene([spot], (64, 60)), 5, spot, h) for h in (None, hot))
     sigma = np.sqrt(clean[[VAR_U, VAR_V]])
-    assert (np.abs(clean[[U, V]] - marred[[U, V]]) < 1.0 * sigma).all()
-    assert marred[CHI2] < 1.4
+    assert (np.abs(clean[[U, V]] - with_hot_pixel[[U, V]]) < 1.0 * sigma).all()
+    assert with_hot_pixel[CHI2] < 1.4
 
 
 def test_a_flat_topped_spot_keeps_its_small_sigma_and_a_speckled_one_does_not():
-    """A symmetric misfit cannot move the centre; a lopsided one does."""
+    """A symmetric misfit does not shift the centre; an asymmetric one does."""
     streak, plain = Spot(30.4, 30.2, 180.0, 1.8, 1.8, 20.0, streak=12.0), Spot(30.4, 30.2, 180.0, 2.5, 2.5)
     flat = fitted(Scene([streak], (64, 60)), 1, streak)
     speckled = fitted(Scene([plain], (64, 60), speckle=0.2), 1, plain)
@@ -218,10 +217,10 @@ def test_a_flat_topped_spot_keeps_its_small_sigma_and_a_speckled_one_does_not():
     assert abs(smooth[COV_UV]) < smooth[VAR_U]
 
 
-def test_a_candidate_that_wanders_off_is_given_up():
+def test_a_candidate_that_diverges_is_rejected():
     image = np.full((80, 80), 20, np.uint8)
-    image[:, 40:] = 200  # an edge, no spot
-    cells, algebra = room()
+    image[:, 40:] = 200  # an edge without a spot
+    cells, algebra = workspace()
     table = start(Spot(40.0, 40.0, 1.0), 20.0)
     table[0, [MOMENT_UU, MOMENT_UV, MOMENT_VV, FLUX]] = 4.0, 0.0, 4.0, 4000.0
     fit_all(pixels(image), table, NOISE, 255.0, 5.0, 0.0, cells, algebra)
@@ -230,7 +229,7 @@ def test_a_candidate_that_wanders_off_is_given_up():
 
 @settings(max_examples=40)
 @given(st.integers(0, 10**6))
-def test_the_step_solves_the_problem(seed):
+def test_the_solution_of_the_normal_equations_agrees_with_numpy(seed):
     rng = np.random.default_rng(seed)
     half = rng.normal(size=(9, 40)) * 10.0 ** rng.uniform(-4, 4, (9, 1))
     N, X = np.zeros((9, 10)), np.zeros((9, 10))
@@ -241,12 +240,12 @@ def test_the_step_solves_the_problem(seed):
 
 
 @pytest.mark.parametrize(("sigma", "lock"), [(0.5, 5e-4), (0.8, 5e-4), (1.0, 5e-4), (2.0, 2e-4)])
-def test_centres_are_not_drawn_to_pixels(sigma, lock):
-    """Without noise the error is a function of the phase in the pixel alone; 16 bit keep rounding out of it."""
+def test_centres_are_not_biased_towards_pixel_centres(sigma, lock):
+    """Without noise the error depends only on the phase within the pixel; 16 bits make rounding negligible."""
     for phase in np.linspace(-0.5, 0.5, 9):
         spot = Spot(30 + phase, 30.2 - phase, 30_000.0, sigma, sigma)
         image = pixels(np.rint(expected(Scene([spot], (61, 61), 1000.0))).astype(np.uint16))
-        cells, algebra = room()
+        cells, algebra = workspace()
         table = start(spot, 1000.0)
         find_moments(image, table, cells)
         fit_all(image, table, Noise(100.0, 0.1, 1000.0, 0.0, 0.0), 65535.0, 20.0, 0.0, cells, algebra)

@@ -1,4 +1,4 @@
-"""The noise model: from a sensor's data sheet, and estimated from pictures."""
+"""The noise model: from a sensor's data sheet and estimated from pictures."""
 
 import warnings
 from dataclasses import dataclass
@@ -25,10 +25,10 @@ SPOTS = [
 
 @dataclass
 class Lab:
-    """A still scene filmed by a sensor: texture, a gradient, bright details and spots that move."""
+    """A static scene recorded by a sensor: texture, a gradient, bright details, and moving spots."""
 
     bits: int = 8
-    shift: int = 0  # bits at the lower end of the file's numbers that are not used
+    shift: int = 0  # unused low bits of the file's values
     gain: float = 40.0  # electrons per DN
     read_e: float = 6.0
     black: float = 4.0
@@ -67,19 +67,19 @@ class Lab:
         return out
 
     def variance(self, level: float) -> float:
-        """Of a pixel at this level of the sensor's own numbers, in those of the file."""
+        """Variance, in units of the file, of a pixel at this level, in units of the sensor."""
         own = (max(level - self.black, 0.0) * self.gain + self.read_e**2) / self.gain**2 + ROUNDING_DN2
         return own * 4.0**self.shift
 
 
-def test_a_sensor_of_38_electrons_per_dn_scatters_as_its_electrons_do():
+def test_the_variance_of_a_sensor_of_38_electrons_per_dn_is_that_of_its_electrons():
     model = NoiseModel.of(SensorNoise(gain_e_per_dn=38.0, read_noise_e=30.0, black_dn=8.0))
     electrons = (108.0 - 8.0) * 38.0
     assert model.variance(108.0) == pytest.approx((electrons + 30.0**2) / 38.0**2 + ROUNDING_DN2)
 
 
 @given(st.floats(-50, 5000), st.floats(0, 5000))
-def test_more_light_never_scatters_less(level, more):
+def test_more_light_never_has_a_smaller_variance(level, more):
     model = NoiseModel(2.0, 0.03, 10.0)
     assert model.variance(level + more) >= model.variance(level) >= 2.0
 
@@ -110,7 +110,7 @@ def test_noise_is_estimated_from_pictures_of_spots_at_rest(gain, read):
     ],
     ids=["usual", "plain", "at rest", "flicker", "12 bit", "12 of 16", "10 bit", "16 bit", "fine steps", "clipped"],
 )
-def test_the_structure_of_a_scene_is_no_noise(lab):
+def test_the_structure_of_a_scene_does_not_count_as_noise(lab):
     """Texture of 4 %, edges, moving spots and changing light: within 1.3 at the background, 2 at half of full scale."""
     model = estimate_noise(lab.pictures(3)).model
     level, half = lab.background + lab.black, 0.5 * (2**lab.bits - 1)
@@ -119,8 +119,8 @@ def test_the_structure_of_a_scene_is_no_noise(lab):
     assert lab.variance(half) / 2 < model.variance(half * at) < 2 * lab.variance(half)
 
 
-def test_without_light_between_background_and_spots_the_slope_is_that_of_a_sensor():
-    """Texture of 8 % in 16 bits is 500 times the shot noise of a spot: its residuals say nothing of the electrons."""
+def test_without_light_between_background_and_spots_the_prior_bounds_the_slope():
+    """Texture of 8 % in 16 bits is 500 times the shot noise of a spot: its residuals do not determine the slope."""
     lab = Lab(bits=16, gain=0.4, read_e=3.0, background=20.0, black=500.0, details=0, texture=0.08, spot_peak=30_000.0)
     estimate = estimate_noise(lab.pictures(4))
     assert 0.1 < estimate.model.slope_dn * lab.gain < 10
@@ -128,14 +128,14 @@ def test_without_light_between_background_and_spots_the_slope_is_that_of_a_senso
 
 
 @pytest.mark.parametrize("quality", [70, 95])
-def test_compressed_pictures_give_a_model_that_finds_their_spots(quality):
+def test_the_model_from_compressed_pictures_finds_their_spots(quality):
     lab = Lab(quality=quality)
     pictures = lab.pictures(5)
     model = estimate_noise(pictures).model
     assert min(len(find_spots(p, noise=model)) for p in pictures) >= 5
 
 
-def test_a_background_that_is_clipped_at_black_keeps_its_noise():
+def test_the_noise_of_a_background_clipped_at_black_is_recovered():
     rng = np.random.default_rng(6)
     model = estimate_noise(
         [np.clip(np.rint(rng.normal(0.3, 2.0, (300, 400))), 0, 255).astype(np.uint8) for _ in range(4)]
@@ -144,7 +144,7 @@ def test_a_background_that_is_clipped_at_black_keeps_its_noise():
 
 
 @given(st.floats(-1.0, 3.0), st.floats(1.0, 6.0))
-def test_mean_and_sigma_of_clipped_values(mean, sigma):
+def test_mean_and_sigma_of_clipped_values_are_recovered(mean, sigma):
     places = (np.arange(4000) + 0.5) / 4000
     values = np.rint([NormalDist(mean, sigma).inv_cdf(p) for p in places]).clip(0)
     got = clipped_normal(values)
@@ -152,7 +152,7 @@ def test_mean_and_sigma_of_clipped_values(mean, sigma):
 
 
 @pytest.mark.parametrize("sigma", [0.1, 0.25, 0.4, 0.7, 2.0])
-def test_the_part_of_rounding_that_time_does_not_show_is_added(sigma):
+def test_the_rounding_error_that_is_constant_in_time_is_added(sigma):
     rng = np.random.default_rng(7)
     level = rng.uniform(0, 50, 60_000)
     a, b = (np.rint(level + sigma * rng.standard_normal(level.size)) for _ in range(2))
@@ -160,8 +160,8 @@ def test_the_part_of_rounding_that_time_does_not_show_is_added(sigma):
 
 
 @pytest.mark.parametrize(("bits", "shift"), [(10, 0), (12, 0), (12, 4)])
-def test_a_sensor_clips_where_its_numbers_end(bits, shift):
-    """And not at 65535, which no 12-bit camera writes."""
+def test_the_clipping_level_is_the_largest_value_of_the_sensor(bits, shift):
+    """Not 65535, which no 12-bit camera writes."""
     full = 2**bits - 1
     lab = Lab(
         bits=bits, shift=shift, gain=20_000 / full, background=0.05 * full, black=0.01 * full, spot_peak=2.0 * full
@@ -174,16 +174,16 @@ def test_a_bright_picture_that_does_not_clip_has_no_saturation_level():
     assert saturation_level(lab.pictures(9), 1.0) is None
 
 
-def test_copies_of_one_picture_are_no_evidence_of_silence():
-    """Recorders repeat a frame that was dropped."""
+def test_copies_of_one_picture_do_not_count_as_a_noiseless_sensor():
+    """Recorders repeat the previous picture in place of a dropped one."""
     picture = Lab().pictures(10, 1)[0]
     estimate = estimate_noise([picture, picture.copy()])
     assert not estimate.temporal
     assert estimate.model.variance(22.0) > 0.7 * Lab().variance(22.0)
 
 
-def test_noise_that_goes_together_over_pixels_is_not_taken_for_less():
-    """As in JPEG pictures: smoothed noise is invisible to differences, but not to a spot several pixels wide."""
+def test_noise_that_is_correlated_between_pixels_is_not_underestimated():
+    """As in JPEG pictures: differences of neighbours underestimate smoothed noise, which affects wide spots."""
     rng = np.random.default_rng(2)
     white = rng.normal(0, 6, (400, 600))
     kernel = np.array([0.25, 0.5, 0.25])
@@ -194,7 +194,7 @@ def test_noise_that_goes_together_over_pixels_is_not_taken_for_less():
 
 
 @pytest.mark.parametrize("bits", [8, 16])
-def test_a_quick_guess_knows_the_background_noise(bits):
+def test_the_quick_model_has_the_noise_of_the_background(bits):
     scale = 1 if bits == 8 else 100
     rng = np.random.default_rng(3)
     image = np.rint(rng.normal(20 * scale, 2.0 * scale, (300, 400))).astype(np.uint8 if bits == 8 else np.uint16)
@@ -202,8 +202,8 @@ def test_a_quick_guess_knows_the_background_noise(bits):
     assert model.variance(20 * scale) == pytest.approx((2.0 * scale) ** 2, rel=0.25)
 
 
-def test_black_pictures_with_spots_have_a_model_and_warn_of_nothing():
-    """No pixel but those of the spots is above zero, as behind a filter."""
+def test_black_pictures_with_spots_give_a_model_without_warnings():
+    """Only the pixels of the spots are above zero, as behind a filter."""
     pictures = [np.zeros((300, 400), np.uint8) for _ in range(4)]
     for k, picture in enumerate(pictures):
         cv2.circle(picture, (100 + 40 * k, 120), 3, 140, -1)
@@ -216,7 +216,7 @@ def test_black_pictures_with_spots_have_a_model_and_warn_of_nothing():
 
 @pytest.mark.parametrize("value", [0, 255])
 @pytest.mark.parametrize("shape", [(1, 1), (3, 50), (0, 0), (9, 9), (40, 40), (300, 400)])
-def test_pictures_without_any_contrast_leave_the_rounding(shape, value):
+def test_the_noise_of_uniform_pictures_is_that_of_rounding(shape, value):
     image = np.full(shape, value, np.uint8)
     assert guess_noise(image).floor_dn2 == pytest.approx(ROUNDING_DN2)
     for pictures in ([image], [image, image.copy(), image.copy()]):
@@ -225,7 +225,7 @@ def test_pictures_without_any_contrast_leave_the_rounding(shape, value):
         assert np.isfinite(model.variance(200.0))
 
 
-def test_no_picture_and_no_noise_are_refused():
+def test_an_empty_list_and_a_model_without_noise_are_rejected():
     with pytest.raises(ValueError, match="at least one picture"):
         estimate_noise([])
     with pytest.raises(ValueError, match="floor_dn2 > 0"):
@@ -233,7 +233,7 @@ def test_no_picture_and_no_noise_are_refused():
 
 
 @pytest.mark.parametrize("size", [(40, 32), (100, 60), (160, 120)])
-def test_pictures_too_small_for_levels_still_have_the_noise_that_was_drawn(size):
+def test_the_noise_of_pictures_too_small_for_levels_is_estimated(size):
     rng = np.random.default_rng(5)
     scene = Scene([Spot(size[0] / 2, size[1] / 2, 3000.0, 1, 1)], size=size, background=200.0, read=20.0)
     model = estimate_noise([photograph(scene, rng, bits=16) for _ in range(2)]).model

@@ -1,6 +1,6 @@
 """The detector on real pictures: laser spots in rooms, beams on a bare sensor, stars, microscope particles.
 
-The figures in the asserts are what it reaches, rounded to the careful side; the README quotes them.
+The limits in the asserts are the figures reached, rounded up; the README quotes them.
 """
 
 import cv2
@@ -17,21 +17,21 @@ px = 1.0
 
 
 def picture(name: str, shrink: int = 1) -> Picture:
-    """A real picture in grey; shrunk by area means where its spot is wider than the 30 px that the detector serves."""
+    """A real picture in grey; reduced by area means if its spot is wider than the detector's limit of 30 px."""
     path = DATA / name
     if not path.exists():
-        pytest.skip(f"the real pictures are not here: {path.parent.name} is missing")
+        pytest.skip(f"the real pictures are not available: {path.parent.name} is missing")
     image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
     size = (image.shape[1] // shrink, image.shape[0] // shrink)
     return cv2.resize(image, size, interpolation=cv2.INTER_AREA) if shrink > 1 else image
 
 
-def away(found: Detections, uv: tuple[float, float]) -> np.ndarray:
+def distances(found: Detections, uv: tuple[float, float]) -> np.ndarray:
     return np.hypot(*(found.uv_px - np.asarray(uv)).T)
 
 
 def centre_of_mass(image: Picture) -> tuple[float, float]:
-    """Of what rises over a fifth of the height: a second way to the centre of a lone beam."""
+    """The centre of mass of the light above a fifth of the maximum: a second estimate of the centre of one beam."""
     light = image.astype(float) - np.median(image)
     light[light < 0.2 * light.max()] = 0
     v, u = np.mgrid[: image.shape[0], : image.shape[1]]
@@ -46,10 +46,10 @@ def centre_of_mass(image: Picture) -> tuple[float, float]:
         pytest.param("6", (836.7, 745.3), marks=pytest.mark.slow),
     ],
 )
-def test_a_laser_pointer_in_a_room_is_found_where_its_publisher_says(name, published):
-    """Published by eye and good to about 2 px. In 4.jpg the red halo, which grey hardly shows, lies to the right."""
+def test_a_laser_pointer_in_a_room_is_found_at_its_published_position(name, published):
+    """Published by eye, to about 2 px. In 4.jpg the red halo, which is faint in grey, lies to the right."""
     found = find_spots(picture(f"laser_spot_room/{name}.jpg"))
-    assert away(found, published).min() < 3 * px
+    assert distances(found, published).min() < 3 * px
 
 
 @pytest.mark.parametrize("name", ["168mm", "280mm", "495mm", "520mm", "666mm", "770mm", "hene", "nolens"])
@@ -57,29 +57,29 @@ def test_a_real_laser_beam_is_one_spot_at_its_centre_of_mass(name):
     image = picture(f"laser_beam_series_t/t-{name}.pgm", shrink=8)
     found = find_spots(image)
     assert len(found) == 1
-    assert away(found, centre_of_mass(image)).max() < 0.25 * px
+    assert distances(found, centre_of_mass(image)).max() < 0.25 * px
 
 
 def test_a_beam_with_a_smear_line_is_one_spot_and_a_beam_of_two_lobes_is_two():
     one, two = picture("laser_beam_modes/TEM00_150mm.pgm", 8), picture("laser_beam_modes/TEM01_200mm.pgm", 8)
     assert len(find_spots(one)) == 1
-    assert away(find_spots(one), centre_of_mass(one)).max() < 0.1 * px
+    assert distances(find_spots(one), centre_of_mass(one)).max() < 0.1 * px
     lobes = find_spots(two)
     assert len(lobes) == 2
     assert np.hypot(*(lobes.uv_px.mean(axis=0) - centre_of_mass(two))) < 0.5 * px
 
 
-def test_a_burnt_out_spot_with_a_noisy_halo_is_found_at_its_core():
+def test_a_saturated_spot_with_a_noisy_halo_is_found_at_its_core():
     image = picture("laser_spot_saturated/laser point.png", shrink=4)
     found = find_spots(image)
     core = np.argwhere(image > 245).mean(axis=0)[::-1]
     assert len(found) == 1
-    assert away(found, tuple(core)).max() < 0.5 * px
+    assert distances(found, tuple(core)).max() < 0.5 * px
 
 
 @pytest.mark.parametrize("name", ["crappy.jpg", "orion_belt.jpg", "pleiades.jpg"])
 def test_the_brightest_stars_are_found_and_are_as_narrow_as_stars(name):
-    """Brightest: the ten highest maxima of a smoothed picture that are not hot pixels or at the border."""
+    """The brightest are the ten highest maxima of a smoothed picture, without hot pixels and the border."""
     image = picture(f"star_fields/{name}")
     found = find_spots(image, noise=estimate_noise([image]).model)
     smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), 1.2)
@@ -87,16 +87,16 @@ def test_the_brightest_stars_are_found_and_are_as_narrow_as_stars(name):
     highest = (smooth == cv2.dilate(smooth, np.ones((15, 15)))) & (smooth > 0)
     v, u = np.nonzero(highest[8:-8, 8:-8])
     order = np.argsort(-smooth[v + 8, u + 8])[:10]
-    missed = [(u[i] + 8, v[i] + 8) for i in order if away(found, (u[i] + 8, v[i] + 8)).min() > 1.5 * px]
+    missed = [(u[i] + 8, v[i] + 8) for i in order if distances(found, (u[i] + 8, v[i] + 8)).min() > 1.5 * px]
     assert missed == []
     assert np.median(found.major_px) < 3 * px
 
 
-def test_dark_particles_lie_where_trackpy_has_them():
-    """trackpy's own published positions (reproducibility_v0.4, arr_3), frame 0 inverted.
+def test_black_particles_agree_with_the_positions_of_trackpy():
+    """trackpy's published positions (reproducibility_v0.4, arr_3), frame 0 inverted.
 
-    It keeps 344 of 366 features, faint rings among them; the detector asks for six sigmas. Positions differ as a
-    centre of mass in a window of 9 px and a fit with its neighbours taken off differ in a crowd.
+    trackpy keeps 344 of 366 features, including faint rings; the detector requires six sigmas. In a crowd a centre of
+    mass in a window of 9 px differs from a fit with the neighbours subtracted.
     """
     image = 255 - picture("particles_trackpy_reference/T76S3F00001.png")
     theirs = np.load(DATA / "particles_trackpy_reference" / "reproducibility_v0.4.npz")["arr_3"][:, 1::-1]

@@ -1,4 +1,4 @@
-"""Looking into regions gives the same spots, bit for bit, as looking at the whole picture."""
+"""Detection in regions gives the same spots, bit for bit, as detection in the whole picture."""
 
 import numpy as np
 import pytest
@@ -15,8 +15,8 @@ NOISE = SensorNoise(gain_e_per_dn=30.0, read_noise_e=45.0)
 
 
 def inside(found: Detections, regions: np.ndarray) -> np.ndarray:
-    away = np.abs(found.uv_px[:, None, :] - regions[None, :, :2]).max(axis=2)
-    return (away <= regions[None, :, 2]).any(axis=1)
+    distance = np.abs(found.uv_px[:, None, :] - regions[None, :, :2]).max(axis=2)
+    return (distance <= regions[None, :, 2]).any(axis=1)
 
 
 def assert_same(image: Picture, regions: np.ndarray) -> int:
@@ -28,7 +28,7 @@ def assert_same(image: Picture, regions: np.ndarray) -> int:
 
 
 @pytest.mark.parametrize("kind", ["main", "faint", "near", "edge", "wide", "small", "speckle"])
-def test_regions_hold_the_same_spots_as_the_whole_picture(kind):
+def test_regions_give_the_same_spots_as_the_whole_picture(kind):
     rng = np.random.default_rng([3, len(kind)])
     scene = scene_of(kind, rng)
     image = photograph(scene, rng)
@@ -41,8 +41,8 @@ def test_regions_hold_the_same_spots_as_the_whole_picture(kind):
 
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("sigma", [1.5, 4.0, 8.0])
-def test_a_region_in_a_crowd_takes_the_neighbours_into_account(seed, sigma):
-    """Spots overlap in chains that lead far out of the region."""
+def test_neighbours_outside_a_region_are_taken_into_account(seed, sigma):
+    """Spots overlap in chains that extend far out of the region."""
     rng = np.random.default_rng(seed)
     gap = 6 * sigma
     spots = [
@@ -54,7 +54,7 @@ def test_a_region_in_a_crowd_takes_the_neighbours_into_account(seed, sigma):
     assert assert_same(image, np.array([[200.0, 160.0, 30.0], [90.0, 300.0, 15.0]])) > 0
 
 
-def test_regions_outside_the_picture_without_size_or_with_nan_hold_nothing():
+def test_regions_outside_the_picture_without_size_or_with_nan_are_empty():
     image = photograph(Scene([Spot(80.0, 60.0, 150.0)], (160, 120)), np.random.default_rng(0))
     odd = np.array([[-500.0, 60.0, 20.0], [80.0, 60.0, -1.0], [np.nan, 60.0, 20.0], [80.0, 60.0, np.nan]])
     assert len(find_spots(image, noise=NOISE, regions=odd)) == 0
@@ -64,14 +64,14 @@ def test_regions_outside_the_picture_without_size_or_with_nan_hold_nothing():
         find_spots(image, regions=[1.0, 2.0])
 
 
-def test_a_finder_keeps_nothing_of_the_picture_before():
-    """Also after looking at parts, and in 8 and 16 bits by turns."""
+def test_a_finder_keeps_nothing_of_the_previous_picture():
+    """Also after a search in regions, and with alternating 8 and 16 bits."""
     rng = np.random.default_rng(1)
     finder, parameters = SpotFinder(330, 250), DetectParameters()
     for k in range(6):
         spots = [Spot(*rng.uniform(30, 220, 2), float(rng.uniform(60, 200))) for _ in range(4)]
         image = photograph(Scene(spots, (330, 250)), rng, 8 if k % 2 else 16)
         finder.find(image, parameters, NOISE, [[spots[0].u, spots[0].v, 12.0]])
-        again, fresh = finder.find(image, parameters, NOISE), SpotFinder(330, 250).find(image, parameters, NOISE)
-        np.testing.assert_array_equal(again.uv_px, fresh.uv_px)
-        np.testing.assert_array_equal(again.cov_px2, fresh.cov_px2)
+        used, new = finder.find(image, parameters, NOISE), SpotFinder(330, 250).find(image, parameters, NOISE)
+        np.testing.assert_array_equal(used.uv_px, new.uv_px)
+        np.testing.assert_array_equal(used.cov_px2, new.cov_px2)

@@ -1,4 +1,4 @@
-"""First labels: right from a wide prior or none, a tie where two poses fit equally, nothing where none does."""
+"""First labels: right with a wide prior or none, a tie if two poses fit equally well, none if no pose fits."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ WIDE = PosePrior(Pose.identity(), 1.0, np.deg2rad(30))
 
 
 def pose_within(prior: PosePrior, rng: np.random.Generator) -> Pose:
-    """Uniform in the cube of positions and in the ball of turns."""
+    """A random pose, uniform in the cube of positions and in the ball of rotation vectors."""
     axis = rng.normal(size=3)
-    turn = prior.within_rad * rng.random() ** (1 / 3) * axis / np.linalg.norm(axis)
-    R = prior.centre.rotation @ Rotation.from_rotvec(turn).as_matrix()
+    rotation_vector = prior.within_rad * rng.random() ** (1 / 3) * axis / np.linalg.norm(axis)
+    R = prior.centre.rotation @ Rotation.from_rotvec(rotation_vector).as_matrix()
     return Pose(R, prior.centre.translation + rng.uniform(-prior.within_m, prior.within_m, 3))
 
 
 @dataclass(frozen=True)
 class Picture:
-    """What is found in one frame, and which view each point is of (FALSE: none)."""
+    """The detections of one frame, and the view that each point comes from (FALSE: none)."""
 
     detections: dict[str, Detections]
     origin: dict[str, np.ndarray]
@@ -48,7 +48,7 @@ def photograph(
     false_points: int = 0,
     hidden: tuple[str, ...] = (),
 ) -> Picture:
-    """The spots in the picture with noise; near each, with probability `clutter`, a false one within 15 px."""
+    """The spots in the picture with noise; near each, with probability `clutter`, a false point within 15 px."""
     uv = model.project(pose)[0]
     visible = model.in_picture(uv)
     detections, origin = {}, {}
@@ -74,7 +74,7 @@ def photograph(
 
 
 def wrong_labels(result: LabelResult, model: SpotModel, picture: Picture) -> list[str]:
-    """Spots that were given a point which is not theirs."""
+    """The spots with a wrong label."""
     assert result.chosen is not None
     return [
         model.views[v][1]
@@ -84,7 +84,10 @@ def wrong_labels(result: LabelResult, model: SpotModel, picture: Picture) -> lis
 
 
 def rates(rig: Rig, count: int, seed: int, least_visible: int = 4) -> tuple[float, float]:
-    """Shares right and wrong: 20 % clutter, 5 false points per picture, 2 % misses, prior of 1 m and 30 deg."""
+    """Shares of right and wrong labellings.
+
+    20 % clutter, 5 false points per picture, 2 % misses, prior of 1 m and 30 deg.
+    """
     model, rng = SpotModel.of(rig), np.random.default_rng(seed)
     right = wrong = done = 0
     while done < count:
@@ -102,7 +105,7 @@ def rates(rig: Rig, count: int, seed: int, least_visible: int = 4) -> tuple[floa
 
 @pytest.mark.parametrize("name", ["fan", "four-skew-beams"])
 def test_labels_are_right_from_a_wide_prior_among_clutter(name):
-    """20 poses: one may stay open, none may be wrong."""
+    """20 poses: one may stay unlabelled, none may be wrong."""
     right, wrong = rates(RIGS[name](), 20, seed=1)
     assert right >= 0.95
     assert wrong == 0
@@ -131,12 +134,12 @@ def test_without_clutter_all_spots_are_labelled_and_the_pose_is_found(name):
         assert wrong_labels(result, model, picture) == []
         visible = model.in_picture(model.project(pose)[0])
         np.testing.assert_array_equal(result.chosen.point_of != NO_POINT, visible)
-        # sigmas hold the model's own error, 0.3 px, that this simulation has not
+        # The sigmas include the model error of 0.3 px, which this simulation does not have.
         assert np.all(np.abs(result.chosen.fit.world_from_body.minus(pose)) < 0.01)
 
 
-def test_the_prior_may_be_anywhere():
-    """Turned by 120 deg about a skew axis and shifted: nothing depends on the identity."""
+def test_the_centre_of_the_prior_may_be_any_pose():
+    """A prior rotated by 120 deg about a skew axis, and shifted."""
     rig = RIGS["fan"]()
     turn = Pose(Rotation.from_rotvec([1.2, 1.2, 1.2]).as_matrix(), np.array([0.4, -0.3, 0.2]))
     beams = {
@@ -154,7 +157,7 @@ def test_the_prior_may_be_anywhere():
 
 
 @pytest.mark.parametrize("hidden", ["1", "5", "6"])
-def test_a_hidden_spot_is_left_open(hidden):
+def test_a_hidden_spot_gets_no_label(hidden):
     rig = RIGS["fan"]()
     model, rng = SpotModel.of(rig), np.random.default_rng(5)
     prior = PosePrior(Pose.identity(), 0.3, np.deg2rad(10))
@@ -165,7 +168,7 @@ def test_a_hidden_spot_is_left_open(hidden):
     assert [s for (_, s), p in zip(model.views, result.chosen.point_of, strict=True) if p == NO_POINT] == [hidden]
 
 
-def test_a_false_point_beside_a_hidden_spot_is_not_taken_for_it():
+def test_a_false_point_beside_a_hidden_spot_does_not_get_its_label():
     rig = RIGS["fan"]()
     model, rng = SpotModel.of(rig), np.random.default_rng(6)
     pose = Pose.identity()
@@ -185,8 +188,8 @@ def without_beam(rig: Rig, beam: str) -> Rig:
                    spots={n: s for n, s in rig.spots.items() if s.beam != beam})  # fmt: skip
 
 
-def test_two_beams_that_could_be_swapped_are_a_tie_with_both_candidates():
-    """A rig of two beams: half a turn about the line between them swaps their spots, and explains them as well."""
+def test_two_exchangeable_beams_give_a_tie_with_both_candidates():
+    """A rig of two beams: half a turn about the line between them swaps their spots and fits equally well."""
     rig = without_beam(RIGS["fan"](), "B")
     model, rng = SpotModel.of(rig), np.random.default_rng(7)
     picture = photograph(model, Pose.identity(), rng)
@@ -196,9 +199,9 @@ def test_two_beams_that_could_be_swapped_are_a_tie_with_both_candidates():
     assert len(result.candidates) >= 2
     assert "equally well" in result.reason
     one, other = result.candidates[:2]
-    apart = one.fit.world_from_body.minus(other.fit.world_from_body)
-    assert np.linalg.norm(apart[3:]) == pytest.approx(np.pi, abs=0.02)
-    # The same four points, each under two names.
+    difference = one.fit.world_from_body.minus(other.fit.world_from_body)
+    assert np.linalg.norm(difference[3:]) == pytest.approx(np.pi, abs=0.02)
+    # The same four points with swapped labels.
     for camera in range(2):
         rows = model.camera_of == camera
         assert sorted(one.point_of[rows]) == sorted(other.point_of[rows])
@@ -208,14 +211,14 @@ def test_two_beams_that_could_be_swapped_are_a_tie_with_both_candidates():
 @pytest.mark.parametrize(
     ("rig_name", "yaw_deg", "p_detect", "hidden", "tie"),
     [
-        ("fan", 24, 0.95, (), False),  # C is out of the picture; turned back, A would be in it and is not found
-        ("fan", 24, 0.5, (), True),  # ... which says little where every second spot is missed
-        ("fan", 12, 0.95, ("3", "6"), True),  # C is hidden: one beam is missing either way
-        ("unequal-fan", 12, 0.95, ("3", "6"), False),  # 18 and 23 deg: the angle itself tells
+        ("fan", 24, 0.95, (), False),  # C is out of the picture; in the rotated pose A would be in it, but is not found
+        ("fan", 24, 0.5, (), True),  # ... which is weak evidence if every second spot is missed
+        ("fan", 12, 0.95, ("3", "6"), True),  # C is hidden: one beam is missing in both poses
+        ("unequal-fan", 12, 0.95, ("3", "6"), False),  # 18 and 23 deg: the angle distinguishes the poses
     ],
 )
-def test_of_equal_angles_only_the_absent_third_beam_tells_which_two_are_seen(rig_name, yaw_deg, p_detect, hidden, tie):
-    """Beams A and B, turned back by 20 deg, are beams B and C as well."""
+def test_with_equal_angles_only_the_third_beam_distinguishes_the_other_two(rig_name, yaw_deg, p_detect, hidden, tie):
+    """Rotated back by 20 deg, beams A and B coincide with beams B and C."""
     rig = RIGS[rig_name]()
     model = SpotModel.of(rig)
     pose = Pose.from_ypr(np.deg2rad([yaw_deg, 0, 0]), np.zeros(3))
@@ -232,7 +235,7 @@ def test_of_equal_angles_only_the_absent_third_beam_tells_which_two_are_seen(rig
         assert wrong_labels(result, model, picture) == []
 
 
-def test_two_beams_of_unequal_angles_are_no_tie_within_the_prior():
+def test_two_beams_of_unequal_angles_give_no_tie_within_the_prior():
     rig = without_beam(RIGS["fan"](), "B")
     model, rng = SpotModel.of(rig), np.random.default_rng(9)
     picture = photograph(model, Pose.identity(), rng)
@@ -242,7 +245,7 @@ def test_two_beams_of_unequal_angles_are_no_tie_within_the_prior():
 
 
 @pytest.mark.parametrize("points", [0, 1, 3])
-def test_too_few_points_are_said_to_be_too_few(points):
+def test_too_few_points_are_reported(points):
     rig = RIGS["fan"]()
     model = SpotModel.of(rig)
     uv = model.project(Pose.identity())[0][:points]
@@ -253,15 +256,15 @@ def test_too_few_points_are_said_to_be_too_few(points):
     assert result.reason == f"only {points} points of light, at least 4 needed"
 
 
-def test_no_camera_with_a_picture_is_no_label():
+def test_without_pictures_there_are_no_labels():
     rig = RIGS["fan"]()
     result = find_labels(rig, SpotModel.of(rig), {}, WIDE)
     assert result.chosen is None
 
 
 @pytest.mark.parametrize("name", ["fan", "four-skew-beams"])
-def test_points_that_are_no_spots_are_no_vehicle(name):
-    """Six false points per picture, five times: a confident pose of nothing would be the worst of all."""
+def test_false_points_alone_give_no_pose(name):
+    """Six false points per picture, five frames."""
     rig = RIGS[name]()
     model, rng = SpotModel.of(rig), np.random.default_rng(10)
     everything = tuple(rig.spots)
@@ -271,8 +274,8 @@ def test_points_that_are_no_spots_are_no_vehicle(name):
 
 
 @pytest.mark.slow
-def test_points_that_are_no_spots_are_hardly_ever_a_vehicle():
-    """Eight false points per picture, sixty times."""
+def test_false_points_alone_hardly_ever_give_a_pose():
+    """Eight false points per picture, sixty frames."""
     rig = RIGS["fan"]()
     model, rng = SpotModel.of(rig), np.random.default_rng(16)
     chosen = 0
@@ -301,9 +304,9 @@ def test_a_vehicle_outside_the_prior_is_not_found():
 def test_the_prior_is_a_cube_and_a_cone():
     prior = PosePrior(Pose.from_ypr(np.array([0.3, 0, 0]), np.array([1.0, 2, 3])), 0.5, np.deg2rad(20))
 
-    def at(shift, turn_deg):
-        turn = np.deg2rad(turn_deg) * np.array([0.6, 0, 0.8])
-        return prior.centre.plus(np.concatenate([shift, turn]))
+    def at(shift, angle_deg):
+        rotation_vector = np.deg2rad(angle_deg) * np.array([0.6, 0, 0.8])
+        return prior.centre.plus(np.concatenate([shift, rotation_vector]))
 
     assert prior.holds(at([0.5, -0.5, 0.5], 20))
     assert not prior.holds(at([0.53, 0, 0], 0))
@@ -311,14 +314,14 @@ def test_the_prior_is_a_cube_and_a_cone():
     assert not prior.holds(at([0, 0, 0], 21))
     everywhere = PosePrior(prior.centre, 0.5, np.pi)
     assert everywhere.holds(at([0, 0, 0], 180))
-    lost = Pose(np.full((3, 3), np.nan), np.zeros(3))
-    assert not prior.holds(lost)
-    both = Pose(np.stack([prior.centre.rotation, lost.rotation]), np.stack([prior.centre.translation] * 2))
+    invalid = Pose(np.full((3, 3), np.nan), np.zeros(3))
+    assert not prior.holds(invalid)
+    both = Pose(np.stack([prior.centre.rotation, invalid.rotation]), np.stack([prior.centre.translation] * 2))
     np.testing.assert_array_equal(prior.holds(both), [True, False])
 
 
 def test_a_camera_without_a_picture_is_no_evidence_against_its_spots():
-    """Three cameras of four still tell; the views of the fourth stay open, and nobody expected them."""
+    """Three of four cameras give the labels; the views of the fourth stay unlabelled and are not expected."""
     rig = RIGS["two-cameras-per-screen"]()
     model, rng = SpotModel.of(rig), np.random.default_rng(12)
     picture = photograph(model, Pose.identity(), rng)
@@ -326,14 +329,14 @@ def test_a_camera_without_a_picture_is_no_evidence_against_its_spots():
     result = find_labels(rig, model, picture.detections, PosePrior(Pose.identity(), 0.3, np.deg2rad(10)))
     assert result.chosen is not None
     assert wrong_labels(result, model, picture) == []
-    blind = np.array([c == "left-b" for c, _ in model.views])
-    assert np.all(result.chosen.point_of[blind] == NO_POINT)
-    assert np.all(result.chosen.point_of[~blind] != NO_POINT)
+    without_picture = np.array([c == "left-b" for c, _ in model.views])
+    assert np.all(result.chosen.point_of[without_picture] == NO_POINT)
+    assert np.all(result.chosen.point_of[~without_picture] != NO_POINT)
 
 
 @pytest.mark.parametrize("hidden", [(), ("1",), ("5",), ("3", "6"), ("1", "4"), ("2", "6")])
-def test_opposed_lasers_that_are_not_one_line_are_labelled_from_three_spots(hidden):
-    """Six beams with one spot each, as the contract has them: there is no whole beam to start from."""
+def test_opposed_lasers_that_are_not_collinear_are_labelled_from_three_spots(hidden):
+    """Six beams with one spot each: no beam has two spots."""
     fan, rng = RIGS["fan"](), np.random.default_rng(13)
     beams, spots = {}, {}
     for name, spot in fan.spots.items():
@@ -350,7 +353,7 @@ def test_opposed_lasers_that_are_not_one_line_are_labelled_from_three_spots(hidd
         assert wrong_labels(result, model, picture) == []
 
 
-def test_the_order_of_the_points_changes_no_label():
+def test_the_order_of_the_points_does_not_change_the_labels():
     rig = RIGS["fan"]()
     model, rng = SpotModel.of(rig), np.random.default_rng(14)
     for _ in range(3):
@@ -368,7 +371,7 @@ def test_the_order_of_the_points_changes_no_label():
             assert a == (NO_POINT if b == NO_POINT else orders[camera][b])
 
 
-def test_the_points_are_left_as_they_came():
+def test_the_detections_are_not_modified():
     rig = RIGS["fan"]()
     model, rng = SpotModel.of(rig), np.random.default_rng(15)
     picture = photograph(model, Pose.identity(), rng, clutter=0.5)

@@ -1,4 +1,4 @@
-"""The search for first labels without a prior: complete, independent of scale, and honest about what it cannot know."""
+"""The search for first labels without a prior: completeness, independence of scale, ties, and false points."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ WIDE = PosePrior(Pose.identity(), 1.0, np.deg2rad(30))
 
 
 def rates(rig: Rig, count: int, seed: int) -> tuple[float, float, float]:
-    """Shares right, wrong, and tied with the truth among the candidates, without a prior.
+    """Shares of right and wrong labellings, and of ties with the truth among the candidates, without a prior.
 
     20 % clutter, 5 false points per picture, 2 % misses, poses of 1 m and 30 deg, at least four spots found.
     """
@@ -62,7 +62,7 @@ def rates(rig: Rig, count: int, seed: int) -> tuple[float, float, float]:
 
 @pytest.mark.parametrize("name", ["unequal-fan", "four-skew-beams"])
 def test_labels_are_right_without_a_prior_among_clutter(name):
-    """30 poses: two may stay open (four spots of two beams are a tie), none may be wrong."""
+    """30 poses: two may stay unlabelled (four spots of two beams are a tie), none may be wrong."""
     right, wrong, _ = rates(RIGS[name](), 30, seed=1)
     assert right >= 28 / 30
     assert wrong == 0
@@ -71,14 +71,14 @@ def test_labels_are_right_without_a_prior_among_clutter(name):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["unequal-fan", "four-skew-beams"])
 def test_labels_are_right_without_a_prior_among_clutter_over_hundreds_of_poses(name):
-    """Two beams of the fan are the same after half a turn, but for the absent third: one missing spot is a tie."""
+    """Two beams of the fan coincide after half a turn: without the third beam the labels are a tie."""
     right, wrong, tied = rates(RIGS[name](), 600, seed=2)
     assert right >= (0.955 if name == "unequal-fan" else 0.98)
     assert right + tied >= 0.985
     assert wrong <= 0.005
 
 
-def test_screens_all_round_cameras_behind_them_and_any_lens_need_no_prior_either():
+def test_random_arrangements_of_screens_cameras_and_lenses_need_no_prior():
     """Tilted screens, two cameras on one of them, half of the cameras behind their screens (rear projection)."""
     done = 0
     for seed in range(8):
@@ -101,21 +101,21 @@ def test_screens_all_round_cameras_behind_them_and_any_lens_need_no_prior_either
     assert done >= 6
 
 
-def test_a_prior_that_allows_everything_is_no_prior():
+def test_a_prior_that_allows_all_poses_has_no_effect():
     rig = RIGS["four-skew-beams"]()
     model, rng = SpotModel.of(rig), np.random.default_rng(3)
     picture = photograph(model, pose_within(WIDE, rng), rng, false_points=4)
     without = candidate_labellings(rig, model, picture.detections)
     everywhere = candidate_labellings(rig, model, picture.detections, PosePrior.everywhere(rig))
     wider = replace(PosePrior.everywhere(rig), within_m=8.0)
-    vague = candidate_labellings(rig, model, picture.detections, wider)
-    for other in (everywhere, vague):
+    widest = candidate_labellings(rig, model, picture.detections, wider)
+    for other in (everywhere, widest):
         np.testing.assert_array_equal(without[0].point_of, other[0].point_of)
         assert other[0].score == pytest.approx(without[0].score, abs=1e-6)
 
 
 @pytest.mark.parametrize("scale", [0.25, 5.0])
-def test_the_size_of_the_pixels_changes_nothing(scale):
+def test_the_size_of_the_pixels_does_not_change_the_labels(scale):
     """A lens of 300 or 6000 px, with noise and picture in proportion: the same labels with the same evidence."""
     rig = RIGS["unequal-fan"]()
     rng = np.random.default_rng(4)
@@ -155,36 +155,36 @@ def test_a_search_without_a_prior_takes_less_than_three_seconds(name):
 # -- ties and candidates ----------------------------------------------------------------------------------------------
 
 
-def test_the_half_turn_of_a_fan_of_equal_angles_is_a_tie_that_no_spot_resolves():
+def test_half_a_turn_of_a_fan_of_equal_angles_is_a_tie_that_no_spot_resolves():
     rig = RIGS["fan"]()
     model, rng = SpotModel.of(rig), np.random.default_rng(6)
     picture = photograph(model, Pose.identity(), rng)
     result = find_labels(rig, model, picture.detections)
     assert result.tie
     assert any(np.abs(c.fit.world_from_body.minus(Pose.identity())).max() < 0.01 for c in result.candidates)
-    words = result.in_words(model)
-    assert "no spot of this rig" in words
-    assert "0.000 m and 180.0 deg apart, so within_deg below 90.0" in words
-    assert find_labels(rig, model, picture.detections, WIDE).chosen is not None  # as it says
+    text = result.in_words(model)
+    assert "no spot of this rig" in text
+    assert "0.000 m and 180.0 deg apart, so within_deg below 90.0" in text
+    assert find_labels(rig, model, picture.detections, WIDE).chosen is not None  # a prior below 90 deg resolves it
 
 
 def test_a_tie_names_the_spots_that_would_resolve_it():
-    """Beams A and B of a fan of equal angles are beams B and C as well: the third beam tells."""
+    """Beams A and B of a fan of equal angles coincide with B and C in another pose: the third beam decides."""
     rig = RIGS["fan"]()
     model, rng = SpotModel.of(rig), np.random.default_rng(7)
     pose = Pose.from_ypr(np.deg2rad([12.0, 0, 0]), np.zeros(3))
     picture = photograph(model, pose, rng, hidden=("3", "6"))
     result = find_labels(rig, model, picture.detections, WIDE)
     assert result.tie
-    words = result.in_words(model)
-    assert words.count(" at x ") == len(result.candidates) == 2
-    assert "where only the first expects one" in words
-    assert "where only the second expects one" in words
-    assert "spot 3 at (" in words  # hidden, of the true pose
-    assert "within_deg below 10.0" in words
+    text = result.in_words(model)
+    assert text.count(" at x ") == len(result.candidates) == 2
+    assert "where only the first expects one" in text
+    assert "where only the second expects one" in text
+    assert "spot 3 at (" in text  # hidden, of the true pose
+    assert "within_deg below 10.0" in text
 
 
-def test_candidates_come_best_first_with_the_truth_among_them_and_without_a_decision():
+def test_candidates_are_sorted_by_score_and_include_the_truth():
     rig = without_beam(RIGS["fan"](), "B")
     model, rng = SpotModel.of(rig), np.random.default_rng(8)
     picture = photograph(model, Pose.identity(), rng, false_points=2)
@@ -210,35 +210,35 @@ def test_no_two_spots_share_a_point():
                 assert len(set(taken)) == len(taken)
 
 
-@pytest.mark.parametrize("pull_px", [0.8, 1.4, 4.0])
-def test_a_spot_that_a_neighbour_has_pulled_is_left_open_and_the_others_are_right(pull_px):
-    """Precise points, 0.01 px, of which one is off by many times its sigma of 0.1 px: two spots have melted."""
+@pytest.mark.parametrize("shift_px", [0.8, 1.4, 4.0])
+def test_a_merged_spot_gets_no_label_and_the_others_are_right(shift_px):
+    """Points of 0.01 px, one of which, merged with a neighbour, is off by many times its sigma of 0.1 px."""
     rig = RIGS["fan"]()
     model, rng = SpotModel.of(rig), np.random.default_rng(18)
     for _ in range(5):
         pose = pose_within(PosePrior(Pose.identity(), 0.3, 0.2), rng)
         picture = photograph(model, pose, rng)
-        uv, pulled = model.project(pose)[0], 1
+        uv, merged = model.project(pose)[0], 1
         for name in model.camera_names:
             views = picture.origin[name]
             points = uv[views] + rng.normal(0, 0.01, (len(views), 2))
-            sigma = np.where(views == pulled, 0.1, 0.01)
-            points[views == pulled] += pull_px * np.array([0.6, -0.8])
+            sigma = np.where(views == merged, 0.1, 0.01)
+            points[views == merged] += shift_px * np.array([0.6, -0.8])
             picture.detections[name] = Detections.at(points, sigma[:, None, None] ** 2 * np.eye(2))
         result = find_labels(rig, model, picture.detections, WIDE)
         assert result.chosen is not None
         assert wrong_labels(result, model, picture) == []
-        others = np.array([v != pulled for v in range(6)]) & model.in_picture(uv)
+        others = np.array([v != merged for v in range(6)]) & model.in_picture(uv)
         assert (result.chosen.point_of[others] != NO_POINT).all()
-        assert result.chosen.point_of[pulled] == NO_POINT
+        assert result.chosen.point_of[merged] == NO_POINT
 
 
-# -- what is nothing --------------------------------------------------------------------------------------------------
+# -- false points -----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
-def test_false_points_are_hardly_ever_a_vehicle_even_without_a_prior():
-    """Eight false points per picture, 300 times: the evidence allows for exp(-2) at most, measured are 0.5 %."""
+def test_false_points_alone_hardly_ever_give_a_pose_without_a_prior():
+    """Eight false points per picture, 300 frames: the threshold allows exp(-2), 0.5 % were measured."""
     rig = RIGS["unequal-fan"]()
     model, rng = SpotModel.of(rig), np.random.default_rng(10)
     chosen = 0
@@ -248,8 +248,8 @@ def test_false_points_are_hardly_ever_a_vehicle_even_without_a_prior():
     assert chosen <= 5
 
 
-def test_a_second_camera_that_sees_the_same_false_lights_is_no_further_evidence():
-    """Lights on the screens that happen to fit four spots: seen by two cameras each they still happen to."""
+def test_a_second_camera_that_sees_the_same_false_lights_adds_no_evidence():
+    """Lights on the screens that fit four spots by chance, seen by two cameras each."""
     rig = RIGS["two-cameras-per-screen"]()
     model, rng = SpotModel.of(rig), np.random.default_rng(11)
     uv = model.project(Pose.identity())[0]
@@ -262,11 +262,11 @@ def test_a_second_camera_that_sees_the_same_false_lights_is_no_further_evidence(
     one_each = {n: d for n, d in found.items() if n.endswith("-a")}
     both = candidate_labellings(rig, model, found, WIDE)[0]
     one = candidate_labellings(rig, model, one_each, WIDE)[0]
-    # Four more points at 10 nats each would be 40; what remains is that the pose is known twice as well.
+    # Four more points at 10 nats each would add 40; only the more accurate pose adds evidence.
     assert both.score < one.score + 8.0
 
 
-def test_the_pose_of_the_best_candidate_is_as_good_as_its_covariance_claims():
+def test_the_covariance_of_the_best_candidate_is_correct():
     rig = RIGS["unequal-fan"]()
     model, rng = SpotModel.of(rig), np.random.default_rng(12)
     squares = []
@@ -274,24 +274,24 @@ def test_the_pose_of_the_best_candidate_is_as_good_as_its_covariance_claims():
         pose = pose_within(PosePrior(Pose.identity(), 0.3, 0.3), rng)
         picture = photograph(model, pose, rng)
         best = candidate_labellings(rig, model, picture.detections)[0]
-        away = pose.minus(best.fit.world_from_body)
-        squares.append(away @ np.linalg.solve(best.fit.covariance, away) / 6)
+        error = pose.minus(best.fit.world_from_body)
+        squares.append(error @ np.linalg.solve(best.fit.covariance, error) / 6)
     assert 0.6 < np.mean(squares) < 1.4  # the mean of 40 has a sigma of 0.09; the evidence may add 0.03 px
 
 
-# -- the parts --------------------------------------------------------------------------------------------------------
+# -- the steps --------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", RIGS)
-def test_everywhere_holds_all_poses_that_the_lab_has_room_for(name):
+def test_the_widest_prior_contains_all_poses_in_the_lab(name):
     rig = RIGS[name]()
     everywhere, rng = PosePrior.everywhere(rig), np.random.default_rng(13)
     poses = Pose(rotations.exp(rng.normal(0, 2, (500, 3))), rng.uniform([-2.5, -2, -2], [2.5, 2, 2], (500, 3)))
     assert everywhere.holds(poses).all()
 
 
-def test_the_volume_of_the_visible_poses_is_that_of_a_count():
-    """Two ways: poses from random pixels, weighed; and the share of poses drawn from everywhere that show enough."""
+def test_the_volume_of_the_visible_poses_agrees_with_a_count():
+    """Two methods: weighted poses from random pixels, and the share of uniformly drawn poses that show enough spots."""
     rig = RIGS["four-skew-beams"]()
     model, everywhere, rng = SpotModel.of(rig), PosePrior.everywhere(rig), np.random.default_rng(14)
     count = 60_000
@@ -308,22 +308,22 @@ def test_the_volume_of_the_visible_poses_is_that_of_a_count():
 
 
 @pytest.mark.parametrize("name", ["unequal-fan", "four-skew-beams"])
-def test_any_four_spots_hold_triples_and_larger_sets_are_served_first(name):
+def test_any_four_spots_contain_triples_and_larger_sets_are_covered_first(name):
     rig = RIGS[name]()
     model = SpotModel.of(rig)
     plan = RigPlan.of(rig, model, 4)
     good = VisiblePoses.of(rig, model, plan.everywhere, 4).triples
     spots = range(len(rig.spots))
     for size, end in plan.stages.items():
-        served = [frozenset(t) for t in plan.triples[:end].tolist()]
-        for those in combinations(spots, size):
-            possible = sum(set(t) <= set(those) for t in good)
-            assert sum(t <= set(those) for t in served) >= min(TIMES, possible)
+        triples = [frozenset(t) for t in plan.triples[:end].tolist()]
+        for visible in combinations(spots, size):
+            possible = sum(set(t) <= set(visible) for t in good)
+            assert sum(t <= set(visible) for t in triples) >= min(TIMES, possible)
     assert list(plan.stages) == sorted(plan.stages, reverse=True)
     assert len(plan.triples) <= len(list(combinations(spots, 3)))
 
 
-def test_collinear_spots_of_a_fan_are_no_triple():
+def test_collinear_spots_of_a_fan_are_not_a_triple():
     rig = RIGS["fan"]()
     visible = VisiblePoses.of(rig, SpotModel.of(rig), PosePrior.everywhere(rig), 4)
     assert (0, 1, 2) not in visible.triples
@@ -346,10 +346,10 @@ def test_a_ray_reaches_every_place_that_it_lights_from_some_pose_of_the_prior():
     assert not narrow.reaches(np.zeros(3), np.array([1.0, 0, 0]), np.array([[2.5, 1.0, 0]])).any()
 
 
-def test_points_on_a_bent_screen_lie_where_the_forward_model_puts_them():
+def test_points_on_a_curved_screen_agree_with_the_forward_model():
     flat = RIGS["unequal-fan"]()
     rig = replace(flat, screens={n: replace(s, bow=(0.01, 0.004, -0.008)) for n, s in flat.screens.items()})
-    model, rng = SpotModel.of(rig), np.random.default_rng(16)
+    model = SpotModel.of(rig)
     pose = Pose.from_ypr(np.array([0.05, 0.02, 0.0]), np.array([0.1, 0.1, 0.0]))
     uv, hits = model.project(pose)[0], model.hits(pose)[0]
     found = {n: Detections.at(uv[model.camera_of == c], np.tile(0.01 * np.eye(2), (3, 1, 1)))
@@ -357,7 +357,7 @@ def test_points_on_a_bent_screen_lie_where_the_forward_model_puts_them():
     points = points_of(rig, model, found, LabelParameters(), lambda _, places: np.isfinite(places[:, 0]))
     np.testing.assert_allclose(points.world, hits, atol=1e-6)
     picture = Picture(found, {n: np.flatnonzero(model.camera_of == c) for c, n in enumerate(model.camera_names)})
-    del rng
+
     result = find_labels(rig, model, picture.detections)
     assert result.chosen is not None
     assert wrong_labels(result, model, picture) == []
@@ -371,7 +371,7 @@ def test_a_crowd_without_known_brightness_is_searched_within_the_budget():
     before = time.process_time()
     find_labels(rig, model, picture.detections, WIDE, few)
     assert time.process_time() - before < 2.0
-    # In a crowd of dim points the spots are the brightest.
+    # The spots are brighter than all false points.
     for name, d in picture.detections.items():
         flux = np.where(picture.origin[name] >= 0, 1000.0, 10.0) * rng.uniform(0.8, 1.2, len(d))
         picture.detections[name] = replace(d, flux=flux)
@@ -381,7 +381,7 @@ def test_a_crowd_without_known_brightness_is_searched_within_the_budget():
 
 
 def test_a_narrow_prior_finds_the_vehicle_among_hundreds_of_points_of_unknown_brightness():
-    """Only the points that some spot may light under the prior count, however many others there are."""
+    """Only points that a spot may light under the prior count, and few of the false points do."""
     rig = RIGS["four-skew-beams"]()
     model, rng = SpotModel.of(rig), np.random.default_rng(19)
     for _ in range(3):
@@ -391,4 +391,4 @@ def test_a_narrow_prior_finds_the_vehicle_among_hundreds_of_points_of_unknown_br
         assert wrong_labels(result, model, picture) == []
     result = find_labels(rig, model, picture.detections, WIDE)
     assert result.chosen is None
-    assert "no flux that tells which may be spots" in result.reason
+    assert "without a flux that shows which may be spots" in result.reason
