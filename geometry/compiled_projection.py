@@ -71,18 +71,18 @@ def _project(v: Views, i: int, R: Array, t: Array, uv: Array, J: Array) -> bool:
     # The ray in world meets the screen.
     view = v[i]
     origin, d, normal, hit, lever = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
-    S, s0 = view.screen_rotation, view.screen_origin
+    S, s0 = view["screen_rotation"], view["screen_origin"]
     facing = height = 0.0
     for a in range(3):
-        origin[a] = R[a, 0] * view.point[0] + R[a, 1] * view.point[1] + R[a, 2] * view.point[2] + t[a]
-        d[a] = R[a, 0] * view.ray[0] + R[a, 1] * view.ray[1] + R[a, 2] * view.ray[2]
+        origin[a] = R[a, 0] * view["point"][0] + R[a, 1] * view["point"][1] + R[a, 2] * view["point"][2] + t[a]
+        d[a] = R[a, 0] * view["ray"][0] + R[a, 1] * view["ray"][1] + R[a, 2] * view["ray"][2]
         normal[a] = S[a, 2]
         facing += normal[a] * d[a]
         height += normal[a] * (s0[a] - origin[a])
     if abs(facing) <= 1e-12:
         return False
     length = height / facing
-    if view.bow[0] != 0.0 or view.bow[1] != 0.0 or view.bow[2] != 0.0:
+    if view["bow"][0] != 0.0 or view["bow"][1] != 0.0 or view["bow"][2] != 0.0:
         length = _meet_bent(v, i, origin, d, length, normal)
         facing = normal[0] * d[0] + normal[1] * d[1] + normal[2] * d[2]
     if not length > 0.0:
@@ -92,21 +92,21 @@ def _project(v: Views, i: int, R: Array, t: Array, uv: Array, J: Array) -> bool:
         lever[a] = hit[a] - t[a]
     for a in range(2):
         along = S[0, a] * (hit[0] - s0[0]) + S[1, a] * (hit[1] - s0[1]) + S[2, a] * (hit[2] - s0[2])
-        if not abs(along) <= view.half_size[a]:
+        if not abs(along) <= view["half_size"][a]:
             return False
     # The camera sees the lit point.
-    C = view.camera_rotation
-    x = C[0, 0] * hit[0] + C[0, 1] * hit[1] + C[0, 2] * hit[2] + view.camera_translation[0]
-    y = C[1, 0] * hit[0] + C[1, 1] * hit[1] + C[1, 2] * hit[2] + view.camera_translation[1]
-    z = C[2, 0] * hit[0] + C[2, 1] * hit[1] + C[2, 2] * hit[2] + view.camera_translation[2]
+    C = view["camera_rotation"]
+    x = C[0, 0] * hit[0] + C[0, 1] * hit[1] + C[0, 2] * hit[2] + view["camera_translation"][0]
+    y = C[1, 0] * hit[0] + C[1, 1] * hit[1] + C[1, 2] * hit[2] + view["camera_translation"][1]
+    z = C[2, 0] * hit[0] + C[2, 1] * hit[1] + C[2, 2] * hit[2] + view["camera_translation"][2]
     if not z > 1e-9:
         return False
     x, y = x / z, y / z
     bx, by, xx, xy, yx, yy = _distorted(v, i, x, y)  # and the Jacobian [[xx, xy], [yx, yy]] of the distortion
-    if view.lens != 0 and not (x * x + y * y < view.fold_r2 and xx * yy - xy * yx > 0.0):
+    if view["lens"] != 0 and not (x * x + y * y < view["fold_r2"] and xx * yy - xy * yx > 0.0):
         return False
-    fx, fy = view.pinhole[0], view.pinhole[1]
-    uv[0], uv[1] = fx * bx + view.pinhole[2], fy * by + view.pinhole[3]
+    fx, fy = view["pinhole"][0], view["pinhole"][1]
+    uv[0], uv[1] = fx * bx + view["pinhole"][2], fy * by + view["pinhole"][3]
     # d(pixel)/d(hit), in world, row by row; along the ray a move of the vehicle changes nothing.
     for row in range(2):
         gx, gy = (fx * xx / z, fx * xy / z) if row == 0 else (fy * yx / z, fy * yy / z)
@@ -128,8 +128,8 @@ def _project(v: Views, i: int, R: Array, t: Array, uv: Array, J: Array) -> bool:
 def _meet_bent(v: Views, i: int, origin: Array, d: Array, length: float, normal: Array) -> float:
     """Newton's method from the flat screen; the surface's normal there goes into `normal`."""
     view = v[i]
-    S, s0 = view.screen_rotation, view.screen_origin
-    a, b, c = view.bow[0], view.bow[1], view.bow[2]
+    S, s0 = view["screen_rotation"], view["screen_origin"]
+    a, b, c = view["bow"][0], view["bow"][1], view["bow"][2]
     p, q = np.empty(3), np.empty(3)
     for k in range(3):
         p[k] = S[0, k] * (origin[0] - s0[0]) + S[1, k] * (origin[1] - s0[1]) + S[2, k] * (origin[2] - s0[2])
@@ -150,10 +150,10 @@ def _meet_bent(v: Views, i: int, origin: Array, d: Array, length: float, normal:
 def _distorted(v: Views, i: int, x: float, y: float) -> tuple[float, float, float, float, float, float]:
     """The distorted normalised point and the Jacobian's entries, as lens.distort and lens.distort_fisheye."""
     view = v[i]
-    kind = view.lens
+    kind = view["lens"]
     if kind == 0:
         return x, y, 1.0, 0.0, 0.0, 1.0
-    k = view.distortion
+    k = view["distortion"]
     r2 = x * x + y * y
     if kind == 3:
         scale, growth = 1.0, 0.0
@@ -188,7 +188,7 @@ def _distorted(v: Views, i: int, x: float, y: float) -> tuple[float, float, floa
     c = mixed + 2 * x * d_prism_y
     e = radial + 2 * y * y * d_radial + 6 * p1 * y + 2 * p2 * x + 2 * y * d_prism_y
     if kind == 2:
-        T = view.tilt
+        T = view["tilt"]
         hx = T[0, 0] * bx + T[0, 1] * by + T[0, 2]
         hy = T[1, 0] * bx + T[1, 1] * by + T[1, 2]
         hz = T[2, 0] * bx + T[2, 1] * by + T[2, 2]

@@ -11,7 +11,7 @@ at right angles by s; "print" Vectors (points, 3), m: by how much each point of 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
@@ -45,6 +45,16 @@ class CornerTerm:
 
     def __len__(self) -> int:
         return len(self.pixels)
+
+    def pick(self, rows: Bools, loss: Loss | None = None) -> CornerTerm:
+        """Some of the corners, with this loss."""
+        per_row = ["pixels", "points", "from_middle", "camera", "placement", "board", "sigma_px"]
+        per_row += [] if self.point is None else ["point"]
+        return replace(self, **{name: getattr(self, name)[rows] for name in per_row}, loss=loss)
+
+    def widened(self, scale: float) -> CornerTerm:
+        """The same corners with all sigmas multiplied."""
+        return replace(self, sigma_px=self.sigma_px * scale)
 
     def project(self, values: Values) -> Array:
         """Where the corners should be: pixels (N, 2); nan behind the camera, or where the lens model has folded."""

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from calibration.least_squares.adjustment import Linearised, Loss, Part, Values
 from calibration.terms.surveyed import pose_of
 from geometry import rotations
-from geometry.arrays import Array, Ints
+from geometry.arrays import Array, Bools, Ints
 from geometry.pose import Pose
 
 
@@ -22,6 +22,17 @@ class RecordTerm:
     recorded: Pose  # (n,)
     sigmas: Array  # (n, 6): m, rad of the error [dt, dtheta]; inf: not known; 0 only where the number is held fixed
     loss: Loss | None = None
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+    def pick(self, rows: Bools, loss: Loss | None = None) -> RecordTerm:
+        """Some of the records, with this loss."""
+        return RecordTerm(self.stack, self.index[rows], self.recorded[rows], self.sigmas[rows], loss)
+
+    def widened(self, scale: float) -> RecordTerm:
+        """The same records with all sigmas multiplied."""
+        return replace(self, sigmas=self.sigmas * scale)
 
     def linearise(self, values: Values) -> Linearised:
         """Pose less record, (n, 6), in sigmas; numbers that are not known, or held, give 0."""

@@ -66,6 +66,17 @@ class SpotTerm:
         object.__setattr__(self, "_screen_of", screen_of[self.spots.view])
         object.__setattr__(self, "_W", whiten(self.spots.covariance))
 
+    def __len__(self) -> int:
+        return len(self.spots)
+
+    def pick(self, rows: Bools, loss: Loss | None = None) -> SpotTerm:
+        """Some of the spots, with this loss."""
+        return SpotTerm(self.rig, self.spots.pick(rows), loss)
+
+    def widened(self, scale: float) -> SpotTerm:
+        """The same spots with all sigmas multiplied."""
+        return SpotTerm(self.rig, replace(self.spots, covariance=self.spots.covariance * scale**2), self.loss)
+
     def linearise(self, values: Values) -> Linearised:
         """N residuals of 2, and their derivatives by all seven stacks."""
         model = self._at(values)

@@ -6,7 +6,7 @@ Stacks: "intrinsics" (fx, fy, cx, cy, px, and 14 distortion numbers), "cameras" 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -58,6 +58,19 @@ class PointTerm:
     fisheye: Bools  # (n_cameras,)
     loss: Loss | None = None
 
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+    def pick(self, rows: Bools, loss: Loss | None = None) -> PointTerm:
+        """Some of the observations, with this loss."""
+        return PointTerm(
+            self.camera_of[rows], self.point_of[rows], self.pixels[rows], self.whiten[rows], self.fisheye, loss
+        )
+
+    def widened(self, scale: float) -> PointTerm:
+        """The same observations with all sigmas multiplied."""
+        return replace(self, whiten=self.whiten / scale)
+
     def linearise(self, values: Values) -> Linearised:
         """Predicted less measured pixel; nan where the point lies behind the camera."""
         intrinsics = array_of(values, "intrinsics")
@@ -95,6 +108,10 @@ class SurfaceTerm:
     sigma_m: Array  # (n,): how far a point may lie off the surface: paint, paper, what the bow does not describe
     loss: Loss | None = None
 
+    def widened(self, scale: float) -> SurfaceTerm:
+        """The same points with all sigmas multiplied."""
+        return replace(self, sigma_m=self.sigma_m * scale)
+
     def linearise(self, values: Values) -> Linearised:
         """Heights over the surface z = a x^2 + b x y + c y^2 of the screen's frame."""
         world_from_screen = pose_of(values, "screens")[self.screen_of]
@@ -124,6 +141,10 @@ class SurveyTerm:
     surveyed: Array  # (n, 3), m
     whiten: Array  # (n, 3, 3): turns an error into sigmas, `whitening` of its covariance
     loss: Loss | None = None
+
+    def widened(self, scale: float) -> SurveyTerm:
+        """The same survey with all sigmas multiplied."""
+        return replace(self, whiten=self.whiten / scale)
 
     def linearise(self, values: Values) -> Linearised:
         """Point less survey."""

@@ -130,9 +130,9 @@ def fit_pose(
     if fit is None or calibration is None:
         return fit
     now = calibration.at(fit.world_from_body)
-    if now is common:
+    if np.array_equal(now, common):
         return fit
-    # The start was so far off that the calibration's errors act differently here.
+    # The solution lies in another cell than the start, where the calibration's errors act differently.
     return _fit(model, rows, pixels, covariances, fit.world_from_body, prior, now, max_iterations)
 
 

@@ -15,7 +15,7 @@ from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.rig import Rig
 from geometry.uncertainty.rig_parameters import RigCovariance, Sensitivity, is_known, moved, rig_names, split
-from geometry.uncertainty.rig_uncertainty import NEAR_M, CalibrationSpread
+from geometry.uncertainty.rig_uncertainty import CELL_M, CELL_RAD, CalibrationSpread
 from tests.geometry.scenes import LENSES, paper_rig, random_pose, random_rig
 
 seeds = st.integers(0, 2**32 - 1)
@@ -117,13 +117,41 @@ def test_the_spread_of_the_pixels_is_that_of_rigs_drawn_from_the_covariance():
     np.testing.assert_allclose(np.corrcoef(np.transpose(draws)), spread / np.outer(claimed, claimed), atol=0.12)
 
 
-def test_near_poses_share_one_spread_and_far_ones_do_not():
+def test_the_covariance_of_the_pixels_does_not_depend_on_earlier_calls():
+    rng = np.random.default_rng(6)
     rig = paper_rig(LENSES[5])
-    names = ("cameras.left.fx", "beams.A.direction_y") if "A" in rig.beams else rig_names(rig)[:2]
-    spread = CalibrationSpread(rig, SpotModel.of(rig), RigCovariance(tuple(names), np.eye(2) * 1e-6))
-    first = spread.at(Pose.identity())
-    assert spread.at(Pose(np.eye(3), np.array([0.5 * NEAR_M, 0, 0]))) is first
-    assert spread.at(Pose(np.eye(3), np.array([3 * NEAR_M, 0, 0]))) is not first
+    names = rig_names(rig)
+    known = RigCovariance(names, np.eye(len(names)) * 1e-6)
+
+    def fresh() -> CalibrationSpread:
+        return CalibrationSpread(rig, SpotModel.of(rig), known)
+
+    # A slow motion: neighbours are nearer than a cell, so that the first of them could stand for the next.
+    poses = [
+        Pose.identity().plus(0.02 * k * np.array([1, 0.5, 0, 0, 0.3, 1]) + 1e-3 * rng.normal(size=6)) for k in range(20)
+    ]
+    forwards, backwards = fresh(), fresh()
+    in_turn = [forwards.at(p) for p in poses]
+    in_reverse = [backwards.at(p) for p in poses[::-1]][::-1]
+    for pose, one, other in zip(poses, in_turn, in_reverse, strict=True):
+        np.testing.assert_array_equal(one, other)
+        np.testing.assert_array_equal(one, fresh().at(pose))
+
+
+def test_poses_of_one_cell_share_a_covariance_that_is_near_their_own():
+    rng = np.random.default_rng(7)
+    rig = paper_rig(LENSES[5])
+    names = rig_names(rig)
+    spread = CalibrationSpread(rig, SpotModel.of(rig), RigCovariance(names, np.eye(len(names)) * 1e-6))
+    middle = spread.at(Pose.identity())
+    half = 0.499 * np.array([CELL_M] * 3 + [CELL_RAD] * 3)
+    for _ in range(20):
+        pose = Pose.identity().plus(rng.uniform(-half, half))
+        assert spread.at(pose) is middle
+        exact = spread._at_exactly(pose)
+        np.testing.assert_allclose(np.sqrt(np.diagonal(middle)), np.sqrt(np.diagonal(exact)), rtol=0.05)
+    beside = Pose.identity().plus(1.2 * half)
+    assert spread.at(beside) is not middle
 
 
 def test_views_without_a_projection_have_no_spread():
