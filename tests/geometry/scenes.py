@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from geometry.camera import Camera
+from geometry.camera import FISHEYE, Camera
 from geometry.pose import Pose
 from geometry.rig import Beam, Rig, Screen, Spot
 
@@ -87,3 +89,16 @@ def random_rig(rng: np.random.Generator) -> Rig:
         spots[f"+{i}"] = Spot(f"+{i}", f"b{i}", +1, "right")
     spots["up"] = Spot("up", "b3", +1, "roof")
     return Rig(screens, cameras, beams, spots)
+
+
+def uncommon_rig(rng: np.random.Generator) -> Rig:
+    """Bent screens, one fisheye camera, the others with the fourteen numbers."""
+    rig = random_rig(rng)
+    screens = {n: replace(s, bow=tuple(rng.normal(0, 0.004, 3))) for n, s in rig.screens.items()}
+    cameras = {}
+    for i, (name, camera) in enumerate(rig.cameras.items()):
+        if i == 0:
+            cameras[name] = replace(camera, lens=FISHEYE, distortion=(0.01, -0.02, 0.003, 0.001))
+        else:
+            cameras[name] = replace(camera, distortion=LENSES[14])
+    return Rig(screens, cameras, rig.beams, rig.spots)

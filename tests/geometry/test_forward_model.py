@@ -15,7 +15,7 @@ from geometry.arrays import numeric_jacobian
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.rig import Beam, Rig, Screen
-from tests.geometry.scenes import LENSES, paper_rig, random_pose, random_rig
+from tests.geometry.scenes import LENSES, paper_rig, random_pose, random_rig, uncommon_rig
 
 seeds = st.integers(0, 2**32 - 1)
 ROUNDING_PX = 1e-8  # pixels of some thousands, metres of some units, a few dozen operations
@@ -61,6 +61,19 @@ def test_the_model_agrees_with_a_plain_one_made_of_other_parts(seed):
             assert np.isnan(pixel).all() or np.allclose(pixel, expected, rtol=1e-11, atol=ROUNDING_PX)
         else:
             np.testing.assert_allclose(pixel, expected, rtol=0, atol=ROUNDING_PX)
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=seeds)
+def test_the_compiled_and_the_numpy_implementation_agree(seed):
+    rng = np.random.default_rng(seed)
+    rig, pose = uncommon_rig(rng), random_pose(rng, 0.3, 0.3)
+    model = SpotModel.of(rig)
+    pixels, J = model.project(pose)
+    found = model.derivatives(pose)
+    np.testing.assert_allclose(found.pixels, pixels, rtol=0, atol=1e-9)
+    good = np.isfinite(pixels[:, 0])
+    np.testing.assert_allclose(found.pose[good], J[good], rtol=1e-9, atol=1e-9)
 
 
 def test_most_spots_of_the_random_scenes_exist():

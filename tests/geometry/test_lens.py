@@ -202,4 +202,4 @@ def test_the_straight_edge_of_the_limit_belongs_to_neither_side_by_accident():
     fold = lens.fold_limit(BARREL)
     xy = np.array([[np.sqrt(fold) * s, 0.0] for s in (1 - 1e-6, 1 + 1e-6, 1.5, 10)])
     _, J = lens.distort(xy, lens.padded(BARREL))
-    assert lens.holds(xy, J, np.asarray(fold)).tolist() == [True, False, False, False]
+    assert lens.is_one_to_one(xy, J, np.asarray(fold)).tolist() == [True, False, False, False]

@@ -39,3 +39,11 @@ def test_what_is_certain_or_unknown_is_said_so():
     for p, shape in ((-0.1, 1.0), (1.1, 1.0), (0.5, 0.0), (math.nan, 1.0)):
         with pytest.raises(ValueError, match="expected a shape above 0 and a probability"):
             gamma_quantile(p, shape)
+
+
+@pytest.mark.parametrize(
+    ("p", "dof", "value"), [(0.05, 6, 12.592), (0.01, 2, 9.210), (0.001, 6, 22.458), (0.05, 1, 3.841)]
+)
+def test_the_limits_are_those_of_the_published_chi_square_table(p, dof, value):
+    """NIST/SEMATECH e-Handbook of Statistical Methods, sec. 1.3.6.7.4."""
+    assert chi2_limit(p, dof) == pytest.approx(value, abs=5e-4)

@@ -2,36 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from geometry.arrays import numeric_jacobian
-from geometry.camera import FISHEYE
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
-from geometry.rig import Rig
 from geometry.uncertainty.rig_parameters import RigCovariance, Sensitivity, is_known, moved, rig_names, split
 from geometry.uncertainty.rig_uncertainty import CELL_M, CELL_RAD, CalibrationSpread
-from tests.geometry.scenes import LENSES, paper_rig, random_pose, random_rig
+from tests.geometry.scenes import LENSES, paper_rig, random_pose, uncommon_rig
 
 seeds = st.integers(0, 2**32 - 1)
-
-
-def uncommon_rig(rng: np.random.Generator) -> Rig:
-    """Bent screens, one fisheye camera, the others with the fourteen numbers."""
-    rig = random_rig(rng)
-    screens = {n: replace(s, bow=tuple(rng.normal(0, 0.004, 3))) for n, s in rig.screens.items()}
-    cameras = {}
-    for i, (name, camera) in enumerate(rig.cameras.items()):
-        if i == 0:
-            cameras[name] = replace(camera, lens=FISHEYE, distortion=(0.01, -0.02, 0.003, 0.001))
-        else:
-            cameras[name] = replace(camera, distortion=LENSES[14])
-    return Rig(screens, cameras, rig.beams, rig.spots)
 
 
 @settings(max_examples=5, deadline=None)
@@ -46,19 +29,6 @@ def test_every_derivative_is_the_difference_that_moving_the_number_makes(seed):
     # Spots far off the picture, where the lens bends most, have derivatives of thousands of px.
     good = np.isfinite(model.project(pose)[0][:, 0])
     np.testing.assert_allclose(found[good], expected[good], rtol=2e-5, atol=2e-3)
-
-
-@settings(max_examples=20, deadline=None)
-@given(seed=seeds)
-def test_pixels_and_pose_derivatives_are_those_of_project(seed):
-    rng = np.random.default_rng(seed)
-    rig, pose = uncommon_rig(rng), random_pose(rng, 0.3, 0.3)
-    model = SpotModel.of(rig)
-    pixels, J = model.project(pose)
-    found = model.derivatives(pose)
-    np.testing.assert_allclose(found.pixels, pixels, rtol=0, atol=1e-9)  # two ways to the same: numpy and compiled
-    good = np.isfinite(pixels[:, 0])
-    np.testing.assert_allclose(found.pose[good], J[good], rtol=1e-9, atol=1e-9)
 
 
 def test_a_stack_of_poses_gives_the_derivatives_of_each():

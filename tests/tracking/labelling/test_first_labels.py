@@ -305,16 +305,16 @@ def test_the_prior_is_a_cube_and_a_cone():
         turn = np.deg2rad(turn_deg) * np.array([0.6, 0, 0.8])
         return prior.centre.plus(np.concatenate([shift, turn]))
 
-    assert prior.holds(at([0.5, -0.5, 0.5], 20))
-    assert not prior.holds(at([0.53, 0, 0], 0))
-    assert not prior.holds(at([0, 0, -0.53], 0))
-    assert not prior.holds(at([0, 0, 0], 21))
+    assert prior.contains(at([0.5, -0.5, 0.5], 20))
+    assert not prior.contains(at([0.53, 0, 0], 0))
+    assert not prior.contains(at([0, 0, -0.53], 0))
+    assert not prior.contains(at([0, 0, 0], 21))
     everywhere = PosePrior(prior.centre, 0.5, np.pi)
-    assert everywhere.holds(at([0, 0, 0], 180))
+    assert everywhere.contains(at([0, 0, 0], 180))
     lost = Pose(np.full((3, 3), np.nan), np.zeros(3))
-    assert not prior.holds(lost)
+    assert not prior.contains(lost)
     both = Pose(np.stack([prior.centre.rotation, lost.rotation]), np.stack([prior.centre.translation] * 2))
-    np.testing.assert_array_equal(prior.holds(both), [True, False])
+    np.testing.assert_array_equal(prior.contains(both), [True, False])
 
 
 def test_a_camera_without_a_picture_is_no_evidence_against_its_spots():
