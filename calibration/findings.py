@@ -1,4 +1,4 @@
-"""The findings of a calibration, each with a level, a reason and a remedy; and their verdict."""
+"""Findings of a calibration, each with a level, a reason and a remedy, and the verdict that they give."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from enum import IntEnum
 
 
 class Level(IntEnum):
-    """How grave a finding is. The order is the gravity."""
+    """Severity of a finding, in ascending order."""
 
     PASS = 0
     WARN = 1  # usable; the user should know
@@ -17,19 +17,20 @@ class Level(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One thing that was tested, and how it came out, in words for the person who can act on it."""
+    """The result of one test, in words for the user who can act on it."""
 
     level: Level
-    what: str  # what was tested and what came out, with figures
-    why: str = ""  # what it means for a measurement
+    what: str  # what was tested and the result, with figures
+    why: str = ""  # consequence for a measurement
     remedy: str = ""  # what to do; empty for PASS
 
 
 def unless_pass(level: Level, what: str, why: str, remedy: str) -> Finding:
-    """A finding that gives its reason and remedy only where it is no PASS."""
+    """A finding that states its reason and remedy only if it is not a PASS."""
     return Finding(level, what) if level is Level.PASS else Finding(level, what, why, remedy)
 
 
 def verdict(findings: Iterable[Finding]) -> Level:
-    """The gravest level among the findings; PASS where there are none."""
+    """The most severe level among the findings; PASS if there are none."""
+
     return max((f.level for f in findings), default=Level.PASS)

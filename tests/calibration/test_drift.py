@@ -144,7 +144,7 @@ def test_what_hides_behind_a_free_nuisance_is_not_detectable():
     open_sight = ExcessResidual.of(np.zeros(2 * N), 0.01 * np.eye(2 * N))
     visible = open_sight.detectable(shift, c.model, 0.001, 0.9)
     assert 0.1 < visible < 0.4
-    assert open_sight.freed(shift).detectable(shift, c.model, 0.001, 0.9) > 1e6
+    assert open_sight.with_free(shift).detectable(shift, c.model, 0.001, 0.9) > 1e6
 
 
 def test_a_drift_of_the_detectable_size_is_found_as_often_as_promised():
@@ -192,8 +192,8 @@ def test_a_misfit_whitened_beforehand_is_explained_just_the_same():
     rng = np.random.default_rng(4)
     root = np.tril(rng.standard_normal((12, 12))) + 5 * np.eye(12)
     columns, nuisance, residual = rng.standard_normal((12, 3)), rng.standard_normal((12, 2)), rng.standard_normal(12)
-    plain = ExcessResidual.of(residual, root @ root.T).freed(nuisance)
-    white = ExcessResidual.of_white(np.linalg.solve(root, residual)).freed(np.linalg.solve(root, nuisance))
+    plain = ExcessResidual.of(residual, root @ root.T).with_free(nuisance)
+    white = ExcessResidual.of_white(np.linalg.solve(root, residual)).with_free(np.linalg.solve(root, nuisance))
     size = np.array([0.5, 1.0, 2.0])
     a = plain.fit("turned", "left", ChangeCandidate(columns, size))
     b = white.fit("turned", "left", ChangeCandidate(np.linalg.solve(root, columns), size))
