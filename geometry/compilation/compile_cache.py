@@ -62,18 +62,27 @@ def _imported(source: Path) -> frozenset[Path]:
     Read with regular expressions: parsing the files of all folders would cost every start 0.1 s. A text that only
     looks like an import adds a file at worst.
     """
-    package = source.parent
-    root = package
-    while (root / "__init__.py").is_file():
-        root = root.parent
+    package = root = os.path.dirname(source)
+    while os.path.isfile(f"{root}/__init__.py"):
+        root = os.path.dirname(root)
     text = re.sub(r"#.*", "", source.read_text("utf-8")).replace("\\\n", " ")
-    found = {root.joinpath(*item.split()[0].split(".")) for line in _IMPORT.findall(text) for item in line.split(",")}
+    modules = {item.split()[0] for line in _IMPORT.findall(text) for item in line.split(",")}
     for module, names in _FROM.findall(text):
-        dots = len(module) - len(module.lstrip("."))
-        base = ([package, *package.parents][dots - 1] if dots else root).joinpath(*module[dots:].split("."))
-        found |= {base, *(base / name for name in re.findall(r"\w+", names))}
-    files = {f for path in found for f in (path.with_name(f"{path.name}.py"), path / "__init__.py")}
-    return frozenset(f for f in files if f.is_file())
+        modules |= {module, *(f"{module.rstrip('.')}.{name}" for name in re.findall(r"\w+", names))}
+    found = set()
+    for module in modules:
+        name = module.lstrip(".")
+        base = root if name == module else os.path.normpath(f"{package}/{'../' * (len(module) - len(name) - 1)}")
+        path = f"{base}/{name.replace('.', '/')}"
+        if _exists(f"{base}/{name.split('.')[0]}"):
+            found |= {f for f in (f"{path}.py", f"{path}/__init__.py") if os.path.isfile(f)}
+    return frozenset(map(Path, found))
+
+
+@cache
+def _exists(module: str) -> bool:
+    """Whether a path without suffix is a package or a module; saves the search for names of other programs."""
+    return os.path.isdir(module) or os.path.isfile(f"{module}.py")
 
 
 @cache

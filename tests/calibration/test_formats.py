@@ -1,4 +1,4 @@
-"""Other programs' camera files: what is written reads back, OpenCV itself agrees, and what cannot be said is refused.
+"""Camera files of other programs: round trips, against OpenCV itself, and refusal of what a format cannot hold.
 
 The texts follow the layouts that each program's documentation shows; their numbers are ours.
 """
@@ -25,7 +25,7 @@ MODULES = {m.NAME: m for m in (opencv_yaml, kalibr, ros, colmap, mrcal)}
 
 
 def parsed(module: ModuleType, text: str, name: str = "left") -> Read:
-    """What a format's reader makes of a text."""
+    """The result of a format's reader for a text."""
     is_text = module.NAME in ("colmap", "mrcal")
     return module.read(text if is_text else parse_mapping(text, "file", module.NAME == "opencv"), name)
 
@@ -39,7 +39,7 @@ def some_camera(rng: np.random.Generator, name: str, count: int, lens: str, plac
 
 
 def assert_same(a: CameraModel, b: CameraModel, with_pose: bool) -> None:
-    """1e-12 relative, the issue's figure; a rotation's entries to that of 1."""
+    """Equality to 1e-12, relative for lengths and numbers of the lens, absolute for entries of rotations."""
     assert (a.image_size_px, a.lens) == (b.image_size_px, b.lens)
     np.testing.assert_allclose(b.pinhole, a.pinhole, rtol=1e-12)
     np.testing.assert_allclose(significant(b.distortion), significant(a.distortion), rtol=1e-12)
@@ -52,7 +52,7 @@ def assert_same(a: CameraModel, b: CameraModel, with_pose: bool) -> None:
 @pytest.mark.parametrize("format_name", MODULES)
 @settings(max_examples=40, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), data=st.data())
-def test_there_and_back_keeps_a_camera(format_name, seed, data):
+def test_writing_and_reading_keeps_a_camera(format_name, seed, data):
     lens = data.draw(st.sampled_from([k for k, v in ROOM[format_name].items() if v]))
     most = max(ROOM[format_name][lens])
     allowed = (0, 4) if lens == FISHEYE else tuple(n for n in (0, 4, 5, 8, 12, 14) if n <= most)
@@ -71,7 +71,7 @@ def test_a_chain_of_cameras_keeps_every_pose(seed, count):
     back = parsed(kalibr, kalibr.write(cameras).text).cameras
     assert [c.name for c in back] == [c.name for c in cameras]
     for a, b in zip(cameras, back, strict=True):
-        # A chain adds up rounding of the largest translation in it.
+        # Rounding errors of the largest translation accumulate along a chain.
         size = max(float(np.linalg.norm(c.camera_from_reference.translation)) for c in cameras)
         assert_same(a, b, with_pose=False)
         np.testing.assert_allclose(b.camera_from_reference.rotation, a.camera_from_reference.rotation, atol=1e-12)
@@ -86,7 +86,7 @@ def test_a_chain_of_cameras_keeps_every_pose(seed, count):
 @pytest.mark.parametrize("old_head", [True, False])
 @pytest.mark.parametrize("flat", [True, False])
 @pytest.mark.parametrize("count", [4, 5, 8, 12, 14])
-def test_what_opencv_writes_is_read_to_the_last_bit(old_head, flat, count):
+def test_a_file_written_by_opencv_is_read_to_the_last_bit(old_head, flat, count):
     if old_head and not hasattr(cv2, "FILE_STORAGE_FORMAT_YAML_1_0"):
         pytest.skip("this OpenCV writes one head only")
     rng = np.random.default_rng(count)
@@ -107,7 +107,7 @@ def test_what_opencv_writes_is_read_to_the_last_bit(old_head, flat, count):
 
 @settings(max_examples=30, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), count=st.sampled_from([0, 4, 5, 8, 12, 14]))
-def test_opencv_reads_what_we_write_to_the_last_bit(seed, count):
+def test_opencv_reads_our_file_to_the_last_bit(seed, count):
     camera = some_camera(np.random.default_rng(seed), 'le"ft: 1', count, PERSPECTIVE, False)
     text = opencv_yaml.write([camera]).text
     storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
@@ -121,8 +121,8 @@ def test_opencv_reads_what_we_write_to_the_last_bit(seed, count):
 
 
 @pytest.mark.parametrize("format_name", ["kalibr", "ros"])
-def test_a_reader_of_yaml_1_1_finds_numbers_where_we_write_numbers(format_name):
-    """Kalibr and ROS read with YAML 1.1, to which 1e-05 is a word."""
+def test_a_yaml_1_1_reader_reads_our_numbers_as_numbers(format_name):
+    """Kalibr and ROS read YAML 1.1, in which 1e-05 is a string."""
     camera = CameraModel("left", (640, 480), (500.0, 1e22, 1e-05, 240.0), (1e-05, -3e-12, 1e-300, 0.0))
     content = yaml.safe_load(MODULES[format_name].write([camera]).text)
     values = content["cam0"] if format_name == "kalibr" else content["distortion_coefficients"]
@@ -130,7 +130,7 @@ def test_a_reader_of_yaml_1_1_finds_numbers_where_we_write_numbers(format_name):
     assert numbers[:3] == [1e-05, -3e-12, 1e-300]
 
 
-# As the programs' documentation shows them ------------------------------------------------------------------------
+# Examples from the documentation of the programs ------------------------------------------------------------------
 
 CAMCHAIN = """\
 cam0:
@@ -236,7 +236,7 @@ def test_a_printed_camera_info_message():
     assert camera.pinhole == (500, 501, 320, 240)
 
 
-def test_colmaps_pixels_begin_half_a_pixel_earlier():
+def test_the_pixel_origin_of_colmap_is_shifted_by_half_a_pixel():
     """A principal point in the middle of a 3072 x 2304 picture is (1536, 1152) for COLMAP, (1535.5, 1151.5) for us."""
     simple, _, radial = parsed(colmap, CAMERAS_TXT).cameras
     assert simple.pinhole == (2559.5, 2559.5, 1535.5, 1151.5)
@@ -272,7 +272,7 @@ def test_a_cameramodel_as_mrcal_writes_it():
         ("mrcal", 4, FISHEYE, "opencv, kalibr, ros, colmap or beampose can"),
     ],
 )
-def test_a_lens_without_room_is_refused_and_told_where_there_is_room(format_name, count, lens, others):
+def test_a_lens_that_a_format_cannot_hold_is_refused_with_formats_that_can(format_name, count, lens, others):
     camera = CameraModel("left", (640, 480), (500, 500, 320, 240), (0.1,) * count, lens)
     with pytest.raises(FormatError) as caught:
         MODULES[format_name].write([camera])
@@ -280,7 +280,7 @@ def test_a_lens_without_room_is_refused_and_told_where_there_is_room(format_name
     assert others in str(caught.value)
 
 
-def test_zeros_at_the_end_are_no_reason_to_refuse_a_lens():
+def test_trailing_zeros_do_not_make_a_format_refuse_a_lens():
     camera = CameraModel("left", (640, 480), (500, 500, 320, 240), (0.1, 0.2, 0.3, 0.4, 0, 0, 0, 0))
     assert parsed(kalibr, kalibr.write([camera]).text).cameras[0].distortion == (0.1, 0.2, 0.3, 0.4)
 
@@ -312,7 +312,7 @@ WRONG = [
 
 
 @pytest.mark.parametrize(("module", "text", "old", "new", "words"), WRONG)
-def test_a_file_that_is_wrong_is_told_where(module, text, old, new, words):
+def test_a_faulty_file_is_refused_with_the_location_of_the_fault(module, text, old, new, words):
     assert old in text
     with pytest.raises(FormatError) as caught:
         parsed(module, text.replace(old, new, 1))

@@ -1,4 +1,4 @@
-"""A planned sigma is a claim: rigs drawn with the planned errors and solved by the program scatter as it says."""
+"""Planned sigmas: poses solved with rigs drawn from the planned errors must scatter accordingly."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def root(C: np.ndarray) -> np.ndarray:
 
 
 def solved_error(rig: Rig, errors: RigErrors, delta: np.ndarray, noise: np.ndarray) -> np.ndarray:
-    """The pose's error (6,) where the rig is truly off by delta (p,) and each pixel by noise (n, 2)."""
+    """The pose error (6,) for a rig with errors delta (p,) and pixels with errors noise (n, 2)."""
     model = SpotModel.of(rig)
     true_pixels, _ = SpotModel.of(moved(rig, errors.names, delta)).project(POSE)
     spread = CalibrationSpread(rig, model, RigCovariance(errors.names, errors.covariance))
@@ -62,7 +62,7 @@ def solved_error(rig: Rig, errors: RigErrors, delta: np.ndarray, noise: np.ndarr
 
 
 def squared_sigmas(errors: np.ndarray, covariance: np.ndarray) -> tuple[float, int]:
-    """The sum of squares (N, 6) in sigmas over the directions that the covariance has, and their number."""
+    """The sum of squared errors (N, 6), in sigmas, over the directions with a variance, and their number."""
     size = np.sqrt(np.diagonal(covariance))
     values, vectors = np.linalg.eigh(covariance / np.outer(size, size))
     real = values > 1e-9 * values[-1]
@@ -71,7 +71,7 @@ def squared_sigmas(errors: np.ndarray, covariance: np.ndarray) -> tuple[float, i
 
 
 def assert_in_band(total: float, count: int) -> None:
-    """Within the 99.9 % band of the chi-square: once in a thousand seeds a right claim fails."""
+    """Within the 99.9 % band of the chi-square: a correct covariance fails for one seed in a thousand."""
     lo, hi = chi2.ppf([0.0005, 0.9995], count)
     assert lo < total < hi, f"{total / count:.3f} per direction, allowed {lo / count:.3f} to {hi / count:.3f}"
 
@@ -87,7 +87,7 @@ def errors(rig) -> RigErrors:
 
 
 def scatter(rig, errors, C, noise_px, count, seed):
-    """Pose errors (count, 6) over rigs whose numbers err by C (p, p) and pixels by noise_px."""
+    """Pose errors (count, 6) over rigs with errors of covariance C (p, p) and pixels with errors of noise_px."""
     rng = np.random.default_rng(seed)
     A, views = root(C), len(SpotModel.of(rig))
     return np.array(
@@ -98,44 +98,44 @@ def scatter(rig, errors, C, noise_px, count, seed):
     )
 
 
-def test_poses_of_rigs_drawn_at_random_scatter_as_planned(rig, errors):
+def test_poses_of_randomly_drawn_rigs_scatter_as_planned(rig, errors):
     planned = budget_of(rig, errors).of(stacked(POSE))
     found = scatter(rig, errors, errors.covariance, SIGMA_PX, 150, seed=1)
     assert_in_band(*squared_sigmas(found, planned.total[0]))
 
 
-def test_poses_with_noise_alone_scatter_as_the_noise_part_says(rig, errors):
+def test_poses_with_noise_alone_scatter_as_the_noise_part_predicts(rig, errors):
     planned = budget_of(rig, errors).of(stacked(POSE))
     found = scatter(rig, errors, np.zeros_like(errors.covariance), SIGMA_PX, 120, seed=2)
     assert_in_band(*squared_sigmas(found, planned.noise[0]))
 
 
 @pytest.mark.parametrize("group", [INTRINSICS, CAMERA_POSES, SCREEN_POSES, BEAM_DIRECTIONS])
-def test_poses_with_one_kind_of_calibration_error_scatter_as_its_part_says(group, rig, errors):
+def test_poses_with_one_kind_of_calibration_error_scatter_as_its_part_predicts(group, rig, errors):
     planned = budget_of(rig, errors).of(stacked(POSE))
     found = scatter(rig, errors, errors.groups[group], 0.0, 60, seed=3)
     assert_in_band(*squared_sigmas(found, planned.groups[0, list(errors.groups).index(group)]))
 
 
-def test_what_one_error_does_is_its_effect(rig, errors):
-    """The effects against whole solutions: they are linear to the second order of a sigma, some 1e-3 of it."""
+def test_the_effect_of_one_error_equals_that_on_a_whole_solution(rig, errors):
+    """The effects are linear; whole solutions differ by second-order terms, some 1e-3 of a sigma."""
     planned = budget_of(rig, errors).of(stacked(POSE))
     for i, name in enumerate(errors.move_names):
         if i % 4 == 0 and errors.move_sigmas[i] > 0:
             found = solved_error(rig, errors, errors.moves[:, i], np.zeros((6, 2)))
             size = np.abs(planned.effects[0]).max(axis=1)  # of the largest effect on each axis
-            # The true rig is off by the move, so the pose is off the other way: estimate = truth + G S (-move).
+            # The true rig differs by `move`, so the pose error has the other sign: estimate = truth + G S (-move).
             np.testing.assert_allclose(found, -planned.effects[0, :, i], atol=0.01 * size.max(), err_msg=name)
 
 
-def test_the_parts_add_up_to_the_whole(rig, errors):
+def test_the_parts_sum_to_the_whole(rig, errors):
     poses = stacked(POSE, Pose.identity())
     b = budget_of(rig, errors).of(poses)
     np.testing.assert_allclose(b.noise + b.groups.sum(axis=1), b.total, rtol=1e-7, atol=1e-18)
 
 
-def test_what_joins_groups_is_in_the_whole_only(rig):
-    """A lens error that comes with an opposite error of the camera's pose, as the rig file says it."""
+def test_correlations_between_groups_are_in_the_whole_only(rig):
+    """A lens error that is correlated with an opposite error of the camera's pose, as stated in the rig file."""
     names = ("cameras.left.cx", "cameras.left.rot_y_rad")
     C = np.array([[0.09, 0.99 * 0.3 * 2.5e-4], [0.99 * 0.3 * 2.5e-4, 2.5e-4**2]])
     stated = RigCovariance(names, C)
@@ -148,7 +148,7 @@ def test_what_joins_groups_is_in_the_whole_only(rig):
     assert_in_band(*squared_sigmas(found, b.total[0]))
 
 
-def test_a_pose_counts_as_observable_where_the_solver_says_so(rig, errors):
+def test_a_pose_counts_as_observable_where_the_solver_agrees(rig, errors):
     rng = np.random.default_rng(5)
     model = SpotModel.of(rig)
     poses = Pose.from_ypr(np.deg2rad(rng.uniform(-70, 70, (120, 3))), rng.uniform(-1.2, 1.2, (120, 3)))
@@ -163,8 +163,8 @@ def test_a_pose_counts_as_observable_where_the_solver_says_so(rig, errors):
         assert np.isfinite(b.condition[i]) == b.observable[i]
 
 
-def test_the_plan_is_the_covariance_that_the_solver_will_state(rig, errors):
-    """Also where some spots are out of the picture: their rows must say nothing, and neither must their errors."""
+def test_the_planned_covariance_equals_that_of_the_solver(rig, errors):
+    """Also with some spots outside the picture, whose rows and errors must have no influence."""
     rng = np.random.default_rng(7)
     model = SpotModel.of(rig)
     poses = Pose.from_ypr(np.deg2rad(rng.uniform(-25, 25, (30, 3))), rng.uniform(-0.5, 0.5, (30, 3)))
@@ -182,7 +182,7 @@ def test_the_plan_is_the_covariance_that_the_solver_will_state(rig, errors):
         )
 
 
-def test_a_spot_near_the_edge_is_not_counted(rig, errors):
+def test_a_spot_near_the_edge_is_not_used(rig, errors):
     wide, near = (budget_of(rig, errors, edge).of(stacked(Pose.identity())) for edge in (0.0, 250.0))
     gap = np.min(np.minimum(wide.pixels + 0.5, SpotModel.of(rig).image_size_px - 0.5 - wide.pixels), axis=-1)
     assert wide.seen.all()
@@ -206,9 +206,9 @@ def test_the_worst_direction_is_that_of_the_largest_variance():
 # The errors to expect ---------------------------------------------------------------------------------------------
 
 
-def test_a_lens_error_takes_the_pose_along_that_opencvs_resection_finds(rig):
-    """The whole chain a second way: dots seen by the true lens, cv2.solvePnP with the wrong one."""
-    expected = ExpectedErrors(dot_survey_m=0.0)  # every dot weighs the same, as in solvePnP
+def test_a_lens_error_changes_the_camera_pose_as_in_opencvs_resection(rig):
+    """Independent check of the whole chain: dots projected by the true lens, cv2.solvePnP with the wrong one."""
+    expected = ExpectedErrors(dot_survey_m=0.0)  # all dots have the same weight, as in solvePnP
     errors, _ = expected_errors(rig, expected)
     camera = rig.cameras["left"]
     dots = module._dots(camera, rig.screens["left"], expected)
@@ -229,14 +229,14 @@ def test_a_lens_error_takes_the_pose_along_that_opencvs_resection_finds(rig):
         np.testing.assert_allclose(found, planned, atol=0.02 * np.abs(found).max(), err_msg=lens)
 
 
-def test_a_camera_whose_screen_gives_no_dots_gets_the_coarse_pose(rig):
+def test_a_camera_without_dots_on_its_screen_gets_the_coarse_pose_error(rig):
     small = {n: replace(s, size_m=(0.05, 0.05)) for n, s in rig.screens.items()}
     errors, _ = expected_errors(replace(rig, screens=small), ExpectedErrors())
     sigma = errors.move_sigmas[errors.names.index("cameras.left.x_m")]
     assert sigma == pytest.approx(ExpectedErrors().camera_position_m)
 
 
-def test_all_distortion_numbers_together_move_the_corner_by_what_was_asked(rig):
+def test_all_distortion_coefficients_together_move_the_corner_by_the_given_error(rig):
     camera = rig.cameras["left"]
     errors, _ = expected_errors(rig, ExpectedErrors(distortion_px=0.2))
     names = [f"cameras.left.{n}" for n in ("k1", "k2", "p1", "p2", "k3")]
@@ -250,7 +250,7 @@ def test_all_distortion_numbers_together_move_the_corner_by_what_was_asked(rig):
     assert np.sqrt(squares) == pytest.approx(0.2, rel=0.1)  # each is scaled at its own worst corner
 
 
-def test_what_the_rig_file_states_of_a_group_stands_in_place_of_what_is_assumed(rig):
+def test_errors_stated_in_the_rig_file_replace_the_assumed_ones(rig):
     names = tuple(f"beams.{b}.direction_{a}" for b in "ABC" for a in "xyz")
     stated = RigCovariance(names, 1e-10 * np.eye(9))
     errors, sources = expected_errors(rig, ExpectedErrors(), stated)
@@ -263,7 +263,7 @@ def test_what_the_rig_file_states_of_a_group_stands_in_place_of_what_is_assumed(
     assert np.count_nonzero(whole.covariance) == 9
 
 
-def test_a_beam_is_not_said_to_err_along_itself(rig):
+def test_a_beam_has_no_error_along_itself(rig):
     errors, _ = expected_errors(rig, ExpectedErrors())
     for name, beam in rig.beams.items():
         for kind in ("direction_", "point_"):

@@ -1,4 +1,4 @@
-"""The numbers of a rig: their names, how they move it, and their derivatives against differences."""
+"""The parameters of a rig: names, perturbations, derivatives against finite differences, covariance of the pixels."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ seeds = st.integers(0, 2**32 - 1)
 
 @settings(max_examples=5, deadline=None)
 @given(seed=seeds)
-def test_every_derivative_is_the_difference_that_moving_the_number_makes(seed):
+def test_every_derivative_equals_the_finite_difference(seed):
     rng = np.random.default_rng(seed)
     rig, pose = uncommon_rig(rng), random_pose(rng, 0.3, 0.3)
     names = rig_names(rig, bow=True)
     model = SpotModel.of(rig)
     found = Sensitivity(rig, model, names).of(model.derivatives(pose))
     expected = numeric_jacobian(lambda q: SpotModel.of(moved(rig, names, q)).project(pose)[0], np.zeros(len(names)))
-    # Spots far off the picture, where the lens bends most, have derivatives of thousands of px.
+    # Spots far outside the picture, where the distortion is largest, have derivatives of thousands of px.
     good = np.isfinite(model.project(pose)[0][:, 0])
     np.testing.assert_allclose(found[good], expected[good], rtol=2e-5, atol=2e-3)
 
@@ -42,7 +42,7 @@ def test_a_stack_of_poses_gives_the_derivatives_of_each():
         np.testing.assert_allclose(together[k], one, rtol=1e-12, atol=1e-9)
 
 
-def test_every_name_is_known_and_splits_into_kind_thing_and_parameter():
+def test_every_name_is_known_and_splits_into_kind_item_and_parameter():
     rig = paper_rig(LENSES[5])
     for name in rig_names(rig, bow=True):
         assert is_known(rig, name)
@@ -53,7 +53,7 @@ def test_every_name_is_known_and_splits_into_kind_thing_and_parameter():
 @pytest.mark.parametrize(
     "name", ["fx", "cameras.left.k4", "cameras.middle.fx", "screens.left.fx", "beams.A.length", "lights.a.b"]
 )
-def test_what_the_rig_does_not_have_is_not_known_and_cannot_be_moved(name):
+def test_a_name_that_the_rig_does_not_have_is_refused(name):
     rig = paper_rig(LENSES[5])
     assert not is_known(rig, name)
     with pytest.raises(KeyError):
@@ -62,7 +62,7 @@ def test_what_the_rig_does_not_have_is_not_known_and_cannot_be_moved(name):
         Sensitivity(rig, SpotModel.of(rig), [name])
 
 
-def test_moving_by_nothing_changes_no_number():
+def test_a_perturbation_of_zero_changes_nothing():
     rig = uncommon_rig(np.random.default_rng(4))
     names = rig_names(rig, bow=True)
     same = SpotModel.of(moved(rig, names, np.zeros(len(names))))
@@ -72,7 +72,7 @@ def test_moving_by_nothing_changes_no_number():
     np.testing.assert_allclose(same.ray, model.ray, rtol=0, atol=1e-15)
 
 
-def test_the_spread_of_the_pixels_is_that_of_rigs_drawn_from_the_covariance():
+def test_the_covariance_of_the_pixels_equals_the_scatter_over_drawn_rigs():
     rng = np.random.default_rng(5)
     rig, pose = paper_rig(LENSES[5]), Pose.identity()
     names = rig_names(rig)
@@ -96,7 +96,7 @@ def test_the_covariance_of_the_pixels_does_not_depend_on_earlier_calls():
     def fresh() -> CalibrationSpread:
         return CalibrationSpread(rig, SpotModel.of(rig), known)
 
-    # A slow motion: neighbours are nearer than a cell, so that the first of them could stand for the next.
+    # A slow motion: successive poses differ by less than a cell.
     poses = [
         Pose.identity().plus(0.02 * k * np.array([1, 0.5, 0, 0, 0.3, 1]) + 1e-3 * rng.normal(size=6)) for k in range(20)
     ]
@@ -124,7 +124,7 @@ def test_poses_of_one_cell_share_a_covariance_that_is_near_their_own():
     assert spread.at(beside) is not middle
 
 
-def test_views_without_a_projection_have_no_spread():
+def test_views_without_a_projection_have_no_covariance():
     rig = paper_rig(LENSES[5], size_m=(1.0, 1.0))
     model = SpotModel.of(rig)
     pose = Pose.from_ypr(np.array([0.5, 0, 0]), np.zeros(3))
