@@ -68,15 +68,15 @@ def _compiled(function: Function, release_gil: bool) -> Function:
             dispatcher._cache = _Cache(function)  # type: ignore[no-untyped-call]
         finally:
             settings.CACHE_DIR = before
-    _take_literals_for_plain(dispatcher)
+    _treat_literals_as_numbers(dispatcher)
     return dispatcher
 
 
-def _take_literals_for_plain(dispatcher: Any) -> None:
-    """Let a compiled function that is called with a literal, `f(x, 0)`, be the same as for any other number.
+def _treat_literals_as_numbers(dispatcher: Any) -> None:
+    """Makes calls with a literal argument, `f(x, 0)`, use the code for any number.
 
-    numba would compile it once more for each literal; also for the first value of a variable that begins as one, as
-    in `count = 0`, and discard that: a sixth of all compiling here.
+    numba would compile the function once more for each literal, and for the first value of a variable such as
+    `count = 0`, and discard some of these versions: a sixth of all compilations (docs/decisions/numba.md).
     """
     of_types = dispatcher.get_call_template
     plain: Any = unliteral

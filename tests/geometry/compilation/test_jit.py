@@ -63,7 +63,7 @@ with event.install_listener("numba:compile", type("Count", (event.Listener,), {
     before = compiled.is_empty(here)
     value = outer.twice_grown(0.0)
 print(json.dumps({
-    "value": value, "cold": [before, compiled.is_empty(here)], "said": [r.getMessage() for r in lines],
+    "value": value, "cold": [before, compiled.is_empty(here)], "reports": [r.getMessage() for r in lines],
     "compiled": sorted(begun), "signatures": len(outer.grown.signatures), "folder": str(compiled.cache_folder(here)),
 }))
 """
@@ -113,10 +113,10 @@ def test_two_processes_that_compile_at_once_do_not_disturb_each_other(first_two)
 
 
 def test_the_first_compilation_is_reported_once(first_two):
-    reports = [one["said"] for one in first_two if one["said"]]
+    reports = [one["reports"] for one in first_two if one["reports"]]
     assert 1 <= len(reports) <= 2  # the later of the two may have found some code
-    for said in reports:
-        assert said == ["compiling for this machine, once (about half a minute)"]
+    for report in reports:
+        assert report == ["compiling for this machine, once (about half a minute)"]
     assert [one["cold"][1] for one in first_two] == [False, False]
 
 
@@ -128,7 +128,7 @@ def test_a_literal_argument_is_compiled_as_a_plain_number(first_two):
 
 def test_the_next_process_compiles_nothing(program, first_two):
     later = found(started(program))
-    assert (later["value"], later["compiled"], later["said"]) == (20.0, [], [])
+    assert (later["value"], later["compiled"], later["reports"]) == (20.0, [], [])
 
 
 @pytest.mark.parametrize("edited", ["geometry/inner.py", "geometry/constants.py"])
@@ -209,17 +209,17 @@ def test_every_form_of_import_is_followed(tmp_path, text):
     assert package / "b.py" in compile_cache._imported(package / "source.py")
 
 
-def test_without_any_folder_to_write_it_works_and_says_that_it_compiles_each_time(program, tmp_path):
+def test_without_a_writable_folder_it_compiles_in_every_process_and_reports_it(program, tmp_path):
     shutil.copytree(program, tmp_path / "program", ignore=shutil.ignore_patterns("__pycache__"))
     (tmp_path / "program" / "geometry" / "compilation" / "__pycache__").write_text(
-        "a file where a folder should be: not even root can"
+        "a file in place of the folder, so that even root cannot create it"
     )
     alone = found(started(tmp_path / "program", "nowhere", XDG_CACHE_HOME="/dev/null/nowhere"))
     assert alone["folder"] == "None"
     assert alone["value"] == 20.0
     assert alone["cold"] == [True, True]
-    assert len(alone["said"]) == 1
-    assert "each time" in alone["said"][0]
+    assert len(alone["reports"]) == 1
+    assert "each time" in alone["reports"][0]
 
 
 def test_only_the_cache_folders_used_last_are_kept(tmp_path):
