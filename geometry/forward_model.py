@@ -161,6 +161,10 @@ class SpotModel:
         passes beside its extent.
         """
         m = self._intersect(world_from_body)
+        return np.where(m.good[..., None], m.hit, np.nan), self._hit_jacobian(m)
+
+    def _hit_jacobian(self, m: _Intersection) -> Array:
+        """The Jacobian (..., n, 3, 6) of the lit points, as in `hits`."""
         # A small motion of the ray along itself has no effect, so the motion is projected along the ray:
         # d(hit) = (I - d n^T / (n.d)) (d(p) + t d(d)), and with theta in body: d(p) + t d(d) = dt - R [q]x dtheta,
         # where q = point + t ray is the lit point in body.
@@ -171,7 +175,7 @@ class SpotModel:
         lever = (m.R @ q[..., None])[..., 0]
         columns = cross(np.swapaxes(m.R, -1, -2), lever[..., None, :])  # (..., n, 3 axes, 3)
         J[..., 3:] = m.oblique @ np.swapaxes(columns, -1, -2)
-        return np.where(m.good[..., None], m.hit, np.nan), J
+        return J
 
     def _intersect(self, world_from_body: Pose) -> _Intersection:
         """Intersections of the rays with their screens."""
@@ -248,7 +252,7 @@ class SpotModel:
         d_point = d_hit @ m.oblique @ m.R
         return SpotDerivatives(
             pixels=np.where(m.good[..., None], projected.pixels, np.nan),
-            pose=d_hit @ self.hits(world_from_body)[1],
+            pose=d_hit @ self._hit_jacobian(m),
             pinhole=projected.d_pinhole,
             distortion=projected.d_distortion,
             camera=projected.d_point @ d_camera,

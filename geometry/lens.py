@@ -116,27 +116,20 @@ def _tilt_derivatives(tau_x: Array, tau_y: Array) -> tuple[Array, Array]:
 
 def _tilt_rotation(cx: Array, sx: Array, cy: Array, sy: Array) -> Array:
     """R_y R_x (..., 3, 3) of OpenCV's tilt, from the cosines and sines of its angles."""
-    zero, one = np.zeros_like(cx), np.ones_like(cx)
-    about_x = np.stack(
-        [np.stack([one, zero, zero], -1), np.stack([zero, cx, sx], -1), np.stack([zero, -sx, cx], -1)], -2
-    )
-    about_y = np.stack(
-        [np.stack([cy, zero, -sy], -1), np.stack([zero, one, zero], -1), np.stack([sy, zero, cy], -1)], -2
-    )
+    about_x, about_y = np.zeros((*np.shape(cx), 3, 3)), np.zeros((*np.shape(cx), 3, 3))
+    about_x[..., 0, 0] = about_y[..., 1, 1] = 1.0
+    about_x[..., 1, 1], about_x[..., 1, 2], about_x[..., 2, 1], about_x[..., 2, 2] = cx, sx, -sx, cx
+    about_y[..., 0, 0], about_y[..., 0, 2], about_y[..., 2, 0], about_y[..., 2, 2] = cy, -sy, sy, cy
     return about_y @ about_x
 
 
 def _along_axis(R: Array) -> Array:
     """The projection (..., 3, 3) onto the sensor along the optical axis, of the tilt's rotation (..., 3, 3)."""
-    zero, one = np.zeros_like(R[..., 0, 0]), np.ones_like(R[..., 0, 0])
-    return np.stack(
-        [
-            np.stack([R[..., 2, 2], zero, -R[..., 0, 2]], -1),
-            np.stack([zero, R[..., 2, 2], -R[..., 1, 2]], -1),
-            np.stack([zero, zero, one], -1),
-        ],
-        -2,
-    )
+    out = np.zeros(R.shape)
+    out[..., 0, 0] = out[..., 1, 1] = R[..., 2, 2]
+    out[..., 0, 2], out[..., 1, 2] = -R[..., 0, 2], -R[..., 1, 2]
+    out[..., 2, 2] = 1.0
+    return out
 
 
 def tilt_matrix(tau_x: Array, tau_y: Array) -> Array:

@@ -20,6 +20,10 @@ from geometry.uncertainty.rig_uncertainty import CalibrationSpread
 # one screen are collinear in every pose) give 1e-13 and less; the worst usable geometry gives about 1e-4.
 RANK_TOLERANCE = 1e-7
 
+# If the start is farther from the solution than this, the effect of the calibration's errors is computed again: within
+# it, the sigmas of the pixels change by up to some per cent.
+NEAR_M, NEAR_RAD = 0.05, np.deg2rad(1.0)
+
 
 @dataclass(frozen=True, slots=True)
 class SolveLimits:
@@ -126,11 +130,11 @@ def fit_pose(
     fit = _fit(model, rows, pixels, covariances, start, prior, common, max_iterations)
     if fit is None:
         return None
-    now = calibration.at(fit.world_from_body)
-    if np.array_equal(now, common):
+    error_of_start = fit.world_from_body.minus(start)
+    if np.linalg.norm(error_of_start[:3]) < NEAR_M and np.linalg.norm(error_of_start[3:]) < NEAR_RAD:
         return fit
-    # The solution lies in another cell than the start, where the calibration's errors act differently.
-    return _fit(model, rows, pixels, covariances, fit.world_from_body, prior, now, max_iterations)
+    common = calibration.at(fit.world_from_body)
+    return _fit(model, rows, pixels, covariances, fit.world_from_body, prior, common, max_iterations)
 
 
 def _fit(

@@ -454,7 +454,10 @@ def _calibration(rec: TrackedRecording, every: AllDetections, assigned: Ints, re
     if rec.calibration is None:
         return calibration_cov, systematic
     points = [labelled_points(every, k, assigned[k], np.zeros_like(calibration_cov)) for k in range(len(rec))]
-    common = [rec.calibration.at(Pose(ref.R[k], ref.t[k])) if rec.measured[k] else None for k in range(len(rec))]
+    common: list[Array | None] = [None] * len(rec)
+    for block in np.array_split(np.flatnonzero(rec.measured), len(rec) // 256 + 1):
+        for k, C in zip(block, rec.calibration.at(Pose(ref.R[block], ref.t[block])), strict=True):
+            common[k] = C
     J_all = project_all(model.numbers, ref.R, ref.t)[1]
     gains: list[tuple[Ints, Array] | None] = [None] * len(rec)
     for second in (False, True):
