@@ -1,1 +1,1 @@
-"""Cameras, screens and beams from measurements of them."""
+"""Calibration of cameras, screens and beams from measurements."""

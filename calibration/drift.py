@@ -1,11 +1,11 @@
-"""What has changed since a calibration: the explanation that a misfit of pixels asks for, and how sure it is.
+"""Changes since a calibration: the most probable explanation of pixel residuals, and its significance.
 
-All of it is linear: a misfit r (m,) between pixels measured and pixels foretold, its covariance C (m, m) under "nothing
-has changed" (noise of the pixels AND of the calibration), and for each possible change a matrix A (m, k) of what it
-does to the pixels. Whether something has changed is told by chi-square tests; what it was by the evidence (MacKay
-1992, "Bayesian interpolation", Neural Computation 4) of r ~ N(0, C + A P A^T), P: how large such changes usually are.
-Without P, dots on one plane make a lens refocused by 0.3 % a camera that moved by 700 mm AND zoomed (measured: BIC
-chose that), as the two look alike there.
+Everything is linear: the residual r (m,) between measured and predicted pixels, its covariance C (m, m) under the
+hypothesis that nothing has changed (noise of the pixels and of the calibration), and for each possible change the
+derivatives A (m, k) of the pixels. Chi-square tests decide whether something has changed. The evidence (MacKay 1992,
+"Bayesian interpolation", Neural Computation 4) of r ~ N(0, C + A P A^T) decides what it was; P is the prior covariance
+of the sizes of such changes. P is necessary: with dots on one plane, a lens refocused by 0.3 % and a camera that moved
+by 700 mm AND zoomed have almost the same effect, and BIC, which has no P, chose the latter (measured).
 """
 
 from __future__ import annotations
@@ -23,112 +23,114 @@ TURNED, MOVED, ZOOMED = "turned", "moved and turned", "focus changed"
 TURNED_ZOOMED, ALL_CHANGED = "turned and focus changed", "moved, turned and focus changed"
 CAMERA_KINDS = (TURNED, MOVED, ZOOMED, TURNED_ZOOMED, ALL_CHANGED)
 WRONG_POINT, LASER_MOVED = "point wrong", "laser moved"
-_RANK = 1e-6  # of a change's largest effect: what a nuisance leaves below this is rounding, not evidence
+_RANK = 1e-6  # relative size below which a projected column is rounding
 
 
 @dataclass(frozen=True, slots=True)
 class UsualSizes:
-    """How large changes are, 1 sigma, that labs meet. They weigh explanations; data outdo them by far when sure."""
+    """Prior sigmas of the changes that occur in laboratories. They decide between equally good fits."""
 
-    turn_rad: float = float(np.deg2rad(0.1))  # a mount that was knocked or has crept
-    move_m: float = 5e-3  # likewise
-    zoom: float = 3e-3  # relative: a focus ring touched
-    point_px: float = 3.0  # a dot mistaken or moved
-    laser_rad: float = 1e-3  # a laser's mount that has crept
-    laser_m: float = 1e-3
+    turn_rad: float = float(np.deg2rad(0.1))  # rotation of a camera whose mount was knocked or has crept
+    move_m: float = 5e-3  # shift of such a camera
+    zoom: float = 3e-3  # relative change of the focal length after a touch of the focus ring
+    point_px: float = 3.0  # error of a dot that was moved or mistaken for another one
+    laser_rad: float = 1e-3  # rotation of a laser whose mount has crept
+    laser_m: float = 1e-3  # shift of such a laser
 
 
 @dataclass(frozen=True, slots=True)
 class ChangeCandidate:
-    """What a possible change does to the pixels."""
+    """A possible change: the derivatives of the pixels by its k parameters, and their prior sigmas."""
 
     columns: Array  # (m, k), px per unit
-    size: Array  # (k,), the change's unit: how large it usually is
+    size: Array  # (k,), prior sigmas
 
-    def beside(self, other: ChangeCandidate) -> ChangeCandidate:
-        """Both at once."""
+    def combined_with(self, other: ChangeCandidate) -> ChangeCandidate:
+        """Both changes together."""
         both = np.concatenate([self.columns, other.columns], axis=1)
         return ChangeCandidate(both, np.concatenate([self.size, other.size]))
 
 
 @dataclass(frozen=True, slots=True)
 class CameraColumns:
-    """What changes of one camera do to m pixel coordinates, px per unit; rows of other cameras are 0."""
+    """Derivatives of m pixel coordinates by changes of one camera, px per unit; 0 for those of other cameras."""
 
-    turn: Array  # (m, 3), px/rad: about its own centre, in the camera frame
-    move: Array  # (m, 3), px/m: the scene moves by this in the camera frame
+    turn: Array  # (m, 3), px/rad: rotation about the camera's centre, in the camera frame
+    move: Array  # (m, 3), px/m: shift of the scene in the camera frame
     zoom: Array  # (m, 1), px: relative change of the focal length
 
     @property
     def model(self) -> Array:
-        """(m, 4): turn and zoom, a similarity of the picture: what the drift is tested by."""
+        """The columns (m, 4) that the test for drift uses: turn and zoom, a similarity of the picture."""
         return np.concatenate([self.turn, self.zoom], axis=1)
 
     def kinds(self, sizes: UsualSizes) -> dict[str, ChangeCandidate]:
-        """The explanations that a camera can give."""
+        """The possible changes of a camera, by kind."""
         turn = ChangeCandidate(self.turn, np.full(3, sizes.turn_rad))
         move = ChangeCandidate(self.move, np.full(3, sizes.move_m))
         zoom = ChangeCandidate(self.zoom, np.full(1, sizes.zoom))
         return {
             TURNED: turn,
             ZOOMED: zoom,
-            TURNED_ZOOMED: turn.beside(zoom),
-            MOVED: turn.beside(move),
-            ALL_CHANGED: turn.beside(move).beside(zoom),
+            TURNED_ZOOMED: turn.combined_with(zoom),
+            MOVED: turn.combined_with(move),
+            ALL_CHANGED: turn.combined_with(move).combined_with(zoom),
         }
 
 
 def camera_columns(points_camera: Array, d_point: Array, d_pinhole: Array, focal: Array) -> CameraColumns:
     """The columns of a camera from its derivatives at n points; m = 2 n.
 
-    points_camera (n, 3), m; d_point (n, 2, 3), px/m, of the pixel by that point; d_pinhole (n, 2, 4); focal (2,), px.
+    points_camera (n, 3), m, in the camera frame; d_point (n, 2, 3), px/m, and d_pinhole (n, 2, 4): derivatives of the
+    pixel by the point and by fx, fy, cx, cy; focal (2,), px.
     """
     n = len(points_camera)
-    turn = d_point @ -skew(points_camera)  # the point moves by phi x p
+    turn = d_point @ -skew(points_camera)  # a rotation by phi moves the point p by phi x p
     zoom = d_pinhole[..., 0] * focal[0] + d_pinhole[..., 1] * focal[1]
     return CameraColumns(turn.reshape(2 * n, 3), d_point.reshape(2 * n, 3), zoom.reshape(2 * n, 1))
 
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """A fitted explanation."""
+    """A change fitted to the residuals."""
 
     kind: str  # TURNED ... LASER_MOVED
-    subject: str  # the camera, the point or the laser
-    columns: Array  # (m, k)
-    delta: Array  # (k,) the most probable size
-    covariance: Array  # (k, k) of that: as wide as such changes usually are where the pixels do not tell
-    noise: Array  # (k, k) how far it scatters when nothing has changed
-    evidence: float  # 2 ln of how much more probable the pixels are with it than without
-    explained: float  # chi-square that it takes away
-    rank: int  # degrees of freedom that it takes
+    subject: str  # name of the camera, point or laser
+    columns: Array  # (m, k) derivatives of the pixels
+    delta: Array  # (k,) most probable size
+    covariance: Array  # (k, k) posterior covariance of delta; the prior one where the pixels do not observe it
+    noise: Array  # (k, k) covariance of delta when nothing has changed
+    evidence: float  # 2 ln of the ratio of the residuals' probabilities with and without this change
+    explained: float  # reduction of chi-square
+    rank: int  # degrees of freedom of that reduction
 
     @property
     def displacement(self) -> Array:
-        """(m,), px: what it did to the pixels."""
+        """The effect (m,), px, of the change on the pixels."""
         return self.columns @ self.delta
 
     @property
     def p_value(self) -> float:
-        """How probable so good an explanation is when nothing has changed."""
+        """Probability of at least this reduction of chi-square when nothing has changed."""
         return chi2_tail(self.explained, self.rank) if self.rank else 1.0
 
 
 @dataclass(frozen=True, slots=True)
 class ExcessResidual:
-    """A whitened misfit from which everything that needs no explanation has been projected out."""
+    """A whitened residual, with the effects of free (nuisance) parameters projected out."""
 
-    white: Array  # (m,)
+    white: Array  # (m,) in sigmas
     factor: Array  # (m, m), lower Cholesky factor of C
-    basis: Array  # (m, q), orthonormal: the whitened nuisances
+    basis: Array  # (m, q), orthonormal: the whitened effects of the free parameters
     dof: int  # m - q
-    is_unit: bool = False  # C is 1: columns need no whitening, which is nearly all the work of a fit
+    is_unit: bool = False  # C is the identity: columns need no whitening, which is nearly all the work of a fit
 
     @staticmethod
     def of(residual: Array, covariance: Array, nuisance: Array | None = None) -> ExcessResidual:
-        """residual (m,), measured minus foretold, px; covariance (m, m); nuisance (m, k): free, of no interest.
+        """From a residual (m,), measured minus predicted, px, its covariance (m, m) and nuisance columns (m, k).
 
-        Raises ValueError where the covariance is not positive definite.
+        Raises:
+            ValueError: the covariance is not positive definite.
         """
         try:
             factor = cholesky(covariance, lower=True)
@@ -136,21 +138,21 @@ class ExcessResidual:
             raise ValueError("the pixels' covariance is not positive definite") from None
         white = solve_triangular(factor, residual, lower=True)
         start = ExcessResidual(white, factor, np.zeros((len(white), 0)), len(white))
-        return start if nuisance is None else start.freed(nuisance)
+        return start if nuisance is None else start.with_free(nuisance)
 
     @staticmethod
     def of_white(residual: Array) -> ExcessResidual:
-        """Of a residual (m,) whose errors are independent and of size 1; columns must be whitened in the same way."""
+        """From a residual (m,) with independent errors of sigma 1; all columns must be whitened in the same way."""
         return ExcessResidual(residual, np.eye(len(residual)), np.zeros((len(residual), 0)), len(residual), True)
 
     @property
     def chi2(self) -> float:
-        """What is left to explain."""
+        """Chi-square of the residual."""
         return float(self.white @ self.white)
 
     @property
     def p_value(self) -> float:
-        """How probable so large a misfit is when nothing has changed."""
+        """Probability of at least this chi-square when nothing has changed."""
         return chi2_tail(self.chi2, self.dof) if self.dof > 0 else 1.0
 
     def _whitened(self, columns: Array) -> Array:
@@ -161,42 +163,42 @@ class ExcessResidual:
         return white - self.basis @ (self.basis.T @ white)
 
     def _basis_of(self, columns: Array) -> Array:
-        """Orthonormal basis (m, r) of what columns (m, k) can still do."""
+        """Orthonormal basis (m, r) of the effects of columns (m, k) that the free parameters do not cover."""
         white = self._whitened(columns)
-        # Columns to one scale first: metres, radians and relative focal lengths have nothing to do with each other.
+        # The columns are scaled to unit length first, since they have different units.
         scale = np.linalg.norm(white, axis=0)
         left = (white - self.basis @ (self.basis.T @ white)) / np.where(scale > 0, scale, 1.0)
         U, s, _ = np.linalg.svd(left, full_matrices=False)
         return U[:, s > _RANK]
 
-    def freed(self, columns: Array) -> ExcessResidual:
-        """With these changes free: the misfit that they cannot explain."""
+    def with_free(self, columns: Array) -> ExcessResidual:
+        """The residual that remains if the parameters of these columns (m, k) are free too."""
         U = self._basis_of(columns)
         white = self.white - U @ (U.T @ self.white)
         basis = np.concatenate([self.basis, U], axis=1)
         return replace(self, white=white, basis=basis, dof=self.dof - U.shape[1])
 
     def without(self, changes: Iterable[Change]) -> ExcessResidual:
-        """With all these changes free."""
+        """The residual that remains if all these changes are free."""
         out = self
         for change in changes:
-            out = out.freed(change.columns)
+            out = out.with_free(change.columns)
         return out
 
     def fit(self, kind: str, subject: str, candidate: ChangeCandidate) -> Change:
-        """How well a change explains the misfit."""
+        """The fit of a possible change to the residual."""
         U = self._basis_of(candidate.columns)
         explained = float(np.sum((U.T @ self.white) ** 2))
         V, s, W = np.linalg.svd(self._projected(candidate.columns) * candidate.size, full_matrices=False)
-        along, W = V.T @ self.white, W * candidate.size  # rows: what one usual size along this way is
+        along, W = V.T @ self.white, W * candidate.size  # rows of W: one prior sigma along each singular direction
         shrunk = s / (1 + s**2)
-        unseen = np.diag(candidate.size**2) - W.T @ W  # 0 unless there are more changes than pixels
+        unobserved = np.diag(candidate.size**2) - W.T @ W  # 0 unless there are more parameters than pixels
         return Change(
             kind=kind,
             subject=subject,
             columns=candidate.columns,
             delta=W.T @ (shrunk * along),
-            covariance=(W.T / (1 + s**2)) @ W + unseen,
+            covariance=(W.T / (1 + s**2)) @ W + unobserved,
             noise=(W.T * shrunk**2) @ W,
             evidence=float(np.sum(along**2 * s * shrunk) - np.sum(np.log1p(s**2))),
             explained=explained,
@@ -204,28 +206,28 @@ class ExcessResidual:
         )
 
     def p_value_of(self, columns: Array) -> float:
-        """How probable so much in the ways of these columns is when nothing has changed."""
+        """Probability of at least this chi-square in the space of these columns when nothing has changed."""
         U = self._basis_of(columns)
         return chi2_tail(float(np.sum((U.T @ self.white) ** 2)), U.shape[1]) if U.shape[1] else 1.0
 
     def detectable(self, directions: Array, columns: Array, p_false_alarm: float, power: float) -> float:
-        """The length, px, of the least visible of some displacements that a test of `columns` finds with this power.
+        """The smallest length, px, at which a test of `columns` detects every displacement in a space with this power.
 
-        directions (m, d): displacements of length 1. inf where one cannot be seen at all.
+        directions (m, d): displacements of length 1 that span the space. inf if one of them has no effect.
         """
         U = self._basis_of(columns)
         if not U.shape[1]:
             return float("inf")
-        seen = U.T @ self._projected(directions)
-        weakest = float(np.linalg.eigvalsh(seen.T @ seen)[0])
+        observed = U.T @ self._projected(directions)
+        weakest = float(np.linalg.eigvalsh(observed.T @ observed)[0])
         if weakest <= 0:
             return float("inf")
         return float(np.sqrt(_noncentrality(U.shape[1], p_false_alarm, power) / weakest))
 
 
 def _noncentrality(dof: int, p_false_alarm: float, power: float) -> float:
-    """Lambda at which a chi-square test of this size finds a change with this power."""
-    from scipy.optimize import brentq  # 0.3 s to import: a run without a fault does not ask
+    """Noncentrality at which a chi-square test with this false alarm probability detects a change with this power."""
+    from scipy.optimize import brentq  # imported here because the import takes 0.3 s
     from scipy.special import chndtr
 
     limit = chi2_limit(p_false_alarm, dof)
@@ -234,13 +236,13 @@ def _noncentrality(dof: int, p_false_alarm: float, power: float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Verdicts:
-    """What was found to have changed, and the tests behind it."""
+    """The changes that were found, and the tests that support them."""
 
-    changes: tuple[Change, ...]  # in the order of their weight
-    left: ExcessResidual  # what they leave
-    p_values: Mapping[str, float]  # per camera, of the first test: before anything was explained
-    p_rest: float  # of the first test of what no camera explains
-    unexplained: bool  # what is left is still significant
+    changes: tuple[Change, ...]  # in the order in which they were found
+    left: ExcessResidual  # residual that they leave
+    p_values: Mapping[str, float]  # per camera, p-value before any change is fitted
+    p_rest: float  # the same of the residual that no camera explains
+    unexplained: bool  # whether `left` is still significant
 
 
 def find_changes(
@@ -250,52 +252,51 @@ def find_changes(
     p_false_alarm: float,
     sizes: UsualSizes | None = None,
 ) -> Verdicts:
-    """What has changed, one thing after another, the best explanation first.
+    """The changes that explain a residual, added one by one, the most probable first.
 
-    others: what else may have changed, by kind and subject: one point that is wrong (WRONG_POINT,
-    its name), one laser (LASER_MOVED, its name). p_false_alarm: that anything at all is found when nothing has
-    changed. Half of it is spent on the cameras, evenly; half on what no camera explains. Where nothing is
-    significant nothing is explained.
+    others: other possible changes, by kind and subject: one wrong point (WRONG_POINT, its name), one laser
+    (LASER_MOVED, its name). p_false_alarm: probability that any change is found when nothing has changed. Half of it
+    is divided evenly among the cameras, half goes to the residual that no camera explains. Changes are added only while
+    a test is significant.
     """
     sizes = sizes or UsualSizes()
     each = p_false_alarm / 2 / max(len(cameras), 1)
 
     def tests(left: ExcessResidual, names: list[str]) -> tuple[dict[str, float], float]:
         models = [cameras[n].model for n in names]
-        rest = left.freed(np.concatenate(models, axis=1)) if models else left
+        rest = left.with_free(np.concatenate(models, axis=1)) if models else left
         return {n: left.p_value_of(cameras[n].model) for n in names}, rest.p_value
 
     p_values, p_rest = tests(misfit, list(cameras))
-    # No more wrong points than a third of all: then nothing is known any more.
-    most = max(1, len(cameras) + len(misfit.white) // 6)
+    # With more wrong points than a third of all, nothing can be concluded.
+    max_changes = max(1, len(cameras) + len(misfit.white) // 6)
     changes: list[Change] = []
     while True:
         left = misfit.without(changes)
         taken = {c.subject for c in changes if c.kind in CAMERA_KINDS}
         of_cameras, of_rest = tests(left, [n for n in cameras if n not in taken])
         significant = min(of_cameras.values(), default=1.0) < each or of_rest < p_false_alarm / 2
-        more = _best(misfit, changes, cameras, others, sizes) if significant and len(changes) < most else None
+        more = _best(misfit, changes, cameras, others, sizes) if significant and len(changes) < max_changes else None
         if more is None:
             return Verdicts(tuple(changes), left, p_values, p_rest, significant)
-        changes = _chosen_anew(misfit, [*changes, more], cameras, others, sizes)
+        changes = _reselected(misfit, [*changes, more], cameras, others, sizes)
 
 
-def _chosen_anew(
+def _reselected(
     misfit: ExcessResidual,
     changes: list[Change],
     cameras: Mapping[str, CameraColumns],
     others: Mapping[tuple[str, str], ChangeCandidate],
     sizes: UsualSizes,
 ) -> list[Change]:
-    """Each change chosen and fitted again with the others free: the first was picked while they were not known.
+    """The changes, each selected and fitted again with the others free: the first was selected without the others.
 
-    A camera that turned while one dot was wrong looks like one that moved; with the dot free it does not.
+    For instance, a camera that turned while one dot was wrong is mistaken for one that moved until the dot is free.
     """
     for _ in range(3):
         before = [(c.kind, c.subject) for c in changes]
         for i in range(len(changes)):
-            apart = changes[:i] + changes[i + 1 :]
-            best = _best(misfit, apart, cameras, others, sizes)
+            best = _best(misfit, changes[:i] + changes[i + 1 :], cameras, others, sizes)
             if best is not None:
                 changes = [*changes[:i], best, *changes[i + 1 :]]
         if before == [(c.kind, c.subject) for c in changes]:
@@ -310,37 +311,38 @@ def _best(
     others: Mapping[tuple[str, str], ChangeCandidate],
     sizes: UsualSizes,
 ) -> Change | None:
-    """The most probable explanation of what the known changes leave; None where none is better than none.
+    """The most probable change beside the known ones; None if no further change is more probable.
 
-    A kind counts as one however many may be its subject: of n points each is an n-th as probable.
+    All kinds have the same prior probability, divided evenly among their subjects: each of n points has 1 / n of it.
     """
     left = misfit.without(known)
     taken = {c.subject if c.kind in CAMERA_KINDS else (c.kind, c.subject) for c in known}
-    weighed: list[tuple[float, Change]] = []
+    scored: list[tuple[float, Change]] = []
     for name, columns in cameras.items():
         if name in taken:
             continue
         for kind, candidate in columns.kinds(sizes).items():
             change = left.fit(kind, name, candidate)
-            weighed.append((change.evidence - 2 * np.log(len(cameras)), change))
+            scored.append((change.evidence - 2 * np.log(len(cameras)), change))
     for (kind, name), candidate in others.items():
         if (kind, name) in taken:
             continue
-        alike = sum(k == kind for k, _ in others)
+        subjects = sum(k == kind for k, _ in others)
         change = left.fit(kind, name, candidate)
-        weighed.append((change.evidence - 2 * np.log(alike), change))
-    weight, best = max(weighed, key=lambda w: w[0], default=(0.0, None))
-    return best if weight > 0 else None
+        scored.append((change.evidence - 2 * np.log(subjects), change))
+    score, best = max(scored, key=lambda s: s[0], default=(0.0, None))
+    return best if score > 0 else None
 
 
 def rms_length(displacement: Array) -> float:
-    """Root mean square length, px, of displacements (2 n,) given as u, v, u, v ..."""
+    """Root mean square length, px, of n displacements (2 n,), ordered u, v, u, v ...; nan for none."""
     return (
         float(np.sqrt(np.mean(np.sum(displacement.reshape(-1, 2) ** 2, axis=1)))) if len(displacement) else float("nan")
     )
 
 
 def expected_rms(columns: Array, covariance: Array) -> float:
-    """The RMS length, px, that an estimated displacement (columns (2n, k)) has by its noise alone."""
+    """The RMS length, px, of a displacement due to noise alone: columns (2n, k), covariance (k, k); nan for none."""
+
     spread = np.einsum("ij,jk,ik->i", columns, covariance, columns)
     return float(np.sqrt(2 * np.mean(spread))) if len(columns) else float("nan")

@@ -1,4 +1,4 @@
-"""The findings of a calibration, each with a level, a reason and a remedy; and their verdict."""
+"""Findings of a calibration, each with a level, a reason and a remedy, and the verdict that they give."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Pure geometry on arrays: no files, no state. Lengths in metres, angles in radians, pixels as in OpenCV."""
+"""Pure geometry on arrays: no files, no state (except compilation/). Metres, radians, and OpenCV's pixels."""

@@ -1,4 +1,4 @@
-"""The array types that the geometry speaks in, and the little linear algebra that numpy lacks."""
+"""Array types, and the small functions of linear algebra that numpy lacks."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Ints: TypeAlias = NDArray[np.int64]
 
 
 def normalised(vectors: Array) -> Array:
-    """Vectors of length one along the given (..., n); a null vector stays null."""
+    """Unit vectors along the given vectors (..., n); a null vector stays null."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return vectors / np.where(length > 0, length, 1.0)
 
@@ -28,19 +28,20 @@ def skew(v: Array) -> Array:
 
 
 def cross(a: Array, b: Array) -> Array:
-    """a x b of (..., 3), broadcast. The same as np.cross, at a fifth of its cost on the small arrays of one frame."""
+    """a x b of vectors (..., 3), broadcast: np.cross, at a fifth of its cost on the small arrays of one frame."""
     a0, a1, a2 = a[..., 0], a[..., 1], a[..., 2]
     b0, b1, b2 = b[..., 0], b[..., 1], b[..., 2]
     return np.stack([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0], axis=-1)
 
 
 def symmetric(matrix: Array) -> Array:
-    """The symmetric part of (..., n, n): what rounding took away from a covariance."""
+    """The symmetric part of matrices (..., n, n): restores the symmetry that rounding takes from a covariance."""
     return 0.5 * (matrix + np.swapaxes(matrix, -1, -2))
 
 
 def numeric_jacobian(f: Callable[[Array], Array], x: Array, step: float = 1e-6) -> Array:
-    """Central differences of f (n,) -> (...,) at x: (..., n). For checks of analytic Jacobians only."""
+    """Jacobian (..., n) at x of a function of (n,) to (...,), by central differences: for checks of analytic ones."""
+
     columns = []
     for i in range(x.size):
         e = np.zeros_like(x)

@@ -16,25 +16,29 @@ LENSES = (PERSPECTIVE, FISHEYE)
 
 @dataclass(frozen=True, slots=True)
 class SensorNoise:
-    """What turns photo-electrons into grey values."""
+    """The relation between photo-electrons and grey values."""
 
     gain_e_per_dn: float  # electrons per DN
     read_noise_e: float  # electrons, 1 sigma
-    black_dn: float = 0.0  # DN that no light gives
+    black_dn: float = 0.0  # DN of a pixel without light
 
 
 @dataclass(frozen=True, slots=True)
 class Camera:
-    """A calibrated camera bolted to the lab."""
+    """A calibrated camera, fixed in the lab.
+
+    Raises:
+        ValueError: unknown lens model, or a number of distortion coefficients that it does not have.
+    """
 
     name: str
-    screen: str  # the screen that it observes
+    screen: str  # name of the screen that it observes
     image_size_px: tuple[int, int]  # width, height
     matrix: Array  # (3, 3), px: fx, fy, cx, cy; no skew
     distortion: tuple[float, ...]  # OpenCV order; 0, 4, 5, 8, 12 or 14 numbers
     camera_from_world: Pose
     noise: SensorNoise | None = None
-    lens: str = PERSPECTIVE  # or FISHEYE: what the distortion numbers mean
+    lens: str = PERSPECTIVE  # or FISHEYE: the model whose coefficients the distortion numbers are
     fold_r2: float = field(init=False)  # squared normalised radius beyond which the lens model folds
 
     def __post_init__(self) -> None:
@@ -53,7 +57,7 @@ class Camera:
         object.__setattr__(self, "fold_r2", limit(self.distortion))
 
     def project(self, points_world: Array) -> Array:
-        """Distorted pixels (..., 2) of world points (..., 3), m; nan behind the camera or beyond the fold limit."""
+        """Distorted pixels (..., 2) of world points (..., 3), m; nan behind the camera or beyond the fold."""
         return project_points(
             self.camera_from_world.apply(np.asarray(points_world, dtype=float)),
             pinhole_numbers(self),
@@ -76,12 +80,15 @@ class Camera:
         return self.camera_from_world.inverse().translation, world.reshape(*pixels.shape[:-1], 3)
 
     def sees(self, pixels: Array, margin_px: float = 0.0) -> Bools:
-        """Whether pixels (..., 2) lie in the picture, or at most `margin_px` outside it. nan does not."""
+        """Whether pixels (..., 2) lie in the picture, or at most `margin_px` outside it; False for nan."""
         return in_picture(np.asarray(pixels, dtype=float), np.asarray(self.image_size_px), margin_px)
 
 
 def in_picture(pixels: Array, sizes_px: Array, margin_px: float | Array = 0.0) -> Bools:
-    """-0.5 <= u < width - 0.5 and likewise for v, widened by the margin. sizes_px (..., 2): width, height."""
+    """Whether pixels (..., 2) lie in pictures: -0.5 <= u < width - 0.5, the same for v, widened by the margin.
+
+    sizes_px (..., 2): width, height. False for nan.
+    """
     shifted = pixels + 0.5
     margin = np.asarray(margin_px)[..., None]
     return np.all((shifted >= -margin) & (shifted < sizes_px + margin), axis=-1)
@@ -97,20 +104,20 @@ def project_points(
 ) -> tuple[Array, Array]:
     """Pixels (..., 2) and d(pixel)/d(point) (..., 2, 3), px/m, of points (..., 3), m, in the camera frame.
 
-    pinhole (..., 4): fx, fy, cx, cy; distortion (..., 14); fold_r2 (...); fisheye (...), None for none: all broadcast
-    against the points, so that points of different cameras go in one call. nan behind the camera (z <= 0) or beyond
-    the fold limit.
+    pinhole (..., 4): fx, fy, cx, cy; distortion (..., 14); fold_r2 (...); fisheye (...), None: no camera is one. All
+    are broadcast against the points, so that one call serves points of several cameras. nan behind the camera (z <= 0)
+    or beyond the fold.
     """
     xy, z, in_front = _on_image_plane(points_camera)
     focal, centre = pinhole[..., :2], pinhole[..., 2:]
     if distortion.any() or (fisheye is not None and np.any(fisheye)):
-        bent, J_lens = _bent(xy, distortion, fisheye)
-        good = in_front & lens.holds(xy, J_lens, fold_r2)
+        distorted, J_lens = _distorted(xy, distortion, fisheye)
+        good = in_front & lens.is_one_to_one(xy, J_lens, fold_r2)
         J_xy = focal[..., :, None] * J_lens
     else:
-        bent, good = xy, in_front
+        distorted, good = xy, in_front
         J_xy = np.broadcast_to(focal[..., :, None] * np.eye(2), (*xy.shape, 2))
-    pixels = np.where(good[..., None], focal * bent + centre, np.nan)
+    pixels = np.where(good[..., None], focal * distorted + centre, np.nan)
     J = np.empty((*xy.shape, 3))
     J[..., :2] = J_xy / z[..., None, None]
     J[..., 2] = -np.einsum("...ij,...j->...i", J[..., :2], xy)
@@ -119,7 +126,7 @@ def project_points(
 
 @dataclass(frozen=True, slots=True)
 class Projected:
-    """Pixels of points and what every number of the camera does to them."""
+    """Pixels of points and their derivatives with respect to the point and to every number of the camera."""
 
     pixels: Array  # (..., 2), distorted; nan as in `project_points`
     d_point: Array  # (..., 2, 3), px/m
@@ -130,35 +137,36 @@ class Projected:
 def project_points_full(
     points_camera: Array, pinhole: Array, distortion: Array, fold_r2: Array, fisheye: Bools | None = None
 ) -> Projected:
-    """As `project_points`, with the derivatives with respect to the camera's own numbers: for calibrations."""
+    """As `project_points`, with the derivatives with respect to the camera's numbers too: for calibrations."""
     pixels, d_point = project_points(points_camera, pinhole, distortion, fold_r2, fisheye)
     xy, _, _ = _on_image_plane(points_camera)
-    bent, _ = _bent(xy, distortion, fisheye)
+    distorted, _ = _distorted(xy, distortion, fisheye)
     d_coefficients = lens.coefficient_jacobian(xy, distortion)
     if fisheye is not None and np.any(fisheye):
         wide = lens.fisheye_coefficient_jacobian(xy, distortion)
         d_coefficients = np.where(np.asarray(fisheye)[..., None, None], wide, d_coefficients)
     d_pinhole = np.zeros((*pixels.shape, 4))
-    d_pinhole[..., 0, 0], d_pinhole[..., 1, 1] = bent[..., 0], bent[..., 1]
+    d_pinhole[..., 0, 0], d_pinhole[..., 1, 1] = distorted[..., 0], distorted[..., 1]
     d_pinhole[..., 0, 2] = d_pinhole[..., 1, 3] = 1.0
     return Projected(pixels, d_point, d_pinhole, pinhole[..., :2, None] * d_coefficients)
 
 
 def _on_image_plane(points_camera: Array) -> tuple[Array, Array, Bools]:
-    """Normalised image points (..., 2), depths with 1 for points behind the camera, and which lie in front."""
+    """Normalised image points (..., 2), depths (...), m (1 for points behind the camera), and which lie in front."""
     z = points_camera[..., 2]
     in_front = z > 1e-9
     z = np.where(in_front, z, 1.0)
     return points_camera[..., :2] / z[..., None], z, in_front
 
 
-def _bent(xy: Array, distortion: Array, fisheye: Bools | None) -> tuple[Array, Array]:
-    """Distorted normalised points and their Jacobian, each by its camera's model."""
+def _distorted(xy: Array, distortion: Array, fisheye: Bools | None) -> tuple[Array, Array]:
+    """Distorted normalised points and their Jacobians, each by the model of its camera."""
+
     if fisheye is None or not np.any(fisheye):
         return lens.distort(xy, distortion)
     wide, J_wide = lens.distort_fisheye(xy, distortion)
     if np.all(fisheye):
         return wide, J_wide
-    bent, J = lens.distort(xy, distortion)
+    distorted, J = lens.distort(xy, distortion)
     which = np.asarray(fisheye)[..., None]
-    return np.where(which, wide, bent), np.where(which[..., None], J_wide, J)
+    return np.where(which, wide, distorted), np.where(which[..., None], J_wide, J)

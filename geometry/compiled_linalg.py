@@ -1,10 +1,10 @@
-"""Small matrices and rotations, one at a time, compiled: for the loops that look at a frame after the other.
+"""Linear algebra of small matrices and single rotations, compiled: for the trackers, which process frame by frame.
 
-The same formulas as geometry/rotations.py, which does stacks; the tests hold the two together. Matrices are C-ordered
-float64.
+The rotations are those of geometry/rotations.py, which computes stacks with numpy and serves everything else;
+tests/geometry/test_compiled_linalg.py compares the two. Matrices are C-ordered float64.
 
-Loops stand here where numpy has a word for it: each array expression, slice that is assigned to, sum or sort costs
-numba a kernel of its own, 0.1 to 3 s of compiling on the user's first run, and runs no faster.
+Loops replace array expressions on purpose: each array expression, assignment to a slice, sum or sort makes numba
+compile a kernel of its own, 0.1 to 3 s on the user's first run, and runs no faster.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from geometry.compilation.jit import compiled
 
 @compiled
 def copy_into(out: Array | Ints, x: Array | Ints) -> None:
-    """out[:] = x, vectors (n,)."""
+    """out[:] = x, for vectors (n,)."""
     for i in range(x.shape[0]):
         out[i] = x[i]
 
 
 @compiled
 def copy_matrix_into(out: Array, a: Array) -> None:
-    """out[:] = a, matrices (n, m)."""
+    """out[:] = a, for matrices (n, m)."""
     for i in range(a.shape[0]):
         for j in range(a.shape[1]):
             out[i, j] = a[i, j]
@@ -32,7 +32,7 @@ def copy_matrix_into(out: Array, a: Array) -> None:
 
 @compiled
 def block(a: Array, n: int) -> Array:
-    """The first n rows and columns of a matrix, as one of their own."""
+    """A copy (n, n) of the first n rows and columns of a matrix."""
     out = np.empty((n, n))
     for i in range(n):
         for j in range(n):
@@ -42,7 +42,7 @@ def block(a: Array, n: int) -> Array:
 
 @compiled
 def column(a: Array, j: int) -> Array:
-    """Column j of a matrix (n, m), as a vector (n,) of its own."""
+    """A copy (n,) of column j of a matrix (n, m)."""
     out = np.empty(a.shape[0])
     for i in range(a.shape[0]):
         out[i] = a[i, j]
@@ -51,7 +51,7 @@ def column(a: Array, j: int) -> Array:
 
 @compiled
 def hstack(a: Array, x: Array) -> Array:
-    """[a, x] (n, m + 1): the right sides of one system."""
+    """[a, x] (n, m + 1): a matrix (n, m) with a vector (n,) as its last column."""
     n, m = a.shape
     out = np.empty((n, m + 1))
     for i in range(n):
@@ -63,7 +63,7 @@ def hstack(a: Array, x: Array) -> Array:
 
 @compiled
 def best_first(score: Array) -> Ints:
-    """The order (n,) of scores from the highest to the lowest; of equals the earlier comes first."""
+    """Indices (n,) that sort scores in descending order; equal scores keep their order."""
     n = score.shape[0]
     order = np.empty(n, np.int64)
     for i in range(n):
@@ -77,7 +77,7 @@ def best_first(score: Array) -> Ints:
 
 @compiled
 def dot(x: Array, y: Array) -> float:
-    """The product of two vectors (n,)."""
+    """The scalar product of two vectors (n,)."""
     s = 0.0
     for i in range(x.shape[0]):
         s += x[i] * y[i]
@@ -86,7 +86,7 @@ def dot(x: Array, y: Array) -> float:
 
 @compiled
 def multiply(a: Array, b: Array) -> Array:
-    """a @ b of small matrices; for these a plain loop is faster than a library call."""
+    """a @ b of small matrices, for which a plain loop is faster than a library call."""
     n, m, k = a.shape[0], b.shape[1], a.shape[1]
     out = np.zeros((n, m))
     for i in range(n):
@@ -138,7 +138,7 @@ def transposed_apply(a: Array, x: Array) -> Array:
 
 @compiled
 def solve(a: Array, b: Array) -> tuple[Array, float]:
-    """x (n, m) with a x = b, and log |det a|, by elimination with row pivots; not finite where det is 0."""
+    """x (n, m) with a x = b, and log |det a|, by elimination with row pivoting; not finite where det a is 0."""
     n, m = a.shape[0], b.shape[1]
     lu, x = a.copy(), b.copy()
     log_det = 0.0
@@ -169,7 +169,7 @@ def solve(a: Array, b: Array) -> tuple[Array, float]:
     return x, log_det
 
 
-LEAST_PIVOT = 1e-15  # of a diagonal entry: what Cholesky's pivot is raised to where rounding has eaten it
+MIN_PIVOT = 1e-15  # smallest pivot of a Cholesky factor relative to the diagonal entry; rounding can make it negative
 
 
 @compiled
@@ -181,11 +181,11 @@ def cholesky(a: Array) -> Array:
         s = a[j, j]
         for k in range(j):
             s -= out[j, k] * out[j, k]
-        least = LEAST_PIVOT * a[j, j]
+        least = MIN_PIVOT * a[j, j]
         if not s > least:
             s = least
         if not s > 0.0:
-            continue  # nothing varies here: the column stays 0
+            continue  # zero variance: the column stays 0
         root = np.sqrt(s)
         out[j, j] = root
         for i in range(j + 1, n):
@@ -198,10 +198,10 @@ def cholesky(a: Array) -> Array:
 
 @compiled
 def posterior(P: Array, information: Array) -> tuple[Array, float]:
-    """(P^-1 + Y)^-1 of a covariance P (n, n), and log det(I + P Y); positive definite whatever the rounding.
+    """(P^-1 + Y)^-1 of a covariance P (n, n), and log det(I + P Y); positive definite in spite of rounding.
 
-    information (k, k), k <= n: Y of the first k numbers, 0 of the others; it may lack rank. With P = S S^T the result
-    is S (I + S^T Y S)^-1 S^T, a square: nothing is subtracted, so a vague P and a sharp Y lose no digits.
+    information (k, k), k <= n: Y of the first k numbers, 0 of the others; it may be singular. With P = S S^T the result
+    is S (I + S^T Y S)^-1 S^T, a square. Nothing is subtracted, so a vague P and a precise Y lose no digits.
     """
     n, k = P.shape[0], information.shape[0]
     S = cholesky(P)
@@ -253,7 +253,7 @@ def posterior(P: Array, information: Array) -> tuple[Array, float]:
 
 @compiled
 def symmetrise(a: Array) -> None:
-    """Take away what rounding did to a covariance's symmetry, in place."""
+    """Replaces a matrix (n, n) by its symmetric part, in place."""
     n = a.shape[0]
     for i in range(n):
         for j in range(i):
@@ -282,7 +282,7 @@ def exp(w: Array) -> Array:
 
 @compiled
 def log(R: Array) -> Array:
-    """The rotation vector (3,), rad, of a rotation matrix (3, 3), through the best conditioned quaternion."""
+    """The rotation vector (3,), rad, of a rotation matrix (3, 3), by way of the best conditioned quaternion."""
     q = np.empty(4)
     trace = R[0, 0] + R[1, 1] + R[2, 2]
     i = 0
@@ -314,7 +314,7 @@ def log(R: Array) -> Array:
 
 @compiled
 def right_jacobian(w: Array) -> Array:
-    """J_r (3, 3) with Exp(w + d) = Exp(w) Exp(J_r d) to first order."""
+    """The right Jacobian J_r (3, 3) of a rotation vector (3,): Exp(w + d) = Exp(w) Exp(J_r d) to first order."""
     angle2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
     if angle2 < 1e-8:
         a, b = 0.5 - angle2 / 24.0, 1.0 / 6.0 - angle2 / 120.0
@@ -332,7 +332,7 @@ def right_jacobian(w: Array) -> Array:
 
 @compiled
 def pose_plus(R: Array, t: Array, d: Array) -> tuple[Array, Array]:
-    """The pose that is d (6,) away: R Exp(dtheta) and t + dt, as Pose.plus."""
+    """The pose (R, t) changed by d (6,): R Exp(dtheta) and t + dt, as `Pose.plus`."""
     t_new = np.empty(3)
     for i in range(3):
         t_new[i] = t[i] + d[i]
@@ -341,7 +341,8 @@ def pose_plus(R: Array, t: Array, d: Array) -> tuple[Array, Array]:
 
 @compiled
 def pose_minus(R: Array, t: Array, R0: Array, t0: Array) -> Array:
-    """The delta (6,) from pose (R0, t0) to (R, t), as Pose.minus."""
+    """The delta (6,) from the pose (R0, t0) to the pose (R, t), as `Pose.minus`."""
+
     out = np.empty(6)
     turn = log(transposed_multiply(R0, R))
     for i in range(3):

@@ -1,7 +1,10 @@
-"""The forward model for one pose at a time, compiled: pixels of a rig's views and their Jacobian.
+"""The compiled implementation of the forward model: pixels of a rig's views and their Jacobian by the pose.
 
-The same geometry as SpotModel.hits and camera.project_points, which are written for arrays and serve calibrations; the
-tests hold the two together. SpotModel.project calls this one.
+The forward model is geometry/forward_model.py; start there. Its `SpotModel.project` calls `project_all` of this module,
+and the trackers' compiled loops call `project_view`. The same geometry stands a second time in
+numpy, in `SpotModel.hits` and `SpotModel.derivatives` with camera.project_points_full: calibrations need derivatives by
+every number of the rig, over stacks of poses, and run seldom. tests/geometry/test_forward_model.py compares both with
+each other, and this one with a plain computation by other means.
 """
 
 from __future__ import annotations
@@ -14,8 +17,8 @@ from numpy.typing import NDArray
 from geometry.arrays import Array, Bools
 from geometry.compilation.jit import compiled
 
-# A SpotModel's numbers as the compiled functions want them, one record per view; meanings and units as there. In one
-# array, since numba unpacks a tuple of arrays at every call: with thirteen a frame took 0.39 ms, in place of 0.32.
+# The numbers of a SpotModel as one record per view; meanings and units as there. They form one array because numba
+# unpacks a tuple of arrays at every call: with thirteen arrays a frame took 0.39 ms instead of 0.32.
 VIEW = np.dtype(
     [
         ("point", np.float64, 3),
@@ -28,8 +31,8 @@ VIEW = np.dtype(
         ("camera_translation", np.float64, 3),
         ("pinhole", np.float64, 4),
         ("distortion", np.float64, 14),
-        ("tilt", np.float64, (3, 3)),  # of the sensor, from the last two distortion numbers
-        ("lens", np.int64),  # 0: none, 1: polynomial, 2: polynomial and tilt, 3: fisheye
+        ("tilt", np.float64, (3, 3)),  # homography of the sensor's tilt, from the last two distortion numbers
+        ("lens", np.int64),  # distortion model; 0: none, 1: polynomial, 2: polynomial and tilt, 3: fisheye
         ("fold_r2", np.float64),
     ],
     align=True,
@@ -39,13 +42,16 @@ Views: TypeAlias = NDArray[np.void]  # (n,) of VIEW
 
 @compiled
 def inside(uv: Array, size: Array) -> bool:
-    """Whether a pixel (2,) lies in a picture of a size (2,). nan does not."""
+    """Whether a pixel (2,) lies in a picture of a size (2,): width, height; False for nan."""
     return uv[0] >= -0.5 and uv[1] >= -0.5 and uv[0] < size[0] - 0.5 and uv[1] < size[1] - 0.5
 
 
 @compiled
 def project_all(v: Views, R: Array, t: Array) -> tuple[Array, Array]:
-    """Pixels (m, n, 2) and Jacobians (m, n, 2, 6) of poses R (m, 3, 3), t (m, 3). nan and 0 where there is none."""
+    """Pixels (m, n, 2) and Jacobians (m, n, 2, 6) of n views for poses R (m, 3, 3), t (m, 3), m.
+
+    nan and 0 where a view has no projection.
+    """
     m, n = R.shape[0], v.shape[0]
     uv, J = np.empty((m, n, 2)), np.empty((m, n, 2, 6))
     for k in range(m):
@@ -56,7 +62,10 @@ def project_all(v: Views, R: Array, t: Array) -> tuple[Array, Array]:
 
 @compiled
 def project_view(v: Views, i: int, R: Array, t: Array, uv: Array, J: Array) -> bool:
-    """One view's pixel into uv (2,) and its Jacobian into J (2, 6); whether there is one (else nan and 0)."""
+    """Writes the pixel of view i to uv (2,) and its Jacobian to J (2, 6); False, nan and 0 if there is no projection.
+
+    R (3, 3), t (3,), m: world_from_body.
+    """
     if _project(v, i, R, t, uv, J):
         return True
     for row in range(2):
@@ -68,22 +77,23 @@ def project_view(v: Views, i: int, R: Array, t: Array, uv: Array, J: Array) -> b
 
 @compiled
 def _project(v: Views, i: int, R: Array, t: Array, uv: Array, J: Array) -> bool:
-    # The ray in world meets the screen.
+    """As `project_view`, but leaves uv and J undefined if there is no projection."""
+    # Intersection of the ray, in world, with the screen.
     view = v[i]
     origin, d, normal, hit, lever = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
-    S, s0 = view.screen_rotation, view.screen_origin
+    S, s0 = view["screen_rotation"], view["screen_origin"]
     facing = height = 0.0
     for a in range(3):
-        origin[a] = R[a, 0] * view.point[0] + R[a, 1] * view.point[1] + R[a, 2] * view.point[2] + t[a]
-        d[a] = R[a, 0] * view.ray[0] + R[a, 1] * view.ray[1] + R[a, 2] * view.ray[2]
+        origin[a] = R[a, 0] * view["point"][0] + R[a, 1] * view["point"][1] + R[a, 2] * view["point"][2] + t[a]
+        d[a] = R[a, 0] * view["ray"][0] + R[a, 1] * view["ray"][1] + R[a, 2] * view["ray"][2]
         normal[a] = S[a, 2]
         facing += normal[a] * d[a]
         height += normal[a] * (s0[a] - origin[a])
     if abs(facing) <= 1e-12:
         return False
     length = height / facing
-    if view.bow[0] != 0.0 or view.bow[1] != 0.0 or view.bow[2] != 0.0:
-        length = _meet_bent(v, i, origin, d, length, normal)
+    if view["bow"][0] != 0.0 or view["bow"][1] != 0.0 or view["bow"][2] != 0.0:
+        length = _intersect_bent(v, i, origin, d, length, normal)
         facing = normal[0] * d[0] + normal[1] * d[1] + normal[2] * d[2]
     if not length > 0.0:
         return False
@@ -92,22 +102,22 @@ def _project(v: Views, i: int, R: Array, t: Array, uv: Array, J: Array) -> bool:
         lever[a] = hit[a] - t[a]
     for a in range(2):
         along = S[0, a] * (hit[0] - s0[0]) + S[1, a] * (hit[1] - s0[1]) + S[2, a] * (hit[2] - s0[2])
-        if not abs(along) <= view.half_size[a]:
+        if not abs(along) <= view["half_size"][a]:
             return False
-    # The camera sees the lit point.
-    C = view.camera_rotation
-    x = C[0, 0] * hit[0] + C[0, 1] * hit[1] + C[0, 2] * hit[2] + view.camera_translation[0]
-    y = C[1, 0] * hit[0] + C[1, 1] * hit[1] + C[1, 2] * hit[2] + view.camera_translation[1]
-    z = C[2, 0] * hit[0] + C[2, 1] * hit[1] + C[2, 2] * hit[2] + view.camera_translation[2]
+    # Image of the lit point in the camera.
+    C = view["camera_rotation"]
+    x = C[0, 0] * hit[0] + C[0, 1] * hit[1] + C[0, 2] * hit[2] + view["camera_translation"][0]
+    y = C[1, 0] * hit[0] + C[1, 1] * hit[1] + C[1, 2] * hit[2] + view["camera_translation"][1]
+    z = C[2, 0] * hit[0] + C[2, 1] * hit[1] + C[2, 2] * hit[2] + view["camera_translation"][2]
     if not z > 1e-9:
         return False
     x, y = x / z, y / z
     bx, by, xx, xy, yx, yy = _distorted(v, i, x, y)  # and the Jacobian [[xx, xy], [yx, yy]] of the distortion
-    if view.lens != 0 and not (x * x + y * y < view.fold_r2 and xx * yy - xy * yx > 0.0):
+    if view["lens"] != 0 and not (x * x + y * y < view["fold_r2"] and xx * yy - xy * yx > 0.0):
         return False
-    fx, fy = view.pinhole[0], view.pinhole[1]
-    uv[0], uv[1] = fx * bx + view.pinhole[2], fy * by + view.pinhole[3]
-    # d(pixel)/d(hit), in world, row by row; along the ray a move of the vehicle changes nothing.
+    fx, fy = view["pinhole"][0], view["pinhole"][1]
+    uv[0], uv[1] = fx * bx + view["pinhole"][2], fy * by + view["pinhole"][3]
+    # d(pixel)/d(hit), in world, row by row; the component of the vehicle's motion along the ray has no effect.
     for row in range(2):
         gx, gy = (fx * xx / z, fx * xy / z) if row == 0 else (fy * yx / z, fy * yy / z)
         gz = -(gx * x + gy * y)
@@ -125,11 +135,14 @@ def _project(v: Views, i: int, R: Array, t: Array, uv: Array, J: Array) -> bool:
 
 
 @compiled
-def _meet_bent(v: Views, i: int, origin: Array, d: Array, length: float, normal: Array) -> float:
-    """Newton's method from the flat screen; the surface's normal there goes into `normal`."""
+def _intersect_bent(v: Views, i: int, origin: Array, d: Array, length: float, normal: Array) -> float:
+    """Length, m, of a ray to a bent screen; writes the surface's normal there, in world, to `normal`.
+
+    Newton's method from the flat screen, at the given length.
+    """
     view = v[i]
-    S, s0 = view.screen_rotation, view.screen_origin
-    a, b, c = view.bow[0], view.bow[1], view.bow[2]
+    S, s0 = view["screen_rotation"], view["screen_origin"]
+    a, b, c = view["bow"][0], view["bow"][1], view["bow"][2]
     p, q = np.empty(3), np.empty(3)
     for k in range(3):
         p[k] = S[0, k] * (origin[0] - s0[0]) + S[1, k] * (origin[1] - s0[1]) + S[2, k] * (origin[2] - s0[2])
@@ -148,12 +161,15 @@ def _meet_bent(v: Views, i: int, origin: Array, d: Array, length: float, normal:
 
 @compiled
 def _distorted(v: Views, i: int, x: float, y: float) -> tuple[float, float, float, float, float, float]:
-    """The distorted normalised point and the Jacobian's entries, as lens.distort and lens.distort_fisheye."""
+    """The distorted normalised point and the entries xx, xy, yx, yy of the Jacobian.
+
+    As lens.distort and lens.distort_fisheye.
+    """
     view = v[i]
-    kind = view.lens
+    kind = view["lens"]
     if kind == 0:
         return x, y, 1.0, 0.0, 0.0, 1.0
-    k = view.distortion
+    k = view["distortion"]
     r2 = x * x + y * y
     if kind == 3:
         scale, growth = 1.0, 0.0
@@ -188,7 +204,7 @@ def _distorted(v: Views, i: int, x: float, y: float) -> tuple[float, float, floa
     c = mixed + 2 * x * d_prism_y
     e = radial + 2 * y * y * d_radial + 6 * p1 * y + 2 * p2 * x + 2 * y * d_prism_y
     if kind == 2:
-        T = view.tilt
+        T = view["tilt"]
         hx = T[0, 0] * bx + T[0, 1] * by + T[0, 2]
         hy = T[1, 0] * bx + T[1, 1] * by + T[1, 2]
         hz = T[2, 0] * bx + T[2, 1] * by + T[2, 2]
@@ -199,8 +215,9 @@ def _distorted(v: Views, i: int, x: float, y: float) -> tuple[float, float, floa
     return bx, by, a, b, c, e
 
 
-def lens_kinds(distortion: Array, fisheye: Bools) -> Array:
-    """(n,) of VIEW's lens from distortion numbers (n, 14) and which are the fisheye model's."""
+def lens_codes(distortion: Array, fisheye: Bools) -> Array:
+    """The field `lens` of VIEW (n,), from distortion numbers (n, 14) and whether they are the fisheye model's (n,)."""
+
     bent = np.any(distortion != 0, axis=-1)
     tilted = np.any(distortion[..., 12:] != 0, axis=-1)
     return np.where(fisheye, 3, np.where(tilted, 2, np.where(bent, 1, 0))).astype(np.int64)

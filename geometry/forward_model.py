@@ -1,7 +1,15 @@
-"""The one forward model: from a pose of the vehicle to the pixels of its spots, with the Jacobian.
+"""The forward model: from a pose of the vehicle to the pixels of its spots, with Jacobians.
 
-A pose puts each beam into world; its ray meets its screen; the camera sees the point of light. The solver, the
-trackers, the spots out of view and the simulator all use this and nothing else.
+The pose transforms each beam to world, the beam's ray intersects its screen, and the camera projects the lit point. The
+solver, the trackers, the simulator and the calibrations all use this model. It has two implementations:
+
+- `SpotModel.project`, compiled (geometry/compiled_projection.py): pixels and their Jacobian by the pose, for the
+  solver, trackers and simulator, which call it several times per frame;
+- `SpotModel.hits` and `SpotModel.derivatives`, numpy: lit points, and derivatives by every number of the rig, for
+  calibrations and their covariances.
+
+tests/geometry/test_forward_model.py compares the pixels and pose Jacobians of both
+(test_the_compiled_and_the_numpy_implementation_agree).
 """
 
 from __future__ import annotations
@@ -12,7 +20,7 @@ import numpy as np
 
 from geometry.arrays import Array, Bools, Ints, cross, skew
 from geometry.camera import FISHEYE, in_picture, pinhole_numbers, project_points_full
-from geometry.compiled_projection import VIEW, Views, lens_kinds, project_all
+from geometry.compiled_projection import VIEW, Views, lens_codes, project_all
 from geometry.lens import padded, tilt_matrix
 from geometry.pose import Pose
 from geometry.rig import Rig
@@ -20,9 +28,9 @@ from geometry.rig import Rig
 
 @dataclass(frozen=True, slots=True)
 class SpotDerivatives:
-    """Pixels of n views and what each number of the rig does to them, px per unit.
+    """Pixels of n views and their derivatives by every number of the rig, px per unit.
 
-    A transform's error is [dt (m, in its first frame), dtheta (rad, in its second)], section 1 of the files' contract.
+    The error of a transform a_from_b is [dt (m, in a), dtheta (rad, in b)], section 1 of the file contract.
     """
 
     pixels: Array  # (..., n, 2); nan where there is no projection
@@ -32,30 +40,30 @@ class SpotDerivatives:
     camera: Array  # (..., n, 2, 6) of camera_from_world
     screen: Array  # (..., n, 2, 6) of world_from_screen
     bow: Array  # (..., n, 2, 3) of the screen's bow
-    direction: Array  # (..., n, 2, 3) of the beam's direction, in body; along the beam it does nothing
-    point: Array  # (..., n, 2, 3) of the beam's point, m, in body; along the beam it does nothing
+    direction: Array  # (..., n, 2, 3) of the beam's direction, in body; 0 along the beam
+    point: Array  # (..., n, 2, 3) of the beam's point, m, in body; 0 along the beam
 
 
 @dataclass(frozen=True, slots=True)
-class _Meeting:
-    """Rays that meet their screens, (..., n)."""
+class _Intersection:
+    """Intersections of n rays with their screens, for poses (...)."""
 
     R: Array  # (..., 1, 3, 3) world from body
     d: Array  # (..., n, 3) the ray in world
-    t: Array  # (..., n) m, its length to the screen
+    t: Array  # (..., n) m, the ray's length to the screen
     hit: Array  # (..., n, 3) m, in world
     on_screen: Array  # (..., n, 3) m, the same in the screen's frame
     normal: Array  # (..., n, 3) the surface's normal there, in world; not of unit length on a bent screen
-    along: Array  # (..., n) normal . d, 1 where that is none
+    along: Array  # (..., n) normal . d; 1 where the ray is parallel to the screen
     oblique: Array  # (..., n, 3, 3) the projection along the ray onto the surface
-    good: Bools  # (..., n)
+    good: Bools  # (..., n) whether the ray meets the screen within its extent
 
 
 @dataclass(frozen=True, slots=True)
 class SpotModel:
-    """A rig unrolled into arrays, one row per view: a camera and a spot of the screen that it observes.
+    """A rig as arrays with one row per view: a camera and a spot of the screen that it observes.
 
-    n views, in the order of Rig.views(): by camera, then by spot.
+    The n views have the order of Rig.views(): by camera, then by spot.
     """
 
     views: tuple[tuple[str, str], ...]  # (camera, spot)
@@ -78,10 +86,10 @@ class SpotModel:
     fisheye: Bools  # (n,)
     fold_r2: Array  # (n,)
     image_size_px: Array  # (n, 2): width, height
-    numbers: Views = field(init=False, repr=False, compare=False)  # the same for the compiled functions
+    numbers: Views = field(init=False, repr=False, compare=False)  # the same as records, for the compiled functions
 
     def __post_init__(self) -> None:
-        lens = lens_kinds(self.distortion, self.fisheye)
+        lens = lens_codes(self.distortion, self.fisheye)
         tilt = tilt_matrix(self.distortion[..., 12], self.distortion[..., 13])
         numbers = np.empty(self.point.shape[:-1], VIEW)
         for name in VIEW.names or ():
@@ -90,7 +98,7 @@ class SpotModel:
 
     @staticmethod
     def of(rig: Rig) -> SpotModel:
-        """Unroll a rig."""
+        """The arrays of a rig."""
         views = rig.views()
         cameras = [rig.cameras[c] for c, _ in views]
         spots = [rig.spots[s] for _, s in views]
@@ -146,16 +154,20 @@ class SpotModel:
         )
 
     def hits(self, world_from_body: Pose) -> tuple[Array, Array]:
-        """Where the rays meet their screens: world points (..., n, 3), m, and their Jacobian (..., n, 3, 6).
+        """Lit points on the screens, in world (..., n, 3), m, and their Jacobian (..., n, 3, 6).
 
         The pose may be a stack (...). The Jacobian is with respect to the pose error [dt (m, world), dtheta (rad,
-        body)], section 1 of the files' contract. A ray that is parallel to its screen, points away from it or falls
-        beside its extent gives nan.
+        body)], section 1 of the file contract. nan where a ray is parallel to its screen, points away from it or
+        passes beside its extent.
         """
-        m = self._meet(world_from_body)
-        # Along the ray a small move changes nothing, so only what the move does across the ray counts:
+        m = self._intersect(world_from_body)
+        return np.where(m.good[..., None], m.hit, np.nan), self._hit_jacobian(m)
+
+    def _hit_jacobian(self, m: _Intersection) -> Array:
+        """The Jacobian (..., n, 3, 6) of the lit points, as in `hits`."""
+        # A small motion of the ray along itself has no effect, so the motion is projected along the ray:
         # d(hit) = (I - d n^T / (n.d)) (d(p) + t d(d)), and with theta in body: d(p) + t d(d) = dt - R [q]x dtheta,
-        # q = point + t ray the lit point in body.
+        # where q = point + t ray is the lit point in body.
         q = self.point + m.t[..., None] * self.ray
         J = np.empty((*m.hit.shape, 6))
         J[..., :3] = m.oblique
@@ -163,10 +175,10 @@ class SpotModel:
         lever = (m.R @ q[..., None])[..., 0]
         columns = cross(np.swapaxes(m.R, -1, -2), lever[..., None, :])  # (..., n, 3 axes, 3)
         J[..., 3:] = m.oblique @ np.swapaxes(columns, -1, -2)
-        return np.where(m.good[..., None], m.hit, np.nan), J
+        return J
 
-    def _meet(self, world_from_body: Pose) -> _Meeting:
-        """Rays and screens brought together."""
+    def _intersect(self, world_from_body: Pose) -> _Intersection:
+        """Intersections of the rays with their screens."""
         R = world_from_body.rotation[..., None, :, :]
         p = (R @ self.point[..., None])[..., 0] + world_from_body.translation[..., None, :]
         d = (R @ self.ray[..., None])[..., 0]
@@ -176,20 +188,20 @@ class SpotModel:
         ahead = np.abs(facing) > 1e-12
         t = height / np.where(ahead, facing, 1.0)
         if self.bow.any():
-            t, normal = self._meet_bent(p, d, t)
+            t, normal = self._intersect_bent(p, d, t)
             facing = np.sum(normal * d, axis=-1)
         hit = p + t[..., None] * d
         on_screen = ((hit - self.screen_origin)[..., None, :] @ self.screen_rotation)[..., 0, :]
         good = ahead & (t > 0) & np.all(np.abs(on_screen[..., :2]) <= self.half_size, axis=-1)
         along = np.where(ahead, facing, 1.0)
         oblique = np.eye(3) - d[..., :, None] * normal[..., None, :] / along[..., None, None]
-        return _Meeting(R, d, t, hit, on_screen, normal, along, oblique, good)
+        return _Intersection(R, d, t, hit, on_screen, normal, along, oblique, good)
 
-    def _meet_bent(self, p: Array, d: Array, t: Array) -> tuple[Array, Array]:
-        """Where rays meet bent screens: lengths (..., n) and the surface's normal there, (..., n, 3), in world.
+    def _intersect_bent(self, p: Array, d: Array, t: Array) -> tuple[Array, Array]:
+        """Lengths (..., n), m, of rays to bent screens, and the surface normals there (..., n, 3), in world.
 
-        Newton's method from the flat screen. A bow of centimetres over metres converges in two or three steps to
-        rounding; the fourth is for larger ones.
+        p, d: (..., n, 3), m and unit, in world; t (..., n), m: lengths to the flat screens. Newton's method from there:
+        a bow of centimetres over metres converges to rounding in two or three steps; the fourth is for larger bows.
         """
         a, b, c = np.moveaxis(self.bow, -1, 0)
         p_s = ((p - self.screen_origin)[..., None, :] @ self.screen_rotation)[..., 0, :]
@@ -206,12 +218,12 @@ class SpotModel:
     def project(self, world_from_body: Pose) -> tuple[Array, Array]:
         """Distorted pixels (..., n, 2) and their Jacobian (..., n, 2, 6), px per m and px per rad.
 
-        nan where no projection exists: the beam misses its screen, or the point lies beyond what the lens model
-        maps. Pixels outside the picture are given as well. Jacobian as in `hits`.
+        nan where no projection exists: the beam misses its screen, or the lit point lies behind the camera or beyond
+        the fold of its lens. Pixels outside the picture are returned too. The pose and the Jacobian are as in `hits`.
         """
         R, t = world_from_body.rotation, world_from_body.translation
         stack = np.broadcast_shapes(R.shape[:-2], t.shape[:-1])
-        # Copies, since numba takes arrays that must not be written to for another type and compiles anew for each.
+        # Copies, because read-only arrays have another type for numba, which would compile a second time for them.
         uv, J = project_all(
             self.numbers,
             np.array(np.broadcast_to(R, (*stack, 3, 3)), dtype=np.float64, order="C").reshape(-1, 3, 3),
@@ -221,17 +233,17 @@ class SpotModel:
         return uv.reshape(*stack, n, 2), J.reshape(*stack, n, 2, 6)
 
     def derivatives(self, world_from_body: Pose) -> SpotDerivatives:
-        """As `project`, with the derivatives with respect to everything in the rig that a calibration determines.
+        """As `project`, with the derivatives by everything in the rig that a calibration determines.
 
-        The pose may be a stack (...). Where there is no projection the pixel is nan and the derivatives mean nothing.
+        The pose may be a stack (...). Without a projection the pixel is nan and the derivatives are undefined.
         """
-        m = self._meet(world_from_body)
+        m = self._intersect(world_from_body)
         R_c, R_s = self.camera_rotation, self.screen_rotation
         in_camera = (R_c @ m.hit[..., None])[..., 0] + self.camera_translation
         safe = np.where(m.good[..., None], in_camera, [0.0, 0.0, 1.0])
         projected = project_points_full(safe, self.pinhole, self.distortion, self.fold_r2, self.fisheye)
         d_hit = projected.d_point @ R_c  # px per m of the lit point, in world
-        # A screen that moves by delta at the lit point carries the point along the ray: d (n.delta) / (n.d).
+        # If the screen moves by delta at the lit point, the point moves along the ray by d (n.delta) / (n.d).
         carried = m.d[..., :, None] * (m.normal / m.along[..., None])[..., None, :]
         x, y = m.on_screen[..., 0], m.on_screen[..., 1]
         bulge = R_s[..., :, 2:] * np.stack([x * x, x * y, y * y], axis=-1)[..., None, :]
@@ -240,7 +252,7 @@ class SpotModel:
         d_point = d_hit @ m.oblique @ m.R
         return SpotDerivatives(
             pixels=np.where(m.good[..., None], projected.pixels, np.nan),
-            pose=d_hit @ self.hits(world_from_body)[1],
+            pose=d_hit @ self._hit_jacobian(m),
             pinhole=projected.d_pinhole,
             distortion=projected.d_distortion,
             camera=projected.d_point @ d_camera,
@@ -251,5 +263,6 @@ class SpotModel:
         )
 
     def in_picture(self, pixels: Array, margin_px: float = 0.0) -> Bools:
-        """Whether pixels (..., n, 2) lie in their cameras' pictures, or at most the margin outside. nan does not."""
+        """Whether pixels (..., n, 2) lie in their cameras' pictures, or at most the margin outside; False for nan."""
+
         return in_picture(pixels, self.image_size_px, margin_px)

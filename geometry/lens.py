@@ -1,8 +1,8 @@
-"""The lens models: OpenCV's distortions of normalised image points, their Jacobians, and how far out they hold.
+"""The lens models: OpenCV's distortions of normalised image points, their Jacobians, and the radius where they fold.
 
-Twelve polynomial numbers and two tilt angles, in OpenCV's order: k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4,
-tau_x, tau_y; or OpenCV's fisheye model with four. Source: OpenCV, calib3d, "Detailed description"; the tests compare
-with cv2.projectPoints and cv2.fisheye.projectPoints.
+The perspective model has twelve polynomial coefficients and two tilt angles, in OpenCV's order: k1, k2, p1, p2, k3, k4,
+k5, k6, s1, s2, s3, s4, tau_x, tau_y. The fisheye model has four. Source: OpenCV, calib3d, "Detailed description"; the
+tests compare with cv2.projectPoints and cv2.fisheye.projectPoints.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ ALLOWED_LENGTHS = (0, 4, 5, 8, 12, 14)
 
 
 def padded(distortion: tuple[float, ...]) -> Array:
-    """All fourteen numbers of a model given by its first 0, 4, 5, 8, 12 or 14."""
+    """All fourteen coefficients (14,) of a model given by its first 0, 4, 5, 8, 12 or 14."""
     out = np.zeros(N_DISTORTION)
     out[: len(distortion)] = distortion
     return out
@@ -34,7 +34,7 @@ def distort(xy: Array, coefficients: Array) -> tuple[Array, Array]:
     numerator = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
     denominator = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
     radial = numerator / denominator
-    # derivatives with respect to r2
+    # Derivatives with respect to r2.
     d_numerator = k1 + r2 * (2 * k2 + 3 * r2 * k3)
     d_denominator = k4 + r2 * (2 * k5 + 3 * r2 * k6)
     d_radial = (d_numerator - radial * d_denominator) / denominator
@@ -56,7 +56,7 @@ def distort(xy: Array, coefficients: Array) -> tuple[Array, Array]:
 
 
 def _tilt(xy: Array, J: Array, tau_x: Array, tau_y: Array) -> tuple[Array, Array]:
-    """The Scheimpflug tilt of the sensor, applied last."""
+    """Distorted points (..., 2) and Jacobians (..., 2, 2) after the Scheimpflug tilt of the sensor, applied last."""
     T = tilt_matrix(np.asarray(tau_x), np.asarray(tau_y))
     h = T[..., :2] @ xy[..., None]
     h = h[..., 0] + T[..., 2]
@@ -66,10 +66,7 @@ def _tilt(xy: Array, J: Array, tau_x: Array, tau_y: Array) -> tuple[Array, Array
 
 
 def coefficient_jacobian(xy: Array, coefficients: Array) -> Array:
-    """d(distorted)/d(coefficients) (..., 2, 14) of `distort`: what a calibration's error in a number does to a point.
-
-    xy (..., 2) and coefficients (..., 14) as in `distort`.
-    """
+    """d(distorted)/d(coefficients) (..., 2, 14) of `distort`; xy (..., 2) and coefficients (..., 14) as there."""
     k1, k2, _, _, k3, k4, k5, k6, *_, tau_x, tau_y = np.moveaxis(coefficients, -1, 0)
     x, y = xy[..., 0], xy[..., 1]
     r2 = x * x + y * y
@@ -102,9 +99,9 @@ def coefficient_jacobian(xy: Array, coefficients: Array) -> Array:
 
 
 def _tilt_derivatives(tau_x: Array, tau_y: Array) -> tuple[Array, Array]:
-    """d(tilt_matrix)/d(tau_x) and /d(tau_y), each (..., 3, 3): the product rule on T = along(R) R.
+    """d(tilt_matrix)/d(tau_x) and d(tilt_matrix)/d(tau_y), each (..., 3, 3): the product rule on T = along(R) R.
 
-    Entries of the factors that do not depend on the angles cancel in the differences.
+    Constant entries of the factors cancel in the differences.
     """
     cx, sx, cy, sy = np.cos(tau_x), np.sin(tau_x), np.cos(tau_y), np.sin(tau_y)
     R = _tilt_rotation(cx, sx, cy, sy)
@@ -118,28 +115,21 @@ def _tilt_derivatives(tau_x: Array, tau_y: Array) -> tuple[Array, Array]:
 
 
 def _tilt_rotation(cx: Array, sx: Array, cy: Array, sy: Array) -> Array:
-    """R_y R_x (..., 3, 3) of OpenCV's tilt from the angles' cosines and sines."""
-    zero, one = np.zeros_like(cx), np.ones_like(cx)
-    about_x = np.stack(
-        [np.stack([one, zero, zero], -1), np.stack([zero, cx, sx], -1), np.stack([zero, -sx, cx], -1)], -2
-    )
-    about_y = np.stack(
-        [np.stack([cy, zero, -sy], -1), np.stack([zero, one, zero], -1), np.stack([sy, zero, cy], -1)], -2
-    )
+    """R_y R_x (..., 3, 3) of OpenCV's tilt, from the cosines and sines of its angles."""
+    about_x, about_y = np.zeros((*np.shape(cx), 3, 3)), np.zeros((*np.shape(cx), 3, 3))
+    about_x[..., 0, 0] = about_y[..., 1, 1] = 1.0
+    about_x[..., 1, 1], about_x[..., 1, 2], about_x[..., 2, 1], about_x[..., 2, 2] = cx, sx, -sx, cx
+    about_y[..., 0, 0], about_y[..., 0, 2], about_y[..., 2, 0], about_y[..., 2, 2] = cy, -sy, sy, cy
     return about_y @ about_x
 
 
 def _along_axis(R: Array) -> Array:
     """The projection (..., 3, 3) onto the sensor along the optical axis, of the tilt's rotation (..., 3, 3)."""
-    zero, one = np.zeros_like(R[..., 0, 0]), np.ones_like(R[..., 0, 0])
-    return np.stack(
-        [
-            np.stack([R[..., 2, 2], zero, -R[..., 0, 2]], -1),
-            np.stack([zero, R[..., 2, 2], -R[..., 1, 2]], -1),
-            np.stack([zero, zero, one], -1),
-        ],
-        -2,
-    )
+    out = np.zeros(R.shape)
+    out[..., 0, 0] = out[..., 1, 1] = R[..., 2, 2]
+    out[..., 0, 2], out[..., 1, 2] = -R[..., 0, 2], -R[..., 1, 2]
+    out[..., 2, 2] = 1.0
+    return out
 
 
 def tilt_matrix(tau_x: Array, tau_y: Array) -> Array:
@@ -149,12 +139,12 @@ def tilt_matrix(tau_x: Array, tau_y: Array) -> Array:
 
 
 def fold_limit(distortion: tuple[float, ...]) -> float:
-    """The squared normalised radius up to which the distorted image grows in every direction; inf if it always does.
+    """The squared normalised radius at which the distorted image stops growing in some direction; inf if it never does.
 
-    Beyond it two directions share one pixel: a point far outside the picture would seem to lie in it. The limit is
-    the first root of d(r N/D)/dr = 0 or of D = 0, with N, D the model's numerator and denominator. From that slope
-    goes what the tangential and prism terms take away in their worst direction, r^2 (3 p1 sin + 3 p2 cos) and so on:
-    where the slope comes near to zero without reaching it, they alone can fold the image. Source: ours.
+    Beyond it two directions share one pixel: a point far outside the picture would seem to lie in it. The limit is the
+    first root of d(r N/D)/dr = 0 or of D = 0, with N, D the model's numerator and denominator. The contribution of the
+    tangential and prism terms in their worst direction, r^2 (3 p1 sin + 3 p2 cos) and so on, is subtracted from that
+    slope: where it comes close to zero without reaching it, these terms alone can fold the image. Source: ours.
     """
     k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 = padded(distortion)[:12]
     N = np.array([1.0, 0, k1, 0, k2, 0, k3])  # polynomials in r, lowest power first
@@ -169,10 +159,10 @@ def fold_limit(distortion: tuple[float, ...]) -> float:
 
 
 def _first_sign_change(p: Array) -> float:
-    """The smallest r in (0, 1e6) at which a polynomial (n,), lowest power first, p[0] = 1, turns negative; else inf.
+    """The smallest r in (0, 1e6) at which a polynomial (n,), lowest power first, p[0] = 1, becomes negative; else inf.
 
-    The roots are sought in 1/r, in which the polynomial begins with the coefficient 1: a highest power that is there
-    by rounding only (a calibration's k3 of 1e-20) then does no harm. Each is verified and refined by a bisection.
+    The roots are computed in 1/r, where the leading coefficient is 1: a highest power that is only rounding (a k3 of
+    1e-20 from a calibration) then does no harm. Each root is verified and refined by bisection.
     """
     inverse = np.roots(p)
     near_real = (inverse.real > 1e-6) & (np.abs(inverse.imag) <= 1e-5 * np.abs(inverse))
@@ -184,7 +174,7 @@ def _first_sign_change(p: Array) -> float:
 
 
 def _bisected(p: Array, below: float, above: float) -> float:
-    """Where a polynomial (n,) that is positive at `below` and negative at `above` turns, to the last bit."""
+    """The zero of a polynomial (n,) that is positive at `below` and negative at `above`, to the last bit."""
     while True:
         middle = 0.5 * (below + above)
         if not below < middle < above:
@@ -195,15 +185,15 @@ def _bisected(p: Array, below: float, above: float) -> float:
             above = middle
 
 
-def holds(xy: Array, jacobian: Array, fold_r2: Array) -> Bools:
-    """Where (..., 2) the model is one to one: inside the radial limit, and orientation kept (det > 0)."""
+def is_one_to_one(xy: Array, jacobian: Array, fold_r2: Array) -> Bools:
+    """Whether the model is one to one at points (..., 2): inside the fold, and with a positive determinant."""
     r2 = np.sum(xy * xy, axis=-1)
     det = jacobian[..., 0, 0] * jacobian[..., 1, 1] - jacobian[..., 0, 1] * jacobian[..., 1, 0]
     return (r2 < fold_r2) & (det > 0)
 
 
 def distort_fisheye(xy: Array, coefficients: Array) -> tuple[Array, Array]:
-    """As `distort`, by OpenCV's fisheye model: an angle t off the axis is drawn at t (1 + k1 t^2 + k2 t^4 + ...).
+    """As `distort`, for OpenCV's fisheye model: the radius of an angle t off the axis is t (1 + k1 t^2 + k2 t^4 + ...).
 
     coefficients (..., 14): k1, k2, k3, k4 and zeros. Source: OpenCV, calib3d, "Fisheye camera model".
     """
@@ -216,7 +206,7 @@ def distort_fisheye(xy: Array, coefficients: Array) -> tuple[Array, Array]:
     td = t * (1 + t2 * (k[..., 0] + t2 * (k[..., 1] + t2 * (k[..., 2] + t2 * k[..., 3]))))
     d_td = 1 + t2 * (3 * k[..., 0] + t2 * (5 * k[..., 1] + t2 * (7 * k[..., 2] + t2 * 9 * k[..., 3])))
     scale = np.where(on_axis, 1.0, td / r)
-    # d(scale)/dr / r, by which the outer product of xy is multiplied
+    # (d(scale)/dr) / r, the factor of the outer product of xy.
     growth = np.where(on_axis, 0.0, (d_td / (1 + r * r) - td / r) / (r * r))
     J = scale[..., None, None] * np.eye(2) + growth[..., None, None] * xy[..., :, None] * xy[..., None, :]
     return scale[..., None] * xy, J
@@ -234,7 +224,7 @@ def fisheye_coefficient_jacobian(xy: Array, coefficients: Array) -> Array:
 
 
 def fisheye_fold_limit(distortion: tuple[float, ...]) -> float:
-    """As `fold_limit`, for the fisheye model: inf where the drawn radius grows up to 90 deg off the axis."""
+    """As `fold_limit`, for the fisheye model: inf where the radius grows up to 90 deg off the axis."""
     k1, k2, k3, k4 = padded(distortion)[:4]
     slope = np.array([1.0, 0, 3 * k1, 0, 5 * k2, 0, 7 * k3, 0, 9 * k4])
     limit = _first_sign_change(slope)
@@ -242,10 +232,10 @@ def fisheye_fold_limit(distortion: tuple[float, ...]) -> float:
 
 
 def undistort(target: Array, coefficients: Array, fold_r2: float, fisheye: bool = False) -> Array:
-    """Normalised points (n, 2) whose distortion is `target` (n, 2); nan where there is none within the fold limit.
+    """Normalised points (n, 2) whose distortion is `target` (n, 2); nan where there is none inside the fold.
 
-    Newton's method from the target itself, each step cut so that the point stays inside the limit and the
-    residual shrinks.
+    Newton's method from the target itself. Each step is shortened until the point stays inside the fold and the
+    residual decreases.
     """
     target = np.asarray(target, dtype=float)
     coefficients = np.asarray(coefficients, dtype=float)
@@ -284,12 +274,13 @@ def undistort(target: Array, coefficients: Array, fold_r2: float, fisheye: bool 
         J = np.where(keep[:, None, None], t_J, J)
         if not np.any(keep & (np.abs(share[:, None] * step) > 1e-15).any(-1)):
             break
-    good = (np.linalg.norm(residual, axis=-1) < 1e-9) & holds(x, J, np.asarray(fold_r2))
+    good = (np.linalg.norm(residual, axis=-1) < 1e-9) & is_one_to_one(x, J, np.asarray(fold_r2))
     return np.where(good[:, None], x, np.nan)
 
 
 def _undistort_fisheye(target: Array, coefficients: Array, fold_r2: float) -> Array:
-    """`undistort` for the fisheye model: one angle per point, by Newton's method kept within the growing stretch."""
+    """`undistort` for the fisheye model: one angle per point, by Newton's method bounded by the fold."""
+
     k1, k2, k3, k4 = coefficients[:4]
     limit = np.arctan(np.sqrt(fold_r2)) * (1 - 1e-9)
     td = np.linalg.norm(target, axis=-1)

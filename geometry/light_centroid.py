@@ -1,9 +1,9 @@
-"""By how much the centre of a spot's light lies beside the image of the beam's axis.
+"""Offset of the fitted centre of a spot's light from the image of the beam's axis.
 
-A beam leaves a symmetric ellipse of light on its screen, with the axis in the middle. Perspective and distortion map
-the two sides of the ellipse unequally, so that a symmetric profile fitted in the picture has another centre: .01 to .05
-px for spots of 3 to 5 px on an oblique screen, growing with the square of the width. The same effect as with the image
-of a circle's centre (Heikkila & Silven, CVPR 1997, 3.1), here for a Gaussian and a weighted fit. Ours.
+A beam leaves a symmetric ellipse of light on its screen, centred on the axis. Perspective and distortion map the two
+sides of the ellipse unequally, so that a symmetric profile fitted in the picture has another centre: 0.01 to 0.05 px
+off for spots of 3 to 5 px on an oblique screen, growing with the square of the width. The effect is that of the image
+of a circle's centre (Heikkila & Silven, CVPR 1997, section 3.1), here for a Gaussian and a weighted fit. Source: ours.
 """
 
 from __future__ import annotations
@@ -17,18 +17,20 @@ from geometry.camera import Camera
 from geometry.planes import meet_plane
 from geometry.rig import Screen
 
-_WINDOW = 3.7  # sigmas from centre to side of the window of a fit: 3.2 along the major axis, more across it
-_STEP_PX = 4.0  # of the differences that give the map's curvature
-_NODES = 33  # along each side of the picture, at which the curvature is computed; it varies slowly
-_LARGEST_SHARE = 0.25  # of the spot's sigma: a larger offset means that the second order is not enough
+_WINDOW = 3.7  # half width of a fit's window in sigmas: 3.2 along the major axis, more across it
+_STEP_PX = 4.0  # step of the differences that give the curvature of the map
+_NODES = 33  # points along each side of the picture at which the curvature is computed; it varies slowly
+_MAX_SHARE = 0.25  # largest offset in sigmas of the spot: a larger one means that the second order does not suffice
 
-# In steps: the centre, one along each axis, and the four diagonal ones.
+# In steps: the centre, the two neighbours along each axis, and the four diagonal ones.
 _STENCIL = np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [-1, -1], [1, -1], [-1, 1]], dtype=float)
 
 
 class CentreOffsets:
-    """The offsets in one camera's pictures of one screen, which is taken to be flat over a spot, and matt: it looks
-    equally bright from everywhere."""
+    """Offsets in the pictures that one camera takes of one screen.
+
+    The screen is assumed to be flat over a spot, and matt: equally bright from all directions.
+    """
 
     def __init__(self, camera: Camera, screen: Screen) -> None:
         width, height = camera.image_size_px
@@ -38,17 +40,17 @@ class CentreOffsets:
         self._curvature = _curvature(camera, screen, nodes)  # (_NODES, _NODES, 2, 3)
 
     def at(self, uv_px: Array, shape_px2: Array, brightness: Array) -> Array:
-        """Fitted centres less the images of the beams' axes (n, 2), px; 0 where the screen is not met.
+        """Fitted centres minus the images of the beams' axes (n, 2), px; 0 where the ray misses the screen.
 
         uv_px (n, 2): centres of the light, distorted pixels. shape_px2 (n, 3): uu, uv, vv of the Gaussians in the
-        picture. brightness (n,): shot noise over background noise, in variance, at the peak, which says how much the
-        wings weigh.
+        picture. brightness (n,): variance of the shot noise at the peak over that of the background noise; the brighter
+        a spot, the more weight its wings have in the fit.
         """
         n = len(uv_px)
         if n == 0:
             return np.zeros((0, 2))
         T = self._interpolated(uv_px)
-        # A Cholesky factor L of each shape; the map in sigmas of the spot, g = L^-1 x.
+        # L is the Cholesky factor of a shape, g = L^-1 x are coordinates in sigmas of the spot.
         l11 = np.sqrt(np.maximum(shape_px2[:, 0], 1e-9))
         l21 = shape_px2[:, 1] / l11
         l22 = np.sqrt(np.maximum(shape_px2[:, 2] - l21**2, 1e-9))
@@ -60,13 +62,13 @@ class CentreOffsets:
         # The exponent is -|g + P(g, g)|^2 / 2 = -|g|^2 / 2 - g . (P_11 g1^2 + 2 P_12 g1 g2 + P_22 g2^2) + ...
         cube1, cube2 = -P1[0], -P2[2]
         mixed1, mixed2 = -(P1[2] + 2 * P2[1]), -(P2[0] + 2 * P1[1])  # of g1 g2^2 and g1^2 g2
-        a, b = np.array([_moved_by(float(r)) for r in brightness]).T
+        a, b = np.array([_centre_shifts(float(r)) for r in brightness]).T
         g1, g2 = a * cube1 + b * mixed1, a * cube2 + b * mixed2
-        kept = np.minimum(1.0, _LARGEST_SHARE / np.maximum(np.hypot(g1, g2), 1e-12))
+        kept = np.minimum(1.0, _MAX_SHARE / np.maximum(np.hypot(g1, g2), 1e-12))
         return np.asarray(np.stack([l11 * g1, l21 * g1 + l22 * g2], axis=-1) * kept[:, None])
 
     def _interpolated(self, uv_px: Array) -> Array:
-        """(n, 2, 3), bilinear between the nodes."""
+        """The curvature (n, 2, 3) at pixels (n, 2), bilinear between the nodes."""
         place = np.clip(uv_px / self._size, 0.0, 1.0) * (_NODES - 1)
         first = np.minimum(place.astype(np.int64), _NODES - 2)
         i, j = first.T
@@ -76,8 +78,10 @@ class CentreOffsets:
 
 
 def _curvature(camera: Camera, screen: Screen, uv_px: Array) -> Array:
-    """Half of the second derivatives (..., 2, 3: uu, uv, vv), 1/px, of the map from the picture to the screen, the
-    screen measured in pixels: s(u + x) = s(u) + J (x + T(x, x)). 0 where the screen is not met."""
+    """The quadratic terms T (..., 2, 3: uu, uv, vv), 1/px, of the map from the picture to the screen.
+
+    s(u + x) = s(u) + J (x + T(x, x)): half of the second derivatives, in pixels. 0 where a ray misses the screen.
+    """
     origin, direction = camera.rays(uv_px[..., None, :] + _STEP_PX * _STENCIL)
     s = meet_plane(origin, direction, screen.world_from_screen)  # (..., 9, 2), m
     at = np.moveaxis(s, -2, 0)
@@ -90,15 +94,16 @@ def _curvature(camera: Camera, screen: Screen, uv_px: Array) -> Array:
     return np.asarray(np.linalg.solve(np.where(good, J, np.eye(2)).astype(float), curvature))
 
 
-def _moved_by(brightness: float) -> tuple[float, float]:
-    """Centre's shift, sigmas, of a unit Gaussian that is fitted with g1^3 and with g1 g2^2 times itself added to it."""
+def _centre_shifts(brightness: float) -> tuple[float, float]:
+    """Shifts, in sigmas, of the fitted centre of a unit Gaussian G to which g1^3 G, or g1 g2^2 G, is added."""
     steps = 0 if not np.isfinite(brightness) or brightness <= 0 else round(2 * np.log2(1 + brightness))
-    return _fitted(min(max(steps, 0), 24))
+    return _fitted_shifts(min(max(steps, 0), 24))
 
 
 @lru_cache(maxsize=32)
-def _fitted(half_octaves: int) -> tuple[float, float]:
-    """As `_moved_by`, for brightness 2^(half_octaves / 2) - 1; the background's slopes are fitted along."""
+def _fitted_shifts(half_octaves: int) -> tuple[float, float]:
+    """As `_centre_shifts`, for the brightness 2^(half_octaves / 2) - 1; the slope of the background is fitted too."""
+
     g = np.linspace(-_WINDOW, _WINDOW, 81)
     g1, g2 = (x.ravel() for x in np.meshgrid(g, g))
     light = np.exp(-0.5 * (g1**2 + g2**2))

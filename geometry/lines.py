@@ -1,4 +1,4 @@
-"""Straight lines in space."""
+"""Straight lines in space: where two are closest, and the point nearest to many."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from geometry.arrays import Array, cross, normalised
 
 
 def common_perpendicular(point_a: Array, direction_a: Array, point_b: Array, direction_b: Array) -> tuple[Array, Array]:
-    """The two points (..., 3), m, at which lines a and b are closest: one on each.
+    """The feet (..., 3), m, of the common perpendicular of lines a and b: one point on each line.
 
-    Points (..., 3), m; directions (..., 3), any length. nan for parallel lines.
+    Points (..., 3), m; directions (..., 3), of any length. nan for parallel lines.
     """
     n = cross(direction_a, direction_b)
     n2 = np.sum(n * n, axis=-1)
@@ -23,7 +23,11 @@ def common_perpendicular(point_a: Array, direction_a: Array, point_b: Array, dir
 
 
 def nearest_point(points: Array, directions: Array, weights: Array | None = None) -> Array:
-    """The point (3,), m, with the least sum of squared distances to lines (n, 3), (n, 3); nan if all are parallel."""
+    """The point (3,), m, with the smallest weighted sum of squared distances to lines; nan if all are parallel.
+
+    points (n, 3), m; directions (n, 3), of any length; weights (n,), 1 by default.
+    """
+
     d = normalised(directions)
     w = np.ones(len(d)) if weights is None else weights
     across = w[:, None, None] * (np.eye(3) - d[:, :, None] * d[:, None, :])

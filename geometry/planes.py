@@ -1,4 +1,4 @@
-"""Rays and planes."""
+"""Intersections of rays with planes."""
 
 from __future__ import annotations
 
@@ -9,10 +9,9 @@ from geometry.pose import Pose
 
 
 def meet_plane(origin: Array, direction: Array, world_from_screen: Pose) -> Array:
-    """Where rays meet a screen.
+    """Intersections (..., 2), m, of rays with the plane of a screen, in the screen frame.
 
-    origin, direction: (..., 3), m and no unit, in world. Returns (..., 2), m, in the screen frame; nan where the ray is
-    parallel to the screen or leaves it behind.
+    origin, direction: (..., 3), m and no unit, in world. nan where the ray is parallel to the plane or points away.
     """
     screen_from_world = world_from_screen.inverse()
     p = screen_from_world.apply(np.asarray(origin, dtype=float))
@@ -25,5 +24,6 @@ def meet_plane(origin: Array, direction: Array, world_from_screen: Pose) -> Arra
 
 
 def screen_to_world(points: Array, world_from_screen: Pose) -> Array:
-    """World coordinates (..., 3), m, of points (..., 2), m, of the screen's plane."""
+    """World coordinates (..., 3), m, of points (..., 2), m, in the plane of a screen."""
+
     return np.einsum("...i,ji->...j", points, world_from_screen.rotation[:, :2]) + world_from_screen.translation

@@ -1,4 +1,4 @@
-"""Rigid transforms between two frames, and the small errors in them."""
+"""Rigid transforms between two frames, and their small errors."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from geometry.arrays import Array, Bools, Ints
 
 @dataclass(frozen=True, slots=True)
 class Pose:
-    """a_from_b: takes coordinates in b to coordinates in a, x_a = rotation x_b + translation.
+    """The rigid transform a_from_b, x_a = rotation x_b + translation, or a stack of transforms.
 
-    Also a stack of transforms: any leading axes, the same for both fields.
+    Leading axes are those of the stack, the same for both fields.
     """
 
     rotation: Array  # (..., 3, 3), proper and orthogonal
@@ -22,7 +22,7 @@ class Pose:
 
     @staticmethod
     def identity() -> Pose:
-        """The transform that changes nothing."""
+        """The identity."""
         return Pose(np.eye(3), np.zeros(3))
 
     @staticmethod
@@ -68,21 +68,22 @@ class Pose:
         return Pose(self.rotation[index], self.translation[index])
 
     def plus(self, delta: Array) -> Pose:
-        """The transform that is `delta` (..., 6) away: [dt (m, in a), dtheta (rad, in b)].
+        """The transform changed by `delta` (..., 6) = [dt (m, in a), dtheta (rad, in b)]: t + dt and R Exp(dtheta).
 
-        t + dt and R Exp(dtheta): the pose error of the files' contract.
+        This is the pose error of section 1 of the file contract.
         """
         delta = np.asarray(delta, dtype=float)
         return Pose(self.rotation @ rotations.exp(delta[..., 3:]), self.translation + delta[..., :3])
 
     def minus(self, other: Pose) -> Array:
-        """The delta (..., 6) with other.plus(delta) = self."""
+        """The delta (..., 6) for which other.plus(delta) = self."""
         turn = np.swapaxes(other.rotation, -1, -2) @ self.rotation
         return np.concatenate([self.translation - other.translation, rotations.log(turn)], axis=-1)
 
 
 def ypr_sigmas(pose: Pose, covariance: Array) -> Array:
-    """Standard deviations of yaw, pitch, roll (..., 3), rad, from pose covariances (..., 6, 6), to first order."""
+    """Standard deviations of yaw, pitch, roll (..., 3), rad, to first order, from pose covariances (..., 6, 6)."""
+
     J = rotations.ypr_jacobian(pose.rotation)
     turned = J @ covariance[..., 3:, 3:] @ np.swapaxes(J, -1, -2)
     return np.sqrt(np.maximum(np.diagonal(turned, axis1=-2, axis2=-1), 0.0))

@@ -1,4 +1,4 @@
-"""What is mounted in the lab, as frozen values: screens, cameras, and the vehicle with its beams and spots."""
+"""The rig as frozen values: screens and cameras in the lab, beams and spots of the vehicle."""
 
 from __future__ import annotations
 
@@ -14,17 +14,21 @@ from geometry.pose import Pose
 
 @dataclass(frozen=True, slots=True)
 class Screen:
-    """A receiving screen: flat, or bent a little."""
+    """A receiving screen, flat or slightly bent."""
 
     name: str
     world_from_screen: Pose  # the screen's z axis is its normal
-    size_m: tuple[float, float] | None = None  # extent along x and y, centred on the origin; None: without end
+    size_m: tuple[float, float] | None = None  # extent along x and y, centred on the origin; None: unlimited
     bow: tuple[float, float, float] = (0.0, 0.0, 0.0)  # a, b, c, 1/m: the surface is z = a x^2 + b x y + c y^2
 
 
 @dataclass(frozen=True, slots=True)
 class Beam:
-    """A laser's line, fixed in the vehicle."""
+    """The line of a laser beam, fixed in the vehicle.
+
+    Raises:
+        ValueError: the direction has no length.
+    """
 
     name: str
     direction: Array  # (3,), unit, in body
@@ -39,7 +43,7 @@ class Beam:
 
 @dataclass(frozen=True, slots=True)
 class Spot:
-    """One end of a beam and the screen that it falls on."""
+    """One end of a beam and the screen on which it falls."""
 
     name: str
     beam: str
@@ -49,7 +53,11 @@ class Spot:
 
 @dataclass(frozen=True, slots=True)
 class Rig:
-    """Everything that is calibrated. Names are the keys; the order is that of the file."""
+    """Everything that is calibrated. Keys are names, in the order of the file.
+
+    Raises:
+        ValueError: a camera or spot refers to a screen or beam that the rig does not have.
+    """
 
     screens: Mapping[str, Screen]
     cameras: Mapping[str, Camera]
@@ -67,5 +75,5 @@ class Rig:
                 raise ValueError(f"spot {spot.name!r} belongs to beam {spot.beam!r}, which is not in the rig")
 
     def views(self) -> list[tuple[str, str]]:
-        """All (camera, spot) pairs: each camera with the spots of the screen that it observes."""
+        """All (camera, spot) pairs: each camera with the spots of its screen."""
         return [(c.name, s.name) for c in self.cameras.values() for s in self.spots.values() if s.screen == c.screen]

@@ -28,7 +28,7 @@ def exp(rotvec: Array) -> Array:
 def log(rotation: Array) -> Array:
     """Rotation vectors (..., 3), rad, |.| <= pi, of rotation matrices (..., 3, 3).
 
-    Through the quaternion, which stays accurate at 0 and at pi (where the matrix's skew part vanishes).
+    By way of the quaternion, which is accurate at 0 and at pi (where the skew part of the matrix vanishes).
     """
     q = quaternion_from_matrix(rotation)
     v, w = q[..., 1:], q[..., 0]
@@ -39,12 +39,12 @@ def log(rotation: Array) -> Array:
 
 
 def angle(rotation: Array) -> Array:
-    """How far rotation matrices (..., 3, 3) turn, rad, 0 to pi."""
+    """Rotation angles (...), rad, 0 to pi, of rotation matrices (..., 3, 3)."""
     return np.linalg.norm(log(rotation), axis=-1)
 
 
 def right_jacobian(rotvec: Array) -> Array:
-    """J_r (..., 3, 3) with Exp(v + d) = Exp(v) Exp(J_r d) to first order.
+    """The right Jacobian J_r (..., 3, 3) of rotation vectors: Exp(v + d) = Exp(v) Exp(J_r d) to first order.
 
     Source: Chirikjian, Stochastic Models, Information Theory, and Lie Groups 2 (2012), eq. 10.86.
     """
@@ -61,7 +61,7 @@ def right_jacobian(rotvec: Array) -> Array:
 def quaternion_from_matrix(rotation: Array) -> Array:
     """Unit quaternions (..., 4), order w, x, y, z with w >= 0, of rotation matrices (..., 3, 3).
 
-    Shepperd (1978): of the four forms the one with the largest divisor, so it holds at every angle.
+    Source: Shepperd (1978), the one of the four forms with the largest divisor, which is accurate at every angle.
     """
     R = np.asarray(rotation, dtype=float)
     m00, m01, m02 = R[..., 0, 0], R[..., 0, 1], R[..., 0, 2]
@@ -108,9 +108,10 @@ def matrix_from_ypr(yaw_pitch_roll: Array) -> Array:
 
 
 def ypr_from_matrix(rotation: Array) -> Array:
-    """Yaw, pitch, roll (..., 3), rad, of rotation matrices (..., 3, 3). At pitch +-90 deg roll is taken as 0.
+    """Yaw, pitch, roll (..., 3), rad, of rotation matrices (..., 3, 3). At pitch +-90 deg roll is set to 0.
 
-    Roll is read from Rz(-yaw) R, so that the three make R again however little yaw is determined near +-90 deg.
+    Roll is computed from Rz(-yaw) R, so that the three angles reproduce R even where yaw is poorly determined, near a
+    pitch of +-90 deg.
     """
     R = np.asarray(rotation, dtype=float)
     cos_pitch = np.hypot(R[..., 0, 0], R[..., 1, 0])
@@ -123,11 +124,12 @@ def ypr_from_matrix(rotation: Array) -> Array:
 
 
 def ypr_jacobian(rotation: Array) -> Array:
-    """d(yaw, pitch, roll) / d(theta) (..., 3, 3) for R Exp(theta): what a body-frame error does to the angles.
+    """d(yaw, pitch, roll) / d(theta) (..., 3, 3) for R Exp(theta): the effect of a body-frame error on the angles.
 
-    From the body rates of an aircraft (for instance Stevens & Lewis, Aircraft Control and Simulation, 1.3-22):
-    roll' = p + tan(pitch) (q sin(roll) + r cos(roll)), and so on. At pitch +-90 deg it grows without bound.
+    Source: the kinematic equations of an aircraft's body rates (for instance Stevens & Lewis, Aircraft Control and
+    Simulation, eq. 1.3-22): roll' = p + tan(pitch) (q sin(roll) + r cos(roll)), and so on. Unbounded at pitch +-90 deg.
     """
+
     ypr = ypr_from_matrix(rotation)
     pitch, roll = ypr[..., 1], ypr[..., 2]
     c, s = np.cos(roll), np.sin(roll)

@@ -1,4 +1,4 @@
-"""Rays and screens that may be bent a little."""
+"""Intersections of rays with screens that may be slightly bent."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ import numpy as np
 from geometry.arrays import Array
 from geometry.pose import Pose
 
-STEPS = 4  # of Newton's method: a bow of centimetres over metres converges in two or three, to rounding
+NEWTON_STEPS = 4  # a bow of centimetres over metres converges to rounding in two or three
 
 
 def meet_surface(origin: Array, direction: Array, world_from_screen: Pose, bow: Sequence[float]) -> Array:
-    """Where rays meet a screen, as points (..., 3), m, in world; nan where the ray leaves it behind.
+    """Intersections (..., 3), m, in world, of rays with a screen; nan where the ray is parallel to it or points away.
 
-    origin, direction: (..., 3), m and no unit, in world. bow: a, b, c, 1/m, of z = a x^2 + b x y + c y^2 in the
-    screen's frame; all 0: flat.
+    origin, direction: (..., 3), m and no unit, in world. bow: a, b, c, 1/m, of the surface z = a x^2 + b x y + c y^2 in
+    the screen frame; all 0: flat.
     """
     screen_from_world = world_from_screen.inverse()
     p = screen_from_world.apply(np.asarray(origin, dtype=float))
@@ -26,7 +26,7 @@ def meet_surface(origin: Array, direction: Array, world_from_screen: Pose, bow: 
     t = -p[..., 2] / np.where(along, d[..., 2], 1.0)
     a, b, c = bow
     if a or b or c:
-        for _ in range(STEPS):
+        for _ in range(NEWTON_STEPS):
             x, y = p[..., 0] + t * d[..., 0], p[..., 1] + t * d[..., 1]
             height = p[..., 2] + t * d[..., 2] - (a * x * x + b * x * y + c * y * y)
             slope = d[..., 2] - (2 * a * x + b * y) * d[..., 0] - (b * x + 2 * c * y) * d[..., 1]

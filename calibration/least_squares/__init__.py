@@ -1,1 +1,1 @@
-"""The sparse least-squares engine of all calibrations."""
+"""Sparse nonlinear least squares for all calibrations: unknowns, terms, priors, solver."""

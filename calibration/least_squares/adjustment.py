@@ -1,9 +1,9 @@
-"""Sparse least squares over a calibration's unknowns: the one engine of all its steps, single and joint.
+"""Sparse nonlinear least squares over the unknowns of a calibration; used by all its steps, single and joint.
 
-Terms of the cost give whitened residuals and their derivatives by the unknowns that they touch; the engine does
-Levenberg-Marquardt steps on the normal equations, weighs outliers down where a term asks for it, and answers with
-covariances of any of the unknowns. Ours; the normal equations are kept sparse as in Triggs et al. (2000), "Bundle
-adjustment: a modern synthesis", section 6.
+The terms of the cost provide whitened residuals and their derivatives by the unknowns on which they depend. `solve`
+takes Levenberg-Marquardt steps on the normal equations and reduces the weight of outliers where a term has a robust
+loss; its result provides covariances of any unknowns. Source: ours; the normal equations are sparse as in Triggs et al.
+(2000), "Bundle adjustment: a modern synthesis", section 6.
 """
 
 from __future__ import annotations
@@ -15,26 +15,26 @@ from typing import Protocol
 import numpy as np
 from scipy import sparse
 from scipy.linalg import block_diag
-from scipy.sparse.linalg import SuperLU, splu
 
 from calibration.least_squares.parameter_blocks import Stack
+from calibration.least_squares.sparse_systems import damped_step, factored, scaled
 from geometry.arrays import Array, Bools, Ints
 
 Values = Mapping[str, Stack]
-Free = Mapping[str, bool | Bools]  # per stack: which numbers (k, dof) may move, True for all; not named: none
-At = tuple[str, int]  # a stack's name and which of its unknowns
-# Per stack: steps are taken in other coordinates, error = basis @ coordinates, (dof, dof). Numbers that nearly do the
-# same (the k1 and k4 of a lens) make normal equations that rounding alone makes singular; a basis in which they do not
-# keeps all digits. Fixed numbers are coordinates of their own.
+Free = Mapping[str, bool | Bools]  # per stack: which numbers (k, dof) are free, True: all; stacks not named are fixed
+At = tuple[str, int]  # name of a stack and index of one of its unknowns
+# Per stack, a matrix (dof, dof): steps are taken in coordinates with error = basis @ coordinates. Numbers with almost
+# the same effect (k1 and k4 of a lens) give normal equations that are singular to rounding; in a suitable basis no
+# digits are lost. Each fixed number must be a coordinate of its own.
 Basis = Mapping[str, Array]
 
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """What one stack's unknowns do to the residuals of a term."""
+    """Derivatives of a term's residuals by the unknowns of one stack."""
 
     stack: str
-    index: Ints  # (N,): which unknown each of the N residuals depends on
+    index: Ints  # (N,): the unknown on which each of the N residuals depends
     jacobian: Array  # (N, d, dof), whitened like the residuals
 
 
@@ -43,24 +43,24 @@ class Linearised:
     """N residuals of d numbers each, in sigmas, and their derivatives."""
 
     residuals: Array  # (N, d)
-    parts: Sequence[Part]
+    parts: Sequence[Part]  # one per stack
 
 
 class Loss(Protocol):
-    """How much a residual counts, from its squared length s (N,) in sigmas."""
+    """A robust loss: a function of the squared lengths s (N,), in sigmas, of residuals."""
 
     def cost(self, s: Array) -> Array:
-        """(N,), s itself for small ones."""
+        """The cost (N,); approaches s for small s."""
 
     def weight(self, s: Array) -> Array:
-        """(N,): d(cost)/ds."""
+        """The weight (N,): d(cost)/ds."""
 
 
 @dataclass(frozen=True, slots=True)
 class Cauchy:
-    """log(1 + s / c^2) c^2: outliers fade and hardly pull."""
+    """The Cauchy loss c^2 log(1 + s / c^2), with which outliers have little influence."""
 
-    scale: float = 3.0  # sigmas at which a residual counts half
+    scale: float = 3.0  # c: length in sigmas at which the weight is one half
 
     def cost(self, s: Array) -> Array:
         return np.log1p(s / self.scale**2) * self.scale**2
@@ -70,59 +70,62 @@ class Cauchy:
 
 
 class Term(Protocol):
-    """One kind of measurement or knowledge."""
+    """A term of the cost: one kind of measurement or of prior knowledge."""
 
     @property
     def loss(self) -> Loss | None:
-        """None where no outliers are expected."""
+        """The robust loss; None (squares) if no outliers are expected."""
 
     def linearise(self, values: Values) -> Linearised:
-        """Residuals and derivatives at these values; nan residuals count as unusable and end the solve."""
+        """Residuals and derivatives at these values; nan where a residual cannot be computed: the step is refused."""
 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """When an adjustment ends."""
+    """Termination criteria of an adjustment."""
 
-    steps: int = 60
-    small_step_sigmas: float = 1e-3  # the last step moved all unknowns together by less than this many sigmas
+    steps: int = 60  # largest number of steps
+    small_step_sigmas: float = 1e-3  # converged if a step is shorter than this, in sigmas of all unknowns together
 
 
 class AdjustmentError(ValueError):
-    """An adjustment that does not settle, or does not determine what it was asked for."""
+    """The adjustment does not converge, or does not determine the requested unknowns."""
 
 
 @dataclass(frozen=True, slots=True)
 class Adjusted:
-    """Where an adjustment ended, and the normal equations there."""
+    """The result of an adjustment, with its normal equations."""
 
     values: Values
-    residuals: tuple[Array, ...]  # per term (N, d), in sigmas, not weighed down
-    weights: tuple[Array, ...]  # per term (N,), 1 where the loss left the residual alone
-    chi2: float  # sum of the squared residuals, weighed
-    dof: int  # residual numbers less free unknowns
+    residuals: tuple[Array, ...]  # per term (N, d), in sigmas, without the weights
+    weights: tuple[Array, ...]  # per term (N,), of its loss; 1 without a loss
+    chi2: float  # weighted sum of the squared residuals
+    dof: int  # number of residuals minus number of free unknowns
     _columns: _Columns
     _normal: sparse.csc_array
 
     def is_free(self, stack: str) -> Bools:
-        """Which numbers (k, dof) of a stack could move."""
+        """Which numbers (k, dof) of a stack were free."""
         free: Bools = self._columns.column[stack] >= 0
         return free
 
     def covariance(self, at: Sequence[At]) -> Array:
-        """Joint covariance (p, p) of the errors of some unknowns, stacked in order; 0 for what was held fixed.
+        """Joint covariance (p, p) of the errors of some unknowns, in this order; 0 for fixed numbers.
 
-        Everything else that was free is accounted for. AdjustmentError where the data leave a direction undetermined.
+        It is marginal: all other free unknowns are taken into account.
+
+        Raises:
+            AdjustmentError: the data do not determine some direction of the unknowns.
         """
         columns = np.concatenate([self._columns.of(*a) for a in at])
         free = columns >= 0
         out = np.zeros((len(columns), len(columns)))
         if free.any():
-            # Scaled to a unit diagonal, pivots tell how nearly singular the equations are, whatever the units.
+            # With a unit diagonal, small pivots show that the equations are nearly singular, independent of the units.
             scale = 1.0 / np.sqrt(np.maximum(self._normal.diagonal(), 1e-300))
-            factor = _factor(_scaled(self._normal, scale))
+            factor = factored(scaled(self._normal, scale))
             if factor is None or np.min(np.abs(factor.U.diagonal())) < 1e-11:
-                raise AdjustmentError("the data leave some direction of the unknowns undetermined")
+                raise AdjustmentError("the data do not determine some direction of the unknowns")
             picked = columns[free]
             rhs = np.zeros((self._normal.shape[0], len(picked)))
             rhs[picked, np.arange(len(picked))] = scale[picked]
@@ -134,10 +137,13 @@ class Adjusted:
         return out
 
     def reduced_normal(self, keep: Sequence[At]) -> Array:
-        """The information (p, p) on some unknowns once all the other free ones are solved for (Schur complement).
+        """Information matrix (p, p) of some unknowns after elimination of all other free ones (Schur complement).
 
-        Rows of fixed numbers are 0. The others must be determined when the kept ones are known. Not for stacks that
-        were solved in another basis: ValueError.
+        Rows of fixed numbers are 0.
+
+        Raises:
+            ValueError: a stack was solved in another basis.
+            AdjustmentError: the other unknowns are not determined even with the kept ones known.
         """
         if any(stack in self._columns.basis for stack, _ in keep):
             raise ValueError("expected stacks solved in their own numbers, got one with another basis")
@@ -148,7 +154,7 @@ class Adjusted:
         H = self._normal.tocsr()
         S = H[kept][:, kept].toarray()
         if len(rest):
-            factor = _factor(H[rest][:, rest].tocsc())
+            factor = factored(H[rest][:, rest].tocsc())
             if factor is None:
                 raise AdjustmentError("the other unknowns are not determined even when the kept ones are known")
             across = H[rest][:, kept].toarray()
@@ -158,9 +164,9 @@ class Adjusted:
         return out
 
     def undetermined(self, keep: Sequence[At], threshold: float = 1e-9) -> Array:
-        """Directions (m, p) in the errors of the kept unknowns that the data do not determine; m = 0 where all are.
+        """The m directions (m, p) in the errors of the kept unknowns that the data do not determine.
 
-        threshold: of the information left along a direction, against that of its numbers one by one.
+        threshold: largest ratio of the information along such a direction to that on its numbers one by one.
         """
         S = self.reduced_normal(keep)
         columns = np.concatenate([self._columns.of(*a) for a in keep])
@@ -176,10 +182,14 @@ class Adjusted:
 def solve(
     values: Values, terms: Sequence[Term], free: Free, limits: Limits = Limits(), basis: Basis | None = None
 ) -> Adjusted:
-    """The values that make the terms' residuals smallest.
+    """The values that minimise the cost of the terms.
 
-    Start values must be near enough for Newton steps. Raises AdjustmentError where the residuals are not finite at the
-    start or the steps do not settle. Directions that nothing determines stay where they started.
+    The start values must lie within the convergence region of Newton's method. Directions that nothing determines keep
+    their start values.
+
+    Raises:
+        AdjustmentError: a residual is not finite at the start, or the steps do not converge.
+        KeyError: `free` names a stack that `values` does not have.
     """
     columns = _Columns.of_free(values, free, basis or {})
     lines = [t.linearise(values) for t in terms]
@@ -190,25 +200,25 @@ def solve(
     for _ in range(limits.steps):
         H, g = _normal_equations(terms, lines, columns)
         while True:
-            delta = _damped_step(H, g, damping)
+            delta = damped_step(H, g, damping)
             moved = columns.moved(values, delta)
             new_lines = [t.linearise(moved) for t in terms]
             finite = all(np.isfinite(line.residuals).all() for line in new_lines)
             new_cost = _cost(terms, new_lines) if finite else np.inf
-            # Rounding of the cost hides gains near the end, so a step this small is taken for one that is none.
+            # Near the minimum, rounding hides a decrease of the cost, so a step this short is accepted in any case.
             size = float(np.sqrt(max(delta @ (H @ delta), 0.0)))
             if new_cost <= cost or size < limits.small_step_sigmas:
                 break
             damping *= 10
             if damping > 1e12:
-                raise AdjustmentError("no step makes the residuals smaller")
+                raise AdjustmentError("no step reduces the residuals")
         if new_cost <= cost:
             values, lines, cost = moved, new_lines, new_cost
         damping = max(damping * 0.1, 1e-12)
         if size < limits.small_step_sigmas:
             break
     else:
-        raise AdjustmentError(f"not settled after {limits.steps} steps: the last one still moved {size:.2g} sigmas")
+        raise AdjustmentError(f"no convergence after {limits.steps} steps: the last one was {size:.2g} sigmas long")
     H, _ = _normal_equations(terms, lines, columns)
     weights = tuple(_weights(t, line) for t, line in zip(terms, lines, strict=True))
     chi2 = sum(float(np.sum(w[:, None] * line.residuals**2)) for w, line in zip(weights, lines, strict=True))
@@ -219,17 +229,17 @@ def solve(
 
 @dataclass(frozen=True, slots=True)
 class _Columns:
-    """Which column of the normal equations each number has; -1 for the fixed ones."""
+    """The column of each number in the normal equations."""
 
-    column: Mapping[str, Ints]  # per stack (k, dof)
-    count: int
+    column: Mapping[str, Ints]  # per stack (k, dof); -1 for fixed numbers
+    count: int  # number of free ones
     basis: Basis
 
     @staticmethod
     def of_free(values: Values, free: Free, basis: Basis) -> _Columns:
         unknown = set(free) - set(values)
         if unknown:
-            raise KeyError(f"no such stacks: {', '.join(sorted(unknown))}")
+            raise KeyError(f"free: unknown stacks {', '.join(sorted(unknown))}")
         column, count = {}, 0
         for name, stack in values.items():
             mask = np.broadcast_to(np.asarray(free.get(name, False)), (len(stack), stack.dof))
@@ -240,22 +250,24 @@ class _Columns:
         return _Columns(column, count, basis)
 
     def of(self, stack: str, element: int) -> Ints:
+        """The columns (dof,) of one unknown."""
         return self.column[stack][element]
 
     def basis_of(self, stack: str) -> Array:
-        """(dof, dof)."""
+        """The basis (dof, dof) in which a stack's steps are taken."""
         return self.basis.get(stack, np.eye(self.column[stack].shape[1]))
 
     def jacobian(self, part: Part) -> Array:
-        """By the coordinates in which steps are taken."""
+        """Derivatives (N, d, dof) by the coordinates in which steps are taken."""
         return part.jacobian @ self.basis[part.stack] if part.stack in self.basis else part.jacobian
 
     def step(self, stack: str, padded: Array) -> Array:
-        """(k, dof): the errors of a stack's numbers from a step in coordinates, 0 at its end."""
+        """The change (k, dof) of a stack's numbers, from a step in coordinates with a 0 appended."""
         delta: Array = padded[self.column[stack]]
         return delta @ self.basis[stack].T if stack in self.basis else delta
 
     def moved(self, values: Values, delta: Array) -> Values:
+        """The values after a step (count,)."""
         padded = np.append(delta, 0.0)  # column -1 reads the 0 at the end
         return {
             name: stack.plus(self.step(name, padded)) if (self.column[name] >= 0).any() else stack
@@ -280,10 +292,11 @@ def _cost(terms: Sequence[Term], lines: Sequence[Linearised]) -> float:
 def _normal_equations(
     terms: Sequence[Term], lines: Sequence[Linearised], columns: _Columns
 ) -> tuple[sparse.csc_array, Array]:
-    """H = J^T W J and -J^T W r.
+    """The normal matrix H = J^T W J (n, n) and the right-hand side -J^T W r (n,).
 
-    Residuals that touch the same unknowns make one dense block: board corners of a picture are dozens of residuals in
-    one block of some 27 columns, and the sum over blocks is then a hundred times smaller than one over residuals.
+    Residuals that depend on the same unknowns form one dense block. The board corners of a picture, for instance, are
+    dozens of residuals in a block of some 27 columns; summing blocks takes a hundredth of the entries of summing
+    residuals.
     """
     n = columns.count
     rows: list[Ints] = []
@@ -298,7 +311,8 @@ def _normal_equations(
         r = line.residuals * root
         J = np.concatenate([columns.jacobian(p) for p in parts], axis=2) * root[..., None]
         shape = [len(columns.column[p.stack]) for p in parts]
-        keys = np.ravel_multi_index([p.index for p in parts], shape)  # one number each: three times as fast to sort
+        keys = np.ravel_multi_index([p.index for p in parts], shape)  # single numbers sort three times as fast
+
         groups, group_of, sizes = np.unique(keys, return_inverse=True, return_counts=True)
         indices = np.unravel_index(groups, shape)
         where = np.concatenate([columns.column[p.stack][i] for p, i in zip(parts, indices, strict=True)], axis=1)
@@ -321,27 +335,3 @@ def _normal_equations(
     i, j, h = np.concatenate(rows), np.concatenate(cols), np.concatenate(entries)
     used = (i >= 0) & (j >= 0)
     return sparse.coo_array((h[used], (i[used], j[used])), shape=(n, n)).tocsc(), g
-
-
-def _scaled(H: sparse.csc_array, scale: Array) -> sparse.csc_array:
-    D = sparse.diags_array(scale)
-    return (D @ H @ D).tocsc()
-
-
-def _factor(H: sparse.csc_array) -> SuperLU | None:
-    """LU factors in an order that keeps the arrow of a bundle sparse; None where it is singular."""
-    try:
-        return splu(H, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-    except RuntimeError:
-        return None
-
-
-def _damped_step(H: sparse.csc_array, g: Array, damping: float) -> Array:
-    """(H + damping diag H)^-1 g, in units where diag H is 1."""
-    diagonal = H.diagonal()
-    scale = 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
-    lifted = _scaled(H, scale) + damping * sparse.eye_array(len(g))
-    factor = _factor(lifted.tocsc())
-    if factor is None:
-        return np.zeros_like(g) if damping > 1e6 else _damped_step(H, g, max(damping * 100, 1e-9))
-    return np.asarray(factor.solve(g * scale) * scale)

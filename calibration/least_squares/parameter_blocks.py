@@ -1,4 +1,4 @@
-"""The kinds of unknowns of a calibration: stacks of vectors, of transforms, of lines, each with its small errors."""
+"""The unknowns of a calibration: stacks of vectors, of transforms and of lines, with their small errors."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ S = TypeVar("S", bound="Stack")
 
 
 class Stack(Protocol):
-    """k unknowns of one kind; an error of one of them is a vector of `dof` numbers."""
+    """k unknowns of one kind. The error of an unknown is a vector of `dof` numbers."""
 
     @property
     def dof(self) -> int:
-        """How many numbers the error of one unknown has."""
+        """Size of the error vector of one unknown."""
 
     def __len__(self) -> int: ...
 
     def plus(self: S, delta: Array) -> S:
-        """The stack with each unknown moved by delta (k, dof)."""
+        """The stack with its unknowns changed by delta (k, dof)."""
 
     def minus(self: S, other: S) -> Array:
-        """The delta (k, dof) with other.plus(delta) = self; exact to first order for lines."""
+        """The delta (k, dof) with other.plus(delta) = self; for lines to first order."""
 
     def pick(self: S, index: Ints) -> S:
         """Some of the unknowns."""
@@ -34,7 +34,7 @@ class Stack(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Vectors:
-    """Plain vectors: lenses, bows, points."""
+    """Vectors: lens parameters, bows, points."""
 
     array: Array  # (k, d)
 
@@ -57,7 +57,7 @@ class Vectors:
 
 @dataclass(frozen=True, slots=True)
 class Poses:
-    """Transforms a_from_b with the error [dt (m, in a), dtheta (rad, in b)] of section 1 of the files' contract."""
+    """Transforms a_from_b with the error [dt (m, in a), dtheta (rad, in b)] of section 1 of the file contract."""
 
     pose: Pose  # a stack of k
 
@@ -79,17 +79,17 @@ class Poses:
 
     @staticmethod
     def of(poses: list[Pose]) -> Poses:
-        """From single transforms."""
+        """A stack of single transforms."""
         rotation = np.array([p.rotation for p in poses], dtype=float).reshape(-1, 3, 3)
         return Poses(Pose(rotation, np.array([p.translation for p in poses], dtype=float).reshape(-1, 3)))
 
 
 @dataclass(frozen=True, slots=True)
 class Lines:
-    """Lines in space: a point and a unit direction each, with the four errors that a line has.
+    """Lines in space, each a point and a unit direction, with four degrees of freedom.
 
-    The error is [change of the direction (2, rad), change of the point (2, m)], both across the line, along the two
-    axes of `basis`. What would move the point along the line is left out: it does nothing.
+    The error is [change of the direction (2, rad), change of the point (2, m)], both perpendicular to the line, along
+    the two axes of `basis`. A shift of the point along the line has no effect and is not an error.
     """
 
     points: Array  # (k, 3), m
@@ -104,8 +104,8 @@ class Lines:
 
     @property
     def basis(self) -> Array:
-        """(k, 3, 2): two unit vectors across each line, the same ones for the same direction."""
-        # The axis that lies least along the line makes the best conditioned cross product.
+        """Two unit vectors perpendicular to each line, (k, 3, 2); a function of the direction alone."""
+        # The coordinate axis farthest from the line gives the best conditioned cross product.
         least = np.eye(3)[np.argmin(np.abs(self.directions), axis=1)]
         first = normalised(np.cross(self.directions, least))
         return np.stack([first, np.cross(self.directions, first)], axis=-1)
@@ -116,12 +116,12 @@ class Lines:
         return Lines(self.points + (B @ delta[:, 2:, None])[..., 0], normalised(turned))
 
     def minus(self, other: Lines) -> Array:
-        # A line has no point of its own: the one across from the other's point is compared.
-        away = self.points - other.points
-        along = np.sum(away * other.directions, axis=1) / np.sum(self.directions * other.directions, axis=1)
-        away = away - along[:, None] * self.directions
+        # The points that represent the lines are arbitrary, so the point opposite the other line's point is compared.
+        shift = self.points - other.points
+        along = np.sum(shift * other.directions, axis=1) / np.sum(self.directions * other.directions, axis=1)
+        shift = shift - along[:, None] * self.directions
         turn = self.directions / np.sum(self.directions * other.directions, axis=1)[:, None]
-        return np.concatenate([(v[:, None, :] @ other.basis)[:, 0] for v in (turn, away)], axis=1)
+        return np.concatenate([(v[:, None, :] @ other.basis)[:, 0] for v in (turn, shift)], axis=1)
 
     def pick(self, index: Ints) -> Lines:
         return Lines(self.points[index], self.directions[index])

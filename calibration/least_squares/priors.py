@@ -1,4 +1,4 @@
-"""What is known of unknowns before the measurements: surveys, data sheets, earlier calibrations."""
+"""Prior knowledge of unknowns, from surveys, data sheets or earlier calibrations, as terms of an adjustment."""
 
 from __future__ import annotations
 
@@ -15,26 +15,29 @@ from geometry.arrays import Array
 
 @dataclass(frozen=True, slots=True)
 class Prior:
-    """Values with a joint covariance of their errors, over any unknowns of any stacks.
+    """Prior values of any unknowns of any stacks, with the joint covariance of their errors.
 
-    Numbers of infinite variance (on the diagonal) are not known and give no residual; nor do directions of zero
-    variance, which the caller holds fixed.
+    Numbers with an infinite variance (on the diagonal) are not known and give no residual; neither do directions of
+    zero variance, which the caller holds fixed.
+
+    Raises:
+        ValueError: the covariance does not have the size of the values.
     """
 
     at: tuple[At, ...]
-    values: tuple[Stack, ...]  # of one unknown each
-    covariance: Array  # (p, p) of the errors, stacked in that order
+    values: tuple[Stack, ...]  # stacks of one unknown each
+    covariance: Array  # (p, p) of the errors, in that order
     loss: Loss | None = None
-    _root: Array = field(init=False)  # (m, p): whitens
+    _root: Array = field(init=False)  # (m, p): whitening matrix
 
     def __post_init__(self) -> None:
         sizes = sum(v.dof for v in self.values)
         if self.covariance.shape != (sizes, sizes):
-            raise ValueError(f"a prior of {sizes} numbers has a covariance of shape {self.covariance.shape}")
+            raise ValueError(f"prior: expected a covariance of {sizes} numbers, got shape {self.covariance.shape}")
         known = np.flatnonzero(np.isfinite(np.diagonal(self.covariance)))
         finite = self.covariance[np.ix_(known, known)]
-        spread = np.sqrt(np.maximum(np.diagonal(finite), 0.0))
-        unit = np.where(spread > 0, spread, 1.0)
+        sigmas = np.sqrt(np.maximum(np.diagonal(finite), 0.0))
+        unit = np.where(sigmas > 0, sigmas, 1.0)
         eigenvalues, vectors = np.linalg.eigh(finite / np.outer(unit, unit))
         real = eigenvalues > 1e-12
         root = np.zeros((int(real.sum()), sizes))
@@ -43,24 +46,24 @@ class Prior:
 
     def linearise(self, values: Values) -> Linearised:
         """One residual of m numbers."""
-        away, parts, start = [], [], 0
+        deltas, parts, start = [], [], 0
         for (stack, element), known in zip(self.at, self.values, strict=True):
             one = np.array([element])
             delta = values[stack].pick(one).minus(known)[0]
-            away.append(delta)
-            J = self._root[:, start : start + known.dof] @ _slope(known, delta)
+            deltas.append(delta)
+            J = self._root[:, start : start + known.dof] @ _minus_jacobian(known, delta)
             parts.append(Part(stack, one, J[None]))
             start += known.dof
-        return Linearised((self._root @ np.concatenate(away))[None], parts)
+        return Linearised((self._root @ np.concatenate(deltas))[None], parts)
 
 
 @dataclass(frozen=True, slots=True)
 class Anchors:
-    """That all unknowns of a stack of vectors lie about where they were said to, each by itself."""
+    """Independent prior values of all unknowns of a stack of vectors, with one sigma."""
 
     stack: str
     known: Array  # (k, d)
-    sigma: float  # of each number
+    sigma: float  # of each number, in its unit
     loss: Loss | None = None
 
     def linearise(self, values: Values) -> Linearised:
@@ -68,13 +71,13 @@ class Anchors:
         now = values[self.stack]
         assert isinstance(now, Vectors)
         k, d = self.known.shape
-        away = now.minus(Vectors(self.known)) / self.sigma
+        residuals = now.minus(Vectors(self.known)) / self.sigma
         J = np.broadcast_to(np.eye(d) / self.sigma, (k, d, d))
-        return Linearised(away, [Part(self.stack, np.arange(k), J)])
+        return Linearised(residuals, [Part(self.stack, np.arange(k), J)])
 
 
-def _slope(known: Stack, delta: Array) -> Array:
-    """d(value.minus(known)) / d(error of value), (dof, dof)."""
+def _minus_jacobian(known: Stack, delta: Array) -> Array:
+    """d(value.minus(known)) / d(error of value) (dof, dof), at the difference delta (dof,)."""
     J = np.eye(known.dof)
     if isinstance(known, Poses):
         J[3:, 3:] = np.linalg.inv(rotations.right_jacobian(delta[3:]))
@@ -82,7 +85,11 @@ def _slope(known: Stack, delta: Array) -> Array:
 
 
 def independent(stack: str, values: Stack, sigmas: Array, first: int = 0) -> Sequence[Prior]:
-    """A prior for each unknown of a stack, sigmas (k, dof), inf where nothing is known; first: of them in the stack."""
+    """A prior for each of k successive unknowns of a stack, from the index `first`.
+
+    values: the k unknowns; sigmas (k, dof): inf where nothing is known.
+    """
+
     return [
         Prior(((stack, first + i),), (values.pick(np.array([i])),), np.diag(sigmas[i] ** 2))
         for i in range(len(values))

@@ -1,1 +1,1 @@
-"""Measurements as terms of an adjustment: whitened residuals with analytic Jacobians."""
+"""Measurements as terms of an adjustment: whitened residuals and analytic Jacobians."""

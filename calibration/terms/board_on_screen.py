@@ -1,4 +1,4 @@
-"""A board fixed to a screen, as a term of an adjustment: the two are parallel, and so far apart.
+"""A board fixed flat to a screen, as a term of an adjustment: the two are parallel, at a known distance.
 
 Stacks: "screens" (world_from_screen), "bow" (1/m), "boards" (world_from_board).
 """
@@ -16,18 +16,18 @@ from geometry.arrays import Array, Ints, skew
 
 @dataclass(frozen=True, slots=True)
 class BoardOnScreenTerm:
-    """n boards, each flat on its screen, the printed side up: its z axis points into the screen."""
+    """n boards, each flat on its screen with the printed side outwards: the board's z axis points into the screen."""
 
-    screen_of: Ints  # (n,)
-    placement_of: Ints  # (n,) into "boards"
-    middle: Array  # (n, 3), m, in the board's frame: where the offset holds
-    offset_m: Array  # (n,): from the screen's surface up to the printed side
-    sigma_m: Array  # (n,): of that
-    tilt_sigma_rad: Array  # (n,): of the angle between board and surface, about each axis of the board
+    screen_of: Ints  # (n,) index into "screens" and "bow"
+    placement_of: Ints  # (n,) index into "boards"
+    middle: Array  # (n, 3), m, in the board's frame: the point at which the offset holds
+    offset_m: Array  # (n,): height of the printed side above the screen's surface
+    sigma_m: Array  # (n,): sigma of the offset
+    tilt_sigma_rad: Array  # (n,): sigma of the angle between board and surface, about each axis of the board
     loss: Loss | None = None
 
     def linearise(self, values: Values) -> Linearised:
-        """Height over the offset, and the slopes of the board's x and y axes against the surface."""
+        """Height minus offset, and the slopes of the board's x and y axes against the surface: (n, 3), in sigmas."""
         world_from_screen = pose_of(values, "screens")[self.screen_of]
         world_from_board = pose_of(values, "boards")[self.placement_of]
         bow = array_of(values, "bow")[self.screen_of]
@@ -38,7 +38,7 @@ class BoardOnScreenTerm:
         residuals = np.concatenate(
             [(surface_heights(p, bow) - self.offset_m)[:, None], (axes @ g[..., None])[..., 0]], axis=1
         )
-        # What moves p and the axes in the screen's frame: the board, and the screen the other way round.
+        # p and the axes, in the screen's frame, depend on the board's pose and on the screen's.
         curve = np.zeros((*g.shape, 3))  # d(g)/d(p)
         a, b, c = np.moveaxis(bow, -1, 0)
         curve[:, 0, 0], curve[:, 0, 1], curve[:, 1, 0], curve[:, 1, 1] = -2 * a, -b, -b, -2 * c
@@ -48,7 +48,8 @@ class BoardOnScreenTerm:
         by_board = np.concatenate([by_p @ R_t, -by_p @ R @ skew(self.middle)], axis=-1)
         by_screen = np.concatenate([-by_p @ R_t, by_p @ skew(p)], axis=-1)
         for k in range(2):
-            # An axis e of the board turns by R (theta x e); seen from a screen that turns, by -theta x axis.
+            # A rotation theta of the board changes its axis by R (theta x e), one of the screen by -theta x axis.
+
             e = np.broadcast_to(np.eye(3)[k], p.shape)
             by_board[:, 1 + k, 3:] += (-g[:, None, :] @ R @ skew(e))[:, 0]
             by_screen[:, 1 + k, 3:] += (g[:, None, :] @ skew(axes[:, k]))[:, 0]

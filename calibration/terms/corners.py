@@ -1,69 +1,80 @@
-"""Board corners in photographs as terms of an adjustment: any number of cameras, boards and placements.
+"""Board corners in photographs as a term of an adjustment: any number of cameras, boards and placements.
 
-The stacks it touches: "intrinsics" Vectors (cameras, 18): fx, fy, cx, cy (px) and fourteen distortion numbers in
-OpenCV's order; "cameras" Poses camera_from_world; "boards" Poses world_from_board, one per placement; "warp" Vectors
-(boards, 3), 1/m: the board's surface is z = a dx^2 + b dx dy + c dy^2 about its middle. Three more where they are
-there: "radius" Vectors (boards, 1), m: of a board's circles, 0 for a board whose points are points; "stretch" Vectors
-(boards, 2): x is drawn at x + e dx + s dy about the middle, so that rows and columns differ in scale by e and are not
-at right angles by s; "print" Vectors (points, 3), m: by how much each point of a board lies off.
+Stacks on which it depends:
+
+- "intrinsics" Vectors (cameras, 18): fx, fy, cx, cy (px) and fourteen distortion coefficients in OpenCV's order;
+- "cameras" Poses: camera_from_world;
+- "boards" Poses: world_from_board, one per placement;
+- "warp" Vectors (boards, 3), 1/m: the board's surface is z = a dx^2 + b dx dy + c dy^2 about its middle;
+- "radius" Vectors (boards, 1), m, optional: radius of the board's circles, 0 for corners;
+- "stretch" Vectors (boards, 2), optional: x is printed at x + e dx + s dy about the middle: rows and columns differ in
+  scale by e, and their angle differs from 90 deg by s (rad);
+- "print" Vectors (points, 3), m, optional: error of each point of a board.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import TypeVar
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from calibration.least_squares.adjustment import Linearised, Loss, Part, Values
-from calibration.least_squares.parameter_blocks import Poses, Vectors
 from calibration.terms.circle_images import NODES, ON_CIRCLE, centroid
+from calibration.terms.surveyed import array_of, pose_of
 from geometry.arrays import Array, Bools, Ints, cross
 from geometry.camera import Projected, project_points_full
 
-S = TypeVar("S")
-
-INTRINSICS = 18  # fx, fy, cx, cy and OpenCV's fourteen
-_BY_BOARD = ("warp", "radius", "stretch")
+INTRINSICS = 18  # numbers of a camera: fx, fy, cx, cy and OpenCV's fourteen distortion coefficients
+_BY_BOARD = ("warp", "radius", "stretch")  # stacks with one unknown per board
 
 
 @dataclass(frozen=True, slots=True)
 class CornerTerm:
-    """N corners, or centroids of circles, each seen once by one camera on one placement of one board."""
+    """N corners, or centroids of circles; each is one observation by a camera of one placement of one board."""
 
     pixels: Array  # (N, 2)
-    points: Array  # (N, 3), m, in the board's frame; z is 0, or what a survey of the board gave
-    from_middle: Array  # (N, 2), m: x and y from the board's middle, about which it is bent
-    camera: Ints  # (N,) into "intrinsics" and "cameras"
-    placement: Ints  # (N,) into "boards"
-    board: Ints  # (N,) into "warp", "radius", "stretch": which physical board
+    points: Array  # (N, 3), m, in the board's frame; z is 0 unless the board was surveyed
+    from_middle: Array  # (N, 2), m: x and y relative to the board's middle, about which it is bent
+    camera: Ints  # (N,) index into "intrinsics" and "cameras"
+    placement: Ints  # (N,) index into "boards"
+    board: Ints  # (N,) index of the physical board into "warp", "radius" and "stretch"
     sigma_px: Array  # (N,), of each coordinate
     fisheye: Bools  # (cameras,)
     loss: Loss | None = None
-    point: Ints | None = None  # (N,) into "print": which point of its board; None where that stack is not used
+    point: Ints | None = None  # (N,) index of the board's point into "print"; None if that stack is not used
 
     def __len__(self) -> int:
         return len(self.pixels)
 
+    def pick(self, rows: Bools, loss: Loss | None = None) -> CornerTerm:
+        """Some of the corners, with this loss."""
+        per_row = ["pixels", "points", "from_middle", "camera", "placement", "board", "sigma_px"]
+        per_row += [] if self.point is None else ["point"]
+        return replace(self, **{name: getattr(self, name)[rows] for name in per_row}, loss=loss)
+
+    def widened(self, scale: float) -> CornerTerm:
+        """The same corners with all sigmas multiplied."""
+        return replace(self, sigma_px=self.sigma_px * scale)
+
     def project(self, values: Values) -> Array:
-        """Where the corners should be: pixels (N, 2); nan behind the camera, or where the lens model has folded."""
+        """Predicted pixels (N, 2) of the corners; nan behind the camera."""
         out = np.empty((len(self), 2))
         for rows, outline in self._kinds(values):
             placed = _Placed.of(self, values, rows, outline)
-            seen = self._projected(values, placed)
-            out[rows] = seen.pixels if outline is None else centroid(seen.pixels.reshape(-1, NODES, 2))[0]
+            projected = self._projected(values, placed)
+            out[rows] = projected.pixels if outline is None else centroid(projected.pixels.reshape(-1, NODES, 2))[0]
         return out
 
     def linearise(self, values: Values) -> Linearised:
-        """Residuals (projected less measured) (N, 2) in sigmas and derivatives; see least_squares/adjustment.py."""
+        """Predicted minus measured pixels (N, 2), in sigmas, and their derivatives by all stacks."""
         residuals = np.empty((len(self), 2))
         jacobians: dict[str, Array] = {}
         for rows, outline in self._kinds(values):
             placed = _Placed.of(self, values, rows, outline)
-            seen = self._projected(values, placed)
-            by = self._derivatives(values, placed, seen)
-            pixels = seen.pixels
+            projected = self._projected(values, placed)
+            by = self._derivatives(values, placed, projected)
+            pixels = projected.pixels
             if outline is not None:
                 pixels, G = centroid(pixels.reshape(-1, NODES, 2))
                 G = G.reshape(len(G), 2, 2 * NODES)
@@ -75,6 +86,7 @@ class CornerTerm:
         return Linearised(residuals, [Part(name, self._index(name), J) for name, J in jacobians.items()])
 
     def _index(self, stack: str) -> Ints:
+        """The unknown (N,) of a stack on which each corner depends."""
         if stack in _BY_BOARD:
             return self.board
         if stack == "print":
@@ -83,23 +95,23 @@ class CornerTerm:
         return self.placement if stack == "boards" else self.camera
 
     def _kinds(self, values: Values) -> list[tuple[Ints, Array | None]]:
-        """Rows that are points with None, and rows that are circles with their radii (n,), m."""
+        """The rows that are corners, with None, and the rows that are circles, with their radii (n,), m."""
         if "radius" not in values:
             return [(np.arange(len(self)), None)]
-        radius = _stack(values, "radius", Vectors).array[self.board, 0]
+        radius = array_of(values, "radius")[self.board, 0]
         kinds = [(np.flatnonzero(radius == 0), None), (np.flatnonzero(radius != 0), radius[radius != 0])]
         return [kind for kind in kinds if len(kind[0])]
 
-    def _derivatives(self, values: Values, placed: _Placed, seen: Projected) -> Mapping[str, Array]:
-        """d(pixel) (n, 2, dof) by each stack."""
-        boards, R = _stack(values, "boards", Poses).pose, _stack(values, "cameras", Poses).pose.rotation
-        by_world_point = seen.d_point @ R[placed.camera]
+    def _derivatives(self, values: Values, placed: _Placed, projected: Projected) -> Mapping[str, Array]:
+        """Derivatives (n, 2, dof) of the pixels by each stack."""
+        boards, R = pose_of(values, "boards"), pose_of(values, "cameras").rotation
+        by_world_point = projected.d_point @ R[placed.camera]
         by_board_point = by_world_point @ boards.rotation[self.placement[placed.row]]
-        # Of R Exp(theta) x: d/dtheta = -R [x]_x; a row w of the derivative by the point gives -w [x]_x = x x w.
+        # d(R Exp(theta) x)/dtheta = -R [x]_x; with a row w of the derivative by the point: -w [x]_x = x cross w.
         out = {
-            "intrinsics": np.concatenate([seen.d_pinhole, seen.d_distortion], axis=2),
+            "intrinsics": np.concatenate([projected.d_pinhole, projected.d_distortion], axis=2),
             "boards": np.concatenate([by_world_point, cross(placed.on_board[:, None], by_board_point)], axis=2),
-            "cameras": np.concatenate([seen.d_point, cross(placed.in_world[:, None], by_world_point)], axis=2),
+            "cameras": np.concatenate([projected.d_point, cross(placed.in_world[:, None], by_world_point)], axis=2),
             "warp": by_board_point[..., 2:] * _bend(placed.from_middle)[:, None],
         }
         if "stretch" in values:
@@ -115,52 +127,53 @@ class CornerTerm:
     def _projected(self, values: Values, placed: _Placed) -> Projected:
         """Pixels with derivatives.
 
-        Camera by camera, not with each point's own lens: what depends on the lens alone (the tilt of the sensor)
-        is then computed once and not for each of twenty thousand corners. Where the radial model folds is not asked:
-        a solve may pass through such lenses on its way; `lens_models.folds_in_picture` asks of the result.
+        The cameras are processed one by one, so that what depends on the lens alone (the tilt of the sensor) is
+        computed once per camera and not once for each of, say, twenty thousand corners. The fold of the lens model is
+        ignored: a solve may pass through lenses that fold; `lens_models.folds_in_picture` checks the result.
         """
-        lenses = _stack(values, "intrinsics", Vectors).array
+        lenses = array_of(values, "intrinsics")
         n = len(placed.camera)
         out = Projected(np.empty((n, 2)), np.empty((n, 2, 3)), np.empty((n, 2, 4)), np.empty((n, 2, 14)))
         for k in np.unique(placed.camera):
-            mine = placed.camera == k
+            of_camera = placed.camera == k
             wide = np.asarray(self.fisheye[k]) if self.fisheye[k] else None
-            one = project_points_full(placed.in_camera[mine], lenses[k, :4], lenses[k, 4:], np.asarray(np.inf), wide)
-            out.pixels[mine], out.d_point[mine] = one.pixels, one.d_point
-            out.d_pinhole[mine], out.d_distortion[mine] = one.d_pinhole, one.d_distortion
+            points = placed.in_camera[of_camera]
+            one = project_points_full(points, lenses[k, :4], lenses[k, 4:], np.asarray(np.inf), wide)
+            out.pixels[of_camera], out.d_point[of_camera] = one.pixels, one.d_point
+            out.d_pinhole[of_camera], out.d_distortion[of_camera] = one.d_pinhole, one.d_distortion
         return out
 
 
 @dataclass(frozen=True, slots=True)
 class _Placed:
-    """Points of n corners, or NODES points on the outline of each circle in turn, in all frames."""
+    """The points of n corners in all frames, or NODES points on the outline of each circle in turn."""
 
-    row: Ints  # (n,) into the term
+    row: Ints  # (n,) index into the term
     camera: Ints  # (n,)
     from_middle: Array  # (n, 2), m
     on_board: Array  # (n, 3), m
-    in_world: Array
-    in_camera: Array
-    by_radius: Array  # (n, 3): d(on_board)/d(radius), 0 for points
+    in_world: Array  # (n, 3), m
+    in_camera: Array  # (n, 3), m
+    by_radius: Array  # (n, 3): d(on_board)/d(radius), 0 for corners
 
     @staticmethod
     def of(term: CornerTerm, values: Values, rows: Ints, radii: Array | None) -> _Placed:
-        """Points of some rows of a term; radii (rows,), m: of circles, None for points."""
+        """The points of some rows of a term; radii (rows,), m, of circles, None for corners."""
         step = np.zeros((len(rows), 2))
         if radii is not None:
             rows = np.repeat(rows, NODES)
             step = np.tile(ON_CIRCLE, (len(radii), 1))
             radii = np.repeat(radii, NODES)
-        out_by = 0.0 if radii is None else radii[:, None]
+        radius = 0.0 if radii is None else radii[:, None]
         board, placement, camera = term.board[rows], term.placement[rows], term.camera[rows]
-        warp = _stack(values, "warp", Vectors).array[board]
-        stretch = _stack(values, "stretch", Vectors).array[board] if "stretch" in values else np.zeros((len(rows), 2))
-        from_middle = term.from_middle[rows] + out_by * step
+        warp = array_of(values, "warp")[board]
+        stretch = array_of(values, "stretch")[board] if "stretch" in values else np.zeros((len(rows), 2))
+        from_middle = term.from_middle[rows] + radius * step
         on_board = term.points[rows].copy()
-        on_board[:, :2] += out_by * step
+        on_board[:, :2] += radius * step
         if "print" in values:
             assert term.point is not None
-            on_board += _stack(values, "print", Vectors).array[term.point[rows]]
+            on_board += array_of(values, "print")[term.point[rows]]
         on_board[:, 0] += np.sum(stretch * from_middle, axis=1)
         on_board[:, 2] += np.sum(warp * _bend(from_middle), axis=1)
         by_radius = np.zeros((len(rows), 3))
@@ -168,8 +181,8 @@ class _Placed:
             by_radius[:, :2] = step
             by_radius[:, 0] += np.sum(stretch * step, axis=1)
             by_radius[:, 2] += np.sum(warp * _bend_slope(from_middle, step), axis=1)
-        in_world = _stack(values, "boards", Poses).pose[placement].apply(on_board)
-        in_camera = _stack(values, "cameras", Poses).pose[camera].apply(in_world)
+        in_world = pose_of(values, "boards")[placement].apply(on_board)
+        in_camera = pose_of(values, "cameras")[camera].apply(in_world)
         return _Placed(rows, camera, from_middle, on_board, in_world, in_camera, by_radius)
 
 
@@ -183,9 +196,10 @@ def single_camera(
     loss: Loss | None = None,
     point: Ints | None = None,
 ) -> CornerTerm:
-    """The corners (N) that one camera sees of one board; points (N, 3) and middle (3,) in the board's frame, m.
+    """The N corners that one camera sees of one board; points (N, 3), m, and middle (3,), m, in the board's frame.
 
-    point (N,): which point of the board each is; needed where the points themselves are solved for.
+    placement (N,): index of each corner's placement. point (N,): index of its point on the board, required if the
+    errors of the points are unknowns ("print").
     """
     one = np.zeros(len(pixels), dtype=np.int64)
     return CornerTerm(
@@ -203,19 +217,13 @@ def single_camera(
 
 
 def _bend(from_middle: Array) -> Array:
-    """What a, b and c of the warp lift a point by: (N, 3), m^2."""
+    """Derivatives (N, 3), m^2, of the height of points (N, 2), m, by a, b and c of the warp."""
     x, y = from_middle[:, 0], from_middle[:, 1]
     return np.stack([x * x, x * y, y * y], axis=1)
 
 
 def _bend_slope(from_middle: Array, step: Array) -> Array:
-    """d(_bend) (N, 3), m, along directions `step` (N, 2)."""
+    """Derivatives (N, 3), m, of `_bend` along directions `step` (N, 2)."""
+
     (x, y), (p, q) = from_middle.T, step.T
     return np.stack([2 * x * p, x * q + y * p, 2 * y * q], axis=1)
-
-
-def _stack(values: Values, name: str, kind: type[S]) -> S:
-    stack = values[name]
-    if not isinstance(stack, kind):
-        raise TypeError(f"the stack {name!r} holds {type(stack).__name__}, expected {kind.__name__}")
-    return stack

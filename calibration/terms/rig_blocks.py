@@ -1,6 +1,6 @@
-"""A rig as stacks of unknowns, and back: values, names and covariances.
+"""Conversion of a rig to stacks of unknowns and back: values, names and covariances.
 
-The stacks "intrinsics", "cameras", "screens", "bow" and "beams" hold the rig's things in the rig's order.
+The stacks "intrinsics", "cameras", "screens", "bow" and "beams" have the rig's order.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from geometry.uncertainty.rig_parameters import BOW, DIRECTION, PINHOLE, POINT, 
 
 INTRINSICS, CAMERAS, SCREENS, BOWS, BEAMS = "intrinsics", "cameras", "screens", "bow", "beams"
 STAND, POSES = "stand", "poses"  # world_from_stand (1), and stand_from_body, one per stand position
-_LENS_NUMBERS = 18  # fx fy cx cy and 14 distortion numbers
-# Of its own variance, added to each number of a prior: a covariance of less than full rank then still holds the
-# directions in which it is 0 (to 1e-4 of a sigma), which a prior otherwise leaves free.
+_INTRINSICS_COUNT = 18  # fx, fy, cx, cy and 14 distortion coefficients
+# Share of its variance that is added to each number of a prior. A singular covariance then also constrains the
+# directions in which it is 0 (to 1e-4 of a sigma); `Prior` leaves such directions free.
 _RIDGE = 1e-8
 
 
 def stacks_of(rig: Rig) -> dict[str, Stack]:
-    """The rig's numbers. Lens numbers beyond those of a camera's model are 0; leave them out of what is free."""
+    """The stacks of a rig. Lens numbers that a camera's model does not have are 0 and must not be free."""
     lens = [np.concatenate([pinhole_numbers(c), padded(c.distortion)]) for c in rig.cameras.values()]
     return {
-        INTRINSICS: Vectors(np.array(lens, dtype=float).reshape(-1, _LENS_NUMBERS)),
+        INTRINSICS: Vectors(np.array(lens, dtype=float).reshape(-1, _INTRINSICS_COUNT)),
         CAMERAS: Poses.of([c.camera_from_world for c in rig.cameras.values()]),
         SCREENS: Poses.of([s.world_from_screen for s in rig.screens.values()]),
         BOWS: Vectors(np.array([s.bow for s in rig.screens.values()], dtype=float).reshape(-1, 3)),
@@ -44,7 +44,7 @@ def stacks_of(rig: Rig) -> dict[str, Stack]:
 
 
 def rig_of(rig: Rig, values: Values) -> Rig:
-    """The rig with the numbers of the stacks that are there; the other ones, names and spots stay."""
+    """The rig with the values of those stacks that are present; everything else is that of the given rig."""
     cameras, screens, beams = dict(rig.cameras), dict(rig.screens), dict(rig.beams)
     for i, (name, c) in enumerate(rig.cameras.items()):
         cameras[name] = _camera(c, i, values)
@@ -59,29 +59,33 @@ def rig_of(rig: Rig, values: Values) -> Rig:
 
 
 def lines_in(values: Values) -> Lines:
-    """The stack of beams."""
+    """The stack of the beams."""
     stack = values[BEAMS]
     assert isinstance(stack, Lines)
     return stack
 
 
 def names_at(rig: Rig, at: At) -> tuple[str, ...]:
-    """The names, as in rig.yaml's covariance blocks, of the numbers of one unknown of a stack."""
+    """The names, as in rig.yaml's covariance blocks, of the numbers of one unknown of a stack.
+
+    Raises:
+        KeyError: the stack does not belong to the rig.
+    """
     stack, i = at
     if stack in (INTRINSICS, CAMERAS):
         name, camera = list(rig.cameras.items())[i]
-        return _of(f"cameras.{name}", (*PINHOLE, *distortion_names(camera)) if stack == INTRINSICS else POSE)
+        return _full_names(f"cameras.{name}", (*PINHOLE, *distortion_names(camera)) if stack == INTRINSICS else POSE)
     if stack in (SCREENS, BOWS):
-        return _of(f"screens.{list(rig.screens)[i]}", POSE if stack == SCREENS else BOW)
+        return _full_names(f"screens.{list(rig.screens)[i]}", POSE if stack == SCREENS else BOW)
     if stack == BEAMS:
-        return _of(f"beams.{list(rig.beams)[i]}", (*DIRECTION, *POINT))
+        return _full_names(f"beams.{list(rig.beams)[i]}", (*DIRECTION, *POINT))
     raise KeyError(stack)
 
 
 def named_errors(rig: Rig, values: Values, at: Sequence[At]) -> tuple[tuple[str, ...], Array]:
-    """Names (p) and the matrix (p, q) that takes errors of unknowns, stacked, to errors of the named numbers.
+    """Names (p) of the numbers of some unknowns, and the matrix (p, q) from errors of the unknowns to their errors.
 
-    A beam's four errors make six, none along the beam; of a lens only the numbers that its model uses have names.
+    A beam's four errors give six, with none along the beam. Only lens numbers that the camera's model uses have names.
     """
     names = [names_at(rig, a) for a in at]
     T = np.zeros((sum(map(len, names)), sum(values[s].dof for s, _ in at)))
@@ -94,10 +98,12 @@ def named_errors(rig: Rig, values: Values, at: Sequence[At]) -> tuple[tuple[str,
 
 
 def prior_of(rig: Rig, covariance: RigCovariance) -> tuple[Prior | None, dict[str, Bools]]:
-    """What a covariance of rig numbers says as a prior about the rig's stacks, and which numbers (k, dof) it frees.
+    """A covariance of rig parameters as a prior on the rig's stacks, and the numbers (k, dof) that are then free.
 
-    What it does not name, or names with a variance of 0, is taken as known and stays fixed. KeyError for a name that
-    the rig does not have.
+    Numbers that are not named, or have a variance of 0, are known and stay fixed. The prior is None if none is free.
+
+    Raises:
+        KeyError: the rig has no parameter of this name.
     """
     values = stacks_of(rig)
     every = [(s, i) for s, stack in values.items() for i in range(len(stack))]
@@ -110,7 +116,7 @@ def prior_of(rig: Rig, covariance: RigCovariance) -> tuple[Prior | None, dict[st
     rows = np.array([order[n] for n in covariance.names], dtype=np.int64)
     full = np.zeros((len(names), len(names)))
     full[np.ix_(rows, rows)] = covariance.matrix
-    # The columns and rows of T are unit vectors across each other, so that its transpose leads back.
+    # The columns of T are orthonormal or 0, so that its transpose maps errors of the numbers back to the unknowns.
     C = T.T @ full @ T
     C += np.diag(_RIDGE * np.diagonal(C))
     known = np.diagonal(C) > 0
@@ -134,12 +140,13 @@ def _camera(c: Camera, i: int, values: Values) -> Camera:
     return replace(c, matrix=matrix, distortion=tuple(lens[: len(c.distortion)]), camera_from_world=pose)
 
 
-def _of(thing: str, parameters: Sequence[str]) -> tuple[str, ...]:
-    return tuple(f"{thing}.{p}" for p in parameters)
+def _full_names(item: str, parameters: Sequence[str]) -> tuple[str, ...]:
+    return tuple(f"{item}.{p}" for p in parameters)
 
 
 def _to_names(values: Mapping[str, Stack], at: At, count: int) -> Array:
-    """(count, dof): errors of an unknown's numbers to errors of those that have names."""
+    """The matrix (count, dof) from the errors of an unknown to those of its `count` named numbers."""
+
     stack = values[at[0]]
     if not isinstance(stack, Lines):
         return np.eye(count, stack.dof)

@@ -1,4 +1,4 @@
-"""Pixels of beams' spots as measurements: of beams, screens, cameras, the stand and its positions."""
+"""Pixels of spots as a term of an adjustment: measurements of beams, screens, cameras, the stand and its positions."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from geometry.rig import Rig
 
 @dataclass(frozen=True, slots=True)
 class SpotPixels:
-    """N spots that were found and labelled, at positions of the stand."""
+    """N detected and labelled spots at positions of the stand."""
 
-    position: Ints  # (N,) which position, from 0
-    view: Ints  # (N,) which view, in the order of Rig.views()
+    position: Ints  # (N,) index of the stand's position
+    view: Ints  # (N,) index of the view, in the order of Rig.views()
     pixels: Array  # (N, 2), distorted
     covariance: Array  # (N, 2, 2), px^2
 
@@ -37,37 +37,48 @@ class SpotPixels:
 
 @dataclass(frozen=True, slots=True)
 class SpotTerm:
-    """Found minus predicted pixels of spots, in their sigmas.
+    """Predicted minus measured pixels of spots, in sigmas.
 
-    The stacks are those of rig_stacks: "intrinsics", "cameras", "screens", "bow" and "beams" in the rig's order,
-    "stand" (one) and "poses" (one per position): world_from_body = stand[0] @ poses[position]. The forward model is
-    that of geometry/forward_model.py, with the screens taken as endless: a spot that was seen hit its screen.
+    The stacks are those of rig_blocks.py: "intrinsics", "cameras", "screens", "bow" and "beams" in the rig's order,
+    "stand" (one) and "poses" (one per position), with world_from_body = stand[0] @ poses[position]. The forward model
+    is that of geometry/forward_model.py with unlimited screens: a spot that was detected did hit its screen.
     """
 
-    rig: Rig  # for what the stacks do not hold: which camera sees which screen, signs of the ends, lens models
+    rig: Rig  # for what the stacks do not contain: which camera sees which screen, ends of beams, lens models
     spots: SpotPixels
     loss: Loss | None = None
-    _model: SpotModel = field(init=False)  # one view per spot, as (N, 1, ...): each has its own pose
+    _model: SpotModel = field(init=False)  # one view per spot, with arrays (N, 1, ...), because each has its own pose
     _screen_of: Ints = field(init=False)  # (N,)
-    _W: Array = field(init=False)  # (N, 2, 2) whitens
+    _W: Array = field(init=False)  # (N, 2, 2) whitening matrices
 
     def __post_init__(self) -> None:
         model = SpotModel.of(self.rig)
         screens = list(self.rig.screens)
         screen_of = np.array([screens.index(self.rig.spots[s].screen) for _, s in model.views], dtype=np.int64)
-        seen = model.subset(self.spots.view)
-        one_each = {
-            f.name: getattr(seen, f.name)[:, None]
-            for f in fields(seen)
-            if f.init and isinstance(getattr(seen, f.name), np.ndarray)
+        of_spots = model.subset(self.spots.view)
+        arrays = {
+            f.name: getattr(of_spots, f.name)[:, None]
+            for f in fields(of_spots)
+            if f.init and isinstance(getattr(of_spots, f.name), np.ndarray)
         }
-        endless = np.full_like(one_each["half_size"], np.inf)
-        object.__setattr__(self, "_model", replace(seen, **{**one_each, "half_size": endless}))
+        unlimited = np.full_like(arrays["half_size"], np.inf)
+        object.__setattr__(self, "_model", replace(of_spots, **{**arrays, "half_size": unlimited}))
         object.__setattr__(self, "_screen_of", screen_of[self.spots.view])
         object.__setattr__(self, "_W", whiten(self.spots.covariance))
 
+    def __len__(self) -> int:
+        return len(self.spots)
+
+    def pick(self, rows: Bools, loss: Loss | None = None) -> SpotTerm:
+        """Some of the spots, with this loss."""
+        return SpotTerm(self.rig, self.spots.pick(rows), loss)
+
+    def widened(self, scale: float) -> SpotTerm:
+        """The same spots with all sigmas multiplied."""
+        return SpotTerm(self.rig, replace(self.spots, covariance=self.spots.covariance * scale**2), self.loss)
+
     def linearise(self, values: Values) -> Linearised:
-        """N residuals of 2, and their derivatives by all seven stacks."""
+        """Residuals (N, 2), and their derivatives by all seven stacks; nan where a beam misses its screen."""
         model = self._at(values)
         beam, camera, screen = model.beam_of[:, 0], model.camera_of[:, 0], self._screen_of
         world_from_stand, stand_from_body = pose_of(values, STAND)[0], pose_of(values, POSES)[self.spots.position]
@@ -89,7 +100,7 @@ class SpotTerm:
         return Linearised(residuals[..., 0], [Part(name, index, self._W @ J) for name, index, J in parts])
 
     def _at(self, values: Values) -> SpotModel:
-        """The forward model with the stacks' numbers."""
+        """The forward model with the values of the stacks."""
         m = self._model
         lens, lines = array_of(values, INTRINSICS), lines_in(values)
         cameras, screens = pose_of(values, CAMERAS), pose_of(values, SCREENS)
@@ -110,7 +121,7 @@ class SpotTerm:
         )
 
     def _folds(self, lens: Array) -> Array:
-        """Where each camera's lens model folds, (cameras,); kept from the rig where its numbers are still the rig's."""
+        """Squared radius (cameras,) at which each lens model folds; that of the rig for an unchanged lens."""
         out = []
         for c, row in zip(self.rig.cameras.values(), lens, strict=True):
             numbers = tuple(row[4 : 4 + len(c.distortion)].tolist())
@@ -122,9 +133,10 @@ class SpotTerm:
 
 
 def _chain(by_body: Array, world_from_stand: Pose, stand_from_body: Pose) -> tuple[Array, Array]:
-    """Derivatives (N, 2, 6) by world_from_stand and by stand_from_body, from those by world_from_body.
+    """Derivatives (N, 2, 6) by world_from_stand and by stand_from_body, from those by world_from_body (N, 2, 6).
 
-    To first order dt_body = dt_stand - R_stand [t_pose]x dtheta_stand + R_stand dt_pose and
+    To first order, dt_body = dt_stand - R_stand [t_pose]x dtheta_stand + R_stand dt_pose and
+
     dtheta_body = R_pose^T dtheta_stand + dtheta_pose.
     """
     R = world_from_stand.rotation

@@ -1,12 +1,12 @@
-"""Surveyed points as terms of an adjustment: where a camera sees them, which screen they lie on, what the survey says.
+"""Surveyed points as terms of an adjustment: their pixels, the screens on which they lie, their surveyed coordinates.
 
-Stacks: "intrinsics" (fx, fy, cx, cy, px, and 14 distortion numbers), "cameras" (camera_from_world), "screens"
-(world_from_screen), "bow" (1/m), "points" (world, m). All Jacobians are for the errors that these stacks define.
+Stacks: "intrinsics" (fx, fy, cx, cy, px, and 14 distortion coefficients), "cameras" (camera_from_world), "screens"
+(world_from_screen), "bow" (1/m), "points" (world, m). All Jacobians are by the errors that these stacks define.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -33,12 +33,12 @@ def array_of(values: Values, stack: str) -> Array:
 
 
 def whitening(covariances: Array) -> Array:
-    """W (..., d, d) with W C W^T = 1, of covariances C (..., d, d): turns an error into sigmas."""
+    """Whitening matrices W (..., d, d) of covariances C (..., d, d): W C W^T = I."""
     return np.linalg.inv(np.linalg.cholesky(covariances))
 
 
 def fold_limits(intrinsics: Array, fisheye: Bools) -> Array:
-    """How far out each camera's lens model holds (n_cameras,), of intrinsics (n_cameras, 18)."""
+    """Squared radii (n_cameras,) at which the lens models fold, of intrinsics (n_cameras, 18)."""
     return np.array(
         [
             (lens.fisheye_fold_limit(tuple(row[4:8])) if wide else lens.fold_limit(tuple(row[4:])))
@@ -49,17 +49,30 @@ def fold_limits(intrinsics: Array, fisheye: Bools) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class PointTerm:
-    """Pixels of surveyed points in fixed cameras: n observations."""
+    """n observations: pixels of points in fixed cameras."""
 
     camera_of: Ints  # (n,)
     point_of: Ints  # (n,)
     pixels: Array  # (n, 2), px, distorted
-    whiten: Array  # (n, 2, 2): turns a pixel error into sigmas, `whitening` of its covariance
+    whiten: Array  # (n, 2, 2): `whitening` of the pixel's covariance
     fisheye: Bools  # (n_cameras,)
     loss: Loss | None = None
 
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+    def pick(self, rows: Bools, loss: Loss | None = None) -> PointTerm:
+        """Some of the observations, with this loss."""
+        return PointTerm(
+            self.camera_of[rows], self.point_of[rows], self.pixels[rows], self.whiten[rows], self.fisheye, loss
+        )
+
+    def widened(self, scale: float) -> PointTerm:
+        """The same observations with all sigmas multiplied."""
+        return replace(self, whiten=self.whiten / scale)
+
     def linearise(self, values: Values) -> Linearised:
-        """Predicted less measured pixel; nan where the point lies behind the camera."""
+        """Predicted minus measured pixels (n, 2), in sigmas; nan where the point lies behind the camera."""
         intrinsics = array_of(values, "intrinsics")
         camera_from_world = pose_of(values, "cameras")[self.camera_of]
         points = array_of(values, "points")[self.point_of]
@@ -88,15 +101,19 @@ class PointTerm:
 
 @dataclass(frozen=True, slots=True)
 class SurfaceTerm:
-    """Points that lie on a screen's surface: n of them, each within its sigma of it."""
+    """n points that lie on the surface of a screen, each to within its sigma."""
 
     screen_of: Ints  # (n,)
     point_of: Ints  # (n,)
-    sigma_m: Array  # (n,): how far a point may lie off the surface: paint, paper, what the bow does not describe
+    sigma_m: Array  # (n,): distance of a point from the surface (paint, paper, shape that the bow does not describe)
     loss: Loss | None = None
 
+    def widened(self, scale: float) -> SurfaceTerm:
+        """The same points with all sigmas multiplied."""
+        return replace(self, sigma_m=self.sigma_m * scale)
+
     def linearise(self, values: Values) -> Linearised:
-        """Heights over the surface z = a x^2 + b x y + c y^2 of the screen's frame."""
+        """Heights (n, 1), in sigmas, above the surface z = a x^2 + b x y + c y^2 in the screen frame."""
         world_from_screen = pose_of(values, "screens")[self.screen_of]
         bow = array_of(values, "bow")[self.screen_of]
         points = array_of(values, "points")[self.point_of]
@@ -118,40 +135,44 @@ class SurfaceTerm:
 
 @dataclass(frozen=True, slots=True)
 class SurveyTerm:
-    """What the survey says of n points, in world."""
+    """The surveyed coordinates of n points, in world."""
 
     point_of: Ints  # (n,)
     surveyed: Array  # (n, 3), m
-    whiten: Array  # (n, 3, 3): turns an error into sigmas, `whitening` of its covariance
+    whiten: Array  # (n, 3, 3): `whitening` of the point's covariance
     loss: Loss | None = None
 
+    def widened(self, scale: float) -> SurveyTerm:
+        """The same survey with all sigmas multiplied."""
+        return replace(self, whiten=self.whiten / scale)
+
     def linearise(self, values: Values) -> Linearised:
-        """Point less survey."""
-        away = array_of(values, "points")[self.point_of] - self.surveyed
-        return Linearised((self.whiten @ away[..., None])[..., 0], [Part("points", self.point_of, self.whiten)])
+        """Point minus survey (n, 3), in sigmas."""
+        delta = array_of(values, "points")[self.point_of] - self.surveyed
+        return Linearised((self.whiten @ delta[..., None])[..., 0], [Part("points", self.point_of, self.whiten)])
 
 
 @dataclass(frozen=True, slots=True)
 class FrameTerm:
-    """Holds the two axes of a screen where they were chosen: no measurement says where a plane's origin is.
+    """Fixes origin and axes of screen frames within their planes, which no measurement determines (gauge).
 
-    Only the shift within the plane and the turn about its normal are held, to a micrometre and a microradian: by
-    definition, not by knowledge. What the plane itself does stays free.
+    Only the shift within the plane and the turn about its normal are constrained, to 1 um and 1 urad. The plane itself
+    stays free.
     """
 
     screen_of: Ints  # (n,)
-    chosen: Pose  # (n,) world_from_screen
+    chosen: Pose  # (n,) world_from_screen of the chosen frame
     loss: Loss | None = None
     sigma: float = 1e-6  # m and rad
 
     def linearise(self, values: Values) -> Linearised:
-        """Shift along x, along y and turn about z away from the chosen frame."""
+        """Shift along x, shift along y and turn about z relative to the chosen frame (n, 3), in sigmas."""
         world_from_screen = pose_of(values, "screens")[self.screen_of]
         delta = world_from_screen.minus(self.chosen)
         axes = np.swapaxes(self.chosen.rotation[..., :2], -1, -2)  # (n, 2, 3)
         shift = (axes @ delta[..., :3, None])[..., 0]
         residuals = np.concatenate([shift, delta[..., 5:]], axis=-1)
-        # The turn away stays far below a radian, where d(log)/d(theta) is 1.
+        # The turn stays far below a radian, where d(log)/d(theta) is the identity.
         J = np.zeros((len(self.screen_of), 3, 6))
         J[:, :2, :3] = axes
         J[:, 2, 5] = 1.0
@@ -165,12 +186,13 @@ def bow_shape(on_screen: Array) -> Array:
 
 
 def surface_heights(on_screen: Array, bow: Array) -> Array:
-    """How far points (..., 3), m, in the screen's frame, lie over its surface along z. bow (..., 3), 1/m."""
+    """Heights (...), m, along z, of points (..., 3), m, in the screen frame, above its surface. bow (..., 3), 1/m."""
     return on_screen[..., 2] - np.sum(bow_shape(on_screen) * bow, axis=-1)
 
 
 def surface_slope(on_screen: Array, bow: Array) -> Array:
-    """d(height)/d(point) (..., 3) in the screen's frame."""
+    """d(height)/d(point) (..., 3), in the screen frame, at points (..., 3), m. bow (..., 3), 1/m."""
+
     a, b, c = np.moveaxis(bow, -1, 0)
     x, y = on_screen[..., 0], on_screen[..., 1]
     return np.stack([-(2 * a * x + b * y), -(b * x + 2 * c * y), np.ones_like(x)], axis=-1)

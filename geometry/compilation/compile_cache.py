@@ -1,8 +1,9 @@
-"""Where the machine code of compiled functions is kept between processes.
+"""Folder on disk that keeps the machine code of compiled functions between processes.
 
-numba's own cache looks only at the file of the function called and not at those that it calls. Here the cache folder
-of a source folder is named by a hash of every compiled source that it imports, directly or not: an edited or
-upgraded file never meets old code, and an edit compiles only what depends on it.
+numba's own cache compares only the file of the function that is called, not the files of the functions and constants
+that this function uses (docs/decisions/compile-cache.md). Here the cache folder of a source folder is named by a hash
+of its compiled sources and of every module of the program that they import, directly or not. Code of an earlier
+version is therefore never run, and an edit recompiles only what depends on the edited file.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import hashlib
 import os
 import re
 import shutil
+import stat
 import sys
 import tempfile
 from functools import cache
@@ -18,52 +20,74 @@ from pathlib import Path
 
 import numba
 
-MOST_FOLDERS = 40  # of code kept in one place, some ten for each version of beampose: more only where it is edited
+MAX_FOLDERS = 40  # cache folders kept in one place; a version of beampose uses about ten
 _MARK = "@compiled"
 _PREFIX = "beampose-compiled-"
-_IMPORT = re.compile(r"^\s*(?:from ([\w.]+) import ([\w, ]+|\([^)]*\))|import ([\w.]+))", re.MULTILINE)
+_NAMES = r"\w+(?:[ \t]+as[ \t]+\w+)?"
+_FROM = re.compile(rf"^[ \t]*from[ \t]+([\w.]+)[ \t]+import[ \t]+(\([^)]*\)|{_NAMES}(?:[ \t]*,[ \t]*{_NAMES})*)", re.M)
+_IMPORT = re.compile(r"^[ \t]*import[ \t]+(.+)$", re.M)
 
 
 def cache_folder(folder: Path) -> Path | None:
-    """Where the machine code of a source folder's functions, as they are now, is kept; None: nothing can be written."""
-    return _writable_folder(_sources(folder))
+    """Cache folder for the functions of a source folder as they are now; None if no folder can be written safely."""
+    return _private_folder(_sources(folder))
 
 
 def is_empty(folder: Path) -> bool:
-    """Whether nothing of a source folder, as it is now, is compiled yet."""
+    """Whether no function of a source folder, as it is now, has been compiled yet."""
     kept = cache_folder(folder)
     return kept is None or not any(kept.rglob("*.nbi"))
 
 
 @cache
 def _sources(folder: Path) -> tuple[Path, ...]:
-    """The files with compiled functions of a source folder and of all that it imports."""
+    """The files with compiled functions of a source folder, and all modules that these import, directly or not.
+
+    Modules without compiled functions count too: numba compiles their constants into the machine code.
+    """
     found: set[Path] = set()
     waiting = [f for f in folder.glob("*.py") if _MARK in f.read_text("utf-8")]
     while waiting:
         source = waiting.pop()
         if source not in found:
             found.add(source)
-            waiting += [f for f in _imported(source) if _MARK in f.read_text("utf-8")]
+            waiting += _imported(source)
     return tuple(sorted(found))
 
 
-def _imported(source: Path) -> list[Path]:
-    """The files of the same program that a source imports."""
-    root = source.parent
-    while (root / "__init__.py").is_file():
-        root = root.parent
-    names = set()
-    for module, imported, plain in _IMPORT.findall(source.read_text("utf-8")):
-        base = module or plain
-        names |= {base, *(f"{base}.{name}" for name in re.findall(r"\w+", imported))}
-    files = (root.joinpath(*name.split(".")).with_suffix(".py") for name in names)
-    return [f for f in files if f.is_file()]
+@cache
+def _imported(source: Path) -> frozenset[Path]:
+    """The files of the same program that a source imports, in any form of `import` and at any indentation.
+
+    Read with regular expressions: parsing the files of all folders would cost every start 0.1 s. A text that only
+    looks like an import adds a file at worst.
+    """
+    package = root = os.path.dirname(source)
+    while os.path.isfile(f"{root}/__init__.py"):
+        root = os.path.dirname(root)
+    text = re.sub(r"#.*", "", source.read_text("utf-8")).replace("\\\n", " ")
+    modules = {item.split()[0] for line in _IMPORT.findall(text) for item in line.split(",")}
+    for module, names in _FROM.findall(text):
+        modules |= {module, *(f"{module.rstrip('.')}.{name}" for name in re.findall(r"\w+", names))}
+    found = set()
+    for module in modules:
+        name = module.lstrip(".")
+        base = root if name == module else os.path.normpath(f"{package}/{'../' * (len(module) - len(name) - 1)}")
+        path = f"{base}/{name.replace('.', '/')}"
+        if _exists(f"{base}/{name.split('.')[0]}"):
+            found |= {f for f in (f"{path}.py", f"{path}/__init__.py") if os.path.isfile(f)}
+    return frozenset(map(Path, found))
 
 
 @cache
-def _writable_folder(sources: tuple[Path, ...]) -> Path | None:
-    """A folder for just this code that can be written: beside it, else the user's, else none."""
+def _exists(module: str) -> bool:
+    """Whether a path without suffix is a package or a module; saves the search for names of other programs."""
+    return os.path.isdir(module) or os.path.isfile(f"{module}.py")
+
+
+@cache
+def _private_folder(sources: tuple[Path, ...]) -> Path | None:
+    """A writable folder for these sources only: beside this module, else the user's cache, else the temporary one."""
     digest = hashlib.sha256(f"{sys.version_info[:2]} {numba.__version__}".encode())
     for source in sources:
         digest.update(source.read_bytes())
@@ -72,11 +96,10 @@ def _writable_folder(sources: tuple[Path, ...]) -> Path | None:
         folder = home / f"{_PREFIX}{digest.hexdigest()[:16]}"
         try:
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-            # What is read from it is executed: nothing that another user has put into a folder open to all.
-            if hasattr(os, "getuid") and folder.stat().st_uid != os.getuid():
+            if not _is_private(folder):
                 continue
             with tempfile.TemporaryFile(dir=folder):
-                os.utime(folder)  # used just now
+                os.utime(folder)  # marks it as used now
         except OSError:
             continue
         _remove_old(home)
@@ -84,14 +107,32 @@ def _writable_folder(sources: tuple[Path, ...]) -> Path | None:
     return None
 
 
-def _remove_old(home: Path) -> None:
-    """Remove all but the folders last used. A process that still works with one of the others only compiles again."""
+def _is_private(folder: Path) -> bool:
+    """Whether only this user can put files into a folder: what is read from it is executed.
 
-    def used(folder: Path) -> float:
+    The folder itself must be a directory (no symbolic link) of this user that neither group nor others may write.
+    Symbolic links above it must belong to this user or to root.
+    """
+    if not hasattr(os, "getuid"):
+        return True
+    user, own = os.getuid(), folder.lstat()
+    above = [parent.lstat() for parent in folder.absolute().parents]
+    return (
+        stat.S_ISDIR(own.st_mode)
+        and own.st_uid == user
+        and not own.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+        and all(one.st_uid in (user, 0) for one in above if stat.S_ISLNK(one.st_mode))
+    )
+
+
+def _remove_old(home: Path) -> None:
+    """Removes all cache folders but the last used. A process that still uses a removed one compiles again."""
+
+    def last_used(folder: Path) -> float:
         try:
             return folder.stat().st_mtime
-        except OSError:  # another process was faster
+        except OSError:  # another process has removed it
             return 0.0
 
-    for folder in sorted(home.glob(f"{_PREFIX}*"), key=used, reverse=True)[MOST_FOLDERS:]:
+    for folder in sorted(home.glob(f"{_PREFIX}*"), key=last_used, reverse=True)[MAX_FOLDERS:]:
         shutil.rmtree(folder, ignore_errors=True)

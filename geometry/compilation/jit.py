@@ -1,18 +1,21 @@
 """The decorator of all compiled functions: numba.njit with machine code kept on disk.
 
-The first call on a new machine compiles; later processes load the code (compile_cache.py says from where). While a
-process compiles, the logger `beampose` gets one line (INFO).
+The first call on a new machine compiles; later processes load the code from the folder that compile_cache.py names.
+When a process starts to compile, the logger `beampose` gets one line (INFO). With NUMBA_DISABLE_JIT=1 the functions
+stay plain Python, for debugging.
 """
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numba
 from numba.core import event
+from numba.core.caching import FunctionCache
 from numba.core.types import unliteral
 
 from geometry.compilation.compile_cache import cache_folder, is_empty
@@ -23,38 +26,57 @@ _folders: set[Path] = set()  # source folders that have compiled functions
 
 
 def compiled(function: Function) -> Function:
-    """numba.njit with numpy's division (x / 0 is inf, no exception) and the cache on disk where there is a place."""
+    """numba.njit with numpy's division (x / 0 is inf, no exception), cached on disk where a folder can be written."""
     return _compiled(function, release_gil=False)
 
 
 def compiled_for_threads(function: Function) -> Function:
-    """As `compiled`, and other threads run meanwhile: for functions that work for a tenth of a millisecond or more.
+    """As `compiled`, but releases the GIL: for functions that run for a tenth of a millisecond or more.
 
-    A thread that releases the GIL may wait long to get it back, so it does not pay for short functions.
+    A thread that releases the GIL may wait long to get it back, so this does not pay for short functions.
     """
     return _compiled(function, release_gil=True)
 
 
+class _Cache(FunctionCache):
+    """numba's cache of one function, for which an unreadable or unwritable file is a missing one."""
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        try:
+            return super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
+        except Exception:  # unpickling a truncated file raises almost anything
+            with suppress(OSError):
+                self.flush()  # type: ignore[no-untyped-call]
+            return None
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        with suppress(OSError):  # for instance a full disk: the code is compiled, only not kept
+            super().save_overload(sig, data)  # type: ignore[no-untyped-call]
+
+
 def _compiled(function: Function, release_gil: bool) -> Function:
+    settings: Any = numba.config
+    dispatcher = numba.njit(function, error_model="numpy", nogil=release_gil)
+    if settings.DISABLE_JIT:
+        return dispatcher
     folder = Path(function.__code__.co_filename).parent
     _folders.add(folder)
     cached = cache_folder(folder)
-    settings: Any = numba.config  # numba reads it while it decorates
-    before = settings.CACHE_DIR
-    settings.CACHE_DIR = before if cached is None else str(cached)
-    try:
-        dispatcher = numba.njit(function, cache=cached is not None, error_model="numpy", nogil=release_gil)
-    finally:
-        settings.CACHE_DIR = before
-    _take_literals_for_plain(dispatcher)
+    if cached is not None:
+        before, settings.CACHE_DIR = settings.CACHE_DIR, str(cached)
+        try:
+            dispatcher._cache = _Cache(function)  # type: ignore[no-untyped-call]
+        finally:
+            settings.CACHE_DIR = before
+    _treat_literals_as_numbers(dispatcher)
     return dispatcher
 
 
-def _take_literals_for_plain(dispatcher: Any) -> None:
-    """Let a compiled function that is called with a literal, `f(x, 0)`, be the same as for any other number.
+def _treat_literals_as_numbers(dispatcher: Any) -> None:
+    """Makes calls with a literal argument, `f(x, 0)`, use the code for any number.
 
-    numba would compile it once more for each literal; also for the first value of a variable that begins as one, as
-    in `count = 0`, and discard that: a sixth of all compiling here.
+    numba would compile the function once more for each literal, and for the first value of a variable such as
+    `count = 0`, and discard some of these versions: a sixth of all compilations (docs/decisions/numba.md).
     """
     of_types = dispatcher.get_call_template
     plain: Any = unliteral
@@ -66,7 +88,7 @@ def _take_literals_for_plain(dispatcher: Any) -> None:
 
 
 class _Notice(event.Listener):
-    """Reports once that code is being compiled, if none was cached: the first call takes longer than usual."""
+    """Reports once per process that code is being compiled and nothing was cached: the first call takes long."""
 
     def __init__(self) -> None:
         self._reported = False

@@ -1,1 +1,1 @@
-"""The pose from labelled spots: closed forms, least squares, robustness, ambiguity."""
+"""The pose from labelled spots: closed forms, least squares, outliers, ambiguity, visibility."""

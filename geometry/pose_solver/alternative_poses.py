@@ -1,7 +1,7 @@
-"""The other poses that put the same spots on the same pixels: what few spots leave open.
+"""The other poses that put the same spots on the same pixels: the ambiguity of few spots.
 
-Three spots have up to eight solutions in closed form (geometry/pose_solver/three_spots.py), mirror solutions among
-them. A fourth spot mostly excludes all but one; beams in one plane, or two of them only, may keep several. Source:
+Three spots have up to eight solutions in closed form (geometry/pose_solver/three_spots.py), including mirror solutions.
+A fourth spot usually excludes all but one; with coplanar beams, or with two beams only, several may remain. Source:
 ours.
 """
 
@@ -18,10 +18,10 @@ from geometry.pose import Pose
 from geometry.pose_solver.gauss_newton import RANK_TOLERANCE, fit_pose
 from geometry.pose_solver.three_spots import poses_from_three_spots
 
-# A solution nearer to the given pose than this, or to another one, is the same: rounding leaves 1e-6 at worst.
+# Solutions that differ by less than this are the same: rounding leaves 1e-6 at worst.
 SAME = 1e-4  # m and rad
-# A fit to all spots lessens the misfit that three of them leave in the others, but hardly by more than this factor.
-WORTH_A_FIT = 50.0
+# A fit to all spots reduces the misfit that a solution for three of them leaves in the others by less than this factor.
+MAX_FIT_GAIN = 50.0
 
 
 def alternatives(
@@ -29,26 +29,26 @@ def alternatives(
 ) -> Pose:
     """All other poses (k,) that put the spots of views `rows` (m,) where the given pose puts them.
 
-    Exactly with three spots; with more, to within the tolerance in every view, after a least-squares fit to all. Views
-    of two cameras may show one spot. An empty stack where there is no other pose. With fewer than three spots, or three
-    that do not fix a pose (on one line), there is a continuum of poses, and the stack is empty too: whether the spots
-    fix the pose at all is for the caller to know (`observable` of a fit).
+    With three spots the poses are exact; with more, they are fitted to all spots and agree in every view to within the
+    tolerance. Views of two cameras may show one spot. The stack is empty if there is no other pose. It is also empty
+    for fewer than three spots, or three collinear ones, which allow a continuum of poses: the caller must check whether
+    the spots determine the pose at all (`observable` of a fit).
     """
     views = np.asarray(rows, dtype=np.int64)
     target, J = model.project(world_from_body)
     places = model.hits(world_from_body)[0]
     views = views[np.isfinite(target[views, 0])]
-    nothing = Pose(np.zeros((0, 3, 3)), np.zeros((0, 3)))
+    none = Pose(np.zeros((0, 3, 3)), np.zeros((0, 3)))
     triple = _best_triple(model, J, views)
     if triple is None:
-        return nothing
+        return none
     solutions = poses_from_three_spots(model.point[triple], model.ray[triple], places[triple])
     solutions = solutions[np.isfinite(solutions.translation[:, 0])]
     found: list[Pose] = []
     exact = len(np.unique(model.spot_of[views])) == 3
     for start in (solutions[i] for i in range(len(solutions.translation))):
         misfit = _misfit(model, start, views, target)
-        if not misfit <= WORTH_A_FIT * tolerance_px:
+        if not misfit <= MAX_FIT_GAIN * tolerance_px:
             continue
         pose = start
         if not exact and misfit > 1e-3 * tolerance_px:
@@ -59,12 +59,12 @@ def alternatives(
         if all(np.abs(pose.minus(other)).max() > SAME for other in (world_from_body, *found)):
             found.append(pose)
     if not found:
-        return nothing
+        return none
     return Pose(np.stack([p.rotation for p in found]), np.stack([p.translation for p in found]))
 
 
 def _best_triple(model: SpotModel, J: Array, rows: Ints) -> Ints | None:
-    """The three views (3,), of three spots, that fix the pose best; None if none do."""
+    """The views (3,) of the three spots that determine the pose best; None if no three do."""
     _, first = np.unique(model.spot_of[rows], return_index=True)
     triples = np.array(list(combinations(rows[np.sort(first)], 3)), dtype=np.int64).reshape(-1, 3)
     if not len(triples):
@@ -76,5 +76,6 @@ def _best_triple(model: SpotModel, J: Array, rows: Ints) -> Ints | None:
 
 
 def _misfit(model: SpotModel, pose: Pose, rows: Ints, target: Array) -> float:
-    """The largest distance of a spot from its target, px; nan where one is not projected."""
+    """The largest distance, px, of a spot from its target; nan if one has no projection."""
+
     return float(np.max(np.linalg.norm(model.project(pose)[0][rows] - target[rows], axis=-1)))

@@ -1,9 +1,9 @@
 """The paper's closed forms for a spot out of view: coplanar beams through one point.
 
 Source: Huo, Yang & Yang, Optics and Precision Engineering 23(8), 2015, section 4.2, eqs. (10) to (14), with its
-misprints mended: (11) C = B + k (B - A) is right and (14)'s coefficients belong to it; (12) must end in X_B, Y_B; l
-begins with (X_B - X_O)^2. Written with vectors, so the screen may be any plane, and with two angles, which need not be
-equal.
+misprints corrected: (11) C = B + k (B - A) is right, and the coefficients of (14) belong to it; (12) must end in X_B,
+Y_B; l begins with (X_B - X_O)^2. The formulas are written with vectors, so that the screen may be any plane, and with
+two angles, which may differ.
 
 O is the point where the beams meet; A, B, C are the spots of three beams on one screen, in this order; alpha is the
 angle AOB and beta the angle BOC.
@@ -17,13 +17,13 @@ from geometry.arrays import Array, Bools, normalised
 from geometry.lines import common_perpendicular
 from geometry.pose import Pose
 
-# How far the angle AOC may differ from alpha + beta at the root that is taken, rad. With noise the root that is wrong
-# (it returns A, or a point behind O) is off by at least the smaller of 2 alpha and 180 deg - 2 alpha.
+# Largest difference, rad, between the angle AOC of the accepted root and alpha + beta. With noise, the wrong root (it
+# gives A, or a point behind O) is off by at least the smaller of 2 alpha and 180 deg - 2 alpha.
 ANGLE_TOLERANCE = np.deg2rad(3.0)
 
 
 def meeting_point(point_a: Array, direction_a: Array, point_b: Array, direction_b: Array) -> Array:
-    """O (..., 3), m: the middle of the common perpendicular of two beams, points (..., 3) and directions (..., 3)."""
+    """O (..., 3), m: the middle of the common perpendicular of two beams. Points (..., 3), m, directions (..., 3)."""
     on_a, on_b = common_perpendicular(point_a, direction_a, point_b, direction_b)
     return 0.5 * (on_a + on_b)
 
@@ -44,18 +44,18 @@ def quadratic_coefficients(O: Array, A: Array, B: Array, beta: float) -> tuple[A
 
 
 def outer_spot(O: Array, A: Array, B: Array, alpha: float, beta: float, tolerance: float = ANGLE_TOLERANCE) -> Array:
-    """C (..., 3), m: the spot beyond B, of a beam at the angle `beta` (rad) from B's; nan where it misses the plane.
+    """C (..., 3), m, eq. (11): the spot beyond B, of a beam at the angle `beta` (rad) from B's; nan if it misses.
 
-    O, A, B (..., 3), m, in world; alpha, the angle AOB by calibration, and beta are in (0, pi/2). Of the two roots the
-    one with k > 0 and angle AOC = alpha + beta within the tolerance. The paper's rule, "the root whose angle AOC is
-    2 alpha", has no such root when the beam leaves the plane behind (8 % of geometries for alpha of 10 to 30 deg, 90 %
-    for 60 to 89 deg), and its nearest is A itself.
+    O, A, B (..., 3), m, in world; alpha, the calibrated angle AOB, and beta are in (0, pi/2). Of the two roots of eq.
+    (14), the one with k > 0 and an angle AOC of alpha + beta, within the tolerance, is taken. The paper's rule, "the
+    root whose angle AOC is 2 alpha", is not fulfilled by any root if the beam points away from the plane (8 % of
+    geometries for alpha of 10 to 30 deg, 90 % for 60 to 89 deg); the nearest root is then A itself.
     """
     a, b, c = quadratic_coefficients(O, A, B, beta)
     with np.errstate(invalid="ignore", divide="ignore"):
-        # b^2 - 4ac = 4 l^2 sin^2(beta) cos^2(beta) |OB x AB|^2 >= 0; rounding may take it below.
+        # b^2 - 4ac = 4 l^2 sin^2(beta) cos^2(beta) |OB x AB|^2 >= 0; rounding may make it negative.
         root = np.sqrt(np.maximum(b * b - 4 * a * c, 0.0))
-        # The form without cancellation: one root by division with a, the other with q; a = 0 (OC parallel to AB): inf.
+        # The form without cancellation: one root is q / a, the other c / q. If a = 0 (OC parallel to AB), k is inf.
         q = -0.5 * (b + np.where(b >= 0, root, -root))
         k = np.stack([q / a, c / q], axis=-1)  # (..., 2)
         C = B[..., None, :] + k[..., None] * (B - A)[..., None, :]
@@ -70,25 +70,28 @@ def outer_spot(O: Array, A: Array, B: Array, alpha: float, beta: float, toleranc
 def middle_spot(O: Array, A: Array, C: Array, alpha: float, beta: float, world_from_screen: Pose) -> Array:
     """B (..., 3), m: the spot between A and C, of a beam `alpha` from A's and `beta` from C's (rad); nan if it misses.
 
-    The middle beam has no form like eq. (14): OA is turned towards OC by the share alpha / (alpha + beta) of the angle
-    AOC as measured, then met with the screen. Source: ours.
+    The paper has no formula like eq. (14) for the middle beam: OA is rotated towards OC by the share
+    alpha / (alpha + beta) of the measured angle AOC, then intersected with the screen. Source: ours.
     """
     OA, OC = normalised(A - O), normalised(C - O)
-    return _turned_to_plane(O, OA, OC, alpha / (alpha + beta), world_from_screen)
+    return _rotated_ray_on_screen(O, OA, OC, alpha / (alpha + beta), world_from_screen)
 
 
 def rotated_spot(O: Array, A: Array, B: Array, alpha: float, beta: float, world_from_screen: Pose) -> Array:
-    """C (..., 3), m, by turning OA towards and beyond OB: the second way to `outer_spot`, the same to rounding.
+    """C (..., 3), m, by rotation of OA towards and beyond OB: equal to `outer_spot` to rounding. Source: ours.
 
-    The turn is measured from B by exactly beta, so an error in alpha does not enter, as in eq. (14).
+    The rotation goes beyond B by exactly beta, so that an error of alpha does not enter, as in eq. (14).
     """
     OA, OB = normalised(A - O), normalised(B - O)
     share = 1 + beta / _angle(OA, OB)
-    return _turned_to_plane(O, OA, OB, share, world_from_screen)
+    return _rotated_ray_on_screen(O, OA, OB, share, world_from_screen)
 
 
-def _turned_to_plane(O: Array, start: Array, towards: Array, share: Array | float, screen: Pose) -> Array:
-    """Where the ray from O, turned from `start` by a share of the angle to `towards`, meets a screen; nan if behind."""
+def _rotated_ray_on_screen(O: Array, start: Array, towards: Array, share: Array | float, screen: Pose) -> Array:
+    """Intersection (..., 3), m, of a screen with the ray from O; nan if the ray points away from it.
+
+    The ray's direction is `start`, rotated by a share of the angle to `towards`; both are unit vectors (..., 3).
+    """
     angle = _angle(start, towards)
     across = normalised(towards - np.sum(start * towards, axis=-1)[..., None] * start)
     turn = angle * share
@@ -103,5 +106,6 @@ def _turned_to_plane(O: Array, start: Array, towards: Array, share: Array | floa
 
 
 def _angle(a: Array, b: Array) -> Array:
-    """Angle (...) between unit vectors, rad; accurate at 0 and pi too."""
+    """Angle (...), rad, between unit vectors; accurate near 0 and pi too."""
+
     return 2 * np.arctan2(np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1))

@@ -1,7 +1,7 @@
-"""The pose from labelled spots: weighted Gauss-Newton on pixel residuals, its covariance, and what cannot be seen.
+"""The pose from labelled spots: weighted Gauss-Newton on pixel residuals, its covariance, and observability.
 
-Source: ours; Gauss-Newton on the error state [dt, dtheta] of section 1 of the files' contract, with the one forward
-model of geometry/forward_model.py and its analytic Jacobian.
+Source: ours; Gauss-Newton on the error state [dt, dtheta] of section 1 of the file contract, with the forward model of
+geometry/forward_model.py and its analytic Jacobian.
 """
 
 from __future__ import annotations
@@ -16,19 +16,23 @@ from geometry.pose import Pose
 from geometry.uncertainty.chi_square import chi2_limit
 from geometry.uncertainty.rig_uncertainty import CalibrationSpread
 
-# Relative size under which a singular value of the whitened, scaled Jacobian is zero. Exact degeneracies (three spots
-# of one screen are collinear whatever the pose) give 1e-13 and less; the worst usable geometry about 1e-4.
+# Relative size below which a singular value of the whitened Jacobian counts as zero. Exact degeneracies (three spots of
+# one screen are collinear in every pose) give 1e-13 and less; the worst usable geometry gives about 1e-4.
 RANK_TOLERANCE = 1e-7
+
+# If the start is farther from the solution than this, the effect of the calibration's errors is computed again: within
+# it, the sigmas of the pixels change by up to some per cent.
+NEAR_M, NEAR_RAD = 0.05, np.deg2rad(1.0)
 
 
 @dataclass(frozen=True, slots=True)
 class SolveLimits:
-    """When a pose of one frame counts as measured."""
+    """Conditions under which the pose of one frame counts as measured."""
 
-    max_sigma_m: float = 0.25  # m: a larger sigma of any direction is no measurement ...
-    max_sigma_rad: float = np.deg2rad(5.0)  # ... nor is this: beyond it first-order covariances mean little
-    p_false_alarm: float = 1e-5  # of the chi-square test that a right set of spots must pass
-    min_outlier_px: float = 0.1  # a spot is left out only if it also lies this far off: smaller misfits are model error
+    max_sigma_m: float = 0.25  # largest sigma of any direction of position, m
+    max_sigma_rad: float = np.deg2rad(5.0)  # the same of attitude, rad: first-order covariances are invalid beyond it
+    p_false_alarm: float = 1e-5  # probability that a correct set of spots fails the chi-square test
+    min_outlier_px: float = 0.1  # smallest residual of an outlier: smaller ones are errors of the model
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,62 +41,57 @@ class PoseFit:
 
     world_from_body: Pose
     covariance: Array  # (6, 6) of [dt (m, world), dtheta (rad, body)]; inf where not observable
-    systematic: Array  # (6, 6) the part of it that the calibration's errors make; 0 where nothing is known of them
-    systematic_share: float  # of the misfit to expect, 0 ... 1: how much of it is the same in every frame
+    systematic: Array  # (6, 6) its part due to the calibration's errors; 0 if their covariance is not known
+    systematic_share: float  # share, 0 ... 1, of the expected chi2 that is the same in every frame
     observable: bool
-    rows: Ints  # (m,) the views used
+    rows: Ints  # (m,) the used views
     residuals_px: Array  # (m, 2) measured minus fitted
     chi2: float  # of the whitened residuals
     dof: int  # 2 m - 6
-    projected_px: Array  # (n, 2) all views of the model from this pose, as SpotModel.project gives them ...
-    jacobian: Array  # (n, 2, 6) ... so that nobody projects the same pose again
-    log_det: float  # of the covariance (2m, 2m), px^2, that the residuals were weighed with
-    _gain: Array  # (6, 2m) what the pose makes of the residuals ...
-    _common: Array | None  # (2n, 2n) ... and the calibration's share of the pixels' covariance
+    projected_px: Array  # (n, 2) pixels of all views of the model at this pose, from SpotModel.project, and ...
+    jacobian: Array  # (n, 2, 6) ... their Jacobians: kept so that the pose need not be projected again
+    log_det: float  # log determinant of the covariance (2m, 2m), px^2, by which the residuals were weighted
+    _gain: Array  # (6, 2m) derivative of the pose by the measured pixels
+    _common: Array | None  # (2n, 2n) covariance of the pixels, px^2, due to the calibration's errors
 
     @property
     def noise(self) -> Array:
-        """(6, 6) the part of the covariance that differs from frame to frame."""
+        """The part (6, 6) of the covariance that is independent from frame to frame."""
         return self.covariance if self._common is None else self.covariance - self.systematic
 
     def widened(self, factor: float) -> PoseFit:
-        """The same fit with all its covariance that many times larger."""
+        """The same fit with all its covariances multiplied by a factor."""
         return replace(self, covariance=self.covariance * factor, systematic=self.systematic * factor)
 
     def spot_covariances(self) -> Array:
-        """What this fit leaves open of each view's pixel: (n, 2, 2), px^2; of where the spot is, not of a measurement.
+        """Covariances (n, 2, 2), px^2, of the predicted pixels of all views, without the noise of a measurement.
 
-        Errors of the calibration move a spot and, through the pose, what is expected of it; what is common cancels.
+        Errors of the calibration move a spot and, through the pose, its prediction too; their common part cancels.
         """
         return point_covariance(self.jacobian, self.noise) + self.calibration_px()
 
     def calibration_px(self) -> Array | float:
-        """The calibration's part of `spot_covariances`: (n, 2, 2), px^2; 0 where nothing is known of its errors."""
+        """The calibration's part of `spot_covariances`: (n, 2, 2), px^2; 0 if its covariance is not known."""
         if self._common is None:
             return 0.0
         n = len(self.jacobian)
         left = np.eye(2 * n)
-        left[:, _both(self.rows)] -= np.nan_to_num(self.jacobian.reshape(2 * n, 6)) @ self._gain
+        left[:, _coordinates(self.rows)] -= np.nan_to_num(self.jacobian.reshape(2 * n, 6)) @ self._gain
         joint = (left @ self._common @ left.T).reshape(n, 2, n, 2)
         return np.asarray(joint[np.arange(n), :, np.arange(n)])
 
     @property
     def rms_px(self) -> float:
-        """Root mean square of the residuals, per axis, px; nan without spots."""
+        """Root mean square of the residuals per axis, px; nan without spots."""
         return float(np.sqrt(np.mean(self.residuals_px**2))) if len(self.rows) else float("nan")
 
     def consistent(self, p_false_alarm: float) -> bool:
-        """Whether the misfit is what the spots' covariances allow."""
-        return self.dof <= 0 or self.chi2 <= largest_chi2(p_false_alarm, self.dof)
-
-
-def largest_chi2(p_false_alarm: float, dof: int) -> float:
-    """The chi-square that a right fit exceeds with this probability. Kept, as it is asked for in every frame."""
-    return chi2_limit(p_false_alarm, dof)
+        """Whether the residuals pass the chi-square test with this probability of a false alarm."""
+        return self.dof <= 0 or self.chi2 <= chi2_limit(p_false_alarm, self.dof)
 
 
 def whiten(covariances: Array) -> Array:
-    """Matrices W (..., 2, 2) with W C W^T = I, of covariances C (..., 2, 2): the inverse of the Cholesky factor."""
+    """Matrices W (..., 2, 2) with W C W^T = I, for covariances C (..., 2, 2): the inverse of the Cholesky factor."""
     a, b, c = covariances[..., 0, 0], covariances[..., 0, 1], covariances[..., 1, 1]
     l11 = np.sqrt(a)
     l21 = b / l11
@@ -115,25 +114,27 @@ def fit_pose(
     calibration: CalibrationSpread | None = None,
     max_iterations: int = 25,
 ) -> PoseFit | None:
-    """The pose that puts the spots of views `rows` (m,) at `pixels` (m, 2), px, with covariances (m, 2, 2), px^2.
+    """The least-squares pose of the spots of views `rows` (m,) at `pixels` (m, 2), with covariances (m, 2, 2), px^2.
 
-    start: where to begin; within some ten degrees it need not be good. prior: a pose and its information matrix
-    (6, 6), added as six more measurements. calibration: its errors are weighed in beside the spots' own and come out
-    as the systematic part. Levenberg's damping keeps a far start from running away. None where it does not converge
-    (a spot without projection on the way, or a singular start).
+    start: the first pose; an error of some ten degrees is allowed. prior: a pose and its information matrix (6, 6),
+    used as six more measurements. calibration: the covariance of its errors is added to that of the spots, and its
+    effect on the pose is the systematic part. Levenberg's damping keeps steps from a poor start bounded. None if the
+    iteration does not converge (a spot loses its projection on the way, or the start is singular).
     """
     if len(rows) == 0:
         return None
     rows = np.asarray(rows)
-    common = None if calibration is None else calibration.at(start)
+    if calibration is None:
+        return _fit(model, rows, pixels, covariances, start, prior, None, max_iterations)
+    common = calibration.at(start)
     fit = _fit(model, rows, pixels, covariances, start, prior, common, max_iterations)
-    if fit is None or calibration is None:
+    if fit is None:
+        return None
+    error_of_start = fit.world_from_body.minus(start)
+    if np.linalg.norm(error_of_start[:3]) < NEAR_M and np.linalg.norm(error_of_start[3:]) < NEAR_RAD:
         return fit
-    now = calibration.at(fit.world_from_body)
-    if now is common:
-        return fit
-    # The start was so far off that the calibration's errors act differently here.
-    return _fit(model, rows, pixels, covariances, fit.world_from_body, prior, now, max_iterations)
+    common = calibration.at(fit.world_from_body)
+    return _fit(model, rows, pixels, covariances, fit.world_from_body, prior, common, max_iterations)
 
 
 def _fit(
@@ -146,11 +147,12 @@ def _fit(
     common: Array | None,
     max_iterations: int,
 ) -> PoseFit | None:
+    """As `fit_pose`, with the covariance (2n, 2n), px^2, of all pixels due to the calibration's errors, or None."""
     if common is None:
         W = whiten(covariances)
         log_det = -2 * float(np.sum(np.log(W[:, [0, 1], [0, 1]])))
     else:
-        root = np.linalg.cholesky(_blocks(covariances) + common[np.ix_(_both(rows), _both(rows))])
+        root = np.linalg.cholesky(_blocks(covariances) + common[np.ix_(_coordinates(rows), _coordinates(rows))])
         W = np.linalg.inv(root)
         log_det = 2 * float(np.sum(np.log(np.diagonal(root))))
     pose, damping = start, 0.0
@@ -160,7 +162,7 @@ def _fit(
     H, g, cost, residuals, projected, J = terms
     for _ in range(max_iterations):
         scale = np.maximum(np.diagonal(H), 1e-12 * np.trace(H))
-        # The smallest damping only steadies directions that no spot sees; elsewhere it is far below rounding.
+        # The smallest damping affects only directions that no spot observes; elsewhere it is far below rounding.
         step = np.asarray(np.linalg.solve(H + np.diag((damping + 1e-14) * scale), g), dtype=np.float64)
         gain = float(step @ g)
         if not np.isfinite(gain):
@@ -174,7 +176,7 @@ def _fit(
             continue
         pose, (H, g, cost, residuals, projected, J) = trial, trial_terms
         damping = damping / 10 if damping > 1e-6 else 0.0
-        if gain < 1e-6:  # in squared sigmas; the step was a thousandth, and what is left is about its square
+        if gain < 1e-6:  # squared sigmas: the step was 1e-3 sigmas, and the remaining error is about its square
             break
     else:
         return None
@@ -182,7 +184,7 @@ def _fit(
     dof = 2 * len(rows) - 6 + (6 if prior is not None else 0)
     K, systematic, share = np.zeros((6, 2 * len(rows))), np.zeros((6, 6)), 0.0
     if common is not None and observable:
-        S = common[np.ix_(_both(rows), _both(rows))]
+        S = common[np.ix_(_coordinates(rows), _coordinates(rows))]
         A = W @ J[rows].reshape(-1, 6)
         K = covariance @ A.T @ W
         systematic = symmetric(K @ S @ K.T)
@@ -206,8 +208,8 @@ def _fit(
     )
 
 
-def _both(rows: Ints) -> Ints:
-    """Where u and v of some views stand among the pixels of all, (2m,)."""
+def _coordinates(rows: Ints) -> Ints:
+    """Indices (2m,) of u and v of m views among the coordinates of all views."""
     return np.ravel(2 * rows[:, None] + np.arange(2))
 
 
@@ -222,9 +224,10 @@ def _blocks(covariances: Array) -> Array:
 def _terms(
     model: SpotModel, rows: Ints, pixels: Array, W: Array, pose: Pose, prior: tuple[Pose, Array] | None
 ) -> tuple[Array, Array, float, Array, Array, Array] | None:
-    """Normal matrix (6, 6), right-hand side (6,), cost, residuals (m, 2) px, and the projection; None if that fails.
+    """Normal matrix (6, 6), right-hand side (6,), cost, residuals (m, 2), px, pixels (n, 2) and Jacobians (n, 2, 6).
 
-    W: (m, 2, 2) for each spot, or (2m, 2m) where their errors go together.
+    W: whitening matrices (m, 2, 2) of independent spots, or (2m, 2m) of correlated ones. None if a spot has no
+    projection.
     """
     projected, J = model.project(pose)
     residuals = pixels - projected[rows]
@@ -238,14 +241,14 @@ def _terms(
         A = W @ J[rows].reshape(-1, 6)
     H, g, cost = A.T @ A, A.T @ r, float(r @ r)
     if prior is not None:
-        # d(minus)/d(step) is the identity to first order in the distance, which is what a prior is good for.
+        # d(minus)/d(step) is the identity to first order in the distance, accurate enough for a prior.
         gap = prior[0].minus(pose)
         H, g, cost = H + prior[1], g + prior[1] @ gap, cost + float(gap @ prior[1] @ gap)
     return H, g, cost, residuals, projected, J
 
 
 def covariance_of(H: Array) -> tuple[Array, bool]:
-    """Covariance (6, 6) of a normal matrix (6, 6), and whether it has full rank; without it all entries are inf."""
+    """Covariance (6, 6) of a normal matrix (6, 6), and whether that has full rank; if not, all entries are inf."""
     eigenvalues, vectors = np.linalg.eigh(symmetric(H))
     if eigenvalues[0] <= (RANK_TOLERANCE**2) * eigenvalues[-1]:
         return np.full((6, 6), np.inf), False
@@ -253,7 +256,7 @@ def covariance_of(H: Array) -> tuple[Array, bool]:
 
 
 def good_enough(fit: PoseFit, limits: SolveLimits) -> bool:
-    """Whether a fit is a measurement of the pose: full rank, and no direction vaguer than the limits."""
+    """Whether a fit is a measurement of the pose: full rank, and no sigma of any direction above the limits."""
     if not fit.observable:
         return False
     worst_m = np.sqrt(np.linalg.eigvalsh(fit.covariance[:3, :3])[-1])
@@ -262,5 +265,6 @@ def good_enough(fit: PoseFit, limits: SolveLimits) -> bool:
 
 
 def point_covariance(J: Array, covariance: Array) -> Array:
-    """What a pose covariance (6, 6) means for pixels: J C J^T (..., 2, 2), px^2, of Jacobians (..., 2, 6)."""
+    """Covariances (..., 2, 2), px^2, of pixels due to a pose covariance C (6, 6): J C J^T, J (..., 2, 6)."""
+
     return J @ covariance @ np.swapaxes(J, -1, -2)

@@ -1,7 +1,7 @@
-"""The turns after which a vehicle's beams lie on each other: its spots alone cannot tell such poses apart.
+"""Symmetries of a vehicle: transforms that map its beams onto themselves. Spots cannot distinguish such poses.
 
-Two beams always have one, half a turn about the line between them that swaps them; so has a fan of equal angles.
-Source: ours.
+Two beams always have one, half a turn about the line midway between them, which swaps them; so has a fan of equal
+angles. Source: ours.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from geometry.forward_model import SpotModel
 from geometry.lines import common_perpendicular
 from geometry.pose import Pose
 
-# Rays that differ by less lie on each other: 4 mm at 2.5 m, about as well as a target is made by design. What is less
-# symmetric a calibrated rig can distinguish.
+# Rays that differ by less coincide: 4 mm at 2.5 m, about the accuracy to which a symmetric target is manufactured. A
+# calibrated rig can distinguish the poses of a less symmetric target.
 SAME_RAD, SAME_M = float(np.deg2rad(0.05)), 0.002
-PARALLEL = 1e-3  # sine of the angle between two rays, below which they give no frame
+PARALLEL = 1e-3  # sine of the angle between two rays below which they define no frame
 
 
 def lie_on_each_other(model: SpotModel, turn: Pose, within_rad: float = SAME_RAD, within_m: float = SAME_M) -> bool:
-    """Whether each spot's ray, moved by a transform of the body onto itself, lies on one of a spot of that screen."""
+    """Whether a transform of the body maps each spot's ray onto the ray of a spot on the same screen."""
     points, rays, screens = _rays(model)
     moved, turned = turn.apply(points), turn.turn(rays)
     angle = np.arccos(np.clip(turned @ rays.T, -1, 1))
@@ -33,7 +33,7 @@ def lie_on_each_other(model: SpotModel, turn: Pose, within_rad: float = SAME_RAD
 
 
 def symmetries(model: SpotModel) -> list[Pose]:
-    """The transforms of the body onto itself, other than none, after which all its rays lie on each other."""
+    """All transforms of the body, except the identity, that map its rays onto its rays."""
     points, rays, screens = _rays(model)
     sines = np.linalg.norm(cross(rays[:, None], rays), axis=-1)
     a, b = np.unravel_index(int(np.argmax(sines)), sines.shape)
@@ -45,21 +45,21 @@ def symmetries(model: SpotModel) -> list[Pose]:
         if screens[c] != screens[a] or screens[d] != screens[b] or sines[c, d] < PARALLEL:
             continue
         turn = _frame(points[c], rays[c], points[d], rays[d]) @ start.inverse()
-        moved = rotations.angle(turn.rotation) > 10 * SAME_RAD or np.linalg.norm(turn.translation) > 10 * SAME_M
-        if moved and lie_on_each_other(model, turn) and not any(_same(turn, other) for other in found):
+        differs = rotations.angle(turn.rotation) > 10 * SAME_RAD or np.linalg.norm(turn.translation) > 10 * SAME_M
+        if differs and lie_on_each_other(model, turn) and not any(_same(turn, other) for other in found):
             found.append(turn)
     return found
 
 
 def _rays(model: SpotModel) -> tuple[Array, Array, Array]:
-    """Point, direction and screen (by its place in the list of places) of each spot, once."""
+    """Points (s, 3), directions (s, 3) and screens (s,) of the s spots; a screen is a number for its origin."""
     _, first = np.unique(model.spot_of, return_index=True)
     _, screens = np.unique(np.round(model.screen_origin[first], 9), axis=0, return_inverse=True)
     return model.point[first], model.ray[first], np.ravel(screens)
 
 
 def _frame(point_a: Array, ray_a: Array, point_b: Array, ray_b: Array) -> Pose:
-    """A frame that two rays fix: its origin amid their common perpendicular, x between the rays."""
+    """The frame of two rays: origin in the middle of their common perpendicular, x along the bisector, z normal."""
     on_a, on_b = common_perpendicular(point_a, ray_a, point_b, ray_b)
     z = normalised(cross(ray_a, ray_b))
     x = normalised(ray_a + ray_b)
@@ -67,5 +67,6 @@ def _frame(point_a: Array, ray_a: Array, point_b: Array, ray_b: Array) -> Pose:
 
 
 def _same(one: Pose, other: Pose) -> bool:
-    away = one.minus(other)
-    return bool(np.linalg.norm(away[3:]) < 2 * SAME_RAD and np.linalg.norm(away[:3]) < 2 * SAME_M)
+    """Whether two transforms are equal within the tolerances."""
+    difference = one.minus(other)
+    return bool(np.linalg.norm(difference[3:]) < 2 * SAME_RAD and np.linalg.norm(difference[:3]) < 2 * SAME_M)

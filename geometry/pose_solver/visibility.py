@@ -1,4 +1,4 @@
-"""What a rig can see: which spots are in which pictures, over a range of poses, and how well they fix the pose."""
+"""Visibility over a range of poses: which spots are in which pictures, and how well they determine the pose."""
 
 from __future__ import annotations
 
@@ -16,32 +16,32 @@ from geometry.pose_prior import PosePrior
 from geometry.pose_solver.gauss_newton import SolveLimits, covariance_of
 from geometry.rig import Rig
 
-POSES = 2000  # a share of 50 % is then known to 1 %
+POSES = 2000  # number of poses drawn: a share of 50 % then has a standard deviation of 1 %
 SEED = 0
-NOISE_PX = 0.1  # the error of a spot for which the sigmas are given: a clean laser spot's
+NOISE_PX = 0.1  # error of a spot, 1 sigma, to which the pose sigmas refer: that of a clean laser spot
 DEFAULT_RANGE = PosePrior(Pose.identity(), within_m=0.5, within_rad=float(np.deg2rad(30.0)))
 
 
 @dataclass(frozen=True, slots=True)
 class Visibility:
-    """What n poses of a range show. All shares are 0 to 1."""
+    """Visibility of the spots over n poses of a range. All shares are 0 to 1."""
 
     views: tuple[tuple[str, str], ...]  # camera, spot
     in_picture: Array  # (views,) share of the poses with this spot in this picture
-    outside: Array  # (views,) ... on its screen, but outside the picture
-    off_screen: Array  # (views,) ... beside its screen, or where the lens model ends
+    outside: Array  # (views,) share with the spot on its screen, but outside the picture
+    off_screen: Array  # (views,) share with the spot beside its screen, or beyond the fold of the lens
     on_screen: Mapping[str, float]  # by spot: share of the poses in which its ray meets its screen
     blind: Mapping[str, float]  # by camera: share of the poses in which it sees no spot at all
-    observable: float  # share of the poses that one frame's visible spots fix, by the solver's own limits
-    spots_in_view: Array  # (n,) how many views are in the picture
-    sigma_m: Array  # (n,) largest standard deviation of a position, m, with `NOISE_PX`; inf where not observable
-    sigma_rad: Array  # (n,) ... of the attitude, rad
+    observable: float  # share of the poses that the visible spots of one frame determine, by the solver's limits
+    spots_in_view: Array  # (n,) number of views in their pictures
+    sigma_m: Array  # (n,) standard deviation of the worst direction of position, m, for NOISE_PX; inf: not observable
+    sigma_rad: Array  # (n,) standard deviation of the worst axis of attitude, rad
 
 
 def poses_within(prior: PosePrior, count: int, seed: int = SEED) -> Pose:
-    """A stack (count,) of poses spread evenly over a prior: over its cube, and over all turns up to its angle.
+    """Random poses (count,), uniform over a prior: over its cube, and over all rotations up to its angle.
 
-    Turns are even in the rotation group's own measure, whose density over the angle is 1 - cos(angle).
+    Uniform in the Haar measure of the rotations, whose density over the angle is proportional to 1 - cos(angle).
     """
     rng = np.random.default_rng(seed)
     axis = normalised(rng.normal(size=(count, 3)))
@@ -56,7 +56,7 @@ def poses_within(prior: PosePrior, count: int, seed: int = SEED) -> Pose:
 
 
 def visibility_of(rig: Rig, prior: PosePrior, limits: SolveLimits, count: int = POSES) -> Visibility:
-    """What the rig sees of poses drawn from a range; the same for the same arguments."""
+    """Visibility of the rig's spots over poses drawn from a prior; deterministic."""
     poses = poses_within(prior, count)
     model = SpotModel.of(rig)
     pixels, J = model.project(poses)
@@ -80,7 +80,10 @@ def visibility_of(rig: Rig, prior: PosePrior, limits: SolveLimits, count: int = 
 
 
 def _sigmas(J: Array, limits: SolveLimits) -> tuple[Array, Array, Bools]:
-    """Worst sigma of position (n,), m, and attitude (n,), rad, of Jacobians (n, views, 2, 6); whether it is a pose."""
+    """Worst sigmas of position (n,), m, and attitude (n,), rad, and whether they are within the limits (n,).
+
+    J: Jacobians (n, views, 2, 6), 0 for spots that are not seen.
+    """
     flat = J.reshape(len(J), -1, 6) / NOISE_PX
     normal = np.swapaxes(flat, -1, -2) @ flat
     sigma_m, sigma_rad = np.full(len(J), np.inf), np.full(len(J), np.inf)
@@ -93,13 +96,14 @@ def _sigmas(J: Array, limits: SolveLimits) -> tuple[Array, Array, Bools]:
 
 
 def with_inverted_camera(rig: Rig, camera: str) -> Rig:
-    """The rig as it would be if this camera's pose had been given the wrong way round."""
+    """The rig with the inverse of this camera's pose: a hypothesis about a wrong rig file."""
     turned = dataclasses.replace(rig.cameras[camera], camera_from_world=rig.cameras[camera].camera_from_world.inverse())
     return dataclasses.replace(rig, cameras={**rig.cameras, camera: turned})
 
 
 def with_other_end(rig: Rig, spot: str) -> Rig:
-    """The rig as it would be if this spot were at the other end of its beam."""
+    """The rig with this spot at the other end of its beam: a hypothesis about a wrong rig file."""
+
     return dataclasses.replace(
         rig, spots={**rig.spots, spot: dataclasses.replace(rig.spots[spot], sign=-rig.spots[spot].sign)}
     )

@@ -1,1 +1,1 @@
-"""The rig's numbers, their covariance, and what it does to pixels."""
+"""The rig's parameters, their covariance, and its effect on pixels; chi-square quantiles."""

@@ -1,6 +1,6 @@
-"""Quantiles of gamma and chi-square distributions, and the tail of the latter.
+"""Quantiles of gamma and chi-square distributions, and the tail probability of the latter.
 
-In plain Python, since importing scipy.special takes 0.13 s of a run that must be ready in half a second; the tests
+In plain Python, because importing scipy.special takes 0.13 s of a run that must start within half a second; the tests
 compare with it.
 """
 
@@ -10,27 +10,30 @@ import math
 from functools import cache
 
 _TINY = 1e-300
-_STEPS = 200  # bisections and Newton steps at most; ten are usual
+_MAX_STEPS = 200  # bisections and Newton steps; about ten are usual
 
 
 @cache
 def chi2_limit(p_above: float, dof: int) -> float:
-    """What a chi-square variable of so many degrees of freedom exceeds with probability p_above (0 to 1)."""
+    """The value that a chi-square variable with dof degrees of freedom exceeds with probability p_above (0 to 1)."""
     return 2 * gamma_quantile(p_above, dof / 2)
 
 
 def chi2_tail(value: float, dof: int) -> float:
-    """The probability that a chi-square variable of so many degrees of freedom exceeds a value; nan for nan."""
+    """The probability that a chi-square variable with dof degrees of freedom exceeds a value; nan for nan."""
     if not 0 < value < math.inf:
         return value if math.isnan(value) else float(value <= 0)
     return math.exp(_log_tails(value / 2, dof / 2)[2])
 
 
 def gamma_quantile(p_above: float, shape: float) -> float:
-    """What a gamma variable of this shape and of scale 1 exceeds with probability p_above (0 to 1).
+    """The value that a gamma variable of this shape and of scale 1 exceeds with probability p_above (0 to 1).
 
-    Newton's method on the tail's logarithm, kept within a bracket; accurate to about 1e-12 times the result, where
-    the shape is below 1e4, and to 1e-9 below 1e7. Start: Wilson and Hilferty (1931).
+    Newton's method on the logarithm of the tail, within a bracket; relative accuracy about 1e-12 for shapes below 1e4,
+    1e-9 below 1e7. Start: Wilson and Hilferty (1931).
+
+    Raises:
+        ValueError: the shape is not positive, or p_above is no probability.
     """
     if not shape > 0 or not 0 <= p_above <= 1:
         raise ValueError(f"expected a shape above 0 and a probability, got {shape} and {p_above}")
@@ -38,9 +41,9 @@ def gamma_quantile(p_above: float, shape: float) -> float:
         return math.inf if p_above == 0 else 0.0
     below, above = 0.0, math.inf
     x = max(shape * (1 - 1 / (9 * shape) + _normal(p_above) / (3 * math.sqrt(shape))) ** 3, 1e-3 * shape)
-    upper = p_above < 0.5  # the smaller tail, of which the logarithm loses nothing
+    upper = p_above < 0.5  # the smaller tail, whose logarithm loses no digits
     wanted = math.log(p_above if upper else 1 - p_above)
-    for _ in range(_STEPS):
+    for _ in range(_MAX_STEPS):
         log_density, log_lower, log_upper = _log_tails(x, shape)
         gap = (log_upper if upper else log_lower) - wanted
         if (gap > 0) == upper:
@@ -58,9 +61,9 @@ def gamma_quantile(p_above: float, shape: float) -> float:
 
 
 def _log_tails(x: float, shape: float) -> tuple[float, float, float]:
-    """ln of the density at x, of the probability below and of the one above.
+    """Logarithms of a gamma variable's density at x, of the probability below x, and of the probability above x.
 
-    Below the mean by the series, above it by the continued fraction. Source: DLMF 8.11.4 and 8.9.2; Lentz's method.
+    Series below the mean, continued fraction above it. Source: DLMF 8.11.4 and 8.9.2; Lentz's method.
     """
     log_density = -x + (shape - 1) * math.log(x) - math.lgamma(shape)
     if x < shape + 1:
@@ -71,7 +74,7 @@ def _log_tails(x: float, shape: float) -> tuple[float, float, float]:
             term *= x / n
             total += term
         log_lower = log_density + math.log(x) + math.log(total)
-        return log_density, log_lower, _log_of_rest(log_lower)
+        return log_density, log_lower, _log_complement(log_lower)
     b = x + 1 - shape
     c, d = 1 / _TINY, 1 / b
     h, i = d, 0
@@ -87,16 +90,17 @@ def _log_tails(x: float, shape: float) -> tuple[float, float, float]:
         if abs(c * d - 1) < 1e-16 or i > 100_000:
             break
     log_upper = log_density + math.log(x) + math.log(h)
-    return log_density, _log_of_rest(log_upper), log_upper
+    return log_density, _log_complement(log_upper), log_upper
 
 
-def _log_of_rest(log_part: float) -> float:
-    """ln(1 - exp(log_part))."""
-    return math.log(max(-math.expm1(log_part), _TINY))
+def _log_complement(log_p: float) -> float:
+    """ln(1 - exp(log_p))."""
+    return math.log(max(-math.expm1(log_p), _TINY))
 
 
 def _normal(p_above: float) -> float:
-    """Roughly what a normal variable exceeds with this probability. Source: Abramowitz and Stegun, 26.2.22 (0.003)."""
+    """Quantile of a normal variable, to 0.003. Source: Abramowitz and Stegun, 26.2.22."""
+
     p = min(p_above, 1 - p_above)
     t = math.sqrt(-2 * math.log(p))
     z = t - (2.30753 + 0.27061 * t) / (1 + 0.99229 * t + 0.04481 * t * t)

@@ -1,8 +1,9 @@
-"""The numbers of a rig that a calibration determines: their names, how they move the rig, and what they are known to.
+"""The parameters of a rig that a calibration determines: their names, their covariance, and their effect on pixels.
 
-Names as in rig.yaml's covariance blocks: `cameras.left.fx`, `screens.right.rot_x_rad`, `beams.A.direction_y`. Cameras
-have fx, fy, cx, cy (px), as many of k1 ... tau_y as their lens model uses, and the error of camera_from_world; screens
-the error of world_from_screen and the bow; beams a direction and a point in body (along the beam they do nothing).
+Names are those of rig.yaml's covariance blocks: `cameras.left.fx`, `screens.right.rot_x_rad`, `beams.A.direction_y`.
+Cameras have fx, fy, cx, cy (px), as many of k1 ... tau_y as their lens model uses, and the error of camera_from_world;
+screens have the error of world_from_screen and the bow; beams have a direction and a point in body, whose components
+along the beam have no effect.
 """
 
 from __future__ import annotations
@@ -29,25 +30,25 @@ POINT = ("point_x_m", "point_y_m", "point_z_m")
 
 @dataclass(frozen=True, slots=True)
 class RigCovariance:
-    """What a calibration knows of the joint errors of a rig's numbers."""
+    """The joint covariance of the errors of a rig's parameters."""
 
-    names: tuple[str, ...]  # p names as above
+    names: tuple[str, ...]  # p names, as in the module's docstring
     matrix: Array  # (p, p), in the parameters' units; may be singular
 
 
 def distortion_names(camera: Camera) -> tuple[str, ...]:
-    """The names of the distortion numbers that a camera has, in order."""
+    """The names of a camera's distortion coefficients, in order."""
     names = FISHEYE_DISTORTION if camera.lens == FISHEYE else DISTORTION
     return names[: len(camera.distortion)]
 
 
 def camera_names(camera: Camera) -> tuple[str, ...]:
-    """All parameters of a camera, without its own name."""
+    """The names of all parameters of a camera, without its own name."""
     return (*PINHOLE, *distortion_names(camera), *POSE)
 
 
 def rig_names(rig: Rig, bow: bool = False) -> tuple[str, ...]:
-    """All parameters of a rig: cameras, screens (with their bows where asked for), beams."""
+    """The names of all parameters of a rig: cameras, screens (optionally with their bows), beams."""
     names = [f"cameras.{n}.{p}" for n, c in rig.cameras.items() for p in camera_names(c)]
     names += [f"screens.{n}.{p}" for n in rig.screens for p in ((*POSE, *BOW) if bow else POSE)]
     names += [f"beams.{n}.{p}" for n in rig.beams for p in (*DIRECTION, *POINT)]
@@ -55,119 +56,130 @@ def rig_names(rig: Rig, bow: bool = False) -> tuple[str, ...]:
 
 
 def split(name: str) -> tuple[str, str, str]:
-    """Kind, thing and parameter: `cameras.left.fx` is cameras, left, fx; the thing's own name may hold dots."""
+    """Kind, item and parameter: `cameras.left.fx` gives cameras, left, fx; the item's own name may contain dots."""
     kind, rest = name.split(".", 1)
-    thing, parameter = rest.rsplit(".", 1)
-    return kind, thing, parameter
+    item, parameter = rest.rsplit(".", 1)
+    return kind, item, parameter
 
 
 def is_known(rig: Rig, name: str) -> bool:
-    """Whether a name is that of a number of this rig."""
+    """Whether this rig has a parameter of this name."""
     if name.count(".") < 2:
         return False
-    kind, thing, parameter = split(name)
-    if kind == "cameras" and thing in rig.cameras:
-        return parameter in camera_names(rig.cameras[thing])
-    if kind == "screens" and thing in rig.screens:
+    kind, item, parameter = split(name)
+    if kind == "cameras" and item in rig.cameras:
+        return parameter in camera_names(rig.cameras[item])
+    if kind == "screens" and item in rig.screens:
         return parameter in (*POSE, *BOW)
-    return kind == "beams" and thing in rig.beams and parameter in (*DIRECTION, *POINT)
+    return kind == "beams" and item in rig.beams and parameter in (*DIRECTION, *POINT)
 
 
 def moved(rig: Rig, names: Sequence[str], delta: Array) -> Rig:
-    """The rig with each named number changed by delta (p,), in the parameters' units. KeyError for unknown names."""
+    """The rig with each named parameter changed by delta (p,), in the parameters' units.
+
+    Raises:
+        KeyError: the rig has no parameter of this name.
+    """
     changes: dict[tuple[str, str], dict[str, float]] = {}
     for name, value in zip(names, delta, strict=True):
         if not is_known(rig, name):
             raise KeyError(name)
-        kind, thing, parameter = split(name)
-        changes.setdefault((kind, thing), {})[parameter] = float(value)
+        kind, item, parameter = split(name)
+        changes.setdefault((kind, item), {})[parameter] = float(value)
     cameras, screens, beams = dict(rig.cameras), dict(rig.screens), dict(rig.beams)
-    for (kind, thing), change in changes.items():
+    for (kind, item), change in changes.items():
         if kind == "cameras":
-            cameras[thing] = _moved_camera(cameras[thing], change)
+            cameras[item] = _perturbed_camera(cameras[item], change)
         elif kind == "screens":
-            screens[thing] = _moved_screen(screens[thing], change)
+            screens[item] = _perturbed_screen(screens[item], change)
         else:
-            beams[thing] = _moved_beam(beams[thing], change)
+            beams[item] = _perturbed_beam(beams[item], change)
     return Rig(screens, cameras, beams, rig.spots)
 
 
-def _several(change: dict[str, float], names: Sequence[str]) -> Array:
+def _changes_of(change: dict[str, float], names: Sequence[str]) -> Array:
+    """The changes of the named parameters (k,), 0 for those that do not change."""
     return np.array([change.get(n, 0.0) for n in names])
 
 
-def _moved_pose(pose: Pose, change: dict[str, float]) -> Pose:
-    delta = _several(change, POSE)
+def _perturbed_pose(pose: Pose, change: dict[str, float]) -> Pose:
+    delta = _changes_of(change, POSE)
     return pose.plus(delta) if delta.any() else pose
 
 
-def _moved_camera(camera: Camera, change: dict[str, float]) -> Camera:
-    d = _several(change, PINHOLE)
+def _perturbed_camera(camera: Camera, change: dict[str, float]) -> Camera:
+    d = _changes_of(change, PINHOLE)
     matrix = camera.matrix + np.array([[d[0], 0, d[2]], [0, d[1], d[3]], [0, 0, 0]])
-    distortion = np.array(camera.distortion) + _several(change, distortion_names(camera))
+    distortion = np.array(camera.distortion) + _changes_of(change, distortion_names(camera))
     return replace(
         camera,
         matrix=matrix,
         distortion=tuple(distortion.tolist()),
-        camera_from_world=_moved_pose(camera.camera_from_world, change),
+        camera_from_world=_perturbed_pose(camera.camera_from_world, change),
     )
 
 
-def _moved_screen(screen: Screen, change: dict[str, float]) -> Screen:
-    a, b, c = (np.array(screen.bow) + _several(change, BOW)).tolist()
-    return replace(screen, world_from_screen=_moved_pose(screen.world_from_screen, change), bow=(a, b, c))
+def _perturbed_screen(screen: Screen, change: dict[str, float]) -> Screen:
+    a, b, c = (np.array(screen.bow) + _changes_of(change, BOW)).tolist()
+    return replace(screen, world_from_screen=_perturbed_pose(screen.world_from_screen, change), bow=(a, b, c))
 
 
-def _moved_beam(beam: Beam, change: dict[str, float]) -> Beam:
-    return Beam(beam.name, beam.direction + _several(change, DIRECTION), beam.point + _several(change, POINT))
+def _perturbed_beam(beam: Beam, change: dict[str, float]) -> Beam:
+    return Beam(beam.name, beam.direction + _changes_of(change, DIRECTION), beam.point + _changes_of(change, POINT))
 
 
 class Sensitivity:
-    """What the named numbers of a rig do to the pixels of its n views.
+    """Derivatives of the pixels of a rig's n views by the named parameters.
 
-    Prepared once per rig, since where each number acts does not depend on the pose.
+    Prepared once per rig: which parameter acts on which view does not depend on the pose.
     """
 
     def __init__(self, rig: Rig, model: SpotModel, names: Sequence[str]) -> None:
-        """KeyError for a name that the rig does not have. model: of this rig, also a subset of its views."""
+        """model: of this rig, possibly of a subset of its views.
+
+        Raises:
+            KeyError: the rig has no parameter of this name.
+        """
         self.names = tuple(names)
         cameras, screens, beams = list(rig.cameras), list(rig.screens), list(rig.beams)
         camera_of = model.camera_of
         screen_of = np.array([screens.index(rig.spots[s].screen) for _, s in model.views], dtype=np.int64)
-        # By field of SpotDerivatives: the parameters' places, their columns there, and which views (n, .) they move.
-        self._moves: dict[str, tuple[list[int], list[int], Array]] = {}
+        # Per field of SpotDerivatives: indices of parameters, their columns in it, and the views (n, .) they act on.
+        self._actions: dict[str, tuple[list[int], list[int], Array]] = {}
         masks: dict[str, list[Array]] = {}
         for i, name in enumerate(self.names):
             if not is_known(rig, name):
                 raise KeyError(name)
-            kind, thing, parameter = split(name)
+            kind, item, parameter = split(name)
             if kind == "cameras":
-                field, column = _camera_place(rig.cameras[thing], parameter)
-                views = camera_of == cameras.index(thing)
+                field, column = _camera_column(rig.cameras[item], parameter)
+                views = camera_of == cameras.index(item)
             elif kind == "screens":
                 field, column = ("bow", BOW.index(parameter)) if parameter in BOW else ("screen", POSE.index(parameter))
-                views = screen_of == screens.index(thing)
+                views = screen_of == screens.index(item)
             else:
                 is_direction = parameter in DIRECTION
                 field = "direction" if is_direction else "point"
                 column = (DIRECTION if is_direction else POINT).index(parameter)
-                views = model.beam_of == beams.index(thing)
-            places, columns, _ = self._moves.setdefault(field, ([], [], np.empty(0)))
-            places.append(i)
+                views = model.beam_of == beams.index(item)
+            indices, columns, _ = self._actions.setdefault(field, ([], [], np.empty(0)))
+            indices.append(i)
             columns.append(column)
             masks.setdefault(field, []).append(views.astype(float))
-        for field, (places, columns, _) in self._moves.items():
-            self._moves[field] = places, columns, np.stack(masks[field], axis=-1)
+        for field, (indices, columns, _) in self._actions.items():
+            self._actions[field] = indices, columns, np.stack(masks[field], axis=-1)
 
     def of(self, derivatives: SpotDerivatives) -> Array:
         """d(pixels)/d(parameters) (..., n, 2, p), px per unit."""
         out = np.zeros((*derivatives.pixels.shape, len(self.names)))
-        for field, (places, columns, views) in self._moves.items():
-            out[..., places] = getattr(derivatives, field)[..., columns] * views[:, None, :]
+        for field, (indices, columns, views) in self._actions.items():
+            out[..., indices] = getattr(derivatives, field)[..., columns] * views[:, None, :]
         return out
 
 
-def _camera_place(camera: Camera, parameter: str) -> tuple[str, int]:
+def _camera_column(camera: Camera, parameter: str) -> tuple[str, int]:
+    """Field of SpotDerivatives and column in it of a camera's parameter."""
+
     if parameter in PINHOLE:
         return "pinhole", PINHOLE.index(parameter)
     if parameter in POSE:

@@ -1,4 +1,4 @@
-"""The least-squares engine: against dense algebra, in its limits, and its claims of covariance."""
+"""The least-squares solver: against dense algebra, in limiting cases, and its covariances."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def test_sparse_and_dense_algebra_agree_in_values_and_covariance(seed):
     assert found.dof == 2 * 60 - 17
 
 
-def test_what_is_held_fixed_stays_and_has_no_variance():
+def test_fixed_numbers_keep_their_values_and_have_no_variance():
     _, term = linear_problem(np.random.default_rng(1))
     mask = np.array([[True, False, True]])
     found = solve(START, [term], {"x": True, "y": mask})
@@ -85,12 +85,12 @@ def test_what_is_held_fixed_stays_and_has_no_variance():
     np.testing.assert_allclose(covariance[np.ix_([0, 2], [0, 2])], np.linalg.inv(J.T @ J)[14:, 14:], rtol=1e-8)
 
 
-def test_a_direction_that_nothing_determines_is_named_and_has_no_covariance():
+def test_an_undetermined_direction_is_returned_and_has_no_covariance():
     _, term = linear_problem(np.random.default_rng(2))
     b = term.b.copy()
-    b[..., 2] = 2 * b[..., 0]  # y0 + 2 y2 is all that acts
+    b[..., 2] = 2 * b[..., 0]  # only y0 + 2 y2 has an effect
     found = solve(START, [Linear(term.index, term.a, b, term.z)], {"x": True, "y": True})
-    with pytest.raises(AdjustmentError, match="undetermined"):
+    with pytest.raises(AdjustmentError, match="do not determine"):
         found.covariance([("y", 0)])
     (direction,) = found.undetermined([("y", 0)])
     np.testing.assert_allclose(direction / direction[0], [1, 0, -0.5], atol=1e-6)
@@ -107,7 +107,7 @@ def test_a_prior_on_an_undetermined_direction_determines_it():
     assert found.covariance([("y", 0)])[2, 2] == pytest.approx(0.25)
 
 
-def test_outliers_hardly_pull_with_a_robust_loss():
+def test_with_a_robust_loss_outliers_have_little_influence():
     truth, term = linear_problem(np.random.default_rng(4), Cauchy(), count=300)
     z = term.z.copy()
     z[10:20] += 200.0
@@ -120,7 +120,7 @@ def test_outliers_hardly_pull_with_a_robust_loss():
     assert np.any(np.abs(least_squares.values["y"].array - truth["y"].array) > 5 * sigmas)
 
 
-def test_start_values_that_predict_nothing_are_refused():
+def test_start_values_without_finite_residuals_are_refused():
     _, term = linear_problem(np.random.default_rng(5))
     broken = Linear(term.index, term.a, term.b, np.full_like(term.z, np.nan))
     with pytest.raises(AdjustmentError, match="start values"):
@@ -129,19 +129,19 @@ def test_start_values_that_predict_nothing_are_refused():
 
 @settings(max_examples=40)
 @given(seed=seeds)
-def test_plus_and_minus_are_there_and_back_for_each_kind_of_unknown(seed):
+def test_minus_is_the_inverse_of_plus_for_each_kind_of_unknown(seed):
     rng = np.random.default_rng(seed)
     delta = rng.normal(scale=1e-4, size=(2, 6))
     poses = Poses.of([random_pose(rng), random_pose(rng)])
     np.testing.assert_allclose(poses.plus(delta).minus(poses), delta, atol=1e-12)
     lines = Lines(rng.normal(size=(2, 3)), normalised(rng.normal(size=(2, 3))))
-    # A line's direction is normalised, and where it passes the old point across moves along: both of second order.
+    # The direction is normalised, and the point opposite the old one shifts along the line: both of second order.
     np.testing.assert_allclose(lines.plus(delta[:, :4]).minus(lines), delta[:, :4], atol=1e-6)
 
 
 @settings(max_examples=40)
 @given(seed=seeds)
-def test_a_lines_point_may_slide_along_it_without_any_difference(seed):
+def test_a_shift_of_a_lines_point_along_it_is_no_difference(seed):
     rng = np.random.default_rng(seed)
     lines = Lines(rng.normal(size=(3, 3)), normalised(rng.normal(size=(3, 3))))
     slid = Lines(lines.points + 0.7 * lines.directions, lines.directions)
@@ -149,7 +149,7 @@ def test_a_lines_point_may_slide_along_it_without_any_difference(seed):
 
 
 @pytest.mark.parametrize("kind", ["poses", "lines", "vectors"])
-def test_a_priors_derivatives_are_those_of_its_residuals(kind):
+def test_the_derivatives_of_a_prior_equal_finite_differences(kind):
     rng = np.random.default_rng(6)
     if kind == "poses":
         known = Poses.of([random_pose(rng)])
@@ -169,7 +169,7 @@ def test_a_priors_derivatives_are_those_of_its_residuals(kind):
     np.testing.assert_allclose(line.parts[0].jacobian[0], expected, rtol=1e-5, atol=1e-4)
 
 
-def test_poses_that_are_measured_twice_come_out_between_with_the_covariance_of_the_mean():
+def test_a_pose_measured_twice_gives_the_mean_and_its_covariance():
     rng = np.random.default_rng(7)
     first = random_pose(rng)
     second = first.plus(np.full(6, 0.02))
@@ -182,5 +182,5 @@ def test_poses_that_are_measured_twice_come_out_between_with_the_covariance_of_t
     np.testing.assert_allclose(found.covariance([("p", 0)]), np.eye(6) * 0.005, atol=1e-6)
 
 
-def test_priors_of_unknowns_about_which_nothing_is_known_are_none():
+def test_unknowns_without_prior_knowledge_get_no_prior():
     assert independent("p", Vectors(np.zeros((2, 3))), np.full((2, 3), np.inf)) == []

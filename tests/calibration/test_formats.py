@@ -130,7 +130,7 @@ def test_numbers_are_valid_in_yaml_1_1(format_name):
     assert numbers[:3] == [1e-05, -3e-12, 1e-300]
 
 
-# As the programs' documentation shows them ------------------------------------------------------------------------
+# Examples from the documentation of the programs ------------------------------------------------------------------
 
 CAMCHAIN = """\
 cam0:

@@ -1,15 +1,17 @@
-"""Rigs for the tests: the paper's, and random ones without any of its symmetries."""
+"""Rigs for the tests: that of the paper, and random ones without its symmetries."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from geometry.camera import Camera
+from geometry.camera import FISHEYE, Camera
 from geometry.pose import Pose
 from geometry.rig import Beam, Rig, Screen, Spot
 
-# Models as calibrations give them, one for each allowed length. All are one to one over a normalised radius of 0.8.
+# Typical models, one for each allowed number of coefficients, all one to one over a normalised radius of 0.8.
 LENSES = {
     0: (),
     4: (-0.21, 0.06, 0.0011, -0.0007),
@@ -21,7 +23,7 @@ LENSES = {
 
 
 def random_pose(rng: np.random.Generator, shift_m: float = 1.0, turn_rad: float = np.pi) -> Pose:
-    """A turn of up to turn_rad about any axis, and a shift of up to shift_m in each coordinate."""
+    """A random pose: a turn of up to turn_rad about any axis, a shift of up to shift_m in each coordinate."""
     axis = rng.normal(size=3)
     rotvec = axis / np.linalg.norm(axis) * rng.uniform(0, turn_rad)
     return Pose(Rotation.from_rotvec(rotvec).as_matrix(), rng.uniform(-shift_m, shift_m, 3))
@@ -68,10 +70,10 @@ def paper_rig(lens: tuple[float, ...] = (), size_m: tuple[float, float] | None =
 
 
 def random_rig(rng: np.random.Generator) -> Rig:
-    """Tilted screens of any extent all round, two cameras on one of them, skew beams that meet nowhere, any lens."""
+    """Three tilted, unlimited screens, two cameras on one of them, skew beams, any lens models."""
     screens, cameras, beams, spots = {}, {}, {}, {}
     for name, azimuth in (("left", np.pi), ("right", 0.0), ("roof", 0.5 * np.pi)):
-        outwards = Rotation.from_euler("ZY", [azimuth, np.pi / 2])  # screen z towards the screen, from the middle
+        outwards = Rotation.from_euler("ZY", [azimuth, np.pi / 2])  # screen z points outwards
         tilt = Rotation.from_rotvec(rng.normal(0, 0.2, 3))
         centre = outwards.apply([0, 0, 2.5]) + rng.normal(0, 0.2, 3)
         screens[name] = Screen(name, Pose((outwards * tilt).as_matrix(), centre))
@@ -87,3 +89,16 @@ def random_rig(rng: np.random.Generator) -> Rig:
         spots[f"+{i}"] = Spot(f"+{i}", f"b{i}", +1, "right")
     spots["up"] = Spot("up", "b3", +1, "roof")
     return Rig(screens, cameras, beams, spots)
+
+
+def uncommon_rig(rng: np.random.Generator) -> Rig:
+    """A random rig with bent screens, one fisheye camera, and fourteen distortion coefficients in the others."""
+    rig = random_rig(rng)
+    screens = {n: replace(s, bow=tuple(rng.normal(0, 0.004, 3))) for n, s in rig.screens.items()}
+    cameras = {}
+    for i, (name, camera) in enumerate(rig.cameras.items()):
+        if i == 0:
+            cameras[name] = replace(camera, lens=FISHEYE, distortion=(0.01, -0.02, 0.003, 0.001))
+        else:
+            cameras[name] = replace(camera, distortion=LENSES[14])
+    return Rig(screens, cameras, rig.beams, rig.spots)

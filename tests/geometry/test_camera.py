@@ -1,4 +1,4 @@
-"""The camera: world points to pixels and back, and what lies in the picture."""
+"""The camera: world points to pixels and back, and the limits of the picture."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def camera(lens: tuple[float, ...] = (), camera_from_world: Pose | None = None) 
 
 
 @given(seed=seeds, n_numbers=st.sampled_from(list(LENSES)))
-def test_world_points_fall_on_opencvs_pixels(seed, n_numbers):
+def test_world_points_project_to_the_pixels_of_opencv(seed, n_numbers):
     rng = np.random.default_rng(seed)
     c = camera(LENSES[n_numbers], random_pose(rng))
     depth = rng.uniform(0.5, 5, (20, 1))
@@ -36,7 +36,7 @@ def test_world_points_fall_on_opencvs_pixels(seed, n_numbers):
 
 
 @given(seed=seeds, n_numbers=st.sampled_from(list(LENSES)))
-def test_the_ray_of_a_pixel_falls_on_that_pixel_from_any_distance(seed, n_numbers):
+def test_points_on_the_ray_of_a_pixel_project_to_that_pixel(seed, n_numbers):
     rng = np.random.default_rng(seed)
     c = camera(LENSES[n_numbers], random_pose(rng))
     pixels = rng.uniform(-0.5, [1279.5, 1023.5], (4, 5, 2))
@@ -53,7 +53,7 @@ def test_rays_begin_at_the_cameras_centre():
     np.testing.assert_allclose(c.camera_from_world.apply(origin), 0, atol=1e-15)
 
 
-def test_the_principal_point_looks_straight_ahead_and_u_runs_right_and_v_down():
+def test_the_principal_point_is_straight_ahead_u_points_right_and_v_down():
     _, rays = camera(LENSES[4]).rays(np.array([[650.25, 500.5], [700, 500.5], [650.25, 600]]))
     np.testing.assert_allclose(rays[0], [0, 0, 1], atol=1e-12)
     assert rays[1, 0] > 0
@@ -93,7 +93,7 @@ def test_a_margin_widens_the_picture_on_every_side():
 
 @settings(max_examples=30)
 @given(seed=seeds)
-def test_points_of_different_cameras_go_in_one_call_with_the_jacobian_of_differences(seed):
+def test_one_call_projects_points_of_several_cameras_with_the_jacobian_of_differences(seed):
     rng = np.random.default_rng(seed)
     cameras = [camera(lens) for lens in LENSES.values()]
     depth = rng.uniform(0.5, 5, (len(cameras), 1))
@@ -105,10 +105,10 @@ def test_points_of_different_cameras_go_in_one_call_with_the_jacobian_of_differe
     for i, c in enumerate(cameras):
         np.testing.assert_allclose(pixels[i], c.project(points[i]), rtol=0, atol=1e-10)
         differences = numeric_jacobian(c.project, points[i])
-        np.testing.assert_allclose(J[i], differences, rtol=1e-6, atol=1e-3)  # px/m, of thousands
+        np.testing.assert_allclose(J[i], differences, rtol=1e-6, atol=1e-3)  # px/m, of values of thousands
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 6, 13, 15])
-def test_a_wrong_count_of_distortion_numbers_is_refused_by_name(n):
+def test_a_wrong_number_of_distortion_coefficients_is_refused_with_the_name_of_the_camera(n):
     with pytest.raises(ValueError, match=f"camera 'left': {n} distortion numbers, OpenCV's models have 0, 4, 5"):
         camera((0.1,) * n)

@@ -1,4 +1,4 @@
-"""The compiled small matrices and rotations against numpy and against the stacked formulas."""
+"""Compiled matrices and rotations against numpy and against geometry/rotations.py."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def vector(rng: np.random.Generator, angle: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("angle", ANGLES)
-def test_rotations_are_those_of_the_stacked_formulas(angle):
+def test_compiled_rotations_equal_the_numpy_ones(angle):
     w = vector(np.random.default_rng(1), angle)
     R = rotations.exp(w)
     np.testing.assert_allclose(compiled_linalg.exp(w), R, rtol=0, atol=1e-15)
@@ -30,7 +30,7 @@ def test_rotations_are_those_of_the_stacked_formulas(angle):
 
 @settings(max_examples=30, deadline=None)
 @given(seed=seeds)
-def test_a_pose_moved_and_taken_apart_again_gives_the_same_difference(seed):
+def test_pose_minus_is_the_inverse_of_pose_plus(seed):
     rng = np.random.default_rng(seed)
     pose = Pose(rotations.exp(vector(rng, 1.0)), rng.normal(size=3))
     delta = np.concatenate([rng.normal(size=3), vector(rng, rng.uniform(0, 3.0))])
@@ -45,7 +45,7 @@ def test_a_pose_moved_and_taken_apart_again_gives_the_same_difference(seed):
 
 @settings(max_examples=30, deadline=None)
 @given(seed=seeds, n=st.integers(1, 12))
-def test_a_system_is_solved_as_numpy_solves_it(seed, n):
+def test_solve_equals_numpy(seed, n):
     rng = np.random.default_rng(seed)
     a, b = rng.normal(size=(n, n)) + 3 * np.eye(n), rng.normal(size=(n, 2))
     x, log_det = compiled_linalg.solve(a, b)
@@ -55,7 +55,7 @@ def test_a_system_is_solved_as_numpy_solves_it(seed, n):
     np.testing.assert_allclose(compiled_linalg.apply(a, b[:, 0].copy()), a @ b[:, 0], rtol=0, atol=1e-12)
 
 
-def test_a_singular_system_is_seen_by_its_determinant():
+def test_the_determinant_of_a_singular_system_is_not_finite():
     a = np.ones((3, 3))
     assert not np.isfinite(compiled_linalg.solve(a, np.ones((3, 1)))[1])
 
@@ -67,13 +67,13 @@ def a_covariance(rng: np.random.Generator, n: int) -> np.ndarray:
 
 @settings(max_examples=30, deadline=None)
 @given(seed=seeds, n=st.integers(1, 18), k=st.integers(1, 6))
-def test_a_triangular_factor_squared_is_the_matrix(seed, n, k):
+def test_a_cholesky_factor_times_its_transpose_is_the_matrix(seed, n, k):
     rng = np.random.default_rng(seed)
     P = a_covariance(rng, n)
     L = compiled_linalg.cholesky(P)
     np.testing.assert_array_equal(L, np.tril(L))
     np.testing.assert_allclose(L @ L.T, P, rtol=0, atol=1e-12)
-    # What does not vary has a row and column of zeros; the others are as without it.
+    # A number without variance has a row and a column of zeros; the others are not affected.
     fixed = rng.integers(n)
     P[fixed], P[:, fixed] = 0.0, 0.0
     L = compiled_linalg.cholesky(P)
@@ -83,7 +83,7 @@ def test_a_triangular_factor_squared_is_the_matrix(seed, n, k):
 
 @settings(max_examples=30, deadline=None)
 @given(seed=seeds, n=st.integers(6, 18), rank=st.integers(0, 6))
-def test_a_posterior_covariance_is_the_dense_formula(seed, n, rank):
+def test_a_posterior_covariance_equals_the_dense_formula(seed, n, rank):
     rng = np.random.default_rng(seed)
     P, J = a_covariance(rng, n), rng.normal(size=(rank, 6))
     Y = np.zeros((n, n))
@@ -96,8 +96,8 @@ def test_a_posterior_covariance_is_the_dense_formula(seed, n, rank):
 
 
 @pytest.mark.parametrize("vague", [1.0, 1e4, 1e8, 1e14])
-def test_a_posterior_is_positive_definite_however_vague_the_prior(vague):
-    """The textbook's P - P H^T S^-1 H P is left with rounding of 1e-16 P: here as much as the result, or more."""
+def test_a_posterior_is_positive_definite_even_with_a_vague_prior(vague):
+    """P - P H^T S^-1 H P has rounding errors of 1e-16 P, here as large as the result or larger."""
     rng = np.random.default_rng(5)
     for _ in range(20):
         Y = np.linalg.inv(a_covariance(rng, 6))
@@ -108,7 +108,7 @@ def test_a_posterior_is_positive_definite_however_vague_the_prior(vague):
         assert np.linalg.eigvalsh(out[:6, :6] / np.outer(sigma[:6], sigma[:6]))[0] > 0
         assert np.linalg.eigvalsh(out / np.outer(sigma, sigma))[0] > -1e-12
         if vague > 1e7:
-            # A vague prior leaves what was measured the measurement's covariance, to the last digits.
+            # With a vague prior the covariance is that of the measurement, to the last digits.
             C = np.linalg.inv(Y)
             scale = np.sqrt(np.outer(np.diagonal(C), np.diagonal(C)))
             np.testing.assert_allclose(out[:6, :6] / scale, C / scale, rtol=0, atol=1e-6)

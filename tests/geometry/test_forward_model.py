@@ -1,4 +1,4 @@
-"""The forward model: pose -> pixels, against a second way, in its limits, and its Jacobian against differences."""
+"""The forward model: both implementations against each other, against other means, and against finite differences."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from geometry.arrays import numeric_jacobian
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.rig import Beam, Rig, Screen
-from tests.geometry.scenes import LENSES, paper_rig, random_pose, random_rig
+from tests.geometry.scenes import LENSES, paper_rig, random_pose, random_rig, uncommon_rig
 
 seeds = st.integers(0, 2**32 - 1)
-ROUNDING_PX = 1e-8  # pixels of some thousands, metres of some units, a few dozen operations
+ROUNDING_PX = 1e-8  # rounding of pixels of some thousands after a few dozen operations
 
 
 def plain_pixel(rig: Rig, camera_name: str, spot_name: str, turn: Rotation, shift: np.ndarray) -> np.ndarray:
-    """The pixel of one spot by other means: scipy turns, a linear system meets the plane, OpenCV projects.
+    """The pixel of one spot by other means: scipy's rotations, a linear system for the hit, OpenCV's projection.
 
-    nan where the beam misses the screen or the spot is behind the camera. Knows nothing of folded lenses.
+    nan where the beam misses the screen or the spot is behind the camera. Lenses that fold are not considered.
     """
     camera, spot = rig.cameras[camera_name], rig.spots[spot_name]
     beam, screen = rig.beams[spot.beam], rig.screens[spot.screen]
@@ -46,7 +46,7 @@ def plain_pixel(rig: Rig, camera_name: str, spot_name: str, turn: Rotation, shif
 
 @settings(max_examples=150)
 @given(seed=seeds)
-def test_the_model_agrees_with_a_plain_one_made_of_other_parts(seed):
+def test_the_model_agrees_with_a_plain_computation_by_other_means(seed):
     rng = np.random.default_rng(seed)
     rig, pose = random_rig(rng), random_pose(rng, 0.8, 0.7)
     model = SpotModel.of(rig)
@@ -57,20 +57,33 @@ def test_the_model_agrees_with_a_plain_one_made_of_other_parts(seed):
         expected = plain_pixel(rig, camera, spot, turn, pose.translation)
         in_camera = rig.cameras[camera].camera_from_world.apply(hit)
         radius2 = np.sum((in_camera[:2] / in_camera[2]) ** 2)
-        if radius2 > 0.8**2:  # beyond the range over which LENSES are one to one: nan is right as well
+        if radius2 > 0.8**2:  # beyond the range in which LENSES are one to one nan is correct too
             assert np.isnan(pixel).all() or np.allclose(pixel, expected, rtol=1e-11, atol=ROUNDING_PX)
         else:
             np.testing.assert_allclose(pixel, expected, rtol=0, atol=ROUNDING_PX)
 
 
-def test_most_spots_of_the_random_scenes_exist():
-    """Otherwise the comparisons of this file would compare nan with nan."""
+@settings(max_examples=20, deadline=None)
+@given(seed=seeds)
+def test_the_compiled_and_the_numpy_implementation_agree(seed):
+    rng = np.random.default_rng(seed)
+    rig, pose = uncommon_rig(rng), random_pose(rng, 0.3, 0.3)
+    model = SpotModel.of(rig)
+    pixels, J = model.project(pose)
+    found = model.derivatives(pose)
+    np.testing.assert_allclose(found.pixels, pixels, rtol=0, atol=1e-9)
+    good = np.isfinite(pixels[:, 0])
+    np.testing.assert_allclose(found.pose[good], J[good], rtol=1e-9, atol=1e-9)
+
+
+def test_most_spots_of_the_random_scenes_have_a_projection():
+    """Otherwise the tests of this file would compare nan with nan."""
     rng = np.random.default_rng(7)
     found = [SpotModel.of(random_rig(rng)).project(random_pose(rng, 0.8, 0.7))[0] for _ in range(100)]
     assert np.mean(np.isfinite(found)) > 0.7
 
 
-def test_the_papers_spots_fall_where_a_pencil_puts_them():
+def test_the_spots_of_the_papers_rig_lie_where_trigonometry_puts_them():
     # 2.5 m from the middle to a screen, beams at 0 and +-30 degrees, cameras 3.5 m behind the screens.
     side = 1180.0 * 2.5 * np.tan(np.radians(30)) / 3.5
     pixels, _ = SpotModel.of(paper_rig()).project(Pose.identity())
@@ -80,7 +93,7 @@ def test_the_papers_spots_fall_where_a_pencil_puts_them():
 
 @settings(max_examples=60)
 @given(seed=seeds)
-def test_the_jacobian_of_the_pixels_is_that_of_differences(seed):
+def test_the_jacobian_of_the_pixels_equals_finite_differences(seed):
     rng = np.random.default_rng(seed)
     model, pose = SpotModel.of(random_rig(rng)), random_pose(rng, 0.6, 0.5)
     pixels, J = model.project(pose)
@@ -93,19 +106,19 @@ def test_the_jacobian_of_the_pixels_is_that_of_differences(seed):
 
 @settings(max_examples=60)
 @given(seed=seeds)
-def test_the_jacobian_of_the_lit_points_is_that_of_differences(seed):
+def test_the_jacobian_of_the_lit_points_equals_finite_differences(seed):
     rng = np.random.default_rng(seed)
     model, pose = SpotModel.of(random_rig(rng)), random_pose(rng, 0.6, 0.5)
     hit, J = model.hits(pose)
     differences = numeric_jacobian(lambda delta: model.hits(pose.plus(delta))[0], np.zeros(6))
-    near = np.linalg.norm(hit, axis=-1) < 20  # m; a grazing ray's differences are not accurate
+    near = np.linalg.norm(hit, axis=-1) < 20  # m; finite differences of grazing rays are not accurate
     scale = np.abs(J[near]).max(axis=(-1, -2), keepdims=True, initial=1.0)
     np.testing.assert_allclose(J[near] / scale, differences[near] / scale, rtol=0, atol=2e-7)
 
 
 @settings(max_examples=30)
 @given(seed=seeds)
-def test_a_stack_of_poses_gives_what_each_pose_gives_alone(seed):
+def test_a_stack_of_poses_gives_the_same_as_each_pose_alone(seed):
     rng = np.random.default_rng(seed)
     model = SpotModel.of(random_rig(rng))
     poses = [random_pose(rng, 0.8, 0.7) for _ in range(6)]
@@ -125,7 +138,7 @@ def test_a_stack_of_poses_gives_what_each_pose_gives_alone(seed):
 
 @settings(max_examples=60)
 @given(seed=seeds)
-def test_pixels_do_not_depend_on_the_labs_choice_of_world(seed):
+def test_pixels_do_not_depend_on_the_choice_of_the_world_frame(seed):
     rng = np.random.default_rng(seed)
     rig, pose = random_rig(rng), random_pose(rng, 0.6, 0.5)
     new_from_world = random_pose(rng, 10.0)
@@ -144,14 +157,14 @@ def test_pixels_do_not_depend_on_the_labs_choice_of_world(seed):
     after, J_after = SpotModel.of(moved).project(new_from_world @ pose)
     near = SpotModel.of(rig).in_picture(before, 2000.0)
     np.testing.assert_allclose(after[near], before[near], rtol=0, atol=1e-7)
-    # An error in world turns with the world; one in the body does not.
+    # A pose error in world rotates with the world frame; one in body does not.
     J_expected = np.concatenate([J_before[..., :3] @ new_from_world.rotation.T, J_before[..., 3:]], axis=-1)
     np.testing.assert_allclose(J_after[near], J_expected[near], rtol=1e-7, atol=1e-5)
 
 
 @settings(max_examples=30)
 @given(seed=seeds)
-def test_a_subset_is_those_rows_of_the_whole(seed):
+def test_a_subset_gives_those_rows_of_the_whole_model(seed):
     rng = np.random.default_rng(seed)
     model, pose = SpotModel.of(random_rig(rng)), random_pose(rng, 0.6, 0.5)
     pixels, J = model.project(pose)
@@ -170,11 +183,10 @@ def test_a_subset_may_be_empty():
     assert (len(model), pixels.shape, J.shape) == (0, (0, 2), (0, 2, 6))
 
 
-def test_the_two_ends_of_a_beam_move_together_along_it():
-    """Sliding the vehicle along beam A moves neither spot of A."""
+def test_a_motion_along_a_beam_moves_neither_of_its_spots():
     _, J = SpotModel.of(paper_rig(LENSES[5])).project(Pose.identity())
     np.testing.assert_allclose(J[[0, 3], :, 0], 0.0, atol=1e-9)  # A runs along the world's x
-    np.testing.assert_allclose(J[[0, 3], :, 3], 0.0, atol=1e-9)  # nor does a turn about it
+    np.testing.assert_allclose(J[[0, 3], :, 3], 0.0, atol=1e-9)  # the same for a turn about it
     assert (np.abs(J[[1, 2, 4, 5], :, 0]).max(axis=1) > 50).all()
 
 
@@ -186,7 +198,7 @@ def _only_beam(direction, size_m=None, point=(0.0, 0.0, 0.0)) -> SpotModel:
 
 
 def test_a_beam_that_points_away_from_its_screen_gives_nan():
-    model = _only_beam([-1.0, 0, 0])  # each end now points at the other screen
+    model = _only_beam([-1.0, 0, 0])  # each end points at the other screen
     assert np.isnan(model.hits(Pose.identity())[0]).all()
     assert np.isnan(model.project(Pose.identity())[0]).all()
 
@@ -233,7 +245,7 @@ def test_a_spot_behind_the_camera_gives_nan():
     assert np.isfinite(model.hits(Pose.identity())[0]).all()
 
 
-def test_views_run_by_camera_then_by_spot_and_name_their_rows():
+def test_views_are_ordered_by_camera_then_by_spot():
     rig = random_rig(np.random.default_rng(1))
     model = SpotModel.of(rig)
     assert list(model.views) == rig.views()
@@ -242,7 +254,7 @@ def test_views_run_by_camera_then_by_spot_and_name_their_rows():
     assert [list(rig.beams)[i] for i in model.beam_of] == [rig.spots[s].beam for _, s in model.views]
 
 
-def test_a_tilted_screen_is_hit_where_its_plane_is():
+def test_a_ray_hits_a_tilted_screen_on_its_plane():
     tilt = Rotation.from_euler("z", 40, degrees=True).as_matrix()
     rig = paper_rig()
     right = rig.screens["right"].world_from_screen
@@ -256,7 +268,7 @@ def test_a_tilted_screen_is_hit_where_its_plane_is():
 
 @settings(max_examples=50)
 @given(seed=seeds)
-def test_rays_meet_a_bent_screen_on_its_surface(seed):
+def test_rays_hit_a_bent_screen_on_its_surface(seed):
     rng = np.random.default_rng(seed)
     flat = random_rig(rng)
     bows = {n: tuple(rng.normal(0, 0.01, 3)) for n in flat.screens}

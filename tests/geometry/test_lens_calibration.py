@@ -1,4 +1,4 @@
-"""What calibrations need of the lens models: derivatives by the coefficients, and the fisheye model against OpenCV."""
+"""Derivatives of the lens models by their coefficients, for calibrations, and the fisheye model against OpenCV."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ WIDE = (0.02, -0.015, 0.006, -0.0011)
 
 @settings(max_examples=50)
 @given(seed=seeds, tilted=st.booleans())
-def test_coefficient_derivatives_are_differences(seed, tilted):
+def test_coefficient_derivatives_equal_finite_differences(seed, tilted):
     rng = np.random.default_rng(seed)
     coefficients = rng.normal(0, 0.05, 14)
     coefficients[12:] *= tilted
@@ -39,7 +39,7 @@ def test_coefficient_derivatives_broadcast_over_cameras_and_points():
 
 @settings(max_examples=50)
 @given(seed=seeds)
-def test_fisheye_pixels_are_opencvs(seed):
+def test_fisheye_pixels_equal_those_of_opencv(seed):
     rng = np.random.default_rng(seed)
     camera = Camera(
         "wide", "s", (1280, 1024), np.array([[410.0, 0, 641], [0, 405, 509], [0, 0, 1]]), WIDE, Pose.identity(),
@@ -53,7 +53,7 @@ def test_fisheye_pixels_are_opencvs(seed):
     np.testing.assert_allclose(origin, 0, atol=1e-15)
 
 
-def test_fisheye_derivatives_are_differences_also_on_the_axis():
+def test_fisheye_derivatives_equal_finite_differences_also_on_the_axis():
     rng = np.random.default_rng(1)
     k = lens.padded(WIDE)
     xy = np.concatenate([[[0.0, 0.0], [1e-9, 0.0]], rng.uniform(-1.5, 1.5, (8, 2))])
@@ -64,7 +64,7 @@ def test_fisheye_derivatives_are_differences_also_on_the_axis():
         np.testing.assert_allclose(J, by_xy, atol=1e-7)
 
 
-def test_a_fisheye_that_folds_says_where_and_projects_nothing_beyond():
+def test_a_fisheye_lens_projects_nothing_beyond_its_fold():
     limit = lens.fisheye_fold_limit((0.0, -0.3, 0.0, 0.0))
     theta = np.arctan(np.sqrt(limit))
     # theta (1 - 0.3 theta^4) is steepest where 1 = 1.5 theta^4
@@ -76,12 +76,12 @@ def test_a_fisheye_that_folds_says_where_and_projects_nothing_beyond():
 
 
 @pytest.mark.parametrize(("kind", "numbers"), [("fisheye", (0.1,) * 5), ("wide", ())])
-def test_a_lens_that_is_none_is_refused(kind, numbers):
+def test_an_unknown_lens_or_a_wrong_number_of_coefficients_is_refused(kind, numbers):
     with pytest.raises(ValueError, match=r"lens|fisheye"):
         Camera("c", "s", (10, 10), np.eye(3), numbers, Pose.identity(), lens=kind)
 
 
-def test_perspective_and_fisheye_points_go_in_one_call():
+def test_one_call_projects_perspective_and_fisheye_points():
     rng = np.random.default_rng(2)
     points = np.column_stack([rng.uniform(-0.4, 0.4, (6, 2)), np.ones(6)])
     pinhole = np.tile([400.0, 410, 320, 240], (6, 1))

@@ -1,4 +1,4 @@
-"""The centre of a spot's light against the image of the beam's axis, by pictures that are integrated ray by ray."""
+"""The offset of a spot's centre from the image of the beam's axis, against pictures that are integrated ray by ray."""
 
 import cv2
 import numpy as np
@@ -57,14 +57,14 @@ def test_the_offset_is_that_of_a_fitted_gaussian(tilt, brightness):
     assert np.linalg.norm(measured - axis - predicted) < 0.2 * size + 5e-4
 
 
-def test_it_grows_with_the_square_of_the_width():
+def test_the_offset_grows_with_the_square_of_the_width():
     screen = Screen("s", Pose(turned([0, 1, 0], 40), np.array([0.0, 0.0, 2.0])))
-    at, dark = np.array([[700.0, 500.0]]), np.zeros(1)
-    narrow, wide = (CentreOffsets(CAMERA, screen).at(at, w**2 * np.array([[1.0, 0, 1]]), dark) for w in (2.0, 4.0))
+    at, faint = np.array([[700.0, 500.0]]), np.zeros(1)
+    narrow, wide = (CentreOffsets(CAMERA, screen).at(at, w**2 * np.array([[1.0, 0, 1]]), faint) for w in (2.0, 4.0))
     assert wide == pytest.approx(4 * narrow, rel=0.01)
 
 
-def test_a_screen_that_is_not_met_moves_nothing():
+def test_without_a_screen_there_is_no_offset():
     behind = Screen("s", Pose(np.eye(3), np.array([0.0, 0.0, -2.0])))
     offsets = CentreOffsets(CAMERA, behind)
     assert not offsets.at(np.array([[700.0, 500.0]]), np.array([[9.0, 0, 9]]), np.zeros(1)).any()

@@ -1,4 +1,4 @@
-"""Lines in space: where two are closest, and the point that is closest to many."""
+"""Lines in space: the closest points of two, and the point nearest to many."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def distance(point: np.ndarray, start: np.ndarray, direction: np.ndarray) -> flo
 def test_the_common_perpendicular_is_perpendicular_to_both_lines_and_ends_on_them(seed):
     a, u, b, v = two_lines(seed)
     p, q = common_perpendicular(a, u, b, v)
-    # Random directions are seldom within 1e-2 of parallel; what is lost then is the square of that.
+    # Random directions are rarely within 1e-2 of parallel; the loss of accuracy is the square of that.
     assert distance(p, a, u) < 1e-9
     assert distance(q, b, v) < 1e-9
     assert abs((q - p) @ u) < 1e-8 * max(1, np.linalg.norm(p))
@@ -85,7 +85,7 @@ def test_lines_through_one_point_are_nearest_to_that_point(seed, n):
 
 @given(seed=seeds, weighted=st.booleans())
 def test_the_nearest_point_is_the_least_squares_solution(seed, weighted):
-    """The second way: each line gives two equations, along two directions across it, to numpy's lstsq."""
+    """Against numpy's lstsq: each line gives two equations, along two directions perpendicular to it."""
     rng = np.random.default_rng(seed)
     points, directions = rng.normal(size=(5, 3)), rng.normal(size=(5, 3))
     weights = rng.uniform(0.1, 3, 5) if weighted else None

@@ -1,4 +1,4 @@
-"""Rays and screens."""
+"""Intersections of rays with screens."""
 
 from __future__ import annotations
 
@@ -41,16 +41,16 @@ def test_the_length_of_a_direction_does_not_matter(length):
 
 
 @pytest.mark.parametrize("length", [1e-6, 1.0, 1e6])
-def test_a_ray_parallel_to_the_screen_meets_it_nowhere(length):
+def test_a_ray_parallel_to_the_screen_does_not_hit_it(length):
     assert np.isnan(meet_plane(np.array([0.0, 0, 1]), length * np.array([0.6, 0.8, 0]), FLAT)).all()
     assert np.isnan(meet_plane(np.array([0.0, 0, 0]), length * np.array([0.6, 0.8, 0]), FLAT)).all()
 
 
-def test_a_ray_that_leaves_the_screen_behind_does_not_meet_it():
+def test_a_ray_that_points_away_from_the_screen_does_not_hit_it():
     assert np.isnan(meet_plane(np.array([0.0, 0, 1]), np.array([0.1, 0, 1]), FLAT)).all()
 
 
-def test_many_rays_and_one_origin_go_in_one_call_and_each_has_its_own_answer():
+def test_one_call_intersects_many_rays_and_one_origin():
     directions = np.array([[[0.0, 0, -1], [1, 0, -1]], [[1, 0, 0], [0, 0, 1]]])
     hits = meet_plane(np.array([0.0, 0, 2]), directions, FLAT)
     np.testing.assert_array_equal(hits, [[[0, 0], [2, 0]], [[np.nan] * 2, [np.nan] * 2]])

@@ -1,4 +1,4 @@
-"""Poses: the algebra of transforms, and the small error in them that the files' contract defines."""
+"""Poses: the algebra of transforms, and the pose error that the file contract defines."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from geometry.pose import Pose, ypr_sigmas
 from tests.geometry.scenes import random_pose
 
 seeds = st.integers(0, 2**32 - 1)
-ROUNDING_M = 1e-14  # of a few metres
+ROUNDING_M = 1e-14  # rounding of a few metres
 
 
 def same(a: Pose, b: Pose, atol: float = ROUNDING_M) -> None:
@@ -20,7 +20,7 @@ def same(a: Pose, b: Pose, atol: float = ROUNDING_M) -> None:
 
 
 @given(seed=seeds)
-def test_frames_cancel_like_fractions(seed):
+def test_a_product_of_transforms_applies_them_in_turn(seed):
     rng = np.random.default_rng(seed)
     a_from_b, b_from_c = random_pose(rng), random_pose(rng)
     points_c = rng.normal(size=(4, 3))
@@ -30,7 +30,7 @@ def test_frames_cancel_like_fractions(seed):
 
 
 @given(seed=seeds)
-def test_there_and_back_is_where_it_began(seed):
+def test_a_transform_times_its_inverse_is_the_identity(seed):
     rng = np.random.default_rng(seed)
     pose = random_pose(rng)
     same(pose @ pose.inverse(), Pose.identity())
@@ -39,7 +39,7 @@ def test_there_and_back_is_where_it_began(seed):
 
 
 @given(seed=seeds)
-def test_a_direction_turns_and_does_not_shift(seed):
+def test_a_direction_is_rotated_and_not_translated(seed):
     rng = np.random.default_rng(seed)
     pose, start, vector = random_pose(rng), rng.normal(size=3), rng.normal(size=3)
     np.testing.assert_allclose(
@@ -48,14 +48,14 @@ def test_a_direction_turns_and_does_not_shift(seed):
 
 
 @given(seed=seeds)
-def test_the_difference_of_two_poses_leads_from_one_to_the_other(seed):
+def test_plus_the_difference_of_two_poses_gives_the_other(seed):
     rng = np.random.default_rng(seed)
     estimate, truth = random_pose(rng), random_pose(rng)
     same(estimate.plus(truth.minus(estimate)), truth)
 
 
 @given(seed=seeds, size=st.sampled_from([1e-12, 1e-6, 0.1, 3.0]))
-def test_a_delta_comes_back_from_the_pose_that_it_leads_to(seed, size):
+def test_minus_is_the_inverse_of_plus(seed, size):
     rng = np.random.default_rng(seed)
     pose, delta = random_pose(rng), size * rng.normal(size=6)
     if np.linalg.norm(delta[3:]) >= np.pi:
@@ -64,7 +64,7 @@ def test_a_delta_comes_back_from_the_pose_that_it_leads_to(seed, size):
 
 
 def test_the_error_shifts_in_world_and_turns_in_the_body():
-    """Section 1 of the contract: t_true = t_est + dt, R_true = R_est Exp(dtheta)."""
+    """Section 1 of the file contract: t_true = t_est + dt, R_true = R_est Exp(dtheta)."""
     facing_left = Pose.from_ypr(np.array([np.pi / 2, 0, 0]), np.zeros(3))
     shifted = facing_left.plus(np.array([0.1, 0, 0, 0, 0, 0]))
     np.testing.assert_allclose(shifted.translation, [0.1, 0, 0], atol=ROUNDING_M)
@@ -74,7 +74,7 @@ def test_the_error_shifts_in_world_and_turns_in_the_body():
 
 
 @given(seed=seeds)
-def test_a_pose_comes_back_from_its_quaternion_and_agrees_with_scipys(seed):
+def test_a_pose_is_recovered_from_its_quaternion_which_equals_scipys(seed):
     pose = random_pose(np.random.default_rng(seed))
     same(Pose.from_quaternion(pose.quaternion_wxyz, pose.translation), pose)
     np.testing.assert_allclose(
@@ -83,12 +83,12 @@ def test_a_pose_comes_back_from_its_quaternion_and_agrees_with_scipys(seed):
 
 
 @given(seed=seeds)
-def test_a_pose_comes_back_from_its_angles(seed):
+def test_a_pose_is_recovered_from_its_angles(seed):
     pose = random_pose(np.random.default_rng(seed))
     same(Pose.from_ypr(pose.ypr, pose.translation), pose, atol=1e-8)
 
 
-def test_a_stack_gives_what_each_gives_alone():
+def test_a_stack_gives_the_same_as_each_element_alone():
     rng = np.random.default_rng(5)
     poses = [random_pose(rng) for _ in range(4)]
     stack = Pose(np.array([p.rotation for p in poses]), np.array([p.translation for p in poses]))
@@ -102,10 +102,10 @@ def test_a_stack_gives_what_each_gives_alone():
         np.testing.assert_allclose(stack.minus(stack[::-1])[i], pose.minus(poses[3 - i]), atol=ROUNDING_M)
 
 
-def test_the_sigmas_of_the_angles_are_the_scatter_of_the_angles():
+def test_the_sigmas_of_the_angles_equal_their_scatter():
     rng = np.random.default_rng(6)
     pose = Pose.from_ypr(np.radians([20.0, 50.0, -35.0]), np.zeros(3))
     root = rng.normal(0, 1e-3, (6, 6))
     scatter = pose.plus(rng.normal(size=(40_000, 6)) @ root.T).ypr.std(axis=0)
-    # 40,000 draws know a sigma to 0.35 %; four times that.
+    # The sigma of 40,000 draws has a standard deviation of 0.35 %; four times that.
     np.testing.assert_allclose(ypr_sigmas(pose, root @ root.T), scatter, rtol=0.014)

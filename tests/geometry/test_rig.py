@@ -1,4 +1,4 @@
-"""The rig: names that must fit together, and the views that follow from them."""
+"""The rig: references between its parts, and the views that they define."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from geometry.rig import Beam, Spot
 from tests.geometry.scenes import camera_that_looks_at, paper_rig
 
 
-def test_a_beams_direction_is_made_one_long():
+def test_the_direction_of_a_beam_is_normalised():
     np.testing.assert_allclose(Beam("A", np.array([0.0, 3.0, 4.0]), np.zeros(3)).direction, [0, 0.6, 0.8], rtol=1e-15)
 
 
 @pytest.mark.parametrize("direction", [[0.0, 0, 0], [np.nan, 0, 1], [np.inf, 0, 0]])
-def test_a_beam_without_direction_is_refused_by_name(direction):
+def test_a_beam_without_direction_is_refused_with_its_name(direction):
     with pytest.raises(ValueError, match=r"beam 'A': the direction has no length"):
         Beam("A", np.array(direction), np.zeros(3))
 
 
-def test_a_camera_that_observes_no_screen_of_the_rig_is_refused_by_name():
+def test_a_camera_of_an_unknown_screen_is_refused_with_its_name():
     rig = paper_rig()
     stray = dataclasses.replace(rig.cameras["left"], screen="wall")
     with pytest.raises(ValueError, match=r"camera 'left' observes screen 'wall', which is not in the rig"):
@@ -35,7 +35,7 @@ def test_a_camera_that_observes_no_screen_of_the_rig_is_refused_by_name():
         (Spot("9", "Z", +1, "left"), r"spot '9' belongs to beam 'Z', which is not in the rig"),
     ],
 )
-def test_a_spot_of_unknown_parts_is_refused_by_name(spot, message):
+def test_a_spot_of_an_unknown_screen_or_beam_is_refused_with_its_name(spot, message):
     rig = paper_rig()
     with pytest.raises(ValueError, match=message):
         dataclasses.replace(rig, spots={**rig.spots, "9": spot})
@@ -47,7 +47,7 @@ def test_a_camera_views_the_spots_of_its_screen_and_no_others():
     ]  # fmt: skip
 
 
-def test_two_cameras_may_watch_one_screen():
+def test_two_cameras_may_observe_one_screen():
     rig = paper_rig()
     second = camera_that_looks_at("second", rig.screens["left"], np.array([0.5, 0.2, -3.0]), ())
     both = dataclasses.replace(rig, cameras={**rig.cameras, "second": second})

@@ -1,4 +1,4 @@
-"""Rays and bent screens: the same as the flat one without a bow, and as the forward model with one."""
+"""Intersections of rays with bent screens: equal to those with a plane if the bow is 0, and on the surface if not."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def test_a_flat_screen_is_a_plane():
     np.testing.assert_allclose(meet_surface(origin, rays, screen, (0.0, 0.0, 0.0)), expected, atol=1e-12)
 
 
-def test_the_ray_meets_the_bent_surface():
+def test_a_ray_aimed_at_a_point_of_a_bent_screen_hits_it():
     rng = np.random.default_rng(2)
     screen, bow = random_pose(rng), (0.02, -0.01, 0.015)
     on_screen = rng.uniform(-1.5, 1.5, (200, 2))

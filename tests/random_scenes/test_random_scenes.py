@@ -102,7 +102,7 @@ def test_the_first_frames_show_enough_spots_and_hide_none(scenes):
         assert scene.has_image[:10].all()
         assert min(len(np.unique(scene.spot_of[row])) for row in scene.shining[:10]) >= LEAST_SPOTS
         assert scene.prior is not None
-        assert scene.prior.holds(scene.poses[0])
+        assert scene.prior.contains(scene.poses[0])
 
 
 def test_the_draws_are_wide():
@@ -228,7 +228,7 @@ def test_a_written_run_folder_reads_back_as_the_scene(tmp_path: Path):
     inside = scene.in_view != OUTSIDE
     np.testing.assert_allclose(uv[inside], scene.uv_px[inside], rtol=0, atol=1e-8 * px)
     assert run.prior is not None
-    assert run.prior.holds(scene.poses[0])
+    assert run.prior.contains(scene.poses[0])
     truth = load_run_truth(run)
     assert truth is not None
     assert truth.spots is not None

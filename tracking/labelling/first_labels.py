@@ -18,9 +18,10 @@ import numpy as np
 from geometry.arrays import Array, Bools, Ints
 from geometry.forward_model import SpotModel
 from geometry.pose_prior import PosePrior
-from geometry.pose_solver.gauss_newton import SolveLimits, largest_chi2, whiten
+from geometry.pose_solver.gauss_newton import SolveLimits, whiten
 from geometry.pose_solver.robust_pose import fit_pose_robust
 from geometry.rig import Rig
+from geometry.uncertainty.chi_square import chi2_limit
 from geometry.uncertainty.rig_uncertainty import CalibrationSpread
 from tracking.detections import Detections
 from tracking.labelling.points import NO_POINT
@@ -133,7 +134,7 @@ def _without_odd_spots(
     covariances = covariances + (SMALL_MODEL_ERROR * parameters.model_sigma_px) ** 2 * np.eye(2)
     W = whiten(covariances)
     misfit = float(np.sum((W @ one.fit.residuals_px[..., None]) ** 2))
-    if one.fit.dof <= 2 or misfit <= largest_chi2(P_ODD, one.fit.dof):
+    if one.fit.dof <= 2 or misfit <= chi2_limit(P_ODD, one.fit.dof):
         return one
     limits = SolveLimits(p_false_alarm=P_ODD)
     start = one.fit.world_from_body

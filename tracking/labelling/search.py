@@ -295,7 +295,7 @@ def _completed(
             continue
         kept.append((pose, labels))
         fit = _consistent_fit(model, points, labels, pose, SHARES[: shares[k] + 1] * sigma_px, calibration)
-        if fit is None or not bool(prior.holds(fit.world_from_body)):
+        if fit is None or not bool(prior.contains(fit.world_from_body)):
             continue
         point_of = np.where(labels == NO_POINT, NO_POINT, points.row[np.maximum(labels, 0)])
         out.append(Labelling(fit, point_of, float(evidence), int(expected_of[k])))

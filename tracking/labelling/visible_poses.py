@@ -47,7 +47,7 @@ class VisiblePoses:
         views = np.array([[rng.choice(views_of[s]) for s in row] for row in spots])
         places = _at_random_pixels(rig, model, views, rng)
         poses = poses_from_three_spots(model.point[views], model.ray[views], places)
-        usable = np.isfinite(poses.translation[..., 0]) & everywhere.holds(poses)
+        usable = np.isfinite(poses.translation[..., 0]) & everywhere.contains(poses)
         source, _ = np.nonzero(usable)
         poses = poses[usable]
         pixels, J = model.project(poses)

@@ -26,7 +26,10 @@ def calibration_errors(
     calibration_cov = np.zeros((n, 2, 2))
     if rec.calibration is None:
         return calibration_cov, np.zeros((1, 6, 6))
-    pixel_cov = [rec.calibration.at(Pose(ref.R[k], ref.t[k])) if rec.measured[k] else None for k in range(frames)]
+    pixel_cov: list[Array | None] = [None] * frames
+    for block in np.array_split(np.flatnonzero(rec.measured), frames // 256 + 1):
+        for k, C in zip(block.tolist(), rec.calibration.at(Pose(ref.R[block], ref.t[block])), strict=True):
+            pixel_cov[k] = C
     J = project_all(rec.model.numbers, ref.R, ref.t)[1]
     gains = _gains(rec, detections, assigned, J, calibration_cov)
     total, count = np.zeros((n, 2, 2)), 0

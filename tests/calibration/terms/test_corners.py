@@ -1,4 +1,4 @@
-"""Corners of boards: the projection against OpenCV's, the derivatives against differences."""
+"""Corners of boards: the projection against OpenCV, the derivatives against finite differences."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ WIDE = np.array([400.0, 405, 330, 250, 0.02, -0.01, 0.003, 0.001, *[0.0] * 10])
 def scene(rng: np.random.Generator, radii: tuple[float, float] | None = None) -> tuple[CornerTerm, dict]:
     """Two cameras (one of them fisheye) that see two bent boards in three placements.
 
-    radii of the two boards' circles, m, 0 for corners: such boards are also stretched, and their points lie off.
+    radii of the circles of both boards, m, 0 for corners; with radii the boards also have stretch and errors of points.
     """
     x, y = np.meshgrid(np.arange(5) * 0.03, np.arange(4) * 0.03)
     grid = np.stack([x.ravel(), y.ravel(), np.zeros(20)], axis=1)
@@ -60,7 +60,7 @@ def scene(rng: np.random.Generator, radii: tuple[float, float] | None = None) ->
         ("radius", (0.006, 0.008)),
     ],
 )
-def test_derivatives_by_each_stack_are_those_of_the_residuals(name, radii):
+def test_derivatives_by_each_stack_equal_finite_differences(name, radii):
     term, values = scene(np.random.default_rng(1), radii)
     part = next(p for p in term.linearise(values).parts if p.stack == name)
     stack = values[name]
@@ -79,7 +79,7 @@ def test_derivatives_by_each_stack_are_those_of_the_residuals(name, radii):
 
 
 @pytest.mark.parametrize("camera", [0, 1])
-def test_corners_fall_where_opencv_puts_them(camera):
+def test_corners_project_to_the_pixels_of_opencv(camera):
     term, values = scene(np.random.default_rng(2))
     mine = (term.camera == camera) & (term.placement == 1)
     x, y = term.from_middle[mine].T
@@ -96,14 +96,14 @@ def test_corners_fall_where_opencv_puts_them(camera):
     np.testing.assert_allclose(term.project(values)[mine], expected.reshape(-1, 2), atol=1e-9)
 
 
-def test_a_residual_is_counted_in_its_own_corners_sigmas():
+def test_a_residual_is_divided_by_its_own_corners_sigma():
     term, values = scene(np.random.default_rng(3))
     away = (term.project(values) - term.pixels) / term.sigma_px[:, None]
     np.testing.assert_allclose(term.linearise(values).residuals, away, atol=1e-12)
 
 
-def test_a_circle_is_seen_at_the_centroid_of_its_image():
-    """Against the grey centroid of its fine outline, drawn by OpenCV's projection of 400 points."""
+def test_a_circle_is_predicted_at_the_centroid_of_its_image():
+    """Against the centroid of a polygon of 400 outline points projected by OpenCV."""
     term, values = scene(np.random.default_rng(4), (0.009, 0.012))
     values |= {"stretch": Vectors(np.zeros((2, 2))), "print": Vectors(np.zeros((20, 3)))}
     turn = np.linspace(0, 2 * np.pi, 400, endpoint=False)
@@ -126,5 +126,5 @@ def test_a_circle_is_seen_at_the_centroid_of_its_image():
     flat = {**values, "radius": Vectors(np.zeros((2, 1)))}
     centres = term.project(flat)[mine]
     found = term.project(values)[mine]
-    assert np.abs(found - centres).max() > 0.1  # px: what is left out if the circle is taken for a point
+    assert np.abs(found - centres).max() > 0.1  # px: the error if the circle is treated as a point
     np.testing.assert_allclose(found, expected, atol=3e-4)  # px

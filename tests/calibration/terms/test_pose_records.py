@@ -1,4 +1,4 @@
-"""Records of a stand's positions as a term."""
+"""Recorded poses of a stand as a term of an adjustment."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from geometry.arrays import numeric_jacobian
 from geometry.pose import Pose
 
 
-def test_its_jacobian_is_that_of_differences_also_far_from_the_record():
+def test_the_jacobian_of_a_record_equals_finite_differences_also_far_from_it():
     rng = np.random.default_rng(1)
     recorded = Pose.from_ypr(rng.normal(size=(3, 3)), rng.normal(size=(3, 3)))
     now = recorded.plus(rng.normal(0, 0.3, (3, 6)))
@@ -27,7 +27,7 @@ def test_its_jacobian_is_that_of_differences_also_far_from_the_record():
         np.testing.assert_allclose(J[k], numeric_jacobian(moved, np.zeros(6)), rtol=1e-5, atol=1e-4)
 
 
-def test_numbers_that_are_not_known_or_held_give_no_residual():
+def test_numbers_not_recorded_or_held_fixed_give_no_residual():
     recorded = Pose.from_ypr(np.zeros((1, 3)), np.zeros((1, 3)))
     sigmas = np.array([[0.1, np.inf, 0.0, 0.1, 0.1, 0.1]])
     line = RecordTerm("poses", np.array([0]), recorded, sigmas).linearise(

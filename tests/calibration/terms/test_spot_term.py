@@ -1,4 +1,4 @@
-"""Spots as measurements: predictions are those of the forward model, derivatives are differences."""
+"""Spots as measurements: predictions against the forward model, derivatives against finite differences."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ POSITIONS = 4
 
 
 def scene(seed: int, bent: bool = True) -> tuple[Rig, dict, SpotPixels]:
-    """A random rig with bent screens on a stand that is turned in world; each position sees all spots."""
+    """A random rig with bent screens, on a stand that is rotated in world, and its visible spots at four positions."""
     rng = np.random.default_rng(seed)
     rig = random_rig(rng)
     if bent:
@@ -37,13 +37,13 @@ def scene(seed: int, bent: bool = True) -> tuple[Rig, dict, SpotPixels]:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_spots_where_the_forward_model_puts_them_have_no_residual(seed):
+def test_spots_at_the_pixels_of_the_forward_model_have_no_residual(seed):
     rig, values, spots = scene(seed)
     assert len(spots) > 12
     np.testing.assert_allclose(SpotTerm(rig, spots).linearise(values).residuals, 0, atol=1e-9)
 
 
-def test_a_residual_is_predicted_minus_found_in_sigmas():
+def test_a_residual_is_predicted_minus_measured_in_sigmas():
     rig, values, spots = scene(1)
     shift = np.array([0.3, -0.2])
     off = SpotPixels(spots.position, spots.view, spots.pixels - shift, spots.covariance)
@@ -54,13 +54,13 @@ def test_a_residual_is_predicted_minus_found_in_sigmas():
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("stack", ["intrinsics", "cameras", "screens", "bow", "beams", "stand", "poses"])
-def test_derivatives_are_those_of_the_residuals(seed, stack):
+def test_derivatives_equal_finite_differences_of_the_residuals(seed, stack):
     rig, values, spots = scene(seed)
     term = SpotTerm(rig, spots)
     (part,) = [p for p in term.linearise(values).parts if p.stack == stack]
     it = values[stack]
     used = np.ones((len(it), it.dof), dtype=bool)
-    if stack == "intrinsics":  # a model of four numbers has no fifth
+    if stack == "intrinsics":  # a model of four coefficients has no fifth
         for i, c in enumerate(rig.cameras.values()):
             used[i, 4 + len(c.distortion) :] = False
 
@@ -75,7 +75,7 @@ def test_derivatives_are_those_of_the_residuals(seed, stack):
     np.testing.assert_allclose(got[:, :, used], expected, rtol=2e-5, atol=2e-5 * np.abs(expected).max())
 
 
-def test_a_rig_goes_into_stacks_and_back_to_the_last_bit():
+def test_conversion_of_a_rig_to_stacks_and_back_is_exact():
     rig, values, _ = scene(2)
     back = rig_of(rig, values)
     for name, c in rig.cameras.items():
@@ -88,7 +88,7 @@ def test_a_rig_goes_into_stacks_and_back_to_the_last_bit():
     np.testing.assert_allclose(back.beams["b1"].direction, rig.beams["b1"].direction, atol=1e-16)
 
 
-def test_moving_stacks_is_moving_the_named_numbers():
+def test_errors_of_stacks_equal_errors_of_the_named_numbers():
     rig, values, _ = scene(3)
     rng = np.random.default_rng(3)
     at = [(s, i) for s in ("beams", "screens", "intrinsics", "cameras", "bow") for i in range(len(values[s]))]
@@ -105,11 +105,11 @@ def test_moving_stacks_is_moving_the_named_numbers():
     poses = random_pose(rng, 0.1, 0.1)
     before = SpotModel.of(rig).project(poses)[0]
     moves = SpotModel.of(other).project(poses)[0] - before
-    assert np.nanmax(np.abs(moves)) > 1e-3  # px: it did move
+    assert np.nanmax(np.abs(moves)) > 1e-3  # px: the errors do have an effect
     np.testing.assert_allclose(SpotModel.of(one).project(poses)[0] - before, moves, atol=1e-6)
 
 
-def test_a_prior_from_a_covariance_weighs_errors_by_it_and_fixes_what_it_does_not_name():
+def test_a_prior_from_a_covariance_weights_errors_by_it_and_fixes_unnamed_numbers():
     rig, values, _ = scene(4)
     names = ("beams.b0.direction_x", "screens.left.x_m", "screens.left.z_m", "cameras.left.fx")
     root = np.random.default_rng(4).normal(size=(4, 4))
@@ -132,16 +132,16 @@ def test_a_prior_from_a_covariance_weighs_errors_by_it_and_fixes_what_it_does_no
     assert np.sum(r**2) == pytest.approx(delta @ np.linalg.solve(C[1:, 1:], delta), rel=1e-5)
 
 
-def test_a_beam_that_misses_gives_nan_and_so_ends_a_solve():
+def test_a_beam_that_misses_its_screen_gives_nan():
     rig, values, spots = scene(5)
     away = Pose.from_ypr(np.array([np.pi / 2, 0, 0]), np.zeros(3))
     turned = {**values, "stand": Poses.of([away @ values["stand"].pose[0]])}
     assert np.isnan(SpotTerm(rig, spots).linearise(turned).residuals).any()
 
 
-def test_a_covariance_of_less_than_full_rank_holds_what_it_says_cannot_vary():
+def test_a_singular_covariance_constrains_its_null_directions():
     rig, values, _ = scene(6)
-    together = np.array([1.0, 2.0])  # two numbers that err as one: y twice as much as x
+    together = np.array([1.0, 2.0])  # two fully correlated errors: y is twice x
     prior, _ = prior_of(
         rig, RigCovariance(("screens.left.x_m", "screens.left.y_m"), 1e-6 * np.outer(together, together))
     )

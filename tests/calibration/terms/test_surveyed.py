@@ -1,4 +1,4 @@
-"""Terms of surveyed points: residuals against a second way to the answer, derivatives against differences."""
+"""Terms of surveyed points: residuals against independent computations, derivatives against finite differences."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def terms(seed=0):
 
 @pytest.mark.parametrize("kind", ["point", "surface", "survey", "frame"])
 @pytest.mark.parametrize("seed", range(3))
-def test_derivatives_are_those_of_the_residuals(kind, seed):
+def test_derivatives_equal_finite_differences_of_the_residuals(kind, seed):
     values, term = scene(seed), terms(seed)[kind]
     line = term.linearise(values)
     assert line.parts
@@ -81,7 +81,7 @@ def test_derivatives_are_those_of_the_residuals(kind, seed):
             np.testing.assert_allclose(mine, expected, atol=2e-4 * scale if kind == "frame" else 1e-6 * scale)
 
 
-def test_a_points_residual_is_the_cameras_pixel_less_the_measured_one_in_sigmas():
+def test_the_residual_of_a_point_is_predicted_minus_measured_pixel_in_sigmas():
     values, term = scene(), terms()["point"]
     row = values["intrinsics"].array[1]
     matrix = np.array([[row[0], 0, row[2]], [0, row[1], row[3]], [0, 0, 1]])
@@ -98,7 +98,7 @@ def test_a_point_behind_the_camera_has_no_residual():
     assert np.isnan(line.residuals).all()
 
 
-def test_points_of_the_surface_have_no_height_whatever_the_bow():
+def test_points_on_a_bent_surface_have_no_height():
     values = scene()
     a, b, c = values["bow"].array[1]
     x, y = 0.7, -0.4
@@ -108,13 +108,13 @@ def test_points_of_the_surface_have_no_height_whatever_the_bow():
     np.testing.assert_allclose(line.residuals, 0, atol=1e-9)
 
 
-def test_whitening_makes_a_covariance_one():
+def test_whitening_turns_a_covariance_into_the_identity():
     C = correlated(np.random.default_rng(3), 4, 3)
     W = whitening(C)
     np.testing.assert_allclose(W @ C @ np.swapaxes(W, -1, -2), np.broadcast_to(np.eye(3), (4, 3, 3)), atol=1e-12)
 
 
-def test_the_frame_is_held_only_within_the_plane():
+def test_the_frame_is_constrained_only_within_the_plane():
     values = scene()
     chosen = values["screens"].pose
     term = FrameTerm(np.array([0, 1]), chosen)
@@ -125,7 +125,7 @@ def test_the_frame_is_held_only_within_the_plane():
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_derivatives_of_a_board_on_a_screen_are_those_of_its_residuals(seed):
+def test_derivatives_of_a_board_on_a_screen_equal_finite_differences(seed):
     rng = np.random.default_rng(seed)
     values = scene(seed)
     screens = values["screens"].pose
@@ -154,7 +154,7 @@ def test_derivatives_of_a_board_on_a_screen_are_those_of_its_residuals(seed):
             np.testing.assert_allclose(mine, expected, atol=1e-8, err_msg=part.stack)
 
 
-def test_a_board_laid_flat_on_a_screen_at_its_thickness_has_no_residual():
+def test_a_board_flat_on_a_screen_at_its_offset_has_no_residual():
     values = {**scene(), "bow": Vectors(np.zeros((2, 3)))}
     middle = np.array([0.15, 0.1, 0.0])
     screen_from_board = Pose(np.diag([1.0, -1, -1]), np.array([0.4, 0.2, 0.003]))

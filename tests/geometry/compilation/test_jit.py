@@ -1,4 +1,4 @@
-"""Machine code on disk: kept for the next process, never that of other sources, and never needed."""
+"""Machine code on disk: kept for the next process, never that of other sources, and never required."""
 
 from __future__ import annotations
 
@@ -8,21 +8,30 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from geometry import compiled_projection as forward
+from geometry import compiled_projection
 from geometry.compilation import compile_cache, jit
+from geometry.forward_model import SpotModel
+from geometry.pose import Pose
+from tests.geometry.scenes import paper_rig
+from tests.paths import ROOT
+from tests.test_architecture import imports, modules
 
-# A program of two floors. What the upper one compiles stands on the lower one's source.
+# A program of two packages. The compiled function of the upper one calls one of the lower one, which uses a constant of
+# a module without compiled functions.
+CONSTANTS = "FACTOR = 10\n"
 INNER = """
 from geometry.compilation.jit import compiled
+from .constants import FACTOR
 
 @compiled
 def grown(x, by):
-    return x + 10 * by
+    return x + FACTOR * by
 """
 OUTER = """
 from geometry.compilation.jit import compiled
@@ -35,7 +44,7 @@ def twice_grown(x):
         count = grown(count, 1)
     return x + count + grown(0, 0)
 """
-# What a process of it finds, as JSON.
+# One process of this program; it prints what it finds as JSON.
 FIND = """
 import json, logging, sys, tempfile
 if "nowhere" in sys.argv:
@@ -54,7 +63,7 @@ with event.install_listener("numba:compile", type("Count", (event.Listener,), {
     before = compiled.is_empty(here)
     value = outer.twice_grown(0.0)
 print(json.dumps({
-    "value": value, "cold": [before, compiled.is_empty(here)], "said": [r.getMessage() for r in lines],
+    "value": value, "cold": [before, compiled.is_empty(here)], "reports": [r.getMessage() for r in lines],
     "compiled": sorted(begun), "signatures": len(outer.grown.signatures), "folder": str(compiled.cache_folder(here)),
 }))
 """
@@ -62,13 +71,14 @@ print(json.dumps({
 
 @pytest.fixture(scope="module")
 def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The two floors in a folder, as yet never run."""
+    """The two packages in a folder, never run before."""
     folder = tmp_path_factory.mktemp("program")
     for floor in ("geometry", "geometry/compilation", "floor"):
         (folder / floor).mkdir()
         (folder / floor / "__init__.py").write_text("")
     for module in (jit, compile_cache):
         shutil.copy(str(module.__file__), folder / "geometry" / "compilation")
+    (folder / "geometry" / "constants.py").write_text(CONSTANTS)
     (folder / "geometry" / "inner.py").write_text(INNER)
     (folder / "floor" / "outer.py").write_text(OUTER)
     return folder
@@ -93,7 +103,7 @@ def found(process: subprocess.Popen[str]) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def first_two(program: Path) -> list[dict[str, Any]]:
-    """Two processes that begin at once, when nothing is compiled."""
+    """Two processes that start at the same time, when nothing is compiled."""
     return [found(process) for process in [started(program), started(program)]]
 
 
@@ -102,45 +112,118 @@ def test_two_processes_that_compile_at_once_do_not_disturb_each_other(first_two)
     assert "twice_grown" in first_two[0]["compiled"] + first_two[1]["compiled"]
 
 
-def test_who_waits_for_the_first_compiling_is_told_once(first_two):
-    told = [one["said"] for one in first_two if one["said"]]
-    assert 1 <= len(told) <= 2  # the later of the two may have found some code
-    for said in told:
-        assert said == ["compiling for this machine, once (about half a minute)"]
+def test_the_first_compilation_is_reported_once(first_two):
+    reports = [one["reports"] for one in first_two if one["reports"]]
+    assert 1 <= len(reports) <= 2  # the later of the two may have found some code
+    for report in reports:
+        assert report == ["compiling for this machine, once (about half a minute)"]
     assert [one["cold"][1] for one in first_two] == [False, False]
 
 
-def test_a_literal_is_a_number_like_any_other(first_two):
+def test_a_literal_argument_is_compiled_as_a_plain_number(first_two):
     compiling = [one for one in first_two if "grown" in one["compiled"]]
     assert [one["compiled"].count("grown") for one in compiling] == [1] * len(compiling)
     assert [one["signatures"] for one in compiling] == [1] * len(compiling)
 
 
-def test_the_next_process_compiles_nothing_and_code_of_an_edited_source_is_never_used(program, first_two):
+def test_the_next_process_compiles_nothing(program, first_two):
     later = found(started(program))
-    assert (later["value"], later["compiled"], later["said"]) == (20.0, [], [])
-    # numba's own cache looks at outer.py only, which stays as it is.
-    (program / "geometry" / "inner.py").write_text(INNER.replace("10", "100"))
-    edited = found(started(program))
-    assert (edited["value"], edited["cold"]) == (200.0, [True, False])
-    assert edited["folder"] != later["folder"]
+    assert (later["value"], later["compiled"], later["reports"]) == (20.0, [], [])
 
 
-def test_without_any_folder_to_write_it_works_and_says_that_it_compiles_each_time(program, tmp_path):
+@pytest.mark.parametrize("edited", ["geometry/inner.py", "geometry/constants.py"])
+def test_code_of_an_edited_source_is_never_run(program, first_two, tmp_path, edited):
+    """numba's own cache compares only outer.py, which stays as it is."""
+    copy = tmp_path / "program"
+    shutil.copytree(program, copy)
+    before = found(started(copy))
+    source = copy / edited
+    source.write_text(
+        source.read_text().replace("FACTOR * by", "10 * FACTOR * by").replace("FACTOR = 10", "FACTOR = 100")
+    )
+    after = found(started(copy))
+    assert (before["value"], after["value"], after["cold"]) == (20.0, 200.0, [True, False])
+    assert before["folder"] != after["folder"]
+
+
+@pytest.mark.parametrize("kept_bytes", [0, 20])
+@pytest.mark.parametrize("kind", ["*.nbi", "*.nbc"])
+def test_a_truncated_cache_file_is_discarded_and_compiled_again(program, first_two, tmp_path, kind, kept_bytes):
+    copy = tmp_path / "program"
+    shutil.copytree(program, copy)
+    files = sorted(Path(found(started(copy))["folder"]).rglob(kind))
+    assert files
+    for file in files:
+        file.write_bytes(file.read_bytes()[:kept_bytes])
+    again = found(started(copy))
+    assert (again["value"], "twice_grown" in again["compiled"]) == (20.0, True)
+    assert found(started(copy))["compiled"] == []
+
+
+def test_without_compilation_the_same_functions_run_as_plain_python():
+    script = """
+import numpy as np
+import lab.runs.process
+from geometry.compiled_linalg import solve
+from geometry.forward_model import SpotModel
+from geometry.pose import Pose
+from tests.geometry.scenes import paper_rig
+assert solve(np.diag([2.0, 4.0]), np.ones((2, 1)))[0].ravel().tolist() == [0.5, 0.25]
+print(SpotModel.of(paper_rig()).project(Pose.identity())[0].round(3).tolist())
+"""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "NUMBA_DISABLE_JIT": "1"}
+    done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (0, "")
+    expected = SpotModel.of(paper_rig()).project(Pose.identity())[0].round(3).tolist()
+    assert json.loads(done.stdout) == expected
+
+
+def test_the_sources_of_compiled_code_are_those_that_it_imports():
+    """The regular expressions find the same files as the syntax tree, in every module of the program."""
+    known = modules(ROOT)
+    for name, path in known.items():
+        expected = {known[n] for n in imports(name, path) if n in known}
+        assert expected <= compile_cache._imported(path), path
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "import a.b",
+        "import os, a.b as x",
+        "from a import b",
+        "from a import (\n    c,  # with a bracket :)\n    b as x,\n)",
+        "from a import c, \\\n    b",
+        "from . import b",
+        "from .b import something",
+        "from ..a.b import something",
+        "def f():\n    from a.b import something",
+    ],
+)
+def test_every_form_of_import_is_followed(tmp_path, text):
+    package = tmp_path / "a"
+    package.mkdir()
+    for file in ("__init__.py", "b.py"):
+        (package / file).write_text("")
+    (package / "source.py").write_text(text)
+    assert package / "b.py" in compile_cache._imported(package / "source.py")
+
+
+def test_without_a_writable_folder_it_compiles_in_every_process_and_reports_it(program, tmp_path):
     shutil.copytree(program, tmp_path / "program", ignore=shutil.ignore_patterns("__pycache__"))
     (tmp_path / "program" / "geometry" / "compilation" / "__pycache__").write_text(
-        "a file where a folder should be: not even root can"
+        "a file in place of the folder, so that even root cannot create it"
     )
     alone = found(started(tmp_path / "program", "nowhere", XDG_CACHE_HOME="/dev/null/nowhere"))
     assert alone["folder"] == "None"
-    assert alone["value"] in (20.0, 200.0)
+    assert alone["value"] == 20.0
     assert alone["cold"] == [True, True]
-    assert len(alone["said"]) == 1
-    assert "each time" in alone["said"][0]
+    assert len(alone["reports"]) == 1
+    assert "each time" in alone["reports"][0]
 
 
-def test_of_old_code_the_last_used_is_left(tmp_path):
-    for age in range(compile_cache.MOST_FOLDERS + 3):
+def test_only_the_cache_folders_used_last_are_kept(tmp_path):
+    for age in range(compile_cache.MAX_FOLDERS + 3):
         folder = tmp_path / f"beampose-compiled-{age:02d}"
         folder.mkdir()
         (folder / "code.nbi").write_text("")
@@ -148,15 +231,57 @@ def test_of_old_code_the_last_used_is_left(tmp_path):
     (tmp_path / "another").mkdir()
     compile_cache._remove_old(tmp_path)
     kept = sorted(p.name for p in tmp_path.iterdir())
-    assert kept == ["another", *(f"beampose-compiled-{age:02d}" for age in range(compile_cache.MOST_FOLDERS))]
+    assert kept == ["another", *(f"beampose-compiled-{age:02d}" for age in range(compile_cache.MAX_FOLDERS))]
 
 
-@pytest.mark.skipif(not hasattr(os, "getuid"), reason="this system's files have no owners")
-def test_code_that_somebody_else_has_laid_there_is_not_run(monkeypatch, tmp_path):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    package = Path(str(forward.__file__)).parent
-    look = compile_cache._writable_folder.__wrapped__  # what is found once is remembered
-    assert look(compile_cache._sources(package)) is not None
+owners = pytest.mark.skipif(not hasattr(os, "getuid"), reason="files of this system have no owners")
+
+
+@pytest.fixture
+def private_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[[], Path | None]:
+    """Looks for the cache folder of geometry/, where only tmp_path can be used."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "cache"))
+    monkeypatch.setattr(compile_cache, "__file__", "/dev/null/compile_cache.py")
+    sources = compile_cache._sources(Path(str(compiled_projection.__file__)).parent)
+    return lambda: compile_cache._private_folder.__wrapped__(sources)  # without its memory of earlier results
+
+
+@owners
+def test_code_of_another_user_is_not_run(private_folder, monkeypatch):
+    assert private_folder() is not None
     monkeypatch.setattr(os, "getuid", lambda: 12345)
-    assert look(compile_cache._sources(package)) is None
+    assert private_folder() is None
+
+
+@owners
+@pytest.mark.parametrize("mode", [0o720, 0o702, 0o777])
+def test_a_folder_that_others_may_write_is_refused(private_folder, mode):
+    folder = private_folder()
+    folder.chmod(mode)
+    assert private_folder() is None
+    folder.chmod(0o755)
+    assert private_folder() == folder
+
+
+@owners
+def test_a_folder_that_is_a_symbolic_link_is_refused(private_folder, tmp_path):
+    folder = private_folder()
+    folder.rename(tmp_path / "elsewhere")
+    folder.symlink_to(tmp_path / "elsewhere")
+    assert private_folder() is None
+
+
+@owners
+def test_a_folder_is_reached_only_through_links_of_this_user_or_of_root(private_folder, tmp_path, monkeypatch):
+    (tmp_path / "real").mkdir()
+    (tmp_path / "cache").symlink_to(tmp_path / "real")
+    assert private_folder() is not None
+    status = Path.lstat
+
+    def of_another_user(path: Path) -> os.stat_result:
+        got = status(path)
+        return os.stat_result((*got[:4], 12345, *got[5:])) if path == tmp_path / "cache" else got
+
+    monkeypatch.setattr(Path, "lstat", of_another_user)
+    assert private_folder() is None

@@ -1,4 +1,4 @@
-"""A closed form for one whole beam and one more spot: a second way to some answers of
+"""A closed form for one whole beam and one more spot: an independent solution for some cases of
 geometry/pose_solver/three_spots.py.
 """
 
@@ -53,7 +53,7 @@ def poses_from_line_and_spot(
             np.broadcast_to(radial_world[..., None, :], radial_body.shape),
         )
         R = world_axes @ np.swapaxes(body_axes, -1, -2)
-        # The beam's point sits on the line, `height_world - height_body` along it.
+        # The beam's point lies on the line, `height_world - height_body` along it.
         anchor = line_point[..., None, :] + (height_world[..., None] - height_body)[..., None] * e[..., None, :]
         return Pose(R, anchor - (R @ beam_point[..., None])[..., 0])
 

@@ -1,4 +1,4 @@
-"""Other poses with the same spots: exact, complete with three spots, and hardly any with four."""
+"""Other poses with the same spots: exact and complete for three spots, none for four spots of skew beams."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.geometry.scenes import random_pose
 
 
 def seen_poses(model: SpotModel, rows: list[int], count: int, rng: np.random.Generator) -> list[Pose]:
-    """Poses in which the views are projected."""
+    """Random poses at which all these views have a projection."""
     out: list[Pose] = []
     while len(out) < count:
         pose = random_pose(rng, 0.4, 0.3)
@@ -27,7 +27,7 @@ def seen_poses(model: SpotModel, rows: list[int], count: int, rng: np.random.Gen
 THREE = [0, 1, 2]  # spots 1, 2, 3 of four skew beams, all on the left screen
 
 
-def test_an_alternative_puts_the_same_spots_on_the_same_pixels_and_is_another_pose():
+def test_an_alternative_pose_puts_the_same_spots_on_the_same_pixels():
     model, rng = SpotModel.of(RIGS["four-skew-beams"]()), np.random.default_rng(1)
     counts = []
     for pose in seen_poses(model, THREE, 30, rng):
@@ -39,7 +39,7 @@ def test_an_alternative_puts_the_same_spots_on_the_same_pixels_and_is_another_po
     assert np.mean(counts) > 1
 
 
-def test_no_fit_from_any_start_finds_a_further_pose():
+def test_fits_from_random_starts_find_no_further_pose():
     model, rng = SpotModel.of(RIGS["four-skew-beams"]()), np.random.default_rng(2)
     found = 0
     for pose in seen_poses(model, THREE, 4, rng):
@@ -62,8 +62,7 @@ def test_a_fourth_spot_of_skew_beams_leaves_no_other_pose():
         assert len(alternatives(model, pose, [0, 1, 2, 5]).translation) == 0
 
 
-def test_two_cameras_on_one_screen_are_no_further_spots():
-    """Views of the same three spots in a second camera exclude nothing and count for nothing."""
+def test_views_of_the_same_spots_by_a_second_camera_exclude_no_pose():
     rig = RIGS["two-cameras-per-screen"]()
     model, rng = SpotModel.of(rig), np.random.default_rng(4)
     first = {v: i for i, v in enumerate(model.views)}
@@ -77,13 +76,13 @@ def test_two_cameras_on_one_screen_are_no_further_spots():
 
 
 @pytest.mark.parametrize("rows", [[], [0], [0, 4], [0, 1, 2]])
-def test_spots_that_fix_no_pose_have_no_list_of_others(rows):
-    """None, one, two, and three on a line: a continuum."""
+def test_spots_that_do_not_determine_a_pose_have_no_alternatives(rows):
+    """None, one, two, or three spots on a line allow a continuum of poses."""
     model = SpotModel.of(RIGS["fan"]())
     assert len(alternatives(model, Pose.identity(), rows).translation) == 0
 
 
-def test_a_fan_of_equal_angles_and_two_beams_coincide_with_themselves_after_half_a_turn():
+def test_a_fan_of_equal_angles_and_two_beams_are_symmetric_under_half_a_turn():
     for name, expected in (("fan", 1), ("two-cameras-per-screen", 1), ("unequal-fan", 0), ("four-skew-beams", 0)):
         assert len(symmetries(SpotModel.of(RIGS[name]()))) == expected
     (turn,) = symmetries(SpotModel.of(RIGS["fan"]()))
@@ -91,7 +90,7 @@ def test_a_fan_of_equal_angles_and_two_beams_coincide_with_themselves_after_half
     np.testing.assert_allclose(turn.translation, 0.0, atol=1e-12)
 
 
-def test_a_symmetric_rig_shows_the_same_points_after_its_turn():
+def test_a_symmetric_vehicle_shows_the_same_points_after_its_symmetry():
     model, rng = SpotModel.of(RIGS["fan"]()), np.random.default_rng(5)
     (turn,) = symmetries(model)
     for _ in range(5):

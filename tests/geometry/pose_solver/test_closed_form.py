@@ -1,4 +1,4 @@
-"""Poses in closed form: exact on exact lines and spots, whatever the beams; nothing where nothing fits."""
+"""The pose in closed form from lines: exact for exact lines of any beams; None where the lines determine no pose."""
 
 from __future__ import annotations
 
@@ -21,24 +21,24 @@ def far_apart(pose: Pose, other: Pose) -> float:
 
 
 def lines_of(pose: Pose, points: np.ndarray, directions: np.ndarray, rng: np.random.Generator):
-    """Beams as lines in world: any point on each, and direction vectors of any length."""
+    """The beams as lines in world: any point of each, and direction vectors of any length."""
     slid = points + rng.uniform(-3, 3, (len(points), 1)) * directions
     return pose.apply(slid), pose.turn(directions) * rng.uniform(0.5, 4, (len(points), 1))
 
 
 @pytest.mark.parametrize("beams", [2, 3, 5])
-def test_beams_that_meet_nowhere_give_back_the_pose_that_drew_them(beams):
+def test_beams_that_do_not_meet_give_the_true_pose(beams):
     rng = np.random.default_rng(beams)
     for _ in range(100):
         directions, points = rng.normal(size=(beams, 3)), rng.normal(0, 0.3, (beams, 3))
         pose = random_pose(rng, 2.0)
         found = pose_from_lines(points, directions, *lines_of(pose, points, directions, rng))
         assert found is not None
-        assert far_apart(found, pose) < 1e-7  # two random beams may be a hundredth of a radian apart
+        assert far_apart(found, pose) < 1e-7  # the angle between two random beams may be a hundredth of a radian
 
 
-def test_the_rotation_is_proper_where_the_lines_are_nearly_mirrored():
-    """Directions of a plane fit a reflection as well; Kabsch's sign keeps it a rotation."""
+def test_the_rotation_is_proper_for_nearly_mirrored_lines():
+    """Coplanar directions also fit a reflection; Kabsch's determinant makes it a rotation."""
     rng = np.random.default_rng(1)
     angles = np.deg2rad([-20.0, 0.0, 20.0])
     directions = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(3)])
@@ -51,7 +51,7 @@ def test_the_rotation_is_proper_where_the_lines_are_nearly_mirrored():
         assert far_apart(found, pose) < 0.03
 
 
-def test_the_origin_is_where_the_sum_of_squared_distances_is_least():
+def test_the_origin_minimises_the_sum_of_squared_distances():
     rng = np.random.default_rng(2)
     directions = normalised(rng.normal(size=(4, 3)))
     points = rng.normal(size=(4, 3))
@@ -67,12 +67,12 @@ def test_the_origin_is_where_the_sum_of_squared_distances_is_least():
         assert cost(found.translation + rng.normal(0, 0.01, 3)) > here
 
 
-def test_parallel_beams_and_a_single_beam_are_no_pose():
+def test_parallel_beams_and_a_single_beam_give_no_pose():
     x = np.array([[1.0, 0, 0]])
     along, points = np.repeat(x, 3, axis=0), np.array([[0.0, 0, 0], [0, 1, 0], [0, 0, 1]])
     assert pose_from_lines(points, along, points, along) is None
     assert pose_from_lines(points, along * [[1], [-1], [1]], points, along * [[1], [-1], [1]]) is None
     assert pose_from_lines(points[:1], x, points[:1], x) is None
-    # Noise makes the lines meet somewhere; the beams still say nothing of the turn about them.
+    # With noise the lines do meet somewhere, but the turn about parallel beams is still not determined.
     noisy = along + np.array([[0, 1e-3, 0], [0, 0, 1e-3], [0, 0, 0]])
     assert pose_from_lines(points, along, points, noisy) is None

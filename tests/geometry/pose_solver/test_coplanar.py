@@ -1,4 +1,4 @@
-"""The paper's closed forms for a spot out of view: against the rigid body, plain trigonometry, and in their limits."""
+"""The paper's closed forms for a spot out of view: against the rigid body, trigonometry, and limiting cases."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ ORIGIN_SCREEN = Pose.identity()  # the plane z = 0
 
 
 def tilted_fan(rng: np.random.Generator) -> tuple[Rig, float, float]:
-    """Three coplanar beams through one point at unequal angles, whose plane lies anyhow in body; tilted screens.
+    """Three coplanar beams through one point at unequal angles, in a random plane of body; tilted screens.
 
     Also alpha, from A to B, and beta, from B to C, rad.
     """
@@ -44,7 +44,7 @@ def tilted_fan(rng: np.random.Generator) -> tuple[Rig, float, float]:
 
 
 def seen_world_points(rig: Rig, model: SpotModel, pixels: np.ndarray) -> np.ndarray:
-    """What the cameras make of pixels (..., n, 2): points (..., n, 3), m, on the screens."""
+    """Points (..., n, 3), m, on the screens, from pixels (..., n, 2)."""
     out = []
     for i, (name, _) in enumerate(model.views):
         camera = rig.cameras[name]
@@ -53,8 +53,8 @@ def seen_world_points(rig: Rig, model: SpotModel, pixels: np.ndarray) -> np.ndar
     return np.stack(out, axis=-2)
 
 
-def test_quadratic_direct_turn_and_rigid_body_put_a_spot_at_the_same_pixel():
-    """2000 poses within 1 m and 30 deg in 200 set-ups: three ways to C, two to A, and one to the hidden middle B."""
+def test_quadratic_rotation_and_rigid_body_give_the_same_pixel():
+    """2000 poses within 1 m and 30 deg of 200 rigs: three solutions for C, two for A, one for the middle spot B."""
     rng = np.random.default_rng(1)
     off_px, compared, outside = [], 0, 0
     for _ in range(200):
@@ -79,12 +79,12 @@ def test_quadratic_direct_turn_and_rigid_body_put_a_spot_at_the_same_pixel():
         compared += len(rigid)
         outside += np.count_nonzero(~camera.sees(rigid[:, row["3"]]))
     assert compared > 1500
-    assert outside > 100  # it is about spots outside the picture
-    assert np.max(off_px) < EXACT_PX  # a nan fails as well
+    assert outside > 100  # the spots of interest lie outside the picture
+    assert np.max(off_px) < EXACT_PX  # fails for nan too
 
 
 def geometries(rng: np.random.Generator, count: int, low_deg: float, high_deg: float):
-    """O (n, 3), directions a, b, c (n, 3) in one plane with angles alpha, beta (n,); A and B on z = 0, C perhaps not.
+    """O (n, 3), directions a, b, c (n, 3) in one plane with angles alpha, beta (n,); A and B on z = 0, C possibly not.
 
     Only geometries where A's and B's beams reach the plane; c's angle to the plane is at least 1e-4 rad.
     """
@@ -104,7 +104,7 @@ def geometries(rng: np.random.Generator, count: int, low_deg: float, high_deg: f
 
 
 def on_floor(O: np.ndarray, ray: np.ndarray) -> np.ndarray:
-    """Where rays from above meet z = 0."""
+    """Intersections of rays from above with z = 0."""
     return O - O[..., 2:] / ray[..., 2:] * ray
 
 
@@ -125,15 +125,15 @@ def test_the_wrong_root_is_never_taken_and_nan_means_that_the_beam_misses(low_de
 
 
 @pytest.mark.parametrize(("low_deg", "high_deg"), [(2, 30), (30, 89)])
-def test_the_direct_turn_misses_exactly_where_the_beam_does(low_deg, high_deg):
+def test_the_rotation_form_gives_nan_exactly_where_the_beam_misses(low_deg, high_deg):
     O, a, b, c, alpha, beta = geometries(np.random.default_rng(3), 500, low_deg, high_deg)
     A, B = on_floor(O, a), on_floor(O, b)
     found = np.array([rotated_spot(O[i], A[i], B[i], alpha[i], beta[i], ORIGIN_SCREEN) for i in range(len(O))])
     np.testing.assert_array_equal(np.isfinite(found).all(axis=1), c[:, 2] < 0)
 
 
-def test_the_papers_rule_alone_would_take_a_spot_that_is_not_there():
-    """Nearest angle AOC to 2 alpha, without a tolerance and k > 0: where C's beam misses it still gives a point."""
+def test_the_papers_rule_alone_would_accept_a_spot_that_does_not_exist():
+    """The angle AOC nearest to 2 alpha, without tolerance and k > 0, gives a point even where C's beam misses."""
     O, a, b, c, alpha, _ = geometries(np.random.default_rng(4), 2000, 60, 89)
     A, B = on_floor(O, a), on_floor(O, b)
     # Equal angles, as in the paper: c at alpha beyond b.
@@ -142,11 +142,11 @@ def test_the_papers_rule_alone_would_take_a_spot_that_is_not_there():
     assert misses.mean() > 0.3
     for i in np.flatnonzero(misses)[:300]:
         k = np.roots(quadratic_coefficients(O[i], A[i], B[i], alpha[i])).real
-        assert np.isfinite(k).all()  # the quadratic has its two roots, and neither is C
+        assert np.isfinite(k).all()  # the quadratic has two roots, neither of which is C
         assert np.isnan(outer_spot(O[i], A[i], B[i], alpha[i], alpha[i])).all()
 
 
-def test_the_discriminant_is_what_the_corrected_paper_says():
+def test_the_discriminant_equals_that_of_the_corrected_formula():
     """b^2 - 4ac = 4 l^2 sin^2 cos^2 |OB x AB|^2: never negative, zero only for O, A, B on a line or a right angle."""
     rng = np.random.default_rng(5)
     O, A, B = rng.normal(size=(3, 500, 3))
@@ -159,7 +159,7 @@ def test_the_discriminant_is_what_the_corrected_paper_says():
                                    rtol=1e-9, atol=1e-12 * np.max(b * b))  # fmt: skip
 
 
-def test_with_equal_angles_one_root_is_a_itself():
+def test_with_equal_angles_one_root_gives_spot_a():
     O, a, b, _, alpha, _ = geometries(np.random.default_rng(6), 200, 5, 80)
     A, B = on_floor(O, a), on_floor(O, b)
     qa, qb, qc = (np.array(q) for q in zip(*(quadratic_coefficients(*g) for g in zip(O, A, B, alpha, strict=True)),
@@ -169,7 +169,7 @@ def test_with_equal_angles_one_root_is_a_itself():
 
 
 def test_a_beam_parallel_to_the_screen_gives_no_spot():
-    """OC parallel to AB: a = 0, and the root has run away to infinity."""
+    """OC parallel to AB: a = 0, and the root is infinite."""
     alpha, beta = np.deg2rad([25.0, 35.0])
     O = np.array([0.0, 0.0, 1.0])
     B = np.array([1 / np.tan(beta), 0.0, 0.0])
@@ -178,7 +178,7 @@ def test_a_beam_parallel_to_the_screen_gives_no_spot():
     assert abs(a) < 1e-14 * (abs(b) + abs(c))
     C = outer_spot(O, A, B, alpha, beta)
     assert np.isnan(C).all() or np.linalg.norm(C - O) > 1e10
-    # A thousandth of a radian to either side: far away, or nothing.
+    # A thousandth of a radian off, to either side, the spot is far away or absent.
     for tip in (-1e-3, 1e-3):
         B = np.array([1 / np.tan(beta + tip), 0.0, 0.0])
         A = np.array([1 / np.tan(alpha + beta + tip), 0.0, 0.0])
@@ -189,8 +189,8 @@ def test_a_beam_parallel_to_the_screen_gives_no_spot():
             assert np.isnan(C).all()
 
 
-def test_the_spot_is_found_when_it_is_the_wrong_root_that_ran_away():
-    """The mirrored beam, at -beta from B, is parallel to the screen: a = 0, and C is the only root left."""
+def test_the_spot_is_found_if_the_wrong_root_is_infinite():
+    """The mirrored beam, at -beta from B, is parallel to the screen: a = 0, and C is the only finite root."""
     alpha, beta = np.deg2rad([20.0, 60.0])
     O = np.array([0.0, 0.0, 1.0])
 
@@ -204,7 +204,7 @@ def test_the_spot_is_found_when_it_is_the_wrong_root_that_ran_away():
     np.testing.assert_allclose(outer_spot(O, A, B, alpha, beta), floor_at(beta), atol=1e-12)
 
 
-def test_many_geometries_in_one_call_are_each_by_itself():
+def test_a_stack_of_geometries_gives_the_same_as_each_alone():
     O, a, b, _, _, _ = geometries(np.random.default_rng(7), 50, 10, 11)
     A, B = on_floor(O, a), on_floor(O, b)
     alpha = beta = np.deg2rad(10.5)
@@ -214,7 +214,7 @@ def test_many_geometries_in_one_call_are_each_by_itself():
 
 
 def test_an_angle_that_contradicts_the_calibration_gives_no_spot():
-    """Seen under 15 deg, calibrated as 20: these are not the beams A and B, or not this O."""
+    """The measured angle is 15 deg, the calibrated one 20: these are not the beams A and B, or O is wrong."""
     O = np.array([0.0, 0.0, 1.0])
     A, B = (np.array([np.tan(np.deg2rad(x)), 0.0, 0.0]) for x in (-15.0, 0.0))
     assert np.isfinite(outer_spot(O, A, B, np.deg2rad(15.0), np.deg2rad(20.0))).all()
@@ -247,7 +247,7 @@ def test_the_misprint_in_equation_12_misses_by_hundreds_of_pixels():
     assert np.nanmedian(literal) > 200.0
 
 
-def test_beams_that_pass_each_other_meet_half_way():
+def test_the_meeting_point_of_skew_beams_is_the_middle_of_their_common_perpendicular():
     up, gap = np.array([0.0, 0, 1]), 0.02
     a, along_a = np.array([1.0, 0.0, 0.0]), np.array([2.0, 0, 0])
     b, along_b = np.array([0.0, -3.0, gap]), np.array([0.0, 1, 0])
@@ -255,7 +255,7 @@ def test_beams_that_pass_each_other_meet_half_way():
 
 
 def test_an_error_of_the_calibrated_alpha_does_not_move_the_spot():
-    """Eq. (14) measures from B: alpha only chooses the root. So does the direct turn."""
+    """In eq. (14) the angle beta is measured from B, and alpha only selects the root; the rotation form is similar."""
     O = np.array([0.3, -0.2, 2.0])
     A, B = np.array([-0.9, 0.1, 0.0]), np.array([0.1, 0.2, 0.0])
     true_alpha = np.arccos((A - O) @ (B - O) / np.linalg.norm(A - O) / np.linalg.norm(B - O))

@@ -1,4 +1,4 @@
-"""Three rays through three points: all poses, mirror solutions among them, and nothing where nothing fits."""
+"""Three rays through three points: all poses, including mirror solutions, and none where no pose exists."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ KINDS = ("any", "one point", "fan", "beam and spot", "crossed ends", "nearly one
 
 
 def problems(kind: str, rng: np.random.Generator, count: int = MANY) -> tuple[Array, Array, Array, Pose]:
-    """Rays in body, the points that they light, and the poses that did it."""
+    """Rays in body, the points that they light, and the true poses."""
     points, rays = rng.normal(0, 0.3, (count, 3, 3)), normalised(rng.normal(size=(count, 3, 3)))
     if kind == "one point":
         points[:] = points[:, :1]
@@ -42,7 +42,7 @@ def problems(kind: str, rng: np.random.Generator, count: int = MANY) -> tuple[Ar
 
 
 def gaps(found: Pose, pose: Pose) -> Array:
-    """How far each solution (m, 8) is from the pose (m), m and rad; inf where there is none."""
+    """Distance of each solution (m, 8) from the pose (m), m and rad; inf where there is no solution."""
     away = np.linalg.norm(found.translation - pose.translation[:, None], axis=-1)
     away = away + np.linalg.norm(found.rotation - pose.rotation[:, None], axis=(-1, -2))
     return np.where(np.isnan(away), np.inf, away)
@@ -72,7 +72,7 @@ def test_every_solution_is_a_rotation_that_puts_the_points_ahead_on_their_rays(k
 
 
 def lengths_by_descent(points: Array, rays: Array, world: Array, rng: np.random.Generator) -> list[Array]:
-    """All positive lengths that Gauss-Newton finds from many starts: the slow way to the same answer."""
+    """All positive lengths that Gauss-Newton finds from many starts: a slow independent solution."""
     pairs = ((0, 1), (0, 2), (1, 2))
     aim = np.array([np.sum((world[i] - world[j]) ** 2) for i, j in pairs])
     lengths = rng.uniform(0, 8, (400, 3))
@@ -105,7 +105,7 @@ def test_a_search_from_many_starts_finds_no_further_solution(kind):
         slow = lengths_by_descent(points[k], rays[k], world[k], rng)
         assert np.isfinite(found.translation[k, :, 0]).sum() >= len(slow)
         several += len(slow) > 1
-    assert several >= 3  # mirror solutions are there to be found
+    assert several >= 3  # there are mirror solutions
 
 
 @pytest.mark.parametrize(("angle_deg", "count"), [(30.0, 4), (50.0, 4), (70.0, 1)])
@@ -161,8 +161,8 @@ def test_three_points_on_a_line_and_three_parallel_rays_give_no_pose():
     assert np.isnan(poses_from_three_spots(points, np.array([x, -x, x]), points + np.array([x, -x, x])).rotation).all()
 
 
-def test_points_that_no_ray_reaches_give_no_pose():
-    """Rays 1 rad apart at most, from one point: no triangle with a side on either side of it."""
+def test_points_out_of_reach_of_the_rays_give_no_pose():
+    """Rays from one point, at most 1 rad apart, do not reach the corners of a triangle that contains the point."""
     rng = np.random.default_rng(5)
     points, rays, world, _ = problems("any", rng, 50)
     assert np.isnan(poses_from_three_spots(points, rays, np.repeat(world[:, :1], 3, axis=1)).rotation).all()
@@ -170,7 +170,7 @@ def test_points_that_no_ray_reaches_give_no_pose():
     assert np.isnan(poses_from_three_spots(points[0], rays[0], nowhere).rotation).all()
 
 
-def test_many_problems_in_one_call_are_each_by_itself():
+def test_a_stack_of_problems_gives_the_same_as_each_alone():
     points, rays, world, _ = problems("any", np.random.default_rng(6), 12)
     many = poses_from_three_spots(points[0], rays[0], world.reshape(3, 4, 3, 3))
     assert many.translation.shape == (3, 4, 8, 3)

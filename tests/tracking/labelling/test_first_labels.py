@@ -308,16 +308,16 @@ def test_the_prior_is_a_cube_and_a_cone():
         rotation_vector = np.deg2rad(angle_deg) * np.array([0.6, 0, 0.8])
         return prior.centre.plus(np.concatenate([shift, rotation_vector]))
 
-    assert prior.holds(at([0.5, -0.5, 0.5], 20))
-    assert not prior.holds(at([0.53, 0, 0], 0))
-    assert not prior.holds(at([0, 0, -0.53], 0))
-    assert not prior.holds(at([0, 0, 0], 21))
+    assert prior.contains(at([0.5, -0.5, 0.5], 20))
+    assert not prior.contains(at([0.53, 0, 0], 0))
+    assert not prior.contains(at([0, 0, -0.53], 0))
+    assert not prior.contains(at([0, 0, 0], 21))
     everywhere = PosePrior(prior.centre, 0.5, np.pi)
-    assert everywhere.holds(at([0, 0, 0], 180))
+    assert everywhere.contains(at([0, 0, 0], 180))
     invalid = Pose(np.full((3, 3), np.nan), np.zeros(3))
-    assert not prior.holds(invalid)
+    assert not prior.contains(invalid)
     both = Pose(np.stack([prior.centre.rotation, invalid.rotation]), np.stack([prior.centre.translation] * 2))
-    np.testing.assert_array_equal(prior.holds(both), [True, False])
+    np.testing.assert_array_equal(prior.contains(both), [True, False])
 
 
 def test_a_camera_without_a_picture_is_no_evidence_against_its_spots():

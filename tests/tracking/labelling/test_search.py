@@ -287,7 +287,7 @@ def test_the_widest_prior_contains_all_poses_in_the_lab(name):
     rig = RIGS[name]()
     everywhere, rng = PosePrior.everywhere(rig), np.random.default_rng(13)
     poses = Pose(rotations.exp(rng.normal(0, 2, (500, 3))), rng.uniform([-2.5, -2, -2], [2.5, 2, 2], (500, 3)))
-    assert everywhere.holds(poses).all()
+    assert everywhere.contains(poses).all()
 
 
 def test_the_volume_of_the_visible_poses_agrees_with_a_count():
