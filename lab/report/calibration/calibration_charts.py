@@ -144,7 +144,7 @@ def drift_chart(
     if expires is not None and expires.toordinal() <= last:
         x = float(p.X(np.array(float(expires.toordinal()))))
         out.append(f'<path d="M{x:.1f} {over:.1f}v{high:.1f}" stroke="{VERMILLION}" stroke-width="1.3"/>')
-        out.append(text(x - 4, over + 12, "expires", "end"))
+        out.append(text(x - 4, over + high - 6, "expires", "end"))  # at the bottom, away from the limits
     at = left
     for i, (name, line) in enumerate(lines.items()):
         out += _drift_line(p, name, line, SERIES[i % len(SERIES)], at)
