@@ -1,1 +1,1 @@
-"""The lab's files and jobs: runs in, tables and reports out."""
+"""The files, commands and reports of the program: from a run folder to tables and reports."""

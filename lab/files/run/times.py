@@ -44,9 +44,9 @@ class Times:
 def load_times(path: Path, frame_rate_hz: float) -> Times:
     """The timestamps file of a run. Raises InputError in one line."""
     table = read_table(path, columns.TIMES)
+    table.refuse_long_lines()
     if not len(table):
         raise InputError(f"{path}: expected a row per frame, got none")
-    table.refuse_long_lines()
     frames = table.whole("frame")
     times_s = table.finite("t_s", "seconds")
     for i in np.flatnonzero(np.diff(frames) <= 0)[:1] + 1:

@@ -83,9 +83,9 @@ class Table:
 
     def require_rows(self, expected: Sequence[str]) -> None:
         """Raises InputError where the table has no rows, or lines with too many fields. expected: shown columns."""
+        self.refuse_long_lines()
         if not len(self):
             raise InputError(f"{self.path}: expected rows {','.join(expected)} below the header, got none")
-        self.refuse_long_lines()
 
     def refuse_long_lines(self) -> None:
         """Raises InputError where lines have more fields than the header."""

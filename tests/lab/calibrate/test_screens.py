@@ -296,7 +296,7 @@ def test_a_scan_in_another_unit_is_reported(tmp_path):
     ("name", "text", "words"),
     [
         ("scan.ply", "", "got an empty file"),
-        ("scan.docx", "x", "expected a cloud of points"),
+        ("scan.docx", "x", "expected a point cloud"),
         ("scan.xyz", "nothing here\n", "expected lines `x y z`, found none"),
         ("scan.xyz", "1 2 3\n4 5\n", "expected lines `x y z`"),
         ("scan.xyz", "nan nan nan\n", "none with three finite numbers"),

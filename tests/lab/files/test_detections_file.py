@@ -268,9 +268,9 @@ def test_a_picture_without_a_usable_row_is_unreadable_not_empty(tmp_path):
     assert images[1] == Missing("unreadable: no row of it can be used")
     assert [len(images[k]) for k in (0, 2, 3, 4)] == [1, 1, 0, 1]
     assert "right: 1 frame unreadable: no row of it can be used (1)" in reader.notes
-    told = check(folder).lines
-    assert any("2 of 5 rows left out: a sigma is not above 0" in line for line in told)
-    assert any("right: 1 frame unreadable: no row of it can be used (1)" in line for line in told)
+    lines = check(folder).lines
+    assert any("2 of 5 rows left out: a sigma is not above 0" in line for line in lines)
+    assert any("right: 1 frame unreadable: no row of it can be used (1)" in line for line in lines)
 
 
 def test_points_far_outside_the_picture_are_left_out_and_a_table_of_them_is_refused(tmp_path):
@@ -278,8 +278,8 @@ def test_points_far_outside_the_picture_are_left_out_and_a_table_of_them_is_refu
     folder = points_for_right(tmp_path / "a", row(0, "right", 5, 6), row(1, "right", 7, 8), row(1, "right", 900, 8))
     reader = open_frames(load_run(folder))
     assert [len(s.images["right"]) for s in reader if s.frame < 2] == [1, 1]
-    told = "1 of 3 points more than 32 px outside its picture of 64x48 px (the first in frame 1, at 900, 8)"
-    assert any(n.endswith(told) for n in reader.notes)
+    text = "1 of 3 points more than 32 px outside its picture of 64x48 px (the first in frame 1, at 900, 8)"
+    assert any(n.endswith(text) for n in reader.notes)
     folder = points_for_right(tmp_path / "b", row(0, "right", 5, 600), row(1, "right", 7, 800))
     with pytest.raises(InputError, match=r"got 2 of 2 points more than 32 px outside .*; are u and v exchanged, or"):
         open_frames(load_run(folder))
