@@ -20,8 +20,8 @@ from scipy.linalg import block_diag
 
 from calibration.beams.beams import StandModel
 from calibration.rig.joint import Joint
-from calibration.rig.rig_steps import RigSteps, calibrate_in_steps
-from calibration.screens.network import Dots, Network, PointObservations
+from calibration.rig.rig_steps import RigCalibration, calibrate_in_steps
+from calibration.screens.network import ControlPoints, Network, PointObservations
 from calibration.screens.screens import ScreenSetup, calibrate
 from calibration.terms.rig_blocks import prior_of, stacks_of
 from geometry.arrays import Array, normalised
@@ -30,8 +30,8 @@ from geometry.pose import Pose
 from geometry.pose_solver.gauss_newton import fit_pose
 from geometry.rig import Rig
 from geometry.uncertainty.rig_parameters import RigCovariance
-from geometry.uncertainty.rig_uncertainty import CalibrationSpread
-from lab.simulate.calibration_campaign import Campaign, Quality, draw_campaign, spots_at
+from geometry.uncertainty.rig_uncertainty import RigUncertainty
+from lab.simulate.calibration_campaign import Campaign, CampaignQuality, draw_campaign, spots_at
 
 POSES_PER_CAMPAIGN = 5  # of the new recording; they share the errors of the calibration
 
@@ -63,7 +63,7 @@ def as_measured(c: Campaign) -> tuple[Network, list[ScreenSetup], StandModel]:
     survey = np.broadcast_to(np.eye(3) * c.quality.survey_m**2, (len(c.dot_names), 3, 3))
     network = Network(
         rig,
-        Dots(c.dot_names, c.dots_surveyed, survey, c.dot_screen),
+        ControlPoints(c.dot_names, c.dots_surveyed, survey, c.dot_screen),
         PointObservations(c.seen_camera, c.seen_dot, c.seen_pixels, np.full(len(c.seen_dot), c.quality.dot_px)),
         lens_priors=() if prior is None else (prior,),
         lens_free=free["intrinsics"],
@@ -75,13 +75,13 @@ def as_measured(c: Campaign) -> tuple[Network, list[ScreenSetup], StandModel]:
     return network, [ScreenSetup() for _ in rig.screens], stand
 
 
-def calibrated(c: Campaign) -> RigSteps:
+def calibrated(c: Campaign) -> RigCalibration:
     """The rig of the campaign by the joint adjustment."""
     network, setups, stand = as_measured(c)
     return calibrate_in_steps(calibrate(network, setups), c.spots, stand)
 
 
-def trial(seed: int, rig: str = "fan", quality: Quality | None = None) -> Trial:
+def trial(seed: int, rig: str = "fan", quality: CampaignQuality | None = None) -> Trial:
     """Draw a campaign, calibrate its rig, and measure with it."""
     c = draw_campaign(seed, rig, quality)
     start = time.perf_counter()
@@ -100,7 +100,7 @@ def measured_with(
 ) -> tuple[Array, Array, Array]:
     """Errors (k, 6) of poses measured with a calibrated rig, NEES/6 (k,), and NEES/6 of the noise alone (k,)."""
     model = SpotModel.of(rig)
-    spread = CalibrationSpread(rig, model, covariance)
+    spread = RigUncertainty(rig, model, covariance)
     spots = spots_at(truth, poses, spot_px, rng)
     errors, nees, alone = [], [], []
     for k in range(len(poses.translation)):
@@ -163,7 +163,7 @@ def _described_alike(truth: Rig, found: Rig) -> Rig:
     return replace(truth, screens=screens)
 
 
-def bench_figures(seeds: Iterable[int], rig: str = "fan", quality: Quality | None = None) -> dict[str, float]:
+def bench_figures(seeds: Iterable[int], rig: str = "fan", quality: CampaignQuality | None = None) -> dict[str, float]:
     """The figures over some campaigns."""
     return figures([trial(s, rig, quality) for s in seeds])
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from bench.tracking import Row, Tally, found_in, tally, track
 from geometry.arrays import Array, Bools
-from lab.simulate.points import PointRun, hidden, simulate_points
+from lab.simulate.points import PointRun, simulate_points, with_occlusions
 from tracking.detections import UNMATCHED
 from tracking.parameters import TrackerParameters
 from tracking.smoothing.recording import TrackedRecording
@@ -145,7 +145,7 @@ def rows(seeds: int, frames: int, only: str = "") -> Iterator[Row]:
         for seed in range(FIRST_SEED, FIRST_SEED + seeds):
             run = simulate_points(scenario, seed, frames=frames, **options)  # type: ignore[arg-type]
             if hide is not None:
-                run = hidden(run, around_bends(run, *hide, np.random.default_rng(seed)))
+                run = with_occlusions(run, around_bends(run, *hide, np.random.default_rng(seed)))
             out, ms = track(run, RIGID)
             causal.append(judged(run, out, ms))
             frames_again, ms_again = second_look(run, out)

@@ -27,7 +27,7 @@ _RANK = 1e-6  # relative size below which a projected column is rounding
 
 
 @dataclass(frozen=True, slots=True)
-class UsualSizes:
+class PriorSizes:
     """Prior sigmas of the changes that occur in laboratories. They decide between equally good fits."""
 
     turn_rad: float = float(np.deg2rad(0.1))  # rotation of a camera whose mount was knocked or has crept
@@ -64,7 +64,7 @@ class CameraColumns:
         """The columns (m, 4) that the test for drift uses: turn and zoom, a similarity of the picture."""
         return np.concatenate([self.turn, self.zoom], axis=1)
 
-    def kinds(self, sizes: UsualSizes) -> dict[str, ChangeCandidate]:
+    def kinds(self, sizes: PriorSizes) -> dict[str, ChangeCandidate]:
         """The possible changes of a camera, by kind."""
         turn = ChangeCandidate(self.turn, np.full(3, sizes.turn_rad))
         move = ChangeCandidate(self.move, np.full(3, sizes.move_m))
@@ -235,7 +235,7 @@ def _noncentrality(dof: int, p_false_alarm: float, power: float) -> float:
 
 
 @dataclass(frozen=True, slots=True)
-class Verdicts:
+class FoundChanges:
     """The changes that were found, and the tests that support them."""
 
     changes: tuple[Change, ...]  # in the order in which they were found
@@ -250,8 +250,8 @@ def find_changes(
     cameras: Mapping[str, CameraColumns],
     others: Mapping[tuple[str, str], ChangeCandidate],
     p_false_alarm: float,
-    sizes: UsualSizes | None = None,
-) -> Verdicts:
+    sizes: PriorSizes | None = None,
+) -> FoundChanges:
     """The changes that explain a residual, added one by one, the most probable first.
 
     others: other possible changes, by kind and subject: one wrong point (WRONG_POINT, its name), one laser
@@ -259,7 +259,7 @@ def find_changes(
     is divided evenly among the cameras, half goes to the residual that no camera explains. Changes are added only while
     a test is significant.
     """
-    sizes = sizes or UsualSizes()
+    sizes = sizes or PriorSizes()
     each = p_false_alarm / 2 / max(len(cameras), 1)
 
     def tests(left: ExcessResidual, names: list[str]) -> tuple[dict[str, float], float]:
@@ -278,7 +278,7 @@ def find_changes(
         significant = min(of_cameras.values(), default=1.0) < each or of_rest < p_false_alarm / 2
         more = _best(misfit, changes, cameras, others, sizes) if significant and len(changes) < max_changes else None
         if more is None:
-            return Verdicts(tuple(changes), left, p_values, p_rest, significant)
+            return FoundChanges(tuple(changes), left, p_values, p_rest, significant)
         changes = _reselected(misfit, [*changes, more], cameras, others, sizes)
 
 
@@ -287,7 +287,7 @@ def _reselected(
     changes: list[Change],
     cameras: Mapping[str, CameraColumns],
     others: Mapping[tuple[str, str], ChangeCandidate],
-    sizes: UsualSizes,
+    sizes: PriorSizes,
 ) -> list[Change]:
     """The changes, each selected and fitted again with the others free: the first was selected without the others.
 
@@ -309,7 +309,7 @@ def _best(
     known: list[Change],
     cameras: Mapping[str, CameraColumns],
     others: Mapping[tuple[str, str], ChangeCandidate],
-    sizes: UsualSizes,
+    sizes: PriorSizes,
 ) -> Change | None:
     """The most probable change beside the known ones; None if no further change is more probable.
 

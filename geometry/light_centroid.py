@@ -14,7 +14,7 @@ import numpy as np
 
 from geometry.arrays import Array, Bools
 from geometry.camera import Camera
-from geometry.planes import meet_plane
+from geometry.planes import intersect_plane
 from geometry.rig import Screen
 
 _WINDOW = 3.7  # half width of a fit's window in sigmas: 3.2 along the major axis, more across it
@@ -26,7 +26,7 @@ _MAX_SHARE = 0.25  # largest offset in sigmas of the spot: a larger one means th
 _STENCIL = np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [-1, -1], [1, -1], [-1, 1]], dtype=float)
 
 
-class CentreOffsets:
+class CentroidOffsets:
     """Offsets in the pictures that one camera takes of one screen.
 
     The screen is assumed to be flat over a spot, and matt: equally bright from all directions.
@@ -83,7 +83,7 @@ def _curvature(camera: Camera, screen: Screen, uv_px: Array) -> Array:
     s(u + x) = s(u) + J (x + T(x, x)): half of the second derivatives, in pixels. 0 where a ray misses the screen.
     """
     origin, direction = camera.rays(uv_px[..., None, :] + _STEP_PX * _STENCIL)
-    s = meet_plane(origin, direction, screen.world_from_screen)  # (..., 9, 2), m
+    s = intersect_plane(origin, direction, screen.world_from_screen)  # (..., 9, 2), m
     at = np.moveaxis(s, -2, 0)
     J = np.stack([at[1] - at[2], at[3] - at[4]], axis=-1) / (2 * _STEP_PX)
     uu = (at[1] - 2 * at[0] + at[2]) / _STEP_PX**2

@@ -8,7 +8,7 @@ from geometry.arrays import Array
 from geometry.pose import Pose
 
 
-def meet_plane(origin: Array, direction: Array, world_from_screen: Pose) -> Array:
+def intersect_plane(origin: Array, direction: Array, world_from_screen: Pose) -> Array:
     """Intersections (..., 2), m, of rays with the plane of a screen, in the screen frame.
 
     origin, direction: (..., 3), m and no unit, in world. nan where the ray is parallel to the plane or points away.

@@ -9,7 +9,7 @@ import numpy as np
 from geometry.arrays import Array, Bools
 from geometry.pose import Pose
 from geometry.rig import Rig
-from geometry.surfaces import meet_surface
+from geometry.surfaces import intersect_surface
 
 SLACK, SLACK_M, SLACK_RAD = 1.02, 0.005, float(np.deg2rad(0.25))  # the limits are widened by this: poses are noisy
 CUBE_FACTOR = 2.0  # side of the vehicle's cube over that of the screens and cameras
@@ -87,7 +87,7 @@ def _seen_of_screen(rig: Rig, camera: str) -> Array:
     width, height = seen_by.image_size_px
     u, v = np.meshgrid(np.linspace(-0.5, width - 0.5, BORDER_POINTS), np.linspace(-0.5, height - 0.5, BORDER_POINTS))
     origin, rays = seen_by.rays(np.stack([u.ravel(), v.ravel()], axis=-1))
-    hits = meet_surface(origin, rays, screen.world_from_screen, screen.bow)
+    hits = intersect_surface(origin, rays, screen.world_from_screen, screen.bow)
     middle = screen.world_from_screen.translation
     distance = abs((origin - middle) @ screen.world_from_screen.rotation[:, 2])
     near = np.linalg.norm(hits - origin, axis=-1) <= MAX_DISTANCE_FACTOR * distance

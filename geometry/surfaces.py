@@ -12,7 +12,7 @@ from geometry.pose import Pose
 NEWTON_STEPS = 4  # a bow of centimetres over metres converges to rounding in two or three
 
 
-def meet_surface(origin: Array, direction: Array, world_from_screen: Pose, bow: Sequence[float]) -> Array:
+def intersect_surface(origin: Array, direction: Array, world_from_screen: Pose, bow: Sequence[float]) -> Array:
     """Intersections (..., 3), m, in world, of rays with a screen; nan where the ray is parallel to it or points away.
 
     origin, direction: (..., 3), m and no unit, in world. bow: a, b, c, 1/m, of the surface z = a x^2 + b x y + c y^2 in

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 
-def short(value: float | None, digits: int = 3) -> str:
+def format_number(value: float | None, digits: int = 3) -> str:
     """A number with `digits` significant digits, without exponent from 1e-4 to 1e6; a dash for None, nan and inf."""
     if value is None or not np.isfinite(value):
         return "\u2013"
@@ -18,19 +18,19 @@ def short(value: float | None, digits: int = 3) -> str:
     return f"{value:.{decimals}f}".replace("-", "\u2212")
 
 
-def plus_minus(value: float, sigma: float, signed: bool = False) -> str:
+def format_with_sigma(value: float, sigma: float, signed: bool = False) -> str:
     """`0.350 ± 0.012`: the sigma to one digit (two digits where the first is 1), the value to as many decimals."""
     if not np.isfinite(value):
         return "\u2013"
     if not (np.isfinite(sigma) and sigma > 0):
-        return ("+" if signed and value > 0 else "") + short(value, 2)
+        return ("+" if signed and value > 0 else "") + format_number(value, 2)
     power = int(np.floor(np.log10(sigma)))
     decimals = max(0, -power + (1 if sigma / 10.0**power < 2 else 0))
     text = f"{value:{'+' if signed else ''}.{decimals}f} ± {sigma:.{decimals}f}"
     return text.replace("-", "\u2212")
 
 
-def percent(share: float | None) -> str:
+def format_percent(share: float | None) -> str:
     """A share as a percentage. 0 % and 100 % mean exactly none and all: other shares get enough decimals."""
     if share is None or not np.isfinite(share):
         return "\u2013"
@@ -42,15 +42,15 @@ def percent(share: float | None) -> str:
     return f"{100 * share:.{decimals}f} %"
 
 
-def length(metres: float | None) -> str:
+def format_length(metres: float | None) -> str:
     """A length in mm, or in m from one metre on."""
     if metres is None or not np.isfinite(metres):
         return "\u2013"
-    return f"{short(metres)} m" if abs(metres) >= 1 else f"{short(1000 * metres)} mm"
+    return f"{format_number(metres)} m" if abs(metres) >= 1 else f"{format_number(1000 * metres)} mm"
 
 
-def angle(degrees: float | None) -> str:
+def format_angle(degrees: float | None) -> str:
     """An angle in degrees, or in thousandths of a degree below a tenth."""
     if degrees is None or not np.isfinite(degrees):
         return "\u2013"
-    return f"{short(degrees)}\u00b0" if abs(degrees) >= 0.1 else f"{short(1000 * degrees)} mdeg"
+    return f"{format_number(degrees)}\u00b0" if abs(degrees) >= 0.1 else f"{format_number(1000 * degrees)} mdeg"

@@ -19,7 +19,7 @@ from tracking.tracked_frame import TrackedFrame
 
 # Two points of one picture nearer than this are one spot detected twice: two different spots a few px wide and so near
 # to each other merge into one detection.
-TWIN_PX = 0.05
+DUPLICATE_PX = 0.05
 LEAST_SIGMA_PX = 1e-4  # a hundredth of the best centroids' sigma: a smaller one is zero, or in another unit
 LARGEST_PX = 1e6  # no picture is as wide; squares of larger coordinates may overflow
 _FEW = 50  # points: up to this number comparing all pairs is faster than sorting (3 us per picture instead of 20)
@@ -27,7 +27,7 @@ _MAX_COMPARED = 100  # preceding points that each point is compared with, in a s
 
 
 @compiled
-def twins(group: Ints, uv: Array, order: Ints, size: Array) -> Bools:
+def duplicates(group: Ints, uv: Array, order: Ints, size: Array) -> Bools:
     """Which of m points are duplicates of another point of their group; of two the one with the larger `size` (m,).
 
     uv (m, 2), px; order (m,): the rows sorted by group, then u, then v. Of equal sizes the later one in that order is
@@ -39,9 +39,9 @@ def twins(group: Ints, uv: Array, order: Ints, size: Array) -> Bools:
         a = order[i]
         for back in range(i - 1, max(-1, i - 1 - _MAX_COMPARED), -1):
             b = order[back]
-            if group[b] != group[a] or uv[a, 0] - uv[b, 0] >= TWIN_PX:
+            if group[b] != group[a] or uv[a, 0] - uv[b, 0] >= DUPLICATE_PX:
                 break
-            if out[b] or (uv[a, 0] - uv[b, 0]) ** 2 + (uv[a, 1] - uv[b, 1]) ** 2 >= TWIN_PX**2:
+            if out[b] or (uv[a, 0] - uv[b, 0]) ** 2 + (uv[a, 1] - uv[b, 1]) ** 2 >= DUPLICATE_PX**2:
                 continue
             if size[b] > size[a]:
                 out[b] = True
@@ -79,7 +79,7 @@ def _few_and_valid(uv_px: Array, cov_px2: Array) -> bool:
         if not good[i]:
             return False
         for j in range(i):
-            if (uv_px[i, 0] - uv_px[j, 0]) ** 2 + (uv_px[i, 1] - uv_px[j, 1]) ** 2 < TWIN_PX**2:
+            if (uv_px[i, 0] - uv_px[j, 0]) ** 2 + (uv_px[i, 1] - uv_px[j, 1]) ** 2 < DUPLICATE_PX**2:
                 return False
     return True
 
@@ -94,7 +94,7 @@ def usable_rows(found: Detections) -> Bools | None:
     rows = np.flatnonzero(good)
     some = uv[rows]
     size = cov[rows, 0, 0] + cov[rows, 1, 1]
-    good[rows] = ~twins(np.zeros(len(rows), dtype=np.int64), some, np.lexsort((some[:, 1], some[:, 0])), size)
+    good[rows] = ~duplicates(np.zeros(len(rows), dtype=np.int64), some, np.lexsort((some[:, 1], some[:, 0])), size)
     return None if good.all() else good
 
 
@@ -123,7 +123,7 @@ class UsablePoints:
             rows.append(None if good is None else np.flatnonzero(good))
         return UsablePoints(tuple(kept), tuple(rows))
 
-    def as_given(self, tracked: TrackedFrame, camera_of: Ints) -> TrackedFrame:
+    def with_given_rows(self, tracked: TrackedFrame, camera_of: Ints) -> TrackedFrame:
         """The tracked frame with `point` as rows of the given detections. camera_of (n,): the camera of each view."""
         if all(rows is None for rows in self.rows):  # the usual case
             return tracked

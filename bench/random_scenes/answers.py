@@ -18,7 +18,7 @@ from geometry.pose import Pose
 from lab.files.run.results import read_poses, read_spots
 from lab.files.run.run_file import Run
 from lab.files.run.times import Times
-from lab.pictures.picture_file import DROPPED, Missing
+from lab.pictures.picture_file import DROPPED, MissingPicture
 from lab.runs import process
 from lab.runs.frames.frames import FrameSet
 from lab.runs.frames.pipeline import FrameRecord, Pipeline, Tracker, tracker_of
@@ -94,7 +94,7 @@ class PointReader:
 
     def __iter__(self) -> Iterator[FrameSet]:
         for k in range(len(self._scene)):
-            pictures = [Missing(DROPPED) if d is None else d for d in self._scene.found(k)]
+            pictures = [MissingPicture(DROPPED) if d is None else d for d in self._scene.found(k)]
             yield FrameSet(k, dict(zip(self.cameras, pictures, strict=True)))
 
 

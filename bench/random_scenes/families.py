@@ -28,7 +28,7 @@ from bench.random_scenes.nuisances import CLEAN_FRAMES
 from bench.random_scenes.projection import spot_pixels
 from bench.random_scenes.scene import Scene, draw_amplitudes, fitted_motion, view_indices
 from geometry.rig import Rig
-from geometry.uncertainty.rig_parameters import RigCovariance, moved, rig_names, split
+from geometry.uncertainty.rig_parameters import RigCovariance, perturbed, rig_names, split_name
 
 
 @dataclass(frozen=True, slots=True)
@@ -254,8 +254,8 @@ RIG_SIGMAS = {
 def rig_covariance(rig: Rig) -> RigCovariance:
     """Errors of all parameters of a rig, correlated within each camera, screen and beam."""
     names = rig_names(rig)
-    sigma = np.array([RIG_SIGMAS.get(split(n)[2], 1e-4 if n.endswith("_rad") else 3e-4) for n in names])
-    things = [split(n)[:2] for n in names]
+    sigma = np.array([RIG_SIGMAS.get(split_name(n)[2], 1e-4 if n.endswith("_rad") else 3e-4) for n in names])
+    things = [split_name(n)[:2] for n in names]
     same = np.array([[a == b for b in things] for a in things])
     return RigCovariance(names, np.where(same, 0.2, 0.0) * np.outer(sigma, sigma) + 0.8 * np.diag(sigma**2))
 
@@ -266,7 +266,7 @@ def _drawn_rig(draw: Draw) -> Scene | None:
     covariance = rig_covariance(known.rig)
     rng = draw.rng(scene.LAB)
     delta = np.linalg.cholesky(covariance.matrix) @ rng.normal(size=len(covariance.names))
-    lab = replace(known, rig=moved(known.rig, covariance.names, delta))
+    lab = replace(known, rig=perturbed(known.rig, covariance.names, delta))
     rng = draw.rng(scene.MOTION)
     motion = motions.sines(rng, np.arange(draw.frames) / 100.0)
     q = fitted_motion(lab, motion, 2 * draw_amplitudes(rng, lab), 20.0, 0.8)

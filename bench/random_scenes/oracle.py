@@ -10,7 +10,7 @@ from bench.random_scenes.scene import CLUTTER, SHINING, Scene
 from geometry.arrays import Array, Bools
 from geometry.forward_model import SpotModel
 from geometry.pose_prior import PosePrior
-from geometry.pose_solver.gauss_newton import SolveLimits, fit_pose, good_enough
+from geometry.pose_solver.gauss_newton import SolveLimits, fit_pose, is_measurement
 from tracking.detections import Detections
 from tracking.labelling.first_labels import find_labels
 
@@ -58,7 +58,7 @@ def ask_oracle(scene: Scene) -> Oracle:
         uv = measured_pixels(scene, k)[rows]
         covariances = scene.sigma_px[rows, None, None] ** 2 * np.eye(2)
         fit = fit_pose(model, rows, uv, covariances, scene.poses[k])
-        if fit is None or not good_enough(fit, limits):
+        if fit is None or not is_measurement(fit, limits):
             continue
         d = scene.poses[k].minus(fit.world_from_body)
         solvable[k], nees[k] = True, float(d @ np.linalg.solve(fit.covariance, d))

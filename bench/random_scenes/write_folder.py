@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from bench.random_scenes.scene import Scene
-from lab.files.rig.rig_covariance import blocks_of
+from lab.files.rig.rig_covariance import covariance_blocks
 from lab.files.rig.rig_file import RigFile, save_rig
 from lab.files.run.run_file import save_run
 from lab.files.text import columns
@@ -21,7 +21,7 @@ def write_run_folder(scene: Scene, folder: Path) -> Path:
     A missing picture has one row without a position, the only form that the file format has for it.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    covariances = {} if scene.covariance is None else blocks_of(scene.covariance)
+    covariances = {} if scene.covariance is None else covariance_blocks(scene.covariance)
     save_rig(RigFile(scene.known_rig, covariances), folder / "rig.yaml")
     content: dict[str, object] = {
         "name": f"seed-{scene.seed}",

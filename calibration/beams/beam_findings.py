@@ -44,7 +44,7 @@ def beam_findings(
         out.append(_sigmas(c, goals))
     if drawing is not None:
         out += _against_the_drawing(c, drawing, goals)
-    out += [_collinearity(pair) for pair in c.one_line]
+    out += [_collinearity(pair) for pair in c.collinearity]
     return out
 
 

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from calibration.terms.spot_term import SpotPixels
 from geometry.arrays import Array, Ints, normalised
 from geometry.forward_model import SpotModel
-from geometry.planes import meet_plane, screen_to_world
+from geometry.planes import intersect_plane, screen_to_world
 from geometry.pose import Pose
 from geometry.pose_solver.closed_form import pose_from_lines
 from geometry.pose_solver.gauss_newton import PoseFit, fit_pose
@@ -30,7 +30,9 @@ def world_points(rig: Rig, spots: SpotPixels) -> Array:
         if rows.any():
             screen = rig.screens[rig.spots[spot].screen].world_from_screen
             origin, direction = rig.cameras[camera].rays(spots.pixels[rows])
-            out[rows] = screen_to_world(meet_plane(np.broadcast_to(origin, direction.shape), direction, screen), screen)
+            out[rows] = screen_to_world(
+                intersect_plane(np.broadcast_to(origin, direction.shape), direction, screen), screen
+            )
     return out
 
 

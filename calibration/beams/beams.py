@@ -51,7 +51,7 @@ class BeamCalibration:
     lines: Lines  # the beams, points nearest to the body's origin
     lines_covariance: Array  # (4 k, 4 k) of their errors
     angles: Sequence[BeamAngle]
-    one_line: Sequence[CollinearityTest]  # opposed beams, and the two ends of a beam that has both
+    collinearity: Sequence[CollinearityTest]  # opposed beams, and the two ends of a beam that has both
     world_from_stand: Pose | None  # None where no position is known
     stand_covariance: Array | None  # (6, 6)
     world_from_body: Pose  # (P,) at the positions, estimated
@@ -225,7 +225,7 @@ def _finished(
     matrix = T @ joint[np.ix_(in_rig, in_rig)] @ T.T
     of_lines = joint[: len(slide), : len(slide)]
     poses = pose_of(values, STAND)[0] @ pose_of(values, POSES)
-    one_line = opposed_pairs(list(rig.beams), lines, of_lines) + _end_collinearity(rig, kept, values, others, free)
+    collinearity = opposed_pairs(list(rig.beams), lines, of_lines) + _end_collinearity(rig, kept, values, others, free)
     named = np.diagonal(matrix) > 0
     return BeamCalibration(
         rig=rig_of(rig, values),
@@ -233,7 +233,7 @@ def _finished(
         lines=lines,
         lines_covariance=of_lines,
         angles=angles_between(list(rig.beams), lines, of_lines),
-        one_line=one_line,
+        collinearity=collinearity,
         world_from_stand=None if stand is None else pose_of(values, STAND)[0],
         stand_covariance=None if stand is None else (joint[~in_rig][:, ~in_rig] if STAND in free else np.zeros((6, 6))),
         world_from_body=poses,

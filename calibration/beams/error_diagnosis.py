@@ -32,7 +32,7 @@ _FEWEST = 6  # positions that a shifted record must share with the spots
 
 
 @dataclass(frozen=True, slots=True)
-class SuspectPose:
+class RecordingError:
     """A mistake whose correction makes the spots consistent."""
 
     in_labels: bool  # otherwise in the stand's record
@@ -40,9 +40,9 @@ class SuspectPose:
     remedy: str
 
 
-def suspect(
+def diagnose_error(
     rig: Rig, spots: SpotPixels, stand: StandModel, knowledge: RigCovariance | None = None
-) -> SuspectPose | None:
+) -> RecordingError | None:
     """The mistake that explains inconsistent spots; None if none of the common ones does.
 
     Arguments as of calibrate_beams, which found too few consistent spots. rig: beams as drawn, which are required.
@@ -56,7 +56,7 @@ def suspect(
 
 @dataclass(frozen=True, slots=True)
 class _Candidate:
-    of: SuspectPose
+    of: RecordingError
     misfit: float  # relative to the present one
     spots: SpotPixels
     stand: StandModel
@@ -101,37 +101,39 @@ def _of_records(rig: Rig, spots: SpotPixels, stand: StandModel) -> list[_Candida
     return out
 
 
-def _other_records(poses: Pose) -> Iterator[tuple[SuspectPose, Pose]]:
+def _other_records(poses: Pose) -> Iterator[tuple[RecordingError, Pose]]:
     """The record with each common mistake corrected."""
     q, t = poses.quaternion_wxyz, poses.translation
     yield (
-        SuspectPose(
+        RecordingError(
             False, "with their quaternions read in the order x, y, z, w", "write them in the order qw, qx, qy, qz"
         ),
         Pose.from_quaternion(np.roll(q, 1, axis=-1), t),
     )
     yield (
-        SuspectPose(False, "inverted", "write stand_from_body, the body's pose in the stand, and not its inverse"),
+        RecordingError(False, "inverted", "write stand_from_body, the body's pose in the stand, and not its inverse"),
         poses.inverse(),
     )
     turned = np.swapaxes(poses.rotation, -1, -2)
     yield (
-        SuspectPose(False, "with their rotations inverted", "write quaternions that rotate from the body to the stand"),
+        RecordingError(
+            False, "with their rotations inverted", "write quaternions that rotate from the body to the stand"
+        ),
         Pose(turned, t),
     )
     for factor, unit in ((1e-3, "millimetres"), (1e-2, "centimetres"), (1e3, "kilometres")):
         remedy = "write x_m, y_m, z_m in metres"
         words = f"with their positions times {factor:g} ({unit} were written)"
-        yield SuspectPose(False, words, remedy), Pose(poses.rotation, factor * t)
+        yield RecordingError(False, words, remedy), Pose(poses.rotation, factor * t)
 
 
 def _shifts(count: int) -> Sequence[int]:
     return [n for n in range(-(count // 2), count // 2 + 1) if n]
 
 
-def _shifted(n: int) -> SuspectPose:
+def _shifted(n: int) -> RecordingError:
     rows = f"{abs(n)} row{'' if abs(n) == 1 else 's'} {'above' if n < 0 else 'below'}"
-    return SuspectPose(
+    return RecordingError(
         False,
         f"when each position has the pose {rows}",
         "the numbering of positions differs between spots and poses: number both alike",
@@ -159,7 +161,7 @@ def _of_labels(rig: Rig, spots: SpotPixels, stand: StandModel) -> list[_Candidat
         misfit = _own_misfit(rig, swap_views(few, a, b), count)
         if misfit < _FAR_BETTER * present:
             camera, first, second = views[a][0], views[a][1], views[b][1]
-            of = SuspectPose(
+            of = RecordingError(
                 True,
                 f"with the labels {first} and {second} of camera {camera!r} exchanged everywhere",
                 "exchange them in the table of spots, or in target.spots",

@@ -107,7 +107,7 @@ def in_words(directions: Array, beam_names: Sequence[str], lines: Lines, world_f
     return out
 
 
-def briefly(undetermined: Sequence[str]) -> str:
+def summary_of(undetermined: Sequence[str]) -> str:
     """A one-line summary: the first two undetermined motions and the number of others."""
     more = len(undetermined) - 2
     return "; ".join(undetermined[:2]) + (f"; and {more} more" if more > 0 else "")

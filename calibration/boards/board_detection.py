@@ -19,7 +19,7 @@ from calibration.boards.chessboard_detection import find_chessboard
 from calibration.boards.circle_detection import find_circles
 
 
-def find_board(image: GreyImage, board: Board, closely: bool = True) -> BoardView | NotFound:
+def find_board(image: GreyImage, board: Board, thorough: bool = True) -> BoardView | NotFound:
     """The board in a grey picture (h, w) of 8 bits.
 
     closely: if False, only the fast methods are used, and the reason for a failure is not determined (NO_CLOSE_LOOK).
@@ -34,7 +34,7 @@ def find_board(image: GreyImage, board: Board, closely: bool = True) -> BoardVie
         return NotFound(f"the picture is only {image.shape[1]}x{image.shape[0]} pixels")
     image = np.ascontiguousarray(image)
     if isinstance(board, Chessboard):
-        return find_chessboard(image, board, closely)
+        return find_chessboard(image, board, thorough)
     if isinstance(board, Charuco):
-        return find_charuco(image, board, closely)
-    return find_circles(image, board, closely)
+        return find_charuco(image, board, thorough)
+    return find_circles(image, board, thorough)

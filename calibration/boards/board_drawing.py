@@ -23,7 +23,7 @@ class Layer:
     Touching squares that are painted one by one show hairlines between them in most PDF viewers.
     """
 
-    dark: bool
+    is_black: bool
     rectangles: Array  # (n, 4), m: left, top, width, height
     circles: Array  # (n, 3), m: centre x, y, radius
 

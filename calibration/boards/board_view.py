@@ -39,7 +39,7 @@ class NotFound:
     reason: str
 
 
-NO_CLOSE_LOOK = NotFound("no board found in a quick search")  # the cause was not determined
+QUICK_SEARCH_FAILED = NotFound("no board found in a quick search")  # the cause was not determined
 BLUR_LIMIT = 0.2  # sigma of the edges in spacings: above it neighbouring corners merge
 
 

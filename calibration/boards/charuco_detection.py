@@ -11,7 +11,7 @@ from calibration.boards import corner_refinement
 from calibration.boards.board_types import Charuco
 from calibration.boards.board_view import (
     BLUR_LIMIT,
-    NO_CLOSE_LOOK,
+    QUICK_SEARCH_FAILED,
     BoardView,
     GreyImage,
     NotFound,
@@ -46,14 +46,14 @@ class Markers:
     corners: Array  # (n, 4, 2), px, clockwise from the marker's top left
 
 
-def find_charuco(image: GreyImage, board: Charuco, closely: bool = True) -> BoardView | NotFound:
+def find_charuco(image: GreyImage, board: Charuco, thorough: bool = True) -> BoardView | NotFound:
     """The visible inner corners, or the reason why there are too few. A part of the board is sufficient.
 
     closely: if False, the reason for missing markers is not determined.
     """
     printed, markers = _as_printed(image, board)
     if len(markers.ids) == 0:
-        return _why_no_markers(image, board) if closely else NO_CLOSE_LOOK
+        return _why_no_markers(image, board) if thorough else QUICK_SEARCH_FAILED
     true, share = _fitting(board, markers)
     if isinstance(true, NotFound):
         return _mirrored(image, board, len(markers.ids)) or true

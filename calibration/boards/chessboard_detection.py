@@ -12,7 +12,7 @@ from calibration.boards import corner_refinement
 from calibration.boards.board_types import Chessboard
 from calibration.boards.board_view import (
     BLUR_LIMIT,
-    NO_CLOSE_LOOK,
+    QUICK_SEARCH_FAILED,
     BoardView,
     GreyImage,
     NotFound,
@@ -28,7 +28,7 @@ _CLASSIC = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
 _SECTORS = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
 
 
-def find_chessboard(image: GreyImage, board: Chessboard, closely: bool = True) -> BoardView | NotFound:
+def find_chessboard(image: GreyImage, board: Chessboard, thorough: bool = True) -> BoardView | NotFound:
     """All inner corners of a chessboard, or the reason why they were not found. A part of it is not sufficient.
 
     closely: if False, only the classical detector is used, and the reason for a failure is not determined.
@@ -36,12 +36,12 @@ def find_chessboard(image: GreyImage, board: Chessboard, closely: bool = True) -
     pale = low_contrast(image)
     if pale is not None:
         return pale
-    for grid in (_grids if closely else _quick_grids)(image, board.columns, board.rows):
+    for grid in (_grids if thorough else _quick_grids)(image, board.columns, board.rows):
         found = _measured(image, grid, board)
         if found is not None:
             return found
-    if not closely:
-        return NO_CLOSE_LOOK
+    if not thorough:
+        return QUICK_SEARCH_FAILED
     largest = _largest_grid(image)
     if largest is not None and sorted(largest.shape[:2]) == sorted((board.columns, board.rows)):
         turned = largest.shape[:2] != (board.rows, board.columns)

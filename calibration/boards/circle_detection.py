@@ -17,7 +17,7 @@ from calibration.boards import corner_refinement
 from calibration.boards.board_types import CircleGrid
 from calibration.boards.board_view import (
     BLUR_LIMIT,
-    NO_CLOSE_LOOK,
+    QUICK_SEARCH_FAILED,
     BoardView,
     GreyImage,
     NotFound,
@@ -45,7 +45,7 @@ class Ellipses:
     contrasts: Array  # (n,), DN
 
 
-def find_circles(image: GreyImage, board: CircleGrid, closely: bool = True) -> BoardView | NotFound:
+def find_circles(image: GreyImage, board: CircleGrid, thorough: bool = True) -> BoardView | NotFound:
     """All centres of a grid of circles, with the areas of the blobs, or the reason why they were not found.
 
     closely: if False, the reason is not determined.
@@ -59,7 +59,7 @@ def find_circles(image: GreyImage, board: CircleGrid, closely: bool = True) -> B
                 return _measured(image if not light else 255 - image, at_full_size(found, scale), board, light)
         if scale == 1.0:
             blobs = _blobs(image)
-    return _why_not(image, board, blobs) if closely else NO_CLOSE_LOOK
+    return _why_not(image, board, blobs) if thorough else QUICK_SEARCH_FAILED
 
 
 def _detector(image: GreyImage) -> cv2.SimpleBlobDetector:

@@ -17,7 +17,7 @@ from calibration.budget.pose_budget import CAMERA_POSES, GROUPS, INTRINSICS, Rig
 from geometry.arrays import Array, skew, symmetric
 from geometry.camera import FISHEYE, Camera, Projected, pinhole_numbers, project_points_full
 from geometry.lens import padded
-from geometry.planes import meet_plane
+from geometry.planes import intersect_plane
 from geometry.rig import Rig, Screen
 from geometry.uncertainty.rig_parameters import (
     DIRECTION,
@@ -27,7 +27,7 @@ from geometry.uncertainty.rig_parameters import (
     RigCovariance,
     distortion_names,
     rig_names,
-    split,
+    split_name,
 )
 
 _FEWEST_DOTS = 4  # required for a resection: three dots allow four poses
@@ -106,7 +106,7 @@ def expected_errors(
 
 def _things(names: Sequence[str], groups: dict[str, Array], follow: Array) -> list[tuple[str, str, Array]]:
     """The groups' covariances split by camera, screen and beam; those of lenses include their effect on the pose."""
-    owner = np.array([".".join(split(n)[:2]) for n in names])
+    owner = np.array([".".join(split_name(n)[:2]) for n in names])
     out = []
     for group, C in groups.items():
         for thing in dict.fromkeys(owner.tolist()):
@@ -198,7 +198,7 @@ def dots_on_screen(camera: Camera, screen: Screen, expected: ExpectedErrors) -> 
     columns = max(round(float(np.sqrt(1.25 * expected.dots))), 1)
     rows = max(round(expected.dots / columns), 1)
     origin, rays = camera.rays(_picture_grid(camera, columns, rows, inset=0.05))
-    xy = meet_plane(origin, np.nan_to_num(rays), screen.world_from_screen)
+    xy = intersect_plane(origin, np.nan_to_num(rays), screen.world_from_screen)
     good = np.isfinite(xy).all(axis=-1) & np.isfinite(rays).all(axis=-1)
     if screen.size_m is not None:
         good &= np.all(np.abs(np.nan_to_num(xy)) <= np.array(screen.size_m) / 2, axis=-1)

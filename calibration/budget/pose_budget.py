@@ -19,7 +19,7 @@ from geometry.camera import in_picture
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.pose_solver.gauss_newton import RANK_TOLERANCE
-from geometry.uncertainty.rig_parameters import BOW, DIRECTION, POSE, Sensitivity, split
+from geometry.uncertainty.rig_parameters import BOW, DIRECTION, POSE, Sensitivity, split_name
 
 INTRINSICS, CAMERA_POSES, SCREEN_POSES = "camera intrinsics", "camera poses", "screen poses"
 SCREEN_SHAPES, BEAM_DIRECTIONS, BEAM_POINTS = "screen shapes", "beam directions", "beam points"
@@ -28,7 +28,7 @@ GROUPS = (INTRINSICS, CAMERA_POSES, SCREEN_POSES, SCREEN_SHAPES, BEAM_DIRECTIONS
 
 def group_of(name: str) -> str:
     """The group of `GROUPS` that a rig's parameter belongs to."""
-    kind, _, parameter = split(name)
+    kind, _, parameter = split_name(name)
     if kind == "cameras":
         return CAMERA_POSES if parameter in POSE else INTRINSICS
     if kind == "screens":

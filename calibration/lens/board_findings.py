@@ -18,9 +18,9 @@ def _two(value: float) -> str:
     return f"{value:.2g}"
 
 
-def doubt_finding(c: Intrinsics) -> Finding | None:
+def model_uncertainty_finding(c: Intrinsics) -> Finding | None:
     """Model error beyond the covariance of the parameters; None if there is no evidence of it."""
-    d = c.doubt
+    d = c.model_uncertainty
     parts = []
     if d.left_px > 0:
         parts.append(f"correlated residuals over the picture of {d.left_px:.2g} px (p = {d.p_value:.1g})")

@@ -78,23 +78,25 @@ def _calibrated(table: CornerTable, options: IntrinsicsOptions) -> Intrinsics:
     free = AS_STATED if shape is None else shape.free
     as_found = (rich[0] if shape is None else shape.fit).values
     board = {name: as_found[name] for name in BOARD_BLOCKS} if shape else board_as_stated(len(table.board_points))
-    ladder = select_model(table, used, rich, board, replace(free, points=False), options.folds, options.lens)
-    found, held, spread = _final(table, ladder.chosen, free, options.folds)
+    selection = select_model(table, used, rich, board, replace(free, points=False), options.folds, options.lens)
+    found, held, spread = _final(table, selection.chosen, free, options.folds)
     noise = max(1.0, spread.factor) if spread.p_value < SCATTER_SIGNIFICANT else 1.0
     distance = options.distance_m or _typical_depth(table, found)
     pixel_map = projection_map(found.model, found.lens, table.image_size_px, distance)
-    doubt = estimate_model_uncertainty(table, found, ladder, pixel_map, found.covariance * noise**2, noise)
+    model_uncertainty = estimate_model_uncertainty(
+        table, found, selection, pixel_map, found.covariance * noise**2, noise
+    )
     out = Intrinsics(
         table=table,
         model=found.model,
         fit=found,
         parameters=found.model.parameters,
-        covariance=found.covariance * (noise * doubt.factor) ** 2,
-        doubt=doubt,
+        covariance=found.covariance * (noise * model_uncertainty.factor) ** 2,
+        model_uncertainty=model_uncertainty,
         correlated_noise=noise,
         scatter=spread,
         held=held,
-        ladder=ladder,
+        selection=selection,
         board=shape,
         halves=_halves(table, found, pixel_map),
         origins=_origins(table, found, pixel_map, options.origins),

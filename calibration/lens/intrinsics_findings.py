@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibration.findings import Finding, Level, unless_pass
-from calibration.lens.board_findings import circles_finding, doubt_finding, points_finding, stretch_finding
+from calibration.lens.board_findings import circles_finding, model_uncertainty_finding, points_finding, stretch_finding
 from calibration.lens.fit.lens_models import folds_in_picture
 from calibration.lens.fit.projection_map import Difference
 from calibration.lens.intrinsics_result import Intrinsics
@@ -55,7 +55,7 @@ def findings_of(c: Intrinsics, limits: FindingLimits = LIMITS) -> tuple[Finding,
         _origins(c, limits),
         _scatter(c),
         _map(c, limits),
-        doubt_finding(c),
+        model_uncertainty_finding(c),
         _warp(c, limits),
         stretch_finding(c),
         points_finding(c),
@@ -93,7 +93,7 @@ def _lens(c: Intrinsics) -> Finding:
             "Two directions would map to the same pixel.",
             _MORE,
         )
-    why = c.ladder.why
+    why = c.selection.why
     return Finding(Level.PASS, f"Lens: {c.model.words}: {why}.")
 
 

@@ -36,11 +36,11 @@ class Intrinsics:
     fit: LensFit
     parameters: tuple[str, ...]  # fx, fy, cx, cy, k1 ...
     covariance: Array  # (p, p) in that order, inflated by scatter between photographs and by model error
-    doubt: ModelUncertainty
+    model_uncertainty: ModelUncertainty
     correlated_noise: float  # factor on the sigmas from that scatter; 1 where it is not significant
     scatter: Scatter
     held: HeldOut
-    ladder: ModelSelection
+    selection: ModelSelection
     board: BoardTest | None  # None where the photographs do not determine the board's bend
     halves: Difference | None  # None where one half does not determine the lens
     origins: Origins | None  # None where all photographs have the same origin

@@ -43,7 +43,7 @@ class ModelUncertainty:
 def estimate_model_uncertainty(
     table: CornerTable,
     found: LensFit,
-    ladder: ModelSelection,
+    selection: ModelSelection,
     at: ProjectionMap,
     covariance: Array,
     scatter: float = 1.0,
@@ -53,13 +53,13 @@ def estimate_model_uncertainty(
     scatter: factor by which photographs scatter more than noise explains. Errors that are correlated within a
     photograph also enlarge the means of cells, and are already in the covariance.
     """
-    noise = min([found.sigma_px, *(r.fit.sigma_px for r in ladder.candidates if r.fit is not None)])
+    noise = min([found.sigma_px, *(r.fit.sigma_px for r in selection.candidates if r.fit is not None)])
     cells, count = cell_means(table, found)
     p, left = beyond_noise(cells, count, noise * scatter)
     inside = seen_at(table, found.used, at.pixels) & np.isfinite(at.by_parameter).all(axis=(2, 3))
     other, between = None, 0.0
-    chosen = ladder.chosen
-    for candidate in ladder.candidates:
+    chosen = selection.chosen
+    for candidate in selection.candidates:
         as_good = not candidate.refused and candidate.excess_px2 <= AS_GOOD_SE * candidate.standard_error_px2
         if (
             candidate.fit is None

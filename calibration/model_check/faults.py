@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.drift import UsualSizes
+from calibration.drift import PriorSizes
 from calibration.model_check.linearised_frames import LinearisedFrames
 from calibration.model_check.recording import ModelCheckRecording, finite
 from geometry.arrays import Array, Bools, Ints, normalised, skew
@@ -25,7 +25,7 @@ ALONG_NORMAL, TILTED = "moved along its normal", "moved and tilted"
 DIRECTION_WRONG, POINT_WRONG, LASER_MOVED = "direction wrong", "shifted sideways", "moved and direction wrong"
 PIXEL_OFFSET, LATE = "constant pixel offset", "not synchronous"
 
-USUAL = UsualSizes()
+USUAL = PriorSizes()
 USUAL_SHIFT_PX = 2.0  # shift of a sensor or a lens in its mount
 USUAL_LATE_S = 3e-3  # delay without a common trigger or clock
 _NEAR_FRAMES = 1.5  # in usual frame intervals: a velocity is estimated from neighbours no farther away in time

@@ -18,7 +18,7 @@ from calibration.least_squares.parameter_blocks import Poses
 from calibration.least_squares.priors import Prior
 from calibration.rig.measurement_groups import GroupFit, Unknowns, group_fit, information
 from calibration.screens.flatness import smallest_scatter
-from calibration.screens.network import Network, NetworkFit, flat_boards, sighting_sigmas
+from calibration.screens.network import Network, NetworkFit, flat_boards, normalised_residuals
 from calibration.terms.pose_records import RecordTerm
 from calibration.terms.rig_blocks import BEAMS, BOWS, CAMERAS, INTRINSICS, POSES, SCREENS, STAND, named_errors, rig_of
 from calibration.terms.spot_term import SpotPixels, SpotTerm
@@ -160,21 +160,23 @@ def free_parameters(measured: Measured) -> dict[str, bool | Bools]:
 def _terms_by_kind(measured: Measured) -> tuple[dict[str, Term], dict[str, tuple[Term, ...]]]:
     """Terms by kind: those whose rows may be excluded, and the others."""
     network, stand = measured.network, measured.stand
-    dots, s = network.dots, network.sightings
+    control_points, s = network.control_points, network.point_observations
     fisheye = np.array([c.lens == FISHEYE for c in network.rig.cameras.values()], dtype=bool)
     every: dict[str, Term] = {SPOTS: SpotTerm(network.rig, measured.spots)}
     fixed: dict[str, tuple[Term, ...]] = {}
     if len(s):
-        every[DOTS] = PointTerm(s.camera_of, s.dot_of, s.pixels, np.eye(2) / s.sigma_px[:, None, None], fisheye)
-    if len(dots):
-        index = np.arange(len(dots))
-        fixed[SURVEY] = (SurveyTerm(index, dots.xyz, whitening(dots.covariance)),)
-        on = dots.screen_of >= 0
+        every[DOTS] = PointTerm(s.camera_of, s.point_of, s.pixels, np.eye(2) / s.sigma_px[:, None, None], fisheye)
+    if len(control_points):
+        index = np.arange(len(control_points))
+        fixed[SURVEY] = (SurveyTerm(index, control_points.xyz, whitening(control_points.covariance)),)
+        on = control_points.screen_of >= 0
         if network.off_surface is not None:
             on = on & ~network.off_surface
         if on.any():
-            scatter = np.array([smallest_scatter(network.surface_scatter_m.get(int(k), 0.0)) for k in dots.screen_of])
-            fixed[SURFACES] = (SurfaceTerm(dots.screen_of[on], index[on], scatter[on]),)
+            scatter = np.array(
+                [smallest_scatter(network.surface_scatter_m.get(int(k), 0.0)) for k in control_points.screen_of]
+            )
+            fixed[SURFACES] = (SurfaceTerm(control_points.screen_of[on], index[on], scatter[on]),)
     if measured.screens.corners is not None:
         every[CORNERS] = measured.screens.corners
         fixed[FLAT_BOARDS] = tuple(flat_boards(measured.screens.corners))
@@ -227,7 +229,7 @@ def _inliers(
     for name, term in every.items():
         if name == DOTS:
             # Relative to the survey, not to the adjusted point, which follows a wrong pixel if one camera sees it only.
-            s = sighting_sigmas(measured.network, values) ** 2
+            s = normalised_residuals(measured.network, values) ** 2
             d = 2
         else:
             r = term.linearise(values).residuals

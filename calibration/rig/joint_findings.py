@@ -24,7 +24,7 @@ from calibration.rig.joint import (
     Joint,
 )
 from calibration.rig.rig_figures import ExpectedPose, HoldOut
-from calibration.rig.rig_steps import RigSteps
+from calibration.rig.rig_steps import RigCalibration
 from geometry.arrays import Array, Ints
 
 _LISTED = 6  # items listed in one line
@@ -93,7 +93,7 @@ _CAUSES: Mapping[str, tuple[str, str]] = {
 
 
 def joint_findings(
-    steps: RigSteps,
+    steps: RigCalibration,
     positions: Sequence[str],
     expected: ExpectedPose | None,
     held_out: HoldOut | None,
@@ -156,7 +156,7 @@ def _fit_of(joint: Joint, name: str, limits: RigLimits) -> Finding:
     return Finding(level, words, why, "" if level == Level.PASS else remedy)
 
 
-def _contradiction(steps: RigSteps, limits: RigLimits) -> list[Finding]:
+def _contradiction(steps: RigCalibration, limits: RigLimits) -> list[Finding]:
     """Whether steps that are consistent separately contradict each other."""
     alone = steps.screens.fit.variance_factor == 1.0 and steps.beams.fit.scale == 1.0
     worst = max(steps.joint.scales.values(), default=1.0)
@@ -172,10 +172,10 @@ def _contradiction(steps: RigSteps, limits: RigLimits) -> list[Finding]:
     ]
 
 
-def _outliers(steps: RigSteps, positions: Sequence[str], limits: RigLimits) -> list[Finding]:
+def _outliers(steps: RigCalibration, positions: Sequence[str], limits: RigLimits) -> list[Finding]:
     joint, measured = steps.joint, steps.measured
     views = joint.rig.views()
-    names, cameras = measured.network.dots.names, list(joint.rig.cameras)
+    names, cameras = measured.network.control_points.names, list(joint.rig.cameras)
     out = []
     for name, kept in joint.kept.items():
         wrong: list[int] = np.flatnonzero(~kept).tolist()
@@ -186,8 +186,8 @@ def _outliers(steps: RigSteps, positions: Sequence[str], limits: RigLimits) -> l
             which = [f"position {positions[at.position[i]]} camera {views[at.view[i]][0]} spot {views[at.view[i]][1]}"
                      for i in wrong]  # fmt: skip
         elif name == DOTS:
-            s = measured.network.sightings
-            seen = [(names[p], cameras[c]) for p, c in zip(s.dot_of[wrong], s.camera_of[wrong], strict=True)]
+            s = measured.network.point_observations
+            seen = [(names[p], cameras[c]) for p, c in zip(s.point_of[wrong], s.camera_of[wrong], strict=True)]
             which = [f"{dot} in camera {camera}" for dot, camera in seen]
         else:
             which = []

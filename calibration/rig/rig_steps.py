@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from calibration.beams.beams import BeamCalibration, StandModel, calibrate_beams
-from calibration.beams.excitation import StandMotion, briefly
+from calibration.beams.excitation import StandMotion, summary_of
 from calibration.least_squares.adjustment import AdjustmentError
 from calibration.rig.joint import Joint, Measured, calibrate_jointly
 from calibration.screens.screens import ScreensResult
@@ -14,7 +14,7 @@ from calibration.terms.spot_term import SpotPixels
 
 
 @dataclass(frozen=True, slots=True)
-class RigSteps:
+class RigCalibration:
     """Results of the steps."""
 
     screens: ScreensResult  # lenses, cameras, screens, control points and boards: all but the spots
@@ -25,7 +25,7 @@ class RigSteps:
 
 def calibrate_in_steps(
     screens: ScreensResult, spots: SpotPixels, stand: StandModel, *, nominal: bool = True
-) -> RigSteps:
+) -> RigCalibration:
     """Calibrate screens, then beams, then all together.
 
     screens: of screens/screens.py, the first step; its network's rig holds nominal beams and the spots too. nominal:
@@ -45,9 +45,9 @@ def calibrate_in_steps(
         raise AdjustmentError(f"{error}; the stand's positions do not suffice ({motion}): {motion.remedy()}") from None
     if beams.undetermined:
         raise AdjustmentError(
-            f"the stand's positions leave undetermined: {briefly(beams.undetermined)}: {beams.motion.remedy()}"
+            f"the stand's positions leave undetermined: {summary_of(beams.undetermined)}: {beams.motion.remedy()}"
         )
     found = beams.fit.adjusted.values
     starts = {n: found[n] for n in (BEAMS, STAND, POSES)}
     measured = Measured(screens.network, screens.fit, spots, stand, starts)
-    return RigSteps(screens, beams, measured, calibrate_jointly(measured))
+    return RigCalibration(screens, beams, measured, calibrate_jointly(measured))

@@ -34,7 +34,7 @@ SIGNIFICANT = 0.001  # p-value of chi-square below which the sigmas are increase
 
 
 @dataclass(frozen=True, slots=True)
-class Dots:
+class ControlPoints:
     """Surveyed control points: p of them."""
 
     names: tuple[str, ...]
@@ -51,7 +51,7 @@ class PointObservations:
     """Observations of control points in pictures: n of them."""
 
     camera_of: Ints  # (n,)
-    dot_of: Ints  # (n,)
+    point_of: Ints  # (n,)
     pixels: Array  # (n, 2)
     sigma_px: Array  # (n,), of each coordinate
 
@@ -64,8 +64,8 @@ class Network:
     """All measurements. The rig gives cameras with their lenses, and screens; its poses are not used."""
 
     rig: Rig
-    dots: Dots
-    sightings: PointObservations
+    control_points: ControlPoints
+    point_observations: PointObservations
     corners: CornerTerm | None = None  # of boards that were carried about, and of boards fixed to screens
     placements: tuple[str, ...] = ()  # names of the boards' positions, in the numbering of the corners
     fixed: BoardOnScreenTerm | None = None
@@ -102,10 +102,10 @@ class NetworkFit:
     variance_factor: float  # 1 if the residuals are consistent with the sigmas
     p_fits: float  # p-value of chi-square, if all sigmas are right
     dof: int
-    sighting_errors_px: Array  # (n, 2): measured minus predicted
-    sighting_sigmas: Array  # (n,): their length in sigmas
+    observation_residuals_px: Array  # (n, 2): measured minus predicted
+    normalised_residuals: Array  # (n,): their length in sigmas
     used: Bools  # (n,) observations that are inliers
-    dot_shifts_m: Array  # (p, 3): adjusted minus surveyed
+    control_point_shifts_m: Array  # (p, 3): adjusted minus surveyed
     corners: CornerTerm | None  # the inliers, with the sigma of their residuals
     corner_errors_px: Array  # (corners, 2): measured minus predicted
     adjusted: Adjusted
@@ -123,7 +123,7 @@ def adjust(network: Network, start: Start) -> NetworkFit:
     values, free, at = _unknowns(network, start)
     corners = None if network.corners is None else _weighted_corners(network, start, values, free)
     rest = _other_terms(network, start, corners)
-    used = np.ones(len(network.sightings), dtype=bool)
+    used = np.ones(len(network.point_observations), dtype=bool)
     robust = solve(values, [_point_term(network, used, Cauchy()), *rest], free)
     used = _inliers(network, robust.values, used)
     found = solve(robust.values, [_point_term(network, used), *rest], free)
@@ -141,7 +141,7 @@ def _unknowns(network: Network, start: Start) -> tuple[Values, dict[str, bool | 
     values: dict[str, Stack] = dict(stacks_of(rig))
     values["cameras"], values["screens"] = Poses(start.camera_from_world), Poses(start.world_from_screen)
     values["bow"] = Vectors(start.bow)
-    values["points"] = Vectors(network.dots.xyz)
+    values["points"] = Vectors(network.control_points.xyz)
     values["boards"] = Poses(start.world_from_board)
     count = 0 if network.corners is None else int(network.corners.board.max(initial=-1)) + 1
     values["warp"] = Vectors(np.zeros((count, 3)))
@@ -173,17 +173,19 @@ def _unknowns(network: Network, start: Start) -> tuple[Values, dict[str, bool | 
 
 
 def _other_terms(network: Network, start: Start, corners: CornerTerm | None) -> list[Term]:
-    dots = network.dots
-    every = np.arange(len(dots))
+    control_points = network.control_points
+    every = np.arange(len(control_points))
     out: list[Term] = [*network.lens_priors, *network.screen_priors]
-    if len(dots):
-        out.append(SurveyTerm(every, dots.xyz, whitening(dots.covariance)))
-        on = dots.screen_of >= 0
+    if len(control_points):
+        out.append(SurveyTerm(every, control_points.xyz, whitening(control_points.covariance)))
+        on = control_points.screen_of >= 0
         if network.off_surface is not None:
             on &= ~network.off_surface
-        scatter = np.array([smallest_scatter(network.surface_scatter_m.get(int(s), 0.0)) for s in dots.screen_of])
+        scatter = np.array(
+            [smallest_scatter(network.surface_scatter_m.get(int(s), 0.0)) for s in control_points.screen_of]
+        )
         if on.any():
-            out.append(SurfaceTerm(dots.screen_of[on], every[on], scatter[on]))
+            out.append(SurfaceTerm(control_points.screen_of[on], every[on], scatter[on]))
     if len(network.rig.screens):
         out.append(FrameTerm(np.arange(len(network.rig.screens)), start.world_from_screen))
     if corners is not None:
@@ -204,40 +206,43 @@ def flat_boards(corners: CornerTerm, sigma_m: float = WARP_SIGMA_M) -> Sequence[
 
 
 def _point_term(network: Network, used: Bools, loss: Cauchy | None = None) -> PointTerm:
-    s = network.sightings
+    s = network.point_observations
     whiten = np.eye(2) / s.sigma_px[used, None, None]
-    return PointTerm(s.camera_of[used], s.dot_of[used], s.pixels[used], whiten, _fisheye(network.rig), loss)
+    return PointTerm(s.camera_of[used], s.point_of[used], s.pixels[used], whiten, _fisheye(network.rig), loss)
 
 
 def _fisheye(rig: Rig) -> Bools:
     return np.array([c.lens == FISHEYE for c in rig.cameras.values()], dtype=bool)
 
 
-def sighting_errors(network: Network, values: Values) -> Array:
+def observation_residuals(network: Network, values: Values) -> Array:
     """Measured minus predicted pixel (n, 2) of all observations, with control points at their SURVEYED positions.
 
     Not at the adjusted ones: a point seen by one camera only follows a wrong pixel as far as its survey sigma allows,
     which would conceal the error. inf where there is no projection.
     """
-    s = network.sightings
+    s = network.point_observations
     cameras = list(rig_of(network.rig, values).cameras.values())
     out = np.full((len(s), 2), np.inf)
     for k, camera in enumerate(cameras):
         mine = np.flatnonzero(s.camera_of == k)
-        errors = s.pixels[mine] - camera.project(network.dots.xyz[s.dot_of[mine]])
+        errors = s.pixels[mine] - camera.project(network.control_points.xyz[s.point_of[mine]])
         out[mine] = np.where(np.isfinite(errors), errors, np.inf)
     return out
 
 
-def sighting_sigmas(network: Network, values: Values) -> Array:
+def normalised_residuals(network: Network, values: Values) -> Array:
     """Length of each observation's error in sigmas (n,), of pixel and survey combined."""
-    s = network.sightings
-    errors = sighting_errors(network, values)
+    s = network.point_observations
+    errors = observation_residuals(network, values)
     term = _point_term(network, np.ones(len(s), dtype=bool))
-    at_survey = {**values, "points": Vectors(network.dots.xyz)}
+    at_survey = {**values, "points": Vectors(network.control_points.xyz)}
     line = term.linearise(at_survey)
     J = next(p for p in line.parts if p.stack == "points").jacobian * s.sigma_px[:, None, None]
-    C = J @ network.dots.covariance[s.dot_of] @ np.swapaxes(J, -1, -2) + np.eye(2) * s.sigma_px[:, None, None] ** 2
+    C = (
+        J @ network.control_points.covariance[s.point_of] @ np.swapaxes(J, -1, -2)
+        + np.eye(2) * s.sigma_px[:, None, None] ** 2
+    )
     safe = np.isfinite(errors).all(axis=1) & np.isfinite(C).all(axis=(1, 2))
     out = np.full(len(s), np.inf)
     out[safe] = np.linalg.norm((whitening(C[safe]) @ errors[safe, :, None])[..., 0], axis=1)
@@ -246,9 +251,9 @@ def sighting_sigmas(network: Network, values: Values) -> Array:
 
 def _inliers(network: Network, values: Values, used: Bools) -> Bools:
     """Observations that are inliers, relative to their own scatter if it exceeds their sigmas."""
-    if not len(network.sightings):
+    if not len(network.point_observations):
         return used
-    off = sighting_sigmas(network, values)
+    off = normalised_residuals(network, values)
     # The median of a two-dimensional Gaussian's length is 1.177 sigmas.
     finite = off[np.isfinite(off)]
     scale = max(1.0, float(np.median(finite)) / 1.177) if finite.size else 1.0
@@ -260,7 +265,7 @@ def _weighted_corners(network: Network, start: Start, values: Values, free: Mapp
     term = replace(network.corners, loss=Cauchy()) if network.corners is not None else None
     assert term is not None
     everything = [
-        _point_term(network, np.ones(len(network.sightings), dtype=bool), Cauchy()),
+        _point_term(network, np.ones(len(network.point_observations), dtype=bool), Cauchy()),
         *_other_terms(network, start, term),
     ]
     found = solve(values, everything, free)
@@ -302,10 +307,12 @@ def _fit(
         variance_factor=factor,
         p_fits=p_fits,
         dof=dof,
-        sighting_errors_px=sighting_errors(network, found.values),
-        sighting_sigmas=sighting_sigmas(network, found.values) if len(network.sightings) else np.empty(0),
+        observation_residuals_px=observation_residuals(network, found.values),
+        normalised_residuals=normalised_residuals(network, found.values)
+        if len(network.point_observations)
+        else np.empty(0),
         used=used,
-        dot_shifts_m=array_of(found.values, "points") - network.dots.xyz,
+        control_point_shifts_m=array_of(found.values, "points") - network.control_points.xyz,
         corner_errors_px=corner_errors,
         corners=corners,
         adjusted=found,

@@ -10,10 +10,10 @@ import numpy as np
 from calibration.findings import Finding, Level
 from calibration.screens.network import Network, NetworkFit
 from calibration.screens.network_sigmas import pointing_sigmas_m, spot_sigmas
-from calibration.screens.screens import Near, ScreensResult
+from calibration.screens.screens import ApproximatePosition, ScreensResult
 from geometry.arrays import Array
 from geometry.camera import Camera
-from geometry.planes import meet_plane
+from geometry.planes import intersect_plane
 from geometry.rig import Screen
 
 _SAME_POSITION = 0.15  # tolerance of another dot's position, as a share of the distance of neighbouring dots
@@ -36,7 +36,7 @@ class ScreenLimits:
 class Outlier:
     """An outlier among the observations, with its probable cause."""
 
-    sighting: int
+    observation: int
     camera: str
     dot: str
     error_px: float
@@ -47,12 +47,12 @@ class Outlier:
 
 def classify_outliers(network: Network, fit: NetworkFit) -> tuple[Outlier, ...]:
     """The observations that the adjustment excluded, with their probable cause."""
-    s, dots = network.sightings, network.dots
+    s, control_points = network.point_observations, network.control_points
     cameras, screens = list(fit.rig.cameras.values()), list(fit.rig.screens.values())
     out: list[Outlier] = []
     for i in np.flatnonzero(~fit.used):
-        camera, dot = cameras[s.camera_of[i]], int(s.dot_of[i])
-        everywhere = camera.project(dots.xyz)
+        camera, dot = cameras[s.camera_of[i]], int(s.point_of[i])
+        everywhere = camera.project(control_points.xyz)
         distances = np.linalg.norm(everywhere - s.pixels[i], axis=1)
         distances[~np.isfinite(distances)] = np.inf
         distances[dot] = np.inf
@@ -60,22 +60,22 @@ def classify_outliers(network: Network, fit: NetworkFit) -> tuple[Outlier, ...]:
         spacing = np.linalg.norm(everywhere - everywhere[nearest], axis=1)
         spacing[nearest] = np.inf
         limit = max(_SAME_POSITION * float(np.nanmin(spacing)), 5 * float(s.sigma_px[i]))
-        at_place_of = dots.names[nearest] if distances[nearest] < limit else ""
-        back = np.flatnonzero((s.camera_of == s.camera_of[i]) & (s.dot_of == nearest) & ~fit.used)
+        at_place_of = control_points.names[nearest] if distances[nearest] < limit else ""
+        back = np.flatnonzero((s.camera_of == s.camera_of[i]) & (s.point_of == nearest) & ~fit.used)
         swapped = bool(at_place_of) and any(
             np.linalg.norm(everywhere[dot] - s.pixels[b]) < limit for b in back.tolist()
         )
         error_m = np.full(2, np.nan)
-        if dots.screen_of[dot] >= 0:
-            error_m = _on_screen(camera, screens[dots.screen_of[dot]], s.pixels[i], dots.xyz[dot])
-        error_px = float(np.linalg.norm(fit.sighting_errors_px[i]))
-        out.append(Outlier(int(i), camera.name, dots.names[dot], error_px, error_m, at_place_of, swapped))
+        if control_points.screen_of[dot] >= 0:
+            error_m = _on_screen(camera, screens[control_points.screen_of[dot]], s.pixels[i], control_points.xyz[dot])
+        error_px = float(np.linalg.norm(fit.observation_residuals_px[i]))
+        out.append(Outlier(int(i), camera.name, control_points.names[dot], error_px, error_m, at_place_of, swapped))
     return tuple(out)
 
 
 def _on_screen(camera: Camera, screen: Screen, pixel: Array, dot: Array) -> Array:
     origin, ray = camera.rays(pixel)
-    return meet_plane(origin, ray, screen.world_from_screen) - screen.world_from_screen.inverse().apply(dot)[:2]
+    return intersect_plane(origin, ray, screen.world_from_screen) - screen.world_from_screen.inverse().apply(dot)[:2]
 
 
 def findings(
@@ -118,12 +118,12 @@ def _agreement(result: ScreensResult, limits: ScreenLimits) -> Finding:
 
 def _doubtful_lens(result: ScreensResult) -> str:
     """The camera with the largest residuals, whose lens calibration may be another camera's."""
-    s, fit = result.network.sightings, result.fit
+    s, fit = result.network.point_observations, result.fit
     if not len(s):
         return ""
     names = list(result.network.rig.cameras)
     misfit = {
-        name: float(np.sqrt(np.mean(fit.sighting_sigmas[rows] ** 2)))
+        name: float(np.sqrt(np.mean(fit.normalised_residuals[rows] ** 2)))
         for c, name in enumerate(names)
         for rows in [(s.camera_of == c) & fit.used]
         if rows.any()
@@ -144,7 +144,7 @@ def _dots(result: ScreensResult, limits: ScreenLimits) -> list[Finding]:
         where = f"camera {m.camera!r}: dot {m.dot!r} is {m.error_px:.1f} px from its predicted position"
         if np.isfinite(m.error_m).all():
             where += f" ({1e3 * m.error_m[0]:+.1f}, {1e3 * m.error_m[1]:+.1f} mm along x, y of its screen)"
-        seen = int(np.sum(network.sightings.dot_of == network.dots.names.index(m.dot)))
+        seen = int(np.sum(network.point_observations.point_of == network.control_points.names.index(m.dot)))
         if m.swapped:
             reported.add((m.camera, m.at_place_of))
             what = f"camera {m.camera!r}: dots {m.dot!r} and {m.at_place_of!r} are exchanged ({m.error_px:.1f} px)"
@@ -161,7 +161,7 @@ def _dots(result: ScreensResult, limits: ScreenLimits) -> list[Finding]:
             )
         out.append(Finding(Level.WARN, what, "it was excluded", remedy))
     for c, name in enumerate(network.rig.cameras):
-        mine = network.sightings.camera_of == c
+        mine = network.point_observations.camera_of == c
         if mine.any() and np.mean(~result.fit.used[mine]) > limits.outliers_fail:
             n, bad = int(mine.sum()), int(np.sum(~result.fit.used[mine]))
             out.append(
@@ -172,7 +172,7 @@ def _dots(result: ScreensResult, limits: ScreenLimits) -> list[Finding]:
                     "check names and coordinates, and that the lens belongs to this camera at this focus",
                 )
             )
-    count = len(network.sightings)
+    count = len(network.point_observations)
     if count and not wrong:
         out.append(Finding(Level.PASS, f"all {count} pixels of dots are consistent with their names"))
     return out
@@ -185,8 +185,8 @@ def _surfaces(result: ScreensResult, limits: ScreenLimits) -> list[Finding]:
             continue
         chosen, flat = screen.flatness.chosen, screen.flatness.flat
         for k in np.flatnonzero(~screen.used):
-            if screen.dots:
-                dot = result.network.dots.names[screen.dots[k]]
+            if screen.control_points:
+                dot = result.network.control_points.names[screen.control_points[k]]
                 out.append(
                     Finding(
                         Level.WARN,
@@ -196,7 +196,7 @@ def _surfaces(result: ScreensResult, limits: ScreenLimits) -> list[Finding]:
                     )
                 )
         n = int(np.sum(screen.used))
-        if screen.dots and n < 6:
+        if screen.control_points and n < 6:
             out.append(
                 Finding(
                     Level.WARN,
@@ -280,7 +280,7 @@ def _second_poses(result: ScreensResult) -> list[Finding]:
     ]
 
 
-def near_findings(result: ScreensResult, near: Mapping[int, Near]) -> list[Finding]:
+def near_findings(result: ScreensResult, near: Mapping[int, ApproximatePosition]) -> list[Finding]:
     """Whether cameras are at their approximate positions, measured by tape."""
     out = []
     for c, n in near.items():

@@ -38,11 +38,11 @@ class NotConnectedError(ValueError):
 
 def camera_on_dots(network: Network, camera: int, within_px: float) -> CameraOnDots:
     """Poses of one camera from the dots that it observes."""
-    s = network.sightings
+    s = network.point_observations
     mine = np.flatnonzero(s.camera_of == camera)
     if len(mine) < FEWEST:
         return CameraOnDots((), f"sees {len(mine)} surveyed dots, expected {FEWEST} or more")
-    points = network.dots.xyz[s.dot_of[mine]]
+    points = network.control_points.xyz[s.point_of[mine]]
     if are_collinear(points):
         return CameraOnDots((), f"sees {len(mine)} surveyed dots that all lie on one line")
     found = resect(list(network.rig.cameras.values())[camera], points, s.pixels[mine], within_px)
@@ -51,7 +51,7 @@ def camera_on_dots(network: Network, camera: int, within_px: float) -> CameraOnD
 
 def chain(
     network: Network,
-    on_dots: Mapping[int, Pose],
+    poses_by_camera: Mapping[int, Pose],
     boards: Mapping[tuple[int, int], Pose],
     held_screen: int | None = None,
     held_camera: int | None = None,
@@ -65,7 +65,7 @@ def chain(
     Raises:
         NotConnectedError: some cameras are not connected with the others.
     """
-    cameras: dict[int, Pose] = dict(on_dots)
+    cameras: dict[int, Pose] = dict(poses_by_camera)
     if not cameras and held_camera is not None:
         cameras[held_camera] = Pose.identity()
     placed: dict[int, Pose] = {}

@@ -21,7 +21,7 @@ class Registration:
 
     world_from_cloud: Pose
     covariance: Array  # (6, 6) of its error
-    misses_m: Array  # (n, 3), world: transformed targets of the scan minus surveyed targets
+    residuals_m: Array  # (n, 3), world: transformed targets of the scan minus surveyed targets
     factor: float  # residuals over their sigmas, at least 1; the covariance is multiplied by its square
 
 

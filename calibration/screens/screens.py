@@ -38,7 +38,7 @@ class Scan:
 class ScreenSetup:
     """Options of one screen."""
 
-    frame_dots: tuple[int, int, int] | None = None  # dots: origin, on the x axis, on the side of positive y
+    frame_points: tuple[int, int, int] | None = None  # dots: origin, on the x axis, on the side of positive y
     origin_at: tuple[float, float] = (0.0, 0.0)  # m: coordinates of the first of them in the screen's frame
     bow: str = "auto"  # auto, always or never
     scatter_m: float | None = None  # of the surface, if known
@@ -46,7 +46,7 @@ class ScreenSetup:
 
 
 @dataclass(frozen=True, slots=True)
-class Near:
+class ApproximatePosition:
     """Approximate position of a camera, measured by tape."""
 
     position_m: Array  # (3,), world
@@ -60,7 +60,7 @@ class ScreenResult:
     flatness: Flatness | None  # None: the screen has only a fixed board
     xyz: Array  # (m, 3), m: the points of the surface fit, in the screen's final frame; m = 0 without
     used: Bools  # (m,)
-    dots: tuple[int, ...]  # indices of the dots; empty for a scan
+    control_points: tuple[int, ...]  # indices of the dots; empty for a scan
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +70,7 @@ class ScreensResult:
     network: Network
     fit: NetworkFit
     screens: tuple[ScreenResult, ...]
-    on_dots: Mapping[int, CameraOnDots] = field(default_factory=dict)
+    poses_by_camera: Mapping[int, CameraOnDots] = field(default_factory=dict)
     # camera -> a second pose that fits nearly as well
     second_poses: Mapping[int, ResectedPose] = field(default_factory=dict)
 
@@ -78,7 +78,7 @@ class ScreensResult:
 def calibrate(
     network: Network,
     setups: Sequence[ScreenSetup],
-    near: Mapping[int, Near] | None = None,
+    near: Mapping[int, ApproximatePosition] | None = None,
     held_screen: int | None = None,
     held_camera: int | None = None,
 ) -> ScreensResult:
@@ -93,11 +93,11 @@ def calibrate(
         ValueError: the dots do not determine a screen's plane.
     """
     near = {} if near is None else near
-    on_dots = {c: camera_on_dots(network, c, WITHIN_PX) for c in range(len(network.rig.cameras))}
-    chosen = {c: _choose(found, near.get(c)) for c, found in on_dots.items() if found.poses}
+    poses_by_camera = {c: camera_on_dots(network, c, WITHIN_PX) for c in range(len(network.rig.cameras))}
+    chosen = {c: _choose(found, near.get(c)) for c, found in poses_by_camera.items() if found.poses}
     boards = boards_seen(network, WITHIN_PX)
-    surveyed = bool(chosen) or (bool(np.any(network.dots.screen_of >= 0)) and not boards)
-    problems = {c: found.problem for c, found in on_dots.items()}
+    surveyed = bool(chosen) or (bool(np.any(network.control_points.screen_of >= 0)) and not boards)
+    problems = {c: found.problem for c, found in poses_by_camera.items()}
     placed = {c: p.camera_from_world for c, p in chosen.items()}
     chained = chain(network, placed, boards, held_screen, held_camera, problems)
     complete, frames, bows, results = _screen_starts(network, setups, chained)
@@ -112,9 +112,12 @@ def calibrate(
     fit = adjust(complete, start)
     results = [_in_final_frame(r, complete, fit, k) for k, r in enumerate(results)]
     second_poses = {
-        c: r for c, found in on_dots.items() for r in [_second_pose(found, chosen.get(c), near.get(c))] if r is not None
+        c: r
+        for c, found in poses_by_camera.items()
+        for r in [_second_pose(found, chosen.get(c), near.get(c))]
+        if r is not None
     }
-    return ScreensResult(complete, fit, tuple(results), on_dots, second_poses)
+    return ScreensResult(complete, fit, tuple(results), poses_by_camera, second_poses)
 
 
 def _screen_starts(
@@ -126,7 +129,7 @@ def _screen_starts(
     results: list[ScreenResult] = []
     bows = np.zeros((len(setups), 3))
     scatter: dict[int, float] = {}
-    off = np.zeros(len(network.dots), dtype=bool)
+    off = np.zeros(len(network.control_points), dtype=bool)
     bent: set[int] = set()
     priors: list[Prior] = []
     for k, (name, setup) in enumerate(zip(network.rig.screens, setups, strict=True)):
@@ -141,17 +144,17 @@ def _screen_starts(
             priors.append(_scan_prior(k, scan))
             results.append(ScreenResult(scan.flatness, scan.xyz, scan.flatness.chosen.used, ()))
             continue
-        dots = np.flatnonzero(network.dots.screen_of == k)
-        if not len(dots):
+        control_points = np.flatnonzero(network.control_points.screen_of == k)
+        if not len(control_points):
             results.append(ScreenResult(None, np.empty((0, 3)), np.empty(0, dtype=bool), ()))
             continue
-        pose, flatness = screen_of_dots(network, dots, setup, seen_from, name)
+        pose, flatness = screen_of_dots(network, control_points, setup, seen_from, name)
         frames[k], bows[k] = pose, flatness.chosen.coefficients[3:]
         scatter[k] = flatness.chosen.scatter_m
-        off[dots[~flatness.chosen.used]] = True
+        off[control_points[~flatness.chosen.used]] = True
         if flatness.chosen.bent:
             bent.add(k)
-        results.append(ScreenResult(flatness, np.empty((0, 3)), flatness.chosen.used, tuple(dots.tolist())))
+        results.append(ScreenResult(flatness, np.empty((0, 3)), flatness.chosen.used, tuple(control_points.tolist())))
     complete = replace(
         network,
         surface_scatter_m=scatter,
@@ -171,15 +174,15 @@ def _board_on(network: Network, screen: int | None) -> int | None:
 
 
 def screen_of_dots(
-    network: Network, dots: Ints, setup: ScreenSetup, seen_from: Array | None, name: str
+    network: Network, control_points: Ints, setup: ScreenSetup, seen_from: Array | None, name: str
 ) -> tuple[Pose, Flatness]:
     """A screen's frame and flatness from its surveyed dots alone.
 
     Raises:
         ValueError: the dots do not determine its plane.
     """
-    xyz, C = network.dots.xyz[dots], network.dots.covariance[dots]
-    count = len(dots)
+    xyz, C = network.control_points.xyz[control_points], network.control_points.covariance[control_points]
+    count = len(control_points)
     if count < 3:
         raise ValueError(f"screen {name!r}: {count} surveyed dots, expected 3 or more; 8 show whether it is flat")
     s = np.linalg.svd(xyz - xyz.mean(axis=0), compute_uv=False)
@@ -188,10 +191,10 @@ def screen_of_dots(
             f"screen {name!r}: its {count} dots are collinear within {1e3 * s[1] / np.sqrt(count):.3g} mm;"
             " a plane requires dots off that line"
         )
-    if setup.frame_dots is None:
+    if setup.frame_points is None:
         frame = frame_of_extent(xyz, seen_from)
     else:
-        o, x, y = (network.dots.xyz[i] for i in setup.frame_dots)
+        o, x, y = (network.control_points.xyz[i] for i in setup.frame_points)
         frame = frame_of_dots(xyz, o, x, y, np.array(setup.origin_at))
     # Repeated in the frame of the chosen surface, whose tilt is not affected by dots off the screen.
     flatness = assess_flatness(*_heights(frame, xyz, C), setup.bow, setup.scatter_m)
@@ -261,19 +264,21 @@ def _scan_prior(screen: int, scan: Scan) -> Prior:
     return Prior((("screens", screen), ("bow", screen)), (poses, Vectors(bow[None])), scan.covariance)
 
 
-def _choose(found: CameraOnDots, near: Near | None) -> ResectedPose:
+def _choose(found: CameraOnDots, near: ApproximatePosition | None) -> ResectedPose:
     """The best pose, of those near the approximate position if there is one."""
     if near is None:
         return found.poses[0]
     return min(found.poses, key=lambda p: (distance_from(p, near) > near.within_m, -int(p.inliers.sum()), p.rms_px))
 
 
-def distance_from(place: ResectedPose, near: Near) -> float:
+def distance_from(place: ResectedPose, near: ApproximatePosition) -> float:
     """Distance, m, of a pose's camera centre from the approximate position."""
     return float(np.linalg.norm(place.camera_from_world.inverse().translation - near.position_m))
 
 
-def _second_pose(found: CameraOnDots, chosen: ResectedPose | None, near: Near | None) -> ResectedPose | None:
+def _second_pose(
+    found: CameraOnDots, chosen: ResectedPose | None, near: ApproximatePosition | None
+) -> ResectedPose | None:
     if chosen is None or len(found.poses) < 2:
         return None
     other = found.poses[1] if found.poses[0] is chosen else found.poses[0]
@@ -283,8 +288,8 @@ def _second_pose(found: CameraOnDots, chosen: ResectedPose | None, near: Near | 
 
 
 def _in_final_frame(result: ScreenResult, network: Network, fit: NetworkFit, screen: int) -> ScreenResult:
-    if not result.dots:
+    if not result.control_points:
         return result
     world_from_screen = list(fit.rig.screens.values())[screen].world_from_screen
-    xyz = world_from_screen.inverse().apply(network.dots.xyz[list(result.dots)])
+    xyz = world_from_screen.inverse().apply(network.control_points.xyz[list(result.control_points)])
     return replace(result, xyz=xyz)

@@ -16,7 +16,7 @@ import numpy as np
 from calibration.least_squares.adjustment import AdjustmentError
 from calibration.screens.network import Network
 from calibration.screens.network_start import NotConnectedError
-from calibration.screens.screens import Near, ScreenSetup, ScreensResult, calibrate
+from calibration.screens.screens import ApproximatePosition, ScreenSetup, ScreensResult, calibrate
 from geometry.arrays import Array, Bools
 
 UNITS: Mapping[float, str] = {
@@ -39,34 +39,36 @@ def wrong_unit(extent_m: float, expected_m: float) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class SurveySuspect:
+class SurveyError:
     """A change to the survey that makes the measurements consistent."""
 
     words: str  # the correction of the survey
     factor: float  # residuals over their sigmas after the correction
 
 
-def suspects(
+def diagnose_survey(
     network: Network,
     setups: Sequence[ScreenSetup],
-    near: Mapping[int, Near],
+    near: Mapping[int, ApproximatePosition],
     held_screen: int | None,
     current: float,
-) -> list[SurveySuspect]:
+) -> list[SurveyError]:
     """Changes with which the measurements fit much better than with the survey as it is, the best first.
 
     current: present misfit (inf if there is no solution).
     """
     out = []
     for words, change in _changes(network):
-        trial = replace(network, dots=replace(network.dots, xyz=change(network.dots.xyz)))
+        trial = replace(network, control_points=replace(network.control_points, xyz=change(network.control_points.xyz)))
         misfit_now = misfit(trial, setups, near, held_screen)
         if misfit_now < 0.3 * current:
-            out.append(SurveySuspect(words, misfit_now))
+            out.append(SurveyError(words, misfit_now))
     return sorted(out, key=lambda s: s.factor)
 
 
-def misfit(network: Network, setups: Sequence[ScreenSetup], near: Mapping[int, Near], held_screen: int | None) -> float:
+def misfit(
+    network: Network, setups: Sequence[ScreenSetup], near: Mapping[int, ApproximatePosition], held_screen: int | None
+) -> float:
     """Misfit of a network: residuals over sigmas, outliers and distances from approximate positions; inf on failure."""
     try:
         result = calibrate(network, setups, near, held_screen)
@@ -75,7 +77,7 @@ def misfit(network: Network, setups: Sequence[ScreenSetup], near: Mapping[int, N
     return misfit_of(result, near)
 
 
-def misfit_of(result: ScreensResult, near: Mapping[int, Near]) -> float:
+def misfit_of(result: ScreensResult, near: Mapping[int, ApproximatePosition]) -> float:
     """Misfit of a result, as in `misfit`."""
     out = float(np.sqrt(result.fit.variance_factor))
     if len(result.fit.used):
@@ -91,9 +93,9 @@ def _changes(network: Network) -> list[tuple[str, Callable[[Array], Array]]]:
     axes = "xyz"
     out: list[tuple[str, Callable[[Array], Array]]] = []
     screens = list(network.rig.screens)
-    wholes: list[tuple[str, Bools]] = [("the survey", np.ones(len(network.dots), dtype=bool))]
+    wholes: list[tuple[str, Bools]] = [("the survey", np.ones(len(network.control_points), dtype=bool))]
     if len(screens) > 1:
-        wholes += [(f"the dots of screen {n!r}", network.dots.screen_of == k) for k, n in enumerate(screens)]
+        wholes += [(f"the dots of screen {n!r}", network.control_points.screen_of == k) for k, n in enumerate(screens)]
     for whose, some in wholes:
         if not some.any():
             continue

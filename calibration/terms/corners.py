@@ -25,7 +25,7 @@ from calibration.terms.surveyed import array_of, pose_of
 from geometry.arrays import Array, Bools, Ints, cross
 from geometry.camera import Projected, project_points_full
 
-INTRINSICS = 18  # numbers of a camera: fx, fy, cx, cy and OpenCV's fourteen distortion coefficients
+INTRINSICS_COUNT = 18  # numbers of a camera: fx, fy, cx, cy and OpenCV's fourteen distortion coefficients
 _BY_BOARD = ("warp", "radius", "stretch")  # stacks with one unknown per board
 
 

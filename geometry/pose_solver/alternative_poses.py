@@ -24,7 +24,7 @@ SAME = 1e-4  # m and rad
 MAX_FIT_GAIN = 50.0
 
 
-def alternatives(
+def alternative_poses(
     model: SpotModel, world_from_body: Pose, rows: Ints | Sequence[int], tolerance_px: float = 1.0
 ) -> Pose:
     """All other poses (k,) that put the spots of views `rows` (m,) where the given pose puts them.

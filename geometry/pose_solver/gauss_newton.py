@@ -14,7 +14,7 @@ from geometry.arrays import Array, Ints, symmetric
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.uncertainty.chi_square import chi2_limit
-from geometry.uncertainty.rig_uncertainty import CalibrationSpread
+from geometry.uncertainty.rig_uncertainty import RigUncertainty
 
 # Relative size below which a singular value of the whitened Jacobian counts as zero. Exact degeneracies (three spots of
 # one screen are collinear in every pose) give 1e-13 and less; the worst usable geometry gives about 1e-4.
@@ -68,7 +68,7 @@ class PoseFit:
 
         Errors of the calibration move a spot and, through the pose, its prediction too; their common part cancels.
         """
-        return point_covariance(self.jacobian, self.noise) + self.calibration_px()
+        return pixel_covariance(self.jacobian, self.noise) + self.calibration_px()
 
     def calibration_px(self) -> Array | float:
         """The calibration's part of `spot_covariances`: (n, 2, 2), px^2; 0 if its covariance is not known."""
@@ -111,7 +111,7 @@ def fit_pose(
     start: Pose,
     *,
     prior: tuple[Pose, Array] | None = None,
-    calibration: CalibrationSpread | None = None,
+    calibration: RigUncertainty | None = None,
     max_iterations: int = 25,
 ) -> PoseFit | None:
     """The least-squares pose of the spots of views `rows` (m,) at `pixels` (m, 2), with covariances (m, 2, 2), px^2.
@@ -255,7 +255,7 @@ def covariance_of(H: Array) -> tuple[Array, bool]:
     return (vectors / eigenvalues) @ vectors.T, True
 
 
-def good_enough(fit: PoseFit, limits: SolveLimits) -> bool:
+def is_measurement(fit: PoseFit, limits: SolveLimits) -> bool:
     """Whether a fit is a measurement of the pose: full rank, and no sigma of any direction above the limits."""
     if not fit.observable:
         return False
@@ -264,7 +264,7 @@ def good_enough(fit: PoseFit, limits: SolveLimits) -> bool:
     return bool(worst_m <= limits.max_sigma_m and worst_rad <= limits.max_sigma_rad)
 
 
-def point_covariance(J: Array, covariance: Array) -> Array:
+def pixel_covariance(J: Array, covariance: Array) -> Array:
     """Covariances (..., 2, 2), px^2, of pixels due to a pose covariance C (6, 6): J C J^T, J (..., 2, 6)."""
 
     return J @ covariance @ np.swapaxes(J, -1, -2)

@@ -12,7 +12,7 @@ from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.pose_solver.gauss_newton import PoseFit, SolveLimits, fit_pose
 from geometry.uncertainty.chi_square import chi2_limit
-from geometry.uncertainty.rig_uncertainty import CalibrationSpread
+from geometry.uncertainty.rig_uncertainty import RigUncertainty
 
 # Squared sigmas by which a pose from three spots may differ from the expected one (p = 1e-3 for six numbers).
 EXPECTED_GATE = 22.5
@@ -32,7 +32,7 @@ class _LabelledSpots:
     expected: tuple[Pose, Array] | None
     limits: SolveLimits
     noise_scale: float
-    calibration: CalibrationSpread | None
+    calibration: RigUncertainty | None
 
     def fit(self, keep: Ints) -> PoseFit | None:
         """The fit to some of the spots."""
@@ -83,7 +83,7 @@ def fit_pose_robust(
     expected: tuple[Pose, Array] | None = None,
     limits: SolveLimits | None = None,
     noise_scale: float = 1.0,
-    calibration: CalibrationSpread | None = None,
+    calibration: RigUncertainty | None = None,
 ) -> PoseFit | None:
     """As `fit_pose`, but one or two spots may be wrong; they are then left out (missing from the result's rows).
 

@@ -22,7 +22,7 @@ SAME_RAD, SAME_M = float(np.deg2rad(0.05)), 0.002
 PARALLEL = 1e-3  # sine of the angle between two rays below which they define no frame
 
 
-def lie_on_each_other(model: SpotModel, turn: Pose, within_rad: float = SAME_RAD, within_m: float = SAME_M) -> bool:
+def is_symmetry(model: SpotModel, turn: Pose, within_rad: float = SAME_RAD, within_m: float = SAME_M) -> bool:
     """Whether a transform of the body maps each spot's ray onto the ray of a spot on the same screen."""
     points, rays, screens = _rays(model)
     moved, turned = turn.apply(points), turn.turn(rays)
@@ -46,7 +46,7 @@ def symmetries(model: SpotModel) -> list[Pose]:
             continue
         turn = _frame(points[c], rays[c], points[d], rays[d]) @ start.inverse()
         differs = rotations.angle(turn.rotation) > 10 * SAME_RAD or np.linalg.norm(turn.translation) > 10 * SAME_M
-        if differs and lie_on_each_other(model, turn) and not any(_same(turn, other) for other in found):
+        if differs and is_symmetry(model, turn) and not any(_same(turn, other) for other in found):
             found.append(turn)
     return found
 

@@ -55,7 +55,7 @@ def rig_names(rig: Rig, bow: bool = False) -> tuple[str, ...]:
     return tuple(names)
 
 
-def split(name: str) -> tuple[str, str, str]:
+def split_name(name: str) -> tuple[str, str, str]:
     """Kind, item and parameter: `cameras.left.fx` gives cameras, left, fx; the item's own name may contain dots."""
     kind, rest = name.split(".", 1)
     item, parameter = rest.rsplit(".", 1)
@@ -66,7 +66,7 @@ def is_known(rig: Rig, name: str) -> bool:
     """Whether this rig has a parameter of this name."""
     if name.count(".") < 2:
         return False
-    kind, item, parameter = split(name)
+    kind, item, parameter = split_name(name)
     if kind == "cameras" and item in rig.cameras:
         return parameter in camera_names(rig.cameras[item])
     if kind == "screens" and item in rig.screens:
@@ -74,7 +74,7 @@ def is_known(rig: Rig, name: str) -> bool:
     return kind == "beams" and item in rig.beams and parameter in (*DIRECTION, *POINT)
 
 
-def moved(rig: Rig, names: Sequence[str], delta: Array) -> Rig:
+def perturbed(rig: Rig, names: Sequence[str], delta: Array) -> Rig:
     """The rig with each named parameter changed by delta (p,), in the parameters' units.
 
     Raises:
@@ -84,7 +84,7 @@ def moved(rig: Rig, names: Sequence[str], delta: Array) -> Rig:
     for name, value in zip(names, delta, strict=True):
         if not is_known(rig, name):
             raise KeyError(name)
-        kind, item, parameter = split(name)
+        kind, item, parameter = split_name(name)
         changes.setdefault((kind, item), {})[parameter] = float(value)
     cameras, screens, beams = dict(rig.cameras), dict(rig.screens), dict(rig.beams)
     for (kind, item), change in changes.items():
@@ -150,7 +150,7 @@ class Sensitivity:
         for i, name in enumerate(self.names):
             if not is_known(rig, name):
                 raise KeyError(name)
-            kind, item, parameter = split(name)
+            kind, item, parameter = split_name(name)
             if kind == "cameras":
                 field, column = _camera_column(rig.cameras[item], parameter)
                 views = camera_of == cameras.index(item)

@@ -17,7 +17,7 @@ from geometry.rig import Rig
 from geometry.uncertainty.rig_parameters import RigCovariance, Sensitivity
 
 
-class CalibrationSpread:
+class RigUncertainty:
     """The joint covariance of the pixels of all views that the covariance of a rig's calibration implies."""
 
     def __init__(self, rig: Rig, model: SpotModel, covariance: RigCovariance) -> None:

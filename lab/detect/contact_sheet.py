@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from lab.pictures.picture_file import Grey
+from lab.pictures.picture_file import GreyPicture
 from lab.report.plot.image import grey_limits, stretched
 from tracking.detections import Detections
 
@@ -30,7 +30,7 @@ _FONT = cv2.FONT_HERSHEY_SIMPLEX
 @dataclass(frozen=True, slots=True)
 class _Kept:
     frame: int
-    picture: Grey
+    picture: GreyPicture
     found: Detections
 
 
@@ -45,7 +45,7 @@ class ContactSheet:
     _kept: dict[int, _Kept] = field(default_factory=dict)  # by index in the series
     _stride: int = 1
 
-    def offer(self, index: int, frame: int, picture: Grey, found: Detections) -> None:
+    def offer(self, index: int, frame: int, picture: GreyPicture, found: Detections) -> None:
         """Offer the picture at this index of the series, from 0, with its detections."""
         if self._selects(index):
             self._kept[index] = _Kept(frame, picture.copy(), found)

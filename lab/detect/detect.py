@@ -16,12 +16,12 @@ from lab.detect.contact_sheet import ContactSheet
 from lab.detect.inputs import PictureFiles, Video, open_inputs
 from lab.detect.picture_series import PictureSeries
 from lab.errors import InputError
-from lab.files.run.parameter_overrides import overridden
+from lab.files.run.parameter_overrides import with_overrides
 from lab.files.text import columns
 from lab.files.text.atomic_write import atomic_folder
 from lab.files.text.csv_text import csv_word
 from lab.files.text.json_text import write_json
-from lab.pictures.picture_file import Missing
+from lab.pictures.picture_file import MissingPicture
 from lab.runs.tables import detection_rows
 from lab.versions import versions
 from tracking.parameters import DetectParameters, TrackerParameters
@@ -54,7 +54,7 @@ class DetectOptions:
                 f"--set: {others[0]}: expected a parameter of detection, such as detect.threshold_sigma; this command"
                 " does not track"
             )
-        return overridden(TrackerParameters(), self.overrides).detect
+        return with_overrides(TrackerParameters(), self.overrides).detect
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +91,7 @@ def detect_pictures(
     source = str(inputs.path if isinstance(inputs, Video) else given[0] if len(given) == 1 else f"{len(given)} files")
     series = PictureSeries(inputs.camera, source, parameters, notes=list(inputs.notes))
     with atomic_folder(out, may_replace=are_detections) as folder:
-        series.estimate_noise([p for p in inputs.noise_pictures() if not isinstance(p, Missing)])
+        series.estimate_noise([p for p in inputs.noise_pictures() if not isinstance(p, MissingPicture)])
         sheet = ContactSheet(_total(inputs, options))
         _search_all(inputs, series, sheet, folder / "detections.csv", options, progress)
         _add_notes(series)
@@ -125,7 +125,7 @@ def _search_all(
         file.write(",".join(columns.DETECTIONS) + "\n")
         pictures = islice(inputs.pictures(options.every), options.limit)
         for done, (frame, picture) in enumerate(pictures, start=1):
-            if isinstance(picture, Missing):
+            if isinstance(picture, MissingPicture):
                 series.unreadable.setdefault(picture.reason, []).append(frame)
             else:
                 found = series.search(frame, picture)

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from geometry.arrays import Array, Bools
-from lab.number_format import short
-from lab.report.plot.axes import Plane, axes, frame, image_plane, note, plane, svg_of
+from lab.number_format import format_number
+from lab.report.plot.axes import PlotArea, axes, frame, image_area, note, plot_area, svg_of
 from lab.report.plot.scales import ticks
 from lab.report.plot.svg import BLUE, ORANGE, VERMILLION, dots, line_path, polyline, text
 from tracking.noise_estimation.levels import LevelVariances
@@ -34,7 +34,7 @@ def counts_chart(series: Sequence[tuple[str, Array]], title: str, x_name: str, *
     lo, hi = float(middle - half), float(middle + half)
     edges = np.linspace(lo, hi, _BINS + 1)
     counts = [np.histogram(np.clip(np.log10(v), lo, hi), edges)[0].astype(float) for _, v in good]
-    p = plane((lo, hi), (0.0, max(float(c.max()) for c in counts) * 1.08), height=250)
+    p = plot_area((lo, hi), (0.0, max(float(c.max()) for c in counts) * 1.08), height=250)
     base = float(p.Y(np.array(0.0)))
     out = _log_axes(p, title, x_name)
     for (name, _), count, colour in zip(good, counts, _COLOURS, strict=False):
@@ -49,14 +49,14 @@ def counts_chart(series: Sequence[tuple[str, Array]], title: str, x_name: str, *
     if len(good) > 1:
         for i, ((name, _), colour) in enumerate(zip(good, _COLOURS, strict=False)):
             out.append(text(right - 8, p.box[1] + 14 + 15 * i, name, "end", f"fill:{colour};font-weight:600"))
-    medians = "; ".join(f"{name}: median {short(float(np.median(v)))}" for name, v in good)
+    medians = "; ".join(f"{name}: median {format_number(float(np.median(v)))}" for name, v in good)
     out.append(note(p, f"{len(good[0][1])} spots; {medians}"))
     return svg_of(p, title, [*out, frame(p)])
 
 
 def places_chart(uv_px: Array, size_px: tuple[int, int]) -> str:
     """Positions of spots (n, 2) in the picture; evenly thinned if there are very many."""
-    p = image_plane(size_px)
+    p = image_area(size_px)
     shown = uv_px[:: max(1, -(-len(uv_px) // _MOST_DOTS))]
     out = axes(p, "Positions of the spots", "u (px)", "v (px)", grid=False)
     out.append(f'<path d="{dots(p.at(shown), 1.6 if len(shown) > 300 else 2.6)}" fill="{BLUE}" fill-opacity="0.45"/>')
@@ -86,7 +86,7 @@ def noise_chart(estimate: NoiseEstimate, measured: LevelVariances | None, name: 
     if measured is not None and len(measured.variance):
         # Variances far above the line come from light that changed between the pictures, such as spots that moved.
         highest = max(highest, float(np.minimum(measured.variance + measured.sigma, 2 * highest).max()) * 1.08)
-    p = plane((bottom, top), (0.0, highest), height=280)
+    p = plot_area((bottom, top), (0.0, highest), height=280)
     title = f"Variance of a pixel: {name}"
     out = axes(p, title, "grey value (DN)", "variance (DN²)")
     band = np.concatenate(
@@ -113,7 +113,7 @@ def noise_chart(estimate: NoiseEstimate, measured: LevelVariances | None, name: 
     return svg_of(p, title, [*out, frame(p)])
 
 
-def _log_axes(p: Plane, title: str, x_name: str) -> list[str]:
+def _log_axes(p: PlotArea, title: str, x_name: str) -> list[str]:
     """Axes whose horizontal values are decimal logarithms."""
     left, top, wide, high = p.box
     bottom = top + high

@@ -15,8 +15,8 @@ from lab.detect.detect_charts import counts_chart, noise_chart, places_chart
 from lab.detect.findings import SizeGroup
 from lab.detect.picture_series import PictureSeries
 from lab.files.text.atomic_write import atomic_write_text
-from lab.number_format import short
-from lab.pictures.picture_file import Grey
+from lab.number_format import format_number
+from lab.pictures.picture_file import GreyPicture
 from lab.report.calibration.calibration_page import PageDrawing, PageTable, Section, section_context
 from lab.report.html import environment
 from lab.report.plot.series import Line, time_panel
@@ -62,16 +62,28 @@ def _key_figures(series: PictureSeries, table: Array, groups: list[SizeGroup]) -
     if len(table):
         low, middle, high = np.percentile(table[:, 3], [5, 50, 95])
         figures.append(
-            ("Size", f"{short(middle)} px", f"1 sigma of the major axis; 90 %: {short(low)} to {short(high)}")
+            (
+                "Size",
+                f"{format_number(middle)} px",
+                f"1 sigma of the major axis; 90 %: {format_number(low)} to {format_number(high)}",
+            )
         )
         low, middle, high = np.percentile(table[:, 5], [5, 50, 95])
         figures.append(
-            ("Signal to noise", short(middle), f"matched filter, median; 90 %: {short(low)} to {short(high)}")
+            (
+                "Signal to noise",
+                format_number(middle),
+                f"matched filter, median; 90 %: {format_number(low)} to {format_number(high)}",
+            )
         )
     model = groups[0].noise.model
     if model is not None:
         figures.append(
-            ("Noise", f"{short(math.sqrt(model.floor_dn2))} DN", f"of a pixel at {short(model.black_dn)} DN")
+            (
+                "Noise",
+                f"{format_number(math.sqrt(model.floor_dn2))} DN",
+                f"of a pixel at {format_number(model.black_dn)} DN",
+            )
         )
     return figures
 
@@ -173,7 +185,7 @@ def _caption(measured: LevelVariances | None) -> str:
     return f"{line} Dots: measured {how}; triangles: larger variances, where the light itself changed."
 
 
-def _levels(pictures: list[Grey], group: SizeGroup) -> LevelVariances | None:
+def _levels(pictures: list[GreyPicture], group: SizeGroup) -> LevelVariances | None:
     """The variances by grey level that the estimate was made from; None for small pictures."""
     estimate = group.noise.estimate
     if not pictures or estimate is None or min(pictures[0].shape) < 32:
@@ -185,9 +197,9 @@ def _levels(pictures: list[Grey], group: SizeGroup) -> LevelVariances | None:
 def _with_sigma(value: float, relative: float) -> str:
     """A value with the sigma of its logarithm: as a factor if that is large, else as a percentage."""
     return (
-        f"{short(value)} ×/÷ {math.exp(relative):.2f}"
+        f"{format_number(value)} ×/÷ {math.exp(relative):.2f}"
         if relative > 0.15
-        else f"{short(value)} ± {100 * relative:.0f} %"
+        else f"{format_number(value)} ± {100 * relative:.0f} %"
     )
 
 

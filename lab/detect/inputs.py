@@ -10,12 +10,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lab.errors import InputError
-from lab.pictures.picture_file import SUFFIXES, Grey, Missing, read_picture
+from lab.pictures.picture_file import PICTURE_SUFFIXES, GreyPicture, MissingPicture, read_picture
 from lab.runs.frames.frame_sources import VideoSource, header_picture_count, number_of, open_video
 from lab.runs.frames.frames import AHEAD, THREADS
 from lab.runs.frames.sensor_noise import VIDEO_PICTURES, noise_estimation_frames
 
-_HINT = f"a picture ({', '.join(s[1:] for s in SUFFIXES)}), a folder of pictures, or a video"
+_HINT = f"a picture ({', '.join(s[1:] for s in PICTURE_SUFFIXES)}), a folder of pictures, or a video"
 _SHOWN = 3  # names in a message
 
 
@@ -31,10 +31,10 @@ class PictureFiles:
         """Number of pictures if every `every`-th is read."""
         return -(-len(self.files) // every)
 
-    def pictures(self, every: int) -> Iterator[tuple[int, Grey | Missing]]:
+    def pictures(self, every: int) -> Iterator[tuple[int, GreyPicture | MissingPicture]]:
         """Every `every`-th picture with its frame number, read ahead in threads."""
         wanted = iter(self.files[::every])
-        waiting: deque[tuple[int, Future[Grey | Missing]]] = deque()
+        waiting: deque[tuple[int, Future[GreyPicture | MissingPicture]]] = deque()
         with ThreadPoolExecutor(THREADS, thread_name_prefix="decode") as pool:
             while True:
                 while len(waiting) < AHEAD and (following := next(wanted, None)) is not None:
@@ -44,7 +44,7 @@ class PictureFiles:
                 number, later = waiting.popleft()
                 yield number, later.result()
 
-    def noise_pictures(self) -> Iterator[Grey | Missing]:
+    def noise_pictures(self) -> Iterator[GreyPicture | MissingPicture]:
         """Pairs of neighbouring pictures, for the estimate of the noise."""
         for i in noise_estimation_frames(len(self.files)):
             yield read_picture(self.files[i][1], None)
@@ -63,7 +63,7 @@ class Video:
         stated = header_picture_count(self.path)
         return None if stated is None else -(-stated // every)
 
-    def pictures(self, every: int) -> Iterator[tuple[int, Grey | Missing]]:
+    def pictures(self, every: int) -> Iterator[tuple[int, GreyPicture | MissingPicture]]:
         """Every `every`-th picture with its frame number."""
         video = VideoSource(self.path, None)
         try:
@@ -81,7 +81,7 @@ class Video:
         finally:
             video.close()
 
-    def noise_pictures(self) -> Iterator[Grey | Missing]:
+    def noise_pictures(self) -> Iterator[GreyPicture | MissingPicture]:
         """Pairs of neighbouring pictures at the start, for the estimate of the noise."""
         video = VideoSource(self.path, None)
         try:
@@ -106,7 +106,7 @@ def open_inputs(given: Sequence[Path], camera: str | None = None) -> PictureFile
         return _numbered(files, camera or given[0].resolve().name)
     files = [file for path in given for file in _files_of(path)]
     files = list({file.resolve(): file for file in files}.values())
-    others = [f for f in files if f.suffix.lower() not in SUFFIXES]
+    others = [f for f in files if f.suffix.lower() not in PICTURE_SUFFIXES]
     if others and len(files) > 1:
         raise InputError(
             f"{others[0]}: expected pictures only, or a single video, got it among {len(files)} files; give the"
@@ -139,13 +139,15 @@ def _pictures_in(folder: Path) -> list[Path]:
         names = sorted(p for p in folder.iterdir() if not p.name.startswith("."))
     except OSError as error:
         raise InputError(f"{folder}: cannot be read: {error.strerror}") from None
-    pictures = [p for p in names if p.suffix.lower() in SUFFIXES and p.is_file()]
+    pictures = [p for p in names if p.suffix.lower() in PICTURE_SUFFIXES and p.is_file()]
     if pictures:
         return pictures
-    below = [p.name for p in names if p.is_dir() and any(q.suffix.lower() in SUFFIXES for q in p.iterdir())]
+    below = [p.name for p in names if p.is_dir() and any(q.suffix.lower() in PICTURE_SUFFIXES for q in p.iterdir())]
     hint = f"; its folders {', '.join(below[:_SHOWN])} do: name one of them" if below else ""
     among = f" among {len(names)} files" if names and not below else ""
-    raise InputError(f"{folder}: the folder holds no pictures ({', '.join(s[1:] for s in SUFFIXES)}){among}{hint}")
+    raise InputError(
+        f"{folder}: the folder holds no pictures ({', '.join(s[1:] for s in PICTURE_SUFFIXES)}){among}{hint}"
+    )
 
 
 def _require_video(path: Path) -> None:

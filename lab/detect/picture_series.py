@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from lab.detect.findings import SizeGroup, SpotCollection, matched_snr
-from lab.pictures.picture_file import Grey
+from lab.pictures.picture_file import GreyPicture
 from lab.runs.frames.sensor_noise import CameraNoise
 from tracking.detections import Detections
 from tracking.parameters import DetectParameters
@@ -21,7 +21,9 @@ class PictureSeries:
     source: str
     parameters: DetectParameters
     groups: dict[tuple[tuple[int, int], int], SizeGroup] = field(default_factory=dict)
-    noise_pictures: dict[tuple[tuple[int, int], int], list[Grey]] = field(default_factory=dict)  # the noise's source
+    noise_pictures: dict[tuple[tuple[int, int], int], list[GreyPicture]] = field(
+        default_factory=dict
+    )  # the noise's source
     spots: SpotCollection = field(default_factory=SpotCollection)
     unreadable: dict[str, list[int]] = field(default_factory=dict)  # frames by reason
     notes: list[str] = field(default_factory=list)
@@ -31,21 +33,21 @@ class PictureSeries:
         """Number of pictures searched."""
         return sum(group.pictures for group in self.groups.values())
 
-    def group_of(self, picture: Grey) -> SizeGroup:
+    def group_of(self, picture: GreyPicture) -> SizeGroup:
         """The group of a picture; a new group estimates its noise from the first picture that is searched."""
         key = _kind(picture)
         if key not in self.groups:
             self.groups[key] = SizeGroup(*key, CameraNoise(self.camera))
         return self.groups[key]
 
-    def estimate_noise(self, pictures: list[Grey]) -> None:
+    def estimate_noise(self, pictures: list[GreyPicture]) -> None:
         """Estimate the noise of each size and depth among some pictures."""
         for picture in pictures:
             self.noise_pictures.setdefault(_kind(picture), []).append(picture)
         for some in self.noise_pictures.values():
             self.group_of(some[0]).noise.estimate_from(some)
 
-    def search(self, frame: int, picture: Grey) -> Detections:
+    def search(self, frame: int, picture: GreyPicture) -> Detections:
         """Detect the spots of a picture and add them to the results."""
         group = self.group_of(picture)
         found = group.noise.detect(picture, self.parameters)
@@ -56,5 +58,5 @@ class PictureSeries:
         return found
 
 
-def _kind(picture: Grey) -> tuple[tuple[int, int], int]:
+def _kind(picture: GreyPicture) -> tuple[tuple[int, int], int]:
     return (picture.shape[1], picture.shape[0]), 8 * picture.dtype.itemsize

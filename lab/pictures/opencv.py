@@ -8,7 +8,7 @@ from types import ModuleType
 
 
 @cache
-def quiet_cv2() -> ModuleType:
+def load_cv2() -> ModuleType:
     """The module cv2, set so that neither it nor FFmpeg writes to standard error about damage that beampose reports.
 
     The setting holds for the rest of the process: the log level is shared by all threads, and any of them may decode.

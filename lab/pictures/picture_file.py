@@ -15,26 +15,26 @@ from typing import TypeAlias, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from lab.pictures.opencv import quiet_cv2
+from lab.pictures.opencv import load_cv2
 from lab.pictures.picture_headers import JPEG_SCAN, DamagedError, Header, jpeg_segments, read_header
 
-SUFFIXES = (".png", ".tif", ".tiff", ".bmp", ".pgm", ".jpg", ".jpeg")
+PICTURE_SUFFIXES = (".png", ".tif", ".tiff", ".bmp", ".pgm", ".jpg", ".jpeg")
 UNREADABLE = "unreadable"
 DROPPED = "dropped"
 _MAX_PADDING_BYTES = 16  # bytes that some cameras add before the end of a JPEG; damage leaves about fifty or more
 _LARGE_BYTES = 1 << 26  # bytes: a larger file is mapped, not read, since its header may show that it is unusable
 
-Grey: TypeAlias = NDArray[np.uint8] | NDArray[np.uint16]  # (h, w), DN
+GreyPicture: TypeAlias = NDArray[np.uint8] | NDArray[np.uint16]  # (h, w), DN
 
 
 @dataclass(frozen=True, slots=True)
-class Missing:
+class MissingPicture:
     """The reason why there is no usable picture."""
 
     reason: str  # "dropped", "unreadable: ...", "wrong size ..."
 
 
-def read_picture(path: Path, size_px: tuple[int, int] | None) -> Grey | Missing:
+def read_picture(path: Path, size_px: tuple[int, int] | None) -> GreyPicture | MissingPicture:
     """The picture in a file as grey (h, w), 8 or 16 bit; Missing where it is damaged or has another (width, height).
 
     size_px None: any size. The caller owns the array. Thread-safe.
@@ -42,23 +42,23 @@ def read_picture(path: Path, size_px: tuple[int, int] | None) -> Grey | Missing:
     try:
         data = _content(path)
     except OSError as error:
-        return Missing(f"{UNREADABLE}: {error.strerror}")
+        return MissingPicture(f"{UNREADABLE}: {error.strerror}")
     return _decoded(data, size_px)
 
 
-def decode(data: bytes, size_px: tuple[int, int] | None) -> Grey | Missing:
+def decode(data: bytes, size_px: tuple[int, int] | None) -> GreyPicture | MissingPicture:
     """As `read_picture`, from the content of a file."""
     return _decoded(np.frombuffer(bytearray(data), np.uint8), size_px)
 
 
-def checked(picture: NDArray[np.generic], size_px: tuple[int, int] | None) -> Grey | Missing:
+def require_format(picture: NDArray[np.generic], size_px: tuple[int, int] | None) -> GreyPicture | MissingPicture:
     """The picture itself if it has this width and height and 8 or 16 bits; else Missing."""
     height, width = picture.shape[:2]
     if size_px is not None and (width, height) != size_px:
-        return Missing(_wrong_size(width, height, size_px))
+        return MissingPicture(_wrong_size(width, height, size_px))
     if picture.dtype not in (np.uint8, np.uint16):
-        return Missing(f"{UNREADABLE}: {picture.dtype} numbers, expected 8 or 16 bits without sign")
-    return cast(Grey, picture)
+        return MissingPicture(f"{UNREADABLE}: {picture.dtype} numbers, expected 8 or 16 bits without sign")
+    return cast(GreyPicture, picture)
 
 
 def _content(path: Path) -> NDArray[np.uint8]:
@@ -79,20 +79,20 @@ def _wrong_size(width: int, height: int, size_px: tuple[int, int]) -> str:
     return f"wrong size {width}x{height}, the rig says {size_px[0]}x{size_px[1]}"
 
 
-def _decoded(data: NDArray[np.uint8], size_px: tuple[int, int] | None) -> Grey | Missing:
+def _decoded(data: NDArray[np.uint8], size_px: tuple[int, int] | None) -> GreyPicture | MissingPicture:
     if not data.size:
-        return Missing(f"{UNREADABLE}: the file is empty")
+        return MissingPicture(f"{UNREADABLE}: the file is empty")
     try:
         header = read_header(data)
         header.require_sound()
         if size_px is not None and (header.width, header.height) != size_px:
-            return Missing(_wrong_size(header.width, header.height, size_px))
+            return MissingPicture(_wrong_size(header.width, header.height, size_px))
         picture = _DECODERS[header.kind](data, header)
     except DamagedError as error:
-        return Missing(f"{UNREADABLE}: {error}")
+        return MissingPicture(f"{UNREADABLE}: {error}")
     except MemoryError:
-        return Missing(f"{UNREADABLE}: not enough memory for it")
-    return checked(picture, size_px)
+        return MissingPicture(f"{UNREADABLE}: not enough memory for it")
+    return require_format(picture, size_px)
 
 
 def _png(data: NDArray[np.uint8], header: Header) -> NDArray[np.generic]:
@@ -188,7 +188,7 @@ def _by_opencv(data: NDArray[np.uint8]) -> NDArray[np.generic]:
     """Decoded by OpenCV; colour is converted to grey with its weights. An EXIF orientation is not applied: pixels stay
     where the sensor has them. Raises DamagedError.
     """
-    cv2 = quiet_cv2()
+    cv2 = load_cv2()
     as_stored = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
     try:
         picture = cv2.imdecode(data, as_stored)

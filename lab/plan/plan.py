@@ -11,8 +11,8 @@ from calibration.findings import Level, verdict
 from lab.errors import QUALITY_GATE_FAILED
 from lab.files.rig.rig_covariance import TARGET, joint_covariance
 from lab.files.rig.rig_file import load_rig_file
-from lab.files.text.atomic_write import atomic_folder, refuse_foreign
-from lab.number_format import angle, length, percent
+from lab.files.text.atomic_write import atomic_folder, check_output_folder
+from lab.number_format import format_angle, format_length, format_percent
 from lab.plan.plan_findings import findings, median_sigma
 from lab.plan.plan_options import Plan, PlanOptions
 from lab.plan.plan_page import write_plan_page
@@ -39,9 +39,11 @@ class PlanOutcome:
 
     def line(self) -> str:
         """One line for the terminal."""
-        sigmas = f"sigma {angle(self.sigma_deg)} and {length(self.sigma_m)} (worst direction, median of the poses)"
+        sizes = f"{format_angle(self.sigma_deg)} and {format_length(self.sigma_m)}"
+        sigmas = f"sigma {sizes} (worst direction, median of the poses)"
         return (
-            f"plan: {self.verdict.name}, {percent(self.measured)} of {self.poses} poses can be measured, {sigmas};"
+            f"plan: {self.verdict.name}, {format_percent(self.measured)} of {self.poses} poses can be"
+            f" measured, {sigmas};"
             f" {self.out / REPORT}"
         )
 
@@ -55,7 +57,7 @@ def plan_rig(rig_path: Path, out: Path, options: PlanOptions | None = None) -> P
         InputError: for a rig that cannot be read, invalid options, or a folder with other files in it.
     """
     options = PlanOptions() if options is None else options
-    refuse_foreign(out, _is_ours)
+    check_output_folder(out, _is_ours)
     plan = plan_of(rig_path, options)
     found = findings(plan)
     with atomic_folder(Path(out), may_replace=_is_ours) as work:

@@ -9,7 +9,7 @@ import numpy as np
 
 from geometry.arrays import Array
 from lab import number_format
-from lab.number_format import percent
+from lab.number_format import format_percent
 from lab.report.plot import svg
 from lab.report.plot.colour_map import colours, hex_colour
 from lab.report.plot.scales import number
@@ -84,12 +84,12 @@ def share_bars(parts: Sequence[tuple[str, float]], title: str) -> str:
         pale = ' opacity="0.4"' if share < 0 else ""
         out.append(svg.text(left - 8, y + 11, name, "end"))
         out.append(f'<rect x="{left}" y="{y}" width="{size:.1f}" height="14" fill="{svg.BLUE}"{pale}/>')
-        out.append(svg.text(left + size + 6, y + 11, percent(share)))
+        out.append(svg.text(left + size + 6, y + 11, format_percent(share)))
     return _svg(out, title, 30 + step * len(parts))
 
 
 def _cell(value: float) -> str:
-    return f"{value:.0f}" if value == round(value) else number_format.short(value)
+    return f"{value:.0f}" if value == round(value) else number_format.format_number(value)
 
 
 def _plain(value: float) -> str:

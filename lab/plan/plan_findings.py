@@ -18,7 +18,7 @@ from calibration.budget.pose_budget import (
 from calibration.budget.pose_grid import NOISE
 from calibration.findings import Finding, Level
 from geometry.arrays import Array, Bools
-from lab.number_format import angle, length, percent
+from lab.number_format import format_angle, format_length, format_percent
 from lab.plan.plan_options import Plan
 
 MIN_MEASURED = 0.5  # share of the grid below which the rig does not suit it
@@ -119,24 +119,27 @@ def advice(plan: Plan) -> list[str]:
     out = []
     if not plan.measured.all():
         out.append(
-            f"Visibility: {percent(1 - float(plan.measured.mean()))} of the poses cannot be measured, however small the"
+            f"Visibility: {format_percent(1 - float(plan.measured.mean()))} of the poses cannot be measured,"
+            " however small the"
             " errors are. The following applies to the observable poses."
         )
     out += [
-        f"Attitude: {first.name} contributes {percent(first.share_deg)} of the variance along the worst direction."
-        f" Halving it would reduce the sigma from {angle(deg)} to {angle(first.halved_deg)}."
+        f"Attitude: {first.name} contributes {format_percent(first.share_deg)} of the variance along the worst"
+        " direction."
+        f" Halving it would reduce the sigma from {format_angle(deg)} to {format_angle(first.halved_deg)}."
         f" {_REMEDIES.get(first.name, '')}"
     ]
     largest = max(lines, key=lambda line: line.share_m)
-    contribution = f"Position: {largest.name} contributes {percent(largest.share_m)} of the variance."
-    halved = f"Halving it would reduce the sigma from {length(m)} to {length(largest.halved_m)}."
+    contribution = f"Position: {largest.name} contributes {format_percent(largest.share_m)} of the variance."
+    halved = f"Halving it would reduce the sigma from {format_length(m)} to {format_length(largest.halved_m)}."
     remedy = "The remedy is the same." if largest.name == first.name else _REMEDIES.get(largest.name, "")
     out.append(f"{contribution} {halved} {remedy}")
     noise = next(line for line in lines if line.name == NOISE)
     rest_deg, rest_m = np.sqrt(max(1 - noise.share_deg, 0.0)) * deg, np.sqrt(max(1 - noise.share_m, 0.0)) * m
     out.append(
-        f"Averaging over frames does not reduce the contribution of the calibration, {angle(rest_deg)} and"
-        f" {length(rest_m)}. It is the same in all frames at a pose and mostly cancels in the difference of two similar"
+        f"Averaging over frames does not reduce the contribution of the calibration, {format_angle(rest_deg)} and"
+        f" {format_length(rest_m)}. It is the same in all frames at a pose and mostly cancels in the difference of two"
+        " similar"
         " poses."
     )
     return out
@@ -156,7 +159,7 @@ def _observability(plan: Plan) -> Iterator[Finding]:
         yield Finding(Level.PASS, f"All {count} poses can be measured.")
         return
     unobservable, vague = int((~plan.observable).sum()), int((plan.observable & ~plan.measured).sum())
-    what = f"{count - measured} of {count} poses ({percent(1 - measured / count)}) cannot be measured:"
+    what = f"{count - measured} of {count} poses ({format_percent(1 - measured / count)}) cannot be measured:"
     what += f" {unobservable} are not observable"
     what += f", {vague} are too uncertain to count as measured" if vague else ""
     where = _where(plan, ~plan.measured)
@@ -188,7 +191,7 @@ def _where(plan: Plan, bad: Bools) -> str:
         excess = max(shares) - float(bad.mean())
         if excess > max(best, 0.02):
             value = float(r.values()[int(np.argmax(shares))])
-            best, words = excess, f"{name.split('_')[0]} {value:g} {_UNITS[name]} ({percent(max(shares))})"
+            best, words = excess, f"{name.split('_')[0]} {value:g} {_UNITS[name]} ({format_percent(max(shares))})"
     return words.replace(" °", "°").replace("-", "−")
 
 
@@ -199,14 +202,14 @@ def _redundancy(plan: Plan) -> Iterator[Finding]:
     if share > 0.05:
         yield Finding(
             Level.WARN,
-            f"{percent(share)} of the measurable poses have only three spots.",
+            f"{format_percent(share)} of the measurable poses have only three spots.",
             "Three spots fit any labels: a wrong label is not detected.",
             "Keep a fourth spot in view: use a wider lens, or one more beam.",
         )
     elif plan.measured.any():
         yield Finding(
             Level.PASS,
-            f"{percent(1 - share)} of the measurable poses have four spots or more: a wrong spot is detected.",
+            f"{format_percent(1 - share)} of the measurable poses have four spots or more: a wrong spot is detected.",
         )
 
 
@@ -215,16 +218,16 @@ def _views(plan: Plan) -> Iterator[Finding]:
     poor = [i for i in np.argsort(shares).tolist() if shares[i] < MIN_IN_VIEW]
     if not poor:
         yield Finding(
-            Level.PASS, f"Every spot is in its picture in at least {percent(float(shares.min()))} of the poses."
+            Level.PASS, f"Every spot is in its picture in at least {format_percent(float(shares.min()))} of the poses."
         )
         return
     camera, spot = plan.views[poor[0]]
-    more = f", and {len(poor) - 1} more views in fewer than {percent(MIN_IN_VIEW)}" if len(poor) > 1 else ""
+    more = f", and {len(poor) - 1} more views in fewer than {format_percent(MIN_IN_VIEW)}" if len(poor) > 1 else ""
     where = _where(plan, ~plan.seen[:, poor[0]])
     yield Finding(
         Level.WARN,
-        f"Spot {spot} is in the picture of {camera} in only {percent(float(shares[poor[0]]))} of the poses{more}."
-        + (f" It is missing most often at {where}." if where else ""),
+        f"Spot {spot} is in the picture of {camera} in only {format_percent(float(shares[poor[0]]))} of the"
+        f" poses{more}." + (f" It is missing most often at {where}." if where else ""),
         "The pose then depends on the other spots alone.",
         f"Turn or move {camera}, or use a wider lens; the table of views shows how far the spot is outside.",
     )
@@ -235,7 +238,8 @@ def _distances(plan: Plan) -> Iterator[Finding]:
     if close.any():
         yield Finding(
             Level.WARN,
-            f"Two spots of one picture are within {MERGING_PX:g} px of each other in {percent(float(close.mean()))} of"
+            f"Two spots of one picture are within {MERGING_PX:g} px of each other in"
+            f" {format_percent(float(close.mean()))} of"
             f" the poses (minimum: {plan.closest_px.min():.1f} px).",
             "Spots that touch are detected as one, and their labels may be swapped.",
             "Spread the beams, or turn one of them out of the plane of the others.",
@@ -245,13 +249,13 @@ def _distances(plan: Plan) -> Iterator[Finding]:
 
 
 def _goals(plan: Plan) -> Iterator[Finding]:
-    options, shown = plan.options, (length, angle)
+    options, shown = plan.options, (format_length, format_angle)
     for k, (what, goal) in enumerate((("position", options.goal_m), ("attitude", options.goal_deg))):
         if goal is None:
             continue
         sigma = plan.worst[:, k]
         good = int(np.sum(np.nan_to_num(sigma, nan=np.inf) <= goal))
-        words = f"The {what} sigma is within {shown[k](goal)} in {percent(good / len(sigma))} of the poses"
+        words = f"The {what} sigma is within {shown[k](goal)} in {format_percent(good / len(sigma))} of the poses"
         if good == len(sigma):
             yield Finding(Level.PASS, words + ".")
         else:

@@ -14,7 +14,7 @@ from calibration.budget.pose_grid import GridPlan
 from geometry.arrays import Array
 from lab.errors import InputError
 from lab.files.text.dataclass_fields import dataclass_from_yaml
-from lab.files.text.error_text import did_you_mean
+from lab.files.text.error_text import suggest_name
 
 MAX_POSES = 100_000  # some 300 MB of memory and a table of 70 MB
 
@@ -115,7 +115,7 @@ def options_of(
     default = PlanOptions()
     for name in ranges:
         if name not in default.ranges:
-            raise InputError(f"--range: expected a coordinate, got {name!r}{did_you_mean(name, default.ranges)}")
+            raise InputError(f"--range: expected a coordinate, got {name!r}{suggest_name(name, default.ranges)}")
     chosen: dict[str, Any] = {**default.ranges, **{name: Range(*r) for name, r in ranges.items()}}
     return PlanOptions(
         **chosen,

@@ -13,7 +13,7 @@ from calibration.budget.pose_grid import AXES, STATUS, plan_grid, poses_of
 from calibration.findings import Finding, verdict
 from geometry.arrays import Array
 from lab import number_format
-from lab.number_format import angle, length, percent
+from lab.number_format import format_angle, format_length, format_percent
 from lab.plan.plan_drawings import cell_map, share_bars
 from lab.plan.plan_findings import (
     CORRELATION,
@@ -71,12 +71,14 @@ def _key_figures(plan: Plan) -> list[tuple[str, str, str]]:
     top = solved.max(axis=0).tolist() if len(solved) else [np.nan, np.nan]
     lines = [line for line in budget_lines(plan) if line.name != CORRELATION]
     figures = [
-        ("Measurable", percent(float(plan.measured.mean())), f"of {len(plan.status)} poses"),
-        ("Attitude", angle(deg), f"median of 1 sigma; up to {angle(top[1])}"),
-        ("Position", length(m), f"median of 1 sigma; up to {length(top[0])}"),
+        ("Measurable", format_percent(float(plan.measured.mean())), f"of {len(plan.status)} poses"),
+        ("Attitude", format_angle(deg), f"median of 1 sigma; up to {format_angle(top[1])}"),
+        ("Position", format_length(m), f"median of 1 sigma; up to {format_length(top[0])}"),
     ]
     if lines:
-        figures.append(("Limited by", lines[0].name, f"{percent(lines[0].share_deg)} of the attitude's variance"))
+        figures.append(
+            ("Limited by", lines[0].name, f"{format_percent(lines[0].share_deg)} of the attitude's variance")
+        )
     return figures
 
 
@@ -85,8 +87,8 @@ def _budget(plan: Plan) -> Section:
     m, deg = median_sigma(plan)
     rows: list[list[object]] = [
         [
-            line.name, line.source, 1e3 * line.sigma_deg, percent(line.share_deg), 1e3 * line.halved_deg,
-            1e3 * line.sigma_m, percent(line.share_m), 1e3 * line.halved_m,
+            line.name, line.source, 1e3 * line.sigma_deg, format_percent(line.share_deg), 1e3 * line.halved_deg,
+            1e3 * line.sigma_m, format_percent(line.share_m), 1e3 * line.halved_m,
         ]
         for line in lines
     ]  # fmt: skip
@@ -213,7 +215,7 @@ def _visibility(plan: Plan) -> Section:
         known = plan.margin_px[:, i][np.isfinite(plan.margin_px[:, i])]
         margins = [round(float(np.median(known))), round(float(known.min()))] if len(known) else [None, None]
         off = float(np.isnan(plan.margin_px[:, i]).mean())
-        rows.append([camera, spot, percent(float(plan.seen[:, i].mean())), percent(off), *margins])
+        rows.append([camera, spot, format_percent(float(plan.seen[:, i].mean())), format_percent(off), *margins])
     words = (
         f"A spot is in view if it is at least {plan.options.edge_px:g} px inside of its picture. A margin is the"
         " distance to the picture's edge, negative outside."
@@ -231,9 +233,10 @@ def _worst(plan: Plan) -> Section:
         rows.append(
             [
                 _three(c[:3], 3), _three(c[3:], 1),
-                STATUS[plan.status[i]], int(spots[i]), margin, angle(float(plan.worst[i, 1])),
-                axis_words(plan.worst_axis[i, 1]), length(float(plan.worst[i, 0])), axis_words(plan.worst_axis[i, 0]),
-                number_format.short(float(plan.condition[i])),
+                STATUS[plan.status[i]], int(spots[i]), margin, format_angle(float(plan.worst[i, 1])),
+                axis_words(plan.worst_axis[i, 1]), format_length(float(plan.worst[i, 0])),
+                axis_words(plan.worst_axis[i, 0]),
+                number_format.format_number(float(plan.condition[i])),
             ]
         )  # fmt: skip
     heads = (

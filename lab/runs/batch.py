@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from lab.errors import QUALITY_GATE_FAILED, BeamposeError, CalibrationError, InputError, RunError
-from lab.files.run.parameter_overrides import overridden
+from lab.files.run.parameter_overrides import with_overrides
 from lab.files.text.csv_text import write_table
 from lab.runs.process import RunOutcome, process_run
 from lab.runs.smoothing_pass import Progress
@@ -57,7 +57,9 @@ def process_batch(
     """
     if not run_folders:
         raise InputError("batch: expected one or more run folders, got none")
-    overridden(TrackerParameters(), overrides or {})  # a misspelt parameter is the command's mistake, not each run's
+    with_overrides(
+        TrackerParameters(), overrides or {}
+    )  # a misspelt parameter is the command's mistake, not each run's
     names = _names(run_folders)
     out = Path(out)
     if out.exists() and not out.is_dir():

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from geometry.forward_model import SpotModel
-from lab.files.rig.calibration_state import require_usable
-from lab.files.run.parameter_overrides import overridden
+from lab.files.rig.calibration_state import require_valid_calibration
+from lab.files.run.parameter_overrides import with_overrides
 from lab.files.run.run_file import Run, load_run
 from lab.files.run.truth import load_run_truth
 from lab.files.text.atomic_write import atomic_folder
@@ -91,9 +91,11 @@ def ready_run(run_folder: Path, overrides: Mapping[str, Any] | None = None) -> R
     """
     run = load_run(run_folder)
     if overrides:
-        run = dataclasses.replace(run, tracker=overridden(run.tracker, overrides))
+        run = dataclasses.replace(run, tracker=with_overrides(run.tracker, overrides))
     recorded = datetime.date.today() if run.recorded is None else run.recorded
-    require_usable(run.calibration, run.rig_path, recorded, "today" if run.recorded is None else "the recording's day")
+    require_valid_calibration(
+        run.calibration, run.rig_path, recorded, "today" if run.recorded is None else "the recording's day"
+    )
     load_run_truth(run)  # a mistake in it stops the run before the processing, not after it
     return run
 

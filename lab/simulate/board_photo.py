@@ -19,7 +19,7 @@ _MARGIN = 1.0  # width of the white margin around the outermost squares or circl
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
+class PhotoSettings:
     """Light, blur, noise and sampling of a photograph of a board."""
 
     paper_dn: float = 205.0  # paper
@@ -55,12 +55,12 @@ def photograph(
     camera: Camera,
     world_from_board: Pose,
     warp: Array | None = None,
-    look: Look | None = None,
+    look: PhotoSettings | None = None,
     seed: int = 0,
 ) -> BoardPhoto:
     """A photograph of a board at `world_from_board`, bent by `warp` (3,), 1/m."""
     bend = np.zeros(3) if warp is None else np.asarray(warp, dtype=float)
-    look = Look() if look is None else look
+    look = PhotoSettings() if look is None else look
     width, height = camera.image_size_px
     board_xy = _board_coordinates(board, camera, world_from_board, bend)
     light = np.full((height, width), look.background_dn)
@@ -147,7 +147,7 @@ def _piece_with_paper(board: Board, corners: Array) -> tuple[slice, slice] | Non
     )
 
 
-def _shade(board: Board, xy: Array, look: Look) -> Array:
+def _shade(board: Board, xy: Array, look: PhotoSettings) -> Array:
     paper = _on_paper(board, xy)
     shade = np.where(paper, look.paper_dn, look.background_dn)
     shade[paper] -= (look.paper_dn - look.ink_dn) * ink_at(board, xy[paper])

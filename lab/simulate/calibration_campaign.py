@@ -18,7 +18,7 @@ from geometry.pose import Pose
 from geometry.rig import Beam, Rig, Screen
 from geometry.uncertainty.rig_parameters import PINHOLE, distortion_names
 from lab.errors import InputError
-from lab.files.text.error_text import did_you_mean
+from lab.files.text.error_text import suggest_name
 from lab.simulate.rigs import RIGS
 
 # One stream of random numbers per subject, so that the positions of the stand do not depend on the number of dots.
@@ -27,7 +27,7 @@ _EDGE_PX = 12.0  # spots and dots closer to the edge of the picture are not used
 
 
 @dataclass(frozen=True, slots=True)
-class Quality:
+class CampaignQuality:
     """Sigmas, per coordinate, of the mounting and of the measurements."""
 
     camera_m: float = 0.004  # mounting: deviation of the cameras from the drawing ...
@@ -71,7 +71,7 @@ class Campaign:
 
     name: str
     seed: int
-    quality: Quality
+    quality: CampaignQuality
     nominal: Rig  # as drawn
     truth: Rig  # as mounted
     lenses: dict[str, LensDraw]
@@ -101,7 +101,7 @@ class Campaign:
         return np.diag(np.repeat([self.quality.place_m, np.deg2rad(self.quality.place_deg)], 3) ** 2)
 
 
-def draw_campaign(seed: int, rig: str | Rig = "fan", quality: Quality | None = None) -> Campaign:
+def draw_campaign(seed: int, rig: str | Rig = "fan", quality: CampaignQuality | None = None) -> Campaign:
     """The truth and the measurements of one campaign, from a seed.
 
     rig: a name of RIGS, or a rig.
@@ -109,9 +109,9 @@ def draw_campaign(seed: int, rig: str | Rig = "fan", quality: Quality | None = N
     Raises:
         InputError: no rig has this name.
     """
-    q = Quality() if quality is None else quality
+    q = CampaignQuality() if quality is None else quality
     if isinstance(rig, str) and rig not in RIGS:
-        raise InputError(f"rig: expected a rig's name, got {rig!r}{did_you_mean(rig, RIGS)}")
+        raise InputError(f"rig: expected a rig's name, got {rig!r}{suggest_name(rig, RIGS)}")
     nominal = RIGS[rig]() if isinstance(rig, str) else rig
     truth = as_mounted(nominal, q, np.random.default_rng([seed, _MOUNTING]))
     lenses = {
@@ -158,7 +158,7 @@ def draw_campaign(seed: int, rig: str | Rig = "fan", quality: Quality | None = N
     )
 
 
-def as_mounted(nominal: Rig, q: Quality, rng: np.random.Generator) -> Rig:
+def as_mounted(nominal: Rig, q: CampaignQuality, rng: np.random.Generator) -> Rig:
     """The rig with random deviations of every pose, lens, beam and screen from the drawing."""
 
     def off(m: float, deg: float) -> Array:
@@ -229,7 +229,7 @@ def lens_covariance(camera: Camera, corner_px: float, views: int = 30) -> Array:
     return solve(values, [term], free).covariance([("intrinsics", 0)])[:used, :used]
 
 
-def _lens(true: Camera, q: Quality, rng: np.random.Generator) -> LensDraw:
+def _lens(true: Camera, q: CampaignQuality, rng: np.random.Generator) -> LensDraw:
     C = lens_covariance(true, q.lens_corner_px)
     fx, fy, cx, cy, *distortion = np.concatenate([pinhole_numbers(true), true.distortion]) + (
         np.linalg.cholesky(C) @ rng.normal(size=len(C))
@@ -239,7 +239,7 @@ def _lens(true: Camera, q: Quality, rng: np.random.Generator) -> LensDraw:
     return LensDraw(drawn, (*PINHOLE, *distortion_names(true)), C)
 
 
-def _dots(rig: Rig, q: Quality) -> tuple[tuple[str, ...], Ints, Array]:
+def _dots(rig: Rig, q: CampaignQuality) -> tuple[tuple[str, ...], Ints, Array]:
     """Names, screens and true positions of the dots that at least one camera sees."""
     names, of_screen, xyz = [], [], []
     columns, rows = q.dots

@@ -26,8 +26,8 @@ from lab.files.text import columns
 from lab.files.text.atomic_write import atomic_folder
 from lab.files.text.csv_text import write_table
 from lab.files.text.yaml_text import write_mapping
-from lab.simulate.board_photo import Look, photograph
-from lab.simulate.calibration_campaign import Campaign, LensDraw, Quality, board_poses, draw_campaign
+from lab.simulate.board_photo import PhotoSettings, photograph
+from lab.simulate.calibration_campaign import Campaign, CampaignQuality, LensDraw, board_poses, draw_campaign
 
 PROJECT = "calibration.yaml"
 BOARD = "charuco:11x9:36mm:27mm:DICT_4X4_100"  # usable also where part of the board is outside the picture
@@ -44,7 +44,7 @@ def simulate_calibration(
     positions: int = 40,
     wrong: float = 0.0,
     photos: bool = False,
-    quality: Quality | None = None,
+    quality: CampaignQuality | None = None,
 ) -> Path:
     """Write a complete calibration campaign into a new folder; returns the folder.
 
@@ -62,7 +62,7 @@ def simulate_calibration(
         raise InputError(f"wrong: expected a share from 0 up to 0.3, got {wrong:g}")
     if positions < 3:
         raise InputError(f"positions: expected 3 or more, got {positions}")
-    q = replace(Quality() if quality is None else quality, positions=positions, wrong=wrong)
+    q = replace(CampaignQuality() if quality is None else quality, positions=positions, wrong=wrong)
     campaign = draw_campaign(seed, rig, q)
     with atomic_folder(Path(out), lambda _: False) as folder:
         write_campaign(campaign, folder)
@@ -158,7 +158,7 @@ def _write_photos(c: Campaign, folder: Path) -> None:
 
 
 def _photograph(board: boards.Board, camera: Camera, poses: Pose, seed: int, into: Path, k: int) -> None:
-    photo = photograph(board, camera, poses[k], look=Look(noise_dn=2.0, samples=16), seed=seed * 1000 + k)
+    photo = photograph(board, camera, poses[k], look=PhotoSettings(noise_dn=2.0, samples=16), seed=seed * 1000 + k)
     if not cv2.imwrite(str(into / f"{k:02d}.png"), photo.image):
         raise InputError(f"{into}: a photograph cannot be written")
 

@@ -13,7 +13,7 @@ from geometry.camera import SensorNoise
 from geometry.pose import Pose
 from lab.simulate.optics import exposure_instants, spot_images, spot_patch
 from lab.simulate.scenarios import Light
-from lab.simulate.scene import LIGHT, PIXELS, SHINING, Scene
+from lab.simulate.scene import LIGHT, PIXELS, VISIBLE, Scene
 
 Floats32 = NDArray[np.float32]
 Picture = NDArray[np.uint8 | np.uint16]
@@ -133,7 +133,7 @@ def _lit(scene: Scene, sensor: Sensor, powers: LaserPowers, k: int) -> tuple[Flo
     shape = np.nanmedian(spots.covariance_px2, axis=0)
     typical_flux = float(np.nanmedian(powers.flux_dn_per_light[views] * spots.light))
     for i, view in enumerate(views):
-        occluded = scene.in_view[k, view] not in (SHINING, 0)
+        occluded = scene.in_view[k, view] not in (VISIBLE, 0)
         if not occluded and np.isfinite(paths[:, i]).all():
             add(paths[:, i], weights, spots.covariance_px2[i], float(powers.flux_dn_per_light[view] * spots.light[i]))
     false = scene.clutter_points

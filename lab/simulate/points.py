@@ -11,7 +11,7 @@ from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.rig import Rig
 from lab.simulate.scenarios import PriorRegion, Scenario
-from lab.simulate.scene import HIDDEN, POINT_NOISE, SHINING, compose, with_overrides
+from lab.simulate.scene import OCCLUDED, POINT_NOISE, VISIBLE, compose, with_overrides
 from tracking.detections import Detections
 
 CLUTTER = -1  # origin of a false detection
@@ -76,7 +76,7 @@ def simulate_points(
         uv = uv + noise_px * rng.standard_normal(uv.shape)
         of = np.concatenate([np.arange(n), np.full(len(uv) - n, CLUTTER)])
         camera = np.concatenate([model.camera_of, false.camera[some]])
-        there = np.concatenate([scene.in_view[k] == SHINING, np.ones(len(uv) - n, dtype=bool)])
+        there = np.concatenate([scene.in_view[k] == VISIBLE, np.ones(len(uv) - n, dtype=bool)])
         shuffled = rng.permutation(len(uv))
         rows = [shuffled[(there & (camera == c) & scene.has_image[k, c])[shuffled]] for c in cameras]
         detections.append(tuple(Detections.at(uv[r], np.tile(covariance, (len(r), 1, 1))) for r in rows))
@@ -101,12 +101,12 @@ def simulate_points(
     )
 
 
-def hidden(run: PointRun, hide: Bools) -> PointRun:
+def with_occlusions(run: PointRun, hide: Bools) -> PointRun:
     """The recording with the spots of `hide` (T, n) occluded. False points are not changed."""
     detections, origins = [], []
     for k in range(len(run.frame)):
         keep = [np.array([o == CLUTTER or not hide[k, o] for o in of], dtype=bool) for of in run.origin[k]]
         detections.append(tuple(d[rows] for d, rows in zip(run.detections[k], keep, strict=True)))
         origins.append(tuple(of[rows] for of, rows in zip(run.origin[k], keep, strict=True)))
-    in_view = np.where(hide & (run.in_view == SHINING), HIDDEN, run.in_view)
+    in_view = np.where(hide & (run.in_view == VISIBLE), OCCLUDED, run.in_view)
     return replace(run, in_view=in_view, detections=tuple(detections), origin=tuple(origins))

@@ -44,7 +44,7 @@ class Clutter:
 
 
 @dataclass(frozen=True, slots=True)
-class Hiding:
+class Occlusion:
     """Obstacles between a beam and its screen: an occluded spot is invisible to every camera."""
 
     miss_probability: float = 0.0  # of each spot in each frame, independently
@@ -94,7 +94,7 @@ class Scenario:
     always_in_view: tuple[str, ...] = ()  # spots that never leave the picture of any camera, for any length of run
     leaves_and_returns: tuple[str, ...] = ()  # spots that do so at least once within `frames`
     clutter: Clutter = Clutter()
-    occlusion: Hiding = Hiding()
+    occlusion: Occlusion = Occlusion()
     faults: tuple[RecordingFault, ...] = ()
     light: Light = Light()
 
@@ -177,7 +177,7 @@ _ALL = (
         _SHARP_TURNS,
         name="hidden-in-turn",
         summary="As sharp-turns, with one spot occluded for ten frames around every bend.",
-        occlusion=Hiding(at_bends_frames=10),
+        occlusion=Occlusion(at_bends_frames=10),
     ),
     replace(
         _SMOOTH_SCENARIO,
@@ -243,7 +243,7 @@ _ALL = (
         _SMOOTH_SCENARIO,
         name="blackout",
         summary="As smooth, with all spots occluded for ten frames every 150 frames.",
-        occlusion=Hiding(blackout_every=150, blackout_frames=10),
+        occlusion=Occlusion(blackout_every=150, blackout_frames=10),
     ),
     replace(
         _SMOOTH_SCENARIO,

@@ -30,7 +30,7 @@ _CHECKED_EVERY_S = 0.05
 _MARGIN_PX = 12.0  # distance from the border of a spot in view, so that the whole spot is visible
 _MAX_DRAWS = 3000
 
-SHINING, HIDDEN, OUTSIDE = 1, 2, 0  # in_view of truth/spots.csv
+VISIBLE, OCCLUDED, OUTSIDE = 1, 2, 0  # in_view of truth/spots.csv
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +107,7 @@ def compose(
     bend_frames = np.floor(motion.bends_s(float(t_s[-1]) + 1.0) * scenario.frame_rate_hz + 1e-6).astype(np.int64)
     turned = np.isin(frame, bend_frames + 1)
     occluded, clutter_points = _occlusions_and_clutter(scenario, model, uv, bend_frames, seed)
-    in_view = np.where(model.in_picture(uv), np.where(occluded, HIDDEN, SHINING), OUTSIDE)
+    in_view = np.where(model.in_picture(uv), np.where(occluded, OCCLUDED, VISIBLE), OUTSIDE)
     return Scene(
         scenario, seed, rig, model, motion, frame, t_s, poses, uv, in_view,
         _usable_pictures(scenario, model, count), turned, clutter_points,

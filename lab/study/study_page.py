@@ -10,7 +10,7 @@ from markupsafe import Markup
 from geometry.arrays import Array
 from lab.files.text.atomic_write import atomic_write_text
 from lab.report.html import environment
-from lab.report.plot.axes import axes, plane, svg_of
+from lab.report.plot.axes import axes, plot_area, svg_of
 from lab.report.plot.scales import robust_range
 from lab.report.plot.series import Line, Shade, time_panel
 from lab.report.plot.svg import BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILLION, line_path, text
@@ -114,7 +114,7 @@ def _tracks(study: Study, camera: int) -> str:
     size = np.array(model.image_size_px[views[0]], dtype=float)
     lo = np.minimum(np.nanmin(uv[:, views], axis=(0, 1)), 0.0) - 20
     hi = np.maximum(np.nanmax(uv[:, views], axis=(0, 1)), size) + 20
-    p = plane((lo[0], hi[0]), (lo[1], hi[1]), equal=True, y_down=True, bottom=38)
+    p = plot_area((lo[0], hi[0]), (lo[1], hi[1]), equal=True, y_down=True, bottom=38)
     title = f"camera {model.camera_names[camera]}"
     out = axes(p, title, "u (px)", "v (px)", grid=False)
     (x0, y0), (x1, y1) = p.at(np.array([[0.0, 0.0], size])).tolist()

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lab.errors import InputError
-from lab.pictures.opencv import quiet_cv2
-from lab.pictures.picture_file import UNREADABLE, Missing, read_picture
+from lab.pictures.opencv import load_cv2
+from lab.pictures.picture_file import UNREADABLE, MissingPicture, read_picture
 from lab.runs.frames.frame_sources import retrieved
 from lab.watch.folder_poll import FolderPoll
 from lab.watch.frame_clock import FrameClock
@@ -115,14 +115,14 @@ class FolderCamera:
         try:
             state = os.stat(file.path)
         except OSError as error:
-            self._put(number, Missing(f"{UNREADABLE}: {error.strerror}"), None)
+            self._put(number, MissingPicture(f"{UNREADABLE}: {error.strerror}"), None)
             return True
         stamp = (state.st_size, state.st_mtime_ns)
         waited_s = time.perf_counter() - file.tried_s
         if stamp == file.tried and waited_s < self.patience_s:
             return False
         content = read_picture(file.path, self.size_px)
-        if isinstance(content, Missing) and content.reason.startswith(UNREADABLE) and stamp != file.tried:
+        if isinstance(content, MissingPicture) and content.reason.startswith(UNREADABLE) and stamp != file.tried:
             file.tried, file.tried_s = stamp, time.perf_counter()
             file.incomplete_s = None if file.incomplete_s is None else begun_s
             self.inbox.announce(self.name, number, content.reason)
@@ -134,7 +134,7 @@ class FolderCamera:
         self._put(number, content, arrived_s)
         return True
 
-    def _put(self, number: int, content: NDArray | Missing, arrived_s: float | None) -> None:
+    def _put(self, number: int, content: NDArray | MissingPicture, arrived_s: float | None) -> None:
         del self._pending[number]
         self.inbox.put(self.name, number, content, arrived_s)
 
@@ -199,10 +199,10 @@ class DeviceCamera:
         lost = self.clock.lost
         return [f"{self.name}: {lost} pictures lost by the device, according to the clock"] if lost else []
 
-    def _decoded(self) -> NDArray | Missing:
+    def _decoded(self) -> NDArray | MissingPicture:
         picture = retrieved(self.capture, self.size_px)
         # Copied, since the device may overwrite its buffer.
-        return picture if isinstance(picture, Missing) else np.array(picture)
+        return picture if isinstance(picture, MissingPicture) else np.array(picture)
 
 
 def open_device(name: str, device: int | str, size_px: tuple[int, int], inbox: Inbox, rate_hz: float) -> DeviceCamera:
@@ -211,7 +211,7 @@ def open_device(name: str, device: int | str, size_px: tuple[int, int], inbox: I
     Raises:
         InputError: the device cannot be opened.
     """
-    cv2 = quiet_cv2()
+    cv2 = load_cv2()
     capture = cv2.VideoCapture(device)
     if not capture.isOpened():
         raise InputError(

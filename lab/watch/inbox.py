@@ -13,14 +13,14 @@ from typing import TypeAlias
 
 import numpy as np
 
-from lab.pictures.picture_file import DROPPED, Grey, Missing
+from lab.pictures.picture_file import DROPPED, GreyPicture, MissingPicture
 from tracking.detections import Detections
 
 MOST_WAITING = 64  # pictures per camera in memory; those of a folder beyond stay on disk
 LONGEST_GAP = 10_000  # frame numbers: a picture this far ahead of the reader is a stray file
 
-Content: TypeAlias = Grey | Detections | Missing
-Finder: TypeAlias = Callable[[Grey], Detections]
+Content: TypeAlias = GreyPicture | Detections | MissingPicture
+Finder: TypeAlias = Callable[[GreyPicture], Detections]
 
 
 @dataclass(slots=True)
@@ -176,7 +176,7 @@ class Inbox:
                 if waiting.arrived_s is not None:
                     arrived.append(waiting.arrived_s)
             else:
-                out[name] = Missing(DROPPED if since_and_why is None else since_and_why[1])
+                out[name] = MissingPicture(DROPPED if since_and_why is None else since_and_why[1])
         self.next_frame = frame + 1
         return out, max(arrived, default=None)
 

@@ -14,7 +14,7 @@ import numpy as np
 from lab.errors import BeamposeError, InputError
 from lab.files.run.detections_file import LONGEST_GAP
 from lab.files.run.run_file import FramesFolder, LiveDevice, Run
-from lab.pictures.picture_file import Grey, Missing
+from lab.pictures.picture_file import GreyPicture, MissingPicture
 from lab.runs.frames.frames import FrameSet
 from lab.watch.cameras import DeviceCamera, FolderCamera, LiveCamera, in_thread, open_device
 from lab.watch.folder_poll import FolderPoll
@@ -95,7 +95,7 @@ class LiveFrames:
                 out.append(f"{name}: pictures with numbers far beyond all others were left out: {_some(queue.strays)}")
         return out
 
-    def begin(self) -> Mapping[str, list[Grey]]:
+    def begin(self) -> Mapping[str, list[GreyPicture]]:
         """Wait for the first pictures of every camera; up to FIRST of each, in the order of their numbers.
 
         Empty if the recording ended without any.
@@ -128,7 +128,7 @@ class LiveFrames:
                     images, self.arrived_s[frame] = self.inbox.take(frame)
                     self.caught_up |= not self.inbox.has_later(frame)
                 for name, content in images.items():
-                    if isinstance(content, Missing):
+                    if isinstance(content, MissingPicture):
                         self._reasons[name][content.reason] += 1
                 yield FrameSet(frame, images)
                 frame += 1
@@ -163,7 +163,7 @@ class LiveFrames:
         """Whether any camera has a complete picture of this frame or a later one."""
         return any(number >= frame for queue in queues for number in queue.pictures)
 
-    def _first_pictures(self) -> dict[str, list[Grey]]:
+    def _first_pictures(self) -> dict[str, list[GreyPicture]]:
         numbers = sorted({n for queue in self.inbox.queues.values() for n in (*queue.pictures, *queue.incomplete)})
         if not numbers:
             return {}
@@ -178,7 +178,7 @@ class LiveFrames:
         return {name: self._usable(queue)[:FIRST] for name, queue in self.inbox.queues.items()}
 
     @staticmethod
-    def _usable(queue: CameraQueue) -> list[Grey]:
+    def _usable(queue: CameraQueue) -> list[GreyPicture]:
         contents = [waiting.content for _, waiting in sorted(queue.pictures.items(), key=lambda item: item[0])]
         return [content for content in contents if isinstance(content, np.ndarray)]
 

@@ -16,7 +16,7 @@ import numpy as np
 from lab.errors import InputError
 from lab.files.text import columns
 from lab.files.text.atomic_write import replace_folder
-from lab.files.text.json_text import plain
+from lab.files.text.json_text import plain_value
 from lab.runs.frames.pipeline import FrameRecord
 from lab.runs.tables import attitude_rows, pose_numbers
 from lab.runs.verdict.frame_checks import FrameChecks
@@ -163,7 +163,7 @@ def json_line(record: FrameRecord, latency_ms: float | None) -> str:
         parts = (numbers[0:3], numbers[3:7], numbers[7:10], numbers[10:13], numbers[13:16])
         content |= dict(zip(names, parts, strict=True))
     content |= {"spots_used": t.spots_used, "latency_ms": latency_ms}
-    return json.dumps(plain(content), allow_nan=False) + "\n"
+    return json.dumps(plain_value(content), allow_nan=False) + "\n"
 
 
 def is_live_table(folder: Path) -> bool:

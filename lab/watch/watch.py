@@ -22,7 +22,7 @@ from geometry.pose import Pose
 from lab.errors import InputError, RunError
 from lab.files.run.run_file import LiveDevice, Run
 from lab.files.text.atomic_write import atomic_folder
-from lab.pictures.picture_file import Grey
+from lab.pictures.picture_file import GreyPicture
 from lab.runs.frames.pipeline import Pipeline, tracker_of
 from lab.runs.frames.sensor_noise import CameraNoise
 from lab.runs.process import RunOutcome, are_results, ready_run, write_results
@@ -129,7 +129,7 @@ class _Finder:
     camera: str
     seconds: float = 0.0
 
-    def __call__(self, picture: Grey) -> Detections:
+    def __call__(self, picture: GreyPicture) -> Detections:
         clock = time.perf_counter()
         found = self.pipeline.spots_in(self.camera, picture)
         self.seconds += time.perf_counter() - clock

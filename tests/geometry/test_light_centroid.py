@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from geometry.camera import Camera
-from geometry.light_centroid import CentreOffsets
-from geometry.planes import meet_plane
+from geometry.light_centroid import CentroidOffsets
+from geometry.planes import intersect_plane
 from geometry.pose import Pose
 from geometry.rig import Screen
 
@@ -45,13 +45,13 @@ def test_the_offset_is_that_of_a_fitted_gaussian(tilt, brightness):
     axis = CAMERA.project(screen.world_from_screen.apply(np.array([*place, 0.0])))
     u, v = (x.ravel().astype(float) for x in np.meshgrid(*(np.rint(c) + np.arange(-26, 27) for c in axis)))
     origin, direction = CAMERA.rays(np.stack([u, v], axis=-1))
-    s = meet_plane(origin, direction, screen.world_from_screen) - place
+    s = intersect_plane(origin, direction, screen.world_from_screen) - place
     image = np.exp(-0.5 * np.einsum("ni,ij,nj->n", s, np.linalg.inv(spread), s))
     d = np.stack([u, v], axis=-1) - axis
     covariance = (d * image[:, None]).T @ d / image.sum()
     measured = fitted_centre(image, u, v, axis, covariance, brightness)
     shape = covariance[[0, 0, 1], [0, 1, 1]][None]
-    predicted = CentreOffsets(CAMERA, screen).at(measured[None], shape, np.array([brightness]))[0]
+    predicted = CentroidOffsets(CAMERA, screen).at(measured[None], shape, np.array([brightness]))[0]
     size = np.linalg.norm(measured - axis)
     assert size > 0.005
     assert np.linalg.norm(measured - axis - predicted) < 0.2 * size + 5e-4
@@ -60,12 +60,12 @@ def test_the_offset_is_that_of_a_fitted_gaussian(tilt, brightness):
 def test_the_offset_grows_with_the_square_of_the_width():
     screen = Screen("s", Pose(turned([0, 1, 0], 40), np.array([0.0, 0.0, 2.0])))
     at, faint = np.array([[700.0, 500.0]]), np.zeros(1)
-    narrow, wide = (CentreOffsets(CAMERA, screen).at(at, w**2 * np.array([[1.0, 0, 1]]), faint) for w in (2.0, 4.0))
+    narrow, wide = (CentroidOffsets(CAMERA, screen).at(at, w**2 * np.array([[1.0, 0, 1]]), faint) for w in (2.0, 4.0))
     assert wide == pytest.approx(4 * narrow, rel=0.01)
 
 
 def test_without_a_screen_there_is_no_offset():
     behind = Screen("s", Pose(np.eye(3), np.array([0.0, 0.0, -2.0])))
-    offsets = CentreOffsets(CAMERA, behind)
+    offsets = CentroidOffsets(CAMERA, behind)
     assert not offsets.at(np.array([[700.0, 500.0]]), np.array([[9.0, 0, 9]]), np.zeros(1)).any()
     assert offsets.at(np.zeros((0, 2)), np.zeros((0, 3)), np.zeros(0)).shape == (0, 2)

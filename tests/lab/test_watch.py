@@ -18,7 +18,7 @@ import yaml
 from lab.errors import InputError, RunError
 from lab.files.run.run_file import LiveDevice, load_run
 from lab.files.text import columns
-from lab.pictures.picture_file import Missing, read_picture
+from lab.pictures.picture_file import MissingPicture, read_picture
 from lab.runs.frames import sensor_noise
 from lab.runs.process import process_run
 from lab.simulate.write import simulate
@@ -359,7 +359,7 @@ def test_an_incomplete_picture_is_read_again_and_a_damaged_one_is_reported(recor
     queue = inbox.queues["left"]
     assert not queue.incomplete
     assert np.array_equal(queue.pictures[0].content, read_picture(recorded / "frames/left/000000.png", None))
-    assert queue.pictures[1].content == Missing("unreadable: cut short")
+    assert queue.pictures[1].content == MissingPicture("unreadable: cut short")
 
 
 # -- when a frame is complete -----------------------------------------------------------------------------------------

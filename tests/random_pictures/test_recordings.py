@@ -29,7 +29,7 @@ from bench.random_pictures.write_folder import write_pictures
 from bench.random_scenes.__main__ import main
 from bench.random_scenes.write_folder import write_run_folder
 from lab.files.run.run_file import load_run
-from lab.pictures.picture_file import Missing
+from lab.pictures.picture_file import MissingPicture
 from lab.runs.frames.frames import open_frames
 from lab.runs.process import process_run
 from tracking.noise import NoiseModel
@@ -54,7 +54,7 @@ def test_a_written_recording_is_a_run_folder_that_states_no_noise(tmp_path: Path
     for k in (0, 3, 4):
         for c, name in enumerate(run.rig.cameras):
             picture = frames[k].images[name]
-            assert isinstance(picture, Missing) != has_image[k, c]
+            assert isinstance(picture, MissingPicture) != has_image[k, c]
             if isinstance(picture, np.ndarray):
                 off = picture.astype(float) - renderer.raw(k, c)
                 assert np.abs(off).max() == 0 if file_format == "png" else np.sqrt(np.mean(off**2)) < 4

@@ -25,7 +25,7 @@ from geometry.forward_model import SpotModel
 from geometry.pose_solver.gauss_newton import fit_pose
 from lab.files.run.run_file import load_run
 from lab.files.run.truth import load_run_truth
-from lab.pictures.picture_file import Missing
+from lab.pictures.picture_file import MissingPicture
 from lab.runs.frames.frames import open_frames
 from tracking.detections import Detections
 
@@ -236,7 +236,7 @@ def test_a_written_run_folder_reads_back_as_the_scene(tmp_path: Path):
     for k, frames in enumerate(open_frames(run)):
         for c, name in enumerate(scene.rig.cameras):
             picture = frames.images[name]
-            assert isinstance(picture, Missing) == (not scene.has_image[k, c])
+            assert isinstance(picture, MissingPicture) == (not scene.has_image[k, c])
             if isinstance(picture, Detections):
                 assert len(picture) == len(scene.detections[k][c])
 

@@ -14,7 +14,7 @@ from geometry.rig import Rig
 from geometry.uncertainty.rig_parameters import RigCovariance
 from lab.simulate.points import CLUTTER, PointRun
 from lab.simulate.scenarios import PriorRegion
-from lab.simulate.scene import HIDDEN, OUTSIDE, SHINING
+from lab.simulate.scene import OCCLUDED, OUTSIDE, VISIBLE
 from tracking.detections import UNMATCHED, Detections
 from tracking.parameters import TrackerParameters
 from tracking.rigid_body.rigid_tracker import RigidTracker
@@ -55,7 +55,7 @@ def tracked(
     return [tracker.step(dt_of(run, k), found_in(run, k)) for k in range(len(run.frame))]
 
 
-def looked_at_again(
+def smoothed_frames(
     run: PointRun,
     frames: list[TrackedFrame],
     parameters: TrackerParameters = RIGID,
@@ -71,7 +71,7 @@ def looked_at_again(
 
 
 @dataclass(frozen=True, slots=True)
-class Judged:
+class Assessment:
     """Answers compared with the truth: T frames, n views."""
 
     labelled: Bools  # (T, n) a detection was labelled
@@ -100,13 +100,13 @@ class Judged:
         return int(np.sum(self.visible & ~self.right))
 
 
-def judged(run: PointRun, frames: list[TrackedFrame]) -> Judged:
+def assess(run: PointRun, frames: list[TrackedFrame]) -> Assessment:
     shape = run.in_view.shape
     origin: Ints = np.full(shape, CLUTTER)
     labelled = np.array([f.point != UNMATCHED for f in frames])
     for k, v in zip(*np.nonzero(labelled), strict=True):
         origin[k, v] = run.origin[k][run.model.camera_of[v]][frames[k].point[v]]
-    visible = (run.in_view == SHINING) & run.has_image[:, run.model.camera_of]
+    visible = (run.in_view == VISIBLE) & run.has_image[:, run.model.camera_of]
     _, J = run.model.project(run.poses)
     errors, nees, bound = np.full((shape[0], 6), np.nan), np.full(shape[0], np.nan), np.full((shape[0], 6), np.nan)
     for k, f in enumerate(frames):
@@ -119,14 +119,14 @@ def judged(run: PointRun, frames: list[TrackedFrame]) -> Judged:
             nees[k] = errors[k] @ np.linalg.solve(f.pose_covariance, errors[k])
     prediction = np.array([f.predicted_px for f in frames]) - run.uv_px
     views = np.arange(shape[1])
-    return Judged(labelled, labelled & (origin == views), visible, errors, nees, bound, prediction)
+    return Assessment(labelled, labelled & (origin == views), visible, errors, nees, bound, prediction)
 
 
 @dataclass(frozen=True, slots=True)
 class Pooled:
     """Several recordings together."""
 
-    some: list[Judged]
+    some: list[Assessment]
 
     @property
     def identity(self) -> float:
@@ -172,7 +172,7 @@ def around_jumps(run: PointRun, which: str, frames: int, seed: int) -> Bools:
     return hide
 
 
-def filmed(
+def recording_of(
     rig: Rig,
     poses: Pose,
     t_s: Array,
@@ -206,7 +206,7 @@ def filmed(
         t_s=t_s,
         poses=poses,
         uv_px=uv,
-        in_view=np.where(model.in_picture(uv), np.where(detected, SHINING, HIDDEN), OUTSIDE),
+        in_view=np.where(model.in_picture(uv), np.where(detected, VISIBLE, OCCLUDED), OUTSIDE),
         has_image=np.ones((frames, len(model.camera_names)), dtype=bool),
         turned=np.zeros(frames, dtype=bool) if turned is None else turned,
         detections=tuple(detections),
@@ -237,7 +237,7 @@ def zig_zag(
     return Pose(np.stack([p.rotation for p in poses]), np.stack([p.translation for p in poses])), t_s, turned
 
 
-def some_frames(run: PointRun, frames: Ints) -> PointRun:
+def selected_frames(run: PointRun, frames: Ints) -> PointRun:
     """The same recording with only these frames, as if the others had been dropped."""
     return replace(
         run,

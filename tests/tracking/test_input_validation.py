@@ -18,7 +18,7 @@ from geometry.pose_prior import PosePrior
 from lab.simulate.points import CLUTTER, PointRun, simulate_points
 from tracking.curve_switching.spot_tracker import SpotTracker
 from tracking.detections import UNMATCHED, Detections
-from tracking.input_validation import TWIN_PX, usable_rows
+from tracking.input_validation import DUPLICATE_PX, usable_rows
 from tracking.parameters import TrackerParameters
 from tracking.rigid_body.rigid_tracker import RigidTracker
 from tracking.statuses import PoseStatus
@@ -141,7 +141,7 @@ def test_poses_of_frames_without_usable_points_are_predicted(what):
     assert (outcome.found[BAD + 5 :] == np.count_nonzero(run.in_view == 1, axis=1)[BAD + 5 :]).all()
 
 
-@pytest.mark.parametrize("apart_px", [0.0, 0.9 * TWIN_PX])
+@pytest.mark.parametrize("apart_px", [0.0, 0.9 * DUPLICATE_PX])
 def test_spots_detected_twice_in_every_frame_keep_their_labels(apart_px):
     """Without the check both share the label's probability, and 238 of 240 spots stay unlabelled."""
     run, rng = recording(), np.random.default_rng(1)
@@ -276,5 +276,5 @@ def test_kept_points_are_no_duplicates_and_dropped_points_had_one(seed, count):
     good = usable_rows(points)
     kept = np.ones(count, dtype=bool) if good is None else good
     gap = np.linalg.norm(uv[:, None] - uv[None], axis=-1)
-    assert (gap[kept][:, kept][~np.eye(kept.sum(), dtype=bool)] >= TWIN_PX).all()
-    assert (gap[~kept][:, kept].min(axis=1) < TWIN_PX).all() if not kept.all() else True
+    assert (gap[kept][:, kept][~np.eye(kept.sum(), dtype=bool)] >= DUPLICATE_PX).all()
+    assert (gap[~kept][:, kept].min(axis=1) < DUPLICATE_PX).all() if not kept.all() else True

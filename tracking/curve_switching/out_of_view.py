@@ -12,7 +12,7 @@ import numpy as np
 from geometry.arrays import Array
 from geometry.forward_model import SpotModel
 from geometry.lines import common_perpendicular
-from geometry.planes import meet_plane, screen_to_world
+from geometry.planes import intersect_plane, screen_to_world
 from geometry.pose_solver import coplanar
 from geometry.rig import Rig
 
@@ -136,5 +136,5 @@ def _on_screens(rig: Rig, model: SpotModel, uv_px: Array) -> Array:
         camera = rig.cameras[name]
         screen = rig.screens[camera.screen].world_from_screen
         origin, rays = camera.rays(uv_px[rows])
-        out[rows] = screen_to_world(meet_plane(origin, rays, screen), screen)
+        out[rows] = screen_to_world(intersect_plane(origin, rays, screen), screen)
     return out

@@ -13,9 +13,9 @@ import numpy as np
 from geometry.arrays import Array, Bools, Ints
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
-from geometry.pose_solver.gauss_newton import PoseFit, SolveLimits, fit_pose, good_enough
+from geometry.pose_solver.gauss_newton import PoseFit, SolveLimits, fit_pose, is_measurement
 from geometry.pose_solver.robust_pose import EXPECTED_GATE, fit_pose_robust
-from geometry.uncertainty.rig_uncertainty import CalibrationSpread
+from geometry.uncertainty.rig_uncertainty import RigUncertainty
 from tracking.curve_switching.tracks import Tracks
 from tracking.curve_switching.vehicle import Vehicle
 from tracking.detections import UNMATCHED, Detections
@@ -49,7 +49,7 @@ class RigidCheck:
     model: SpotModel
     parameters: TrackerParameters
     limits: SolveLimits
-    calibration: CalibrationSpread | None
+    calibration: RigUncertainty | None
 
     def pose_of_matches(
         self,
@@ -73,7 +73,7 @@ class RigidCheck:
         fit = self.robust_fit(rows, uv, cov, start, vehicle, expected=vehicle.expected)
         if fit is None:
             fit = self._merged_fit(rows, uv, cov, start, vehicle)
-        if fit is None or not good_enough(fit, self.limits):
+        if fit is None or not is_measurement(fit, self.limits):
             return None, point, turned
         if len(rows) < 4 and not _agrees_with_motion(fit, vehicle):
             return None, point, turned

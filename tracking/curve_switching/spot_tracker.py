@@ -16,10 +16,10 @@ from geometry.arrays import Array, Bools, Ints
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.pose_prior import PosePrior
-from geometry.pose_solver.gauss_newton import PoseFit, SolveLimits, good_enough, point_covariance
+from geometry.pose_solver.gauss_newton import PoseFit, SolveLimits, is_measurement, pixel_covariance
 from geometry.rig import Rig
 from geometry.uncertainty.rig_parameters import RigCovariance
-from geometry.uncertainty.rig_uncertainty import CalibrationSpread
+from geometry.uncertainty.rig_uncertainty import RigUncertainty
 from tracking.curve_switching.matching import match
 from tracking.curve_switching.out_of_view import CoplanarViews, quadratic_positions
 from tracking.curve_switching.rigid_check import RigidCheck, matched_pixels, outside_first_search
@@ -63,7 +63,7 @@ class SpotTracker:
         """covariance: of the rig's calibration, if known; it then contributes to the covariances of the poses."""
         self.rig = rig
         self.model = SpotModel.of(rig)
-        self.calibration = None if covariance is None else CalibrationSpread(rig, self.model, covariance)
+        self.calibration = None if covariance is None else RigUncertainty(rig, self.model, covariance)
         self.parameters = parameters
         self.prior = prior
         self.coplanar = CoplanarViews.of(rig, self.model)
@@ -181,7 +181,7 @@ class SpotTracker:
         if fit is None:
             # The labels agree within the model's error but not within the stated sigmas.
             fit = self.rigid_check.widened_fit(rows, uv, cov, start, self.vehicle)
-        if fit is None or not good_enough(fit, self.limits):
+        if fit is None or not is_measurement(fit, self.limits):
             return nothing
         names = ", ".join(self.model.views[v][1] for v in rows)
         events.append(Event(kind, f"spots {names} found from the prior alone"))
@@ -260,7 +260,7 @@ class SpotTracker:
             position, spread = fit.projected_px, fit.spot_covariances() * self.vehicle.noise_scale**2
         else:
             position, J = self.model.project(motion.world_from_body)
-            spread = point_covariance(J, motion.covariance) + self.vehicle.calibration_px(n)
+            spread = pixel_covariance(J, motion.covariance) + self.vehicle.calibration_px(n)
         exists = ~np.isnan(position[:, 0])
         if self.parameters.out_of_view == "quadratic":
             solved = quadratic_positions(self.rig, self.model, self.coplanar, uv)

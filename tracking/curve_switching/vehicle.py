@@ -11,7 +11,7 @@ from geometry.arrays import Array, Bools, Ints
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.pose_prior import PosePrior
-from geometry.pose_solver.gauss_newton import PoseFit, point_covariance
+from geometry.pose_solver.gauss_newton import PoseFit, pixel_covariance
 from tracking.curve_switching import pose_filter
 from tracking.curve_switching.pose_filter import RigidMotion
 from tracking.parameters import TrackerParameters
@@ -126,7 +126,7 @@ class Vehicle:
             projected, J = model.project(motion.world_from_body)
             y = uv_px - projected[rows]
             C = (cov_px2 + self.calibration_px(len(model))[rows]) * self.noise_scale**2
-            S = point_covariance(J[rows], motion.covariance) + C
+            S = pixel_covariance(J[rows], motion.covariance) + C
             nis = np.sum(y * np.linalg.solve(S, y[..., None])[..., 0], axis=-1)
             log_clutter = np.log(max(self.parameters.labels.clutter_per_px2, CLUTTER_NEAR_SPOTS))
             log_spot = -0.5 * nis - 0.5 * np.log(np.linalg.det(2 * np.pi * S))

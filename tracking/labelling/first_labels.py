@@ -22,7 +22,7 @@ from geometry.pose_solver.gauss_newton import SolveLimits, whiten
 from geometry.pose_solver.robust_pose import fit_pose_robust
 from geometry.rig import Rig
 from geometry.uncertainty.chi_square import chi2_limit
-from geometry.uncertainty.rig_uncertainty import CalibrationSpread
+from geometry.uncertainty.rig_uncertainty import RigUncertainty
 from tracking.detections import Detections
 from tracking.labelling.points import NO_POINT
 from tracking.labelling.search import Labelling, candidate_labellings, crowd_of_unknown_brightness
@@ -85,7 +85,7 @@ def find_labels(
     detections: Mapping[str, Detections],
     prior: PosePrior | None = None,
     parameters: LabelParameters | None = None,
-    calibration: CalibrationSpread | None = None,
+    calibration: RigUncertainty | None = None,
 ) -> LabelResult:
     """Label the points of all cameras of one frame from a prior alone, or without one.
 
@@ -120,7 +120,7 @@ def _without_odd_spots(
     detections: Mapping[str, Detections],
     one: Labelling,
     parameters: LabelParameters,
-    calibration: CalibrationSpread | None,
+    calibration: RigUncertainty | None,
 ) -> Labelling:
     """A labelling without its odd spots, if the others then agree within their own sigmas.
 

@@ -10,7 +10,7 @@ import numpy as np
 from geometry.arrays import Array, Bools, Ints
 from geometry.forward_model import SpotModel
 from geometry.rig import Rig
-from geometry.surfaces import meet_surface
+from geometry.surfaces import intersect_surface
 from tracking.detections import Detections
 from tracking.parameters import LabelParameters
 
@@ -58,7 +58,9 @@ def points_of(
             order = np.argsort(-np.nan_to_num(found.flux, nan=0.0), kind="stable")
             if len(found) > parameters.max_points:
                 origin, rays = camera.rays(found.uv_px[order])
-                possible = np.flatnonzero(reached(c, meet_surface(origin, rays, screen.world_from_screen, screen.bow)))
+                possible = np.flatnonzero(
+                    reached(c, intersect_surface(origin, rays, screen.world_from_screen, screen.bow))
+                )
                 brightest = order[possible[: parameters.max_points]]
                 # The density of false points is that of all points at least as bright as these.
                 if len(possible) > parameters.max_points:
@@ -67,7 +69,7 @@ def points_of(
                 brightest = order
             here = found.uv_px[brightest]
             origin, rays = camera.rays(here + np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])[:, None])
-            hits = meet_surface(origin, rays, screen.world_from_screen, screen.bow)
+            hits = intersect_surface(origin, rays, screen.world_from_screen, screen.bow)
             uv.append(here)
             cov.append(found.cov_px2[brightest])
             world.append(hits[0])

@@ -14,8 +14,8 @@ from geometry.pose import Pose
 from geometry.pose_prior import PosePrior
 from geometry.pose_solver.gauss_newton import PoseFit, fit_pose
 from geometry.rig import Rig
-from geometry.surfaces import meet_surface
-from geometry.uncertainty.rig_uncertainty import CalibrationSpread
+from geometry.surfaces import intersect_surface
+from geometry.uncertainty.rig_uncertainty import RigUncertainty
 from tracking.detections import Detections
 from tracking.labelling.candidates import BestCandidates, generate
 from tracking.labelling.completion import complete_all
@@ -113,7 +113,7 @@ def candidate_labellings(
     detections: Mapping[str, Detections],
     prior: PosePrior | None = None,
     parameters: LabelParameters | None = None,
-    calibration: CalibrationSpread | None = None,
+    calibration: RigUncertainty | None = None,
     most: int = 8,
 ) -> list[Labelling]:
     """The at most `most` labellings of one frame that best explain its points, best first.
@@ -172,7 +172,7 @@ def crowd_of_unknown_brightness(
     for name in crowds:
         camera = rig.cameras[name]
         screen = rig.screens[camera.screen]
-        places = meet_surface(*camera.rays(detections[name].uv_px), screen.world_from_screen, screen.bow)
+        places = intersect_surface(*camera.rays(detections[name].uv_px), screen.world_from_screen, screen.bow)
         count = int(np.count_nonzero(_reached_by_any(plan, prior, model.camera_names.index(name), places)))
         if count > limit:
             return name, count
@@ -229,10 +229,10 @@ def _within_budget(
         most = max(int(0.8 * most), FEWEST_POINTS)
 
 
-_calibration_covs: list[tuple[CalibrationSpread, RigPlan, Array]] = []
+_calibration_covs: list[tuple[RigUncertainty, RigPlan, Array]] = []
 
 
-def _calibration_cov_px2(plan: RigPlan, calibration: CalibrationSpread | None) -> Array:
+def _calibration_cov_px2(plan: RigPlan, calibration: RigUncertainty | None) -> Array:
     """The calibration's covariance of each view's pixel (n, 2, 2), px^2, in a typical pose; cached."""
     n = len(plan.model)
     if calibration is None or plan.typical is None:
@@ -277,7 +277,7 @@ def _completed(
     prior: PosePrior,
     log_volume: float,
     best: BestCandidates,
-    calibration: CalibrationSpread | None,
+    calibration: RigUncertainty | None,
     most: int,
     sigma_px: float,
 ) -> list[Labelling]:
@@ -308,7 +308,7 @@ def _consistent_fit(
     labels: Ints,
     start: Pose,
     model_errors_px: Array,
-    calibration: CalibrationSpread | None,
+    calibration: RigUncertainty | None,
 ) -> PoseFit | None:
     """The fit to labelled points with the smallest model error under which all points agree.
 

@@ -7,7 +7,7 @@ import numpy as np
 from geometry import rotations
 from geometry.arrays import Array, Bools
 from geometry.forward_model import SpotModel
-from geometry.pose_solver.symmetry import lie_on_each_other
+from geometry.pose_solver.symmetry import is_symmetry
 from tracking.labelling.points import NO_POINT
 from tracking.labelling.search import Labelling
 
@@ -33,7 +33,7 @@ def what_decides(model: SpotModel, one: Labelling, other: Labelling) -> str:
         ]
         if places:
             parts.append(f"spot {', '.join(places)}, where only the {which} expects one and none was found (hidden?)")
-    if lie_on_each_other(model, here.inverse() @ there, FITTED_RAD, FITTED_M):
+    if is_symmetry(model, here.inverse() @ there, FITTED_RAD, FITTED_M):
         parts.append("no spot of this rig: it is symmetric under the rotation from one pose to the other")
     elif not parts:
         parts.append("another spot in view")

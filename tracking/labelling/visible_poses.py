@@ -20,7 +20,7 @@ from geometry.pose import Pose
 from geometry.pose_prior import PosePrior
 from geometry.pose_solver.three_spots import poses_from_three_spots
 from geometry.rig import Rig
-from geometry.surfaces import meet_surface
+from geometry.surfaces import intersect_surface
 
 DRAWN = 4000  # sets of three pixels; the relative error of the volume is then 0.1 to 0.2
 FIXES = 1e-4  # least ratio of the singular values of three spots' Jacobian; collinear spots have 1e-12
@@ -83,7 +83,7 @@ def _at_random_pixels(rig: Rig, model: SpotModel, views: Ints, rng: np.random.Ge
         of_camera = model.camera_of[views] == c
         screen = rig.screens[rig.cameras[name].screen]
         origin, rays = rig.cameras[name].rays(pixels[of_camera])
-        hits = meet_surface(origin, rays, screen.world_from_screen, screen.bow)
+        hits = intersect_surface(origin, rays, screen.world_from_screen, screen.bow)
         if screen.size_m is not None:
             local = screen.world_from_screen.inverse().apply(hits)
             hits[(np.abs(local[:, :2]) > np.asarray(screen.size_m) / 2).any(axis=1)] = np.nan

@@ -12,7 +12,7 @@ from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.pose_prior import PosePrior
 from geometry.rig import Rig
-from geometry.uncertainty.rig_uncertainty import CalibrationSpread
+from geometry.uncertainty.rig_uncertainty import RigUncertainty
 from tracking.detections import Detections
 from tracking.labelling.first_labels import NO_POINT, Labelling, candidate_labellings, find_labels
 from tracking.parameters import TrackerParameters
@@ -37,7 +37,7 @@ class Acquisition:
         model: SpotModel,
         parameters: TrackerParameters,
         prior: PosePrior,
-        calibration: CalibrationSpread | None,
+        calibration: RigUncertainty | None,
     ) -> None:
         """prior: where the vehicle is in the first frame."""
         self._rig, self._model, self._parameters = rig, model, parameters

@@ -13,7 +13,7 @@ from geometry.arrays import Array, Ints
 from geometry.compiled_projection import project_all
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
-from geometry.pose_solver.alternative_poses import alternatives
+from geometry.pose_solver.alternative_poses import alternative_poses
 from tracking.rigid_body.association.frame_detections import BLENDED, NOT_SEARCHED, Observation, distinct_spots
 from tracking.rigid_body.association.likelihood import detection_log_likelihood, log_clutter_ratio
 from tracking.rigid_body.hypotheses.hypothesis_set import Children, Dynamics, Hypotheses, State, add_child
@@ -100,7 +100,7 @@ def add_mirror_solutions(
         ):
             continue
         pose = Pose(children.hypotheses.R[c].copy(), children.hypotheses.t[c].copy())
-        others = alternatives(model, pose, np.flatnonzero(exact))
+        others = alternative_poses(model, pose, np.flatnonzero(exact))
         manoeuvre = bool(children.manoeuvre[c])
         p = dynamics.p_manoeuvre
         log_weight = float(old.log_weight[parent]) + float(np.log(p if manoeuvre else 1 - p))

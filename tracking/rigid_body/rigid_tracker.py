@@ -28,7 +28,7 @@ from geometry.pose_prior import PosePrior
 from geometry.pose_solver.gauss_newton import SolveLimits, fit_pose
 from geometry.rig import Rig
 from geometry.uncertainty.rig_parameters import RigCovariance
-from geometry.uncertainty.rig_uncertainty import CalibrationSpread
+from geometry.uncertainty.rig_uncertainty import RigUncertainty
 from tracking.detections import Detections
 from tracking.input_validation import UsablePoints, check_step
 from tracking.labelling.first_labels import NO_POINT, Labelling
@@ -91,7 +91,7 @@ class RigidTracker:
         self.rig = rig
         self.model = SpotModel.of(rig)
         self.parameters = parameters
-        self.calibration = None if covariance is None else CalibrationSpread(rig, self.model, covariance)
+        self.calibration = None if covariance is None else RigUncertainty(rig, self.model, covariance)
         self.limits = SolveLimits(parameters.max_sigma_m, np.deg2rad(parameters.max_sigma_deg))
         self.variance_factor = VarianceFactor()
         self.process_noise = AdaptiveProcessNoise(parameters)
@@ -138,7 +138,7 @@ class RigidTracker:
         check_step(dt_s, found, self.model.camera_names, not self._begun)
         usable = UsablePoints.of(found)
         self._begun = True
-        return usable.as_given(self._step(dt_s, usable.found), self.model.camera_of)
+        return usable.with_given_rows(self._step(dt_s, usable.found), self.model.camera_of)
 
     def _step(self, dt_s: float, found: Sequence[Detections | None]) -> TrackedFrame:
         """Track one frame with valid detections."""

@@ -32,7 +32,7 @@ class PlaceErrors:
     same_error_frames: Array  # (T,) number of frames, this one included, with the same errors; mean over the views
     reach_px: Array  # (n,) correlation length: the sigma of a spot whose mean over white texture would make it
     elsewhere: float = 0.0  # share of the variance that is the same in all places: errors of the rig, not of a place
-    few: float = 1.0  # factor of their variance, because it is estimated from few places
+    few_places_factor: float = 1.0  # factor of their variance, because it is estimated from few places
 
     def factor(self, averaged: Array) -> Array:
         """Factors (T,) of covariances that were computed as if the errors of all frames were independent.
@@ -40,7 +40,8 @@ class PlaceErrors:
         averaged (T,): number of frames that each pose is a mean of.
         """
         return np.asarray(
-            1 + self.share * (self.few * np.minimum(self.same_error_frames, np.maximum(averaged, 1.0)) - 1)
+            1
+            + self.share * (self.few_places_factor * np.minimum(self.same_error_frames, np.maximum(averaged, 1.0)) - 1)
         )
 
 
@@ -80,8 +81,8 @@ def place_errors(residual: Array, uv_px: Array, width_px: Array, averaged: Array
     white = max(1 - seen, 0.0) / (1 - absorbed / float(np.median(np.maximum(averaged, 1.0))))
     # A variance estimated from few places is uncertain: Student's distribution is wider by this factor in variance.
     free = 2 * (1 - absorbed) * float(np.sum(labelled / np.maximum(sums.same_error_frames, 1.0)))
-    few = min(free / max(free - 2, 1e-9), _MAX_STUDENT)
-    return PlaceErrors(place / (place + white), same_error_frames, sums.reach_px, sums.elsewhere, few)
+    few_places_factor = min(free / max(free - 2, 1e-9), _MAX_STUDENT)
+    return PlaceErrors(place / (place + white), same_error_frames, sums.reach_px, sums.elsewhere, few_places_factor)
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,7 @@ from geometry.arrays import Array, Bools, Ints
 from geometry.forward_model import SpotModel
 from geometry.rig import Rig
 from geometry.uncertainty.rig_parameters import RigCovariance
-from geometry.uncertainty.rig_uncertainty import CalibrationSpread
+from geometry.uncertainty.rig_uncertainty import RigUncertainty
 from tracking.detections import UNMATCHED, Detections
 from tracking.parameters import TrackerParameters
 from tracking.rigid_body.association.frame_detections import BLENDED
@@ -45,7 +45,7 @@ class TrackedRecording:
         self.rig = rig
         self.model = SpotModel.of(rig)
         self.parameters = parameters
-        self.calibration = None if covariance is None else CalibrationSpread(rig, self.model, covariance)
+        self.calibration = None if covariance is None else RigUncertainty(rig, self.model, covariance)
         self.exposure_s = exposure_s
         self._dt: list[float] = []
         self._uv: list[Array] = []

@@ -14,7 +14,7 @@ from calibration.least_squares.priors import Anchors, independent
 from calibration.lens.fit.corner_table import CornerTable
 from calibration.lens.fit.lens_models import LensModel
 from calibration.lens.fit.lens_parameters import AS_STATED, BoardFreedom, Values, array_of, lens_of
-from calibration.terms.corners import INTRINSICS, CornerTerm, single_camera
+from calibration.terms.corners import INTRINSICS_COUNT, CornerTerm, single_camera
 from geometry.arrays import Array, Bools
 
 CONVERGED = Limits()
@@ -62,13 +62,13 @@ def coefficient_prior(table: CornerTable, used: Bools, model: LensModel, values:
     with np.errstate(invalid="ignore", divide="ignore"):
         r2 = np.nanquantile(np.sum(xyz[:, :2] ** 2, axis=1) / xyz[:, 2] ** 2, 0.99)
     power = np.array([1, 2, 0, 0, 3, 1, 2, 3, 1, 2, 1, 2, 0, 0])
-    sigmas = np.full(INTRINSICS, np.inf)
+    sigmas = np.full(INTRINSICS_COUNT, np.inf)
     radial = np.array([0, 1, 4, 5, 6, 7])
     sigmas[4 + radial] = _MODERATE / float(r2) ** power[radial]
     prism = np.array([8, 9, 10, 11])
     sigmas[4 + prism] = _MODERATE_PRISM / float(r2) ** power[prism]
     sigmas[~model.free] = np.inf
-    return independent("intrinsics", Vectors(np.zeros((1, INTRINSICS))), sigmas[None])[0]
+    return independent("intrinsics", Vectors(np.zeros((1, INTRINSICS_COUNT))), sigmas[None])[0]
 
 
 def with_circle_radius(table: CornerTable, used: Bools, model: LensModel, values: Values) -> tuple[Values, list[Term]]:
@@ -152,8 +152,8 @@ def _lens_basis(term: CornerTerm, known: Sequence[Term], model: LensModel, value
     From the R factor of a QR decomposition of the derivatives at the start; the identity if R is singular.
     """
     own = [p.jacobian for t in [term, *known] for p in t.linearise(values).parts if p.stack == "intrinsics"]
-    rows = np.concatenate([J.reshape(-1, INTRINSICS) for J in own])[:, model.free]
-    basis = np.eye(INTRINSICS)
+    rows = np.concatenate([J.reshape(-1, INTRINSICS_COUNT) for J in own])[:, model.free]
+    basis = np.eye(INTRINSICS_COUNT)
     scale = np.linalg.norm(rows, axis=0)
     if not (np.isfinite(scale).all() and np.all(scale > 0)):
         return basis

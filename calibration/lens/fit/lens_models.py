@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.terms.corners import INTRINSICS
+from calibration.terms.corners import INTRINSICS_COUNT
 from geometry import lens
 from geometry.arrays import Array, Bools
 from geometry.camera import FISHEYE, PERSPECTIVE
@@ -25,7 +25,7 @@ class LensModel:
     def __post_init__(self) -> None:
         allowed = (4,) if self.lens == FISHEYE else (0, 4, 5, 8, 12)
         if self.lens not in (PERSPECTIVE, FISHEYE) or self.coefficients not in allowed:
-            raise ValueError(f"expected one of the models {', '.join(m.title for m in LADDER)}")
+            raise ValueError(f"expected one of the models {', '.join(m.title for m in LENS_MODELS)}")
 
     @property
     def fisheye(self) -> bool:
@@ -45,7 +45,7 @@ class LensModel:
     @property
     def free(self) -> Bools:
         """(18,): which of fx, fy, cx, cy and the fourteen distortion coefficients are free in a fit."""
-        return np.arange(INTRINSICS) < 4 + self.coefficients
+        return np.arange(INTRINSICS_COUNT) < 4 + self.coefficients
 
     def cut(self, numbers: Array) -> Array:
         """The lens (18,) with the coefficients that this model does not have set to 0."""
@@ -60,7 +60,7 @@ class LensModel:
 
 # In ascending order of flexibility. Fisheye stands before the rational model: it has as many coefficients as the
 # second model, but distorts even with all of them 0.
-LADDER = (
+LENS_MODELS = (
     LensModel(0),
     LensModel(4),
     LensModel(5),
@@ -76,10 +76,10 @@ def named(title: str) -> LensModel:
     Raises:
         ValueError: no model has it; the message lists the titles.
     """
-    for model in LADDER:
+    for model in LENS_MODELS:
         if model.title == title:
             return model
-    raise ValueError(f"expected a lens model out of {', '.join(m.title for m in LADDER)}, got {title!r}")
+    raise ValueError(f"expected a lens model out of {', '.join(m.title for m in LENS_MODELS)}, got {title!r}")
 
 
 def rational_of_fisheye(numbers: Array, widest_rad: float) -> Array:
@@ -96,7 +96,7 @@ def rational_of_fisheye(numbers: Array, widest_rad: float) -> Array:
     A = np.concatenate([powers, -scale[:, None] * powers], axis=1) * weight
     norm = np.linalg.norm(A, axis=0)
     k = np.linalg.lstsq(A / norm, (scale - 1) * weight[:, 0], rcond=1e-10)[0] / norm
-    out = np.zeros(INTRINSICS)
+    out = np.zeros(INTRINSICS_COUNT)
     out[:4] = numbers[:4]
     out[[4, 5, 8]], out[9:12] = k[:3], k[3:]
     return out

@@ -17,7 +17,7 @@ from calibration.lens.fit.lens_adjustment import FitSettings, adjust, term_of
 from calibration.lens.fit.lens_fit import FEWEST_CORNERS
 from calibration.lens.fit.lens_models import LensModel, folds_in_picture, undistorted
 from calibration.lens.fit.lens_parameters import AS_STATED, Values, lens_of, values_of
-from calibration.terms.corners import INTRINSICS
+from calibration.terms.corners import INTRINSICS_COUNT
 from geometry.arrays import Array, Bools, Ints
 from geometry.camera import FISHEYE
 from geometry.pose import Pose
@@ -100,7 +100,7 @@ def _guesses(table: CornerTable, fisheye: bool) -> Sequence[float]:
 
 
 def _first_lens(focal: float, image_size_px: tuple[int, int]) -> Array:
-    lens = np.zeros(INTRINSICS)
+    lens = np.zeros(INTRINSICS_COUNT)
     width, height = image_size_px
     lens[:4] = focal, focal, (width - 1) / 2, (height - 1) / 2
     return lens
@@ -108,7 +108,7 @@ def _first_lens(focal: float, image_size_px: tuple[int, int]) -> Array:
 
 def _short_solve(table: CornerTable, used: Bools, model: LensModel, values: Values) -> Values:
     """First focal lengths and k1 alone, then the rest: from a bad start, all parameters together may diverge."""
-    few_parameters = np.zeros(INTRINSICS, dtype=bool)
+    few_parameters = np.zeros(INTRINSICS_COUNT, dtype=bool)
     few_parameters[[0, 1, 4]] = True
     for lens_free in (few_parameters, model.free):
         term = term_of(table, used, model.fisheye)

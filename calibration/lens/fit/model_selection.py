@@ -13,7 +13,7 @@ from calibration.least_squares.parameter_blocks import Vectors
 from calibration.lens.fit.corner_table import CornerTable
 from calibration.lens.fit.hold_out import BRIEF, HeldOut, Scatter, hold_out, scatter
 from calibration.lens.fit.lens_fit import CORNER_GATE, LensFit, fit, robust_fit
-from calibration.lens.fit.lens_models import LADDER, LensModel, folds_in_picture, rational_of_fisheye
+from calibration.lens.fit.lens_models import LENS_MODELS, LensModel, folds_in_picture, rational_of_fisheye
 from calibration.lens.fit.lens_parameters import AS_STATED, BoardFreedom, Values
 from calibration.lens.fit.residual_cells import SIGNIFICANT, beyond_noise, cell_means
 from geometry.arrays import Bools
@@ -67,7 +67,7 @@ def select_model(
     """
     fitted: list[ModelCandidate] = []
     below: LensFit | None = None
-    for model in LADDER if only is None else (only,):
+    for model in LENS_MODELS if only is None else (only,):
         starts = [f for f in rich if f.model.fisheye == model.fisheye and f.model.coefficients <= model.coefficients]
         starts = starts or [f for f in rich if f.model.fisheye == model.fisheye]
         if below is not None and not model.fisheye and model.coefficients >= RATIONAL.coefficients:

@@ -12,7 +12,7 @@ import numpy as np
 from calibration.beams.beam_findings import ARCSEC, UNDETERMINED, BeamGoals, beam_findings, direction_sigmas
 from calibration.beams.beams import BeamCalibration, self_calibrate
 from calibration.beams.beams import calibrate_beams as solve_beams
-from calibration.beams.excitation import briefly
+from calibration.beams.excitation import summary_of
 from calibration.findings import Finding, Level, verdict
 from calibration.least_squares.adjustment import AdjustmentError
 from geometry.uncertainty.rig_parameters import RigCovariance
@@ -24,11 +24,11 @@ from lab.errors import CalibrationError, InputError
 from lab.files.project.project import load_project
 from lab.files.project.project_types import Project
 from lab.files.rig.calibration_state import CalibrationState
-from lab.files.rig.rig_covariance import blocks_of, joint_covariance
+from lab.files.rig.rig_covariance import covariance_blocks, joint_covariance
 from lab.files.rig.rig_file import RigFile, load_rig_file, save_rig
 from lab.files.rig.screens_file import load_screens
-from lab.files.text.atomic_write import atomic_folder, beside_a_good_one, refuse_foreign
-from lab.files.text.error_text import did_you_mean
+from lab.files.text.atomic_write import atomic_folder, check_output_folder, keep_good_results
+from lab.files.text.error_text import suggest_name
 from lab.files.text.yaml_text import read_mapping
 
 RIG = "rig.yaml"
@@ -68,7 +68,7 @@ class BeamsOutcome:
         if self.level == Level.FAIL:
             what_failed = worst.what.split(" (")[0]
             if c.undetermined and worst.what.startswith(UNDETERMINED):
-                what_failed = f"{UNDETERMINED}: {briefly(c.undetermined)}"
+                what_failed = f"{UNDETERMINED}: {summary_of(c.undetermined)}"
             reason = f"; {what_failed}: {worst.remedy}"
         return f"{self.name}: {self.level.name}: {what}{reason} -> {self.out}"
 
@@ -86,7 +86,7 @@ def calibrate_beams(
         InputError: for errors in the files.
         CalibrationError: if the spots do not determine a calibration. `out` is left unchanged.
     """
-    refuse_foreign(out, _is_ours)
+    check_output_folder(out, _is_ours)
     project = load_project(Path(project_path), lab_known=True)
     day = calibration_date(project, today)
     check_no_duplicates(project)
@@ -108,7 +108,7 @@ def calibrate_beams(
         *_input_findings(project, recordings, lab_covariance is not None, file.calibration, rig_path),
     ]
     level = verdict(findings)
-    folder = beside_a_good_one(out, level == Level.FAIL, RIG)
+    folder = keep_good_results(out, level == Level.FAIL, RIG)
     outcome = BeamsOutcome(
         project.name, folder, level, tuple(findings), found, None if level == Level.FAIL else folder / RIG
     )
@@ -143,7 +143,7 @@ def _calibrated_lab(project: Project, rig_path: Path) -> tuple[RigFile, RigCovar
             if name not in calibrated:
                 raise InputError(
                     f"{rig_path}: expected {kind} {name!r} of {project.path.name}, got {', '.join(calibrated)}"
-                    f"{did_you_mean(name, calibrated)}; calibrate it first (`beampose calibrate screen`)"[:300]
+                    f"{suggest_name(name, calibrated)}; calibrate it first (`beampose calibrate screen`)"[:300]
                 )
     if not project.beams and not file.rig.beams:
         raise InputError(
@@ -221,4 +221,4 @@ def _rig_file(
     expiry = [d for d in (lab.valid_until if lab is not None else None, expiry_date(project, day)) if d is not None]
     reasons = [f.what for f in findings if f.level > Level.PASS]
     state = CalibrationState(day, verdict(findings).name, min(expiry, default=None), tuple(reasons), project.notes)
-    return RigFile(c.rig, blocks_of(c.covariance), state)
+    return RigFile(c.rig, covariance_blocks(c.covariance), state)

@@ -15,7 +15,7 @@ from geometry.arrays import Array, Bools
 from geometry.pose import ypr_sigmas
 from geometry.rig import Rig
 from lab.calibrate.beams.beam_tables import difference_from_nominal, residuals_mm, used_positions
-from lab.number_format import short
+from lab.number_format import format_number
 from lab.report.calibration.calibration_charts import residual_histogram
 from lab.report.calibration.calibration_drawings import coverage_map, residual_field
 from lab.report.calibration.calibration_page import (
@@ -73,16 +73,26 @@ def _key_figures(c: BeamCalibration) -> list[tuple[str, str, str]]:
     if not c.undetermined:
         worst = list(c.rig.beams)[int(np.argmax(direction))]
         rms = float(np.sqrt(np.mean(direction**2))) / ARCSEC
-        note = f"1 sigma per axis, RMS over beams; worst: {worst} with {short(float(direction.max()) / ARCSEC, 3)}"
+        note = (
+            f"1 sigma per axis, RMS over beams; worst: {worst} with {format_number(float(direction.max()) / ARCSEC, 3)}"
+        )
         note += "; in the frame of the nominal beams" if c.world_from_stand is None else ""
-        out.append(("sigma of directions", f"{short(rms, 3)} arcsec", note))
+        out.append(("sigma of directions", f"{format_number(rms, 3)} arcsec", note))
         rms = 1e3 * float(np.sqrt(np.mean(offset**2)))
-        out.append(("sigma of offsets", f"{short(rms, 3)} mm", "per axis, at the point nearest to the body's origin"))
+        out.append(
+            ("sigma of offsets", f"{format_number(rms, 3)} mm", "per axis, at the point nearest to the body's origin")
+        )
     if c.angles:
         angles = float(np.sqrt(np.mean([a.sigma**2 for a in c.angles]))) / ARCSEC
         note = "RMS over pairs; independent of the body frame"
-        out.append(("angles between beams", f"± {short(angles, 3)} arcsec", note))
-    out.append(("residuals", f"{short(rms_px, 3)} px · {short(rms_mm, 3)} mm", "RMS per axis, mm on the screens"))
+        out.append(("angles between beams", f"± {format_number(angles, 3)} arcsec", note))
+    out.append(
+        (
+            "residuals",
+            f"{format_number(rms_px, 3)} px · {format_number(rms_mm, 3)} mm",
+            "RMS per axis, mm on the screens",
+        )
+    )
     out.append(("spots", f"{int(kept.sum())} of {len(kept)}", "used; the others were rejected as outliers"))
     count = len(c.world_from_body.translation)
     out.append(("positions", str(count), "known poses" if c.world_from_stand is not None else "unknown poses"))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from calibration.beams.error_diagnosis import suspect
+from calibration.beams.error_diagnosis import diagnose_error
 from geometry.rig import Rig
 from geometry.uncertainty.rig_parameters import RigCovariance
 from lab.calibrate.beams.recordings import Recordings, stand_of
@@ -23,7 +23,7 @@ def diagnose_failed_fit(
     Raises:
         InputError: if a single known mistake explains the failure.
     """
-    found = suspect(rig, recordings.spots, stand_of(project, recordings), lab_covariance)
+    found = diagnose_error(rig, recordings.spots, stand_of(project, recordings), lab_covariance)
     if found is None:
         return
     files = [r.spots or r.run if found.in_labels else r.poses for r in project.recordings]

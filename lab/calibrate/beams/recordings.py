@@ -20,8 +20,8 @@ from lab.files.project.point_files import StandPoses, read_poses
 from lab.files.project.project_types import Project, RecordingEntry
 from lab.files.text.csv_table import Table
 from lab.files.text.csv_text import read_table
-from lab.files.text.error_text import did_you_mean, shown_line
-from lab.files.text.range_checks import SIGMAS_PX, refuse_far_pixels, refuse_sigmas
+from lab.files.text.error_text import printable_line, suggest_name
+from lab.files.text.range_checks import SIGMA_RANGE_PX, check_pixels, check_sigmas
 
 if TYPE_CHECKING:
     pass
@@ -149,7 +149,9 @@ def read_spot_table(path: Path, rig: Rig, notes: list[str]) -> SpotRows:
     table.require_rows(("position", *SPOTS))
     key = "position" if "position" in table else "frame"
     if key not in table:
-        raise InputError(f"{path}: expected a column 'position' (or 'frame'), got {shown_line(','.join(table.header))}")
+        raise InputError(
+            f"{path}: expected a column 'position' (or 'frame'), got {printable_line(','.join(table.header))}"
+        )
     table.whole(key)
     if "status" in table:
         table = table.select(np.isin(table.words["status"].tolist(), _USED))
@@ -163,7 +165,7 @@ def read_spot_table(path: Path, rig: Rig, notes: list[str]) -> SpotRows:
     for i, (camera, spot) in enumerate(zip(cameras, spots, strict=True)):
         for kind, name, names in (("camera", camera, rig.cameras), ("spot", spot, rig.spots)):
             if name not in names:
-                raise table.error(i, f"{kind}: expected {wanted[kind]}, got {name!r}{did_you_mean(name, names)}"[:200])
+                raise table.error(i, f"{kind}: expected {wanted[kind]}, got {name!r}{suggest_name(name, names)}"[:200])
         if (camera, spot) not in views:
             raise table.error(
                 i,
@@ -173,7 +175,7 @@ def read_spot_table(path: Path, rig: Rig, notes: list[str]) -> SpotRows:
         view[i] = views[camera, spot]
     pixels = np.stack([table.finite(name) for name in ("u_px", "v_px")], axis=1)
     sizes = {name: c.image_size_px for name, c in rig.cameras.items()}
-    refuse_far_pixels(table, sizes)
+    check_pixels(table, sizes)
     pairs = np.stack([whole, view], axis=1)
     _, first, count = np.unique(pairs, axis=0, return_index=True, return_counts=True)
     if key == "frame" and np.any(count > 1):
@@ -196,7 +198,7 @@ def _covariances(table: Table, notes: list[str]) -> Array:
             out[:, k, k] = DEFAULT_SPOT_SIGMA_PX**2
             continue
         given = table.finite(name, "a number above 0", may_be_empty=True)
-        refuse_sigmas(table, name, SIGMAS_PX, "px")
+        check_sigmas(table, name, SIGMA_RANGE_PX, "px")
         out[:, k, k] = np.where(np.isnan(given), DEFAULT_SPOT_SIGMA_PX, given) ** 2
         if k == 0 and np.isnan(given).any():
             notes.append(

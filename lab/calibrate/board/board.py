@@ -10,9 +10,9 @@ from pathlib import Path
 from calibration.boards.board_types import Board, Charuco
 from lab.calibrate.board.board_page import as_pdf, as_png, as_svg, lay_out
 from lab.errors import InputError
-from lab.files.rig.board_file import board_of, load_board, save_board
+from lab.files.rig.board_file import load_board, load_board_or_text, save_board
 from lab.files.text.atomic_write import atomic_folder, atomic_write_bytes
-from lab.files.text.error_text import did_you_mean
+from lab.files.text.error_text import suggest_name
 
 FORMATS = ("pdf", "svg", "png")
 DESCRIPTION = "board.yaml"
@@ -60,14 +60,14 @@ def write_board(
         InputError: for an unknown format, a board that does not fit on the page, or files that cannot be written.
     """
     if isinstance(board, str | Path):
-        board = board_of(board)
+        board = load_board_or_text(board)
     out = Path(out)
     single = out.suffix.lower()[1:]
     if single in FORMATS and not out.is_dir():
         formats = (single,)
     for name in formats:
         if name not in FORMATS:
-            raise InputError(f"format: expected {', '.join(FORMATS)}, got {name!r}{did_you_mean(name, FORMATS)}")
+            raise InputError(f"format: expected {', '.join(FORMATS)}, got {name!r}{suggest_name(name, FORMATS)}")
     if out.suffix and not out.is_dir() and not (single in FORMATS or _is_number(single)):
         raise InputError(
             f"{out}: expected a folder, or a file ending in .{', .'.join(FORMATS)}, got {out.suffix};"

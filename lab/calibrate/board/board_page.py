@@ -116,7 +116,7 @@ def as_pdf(page: Page) -> bytes:
     pdf = FPDF(unit="pt", format=(w * pt, h * pt))
     pdf.viewer_preferences = ViewerPreferences(print_scaling="None")
     pdf.add_page()
-    layers = [(x.dark, page.rectangles_mm(x), page.circles_mm(x)) for x in page.drawing.layers]
+    layers = [(x.is_black, page.rectangles_mm(x), page.circles_mm(x)) for x in page.drawing.layers]
     for black, rectangles, circles in [*layers, (True, page.bar_parts_mm(), np.empty((0, 3)))]:
         with pdf.new_path() as path:
             path.style.fill_color = "#000" if black else "#fff"
@@ -144,7 +144,7 @@ def as_svg(page: Page) -> str:
     ]
     for layer in page.drawing.layers:
         path = "".join(f"M{x:.5f} {y:.5f}h{a:.5f}v{b:.5f}h{-a:.5f}z" for x, y, a, b in page.rectangles_mm(layer))
-        colour = "#000" if layer.dark else "#fff"
+        colour = "#000" if layer.is_black else "#fff"
         if path:
             out.append(f'<path fill="{colour}" d="{path}"/>')
         out += [
@@ -177,7 +177,7 @@ def as_png(page: Page, dpi: float = 300.0) -> bytes:
         raise InputError(f"dpi: at {dpi:g} dpi this page has {width}x{height} pixels; lower the dpi, or use the PDF")
     paper = np.full((height, width), 255, dtype=np.uint8)
     for layer in page.drawing.layers:
-        grey = 0 if layer.dark else 255
+        grey = 0 if layer.is_black else 255
         _paint_rectangles(paper, page.rectangles_mm(layer) * per_mm, grey)
         for circle in page.circles_mm(layer) * per_mm:
             _paint_circle(paper, circle, grey)

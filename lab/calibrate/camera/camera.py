@@ -12,7 +12,7 @@ import numpy as np
 from calibration.boards.board_types import Board, CircleGrid
 from calibration.findings import Level
 from calibration.lens.fit.corner_table import CircleAreas, CornerTable
-from calibration.lens.fit.lens_models import LADDER, named
+from calibration.lens.fit.lens_models import LENS_MODELS, named
 from calibration.lens.intrinsics import (
     FEWEST_VIEWS,
     IntrinsicsError,
@@ -25,16 +25,16 @@ from geometry.camera import FISHEYE, PERSPECTIVE
 from lab.calibrate.camera.camera_outcome import CameraOutcome
 from lab.calibrate.camera.photos import PhotoSet, Progress, find_in_photos, origins_of
 from lab.errors import CalibrationError, InputError
-from lab.files.rig.board_file import board_of
+from lab.files.rig.board_file import load_board_or_text
 from lab.files.rig.camera_block import Covariance
 from lab.files.rig.camera_file import CameraCalibration, CameraFile, save_camera
-from lab.files.text.atomic_write import atomic_folder, beside_a_good_one, refuse_foreign
+from lab.files.text.atomic_write import atomic_folder, check_output_folder, keep_good_results
 from lab.files.text.csv_text import write_table
-from lab.files.text.error_text import did_you_mean
+from lab.files.text.error_text import suggest_name
 
 CAMERA, FAILED, CORNERS = "camera.yaml", "camera.failed.yaml", "corners.csv"
 CORNER_COLUMNS = ("view", "id", "u_px", "v_px", "residual_u_px", "residual_v_px", "used")  # measured minus model
-LENSES = ("auto", *(m.title for m in LADDER))
+LENSES = ("auto", *(m.title for m in LENS_MODELS))
 WARPS = {"auto": None, "on": True, "off": False}
 
 
@@ -52,11 +52,11 @@ class CameraOptions:
 
     def __post_init__(self) -> None:
         if self.lens not in LENSES:
-            raise InputError(f"lens: expected {', '.join(LENSES)}, got {self.lens!r}{did_you_mean(self.lens, LENSES)}")
+            raise InputError(f"lens: expected {', '.join(LENSES)}, got {self.lens!r}{suggest_name(self.lens, LENSES)}")
         if self.warp not in WARPS:
-            raise InputError(f"warp: expected {', '.join(WARPS)}, got {self.warp!r}{did_you_mean(self.warp, WARPS)}")
+            raise InputError(f"warp: expected {', '.join(WARPS)}, got {self.warp!r}{suggest_name(self.warp, WARPS)}")
         if self.stretch not in WARPS:
-            near = did_you_mean(self.stretch, WARPS)
+            near = suggest_name(self.stretch, WARPS)
             raise InputError(f"stretch: expected {', '.join(WARPS)}, got {self.stretch!r}{near}")
         if self.distance_m is not None and not (np.isfinite(self.distance_m) and self.distance_m > 0):
             raise InputError(f"distance: expected metres above 0, got {self.distance_m:g}")
@@ -91,9 +91,9 @@ def calibrate_camera(
         CalibrationError: if the photographs do not determine the camera.
     """
     options = options or CameraOptions()
-    refuse_foreign(out, _is_ours)
+    check_output_folder(out, _is_ours)
     day = today or datetime.date.today()
-    known = board_of(board) if isinstance(board, str | Path) else board
+    known = load_board_or_text(board) if isinstance(board, str | Path) else board
     found = find_in_photos(photos, known, progress, fewest=FEWEST_VIEWS)
     table = corner_table(found)
     try:
@@ -102,7 +102,7 @@ def calibrate_camera(
         raise InputError(f"{options.name} ({found.line()}): {error}") from None
     except IntrinsicsError as error:
         raise CalibrationError(f"{options.name} ({found.line()}): {error}") from None
-    folder = beside_a_good_one(out, result.verdict == Level.FAIL, CAMERA)
+    folder = keep_good_results(out, result.verdict == Level.FAIL, CAMERA)
     outcome = CameraOutcome(options.name, folder, result, found)
     file = camera_file(outcome, options, day)
     with atomic_folder(folder, may_replace=_is_ours) as work:
@@ -171,9 +171,9 @@ def figures_of(r: Intrinsics) -> dict[str, float]:
         "uncertainty_worst_mm": float(np.nanmax(mm)),
         "scatter_between_photographs": r.scatter.factor,
         "sigmas_raised_by": r.correlated_noise,
-        "sigmas_raised_for_model_by": r.doubt.factor,
-        "residuals_together_px": r.doubt.left_px,
-        "lens_models_differ_px": r.doubt.between_px,
+        "sigmas_raised_for_model_by": r.model_uncertainty.factor,
+        "residuals_together_px": r.model_uncertainty.left_px,
+        "lens_models_differ_px": r.model_uncertainty.between_px,
         "picture_covered": r.coverage.filled,
         "tilts_differ_by_deg": r.coverage.spread_deg,
     }

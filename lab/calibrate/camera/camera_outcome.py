@@ -11,7 +11,7 @@ from calibration.findings import Level
 from calibration.lens.intrinsics_result import Intrinsics
 from lab.calibrate.camera.photos import PhotoSet
 from lab.errors import CalibrationError
-from lab.number_format import short
+from lab.number_format import format_number
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +40,8 @@ class CameraOutcome:
         reason = "" if self.level == Level.PASS else f": {worst.what.rstrip('.')}"
         px, mm = (np.nanmedian(m) for m in (r.map.sigma_px(r.covariance), r.map.sigma_mm(r.covariance)))
         return (
-            f"{self.name}: {self.level.name}: fx {r.fit.lens[0]:.2f} ± {short(r.sigmas[0], 2)} px, {r.model.words}, RMS"
-            f" {r.rms_px:.3f} px, directions to {short(px, 2)} px / {short(mm, 2)} mm at"
+            f"{self.name}: {self.level.name}: fx {r.fit.lens[0]:.2f} ± {format_number(r.sigmas[0], 2)} px,"
+            f" {r.model.words}, RMS"
+            f" {r.rms_px:.3f} px, directions to {format_number(px, 2)} px / {format_number(mm, 2)} mm at"
             f" {r.distance_m:.3g} m{reason} -> {self.out}"
         )

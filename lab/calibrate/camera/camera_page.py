@@ -10,16 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.findings import Level
-from calibration.lens.board_findings import circles_finding, doubt_finding, points_finding, stretch_finding
+from calibration.lens.board_findings import circles_finding, model_uncertainty_finding, points_finding, stretch_finding
 from calibration.lens.fit.lens_models import LensModel
 from calibration.lens.intrinsics_result import Intrinsics
 from geometry.arrays import Array
 from lab.calibrate.camera.camera_outcome import CameraOutcome
 from lab.calibrate.camera.photos import VIDEO_SUFFIXES
 from lab.files.rig.camera_file import CameraFile
-from lab.number_format import short
-from lab.pictures.picture_file import Missing, decode
-from lab.report.calibration.calibration_charts import lens_ladder, residual_histogram
+from lab.number_format import format_number
+from lab.pictures.picture_file import MissingPicture, decode
+from lab.report.calibration.calibration_charts import lens_model_chart, residual_histogram
 from lab.report.calibration.calibration_drawings import corners_overlay, coverage_map, residual_field, tilt_polar
 from lab.report.calibration.calibration_maps import correlation_matrix
 from lab.report.calibration.calibration_page import (
@@ -28,7 +28,7 @@ from lab.report.calibration.calibration_page import (
     PageTable,
     Section,
     provenance,
-    telling_views,
+    representative_views,
     write_calibration_report,
 )
 from lab.report.plot.maps import heat_map
@@ -61,21 +61,33 @@ def write_page(outcome: CameraOutcome, file: CameraFile, day: datetime.date, fol
 
 def _key_figures(r: Intrinsics, file: CameraFile) -> list[tuple[str, str, str]]:
     px, mm = r.map.sigma_px(r.covariance), r.map.sigma_mm(r.covariance)
-    at = f"at {short(r.distance_m)} m"
+    at = f"at {format_number(r.distance_m)} m"
     held = r.held.rms_px * _mm_per_px(r)
     until = file.calibration.valid_until if file.calibration else ""
     failed = r.verdict is Level.FAIL
     return [
-        ("focal length fx", f"{r.fit.lens[0]:.2f} ± {short(r.sigmas[0], 2)} px", f"{r.sigmas[0] / r.fit.lens[0]:.2%}"),
+        (
+            "focal length fx",
+            f"{r.fit.lens[0]:.2f} ± {format_number(r.sigmas[0], 2)} px",
+            f"{r.sigmas[0] / r.fit.lens[0]:.2%}",
+        ),
         ("lens model", r.model.words, "smallest that predicts new photographs as well as the best"),
         (
             "direction of a pixel, median",
-            f"{short(np.nanmedian(px), 2)} px · {short(np.nanmedian(mm), 2)} mm",
+            f"{format_number(np.nanmedian(px), 2)} px · {format_number(np.nanmedian(mm), 2)} mm",
             f"1 sigma, {at}",
         ),
-        ("direction, maximum", f"{short(np.nanmax(px), 2)} px · {short(np.nanmax(mm), 2)} mm", f"1 sigma, {at}"),
+        (
+            "direction, maximum",
+            f"{format_number(np.nanmax(px), 2)} px · {format_number(np.nanmax(mm), 2)} mm",
+            f"1 sigma, {at}",
+        ),
         ("RMS of corners", f"{r.rms_px:.3f} px", f"per coordinate; {r.rms_2d_px:.3f} px per corner, as in OpenCV"),
-        ("RMS in held-out photographs", f"{r.held.rms_px:.3f} px · {short(held, 2)} mm", f"per coordinate, {at}"),
+        (
+            "RMS in held-out photographs",
+            f"{r.held.rms_px:.3f} px · {format_number(held, 2)} mm",
+            f"per coordinate, {at}",
+        ),
         ("valid until", "must not be used" if failed else until or "no expiry date", ""),
     ]
 
@@ -106,27 +118,27 @@ def _numbers(r: Intrinsics) -> Section:
 
 
 def _model(r: Intrinsics) -> Section:
-    candidates = [x for x in r.ladder.candidates if x.held is not None]
+    candidates = [x for x in r.selection.candidates if x.held is not None]
     held = np.array([np.nan if x.held is None else x.held.rms_px for x in candidates])
     fitted = np.array([np.nan if x.fit is None else x.fit.sigma_px for x in candidates])
     # Standard error of the difference to the best model, which is much smaller than that of each error alone.
     spread = np.array([x.standard_error_px2 for x in candidates]) / (2 * held)
-    chosen = next(k for k, x in enumerate(candidates) if x.model == r.ladder.chosen.model)
-    chart = lens_ladder([_label(x.model) for x in candidates], held, chosen, fit_rms_px=fitted, sigma_px=spread)
+    chosen = next(k for k, x in enumerate(candidates) if x.model == r.selection.chosen.model)
+    chart = lens_model_chart([_label(x.model) for x in candidates], held, chosen, fit_rms_px=fitted, sigma_px=spread)
     rows = [
         (
             x.model.words,
             np.nan if x.fit is None else x.fit.sigma_px,
             np.nan if x.held is None else x.held.rms_px,
-            "chosen" if x.model == r.ladder.chosen.model else x.refused or "larger error, or no improvement",
+            "chosen" if x.model == r.selection.chosen.model else x.refused or "larger error, or no improvement",
         )
-        for x in r.ladder.candidates
+        for x in r.selection.candidates
     ]
     words = [
         f"Cross-validation with {len(r.held.folds)} folds: each model was fitted without some of the photographs and"
         " then used to predict these (only the pose of the board was fitted in them). Residuals of the fitted"
         " photographs decrease with every coefficient; residuals of held-out photographs do not.",
-        f"Chosen: {r.model.words}: {r.ladder.why}.",
+        f"Chosen: {r.model.words}: {r.selection.why}.",
     ]
     if r.warp is not None:
         bend = ", ".join(f"{w:.3g} ± {s:.1g}" for w, s in zip(r.warp.warp, r.warp.sigma, strict=True))
@@ -134,7 +146,9 @@ def _model(r: Intrinsics) -> Section:
             f"Board: {'corrected for its bend' if r.warp.corrected else 'assumed flat'} ({r.warp.why}). Estimated bend:"
             f" {bend} per metre for x², xy, y²; {1000 * r.warp.rise_m:.2f} mm between the lowest and the highest point."
         )
-    words += [f.what for f in (stretch_finding(r), points_finding(r), circles_finding(r), doubt_finding(r)) if f]
+    words += [
+        f.what for f in (stretch_finding(r), points_finding(r), circles_finding(r), model_uncertainty_finding(r)) if f
+    ]
     caption = (
         "Bars: error on held-out photographs; whiskers: sigma of the difference to the best; ticks: fitted photographs."
     )
@@ -152,7 +166,7 @@ def _extent(r: Intrinsics) -> tuple[float, float, float, float]:
 
 
 def _uncertainty(r: Intrinsics) -> Section:
-    extent, at = _extent(r), f"at {short(r.distance_m)} m"
+    extent, at = _extent(r), f"at {format_number(r.distance_m)} m"
     drawings = [
         PageDrawing(
             heat_map(r.map.sigma_px(r.covariance), extent, "Uncertainty of a pixel's direction", "px"),
@@ -176,8 +190,8 @@ def _uncertainty(r: Intrinsics) -> Section:
         drawings.append(
             PageDrawing(
                 heat_map(size, extent, "Difference between the two halves of the photographs", "px"),
-                f"RMS {short(d.rms_px)} px ({short(d.rms_mm, 2)} mm {at}); expected from the sigmas"
-                f" {short(d.expected_rms_px)} px (p = {d.p_value:.2g}).",
+                f"RMS {format_number(d.rms_px)} px ({format_number(d.rms_mm, 2)} mm {at}); expected from the sigmas"
+                f" {format_number(d.expected_rms_px)} px (p = {d.p_value:.2g}).",
             )
         )
         words.append(
@@ -199,7 +213,7 @@ def _residuals(outcome: CameraOutcome) -> Section:
         ),
     ]
     rms = _rms_per_view(r)
-    for v, word in telling_views(rms, worst=_WORST_VIEWS):
+    for v, word in representative_views(rms, worst=_WORST_VIEWS):
         name, _ = outcome.photos.views[v]
         mine = t.view == v
         drawings.append(
@@ -241,7 +255,7 @@ def _picture(outcome: CameraOutcome, name: str) -> NDArray[np.uint8] | None:
         picture = decode(path.read_bytes(), outcome.photos.image_size_px)
     except OSError:
         return None
-    if isinstance(picture, Missing):
+    if isinstance(picture, MissingPicture):
         return None
     if picture.dtype == np.uint8:
         return np.asarray(picture, dtype=np.uint8)

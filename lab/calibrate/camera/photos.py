@@ -14,10 +14,17 @@ import numpy as np
 
 from calibration.boards.board_detection import find_board
 from calibration.boards.board_types import Board, Chessboard
-from calibration.boards.board_view import NO_CLOSE_LOOK, BoardView, GreyImage, NotFound
+from calibration.boards.board_view import QUICK_SEARCH_FAILED, BoardView, GreyImage, NotFound
 from lab.errors import InputError
-from lab.pictures.opencv import quiet_cv2
-from lab.pictures.picture_file import SUFFIXES, UNREADABLE, Grey, Missing, checked, read_picture
+from lab.pictures.opencv import load_cv2
+from lab.pictures.picture_file import (
+    PICTURE_SUFFIXES,
+    UNREADABLE,
+    GreyPicture,
+    MissingPicture,
+    read_picture,
+    require_format,
+)
 
 VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".webm")
 VIDEO_PICTURES = 120  # largest number of frames used of one video, evenly spaced: neighbouring frames differ little
@@ -72,7 +79,7 @@ def _files_of(path: Path) -> list[Path]:
         if not inside:
             below = [p.name for p in sorted(path.iterdir()) if p.is_dir() and any(map(_is_picture, p.iterdir()))]
             hint = f"; give one of its folders with pictures: {', '.join(below[:_MAX_NAMES])}" if below else ""
-            raise InputError(f"{path}: the folder has no pictures ({', '.join(s[1:] for s in SUFFIXES)}){hint}")
+            raise InputError(f"{path}: the folder has no pictures ({', '.join(s[1:] for s in PICTURE_SUFFIXES)}){hint}")
         return inside
     if path.exists():
         return [path]
@@ -86,7 +93,7 @@ def _files_of(path: Path) -> list[Path]:
 
 
 def _is_picture(path: Path) -> bool:
-    return path.is_file() and path.suffix.lower() in SUFFIXES + VIDEO_SUFFIXES and not path.name.startswith(".")
+    return path.is_file() and path.suffix.lower() in PICTURE_SUFFIXES + VIDEO_SUFFIXES and not path.name.startswith(".")
 
 
 def _natural(path: Path) -> tuple[str, list[tuple[int, str]]]:
@@ -114,7 +121,7 @@ def find_in_photos(
     first_of: dict[bytes, str] = {}
     for done, (name, path, picture) in enumerate(_pictures(files, names), 1):
         path_of[name] = path
-        if isinstance(picture, Missing):
+        if isinstance(picture, MissingPicture):
             refused.append((name, picture.reason))
         else:
             sizes.setdefault((picture.shape[1], picture.shape[0]), []).append(name)
@@ -123,7 +130,7 @@ def find_in_photos(
                 refused.append((name, f"{_DUPLICATE}{original}: it would count twice"))
             elif len(sizes) == 1:  # pictures of different sizes are an error: only their sizes are collected
                 found = find_board(as_8_bit(picture), board, _search_thoroughly(board, bool(views), refused))
-                if found is NO_CLOSE_LOOK:
+                if found is QUICK_SEARCH_FAILED:
                     quick.add(name)
                 elif isinstance(found, NotFound):
                     refused.append((name, found.reason))
@@ -137,14 +144,14 @@ def find_in_photos(
         raise InputError(_mixed(sizes))
     if views and quick and isinstance(board, Chessboard):  # some show the board: search the others thoroughly too
         for name, _, picture in _pictures(files, names):
-            if name in quick and not isinstance(picture, Missing):
+            if name in quick and not isinstance(picture, MissingPicture):
                 found = find_board(as_8_bit(picture), board)
                 if isinstance(found, NotFound):
                     refused.append((name, found.reason))
                 else:
                     views.append((name, found))
     else:
-        refused += [(name, NO_CLOSE_LOOK.reason) for name in quick]
+        refused += [(name, QUICK_SEARCH_FAILED.reason) for name in quick]
     order = {name: k for k, name in enumerate(path_of)}
     views.sort(key=lambda view: order[view[0]])
     refused.sort(key=lambda item: order[item[0]])
@@ -152,7 +159,7 @@ def find_in_photos(
     return PhotoSet(board, next(iter(sizes)), tuple(views), tuple(refused), path_of)
 
 
-def as_8_bit(picture: Grey) -> GreyImage:
+def as_8_bit(picture: GreyPicture) -> GreyImage:
     """A picture as 8 bits; 16 bits are scaled from the 0.1 to the 99.9 percentile of the picture."""
     if picture.dtype == np.uint8:
         return np.asarray(picture, dtype=np.uint8)
@@ -182,7 +189,9 @@ def _names(files: Sequence[Path]) -> dict[Path, str]:
     return names
 
 
-def _pictures(files: Sequence[Path], names: dict[Path, str]) -> Iterator[tuple[str, Path, Grey | Missing]]:
+def _pictures(
+    files: Sequence[Path], names: dict[Path, str]
+) -> Iterator[tuple[str, Path, GreyPicture | MissingPicture]]:
     for path in files:
         if path.suffix.lower() in VIDEO_SUFFIXES:
             yield from ((f"{names[path]}#{k}", path, picture) for k, picture in _frames(path))
@@ -193,16 +202,16 @@ def _pictures(files: Sequence[Path], names: dict[Path, str]) -> Iterator[tuple[s
 def _frame_count(path: Path) -> int:
     if path.suffix.lower() not in VIDEO_SUFFIXES:
         return 1
-    cv2 = quiet_cv2()
+    cv2 = load_cv2()
     video = cv2.VideoCapture(str(path))
     count = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
     video.release()
     return min(max(count, 1), VIDEO_PICTURES)
 
 
-def _frames(path: Path) -> Iterator[tuple[int, Grey | Missing]]:
+def _frames(path: Path) -> Iterator[tuple[int, GreyPicture | MissingPicture]]:
     """Evenly spaced frames of a video with their numbers."""
-    cv2 = quiet_cv2()
+    cv2 = load_cv2()
     video = cv2.VideoCapture(str(path))
     try:
         count = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
@@ -213,10 +222,10 @@ def _frames(path: Path) -> Iterator[tuple[int, Grey | Missing]]:
                 good, frame = video.retrieve()
                 if good:
                     grey = frame if frame.ndim == 2 else cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
-                    yield number, checked(grey, None)
+                    yield number, require_format(grey, None)
             number += 1
         if number == 0:
-            yield 0, Missing("unreadable: not a video, or in a format that OpenCV cannot decode")
+            yield 0, MissingPicture("unreadable: not a video, or in a format that OpenCV cannot decode")
     finally:
         video.release()
 
@@ -226,7 +235,7 @@ def most_frequent_reason(refused: Sequence[tuple[str, str]]) -> str:
     if not refused:
         return "no picture was refused"
     duplicates = [item for item in refused if item[1].startswith(_DUPLICATE)]
-    quick = [item for item in refused if item[1] == NO_CLOSE_LOOK.reason]
+    quick = [item for item in refused if item[1] == QUICK_SEARCH_FAILED.reason]
     specific = [item for item in refused if item not in duplicates and item not in quick] or quick or duplicates
     kinds = Counter(_kind(reason) for _, reason in specific)
     kind, count = kinds.most_common(1)[0]

@@ -18,8 +18,8 @@ from calibration.drift import (
     CAMERA_KINDS,
     TURNED_ZOOMED,
     Change,
-    UsualSizes,
-    Verdicts,
+    FoundChanges,
+    PriorSizes,
     expected_rms,
     find_changes,
     rms_length,
@@ -27,7 +27,7 @@ from calibration.drift import (
 from calibration.findings import Finding, Level, verdict
 from geometry.arrays import Array
 from geometry.camera import Camera
-from geometry.planes import meet_plane
+from geometry.planes import intersect_plane
 from geometry.rig import Rig
 from lab.calibrate.drift_check.drift_comparison import PixelComparison, check_at_rest, compare_points, compare_still
 from lab.calibrate.drift_check.drift_history import HistoryRow, read_history, write_history
@@ -45,7 +45,7 @@ from lab.calibrate.drift_check.drift_result import (
 )
 from lab.files.rig.rig_covariance import joint_covariance
 from lab.files.rig.rig_file import RigFile, load_rig_file
-from lab.files.text.atomic_write import atomic_folder, refuse_foreign
+from lab.files.text.atomic_write import atomic_folder, check_output_folder
 from lab.files.text.csv_text import csv_word
 
 TABLE = "drift.csv"
@@ -83,7 +83,7 @@ def check_drift(
     Raises:
         InputError: for errors in the files.
     """
-    refuse_foreign(out, _is_ours)
+    check_output_folder(out, _is_ours)
     inputs.check()
     limits = limits or DriftLimits()
     today = today or datetime.date.today()
@@ -180,7 +180,7 @@ def _unchecked(rig: Rig, cameras: Sequence[CameraDrift]) -> tuple[str, ...]:
 
 
 def _camera_drift(
-    rig: Rig, name: str, one: PixelComparison, verdicts: Verdicts, limits: DriftLimits, p_false_alarm: float
+    rig: Rig, name: str, one: PixelComparison, verdicts: FoundChanges, limits: DriftLimits, p_false_alarm: float
 ) -> CameraDrift:
     camera, rows = rig.cameras[name], one.rows_of(name)
     of_rows = np.stack([2 * rows, 2 * rows + 1], axis=1).ravel()
@@ -188,7 +188,7 @@ def _camera_drift(
     own = next((c for c in verdicts.changes if c.kind in CAMERA_KINDS and c.subject == name), None)
     # The figures are computed after removing all other changes.
     misfit = one.misfit.without(c for c in verdicts.changes if c is not own)
-    fit = misfit.fit(TURNED_ZOOMED, name, one.columns[name].kinds(UsualSizes())[TURNED_ZOOMED])
+    fit = misfit.fit(TURNED_ZOOMED, name, one.columns[name].kinds(PriorSizes())[TURNED_ZOOMED])
     drift = (own or fit).displacement[of_rows].reshape(-1, 2)
     mean = model[of_rows].reshape(-1, 2, 4).mean(axis=0)
     sigmas = np.sqrt(np.maximum(np.diagonal(fit.covariance), 0))
@@ -246,7 +246,7 @@ def mm_at_screen(rig: Rig, camera: Camera, pixels: Array, displacement_px: Array
     Distance between the points of the screen at half the displacement to either side; its bow, a few mm, is neglected.
     """
     screen = rig.screens[camera.screen].world_from_screen
-    ends = [meet_plane(*camera.rays(pixels + sign * displacement_px / 2), screen) for sign in (-1, 1)]
+    ends = [intersect_plane(*camera.rays(pixels + sign * displacement_px / 2), screen) for sign in (-1, 1)]
     squared = np.sum((ends[1] - ends[0]) ** 2, axis=1)
     squared = squared[np.isfinite(squared)]
     return 1e3 * float(np.sqrt(squared.mean())) if len(squared) else float("nan")

@@ -14,7 +14,7 @@ from calibration.drift import (
     CameraColumns,
     ChangeCandidate,
     ExcessResidual,
-    UsualSizes,
+    PriorSizes,
     camera_columns,
 )
 from geometry.arrays import Array, Ints, skew
@@ -24,7 +24,15 @@ from geometry.lens import padded
 from geometry.pose import Pose
 from geometry.pose_solver.gauss_newton import fit_pose
 from geometry.rig import Rig
-from geometry.uncertainty.rig_parameters import BOW, PINHOLE, POSE, RigCovariance, Sensitivity, distortion_names, split
+from geometry.uncertainty.rig_parameters import (
+    BOW,
+    PINHOLE,
+    POSE,
+    RigCovariance,
+    Sensitivity,
+    distortion_names,
+    split_name,
+)
 from lab.calibrate.drift_check.drift_inputs import KnownPoints, StillSpots, check_points_match
 from lab.errors import InputError
 
@@ -132,7 +140,7 @@ def _one_point(n: int, i: int) -> ChangeCandidate:
     """The change that moves only pixel i of n."""
     out = np.zeros((2 * n, 2))
     out[2 * i, 0] = out[2 * i + 1, 1] = 1.0
-    return ChangeCandidate(out, np.full(2, UsualSizes().point_px))
+    return ChangeCandidate(out, np.full(2, PriorSizes().point_px))
 
 
 def _by_parameters(
@@ -155,7 +163,7 @@ def _by_parameters(
     J = np.zeros((n, 2, len(names)))
     lens_names = distortion_names(camera)
     for k, full in enumerate(names):
-        kind, thing, parameter = split(full)
+        kind, thing, parameter = split_name(full)
         if kind == "cameras" and thing == camera.name:
             if parameter in PINHOLE:
                 J[..., k] = lens.d_pinhole[..., PINHOLE.index(parameter)]
@@ -251,7 +259,7 @@ def _changes_of_spots(rig: Rig, part: SpotModel, d: SpotDerivatives) -> dict[tup
     """The candidates besides the cameras: one wrong spot, or one moved laser."""
     n = len(part)
     changes = {(WRONG_POINT, f"{s} ({c})"): _one_point(n, i) for i, (c, s) in enumerate(part.views)}
-    laser = np.repeat([UsualSizes().laser_rad, UsualSizes().laser_m], 3)
+    laser = np.repeat([PriorSizes().laser_rad, PriorSizes().laser_m], 3)
     for b, beam in enumerate(rig.beams):
         on_beam = (part.beam_of == b)[:, None, None]
         moves = np.concatenate([d.direction * on_beam, d.point * on_beam], axis=-1).reshape(2 * n, 6)

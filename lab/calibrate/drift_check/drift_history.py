@@ -12,7 +12,7 @@ from calibration.findings import Level
 from lab.errors import InputError
 from lab.files.text.atomic_write import atomic_write_text
 from lab.files.text.csv_text import csv_word, read_table
-from lab.files.text.error_text import shown_line
+from lab.files.text.error_text import printable_line
 
 COLUMNS = ("date", "camera", "drift_px", "noise_px", "drift_mm", "verdict")
 
@@ -51,7 +51,8 @@ def read_history(path: Path) -> list[HistoryRow]:
             day, level = datetime.date.fromisoformat(date), Level[verdict]
         except (ValueError, KeyError):
             raise table.error(
-                i, f"expected a date and a verdict, got {shown_line(f'{date}, {verdict}')}; correct or delete the row"
+                i,
+                f"expected a date and a verdict, got {printable_line(f'{date}, {verdict}')}; correct or delete the row",
             ) from None
         rows.append(HistoryRow(day, cameras[i], drift[i], noise[i], drift_mm[i], level))
     return rows

@@ -16,8 +16,8 @@ from lab.files.run.results import read_poses, read_spots
 from lab.files.run.truth import read_true_poses
 from lab.files.text.csv_table import Table
 from lab.files.text.csv_text import read_table
-from lab.files.text.error_text import did_you_mean
-from lab.files.text.range_checks import SIGMAS_PX, refuse_far_pixels, refuse_sigmas
+from lab.files.text.error_text import suggest_name
+from lab.files.text.range_checks import SIGMA_RANGE_PX, check_pixels, check_sigmas
 
 PIXELS = ("camera", "point", "u_px", "v_px")
 PLACES = ("x_m", "y_m", "z_m", "sigma_x_m", "sigma_y_m", "sigma_z_m")
@@ -103,12 +103,12 @@ def read_points(path: Path, survey: Path | None, rig: Rig, default_sigma_px: flo
     for i, (camera, point) in enumerate(zip(cameras, points, strict=True)):
         if camera not in rig.cameras:
             raise table.error(
-                i, f"camera: expected a camera of the rig, got {camera!r}{did_you_mean(camera, rig.cameras)}"
+                i, f"camera: expected a camera of the rig, got {camera!r}{suggest_name(camera, rig.cameras)}"
             )
         if point not in coordinates:
             raise InputError(
                 f"{survey or path}: expected the coordinates of point {point!r} ({path.name}, line {table.lines[i]}),"
-                " got none" + did_you_mean(point, coordinates)
+                " got none" + suggest_name(point, coordinates)
             )
         if (camera, point) in seen:
             raise table.error(
@@ -118,8 +118,8 @@ def read_points(path: Path, survey: Path | None, rig: Rig, default_sigma_px: flo
             )
         seen[camera, point] = int(table.lines[i])
     sigma = table.optional("sigma_px")
-    refuse_sigmas(table, "sigma_px", SIGMAS_PX, "px")
-    refuse_far_pixels(table, {name: c.image_size_px for name, c in rig.cameras.items()})
+    check_sigmas(table, "sigma_px", SIGMA_RANGE_PX, "px")
+    check_pixels(table, {name: c.image_size_px for name, c in rig.cameras.items()})
     found = [coordinates[point] for point in points]
     return KnownPoints(
         tuple(cameras), tuple(points), pixels, np.where(np.isnan(sigma), default_sigma_px, sigma),
@@ -184,7 +184,7 @@ def _coordinates(table: Table, rig: Rig) -> dict[str, tuple[list[float], list[fl
         if on_screens and screens[i] not in rig.screens:
             raise table.error(
                 i,
-                f"screen: expected a screen of the rig, got {screens[i]!r}{did_you_mean(screens[i], rig.screens)}",
+                f"screen: expected a screen of the rig, got {screens[i]!r}{suggest_name(screens[i], rig.screens)}",
             )
         entry = (place + fill, sigma + fill, screens[i])
         if out.setdefault(point, entry) != entry:
@@ -221,10 +221,10 @@ def _still(results: Path, rig: Rig, named: Path) -> StillSpots:
     for camera, spot in grid.views:
         if camera not in rig.cameras:
             raise InputError(
-                f"{named}: camera: expected a camera of the rig, got {camera!r}{did_you_mean(camera, rig.cameras)}"
+                f"{named}: camera: expected a camera of the rig, got {camera!r}{suggest_name(camera, rig.cameras)}"
             )
         if spot not in rig.spots:
-            raise InputError(f"{named}: spot: expected a spot of the rig, got {spot!r}{did_you_mean(spot, rig.spots)}")
+            raise InputError(f"{named}: spot: expected a spot of the rig, got {spot!r}{suggest_name(spot, rig.spots)}")
         if (camera, spot) not in known:
             raise InputError(f"{named}: camera {camera!r} does not observe the screen of spot {spot!r} in this rig")
     views, pixels, scatter, sigma, frames, drift = [], [], [], [], [], []

@@ -11,7 +11,7 @@ from calibration.drift import ALL_CHANGED, LASER_MOVED, MOVED, TURNED, TURNED_ZO
 from calibration.findings import Finding, Level
 from lab.calibrate.drift_check.drift_result import CameraDrift, DriftLimits, OtherChange, is_weak, level_of
 from lab.files.rig.calibration_state import CalibrationState
-from lab.number_format import short
+from lab.number_format import format_number
 
 _CHECK_MOUNT = "Look for a displaced or loose mount; fix it, then recalibrate the camera's pose (`calibrate rig`)."
 _CHECK_LENS = "Check the focus and zoom rings and the lens mount, lock them, then recalibrate this camera's lens."
@@ -88,8 +88,8 @@ def _days(count: int) -> str:
 
 def size(px: float, mm: float) -> str:
     """An amount of drift in words: `0.52 px (1.5 mm at the screen)`."""
-    return f"{short(px)} px" + (
-        f" ({short(mm)} mm at the screen)" if np.isfinite(mm) else " (the rays miss the screen)"
+    return f"{format_number(px)} px" + (
+        f" ({format_number(mm)} mm at the screen)" if np.isfinite(mm) else " (the rays miss the screen)"
     )
 
 
@@ -127,7 +127,7 @@ def camera_findings(c: CameraDrift, limits: DriftLimits, pose_free: bool) -> lis
     if np.isfinite(c.detectable_px):
         detectable = f"the smallest detectable shift is {size(c.detectable_px, c.detectable_mm)}"
     state = "shows no change, but this check is weak" if weak else "has not changed"
-    what = f"{name} {state}: drift {size(c.drift_px, c.drift_mm)}, expected from noise {short(c.noise_px)} px"
+    what = f"{name} {state}: drift {size(c.drift_px, c.drift_mm)}, expected from noise {format_number(c.noise_px)} px"
     what += f"; {detectable}"
     if not weak:
         return [Finding(Level.PASS, what)]
@@ -143,9 +143,8 @@ def describe_change(c: CameraDrift) -> str:
     assert c.change is not None
     kind = c.change.kind
     if kind == ZOOMED:
-        return (
-            f"has another focal length ({_signed(c.scale_ppm)} ± {short(c.sigma_scale_ppm)} ppm): focus or zoom changed"
-        )
+        scale = f"{_signed(c.scale_ppm)} ± {format_number(c.sigma_scale_ppm)} ppm"
+        return f"has another focal length ({scale}): focus or zoom changed"
     if kind in (TURNED, TURNED_ZOOMED):
         turn = c.change.delta[:3]
         sigma = np.sqrt(np.maximum(np.diagonal(c.change.covariance)[:3], 0))
@@ -153,11 +152,12 @@ def describe_change(c: CameraDrift) -> str:
         of_angle = float(np.sqrt((turn / max(angle, 1e-12)) ** 2 @ sigma**2))
         axis = ("its horizontal axis (up or down)", "its vertical axis (sideways)", "its optical axis (rolled)")
         main = axis[int(np.argmax(np.abs(turn)))]
-        words = f"turned by {short(np.rad2deg(angle))} ± {short(np.rad2deg(of_angle), 2)} deg, mainly about {main}"
+        size = f"{format_number(np.rad2deg(angle))} ± {format_number(np.rad2deg(of_angle), 2)} deg"
+        words = f"turned by {size}, mainly about {main}"
         return words + (", and its focal length changed" if kind == TURNED_ZOOMED else "")
     moved = 1e3 * float(np.linalg.norm(c.change.delta[3:6]))
     turned = np.rad2deg(float(np.linalg.norm(c.change.delta[:3])))
-    words = f"moved by about {short(moved, 2)} mm and turned by about {short(turned, 2)} deg"
+    words = f"moved by about {format_number(moved, 2)} mm and turned by about {format_number(turned, 2)} deg"
     return words + (", and its focal length changed" if kind == ALL_CHANGED else "")
 
 
@@ -184,4 +184,4 @@ def _p(p: float) -> str:
 
 
 def _signed(value: float) -> str:
-    return ("+" if value > 0 else "") + short(value)
+    return ("+" if value > 0 else "") + format_number(value)

@@ -14,7 +14,7 @@ from lab.calibrate.drift_check.drift_history import HistoryRow
 from lab.calibrate.drift_check.drift_messages import describe_change, size
 from lab.calibrate.drift_check.drift_result import CameraDrift, DriftLimits, DriftOutcome, OtherChange, is_weak
 from lab.files.rig.rig_file import RigFile
-from lab.number_format import short
+from lab.number_format import format_number
 from lab.report.calibration.calibration_charts import DriftLine, drift_chart
 from lab.report.calibration.calibration_drawings import corners_overlay
 from lab.report.calibration.calibration_page import (
@@ -25,7 +25,7 @@ from lab.report.calibration.calibration_page import (
     provenance,
     write_calibration_report,
 )
-from lab.report.calibration.calibration_scene import Dot, rig_things, scene_views
+from lab.report.calibration.calibration_scene import Marker, rig_things, scene_views
 
 
 def write_page(
@@ -60,10 +60,12 @@ def _key_figures(
 ) -> list[tuple[str, str, str]]:
     out = []
     for c in cameras:
-        value = f"{short(c.drift_px)} px · {short(c.drift_mm)} mm"
-        state = describe_change(c) if c.change is not None else f"expected from noise: {short(c.noise_px, 2)} px"
+        value = f"{format_number(c.drift_px)} px · {format_number(c.drift_mm)} mm"
+        state = (
+            describe_change(c) if c.change is not None else f"expected from noise: {format_number(c.noise_px, 2)} px"
+        )
         if c.change is None and is_weak(c.detectable_mm, limits):
-            state = f"weak check: shifts below {short(c.detectable_px, 2)} px are not detected"
+            state = f"weak check: shifts below {format_number(c.detectable_px, 2)} px are not detected"
         out.append((f"drift of camera {c.camera}", value, state))
     if file.calibration is not None:
         until = file.calibration.valid_until
@@ -88,7 +90,8 @@ def _drift_section(
         (
             c.camera, c.level.name, len(c.pixels), c.drift_px, c.drift_mm, c.noise_px, f"{c.p_value:.1g}",
             c.detectable_px, c.detectable_mm, _plus_minus(c.shift_px, c.sigma_shift_px),
-            _plus_minus(c.turn_deg, c.sigma_turn_deg), f"{short(c.scale_ppm)} ± {short(c.sigma_scale_ppm, 2)}",
+            _plus_minus(c.turn_deg, c.sigma_turn_deg),
+            f"{format_number(c.scale_ppm)} ± {format_number(c.sigma_scale_ppm, 2)}",
         )
         for c in cameras
     ]  # fmt: skip
@@ -123,7 +126,7 @@ def _plus_minus(values: Array, sigmas: Array) -> str:
     sigma = float(np.max(sigmas))
     decimals = int(np.clip(1 - np.floor(np.log10(sigma)), 0, 6)) if sigma > 0 else 3
     words = ", ".join(f"{v:.{decimals}f}" for v in values.tolist())
-    return f"{words} ± {short(sigma, 2)}".replace("-", "−")
+    return f"{words} ± {format_number(sigma, 2)}".replace("-", "−")
 
 
 def _history_section(history: Sequence[HistoryRow], limits: DriftLimits, file: RigFile) -> Section:
@@ -171,8 +174,8 @@ def _points_section(
 
 def _scene_section(file: RigFile, compared: Sequence[PixelComparison]) -> Section:
     things = rig_things(file.rig)
-    marks: dict[str, Dot] = {}
+    marks: dict[str, Marker] = {}
     for one in compared:
         for label, xyz in zip(one.label, one.xyz, strict=True):
-            marks.setdefault(label, Dot(label, xyz))
+            marks.setdefault(label, Marker(label, xyz))
     return Section("The lab", (), scene_views([*things, *marks.values()], "Cameras, screens and points"))

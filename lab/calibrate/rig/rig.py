@@ -14,7 +14,7 @@ from calibration.findings import Finding, Level, verdict
 from calibration.least_squares.adjustment import AdjustmentError
 from calibration.rig.joint_findings import RigLimits, joint_findings
 from calibration.rig.rig_figures import central_pose, expected_pose, hold_out, spot_sigma
-from calibration.rig.rig_steps import RigSteps, calibrate_in_steps
+from calibration.rig.rig_steps import RigCalibration, calibrate_in_steps
 from calibration.screens.network_findings import ScreenLimits, near_findings
 from calibration.screens.network_findings import findings as network_findings
 from calibration.screens.screens import ScreensResult
@@ -30,9 +30,9 @@ from lab.errors import CalibrationError, InputError
 from lab.files.project.project import load_project
 from lab.files.project.project_types import Project
 from lab.files.rig.calibration_state import CalibrationState
-from lab.files.rig.rig_covariance import blocks_of
+from lab.files.rig.rig_covariance import covariance_blocks
 from lab.files.rig.rig_file import RigFile, save_rig
-from lab.files.text.atomic_write import atomic_folder, beside_a_good_one, refuse_foreign
+from lab.files.text.atomic_write import atomic_folder, check_output_folder, keep_good_results
 
 RIG = "rig.yaml"
 FAILED_RIG = "rig.failed.yaml"  # file name if the verdict is FAIL, so that no program reads it by mistake
@@ -53,7 +53,7 @@ def calibrate_rig(
         InputError: for errors in the files.
         CalibrationError: if the measurements do not determine a calibration. Nothing is written.
     """
-    refuse_foreign(out, _is_ours)
+    check_output_folder(out, _is_ours)
     project = load_project(Path(project_path))
     day = calibration_date(project, today)
     check_no_duplicates(project)
@@ -83,7 +83,7 @@ def calibrate_rig(
         *_input_findings(project, recordings, inputs, day),
     ]
     level = verdict(findings)
-    folder = beside_a_good_one(out, level == Level.FAIL, RIG)
+    folder = keep_good_results(out, level == Level.FAIL, RIG)
     outcome = RigOutcome(project.name, folder, level, tuple(findings), steps, expected, held_out)
     with atomic_folder(folder, may_replace=_is_ours) as work:
         save_rig(_rig_file(outcome, project, day), work / (FAILED_RIG if level == Level.FAIL else RIG))
@@ -109,7 +109,7 @@ def _recordings(project: Project, lab: Rig) -> Recordings:
     return recordings
 
 
-def _solved(project: Project, screens: ScreensResult, recordings: Recordings) -> RigSteps:
+def _solved(project: Project, screens: ScreensResult, recordings: Recordings) -> RigCalibration:
     try:
         return calibrate_in_steps(screens, recordings.spots, stand_of(project, recordings))
     except (AdjustmentError, ValueError) as error:
@@ -117,12 +117,12 @@ def _solved(project: Project, screens: ScreensResult, recordings: Recordings) ->
         raise CalibrationError(f"{project.path}: the rig cannot be calibrated: {error}") from None
 
 
-def _step_findings(steps: RigSteps, nominal: Rig, positions: Sequence[str]) -> list[Finding]:
+def _step_findings(steps: RigCalibration, nominal: Rig, positions: Sequence[str]) -> list[Finding]:
     """Warnings of the single steps about the measurements. The quality of the fit is judged on the joint adjustment."""
     beams = steps.beams
     if steps.joint.scales:
         # The test whether two ends form one line used the original sigmas, which turned out too small.
-        beams = replace(beams, one_line=())
+        beams = replace(beams, collinearity=())
     out = network_findings(steps.screens, _NO_FIT_LIMITS) + beam_findings(beams, nominal, positions, _NO_SIGMA_LIMITS)
     return [f for f in out if f.level > Level.PASS]
 
@@ -188,4 +188,4 @@ def _rig_file(outcome: RigOutcome, project: Project, day: datetime.date) -> RigF
     worst_first = sorted(outcome.findings, key=lambda f: -f.level)
     reasons = tuple(f.what for f in worst_first if f.level > Level.PASS)
     state = CalibrationState(day, outcome.level.name, until, reasons, project.notes)
-    return RigFile(joint.rig, blocks_of(joint.covariance), state)
+    return RigFile(joint.rig, covariance_blocks(joint.covariance), state)

@@ -11,7 +11,7 @@ from calibration.findings import Finding, Level
 from calibration.rig.joint import SPOTS
 from calibration.rig.joint_findings import in_degrees, in_mm
 from calibration.rig.rig_figures import ExpectedPose, HoldOut
-from calibration.rig.rig_steps import RigSteps
+from calibration.rig.rig_steps import RigCalibration
 from lab.errors import CalibrationError
 
 
@@ -23,7 +23,7 @@ class RigOutcome:
     out: Path  # folder of the results: `OUT-failed` if a FAIL would have replaced a valid calibration
     level: Level
     findings: tuple[Finding, ...]
-    steps: RigSteps
+    steps: RigCalibration
     expected: ExpectedPose | None
     held_out: HoldOut | None
 

@@ -17,7 +17,7 @@ from geometry.rig import Rig
 from lab.calibrate.beams.recordings import Recordings
 from lab.calibrate.rig import rig_page_sections
 from lab.calibrate.rig.rig_outcome import RigOutcome
-from lab.number_format import short
+from lab.number_format import format_number
 from lab.report.calibration.calibration_charts import residual_histogram
 from lab.report.calibration.calibration_drawings import residual_field
 from lab.report.calibration.calibration_page import (
@@ -74,14 +74,14 @@ def _key_figures(o: RigOutcome) -> list[tuple[str, str, str]]:
         out.append(("held-out positions", words, f"RMS per axis, {h.ratio:.2f} times the expected value"))
     spots = joint.every[SPOTS].linearise(joint.values).residuals
     px = _spot_pixels(o, spots)[joint.kept[SPOTS]]
-    out.append(("spots", f"{short(float(np.sqrt(np.mean(px**2))), 3)} px", "RMS residual per axis"))
+    out.append(("spots", f"{format_number(float(np.sqrt(np.mean(px**2))), 3)} px", "RMS residual per axis"))
     if DOTS in joint.every:
-        s = o.steps.measured.network.sightings
+        s = o.steps.measured.network.point_observations
         px = joint.every[DOTS].linearise(joint.values).residuals * s.sigma_px[:, None]
         rms = float(np.sqrt(np.mean(px[joint.kept[DOTS]] ** 2)))
-        out.append(("control points", f"{short(rms, 3)} px", "RMS residual per axis"))
+        out.append(("control points", f"{format_number(rms, 3)} px", "RMS residual per axis"))
     sigma = rig_page_sections.beam_sigmas(joint)[0] / rig_page_sections.ARCSEC
-    out.append(("beam directions", f"{short(float(np.sqrt(np.mean(sigma**2))), 3)} arcsec", "1 sigma per axis"))
+    out.append(("beam directions", f"{format_number(float(np.sqrt(np.mean(sigma**2))), 3)} arcsec", "1 sigma per axis"))
     return out
 
 
@@ -202,7 +202,7 @@ def _residuals(o: RigOutcome) -> Section:
     camera_of = np.array([cameras.index(views[v][0]) for v in measured.spots.view], dtype=np.int64)
     drawings += _fields(o, "spots", measured.spots.pixels, px, camera_of, joint.kept[SPOTS])
     if DOTS in joint.every:
-        s = measured.network.sightings
+        s = measured.network.point_observations
         r = joint.every[DOTS].linearise(joint.values).residuals
         residuals_px = -r * s.sigma_px[:, None]
         drawings += _fields(o, "control points", s.pixels, residuals_px, s.camera_of, joint.kept[DOTS])

@@ -10,7 +10,7 @@ from calibration.terms.surveyed import pose_of
 from geometry.arrays import Array
 from geometry.pose import ypr_sigmas
 from geometry.rig import Rig
-from geometry.uncertainty.rig_parameters import split
+from geometry.uncertainty.rig_parameters import split_name
 from lab.calibrate.rig.rig_outcome import RigOutcome
 from lab.report.calibration.calibration_maps import correlation_matrix, flatness_map
 from lab.report.calibration.calibration_page import (
@@ -150,10 +150,10 @@ def correlations_section(o: RigOutcome) -> Section:
     shown = [
         i
         for i, n in enumerate(C.names)
-        if split(n)[0] == "beams"
-        or (sigma[i] > _GAUGE_SIGMA and not split(n)[2].startswith(("k", "p1", "p2", "s", "tau")))
+        if split_name(n)[0] == "beams"
+        or (sigma[i] > _GAUGE_SIGMA and not split_name(n)[2].startswith(("k", "p1", "p2", "s", "tau")))
     ]
-    shown.sort(key=lambda i: ("beams", "screens", "cameras").index(split(C.names[i])[0]))
+    shown.sort(key=lambda i: ("beams", "screens", "cameras").index(split_name(C.names[i])[0]))
     names = [_short_name(C.names[i]) for i in shown]
     picture = correlation_matrix(names, C.matrix[np.ix_(shown, shown)], "Correlations of the rig's parameters")
     words = "Correlated errors partly cancel in the pose: without the correlations its sigma would be too large."
@@ -162,7 +162,7 @@ def correlations_section(o: RigOutcome) -> Section:
 
 def _short_name(name: str) -> str:
     """`camera left fx` for `cameras_section.left.fx`."""
-    kind, thing, parameter = split(name)
+    kind, thing, parameter = split_name(name)
     bare = parameter.removesuffix("_per_m").removesuffix("_rad").removesuffix("_m")
     return f"{kind.removesuffix('s')} {thing} {bare}"
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from calibration.rig.joint import CORNERS, DOTS, RECORDS, SPOTS, Joint
-from calibration.rig.rig_steps import RigSteps
+from calibration.rig.rig_steps import RigCalibration
 from calibration.terms.corners import CornerTerm
 from calibration.terms.pose_records import RecordTerm
 from calibration.terms.surveyed import array_of
@@ -21,7 +21,7 @@ COLUMNS = ("kind", "name", "camera", "axis", "residual", "unit", "sigmas", "used
 _AXES = ("x", "y", "z", "rot_x", "rot_y", "rot_z")
 
 
-def write_residuals(steps: RigSteps, positions: Sequence[str], path: Path) -> None:
+def write_residuals(steps: RigCalibration, positions: Sequence[str], path: Path) -> None:
     """Write the table, measured minus adjusted, one row per number. Column sigmas: in units of the stated sigma."""
     lines = [",".join(COLUMNS)]
     for kind, name, camera, axis, residual, unit, sigmas, used in _rows(steps, positions):
@@ -32,7 +32,7 @@ def write_residuals(steps: RigSteps, positions: Sequence[str], path: Path) -> No
 _Row = tuple[str, str, str, str, float, str, float, bool]
 
 
-def _rows(steps: RigSteps, positions: Sequence[str]) -> Iterator[_Row]:
+def _rows(steps: RigCalibration, positions: Sequence[str]) -> Iterator[_Row]:
     joint, measured = steps.joint, steps.measured
     cameras, views = list(joint.rig.cameras), joint.rig.views()
     network = measured.network
@@ -45,15 +45,15 @@ def _rows(steps: RigSteps, positions: Sequence[str]) -> Iterator[_Row]:
             name = f"position {positions[spots.position[i]]} spot {spot}"
             yield from _pixel("spot", name, camera, -(root @ r), r, bool(joint.kept[SPOTS][i]))
     if DOTS in joint.every:
-        s = network.sightings
+        s = network.point_observations
         residuals = joint.every[DOTS].linearise(joint.values).residuals
         for i, r in enumerate(residuals):
-            name = network.dots.names[s.dot_of[i]]
+            name = network.control_points.names[s.point_of[i]]
             yield from _pixel("dot", name, cameras[s.camera_of[i]], -r * s.sigma_px[i], r, bool(joint.kept[DOTS][i]))
-    if len(network.dots):
-        errors = network.dots.xyz - array_of(joint.values, "points")
-        sigma = np.sqrt(np.diagonal(network.dots.covariance, axis1=1, axis2=2))
-        for name, e, s1 in zip(network.dots.names, errors, sigma, strict=True):
+    if len(network.control_points):
+        errors = network.control_points.xyz - array_of(joint.values, "points")
+        sigma = np.sqrt(np.diagonal(network.control_points.covariance, axis1=1, axis2=2))
+        for name, e, s1 in zip(network.control_points.names, errors, sigma, strict=True):
             for k in range(3):
                 yield "survey", name, "", _AXES[k], float(1e3 * e[k]), "mm", float(e[k] / s1[k]), True
     records = joint.every.get(RECORDS)

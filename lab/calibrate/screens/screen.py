@@ -22,10 +22,10 @@ from lab.errors import CalibrationError
 from lab.files.project.project import load_project
 from lab.files.project.project_types import Project
 from lab.files.rig.calibration_state import CalibrationState
-from lab.files.rig.rig_covariance import blocks_of
+from lab.files.rig.rig_covariance import covariance_blocks
 from lab.files.rig.rig_file import RigFile, save_rig
 from lab.files.rig.screens_file import ScreensFile, save_screens
-from lab.files.text.atomic_write import atomic_folder, beside_a_good_one, refuse_foreign
+from lab.files.text.atomic_write import atomic_folder, check_output_folder, keep_good_results
 
 SCREENS, RIG = "screens.yaml", "rig.yaml"
 
@@ -74,7 +74,7 @@ def calibrate_screen(project_path: Path, out: Path, today: datetime.date | None 
         InputError: for errors in the files.
         CalibrationError: if the measurements do not determine a calibration. `out` is left unchanged.
     """
-    refuse_foreign(out, _is_ours)
+    check_output_folder(out, _is_ours)
     project = load_project(Path(project_path))
     day = calibration_date(project, today)
     inputs = screen_inputs(project)
@@ -88,7 +88,7 @@ def calibrate_screen(project_path: Path, out: Path, today: datetime.date | None 
         *(Finding(Level.WARN, note) for note in inputs.notes),
     ]
     level = verdict(found)
-    folder = beside_a_good_one(out, level == Level.FAIL, SCREENS)
+    folder = keep_good_results(out, level == Level.FAIL, SCREENS)
     outcome = ScreensOutcome(project.name, folder, level, tuple(found), result)
     with atomic_folder(folder, may_replace=_is_ours) as work:
         if level != Level.FAIL:
@@ -123,4 +123,4 @@ def _save(project: Project, outcome: ScreensOutcome, day: datetime.date, folder:
         note = "the beams are nominal, not calibrated: run `beampose calibrate beams`"
         state = replace(state, verdict=max(outcome.level, Level.WARN).name, reasons=(note, *reasons))
         whole = Rig(rig.screens, rig.cameras, project.beams, project.spots)
-        save_rig(RigFile(whole, blocks_of(fit.covariance), state), folder / RIG)
+        save_rig(RigFile(whole, covariance_blocks(fit.covariance), state), folder / RIG)

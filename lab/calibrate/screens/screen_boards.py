@@ -20,7 +20,7 @@ from geometry.rig import Rig
 from lab.calibrate.camera.photos import as_8_bit
 from lab.errors import CalibrationError
 from lab.files.project.project_types import FixedBoard, Project
-from lab.pictures.picture_file import Missing, read_picture
+from lab.pictures.picture_file import MissingPicture, read_picture
 
 START_CORNER_SIGMA_PX = 0.2  # initial value; the adjustment estimates it from the residuals
 
@@ -174,7 +174,7 @@ def _fisheye(rig: Rig) -> Bools:
 def _view(path: Path, board: Board, size_px: tuple[int, int]) -> BoardView | str:
     """The view of a board in a photograph, or the reason why there is none."""
     picture = read_picture(path, size_px)
-    if isinstance(picture, Missing):
+    if isinstance(picture, MissingPicture):
         return picture.reason.replace("the rig says", "the camera's calibration says")
     found = find_board(as_8_bit(picture), board)
     return found.reason if isinstance(found, NotFound) else found

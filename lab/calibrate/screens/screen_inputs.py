@@ -10,9 +10,9 @@ import numpy as np
 
 from calibration.least_squares.priors import Prior
 from calibration.screens.clouds import MissingOpen3DError, scan_of
-from calibration.screens.network import Dots, Network, PointObservations
+from calibration.screens.network import ControlPoints, Network, PointObservations
 from calibration.screens.registration import register
-from calibration.screens.screens import Near, Scan, ScreenSetup
+from calibration.screens.screens import ApproximatePosition, Scan, ScreenSetup
 from calibration.screens.survey_diagnosis import wrong_unit
 from calibration.terms.rig_blocks import prior_of
 from geometry.arrays import Array, Bools, Ints
@@ -21,11 +21,11 @@ from geometry.rig import Rig, Screen
 from geometry.uncertainty.rig_parameters import RigCovariance
 from lab.calibrate.screens.screen_boards import board_views
 from lab.errors import InputError
-from lab.files.project.cloud_file import read_cloud
+from lab.files.project.cloud_file import read_point_cloud
 from lab.files.project.point_files import Observations, Survey, read_observations, read_survey
 from lab.files.project.project_types import Cloud, Project, ScreenEntry
-from lab.files.text.error_text import did_you_mean
-from lab.files.text.range_checks import FARTHEST_IN_SCAN
+from lab.files.text.error_text import suggest_name
+from lab.files.text.range_checks import MAX_SCAN_COORDINATE
 
 LARGEST_SCREEN_M = 100.0  # a larger screen is taken for an error of the unit
 SMALLEST_SCREEN_M = 0.02
@@ -39,7 +39,7 @@ class ScreenInputs:
 
     network: Network
     setups: tuple[ScreenSetup, ...]  # one per screen
-    near: Mapping[int, Near]
+    near: Mapping[int, ApproximatePosition]
     held_screen: int | None  # screen whose frame defines the world frame if there is no survey
     notes: tuple[str, ...]  # assumptions and exclusions, shown as warnings
     remarks: tuple[str, ...] = ()  # properties of the scans
@@ -65,7 +65,7 @@ def screen_inputs(project: Project) -> ScreenInputs:
     )
     screen_of = _screens_of_points(project, survey, observations)
     _check_extent(project, survey, screen_of)
-    control_points = Dots(survey.names, survey.xyz, survey.covariance, screen_of)
+    control_points = ControlPoints(survey.names, survey.xyz, survey.covariance, screen_of)
     cameras, index = list(rig.cameras), {n: i for i, n in enumerate(survey.names)}
     point_observations = PointObservations(
         np.array([cameras.index(c) for c in observations.camera], dtype=np.int64),
@@ -77,8 +77,8 @@ def screen_inputs(project: Project) -> ScreenInputs:
     prior, lens_free = _lens_prior(project, rig)
     network = Network(
         rig=rig,
-        dots=control_points,
-        sightings=point_observations,
+        control_points=control_points,
+        point_observations=point_observations,
         corners=boards.corners,
         placements=boards.placements,
         fixed=boards.fixed,
@@ -89,7 +89,11 @@ def screen_inputs(project: Project) -> ScreenInputs:
     held = None if len(control_points) and len(point_observations) else _held_screen(project)
     scans = {n: _scan(s.cloud, s, survey, project) for n, s in project.screens.items() if s.cloud is not None}
     setups = tuple(_setup(s, survey, project, scans.get(n)) for n, s in project.screens.items())
-    near = {i: Near(c.near_m, c.within_m) for i, c in enumerate(project.cameras.values()) if c.near_m is not None}
+    near = {
+        i: ApproximatePosition(c.near_m, c.within_m)
+        for i, c in enumerate(project.cameras.values())
+        if c.near_m is not None
+    }
     scan_notes = [note for _, ns in scans.values() for note in ns]
     noted = (*survey.notes, *observations.notes, *boards.notes)
     return ScreenInputs(network, setups, near, held, noted, tuple(scan_notes), boards.photo_of)
@@ -180,18 +184,18 @@ def _held_screen(project: Project) -> int:
 
 
 def _setup(entry: ScreenEntry, survey: Survey, project: Project, scan: tuple[Scan, list[str]] | None) -> ScreenSetup:
-    dots = None
+    control_points = None
     if entry.frame is not None:
         for key in ("origin", "x", "y"):
             name = getattr(entry.frame, key)
             if name not in survey.names:
                 raise InputError(
                     f"{project.path}: screens.{entry.name}.frame.{key}: expected a point of the survey, got {name!r}"
-                    f"{did_you_mean(name, survey.names)}"[:240]
+                    f"{suggest_name(name, survey.names)}"[:240]
                 )
-        dots = tuple(survey.names.index(getattr(entry.frame, k)) for k in ("origin", "x", "y"))
+        control_points = tuple(survey.names.index(getattr(entry.frame, k)) for k in ("origin", "x", "y"))
     return ScreenSetup(
-        frame_dots=None if dots is None else (dots[0], dots[1], dots[2]),
+        frame_points=None if control_points is None else (control_points[0], control_points[1], control_points[2]),
         origin_at=(0.0, 0.0) if entry.frame is None else entry.frame.origin_at_m,
         bow=entry.bow,
         scatter_m=entry.surface_sigma_m,
@@ -201,11 +205,11 @@ def _setup(entry: ScreenEntry, survey: Survey, project: Project, scan: tuple[Sca
 
 def _scan(cloud: Cloud, entry: ScreenEntry, survey: Survey, project: Project) -> tuple[Scan, list[str]]:
     """The scan of a screen in the world frame, and notes on it."""
-    points, notes = read_cloud(cloud.path, cloud.unit_m)
+    points, notes = read_point_cloud(cloud.path, cloud.unit_m)
     pose, covariance, words = cloud.world_from_cloud, None, list(notes)
     try:
         if cloud.targets is not None:
-            targets = read_survey([cloud.targets], project.screens, FARTHEST_IN_SCAN)
+            targets = read_survey([cloud.targets], project.screens, MAX_SCAN_COORDINATE)
             both = [n for n in targets.names if n in survey.names]
             a = [targets.names.index(n) for n in both]
             b = [survey.names.index(n) for n in both]
@@ -213,7 +217,7 @@ def _scan(cloud: Cloud, entry: ScreenEntry, survey: Survey, project: Project) ->
             at = targets.xyz[a] * cloud.unit_m
             found = register(both, at, survey.xyz[b], survey.covariance[b], sigma)
             pose, covariance = found.world_from_cloud, found.covariance
-            misses = 1e3 * float(np.sqrt(np.mean(np.sum(found.misses_m**2, axis=1))))
+            misses = 1e3 * float(np.sqrt(np.mean(np.sum(found.residuals_m**2, axis=1))))
             words.append(f"{cloud.path.name}: {len(both)} targets fit the survey to {misses:.2g} mm RMS")
         scan = scan_of(points, entry.size_m, cloud.point_sigma_m, entry.bow, None, pose, covariance)
     except MissingOpen3DError as error:

@@ -14,8 +14,8 @@ from calibration.screens.screens import ScreensResult
 from geometry.camera import pinhole_numbers
 from lab.calibrate.screens.screen_inputs import ScreenInputs
 from lab.files.project.project_types import Project
-from lab.files.rig.rig_covariance import blocks_of
-from lab.number_format import short
+from lab.files.rig.rig_covariance import covariance_blocks
+from lab.number_format import format_number
 from lab.report.calibration.calibration_drawings import corners_overlay
 from lab.report.calibration.calibration_maps import correlation_matrix, flatness_map
 from lab.report.calibration.calibration_page import (
@@ -26,7 +26,7 @@ from lab.report.calibration.calibration_page import (
     provenance,
     write_calibration_report,
 )
-from lab.report.calibration.calibration_scene import LAB_VIEWS, Dot, Rectangle, Thing, frustum_of, scene_views
+from lab.report.calibration.calibration_scene import LAB_VIEWS, Marker, Rectangle, SceneObject, frustum_of, scene_views
 
 _MAX_ROWS = 400  # rows in the table of observations; residuals.csv has all
 
@@ -71,30 +71,30 @@ def _key_figures(result: ScreensResult) -> list[tuple[str, str, str]]:
         note = "1 sigma along its normal, maximum"
         if flatness is not None:
             shape = "curved" if flatness.chosen.bent else "flat"
-            note += f"; {shape}, residual {short(1e3 * flatness.chosen.rms_m, 2)} mm RMS"
-        out.append((f"Surface of screen {name}", f"{short(sigma, 2)} mm", note))
+            note += f"; {shape}, residual {format_number(1e3 * flatness.chosen.rms_m, 2)} mm RMS"
+        out.append((f"Surface of screen {name}", f"{format_number(sigma, 2)} mm", note))
     for name, sigma_m in pointing_sigmas_m(result).items():
         px = sigma_m * float(pinhole_numbers(fit.rig.cameras[name])[0]) / _distance(result, name)
-        note = f"1 sigma at the centre of its screen; {short(px, 2)} px"
-        out.append((f"Pose of camera {name}", f"{short(1e3 * sigma_m, 2)} mm", note))
-    used = fit.sighting_errors_px[fit.used]
+        note = f"1 sigma at the centre of its screen; {format_number(px, 2)} px"
+        out.append((f"Pose of camera {name}", f"{format_number(1e3 * sigma_m, 2)} mm", note))
+    used = fit.observation_residuals_px[fit.used]
     if len(used):
         rms = float(np.sqrt(np.mean(used**2)))
         out.append(
             (
                 "Control points",
-                f"{short(rms, 3)} px",
+                f"{format_number(rms, 3)} px",
                 f"RMS per axis of {len(used)} observations, {len(fit.used) - len(used)} excluded",
             )
         )
     if len(fit.corner_errors_px):
         rms = float(np.sqrt(np.mean(fit.corner_errors_px**2)))
-        out.append(("Corners of boards", f"{short(rms, 3)} px", f"RMS per axis of {len(fit.corner_errors_px)}"))
+        out.append(("Corners of boards", f"{format_number(rms, 3)} px", f"RMS per axis of {len(fit.corner_errors_px)}"))
     factor = float(np.sqrt(fit.variance_factor))
     note = (
         "the stated sigmas are correct" if factor == 1 else "times the stated sigmas; all sigmas are multiplied by it"
     )
-    out.append(("Misfit", short(factor, 3), f"{note} ({fit.dof} degrees of freedom)"))
+    out.append(("Misfit", format_number(factor, 3), f"{note} ({fit.dof} degrees of freedom)"))
     return out
 
 
@@ -112,7 +112,7 @@ def _places(result: ScreensResult) -> Section:
     rows = []
     for i, (name, c) in enumerate(fit.rig.cameras.items()):
         x, y, z = c.camera_from_world.inverse().translation.tolist()
-        mine = network.sightings.camera_of == i
+        mine = network.point_observations.camera_of == i
         boards = 0 if fit.corners is None else len(set(fit.corners.placement[fit.corners.camera == i].tolist()))
         position, attitude = sigmas[name]
         place = [name, c.screen, f"{x:.4f}, {y:.4f}, {z:.4f}", 1e3 * position, float(np.degrees(attitude))]
@@ -148,13 +148,14 @@ def _screen(result: ScreensResult, project: Project, k: int) -> Section:
         on = f.chosen.used
         if not on.all():
             words.append(f"{int(np.sum(~on))} of {len(on)} points are far off it and are not drawn: see the warnings.")
-        over = "the control points" if about.dots else "patches of the scan (medians of their points)"
+        over = "the control points" if about.control_points else "patches of the scan (medians of their points)"
         words.append(
-            f"The best plane has residuals of {short(1e3 * f.flat.rms_m, 3)} mm RMS at {over}"
+            f"The best plane has residuals of {format_number(1e3 * f.flat.rms_m, 3)} mm RMS at {over}"
             + (
                 "; there are too few of them to test for a curvature."
                 if f.bent is None
-                else f", the best curved surface {short(1e3 * f.bent.rms_m, 3)} mm; the probability of so large an"
+                else f", the best curved surface {format_number(1e3 * f.bent.rms_m, 3)} mm; the probability of so"
+                " large an"
                 f" improvement on a flat screen is {f.p_flat:.2g}."
             )
         )
@@ -191,8 +192,8 @@ def _pixels(result: ScreensResult) -> Section:
     fit, network = result.fit, result.network
     drawings = []
     for i, (name, c) in enumerate(fit.rig.cameras.items()):
-        mine = network.sightings.camera_of == i
-        pixels, error = network.sightings.pixels[mine], fit.sighting_errors_px[mine]
+        mine = network.point_observations.camera_of == i
+        pixels, error = network.point_observations.pixels[mine], fit.observation_residuals_px[mine]
         rejected = ~fit.used[mine]
         if fit.corners is not None:
             its = fit.corners.camera == i
@@ -210,15 +211,15 @@ def _observations(result: ScreensResult) -> Section:
     """Section with the table of the observations, the largest residuals first."""
     network, fit = result.network, result.fit
     screens = list(fit.rig.screens)
-    s = network.sightings
+    s = network.point_observations
     rows: list[list[object]] = []
     for i in range(len(s)):
-        d = int(s.dot_of[i])
-        k = int(network.dots.screen_of[d])
-        names = [list(fit.rig.cameras)[s.camera_of[i]], network.dots.names[d], screens[k] if k >= 0 else ""]
-        pixel, residual = [f"{v:.2f}" for v in s.pixels[i]], [f"{v:+.3f}" for v in fit.sighting_errors_px[i]]
-        rows.append([*names, *pixel, *residual, f"{fit.sighting_sigmas[i]:.2f}", bool(fit.used[i])])
-    rows = [rows[int(i)] for i in np.argsort(-fit.sighting_sigmas, kind="stable")]
+        d = int(s.point_of[i])
+        k = int(network.control_points.screen_of[d])
+        names = [list(fit.rig.cameras)[s.camera_of[i]], network.control_points.names[d], screens[k] if k >= 0 else ""]
+        pixel, residual = [f"{v:.2f}" for v in s.pixels[i]], [f"{v:+.3f}" for v in fit.observation_residuals_px[i]]
+        rows.append([*names, *pixel, *residual, f"{fit.normalised_residuals[i]:.2f}", bool(fit.used[i])])
+    rows = [rows[int(i)] for i in np.argsort(-fit.normalised_residuals, kind="stable")]
     heads = [
         "camera", "point", "screen", "u (px)", "v (px)", "residual u (px)", "residual v (px)", "in sigmas", "used",
     ]  # fmt: skip
@@ -230,7 +231,7 @@ def _observations(result: ScreensResult) -> Section:
 
 def _scene(result: ScreensResult) -> list[PageDrawing]:
     fit, network = result.fit, result.network
-    things: list[Thing] = []
+    things: list[SceneObject] = []
     for k, (name, screen) in enumerate(fit.rig.screens.items()):
         size = screen.size_m
         if size is None:
@@ -238,12 +239,12 @@ def _scene(result: ScreensResult) -> list[PageDrawing]:
             size = (2 * float(half[0]), 2 * float(half[1]))
         things.append(Rectangle(f"screen {name}", screen.world_from_screen, size))
     things += [frustum_of(c) for c in fit.rig.cameras.values()]
-    things += [Dot("", p) for p in network.dots.xyz[: 5 * _MAX_ROWS]]
+    things += [Marker("", p) for p in network.control_points.xyz[: 5 * _MAX_ROWS]]
     return [PageDrawing(view) for view in scene_views(things, "Cameras, screens and control points", LAB_VIEWS)]
 
 
 def _correlations(result: ScreensResult) -> Section:
-    blocks = blocks_of(result.fit.covariance)
+    blocks = covariance_blocks(result.fit.covariance)
     first = next(iter(result.fit.rig.cameras))
     block = blocks[f"cameras.{first}"]
     screen = result.fit.rig.cameras[first].screen

@@ -22,12 +22,14 @@ def write_tables(result: ScreensResult, folder: Path) -> None:
     """
     network, fit = result.network, result.fit
     cameras, screens = list(fit.rig.cameras), list(fit.rig.screens)
-    s = network.sightings
+    s = network.point_observations
     rows: list[list[object]] = []
     for i in range(len(s)):
-        names = [cameras[s.camera_of[i]], network.dots.names[s.dot_of[i]]]
-        sigmas = round(float(fit.sighting_sigmas[i]), 3)
-        rows.append([*names, *s.pixels[i].round(4), *fit.sighting_errors_px[i].round(4), sigmas, int(fit.used[i])])
+        names = [cameras[s.camera_of[i]], network.control_points.names[s.point_of[i]]]
+        sigmas = round(float(fit.normalised_residuals[i]), 3)
+        rows.append(
+            [*names, *s.pixels[i].round(4), *fit.observation_residuals_px[i].round(4), sigmas, int(fit.used[i])]
+        )
     if fit.corners is not None:
         c = fit.corners
         in_sigmas = np.linalg.norm(fit.corner_errors_px, axis=1) / c.sigma_px
@@ -37,16 +39,18 @@ def write_tables(result: ScreensResult, folder: Path) -> None:
                 [*names, *c.pixels[i].round(4), *fit.corner_errors_px[i].round(4), round(float(in_sigmas[i]), 3), 1]
             )
     write_table(folder / RESIDUALS, RESIDUAL_COLUMNS, rows)
-    height = np.full(len(network.dots), np.nan)
-    used = np.ones(len(network.dots), dtype=bool)
+    height = np.full(len(network.control_points), np.nan)
+    used = np.ones(len(network.control_points), dtype=bool)
     for screen in result.screens:
-        if screen.dots and screen.flatness is not None:
-            height[list(screen.dots)] = screen.flatness.chosen.heights_m
-            used[list(screen.dots)] = screen.used
-    xyz = network.dots.xyz + fit.dot_shifts_m
+        if screen.control_points and screen.flatness is not None:
+            height[list(screen.control_points)] = screen.flatness.chosen.heights_m
+            used[list(screen.control_points)] = screen.used
+    xyz = network.control_points.xyz + fit.control_point_shifts_m
     points: list[list[object]] = []
-    for i, (name, k) in enumerate(zip(network.dots.names, network.dots.screen_of, strict=True)):
+    for i, (name, k) in enumerate(zip(network.control_points.names, network.control_points.screen_of, strict=True)):
         height_m = "" if np.isnan(height[i]) else round(float(height[i]), 7)
         screen_name = "" if k < 0 else screens[k]
-        points.append([name, screen_name, *xyz[i].round(7), *fit.dot_shifts_m[i].round(7), height_m, int(used[i])])
+        points.append(
+            [name, screen_name, *xyz[i].round(7), *fit.control_point_shifts_m[i].round(7), height_m, int(used[i])]
+        )
     write_table(folder / DOTS, DOT_COLUMNS, points)

@@ -13,7 +13,7 @@ from calibration.findings import Finding, Level
 from calibration.least_squares.adjustment import AdjustmentError
 from calibration.screens.network_start import NotConnectedError
 from calibration.screens.screens import ScreensResult, calibrate
-from calibration.screens.survey_diagnosis import SurveySuspect, misfit_of, suspects
+from calibration.screens.survey_diagnosis import SurveyError, diagnose_survey, misfit_of
 from lab.calibrate.screens.screen_inputs import ScreenInputs
 from lab.errors import CalibrationError, InputError
 from lab.files.project.project_types import Project
@@ -37,9 +37,9 @@ def adjusted_screens(project: Project, inputs: ScreenInputs) -> ScreensResult:
         misfit = misfit_of(result, inputs.near)
     except (NotConnectedError, AdjustmentError, ValueError) as error:
         problem = error
-    enough = len(inputs.network.sightings) >= 4
+    enough = len(inputs.network.point_observations) >= 4
     if enough and misfit > _SUSPICIOUS_MISFIT and not _too_few_points(problem):
-        changes = suspects(inputs.network, inputs.setups, inputs.near, inputs.held_screen, misfit)
+        changes = diagnose_survey(inputs.network, inputs.setups, inputs.near, inputs.held_screen, misfit)
         explanations = [c for c in changes if c.factor < _ACCEPTED_MISFIT]
         if explanations:
             raise InputError(_explained(where, explanations))
@@ -56,7 +56,7 @@ def _too_few_points(problem: Exception | None) -> bool:
     return any(words in text for words in ("expected 4 or more", "expected 3 or more", "on one line", "found none"))
 
 
-def _explained(where: str, explanations: Sequence[SurveySuspect]) -> str:
+def _explained(where: str, explanations: Sequence[SurveyError]) -> str:
     """The message that names the change with which the survey fits."""
     best = explanations[0]
     others = [c for c in explanations[1:] if c.factor < 1.2 * best.factor]
@@ -98,13 +98,13 @@ def _coverage(project: Project, result: ScreensResult) -> list[Finding]:
     """Warnings for control points outside of their screen, and for screens that the points cover only partly."""
     out = []
     for (name, entry), screen in zip(project.screens.items(), result.screens, strict=True):
-        if entry.size_m is None or not screen.dots:
+        if entry.size_m is None or not screen.control_points:
             continue
         half = np.array(entry.size_m) / 2
         reach = np.abs(screen.xyz[:, :2])
         beyond = np.flatnonzero((reach > half + 0.01).any(axis=1))
         if beyond.size:
-            point = result.network.dots.names[screen.dots[int(beyond[0])]]
+            point = result.network.control_points.names[screen.control_points[int(beyond[0])]]
             count = "1 point" if len(beyond) == 1 else f"{len(beyond)} points"
             out.append(
                 Finding(

@@ -15,7 +15,7 @@ BY_OPEN3D = (".ply", ".pcd", ".pts", ".xyzn", ".xyzrgb")
 AS_TEXT = (".xyz", ".txt", ".csv", ".asc")
 
 
-def read_cloud(path: Path, unit_m: float) -> tuple[Array, tuple[str, ...]]:
+def read_point_cloud(path: Path, unit_m: float) -> tuple[Array, tuple[str, ...]]:
     """The points (n, 3), m, of a scan, and notes of what was left out. unit_m: metres in one unit of the file.
 
     Raises:

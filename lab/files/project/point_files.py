@@ -14,15 +14,15 @@ from lab.files.run.truth import check_unit_quaternions
 from lab.files.text import columns
 from lab.files.text.csv_table import Table
 from lab.files.text.csv_text import read_table
-from lab.files.text.error_text import did_you_mean
+from lab.files.text.error_text import suggest_name
 from lab.files.text.range_checks import (
-    FARTHEST_M,
+    MAX_COORDINATE_M,
     SIGMA_RANGE_DEG,
     SIGMA_RANGE_M,
-    SIGMAS_PX,
+    SIGMA_RANGE_PX,
     check_coordinates,
-    refuse_far_pixels,
-    refuse_sigmas,
+    check_pixels,
+    check_sigmas,
 )
 
 SURVEY = ("point", "x_m", "y_m", "z_m")
@@ -66,7 +66,7 @@ class StandPoses:
     sigmas: Array  # (n, 6): m along the stand's axes, rad about the body's; nan where the table gives none
 
 
-def read_survey(paths: Sequence[Path], screens: Collection[str], farthest_m: float = FARTHEST_M) -> Survey:
+def read_survey(paths: Sequence[Path], screens: Collection[str], farthest_m: float = MAX_COORDINATE_M) -> Survey:
     """The surveyed points of some files. screens: the project's, for the column `screen`.
 
     farthest_m: the largest accepted coordinate.
@@ -91,7 +91,7 @@ def read_survey(paths: Sequence[Path], screens: Collection[str], farthest_m: flo
         on = table.names("screen", may_be_empty=True) if "screen" in table else [""] * len(table)
         for i, s in enumerate(on):
             if s and s not in screens:
-                raise table.error(i, f"screen: expected a screen of the project, got {s!r}{did_you_mean(s, screens)}")
+                raise table.error(i, f"screen: expected a screen of the project, got {s!r}{suggest_name(s, screens)}")
         names += points
         xyz.append(coordinates)
         covariance.append(sigmas[:, :, None] ** 2 * np.eye(3))
@@ -134,11 +134,11 @@ def read_observations(
         camera += of_camera
         point += of_point
         uv = _finite(table, POINTS[2:])
-        refuse_far_pixels(table, cameras)
+        check_pixels(table, cameras)
         pixels.append(uv)
         if "sigma_px" in table:
             given = table.finite("sigma_px", "a number above 0", may_be_empty=True)
-            refuse_sigmas(table, "sigma_px", SIGMAS_PX, "px")
+            check_sigmas(table, "sigma_px", SIGMA_RANGE_PX, "px")
             sigma = np.where(np.isnan(given), DEFAULT_POINT_SIGMA_PX, given)
         else:
             notes.append(f"{path}: no column sigma_px: {DEFAULT_POINT_SIGMA_PX} px is assumed")
@@ -179,7 +179,7 @@ def read_poses(path: Path) -> StandPoses:
         if name in table:
             value = table.finite(name, "0 or more", may_be_empty=True)
             allowed, unit = ((0.0, SIGMA_RANGE_M[1]), "m") if k < 3 else (SIGMA_RANGE_DEG, "deg")
-            refuse_sigmas(table, name, allowed, unit)
+            check_sigmas(table, name, allowed, unit)
             sigmas[:, k] = value if k < 3 else np.radians(value)
     return StandPoses(frames, Pose.from_quaternion(q, xyz), sigmas)
 
@@ -196,7 +196,7 @@ def _refuse_unknown(table: Table, kind: str, names: Sequence[str], known: Collec
                 i,
                 f"{kind}: expected a {kind} of {whose}, which has none, got {name!r}; add {missing} to the project",
             )
-        raise table.error(i, f"{kind}: expected a {kind} of {whose}, got {name!r}{did_you_mean(name, known)}"[:200])
+        raise table.error(i, f"{kind}: expected a {kind} of {whose}, got {name!r}{suggest_name(name, known)}"[:200])
 
 
 def _finite(table: Table, names: Sequence[str]) -> Array:
@@ -210,7 +210,7 @@ def _survey_sigmas(table: Table) -> tuple[Array, list[str]]:
     for k, name in enumerate(SURVEY_SIGMAS):
         if name in table:
             sigmas[:, k] = table.finite(name, "a number above 0", may_be_empty=True)
-            refuse_sigmas(table, name, SIGMA_RANGE_M, "m")
+            check_sigmas(table, name, SIGMA_RANGE_M, "m")
     none = np.isnan(sigmas)
     if not none.any():
         return sigmas, []

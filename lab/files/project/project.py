@@ -40,7 +40,7 @@ from lab.files.project.project_types import (
 from lab.files.rig.board_file import load_board
 from lab.files.rig.camera_file import CameraFile, load_camera
 from lab.files.rig.interchange import read_cameras
-from lab.files.text.error_text import FileError, did_you_mean
+from lab.files.text.error_text import FileError, suggest_name
 from lab.files.text.fields import validated
 from lab.files.text.yaml_text import read_mapping
 
@@ -96,7 +96,7 @@ class _Reader:
         if path.is_dir():
             self.mistakes.append(f"{where}: expected a file, found a folder at {path}; name a file in it")
         elif not path.is_file():
-            near = did_you_mean(path.name, [p.name for p in path.parent.glob("*")] if path.parent.is_dir() else [])
+            near = suggest_name(path.name, [p.name for p in path.parent.glob("*")] if path.parent.is_dir() else [])
             hint = near if "did you mean" in near else "; paths start at this file's folder"
             self.mistakes.append(f"{where}: expected a file, found none at {path}{hint}")
         return path
@@ -111,7 +111,7 @@ class _Reader:
         if not path.is_file():
             return None
         try:
-            lens = lens_of(path, block.camera)
+            lens = load_lens(path, block.camera)
         except InputError as error:
             self.mistakes.append(f"{where}: {error}")
             return None
@@ -207,7 +207,7 @@ def placement_of(photo: Path) -> str:
     return str(int(numbers[-1])).zfill(6) if numbers else photo.stem
 
 
-def lens_of(path: Path, name: str | None = None) -> CameraFile:
+def load_lens(path: Path, name: str | None = None) -> CameraFile:
     """The lens of one camera from a camera.yaml or any exchange format. Raises InputError.
 
     name: the camera, where the file has several.
@@ -218,7 +218,7 @@ def lens_of(path: Path, name: str | None = None) -> CameraFile:
         raise InputError(f"{path}: expected one camera, got {len(cameras)} ({names}); choose one with `camera: NAME`")
     known = {c.name: c for c in cameras}
     if name is not None and name not in known:
-        raise InputError(f"{path}: expected a camera of this file, got {name!r}{did_you_mean(name, known)}")
+        raise InputError(f"{path}: expected a camera of this file, got {name!r}{suggest_name(name, known)}")
     model = cameras[0] if name is None else known[name]
     if len(cameras) == 1 and _is_camera_yaml(path):
         return load_camera(path)

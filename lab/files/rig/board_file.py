@@ -17,7 +17,7 @@ CHESSBOARD, CIRCLES, CHARUCO = "chessboard", "circles", "charuco"
 _TruthValue = Annotated[bool, pydantic.PlainValidator(boolean)]
 
 
-def board_of(text_or_path: str | Path) -> Board:
+def load_board_or_text(text_or_path: str | Path) -> Board:
     """The board of a board.yaml, or of a text such as chessboard:9x6:25mm. Raises InputError, in one line."""
     text = str(text_or_path)
     if Path(text).suffix.lower() in (".yaml", ".yml") or Path(text).is_file():

@@ -70,7 +70,9 @@ def state_mapping(state: CalibrationState) -> dict[str, Any]:
     return out
 
 
-def require_usable(state: CalibrationState | None, path: Path, on: datetime.date, what: str = "today") -> None:
+def require_valid_calibration(
+    state: CalibrationState | None, path: Path, on: datetime.date, what: str = "today"
+) -> None:
     """Checks that a calibration may be used on the day `on`; None (state unknown) may.
 
     what: the name of that day in the message.

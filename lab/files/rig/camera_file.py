@@ -22,7 +22,7 @@ from lab.files.rig.camera_block import (
     covariance_mapping,
     lens_mapping,
 )
-from lab.files.text.error_text import did_you_mean
+from lab.files.text.error_text import suggest_name
 from lab.files.text.fields import (
     Block,
     Integer,
@@ -182,7 +182,7 @@ class _CameraFileBlock(LensBlock):
         seen: set[str] = set()
         for name in self.covariance.parameters:
             if name not in known:
-                raise field_error(f"covariance.parameters: unknown parameter {name!r}{did_you_mean(name, known)}")
+                raise field_error(f"covariance.parameters: unknown parameter {name!r}{suggest_name(name, known)}")
             if name in seen:
                 raise field_error(f"covariance.parameters: expected each name once, got {name!r} a second time")
             seen.add(name)

@@ -19,7 +19,7 @@ from lab.files.rig.camera_file import CameraFile, load_camera, save_camera
 from lab.files.rig.rig_file import SCHEMA as RIG_SCHEMA
 from lab.files.rig.rig_file import RigFile, load_rig_file
 from lab.files.text.atomic_write import atomic_write_text
-from lab.files.text.error_text import did_you_mean
+from lab.files.text.error_text import suggest_name
 from lab.files.text.yaml_text import parse_mapping, read_text
 
 BEAMPOSE, RIG = "beampose", "beampose-rig"
@@ -134,7 +134,7 @@ def _unknown() -> str:
 
 def _known(name: str, allowed: Sequence[str], option: str) -> str:
     if name not in allowed:
-        raise InputError(f"{option}: expected {', '.join(allowed)}, got {name!r}{did_you_mean(name, allowed)}")
+        raise InputError(f"{option}: expected {', '.join(allowed)}, got {name!r}{suggest_name(name, allowed)}")
     return name
 
 
@@ -208,7 +208,7 @@ def _chosen(models: Sequence[CameraModel], camera: str | None, path: Path, targe
     names = [m.name for m in models]
     if camera is not None:
         if camera not in names:
-            raise InputError(f"{path}: expected a camera {camera!r}, found none{did_you_mean(camera, names)}")
+            raise InputError(f"{path}: expected a camera {camera!r}, found none{suggest_name(camera, names)}")
         return tuple(m for m in models if m.name == camera)
     holds_many = target != BEAMPOSE and _FOREIGN[target].HOLDS_MANY
     if len(models) > 1 and not holds_many:

@@ -9,7 +9,7 @@ import numpy as np
 
 from geometry.arrays import Array, symmetric
 from geometry.rig import Rig
-from geometry.uncertainty.rig_parameters import RigCovariance, is_known, split
+from geometry.uncertainty.rig_parameters import RigCovariance, is_known, split_name
 from lab.errors import InputError
 from lab.files.rig.camera_block import Covariance, covariance_error
 
@@ -54,16 +54,16 @@ def joint_covariance(rig: Rig, blocks: Mapping[str, Covariance], path: Path | st
     return RigCovariance(tuple(names), joint)
 
 
-def blocks_of(covariance: RigCovariance) -> dict[str, Covariance]:
+def covariance_blocks(covariance: RigCovariance) -> dict[str, Covariance]:
     """A joint covariance as blocks of a rig.yaml: complete for the target, an excerpt for each camera and screen."""
     out: dict[str, Covariance] = {}
     of: dict[str, list[int]] = {}
     for i, name in enumerate(covariance.names):
-        kind, thing, _ = split(name)
+        kind, thing, _ = split_name(name)
         if kind in ("cameras", "screens"):
             of.setdefault(f"{kind}.{thing}", []).append(i)
     for where, rows in of.items():
-        names = tuple(split(covariance.names[i])[2] for i in rows)
+        names = tuple(split_name(covariance.names[i])[2] for i in rows)
         out[where] = Covariance(names, symmetric(covariance.matrix[np.ix_(rows, rows)]))
     out[TARGET] = Covariance(covariance.names, symmetric(covariance.matrix))
     return out

@@ -23,7 +23,7 @@ from lab.files.rig.camera_block import (
     lens_mapping,
     plain_floats,
 )
-from lab.files.text.error_text import FileError, did_you_mean
+from lab.files.text.error_text import FileError, suggest_name
 from lab.files.text.fields import (
     Block,
     NonNegative,
@@ -234,7 +234,7 @@ def _broken_references(content: _RigBlock) -> list[str]:
 
 def unknown_name(kind: str, name: str, where: str, known: Collection[str]) -> str:
     """The message for a name that does not exist in the file."""
-    return f"{where}: expected a {kind} of this file, got {name!r}{did_you_mean(name, known)}"
+    return f"{where}: expected a {kind} of this file, got {name!r}{suggest_name(name, known)}"
 
 
 def _covariance_blocks(content: _RigBlock) -> list[tuple[str, CovarianceBlock]]:

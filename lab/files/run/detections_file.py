@@ -14,7 +14,7 @@ from lab.errors import InputError
 from lab.files.text.csv_table import Table, is_whole
 from lab.files.text.csv_text import read_table
 from tracking.detections import Detections
-from tracking.input_validation import LARGEST_PX, LEAST_SIGMA_PX, TWIN_PX, twins
+from tracking.input_validation import DUPLICATE_PX, LARGEST_PX, LEAST_SIGMA_PX, duplicates
 
 REQUIRED = ("frame", "camera", "u_px", "v_px")
 DEFAULT_SIGMA_PX = 0.1  # px, where the file gives no sigma: about the centroid noise of a clean laser spot
@@ -34,7 +34,7 @@ class CameraPoints:
     frames: Ints  # (m,) increasing: frames with points
     starts: Ints  # (m + 1,) rows of frame i: starts[i] to starts[i + 1]
     points: Detections  # within a frame: brightest first
-    spoilt: Ints  # increasing: frames that have rows, none of them usable
+    unusable: Ints  # increasing: frames that have rows, none of them usable
 
     def at(self, frame: int) -> Detections:
         """The points of one frame, possibly none."""
@@ -43,15 +43,15 @@ class CameraPoints:
             return Detections.none()
         return self.points[slice(int(self.starts[i]), int(self.starts[i + 1]))]
 
-    def says_nothing_of(self, frame: int) -> bool:
+    def has_only_unusable_rows(self, frame: int) -> bool:
         """Whether a frame has rows, none of them usable."""
-        i = int(np.searchsorted(self.spoilt, frame))
-        return i < len(self.spoilt) and self.spoilt[i] == frame
+        i = int(np.searchsorted(self.unusable, frame))
+        return i < len(self.unusable) and self.unusable[i] == frame
 
     def without(self, rows: Bools) -> CameraPoints:
         """The same without some of the points: rows (m,). A frame without points left still has a picture."""
         kept = np.concatenate([[0], np.cumsum(~rows)])
-        return CameraPoints(self.frames, kept[self.starts], self.points[~rows], self.spoilt)
+        return CameraPoints(self.frames, kept[self.starts], self.points[~rows], self.unusable)
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +62,7 @@ class DetectionsFile:
     first: int  # the smallest and the largest frame number of all cameras
     last: int
     notes: tuple[str, ...]  # what was left out or assumed
-    spoilt: Mapping[str, str]  # cameras without a usable row -> the reason of the first one
+    unusable: Mapping[str, str]  # cameras without a usable row -> the reason of the first one
 
 
 def read_detections(path: Path) -> DetectionsFile:
@@ -110,8 +110,8 @@ def read_detections(path: Path) -> DetectionsFile:
     for name in dict.fromkeys(rows.camera[good]):
         of = rows.camera == name
         cameras[str(name)] = _camera_points(np.flatnonzero(good & of), frame, points, frame[placed & of])
-    spoilt = {name: why for name, why in rows.why_of.items() if name and name not in cameras}
-    return DetectionsFile(cameras, int(frame[good].min()), int(frame[good].max()), tuple(rows.notes), spoilt)
+    unusable = {name: why for name, why in rows.why_of.items() if name and name not in cameras}
+    return DetectionsFile(cameras, int(frame[good].min()), int(frame[good].max()), tuple(rows.notes), unusable)
 
 
 @dataclass(slots=True)
@@ -158,8 +158,8 @@ class _Rows:
         picture = camera * len(numbers) + which
         uv, size = uv[rows], (sigma[rows] ** 2).sum(-1)
         again = np.zeros(len(self.good), dtype=bool)
-        again[rows] = twins(picture, uv, np.lexsort((uv[:, 1], uv[:, 0], picture)), size)
-        why = f"the same point a second time, or one less than {TWIN_PX} px from it"
+        again[rows] = duplicates(picture, uv, np.lexsort((uv[:, 1], uv[:, 0], picture)), size)
+        why = f"the same point a second time, or one less than {DUPLICATE_PX} px from it"
         self._leave_out(again, why, "u_px", "v_px")
 
     def _leave_out(self, which: ArrayLike, why: str, *fields: str) -> None:
@@ -176,12 +176,12 @@ class _Rows:
         self.good[new] = False
 
 
-def too_sparse(span: int, pictures: int) -> bool:
+def is_too_sparse(span: int, pictures: int) -> bool:
     """Whether a span of frame numbers is too long for its pictures: the output has a row per frame number."""
     return span > LONG_SPAN and span > MAX_NUMBERS_PER_PICTURE * pictures
 
 
-def far_off(numbers: Array | Ints) -> Bools:
+def stray_frames(numbers: Array | Ints) -> Bools:
     """Which of the rising frame numbers (n,) are strays: a few, separated by a gap longer than the recording.
 
     Every number in the gap costs as much as a frame: a file named 090000.png beside 300 pictures costs 90 s.
@@ -200,8 +200,8 @@ def _stray(frame: Array, good: Bools) -> Bools:
     numbers = np.unique(frame[good])
     if not numbers.size:
         return out
-    if not too_sparse(int(numbers[-1] - numbers[0]) + 1, numbers.size):
-        out[good] = np.isin(frame[good], numbers[far_off(numbers)])
+    if not is_too_sparse(int(numbers[-1] - numbers[0]) + 1, numbers.size):
+        out[good] = np.isin(frame[good], numbers[stray_frames(numbers)])
         return out
     pieces = np.split(numbers, np.flatnonzero(np.diff(numbers) > LONG_SPAN) + 1)
     longest = max(pieces, key=len)
@@ -218,5 +218,5 @@ def _camera_points(rows: Ints, frame: Array, points: Detections, placed: Array) 
     """
     order = rows[np.lexsort((np.nan_to_num(-points.flux[rows], nan=np.inf), frame[rows]))]
     frames, starts = np.unique(frame[order].astype(np.int64), return_index=True)
-    spoilt = np.setdiff1d(placed.astype(np.int64), frames)
-    return CameraPoints(frames, np.append(starts, len(order)), points[order], spoilt)
+    unusable = np.setdiff1d(placed.astype(np.int64), frames)
+    return CameraPoints(frames, np.append(starts, len(order)), points[order], unusable)

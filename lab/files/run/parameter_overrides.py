@@ -10,7 +10,7 @@ from lab.files.text.dataclass_fields import dataclass_from_yaml
 from tracking.parameters import TrackerParameters
 
 
-def overridden(parameters: TrackerParameters, overrides: Mapping[str, Any]) -> TrackerParameters:
+def with_overrides(parameters: TrackerParameters, overrides: Mapping[str, Any]) -> TrackerParameters:
     """The parameters with overrides, checked as in a file. Dotted names address inner blocks. Raises InputError."""
     content = dataclasses.asdict(parameters)
     for name, value in overrides.items():

@@ -22,7 +22,7 @@ from lab.files.rig.rig_covariance import joint_covariance
 from lab.files.rig.rig_file import load_rig_file
 from lab.files.run.times import Times, load_times
 from lab.files.text.dataclass_fields import dataclass_from_yaml
-from lab.files.text.error_text import FileError, did_you_mean
+from lab.files.text.error_text import FileError, suggest_name
 from lab.files.text.fields import (
     Block,
     NonNegative,
@@ -36,7 +36,7 @@ from lab.files.text.fields import (
     validated,
 )
 from lab.files.text.yaml_text import read_mapping, write_mapping
-from lab.pictures.picture_file import SUFFIXES
+from lab.pictures.picture_file import PICTURE_SUFFIXES
 from tracking.parameters import TrackerParameters
 
 SCHEMA = "beampose/run/1"
@@ -128,7 +128,7 @@ def load_run(run_folder: Path) -> Run:
     rig_file = load_rig_file(rig_path)
     rig = rig_file.rig
     mistakes = [
-        f"{path}: cameras.{name}: expected a camera of {rig_path.name}, got {name!r}{did_you_mean(name, rig.cameras)}"
+        f"{path}: cameras.{name}: expected a camera of {rig_path.name}, got {name!r}{suggest_name(name, rig.cameras)}"
         for name in content.cameras
         if name not in rig.cameras
     ]
@@ -258,7 +258,7 @@ def _source_of(block: _SourceBlock, folder: Path, where: str) -> Source:
     path = folder / str(block.frames)
     if path.is_dir():
         return FramesFolder(path)
-    if path.suffix.lower() in SUFFIXES and path.is_file():
+    if path.suffix.lower() in PICTURE_SUFFIXES and path.is_file():
         raise InputError(
             f"{where}.frames: expected a folder or a video, got the single picture {path}; name its folder"
         )

@@ -20,7 +20,7 @@ from lab.files.run.run_file import Run
 from lab.files.text import columns
 from lab.files.text.csv_table import Categorical, Table
 from lab.files.text.csv_text import read_table
-from lab.files.text.error_text import did_you_mean
+from lab.files.text.error_text import suggest_name
 
 MAX_COMPARED_FRAMES = 500  # by `largest_disagreement_px`, evenly spread: enough to show a wrong rig
 
@@ -120,7 +120,7 @@ def _read_true_spots(path: Path, known: dict[str, Collection[str] | None]) -> Tr
             if names is not None and word not in names:
                 i = int(np.argmax(words.codes == code))
                 raise table.error(
-                    i, f"{column}: expected a {column} of the rig, got {word!r}{did_you_mean(word, names)}"
+                    i, f"{column}: expected a {column} of the rig, got {word!r}{suggest_name(word, names)}"
                 )
     spots = TrueSpots(
         frame, table.words["camera"], table.words["spot"], table.stack("u_px", "v_px"), in_view.astype(np.int64)

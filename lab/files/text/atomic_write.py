@@ -39,7 +39,7 @@ def atomic_write_bytes(content: bytes, path: Path) -> None:
         raise InputError(f"{path}: cannot be written: {error.strerror}{remedy}") from None
 
 
-def refuse_foreign(target: Path, may_replace: Callable[[Path], bool]) -> None:
+def check_output_folder(target: Path, may_replace: Callable[[Path], bool]) -> None:
     """Raises InputError where results cannot be written to the folder `target`. Creates nothing.
 
     To be called before long work, so that a mistake in --out is reported before the work and not after it.
@@ -73,7 +73,7 @@ def atomic_folder(target: Path, may_replace: Callable[[Path], bool]) -> Iterator
         InputError: the folder cannot be made, or `target` holds something that must not be deleted.
     """
     target = Path(target)
-    refuse_foreign(target, may_replace)
+    check_output_folder(target, may_replace)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         work = target.parent / f".{target.name}.part-{os.getpid()}"
@@ -104,7 +104,7 @@ def replace_folder(work: Path, target: Path) -> None:
     shutil.rmtree(old, ignore_errors=True)
 
 
-def beside_a_good_one(target: Path, failed: bool, good: str) -> Path:
+def keep_good_results(target: Path, failed: bool, good: str) -> Path:
     """The folder for results: `target`, or `target-failed` where they failed and `target` holds the file `good`."""
     target = Path(target)
     return target.with_name(f"{target.name}-failed") if failed and (target / good).is_file() else target

@@ -11,7 +11,7 @@ import numpy as np
 
 from geometry.arrays import Array, Bools, Ints
 from lab.errors import InputError
-from lab.files.text.error_text import shown
+from lab.files.text.error_text import describe_value
 
 MAX_EXACT_INTEGER = 2**53  # a larger number read as float is not exact
 
@@ -77,7 +77,7 @@ class Table:
         """The content of a number field as an error message shows it."""
         text = self.texts.get(column, {}).get(int(self.lines[row]))
         if text is not None:
-            return shown(text)
+            return describe_value(text)
         value = float(self.numbers[column][row])
         return "nothing" if math.isnan(value) else f"{value:.7g}"
 

@@ -22,7 +22,7 @@ from geometry.arrays import Array, Ints
 from lab.errors import InputError
 from lab.files.text.atomic_write import atomic_write_text
 from lab.files.text.csv_table import Categorical, Table
-from lab.files.text.error_text import did_you_mean, shown_line
+from lab.files.text.error_text import printable_line, suggest_name
 
 # The columns that hold words; every other column holds numbers.
 WORD_COLUMNS = ("camera", "spot", "beam", "status", "point", "screen", "date", "verdict")
@@ -95,9 +95,9 @@ def _checked_header(path: Path, data: bytes, required: Sequence[str]) -> tuple[s
             )
     for name in required:
         if name not in header:
-            near = did_you_mean(name, header)
+            near = suggest_name(name, header)
             meant = f"{near.removesuffix('?')} in the header?" if "did you mean" in near else ""
-            raise InputError(f"{path}: expected a column {name!r}, got {shown_line(','.join(header))}{meant}")
+            raise InputError(f"{path}: expected a column {name!r}, got {printable_line(','.join(header))}{meant}")
     twice = [name for i, name in enumerate(header) if name and name in header[:i]]
     if twice:
         raise InputError(

@@ -12,7 +12,7 @@ from typing import Annotated, Any, TypeVar
 import pydantic
 
 from lab.errors import InputError
-from lab.files.text.error_text import shown
+from lab.files.text.error_text import describe_value
 from lab.files.text.fields import (
     Block,
     Integer,
@@ -45,7 +45,7 @@ def dataclass_from_yaml(cls: type[T], mapping: Any, path: Path | str, inside: st
 
 def _as_mapping(value: Any, path: Path | str, inside: str) -> Mapping[str, Any]:
     if not isinstance(value, Mapping):
-        raise InputError(f"{path}: {inside}: expected a mapping, got {shown(value)}")
+        raise InputError(f"{path}: {inside}: expected a mapping, got {describe_value(value)}")
     return value
 
 

@@ -18,7 +18,7 @@ class FileError(InputError):
         super().__init__(self.lines[0] + tail)
 
 
-def did_you_mean(word: object, known: Iterable[str]) -> str:
+def suggest_name(word: object, known: Iterable[str]) -> str:
     """`; did you mean 'frames'?`; `; known: ...` where no name is similar; empty where no name is known."""
     known = [str(k) for k in known]
     near = difflib.get_close_matches(str(word), known, n=1, cutoff=0.6)
@@ -30,7 +30,7 @@ def did_you_mean(word: object, known: Iterable[str]) -> str:
     return f"; known: {', '.join(known)}" if known else ""
 
 
-def shown(value: object) -> str:
+def describe_value(value: object) -> str:
     """A value as an error message shows it: short, and in the file's terms."""
     if value is None:
         return "nothing"
@@ -44,7 +44,7 @@ def shown(value: object) -> str:
     return text if len(text) <= 50 else text[:46] + " ..."
 
 
-def shown_line(line: str) -> str:
+def printable_line(line: str) -> str:
     """A line of a file as an error message shows it: at most 150 characters, control characters replaced."""
     text = "".join(c if c.isprintable() else "?" for c in line)
     return text if len(text) <= 150 else f"{text[:146]} ..."

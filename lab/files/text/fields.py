@@ -14,7 +14,7 @@ from typing import Annotated, Any, TypeVar
 import pydantic
 from pydantic_core import PydanticCustomError
 
-from lab.files.text.error_text import FileError, did_you_mean, shown
+from lab.files.text.error_text import FileError, describe_value, suggest_name
 
 M = TypeVar("M", bound="Block")
 
@@ -26,7 +26,7 @@ def field_error(text: str) -> PydanticCustomError:
 
 def unexpected_value(expected: str, found: object) -> PydanticCustomError:
     """The error `expected ..., got ...`."""
-    return field_error(f"expected {expected}, got {shown(found)}")
+    return field_error(f"expected {expected}, got {describe_value(found)}")
 
 
 def finite_number(value: Any) -> float:
@@ -118,9 +118,9 @@ def one_of(allowed: tuple[Any, ...]) -> Callable[[Any], Any]:
         words = (
             ", ".join(repr(a) for a in allowed[:-1]) + f" or {allowed[-1]!r}" if len(allowed) > 1 else repr(*allowed)
         )
-        suggestion = did_you_mean(value, [a for a in allowed if isinstance(a, str)])
+        suggestion = suggest_name(value, [a for a in allowed if isinstance(a, str)])
         raise field_error(
-            f"expected {words}, got {shown(value)}" + (suggestion if "did you mean" in suggestion else "")
+            f"expected {words}, got {describe_value(value)}" + (suggestion if "did you mean" in suggestion else "")
         )
 
     return check
@@ -153,7 +153,7 @@ class Block(pydantic.BaseModel):
             raise unexpected_value(f"a mapping with {', '.join(names)}", value)
         for key in value:
             if key not in names:
-                raise field_error(f"unknown key {key!r}{did_you_mean(key, names)}")
+                raise field_error(f"unknown key {key!r}{suggest_name(key, names)}")
         return value
 
 
@@ -177,4 +177,4 @@ def _line(error: Any, path: Path | str, inside: str) -> str:
     if error["type"] == "mistake":
         return f"{where}{error['ctx']['text']}"
     expected = error["msg"].replace("Input should be ", "expected ").removeprefix("Value error, ")
-    return f"{where}{expected}, got {shown(error['input'])}"
+    return f"{where}{expected}, got {describe_value(error['input'])}"

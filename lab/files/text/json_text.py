@@ -12,15 +12,17 @@ import numpy as np
 
 def write_json(content: Any, path: Path) -> None:
     """Write a value as a JSON file, indented."""
-    path.write_text(json.dumps(plain(content), indent=1, ensure_ascii=False, allow_nan=False) + "\n", encoding="utf-8")
+    path.write_text(
+        json.dumps(plain_value(content), indent=1, ensure_ascii=False, allow_nan=False) + "\n", encoding="utf-8"
+    )
 
 
-def plain(value: Any) -> Any:
+def plain_value(value: Any) -> Any:
     """The value with Python numbers instead of numpy's, and None for nan and infinity, which JSON does not have."""
     if isinstance(value, Mapping):
-        return {str(k): plain(v) for k, v in value.items()}
+        return {str(k): plain_value(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
-        return [plain(v) for v in value]
+        return [plain_value(v) for v in value]
     if isinstance(value, np.generic):
         value = value.item()
     if isinstance(value, float) and not np.isfinite(value):

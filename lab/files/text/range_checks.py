@@ -8,15 +8,17 @@ import numpy as np
 
 from lab.files.text.csv_table import Table
 
-FARTHEST_M = 10_000.0  # m from the origin: coordinates of a national grid must be transformed to a local frame first
-FARTHEST_IN_SCAN = 1e8  # units of a scanned cloud, which may be millimetres and in a national grid
+MAX_COORDINATE_M = (
+    10_000.0  # m from the origin: coordinates of a national grid must be transformed to a local frame first
+)
+MAX_SCAN_COORDINATE = 1e8  # units of a scanned cloud, which may be millimetres and in a national grid
 MARGIN_PICTURES = 1.0  # how far outside the picture, in picture widths, a pixel is accepted: predictions lie there
-SIGMA_RANGE_M = (1e-9, FARTHEST_M)
-SIGMAS_PX = (1e-6, 1e5)
+SIGMA_RANGE_M = (1e-9, MAX_COORDINATE_M)
+SIGMA_RANGE_PX = (1e-6, 1e5)
 SIGMA_RANGE_DEG = (0.0, 360.0)
 
 
-def check_coordinates(table: Table, names: Sequence[str], farthest_m: float = FARTHEST_M) -> None:
+def check_coordinates(table: Table, names: Sequence[str], farthest_m: float = MAX_COORDINATE_M) -> None:
     """Raises InputError at the first coordinate, m, of the columns `names` that lies outside any lab."""
     xyz = table.stack(*names)
     for i, k in np.argwhere(~(np.abs(xyz) <= farthest_m))[:1]:
@@ -27,7 +29,7 @@ def check_coordinates(table: Table, names: Sequence[str], farthest_m: float = FA
         )
 
 
-def refuse_far_pixels(table: Table, sizes: Mapping[str, tuple[int, int]]) -> None:
+def check_pixels(table: Table, sizes: Mapping[str, tuple[int, int]]) -> None:
     """Raises InputError at the first pixel (u_px, v_px) more than MARGIN_PICTURES outside its camera's picture.
 
     sizes: width and height, px, of each camera; rows of other cameras are not checked.
@@ -46,7 +48,7 @@ def refuse_far_pixels(table: Table, sizes: Mapping[str, tuple[int, int]]) -> Non
         )
 
 
-def refuse_sigmas(table: Table, name: str, allowed: tuple[float, float], unit: str) -> None:
+def check_sigmas(table: Table, name: str, allowed: tuple[float, float], unit: str) -> None:
     """Raises InputError at the first sigma of the column `name` outside the allowed range; nan: not given."""
     sigma, (least, largest) = table.numbers[name], allowed
     for i in np.flatnonzero((sigma < least) | (sigma > largest))[:1]:

@@ -17,7 +17,7 @@ import yaml
 
 from lab.errors import InputError
 from lab.files.text.atomic_write import atomic_write_text
-from lab.files.text.error_text import shown
+from lab.files.text.error_text import describe_value
 
 
 class _StrictLoader(yaml.SafeLoader):
@@ -129,7 +129,7 @@ def parse_mapping(text: str, path: Path | str, opencv: bool = False) -> dict[str
     except RecursionError:
         raise InputError(f"{path}: expected YAML, found a nesting too deep to read") from None
     if not isinstance(content, dict):
-        raise InputError(f"{path}: expected `key: value` lines, got {shown(content)}")
+        raise InputError(f"{path}: expected `key: value` lines, got {describe_value(content)}")
     return content
 
 

@@ -10,7 +10,7 @@ from html import escape
 import numpy as np
 
 from geometry.arrays import Array
-from lab.report.plot.axes import Plane, frame, heading, plane, svg_of, x_ticks, y_ticks
+from lab.report.plot.axes import PlotArea, frame, heading, plot_area, svg_of, x_ticks, y_ticks
 from lab.report.plot.histogram import histogram
 from lab.report.plot.scales import Scale, number, tick_texts, ticks
 from lab.report.plot.svg import BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION, dots, line_path, text
@@ -39,7 +39,7 @@ def residual_histogram(
     return histogram(values, limits, title, f"residual ({unit})", sigma=spread, footnote=words)
 
 
-def lens_ladder(
+def lens_model_chart(
     names: Sequence[str],
     holdout_rms_px: Array,
     chosen: int,
@@ -59,7 +59,7 @@ def lens_ladder(
     top = max(min(float(finite.max()), 4 * float(finite.min())) * 1.15 if finite.size else 1.0, 1e-9)
     row, left = 26.0, min(20 + 6.4 * max((len(n) for n in names), default=0), 200.0)
     low = 28 + row * len(names)
-    p = Plane(Scale(0, top, left, 470), Scale(0, len(names), 28, low), 540, low + 38)
+    p = PlotArea(Scale(0, top, left, 470), Scale(0, len(names), 28, low), 540, low + 38)
     marks = ticks(0, top, 6)
     out = [text(8, 15, title, "title"), x_ticks(p, marks, tick_texts(marks), grid=True)]
     out.append(text((left + 470) / 2, low + 30, "hold-out RMS (px)", "mid"))
@@ -123,7 +123,7 @@ def drift_chart(
     if expires is not None and expires.toordinal() <= last + max(2 * (last - first), 30):
         last = max(last, expires.toordinal())
     pad = max(0.03 * (last - first), 0.6)
-    p = plane((first - pad, last + pad), (0, top * 1.12), height=250)
+    p = plot_area((first - pad, last + pad), (0, top * 1.12), height=250)
     left, over, wide, high = p.box
     marks, dated = ticks(0, p.Y.hi, 5), _day_ticks(first, last)
     out = [
@@ -152,7 +152,7 @@ def drift_chart(
     return svg_of(p, title, [*out, frame(p)])
 
 
-def _drift_line(p: Plane, name: str, line: DriftLine, colour: str, legend_x: float) -> list[str]:
+def _drift_line(p: PlotArea, name: str, line: DriftLine, colour: str, legend_x: float) -> list[str]:
     """One camera's values over the days with their sigmas, and its entry in the legend."""
     order = np.argsort([d.toordinal() for d in line.dates], kind="stable")
     x = p.X(np.array([line.dates[k].toordinal() for k in order], dtype=float))

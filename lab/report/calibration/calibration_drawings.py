@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from geometry.arrays import Array, Bools
-from lab.report.plot.axes import Plane, axes, frame, image_plane, note, svg_of
+from lab.report.plot.axes import PlotArea, axes, frame, image_area, note, svg_of
 from lab.report.plot.scales import Scale, number, round_size
 from lab.report.plot.svg import BLUE, INK, ORANGE, VERMILLION, dots, picture_uri, polyline, segments, text
 
@@ -39,7 +39,7 @@ def corners_overlay(
     or (height, width, 3): the photograph, embedded beneath as a smaller JPEG. rejected (n,): corners that were not
     used. labels (n,): names of the corners, if any.
     """
-    p = image_plane(size_px)
+    p = image_area(size_px)
     out = axes(p, title, "u (px)", "v (px)", grid=picture is None)
     if picture is not None:
         out.append(_photograph(p, np.asarray(picture)))
@@ -80,7 +80,7 @@ def residual_field(
     found, residual = np.asarray(found_px, dtype=float), np.asarray(residual_px, dtype=float)
     good = np.isfinite(found).all(axis=1) & np.isfinite(residual).all(axis=1)
     found, residual = found[good], residual[good]
-    p = image_plane(size_px)
+    p = image_area(size_px)
     out = axes(p, title, "u (px)", "v (px)")
     if not len(found):
         return svg_of(p, title, [*out, frame(p), _in_the_middle(p, f"no {things}")])
@@ -137,7 +137,7 @@ def coverage_map(
     """
     corners = np.asarray(corners_px, dtype=float)
     corners = corners[np.isfinite(corners).all(axis=1)]
-    p = image_plane(size_px)
+    p = image_area(size_px)
     out = axes(p, title, "u (px)", "v (px)", grid=False)
     middle, _, count = cell_means(size_px, corners, np.zeros((len(corners), 1)), cells, 0)
     side = np.array([size_px[0] / cells, size_px[1] * cells / len(count)])
@@ -177,7 +177,7 @@ def tilt_polar(
     tilts, azimuths = np.asarray(tilts_deg, dtype=float), np.radians(np.asarray(azimuths_deg, dtype=float))
     finite = tilts[np.isfinite(tilts)]
     outer = max(60.0, float(finite.max()) * 1.05 if finite.size else 0.0)
-    p = Plane(Scale(-outer, outer, 95, 445), Scale(-outer, outer, 30, 380), 540, 412)
+    p = PlotArea(Scale(-outer, outer, 95, 445), Scale(-outer, outer, 30, 380), 540, 412)
     out = [text(58, 15, title, "title")]
     at = p.at(np.zeros(2))
     per_degree = 175 / outer
@@ -215,7 +215,7 @@ def _capped(vectors: Array) -> Array:
     return vectors * np.minimum(1.0, _LONGEST / np.maximum(length, 1e-9))
 
 
-def _scale_bar(p: Plane, stretch: float, bar: float) -> str:
+def _scale_bar(p: PlotArea, stretch: float, bar: float) -> str:
     left, top, wide, _ = p.box
     long = bar * stretch
     x, y = left + wide - 8, top - 8
@@ -225,7 +225,7 @@ def _scale_bar(p: Plane, stretch: float, bar: float) -> str:
     return line + text(x - long - 6, y + 4, words, "end")
 
 
-def _photograph(p: Plane, picture: np.ndarray) -> str:
+def _photograph(p: PlotArea, picture: np.ndarray) -> str:
     """The photograph inside the axes, as JPEG."""
     if picture.dtype != np.uint8:
         top = max(float(picture.max()), 1.0)
@@ -244,6 +244,6 @@ def _photograph(p: Plane, picture: np.ndarray) -> str:
     )
 
 
-def _in_the_middle(p: Plane, words: str) -> str:
+def _in_the_middle(p: PlotArea, words: str) -> str:
     left, top, wide, high = p.box
     return text(left + wide / 2, top + high / 2, words, "mid")

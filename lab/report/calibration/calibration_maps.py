@@ -8,7 +8,7 @@ from html import escape
 import numpy as np
 
 from geometry.arrays import Array
-from lab.report.plot.axes import Plane, axes, frame, note, plane, svg_of
+from lab.report.plot.axes import PlotArea, axes, frame, note, plot_area, svg_of
 from lab.report.plot.colour_map import BAR_WIDTH, colour_bar, colours, hex_colour, value_range
 from lab.report.plot.maps import contour_lines, label_place
 from lab.report.plot.scales import Scale, number, ticks
@@ -38,7 +38,7 @@ def flatness_map(
     if size_m is not None:
         half = np.array(size_m) / 2
         lo, hi = np.minimum(lo, -half), np.maximum(hi, half)
-    p = plane((lo[0], hi[0]), (lo[1], hi[1]), equal=True, right=BAR_WIDTH)
+    p = plot_area((lo[0], hi[0]), (lo[1], hi[1]), equal=True, right=BAR_WIDTH)
     limits = value_range(mm, True)
     out = axes(p, title, "x of the screen (m)", "y of the screen (m)")
     if bow is not None:
@@ -92,7 +92,7 @@ def correlation_matrix(names: Sequence[str], covariance: Array, title: str = "Co
     left, top = min(28 + 6.0 * max((len(w) for w in names), default=0), 190.0), 24.0
     side = min(26.0, (540 - left - BAR_WIDTH) / max(n, 1))
     wide = side * n
-    p = Plane(Scale(0, n, left, left + wide), Scale(0, n, top, top + wide), 540, top + wide + left - 16)
+    p = PlotArea(Scale(0, n, left, left + wide), Scale(0, n, top, top + wide), 540, top + wide + left - 16)
     out = [text(8, 15, title, "title")]
     size = f"font-size:{min(11.0, max(side * 0.95, 5.0)):.1f}px"
     for i, name in enumerate(names):

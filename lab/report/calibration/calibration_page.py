@@ -19,7 +19,7 @@ from calibration.findings import Finding, Level
 from geometry.arrays import Array
 from lab.errors import InputError
 from lab.files.text.atomic_write import atomic_write_text
-from lab.number_format import short
+from lab.number_format import format_number
 from lab.report.html import environment
 
 FILE_NAME = "report.html"
@@ -117,7 +117,7 @@ def provenance(inputs: Iterable[Path] = (), made: date | None = None) -> Provena
     return Provenance((made or date.today()).isoformat(), version, tuple(lines))
 
 
-def telling_views(rms_px: Array, worst: int = 4) -> list[tuple[int, str]]:
+def representative_views(rms_px: Array, worst: int = 4) -> list[tuple[int, str]]:
     """Indices of the views to show as pictures, each with its rank: the worst ones, the median and the best.
 
     rms_px (n,): nan for an unused view, which is never shown. worst: number of the worst views.
@@ -220,7 +220,7 @@ def cell(value: object) -> str:
     if isinstance(value, int | np.integer):
         return str(value)
     if isinstance(value, float | np.floating):
-        return short(float(value), 4) if math.isfinite(value) else "–" if math.isnan(value) else "∞"
+        return format_number(float(value), 4) if math.isfinite(value) else "–" if math.isnan(value) else "∞"
     return str(value)
 
 

@@ -13,7 +13,7 @@ from geometry.camera import Camera, pinhole_numbers
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.rig import Rig
-from lab.report.plot.axes import Plane, svg_of
+from lab.report.plot.axes import PlotArea, svg_of
 from lab.report.plot.scales import Scale, number, round_size
 from lab.report.plot.svg import BLUE, GREEN, ORANGE, PURPLE, VERMILLION, dots, polyline, segments, text
 
@@ -51,7 +51,7 @@ class Ray:
 
 
 @dataclass(frozen=True, slots=True)
-class Dot:
+class Marker:
     """A point: a spot, a control point or the body's origin."""
 
     name: str
@@ -59,7 +59,7 @@ class Dot:
     colour: str = ORANGE
 
 
-Thing = Frustum | Rectangle | Ray | Dot
+SceneObject = Frustum | Rectangle | Ray | Marker
 
 # World directions that point right and up in the drawing. z is up in the world frame of a lab, y is down in a camera.
 VIEWS: dict[str, tuple[Array, Array]] = {
@@ -82,12 +82,12 @@ def frustum_of(camera: Camera, colour: str = BLUE) -> Frustum:
     return Frustum(camera.name, camera.camera_from_world, half, colour)
 
 
-def rig_things(rig: Rig, world_from_body: Pose | None = None) -> list[Thing]:
+def rig_things(rig: Rig, world_from_body: Pose | None = None) -> list[SceneObject]:
     """The cameras and screens of a rig and, if the vehicle's pose is given, its beams and spots.
 
     A screen without a size is drawn large enough for its spots, at least 1 m.
     """
-    things: list[Thing] = []
+    things: list[SceneObject] = []
     model = SpotModel.of(rig)
     hits = np.full((len(model), 3), np.nan) if world_from_body is None else model.hits(world_from_body)[0]
     for screen in rig.screens.values():
@@ -107,19 +107,19 @@ def rig_things(rig: Rig, world_from_body: Pose | None = None) -> list[Thing]:
                 continue
             drawn.add(spot)
             start = world_from_body.apply(rig.beams[rig.spots[spot].beam].point)
-            things += [Ray(rig.spots[spot].beam, start, hits[i]), Dot(spot, hits[i])]
-        things.append(Dot("vehicle", world_from_body.translation, PURPLE))
+            things += [Ray(rig.spots[spot].beam, start, hits[i]), Marker(spot, hits[i])]
+        things.append(Marker("vehicle", world_from_body.translation, PURPLE))
     return things
 
 
 def scene_views(
-    things: Sequence[Thing], title: str = "Cameras, screens and beams", views: Sequence[str] = LAB_VIEWS
+    things: Sequence[SceneObject], title: str = "Cameras, screens and beams", views: Sequence[str] = LAB_VIEWS
 ) -> list[str]:
     """Several views of the same scene: LAB_VIEWS, or CAMERA_VIEWS for boards in front of a single camera."""
     return [scene_view(things, f"{title}, {name}", name) for name in views]
 
 
-def scene_view(things: Sequence[Thing], title: str, view: str = LAB_VIEWS[0]) -> str:
+def scene_view(things: Sequence[SceneObject], title: str, view: str = LAB_VIEWS[0]) -> str:
     """Parallel projection of a scene. view: one of VIEWS. Lengths along the drawing's axes are to scale."""
     right, up = VIEWS[view]
     to_drawing = np.stack([right / np.linalg.norm(right), up / np.linalg.norm(up)])
@@ -133,7 +133,7 @@ def scene_view(things: Sequence[Thing], title: str, view: str = LAB_VIEWS[0]) ->
     scale = min(440 / span[0], 360 / span[1])
     high = span[1] * scale
     x0 = (540 - span[0] * scale) / 2
-    p = Plane(
+    p = PlotArea(
         Scale(lo[0], lo[0] + span[0], x0, x0 + span[0] * scale),
         Scale(lo[1], lo[1] + span[1], 44 + high, 44),
         540,
@@ -158,7 +158,7 @@ def scene_view(things: Sequence[Thing], title: str, view: str = LAB_VIEWS[0]) ->
     return svg_of(p, title, out)
 
 
-def _frustum_length(things: Sequence[Thing]) -> float:
+def _frustum_length(things: Sequence[SceneObject]) -> float:
     """Length of the drawn fields of view, m: a seventh of the scene."""
     points = [t.camera_from_world.inverse().translation for t in things if isinstance(t, Frustum)]
     points += [p for t in things if not isinstance(t, Frustum) for p in _outline(t, 0.0)]
@@ -167,7 +167,7 @@ def _frustum_length(things: Sequence[Thing]) -> float:
     return max(float(np.ptp(cloud, axis=0).max()) / 7, 0.02) if len(cloud) else 1.0
 
 
-def _outline(thing: Thing, reach: float) -> Array:
+def _outline(thing: SceneObject, reach: float) -> Array:
     """Corners of a thing (k, 3), m, in world. reach: length of a field of view, m."""
     if isinstance(thing, Frustum):
         a, b = thing.half_width
@@ -184,7 +184,7 @@ def _outline(thing: Thing, reach: float) -> Array:
     return np.asarray(thing.place, dtype=float).reshape(1, 3)
 
 
-def _drawn(thing: Thing, p: Plane, at: Array) -> tuple[str, tuple[float, float, str, str] | None]:
+def _drawn(thing: SceneObject, p: PlotArea, at: Array) -> tuple[str, tuple[float, float, str, str] | None]:
     """SVG of a thing, and its label: x, y, text, colour."""
     c = thing.colour
     tip = f"<title>{escape(thing.name)}</title>"
@@ -211,7 +211,7 @@ def _pair(at: Array) -> tuple[float, float]:
     return float(at[0]), float(at[1])
 
 
-def _placed(labels: list[tuple[float, float, str, str]], p: Plane) -> list[str]:
+def _placed(labels: list[tuple[float, float, str, str]], p: PlotArea) -> list[str]:
     """Labels beside their things, shifted vertically so that none overlap; labels without a free place are omitted."""
     out: list[str] = []
     taken: list[tuple[float, float, float, float]] = []
@@ -230,7 +230,7 @@ def _placed(labels: list[tuple[float, float, str, str]], p: Plane) -> list[str]:
     return out
 
 
-def _axis_cross(p: Plane, to_drawing: Array) -> list[str]:
+def _axis_cross(p: PlotArea, to_drawing: Array) -> list[str]:
     """Directions of the world's axes, bottom left; an axis along the line of sight is omitted."""
     out = []
     origin = np.array([34.0, p.height - 30.0])

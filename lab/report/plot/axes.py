@@ -13,7 +13,7 @@ from lab.report.plot.svg import figure, text, vertical_text
 
 
 @dataclass(frozen=True, slots=True)
-class Plane:
+class PlotArea:
     """The scales of a drawing and its size. Coordinates are viewBox units."""
 
     X: Scale
@@ -33,7 +33,7 @@ class Plane:
         return left, top, abs(self.X.b - self.X.a), abs(self.Y.b - self.Y.a)
 
 
-def plane(
+def plot_area(
     x_range: tuple[float, float],
     y_range: tuple[float, float],
     *,
@@ -45,7 +45,7 @@ def plane(
     right: float = 12,
     bottom: float = 52,
     tallest: float = 440,
-) -> Plane:
+) -> PlotArea:
     """A plot area for values in these ranges. equal: one unit has the same length in x and y, and the height follows.
 
     y_down: y grows downwards, as in images. `bottom` leaves room for tick labels, the name of the axis and a `note`.
@@ -58,20 +58,22 @@ def plane(
             wide, high = wide * tallest / high, tallest
         height = top + high + bottom
     low, up = (top, height - bottom) if y_down else (height - bottom, top)
-    return Plane(Scale(*x_range, left, left + wide), Scale(*y_range, low, up), width, height)
+    return PlotArea(Scale(*x_range, left, left + wide), Scale(*y_range, low, up), width, height)
 
 
-def image_plane(size_px: tuple[int, int], *, width: float = 540, right: float = 12) -> Plane:
+def image_area(size_px: tuple[int, int], *, width: float = 540, right: float = 12) -> PlotArea:
     """A plot area for the pixels of an image, whose edges are at -0.5 and size - 0.5."""
-    return plane((-0.5, size_px[0] - 0.5), (-0.5, size_px[1] - 0.5), equal=True, y_down=True, width=width, right=right)
+    return plot_area(
+        (-0.5, size_px[0] - 0.5), (-0.5, size_px[1] - 0.5), equal=True, y_down=True, width=width, right=right
+    )
 
 
-def svg_of(p: Plane, title: str, parts: list[str], css: str = "plot") -> str:
+def svg_of(p: PlotArea, title: str, parts: list[str], css: str = "plot") -> str:
     """The drawing as an svg element with a name for screen readers."""
     return figure(p.width, p.height, title, parts, css=css)
 
 
-def axes(p: Plane, title: str, x_name: str, y_name: str, *, grid: bool = True) -> list[str]:
+def axes(p: PlotArea, title: str, x_name: str, y_name: str, *, grid: bool = True) -> list[str]:
     """Title, ticks with labels, names of both axes; grid lines, or short ticks without `grid`."""
     left, top, wide, high = p.box
     xs = ticks(min(p.X.lo, p.X.hi), max(p.X.lo, p.X.hi), max(3, int(wide / 75)))
@@ -85,13 +87,13 @@ def axes(p: Plane, title: str, x_name: str, y_name: str, *, grid: bool = True) -
     ]
 
 
-def heading(p: Plane, title: str) -> str:
+def heading(p: PlotArea, title: str) -> str:
     """The title above the axes."""
     left, top, _, _ = p.box
     return text(left, top - 8, title, "title")
 
 
-def x_ticks(p: Plane, values: Array, labels: Sequence[str], *, grid: bool = False) -> str:
+def x_ticks(p: PlotArea, values: Array, labels: Sequence[str], *, grid: bool = False) -> str:
     """Ticks of the x axis at values (n,), or grid lines, and their labels; an empty label is omitted."""
     _, top, _, high = p.box
     places = p.X(values).tolist()
@@ -100,7 +102,7 @@ def x_ticks(p: Plane, values: Array, labels: Sequence[str], *, grid: bool = Fals
     return f'<path class="grid" d="{lines}"/>{"".join(words)}'
 
 
-def y_ticks(p: Plane, values: Array, labels: Sequence[str], *, grid: bool = False) -> str:
+def y_ticks(p: PlotArea, values: Array, labels: Sequence[str], *, grid: bool = False) -> str:
     """Ticks of the y axis at values (n,), or grid lines, and their labels."""
     left, _, wide, _ = p.box
     places = p.Y(values).tolist()
@@ -109,12 +111,12 @@ def y_ticks(p: Plane, values: Array, labels: Sequence[str], *, grid: bool = Fals
     return f'<path class="grid" d="{lines}"/>{"".join(words)}'
 
 
-def note(p: Plane, words: str) -> str:
+def note(p: PlotArea, words: str) -> str:
     """A footnote below the name of the x axis."""
     return text(p.box[0], p.height - 5, words, "", "font-size:10.5px")
 
 
-def frame(p: Plane, closed: bool = True) -> str:
+def frame(p: PlotArea, closed: bool = True) -> str:
     """The edge of the plot area: all four sides, or the left and the bottom one."""
     left, top, wide, high = p.box
     d = f"M{left:.1f} {top:.1f}"

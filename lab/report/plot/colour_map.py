@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from geometry.arrays import Array
-from lab.report.plot.axes import Plane
+from lab.report.plot.axes import PlotArea
 from lab.report.plot.scales import Scale, tick_texts, ticks
 from lab.report.plot.svg import text
 
@@ -59,7 +59,7 @@ def value_range(values: Array, diverging: bool) -> tuple[float, float]:
     return lo, max(hi, lo + max(abs(lo), 1e-12) * 1e-3)
 
 
-def colour_bar(p: Plane, lo: float, hi: float, unit: str, diverging: bool) -> str:
+def colour_bar(p: PlotArea, lo: float, hi: float, unit: str, diverging: bool) -> str:
     """The colours with their values, to the right of the axes."""
     left, top, wide, high = p.box
     high = max(high, 40.0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from geometry.arrays import Array, Ints
-from lab.report.plot.axes import axes, frame, note, plane, svg_of
+from lab.report.plot.axes import axes, frame, note, plot_area, svg_of
 from lab.report.plot.svg import BLUE, bar_path, line_path
 
 
@@ -33,7 +33,7 @@ def histogram(
     if sigma:
         normal = len(values) * wide * np.exp(-((middle / sigma) ** 2) / 2) / (sigma * np.sqrt(2 * np.pi))
     top = max(float(counts.max(initial=0)), float(normal.max(initial=0)), 1) * 1.06
-    p = plane(limits, (0, top), height=height)
+    p = plot_area(limits, (0, top), height=height)
     bars = bar_path(p.X(edges), p.Y(counts.astype(float)), float(p.Y(np.array(0.0))))
     out = [*axes(p, title, x_name, "count"), f'<path d="{bars}" fill="{BLUE}" fill-opacity="0.7"/>']
     if sigma:

@@ -9,7 +9,7 @@ import numpy as np
 from contourpy import contour_generator
 
 from geometry.arrays import Array
-from lab.report.plot.axes import Plane, axes, frame, note, plane, svg_of
+from lab.report.plot.axes import PlotArea, axes, frame, note, plot_area, svg_of
 from lab.report.plot.colour_map import BAR_WIDTH, colour_bar, colours, value_range
 from lab.report.plot.scales import number, ticks
 from lab.report.plot.svg import picture_uri, polyline, text
@@ -38,7 +38,7 @@ def heat_map(
     values = np.asarray(values, dtype=float)
     lo, hi = limits or value_range(values, diverging)
     x0, x1, y0, y1 = extent
-    p = plane((x0, x1), (y0, y1), equal=equal, y_down=y_down, right=BAR_WIDTH)
+    p = plot_area((x0, x1), (y0, y1), equal=equal, y_down=y_down, right=BAR_WIDTH)
     out = [*axes(p, title, x_name, y_name, grid=False), _hatched(*p.box)]
     out.append(_image(p, _enlarged(values if y_down else values[::-1]), lo, hi, diverging))
     marks = np.asarray(levels, dtype=float) if levels is not None else contour_levels(lo, hi)
@@ -85,7 +85,7 @@ def contour_lines(values: Array, x: Array, y: Array, level: float) -> list[Array
     return [np.asarray(line) for line in generator.lines(level)]
 
 
-def label_place(p: Plane, lines: list[Array]) -> tuple[float, float] | None:
+def label_place(p: PlotArea, lines: list[Array]) -> tuple[float, float] | None:
     """The place for the label of contour lines, drawing coordinates: their point nearest the diagonal of the plot.
 
     This spreads the labels of different levels. None where all points are too close to the edge for a label.
@@ -101,7 +101,7 @@ def label_place(p: Plane, lines: list[Array]) -> tuple[float, float] | None:
     return x, y
 
 
-def _image(p: Plane, values: Array, lo: float, hi: float, diverging: bool) -> str:
+def _image(p: PlotArea, values: Array, lo: float, hi: float, diverging: bool) -> str:
     """The colours of values (rows, columns) over the plot area as an embedded PNG, transparent at nan."""
     rgb = colours((values - lo) / (hi - lo), diverging)
     alpha = np.where(np.isfinite(values), 255, 0).astype(np.uint8)

@@ -8,8 +8,8 @@ from html import escape
 import numpy as np
 
 from geometry.arrays import Array, Bools
-from lab.number_format import short
-from lab.report.plot.axes import Plane, frame, heading, x_ticks, y_ticks
+from lab.number_format import format_number
+from lab.report.plot.axes import PlotArea, frame, heading, x_ticks, y_ticks
 from lab.report.plot.scales import Scale, padded_range, tick_texts, ticks
 from lab.report.plot.svg import area_path, figure, line_path, text
 from lab.report.plot.thinning import band_envelope, envelope, true_shares
@@ -71,7 +71,7 @@ def time_panel(
     )
     lo, hi = y_range or padded_range(values)
     bottom = height - (30.0 if with_time else 8.0)
-    p = Plane(time_scale(t, 54.0, width - 10.0), Scale(lo, hi, bottom, 20.0), width, height)
+    p = PlotArea(time_scale(t, 54.0, width - 10.0), Scale(lo, hi, bottom, 20.0), width, height)
     bins = int(p.X.b - p.X.a)
     marks = ticks(lo, hi, max(5, int((bottom - 20.0) / 22)))
     out = [*_shaded(p, shades, len(t)), y_ticks(p, marks, tick_texts(marks), grid=True)]
@@ -95,7 +95,7 @@ def time_panel(
         beyond = max(beyond, float(np.abs(outside).max()) if outside.size else 0.0)
     out.append(heading(p, f"{title} ({unit})" if unit else title))
     if beyond:
-        out.append(text(p.X.b, 12, f"▲▼ up to {short(beyond)} {unit}", "end"))
+        out.append(text(p.X.b, 12, f"▲▼ up to {format_number(beyond)} {unit}", "end"))
     return figure(width, height, title, [*out, frame(p, closed=False)], data=time_data(p.X))
 
 
@@ -112,7 +112,7 @@ def time_data(X: Scale) -> str:
     return f' data-t="{X.lo!r} {X.hi!r} {X.a} {X.b}"'
 
 
-def time_ticks(p: Plane, name: str) -> str:
+def time_ticks(p: PlotArea, name: str) -> str:
     """Ticks of a time axis; with a name also the labels and, at the right end, the name."""
     values = ticks(p.X.lo, p.X.hi, 6)
     free = p.X(values) < p.X.b - _NAME_WIDTH
@@ -121,7 +121,7 @@ def time_ticks(p: Plane, name: str) -> str:
     return x_ticks(p, values, labels) + (text(p.X.b, top + high + 15, name, "end") if name else "")
 
 
-def _shaded(p: Plane, shades: tuple[Shade, ...], n: int) -> list[str]:
+def _shaded(p: PlotArea, shades: tuple[Shade, ...], n: int) -> list[str]:
     """Rectangles behind the intervals, each from half a frame before its first to half a frame after its last frame."""
     left, top, wide, high = p.box
     half = 0.5 / max(n - 1, 1)
@@ -137,7 +137,7 @@ def _shaded(p: Plane, shades: tuple[Shade, ...], n: int) -> list[str]:
     return out
 
 
-def _marks_beyond(p: Plane, x: Array, y: Array, colour: str) -> str:
+def _marks_beyond(p: PlotArea, x: Array, y: Array, colour: str) -> str:
     """Small triangles where a line leaves the axes, at most one in five units of width."""
     out = []
     for outside, edge, tip in ((y > p.Y.hi, p.Y.b, -5), (y < p.Y.lo, p.Y.a, 5)):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from lab.number_format import angle, length, percent, short
+from lab.number_format import format_angle, format_length, format_number, format_percent
 from lab.report.run.tables import KeyFigure, counted, pixels
 from lab.report.run.truth_errors import MotionErrors, PoseSpread, SpotErrors, TruthErrors
 
@@ -14,7 +14,7 @@ def truth_figures(e: TruthErrors | None) -> list[KeyFigure]:
         s, smooth = e.spots, e.spots.prediction_px.get("smooth")
         outside = s.out_of_view_px
         keys += [
-            KeyFigure("right in view", percent(s.in_view_identity), "of visible spots"),
+            KeyFigure("right in view", format_percent(s.in_view_identity), "of visible spots"),
             KeyFigure("wrong labels", counted(s.wrong_labels), "measured rows"),
             KeyFigure("prediction error", pixels(None if smooth is None else smooth.rms), "RMS without true bends"),
             KeyFigure(
@@ -27,12 +27,12 @@ def truth_figures(e: TruthErrors | None) -> list[KeyFigure]:
         causal = None if e.pose_causal is None else e.pose_causal.measured
         notes = ["RMS, measured poses"] * 2
         if causal is not None:
-            shown = angle(causal.rotation_deg.rms), length(causal.position_m.rms)
+            shown = format_angle(causal.rotation_deg.rms), format_length(causal.position_m.rms)
             notes = [f"RMS, smoothed; causal {value}" for value in shown]
         keys += [
-            KeyFigure("rotation error", angle(measured.rotation_deg.rms), notes[0]),
-            KeyFigure("position error", length(measured.position_m.rms), notes[1]),
-            KeyFigure("NEES", short(measured.nees_mean), "mean; 6 if σ is correct"),
+            KeyFigure("rotation error", format_angle(measured.rotation_deg.rms), notes[0]),
+            KeyFigure("position error", format_length(measured.position_m.rms), notes[1]),
+            KeyFigure("NEES", format_number(measured.nees_mean), "mean; 6 if σ is correct"),
         ]
     return keys
 
@@ -53,7 +53,7 @@ def pixel_rows(e: TruthErrors | None) -> list[tuple[str, ...]]:
         ("occluded", s.occluded_px, "the estimate while no detection was accepted"),
     )
     return [
-        (name, counted(x.rows), *(short(v) for v in (x.rms_u, x.rms_v, x.p99, x.max)), meaning)
+        (name, counted(x.rows), *(format_number(v) for v in (x.rms_u, x.rms_v, x.p99, x.max)), meaning)
         for name, x, meaning in kinds
         if x is not None
     ]
@@ -77,8 +77,8 @@ def error_rows(e: TruthErrors | None) -> list[tuple[str, str, str]]:
 
 def _label_rows(s: SpotErrors) -> list[tuple[str, str, str]]:
     out = [
-        ("right identity in view", percent(s.in_view_identity), "of visible spots, found under their own name"),
-        ("wrong labels", f"{counted(s.wrong_labels)} ({percent(s.wrong_label_share)})", "of all measured rows"),
+        ("right identity in view", format_percent(s.in_view_identity), "of visible spots, found under their own name"),
+        ("wrong labels", f"{counted(s.wrong_labels)} ({format_percent(s.wrong_label_share)})", "of all measured rows"),
     ]
     for block, name in ((s.re_entries, "re-entries kept"), (s.after_hiding, "kept after occlusion")):
         if block.total:
@@ -87,24 +87,24 @@ def _label_rows(s: SpotErrors) -> list[tuple[str, str, str]]:
     rate = s.recognition_rate_eq15.get
     return [
         *out,
-        ("recognition rate, eq. (15)", percent(rate("paper")), "all rows; spots out of view count as wrong"),
-        ("… in view only", percent(rate("in_view")), "of the rows with a visible spot"),
-        ("… all, within 3 px", percent(rate("all_within_tolerance")), "of all rows, measured or solved"),
+        ("recognition rate, eq. (15)", format_percent(rate("paper")), "all rows; spots out of view count as wrong"),
+        ("… in view only", format_percent(rate("in_view")), "of the rows with a visible spot"),
+        ("… all, within 3 px", format_percent(rate("all_within_tolerance")), "of all rows, measured or solved"),
     ]
 
 
 def _pose_rows(x: PoseSpread, name: str) -> list[tuple[str, str, str]]:
-    turns = ", ".join(f"{k} {angle(v)}" for k, v in x.rotation_rms_deg.items())
-    shifts = ", ".join(f"{k} {length(v)}" for k, v in x.position_rms_m.items())
-    largest = angle(x.rotation_deg.max), length(x.position_m.max)
+    turns = ", ".join(f"{k} {format_angle(v)}" for k, v in x.rotation_rms_deg.items())
+    shifts = ", ".join(f"{k} {format_length(v)}" for k, v in x.position_rms_m.items())
+    largest = format_angle(x.rotation_deg.max), format_length(x.position_m.max)
     out = [
         (f"rotation, {name} poses", f"RMS {turns}; largest {largest[0]}", f"about the body's axes, {x.rows} frames"),
         (f"position, {name} poses", f"RMS {shifts}; largest {largest[1]}", f"along the world's axes, {x.rows} frames"),
     ]
     if x.nees_mean is not None and x.nees_mean_95 is not None:
-        low, high = (short(v) for v in x.nees_mean_95)
+        low, high = (format_number(v) for v in x.nees_mean_95)
         meaning = f"6 expected; {low} to {high} in 95 % of runs of independent frames"
-        out.append((f"NEES, {name} poses", short(x.nees_mean), meaning))
+        out.append((f"NEES, {name} poses", format_number(x.nees_mean), meaning))
     return out
 
 
@@ -114,7 +114,7 @@ def _motion_rows(x: MotionErrors | None, causal: str) -> list[tuple[str, str, st
         bends = f", without {x.rows_at_bends_left_out} frames at bends" if x.rows_at_bends_left_out else ""
         for block, what, unit in ((x.velocity_m_s, "velocity", "mm/s"), (x.rate_rad_s, "angular rate", "mrad/s")):
             if block is not None:
-                axes = ", ".join(f"{k} {short(1000 * v)} {unit}" for k, v in block.rms_axes.items())
-                value = f"RMS {axes}; largest {short(1000 * block.max)} {unit}"
+                axes = ", ".join(f"{k} {format_number(1000 * v)} {unit}" for k, v in block.rms_axes.items())
+                value = f"RMS {axes}; largest {format_number(1000 * block.max)} {unit}"
                 out.append((f"{what}{causal}", value, f"against differences of the true poses{bends}"))
     return out

@@ -7,7 +7,7 @@ from typing import Any
 from urllib.parse import quote
 
 from lab.files.text.atomic_write import atomic_write_text
-from lab.number_format import short
+from lab.number_format import format_number
 from lab.report.html import environment
 from lab.report.run.summary import VERDICTS
 
@@ -81,4 +81,4 @@ def _cell(value: Any) -> tuple[str, str]:
     except (TypeError, ValueError):
         return str(value), str(value).lower()
     whole = number.is_integer() and abs(number) < 1e9
-    return (str(int(number)) if whole else short(number, 4)), repr(number)
+    return (str(int(number)) if whole else format_number(number, 4)), repr(number)

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from geometry.arrays import Array
-from lab.number_format import plus_minus, short
-from lab.report.plot.axes import frame, heading, image_plane, note, svg_of
+from lab.number_format import format_number, format_with_sigma
+from lab.report.plot.axes import frame, heading, image_area, note, svg_of
 from lab.report.plot.scales import number, round_size
 from lab.report.plot.svg import BLUE, VERMILLION, dots, segments, text
 
@@ -95,26 +95,26 @@ def _pair(group: Mapping[str, Any], name: str) -> Array:
 def _numbers(g: Mapping[str, Any]) -> tuple[str, ...]:
     mean, sigma, sigmas = _pair(g, "mean_px"), _pair(g, "sigma_of_mean_px"), _pair(g, "mean_sigmas")
     allowed = _pair(g, "calibration_px")
-    means = [plus_minus(m, s, signed=True) for m, s in zip(mean.tolist(), sigma.tolist(), strict=True)]
+    means = [format_with_sigma(m, s, signed=True) for m, s in zip(mean.tolist(), sigma.tolist(), strict=True)]
     nis = g.get("nis")
     nis_text = "–"
     if isinstance(nis, Mapping):
-        low, high = short(_float(nis.get("low"))), short(_float(nis.get("high")))
-        nis_text = f"{short(_float(nis.get('mean')))} ({low} to {high})"
+        low, high = format_number(_float(nis.get("low"))), format_number(_float(nis.get("high")))
+        nis_text = f"{format_number(_float(nis.get('mean')))} ({low} to {high})"
     share = _float(g.get("outliers"))
     return (
         str(g.get("frames")),
         *means,
         ", ".join(f"{s:+.2f}".replace("-", "\u2212") for s in sigmas) if np.isfinite(sigmas).all() else "–",
-        f"{short(allowed[0], 2)}, {short(allowed[1], 2)}" if np.any(allowed > 0) else "–",
-        short(_float(g.get("scatter"))),
+        f"{format_number(allowed[0], 2)}, {format_number(allowed[1], 2)}" if np.any(allowed > 0) else "–",
+        format_number(_float(g.get("scatter"))),
         nis_text,
         "–" if not np.isfinite(share) else f"{100 * share:.2g} %",
     )
 
 
 def _signed(value: float) -> str:
-    return "–" if not np.isfinite(value) else ("+" if value > 0 else "") + short(value, 2)
+    return "–" if not np.isfinite(value) else ("+" if value > 0 else "") + format_number(value, 2)
 
 
 def _drawing(index: int, camera: str, size: Any, views: list[Mapping[str, Any]]) -> str:
@@ -126,7 +126,7 @@ def _drawing(index: int, camera: str, size: Any, views: list[Mapping[str, Any]])
     known = np.isfinite(place).all(axis=1) & np.isfinite(mean).all(axis=1)
     if not known.any() or not (isinstance(size, list) and len(size) == 2):
         return ""
-    plane = image_plane((int(size[0]), int(size[1])))
+    plane = image_area((int(size[0]), int(size[1])))
     longest = float(np.linalg.norm(mean[known], axis=1).max())
     factor = round_size(_LONGEST * float(size[0]) / max(longest, 1e-6))
     left, top, wide, high = plane.box
@@ -153,5 +153,5 @@ def _drawing(index: int, camera: str, size: Any, views: list[Mapping[str, Any]])
         )
     times = f"{factor:,.0f}".replace(",", "\u202f") if factor >= 1 else number(factor)
     parts += ["</g>", frame(plane)]
-    parts.append(note(plane, f"arrows magnified {times} times; longest {short(longest, 2)} px"))
+    parts.append(note(plane, f"arrows magnified {times} times; longest {format_number(longest, 2)} px"))
     return svg_of(plane, f"mean residuals in camera {camera}", parts)

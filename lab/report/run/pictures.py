@@ -13,7 +13,7 @@ from geometry.arrays import Array
 from lab.errors import BeamposeError
 from lab.files.run.results import SPOT_STATUSES, read_result_table
 from lab.files.run.run_file import DetectionsTable, LiveDevice
-from lab.pictures.picture_file import Grey, Missing
+from lab.pictures.picture_file import GreyPicture, MissingPicture
 from lab.report.plot import svg
 from lab.report.plot.image import grey_limits, image_uri, stretched
 from lab.report.run.events import ShownEvent
@@ -46,7 +46,7 @@ def pictures(m: ReportData, results: Path, selection: list[ShownEvent]) -> list[
     if m.run is None:
         return []
     points = _detections(results / "detections.csv", {int(m.spots.frames[e.index]) for e in selection})
-    read: dict[tuple[str, int], Grey | str] = {}
+    read: dict[tuple[str, int], GreyPicture | str] = {}
     for camera, source in m.run.cameras.items():
         frames = [int(m.spots.frames[e.index]) for e in selection if e.camera == camera]
         if not frames or isinstance(source, DetectionsTable | LiveDevice):
@@ -56,7 +56,7 @@ def pictures(m: ReportData, results: Path, selection: list[ShownEvent]) -> list[
         except BeamposeError:
             continue
         for frame, picture in found.items():
-            if isinstance(picture, Missing):
+            if isinstance(picture, MissingPicture):
                 read[camera, frame] = picture.reason
             elif not isinstance(picture, Detections):
                 read[camera, frame] = picture  # in their own type: eight pictures as floats would take 80 MB

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from geometry.arrays import Array
-from lab.number_format import angle, length, percent, short
+from lab.number_format import format_angle, format_length, format_number, format_percent
 from lab.report.plot.thinning import true_ranges
 from lab.report.run.report_data import ReportData
 from lab.report.run.truth_errors import ViewErrors
@@ -25,7 +25,7 @@ class KeyFigure:
 
 def pixels(value: float | None) -> str:
     """A distance in the picture."""
-    return "\u2013" if value is None or not np.isfinite(value) else f"{short(value)} px"
+    return "\u2013" if value is None or not np.isfinite(value) else f"{format_number(value)} px"
 
 
 def _median(values: Array) -> float | None:
@@ -55,15 +55,17 @@ def key_figures(m: ReportData) -> list[KeyFigure]:
     yaw_note, position_note = "median of measured poses", "median of √(σx²+σy²+σz²)"
     if m.causal is not None:
         causal = m.causal.has(PoseStatus.MEASURED)
-        yaw_note = f"median, smoothed; causal {angle(_median(m.causal.sigma_ypr_deg[causal, 0]))}"
+        yaw_note = f"median, smoothed; causal {format_angle(_median(m.causal.sigma_ypr_deg[causal, 0]))}"
         causal_m = _median(np.linalg.norm(m.causal.sigma_position_m[causal], axis=1))
-        position_note = f"median, smoothed; causal {length(causal_m)}"
+        position_note = f"median, smoothed; causal {format_length(causal_m)}"
     return [
-        KeyFigure("frames", f"{n:,}".replace(",", "\u202f"), f"{short(span)} s" if m.time_name != "frame" else ""),
-        KeyFigure("pose measured", percent(float(measured.mean()) if len(measured) else None), "of all frames"),
-        KeyFigure("spots found", percent(found), "of the spots expected in view"),
-        KeyFigure("σ of yaw", angle(_median(p.sigma_ypr_deg[measured, 0])), yaw_note),
-        KeyFigure("σ of position", length(sigma_m), position_note),
+        KeyFigure(
+            "frames", f"{n:,}".replace(",", "\u202f"), f"{format_number(span)} s" if m.time_name != "frame" else ""
+        ),
+        KeyFigure("pose measured", format_percent(float(measured.mean()) if len(measured) else None), "of all frames"),
+        KeyFigure("spots found", format_percent(found), "of the spots expected in view"),
+        KeyFigure("σ of yaw", format_angle(_median(p.sigma_ypr_deg[measured, 0])), yaw_note),
+        KeyFigure("σ of position", format_length(sigma_m), position_note),
         KeyFigure("residual", pixels(_median(p.rms_px[measured])), "median RMS of the pose"),
     ]
 
@@ -86,18 +88,22 @@ def spot_rows(m: ReportData) -> tuple[list[str], list[list[str]]]:
         counts = [int(m.spots.has(s)[:, j].sum()) for s in SpotStatus]
         sigma = np.where(m.spots.measured[:, j], m.spots.sigma_px[:, j].max(axis=1), np.nan)
         row = [camera, spot, *(str(c) if c else "·" for c in counts)]
-        row += [short(_median(sigma)), short(_rms(np.linalg.norm(innovation[:, j], axis=1)))]
+        row += [format_number(_median(sigma)), format_number(_rms(np.linalg.norm(innovation[:, j], axis=1)))]
         if m.residual_px is not None:
             r = m.residual_px[:, j]
             r = r[np.isfinite(r).all(axis=1)]
             mean = ", ".join(f"{x:+.3f}".replace("-", "\u2212") for x in r.mean(axis=0)) if len(r) else "\u2013"
-            row += [short(_rms(np.linalg.norm(r, axis=1))), mean]
+            row += [format_number(_rms(np.linalg.norm(r, axis=1))), mean]
         if doubtful.any():
             row.append(str(int((doubtful & ~m.spots.measured)[:, j].sum()) or "·"))
         if scored:
             own = scored.get((camera, spot), ViewErrors(camera, spot))
             outside = own.out_of_view_error_px
-            row += [percent(own.identity), counted(own.wrong_labels), short(None if outside is None else outside.rms)]
+            row += [
+                format_percent(own.identity),
+                counted(own.wrong_labels),
+                format_number(None if outside is None else outside.rms),
+            ]
         rows.append(row)
     return heads, rows
 

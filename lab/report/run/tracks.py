@@ -8,7 +8,7 @@ import numpy as np
 
 from geometry.arrays import Array, Bools, Ints
 from lab.files.run.results import POSE_STATUSES, SPOT_STATUSES
-from lab.report.plot.axes import Plane, axes, frame, plane, svg_of
+from lab.report.plot.axes import PlotArea, axes, frame, plot_area, svg_of
 from lab.report.plot.scales import Scale
 from lab.report.plot.series import time_data, time_scale, time_ticks
 from lab.report.plot.svg import BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION, figure, line_path, text
@@ -72,7 +72,7 @@ def tracks_figure(m: ReportData, camera: str) -> str:
     return svg_of(p, f"Tracks of the spots in the picture of camera {camera}", out)
 
 
-def _track_plane(uv: Array, measured: Bools, size: tuple[int, int] | None) -> tuple[Plane, Array]:
+def _track_plane(uv: Array, measured: Bools, size: tuple[int, int] | None) -> tuple[PlotArea, Array]:
     """The plot area for positions (F, n, 2), px, and the corners (2, 2) of the picture.
 
     Without a rig (size None) the edge of the picture is unknown, and the measured positions stand for it.
@@ -84,7 +84,7 @@ def _track_plane(uv: Array, measured: Bools, size: tuple[int, int] | None) -> tu
     margin = _BEYOND * (hi - lo) + 1.0
     low = np.maximum(np.minimum(np.nanmin(uv, axis=(0, 1)), lo), lo - margin) - 0.03 * (hi - lo) - 1.0
     high = np.minimum(np.maximum(np.nanmax(uv, axis=(0, 1)), hi), hi + margin) + 0.03 * (hi - lo) + 1.0
-    p = plane((low[0], high[0]), (low[1], high[1]), equal=True, y_down=True, bottom=38, tallest=420)
+    p = plot_area((low[0], high[0]), (low[1], high[1]), equal=True, y_down=True, bottom=38, tallest=420)
     return p, np.stack([lo, hi])
 
 
@@ -187,7 +187,7 @@ def timeline_figure(m: ReportData) -> str:
         y += row + (6 if name == "pose" else 0)
     X = time_scale(m.t_s, left, right)
     X = time_scale(m.t_s, left, right, 0.5 * (X.hi - X.lo) / max(n - 1, 1))
-    p = Plane(X, Scale(0, 1, y + 1, 8), 1110, y + 24)
+    p = PlotArea(X, Scale(0, 1, y + 1, 8), 1110, y + 24)
     out.append(time_ticks(p, m.time_name))
     return figure(p.width, p.height, "Status of the pose and of every spot over time", out, data=time_data(X))
 

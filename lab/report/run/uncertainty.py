@@ -6,7 +6,7 @@ import numpy as np
 
 from geometry.arrays import Array
 from geometry.rotations import ypr_jacobian
-from lab.number_format import angle, length
+from lab.number_format import format_angle, format_length
 from lab.report.run.report_data import ReportData
 from tracking.statuses import PoseStatus
 
@@ -31,7 +31,7 @@ def budget_rows(m: ReportData) -> list[tuple[str, ...]]:
     sigmas = [np.sqrt(np.median(c, axis=0)) for c in columns]
     rows = []
     for i, name in enumerate(("x", "y", "z", "yaw", "pitch", "roll")):
-        shown = length if i < 3 else angle
+        shown = format_length if i < 3 else format_angle
         rows.append((name, *(shown(float(s[i])) for s in sigmas)))
     return rows
 

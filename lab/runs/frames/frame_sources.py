@@ -14,15 +14,23 @@ import numpy as np
 from geometry.arrays import Ints
 from lab.errors import InputError
 from lab.files.run.detections_file import CameraPoints
-from lab.pictures.opencv import quiet_cv2
-from lab.pictures.picture_file import DROPPED, SUFFIXES, UNREADABLE, Grey, Missing, checked, read_picture
+from lab.pictures.opencv import load_cv2
+from lab.pictures.picture_file import (
+    DROPPED,
+    PICTURE_SUFFIXES,
+    UNREADABLE,
+    GreyPicture,
+    MissingPicture,
+    read_picture,
+    require_format,
+)
 from tracking.detections import Detections
 
 if TYPE_CHECKING:
     import cv2
 
-Picture: TypeAlias = Grey | Detections | Missing
-Requested: TypeAlias = Picture | Future[Grey | Missing] | Future[Grey | Missing | None]
+Picture: TypeAlias = GreyPicture | Detections | MissingPicture
+Requested: TypeAlias = Picture | Future[GreyPicture | MissingPicture] | Future[GreyPicture | MissingPicture | None]
 _LAST_NUMBER = re.compile(r"([0-9]+)[^0-9]*$")
 
 
@@ -37,18 +45,18 @@ class Grabbed(Protocol):
     def retrieve(self) -> Any: ...
 
 
-def retrieved(capture: Grabbed, size_px: tuple[int, int] | None) -> Grey | Missing:
+def retrieved(capture: Grabbed, size_px: tuple[int, int] | None) -> GreyPicture | MissingPicture:
     """The picture that a capture has grabbed, as grey values of this (width, height).
 
     The array may be the capture's own buffer, which the next picture overwrites.
     """
     good, picture = capture.retrieve()
     if not good or picture is None:
-        return Missing(f"{UNREADABLE}: damaged")
+        return MissingPicture(f"{UNREADABLE}: damaged")
     if picture.ndim == 3:
-        cv2 = quiet_cv2()
+        cv2 = load_cv2()
         picture = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY) if picture.shape[2] == 3 else picture[..., 0]
-    return checked(picture, size_px)
+    return require_format(picture, size_px)
 
 
 class Source(Protocol):
@@ -79,7 +87,12 @@ def number_of(name: str) -> int | None:
     """The frame number in a picture's file name: the last group of digits before the suffix. None: not a picture."""
     stem, suffix = os.path.splitext(name)
     match = _LAST_NUMBER.search(stem)
-    if name.startswith(".") or suffix.lower() not in SUFFIXES or match is None or len(match[1].lstrip("0")) > 15:
+    if (
+        name.startswith(".")
+        or suffix.lower() not in PICTURE_SUFFIXES
+        or match is None
+        or len(match[1].lstrip("0")) > 15
+    ):
         return None
     return int(match[1])
 
@@ -110,7 +123,9 @@ def list_folder(folder: Path) -> FolderListing:
         names[number] = name
     if not names:
         others = f" among {len(ignored)} files" if ignored else ""
-        raise InputError(f"{folder}: expected pictures with a number ({', '.join(SUFFIXES)}), found none{others}")
+        raise InputError(
+            f"{folder}: expected pictures with a number ({', '.join(PICTURE_SUFFIXES)}), found none{others}"
+        )
     return FolderListing(folder, dict(sorted(names.items())), tuple(ignored))
 
 
@@ -124,7 +139,7 @@ class FolderSource:
     def request(self, frame: int, pool: ThreadPoolExecutor) -> Requested:
         name = self.listing.names.get(frame)
         if name is None:
-            return Missing(DROPPED)
+            return MissingPicture(DROPPED)
         return pool.submit(read_picture, self.listing.folder / name, self.size_px)
 
     def close(self) -> None: ...
@@ -144,11 +159,11 @@ class TableSource:
 
     def request(self, frame: int, pool: ThreadPoolExecutor) -> Requested:
         if not self.first <= frame <= self.last:
-            return Missing(DROPPED)
+            return MissingPicture(DROPPED)
         if self.points is None:
             return Detections.none()
-        if self.points.says_nothing_of(frame):
-            return Missing(f"{UNREADABLE}: no row of it can be used")
+        if self.points.has_only_unusable_rows(frame):
+            return MissingPicture(f"{UNREADABLE}: no row of it can be used")
         return self.points.at(frame)
 
     def close(self) -> None: ...
@@ -165,9 +180,9 @@ class VideoSource:
         self.pictures = 0  # number read so far
 
     def request(self, frame: int, pool: ThreadPoolExecutor) -> Requested:
-        return self._thread.submit(self._next) if frame >= 0 else Missing(DROPPED)
+        return self._thread.submit(self._next) if frame >= 0 else MissingPicture(DROPPED)
 
-    def _next(self) -> Grey | Missing | None:
+    def _next(self) -> GreyPicture | MissingPicture | None:
         if not self._capture.grab():
             return None
         self.pictures += 1
@@ -177,7 +192,7 @@ class VideoSource:
         """Skip one picture; False at the end."""
         return bool(self._capture.grab())
 
-    def next_picture(self) -> Grey | Missing | None:
+    def next_picture(self) -> GreyPicture | MissingPicture | None:
         """The next picture; None at the end. Must not be mixed with `request`."""
         return self._next()
 
@@ -192,7 +207,7 @@ def open_video(path: Path) -> cv2.VideoCapture:
     Raises:
         InputError: OpenCV cannot read it.
     """
-    cv2 = quiet_cv2()
+    cv2 = load_cv2()
     capture = cv2.VideoCapture(str(path))
     if not capture.isOpened():
         raise InputError(
@@ -206,6 +221,6 @@ def open_video(path: Path) -> cv2.VideoCapture:
 def header_picture_count(path: Path) -> int | None:
     """Number of pictures by the video's header, which may be wrong; None where it states none."""
     capture = open_video(path)
-    count = capture.get(quiet_cv2().CAP_PROP_FRAME_COUNT)
+    count = capture.get(load_cv2().CAP_PROP_FRAME_COUNT)
     capture.release()
     return int(count) if 0 < count < 2**40 else None

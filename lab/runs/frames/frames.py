@@ -14,10 +14,10 @@ import numpy as np
 
 from geometry.arrays import Bools, Ints
 from lab.errors import InputError
-from lab.files.run.detections_file import CameraPoints, DetectionsFile, far_off, read_detections, too_sparse
+from lab.files.run.detections_file import CameraPoints, DetectionsFile, is_too_sparse, read_detections, stray_frames
 from lab.files.run.run_file import DetectionsTable, FramesFolder, LiveDevice, Run, VideoFile
-from lab.files.text.error_text import did_you_mean
-from lab.pictures.picture_file import DROPPED, Grey, Missing
+from lab.files.text.error_text import suggest_name
+from lab.pictures.picture_file import DROPPED, MissingPicture
 from lab.runs.frames.frame_sources import (
     FolderListing,
     FolderSource,
@@ -31,7 +31,7 @@ from lab.runs.frames.frame_sources import (
     result_of,
 )
 
-__all__ = ["FrameReader", "FrameSet", "Grey", "Missing", "Picture", "open_frames", "pictures_at"]
+__all__ = ["FrameReader", "FrameSet", "MissingPicture", "Picture", "open_frames", "pictures_at"]
 
 AHEAD = 8  # frames read before they are requested: 21 MB for two 1280x1024 cameras, whatever the run's length
 THREADS = min(4, os.cpu_count() or 1)  # pictures decoded at once
@@ -142,7 +142,9 @@ class FrameReader:
                 self._note_ends(ended, frame)
                 if len(ended) == len(self._stated_counts) and (self.last is None or frame > self.last):
                     return
-                images = {name: Missing(DROPPED) if picture is None else picture for name, picture in got.items()}
+                images = {
+                    name: MissingPicture(DROPPED) if picture is None else picture for name, picture in got.items()
+                }
                 self._count(frame, images)
                 yield FrameSet(frame, images)
 
@@ -169,7 +171,7 @@ class FrameReader:
             return
         pictures = sum(len(v.names) for v in self._listings.values())
         pictures += sum(len(c.frames) for t in self._tables.values() for c in t.cameras.values())
-        if too_sparse(self.last - self.first + 1, pictures):
+        if is_too_sparse(self.last - self.first + 1, pictures):
             stray = "file" if self._listings else "row"
             holders = "names" if self._listings else "frame numbers"
             raise InputError(
@@ -184,7 +186,7 @@ class FrameReader:
         everything: list[Ints] = [v.numbers for v in self._listings.values()]
         everything += [c.frames for t in self._tables.values() for c in t.cameras.values()]
         numbers = np.unique(np.concatenate(everything)) if everything else np.empty(0, np.int64)
-        strays = far_off(numbers)
+        strays = stray_frames(numbers)
         for listing in self._listings.values():
             for number in numbers[strays].tolist():
                 if number in listing.names:
@@ -215,7 +217,7 @@ class FrameReader:
     def _unknown(self, table: DetectionsFile) -> list[str]:
         """Cameras of a table that the rig does not have."""
         known = (*self._run.rig.cameras, *self._run.left_out)
-        return [c for c in (*table.cameras, *table.spoilt) if c not in known]
+        return [c for c in (*table.cameras, *table.unusable) if c not in known]
 
     def _note_camera(self, name: str, path: Path, table: DetectionsFile) -> None:
         points = table.cameras.get(name)
@@ -223,16 +225,16 @@ class FrameReader:
             points = self._in_picture(name, path, points)
             self._tables[name] = replace(table, cameras={**table.cameras, name: points})
             return
-        if name in table.spoilt:
+        if name in table.unusable:
             raise InputError(
-                f"{path}: camera {name!r}: expected rows that can be used, got none: {table.spoilt[name]}; put"
+                f"{path}: camera {name!r}: expected rows that can be used, got none: {table.unusable[name]}; put"
                 f" them right, or leave {name!r} out of `cameras` in {self._run.path}"
             )
         unknown = self._unknown(table)
         if unknown:
             raise InputError(
                 f"{path}: camera: expected rows of {name!r}, got none, but rows of {', '.join(map(repr, unknown))},"
-                f" which the rig does not have{did_you_mean(unknown[0], self._run.rig.cameras)}"
+                f" which the rig does not have{suggest_name(unknown[0], self._run.rig.cameras)}"
             )
         self._tables[name] = table
         self._notes.append(f"{path}: no rows of camera {name!r}; all its pictures count as empty")
@@ -274,7 +276,7 @@ class FrameReader:
 
     def _count(self, frame: int, images: Mapping[str, Picture]) -> None:
         for camera, picture in images.items():
-            if isinstance(picture, Missing):
+            if isinstance(picture, MissingPicture):
                 missing = self._missing.setdefault((camera, picture.reason), _MissingFrames())
                 missing.count += 1
                 if len(missing.first) < NAMED:
@@ -309,16 +311,16 @@ def pictures_at(run: Run, camera: str, frames: Sequence[int]) -> dict[int, Pictu
                     at += 1
                 shown = video.next_picture() if at == frame else None
                 at += 1
-                out[frame] = Missing(DROPPED) if shown is None else shown
+                out[frame] = MissingPicture(DROPPED) if shown is None else shown
         elif isinstance(source, DetectionsTable):
-            out = dict.fromkeys(wanted, Missing("no pictures: detected points"))
+            out = dict.fromkeys(wanted, MissingPicture("no pictures: detected points"))
         elif isinstance(source, LiveDevice):
-            out = dict.fromkeys(wanted, Missing("no pictures: a live camera"))
+            out = dict.fromkeys(wanted, MissingPicture("no pictures: a live camera"))
         else:
             folder = FolderSource(list_folder(source.path), size_px)
             pool = stack.enter_context(ThreadPoolExecutor(THREADS))
             requested = {frame: folder.request(frame, pool) for frame in wanted}
             for frame, later in requested.items():
                 picture = result_of(later)
-                out[frame] = Missing(DROPPED) if picture is None else picture
+                out[frame] = MissingPicture(DROPPED) if picture is None else picture
     return out

@@ -9,10 +9,10 @@ from typing import Protocol
 
 import numpy as np
 
-from geometry.light_centroid import CentreOffsets
+from geometry.light_centroid import CentroidOffsets
 from geometry.pose_prior import PosePrior
 from lab.files.run.run_file import Run
-from lab.pictures.picture_file import Grey, Missing
+from lab.pictures.picture_file import GreyPicture, MissingPicture
 from lab.runs.frames.frames import FrameSet, open_frames
 from lab.runs.frames.sensor_noise import CameraNoise, camera_noises
 from tracking.curve_switching.spot_tracker import SpotTracker
@@ -90,7 +90,7 @@ class Pipeline:
     noise: dict[str, CameraNoise]  # of cameras with pictures
     on_record: Callable[[FrameRecord], None] | None = None  # called with each record at once
     timings: Timings = field(default_factory=Timings)
-    _offsets: dict[str, CentreOffsets] = field(default_factory=dict)
+    _offsets: dict[str, CentroidOffsets] = field(default_factory=dict)
 
     @staticmethod
     def of(run: Run) -> Pipeline:
@@ -131,16 +131,16 @@ class Pipeline:
         for frames in self.reader:
             yield frames.frame, self._detect(frames)[0]
 
-    def spots_in(self, camera: str, picture: Grey) -> Detections:
+    def spots_in(self, camera: str, picture: GreyPicture) -> Detections:
         """The points in one picture of a camera. Not thread-safe for the same camera."""
         noise = self.noise[camera]
         points = noise.detect(picture, self.run.tracker.detect)
         return on_beam_axes(points, self._offsets_of(camera), noise.model)
 
-    def _offsets_of(self, camera: str) -> CentreOffsets:
+    def _offsets_of(self, camera: str) -> CentroidOffsets:
         if camera not in self._offsets:
             seen_by = self.run.rig.cameras[camera]
-            self._offsets[camera] = CentreOffsets(seen_by, self.run.rig.screens[seen_by.screen])
+            self._offsets[camera] = CentroidOffsets(seen_by, self.run.rig.screens[seen_by.screen])
         return self._offsets[camera]
 
     def _spent(self, on: str, since: float) -> float:
@@ -153,7 +153,7 @@ class Pipeline:
         missing: list[str] = []
         for name in self.run.rig.cameras:
             picture = frames.images[name]
-            if isinstance(picture, Missing):
+            if isinstance(picture, MissingPicture):
                 found.append(None)
                 missing.append(picture.reason)
                 continue
@@ -164,7 +164,7 @@ class Pipeline:
         return tuple(found), tuple(missing)
 
 
-def on_beam_axes(found: Detections, offsets: CentreOffsets, noise: NoiseModel | None) -> Detections:
+def on_beam_axes(found: Detections, offsets: CentroidOffsets, noise: NoiseModel | None) -> Detections:
     """Detections (n) with positions shifted from the light's centroid to the image of the beam's axis."""
     if not len(found) or noise is None:
         return found

@@ -15,7 +15,7 @@ from geometry.pose_solver.symmetry import symmetries
 from geometry.rig import Rig
 from geometry.uncertainty.rig_parameters import RigCovariance
 from lab.errors import CalibrationError, InputError
-from lab.files.rig.calibration_state import CalibrationState, require_usable
+from lab.files.rig.calibration_state import CalibrationState, require_valid_calibration
 from lab.files.rig.rig_covariance import joint_covariance
 from lab.files.rig.rig_file import load_rig_file
 from lab.files.run.run_file import Run, load_run
@@ -83,7 +83,7 @@ def _describe_calibration(
     """Date and verdict of the calibration, and whether it may be used on the day of the recording (or today)."""
     try:
         day = datetime.date.today() if recorded is None else recorded
-        require_usable(state, path, day, "today" if recorded is None else "the recording's day")
+        require_valid_calibration(state, path, day, "today" if recorded is None else "the recording's day")
     except CalibrationError as error:
         findings.unusable += str(error).splitlines()
     text = "the rig file does not state when it was calibrated"

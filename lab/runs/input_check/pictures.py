@@ -11,7 +11,7 @@ from geometry.arrays import Ints
 from lab.errors import InputError
 from lab.files.run.run_file import Run
 from lab.files.run.truth import largest_disagreement_px, load_run_truth
-from lab.pictures.picture_file import DROPPED, UNREADABLE, Missing
+from lab.pictures.picture_file import DROPPED, UNREADABLE, MissingPicture
 from lab.runs.frames.frames import FrameReader
 from lab.runs.input_check.findings import Findings, table
 from tracking.detections import Detections
@@ -78,7 +78,7 @@ def _describe_pictures(findings: Findings, run: Run, seen: dict[str, _Seen]) -> 
 
 
 def _count(seen: _Seen, frame: int, picture: object) -> None:
-    if isinstance(picture, Missing):
+    if isinstance(picture, MissingPicture):
         seen.dropped += picture.reason == DROPPED
         seen.unreadable += picture.reason.startswith(UNREADABLE)
         seen.wrong_size += picture.reason.startswith("wrong size")

@@ -14,7 +14,7 @@ from calibration.model_check.fault_identification import FaultDiagnosis, FittedF
 from calibration.model_check.noise_scales import UNEVEN, is_noisy
 from calibration.model_check.unseen import UnseenView
 from geometry.forward_model import SpotModel
-from lab.number_format import plus_minus, short
+from lab.number_format import format_number, format_with_sigma
 
 MATTERS_SIGMAS = 0.5  # in stated sigmas of a pose or a spot: a smaller bias is negligible against the stated sigma
 # A larger bias makes the stated sigmas wrong; the limit of the noise scale in lab/runs/verdict/quality.py is the same.
@@ -98,7 +98,8 @@ def fault_finding(
     if effect.axis >= 0:
         camera, spot = model.views[effect.view]
         where = (
-            f"spot {spot} in camera `{camera}` lies {short(effect.off_sigmas, 2)} sigma ({short(effect.off_px, 2)} px)"
+            f"spot {spot} in camera `{camera}` lies {format_number(effect.off_sigmas, 2)} sigma"
+            f" ({format_number(effect.off_px, 2)} px)"
             f" off in {'uv'[effect.axis]} against the other spots: "
         )
     what = f"{where}{text}, p {p_text(suspected.best.change.p_value)}"
@@ -118,7 +119,8 @@ def unexplained_finding(diagnosis: FaultDiagnosis) -> Finding:
         level,
         f"the residuals do not fit the rig file{beyond}, and no single camera, screen, beam or clock explains it,"
         f" p {p_text(diagnosis.p_after)}",
-        f"the residuals are {short(diagnosis.residual_scale, 2)} times as large as the spots' sigmas allow; the stated"
+        f"the residuals are {format_number(diagnosis.residual_scale, 2)} times as large as the spots'"
+        " sigmas allow; the stated"
         " sigmas of the poses do not include this",
         "Calibrate the rig again; if that does not help, check the lens models and the flatness of the screens.",
     )
@@ -134,9 +136,9 @@ def noise_finding(result: ModelCheckResult, diagnosis: FaultDiagnosis) -> Findin
     factor = max(of_cameras.values())
     if not is_noisy(factor, result.stated_residual_scale):
         return None
-    size = f"{short(factor, 2)} times as large as the sigmas of the detections"
+    size = f"{format_number(factor, 2)} times as large as the sigmas of the detections"
     uneven = factor > UNEVEN * min(of_cameras.values())
-    each = ", ".join(f"camera `{name}` {short(value, 2)}" for name, value in of_cameras.items())
+    each = ", ".join(f"camera `{name}` {format_number(value, 2)}" for name, value in of_cameras.items())
     where = f" ({each})" if uneven else ""
     if diagnosis.is_correlated:
         return Finding(
@@ -190,7 +192,7 @@ def _consequence(effects: Sequence[Effect], level: Level) -> str:
 def _range(values: Sequence[float]) -> str:
     """`0.31`, or `0.31 to 0.64` where they differ by more than a tenth."""
     low, high = min(values), max(values)
-    return short(high, 2) if high <= 1.1 * low else f"{short(low, 2)} to {short(high, 2)}"
+    return format_number(high, 2) if high <= 1.1 * low else f"{format_number(low, 2)} to {format_number(high, 2)}"
 
 
 def _description(e: FittedFault, model: SpotModel, frame_interval_s: float) -> str:
@@ -202,7 +204,7 @@ def _description(e: FittedFault, model: SpotModel, frame_interval_s: float) -> s
         length = float(np.linalg.norm(delta[part]))
         along = delta[part] / max(length, 1e-300)
         of = float(np.sqrt(along**2 @ sigma[part] ** 2))
-        return f"{plus_minus(factor * length, factor * of)} {unit}"
+        return f"{format_with_sigma(factor * length, factor * of)} {unit}"
 
     every = slice(None)
     subject = f"{fault.component} `{fault.name}`"
@@ -242,7 +244,7 @@ def _delay(name: str, late_s: float, sigma_s: float, model: SpotModel, frame_int
     if len(filming) == 2:
         other = next(c for c in filming if c != name)
         name, others, word = (name, f"camera `{other}`", "late") if late_s > 0 else (other, f"camera `{name}`", "late")
-    size = f"{plus_minus(1e3 * abs(late_s), 1e3 * sigma_s)} ms"
+    size = f"{format_with_sigma(1e3 * abs(late_s), 1e3 * sigma_s)} ms"
     text = f"camera `{name}` is about {size} {word} against {others}"
     count = round(abs(late_s) / frame_interval_s) if frame_interval_s > 0 else 0
     if count and abs(abs(late_s) / frame_interval_s - count) < _WHOLE_FRAME:

@@ -20,7 +20,7 @@ from geometry.pose import Pose
 from geometry.pose_solver.gauss_newton import fit_pose
 from geometry.rig import Rig
 from geometry.uncertainty.rig_parameters import RigCovariance
-from geometry.uncertainty.rig_uncertainty import CalibrationSpread
+from geometry.uncertainty.rig_uncertainty import RigUncertainty
 from lab.runs.frames.pipeline import FrameRecord
 from lab.runs.verdict.frame_ranges import FrameRanges
 from tracking.consistency import (
@@ -51,12 +51,12 @@ class FrameChecks:
     causal: FrameRanges = field(default_factory=FrameRanges)  # frames whose pose contradicts only the causal pass
     invalid: FrameRanges = field(default_factory=FrameRanges)  # frames with an invalid covariance
     _model: SpotModel = field(init=False)
-    _spread: CalibrationSpread | None = field(init=False, default=None)
+    _spread: RigUncertainty | None = field(init=False, default=None)
 
     def __post_init__(self) -> None:
         self._model = SpotModel.of(self.rig)
         if self.covariance is not None:
-            self._spread = CalibrationSpread(self.rig, self._model, self.covariance)
+            self._spread = RigUncertainty(self.rig, self._model, self.covariance)
 
     def passed(self, records: Iterable[Pair]) -> Iterator[Pair]:
         """The frames as they may be written, each with the same in the causal pass (None: only one pass)."""

@@ -16,7 +16,7 @@ from calibration.least_squares.adjustment import AdjustmentError
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.rig import Rig
-from geometry.uncertainty.rig_parameters import RigCovariance, moved
+from geometry.uncertainty.rig_parameters import RigCovariance, perturbed
 from lab.simulate.rigs import RIGS
 from tests.calibration.beams.bench import (
     ARCSEC,
@@ -175,11 +175,11 @@ def test_opposed_lasers_are_distinguished_from_one_line():
     rig = opposed(RIGS["fan"](), rng)
     poses = positions(rng)
     two = calibrate_beams(rig, recorded(rng, rig, poses), exact(poses))
-    assert {(o.first, o.second) for o in two.one_line} == {("A+", "A-"), ("B+", "B-"), ("C+", "C-")}
-    assert all(o.p < 1e-3 for o in two.one_line)
+    assert {(o.first, o.second) for o in two.collinearity} == {("A+", "A-"), ("B+", "B-"), ("C+", "C-")}
+    assert all(o.p < 1e-3 for o in two.collinearity)
     straight = calibrate_beams(RIGS["fan"](), recorded(rng, RIGS["fan"](), poses), exact(poses))
-    assert [o.first for o in straight.one_line] == ["A end +", "B end +", "C end +"]
-    assert all(o.p > 1e-3 for o in straight.one_line)
+    assert [o.first for o in straight.collinearity] == ["A end +", "B end +", "C end +"]
+    assert all(o.p > 1e-3 for o in straight.collinearity)
 
 
 def test_two_lasers_described_as_one_beam_are_detected():
@@ -189,7 +189,7 @@ def test_two_lasers_described_as_one_beam_are_detected():
     poses = positions(rng)
     found = calibrate_beams(rig, recorded(rng, truth, poses), exact(poses))
     assert found.fit.kept.all()
-    assert min(o.p for o in found.one_line) < 1e-6
+    assert min(o.p for o in found.collinearity) < 1e-6
 
 
 def test_errors_of_the_stand_increase_direction_sigmas_but_not_those_of_angles():
@@ -227,7 +227,7 @@ def simulated(seed: int, known: str):
     pose_sigmas = np.array([2e-4] * 3 + [20 * ARCSEC] * 3)
     read = poses.plus(rng.normal(size=(40, 6)) * pose_sigmas)
     knowledge = rig_errors(np.random.default_rng(0), mounted)
-    assumed = moved(
+    assumed = perturbed(
         mounted, knowledge.names, -rng.multivariate_normal(np.zeros(len(knowledge.names)), knowledge.matrix)
     )
     stand_sigmas = np.array([3e-4] * 3 + [30 * ARCSEC] * 3)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibration.beams.error_diagnosis import suspect, swap_views
+from calibration.beams.error_diagnosis import diagnose_error, swap_views
 from geometry.pose import Pose
 from lab.simulate.rigs import RIGS
 from tests.calibration.beams.bench import drawn, positions, recorded, unknown_place
@@ -34,7 +34,7 @@ DRAWN = drawn(RIG, np.random.default_rng(3), 0.005, 0.003)
     ],
 )
 def test_a_common_mistake_in_the_stands_record_is_identified(written, words):
-    found = suspect(DRAWN, SPOTS, unknown_place(written))
+    found = diagnose_error(DRAWN, SPOTS, unknown_place(written))
     assert found is not None
     assert words in found.words
     assert not found.in_labels
@@ -42,7 +42,7 @@ def test_a_common_mistake_in_the_stands_record_is_identified(written, words):
 
 def test_two_labels_exchanged_in_all_pictures_are_identified():
     mixed = swap_views(SPOTS, 0, 2)
-    found = suspect(DRAWN, mixed, unknown_place(POSES))
+    found = diagnose_error(DRAWN, mixed, unknown_place(POSES))
     assert found is not None
     assert found.in_labels
     (camera, first), (_, second) = RIG.views()[0], RIG.views()[2]
@@ -51,9 +51,9 @@ def test_two_labels_exchanged_in_all_pictures_are_identified():
 
 def test_shuffled_positions_have_no_diagnosis():
     order = np.random.default_rng(5).permutation(20)
-    assert suspect(DRAWN, SPOTS, unknown_place(POSES[order])) is None
+    assert diagnose_error(DRAWN, SPOTS, unknown_place(POSES[order])) is None
 
 
 def test_random_spots_have_no_diagnosis():
     noise = np.random.default_rng(6).uniform(100, 900, SPOTS.pixels.shape)
-    assert suspect(DRAWN, replace(SPOTS, pixels=noise), unknown_place(POSES)) is None
+    assert diagnose_error(DRAWN, replace(SPOTS, pixels=noise), unknown_place(POSES)) is None

@@ -14,17 +14,17 @@ import pytest
 from calibration.boards import charuco_detection, chessboard_detection, corner_refinement
 from calibration.boards.board_detection import find_board
 from calibration.boards.board_types import Board, CircleGrid, parse
-from calibration.boards.board_view import NO_CLOSE_LOOK, BoardView, NotFound
+from calibration.boards.board_view import QUICK_SEARCH_FAILED, BoardView, NotFound
 from calibration.terms.circle_images import radius_by_areas
 from geometry import rotations
 from geometry.camera import FISHEYE, PERSPECTIVE, Camera
 from geometry.pose import Pose
-from lab.simulate.board_photo import BoardPhoto, Look, photograph
+from lab.simulate.board_photo import BoardPhoto, PhotoSettings, photograph
 from tests.paths import DATA
 
 px = 1.0
 CHESS, CHARUCO = "chessboard:9x6:25mm", "charuco:7x5:35mm:24mm:DICT_5X5_100"
-CLEAN = Look(blur_px=0.7, samples=16)
+CLEAN = PhotoSettings(blur_px=0.7, samples=16)
 
 
 def camera(lens: str = PERSPECTIVE) -> Camera:
@@ -41,7 +41,7 @@ def board_pose(board: Board, turn: tuple[float, float, float], distance: float =
 
 
 @cache
-def shot(text: str, turn=(0.4, -0.3, 0.15), look: Look = CLEAN, **more) -> tuple[Board, BoardPhoto]:
+def shot(text: str, turn=(0.4, -0.3, 0.15), look: PhotoSettings = CLEAN, **more) -> tuple[Board, BoardPhoto]:
     board = parse(text)
     return board, photograph(board, camera(), board_pose(board, turn), look=look, **more)
 
@@ -96,7 +96,7 @@ def test_points_are_detected_at_their_true_positions(text, within):
 
 @pytest.mark.parametrize("text", [CHESS, "circles:9x7:25mm", CHARUCO])
 def test_errors_from_noise_and_blur_are_below_a_tenth_of_a_pixel(text):
-    board, photo = shot(text, look=Look(blur_px=1.2, noise_dn=4, gradient=0.4, samples=9), seed=3)
+    board, photo = shot(text, look=PhotoSettings(blur_px=1.2, noise_dn=4, gradient=0.4, samples=9), seed=3)
     view = view_of(photo.image, board)
     assert len(view) >= 0.9 * len(board.ids)
     assert rms(view, photo) < 0.1 * px
@@ -135,7 +135,7 @@ def test_centroids_and_areas_of_circles_are_correct(text, turn):
 
 @pytest.mark.parametrize("blur", [0.6, 1.0, 1.8])
 def test_blur_is_measured(blur):
-    board, photo = shot(CHESS, look=Look(blur_px=blur, noise_dn=2, samples=9))
+    board, photo = shot(CHESS, look=PhotoSettings(blur_px=blur, noise_dn=2, samples=9))
     assert view_of(photo.image, board).blur_px == pytest.approx(np.hypot(blur, 12**-0.5), abs=0.1)
 
 
@@ -146,7 +146,7 @@ def test_blur_is_measured(blur):
 @pytest.mark.parametrize("roll", [0.0, -1.7, 3.0])
 def test_the_first_point_is_the_same_for_every_roll_of_the_camera(text, roll):
     """5x5 corners look the same after half a turn; their rows point to the right."""
-    board, photo = shot(text, turn=(0.25, 0.2, roll), look=Look(samples=9))
+    board, photo = shot(text, turn=(0.25, 0.2, roll), look=PhotoSettings(samples=9))
     view = view_of(photo.image, board)
     miss = np.linalg.norm(view.pixels - photo.pixels[view.ids], axis=1).max()
     if board.symmetry == 1 or abs(roll) < 1.5:
@@ -241,7 +241,9 @@ def test_a_mirrored_picture_of_a_charuco_board_is_rejected(text):
 def test_a_mirrored_board_of_4x4_bits_is_rejected_although_some_markers_resemble_others():
     board = parse("charuco:11x9:36mm:27mm:DICT_4X4_100")
     larger = replace(camera(), image_size_px=(800, 600), matrix=np.diag([5 / 3, 5 / 3, 1]) @ camera().matrix)
-    photo = photograph(board, larger, board_pose(board, (0.2, 0.1, 0.1), 1.6), look=Look(blur_px=0.7, samples=4))
+    photo = photograph(
+        board, larger, board_pose(board, (0.2, 0.1, 0.1), 1.6), look=PhotoSettings(blur_px=0.7, samples=4)
+    )
     mirrored = np.ascontiguousarray(photo.image[:, ::-1])
     assert len(charuco_detection.find_markers(mirrored, board.dictionary, board.markers).ids) >= 2
     assert "mirror" in reason_of(mirrored, board)
@@ -250,11 +252,11 @@ def test_a_mirrored_board_of_4x4_bits_is_rejected_although_some_markers_resemble
 @pytest.mark.parametrize("text", [CHESS, "circles:9x7:25mm", CHARUCO])
 def test_a_quick_search_finds_a_board_and_gives_no_reason(text):
     board, photo = shot(text)
-    view = find_board(photo.image, board, closely=False)
+    view = find_board(photo.image, board, thorough=False)
     assert isinstance(view, BoardView)
     assert rms(view, photo) < 0.04 * px
     wall = np.random.default_rng(0).integers(60, 190, (360, 480)).astype(np.uint8)
-    assert find_board(wall, board, closely=False) is NO_CLOSE_LOOK
+    assert find_board(wall, board, thorough=False) is QUICK_SEARCH_FAILED
 
 
 def test_corners_of_a_mirrored_chessboard_are_not_in_mirrored_order():

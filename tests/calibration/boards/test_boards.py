@@ -88,9 +88,9 @@ def test_printed_shapes_and_ink_density_agree(text):
     for layer in drawing.layers:
         for left, top, width, height in layer.rectangles:
             inside = np.all((at >= [left, top]) & (at < [left + width, top + height]), axis=1)
-            ink[inside] = layer.dark
+            ink[inside] = layer.is_black
         for x, y, r in layer.circles:
-            ink[np.hypot(at[:, 0] - x, at[:, 1] - y) < r] = layer.dark
+            ink[np.hypot(at[:, 0] - x, at[:, 1] - y) < r] = layer.is_black
     np.testing.assert_array_equal(ink_at(board, at - drawing.first_point), ink)
     assert 0.05 < ink.mean() < 0.95
 

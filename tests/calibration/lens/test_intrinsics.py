@@ -11,7 +11,7 @@ import pytest
 
 from calibration.findings import Level
 from calibration.lens.fit.corner_table import CornerTable
-from calibration.lens.fit.lens_models import LADDER, LensModel, named
+from calibration.lens.fit.lens_models import LENS_MODELS, LensModel, named
 from calibration.lens.intrinsics import IntrinsicsError, IntrinsicsOptions, calibrate_intrinsics
 from calibration.lens.intrinsics_findings import findings_of
 from calibration.lens.intrinsics_result import Intrinsics
@@ -63,13 +63,13 @@ def test_the_true_lens_model_is_selected(lens, fisheye, expected):
     near = (0.15, 0.4) if lens[0] < 900 else (0.35, 0.7)
     c = calibrate_intrinsics(photographs(Scene(lens=lens, fisheye=fisheye, views=20, distance_m=near), 3))
     assert c.model == named(expected)
-    assert [r.model for r in c.ladder.candidates] == list(LADDER)
+    assert [r.model for r in c.selection.candidates] == list(LENS_MODELS)
 
 
 def test_a_requested_lens_model_is_used():
     c = calibrate_intrinsics(photographs(Scene(views=6), 5), QUICK)
     assert c.model == LensModel(4)
-    assert c.ladder.why == "as requested"
+    assert c.selection.why == "as requested"
     assert c.parameters == ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
     assert len(c.distortion) == 4
 
@@ -123,7 +123,7 @@ def test_errors_correlated_within_a_photograph_inflate_the_sigmas():
     assert c.correlated_noise > 1.5
     assert finding(c, "parameters scatter") is Level.WARN
     raw = np.sqrt(np.diagonal(c.fit.covariance))
-    np.testing.assert_allclose(c.sigmas, c.correlated_noise * c.doubt.factor * raw)
+    np.testing.assert_allclose(c.sigmas, c.correlated_noise * c.model_uncertainty.factor * raw)
 
 
 def test_halves_taken_with_two_focal_lengths_differ_significantly():
@@ -193,7 +193,7 @@ def test_random_corners_are_rejected():
 
 
 def test_every_lens_model_is_found_by_its_title():
-    assert [named(m.title) for m in LADDER] == list(LADDER)
+    assert [named(m.title) for m in LENS_MODELS] == list(LENS_MODELS)
     assert named("fisheye") == LensModel(4, FISHEYE)
     with pytest.raises(ValueError, match="expected a lens model out of 0, 4, 5, fisheye, 8, 12, got '7'"):
         named("7")

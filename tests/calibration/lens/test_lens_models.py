@@ -9,7 +9,7 @@ import pytest
 
 from calibration.lens.fit.hold_out import HeldOut, folds_of
 from calibration.lens.fit.lens_fit import robust_fit
-from calibration.lens.fit.lens_models import LADDER, LensModel, folds_in_picture, named
+from calibration.lens.fit.lens_models import LENS_MODELS, LensModel, folds_in_picture, named
 from calibration.lens.fit.lens_parameters import AS_STATED
 from calibration.lens.fit.lens_start import start
 from calibration.lens.fit.model_selection import ModelCandidate, choose
@@ -29,21 +29,21 @@ def candidate(title: str, errors_px2: list[float], refused: str = "") -> ModelCa
 
 
 def test_the_smaller_model_is_chosen_if_the_gain_is_within_its_standard_error():
-    ladder = choose([candidate("4", [1.0, 1.2, 0.9, 1.1]), candidate("5", [0.9, 1.25, 0.92, 1.1])])
-    assert ladder.chosen.model.title == "4"
-    assert "within one standard error" in ladder.why
+    selection = choose([candidate("4", [1.0, 1.2, 0.9, 1.1]), candidate("5", [0.9, 1.25, 0.92, 1.1])])
+    assert selection.chosen.model.title == "4"
+    assert "within one standard error" in selection.why
 
 
 def test_a_small_gain_in_every_view_is_significant():
     """The comparison is paired: views differ much more than the two models do."""
-    ladder = choose([candidate("4", [1.0, 5.2, 0.3, 9.1]), candidate("5", [0.9, 5.1, 0.2, 9.0])])
-    assert ladder.chosen.model.title == "5"
-    assert "every smaller usable model errs more" in ladder.why
+    selection = choose([candidate("4", [1.0, 5.2, 0.3, 9.1]), candidate("5", [0.9, 5.1, 0.2, 9.0])])
+    assert selection.chosen.model.title == "5"
+    assert "every smaller usable model errs more" in selection.why
 
 
 def test_a_refused_model_is_never_chosen():
-    ladder = choose([candidate("4", [1.0, 1.2, 0.9]), candidate("8", [0.1, 0.1, 0.1], refused="it folds")])
-    assert ladder.chosen.model.title == "4"
+    selection = choose([candidate("4", [1.0, 1.2, 0.9]), candidate("8", [0.1, 0.1, 0.1], refused="it folds")])
+    assert selection.chosen.model.title == "4"
 
 
 def test_every_view_is_in_exactly_one_fold():
@@ -64,7 +64,7 @@ def test_a_radial_mapping_that_decreases_before_the_corner_folds_in_the_picture(
 def test_only_the_coefficients_of_the_model_are_kept():
     everything = np.arange(1.0, 19.0)
     assert np.count_nonzero(LensModel(4).cut(everything)) == 8
-    assert [int(m.free.sum()) for m in LADDER] == [4, 8, 9, 8, 12, 16]
+    assert [int(m.free.sum()) for m in LENS_MODELS] == [4, 8, 9, 8, 12, 16]
 
 
 def test_the_map_excludes_rotations_of_the_camera():

@@ -18,9 +18,9 @@ from calibration.rig.rig_steps import calibrate_in_steps
 from calibration.screens.screens import calibrate
 from calibration.terms.corners import CornerTerm
 from geometry.pose import Pose
-from lab.simulate.calibration_campaign import Campaign, Quality, draw_campaign, spots_at
+from lab.simulate.calibration_campaign import Campaign, CampaignQuality, draw_campaign, spots_at
 
-SMALL = Quality(positions=15, dots=(5, 4))
+SMALL = CampaignQuality(positions=15, dots=(5, 4))
 
 
 @cache
@@ -44,7 +44,7 @@ def findings_of(of):
 
 
 def test_noise_free_measurements_give_the_true_rig():
-    exact = Quality(
+    exact = CampaignQuality(
         positions=12, dots=(4, 3), survey_m=3e-8, dot_px=1e-5, stand_m=1e-9, stand_deg=1e-7, spot_px=1e-5,
         lens_corner_px=1e-5,
     )  # fmt: skip

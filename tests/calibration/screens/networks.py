@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from calibration.boards.board_types import Charuco
-from calibration.screens.network import Dots, Network, PointObservations
+from calibration.screens.network import ControlPoints, Network, PointObservations
 from calibration.terms.board_on_screen import BoardOnScreenTerm
 from calibration.terms.corners import CornerTerm
 from geometry.camera import Camera
@@ -45,7 +45,7 @@ def lab(bow=0.0):
     return Rig(screens, cameras, {}, {})
 
 
-def measured(seed=0, bow=0.0, dots=12, rig=None):
+def measured(seed=0, bow=0.0, control_points=12, rig=None):
     """Dots on each screen, surveyed and observed with noise."""
     rng = np.random.default_rng(seed)
     rig = lab(bow) if rig is None else rig
@@ -54,7 +54,7 @@ def measured(seed=0, bow=0.0, dots=12, rig=None):
     screens = list(rig.screens)
     for c, camera in enumerate(rig.cameras.values()):
         screen = rig.screens[camera.screen]
-        for i in range(dots):
+        for i in range(control_points):
             for _ in range(1000):
                 x, y = rng.uniform(-1.1, 1.1), rng.uniform(-0.9, 0.9)
                 place = screen.world_from_screen.apply(np.array([x, y, screen.bow[0] * x * x]))
@@ -72,7 +72,7 @@ def measured(seed=0, bow=0.0, dots=12, rig=None):
     C = np.tile(np.eye(3) * SURVEY_SIGMA_M**2, (len(true), 1, 1))
     return Network(
         rig,
-        Dots(tuple(names), surveyed, C, np.array(on)),
+        ControlPoints(tuple(names), surveyed, C, np.array(on)),
         PointObservations(np.array(cameras), np.array(seen), np.array(pixels), np.full(len(seen), PIXEL_SIGMA_PX)),
     )
 
@@ -124,6 +124,6 @@ def without_dots(network):
     none = np.empty(0, dtype=np.int64)
     return replace(
         network,
-        dots=Dots((), np.empty((0, 3)), np.empty((0, 3, 3)), none),
-        sightings=PointObservations(none, none, np.empty((0, 2)), np.empty(0)),
+        control_points=ControlPoints((), np.empty((0, 3)), np.empty((0, 3, 3)), none),
+        point_observations=PointObservations(none, none, np.empty((0, 2)), np.empty(0)),
     )

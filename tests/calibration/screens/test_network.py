@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from calibration.findings import Level
-from calibration.screens.network import Dots, PointObservations
+from calibration.screens.network import ControlPoints, PointObservations
 from calibration.screens.network_findings import classify_outliers, findings, near_findings
 from calibration.screens.network_sigmas import pointing_sigmas_m, spot_sigmas
 from calibration.screens.network_start import NotConnectedError
-from calibration.screens.screens import Near, ScreenSetup, calibrate
-from calibration.screens.survey_diagnosis import misfit_of, suspects, wrong_unit
+from calibration.screens.screens import ApproximatePosition, ScreenSetup, calibrate
+from calibration.screens.survey_diagnosis import diagnose_survey, misfit_of, wrong_unit
 from geometry.pose import Pose
 from geometry.rig import Rig
 from tests.calibration.screens.networks import (
@@ -100,9 +100,9 @@ def test_surfaces_and_cameras_are_known_more_accurately_than_a_single_dot():
 
 def test_exchanged_names_are_identified_and_do_not_bias_the_camera():
     network = measured(1)
-    of = network.sightings.dot_of.copy()
+    of = network.point_observations.point_of.copy()
     of[[2, 5]] = of[[5, 2]]
-    result = calibrate(replace(network, sightings=replace(network.sightings, dot_of=of)), PLAIN)
+    result = calibrate(replace(network, point_observations=replace(network.point_observations, point_of=of)), PLAIN)
     words = [f.what for f in findings(result) if f.level == Level.WARN]
     assert len(words) == 1
     assert "camera 'left': dots 'L6' and 'L3' are exchanged" in words[0]
@@ -114,18 +114,18 @@ def test_exchanged_names_are_identified_and_do_not_bias_the_camera():
 
 def test_a_dot_with_the_name_of_another_one_is_identified():
     network = measured(1)
-    pixels = network.sightings.pixels.copy()
+    pixels = network.point_observations.pixels.copy()
     pixels[3] = pixels[7] + 0.1
-    result = calibrate(replace(network, sightings=replace(network.sightings, pixels=pixels)), PLAIN)
+    result = calibrate(replace(network, point_observations=replace(network.point_observations, pixels=pixels)), PLAIN)
     (wrong,) = classify_outliers(result.network, result.fit)
     assert (wrong.dot, wrong.at_place_of, wrong.swapped) == ("L4", "L8", False)
 
 
 def test_a_wrong_point_of_light_is_excluded_and_its_error_given_in_metres():
     network = measured(1)
-    pixels = network.sightings.pixels.copy()
+    pixels = network.point_observations.pixels.copy()
     pixels[3] += [25.0, 5.0]
-    result = calibrate(replace(network, sightings=replace(network.sightings, pixels=pixels)), PLAIN)
+    result = calibrate(replace(network, point_observations=replace(network.point_observations, pixels=pixels)), PLAIN)
     (wrong,) = classify_outliers(result.network, result.fit)
     assert wrong.dot == "L4"
     assert wrong.at_place_of == ""
@@ -135,18 +135,18 @@ def test_a_wrong_point_of_light_is_excluded_and_its_error_given_in_metres():
 
 def test_a_dot_surveyed_off_its_screen_is_reported_with_its_height():
     network = measured(1)
-    xyz = network.dots.xyz.copy()
+    xyz = network.control_points.xyz.copy()
     xyz[3, 0] += 0.02
-    result = calibrate(replace(network, dots=replace(network.dots, xyz=xyz)), PLAIN)
+    result = calibrate(replace(network, control_points=replace(network.control_points, xyz=xyz)), PLAIN)
     assert any("dot 'L4' is +20" in f.what for f in findings(result))
 
 
 def test_sigmas_that_are_too_small_are_increased():
     network = measured(2)
     rng = np.random.default_rng(0)
-    pixels = network.sightings.pixels + 0.6 * rng.normal(size=network.sightings.pixels.shape)
-    rough = replace(network, sightings=replace(network.sightings, pixels=pixels))
-    rough = replace(rough, dots=replace(rough.dots, covariance=rough.dots.covariance / 9))
+    pixels = network.point_observations.pixels + 0.6 * rng.normal(size=network.point_observations.pixels.shape)
+    rough = replace(network, point_observations=replace(network.point_observations, pixels=pixels))
+    rough = replace(rough, control_points=replace(rough.control_points, covariance=rough.control_points.covariance / 9))
     result = calibrate(rough, PLAIN)
     assert result.fit.variance_factor > 2
     assert any(f.level >= Level.WARN and "larger than their sigmas" in f.what for f in findings(result))
@@ -179,13 +179,13 @@ def test_a_board_seen_by_two_cameras_connects_one_without_dots_to_the_world():
 
 def test_unconnected_cameras_are_reported():
     network = measured(3)
-    some = network.sightings.camera_of == 0
-    s = network.sightings
-    lone = PointObservations(s.camera_of[some], s.dot_of[some], s.pixels[some], s.sigma_px[some])
+    some = network.point_observations.camera_of == 0
+    s = network.point_observations
+    lone = PointObservations(s.camera_of[some], s.point_of[some], s.pixels[some], s.sigma_px[some])
     with pytest.raises(
         NotConnectedError, match=r"camera 'right' is not connected with the others \('left' have a pose\)"
     ):
-        calibrate(replace(network, sightings=lone), PLAIN)
+        calibrate(replace(network, point_observations=lone), PLAIN)
 
 
 def test_a_board_fixed_to_the_screen_gives_its_plane_without_a_survey():
@@ -211,14 +211,20 @@ def test_a_board_fixed_to_the_screen_gives_its_plane_without_a_survey():
 
 def test_a_screen_without_measurements_is_reported():
     network = measured(0)
-    off = replace(network, dots=replace(network.dots, screen_of=np.where(network.dots.screen_of == 1, -1, 0)))
+    off = replace(
+        network,
+        control_points=replace(
+            network.control_points, screen_of=np.where(network.control_points.screen_of == 1, -1, 0)
+        ),
+    )
     with pytest.raises(NotConnectedError, match="screen 'right': expected three or more surveyed dots"):
         calibrate(off, PLAIN)
 
 
 def near_truth(error=0.1):
     return {
-        k: Near(c.camera_from_world.inverse().translation + error, 0.5) for k, c in enumerate(lab().cameras.values())
+        k: ApproximatePosition(c.camera_from_world.inverse().translation + error, 0.5)
+        for k, c in enumerate(lab().cameras.values())
     }
 
 
@@ -235,11 +241,11 @@ def near_truth(error=0.1):
     ],
 )
 def test_approximate_camera_positions_reveal_exchanged_axes_and_wrong_units(spoil, words):
-    network = measured(1, dots=5)
-    spoilt = replace(network, dots=replace(network.dots, xyz=spoil(network.dots.xyz)))
+    network = measured(1, control_points=5)
+    spoilt = replace(network, control_points=replace(network.control_points, xyz=spoil(network.control_points.xyz)))
     result = calibrate(spoilt, PLAIN, near_truth())
     assert any(f.level == Level.FAIL for f in near_findings(result, near_truth()))
-    found = suspects(spoilt, PLAIN, near_truth(), None, misfit_of(result, near_truth()))
+    found = diagnose_survey(spoilt, PLAIN, near_truth(), None, misfit_of(result, near_truth()))
     assert found[0].words == words
     assert found[0].factor < 2 < found[1].factor
 
@@ -258,11 +264,18 @@ def test_a_size_reveals_the_unit(extent, words):
 
 def test_collinear_dots_give_no_camera_pose():
     network = measured(0)
-    t = np.linspace(-1, 1, len(network.dots))
+    t = np.linspace(-1, 1, len(network.control_points))
     line = np.stack([np.full_like(t, -2.5), t, 0.3 * t], axis=1)
-    dots = Dots(network.dots.names, line, network.dots.covariance, network.dots.screen_of)
+    control_points = ControlPoints(
+        network.control_points.names, line, network.control_points.covariance, network.control_points.screen_of
+    )
     pixels = np.concatenate([c.project(line[12 * k : 12 * k + 12]) for k, c in enumerate(network.rig.cameras.values())])
     with pytest.raises(NotConnectedError, match="all lie on one line"):
         calibrate(
-            replace(network, dots=dots, sightings=replace(network.sightings, pixels=np.nan_to_num(pixels))), PLAIN
+            replace(
+                network,
+                control_points=control_points,
+                point_observations=replace(network.point_observations, pixels=np.nan_to_num(pixels)),
+            ),
+            PLAIN,
         )

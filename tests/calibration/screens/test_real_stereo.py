@@ -11,7 +11,7 @@ import pytest
 from calibration.boards.board_detection import find_board
 from calibration.boards.board_types import Chessboard
 from calibration.boards.board_view import BoardView
-from calibration.screens.network import Dots, Network, PointObservations
+from calibration.screens.network import ControlPoints, Network, PointObservations
 from calibration.screens.screens import ScreenSetup, calibrate
 from calibration.terms.board_on_screen import BoardOnScreenTerm
 from calibration.terms.corners import CornerTerm
@@ -67,7 +67,7 @@ def stereo():
     tight = np.array([1e-4])
     network = Network(
         rig,
-        Dots((), np.empty((0, 3)), np.empty((0, 3, 3)), none),
+        ControlPoints((), np.empty((0, 3)), np.empty((0, 3, 3)), none),
         PointObservations(none, none, np.empty((0, 2)), np.empty(0)),
         corners=corners,
         placements=tuple(f"{k}" for k in range(1, 8)),

@@ -26,7 +26,7 @@ needs_open3d = pytest.mark.skipif(importlib.util.find_spec("open3d") is None, re
 SIGMA = 3e-4
 
 
-def dots(rng, n, bow=(0.0, 0.0, 0.0)):
+def control_points(rng, n, bow=(0.0, 0.0, 0.0)):
     """Points of a 4 m x 3 m screen, in a slightly tilted frame, and the sigma of each."""
     x, y = rng.uniform(-2, 2, n), rng.uniform(-1.5, 1.5, n)
     z = 0.002 + 0.01 * x - 0.02 * y + bow[0] * x * x + bow[1] * x * y + bow[2] * y * y
@@ -36,7 +36,7 @@ def dots(rng, n, bow=(0.0, 0.0, 0.0)):
 def test_a_flat_screen_is_rarely_bent_and_its_covariance_is_correct():
     bent, squares = 0, []
     for seed in range(150):
-        flatness = assess_flatness(*dots(np.random.default_rng(seed), 12))
+        flatness = assess_flatness(*control_points(np.random.default_rng(seed), 12))
         bent += flatness.chosen.bent
         e = flatness.chosen.coefficients[:3] - [0.002, 0.01, -0.02]
         squares.append(e @ np.linalg.solve(flatness.chosen.covariance[:3, :3], e) / 3)
@@ -45,7 +45,7 @@ def test_a_flat_screen_is_rarely_bent_and_its_covariance_is_correct():
 
 
 def test_a_bow_of_four_millimetres_is_estimated_within_its_sigma():
-    found = [assess_flatness(*dots(np.random.default_rng(s), 12, (1e-3, 0, 0))).chosen for s in range(40)]
+    found = [assess_flatness(*control_points(np.random.default_rng(s), 12, (1e-3, 0, 0))).chosen for s in range(40)]
     assert np.mean([f.bent for f in found]) > 0.9
     off = [(f.coefficients[3] - 1e-3) / np.sqrt(f.covariance[3, 3]) for f in found if f.bent]
     assert np.sqrt(np.mean(np.square(off))) < 1.5
@@ -53,7 +53,7 @@ def test_a_bow_of_four_millimetres_is_estimated_within_its_sigma():
 
 def test_the_scatter_of_a_rough_screen_is_estimated():
     rng = np.random.default_rng(1)
-    xyz, sigma = dots(rng, 60)
+    xyz, sigma = control_points(rng, 60)
     xyz[:, 2] += 2e-3 * rng.normal(size=60)
     chosen = assess_flatness(xyz, sigma).chosen
     assert chosen.scatter_m == pytest.approx(2e-3, rel=0.3)
@@ -64,7 +64,7 @@ def test_the_scatter_of_a_rough_screen_is_estimated():
 def test_a_dot_thirty_millimetres_off_is_excluded(n):
     right = 0
     for seed in range(30):
-        xyz, sigma = dots(np.random.default_rng(seed), n)
+        xyz, sigma = control_points(np.random.default_rng(seed), n)
         xyz[2, 2] += 0.03
         right += np.array_equal(np.flatnonzero(~assess_flatness(xyz, sigma).chosen.used), [2])
     assert right >= 26
@@ -102,7 +102,7 @@ def test_named_dots_define_the_frame():
 
 
 def test_the_covariance_of_a_frame_is_that_of_its_surface():
-    surface = assess_flatness(*dots(np.random.default_rng(5), 30, (2e-3, 0, 0)), bow="always").chosen
+    surface = assess_flatness(*control_points(np.random.default_rng(5), 30, (2e-3, 0, 0)), bow="always").chosen
     frame = Pose(exp(np.array([0.3, -0.2, 0.5])), np.array([1.0, 2, 3]))
 
     def error(delta):
@@ -123,7 +123,7 @@ def test_the_covariance_of_a_frame_is_that_of_its_surface():
 
 def test_a_frame_moved_to_its_surface_has_no_remaining_slope():
     rng = np.random.default_rng(2)
-    xyz, sigma = dots(rng, 200)
+    xyz, sigma = control_points(rng, 200)
     frame = moved_to_surface(Pose.identity(), assess_flatness(xyz, sigma).chosen)
     again = assess_flatness(frame.inverse().apply(xyz), sigma).chosen
     np.testing.assert_allclose(again.coefficients[:3], 0, atol=2e-5)  # of second order in a slope of 0.02
@@ -134,15 +134,23 @@ def test_dots_that_determine_no_plane_raise(count, words):
     t = np.linspace(-1, 1, count)
     line = np.stack([np.full(count, -2.5), t, 0.2 * t], axis=1)
     plain = measured(0)
-    dots = replace(plain.dots, xyz=line, covariance=plain.dots.covariance[:count], screen_of=np.zeros(count, dtype=int))
+    control_points = replace(
+        plain.control_points,
+        xyz=line,
+        covariance=plain.control_points.covariance[:count],
+        screen_of=np.zeros(count, dtype=int),
+    )
     with pytest.raises(ValueError, match=words):
-        screen_of_dots(replace(plain, dots=dots), np.arange(count), ScreenSetup(), None, "left")
+        screen_of_dots(replace(plain, control_points=control_points), np.arange(count), ScreenSetup(), None, "left")
 
 
 def test_resection_tolerates_a_third_of_wrong_names():
     network, rig = measured(4), lab()
-    mine = network.sightings.camera_of == 0
-    points, pixels = network.dots.xyz[network.sightings.dot_of[mine]], network.sightings.pixels[mine]
+    mine = network.point_observations.camera_of == 0
+    points, pixels = (
+        network.control_points.xyz[network.point_observations.point_of[mine]],
+        network.point_observations.pixels[mine],
+    )
     mixed = pixels[[1, 2, 0, 4, 3, *range(5, 12)]]
     found = resect(rig.cameras["left"], points, mixed, 8.0)[0]
     np.testing.assert_array_equal(np.flatnonzero(~found.inliers), range(5))

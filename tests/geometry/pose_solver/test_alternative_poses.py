@@ -7,7 +7,7 @@ import pytest
 
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
-from geometry.pose_solver.alternative_poses import alternatives
+from geometry.pose_solver.alternative_poses import alternative_poses
 from geometry.pose_solver.gauss_newton import fit_pose
 from geometry.pose_solver.symmetry import symmetries
 from lab.simulate.rigs import RIGS
@@ -31,7 +31,7 @@ def test_an_alternative_pose_puts_the_same_spots_on_the_same_pixels():
     model, rng = SpotModel.of(RIGS["four-skew-beams"]()), np.random.default_rng(1)
     counts = []
     for pose in seen_poses(model, THREE, 30, rng):
-        others = alternatives(model, pose, THREE)
+        others = alternative_poses(model, pose, THREE)
         counts.append(len(others.translation))
         for i in range(counts[-1]):
             np.testing.assert_allclose(model.project(others[i])[0][THREE], model.project(pose)[0][THREE], atol=1e-5)
@@ -43,7 +43,7 @@ def test_fits_from_random_starts_find_no_further_pose():
     model, rng = SpotModel.of(RIGS["four-skew-beams"]()), np.random.default_rng(2)
     found = 0
     for pose in seen_poses(model, THREE, 4, rng):
-        others = alternatives(model, pose, THREE)
+        others = alternative_poses(model, pose, THREE)
         known = [pose, *(others[i] for i in range(len(others.translation)))]
         target = model.project(pose)[0][THREE]
         for _ in range(150):
@@ -59,7 +59,7 @@ def test_fits_from_random_starts_find_no_further_pose():
 def test_a_fourth_spot_of_skew_beams_leaves_no_other_pose():
     model, rng = SpotModel.of(RIGS["four-skew-beams"]()), np.random.default_rng(3)
     for pose in seen_poses(model, [0, 1, 2, 5], 20, rng):
-        assert len(alternatives(model, pose, [0, 1, 2, 5]).translation) == 0
+        assert len(alternative_poses(model, pose, [0, 1, 2, 5]).translation) == 0
 
 
 def test_views_of_the_same_spots_by_a_second_camera_exclude_no_pose():
@@ -69,17 +69,17 @@ def test_views_of_the_same_spots_by_a_second_camera_exclude_no_pose():
     one = [first["left-a", "1"], first["left-a", "2"], first["right-a", "5"]]
     both = [*one, first["left-b", "1"], first["right-b", "5"]]
     for pose in seen_poses(model, both, 10, rng):
-        a, b = alternatives(model, pose, one), alternatives(model, pose, both)
+        a, b = alternative_poses(model, pose, one), alternative_poses(model, pose, both)
         assert len(a.translation) == len(b.translation)
     pair = [first["left-a", "1"], first["left-b", "1"], first["left-a", "2"]]
-    assert len(alternatives(model, Pose.identity(), pair).translation) == 0
+    assert len(alternative_poses(model, Pose.identity(), pair).translation) == 0
 
 
 @pytest.mark.parametrize("rows", [[], [0], [0, 4], [0, 1, 2]])
 def test_spots_that_do_not_determine_a_pose_have_no_alternatives(rows):
     """None, one, two, or three spots on a line allow a continuum of poses."""
     model = SpotModel.of(RIGS["fan"]())
-    assert len(alternatives(model, Pose.identity(), rows).translation) == 0
+    assert len(alternative_poses(model, Pose.identity(), rows).translation) == 0
 
 
 def test_a_fan_of_equal_angles_and_two_beams_are_symmetric_under_half_a_turn():

@@ -7,8 +7,8 @@ import numpy as np
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.pose_solver.gauss_newton import PoseFit, fit_pose
-from geometry.uncertainty.rig_parameters import RigCovariance, moved, rig_names
-from geometry.uncertainty.rig_uncertainty import CalibrationSpread
+from geometry.uncertainty.rig_parameters import RigCovariance, perturbed, rig_names
+from geometry.uncertainty.rig_uncertainty import RigUncertainty
 from tests.geometry.scenes import LENSES, paper_rig
 
 RIG = paper_rig(LENSES[5])
@@ -20,13 +20,13 @@ SIGMAS = np.array(
 )
 SIGMAS[[i for i, n in enumerate(NAMES) if ".p1" in n or ".p2" in n]] = 1e-5
 COVARIANCE = RigCovariance(NAMES, np.diag(SIGMAS**2))
-SPREAD = CalibrationSpread(RIG, MODEL, COVARIANCE)
+SPREAD = RigUncertainty(RIG, MODEL, COVARIANCE)
 NOISE_PX = 0.05
 
 
 def drawn_fit(rng: np.random.Generator, rows: np.ndarray) -> tuple[PoseFit, np.ndarray]:
     """A fit to noisy spots of a rig with randomly drawn errors, and the true pixels of all views."""
-    true = SpotModel.of(moved(RIG, NAMES, SIGMAS * rng.normal(size=len(SIGMAS)))).project(POSE)[0]
+    true = SpotModel.of(perturbed(RIG, NAMES, SIGMAS * rng.normal(size=len(SIGMAS)))).project(POSE)[0]
     uv = true[rows] + NOISE_PX * rng.normal(size=(len(rows), 2))
     C = np.tile(NOISE_PX**2 * np.eye(2), (len(rows), 1, 1))
     fit = fit_pose(MODEL, rows, uv, C, POSE, calibration=SPREAD)
@@ -43,7 +43,7 @@ def test_noise_and_systematic_part_are_covariances_that_sum_to_the_whole():
 
 
 def test_a_perfect_calibration_gives_the_plain_solution():
-    none = CalibrationSpread(RIG, MODEL, RigCovariance(NAMES, np.zeros((len(NAMES), len(NAMES)))))
+    none = RigUncertainty(RIG, MODEL, RigCovariance(NAMES, np.zeros((len(NAMES), len(NAMES)))))
     uv = MODEL.project(POSE)[0] + np.random.default_rng(1).normal(0, NOISE_PX, (6, 2))
     C = np.tile(NOISE_PX**2 * np.eye(2), (6, 1, 1))
     plain, weighed = (fit_pose(MODEL, np.arange(6), uv, C, POSE, calibration=c) for c in (None, none))
@@ -71,7 +71,7 @@ def test_poses_from_wrongly_calibrated_rigs_scatter_as_the_covariance_predicts()
 
 def test_frames_of_one_rig_scatter_as_the_noise_part_predicts():
     rng = np.random.default_rng(3)
-    off = SpotModel.of(moved(RIG, NAMES, SIGMAS * rng.normal(size=len(SIGMAS))))
+    off = SpotModel.of(perturbed(RIG, NAMES, SIGMAS * rng.normal(size=len(SIGMAS))))
     C = np.tile(NOISE_PX**2 * np.eye(2), (6, 1, 1))
     poses = []
     for _ in range(400):

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from geometry.forward_model import SpotModel
-from geometry.planes import meet_plane, screen_to_world
+from geometry.planes import intersect_plane, screen_to_world
 from geometry.pose import Pose
 from geometry.pose_solver.coplanar import meeting_point, middle_spot, outer_spot, quadratic_coefficients, rotated_spot
 from geometry.rig import Beam, Rig, Screen
@@ -49,7 +49,7 @@ def seen_world_points(rig: Rig, model: SpotModel, pixels: np.ndarray) -> np.ndar
     for i, (name, _) in enumerate(model.views):
         camera = rig.cameras[name]
         screen = rig.screens[camera.screen].world_from_screen
-        out.append(screen_to_world(meet_plane(*camera.rays(pixels[..., i, :]), screen), screen))
+        out.append(screen_to_world(intersect_plane(*camera.rays(pixels[..., i, :]), screen), screen))
     return np.stack(out, axis=-2)
 
 

@@ -14,8 +14,8 @@ from geometry.pose_solver.gauss_newton import (
     SolveLimits,
     covariance_of,
     fit_pose,
-    good_enough,
-    point_covariance,
+    is_measurement,
+    pixel_covariance,
     whiten,
 )
 from geometry.pose_solver.robust_pose import fit_pose_robust
@@ -109,7 +109,7 @@ def test_two_beams_seen_at_both_ends_suffice(spots):
         pose = seen_pose(model, rng)
         fit = fit_pose(model, rows, model.project(pose)[0][rows], isotropic(4), pose.plus(rng.normal(0, 0.05, 6)))
         assert fit is not None
-        assert good_enough(fit, SolveLimits())
+        assert is_measurement(fit, SolveLimits())
         assert fit.dof == 2
         assert np.abs(fit.world_from_body.minus(pose)).max() < 1e-9
 
@@ -128,7 +128,7 @@ def test_three_spots_of_one_screen_do_not_determine_a_pose(spots):
         assert fit is not None
         assert not fit.observable
         assert np.isinf(fit.covariance).all()
-        assert not good_enough(fit, SolveLimits())
+        assert not is_measurement(fit, SolveLimits())
 
 
 def test_three_noisy_spots_of_one_screen_do_not_determine_a_pose():
@@ -138,7 +138,7 @@ def test_three_noisy_spots_of_one_screen_do_not_determine_a_pose():
         pose = seen_pose(model, rng)
         uv = model.project(pose)[0][rows] + rng.normal(0, NOISE_PX, (3, 2))
         fit = fit_pose(model, rows, uv, isotropic(3), pose)
-        assert fit is None or not good_enough(fit, SolveLimits())
+        assert fit is None or not is_measurement(fit, SolveLimits())
 
 
 @pytest.mark.parametrize("count", [1, 2])
@@ -180,9 +180,9 @@ def test_a_vague_pose_is_not_a_measurement():
     assert fit is not None
     sigma_m = np.sqrt(np.linalg.eigvalsh(fit.covariance[:3, :3])[-1])
     sigma_rad = np.sqrt(np.linalg.eigvalsh(fit.covariance[3:, 3:])[-1])
-    assert good_enough(fit, SolveLimits(1.01 * sigma_m, 1.01 * sigma_rad))
-    assert not good_enough(fit, SolveLimits(0.99 * sigma_m, 1.01 * sigma_rad))
-    assert not good_enough(fit, SolveLimits(1.01 * sigma_m, 0.99 * sigma_rad))
+    assert is_measurement(fit, SolveLimits(1.01 * sigma_m, 1.01 * sigma_rad))
+    assert not is_measurement(fit, SolveLimits(0.99 * sigma_m, 1.01 * sigma_rad))
+    assert not is_measurement(fit, SolveLimits(1.01 * sigma_m, 0.99 * sigma_rad))
 
 
 def test_a_prior_makes_a_pose_observable():
@@ -302,7 +302,7 @@ def test_the_covariance_of_a_pixel_equals_the_scatter_of_projected_poses():
     many = Pose(rotations.exp(errors[:, 3:]), errors[:, :3])
     scatter = model.project(many)[0] - uv
     sampled = np.einsum("tni,tnj->nij", scatter, scatter) / len(errors)
-    claimed = point_covariance(J, covariance)
+    claimed = pixel_covariance(J, covariance)
     # 4000 samples: 2.2 % of each variance, 1 sigma
     np.testing.assert_allclose(sampled, claimed, atol=0.1 * claimed.max())
 

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from geometry.arrays import numeric_jacobian
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
-from geometry.uncertainty.rig_parameters import RigCovariance, Sensitivity, is_known, moved, rig_names, split
-from geometry.uncertainty.rig_uncertainty import CalibrationSpread
+from geometry.uncertainty.rig_parameters import RigCovariance, Sensitivity, is_known, perturbed, rig_names, split_name
+from geometry.uncertainty.rig_uncertainty import RigUncertainty
 from tests.geometry.scenes import LENSES, paper_rig, random_pose, uncommon_rig
 
 seeds = st.integers(0, 2**32 - 1)
@@ -25,7 +25,7 @@ def test_every_derivative_equals_the_finite_difference(seed):
     names = rig_names(rig, bow=True)
     model = SpotModel.of(rig)
     found = Sensitivity(rig, model, names).of(model.derivatives(pose))
-    expected = numeric_jacobian(lambda q: SpotModel.of(moved(rig, names, q)).project(pose)[0], np.zeros(len(names)))
+    expected = numeric_jacobian(lambda q: SpotModel.of(perturbed(rig, names, q)).project(pose)[0], np.zeros(len(names)))
     # Spots far outside the picture, where the distortion is largest, have derivatives of thousands of px.
     good = np.isfinite(model.project(pose)[0][:, 0])
     np.testing.assert_allclose(found[good], expected[good], rtol=2e-5, atol=2e-3)
@@ -46,8 +46,8 @@ def test_every_name_is_known_and_splits_into_kind_item_and_parameter():
     rig = paper_rig(LENSES[5])
     for name in rig_names(rig, bow=True):
         assert is_known(rig, name)
-        assert ".".join(split(name)) == name
-    assert split("cameras.left.upper.fx") == ("cameras", "left.upper", "fx")
+        assert ".".join(split_name(name)) == name
+    assert split_name("cameras.left.upper.fx") == ("cameras", "left.upper", "fx")
 
 
 @pytest.mark.parametrize(
@@ -57,7 +57,7 @@ def test_a_name_that_the_rig_does_not_have_is_refused(name):
     rig = paper_rig(LENSES[5])
     assert not is_known(rig, name)
     with pytest.raises(KeyError):
-        moved(rig, [name], np.ones(1))
+        perturbed(rig, [name], np.ones(1))
     with pytest.raises(KeyError):
         Sensitivity(rig, SpotModel.of(rig), [name])
 
@@ -65,7 +65,7 @@ def test_a_name_that_the_rig_does_not_have_is_refused(name):
 def test_a_perturbation_of_zero_changes_nothing():
     rig = uncommon_rig(np.random.default_rng(4))
     names = rig_names(rig, bow=True)
-    same = SpotModel.of(moved(rig, names, np.zeros(len(names))))
+    same = SpotModel.of(perturbed(rig, names, np.zeros(len(names))))
     model = SpotModel.of(rig)
     np.testing.assert_allclose(same.pinhole, model.pinhole, rtol=0)
     np.testing.assert_allclose(same.screen_rotation, model.screen_rotation, rtol=0)
@@ -78,9 +78,10 @@ def test_the_covariance_of_the_pixels_equals_the_scatter_over_drawn_rigs():
     names = rig_names(rig)
     A = rng.normal(size=(len(names), len(names))) * 1e-4
     A[[i for i, n in enumerate(names) if n.endswith((".fx", ".cy"))]] *= 3000
-    spread = CalibrationSpread(rig, SpotModel.of(rig), RigCovariance(names, A @ A.T)).at(pose)
+    spread = RigUncertainty(rig, SpotModel.of(rig), RigCovariance(names, A @ A.T)).at(pose)
     draws = [
-        SpotModel.of(moved(rig, names, A @ rng.normal(size=len(names)))).project(pose)[0].ravel() for _ in range(1500)
+        SpotModel.of(perturbed(rig, names, A @ rng.normal(size=len(names)))).project(pose)[0].ravel()
+        for _ in range(1500)
     ]
     claimed, seen = np.sqrt(np.diagonal(spread)), np.std(draws, axis=0)
     np.testing.assert_allclose(seen, claimed, rtol=0.08)  # 1500 draws scatter by 2 %
@@ -93,8 +94,8 @@ def test_the_covariance_of_the_pixels_does_not_depend_on_earlier_calls():
     names = rig_names(rig)
     known = RigCovariance(names, np.eye(len(names)) * 1e-6)
 
-    def fresh() -> CalibrationSpread:
-        return CalibrationSpread(rig, SpotModel.of(rig), known)
+    def fresh() -> RigUncertainty:
+        return RigUncertainty(rig, SpotModel.of(rig), known)
 
     # A slow motion, with successive poses 20 mm apart.
     poses = [
@@ -112,7 +113,7 @@ def test_a_stack_of_poses_gives_the_covariance_of_each():
     rng = np.random.default_rng(7)
     rig = paper_rig(LENSES[5])
     names = rig_names(rig)
-    spread = CalibrationSpread(rig, SpotModel.of(rig), RigCovariance(names, np.eye(len(names)) * 1e-6))
+    spread = RigUncertainty(rig, SpotModel.of(rig), RigCovariance(names, np.eye(len(names)) * 1e-6))
     poses = Pose.from_ypr(rng.normal(0, 0.1, (4, 3)), rng.normal(0, 0.1, (4, 3)))
     together = spread.at(poses)
     for k in range(4):
@@ -126,6 +127,6 @@ def test_views_without_a_projection_have_no_covariance():
     gone = np.isnan(model.project(pose)[0][:, 0])
     assert gone.any()
     names = rig_names(rig)
-    joint = CalibrationSpread(rig, model, RigCovariance(names, np.eye(len(names)) * 1e-8)).at(pose)
+    joint = RigUncertainty(rig, model, RigCovariance(names, np.eye(len(names)) * 1e-8)).at(pose)
     assert np.all(np.isfinite(joint))
     assert np.all(np.diagonal(joint).reshape(-1, 2)[gone] == 0)

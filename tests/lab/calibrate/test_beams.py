@@ -26,7 +26,7 @@ from lab.errors import CalibrationError, InputError
 from lab.files.project.project import load_project
 from lab.files.rig.calibration_state import CalibrationState
 from lab.files.rig.camera_file import CameraFile, save_camera
-from lab.files.rig.rig_covariance import blocks_of, joint_covariance
+from lab.files.rig.rig_covariance import covariance_blocks, joint_covariance
 from lab.files.rig.rig_file import RigFile, as_mapping, load_rig_file, save_rig
 from lab.files.rig.screens_file import ScreensFile, save_screens
 from lab.files.run.run_file import save_run
@@ -72,7 +72,8 @@ def write_spots(path: Path, rig: Rig, spots: SpotPixels) -> None:
 def write_project(folder: Path, rig: Rig, nominal: Rig, stand: dict | None, recordings: list[dict]) -> Path:
     """A project with calibrated cameras and screens (rig.yaml) and the nominal beams as its target."""
     save_rig(
-        RigFile(rig, {k: v for k, v in blocks_of(lab_covariance(rig)).items() if k != "target"}), folder / "rig.yaml"
+        RigFile(rig, {k: v for k, v in covariance_blocks(lab_covariance(rig)).items() if k != "target"}),
+        folder / "rig.yaml",
     )
     cameras = {}
     for name, c in rig.cameras.items():

@@ -16,7 +16,7 @@ from calibration.boards.board_view import BoardView
 from lab.calibrate.board.board import write_board
 from lab.calibrate.board.board_page import as_pdf, lay_out
 from lab.errors import InputError
-from lab.files.rig.board_file import board_of, load_board
+from lab.files.rig.board_file import load_board, load_board_or_text
 
 TEXTS = ["chessboard:9x6:25mm", "acircles:4x11:20mm", "charuco:5x7:36mm:27mm:DICT_4X4_50:inverted"]
 
@@ -78,9 +78,9 @@ def test_a_file_with_mistakes_is_refused_with_its_field(tmp_path):
     path = tmp_path / "board.yaml"
     path.write_text("schema: beampose/board/1\nkind: chessboard\ncolumns: 9\nrows: 6\nspacing_m: 0.025\n")
     with pytest.raises(InputError, match=r"board\.yaml: expected square_m for a board of kind 'chessboard'"):
-        board_of(path)
+        load_board_or_text(path)
     with pytest.raises(InputError, match=r"expected a length with its unit .* or name a board\.yaml"):
-        board_of("chessboard:9x6:25")
+        load_board_or_text("chessboard:9x6:25")
 
 
 @pytest.mark.parametrize("name", ["x.jpg", "board.yaml", "board.PDF2"])

@@ -10,13 +10,13 @@ import pytest
 
 from calibration.boards.board_detection import NotFound, find_board
 from calibration.boards.board_types import parse
-from calibration.boards.board_view import NO_CLOSE_LOOK
+from calibration.boards.board_view import QUICK_SEARCH_FAILED
 from geometry.camera import Camera
 from geometry.pose import Pose
 from lab.calibrate.camera import photos as photos_module
 from lab.calibrate.camera.photos import PhotoSet, find_in_photos, load_photos, origins_of
 from lab.errors import InputError
-from lab.simulate.board_photo import Look, photograph
+from lab.simulate.board_photo import PhotoSettings, photograph
 
 BOARD = parse("chessboard:9x6:25mm")
 
@@ -25,7 +25,7 @@ BOARD = parse("chessboard:9x6:25mm")
 def picture() -> np.ndarray:
     camera = Camera("c", "s", (400, 300), np.array([[500.0, 0, 200], [0, 500, 150], [0, 0, 1]]), (), Pose.identity())
     at = Pose(np.eye(3), np.array([0, 0, 0.5]) - BOARD.middle)
-    return photograph(BOARD, camera, at, look=Look(samples=16)).image
+    return photograph(BOARD, camera, at, look=PhotoSettings(samples=16)).image
 
 
 def test_pictures_of_every_kind_are_read_in_natural_order(tmp_path, picture):
@@ -92,11 +92,11 @@ def test_only_the_first_pictures_without_a_board_are_searched_thoroughly(tmp_pat
     searches = []
     wall = np.random.default_rng(0).integers(60, 190, picture.shape).astype(np.uint8)
 
-    def recorded(image, board, closely=True):
-        searches.append(closely)
+    def recorded(image, board, thorough=True):
+        searches.append(thorough)
         if np.isin(image, wall).all() and image.std() > 35:  # the wall: its thorough search takes a second
-            return NotFound("no chessboard seen") if closely else NO_CLOSE_LOOK
-        return find_board(image, board, closely)
+            return NotFound("no chessboard seen") if thorough else QUICK_SEARCH_FAILED
+        return find_board(image, board, thorough)
 
     monkeypatch.setattr(photos_module, "find_board", recorded)
     for k in range(4):
@@ -119,14 +119,16 @@ def test_only_the_first_pictures_without_a_board_are_searched_thoroughly(tmp_pat
 def test_a_video_that_shows_a_charuco_board_now_and_then_has_the_reasons_of_ten_frames_only(tmp_path, monkeypatch):
     board = parse("charuco:5x4:40mm:30mm:DICT_4X4_50")
     camera = Camera("c", "s", (400, 300), np.array([[500.0, 0, 200], [0, 500, 150], [0, 0, 1]]), (), Pose.identity())
-    seen = photograph(board, camera, Pose(np.eye(3), np.array([0, 0, 0.5]) - board.middle), look=Look(samples=9)).image
+    seen = photograph(
+        board, camera, Pose(np.eye(3), np.array([0, 0, 0.5]) - board.middle), look=PhotoSettings(samples=9)
+    ).image
     wall = np.random.default_rng(0).integers(60, 190, seen.shape).astype(np.uint8)
     monkeypatch.setattr(photos_module, "_REASONS", 3)
     for k in range(12):
         cv2.imwrite(str(tmp_path / f"{k}.png"), seen + np.uint8(k) if k % 4 == 3 else np.roll(wall, k))
     found = find_in_photos([tmp_path], board)
     assert [name for name, _ in found.views] == ["3.png", "7.png", "11.png"]
-    quick = [name for name, reason in found.refused if reason == NO_CLOSE_LOOK.reason]
+    quick = [name for name, reason in found.refused if reason == QUICK_SEARCH_FAILED.reason]
     assert quick == ["2.png", "5.png", "6.png", "8.png", "9.png", "10.png"]
     assert "(3 of 3, first 0.png)" in found.line()
 

@@ -23,12 +23,12 @@ from lab.files.rig.rig_covariance import joint_covariance
 from lab.files.rig.rig_file import load_rig, load_rig_file, save_rig
 from lab.files.run.results import read_poses
 from lab.runs.process import process_run
-from lab.simulate.calibration_campaign import Quality
+from lab.simulate.calibration_campaign import CampaignQuality
 from lab.simulate.campaign_files import simulate_calibration
 from lab.simulate.write import simulate
 
 DAY = datetime.date(2026, 3, 14)
-SMALL = Quality(dots=(5, 4))
+SMALL = CampaignQuality(dots=(5, 4))
 
 
 @pytest.fixture(scope="module")
@@ -225,7 +225,7 @@ def test_a_lens_without_a_covariance_is_assumed_exact_with_a_warning(project, tm
 @pytest.mark.slow
 def test_recordings_can_be_run_folders_with_unlabelled_spots(tmp_path):
     nothing = dict.fromkeys(("camera_m", "camera_deg", "screen_m", "screen_deg", "beam_deg", "beam_m"), 0.0)
-    as_designed = Quality(**nothing, focal_px=0.0, centre_px=0.0, distortion_share=0.0)
+    as_designed = CampaignQuality(**nothing, focal_px=0.0, centre_px=0.0, distortion_share=0.0)
     project = simulate_calibration(tmp_path / "lab", seed=5, quality=as_designed)
     simulate("smooth", project / "run", seed=2, frames=60, detections_only=True, noise_px=0.054)
     path = project / "calibration.yaml"

@@ -20,13 +20,13 @@ from geometry.pose import Pose
 from lab.calibrate.screens.screen import calibrate_screen
 from lab.calibrate.screens.screen_tables import DOT_COLUMNS, RESIDUAL_COLUMNS
 from lab.errors import CalibrationError, InputError
-from lab.files.project.cloud_file import read_cloud
+from lab.files.project.cloud_file import read_point_cloud
 from lab.files.rig.camera_block import Covariance
 from lab.files.rig.camera_file import CameraFile, load_camera, save_camera
 from lab.files.rig.rig_file import load_rig_file
 from lab.files.rig.screens_file import load_screens, save_screens
 from lab.files.text.yaml_text import write_mapping
-from lab.simulate.board_photo import Look, photograph
+from lab.simulate.board_photo import PhotoSettings, photograph
 from tests.lab.calibrate.screen_projects import truth, write_project
 from tests.lab.files.test_project import TARGET, changed
 from tests.paths import DATA
@@ -217,7 +217,7 @@ def board_project(folder, seen=True):
     lying = screen.world_from_screen @ Pose(np.diag([1.0, -1, -1]), np.array([-0.4, 0.45, 0.003]))
     picture = np.full((1024, 1280), 90, np.uint8)
     if seen:
-        picture = photograph(BOARD, camera, lying, look=Look(noise_dn=1.0, samples=16)).image
+        picture = photograph(BOARD, camera, lying, look=PhotoSettings(noise_dn=1.0, samples=16)).image
     cv2.imwrite(str(folder / "board.png"), picture)
     fixed = {"board": BOARD.describe(), "offset_m": 0.003, "photos": {"left": "board.png"}}
     write_mapping(
@@ -305,12 +305,12 @@ def test_a_scan_in_another_unit_is_reported(tmp_path):
 def test_an_unreadable_cloud_is_refused_with_the_reason(tmp_path, name, text, words):
     (tmp_path / name).write_text(text)
     with pytest.raises(InputError, match=words):
-        read_cloud(tmp_path / name, 1.0)
+        read_point_cloud(tmp_path / name, 1.0)
 
 
 def test_points_without_a_return_are_excluded_and_counted(tmp_path):
     (tmp_path / "scan.xyz").write_text("X Y Z\n1,2,3\nnan,nan,nan\n4,5,6\n")
-    points, notes = read_cloud(tmp_path / "scan.xyz", 1e-3)
+    points, notes = read_point_cloud(tmp_path / "scan.xyz", 1e-3)
     np.testing.assert_allclose(points, [[0.001, 0.002, 0.003], [0.004, 0.005, 0.006]])
     assert notes == ("scan.xyz: 1 of 3 points left out: not finite",)
 
@@ -319,7 +319,7 @@ def test_without_open3d_the_error_for_a_ply_file_explains_the_installation(tmp_p
     monkeypatch.setitem(sys.modules, "open3d", None)
     write_ply(tmp_path / "scan.ply", np.eye(3))
     with pytest.raises(InputError, match=r"scan.ply: point clouds need Open3D.*make pointcloud"):
-        read_cloud(tmp_path / "scan.ply", 1.0)
+        read_point_cloud(tmp_path / "scan.ply", 1.0)
 
 
 # Real photographs ---------------------------------------------------------------------------------------------------

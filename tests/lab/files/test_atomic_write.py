@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from lab.errors import InputError
-from lab.files.text.atomic_write import atomic_folder, beside_a_good_one, refuse_foreign
+from lab.files.text.atomic_write import atomic_folder, check_output_folder, keep_good_results
 
 
 def never(folder: Path) -> bool:
@@ -155,12 +155,12 @@ def test_old_results_are_restored_when_the_last_rename_fails(tmp_path, monkeypat
 
 def test_failed_results_do_not_replace_good_ones(tmp_path):
     good = tmp_path / "left"
-    assert beside_a_good_one(good, True, "camera.yaml") == good
+    assert keep_good_results(good, True, "camera.yaml") == good
     good.mkdir()
     (good / "camera.yaml").write_text("good")
-    assert beside_a_good_one(good, False, "camera.yaml") == good
-    assert beside_a_good_one(good, True, "camera.yaml") == tmp_path / "left-failed"
-    assert beside_a_good_one(good, True, "rig.yaml") == good
+    assert keep_good_results(good, False, "camera.yaml") == good
+    assert keep_good_results(good, True, "camera.yaml") == tmp_path / "left-failed"
+    assert keep_good_results(good, True, "rig.yaml") == good
 
 
 def test_an_unusable_target_is_reported_before_any_work_with_a_remedy(tmp_path):
@@ -176,15 +176,15 @@ def test_an_unusable_target_is_reported_before_any_work_with_a_remedy(tmp_path):
         (tmp_path / "link", "a broken link"),
     ):
         with pytest.raises(InputError, match=f"{words}; choose another --out"):
-            refuse_foreign(place, never)
+            check_output_folder(place, never)
     assert names(tmp_path) == ["file", "letters", "link"]
 
 
 def test_a_usable_target_is_accepted_and_nothing_is_made(tmp_path):
     (tmp_path / "old").mkdir()
     (tmp_path / "old" / "a.csv").write_text("1")
-    refuse_foreign(tmp_path / "old", always)
-    refuse_foreign(tmp_path / "new" / "results", never)
+    check_output_folder(tmp_path / "old", always)
+    check_output_folder(tmp_path / "new" / "results", never)
     assert names(tmp_path) == ["old"]
 
 

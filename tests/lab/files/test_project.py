@@ -10,7 +10,7 @@ from lab.errors import InputError
 from lab.files.project.point_files import read_observations, read_poses, read_survey
 from lab.files.project.project import load_project, placement_of
 from lab.files.rig.board_file import save_board
-from lab.files.text.range_checks import FARTHEST_IN_SCAN
+from lab.files.text.range_checks import MAX_SCAN_COORDINATE
 from lab.files.text.yaml_text import read_mapping, write_mapping
 from tests.lab.calibrate.screen_projects import write_project
 
@@ -195,7 +195,7 @@ def test_only_an_empty_sigma_counts_as_unknown(tmp_path):
 def test_targets_of_a_scan_may_be_millimetres_in_a_national_grid(tmp_path):
     path = tmp_path / "targets.csv"
     path.write_text("point,x_m,y_m,z_m\n1,3500000,5400000,21000\n")
-    assert read_survey([path], [], FARTHEST_IN_SCAN).xyz[0, 1] == 5.4e6
+    assert read_survey([path], [], MAX_SCAN_COORDINATE).xyz[0, 1] == 5.4e6
     with pytest.raises(InputError, match=r"line 2: x_m: expected metres, within 10 km .*are these millimetres"):
         read_survey([path], [])
 

@@ -9,7 +9,7 @@ import pytest
 
 from geometry.uncertainty.rig_parameters import rig_names
 from lab.errors import CalibrationError, InputError
-from lab.files.rig.calibration_state import CalibrationState, require_usable
+from lab.files.rig.calibration_state import CalibrationState, require_valid_calibration
 from lab.files.rig.camera_block import Covariance
 from lab.files.rig.rig_covariance import joint_covariance
 from lab.files.rig.rig_file import RigFile, load_rig_file, save_rig
@@ -86,10 +86,10 @@ DAY = datetime.date(2026, 3, 14)
 
 def test_a_calibration_may_be_used_up_to_its_last_day_and_not_after(tmp_path):
     state = CalibrationState(DAY, "PASS", DAY + datetime.timedelta(90))
-    require_usable(state, tmp_path / "rig.yaml", DAY + datetime.timedelta(90))
+    require_valid_calibration(state, tmp_path / "rig.yaml", DAY + datetime.timedelta(90))
     words = r"valid_until: 2026-06-12 was 1 day before 2026-06-13 \(today\)"
     with pytest.raises(CalibrationError, match=words) as caught:
-        require_usable(state, tmp_path / "rig.yaml", DAY + datetime.timedelta(91))
+        require_valid_calibration(state, tmp_path / "rig.yaml", DAY + datetime.timedelta(91))
     assert caught.value.exit_status == 3
     assert "calibrate check" in str(caught.value)
 
@@ -97,12 +97,12 @@ def test_a_calibration_may_be_used_up_to_its_last_day_and_not_after(tmp_path):
 def test_a_failed_calibration_is_refused_with_the_reason(tmp_path):
     state = CalibrationState(DAY, "FAIL", None, ("the stand did not roll",))
     with pytest.raises(CalibrationError, match=r"FAIL \(the stand did not roll\)"):
-        require_usable(state, tmp_path / "rig.yaml", DAY)
+        require_valid_calibration(state, tmp_path / "rig.yaml", DAY)
 
 
 def test_a_rig_without_a_calibration_state_may_be_used(tmp_path):
-    require_usable(None, tmp_path / "rig.yaml", DAY)
-    require_usable(CalibrationState(DAY, "WARN"), tmp_path / "rig.yaml", DAY)
+    require_valid_calibration(None, tmp_path / "rig.yaml", DAY)
+    require_valid_calibration(CalibrationState(DAY, "WARN"), tmp_path / "rig.yaml", DAY)
 
 
 @pytest.mark.parametrize("date", ["yesterday", "14.3.2026", "2026-13-01", "7"])

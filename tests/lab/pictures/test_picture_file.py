@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from lab.pictures.inflate import decompress
-from lab.pictures.picture_file import Missing, decode, read_picture
+from lab.pictures.picture_file import MissingPicture, decode, read_picture
 from tests.lab.pictures.picture_files import chunk, png, tiff
 
 SIZE = (37, 29)
@@ -30,7 +30,7 @@ def noise(dtype: type = np.uint8, channels: int = 1, largest: int | None = None)
 
 def assert_same(data: bytes, picture: np.ndarray) -> None:
     got = decode(data, SIZE)
-    assert not isinstance(got, Missing), got.reason
+    assert not isinstance(got, MissingPicture), got.reason
     assert got.dtype == picture.dtype
     np.testing.assert_array_equal(got, picture)
     # compiled detection is made for one kind of array
@@ -109,7 +109,7 @@ def test_an_impossible_png_header_is_damage(bits, colour_type, capfd):
     data = png(noise(), colour_type=colour_type)
     header = struct.pack(">IIBBBBB", *SIZE, bits, colour_type, 0, 0, 0)
     data = data[:8] + chunk(b"IHDR", header) + data[33:]
-    assert isinstance(decode(data, SIZE), Missing)
+    assert isinstance(decode(data, SIZE), MissingPicture)
     assert capfd.readouterr() == ("", "")
 
 
@@ -154,7 +154,7 @@ def test_a_damaged_8_bit_strip_is_not_a_picture_of_zeros(capfd):
     at = data.index(b"\x80", 8)  # the first code of LZW empties the table
     beyond = data[: at + 40] + b"\xff\xff\xff" + data[at + 43 :]  # a code that is not in the table yet
     assert not as_opencv(beyond).all()
-    assert decode(beyond, SIZE) == Missing("unreadable: damaged, or cut short")
+    assert decode(beyond, SIZE) == MissingPicture("unreadable: damaged, or cut short")
     assert capfd.readouterr() == ("", "")
 
 
@@ -176,7 +176,7 @@ def test_sample_types_that_no_camera_has_are_refused_before_decoding(dtype, name
 def test_a_tiff_whose_directory_contradicts_its_content_is_unreadable(changes, capfd):
     for deflated in (False, True):
         got = decode(tiff(noise(), deflated=deflated, rows_per_strip=5, tags=changes), SIZE)
-        assert isinstance(got, Missing) or np.array_equal(got, noise())
+        assert isinstance(got, MissingPicture) or np.array_equal(got, noise())
     assert capfd.readouterr() == ("", "")
 
 
@@ -209,7 +209,7 @@ def test_a_pgm_has_its_stored_values_whatever_the_stated_maximum(largest, head):
     ],
 )
 def test_an_invalid_pgm_is_refused_with_the_reason(data, reason):
-    assert decode(data, SIZE) == Missing(f"unreadable: {reason}")
+    assert decode(data, SIZE) == MissingPicture(f"unreadable: {reason}")
 
 
 def test_pbm_and_colour_ppm_are_decoded_as_by_opencv():
@@ -242,9 +242,11 @@ def test_a_damaged_jpeg_is_unreadable_but_padding_before_a_marker_is_allowed(cap
 
 def test_a_jpeg_without_an_end_marker_or_a_frame_header_is_unreadable(capfd):
     data = cv2.imencode(".jpg", noise())[1].tobytes()
-    assert decode(data[:-2], SIZE) == Missing("unreadable: cut short")
-    assert decode(b"\xff\xd8\xff\xd9", SIZE) == Missing("unreadable: damaged (no frame header before the first scan)")
-    assert decode(data[:20], SIZE) == Missing("unreadable: cut short")
+    assert decode(data[:-2], SIZE) == MissingPicture("unreadable: cut short")
+    assert decode(b"\xff\xd8\xff\xd9", SIZE) == MissingPicture(
+        "unreadable: damaged (no frame header before the first scan)"
+    )
+    assert decode(data[:20], SIZE) == MissingPicture("unreadable: cut short")
     assert capfd.readouterr() == ("", "")
 
 
@@ -283,7 +285,7 @@ def test_a_picture_of_another_size_than_the_rig_has_is_not_decoded(kind, monkeyp
 
     for name in ("png", "jpeg", "tiff", "pnm", "bmp"):
         monkeypatch.setitem(sys.modules["lab.pictures.picture_file"]._DECODERS, name, never)
-    assert decode(of_size(kind, 640, 480), SIZE) == Missing("wrong size 640x480, the rig says 37x29")
+    assert decode(of_size(kind, 640, 480), SIZE) == MissingPicture("wrong size 640x480, the rig says 37x29")
     big = decode(of_size(kind, 30000, 30000), None).reason
     assert big.startswith("unreadable: the header says 30000x30000 px, more than")
     for size in ((0, 480), (640, 0)):
@@ -295,7 +297,7 @@ def test_a_picture_of_another_size_than_the_rig_has_is_not_decoded(kind, monkeyp
 @pytest.mark.parametrize("kind", KINDS)
 def test_content_smaller_than_the_stated_size_is_unreadable_without_output(kind, capfd):
     got = decode(of_size(kind, 37, 3000), (37, 3000))
-    assert isinstance(got, Missing)
+    assert isinstance(got, MissingPicture)
     assert capfd.readouterr() == ("", "")
 
 
@@ -318,7 +320,7 @@ def test_a_stream_of_gigabytes_is_decompressed_only_to_the_size_of_the_picture()
     bomb = b"".join(packer.compress(bytes(1 << 20)) for _ in range(500)) + packer.flush()
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     assert decompress(bomb, 30 * 37) is None
-    assert isinstance(decode(png(noise(), content=bomb), SIZE), Missing)
+    assert isinstance(decode(png(noise(), content=bomb), SIZE), MissingPicture)
     grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
     assert grown <= 50_000 * (1024 if sys.platform == "darwin" else 1)
 

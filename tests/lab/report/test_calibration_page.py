@@ -27,7 +27,7 @@ from lab.report.calibration.calibration_page import (
     cell,
     page,
     provenance,
-    telling_views,
+    representative_views,
     write_calibration_report,
 )
 from lab.report.plot.colour_map import value_range
@@ -71,7 +71,7 @@ def all_drawings() -> dict[str, str]:
         "map of nothing": heat_map(np.full((3, 4), np.nan), (0, 1, 0, 1), "t", "px"),
         "histogram": charts.residual_histogram(RESIDUALS, sigma=0.2),
         "histogram of none": charts.residual_histogram(RESIDUALS[:0]),
-        "ladder": charts.lens_ladder(
+        "ladder": charts.lens_model_chart(
             ["4 <&>", "5", "fisheye"], np.array([0.3, 0.2, np.nan]), 1, fit_rms_px=np.array([0.3, 0.1, np.nan])
         ),
         "flatness": maps.flatness_map(
@@ -200,9 +200,9 @@ def test_a_report_of_400_views_stays_below_5_mb_and_keeps_its_table():
 
 def test_the_representative_views_are_the_worst_the_median_and_the_best():
     rms = np.array([0.5, 0.1, 0.9, np.nan, 0.3, 0.7])
-    assert dict(telling_views(rms, 2)) == {2: "worst", 5: "2. worst", 0: "median", 1: "best"}
-    assert telling_views(np.full(3, np.nan)) == []
-    assert [i for i, _ in telling_views(np.array([0.2]))] == [0]
+    assert dict(representative_views(rms, 2)) == {2: "worst", 5: "2. worst", 0: "median", 1: "best"}
+    assert representative_views(np.full(3, np.nan)) == []
+    assert [i for i, _ in representative_views(np.array([0.2]))] == [0]
 
 
 def test_the_file_is_written_atomically_and_lists_its_inputs(tmp_path: Path):

@@ -383,10 +383,10 @@ class TestDrawing:
 
 class TestNumbers:
     def test_a_share_below_one_is_never_shown_as_100_percent(self):
-        assert number_format.percent(0.99996) != "100.0 %"
-        assert number_format.percent(0.99996).startswith("99.99")
-        assert number_format.percent(1.0) == "100 %"
-        assert number_format.percent(0.00001) != "0.0 %"
+        assert number_format.format_percent(0.99996) != "100.0 %"
+        assert number_format.format_percent(0.99996).startswith("99.99")
+        assert number_format.format_percent(1.0) == "100 %"
+        assert number_format.format_percent(0.00001) != "0.0 %"
 
     @pytest.mark.parametrize(
         ("value", "words"),
@@ -400,13 +400,13 @@ class TestNumbers:
         ],
     )
     def test_numbers_are_short_and_plain(self, value, words):
-        assert number_format.short(value) == words
+        assert number_format.format_number(value) == words
 
     def test_lengths_and_angles_have_a_suitable_unit(self):
-        assert number_format.length(0.00046) == "0.460 mm"
-        assert number_format.length(1.5) == "1.50 m"
-        assert number_format.angle(0.0027) == "2.70 mdeg"
-        assert number_format.angle(2.5) == "2.50\u00b0"
+        assert number_format.format_length(0.00046) == "0.460 mm"
+        assert number_format.format_length(1.5) == "1.50 m"
+        assert number_format.format_angle(0.0027) == "2.70 mdeg"
+        assert number_format.format_angle(2.5) == "2.50\u00b0"
 
 
 class TestIndex:

@@ -14,7 +14,7 @@ from calibration.model_check import noise_scales
 from calibration.model_check.effect import Effect
 from calibration.model_check.fault_identification import FaultDiagnosis
 from geometry.pose_prior import PosePrior
-from lab.number_format import plus_minus, short
+from lab.number_format import format_number, format_with_sigma
 from lab.runs.model_check import messages
 from lab.runs.model_check.check import check_model, check_sampled_frames
 from lab.runs.model_check.frame_sampler import FrameSampler, SampledFrame, stated_covariances
@@ -124,7 +124,7 @@ def test_sigmas_that_are_stated_too_small_are_a_warning_with_the_factor():
     run, recording = recorded("smooth", 5, frames=300, claimed_px=NOISE_PX / 3)
     (finding,) = check_model(run.rig, recording).findings
     assert finding.level == Level.WARN
-    assert f"{short(3.0, 2)} times as large as the sigmas of the detections; they are random" in finding.what
+    assert f"{format_number(3.0, 2)} times as large as the sigmas of the detections; they are random" in finding.what
 
 
 def test_the_camera_with_the_wrong_sigmas_is_reported():
@@ -184,7 +184,7 @@ def test_each_alternative_is_reported_with_its_own_size_and_effect():
     [(0.3501, 0.0123, "0.350 ± 0.012"), (2.93, 0.05, "2.93 ± 0.05"), (12.0, 3.0, "12 ± 3"), (0.5, 0.0, "0.50")],
 )
 def test_a_size_has_the_digits_that_its_sigma_allows(value, sigma, text):
-    assert plus_minus(value, sigma) == text
+    assert format_with_sigma(value, sigma) == text
 
 
 # Sampling -------------------------------------------------------------------------------------------------------

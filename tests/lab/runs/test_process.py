@@ -19,7 +19,7 @@ from lab.errors import InputError, RunError
 from lab.files.run.results import POSE_STATUSES, read_poses, read_spots
 from lab.files.run.run_file import load_run
 from lab.files.text import columns
-from lab.files.text.json_text import plain
+from lab.files.text.json_text import plain_value
 from lab.runs import process
 from lab.runs.batch import process_batch
 from lab.runs.frames.pipeline import FrameRecord, Pipeline
@@ -226,7 +226,7 @@ def test_the_summary_is_strict_json(results):
 
 def test_a_number_that_is_not_finite_is_null_in_the_summary():
     content = {"a": float("nan"), "b": [np.float64("inf"), np.int64(3)], "c": (np.float32(0.5), True, None, "text")}
-    assert plain(content) == {"a": None, "b": [None, 3], "c": [0.5, True, None, "text"]}
+    assert plain_value(content) == {"a": None, "b": [None, 3], "c": [0.5, True, None, "text"]}
 
 
 def test_without_truth_there_are_no_errors(tmp_path):

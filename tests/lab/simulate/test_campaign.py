@@ -14,7 +14,7 @@ from lab.files.project.point_files import read_observations, read_poses, read_su
 from lab.files.project.project import load_project
 from lab.files.rig.rig_file import load_rig
 from lab.files.text.csv_text import read_table
-from lab.simulate.calibration_campaign import Quality, draw_campaign, lens_covariance
+from lab.simulate.calibration_campaign import CampaignQuality, draw_campaign, lens_covariance
 from lab.simulate.campaign_files import simulate_calibration
 from lab.simulate.rigs import RIGS
 
@@ -62,7 +62,7 @@ def test_spots_and_dots_agree_with_the_truth_within_their_sigmas(folder):
 
 
 def test_errors_of_the_recorded_stand_positions_agree_with_their_sigmas():
-    c = draw_campaign(3, quality=Quality(positions=400))
+    c = draw_campaign(3, quality=CampaignQuality(positions=400))
     errors = c.stand_recorded.minus(c.stand_from_body) / c.record_sigmas
     assert np.sqrt(np.mean(errors**2)) == pytest.approx(1.0, abs=0.05)
 
@@ -79,7 +79,7 @@ def test_the_mounted_rig_deviates_from_its_drawing_by_mounting_tolerances():
 def test_lens_errors_agree_with_their_covariance():
     sizes = []
     for seed in range(12):
-        c = draw_campaign(seed, quality=Quality(positions=3, dots=(2, 2)))
+        c = draw_campaign(seed, quality=CampaignQuality(positions=3, dots=(2, 2)))
         for name, lens in c.lenses.items():
             true = c.truth.cameras[name]
             e = np.array(
@@ -108,7 +108,7 @@ def test_the_same_seed_gives_the_same_bytes_and_another_seed_does_not(folder, tm
 
 
 def test_outliers_have_the_given_share_and_large_errors():
-    c = draw_campaign(6, quality=Quality(wrong=0.1))
+    c = draw_campaign(6, quality=CampaignQuality(wrong=0.1))
     good = draw_campaign(6)
     assert 0.04 < c.wrong_spots.mean() < 0.18
     away = np.linalg.norm(c.spots.pixels - good.spots.pixels, axis=1)
@@ -118,7 +118,7 @@ def test_outliers_have_the_given_share_and_large_errors():
 
 @pytest.mark.parametrize("rig", sorted(RIGS))
 def test_every_example_rig_can_be_calibrated_with_its_campaign(rig):
-    c = draw_campaign(1, rig, Quality(positions=10))
+    c = draw_campaign(1, rig, CampaignQuality(positions=10))
     # Each camera needs four dots, each position five coordinates.
     assert np.bincount(c.seen_camera).min() >= 8
     assert np.bincount(c.spots.position).min() >= 3
@@ -160,9 +160,9 @@ def test_an_existing_folder_is_not_overwritten(folder):
 
 
 def test_a_known_pose_of_the_stand_is_written_with_its_sigmas(tmp_path):
-    quality = Quality(place_known=True)
+    quality = CampaignQuality(place_known=True)
     stand = load_project(simulate_calibration(tmp_path / "known", seed=2, positions=3, quality=quality)).stand
-    c = draw_campaign(2, quality=Quality(place_known=True, positions=3))
+    c = draw_campaign(2, quality=CampaignQuality(place_known=True, positions=3))
     assert isinstance(stand.world_from_stand, Pose)
     error = stand.world_from_stand.minus(c.world_from_stand)
     assert np.all(np.abs(error) < 5 * np.sqrt(np.diagonal(c.place_covariance)))

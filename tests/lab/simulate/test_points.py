@@ -11,8 +11,8 @@ from geometry.pose import Pose
 from lab.errors import InputError
 from lab.simulate.motion import Motion, Wave
 from lab.simulate.points import CLUTTER, simulate_points
-from lab.simulate.scenarios import SCENARIOS, Hiding, RecordingFault
-from lab.simulate.scene import SHINING, compose
+from lab.simulate.scenarios import SCENARIOS, Occlusion, RecordingFault
+from lab.simulate.scene import VISIBLE, compose
 
 HIDDEN = 2
 
@@ -31,7 +31,7 @@ def test_the_vehicle_starts_within_the_prior_with_all_spots_in_view(name, seed):
     guess = Pose.from_ypr(np.deg2rad(prior.yaw_pitch_roll_deg), np.array(prior.position_m))
     assert np.all(np.abs(scene.poses.translation[0] - prior.position_m) <= prior.within_m)
     assert rotations.angle(guess.rotation.T @ scene.poses.rotation[0]) <= np.deg2rad(prior.within_deg)
-    assert np.all(scene.in_view[0] == SHINING)
+    assert np.all(scene.in_view[0] == VISIBLE)
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -44,9 +44,9 @@ def test_the_scenario_huo2015_has_the_properties_of_the_paper(seed):
     assert np.abs(run.poses.translation).max() <= 1.0
     assert np.abs(np.rad2deg(run.poses.ypr)).max() <= 30.0
     # Two pairs never leave, the third leaves and returns.
-    assert np.all(run.in_view[:, np.isin(spot, ("1", "2", "4", "5"))] == SHINING)
+    assert np.all(run.in_view[:, np.isin(spot, ("1", "2", "4", "5"))] == VISIBLE)
     for name in ("3", "6"):
-        seen = run.in_view[:, spot == name][:, 0] == SHINING
+        seen = run.in_view[:, spot == name][:, 0] == VISIBLE
         out = np.flatnonzero(~seen)
         assert out.size >= 5
         assert seen[0]
@@ -64,11 +64,11 @@ def test_clutter_has_its_probability_and_its_distance_from_spots_in_the_picture(
         for c, found in enumerate(pictures)
         for uv in found.uv_px[run.origin[k][c] == CLUTTER]
     ]
-    in_picture = int((run.in_view == SHINING).sum())
+    in_picture = int((run.in_view == VISIBLE).sum())
     # 5 binomial sigmas
     assert len(false) == pytest.approx(0.2 * in_picture, abs=5 * np.sqrt(0.16 * in_picture))
     for k, c, uv in false:
-        own = (run.model.camera_of == c) & (run.in_view[k] == SHINING)
+        own = (run.model.camera_of == c) & (run.in_view[k] == VISIBLE)
         assert np.linalg.norm(run.uv_px[k, own] - uv, axis=-1).min() <= 15.0
 
 
@@ -146,11 +146,11 @@ def test_an_occluded_spot_is_in_view_but_not_detected():
     run = simulate_points("hidden-in-turn", 1, clutter=0.0)
     assert (run.in_view == HIDDEN).any()
     for k, pictures in enumerate(run.origin):
-        assert sorted(np.concatenate(pictures)) == list(np.flatnonzero(run.in_view[k] == SHINING))
+        assert sorted(np.concatenate(pictures)) == list(np.flatnonzero(run.in_view[k] == VISIBLE))
     # Around each bend: one spot for ten frames, five before and five from the bent frame on.
     for k in np.flatnonzero(run.turned):
         if 20 < k < 590:
-            assert np.all((run.in_view[k - 5 : k + 5] != SHINING).any(axis=1) | (run.in_view[k] == 0).any())
+            assert np.all((run.in_view[k - 5 : k + 5] != VISIBLE).any(axis=1) | (run.in_view[k] == 0).any())
 
 
 def test_a_blackout_has_no_detections_and_ends_for_all_spots():
@@ -235,6 +235,6 @@ def test_a_scenario_with_impossible_conditions_is_rejected(monkeypatch):
 
 
 def test_misses_occlude_single_spots():
-    missing = replace(SCENARIOS["static"], occlusion=Hiding(miss_probability=0.3))
+    missing = replace(SCENARIOS["static"], occlusion=Occlusion(miss_probability=0.3))
     share = (simulate_points(missing, 0).in_view == HIDDEN).mean()
     assert share == pytest.approx(0.3, abs=0.05)

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 import yaml
 
-from geometry.uncertainty.rig_parameters import moved
+from geometry.uncertainty.rig_parameters import perturbed
 from lab.errors import InputError
 from lab.files.rig.rig_file import load_rig, save_rig
 from lab.files.run.detections_file import read_detections
 from lab.runs.input_check.check import check
 from lab.simulate.picture import expected_light, laser_powers, make_sensor, render
 from lab.simulate.points import simulate_points
-from lab.simulate.scenarios import LIGHTS, SCENARIOS, Clutter, Hiding, Light
+from lab.simulate.scenarios import LIGHTS, SCENARIOS, Clutter, Light, Occlusion
 from lab.simulate.scene import compose
 from lab.simulate.write import simulate
 
@@ -138,7 +138,7 @@ def test_only_visible_spots_give_light():
         SCENARIOS["static"],
         light=LIGHTS["clean"],
         clutter=Clutter(per_spot=0.0),
-        occlusion=Hiding(blackout_every=1, blackout_frames=1, clean_start=1),
+        occlusion=Occlusion(blackout_every=1, blackout_frames=1, clean_start=1),
     )
     scene = compose(occluded, 0, 2)
     sensor, powers = make_sensor(scene, 0), laser_powers(scene)
@@ -233,7 +233,7 @@ def test_the_run_folder_of_a_given_rig_contains_its_calibration(tmp_path):
     """The spots are those of the true rig; the run folder contains its calibration."""
     true = simulate("clean", tmp_path / "first", seed=1, frames=2, detections_only=True) / "rig.yaml"
     rig = load_rig(true)
-    off = moved(rig, ["cameras.left.fx", "beams.A.direction_y"], np.array([3.0, 1e-3]))
+    off = perturbed(rig, ["cameras.left.fx", "beams.A.direction_y"], np.array([3.0, 1e-3]))
     save_rig(off, tmp_path / "true.yaml")
     folder = simulate(
         "clean", tmp_path / "run", seed=1, frames=4, detections_only=True, noise_px=0.0, clutter=0.0,

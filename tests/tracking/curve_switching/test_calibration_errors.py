@@ -8,9 +8,9 @@ import pytest
 from geometry.pose import Pose
 from geometry.pose_prior import PosePrior
 from geometry.rig import Rig
-from geometry.uncertainty.rig_parameters import RigCovariance, moved, rig_names, split
+from geometry.uncertainty.rig_parameters import RigCovariance, perturbed, rig_names, split_name
 from lab.simulate.points import PointRun, simulate_points
-from tests.tracking.rigid_runs import Pooled, judged, looked_at_again, tracked
+from tests.tracking.rigid_runs import Pooled, assess, smoothed_frames, tracked
 from tracking.curve_switching.spot_tracker import SpotTracker
 from tracking.parameters import TrackerParameters
 from tracking.statuses import PoseStatus
@@ -29,11 +29,11 @@ POSE_SIGMA = {"m": 3e-4, "rad": 1e-4}
 def covariance_of(rig: Rig, scale: float = 1.0) -> RigCovariance:
     """The covariance of a calibration with errors that are correlated within each camera and within each beam."""
     names = rig_names(rig)
-    sigma = np.array([SIGMAS.get(split(n)[2], POSE_SIGMA["rad" if n.endswith("_rad") else "m"]) for n in names])
+    sigma = np.array([SIGMAS.get(split_name(n)[2], POSE_SIGMA["rad" if n.endswith("_rad") else "m"]) for n in names])
     correlation = np.eye(len(names))
     for i, a in enumerate(names):
         for j, b in enumerate(names):
-            if i != j and split(a)[:2] == split(b)[:2]:
+            if i != j and split_name(a)[:2] == split_name(b)[:2]:
                 correlation[i, j] = 0.3 if (i + j) % 2 else 0.2
     C = correlation * np.outer(sigma, sigma) * scale**2
     return RigCovariance(names, C)
@@ -41,7 +41,7 @@ def covariance_of(rig: Rig, scale: float = 1.0) -> RigCovariance:
 
 def drawn(rig: Rig, covariance: RigCovariance, rng: np.random.Generator) -> Rig:
     values, vectors = np.linalg.eigh(covariance.matrix)
-    return moved(rig, covariance.names, vectors @ (np.sqrt(np.maximum(values, 0)) * rng.normal(size=len(values))))
+    return perturbed(rig, covariance.names, vectors @ (np.sqrt(np.maximum(values, 0)) * rng.normal(size=len(values))))
 
 
 def track(run: PointRun, rig: Rig, covariance: RigCovariance | None) -> list[TrackedFrame]:
@@ -108,9 +108,9 @@ def rigid_nees(scenario: str, seeds: range, frames: int, noise_px: float, stated
         rig = drawn(run.rig, covariance, np.random.default_rng([seed, 99]))
         known = covariance if stated else None
         first = tracked(run, rig=rig, covariance=known)
-        second, _ = looked_at_again(run, first, rig=rig, covariance=known)
-        causal.append(judged(run, first))
-        smoothed.append(judged(run, second))
+        second, _ = smoothed_frames(run, first, rig=rig, covariance=known)
+        causal.append(assess(run, first))
+        smoothed.append(assess(run, second))
         if stated:
             assert causal[-1].missed() + causal[-1].wrong + smoothed[-1].missed() + smoothed[-1].wrong == 0
     return Pooled(causal).nees(), Pooled(smoothed).nees()

@@ -12,7 +12,7 @@ from geometry.pose import Pose
 from geometry.pose_prior import PosePrior
 from lab.simulate.points import PointRun, simulate_points
 from lab.simulate.rigs import RIGS
-from lab.simulate.scenarios import SCENARIOS, Clutter, Hiding
+from lab.simulate.scenarios import SCENARIOS, Clutter, Occlusion
 from tracking.curve_switching.out_of_view import CoplanarViews, quadratic_positions
 from tracking.curve_switching.spot_tracker import SpotTracker
 from tracking.detections import UNMATCHED, Detections
@@ -308,7 +308,7 @@ def test_after_a_blackout_of_ten_frames_the_spots_are_found_again():
 
 
 def test_clutter_is_not_matched_in_a_blackout():
-    scenario = replace(SCENARIOS["blackout"], occlusion=Hiding(blackout_every=60, blackout_frames=10),
+    scenario = replace(SCENARIOS["blackout"], occlusion=Occlusion(blackout_every=60, blackout_frames=10),
                        clutter=Clutter(per_spot=0.2, per_image=3.0))  # fmt: skip
     wrong = 0
     for seed in (31, 32):

@@ -9,9 +9,9 @@ import pytest
 
 from geometry.pose import Pose
 from geometry.rig import Beam, Rig, Spot
-from lab.simulate.points import hidden
+from lab.simulate.points import with_occlusions
 from lab.simulate.rigs import fan, look_at
-from tests.tracking.rigid_runs import filmed, judged, looked_at_again, tracked
+from tests.tracking.rigid_runs import assess, recording_of, smoothed_frames, tracked
 from tracking.statuses import PoseStatus
 
 ANGLES_DEG = (-5.0, 5.0)
@@ -49,15 +49,15 @@ def test_a_vehicle_at_rest_with_two_beams_is_found_in_the_first_frames(focal_px,
         rng = np.random.default_rng([seed, 1])
         place = Pose.from_ypr(np.deg2rad([3.0, 1.0, 1.0]) * rng.uniform(-1, 1, 3), 0.05 * rng.uniform(-1, 1, 3))
         poses = Pose(np.tile(place.rotation, (frames, 1, 1)), np.tile(place.translation, (frames, 1)))
-        run = filmed(two_beams(focal_px), poses, np.arange(frames) / frame_rate_hz, 0.05, seed)
+        run = recording_of(two_beams(focal_px), poses, np.arange(frames) / frame_rate_hz, 0.05, seed)
         causal = tracked(run)
-        of = judged(run, causal)
+        of = assess(run, causal)
         assert of.wrong == 0
         assert of.visible.sum() >= 0.8 * of.visible.size
         assert np.array_equal(of.right[3:], of.visible[3:])
         assert all(f.pose_status is PoseStatus.MEASURED for f in causal[3:])
-        again, _ = looked_at_again(run, causal)
-        assert judged(run, again).identity == 1.0
+        again, _ = smoothed_frames(run, causal)
+        assert assess(run, again).identity == 1.0
 
 
 def test_a_vehicle_is_found_at_once_after_an_occlusion_wherever_the_prediction_has_drifted():
@@ -69,11 +69,11 @@ def test_a_vehicle_is_found_at_once_after_an_occlusion_wherever_the_prediction_h
         poses = Pose.from_ypr(
             np.stack([yaw, 0.5 * yaw, 0 * yaw], axis=1), np.stack([0.02 * yaw, yaw * 0.3, 0 * yaw], 1)
         )
-        run = filmed(two_beams(1500.0), poses, t, 0.05, seed)
+        run = recording_of(two_beams(1500.0), poses, t, 0.05, seed)
         occluded = np.zeros_like(run.in_view, dtype=bool)
         occluded[30:62] = True
-        run = hidden(run, occluded)
-        of = judged(run, tracked(run))
+        run = with_occlusions(run, occluded)
+        of = assess(run, tracked(run))
         assert of.wrong == 0
         assert np.array_equal(of.right[63:], of.visible[63:])
         assert of.visible[63:].sum() > 60

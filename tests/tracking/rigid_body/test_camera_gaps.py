@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lab.simulate.points import simulate_points
-from tests.tracking.rigid_runs import judged, looked_at_again, tracked, without_pictures
+from tests.tracking.rigid_runs import assess, smoothed_frames, tracked, without_pictures
 from tracking.tracked_frame import TrackedFrame
 
 FRAMES = 120
@@ -23,10 +23,10 @@ def test_a_gap_of_a_camera_to_the_end_or_from_the_start_makes_no_pose_confidentl
     for scenario in ("smooth", "sharp-turns"):
         run = without_pictures(simulate_points(scenario, 7010, frames=FRAMES), gap, camera)
         causal = tracked(run)
-        again, _ = looked_at_again(run, causal)
+        again, _ = smoothed_frames(run, causal)
         both: tuple[list[TrackedFrame], ...] = (causal, again)
         for frames in both:
-            of = judged(run, frames)
+            of = assess(run, frames)
             assert of.wrong == 0
             known = ~np.isnan(of.nees)
             assert known.sum() > 40

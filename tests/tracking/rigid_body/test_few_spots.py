@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from geometry.pose import Pose
-from geometry.pose_solver.alternative_poses import alternatives
-from lab.simulate.points import PointRun, hidden, simulate_points
+from geometry.pose_solver.alternative_poses import alternative_poses
+from lab.simulate.points import PointRun, simulate_points, with_occlusions
 from lab.simulate.rigs import RIGS, scaled
 from lab.simulate.scenarios import PriorRegion
-from tests.tracking.rigid_runs import RIGID, dt_of, filmed, found_in, judged, prior_of, tracked
+from tests.tracking.rigid_runs import RIGID, assess, dt_of, found_in, prior_of, recording_of, tracked
 from tracking.detections import UNMATCHED
 from tracking.rigid_body.hypotheses.prediction_checks import (
     MAX_TRACKING_SIGMA_PX,
@@ -30,7 +30,7 @@ def occluded_then_few(seed: int, occluded: int, few: int) -> PointRun:
     hide = np.zeros(run.in_view.shape, dtype=bool)
     hide[60:] = True
     hide[60 + occluded :, [0, 1, 4]] = False
-    return hidden(run, hide)
+    return with_occlusions(run, hide)
 
 
 def test_fewer_than_four_spots_are_not_labelled_if_the_prediction_is_vague():
@@ -74,15 +74,15 @@ def test_three_spots_are_measured_only_where_the_motion_excludes_their_mirror_so
     hide = np.zeros((frames, 7), dtype=bool)
     hide[SEEN:] = True
     hide[SEEN + occluded :, THREE] = False
-    run = filmed(
+    run = recording_of(
         rig, poses, np.arange(frames) / 50.0, 0.01, 1, hide=hide, prior=PriorRegion(within_m=0.5, within_deg=20.0)
     )
-    others = alternatives(run.model, PLACE, THREE)
+    others = alternative_poses(run.model, PLACE, THREE)
     away = [others[i].minus(PLACE) for i in range(len(others.translation))]
     mirror = min(away, key=lambda d: float(np.linalg.norm(d[3:])))
     assert np.rad2deg(np.linalg.norm(mirror[3:])) == pytest.approx(MIRROR_DEG, abs=0.01)
     causal = tracked(run)
-    of = judged(run, causal)
+    of = assess(run, causal)
     assert of.wrong == 0
     # After an occlusion three spots fit either solution: their labels wait for some frames.
     assert of.missed() <= (3 * len(THREE) if occluded else 0)

@@ -16,17 +16,17 @@ from geometry.arrays import Array, numeric_jacobian
 from geometry.pose import Pose
 from geometry.pose_prior import PosePrior
 from geometry.rig import Rig
-from lab.simulate.points import PointRun, hidden, simulate_points
+from lab.simulate.points import PointRun, simulate_points, with_occlusions
 from tests.tracking.rigid_runs import (
     RIGID,
-    Judged,
+    Assessment,
     Pooled,
     around_jumps,
+    assess,
     dt_of,
     found_in,
-    judged,
     prior_of,
-    some_frames,
+    selected_frames,
     tracked,
     without_pictures,
 )
@@ -42,7 +42,7 @@ def recorded(
     scenario: str, seed: int, frames: int = 200, hide: tuple[str, int] | None = None, clutter: float | None = None
 ) -> PointRun:
     run = simulate_points(scenario, seed, frames=frames, clutter=clutter)
-    return run if hide is None else hidden(run, around_jumps(run, *hide, seed))
+    return run if hide is None else with_occlusions(run, around_jumps(run, *hide, seed))
 
 
 @cache
@@ -52,7 +52,7 @@ def answers(
     return tracked(recorded(scenario, seed, frames, hide, clutter))
 
 
-def found_again(run: PointRun, of: Judged) -> list[int]:
+def found_again(run: PointRun, of: Assessment) -> list[int]:
     """For each blackout, the number of frames after it until every visible spot was labelled."""
     blackout = ~of.visible.any(axis=1)
     complete = np.all(of.right | ~of.visible, axis=1)
@@ -81,7 +81,7 @@ LABEL_CASES: list[tuple[str, tuple[str, int] | None, float | None, int]] = [
 @pytest.mark.parametrize(("scenario", "hide", "clutter", "lost"), LABEL_CASES)
 def test_spots_keep_their_labels_through_velocity_jumps_and_occlusions(scenario, hide, clutter, lost):
     """200 frames with about 1100 visible spots: hardly any is missed, and none is labelled wrongly."""
-    of = judged(recorded(scenario, 7001, 200, hide, clutter), answers(scenario, 7001, 200, hide, clutter))
+    of = assess(recorded(scenario, 7001, 200, hide, clutter), answers(scenario, 7001, 200, hide, clutter))
     assert of.missed() <= lost
     assert of.wrong == 0
 
@@ -90,7 +90,7 @@ def test_spots_keep_their_labels_through_velocity_jumps_and_occlusions(scenario,
 def test_after_a_blackout_at_a_velocity_jump_the_vehicle_is_found_within_three_frames(frames):
     for seed in (7001, 7002):
         run = recorded("sharp-turns", seed, 200, ("all", frames))
-        delays = found_again(run, judged(run, answers("sharp-turns", seed, 200, ("all", frames))))
+        delays = found_again(run, assess(run, answers("sharp-turns", seed, 200, ("all", frames))))
         assert len(delays) >= 3
         assert max(delays) <= 3
 
@@ -98,7 +98,7 @@ def test_after_a_blackout_at_a_velocity_jump_the_vehicle_is_found_within_three_f
 def test_a_velocity_jump_after_frames_with_one_screen_is_not_taken_for_an_occlusion_of_the_other():
     """Measured before this was checked: after one such jump a screen had no labels for the remaining 450 frames."""
     run = recorded("sharp-turns", 8102, 200, ("screen", 3))
-    of = judged(run, answers("sharp-turns", 8102, 200, ("screen", 3)))
+    of = assess(run, answers("sharp-turns", 8102, 200, ("screen", 3)))
     assert run.turned[147]
     assert run.turned[149]
     assert not of.visible[148].all()
@@ -122,9 +122,9 @@ def test_false_points_on_an_occluded_screen_are_hardly_ever_labelled():
     hide = np.zeros(run.in_view.shape, dtype=bool)
     hide[40:60, run.model.camera_of == 0] = True
     hide[90:120, run.model.camera_of == 1] = True
-    run = hidden(run, hide)
+    run = with_occlusions(run, hide)
     frames = tracked(run)
-    of = judged(run, frames)
+    of = assess(run, frames)
     false_points = sum(len(run.detections[k][0]) for k in range(40, 60))
     assert false_points > 30
     # A known limit: two false points, 3.9 and 1.5 px from where the occluded screen's spots would be, are taken for
@@ -187,12 +187,12 @@ def test_spots_outside_the_picture_have_the_status_out_of_view():
 
 
 def test_a_smooth_motion_is_predicted_to_slightly_more_than_the_noise():
-    of = Pooled([judged(recorded("smooth", s), answers("smooth", s)) for s in (7001, 7002)])
+    of = Pooled([assess(recorded("smooth", s), answers("smooth", s)) for s in (7001, 7002)])
     assert np.all(of.prediction_px() <= 0.17)
 
 
 def test_poses_are_better_than_single_frames_and_their_covariances_are_right():
-    of = Pooled([judged(recorded("smooth", s), answers("smooth", s)) for s in (7001, 7002)])
+    of = Pooled([assess(recorded("smooth", s), answers("smooth", s)) for s in (7001, 7002)])
     assert of.over_bound(rotation=False) < 0.95
     assert of.over_bound() < 1.0  # 0.85 over many runs: test_..._many_runs
     assert 0.8 < of.nees(observable=True) < 1.25
@@ -217,9 +217,9 @@ def test_dropped_frames_make_longer_steps():
     run = recorded("smooth", 7002, 200)
     rng = np.random.default_rng(1)
     keep = np.flatnonzero(rng.random(200) < 0.7)
-    sparse = some_frames(run, keep)
+    sparse = selected_frames(run, keep)
     assert max(np.diff(sparse.t_s)) > 0.03
-    of = judged(sparse, tracked(sparse))
+    of = assess(sparse, tracked(sparse))
     assert of.missed() <= 3
     assert of.wrong == 0
     assert 0.7 < Pooled([of]).nees() < 1.4
@@ -230,7 +230,7 @@ def test_dropped_frames_make_longer_steps():
 def test_a_camera_without_pictures_for_some_frames_does_no_harm(camera, gap):
     run = without_pictures(recorded("smooth", 7005), slice(60, 60 + gap), camera)
     frames = tracked(run)
-    of = judged(run, frames)
+    of = assess(run, frames)
     assert of.wrong == 0
     assert of.missed() <= 10  # at the end of 20 frames with one camera some labels wait: nothing checks them
     without_picture = run.model.camera_of == camera
@@ -253,7 +253,7 @@ def long_occlusion() -> tuple[PointRun, list[TrackedFrame]]:
     run = simulate_points("unequal-fan", 7006, frames=420)
     hide = np.zeros(run.in_view.shape, dtype=bool)
     hide[60:360] = True
-    run = hidden(run, hide)
+    run = with_occlusions(run, hide)
     return run, tracked(run)
 
 
@@ -271,14 +271,14 @@ def test_while_fully_occluded_the_covariance_grows_with_every_frame_until_the_po
         sigma = np.sqrt(np.diagonal(after))
         assert np.linalg.eigvalsh((after - before) / np.outer(sigma, sigma))[0] > -1e-6
     assert all(f.pose is None and f.pose_covariance is None for f in frames[last:360])
-    of = judged(run, frames)
+    of = assess(run, frames)
     assert of.wrong == 0
     assert np.nanmax(of.nees[60:last]) / 6 < 4
 
 
 def test_a_vehicle_that_reappears_after_seconds_is_found_with_an_event():
     run, frames = long_occlusion()
-    of = judged(run, frames)
+    of = assess(run, frames)
     assert found_again(run, of)[0] <= 3
     events = [e.kind for k in range(60, 420) for e in frames[k].events if e.kind != "undecided"]
     assert events == ["reacquired"]
@@ -290,7 +290,7 @@ def test_each_label_found_from_a_prior_alone_leaves_an_event():
     run, frames = recorded("smooth", 7001), answers("smooth", 7001)
     kinds = [(k, e.kind) for k, f in enumerate(frames) for e in f.events if e.kind != "undecided"]
     assert kinds == [(0, "labelled")]
-    assert judged(run, frames).right[0].sum() == judged(run, frames).visible[0].sum()
+    assert assess(run, frames).right[0].sum() == assess(run, frames).visible[0].sum()
 
 
 def test_a_tie_at_the_start_leaves_all_labels_open_until_the_third_beam_decides_it():
@@ -346,7 +346,7 @@ def test_false_points_near_occluded_spots_are_hardly_ever_taken_for_a_vehicle():
     found = 0
     for seed in range(7001, 7021):
         run = simulate_points("smooth", seed, frames=30, clutter=1.0)
-        run = hidden(run, np.ones(run.in_view.shape, dtype=bool))
+        run = with_occlusions(run, np.ones(run.in_view.shape, dtype=bool))
         found += any(f.pose_status is PoseStatus.MEASURED for f in tracked(run))
     assert found <= 4
 
@@ -375,7 +375,7 @@ def test_the_choice_of_the_world_frame_changes_nothing(turn, shift, seed):
     """With a jerk set by hand: the estimated one has a strength for each axis of the world."""
     run = simulate_points("sharp-turns", 7100 + seed, frames=40)
     if seed % 2:
-        run = hidden(run, around_jumps(run, "all", 3, seed))
+        run = with_occlusions(run, around_jumps(run, "all", 3, seed))
     T = Pose(Rotation.from_rotvec(turn).as_matrix(), np.array(shift))
     rig = seen_from(T, run.rig)
     p = prior_of(run)
@@ -410,7 +410,7 @@ def test_the_order_of_the_detections_changes_nothing():
         ),
         origin=tuple(tuple(d[o] for d, o in zip(f, fo, strict=True)) for f, fo in zip(run.origin, orders, strict=True)),
     )
-    one, other = judged(run, answers("sharp-turns", 7001, 200, ("all", 3))), judged(shuffled, tracked(shuffled))
+    one, other = assess(run, answers("sharp-turns", 7001, 200, ("all", 3))), assess(shuffled, tracked(shuffled))
     np.testing.assert_array_equal(one.labelled, other.labelled)
     np.testing.assert_array_equal(one.right, other.right)
     np.testing.assert_allclose(one.errors, other.errors, atol=1e-7)
@@ -450,7 +450,7 @@ def test_sigmas_three_times_too_small_are_corrected():
     tracker = RigidTracker(run.rig, RIGID, prior_of(run))
     frames = [tracker.step(dt_of(run, k), found_in(optimistic_run, k)) for k in range(200)]
     assert tracker.noise_scale == pytest.approx(3.0, rel=0.2)
-    of = judged(run, frames)
+    of = assess(run, frames)
     assert np.nanmean(of.nees[100:]) / 6 < 1.6
     assert of.wrong == 0
     # The scale follows after nine frames; until then a gate of five sigmas misses some spots.
@@ -460,7 +460,7 @@ def test_sigmas_three_times_too_small_are_corrected():
 def test_a_jerk_set_by_hand_is_kept_and_one_that_is_too_small_makes_predictions_worse():
     run = recorded("smooth", 7002)
     stiff = TrackerParameters(learn_jerk=False, jerk_m_s3=0.01, jerk_rad_s3=0.01)
-    of, adapted = judged(run, tracked(run, stiff)), judged(run, answers("smooth", 7002))
+    of, adapted = assess(run, tracked(run, stiff)), assess(run, answers("smooth", 7002))
     worse = Pooled([of]).prediction_px() / Pooled([adapted]).prediction_px()
     assert np.all(worse > 1.0)  # slightly along u: velocity jumps are followed as manoeuvres
     assert np.max(worse) > 1.2
@@ -494,8 +494,8 @@ def test_over_eight_runs_of_600_frames_labels_poses_and_sigmas_meet_the_goals_of
 ):
     runs = [simulate_points(scenario, s, frames=600, clutter=clutter) for s in SEEDS]
     if hide is not None:
-        runs = [hidden(run, around_jumps(run, *hide, s)) for run, s in zip(runs, SEEDS, strict=True)]
-    of = [judged(run, tracked(run)) for run in runs]
+        runs = [with_occlusions(run, around_jumps(run, *hide, s)) for run, s in zip(runs, SEEDS, strict=True)]
+    of = [assess(run, tracked(run)) for run in runs]
     pooled = Pooled(of)
     assert pooled.identity >= identity
     assert pooled.wrong_share <= 2e-4

@@ -11,7 +11,7 @@ from geometry.pose import Pose
 from lab.simulate.points import PointRun
 from lab.simulate.rigs import RIGS
 from lab.simulate.scenarios import PriorRegion
-from tests.tracking.rigid_runs import Judged, filmed, judged, looked_at_again, tracked, zig_zag
+from tests.tracking.rigid_runs import Assessment, assess, recording_of, smoothed_frames, tracked, zig_zag
 
 NOISE_PX = 0.01
 START = Pose.from_ypr(np.deg2rad([7.0, 0.0, 0.0]), np.zeros(3))
@@ -23,12 +23,12 @@ COVERED = 12.592  # 95 % quantile of chi-square with 6 degrees of freedom
 
 
 @cache
-def both(rate: float, seed: int) -> tuple[PointRun, Judged, Judged]:
+def both(rate: float, seed: int) -> tuple[PointRun, Assessment, Assessment]:
     poses, t_s, turned = zig_zag(seed, FRAMES, 100.0, EVERY, rate, START)
-    run = filmed(RIGS["four-skew-beams"](), poses, t_s, NOISE_PX, seed, turned, prior=PRIOR)
+    run = recording_of(RIGS["four-skew-beams"](), poses, t_s, NOISE_PX, seed, turned, prior=PRIOR)
     causal = tracked(run)
-    again, _ = looked_at_again(run, causal)
-    return run, judged(run, causal), judged(run, again)
+    again, _ = smoothed_frames(run, causal)
+    return run, assess(run, causal), assess(run, again)
 
 
 @pytest.mark.parametrize("rate", [HARD, SOFT], ids=["hard", "soft"])

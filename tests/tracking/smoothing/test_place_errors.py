@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lab.simulate.points import CLUTTER, PointRun, simulate_points
-from tests.tracking.rigid_runs import judged, looked_at_again, tracked
+from tests.tracking.rigid_runs import assess, smoothed_frames, tracked
 from tracking.detections import Detections
 from tracking.smoothing.place_errors import PlaceErrors, correlation, place_errors
 
@@ -43,8 +43,8 @@ def test_sigmas_stay_right_where_texture_shifts_the_spots(scenario, least, most)
     nees, shares = [], []
     for seed in range(2):
         run = textured(simulate_points(scenario, seed, frames=120, noise_px=0.05, clutter=0.0), 0.03, 0.01, seed)
-        frames, smoothed = looked_at_again(run, tracked(run))
-        answers = judged(run, frames).nees
+        frames, smoothed = smoothed_frames(run, tracked(run))
+        answers = assess(run, frames).nees
         nees.append(np.nanmean(answers) / 6)
         shares.append(smoothed.place_share)
     assert least < np.mean(nees) < most
@@ -54,9 +54,9 @@ def test_sigmas_stay_right_where_texture_shifts_the_spots(scenario, least, most)
 def test_white_noise_is_averaged_over_a_vehicle_at_rest():
     for seed in range(2):
         run = textured(simulate_points("static", seed, frames=120, noise_px=0.05, clutter=0.0), 0.0, 0.05, seed)
-        frames, smoothed = looked_at_again(run, tracked(run))
+        frames, smoothed = smoothed_frames(run, tracked(run))
         assert smoothed.place_share < 0.02
-        one = judged(run, frames).bound[60]
+        one = assess(run, frames).bound[60]
         assert frames[60].pose_covariance[0, 0] < one[0] / 20
 
 

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 
 from geometry.pose import Pose
-from lab.simulate.points import PointRun, hidden, simulate_points
+from lab.simulate.points import PointRun, simulate_points, with_occlusions
 from tests.tracking.rigid_runs import (
     RIGID,
-    Judged,
+    Assessment,
     Pooled,
     around_jumps,
+    assess,
     found_in,
-    judged,
-    looked_at_again,
-    some_frames,
+    selected_frames,
+    smoothed_frames,
     tracked,
     without_pictures,
 )
@@ -38,13 +38,13 @@ def both_passes(scenario: str, seed: int, frames: int = 200, hide: tuple[str, in
     """A recording, the causal answers, the smoothed ones, and the smoother's result for the run."""
     run = simulate_points(scenario, seed, frames=frames)
     if hide is not None:
-        run = hidden(run, around_jumps(run, *hide, seed))
+        run = with_occlusions(run, around_jumps(run, *hide, seed))
     causal = tracked(run)
-    return run, causal, *looked_at_again(run, causal)
+    return run, causal, *smoothed_frames(run, causal)
 
 
-def judged_both(passes: Passes) -> tuple[Judged, Judged]:
-    return judged(passes[0], passes[1]), judged(passes[0], passes[2])
+def judged_both(passes: Passes) -> tuple[Assessment, Assessment]:
+    return assess(passes[0], passes[1]), assess(passes[0], passes[2])
 
 
 CASES: list[tuple[str, tuple[str, int] | None]] = [
@@ -104,7 +104,7 @@ def test_velocity_jumps_are_neither_smoothed_away_nor_invented():
     at_jumps, steady = [], []
     for run, _, again, _ in of:
         near = np.convolve(run.turned, np.ones(5), "same") > 0
-        j = judged(run, again)
+        j = assess(run, again)
         at_jumps.append(j.nees[near])
         steady.append(j.nees[~near])
     # White jerk with a jump is the model of a corner that the simulation puts within one step.
@@ -131,7 +131,7 @@ def test_with_the_jerk_set_by_hand_the_last_frame_agrees_with_the_tracker():
     by_hand = TrackerParameters(learn_jerk=False, jerk_m_s3=3.0, jerk_rad_s3=8.0, p_manoeuvre=1e-9)
     run = simulate_points("smooth", 7003, frames=150, clutter=0.0)
     causal = tracked(run, by_hand)
-    again, smoothed = looked_at_again(run, causal, by_hand)
+    again, smoothed = smoothed_frames(run, causal, by_hand)
     np.testing.assert_allclose(smoothed.jerk, [3.0, 8.0])
     a, b = causal[-1], again[-1]
     assert a.pose is not None
@@ -151,11 +151,11 @@ def test_smoothing_does_not_depend_on_the_direction_of_time():
     """The reversed run with the same labels has the same poses and the opposite velocities."""
     run, causal, _, _ = both_passes("smooth", 7001)
     whole = slice(None, None, -1)
-    back = some_frames(run, np.arange(len(run.frame))[whole])
+    back = selected_frames(run, np.arange(len(run.frame))[whole])
     back = replace(back, t_s=-back.t_s)
     by_hand = TrackerParameters(learn_jerk=False, jerk_m_s3=3.0, jerk_rad_s3=8.0)
-    forth, _ = looked_at_again(run, causal, by_hand)
-    turned, _ = looked_at_again(back, causal[whole], by_hand)
+    forth, _ = smoothed_frames(run, causal, by_hand)
+    turned, _ = smoothed_frames(back, causal[whole], by_hand)
     middle = range(40, 160)  # the priors at the ends differ
     for k in middle:
         a, b = forth[k], turned[len(turned) - 1 - k]
@@ -177,7 +177,7 @@ def test_the_strength_of_the_jerk_follows_the_motion():
 def test_poses_in_an_occlusion_follow_from_both_sides():
     run, causal, again, _ = both_passes("sharp-turns", 7001, 200, ("all", 3))
     occluded = ~((run.in_view == 1).any(axis=1))
-    c, a = judged(run, causal), judged(run, again)
+    c, a = assess(run, causal), assess(run, again)
     inside = occluded & ~np.isnan(c.errors[:, 0])
     assert inside.sum() >= 9
     for part in (slice(0, 3), slice(3, 6)):  # position and attitude
@@ -193,7 +193,7 @@ def test_the_covariance_covers_a_velocity_jump_in_the_middle_of_an_occlusion():
     for seed in (7001, 7002):
         run, _, again, _ = both_passes("sharp-turns", seed, 200, ("all", 10))
         occluded = ~((run.in_view == 1).any(axis=1))
-        nees.append(judged(run, again).nees[occluded])
+        nees.append(assess(run, again).nees[occluded])
     assert np.nanmean(np.concatenate(nees)) / 6 < 2.0
 
 
@@ -202,11 +202,11 @@ def test_a_start_that_the_tracker_could_not_label_is_labelled_from_later_frames(
     run = simulate_points("static", 7004, frames=60, clutter=0.0)
     hide = np.zeros(run.in_view.shape, dtype=bool)
     hide[:15, [2, 5]] = True
-    run = hidden(run, hide)
+    run = with_occlusions(run, hide)
     causal = tracked(run)
     assert all(f.pose_status is PoseStatus.LOST for f in causal[:15])
-    again, _ = looked_at_again(run, causal)
-    j = judged(run, again)
+    again, _ = smoothed_frames(run, causal)
+    j = assess(run, again)
     assert j.missed() == 0
     assert np.all(j.nees[:15] / 6 < 4)
 
@@ -231,8 +231,8 @@ def test_labels_that_are_changed_or_left_open_have_events():
 
 def test_a_gap_of_one_camera_is_bridged_from_both_sides():
     run = without_pictures(simulate_points("smooth", 7005, frames=160), slice(60, 80), 0)
-    again, _ = looked_at_again(run, tracked(run))
-    j = judged(run, again)
+    again, _ = smoothed_frames(run, tracked(run))
+    j = assess(run, again)
     assert j.missed() <= 1
     assert j.wrong == 0
     assert np.mean(j.nees[55:85]) / 6 < 2.0
@@ -244,17 +244,17 @@ def test_a_gap_of_one_camera_is_bridged_from_both_sides():
 @pytest.mark.parametrize("frames", [1, 2, 3])
 def test_very_short_runs_are_smoothed_too(frames):
     run = simulate_points("smooth", 7001, frames=frames)
-    again, smoothed = looked_at_again(run, tracked(run))
+    again, smoothed = smoothed_frames(run, tracked(run))
     assert smoothed.frames == frames
     assert len(again) == frames
-    assert judged(run, again).identity == 1.0
-    assert np.all(judged(run, again).nees / 6 < 4)
+    assert assess(run, again).identity == 1.0
+    assert np.all(assess(run, again).nees / 6 < 4)
 
 
 def test_nothing_is_known_of_a_run_without_visible_spots():
     run = simulate_points("smooth", 7006, frames=20, clutter=0.5)
-    run = hidden(run, np.ones(run.in_view.shape, dtype=bool))
-    again, smoothed = looked_at_again(run, tracked(run))
+    run = with_occlusions(run, np.ones(run.in_view.shape, dtype=bool))
+    again, smoothed = smoothed_frames(run, tracked(run))
     assert not smoothed.known.any()
     for f in again:
         assert f.pose_status is PoseStatus.LOST
@@ -273,16 +273,16 @@ def test_labels_of_the_papers_tracker_are_not_changed():
     smoothed = smooth(recording)
     assert smoothed.relabelled == 0
     assert np.all(smoothed.assigned[:, 2] == -1)
-    j = judged(run, [smoothed.frame(k, f, found_in(run, k)) for k, f in enumerate(worse)])
+    j = assess(run, [smoothed.frame(k, f, found_in(run, k)) for k, f in enumerate(worse)])
     assert 0.5 < np.mean(j.nees) / 6 < 2.0
 
 
 def test_sigmas_three_times_too_small_are_corrected():
     run = simulate_points("smooth", 7008, frames=150)
     small = replace(run, detections=tuple(tuple(replace(d, cov_px2=d.cov_px2 / 9) for d in f) for f in run.detections))
-    again, smoothed = looked_at_again(small, tracked(small))
+    again, smoothed = smoothed_frames(small, tracked(small))
     assert smoothed.noise_scale == pytest.approx(3.0, rel=0.1)
-    j = judged(run, again)
+    j = assess(run, again)
     assert np.mean(j.nees) / 6 < 1.7
     assert j.missed() <= 3
 
@@ -292,11 +292,11 @@ def test_poses_in_an_occlusion_at_rest_stay_where_they_are():
     run = simulate_points("static", 7009, frames=60, clutter=0.0)
     hide = np.zeros(run.in_view.shape, dtype=bool)
     hide[30:35] = True
-    run = hidden(run, hide)
-    again, _ = looked_at_again(run, tracked(run))
+    run = with_occlusions(run, hide)
+    again, _ = smoothed_frames(run, tracked(run))
     poses = [f.pose for f in again]
     assert all(isinstance(p, Pose) for p in poses)
-    errors = judged(run, again).errors
+    errors = assess(run, again).errors
     sigma = np.sqrt([np.diagonal(f.pose_covariance) for f in again])
     assert np.all(np.abs(errors / sigma)[30:35] < 4)
     assert np.all(sigma[32] >= sigma[28])
