@@ -11,6 +11,7 @@ from math import sqrt
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from geometry.arrays import Array, Ints
 from geometry.compilation.jit import compiled
@@ -178,6 +179,19 @@ def insertion_sort(values: Array, n: int) -> None:
 
 
 @compiled
+def insert_nearest(near: NDArray, gaps: Array, filled: int, most: int, gap: float, row: int) -> int:
+    """Enter a row into the at most `most` nearest ones, sorted by gap; returns their new number."""
+    if filled == most and gap >= gaps[most - 1]:
+        return filled
+    k = min(filled, most - 1)
+    while k > 0 and gaps[k - 1] > gap:
+        gaps[k], near[k] = gaps[k - 1], near[k - 1]
+        k -= 1
+    gaps[k], near[k] = gap, row
+    return min(filled + 1, most)
+
+
+@compiled
 def _is_highest_block(blocks: Blocks, row: int, column: int) -> bool:
     rows, columns = blocks.maps.shape[1:]
     here = blocks.maps[HIGHEST8, row, column]
@@ -305,14 +319,8 @@ def _nearest_brighter(peaks: Array, order: Ints, place: int, near: Ints, gaps: A
         j = order[before]
         du, dv = peaks[i, AT_U] - peaks[j, AT_U], peaks[i, AT_V] - peaks[j, AT_V]
         gap = du * du + dv * dv
-        if peaks[j, WIDE] or gap >= RADIUS**2 or (filled == MAX_COMPARED and gap >= gaps[MAX_COMPARED - 1]):
-            continue
-        k = min(filled, MAX_COMPARED - 1)
-        while k > 0 and gaps[k - 1] > gap:
-            gaps[k], near[k] = gaps[k - 1], near[k - 1]
-            k -= 1
-        gaps[k], near[k] = gap, j
-        filled = min(filled + 1, MAX_COMPARED)
+        if not peaks[j, WIDE] and gap < RADIUS**2:
+            filled = insert_nearest(near, gaps, filled, MAX_COMPARED, gap, j)
     return filled
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from geometry.arrays import Array
 from geometry.compilation.jit import compiled
 from tracking.detection import ellipse
+from tracking.detection.candidates import insert_nearest
 from tracking.detection.normal_equations import PolynomialFrame, accumulate, add_light, frame_of, solve_normal
 from tracking.detection.pixels import VALID, Noise, Pixels, Window, read_window, window_around
 from tracking.detection.quality import assess_fit, gain_over_plane
@@ -208,14 +209,8 @@ def _neighbours(table: Array, i: int, window: Window, near: Array, gaps: Array) 
         if j == i or table[j, FLUX] <= 0.0:
             continue
         gap = _gap(table[i], table[j], window)
-        if gap >= 0 or (filled == _MOST_NEIGHBOURS and gap >= gaps[_MOST_NEIGHBOURS - 1]):
-            continue
-        k = min(filled, _MOST_NEIGHBOURS - 1)
-        while k > 0 and gaps[k - 1] > gap:
-            gaps[k], near[k] = gaps[k - 1], near[k - 1]
-            k -= 1
-        gaps[k], near[k] = gap, j
-        filled = min(filled + 1, _MOST_NEIGHBOURS)
+        if gap < 0:
+            filled = insert_nearest(near, gaps, filled, _MOST_NEIGHBOURS, gap, j)
     return filled
 
 
