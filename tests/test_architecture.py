@@ -280,7 +280,7 @@ def test_a_package_from_outside_is_seen(small_program):
     assert foreign_packages(small_program, "geometry") == {"numpy", "cv2"}
 
 
-def test_an_import_at_the_top_is_told_from_one_in_a_function(small_program):
+def test_an_import_at_the_top_is_distinguished_from_one_in_a_function(small_program):
     path = small_program / "lab" / "run.py"
     path.write_text("try:\n    import cv2\nexcept ImportError:\n    pass\ndef f():\n    import open3d\n")
     assert imports("lab.run", path, into_functions=False) == {"cv2"}

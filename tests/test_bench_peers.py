@@ -203,8 +203,8 @@ def test_our_tracker_gets_no_labels_and_finds_them():
     assert FRAME_S == 0.01
 
 
-def test_a_missing_library_is_told_and_the_others_are_measured(monkeypatch, tmp_path, capsys):
-    monkeypatch.setitem(ENTRIES, "norfair", Entry("norfair", "with_norfair", "no_such_library"))
+def test_a_missing_library_is_reported_and_the_others_are_measured(monkeypatch, tmp_path, capsys):
+    monkeypatch.setitem(ENTRIES, "norfair", Entry("norfair", "adapters.with_norfair", "no_such_library"))
     out = tmp_path / "results.csv"
     arguments = ["--trackers", "spots", "norfair", "--scenes", "standard", "--seeds", "1", "1", "--frames", "60"]
     assert command.main([*arguments, "--out", str(out)]) == 0
@@ -216,7 +216,7 @@ def test_a_missing_library_is_told_and_the_others_are_measured(monkeypatch, tmp_
     assert only.frames_per_s > 0
 
 
-def test_a_tracker_that_fails_is_told_and_the_others_are_measured(monkeypatch, tmp_path, capsys):
+def test_a_tracker_that_fails_is_reported_and_the_others_are_measured(monkeypatch, tmp_path, capsys):
     monkeypatch.setitem(ENTRIES, "trackpy", Entry("trackpy", "ours", options={"colour": "red"}))
     arguments = ["--trackers", "spots", "trackpy", "--scenes", "standard", "--seeds", "1", "1", "--frames", "60"]
     assert command.main([*arguments, "--out", str(tmp_path / "results.csv")]) == 1

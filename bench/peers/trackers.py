@@ -55,12 +55,12 @@ ENTRIES = {
         Entry("rigid-smoothed", "ours", options={"method": "rigid", "smoothed": True}),
         # On dense, `spots` searches for the vehicle again in a third of the frames: 0.13 s each, minutes for a scene.
         Entry("spots", "ours", options={"method": "spots"}, seeds=1),
-        Entry("pyrecest-jpda", "with_pyrecest", "pyrecest", {"association": "jpda", "q": 2.0}, seeds=2),
-        Entry("pyrecest-gnn", "with_pyrecest", "pyrecest", {"association": "gnn", "q": 2.0}, seeds=2),
-        Entry("stonesoup-gnn", "with_stonesoup", "stonesoup", {"q": 3.0}, seeds=1),
-        Entry("norfair", "with_norfair", "norfair", {"R": 4.0, "Q": 0.1}, seeds=2),
-        Entry("bytetrack", "with_bytetrack", "trackers", {"half_px": 40.0}, seeds=2),
-        Entry("laptrack", "with_laptrack", "laptrack", {"gate_px": 45.0, "gap_px": 150.0}, seeds=1),
-        Entry("trackpy", "with_trackpy", "trackpy", {"gate_px": 25.0, "frames_kept": 20}, seeds=1),
+        Entry("pyrecest-jpda", "adapters.with_pyrecest", "pyrecest", {"association": "jpda", "q": 2.0}, seeds=2),
+        Entry("pyrecest-gnn", "adapters.with_pyrecest", "pyrecest", {"association": "gnn", "q": 2.0}, seeds=2),
+        Entry("stonesoup-gnn", "adapters.with_stonesoup", "stonesoup", {"q": 3.0}, seeds=1),
+        Entry("norfair", "adapters.with_norfair", "norfair", {"R": 4.0, "Q": 0.1}, seeds=2),
+        Entry("bytetrack", "adapters.with_bytetrack", "trackers", {"half_px": 40.0}, seeds=2),
+        Entry("laptrack", "adapters.with_laptrack", "laptrack", {"gate_px": 45.0, "gap_px": 150.0}, seeds=1),
+        Entry("trackpy", "adapters.with_trackpy", "trackpy", {"gate_px": 25.0, "frames_kept": 20}, seeds=1),
     )
 }

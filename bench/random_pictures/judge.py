@@ -19,8 +19,8 @@ from bench.random_pictures.adapter import reported_model, variance_at
 from bench.random_pictures.render import Renderer
 from bench.random_pictures.sensors import true_noise
 from bench.random_scenes.answers import LOST, MEASURED, pass_of_files
+from bench.random_scenes.draw.nuisances import FalsePoints
 from bench.random_scenes.judge import CONFIDENTLY_WRONG, whitened_errors
-from bench.random_scenes.nuisances import FalsePoints
 from bench.random_scenes.oracle import ask_oracle
 from bench.random_scenes.scene import OUTSIDE, SHINING, Scene, composed
 from geometry.arrays import Array, Bools

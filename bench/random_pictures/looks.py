@@ -41,7 +41,7 @@ class Look:
     exposure_share: float  # of the frame interval
     fastest_px: float  # per frame
     least_streak_px: float = 0.0  # of the longest streak
-    motion: str = ""  # of bench.random_scenes.motions; empty: any
+    motion: str = ""  # of bench.random_scenes.draw.motions; empty: any
     hidden: bool = True  # with occlusions and missing pictures
     plain_rig: bool = False  # the rig of the paper at 1280 x 1024
 

@@ -13,10 +13,10 @@ from bench.random_pictures.optics import BeamShape
 from bench.random_pictures.sensors import Light
 from bench.random_pictures.spots import BeamEnd, draw_speckle
 from bench.random_scenes.drafts import paper_lab
-from bench.random_scenes.motions import MOTIONS, Motion, draw_motion
-from bench.random_scenes.nuisances import FalsePoints, draw_hidden, draw_missing
+from bench.random_scenes.draw.motions import MOTIONS, Motion, draw_motion
+from bench.random_scenes.draw.nuisances import FalsePoints, draw_hidden, draw_missing
+from bench.random_scenes.draw.rigs import Lab, draw_lab
 from bench.random_scenes.projection import spot_pixels
-from bench.random_scenes.rigs import Lab, draw_lab
 from bench.random_scenes.scene import (
     LAB,
     MOTION,

@@ -6,13 +6,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from bench.random_scenes import rigs, scene
-from bench.random_scenes.motions import Motion
-from bench.random_scenes.nuisances import CLEAN_FRAMES, FalsePoints
+from bench.random_scenes import scene
+from bench.random_scenes.draw import rigs
+from bench.random_scenes.draw.motions import Motion
+from bench.random_scenes.draw.nuisances import CLEAN_FRAMES, FalsePoints
+from bench.random_scenes.draw.rigs import Lab
+from bench.random_scenes.draw.vehicles import LEFT, RIGHT, Vehicle
 from bench.random_scenes.projection import spot_pixels
-from bench.random_scenes.rigs import Lab
 from bench.random_scenes.scene import Scene, draw_amplitudes, draw_prior, fitted_motion, view_indices
-from bench.random_scenes.vehicles import LEFT, RIGHT, Vehicle
 from geometry.arrays import Array, Bools, Ints
 from geometry.pose import Pose
 from geometry.rig import Screen

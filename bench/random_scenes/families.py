@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bench.random_scenes import motions, nuisances, scene
+from bench.random_scenes import scene
 from bench.random_scenes.drafts import (
     Draft,
     Draw,
@@ -23,8 +23,9 @@ from bench.random_scenes.drafts import (
     usual_lab,
     zigzag_with_bends,
 )
-from bench.random_scenes.motions import Motion
-from bench.random_scenes.nuisances import CLEAN_FRAMES
+from bench.random_scenes.draw import motions, nuisances
+from bench.random_scenes.draw.motions import Motion
+from bench.random_scenes.draw.nuisances import CLEAN_FRAMES
 from bench.random_scenes.projection import spot_pixels
 from bench.random_scenes.scene import Scene, draw_amplitudes, fitted_motion, view_indices
 from geometry.rig import Rig

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from bench.random_scenes.motions import Motion, draw_motion
-from bench.random_scenes.nuisances import (
+from bench.random_scenes.draw.motions import Motion, draw_motion
+from bench.random_scenes.draw.nuisances import (
     CLEAN_FRAMES,
     MOST_ANYWHERE,
     FalsePoints,
@@ -15,9 +15,9 @@ from bench.random_scenes.nuisances import (
     draw_hidden,
     draw_missing,
 )
+from bench.random_scenes.draw.rigs import Lab, draw_lab
+from bench.random_scenes.draw.vehicles import LEAST_SPOTS
 from bench.random_scenes.projection import in_picture, spot_pixels
-from bench.random_scenes.rigs import Lab, draw_lab
-from bench.random_scenes.vehicles import LEAST_SPOTS
 from geometry import rotations
 from geometry.arrays import Array, Bools, Ints
 from geometry.pose import Pose

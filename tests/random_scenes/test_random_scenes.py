@@ -14,12 +14,12 @@ import pytest
 from bench.random_scenes.__main__ import main
 from bench.random_scenes.answers import LOST, MEASURED, Answers, Pass, answers_in_memory, answers_through_files
 from bench.random_scenes.drafts import bends_px
+from bench.random_scenes.draw.vehicles import LEAST_SPOTS
 from bench.random_scenes.families import FAMILIES, family_scene
 from bench.random_scenes.judge import figures, independent_poses, judge
 from bench.random_scenes.oracle import ask_oracle, measured_pixels
 from bench.random_scenes.report import summary
 from bench.random_scenes.scene import CLUTTER, HIDDEN, OUTSIDE, SHINING, Scene, random_scene
-from bench.random_scenes.vehicles import LEAST_SPOTS
 from bench.random_scenes.write_folder import write_run_folder
 from geometry.forward_model import SpotModel
 from geometry.pose_solver.gauss_newton import fit_pose

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.random_scenes.cameras import FOCAL_PX, SIZES_PX, draw_camera
-from bench.random_scenes.vehicles import LEAST_SPOTS, LEFT, RIGHT, THIRD, Vehicle, draw_vehicle
+from bench.random_scenes.draw.cameras import FOCAL_PX, SIZES_PX, draw_camera
+from bench.random_scenes.draw.vehicles import LEAST_SPOTS, LEFT, RIGHT, THIRD, Vehicle, draw_vehicle
 from geometry import rotations
 from geometry.arrays import Array
 from geometry.camera import Camera

@@ -1,0 +1,1 @@
+"""Other trackers behind one interface, a module each."""
