@@ -39,7 +39,11 @@ def texts(root: Path) -> Iterator[tuple[str, str]]:
     for path in [root / "cli.py", *(p for name in PACKAGES for p in sorted((root / name).rglob("*.py")))]:
         for text in strings_of(path.read_text(encoding="utf-8")):
             yield str(path.relative_to(root)), text
-    documents = [*sorted(root.glob("*.md")), *sorted((root / "docs").rglob("*.md")), *sorted(root.rglob("*.j2"))]
+    documents = [
+        *sorted(root.glob("*.md")),
+        *sorted((root / "docs").rglob("*.md")),
+        *sorted((root / "lab").rglob("*.j2")),
+    ]
     for path in documents:
         yield str(path.relative_to(root)), path.read_text(encoding="utf-8")
 
@@ -101,3 +105,41 @@ def test_a_command_that_does_not_exist_is_found(text):
 )
 def test_a_text_without_a_mistake_passes(text):
     assert not [p for m in mentions(text) if (p := problem(m))]
+
+
+PATH = re.compile(r"`([\w./-]+/(?:[\w.-]+\.(?:py|md|j2|txt|yaml|toml))?)`")
+FUNCTIONS_OF = re.compile(r"`([\w./]+\.py)`: ((?:`\w+`(?:, )?)+)")
+
+
+def documents(root: Path) -> list[Path]:
+    return [*sorted(root.glob("*.md")), *sorted((root / "docs").rglob("*.md")), root / "sample_runs" / "README.md"]
+
+
+def missing_paths(text: str, root: Path) -> list[str]:
+    """Paths of the program, its tests and benches in backticks that do not exist, and functions that a file lacks."""
+    tops = ("geometry", "tracking", "calibration", "lab", "tests", "bench", "docs", "sample_runs")
+    paths = [path for path in PATH.findall(text) if path.split("/")[0] in tops]
+    wrong = [path for path in paths if not (root / path).exists()]
+    for path, names in FUNCTIONS_OF.findall(text):
+        code = (root / path).read_text(encoding="utf-8") if (root / path).is_file() else ""
+        wrong += [
+            f"{path}: {n}" for n in re.findall(r"\w+", names) if not re.search(rf"^(def|class) {n}\b", code, re.M)
+        ]
+    return wrong
+
+
+def test_every_path_and_function_that_a_document_names_exists():
+    found = {d.name: missing_paths(d.read_text(encoding="utf-8"), ROOT) for d in documents(ROOT) if d.is_file()}
+    assert {name: wrong for name, wrong in found.items() if wrong} == {}
+
+
+def test_the_map_answers_a_newcomers_questions_with_paths():
+    text = (ROOT / "docs" / "design.md").read_text(encoding="utf-8")
+    questions = [line for line in text.splitlines() if line.startswith("| ") and "? | " in line]
+    assert len(questions) >= 25
+    assert all(PATH.search(line) for line in questions)
+
+
+@pytest.mark.parametrize("text", ["`geometry/spots.py`", "`lab/none/`", "`geometry/lens.py`: `no_such_function`"])
+def test_a_path_or_function_that_does_not_exist_is_found(text):
+    assert missing_paths(text, ROOT)

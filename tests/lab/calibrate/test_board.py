@@ -60,6 +60,12 @@ def test_the_pdf_holds_the_same_shapes_in_millimetres(text):
     assert b"/PrintScaling /None" in pdf
 
 
+def test_the_same_board_gives_the_same_pdf_at_any_time():
+    board = parse("chessboard:9x6:25mm")
+    assert as_pdf(lay_out(board)) == as_pdf(lay_out(board))
+    assert b"CreationDate (D:20000101" in as_pdf(lay_out(board))
+
+
 def test_a_board_too_large_for_the_page_is_refused_with_the_remedy(tmp_path):
     with pytest.raises(InputError, match=r"300 x 210 mm do not fit on A4; use A3 .*, or reduce the 30 mm to 25\.1 mm"):
         write_board("chessboard:9x6:30mm", tmp_path / "b")
