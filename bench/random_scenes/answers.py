@@ -139,7 +139,7 @@ def answers_in_memory(scene: Scene, parameters: TrackerParameters | None = None)
         _pass(scene, smoothed),
         _pass(scene, causal),
         verdict.exit_status,
-        verdict.reasons,
+        verdict.texts,
         tuple(dict.fromkeys(caught)),
         len(caught),
         seconds / len(scene) * 1e3,
@@ -158,7 +158,7 @@ def answers_through_files(scene: Scene, run_folder: Path) -> Answers:
         seconds = time.process_time() - start
         smoothed = pass_of_files(scene, out, causal=False)
     return Answers(
-        smoothed, None, outcome.exit_status, outcome.verdict.reasons, tuple(dict.fromkeys(caught)), len(caught),
+        smoothed, None, outcome.exit_status, outcome.verdict.texts, tuple(dict.fromkeys(caught)), len(caught),
         seconds / len(scene) * 1e3, float("nan"), float("nan"), 0,
     )  # fmt: skip
 

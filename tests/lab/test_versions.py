@@ -11,7 +11,9 @@ from tests.paths import ROOT
 from tests.test_architecture import FLOORS, foreign_packages
 
 # Libraries without influence on numbers: the command line, reports, and reading of settings.
-WITHOUT_NUMBERS = {"click", "jinja2", "markupsafe", "pydantic", "pydantic_core", "rich", "yaml"}
+WITHOUT_NUMBERS = {
+    "click", "contourpy", "fpdf", "jinja2", "markupsafe", "pydantic", "pydantic_core", "rich", "yaml",
+}  # fmt: skip
 NOT_ALWAYS_INSTALLED = {"open3d"}
 
 

@@ -169,7 +169,7 @@ def read_spot_table(path: Path, rig: Rig, notes: list[str]) -> SpotRows:
         if (camera, spot) not in views:
             raise table.error(
                 i,
-                f"camera {camera!r} observes screen {rig.cameras[camera].screen!r}, spot {spot!r} falls on"
+                f"camera {camera!r} observes screen {rig.cameras[camera].screen!r}, but spot {spot!r} is on"
                 f" {rig.spots[spot].screen!r}; one of the two names is wrong",
             )
         view[i] = views[camera, spot]

@@ -258,7 +258,7 @@ def _write(
     lost = [m.name for m in models if m.name in covariances]
     if not lost:
         return written.notes
-    return (*written.notes, f"{target} has no place for a covariance: that of {', '.join(lost)} is left out")
+    return (*written.notes, f"{target} cannot hold a covariance: that of {', '.join(lost)} is not written")
 
 
 def _write_ours(model: CameraModel, covariance: Covariance | None, path: Path) -> tuple[str, ...]:
@@ -267,7 +267,7 @@ def _write_ours(model: CameraModel, covariance: Covariance | None, path: Path) -
     save_camera(CameraFile(model.name, model.image_size_px, K, model.distortion, model.lens, covariance), path)
     if model.camera_from_reference is None:
         return ()
-    return (f"camera.yaml has no place for a pose: where {model.name} stands is left out",)
+    return (f"camera.yaml cannot hold a pose: that of {model.name} is not written",)
 
 
 def _check_round_trip(models: Sequence[CameraModel], text: str, path: Path, target: str) -> None:

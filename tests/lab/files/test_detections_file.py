@@ -14,7 +14,8 @@ from lab.errors import InputError
 from lab.files.run.detections_file import read_detections
 from lab.files.run.run_file import load_run
 from lab.files.text import columns
-from lab.runs.frames.frames import Missing, open_frames
+from lab.pictures.picture_file import MissingPicture
+from lab.runs.frames.frames import open_frames
 from lab.runs.input_check.check import check
 from tests.lab.run_folders import edit, write_run
 from tracking.detections import Detections
@@ -148,7 +149,13 @@ def test_pictures_of_one_camera_and_points_of_the_other_can_be_combined(tmp_path
     assert list(got) == [0, 1, 2, 3, 4]
     assert all(isinstance(images["left"], np.ndarray) for images in got.values())
     # nothing found between two rows is a picture without points; beyond the rows there is no picture
-    assert [type(got[f]["right"]) for f in range(5)] == [Missing, Detections, Detections, Detections, Missing]
+    assert [type(got[f]["right"]) for f in range(5)] == [
+        MissingPicture,
+        Detections,
+        Detections,
+        Detections,
+        MissingPicture,
+    ]
     assert [len(got[f]["right"]) for f in (1, 2, 3)] == [1, 0, 2]
     assert any(n.endswith("rows of cameras that the rig does not have are not used: middle") for n in reader.notes)
 
@@ -265,7 +272,7 @@ def test_a_picture_without_a_usable_row_is_unreadable_not_empty(tmp_path):
     folder = points_for_right(tmp_path / "a", *rows, row(2, "right", 9, 9), row(4, "right", 5, 6))
     reader = open_frames(load_run(folder))
     images = [s.images["right"] for s in reader]
-    assert images[1] == Missing("unreadable: no row of it can be used")
+    assert images[1] == MissingPicture("unreadable: no row of it can be used")
     assert [len(images[k]) for k in (0, 2, 3, 4)] == [1, 1, 0, 1]
     assert "right: 1 frame unreadable: no row of it can be used (1)" in reader.notes
     lines = check(folder).lines

@@ -53,7 +53,7 @@ def test_the_line_names_both_formats_and_what_was_left_out(source, tmp_path):
     outcome = convert(tmp_path / "c.yaml", tmp_path / "left.yml")
     lines = outcome.line().splitlines()
     assert lines[0].startswith("left: beampose camera.yaml -> OpenCV YAML, ")
-    assert lines[1:] == ["  note: opencv has no place for a covariance: that of left is left out"]
+    assert lines[1:] == ["  note: opencv cannot hold a covariance: that of left is not written"]
 
 
 @pytest.fixture
@@ -76,7 +76,7 @@ def test_all_cameras_of_a_rig_are_converted_with_their_poses(rig, tmp_path):
     outcome = convert(rig, tmp_path / "cameras.txt")
     assert outcome.notes == (
         "colmap numbers its cameras: left is camera 1, right is camera 2",
-        "colmap has no place for a pose: where left, right stands is left out",
+        "colmap cannot hold poses: the pose of left, right is not written",
     )
 
 

@@ -386,4 +386,4 @@ def test_a_process_writes_nothing_to_standard_error():
         [sys.executable, "-c", CHATTER], input=b"".join(f + b"=====" for f in files), capture_output=True, check=True
     )
     assert out.stderr == b""
-    assert set(out.stdout.split()) <= {b"Missing", b"ndarray"}
+    assert set(out.stdout.split()) <= {b"MissingPicture", b"ndarray"}

@@ -17,10 +17,10 @@ import pytest
 
 from lab.errors import InputError
 from lab.files.run.run_file import load_run
-from lab.pictures.picture_file import decode, read_picture
+from lab.pictures.picture_file import MissingPicture, decode, read_picture
 from lab.runs.frames import frames
 from lab.runs.frames.frame_sources import list_folder
-from lab.runs.frames.frames import FrameSet, Missing, open_frames, pictures_at
+from lab.runs.frames.frames import FrameSet, open_frames, pictures_at
 from tests.lab.run_folders import edit, picture_of, write_run
 
 SIZE = (64, 48)
@@ -95,7 +95,7 @@ def test_the_display_orientation_of_a_jpeg_is_not_applied():
 def test_a_truncated_picture_is_unreadable(suffix, share, capfd):
     data = encoded(suffix, textured())
     got = decode(data[: int(len(data) * share)], SIZE)
-    assert isinstance(got, Missing)
+    assert isinstance(got, MissingPicture)
     assert got.reason.startswith("unreadable")
     assert capfd.readouterr().err == ""
 
@@ -117,7 +117,7 @@ def test_one_wrong_byte_in_a_png_is_detected_by_its_checksum(at, capfd):
 
 @pytest.mark.parametrize("tail", [b"", b"\0" * 512, b"camera's own remark \xff\x00"])
 def test_a_jpeg_with_data_after_its_end_is_complete(tail):
-    assert not isinstance(decode(encoded(".jpg", textured()) + tail, SIZE), Missing)
+    assert not isinstance(decode(encoded(".jpg", textured()) + tail, SIZE), MissingPicture)
 
 
 def test_the_end_of_a_progressive_jpeg_with_a_thumbnail_is_recognised():
@@ -125,8 +125,8 @@ def test_the_end_of_a_progressive_jpeg_with_a_thumbnail_is_recognised():
     thumbnail = encoded(".jpg", textured()[:8, :8])
     segment = b"\xff\xe1" + struct.pack(">H", len(thumbnail) + 2) + thumbnail
     whole = data.tobytes()[:2] + segment + data.tobytes()[2:]
-    assert not isinstance(decode(whole, SIZE), Missing)
-    assert decode(whole[:-2], SIZE) == Missing("unreadable: cut short")
+    assert not isinstance(decode(whole, SIZE), MissingPicture)
+    assert decode(whole[:-2], SIZE) == MissingPicture("unreadable: cut short")
 
 
 @pytest.mark.parametrize("data", [b"", b"hello", b"\x89PNG\r\n\x1a\n", b"\xff\xd8", b"P5\n999999 999999\n255\n00"])
@@ -164,7 +164,7 @@ def test_missing_numbers_are_dropped_frames_of_that_camera(tmp_path):
     for camera, number in (("left", 0), ("left", 3), ("right", 3), ("right", 4), ("right", 7)):
         (folder / "frames" / camera / f"{number:06d}.png").unlink()
     reader = open_frames(load_run(folder))
-    got = {s.frame: [c for c, p in s.images.items() if not isinstance(p, Missing)] for s in reader}
+    got = {s.frame: [c for c, p in s.images.items() if not isinstance(p, MissingPicture)] for s in reader}
     both = ["left", "right"]
     assert got == {0: ["right"], 1: both, 2: both, 3: [], 4: ["left"], 5: both, 6: both, 7: ["left"]}
     assert reader.notes == ["left: 2 frames dropped (0, 3)", "right: 3 frames dropped (3, 4, 7)"]
@@ -179,7 +179,7 @@ def test_the_run_continues_past_damaged_empty_and_wrong_sized_pictures(tmp_path,
     (left / "000002.png").write_bytes(b"")
     cv2.imwrite(str(left / "000004.png"), np.zeros((10, 12), np.uint8))
     reader = open_frames(load_run(folder))
-    reasons = {s.frame: s.images["left"].reason for s in reader if isinstance(s.images["left"], Missing)}
+    reasons = {s.frame: s.images["left"].reason for s in reader if isinstance(s.images["left"], MissingPicture)}
     assert reasons == {
         1: "unreadable: cut short",
         2: "unreadable: the file is empty",
@@ -229,7 +229,7 @@ def test_a_long_gap_between_several_pictures_is_kept(tmp_path):
             (folder / f"frames/{camera}/{old:06d}.png").rename(folder / f"frames/{camera}/{new:06d}.png")
     sets = read_all(folder)
     assert len(sets) == 20002
-    assert sum(isinstance(s.images["left"], Missing) for s in sets) == 20002 - 5
+    assert sum(isinstance(s.images["left"], MissingPicture) for s in sets) == 20002 - 5
 
 
 def test_a_single_stray_file_is_an_error_before_the_gap_is_filled(tmp_path):
@@ -356,14 +356,14 @@ def test_frame_n_of_a_video_is_its_nth_picture(video_run):
     assert [s.frame for s in sets] == list(range(12))
     for s in sets:
         np.testing.assert_array_equal(s.images["left"], picture_of(s.frame))
-        assert isinstance(s.images["right"], Missing) == (s.frame >= 5)
+        assert isinstance(s.images["right"], MissingPicture) == (s.frame >= 5)
     assert reader.expected_frames == 12
 
 
 def test_frames_after_the_end_of_a_video_are_dropped(video_run):
     write_video(video_run / "left.avi", 3)
     sets = read_all(video_run)
-    assert [isinstance(s.images["left"], Missing) for s in sets] == [False] * 3 + [True] * 2
+    assert [isinstance(s.images["left"], MissingPicture) for s in sets] == [False] * 3 + [True] * 2
 
 
 def test_pictures_of_a_video_of_another_size_are_missing(video_run):
@@ -392,7 +392,7 @@ def test_single_pictures_can_be_read(video_run):
     assert list(got) == [3, 7, 40]
     np.testing.assert_array_equal(got[3], picture_of(3))
     np.testing.assert_array_equal(got[7], picture_of(7))
-    assert got[40] == Missing("dropped")
+    assert got[40] == MissingPicture("dropped")
     folder = pictures_at(run, "right", [4, 9])
     np.testing.assert_array_equal(folder[4], picture_of(4))
-    assert folder[9] == Missing("dropped")
+    assert folder[9] == MissingPicture("dropped")
