@@ -56,8 +56,8 @@ def test_the_calibrations_covariance_is_in_its_own_table_and_in_the_total(run_fo
     assert len(rows) == 10
     assert float(rows[0]["c00"]) == pytest.approx(poses.systematic[0, 0, 0])
     report = (tmp_path / "with" / "report.html").read_text()
-    assert "of it calibration" in report
-    assert "no mean lessens them" in report
+    assert "calibration part" in report
+    assert "averaging does not reduce them" in report
     assert "states no covariance of its calibration" in (tmp_path / "without" / "report.html").read_text()
 
 
