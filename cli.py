@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import click
 
-from lab.commands import calibrate, plan_and_simulate, results, run
+from lab.commands import batch, calibrate, plan_and_simulate, results, run
 from lab.commands.common import Commands
 
 
@@ -20,7 +20,7 @@ def main() -> None:
 
 for command in (
     run.run,
-    run.batch,
+    batch.batch,
     run.detect,
     run.watch,
     plan_and_simulate.simulate,

@@ -25,7 +25,8 @@ from click.testing import CliRunner, Result
 from cli import main
 from lab.commands.common import PIPE_CLOSED
 from lab.errors import CalibrationError, InputError, RunError
-from lab.runs import batch, process
+from lab.runs import process
+from lab.runs.batch import task as batch
 from lab.simulate.scenarios import SCENARIOS
 from lab.simulate.write import simulate
 from tests.lab.run_folders import write_run

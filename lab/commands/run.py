@@ -1,4 +1,4 @@
-"""`beampose run`, `batch`, `watch` and `detect`: from pictures to results."""
+"""`beampose run`, `watch` and `detect`: from pictures to results."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import click
 
 from lab.commands.common import ANY_PATH, FOLDER, conclude, progress_bar, set_option
 
-_causal_option = click.option(
+causal_option = click.option(
     "--causal", is_flag=True, help="No smoothing pass: attitude.csv has the poses as known at each instant."
 )
 
@@ -18,7 +18,7 @@ _causal_option = click.option(
 @click.command()
 @click.argument("run_folder", metavar="RUN", type=ANY_PATH)
 @click.option("--out", required=True, type=FOLDER, help="Where the results go; earlier results there are replaced.")
-@_causal_option
+@causal_option
 @set_option
 def run(run_folder: Path, out: Path, causal: bool, settings: dict[str, Any]) -> None:
     """Process one run folder: tables, summary.json and report.html.
@@ -32,26 +32,6 @@ def run(run_folder: Path, out: Path, causal: bool, settings: dict[str, Any]) -> 
     with progress_bar(run_folder.name) as progress:
         outcome = process_run(run_folder, out, overrides=settings, causal=causal, progress=progress)
     click.echo(outcome.line())
-    sys.exit(outcome.exit_status)
-
-
-@click.command()
-@click.argument("run_folders", metavar="RUN...", nargs=-1, required=True, type=ANY_PATH)
-@click.option("--out", required=True, type=FOLDER, help="Gets one folder per run, batch.csv and index.html.")
-@_causal_option
-@set_option
-def batch(run_folders: tuple[Path, ...], out: Path, causal: bool, settings: dict[str, Any]) -> None:
-    """Process many run folders; a run that fails does not stop the others.
-
-    \b
-    Example:
-        beampose batch sample_runs/huo2015 sample_runs/damaged --out results/all
-    """
-    from lab.runs.batch import process_batch
-
-    outcome = process_batch(run_folders, out, overrides=settings, causal=causal, report=click.echo)
-    click.echo(f"table: {outcome.table}")
-    click.echo(f"index: {outcome.index}")
     sys.exit(outcome.exit_status)
 
 

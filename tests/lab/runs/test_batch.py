@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 
 from lab.errors import CalibrationError, InputError, RunError
-from lab.runs import batch as module
-from lab.runs.batch import COLUMNS, process_batch
+from lab.runs.batch import task as module
+from lab.runs.batch.batch import process_batch
+from lab.runs.batch.task import COLUMNS
 from lab.simulate.write import simulate
 from tests.lab.run_folders import write_run
 
@@ -48,7 +49,8 @@ def test_the_good_runs_have_their_results_and_the_bad_one_has_none(mixed):
     for row in rows_of(outcome.table):
         if row["results"]:
             assert (out / row["results"] / "attitude.csv").is_file()
-    assert sorted(p.name for p in out.iterdir()) == ["batch.csv", "good", "grey", "index.html", "last"]
+    seen = [p.name for p in out.iterdir() if not p.name.startswith(".")]
+    assert sorted(seen) == ["batch.csv", "good", "grey", "index.html", "last"]
 
 
 def test_a_line_is_reported_for_every_run_when_it_ends(mixed):

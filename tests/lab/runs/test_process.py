@@ -21,7 +21,7 @@ from lab.files.run.run_file import load_run
 from lab.files.text import columns
 from lab.files.text.json_text import plain_value
 from lab.runs import process
-from lab.runs.batch import process_batch
+from lab.runs.batch.batch import process_batch
 from lab.runs.frames.pipeline import FrameRecord, Pipeline
 from lab.runs.process import are_results, process_run
 from lab.runs.run_tally import RunTally

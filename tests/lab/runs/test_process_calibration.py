@@ -16,7 +16,7 @@ from lab.files.rig.calibration_state import CalibrationState
 from lab.files.rig.camera_block import Covariance
 from lab.files.rig.rig_file import RigFile, load_rig_file, save_rig
 from lab.files.run.results import read_poses
-from lab.runs.batch import process_batch
+from lab.runs.batch.batch import process_batch
 from lab.runs.process import process_run
 from lab.simulate.write import simulate
 

@@ -1,0 +1,151 @@
+"""Processes many runs: a result folder each, batch.csv and index.html. Work that is done already is skipped."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import time
+from collections.abc import Callable, Generator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from lab.errors import QUALITY_GATE_FAILED, BeamposeError, CalibrationError, InputError, RunError
+from lab.files.run.parameter_overrides import with_overrides
+from lab.runs.batch.result_folders import allotted, moved_runs
+from lab.runs.batch.resumption import fingerprint_of, finished_summary
+from lab.runs.batch.run_list import listed_runs
+from lab.runs.batch.table import BatchTable, locked
+from lab.runs.batch.task import Task, TaskOutcome, failed_row, perform
+from lab.runs.batch.workers import performed
+from lab.runs.process import ready_run
+from tracking.parameters import TrackerParameters
+
+INDEX_SECONDS = 60.0  # index.html of a long batch is at most this old
+
+
+@dataclass(frozen=True, slots=True)
+class BatchOptions:
+    """How a batch is processed."""
+
+    overrides: Mapping[str, Any] | None = None  # as for process_run
+    causal: bool = False  # as for process_run
+    jobs: int | None = None  # processes; None: all in this process, as is a single run
+    force: bool = False  # process again what is done already
+    shard: tuple[int, int] = (1, 1)  # (i, n): the i-th of n parts of the runs
+    full_hash: bool = False  # large files are read completely for the fingerprint
+
+
+@dataclass(frozen=True, slots=True)
+class BatchOutcome:
+    """The rows of this batch's runs in batch.csv, and the files written."""
+
+    rows: tuple[Mapping[str, Any], ...]
+    skipped: int  # runs that were done already
+    table: Path
+    index: Path
+
+    @property
+    def exit_status(self) -> int:
+        """1 if a run could not be processed, 3 if its calibration is the only reason; else 4 or 0."""
+        found = {row["exit_status"] for row in self.rows}
+        failed = found - {0, QUALITY_GATE_FAILED}
+        if failed:
+            return CalibrationError.exit_status if failed == {CalibrationError.exit_status} else RunError.exit_status
+        return QUALITY_GATE_FAILED if QUALITY_GATE_FAILED in found else 0
+
+
+def process_batch(
+    runs: Sequence[str | os.PathLike[str]],
+    out: Path,
+    options: BatchOptions | None = None,
+    *,
+    lists: Sequence[str | os.PathLike[str]] = (),
+    report: Callable[[str], None] = lambda line: None,
+    progress: Callable[[int, int, int], None] = lambda done, processed, total: None,
+) -> BatchOutcome:
+    """Process runs into folders in `out`; a run that fails, in whatever way, does not stop the others.
+
+    runs, lists: as for `listed_runs`. report: called with one line per run. progress: called with the numbers of
+    runs that are done, that were processed (not skipped), and of all. With `jobs`, a script must call this under
+    `if __name__ == "__main__"`, since the processes import it.
+
+    Raises:
+        InputError: the command as a whole cannot be carried out.
+    """
+    options, out = options or BatchOptions(), Path(out)
+    # A misspelt parameter is the command's mistake, not each run's.
+    with_overrides(TrackerParameters(), options.overrides or {})
+    folders = listed_runs(runs, lists)
+    _make_folder(out)
+    tasks = _tasks(folders, out, options)
+    table = BatchTable(out, [task.place for task in tasks])
+    number, count = options.shard
+    mine = tasks[number - 1 :: count]
+    rows: dict[str, Mapping[str, Any]] = {}
+    skipped, written = 0, 0.0
+    progress(0, 0, len(mine))
+    try:
+        with contextlib.closing(_outcomes(mine, options.jobs)) as outcomes:
+            for task, outcome in outcomes:
+                rows[task.place] = outcome.row
+                skipped += outcome.skipped
+                table.add(outcome.row)
+                report(_line(task, outcome))
+                progress(len(rows), len(rows) - skipped, len(mine))
+                # After every run: if the program is killed, the rows so far are kept. Rows of skipped runs follow
+                # from their results. If the disk is full, the next run may find space, and the end reports it.
+                if not outcome.skipped:
+                    now = time.monotonic()
+                    with contextlib.suppress(InputError):
+                        table.write(index=now - written > INDEX_SECONDS and len(rows) > 1)
+                        written = now if now - written > INDEX_SECONDS else written
+    finally:
+        table.write(index=True)
+    return BatchOutcome(tuple(rows[task.place] for task in mine), skipped, table.path, out / "index.html")
+
+
+def _make_folder(out: Path) -> None:
+    if out.exists() and not out.is_dir():
+        raise InputError(f"{out}: expected a folder for the results, found a file; choose another --out")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{out}: the folder cannot be made: {error.strerror}") from None
+
+
+def _tasks(folders: Sequence[Path], out: Path, options: BatchOptions) -> list[Task]:
+    """The tasks of all runs; each gets its result folder, whatever shard processes it."""
+    overrides = dict(options.overrides or {})
+    with locked(out):
+        resumable = {}
+        for place, (folder, name) in moved_runs(out, folders).items():
+            with contextlib.suppress(BeamposeError, OSError):
+                value = fingerprint_of(ready_run(folder, overrides), options.causal, options.full_hash)
+                if finished_summary(out / name, value) is not None:
+                    resumable[place] = name
+        names = allotted(out, folders, resumable)
+    return [
+        Task(folder, out, name, overrides, options.causal, options.force, options.full_hash)
+        for folder, name in zip(folders, names, strict=True)
+    ]
+
+
+def _outcomes(tasks: Sequence[Task], jobs: int | None) -> Generator[tuple[Task, TaskOutcome], None, None]:
+    if jobs is None or len(tasks) == 1:
+        for task in tasks:
+            yield task, perform(task)
+        return
+    if not tasks:
+        return
+    with contextlib.closing(performed(tasks, perform, min(jobs, len(tasks)))) as results:
+        for task, outcome in results:
+            died = "the process ended without a result: it was killed, or ran out of memory, or a library crashed"
+            yield task, outcome or TaskOutcome(failed_row(task, died))
+
+
+def _line(task: Task, outcome: TaskOutcome) -> str:
+    row = outcome.row
+    done = "done already; " if outcome.skipped else ""
+    line = f"{task.results}: {row['status'].upper()}: {done}{row['message']}"
+    return "".join(c if c.isprintable() else "?" for c in line)

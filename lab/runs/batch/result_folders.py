@@ -1,0 +1,90 @@
+"""The result folder of every run of a batch. It stays the same in later batches into the same folder."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from lab.errors import InputError
+from lab.files.text.atomic_write import atomic_write_text
+
+FILE_NAME = ".batch-folders.json"
+SCHEMA = "beampose/batch-folders/1"
+RESERVED = ("batch.csv", "index.html", "errors", "parquet")  # names in the batch's folder that no run may have
+
+
+def displayed(path: str | os.PathLike[str]) -> str:
+    """A path as UTF-8 text; bytes that are not UTF-8 as `\\xe9`."""
+    return os.fsencode(path).decode("utf-8", "backslashreplace")
+
+
+def allotted(out: Path, folders: Sequence[Path], resumable: Mapping[str, str]) -> list[str]:
+    """The name of the result folder in `out` for each run folder; recorded in `out`. To be called under the lock.
+
+    It is the name of the run folder, with that of its parent where two runs of the batch have one name, and with a
+    digest of its place where another run has that name already. A run that has a result folder keeps it. resumable:
+    result folders by run folder, of runs that have been moved: the run takes over the results.
+
+    Raises:
+        InputError: the record is damaged or cannot be written.
+    """
+    record = _read(out / FILE_NAME)
+    owners = {name.casefold(): place for place, name in record.items()}
+    places = [displayed(os.path.realpath(f)) for f in folders]
+    simple = [_simple(p) for p in folders]
+    names = []
+    for place, folder, name in zip(places, folders, simple, strict=True):
+        if place not in record and place in resumable:
+            taken = resumable[place]
+            record = {p: n for p, n in record.items() if n != taken}
+            record[place], owners[taken.casefold()] = taken, place
+        if place not in record:
+            parent = _simple(Path(os.path.realpath(folder)).parent)
+            digest = hashlib.sha256(place.encode()).hexdigest()[:8]
+            choices = [f"{parent}-{name}", f"{name}-{digest}", f"{name}-{digest}-2"]
+            if simple.count(name) == 1:
+                choices.insert(0, name)
+            record[place] = next(c for c in choices if c.casefold() not in owners and c not in RESERVED)
+            owners[record[place].casefold()] = place
+        names.append(record[place])
+    atomic_write_text(json.dumps({"schema": SCHEMA, "folders": record}, indent=1) + "\n", out / FILE_NAME)
+    return names
+
+
+def moved_runs(out: Path, folders: Sequence[Path]) -> dict[str, tuple[Path, str]]:
+    """Runs without a result folder, where one of the same name belongs to a run folder that is gone.
+
+    Returns the run folder and the name of the results, by place.
+    """
+    record = _read(out / FILE_NAME)
+    gone = {name: place for place, name in record.items() if not os.path.isdir(place)}
+    found = {}
+    for folder in folders:
+        place, name = displayed(os.path.realpath(folder)), _simple(folder)
+        if place not in record and name in gone:
+            found[place] = (folder, name)
+    return found
+
+
+def _simple(folder: Path) -> str:
+    """The folder's own name, such that every file system and table can hold it."""
+    name = os.fsencode(os.path.basename(os.path.realpath(folder))).decode("utf-8", "replace").replace("\ufffd", "_")
+    return "".join(c if c.isprintable() else "_" for c in name) or "run"
+
+
+def _read(path: Path) -> dict[str, str]:
+    try:
+        content = json.loads(path.read_text("utf-8"))
+        folders = content["folders"]
+        if content["schema"] != SCHEMA or not all(isinstance(v, str) for v in folders.values()):
+            raise ValueError
+    except FileNotFoundError:
+        return {}
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+    except (ValueError, KeyError, TypeError, AttributeError):
+        raise InputError(f"{path}: expected the result folders of a batch, found another file; delete it") from None
+    return dict(folders)
