@@ -90,7 +90,7 @@ def process_batch(
             for task, outcome in outcomes:
                 rows[task.place] = outcome.row
                 skipped += outcome.skipped
-                table.add(outcome.row)
+                table.add(outcome.row, outcome.skipped)
                 report(_line(task, outcome))
                 progress(len(rows), len(rows) - skipped, len(mine))
                 # After every run: if the program is killed, the rows so far are kept. Rows of skipped runs follow

@@ -17,8 +17,9 @@ RESERVED = ("batch.csv", "index.html", "errors", "parquet")  # names in the batc
 
 
 def displayed(path: str | os.PathLike[str]) -> str:
-    """A path as UTF-8 text; bytes that are not UTF-8 as `\\xe9`."""
-    return os.fsencode(path).decode("utf-8", "backslashreplace")
+    """A path as printable UTF-8 text; other bytes and control characters as `\\xe9`."""
+    text = os.fsencode(path).decode("utf-8", "backslashreplace")
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 def allotted(out: Path, folders: Sequence[Path], resumable: Mapping[str, str]) -> list[str]:

@@ -48,11 +48,14 @@ class BatchTable:
         self.path = out / FILE_NAME
         self._out, self._order = out, {place: i for i, place in enumerate(places)}
         self._own: dict[str, Mapping[str, Any]] = {}  # rows of this batch that are not yet in the file
+        self._skipped: set[str] = set()
         read_rows(self.path)
 
-    def add(self, row: Mapping[str, Any]) -> None:
-        """Remember a row of this batch for the next `write`."""
+    def add(self, row: Mapping[str, Any], skipped: bool = False) -> None:
+        """Remember a row of this batch for the next `write`. skipped: it was made from earlier results."""
         self._own[row["folder"]] = row
+        if skipped:
+            self._skipped.add(row["folder"])
 
     def write(self, index: bool = False) -> None:
         """Merge the rows added since into batch.csv, and with `index` write index.html.
@@ -61,7 +64,12 @@ class BatchTable:
             InputError: a file cannot be written. The rows are kept for the next attempt.
         """
         with locked(self._out):
-            rows = merged(read_rows(self.path), self._own, self._order)
+            there = read_rows(self.path)
+            for row in there:  # the time of the processing is better known than from the results
+                own = self._own.get(row["folder"])
+                if own and row["folder"] in self._skipped and row["results"] == own["results"] and row.get("seconds"):
+                    self._own[row["folder"]] = {**own, "seconds": row["seconds"]}
+            rows = merged(there, self._own, self._order)
             extra = [c for c in dict.fromkeys(c for row in rows for c in row) if c not in COLUMNS]
             header = [*COLUMNS, *extra]
             write_table(self.path, header, [[row.get(c, "") for c in header] for row in rows])

@@ -155,6 +155,8 @@ def _unforeseen(task: Task, error: Exception) -> str:
     if isinstance(error, OSError) and error.strerror:
         named = isinstance(error.filename, str | bytes | os.PathLike)
         first = f"{displayed(error.filename)}: {error.strerror}" if named else error.strerror
+        kind = ""  # the system's reason is enough
+    message = f"unforeseen error: {kind}: {first}" if kind else first
     text = _as_text("".join(traceback.format_exception(error)))
     for path in (task.error_file, Path(tempfile.gettempdir()) / f"beampose-{task.results}-{os.getpid()}.txt"):
         try:
@@ -162,8 +164,8 @@ def _unforeseen(task: Task, error: Exception) -> str:
             atomic_write_text(text, path)
         except (OSError, BeamposeError):
             continue
-        return f"unforeseen error: {kind}: {first}; the traceback is in {displayed(path)}; please report it"
-    return f"unforeseen error: {kind}: {first}; its traceback could not be saved"
+        return f"{message}; the traceback is in {displayed(path)}{'; please report it' if kind else ''}"
+    return f"{message}; its traceback could not be saved"
 
 
 def _remove_error_file(task: Task) -> None:
