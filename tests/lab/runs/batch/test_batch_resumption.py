@@ -17,7 +17,7 @@ from lab.runs.batch import resumption
 from lab.runs.batch.batch import BatchOptions, process_batch
 from lab.simulate.write import simulate
 from tests.lab.run_folders import edit, write_run
-from tests.lab.runs.test_batch import points_run, rows_of
+from tests.lab.runs.batch.test_batch import points_run, rows_of
 from tests.paths import ROOT
 
 TABLES = ("attitude.csv", "spots.csv", "attitude_causal.csv")

@@ -16,7 +16,7 @@ from lab.runs.batch.batch import BatchOptions, process_batch
 from lab.runs.batch.table import BatchTable
 from lab.simulate.write import simulate
 from tests.lab.run_folders import edit
-from tests.lab.runs.test_batch import points_run, rows_of
+from tests.lab.runs.batch.test_batch import points_run, rows_of
 
 FAULTS = [
     ZeroDivisionError("division by zero"),

@@ -11,7 +11,7 @@ from lab.commands.batch import pace
 from lab.errors import InputError
 from lab.runs.batch.batch import BatchOptions, process_batch
 from lab.runs.batch.run_list import listed_runs, shard_of
-from tests.lab.runs.test_batch import points_run, rows_of
+from tests.lab.runs.batch.test_batch import points_run, rows_of
 
 
 @pytest.fixture
