@@ -36,6 +36,9 @@ def _shard(ctx: click.Context, parameter: click.Parameter, value: str | None) ->
 @click.option("--force", is_flag=True, help="Process all runs again, also those that are done.")
 @click.option("--shard", metavar="I/N", callback=_shard, help="Only the I-th of N parts of the runs, for array jobs.")
 @click.option("--full-hash", is_flag=True, help="Compare all bytes of pictures and videos with --out, not samples.")
+@click.option(
+    "--parquet", is_flag=True, help="Also write all attitudes and spots as Parquet data sets (needs pyarrow)."
+)
 @causal_option
 @set_option
 def batch(
@@ -46,6 +49,7 @@ def batch(
     force: bool,
     shard: tuple[int, int],
     full_hash: bool,
+    parquet: bool,
     causal: bool,
     settings: dict[str, Any],
 ) -> None:
@@ -63,7 +67,7 @@ def batch(
         raise click.UsageError("Missing argument 'RUN...'.", click.get_current_context())
     from lab.runs.batch.batch import BatchOptions, process_batch
 
-    options = BatchOptions(settings, causal, jobs, force, shard, full_hash)
+    options = BatchOptions(settings, causal, jobs, force, shard, full_hash, parquet)
     line = _printer()
     with _progress() as progress:
         outcome = process_batch(runs, out, options, lists=lists, report=line, progress=progress)

@@ -12,10 +12,11 @@ from typing import Any
 
 from lab.errors import QUALITY_GATE_FAILED, BeamposeError, CalibrationError, InputError, RunError
 from lab.files.run.parameter_overrides import with_overrides
+from lab.runs.batch.parquet import require_pyarrow, update_data_sets
 from lab.runs.batch.result_folders import allotted, moved_runs
 from lab.runs.batch.resumption import fingerprint_of, finished_summary
 from lab.runs.batch.run_list import listed_runs
-from lab.runs.batch.table import BatchTable, locked
+from lab.runs.batch.table import BatchTable, locked, read_rows
 from lab.runs.batch.task import Task, TaskOutcome, failed_row, perform
 from lab.runs.batch.workers import performed
 from lab.runs.process import ready_run
@@ -34,6 +35,7 @@ class BatchOptions:
     force: bool = False  # process again what is done already
     shard: tuple[int, int] = (1, 1)  # (i, n): the i-th of n parts of the runs
     full_hash: bool = False  # large files are read completely for the fingerprint
+    parquet: bool = False  # also write Parquet data sets of attitudes and spots
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +78,8 @@ def process_batch(
     options, out = options or BatchOptions(), Path(out)
     # A misspelt parameter is the command's mistake, not each run's.
     with_overrides(TrackerParameters(), options.overrides or {})
+    if options.parquet:
+        require_pyarrow()
     folders = listed_runs(runs, lists)
     _make_folder(out)
     tasks = _tasks(folders, out, options)
@@ -102,6 +106,9 @@ def process_batch(
                         written = now if now - written > INDEX_SECONDS else written
     finally:
         table.write(index=True)
+    if options.parquet:
+        with locked(out):
+            update_data_sets(read_rows(table.path), out)
     return BatchOutcome(tuple(rows[task.place] for task in mine), skipped, table.path, out / "index.html")
 
 

@@ -129,6 +129,17 @@ def tables(out: Path) -> dict[str, bytes]:
     return {str(p.relative_to(out)): p.read_bytes() for p in sorted(out.glob("*/*.csv")) if p.name in TABLES}
 
 
+def wait_until_the_group_has_ended(group: int) -> None:
+    for _ in range(300):
+        try:
+            os.killpg(group, 0)
+        except ProcessLookupError:
+            return
+        time.sleep(0.1)
+    os.killpg(group, signal.SIGKILL)
+    pytest.fail("workers of a killed batch are still there after 30 s")
+
+
 def killed_then_resumed(recordings, tmp_path: Path, seconds: float) -> None:
     runs, expected = recordings
     program = "import sys; from cli import main; main(sys.argv[1:])"
@@ -138,6 +149,7 @@ def killed_then_resumed(recordings, tmp_path: Path, seconds: float) -> None:
     time.sleep(seconds)
     first.send_signal(signal.SIGKILL)  # the parent only: its workers must end by themselves
     first.wait()
+    wait_until_the_group_has_ended(first.pid)
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode in (0, 4), done.stderr
     assert tables(tmp_path / "out") == expected
