@@ -215,9 +215,12 @@ def test_formulas_use_only_numerical_packages(floor):
 
 def test_what_the_program_imports_is_declared_in_pyproject():
     declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    required = [*declared["dependencies"], *declared["optional-dependencies"]["pointcloud"]]
+    required = [
+        *declared["dependencies"],
+        *(r for extra in ("pointcloud", "parquet") for r in declared["optional-dependencies"][extra]),
+    ]
     names = {canonicalize_name(Requirement(requirement).name) for requirement in required}
-    distributions = packages_distributions() | {"open3d": ["open3d"]}  # seldom installed
+    distributions = packages_distributions() | {n: [n] for n in ("open3d", "pyarrow")}  # seldom installed
     used = set().union(*(foreign_packages(ROOT, floor) for floor in FLOORS))
     assert {"numpy", "scipy"} <= used
     missing = {p for p in used if not names & set(map(canonicalize_name, distributions.get(p, [])))}
