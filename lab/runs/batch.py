@@ -80,7 +80,7 @@ def process_batch(
         rows.append(row)
         # After every run: if the next one is killed, the rows so far are kept.
         write_table(out / "batch.csv", COLUMNS, [[row[c] for c in COLUMNS] for row in rows])
-    from lab.report.run.index import write_index
+    from lab.report.index.index import write_index
 
     index = write_index(rows, out)
     return BatchOutcome(tuple(rows), out / "batch.csv", index)
