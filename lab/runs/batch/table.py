@@ -75,7 +75,7 @@ class BatchTable:
             write_table(self.path, header, [[row.get(c, "") for c in header] for row in rows])
             self._own.clear()
             if index:
-                from lab.report.run.index import write_index
+                from lab.report.index.index import write_index
 
                 write_index([dict(row) for row in rows], self._out)
 

@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 
 from lab import number_format
+from lab.report.index.index import write_index
 from lab.report.plot import thinning
 from lab.report.plot.image import grey_limits, stretched
 from lab.report.plot.scales import tick_texts, ticks
 from lab.report.plot.series import Line, Shade, time_panel
 from lab.report.plot.svg import BLUE, line_path
 from lab.report.run.events import MOST_PICTURES, events, selected
-from lab.report.run.index import write_index
 from lab.report.run.page import write_report
 from lab.report.run.pictures import _arrow
 from lab.report.run.report_data import read_report_data

@@ -1,0 +1,1 @@
+"""The index of a batch: index.html with a row per run, thumbnails, and trends over the recording date."""
