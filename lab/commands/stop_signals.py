@@ -38,6 +38,9 @@ def stopped_by_signals() -> Iterator[None]:
             signal.signal(number, _first)
     try:
         yield
+    except StoppedBySignal:
+        remove_unfinished()  # what a signal at the entry of a block's end has left
+        raise
     finally:
         for number in ours:
             if signal.getsignal(number) == _first:  # no signal came

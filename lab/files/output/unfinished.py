@@ -19,17 +19,24 @@ def removed_at_the_end(path: Path) -> Iterator[None]:
     try:
         yield
     finally:
-        if _unfinished.get(path) == os.getpid():
-            remove(path)
-            _unfinished.pop(path, None)
+        try:
+            _remove_own(path)
+        except BaseException:  # a signal in the middle of it
+            _remove_own(path)
+            raise
+        _unfinished.pop(path, None)
 
 
 def remove_unfinished() -> None:
     """Remove all such paths of this process. For a process that ends without unwinding its blocks."""
     for _ in range(3):  # other threads may still write into the folders
-        for path, process in list(_unfinished.items()):
-            if process == os.getpid():
-                remove(path)
+        for path in list(_unfinished):
+            _remove_own(path)
+
+
+def _remove_own(path: Path) -> None:
+    if _unfinished.get(path) == os.getpid():
+        remove(path)
 
 
 def remove(path: Path) -> None:
