@@ -65,14 +65,6 @@ def _quiet_when_the_reader_has_gone() -> Iterator[None]:
         sys.exit(PIPE_CLOSED)
 
 
-def echo_or_go_on(line: str) -> None:
-    """Prints a line of a long command, which goes on where nobody reads it any more (`beampose batch ... | head`)."""
-    try:
-        click.echo(line)
-    except BrokenPipeError:
-        _to_nowhere(sys.stdout)
-
-
 def _complain(line: str) -> None:
     """Prints a line to stderr. Where it cannot be written (full disk, terminal closed), the exit status is kept.
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from lab.commands.common import ANY_PATH, FOLDER, conclude, echo_or_go_on, progress_bar, set_option
+from lab.commands.common import ANY_PATH, FOLDER, conclude, progress_bar, set_option
 
 _causal_option = click.option(
     "--causal", is_flag=True, help="No smoothing pass: attitude.csv has the poses as known at each instant."
@@ -49,7 +49,7 @@ def batch(run_folders: tuple[Path, ...], out: Path, causal: bool, settings: dict
     """
     from lab.runs.batch import process_batch
 
-    outcome = process_batch(run_folders, out, overrides=settings, causal=causal, report=echo_or_go_on)
+    outcome = process_batch(run_folders, out, overrides=settings, causal=causal, report=click.echo)
     click.echo(f"table: {outcome.table}")
     click.echo(f"index: {outcome.index}")
     sys.exit(outcome.exit_status)

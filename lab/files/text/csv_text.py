@@ -23,7 +23,6 @@ from lab.errors import InputError
 from lab.files.text.atomic_write import atomic_write_text
 from lab.files.text.csv_table import Categorical, Table
 from lab.files.text.error_text import printable_line, suggest_name
-from lab.files.text.regular_file import require_regular_file
 
 # The columns that hold words; every other column holds numbers.
 WORD_COLUMNS = ("camera", "spot", "beam", "status", "point", "screen", "date", "verdict")
@@ -60,7 +59,6 @@ def read_table(path: Path, required: Iterable[str], optional: Iterable[str] = ()
 
 def _content(path: Path, required: Sequence[str], damaged: bool) -> bytes:
     """The bytes of a table, UTF-8 text with a line or more. Raises InputError."""
-    require_regular_file(path)
     try:
         data = path.read_bytes()
     except FileNotFoundError:

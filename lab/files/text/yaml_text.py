@@ -18,7 +18,6 @@ import yaml
 from lab.errors import InputError
 from lab.files.text.atomic_write import atomic_write_text
 from lab.files.text.error_text import describe_value
-from lab.files.text.regular_file import require_regular_file
 
 
 class _StrictLoader(yaml.SafeLoader):
@@ -88,7 +87,6 @@ _OpenCVLoader.add_multi_constructor("tag:yaml.org,2002:opencv-", _construct_tagg
 
 def read_text(path: Path) -> str:
     """The text of a UTF-8 file. Raises InputError, in one line."""
-    require_regular_file(path)
     try:
         return path.read_bytes().decode("utf-8")
     except UnicodeDecodeError as error:
