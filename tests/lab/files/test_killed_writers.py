@@ -173,9 +173,9 @@ from lab.commands import stop_signals
 from lab.files.text.atomic_write import atomic_folder
 stop_signals._GRACE_S = 0.2
 with stop_signals.stopped_by_signals(), atomic_folder(Path(sys.argv[1]), lambda _: True) as work:
-    print("ready", flush=True)
     while True:
         try:
+            print("ready", flush=True)
             time.sleep(60)
         except SystemExit:
             pass
