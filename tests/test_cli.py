@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import logging
+import os
 import re
 import shlex
 import signal
@@ -25,6 +26,7 @@ from click.testing import CliRunner, Result
 from cli import main
 from lab.commands.common import PIPE_CLOSED
 from lab.errors import CalibrationError, InputError, RunError
+from lab.files.output import saved_traceback
 from lab.runs import process
 from lab.runs.batch import task as batch
 from lab.simulate.scenarios import SCENARIOS
@@ -332,6 +334,87 @@ def test_every_kind_of_error_is_a_plain_line_with_its_exit_status(tmp_path, monk
     assert done.exit_code == status
     assert done.stderr.strip() == words
     assert done.stdout.strip() == ""
+
+
+@pytest.mark.parametrize("error", [RuntimeError("an index\n\x1b[31mis wrong"), ZeroDivisionError(), EOFError("cut")])
+def test_an_unforeseen_error_is_one_line_with_the_place_of_its_traceback(tmp_path, monkeypatch, error):
+    def fail(*_, **__):
+        raise error
+
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(process, "process_run", fail)
+    for number in (1, 2):
+        done = typed("run", tmp_path, "--out", tmp_path / "out")
+        assert (done.exit_code, done.stdout) == (1, "")
+        (line,) = done.stderr.splitlines()
+        words = " ".join(f"{type(error).__name__}: {error}".replace("\x1b", " ").split()).rstrip(": ")
+        place = re.fullmatch(
+            rf"beampose: unexpected error: {re.escape(words)}; the traceback is in (.*); please report it", line
+        )
+        assert place is not None, line
+        text = Path(place[1]).read_text("utf-8")
+        assert "in fail" in text
+        assert "command: " in text
+        assert "numpy " in text
+        assert len(list((tmp_path / "cache").rglob("*.txt"))) == number  # an earlier one is kept
+
+
+def test_a_traceback_that_cannot_be_saved_is_shown(tmp_path, monkeypatch):
+    def fail(*_, **__):
+        raise RuntimeError("an index")
+
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    monkeypatch.setattr(saved_traceback.tempfile, "mkstemp", lambda **_: fail_to_write())
+    monkeypatch.setattr(process, "process_run", fail)
+    done = typed("run", tmp_path, "--out", tmp_path / "out")
+    assert done.exit_code == 1
+    assert "beampose: unexpected error: RuntimeError: an index; please report it with this traceback:" in done.stderr
+    assert "in fail" in done.stderr
+
+
+def fail_to_write() -> None:
+    raise OSError(28, "No space left on device")
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="signals of POSIX")
+@pytest.mark.parametrize("sent", ["SIGTERM", "SIGHUP"])
+def test_a_run_that_is_stopped_by_a_signal_leaves_nothing_and_says_so(tmp_path, sent):
+    simulate("smooth", tmp_path / "run", seed=5, frames=400, detections_only=True)
+    command = [sys.executable, "-P", "-c", PROGRAM, "run", "run", "--out", "out"]
+    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as running:
+        until = time.monotonic() + 120
+        while time.monotonic() < until and not list(tmp_path.glob(".out.part-*/attitude.csv")):
+            time.sleep(0.01)
+        second = typed("run", tmp_path / "run", "--out", tmp_path / "out")
+        running.send_signal(getattr(signal, sent))
+        out, errors = running.communicate(timeout=60)
+    assert second.exit_code == 2
+    assert f"in use by process {running.pid} on" in second.stderr
+    assert (running.returncode, out, errors) == (128 + getattr(signal, sent), "", f"beampose: stopped by {sent}\n")
+    assert [p.name for p in tmp_path.iterdir()] == ["run"]
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="a device of Linux")
+def test_an_error_message_that_cannot_be_written_keeps_its_exit_status(tmp_path):
+    program = shlex.join([sys.executable, "-P", "-c", PROGRAM, "check", "nowhere"])
+    assert subprocess.run(["sh", "-c", f"{program} 2>/dev/full"], cwd=tmp_path, capture_output=True).returncode == 2
+    program = shlex.join([sys.executable, "-P", "-c", PROGRAM, "run", "nowhere", "--out", "out"])
+    assert subprocess.run(["sh", "-c", f"{program} 2>/dev/full"], cwd=tmp_path, capture_output=True).returncode == 2
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="Windows has no named pipes")
+@pytest.mark.parametrize("name", ["frames/000001.png", "film.mp4"])
+def test_a_named_pipe_is_no_picture_and_nothing_waits_for_it(tmp_path, name):
+    path = tmp_path / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    os.mkfifo(path)
+    program = [sys.executable, "-P", "-c", PROGRAM, "detect", name.split("/")[0], "--out", "out"]
+    done = subprocess.run(program, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 2
+    assert 1 <= len(done.stderr.splitlines()) <= 2
+    assert "unexpected" not in done.stderr
+    assert [p.name for p in tmp_path.iterdir()] == [name.split("/")[0]]
 
 
 def test_a_failed_quality_gate_is_exit_status_4_in_summary_and_report(tmp_path):

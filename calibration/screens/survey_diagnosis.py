@@ -52,13 +52,17 @@ def diagnose_survey(
     near: Mapping[int, ApproximatePosition],
     held_screen: int | None,
     current: float,
+    progress: Callable[[int, int], None] | None = None,
 ) -> list[SurveyError]:
     """Changes with which the measurements fit much better than with the survey as it is, the best first.
 
-    current: present misfit (inf if there is no solution).
+    current: present misfit (inf if there is no solution). progress: called with the changes tried and their number.
     """
     out = []
-    for words, change in _changes(network):
+    changes = _changes(network)
+    for done, (words, change) in enumerate(changes):
+        if progress is not None:
+            progress(done, len(changes))
         trial = replace(network, control_points=replace(network.control_points, xyz=change(network.control_points.xyz)))
         misfit_now = misfit(trial, setups, near, held_screen)
         if misfit_now < 0.3 * current:

@@ -115,7 +115,9 @@ def screen(project: Path, out: Path) -> None:
     """
     from lab.calibrate.screens.screen import calibrate_screen
 
-    conclude(calibrate_screen(project, out))
+    with progress_bar("survey") as progress:
+        outcome = calibrate_screen(project, out, progress=progress)
+    conclude(outcome)
 
 
 @calibrate.command()
@@ -146,7 +148,9 @@ def rig(project: Path, out: Path) -> None:
     """
     from lab.calibrate.rig.rig import calibrate_rig
 
-    conclude(calibrate_rig(project, out))
+    with progress_bar("survey, screens and beams") as progress:
+        outcome = calibrate_rig(project, out, progress=progress)
+    conclude(outcome)
 
 
 @calibrate.command("check")

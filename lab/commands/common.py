@@ -8,10 +8,11 @@ import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import click
 
+from lab.commands.stop_signals import StoppedBySignal, stopped_by_signals
 from lab.errors import BeamposeError
 
 FOLDER = click.Path(file_okay=False, path_type=Path)
@@ -45,61 +46,106 @@ def _open_standard_streams() -> None:
             setattr(sys, name, open(os.devnull, mode, encoding="utf-8"))  # noqa: SIM115 - open until the end
 
 
+def _to_nowhere(*streams: TextIO) -> None:
+    """Connects streams to the null device: what Python has in their buffers at exit must go somewhere."""
+    null = os.open(os.devnull, os.O_WRONLY)
+    for stream in streams:
+        with contextlib.suppress(OSError, ValueError):
+            os.dup2(null, stream.fileno())
+    os.close(null)
+
+
 @contextlib.contextmanager
 def _quiet_when_the_reader_has_gone() -> Iterator[None]:
     """Ends the program without a message where the reader of stdout or stderr has gone (`beampose ... | head`)."""
     try:
         yield
     except BrokenPipeError:
-        # Python writes what is left in its buffers at exit: it must go somewhere.
-        null = os.open(os.devnull, os.O_WRONLY)
-        for stream in (sys.stdout, sys.stderr):
-            with contextlib.suppress(OSError, ValueError):
-                os.dup2(null, stream.fileno())
+        _to_nowhere(sys.stdout, sys.stderr)
         sys.exit(PIPE_CLOSED)
 
 
+def _complain(line: str) -> None:
+    """Prints a line to stderr. Where it cannot be written (full disk, terminal closed), the exit status is kept.
+
+    Raises BrokenPipeError.
+    """
+    try:
+        click.echo(f"beampose: {line}", err=True)
+    except BrokenPipeError:
+        raise
+    except OSError:
+        _to_nowhere(sys.stderr)
+
+
 class Commands(click.Group):
-    """A group whose errors (the lab's own and click's) end as one or two plain lines and an exit status."""
+    """A group whose errors (the lab's own, click's and unforeseen ones) end as plain lines and an exit status."""
 
     def main(self, *args: Any, **kwargs: Any) -> Any:
         _open_standard_streams()
         _show_log_on_a_terminal()
-        with _quiet_when_the_reader_has_gone():
-            try:
-                sys.exit(super().main(*args, **{**kwargs, "standalone_mode": False}))
-            except click.exceptions.NoArgsIsHelpError as error:
-                error.show()
-                sys.exit(error.exit_code)
-            except click.UsageError as error:
-                click.echo(f"beampose: {error.format_message()}", err=True)
-                if error.ctx:
-                    click.echo(f"Help: {error.ctx.command_path} --help", err=True)
-                sys.exit(error.exit_code)
-            except click.Abort:
-                click.echo("beampose: stopped", err=True)
-                sys.exit(1)
+        with _quiet_when_the_reader_has_gone(), _stop_is_a_line(), stopped_by_signals(), _errors_are_lines():
+            sys.exit(super().main(*args, **{**kwargs, "standalone_mode": False}))
+
+    # Here too, since click's own main turns a closed pipe into status 1 and EOFError into an interruption.
 
     def make_context(self, *args: Any, **kwargs: Any) -> click.Context:
-        with _quiet_when_the_reader_has_gone():  # --help and --version are printed here
+        with _quiet_when_the_reader_has_gone(), _errors_are_lines():  # --help and --version are printed here
             return super().make_context(*args, **kwargs)
 
     def invoke(self, ctx: click.Context) -> Any:
-        with _quiet_when_the_reader_has_gone():
-            try:
-                return super().invoke(ctx)
-            except BrokenPipeError:
-                raise
-            except BeamposeError as error:
-                click.echo(f"beampose: {error}", err=True)
-                sys.exit(error.exit_status)
-            except MemoryError:
-                click.echo("beampose: out of memory", err=True)
-                sys.exit(1)
-            except OSError as error:
-                where = f"{error.filename}: " if error.filename else ""
-                click.echo(f"beampose: {where}{error.strerror or error}", err=True)
-                sys.exit(1)
+        with _quiet_when_the_reader_has_gone(), _errors_are_lines():
+            return super().invoke(ctx)
+
+
+@contextlib.contextmanager
+def _stop_is_a_line() -> Iterator[None]:
+    """Says that a signal ended the command."""
+    try:
+        yield
+    except StoppedBySignal as stop:
+        _complain(f"stopped by {stop.name}")
+        raise
+
+
+@contextlib.contextmanager
+def _errors_are_lines() -> Iterator[None]:
+    """Turns exceptions into lines on stderr and an exit status."""
+    try:
+        yield
+    except click.exceptions.Exit:
+        raise
+    except click.exceptions.NoArgsIsHelpError as error:
+        error.show()
+        sys.exit(error.exit_code)
+    except click.UsageError as error:
+        _complain(error.format_message())
+        if error.ctx:
+            click.echo(f"Help: {error.ctx.command_path} --help", err=True)
+        sys.exit(error.exit_code)
+    except click.ClickException as error:
+        _complain(error.format_message())
+        sys.exit(error.exit_code)
+    except (click.Abort, KeyboardInterrupt):
+        _complain("stopped")
+        sys.exit(1)
+    except BeamposeError as error:
+        _complain(str(error))
+        sys.exit(error.exit_status)
+    except MemoryError:
+        _complain("out of memory")
+        sys.exit(1)
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        where = f"{error.filename}: " if error.filename else ""
+        _complain(f"{where}{error.strerror or error}")
+        sys.exit(1)
+    except Exception as error:
+        from lab.files.output.saved_traceback import unexpected_error  # only where there is one
+
+        _complain(unexpected_error(error))
+        sys.exit(1)
 
 
 def read_settings(ctx: click.Context, parameter: click.Parameter, values: Sequence[str]) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from lab.commands.common import ANY_PATH, FOLDER
+from lab.commands.common import ANY_PATH, FOLDER, progress_bar
 from lab.errors import InputError
 
 
@@ -22,7 +22,8 @@ def check(path: Path) -> None:
     """
     from lab.runs.input_check.check import check as check_path
 
-    result = check_path(path)
+    with progress_bar(path.name) as progress:
+        result = check_path(path, progress)
     for line in result.lines:
         click.echo(line)
     sys.exit(result.exit_status)

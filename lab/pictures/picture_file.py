@@ -6,6 +6,7 @@ verified where a format has them. Libraries do not write about damage to standar
 
 from __future__ import annotations
 
+import os
 import re
 import struct
 from dataclasses import dataclass
@@ -61,10 +62,15 @@ def require_format(picture: NDArray[np.generic], size_px: tuple[int, int] | None
     return cast(GreyPicture, picture)
 
 
+def _without_waiting(path: str, flags: int) -> int:
+    """Opens a file; a named pipe, too, at once (it would wait for a writer, perhaps for ever)."""
+    return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
+
+
 def _content(path: Path) -> NDArray[np.uint8]:
     """The bytes of a file; writing to them does not change the file. Raises OSError."""
-    with open(path, "rb", buffering=0) as file:
-        size = file.seek(0, 2)
+    with open(path, "rb", buffering=0, opener=_without_waiting) as file:
+        size = file.seek(0, 2)  # OSError for a pipe
         if size > _LARGE_BYTES:
             return np.memmap(file, np.uint8, "c", shape=(size,))
         file.seek(0)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 import socket
 import time
@@ -15,7 +14,7 @@ import numpy as np
 
 from lab.errors import InputError
 from lab.files.text import columns
-from lab.files.text.atomic_write import replace_folder
+from lab.files.text.atomic_write import replacement_within
 from lab.files.text.json_text import plain_value
 from lab.runs.frames.pipeline import FrameRecord
 from lab.runs.tables import attitude_rows, pose_numbers
@@ -142,12 +141,9 @@ class LiveOutput:
 
     def _opened(self) -> TextIO:
         """Open the live table in its own folder, which replaces earlier results."""
-        new = self.out.parent / f".{self.out.name}.live-{os.getpid()}"
-        shutil.rmtree(new, ignore_errors=True)
-        new.mkdir(parents=True)
-        file = (new / LIVE_TABLE).open("w+", encoding="utf-8", newline="")
-        file.write(",".join(columns.ATTITUDE) + "\n")
-        replace_folder(new, self.out)
+        with replacement_within(self.out) as new:
+            file = (new / LIVE_TABLE).open("w+", encoding="utf-8", newline="")
+            file.write(",".join(columns.ATTITUDE) + "\n")
         return file
 
 

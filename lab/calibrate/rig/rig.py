@@ -25,7 +25,7 @@ from lab.calibrate.calibration_date import calibration_date, expiry_date, expiry
 from lab.calibrate.rig.rig_outcome import RigOutcome
 from lab.calibrate.rig.rig_tables import RESIDUALS, write_residuals
 from lab.calibrate.screens.screen_inputs import ScreenInputs, screen_inputs
-from lab.calibrate.screens.survey_check import adjusted_screens, survey_findings
+from lab.calibrate.screens.survey_check import SearchProgress, adjusted_screens, survey_findings
 from lab.errors import CalibrationError, InputError
 from lab.files.project.project import load_project
 from lab.files.project.project_types import Project
@@ -41,13 +41,18 @@ _NO_SIGMA_LIMITS = BeamGoals(direction=np.inf, direction_unusable=np.inf, wrong_
 
 
 def calibrate_rig(
-    project_path: Path, out: Path, today: datetime.date | None = None, limits: RigLimits | None = None
+    project_path: Path,
+    out: Path,
+    today: datetime.date | None = None,
+    limits: RigLimits | None = None,
+    *,
+    progress: SearchProgress | None = None,
 ) -> RigOutcome:
     """Calibrate a whole rig; write rig.yaml, residuals.csv and report.html into the folder `out`.
 
     rig.yaml holds the verdict and the joint covariance of all parameters (in the target's block; cameras and screens
     hold their own parts of it). If the verdict is FAIL, the file is called rig.failed.yaml; a FAIL never replaces an
-    earlier calibration, its results go to `OUT-failed`.
+    earlier calibration, its results go to `OUT-failed`. progress: of the search for a mistake in a survey.
 
     Raises:
         InputError: for errors in the files.
@@ -65,7 +70,7 @@ def calibrate_rig(
     inputs = screen_inputs(project)
     rig = replace(inputs.network.rig, beams=project.beams, spots=project.spots)
     inputs = replace(inputs, network=replace(inputs.network, rig=rig))
-    screens = adjusted_screens(project, inputs)
+    screens = adjusted_screens(project, inputs, progress)
     recordings = _recordings(project, screens.fit.rig)
     steps = _solved(project, screens, recordings)
     joint = steps.joint

@@ -17,7 +17,7 @@ from geometry.rig import Rig
 from lab.calibrate.calibration_date import calibration_date, expiry_date, expiry_findings
 from lab.calibrate.screens.screen_inputs import screen_inputs
 from lab.calibrate.screens.screen_tables import DOTS, RESIDUALS, write_tables
-from lab.calibrate.screens.survey_check import adjusted_screens, survey_findings
+from lab.calibrate.screens.survey_check import SearchProgress, adjusted_screens, survey_findings
 from lab.errors import CalibrationError
 from lab.files.project.project import load_project
 from lab.files.project.project_types import Project
@@ -63,12 +63,14 @@ def _counted(n: int, what: str) -> str:
     return f"{n} {what}{'' if n == 1 else 's'}"
 
 
-def calibrate_screen(project_path: Path, out: Path, today: datetime.date | None = None) -> ScreensOutcome:
+def calibrate_screen(
+    project_path: Path, out: Path, today: datetime.date | None = None, *, progress: SearchProgress | None = None
+) -> ScreensOutcome:
     """Calibrate the screens and the poses of the cameras of a project.
 
     Writes into `out`: screens.yaml; rig.yaml with the nominal beams, if the project has a target; residuals.csv,
     dots.csv and report.html. If the verdict is FAIL, no YAML file is written and an earlier calibration is kept: the
-    results go to `OUT-failed`.
+    results go to `OUT-failed`. progress: of the search for a mistake in a survey that does not fit.
 
     Raises:
         InputError: for errors in the files.
@@ -78,7 +80,7 @@ def calibrate_screen(project_path: Path, out: Path, today: datetime.date | None 
     project = load_project(Path(project_path))
     day = calibration_date(project, today)
     inputs = screen_inputs(project)
-    result = adjusted_screens(project, inputs)
+    result = adjusted_screens(project, inputs, progress)
     placed = near_findings(result, inputs.near)
     found = [
         *placed,

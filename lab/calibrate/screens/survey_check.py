@@ -5,7 +5,8 @@ The pixels alone cannot detect a rotated or mirrored world frame; `calibrate scr
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import TypeAlias
 
 import numpy as np
 
@@ -18,12 +19,15 @@ from lab.calibrate.screens.screen_inputs import ScreenInputs
 from lab.errors import CalibrationError, InputError
 from lab.files.project.project_types import Project
 
+SearchProgress: TypeAlias = Callable[[int, int], None]
 _SUSPICIOUS_MISFIT = 4.0  # misfit (see survey_diagnosis.py) above which swapped axes and wrong units are tested
 _ACCEPTED_MISFIT = 2.0  # misfit below which a change to the survey is accepted as the explanation
 
 
-def adjusted_screens(project: Project, inputs: ScreenInputs) -> ScreensResult:
+def adjusted_screens(project: Project, inputs: ScreenInputs, progress: SearchProgress | None = None) -> ScreensResult:
     """Adjust cameras and screens to the survey; if they do not fit, find the mistake in the survey.
+
+    progress: called with the number of changes to the survey that have been tried, and of all.
 
     Raises:
         InputError: for a survey that fits with other axes, signs or units, or parts without common measurements.
@@ -39,7 +43,7 @@ def adjusted_screens(project: Project, inputs: ScreenInputs) -> ScreensResult:
         problem = error
     enough = len(inputs.network.point_observations) >= 4
     if enough and misfit > _SUSPICIOUS_MISFIT and not _too_few_points(problem):
-        changes = diagnose_survey(inputs.network, inputs.setups, inputs.near, inputs.held_screen, misfit)
+        changes = diagnose_survey(inputs.network, inputs.setups, inputs.near, inputs.held_screen, misfit, progress)
         explanations = [c for c in changes if c.factor < _ACCEPTED_MISFIT]
         if explanations:
             raise InputError(_explained(where, explanations))

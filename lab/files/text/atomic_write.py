@@ -1,14 +1,22 @@
-"""Atomic writing: a result folder or a file is either complete or as it was before."""
+"""Atomic writing: a result folder or a file is either complete or as it was before.
+
+What a killed process leaves (a hidden part folder or file) is removed by the next one that writes to the same place.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import os
-import shutil
+import re
+import secrets
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from lab.errors import InputError
+from lab.files.output.folder_lock import folder_lock, is_at, lock
+from lab.files.output.part_folder import part_folder, recover, replace_folder
+from lab.files.output.unfinished import removed_at_the_end
 
 _REMEDIES = {
     IsADirectoryError: "; name a file in it",
@@ -26,17 +34,44 @@ def atomic_write_text(text: str, path: Path) -> None:
 def atomic_write_bytes(content: bytes, path: Path) -> None:
     """Write a file so that `path` is either the whole new file or what it was before. Raises InputError."""
     path = Path(path)
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        with part.open("wb") as file:
+        while not _written(content, path):
+            pass  # another process has taken the part for one that was left
+    except OSError as error:
+        remedy = next((text for kind, text in _REMEDIES.items() if isinstance(error, kind)), "")
+        raise InputError(f"{path}: cannot be written: {error.strerror}{remedy}") from None
+    _remove_left_parts(path)
+
+
+def _written(content: bytes, path: Path) -> bool:
+    """Write a file under another name, locked while it is incomplete, and rename it. Raises OSError."""
+    part = path.with_name(f".{path.name}.{secrets.token_hex(8)}.part")
+    with removed_at_the_end(part):
+        with part.open("xb") as file:
+            try:
+                held = lock(file.fileno())
+            except BlockingIOError:
+                return False
+            if held and not is_at(file.fileno(), part):
+                return False
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
-        part.replace(path)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        remedy = next((text for kind, text in _REMEDIES.items() if isinstance(error, kind)), "")
-        raise InputError(f"{path}: cannot be written: {error.strerror}{remedy}") from None
+            if held:
+                part.replace(path)
+        if not held:  # Windows renames no open file
+            part.replace(path)
+    return True
+
+
+def _remove_left_parts(path: Path) -> None:
+    """Remove part files of processes that were killed: those that can be locked."""
+    name = re.compile(rf"\.{re.escape(path.name)}\.[0-9a-f]+\.part")
+    with contextlib.suppress(OSError):
+        for part in [p for p in path.parent.iterdir() if name.fullmatch(p.name)]:
+            with contextlib.suppress(OSError), part.open("rb") as file:
+                if lock(file.fileno()):
+                    part.unlink()
 
 
 def check_output_folder(target: Path, may_replace: Callable[[Path], bool]) -> None:
@@ -49,11 +84,15 @@ def check_output_folder(target: Path, may_replace: Callable[[Path], bool]) -> No
         raise InputError(f"{target}: expected a folder for the results, found a broken link; choose another --out")
     if target.exists() and not target.is_dir():
         raise InputError(f"{target}: expected a folder for the results, found a file; choose another --out")
+    if target.is_mount():
+        raise InputError(
+            f"{target}: expected a folder that can be replaced, found a mounted volume; name a folder in it"
+        )
     above = next(p for p in (target, *target.absolute().parents) if p.exists())
     if not above.is_dir():
         raise InputError(f"{target}: the folder cannot be made: {above} is a file; choose another --out")
     # An existing target is replaced by a rename, which needs write permission in its parent.
-    place = target.absolute().parent if above == target else above
+    place = _place_of(target).parent if above == target else above
     if not os.access(place, os.W_OK | os.X_OK):
         raise InputError(
             f"{target}: the folder cannot be made: no write permission in {place}; choose another --out, or request"
@@ -67,41 +106,40 @@ def check_output_folder(target: Path, may_replace: Callable[[Path], bool]) -> No
 def atomic_folder(target: Path, may_replace: Callable[[Path], bool]) -> Iterator[Path]:
     """Yields an empty folder beside `target`. It replaces `target` when the block succeeds and is deleted otherwise.
 
-    An existing target is replaced only if it is empty or `may_replace(target)` is true.
+    An existing target is replaced only if it is empty or `may_replace(target)` is true. Until the block ends, nothing
+    else can write to `target`. What killed processes left there is put back or removed.
 
     Raises:
-        InputError: the folder cannot be made, or `target` holds something that must not be deleted.
+        InputError: the folder cannot be made, another process writes to it, or `target` holds something that must not
+            be deleted.
     """
-    target = Path(target)
     check_output_folder(target, may_replace)
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        work = target.parent / f".{target.name}.part-{os.getpid()}"
-        shutil.rmtree(work, ignore_errors=True)
-        work.mkdir()
-    except OSError as error:
-        raise InputError(f"{target}: the folder cannot be made: {error.strerror}; choose another --out") from None
-    try:
+    place = _place_of(target)
+    with contextlib.ExitStack() as stack:
+        try:
+            place.parent.mkdir(parents=True, exist_ok=True)
+            if stack.enter_context(folder_lock(place, str(target))):
+                recover(place)
+            check_output_folder(target, may_replace)
+            work = stack.enter_context(part_folder(place))
+        except OSError as error:
+            raise InputError(f"{target}: the folder cannot be made: {error.strerror}; choose another --out") from None
         yield work
-        replace_folder(work, target)
-    except BaseException:
-        shutil.rmtree(work, ignore_errors=True)
-        raise
+        replace_folder(work, place)
 
 
-def replace_folder(work: Path, target: Path) -> None:
-    """Rename `work` to `target`. An old target is renamed first, restored if the second rename fails, then deleted."""
-    if not target.exists():
-        work.rename(target)
-        return
-    old = target.parent / f".{target.name}.old-{os.getpid()}"
-    target.rename(old)
-    try:
-        work.rename(target)
-    except OSError:
-        old.rename(target)
-        raise
-    shutil.rmtree(old, ignore_errors=True)
+@contextmanager
+def replacement_within(target: Path) -> Iterator[Path]:
+    """As `atomic_folder`, for its holder: replaces `target` before the end of the work. Raises OSError."""
+    place = _place_of(target)
+    with part_folder(place) as work:
+        yield work
+        replace_folder(work, place)
+
+
+def _place_of(target: Path) -> Path:
+    """The absolute path of a folder, without links: its name and the folder in which it is replaced."""
+    return Path(os.path.realpath(target))
 
 
 def keep_good_results(target: Path, failed: bool, good: str) -> Path:

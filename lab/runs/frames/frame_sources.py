@@ -14,6 +14,7 @@ import numpy as np
 from geometry.arrays import Ints
 from lab.errors import InputError
 from lab.files.run.detections_file import CameraPoints
+from lab.files.text.regular_file import require_regular_file
 from lab.pictures.opencv import load_cv2
 from lab.pictures.picture_file import (
     DROPPED,
@@ -207,6 +208,7 @@ def open_video(path: Path) -> cv2.VideoCapture:
     Raises:
         InputError: OpenCV cannot read it.
     """
+    require_regular_file(path)
     cv2 = load_cv2()
     capture = cv2.VideoCapture(str(path))
     if not capture.isOpened():

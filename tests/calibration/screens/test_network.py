@@ -245,7 +245,12 @@ def test_approximate_camera_positions_reveal_exchanged_axes_and_wrong_units(spoi
     spoilt = replace(network, control_points=replace(network.control_points, xyz=spoil(network.control_points.xyz)))
     result = calibrate(spoilt, PLAIN, near_truth())
     assert any(f.level == Level.FAIL for f in near_findings(result, near_truth()))
-    found = diagnose_survey(spoilt, PLAIN, near_truth(), None, misfit_of(result, near_truth()))
+    tried: list[tuple[int, int]] = []
+    found = diagnose_survey(
+        spoilt, PLAIN, near_truth(), None, misfit_of(result, near_truth()), lambda *done: tried.append(done)
+    )
+    assert tried == [(k, len(tried)) for k in range(len(tried))]
+    assert tried
     assert found[0].words == words
     assert found[0].factor < 2 < found[1].factor
 

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import errno
 import importlib
 import os
+import stat
+import sys
 from pathlib import Path
 
 import pytest
 
 from lab.errors import InputError
-from lab.files.text.atomic_write import atomic_folder, check_output_folder, keep_good_results
+from lab.files.output import folder_lock, part_folder
+from lab.files.text.atomic_write import atomic_folder, atomic_write_text, check_output_folder, keep_good_results
 
 
 def never(folder: Path) -> bool:
@@ -123,12 +127,141 @@ def test_a_parent_that_is_a_file_is_a_plain_error(tmp_path):
 
 
 def test_the_working_folder_of_a_killed_run_is_removed(tmp_path):
-    left = tmp_path / f".results.part-{os.getpid()}"
-    left.mkdir()
-    (left / "a.csv").write_text("half of long ago")
+    for left in (".results.part-4711", ".results.part-00ff", ".results.old-00ff"):
+        (tmp_path / left).mkdir()
+        (tmp_path / left / "a.csv").write_text("half of long ago")
+    (tmp_path / "results").mkdir()
+    (tmp_path / ".results.beampose-lock").write_text("of a process that was killed")
     with atomic_folder(tmp_path / "results", never) as work:
         (work / "b.csv").write_text("1")
     assert names(tmp_path / "results") == ["b.csv"]
+    assert names(tmp_path) == ["results"]
+
+
+def test_parts_of_other_targets_with_a_similar_name_are_kept(tmp_path):
+    others = [".results-2.part-00ff", ".results.part-1.part-00ff", ".results.backup"]
+    for other in others:
+        (tmp_path / other).mkdir()
+    with atomic_folder(tmp_path / "results", never):
+        pass
+    assert names(tmp_path) == sorted([*others, "results"])
+
+
+def test_results_between_the_two_renames_are_put_back_at_the_next_start(tmp_path):
+    (tmp_path / ".results.old-00ff").mkdir()
+    (tmp_path / ".results.old-00ff" / "good.csv").write_text("1")
+
+    def fail():
+        with atomic_folder(tmp_path / "results", always):
+            raise ValueError("again")
+
+    with pytest.raises(ValueError, match="again"):
+        fail()
+    assert names(tmp_path) == ["results"]
+    assert names(tmp_path / "results") == ["good.csv"]
+
+
+@pytest.mark.parametrize("can_exchange", [True, False])
+def test_an_old_target_is_replaced_with_and_without_an_exchange_of_folders(tmp_path, monkeypatch, can_exchange):
+    if not can_exchange:
+        monkeypatch.setattr(part_folder, "exchange", lambda one, other: False)
+    target = tmp_path / "results"
+    for number in "12":
+        with atomic_folder(target, always) as work:
+            (work / number).write_text(number)
+        assert names(target) == [number]
+        assert names(tmp_path) == ["results"]
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="renameat2 is a call of Linux")
+def test_two_folders_are_exchanged_in_one_step(tmp_path):
+    for name in ("one", "other"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / name).write_text(name)
+    assert part_folder.exchange(tmp_path / "one", tmp_path / "other")
+    assert (names(tmp_path / "one"), names(tmp_path / "other")) == (["other"], ["one"])
+    assert not part_folder.exchange(tmp_path / "one", tmp_path / "nothing")
+
+
+def test_a_second_writer_is_refused_and_disturbs_nothing(tmp_path):
+    target, alias = tmp_path / "results", tmp_path / "alias"
+    alias.symlink_to(target)
+    with atomic_folder(target, never) as work:
+        target.mkdir()
+        for place in (target, alias):
+            with (
+                pytest.raises(
+                    InputError, match=rf"{place}: .* in use by process {os.getpid()} on .*; wait for its end"
+                ),
+                atomic_folder(place, never),
+            ):
+                pytest.fail("the block must not begin")
+        (work / "a.csv").write_text("1")
+    assert names(target) == ["a.csv"]
+    assert names(tmp_path) == ["alias", "results"]
+
+
+def test_a_link_to_a_folder_remains_and_the_folder_is_replaced(tmp_path):
+    (tmp_path / "disk" / "real").mkdir(parents=True)
+    link = tmp_path / "results"
+    link.symlink_to(tmp_path / "disk" / "real")
+    with atomic_folder(link, never) as work:
+        (work / "a.csv").write_text("1")
+    assert link.is_symlink()
+    assert names(tmp_path / "disk" / "real") == ["a.csv"]
+    assert names(tmp_path / "disk") == ["real"]
+
+
+def test_a_file_system_without_locks_is_used_without_them_and_nothing_is_swept(tmp_path, monkeypatch):
+    def unsupported(*_):
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(folder_lock.fcntl, "flock", unsupported)
+    (tmp_path / ".results.part-00ff").mkdir()  # perhaps of a living process: it cannot be known
+    with atomic_folder(tmp_path / "results", never) as work:
+        (work / "a.csv").write_text("1")
+    assert names(tmp_path / "results") == ["a.csv"]
+    assert ".results.part-00ff" in names(tmp_path)
+    atomic_write_text("1", tmp_path / "b.csv")
+    assert (tmp_path / "b.csv").read_text() == "1"
+
+
+def test_the_folder_has_the_usual_permissions(tmp_path):
+    before = os.umask(0o027)
+    try:
+        with atomic_folder(tmp_path / "results", never):
+            pass
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE((tmp_path / "results").stat().st_mode) == 0o750
+
+
+def test_part_files_of_killed_processes_are_removed_and_those_of_living_ones_kept(tmp_path):
+    target = tmp_path / "batch.csv"
+    dead, alive, other = (tmp_path / f".{name}.part" for name in ("batch.csv.00ff", "batch.csv.11ff", "runs.csv.00ff"))
+    for path in (dead, alive, other):
+        path.write_text("half")
+    with alive.open("rb") as file:
+        assert folder_lock.lock(file.fileno())
+        atomic_write_text("1", target)
+        assert names(tmp_path) == sorted([alive.name, other.name, target.name])
+    atomic_write_text("2", target)
+    assert names(tmp_path) == sorted([other.name, target.name])
+    assert target.read_text() == "2"
+
+
+def test_a_part_file_that_another_process_took_for_a_left_one_is_written_again(tmp_path, monkeypatch):
+    answers = iter([BlockingIOError(), None])
+
+    def taken_once(*_):
+        answer = next(answers, None)
+        if answer is not None:
+            raise answer
+
+    monkeypatch.setattr(folder_lock.fcntl, "flock", taken_once)
+    atomic_write_text("1", tmp_path / "a.csv")
+    assert (tmp_path / "a.csv").read_text() == "1"
+    assert names(tmp_path) == ["a.csv"]
 
 
 def test_old_results_are_restored_when_the_last_rename_fails(tmp_path, monkeypatch):
@@ -145,6 +278,7 @@ def test_old_results_are_restored_when_the_last_rename_fails(tmp_path, monkeypat
     def replace_it():
         with atomic_folder(target, always) as work:
             (work / "new").write_text("1")
+            monkeypatch.setattr(part_folder, "exchange", lambda one, other: False)
             monkeypatch.setattr(Path, "rename", broken)
 
     with pytest.raises(OSError, match="No space left"):

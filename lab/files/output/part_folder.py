@@ -1,0 +1,76 @@
+"""The part folder of a result: filled beside its target, then put in the target's place in one step.
+
+Names are unique (`.results.part-<random>`), since processes in two containers may have the same number. Where the
+system can exchange two folders (Linux: renameat2), the target is never missing. Elsewhere two renames replace it; a
+process that is killed between them leaves the earlier results as `.results.old-<random>`, and `recover` puts them back.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import re
+import secrets
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from lab.files.output.unfinished import remove, removed_at_the_end
+
+_AT_FDCWD, _RENAME_EXCHANGE = -100, 2  # linux/fcntl.h, linux/fs.h
+
+
+@contextmanager
+def part_folder(target: Path) -> Iterator[Path]:
+    """Yields a new empty folder beside `target`, removed when the block ends unless it was renamed. Raises OSError."""
+    work = target.parent / f".{target.name}.part-{secrets.token_hex(8)}"
+    with removed_at_the_end(work):
+        work.mkdir()
+        yield work
+
+
+def replace_folder(work: Path, target: Path) -> None:
+    """Put the part folder `work` in the place of `target`. An old target gets the name `work`, for its removal.
+
+    If that fails, `target` is as it was before. Raises OSError.
+    """
+    if not target.exists():
+        work.rename(target)
+    elif not exchange(work, target):
+        old = target.parent / f".{target.name}.old-{secrets.token_hex(8)}"
+        try:
+            target.rename(old)
+            work.rename(target)
+        except BaseException:  # also a signal
+            if old.exists() and not target.exists():
+                old.rename(target)
+            raise
+        old.rename(work)  # now it is no longer what `recover` looks for
+
+
+def exchange(one: Path, other: Path) -> bool:
+    """Exchange two folders in one step. False: the system or the file system cannot, and nothing has changed."""
+    if not sys.platform.startswith("linux"):
+        return False
+    rename = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
+    if rename is None:
+        return False
+    paths = [ctypes.c_char_p(os.fsencode(path)) for path in (one, other)]
+    return bool(rename(_AT_FDCWD, paths[0], _AT_FDCWD, paths[1], ctypes.c_uint(_RENAME_EXCHANGE)) == 0)
+
+
+def recover(target: Path) -> None:
+    """Put back results that a killed process has renamed, and remove what killed processes left of theirs.
+
+    Only for the holder of the target's lock: nobody else writes here now. Raises OSError.
+    """
+    name = re.compile(rf"\.{re.escape(target.name)}\.(part|old|live)-[0-9a-f]+")
+    left = [path for path in target.parent.iterdir() if name.fullmatch(path.name)]
+    old = [path for path in left if ".old-" in path.name.removeprefix(f".{target.name}")]
+    if old and not target.exists():
+        last = max(old, key=lambda path: path.lstat().st_ctime_ns)
+        last.rename(target)
+        left.remove(last)
+    for path in left:
+        remove(path)

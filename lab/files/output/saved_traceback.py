@@ -1,0 +1,79 @@
+"""An exception that the program did not foresee: its traceback is saved to a file, and a line says where."""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import os
+import platform
+import sys
+import tempfile
+import traceback
+from pathlib import Path
+
+_LONGEST = 300  # characters of an exception's text in a line
+
+
+def unexpected_error(error: BaseException) -> str:
+    """Save the traceback of an unforeseen exception. Returns one line about it, with the place of the file.
+
+    Where no file can be written, the traceback itself follows the line.
+    """
+    report = _report(error)
+    words = "".join(c if c.isprintable() else " " for c in f"{type(error).__name__}: {_text(error)}")
+    words = " ".join(words.split()).rstrip(": ")
+    words = words if len(words) <= _LONGEST else f"{words[: _LONGEST - 4]} ..."
+    place = _save(report)
+    if place is None:
+        return f"unexpected error: {words}; please report it with this traceback:\n{report}"
+    return f"unexpected error: {words}; the traceback is in {place}; please report it"
+
+
+def _text(error: BaseException) -> str:
+    try:
+        return str(error)
+    except Exception:  # a class whose own __str__ fails
+        return "(no text)"
+
+
+def _report(error: BaseException) -> str:
+    """The traceback, and what is needed to repeat the command."""
+    from lab.versions import versions  # reads the installed packages: only needed here
+
+    try:
+        installed = ", ".join(f"{name} {number}" for name, number in versions().items())
+    except Exception:  # the report is written in any case
+        installed = "unknown"
+    try:
+        trace = "".join(traceback.format_exception(error))
+    except Exception:
+        trace = f"{type(error).__name__} (its traceback cannot be shown)\n"
+    now = datetime.datetime.now().astimezone().isoformat(sep=" ", timespec="seconds")
+    lines = (
+        f"time: {now}",
+        f"command: {' '.join(map(repr, sys.argv[1:]))}",
+        f"system: {platform.platform()}, Python {platform.python_version()}",
+        f"versions: {installed}",
+    )
+    return "\n".join((*lines, "", trace))
+
+
+def _save(report: str) -> Path | None:
+    """Write a report to a new file: in the user's cache folder, else the one for temporary files, else here."""
+    places = []
+    with contextlib.suppress(RuntimeError):  # no home folder
+        places.append(Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()) / "beampose" / "errors")
+    with contextlib.suppress(OSError):
+        places.append(Path(tempfile.gettempdir()))
+    for place in (*places, Path.cwd()):
+        try:
+            place.mkdir(parents=True, exist_ok=True)
+            number, name = tempfile.mkstemp(
+                prefix=f"beampose-error-{datetime.date.today().isoformat()}-", suffix=".txt", dir=place
+            )
+            with open(number, "w", encoding="utf-8", errors="backslashreplace") as file:
+                file.write(report)
+        except OSError:
+            continue
+        return Path(name)
+    return None
