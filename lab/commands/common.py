@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import math
 import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -13,10 +14,26 @@ from typing import Any
 import click
 
 from lab.errors import BeamposeError
+from lab.files.text.error_text import printable
 
 FOLDER = click.Path(file_okay=False, path_type=Path)
 ANY_PATH = click.Path(path_type=Path)
 PIPE_CLOSED = 141  # 128 + SIGPIPE: the status that a shell reports for a program whose reader has gone
+
+
+class NumberRange(click.FloatRange):
+    """A finite number in a range; click's own range accepts nan."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        number = super().convert(value, param, ctx)
+        if not math.isfinite(number):
+            self.fail(f"expected a finite number, got {value}.", param, ctx)
+        return number
+
+
+def show_line(text: str) -> None:
+    """Prints a line on stdout; names of files and runs in it must not control the terminal."""
+    click.echo(printable(text))
 
 
 class _StderrHandler(logging.Handler):
@@ -72,7 +89,7 @@ class Commands(click.Group):
                 error.show()
                 sys.exit(error.exit_code)
             except click.UsageError as error:
-                click.echo(f"beampose: {error.format_message()}", err=True)
+                click.echo(printable(f"beampose: {error.format_message()}"), err=True)
                 if error.ctx:
                     click.echo(f"Help: {error.ctx.command_path} --help", err=True)
                 sys.exit(error.exit_code)
@@ -91,14 +108,14 @@ class Commands(click.Group):
             except BrokenPipeError:
                 raise
             except BeamposeError as error:
-                click.echo(f"beampose: {error}", err=True)
+                click.echo(printable(f"beampose: {error}"), err=True)
                 sys.exit(error.exit_status)
             except MemoryError:
                 click.echo("beampose: out of memory", err=True)
                 sys.exit(1)
             except OSError as error:
                 where = f"{error.filename}: " if error.filename else ""
-                click.echo(f"beampose: {where}{error.strerror or error}", err=True)
+                click.echo(printable(f"beampose: {where}{error.strerror or error}"), err=True)
                 sys.exit(1)
 
 
@@ -149,5 +166,5 @@ def progress_bar(name: str) -> Iterator[Callable[..., None] | None]:
 
 def conclude(outcome: Any) -> None:
     """Prints an outcome and ends with its exit status."""
-    click.echo(outcome.line())
+    show_line(outcome.line())
     sys.exit(outcome.exit_status)

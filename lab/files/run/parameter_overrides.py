@@ -15,9 +15,9 @@ def with_overrides(parameters: TrackerParameters, overrides: Mapping[str, Any]) 
     content = dataclasses.asdict(parameters)
     for name, value in overrides.items():
         *blocks, last = name.split(".")
-        inner = content
+        inner: Any = content
         for block in blocks:
-            inner = inner.setdefault(block, {})
+            inner = inner.get(block)
             if not isinstance(inner, dict):
                 break
         else:

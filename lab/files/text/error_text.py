@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Iterable, Mapping
 
 from lab.errors import InputError
@@ -42,6 +43,20 @@ def describe_value(value: object) -> str:
     if len(text) > 50 and isinstance(value, list):
         return f"a list of {len(value)}"
     return text if len(text) <= 50 else text[:46] + " ..."
+
+
+def is_formula(text: str) -> bool:
+    """Whether a spreadsheet may read this text as a formula that calls something.
+
+    `=` and `@` begin one. So do `+` and `-`, but a sign with letters and digits only (`+x`, `-12.5`) calls nothing.
+    """
+    start = text.lstrip()[:1]
+    return start in ("=", "@") or (start in ("+", "-") and re.fullmatch(r"[\w.+-]*", text.strip()) is None)
+
+
+def printable(text: str) -> str:
+    """A text without characters that control a terminal or that have no UTF-8 form; line breaks stay."""
+    return "".join(c if c.isprintable() or c == "\n" else "?" for c in text)
 
 
 def printable_line(line: str) -> str:
