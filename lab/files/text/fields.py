@@ -65,8 +65,10 @@ def number_between(least: float, largest: float, unit: str) -> Callable[[Any], f
     """A validator of numbers from `least` to `largest`."""
 
     def check(value: Any) -> float:
-        if not _is_number(value) or not least <= value <= largest:
-            raise unexpected_value(f"a number above 0, from {least:g} to {largest:g} {unit}", value)
+        if not _is_number(value) or (least > 0 >= value):
+            raise unexpected_value("a number above 0" if least > 0 else "a finite number", value)
+        if not least <= value <= largest:
+            raise unexpected_value(f"{least:g} to {largest:g} {unit}", value)
         return float(value)
 
     return check

@@ -245,7 +245,7 @@ BROKEN = [
     (
         f"camera_from_world: {{{QUATERNION}, translation_m: [0, 0.4, 0]}}",
         "camera_from_world: [1, 2]",
-        "cameras.left.camera_from_world: expected a mapping with quaternion_wxyz, translation_m, got a list",
+        "cameras.left.camera_from_world: expected a mapping with quaternion_wxyz, translation_m, got [1, 2]",
     ),
     (
         "noise: {gain_e_per_dn: 38.0",
@@ -347,12 +347,12 @@ def test_the_first_of_several_mistakes_is_shown_and_the_rest_counted(old, new, w
     [
         ("", "rig.yaml: expected `key: value` lines, got nothing"),
         ("- 1\n- 2\n", "rig.yaml: expected `key: value` lines, got a list"),
-        ("just words", "rig.yaml: expected `key: value` lines, got 'just words'"),
+        ("just words", "rig.yaml: expected `key: value` lines, got other text"),
         ("a: 1\n---\nb: 2\n", "rig.yaml: line 2: expected YAML, found another document"),
         ("a: *nothing\n", "rig.yaml: line 1: expected YAML, found undefined alias 'nothing'"),
-        ("a: !!python/object/apply:os.getcwd []\n", "rig.yaml: line 1: expected YAML, found could not determine"),
+        ("a: !!python/object/apply:os.getcwd []\n", "rig.yaml: line 1: expected YAML, found a tag of another program"),
         ("\x00", "rig.yaml: expected YAML, found unacceptable character"),
-        ("[" * 5000, "rig.yaml: expected YAML, found a nesting too deep to read"),
+        ("[" * 5000, "rig.yaml: line 1: expected YAML, found a nesting deeper than 60 levels"),
     ],
 )
 def test_a_file_that_is_not_a_rig_is_refused(text, words, tmp_path):
