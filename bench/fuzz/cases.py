@@ -54,7 +54,7 @@ def _project(work: Path, base: Path, rng: random.Random) -> list[str]:
 def _drift(work: Path, base: Path, rng: random.Random) -> list[str]:
     """A drift check with damaged points or survey."""
     shutil.copytree(base / "calibration", work / "in")
-    shutil.copy(base / "points" / "rig.yaml", work / "in" / "rig.yaml")
+    shutil.copy(base / "calibration" / "truth" / "rig.yaml", work / "in" / "rig.yaml")
     damage_file(work / "in" / rng.choice(("points.csv", "survey.csv", "rig.yaml")), rng)
     inputs = ["--points", str(work / "in" / "points.csv"), "--survey", str(work / "in" / "survey.csv")]
     return ["calibrate", "check", str(work / "in" / "rig.yaml"), *inputs, "--out", str(work / "out")]
@@ -67,7 +67,7 @@ def _lens(work: Path, base: Path, rng: random.Random) -> list[str]:
     damage_file(source, rng)
     (work / "out").mkdir()
     name, target = rng.choice((("new.camera.yaml", "beampose"), ("new.yml", "opencv"), ("new.txt", "colmap")))
-    return ["calibrate", "convert", str(source), str(work / "out" / name), "--to", target]
+    return ["calibrate", "convert", str(source), str(work / "out" / name), "--to", target, "--camera", "left"]
 
 
 def _shots(work: Path, base: Path, rng: random.Random) -> list[str]:

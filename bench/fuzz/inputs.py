@@ -24,8 +24,6 @@ def write_inputs(folder: Path) -> Path:
         file.write("timestamps: times.csv\ntracker:\n  r1_px: 12\n  detect:\n    threshold_sigma: 5.0\n")
     simulate("huo2015", folder / "pictures", seed=1, frames=2, picture_scale=0.2)
     shutil.copytree(ROOT / "sample_runs" / "calibration", folder / "calibration")
-    with (folder / "calibration" / "calibration.yaml").open("a") as file:
-        file.write("notes: ''\n")
     _write_lenses(folder / "lenses")
     rng = np.random.default_rng(1)
     pictures = [_picture(rng, 16 + 4 * n) for n in range(4)]

@@ -22,7 +22,7 @@ from lab.files.rig.rig_covariance import joint_covariance
 from lab.files.rig.rig_file import load_rig_file
 from lab.files.run.times import Times, load_times
 from lab.files.text.dataclass_fields import dataclass_from_yaml
-from lab.files.text.error_text import FileError, suggest_name
+from lab.files.text.error_text import FileError, name_of_path, suggest_name
 from lab.files.text.fields import (
     Block,
     Name,
@@ -151,7 +151,7 @@ def load_run(run_folder: Path) -> Run:
     in_use = dataclasses.replace(rig, cameras={n: c for n, c in rig.cameras.items() if n in sources})
     return Run(
         folder=folder,
-        name=content.name or folder.resolve().name,
+        name=content.name or name_of_path(folder),
         rig=in_use,
         rig_path=rig_path,
         frame_rate_hz=content.frame_rate_hz,

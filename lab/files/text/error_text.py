@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import re
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 
 from lab.errors import InputError
 
@@ -56,7 +57,15 @@ def is_formula(text: str) -> bool:
 
 def printable(text: str) -> str:
     """A text without characters that control a terminal or that have no UTF-8 form; line breaks stay."""
-    return "".join(c if c.isprintable() or c == "\n" else "?" for c in text)
+    return "".join(c if c.isprintable() or c in "\n\t" else "?" for c in text)
+
+
+def name_of_path(path: Path) -> str:
+    """The last part of a path as the name of a run or a camera: printable, and no formula for a spreadsheet."""
+    text = printable(path.resolve().name).strip()
+    while is_formula(text):
+        text = text[1:].lstrip()
+    return text or "unnamed"
 
 
 def printable_line(line: str) -> str:
