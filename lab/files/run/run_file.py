@@ -108,6 +108,14 @@ class Run:
         """Path of run.yaml."""
         return self.folder / "run.yaml"
 
+    @property
+    def paths_outside(self) -> tuple[Path, ...]:
+        """The files and folders that run.yaml names and that are not in the run folder, links followed."""
+        named = [self.rig_path, *([] if self.times_path is None else [self.times_path])]
+        named += [s.path for s in self.cameras.values() if not isinstance(s, LiveDevice)]
+        home = self.folder.resolve()
+        return tuple(dict.fromkeys(p for p in named if not p.resolve().is_relative_to(home)))
+
 
 def load_run(run_folder: Path) -> Run:
     """Read and check run.yaml of a run folder, its rig and its timestamps; pictures are not opened.
