@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -67,7 +68,7 @@ def _href(row: dict[str, Any], out: Path) -> str:
         path = path.relative_to(out.resolve()) if path.is_relative_to(out.resolve()) else path
     if not (out / path).is_file():
         return ""
-    return path.as_uri() if path.is_absolute() else "./" + quote(path.as_posix())
+    return path.as_uri() if path.is_absolute() else "./" + quote(os.fsencode(path.as_posix()))
 
 
 def _cell(value: Any) -> tuple[str, str]:
