@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from lab.commands.common import ANY_PATH, FOLDER, Commands, conclude, progress_bar
+from lab.commands.common import ANY_PATH, FOLDER, Commands, NumberRange, conclude, progress_bar
 
 
 @click.group(cls=Commands)
@@ -26,7 +26,7 @@ def calibrate() -> None:
 @click.argument("board")
 @click.option("--out", required=True, type=ANY_PATH, help="A folder, or one file ending in .pdf, .svg or .png.")
 @click.option("--page", default="A4", show_default=True, help="A4, A3 ..., or fit: the size of the board.")
-@click.option("--dpi", default=300.0, show_default=True, type=click.FloatRange(50, 2400), help="Resolution of the PNG.")
+@click.option("--dpi", default=300.0, show_default=True, type=NumberRange(50, 2400), help="Resolution of the PNG.")
 def board(board: str, out: Path, page: str, dpi: float) -> None:
     """Write a printable board to exact scale, and board.yaml.
 
@@ -47,9 +47,7 @@ def board(board: str, out: Path, page: str, dpi: float) -> None:
 @click.option("--board", required=True, help="The board in the photos: as for `calibrate board`, or a board.yaml.")
 @click.option("--out", required=True, type=FOLDER, help="Gets camera.yaml, corners.csv and report.html.")
 @click.option("--name", help="The camera's name; default: that of the folder --out.")
-@click.option(
-    "--distance-m", type=click.FloatRange(min=0, min_open=True), help="Distance to the screen, for figures in mm."
-)
+@click.option("--distance-m", type=NumberRange(min=0, min_open=True), help="Distance to the screen, for figures in mm.")
 @click.option("--lens", default="auto", show_default=True, help="0, 4, 5, 8, 12 or fisheye; auto: by views held out.")
 @click.option(
     "--warp", default="auto", show_default=True, help="auto, on, off: whether the bending of the board is solved for."

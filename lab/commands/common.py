@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import math
 import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -14,10 +15,26 @@ import click
 
 from lab.commands.stop_signals import StoppedBySignal, stopped_by_signals
 from lab.errors import BeamposeError
+from lab.files.text.error_text import printable
 
 FOLDER = click.Path(file_okay=False, path_type=Path)
 ANY_PATH = click.Path(path_type=Path)
 PIPE_CLOSED = 141  # 128 + SIGPIPE: the status that a shell reports for a program whose reader has gone
+
+
+class NumberRange(click.FloatRange):
+    """A finite number in a range; click's own range accepts nan."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        number = super().convert(value, param, ctx)
+        if not math.isfinite(number):
+            self.fail(f"expected a finite number, got {value}.", param, ctx)
+        return number
+
+
+def show_line(text: str) -> None:
+    """Prints a line on stdout; names of files and runs in it must not control the terminal."""
+    click.echo(printable(text))
 
 
 class _StderrHandler(logging.Handler):
@@ -71,7 +88,7 @@ def _complain(line: str) -> None:
     Raises BrokenPipeError.
     """
     try:
-        click.echo(f"beampose: {line}", err=True)
+        click.echo(printable(f"beampose: {line}"), err=True)
     except BrokenPipeError:
         raise
     except OSError:
@@ -195,5 +212,5 @@ def progress_bar(name: str) -> Iterator[Callable[..., None] | None]:
 
 def conclude(outcome: Any) -> None:
     """Prints an outcome and ends with its exit status."""
-    click.echo(outcome.line())
+    show_line(outcome.line())
     sys.exit(outcome.exit_status)

@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from lab.commands.common import ANY_PATH, FOLDER, conclude, progress_bar, read_settings
+from lab.commands.common import ANY_PATH, FOLDER, NumberRange, conclude, progress_bar, read_settings, show_line
 
 
 @click.command()
@@ -24,14 +24,12 @@ from lab.commands.common import ANY_PATH, FOLDER, conclude, progress_bar, read_s
     "--noise-px",
     default=0.1,
     show_default=True,
-    type=click.FloatRange(min=0),
+    type=NumberRange(0, 1000),
     help="With --points: noise of a spot, 1 sigma.",
 )
-@click.option("--clutter", type=click.FloatRange(0, 1), help="Probability of a false spot near each spot.")
+@click.option("--clutter", type=NumberRange(0, 1), help="Probability of a false spot near each spot.")
 @click.option("--light", help="A preset of light and sensor instead of the scenario's.")
-@click.option(
-    "--scale", default=1.0, show_default=True, type=click.FloatRange(0.1, 1), help="0.5: pictures half as wide."
-)
+@click.option("--scale", default=1.0, show_default=True, type=NumberRange(0.1, 1), help="0.5: pictures half as wide.")
 @click.option("--rig", type=ANY_PATH, help="A rig.yaml with the true rig, instead of the scenario's.")
 @click.option(
     "--known-rig", type=ANY_PATH, help="The rig.yaml for the run folder, such as a calibration of the true rig."
@@ -82,7 +80,7 @@ def simulate(
             known_rig=known_rig,
             progress=None if progress is None else lambda done, total: progress(done, total),
         )
-    click.echo(f"run: {folder}")
+    show_line(f"run: {folder}")
 
 
 def _ranges(
@@ -113,9 +111,9 @@ def _ranges(
     callback=_ranges,
     help="Of x_m, y_m, z_m, yaw_deg, pitch_deg, roll_deg; e.g. --range yaw_deg=-30:30:13.",
 )
-@click.option("--sigma-px", type=click.FloatRange(min=0, min_open=True), help="Noise of a spot, 1 sigma.")
-@click.option("--goal-deg", type=click.FloatRange(min=0, min_open=True), help="The attitude sigma to reach.")
-@click.option("--goal-mm", type=click.FloatRange(min=0, min_open=True), help="The position sigma to reach.")
+@click.option("--sigma-px", type=NumberRange(min=0, min_open=True), help="Noise of a spot, 1 sigma.")
+@click.option("--goal-deg", type=NumberRange(min=0, min_open=True), help="The attitude sigma to reach.")
+@click.option("--goal-mm", type=NumberRange(min=0, min_open=True), help="The position sigma to reach.")
 @click.option(
     "--expect",
     "settings",

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from lab.commands.common import ANY_PATH, FOLDER, progress_bar
+from lab.commands.common import ANY_PATH, FOLDER, progress_bar, show_line
 from lab.errors import InputError
 
 
@@ -25,7 +25,7 @@ def check(path: Path) -> None:
     with progress_bar(path.name) as progress:
         result = check_path(path, progress)
     for line in result.lines:
-        click.echo(line)
+        show_line(line)
     sys.exit(result.exit_status)
 
 
@@ -44,7 +44,7 @@ def report(results: Path, run_folder: Path | None) -> None:
 
     if not are_results(results):
         raise InputError(f"{results}: expected a folder that `beampose run` wrote, found no summary.json of one")
-    click.echo(f"report: {write_report(results, run_folder)}")
+    show_line(f"report: {write_report(results, run_folder)}")
 
 
 @click.command()
@@ -62,6 +62,6 @@ def study(name: str, out: Path, seed: int) -> None:
 
     outcome = study_huo2015(out, seed=seed)
     for line in outcome.lines:
-        click.echo(line)
-    click.echo(f"table: {outcome.table}")
-    click.echo(f"report: {outcome.report}")
+        show_line(line)
+    show_line(f"table: {outcome.table}")
+    show_line(f"report: {outcome.report}")

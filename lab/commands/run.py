@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from lab.commands.common import ANY_PATH, FOLDER, conclude, progress_bar, set_option
+from lab.commands.common import ANY_PATH, FOLDER, NumberRange, conclude, progress_bar, set_option, show_line
 
 causal_option = click.option(
     "--causal", is_flag=True, help="No smoothing pass: attitude.csv has the poses as known at each instant."
@@ -31,7 +31,7 @@ def run(run_folder: Path, out: Path, causal: bool, settings: dict[str, Any]) -> 
 
     with progress_bar(run_folder.name) as progress:
         outcome = process_run(run_folder, out, overrides=settings, causal=causal, progress=progress)
-    click.echo(outcome.line())
+    show_line(outcome.line())
     sys.exit(outcome.exit_status)
 
 
@@ -76,14 +76,14 @@ def detect(
     "--idle",
     default=10.0,
     show_default=True,
-    type=click.FloatRange(min=0.1),
+    type=NumberRange(min=0.1),
     help="Seconds without a new picture after which the recording has ended.",
 )
 @click.option(
     "--timeout",
     default=0.25,
     show_default=True,
-    type=click.FloatRange(min=0.001),
+    type=NumberRange(min=0.001),
     help="Seconds for which a frame waits for a camera whose picture is missing.",
 )
 @click.option("--reprocess", is_flag=True, help="At the end, process the finished folders as `run` does.")

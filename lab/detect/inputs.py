@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lab.errors import InputError
+from lab.files.text.error_text import is_formula, name_of_path
 from lab.pictures.picture_file import PICTURE_SUFFIXES, GreyPicture, MissingPicture, read_picture
 from lab.runs.frames.frame_sources import VideoSource, header_picture_count, number_of, open_video
 from lab.runs.frames.frames import AHEAD, THREADS
@@ -101,9 +102,13 @@ def open_inputs(given: Sequence[Path], camera: str | None = None) -> PictureFile
     Raises:
         InputError: a path does not exist, a folder has no pictures, or pictures and videos are mixed.
     """
+    if camera is not None and (not camera.isprintable() or is_formula(camera)):
+        raise InputError(
+            f"--camera: expected a name without control characters and without =, +, -, @ in front, got {camera!r}"
+        )
     if len(given) == 1 and given[0].is_dir():
         files = _pictures_in(given[0])
-        return _numbered(files, camera or given[0].resolve().name)
+        return _numbered(files, camera or name_of_path(given[0]))
     files = [file for path in given for file in _files_of(path)]
     files = list({file.resolve(): file for file in files}.values())
     others = [f for f in files if f.suffix.lower() not in PICTURE_SUFFIXES]
@@ -114,10 +119,10 @@ def open_inputs(given: Sequence[Path], camera: str | None = None) -> PictureFile
         )
     if others:
         _require_video(others[0])
-        return Video(camera or others[0].stem, others[0])
+        return Video(camera or name_of_path(others[0].with_suffix("")), others[0])
     folders = {file.resolve().parent for file in files}
-    own = files[0].stem if len(files) == 1 else folders.pop().name if len(folders) == 1 else "pictures"
-    return _numbered(files, camera or own)
+    own = files[0].with_suffix("") if len(files) == 1 else folders.pop() if len(folders) == 1 else Path("pictures")
+    return _numbered(files, camera or name_of_path(own))
 
 
 def _files_of(path: Path) -> list[Path]:

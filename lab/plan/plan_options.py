@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from itertools import product
@@ -15,8 +16,11 @@ from geometry.arrays import Array
 from lab.errors import InputError
 from lab.files.text.dataclass_fields import dataclass_from_yaml
 from lab.files.text.error_text import suggest_name
+from lab.files.text.range_checks import MAX_COORDINATE_M
 
 MAX_POSES = 100_000  # some 300 MB of memory and a table of 70 MB
+MAX_ANGLE_DEG = 360.0
+SIZE_RANGE = (1e-12, 1e6)  # of sigmas and goals that are not 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +78,7 @@ class PlanOptions:
     @property
     def count(self) -> int:
         """Number of poses of the grid."""
-        return int(np.prod([r.count for r in self.ranges.values()]))
+        return math.prod(r.count for r in self.ranges.values())
 
     def coordinates(self) -> Array:
         """The grid (count, 6): x, y, z (m), yaw, pitch, roll (deg), the last varying fastest."""
@@ -88,11 +92,16 @@ def _check_size(name: str, value: float | None) -> None:
     """Raise InputError for a number that is negative or not finite."""
     if value is not None and not (np.isfinite(value) and value >= 0):
         raise InputError(f"{name}: expected a number of 0 or more, got {value}")
+    if value is not None and value != 0 and not SIZE_RANGE[0] <= value <= SIZE_RANGE[1]:
+        raise InputError(f"{name}: expected a number from {SIZE_RANGE[0]:g} to {SIZE_RANGE[1]:g}, got {value:g}")
 
 
 def _check_range(name: str, r: Range) -> None:
     if not (np.isfinite(r.first) and np.isfinite(r.last)):
         raise InputError(f"{name}: expected finite ends, got {r.first} and {r.last}")
+    farthest, unit = (MAX_ANGLE_DEG, "deg") if name.endswith("_deg") else (MAX_COORDINATE_M, "m")
+    if max(abs(r.first), abs(r.last)) > farthest:
+        raise InputError(f"{name}: expected ends within {farthest:g} {unit}, got {r.first:g} and {r.last:g}")
     if r.count < 1 or r.count != int(r.count):
         raise InputError(f"{name}: expected a count of 1 or more, got {r.count}")
     if r.last < r.first or (r.last == r.first and r.count > 1):

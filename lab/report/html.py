@@ -7,14 +7,18 @@ from pathlib import Path
 
 import jinja2
 
+from lab.report.content_policy import content_policy
+
 
 @cache
 def environment() -> jinja2.Environment:
     """The templates in lab/report/templates/; text that is not marked as HTML is escaped."""
-    return jinja2.Environment(
+    made = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent / "templates"),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    made.globals["content_policy"] = lambda template: content_policy(made, template)
+    return made

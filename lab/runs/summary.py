@@ -114,6 +114,8 @@ def _notes(pipeline: Pipeline, tally: RunTally) -> list[str]:
         notes.append(f"cameras of the rig without data in this run: {', '.join(pipeline.run.left_out)}")
     if tally.unlisted:
         notes.append(f"events: the first {MOST_EVENTS} of {MOST_EVENTS + tally.unlisted} are listed")
+    if outside := pipeline.run.paths_outside:
+        notes.append(f"read from outside the run folder: {', '.join(map(str, outside))}")
     return notes
 
 

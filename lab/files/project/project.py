@@ -40,7 +40,7 @@ from lab.files.project.project_types import (
 from lab.files.rig.board_file import load_board
 from lab.files.rig.camera_file import CameraFile, load_camera
 from lab.files.rig.interchange import read_cameras
-from lab.files.text.error_text import FileError, suggest_name
+from lab.files.text.error_text import FileError, name_of_path, suggest_name
 from lab.files.text.fields import validated
 from lab.files.text.yaml_text import read_mapping
 
@@ -62,7 +62,7 @@ def load_project(path: Path, lab_known: bool = False) -> Project:
     cameras = {name: reader.camera(name, block) for name, block in content.cameras.items()}
     project = Project(
         path=path,
-        name=content.name or path.resolve().parent.name,
+        name=content.name or name_of_path(path.resolve().parent),
         date=content.date,
         valid_days=content.valid_days,
         cameras={name: c for name, c in cameras.items() if c is not None},

@@ -25,8 +25,8 @@ from lab.files.text.fields import (
     numbers,
     one_of,
     positive_numbers,
+    printable_name,
     unexpected_value,
-    word,
 )
 
 SCHEMA = "beampose/calibration/1"
@@ -56,10 +56,10 @@ def _days(value: Any) -> int | None:
 
 
 def _name(value: Any) -> str:
-    name = word(value)
-    if any(c in name for c in "/\\") or not name.isprintable():
+    text = printable_name(value)
+    if any(c in text for c in "/\\"):
         raise unexpected_value("a name without / and \\", value)
-    return name
+    return text
 
 
 _Name = Annotated[str, pydantic.PlainValidator(_name)]

@@ -27,11 +27,11 @@ from lab.files.text.fields import (
     Block,
     Integer,
     Lines,
+    Name,
     NonNegative,
     Number,
     Positive,
     Text,
-    Word,
     field_error,
     one_of,
     validated,
@@ -169,7 +169,7 @@ class _CalibrationBlock(Block):
 
 class _CameraFileBlock(LensBlock):
     schema_: Annotated[str, pydantic.PlainValidator(one_of((SCHEMA,)))] = pydantic.Field(alias="schema")
-    name: Word
+    name: Name
     covariance: CovarianceBlock | None = None
     calibration: _CalibrationBlock | None = None
 

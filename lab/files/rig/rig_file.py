@@ -26,6 +26,7 @@ from lab.files.rig.camera_block import (
 from lab.files.text.error_text import FileError, suggest_name
 from lab.files.text.fields import (
     Block,
+    Name,
     NonNegative,
     Number,
     Positive,
@@ -176,8 +177,8 @@ class _SpotBlock(Block):
 class TargetBlock(Block):
     """The vehicle's beams and spots."""
 
-    beams: dict[str, _BeamBlock]
-    spots: dict[str, _SpotBlock]
+    beams: dict[Name, _BeamBlock]
+    spots: dict[Name, _SpotBlock]
     covariance: CovarianceBlock | None = None
 
     def beam_values(self) -> dict[str, Beam]:
@@ -214,8 +215,8 @@ class TargetBlock(Block):
 
 class _RigBlock(Block):
     schema_: Annotated[str, pydantic.PlainValidator(one_of((SCHEMA,)))] = pydantic.Field(alias="schema")
-    screens: dict[str, ScreenBlock]
-    cameras: dict[str, CameraBlock]
+    screens: dict[Name, ScreenBlock]
+    cameras: dict[Name, CameraBlock]
     target: TargetBlock
     calibration: CalibrationStateBlock | None = None
 

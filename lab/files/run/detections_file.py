@@ -18,6 +18,7 @@ from tracking.input_validation import DUPLICATE_PX, LARGEST_PX, LEAST_SIGMA_PX, 
 
 REQUIRED = ("frame", "camera", "u_px", "v_px")
 DEFAULT_SIGMA_PX = 0.1  # px, where the file gives no sigma: about the centroid noise of a clean laser spot
+LARGEST_SHAPE = 1e15  # largest magnitude of a number of SHAPE
 SHAPE = ("flux", "peak", "major_px", "minor_px", "angle_deg")
 # More frame numbers per picture indicate a stray number, or time stamps as frame numbers.
 MAX_NUMBERS_PER_PICTURE = 1000
@@ -105,13 +106,18 @@ def read_detections(path: Path) -> DetectionsFile:
     good = rows.good
     cov[good, 0, 0], cov[good, 1, 1] = sigma[good, 0] ** 2, sigma[good, 1] ** 2
     cov[good, 0, 1] = cov[good, 1, 0] = shared[good]
-    points = Detections(uv, cov, *(column(name, np.nan) for name in SHAPE))
+    points = Detections(uv, cov, *(_stated(column(name, np.nan)) for name in SHAPE))
     cameras = {}
     for name in dict.fromkeys(rows.camera[good]):
         of = rows.camera == name
         cameras[str(name)] = _camera_points(np.flatnonzero(good & of), frame, points, frame[placed & of])
     unusable = {name: why for name, why in rows.why_of.items() if name and name not in cameras}
     return DetectionsFile(cameras, int(frame[good].min()), int(frame[good].max()), tuple(rows.notes), unusable)
+
+
+def _stated(values: Array) -> Array:
+    """A column (n,) of the points' shape; nan, as for an empty field, where no camera gives such a number."""
+    return np.where(np.abs(values) <= LARGEST_SHAPE, values, np.nan)
 
 
 @dataclass(slots=True)

@@ -9,13 +9,15 @@ from typing import Any
 from lab.files.text.dataclass_fields import dataclass_from_yaml
 from tracking.parameters import TrackerParameters
 
+MAX_DOTS = 5  # of a name; the parameters have one level of blocks
+
 
 def with_overrides(parameters: TrackerParameters, overrides: Mapping[str, Any]) -> TrackerParameters:
     """The parameters with overrides, checked as in a file. Dotted names address inner blocks. Raises InputError."""
     content = dataclasses.asdict(parameters)
     for name, value in overrides.items():
-        *blocks, last = name.split(".")
-        inner = content
+        *blocks, last = name.split(".") if name.count(".") <= MAX_DOTS else [name]
+        inner: Any = content
         for block in blocks:
             inner = inner.setdefault(block, {})
             if not isinstance(inner, dict):

@@ -22,15 +22,17 @@ from lab.files.rig.rig_covariance import joint_covariance
 from lab.files.rig.rig_file import load_rig_file
 from lab.files.run.times import Times, load_times
 from lab.files.text.dataclass_fields import dataclass_from_yaml
-from lab.files.text.error_text import FileError, suggest_name
+from lab.files.text.error_text import FileError, name_of_path, suggest_name
 from lab.files.text.fields import (
     Block,
+    Name,
     NonNegative,
     Positive,
     Text,
     Vector3,
     Word,
     field_error,
+    number_between,
     one_of,
     unexpected_value,
     validated,
@@ -40,6 +42,8 @@ from lab.pictures.picture_file import PICTURE_SUFFIXES
 from tracking.parameters import TrackerParameters
 
 SCHEMA = "beampose/run/1"
+LONGEST_EXPOSURE = 1.05  # of the time between two frames; above 1 for a rounded frame rate
+RATE_RANGE_HZ = (1e-6, 1e7)  # a picture in 12 days; the fastest cameras
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,6 +108,14 @@ class Run:
         """Path of run.yaml."""
         return self.folder / "run.yaml"
 
+    @property
+    def paths_outside(self) -> tuple[Path, ...]:
+        """The files and folders that run.yaml names and that are not in the run folder, links followed."""
+        named = [self.rig_path, *([] if self.times_path is None else [self.times_path])]
+        named += [s.path for s in self.cameras.values() if not isinstance(s, LiveDevice)]
+        home = self.folder.resolve()
+        return tuple(dict.fromkeys(p for p in named if not p.resolve().is_relative_to(home)))
+
 
 def load_run(run_folder: Path) -> Run:
     """Read and check run.yaml of a run folder, its rig and its timestamps; pictures are not opened.
@@ -147,7 +159,7 @@ def load_run(run_folder: Path) -> Run:
     in_use = dataclasses.replace(rig, cameras={n: c for n, c in rig.cameras.items() if n in sources})
     return Run(
         folder=folder,
-        name=content.name or folder.resolve().name,
+        name=content.name or name_of_path(folder),
         rig=in_use,
         rig_path=rig_path,
         frame_rate_hz=content.frame_rate_hz,
@@ -227,9 +239,9 @@ def _some_cameras(value: Any) -> Any:
 
 class _RunBlock(Block):
     schema_: Annotated[str, pydantic.PlainValidator(one_of((SCHEMA,)))] = pydantic.Field(alias="schema")
-    name: Word | None = None
+    name: Name | None = None
     rig: Word
-    frame_rate_hz: Positive
+    frame_rate_hz: Annotated[float, pydantic.PlainValidator(number_between(*RATE_RANGE_HZ, "Hz"))]
     exposure_s: Positive | None = None
     timestamps: Word | None = None
     cameras: Annotated[dict[str, _SourceBlock], pydantic.BeforeValidator(_some_cameras)]
@@ -237,6 +249,15 @@ class _RunBlock(Block):
     tracker: Any = None
     recorded: OptionalDay = None
     notes: Text = ""
+
+    @pydantic.model_validator(mode="after")
+    def _exposure_within_a_frame(self) -> _RunBlock:
+        if self.exposure_s is not None and self.exposure_s * self.frame_rate_hz > LONGEST_EXPOSURE:
+            raise field_error(
+                f"exposure_s: expected at most the {1 / self.frame_rate_hz:.6g} s between two frames"
+                f" ({self.frame_rate_hz:g} Hz), got {self.exposure_s:g}; give seconds, not milliseconds"
+            )
+        return self
 
 
 def _prior_of(block: _PriorBlock) -> PosePrior:

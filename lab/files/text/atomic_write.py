@@ -27,8 +27,11 @@ _REMEDIES = {
 
 
 def atomic_write_text(text: str, path: Path) -> None:
-    """Write a UTF-8 text file, complete or not at all. Raises InputError."""
-    atomic_write_bytes(text.encode("utf-8"), path)
+    """Write a UTF-8 text file, complete or not at all; bytes of names that are not UTF-8 become `?`.
+
+    Raises InputError.
+    """
+    atomic_write_bytes(text.encode("utf-8", "replace"), path)
 
 
 def atomic_write_bytes(content: bytes, path: Path) -> None:

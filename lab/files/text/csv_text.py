@@ -22,7 +22,7 @@ from geometry.arrays import Array, Ints
 from lab.errors import InputError
 from lab.files.text.atomic_write import atomic_write_text
 from lab.files.text.csv_table import Categorical, Table
-from lab.files.text.error_text import printable_line, suggest_name
+from lab.files.text.error_text import is_formula, printable_line, suggest_name
 
 # The columns that hold words; every other column holds numbers.
 WORD_COLUMNS = ("camera", "spot", "beam", "status", "point", "screen", "date", "verdict")
@@ -60,6 +60,8 @@ def read_table(path: Path, required: Iterable[str], optional: Iterable[str] = ()
 def _content(path: Path, required: Sequence[str], damaged: bool) -> bytes:
     """The bytes of a table, UTF-8 text with a line or more. Raises InputError."""
     try:
+        if not (path.is_file() or path.is_dir()) and path.exists():
+            raise InputError(f"{path}: expected a table, found a pipe or a device; save the table as a file")
         data = path.read_bytes()
     except FileNotFoundError:
         raise InputError(f"{path}: expected a table with columns {','.join(required)}, found no file") from None
@@ -93,11 +95,13 @@ def _checked_header(path: Path, data: bytes, required: Sequence[str]) -> tuple[s
                 f"{path}: expected columns separated by commas, got {word}; separate columns with commas, and write"
                 " decimals with a point"
             )
+    # A single text is not shown: the path may name any file.
+    found = printable_line(",".join(header)) if len(header) > 1 or header[0] in required else "a line without commas"
     for name in required:
         if name not in header:
             near = suggest_name(name, header)
             meant = f"{near.removesuffix('?')} in the header?" if "did you mean" in near else ""
-            raise InputError(f"{path}: expected a column {name!r}, got {printable_line(','.join(header))}{meant}")
+            raise InputError(f"{path}: expected a column {name!r}, got {found}{meant}")
     twice = [name for i, name in enumerate(header) if name and name in header[:i]]
     if twice:
         raise InputError(
@@ -245,8 +249,13 @@ def csv_text(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
     out = io.StringIO(newline="")
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(header)
-    writer.writerows(rows)
+    writer.writerows([_not_a_formula(field) for field in row] for row in rows)
     return out.getvalue()
+
+
+def _not_a_formula(field: object) -> object:
+    """A text that a spreadsheet would read as a formula, with an apostrophe in front; any other field as it is."""
+    return f"'{field}" if isinstance(field, str) and is_formula(field) else field
 
 
 def write_table(path: Path, header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 
 from lab.errors import InputError
 
@@ -42,6 +44,28 @@ def describe_value(value: object) -> str:
     if len(text) > 50 and isinstance(value, list):
         return f"a list of {len(value)}"
     return text if len(text) <= 50 else text[:46] + " ..."
+
+
+def is_formula(text: str) -> bool:
+    """Whether a spreadsheet may read this text as a formula that calls something.
+
+    `=` and `@` begin one. So do `+` and `-`, but a sign with letters and digits only (`+x`, `-12.5`) calls nothing.
+    """
+    start = text.lstrip()[:1]
+    return start in ("=", "@") or (start in ("+", "-") and re.fullmatch(r"[\w.+-]*", text.strip()) is None)
+
+
+def printable(text: str) -> str:
+    """A text without characters that control a terminal or that have no UTF-8 form; line breaks stay."""
+    return "".join(c if c.isprintable() or c in "\n\t" else "?" for c in text)
+
+
+def name_of_path(path: Path) -> str:
+    """The last part of a path as the name of a run or a camera: printable, and no formula for a spreadsheet."""
+    text = printable(path.resolve().name).strip()
+    while is_formula(text):
+        text = text[1:].lstrip()
+    return text or "unnamed"
 
 
 def printable_line(line: str) -> str:

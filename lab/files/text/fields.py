@@ -14,9 +14,14 @@ from typing import Annotated, Any, TypeVar
 import pydantic
 from pydantic_core import PydanticCustomError
 
-from lab.files.text.error_text import FileError, describe_value, suggest_name
+from lab.files.text.error_text import FileError, describe_value, is_formula, suggest_name
 
 M = TypeVar("M", bound="Block")
+MAX_NUMBER = 1e15  # largest magnitude of any number: its higher powers can still be computed
+MIN_POSITIVE = 1e-15
+MAX_EXACT_INTEGER = 2**53
+MAX_COORDINATE = 1e8  # m, of a vector
+MAX_NAME = 200  # characters
 
 
 def field_error(text: str) -> PydanticCustomError:
@@ -29,31 +34,61 @@ def unexpected_value(expected: str, found: object) -> PydanticCustomError:
     return field_error(f"expected {expected}, got {describe_value(found)}")
 
 
+def _is_number(value: Any) -> bool:
+    """Whether the value is a finite number. An integer may have more digits than a float can hold."""
+    return (
+        isinstance(value, int | float)
+        and not isinstance(value, bool)
+        and (isinstance(value, int) or math.isfinite(value))
+    )
+
+
 def finite_number(value: Any) -> float:
-    """A finite number."""
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+    """A finite number of magnitude up to MAX_NUMBER."""
+    if not _is_number(value):
         raise unexpected_value("a finite number", value)
+    if abs(value) > MAX_NUMBER:
+        raise unexpected_value(f"a number of magnitude up to {MAX_NUMBER:g}", value)
     return float(value)
 
 
 def positive_number(value: Any) -> float:
-    """A finite number above zero."""
-    if isinstance(value, bool) or not isinstance(value, int | float) or not (math.isfinite(value) and value > 0):
+    """A number above zero, from MIN_POSITIVE to MAX_NUMBER."""
+    if not _is_number(value) or value <= 0:
         raise unexpected_value("a number above 0", value)
+    if not MIN_POSITIVE <= value <= MAX_NUMBER:
+        raise unexpected_value(f"a number from {MIN_POSITIVE:g} to {MAX_NUMBER:g}", value)
     return float(value)
 
 
+def number_between(least: float, largest: float, unit: str) -> Callable[[Any], float]:
+    """A validator of numbers from `least` to `largest`."""
+
+    def check(value: Any) -> float:
+        if not _is_number(value) or (least > 0 >= value):
+            raise unexpected_value("a number above 0" if least > 0 else "a finite number", value)
+        if not least <= value <= largest:
+            raise unexpected_value(f"{least:g} to {largest:g} {unit}", value)
+        return float(value)
+
+    return check
+
+
 def non_negative_number(value: Any) -> float:
-    """A finite number, zero or above."""
-    if isinstance(value, bool) or not isinstance(value, int | float) or not (math.isfinite(value) and value >= 0):
+    """A number from 0 to MAX_NUMBER."""
+    if not _is_number(value) or value < 0:
         raise unexpected_value("a number of 0 or more", value)
+    if value > MAX_NUMBER:
+        raise unexpected_value(f"a number from 0 to {MAX_NUMBER:g}", value)
     return float(value)
 
 
 def whole_number(value: Any) -> int:
-    """A whole number; 3.0 counts as one."""
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value) or value != int(value):
+    """A whole number of magnitude up to MAX_EXACT_INTEGER; 3.0 counts as one."""
+    if not _is_number(value) or value != int(value):
         raise unexpected_value("a whole number", value)
+    if abs(value) > MAX_EXACT_INTEGER:
+        raise unexpected_value(f"a whole number up to {MAX_EXACT_INTEGER}", value)
     return int(value)
 
 
@@ -73,6 +108,18 @@ def word(value: Any) -> str:
     if not isinstance(value, str) or not value.strip():
         raise unexpected_value("a word", value)
     return value
+
+
+def printable_name(value: Any) -> str:
+    """A name that can be printed, and that a spreadsheet reads as a text, not as a formula."""
+    text = word(value)
+    if not text.isprintable():
+        raise unexpected_value("a name without control characters", text)
+    if len(text) > MAX_NAME:
+        raise unexpected_value(f"a name of up to {MAX_NAME} characters", text)
+    if is_formula(text):
+        raise unexpected_value("a name that a spreadsheet does not read as a formula (no =, +, -, @ in front)", text)
+    return text
 
 
 def free_text(value: Any) -> str:
@@ -98,6 +145,14 @@ def numbers(count: int) -> Callable[[Any], list[float]]:
         return [finite_number(v) for v in value]
 
     return check
+
+
+def vector3(value: Any) -> list[float]:
+    """A list of three numbers of magnitude up to MAX_COORDINATE."""
+    values = numbers(3)(value)
+    if max(map(abs, values)) > MAX_COORDINATE:
+        raise unexpected_value(f"three numbers of magnitude up to {MAX_COORDINATE:g}", value)
+    return values
 
 
 def positive_numbers(count: int) -> Callable[[Any], list[float]]:
@@ -136,7 +191,8 @@ NonNegative = Annotated[float, _plain(non_negative_number)]
 Integer = Annotated[int, _plain(whole_number)]
 Word = Annotated[str, _plain(word)]
 Text = Annotated[str, _plain(free_text)]
-Vector3 = Annotated[list[float], _plain(numbers(3))]
+Name = Annotated[str, _plain(printable_name)]
+Vector3 = Annotated[list[float], _plain(vector3)]
 Lines = Annotated[list[str], _plain(lines_of_text)]
 
 
@@ -170,7 +226,7 @@ def validated(model: type[M], content: Mapping[str, Any], path: Path | str, insi
 
 
 def _line(error: Any, path: Path | str, inside: str) -> str:
-    field = ".".join(([inside] if inside else []) + [str(part) for part in error["loc"]])
+    field = ".".join(([inside] if inside else []) + [str(part) for part in error["loc"] if part != "[key]"])
     where = f"{path}: {field}: " if field else f"{path}: "
     if error["type"] == "missing":
         return f"{where}expected a value, got nothing; add it"

@@ -12,9 +12,8 @@ import numpy as np
 
 def write_json(content: Any, path: Path) -> None:
     """Write a value as a JSON file, indented."""
-    path.write_text(
-        json.dumps(plain_value(content), indent=1, ensure_ascii=False, allow_nan=False) + "\n", encoding="utf-8"
-    )
+    text = json.dumps(plain_value(content), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+    path.write_bytes(text.encode("utf-8", "backslashreplace"))  # of names that are not UTF-8; JSON has these escapes
 
 
 def plain_value(value: Any) -> Any:

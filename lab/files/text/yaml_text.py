@@ -7,8 +7,8 @@ and `"1"` are the same spot. Why PyYAML and not ruamel.yaml: docs/decisions/yaml
 
 from __future__ import annotations
 
-import math
 import re
+import stat
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -17,77 +17,19 @@ import yaml
 
 from lab.errors import InputError
 from lab.files.text.atomic_write import atomic_write_text
-from lab.files.text.error_text import describe_value
+from lab.files.text.yaml_loader import OpenCVLoader, StrictLoader
 
-
-class _StrictLoader(yaml.SafeLoader):
-    """Safe loader with the core types of YAML 1.2 only, keys as written, and no repeated key."""
-
-    yaml_implicit_resolvers: dict[str, list[tuple[str, re.Pattern[str]]]] = {}  # noqa: RUF012 - replaces the base's
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        own = [key for key, _ in node.value if key.tag != "tag:yaml.org,2002:merge"]
-        seen: set[str] = set()
-        for key in own:
-            if not isinstance(key, yaml.ScalarNode):
-                raise yaml.constructor.ConstructorError(None, None, "a key that is not a word", key.start_mark)
-            if key.value in seen:
-                raise yaml.constructor.ConstructorError(
-                    None, None, f"the key {key.value!r} a second time", key.start_mark
-                )
-            seen.add(key.value)
-        self.flatten_mapping(node)
-        return {key.value: self.construct_object(value, deep=True) for key, value in node.value}
-
-
-def _construct_map(loader: _StrictLoader, node: yaml.MappingNode) -> dict[Any, Any]:
-    return loader.construct_mapping(node, deep=True)
-
-
-_StrictLoader.add_constructor("tag:yaml.org,2002:map", _construct_map)
-for _tag, _pattern, _first in (
-    ("null", r"~|null|Null|NULL|", ["~", "n", "N", ""]),
-    ("bool", r"true|True|TRUE|false|False|FALSE", list("tTfF")),
-    ("int", r"[-+]?(0|[1-9][0-9]*)", list("-+0123456789")),
-    (
-        "float",
-        r"[-+]?((\.[0-9]+|[0-9]+\.[0-9]*)([eE][-+]?[0-9]+)?|[0-9]+[eE][-+]?[0-9]+|\.(inf|Inf|INF))|\.(nan|NaN|NAN)",
-        list("-+.0123456789"),
-    ),
-    ("merge", r"<<", ["<"]),
-):
-    _StrictLoader.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(rf"^(?:{_pattern})$"), _first)
-
-
-def _construct_int(loader: _StrictLoader, node: yaml.ScalarNode) -> int:
-    return int(loader.construct_scalar(node))
-
-
-def _construct_float(loader: _StrictLoader, node: yaml.ScalarNode) -> float:
-    text = str(loader.construct_scalar(node)).lower()
-    if text.lstrip("+-") in (".inf", ".nan"):
-        return math.copysign(math.inf, -1 if text[0] == "-" else 1) if "inf" in text else math.nan
-    return float(text)
-
-
-_StrictLoader.add_constructor("tag:yaml.org,2002:int", _construct_int)
-_StrictLoader.add_constructor("tag:yaml.org,2002:float", _construct_float)
-
-
-class _OpenCVLoader(_StrictLoader):
-    """The strict loader, with OpenCV's matrices as mappings."""
-
-
-def _construct_tagged(loader: _OpenCVLoader, _suffix: str, node: yaml.MappingNode) -> dict[Any, Any]:
-    return loader.construct_mapping(node, deep=True)
-
-
-_OpenCVLoader.add_multi_constructor("tag:yaml.org,2002:opencv-", _construct_tagged)
+MAX_FILE_BYTES = 64 << 20  # our largest files, rigs with a joint covariance, have some 1 MB
 
 
 def read_text(path: Path) -> str:
-    """The text of a UTF-8 file. Raises InputError, in one line."""
+    """The text of a UTF-8 file of at most MAX_FILE_BYTES. Raises InputError, in one line."""
     try:
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode) and not stat.S_ISDIR(status.st_mode):
+            raise InputError(f"{path}: expected a file, found a pipe or a device; save the text as a file")
+        if status.st_size > MAX_FILE_BYTES:
+            raise InputError(f"{path}: expected a file of at most {MAX_FILE_BYTES >> 20} MB, found a larger one")
         return path.read_bytes().decode("utf-8")
     except UnicodeDecodeError as error:
         raise InputError(
@@ -111,7 +53,7 @@ def parse_mapping(text: str, path: Path | str, opencv: bool = False) -> dict[str
     if opencv:
         text = re.sub(r"\A\ufeff?%YAML:1\.0[^\n]*", "", text)
     try:
-        content = yaml.load(text, Loader=_OpenCVLoader if opencv else _StrictLoader)
+        content = yaml.load(text, Loader=OpenCVLoader if opencv else StrictLoader)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         where = f"line {mark.line + 1}" if mark else "the text"
@@ -122,14 +64,15 @@ def parse_mapping(text: str, path: Path | str, opencv: bool = False) -> dict[str
             problem = 'a lone minus; quote it: "-"'
         elif "mapping values are not allowed" in problem:
             problem = "a second colon; quote the text that holds it"
-        problem = problem.removeprefix("but ").removeprefix("found ")
+        if problem.startswith("could not determine a constructor"):
+            problem = "a tag of another program (`!name`, `!!name`); remove the tag"
+        problem = problem.removeprefix("but ").removeprefix("expected a sequence node, but ").removeprefix("found ")
         raise InputError(f"{path}: {where}: expected YAML, found {problem}") from None
     except yaml.YAMLError as error:
         raise InputError(f"{path}: expected YAML, found {str(error).splitlines()[0]}") from None
-    except RecursionError:
-        raise InputError(f"{path}: expected YAML, found a nesting too deep to read") from None
-    if not isinstance(content, dict):
-        raise InputError(f"{path}: expected `key: value` lines, got {describe_value(content)}")
+    if not isinstance(content, dict):  # its content is not shown: the path may name any file
+        kind = "nothing" if content is None else "a list" if isinstance(content, list) else "other text"
+        raise InputError(f"{path}: expected `key: value` lines, got {kind}")
     return content
 
 

@@ -12,6 +12,7 @@ from geometry.forward_model import SpotModel
 from lab.errors import BeamposeError
 from lab.files.run.results import PoseTrack, SpotGrid, has_causal, read_poses, read_spots, read_summary
 from lab.files.run.run_file import Run, load_run
+from lab.files.text.error_text import name_of_path
 from lab.report.run.summary import RunSummary, summary_of
 from lab.report.run.truth_errors import TruthErrors, errors_of
 from lab.runs.score.score import TruthArrays, pose_errors, read_truth, score_against
@@ -90,7 +91,7 @@ def read_report_data(results: Path, run_folder: Path | None) -> ReportData:
     times_known = bool(len(spots.t_s)) and bool(np.isfinite(spots.t_s).all())
     residual_px, residual_share = (None, None) if run is None else _residuals(spots, poses, run)
     return ReportData(
-        name=summary.name or results.resolve().name,
+        name=summary.name or name_of_path(results),
         summary=summary,
         spots=spots,
         poses=poses,

@@ -60,6 +60,8 @@ def _check_run(folder: Path, progress: Progress | None) -> CheckResult:
         findings.remarks.append(
             f"{run.path}: cameras: camera {name!r} of the rig is left out; the run works without it"
         )
+    for outside in run.paths_outside:
+        findings.facts += ["", f"Read from outside the run folder: {outside}"]
     if run.prior is None:
         _describe_search(findings, run)
     try:

@@ -1,0 +1,60 @@
+"""Damaged inputs end in a result or in one line; see bench/fuzz."""
+
+from __future__ import annotations
+
+import pytest
+
+from bench.fuzz.cases import KINDS, write_case
+from bench.fuzz.inputs import write_inputs
+from bench.fuzz.judge import fault_of_lines, not_finite_in, run_case, run_command
+
+INPUTS = 40
+
+
+@pytest.fixture(scope="module")
+def base(tmp_path_factory):
+    return write_inputs(tmp_path_factory.mktemp("fuzz") / "base")
+
+
+def test_damaged_inputs_end_in_a_result_or_in_a_line(base, tmp_path):
+    endings = [run_case(2, n, base, tmp_path / "work") for n in range(INPUTS)]
+    assert [e for e in endings if e.fault] == []
+    assert {e.status for e in endings} >= {0, 2}
+
+
+@pytest.mark.parametrize("kind", [k for k in KINDS if k not in ("--set", "plan options", "simulate options", "names")])
+def test_the_inputs_are_valid_before_they_are_damaged(kind, base, tmp_path, monkeypatch):
+    monkeypatch.setattr("bench.fuzz.cases.damage_file", lambda path, rng: None)
+    (tmp_path / "work").mkdir()
+    command = next(c for k, c in (_case(n, base, tmp_path) for n in range(500)) if k == kind)
+    status, out, err, fault = run_command(command)
+    assert (status, fault) == (0, ""), out + err
+
+
+def _case(number, base, tmp_path):
+    import shutil
+
+    shutil.rmtree(tmp_path / "work")
+    (tmp_path / "work").mkdir()
+    return write_case(3, number, base, tmp_path / "work")
+
+
+def test_the_judge_knows_a_wrong_ending(tmp_path):
+    assert fault_of_lines(0, "fine\n", "") == fault_of_lines(2, "", "beampose: a line\n") == ""
+    assert all(map(fault_of_lines, (7, 2, 1), ("", "", ""), ("x\n", "", "Traceback ...\n")))
+    assert all(map(fault_of_lines, (2, 2), ("", ""), ("a\n" * 9, "\x1b[2J\n")))
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "a.csv").write_text("x\n1\n")
+    assert not_finite_in(tmp_path) == ""
+    (tmp_path / "out" / "a.csv").write_text("x\n1\ninf\n")
+    assert not_finite_in(tmp_path).startswith("a.csv line 3")
+
+
+def test_an_exception_that_leaves_the_program_is_a_fault(monkeypatch):
+    def breaks(*_):
+        raise ZeroDivisionError("x")
+
+    monkeypatch.setattr("lab.runs.input_check.check.check", breaks)
+    status, _, err, fault = run_command(["check", "nowhere"])
+    assert "ZeroDivisionError" in fault + err
+    assert fault or fault_of_lines(status, "", err)
