@@ -15,6 +15,7 @@ from lab.report.plot.svg import area_path, figure, line_path, text
 from lab.report.plot.thinning import band_envelope, envelope, true_shares
 from lab.report.plot.zoom_data import ZoomData
 
+_BINS_PER_UNIT = 0.6  # of a thinned series; cursor.js draws enlarged parts from more points
 _NAME_WIDTH = 46  # viewBox units at the right end of a time axis that its name takes
 
 
@@ -89,7 +90,7 @@ def time_panel(
     lo, hi = y_range or padded_range(values)
     bottom = height - (30.0 if with_time else 8.0)
     p = PlotArea(time_scale(t, 54.0, width - 10.0), Scale(lo, hi, bottom, 20.0), width, height)
-    bins = int(p.X.b - p.X.a)
+    bins = max(int(_BINS_PER_UNIT * (p.X.b - p.X.a)), 1)
     marks = ticks(lo, hi, max(5, int((bottom - 20.0) / 22)))
     out = ['<g class="whole">', *_shaded(p, shades, len(t)), y_ticks(p, marks, tick_texts(marks), grid=True)]
     out.append(time_ticks(p, time_name if with_time else ""))

@@ -1,7 +1,7 @@
 """The series behind a page's time plots, compact enough to embed: cursor.js draws parts of them when a user zooms.
 
 Each series of n values is a row of integers: asinh((y - centre) / scale), rounded. So a few large values cost no
-resolution near the centre. Above a size limit each block of k frames is stored as its smallest and largest value. The
+resolution near the centre. Above a size limit each block of frames is stored as its smallest and largest value. The
 integers are differenced, split into planes of bytes and deflated.
 """
 
@@ -18,7 +18,8 @@ import numpy as np
 from geometry.arrays import Array, Ints
 
 _BITS, _FINE_BITS = 14, 20
-_SPARE_BYTES, _BYTES_PER_FRAME, _MOST_BYTES = 150_000, 60, 2_900_000
+_FINE_SHARE = 8  # blocks of fine series are shorter by this factor: they are smooth and so compress better
+_SPARE_BYTES, _BYTES_PER_FRAME, _MOST_BYTES = 150_000, 65, 3_000_000
 
 
 class ZoomData:
@@ -68,14 +69,13 @@ class ZoomData:
         expected = 1.6 * n * len(self._series)
         block = 1 if expected <= 1.3 * allowed else max(2, int(1.4 * expected / allowed))
         while True:
-            packed = [_packed(y, bits, block) for y, bits in self._series]
+            packed = [_packed(y, bits, _own(block, bits)) for y, bits in self._series]
             data = base64.b64encode(zlib.compress(b"".join([*fixed, *(p[1] for p in packed)]), 6)).decode("ascii")
             if len(data) <= allowed or block >= max(n, 1):
                 break
             block = max(block + 1, int(block * 1.05 * len(data) / allowed))
         head = {
             "n": n,
-            "block": block,
             "t": _whole_numbers(self._t)[0],
             "frames": _whole_numbers(self._frames.astype(float), 1.0)[0],
             "rows": self._rows,
@@ -83,6 +83,11 @@ class ZoomData:
             "data": data,
         }
         return json.dumps(head, separators=(",", ":"), ensure_ascii=True).replace("<", "\\u003c")
+
+
+def _own(block: int, bits: int) -> int:
+    """The length of the blocks of a series where most have `block` frames."""
+    return block if bits == _BITS else -(-block // _FINE_SHARE)
 
 
 def _bytes(values: Ints, count: int) -> bytes:
@@ -100,7 +105,7 @@ def _whole_numbers(values: Array, least_step: float = 1e-6) -> tuple[list[float]
 
 
 def _packed(y: Array, bits: int, block: int) -> tuple[list[float], bytes]:
-    """Centre, scale, lowest asinh, its step, and bytes per value; and the integers, 0 for nan."""
+    """Centre, scale, lowest asinh, its step, bytes per value, frames per block; and the integers, 0 for nan."""
     finite = y[np.isfinite(y)]
     centre = float(np.median(finite)) if finite.size else 0.0
     usual = float(np.percentile(np.abs(finite - centre), 75)) if finite.size else 0.0
@@ -118,4 +123,4 @@ def _packed(y: Array, bits: int, block: int) -> tuple[list[float], bytes]:
     step = max((float(np.nanmax(u)) - lowest) if finite.size else 0.0, 1e-9) / (2**bits - 2)
     q = np.where(np.isfinite(u), 1 + np.round((np.nan_to_num(u) - lowest) / step), 0).astype(np.int64)
     count = (bits + 7) // 8
-    return [centre, scale, lowest, step, count], _bytes(np.diff(q, prepend=0), count)
+    return [centre, scale, lowest, step, count, block], _bytes(np.diff(q, prepend=0), count)

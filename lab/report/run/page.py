@@ -10,9 +10,9 @@ from markupsafe import Markup
 from lab.files.text.atomic_write import atomic_write_text
 from lab.report.html import environment
 from lab.report.run import error_tables, figures, pose_curves, tables, trust, uncertainty
-from lab.report.run.events import ShownEvent, events, selected
 from lab.report.run.blocks.model_fit import HEADS as MODEL_FIT_HEADS
 from lab.report.run.blocks.model_fit import model_fit
+from lab.report.run.events import ShownEvent, events, selected
 from lab.report.run.pictures import pictures
 from lab.report.run.report_data import ReportData, read_report_data
 from lab.report.run.tracks import POSE_COLOURS, SPOT_COLOURS, timeline_figure, tracks_figure, zoom_data
@@ -64,7 +64,9 @@ def page(m: ReportData, results: Path) -> str:
         "timeline": Markup(timeline_figure(m)) if len(m.spots.frames) and m.spots.views else "",
         "spot_legend": [(str(s), SPOT_COLOURS[s], s.meaning_for(method)) for s in SpotStatus],
         "pose_legend": [(str(s), POSE_COLOURS[s], s.meaning) for s in PoseStatus],
-        "truth_grid": Markup(figures.error_grid(m, columns, zoom=zoom)) if (columns := figures.truth_columns(m)) else "",
+        "truth_grid": Markup(figures.error_grid(m, columns, zoom=zoom))
+        if (columns := figures.truth_columns(m))
+        else "",
         "nees_figure": Markup(figures.nees_figure(m, zoom)),
         "rms_figure": Markup(figures.rms_figure(m, zoom)),
         "residual_grid": Markup(figures.error_grid(m, figures.residual_columns(m), zoom=zoom)),
@@ -110,7 +112,10 @@ def _run_line(m: ReportData) -> str:
 
 
 def _event_rows(m: ReportData, found: list[ShownEvent]) -> list[tuple[str, str, str, str, str]]:
-    """Frame, time, camera and text of each event, and the address of its place in the plots, without occlusions: they are many and in the status figure."""
+    """Frame, time, camera and text of each event, and the address of its place in the plots.
+
+    Without occlusions: they are many and in the status figure.
+    """
     clock = m.time_name != "frame"
     return [
         (

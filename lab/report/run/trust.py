@@ -19,7 +19,7 @@ from tracking.statuses import PoseStatus
 GOOD, LOOK, BAD, UNKNOWN = "good", "look", "bad", "unknown"
 _LARGE = 1.5  # residuals over their stated sigma from which a camera or beam is pointed out
 _LEVELS = {"small": GOOD, "check": LOOK, "fail": BAD}
-_SURE = 0.99
+_SURE, _MOST, _DOUBTFUL = 0.99, 0.95, 0.9  # probability of a label: sure; share of sure labels; doubtful below
 _AMBIGUOUS = (
     ("tie", "ties of two labellings"),
     ("undecided", "intervals with an undecided label"),
@@ -43,7 +43,7 @@ def time_link(m: ReportData, first: int, last: int) -> str:
     """The address within the page that enlarges the frames first..last (indices) with some frames around them."""
     margin = max(10, (last - first) // 2)
     a, b = max(first - margin, 0), min(last + margin, len(m.t_s) - 1)
-    return f"#t={m.t_s[a]:.6g},{m.t_s[b]:.6g}" if b > a else ""
+    return f"#t={m.t_s[a]:.9g},{m.t_s[b]:.9g}&at={m.t_s[first]:.9g}" if b > a else ""
 
 
 def evidence(m: ReportData, fit: ModelFit | None) -> list[Evidence]:
@@ -122,11 +122,10 @@ def _residuals(m: ReportData) -> list[Evidence]:
             r, sigma = m.residual_px[:, own], m.spots.sigma_px[:, own]
             if np.isfinite(r).any():
                 ratio = float(np.sqrt(np.nanmean((r / sigma) ** 2) / m.residual_share))
-                parts.append(f"{group} {format_number(_rms(r), 2)} px ({format_number(ratio, 2)})")
+                parts.append(f"{group} {format_number(_rms(r), 2)} px ({format_number(ratio, 2)} × expected)")
                 largest = max(largest, ratio)
         if parts:
-            words = f"{', '.join(parts)}; in brackets: over the expected size"
-            out.append(Evidence(LOOK if largest > _LARGE else GOOD, name, words))
+            out.append(Evidence(LOOK if largest > _LARGE else GOOD, name, ", ".join(parts)))
     return out or [Evidence(UNKNOWN, "Residuals", "no frame has a measured pose")]
 
 
@@ -149,7 +148,9 @@ def _labels(m: ReportData) -> Evidence:
         return Evidence(GOOD, "Labels", words)
     words += f"; lowest {format_number(float(p[k, j]), 3)}, spot {m.spots.views[j][1]}"
     link = time_link(m, int(k), int(k))
-    return Evidence(GOOD if sure > 0.99 else LOOK, "Labels", words, link, f"frame {m.spots.frames[k]}")
+    return Evidence(
+        GOOD if sure >= _MOST and p[k, j] >= _DOUBTFUL else LOOK, "Labels", words, link, f"frame {m.spots.frames[k]}"
+    )
 
 
 def _ambiguous(m: ReportData) -> Evidence:
@@ -171,9 +172,7 @@ def methods(m: ReportData, fit: ModelFit | None) -> Methods:
     """The text on the methods, with the run's own numbers."""
     p, measured = m.poses, m.poses.has(PoseStatus.MEASURED)
     sizes, versions = m.picture_sizes, dict(m.summary.details["versions"])
-    cameras = [
-        f"{c}, {sizes[c][0]} \u00d7 {sizes[c][1]} px" if c in sizes else c for c in m.spots.cameras
-    ]
+    cameras = [f"{c}, {sizes[c][0]} \u00d7 {sizes[c][1]} px" if c in sizes else c for c in m.spots.cameras]
     state, span = m.summary.calibration, float(m.t_s[-1] - m.t_s[0]) if len(m.t_s) else 0.0
     known = bool(measured.any())
 

@@ -67,40 +67,38 @@
     };
     const t = times(head.t), frames = times(head.frames);
     const rows = head.rows.map((row) => ({ ...row, codes: integers(head.n, 1) }));
-    const blocks = Math.ceil(head.n / head.block), length = head.block > 1 ? 2 * blocks : blocks;
-    const places = head.series.map((s) => [s, (at += length * s[4]) - length * s[4]]);
-    const centres = t;
+    const places = head.series.map((s) => {
+      const blocks = Math.ceil(head.n / s[5]), length = s[5] > 1 ? 2 * blocks : blocks;
+      return [s, (at += length * s[4]) - length * s[4], blocks, length];
+    });
     const ready = new Map();
     const series = (name) => {
       if (name.startsWith("=")) {
         const value = Number(name.slice(1));
-        return { low: () => value, high: () => value };
+        return { low: () => value, high: () => value, block: Infinity };
       }
       if (!ready.has(name)) {
-        const [[centre, scale, lowest, step, width], start] = places[Number(name)];
+        const [[centre, scale, lowest, step, width, block], start, blocks, length] = places[Number(name)];
         at = start;
         const q = integers(length, width), mask = 2 ** (8 * width) - 1, y = new Float64Array(length);
         for (let i = 0, sum = 0; i < length; i++) {
           sum = (sum + q[i]) & mask;
           y[i] = sum ? centre + scale * Math.sinh(lowest + (sum - 1) * step) : NaN;
         }
-        const shift = head.block > 1 ? blocks : 0;
-        ready.set(name, { low: (i) => y[i], high: (i) => y[i + shift] });
+        const shift = block > 1 ? blocks : 0, which = block > 1 ? (i) => Math.floor(i / block) : (i) => i;
+        ready.set(name, { low: (i) => y[which(i)], high: (i) => y[which(i) + shift], block });
       }
       return ready.get(name);
     };
     const band = (names) => {
       const parts = names.split(" ");
       const [a, b] = [series(parts[0]), series(parts[1])];
-      if (parts.length === 2) return { low: a.low, high: b.high };
-      const times_ = Number(parts[2]);
-      return { low: (i) => a.low(i) - times_ * b.high(i), high: (i) => a.high(i) + times_ * b.high(i) };
+      const block = Math.min(a.block, b.block);
+      if (parts.length === 2) return { low: a.low, high: b.high, block };
+      const many = Number(parts[2]);
+      return { low: (i) => a.low(i) - many * b.high(i), high: (i) => a.high(i) + many * b.high(i), block };
     };
-    const blockTime = (i) => {
-      const last = Math.min((i + 1) * head.block, head.n) - 1;
-      return (centres[i * head.block] + centres[last]) / 2;
-    };
-    return { n: head.n, block: head.block, blocks, t, frames, rows, series, band, blockTime };
+    return { n: head.n, t, frames, rows, series, band };
   }
   /** The first index whose time is at least t. */
   function indexFrom(t) {
@@ -140,18 +138,28 @@
   };
 
   // ---- drawing an enlarged part -----------------------------------------------------------------------------------
-  /** Calls visit(time, low, high, from, to) for every block, or group of blocks, of the visible part. */
-  function visit(p, each) {
-    const wide = p.right - p.left;
-    const a = Math.max(Math.floor(indexFrom(view.lo) / store.block) - 1, 0);
-    const b = Math.min(Math.ceil(indexFrom(view.hi) / store.block) + 1, store.blocks);
-    const group = Math.max(1, Math.ceil((b - a) / wide));
-    for (let i = a; i < b; i += group) each(store.blockTime(Math.min(i + (group >> 1), b - 1)), i, Math.min(i + group, b));
-    return { a, b, group };
+  /** Calls each(time, first frame, one past the last) for groups of at least `block` frames in the visible part. */
+  function visit(p, block, each) {
+    const least = Number.isFinite(block) ? block : store.n;
+    const count = indexFrom(view.hi) - indexFrom(view.lo);
+    const group = least * Math.max(1, Math.ceil(count / least / (p.right - p.left)));
+    const a = Math.max(Math.floor(indexFrom(view.lo) / group) - 1, 0) * group;
+    const b = Math.min((Math.ceil(indexFrom(view.hi) / group) + 1) * group, store.n);
+    if (group >= store.n) { // a constant: its two ends
+      each(store.t[0], 0, 1);
+      each(store.t[store.n - 1], store.n - 1, store.n);
+      return Infinity;
+    }
+    for (let i = a; i < b; i += group) {
+      const end = Math.min(i + group, store.n);
+      each((store.t[i] + store.t[end - 1]) / 2, i, end);
+    }
+    return group > 1 ? Infinity : b - a;
   }
+  /** The smallest low and the largest high of the frames from..to - 1; NaN where there is none. */
   function edges(s, from, to) {
     let low = Infinity, high = -Infinity;
-    for (let i = from; i < to; i++) {
+    for (let i = from; i < to; i += s.block) {
       const l = s.low(i), h = s.high(i);
       if (l < low) low = l;
       if (h > high) high = h;
@@ -164,10 +172,10 @@
     const codes = store.rows[p.row]?.codes;
     const all = [...p.lines.map(([e]) => [store.series(e.dataset.s), false])];
     all.push(...p.bands.map(([e]) => [store.band(e.dataset.b), true]));
-    visit(p, (t, from, to) => {
+    visit(p, Math.min(...all.map(([s]) => s.block)), (t, from, to) => {
       if (t < view.lo || t > view.hi) return;
       for (const [s, isBand] of all) {
-        if (isBand && codes && codes[from * store.block] !== 1) continue; // bands of predicted poses set no range
+        if (isBand && codes && codes[from] !== 1) continue; // bands of predicted poses set no range
         add(...edges(s, from, to));
       }
     });
@@ -189,7 +197,7 @@
         if (up.length) d += `M${up.concat(down.reverse()).join("L")}z`;
         [up, down] = [[], []];
       };
-      visit(p, (t, from, to) => {
+      visit(p, s.block, (t, from, to) => {
         const [low, high] = edges(s, from, to);
         if (Number.isNaN(low)) return close();
         const x = X(t).toFixed(1);
@@ -209,7 +217,7 @@
         d += `${run++ ? "L" : "M"}${x} ${Y(clamp(y)).toFixed(1)}`;
         last = y;
       };
-      const seen = visit(p, (t, from, to) => {
+      const seen = visit(p, s.block, (t, from, to) => {
         const [low, high] = edges(s, from, to);
         if (Number.isNaN(low)) {
           if (run === 1) d += "h0";
@@ -217,18 +225,19 @@
           return;
         }
         const x = X(t).toFixed(1);
+        const inView = t >= view.lo && t <= view.hi;
         const upFirst = Math.abs(low - last) <= Math.abs(high - last);
         point(x, upFirst ? low : high);
         if (high > low) point(x, upFirst ? high : low);
-        if (high > hi && x >= p.left && x <= p.right) marks.add(`M${5 * Math.round(x / 5) - 3} ${top}h6l-3 -5z`);
-        if (low < lo && x >= p.left && x <= p.right) marks.add(`M${5 * Math.round(x / 5) - 3} ${bottom}h6l-3 5z`);
+        if (high > hi && inView) marks.add(`M${5 * Math.round(x / 5) - 3} ${top}h6l-3 -5z`);
+        if (low < lo && inView) marks.add(`M${5 * Math.round(x / 5) - 3} ${bottom}h6l-3 5z`);
         dots += `M${x} ${Y(clamp(low)).toFixed(1)}h0`;
       });
       if (run === 1) d += "h0";
       const path = e.cloneNode(true);
       path.setAttribute("d", d);
       inner.append(path);
-      if (store.block === 1 && seen.b - seen.a < (p.right - p.left) / 8 && !e.hasAttribute("stroke-dasharray")) {
+      if (seen < (p.right - p.left) / 8 && !e.hasAttribute("stroke-dasharray")) {
         make("path", { class: "line", d: dots, stroke: e.getAttribute("stroke"), "stroke-width": 3.4 }, inner);
       }
       if (marks.size) make("path", { d: [...marks].join(""), fill: e.getAttribute("stroke") }, group);
@@ -319,7 +328,7 @@
       m.dots ??= m.colours.map((stroke) => make("circle", { r: 6, class: "here", stroke }, m.svg));
       const [xl, xh, xa, xb, yl, yh, ya, yb] = m.map;
       m.dots.forEach((dot, j) => {
-        const at = [0, 1].map((k) => (i < 0 ? NaN : store.series(m.uv[2 * j + k]).low(Math.floor(i / store.block))));
+        const at = [0, 1].map((k) => (i < 0 ? NaN : store.series(m.uv[2 * j + k]).low(i)));
         const x = xa + ((at[0] - xl) * (xb - xa)) / (xh - xl), y = ya + ((at[1] - yl) * (yb - ya)) / (yh - yl);
         const inside = x >= Math.min(xa, xb) && x <= Math.max(xa, xb) && y >= Math.min(ya, yb) && y <= Math.max(ya, yb);
         dot.style.display = inside ? "" : "none";
@@ -338,20 +347,19 @@
     const head = clock ? `t = ${t.toFixed(3)} s` : `frame ${Math.round(t)}`;
     html("strong", {}, dock, i >= 0 && clock ? `${head} \u00b7 frame ${store.frames[i]}` : head);
     if (i < 0) return;
-    const block = Math.floor(i / store.block);
     const values = html("table", {}, dock);
     const line = (name, s, isBand) => {
-      const row = html("tr", {}, values), low = s.low(block), high = s.high(block);
+      const row = html("tr", {}, values), low = s.low(i), high = s.high(i);
       html("th", { scope: "row" }, row, name);
       const both = isBand ? low !== high : high > low;
       html("td", {}, row, `${both ? `${written(low)} to ${written(high)}` : written(low)} ${hovered.unit}`);
     };
     if (hovered) {
+      const blocks = hovered.lines.map(([e]) => store.series(e.dataset.s).block).filter(Number.isFinite);
       for (const [e, name] of hovered.lines) line(name, store.series(e.dataset.s), false);
       for (const [e, name] of hovered.bands) line(name, store.band(e.dataset.b), true);
-      if (store.block > 1 && hovered.lines.length) {
-        html("p", {}, dock, `smallest and largest of ${store.block} frames`);
-      }
+      const most = Math.max(1, ...blocks);
+      if (most > 1) html("p", {}, dock, `\u201cto\u201d: smallest and largest of up to ${most} frames`);
     }
     const list = html("p", { class: "statuses" }, dock);
     for (const row of store.rows) {
@@ -420,7 +428,8 @@
     if (!found || !store) return;
     const [lo, hi] = [Number(found[1]), Number(found[2])];
     if (!(hi > lo) || hi <= full.lo || lo >= full.hi) return;
-    cursor = Math.min(Math.max((lo + hi) / 2, full.lo), full.hi);
+    const at = /[#&]at=(-?[\d.eE+-]+)/.exec(location.hash);
+    if (at) cursor = Math.min(Math.max(Number(at[1]), full.lo), full.hi);
     show(lo, hi, true);
     if (scroll) (bar?.element.nextElementSibling || plots[0].svg).scrollIntoView();
   }
@@ -461,6 +470,11 @@
     return { element, update };
   }
   let bar = null;
+  document.addEventListener("pointerdown", (event) => {
+    if (event.target.closest("svg[data-t], #timebar, a") || cursor === null) return;
+    cursor = hovered = null;
+    refresh();
+  });
 
   // ---- pointer, wheel, keys ---------------------------------------------------------------------------------------
   const fingers = new Map();

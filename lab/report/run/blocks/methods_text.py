@@ -13,11 +13,12 @@ BIERMAN = (
     " 65\u201375."
 )
 BAR_SHALOM = (
-    "Bar-Shalom Y, Li XR, Kirubarajan T (2001). Estimation with Applications to Tracking and Navigation. Wiley, New York."
+    "Bar-Shalom Y, Li XR, Kirubarajan T (2001). Estimation with Applications to Tracking and Navigation."
+    " Wiley, New York."
 )
 BAARDA = (
-    "Baarda W (1968). A testing procedure for use in geodetic networks. Netherlands Geodetic Commission, Publications on"
-    " Geodesy 2(5), Delft."
+    "Baarda W (1968). A testing procedure for use in geodetic networks. Netherlands Geodetic Commission,"
+    " Publications on Geodesy 2(5), Delft."
 )
 
 
@@ -73,15 +74,15 @@ def methods_text(f: MethodsFacts) -> Methods:
     program = f"beampose {f.version}".strip()
     if f.method == "spots":
         tracking = (
-            f" Spots were detected and tracked with {program}, by prediction and matching in three steps with curve"
-            f" switching {cite(HUO)}. The pose of the vehicle was estimated in each frame from the labelled spots of all"
-            " cameras by weighted least squares on their pixels."
+            f" Spots were detected and tracked with {program}, by prediction and matching in three steps with"
+            f" curve switching {cite(HUO)}. The pose of the vehicle was estimated in each frame from the labelled spots"
+            " of all cameras by weighted least squares on their pixels."
         )
     else:
         tracking = (
-            f" Spots were detected and tracked with {program}: one filter estimates the motion of the rigid vehicle, the"
-            " detections of each frame are assigned to the spots jointly, several hypotheses are kept until one is clearly"
-            f" the most likely {cite(BAR_SHALOM)}, and labels must be confirmed by the other spots of the frame"
+            f" Spots were detected and tracked with {program}: one filter estimates the motion of the rigid vehicle,"
+            " the detections of each frame are assigned to the spots jointly, several hypotheses are kept until one is"
+            f" clearly the most likely {cite(BAR_SHALOM)}, and labels must be confirmed by the other spots of the frame"
             f" {cite(BAARDA)}. The measurement principle and the treatment of spots out of view follow {cite(HUO)}."
         )
     if f.smoothed:
@@ -94,8 +95,8 @@ def methods_text(f: MethodsFacts) -> Methods:
     results += f" (frames otherwise: {', '.join(others)})." if others else "."
     if f.sigma_angles:
         results += (
-            f" Median standard uncertainties of the measured poses (k = 1) are {f.sigma_angles} in yaw, pitch and roll and"
-            f" {f.sigma_position} in x, y and z"
+            f" Median standard uncertainties of the measured poses (k = 1) are {f.sigma_angles} in yaw, pitch and roll"
+            f" and {f.sigma_position} in x, y and z"
         )
         results += ", with the calibration's contribution." if f.calibration_sigmas else ", without the calibration's."
     results += f" The median residual of a pose is {f.residual} (RMS over its spots)." if f.residual else ""
