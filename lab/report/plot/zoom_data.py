@@ -19,7 +19,7 @@ from geometry.arrays import Array, Ints
 
 _BITS, _FINE_BITS = 14, 20
 _FINE_SHARE = 8  # blocks of fine series are shorter by this factor: they are smooth and so compress better
-_SPARE_BYTES, _BYTES_PER_FRAME, _MOST_BYTES = 150_000, 65, 3_000_000
+_SPARE_BYTES, _BYTES_PER_FRAME, _MOST_BYTES = 150_000, 65, 2_700_000
 
 
 class ZoomData:

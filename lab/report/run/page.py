@@ -7,7 +7,9 @@ from typing import Any
 
 from markupsafe import Markup
 
+from lab.errors import InputError
 from lab.files.text.atomic_write import atomic_write_text
+from lab.report.failure import write_failure_report
 from lab.report.html import environment
 from lab.report.run import error_tables, figures, pose_curves, tables, trust, uncertainty
 from lab.report.run.blocks.model_fit import HEADS as MODEL_FIT_HEADS
@@ -29,10 +31,16 @@ def write_report(results: Path, run_folder: Path | None = None) -> Path:
     errors against truth are added.
 
     Raises:
-        InputError: the tables cannot be read.
+        InputError: the tables cannot be read; report.html then says so.
     """
     path = results / FILE_NAME
-    atomic_write_text(page(read_report_data(results, run_folder), results), path)
+    try:
+        data = read_report_data(results, run_folder)
+    except InputError as error:
+        if results.is_dir():
+            write_failure_report(results, results.resolve().name, str(error), run_folder)
+        raise
+    atomic_write_text(page(data, results), path)
     return path
 
 
