@@ -98,7 +98,8 @@
       const many = Number(parts[2]);
       return { low: (i) => a.low(i) - many * b.high(i), high: (i) => a.high(i) + many * b.high(i), block };
     };
-    return { n: head.n, t, frames, rows, series, band };
+    const most = Math.max(1, ...head.series.map((one) => one[5]));
+    return { n: head.n, t, frames, rows, series, band, most };
   }
   /** The first index whose time is at least t. */
   function indexFrom(t) {
@@ -183,6 +184,8 @@
     const pad = Math.max(0.06 * (hi - lo), 1e-9, 1e-6 * Math.abs(hi));
     return [lo - pad, hi + pad];
   }
+  /** Whether blocks of a thinned series are wide enough on the screen to be drawn as boxes from low to high. */
+  const boxed = (s, x0, x1) => s.block > 1 && Number.isFinite(s.block) && x1 - x0 > 3;
   function drawSeries(p, group, X, Y, lo, hi) {
     const [, , bottom, top] = p.y;
     const inner = make("svg", {
@@ -200,9 +203,11 @@
       visit(p, s.block, (t, from, to) => {
         const [low, high] = edges(s, from, to);
         if (Number.isNaN(low)) return close();
-        const x = X(t).toFixed(1);
-        up.push(`${x} ${Y(clamp(high)).toFixed(1)}`);
-        down.push(`${x} ${Y(clamp(low)).toFixed(1)}`);
+        const [x0, x1] = [X(border(from)), X(border(to))];
+        for (const x of boxed(s, x0, x1) ? [x0, x1] : [X(t)]) {
+          up.push(`${x.toFixed(1)} ${Y(clamp(high)).toFixed(1)}`);
+          down.push(`${x.toFixed(1)} ${Y(clamp(low)).toFixed(1)}`);
+        }
       });
       close();
       const path = e.cloneNode(true);
@@ -212,7 +217,7 @@
     for (const [e] of p.lines) {
       const s = store.series(e.dataset.s);
       const marks = new Set();
-      let d = "", dots = "", run = 0, last = NaN;
+      let d = "", dots = "", ranges = "", run = 0, last = NaN;
       const point = (x, y) => {
         d += `${run++ ? "L" : "M"}${x} ${Y(clamp(y)).toFixed(1)}`;
         last = y;
@@ -226,6 +231,11 @@
         }
         const x = X(t).toFixed(1);
         const inView = t >= view.lo && t <= view.hi;
+        const [x0, x1] = [X(border(from)), X(border(to))];
+        if (boxed(s, x0, x1)) {
+          const [a, b] = [Y(clamp(low)).toFixed(1), Y(clamp(high)).toFixed(1)];
+          ranges += `M${x0.toFixed(1)} ${a}H${x1.toFixed(1)}V${b}H${x0.toFixed(1)}z`;
+        }
         const upFirst = Math.abs(low - last) <= Math.abs(high - last);
         point(x, upFirst ? low : high);
         if (high > low) point(x, upFirst ? high : low);
@@ -235,7 +245,11 @@
       });
       if (run === 1) d += "h0";
       const path = e.cloneNode(true);
-      path.setAttribute("d", d);
+      path.setAttribute("d", ranges || d);
+      if (ranges) { // single frames are not known: no line between them
+        path.removeAttribute("class");
+        for (const [key, value] of [["fill", e.getAttribute("stroke")], ["opacity", 0.4]]) path.setAttribute(key, value);
+      }
       inner.append(path);
       if (seen < (p.right - p.left) / 8 && !e.hasAttribute("stroke-dasharray")) {
         make("path", { class: "line", d: dots, stroke: e.getAttribute("stroke"), "stroke-width": 3.4 }, inner);
@@ -462,7 +476,10 @@
     first.before(element);
     const update = () => {
       const v = current(), digits = clock ? 3 : 0;
-      words.textContent = `${v.lo.toFixed(digits)} to ${v.hi.toFixed(digits)}${clock ? " s" : ""}`;
+      const frames = indexFrom(v.hi) - indexFrom(v.lo);
+      const thin = store.most > 1 && (476 * store.most) / Math.max(frames, 1) > 3;
+      words.textContent = `${v.lo.toFixed(digits)} to ${v.hi.toFixed(digits)}${clock ? " s" : ""}`
+        + (thin ? ` \u00b7 boxes: range of up to ${store.most} frames; every value is in the tables` : "");
       all.disabled = smaller.disabled = !view;
       if (cursor !== null) slider.value = nearest(cursor);
       slider.setAttribute("aria-valuetext", cursor === null ? "no cursor" : dock.querySelector("strong")?.textContent || "");
