@@ -13,7 +13,9 @@ from lab.report.plot.axes import PlotArea, frame, heading, x_ticks, y_ticks
 from lab.report.plot.scales import Scale, padded_range, tick_texts, ticks
 from lab.report.plot.svg import area_path, figure, line_path, text
 from lab.report.plot.thinning import band_envelope, envelope, true_shares
+from lab.report.plot.zoom_data import ZoomData
 
+_BINS_PER_UNIT = 0.6  # of a thinned series; cursor.js draws enlarged parts from more points
 _NAME_WIDTH = 46  # viewBox units at the right end of a time axis that its name takes
 
 
@@ -37,6 +39,17 @@ class Band:
     colour: str
     name: str
     opacity: float = 0.25
+    sigma: Array | None = None  # (n,) where the band is centre +- times * sigma
+    centre: Array | float = 0.0
+    times: float = 1.0
+
+    @classmethod
+    def about(
+        cls, centre: Array | float, sigma: Array, times: float, colour: str, name: str, opacity: float = 0.25
+    ) -> Band:
+        """The band centre +- times * sigma."""
+        low, high = centre - times * sigma, centre + times * sigma
+        return cls(low, high, colour, name, opacity, sigma, centre, times)
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,10 +74,15 @@ def time_panel(
     height: int = 118,
     with_time: bool = True,
     time_name: str = "time (s)",
+    zoom: ZoomData | None = None,
+    row: int = -1,
+    fit: bool = False,
 ) -> str:
     """One plot over times t (n,), increasing.
 
     Values beyond y_range are drawn at its edge with a mark, and the largest one is given in the corner.
+    zoom: takes the series, so that a part of the time can be enlarged; row: the number of the row of statuses in it
+    from which the shades follow; fit: the y axis of an enlarged part follows the values in it.
     """
     values = np.concatenate(
         [np.zeros(0), *(line.y for line in lines), *(b.low for b in bands), *(b.high for b in bands)]
@@ -72,15 +90,16 @@ def time_panel(
     lo, hi = y_range or padded_range(values)
     bottom = height - (30.0 if with_time else 8.0)
     p = PlotArea(time_scale(t, 54.0, width - 10.0), Scale(lo, hi, bottom, 20.0), width, height)
-    bins = int(p.X.b - p.X.a)
+    bins = max(int(_BINS_PER_UNIT * (p.X.b - p.X.a)), 1)
     marks = ticks(lo, hi, max(5, int((bottom - 20.0) / 22)))
-    out = [*_shaded(p, shades, len(t)), y_ticks(p, marks, tick_texts(marks), grid=True)]
+    out = ['<g class="whole">', *_shaded(p, shades, len(t)), y_ticks(p, marks, tick_texts(marks), grid=True)]
     out.append(time_ticks(p, time_name if with_time else ""))
     for band in bands:
         x, low, high = band_envelope(t, band.low, band.high, bins)
         d = area_path(p.X(x), p.Y(np.clip(low, lo, hi)), p.Y(np.clip(high, lo, hi)))
         out.append(
-            f'<path d="{d}" fill="{band.colour}" opacity="{band.opacity}"><title>{escape(band.name)}</title></path>'
+            f'<path d="{d}" fill="{band.colour}" opacity="{band.opacity}"{_band_data(zoom, band, fit)}>'
+            f"<title>{escape(band.name)}</title></path>"
         )
     beyond = 0.0
     for line in lines:
@@ -88,15 +107,37 @@ def time_panel(
         dash = f' stroke-dasharray="{line.dash}"' if line.dash else ""
         out.append(
             f'<path class="line" d="{line_path(p.X(x), p.Y(np.clip(y, lo, hi)))}" stroke="{line.colour}"'
-            f' stroke-width="{line.width}"{dash}><title>{escape(line.name)}</title></path>'
+            f' stroke-width="{line.width}"{dash}{_line_data(zoom, line, fit)}><title>{escape(line.name)}</title></path>'
         )
         out.append(_marks_beyond(p, x, y, line.colour))
         outside = line.y[(line.y < lo) | (line.y > hi)]
         beyond = max(beyond, float(np.abs(outside).max()) if outside.size else 0.0)
-    out.append(heading(p, f"{title} ({unit})" if unit else title))
     if beyond:
         out.append(text(p.X.b, 12, f"▲▼ up to {format_number(beyond)} {unit}", "end"))
-    return figure(width, height, title, [*out, frame(p, closed=False)], data=time_data(p.X))
+    out += ["</g>", heading(p, f"{title} ({unit})" if unit else title)]
+    data = time_data(p.X)
+    if zoom is not None and len(t) == zoom.n:
+        data += f' data-y="{lo!r} {hi!r} {bottom} 20.0" data-u="{escape(unit, quote=True)}" data-row="{row}"'
+        data += f' data-name="{escape(time_name) if with_time else ""}"' + (' data-fit="1"' if fit else "")
+    return figure(width, height, title, [*out, frame(p, closed=False)], data=data)
+
+
+def _line_data(zoom: ZoomData | None, line: Line, fine: bool) -> str:
+    """The attribute that names the series of a line."""
+    name = None if zoom is None else zoom.add(line.y, fine)
+    return "" if name is None else f' data-s="{name}"'
+
+
+def _band_data(zoom: ZoomData | None, band: Band, fine: bool) -> str:
+    """The attribute that names the series of a band: `centre sigma times`, or its two edges."""
+    if zoom is None:
+        return ""
+    if band.sigma is None:
+        names = [zoom.add(band.low), zoom.add(band.high)]
+    else:
+        centre = f"={band.centre!r}" if isinstance(band.centre, float) else zoom.add(band.centre, fine)
+        names = [centre, zoom.add(band.sigma), repr(float(band.times))]
+    return "" if None in names else f' data-b="{" ".join(map(str, names))}"'
 
 
 def time_scale(t: Array, left: float, right: float, margin: float = 0.0) -> Scale:

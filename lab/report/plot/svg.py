@@ -11,7 +11,7 @@ from html import escape
 
 import numpy as np
 
-from geometry.arrays import Array
+from geometry.arrays import Array, Ints
 from lab.report.plot.thinning import true_ranges
 
 # The palette of Okabe & Ito: distinct with any kind of colour vision.
@@ -44,9 +44,23 @@ def line_path(x: Array, y: Array) -> str:
     """The `d` of a line through drawing coordinates (n,), interrupted at nan; an isolated point becomes a dot."""
     parts = []
     for start, stop in true_ranges(np.isfinite(x) & np.isfinite(y)):
-        points = " ".join(map("%.1f %.1f".__mod__, zip(x[start:stop].tolist(), y[start:stop].tolist(), strict=True)))
-        parts.append(f"M{points}" if stop - start > 1 else f"M{points}h0")
+        parts.append(_steps(x[start:stop], y[start:stop]) + ("" if stop - start > 1 else "h0"))
     return "".join(parts)
+
+
+def _steps(x: Array, y: Array) -> str:
+    """The `d` of a line through finite drawing coordinates (n,), n > 0: its start and then steps, in tenths."""
+    places = np.round(10 * np.stack([x, y], -1)).astype(np.int64)  # rounded first: steps do not accumulate errors
+    start = f"M{places[0, 0] / 10:.1f} {places[0, 1] / 10:.1f}"
+    return start + ("l" + _tenths(np.diff(places, axis=0).ravel()) if len(places) > 1 else "")
+
+
+def _tenths(values: Ints) -> str:
+    """Integers (n,) divided by ten as a list of numbers in as few characters as SVG allows."""
+    distinct, which = np.unique(values, return_inverse=True)
+    words = [f"{v / 10:g}".replace("0.", ".") if abs(v) < 10 else f"{v / 10:g}" for v in distinct.tolist()]
+    words = [w if w.startswith("-") else f" {w}" for w in words]
+    return "".join([words[i] for i in which.tolist()]).lstrip()
 
 
 def area_path(x: Array, low: Array, high: Array) -> str:
@@ -55,7 +69,7 @@ def area_path(x: Array, low: Array, high: Array) -> str:
     for start, stop in true_ranges(np.isfinite(low) & np.isfinite(high)):
         xs = np.concatenate([x[start:stop], x[start:stop][::-1]])
         ys = np.concatenate([high[start:stop], low[start:stop][::-1]])
-        parts.append("M" + " ".join(map("%.1f %.1f".__mod__, zip(xs.tolist(), ys.tolist(), strict=True))) + "Z")
+        parts.append(_steps(xs, ys) + "z")
     return "".join(parts)
 
 

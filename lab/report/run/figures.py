@@ -9,6 +9,7 @@ from lab.report.plot.histogram import histogram
 from lab.report.plot.scales import robust_range
 from lab.report.plot.series import Band, Line, Shade, time_panel
 from lab.report.plot.svg import BLUE, GREEN, VERMILLION
+from lab.report.plot.zoom_data import ZoomData
 from lab.report.run.report_data import ReportData
 from lab.runs.score.score import normalised_squares
 from tracking.statuses import PoseStatus, SpotStatus
@@ -25,7 +26,7 @@ def pose_shades(m: ReportData) -> tuple[Shade, ...]:
     )
 
 
-def nees_figure(m: ReportData) -> str:
+def nees_figure(m: ReportData, zoom: ZoomData | None = None) -> str:
     """The normalised estimation error squared over time; empty without truth."""
     delta = m.pose_errors
     if delta is None:
@@ -49,6 +50,8 @@ def nees_figure(m: ReportData) -> str:
         width=1090,
         height=140,
         time_name=m.time_name,
+        zoom=zoom,
+        row=0,
     )
 
 
@@ -59,7 +62,9 @@ def view_shades(m: ReportData, j: int) -> tuple[Shade, ...]:
     return (*shades, Shade(m.spots.has(SpotStatus.LOST)[:, j], "lost", "lost"))
 
 
-def error_grid(m: ReportData, columns: tuple[tuple[str, Array], ...], at_least_px: float = 0.5) -> str:
+def error_grid(
+    m: ReportData, columns: tuple[tuple[str, Array], ...], at_least_px: float = 0.5, zoom: ZoomData | None = None
+) -> str:
     """A row of panels for each view: u and v of the named errors (F, V, 2), px, over time; one y scale per column."""
     out = []
     shown = [j for j in range(len(m.spots.views)) if any(np.isfinite(e[:, j]).any() for _, e in columns)]
@@ -82,6 +87,8 @@ def error_grid(m: ReportData, columns: tuple[tuple[str, Array], ...], at_least_p
                     height=128 if last else 104,
                     with_time=last,
                     time_name=m.time_name,
+                    zoom=zoom,
+                    row=1 + j,
                 )
             )
     return "".join(out)
@@ -105,7 +112,7 @@ def residual_columns(m: ReportData) -> tuple[tuple[str, Array], ...]:
     return columns
 
 
-def rms_figure(m: ReportData) -> str:
+def rms_figure(m: ReportData, zoom: ZoomData | None = None) -> str:
     """The residual RMS of the pose over time, and a histogram of the residuals."""
     p = m.poses
     if not np.isfinite(p.rms_px).any():
@@ -121,6 +128,8 @@ def rms_figure(m: ReportData) -> str:
         y_range=(0.0, max(top, 1e-6)),
         height=_RMS_HEIGHT,
         time_name=m.time_name,
+        zoom=zoom,
+        row=0,
     )
     if m.residual_px is None:
         limits = 0.0, max(float(np.nanpercentile(p.rms_px, 99.5)) * 1.2, 1e-9)

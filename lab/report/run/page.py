@@ -7,15 +7,17 @@ from typing import Any
 
 from markupsafe import Markup
 
+from lab.errors import InputError
 from lab.files.text.atomic_write import atomic_write_text
+from lab.report.failure import write_failure_report
 from lab.report.html import environment
-from lab.report.run import error_tables, figures, pose_curves, tables, uncertainty
+from lab.report.run import error_tables, figures, pose_curves, tables, trust, uncertainty
+from lab.report.run.blocks.model_fit import HEADS as MODEL_FIT_HEADS
+from lab.report.run.blocks.model_fit import model_fit
 from lab.report.run.events import ShownEvent, events, selected
-from lab.report.run.model_fit import HEADS as MODEL_FIT_HEADS
-from lab.report.run.model_fit import model_fit
 from lab.report.run.pictures import pictures
 from lab.report.run.report_data import ReportData, read_report_data
-from lab.report.run.tracks import POSE_COLOURS, SPOT_COLOURS, timeline_figure, tracks_figure
+from lab.report.run.tracks import POSE_COLOURS, SPOT_COLOURS, timeline_figure, tracks_figure, zoom_data
 from tracking.statuses import PoseStatus, SpotStatus
 
 FILE_NAME = "report.html"
@@ -29,10 +31,16 @@ def write_report(results: Path, run_folder: Path | None = None) -> Path:
     errors against truth are added.
 
     Raises:
-        InputError: the tables cannot be read.
+        InputError: the tables cannot be read; report.html then says so.
     """
     path = results / FILE_NAME
-    atomic_write_text(page(read_report_data(results, run_folder), results), path)
+    try:
+        data = read_report_data(results, run_folder)
+    except InputError as error:
+        if results.is_dir():
+            write_failure_report(results, results.resolve().name, str(error), run_folder)
+        raise
+    atomic_write_text(page(data, results), path)
     return path
 
 
@@ -42,29 +50,34 @@ def page(m: ReportData, results: Path) -> str:
     listed = _event_rows(m, found)
     heads, rows = tables.spot_rows(m)
     fit = model_fit(m.summary.model_check)
+    zoom = zoom_data(m)
     method, details = m.summary.method, m.summary.details
     context: dict[str, Any] = {
         "name": m.name,
         "verdict": m.summary.verdict,
+        "evidence": trust.evidence(m, fit),
+        "methods": trust.methods(m, fit),
         "keys": tables.key_figures(m),
         "truth_keys": error_tables.truth_figures(m.errors),
         "pixel_rows": error_tables.pixel_rows(m.errors),
         "run_line": _run_line(m),
-        "pose_figure": Markup(pose_curves.pose_figure(m)),
-        "motion_figure": Markup(pose_curves.motion_figure(m)),
+        "pose_figure": Markup(pose_curves.pose_figure(m, zoom)),
+        "motion_figure": Markup(pose_curves.motion_figure(m, zoom)),
         "smoothed": m.causal is not None,
         "method": method,
         "budget_heads": uncertainty.HEADS,
         "budget_rows": uncertainty.budget_rows(m),
         "budget_words": uncertainty.words(m),
-        "tracks": [Markup(t) for c in m.spots.cameras if (t := tracks_figure(m, c))],
+        "tracks": [Markup(t) for c in m.spots.cameras if (t := tracks_figure(m, c, zoom))],
         "timeline": Markup(timeline_figure(m)) if len(m.spots.frames) and m.spots.views else "",
         "spot_legend": [(str(s), SPOT_COLOURS[s], s.meaning_for(method)) for s in SpotStatus],
         "pose_legend": [(str(s), POSE_COLOURS[s], s.meaning) for s in PoseStatus],
-        "truth_grid": Markup(figures.error_grid(m, columns)) if (columns := figures.truth_columns(m)) else "",
-        "nees_figure": Markup(figures.nees_figure(m)),
-        "rms_figure": Markup(figures.rms_figure(m)),
-        "residual_grid": Markup(figures.error_grid(m, figures.residual_columns(m))),
+        "truth_grid": Markup(figures.error_grid(m, columns, zoom=zoom))
+        if (columns := figures.truth_columns(m))
+        else "",
+        "nees_figure": Markup(figures.nees_figure(m, zoom)),
+        "rms_figure": Markup(figures.rms_figure(m, zoom)),
+        "residual_grid": Markup(figures.error_grid(m, figures.residual_columns(m), zoom=zoom)),
         "residual_known": m.residual_px is not None,
         "model_fit": fit,
         "model_fit_heads": MODEL_FIT_HEADS,
@@ -88,6 +101,7 @@ def page(m: ReportData, results: Path) -> str:
         "versions": details["versions"],
         "inputs": m.summary.inputs,
     }
+    context["zoom_data"] = "" if zoom is None else Markup(zoom.encoded())
     return environment().get_template("report.html.j2").render(context)
 
 
@@ -105,11 +119,20 @@ def _run_line(m: ReportData) -> str:
     return " · ".join(p for p in parts if p)
 
 
-def _event_rows(m: ReportData, found: list[ShownEvent]) -> list[tuple[str, str, str, str]]:
-    """Frame, time, camera and text of each event, without occlusions: they are many and in the status figure."""
+def _event_rows(m: ReportData, found: list[ShownEvent]) -> list[tuple[str, str, str, str, str]]:
+    """Frame, time, camera and text of each event, and the address of its place in the plots.
+
+    Without occlusions: they are many and in the status figure.
+    """
     clock = m.time_name != "frame"
     return [
-        (str(m.spots.frames[e.index]), f"{m.t_s[e.index]:.3f}" if clock else "", e.camera, e.text)
+        (
+            str(m.spots.frames[e.index]),
+            f"{m.t_s[e.index]:.3f}" if clock else "",
+            e.camera,
+            e.text,
+            trust.time_link(m, e.index, e.index),
+        )
         for e in found
         if e.kind != "occluded"
     ]

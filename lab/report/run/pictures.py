@@ -116,7 +116,8 @@ def _drawing(shot: _Shot, picture: Array | str) -> str:
         out.append(_zoom(shot, picture, focus))
     out.append(_statuses(shot, tall))
     height = max(tall, _ZOOM_SHOWN + 96) + 36
-    return svg.figure(540, height, f"{head}: {event.text}", out, css="plot shot")
+    data = f' data-at="{float(m.t_s[event.index])!r}" data-frame="{shot.frame}"'
+    return svg.figure(540, height, f"{head}: {event.text}", out, css="plot shot", data=data)
 
 
 def _focus(shot: _Shot) -> Array | None:

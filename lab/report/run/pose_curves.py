@@ -13,6 +13,7 @@ from lab.files.run.results import PoseTrack
 from lab.report.plot.scales import padded_range, robust_range
 from lab.report.plot.series import Band, Line, time_panel
 from lab.report.plot.svg import BLUE, GREY, SKY, VERMILLION
+from lab.report.plot.zoom_data import ZoomData
 from lab.report.run.figures import pose_shades
 from lab.report.run.report_data import ReportData
 from lab.runs.score.motion_score import differenced
@@ -35,7 +36,7 @@ class _Curve:
     causal: Array | None  # (F,) error of the causal filter, or its difference to `value` where there is no truth
 
 
-def pose_figure(m: ReportData) -> str:
+def pose_figure(m: ReportData, zoom: ZoomData | None = None) -> str:
     """Attitude and position over time beside their uncertainty; empty where no pose is known."""
     p = m.poses
     if not p.known.any():
@@ -47,6 +48,7 @@ def pose_figure(m: ReportData) -> str:
     sigmas = np.concatenate([p.sigma_ypr_deg, p.sigma_position_m], axis=1)
     return _rows(
         m,
+        zoom,
         [
             _Curve(
                 name,
@@ -61,7 +63,7 @@ def pose_figure(m: ReportData) -> str:
     )
 
 
-def motion_figure(m: ReportData) -> str:
+def motion_figure(m: ReportData, zoom: ZoomData | None = None) -> str:
     """Velocity and angular rate beside their uncertainty; empty where neither is known.
 
     Truth: differences of the true poses.
@@ -75,6 +77,7 @@ def motion_figure(m: ReportData) -> str:
     names = [f"{what} {axis}" for what in ("velocity", "rate") for axis in "xyz"]
     return _rows(
         m,
+        zoom,
         [
             _Curve(
                 name,
@@ -110,12 +113,12 @@ def _minus(poses: PoseTrack, true: Pose | None) -> Array | None:
     return np.concatenate([np.where(np.isfinite(shift[:, :1]), ypr, np.nan), shift], axis=1)
 
 
-def _rows(m: ReportData, curves: list[_Curve]) -> str:
+def _rows(m: ReportData, zoom: ZoomData | None, curves: list[_Curve]) -> str:
     measured = m.poses.has(PoseStatus.MEASURED)
-    return "".join(_row(m, curve, measured, curve is curves[-1]) for curve in curves)
+    return "".join(_row(m, zoom, curve, measured, curve is curves[-1]) for curve in curves)
 
 
-def _row(m: ReportData, c: _Curve, measured: Bools, last: bool) -> str:
+def _row(m: ReportData, zoom: ZoomData | None, c: _Curve, measured: Bools, last: bool) -> str:
     """Two panels: the value with its band, and the uncertainty with the known errors."""
     t, shades, height = m.pose_times, pose_shades(m), 128 if last else 104
     value = time_panel(
@@ -123,7 +126,7 @@ def _row(m: ReportData, c: _Curve, measured: Bools, last: bool) -> str:
         c.name,
         c.unit,
         lines=(Line(c.value, BLUE, c.name, 1.3),),
-        bands=(Band(c.value - 3 * c.sigma, c.value + 3 * c.sigma, SKY, "\u00b13\u03c3", 0.45),),
+        bands=(Band.about(c.value, c.sigma, 3.0, SKY, "\u00b13\u03c3", 0.45),),
         shades=shades,
         # Only the bands of measured poses set the range: that of a long prediction would flatten the rest.
         y_range=padded_range(
@@ -132,6 +135,9 @@ def _row(m: ReportData, c: _Curve, measured: Bools, last: bool) -> str:
         height=height,
         with_time=last,
         time_name=m.time_name,
+        zoom=zoom,
+        row=0,
+        fit=True,
     )
     shown = c.sigma[measured] if measured.any() else c.sigma
     unit, factor = (c.unit, 1.0) if np.nanmax(shown, initial=0.0) > c.large else (c.small_unit, 1000.0)
@@ -146,20 +152,21 @@ def _row(m: ReportData, c: _Curve, measured: Bools, last: bool) -> str:
             lines.append(Line(factor * errors, colour, name, width))
             if np.isfinite(errors[measured]).any():
                 limit = max(limit, robust_range(factor * errors[measured])[1])
-    s = factor * c.sigma
     uncertainty = time_panel(
         t,
         f"{c.name}: \u00b1\u03c3, \u00b13\u03c3" + (" and error" if c.error is not None else ""),
         unit,
         lines=tuple(lines),
         bands=(
-            Band(-3 * s, 3 * s, SKY, "\u00b13\u03c3", 0.35),
-            Band(-s, s, BLUE, "\u00b1\u03c3", 0.35),
+            Band.about(0.0, c.sigma, 3 * factor, SKY, "\u00b13\u03c3", 0.35),
+            Band.about(0.0, c.sigma, factor, BLUE, "\u00b1\u03c3", 0.35),
         ),
         shades=shades,
         y_range=(-limit, limit),
         height=height,
         with_time=last,
         time_name=m.time_name,
+        zoom=zoom,
+        row=0,
     )
     return value + uncertainty

@@ -20,6 +20,7 @@ VERDICTS = {
         "FAIL",
         "The run was processed, but a quality gate failed: read the points below.",
     ),
+    "error": ("ERROR", "The run could not be processed: there are no results to use."),
 }
 _NO_VERDICT = ("NO VERDICT", "The results hold no verdict: summary.json is missing or was written by another program.")
 
@@ -83,6 +84,7 @@ class RunSummary:
     details: dict[str, list[tuple[str, str]]]  # the blocks of DETAILS: dotted names and plain values
     errors: Mapping[str, Any] | None  # of the score against truth, as lab.runs.score.score writes it
     model_check: Mapping[str, Any] | None
+    calibration: Mapping[str, Any] | None  # date, verdict, valid_until; None where the rig states none
 
 
 def summary_of(tree: Mapping[str, Any]) -> RunSummary:
@@ -106,6 +108,7 @@ def summary_of(tree: Mapping[str, Any]) -> RunSummary:
         details={name: flattened(tree.get(name) or {}) for name in DETAILS},
         errors=_mapping(tree.get("errors")) or None,
         model_check=valid(dict[str, Any], tree.get("model_check")),
+        calibration=valid(dict[str, Any], tree.get("calibration")),
     )
 
 

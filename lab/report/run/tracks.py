@@ -8,10 +8,11 @@ import numpy as np
 
 from geometry.arrays import Array, Bools, Ints
 from lab.files.run.results import POSE_STATUSES, SPOT_STATUSES
-from lab.report.plot.axes import PlotArea, axes, frame, plot_area, svg_of
+from lab.report.plot.axes import PlotArea, axes, frame, plot_area
 from lab.report.plot.scales import Scale
 from lab.report.plot.series import time_data, time_scale, time_ticks
-from lab.report.plot.svg import BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION, figure, line_path, text
+from lab.report.plot.svg import BLUE, GREEN, GREY, INK, ORANGE, PURPLE, SKY, VERMILLION, figure, line_path, text
+from lab.report.plot.zoom_data import ZoomData
 from lab.report.run.report_data import ReportData
 from tracking.statuses import PoseStatus, SpotStatus
 
@@ -35,7 +36,7 @@ _MOST_POINTS = 3000  # of a drawn track
 _MOST_TURNS = 60  # marked turns of a spot
 
 
-def tracks_figure(m: ReportData, camera: str) -> str:
+def tracks_figure(m: ReportData, camera: str, zoom: ZoomData | None = None) -> str:
     """The tracks of a camera's spots in pixels with the edge of the picture; parts outside it are dashed."""
     views = [j for j, (c, _) in enumerate(m.spots.views) if c == camera]
     uv = m.spots.uv_px[:, views]
@@ -69,7 +70,21 @@ def tracks_figure(m: ReportData, camera: str) -> str:
     beyond = bool(np.any(np.isfinite(uv) & ((uv < low) | (uv > high_uv))))
     words = f"camera {camera}" + (" (parts of the tracks lie outside this drawing)" if beyond else "")
     out += [*axes(p, words, "u (px)", "v (px)", grid=False), frame(p, closed=False)]
-    return svg_of(p, f"Tracks of the spots in the picture of camera {camera}", out)
+    data = "" if zoom is None else _track_data(p, uv, zoom)
+    return figure(p.width, p.height, f"Tracks of the spots in the picture of camera {camera}", out, data=data)
+
+
+def _track_data(p: PlotArea, uv: Array, zoom: ZoomData) -> str:
+    """The attributes from which cursor.js marks the places of the spots at the cursor: uv (F, n, 2), px."""
+    names = [zoom.add(uv[:, i, axis]) for i in range(uv.shape[1]) for axis in (0, 1)]
+    if None in names:
+        return ""
+    colours = [TRACK_COLOURS[i % len(TRACK_COLOURS)] for i in range(uv.shape[1])]
+    scales = [s for scale in (p.X, p.Y) for s in (scale.lo, scale.hi, scale.a, scale.b)]
+    return (
+        f' data-map="{" ".join(f"{float(s):.6g}" for s in scales)}" data-uv="{" ".join(map(str, names))}"'
+        f' data-colours="{" ".join(colours)}"'
+    )
 
 
 def _track_plane(uv: Array, measured: Bools, size: tuple[int, int] | None) -> tuple[PlotArea, Array]:
@@ -152,9 +167,29 @@ def _labels(labels: list[tuple[float, float, str, str]]) -> list[str]:
         placed.append((lx, ly))
         out.append(
             f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3.5" fill="{colour}"><title>first position</title></circle>'
-            + text(lx, ly, spot, "label", f"fill:{colour}")
+            + text(lx, ly, spot, "label", f"fill:{INK}")
         )
     return out
+
+
+def _status_rows(m: ReportData) -> list[tuple[str, Ints, list[tuple[str, str]]]]:
+    """Name, status codes (F,), and the words and colours of the codes: of the pose, and of each view."""
+    pose_words = [(str(s), POSE_COLOURS[s]) for s in POSE_STATUSES]
+    spot_words = [(str(s), SPOT_COLOURS[s]) for s in SPOT_STATUSES]
+    rows: list[tuple[str, Ints, list[tuple[str, str]]]] = []
+    if len(m.poses.frames) == len(m.spots.frames):
+        rows.append(("pose", m.poses.status, pose_words))
+    return rows + [(f"{c} / {s}", m.spots.status[:, j], spot_words) for j, (c, s) in enumerate(m.spots.views)]
+
+
+def zoom_data(m: ReportData) -> ZoomData | None:
+    """An empty store with the statuses: row 0 of the pose, then one per view; None where the tables disagree."""
+    if not len(m.spots.frames) or not np.array_equal(m.poses.frames, m.spots.frames):
+        return None
+    zoom = ZoomData(m.t_s, m.spots.frames)
+    for name, codes, words in _status_rows(m):
+        zoom.add_row(name, codes, words)
+    return zoom
 
 
 def timeline_figure(m: ReportData) -> str:
@@ -164,16 +199,14 @@ def timeline_figure(m: ReportData) -> str:
     n_columns = min(n, int(right - left))
     column = np.arange(n) * n_columns // max(n, 1)
     size = np.bincount(column, minlength=n_columns)
-    pose_words = [(str(s), POSE_COLOURS[s]) for s in POSE_STATUSES]
-    spot_words = [(str(s), SPOT_COLOURS[s]) for s in SPOT_STATUSES]
-    rows: list[tuple[str, Ints, list[tuple[str, str]]]] = []
-    if len(m.poses.frames) == n:
-        rows.append(("pose", m.poses.status, pose_words))
-    rows += [(f"{c} / {s}", m.spots.status[:, j], spot_words) for j, (c, s) in enumerate(m.spots.views)]
-    out, y = [], 8.0
+    rows = _status_rows(m)
+    names: list[str] = []
+    out, y = ['<g class="whole">'], 8.0
+    tops = []
     for name, status, words in rows:
-        out.append(text(left - 8, y + 13, name if len(name) <= 20 else name[:19] + "…", "end"))
-        measured = int(np.isin(status, [0, 1] if words is spot_words else [0]).sum())
+        tops.append(f"{y:.0f}")
+        names.append(text(left - 8, y + 13, name if len(name) <= 20 else name[:19] + "…", "end"))
+        measured = int(np.isin(status, [0] if name == "pose" else [0, 1]).sum())
         below = np.zeros(n_columns)
         for code, (word, colour) in enumerate(words):
             count = np.bincount(column[status == code], minlength=n_columns)
@@ -183,13 +216,15 @@ def timeline_figure(m: ReportData) -> str:
                 title = escape(f"{name}: {word} in {count.sum()} of {n} frames")
                 out.append(f'<path d="{d}" fill="{colour}"><title>{title}</title></path>')
             below += share
-        out.append(text(right + 8, y + 13, f"{100 * measured / max(n, 1):.1f} % measured"))
+        names.append(text(right + 8, y + 13, f"{100 * measured / max(n, 1):.1f} % measured"))
         y += row + (6 if name == "pose" else 0)
     X = time_scale(m.t_s, left, right)
     X = time_scale(m.t_s, left, right, 0.5 * (X.hi - X.lo) / max(n - 1, 1))
     p = PlotArea(X, Scale(0, 1, y + 1, 8), 1110, y + 24)
-    out.append(time_ticks(p, m.time_name))
-    return figure(p.width, p.height, "Status of the pose and of every spot over time", out, data=time_data(X))
+    out += [time_ticks(p, m.time_name), "</g>", *names]
+    data = f'{time_data(X)} data-tops="{" ".join(tops)}" data-high="{row - 4:.0f}" data-name="{m.time_name}"'
+    data += f' data-y="0 1 {y + 1:.0f} 8"'
+    return figure(p.width, p.height, "Status of the pose and of every spot over time", out, data=data)
 
 
 def _strip(share: Array, below: Array, left: float, wide: float, top: float, height: float) -> str:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lab.report.run.model_fit import HEADS, model_fit
+from lab.report.run.blocks.model_fit import HEADS, model_fit
 from lab.report.run.page import write_report
 from lab.report.run.summary import summary_of
 from lab.runs.model_check.check import check_model

@@ -299,7 +299,7 @@ def test_events_recorded_by_the_run_are_listed_and_pictured(fake, tmp_path):
     path = tmp_path / "results" / "summary.json"
     noted = {"frame": 33, "kind": "tie", "camera": None, "spot": None, "text": "two labels fit <equally>"}
     path.write_text(json.dumps(json.loads(path.read_text()) | {"events": [noted, {"frame": 10**9}, "odd"]}))
-    assert "<td>33</td><td>0.330</td><td>left</td><td>two labels fit &lt;equally&gt;</td>" in write_report(
+    assert ">33</a></td><td>0.330</td><td>left</td><td>two labels fit &lt;equally&gt;</td>" in write_report(
         tmp_path / "results"
     ).read_text(encoding="utf-8")
     material = read_report_data(tmp_path / "results", fake.run_folder)

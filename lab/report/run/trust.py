@@ -1,0 +1,213 @@
+"""Can this run be trusted? The evidence in a few lines; and the facts of the text on the methods."""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from geometry.arrays import Array, Bools
+from lab.number_format import format_angle, format_length, format_number, format_percent
+from lab.report.plot.thinning import true_ranges
+from lab.report.run.blocks.methods_text import Methods, MethodsFacts, methods_text
+from lab.report.run.blocks.model_fit import ModelFit
+from lab.report.run.report_data import ReportData
+from tracking.statuses import PoseStatus
+
+GOOD, LOOK, BAD, UNKNOWN = "good", "look", "bad", "unknown"
+_LARGE = 1.5  # residuals over their stated sigma from which a camera or beam is pointed out
+_LEVELS = {"small": GOOD, "check": LOOK, "fail": BAD}
+_SURE, _MOST, _DOUBTFUL = 0.99, 0.95, 0.9  # probability of a label: sure; share of sure labels; doubtful below
+_AMBIGUOUS = (
+    ("tie", "ties of two labellings"),
+    ("undecided", "intervals with an undecided label"),
+    ("changed", "labels changed by the smoothing pass"),
+    ("relabelled", "times all spots were labelled again"),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """One line of evidence."""
+
+    level: str  # GOOD, LOOK, BAD or UNKNOWN
+    name: str
+    text: str
+    link: str = ""  # an address within the page that shows the place in the plots
+    link_text: str = ""
+
+
+def time_link(m: ReportData, first: int, last: int) -> str:
+    """The address within the page that enlarges the frames first..last (indices) with some frames around them."""
+    margin = max(10, (last - first) // 2)
+    a, b = max(first - margin, 0), min(last + margin, len(m.t_s) - 1)
+    return f"#t={m.t_s[a]:.9g},{m.t_s[b]:.9g}&at={m.t_s[first]:.9g}" if b > a else ""
+
+
+def evidence(m: ReportData, fit: ModelFit | None) -> list[Evidence]:
+    """The lines: poses, calibration, model check, residuals by camera and by beam, labels, what was ambiguous."""
+    lines = [_poses(m), _calibration(m), _model(fit), *_residuals(m), _labels(m), _ambiguous(m)]
+    return [line for line in lines if line is not None]
+
+
+def _poses(m: ReportData) -> Evidence | None:
+    measured = m.poses.has(PoseStatus.MEASURED)
+    if not len(measured):
+        return Evidence(BAD, "Poses", "the results have no frames")
+    gaps = true_ranges(~measured)
+    if not gaps:
+        return Evidence(GOOD, "Poses", f"measured in all {len(measured)} frames")
+    first, stop = max(gaps, key=lambda gap: gap[1] - gap[0])
+    words = f"measured in {format_percent(float(measured.mean()))} of the frames; longest gap {_count(stop - first)}"
+    level = BAD if not measured.any() else LOOK if measured.mean() < _SURE else GOOD
+    return Evidence(level, "Poses", words, time_link(m, first, stop - 1), f"frame {m.poses.frames[first]}")
+
+
+def _count(n: int) -> str:
+    return f"{n} frame{'s' if n != 1 else ''}"
+
+
+def _calibration(m: ReportData) -> Evidence:
+    state = m.summary.calibration
+    if not state:
+        return Evidence(UNKNOWN, "Calibration", "date and verdict are not stated in rig.yaml (block `calibration`)")
+    verdict = str(state.get("verdict", "without a verdict"))
+    words = f"{verdict}, of {state.get('date', 'an unknown day')}"
+    recorded = None if m.run is None else m.run.recorded
+    day, until = _day(state.get("date")), _day(state.get("valid_until"))
+    if day and recorded:
+        age = (recorded - day).days
+        words += f", {abs(age)} days {'before' if age >= 0 else 'after'} the recording"
+    elif day:
+        words += "; its age is unknown, as run.yaml has no `recorded`"
+    words += f"; valid until {until.isoformat()}" if until else ""
+    late = bool(until and recorded and recorded > until)
+    level = BAD if verdict == "FAIL" or late else GOOD if verdict == "PASS" else LOOK
+    return Evidence(level, "Calibration", words)
+
+
+def _day(value: object) -> datetime.date | None:
+    try:
+        return datetime.date.fromisoformat(str(value)[:10])
+    except ValueError:
+        return None
+
+
+def _model(fit: ModelFit | None) -> Evidence:
+    if fit is None:
+        return Evidence(UNKNOWN, "Rig and recording", "the results have no model check")
+    if fit.sentence.startswith("Not tested"):
+        return Evidence(UNKNOWN, "Rig and recording", fit.sentence)
+    levels = [_LEVELS.get(f.level, LOOK) for f in fit.findings]
+    worst = BAD if BAD in levels else LOOK if LOOK in levels else GOOD
+    words = fit.sentence.rstrip(":.") + "".join(f"; {f.what}" for f in fit.findings[:2])
+    return Evidence(worst, "Rig and recording", words)
+
+
+def _residuals(m: ReportData) -> list[Evidence]:
+    """The residuals by camera and by beam, px RMS, and over the size expected from the stated sigmas."""
+    if m.residual_px is None or m.run is None or not m.residual_share:
+        return [Evidence(UNKNOWN, "Residuals", "not known without the run folder's rig, or without a measured pose")]
+    beams = {name: spot.beam for name, spot in m.run.rig.spots.items()}
+    out = []
+    for name, groups in (
+        ("Residuals by camera", [camera for camera, _ in m.spots.views]),
+        ("Residuals by beam", [beams.get(spot, "?") for _, spot in m.spots.views]),
+    ):
+        parts, largest = [], 0.0
+        for group in dict.fromkeys(groups):
+            own = [j for j, g in enumerate(groups) if g == group]
+            r, sigma = m.residual_px[:, own], m.spots.sigma_px[:, own]
+            if np.isfinite(r).any():
+                ratio = float(np.sqrt(np.nanmean((r / sigma) ** 2) / m.residual_share))
+                parts.append(f"{group} {format_number(_rms(r), 2)} px ({format_number(ratio, 2)} × expected)")
+                largest = max(largest, ratio)
+        if parts:
+            out.append(Evidence(LOOK if largest > _LARGE else GOOD, name, ", ".join(parts)))
+    return out or [Evidence(UNKNOWN, "Residuals", "no frame has a measured pose")]
+
+
+def _rms(r: Array) -> float:
+    """The RMS length of vectors (..., 2) with nan."""
+    lengths = np.linalg.norm(r, axis=-1)
+    return float(np.sqrt(np.nanmean(lengths**2)))
+
+
+def _labels(m: ReportData) -> Evidence:
+    p = m.spots.label_probability
+    given: Bools = np.isfinite(p) & m.spots.measured
+    if not given.any():
+        return Evidence(UNKNOWN, "Labels", "the results state no probabilities of labels")
+    sure = float((p[given] >= _SURE).mean())
+    where = np.where(given, p, np.inf)
+    k, j = np.unravel_index(int(np.argmin(where)), where.shape)
+    words = f"{format_percent(sure)} of {int(given.sum())} are right with a probability of at least {_SURE:g}"
+    if p[k, j] >= _SURE:
+        return Evidence(GOOD, "Labels", words)
+    words += f"; lowest {format_number(float(p[k, j]), 3)}, spot {m.spots.views[j][1]}"
+    link = time_link(m, int(k), int(k))
+    return Evidence(
+        GOOD if sure >= _MOST and p[k, j] >= _DOUBTFUL else LOOK, "Labels", words, link, f"frame {m.spots.frames[k]}"
+    )
+
+
+def _ambiguous(m: ReportData) -> Evidence:
+    left_open = np.isfinite(m.spots.label_probability) & ~m.spots.measured
+    counts = [(int(left_open.sum()), "detections left without a label")]
+    counts += [(m.summary.event_counts.get(kind, 0), words) for kind, words in _AMBIGUOUS]
+    counts.append((m.summary.found_again or 0, "times the vehicle was lost and found again"))
+    parts = [f"{count} {words}" for count, words in counts if count]
+    if not parts:
+        return Evidence(GOOD, "Ambiguous", "nothing")
+    frames = np.flatnonzero(left_open.any(axis=1))
+    if len(frames):
+        k = int(frames[0])
+        return Evidence(LOOK, "Ambiguous", "; ".join(parts), time_link(m, k, k), f"first: frame {m.spots.frames[k]}")
+    return Evidence(LOOK, "Ambiguous", "; ".join(parts))
+
+
+def methods(m: ReportData, fit: ModelFit | None) -> Methods:
+    """The text on the methods, with the run's own numbers."""
+    p, measured = m.poses, m.poses.has(PoseStatus.MEASURED)
+    sizes, versions = m.picture_sizes, dict(m.summary.details["versions"])
+    cameras = [f"{c}, {sizes[c][0]} \u00d7 {sizes[c][1]} px" if c in sizes else c for c in m.spots.cameras]
+    state, span = m.summary.calibration, float(m.t_s[-1] - m.t_s[0]) if len(m.t_s) else 0.0
+    known = bool(measured.any())
+
+    def medians(values: Array, written: Callable[[float | None], str]) -> str:
+        return ", ".join(written(float(np.nanmedian(values[measured, i]))) for i in range(3))
+
+    rms = p.rms_px[measured & np.isfinite(p.rms_px)]
+    return methods_text(
+        MethodsFacts(
+            version=versions.get("beampose", ""),
+            method=m.summary.method,
+            smoothed=m.causal is not None,
+            cameras=tuple(cameras),
+            spots=len(dict.fromkeys(spot for _, spot in m.spots.views)),
+            beams=None if m.run is None else len(m.run.rig.beams),
+            frames=len(m.spots.frames),
+            rate_hz=None if m.run is None else m.run.frame_rate_hz,
+            duration_s=span if m.time_name != "frame" and span > 0 else None,
+            calibration=f"was calibrated on {state['date']}" if state and "date" in state else "",
+            calibration_sigmas=bool(np.isfinite(p.systematic).any()),
+            measured=format_percent(float(measured.mean()) if len(measured) else 0.0),
+            predicted=int(p.has(PoseStatus.PREDICTED).sum()),
+            lost=int(p.has(PoseStatus.LOST).sum()),
+            sigma_angles=medians(p.sigma_ypr_deg, format_angle) if known else "",
+            sigma_position=medians(p.sigma_position_m, format_length) if known else "",
+            residual=f"{format_number(float(np.median(rms)))} px" if len(rms) else "",
+            model_check=_model_words(fit),
+            verdict=m.summary.verdict.word,
+        )
+    )
+
+
+def _model_words(fit: ModelFit | None) -> str:
+    if fit is None or fit.sentence.startswith("Not tested"):
+        return ""
+    if not fit.findings:
+        return "No deviation of a camera, screen, beam or clock from the calibrated rig was found in the residuals."
+    return f"Deviations from the calibrated rig found in the residuals: {'; '.join(f.what for f in fit.findings)}."
