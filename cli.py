@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import click
 
-from lab.commands import calibrate, plan_and_simulate, results, run
+from lab.commands import calibrate, maintenance, plan_and_simulate, results, run
 from lab.commands.common import Commands
 
 
@@ -29,6 +29,7 @@ for command in (
     results.study,
     calibrate.calibrate,
     plan_and_simulate.plan,
+    maintenance.doctor,
 ):
     main.add_command(command)
 

@@ -126,6 +126,7 @@ def test_the_commands_are_those_of_the_contract():
         "study",
         "calibrate",
         "plan",
+        "doctor",
     }
     steps = {"board", "camera", "screen", "beams", "rig", "check", "convert", "simulate"}
     assert {name for name in COMMANDS if name.startswith("calibrate ")} == {f"calibrate {step}" for step in steps}
@@ -167,7 +168,7 @@ def test_the_example_of_run_leaves_the_files_of_the_contract(desk):
     assert isinstance(json.loads((out / "summary.json").read_text()), dict)
 
 
-@pytest.mark.parametrize("name", ["check", "report", "detect"])
+@pytest.mark.parametrize("name", ["check", "report", "detect", "doctor"])
 def test_the_example_works(works, name):
     assert works(*example(name)).strip()
 
