@@ -30,6 +30,7 @@ for command in (
     calibrate.calibrate,
     plan_and_simulate.plan,
     maintenance.doctor,
+    maintenance.explain,
 ):
     main.add_command(command)
 

@@ -127,6 +127,7 @@ def test_the_commands_are_those_of_the_contract():
         "calibrate",
         "plan",
         "doctor",
+        "explain",
     }
     steps = {"board", "camera", "screen", "beams", "rig", "check", "convert", "simulate"}
     assert {name for name in COMMANDS if name.startswith("calibrate ")} == {f"calibrate {step}" for step in steps}
@@ -168,7 +169,7 @@ def test_the_example_of_run_leaves_the_files_of_the_contract(desk):
     assert isinstance(json.loads((out / "summary.json").read_text()), dict)
 
 
-@pytest.mark.parametrize("name", ["check", "report", "detect", "doctor"])
+@pytest.mark.parametrize("name", ["check", "report", "detect", "doctor", "explain"])
 def test_the_example_works(works, name):
     assert works(*example(name)).strip()
 

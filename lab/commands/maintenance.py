@@ -1,4 +1,4 @@
-"""`beampose doctor`: is the installation fit for use."""
+"""`beampose doctor` and `explain`: the installation, and what codes mean."""
 
 from __future__ import annotations
 
@@ -31,3 +31,20 @@ def doctor(files: tuple[Path, ...], out: Path) -> None:
     for line in lines:
         click.echo(str(line))
     sys.exit(exit_status(lines))
+
+
+@click.command()
+@click.argument("codes", metavar="[CODE]...", nargs=-1)
+def explain(codes: tuple[str, ...]) -> None:
+    """Explain the code of a warning, a verdict reason, a finding or an error; without a code, list all codes.
+
+    The codes are in reports, in summary.json and in the lines of `beampose doctor`.
+
+    \b
+    Example:
+        beampose explain BP-V03
+    """
+    from lab.explain import catalogue
+
+    texts = [catalogue.explain(code) for code in codes] if codes else catalogue.listed()
+    click.echo(("\n\n" if codes else "\n").join(texts))

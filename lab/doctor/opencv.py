@@ -51,8 +51,9 @@ def _read_back(cv2: Any, suffix: str, bits: int, error: float) -> bool:
         found = cv2.imdecode(data, cv2.IMREAD_ANYDEPTH | cv2.IMREAD_GRAYSCALE) if written else None
     except cv2.error:
         return False
-    same_kind = found is not None and found.shape == picture.shape and found.dtype == picture.dtype
-    return bool(same_kind and np.max(np.abs(found.astype(float) - picture)) <= error)
+    if found is None or found.shape != picture.shape or found.dtype != picture.dtype:
+        return False
+    return bool(np.max(np.abs(found.astype(float) - picture)) <= error)
 
 
 def check_videos(cv2: Any) -> Line:
