@@ -29,6 +29,8 @@ for command in (
     results.study,
     calibrate.calibrate,
     plan_and_simulate.plan,
+    maintenance.init,
+    maintenance.verify,
     maintenance.doctor,
     maintenance.explain,
 ):

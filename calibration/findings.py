@@ -28,7 +28,9 @@ class Finding:
 
 def unless_pass(level: Level, what: str, why: str, remedy: str, *, code: str) -> Finding:
     """A finding whose reason and remedy are dropped when its level is PASS."""
-    return Finding(level, what, *(() if level is Level.PASS else (why, remedy)), code=code)
+    if level is Level.PASS:
+        return Finding(level, what, code=code)
+    return Finding(level, what, why, remedy, code)
 
 
 def verdict(findings: Iterable[Finding]) -> Level:

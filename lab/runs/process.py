@@ -66,11 +66,13 @@ def process_run(
     overrides: Mapping[str, Any] | None = None,
     causal: bool = False,
     progress: Progress | None = None,
+    more: Callable[[Run], Mapping[str, Any]] | None = None,
 ) -> RunOutcome:
     """Process one run folder into the folder `out`: the tables, summary.json and report.html.
 
     overrides: tracker parameters that replace those of run.yaml. causal: the tables hold the causal estimates and
     nothing is smoothed; otherwise they hold the smoothed estimates, and attitude_causal.csv the causal ones.
+    more: additional content of summary.json; called with the run before its processing.
 
     Raises:
         BeamposeError: the run cannot be processed (CalibrationError: its rig's calibration must not be used); `out` is
@@ -78,8 +80,11 @@ def process_run(
     """
     started = time.perf_counter()
     run = ready_run(run_folder, overrides)
+    added = {} if more is None else more(run)
     with atomic_folder(out, may_replace=are_results) as work:
-        return write_results(Pipeline.of(run), work, Path(out), started, causal=causal, progress=progress)
+        return write_results(
+            Pipeline.of(run), work, Path(out), started, causal=causal, progress=progress, more=lambda: added
+        )
 
 
 def ready_run(run_folder: Path, overrides: Mapping[str, Any] | None = None) -> Run:

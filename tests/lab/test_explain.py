@@ -23,7 +23,8 @@ CODE = re.compile(r"BP-[A-Z]\d\d")
 def sources() -> Iterator[tuple[str, str]]:
     for package in ("calibration", "lab"):
         for path in sorted((ROOT / package).rglob("*.py")):
-            if "lab/explain" not in path.as_posix():
+            # calibration/findings.py defines the makers and passes codes on.
+            if "lab/explain" not in path.as_posix() and path.name != "findings.py":
                 yield path.relative_to(ROOT).as_posix(), path.read_text("utf-8")
 
 
@@ -37,7 +38,7 @@ def without_code(name: str, text: str) -> list[str]:
             continue
         given = [k.value for k in node.keywords if k.arg == "code"] or node.args[:1]
         codes = [c.value for c in given if isinstance(c, ast.Constant) and CODE.fullmatch(str(c.value))]
-        if not codes and "*(()" not in ast.unparse(node):  # unless_pass itself passes its code on
+        if not codes:
             wrong.append(f"{name}:{node.lineno}")
     return wrong
 

@@ -29,7 +29,7 @@ def test_every_input_has_one_entry_with_its_digest_and_size(tmp_path):
         assert entries[name]["covers"] == "contents"
     pictures = list((folder / "frames/left").iterdir())
     assert entries["frames/left"]["bytes"] == sum(p.stat().st_size for p in pictures)
-    assert entries["frames/left"]["covers"] == "names and sizes"
+    assert entries["frames/left"]["covers"] == "names, sizes and contents"
 
 
 def test_fingerprints_do_not_depend_on_the_location(tmp_path):
@@ -44,7 +44,7 @@ def test_a_timestamps_file_is_an_input(tmp_path):
     assert "times.csv" in by_name(folder)
 
 
-@pytest.mark.parametrize("change", ["rename", "grow", "remove", "add"])
+@pytest.mark.parametrize("change", ["rename", "grow", "remove", "add", "edit"])
 def test_a_changed_folder_of_pictures_has_another_digest(tmp_path, change):
     folder = write_run(tmp_path / "run")
     before = by_name(folder)
@@ -54,6 +54,10 @@ def test_a_changed_folder_of_pictures_has_another_digest(tmp_path, change):
             picture.rename(picture.with_name("000007.png"))
         case "grow":
             picture.write_bytes(picture.read_bytes() + b"\0")
+        case "edit":
+            content = bytearray(picture.read_bytes())
+            content[len(content) // 2] ^= 1
+            picture.write_bytes(content)
         case "remove":
             picture.unlink()
         case "add":
@@ -73,12 +77,48 @@ def test_a_table_of_both_cameras_is_listed_once(tmp_path):
     assert list(by_name(folder)) == ["run.yaml", "rig.yaml", "detections.csv"]
 
 
-def test_the_digest_of_a_huge_file_covers_its_start_and_size(tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "MAX_HASHED_BYTES", 1000)
+def test_the_digest_of_a_huge_file_covers_samples_and_its_size(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "MAX_HASHED_BYTES", 1600)
     folder = write_run(tmp_path / "run")
     rig = folder / "rig.yaml"
-    rig.write_text(rig.read_text() + "# " + "x" * 2000 + "\n")
+    rig.write_text(rig.read_text() + "# " + "x" * 4000 + "\n")
     entry = by_name(folder)["rig.yaml"]
-    assert entry["covers"] == "the first 1000 bytes"
-    assert entry["sha256"] == hashlib.sha256(rig.read_bytes()[:1000]).hexdigest()
+    content = rig.read_bytes()
+    starts = [(len(content) - 100) * i // 15 for i in range(16)]
+    assert entry["covers"] == "16 samples, 1600 bytes in all"
+    assert entry["sha256"] == hashlib.sha256(b"".join(content[s : s + 100] for s in starts)).hexdigest()
     assert entry["bytes"] == os.path.getsize(rig)
+
+
+@pytest.mark.parametrize("place", ["start", "end"])
+def test_a_changed_byte_at_either_end_of_a_sampled_picture_changes_the_digest(tmp_path, monkeypatch, place):
+    monkeypatch.setattr(module, "MAX_PICTURE_BYTES", 32)
+    folder = write_run(tmp_path / "run")
+    picture = folder / "frames/left/000002.png"
+    before = by_name(folder)["frames/left"]
+    assert before["covers"] == "names, sizes and samples of the contents"
+    content = bytearray(picture.read_bytes())
+    content[0 if place == "start" else -1] ^= 1
+    picture.write_bytes(content)
+    assert by_name(folder)["frames/left"]["sha256"] != before["sha256"]
+
+
+def test_a_full_fingerprint_covers_every_byte_of_a_picture(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "MAX_PICTURE_BYTES", 16)
+    folder = write_run(tmp_path / "run")
+    picture = folder / "frames/left/000002.png"
+    content = picture.read_bytes()
+    digests = set()
+    for k in range(40):
+        picture.write_bytes(content[:k] + bytes([content[k] ^ 1]) + content[k + 1 :])
+        entry = next(e for e in fingerprints(load_run(folder), full=True) if e["path"].endswith("left"))
+        digests.add(entry["sha256"])
+        assert entry["covers"] == "names, sizes and contents"
+    assert len(digests) == 40
+
+
+def test_the_tables_of_the_truth_are_inputs(tmp_path):
+    folder = write_run(tmp_path / "run")
+    (folder / "truth").mkdir()
+    (folder / "truth/pose.csv").write_text("frame\n")
+    assert "truth/pose.csv" in by_name(folder)
