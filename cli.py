@@ -30,6 +30,7 @@ for command in (
     calibrate.calibrate,
     plan_and_simulate.plan,
     maintenance.init,
+    maintenance.schema,
     maintenance.verify,
     maintenance.doctor,
     maintenance.explain,

@@ -130,6 +130,7 @@ def test_the_commands_are_those_of_the_contract():
         "explain",
         "init",
         "verify",
+        "schema",
     }
     steps = {"board", "camera", "screen", "beams", "rig", "check", "convert", "simulate"}
     assert {name for name in COMMANDS if name.startswith("calibrate ")} == {f"calibrate {step}" for step in steps}
@@ -205,7 +206,7 @@ def test_the_examples_of_calibrate_lead_from_a_campaign_to_a_rig_that_is_checked
     works("check", "results/rig/rig.yaml")
 
 
-@pytest.mark.parametrize("name", ["calibrate board", "calibrate convert", "plan", "init"])
+@pytest.mark.parametrize("name", ["calibrate board", "calibrate convert", "plan", "init", "schema"])
 def test_the_example_works_without_preparation(works, name):
     arguments = example(name)
     if name == "plan":
@@ -260,6 +261,8 @@ def test_simulate_lists_every_scenario(works):
         ("simulate nothing --out r", "got 'nothing'"),
         ("simulate clean --out r --frames 0", "0 is not in the range"),
         ("report sample_runs", "found no summary.json"),
+        ("schema", "expected a kind of file (rig, run, camera, board, calibration, screens) or --out FOLDER"),
+        ("schema riga", "'riga' is not one of"),
         ("verify sample_runs", "found no summary.json"),
         ("explain BP-V99", "expected a code such as BP-V03, got 'BP-V99'"),
         ("init sample_runs --beams 3", "expected a new or empty folder, found files"),

@@ -1,4 +1,4 @@
-"""`beampose init`, `verify`, `doctor` and `explain`: a start, results checked again, the installation, codes."""
+"""`beampose init`, `schema`, `verify`, `doctor`, `explain`: a first rig, editors, results, the installation, codes."""
 
 from __future__ import annotations
 
@@ -51,6 +51,7 @@ def explain(codes: tuple[str, ...]) -> None:
     click.echo(("\n\n" if codes else "\n").join(texts))
 
 
+_FILES = ("rig", "run", "camera", "board", "calibration", "screens")
 _QUESTIONS = {
     "screens": "How many screens are there",
     "cameras": "How many cameras film them, in all",
@@ -150,3 +151,27 @@ def verify(results: Path, run_folder: Path | None) -> None:
     for line in verification.lines():
         click.echo(line)
     sys.exit(verification.exit_status)
+
+
+@click.command()
+@click.argument("name", metavar="[FILE]", required=False, type=click.Choice(_FILES))
+@click.option("--out", type=FOLDER, help="Write FILE.schema.json there; without FILE, the schemas of all files.")
+def schema(name: str | None, out: Path | None) -> None:
+    """Export JSON schemas of the YAML files, with which editors complete and check them.
+
+    FILE: rig, run, camera, board, calibration or screens. Editors with the YAML language server use a schema that the
+    first line of a file names: `# yaml-language-server: $schema=schemas/rig.schema.json`.
+
+    \b
+    Example:
+        beampose schema --out schemas
+    """
+    from lab.schema.files import as_text, write
+
+    if out is None and name is None:
+        raise click.UsageError(f"expected a kind of file ({', '.join(_FILES)}) or --out FOLDER, got neither")
+    if out is None:
+        click.echo(as_text(str(name)), nl=False)
+        return
+    for path in write([name] if name else list(_FILES), out):
+        click.echo(f"schema: {path}")

@@ -21,7 +21,7 @@ _SCREENS = (
     ("back", (0.0, -1.0, 0.0), ((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0))),
 )
 _HALF_FAN_DEG = 20.0  # between the middle and the outermost beam of a fan
-_UNEQUAL = 1.25  # ratio of neighbouring angles: beams at unequal angles can be told apart
+_UNEQUAL = 1.25  # ratio of neighbouring angles: beams at unequal angles can be distinguished
 _TILT = 0.08  # tangent by which every second beam leaves the plane of its fan: coplanar beams determine less
 _VIEW_M = 2.6  # width of the picture at a screen 2.5 m away
 
