@@ -245,6 +245,7 @@ def test_simulate_lists_every_scenario(works):
         ("run nowhere --out r", "nowhere: expected a run folder, found nothing"),
         ("run sample_runs/README.md --out r", "sample_runs/README.md: expected a run folder, found a file"),
         ("run sample_runs/huo2015 --out sample_runs/huo2015", "something other than earlier results"),
+        ("run sample_runs/huo2015 --out r --quiet --verbose", "expected --verbose or --quiet, got both"),
         ("run sample_runs/huo2015 --out r --set r1_px", "expected NAME=VALUE, got 'r1_px'"),
         ("run sample_runs/huo2015 --out r --set r1_pz=3", "unknown key 'r1_pz'"),
         ("batch --out r", "Missing argument 'RUN...'"),
