@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -98,23 +98,33 @@ def other_versions(recorded: Recorded) -> list[str]:
 def compare_inputs(recorded: Recorded, run: Run) -> InputsNow:
     """Compare the fingerprints of a run's inputs with the recorded ones.
 
-    Files count as the same by their order in the list, since a run folder may have moved. A fingerprint that covers
-    another part of a file than today's cannot be compared.
+    Files are matched by name (of equal names, in order), since a run folder may have moved. A file that has no recorded
+    fingerprint, or one of another part of the file than today's, cannot be compared.
     """
-    current = fingerprints(run)
-    full: list[dict[str, Any]] | None = None
-    changed, not_compared, same = [], [], 0
-    if len(current) != len(recorded.inputs):
-        changed.append(f"{len(current)} input files, recorded were {len(recorded.inputs)}")
-    for i, (old, now) in enumerate(zip(recorded.inputs, current, strict=False)):
-        if old.covers != now["covers"]:
-            full = fingerprints(run, full=True) if full is None else full
-            now = full[i]
-        if old.covers != now["covers"] and old.bytes == now["bytes"]:
-            not_compared.append(f"{now['path']}: the recorded fingerprint covers {old.covers or 'an unknown part'}")
-        elif (old.sha256, old.bytes) != (now["sha256"], now["bytes"]):
-            size = f", {old.bytes} bytes, now {now['bytes']}" if old.bytes != now["bytes"] else ""
+    current = _by_name(fingerprints(run))
+    old_ones = _by_name([old.model_dump() for old in recorded.inputs])
+    full: dict[tuple[str, int], dict[str, Any]] | None = None
+    changed = [f"{old['path']}: was an input, is none now" for key, old in old_ones.items() if key not in current]
+    not_compared, same = [], 0
+    for key, now in current.items():
+        old = old_ones.get(key)
+        if old is None:
+            not_compared.append(f"{now['path']}: no fingerprint was recorded")
+            continue
+        if old["covers"] != now["covers"]:
+            full = _by_name(fingerprints(run, full=True)) if full is None else full
+            now = full[key]
+        if old["covers"] != now["covers"] and old["bytes"] == now["bytes"]:
+            not_compared.append(f"{now['path']}: the recorded fingerprint covers {old['covers'] or 'an unknown part'}")
+        elif (old["sha256"], old["bytes"]) != (now["sha256"], now["bytes"]):
+            size = f", {old['bytes']} bytes, now {now['bytes']}" if old["bytes"] != now["bytes"] else ""
             changed.append(f"{now['path']}: other contents{size}")
         else:
             same += 1
     return InputsNow(tuple(changed), tuple(not_compared), same)
+
+
+def _by_name(entries: Sequence[dict[str, Any]]) -> dict[tuple[str, int], dict[str, Any]]:
+    """Entries by name of file and number among those of that name."""
+    names = [Path(e["path"]).name for e in entries]
+    return {(name, names[:i].count(name)): e for i, (name, e) in enumerate(zip(names, entries, strict=True))}

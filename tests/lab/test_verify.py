@@ -95,6 +95,17 @@ def test_changed_inputs_are_named(copy):
     assert found.exit_status == 4
 
 
+def test_an_input_that_was_not_recorded_is_not_compared_and_a_lost_one_is_a_change(copy):
+    path = copy / "out" / "summary.json"
+    content = json.loads(path.read_text())
+    content["inputs"] = [i for i in content["inputs"] if not i["path"].endswith("rig.yaml")]
+    content["inputs"].append({"path": "times.csv", "sha256": "0", "bytes": 1, "covers": "contents"})
+    path.write_text(json.dumps(content))
+    found = verify(copy / "out").inputs
+    assert [t.split(": ")[1] for t in found.not_compared] == ["no fingerprint was recorded"]
+    assert found.changed == ("times.csv: was an input, is none now",)
+
+
 def test_other_versions_are_named_and_are_no_difference(copy):
     path = copy / "out" / "summary.json"
     content = json.loads(path.read_text())
