@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import click
 
-from lab.commands import batch, calibrate, plan_and_simulate, results, run
+from lab.commands import batch, calibrate, maintenance, plan_and_simulate, results, run
 from lab.commands.common import Commands
 
 
@@ -29,6 +29,11 @@ for command in (
     results.study,
     calibrate.calibrate,
     plan_and_simulate.plan,
+    maintenance.init,
+    maintenance.schema,
+    maintenance.verify,
+    maintenance.doctor,
+    maintenance.explain,
 ):
     main.add_command(command)
 

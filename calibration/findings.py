@@ -23,11 +23,14 @@ class Finding:
     what: str  # what was tested and the result, with figures
     why: str = ""  # what it means for a measurement
     remedy: str = ""  # what to do; empty for PASS
+    code: str = ""  # BP-B01 ...: `beampose explain CODE`; may be empty for PASS
 
 
-def unless_pass(level: Level, what: str, why: str, remedy: str) -> Finding:
+def unless_pass(level: Level, what: str, why: str, remedy: str, *, code: str) -> Finding:
     """A finding whose reason and remedy are dropped when its level is PASS."""
-    return Finding(level, what) if level is Level.PASS else Finding(level, what, why, remedy)
+    if level is Level.PASS:
+        return Finding(level, what, code=code)
+    return Finding(level, what, why, remedy, code)
 
 
 def verdict(findings: Iterable[Finding]) -> Level:

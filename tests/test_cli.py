@@ -129,6 +129,11 @@ def test_the_commands_are_those_of_the_contract():
         "study",
         "calibrate",
         "plan",
+        "doctor",
+        "explain",
+        "init",
+        "verify",
+        "schema",
     }
     steps = {"board", "camera", "screen", "beams", "rig", "check", "convert", "simulate"}
     assert {name for name in COMMANDS if name.startswith("calibrate ")} == {f"calibrate {step}" for step in steps}
@@ -170,7 +175,7 @@ def test_the_example_of_run_leaves_the_files_of_the_contract(desk):
     assert isinstance(json.loads((out / "summary.json").read_text()), dict)
 
 
-@pytest.mark.parametrize("name", ["check", "report", "detect"])
+@pytest.mark.parametrize("name", ["check", "report", "detect", "doctor", "explain", "verify"])
 def test_the_example_works(works, name):
     assert works(*example(name)).strip()
 
@@ -204,7 +209,7 @@ def test_the_examples_of_calibrate_lead_from_a_campaign_to_a_rig_that_is_checked
     works("check", "results/rig/rig.yaml")
 
 
-@pytest.mark.parametrize("name", ["calibrate board", "calibrate convert", "plan"])
+@pytest.mark.parametrize("name", ["calibrate board", "calibrate convert", "plan", "init", "schema"])
 def test_the_example_works_without_preparation(works, name):
     arguments = example(name)
     if name == "plan":
@@ -243,6 +248,7 @@ def test_simulate_lists_every_scenario(works):
         ("run nowhere --out r", "nowhere: expected a run folder, found nothing"),
         ("run sample_runs/README.md --out r", "sample_runs/README.md: expected a run folder, found a file"),
         ("run sample_runs/huo2015 --out sample_runs/huo2015", "something other than earlier results"),
+        ("run sample_runs/huo2015 --out r --quiet --verbose", "expected --verbose or --quiet, got both"),
         ("run sample_runs/huo2015 --out r --set r1_px", "expected NAME=VALUE, got 'r1_px'"),
         ("run sample_runs/huo2015 --out r --set r1_pz=3", "unknown key 'r1_pz'"),
         ("batch --out r", "Missing argument 'RUN...'"),
@@ -259,6 +265,14 @@ def test_simulate_lists_every_scenario(works):
         ("simulate nothing --out r", "got 'nothing'"),
         ("simulate clean --out r --frames 0", "0 is not in the range"),
         ("report sample_runs", "found no summary.json"),
+        ("schema", "expected a kind of file (rig, run, camera, board, calibration, screens) or --out FOLDER"),
+        ("schema riga", "'riga' is not one of"),
+        ("verify sample_runs", "found no summary.json"),
+        ("explain BP-V99", "expected a code such as BP-V03, got 'BP-V99'"),
+        ("init sample_runs --beams 3", "expected a new or empty folder, found files"),
+        ("init r --beams 2 --screens 1", "expected at least 3 for 1 screen, got 2"),
+        ("init r --cameras 1 --screens 2", "expected at least one per screen (2), got 1"),
+        ("init r --picture large", "expected WIDTHxHEIGHT in pixels such as 1280x1024, got 'large'"),
         ("study nothing --out r", "'nothing' is not"),
         ("calibrate sreen x --out r", "No such command 'sreen'. Did you mean 'screen'?"),
         ("calibrate board chess:9x6 --out r", "chess"),

@@ -74,6 +74,7 @@ def _determined(c: BeamCalibration, positions: Sequence[str]) -> list[Finding]:
                 f"{len(c.dropped)} positions excluded: {names}{' …' if len(c.dropped) > _WORST_NAMED else ''}",
                 "too few of their spots were detected to determine the vehicle's pose, which is not recorded either",
                 "keep spots of both screens in view",
+                code="BP-B01",
             )
         )
     if count < FEWEST_POSITIONS:
@@ -83,6 +84,7 @@ def _determined(c: BeamCalibration, positions: Sequence[str]) -> list[Finding]:
                 f"only {count} position{'' if count == 1 else 's'}, expected {FEWEST_POSITIONS} or more",
                 "with so few, a wrong record or label cannot be detected and biases the beams",
                 "record 20 positions or more, turned about all axes",
+                code="BP-B02",
             )
         )
     known = c.world_from_stand is not None
@@ -93,6 +95,7 @@ def _determined(c: BeamCalibration, positions: Sequence[str]) -> list[Finding]:
                 f"{UNDETERMINED}: {'; '.join(c.undetermined)} ({c.motion})",
                 "along these motions no spot moves: their values would be those of the start",
                 c.motion.remedy() + (", or give world_from_stand with its sigmas" if known else ""),
+                code="BP-B03",
             )
         )
     elif known:
@@ -109,6 +112,7 @@ def _determined(c: BeamCalibration, positions: Sequence[str]) -> list[Finding]:
                 "angles between beams and the shape of the rig are measured; attitudes of the vehicle refer to this"
                 " body frame, not to the vehicle's own axes",
                 "record some positions at known attitudes to determine the vehicle's own axes",
+                code="BP-B04",
             )
         )
     return out
@@ -135,6 +139,7 @@ def _wrong_spots(c: BeamCalibration, positions: Sequence[str], goals: BeamGoals)
             f"{len(wrong)} of {len(c.spots)} spots excluded as outliers ({named})",
             "reflections, wrong labels or saturated spots; they do not affect the result" if share else "",
             "inspect these pictures; correct the labels or the light" if share > goals.wrong_share else "",
+            code="BP-B05",
         )
     ]
     cameras = list(c.rig.cameras)
@@ -147,6 +152,7 @@ def _wrong_spots(c: BeamCalibration, positions: Sequence[str], goals: BeamGoals)
                 f"position {used[c.spots.position[i]]}: spots {first} and {second} of camera {camera!r} are exchanged",
                 "each is at the place of the other; both were excluded",
                 "exchange the two names at this position in the table of spots",
+                code="BP-B06",
             )
         )
     at = Counter(c.spots.position[wrong].tolist())
@@ -160,6 +166,7 @@ def _wrong_spots(c: BeamCalibration, positions: Sequence[str], goals: BeamGoals)
                 f"most spots of {'position' if len(bad) == 1 else 'positions'} {names} were excluded",
                 "if all spots of a position have large residuals, its recorded pose or its labels are wrong",
                 "check the stand's record there",
+                code="BP-B07",
             )
         )
     return out
@@ -176,6 +183,7 @@ def _noise(c: BeamCalibration, goals: BeamGoals) -> Finding:
             "an error that the model does not contain: screens that are not flat, cameras that moved, a stand less"
             " accurate than stated, beams that drift while they warm up",
             "see the residuals by screen and position below; calibrate cameras and screens again, warm up the lasers",
+            code="BP-B08",
         )
     words = f"residuals of the spots: {rms:.3g} px RMS per axis, consistent with their sigmas"
     if c.fit.scale > 1:
@@ -215,6 +223,7 @@ def _sigmas(c: BeamCalibration, goals: BeamGoals) -> Finding:
         f"{words} (goal {goals.direction / ARCSEC:.3g} arcsec)",
         why,
         remedy,
+        code="BP-B09",
     )
 
 
@@ -234,6 +243,7 @@ def _against_the_drawing(c: BeamCalibration, drawing: Rig, goals: BeamGoals) -> 
                     f" {np.rad2deg(angles[i, nearest]):.1f} deg from that of beam {names[nearest]}",
                     "labels that are exchanged in all pictures are consistent; only the drawing reveals them",
                     f"check which laser is {n} and which is {names[nearest]}: cover one",
+                    code="BP-B10",
                 )
             )
         elif angles[i, i] > goals.drawing:
@@ -243,6 +253,7 @@ def _against_the_drawing(c: BeamCalibration, drawing: Rig, goals: BeamGoals) -> 
                     f"beam {n} is {np.rad2deg(angles[i, i]):.1f} deg from its drawing",
                     "mounting errors are smaller; the cause is a wrong label, or a body frame other than the drawing's",
                     "check the labels and the carriage's axes; if both are right, update the drawing",
+                    code="BP-B11",
                 )
             )
     if not out:
@@ -266,5 +277,6 @@ def _collinearity(pair: CollinearityTest) -> Finding:
             f"{words}: the two ends are not collinear ({p})",
             "described as one beam, each end is wrong by half of that",
             "describe them in target.beams as two beams with one spot each, and calibrate again",
+            code="BP-B12",
         )
     return Finding(Level.PASS, f"{words}: two beams, as described ({p})")

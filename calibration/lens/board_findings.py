@@ -35,6 +35,7 @@ def model_uncertainty_finding(c: Intrinsics) -> Finding | None:
         " the models.",
         "Take more photographs with the board near the border of the picture, where lens models differ; name the lens"
         " model if you know it (--lens).",
+        code="BP-L01",
     )
 
 
@@ -58,6 +59,7 @@ def stretch_finding(c: Intrinsics) -> Finding | None:
             "The photographs cannot distinguish a board that is out of scale from pixels that are not square; one of"
             f" the two is the case: fx / fy is {fx / fy:.4f}.",
             "Photograph the board turned by 90 deg in its plane as well; measure it along both directions.",
+            code="BP-L02",
         )
     off = max(abs(s.stretch), abs(s.lean_rad))
     return unless_pass(
@@ -67,6 +69,7 @@ def stretch_finding(c: Intrinsics) -> Finding | None:
         " nor the board's absolute size: distances measured from this board may be wrong by the same share.",
         "Measure the board over its whole length in both directions (printers stretch along the paper feed), print it"
         " again at 100 %, or state the measured sizes.",
+        code="BP-L03",
     )
 
 
@@ -88,6 +91,7 @@ def points_finding(c: Intrinsics) -> Finding | None:
         if p.corrected
         else "",
         "Print it on one stiff sheet, or use a machined board." if p.corrected else "",
+        code="BP-L04",
     )
 
 
@@ -110,4 +114,5 @@ def circles_finding(c: Intrinsics) -> Finding | None:
         "The measured size was used. Ink that spreads makes circles larger; otherwise spacing and diameter are not of"
         " the same board, or one of them is wrong.",
         "Measure the diameter and the spacing of the circles on the board, and state both.",
+        code="BP-L05",
     )

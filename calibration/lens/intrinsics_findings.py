@@ -92,6 +92,7 @@ def _lens(c: Intrinsics) -> Finding:
             f"{c.model.words}: the mapping folds inside the picture",
             "Two directions would map to the same pixel.",
             _MORE,
+            code="BP-L10",
         )
     why = c.selection.why
     return Finding(Level.PASS, f"Lens: {c.model.words}: {why}.")
@@ -105,6 +106,7 @@ def _noise(c: Intrinsics, limits: FindingLimits) -> Finding:
         " or not as stated, or a lens that no available model describes.",
         "See the residuals below; fix the board to glass or a thick plate, hold it still, light it well, and check"
         " its measures.",
+        code="BP-L11",
     )
 
 
@@ -121,6 +123,7 @@ def _rejected(c: Intrinsics, limits: FindingLimits) -> Finding:
         "A corner more than 4.5 sigmas from the model counts as an outlier; with so many outliers the other corners"
         " are doubtful too.",
         "See the views marked below; photograph them again, sharp and without glare.",
+        code="BP-L12",
     )
 
 
@@ -131,6 +134,7 @@ def _views(c: Intrinsics, limits: FindingLimits) -> Finding:
         f"{count} photographs used, {int(c.fit.used.sum())} corners.",
         "With few photographs neither the lens model nor its errors can be checked.",
         "Take 15 to 30 photographs.",
+        code="BP-L13",
     )
 
 
@@ -140,6 +144,7 @@ def _tilts(c: Intrinsics, limits: FindingLimits) -> Finding:
         f"The orientations of the boards differ by up to {c.coverage.spread_deg:.0f} deg.",
         "Without tilted boards the focal length can hardly be separated from the distance.",
         _TILTED[0].upper() + _TILTED[1:] + ".",
+        code="BP-L14",
     )
 
 
@@ -153,6 +158,7 @@ def _coverage(c: Intrinsics, limits: FindingLimits) -> Finding:
         "In areas without corners the lens model is extrapolated, and the uncertainty map is valid only if the model"
         " is.",
         "Add photographs with the board in these areas, cut off by the border of the picture if the board allows it.",
+        code="BP-L15",
     )
 
 
@@ -168,6 +174,7 @@ def _focal(c: Intrinsics, limits: FindingLimits) -> Finding:
         "A pose's distance is uncertain by that share:"
         f" {_two(1000 * share * c.distance_m)} mm at {c.distance_m:.3g} m.",
         f"Take more photographs; {_TILTED}.",
+        code="BP-L16",
     )
 
 
@@ -187,6 +194,7 @@ def _aspect(c: Intrinsics, limits: FindingLimits) -> Finding:
         " them.",
         "Measure the board along both directions; photograph it turned by 90 deg as well; check the scaling of the"
         " pictures.",
+        code="BP-L17",
     )
 
 
@@ -203,6 +211,7 @@ def _principal_point(c: Intrinsics, limits: FindingLimits) -> Finding:
         "A large offset indicates a cropped or shifted picture"
         + (" (the uncertainty does not explain it)." if sure else "; here the views hardly determine it."),
         "Check that the pictures are not cropped; photograph the board turned by 90 deg in its plane as well.",
+        code="BP-L18",
     )
 
 
@@ -213,6 +222,7 @@ def _overfit(c: Intrinsics, limits: FindingLimits) -> Finding:
         f"Hold-out error: {_mm(c, c.held.rms_px)}, {ratio:.2f} times the corners' own noise.",
         "The lens is fitted to the noise of its own photographs.",
         _MORE[0].upper() + _MORE[1:] + ".",
+        code="BP-L19",
     )
 
 
@@ -224,6 +234,7 @@ def _halves(c: Intrinsics, limits: FindingLimits) -> Finding:
             "Half of the photographs do not determine the lens, so that two halves cannot be compared.",
             "Errors of the model, which the covariance does not contain, remain undetected.",
             _MORE[0].upper() + _MORE[1:] + ".",
+            code="BP-L20",
         )
     return unless_pass(
         _disagreement(d, limits),
@@ -233,6 +244,7 @@ def _halves(c: Intrinsics, limits: FindingLimits) -> Finding:
         " does not explain.",
         "Use a stiffer board, check its measures, take more and more varied photographs; if the photographs are from"
         " two cameras, or focus or zoom was changed, calibrate each set separately.",
+        code="BP-L21",
     )
 
 
@@ -252,6 +264,7 @@ def _origins(c: Intrinsics, limits: FindingLimits) -> Finding | None:
         f" {d.expected_rms_px:.3g} px are expected from their sigmas (p = {d.p_value:.2g}).",
         "The photographs seem to be from two cameras, or focus or zoom was changed in between.",
         "Calibrate each set separately; fix focus and zoom before the first photograph.",
+        code="BP-L22",
     )
 
 
@@ -269,6 +282,7 @@ def _scatter(c: Intrinsics) -> Finding:
         "Errors of the corners within one photograph are correlated: a board that bends, blur, glare, or a lens that"
         " no available model describes.",
         "Use a stiffer board, hold it still, and take more photographs.",
+        code="BP-L23",
     )
 
 
@@ -282,6 +296,7 @@ def _map(c: Intrinsics, limits: FindingLimits) -> Finding:
         f" ({_two(worst_mm)} mm) at the worst place (1 sigma).",
         "Every spot at such a place has this error, the same in all frames: averaging does not reduce it.",
         "Add photographs with the board where the uncertainty map is worst.",
+        code="BP-L24",
     )
 
 
@@ -298,4 +313,5 @@ def _warp(c: Intrinsics, limits: FindingLimits) -> Finding | None:
         "A board bent this much is no longer the smooth surface that the correction assumes, and may bend differently"
         " each time it is held.",
         "Glue it to glass or a thick plate.",
+        code="BP-L25",
     )

@@ -113,6 +113,7 @@ def joint_findings(
                 f"none of {len(positions)} positions could be held out: the others do not determine the calibration",
                 "the calibration is not tested with independent spots",
                 "record 20 positions or more, turned about all axes",
+                code="BP-R01",
             )
         )
     out.append(_expected(expected, limits))
@@ -153,7 +154,7 @@ def _fit_of(joint: Joint, name: str, limits: RigLimits) -> Finding:
     done = "all their sigmas were multiplied by it" if name in joint.scales else "their sigmas were not changed"
     why, remedy = _CAUSES[name]
     words = f"{name}: residuals are {scale:.2g} times their sigmas ({counted}); {done}"
-    return Finding(level, words, why, "" if level == Level.PASS else remedy)
+    return Finding(level, words, why, "" if level == Level.PASS else remedy, code="BP-R02")
 
 
 def _contradiction(steps: RigCalibration, limits: RigLimits) -> list[Finding]:
@@ -168,6 +169,7 @@ def _contradiction(steps: RigCalibration, limits: RigLimits) -> list[Finding]:
             "cameras and screens are consistent separately, and so are beams, but not together",
             "survey and stand contradict each other, although each has small residuals of its own",
             "check that dots and spots were recorded with the same camera settings and nothing moved in between",
+            code="BP-R03",
         )
     ]
 
@@ -203,6 +205,7 @@ def _outliers(steps: RigCalibration, positions: Sequence[str], limits: RigLimits
                     f" ({', '.join(positions[i] for i in wrong[:_LISTED])}{' …' if len(wrong) > _LISTED else ''})",
                     "these records were excluded",
                     "check the stand's record there: a missed step, or shifted frame numbers",
+                    code="BP-R04",
                 )
             )
             continue
@@ -213,6 +216,7 @@ def _outliers(steps: RigCalibration, positions: Sequence[str], limits: RigLimits
                 f"{name}: {len(wrong)} of {len(kept)} excluded as outliers{named}",
                 "" if level == Level.PASS else "with many outliers, the others may agree by chance",
                 "" if level == Level.PASS else "inspect these pictures and labels; correct them or the light",
+                code="BP-R05",
             )
         )
         if name == SPOTS:
@@ -233,6 +237,7 @@ def _bad_positions(position: Ints, wrong: Sequence[int], positions: Sequence[str
             f"most spots of position {names} were excluded",
             "if all spots of a position have large residuals, its recorded pose or its labels are wrong",
             "check the stand's record there",
+            code="BP-R06",
         )
     ]
 
@@ -250,6 +255,7 @@ def _held_out(h: HoldOut, limits: RigLimits) -> Finding:
         f"{words}; {h.ratio:.2f} times the expected error",
         "errors of new recordings will exceed their covariance",
         "see which positions have large errors and what changed between them: a camera, the stand's zero, the lasers",
+        code="BP-R07",
     )
 
 
@@ -260,6 +266,7 @@ def _expected(e: ExpectedPose | None, limits: RigLimits) -> Finding:
             "at the centre of the stand's positions too few spots are in the pictures to measure a pose",
             "the rig cannot be used there",
             "aim the cameras at the spots",
+            code="BP-R08",
         )
     deg, mm = in_degrees(e.total), in_mm(e.total)
     words = (
@@ -279,4 +286,5 @@ def _expected(e: ExpectedPose | None, limits: RigLimits) -> Finding:
         f"the goal is {np.rad2deg(limits.attitude_warn) / 2:.2g} deg and {1e3 * limits.position_warn_m / 2:.2g} mm;"
         f" the largest part is from {most}",
         "improve that first; more positions of the stand, or dots, help if noise is the cause",
+        code="BP-R09",
     )

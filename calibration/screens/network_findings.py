@@ -102,6 +102,7 @@ def _agreement(result: ScreensResult, limits: ScreenLimits) -> Finding:
             "no measurement is redundant",
             "a wrong dot or a wrong coordinate cannot be detected",
             "survey more dots: eight or more per screen, all of them seen by its camera",
+            code="BP-S01",
         )
     if factor == 1.0:
         return Finding(Level.PASS, f"the residuals are consistent with their sigmas (redundancy {fit.dof})")
@@ -113,6 +114,7 @@ def _agreement(result: ScreensResult, limits: ScreenLimits) -> Finding:
         ""
         if level is Level.PASS
         else f"check the sigmas of survey and pixels and the dots' names{_doubtful_lens(result)}",
+        code="BP-S02",
     )
 
 
@@ -159,7 +161,7 @@ def _dots(result: ScreensResult, limits: ScreenLimits) -> list[Finding]:
                 where,
                 "inspect the picture: another point of light was measured, or the survey of the dot is wrong",
             )
-        out.append(Finding(Level.WARN, what, "it was excluded", remedy))
+        out.append(Finding(Level.WARN, what, "it was excluded", remedy, code="BP-S03"))
     for c, name in enumerate(network.rig.cameras):
         mine = network.point_observations.camera_of == c
         if mine.any() and np.mean(~result.fit.used[mine]) > limits.outliers_fail:
@@ -170,6 +172,7 @@ def _dots(result: ScreensResult, limits: ScreenLimits) -> list[Finding]:
                     f"camera {name!r}: {bad} of {n} dots do not fit its pose",
                     "with so many outliers the others may fit by chance",
                     "check names and coordinates, and that the lens belongs to this camera at this focus",
+                    code="BP-S04",
                 )
             )
     count = len(network.point_observations)
@@ -193,6 +196,7 @@ def _surfaces(result: ScreensResult, limits: ScreenLimits) -> list[Finding]:
                         f"screen {name!r}: dot {dot!r} is {1e3 * chosen.heights_m[k]:+.1f} mm off its surface",
                         "it was excluded from the surface",
                         "survey it again, or correct the column `screen`",
+                        code="BP-S05",
                     )
                 )
         n = int(np.sum(screen.used))
@@ -203,6 +207,7 @@ def _surfaces(result: ScreensResult, limits: ScreenLimits) -> list[Finding]:
                     f"screen {name!r}: {n} dots",
                     "too few to distinguish a bent screen from a wrong dot",
                     "survey eight or more, spread to the screen's edges",
+                    code="BP-S06",
                 )
             )
         rms, largest = 1e3 * chosen.rms_m, 1e3 * chosen.largest_m
@@ -215,6 +220,7 @@ def _surfaces(result: ScreensResult, limits: ScreenLimits) -> list[Finding]:
                     f" {1e3 * flat.rms_m:.2g} mm RMS for a plane, {rms:.2g} mm for the bent surface",
                     "spots are computed on the bent surface, which is extrapolated beyond the dots",
                     "flatten the screen, or survey dots to its edges",
+                    code="BP-S07",
                 )
             )
         if chosen.scatter_m > limits.scatter_warn_m:
@@ -226,6 +232,7 @@ def _surfaces(result: ScreensResult, limits: ScreenLimits) -> list[Finding]:
                     f" {'bent shape' if chosen.bent else 'plane'}, up to {largest:.2g} mm",
                     "spots at oblique incidence are displaced by about as much; no smooth shape describes it",
                     "flatten the screen, or survey more dots so that a bow can be fitted",
+                    code="BP-S08",
                 )
             )
         elif not chosen.bent:
@@ -264,6 +271,7 @@ def _sigma_finding(words: str, sigma_m: float, limits: ScreenLimits) -> Finding:
         what,
         "every pose measured with it has this error",
         "survey more dots, farther apart, with smaller sigmas; let the camera see all of them",
+        code="BP-S09",
     )
 
 
@@ -275,6 +283,7 @@ def _second_poses(result: ScreensResult) -> list[Finding]:
             f"camera {names[c]!r}: a second pose fits its dots nearly as well ({second.rms_px:.2g} px RMS)",
             "coplanar dots that appear small in the picture allow two poses; the better one was used",
             "add `near_m` (its position by tape measure) to this camera, or dots off the screen's plane",
+            code="BP-S10",
         )
         for c, second in result.second_poses.items()
     ]
@@ -292,12 +301,5 @@ def near_findings(result: ScreensResult, near: Mapping[int, ApproximatePosition]
         else:
             remedy = "check near_m, the survey's columns, the pixels' u and v, and the cameras' names"
             why = "the survey may have exchanged axes or another unit, pixels may be mirrored, or cameras exchanged"
-            out.append(
-                Finding(
-                    Level.FAIL,
-                    what,
-                    why,
-                    remedy,
-                )
-            )
+            out.append(Finding(Level.FAIL, what, why, remedy, code="BP-S11"))
     return out

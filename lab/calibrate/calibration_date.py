@@ -40,5 +40,6 @@ def expiry_findings(project: Project, day: datetime.date, today: datetime.date |
             f"the calibration expired on {until.isoformat()}, {(now - until).days} days ago",
             f"measured on {day.isoformat()}, valid for {project.valid_days} days: runs recorded today refuse it",
             "measure again, or correct date and valid_days",
+            code="BP-K07",
         )
     ]

@@ -19,19 +19,42 @@ causal_option = click.option(
 @click.argument("run_folder", metavar="RUN", type=ANY_PATH)
 @click.option("--out", required=True, type=FOLDER, help="Where the results go; earlier results there are replaced.")
 @causal_option
+@click.option(
+    "--full-hash", is_flag=True, help="Fingerprint every byte of the inputs; otherwise large ones are sampled."
+)
+@click.option("--verbose", "-v", is_flag=True, help="Show the lines of run.log on standard error as they come.")
+@click.option("--quiet", "-q", is_flag=True, help="Show nothing but errors.")
 @set_option
-def run(run_folder: Path, out: Path, causal: bool, settings: dict[str, Any]) -> None:
-    """Process one run folder: tables, summary.json and report.html.
+@click.pass_context
+def run(
+    ctx: click.Context,
+    run_folder: Path,
+    out: Path,
+    causal: bool,
+    full_hash: bool,
+    verbose: bool,
+    quiet: bool,
+    settings: dict[str, Any],
+) -> None:
+    """Process one run folder: tables, summary.json, report.html and run.log.
 
     \b
     Example:
         beampose run sample_runs/huo2015 --out results/huo2015
     """
+    from lab.commands.command_line import provenance
+    from lab.commands.verbosity import shown
+    from lab.files.run.fingerprints import fingerprints
+    from lab.files.run.run_file import Run
     from lab.runs.process import process_run
 
-    with progress_bar(run_folder.name) as progress:
-        outcome = process_run(run_folder, out, overrides=settings, causal=causal, progress=progress)
-    show_line(outcome.line())
+    def more(of: Run) -> dict[str, Any]:
+        return provenance(ctx) | ({"inputs": fingerprints(of, full=True)} if full_hash else {})
+
+    with shown(run_folder.name, verbose=verbose, quiet=quiet) as progress:
+        outcome = process_run(run_folder, out, overrides=settings, causal=causal, progress=progress, more=more)
+    if not quiet:
+        show_line(outcome.line())
     sys.exit(outcome.exit_status)
 
 

@@ -170,6 +170,7 @@ def _observability(plan: Plan) -> Iterator[Finding]:
             "At no pose of the grid are enough spots in the pictures.",
             "Check that the ranges are where the vehicle will be (in world coordinates), and check the poses of the"
             " cameras and screens with `beampose check`.",
+            code="BP-P01",
         )
         return
     yield Finding(
@@ -178,6 +179,7 @@ def _observability(plan: Plan) -> Iterator[Finding]:
         "A run gives no measured pose there.",
         "See below which spots leave their pictures; move or turn those cameras, use wider lenses, or add a beam that"
         " stays in view.",
+        code="BP-P02",
     )
 
 
@@ -205,6 +207,7 @@ def _redundancy(plan: Plan) -> Iterator[Finding]:
             f"{format_percent(share)} of the measurable poses have only three spots.",
             "Three spots fit any labels: a wrong label is not detected.",
             "Keep a fourth spot in view: use a wider lens, or one more beam.",
+            code="BP-P03",
         )
     elif plan.measured.any():
         yield Finding(
@@ -230,6 +233,7 @@ def _views(plan: Plan) -> Iterator[Finding]:
         f" poses{more}." + (f" It is missing most often at {where}." if where else ""),
         "The pose then depends on the other spots alone.",
         f"Turn or move {camera}, or use a wider lens; the table of views shows how far the spot is outside.",
+        code="BP-P04",
     )
 
 
@@ -243,6 +247,7 @@ def _distances(plan: Plan) -> Iterator[Finding]:
             f" the poses (minimum: {plan.closest_px.min():.1f} px).",
             "Spots that touch are detected as one, and their labels may be swapped.",
             "Spread the beams, or turn one of them out of the plane of the others.",
+            code="BP-P05",
         )
     elif np.isfinite(plan.closest_px).any():
         yield Finding(Level.PASS, f"Spots of one picture are at least {plan.closest_px.min():.0f} px apart.")
@@ -264,6 +269,7 @@ def _goals(plan: Plan) -> Iterator[Finding]:
                 words + ".",
                 "The other poses do not reach the goal.",
                 "Improve the largest contribution in the error budget, or narrow the range.",
+                code="BP-P06",
             )
 
 

@@ -21,6 +21,7 @@ from lab.files.text.atomic_write import atomic_folder
 from lab.files.text.json_text import write_json
 from lab.runs.frames.pipeline import FrameRecord, Pipeline
 from lab.runs.model_check.frame_sampler import FrameSampler, stated_covariances, widths
+from lab.runs.run_log import RunLog, listening
 from lab.runs.run_tally import RunTally
 from lab.runs.smoothing_pass import Progress, TrackingAndSmoothing
 from lab.runs.summary import SUMMARY_SCHEMA, RunResults, summary_of
@@ -28,6 +29,7 @@ from lab.runs.tables import TableWriter
 from lab.runs.verdict import quality
 from lab.runs.verdict.frame_checks import FrameChecks
 from lab.runs.verdict.run_statistics import CameraStatistics, RunStatistics
+from lab.versions import versions
 
 if TYPE_CHECKING:
     from lab.runs.model_check.check import ModelCheck
@@ -119,9 +121,24 @@ def write_results(
 
     started: time.perf_counter() at the start of the command. more: additional content of summary.json, called last.
     """
+    with listening() as log:
+        return _write_results(pipeline, work, out, started, log, causal, progress, more)
+
+
+def _write_results(
+    pipeline: Pipeline,
+    work: Path,
+    out: Path,
+    started: float,
+    log: RunLog,
+    causal: bool,
+    progress: Progress | None,
+    more: Callable[[], Mapping[str, Any]],
+) -> RunOutcome:
     run = pipeline.run
+    log.start(run, versions())
     tally = RunTally(tuple(run.rig.cameras), tuple(f"{c}/{s}" for c, s in SpotModel.of(run.rig).views))
-    passes = TrackingAndSmoothing(pipeline, work, progress)
+    passes = TrackingAndSmoothing(pipeline, work, log.progress(progress))
     statistics, model_check, verdict = write_tables(
         pipeline, passes, work, causal=causal, on_frame=lambda record, _: tally.add(record)
     )
@@ -133,8 +150,11 @@ def write_results(
     write_json({**content, **added}, work / "summary.json")
     from lab.report.run.page import write_report  # imports the template engine, which only the report needs
 
+    log.info("stage: report")
     write_report(work, run.folder)
     seconds = time.perf_counter() - started
+    log.conclude(verdict, content, seconds)
+    log.write(work)
     return RunOutcome(run.name, out, verdict, statistics.frames, statistics.measured, seconds, errors)
 
 

@@ -181,6 +181,7 @@ def _input_findings(
                 f" {'; '.join(lab_state.reasons) or 'no reason given'}",
                 "errors of cameras and screens carry over to the beams",
                 "see the report beside it",
+                code="BP-K01",
             )
         )
     if not with_covariance:
@@ -190,6 +191,7 @@ def _input_findings(
                 f"{rig_path.name} holds no covariance of cameras and screens: they are taken as exact",
                 "the sigmas of the beams are of the spots' noise alone, too small",
                 "calibrate cameras and screens with beampose, which writes their covariance",
+                code="BP-K02",
             )
         )
     stand = project.stand
@@ -201,6 +203,7 @@ def _input_findings(
                 "stand.world_from_stand has no sigma: it is assumed exact",
                 "its error goes unnoticed into the boresight of all beams",
                 "give stand.sigma_m and stand.sigma_deg, or omit world_from_stand so that it is estimated",
+                code="BP-K03",
             )
         )
     if recordings.stand_from_body is not None and not np.any(recordings.pose_sigmas):

@@ -156,6 +156,7 @@ def judge(
                 not_checked(unchecked),
                 "a drift of it would not be noticed",
                 "measure known points in every camera",
+                code="BP-C10",
             )
         )
     if not data.with_covariance:
@@ -165,6 +166,7 @@ def judge(
                 "rig.yaml has no covariance: the calibration's own errors count as drift here",
                 "false alarms are more frequent than stated",
                 "calibrate with beampose, which writes the covariance",
+                code="BP-C11",
             )
         )
     if not data.sigma_given:

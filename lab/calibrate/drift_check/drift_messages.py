@@ -34,6 +34,7 @@ def state_findings(state: CalibrationState | None, today: datetime.date, warning
                 "rig.yaml does not state when it was calibrated (no block `calibration`)",
                 "it may be out of date",
                 "Calibrate with beampose, or add calibration: {date: ..., verdict: PASS, valid_until: ...}.",
+                code="BP-C01",
             )
         ]
     out = []
@@ -44,6 +45,7 @@ def state_findings(state: CalibrationState | None, today: datetime.date, warning
                 f"the calibration of {state.date} failed: {state.reasons[0] if state.reasons else 'no reason given'}",
                 "it must not be used, even without drift",
                 "Correct the cause and calibrate again.",
+                code="BP-C02",
             )
         )
     if state.date > today:
@@ -53,6 +55,7 @@ def state_findings(state: CalibrationState | None, today: datetime.date, warning
                 f"the calibration is dated {state.date}, after today ({today})",
                 "its age is unknown",
                 "Check the clock of this computer and the date in rig.yaml.",
+                code="BP-C03",
             )
         )
     if state.valid_until is None:
@@ -66,6 +69,7 @@ def state_findings(state: CalibrationState | None, today: datetime.date, warning
                 f"the calibration expired on {state.valid_until}, {_days(-left)} ago",
                 "mounts and lenses creep; this date was set for the calibration",
                 "Calibrate again, or, if the drift is within the limits, set a new valid_until in rig.yaml.",
+                code="BP-C04",
             )
         )
     elif left <= warning_days:
@@ -75,6 +79,7 @@ def state_findings(state: CalibrationState | None, today: datetime.date, warning
                 f"the calibration expires on {state.valid_until}, in {_days(left)}",
                 "later runs will be refused",
                 "Plan a new calibration.",
+                code="BP-C05",
             )
         )
     else:
@@ -109,7 +114,7 @@ def camera_findings(c: CameraDrift, limits: DriftLimits, pose_free: bool) -> lis
         remedy = "" if level == Level.PASS else _REMEDIES[c.change.kind]
         change = describe_change(c)
         what = f"{name} {change}: its picture is off by {size(c.drift_px, c.drift_mm)}, p = {_p(c.change.p_value)}"
-        out.append(Finding(level, what, why + "." + also if also else why, remedy))
+        out.append(Finding(level, what, why + "." + also if also else why, remedy, code="BP-C06"))
     if np.isfinite(c.unexplained_px):
         out.append(
             Finding(
@@ -118,6 +123,7 @@ def camera_findings(c: CameraDrift, limits: DriftLimits, pose_free: bool) -> lis
                 " camera, a changed focus or a few wrong points do not explain",
                 "the points, the screen or the lens differ from the calibration",
                 "Check the names and coordinates of the points; if they are correct, calibrate again.",
+                code="BP-C07",
             )
         )
     if out:
@@ -135,7 +141,7 @@ def camera_findings(c: CameraDrift, limits: DriftLimits, pose_free: bool) -> lis
     if pose_free:
         remedy = "An unknown vehicle pose absorbs such shifts: give the pose (--pose) or measure known points."
     why = f"the check can miss a drift far beyond {limits.fail_mm:g} mm, the limit for use"
-    return [Finding(Level.WARN, what, why, remedy)]
+    return [Finding(Level.WARN, what, why, remedy, code="BP-C08")]
 
 
 def describe_change(c: CameraDrift) -> str:
@@ -175,7 +181,11 @@ def other_findings(others: Sequence[OtherChange], limits: DriftLimits) -> list[F
             why = "the point has moved or was confused with another; the cameras are judged without it"
             remedy = "Inspect the point and measure it again; remove it from the file if it is lost."
             level = min(level, Level.WARN)  # an error of the point, not of the calibration
-        out.append(Finding(level, what + f", p = {_p(o.change.p_value)}", why, remedy if level > Level.PASS else ""))
+        out.append(
+            Finding(
+                level, what + f", p = {_p(o.change.p_value)}", why, remedy if level > Level.PASS else "", code="BP-C09"
+            )
+        )
     return out
 
 

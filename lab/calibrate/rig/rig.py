@@ -146,6 +146,7 @@ def _input_findings(
                     f"camera {name!r}: the lens calibration {camera.lens_path.name} has the verdict FAIL{why}",
                     "an error of the lens distorts every measurement of the camera",
                     "calibrate the lens again (`beampose calibrate camera`)",
+                    code="BP-K04",
                 )
             )
         if state is not None and state.valid_until and state.valid_until < day.isoformat():
@@ -155,6 +156,7 @@ def _input_findings(
                     f"camera {name!r}: the lens calibration {camera.lens_path.name} expired on {state.valid_until}",
                     "lenses change with time and temperature",
                     "calibrate the lens again (`beampose calibrate camera`)",
+                    code="BP-K05",
                 )
             )
         if camera.lens.covariance is None:
@@ -164,6 +166,7 @@ def _input_findings(
                     f"camera {name!r}: {camera.lens_path.name} has no covariance: its lens is assumed exact",
                     "all sigmas are too small, since the error of the lens is missing in them",
                     "calibrate the lens with beampose, which writes the covariance",
+                    code="BP-K06",
                 )
             )
     stand = project.stand
@@ -174,6 +177,7 @@ def _input_findings(
                 "stand.world_from_stand has no sigma: it is assumed exact",
                 "its error goes unnoticed into the boresight of all beams",
                 "give stand.sigma_m and stand.sigma_deg, or omit world_from_stand so that it is estimated",
+                code="BP-K03",
             )
         )
     if not np.any(recordings.pose_sigmas):

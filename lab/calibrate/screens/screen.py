@@ -87,7 +87,7 @@ def calibrate_screen(
         *network_findings(result, names_doubted=verdict(placed) > Level.PASS),
         *survey_findings(project, result),
         *expiry_findings(project, day, today),
-        *(Finding(Level.WARN, note) for note in inputs.notes),
+        *(Finding(Level.WARN, note, code="BP-K08") for note in inputs.notes),
     ]
     level = verdict(found)
     folder = keep_good_results(out, level == Level.FAIL, SCREENS)

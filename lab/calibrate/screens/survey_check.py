@@ -93,6 +93,7 @@ def _shared_lenses(project: Project) -> list[Finding]:
                         f"cameras {first!r} and {second!r} share the lens calibration {a.lens_path.name}",
                         "two lenses of one type differ by much more than the errors of a calibration",
                         "give each camera its own lens calibration",
+                        code="BP-S12",
                     )
                 )
     return out
@@ -116,6 +117,7 @@ def _coverage(project: Project, result: ScreensResult) -> list[Finding]:
                     f"screen {name!r}: control point {point!r} is outside of size_m ({count} in all)",
                     "spots outside of size_m count as off the screen",
                     "correct size_m, or define the screen's frame by three named points (`frame`)",
+                    code="BP-S13",
                 )
             )
         share = np.ptp(screen.xyz[screen.used, :2], axis=0) / np.array(entry.size_m)
@@ -128,6 +130,7 @@ def _coverage(project: Project, result: ScreensResult) -> list[Finding]:
                     "outside of the control points its shape is extrapolated"
                     + ("" if entry.frame else ", and the centre of the points is taken as the centre of the screen"),
                     "survey points near its corners" + ("" if entry.frame else ", or name three points in `frame`"),
+                    code="BP-S14",
                 )
             )
     return out

@@ -39,7 +39,7 @@ def dataclass_from_yaml(cls: type[T], mapping: Any, path: Path | str, inside: st
     Raises:
         FileError: unknown keys, wrong types, and values that the dataclass itself refuses.
     """
-    model = _model_of(cls)
+    model = block_of(cls)
     return _value_of(cls, validated(model, {} if mapping is None else _as_mapping(mapping, path, inside), path, inside))
 
 
@@ -49,8 +49,8 @@ def _as_mapping(value: Any, path: Path | str, inside: str) -> Mapping[str, Any]:
     return value
 
 
-def _model_of(cls: type) -> type[Block]:
-    """A strict pydantic model with the fields of a dataclass."""
+def block_of(cls: type) -> type[Block]:
+    """A strict pydantic model with the fields of a parameter dataclass, see `dataclass_from_yaml`."""
     hints = typing.get_type_hints(cls)
     fields: dict[str, Any] = {}
     for field in dataclasses.fields(cls):
@@ -92,7 +92,7 @@ def _kind_of(hint: Any) -> Any:
             return Annotated[Any, pydantic.PlainValidator(_number_tuple)]
         return Annotated[Any, pydantic.PlainValidator(lambda v: tuple(numbers(len(arguments))(v)))]
     if dataclasses.is_dataclass(hint):
-        return _model_of(typing.cast(type, hint))
+        return block_of(typing.cast(type, hint))
     kinds: dict[Any, Any] = {
         float: Number,
         int: Integer,

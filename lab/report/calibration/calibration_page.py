@@ -178,7 +178,14 @@ def _rendered(report: CalibrationReport, drawn: list[list[PageDrawing]]) -> str:
         "made": report.made,
         "made_line": f"{report.made.date} · {_counted(report.findings)}",
         "findings": [
-            {"css": _CSS[f.level], "word": f.level.name, "what": f.what, "why": f.why, "remedy": f.remedy}
+            {
+                "css": _CSS[f.level],
+                "word": f.level.name,
+                "what": f.what,
+                "why": f.why,
+                "remedy": f.remedy,
+                "code": f.code if f.level > Level.PASS else "",
+            }
             for f in worst_first
         ],
         "key_figures": report.key_figures,

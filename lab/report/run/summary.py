@@ -32,6 +32,7 @@ class Point:
     what: str
     remedy: str = ""
     fails: bool = False  # True: a failed quality gate
+    code: str = ""  # `beampose explain CODE`; empty in older results
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,7 +120,10 @@ def verdict_of(tree: Mapping[str, Any]) -> VerdictText:
     word, sentence = VERDICTS.get(status, _NO_VERDICT)
     evidence = block.get("evidence")
     found = [e for e in evidence if isinstance(e, dict)] if isinstance(evidence, list) else []
-    points = [Point(str(e.get("what")), str(e.get("remedy") or ""), e.get("level") == "fail") for e in found]
+    points = [
+        Point(str(e.get("what")), str(e.get("remedy") or ""), e.get("level") == "fail", str(e.get("code") or ""))
+        for e in found
+    ]
     return VerdictText(
         status=status if status in VERDICTS else "unknown",
         word=word,

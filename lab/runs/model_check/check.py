@@ -39,13 +39,16 @@ class ModelCheck:
     def as_mapping(self) -> dict[str, Any]:
         """Plain values for summary.json.
 
-        tested, why_not; frames_used, frames_for_diagnosis; findings: level (PASS, WARN, FAIL), what, why, remedy;
+        tested, why_not; frames_used, frames_for_diagnosis; findings: level (PASS, WARN, FAIL), code, what, why, remedy;
         residual_scale, noise_scale, correlation_frames, p_before, p_after: see FaultDiagnosis (under the covariances
         scaled by noise_of_cameras); suspected_faults: component, name, kind, delta and sigma (in rad, m, px, s, or
         relative), explained (chi-square), p; off_px, off_sigmas, attitude_deg, position_mm, pose_sigmas: see Effect;
         and alternatives, each with the same; views, cameras, beams: see GroupStatistics; image_sizes_px.
         """
-        findings = [{"level": f.level.name, "what": f.what, "why": f.why, "remedy": f.remedy} for f in self.findings]
+        findings = [
+            {"level": f.level.name, "code": f.code, "what": f.what, "why": f.why, "remedy": f.remedy}
+            for f in self.findings
+        ]
         out = {"tested": self.result.diagnosis is not None, "why_not": self.why_not, "findings": findings}
         out |= result_mapping(self.result)
         if self.result.statistics is not None:

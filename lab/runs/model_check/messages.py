@@ -108,7 +108,7 @@ def fault_finding(
     if suspected.alternatives and level > Level.PASS:
         way = "A new calibration of the beams" if components == [f.BEAM] else "A `calibrate check` with marked points"
         remedy += f" {way} distinguishes the candidates."
-    return Finding(level, what, _consequence(effects, level), remedy)
+    return Finding(level, what, _consequence(effects, level), remedy, code="BP-M01")
 
 
 def unexplained_finding(diagnosis: FaultDiagnosis) -> Finding:
@@ -123,6 +123,7 @@ def unexplained_finding(diagnosis: FaultDiagnosis) -> Finding:
         " sigmas allow; the stated"
         " sigmas of the poses do not include this",
         "Calibrate the rig again; if that does not help, check the lens models and the flatness of the screens.",
+        code="BP-M02",
     )
 
 
@@ -148,6 +149,7 @@ def noise_finding(result: ModelCheckResult, diagnosis: FaultDiagnosis) -> Findin
             "correlated errors do not average out over frames: the stated sigmas of the poses are too small",
             "Check the lens models, the flatness of the screens and the light (reflections, clipped spots); then"
             " calibrate the rig again.",
+            code="BP-M03",
         )
     return Finding(
         Level.WARN,
@@ -156,6 +158,7 @@ def noise_finding(result: ModelCheckResult, diagnosis: FaultDiagnosis) -> Findin
         " program); the covariances of the poses are widened by this factor",
         "State larger sigmas with the detections, or improve the light: larger or brighter spots, a shorter exposure,"
         " a matt screen.",
+        code="BP-M04",
     )
 
 
@@ -169,6 +172,7 @@ def unseen_finding(unseen: UnseenView, model: SpotModel) -> Finding:
         "its laser is off or occluded, or points so far from where the rig file says that its spot is taken for"
         " clutter; the pose is computed without it",
         "Check the pictures where that spot should be; then check its laser's mount, or calibrate the beams again.",
+        code="BP-M05",
     )
 
 

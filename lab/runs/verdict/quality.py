@@ -73,7 +73,8 @@ def judge(statistics: RunStatistics, findings: Sequence[Finding] = (), noise_sca
     for finding in findings:
         if finding.level > Level.PASS:
             fails = finding.level == Level.FAIL
-            found.append(VerdictReason(ReasonKind.MODEL, fails, f"{finding.what}; {finding.why}", finding.remedy))
+            what = f"{finding.what}; {finding.why}"
+            found.append(VerdictReason(ReasonKind.MODEL, fails, what, finding.remedy, code=finding.code))
     found += _interruptions(statistics)
     found.sort(key=lambda e: not e.fails)  # stable: failures first
     if found:

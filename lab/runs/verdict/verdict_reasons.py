@@ -32,6 +32,26 @@ class ReasonKind(StrEnum):
     MODEL = "model"  # a finding of the model check
 
 
+# For `beampose explain`; stable: new kinds get new codes.
+CODES = {
+    ReasonKind.NO_FRAMES: "BP-V01",
+    ReasonKind.NEVER_FOUND: "BP-V02",
+    ReasonKind.FEW_MEASURED: "BP-V03",
+    ReasonKind.NO_PICTURES: "BP-V04",
+    ReasonKind.CAMERA_LATE: "BP-V05",
+    ReasonKind.CAMERA_STOPPED: "BP-V06",
+    ReasonKind.MISSING_PICTURES: "BP-V07",
+    ReasonKind.NOTHING_DETECTED: "BP-V08",
+    ReasonKind.FEW_POINTS: "BP-V09",
+    ReasonKind.NOT_ACQUIRED: "BP-V10",
+    ReasonKind.NOT_CONFIRMED: "BP-V11",
+    ReasonKind.AMBIGUOUS: "BP-V12",
+    ReasonKind.LOST: "BP-V13",
+    ReasonKind.CONTRADICTION: "BP-V14",
+    ReasonKind.INTERNAL: "BP-V15",
+    ReasonKind.NOISE_SCALE: "BP-V16",
+    ReasonKind.MODEL: "BP-V17",
+}
 REMEDIES = {
     ReasonKind.NO_FRAMES: "Check the folders of pictures, or the detections, that run.yaml names (`beampose check`).",
     ReasonKind.NEVER_FOUND: "See the reasons below.",
@@ -76,11 +96,13 @@ class VerdictReason:
     what: str
     remedy: str
     numbers: Mapping[str, Any] = field(default_factory=dict)  # plain values
+    code: str = ""  # of the finding of the model check; empty: that of the kind
 
     def as_mapping(self) -> dict[str, Any]:
         """For summary.json."""
         return {
             "kind": self.kind.value,
+            "code": self.code or CODES[self.kind],
             "level": "fail" if self.fails else "check",
             "what": self.what,
             "remedy": self.remedy,

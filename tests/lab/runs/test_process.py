@@ -39,7 +39,8 @@ from tracking.statuses import PoseStatus, SpotStatus
 from tracking.tracked_frame import Event, TrackedFrame
 
 CAUSAL_FILES = (
-    "attitude.csv", "beams.csv", "covariance.csv", "detections.csv", "report.html", "spots.csv", "summary.json",
+    "attitude.csv", "beams.csv", "covariance.csv", "detections.csv", "report.html", "run.log", "spots.csv",
+    "summary.json",
 )  # fmt: skip
 FILES = (*CAUSAL_FILES, "attitude_causal.csv", "covariance_causal.csv")
 HEADERS = {"attitude.csv": columns.ATTITUDE, "beams.csv": columns.BEAMS, "covariance.csv": columns.COVARIANCE,
@@ -207,7 +208,9 @@ def test_the_counts_of_the_summary_are_those_of_the_tables(results, tables):
 
 def test_the_summary_lists_inputs_parameters_and_versions(results, run_folder):
     summary = json.loads((results / "summary.json").read_text("utf-8"))
-    assert {Path(e["path"]).name for e in summary["inputs"]} == {"run.yaml", "rig.yaml", "left", "right"}
+    assert {Path(e["path"]).name for e in summary["inputs"]} == {
+        "run.yaml", "rig.yaml", "left", "right", "pose.csv", "spots.csv",
+    }  # fmt: skip
     assert summary["parameters"]["tracker"]["r1_px"] == 10.0
     assert summary["parameters"]["prior"]["within_m"] == pytest.approx(1.0)
     assert summary["parameters"]["prior"]["within_deg"] == pytest.approx(30.0)

@@ -263,7 +263,7 @@ def test_every_kind_of_reason_and_every_cause_has_a_remedy():
 def test_a_reason_is_written_as_plain_values():
     (reason,) = judge(statistics_of(cameras=with_missing((990, 999)))).reasons
     mapping = reason.as_mapping()
-    assert list(mapping) == ["kind", "level", "what", "remedy", "numbers"]
+    assert list(mapping) == ["kind", "code", "level", "what", "remedy", "numbers"]
     assert (mapping["kind"], mapping["level"]) == ("camera_stopped", "check")
     assert mapping["numbers"] == {"camera": "left", "missing": [[990, 999]]}
 

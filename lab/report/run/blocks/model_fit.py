@@ -21,6 +21,7 @@ HEADS = (
 )  # fmt: skip
 _LONGEST = 0.1  # length of the longest arrow, as a share of the image width
 _SIGNIFICANT = 3.0  # sigmas of chance and calibration: radius of the circles
+_TEXTS = ("what", "why", "remedy", "code")
 _LEVELS = {"PASS": "small", "WARN": "check", "FAIL": "fail"}
 
 
@@ -32,6 +33,7 @@ class FindingRow:
     what: str
     why: str
     remedy: str
+    code: str = ""  # `beampose explain CODE`; empty in older results
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +51,7 @@ def model_fit(block: Mapping[str, Any] | None) -> ModelFit | None:
     if block is None:
         return None
     findings = tuple(
-        FindingRow(_LEVELS.get(str(f.get("level")), "check"), *(str(f.get(k) or "") for k in ("what", "why", "remedy")))
+        FindingRow(_LEVELS.get(str(f.get("level")), "check"), *(str(f.get(k) or "") for k in _TEXTS))
         for f in _mappings(block.get("findings"))
     )
     rows = []

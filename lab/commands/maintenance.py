@@ -1,0 +1,177 @@
+"""`beampose init`, `schema`, `verify`, `doctor`, `explain`: a first rig, editors, results, the installation, codes."""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+
+import click
+
+from lab.commands.common import ANY_PATH, FOLDER, progress_bar
+
+
+@click.command()
+@click.argument("files", metavar="[CALIBRATION]...", nargs=-1, type=ANY_PATH)
+@click.option("--out", default=".", type=ANY_PATH, help="Where results will be written: its free space is checked.")
+def doctor(files: tuple[Path, ...], out: Path) -> None:
+    """Check the installation, the machine and calibration files: one line each, OK, WARN or FAIL, with a remedy.
+
+    CALIBRATION: any number of rig.yaml, camera.yaml and screens.yaml files, or run folders, whose age and verdict are
+    checked. Exit status: 0 without a FAIL; 1: the installation is faulty; 2: a file is wrong; 3: a calibration must
+    not be used.
+
+    \b
+    Example:
+        beampose doctor sample_runs/huo2015
+    """
+    from lab.doctor.doctor import examine
+    from lab.doctor.lines import exit_status
+
+    lines = examine(files, out)
+    for line in lines:
+        click.echo(str(line))
+    sys.exit(exit_status(lines))
+
+
+@click.command()
+@click.argument("codes", metavar="[CODE]...", nargs=-1)
+def explain(codes: tuple[str, ...]) -> None:
+    """Explain the code of a warning, a verdict reason, a finding or an error; without a code, list all codes.
+
+    The codes are in reports, in summary.json and in the lines of `beampose doctor`.
+
+    \b
+    Example:
+        beampose explain BP-V03
+    """
+    from lab.explain import catalogue
+
+    texts = [catalogue.explain(code) for code in codes] if codes else catalogue.listed()
+    click.echo(("\n\n" if codes else "\n").join(texts))
+
+
+_FILES = ("rig", "run", "camera", "board", "calibration", "screens")
+_QUESTIONS = {
+    "screens": "How many screens are there",
+    "cameras": "How many cameras film them, in all",
+    "beams": "How many laser beams does the vehicle carry (lines, not spots)",
+    "rate": "How many pictures per second",
+}
+_DEFAULTS = {"screens": 2, "cameras": 2, "beams": 3, "rate": 100.0}
+
+
+def _on_a_terminal() -> bool:
+    return sys.stdin.isatty() and sys.stdout.isatty()
+
+
+def _asked(given: dict[str, float | None]) -> dict[str, float]:
+    """The values that were not given: asked for on a terminal, else the default; a camera per screen at least."""
+    ask = _on_a_terminal()
+    out: dict[str, float] = {}
+    for name, value in given.items():
+        default = max(_DEFAULTS[name], out["screens"]) if name == "cameras" else _DEFAULTS[name]
+        if name == "beams" and out["screens"] != 2:
+            default = 3 if out["screens"] == 1 else 4
+        if value is None:
+            value = click.prompt(_QUESTIONS[name], default=default, type=type(_DEFAULTS[name])) if ask else default
+        out[name] = value
+    return out
+
+
+@click.command()
+@click.argument("folder", metavar="DIR", type=FOLDER)
+@click.option("--screens", type=click.IntRange(1, 4), help="Number of screens; default 2, left and right.")
+@click.option(
+    "--cameras", type=click.IntRange(1, 16), help="Number of cameras in all; default: one per screen, 2 or more."
+)
+@click.option("--beams", type=click.IntRange(1, 12), help="Number of laser beams; default 3, of one or two spots each.")
+@click.option("--rate", type=click.FloatRange(0.1, 1e6), help="Pictures per second; default 100.")
+@click.option(
+    "--distance", default=2.5, show_default=True, type=click.FloatRange(0.2, 100), help="From vehicle to screens, m."
+)
+@click.option("--picture", default="1280x1024", show_default=True, help="Picture size, WIDTHxHEIGHT in pixels.")
+def init(
+    folder: Path,
+    screens: int | None,
+    cameras: int | None,
+    beams: int | None,
+    rate: float | None,
+    distance: float,
+    picture: str,
+) -> None:
+    """Write a commented rig.yaml and run.yaml to start from, with simulated points to try them.
+
+    On a terminal it asks for what is not given as an option. The files pass `beampose check`; replace the numbers
+    by those of your lab.
+
+    \b
+    Example:
+        beampose init my-lab --screens 2 --cameras 2 --beams 3 --rate 100
+    """
+    from lab.init.files import start
+    from lab.init.layout import Layout
+
+    values = _asked({"screens": screens, "cameras": cameras, "beams": beams, "rate": rate})
+    layout = Layout(
+        int(values["cameras"]), int(values["screens"]), int(values["beams"]), distance, _picture_size(picture)
+    )
+    started = start(folder, layout, values["rate"])
+    click.echo(f"rig: {started.rig}")
+    click.echo(f"run: {started.run}")
+    click.echo(f"Next: beampose check {folder}; beampose run {folder} --out {folder / 'results'}")
+
+
+def _picture_size(text: str) -> tuple[int, int]:
+    match = re.fullmatch(r"(\d{2,5})[xX](\d{2,5})", text.strip())
+    if match is None:
+        raise click.BadParameter(
+            f"expected WIDTHxHEIGHT in pixels such as 1280x1024, got {text!r}", param_hint="--picture"
+        )
+    return int(match[1]), int(match[2])
+
+
+@click.command()
+@click.argument("results", type=click.Path(exists=True, file_okay=False, path_type=Path))
+@click.option("--run", "run_folder", type=FOLDER, help="The run folder, if it has moved.")
+def verify(results: Path, run_folder: Path | None) -> None:
+    """Compute a result again from its recorded inputs and parameters, and compare all tables byte by byte.
+
+    Names each table that differs, with its first row and column, and each input that has changed. Exit status 0: all
+    is the same; 4: something differs.
+
+    \b
+    Example:
+        beampose verify results/huo2015
+    """
+    from lab.verify.verify import verify as verify_results
+
+    with progress_bar(results.name) as progress:
+        verification = verify_results(results, run_folder, progress)
+    for line in verification.lines():
+        click.echo(line)
+    sys.exit(verification.exit_status)
+
+
+@click.command()
+@click.argument("name", metavar="[FILE]", required=False, type=click.Choice(_FILES))
+@click.option("--out", type=FOLDER, help="Write FILE.schema.json there; without FILE, the schemas of all files.")
+def schema(name: str | None, out: Path | None) -> None:
+    """Export JSON schemas of the YAML files, with which editors complete and check them.
+
+    FILE: rig, run, camera, board, calibration or screens. Editors with the YAML language server use a schema that the
+    first line of a file names: `# yaml-language-server: $schema=schemas/rig.schema.json`.
+
+    \b
+    Example:
+        beampose schema --out schemas
+    """
+    from lab.schema.files import as_text, write
+
+    if out is None and name is None:
+        raise click.UsageError(f"expected a kind of file ({', '.join(_FILES)}) or --out FOLDER, got neither")
+    if out is None:
+        click.echo(as_text(str(name)), nl=False)
+        return
+    for path in write([name] if name else list(_FILES), out):
+        click.echo(f"schema: {path}")

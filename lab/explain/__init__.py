@@ -1,0 +1,1 @@
+"""The codes of warnings, verdict reasons, findings and errors, and what each means: `beampose explain`."""

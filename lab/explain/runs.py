@@ -1,0 +1,137 @@
+"""Explanations of a run's verdict (BP-V) and of its model check (BP-M)."""
+
+from __future__ import annotations
+
+from lab.explain.explanation import Explanation, Explanations
+
+VERDICT: Explanations = {
+    "BP-V01": Explanation(
+        "No frames",
+        "The run has no frame, so there is nothing to measure.",
+        "Check the folders of pictures, the videos or the tables of detections that run.yaml names: `beampose"
+        " check` lists what it finds there.",
+    ),
+    "BP-V02": Explanation(
+        "The vehicle was never found",
+        "No frame has a measured pose. The reasons listed below it say whether pictures, points of light or an"
+        " explaining pose are missing.",
+        "Act on the other reasons, the first one first.",
+    ),
+    "BP-V03": Explanation(
+        "Few frames with a measured pose",
+        "A share of the frames has no measured pose: FAIL below the gate, CHECK below 95 %. The text counts the"
+        " causes: hidden spots, spots out of view, too few points of light, uncertain labels and others. Poses of"
+        " frames that are measured are not affected.",
+        "Treat the most frequent cause first. If the spots leave the pictures, `beampose plan` shows where.",
+    ),
+    "BP-V04": Explanation(
+        "A camera without pictures",
+        "No usable picture of this camera was found. The pose rests on the other cameras alone.",
+        "Check the camera, its cable and the path in run.yaml; or take the camera out of run.yaml.",
+    ),
+    "BP-V05": Explanation(
+        "A camera starts late",
+        "This camera has no picture of the first frames. Poses before its first picture have wider sigmas.",
+        "Start all cameras before the motion.",
+    ),
+    "BP-V06": Explanation(
+        "A camera stopped early",
+        "This camera has no picture from some frame on. Later poses have wider sigmas.",
+        "Check the camera's disk, cable and trigger.",
+    ),
+    "BP-V07": Explanation(
+        "Missing pictures",
+        "More than 5 % of the pictures of this camera are missing or damaged, scattered over the run.",
+        "Check the camera's disk, cable and trigger for dropped frames.",
+    ),
+    "BP-V08": Explanation(
+        "Nothing detected",
+        "Pictures of this camera show no point of light where the pose puts spots.",
+        "Look at the pictures: laser on, lens uncovered, spots bright enough? If spots are visible, lower"
+        " detect.threshold_sigma or state the camera's noise in rig.yaml.",
+    ),
+    "BP-V09": Explanation(
+        "Too few points of light",
+        "Too few points are visible at once to determine a first pose.",
+        "Improve light and exposure, or keep the vehicle where the cameras see its spots.",
+    ),
+    "BP-V10": Explanation(
+        "No pose explains the points",
+        "Enough points of light are visible, but no pose within the prior explains them.",
+        "Check the prior in run.yaml, that each camera's pictures are in its own folder, and that rig.yaml is the"
+        " rig of this recording (`beampose calibrate check`).",
+    ),
+    "BP-V11": Explanation(
+        "Causal poses not confirmed",
+        "The causal pass measures poses that the smoothing pass does not confirm.",
+        "Use attitude_causal.csv with care, and report this run as an error of the program.",
+    ),
+    "BP-V12": Explanation(
+        "More than one pose is possible",
+        "Different labels of the spots fit equally well, so that the pose is ambiguous.",
+        "Make the prior narrower, start where another spot is visible, or use a fan with unequal angles.",
+    ),
+    "BP-V13": Explanation(
+        "The vehicle was lost",
+        "For a time nothing explained the points of light. Frames of that time have no pose or a predicted one.",
+        "Check the first of these frames: occlude fewer spots, or for a shorter time.",
+    ),
+    "BP-V14": Explanation(
+        "Contradictory poses",
+        "Some poses contradict their own spots or the causal pass. They are reported as predicted, with sigmas"
+        " that cover the difference.",
+        "Check these frames for reflections near the spots and for a rig that has moved.",
+    ),
+    "BP-V15": Explanation(
+        "Invalid covariance",
+        "A covariance is not positive definite. This is an error of the program; the values are omitted.",
+        "Report this run as an error of the program.",
+    ),
+    "BP-V16": Explanation(
+        "Spots far from the fitted pose",
+        "The spots lie farther from the fitted pose than their sigmas allow. Above the gate, rig.yaml does not"
+        " describe this set-up.",
+        "Check the calibration (`beampose calibrate check`) and the light (speckle).",
+    ),
+    "BP-V17": Explanation(
+        "A finding of the model check",
+        "The spots of the whole run show a systematic deviation from rig.yaml. Its own code, BP-M01 to BP-M05,"
+        " says which kind.",
+        "Act on the finding: the report names the component.",
+    ),
+}
+
+MODEL_CHECK: Explanations = {
+    "BP-M01": Explanation(
+        "A component of the rig has changed",
+        "A camera, screen, beam, spot or clock deviates from rig.yaml by a significant amount. The finding states"
+        " the amount and the effect on the pose. Averaging over frames does not reduce this effect.",
+        "Check the mount of that component, then calibrate it again. `beampose calibrate check` with known points"
+        " distinguishes several candidates.",
+    ),
+    "BP-M02": Explanation(
+        "The residuals do not fit the rig",
+        "The residuals are larger than the sigmas allow, and no single component explains them. The sigmas of the"
+        " poses do not include this.",
+        "Calibrate the rig again; if that does not help, check lens models and flatness of the screens.",
+    ),
+    "BP-M03": Explanation(
+        "Correlated residuals",
+        "The errors of the spots are similar in neighbouring frames. They do not average out, so that the stated"
+        " sigmas of the poses are too small.",
+        "Check lens models, flatness of the screens and the light (reflections, clipped spots); then calibrate"
+        " the rig again.",
+    ),
+    "BP-M04": Explanation(
+        "Sigmas of the spots are too small",
+        "The residuals are random, but larger than stated. The covariances of the poses are widened by the factor"
+        " found.",
+        "Improve the light (larger or brighter spots, shorter exposure, matt screen), or state larger sigmas with"
+        " the detections.",
+    ),
+    "BP-M05": Explanation(
+        "A spot is hardly ever measured",
+        "The pose puts this spot well inside the picture, but it is not found there. The pose is computed without it.",
+        "Check whether its laser is on and unobstructed; then its mount; or calibrate the beams again.",
+    ),
+}

@@ -1,0 +1,1 @@
+"""`beampose init`: a first rig.yaml and run.yaml, with comments."""

@@ -1,0 +1,135 @@
+"""The files of `beampose init`: rig.yaml and run.yaml with comments, and simulated points to try them with."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import shutil
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from lab.errors import InputError
+from lab.files.rig.rig_file import load_rig, save_rig
+from lab.files.run.run_file import load_run, save_run
+from lab.files.text.atomic_write import atomic_folder, atomic_write_text
+from lab.init.layout import Layout, rig_of
+from lab.simulate.motion import Motion, Wave
+from lab.simulate.scenarios import SCENARIOS
+from lab.simulate.write import simulate
+
+EXAMPLE = "example-points.csv"
+FRAMES = 100  # of the simulated points
+_MOTION = Motion(
+    (0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+    (Wave("x", 0.06, 0.2), Wave("y", 0.08, 0.25), Wave("yaw", 7, 0.3), Wave("pitch", 5, 0.35), Wave("roll", 6, 0.2)),
+)
+
+# A comment before the first line that has this key, by key and indentation.
+_RIG_COMMENTS = {
+    "screens": "Screens. The world frame is yours to choose: right-handed, metres. Poses are a_from_b:\n# coordinates"
+    " in b to coordinates in a.",
+    "  *.world_from_screen": "Origin and x, y axes of the screen lie in its surface. Measured by `beampose calibrate"
+    " screen`.",
+    "  *.size_m": "Extent along x and y, centred on the origin; leave it out for an unlimited screen.",
+    "cameras": "Cameras, each with the screen that it observes.",
+    "  *.image_size_px": "Width, height, in pixels.",
+    "  *.camera_matrix": "Lens, in pixels; (0, 0) is the centre of the top-left pixel. Measured by `beampose calibrate"
+    " camera`.",
+    "  *.camera_from_world": "Pose: x right, y down, z forward. Measured by `beampose calibrate screen`.",
+    "target": "Lasers of the vehicle, in its own (body) frame. Measured by `beampose calibrate beams`.",
+    "  beams": "A beam is a line: a direction and a point on it.",
+    "  spots": "A spot is where one end of a beam (+ along its direction, - against it) meets a screen.",
+}
+_RUN_COMMENTS = {
+    "name": "Shown in reports.",
+    "rig": "Path of the rig file; paths start at the folder of this file.",
+    "frame_rate_hz": "Pictures per second. For an uneven rate add `timestamps: times.csv` with columns frame,t_s.",
+    "cameras": f"Simulated points, to try `beampose run` at once. For your recording replace `detections: {EXAMPLE}`"
+    " by\n# `frames: frames/NAME` (a folder of pictures, the number in a name is the frame) or `frames: NAME.avi` (a"
+    " video).",
+    "prior": "Where the vehicle is in the first frame, and how far it may be from there. Leave it out if unknown.",
+    "notes": "Optional, shown in the report.",
+}
+_START = "A start, not a measurement: replace the numbers by those of your lab."
+_OPTIONAL_RIG = (
+    "# Optional, in each camera: noise: {gain_e_per_dn: 38.0, read_noise_e: 6.0, black_dn: 4.0}; estimated if absent.\n"
+    "# Optional: calibration: {date: 2026-03-14, verdict: PASS, valid_until: 2026-09-14}\n"
+)
+_OPTIONAL_RUN = (
+    "# Optional: exposure_s: 0.0005; recorded: 2026-03-14\n"
+    "# Optional: tracker: {method: rigid}, and any parameter that summary.json lists under parameters.tracker.\n"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Started:
+    """The files written."""
+
+    folder: Path
+    rig: Path
+    run: Path
+
+
+def start(folder: Path, layout: Layout, frame_rate_hz: float) -> Started:
+    """Write rig.yaml, run.yaml and simulated points into a new or empty folder.
+
+    Raises:
+        InputError: the folder holds files, or the layout cannot measure a pose.
+    """
+    folder = Path(folder)
+    if folder.is_dir() and any(folder.iterdir()):
+        raise InputError(f"{folder}: expected a new or empty folder, found files in it; name another one")
+    rig = rig_of(layout)
+    with atomic_folder(folder, may_replace=lambda _: False) as work:
+        rig_path = work / "rig.yaml"
+        save_rig(rig, rig_path)
+        _comment(rig_path, _RIG_COMMENTS, f"{_START}\n# Check it with `beampose check rig.yaml`.", _OPTIONAL_RIG)
+        _points(work, frame_rate_hz)
+        run = {
+            "name": "first-run",
+            "rig": "rig.yaml",
+            "frame_rate_hz": float(frame_rate_hz),
+            "cameras": {name: {"detections": EXAMPLE} for name in rig.cameras},
+            "prior": {
+                "position_m": [0.0, 0.0, 0.0],
+                "yaw_pitch_roll_deg": [0.0, 0.0, 0.0],
+                "within_m": min(0.5, 0.2 * layout.distance_m),
+                "within_deg": 25.0,
+            },
+            "notes": "Simulated points of an example rig.",
+        }
+        _comment(save_run(run, work), _RUN_COMMENTS, "One recording.", _OPTIONAL_RUN)
+        load_rig(rig_path)
+        load_run(work)
+    return Started(folder, folder / "rig.yaml", folder / "run.yaml")
+
+
+def _points(work: Path, frame_rate_hz: float) -> None:
+    """Simulated points of the rig in `work`, a slow motion."""
+    scenario = dataclasses.replace(
+        SCENARIOS["clean"],
+        motion=_MOTION,
+        always_in_view=(),
+        leaves_and_returns=(),
+        frame_rate_hz=frame_rate_hz,
+    )
+    with tempfile.TemporaryDirectory(prefix="beampose-") as name:
+        made = simulate(
+            scenario, Path(name) / "run", frames=FRAMES, detections_only=True, clutter=0.0, rig=work / "rig.yaml"
+        )
+        shutil.copyfile(made / "detections.csv", work / EXAMPLE)
+
+
+def _comment(path: Path, comments: Mapping[str, str], head: str, tail: str) -> None:
+    """Add comments to a YAML file: `key`, or `  *.key` for a key two levels down, stands for its first line."""
+    lines, waiting = [f"# {head}"], dict(comments)
+    for line in path.read_text("utf-8").splitlines():
+        match = re.match(r"^( *)([\w'\"-]+):", line)
+        if match:
+            indent, key = match[1], match[2]
+            names = (f"{indent}{key}", f"{indent[2:]}*.{key}")
+            lines += [f"{indent}# {waiting.pop(name)}" for name in names if name in waiting]
+        lines.append(line)
+    atomic_write_text("\n".join([*lines, tail]), path)

@@ -1,0 +1,1 @@
+"""`beampose schema`: JSON schemas of the YAML files, for editors."""

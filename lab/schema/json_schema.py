@@ -1,0 +1,116 @@
+"""JSON schemas from the blocks of the YAML files (pydantic models whose fields have validators of their own)."""
+
+from __future__ import annotations
+
+import inspect
+import re
+import textwrap
+import types
+import typing
+from collections.abc import Callable
+from typing import Annotated, Any
+
+import pydantic
+
+from lab.files.text import fields
+from lab.files.text.fields import Block
+
+Schema = dict[str, Any]
+_TEXT: Schema = {"type": ["string", "number", "boolean"], "minLength": 1}  # a bare number counts as its text
+_OF_VALIDATORS: dict[Callable[..., Any], Schema] = {
+    fields.finite_number: {"type": "number"},
+    fields.positive_number: {"type": "number", "exclusiveMinimum": 0},
+    fields.non_negative_number: {"type": "number", "minimum": 0},
+    fields.whole_number: {"type": "integer"},
+    fields.boolean: {"type": "boolean"},
+    fields.word: _TEXT,
+    fields.free_text: {"type": ["string", "number", "boolean", "null"]},
+    fields.lines_of_text: {"type": "array", "items": {"type": "string"}},
+}
+# Validators that belong to one file, by name: what they accept beside or instead of their type.
+_OF_NAMES: dict[str, Schema] = {
+    "_paths": {"anyOf": [{"type": "string"}, {"type": "array", "items": {"type": "string"}}]},
+    "_board": {"type": "string"},
+    "_days": {"type": ["integer", "null"], "minimum": 1},
+    "_name": _TEXT,
+    "_unit_quaternion": {"type": "array", "items": {"type": "number"}, "minItems": 4, "maxItems": 4},
+    "_direction": {"type": "array", "items": {"type": "number"}, "minItems": 3, "maxItems": 3},
+    "_image_size": {"type": "array", "items": {"type": "integer", "minimum": 1}, "minItems": 2, "maxItems": 2},
+    "_distortion": {"type": "array", "items": {"type": "number"}, "maxItems": 14},
+    "_a_device": {"type": ["integer", "string"]},
+    "_an_angle_range": {"type": "number", "exclusiveMinimum": 0, "maximum": 180},
+    "iso_date": {"type": "string", "description": "a date such as 2026-03-14"},
+    "_day_or_none": {"type": ["string", "null"], "description": "a date such as 2026-03-14"},
+    "_number_tuple": {"type": "array", "items": {"type": "number"}},
+}
+_OF_TYPES: dict[Any, Schema] = {
+    float: {"type": "number"}, int: {"type": "integer"}, bool: {"type": "boolean"}, str: {"type": "string"},
+    type(None): {"type": "null"},
+}  # fmt: skip
+_COMMENT = re.compile(r"^    (\w+): [^#\n]*#\s*(?!noqa)(.+)$", re.MULTILINE)
+
+
+def schema_of_block(block: type[Block], commented: type | None = None) -> Schema:
+    """The schema of a mapping. commented: the class whose source has comments for the fields; default: the block."""
+    comments = comments_of(commented or block)
+    properties, required = {}, []
+    for name, field in block.model_fields.items():
+        key = field.alias or name
+        schema = _of_field(field)
+        if name in comments:
+            schema = {**schema, "description": comments[name]}
+        if field.is_required():
+            required.append(key)
+        elif not isinstance(field.default, Block) and field.default not in (None, [], {}, ""):
+            schema = {**schema, "default": field.default}
+        properties[key] = schema
+    out: Schema = {"type": "object", "properties": properties, "additionalProperties": False}
+    return {**out, "required": required} if required else out
+
+
+def comments_of(cls: type) -> dict[str, str]:
+    """The comments behind the fields of a class, by field; empty without its source."""
+    try:
+        source = textwrap.dedent(inspect.getsource(cls))
+    except (OSError, TypeError):
+        return {}
+    return dict(_COMMENT.findall(source))
+
+
+def _of_field(field: pydantic.fields.FieldInfo) -> Schema:
+    validators = [m for m in field.metadata if isinstance(m, pydantic.PlainValidator)]
+    return _of_validator(validators[-1].func, field.annotation) if validators else schema_of(field.annotation)
+
+
+def schema_of(hint: Any) -> Schema:
+    """The schema of a type of a field; empty (anything) for types that have none."""
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin is Annotated:
+        validators = [m for m in arguments[1:] if isinstance(m, pydantic.PlainValidator)]
+        return _of_validator(validators[-1].func, arguments[0]) if validators else schema_of(arguments[0])
+    if origin in (typing.Union, types.UnionType):
+        return {"anyOf": [schema_of(a) for a in arguments]}
+    if origin is list:
+        return {"type": "array", "items": schema_of(arguments[0])}
+    if origin is dict:
+        return {"type": "object", "additionalProperties": schema_of(arguments[1])}
+    if isinstance(hint, type) and issubclass(hint, Block):
+        return schema_of_block(hint)
+    return dict(_OF_TYPES.get(hint, {}))
+
+
+def _of_validator(function: Callable[..., Any], hint: Any) -> Schema:
+    """The schema of what a validator accepts; where it is not known, that of the type it returns."""
+    if function in _OF_VALIDATORS:
+        return dict(_OF_VALIDATORS[function])
+    name = function.__name__
+    if name in _OF_NAMES:
+        return dict(_OF_NAMES[name])
+    inner = inspect.getclosurevars(function).nonlocals
+    if "allowed" in inner:  # one_of
+        return {"enum": list(inner["allowed"])}
+    if "count" in inner:  # numbers, positive_numbers
+        limits = {"exclusiveMinimum": 0} if "positive" in function.__qualname__ else {}
+        items = {"type": "number", **limits}
+        return {"type": "array", "items": items, "minItems": inner["count"], "maxItems": inner["count"]}
+    return schema_of(hint)
