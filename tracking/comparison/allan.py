@@ -50,8 +50,8 @@ def allan_deviation(readings: Array, step_s: float, confidence: float = 0.95) ->
     slope = _slopes(deviation)
     freedom = np.array([_freedom(n + 1, m, s) for m, s in zip(averaged.tolist(), slope.tolist(), strict=True)])
     tail = 0.5 * (1 - confidence)
-    low = deviation * np.sqrt(freedom / chi2.ppf(1 - tail, freedom))
-    high = deviation * np.sqrt(freedom / chi2.ppf(tail, freedom))
+    low = deviation * np.sqrt(freedom / np.asarray(chi2.ppf(1 - tail, freedom), dtype=float))
+    high = deviation * np.sqrt(freedom / np.asarray(chi2.ppf(tail, freedom), dtype=float))
     return AllanDeviation(averaged * step_s, averaged, deviation, low, high, freedom, slope)
 
 

@@ -29,9 +29,10 @@ from tracking.comparison.time_candidates import offset_candidates
 _OUTLIER_P = 1e-5
 _HUBER_P = 0.01
 _MOST_STEPS = 30
+_CANDIDATE_STEPS = 8
 _BLOCKS = 30
-_CANDIDATE_SAMPLES = 3000  # of the result, where candidates of the offset are compared
-_SAME_FIT = 1.1  # ratio of the residuals' scales (squared) within which two offsets explain the data equally well
+_CANDIDATE_SAMPLES = 600  # of the result, where candidates of the offset are compared
+_SAME_FIT = 5.0  # sigmas of the residuals' variance within which two offsets explain their frames equally well
 LEAST_FRAMES = 8
 
 
@@ -99,28 +100,27 @@ def estimate_alignment(
     if free.offset and offset_s is None:
         offsets += offset_candidates(result, reference)
     thin = result.select(np.unique(np.linspace(0, len(result) - 1, _CANDIDATE_SAMPLES).round().astype(int)))
-    found: list[tuple[float, Estimate]] = []
+    found: list[Estimate] = []
     for offset in dict.fromkeys(offsets):
         start = Alignment.identity(offset, middle)
         if residuals(thin, reference, start, gap).known.sum() < LEAST_FRAMES:
             continue
         first = first_alignment(thin, reference, start, mask)
-        fitted = _fit(result if len(offsets) == 1 else thin, reference, first, mask, gap)
+        fitted = _fit(thin, reference, first, mask, gap, steps=_CANDIDATE_STEPS)
         if fitted is not None:
-            found.append((fitted.scale, fitted))
+            found.append(fitted)
     if not found:
         raise NotComparableError("no common times")
-    best = min(found, key=lambda f: f[0])[1]
-    same = [f for f in found if f[0] <= _SAME_FIT * best.scale + 1e-12]
-    rivals = _distinct([f[1] for f in same])
-    if len(rivals) > 1 and "offset_s" not in best.determined.undetermined:
-        best = min(rivals, key=lambda e: abs(e.alignment.offset_s - offsets[0]))
+    best = min(found, key=lambda e: e.scale)
+    rivals = _distinct([best, *(e for e in found if e.scale <= _as_good(best))])
+    if len(rivals) > 1:  # the alignment that explains the most frames; the others are reported
+        best = max(rivals, key=lambda e: int(e.inliers.sum()))
     others = tuple(e.alignment.offset_s for e in rivals if e is not best)
     if "offset_s" in best.determined.undetermined:
         others = ()
         start = first_alignment(thin, reference, Alignment.identity(offsets[0], middle), mask)
         if residuals(result, reference, start, gap).known.sum() < LEAST_FRAMES:
-            raise NotComparableError("the motion does not determine the time offset, and the clocks have no common times")
+            raise NotComparableError("no motion determines the time offset, and the clocks have no common times")
         best = replace(best, alignment=start)
     final = _fit(result, reference, best.alignment, mask, gap)
     if final is None:
@@ -141,6 +141,12 @@ def _distinct(estimates: list[Estimate]) -> list[Estimate]:
         if all(abs(e.alignment.offset_s - k.alignment.offset_s) > 10 * _offset_sigma(e, k) for k in kept):
             kept.append(e)
     return kept
+
+
+def _as_good(best: Estimate) -> float:
+    """The largest variance factor that is as good as the best one, for the number of independent residuals."""
+    independent = max(float(best.inliers.sum()) * 3 / best.correlation**2, 2.0)
+    return best.scale * (1.1 + _SAME_FIT * math.sqrt(2 / independent)) + 1e-12
 
 
 def _offset_sigma(a: Estimate, b: Estimate) -> float:
@@ -183,12 +189,14 @@ def inverse_covariances(r: Residuals, shared: float = 1.0) -> Array:
     return symmetric(W)
 
 
-def _fit(result: Motion, reference: Motion, start: Alignment, mask: Bools, gap: float) -> Estimate | None:
+def _fit(
+    result: Motion, reference: Motion, start: Alignment, mask: Bools, gap: float, steps: int = _MOST_STEPS
+) -> Estimate | None:
     """Huber's weights until convergence, then without the outliers. None where too few times are common."""
     alignment, what = start, None
     inliers = np.ones(len(result), dtype=bool)
     for robust in (True, False):
-        for step in range(_MOST_STEPS):
+        for step in range(steps):
             w = _weighted(result, reference, alignment, gap)
             if w is None:
                 return None
@@ -222,9 +230,7 @@ def _is_small(delta: Array, w: _Weighted, result: Motion) -> bool:
     return bool(np.all(np.abs(delta[TIME]) < limit) and np.all(np.abs(delta[2:]) < 1e-10))
 
 
-def _information(
-    result: Motion, reference: Motion, alignment: Alignment, w: _Weighted, weight: Array
-) -> Information:
+def _information(result: Motion, reference: Motion, alignment: Alignment, w: _Weighted, weight: Array) -> Information:
     J, J_reference = jacobians(result, reference, alignment, w.r.compared)
     noise = w.r.result_covariance * max(w.scale, 1.0)
     return Information(J, J_reference, w.W * weight[:, None, None], noise * (weight > 0)[:, None, None])

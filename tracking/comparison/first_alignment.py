@@ -47,7 +47,9 @@ def first_alignment(result: Motion, reference: Motion, start: Alignment, free: B
     for world in turns:
         candidate = replace(found, world=world)
         if free[BODY].all() and result.rotation is not None and there.rotation is not None:
-            candidate = replace(candidate, body=_mean_rotation(np.swapaxes(world @ result.rotation, -1, -2) @ there.rotation))
+            candidate = replace(
+                candidate, body=_mean_rotation(np.swapaxes(world @ result.rotation, -1, -2) @ there.rotation)
+            )
         candidate = _with_places(candidate, result, places, free)
         candidates.append((_misfit(result, reference, candidate), candidate))
     least = min(misfit for misfit, _ in candidates)
@@ -78,10 +80,10 @@ def _with_places(alignment: Alignment, result: Motion, places: Array, free: Bool
         rest = rest - alignment.translation_m
     rest = rest - (middle := np.median(rest, axis=0) * bool(free[TRANSLATION].all()))
     good = np.ones(n, dtype=bool)
-    x = np.zeros(6)
+    x: Array = np.zeros(6)
     for _ in range(2):
         # rcond: where attitudes hardly change, the lever arm stays near zero.
-        x = np.linalg.lstsq(J[good].reshape(-1, 6), rest[good].ravel(), rcond=1e-2)[0]
+        x = np.asarray(np.linalg.lstsq(J[good].reshape(-1, 6), rest[good].ravel(), rcond=1e-2)[0])
         away = np.linalg.norm(rest - J @ x, axis=1)
         good = away <= np.quantile(away, 0.9)
     lever = x[:3] if free[LEVER].all() else alignment.lever_m

@@ -20,6 +20,7 @@ PARAMETERS = (
 )  # fmt: skip
 TIME, WORLD, BODY, LEVER, TRANSLATION = slice(0, 2), slice(2, 5), slice(5, 8), slice(8, 11), slice(11, 14)
 
+
 @dataclass(frozen=True, slots=True)
 class Alignment:
     """Clocks and frames of a reference relative to those of a result."""

@@ -10,6 +10,7 @@ from geometry import rotations
 from geometry.arrays import Array, Bools, Ints
 
 GAP = 2.5  # times the median step: no interpolation across longer gaps
+_BEYOND_ENDS = 0.01  # steps by which a time may lie before the first or after the last sample
 _SLOPE_SAMPLES = 3  # on either side
 
 
@@ -70,7 +71,7 @@ def interpolate(motion: Motion, t_s: Array, gap: float = GAP) -> Interpolated:
     tolerance = 1e-6
     long = np.diff(motion.t_s) > gap * step
     on_first, on_second = np.abs(u) < tolerance, np.abs(u - 1) < tolerance
-    inside = (u > -tolerance) & (u < 1 + tolerance)
+    inside = (u > -_BEYOND_ENDS) & (u < 1 + _BEYOND_ENDS)
     known = inside & (~long[before] | on_first | on_second)
     places = before[:, None] + np.array([-1, 0, 1, 2])
     long_around = np.concatenate([[True], long, [True]])  # before the first sample, between samples, after the last one

@@ -86,7 +86,7 @@ def _reduced(info: Information, basis: Array, part: slice, noise: float, largest
     if not np.any(basis[part]):
         return basis, none
     J = info.J @ basis
-    H = symmetric(np.einsum("nik,nij,njl->kl", J, info.W, J))
+    H = symmetric(np.einsum("nik,nil->kl", J, info.W @ J))
     block = basis[part]  # (3, k)
     scale = 1 / np.sqrt(np.maximum(np.diag(H), 1e-300))
     eigenvalues, vectors = np.linalg.eigh(H * scale[:, None] * scale)
