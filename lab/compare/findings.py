@@ -11,6 +11,7 @@ from lab.number_format import format_number, format_percent, format_with_sigma
 from tracking.comparison.estimation import Estimate
 from tracking.comparison.frame_alignment import BODY, LEVER, TRANSLATION, WORLD
 
+_BAD_FIT = 25.0  # variance factor: five times the stated sigmas
 UNDETERMINED = "not determined"
 
 
@@ -49,6 +50,12 @@ def undetermined_lines(e: Estimate | None) -> list[str]:
     if e is None:
         return []
     lines = []
+    if e.scale > _BAD_FIT:
+        lines.append(
+            f"The recordings do not fit: the differences are {format_number(float(np.sqrt(e.scale)))} times the stated"
+            " sigmas. The alignment may be wrong: are both of the same motion, and are the units and the order of the"
+            " columns right?"
+        )
     if "offset_s" in e.determined.undetermined:
         lines.append(
             "The time offset is not determined: the recordings show no common motion that a shift in time would"

@@ -82,8 +82,8 @@ def _curves(comparison: Comparison) -> Section:
     drawings = [PageDrawing(_curve(comparison, axis, k, shades)) for k, axis in enumerate(comparison.axes)]
     words = (
         "Result minus reference, after the alignment. Bands: two stated sigmas of the difference. Rotations are about"
-        " the axes of the reference's body; yaw, pitch and roll are differences of the angles. Triangles mark values beyond"
-        " the axis."
+        " the axes of the reference's body; yaw, pitch and roll are differences of the angles. Triangles mark values"
+        " beyond the axis."
     )
     return Section("Differences over time", words, drawings)
 

@@ -52,7 +52,7 @@ def allan_deviation(readings: Array, step_s: float, confidence: float = 0.95) ->
     tail = 0.5 * (1 - confidence)
     low = deviation * np.sqrt(freedom / np.asarray(chi2.ppf(1 - tail, freedom), dtype=float))
     high = deviation * np.sqrt(freedom / np.asarray(chi2.ppf(tail, freedom), dtype=float))
-    return AllanDeviation(averaged * step_s, averaged, deviation, low, high, freedom, slope)
+    return AllanDeviation(np.asarray(averaged * step_s, dtype=float), averaged, deviation, low, high, freedom, slope)
 
 
 def _slopes(deviation: Array) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +14,7 @@ from tracking.comparison.motion import Motion, interpolate
 
 _BASES = 5  # samples that are tried as the one to which the others are related: some may be outliers
 _TURNS = 24  # rotations about the main axis of the motion that are tried: one axis alone does not determine A
+_ALTERNATIONS = 8
 _MOST_SAMPLES = 400
 
 
@@ -42,7 +44,10 @@ def first_alignment(result: Motion, reference: Motion, start: Alignment, free: B
             turns += list(rotations.exp(angles[:, None] * axis) @ found.world)
         noise = float(np.trace(result.covariance[:, :3, :3], axis1=1, axis2=2).sum())
         p, q = result.position_m, places
-        turns.append(_turn(p - np.median(p, axis=0), q - np.median(q, axis=0), noise))
+        by_places = _turn(p - np.median(p, axis=0), q - np.median(q, axis=0), noise)
+        turns.append(by_places)
+        if result.rotation is not None and there.rotation is None:
+            turns += _with_lever_arm(start, result, q, noise, by_places, free)
     candidates = []
     for world in turns:
         candidate = replace(found, world=world)
@@ -54,6 +59,38 @@ def first_alignment(result: Motion, reference: Motion, start: Alignment, free: B
         candidates.append((_misfit(result, reference, candidate), candidate))
     least = min(misfit for misfit, _ in candidates)
     return next(candidate for misfit, candidate in candidates if misfit <= 1.05 * least)
+
+
+def _with_lever_arm(
+    start: Alignment, result: Motion, places: Array, noise: float, first: Array, free: Bools
+) -> list[Array]:
+    """Rotations A for places of a point with an unknown lever arm, by alternating between A and the lever arm.
+
+    From 24 starting rotations, since the alternation finds the nearest minimum.
+    """
+    assert result.position_m is not None
+    assert result.rotation is not None
+    found = []
+    for quarter in _quarter_turns():
+        world = quarter @ first
+        for _ in range(_ALTERNATIONS):
+            lever = _with_places(replace(start, world=world), result, places, free).lever_m
+            points = result.position_m + result.rotation @ lever
+            world = _turn(points - np.median(points, axis=0), places - np.median(places, axis=0), noise)
+        found.append(world)
+    return found
+
+
+def _quarter_turns() -> list[Array]:
+    """The 24 rotations of a cube."""
+    found = []
+    for order in itertools.permutations(range(3)):
+        for signs in itertools.product((1.0, -1.0), repeat=3):
+            matrix = np.zeros((3, 3))
+            matrix[range(3), order] = signs
+            if np.linalg.det(matrix) > 0:
+                found.append(matrix)
+    return found
 
 
 def _misfit(result: Motion, reference: Motion, alignment: Alignment) -> float:
