@@ -44,7 +44,7 @@ def first_alignment(result: Motion, reference: Motion, start: Alignment, free: B
             turns += list(rotations.exp(angles[:, None] * axis) @ found.world)
         noise = float(np.trace(result.covariance[:, :3, :3], axis1=1, axis2=2).sum())
         p, q = result.position_m, places
-        by_places = _turn(p - np.median(p, axis=0), q - np.median(q, axis=0), noise)
+        by_places = _turn_of_places(p, q, noise, np.eye(3))
         turns.append(by_places)
         if result.rotation is not None and there.rotation is None:
             turns += _with_lever_arm(start, result, q, noise, by_places, free)
@@ -76,9 +76,20 @@ def _with_lever_arm(
         for _ in range(_ALTERNATIONS):
             lever = _with_places(replace(start, world=world), result, places, free).lever_m
             points = result.position_m + result.rotation @ lever
-            world = _turn(points - np.median(points, axis=0), places - np.median(places, axis=0), noise)
+            world = _turn_of_places(points, places, noise, world)
         found.append(world)
     return found
+
+
+def _turn_of_places(points: Array, places: Array, noise: float, near: Array) -> Array:
+    """The rotation between two clouds of points (n, 3) with unknown centres, without the worst tenth."""
+    good, world = np.ones(len(points), dtype=bool), near
+    for _ in range(2):
+        moved, seen = points - points[good].mean(axis=0), places - places[good].mean(axis=0)
+        world = _turn(moved[good], seen[good], noise, near)
+        away = np.linalg.norm(seen - moved @ world.T, axis=1)
+        good = away <= np.quantile(away, 0.9)
+    return world
 
 
 def _quarter_turns() -> list[Array]:
@@ -149,13 +160,13 @@ def _by_attitude(start: Alignment, R: Array, Q: Array, noise: float, free: Bools
     return replace(start, world=found[0], body=found[1])
 
 
-def _turn(moved: Array, seen: Array, noise: float) -> Array:
-    """The rotation A (3, 3) with seen = A moved, both (n, 3); near the identity about axes without motion."""
+def _turn(moved: Array, seen: Array, noise: float, near: Array | None = None) -> Array:
+    """The rotation A (3, 3) with seen = A moved, both (n, 3); close to `near` (the identity) about axes without motion."""
     length = np.linalg.norm(moved, axis=1)
     gap = np.linalg.norm(np.abs(np.linalg.norm(seen, axis=1) - length)[:, None], axis=1)
     good = gap <= 3 * np.median(gap) + 1e-12  # lengths do not depend on A: outliers show before A is known
     M = seen[good].T @ moved[good]
-    M = M + (1e-3 * float(np.sum(moved[good] ** 2)) + 10 * noise + 1e-12) * np.eye(3)
+    M = M + (1e-3 * float(np.sum(moved[good] ** 2)) + 10 * noise + 1e-12) * (np.eye(3) if near is None else near)
     return _nearest_rotation(M)
 
 

@@ -33,10 +33,10 @@ def places_only(motion: Motion) -> Motion:
 
 
 def test_errors_of_all_fourteen_parameters_agree_with_their_covariance():
-    found = [estimate_alignment(*recordings(seed), offset_s=0.1) for seed in range(16)]
+    found = [estimate_alignment(*recordings(seed), offset_s=0.1) for seed in range(10)]
     assert all(e.free.all() and not e.determined.undetermined for e in found)
-    # 16 x 14 squared normal errors: a mean of 1 with a standard deviation of 0.09.
-    assert 0.7 < nees(found) < 1.3
+    # 10 x 14 squared normal errors: a mean of 1 with a standard deviation of 0.12.
+    assert 0.6 < nees(found) < 1.4
     assert 0.85 < np.mean([e.scale for e in found]) < 1.15
 
 
@@ -63,11 +63,11 @@ def test_angles_alone_determine_clocks_and_rotations():
 
 def test_places_alone_determine_clocks_world_and_lever_arm():
     found = []
-    for seed in range(8):
+    for seed in range(4):
         result, reference = recordings(seed)
         found.append(estimate_alignment(result, places_only(reference), offset_s=0.1))
     assert not found[0].free[BODY].any()
-    assert 0.6 < nees(found, replace(TRUTH, body=np.eye(3))) < 1.4
+    assert 0.5 < nees(found, replace(TRUTH, body=np.eye(3))) < 1.5
 
 
 def test_an_unknown_offset_of_days_is_found_without_help():
@@ -77,6 +77,7 @@ def test_an_unknown_offset_of_days_is_found_without_help():
     assert e.other_offsets == ()
 
 
+@pytest.mark.slow
 def test_noise_of_a_reference_does_not_pull_the_offset_to_half_a_sample():
     # Slow motion: 0.2 sigma of the reference per sample. Interpolation at half a sample has the smallest noise.
     truth = replace(TRUTH, offset_s=0.0)
@@ -192,9 +193,10 @@ def test_the_jacobian_is_the_derivative_of_the_residuals():
     for k in range(14):
         delta = np.zeros(14)
         delta[k] = 1e-5
-        change = residuals(result, reference, TRUTH.plus(delta)).values - residuals(
-            result, reference, TRUTH.plus(-delta)
-        ).values
+        change = (
+            residuals(result, reference, TRUTH.plus(delta)).values
+            - residuals(result, reference, TRUTH.plus(-delta)).values
+        )
         for analytic in (J, with_reference):
             np.testing.assert_allclose(analytic[middle, :, k], change[middle] / 2e-5, atol=2e-3)
 
