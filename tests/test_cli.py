@@ -168,7 +168,7 @@ def test_the_example_of_run_leaves_the_files_of_the_contract(desk):
     assert isinstance(json.loads((out / "summary.json").read_text()), dict)
 
 
-@pytest.mark.parametrize("name", ["check", "report", "detect"])
+@pytest.mark.parametrize("name", ["check", "report", "detect", "compare"])
 def test_the_example_works(works, name):
     assert works(*example(name)).strip()
 
@@ -257,6 +257,8 @@ def test_simulate_lists_every_scenario(works):
         ("simulate nothing --out r", "got 'nothing'"),
         ("simulate clean --out r --frames 0", "0 is not in the range"),
         ("report sample_runs", "found no summary.json"),
+        ("compare sample_runs --out r", "expected a second result folder or --reference"),
+        ("compare sample_runs sample_runs --out r", "found no summary.json"),
         ("study nothing --out r", "'nothing' is not"),
         ("calibrate sreen x --out r", "No such command 'sreen'. Did you mean 'screen'?"),
         ("calibrate board chess:9x6 --out r", "chess"),

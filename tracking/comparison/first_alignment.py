@@ -161,7 +161,7 @@ def _by_attitude(start: Alignment, R: Array, Q: Array, noise: float, free: Bools
 
 
 def _turn(moved: Array, seen: Array, noise: float, near: Array | None = None) -> Array:
-    """The rotation A (3, 3) with seen = A moved, both (n, 3); close to `near` (the identity) about axes without motion."""
+    """The rotation A (3, 3) with seen = A moved, both (n, 3); about axes without motion close to `near` (identity)."""
     length = np.linalg.norm(moved, axis=1)
     gap = np.linalg.norm(np.abs(np.linalg.norm(seen, axis=1) - length)[:, None], axis=1)
     good = gap <= 3 * np.median(gap) + 1e-12  # lengths do not depend on A: outliers show before A is known

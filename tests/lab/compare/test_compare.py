@@ -131,7 +131,9 @@ def test_an_encoder_with_one_angle_is_a_reference(folder):
 
 
 def test_two_results_are_compared_frame_by_frame_without_alignment(folder, result, motions):
-    moved = Motion(motions[0].t_s, motions[0].rotation, motions[0].position_m + [1e-3, 0, 0], motions[0].covariance)
+    moved = Motion(
+        motions[0].t_s, motions[0].rotation, motions[0].position_m + np.array([1e-3, 0, 0]), motions[0].covariance
+    )
     other = write_results(folder / "results" / "two", moved)
     found = compare(other, other=result)
     assert found.estimate is None
