@@ -12,6 +12,7 @@ from tracking.comparison.estimation import Estimate
 from tracking.comparison.frame_alignment import BODY, LEVER, TRANSLATION, WORLD
 
 _BAD_FIT = 25.0  # variance factor: five times the stated sigmas
+_LOST_SHARE = 0.1  # of an undetermined direction in a component that counts as undetermined
 UNDETERMINED = "not determined"
 
 
@@ -29,19 +30,20 @@ def alignment_rows(comparison: Comparison) -> list[tuple[str, str, str]]:
     if e.free[1]:
         rate = UNDETERMINED if "rate" in lost else format_with_sigma(1e6 * a.rate, float(1e6 * s[1]))
         rows.append(("clock rate, reference against result", rate, "ppm"))
-    for part, name, rotation in ((WORLD, "world", a.world), (BODY, "body", a.body)):
+    none = np.zeros((0, 3))
+    turns, lengths = e.determined.world_axes, e.determined.lever_axes
+    for part, name, values, unit, axes in (
+        (WORLD, "world rotation", np.rad2deg(rotations.log(a.world)), "deg", turns),
+        (BODY, "body rotation", np.rad2deg(rotations.log(a.body)), "deg", none),
+        (LEVER, "lever arm", 1e3 * a.lever_m, "mm", lengths),
+        (TRANSLATION, "translation", 1e3 * a.translation_m, "mm", none),
+    ):
         if e.free[part].all():
-            vector, sigma = np.rad2deg(rotations.log(rotation)), np.rad2deg(s[part])
-            rows += [
-                (f"{name} rotation {axis}", format_with_sigma(float(vector[k]), float(sigma[k])), "deg")
-                for k, axis in enumerate("xyz")
-            ]
-    for part, name, vector in ((LEVER, "lever arm", a.lever_m), (TRANSLATION, "translation", a.translation_m)):
-        if e.free[part].all():
-            rows += [
-                (f"{name} {axis}", format_with_sigma(float(1e3 * vector[k]), float(1e3 * s[part][k])), "mm")
-                for k, axis in enumerate("xyz")
-            ]
+            sigmas = (np.rad2deg(s[part]) if unit == "deg" else 1e3 * s[part]).tolist()
+            lost_share = np.linalg.norm(axes, axis=0).tolist()
+            for axis, value, sigma, share in zip("xyz", values.tolist(), sigmas, lost_share, strict=True):
+                known = share < _LOST_SHARE
+                rows.append((f"{name} {axis}", format_with_sigma(value, sigma) if known else UNDETERMINED, unit))
     return rows
 
 
@@ -72,7 +74,8 @@ def undetermined_lines(e: Estimate | None) -> list[str]:
     if len(e.determined.world_axes) and e.free[BODY].all():
         lines.append(
             f"The world rotation and the body rotation are not distinguished about {_axes(e.determined.world_axes)} of"
-            " the reference's world: only their combined effect is known. The differences do not depend on it."
+            " the reference's world: only their combined effect is known. The body rotation holds for a world"
+            " rotation without that part."
         )
     elif len(e.determined.world_axes):
         lines.append(f"The world rotation is not determined about {_axes(e.determined.world_axes)}.")

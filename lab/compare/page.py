@@ -136,9 +136,9 @@ def _allan(still: StillStand | None) -> Section | None:
     if still is None:
         return None
     words = [
-        f"Overlapping Allan deviation of the result's angles over the longest stationary stretch,"
-        f" {format_number(still.first_s)} s to {format_number(still.last_s)} s ({still.count} frames), with 95 % limits."
-        " Slope −1/2: white noise, averaging helps; 0: flicker noise; +1/2: random walk, longer averages are"
+        "Overlapping Allan deviation of the result's angles over the longest time without motion,"
+        f" {format_number(still.first_s)} s to {format_number(still.last_s)} s ({still.count} frames), with 95 %"
+        " limits. Slope −1/2: white noise, averaging helps; 0: flicker noise; +1/2: random walk, longer averages are"
         " worse.",
         "A smoothed result has correlated errors at short times: there its deviation is below that of single frames.",
     ]

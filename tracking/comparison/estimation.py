@@ -110,7 +110,7 @@ def estimate_alignment(
         if fitted is not None:
             found.append(fitted)
     if not found:
-        raise NotComparableError("no common times")
+        raise NotComparableError(f"fewer than {LEAST_FRAMES} common times")
     best = min(found, key=lambda e: e.scale)
     rivals = _distinct([best, *(e for e in found if e.scale <= _as_good(best))])
     if len(rivals) > 1:  # the alignment that explains the most frames; the others are reported
@@ -120,11 +120,13 @@ def estimate_alignment(
         others = ()
         start = first_alignment(thin, reference, Alignment.identity(offsets[0], middle), mask)
         if residuals(result, reference, start, gap).known.sum() < LEAST_FRAMES:
-            raise NotComparableError("no motion determines the time offset, and the clocks have no common times")
+            raise NotComparableError(
+                "no motion determines the time offset, and the clocks as they are have no common times"
+            )
         best = replace(best, alignment=start)
     final = _fit(result, reference, best.alignment, mask, gap)
     if final is None:
-        raise NotComparableError("no common times")
+        raise NotComparableError(f"fewer than {LEAST_FRAMES} common times")
     return replace(final, other_offsets=others)
 
 

@@ -14,6 +14,7 @@ import pytest
 from geometry import rotations
 from geometry.arrays import Array
 from lab.compare.compare import compare
+from lab.compare.findings import UNDETERMINED, alignment_rows
 from lab.compare.reference_file import read_reference
 from lab.compare.tables import DIFFERENCES
 from lab.compare.write import compare_and_write
@@ -126,6 +127,9 @@ def test_an_encoder_with_one_angle_is_a_reference(folder):
     assert found.estimate is not None
     assert found.alignment.offset_s == pytest.approx(-0.05, abs=2e-3)
     assert len(found.estimate.determined.world_axes) == 1
+    rows = {name: value for name, value, _ in alignment_rows(found)}
+    assert rows["world rotation z"] == UNDETERMINED
+    assert UNDETERMINED not in (rows["world rotation x"], rows["world rotation y"])
     assert found.noise.factor == pytest.approx(1.0, abs=0.2)
     assert any("no pitch_deg and no roll_deg" in note for note in found.notes)
 
@@ -212,7 +216,7 @@ def test_what_cannot_be_compared_is_named(folder, result, motions):
     with pytest.raises(InputError, match=r"summary\.json"):
         compare(folder, other=result)
     far = write_tum(folder / "far.tum", replace(motions[1], t_s=motions[1].t_s + 1e5))
-    with pytest.raises(InputError, match="no common times; give the offset"):
+    with pytest.raises(InputError, match="fewer than 8 common times; give the offset"):
         compare(result, reference=far, align=("world", "body"))
     with pytest.raises(InputError, match="something other than earlier results"):
         compare_and_write(result, result, None, result)
