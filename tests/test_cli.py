@@ -127,6 +127,7 @@ def test_the_commands_are_those_of_the_contract():
         "check",
         "report",
         "study",
+        "compare",
         "calibrate",
         "plan",
         "doctor",
@@ -175,7 +176,7 @@ def test_the_example_of_run_leaves_the_files_of_the_contract(desk):
     assert isinstance(json.loads((out / "summary.json").read_text()), dict)
 
 
-@pytest.mark.parametrize("name", ["check", "report", "detect", "doctor", "explain", "verify"])
+@pytest.mark.parametrize("name", ["check", "report", "detect", "doctor", "explain", "verify", "compare"])
 def test_the_example_works(works, name):
     assert works(*example(name)).strip()
 
@@ -273,6 +274,8 @@ def test_simulate_lists_every_scenario(works):
         ("init r --beams 2 --screens 1", "expected at least 3 for 1 screen, got 2"),
         ("init r --cameras 1 --screens 2", "expected at least one per screen (2), got 1"),
         ("init r --picture large", "expected WIDTHxHEIGHT in pixels such as 1280x1024, got 'large'"),
+        ("compare sample_runs --out r", "expected a second result folder or --reference"),
+        ("compare sample_runs sample_runs --out r", "found no summary.json"),
         ("study nothing --out r", "'nothing' is not"),
         ("calibrate sreen x --out r", "No such command 'sreen'. Did you mean 'screen'?"),
         ("calibrate board chess:9x6 --out r", "chess"),

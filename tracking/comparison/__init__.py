@@ -1,0 +1,1 @@
+"""Compares two recorded motions: time offset, clock rate and frame alignment, differences, Allan deviation."""
