@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from calibration.least_squares.priors import Prior
-from calibration.screens.clouds import MissingOpen3DError, scan_of
+from calibration.open3d_loader import MissingOpen3DError
+from calibration.screens.clouds import scan_of
 from calibration.screens.network import ControlPoints, Network, PointObservations
 from calibration.screens.registration import register
 from calibration.screens.screens import ApproximatePosition, Scan, ScreenSetup

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import datetime
-import importlib.util
 import os
 import sys
 from dataclasses import replace
@@ -29,10 +28,10 @@ from lab.files.text.yaml_text import write_mapping
 from lab.simulate.board_photo import PhotoSettings, photograph
 from tests.lab.calibrate.screen_projects import truth, write_project
 from tests.lab.files.test_project import TARGET, changed
+from tests.open3d_marker import needs_open3d
 from tests.paths import DATA
 
 BOARD = Charuco(8, 6, 0.15, 0.11, "DICT_4X4_50")
-needs_open3d = pytest.mark.skipif(importlib.util.find_spec("open3d") is None, reason="Open3D is not installed")
 
 
 def rewritten(path, change):
@@ -318,7 +317,7 @@ def test_points_without_a_return_are_excluded_and_counted(tmp_path):
 def test_without_open3d_the_error_for_a_ply_file_explains_the_installation(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "open3d", None)
     write_ply(tmp_path / "scan.ply", np.eye(3))
-    with pytest.raises(InputError, match=r"scan.ply: point clouds need Open3D.*make pointcloud"):
+    with pytest.raises(InputError, match=r"scan.ply: this needs Open3D, which is not installed"):
         read_point_cloud(tmp_path / "scan.ply", 1.0)
 
 
