@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import click
 
-from lab.commands import calibrate, plan_and_simulate, results, run
+from lab.commands import calibrate, plan_and_simulate, results, run, view
 from lab.commands.common import Commands
 
 
@@ -27,6 +27,7 @@ for command in (
     results.check,
     results.report,
     results.study,
+    view.view,
     calibrate.calibrate,
     plan_and_simulate.plan,
 ):

@@ -124,6 +124,7 @@ def test_the_commands_are_those_of_the_contract():
         "check",
         "report",
         "study",
+        "view",
         "calibrate",
         "plan",
     }
@@ -167,7 +168,7 @@ def test_the_example_of_run_leaves_the_files_of_the_contract(desk):
     assert isinstance(json.loads((out / "summary.json").read_text()), dict)
 
 
-@pytest.mark.parametrize("name", ["check", "report", "detect"])
+@pytest.mark.parametrize("name", ["check", "report", "detect", "view"])
 def test_the_example_works(works, name):
     assert works(*example(name)).strip()
 
