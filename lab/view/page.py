@@ -32,6 +32,7 @@ def write_page(view: View, index: int | None, path: Path) -> None:
             frame=None if index is None else int(content.frames[index]),
             moments=int(content.known.sum()),
             ellipsoids=len(view.ellipsoids),
+            too_large=view.too_large,
             scale=f"{view.sigma_scale:g}",
             drawings=[Markup(d) for d in scene_views(things)],
             data=Markup(json.dumps(scene_data(view, index), separators=(",", ":")).replace("<", "\\u003c")),

@@ -23,6 +23,7 @@ from lab.view.content import Content
 
 MOST_ELLIPSOIDS = 60
 MOST_POINTS = 1500  # of the trajectory
+_LARGEST = 0.2  # largest semi-axis that is drawn, in shares of the scene's extent: larger ones would cover it
 _SHARE = 0.02  # of the scene's extent: the size at which a typical ellipsoid is drawn
 _TURN = np.linspace(0, 2 * np.pi, 33)
 
@@ -52,6 +53,7 @@ class View:
     fixed: Sequence[SceneObject]  # screens, cameras and the trajectory
     ellipsoids: list[Ellipsoid]
     sigma_scale: float  # the ellipsoids' semi-axes over the sigmas
+    too_large: int  # ellipsoids that are not drawn, because they would cover the scene
     reach_m: float  # length of a field of view
     extent_m: float  # of the scene: the longest side of its box
 
@@ -78,8 +80,9 @@ def view_of(content: Content, index: int | None, sigma_scale: float | None = Non
     extent = float(np.ptp(points[np.isfinite(points).all(axis=1)], axis=0).max())
     with_sigma = known[np.isfinite(content.position_covariance[known]).all(axis=(1, 2))]
     scale = _scale(content, with_sigma, extent) if sigma_scale is None else sigma_scale
-    drawn = thinned(with_sigma, MOST_ELLIPSOIDS)
-    return View(content, fixed, [ellipsoid(content, int(i), scale) for i in drawn], scale, reach, extent)
+    ellipsoids = [ellipsoid(content, int(i), scale) for i in thinned(with_sigma, MOST_ELLIPSOIDS)]
+    drawn = [e for e in ellipsoids if np.linalg.norm(e.axes, axis=0).max() <= _LARGEST * extent]
+    return View(content, fixed, drawn, scale, len(ellipsoids) - len(drawn), reach, extent)
 
 
 def ellipsoid(content: Content, index: int, scale: float) -> Ellipsoid:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import sys
 
 import cv2
 import numpy as np
@@ -21,13 +22,13 @@ from lab.view.page import scene_data
 from lab.view.scene import view_of
 from lab.view.view import show
 from lab.view.window import Player, fill
-from tests.lab.fake_results import write_fake
+from tests.lab.fake_results import make
 from tests.open3d_marker import needs_open3d
 
 
 @pytest.fixture(scope="module")
 def fake(tmp_path_factory):
-    return write_fake(tmp_path_factory.mktemp("fake"))
+    return make(tmp_path_factory.mktemp("fake"))
 
 
 @pytest.fixture
@@ -57,13 +58,17 @@ def test_the_ellipsoids_are_the_sigmas_times_the_stated_scale(content):
     e = view.ellipsoids[0]
     np.testing.assert_allclose(e.axes @ e.axes.T, 1e4 * content.position_covariance[first], rtol=1e-9, atol=1e-15)
     drawn = solids.ball(e.centre, e.axes, e.colour)
-    chi2 = np.einsum(
-        "ni,ij,nj->n",
-        *(2 * [drawn.vertices - e.centre])[:1],
-        np.linalg.inv(e.axes @ e.axes.T),
-        drawn.vertices - e.centre,
-    )
+    off = drawn.vertices - e.centre
+    chi2 = np.einsum("ni,ij,nj->n", off, np.linalg.inv(e.axes @ e.axes.T), off)
     np.testing.assert_allclose(chi2, 1.0, rtol=1e-6)
+
+
+def test_an_ellipsoid_that_would_cover_the_scene_is_counted_and_not_drawn(content):
+    content.position_covariance[np.flatnonzero(content.known)[0]] = 1e4 * np.eye(3)
+    view = view_of(content, None)
+    assert view.too_large >= 1
+    assert max(np.linalg.norm(e.axes, axis=0).max() for e in view.ellipsoids) < 0.25 * view.extent_m
+    assert view_of(content, None, 1e-6).too_large == 0
 
 
 def test_an_unknown_frame_and_a_missing_run_folder_are_named(fake, content, tmp_path):
@@ -142,7 +147,7 @@ def test_files_are_written_without_a_display(fake, tmp_path, monkeypatch):
 
 
 def test_without_open3d_the_page_and_the_glb_are_written_and_the_reason_is_said(fake, tmp_path, monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "open3d", None)
+    monkeypatch.setitem(sys.modules, "open3d", None)
     done = show(fake.results, tmp_path / "out")
     assert [path.name for path in done.files] == ["view.html", "scene.glb"]
     assert "no scene.ply and no rendered pictures: this needs Open3D" in done.notes[0]
