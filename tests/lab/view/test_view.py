@@ -146,6 +146,14 @@ def test_files_are_written_without_a_display(fake, tmp_path, monkeypatch):
         assert (picture.max(axis=2) - picture.min(axis=2) > 60).mean() > 1e-3  # coloured lines on white
 
 
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="other systems always have a display")
+def test_a_display_that_does_not_answer_is_none(monkeypatch):
+    monkeypatch.setenv("DISPLAY", ":9876")
+    assert not view_module.has_display()
+    monkeypatch.delenv("DISPLAY")
+    assert not view_module.has_display()
+
+
 def test_without_open3d_the_page_and_the_glb_are_written_and_the_reason_is_said(fake, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "open3d", None)
     done = show(fake.results, tmp_path / "out")
