@@ -16,7 +16,7 @@ SAMPLE_RUNS := $(patsubst %/run.yaml,%,$(wildcard sample_runs/*/run.yaml))
 DEMO := results/demo
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all check format bench-tracking bench-random bench-detection bench-throughput bench-live bench-calibration peers bench-peers lock wheel pointcloud clean
+.PHONY: help setup demo test test-all check format bench-tracking bench-random bench-detection bench-throughput bench-live bench-calibration peers bench-peers lock wheel clean
 
 help:  ## List the chores
 	@sed -n 's/^\([a-z-]*\):.*##  */\1|/p' $(MAKEFILE_LIST) | while IFS='|' read -r name what; do \
@@ -113,19 +113,6 @@ lock:  ## Write requirements.lock again from pyproject.toml
 
 wheel: setup  ## Build dist/beampose-*.whl
 	$(BIN)/python -m build --no-isolation --outdir dist .
-
-# open3d's library needs libusb even to be imported, and pip cannot install that.
-pointcloud: setup  ## Add open3d, for calibrating screens from point clouds
-	@$(BIN)/python -c 'import ctypes.util, sys; sys.exit(not ctypes.util.find_library("usb-1.0"))' || { \
-		if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
-			apt-get update -qq && apt-get install -y -qq --no-install-recommends libusb-1.0-0; \
-		else \
-			echo "open3d needs the system package libusb-1.0-0, which is not installed." >&2; \
-			echo "On Debian or Ubuntu: sudo apt-get install libusb-1.0-0, then make pointcloud again." >&2; exit 2; \
-		fi; }
-	$(BIN)/python -m pip install --quiet --require-virtualenv --no-build-isolation \
-		--constraint requirements.lock --editable '.[pointcloud]'
-	$(BIN)/python -c 'import open3d; print("open3d", open3d.__version__)'
 
 clean:  ## Remove the environment, builds, results and caches
 	rm -rf .venv .venv-peers build dist results .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import click
 
-from lab.commands import batch, calibrate, compare, maintenance, plan_and_simulate, results, run
+from lab.commands import batch, calibrate, compare, maintenance, plan_and_simulate, results, run, view
 from lab.commands.common import Commands
 
 
@@ -28,6 +28,7 @@ for command in (
     results.report,
     results.study,
     compare.compare,
+    view.view,
     calibrate.calibrate,
     plan_and_simulate.plan,
     maintenance.init,

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import platform
 from importlib import metadata
 
 PACKAGES = (
     "beampose", "numpy", "scipy", "opencv-python-headless", "numba", "llvmlite", "isal", "simplejpeg", "pandas",
 )  # fmt: skip
+ONE_OF = ("open3d-cpu", "open3d")  # the name depends on the platform; some have neither
 
 
 def versions() -> dict[str, str]:
@@ -18,4 +20,7 @@ def versions() -> dict[str, str]:
             out[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
             out[name] = "not installed as a package"
+    for name in ONE_OF:
+        with contextlib.suppress(metadata.PackageNotFoundError):
+            out[name] = metadata.version(name)
     return out

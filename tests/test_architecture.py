@@ -36,7 +36,7 @@ MOST_MODULES, MOST_LINES, MEDIAN_LINES = 15, 350, 150
 MAY_USE_FROM_OUTSIDE = {
     "geometry": {"numpy", "scipy", "numba"},
     "tracking": {"numpy", "scipy", "numba", "cv2"},
-    "calibration": {"numpy", "scipy", "cv2", "open3d"},
+    "calibration": {"numpy", "scipy", "cv2", "open3d", "libusb_package"},
 }
 
 
@@ -215,12 +215,10 @@ def test_formulas_use_only_numerical_packages(floor):
 
 def test_what_the_program_imports_is_declared_in_pyproject():
     declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    required = [
-        *declared["dependencies"],
-        *(r for extra in ("pointcloud", "parquet") for r in declared["optional-dependencies"][extra]),
-    ]
+    required = [*declared["dependencies"], *declared["optional-dependencies"]["parquet"]]
     names = {canonicalize_name(Requirement(requirement).name) for requirement in required}
-    distributions = packages_distributions() | {n: [n] for n in ("open3d", "pyarrow")}  # seldom installed
+    not_everywhere = {"open3d": ["open3d"], "libusb_package": ["libusb-package"], "pyarrow": ["pyarrow"]}
+    distributions = not_everywhere | packages_distributions()
     used = set().union(*(foreign_packages(ROOT, floor) for floor in FLOORS))
     assert {"numpy", "scipy"} <= used
     missing = {p for p in used if not names & set(map(canonicalize_name, distributions.get(p, [])))}
@@ -228,7 +226,8 @@ def test_what_the_program_imports_is_declared_in_pyproject():
 
 
 def test_open3d_is_not_needed_to_import_anything():
-    hungry = [n for n, p in modules(ROOT).items() if "open3d" in map(floor_of, imports(n, p, into_functions=False))]
+    names = {"open3d", "libusb_package"}
+    hungry = [n for n, p in modules(ROOT).items() if names & set(map(floor_of, imports(n, p, into_functions=False)))]
     assert hungry == []
 
 

@@ -56,6 +56,7 @@ def loaded(code: str, *arguments: str, word: str = "LOADED") -> set[str]:
         ("run", "--help"),
         ("detect", "--help"),
         ("watch", "--help"),
+        ("view", "--help"),
         ("calibrate", "rig", "--help"),
     ],
 )

@@ -7,11 +7,11 @@ number of its points. The surface is therefore fitted to patches, not to points.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from scipy import ndimage
 
+from calibration.open3d_loader import open3d
 from calibration.screens.flatness import assess_flatness
 from calibration.screens.screen_frame import frame_of_extent
 from calibration.screens.screens import Scan, moved_to_surface, pose_covariance
@@ -27,14 +27,6 @@ _PLANES = 4  # planes searched for, the largest first
 # Shares of a point's scatter (ours, conservative) that are common to all points of a patch, and to all of the scan.
 _SHARED_IN_PATCH = 1 / 3
 _SHARED_BY_ALL = 1 / 2
-INSTALL = (
-    "point clouds need Open3D, which is not installed: `make pointcloud`, or `pip install 'beampose[pointcloud]'`"
-    " (on Debian and Ubuntu also `apt install libusb-1.0-0`)"
-)
-
-
-class MissingOpen3DError(RuntimeError):
-    """Open3D is not installed. The message describes the installation."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,19 +35,6 @@ class PlaneCandidate:
 
     points: Array  # (n, 3): the largest connected component
     extent_m: Array  # (2,), the longer one first
-
-
-def open3d() -> Any:
-    """The module.
-
-    Raises:
-        MissingOpen3DError: Open3D is not installed.
-    """
-    try:
-        import open3d as module
-    except (ImportError, OSError) as error:  # OSError: a system library that it needs is missing
-        raise MissingOpen3DError(f"{INSTALL} ({error})") from None
-    return module
 
 
 def scan_of(
@@ -75,7 +54,7 @@ def scan_of(
 
     Raises:
         ValueError: there is no such plane.
-        MissingOpen3DError: Open3D is not installed.
+        MissingOpen3DError: Open3D cannot be loaded.
     """
     if len(points) < FEWEST:
         raise ValueError(f"{len(points)} points, expected {FEWEST} or more")

@@ -9,9 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from calibration.least_squares.priors import Prior
-from calibration.screens.clouds import MissingOpen3DError, scan_of
+from calibration.open3d_loader import MissingOpen3DError
+from calibration.screens.clouds import FEWEST, scan_of
 from calibration.screens.network import ControlPoints, Network, PointObservations
 from calibration.screens.registration import register
+from calibration.screens.scan_alignment import align, on_surfaces
 from calibration.screens.screens import ApproximatePosition, Scan, ScreenSetup
 from calibration.screens.survey_diagnosis import wrong_unit
 from calibration.terms.rig_blocks import prior_of
@@ -205,9 +207,9 @@ def _setup(entry: ScreenEntry, survey: Survey, project: Project, scan: tuple[Sca
 
 def _scan(cloud: Cloud, entry: ScreenEntry, survey: Survey, project: Project) -> tuple[Scan, list[str]]:
     """The scan of a screen in the world frame, and notes on it."""
-    points, notes = read_point_cloud(cloud.path, cloud.unit_m)
-    pose, covariance, words = cloud.world_from_cloud, None, list(notes)
+    pose, covariance = cloud.world_from_cloud, None
     try:
+        points, words = _points(cloud)
         if cloud.targets is not None:
             targets = read_survey([cloud.targets], project.screens, MAX_SCAN_COORDINATE)
             both = [n for n in targets.names if n in survey.names]
@@ -225,3 +227,34 @@ def _scan(cloud: Cloud, entry: ScreenEntry, survey: Survey, project: Project) ->
     except ValueError as error:
         raise InputError(f"{cloud.path}: {error}") from None
     return scan, [*words, f"{cloud.path.name}: {scan.words}"]
+
+
+def _points(cloud: Cloud) -> tuple[Array, list[str]]:
+    """The points (n, 3), m, of all scans of a cloud that lie on surfaces, in the frame of the first; and notes.
+
+    Raises:
+        InputError: a scan cannot be read, or a further one cannot be aligned with the first.
+        MissingOpen3DError: Open3D cannot be loaded.
+    """
+    scans: list[Array] = []
+    words: list[str] = []
+    for path in (cloud.path, *cloud.also):
+        points, notes = read_point_cloud(path, cloud.unit_m)
+        words += notes
+        if len(points) >= FEWEST:
+            kept = on_surfaces(points)
+            if not kept.all():
+                words.append(f"{path.name}: {np.sum(~kept)} of {len(points)} points left out: far from all others")
+            points = points[kept]
+        if scans:
+            try:
+                found = align(points, scans[0])
+            except ValueError as error:
+                raise InputError(f"{path}: {error}") from None
+            points = found.fixed_from_moving.apply(points)
+            words.append(
+                f"{path.name}: aligned with {cloud.path.name} with a scatter of {1e3 * found.sigma_m:.2g} mm;"
+                f" {100 * found.overlap:.0f} % of it overlaps"
+            )
+        scans.append(points)
+    return np.concatenate(scans), words

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.screens.clouds import MissingOpen3DError, open3d
+from calibration.open3d_loader import MissingOpen3DError, open3d
 from geometry.arrays import Array
 from lab.errors import InputError
 

@@ -138,6 +138,7 @@ class _Reader:
             world_from_cloud=None if block.world_from_cloud is None else block.world_from_cloud.pose(),
             targets=None if block.targets is None else self.file(block.targets, f"{where}.targets"),
             point_sigma_m=block.point_sigma_m,
+            also=tuple(self.file(name, f"{where}.also") for name in block.also),
         )
 
     def _fixed_board(self, block: FixedBoardBlock, where: str) -> FixedBoard | None:

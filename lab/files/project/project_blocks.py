@@ -85,6 +85,7 @@ class FixedBoardBlock(Block):
 
 class CloudBlock(Block):
     file: Word
+    also: list[Word] = []  # noqa: RUF012 - frozen
     unit: Annotated[str, pydantic.PlainValidator(one_of(tuple(CLOUD_UNITS)))] = "m"
     world_from_cloud: PoseBlock | None = None
     targets: Word | None = None

@@ -46,6 +46,7 @@ class Cloud:
     world_from_cloud: Pose | None  # None: determined from the targets
     targets: Path | None  # points in both scan and survey: point,x_m,y_m,z_m in the cloud's frame
     point_sigma_m: float | None  # of one scanned point; None: from the scatter of the cloud
+    also: tuple[Path, ...] = ()  # further scans in the same unit, aligned with the first by what they share
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,7 +126,7 @@ class Project:
         out = [self.path, *(c.lens_path for c in self.cameras.values()), *self.survey, *self.points]
         for s in self.screens.values():
             out += [p for b in s.boards for p in b.photos.values()]
-            out += [p for p in (s.cloud.path, s.cloud.targets) if p] if s.cloud else []
+            out += [p for p in (s.cloud.path, *s.cloud.also, s.cloud.targets) if p] if s.cloud else []
         out += [p for b in self.boards for of_camera in b.photos.values() for p in of_camera.values()]
         for r in self.recordings:
             out += [p for p in (r.run / "run.yaml" if r.run else None, r.spots, r.poses) if p]

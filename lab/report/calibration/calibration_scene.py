@@ -15,7 +15,7 @@ from geometry.pose import Pose
 from geometry.rig import Rig
 from lab.report.plot.axes import PlotArea, svg_of
 from lab.report.plot.scales import Scale, number, round_size
-from lab.report.plot.svg import BLUE, GREEN, ORANGE, PURPLE, VERMILLION, dots, polyline, segments, text
+from lab.report.plot.svg import BLUE, GREEN, ORANGE, PURPLE, VERMILLION, dots, line_path, polyline, segments, text
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +59,16 @@ class Marker:
     colour: str = ORANGE
 
 
-SceneObject = Frustum | Rectangle | Ray | Marker
+@dataclass(frozen=True, slots=True)
+class Trail:
+    """A line through points: a trajectory, or a curve on an ellipsoid."""
+
+    name: str
+    places: Array  # (n, 3), m, in world; interrupted at nan
+    colour: str = PURPLE
+
+
+SceneObject = Frustum | Rectangle | Ray | Marker | Trail
 
 # World directions that point right and up in the drawing. z is up in the world frame of a lab, y is down in a camera.
 VIEWS: dict[str, tuple[Array, Array]] = {
@@ -123,8 +132,8 @@ def scene_view(things: Sequence[SceneObject], title: str, view: str = LAB_VIEWS[
     """Parallel projection of a scene. view: one of VIEWS. Lengths along the drawing's axes are to scale."""
     right, up = VIEWS[view]
     to_drawing = np.stack([right / np.linalg.norm(right), up / np.linalg.norm(up)])
-    reach = _frustum_length(things)
-    outlines = [_outline(t, reach) for t in things]
+    reach = frustum_length(things)
+    outlines = [outline(t, reach) for t in things]
     flat = [o @ to_drawing.T for o in outlines]
     all_points = np.concatenate([*flat, np.zeros((1, 2))]) if flat else np.zeros((1, 2))
     all_points = all_points[np.isfinite(all_points).all(axis=1)]
@@ -158,16 +167,16 @@ def scene_view(things: Sequence[SceneObject], title: str, view: str = LAB_VIEWS[
     return svg_of(p, title, out)
 
 
-def _frustum_length(things: Sequence[SceneObject]) -> float:
+def frustum_length(things: Sequence[SceneObject]) -> float:
     """Length of the drawn fields of view, m: a seventh of the scene."""
     points = [t.camera_from_world.inverse().translation for t in things if isinstance(t, Frustum)]
-    points += [p for t in things if not isinstance(t, Frustum) for p in _outline(t, 0.0)]
+    points += [p for t in things if not isinstance(t, Frustum) for p in outline(t, 0.0)]
     cloud = np.array(points).reshape(-1, 3)
     cloud = cloud[np.isfinite(cloud).all(axis=1)]
     return max(float(np.ptp(cloud, axis=0).max()) / 7, 0.02) if len(cloud) else 1.0
 
 
-def _outline(thing: SceneObject, reach: float) -> Array:
+def outline(thing: SceneObject, reach: float) -> Array:
     """Corners of a thing (k, 3), m, in world. reach: length of a field of view, m."""
     if isinstance(thing, Frustum):
         a, b = thing.half_width
@@ -181,6 +190,8 @@ def _outline(thing: SceneObject, reach: float) -> Array:
         return thing.world_from_rectangle.apply(corners - (np.array([w / 2, h / 2, 0]) if thing.centred else 0))
     if isinstance(thing, Ray):
         return np.stack([thing.start, thing.end])
+    if isinstance(thing, Trail):
+        return np.asarray(thing.places, dtype=float).reshape(-1, 3)
     return np.asarray(thing.place, dtype=float).reshape(1, 3)
 
 
@@ -203,6 +214,9 @@ def _drawn(thing: SceneObject, p: PlotArea, at: Array) -> tuple[str, tuple[float
             f'<path d="{segments(at[:1], at[1:])}" stroke="{c}" stroke-width="1.1" stroke-opacity="0.85">{tip}</path>',
             None,
         )
+    if isinstance(thing, Trail):
+        line = line_path(at[:, 0], at[:, 1])
+        return f'<path d="{line}" fill="none" stroke="{c}" stroke-width="1.1">{tip}</path>', None
     shape = f'<path d="{dots(at, 3.2)}" fill="{c}" stroke="var(--paper)" stroke-width="0.6">{tip}</path>'
     return shape, (*_pair(at[0]), thing.name, c)
 

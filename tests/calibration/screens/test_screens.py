@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -21,8 +19,8 @@ from geometry.arrays import numeric_jacobian
 from geometry.pose import Pose
 from geometry.rotations import exp
 from tests.calibration.screens.networks import lab, measured
+from tests.open3d_marker import needs_open3d
 
-needs_open3d = pytest.mark.skipif(importlib.util.find_spec("open3d") is None, reason="Open3D is not installed")
 SIGMA = 3e-4
 
 
@@ -210,12 +208,6 @@ def test_without_a_size_the_largest_plane_is_used_and_a_size_that_fits_none_rais
 def test_a_cloud_of_few_points_raises():
     with pytest.raises(ValueError, match="50 points, expected 200"):
         clouds.scan_of(np.zeros((50, 3)))
-
-
-def test_without_open3d_the_message_describes_its_installation(monkeypatch):
-    monkeypatch.setitem(sys.modules, "open3d", None)
-    with pytest.raises(clouds.MissingOpen3DError, match=r"make pointcloud.*pip install 'beampose\[pointcloud\]'"):
-        clouds.planes(np.random.default_rng(0).normal(size=(300, 3)))
 
 
 @needs_open3d

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import datetime
-import importlib.util
 import os
 import sys
 from dataclasses import replace
@@ -29,10 +28,10 @@ from lab.files.text.yaml_text import write_mapping
 from lab.simulate.board_photo import PhotoSettings, photograph
 from tests.lab.calibrate.screen_projects import truth, write_project
 from tests.lab.files.test_project import TARGET, changed
+from tests.open3d_marker import needs_open3d
 from tests.paths import DATA
 
 BOARD = Charuco(8, 6, 0.15, 0.11, "DICT_4X4_50")
-needs_open3d = pytest.mark.skipif(importlib.util.find_spec("open3d") is None, reason="Open3D is not installed")
 
 
 def rewritten(path, change):
@@ -282,6 +281,38 @@ def test_a_scan_replaces_the_control_points_of_a_screen(tmp_path, kind):
 
 
 @needs_open3d
+def test_two_scans_of_a_screen_are_aligned_and_points_off_it_left_out(tmp_path):
+    rng = np.random.default_rng(0)
+    path = write_project(tmp_path / "p", points_each=10)
+    screen = truth().screens["right"].world_from_screen
+    shift = Pose(np.eye(3), np.array([0.02, -0.01, 0.015]))
+    for name, pose in (("a.xyz", Pose.identity()), ("b.xyz", shift)):
+        z = 1e-3 * rng.normal(size=9000)
+        u, v = rng.uniform(-1.2, 1.2, 9000), rng.uniform(-1, 1, 9000)
+        # The screen, and two boards that stand at right angles to it and to each other.
+        parts = (
+            np.column_stack([u, v, z]),
+            np.column_stack([z - 1.5, v, u / 4 + 0.4])[:3000],
+            np.column_stack([u / 4, z - 1.3, v / 3 + 0.4])[:3000],
+            rng.uniform([-1, -0.8, 0.3], [1, 0.8, 0.8], (40, 3)),
+        )
+        np.savetxt(tmp_path / "p" / name, pose.apply(screen.apply(np.concatenate(parts))), fmt="%.5f")
+    changed(path, screens__right__cloud={"file": "a.xyz", "also": ["b.xyz"]})
+    outcome = calibrate_screen(path, tmp_path / "out")
+    found = load_screens(tmp_path / "out" / "screens.yaml").rig.screens["right"].world_from_screen
+    normal = screen.rotation[:, 2]
+    assert abs(found.rotation[:, 2] @ normal) == pytest.approx(1, abs=1e-6)
+    assert abs((found.translation - screen.translation) @ normal) < 1e-3  # the shift of b is 15 mm along it
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "aligned with a.xyz with a scatter of" in page
+    assert "points left out: far from all others" in page
+    assert outcome.exit_status == 0
+    (tmp_path / "p" / "b.xyz").write_text("\n".join(f"{50 + x} {y} 1" for x in range(20) for y in range(20)))
+    with pytest.raises(InputError, match=r"b.xyz: 0 % of its points are near the first scan"):
+        calibrate_screen(path, tmp_path / "out2")
+
+
+@needs_open3d
 def test_a_scan_in_another_unit_is_reported(tmp_path):
     rng = np.random.default_rng(0)
     path = write_project(tmp_path / "p", points_each=8)
@@ -318,7 +349,7 @@ def test_points_without_a_return_are_excluded_and_counted(tmp_path):
 def test_without_open3d_the_error_for_a_ply_file_explains_the_installation(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "open3d", None)
     write_ply(tmp_path / "scan.ply", np.eye(3))
-    with pytest.raises(InputError, match=r"scan.ply: point clouds need Open3D.*make pointcloud"):
+    with pytest.raises(InputError, match=r"scan.ply: this needs Open3D, which is not installed"):
         read_point_cloud(tmp_path / "scan.ply", 1.0)
 
 

@@ -1,0 +1,116 @@
+"use strict";
+(() => {
+  const data = JSON.parse(document.getElementById("data").textContent);
+  const canvas = document.getElementById("scene"), pen = canvas.getContext("2d");
+  const slider = document.getElementById("time"), play = document.getElementById("play");
+  const shown = document.getElementById("moment"), moments = data.moments;
+  let turn = -0.6, tilt = 0.5, zoom = 1, playing = null;
+
+  // The box of the scene: its centre and half its diagonal.
+  const low = [1e9, 1e9, 1e9], high = [-1e9, -1e9, -1e9];
+  for (const line of data.lines) for (const p of line.p) if (p) for (let i = 0; i < 3; i++) {
+    low[i] = Math.min(low[i], p[i]);
+    high[i] = Math.max(high[i], p[i]);
+  }
+  const centre = low.map((v, i) => (v + high[i]) / 2);
+  const radius = Math.max(Math.hypot(...high.map((v, i) => v - low[i])) / 2, 1e-3);
+
+  // World to canvas: turned about z, then tilted; a parallel projection.
+  const place = p => {
+    const x = p[0] - centre[0], y = p[1] - centre[1], z = p[2] - centre[2];
+    const right = Math.cos(turn) * x - Math.sin(turn) * y, away = Math.sin(turn) * x + Math.cos(turn) * y;
+    const scale = zoom * 0.5 * Math.min(canvas.clientWidth, canvas.clientHeight * 1.6) / radius;
+    return [canvas.clientWidth / 2 + scale * right,
+      canvas.clientHeight / 2 - scale * (Math.cos(tilt) * z + Math.sin(tilt) * away)];
+  };
+  const trace = points => {
+    pen.beginPath();
+    let down = false;
+    for (const p of points) {
+      if (!p) { down = false; continue; }
+      const [x, y] = place(p);
+      if (down) pen.lineTo(x, y); else pen.moveTo(x, y);
+      down = true;
+    }
+  };
+  const label = (words, p) => {
+    const [x, y] = place(p);
+    pen.fillStyle = getComputedStyle(document.body).color;
+    pen.fillText(words, x + 6, y - 5);
+  };
+
+  function draw() {
+    const ratio = window.devicePixelRatio || 1;
+    canvas.width = canvas.clientWidth * ratio;
+    canvas.height = canvas.clientHeight * ratio;
+    pen.setTransform(ratio, 0, 0, ratio, 0, 0);
+    pen.clearRect(0, 0, canvas.clientWidth, canvas.clientHeight);
+    pen.font = "12px system-ui, sans-serif";
+    for (const line of data.lines) {
+      trace(line.p);
+      if (line.f) { pen.globalAlpha = 0.12; pen.fillStyle = line.c; pen.fill(); pen.globalAlpha = 1; }
+      pen.strokeStyle = line.c;
+      pen.lineWidth = 1.2;
+      pen.stroke();
+      if (line.n && line.p[0]) label(line.n, line.p[0]);
+    }
+    if (!moments.length) return;
+    const now = moments[Number(slider.value)];
+    pen.strokeStyle = "#D55E00";
+    for (const ray of now.r) { trace(ray); pen.stroke(); }
+    for (const [name, colour, ...p] of now.s) {
+      const [x, y] = place(p);
+      pen.fillStyle = colour;
+      pen.beginPath();
+      pen.arc(x, y, 4, 0, 2 * Math.PI);
+      pen.fill();
+      label(name, p);
+    }
+    shown.textContent = `frame ${now.k} · ${now.t.toFixed(2)} s${now.m ? "" : " · not measured"}`;
+  }
+
+  function stop() { playing = null; play.textContent = "Play"; }
+  function advance() {
+    if (!playing) return;
+    const t = playing.t + (performance.now() - playing.clock) / 1000;
+    let k = Number(slider.value);
+    while (k < moments.length - 1 && moments[k + 1].t <= t) k++;
+    slider.value = k;
+    draw();
+    if (k === moments.length - 1) stop(); else requestAnimationFrame(advance);
+  }
+  play.addEventListener("click", () => {
+    if (playing) { stop(); return; }
+    if (Number(slider.value) === moments.length - 1) slider.value = 0;
+    playing = { clock: performance.now(), t: moments[Number(slider.value)].t };
+    play.textContent = "Pause";
+    requestAnimationFrame(advance);
+  });
+  slider.max = Math.max(moments.length - 1, 0);
+  slider.value = data.first;
+  slider.addEventListener("input", () => { stop(); draw(); });
+
+  const limit = v => Math.max(-Math.PI / 2, Math.min(Math.PI / 2, v));
+  let grip = null;
+  canvas.addEventListener("pointerdown", e => { grip = [e.clientX, e.clientY]; canvas.setPointerCapture(e.pointerId); });
+  canvas.addEventListener("pointermove", e => {
+    if (!grip) return;
+    turn += (e.clientX - grip[0]) / 200;
+    tilt = limit(tilt + (e.clientY - grip[1]) / 200);
+    grip = [e.clientX, e.clientY];
+    draw();
+  });
+  canvas.addEventListener("pointerup", () => { grip = null; });
+  canvas.addEventListener("wheel", e => { e.preventDefault(); zoom *= Math.exp(-e.deltaY / 600); draw(); }, { passive: false });
+  canvas.addEventListener("keydown", e => {
+    const by = { ArrowLeft: [-0.1, 0], ArrowRight: [0.1, 0], ArrowUp: [0, 0.1], ArrowDown: [0, -0.1] }[e.key];
+    if (by) { turn += by[0]; tilt = limit(tilt + by[1]); }
+    else if (e.key === "+") zoom *= 1.2;
+    else if (e.key === "-") zoom /= 1.2;
+    else return;
+    e.preventDefault();
+    draw();
+  });
+  window.addEventListener("resize", draw);
+  draw();
+})();

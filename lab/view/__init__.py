@@ -1,0 +1,1 @@
+"""`beampose view`: a rig, a run or results in three dimensions."""
