@@ -11,6 +11,7 @@ from typing import Any
 
 from lab.errors import QUALITY_GATE_FAILED
 from lab.files.run.run_file import Run
+from lab.files.text.error_text import printable
 from lab.runs.smoothing_pass import Progress
 from lab.runs.verdict.quality import Verdict
 
@@ -45,7 +46,7 @@ class RunLog(logging.Handler):
 
     def _add(self, level: str, text: str) -> None:
         now = datetime.datetime.now(datetime.UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
-        line = f"{now} {level:<7} {' '.join(text.splitlines())}"
+        line = printable(f"{now} {level:<7} {' '.join(text.splitlines())}")
         self._lines.append(line)
         LOGGER.log(logging.getLevelNamesMapping().get(level, logging.INFO), line)
 
@@ -76,7 +77,7 @@ class RunLog(logging.Handler):
     def write(self, folder: Path) -> None:
         """Write run.log."""
         text = "\n".join([*self._lines, ""])
-        (folder / FILE).write_text(text, encoding="utf-8", errors="backslashreplace")
+        (folder / FILE).write_text(text, encoding="utf-8")
 
 
 @contextlib.contextmanager
