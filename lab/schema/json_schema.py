@@ -24,6 +24,8 @@ _OF_VALIDATORS: dict[Callable[..., Any], Schema] = {
     fields.whole_number: {"type": "integer"},
     fields.boolean: {"type": "boolean"},
     fields.word: _TEXT,
+    fields.printable_name: {**_TEXT, "maxLength": fields.MAX_NAME},
+    fields.vector3: {"type": "array", "items": {"type": "number"}, "minItems": 3, "maxItems": 3},
     fields.free_text: {"type": ["string", "number", "boolean", "null"]},
     fields.lines_of_text: {"type": "array", "items": {"type": "string"}},
 }
@@ -107,6 +109,8 @@ def _of_validator(function: Callable[..., Any], hint: Any) -> Schema:
     if name in _OF_NAMES:
         return dict(_OF_NAMES[name])
     inner = inspect.getclosurevars(function).nonlocals
+    if {"least", "largest"} <= inner.keys():  # number_between
+        return {"type": "number", "minimum": inner["least"], "maximum": inner["largest"]}
     if "allowed" in inner:  # one_of
         return {"enum": list(inner["allowed"])}
     if "count" in inner:  # numbers, positive_numbers
