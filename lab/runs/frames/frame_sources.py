@@ -207,6 +207,8 @@ def open_video(path: Path) -> cv2.VideoCapture:
     Raises:
         InputError: OpenCV cannot read it.
     """
+    if path.is_fifo():  # OpenCV would wait for a writer
+        raise InputError(f"{path}: expected a video, found a pipe; save the video as a file")
     cv2 = load_cv2()
     capture = cv2.VideoCapture(str(path))
     if not capture.isOpened():
