@@ -22,6 +22,7 @@ from lab.files.text.csv_table import Categorical, Table
 from lab.files.text.csv_text import read_table
 from lab.files.text.error_text import suggest_name
 
+FARTHEST = 1e9  # px, m or s: a number beyond it is a mistake, and its square may not be finite
 MAX_COMPARED_FRAMES = 500  # by `largest_disagreement_px`, evenly spread: enough to show a wrong rig
 
 
@@ -87,6 +88,9 @@ def read_true_poses(path: Path) -> TruePoses:
     for i in np.flatnonzero(np.diff(frame) <= 0)[:1] + 1:
         raise table.error(i, f"frame: expected rising numbers, got {frame[i]} after {frame[i - 1]}")
     numbers = {name: table.finite(name) for name in columns.TRUTH_POSE[1:]}
+    for name in ("t_s", "x_m", "y_m", "z_m"):
+        for i in np.flatnonzero(np.abs(numbers[name]) > FARTHEST)[:1]:
+            raise table.error(i, f"{name}: expected a number within {FARTHEST:g}, got {table.found(name, i)}")
     check_unit_quaternions(table)
     return TruePoses(frame, numbers["t_s"], table.stack("x_m", "y_m", "z_m"), table.stack("qw", "qx", "qy", "qz"))
 
@@ -114,6 +118,8 @@ def _read_true_spots(path: Path, known: dict[str, Collection[str] | None]) -> Tr
     for name in ("u_px", "v_px"):
         for i in np.flatnonzero(~np.isfinite(table.numbers[name]) & (in_view > 0))[:1]:
             raise table.error(i, f"{name}: expected a number where in_view is 1 or 2, got {table.found(name, i)}")
+        for i in np.flatnonzero(np.abs(table.numbers[name]) > FARTHEST)[:1]:
+            raise table.error(i, f"{name}: expected a pixel within {FARTHEST:g}, got {table.found(name, i)}")
     for column, names in known.items():
         words = table.words[column]
         for code, word in enumerate(words.words):

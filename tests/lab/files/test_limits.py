@@ -10,10 +10,12 @@ import pytest
 from lab.errors import InputError
 from lab.files.rig.rig_file import load_rig
 from lab.files.run.run_file import load_run
+from lab.files.run.truth import load_truth
 from lab.files.text.csv_text import csv_text, read_table
 from lab.files.text.error_text import is_formula, name_of_path, printable
 from lab.files.text.yaml_text import parse_mapping, parse_value, read_mapping
 from lab.plan.plan_options import options_of
+from lab.runs.frames.frame_sources import open_video
 from tests.paths import ROOT
 
 CALIBRATED = ROOT / "sample_runs" / "calibrated"
@@ -66,6 +68,19 @@ def test_a_pipe_in_place_of_a_file_is_refused_and_not_waited_for(tmp_path):
         read_mapping(tmp_path / "pipe")
     with pytest.raises(InputError, match="found a pipe or a device"):
         read_table(tmp_path / "pipe", ("frame",))
+    with pytest.raises(InputError, match="found a named pipe"):
+        open_video(tmp_path / "pipe")
+
+
+@pytest.mark.parametrize(
+    ("table", "row"), [("spots.csv", "0,left,1,-1e300,5,1"), ("pose.csv", "0,0,1e300,0,0,1,0,0,0")]
+)
+def test_a_truth_whose_squares_are_not_finite_is_refused(table, row, tmp_path):
+    (tmp_path / "truth").mkdir()
+    header = "frame,camera,spot,u_px,v_px,in_view" if table == "spots.csv" else "frame,t_s,x_m,y_m,z_m,qw,qx,qy,qz"
+    (tmp_path / "truth" / table).write_text(f"{header}\n{row}\n")
+    with pytest.raises(InputError, match="within 1e\\+09, got"):
+        load_truth(tmp_path)
 
 
 @pytest.mark.parametrize("text", ["secret:x:0:0:root", "secret word", "- secret", "secret"])
