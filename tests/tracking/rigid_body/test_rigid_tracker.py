@@ -338,6 +338,7 @@ def test_false_points_anywhere_are_not_taken_for_a_vehicle():
     assert {f.pose_status for f in frames} == {PoseStatus.LOST}
 
 
+@pytest.mark.slow
 def test_false_points_near_occluded_spots_are_hardly_ever_taken_for_a_vehicle():
     """With the prior of the run three to five of 30 x 6 points near occluded spots sometimes fit a pose by chance.
 
