@@ -20,7 +20,16 @@ def _huo2015(seed: int) -> Comparison:
     return compare_huo2015(seed)
 
 
-STUDIES: dict[str, Callable[[int], Comparison]] = {"huo2015": _huo2015}  # name: seed -> table and figures
+def _fu2016(seed: int) -> Comparison:
+    from lab.unscented.study_fu2016 import compare_fu2016
+
+    return compare_fu2016(seed)
+
+
+STUDIES: dict[str, Callable[[int], Comparison]] = {  # name: seed -> table and figures
+    "huo2015": _huo2015,
+    "fu2016": _fu2016,
+}
 
 
 @click.command()
