@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from lab.errors import InputError
-from lab.explain import calibrations, lenses, program, runs
+from lab.explain import calibrations, lenses, program, runs, tracks
 from lab.explain.explanation import Explanations, as_text
 from lab.files.text.error_text import suggest_name
 
 SECTIONS: dict[str, Explanations] = {
     "Verdict of a run": runs.VERDICT,
     "Model check of a run": runs.MODEL_CHECK,
+    "Track of one target": tracks.POINT,
     "Errors": program.ERRORS,
     "Installation (`beampose doctor`)": program.DOCTOR,
     "Inputs of a calibration": calibrations.INPUTS,

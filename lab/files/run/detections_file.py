@@ -66,8 +66,8 @@ class DetectionsFile:
     unusable: Mapping[str, str]  # cameras without a usable row -> the reason of the first one
 
 
-def read_detections(path: Path) -> DetectionsFile:
-    """The points of a detections.csv.
+def read_detections(path: Path, named: str | None = None) -> DetectionsFile:
+    """The points of a detections.csv. named: the camera of all rows, for a file that may lack the column.
 
     Rows may be in any order. Unusable rows are left out and counted in `notes`, each reason with its first example.
 
@@ -75,13 +75,15 @@ def read_detections(path: Path) -> DetectionsFile:
         InputError: the file is not a table, lacks a column of REQUIRED, or has no usable row.
     """
     optional = ("sigma_u_px", "sigma_v_px", "cov_uv_px2", *SHAPE)
-    table = read_table(path, REQUIRED, optional, damaged=True)
+    required = tuple(name for name in REQUIRED if name != "camera" or named is None)
+    table = read_table(path, required, (*optional, "camera"), damaged=True)
     n = len(table)
 
     def column(name: str, default: float) -> Array:
         return table.numbers[name] if name in table else np.full(n, default)
 
-    rows = _Rows(path, table, np.array(table.words["camera"].tolist(), dtype=object), np.ones(n, dtype=bool))
+    names = table.words["camera"].tolist() if "camera" in table else [named] * n
+    rows = _Rows(path, table, np.array(names, dtype=object), np.ones(n, dtype=bool))
     missing = [c for c in ("sigma_u_px", "sigma_v_px") if c not in table]
     if missing:
         rows.notes.append(f"{path}: no column {' and '.join(missing)}: {DEFAULT_SIGMA_PX} px is assumed")
@@ -100,7 +102,7 @@ def read_detections(path: Path) -> DetectionsFile:
         rows.notes.append(f"{path}: {count} line{'s' if count > 1 else ''} left out: more fields than the header has")
     if not rows.good.any():
         because = "".join(f"; {note.removeprefix(f'{path}: ')}" for note in rows.notes[len(missing) > 0 :])
-        raise InputError(f"{path}: expected rows with {', '.join(REQUIRED)}, got none that can be used{because}")
+        raise InputError(f"{path}: expected rows with {', '.join(required)}, got none that can be used{because}")
 
     cov = np.tile(np.eye(2), (n, 1, 1))
     good = rows.good

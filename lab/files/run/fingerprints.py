@@ -38,6 +38,15 @@ def fingerprints(run: Run, full: bool = False) -> list[dict[str, Any]]:
     return out
 
 
+def fingerprint(path: Path) -> dict[str, Any]:
+    """The entry of one input: a file, or a folder of pictures.
+
+    Raises:
+        OSError: a file cannot be read.
+    """
+    return _of_folder(path, full=False) if path.is_dir() else _of_file(path, full=False)
+
+
 def _of_file(path: Path, full: bool) -> dict[str, Any]:
     size = path.stat().st_size
     digest = hashlib.sha256()

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from lab.files.text.dataclass_fields import dataclass_from_yaml
-from tracking.parameters import TrackerParameters
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+T = TypeVar("T", bound="DataclassInstance")
 
 MAX_DOTS = 5  # of a name; the parameters have one level of blocks
 
 
-def with_overrides(parameters: TrackerParameters, overrides: Mapping[str, Any]) -> TrackerParameters:
-    """The parameters with overrides, checked as in a file. Dotted names address inner blocks. Raises InputError."""
+def with_overrides(parameters: T, overrides: Mapping[str, Any]) -> T:
+    """Parameters with overrides, checked as in a file. Dotted names address inner blocks. Raises InputError."""
     content = dataclasses.asdict(parameters)
     for name, value in overrides.items():
         *blocks, last = name.split(".") if name.count(".") <= MAX_DOTS else [name]
@@ -26,4 +30,4 @@ def with_overrides(parameters: TrackerParameters, overrides: Mapping[str, Any]) 
             inner[last] = value
             continue
         content[name] = value  # there is no such block, which the check reports
-    return dataclass_from_yaml(TrackerParameters, content, "--set")
+    return dataclass_from_yaml(type(parameters), content, "--set")

@@ -1,0 +1,192 @@
+"""The input of `beampose track point`: detections by frame, from pictures, a video or a table."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from geometry.arrays import Array, Ints
+from lab.detect.inputs import PictureFiles, Video, open_inputs
+from lab.errors import InputError
+from lab.files.run.detections_file import is_too_sparse, read_detections
+from lab.files.text.csv_text import read_table
+from lab.files.text.error_text import name_of_path
+from lab.pictures.opencv import load_cv2
+from lab.pictures.picture_file import DROPPED, MissingPicture
+from lab.runs.frames.frame_sources import open_video
+from lab.runs.frames.sensor_noise import CameraNoise
+from tracking.detections import Detections
+from tracking.noise import Picture
+from tracking.parameters import DetectParameters
+from tracking.single_target.blobs import find_blobs
+from tracking.single_target.parameters import BlobParameters
+
+DETECTORS = ("spots", "dark", "bright")
+TABLE = "table"  # in place of a detector, for a CSV file
+LARGEST_RATE_HZ = 1e6  # a larger rate in a video's header is not one
+
+Progress = Callable[[int, int | None], None]  # pictures done, total number of pictures where known
+
+
+@dataclass(slots=True)
+class PointRecording:
+    """All frame numbers from the first to the last (T,), with the detections of each."""
+
+    name: str
+    path: Path
+    detector: str  # one of DETECTORS, or TABLE
+    frames: Ints  # (T,)
+    found: list[Detections | None]  # None: no usable picture
+    rate_hz: float | None
+    t_s: Array | None  # (T,) None: the rate is not known
+    size_px: tuple[int, int] | None  # width, height of the pictures
+    missing: dict[str, int] = field(default_factory=dict)  # reason -> number of frames
+    notes: list[str] = field(default_factory=list)
+
+    @property
+    def steps(self) -> Array:
+        """Time from the frame before (T,), in frames: not whole numbers where the times are irregular."""
+        if self.t_s is None or self.rate_hz is None:
+            return np.diff(self.frames.astype(float), prepend=float(self.frames[0]))
+        return np.diff(self.t_s, prepend=self.t_s[0]) * self.rate_hz
+
+
+def read_recording(
+    path: Path,
+    detector: str,
+    detect: DetectParameters,
+    blobs: BlobParameters,
+    rate_hz: float | None = None,
+    camera: str | None = None,
+    limit: int | None = None,
+    progress: Progress | None = None,
+) -> PointRecording:
+    """The detections of a folder of pictures, a video or a CSV file with frame,u_px,v_px.
+
+    rate_hz: frames per second; None: that of a video's header or of the table's t_s, where there is one. camera: of a
+    table with several. limit: largest number of pictures.
+
+    Raises:
+        InputError: the path or an option cannot be used, or no picture can be read.
+    """
+    if path.suffix.lower() == ".csv":
+        return _of_table(path, rate_hz, camera)
+    if camera is not None:
+        raise InputError(f"--camera: expected a table with a column camera, got {path}; leave the option out")
+    inputs = open_inputs([path])
+    if rate_hz is None and isinstance(inputs, Video):
+        rate_hz = _header_rate(path)
+    search = _search_of(detector, inputs, detect, blobs)
+    by_frame: dict[int, Detections | None] = {}
+    missing: dict[str, int] = {}
+    size: tuple[int, int] | None = None
+    total = inputs.count(1) if limit is None else limit
+    for done, (frame, picture) in enumerate(inputs.pictures(1), start=1):
+        if isinstance(picture, MissingPicture):
+            by_frame[frame] = None
+            missing[picture.reason] = missing.get(picture.reason, 0) + 1
+        else:
+            size = size or (picture.shape[1], picture.shape[0])
+            by_frame[frame] = search(picture)
+        if progress is not None:
+            progress(done, total)
+        if limit is not None and done >= limit:
+            break
+    if size is None:
+        why = f": {max(missing, key=lambda r: missing[r])}" if missing else ""
+        raise InputError(f"{path}: expected pictures, got none that can be read{why}")
+    out = _filled(path, detector, by_frame, rate_hz, size)
+    for reason, count in missing.items():
+        out.missing[reason] = out.missing.get(reason, 0) + count
+    out.notes += inputs.notes
+    return out
+
+
+def _search_of(
+    detector: str, inputs: PictureFiles | Video, detect: DetectParameters, blobs: BlobParameters
+) -> Callable[[Picture], Detections]:
+    if detector != "spots":
+        return lambda picture: find_blobs(picture, blobs)
+    noise = CameraNoise(inputs.camera)
+    noise.estimate_from([p for p in inputs.noise_pictures() if not isinstance(p, MissingPicture)])
+    return lambda picture: noise.detect(picture, detect)
+
+
+def _filled(
+    path: Path, detector: str, by_frame: dict[int, Detections | None], rate_hz: float | None, size: tuple[int, int]
+) -> PointRecording:
+    """Every frame number from the first to the last; those between without a picture are dropped ones."""
+    first, last = min(by_frame), max(by_frame)
+    if is_too_sparse(last - first + 1, len(by_frame)):
+        raise InputError(
+            f"{path}: expected numbered pictures of one recording, got {len(by_frame)} with numbers from {first} to"
+            f" {last}; move the strays out of the folder"
+        )
+    frames = np.arange(first, last + 1)
+    dropped = len(frames) - len(by_frame)
+    t_s = None if rate_hz is None else (frames - first) / rate_hz
+    found = [by_frame.get(k) for k in frames.tolist()]
+    missing = {DROPPED: dropped} if dropped else {}
+    return PointRecording(
+        name_of_path(path.with_suffix("")), path, detector, frames, found, rate_hz, t_s, size, missing
+    )
+
+
+def _header_rate(path: Path) -> float | None:
+    """The frame rate in a video's header; None where it states none."""
+    capture = open_video(path)
+    rate = float(capture.get(load_cv2().CAP_PROP_FPS))
+    capture.release()
+    return rate if 0 < rate < LARGEST_RATE_HZ else None
+
+
+def _of_table(path: Path, rate_hz: float | None, camera: str | None) -> PointRecording:
+    file = read_detections(path, named="target")
+    names = list(file.cameras)
+    if camera is None and len(names) > 1:
+        raise InputError(f"{path}: expected points of one camera, got {', '.join(names)}; choose one with --camera")
+    chosen = names[0] if camera is None else camera
+    if chosen not in file.cameras:
+        raise InputError(f"--camera: expected one of {', '.join(names)}, got {chosen!r}")
+    if is_too_sparse(file.last - file.first + 1, len(file.cameras[chosen].frames)):
+        raise InputError(
+            f"{path}: frame: expected numbers of one recording, got {file.first} to {file.last} with"
+            f" {len(file.cameras[chosen].frames)} frames; are these time stamps?"
+        )
+    points = file.cameras[chosen]
+    frames = np.arange(file.first, file.last + 1)
+    found = [None if points.has_only_unusable_rows(k) else points.at(k) for k in frames.tolist()]
+    unusable = sum(f is None for f in found)
+    rate, t_s = _times(path, frames, rate_hz)
+    missing = {"no usable row": unusable} if unusable else {}
+    return PointRecording(
+        name_of_path(path.with_suffix("")), path, TABLE, frames, found, rate, t_s, None, missing, list(file.notes)
+    )
+
+
+def _times(path: Path, frames: Ints, rate_hz: float | None) -> tuple[float | None, Array | None]:
+    """Frame rate and times (T,) of a table: those of its column t_s, where it has one and no rate is given.
+
+    Raises:
+        InputError: t_s does not rise with the frame.
+    """
+    if rate_hz is not None:
+        return rate_hz, (frames - frames[0]) / rate_hz
+    table = read_table(path, ("frame",), ("t_s",), damaged=True)
+    good = np.isfinite(table.numbers["t_s"]) & np.isfinite(table.numbers["frame"])
+    good &= (table.numbers["frame"] >= frames[0]) & (table.numbers["frame"] <= frames[-1])
+    numbers, first = np.unique(table.numbers["frame"][good], return_index=True)
+    t = table.numbers["t_s"][good][first]
+    if len(numbers) < 2:
+        return None, None
+    rates = np.diff(numbers) / np.where(np.diff(t) > 0, np.diff(t), np.nan)
+    if np.isnan(rates).any():
+        at = int(numbers[int(np.flatnonzero(np.isnan(rates))[0]) + 1])
+        raise InputError(f"{path}: t_s: expected times that rise with the frame, got one that does not at frame {at}")
+    rate = float(np.median(rates))
+    known = np.interp(frames, numbers, t)
+    outside = np.clip(frames, numbers[0], numbers[-1])
+    return rate, known + (frames - outside) / rate  # beyond the first and last time: at the median rate

@@ -1,0 +1,81 @@
+"""Dark or bright blobs of a grey picture: contrast to the local mean, connected pixels, centroid of the contrast."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from geometry.arrays import Array
+from tracking.detections import Detections
+from tracking.noise import Picture
+from tracking.single_target.parameters import BlobParameters
+
+_MAD_TO_SIGMA = 1.4826  # of a Gaussian
+_EVERY = 4  # every 4th row and column is enough for the noise
+
+
+def find_blobs(picture: Picture, parameters: BlobParameters) -> Detections:
+    """The blobs of a picture (h, w), strongest first.
+
+    flux is the sum and peak the maximum of the contrast, DN; the axes are the square roots of the second moments. The
+    covariance of a centroid is that of the contrast's noise; errors of the outline are not part of it. Blobs that touch
+    the picture's edge are left out, since their centroid is not that of the target.
+    """
+    grey = picture.astype(np.float32)
+    side = 2 * (parameters.background_px // 2) + 1
+    contrast = grey - cv2.blur(grey, (side, side), borderType=cv2.BORDER_REFLECT)
+    if parameters.polarity == "dark":
+        contrast = -contrast
+    sample = contrast[::_EVERY, ::_EVERY]
+    sigma = max(float(_MAD_TO_SIGMA * np.median(np.abs(sample - np.median(sample)))), 0.3)  # 0.3 DN: rounding
+    limit = max(parameters.threshold_sigma * sigma, parameters.threshold_share * float(contrast.max()))
+    mask = np.asarray(contrast > limit, dtype=np.uint8)
+    if parameters.close_px > 1:
+        kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (parameters.close_px, parameters.close_px))
+        mask = np.asarray(cv2.morphologyEx(mask, cv2.MORPH_CLOSE, kernel), dtype=np.uint8)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
+    left, top, wide, high = (stats[:, i] for i in (0, 1, 2, 3))
+    longest = np.maximum(wide, high)
+    h, w = picture.shape
+    good = (longest >= parameters.min_size_px) & (longest <= parameters.max_size_px)
+    good &= (left > 0) & (top > 0) & (left + wide < w) & (top + high < h)
+    good[0] = False  # the background
+    rows = np.flatnonzero(good)
+    if not len(rows):
+        return Detections.none()
+    place = np.full(count, -1)
+    place[rows] = np.arange(len(rows))
+    v, u = np.nonzero(mask)
+    of = place[labels[v, u]]
+    u, v, of, weight = u[of >= 0], v[of >= 0], of[of >= 0], np.maximum(contrast[v, u][of >= 0].astype(float), 0.0)
+    found = _moments(u.astype(float), v.astype(float), of, weight, len(rows), sigma)
+    return found[np.argsort(-found.flux, kind="stable")]
+
+
+def _moments(u: Array, v: Array, of: np.ndarray, weight: Array, n: int, sigma: float) -> Detections:
+    """Centroids and shapes of n blobs from their pixels (k,): coordinates, blob and contrast."""
+
+    def summed(values: Array) -> Array:
+        return np.asarray(np.bincount(of, values, n), dtype=float)
+
+    flux = summed(weight)
+    centre = np.stack([summed(weight * u), summed(weight * v)], -1) / flux[:, None]
+    du, dv = u - centre[of, 0], v - centre[of, 1]
+    shape = np.empty((n, 2, 2))
+    spread = np.empty((n, 2, 2))
+    for i, j, product in ((0, 0, du * du), (0, 1, du * dv), (1, 1, dv * dv)):
+        shape[:, i, j] = shape[:, j, i] = summed(weight * product) / flux
+        spread[:, i, j] = spread[:, j, i] = summed(product) / flux**2
+    values, vectors = np.linalg.eigh(shape + np.eye(2) / 12)  # 1/12 px^2: a pixel is a square
+    angle = np.rad2deg(np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1]))
+    peak = np.zeros(n)
+    np.maximum.at(peak, of, weight)
+    return Detections(
+        centre,
+        sigma**2 * spread + np.eye(2) / 12 / np.bincount(of, minlength=n)[:, None, None],
+        flux,
+        peak,
+        np.sqrt(values[:, 1]),
+        np.sqrt(values[:, 0]),
+        90.0 - (90.0 - angle) % 180.0,
+    )

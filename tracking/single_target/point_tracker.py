@@ -1,0 +1,150 @@
+"""The tracker of one target: a constant-velocity Kalman filter with gate, prediction through misses, re-acquisition.
+
+Source: Duan, Yuan, Wang & Huangfu, "Target tracking system of UAV based on Kalman filter", Intelligent Computer and
+Applications 10(10), 92 (2020), eqs. (1) to (9). Gate, confirmation, estimated process noise and statuses are ours. The
+filter's equations are those of tracking/curve_switching/kalman.py with the time step 1 of the paper (one frame).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from geometry.arrays import Array
+from tracking.curve_switching import kalman
+from tracking.detections import UNMATCHED, Detections
+from tracking.single_target.candidate_tracks import CandidateTracks, Step, nearest
+from tracking.single_target.parameters import USUAL, PointParameters, TargetStatus
+
+SIGMA_A_RANGE = (1e-3, 1e3)  # px/frame^2: limits of the estimated acceleration
+SIGMA_A_RATE = 0.05  # relative change of the estimated acceleration per excess of one normalised innovation
+MISS_GROWTH = 1.15  # factor of the acceleration per frame without a detection, up to the initial value
+_FLUX_RATE = 0.1  # of the running mean of the target's brightness
+
+
+@dataclass(frozen=True, slots=True)
+class PointEstimate:
+    """The target in one frame. Numbers that are not known are nan."""
+
+    status: TargetStatus
+    x: Array  # (4,) u, v, px, and their rates, px/frame
+    P: Array  # (4, 4)
+    predicted_px: Array  # (2,) predicted before this frame's picture
+    nis: float  # normalised innovation squared of the detection, or of the nearest one outside the gate
+    row: int  # the detection, or UNMATCHED
+    sigma_a_px: float  # px/frame^2, estimated so far
+
+
+NOTHING = PointEstimate(
+    TargetStatus.LOST, np.full(4, np.nan), np.full((4, 4), np.nan), np.full(2, np.nan), np.nan, UNMATCHED, np.nan
+)
+
+
+class PointTracker:
+    """Follows one target, picture by picture."""
+
+    def __init__(self, parameters: PointParameters = USUAL) -> None:
+        self.parameters = parameters
+        self.acquired: tuple[Step, ...] = ()  # after a step that started a track: its detections, this one last
+        self._candidates = CandidateTracks.none(parameters)
+        self._x: Array | None = None  # None: no track
+        self._P = np.zeros((4, 4))
+        self._sigma_a = parameters.sigma_a_px
+        self._unseen = 0.0  # frames
+        self._flux = float("nan")  # running mean of the target's brightness
+        self._last_px: Array | None = None  # where the target was lost
+        self._waited = 0.0  # frames since the last picture that CandidateTracks has seen
+
+    def step(self, dt: float, found: Detections | None) -> PointEstimate:
+        """The target `dt` frames after the last step; found: the picture's detections, None without a picture."""
+        self.acquired = ()
+        self._waited += dt
+        if self._x is None:
+            self._unseen += dt
+            return NOTHING if found is None else self._acquire(found)
+        self._x, self._P = kalman.predict(self._x, self._P, dt, np.asarray(self._acceleration()))
+        predicted, self._unseen = self._x[:2].copy(), self._unseen + dt
+        row, nis = None, float("nan")
+        if found is not None:
+            cov = self._covariances(found)
+            row, nis = nearest(self._x, self._P, found.uv_px, cov, self.parameters.p_gate)
+            if row is not None:
+                self._update(found, cov, row, nis)
+                return self._estimate(TargetStatus.MEASURED, predicted, nis, row)
+        sigma = float(np.sqrt(np.linalg.eigvalsh(self._P[:2, :2])[1]))
+        if self._unseen > self.parameters.max_predicted or sigma > self.parameters.lost_sigma_px:
+            self._last_px, self._x = predicted, None
+            self._candidates, self._waited = CandidateTracks.none(self.parameters), 0.0
+            return replace(NOTHING, predicted_px=predicted, nis=nis, sigma_a_px=self._sigma_a)
+        return self._estimate(TargetStatus.PREDICTED, predicted, nis, UNMATCHED)
+
+    def _acquire(self, found: Detections) -> PointEstimate:
+        cov = self._covariances(found)
+        steps = self._candidates.step(self._waited, found, cov, self._may_start(found))
+        self._waited = 0.0
+        if steps is None:
+            return NOTHING
+        last = steps[-1]
+        self._x, self._P, self._unseen, self.acquired = last.x, last.P, 0.0, steps
+        fluxes = [s.flux for s in steps if np.isfinite(s.flux)]
+        self._flux = float(np.mean(fluxes)) if fluxes else self._flux
+        return self._estimate(TargetStatus.MEASURED, np.full(2, np.nan), float("nan"), last.row)
+
+    def _update(self, found: Detections, cov: Array, row: int, nis: float) -> None:
+        assert self._x is not None
+        self._x, self._P = kalman.update(self._x, self._P, found.uv_px[row], cov[row])
+        if self.parameters.learn_sigma_a and self._unseen <= 1.5:
+            change = np.exp(SIGMA_A_RATE * (np.clip(nis / 2, 0, 6) - 1))
+            self._sigma_a = float(np.clip(self._sigma_a * change, *SIGMA_A_RANGE))
+        flux = float(found.flux[row])
+        if np.isfinite(flux):
+            self._flux = flux if np.isnan(self._flux) else (1 - _FLUX_RATE) * self._flux + _FLUX_RATE * flux
+        self._unseen = 0.0
+
+    def _acceleration(self) -> float:
+        """px/frame^2 for the prediction: a target that moved steadily may turn while it is hidden."""
+        largest = max(self.parameters.sigma_a_px, self._sigma_a)
+        return min(float(self._sigma_a * MISS_GROWTH ** min(self._unseen, 1e3)), largest)
+
+    def _may_start(self, found: Detections) -> np.ndarray:
+        """(n,): detections from which a track may start: near the given place, or what the lost target can be."""
+        p, good = self.parameters, np.ones(len(found), dtype=bool)
+        if self._last_px is None:
+            if p.start_px is not None:
+                good &= np.linalg.norm(found.uv_px - p.start_px, axis=-1) <= p.start_within_px
+            return good
+        reach = 3 * p.lost_sigma_px + p.max_speed_px * self._unseen
+        good &= np.linalg.norm(found.uv_px - self._last_px, axis=-1) <= reach
+        if np.isfinite(self._flux):
+            ratio = np.maximum(found.flux, 1e-12) / max(self._flux, 1e-12)
+            good &= ~np.isfinite(found.flux) | (np.abs(np.log(ratio)) <= np.log(p.max_size_ratio))
+        return good
+
+    def _covariances(self, found: Detections) -> Array:
+        return found.cov_px2 + self.parameters.sigma_model_px**2 * np.eye(2)
+
+    def _estimate(self, status: TargetStatus, predicted: Array, nis: float, row: int) -> PointEstimate:
+        assert self._x is not None
+        return PointEstimate(status, self._x.copy(), self._P.copy(), predicted, nis, row, self._sigma_a)
+
+
+def track_point(
+    dt: Array, found: Sequence[Detections | None], parameters: PointParameters = USUAL
+) -> list[PointEstimate]:
+    """The target in each of T frames. dt (T,): frames since the one before; found: as for `PointTracker.step`.
+
+    The detections that confirmed a track are reported as measured, in the frames before the confirmation too.
+    """
+    tracker = PointTracker(parameters)
+    out: list[PointEstimate] = []
+    pictures: list[int] = []  # frames with a picture
+    for k, (step, detections) in enumerate(zip(dt.tolist(), found, strict=True)):
+        if detections is not None:
+            pictures.append(k)
+        out.append(tracker.step(step, detections))
+        for at, earlier in zip(pictures[-len(tracker.acquired) : -1], tracker.acquired[:-1], strict=False):
+            start = replace(out[k], x=earlier.x, P=earlier.P, row=earlier.row)
+            out[at] = start
+    return out
