@@ -26,9 +26,16 @@ def _fu2016(seed: int) -> Comparison:
     return compare_fu2016(seed)
 
 
+def _duan2020(seed: int) -> Comparison:
+    from lab.single_target.study_duan2020 import compare_duan2020
+
+    return compare_duan2020(seed)
+
+
 STUDIES: dict[str, Callable[[int], Comparison]] = {  # name: seed -> table and figures
     "huo2015": _huo2015,
     "fu2016": _fu2016,
+    "duan2020": _duan2020,
 }
 
 

@@ -48,12 +48,16 @@ def find_blobs(picture: Picture, parameters: BlobParameters) -> Detections:
     v, u = np.nonzero(mask)
     of = place[labels[v, u]]
     u, v, of, weight = u[of >= 0], v[of >= 0], of[of >= 0], np.maximum(contrast[v, u][of >= 0].astype(float), 0.0)
-    found = _moments(u.astype(float), v.astype(float), of, weight, len(rows), sigma)
+    found = _moments(u.astype(float), v.astype(float), of, weight, len(rows), sigma, limit)
     return found[np.argsort(-found.flux, kind="stable")]
 
 
-def _moments(u: Array, v: Array, of: np.ndarray, weight: Array, n: int, sigma: float) -> Detections:
-    """Centroids and shapes of n blobs from their pixels (k,): coordinates, blob and contrast."""
+def _moments(u: Array, v: Array, of: np.ndarray, weight: Array, n: int, sigma: float, limit: float) -> Detections:
+    """Centroids and shapes of n blobs from their pixels (k,): coordinates, blob and contrast.
+
+    The covariance has the noise of the pixels, and the effect of pixels at the edge below the limit, which are left
+    out: up to limit / peak of a pixel's weight, uniform.
+    """
 
     def summed(values: Array) -> Array:
         return np.asarray(np.bincount(of, values, n), dtype=float)
@@ -70,9 +74,10 @@ def _moments(u: Array, v: Array, of: np.ndarray, weight: Array, n: int, sigma: f
     angle = np.rad2deg(np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1]))
     peak = np.zeros(n)
     np.maximum.at(peak, of, weight)
+    edge = (limit / np.maximum(peak, limit)) ** 2
     return Detections(
         centre,
-        sigma**2 * spread + np.eye(2) / 12 / np.bincount(of, minlength=n)[:, None, None],
+        sigma**2 * spread + np.eye(2) * (edge / 12 / np.bincount(of, minlength=n))[:, None, None],
         flux,
         peak,
         np.sqrt(values[:, 1]),

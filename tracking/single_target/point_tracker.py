@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from geometry.arrays import Array
+from geometry.uncertainty.chi_square import chi2_limit
 from tracking.curve_switching import kalman
 from tracking.detections import UNMATCHED, Detections
 from tracking.single_target.candidate_tracks import CandidateTracks, Step, nearest
@@ -20,7 +21,10 @@ from tracking.single_target.parameters import USUAL, PointParameters, TargetStat
 
 SIGMA_A_RANGE = (1e-3, 1e3)  # px/frame^2: limits of the estimated acceleration
 SIGMA_A_RATE = 0.05  # relative change of the estimated acceleration per excess of one normalised innovation
-MISS_GROWTH = 1.15  # factor of the acceleration per frame without a detection, up to the initial value
+NEAR_MISS = 4.0  # times the gate: a detection nearer than this may be the target that turns
+# Factors of the acceleration per frame without a detection, and their largest product: a target that moved steadily may
+# turn while it is hidden, and does turn if a detection lies a little outside the gate.
+MISS_GROWTH, NEAR_MISS_GROWTH, MOST_GROWTH = 1.1, 1.5, 10.0
 _FLUX_RATE = 0.1  # of the running mean of the target's brightness
 
 
@@ -53,6 +57,7 @@ class PointTracker:
         self._P = np.zeros((4, 4))
         self._sigma_a = parameters.sigma_a_px
         self._unseen = 0.0  # frames
+        self._growth = 1.0  # of the acceleration while the target is not seen
         self._flux = float("nan")  # running mean of the target's brightness
         self._last_px: Array | None = None  # where the target was lost
         self._waited = 0.0  # frames since the last picture that CandidateTracks has seen
@@ -64,15 +69,18 @@ class PointTracker:
         if self._x is None:
             self._unseen += dt
             return NOTHING if found is None else self._acquire(found)
-        self._x, self._P = kalman.predict(self._x, self._P, dt, np.asarray(self._acceleration()))
+        self._x, self._P = kalman.predict(self._x, self._P, dt, np.asarray(self._sigma_a * self._growth))
         predicted, self._unseen = self._x[:2].copy(), self._unseen + dt
-        row, nis = None, float("nan")
+        row, nis, near = None, float("nan"), False
         if found is not None:
             cov = self._covariances(found)
             row, nis = nearest(self._x, self._P, found.uv_px, cov, self.parameters.p_gate)
             if row is not None:
                 self._update(found, cov, row, nis)
                 return self._estimate(TargetStatus.MEASURED, predicted, nis, row)
+            near = nis < NEAR_MISS * chi2_limit(self.parameters.p_gate, 2)
+            self._learn(nis if near else float("nan"))
+        self._growth = min(self._growth * (NEAR_MISS_GROWTH if near else MISS_GROWTH) ** dt, MOST_GROWTH)
         sigma = float(np.sqrt(np.linalg.eigvalsh(self._P[:2, :2])[1]))
         if self._unseen > self.parameters.max_predicted or sigma > self.parameters.lost_sigma_px:
             self._last_px, self._x = predicted, None
@@ -87,7 +95,8 @@ class PointTracker:
         if steps is None:
             return NOTHING
         last = steps[-1]
-        self._x, self._P, self._unseen, self.acquired = last.x, last.P, 0.0, steps
+        self._x, self._P, self.acquired = last.x, last.P, steps
+        self._unseen, self._growth = 0.0, 1.0
         fluxes = [s.flux for s in steps if np.isfinite(s.flux)]
         self._flux = float(np.mean(fluxes)) if fluxes else self._flux
         return self._estimate(TargetStatus.MEASURED, np.full(2, np.nan), float("nan"), last.row)
@@ -95,18 +104,20 @@ class PointTracker:
     def _update(self, found: Detections, cov: Array, row: int, nis: float) -> None:
         assert self._x is not None
         self._x, self._P = kalman.update(self._x, self._P, found.uv_px[row], cov[row])
-        if self.parameters.learn_sigma_a and self._unseen <= 1.5:
-            change = np.exp(SIGMA_A_RATE * (np.clip(nis / 2, 0, 6) - 1))
-            self._sigma_a = float(np.clip(self._sigma_a * change, *SIGMA_A_RANGE))
+        self._learn(nis)
         flux = float(found.flux[row])
         if np.isfinite(flux):
             self._flux = flux if np.isnan(self._flux) else (1 - _FLUX_RATE) * self._flux + _FLUX_RATE * flux
-        self._unseen = 0.0
+        self._unseen, self._growth = 0.0, 1.0
 
-    def _acceleration(self) -> float:
-        """px/frame^2 for the prediction: a target that moved steadily may turn while it is hidden."""
-        largest = max(self.parameters.sigma_a_px, self._sigma_a)
-        return min(float(self._sigma_a * MISS_GROWTH ** min(self._unseen, 1e3)), largest)
+    def _learn(self, nis: float) -> None:
+        """Adapt the acceleration to an innovation, of a detection in the gate or a little outside it.
+
+        Without those outside, an acceleration that is much too small would never be corrected.
+        """
+        if self.parameters.learn_sigma_a and np.isfinite(nis) and self._unseen <= 1.5:
+            change = np.exp(SIGMA_A_RATE * (np.clip(nis / 2, 0, 6) - 1))
+            self._sigma_a = float(np.clip(self._sigma_a * change, *SIGMA_A_RANGE))
 
     def _may_start(self, found: Detections) -> np.ndarray:
         """(n,): detections from which a track may start: near the given place, or what the lost target can be."""

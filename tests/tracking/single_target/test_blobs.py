@@ -1,0 +1,62 @@
+"""Blobs: centroids of discs with known centres, and what is not the target."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from tracking.single_target.blobs import find_blobs
+from tracking.single_target.parameters import BlobParameters
+
+
+def disc(centre, radius, size=(240, 180), ground=140.0, ink=40.0, noise=1.5, seed=0):
+    """A disc with soft edges on an even ground, (h, w), 8 bit."""
+    w, h = size
+    v, u = np.mgrid[:h, :w]
+    cover = np.clip(radius + 0.5 - np.hypot(u - centre[0], v - centre[1]), 0, 1)
+    grey = ground + (ink - ground) * cover + noise * np.random.default_rng(seed).standard_normal((h, w))
+    return np.clip(np.round(grey), 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize("polarity", ["dark", "bright"])
+@pytest.mark.parametrize("centre", [(100.0, 80.0), (101.37, 77.81)])
+def test_the_centroid_of_a_disc_is_its_centre(polarity, centre):
+    ink = 40.0 if polarity == "dark" else 230.0
+    found = find_blobs(disc(centre, 9.0, ink=ink), BlobParameters(polarity=polarity))
+    assert len(found) == 1
+    np.testing.assert_allclose(found.uv_px[0], centre, atol=0.05)
+    assert found.major_px[0] == pytest.approx(4.5, rel=0.1)  # half the radius
+
+
+def test_16_bit_pictures_give_the_same_place():
+    picture = disc((100.3, 80.6), 8.0)
+    narrow, wide = (find_blobs(p, BlobParameters()) for p in (picture, picture.astype(np.uint16) * 256))
+    np.testing.assert_allclose(narrow.uv_px, wide.uv_px, atol=1e-3)
+
+
+def test_an_empty_picture_has_no_blob():
+    assert len(find_blobs(disc((100, 80), 0.0, ink=140.0), BlobParameters())) == 0
+    assert len(find_blobs(np.full((60, 80), 7, np.uint8), BlobParameters())) == 0
+
+
+def test_what_touches_the_edge_or_is_too_large_is_left_out():
+    assert len(find_blobs(disc((3.0, 80.0), 9.0), BlobParameters())) == 0
+    line = disc((100, 80), 9.0)
+    cv2.line(line, (20, 5), (20, 170), 30, 3)
+    found = find_blobs(line, BlobParameters(max_size_px=100.0))
+    assert len(found) == 1
+    np.testing.assert_allclose(found.uv_px[0], (100, 80), atol=0.1)
+
+
+def test_the_stronger_blob_comes_first():
+    picture = np.minimum(disc((60, 80), 5.0), disc((150, 90), 9.0, seed=1))
+    found = find_blobs(picture, BlobParameters())
+    assert len(found) == 2
+    np.testing.assert_allclose(found.uv_px, [(150, 90), (60, 80)], atol=0.2)
+
+
+def test_the_stated_sigma_is_that_of_the_noise():
+    centres = np.array([find_blobs(disc((100.2, 80.4), 9.0, seed=k), BlobParameters()).uv_px[0] for k in range(40)])
+    stated = np.sqrt(find_blobs(disc((100.2, 80.4), 9.0), BlobParameters()).cov_px2[0, 0, 0])
+    assert stated / 2.5 < centres[:, 0].std() < 1.5 * stated

@@ -1,0 +1,159 @@
+"""One target over time: consistent covariances, prediction through misses, honest statuses, re-acquisition."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tracking.detections import Detections
+from tracking.single_target.parameters import PointParameters, TargetStatus
+from tracking.single_target.point_tracker import PointTracker, track_point
+
+SIGMA = 0.2
+FIXED = PointParameters(learn_sigma_a=False, sigma_a_px=0.05, sigma_model_px=0.0)
+
+
+def at(*places, flux=1000.0):
+    uv = np.array(places, dtype=float).reshape(-1, 2)
+    found = Detections.at(uv, np.tile(SIGMA**2 * np.eye(2), (len(uv), 1, 1)))
+    return replace(found, flux=np.broadcast_to(np.asarray(flux, dtype=float), (len(uv),)).copy())
+
+
+def motion(rng, frames, sigma_a=0.05, start=(200.0, 300.0), speed=(2.0, -1.0)):
+    """Positions (T, 2) of a target with white acceleration that is constant within a frame, as the filter assumes."""
+    a = sigma_a * rng.standard_normal((frames, 2))
+    v = np.array(speed) + np.concatenate([np.zeros((1, 2)), np.cumsum(a[:-1], axis=0)])
+    return np.array(start) + np.concatenate([np.zeros((1, 2)), np.cumsum(v[:-1] + 0.5 * a[:-1], axis=0)])
+
+
+def seen(rng, path, hidden=()):
+    noisy = path + SIGMA * rng.standard_normal(path.shape)
+    return [at() if k in hidden else at(uv) for k, uv in enumerate(noisy)]
+
+
+def steps(frames):
+    return np.concatenate([[0.0], np.ones(frames - 1)])
+
+
+def statuses(track):
+    return [e.status.value for e in track]
+
+
+def test_positions_and_covariances_agree_with_the_errors():
+    rng = np.random.default_rng(1)
+    nees, nis = [], []
+    for _ in range(30):
+        path = motion(rng, 40)
+        track = track_point(steps(40), seen(rng, path), FIXED)
+        e = track[-1].x[:2] - path[-1]
+        nees.append(e @ np.linalg.solve(track[-1].P[:2, :2], e))
+        nis += [t.nis for t in track[5:]]
+    assert 0.6 < np.mean(nees) / 2 < 1.5  # 30 runs: sigma of the ratio is 0.18
+    assert 0.9 < np.mean(nis) / 2 < 1.1
+
+
+def test_the_first_vector_is_the_difference_of_the_first_two_positions():
+    track = track_point(steps(3), [at((10, 20)), at((13, 18)), at((16, 16))], replace(FIXED, confirm=2))
+    np.testing.assert_allclose(track[1].x, [13, 18, 3, -2])
+    assert np.isnan(track[0].x[2:]).all()
+    np.testing.assert_allclose(track[2].predicted_px, [16, 16])
+
+
+def test_hidden_frames_are_predicted_with_sigmas_that_cover_the_error():
+    rng = np.random.default_rng(2)
+    errors = []
+    for _ in range(20):
+        path = motion(rng, 40)
+        track = track_point(steps(40), seen(rng, path, hidden=range(25, 33)), FIXED)
+        assert statuses(track)[25:33] == ["predicted"] * 8
+        assert track[33].status is TargetStatus.MEASURED
+        errors.append((track[32].x[:2] - path[32]) / np.sqrt(np.diagonal(track[32].P)[:2]))
+        assert track[32].P[0, 0] > track[25].P[0, 0] > track[24].P[0, 0]
+    assert np.mean(np.square(errors)) < 1.5
+    assert np.abs(errors).max() < 4.5
+
+
+def test_two_frames_in_one_step_are_two_steps():
+    rng = np.random.default_rng(3)
+    path = motion(rng, 12, sigma_a=0.0)
+    found = seen(rng, path)
+    all_frames = track_point(steps(12), [*found[:6], None, *found[7:]], FIXED)
+    without = track_point(np.array([0, 1, 1, 1, 1, 1, 2, 1, 1, 1, 1.0]), [*found[:6], *found[7:]], FIXED)
+    assert all_frames[6].status is TargetStatus.PREDICTED
+    np.testing.assert_allclose(all_frames[-1].x, without[-1].x, atol=0.05)
+
+
+@pytest.mark.parametrize("flux", [1000.0, np.nan])
+def test_clutter_is_not_taken_for_the_target(flux):
+    rng = np.random.default_rng(4)
+    path = motion(rng, 100)
+    noisy = path + SIGMA * rng.standard_normal(path.shape)
+    found = [at(uv, *rng.uniform(0, 800, (10, 2)), flux=[flux] + 10 * [0.5 * flux]) for uv in noisy]
+    track = track_point(steps(100), found, FIXED)
+    assert np.mean([e.row == 0 for e in track]) >= 0.98
+
+
+def test_before_the_target_appears_and_after_it_is_lost_there_is_no_position():
+    rng = np.random.default_rng(5)
+    path = motion(rng, 20)
+    found = [*[at()] * 5, *seen(rng, path), *[at()] * 60]
+    track = track_point(steps(85), found, FIXED)
+    words = statuses(track)
+    assert words[:5] == ["lost"] * 5
+    assert words[5:25] == ["measured"] * 20  # the frames that confirmed it too
+    predicted = words[25:].count("predicted")
+    assert 10 <= predicted <= 50
+    assert words[25:] == ["predicted"] * predicted + ["lost"] * (60 - predicted)
+    assert all(np.isnan(e.x).all() for e in track if e.status is TargetStatus.LOST)
+
+
+def test_a_lost_target_is_found_again_by_its_brightness():
+    rng = np.random.default_rng(6)
+    path = motion(rng, 150, sigma_a=0.0)
+    other = at((350.0, 100.0), flux=20.0)  # stands still, 50 times fainter
+    found = [at(uv) if k < 30 or k >= 100 else other for k, uv in enumerate(path)]
+    track = track_point(steps(150), found, FIXED)
+    words = statuses(track)
+    assert words[95] == "lost"
+    assert words[100:] == ["measured"] * 50
+    np.testing.assert_allclose(track[-1].x[:2], path[-1], atol=0.5)
+
+
+def test_only_noise_gives_no_track():
+    rng = np.random.default_rng(7)
+    found = [at(*rng.uniform(0, 2000, (2, 2))) for _ in range(100)]
+    assert statuses(track_point(steps(100), found, FIXED)).count("measured") <= 5
+
+
+def test_the_start_place_chooses_among_several_targets():
+    rng = np.random.default_rng(8)
+    one, other = motion(rng, 30), motion(rng, 30, start=(600.0, 500.0))
+    found = [at(a, b, flux=[2000.0, 1000.0]) for a, b in zip(one, other, strict=True)]
+    for start, path in (((195.0, 305.0), one), ((610.0, 495.0), other)):
+        track = track_point(steps(30), found, replace(FIXED, start_px=start))
+        np.testing.assert_allclose(track[-1].x[:2], path[-1], atol=0.5)
+    assert track_point(steps(30), found, FIXED)[-1].row == 0, "the brightest"
+    nowhere = track_point(steps(30), found, replace(FIXED, start_px=(1000.0, 1000.0)))
+    assert set(statuses(nowhere)) == {"lost"}
+
+
+@pytest.mark.parametrize("true", [0.02, 2.0])
+def test_the_process_noise_is_estimated(true):
+    rng = np.random.default_rng(9)
+    path = motion(rng, 400, sigma_a=true)
+    track = track_point(steps(400), seen(rng, path), PointParameters(sigma_model_px=0.0))
+    assert true / 3 < track[-1].sigma_a_px < true * 3
+    assert statuses(track).count("measured") >= 390
+
+
+def test_without_a_picture_nothing_is_measured():
+    tracker = PointTracker(FIXED)
+    assert tracker.step(0.0, None).status is TargetStatus.LOST
+
+
+@pytest.mark.parametrize("wrong", [{"confirm": 1}, {"p_gate": 0.0}, {"sigma_a_px": -1.0}, {"max_size_ratio": 1.0}])
+def test_a_parameter_without_meaning_is_refused(wrong):
+    with pytest.raises(ValueError, match="expected"):
+        PointParameters(**wrong)
