@@ -7,11 +7,11 @@ geometry/forward_model.py and its analytic Jacobian.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 
 from geometry.arrays import Array, Ints, symmetric
-from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.uncertainty.chi_square import chi2_limit
 from geometry.uncertainty.rig_uncertainty import RigUncertainty
@@ -23,6 +23,13 @@ RANK_TOLERANCE = 1e-7
 # If the start is farther from the solution than this, the effect of the calibration's errors is computed again: within
 # it, the sigmas of the pixels change by up to some per cent.
 NEAR_M, NEAR_RAD = 0.05, np.deg2rad(1.0)
+
+
+class PoseModel(Protocol):
+    """A forward model of n views: geometry/forward_model.py for spots, marker_model.py for markers on the body."""
+
+    def project(self, world_from_body: Pose) -> tuple[Array, Array]:
+        """Pixels (n, 2) and their Jacobian (n, 2, 6) by the pose error; nan where there is no projection."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +111,7 @@ def whiten(covariances: Array) -> Array:
 
 
 def fit_pose(
-    model: SpotModel,
+    model: PoseModel,
     rows: Ints,
     pixels: Array,
     covariances: Array,
@@ -138,7 +145,7 @@ def fit_pose(
 
 
 def _fit(
-    model: SpotModel,
+    model: PoseModel,
     rows: Ints,
     pixels: Array,
     covariances: Array,
@@ -222,7 +229,7 @@ def _blocks(covariances: Array) -> Array:
 
 
 def _terms(
-    model: SpotModel, rows: Ints, pixels: Array, W: Array, pose: Pose, prior: tuple[Pose, Array] | None
+    model: PoseModel, rows: Ints, pixels: Array, W: Array, pose: Pose, prior: tuple[Pose, Array] | None
 ) -> tuple[Array, Array, float, Array, Array, Array] | None:
     """Normal matrix (6, 6), right-hand side (6,), cost, residuals (m, 2), px, pixels (n, 2) and Jacobians (n, 2, 6).
 

@@ -24,7 +24,7 @@ from lab.study.comparison import Comparison, ComparisonRow, Figure
 SCENES = 20
 START_FRAMES = 5
 COLOURS = {"detections": GREEN, "as printed": ORANGE, "corrected": BLUE, "beampose": VERMILLION}
-# Quantity, unit, note; in the order of `_figures_of`.
+# Quantity, unit, note; in the order of `figures_of`.
 QUANTITIES = (
     ("RMS error in view", "px", "per coordinate, without the first frames"),
     ("largest error in the turn", "px", "a turn of 90 degrees in 20 frames"),
@@ -43,7 +43,7 @@ def compare_duan2020(seed: int = 1, scenes: int = SCENES) -> Comparison:
         for number in range(scenes):
             scene = simulate(seed, number, clutter)
             for name in FILTERS:
-                of[name].append(_figures_of(scene, track(scene, name)))
+                of[name].append(figures_of(scene, track(scene, name)))
         middle = {name: np.median(np.where(np.isfinite(v), v, np.inf), axis=0) for name, v in of.items()}
         for i, (quantity, unit, note) in enumerate(QUANTITIES):
             values = tuple(float(v[i]) if np.isfinite(v[i]) else None for v in middle.values())
@@ -57,7 +57,7 @@ def compare_duan2020(seed: int = 1, scenes: int = SCENES) -> Comparison:
         rows=tuple(rows),
         explanation="Detections: the brightest one of each frame, without a filter. As printed: eqs. (1) to (9), with"
         " P (1 - K H) in eq. (5) and the detection that is nearest to the prediction. Corrected: the same with"
-        " (I - K H) P. Both get the true noise and acceleration. Beampose: `beampose track point`, which has a gate,"
+        " (I - K H) P. Both get the true noise and acceleration. Beampose: the command “track point”, which has a gate,"
         " estimates the acceleration, and waits for three detections that agree. Values are medians over the scenes."
         f" False detections: {5 * CLUTTER:g} per frame on average, half as bright as the target. The paper shows"
         " pictures of a tracked car and states no figure.",
@@ -66,7 +66,7 @@ def compare_duan2020(seed: int = 1, scenes: int = SCENES) -> Comparison:
     )
 
 
-def _figures_of(scene: PointScene, tracked: TrackedScene) -> list[float]:
+def figures_of(scene: PointScene, tracked: TrackedScene) -> list[float]:
     """The QUANTITIES of a scene; nan where there is no position."""
     difference = tracked.uv_px - scene.uv_px
     error = np.linalg.norm(difference, axis=1)
