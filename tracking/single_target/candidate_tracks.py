@@ -42,10 +42,13 @@ class CandidateTracks:
         """The state before the first picture."""
         return CandidateTracks(parameters, [], [])
 
-    def step(self, dt: float, found: Detections, cov: Array, may_start: Bools) -> tuple[Step, ...] | None:
+    def step(
+        self, dt: float, found: Detections, cov: Array, may_start: Bools, near: Array | None = None
+    ) -> tuple[Step, ...] | None:
         """Continue with a picture's detections; cov (n, 2, 2), px^2. Returns the steps of a confirmed motion, or None.
 
-        dt: frames since the last picture. may_start (n,): detections where a motion may begin.
+        dt: frames since the last picture. may_start (n,): detections where a motion may begin. Of several motions that
+        are confirmed, the brightest is chosen, or the one that is nearest to the place `near` (2,).
         """
         p, kept = self.parameters, min(len(found), self.parameters.most_candidates)
         continued = [c for track in self._tracks if (c := self._continued(track, dt, found, cov)) is not None]
@@ -58,7 +61,11 @@ class CandidateTracks:
         self._tracks = (continued + started)[:_MOST_TRACKS]
         self._last = [_first(found, cov, row) for row in np.flatnonzero(may_start[:kept]).tolist()]
         confirmed = [track for track in self._tracks if len(track) >= p.confirm]
-        return _brightest(confirmed) if confirmed else None
+        if not confirmed:
+            return None
+        if near is None:
+            return _brightest(confirmed)
+        return min(confirmed, key=lambda track: float(np.linalg.norm(track[-1].x[:2] - near)))
 
     def _continued(self, track: tuple[Step, ...], dt: float, found: Detections, cov: Array) -> tuple[Step, ...] | None:
         """A motion with the nearest detection in its gate; None: there is none."""

@@ -19,12 +19,13 @@ from tracking.detections import UNMATCHED, Detections
 from tracking.single_target.candidate_tracks import CandidateTracks, Step, nearest
 from tracking.single_target.parameters import USUAL, PointParameters, TargetStatus
 
-SIGMA_A_RANGE = (1e-3, 1e3)  # px/frame^2: limits of the estimated acceleration
+SIGMA_A_RANGE = (0.05, 1e3)  # limits of the estimated acceleration, in initial values: a target at rest may start
 SIGMA_A_RATE = 0.05  # relative change of the estimated acceleration per excess of one normalised innovation
 NEAR_MISS = 4.0  # times the gate: a detection nearer than this may be the target that turns
 # Factors of the acceleration per frame without a detection, and their largest product: a target that moved steadily may
 # turn while it is hidden, and does turn if a detection lies a little outside the gate.
 MISS_GROWTH, NEAR_MISS_GROWTH, MOST_GROWTH = 1.1, 1.5, 10.0
+SPEED_FACTOR = 3.0  # a lost target may move this much faster than ever observed
 _FLUX_RATE = 0.1  # of the running mean of the target's brightness
 
 
@@ -57,6 +58,7 @@ class PointTracker:
         self._P = np.zeros((4, 4))
         self._sigma_a = parameters.sigma_a_px
         self._unseen = 0.0  # frames
+        self._speed = 0.0  # px/frame, the largest so far
         self._growth = 1.0  # of the acceleration while the target is not seen
         self._flux = float("nan")  # running mean of the target's brightness
         self._last_px: Array | None = None  # where the target was lost
@@ -90,7 +92,7 @@ class PointTracker:
 
     def _acquire(self, found: Detections) -> PointEstimate:
         cov = self._covariances(found)
-        steps = self._candidates.step(self._waited, found, cov, self._may_start(found))
+        steps = self._candidates.step(self._waited, found, cov, self._may_start(found), self._last_px)
         self._waited = 0.0
         if steps is None:
             return NOTHING
@@ -109,6 +111,7 @@ class PointTracker:
         if np.isfinite(flux):
             self._flux = flux if np.isnan(self._flux) else (1 - _FLUX_RATE) * self._flux + _FLUX_RATE * flux
         self._unseen, self._growth = 0.0, 1.0
+        self._speed = max(self._speed, float(np.linalg.norm(self._x[2:])))
 
     def _learn(self, nis: float) -> None:
         """Adapt the acceleration to an innovation, of a detection in the gate or a little outside it.
@@ -117,7 +120,8 @@ class PointTracker:
         """
         if self.parameters.learn_sigma_a and np.isfinite(nis) and self._unseen <= 1.5:
             change = np.exp(SIGMA_A_RATE * (np.clip(nis / 2, 0, 6) - 1))
-            self._sigma_a = float(np.clip(self._sigma_a * change, *SIGMA_A_RANGE))
+            low, high = np.multiply(SIGMA_A_RANGE, self.parameters.sigma_a_px)
+            self._sigma_a = float(np.clip(self._sigma_a * change, low, high))
 
     def _may_start(self, found: Detections) -> np.ndarray:
         """(n,): detections from which a track may start: near the given place, or what the lost target can be."""
@@ -126,7 +130,7 @@ class PointTracker:
             if p.start_px is not None:
                 good &= np.linalg.norm(found.uv_px - p.start_px, axis=-1) <= p.start_within_px
             return good
-        reach = 3 * p.lost_sigma_px + p.max_speed_px * self._unseen
+        reach = 3 * p.lost_sigma_px + min(p.max_speed_px, SPEED_FACTOR * max(self._speed, 1.0)) * self._unseen
         good &= np.linalg.norm(found.uv_px - self._last_px, axis=-1) <= reach
         if np.isfinite(self._flux):
             ratio = np.maximum(found.flux, 1e-12) / max(self._flux, 1e-12)
