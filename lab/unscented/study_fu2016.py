@@ -23,6 +23,8 @@ from lab.unscented.experiment_fu2016 import (
     quiet_rms,
     simulate,
 )
+from lab.unscented.picture_experiment import run_pictures
+from lab.unscented.picture_figures import picture_figure, picture_rows
 from tracking.unscented.fu2016 import P0, STATES, R, bearings, process, selection
 from tracking.unscented.observability import Observability, observability
 from tracking.unscented.sigma_points import Function
@@ -45,10 +47,11 @@ class Errors:
     peaks: dict[str, Array]  # disturbance -> (N, 3)
 
 
-def compare_fu2016(seed: int = 1, recordings: int = RECORDINGS) -> Comparison:
-    """The table and the figures of section 4; the seed determines the result."""
+def compare_fu2016(seed: int = 1, recordings: int = RECORDINGS, pictures: int | None = None) -> Comparison:
+    """The table and the figures of section 4; the seed determines the result. pictures: the first ones; None: all."""
     errors = {name: _errors(seed, recordings, name) for name in FILTERS}
     first = simulate(seed, 0, "none")
+    shown = {name: run_pictures(seed, name == "Student-t", pictures) for name in ("standard", "Student-t")}
     observed = {
         name: observability(first.states, process(DT_S), function, R[0, 0] * np.eye(m), P0)
         for name, (function, m) in OBSERVATIONS.items()
@@ -57,13 +60,13 @@ def compare_fu2016(seed: int = 1, recordings: int = RECORDINGS) -> Comparison:
         title="Fu, Kong, Dong, Zhi & Gao (2016), section 4",
         setting=f"{recordings} recordings · 20 s at {DT_S:g} s · disturbance from 6 to 8 s · seed {seed}",
         methods=FILTERS,
-        rows=(*_quiet_rows(errors), *_peak_rows(errors), *_observability_rows(observed)),
+        rows=(*_quiet_rows(errors), *_peak_rows(errors), *_observability_rows(observed), *picture_rows(shown)),
         explanation="Standard: the unscented filter with the paper's numbers and the weights of eq. (9) as they are"
         " meant. As printed: with eqs. (11) to (13). Gate: measurements beyond a Mahalanobis distance (p = 0.001) are"
         " not used. Student-t: their noise is increased. All four have the same motion model, Q and R. Values are"
         " medians over the recordings; “worst” is the largest one. Position and velocity are those of y and z: eq. (4)"
         " does not observe the range x.",
-        figures=(*_curves(seed), _observability_figure(observed)),
+        figures=(*_curves(seed), _observability_figure(observed), picture_figure(seed, shown["Student-t"])),
         source="Y. Fu, X. Kong, X. Dong, J. Zhi, Y. Gao, Journal of Applied Optics 37(6), 860 (2016),"
         " doi 10.5768/JAO201637.0602004.",
     )

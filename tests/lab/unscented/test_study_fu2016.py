@@ -11,7 +11,7 @@ from lab.unscented.study_fu2016 import compare_fu2016
 
 @pytest.fixture(scope="module")
 def study():
-    return compare_fu2016(seed=3, recordings=1)
+    return compare_fu2016(seed=3, recordings=1, pictures=13)
 
 
 @pytest.mark.parametrize("disturbance", DISTURBANCES[1:])
