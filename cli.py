@@ -4,7 +4,18 @@ from __future__ import annotations
 
 import click
 
-from lab.commands import batch, calibrate, compare, maintenance, plan_and_simulate, results, run, study, track, view
+from lab.commands import (
+    batch,
+    calibrate,
+    compare,
+    maintenance,
+    plan_and_simulate,
+    results,
+    run,
+    study,
+    track_point,
+    view,
+)
 from lab.commands.common import Commands
 
 
@@ -27,7 +38,7 @@ for command in (
     results.check,
     results.report,
     study.study,
-    track.track,
+    track_point.track,
     compare.compare,
     view.view,
     calibrate.calibrate,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -17,13 +17,11 @@ from lab.report.plot.histogram import histogram
 from lab.report.plot.scales import padded_range
 from lab.report.plot.series import Band, Line, Shade, time_panel
 from lab.report.plot.svg import BLUE, GREEN, ORANGE, VERMILLION, dots, line_path
+from lab.single_target.outcome import PointOutcome
 from lab.single_target.recording import TABLE, PointRecording
 from lab.versions import versions
 from tracking.single_target.parameters import TargetStatus
 from tracking.single_target.point_tracker import PointEstimate
-
-if TYPE_CHECKING:
-    from lab.single_target.track_point import PointOutcome
 
 _MOST_DOTS = 6000
 _SENTENCES = {

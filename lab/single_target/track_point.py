@@ -15,14 +15,14 @@ from lab.files.run.fingerprints import fingerprint
 from lab.files.run.parameter_overrides import with_overrides
 from lab.files.text.atomic_write import atomic_folder
 from lab.files.text.json_text import write_json
-from lab.number_format import format_percent
-from lab.single_target.recording import DETECTORS, TABLE, PointRecording, Progress, read_recording
+from lab.single_target.outcome import PointOutcome
+from lab.single_target.recording import DETECTORS, TABLE, Progress, read_recording
 from lab.single_target.track_table import write_track
-from lab.single_target.verdict import PointStatistics, Reason, reasons_of, statistics_of, status_of
+from lab.single_target.verdict import reasons_of, statistics_of, status_of
 from lab.versions import versions
 from tracking.parameters import DetectParameters
 from tracking.single_target.parameters import BlobParameters, PointParameters, TargetStatus
-from tracking.single_target.point_tracker import PointEstimate, track_point
+from tracking.single_target.point_tracker import track_point
 
 SCHEMA = "beampose/track-point/1"
 OVERLAY = "overlay.mp4"
@@ -58,26 +58,6 @@ class PointOptions:
         track = made.track if self.start_px is None else dataclasses.replace(made.track, start_px=self.start_px)
         polarity: Any = self.detector if self.detector in ("dark", "bright") else made.blobs.polarity
         return dataclasses.replace(made, track=track, blobs=dataclasses.replace(made.blobs, polarity=polarity))
-
-
-@dataclass(frozen=True, slots=True)
-class PointOutcome:
-    """The outcome of one call."""
-
-    recording: PointRecording
-    track: tuple[PointEstimate, ...]
-    statistics: PointStatistics
-    reasons: tuple[Reason, ...]
-    verdict: str
-    exit_status: int
-    out: Path
-
-    def line(self) -> str:
-        """One line for the command line."""
-        s = self.statistics
-        first = f" ({self.reasons[0].what})" if self.reasons else ""
-        measured = format_percent(s.share(TargetStatus.MEASURED))
-        return f"{self.verdict} {self.recording.name}: {s.frames} frames, {measured} measured{first} -> {self.out}"
 
 
 def track_target(

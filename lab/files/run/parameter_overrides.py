@@ -4,21 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar, cast
 
 from lab.files.text.dataclass_fields import dataclass_from_yaml
 
-if TYPE_CHECKING:
-    from _typeshed import DataclassInstance
-
-T = TypeVar("T", bound="DataclassInstance")
+T = TypeVar("T")  # a parameter dataclass
 
 MAX_DOTS = 5  # of a name; the parameters have one level of blocks
 
 
 def with_overrides(parameters: T, overrides: Mapping[str, Any]) -> T:
     """Parameters with overrides, checked as in a file. Dotted names address inner blocks. Raises InputError."""
-    content = dataclasses.asdict(parameters)
+    content: dict[str, Any] = dataclasses.asdict(cast(Any, parameters))
     for name, value in overrides.items():
         *blocks, last = name.split(".") if name.count(".") <= MAX_DOTS else [name]
         inner: Any = content
