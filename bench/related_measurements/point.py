@@ -5,7 +5,7 @@
     python -m bench.related_measurements.point --video spider_video.mp4 --published spider_video_tracked.csv
 
 --flight: longitude and latitude of a flight at 1 Hz, as east and north in metres, with added noise and hidden
-intervals; the recorded positions are the reference. --video: two dark targets, A and B, each tracked on its own from
+intervals; the recorded positions are the reference. --video: two black targets, A and B, each tracked on its own from
 its first published position; the table shows the differences to the published positions (those of another program).
 """
 
@@ -84,7 +84,7 @@ def video(path: Path, published: Path, limit: int | None) -> None:
     for name, positions in table.groupby("id"):
         first = positions.iloc[0]
         options = PointOptions(
-            detector="dark",
+            detector="darker",
             start_px=(float(first.pos_x), float(first.pos_y)),
             limit=limit,
             overrides={"track.sigma_model_px": 1.0},

@@ -40,8 +40,8 @@ def _place(ctx: click.Context, parameter: click.Parameter, value: str | None) ->
     "--detector",
     default="spots",
     show_default=True,
-    type=click.Choice(["spots", "dark", "bright"]),
-    help="Points of light, or dark or bright targets. Not used for a table.",
+    type=click.Choice(["spots", "darker", "brighter"]),
+    help="Points of light, or larger targets, darker or brighter than what is around them. Not used for a table.",
 )
 @click.option("--start", metavar="U,V", callback=_place, help="Where the target is at the start, px; default: the"
               " brightest one.")  # fmt: skip

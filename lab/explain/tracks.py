@@ -8,7 +8,7 @@ POINT: Explanations = {
     "BP-N01": Explanation(
         "The target was never found",
         "No detection agrees with a steady motion over enough consecutive pictures. There is no position.",
-        "Look at the pictures. `--detector spots` is for points of light, `dark` and `bright` are for larger targets."
+        "Look at the pictures. `--detector spots` is for points of light, `darker` and `brighter` for larger targets."
         " Lower the detector's threshold with `--set`.",
     ),
     "BP-N02": Explanation(

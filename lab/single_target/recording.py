@@ -24,7 +24,7 @@ from tracking.parameters import DetectParameters
 from tracking.single_target.blobs import find_blobs
 from tracking.single_target.parameters import BlobParameters
 
-DETECTORS = ("spots", "dark", "bright")
+DETECTORS = ("spots", "darker", "brighter")
 TABLE = "table"  # in place of a detector, for a CSV file
 LARGEST_RATE_HZ = 1e6  # a larger rate in a video's header is not one
 

@@ -34,7 +34,7 @@ class PointSettings:
 
     track: PointParameters = field(default_factory=PointParameters)
     detect: DetectParameters = field(default_factory=DetectParameters)  # of the detector `spots`
-    blobs: BlobParameters = field(default_factory=BlobParameters)  # of the detectors `dark` and `bright`
+    blobs: BlobParameters = field(default_factory=BlobParameters)  # of the detectors `darker` and `brighter`
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +56,7 @@ class PointOptions:
             raise InputError(f"--detector: expected one of {', '.join(DETECTORS)}, got {self.detector!r}")
         made = with_overrides(PointSettings(), self.overrides)
         track = made.track if self.start_px is None else dataclasses.replace(made.track, start_px=self.start_px)
-        polarity: Any = self.detector if self.detector in ("dark", "bright") else made.blobs.polarity
+        polarity: Any = self.detector if self.detector in ("darker", "brighter") else made.blobs.polarity
         return dataclasses.replace(made, track=track, blobs=dataclasses.replace(made.blobs, polarity=polarity))
 
 

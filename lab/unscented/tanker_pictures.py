@@ -56,7 +56,7 @@ CLEAR, GUST = Difficulty(), Difficulty(false_lights=16, p_hidden=0.1, blur_px=3.
 
 
 def render(state: Array, difficulty: Difficulty, rng: np.random.Generator) -> NDArray[np.uint8]:
-    """The picture (h, w) of a tanker in a state (8,) of tracking/unscented/fu2016.py: sky, dark body, lamps, noise."""
+    """The picture (h, w) of a tanker in a state (8,) of tracking/unscented/fu2016.py: sky, body, lamps, noise."""
     w, h = SIZE_PX
     cloud = rng.standard_normal((8, 10)).astype(np.float32)
     sky: NDArray[np.float32] = np.empty((h, w), np.float32)

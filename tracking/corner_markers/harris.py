@@ -74,7 +74,7 @@ def harris_corners(picture: Picture, parameters: HarrisParameters | None = None)
 def _centroids(picture: Picture, u: np.ndarray, v: np.ndarray, half: int) -> tuple[Array, np.ndarray]:
     """Centroids (n, 2) of the light above the window's edge, and whether the middle is brighter than the edge.
 
-    The level is a high percentile of the edge: a lamp in front of a dark body has bright sky on one side only. Where
+    The level is a high percentile of the edge: a lamp in front of a darker body has bright sky on one side only. Where
     the middle is not brighter, the corner's own pixel is its place.
     """
     offsets = np.arange(-half, half + 1)

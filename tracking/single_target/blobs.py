@@ -1,4 +1,4 @@
-"""Dark or bright blobs of a grey picture: contrast to the local mean, connected pixels, centroid of the contrast."""
+"""Darker or bright blobs of a grey picture: contrast to the local mean, connected pixels, centroid of the contrast."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def find_blobs(picture: Picture, parameters: BlobParameters) -> Detections:
     grey = picture.astype(np.float32)
     side = 2 * (parameters.background_px // 2) + 1
     contrast = grey - cv2.blur(grey, (side, side), borderType=cv2.BORDER_REFLECT)
-    if parameters.polarity == "dark":
+    if parameters.polarity == "darker":
         contrast = -contrast
     sample = contrast[::_EVERY, ::_EVERY]
     sigma = max(float(_MAD_TO_SIGMA * np.median(np.abs(sample - np.median(sample)))), 0.3)  # 0.3 DN: rounding

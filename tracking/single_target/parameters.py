@@ -41,9 +41,9 @@ USUAL = PointParameters()
 
 @dataclass(frozen=True, slots=True)
 class BlobParameters:
-    """Detection of a dark or bright blob against its surroundings (blobs.py)."""
+    """Detection of a blob that is darker or brighter than its surroundings (blobs.py)."""
 
-    polarity: Literal["dark", "bright"] = "dark"
+    polarity: Literal["darker", "brighter"] = "darker"
     background_px: int = 61  # px: side of the square whose mean is the background; larger than the target
     close_px: int = 5  # px: gaps up to this width join parts of a blob; 0: none
     threshold_sigma: float = 8.0  # least contrast in sigmas of the background's noise ...

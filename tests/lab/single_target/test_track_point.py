@@ -33,7 +33,7 @@ def picture(k, ink=40, ground=150):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Pictures of a dark disc; two are missing, one shows nothing, one is damaged."""
+    """Pictures of a black disc; two are missing, one shows nothing, one is damaged."""
     out = tmp_path_factory.mktemp("pictures") / "disc"
     out.mkdir()
     for k in range(FRAMES):
@@ -55,8 +55,8 @@ def write_points(path, places, header="frame,u_px,v_px"):
     return path
 
 
-def test_a_dark_target_in_pictures_is_tracked_through_missing_pictures(folder, tmp_path):
-    outcome = track_target(folder, tmp_path / "out", PointOptions("dark", rate_hz=50.0, overlay=True))
+def test_a_black_target_in_pictures_is_tracked_through_missing_pictures(folder, tmp_path):
+    outcome = track_target(folder, tmp_path / "out", PointOptions("darker", rate_hz=50.0, overlay=True))
     rows = rows_of(tmp_path / "out")
     assert [int(r["frame"]) for r in rows] == list(range(FRAMES))
     words = [r["status"] for r in rows]
@@ -78,15 +78,15 @@ def test_a_dark_target_in_pictures_is_tracked_through_missing_pictures(folder, t
 
 
 def test_the_summary_has_what_other_results_have(folder, tmp_path):
-    track_target(folder, tmp_path / "out", PointOptions("dark"))
+    track_target(folder, tmp_path / "out", PointOptions("darker"))
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["counts"]["status"] == {"measured": 26, "predicted": 4, "lost": 0}
     assert summary["inputs"][0]["sha256"]
     assert summary["versions"]["numpy"]
     assert summary["verdict"]["status"] == "CHECK"
-    assert summary["parameters"]["blobs"]["polarity"] == "dark"
+    assert summary["parameters"]["blobs"]["polarity"] == "darker"
     assert summary["events"] == [{"frame": 0, "kind": "acquired"}]
-    track_target(folder, tmp_path / "out", PointOptions("dark"))  # replaces its own results
+    track_target(folder, tmp_path / "out", PointOptions("darker"))  # replaces its own results
 
 
 def test_a_plain_table_is_tracked_and_irregular_times_count(tmp_path):
@@ -112,7 +112,7 @@ def test_without_a_frame_rate_there_are_no_seconds(tmp_path):
 
 def test_a_target_that_is_not_there_is_a_failed_gate_without_positions(folder, tmp_path):
     done = CliRunner().invoke(
-        main, ["track", "point", str(folder), "--out", str(tmp_path / "out"), "--detector", "bright"]
+        main, ["track", "point", str(folder), "--out", str(tmp_path / "out"), "--detector", "brighter"]
     )
     assert done.exit_code == 4
     assert done.output.startswith("FAIL disc: 30 frames")

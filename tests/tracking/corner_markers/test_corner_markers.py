@@ -35,7 +35,7 @@ def test_each_lamp_has_a_corner_at_its_place():
     places, _ = marker_model().project(pose_of(STATE))
     corners = harris_corners(render(STATE, CLEAN, rng))
     distance = np.linalg.norm(corners.uv_px[None] - places[:, None], axis=-1).min(axis=1)
-    assert distance.max() < 0.5  # the wing tips: half of the background is dark
+    assert distance.max() < 0.5  # the wing tips: half of the background is darker
 
 
 def test_an_even_picture_has_no_corner():

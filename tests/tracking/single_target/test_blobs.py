@@ -19,10 +19,10 @@ def disc(centre, radius, size=(240, 180), ground=140.0, ink=40.0, noise=1.5, see
     return np.clip(np.round(grey), 0, 255).astype(np.uint8)
 
 
-@pytest.mark.parametrize("polarity", ["dark", "bright"])
+@pytest.mark.parametrize("polarity", ["darker", "brighter"])
 @pytest.mark.parametrize("centre", [(100.0, 80.0), (101.37, 77.81)])
 def test_the_centroid_of_a_disc_is_its_centre(polarity, centre):
-    ink = 40.0 if polarity == "dark" else 230.0
+    ink = 40.0 if polarity == "darker" else 230.0
     found = find_blobs(disc(centre, 9.0, ink=ink), BlobParameters(polarity=polarity))
     assert len(found) == 1
     np.testing.assert_allclose(found.uv_px[0], centre, atol=0.05)
