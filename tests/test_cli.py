@@ -178,7 +178,9 @@ def test_the_example_of_run_leaves_the_files_of_the_contract(desk):
     assert isinstance(json.loads((out / "summary.json").read_text()), dict)
 
 
-@pytest.mark.parametrize("name", ["check", "report", "detect", "doctor", "explain", "verify", "compare", "view"])
+@pytest.mark.parametrize(
+    "name", ["check", "report", "detect", "track point", "doctor", "explain", "verify", "compare", "view"]
+)
 def test_the_example_works(works, name):
     assert works(*example(name)).strip()
 
@@ -279,6 +281,9 @@ def test_simulate_lists_every_scenario(works):
         ("compare sample_runs --out r", "expected a second result folder or --reference"),
         ("compare sample_runs sample_runs --out r", "found no summary.json"),
         ("study nothing --out r", "'nothing' is not"),
+        ("track point nowhere --out r", "nowhere: expected a picture"),
+        ("track point sample_runs/README.md --out r", "sample_runs/README.md: expected a picture"),
+        ("track point sample_runs/huo2015/frames/left --out r --detector red", "'red' is not one of"),
         ("calibrate sreen x --out r", "No such command 'sreen'. Did you mean 'screen'?"),
         ("calibrate board chess:9x6 --out r", "chess"),
         ("calibrate screen nowhere.yaml --out r", "nowhere.yaml: expected a file, found none"),
