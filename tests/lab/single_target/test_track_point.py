@@ -122,6 +122,14 @@ def test_a_target_that_is_not_there_is_a_failed_gate_without_positions(folder, t
     assert "BP-N01" in (tmp_path / "out" / "report.html").read_text("utf-8")
 
 
+def test_too_few_measured_frames_fail_the_gate(folder, tmp_path):
+    outcome = track_target(folder, tmp_path / "out", PointOptions("darker", min_measured=0.9))
+    assert (outcome.verdict, outcome.exit_status) == ("FAIL", 4)
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["verdict"]["exit_status"] == 4
+    assert "FAIL" in (tmp_path / "out" / "report.html").read_text("utf-8")
+
+
 def test_two_similar_targets_are_reported_and_one_can_be_chosen(tmp_path):
     lines = [f"{k},{u},{v}" for k in range(20) for u, v in (path_of(k), path_of(k) + np.array([300, 0]))]
     table = tmp_path / "two.csv"

@@ -96,6 +96,16 @@ def test_only_false_lights_give_no_pose():
     assert match_markers(model, np.zeros((0, 2)), pose_of(STATE), rng) is None
 
 
+@pytest.mark.parametrize(("apart_m", "rows"), [(0.05, [0, 1, 2, 3, 4, UNMATCHED]), (0.02, None)])
+def test_a_corner_belongs_to_one_lamp_and_two_equal_choices_give_no_pose(apart_m, rows):
+    rng = np.random.default_rng(9)
+    places, _ = marker_model().project(pose_of(STATE))
+    sixth = MARKERS[-1:] + np.array([0.0, apart_m, 0.0])  # beside the fifth, and not lit
+    twin = replace(marker_model(), markers=np.concatenate([MARKERS, sixth]))
+    match = match_markers(twin, places, pose_of(STATE), rng)
+    assert (None if match is None else match.rows.tolist()) == rows
+
+
 def test_behind_the_camera_there_is_no_pose():
     rng = np.random.default_rng(6)
     behind = Pose(np.eye(3), np.array([-20.0, 0, 0]))
