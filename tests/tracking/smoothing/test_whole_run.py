@@ -18,7 +18,7 @@ FRAMES, GAP = 50, slice(26, 28)  # frames that the first estimate does not use
 
 
 @pytest.mark.parametrize("step", [26, 27])
-@pytest.mark.parametrize("seed", [1, 3, 4, 5])
+@pytest.mark.parametrize("seed", [0, 6, 11])
 def test_a_step_of_a_vehicle_at_rest_is_fitted_after_an_estimate_without_its_frames(seed, step):
     """The jerk is close to zero then: a linear Gauss-Newton step costs more than it gains, at any damping."""
     rng = np.random.default_rng(seed)
