@@ -146,13 +146,13 @@ class LabelConfirmation:
         use, _, cov = chosen_points(obs.frame, assigned, obs.calibration_cov)
         uncontrolled = use & ~well_controlled(model.numbers, h.now.R[0], h.now.t[0], use, cov)
         # A spot that the frame before showed as well confirms itself. A single spot that reappears where it may be
-        # anywhere waits for the next frame.
+        # anywhere waits for the next frame, as does one that alone determines a direction of the pose.
         new = unchecked & ~self._found_before
         single = np.count_nonzero(new) == 1 and (uncontrolled if spots >= MANY_SPOTS else uncontrolled.any()) & new
-        single = np.any(single) or np.any(decisive(model, h.now.R[0], h.now.t[0], use, cov) & new)
+        single = single | (decisive(model, h.now.R[0], h.now.t[0], use, cov) & new)
         far = largest_spot_sigma(model.numbers, R, t, P, used) > MAX_THREE_SPOT_SIGMA_PX
         too_few = sure < MIN_REDUNDANT_SPOTS and (uncontrolled.any() or far or doubtful.any())
-        if too_few or single:
+        if too_few or np.any(single):
             return self._postpone(h, least)
         return Confirmation(least, before.confirmed, before.spread)
 
