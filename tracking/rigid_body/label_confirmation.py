@@ -158,11 +158,12 @@ class LabelConfirmation:
 
 
 def decisive(model: SpotModel, R: Array, t: Array, use: Bools, cov: Array) -> Bools:
-    """(n,): used views (n,) whose spot alone determines a direction of the pose (R (3, 3), t (3,)).
+    """(n,): the used views (n,) of the one spot that alone determines a direction of the pose (R (3, 3), t (3,)).
 
     Such a spot may be a false point: one somewhere on its path fits the others as well, such as on the second screen
     beside any number of spots that lie on one line of the first. cov (n, 2, 2), px^2. The other spots must predict it
-    to MAX_CHECKING_SIGMA_PX. Source: ours.
+    to MAX_CHECKING_SIGMA_PX. Where that is so of several spots, as of all in a frame of four, they need each other, and
+    none is named. Source: ours.
     """
     _, J = project_all(model.numbers, R[None], t[None])
     J = J[0]
@@ -174,4 +175,4 @@ def decisive(model: SpotModel, R: Array, t: Array, use: Bools, cov: Array) -> Bo
         others = total - information[model.spot_of == model.spot_of[view]].sum(axis=0)
         predicted = J[view] @ np.linalg.solve(others, J[view].T)
         out[view] = np.linalg.eigvalsh(predicted)[-1] > MAX_CHECKING_SIGMA_PX**2
-    return out
+    return out & (distinct_spots(out, model.spot_of) == 1)
