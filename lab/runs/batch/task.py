@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import os
 import tempfile
+import time
 import traceback
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from lab.errors import BeamposeError, RunError
+from lab.files.output.folder_lock import FolderInUseError
 from lab.files.run.run_file import Run
 from lab.files.text.atomic_write import atomic_write_text
 from lab.runs.batch.result_folders import displayed
@@ -34,6 +36,8 @@ class Task:
     causal: bool = False
     force: bool = False  # process although results exist
     full_hash: bool = False
+    provenance: Mapping[str, Any] = field(default_factory=dict)  # added to summary.json
+    patience_s: float = 0.0  # for the end of another process that writes to the result folder
 
     @property
     def place(self) -> str:
@@ -68,12 +72,10 @@ def perform(task: Task) -> TaskOutcome:
         summary = None if task.force else finished_summary(task.out / task.results, value)
         if summary is not None:
             raise _AlreadyDone(summary)
-        return {"fingerprint": value}
+        return {**task.provenance, "fingerprint": value}
 
     try:
-        outcome = process_run(
-            task.folder, task.out / task.results, overrides=task.overrides, causal=task.causal, more=fingerprint
-        )
+        outcome = _processed(task, fingerprint)
         row, skipped = _row(task, outcome), False
     except _AlreadyDone as done:
         try:
@@ -89,6 +91,20 @@ def perform(task: Task) -> TaskOutcome:
     if skipped:
         _remove_error_file(task)
     return TaskOutcome(row, skipped)
+
+
+def _processed(task: Task, more: Callable[[Run], Mapping[str, Any]]) -> RunOutcome:
+    """Process the run; waits while another process writes to its result folder. Raises as `process_run`."""
+    until = time.monotonic() + task.patience_s
+    while True:
+        try:
+            return process_run(
+                task.folder, task.out / task.results, overrides=task.overrides, causal=task.causal, more=more
+            )
+        except FolderInUseError:
+            if time.monotonic() >= until:
+                raise
+            time.sleep(min(1.0, task.patience_s))
 
 
 def failed_row(task: Task, message: str, exit_status: int = RunError.exit_status) -> dict[str, Any]:
