@@ -17,7 +17,7 @@ from lab.runs.batch.result_folders import allotted, moved_runs
 from lab.runs.batch.resumption import fingerprint_of, finished_summary
 from lab.runs.batch.run_list import listed_runs
 from lab.runs.batch.table import BatchTable, locked, read_rows
-from lab.runs.batch.task import Task, TaskOutcome, failed_row, perform
+from lab.runs.batch.task import Task, TaskOutcome, concluded, failed_row, perform
 from lab.runs.batch.workers import performed
 from lab.runs.process import ready_run
 from tracking.parameters import TrackerParameters
@@ -66,12 +66,15 @@ def process_batch(
     *,
     lists: Sequence[str | os.PathLike[str]] = (),
     report: Callable[[str], None] = lambda line: None,
+    complain: Callable[[str], None] | None = None,
+    log: Callable[[str], None] = lambda line: None,
     progress: Callable[[int, int, int], None] = lambda done, processed, total: None,
 ) -> BatchOutcome:
     """Process runs into folders in `out`; a run that fails, in whatever way, does not stop the others.
 
-    runs, lists: as for `listed_runs`. report: called with one line per run. progress: called with the numbers of
-    runs that are done, that were processed (not skipped), and of all. With `jobs`, a script must call this under
+    runs, lists: as for `listed_runs`. report: called with one line per run. complain: in its place for runs that ended
+    with an error. log: called with the lines of each run's log when it ends. progress: called with the numbers of runs
+    that are done, that were processed (not skipped), and of all. With `jobs`, a script must call this under
     `if __name__ == "__main__"`, since the processes import it.
 
     Raises:
@@ -92,11 +95,14 @@ def process_batch(
     skipped = 0
     progress(0, 0, len(mine))
     with _outcomes(mine, out, options, report) as outcomes, _written(table) as add:
-        for task, outcome in outcomes:
+        for task, ended in outcomes:
+            outcome = concluded(task, ended)
             rows[task.place] = outcome.row
             skipped += outcome.skipped
             add(outcome)
-            report(_line(task, outcome))
+            for line in outcome.log:
+                log(f"{task.results}: {line}")
+            (complain if complain and outcome.row["status"] == "error" else report)(_line(task, outcome))
             progress(len(rows), len(rows) - skipped, len(mine))
     if options.parquet:
         with locked(out):
@@ -148,9 +154,7 @@ def _tasks(folders: Sequence[Path], out: Path, options: BatchOptions) -> list[Ta
                     resumable[place] = name
         names = allotted(out, folders, resumable)
     return [
-        Task(
-            folder, out, name, overrides, options.causal, options.force, options.full_hash, options.provenance or {}
-        )
+        Task(folder, out, name, overrides, options.causal, options.force, options.full_hash, options.provenance or {})
         for folder, name in zip(folders, names, strict=True)
     ]
 

@@ -23,8 +23,8 @@ from typing import TYPE_CHECKING, Any
 from lab.errors import InputError, RunError
 from lab.files.output.unfinished import removed_at_the_end
 from lab.files.text.atomic_write import atomic_write_text
-from lab.runs.batch.resumption import program_digest
 from lab.runs.batch.result_folders import displayed
+from lab.runs.batch.resumption import program_digest
 from lab.runs.batch.task import Task, TaskOutcome, failed_row, perform
 from lab.versions import versions
 
@@ -54,7 +54,9 @@ class _Shared:
         except (OSError, ValueError):
             seen = False
         if not seen:
-            return f"expected the folder {displayed(os.path.dirname(self.probe))} of this computer, found none or another"
+            return (
+                f"expected the folder {displayed(os.path.dirname(self.probe))} of this computer, found none or another"
+            )
         missing = [folder for folder in folders if not os.path.isdir(folder)]
         if missing:
             return f"expected the run folder {displayed(missing[0])}, found nothing there"
