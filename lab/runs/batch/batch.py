@@ -22,7 +22,8 @@ from lab.runs.batch.workers import performed
 from lab.runs.process import ready_run
 from tracking.parameters import TrackerParameters
 
-INDEX_SECONDS = 60.0  # index.html of a long batch is at most this old
+INDEX_SECONDS = 60.0  # between two versions of index.html in a long batch
+_INDEX_SHARE = 0.02  # of the time, at most, is spent on them: that of 2,000 runs takes several seconds
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,19 +114,21 @@ def process_batch(
 @contextlib.contextmanager
 def _written(table: BatchTable) -> Iterator[Callable[[TaskOutcome], None]]:
     """A function that puts an outcome into batch.csv; index.html is written now and then, and when the block ends."""
-    last = 0.0
+    due = time.monotonic() + INDEX_SECONDS
 
     def add(outcome: TaskOutcome) -> None:
-        nonlocal last
+        nonlocal due
         table.add(outcome.row, outcome.skipped)
         # After every run: if the program is killed, the rows so far are kept. Rows of skipped runs follow from their
         # results. If the disk is full, the next run may find space, and the end reports it.
         if not outcome.skipped:
-            now = time.monotonic()
-            index = now - last > INDEX_SECONDS
+            begun = time.monotonic()
+            index = begun > due
             with contextlib.suppress(InputError):
-                table.write(index=index and last > 0)
-            last = now if index else last
+                table.write(index=index)
+            if index:
+                now = time.monotonic()
+                due = now + max(INDEX_SECONDS, (now - begun) / _INDEX_SHARE)
 
     try:
         yield add
