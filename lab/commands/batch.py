@@ -13,7 +13,7 @@ from typing import Any
 import click
 from click.core import ParameterSource
 
-from lab.commands.common import ANY_PATH, FOLDER, complain, set_option
+from lab.commands.common import ANY_PATH, FOLDER, complain, set_option, show_line
 from lab.commands.run import causal_option
 from lab.commands.verbosity import check_verbosity, quiet_option, silenced
 from lab.errors import BeamposeError
@@ -129,7 +129,7 @@ def _printer() -> Callable[[str], None]:
         if gone:
             return
         try:
-            click.echo(text)
+            show_line(text)
         except BrokenPipeError:
             gone = True
             with contextlib.suppress(OSError, ValueError):  # what is left in the buffer must go somewhere
