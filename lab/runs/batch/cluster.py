@@ -168,7 +168,7 @@ class Cluster:
         for worker, answer in answers.items():
             if isinstance(answer, BaseException):
                 first = (str(answer).splitlines() or [""])[0]
-                answer = f"expected beampose as it is installed here, got {type(answer).__name__}: {first}"
+                answer = f"expected beampose as it is installed here; the worker reports {first}"
             if answer:
                 raise InputError(f"--dask {self._address}: worker {worker}: {answer}")
         threads = max(self._client.nthreads().values(), default=1)
