@@ -17,7 +17,7 @@ from lab.errors import CalibrationError, InputError, RunError
 from lab.explain.catalogue import EXPLANATIONS
 from lab.runs import process
 from lab.runs.batch import task as module
-from lab.runs.batch.batch import process_batch
+from lab.runs.batch.batch import BatchOptions, process_batch
 from lab.runs.batch.task import COLUMNS
 from lab.simulate.write import simulate
 from tests.lab.run_folders import write_run
@@ -226,3 +226,27 @@ def test_verbose_shows_the_log_of_each_run_and_excludes_quiet(tmp_path):
     log = (tmp_path / "out/a/run.log").read_text("utf-8").splitlines()
     assert done.stderr.splitlines() == [f"a: {line}" for line in log]
     assert CliRunner().invoke(main, ["batch", str(run), "--out", out, "-v", "-q"]).exit_code == 2
+
+
+def fields(value: object, place: str = "") -> dict[str, object]:
+    """All numbers and words of a JSON value, by their place in it."""
+    if isinstance(value, dict):
+        return {k: v for key, inner in value.items() for k, v in fields(inner, f"{place}.{key}").items()}
+    if isinstance(value, list):
+        return {k: v for i, inner in enumerate(value) for k, v in fields(inner, f"{place}.{i}").items()}
+    return {place: value}
+
+
+@pytest.mark.slow
+def test_a_summary_depends_on_the_number_of_processes_only_in_times_and_the_command(tmp_path):
+    runs = [points_run(tmp_path / "a"), points_run(tmp_path / "b", 6)]
+    found = []
+    for jobs in (None, 2):
+        options = BatchOptions(jobs=jobs, provenance={"command": f"--jobs {jobs}"})
+        process_batch(runs, tmp_path / f"out-{jobs}", options)
+        found.append(fields(json.loads((tmp_path / f"out-{jobs}/a/summary.json").read_text("utf-8"))))
+    differ = {place for place in found[0].keys() | found[1].keys() if found[0].get(place) != found[1].get(place)}
+    assert len(found[0]) > 100
+    assert ".command" in differ
+    times = {".command", ".rates.processed_frames_per_s", ".smoother.seconds"}
+    assert {place for place in differ if not place.startswith(".timings.")} <= times
