@@ -12,7 +12,7 @@ import lab.report
 
 CSS = Path(lab.report.__file__).parent / "templates"
 PAGES = {"run report": ("style.css", "sections.css"), "batch index": ("style.css", "index.css")}
-MEDIA = {"light": None, "dark": "prefers-color-scheme:dark", "print": "print"}
+MEDIA = {"screen": None, "second scheme": "prefers-color-scheme", "print": "print"}
 TEXT, GRAPHICS = 4.5, 3.0
 
 
