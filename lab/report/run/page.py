@@ -9,7 +9,7 @@ from markupsafe import Markup
 
 from lab.errors import InputError
 from lab.files.text.atomic_write import atomic_write_text
-from lab.report.failure import write_failure_report
+from lab.report.failure import Failure, files_beside, write_failure_report
 from lab.report.html import environment
 from lab.report.run import error_tables, figures, pose_curves, tables, trust, uncertainty
 from lab.report.run.blocks.model_fit import HEADS as MODEL_FIT_HEADS
@@ -38,7 +38,13 @@ def write_report(results: Path, run_folder: Path | None = None) -> Path:
         data = read_report_data(results, run_folder)
     except InputError as error:
         if results.is_dir():
-            write_failure_report(results, results.resolve().name, str(error), run_folder)
+            folder = "" if run_folder is None else str(run_folder)
+            write_failure_report(
+                path,
+                Failure(
+                    results.resolve().name, str(error), folder, error.code, error.exit_status, files=files_beside(path)
+                ),
+            )
         raise
     atomic_write_text(page(data, results), path)
     return path

@@ -439,6 +439,20 @@ class TestIndex:
         assert "no &lt;rig&gt; &amp; no run" in html
         assert "<rig>" not in html
 
+    def test_the_folder_of_all_runs_is_stated_once_and_a_column_without_a_value_is_left_out(self, tmp_path):
+        rows = [{**row, "run": f"/data/campaign/day/{row['name']}-x"} for row in self.ROWS]
+        rows[1]["message"] = "/data/campaign/day/b-error-x/run.yaml: expected a mapping"
+        html = write_index(rows, tmp_path).read_text(encoding="utf-8")
+        assert html.count("/data/campaign/day") == 1
+        assert "b-error-x/run.yaml: expected a mapping" in html
+        assert ">frames<" in html
+        assert ">time (s)<" not in html
+
+    def test_folders_without_a_common_one_are_shown_in_full(self, tmp_path):
+        rows = [{**row, "run": f"{place}/x"} for row, place in zip(self.ROWS, ("/a", "/b", "", "c"), strict=True)]
+        html = write_index(rows, tmp_path).read_text(encoding="utf-8")
+        assert all(f'<span class="path">{place}/x</span>' in html for place in ("/a", "/b", "", "c"))
+
     def test_the_index_of_an_empty_batch_says_so(self, tmp_path):
         assert "The batch has no runs." in write_index([], tmp_path).read_text(encoding="utf-8")
 
