@@ -144,7 +144,13 @@ def _marks(data: ResultData, index: int, near: int | None, tail: int) -> list[Sp
     if model is not None and near == index:
         pose, P = data.poses.world_from_body[index], data.poses.covariance[index]
         if np.isfinite(P).all():
-            tracks, covariance = uncertainty_tracks(model, pose, P, SIGMAS), pixel_covariance(model, pose, P)
+            rows = np.flatnonzero(~spots.measured[index])
+            tracks, covariance = np.full((len(spots.views), 0, 2), np.nan), np.full((len(spots.views), 2, 2), np.nan)
+            if len(rows):
+                hidden = model.subset(rows)
+                found = uncertainty_tracks(hidden, pose, P, SIGMAS)
+                tracks = np.full((len(spots.views), *found.shape[1:]), np.nan)
+                tracks[rows], covariance[rows] = found, pixel_covariance(hidden, pose, P)
     out = []
     for j, (_, spot) in enumerate(spots.views):
         code = int(spots.status[index, j])

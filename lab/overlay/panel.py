@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from typing import TypeAlias
+
 import cv2
 import numpy as np
 
 from geometry.arrays import Array
 from lab.overlay.canvas import INK, PAPER, SOFT, Canvas, Colour, Pixels, bgr, light, text_size, write
 from lab.overlay.frame_content import SIGMAS, CameraFrame, SpotMark
+from lab.pictures.picture_file import GreyPicture
 from lab.report.plot.image import grey_limits, stretched
 from lab.report.plot.svg import GREY, YELLOW
 from lab.report.run.tracks import SPOT_COLOURS
 from tracking.statuses import SpotStatus
+
+Limits: TypeAlias = tuple[float, float]  # grey values shown as black and as white
 
 BEAM, BOX, PREDICTED = (200, 170, 120), (215, 210, 205), bgr(YELLOW)
 _RING = 9.0  # units
@@ -33,12 +38,18 @@ def status_words(mark: SpotMark) -> str:
     return f"{mark.spot} {words}{doubt}"
 
 
-def grey_picture(camera: CameraFrame) -> Pixels | None:
-    """The picture with stretched contrast (h, w), or None without one."""
+def limits_of(picture: GreyPicture) -> Limits:
+    """The grey values of a picture that are shown as black and as white."""
+    return grey_limits(picture.astype(float))
+
+
+def grey_picture(camera: CameraFrame, limits: Limits | None = None) -> Pixels | None:
+    """The picture with stretched contrast (h, w), or None without one. limits: None: those of the picture."""
     if camera.picture is None:
         return None
-    values = camera.picture.astype(float)
-    return np.asarray(stretched(values, *grey_limits(values)), np.uint8)
+    low, high = limits_of(camera.picture) if limits is None else limits
+    shades = stretched(np.arange(np.iinfo(camera.picture.dtype).max + 1, dtype=float), low, high)
+    return np.asarray(shades[camera.picture], np.uint8)
 
 
 def panel(camera: CameraFrame, grey: Pixels | None, width: int, unit: float, size: float) -> Pixels:

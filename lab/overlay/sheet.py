@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import cv2
@@ -10,9 +10,11 @@ import numpy as np
 
 from lab.overlay.canvas import DESK, INK, PAPER, SOFT, Canvas, Colour, Pixels, bgr, light, text_size, write
 from lab.overlay.frame_content import CameraFrame, FrameContent
-from lab.overlay.panel import BEAM, BOX, PREDICTED, colour_of, cut, grey_picture, panel
+from lab.overlay.panel import BEAM, BOX, PREDICTED, Limits, colour_of, cut, grey_picture, limits_of, panel
 from lab.report.run.tracks import POSE_COLOURS
 from tracking.statuses import SpotStatus
+
+__all__ = ["Layout", "Limits", "limits_of", "png", "sheet"]
 
 _GAP = 10  # px between parts
 _LINE = 16.0  # px, height of a line of text
@@ -51,13 +53,28 @@ class Layout:
         return Layout(min(n, 2 if n < 5 else 3), tuple(widths), tuple(heights), unit, _LINE * unit)
 
 
-def sheet(content: FrameContent, layout: Layout, cuts: bool = True, legend: bool = True) -> Pixels:
-    """The picture (h, w, 3), 8 bit, BGR. cuts: with an enlarged part for each spot."""
-    blocks = [_camera_block(camera, layout.widths[i], layout, cuts) for i, camera in enumerate(content.cameras)]
+def sheet(
+    content: FrameContent,
+    layout: Layout,
+    cuts: bool = True,
+    limits: Mapping[str, Limits] | None = None,
+    same_size: str = "",
+) -> Pixels:
+    """The picture (h, w, 3), 8 bit, BGR.
+
+    cuts: with an enlarged part for each spot. limits: the grey values shown as black and white, by camera; those of
+    each picture where they are not given. same_size: for a video: the longest text of a pose; head and legend then have
+    the same size in all frames.
+    """
+    known = {} if limits is None else limits
+    blocks = [
+        _camera_block(camera, layout.widths[i], layout, cuts, known.get(camera.camera))
+        for i, camera in enumerate(content.cameras)
+    ]
     rows = [blocks[k : k + layout.columns] for k in range(0, len(blocks), layout.columns)]
     wide = max(sum(b.shape[1] + _GAP for b in row) for row in rows) + _GAP
     wide = max(wide, round(40 * layout.line))
-    parts = [_head(content, wide, layout)]
+    parts = [_head(content, wide, layout, same_size)]
     for row in rows:
         tall = max(b.shape[0] for b in row)
         strip: Pixels = np.full((tall + _GAP, wide, 3), DESK, np.uint8)
@@ -66,19 +83,20 @@ def sheet(content: FrameContent, layout: Layout, cuts: bool = True, legend: bool
             strip[: b.shape[0], x : x + b.shape[1]] = b
             x += b.shape[1] + _GAP
         parts.append(strip)
-    if legend:
-        parts.append(_legend(content, wide, layout))
+    parts.append(_legend(content, wide, layout, bool(same_size)))
     return np.concatenate(parts)
 
 
-def _head(content: FrameContent, wide: int, layout: Layout) -> Pixels:
-    """Frame number, time, name of the run and pose."""
+def _head(content: FrameContent, wide: int, layout: Layout, longest: str) -> Pixels:
+    """Frame number, time, name of the run and pose, with room for the longest text of a pose."""
     line = layout.line
     when = f"   t = {content.t_s:.4f} s" if np.isfinite(content.t_s) else ""
     status = content.pose_status
     state = "no row in the results" if status is None else str(status)
-    lines = _wrapped(content.pose_words, wide - 4 * _GAP - text_size(state + "   ", line)[0], line)
-    out: Pixels = np.full((round((2.0 + 1.35 * len(lines)) * line) + _GAP, wide, 3), DESK, np.uint8)
+    room = wide - 4 * _GAP - text_size("predicted   ", line, bold=True)[0]
+    lines = _wrapped(content.pose_words, room, line)
+    rows = len(_wrapped(longest, room, line)) if longest else len(lines)
+    out: Pixels = np.full((round((2.0 + 1.35 * rows) * line) + _GAP, wide, 3), DESK, np.uint8)
     write(out, (_GAP, 1.5 * line), f"frame {content.frame}{when}   {content.name}", 1.15 * line, INK, bold=False)
     colour = SOFT if status is None else light(bgr(POSE_COLOURS[status]))
     write(out, (_GAP, 2.9 * line), state, line, colour, bold=True)
@@ -100,10 +118,10 @@ def _wrapped(words: str, wide: int, line: float) -> list[str]:
     return lines
 
 
-def _camera_block(camera: CameraFrame, wide: int, layout: Layout, cuts: bool) -> Pixels:
+def _camera_block(camera: CameraFrame, wide: int, layout: Layout, cuts: bool, limits: Limits | None) -> Pixels:
     """A camera's caption, picture and enlarged spots."""
     line, unit = layout.line, layout.unit
-    grey = grey_picture(camera)
+    grey = grey_picture(camera, limits)
     measured = sum(m.status is not None and m.status.measured for m in camera.marks)
     n = len(camera.detections)
     words = f"{camera.camera}: {measured} of {len(camera.marks)} spots measured, {n} detection{'' if n == 1 else 's'}"
@@ -124,23 +142,23 @@ def _camera_block(camera: CameraFrame, wide: int, layout: Layout, cuts: bool) ->
     return np.concatenate(parts)
 
 
-def _legend(content: FrameContent, wide: int, layout: Layout) -> Pixels:
-    """What the marks mean; only those that are drawn, and all that every frame has."""
+def _legend(content: FrameContent, wide: int, layout: Layout, whole: bool) -> Pixels:
+    """What the marks mean. whole: also those that are not drawn in this frame."""
     line, unit = layout.line, layout.unit
     marks = [m for c in content.cameras for m in c.marks]
-    present = {m.status for m in marks if m.status is not None}
+    present = set(SpotStatus) if whole else {m.status for m in marks if m.status is not None}
     out = _Flow(wide, line, unit)
     out.add("detection", lambda c, at: c.box(at, 4.5, BOX))
     for status in SpotStatus:
         if status in present and status != SpotStatus.LOST:
             dash = 0.0 if status.measured else 4.0
             out.add(str(status).replace("_", " "), _ring_of(colour_of(status), dash))
-    if any(np.isfinite(m.predicted_px).all() for m in marks):
+    if whole or any(np.isfinite(m.predicted_px).all() for m in marks):
         out.add("predicted; ellipse: 3 sigma of its predictions nearby", _predicted)
-    if any(len(m.track_px) for m in marks):
+    if whole or any(len(m.track_px) for m in marks):
         out.add("where the spot can lie (3 sigma of the pose)", _line_of(SOFT, 2.0, 0.0))
-    if any(len(m.beam_px) for m in marks):
-        moved = content.beams_of_frame is not None and content.beams_of_frame != content.frame
+    if whole or any(len(m.beam_px) for m in marks):
+        moved = not whole and content.beams_of_frame is not None and content.beams_of_frame != content.frame
         whose = f", with the pose of frame {content.beams_of_frame}" if moved else ""
         out.add(f"image of its beam, for a screen nearer or farther{whose}", _line_of(BEAM, 1.0, 7.0))
     return out.image()
