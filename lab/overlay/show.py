@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,6 +19,9 @@ from lab.overlay.frame_content import FrameContent, frame_content
 from lab.overlay.result_data import ResultData, read_result_data
 from lab.overlay.sheet import Layout, png, sheet
 from lab.runs.frames.frames import Picture, pictures_at
+
+if TYPE_CHECKING:
+    from lab.runs.frames.pipeline import FrameRecord, Pipeline
 
 Progress = Callable[..., None]  # frames done, frames in all, stage
 PICTURE_SUFFIX = ".png"
@@ -96,6 +100,7 @@ def _of_run(folder: Path, frame: int, camera: str | None, progress: Progress | N
     from lab.runs.frames.pipeline import Pipeline
     from lab.runs.process import ready_run
     from lab.runs.tables import TableWriter
+    from lab.runs.verdict.frame_checks import FrameChecks
 
     run = ready_run(folder)
     reader = open_frames(run)
@@ -108,19 +113,26 @@ def _of_run(folder: Path, frame: int, camera: str | None, progress: Progress | N
     with tempfile.TemporaryDirectory(prefix="beampose-show-") as made:
         work = Path(made)
         with TableWriter(work, run.rig, run.covariance is not None) as tables:
-            for done, record in enumerate(pipeline.records(), start=1):
+            checks = FrameChecks(run.rig, run.covariance)
+            for record, _ in checks.passed(_up_to(frame, pipeline, progress)):
                 tables.write(record, None)
-                if progress is not None:
-                    progress(done, frame - reader.first + 1, "processing")
-                if record.frame == frame:
-                    reached = True
-                    break
+                reached = record.frame == frame
         if not reached:
             raise InputError(f"--frame {frame}: the recording ends before it")
         data = _with_run(read_result_data(work, folder), run)
     notes = (f"processed up to frame {frame} without smoothing; for more pictures show the results of `beampose run`",)
     shown = _shown(data, frame, camera)
     return replace(shown, notes=(*shown.notes, *notes))
+
+
+def _up_to(frame: int, pipeline: Pipeline, progress: Progress | None) -> Iterator[tuple[FrameRecord, None]]:
+    """The records of the causal pass up to a frame."""
+    for done, record in enumerate(pipeline.records(), start=1):
+        if progress is not None:
+            progress(done, done + frame - record.frame, "processing")
+        yield record, None
+        if record.frame >= frame:
+            return
 
 
 def _with_run(data: ResultData, run: Run) -> ResultData:
