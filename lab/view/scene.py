@@ -65,22 +65,28 @@ class View:
         return [t for t in things if isinstance(t, Ray | Marker)]
 
 
-def view_of(content: Content, index: int | None, sigma_scale: float | None = None) -> View:
+def view_of(
+    content: Content,
+    index: int | None,
+    sigma_scale: float | None = None,
+    most_points: int = MOST_POINTS,
+    most_ellipsoids: int = MOST_ELLIPSOIDS,
+) -> View:
     """The scene of a content. index: of the pose whose spots size screens without a size.
 
-    sigma_scale: None: a round number that makes the ellipsoids visible.
+    sigma_scale: None: a round number that makes the ellipsoids visible. most_points: of the trajectory.
     """
     pose = None if index is None else content.world_from_body[index]
     fixed: list[SceneObject] = [t for t in rig_things(content.rig, pose) if not isinstance(t, Ray | Marker)]
     known = np.flatnonzero(content.known)
     if len(known) > 1:
-        fixed.append(Trail("trajectory", _trajectory(content), PURPLE))
+        fixed.append(Trail("trajectory", _trajectory(content, most_points), PURPLE))
     reach = frustum_length(fixed)
     points = np.concatenate([outline(t, reach) for t in fixed])
     extent = float(np.ptp(points[np.isfinite(points).all(axis=1)], axis=0).max())
     with_sigma = known[np.isfinite(content.position_covariance[known]).all(axis=(1, 2))]
     scale = _scale(content, with_sigma, extent) if sigma_scale is None else sigma_scale
-    ellipsoids = [ellipsoid(content, int(i), scale) for i in thinned(with_sigma, MOST_ELLIPSOIDS)]
+    ellipsoids = [ellipsoid(content, int(i), scale) for i in thinned(with_sigma, most_ellipsoids)]
     drawn = [e for e in ellipsoids if np.linalg.norm(e.axes, axis=0).max() <= _LARGEST * extent]
     return View(content, fixed, drawn, scale, len(ellipsoids) - len(drawn), reach, extent)
 
@@ -99,9 +105,9 @@ def thinned(indices: Ints, most: int) -> Ints:
     return indices[np.unique(np.linspace(0, len(indices) - 1, most).round().astype(np.int64))]
 
 
-def _trajectory(content: Content) -> Array:
-    """Positions (n, 3) at even steps of the frames, with nan where the pose is unknown."""
-    return content.world_from_body.translation[thinned(np.arange(len(content.frames)), MOST_POINTS)]
+def _trajectory(content: Content, most: int) -> Array:
+    """Positions (n, 3), at most so many, at even steps of the frames, with nan where the pose is unknown."""
+    return content.world_from_body.translation[thinned(np.arange(len(content.frames)), most)]
 
 
 def _scale(content: Content, indices: Ints, extent_m: float) -> float:
