@@ -25,6 +25,7 @@ MOST_ELLIPSOIDS = 60
 MOST_POINTS = 1500  # of the trajectory
 _LARGEST = 0.2  # largest semi-axis that is drawn, in shares of the scene's extent: larger ones would cover it
 _SHARE = 0.02  # of the scene's extent: the size at which a typical ellipsoid is drawn
+_SIZING = 200  # poses whose spots decide the size of a screen that states none
 _TURN = np.linspace(0, 2 * np.pi, 33)
 
 
@@ -77,8 +78,9 @@ def view_of(
     sigma_scale: None: a round number that makes the ellipsoids visible. most_points: of the trajectory.
     """
     pose = None if index is None else content.world_from_body[index]
-    fixed: list[SceneObject] = [t for t in rig_things(content.rig, pose) if not isinstance(t, Ray | Marker)]
     known = np.flatnonzero(content.known)
+    others = content.world_from_body[thinned(known, _SIZING)] if len(known) > 1 else None
+    fixed: list[SceneObject] = [t for t in rig_things(content.rig, pose, others) if not isinstance(t, Ray | Marker)]
     if len(known) > 1:
         fixed.append(Trail("trajectory", _trajectory(content, most_points), PURPLE))
     reach = frustum_length(fixed)

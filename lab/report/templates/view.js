@@ -19,7 +19,7 @@
   const shown = document.getElementById("scene-moment"), moments = data.moments;
   const box = canvas.closest("[data-scene]"); // in a report: the drawings are shown until the scene is
   if (box) box.classList.add("live-scene");
-  let turn = -0.6, tilt = 0.5, zoom = document.querySelector("[data-scene]") ? 0.68 : 1, playing = null;
+  let turn = -0.6, tilt = 0.5, zoom = document.querySelector("[data-scene]") ? 0.8 : 1, playing = null;
 
   // The box of the scene: its centre and half its diagonal.
   const low = [1e9, 1e9, 1e9], high = [-1e9, -1e9, -1e9];

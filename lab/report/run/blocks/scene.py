@@ -16,7 +16,7 @@ from lab.view.content import content_of_poses
 from lab.view.page import as_script, scene_data
 from lab.view.scene import view_of
 
-_MOMENTS, _POINTS = 60, 240  # of the playback and of the trajectory: together 15 kB
+_MOMENTS, _POINTS = 40, 160  # of the playback and of the trajectory: together 9 kB
 _DIGITS = 3  # of coordinates in m
 
 
