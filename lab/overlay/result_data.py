@@ -130,7 +130,7 @@ def _detections(path: Path) -> dict[str, CameraTable]:
     if not path.is_file():
         return {}
     table = read_result_table(path, ("frame", "camera", "u_px", "v_px"))
-    frame, camera, uv = table.numbers["frame"].astype(np.int64), table.words["camera"], table.stack("u_px", "v_px")
+    frame, camera, uv = table.whole("frame"), table.words["camera"], table.stack("u_px", "v_px")
     out = {}
     for code, name in enumerate(camera.words):
         rows = np.flatnonzero(camera.codes == code)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import secrets
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
@@ -70,13 +69,15 @@ def write_video(
             if writer is None:
                 notes.append(f"this OpenCV cannot write {codec} videos ({suffix})")
                 continue
-            with contextlib.closing(images):
+            try:
                 writer.write(one)
                 for done, image in enumerate(images, start=2):
                     writer.write(image)
                     if progress is not None:
                         progress(done, len(indices), "video")
-            writer.release()
+            finally:
+                writer.release()
+                images.close()  # with its files and threads
             if not part.is_file() or not part.stat().st_size:
                 raise RunError(f"{path}: the video could not be written; is the disk full?")
             part.replace(path)
