@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import unicodedata
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -17,6 +18,7 @@ Colour: TypeAlias = tuple[int, int, int]  # BGR
 
 PAPER, DESK, INK, SOFT, BLACK = (28, 24, 22), (14, 12, 11), (240, 237, 234), (182, 174, 168), (0, 0, 0)
 FONT = cv2.FONT_HERSHEY_SIMPLEX
+_DRAWS_UNICODE = int(cv2.__version__.split(".")[0]) >= 5
 _SHIFT = 4  # binary digits of a pixel's fraction
 _FAR = 4000.0  # px outside the canvas beyond which nothing is drawn
 _TURN = np.linspace(0, 2 * np.pi, 73)
@@ -34,8 +36,10 @@ def light(colour: Colour) -> Colour:
 
 
 def plain(words: str) -> str:
-    """Words that every version of OpenCV can draw: other characters become `?`."""
-    return "".join(c if " " <= c <= "~" else "?" for c in words)
+    """Words that this OpenCV can draw: before version 5 letters lose their accents, and others become `?`."""
+    if not _DRAWS_UNICODE:
+        words = "".join(c for c in unicodedata.normalize("NFKD", words) if not unicodedata.combining(c))
+    return "".join(c if " " <= c <= "~" or (_DRAWS_UNICODE and c.isprintable()) else "?" for c in words)
 
 
 def text_size(words: str, size: float, bold: bool = False) -> tuple[int, int]:

@@ -13,7 +13,7 @@ from click.testing import CliRunner
 from cli import main
 from lab.errors import InputError, RunError
 from lab.files.run.results import read_poses
-from lab.overlay import video
+from lab.overlay import canvas, video
 from lab.overlay.canvas import bgr
 from lab.overlay.frame_content import frame_content, pose_words
 from lab.overlay.result_data import read_result_data
@@ -220,3 +220,10 @@ def test_frames_that_the_results_do_not_have_and_options_without_a_video_are_ref
     done = CliRunner().invoke(main, ["report", str(fake.results), "--every", "2"], standalone_mode=True)
     assert done.exit_code == 2
     assert "add --video" in done.output
+
+
+def test_names_are_drawn_as_far_as_this_opencv_can(monkeypatch):
+    monkeypatch.setattr(canvas, "_DRAWS_UNICODE", False)
+    assert canvas.plain("línks ü 屏 1\n") == "links u ? 1?"
+    monkeypatch.setattr(canvas, "_DRAWS_UNICODE", True)
+    assert canvas.plain("línks ü 1\n") == "línks ü 1?"
