@@ -135,7 +135,7 @@ def test_markup_in_names_does_not_end_the_data_block(fake, tmp_path):
     spots = results / "spots.csv"
     spots.write_text(spots.read_text().replace(",left,1,", ",left,</script>1,"))
     html = write_report(results).read_text(encoding="utf-8")
-    assert html.count("</script>") == 2
+    assert html.count("</script>") == 4  # two blocks of data, two programs
     assert json.loads(re.search(r'id="zoom-data">(.*?)</script>', html, flags=re.S).group(1))["rows"]
 
 
