@@ -12,7 +12,7 @@ from typing import Any
 
 import click
 
-from lab.commands.common import ANY_PATH, FOLDER, set_option
+from lab.commands.common import ANY_PATH, FOLDER, set_option, show_line
 from lab.commands.run import causal_option
 from lab.errors import BeamposeError
 
@@ -87,7 +87,7 @@ def _printer() -> Callable[[str], None]:
         if gone:
             return
         try:
-            click.echo(text)
+            show_line(text)
         except BrokenPipeError:
             gone = True
             with contextlib.suppress(OSError, ValueError):  # what is left in the buffer must go somewhere

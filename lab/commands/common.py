@@ -38,6 +38,11 @@ def show_line(text: str) -> None:
     click.echo(printable(text))
 
 
+def show_note(text: str) -> None:
+    """Prints a note on stderr, printable as the lines on stdout."""
+    click.echo(printable(f"beampose: {text}"), err=True)
+
+
 class _StderrHandler(logging.Handler):
     """Shows log messages of the libraries below, such as that they compile, as lines on stderr."""
 
