@@ -141,6 +141,28 @@ def test_the_commands_are_those_of_the_contract():
     assert {name for name in COMMANDS if name.startswith("calibrate ")} == {f"calibrate {step}" for step in steps}
 
 
+@pytest.mark.parametrize("width", [80, 100])
+@pytest.mark.parametrize("group", ["", "calibrate"])
+def test_the_list_of_commands_cuts_no_description(group, width):
+    commands = COMMANDS["calibrate"].commands if group else main.commands
+    done = CliRunner().invoke(main, [*group.split(), "--help"], terminal_width=width, prog_name="beampose")
+    shown = " ".join(done.stdout.partition("Commands:")[2].split())
+    assert "..." not in shown
+    for command in commands.values():
+        assert " ".join(command.help.split("\n\n")[0].split()).partition(". ")[0].rstrip(".") in shown
+    assert max(map(len, done.stdout.splitlines())) <= width
+
+
+@pytest.mark.parametrize("name", [b"caf\xe9", b"\x1b[2J"])
+def test_names_of_folders_that_no_terminal_can_show_are_printed_with_question_marks(name, tmp_path):
+    folder = os.fsdecode(os.fsencode(tmp_path) + b"/" + name)
+    for arguments in (("schema", "rig", "--out", folder), ("batch", "nothing", "--out", folder)):
+        done = typed(*arguments)
+        assert done.exception is None or isinstance(done.exception, SystemExit)
+        assert f"{tmp_path}/{name[:3].decode() if name[:1] == b'c' else ''}?" in done.stdout
+        assert "\x1b" not in done.stdout
+
+
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_command_has_a_description_and_an_example(name):
     assert len(COMMANDS[name].get_short_help_str(200)) > 20
