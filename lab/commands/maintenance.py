@@ -8,6 +8,7 @@ from pathlib import Path
 
 import click
 
+from lab.commands import completion
 from lab.commands.common import ANY_PATH, FOLDER, NumberRange, progress_bar, show_line
 
 
@@ -35,7 +36,7 @@ def doctor(files: tuple[Path, ...], out: Path) -> None:
 
 
 @click.command()
-@click.argument("codes", metavar="[CODE]...", nargs=-1)
+@click.argument("codes", metavar="[CODE]...", nargs=-1, shell_complete=completion.codes)
 def explain(codes: tuple[str, ...]) -> None:
     """Explain the code of a warning, a verdict reason, a finding or an error; without a code, list all codes.
 
