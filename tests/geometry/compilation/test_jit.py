@@ -158,12 +158,11 @@ def test_a_truncated_cache_file_is_discarded_and_compiled_again(program, first_t
         for kept_bytes in (0, 20):
             files = sorted(folder.rglob(kind))
             assert files
-            assert all(file.stat().st_size > 20 for file in files)  # whole, also after the previous damage
             for file in files:
                 file.write_bytes(file.read_bytes()[:kept_bytes])
             again = found(started(copy))
             assert (again["value"], "twice_grown" in again["compiled"]) == (20.0, True)
-    assert found(started(copy))["compiled"] == []
+            assert found(started(copy))["compiled"] == []
 
 
 def test_without_compilation_the_same_functions_run_as_plain_python():
