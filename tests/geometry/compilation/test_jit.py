@@ -174,7 +174,9 @@ from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from tests.geometry.scenes import paper_rig
 assert solve(np.diag([2.0, 4.0]), np.ones((2, 1)))[0].ravel().tolist() == [0.5, 0.25]
-print(SpotModel.of(paper_rig()).project(Pose.identity())[0].round(3).tolist())
+model = SpotModel.of(paper_rig())
+assert model.numbers[0].point.tolist() == model.point[0].tolist()  # as the trackers' loops read them
+print(model.project(Pose.identity())[0].round(3).tolist())
 """
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "NUMBA_DISABLE_JIT": "1"}
     done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, timeout=60)
