@@ -6,6 +6,7 @@ from pathlib import Path
 
 import click
 
+from lab.commands import completion
 from lab.commands.common import ANY_PATH, FOLDER, Commands, NumberRange, conclude, progress_bar, show_line
 
 
@@ -200,7 +201,13 @@ def convert(source: Path, destination: Path, origin: str | None, target: str | N
 
 @calibrate.command("simulate")
 @click.option("--out", required=True, type=FOLDER, help="The folder to write; it must not exist yet.")
-@click.option("--rig", default="fan", show_default=True, help="One of lab/simulate/rigs.py.")
+@click.option(
+    "--rig",
+    default="fan",
+    show_default=True,
+    shell_complete=completion.rigs,
+    help="One of lab/simulate/rigs.py.",
+)
 @click.option(
     "--seed", default=0, show_default=True, type=click.IntRange(min=0), help="The same seed gives the same bytes."
 )
