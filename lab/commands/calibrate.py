@@ -6,7 +6,8 @@ from pathlib import Path
 
 import click
 
-from lab.commands.common import ANY_PATH, FOLDER, Commands, NumberRange, conclude, progress_bar
+from lab.commands import completion
+from lab.commands.common import ANY_PATH, FOLDER, Commands, NumberRange, conclude, progress_bar, show_line
 
 
 @click.group(cls=Commands)
@@ -200,7 +201,13 @@ def convert(source: Path, destination: Path, origin: str | None, target: str | N
 
 @calibrate.command("simulate")
 @click.option("--out", required=True, type=FOLDER, help="The folder to write; it must not exist yet.")
-@click.option("--rig", default="fan", show_default=True, help="One of lab/simulate/rigs.py.")
+@click.option(
+    "--rig",
+    default="fan",
+    show_default=True,
+    shell_complete=completion.rigs,
+    help="One of lab/simulate/rigs.py.",
+)
 @click.option(
     "--seed", default=0, show_default=True, type=click.IntRange(min=0), help="The same seed gives the same bytes."
 )
@@ -218,4 +225,4 @@ def simulate_campaign(out: Path, rig: str, seed: int, positions: int, photos: bo
     from lab.simulate.campaign_files import simulate_calibration
 
     folder = simulate_calibration(out, seed=seed, rig=rig, positions=positions, photos=photos)
-    click.echo(f"project: {folder / 'calibration.yaml'}")
+    show_line(f"project: {folder / 'calibration.yaml'}")

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import click
 
-from lab.commands.common import ANY_PATH, FOLDER, progress_bar
+from lab.commands import completion
+from lab.commands.common import ANY_PATH, FOLDER, NumberRange, progress_bar, show_line
 
 
 @click.command()
@@ -30,12 +31,12 @@ def doctor(files: tuple[Path, ...], out: Path) -> None:
 
     lines = examine(files, out)
     for line in lines:
-        click.echo(str(line))
+        show_line(str(line))
     sys.exit(exit_status(lines))
 
 
 @click.command()
-@click.argument("codes", metavar="[CODE]...", nargs=-1)
+@click.argument("codes", metavar="[CODE]...", nargs=-1, shell_complete=completion.codes)
 def explain(codes: tuple[str, ...]) -> None:
     """Explain the code of a warning, a verdict reason, a finding or an error; without a code, list all codes.
 
@@ -48,7 +49,7 @@ def explain(codes: tuple[str, ...]) -> None:
     from lab.explain import catalogue
 
     texts = [catalogue.explain(code) for code in codes] if codes else catalogue.listed()
-    click.echo(("\n\n" if codes else "\n").join(texts))
+    show_line(("\n\n" if codes else "\n").join(texts))
 
 
 _FILES = ("rig", "run", "camera", "board", "calibration", "screens")
@@ -86,9 +87,9 @@ def _asked(given: dict[str, float | None]) -> dict[str, float]:
     "--cameras", type=click.IntRange(1, 16), help="Number of cameras in all; default: one per screen, 2 or more."
 )
 @click.option("--beams", type=click.IntRange(1, 12), help="Number of laser beams; default 3, of one or two spots each.")
-@click.option("--rate", type=click.FloatRange(0.1, 1e6), help="Pictures per second; default 100.")
+@click.option("--rate", type=NumberRange(0.1, 1e6), help="Pictures per second; default 100.")
 @click.option(
-    "--distance", default=2.5, show_default=True, type=click.FloatRange(0.2, 100), help="From vehicle to screens, m."
+    "--distance", default=2.5, show_default=True, type=NumberRange(0.2, 100), help="From vehicle to screens, m."
 )
 @click.option("--picture", default="1280x1024", show_default=True, help="Picture size, WIDTHxHEIGHT in pixels.")
 def init(
@@ -117,9 +118,9 @@ def init(
         int(values["cameras"]), int(values["screens"]), int(values["beams"]), distance, _picture_size(picture)
     )
     started = start(folder, layout, values["rate"])
-    click.echo(f"rig: {started.rig}")
-    click.echo(f"run: {started.run}")
-    click.echo(f"Next: beampose check {folder}; beampose run {folder} --out {folder / 'results'}")
+    show_line(f"rig: {started.rig}")
+    show_line(f"run: {started.run}")
+    show_line(f"Next: beampose check {folder}; beampose run {folder} --out {folder / 'results'}")
 
 
 def _picture_size(text: str) -> tuple[int, int]:
@@ -149,7 +150,7 @@ def verify(results: Path, run_folder: Path | None) -> None:
     with progress_bar(results.name) as progress:
         verification = verify_results(results, run_folder, progress)
     for line in verification.lines():
-        click.echo(line)
+        show_line(line)
     sys.exit(verification.exit_status)
 
 
@@ -174,4 +175,4 @@ def schema(name: str | None, out: Path | None) -> None:
         click.echo(as_text(str(name)), nl=False)
         return
     for path in write([name] if name else list(_FILES), out):
-        click.echo(f"schema: {path}")
+        show_line(f"schema: {path}")

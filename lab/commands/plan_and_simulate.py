@@ -8,11 +8,12 @@ from typing import Any
 
 import click
 
+from lab.commands import completion
 from lab.commands.common import ANY_PATH, FOLDER, NumberRange, conclude, progress_bar, read_settings, show_line
 
 
 @click.command()
-@click.argument("scenario")
+@click.argument("scenario", shell_complete=completion.scenarios)
 @click.option("--out", type=FOLDER, help="The run folder to write; it must not exist yet.")
 @click.option(
     "--seed", default=0, show_default=True, type=click.IntRange(min=0), help="The same seed gives the same bytes."
@@ -59,8 +60,8 @@ def simulate(
 
     if scenario == "list":
         for listed in SCENARIOS.values():
-            click.echo(f"{listed.name:24s}{listed.summary}")
-        click.echo(f"{'lights:':24s}{', '.join(LIGHTS)}")
+            show_line(f"{listed.name:24s}{listed.summary}")
+        show_line(f"{'lights:':24s}{', '.join(LIGHTS)}")
         return
     if out is None:
         raise click.UsageError("Missing option '--out'.")

@@ -13,8 +13,11 @@ T = TypeVar("T")  # a parameter dataclass
 MAX_DOTS = 5  # of a name; the parameters have one level of blocks
 
 
-def with_overrides(parameters: T, overrides: Mapping[str, Any]) -> T:
-    """Parameters with overrides, checked as in a file. Dotted names address inner blocks. Raises InputError."""
+def with_overrides(parameters: T, overrides: Mapping[str, Any], place: str = "--set") -> T:
+    """Parameters with overrides, checked as in a file. Dotted names address inner blocks.
+
+    place: where the overrides are from, in messages. Raises InputError.
+    """
     content: dict[str, Any] = dataclasses.asdict(cast(Any, parameters))
     for name, value in overrides.items():
         *blocks, last = name.split(".") if name.count(".") <= MAX_DOTS else [name]
@@ -27,4 +30,4 @@ def with_overrides(parameters: T, overrides: Mapping[str, Any]) -> T:
             inner[last] = value
             continue
         content[name] = value  # there is no such block, which the check reports
-    return dataclass_from_yaml(type(parameters), content, "--set")
+    return dataclass_from_yaml(type(parameters), content, place)
