@@ -98,6 +98,8 @@ def _path(recording: PointRecording, track: tuple[PointEstimate, ...]) -> Sectio
 
 def _curves(recording: PointRecording, track: tuple[PointEstimate, ...]) -> Section:
     x = _states(track)
+    if not np.isfinite(x[:, 0]).any():
+        return Section("Position and velocity", "There is no position.")
     sigma = np.array([np.sqrt(np.diagonal(e.P)) for e in track])
     seconds = recording.t_s is not None
     t: Array = recording.frames.astype(float) if recording.t_s is None else recording.t_s

@@ -83,13 +83,16 @@ def read_recording(
     by_frame: dict[int, Detections | None] = {}
     missing: dict[str, int] = {}
     size: tuple[int, int] | None = None
+    others = 0  # pictures of another size than the first
     total = inputs.count(1) if limit is None else limit
     for done, (frame, picture) in enumerate(inputs.pictures(1), start=1):
         if isinstance(picture, MissingPicture):
             by_frame[frame] = None
             missing[picture.reason] = missing.get(picture.reason, 0) + 1
         else:
-            size = size or (picture.shape[1], picture.shape[0])
+            own = (picture.shape[1], picture.shape[0])
+            size = size or own
+            others += own != size
             by_frame[frame] = search(picture)
         if progress is not None:
             progress(done, total)
@@ -102,6 +105,8 @@ def read_recording(
     for reason, count in missing.items():
         out.missing[reason] = out.missing.get(reason, 0) + count
     out.notes += inputs.notes
+    if others:
+        out.notes.append(f"{others} pictures have another size than the first, {size[0]}x{size[1]} px")
     return out
 
 

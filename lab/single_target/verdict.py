@@ -98,7 +98,8 @@ def reasons_of(
     pictures = sum(f is not None for f in recording.found)
     out = []
     if not statistics.counts[TargetStatus.MEASURED.value]:
-        seen = f"{statistics.detections_mean:.3g} detections per picture"
+        mean = statistics.detections_mean
+        seen = f"{mean:.3g} detection{'' if mean == 1 else 's'} per picture"
         out.append(
             Reason(
                 True,
