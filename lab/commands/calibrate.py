@@ -200,7 +200,12 @@ def convert(source: Path, destination: Path, origin: str | None, target: str | N
 
 @calibrate.command("simulate")
 @click.option("--out", required=True, type=FOLDER, help="The folder to write; it must not exist yet.")
-@click.option("--rig", default="fan", show_default=True, help="One of lab/simulate/rigs.py.")
+@click.option(
+    "--rig",
+    default="fan",
+    show_default=True,
+    help="A rig.yaml as designed, or fan, unequal-fan, two-cameras-per-screen, four-skew-beams.",
+)
 @click.option(
     "--seed", default=0, show_default=True, type=click.IntRange(min=0), help="The same seed gives the same bytes."
 )
