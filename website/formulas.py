@@ -29,6 +29,9 @@ def with_mathml(html: str) -> str:
 
 def _rendered(match: re.Match[str]) -> str:
     latex = entities.unescape(match["latex"]).strip()
+    plain = latex.replace("\\\\", "").replace("\\{", "").replace("\\}", "")
+    if plain.count("{") != plain.count("}"):
+        raise FormulaError(f"formula {latex!r}: the braces are not balanced")
     display = "block" if match["open"] == "[" else "inline"
     try:
         mathml = convert(latex, display=display)

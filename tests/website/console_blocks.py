@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from tests.paths import ROOT
 from website.pages import GENERATED
 
-_BLOCK = re.compile(r"^( *)```console\n(.*?)^ *```", re.MULTILINE | re.DOTALL)
+_BLOCK = re.compile(r"^ *```console\n(.*?)^ *```", re.MULTILINE | re.DOTALL)
 _STATUS = re.compile(r"\s+# exit status (\d+)$")
 
 
@@ -26,7 +26,7 @@ def commands_in(text: str) -> list[Shown]:
     """The commands of a document in their order. A backslash at the end of a line continues a command."""
     out = []
     for match in _BLOCK.finditer(text):
-        lines = textwrap.dedent(match[1] + match[2]).replace("\\\n", "").splitlines()
+        lines = textwrap.dedent(match[1]).replace("\\\n", "").splitlines()
         for line in lines:
             if line.startswith("$ "):
                 status = _STATUS.search(line)
