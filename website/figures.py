@@ -57,7 +57,10 @@ def styles() -> str:
     """The rules of the reports' style sheet that concern figures, with its colours by day."""
     sheet = (ROOT / "lab" / "report" / "templates" / "style.css").read_text(encoding="utf-8")
     colours = dict(re.findall(r"(--[\w-]+):([^;}]+)", re.search(r":root\{([^}]*)\}", sheet)[1]))  # type: ignore[index]
-    rules = "".join(re.findall(r"(?:^|(?<=\}))svg [^{}@]*\{[^}]*\}", sheet, re.MULTILINE))
+    rules = ""
+    for selectors, body in re.findall(r"([^{}@]+)\{([^{}]*)\}", re.sub(r"@media[^{]*\{(?:[^{}]*\{[^{}]*\})*\}", "", sheet)):
+        of_figures = [part.strip() for part in selectors.split(",") if part.strip().startswith("svg ")]
+        rules += f"{','.join(of_figures)}{{{body}}}" if of_figures else ""
     for name, value in colours.items():
         rules = rules.replace(f"var({name})", value)
     return rules
