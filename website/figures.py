@@ -58,7 +58,9 @@ def styles() -> str:
     sheet = (ROOT / "lab" / "report" / "templates" / "style.css").read_text(encoding="utf-8")
     colours = dict(re.findall(r"(--[\w-]+):([^;}]+)", re.search(r":root\{([^}]*)\}", sheet)[1]))  # type: ignore[index]
     rules = ""
-    for selectors, body in re.findall(r"([^{}@]+)\{([^{}]*)\}", re.sub(r"@media[^{]*\{(?:[^{}]*\{[^{}]*\})*\}", "", sheet)):
+    for selectors, body in re.findall(
+        r"([^{}@]+)\{([^{}]*)\}", re.sub(r"@media[^{]*\{(?:[^{}]*\{[^{}]*\})*\}", "", sheet)
+    ):
         of_figures = [part.strip() for part in selectors.split(",") if part.strip().startswith("svg ")]
         rules += f"{','.join(of_figures)}{{{body}}}" if of_figures else ""
     for name, value in colours.items():

@@ -15,10 +15,11 @@ ROOT = Path(__file__).resolve().parents[1]
 if str(ROOT) not in sys.path:  # MkDocs loads this file by its path
     sys.path.insert(0, str(ROOT))
 
-from website.formulas import FormulaError, with_mathml
-from website.navigation import expanded
-from website.network import network_addresses
-from website.pages import GENERATED
+from website.formulas import FormulaError, with_mathml  # noqa: E402
+from website.huo2015 import with_table  # noqa: E402
+from website.navigation import expanded  # noqa: E402
+from website.network import network_addresses  # noqa: E402
+from website.pages import GENERATED  # noqa: E402
 
 _LOG = logging.getLogger("mkdocs.hooks.beampose")
 
@@ -35,6 +36,11 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     for path, page in GENERATED.items():
         files.append(File.generated(config, path, content=page()))
     return files
+
+
+def on_page_markdown(markdown: str, page: Any, config: MkDocsConfig, files: Files) -> str:
+    """Put the table of the study into its page."""
+    return with_table(markdown)
 
 
 def on_page_content(html: str, page: Any, config: MkDocsConfig, files: Files) -> str:

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from website import codes, commands, huo2015, parameters, yaml_files
+from website import codes, commands, parameters, yaml_files
 
 GENERATED: Mapping[str, Callable[[], str]] = {
-    "huo2015.md": huo2015.page,
     "reference/parameters.md": parameters.page,
     "reference/commands.md": commands.page,
     "reference/yaml-files.md": yaml_files.page,

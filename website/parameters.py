@@ -39,8 +39,8 @@ tracker:
 $ beampose run sample_runs/sharp-turns --out results/sensitive --set detect.threshold_sigma=5
 ```
 
-A misspelt name is an error (exit status 2). `summary.json` lists the value of every parameter of a run. The defaults suit
-most recordings: change one if the report or the page [Troubleshooting](../troubleshooting.md) gives a reason.
+A misspelt name is an error (exit status 2). `summary.json` lists the value of every parameter of a run. The defaults
+suit most recordings: change one if the report or the page [Troubleshooting](../troubleshooting.md) gives a reason.
 
 This page is generated from `tracking/parameters.py`.
 """
@@ -85,14 +85,16 @@ def _statements(source: str) -> Iterator[list[str]]:
     lines = iter(source.splitlines())
     for line in lines:
         statement = [line]
-        while _FIELD.match(line) and sum(s.split("#")[0].count("(") - s.split("#")[0].count(")") for s in statement) > 0:
+        while (
+            _FIELD.match(line) and sum(s.split("#")[0].count("(") - s.split("#")[0].count(")") for s in statement) > 0
+        ):
             statement.append(next(lines))
         yield statement
 
 
 def unit_of(name: str, meaning: str) -> str:
     """The unit that the name states, in words for the table."""
-    if name.startswith("p_") and name != "p_norm" or "probability" in name:
+    if (name.startswith("p_") and name != "p_norm") or "probability" in name:
         return "probability"
     for end, unit in _UNITS:
         if name.endswith(end):

@@ -10,8 +10,8 @@ from website.text import cell, code, table
 
 _HEAD = """# Fields of the YAML files
 
-Every field that a YAML file may have, as the program checks it. `NAME` stands for a name of your choice, `[]` for the items
-of a list. An unknown field is an error with a suggestion. `beampose schema --out schemas` writes the same as
+Every field that a YAML file may have, as the program checks it. `NAME` stands for a name of your choice, `[]` for the
+items of a list. An unknown field is an error with a suggestion. `beampose schema --out schemas` writes the same as
 JSON schemas, with which editors complete and check the files. Meanings, frames and conventions:
 [File formats](../formats.md).
 

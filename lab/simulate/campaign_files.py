@@ -54,9 +54,9 @@ def simulate_calibration(
     calibration.yaml, a camera.yaml per camera, survey.csv, points.csv, poses.csv, spots.csv, and truth/: rig.yaml (as
     mounted), poses.csv (world_from_body at the positions). The same arguments give the same bytes.
 
-    rig: a name of RIGS, or the path of a rig.yaml with the designed rig. positions: of the stand. wrong: share of outliers among the pixels of control points and spots.
-    photos: also board photographs of each camera, for `beampose calibrate camera`. quality: sigmas of mounting and
-    measurement.
+    rig: a name of RIGS, or the path of a rig.yaml with the designed rig. positions: of the stand. wrong: share of
+    outliers among the pixels of control points and spots. photos: also board photographs of each camera, for `beampose
+    calibrate camera`. quality: sigmas of mounting and measurement.
 
     Raises:
         InputError: an argument is not valid, the rig file cannot be read, or the folder exists.

@@ -178,7 +178,7 @@ _ALL = (
     ),
     Scenario(
         name="small-motion",
-        summary="Slow motion of a few centimetres and degrees, for a rig of your own: no spot has to leave the picture.",
+        summary="Slow motion of a few centimetres and degrees; suits any rig, such as one of your own.",
         motion=_SMALL,
         light=LIGHTS["clean"],
     ),

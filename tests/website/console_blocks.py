@@ -47,5 +47,3 @@ def is_shown(line: str, printed: list[str]) -> bool:
     """Whether a line that a document shows was printed; numbers may differ."""
     pattern = re.sub(r"\d[\d.]*", "#", line).strip()
     return any(re.sub(r"\d[\d.]*", "#", other).strip() == pattern for other in printed)
-
-

@@ -86,7 +86,7 @@ def desk(tmp_path: Path) -> Path:
     program = tmp_path / ".bin" / "beampose"
     program.parent.mkdir()
     start = f"import sys; sys.path.insert(0, {str(ROOT)!r}); from cli import main; main(prog_name='beampose')"
-    program.write_text(f"#!/bin/sh\nexec {shlex.quote(sys.executable)} -P -c {shlex.quote(start)} \"$@\"\n")
+    program.write_text(f'#!/bin/sh\nexec {shlex.quote(sys.executable)} -P -c {shlex.quote(start)} "$@"\n')
     program.chmod(0o755)
     return tmp_path
 

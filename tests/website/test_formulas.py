@@ -24,3 +24,9 @@ def test_a_formula_becomes_mathml_that_is_well_formed(form, display):
 def test_a_formula_that_cannot_be_rendered_stops_the_build(latex):
     with pytest.raises(formulas.FormulaError, match="formula"):
         formulas.with_mathml(INLINE.format(latex))
+
+
+def test_function_names_are_set_apart_from_their_arguments():
+    page = formulas.with_mathml(INLINE.format(r"l q \cos^2 \beta + \ln(x) \frac{\ln p}{2}"))
+    assert page.count("<mspace") == 3  # q cos, cos beta, ln p; none before the bracket
+    ElementTree.fromstring(re.search(r"<math.*</math>", page, re.DOTALL)[0])

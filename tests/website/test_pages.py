@@ -15,7 +15,7 @@ from lab.explain.catalogue import EXPLANATIONS
 from lab.schema.files import BLOCKS
 from tests.paths import ROOT
 from tracking.parameters import DetectParameters, LabelParameters, TrackerParameters
-from website import codes, commands, parameters, yaml_files
+from website import codes, commands, huo2015, parameters, yaml_files
 from website.navigation import expanded
 from website.network import network_addresses
 from website.pages import GENERATED
@@ -70,6 +70,12 @@ def test_every_yaml_file_has_a_table_and_no_remark_is_meant_for_a_linter():
     assert [name for name in BLOCKS if f"{{ #{name} }}" not in page] == []
     assert "`cameras.NAME.camera_matrix.fx` | number above 0 | yes" in page
     assert "noqa" not in page
+
+
+def test_the_table_of_the_study_is_put_into_its_page():
+    page = huo2015.with_table((ROOT / "docs" / "huo2015.md").read_text(encoding="utf-8"))
+    assert huo2015.MARKER not in page
+    assert "| 65.97 |" in page
 
 
 def test_a_cell_keeps_its_text_whatever_characters_it_has():
