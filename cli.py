@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import click
 
-from lab.commands import batch, calibrate, compare, maintenance, plan_and_simulate, results, run, view
+from lab.commands import batch, calibrate, compare, maintenance, plan_and_simulate, results, run, study, view
 from lab.commands.common import Commands
 
 
@@ -26,7 +26,7 @@ for command in (
     plan_and_simulate.simulate,
     results.check,
     results.report,
-    results.study,
+    study.study,
     compare.compare,
     view.view,
     calibrate.calibrate,

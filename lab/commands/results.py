@@ -1,4 +1,4 @@
-"""`beampose check`, `report` and `study`: inputs checked, results shown, a published experiment repeated."""
+"""`beampose check` and `report`: inputs checked, results shown."""
 
 from __future__ import annotations
 
@@ -45,23 +45,3 @@ def report(results: Path, run_folder: Path | None) -> None:
     if not are_results(results):
         raise InputError(f"{results}: expected a folder that `beampose run` wrote, found no summary.json of one")
     show_line(f"report: {write_report(results, run_folder)}")
-
-
-@click.command()
-@click.argument("name", type=click.Choice(["huo2015"]))
-@click.option("--out", required=True, type=FOLDER, help="Gets report.html, figures.csv and the run.")
-@click.option("--seed", default=1, show_default=True, type=click.IntRange(min=0))
-def study(name: str, out: Path, seed: int) -> None:
-    """Repeat a published experiment and compare with its printed figures.
-
-    \b
-    Example:
-        beampose study huo2015 --out results/study
-    """
-    from lab.study.studies import study_huo2015
-
-    outcome = study_huo2015(out, seed=seed)
-    for line in outcome.lines:
-        show_line(line)
-    show_line(f"table: {outcome.table}")
-    show_line(f"report: {outcome.report}")

@@ -11,6 +11,7 @@ from geometry.pose import Pose
 from geometry.pose_prior import PosePrior
 from geometry.pose_solver.gauss_newton import fit_pose
 from lab.simulate.points import PointRun, simulate_points
+from lab.study.comparison import ComparisonRow
 from tracking.curve_switching import kalman
 from tracking.curve_switching.out_of_view import CoplanarViews, quadratic_positions
 from tracking.curve_switching.spot_tracker import SpotTracker
@@ -25,6 +26,7 @@ STIFF_PX_S2, LOOSE_PX_S2 = 300.0, 5000.0  # small and large process noise of the
 R1_PX = 10.0  # the first search radius; a larger innovation counts as a bend
 BEND_FRAMES = 2  # the bend and the frame after it, excluded from the RMS in the paper as well
 START_FRAMES = 5
+METHOD_NAMES = ("conventional", "curve switching", "beampose")
 
 PAPER = TrackerParameters(
     method="spots",
@@ -46,19 +48,6 @@ CONVENTIONAL = TrackerParameters(
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
-    """One line of figures.csv; None where a column has no value."""
-
-    quantity: str
-    unit: str
-    paper: float | None
-    conventional: float | None
-    curve_switching: float | None
-    beampose: float | None
-    note: str = ""
-
-
-@dataclass(frozen=True, slots=True)
 class TrackedRun:
     """The output of a tracker for the recording, T frames, n views."""
 
@@ -75,7 +64,7 @@ class Study:
 
     seed: int
     run: PointRun
-    rows: tuple[Row, ...]
+    rows: tuple[ComparisonRow, ...]  # values: conventional, curve switching, beampose
     prediction_errors: dict[str, Array]  # name of a filter: (T, n, 2) prediction error on the same spots
     outside_px: dict[str, Array]  # name of a method: (T, n) error of spots out of view; nan elsewhere
     trackers: dict[str, TrackedRun]
@@ -221,20 +210,18 @@ def _steady(run: PointRun, bends: Bools) -> Bools:
     return np.asarray(use)
 
 
-def _filter_rows(run: PointRun, same: dict[str, Array], bends: Bools) -> list[Row]:
+def _filter_rows(run: PointRun, same: dict[str, Array], bends: Bools) -> list[ComparisonRow]:
     use, out = _steady(run, bends), []
     for name in ("stiff", "loose"):
         conventional = _rms(same[f"conventional, {name}"], use)
         switching = _rms(same[f"curve switching, {name}"], use)
         for axis, printed in ((0, 0.6762), (1, 0.6611)):
             out.append(
-                Row(
+                ComparisonRow(
                     f"prediction RMS {'xy'[axis]}, same spots, {name} filter",
                     "px",
                     printed,
-                    conventional[axis],
-                    switching[axis],
-                    None,
+                    (conventional[axis], switching[axis], None),
                     f"sigma_a {STIFF_PX_S2 if name == 'stiff' else LOOSE_PX_S2:g} px/s^2; without bends; published for"
                     " the switching filter only",
                 )
@@ -242,33 +229,31 @@ def _filter_rows(run: PointRun, same: dict[str, Array], bends: Bools) -> list[Ro
     return out
 
 
-def _outside_rows(run: PointRun, outside: dict[str, Array]) -> list[Row]:
+def _outside_rows(run: PointRun, outside: dict[str, Array]) -> list[ComparisonRow]:
     out = []
     for noise in (0.0, NOISE_PX):
         for name, printed in (("3", 0.05), ("6", 0.05)):
             views = [i for i, (_, spot) in enumerate(run.model.views) if spot == name]
             worst = {way: float(np.nanmax(outside[f"{way}, {noise:g} px"][:, views])) for way in METHODS}
             out.append(
-                Row(
+                ComparisonRow(
                     f"largest out-of-view error, spot {name}, {noise:g} px noise",
                     "px",
                     printed,
-                    None,
-                    worst["quadratic"],
-                    worst["rigid"],
+                    (None, worst["quadratic"], worst["rigid"]),
                     "quadratic | rigid body (column beampose); published: 0.05 simulated, 2.5 measured",
                 )
             )
     return out
 
 
-def _tracker_rows(run: PointRun, trackers: dict[str, TrackedRun], bends: Bools) -> list[Row]:
+def _tracker_rows(run: PointRun, trackers: dict[str, TrackedRun], bends: Bools) -> list[ComparisonRow]:
     use = _steady(run, bends)
     visible = run.in_view == 1
     exists = ~np.isnan(run.uv_px[..., 0])
 
-    def row(quantity: str, unit: str, printed: float | None, of: dict[str, float], note: str) -> Row:
-        return Row(quantity, unit, printed, of["conventional"], of["curve switching"], of["beampose"], note)
+    def row(quantity: str, unit: str, printed: float | None, of: dict[str, float], note: str) -> ComparisonRow:
+        return ComparisonRow(quantity, unit, printed, tuple(of[name] for name in METHOD_NAMES), note)
 
     def largest(t: TrackedRun) -> float:
         return float(np.nanmax(np.linalg.norm(t.uv_px - run.uv_px, axis=-1)[START_FRAMES:]))

@@ -1,49 +1,41 @@
-"""The page of a repeated experiment: its table beside the published figures, and its curves."""
+"""Section 5.1 of Huo (2015): the table beside the published figures, and the curves."""
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
-from markupsafe import Markup
 
 from geometry.arrays import Array
-from lab.files.text.atomic_write import atomic_write_text
-from lab.report.html import environment
 from lab.report.plot.axes import axes, plot_area, svg_of
 from lab.report.plot.scales import robust_range
 from lab.report.plot.series import Line, Shade, time_panel
 from lab.report.plot.svg import BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILLION, line_path, text
-from lab.study.experiment_huo2015 import Study
+from lab.study.comparison import Comparison, Figure
+from lab.study.experiment_huo2015 import METHOD_NAMES, Study, repeat_huo2015
 
 U_COLOUR, V_COLOUR = BLUE, VERMILLION
 _TRACK_COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY)
 
 
-def write_study(study: Study, folder: Path) -> Path:
-    """Write report.html of a study into a folder; returns its path."""
-    rows = [
-        (r.quantity, r.unit, *(_shown(v) for v in (r.paper, r.conventional, r.curve_switching, r.beampose)), r.note)
-        for r in study.rows
-    ]
-    html = (
-        environment()
-        .get_template("study.html.j2")
-        .render(
-            seed=study.seed,
-            frames=len(study.run.frame),
-            noise=f"{study.run.noise_px:g}",
-            rows=rows,
-            figures=[(title, words, Markup(drawing)) for title, words, drawing in _figures(study)],
-        )
+def compare_huo2015(seed: int = 1, frames: int = 600) -> Comparison:
+    """The table and the figures of section 5.1."""
+    return comparison_of(repeat_huo2015(seed, frames))
+
+
+def comparison_of(study: Study) -> Comparison:
+    """The content of the page of a repeated experiment."""
+    return Comparison(
+        title="Huo, Yang & Yang (2015), section 5.1",
+        setting=f"{len(study.run.frame)} frames · 100 Hz · three beams · {study.run.noise_px:g} px noise"
+        f" (the paper states none) · 20 % clutter · seed {study.seed}",
+        methods=METHOD_NAMES,
+        rows=study.rows,
+        explanation="Conventional and curve switching: the paper's tracker alone (no rigid-body check, occluded spots"
+        " from their own filter, quadratic equation out of view), without and with eq. (6). Beampose: the default"
+        " settings of method “spots”.",
+        figures=tuple(Figure(*figure) for figure in _figures(study)),
+        source="J. Huo, N. Yang, M. Yang, Optics and Precision Engineering 23(8), 2134 (2015),"
+        " doi 10.3788/OPE.20152308.2134.",
     )
-    path = folder / "report.html"
-    atomic_write_text(html, path)
-    return path
-
-
-def _shown(value: float | None) -> str:
-    return "–" if value is None else "0" if abs(value) < 1e-9 else f"{value:.3g}" if value < 1e-2 else f"{value:.4g}"
 
 
 def _figures(study: Study) -> list[tuple[str, str, str]]:

@@ -1,0 +1,43 @@
+"""`beampose study`: published experiments repeated, their figures beside ours."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from lab.commands.common import FOLDER, show_line
+
+if TYPE_CHECKING:
+    from lab.study.comparison import Comparison
+
+
+def _huo2015(seed: int) -> Comparison:
+    from lab.study.huo2015 import compare_huo2015
+
+    return compare_huo2015(seed)
+
+
+STUDIES: dict[str, Callable[[int], Comparison]] = {"huo2015": _huo2015}  # name: seed -> table and figures
+
+
+@click.command()
+@click.argument("name", type=click.Choice(list(STUDIES)))
+@click.option("--out", required=True, type=FOLDER, help="Gets report.html and figures.csv.")
+@click.option("--seed", default=1, show_default=True, type=click.IntRange(min=0))
+def study(name: str, out: Path, seed: int) -> None:
+    """Repeat a published experiment and compare with its printed figures.
+
+    \b
+    Example:
+        beampose study huo2015 --out results/study
+    """
+    from lab.study.comparison import write_comparison
+
+    outcome = write_comparison(STUDIES[name](seed), out)
+    for line in outcome.lines:
+        show_line(line)
+    show_line(f"table: {outcome.table}")
+    show_line(f"report: {outcome.report}")

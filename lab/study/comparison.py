@@ -1,0 +1,105 @@
+"""A repeated experiment: the published figures beside ours, written as figures.csv and report.html."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from markupsafe import Markup
+
+from lab.files.text.atomic_write import atomic_folder, atomic_write_text
+from lab.files.text.csv_text import write_table
+from lab.report.html import environment
+
+
+@dataclass(frozen=True, slots=True)
+class ComparisonRow:
+    """One compared quantity; None where a column has no value. `values` has one number per method."""
+
+    quantity: str
+    unit: str
+    paper: float | None
+    values: tuple[float | None, ...]
+    note: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Figure:
+    """A section of the page: heading, a paragraph, and drawings (SVG of lab/report/plot)."""
+
+    title: str
+    words: str
+    drawing: str
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """All that a study shows.
+
+    `methods` are the names of the columns of values; `setting` is the line under the heading; `explanation` says what
+    the methods are; `source` is the reference of the paper.
+    """
+
+    title: str
+    setting: str
+    methods: tuple[str, ...]
+    rows: tuple[ComparisonRow, ...]
+    explanation: str
+    figures: tuple[Figure, ...]
+    source: str
+
+    def value(self, quantity: str, method: str) -> float | None:
+        """The number of one method for one quantity.
+
+        Raises:
+            StopIteration: the study has no such quantity.
+            ValueError: the study has no such method.
+        """
+        column = self.methods.index(method)
+        return next(row.values[column] for row in self.rows if row.quantity == quantity)
+
+
+@dataclass(frozen=True, slots=True)
+class StudyOutcome:
+    """The files written, and the lines printed."""
+
+    lines: tuple[str, ...]
+    table: Path
+    report: Path
+
+
+def columns(comparison: Comparison) -> tuple[str, ...]:
+    """The header of figures.csv."""
+    methods = (method.replace(" ", "_").replace("-", "_") for method in comparison.methods)
+    return ("quantity", "unit", "paper", *methods, "note")
+
+
+def write_comparison(comparison: Comparison, out: Path) -> StudyOutcome:
+    """Write figures.csv and report.html into the folder `out`.
+
+    Raises:
+        InputError: `out` contains other files.
+    """
+    with atomic_folder(out, may_replace=lambda folder: (folder / "figures.csv").is_file()) as work:
+        cells = [[row.quantity, row.unit, row.paper, *row.values, row.note] for row in comparison.rows]
+        rows = [["" if v is None else f"{v:.6g}" if isinstance(v, float) else v for v in row] for row in cells]
+        write_table(work / "figures.csv", columns(comparison), rows)
+        atomic_write_text(_page(comparison), work / "report.html")
+    lines = tuple(_line(comparison, row) for row in comparison.rows)
+    return StudyOutcome(lines, Path(out) / "figures.csv", Path(out) / "report.html")
+
+
+def _line(comparison: Comparison, row: ComparisonRow) -> str:
+    values = zip(("paper", *comparison.methods), (row.paper, *row.values), strict=True)
+    unit = f" ({row.unit})" if row.unit else ""
+    return f"{row.quantity}{unit}: " + ", ".join(f"{name} {'-' if v is None else f'{v:.4g}'}" for name, v in values)
+
+
+def _page(comparison: Comparison) -> str:
+    rows = [(r.quantity, r.unit, *(_shown(v) for v in (r.paper, *r.values)), r.note) for r in comparison.rows]
+    figures = [(figure.title, figure.words, Markup(figure.drawing)) for figure in comparison.figures]
+    return environment().get_template("study.html.j2").render(study=comparison, rows=rows, figures=figures)
+
+
+def _shown(value: float | None) -> str:
+    return "–" if value is None else "0" if abs(value) < 1e-9 else f"{value:.3g}" if value < 1e-2 else f"{value:.4g}"
