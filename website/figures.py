@@ -24,6 +24,13 @@ COMMANDS = (
     "calibrate rig campaign --out rig",
     "plan campaign/truth/rig.yaml --range yaw_deg=-30:30:13 --range pitch_deg=-20:20:9 --out plan",
     "study huo2015 --out study",
+    # the run of the tutorial
+    "init my-lab --screens 2 --cameras 2 --beams 3 --rate 100",
+    "calibrate simulate --rig my-lab/rig.yaml --seed 1 --out my-campaign",
+    "calibrate rig my-campaign --out my-rig",
+    "simulate small-motion --rig my-campaign/truth/rig.yaml --known-rig my-rig/rig.yaml --frames 200 --light quiet"
+    " --seed 1 --out my-run",
+    "run my-run --out day-1",
 )
 # Name of the picture: the folder of the report, the beginning of the label of its figure there, which of several.
 FIGURES = {
@@ -36,6 +43,9 @@ FIGURES = {
     "rig": ("rig", "Cameras, screens and beams, seen obliquely", 0),
     "rig-held-out": ("rig", "Attitude error of held-out positions", 0),
     "rig-residuals": ("rig", "Camera left: control points", 0),
+    "run-yaw": ("day-1", "yaw", 0),
+    "run-yaw-error": ("day-1", "yaw: ", 0),
+    "run-status": ("day-1", "Status of the pose", 0),
     "huo2015/prediction-conventional": ("study", "conventional, stiff", 0),
     "huo2015/prediction-switching": ("study", "curve switching, stiff", 0),
     "huo2015/out-of-view-3": ("study", "spot 3: distance from truth", 0),
@@ -45,6 +55,7 @@ FIGURES = {
     "huo2015/tracking-error-3": ("study", "spot 3 (left): estimate", 0),
 }
 _FIGURE = re.compile(r'<svg class="plot"[^>]*aria-label="(?P<label>[^"]*)".*?</svg>', re.DOTALL)
+_RIGHT = 14.0  # px added on the right: in a report, words may reach beyond the figure
 PHOTOS = (0, 3, 7, 11, 15, 19)  # of the campaign's photographs, in the picture of how to take them
 
 
@@ -70,12 +81,14 @@ def styles() -> str:
 
 def standalone(svg: str) -> str:
     """A figure of a report as a file of its own, on white."""
-    width, height = re.search(r'viewBox="0 0 ([\d.]+) ([\d.]+)"', svg).groups()  # type: ignore[union-attr]
+    wide, height = map(float, re.search(r'viewBox="0 0 ([\d.]+) ([\d.]+)"', svg).groups())  # type: ignore[union-attr]
+    width = wide + _RIGHT
     head, body = svg.split(">", 1)
+    head = re.sub(r'viewBox="[^"]*"', f'viewBox="0 0 {width:g} {height:g}"', head)
     head = re.sub(r' data-[\w-]+="[^"]*"', "", head).replace("<svg ", '<svg xmlns="http://www.w3.org/2000/svg" ')
     font = "svg{font-family:system-ui,'Segoe UI',Arial,'Liberation Sans',sans-serif}"
-    paper = f'<rect width="{width}" height="{height}" fill="#fff"/>'
-    return f'{head} width="{width}" height="{height}"><style>{font}{styles()}</style>{paper}{body}\n'
+    paper = f'<rect width="{width:g}" height="{height:g}" fill="#fff"/>'
+    return f'{head} width="{width:g}" height="{height:g}"><style>{font}{styles()}</style>{paper}{body}\n'
 
 
 def mosaic(photos: list[Path], columns: int = 3, width: int = 360) -> np.ndarray:
@@ -102,7 +115,11 @@ def make(work: Path, images: Path) -> None:
         print(f"beampose {command}", flush=True)
         subprocess.run([sys.executable, "-P", "-c", start, *command.split()], cwd=work, check=True)
     for name, (folder, label, which) in FIGURES.items():
-        found = [svg for text, svg in figures_of((work / folder / "report.html").read_text("utf-8")) if label in text]
+        found = [
+            svg
+            for text, svg in figures_of((work / folder / "report.html").read_text("utf-8"))
+            if text.startswith(label)
+        ]
         if len(found) <= which:
             raise LookupError(f"{folder}/report.html has no figure {label!r}")
         path = images / f"{name}.svg"

@@ -16,10 +16,10 @@ if str(ROOT) not in sys.path:  # MkDocs loads this file by its path
     sys.path.insert(0, str(ROOT))
 
 from website.formulas import FormulaError, with_mathml  # noqa: E402
-from website.huo2015 import with_table  # noqa: E402
 from website.navigation import expanded  # noqa: E402
 from website.network import network_addresses  # noqa: E402
 from website.pages import GENERATED  # noqa: E402
+from website.study_tables import with_tables  # noqa: E402
 
 _LOG = logging.getLogger("mkdocs.hooks.beampose")
 
@@ -39,8 +39,8 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Any, config: MkDocsConfig, files: Files) -> str:
-    """Put the table of the study into its page."""
-    return with_table(markdown)
+    """Put the tables of studies into their pages."""
+    return with_tables(markdown)
 
 
 def on_page_content(html: str, page: Any, config: MkDocsConfig, files: Files) -> str:
