@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from calibration.budget.expected_errors import ExpectedErrors
 from tracking.parameters import DetectParameters, LabelParameters, TrackerParameters
 from website.text import cell, code, table
 
@@ -22,7 +23,8 @@ _CLASSES = (
 _UNITS = (
     ("_per_px2", "1/px²"), ("_px_s2", "px/s²"), ("_m_s3", "m/s³ per √Hz"), ("_rad_s3", "rad/s³ per √Hz"),
     ("_rad_s2", "rad/s²"), ("_m_s2", "m/s²"), ("_deg_s", "°/s"), ("_m_s", "m/s"), ("_px", "px"), ("_deg", "°"),
-    ("_m", "m"), ("_s", "s"), ("_dn", "grey levels"), ("_sigmas", "sigmas"), ("_sigma", "sigmas"), ("_nats", "nats"),
+    ("_arcsec", "arcsec"), ("_relative", "share"), ("_m", "m"), ("_s", "s"), ("_dn", "grey levels"),
+    ("_sigmas", "sigmas"), ("_sigma", "sigmas"), ("_nats", "nats"),
 )  # fmt: skip
 _FIELD = re.compile(r"^    (?P<name>\w+): (?P<rest>.*)$")
 _HEAD = """# All parameters
@@ -44,6 +46,17 @@ suit most recordings: change one if the report or the page [Troubleshooting](../
 
 This page is generated from `tracking/parameters.py`.
 """
+
+_EXPECTED = """## Expected calibration errors { #expected-errors }
+
+What `beampose plan` assumes of a rig that is not calibrated yet: standard deviations that a careful calibration reaches,
+with the procedure behind each. Errors that rig.yaml states replace them. `--expect NAME=VALUE` sets another value:
+
+```console
+$ beampose plan sample_runs/huo2015/rig.yaml --out results/plan --expect beam_direction_arcsec=30
+```
+"""
+_COLUMNS = ("parameter", "default", "unit", "meaning")
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -92,8 +105,8 @@ def _statements(source: str) -> Iterator[list[str]]:
         yield statement
 
 
-def unit_of(name: str, meaning: str) -> str:
-    """The unit that the name states, in words for the table."""
+def unit_of(name: str) -> str:
+    """The unit that a parameter's name states, in words for the table."""
     if (name.startswith("p_") and name != "p_norm") or "probability" in name:
         return "probability"
     for end, unit in _UNITS:
@@ -123,20 +136,24 @@ def page() -> str:
     """The page as Markdown."""
     lines = [_HEAD]
     for title, prefix, cls in _CLASSES:
-        doc = " ".join((inspect.getdoc(cls) or "").split())
-        lines += [f"## {title}", "", cell(doc), ""]
-        defaults = {f.name: f.default for f in dataclasses.fields(cls)}
-        rows: list[tuple[str, ...]] = []
-        section = ""
-        for field in commented_fields(cls):
-            if defaults[field.name] is dataclasses.MISSING:  # a block of its own
-                continue
-            if field.section != section:
-                lines += table(("parameter", "default", "unit", "meaning"), rows) if rows else []
-                section, rows = field.section, []
-                lines += [f"### {section}", ""]
-            meaning = _without_unit(field.meaning)
-            name, value = prefix + field.name, defaults[field.name]
-            rows.append((code(name), code(_value(value)), unit_of(field.name, meaning), cell(meaning)))
-        lines += table(("parameter", "default", "unit", "meaning"), rows)
-    return "\n".join(lines)
+        lines += [f"## {title}", "", cell(" ".join((inspect.getdoc(cls) or "").split())), "", *_tables(cls, prefix)]
+    return "\n".join([*lines, _EXPECTED, *_tables(ExpectedErrors, "")])
+
+
+def _tables(cls: type, prefix: str) -> list[str]:
+    """A table of the parameters of a class for each of its sections."""
+    defaults = {f.name: f.default for f in dataclasses.fields(cls)}
+    lines: list[str] = []
+    rows: list[tuple[str, ...]] = []
+    section = ""
+    for field in commented_fields(cls):
+        if defaults[field.name] is dataclasses.MISSING:  # a block of its own
+            continue
+        if field.section != section:
+            lines += table(_COLUMNS, rows) if rows else []
+            section, rows = field.section, []
+            lines += [f"### {section}", ""]
+        meaning = _without_unit(field.meaning)
+        name, value = prefix + field.name, defaults[field.name]
+        rows.append((code(name), code(_value(value)), unit_of(field.name), cell(meaning)))
+    return [*lines, *table(_COLUMNS, rows)]

@@ -11,6 +11,7 @@ import sys
 
 import pytest
 
+from calibration.budget.expected_errors import ExpectedErrors
 from lab.explain.catalogue import EXPLANATIONS
 from lab.schema.files import BLOCKS
 from tests.paths import ROOT
@@ -21,12 +22,14 @@ from website.network import network_addresses
 from website.pages import GENERATED
 from website.text import cell
 
+CLASSES = (("", TrackerParameters), ("detect.", DetectParameters), ("labels.", LabelParameters), ("", ExpectedErrors))
+
 
 def test_every_parameter_has_a_row_with_its_default_and_a_meaning():
     rows = dict(re.findall(r"^\| `([\w.]+)` \| (.*) \|$", parameters.page(), re.MULTILINE))
     names = {
         prefix + f.name: f.default
-        for prefix, cls in (("", TrackerParameters), ("detect.", DetectParameters), ("labels.", LabelParameters))
+        for prefix, cls in CLASSES
         for f in dataclasses.fields(cls)
         if f.default is not dataclasses.MISSING
     }
