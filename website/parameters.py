@@ -50,7 +50,8 @@ This page is generated from `tracking/parameters.py`.
 _EXPECTED = """## Expected calibration errors { #expected-errors }
 
 What `beampose plan` assumes of a rig that is not calibrated yet: standard deviations that a careful calibration
-reaches, with the procedure behind each. Errors that rig.yaml states replace them. `--expect NAME=VALUE` sets another value:
+reaches, with the procedure behind each. Errors that rig.yaml states replace them. `--expect NAME=VALUE` sets another
+value:
 
 ```console
 $ beampose plan sample_runs/huo2015/rig.yaml --out plan --expect beam_direction_arcsec=30

@@ -96,9 +96,11 @@ def test_a_pattern_in_the_navigation_becomes_the_files_that_match_it(tmp_path):
     (tmp_path / "papers").mkdir()
     for name in ("b.md", "README.md", "a.md"):
         (tmp_path / "papers" / name).write_text("# x")
-    nav = [{"T": [{"Papers": "papers/*.md"}, {"None": "none/*.md"}]}, "index.md"]
+    for name in ("index.md", "guide.md", "new.md"):
+        (tmp_path / name).write_text("# x")
+    nav = [{"T": [{"Papers": "papers/*.md"}, {"None": "none/*.md"}, {"More": "*.md"}]}, "index.md", {"G": "guide.md"}]
     found = ["papers/README.md", "papers/a.md", "papers/b.md"]
-    assert expanded(nav, tmp_path) == [{"T": [{"Papers": found}]}, "index.md"]
+    assert expanded(nav, tmp_path) == [{"T": [{"Papers": found}, {"More": ["new.md"]}]}, "index.md", {"G": "guide.md"}]
 
 
 @pytest.mark.parametrize(
