@@ -43,6 +43,11 @@ def pages() -> dict[str, str]:
     return texts | {name: page() for name, page in GENERATED.items()}
 
 
+def indented_commands(text: str) -> list[str]:
+    """The commands of this program in indented blocks, as README.md has them, without the comments behind them."""
+    return [line.split("  #")[0].strip() for line in re.findall(r"^ {4}(beampose .+)$", text, re.MULTILINE)]
+
+
 def is_shown(line: str, printed: list[str]) -> bool:
     """Whether a line that a document shows was printed; numbers may differ."""
     pattern = re.sub(r"\d[\d.]*", "#", line).strip()

@@ -13,7 +13,7 @@ import pytest
 
 from cli import main
 from tests.paths import ROOT
-from tests.website.console_blocks import Shown, commands_in, is_shown, pages
+from tests.website.console_blocks import Shown, commands_in, indented_commands, is_shown, pages
 
 PAGES = {name: shown for name, text in pages().items() if (shown := commands_in(text))}
 
@@ -49,6 +49,13 @@ def problem(line: str) -> str | None:
 @pytest.mark.parametrize("page", PAGES)
 def test_every_command_shown_has_valid_options(page):
     assert [wrong for shown in PAGES[page] if (wrong := problem(shown.command))] == []
+
+
+@pytest.mark.parametrize("name", ["README.md", "sample_runs/README.md"])
+def test_every_command_in_the_readmes_has_valid_options(name):
+    lines = indented_commands((ROOT / name).read_text(encoding="utf-8"))
+    assert len(lines) >= 5
+    assert [wrong for line in lines if (wrong := problem(line.split(" #")[0]))] == []
 
 
 def test_the_pages_of_the_user_show_commands():
