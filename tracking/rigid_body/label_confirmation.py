@@ -8,12 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from geometry.arrays import Array, Bools, Ints
+from geometry.compiled_projection import project_all
 from geometry.forward_model import SpotModel
 from tracking.parameters import TrackerParameters
 from tracking.rigid_body.association.frame_detections import BLENDED, Observation, distinct_spots
 from tracking.rigid_body.hypotheses.hypothesis_set import Children, Dynamics, Hypotheses
 from tracking.rigid_body.hypotheses.iterated_update import chosen_points
 from tracking.rigid_body.hypotheses.prediction_checks import (
+    MAX_CHECKING_SIGMA_PX,
     MAX_THREE_SPOT_SIGMA_PX,
     MIN_CONFIRMING_SPOTS,
     MIN_REDUNDANT_SPOTS,
@@ -28,6 +30,7 @@ from tracking.rigid_body.pose_candidates import predicted_hypothesis
 MANY_SPOTS = 6  # with so many, an uncontrolled spot concerns only its own label
 # Of a first acquisition against "all points are false"; false points reach it with exp(-7) = 1e-3 per frame.
 MIN_EVIDENCE_NATS = 7.0
+WIDE_SIGMA = 10.0  # m, rad: of a prior that does not matter
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +103,8 @@ class LabelConfirmation:
         elif h.best in h.searched and not h.first:
             use, _, cov = chosen_points(obs.frame, assigned, obs.calibration_cov)
             controlled = well_controlled(model.numbers, h.now.R[0], h.now.t[0], use, cov)
-            if distinct_spots(controlled, model.spot_of) < MIN_REDUNDANT_SPOTS:
+            few = distinct_spots(controlled, model.spot_of) < MIN_REDUNDANT_SPOTS
+            if few or decisive(model, h.now.R[0], h.now.t[0], use, cov).any():
                 # If the others leave a direction of the pose open, some false point fits: the next frame must agree.
                 out = self._postpone(h, out.min_probability)
         self._found_before = assigned >= 0
@@ -142,11 +146,33 @@ class LabelConfirmation:
         use, _, cov = chosen_points(obs.frame, assigned, obs.calibration_cov)
         uncontrolled = use & ~well_controlled(model.numbers, h.now.R[0], h.now.t[0], use, cov)
         # A spot that the frame before showed as well confirms itself. A single spot that reappears where it may be
-        # anywhere waits for the next frame.
+        # anywhere waits for the next frame, as does one that alone determines a direction of the pose.
         new = unchecked & ~self._found_before
         single = np.count_nonzero(new) == 1 and (uncontrolled if spots >= MANY_SPOTS else uncontrolled.any()) & new
+        single = single | (decisive(model, h.now.R[0], h.now.t[0], use, cov) & new)
         far = largest_spot_sigma(model.numbers, R, t, P, used) > MAX_THREE_SPOT_SIGMA_PX
         too_few = sure < MIN_REDUNDANT_SPOTS and (uncontrolled.any() or far or doubtful.any())
         if too_few or np.any(single):
             return self._postpone(h, least)
         return Confirmation(least, before.confirmed, before.spread)
+
+
+def decisive(model: SpotModel, R: Array, t: Array, use: Bools, cov: Array) -> Bools:
+    """(n,): the used views (n,) of the one spot that alone determines a direction of the pose (R (3, 3), t (3,)).
+
+    Such a spot may be a false point: one somewhere on its path fits the others as well, such as on the second screen
+    beside any number of spots that lie on one line of the first. cov (n, 2, 2), px^2. The other spots must predict it
+    to MAX_CHECKING_SIGMA_PX. Where that is so of several spots, as of all in a frame of four, they need each other, and
+    none is named. Source: ours.
+    """
+    _, J = project_all(model.numbers, R[None], t[None])
+    J = J[0]
+    information = np.zeros((len(model), 6, 6))
+    information[use] = np.swapaxes(J[use], 1, 2) @ np.linalg.solve(cov[use], J[use])
+    total = information.sum(axis=0) + np.eye(6) / WIDE_SIGMA**2
+    out = np.zeros(len(model), dtype=bool)
+    for view in np.flatnonzero(use):
+        others = total - information[model.spot_of == model.spot_of[view]].sum(axis=0)
+        predicted = J[view] @ np.linalg.solve(others, J[view].T)
+        out[view] = np.linalg.eigvalsh(predicted)[-1] > MAX_CHECKING_SIGMA_PX**2
+    return out & (distinct_spots(out, model.spot_of) == 1)

@@ -12,6 +12,7 @@ from geometry.arrays import Array, Bools, Ints
 from geometry.pose import Pose
 from tracking.detections import UNMATCHED, Detections
 from tracking.parameters import TrackerParameters
+from tracking.statuses import PoseStatus
 from tracking.tracked_frame import TrackedFrame
 
 MOST_KEPT = 2000  # frames; as many as the statistics use
@@ -109,9 +110,11 @@ class FrameSampler:
             # An innovation is normalised by the tracker's full covariance, including its estimated noise scale.
             predicted_cov_px2 = predicted_cov_px2 + tracked.cov_px2 - stated_cov_px2
         cov_px2 = tracked.cov_px2 if stated_cov_px2 is None else stated_cov_px2
+        # A predicted pose may be far from the frame's spots without any fault of the rig.
+        pose = tracked.pose if tracked.pose_status is PoseStatus.MEASURED else None
         self.add(
             SampledFrame(
-                t_s, seen, tracked.uv_px, cov_px2, tracked.pose, tracked.predicted_px, predicted_cov_px2,
+                t_s, seen, tracked.uv_px, cov_px2, pose, tracked.predicted_px, predicted_cov_px2,
                 tracked.pose_covariance, width_px,
             )
         )  # fmt: skip

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 
 from geometry.arrays import Array
 from tests.tracking.smoothing.test_fixed_interval import Run, drawn
@@ -83,3 +86,20 @@ def test_steps_with_a_velocity_jump_are_left_out():
     usable[140:160] = False
     without_jump = next_log_density(START, out, usable, local=True)
     assert np.all(with_jump[150] > without_jump[150])
+
+
+@pytest.mark.parametrize(("amplitude", "largest"), [(0.0, 1.4), (0.3, 1.6), (0.6, 1.5)])
+def test_covariances_are_right_where_one_axis_moves_less_than_the_noise(amplitude, largest):
+    """amplitude: of a sine in the rotation about x, in sigmas of one frame's own pose."""
+    jerk = np.array([20.0, 50.0, 50.0, 1e-4, 100.0, 100.0]) ** 2
+    squares = []
+    for seed in range(60, 64):
+        run = drawn(seed, FRAMES, jerk=jerk)
+        L = run.info.information
+        sigma = np.mean(np.sqrt(np.linalg.inv(L)[:, 3, 3]))
+        sine = amplitude * sigma * np.sin(2 * np.pi * (2 + 2 * (seed % 3)) * np.cumsum(run.info.dt))
+        run = replace(run, info=run.info._replace(vector=run.info.vector + L[:, :, 3] * sine[:, None]))
+        log_density, _ = estimated(run)
+        out = smoothed(run.ref, run.info, np.exp(log_density))
+        squares.append((run.true[:, 3] + sine - out.x[:, 3]) ** 2 / out.pose_P[:, 3, 3])
+    assert 0.6 < np.mean(squares) < largest

@@ -24,6 +24,7 @@ PSEUDO_COUNT = 2.0  # determined components of the present strength that are add
 MIN_COUNT = 1.0  # determined components of a window, below which the strength does not fall
 NO_DATA_SHARE = 0.01  # of that: a window without data, whose strength stays
 WINDOW_COUNT = 12.0  # determined components per window: the sigma of the logarithm of its strength is then 0.4
+AXES_SIGMA = 2.0  # of log q between axes: a factor of 2.7 in the motion
 RELAXATION = 1.6  # of the fixed point's step in log q: gamma changes by q^(1/6), so plain steps are short
 MAX_STEP = 4.0  # in log q
 
@@ -37,12 +38,16 @@ def next_log_density(log_density: Array, out: Interval, usable: Bools, local: bo
     energy = np.where(usable[:, None], out.energy, 0.0)
     gamma = np.where(usable[:, None], out.gamma, 0.0)
     frames = len(energy)
-    change = np.empty_like(log_density)
+    energies, gammas = np.empty_like(log_density), np.empty_like(log_density)
     for axis in range(log_density.shape[1]):
         total = float(gamma[:, axis].sum())
         width = frames if total <= 0 else int(np.clip(np.ceil(frames * WINDOW_COUNT / total), 9, frames))
-        e, g = (_window_sums(a[:, axis], width) for a in (energy, gamma))
-        step = np.log((e + PSEUDO_COUNT) / (g + PSEUDO_COUNT))
+        energies[:, axis], gammas[:, axis] = (_window_sums(a[:, axis], width) for a in (energy, gamma))
+    prior = _prior_components(log_density, gammas)
+    change = np.empty_like(log_density)
+    for axis in range(log_density.shape[1]):
+        e, g, p = energies[:, axis], gammas[:, axis], prior[:, axis]
+        step = np.log((e + PSEUDO_COUNT + np.maximum(p, 0.0)) / (g + PSEUDO_COUNT + np.maximum(-p, 0.0)))
         # The strength must not fall so far that no data could raise it again.
         has_data = g > NO_DATA_SHARE * MIN_COUNT
         step = np.where(
@@ -53,6 +58,22 @@ def next_log_density(log_density: Array, out: Interval, usable: Bools, local: bo
             step[:] = _weighted_median(step, g)
         change[:, axis] = np.clip(RELAXATION * step, -MAX_STEP, MAX_STEP)
     return np.clip(log_density + change, *LOG_RANGE)
+
+
+def _prior_components(log_density: Array, gamma: Array) -> Array:
+    """(T, 6): by how much a prior raises the energy of the process noise, in determined components.
+
+    The prior: log q of an axis is normal about that of the axes of its kind, translation or rotation, weighted with
+    what the data determine of each, gamma (T, 6). Without it the strength of an axis in which the motion is smaller
+    than the noise collapses to zero, the usual fault of a variance estimated from weak data, and the covariance with
+    it. Where the data determine it the prior weighs one or two components of dozens.
+    """
+    out = np.empty_like(log_density)
+    for axes in (slice(0, 3), slice(3, 6)):
+        weight = gamma[:, axes] + 1e-9
+        centre = np.sum(weight * log_density[:, axes], axis=1) / weight.sum(axis=1)
+        out[:, axes] = 2 * (centre[:, None] - log_density[:, axes]) / AXES_SIGMA**2
+    return out
 
 
 def _window_sums(values: Array, width: int) -> Array:

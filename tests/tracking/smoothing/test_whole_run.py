@@ -1,0 +1,49 @@
+"""The estimate of a whole run's motion converges, also where the motion is nearly rigid."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from geometry.pose import Pose
+from lab.simulate.rigs import RIGS
+from tests.tracking.rigid_runs import RIGID, dt_of, found_in, recording_of, tracked
+from tracking.smoothing.motion.reference import straight_between
+from tracking.smoothing.motion.run_detections import spot_information
+from tracking.smoothing.motion.whole_run import SmoothedMotion, WholeRun, estimate
+from tracking.smoothing.recording import TrackedRecording
+
+AT_REST = Pose.from_ypr(np.deg2rad([7.0, 0.0, 0.0]), np.zeros(3))
+FRAMES, GAP = 50, slice(26, 28)  # frames that the first estimate does not use
+
+
+@pytest.mark.parametrize("step", [26, 27])
+@pytest.mark.parametrize("seed", [0, 6, 11])
+def test_a_step_of_a_vehicle_at_rest_is_fitted_after_an_estimate_without_its_frames(seed, step):
+    """The jerk is close to zero then: a linear Gauss-Newton step costs more than it gains, at any damping."""
+    rng = np.random.default_rng(seed)
+    turn = np.deg2rad(rng.uniform(0.1, 1.5, 3) * rng.choice([-1, 1], 3))
+    after = AT_REST.plus(np.concatenate([rng.normal(0, 0.002, 3), turn]))
+    turned = np.arange(FRAMES) >= step
+    poses = Pose(
+        np.where(turned[:, None, None], after.rotation, AT_REST.rotation),
+        np.where(turned[:, None], after.translation, AT_REST.translation),
+    )
+    run = recording_of(RIGS["four-skew-beams"](), poses, np.arange(FRAMES) / 80, 0.05, seed)
+    recording = TrackedRecording(run.rig, RIGID)
+    for k, frame in enumerate(tracked(run)):
+        recording.append(dt_of(run, k), found_in(run, k), frame)
+    detections, assigned, n = recording.run_detections(), recording.assigned, len(run.model)
+    whole = WholeRun(run.model.numbers, detections, np.zeros((n, 2, 2)), recording.dt_s, 0.0, True)
+    used = np.ones(FRAMES, dtype=bool)
+    used[GAP] = False
+    straight = np.concatenate([poses.rotation, poses.translation[:, None]], axis=1)
+    jumped = np.arange(FRAMES) == GAP.stop  # as the tracker sees it after the gap
+    motion = SmoothedMotion.begin(straight_between(straight, used, np.cumsum(recording.dt_s)), jumped, None)
+    motion = estimate(whole, assigned, used, motion, 0, used)
+    every = np.ones(FRAMES, dtype=bool)
+    motion = estimate(whole, assigned, every, motion, 12, every)
+    chi2 = spot_information(whole.views, detections, assigned, whole.calibration_cov, motion.ref, 0)[2]
+    labels = (assigned >= 0).sum(axis=1)
+    assert chi2.sum() / (2 * labels.sum()) < 1.2
+    assert np.max(chi2 / np.maximum(2 * labels, 1)) < 4
