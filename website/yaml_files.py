@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from typing import Any
 
@@ -11,9 +12,9 @@ from website.text import cell, code, table
 _HEAD = """# Fields of the YAML files
 
 Every field that a YAML file may have, as the program checks it. `NAME` stands for a name of your choice, `[]` for the
-items of a list. An unknown field is an error with a suggestion. `beampose schema --out schemas` writes the same as
-JSON schemas, with which editors complete and check the files. Meanings, frames and conventions:
-[File formats](../formats.md).
+items of a list. A required field must be there if its block is. An unknown field is an error with a suggestion.
+`beampose schema --out schemas` writes the same as JSON schemas, with which editors complete and check the files.
+Meanings, frames and conventions: [File formats](../formats.md).
 
 This page is generated from `lab/schema/`.
 """
@@ -57,7 +58,7 @@ def _inner(field: dict[str, Any], path: str) -> Iterator[tuple[str, ...]]:
 def kind_of(field: dict[str, Any]) -> str:
     """What a field may hold, in words."""
     if "enum" in field:
-        return " or ".join(f"`{value}`" for value in field["enum"])
+        return " or ".join(f"`{value}`" if value else "empty" for value in field["enum"])
     if "anyOf" in field:
         return " or ".join(dict.fromkeys(kind_of(o) for o in field["anyOf"] if o.get("type") != "null"))
     kind = field.get("type", "")
@@ -68,7 +69,7 @@ def kind_of(field: dict[str, Any]) -> str:
         return _array(field)
     if kind == "object":
         inner = field.get("additionalProperties")
-        return f"names, each with {kind_of(inner)}" if isinstance(inner, dict) and inner else "block"
+        return f"names, each with a {kind_of(inner)}" if isinstance(inner, dict) and inner else "block"
     return f"{_WORDS.get(kind, 'any')}{_limits(field)}"
 
 
@@ -76,7 +77,8 @@ def _array(field: dict[str, Any]) -> str:
     least, most = field.get("minItems"), field.get("maxItems")
     count = f"{most} " if least == most and most else f"up to {most} " if most else ""
     inner = kind_of(field.get("items", {}))
-    return f"list of {count}{'numbers' if inner.startswith('number') else inner}"
+    plural = re.sub(r"^(number|whole number|text|list|block)\b", r"\1s", inner)
+    return f"list of {count}{plural}"
 
 
 def _limits(field: dict[str, Any]) -> str:
