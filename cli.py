@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import click
 
-from lab.commands import batch, calibrate, compare, maintenance, plan_and_simulate, results, run, study, view
+from lab.commands import batch, calibrate, compare, maintenance, plan_and_simulate, results, run, show, study, view
 from lab.commands.common import Commands
 
 
@@ -29,6 +29,7 @@ for command in (
     study.study,
     compare.compare,
     view.view,
+    show.show,
     calibrate.calibrate,
     plan_and_simulate.plan,
     maintenance.init,

@@ -215,7 +215,8 @@ def test_formulas_use_only_numerical_packages(floor):
 
 def test_what_the_program_imports_is_declared_in_pyproject():
     declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    required = [*declared["dependencies"], *declared["optional-dependencies"]["parquet"]]
+    extras = declared["optional-dependencies"]
+    required = [*declared["dependencies"], *extras["parquet"], *extras["cluster"]]
     names = {canonicalize_name(Requirement(requirement).name) for requirement in required}
     not_everywhere = {"open3d": ["open3d"], "libusb_package": ["libusb-package"], "pyarrow": ["pyarrow"]}
     distributions = not_everywhere | packages_distributions()

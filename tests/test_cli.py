@@ -129,6 +129,7 @@ def test_the_commands_are_those_of_the_contract():
         "study",
         "compare",
         "view",
+        "show",
         "calibrate",
         "plan",
         "doctor",
@@ -177,7 +178,9 @@ def test_the_example_of_run_leaves_the_files_of_the_contract(desk):
     assert isinstance(json.loads((out / "summary.json").read_text()), dict)
 
 
-@pytest.mark.parametrize("name", ["check", "report", "detect", "doctor", "explain", "verify", "compare", "view"])
+@pytest.mark.parametrize(
+    "name", ["check", "report", "detect", "doctor", "explain", "verify", "compare", "view", "show"]
+)
 def test_the_example_works(works, name):
     assert works(*example(name)).strip()
 

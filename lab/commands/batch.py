@@ -11,21 +11,25 @@ from pathlib import Path
 from typing import Any
 
 import click
+from click.core import ParameterSource
 
-from lab.commands.common import ANY_PATH, FOLDER, set_option
+from lab.commands.common import ANY_PATH, FOLDER, complain, set_option, show_line
 from lab.commands.run import causal_option
+from lab.commands.verbosity import check_verbosity, quiet_option, silenced
 from lab.errors import BeamposeError
 
 Shown = Callable[[int, int, int], None]
 
 
-def _shard(ctx: click.Context, parameter: click.Parameter, value: str | None) -> tuple[int, int]:
+def _shard(ctx: click.Context, parameter: click.Parameter, value: str | None) -> str | None:
+    """The text, checked: it is also part of the recorded command."""
     from lab.runs.batch.run_list import shard_of
 
     try:
-        return (1, 1) if value is None else shard_of(value)
+        shard_of(value or "1/1")
     except BeamposeError as error:
         raise click.BadParameter(str(error).removeprefix("--shard: "), ctx=ctx, param=parameter) from None
+    return value
 
 
 @click.command()
@@ -33,6 +37,11 @@ def _shard(ctx: click.Context, parameter: click.Parameter, value: str | None) ->
 @click.option("--list", "lists", multiple=True, type=ANY_PATH, help="A text file with a run per line; - is stdin.")
 @click.option("--out", required=True, type=FOLDER, help="Gets one folder per run, batch.csv and index.html.")
 @click.option("--jobs", default=1, show_default=True, type=click.IntRange(1, 1024), help="Processes at the same time.")
+@click.option(
+    "--dask",
+    metavar="ADDRESS",
+    help="Process the runs on this Dask cluster: its scheduler's address, or the scheduler's file (needs distributed).",
+)
 @click.option("--force", is_flag=True, help="Process all runs again, also those that are done.")
 @click.option("--shard", metavar="I/N", callback=_shard, help="Only the I-th of N parts of the runs, for array jobs.")
 @click.option("--full-hash", is_flag=True, help="Compare all bytes of pictures and videos with --out, not samples.")
@@ -40,42 +49,75 @@ def _shard(ctx: click.Context, parameter: click.Parameter, value: str | None) ->
     "--parquet", is_flag=True, help="Also write all attitudes and spots as Parquet data sets (needs pyarrow)."
 )
 @causal_option
+@click.option("--verbose", "-v", is_flag=True, help="Show the lines of each run's log on standard error when it ends.")
+@quiet_option
 @set_option
+@click.pass_context
 def batch(
+    ctx: click.Context,
     runs: tuple[Path, ...],
     lists: tuple[Path, ...],
     out: Path,
     jobs: int,
+    dask: str | None,
     force: bool,
-    shard: tuple[int, int],
+    shard: str | None,
     full_hash: bool,
     parquet: bool,
     causal: bool,
+    verbose: bool,
+    quiet: bool,
     settings: dict[str, Any],
 ) -> None:
     """Process many run folders; a run that fails does not stop the others.
 
     RUN is a run folder, a pattern such as 'data/*/run-*', or @FILE, a text file with a run per line. A run whose
     results in --out have the same inputs, settings, calibration and version is skipped: after an interruption, the
-    same command continues. Several batches may use one --out.
+    same command continues. Several batches may use one --out. The workers of a Dask cluster must see the folders under
+    the same paths as this computer, and have the same versions installed.
 
     \b
     Example:
         beampose batch sample_runs/huo2015 sample_runs/damaged --out results/all
     """
     if not runs and not lists:
-        raise click.UsageError("Missing argument 'RUN...'.", click.get_current_context())
+        raise click.UsageError("Missing argument 'RUN...'.", ctx)
+    if dask is not None and ctx.get_parameter_source("jobs") is ParameterSource.COMMANDLINE:
+        raise click.UsageError("expected --jobs or --dask, got both", ctx)
+    check_verbosity(verbose=verbose, quiet=quiet)
+    from lab.commands.command_line import provenance
     from lab.runs.batch.batch import BatchOptions, process_batch
+    from lab.runs.batch.run_list import shard_of
 
-    options = BatchOptions(settings, causal, jobs, force, shard, full_hash, parquet)
+    part = shard_of(shard or "1/1")
+    options = BatchOptions(settings, causal, jobs, force, part, full_hash, parquet, dask, provenance(ctx))
     line = _printer()
-    with _progress() as progress:
-        outcome = process_batch(runs, out, options, lists=lists, report=line, progress=progress)
-    if outcome.skipped:
-        line(f"done already: {outcome.skipped} of {len(outcome.rows)} runs; --force processes them again")
-    line(f"table: {outcome.table}")
-    line(f"index: {outcome.index}")
+
+    def log(text: str) -> None:
+        if verbose:
+            print(text, file=sys.stderr, flush=True)
+
+    with _progress() if not quiet else silenced() as progress:
+        outcome = process_batch(
+            runs,
+            out,
+            options,
+            lists=lists,
+            report=_nowhere if quiet else line,
+            complain=complain if quiet else line,
+            log=log,
+            progress=progress or _nowhere,
+        )
+    if not quiet:
+        if outcome.skipped:
+            line(f"done already: {outcome.skipped} of {len(outcome.rows)} runs; --force processes them again")
+        line(f"table: {outcome.table}")
+        line(f"index: {outcome.index}")
     sys.exit(outcome.exit_status)
+
+
+def _nowhere(*_: object) -> None:
+    """Shows nothing."""
 
 
 def _printer() -> Callable[[str], None]:
@@ -87,7 +129,7 @@ def _printer() -> Callable[[str], None]:
         if gone:
             return
         try:
-            click.echo(text)
+            show_line(text)
         except BrokenPipeError:
             gone = True
             with contextlib.suppress(OSError, ValueError):  # what is left in the buffer must go somewhere

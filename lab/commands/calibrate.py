@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from lab.commands.common import ANY_PATH, FOLDER, Commands, NumberRange, conclude, progress_bar
+from lab.commands.common import ANY_PATH, FOLDER, Commands, NumberRange, conclude, progress_bar, show_line
 
 
 @click.group(cls=Commands)
@@ -223,4 +223,4 @@ def simulate_campaign(out: Path, rig: str, seed: int, positions: int, photos: bo
     from lab.simulate.campaign_files import simulate_calibration
 
     folder = simulate_calibration(out, seed=seed, rig=rig, positions=positions, photos=photos)
-    click.echo(f"project: {folder / 'calibration.yaml'}")
+    show_line(f"project: {folder / 'calibration.yaml'}")

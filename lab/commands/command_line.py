@@ -9,6 +9,8 @@ from typing import Any
 
 import click
 
+_MOST_ARGUMENTS = 20  # of a list of runs: each of its results records the command
+
 
 def command_line(ctx: click.Context) -> str:
     """The command of a context with its arguments and the options that differ from their defaults."""
@@ -17,10 +19,18 @@ def command_line(ctx: click.Context) -> str:
     for parameter in ctx.command.params:
         value = ctx.params.get(parameter.name or "")
         if isinstance(parameter, click.Argument):
-            words += [str(v) for v in value] if isinstance(value, tuple) else [str(value)]
+            words += _arguments(value) if isinstance(value, tuple) else [str(value)]
         elif value not in (None, False, (), {}) and value != parameter.get_default(ctx):
-            options += _option(parameter.opts[-1], value)
+            options += _option(max(parameter.opts, key=len), value)
     return shlex.join([*words, *options])
+
+
+def _arguments(values: tuple[Any, ...]) -> list[str]:
+    """The values of an argument; of a long list the first ones, and how many there are."""
+    words = [str(v) for v in values]
+    if len(words) <= _MOST_ARGUMENTS:
+        return words
+    return [*words[:_MOST_ARGUMENTS], f"... ({len(words)} in all)"]
 
 
 def _option(name: str, value: Any) -> list[str]:

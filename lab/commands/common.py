@@ -37,7 +37,7 @@ def show_line(text: str) -> None:
     click.echo(printable(text))
 
 
-class _StderrHandler(logging.Handler):
+class StderrHandler(logging.Handler):
     """Shows log messages of the libraries below, such as that they compile, as lines on stderr."""
 
     def emit(self, record: logging.LogRecord) -> None:
@@ -48,7 +48,7 @@ def _show_log_on_a_terminal() -> None:
     """Shows log messages where a progress bar is shown. Elsewhere, any line on stderr indicates a problem."""
     logger = logging.getLogger("beampose")
     if sys.stderr.isatty() and not logger.handlers:
-        logger.addHandler(_StderrHandler())
+        logger.addHandler(StderrHandler())
         logger.setLevel(logging.INFO)
 
 
@@ -82,8 +82,8 @@ def _quiet_when_the_reader_has_gone() -> Iterator[None]:
         sys.exit(PIPE_CLOSED)
 
 
-def _complain(line: str) -> None:
-    """Prints a line to stderr. Where it cannot be written (full disk, terminal closed), the exit status is kept.
+def complain(line: str) -> None:
+    """Prints a line about an error to stderr. Where that fails (full disk, terminal closed), the exit status is kept.
 
     Raises BrokenPipeError.
     """
@@ -121,7 +121,7 @@ def _stop_is_a_line() -> Iterator[None]:
     try:
         yield
     except StoppedBySignal as stop:
-        _complain(f"stopped by {stop.name}")
+        complain(f"stopped by {stop.name}")
         raise
 
 
@@ -136,32 +136,32 @@ def _errors_are_lines() -> Iterator[None]:
         error.show()
         sys.exit(error.exit_code)
     except click.UsageError as error:
-        _complain(error.format_message())
+        complain(error.format_message())
         if error.ctx:
             click.echo(f"Help: {error.ctx.command_path} --help", err=True)
         sys.exit(error.exit_code)
     except click.ClickException as error:
-        _complain(error.format_message())
+        complain(error.format_message())
         sys.exit(error.exit_code)
     except (click.Abort, KeyboardInterrupt):
-        _complain("stopped")
+        complain("stopped")
         sys.exit(1)
     except BeamposeError as error:
-        _complain(str(error))
+        complain(str(error))
         sys.exit(error.exit_status)
     except MemoryError:
-        _complain("out of memory")
+        complain("out of memory")
         sys.exit(1)
     except BrokenPipeError:
         raise
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
-        _complain(f"{where}{error.strerror or error}")
+        complain(f"{where}{error.strerror or error}")
         sys.exit(1)
     except Exception as error:
         from lab.files.output.saved_traceback import unexpected_error  # only where there is one
 
-        _complain(unexpected_error(error))
+        complain(unexpected_error(error))
         sys.exit(1)
 
 

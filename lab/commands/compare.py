@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from lab.commands.common import FOLDER
+from lab.commands.common import FOLDER, show_line
 
 _RESULTS = click.Path(exists=True, file_okay=False, path_type=Path)
 _WAYS = ("time", "rate", "world", "body")
@@ -74,6 +74,6 @@ def compare(
         result, other, reference, out, align=align, offset_s=offset_s, sigma_m=sigma_m, sigma_deg=sigma_deg
     )
     for line in outcome.lines:
-        click.echo(line)
+        show_line(line)
     if outcome.report is not None:
-        click.echo(f"report: {outcome.report}")
+        show_line(f"report: {outcome.report}")

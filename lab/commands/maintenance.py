@@ -8,7 +8,7 @@ from pathlib import Path
 
 import click
 
-from lab.commands.common import ANY_PATH, FOLDER, progress_bar
+from lab.commands.common import ANY_PATH, FOLDER, progress_bar, show_line
 
 
 @click.command()
@@ -30,7 +30,7 @@ def doctor(files: tuple[Path, ...], out: Path) -> None:
 
     lines = examine(files, out)
     for line in lines:
-        click.echo(str(line))
+        show_line(str(line))
     sys.exit(exit_status(lines))
 
 
@@ -48,7 +48,7 @@ def explain(codes: tuple[str, ...]) -> None:
     from lab.explain import catalogue
 
     texts = [catalogue.explain(code) for code in codes] if codes else catalogue.listed()
-    click.echo(("\n\n" if codes else "\n").join(texts))
+    show_line(("\n\n" if codes else "\n").join(texts))
 
 
 _FILES = ("rig", "run", "camera", "board", "calibration", "screens")
@@ -117,9 +117,9 @@ def init(
         int(values["cameras"]), int(values["screens"]), int(values["beams"]), distance, _picture_size(picture)
     )
     started = start(folder, layout, values["rate"])
-    click.echo(f"rig: {started.rig}")
-    click.echo(f"run: {started.run}")
-    click.echo(f"Next: beampose check {folder}; beampose run {folder} --out {folder / 'results'}")
+    show_line(f"rig: {started.rig}")
+    show_line(f"run: {started.run}")
+    show_line(f"Next: beampose check {folder}; beampose run {folder} --out {folder / 'results'}")
 
 
 def _picture_size(text: str) -> tuple[int, int]:
@@ -149,7 +149,7 @@ def verify(results: Path, run_folder: Path | None) -> None:
     with progress_bar(results.name) as progress:
         verification = verify_results(results, run_folder, progress)
     for line in verification.lines():
-        click.echo(line)
+        show_line(line)
     sys.exit(verification.exit_status)
 
 
@@ -174,4 +174,4 @@ def schema(name: str | None, out: Path | None) -> None:
         click.echo(as_text(str(name)), nl=False)
         return
     for path in write([name] if name else list(_FILES), out):
-        click.echo(f"schema: {path}")
+        show_line(f"schema: {path}")

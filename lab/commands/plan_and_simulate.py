@@ -59,8 +59,8 @@ def simulate(
 
     if scenario == "list":
         for listed in SCENARIOS.values():
-            click.echo(f"{listed.name:24s}{listed.summary}")
-        click.echo(f"{'lights:':24s}{', '.join(LIGHTS)}")
+            show_line(f"{listed.name:24s}{listed.summary}")
+        show_line(f"{'lights:':24s}{', '.join(LIGHTS)}")
         return
     if out is None:
         raise click.UsageError("Missing option '--out'.")

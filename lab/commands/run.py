@@ -9,6 +9,7 @@ from typing import Any
 import click
 
 from lab.commands.common import ANY_PATH, FOLDER, NumberRange, conclude, progress_bar, set_option, show_line
+from lab.commands.verbosity import quiet_option, shown, verbose_option
 
 causal_option = click.option(
     "--causal", is_flag=True, help="No smoothing pass: attitude.csv has the poses as known at each instant."
@@ -22,8 +23,8 @@ causal_option = click.option(
 @click.option(
     "--full-hash", is_flag=True, help="Fingerprint every byte of the inputs; otherwise large ones are sampled."
 )
-@click.option("--verbose", "-v", is_flag=True, help="Show the lines of run.log on standard error as they come.")
-@click.option("--quiet", "-q", is_flag=True, help="Show nothing but errors.")
+@verbose_option
+@quiet_option
 @set_option
 @click.pass_context
 def run(
@@ -43,7 +44,6 @@ def run(
         beampose run sample_runs/huo2015 --out results/huo2015
     """
     from lab.commands.command_line import provenance
-    from lab.commands.verbosity import shown
     from lab.files.run.fingerprints import fingerprints
     from lab.files.run.run_file import Run
     from lab.runs.process import process_run
@@ -110,14 +110,20 @@ def detect(
     help="Seconds for which a frame waits for a camera whose picture is missing.",
 )
 @click.option("--reprocess", is_flag=True, help="At the end, process the finished folders as `run` does.")
+@verbose_option
+@quiet_option
 @set_option
+@click.pass_context
 def watch(
+    ctx: click.Context,
     run_folder: Path,
     out: Path,
     udp: str | None,
     idle: float,
     timeout: float,
     reprocess: bool,
+    verbose: bool,
+    quiet: bool,
     settings: dict[str, Any],
 ) -> None:
     """Process a run while it is recorded: the pose of every frame as it arrives.
@@ -130,10 +136,11 @@ def watch(
     Example:
         beampose watch runs/today --out results/today --udp 127.0.0.1:5005
     """
+    from lab.commands.command_line import provenance
     from lab.watch.live_frames import WatchOptions
     from lab.watch.watch import stopped_by_ctrl_c, watch_run
 
-    with progress_bar(run_folder.name) as progress, stopped_by_ctrl_c() as stop:
+    with shown(run_folder.name, verbose=verbose, quiet=quiet) as progress, stopped_by_ctrl_c() as stop:
         outcome = watch_run(
             run_folder,
             out,
@@ -143,5 +150,8 @@ def watch(
             overrides=settings,
             progress=progress,
             stop=stop,
+            provenance=provenance(ctx),
         )
-    conclude(outcome)
+    if not quiet:
+        show_line(outcome.line())
+    sys.exit(outcome.exit_status)

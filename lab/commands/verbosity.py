@@ -9,7 +9,12 @@ from collections.abc import Callable, Iterator
 
 import click
 
-from lab.commands.common import progress_bar
+from lab.commands.common import StderrHandler, progress_bar
+
+verbose_option = click.option(
+    "--verbose", "-v", is_flag=True, help="Show the lines of run.log on standard error as they come."
+)
+quiet_option = click.option("--quiet", "-q", is_flag=True, help="Show nothing but errors.")
 
 
 class _Lines(logging.Handler):
@@ -24,10 +29,10 @@ def shown(name: str, *, verbose: bool, quiet: bool) -> Iterator[Callable[..., No
     Raises:
         click.UsageError: both options are given.
     """
-    if verbose and quiet:
-        raise click.UsageError("expected --verbose or --quiet, got both")
+    check_verbosity(verbose=verbose, quiet=quiet)
     if quiet:
-        yield None
+        with silenced():
+            yield None
     elif verbose:
         from lab.runs.run_log import LOGGER
 
@@ -40,3 +45,23 @@ def shown(name: str, *, verbose: bool, quiet: bool) -> Iterator[Callable[..., No
     else:
         with progress_bar(name) as progress:
             yield progress
+
+
+def check_verbosity(*, verbose: bool, quiet: bool) -> None:
+    """Raises click.UsageError where both options are given."""
+    if verbose and quiet:
+        raise click.UsageError("expected --verbose or --quiet, got both")
+
+
+@contextlib.contextmanager
+def silenced() -> Iterator[None]:
+    """Messages of the libraries, such as that they compile, are not shown on the terminal in this block."""
+    handlers = [h for h in logging.getLogger("beampose").handlers if isinstance(h, StderrHandler)]
+    before = [handler.level for handler in handlers]
+    for handler in handlers:
+        handler.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        for handler, level in zip(handlers, before, strict=True):
+            handler.setLevel(level)

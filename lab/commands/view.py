@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from lab.commands.common import ANY_PATH, FOLDER
+from lab.commands.common import ANY_PATH, FOLDER, complain, show_line
 
 
 @click.command()
@@ -34,6 +34,6 @@ def view(path: Path, out: Path | None, frame: int | None, rig: Path | None, sigm
 
     done = show(path, out, frame=frame, rig=rig, sigma_scale=sigma_scale)
     for file in done.files:
-        click.echo(file)
+        show_line(str(file))
     for note in done.notes:
-        click.echo(f"beampose: {note}", err=True)
+        complain(note)

@@ -2,21 +2,41 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
+from lab.errors import RunError
+from lab.explain.catalogue import EXPLANATIONS
 from lab.files.text.atomic_write import atomic_write_text
+from lab.files.text.error_text import printable
 from lab.report.html import environment
 
 
-def write_failure_report(results: Path, name: str, message: str, run_folder: Path | None = None) -> Path:
-    """Write report.html into a folder that has no usable results; returns its path.
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """What is known of a run that ended with an error."""
 
-    message: the error as the command line shows it: one plain line. The page lists the files of the folder, so that
-    results of an earlier attempt are not taken for those of this one.
-    """
-    files = sorted(p.name for p in results.iterdir() if p.is_file() and p.name != "report.html")
-    page = environment().get_template("failure.html.j2")
-    path = results / "report.html"
-    where = "" if run_folder is None else str(run_folder)
-    atomic_write_text(page.render(name=name, message=message, run_folder=where, files=files), path)
+    name: str
+    message: str  # the error as the command line shows it: one plain line
+    run_folder: str = ""
+    code: str = RunError.code  # its explanation is shown
+    exit_status: int = RunError.exit_status
+    log: Sequence[str] = ()  # lines up to the error
+    files: Sequence[str] = ()  # in the folder of the results: of an earlier attempt, or incomplete
+    traceback: str = ""  # address of its file, relative to the report
+    earlier: bool = False  # the results of an earlier, successful processing were kept elsewhere
+
+
+def files_beside(report: Path) -> list[str]:
+    """The names of the files in the folder of a report, so that they are not taken for results of this attempt."""
+    return sorted(p.name for p in report.parent.iterdir() if p.is_file() and p.name != report.name)
+
+
+def write_failure_report(path: Path, failure: Failure) -> Path:
+    """Write the report of a failure as the HTML file `path`; returns the path. Raises InputError."""
+    text = environment().get_template("failure.html.j2").render(
+        f=failure, explanation=EXPLANATIONS[failure.code], log=[printable(line) for line in failure.log]
+    )  # fmt: skip
+    atomic_write_text(text, path)
     return path

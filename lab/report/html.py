@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from functools import cache
 from pathlib import Path
 
 import jinja2
+from markupsafe import Markup, escape
 
 from lab.report.content_policy import content_policy
 
@@ -20,5 +22,11 @@ def environment() -> jinja2.Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    made.filters["words"] = words
     made.globals["content_policy"] = lambda template: content_policy(made, template)
     return made
+
+
+def words(text: str) -> Markup:
+    """A message as HTML: what the command line shows between backticks is code here."""
+    return Markup(re.sub(r"`([^`\n]+)`", r"<code>\1</code>", str(escape(text))))

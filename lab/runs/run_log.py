@@ -91,3 +91,24 @@ def listening() -> Iterator[RunLog]:
     finally:
         _LIBRARIES.removeHandler(log)
         _LIBRARIES.setLevel(level)
+
+
+class _Collector(logging.Handler):
+    def __init__(self, lines: list[str]) -> None:
+        super().__init__(logging.INFO)
+        self._lines = lines
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self._lines.append(record.getMessage())
+
+
+@contextlib.contextmanager
+def collected_lines() -> Iterator[list[str]]:
+    """A list that gets the lines of a run's log as they come: also of a run that ends with an error."""
+    lines: list[str] = []
+    handler = _Collector(lines)
+    LOGGER.addHandler(handler)
+    try:
+        yield lines
+    finally:
+        LOGGER.removeHandler(handler)

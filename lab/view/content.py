@@ -12,10 +12,9 @@ from geometry.pose import Pose
 from geometry.rig import Rig
 from lab.errors import InputError
 from lab.files.rig.rig_file import load_rig
-from lab.files.run.results import read_poses, read_summary
+from lab.files.run.results import PoseTrack, read_poses, read_summary
 from lab.files.run.run_file import load_run
 from lab.files.run.truth import load_run_truth
-from lab.report.run.summary import summary_of
 from tracking.statuses import PoseStatus
 
 
@@ -76,13 +75,17 @@ def read_content(path: Path, rig_path: Path | None) -> Content:
 
 
 def _of_results(results: Path, rig_path: Path | None) -> Content:
-    summary = summary_of(read_summary(results))
-    rig = load_rig(rig_path) if rig_path is not None else _rig_of_results(results, summary.run_folder)
+    summary = read_summary(results)
+    rig = load_rig(rig_path) if rig_path is not None else _rig_of_results(results, str(summary.get("run_folder") or ""))
     track = read_poses(results)
-    covariance = track.covariance[:, :3, :3]
+    return content_of_poses(str(summary.get("name") or results.resolve().name), rig, track)
+
+
+def content_of_poses(name: str, rig: Rig, track: PoseTrack) -> Content:
+    """The poses of attitude.csv with the covariances of their positions."""
+    covariance = track.covariance[:, :3, :3].copy()
     without = ~np.isfinite(covariance).all(axis=(1, 2))
     covariance[without] = track.sigma_position_m[without][:, :, None] ** 2 * np.eye(3)
-    name = summary.name or results.resolve().name
     measured = track.has(PoseStatus.MEASURED)
     t_s = _times(track.frames, track.t_s)
     return Content(name, "attitude.csv", rig, track.frames, t_s, track.world_from_body, covariance, measured)

@@ -9,10 +9,13 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from geometry.arrays import Array
+from geometry.arrays import Array, Ints
+from geometry.forward_model import SpotModel
 from lab.files.text.atomic_write import atomic_write_text
-from lab.report.calibration.calibration_scene import Marker, Ray, Rectangle, scene_views
+from lab.report.calibration.calibration_scene import Rectangle, scene_views
 from lab.report.html import environment
+from lab.report.plot.svg import ORANGE, PURPLE
+from lab.view.content import Content
 from lab.view.scene import View, thinned
 from lab.view.solids import edges
 
@@ -35,41 +38,67 @@ def write_page(view: View, index: int | None, path: Path) -> None:
             too_large=view.too_large,
             scale=f"{view.sigma_scale:g}",
             drawings=[Markup(d) for d in scene_views(things)],
-            data=Markup(json.dumps(scene_data(view, index), separators=(",", ":")).replace("<", "\\u003c")),
+            data=as_script(scene_data(view, index)),
         )
     )
     atomic_write_text(html, path)
 
 
-def scene_data(view: View, index: int | None) -> dict[str, Any]:
-    """The scene for the page's program: lines, labels and moments; coordinates in m, rounded to 0.1 mm."""
+def as_script(data: dict[str, Any]) -> Markup:
+    """Data for a script element of type application/json."""
+    return Markup(json.dumps(data, separators=(",", ":")).replace("<", "\\u003c"))
+
+
+def scene_data(
+    view: View, index: int | None, most_moments: int = MOST_MOMENTS, digits: int = 4, labels: bool = True
+) -> dict[str, Any]:
+    """The scene for the page's program: lines, labels and moments; coordinates in m, rounded to so many digits.
+
+    labels: with the names of screens and cameras.
+    """
     lines = []
     for thing in view.fixed:
         for number, line in enumerate(edges(thing, view.reach_m)):
-            label = thing.name if number == 0 and not thing.name.startswith("trajectory") else ""
-            lines.append({"c": thing.colour, "n": label, "f": isinstance(thing, Rectangle), "p": _rounded(line)})
+            label = thing.name if labels and number == 0 and not thing.name.startswith("trajectory") else ""
+            lines.append(
+                {"c": thing.colour, "n": label, "f": isinstance(thing, Rectangle), "p": _rounded(line, digits)}
+            )
     for e in view.ellipsoids:
-        lines += [{"c": e.colour, "n": "", "f": False, "p": _rounded(c.places)} for c in e.circles()]
+        lines += [{"c": e.colour, "n": "", "f": False, "p": _rounded(c.places, digits)} for c in e.circles()]
     content = view.content
-    moments = []
-    indices = thinned(np.flatnonzero(content.known), MOST_MOMENTS)
-    for i in indices:
-        things = view.moving(int(i))
-        rays = [t for t in things if isinstance(t, Ray)]
-        spots = [t for t in things if isinstance(t, Marker)]
-        moments.append(
+    indices = thinned(np.flatnonzero(content.known), most_moments)
+    first = 0 if index is None else min(int(np.searchsorted(indices, index)), len(indices) - 1)
+    return {"lines": lines, "moments": _moments(content, indices, digits), "first": first}
+
+
+def _moments(content: Content, indices: Ints, digits: int) -> list[dict[str, Any]]:
+    """Frame, time, status, rays and spots (name, colour and place) of some poses: as View.moving, all at once."""
+    rig, poses = content.rig, content.world_from_body[indices]
+    model = SpotModel.of(rig)
+    hits = model.hits(poses)[0]
+    starts = {b.name: poses.apply(b.point) for b in rig.beams.values()} if len(indices) else {}
+    out = []
+    for k, i in enumerate(indices.tolist()):
+        rays, spots, drawn = [], [], set()
+        for j, (_, spot) in enumerate(model.views):
+            if spot in drawn or not np.isfinite(hits[k, j]).all():
+                continue
+            drawn.add(spot)
+            rays.append(_rounded(np.stack([starts[rig.spots[spot].beam][k], hits[k, j]]), digits))
+            spots.append([spot, ORANGE, *hits[k, j].round(digits).tolist()])
+        spots.append(["vehicle", PURPLE, *poses.translation[k].round(digits).tolist()])
+        out.append(
             {
                 "k": int(content.frames[i]),
                 "t": round(float(content.t_s[i]), 4),
                 "m": bool(content.measured[i]),
-                "r": [_rounded(np.stack([t.start, t.end])) for t in rays],
-                "s": [[t.name, t.colour, *t.place.round(4).tolist()] for t in spots if np.isfinite(t.place).all()],
+                "r": rays,
+                "s": spots,
             }
         )
-    first = 0 if index is None else min(int(np.searchsorted(indices, index)), len(indices) - 1)
-    return {"lines": lines, "moments": moments, "first": first}
+    return out
 
 
-def _rounded(points: Array) -> list[list[float] | None]:
+def _rounded(points: Array, digits: int) -> list[list[float] | None]:
     """Points (n, 3) as lists; None where not finite."""
-    return [[round(v, 4) for v in p] if np.isfinite(p).all() else None for p in points.tolist()]
+    return [[round(v, digits) for v in p] if np.isfinite(p).all() else None for p in points.tolist()]

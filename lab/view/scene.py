@@ -25,6 +25,7 @@ MOST_ELLIPSOIDS = 60
 MOST_POINTS = 1500  # of the trajectory
 _LARGEST = 0.2  # largest semi-axis that is drawn, in shares of the scene's extent: larger ones would cover it
 _SHARE = 0.02  # of the scene's extent: the size at which a typical ellipsoid is drawn
+_SIZING = 200  # poses whose spots decide the size of a screen that states none
 _TURN = np.linspace(0, 2 * np.pi, 33)
 
 
@@ -65,22 +66,29 @@ class View:
         return [t for t in things if isinstance(t, Ray | Marker)]
 
 
-def view_of(content: Content, index: int | None, sigma_scale: float | None = None) -> View:
+def view_of(
+    content: Content,
+    index: int | None,
+    sigma_scale: float | None = None,
+    most_points: int = MOST_POINTS,
+    most_ellipsoids: int = MOST_ELLIPSOIDS,
+) -> View:
     """The scene of a content. index: of the pose whose spots size screens without a size.
 
-    sigma_scale: None: a round number that makes the ellipsoids visible.
+    sigma_scale: None: a round number that makes the ellipsoids visible. most_points: of the trajectory.
     """
     pose = None if index is None else content.world_from_body[index]
-    fixed: list[SceneObject] = [t for t in rig_things(content.rig, pose) if not isinstance(t, Ray | Marker)]
     known = np.flatnonzero(content.known)
+    others = content.world_from_body[thinned(known, _SIZING)] if len(known) > 1 else None
+    fixed: list[SceneObject] = [t for t in rig_things(content.rig, pose, others) if not isinstance(t, Ray | Marker)]
     if len(known) > 1:
-        fixed.append(Trail("trajectory", _trajectory(content), PURPLE))
+        fixed.append(Trail("trajectory", _trajectory(content, most_points), PURPLE))
     reach = frustum_length(fixed)
     points = np.concatenate([outline(t, reach) for t in fixed])
     extent = float(np.ptp(points[np.isfinite(points).all(axis=1)], axis=0).max())
     with_sigma = known[np.isfinite(content.position_covariance[known]).all(axis=(1, 2))]
     scale = _scale(content, with_sigma, extent) if sigma_scale is None else sigma_scale
-    ellipsoids = [ellipsoid(content, int(i), scale) for i in thinned(with_sigma, MOST_ELLIPSOIDS)]
+    ellipsoids = [ellipsoid(content, int(i), scale) for i in thinned(with_sigma, most_ellipsoids)]
     drawn = [e for e in ellipsoids if np.linalg.norm(e.axes, axis=0).max() <= _LARGEST * extent]
     return View(content, fixed, drawn, scale, len(ellipsoids) - len(drawn), reach, extent)
 
@@ -99,9 +107,9 @@ def thinned(indices: Ints, most: int) -> Ints:
     return indices[np.unique(np.linspace(0, len(indices) - 1, most).round().astype(np.int64))]
 
 
-def _trajectory(content: Content) -> Array:
-    """Positions (n, 3) at even steps of the frames, with nan where the pose is unknown."""
-    return content.world_from_body.translation[thinned(np.arange(len(content.frames)), MOST_POINTS)]
+def _trajectory(content: Content, most: int) -> Array:
+    """Positions (n, 3), at most so many, at even steps of the frames, with nan where the pose is unknown."""
+    return content.world_from_body.translation[thinned(np.arange(len(content.frames)), most)]
 
 
 def _scale(content: Content, indices: Ints, extent_m: float) -> float:

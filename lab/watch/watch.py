@@ -63,6 +63,7 @@ def watch_run(
     overrides: Mapping[str, Any] | None = None,
     progress: Progress | None = None,
     stop: threading.Event | None = None,
+    provenance: Mapping[str, Any] | None = None,
 ) -> WatchOutcome:
     """Process a run folder whose cameras are folders that are being filled, or devices.
 
@@ -71,7 +72,7 @@ def watch_run(
     when all devices have ended, or when `stop` is set; then `out` receives the results of `beampose run`, computed from
     the received detections. These differ from those of a run by the pictures that the noise is estimated from (here
     each camera's first ones) and by pictures that came too late. reprocess: computes the results from the finished
-    folders instead, as `beampose run` does, which takes longer.
+    folders instead, as `beampose run` does, which takes longer. provenance: added to summary.json, such as the command.
 
     Raises:
         BeamposeError: the run cannot be watched, or no picture came.
@@ -99,7 +100,7 @@ def watch_run(
             def more() -> dict[str, Any]:
                 if not reprocess:
                     pipeline.timings.detection += sum(finder.seconds for finder in finders.values())
-                return output.finish(work)
+                return {**(provenance or {}), **output.finish(work)}
 
             outcome = write_results(pipeline, work, Path(out), started, progress=progress, more=more)
     return WatchOutcome(outcome, output.latency)

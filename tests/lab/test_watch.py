@@ -115,7 +115,7 @@ def followed(recorded: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[
         listener.bind(("127.0.0.1", 0))
         listener.settimeout(0.5)
         address = f"127.0.0.1:{listener.getsockname()[1]}"
-        outcome = watched(run, run.parent / "out", feeder, udp=address)
+        outcome = watched(run, run.parent / "out", feeder, udp=address, provenance={"command": "beampose watch"})
         lines = [json.loads(listener.recv(10_000)) for _ in range(FRAMES)]
     assert outcome.exit_status == 0, outcome.line()
     return run.parent / "out", lines
@@ -143,8 +143,10 @@ def test_a_line_of_json_is_sent_for_every_frame(followed):
     assert 0 <= last["latency_ms"] < 10_000
 
 
-def test_the_summary_contains_the_latency_of_the_poses(followed):
-    live = json.loads((followed[0] / "summary.json").read_text("utf-8"))["live"]
+def test_the_summary_contains_the_latency_of_the_poses_and_the_command(followed):
+    summary = json.loads((followed[0] / "summary.json").read_text("utf-8"))
+    live = summary["live"]
+    assert summary["command"] == "beampose watch"
     latency = live["latency_ms"]
     assert latency["frames"] + latency["start_frames"] == FRAMES
     assert live["udp"]["not_sent"] == 0

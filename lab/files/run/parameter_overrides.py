@@ -12,8 +12,13 @@ from tracking.parameters import TrackerParameters
 MAX_DOTS = 5  # of a name; the parameters have one level of blocks
 
 
-def with_overrides(parameters: TrackerParameters, overrides: Mapping[str, Any]) -> TrackerParameters:
-    """The parameters with overrides, checked as in a file. Dotted names address inner blocks. Raises InputError."""
+def with_overrides(
+    parameters: TrackerParameters, overrides: Mapping[str, Any], place: str = "--set"
+) -> TrackerParameters:
+    """The parameters with overrides, checked as in a file. Dotted names address inner blocks.
+
+    place: where the overrides are from, in messages. Raises InputError.
+    """
     content = dataclasses.asdict(parameters)
     for name, value in overrides.items():
         *blocks, last = name.split(".") if name.count(".") <= MAX_DOTS else [name]
@@ -26,4 +31,4 @@ def with_overrides(parameters: TrackerParameters, overrides: Mapping[str, Any]) 
             inner[last] = value
             continue
         content[name] = value  # there is no such block, which the check reports
-    return dataclass_from_yaml(TrackerParameters, content, "--set")
+    return dataclass_from_yaml(TrackerParameters, content, place)

@@ -49,6 +49,7 @@ class SpotGrid:
     gain: Array  # (F, V)
     label_probability: Array  # (F, V) probability that the label is right; nan without a label, and in older results
     status: Ints  # (F, V) index into SPOT_STATUSES, or ABSENT
+    cov_uv_px2: Array | None = None  # (F, V), nan in older results; None: not read
 
     @property
     def measured(self) -> Bools:
@@ -118,7 +119,7 @@ def on_grid(
 def read_spots(results: Path) -> SpotGrid:
     """spots.csv of a results folder. Raises InputError."""
     required = [c for c in columns.SPOTS if c != "cov_uv_px2" and c not in columns.ADDED]
-    table = read_result_table(results / "spots.csv", required, ("label_probability",))
+    table = read_result_table(results / "spots.csv", required, ("label_probability", "cov_uv_px2"))
     frame, camera, spot = table.numbers["frame"], table.words["camera"], table.words["spot"]
     frames = np.unique(frame).astype(np.int64)
     pairs = np.unique(np.stack([camera.codes, spot.codes], -1), axis=0) if len(table) else np.zeros((0, 2), np.int64)
@@ -144,6 +145,7 @@ def read_spots(results: Path) -> SpotGrid:
         gain=grid("gain")[..., 0],
         label_probability=grid("label_probability")[..., 0],
         status=status,
+        cov_uv_px2=grid("cov_uv_px2")[..., 0],
     )
 
 

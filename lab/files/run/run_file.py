@@ -268,6 +268,11 @@ def _prior_of(block: _PriorBlock) -> PosePrior:
     )
 
 
+def prior_from(content: Mapping[str, Any], place: str) -> PosePrior:
+    """The prior region that the `prior` block of a run.yaml states. place: in messages. Raises InputError."""
+    return _prior_of(validated(_PriorBlock, dict(content), place))
+
+
 def _source_of(block: _SourceBlock, folder: Path, where: str) -> Source:
     if block.device is not None:
         return LiveDevice(block.device)

@@ -151,7 +151,7 @@ def page(report: CalibrationReport) -> str:
         ((len(d.picture.encode()), i, k) for i, section in enumerate(drawn) for k, d in enumerate(section)),
         reverse=True,
     )
-    excess = len(html.encode()) - LARGEST_BYTES
+    excess = len(html.encode("utf-8", "replace")) - LARGEST_BYTES
     if excess <= 0:
         return html
     for size, i, k in by_size:

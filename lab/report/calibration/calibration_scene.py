@@ -91,10 +91,11 @@ def frustum_of(camera: Camera, colour: str = BLUE) -> Frustum:
     return Frustum(camera.name, camera.camera_from_world, half, colour)
 
 
-def rig_things(rig: Rig, world_from_body: Pose | None = None) -> list[SceneObject]:
+def rig_things(rig: Rig, world_from_body: Pose | None = None, others: Pose | None = None) -> list[SceneObject]:
     """The cameras and screens of a rig and, if the vehicle's pose is given, its beams and spots.
 
-    A screen without a size is drawn large enough for its spots, at least 1 m.
+    A screen without a size is drawn large enough for its spots, at least 1 m. others: a stack of poses (k,) for whose
+    spots it is large enough too, but for the outermost of each hundred.
     """
     things: list[SceneObject] = []
     model = SpotModel.of(rig)
@@ -103,9 +104,12 @@ def rig_things(rig: Rig, world_from_body: Pose | None = None) -> list[SceneObjec
         size = screen.size_m
         if size is None:
             on_screen = np.array([s.screen == screen.name for s in (rig.spots[v] for _, v in model.views)], dtype=bool)
-            local = screen.world_from_screen.inverse().apply(hits[on_screen].reshape(-1, 3))[:, :2]
-            local = local[np.isfinite(local).all(axis=1)]
-            half = np.maximum(np.abs(local).max(axis=0, initial=0.4) * 1.2, 0.5)
+            half = 1.2 * _reach(hits[on_screen], screen.world_from_screen, 1.0)
+            if others is not None:
+                half = np.maximum(
+                    half, 1.2 * _reach(model.hits(others)[0][:, on_screen], screen.world_from_screen, 0.99)
+                )
+            half = np.maximum(half, 0.5)
             size = (2 * float(half[0]), 2 * float(half[1]))
         things.append(Rectangle(f"screen {screen.name}", screen.world_from_screen, size))
     things += [frustum_of(c) for c in rig.cameras.values()]
@@ -119,6 +123,13 @@ def rig_things(rig: Rig, world_from_body: Pose | None = None) -> list[SceneObjec
             things += [Ray(rig.spots[spot].beam, start, hits[i]), Marker(spot, hits[i])]
         things.append(Marker("vehicle", world_from_body.translation, PURPLE))
     return things
+
+
+def _reach(hits: Array, world_from_screen: Pose, share: float) -> Array:
+    """The distances (2,), m, along a screen's axes within which this share of points (..., 3) in world lies."""
+    local = world_from_screen.inverse().apply(hits.reshape(-1, 3))[:, :2]
+    local = local[np.isfinite(local).all(axis=1)]
+    return np.asarray(np.quantile(np.abs(local), share, axis=0)) if len(local) else np.zeros(2)
 
 
 def scene_views(

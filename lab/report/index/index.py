@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,7 +27,8 @@ _POINTS = (64, 20)  # per curve of a thumbnail: of few runs, of many
 _LEAST_DEG, _LEAST_M = 0.1, 0.001  # ranges that fill a thumbnail's height
 # Keys of a row that have a column of their own, or that its other columns imply.
 _SHOWN = {
-    *NAME, *VERDICT, *LINK, "frames", "measured_share", "measured_frames", "exit_status", "seconds", "message",
+    *NAME, *VERDICT, *LINK, "folder", "frames", "measured_share", "measured_frames", "exit_status", "seconds",
+    "message",
 }  # fmt: skip
 
 
@@ -58,18 +60,26 @@ def write_index(rows: Sequence[Mapping[str, Any]], out: Path) -> Path:
     its summary.json has no verdict of an earlier processing.
     """
     runs = sorted((indexed_run(row, Path(out)) for row in rows), key=lambda run: run.badness)
+    above = _common_folder([run.folder for run in runs])
     added = list(dict.fromkeys(key for row in rows for key in row if key not in _SHOWN))
     points = _POINTS[len(runs) > _MANY]
     counts = {(run.rank, run.status): 0 for run in runs}
     for run in runs:
         counts[run.rank, run.status] += 1
+    columns = [*_COLUMNS, *(Column(key.replace("_", " ")) for key in added)]
+    cells = [[*_cells(run, points), *(_other_cell(run.row.get(key)) for key in added)] for run in runs]
+    kept = [i for i in range(len(columns)) if any(row[i].text for row in cells)]  # no column without a value
     script = environment().get_template("index.js").render().strip()
     text = (
         environment()
         .get_template("index.html.j2")
         .render(
-            columns=[*_COLUMNS, *(Column(key.replace("_", " ")) for key in added), Column("message", css="words")],
-            runs=[(run, [*_cells(run, points), *_other_cells(run, added)]) for run in runs],
+            columns=[columns[i] for i in kept],
+            runs=[
+                (run, _path(run, above), _why(run, above), [row[i] for i in kept])
+                for run, row in zip(runs, cells, strict=True)
+            ],
+            above=above,
             counts=[(status, _word(runs, status), n) for (_, status), n in counts.items()],
             trends=[Markup(t) for t in trends(runs)],
             dated=len(dated(runs)),
@@ -80,6 +90,27 @@ def write_index(rows: Sequence[Mapping[str, Any]], out: Path) -> Path:
     path = Path(out) / FILE_NAME
     atomic_write_text(text.encode("utf-8", "replace").decode(), path)  # names of folders need not be valid text
     return path
+
+
+def _common_folder(folders: Sequence[str]) -> str:
+    """The folder that the folders of all runs are in, to be stated once; empty if there is none."""
+    try:
+        above = os.path.commonpath([os.path.dirname(folder) for folder in folders if folder])
+    except ValueError:  # no folder, or absolute and relative ones
+        return ""
+    return "" if above == os.path.sep else above
+
+
+def _path(run: IndexedRun, above: str) -> str:
+    """The run folder below the common one; empty where the name says it."""
+    path = os.path.relpath(run.folder, above) if run.folder and above else run.folder
+    return "" if path == run.name else path
+
+
+def _why(run: IndexedRun, above: str) -> str:
+    """The message, without the folder that the page states; that of a PASS says no more than the verdict."""
+    text = "" if run.status == "pass" else str(run.row.get("message") or "")
+    return text.replace(above + os.path.sep, "") if above else text
 
 
 def _word(runs: Sequence[IndexedRun], status: str) -> str:
@@ -94,9 +125,9 @@ _COLUMNS = (
     Column("measured", "Share of the frames with a measured pose", "n"),
     Column("rms (px)", "Median of the residual rms of the measured frames", "n"),
     Column("mean res. (px)", "Largest mean residual of a camera: grows when a camera or a screen has moved", "n"),
-    Column("σ attitude (°)", "Median over the frames of the largest sigma of yaw, pitch and roll", "n"),
-    Column("σ position (mm)", "Median over the frames of the largest sigma of x, y and z", "n"),
-    Column("calibration (d)", "Age of the calibration at the recording, days", "n"),
+    Column("σ\u00a0attitude (°)", "Median over the frames of the largest sigma of yaw, pitch and roll", "n"),
+    Column("σ\u00a0position (mm)", "Median over the frames of the largest sigma of x, y and z", "n"),
+    Column("calib. age (d)", "Age of the calibration at the recording, days", "n"),
     Column("time (s)", "Duration of the processing", "n"),
 )
 
@@ -142,11 +173,6 @@ def _shown(value: float, digits: int) -> Cell:
     shown = format_number(value, digits)
     plain = shown.replace(".", "", 1).isdigit()
     return Cell(shown, "n", "" if plain else f"{value:.6g}")
-
-
-def _other_cells(run: IndexedRun, added: Sequence[str]) -> list[Cell]:
-    words = str(run.row.get("message") or "")
-    return [*(_other_cell(run.row.get(key)) for key in added), Cell(words, "words")]
 
 
 def _other_cell(value: Any, digits: int = 4) -> Cell:

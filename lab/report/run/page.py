@@ -9,11 +9,12 @@ from markupsafe import Markup
 
 from lab.errors import InputError
 from lab.files.text.atomic_write import atomic_write_text
-from lab.report.failure import write_failure_report
+from lab.report.failure import Failure, files_beside, write_failure_report
 from lab.report.html import environment
 from lab.report.run import error_tables, figures, pose_curves, tables, trust, uncertainty
 from lab.report.run.blocks.model_fit import HEADS as MODEL_FIT_HEADS
 from lab.report.run.blocks.model_fit import model_fit
+from lab.report.run.blocks.scene import scene_of
 from lab.report.run.events import ShownEvent, events, selected
 from lab.report.run.pictures import pictures
 from lab.report.run.report_data import ReportData, read_report_data
@@ -38,7 +39,13 @@ def write_report(results: Path, run_folder: Path | None = None) -> Path:
         data = read_report_data(results, run_folder)
     except InputError as error:
         if results.is_dir():
-            write_failure_report(results, results.resolve().name, str(error), run_folder)
+            folder = "" if run_folder is None else str(run_folder)
+            write_failure_report(
+                path,
+                Failure(
+                    results.resolve().name, str(error), folder, error.code, error.exit_status, files=files_beside(path)
+                ),
+            )
         raise
     atomic_write_text(page(data, results), path)
     return path
@@ -69,6 +76,7 @@ def page(m: ReportData, results: Path) -> str:
         "budget_rows": uncertainty.budget_rows(m),
         "budget_words": uncertainty.words(m),
         "tracks": [Markup(t) for c in m.spots.cameras if (t := tracks_figure(m, c, zoom))],
+        "scene": scene_of(m.name, None if m.run is None else m.run.rig, m.poses),
         "timeline": Markup(timeline_figure(m)) if len(m.spots.frames) and m.spots.views else "",
         "spot_legend": [(str(s), SPOT_COLOURS[s], s.meaning_for(method)) for s in SpotStatus],
         "pose_legend": [(str(s), POSE_COLOURS[s], s.meaning) for s in PoseStatus],

@@ -17,6 +17,7 @@ from lab.report.run.report_data import ReportData
 from tracking.statuses import PoseStatus
 
 GOOD, LOOK, BAD, UNKNOWN = "good", "look", "bad", "unknown"
+_MODEL = "Fit of rig and recording"
 _LARGE = 1.5  # residuals over their stated sigma from which a camera or beam is pointed out
 _LEVELS = {"small": GOOD, "check": LOOK, "fail": BAD}
 _SURE, _MOST, _DOUBTFUL = 0.99, 0.95, 0.9  # probability of a label: sure; share of sure labels; doubtful below
@@ -96,14 +97,19 @@ def _day(value: object) -> datetime.date | None:
 
 
 def _model(fit: ModelFit | None) -> Evidence:
+    """Whether the residuals agree with the rig as calibrated."""
     if fit is None:
-        return Evidence(UNKNOWN, "Rig and recording", "the results have no model check")
-    if fit.sentence.startswith("Not tested"):
-        return Evidence(UNKNOWN, "Rig and recording", fit.sentence)
+        return Evidence(UNKNOWN, _MODEL, "the results have no model check")
+    if not fit.tested:
+        return Evidence(UNKNOWN, _MODEL, fit.sentence[:1].lower() + fit.sentence[1:].rstrip("."))
     levels = [_LEVELS.get(f.level, LOOK) for f in fit.findings]
     worst = BAD if BAD in levels else LOOK if LOOK in levels else GOOD
-    words = fit.sentence.rstrip(":.") + "".join(f"; {f.what}" for f in fit.findings[:2])
-    return Evidence(worst, "Rig and recording", words)
+    words = "the residuals agree with the calibrated rig"
+    if levels:
+        words = "deviations within the stated uncertainty" if worst == GOOD else "the residuals do not fit the rig"
+    words += f" ({_count(fit.frames)} tested)" if fit.frames is not None else ""
+    found = "; ".join(f.what for f in fit.findings[:2]) + ("; and more" if len(fit.findings) > 2 else "")
+    return Evidence(worst, _MODEL, f"{words}: {found}" if found else words)
 
 
 def _residuals(m: ReportData) -> list[Evidence]:
@@ -206,7 +212,7 @@ def methods(m: ReportData, fit: ModelFit | None) -> Methods:
 
 
 def _model_words(fit: ModelFit | None) -> str:
-    if fit is None or fit.sentence.startswith("Not tested"):
+    if fit is None or not fit.tested:
         return ""
     if not fit.findings:
         return "No deviation of a camera, screen, beam or clock from the calibrated rig was found in the residuals."

@@ -353,6 +353,7 @@
       });
     }
     readout(i, t);
+    document.dispatchEvent(new CustomEvent("beampose-cursor", { detail: t })); // for the scene in three dimensions
   }
   function readout(i, t) {
     dock.style.display = t === null ? "none" : "block";

@@ -1,10 +1,25 @@
 "use strict";
 (() => {
-  const data = JSON.parse(document.getElementById("data").textContent);
+  const source = document.getElementById("scene-data");
+  if (!source) return;
+  const data = JSON.parse(source.textContent);
+  if (data.packed) { // of a report: whole mm (lab/report/run/blocks/scene.py)
+    const metres = p => p && p.map(v => v / 1000);
+    for (const line of data.lines) line.p = line.p.map(metres);
+    data.moments = data.packed.map(([k, t, m, at, spots]) => {
+      const vehicle = metres(at), places = spots.map(s => metres(s.slice(1, 4)));
+      return {
+        k, t, m, r: spots.map((s, i) => [s.length > 4 ? metres(s.slice(4)) : vehicle, places[i]]),
+        s: [...spots.map((s, i) => [data.names[s[0]], "#E69F00", ...places[i]]), ["vehicle", "#CC79A7", ...vehicle]],
+      };
+    });
+  }
   const canvas = document.getElementById("scene"), pen = canvas.getContext("2d");
-  const slider = document.getElementById("time"), play = document.getElementById("play");
-  const shown = document.getElementById("moment"), moments = data.moments;
-  let turn = -0.6, tilt = 0.5, zoom = 1, playing = null;
+  const slider = document.getElementById("scene-time"), play = document.getElementById("scene-play");
+  const shown = document.getElementById("scene-moment"), moments = data.moments;
+  const box = canvas.closest("[data-scene]"); // in a report: the drawings are shown until the scene is
+  if (box) box.classList.add("live-scene");
+  let turn = -0.6, tilt = 0.5, zoom = document.querySelector("[data-scene]") ? 0.8 : 1, playing = null;
 
   // The box of the scene: its centre and half its diagonal.
   const low = [1e9, 1e9, 1e9], high = [-1e9, -1e9, -1e9];
@@ -101,7 +116,8 @@
     draw();
   });
   canvas.addEventListener("pointerup", () => { grip = null; });
-  canvas.addEventListener("wheel", e => { e.preventDefault(); zoom *= Math.exp(-e.deltaY / 600); draw(); }, { passive: false });
+  // In a report the wheel scrolls the page until the scene is clicked.
+  canvas.addEventListener("wheel", e => { if (box && document.activeElement !== canvas) return; e.preventDefault(); zoom *= Math.exp(-e.deltaY / 600); draw(); }, { passive: false });
   canvas.addEventListener("keydown", e => {
     const by = { ArrowLeft: [-0.1, 0], ArrowRight: [0.1, 0], ArrowUp: [0, 0.1], ArrowDown: [0, -0.1] }[e.key];
     if (by) { turn += by[0]; tilt = limit(tilt + by[1]); }
@@ -111,6 +127,17 @@
     e.preventDefault();
     draw();
   });
+  // The report's cursor: the moment nearest to its time.
+  document.addEventListener("beampose-cursor", e => {
+    if (!moments.length || e.detail === null) return;
+    let best = 0;
+    moments.forEach((m, k) => { if (Math.abs(m.t - e.detail) < Math.abs(moments[best].t - e.detail)) best = k; });
+    if (Number(slider.value) === best) return;
+    stop();
+    slider.value = best;
+    draw();
+  });
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", draw);
   window.addEventListener("resize", draw);
   draw();
 })();

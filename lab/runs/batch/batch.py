@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import time
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,12 +17,13 @@ from lab.runs.batch.result_folders import allotted, moved_runs
 from lab.runs.batch.resumption import fingerprint_of, finished_summary
 from lab.runs.batch.run_list import listed_runs
 from lab.runs.batch.table import BatchTable, locked, read_rows
-from lab.runs.batch.task import Task, TaskOutcome, failed_row, perform
+from lab.runs.batch.task import Task, TaskOutcome, concluded, failed_row, perform
 from lab.runs.batch.workers import performed
 from lab.runs.process import ready_run
 from tracking.parameters import TrackerParameters
 
-INDEX_SECONDS = 60.0  # index.html of a long batch is at most this old
+INDEX_SECONDS = 60.0  # between two versions of index.html in a long batch
+_INDEX_SHARE = 0.02  # of the time, at most, is spent on them: that of 2,000 runs takes several seconds
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +37,8 @@ class BatchOptions:
     shard: tuple[int, int] = (1, 1)  # (i, n): the i-th of n parts of the runs
     full_hash: bool = False  # large files are read completely for the fingerprint
     parquet: bool = False  # also write Parquet data sets of attitudes and spots
+    dask: str | None = None  # address of a Dask cluster that processes the runs, in place of processes
+    provenance: Mapping[str, Any] | None = None  # added to every summary.json, such as the command line
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,12 +67,15 @@ def process_batch(
     *,
     lists: Sequence[str | os.PathLike[str]] = (),
     report: Callable[[str], None] = lambda line: None,
+    complain: Callable[[str], None] | None = None,
+    log: Callable[[str], None] = lambda line: None,
     progress: Callable[[int, int, int], None] = lambda done, processed, total: None,
 ) -> BatchOutcome:
     """Process runs into folders in `out`; a run that fails, in whatever way, does not stop the others.
 
-    runs, lists: as for `listed_runs`. report: called with one line per run. progress: called with the numbers of
-    runs that are done, that were processed (not skipped), and of all. With `jobs`, a script must call this under
+    runs, lists: as for `listed_runs`. report: called with one line per run. complain: in its place for runs that ended
+    with an error. log: called with the lines of each run's log when it ends. progress: called with the numbers of runs
+    that are done, that were processed (not skipped), and of all. With `jobs`, a script must call this under
     `if __name__ == "__main__"`, since the processes import it.
 
     Raises:
@@ -87,29 +93,47 @@ def process_batch(
     number, count = options.shard
     mine = tasks[number - 1 :: count]
     rows: dict[str, Mapping[str, Any]] = {}
-    skipped, written = 0, 0.0
+    skipped = 0
     progress(0, 0, len(mine))
-    try:
-        with contextlib.closing(_outcomes(mine, options.jobs)) as outcomes:
-            for task, outcome in outcomes:
-                rows[task.place] = outcome.row
-                skipped += outcome.skipped
-                table.add(outcome.row, outcome.skipped)
-                report(_line(task, outcome))
-                progress(len(rows), len(rows) - skipped, len(mine))
-                # After every run: if the program is killed, the rows so far are kept. Rows of skipped runs follow
-                # from their results. If the disk is full, the next run may find space, and the end reports it.
-                if not outcome.skipped:
-                    now = time.monotonic()
-                    with contextlib.suppress(InputError):
-                        table.write(index=now - written > INDEX_SECONDS and len(rows) > 1)
-                        written = now if now - written > INDEX_SECONDS else written
-    finally:
-        table.write(index=True)
+    with _outcomes(mine, out, options, report) as outcomes, _written(table) as add:
+        for task, ended in outcomes:
+            outcome = concluded(task, ended)
+            rows[task.place] = outcome.row
+            skipped += outcome.skipped
+            add(outcome)
+            for line in outcome.log:
+                log(f"{task.results}: {line}")
+            (complain if complain and outcome.row["status"] == "error" else report)(_line(task, outcome))
+            progress(len(rows), len(rows) - skipped, len(mine))
     if options.parquet:
         with locked(out):
             update_data_sets(read_rows(table.path), out)
     return BatchOutcome(tuple(rows[task.place] for task in mine), skipped, table.path, out / "index.html")
+
+
+@contextlib.contextmanager
+def _written(table: BatchTable) -> Iterator[Callable[[TaskOutcome], None]]:
+    """A function that puts an outcome into batch.csv; index.html is written now and then, and when the block ends."""
+    due = time.monotonic() + INDEX_SECONDS
+
+    def add(outcome: TaskOutcome) -> None:
+        nonlocal due
+        table.add(outcome.row, outcome.skipped)
+        # After every run: if the program is killed, the rows so far are kept. Rows of skipped runs follow from their
+        # results. If the disk is full, the next run may find space, and the end reports it.
+        if not outcome.skipped:
+            begun = time.monotonic()
+            index = begun > due
+            with contextlib.suppress(InputError):
+                table.write(index=index)
+            if index:
+                now = time.monotonic()
+                due = now + max(INDEX_SECONDS, (now - begun) / _INDEX_SHARE)
+
+    try:
+        yield add
+    finally:
+        table.write(index=True)
 
 
 def _make_folder(out: Path) -> None:
@@ -133,19 +157,33 @@ def _tasks(folders: Sequence[Path], out: Path, options: BatchOptions) -> list[Ta
                     resumable[place] = name
         names = allotted(out, folders, resumable)
     return [
-        Task(folder, out, name, overrides, options.causal, options.force, options.full_hash)
+        Task(folder, out, name, overrides, options.causal, options.force, options.full_hash, options.provenance or {})
         for folder, name in zip(folders, names, strict=True)
     ]
 
 
-def _outcomes(tasks: Sequence[Task], jobs: int | None) -> Generator[tuple[Task, TaskOutcome], None, None]:
-    if jobs is None or len(tasks) == 1:
-        for task in tasks:
-            yield task, perform(task)
-        return
-    if not tasks:
-        return
-    with contextlib.closing(performed(tasks, perform, min(jobs, len(tasks)))) as results:
+@contextlib.contextmanager
+def _outcomes(
+    tasks: Sequence[Task], out: Path, options: BatchOptions, report: Callable[[str], None]
+) -> Iterator[Iterator[tuple[Task, TaskOutcome]]]:
+    """The tasks with their outcomes, as they end: in this process, in others, or on a cluster."""
+    with contextlib.ExitStack() as stack:
+        if options.dask is not None:
+            from lab.runs.batch.cluster import connected
+
+            cluster = stack.enter_context(connected(options.dask, out))
+            if note := cluster.check(tasks):
+                report(f"note: {note}")
+            outcomes = cluster.performed(tasks)
+        elif options.jobs is None or len(tasks) <= 1:
+            outcomes = ((task, perform(task)) for task in tasks)
+        else:
+            outcomes = _by_processes(tasks, min(options.jobs, len(tasks)))
+        yield stack.enter_context(contextlib.closing(outcomes))
+
+
+def _by_processes(tasks: Sequence[Task], jobs: int) -> Generator[tuple[Task, TaskOutcome], None, None]:
+    with contextlib.closing(performed(tasks, perform, jobs)) as results:
         for task, outcome in results:
             died = "the process ended without a result: it was killed, or ran out of memory, or a library crashed"
             yield task, outcome or TaskOutcome(failed_row(task, died))

@@ -34,13 +34,13 @@ def fingerprint_of(run: Run, causal: bool, full: bool = False) -> str:
         "causal": causal,
         "calibration": None if run.calibration is None else state_mapping(run.calibration),
         "versions": versions(),
-        "program": _program(),
+        "program": program_digest(),
     }
     return hashlib.sha256(json.dumps(plain_value(content), sort_keys=True, default=str).encode()).hexdigest()
 
 
 @cache
-def _program() -> str:
+def program_digest() -> str:
     """SHA-256 of the program's sources and templates: a version in development has no number of its own."""
     root = Path(__file__).resolve().parents[3]
     digest = hashlib.sha256()

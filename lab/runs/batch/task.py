@@ -2,25 +2,33 @@
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
 import os
 import tempfile
+import time
 import traceback
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from lab.errors import BeamposeError, RunError
+from lab.files.output.folder_lock import FolderInUseError
 from lab.files.run.run_file import Run
 from lab.files.text.atomic_write import atomic_write_text
 from lab.runs.batch.result_folders import displayed
 from lab.runs.batch.resumption import fingerprint_of, finished_summary
 from lab.runs.process import RunOutcome, process_run
+from lab.runs.run_log import collected_lines
 
 COLUMNS = (
     "run", "name", "folder", "status", "exit_status", "frames", "measured_frames", "measured_share", "seconds",
-    "results", "message",
+    "results", "message", "report",
 )  # fmt: skip
+REPORT = "report.html"  # in a result folder
+_WAITING_S = 1.0  # between two attempts
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +42,8 @@ class Task:
     causal: bool = False
     force: bool = False  # process although results exist
     full_hash: bool = False
+    provenance: Mapping[str, Any] = field(default_factory=dict)  # added to summary.json
+    patience_s: float = 0.0  # for the end of another process that writes to the result folder
 
     @property
     def place(self) -> str:
@@ -45,6 +55,11 @@ class Task:
         """Where the traceback of an unforeseen error is saved."""
         return self.out / "errors" / f"{self.results}.txt"
 
+    @property
+    def error_report(self) -> Path:
+        """The report of a run that ended with an error. Its result folder keeps earlier results."""
+        return self.error_file.with_suffix(".html")
+
 
 @dataclass(frozen=True, slots=True)
 class TaskOutcome:
@@ -52,6 +67,8 @@ class TaskOutcome:
 
     row: dict[str, Any]
     skipped: bool = False
+    code: str = ""  # of the error, for `beampose explain`
+    log: tuple[str, ...] = ()  # the lines of the run's log
 
 
 class _AlreadyDone(Exception):  # noqa: N818 - ends the processing, not an error
@@ -68,27 +85,38 @@ def perform(task: Task) -> TaskOutcome:
         summary = None if task.force else finished_summary(task.out / task.results, value)
         if summary is not None:
             raise _AlreadyDone(summary)
-        return {"fingerprint": value}
+        return {**task.provenance, "fingerprint": value}
 
-    try:
-        outcome = process_run(
-            task.folder, task.out / task.results, overrides=task.overrides, causal=task.causal, more=fingerprint
-        )
-        row, skipped = _row(task, outcome), False
-    except _AlreadyDone as done:
+    code = ""
+    with collected_lines() as log:
         try:
-            row, skipped = _row_of_summary(task, done.summary), True
-        except (KeyError, TypeError, AttributeError, ValueError):
-            row, skipped = failed_row(task, "summary.json of the earlier results is damaged; delete the folder"), False
-    except BeamposeError as error:
-        row, skipped = failed_row(task, str(error), error.exit_status), False
-    except Exception as error:  # unforeseen: it must not stop the other runs
-        row, skipped = failed_row(task, _unforeseen(task, error)), False
-    else:
-        _remove_error_file(task)
-    if skipped:
-        _remove_error_file(task)
-    return TaskOutcome(row, skipped)
+            row, skipped = _row(task, _processed(task, fingerprint)), False
+        except _AlreadyDone as done:
+            try:
+                row, skipped = _row_of_summary(task, done.summary), True
+            except (KeyError, TypeError, AttributeError, ValueError):
+                damaged = "summary.json of the earlier results is damaged; delete the folder"
+                row, skipped, code = failed_row(task, damaged), False, RunError.code
+        except BeamposeError as error:
+            row, skipped, code = failed_row(task, str(error), error.exit_status), False, error.code
+        except Exception as error:  # unforeseen: it must not stop the other runs
+            row, skipped, code = failed_row(task, _unforeseen(task, error)), False, RunError.code
+    return TaskOutcome(row, skipped, code, tuple(log))
+
+
+def _processed(task: Task, more: Callable[[Run], Mapping[str, Any]]) -> RunOutcome:
+    """Process the run; waits while another process writes to its result folder. Raises as `process_run`."""
+    waited = 0.0
+    while True:
+        try:
+            return process_run(
+                task.folder, task.out / task.results, overrides=task.overrides, causal=task.causal, more=more
+            )
+        except FolderInUseError:
+            if waited >= task.patience_s:
+                raise
+            time.sleep(_WAITING_S)
+            waited += _WAITING_S
 
 
 def failed_row(task: Task, message: str, exit_status: int = RunError.exit_status) -> dict[str, Any]:
@@ -117,6 +145,7 @@ def _row(task: Task, outcome: RunOutcome) -> dict[str, Any]:
         "seconds": round(outcome.seconds, 3),
         "results": task.results,
         "message": _as_text("; ".join(outcome.verdict.texts)),
+        "report": f"{task.results}/{REPORT}",
     }
 
 
@@ -136,6 +165,7 @@ def _row_of_summary(task: Task, summary: Mapping[str, Any]) -> dict[str, Any]:
         "seconds": round(float(summary["timings"]["wall_s"]), 3),
         "results": task.results,
         "message": "; ".join(verdict["reasons"]),
+        "report": f"{task.results}/{REPORT}",
     }
 
 
@@ -168,10 +198,36 @@ def _unforeseen(task: Task, error: Exception) -> str:
     return f"{message}; its traceback could not be saved"
 
 
-def _remove_error_file(task: Task) -> None:
-    """The traceback of an earlier attempt, and the folder where it was the last."""
+def concluded(task: Task, outcome: TaskOutcome) -> TaskOutcome:
+    """The outcome with its report: that of a failure is written here, and that of an earlier failure is removed."""
+    if outcome.row["status"] != "error":
+        _remove_error_files(task)
+        return outcome
+    from lab.report.failure import Failure, write_failure_report  # imports the template engine
+
+    row, saved = outcome.row, task.error_file
+    failure = Failure(
+        name=row["name"],
+        message=row["message"],
+        run_folder=row["run"],
+        code=outcome.code or RunError.code,
+        exit_status=row["exit_status"],
+        log=outcome.log,
+        traceback=quote(os.fsencode(saved.name)) if str(saved) in row["message"] else "",
+        earlier=(task.out / task.results / REPORT).is_file(),
+    )
     try:
+        saved.parent.mkdir(parents=True, exist_ok=True)
+        write_failure_report(task.error_report, failure)
+    except (OSError, BeamposeError):  # a full disk: the row has the message
+        return outcome
+    report = f"{saved.parent.name}/{task.error_report.name}"
+    return dataclasses.replace(outcome, row={**row, "report": report})
+
+
+def _remove_error_files(task: Task) -> None:
+    """The traceback and the report of an earlier attempt, and the folder where they were the last."""
+    with contextlib.suppress(OSError):
+        task.error_report.unlink(missing_ok=True)
         task.error_file.unlink(missing_ok=True)
         task.error_file.parent.rmdir()
-    except OSError:
-        pass

@@ -48,6 +48,7 @@ def _until_a_process_dies(
 ) -> Generator[tuple[T, R | None], None, list[T]]:
     """Takes tasks from `waiting`; returns those that were running when a process died, none at the end."""
     running: dict[Future[R], T] = {}
+    ended: list[tuple[T, R]] = []  # held back until their processes have new tasks: the caller may take its time
     threads = threads_per_process(jobs)
     with _limited_threads(threads), _pool(jobs, threads) as pool:
         while waiting or running:
@@ -57,6 +58,8 @@ def _until_a_process_dies(
                 except BrokenProcessPool:
                     break
                 waiting.popleft()
+            yield from ended
+            ended.clear()
             if not running:
                 return []  # no process could be started for a task: the caller starts a new pool
             done, _ = wait(running, return_when=FIRST_COMPLETED)
@@ -64,14 +67,17 @@ def _until_a_process_dies(
             for future in done:
                 task = running.pop(future)
                 try:
-                    result = future.result()
+                    ended.append((task, future.result()))
                 except BrokenProcessPool:
                     interrupted.append(task)
-                    continue
-                yield task, result
             if interrupted:
-                return [*interrupted, *running.values()]
-    return []
+                interrupted += running.values()
+                running.clear()
+                break
+        else:
+            interrupted = []
+    yield from ended
+    return interrupted
 
 
 def threads_per_process(jobs: int) -> int:

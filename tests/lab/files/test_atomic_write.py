@@ -38,6 +38,39 @@ def test_the_target_appears_only_when_the_block_has_ended(tmp_path):
     assert names(tmp_path) == ["results"]
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="the names of open files are read from /proc")
+def test_all_files_are_on_the_disk_before_the_folder_gets_its_name(tmp_path, monkeypatch):
+    """Otherwise a power cut leaves a complete folder of empty files."""
+    original, synced = os.fsync, []
+
+    def fsync(file: int) -> None:
+        assert not target.exists()
+        synced.append(os.path.basename(os.readlink(f"/proc/self/fd/{file}")))
+        original(file)
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    target = tmp_path / "results"
+    with atomic_folder(target, never) as work:
+        (work / "inner").mkdir()
+        for name in ("a.csv", "inner/b.txt"):
+            (work / name).write_text("1")
+    assert sorted(synced) == sorted(["a.csv", "b.txt", "inner", work.name])
+
+
+def test_a_disk_that_fails_at_the_end_leaves_the_old_results(tmp_path, monkeypatch):
+    def fsync(file: int) -> None:
+        raise OSError(errno.EIO, "Input/output error")
+
+    target = tmp_path / "results"
+    target.mkdir()
+    (target / "a.csv").write_text("old")
+    monkeypatch.setattr(os, "fsync", fsync)
+    with pytest.raises(OSError, match="Input/output"), atomic_folder(target, always) as work:
+        (work / "a.csv").write_text("new")
+    assert (target / "a.csv").read_text() == "old"
+    assert names(tmp_path) == ["results"]
+
+
 @pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt, SystemExit])
 def test_a_block_that_ends_with_an_exception_leaves_nothing(tmp_path, error):
     target = tmp_path / "results"

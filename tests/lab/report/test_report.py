@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from lab import number_format
+from lab.files.run.results import read_poses
 from lab.report.index.index import write_index
 from lab.report.plot import thinning
 from lab.report.plot.image import grey_limits, stretched
@@ -439,6 +440,20 @@ class TestIndex:
         assert "no &lt;rig&gt; &amp; no run" in html
         assert "<rig>" not in html
 
+    def test_the_folder_of_all_runs_is_stated_once_and_a_column_without_a_value_is_left_out(self, tmp_path):
+        rows = [{**row, "run": f"/data/campaign/day/{row['name']}-x"} for row in self.ROWS]
+        rows[1]["message"] = "/data/campaign/day/b-error-x/run.yaml: expected a mapping"
+        html = write_index(rows, tmp_path).read_text(encoding="utf-8")
+        assert html.count("/data/campaign/day") == 1
+        assert "b-error-x/run.yaml: expected a mapping" in html
+        assert ">frames<" in html
+        assert ">time (s)<" not in html
+
+    def test_folders_without_a_common_one_are_shown_in_full(self, tmp_path):
+        rows = [{**row, "run": f"{place}/x"} for row, place in zip(self.ROWS, ("/a", "/b", "", "c"), strict=True)]
+        html = write_index(rows, tmp_path).read_text(encoding="utf-8")
+        assert all(f'<span class="path">{place}/x</span>' in html for place in ("/a", "/b", "", "c"))
+
     def test_the_index_of_an_empty_batch_says_so(self, tmp_path):
         assert "The batch has no runs." in write_index([], tmp_path).read_text(encoding="utf-8")
 
@@ -446,3 +461,25 @@ class TestIndex:
 @pytest.mark.slow
 def test_a_report_of_a_hundred_thousand_frames_stays_under_five_megabytes(tmp_path):
     assert write_report(make(tmp_path, 100_000).results).stat().st_size < 5_000_000
+
+
+def test_the_scene_in_three_dimensions_follows_the_cursor_and_has_the_poses_of_the_run(tmp_path):
+    fake = make(tmp_path, 120, seed=4)
+    page = write_report(fake.results).read_text()
+    data = json.loads(re.search(r'<script type="application/json" id="scene-data">(.*?)</script>', page, re.DOTALL)[1])
+    poses = read_poses(fake.results)
+    places = {int(f): p for f, p in zip(poses.frames, poses.world_from_body.translation, strict=True)}
+    assert len(data["packed"]) == 40
+    for frame, _, _, at, spots in data["packed"]:
+        np.testing.assert_allclose(np.array(at) / 1000, places[frame], atol=0.6e-3)
+        assert {data["names"][s[0]] for s in spots} <= set("123456")
+    # A drawing is there where no script runs, and in print.
+    assert page.count("Screens, cameras and beams, ") >= 2
+    assert page.count('"beampose-cursor"') == 2  # sent by the plots, received by the scene
+    assert len(re.search(r'<div class="scene" data-scene>.*?</section>', page, re.DOTALL)[0]) < 45_000
+
+
+def test_a_report_without_the_rig_has_no_scene(tmp_path):
+    fake = make(tmp_path, 20)
+    (fake.run_folder / "rig.yaml").unlink()
+    assert "In three dimensions" not in write_report(fake.results).read_text()

@@ -135,7 +135,7 @@ def test_markup_in_names_does_not_end_the_data_block(fake, tmp_path):
     spots = results / "spots.csv"
     spots.write_text(spots.read_text().replace(",left,1,", ",left,</script>1,"))
     html = write_report(results).read_text(encoding="utf-8")
-    assert html.count("</script>") == 2
+    assert html.count("</script>") == 4  # two blocks of data, two programs
     assert json.loads(re.search(r'id="zoom-data">(.*?)</script>', html, flags=re.S).group(1))["rows"]
 
 
@@ -164,7 +164,13 @@ def test_damaged_tables_give_a_report_that_says_so(tmp_path):
 def test_the_evidence_leads_to_the_longest_gap_and_the_least_certain_label(fake):
     m = read_report_data(fake.results, None)
     lines = {e.name: e for e in evidence(m, None)}
-    assert set(lines) >= {"Poses", "Calibration", "Rig and recording", "Residuals by camera", "Residuals by beam"}
+    assert set(lines) >= {
+        "Poses",
+        "Calibration",
+        "Fit of rig and recording",
+        "Residuals by camera",
+        "Residuals by beam",
+    }
     gap = lines["Poses"]
     assert gap.link.startswith("#t=")
     first = float(gap.link.split("at=")[1])

@@ -96,7 +96,7 @@ def test_the_page_has_a_moment_for_each_pose_and_opens_offline(content, tmp_path
     view = view_of(content, index)
     view_module.write_files(view, index, tmp_path)
     page = (tmp_path / "view.html").read_text()
-    data = json.loads(re.search(r'<script type="application/json" id="data">(.*?)</script>', page, re.DOTALL)[1])
+    data = json.loads(re.search(r'<script type="application/json" id="scene-data">(.*?)</script>', page, re.DOTALL)[1])
     assert data == json.loads(json.dumps(scene_data(view, index)))
     assert [m["k"] for m in data["moments"]] == content.frames[content.known].tolist()
     assert data["moments"][data["first"]]["k"] == content.frames[index]

@@ -44,6 +44,8 @@ class ModelFit:
     findings: tuple[FindingRow, ...]
     rows: tuple[tuple[str, ...], ...]  # under HEADS: views, then cameras, then beams
     drawings: tuple[str, ...]  # SVG, one per camera
+    tested: bool = True
+    frames: int | None = None  # that the answer rests on
 
 
 def model_fit(block: Mapping[str, Any] | None) -> ModelFit | None:
@@ -66,7 +68,15 @@ def model_fit(block: Mapping[str, Any] | None) -> ModelFit | None:
         for i, (camera, size) in enumerate(sizes.items() if isinstance(sizes, Mapping) else ())
         if (drawn := _drawing(i, str(camera), size, _mappings(block.get("views"))))
     ]
-    return ModelFit(_sentence(block, findings), findings, tuple(rows), tuple(drawings))
+    used = block.get("frames_for_diagnosis")
+    return ModelFit(
+        _sentence(block, findings),
+        findings,
+        tuple(rows),
+        tuple(drawings),
+        bool(block.get("tested")),
+        used if isinstance(used, int) else None,
+    )
 
 
 def _sentence(block: Mapping[str, Any], findings: tuple[FindingRow, ...]) -> str:

@@ -3,13 +3,21 @@
 from __future__ import annotations
 
 import csv
+import html
+import json
 from pathlib import Path
 
+import click
 import pytest
+from click.testing import CliRunner
 
+from cli import main
+from lab.commands.command_line import command_line
 from lab.errors import CalibrationError, InputError, RunError
+from lab.explain.catalogue import EXPLANATIONS
+from lab.runs import process
 from lab.runs.batch import task as module
-from lab.runs.batch.batch import process_batch
+from lab.runs.batch.batch import BatchOptions, process_batch
 from lab.runs.batch.task import COLUMNS
 from lab.simulate.write import simulate
 from tests.lab.run_folders import write_run
@@ -50,7 +58,7 @@ def test_the_good_runs_have_their_results_and_the_bad_one_has_none(mixed):
         if row["results"]:
             assert (out / row["results"] / "attitude.csv").is_file()
     seen = [p.name for p in out.iterdir() if not p.name.startswith(".")]
-    assert sorted(seen) == ["batch.csv", "good", "grey", "index.html", "last"]
+    assert sorted(seen) == ["batch.csv", "errors", "good", "grey", "index.html", "last"]
 
 
 def test_a_line_is_reported_for_every_run_when_it_ends(mixed):
@@ -146,3 +154,99 @@ def test_names_with_commas_are_unchanged_in_the_table(tmp_path):
     (row,) = rows_of(process_batch([run], tmp_path / "out").table)
     assert row["run"] == str(run)
     assert (tmp_path / "out" / row["results"] / "summary.json").is_file()
+
+
+# Runs that end with an error ------------------------------------------------------------------------------------------
+
+
+def test_the_report_of_a_failed_run_has_message_status_and_explained_code_and_the_index_links_it(mixed):
+    outcome, _ = mixed
+    row = rows_of(outcome.table)[1]
+    assert (row["results"], row["report"]) == ("", "errors/nothing.html")
+    page = (outcome.table.parent / row["report"]).read_text("utf-8")
+    assert html.escape(row["message"]) in page
+    assert "BP-E02" in page
+    assert EXPLANATIONS["BP-E02"].meaning in page
+    assert "exit status 2" in page
+    assert 'href="./errors/nothing.html"' in outcome.index.read_text("utf-8")
+
+
+def test_a_failed_run_keeps_its_earlier_results_and_a_later_success_removes_the_failure(tmp_path):
+    run, out = points_run(tmp_path / "a"), tmp_path / "out"
+    process_batch([run], out)
+    before = (out / "a/report.html").read_bytes()
+    (run / "rig.yaml").rename(run / "rig.away")
+    (row,) = rows_of(process_batch([run], out).table)
+    assert (row["status"], row["results"], row["report"]) == ("error", "", "errors/a.html")
+    assert "earlier processing were kept" in (out / "errors/a.html").read_text("utf-8")
+    assert (out / "a/report.html").read_bytes() == before
+    (run / "rig.away").rename(run / "rig.yaml")
+    (row,) = rows_of(process_batch([run], out).table)
+    assert (row["status"], row["report"]) == ("pass", "a/report.html")
+    assert not (out / "errors").exists()
+
+
+def test_the_report_of_a_failure_in_the_middle_has_the_lines_of_the_log_until_then(tmp_path, monkeypatch):
+    def ended(*_, **__):
+        raise RunError("the pictures ended")
+
+    monkeypatch.setattr(process, "write_tables", ended)
+    lines: list[str] = []
+    (row,) = rows_of(process_batch([points_run(tmp_path / "a")], tmp_path / "out", log=lines.append).table)
+    page = (tmp_path / "out" / row["report"]).read_text("utf-8")
+    assert [" start: " in line for line in lines] == [True, False]
+    assert all(html.escape(line.removeprefix("a: ")) in page for line in lines)
+
+
+def test_the_summary_has_the_command_and_quiet_shows_nothing_but_errors(tmp_path):
+    run, out = points_run(tmp_path / "a"), tmp_path / "out"
+    done = CliRunner().invoke(main, ["batch", str(run), "--out", str(out), "--quiet", "--set", "r1_px=9"])
+    assert (done.stdout, done.stderr, done.exit_code) == ("", "", 0)
+    summary = json.loads((out / "a/summary.json").read_text("utf-8"))
+    assert summary["command"] == f"beampose batch {run} --out {out} --quiet --set r1_px=9"
+    done = CliRunner().invoke(main, ["batch", str(tmp_path / "none"), "--out", str(out), "--quiet"])
+    assert (done.stdout, done.stderr.count("\n"), done.exit_code) == ("", 1, 1)
+    assert done.stderr.startswith("beampose: none: ERROR: ")
+
+
+def test_a_long_list_of_runs_is_shortened_in_the_recorded_command():
+    runs = [f"run-{i}" for i in range(2000)]
+    context = main.commands["batch"].make_context(
+        "batch", [*runs, "--out", "x"], parent=click.Context(main, info_name="beampose")
+    )
+    line = command_line(context)
+    assert line.startswith("beampose batch run-0 run-1 ")
+    assert "(2000 in all)" in line
+    assert len(line) < 400
+
+
+def test_verbose_shows_the_log_of_each_run_and_excludes_quiet(tmp_path):
+    run, out = points_run(tmp_path / "a"), str(tmp_path / "out")
+    done = CliRunner().invoke(main, ["batch", str(run), "--out", out, "-v"])
+    log = (tmp_path / "out/a/run.log").read_text("utf-8").splitlines()
+    assert done.stderr.splitlines() == [f"a: {line}" for line in log]
+    assert CliRunner().invoke(main, ["batch", str(run), "--out", out, "-v", "-q"]).exit_code == 2
+
+
+def fields(value: object, place: str = "") -> dict[str, object]:
+    """All numbers and words of a JSON value, by their place in it."""
+    if isinstance(value, dict):
+        return {k: v for key, inner in value.items() for k, v in fields(inner, f"{place}.{key}").items()}
+    if isinstance(value, list):
+        return {k: v for i, inner in enumerate(value) for k, v in fields(inner, f"{place}.{i}").items()}
+    return {place: value}
+
+
+@pytest.mark.slow
+def test_a_summary_depends_on_the_number_of_processes_only_in_times_and_the_command(tmp_path):
+    runs = [points_run(tmp_path / "a"), points_run(tmp_path / "b", 6)]
+    found = []
+    for jobs in (None, 2):
+        options = BatchOptions(jobs=jobs, provenance={"command": f"--jobs {jobs}"})
+        process_batch(runs, tmp_path / f"out-{jobs}", options)
+        found.append(fields(json.loads((tmp_path / f"out-{jobs}/a/summary.json").read_text("utf-8"))))
+    differ = {place for place in found[0].keys() | found[1].keys() if found[0].get(place) != found[1].get(place)}
+    assert len(found[0]) > 100
+    assert ".command" in differ
+    times = {".command", ".rates.processed_frames_per_s", ".smoother.seconds"}
+    assert {place for place in differ if not place.startswith(".timings.")} <= times

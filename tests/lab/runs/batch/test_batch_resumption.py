@@ -66,7 +66,7 @@ def test_any_changed_input_or_version_is_a_reason_to_process_again(done, tmp_pat
         case "summary":
             (tmp_path / "out/run/summary.json").write_text('{"schema": "beampose/summary/1"}')
         case "program":
-            monkeypatch.setattr(resumption, "_program", lambda: "another version")
+            monkeypatch.setattr(resumption, "program_digest", lambda: "another version")
         case "library":
             monkeypatch.setattr(resumption, "versions", lambda: {"numpy": "0"})
     assert again(done) == 0

@@ -1,0 +1,240 @@
+"""A results folder as an object: tables as pandas frames, poses as arrays, annotated pictures."""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from geometry.arrays import Array, Bools, Ints
+from geometry.forward_model import SpotModel
+from geometry.pose_prior import PosePrior
+from geometry.rig import Rig
+from lab.api.frames import read_frame
+from lab.errors import InputError
+from lab.files.run.results import PoseTrack, has_causal, read_poses, read_summary
+from lab.files.run.run_file import Run, load_run
+from lab.files.text import columns
+from lab.overlay.canvas import Pixels
+from lab.overlay.sheet import png
+from lab.overlay.show import show_frame, write_picture
+from lab.runs.process import are_results
+
+_EVENT_COLUMNS = ("frame", "last_frame", "kind", "camera", "spot", "text")
+_AT_ONCE = 2000  # poses projected at once, which bounds the memory
+
+
+@dataclass(frozen=True, slots=True)
+class AnnotatedPicture:
+    """A picture of one frame; a notebook displays it, `plt.imshow(picture.pixels)` does too."""
+
+    pixels: Pixels  # (h, w, 3), 8 bit: red, green, blue
+
+    def save(self, path: Path | str) -> Path:
+        """Write a .png file; returns its path. Raises InputError."""
+        write_picture(np.ascontiguousarray(self.pixels[..., ::-1]), Path(path))
+        return Path(path)
+
+    def _repr_png_(self) -> bytes:
+        return png(np.ascontiguousarray(self.pixels[..., ::-1]))
+
+
+class Results:
+    """The results of one run. Tables are read when they are first used.
+
+    >>> run = lab.load(results)
+    >>> run.attitude[["frame", "t_s", "yaw_deg", "sigma_yaw_deg"]].shape
+    (40, 4)
+    >>> run.rotations.shape, run.covariance.shape
+    ((40, 3, 3), (40, 6, 6))
+    >>> bool(run.known.all())
+    True
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        run_folder: Path | None = None,
+        keep: tempfile.TemporaryDirectory[str] | None = None,
+    ) -> None:
+        """keep: a temporary folder that lasts as long as this object."""
+        self.folder = folder
+        self._given = run_folder
+        self._keep = keep
+
+    def __repr__(self) -> str:
+        status = self.summary.get("verdict", {}).get("status", "no verdict")
+        return f"<Results of {self.name}: {status}, {len(self.frames)} frames, {self.folder}>"
+
+    @cached_property
+    def summary(self) -> dict[str, Any]:
+        """summary.json: verdict, counts, parameters, versions, fingerprints."""
+        return read_summary(self.folder)
+
+    @property
+    def name(self) -> str:
+        """The name of the run."""
+        return str(self.summary.get("name", self.folder.name))
+
+    @cached_property
+    def attitude(self) -> pd.DataFrame:
+        """attitude.csv: a row per frame with position, quaternion, angles, their sigmas, velocities and status."""
+        return read_frame(self.folder / "attitude.csv", columns.ATTITUDE, columns.MOTION)
+
+    @cached_property
+    def attitude_causal(self) -> pd.DataFrame | None:
+        """attitude_causal.csv, the poses as known at each instant; None where the results are not smoothed."""
+        if not has_causal(self.folder):
+            return None
+        return read_frame(self.folder / f"attitude{columns.CAUSAL}.csv", columns.ATTITUDE, columns.MOTION)
+
+    @cached_property
+    def spots(self) -> pd.DataFrame:
+        """spots.csv: a row per frame, camera and spot with place (px), sigma, status and prediction."""
+        return read_frame(self.folder / "spots.csv", columns.SPOTS, ("cov_uv_px2", "label_probability"))
+
+    @cached_property
+    def detections(self) -> pd.DataFrame:
+        """detections.csv: a row per detected point of light."""
+        return read_frame(self.folder / "detections.csv", columns.DETECTIONS, ("cov_uv_px2",))
+
+    @cached_property
+    def beams(self) -> pd.DataFrame:
+        """beams.csv: direction and a point, in world, of each beam in each frame."""
+        return read_frame(self.folder / "beams.csv", columns.BEAMS)
+
+    @cached_property
+    def events(self) -> pd.DataFrame:
+        """What the run noted: frame, last_frame, kind, camera, spot (None: of the whole rig) and text."""
+        listed = self.summary.get("events", [])
+        rows = [{name: e.get(name) for name in _EVENT_COLUMNS} for e in listed if isinstance(e, dict)]
+        return pd.DataFrame(rows, columns=list(_EVENT_COLUMNS))
+
+    @cached_property
+    def _poses(self) -> PoseTrack:
+        return read_poses(self.folder)
+
+    @property
+    def frames(self) -> Ints:
+        """Frame numbers (n,); all arrays below have a row for each."""
+        return self._poses.frames
+
+    @property
+    def time_s(self) -> Array:
+        """(n,), s since frame 0, at mid-exposure."""
+        return self._poses.t_s
+
+    @property
+    def known(self) -> Bools:
+        """(n,): whether there is a pose."""
+        return self._poses.known
+
+    @property
+    def measured(self) -> Bools:
+        """(n,): whether the pose is measured from the spots of the frame."""
+        return np.asarray(self.attitude["status"] == "measured")
+
+    @property
+    def positions(self) -> Array:
+        """(n, 3), m: the body's origin in world; nan where unknown."""
+        return self._poses.world_from_body.translation
+
+    @property
+    def rotations(self) -> Array:
+        """(n, 3, 3), world from body; nan where unknown."""
+        return np.where(self.known[:, None, None], self._poses.world_from_body.rotation, np.nan)
+
+    @property
+    def covariance(self) -> Array:
+        """(n, 6, 6) of the pose error [dt (m, in world), dtheta (rad, in body)]; nan where unknown."""
+        return self._poses.covariance
+
+    @property
+    def systematic(self) -> Array:
+        """(n, 6, 6), the calibration's share of the covariance, equal in all frames; nan where it is unknown."""
+        return self._poses.systematic
+
+    @cached_property
+    def _run(self) -> Run:
+        return load_run(self.run_folder)
+
+    @property
+    def rig(self) -> Rig:
+        """The rig of the run folder. Raises InputError where the run folder is not there."""
+        return self._run.rig
+
+    @property
+    def prior(self) -> PosePrior | None:
+        """The prior of the run folder's run.yaml. Raises InputError where the run folder is not there."""
+        return self._run.prior
+
+    @property
+    def run_folder(self) -> Path:
+        """The run folder that was processed. Raises InputError where it is not there."""
+        named = str(self.summary.get("run_folder") or "")
+        for folder in (self._given,) if self._given else (Path(named), self.folder / named) if named else ():
+            if folder is not None and folder.is_dir():
+                return folder
+        raise InputError(
+            f"{self.folder}: its run folder {self._given or named} is not there; name it: lab.load(folder, run=...)"
+        )
+
+    @cached_property
+    def residuals(self) -> pd.DataFrame:
+        """Measured minus projected place (px) of each measured spot: frame, t_s, camera, spot, du_px, dv_px.
+
+        Projected from the pose of the frame, where that is measured. Raises InputError where the run folder is not
+        there.
+        """
+        model = SpotModel.of(self.rig)
+        spots = self.spots[self.spots["status"].isin(["matched", "turned"])]
+        row = np.searchsorted(self.frames, spots["frame"].to_numpy())
+        spots = spots[self.measured[row]]
+        row = row[self.measured[row]]
+        place = {view: i for i, view in enumerate(model.views)}
+        view = np.array([place.get(v, -1) for v in zip(spots["camera"], spots["spot"], strict=True)], dtype=np.int64)
+        if (view < 0).any():
+            raise InputError(f"{self.run_folder}: expected the cameras and spots of {self.folder}, found another rig")
+        projected = np.full((len(row), 2), np.nan)
+        for start in range(0, len(self.frames), _AT_ONCE):
+            here = np.flatnonzero((row >= start) & (row < start + _AT_ONCE))
+            part = np.unique(row[here])
+            if len(part):
+                uv = model.project(self._poses.world_from_body[part])[0]
+                projected[here] = uv[np.searchsorted(part, row[here]), view[here]]
+        out = spots[["frame", "t_s", "camera", "spot"]].reset_index(drop=True)
+        return out.assign(
+            du_px=spots["u_px"].to_numpy() - projected[:, 0], dv_px=spots["v_px"].to_numpy() - projected[:, 1]
+        )
+
+    def show(self, frame: int, camera: str | None = None) -> AnnotatedPicture:
+        """The pictures of a frame with detections, labels, predictions and beams, as of the command `show`.
+
+        Raises:
+            InputError: there is no such frame or camera.
+        """
+        image = show_frame(self.folder, frame, camera=camera, run_folder=self._given).image
+        return AnnotatedPicture(np.ascontiguousarray(image[..., ::-1]))
+
+
+def load(folder: Path | str, *, run: Path | str | None = None) -> Results:
+    """The results that `beampose run` wrote into a folder. run: its run folder, if that has moved.
+
+    >>> lab.load(results).spots.columns[:4].tolist()
+    ['frame', 't_s', 'camera', 'spot']
+    >>> lab.load("nowhere")
+    Traceback (most recent call last):
+    lab.errors.InputError: nowhere: expected a folder that `beampose run` wrote, found no summary.json of one
+
+    Raises:
+        InputError: the folder holds no results. (A damaged table raises it when it is first used.)
+    """
+    folder = Path(folder)
+    if not are_results(folder):
+        raise InputError(f"{folder}: expected a folder that `beampose run` wrote, found no summary.json of one")
+    return Results(folder, None if run is None else Path(run))

@@ -1,0 +1,1 @@
+"""Pictures of single frames and videos with what a run found drawn over them."""

@@ -1,0 +1,203 @@
+"""What is drawn over the pictures of one frame: detections, labelled spots, predictions, and tracks of the others."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from geometry.arrays import Array
+from geometry.pose import Pose
+from geometry.uncertainty.spot_tracks import beam_image, pixel_covariance, scatter, uncertainty_tracks
+from lab.files.run.results import POSE_STATUSES, SPOT_STATUSES, PoseTrack
+from lab.overlay.result_data import ResultData
+from lab.pictures.picture_file import GreyPicture
+from lab.runs.frames.frames import Picture
+from tracking.detections import Detections
+from tracking.statuses import PoseStatus, SpotStatus
+
+SIGMAS = 3.0  # of all ellipses and tracks
+_NEIGHBOURS = 50  # frames on either side whose predictions show how well a spot is predicted
+_NONE = np.zeros((0, 2))
+_UNKNOWN = np.full((2, 2), np.nan)
+
+
+@dataclass(frozen=True, slots=True)
+class SpotMark:
+    """One spot in one picture. Places are in distorted pixels, nan where unknown."""
+
+    spot: str
+    status: SpotStatus | None  # None: the results have no row of it
+    uv_px: Array  # (2,), measured or estimated
+    cov_px2: Array  # (2, 2) of it
+    predicted_px: Array  # (2,)
+    predicted_cov_px2: Array  # (2, 2) of the detection about it: the scatter of this spot's predictions nearby
+    label_probability: float
+    track_px: Array  # (k, 2): where the spot can lie within 3 sigma of the pose; empty for a measured spot
+    beam_px: Array  # (m, 2): the image of its beam; empty for a measured spot
+    tail_px: Array  # (n, 2): its places in the frames before, the last one first; for videos
+
+
+@dataclass(frozen=True, slots=True)
+class CameraFrame:
+    """One camera's picture and marks."""
+
+    camera: str
+    size_px: tuple[int, int]
+    picture: GreyPicture | None
+    reason: str  # why there is no picture
+    detections: Array  # (n, 2), px
+    marks: tuple[SpotMark, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class FrameContent:
+    """One frame of all cameras."""
+
+    name: str
+    frame: int
+    t_s: float  # nan where unknown
+    pose_status: PoseStatus | None
+    pose_words: str  # the pose with its sigmas
+    beams_of_frame: int | None  # the frame whose pose the beams are drawn with; None: no beams are drawn
+    cameras: tuple[CameraFrame, ...]
+
+
+def frame_content(
+    data: ResultData, index: int, pictures: dict[str, Picture], cameras: list[str], tail: int = 0
+) -> FrameContent:
+    """What is drawn of the frame with this index. pictures: by camera. tail: frames of each spot's past."""
+    poses = data.poses
+    code = int(poses.status[index])
+    near = index if poses.known[index] else _nearest_known(poses, index)
+    marks = _marks(data, index, near, tail)
+    shown = []
+    for camera in cameras:
+        views = data.views_of(camera)
+        picture = pictures.get(camera)
+        grey = picture if isinstance(picture, np.ndarray) else None
+        table = data.detections.get(camera)
+        shown.append(
+            CameraFrame(
+                camera,
+                data.sizes_px[camera],
+                grey,
+                "" if grey is not None else _reason(picture),
+                _NONE if table is None else table.at(int(poses.frames[index])),
+                tuple(marks[j] for j in views),
+            )
+        )
+    return FrameContent(
+        name=data.name,
+        frame=int(poses.frames[index]),
+        t_s=float(poses.t_s[index]),
+        pose_status=POSE_STATUSES[code] if code >= 0 else None,
+        pose_words=pose_words(poses, index),
+        beams_of_frame=None if near is None or data.model is None else int(poses.frames[near]),
+        cameras=tuple(shown),
+    )
+
+
+def pose_words(poses: PoseTrack, index: int) -> str:
+    """Position and angles of a frame with their sigmas in ASCII, since not every OpenCV draws other characters."""
+    if not poses.known[index]:
+        return "no pose"
+    position = [
+        _with_sigma(1e3 * float(v), 1e3 * float(s))
+        for v, s in zip(poses.world_from_body.translation[index], poses.sigma_position_m[index], strict=True)
+    ]
+    angles = [
+        _with_sigma(float(v), float(s))
+        for v, s in zip(poses.yaw_pitch_roll_deg[index], poses.sigma_ypr_deg[index], strict=True)
+    ]
+    used, rms = poses.spots_used[index], poses.rms_px[index]
+    fit = f"   {int(used)} spots" if np.isfinite(used) else ""
+    fit += f", rms {rms:.2g} px" if np.isfinite(rms) else ""
+    place = f"x {position[0]}, y {position[1]}, z {position[2]} mm"
+    return f"{place}   yaw {angles[0]}, pitch {angles[1]}, roll {angles[2]} deg{fit}"
+
+
+def _with_sigma(value: float, sigma: float) -> str:
+    if not (np.isfinite(sigma) and sigma > 0):
+        return f"{value:.4g}"
+    decimals = int(np.clip(1 - np.floor(np.log10(sigma)), 0, 6))
+    return f"{value:.{decimals}f} +- {sigma:.{decimals}f}"
+
+
+def _reason(picture: Picture | None) -> str:
+    if picture is None or isinstance(picture, Detections):
+        return "no picture: detected points"
+    reason = str(getattr(picture, "reason", ""))
+    return reason if reason.startswith("no picture") else f"no picture: {reason}"
+
+
+def _nearest_known(poses: PoseTrack, index: int) -> int | None:
+    known = np.flatnonzero(poses.known)
+    return int(known[np.argmin(np.abs(known - index))]) if len(known) else None
+
+
+def _marks(data: ResultData, index: int, near: int | None, tail: int) -> list[SpotMark]:
+    """The marks of all views. near: index of the pose that the beams are drawn with."""
+    spots, model = data.spots, data.model
+    tracks: Array | None = None
+    covariance: Array | None = None
+    if model is not None and near == index:
+        pose, P = data.poses.world_from_body[index], data.poses.covariance[index]
+        if np.isfinite(P).all():
+            rows = np.flatnonzero(~spots.measured[index])
+            tracks, covariance = np.full((len(spots.views), 0, 2), np.nan), np.full((len(spots.views), 2, 2), np.nan)
+            if len(rows):
+                hidden = model.subset(rows)
+                found = uncertainty_tracks(hidden, pose, P, SIGMAS)
+                tracks = np.full((len(spots.views), *found.shape[1:]), np.nan)
+                tracks[rows], covariance[rows] = found, pixel_covariance(hidden, pose, P)
+    out = []
+    for j, (_, spot) in enumerate(spots.views):
+        code = int(spots.status[index, j])
+        status = SPOT_STATUSES[code] if code >= 0 else None
+        measured = status is not None and status.measured
+        uv = spots.uv_px[index, j]
+        cov = _stated(data, index, j)
+        if not measured and covariance is not None and not np.isfinite(cov).all():
+            cov = covariance[j]
+        out.append(
+            SpotMark(
+                spot=spot,
+                status=status,
+                uv_px=uv,
+                cov_px2=cov,
+                predicted_px=spots.predicted_px[index, j],
+                predicted_cov_px2=_scatter_near(data, index, j),
+                label_probability=float(spots.label_probability[index, j]),
+                track_px=_NONE if measured or tracks is None else tracks[j],
+                beam_px=_NONE if measured or near is None else _beam(data, j, data.poses.world_from_body[near]),
+                tail_px=spots.uv_px[max(index - tail, 0) : index + 1, j][::-1] if tail else _NONE,
+            )
+        )
+    return out
+
+
+def _stated(data: ResultData, index: int, j: int) -> Array:
+    """The covariance of a spot's place as spots.csv states it."""
+    s = data.spots
+    cov = np.diag(s.sigma_px[index, j] ** 2)
+    mixed = np.nan if s.cov_uv_px2 is None else float(s.cov_uv_px2[index, j])
+    cov[0, 1] = cov[1, 0] = mixed if np.isfinite(mixed) else 0.0
+    return cov if np.isfinite(cov).all() else _UNKNOWN
+
+
+def _scatter_near(data: ResultData, index: int, j: int) -> Array:
+    """The scatter of a spot's detections about its predictions in the frames around this one, without this one."""
+    s = data.spots
+    part = slice(max(index - _NEIGHBOURS, 0), index + _NEIGHBOURS + 1)
+    differences = np.where(s.measured[part, j, None], s.uv_px[part, j] - s.predicted_px[part, j], np.nan)
+    differences[index - part.start] = np.nan
+    return scatter(differences)
+
+
+def _beam(data: ResultData, j: int, world_from_body: Pose) -> Array:
+    """The image of the beam of view j."""
+    if data.run is None:
+        return _NONE
+    camera, spot = data.spots.views[j]
+    return beam_image(data.run.rig, data.run.rig.cameras[camera], spot, world_from_body)
