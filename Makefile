@@ -14,7 +14,10 @@ READY_DOCS := $(VENV)/.ready-docs
 # Only the trackers that are there: ours, and the peers after `make peers`.
 BENCH_PEERS = $(if $(wildcard $(READY_PEERS)),$(VENV_PEERS)/bin/python -m bench.peers,$(BIN)/python -m bench.peers --trackers ours)
 SAMPLE_RUNS := $(patsubst %/run.yaml,%,$(wildcard sample_runs/*/run.yaml))
+# Tests of one module stay on one worker as long as possible: they share what the module makes once.
+PARALLEL := -n $(WORKERS) --dist worksteal
 DEMO := results/demo
+DEMO_FIRST := $(patsubst %,$(DEMO)/%/report.html,huo2015 sharp-turns calibration)
 
 .DEFAULT_GOAL := help
 .PHONY: help setup demo test test-all check format docs bench-tracking bench-random bench-detection bench-throughput bench-live bench-calibration peers bench-peers lock lock-docs wheel clean
@@ -42,13 +45,16 @@ $(READY): requirements.lock pyproject.toml
 	$(BIN)/python -m lab.runs.warm_up
 	@touch $(READY)
 
-# The batch's exit status is the demo's, but the paths are shown in any case.
+# The batch's exit status is the demo's, but the results that are there are shown in any case.
 demo: setup  ## Process the sample runs, calibrate the sample rig, show where the results are
 	@test -n "$(SAMPLE_RUNS)" || { echo "sample_runs/ holds no run (a folder with a run.yaml)." >&2; exit 2; }
 	@status=0; $(BIN)/beampose batch $(SAMPLE_RUNS) --out $(DEMO) || status=$$?; \
 	$(BIN)/beampose calibrate rig sample_runs/calibration --out $(DEMO)/calibration || status=$$?; \
-	echo; echo "Tables and reports:"; \
-	find $(DEMO) \( -name '*.csv' -o -name '*.html' \) | sort | sed 's/^/  /'; \
+	echo; echo "All runs, the worst first, with a report each:"; \
+	ls $(DEMO)/index.html 2>/dev/null | sed 's/^/  /'; \
+	echo "Reports to open first (a run of pictures, fast turns, the calibration of a rig):"; \
+	ls $(DEMO_FIRST) 2>/dev/null | sed 's/^/  /'; \
+	echo "Tables: batch.csv in $(DEMO), and the CSV files in its folders."; \
 	exit $$status
 
 check: setup  ## Lint, formatting and types
@@ -57,10 +63,10 @@ check: setup  ## Lint, formatting and types
 	$(BIN)/mypy
 
 test: check  ## The checks and the fast tests
-	$(BIN)/python -m pytest -n $(WORKERS)
+	$(BIN)/python -m pytest $(PARALLEL)
 
 test-all: check  ## The checks and all tests, the slow ones too
-	$(BIN)/python -m pytest -n $(WORKERS) -m 'slow or not slow'
+	$(BIN)/python -m pytest $(PARALLEL) -m 'slow or not slow'
 
 format: setup  ## Format the code and apply the linter's automatic fixes
 	$(BIN)/ruff check --fix .

@@ -15,7 +15,9 @@ tests/geometry/test_forward_model.py compares the pixels and pose Jacobians of b
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
+import numba
 import numpy as np
 
 from geometry.arrays import Array, Bools, Ints, cross, skew
@@ -94,6 +96,9 @@ class SpotModel:
         numbers = np.empty(self.point.shape[:-1], VIEW)
         for name in VIEW.names or ():
             numbers[name] = lens if name == "lens" else tilt if name == "tilt" else getattr(self, name)
+        settings: Any = numba.config
+        if settings.DISABLE_JIT:  # compiled code reads fields as attributes; plain Python needs a recarray for that
+            numbers = numbers.view(np.recarray)
         object.__setattr__(self, "numbers", numbers)
 
     @staticmethod

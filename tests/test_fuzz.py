@@ -22,7 +22,10 @@ def test_damaged_inputs_end_in_a_result_or_in_a_line(base, tmp_path):
     assert {e.status for e in endings} >= {0, 2}
 
 
-@pytest.mark.parametrize("kind", [k for k in KINDS if k not in ("--set", "plan options", "simulate options", "names")])
+_HOSTILE_OPTIONS = ("--set", "plan options", "simulate options", "names", "compare options", "init")
+
+
+@pytest.mark.parametrize("kind", [k for k in KINDS if k not in _HOSTILE_OPTIONS])
 def test_the_inputs_are_valid_before_they_are_damaged(kind, base, tmp_path, monkeypatch):
     monkeypatch.setattr("bench.fuzz.cases.damage_file", lambda path, rng: None)
     (tmp_path / "work").mkdir()

@@ -9,6 +9,7 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+from bench.fuzz import result_cases
 from bench.fuzz.hostile import OPTION_VALUES
 from bench.fuzz.inputs import PICTURE_SUFFIXES
 from bench.fuzz.mutations import damage_file
@@ -159,6 +160,13 @@ KINDS: dict[str, tuple[Callable[[Path, Path, random.Random], list[str]], int]] =
     "plan options": (_plan_options, 3),
     "simulate options": (_simulate_options, 3),
     "names": (_names, 2),
+    "reference": (result_cases.reference, 5),
+    "two results": (result_cases.two_results, 3),
+    "compare options": (result_cases.compare_options, 2),
+    "results": (result_cases.results, 3),
+    "view": (result_cases.view, 1),
+    "continued batch": (result_cases.continued_batch, 3),
+    "init": (result_cases.init_answers, 3),
 }  # what writes the case, and its share
 
 

@@ -8,7 +8,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from geometry.rotations import quaternion_from_matrix
+from lab.compare.reference_file import read_reference
 from lab.files.rig.interchange import convert
+from lab.runs.batch.batch import BatchOptions, process_batch
+from lab.runs.process import process_run
 from lab.simulate.write import simulate
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -35,7 +39,21 @@ def write_inputs(folder: Path) -> Path:
     for picture in pictures:
         video.write(picture)
     video.release()
+    _write_results(folder)
     return folder
+
+
+def _write_results(folder: Path) -> None:
+    """Results of the run with points, a batch of it, and its truth as references in both formats."""
+    process_run(folder / "points", folder / "results")
+    process_batch([folder / "points"], folder / "batch", BatchOptions(parquet=True))
+    shutil.copy(folder / "points" / "truth" / "pose.csv", folder / "reference.csv")
+    truth = read_reference(folder / "reference.csv").motion
+    assert truth.position_m is not None
+    assert truth.rotation is not None
+    w, x, y, z = quaternion_from_matrix(truth.rotation).T
+    rows = np.column_stack([truth.t_s, truth.position_m, x, y, z, w])
+    np.savetxt(folder / "reference.tum", rows)
 
 
 def _write_lenses(folder: Path) -> None:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import io
 import os
+import re
 import resource
 import shutil
 import sys
 import time
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,6 +20,7 @@ STATUSES = (0, 1, 2, 3, 4)
 LIMIT_S = 20.0
 LIMIT_MEMORY_MB = 3000
 _NOT_FINITE = ("nan", "inf", "-inf", "+inf", "infinity", "-infinity")
+_NOT_FINITE_JSON = re.compile(r"[:\[,]\s*(NaN|-?Infinity)\b")
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +51,7 @@ def run_case(seed: int, number: int, base: Path, work: Path) -> Ending:
 
 def judged(number: int, kind: str, command: Sequence[str], work: Callable[[], Path]) -> Ending:
     """Run a command and judge it. work: the folder in which the results are looked for."""
+    before = _identities(work())
     started, clock = time.process_time(), time.monotonic()
     status, out, err, fault = run_command(command)
     seconds = max(time.process_time() - started, min(time.monotonic() - clock, 0.0))
@@ -59,7 +62,7 @@ def judged(number: int, kind: str, command: Sequence[str], work: Callable[[], Pa
     if not fault:
         fault = fault_of_lines(status, out, err)
     if not fault and status in (0, 4):
-        fault = not_finite_in(work())
+        fault = not_finite_in(work(), before)
     return Ending(number, kind, tuple(command), status, seconds, fault)
 
 
@@ -101,10 +104,23 @@ def fault_of_lines(status: int, out: str, err: str) -> str:
     return ""
 
 
-def not_finite_in(folder: Path) -> str:
-    """The first table under a folder's results with a number that is not finite; empty: none."""
-    for path in sorted(folder.glob("out*/**/*.csv")):
+def _identities(folder: Path) -> Mapping[Path, tuple[int, int]]:
+    """Number and time of the files under a folder's results."""
+    found = ((path, path.lstat()) for path in folder.glob("out*/**/*") if path.is_file())
+    return {path: (stat.st_ino, stat.st_mtime_ns) for path, stat in found}
+
+
+def not_finite_in(folder: Path, before: Mapping[Path, tuple[int, int]] | None = None) -> str:
+    """The first table or JSON file under a folder's results with a number that is not finite; empty: none.
+
+    before: files that were there before the command (a damaged table may be one), as `_identities` returns them.
+    """
+    written = dict(_identities(folder).items() - (before or {}).items())
+    for path in sorted(path for path in written if path.suffix == ".csv"):
         for n, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines()[1:], 2):
             if any(field.strip().lower() in _NOT_FINITE for field in line.split(",")):
                 return f"{path.name} line {n}: {line[:200]}"
+    for path in sorted(path for path in written if path.suffix == ".json"):
+        if found := _NOT_FINITE_JSON.search(path.read_text(encoding="utf-8", errors="replace")):
+            return f"{path.name}: {found[0]}"
     return ""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import multiprocessing
 import os
 from collections.abc import Iterator
@@ -10,15 +11,16 @@ from pathlib import Path
 
 from bench.fuzz.judge import Ending, run_case
 
-WAIT_S = 60.0  # wall time; the limit of a case is in process time, since other programs may use the machine
+WAIT_S = 300.0  # wall time: other programs may use the machine; the limit of a case is in process time
 
 
 def _serve(pipe: Connection, seed: int, base: Path, work: Path) -> None:
     """The worker: runs the cases whose numbers arrive."""
     null = os.open(os.devnull, os.O_WRONLY)
     os.dup2(null, 2)  # messages of the video library
-    while (number := pipe.recv()) is not None:
-        pipe.send(run_case(seed, number, base, work))
+    with contextlib.suppress(EOFError):  # the program that gives the numbers has ended
+        while (number := pipe.recv()) is not None:
+            pipe.send(run_case(seed, number, base, work))
 
 
 class _Worker:
@@ -32,7 +34,9 @@ class _Worker:
     def start(self) -> None:
         context = multiprocessing.get_context("spawn")
         self.pipe, other = context.Pipe()
-        self.process = context.Process(target=_serve, args=(other, *self.arguments), daemon=True)
+        self.process = context.Process(
+            target=_serve, args=(other, *self.arguments)
+        )  # not a daemon: a view starts processes
         self.process.start()
         other.close()
 
@@ -53,12 +57,25 @@ class _Worker:
         self.start()
         return Ending(self.number, "?", (), -1, WAIT_S, fault)
 
+    def end(self) -> None:
+        """Ends the process."""
+        self.process.kill()
+        self.process.join()
+
 
 def endings(numbers: range, seed: int, base: Path, folder: Path, jobs: int) -> Iterator[Ending]:
     """The endings of all cases, as they come."""
     workers = [_Worker(seed, base, folder / f"work-{n}") for n in range(jobs)]
-    left = iter(numbers)
-    busy = {}
+    try:
+        yield from _given(iter(numbers), workers)
+    finally:
+        for worker in workers:
+            worker.end()
+
+
+def _given(left: Iterator[int], workers: list[_Worker]) -> Iterator[Ending]:
+    """Gives every worker a number as soon as it is free."""
+    busy: dict[Connection, _Worker] = {}
     for worker in workers:
         if (number := next(left, None)) is not None:
             worker.give(number)
@@ -71,5 +88,3 @@ def endings(numbers: range, seed: int, base: Path, folder: Path, jobs: int) -> I
             if (number := next(left, None)) is not None:
                 worker.give(number)
                 busy[worker.pipe] = worker
-    for worker in workers:
-        worker.pipe.send(None)

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from calibration.beams.mean_rotation import mean_rotation
 from calibration.least_squares.parameter_blocks import Lines
 from geometry import rotations
 from geometry.arrays import Array, cross, normalised
@@ -32,10 +33,7 @@ class StandMotion:
     def of(stand_from_body: Pose) -> StandMotion:
         """The variation of positions (P,)."""
         shifts = np.sqrt(np.mean((stand_from_body.translation - stand_from_body.translation.mean(axis=0)) ** 2, axis=0))
-        mean = stand_from_body.rotation.mean(axis=0)
-        U, _, V = np.linalg.svd(mean)
-        middle = U @ np.diag([1.0, 1.0, np.linalg.det(U @ V)]) @ V
-        turns = rotations.log(stand_from_body.rotation @ middle.T)
+        turns = rotations.log(stand_from_body.rotation @ mean_rotation(stand_from_body.rotation).T)
         return StandMotion(np.sqrt(np.mean(turns**2, axis=0)), shifts)
 
     def __str__(self) -> str:

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.stats import chi2 as chi2_distribution
 
 from calibration.beams.beam_findings import FEWEST_POSITIONS
+from calibration.beams.mean_rotation import mean_rotation
 from calibration.rig.joint import SPOTS, Joint, Measured, calibrate_jointly
 from calibration.rig.measurement_groups import jacobian, shares
 from calibration.terms.rig_blocks import POSES, STAND, named_errors
@@ -65,8 +66,7 @@ class HoldOut:
 def central_pose(joint: Joint) -> Pose:
     """world_from_body at the centre of the stand's positions."""
     poses = pose_of(joint.values, POSES)
-    U, _, V = np.linalg.svd(poses.rotation.mean(axis=0))
-    middle = Pose(U @ np.diag([1.0, 1.0, np.linalg.det(U @ V)]) @ V, poses.translation.mean(axis=0))
+    middle = Pose(mean_rotation(poses.rotation), poses.translation.mean(axis=0))
     return pose_of(joint.values, STAND)[0] @ middle
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import click
 
+from lab.commands import completion
 from lab.commands.common import ANY_PATH, FOLDER, Commands, NumberRange, conclude, progress_bar, show_line
 
 
@@ -204,6 +205,7 @@ def convert(source: Path, destination: Path, origin: str | None, target: str | N
     "--rig",
     default="fan",
     show_default=True,
+    shell_complete=completion.rigs,
     help="A rig.yaml as designed, or fan, unequal-fan, two-cameras-per-screen, four-skew-beams.",
 )
 @click.option(

@@ -19,6 +19,7 @@ from lab.files.text.error_text import printable
 
 FOLDER = click.Path(file_okay=False, path_type=Path)
 ANY_PATH = click.Path(path_type=Path)
+_ANY_LENGTH = 10_000  # of a first sentence
 PIPE_CLOSED = 141  # 128 + SIGPIPE: the status that a shell reports for a program whose reader has gone
 
 
@@ -109,6 +110,14 @@ class Commands(click.Group):
     def make_context(self, *args: Any, **kwargs: Any) -> click.Context:
         with _quiet_when_the_reader_has_gone(), _errors_are_lines():  # --help and --version are printed here
             return super().make_context(*args, **kwargs)
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Lists the commands with the whole first sentence of each: click cuts it at the width of the terminal."""
+        shown = [(name, self.get_command(ctx, name)) for name in self.list_commands(ctx)]
+        rows = [(name, c.get_short_help_str(_ANY_LENGTH)) for name, c in shown if c is not None and not c.hidden]
+        if rows:
+            with formatter.section("Commands"):
+                formatter.write_dl(rows)
 
     def invoke(self, ctx: click.Context) -> Any:
         with _quiet_when_the_reader_has_gone(), _errors_are_lines():

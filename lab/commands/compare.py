@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from lab.commands.common import FOLDER, show_line
+from lab.commands.common import FOLDER, NumberRange, show_line
 
 _RESULTS = click.Path(exists=True, file_okay=False, path_type=Path)
 _WAYS = ("time", "rate", "world", "body")
@@ -42,12 +42,14 @@ def _read_align(ctx: click.Context, parameter: click.Parameter, value: str | Non
     callback=_read_align,
     help="all, none, or some of time,rate,world,body. Default: all for a reference, none for two results.",
 )
-@click.option("--offset", "offset_s", type=float, help="Reference time minus result time in s, approximately.")
 @click.option(
-    "--sigma-m", type=click.FloatRange(min=0), default=0.0, help="Sigma of the reference's positions, if it has none."
+    "--offset", "offset_s", type=NumberRange(-1e12, 1e12), help="Reference time minus result time in s, approximately."
 )
 @click.option(
-    "--sigma-deg", type=click.FloatRange(min=0), default=0.0, help="Sigma of the reference's angles, if it has none."
+    "--sigma-m", type=NumberRange(0, 1e6), default=0.0, help="Sigma of the reference's positions, if it has none."
+)
+@click.option(
+    "--sigma-deg", type=NumberRange(0, 1e6), default=0.0, help="Sigma of the reference's angles, if it has none."
 )
 def compare(
     result: Path,

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import click
 
-from lab.commands.common import ANY_PATH, FOLDER, progress_bar, show_line
+from lab.commands import completion
+from lab.commands.common import ANY_PATH, FOLDER, NumberRange, progress_bar, show_line
 
 
 @click.command()
@@ -35,7 +36,7 @@ def doctor(files: tuple[Path, ...], out: Path) -> None:
 
 
 @click.command()
-@click.argument("codes", metavar="[CODE]...", nargs=-1)
+@click.argument("codes", metavar="[CODE]...", nargs=-1, shell_complete=completion.codes)
 def explain(codes: tuple[str, ...]) -> None:
     """Explain the code of a warning, a verdict reason, a finding or an error; without a code, list all codes.
 
@@ -86,9 +87,9 @@ def _asked(given: dict[str, float | None]) -> dict[str, float]:
     "--cameras", type=click.IntRange(1, 16), help="Number of cameras in all; default: one per screen, 2 or more."
 )
 @click.option("--beams", type=click.IntRange(1, 12), help="Number of laser beams; default 3, of one or two spots each.")
-@click.option("--rate", type=click.FloatRange(0.1, 1e6), help="Pictures per second; default 100.")
+@click.option("--rate", type=NumberRange(0.1, 1e6), help="Pictures per second; default 100.")
 @click.option(
-    "--distance", default=2.5, show_default=True, type=click.FloatRange(0.2, 100), help="From vehicle to screens, m."
+    "--distance", default=2.5, show_default=True, type=NumberRange(0.2, 100), help="From vehicle to screens, m."
 )
 @click.option("--picture", default="1280x1024", show_default=True, help="Picture size, WIDTHxHEIGHT in pixels.")
 def init(

@@ -8,11 +8,12 @@ from typing import Any
 
 import click
 
+from lab.commands import completion
 from lab.commands.common import ANY_PATH, FOLDER, NumberRange, conclude, progress_bar, read_settings, show_line
 
 
 @click.command()
-@click.argument("scenario")
+@click.argument("scenario", shell_complete=completion.scenarios)
 @click.option("--out", type=FOLDER, help="The run folder to write; it must not exist yet.")
 @click.option(
     "--seed", default=0, show_default=True, type=click.IntRange(min=0), help="The same seed gives the same bytes."

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from lab.commands.common import ANY_PATH, FOLDER, complain, show_line
+from lab.commands.common import ANY_PATH, FOLDER, NumberRange, complain, show_line
 
 
 @click.command()
@@ -16,7 +16,7 @@ from lab.commands.common import ANY_PATH, FOLDER, complain, show_line
 @click.option("--rig", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="Instead of the run's rig.")
 @click.option(
     "--sigma-scale",
-    type=click.FloatRange(min=0, max=1e9, min_open=True),
+    type=NumberRange(min=0, max=1e9, min_open=True),
     help="Size of the sigma ellipsoids; default: a round number that makes them visible.",
 )
 def view(path: Path, out: Path | None, frame: int | None, rig: Path | None, sigma_scale: float | None) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from geometry import rotations
 from geometry.arrays import Array, Bools, Ints
-from lab.compare.reference_file import read_reference
+from lab.compare.reference_file import FARTHEST, LATEST_S, read_reference
 from lab.errors import InputError
 from lab.files.run.results import PoseTrack, read_poses
 from lab.runs.process import are_results
@@ -121,6 +121,11 @@ def compare(
         except NotComparableError as error:
             remedy = "give the offset of its clock with --offset, or record both at the same time"
             raise InputError(f"{reference or other}: cannot be compared with {result}: {error}; {remedy}") from None
+        except np.linalg.LinAlgError:
+            raise InputError(
+                f"{reference or other}: cannot be compared with {result}: its numbers or their sigmas differ too"
+                " much in size; check units, columns and outliers"
+            ) from None
         alignment = estimate.alignment
     found = differences(mine, theirs, alignment, gap)
     if found.known.sum() < 4:
@@ -164,12 +169,19 @@ def _motion_of(folder: Path) -> tuple[Ints, Motion, Motion]:
         raise InputError(
             f"{folder}: expected measured frames with covariances, found {len(rows)}; process the run again"
         )
-    total = track.covariance[rows]
+    pose, total = track.world_from_body[rows], track.covariance[rows]
+    beyond = np.abs(pose.translation).max(axis=1) > FARTHEST
+    beyond |= (np.abs(track.t_s[rows]) > LATEST_S) | (np.linalg.eigvalsh(total)[:, 0] <= 0)
+    beyond |= total.max(axis=(1, 2)) > FARTHEST**2
+    if beyond.any():
+        raise InputError(
+            f"{folder}: frame {track.frames[rows[beyond][0]]}: expected a pose within {FARTHEST:g} m with a positive"
+            " definite covariance, found others; process the run again"
+        )
     systematic = np.nan_to_num(track.systematic[rows])
     rest = total - systematic
     separable = np.linalg.eigvalsh(rest)[:, 0] > 0
     noise = np.where(separable[:, None, None], rest, total)
-    pose = track.world_from_body[rows]
     return (
         track.frames[rows],
         Motion(track.t_s[rows], pose.rotation, pose.translation, noise),

@@ -20,6 +20,8 @@ QUATERNION = ("qw", "qx", "qy", "qz")
 ANGLES = ("yaw_deg", "pitch_deg", "roll_deg")
 SIGMAS = tuple(f"sigma_{name}" for name in (*POSITION, *ANGLES))
 _TUM = 8  # numbers in a line
+FARTHEST = 1e6  # m, deg: a position, an angle or a sigma beyond it is a mistake, and squares lose all smaller numbers
+LATEST_S = 1e12  # 30,000 years: times in ns are beyond it
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +80,8 @@ def _from_tum(
             )
         values[i] = numbers
     lines = np.array([line for line, _ in rows])
+    check_size(path, lines, "t", values[:, 0], LATEST_S)
+    check_size(path, lines, "x y z", values[:, 1:4], FARTHEST)
     _check_times(path, values[:, 0], lines)
     rotation = _rotations(path, values[:, [7, 4, 5, 6]], lines)
     covariance = np.zeros((len(values), 6, 6))
@@ -96,6 +100,8 @@ def _from_csv(path: Path, sigma_m: float, sigma_deg: float) -> tuple[Motion, tup
             f"{path}: expected columns {','.join(QUATERNION)} or {','.join(ANGLES)} or {','.join(POSITION)} beside t_s,"
             f" got {','.join(table.header)[:80]}; rename the columns"
         )
+    for name in ("t_s", *(c for c in (*POSITION, *ANGLES, *SIGMAS) if c in table)):
+        check_size(path, table.lines, name, table.optional(name), LATEST_S if name == "t_s" else FARTHEST)
     notes: list[str] = []
     used = [*(POSITION if places else ()), *(QUATERNION if quaternions else angles)]
     stacked = np.stack([table.finite("t_s"), *(table.optional(name) for name in used)], axis=1)
@@ -119,6 +125,16 @@ def _from_csv(path: Path, sigma_m: float, sigma_deg: float) -> tuple[Motion, tup
             notes.append(f"The reference has no {' and no '.join(absent)}: taken as 0.")
     covariance = _stated(table, complete, rotation, sigma_m, sigma_deg)
     return Motion(stacked[:, 0], rotation, position, covariance), tuple(notes)
+
+
+def check_size(path: Path, lines: Ints, names: str, values: Array, most: float) -> None:
+    """Raises InputError with the first line where a magnitude of `values` (n, ...) is beyond `most`; nan is none."""
+    far = np.abs(values.reshape(len(lines), -1)) > most
+    for i in np.flatnonzero(far.any(axis=1))[:1].tolist():
+        raise InputError(
+            f"{path}: line {lines[i]}: {names}: expected numbers within {most:g},"
+            f" got {values.reshape(len(lines), -1)[i][far[i]][0]:g}; check units and columns"
+        )
 
 
 def _all_or_none(table: Table, names: tuple[str, ...]) -> bool:

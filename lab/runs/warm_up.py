@@ -15,7 +15,7 @@ from lab.runs.process import process_run
 from lab.simulate.write import simulate
 
 SCENARIO = "huo2015"
-FRAMES = 60  # of the recording of points: with a bend, false points and a spot that leaves the picture
+FRAMES = 100  # of the points: with a bend, false points, a spot that leaves the picture, a long steady part
 PICTURES = 6  # frames of the recording of pictures
 
 

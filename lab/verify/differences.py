@@ -55,7 +55,12 @@ def _same_bytes(first: Path, second: Path) -> bool:
 
 
 def _fields(line: bytes) -> list[str]:
-    return next(csv.reader([line.decode("utf-8", "replace").rstrip("\r\n")]), [])
+    """The fields of a line; a damaged line that is no CSV is one field."""
+    text = line.decode("utf-8", "replace").rstrip("\r\n")
+    try:
+        return next(csv.reader([text]), [])
+    except csv.Error:  # a carriage return within a field, or a field of more than 131,072 characters
+        return [text]
 
 
 def _row_text(number: int, header: list[str], old: bytes | None, new: bytes | None) -> str:

@@ -155,6 +155,8 @@ def test_a_run_folder_that_has_gone_is_an_input_error(copy):
         ("frame,a\r\n0,1\n", "frame,a\n0,1\n", "line 1: other bytes at the same fields"),
         ("frame,a,b\n0,1,2\n", "frame,a\n0,1\n", "line 1: field 3: recorded 'b', computed 'nothing'"),
         ('spot,a\n"x,y",1\n', 'spot,a\n"x,y",2\n', "line 2: a: recorded '1', computed '2' (1 of 2 lines differ)"),
+        ("frame,x\n0,1\r2\n", "frame,x\n0,1\n", "line 2 (frame 0): frame: recorded '0,1\\r2', computed '0'"),
+        ("frame,x\n0," + "1" * 200_000, "frame,x\n0,1\n", "line 2 (frame 0): frame: recorded '0,111"),
     ],
 )
 def test_each_kind_of_difference_has_its_words(tmp_path, recorded, computed, text):

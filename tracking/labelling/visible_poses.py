@@ -44,7 +44,7 @@ class VisiblePoses:
         views_of = [np.flatnonzero(model.spot_of == s) for s in range(len(model.spot_names))]
         which = rng.integers(len(triples), size=DRAWN)
         spots = np.array(triples)[which]
-        views = np.array([[rng.choice(views_of[s]) for s in row] for row in spots])
+        views = _one_view_each(views_of, spots, rng)
         places = _at_random_pixels(rig, model, views, rng)
         poses = poses_from_three_spots(model.point[views], model.ray[views], places)
         usable = np.isfinite(poses.translation[..., 0]) & everywhere.contains(poses)
@@ -56,7 +56,7 @@ class VisiblePoses:
         shown = np.stack([seen[:, rows].sum(axis=1) for rows in views_of], axis=-1)
         enough = np.count_nonzero(shown, axis=1) >= min(min_spots, len({int(s) for s in model.spot_of}))
         at = np.arange(len(source))[:, None]
-        s = np.linalg.svd(J[at, views[source]].reshape(-1, 6, 6), compute_uv=False)
+        s: Array = np.asarray(np.linalg.svd(J[at, views[source]].reshape(-1, 6, 6), compute_uv=False), dtype=float)
         quality = s[:, -1] / np.maximum(s[:, 0], 1e-300)
         good = _fixing(triples, which[source], quality, enough)
         if not good:
@@ -66,6 +66,14 @@ class VisiblePoses:
         log_volume = min(float(np.log(max(volume, 1e-300))), everywhere.log_volume)
         typical = poses[int(np.argmax(np.count_nonzero(shown, axis=1) + quality / quality.max()))]
         return VisiblePoses({triples[i]: q for i, q in good.items()}, log_volume, typical)
+
+
+def _one_view_each(views_of: Sequence[Ints], spots: Ints, rng: np.random.Generator) -> Ints:
+    """A view of each of some spots, at random: as `rng.choice` of each spot's views in turn, far faster."""
+    counts = np.array([len(views) for views in views_of])
+    first = np.cumsum(counts) - counts
+    chosen: Ints = np.concatenate(views_of)[first[spots] + rng.integers(counts[spots])]
+    return chosen
 
 
 def _sets_of_three(model: SpotModel) -> list[tuple[int, int, int]]:

@@ -6,6 +6,7 @@ import dataclasses
 import types
 import typing
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -39,7 +40,7 @@ def dataclass_from_yaml(cls: type[T], mapping: Any, path: Path | str, inside: st
     Raises:
         FileError: unknown keys, wrong types, and values that the dataclass itself refuses.
     """
-    model = block_of(cls)
+    model = block_of(typing.cast(Any, cls))
     return _value_of(cls, validated(model, {} if mapping is None else _as_mapping(mapping, path, inside), path, inside))
 
 
@@ -49,6 +50,7 @@ def _as_mapping(value: Any, path: Path | str, inside: str) -> Mapping[str, Any]:
     return value
 
 
+@cache
 def block_of(cls: type) -> type[Block]:
     """A strict pydantic model with the fields of a parameter dataclass, see `dataclass_from_yaml`."""
     hints = typing.get_type_hints(cls)

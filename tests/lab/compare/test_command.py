@@ -16,6 +16,8 @@ from tests.tracking.comparison.motions import recordings
         (("--align", "tme"), "expected all, none or some of time,rate,world,body, got 'tme'"),
         (("--align", "rate"), "rate needs time too"),
         (("--sigma-m", "-1"), "not in the range"),
+        (("--sigma-deg", "nan"), "expected a finite number"),
+        (("--offset", "1e300"), "not in the range"),
         (("--reference", "nowhere.csv"), "does not exist"),
         ((), "expected a second result folder or --reference FILE"),
     ],

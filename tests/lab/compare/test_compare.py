@@ -199,6 +199,10 @@ def test_stated_sigmas_of_angles_become_the_covariance_of_the_body(folder):
         ("0 1 2 3 0 0 0 1\n1 1 2 x 0 0 0 1\n", "line 2: expected eight numbers"),
         ("0 1 2 3 0 0 0 1\n1 1 2 3 0 0 0 9\n", "line 2: expected a quaternion"),
         ("0 1 2 3 0 0 0 1\n0 1 2 3 0 0 0 1\n", "line 2: expected rising times"),
+        ("0 1 2 3 0 0 0 1\n1 1 2e9 3 0 0 0 1\n", "line 2: x y z: expected numbers within 1e"),
+        ("0 1 2 3 0 0 0 1\n1e18 1 2 3 0 0 0 1\n", "line 2: t: expected numbers within 1e"),
+        ("t_s,x_m,y_m,z_m\n0,1,1,1\n1,1,-2147483648,1\n", "line 3: y_m: expected numbers within 1e"),
+        ("t_s,x_m,y_m,z_m,sigma_x_m\n0,1,1,1,1\n1,1,1,1,1e300\n", "line 3: sigma_x_m: expected numbers within"),
     ],
 )
 def test_a_wrong_reference_is_one_line_with_the_place(tmp_path, text, words):

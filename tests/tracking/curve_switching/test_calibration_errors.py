@@ -81,7 +81,7 @@ def mean_nees(scenario: str, seeds: range, stated: bool = True, frames: int = 6)
     return float(np.mean(values)), measured / (len(seeds) * frames), drops
 
 
-@pytest.mark.parametrize("scenario", ["clean", "four-skew-beams"])
+@pytest.mark.parametrize("scenario", ["clean", pytest.param("four-skew-beams", marks=pytest.mark.slow)])
 def test_the_stated_covariance_includes_the_calibration_errors(scenario):
     # 12 rigs, and frames of a rig share its errors: the mean of NEES / 6 scatters by 0.16.
     mean, measured, drops = mean_nees(scenario, range(12), frames=4)
@@ -116,7 +116,7 @@ def rigid_nees(scenario: str, seeds: range, frames: int, noise_px: float, stated
     return Pooled(causal).nees(), Pooled(smoothed).nees()
 
 
-@pytest.mark.parametrize("scenario", ["clean", "four-skew-beams"])
+@pytest.mark.parametrize("scenario", ["four-skew-beams", pytest.param("clean", marks=pytest.mark.slow)])
 def test_covariances_of_the_rigid_tracker_and_the_smoother_include_the_calibration_errors(scenario):
     # All frames of a smoothed motion share one rig's errors: the mean of NEES / 6 over 7 rigs scatters by 0.22.
     for value in rigid_nees(scenario, range(7), frames=20, noise_px=0.05):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import resource
+import shutil
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -30,28 +31,34 @@ FAULTS = [
 ]
 
 
-@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: type(fault).__name__)
-def test_an_unforeseen_error_is_a_row_with_the_place_of_its_traceback(tmp_path, monkeypatch, fault):
+def test_unforeseen_errors_are_rows_with_the_places_of_their_tracebacks(tmp_path, monkeypatch):
     original = task.process_run
+    good = points_run(tmp_path / "good")
+    bad = {tmp_path / f"bad{n}": fault for n, fault in enumerate(FAULTS)}
+    for folder in bad:
+        shutil.copytree(good, folder)
 
     def process(folder, *args, **kwargs):
-        if folder.name == "bad":
-            raise fault
+        if folder in bad:
+            raise bad[folder]
         return original(folder, *args, **kwargs)
 
     monkeypatch.setattr(task, "process_run", process)
-    good, bad = points_run(tmp_path / "good"), points_run(tmp_path / "bad")
-    outcome = process_batch([bad, good], tmp_path / "out")
-    first, second = rows_of(outcome.table)
-    assert (first["status"], first["exit_status"], first["results"]) == ("error", "1", "")
-    assert (second["status"], outcome.exit_status) == ("pass", 1)
-    saved = tmp_path / "out/errors/bad.txt"
-    assert str(saved) in first["message"]
-    assert type(fault).__name__ in saved.read_text("utf-8")
+    outcome = process_batch([*bad, good], tmp_path / "out")
+    *rows, last = rows_of(outcome.table)
+    assert (last["status"], outcome.exit_status) == ("pass", 1)
+    for row, (folder, fault) in zip(rows, bad.items(), strict=True):
+        assert (row["status"], row["exit_status"], row["results"]) == ("error", "1", "")
+        saved = tmp_path / "out/errors" / f"{folder.name}.txt"
+        assert str(saved) in row["message"]
+        assert type(fault).__name__ in saved.read_text("utf-8")
 
+    first, *others = bad
     monkeypatch.setattr(task, "process_run", original)
-    assert process_batch([bad], tmp_path / "out").exit_status == 0
-    assert not saved.parent.exists()
+    for folder in others:
+        (tmp_path / "out/errors" / f"{folder.name}.txt").unlink()
+    assert process_batch([first], tmp_path / "out").exit_status == 0
+    assert not (tmp_path / "out/errors").exists()
 
 
 def test_a_full_disk_in_a_table_stops_its_own_run_only(tmp_path):
@@ -85,21 +92,23 @@ def test_an_absurd_rate_a_loop_of_links_and_a_folder_without_a_run_do_not_stop_t
     assert [r["status"] for r in rows] == ["error"] * 4 + ["pass"]
 
 
-@pytest.mark.parametrize("name", [b"caf\xe9", b"line\nbreak", b"red\x1b[31m", b"index.html", b"errors", b"=1+1"])
-def test_a_folder_of_any_name_has_a_row_and_does_not_stop_the_batch(tmp_path, name):
+def test_folders_of_any_name_have_a_row_and_do_not_stop_the_batch(tmp_path):
     lines: list[str] = []
-    strange = Path(os.fsdecode(os.path.join(os.fsencode(tmp_path), name)))
-    points_run(tmp_path / "plain").rename(strange)
+    names = (b"caf\xe9", b"line\nbreak", b"red\x1b[31m", b"index.html", b"errors", b"=1+1")
+    strange = [Path(os.fsdecode(os.path.join(os.fsencode(tmp_path), name))) for name in names]
+    for folder in strange:
+        points_run(tmp_path / "plain").rename(folder)
     good = points_run(tmp_path / "good")
-    outcome = process_batch([strange, good], tmp_path / "out", report=lines.append)
-    rows = rows_of(outcome.table)
-    assert len(rows) == 2
-    assert rows[1]["status"] == "pass"
+    outcome = process_batch([*strange, good], tmp_path / "out", report=lines.append)
+    *rows, last = rows_of(outcome.table)
+    assert len(rows) == len(names)
+    assert last["status"] == "pass"
     assert all(line.isprintable() for line in lines)
     assert (tmp_path / "out/index.html").is_file()
-    if rows[0]["status"] != "error":
-        results = rows[0]["results"].removeprefix("'")  # before what a spreadsheet would read as a formula
-        assert (tmp_path / "out" / results / "report.html").is_file()
+    for row in rows:
+        if row["status"] != "error":
+            results = row["results"].removeprefix("'")  # before what a spreadsheet would read as a formula
+            assert (tmp_path / "out" / results / "report.html").is_file()
 
 
 def test_a_run_whose_process_dies_is_a_row(tmp_path, monkeypatch):
