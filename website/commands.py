@@ -13,7 +13,7 @@ from website.text import cell, code, table
 
 _HEAD = """# All commands
 
-`beampose COMMAND --help` shows the same on the terminal.
+`beampose COMMAND --help` shows the same on the terminal. [Shell completion](../shell_completion.md) completes them.
 
 This page is generated from `lab/commands/`.
 """
@@ -30,14 +30,6 @@ _TAIL = """## Exit status
 | 128 + n | stopped by signal n (130: Ctrl-C) |
 
 An error is one or two plain lines on standard error. The status always agrees with the verdict of the report.
-
-## Shell completion
-
-```console
-$ eval "$(_BEAMPOSE_COMPLETE=bash_source beampose)"
-```
-
-Put this line into `~/.bashrc`; for zsh write `zsh_source` into `~/.zshrc`.
 """
 
 
