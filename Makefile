@@ -10,6 +10,7 @@ SEEDS ?= 1:301
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 READY_PEERS := $(VENV_PEERS)/.ready
+READY_DOCS := $(VENV)/.ready-docs
 # Only the trackers that are there: ours, and the peers after `make peers`.
 BENCH_PEERS = $(if $(wildcard $(READY_PEERS)),$(VENV_PEERS)/bin/python -m bench.peers,$(BIN)/python -m bench.peers --trackers ours)
 SAMPLE_RUNS := $(patsubst %/run.yaml,%,$(wildcard sample_runs/*/run.yaml))
@@ -19,7 +20,7 @@ DEMO := results/demo
 DEMO_FIRST := $(patsubst %,$(DEMO)/%/report.html,huo2015 sharp-turns calibration)
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all check format bench-tracking bench-random bench-detection bench-throughput bench-live bench-calibration peers bench-peers lock wheel clean
+.PHONY: help setup demo test test-all check format docs bench-tracking bench-random bench-detection bench-throughput bench-live bench-calibration peers bench-peers lock lock-docs wheel clean
 
 help:  ## List the chores
 	@sed -n 's/^\([a-z-]*\):.*##  */\1|/p' $(MAKEFILE_LIST) | while IFS='|' read -r name what; do \
@@ -71,6 +72,16 @@ format: setup  ## Format the code and apply the linter's automatic fixes
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
+docs: $(READY_DOCS)  ## Build the documentation site (build/docs/index.html); it needs no network when it is read
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
+	@echo "Open build/docs/index.html"
+
+# In the project's environment, since pages are generated from the code; the versions shared with requirements.lock are its.
+$(READY_DOCS): $(READY) requirements-docs.lock
+	@rm -f $(READY_DOCS)
+	$(BIN)/python -m pip install --quiet --require-virtualenv --requirement requirements-docs.lock
+	@touch $(READY_DOCS)
+
 bench-tracking: setup  ## The tracking figures on fresh seeds, peers if installed
 	$(BIN)/python -m bench.tracking
 	$(BIN)/python -m bench.first_labels
@@ -116,6 +127,15 @@ lock:  ## Write requirements.lock again from pyproject.toml
 	build/lock/bin/pip-compile --quiet --extra dev --strip-extras --no-header --no-emit-options \
 		--no-emit-index-url --no-emit-find-links --no-emit-trusted-host $(LOCK_FLAGS) \
 		--output-file requirements.lock pyproject.toml
+
+# Without the packages that requirements.lock has: the environment has them already.
+lock-docs:  ## Write requirements-docs.lock again from pyproject.toml and requirements.lock
+	$(PYTHON) -m venv --clear build/lock
+	build/lock/bin/python -m pip install --quiet pip-tools
+	build/lock/bin/pip-compile --quiet --extra docs --constraint requirements.lock --strip-extras --no-header \
+		--no-annotate --no-emit-options --no-emit-index-url --no-emit-find-links --no-emit-trusted-host $(LOCK_FLAGS) \
+		--output-file build/requirements-docs.txt pyproject.toml
+	grep -v -x -F -f requirements.lock build/requirements-docs.txt > requirements-docs.lock
 
 wheel: setup  ## Build dist/beampose-*.whl
 	$(BIN)/python -m build --no-isolation --outdir dist .

@@ -99,6 +99,16 @@ def test_the_lock_file_says_versions_and_nothing_of_where_they_come_from():
     assert len(lines) == len(locked()) >= 30  # each line that is not a comment is a pin
 
 
+def test_the_lock_file_of_the_documentation_adds_to_the_other_one_and_contradicts_none_of_it():
+    text = (ROOT / "requirements-docs.lock").read_text(encoding="utf-8")
+    assert places(PACKAGE_INDEX, {"requirements-docs.lock": text}) == []
+    pins = dict(line.split("==") for line in text.splitlines())
+    versions = {canonicalize_name(name): version for name, version in pins.items()}
+    assert set(versions) & set(locked()) == set()
+    for requirement in map(Requirement, PROJECT["optional-dependencies"]["docs"]):
+        assert requirement.specifier.contains(Version(versions[canonicalize_name(requirement.name)])), requirement
+
+
 @pytest.mark.parametrize("group", ["dependencies", "dev"])
 def test_the_lock_file_has_a_fitting_version_of_every_dependency(group):
     wanted = PROJECT["dependencies"] if group == "dependencies" else PROJECT["optional-dependencies"][group]

@@ -46,9 +46,9 @@ class TrackerParameters:
     p_detect: float = 0.98  # probability that a spot which is in the picture and not hidden is found
     p_blend: float = 0.02  # probability that it is merged with a neighbour; needs the detections' shapes
     min_label_probability: float = 0.8  # a less probable label is not assigned: the status is occluded
-    learn_jerk: bool = True  # estimate the jerk of the steady motion from the innovations; initial values:
-    jerk_m_s3: float = 20.0  # m/s^3 per sqrt(Hz), of the translation
-    jerk_rad_s3: float = 60.0  # rad/s^3 per sqrt(Hz), of the rotation
+    learn_jerk: bool = True  # estimate the jerk of the steady motion from the innovations
+    jerk_m_s3: float = 20.0  # m/s^3 per sqrt(Hz), of the translation; the initial value if estimated
+    jerk_rad_s3: float = 60.0  # rad/s^3 per sqrt(Hz), of the rotation; the initial value if estimated
     p_manoeuvre: float = 0.02  # initial probability per frame that the velocities jump; estimated with the jerk
 
     # Matching, section 4.1 (spots)

@@ -206,7 +206,7 @@ def convert(source: Path, destination: Path, origin: str | None, target: str | N
     default="fan",
     show_default=True,
     shell_complete=completion.rigs,
-    help="One of lab/simulate/rigs.py.",
+    help="A rig.yaml as designed, or fan, unequal-fan, two-cameras-per-screen, four-skew-beams.",
 )
 @click.option(
     "--seed", default=0, show_default=True, type=click.IntRange(min=0), help="The same seed gives the same bytes."

@@ -15,16 +15,11 @@ from lab.files.rig.rig_file import load_rig, save_rig
 from lab.files.run.run_file import load_run, save_run
 from lab.files.text.atomic_write import atomic_folder, atomic_write_text
 from lab.init.layout import Layout, rig_of
-from lab.simulate.motion import Motion, Wave
 from lab.simulate.scenarios import SCENARIOS
 from lab.simulate.write import simulate
 
 EXAMPLE = "example-points.csv"
 FRAMES = 100  # of the simulated points
-_MOTION = Motion(
-    (0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
-    (Wave("x", 0.06, 0.2), Wave("y", 0.08, 0.25), Wave("yaw", 7, 0.3), Wave("pitch", 5, 0.35), Wave("roll", 6, 0.2)),
-)
 
 # A comment before the first line that has this key, by key and indentation.
 _RIG_COMMENTS = {
@@ -110,7 +105,7 @@ def _points(work: Path, frame_rate_hz: float) -> None:
     """Simulated points of the rig in `work`, a slow motion."""
     scenario = dataclasses.replace(
         SCENARIOS["clean"],
-        motion=_MOTION,
+        motion=SCENARIOS["small-motion"].motion,
         always_in_view=(),
         leaves_and_returns=(),
         frame_rate_hz=frame_rate_hz,

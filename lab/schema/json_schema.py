@@ -49,7 +49,7 @@ _OF_TYPES: dict[Any, Schema] = {
     float: {"type": "number"}, int: {"type": "integer"}, bool: {"type": "boolean"}, str: {"type": "string"},
     type(None): {"type": "null"},
 }  # fmt: skip
-_COMMENT = re.compile(r"^    (\w+): [^#\n]*#\s*(?!noqa)(.+)$", re.MULTILINE)
+_COMMENT = re.compile(r"^    (\w+): [^#\n]*#(?!\s*noqa)\s*(.+)$", re.MULTILINE)
 
 
 def schema_of_block(block: type[Block], commented: type | None = None) -> Schema:

@@ -15,19 +15,22 @@ from calibration.boards import board_types as boards
 from geometry.arrays import Array
 from geometry.camera import Camera
 from geometry.pose import Pose
+from geometry.rig import Rig
 from lab.errors import InputError
 from lab.files.project.point_files import POINTS, POSE_SIGMAS, SURVEY, SURVEY_SIGMAS
 from lab.files.project.project_blocks import SCHEMA
 from lab.files.rig.board_file import save_board
 from lab.files.rig.camera_block import Covariance
 from lab.files.rig.camera_file import CameraCalibration, CameraFile, save_camera
-from lab.files.rig.rig_file import RigFile, as_mapping, pose_mapping, save_rig
+from lab.files.rig.rig_file import RigFile, as_mapping, load_rig, pose_mapping, save_rig
 from lab.files.text import columns
 from lab.files.text.atomic_write import atomic_folder
 from lab.files.text.csv_text import write_table
+from lab.files.text.error_text import suggest_name
 from lab.files.text.yaml_text import write_mapping
 from lab.simulate.board_photo import PhotoSettings, photograph
 from lab.simulate.calibration_campaign import Campaign, CampaignQuality, LensDraw, board_poses, draw_campaign
+from lab.simulate.rigs import RIGS
 
 PROJECT = "calibration.yaml"
 BOARD = "charuco:11x9:36mm:27mm:DICT_4X4_100"  # usable also where part of the board is outside the picture
@@ -51,24 +54,35 @@ def simulate_calibration(
     calibration.yaml, a camera.yaml per camera, survey.csv, points.csv, poses.csv, spots.csv, and truth/: rig.yaml (as
     mounted), poses.csv (world_from_body at the positions). The same arguments give the same bytes.
 
-    rig: a name of RIGS. positions: of the stand. wrong: share of outliers among the pixels of control points and spots.
-    photos: also board photographs of each camera, for `beampose calibrate camera`. quality: sigmas of mounting and
-    measurement.
+    rig: a name of RIGS, or the path of a rig.yaml with the designed rig. positions: of the stand. wrong: share of
+    outliers among the pixels of control points and spots. photos: also board photographs of each camera, for `beampose
+    calibrate camera`. quality: sigmas of mounting and measurement.
 
     Raises:
-        InputError: an argument is not valid, or the folder exists.
+        InputError: an argument is not valid, the rig file cannot be read, or the folder exists.
     """
     if not 0 <= wrong < 0.3:
         raise InputError(f"wrong: expected a share from 0 up to 0.3, got {wrong:g}")
     if positions < 3:
         raise InputError(f"positions: expected 3 or more, got {positions}")
     q = replace(CampaignQuality() if quality is None else quality, positions=positions, wrong=wrong)
-    campaign = draw_campaign(seed, rig, q)
+    campaign = draw_campaign(seed, rig if rig in RIGS else _designed(rig), q)
     with atomic_folder(Path(out), lambda _: False) as folder:
         write_campaign(campaign, folder)
         if photos:
             _write_photos(campaign, folder)
     return Path(out)
+
+
+def _designed(rig: str) -> Rig:
+    """The rig of a rig.yaml; a word that names no file and no rig is taken for a misspelt name.
+
+    Raises:
+        InputError: there is no such rig or file, or the file is wrong.
+    """
+    if not Path(rig).exists():
+        raise InputError(f"rig: expected a rig.yaml or a rig's name, got {rig!r}{suggest_name(rig, RIGS)}")
+    return load_rig(Path(rig))
 
 
 def write_campaign(c: Campaign, folder: Path) -> None:

@@ -117,6 +117,10 @@ _SHARP = Motion(
         Wave("yaw", 20, 1.25, "triangle"), Wave("pitch", 10, 1.0, "triangle"),
     ),
 )  # fmt: skip
+_SMALL = Motion(
+    (0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+    (Wave("x", 0.06, 0.2), Wave("y", 0.08, 0.25), Wave("yaw", 7, 0.3), Wave("pitch", 5, 0.35), Wave("roll", 6, 0.2)),
+)
 LIGHTS: MappingProxyType[str, Light] = MappingProxyType(
     {
         "lab": Light(),
@@ -170,6 +174,12 @@ _ALL = (
         name="clean",
         summary="As smooth, without clutter, speckle, texture, hot pixels, reflections: errors by noise only.",
         clutter=Clutter(per_spot=0.0),
+        light=LIGHTS["clean"],
+    ),
+    Scenario(
+        name="small-motion",
+        summary="Slow motion of a few centimetres and degrees; suits any rig, such as one of your own.",
+        motion=_SMALL,
         light=LIGHTS["clean"],
     ),
     _SHARP_TURNS,

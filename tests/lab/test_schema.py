@@ -149,3 +149,8 @@ def test_the_schemas_are_written_into_a_folder(tmp_path: Path):
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="the folder cannot be made"):
         files.write(["rig"], tmp_path / "file")
+
+
+@pytest.mark.parametrize("name", BLOCKS)
+def test_a_remark_for_the_linter_is_no_description(name):
+    assert "noqa" not in as_text(name)

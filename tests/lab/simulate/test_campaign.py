@@ -14,9 +14,12 @@ from lab.files.project.point_files import read_observations, read_poses, read_su
 from lab.files.project.project import load_project
 from lab.files.rig.rig_file import load_rig
 from lab.files.text.csv_text import read_table
+from lab.init.files import start
+from lab.init.layout import Layout
 from lab.simulate.calibration_campaign import CampaignQuality, draw_campaign, lens_covariance
 from lab.simulate.campaign_files import simulate_calibration
 from lab.simulate.rigs import RIGS
+from lab.simulate.write import simulate
 
 
 @pytest.fixture(scope="module")
@@ -167,3 +170,21 @@ def test_a_known_pose_of_the_stand_is_written_with_its_sigmas(tmp_path):
     error = stand.world_from_stand.minus(c.world_from_stand)
     assert np.all(np.abs(error) < 5 * np.sqrt(np.diagonal(c.place_covariance)))
     assert np.isclose(stand.sigma_m, quality.place_m)
+
+
+def test_a_campaign_and_a_recording_of_a_rig_of_your_own(tmp_path):
+    """The rig that `beampose init` writes has no spots that leave the picture, as most scenarios require."""
+    designed = start(tmp_path / "lab", Layout(cameras=2, screens=2, beams=3), 100.0).rig
+    folder = simulate_calibration(tmp_path / "campaign", rig=str(designed), positions=4)
+    assert set(load_project(folder).cameras) == set(load_rig(designed).cameras)
+    true = folder / "truth" / "rig.yaml"
+    run = simulate("small-motion", tmp_path / "run", frames=3, detections_only=True, rig=true, known_rig=designed)
+    np.testing.assert_allclose(load_rig(run / "rig.yaml").beams["A"].direction, load_rig(designed).beams["A"].direction)
+    assert not np.allclose(load_rig(true).beams["A"].direction, load_rig(designed).beams["A"].direction, atol=1e-6)
+
+
+@pytest.mark.parametrize(("rig", "words"), [("fna", "did you mean 'fan'"), ("lab/rig.yaml", "known: fan")])
+def test_a_rig_that_is_neither_a_name_nor_a_file_is_an_error(rig, words, tmp_path):
+    with pytest.raises(InputError, match=words):
+        simulate_calibration(tmp_path / "campaign", rig=rig)
+    assert not (tmp_path / "campaign").exists()

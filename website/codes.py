@@ -1,0 +1,25 @@
+"""The page of all codes BP-..., from the catalogue that `beampose explain` reads."""
+
+from __future__ import annotations
+
+from lab.explain.catalogue import SECTIONS
+from website.text import cell
+
+_HEAD = """# Codes
+
+Every warning, verdict reason, finding and error has a code. It appears in reports, in `summary.json` and on the
+terminal. `beampose explain BP-V03` shows the text of this page. A text may change; a code keeps its meaning.
+
+This page is generated from `lab/explain/`.
+"""
+
+
+def page() -> str:
+    """The page as Markdown."""
+    lines = [_HEAD]
+    for title, section in SECTIONS.items():
+        lines += [f"## {title}", ""]
+        for code, text in section.items():
+            lines += [f"### {code}: {cell(text.title)} {{ #{code.lower()} }}", ""]
+            lines += [cell(text.meaning), "", f"**What to do:** {cell(text.remedy)}", ""]
+    return "\n".join(lines)
