@@ -22,7 +22,7 @@ class SegmentationParameters:
     min_area_px2: float = 6.0  # smaller regions are noise
     max_area_px2: float = 40000.0  # larger regions are background
     centroid: Literal["coverage", "contour"] = "coverage"  # contour: the paper's
-    sigma_floor_px: float = 0.03  # smallest sigma of a centroid: shading and texture of a real marker
+    sigma_floor_px: float = 0.02  # smallest sigma of a centroid: shading and texture of a real marker
     max_markers: int = 40  # per picture, the largest regions first
 
     def __post_init__(self) -> None:

@@ -15,8 +15,8 @@ from geometry.arrays import Array, Ints, symmetric
 from geometry.pose import Pose
 from geometry.uncertainty.chi_square import chi2_tail
 from tracking.binocular.acquisition import acquire, distinct, mirrored
-from tracking.binocular.joint_fit import JointFit
-from tracking.binocular.labelling import Images, LabelledPose, labelled_pose
+from tracking.binocular.joint_fit import JointFit, MarkerObservations
+from tracking.binocular.labelling import Images, LabelledPose, labelled_pose, observations
 from tracking.binocular.marker_model import MarkerImages, MarkerModel, StereoPair, project_markers
 from tracking.binocular.motion import Motion
 from tracking.binocular.parameters import MatchParameters
@@ -41,7 +41,8 @@ class BinocularFrame:
     reason: str  # why it is not measured; empty if it is
     pose: Pose | None  # world_from_body
     covariance: Array | None  # (6, 6)
-    fit: JointFit | None  # of the images of this frame
+    fit: JointFit | None  # of the images of this frame, also where it is no measurement
+    observed: MarkerObservations | None  # the images of that fit
     index: Ints  # (2, K) candidates of the markers, -1: none
     predicted_px: Array  # (2, K, 2), before the pictures were used; nan without a prediction
     predicted_cov_px2: Array  # (2, K, 2, 2)
@@ -58,6 +59,7 @@ class BinocularTracker:
     def __init__(self, pair: StereoPair, model: MarkerModel, parameters: MatchParameters) -> None:
         self._pair, self._model, self._p = pair, model, parameters
         self._motion: Motion | None = None
+        self._images: Images = (MarkerImages.none(), MarkerImages.none())  # of the current frame
         self._last_measured: int = -1
         self._count = -1
 
@@ -70,6 +72,7 @@ class BinocularTracker:
             return self._unmeasured(NO_PICTURES, ahead)
         if max(len(found) for found in images) < self._p.min_markers:
             return self._unmeasured(TOO_FEW, ahead)
+        self._images = images
         candidates = self._candidates(images, ahead)
         if not candidates:
             return self._unmeasured(NO_POSE, ahead)
@@ -176,5 +179,6 @@ class BinocularTracker:
             cov = J @ ahead.pose_covariance @ np.swapaxes(J, -1, -2)
         used = found is not None and (status is PoseStatus.MEASURED or reason == AMBIGUOUS)
         index = found.index if found is not None and used else np.full((2, count), -1, dtype=np.int64)
-        fit = found.fit if found is not None else None
-        return BinocularFrame(status, reason, pose, covariance, fit, index, pixels, cov)
+        fit = None if found is None else found.fit
+        observed = None if found is None else observations(self._images, found.index)
+        return BinocularFrame(status, reason, pose, covariance, fit, observed, index, pixels, cov)
