@@ -33,7 +33,9 @@ FRAMES, RATE_HZ = 60, 25.0
 _RADIUS_M = 0.03  # of a marker
 _SUB = 8  # each pixel of a marker's outline is divided into _SUB x _SUB
 _BLUR_PX = 0.6
-_SKY, _MARKER, _RIM, _PROBE = (np.array(c, dtype=float) for c in ((150, 120, 95), (40, 35, 165), (70, 70, 75), (45, 48, 50)))
+_SKY, _MARKER, _RIM, _PROBE = (
+    np.array(c, dtype=float) for c in ((150, 120, 95), (40, 35, 165), (70, 70, 75), (45, 48, 50))
+)
 _EXPOSURE = (1.0, 1.35)  # of the two cameras: the right one is brighter, as in the paper
 _READ_DN, _ELECTRONS = 1.2, 60.0  # read noise; electrons per DN
 
@@ -75,7 +77,9 @@ def simulated_pair(focal_px: float, size_px: tuple[int, int], baseline_m: float 
     )
 
 
-def scene(seed: int, frames: int = FRAMES, size_px: tuple[int, int] = (960, 720), focal_px: float = 1100.0) -> StereoScene:
+def scene(
+    seed: int, frames: int = FRAMES, size_px: tuple[int, int] = (960, 720), focal_px: float = 1100.0
+) -> StereoScene:
     """The drogue sways in front of the cameras and comes from 11 m to 7 m (at 25 Hz, whatever the number of frames)."""
     rng = np.random.default_rng(seed)
     t = np.arange(frames) / RATE_HZ
@@ -230,8 +234,9 @@ def _write_points(view: StereoScene, noise_px: float, rng: np.random.Generator, 
             size = np.array(camera.image_size_px)
             seen = in_picture(pixels[i, c], size) & ~hidden[i, c]
             uv = pixels[i, c, seen] + noise_px * rng.normal(size=(int(seen.sum()), 2))
-            for at in rng.permutation(np.vstack([uv, rng.uniform(0, 1, 2) * (size - 1)])):
-                rows.append([i, camera.name, *(f"{x:.6f}" for x in at), sigma, sigma, 1000, 100, 1.5, 1.5, 0, 0])
+            places = rng.permutation(np.vstack([uv, rng.uniform(0, 1, 2) * (size - 1)]))
+            shape = (sigma, sigma, 1000, 100, 1.5, 1.5, 0, 0)
+            rows += [[i, camera.name, *(f"{x:.6f}" for x in at), *shape] for at in places]
     write_table(path, columns.DETECTIONS, rows)
 
 

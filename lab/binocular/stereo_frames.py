@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -32,11 +32,19 @@ class StereoFrame:
 class _Reader(Protocol):
     """One camera's pictures; every frame number is requested once, in increasing order."""
 
-    first: int
-    last: int | None  # None: known at the end of the video
+    @property
+    def first(self) -> int:
+        """The first frame number."""
+
+    @property
+    def last(self) -> int | None:
+        """The last frame number; None: known at the end of the video."""
 
     def at(self, frame: int) -> Content | None:
         """The content of a frame; None: the video has ended."""
+
+    def skip(self, frame: int) -> None:
+        """Passes over a frame whose content is not needed."""
 
 
 class _Folder:
@@ -54,6 +62,8 @@ class _Folder:
         name = self._listing.names.get(frame)
         return MissingPicture(DROPPED) if name is None else read_colour(self._listing.folder / name, self._size)
 
+    def skip(self, frame: int) -> None: ...
+
 
 class _Video:
     def __init__(self, path: Path, size_px: tuple[int, int]) -> None:
@@ -69,6 +79,10 @@ class _Video:
         good, picture = self._capture.retrieve()
         return colour_of(picture, self._size) if good and picture is not None else MissingPicture(UNREADABLE)
 
+    def skip(self, frame: int) -> None:
+        if frame >= 0:
+            self._capture.grab()
+
 
 class _Table:
     def __init__(self, path: Path, camera: str) -> None:
@@ -83,6 +97,8 @@ class _Table:
         n = len(found.uv_px)
         return MarkerImages(found.uv_px, found.cov_px2, np.full(n, np.nan), np.zeros(n, dtype=np.int64))
 
+    def skip(self, frame: int) -> None: ...
+
 
 def _reader(source: Source, camera: str, size_px: tuple[int, int]) -> _Reader:
     if isinstance(source, FramesFolder):
@@ -92,25 +108,46 @@ def _reader(source: Source, camera: str, size_px: tuple[int, int]) -> _Reader:
     return _Video(source.path, size_px)
 
 
+def _readers(run: StereoRun) -> list[_Reader]:
+    return [
+        _reader(source, name, camera.image_size_px)
+        for (name, source), camera in zip(run.cameras.items(), run.pair.cameras, strict=True)
+    ]
+
+
 def stereo_frames(run: StereoRun) -> Iterator[StereoFrame]:
     """All frames, from the first to the last of any camera.
 
     Raises:
-        InputError: a folder is empty, a video or table cannot be read, or both videos have no picture.
+        InputError: a folder is empty, or a video or table cannot be read.
     """
-    readers = [
-        _reader(source, name, camera.image_size_px)
-        for (name, source), camera in zip(run.cameras.items(), run.pair.cameras, strict=True)
-    ]
+    readers = _readers(run)
     frame = min(r.first for r in readers)
     known = [r.last for r in readers if r.last is not None]
     last = max(known) if known else -1
-    open_ended = [r for r in readers if r.last is None]
+    ended: set[int] = set()  # videos, by their index
     while True:
-        got = [r.at(frame) for r in readers]
-        running = any(c is not None for r, c in zip(readers, got, strict=True) if r in open_ended)
+        got = [MissingPicture(DROPPED) if i in ended else r.at(frame) for i, r in enumerate(readers)]
+        ended |= {i for i, content in enumerate(got) if content is None}
+        running = any(r.last is None and i not in ended for i, r in enumerate(readers))
         if frame > last and not running:
             return
-        left, right = (MissingPicture(DROPPED) if c is None else c for c in got)
+        left, right = (MissingPicture(DROPPED) if content is None else content for content in got)
         yield StereoFrame(frame, (left, right))
         frame += 1
+
+
+def frames_at(run: StereoRun, wanted: Collection[int]) -> dict[int, StereoFrame]:
+    """Some frames by number. A video is read from its start. Raises InputError as `stereo_frames`."""
+    if not wanted:
+        return {}
+    readers = _readers(run)
+    out = {}
+    for frame in range(min(r.first for r in readers), max(wanted) + 1):
+        if frame in wanted:
+            left, right = (MissingPicture(DROPPED) if c is None else c for c in (r.at(frame) for r in readers))
+            out[frame] = StereoFrame(frame, (left, right))
+        else:
+            for r in readers:
+                r.skip(frame)
+    return out

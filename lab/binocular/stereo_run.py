@@ -106,7 +106,9 @@ def load_stereo_run(run_folder: Path) -> StereoRun:
     path = folder / "run.yaml"
     mapping = read_mapping(path)
     if mapping.get("schema") == "beampose/run/1":
-        raise InputError(f"{path}: schema: expected {SCHEMA!r}, got a run of laser spots; process it with `beampose run`")
+        raise InputError(
+            f"{path}: schema: expected {SCHEMA!r}, got a run of laser spots; process it with `beampose run`"
+        )
     content = validated(_StereoRunBlock, mapping, path)
     names = list(content.cameras)
     if len(names) != 2:
@@ -167,7 +169,9 @@ def _source_of(block: _SourceBlock, folder: Path, where: str) -> Source:
     if path.is_dir():
         return FramesFolder(path)
     if path.suffix.lower() in PICTURE_SUFFIXES and path.is_file():
-        raise InputError(f"{where}.frames: expected a folder or a video, got the single picture {path}; name its folder")
+        raise InputError(
+            f"{where}.frames: expected a folder or a video, got the single picture {path}; name its folder"
+        )
     if path.is_file():
         return VideoFile(path)
     raise InputError(f"{where}.frames: expected a folder of pictures or a video, found nothing at {path}")

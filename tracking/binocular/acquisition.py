@@ -56,7 +56,9 @@ def matching_pairs(pair: StereoPair, images: Images, p: MatchParameters) -> Bool
 def acquire(pair: StereoPair, model: MarkerModel, images: Images, p: MatchParameters) -> list[LabelledPose]:
     """The poses that explain the candidates, different ones, the best first; empty where none does."""
     partners = matching_pairs(pair, images, p)
-    ranked = [_ranked(images[0], partners.any(axis=1)), _ranked(images[1], partners.any(axis=0))]
+    left: Bools = np.asarray(partners.any(axis=1))
+    right: Bools = np.asarray(partners.any(axis=0))
+    ranked = [_ranked(images[0], left), _ranked(images[1], right)]
     found: list[LabelledPose] = []
     expected = sum(min(len(model), len(candidates)) for candidates in images)
     for c in (0, 1):
@@ -159,7 +161,7 @@ def _hypotheses(pair: StereoPair, model: MarkerModel, found: MarkerImages, ranke
     good = np.isfinite(all_rays).all(axis=(1, 2))
     origin = np.broadcast_to(eye, (3, 3))
     poses = poses_from_three_spots(origin, all_rays[good], markers[good])
-    solved = np.isfinite(poses.translation).all(axis=-1)
+    solved: Bools = np.asarray(np.isfinite(poses.translation).all(axis=-1))
     return poses[solved].inverse()
 
 
@@ -168,10 +170,7 @@ def _best(pair: StereoPair, model: MarkerModel, images: Images, poses: Pose) -> 
     if not len(poses.translation):
         return []
     scores = np.concatenate(
-        [
-            _coarse(pair, model, images, poses[i : i + _CHUNK])
-            for i in range(0, len(poses.translation), _CHUNK)
-        ]
+        [_coarse(pair, model, images, poses[i : i + _CHUNK]) for i in range(0, len(poses.translation), _CHUNK)]
     )
     kept: list[Pose] = []
     for i in np.argsort(-scores)[: 20 * _REFINED].tolist():

@@ -1,8 +1,8 @@
 """Whether the two cameras expose at the same time, from residuals that grow with the velocity in the picture.
 
-If the right picture is taken a time d after the left one, each of its images is shifted by d times its velocity. Part of
-the shift is absorbed by the pose; the rest (across the epipolar lines, and in the size of the target) is a residual. All
-frames together give d by least squares, beside a rotation of the right camera, which shifts all frames equally.
+If the right picture is taken a time d after the left one, each of its images is shifted by d times its velocity. Part
+of the shift is absorbed by the pose; the rest (across the epipolar lines, and in the size of the target) is a residual.
+All frames together give d by least squares, beside a rotation of the right camera, which shifts all frames equally.
 Source: ours.
 """
 

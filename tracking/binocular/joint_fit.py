@@ -1,7 +1,8 @@
 """The pose that explains the images of all markers in both cameras: the joint reprojection fit.
 
 Generalised least squares: the covariance of the pixels is their noise plus what is common to all frames, the errors of
-the calibration and of the surveyed markers. Source: ours, after the solver of the main path (geometry/pose_solver/gauss_newton.py).
+the calibration and of the surveyed markers. Source: ours, after the solver of the main path
+(geometry/pose_solver/gauss_newton.py).
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from geometry.arrays import Array, Bools, symmetric
+from geometry.arrays import Array, Bools, Ints, symmetric
 from geometry.pose import Pose
 from tracking.binocular.marker_model import MarkerModel, StereoPair, calibration_jacobian, project_markers
 
@@ -56,7 +57,7 @@ def fit_pose(pair: StereoPair, model: MarkerModel, observed: MarkerObservations,
     With fewer than three images of markers, or where they do not determine the pose, `observable` is False and the
     covariance is infinite.
     """
-    rows = np.flatnonzero(np.repeat(observed.seen.ravel(), 2))
+    rows: Ints = np.flatnonzero(np.repeat(observed.seen.ravel(), 2)).astype(np.int64)
     if len(rows) < 6:
         return None
     whitening = _whitening(pair, model, observed, start, rows)
@@ -75,7 +76,7 @@ def fit_pose(pair: StereoPair, model: MarkerModel, observed: MarkerObservations,
     covariance, observable = _covariance(J)
     systematic = np.zeros((6, 6))
     if observable:
-        gain = covariance @ J.T @ again
+        gain: Array = covariance @ J.T @ again
         systematic = symmetric(gain @ _common_errors(pair, model, found, rows) @ gain.T)
     return JointFit(found, covariance, systematic, residuals, float(r @ r), len(rows) - 6, observable)
 
@@ -96,7 +97,7 @@ def bound(pair: StereoPair, model: MarkerModel, pose: Pose, cov_px2: Array, seen
 
 
 def _minimised(
-    pair: StereoPair, model: MarkerModel, uv_px: Array, start: Pose, rows: Array, whitening: Array
+    pair: StereoPair, model: MarkerModel, uv_px: Array, start: Pose, rows: Ints, whitening: Array
 ) -> Pose | None:
     pose, damping = start, 1e-3
     r, J = _whitened(pair, model, uv_px, pose, rows, whitening)
@@ -105,7 +106,7 @@ def _minimised(
     cost = float(r @ r)
     for _ in range(_STEPS):
         H, g = J.T @ J, J.T @ r
-        step = np.linalg.lstsq(H + damping * np.diag(np.diagonal(H) + 1e-12), g, rcond=None)[0]
+        step: Array = np.linalg.lstsq(H + damping * np.diag(np.diagonal(H) + 1e-12), g, rcond=None)[0].astype(float)
         trial = pose.plus(step)
         t_r, t_J = _whitened(pair, model, uv_px, trial, rows, whitening)
         t_cost = float(t_r @ t_r)
@@ -122,7 +123,7 @@ def _minimised(
 
 
 def _whitened(
-    pair: StereoPair, model: MarkerModel, uv_px: Array, pose: Pose, rows: Array, whitening: Array
+    pair: StereoPair, model: MarkerModel, uv_px: Array, pose: Pose, rows: Ints, whitening: Array
 ) -> tuple[Array, Array]:
     """Residuals (m,) in sigmas and the derivatives (m, 6) of the prediction."""
     pixels, J = project_markers(pair, model, pose)
@@ -133,7 +134,7 @@ def _whitened(
     return white[:, 0], white[:, 1:]
 
 
-def _common_errors(pair: StereoPair, model: MarkerModel, pose: Pose, rows: Array) -> Array:
+def _common_errors(pair: StereoPair, model: MarkerModel, pose: Pose, rows: Ints) -> Array:
     """Covariance (m, m), px^2, of pixel coordinates due to the calibration and the survey of the markers."""
     out = np.zeros((len(rows), len(rows)))
     if pair.covariance is not None:
@@ -147,7 +148,9 @@ def _common_errors(pair: StereoPair, model: MarkerModel, pose: Pose, rows: Array
     return out
 
 
-def _whitening(pair: StereoPair, model: MarkerModel, observed: MarkerObservations, pose: Pose, rows: Array) -> Array | None:
+def _whitening(
+    pair: StereoPair, model: MarkerModel, observed: MarkerObservations, pose: Pose, rows: Ints
+) -> Array | None:
     """W (m, m) with W C W^T = I for the covariance C of the m pixel coordinates; None where a marker has no image."""
     blocks = observed.cov_px2[observed.seen]
     C = np.zeros((len(rows), len(rows)))

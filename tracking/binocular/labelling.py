@@ -61,9 +61,7 @@ def expected_areas(pair: StereoPair, model: MarkerModel, pose: Pose) -> Array:
     return np.array(out)
 
 
-def assign(
-    pair: StereoPair, model: MarkerModel, images: Images, pose: Pose, spread: Array, p: MatchParameters
-) -> Ints:
+def assign(pair: StereoPair, model: MarkerModel, images: Images, pose: Pose, spread: Array, p: MatchParameters) -> Ints:
     """The candidates (2, K) of all markers at a pose of covariance `spread` (6, 6); -1 where none fits."""
     pixels, J = project_markers(pair, model, pose)
     areas = expected_areas(pair, model, pose)

@@ -133,8 +133,13 @@ def calibration_jacobian(pair: StereoPair, points_world: Array) -> Array:
             np.asarray(camera.lens == FISHEYE),
         )
         by_turn = np.cross(points_world[:, None, :], seen.d_point @ to_camera.rotation)
-        by = dict(zip((*PINHOLE, *DISTORTION, *POSE), np.concatenate(
-            [seen.d_pinhole, seen.d_distortion, seen.d_point, by_turn], axis=-1).transpose(2, 0, 1), strict=True))
+        by = dict(
+            zip(
+                (*PINHOLE, *DISTORTION, *POSE),
+                np.concatenate([seen.d_pinhole, seen.d_distortion, seen.d_point, by_turn], axis=-1).transpose(2, 0, 1),
+                strict=True,
+            )
+        )
         for i, name in enumerate(names):
             _, item, parameter = split_name(name)
             if item == camera.name:

@@ -1,4 +1,4 @@
-"""Constant-velocity prediction of the target's pose, for matching and for frames without a measurement. Source: ours."""
+"""Constant-velocity prediction of the target's pose: for matching, and for frames without a measurement. Ours."""
 
 from __future__ import annotations
 

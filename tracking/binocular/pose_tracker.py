@@ -115,9 +115,7 @@ class BinocularTracker:
     def _convincing(self, found: LabelledPose, images: Images) -> bool:
         explained = int((found.index >= 0).sum())
         expected = min(2 * len(self._model), len(images[0]) + len(images[1]))
-        return (
-            chi2_tail(found.fit.chi2, max(found.fit.dof, 1)) > _TRUSTED_P and explained >= _TRUSTED_SHARE * expected
-        )
+        return chi2_tail(found.fit.chi2, max(found.fit.dof, 1)) > _TRUSTED_P and explained >= _TRUSTED_SHARE * expected
 
     def _prior_nats(self, candidate: LabelledPose, ahead: Motion | None) -> float:
         """Log density of a candidate under the prediction, up to a constant and limited."""
@@ -137,9 +135,7 @@ class BinocularTracker:
             return MISFIT
         if best.evidence < self._p.lead_nats:
             return NO_POSE
-        worst = np.sqrt(
-            [np.linalg.eigvalsh(best.fit.covariance[s, s])[-1] for s in (slice(0, 3), slice(3, 6))]
-        )
+        worst = np.sqrt([np.linalg.eigvalsh(best.fit.covariance[s, s])[-1] for s in (slice(0, 3), slice(3, 6))])
         if worst[0] > LOST_SIGMA_M or worst[1] > LOST_SIGMA_RAD:
             return WEAK
         return AMBIGUOUS if rivals else ""

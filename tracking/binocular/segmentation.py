@@ -1,7 +1,7 @@
 """Marker candidates in a colour picture: Zhou (2020), section 2, with centroids to a few hundredths of a pixel.
 
-The paper brightens the left picture by gamma 0.8, gives the right one the histogram of the left, segments in HSV, cleans
-the mask by a median filter, an opening and a closing, and takes the centroid of each contour. A contour's centroid
+The paper brightens the left picture by gamma 0.8, gives the right one the histogram of the left, segments in HSV,
+cleans the mask by a median filter, an opening and a closing, and takes the centroid of each contour. A contour's centroid
 carries the errors of its pixels' edges. Ours (`coverage`) weights each pixel of the unchanged picture with the share of
 the marker's colour in it, which is linear in the light: partly covered pixels and defocus do not shift it.
 """
@@ -129,7 +129,7 @@ def marker_candidates(
             if p.centroid == "coverage":
                 measured = _coverage_centroid(picture[box].astype(float), own, anywhere[box] & ~own)
             uv, cov, size = _contour_centroid(own) if measured is None else measured
-            uv = uv + [box[1].start, box[0].start]
+            uv = uv + np.array([box[1].start, box[0].start])
             rows.append((size, uv, cov + p.sigma_floor_px**2 * np.eye(2), index))
     rows.sort(key=lambda row: -row[0])
     rows = rows[: p.max_markers]
@@ -169,15 +169,15 @@ def _coverage_centroid(patch: Array, own: Bools, others: Bools) -> tuple[Array, 
     background = patch[ring].mean(axis=0)
     apart = patch[core].mean(axis=0) - background
     spread = np.cov(patch[ring].T) + _LEAST_VARIANCE_DN2 * np.eye(3)
-    direction = np.linalg.solve(spread, apart)
+    direction: Array = np.linalg.solve(spread, apart).astype(float)
     contrast = float(direction @ apart)
     if contrast < _LEAST_CONTRAST2:
         return None
-    share = (patch - background) @ direction / contrast
+    share: Array = (patch - background) @ direction / contrast
     weight = float(share[near].sum())
     if weight < 1.0:
         return None
-    v, u = np.indices(own.shape)
+    v, u = np.mgrid[: own.shape[0], : own.shape[1]]
     at = np.stack([u[near], v[near]], axis=1)
     centre = share[near] @ at / weight
     arm = at - centre

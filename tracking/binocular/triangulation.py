@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from geometry.arrays import Array, symmetric
+from geometry.arrays import Array, Bools, symmetric
 from geometry.camera import Camera
 from geometry.lines import common_perpendicular
 from tracking.binocular.marker_model import StereoPair, project
@@ -61,7 +61,7 @@ def triangulate(pair: StereoPair, uv_px: Array, cov_px2: Array) -> Triangulated:
     )
     feet = common_perpendicular(from_left, along_left, from_right, along_right)
     points = 0.5 * (feet[0] + feet[1])
-    weight = np.linalg.inv(cov_px2)
+    weight: Array = np.asarray(np.linalg.inv(cov_px2), dtype=np.float64)
     for _ in range(_STEPS):
         residual, JtW, H = _normal_equations(pair, points, uv_px, weight)
         step = _solved(H, JtW, residual)
@@ -70,9 +70,9 @@ def triangulate(pair: StereoPair, uv_px: Array, cov_px2: Array) -> Triangulated:
             break
     residual, _, H = _normal_equations(pair, points, uv_px, weight)
     chi2 = np.einsum("cni,cnij,cnj->n", residual, weight, residual)
-    good = np.isfinite(H).all(axis=(1, 2))
+    good: Bools = np.isfinite(H).all(axis=(1, 2))
     H[~good] = np.eye(3)
-    covariance = np.where(good[:, None, None], symmetric(np.linalg.inv(H)), np.nan)
+    covariance = np.where(good[:, None, None], symmetric(np.asarray(np.linalg.inv(H), dtype=np.float64)), np.nan)
     return Triangulated(points, covariance, chi2)
 
 
@@ -86,7 +86,7 @@ def _normal_equations(pair: StereoPair, points: Array, uv_px: Array, weight: Arr
 def _solved(H: Array, JtW: Array, residual: Array) -> Array:
     """Steps (n, 3); nan where a point has no projection or the rays are parallel."""
     right = (JtW @ residual[..., None]).sum(axis=0)
-    good = np.isfinite(H).all(axis=(1, 2)) & np.isfinite(right).all(axis=(1, 2))
+    good: Bools = np.asarray(np.isfinite(H).all(axis=(1, 2)) & np.isfinite(right).all(axis=(1, 2)))
     good[good] = np.linalg.cond(H[good]) < 1e15
     step = np.full(right.shape, np.nan)
     if good.any():

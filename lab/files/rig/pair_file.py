@@ -16,8 +16,14 @@ from geometry.pose import Pose
 from geometry.uncertainty.rig_parameters import RigCovariance, camera_names
 from lab.errors import InputError
 from lab.files.rig.calibration_state import CalibrationState, CalibrationStateBlock, state_mapping
-from lab.files.rig.camera_block import Covariance, CovarianceBlock, LensBlock, covariance_error, covariance_mapping
-from lab.files.rig.camera_block import lens_mapping
+from lab.files.rig.camera_block import (
+    Covariance,
+    CovarianceBlock,
+    LensBlock,
+    covariance_error,
+    covariance_mapping,
+    lens_mapping,
+)
 from lab.files.rig.interchange import BEAMPOSE, RIG, read_cameras, recognised_format
 from lab.files.rig.rig_covariance import joint_covariance
 from lab.files.rig.rig_file import PoseBlock, load_rig_file, pose_mapping
@@ -68,8 +74,9 @@ def load_pair_file(path: Path) -> PairFile:
         return PairFile(rig.rig.cameras, joint_covariance(rig.rig, rig.covariances, path), rig.calibration)
     models = read_cameras(path)
     if len(models) < 2:
-        raise InputError(f"{path}: expected two cameras with their poses, got the single camera {models[0].name};"
-                         f" {REMEDY}")
+        raise InputError(
+            f"{path}: expected two cameras with their poses, got the single camera {models[0].name}; {REMEDY}"
+        )
     lost = [m.name for m in models if m.camera_from_reference is None]
     if lost or kind == BEAMPOSE:
         raise InputError(
@@ -87,9 +94,7 @@ def load_pair_file(path: Path) -> PairFile:
 
 def _own(content: _PairBlock, path: Path) -> PairFile:
     cameras = {
-        name: Camera(
-            name, "", b.size(), b.matrix(), tuple(b.distortion), b.camera_from_world.pose(), lens=b.lens
-        )
+        name: Camera(name, "", b.size(), b.matrix(), tuple(b.distortion), b.camera_from_world.pose(), lens=b.lens)
         for name, b in content.cameras.items()
     }
     if len(cameras) < 2:
@@ -100,7 +105,9 @@ def _own(content: _PairBlock, path: Path) -> PairFile:
         known = [f"cameras.{name}.{p}" for name, camera in cameras.items() for p in camera_names(camera)]
         for name in block.parameters:
             if name not in known:
-                raise InputError(f"{path}: covariance.parameters: unknown parameter {name!r}{suggest_name(name, known)}")
+                raise InputError(
+                    f"{path}: covariance.parameters: unknown parameter {name!r}{suggest_name(name, known)}"
+                )
         mistake = covariance_error(block)
         if mistake:
             raise InputError(f"{path}: covariance.matrix: {mistake}")

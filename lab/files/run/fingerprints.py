@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -36,6 +37,16 @@ def fingerprints(run: Run, full: bool = False) -> list[dict[str, Any]]:
         done.add(source.path)
         out.append(_of_folder(source.path, full) if isinstance(source, FramesFolder) else _of_file(source.path, full))
     return out
+
+
+def fingerprints_of(files: Iterable[Path], sources: Iterable[Path], full: bool = False) -> list[dict[str, Any]]:
+    """Path, SHA-256 and size of files and of sources, each a file or a folder of pictures; each path once.
+
+    Raises:
+        OSError: a file cannot be read.
+    """
+    paths = dict.fromkeys((*files, *sources))
+    return [_of_folder(p, full) if p.is_dir() else _of_file(p, full) for p in paths]
 
 
 def _of_file(path: Path, full: bool) -> dict[str, Any]:
