@@ -39,6 +39,7 @@ for command in (
     maintenance.explain,
 ):
     main.add_command(command)
+calibrate.calibrate.add_command(stereo.pair)
 
 if __name__ == "__main__":
     main()

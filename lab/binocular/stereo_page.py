@@ -248,8 +248,8 @@ def _pair(results: StereoResults) -> Section:
     else:
         rows.append(["synchronisation", "not tested: too few moving frames"])
     words = (
-        "Synchronisation and rotation are estimated from the residuals of all frames: an offset in time shifts images in"
-        " proportion to their velocity, a rotation shifts them equally in all frames."
+        "Synchronisation and rotation are estimated from the residuals of all frames: an offset in time shifts images"
+        " in proportion to their velocity, a rotation shifts them equally in all frames."
     )
     drawings = []
     if len(results.measured) > 1:

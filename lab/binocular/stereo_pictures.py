@@ -89,7 +89,7 @@ def _side(results: StereoResults, record: StereoRecord, content: Content, c: int
         if used[k] >= 0:
             u, v = place(at[used[k]])
             out.append(_ring(u, v, GREEN))
-            style = f"fill:#7dffce;font-weight:700;font-size:13px"
+            style = "fill:#7dffce;font-weight:700;font-size:13px"
             out.append(f'<text x="{u + 9:.1f}" y="{v - 7:.1f}" style="{style}">{escape(label)}</text>')
         elif np.isfinite(expected[k]).all() and x0 <= expected[k, 0] <= x1 and y0 <= expected[k, 1] <= y1:
             u, v = place(expected[k])

@@ -1,7 +1,7 @@
 """Marker candidates in a colour picture: Zhou (2020), section 2, with centroids to a few hundredths of a pixel.
 
 The paper brightens the left picture by gamma 0.8, gives the right one the histogram of the left, segments in HSV,
-cleans the mask by a median filter, an opening and a closing, and takes the centroid of each contour. A contour's centroid
+cleans the mask by a median filter, an opening and a closing, and takes the centroid of each contour. Such a centroid
 carries the errors of its pixels' edges. Ours (`coverage`) weights each pixel of the unchanged picture with the share of
 the marker's colour in it, which is linear in the light: partly covered pixels and defocus do not shift it.
 """

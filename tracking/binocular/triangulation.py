@@ -70,7 +70,7 @@ def triangulate(pair: StereoPair, uv_px: Array, cov_px2: Array) -> Triangulated:
             break
     residual, _, H = _normal_equations(pair, points, uv_px, weight)
     chi2 = np.einsum("cni,cnij,cnj->n", residual, weight, residual)
-    good: Bools = np.isfinite(H).all(axis=(1, 2))
+    good: Bools = np.asarray(np.isfinite(H).all(axis=(1, 2)))
     H[~good] = np.eye(3)
     covariance = np.where(good[:, None, None], symmetric(np.asarray(np.linalg.inv(H), dtype=np.float64)), np.nan)
     return Triangulated(points, covariance, chi2)
@@ -86,7 +86,8 @@ def _normal_equations(pair: StereoPair, points: Array, uv_px: Array, weight: Arr
 def _solved(H: Array, JtW: Array, residual: Array) -> Array:
     """Steps (n, 3); nan where a point has no projection or the rays are parallel."""
     right = (JtW @ residual[..., None]).sum(axis=0)
-    good: Bools = np.asarray(np.isfinite(H).all(axis=(1, 2)) & np.isfinite(right).all(axis=(1, 2)))
+    finite = np.isfinite(H).all(axis=(1, 2)) & np.isfinite(right).all(axis=(1, 2))
+    good: Bools = np.asarray(finite)
     good[good] = np.linalg.cond(H[good]) < 1e15
     step = np.full(right.shape, np.nan)
     if good.any():
