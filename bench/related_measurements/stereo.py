@@ -46,7 +46,9 @@ def main() -> None:
     for name, rms in (("Horn", horn), ("joint", joint)):
         turn = np.rad2deg(np.linalg.norm(rms[3:]))
         print(f"seven markers, 10 m, {name}: {1000 * np.linalg.norm(rms[:3]):.2f} mm, {turn:.3f} deg")
-    print(f"  joint over bound: position {p.ratios()[0]:.3f}, rotation {p.ratios()[1]:.3f}; NEES/6 {p.nees.mean() / 6:.3f}")
+    print(
+        f"  joint over bound: position {p.ratios()[0]:.3f}, rotation {p.ratios()[1]:.3f}; NEES/6 {p.nees.mean() / 6:.3f}"
+    )
     if given.campaigns:
         _campaigns(given.campaigns, given.seed)
 
@@ -63,7 +65,8 @@ def _campaigns(count: int, seed: int) -> None:
         print(f"campaign {i}: bias of the joint fit " + ", ".join(f"{100 * b:+.3f} %" for b in bias[-1])
               + f"; NEES/6 {nees[-1] / 6:.2f}")  # fmt: skip
     rms = np.sqrt((np.array(bias) ** 2).mean(axis=0))
-    print("all campaigns: RMS bias " + ", ".join(f"{d:g} m {100 * b:.3f} %" for d, b in zip(DISTANCES_M, rms, strict=True))
+    shares = [f"{d:g} m {100 * b:.3f} %" for d, b in zip(DISTANCES_M, rms, strict=True)]
+    print("all campaigns: RMS bias " + ", ".join(shares)
           + f"; NEES/6 {np.mean(nees) / 6:.2f}")  # fmt: skip
 
 

@@ -15,7 +15,7 @@ from calibration.lens.fit.lens_models import LensModel
 from calibration.lens.intrinsics import IntrinsicsOptions, calibrate_intrinsics
 from calibration.pair.pair_calibration import CalibratedPair, calibrate_pair
 from geometry import rotations
-from geometry.arrays import Array
+from geometry.arrays import Array, Ints
 from geometry.camera import in_picture
 from geometry.pose import Pose
 from lab.binocular.simulated_recording import drogue_markers, simulated_pair
@@ -27,7 +27,7 @@ from tracking.binocular.triangulation import linear_points, triangulate, undisto
 
 FOCAL_PX, SIZE_PX, BASELINE_M = 939.0, (1920, 1080), 0.5
 DISTANCES_M = (5.0, 10.0, 15.0, 20.0, 25.0, 30.0)
-METHODS = ("linear", "most likely", "joint fit")  # the paper's equations (7) to (9); single points; all markers
+METHODS = ("paper's method", "single points", "joint fit")  # equations (7) to (9); most likely points; all markers
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +94,7 @@ def random_pose(distance_m: float, rng: np.random.Generator) -> Pose:
 class PoseErrors:
     """Errors of the pose of seven markers over many trials."""
 
-    horn: Array  # (trials, 6), section 1 of the file contract: from the triangulated points
+    horn: Array  # (trials, 6), section 1 of the file contract: the paper's method
     joint: Array  # (trials, 6): the joint fit
     bounds: Array  # (trials, 6): smallest sigmas of an unbiased estimate
     nees: Array  # (trials,) of the joint fit
@@ -116,7 +116,8 @@ def pose_errors(
     for _ in range(trials):
         pose = random_pose(distance_m, rng)
         uv = project_markers(pair, model, pose)[0] + rng.normal(0, noise_px, (2, len(model), 2))
-        horn = pose_of_points(model.positions, triangulate(pair, uv, cov).points)
+        flat = np.stack([undistorted_pixels(c, u) for c, u in zip(pair.cameras, uv, strict=True)])
+        horn = pose_of_points(model.positions, linear_points(pair, flat))
         fit = first_fit(pair, model, MarkerObservations(uv, cov))
         assert fit is not None
         delta = pose.minus(fit.pose)
@@ -131,7 +132,7 @@ def simulated_calibration(rng: np.random.Generator, pairs: int = 20, noise_px: f
     true = simulated_pair(FOCAL_PX, SIZE_PX, BASELINE_M)
     grid = np.array([[x, y, 0.0] for y in range(6) for x in range(9)]) * 0.08
     middle = grid.mean(axis=0)
-    found: list[list[tuple[Array, Array]]] = [[], []]
+    found: list[list[tuple[Ints, Array]]] = [[], []]
     numbers: tuple[list[int], list[int]] = ([], [])
     number = 0
     while min(map(len, numbers)) < pairs:
@@ -142,14 +143,10 @@ def simulated_calibration(rng: np.random.Generator, pairs: int = 20, noise_px: f
         board = Pose(turn, at - turn @ middle)
         pixels = project(true, board.apply(grid))[0]
         for c, camera in enumerate(true.cameras):
-            inside = np.flatnonzero(in_picture(pixels[c], np.array(camera.image_size_px), -10.0))
+            inside: Ints = np.flatnonzero(in_picture(pixels[c], np.array(camera.image_size_px), -10.0)).astype(np.int64)
             if len(inside) >= 20:
                 found[c].append((inside, pixels[c, inside] + rng.normal(0, noise_px, (len(inside), 2))))
                 numbers[c].append(number)
-    single = [
-        calibrate_intrinsics(
-            CornerTable.of(views, grid, middle, SIZE_PX), IntrinsicsOptions(lens=LensModel(5), warp=False, stretch=False)
-        )
-        for views in found
-    ]
+    options = IntrinsicsOptions(lens=LensModel(5), warp=False, stretch=False)
+    single = [calibrate_intrinsics(CornerTable.of(views, grid, middle, SIZE_PX), options) for views in found]
     return calibrate_pair(("left", "right"), (single[0], single[1]), numbers)

@@ -20,7 +20,16 @@ def _huo2015(seed: int) -> Comparison:
     return compare_huo2015(seed)
 
 
-STUDIES: dict[str, Callable[[int], Comparison]] = {"huo2015": _huo2015}  # name: seed -> table and figures
+def _zhou2020(seed: int) -> Comparison:
+    from lab.binocular.zhou2020 import compare_zhou2020
+
+    return compare_zhou2020(seed)
+
+
+STUDIES: dict[str, Callable[[int], Comparison]] = {
+    "huo2015": _huo2015,
+    "zhou2020": _zhou2020,
+}  # name: seed -> table and figures
 
 
 @click.command()
