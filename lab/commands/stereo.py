@@ -21,7 +21,7 @@ def stereo(run_folder: Path, out: Path) -> None:
 
     \b
     Example:
-        beampose stereo sample_runs/stereo-drogue --out results/drogue
+        beampose stereo runs/drogue --out results/drogue
     """
     from lab.binocular.process_stereo import process_stereo_run
 
