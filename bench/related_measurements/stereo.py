@@ -46,9 +46,8 @@ def main() -> None:
     for name, rms in (("Horn", horn), ("joint", joint)):
         turn = np.rad2deg(np.linalg.norm(rms[3:]))
         print(f"seven markers, 10 m, {name}: {1000 * np.linalg.norm(rms[:3]):.2f} mm, {turn:.3f} deg")
-    print(
-        f"  joint over bound: position {p.ratios()[0]:.3f}, rotation {p.ratios()[1]:.3f}; NEES/6 {p.nees.mean() / 6:.3f}"
-    )
+    position, rotation = p.ratios()
+    print(f"  joint over bound: position {position:.3f}, rotation {rotation:.3f}; NEES/6 {p.nees.mean() / 6:.3f}")
     if given.campaigns:
         _campaigns(given.campaigns, given.seed)
 

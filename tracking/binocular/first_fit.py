@@ -10,7 +10,8 @@ import numpy as np
 
 from geometry.pose import Pose
 from geometry.pose_solver.three_spots import poses_from_three_spots
-from tracking.binocular.acquisition import marker_triples, mirrored
+from geometry.uncertainty.chi_square import chi2_tail
+from tracking.binocular.acquisition import marker_triples, mirrored, same_pose
 from tracking.binocular.horn import pose_of_points
 from tracking.binocular.joint_fit import JointFit, MarkerObservations, fit_pose
 from tracking.binocular.marker_model import MarkerModel, StereoPair, project_markers
@@ -18,27 +19,37 @@ from tracking.binocular.triangulation import triangulate
 
 _STARTS = 3  # poses of three markers that are tried
 _TRIPLES = 4
+_PLAUSIBLE_P, _CLEAR_CHI2 = 1e-3, 25.0  # misfit of a right pose, and how much larger that of a wrong one is
 
 
 def first_fit(pair: StereoPair, model: MarkerModel, observed: MarkerObservations) -> JointFit | None:
     """The pose with the least misfit; None where no start leads to one."""
-    found: JointFit | None = None
-    for start in _starts(pair, model, observed):
-        for pose in (start, mirrored(pair, model, start)):
-            fit = fit_pose(pair, model, observed, pose)
-            if fit is not None and fit.observable and (found is None or fit.chi2 < found.chi2):
-                found = fit
-    return found
-
-
-def _starts(pair: StereoPair, model: MarkerModel, observed: MarkerObservations) -> list[Pose]:
     both = np.flatnonzero(observed.seen.all(axis=0))
-    starts = []
+    found: list[JointFit] = []
     if len(both) >= 3:
         points = triangulate(pair, observed.uv_px[:, both], observed.cov_px2[:, both])
         if np.isfinite(points.points).all():
-            starts.append(pose_of_points(model.positions[both], points.points))
-    return starts + _three_marker_poses(pair, model, observed)
+            found = _fits(pair, model, observed, pose_of_points(model.positions[both], points.points))
+    if not _clear(found):
+        for start in _three_marker_poses(pair, model, observed):
+            found += _fits(pair, model, observed, start)
+    return min(found, key=lambda fit: fit.chi2, default=None)
+
+
+def _fits(pair: StereoPair, model: MarkerModel, observed: MarkerObservations, start: Pose) -> list[JointFit]:
+    """The fits from a pose and from the one with the normal reflected."""
+    fits = (fit_pose(pair, model, observed, pose) for pose in (start, mirrored(pair, model, start)))
+    return [fit for fit in fits if fit is not None and fit.observable]
+
+
+def _clear(found: list[JointFit]) -> bool:
+    """Whether the best of two fits is plausible and the other one is another pose, much worse."""
+    if len(found) < 2:
+        return False
+    best, other = sorted(found, key=lambda fit: fit.chi2)
+    same = same_pose(best.pose, other.pose)
+    plausible = best.dof > 0 and chi2_tail(best.chi2, best.dof) > _PLAUSIBLE_P
+    return plausible and not same and other.chi2 - best.chi2 > _CLEAR_CHI2
 
 
 def _three_marker_poses(pair: StereoPair, model: MarkerModel, observed: MarkerObservations) -> list[Pose]:

@@ -16,6 +16,8 @@ from geometry.pose import Pose
 from tracking.binocular.marker_model import MarkerModel, StereoPair, calibration_jacobian, project_markers
 
 _STEPS = 40
+_CONVERGED = 1e-6  # squared length of the last step, in sigmas
+_LEAST_DAMPING = 1e-9  # keeps the equations regular where the images determine five numbers only
 _RANK = 1e-9  # smallest singular value over the largest of the whitened Jacobian with scaled columns
 
 
@@ -106,13 +108,15 @@ def _minimised(
     cost = float(r @ r)
     for _ in range(_STEPS):
         H, g = J.T @ J, J.T @ r
-        step: Array = np.linalg.lstsq(H + damping * np.diag(np.diagonal(H) + 1e-12), g, rcond=None)[0].astype(float)
+        scale = 1 / np.sqrt(np.maximum(np.diagonal(H), 1e-300))
+        scaled = H * np.outer(scale, scale) + damping * np.eye(6)
+        step: Array = scale * np.linalg.solve(scaled, scale * g)
         trial = pose.plus(step)
         t_r, t_J = _whitened(pair, model, uv_px, trial, rows, whitening)
         t_cost = float(t_r @ t_r)
         if np.isfinite(t_cost) and t_cost <= cost:
-            small = cost - t_cost < 1e-9 * (1 + cost) and float(step @ H @ step) < 1e-8
-            pose, r, J, cost, damping = trial, t_r, t_J, t_cost, max(damping / 10, 1e-12)
+            small = cost - t_cost < 1e-6 * (1 + cost) and float(step @ H @ step) < _CONVERGED
+            pose, r, J, cost, damping = trial, t_r, t_J, t_cost, max(damping / 10, _LEAST_DAMPING)
             if small:
                 return pose
         else:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from geometry.arrays import Array, Ints
+from geometry.arrays import Array, Bools, Ints, cross
 from geometry.camera import FISHEYE, Camera, pinhole_numbers, project_points, project_points_full
 from geometry.lens import padded
 from geometry.pose import Pose
@@ -55,6 +55,31 @@ class MarkerImages:
 
 
 @dataclass(frozen=True, slots=True)
+class CameraNumbers:
+    """The numbers of both cameras, stacked: one call projects into both, at half the cost of two."""
+
+    rotation: Array  # (2, 3, 3) camera_from_world
+    translation: Array  # (2, 3), m
+    pinhole: Array  # (2, 1, 4)
+    distortion: Array  # (2, 1, 14)
+    fold_r2: Array  # (2, 1)
+    fisheye: Bools | None  # (2, 1); None: neither camera is one
+
+    @staticmethod
+    def of(cameras: tuple[Camera, Camera]) -> CameraNumbers:
+        """Of two cameras."""
+        wide = np.array([[c.lens == FISHEYE] for c in cameras])
+        return CameraNumbers(
+            np.stack([c.camera_from_world.rotation for c in cameras]),
+            np.stack([c.camera_from_world.translation for c in cameras]),
+            np.stack([pinhole_numbers(c) for c in cameras])[:, None],
+            np.stack([padded(c.distortion) for c in cameras])[:, None],
+            np.array([[c.fold_r2] for c in cameras]),
+            wide if wide.any() else None,
+        )
+
+
+@dataclass(frozen=True, slots=True)
 class StereoPair:
     """Two calibrated cameras; the pictures of the first are the reference of the histogram specification.
 
@@ -66,8 +91,10 @@ class StereoPair:
 
     cameras: tuple[Camera, Camera]
     covariance: RigCovariance | None = None
+    numbers: CameraNumbers = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "numbers", CameraNumbers.of(self.cameras))
         if not self.baseline_m > 0:
             raise ValueError("the two cameras are at the same place: there is no baseline")
         names = [c.name for c in self.cameras]
@@ -87,18 +114,10 @@ def project(pair: StereoPair, points_world: Array) -> tuple[Array, Array]:
 
     The derivatives (..., 2, K, 2, 3) are px/m, by the point in world. nan behind a camera or beyond the lens's fold.
     """
-    both = []
-    for camera in pair.cameras:
-        to_camera = camera.camera_from_world
-        pixels, J = project_points(
-            points_world @ to_camera.rotation.T + to_camera.translation,
-            pinhole_numbers(camera),
-            padded(camera.distortion),
-            np.asarray(camera.fold_r2),
-            np.asarray(camera.lens == FISHEYE),
-        )
-        both.append((pixels, J @ to_camera.rotation))
-    return np.stack([p for p, _ in both], axis=-3), np.stack([J for _, J in both], axis=-4)
+    n = pair.numbers
+    in_cameras = points_world[..., None, :, :] @ np.swapaxes(n.rotation, -1, -2) + n.translation[:, None]
+    pixels, J = project_points(in_cameras, n.pinhole, n.distortion, n.fold_r2, n.fisheye)
+    return pixels, J @ n.rotation[:, None]
 
 
 def project_markers(pair: StereoPair, model: MarkerModel, world_from_body: Pose) -> tuple[Array, Array]:
@@ -111,7 +130,7 @@ def project_markers(pair: StereoPair, model: MarkerModel, world_from_body: Pose)
     pixels, by_point = project(pair, turned + world_from_body.translation[..., None, :])
     # d(R Exp(theta) m)/dtheta = -R [m]_x; with a row w of the derivative by the point, -w R [m]_x = m x (w R).
     in_body = by_point @ R[..., None, None, :, :]
-    by_turn = np.cross(model.positions[:, None, :], in_body)
+    by_turn = cross(model.positions[:, None, :], in_body)
     return pixels, np.concatenate([by_point, by_turn], axis=-1)
 
 
@@ -132,7 +151,7 @@ def calibration_jacobian(pair: StereoPair, points_world: Array) -> Array:
             np.asarray(camera.fold_r2),
             np.asarray(camera.lens == FISHEYE),
         )
-        by_turn = np.cross(points_world[:, None, :], seen.d_point @ to_camera.rotation)
+        by_turn = cross(points_world[:, None, :], seen.d_point @ to_camera.rotation)
         by = dict(
             zip(
                 (*PINHOLE, *DISTORTION, *POSE),

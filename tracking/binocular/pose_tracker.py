@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from geometry.arrays import Array, Ints, symmetric
+from geometry.camera import in_picture
 from geometry.pose import Pose
 from geometry.uncertainty.chi_square import chi2_tail
 from tracking.binocular.acquisition import acquire, distinct, mirrored
@@ -25,11 +26,15 @@ from tracking.statuses import LOST_SIGMA_M, LOST_SIGMA_RAD, PoseStatus
 _MOST_PRIOR_NATS = 20.0  # a target that jumps is found: the motion never outweighs two images
 _TRUSTED_P, _TRUSTED_SHARE = 1e-3, 0.75  # misfit and share of explained images without a search from scratch
 
+# A camera with this many candidates must confirm this share of the markers that the pose puts into its picture.
+_ENOUGH_CANDIDATES, _LEAST_CONFIRMED = 3, 0.3
+
 NO_PICTURES = "no picture of either camera"
 TOO_FEW = "fewer than three markers found"
 NO_POSE = "no pose explains the candidates"
 AMBIGUOUS = "several poses explain the markers"
 MISFIT = "the markers do not fit together: calibration, synchronisation or marker model"
+CONTRADICTED = "the two pictures contradict each other: calibration, exchanged cameras or synchronisation"
 WEAK = "the markers found do not determine the pose"
 
 
@@ -135,10 +140,22 @@ class BinocularTracker:
             return MISFIT
         if best.evidence < self._p.lead_nats:
             return NO_POSE
+        if self._contradicted(best):
+            return CONTRADICTED
         worst = np.sqrt([np.linalg.eigvalsh(best.fit.covariance[s, s])[-1] for s in (slice(0, 3), slice(3, 6))])
         if worst[0] > LOST_SIGMA_M or worst[1] > LOST_SIGMA_RAD:
             return WEAK
         return AMBIGUOUS if rivals else ""
+
+    def _contradicted(self, best: LabelledPose) -> bool:
+        """Whether a camera sees candidates, but hardly one where the pose puts markers: cameras exchanged, or moved."""
+        pixels = project_markers(self._pair, self._model, best.fit.pose)[0]
+        for c, (camera, found) in enumerate(zip(self._pair.cameras, self._images, strict=True)):
+            expected = int(in_picture(pixels[c], np.array(camera.image_size_px)).sum())
+            confirmed = int((best.index[c] >= 0).sum())
+            if len(found) >= _ENOUGH_CANDIDATES and confirmed < min(_LEAST_CONFIRMED * expected, expected - 1):
+                return True
+        return False
 
     def _both(
         self, best: LabelledPose, rivals: list[LabelledPose], weights: Array, ahead: Motion | None

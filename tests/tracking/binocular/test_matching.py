@@ -36,7 +36,7 @@ def test_candidates_match_along_the_epipolar_line_only():
     left, right = images(pose_at(9, 2), rng)
     pairs = matching_pairs(PAIR, (left, right), P)
     assert (pairs.sum(axis=1) >= 1).all()
-    moved = MarkerImages(right.uv_px + [0.0, 8.0], right.cov_px2, right.area_px2, right.colour)
+    moved = MarkerImages(right.uv_px + np.array([0.0, 8.0]), right.cov_px2, right.area_px2, right.colour)
     assert matching_pairs(PAIR, (left, moved), P).sum() < pairs.sum()
     other = MarkerImages(right.uv_px, right.cov_px2, right.area_px2, right.colour + 1)
     assert not matching_pairs(PAIR, (left, other), P).any()
@@ -71,8 +71,9 @@ def test_too_few_markers_and_no_pictures_are_lost_with_their_reason():
     assert BinocularTracker(PAIR, MODEL, P).step(0.0, (None, None)).reason == NO_PICTURES
 
 
-def test_points_without_a_target_give_no_measured_pose():
-    for seed in range(6):
+@pytest.mark.parametrize("seeds", [(0,), pytest.param(range(1, 40), marks=pytest.mark.slow)])
+def test_points_without_a_target_give_no_measured_pose(seeds):
+    for seed in seeds:
         rng = np.random.default_rng(seed)
         left, right = (rng.uniform(300, 700, (9, 2)) for _ in range(2))
         cov = np.broadcast_to(0.01 * np.eye(2), (9, 2, 2))
@@ -84,8 +85,8 @@ def test_points_without_a_target_give_no_measured_pose():
 def test_a_flat_far_target_has_two_attitudes_and_the_covariance_covers_both():
     flat = MarkerModel(MODEL.names, MODEL.positions * [1, 1, 0], MODEL.colour, MODEL.radius_m)
     rng, seen = np.random.default_rng(6), 0
-    for i in range(6):
-        pose = random_pose(40.0, np.random.default_rng(i))
+    for i in range(2):
+        pose = random_pose(60.0, np.random.default_rng(i))
         uv = project_markers(PAIR, flat, pose)[0] + rng.normal(0, 0.1, (2, 7, 2))
         cov = np.broadcast_to(0.01 * np.eye(2), (7, 2, 2))
         pictures = tuple(MarkerImages(u, cov, np.full(7, np.nan), np.zeros(7, dtype=np.int64)) for u in uv)
@@ -93,7 +94,7 @@ def test_a_flat_far_target_has_two_attitudes_and_the_covariance_covers_both():
         if frame.status is PoseStatus.MEASURED or frame.reason == AMBIGUOUS:
             assert consistent(pose, frame)
         seen += frame.reason == AMBIGUOUS
-    assert seen >= 2
+    assert seen >= 1
 
 
 def test_the_mirrored_pose_has_nearly_the_same_images_of_a_flat_target_and_twice_mirrored_is_the_start():
@@ -112,7 +113,9 @@ def recording(delay_s, seed=7):
     for i in range(14):
         t = i / 25
         pose, later = (
-            Pose.from_ypr(np.array([0.3 * np.sin(2 * s), 0.1, 0.2]), np.array([0.2 + 0.5 * np.sin(3 * s), 0.9 * s - 0.2, 8.0]))
+            Pose.from_ypr(
+                np.array([0.3 * np.sin(2 * s), 0.1, 0.2]), np.array([0.2 + 0.5 * np.sin(3 * s), 0.9 * s - 0.2, 8.0])
+            )
             for s in (t, t + delay_s)
         )
         frame = tracker.step(t, images(pose, rng, delay=later))
@@ -122,9 +125,9 @@ def recording(delay_s, seed=7):
 
 
 def test_an_offset_of_the_clocks_is_measured_from_residuals_that_grow_with_velocity():
-    late = clock_offset(PAIR, MODEL, recording(0.004))
+    late = clock_offset(PAIR, MODEL, recording(0.003))
     assert late.significant
-    assert late.offset_s == pytest.approx(0.004, abs=5 * late.sigma_s + 2e-4)
+    assert late.offset_s == pytest.approx(0.003, abs=4 * late.sigma_s)
     none = clock_offset(PAIR, MODEL, recording(0.0))
     assert not none.significant
     assert abs(none.offset_s) < 5 * none.sigma_s
