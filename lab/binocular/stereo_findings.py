@@ -44,12 +44,12 @@ def _measured(results: StereoResults) -> Iterator[Finding]:
             "There is no result.",
             "Look at the annotated pictures: are the markers found in both? If not, adapt the colours in run.yaml. If"
             " they are, check the positions of the markers and the order of the cameras.",
-            "BP-S01",
+            code="BP-W01",
         )
     elif share < GOOD_MEASURED:
         level = Level.FAIL if share < LEAST_MEASURED else Level.WARN
         why = "The other frames are predicted or lost; measured ones are not affected."
-        yield Finding(level, what, why, "Treat the most frequent reason first.", "BP-S02")
+        yield Finding(level, what, why, "Treat the most frequent reason first.", code="BP-W02")
     else:
         yield Finding(Level.PASS, what)
 
@@ -65,7 +65,7 @@ def _cameras(results: StereoResults) -> Iterator[Finding]:
                 f"camera {camera.name}: {len(missing)} of {total} frames have no picture ({reason}: {count})",
                 "Poses of these frames rest on the other camera alone, with larger sigmas.",
                 "Check the camera's disk, cable and trigger.",
-                "BP-S03",
+                code="BP-W03",
             )
         with_picture = [r.candidates[c] for r in results.records if r.candidates[c] is not None]
         empty = sum(1 for found in with_picture if found is not None and len(found) < 3)
@@ -75,7 +75,7 @@ def _cameras(results: StereoResults) -> Iterator[Finding]:
                 f"camera {camera.name}: fewer than three markers in {empty} of {len(with_picture)} pictures",
                 "This camera hardly contributes: the distance is that of a single camera.",
                 "Look at its pictures: exposure, focus, colours in run.yaml, view not blocked.",
-                "BP-S04",
+                code="BP-W04",
             )
 
 
@@ -98,7 +98,7 @@ def _clock(results: StereoResults) -> Iterator[Finding]:
         f"{what}: the residuals grow with the velocity in the picture ({clock.shift_px:.2f} px RMS)",
         "The distance is wrong by more than its sigma where the target moves sideways.",
         "Trigger both cameras with one signal, or repair dropped frames in one of them.",
-        "BP-S05",
+        code="BP-W05",
     )
 
 
@@ -117,7 +117,7 @@ def _moved(results: StereoResults) -> Iterator[Finding]:
         f"the right camera appears turned by {np.rad2deg(angle):.3f} deg ({shift:.2f} px) against the calibration",
         "Distances have a systematic error" + (" beyond the stated sigmas." if covered is None else "."),
         "Check the mounts, and calibrate the pair again with `beampose calibrate pair`.",
-        "BP-S06",
+        code="BP-W06",
     )
 
 
@@ -135,7 +135,7 @@ def _noise(results: StereoResults) -> Iterator[Finding]:
         "The calibration, the positions of the markers or the stated sigmas are wrong; poses are less accurate than"
         " stated.",
         "Check the marker positions in run.yaml (and state their `sigma_m`), then the calibration of the pair.",
-        "BP-S07",
+        code="BP-W07",
     )
 
 
@@ -147,5 +147,5 @@ def _ambiguous(results: StereoResults) -> Iterator[Finding]:
             f"{count} frames have two attitudes that explain the markers",
             "A flat target far away looks the same with its normal reflected at the line of sight.",
             "Mount some markers in front of the others, or use the frames from a shorter distance.",
-            "BP-S08",
+            code="BP-W08",
         )

@@ -113,10 +113,7 @@ def load_stereo_run(run_folder: Path) -> StereoRun:
     names = list(content.cameras)
     if len(names) != 2:
         what = f"the single camera {names[0]}" if len(names) == 1 else f"{len(names)} cameras"
-        raise InputError(
-            f"{path}: cameras: expected two cameras, got {what}; distance from one camera: `beampose track`, or add"
-            " the second camera"
-        )
+        raise InputError(f"{path}: cameras: expected two cameras, got {what}; add the second camera of the pair")
     pair_path = folder / content.pair
     file = load_pair_file(pair_path)
     for name in names:

@@ -14,7 +14,7 @@ class SegmentationParameters:
         ValueError: a value is out of its range.
     """
 
-    gamma: float = 0.8  # of the left picture; the paper's value, below 1: brightens dark regions
+    gamma: float = 0.8  # of the left picture; the paper's value, below 1: brightens low levels
     specify_histogram: bool = True  # right picture to the histogram of the left one
     median_px: int = 3  # side of the median filter of the mask, odd; 0 or 1: none
     opening_px: int = 3  # side of the opening, removes specks; 0 or 1: none

@@ -48,7 +48,7 @@ def findings_of(pair: CalibratedPair, names: tuple[str, str]) -> tuple[Finding, 
     for name, single in zip(names, pair.single, strict=True):
         # Warnings at most: the lens in use is that of the joint adjustment, whose residuals BP-Q01 judges.
         found += [
-            Finding(Level.WARN, f"camera {name}: {f.what}", f.why, f.remedy, f.code or "BP-Q04")
+            Finding(Level.WARN, f"camera {name} ({f.code}): {f.what}", f.why, f.remedy, code="BP-Q04")
             for f in single.findings
             if f.level > Level.PASS
         ]

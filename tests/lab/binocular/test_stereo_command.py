@@ -103,7 +103,7 @@ def test_unsynchronised_pictures_fail_the_run_and_say_by_how_much(tmp_path):
     assert outcome.exit_status == 4
     clock = outcome.results.clock
     assert clock.offset_s == pytest.approx(0.003, abs=5 * clock.sigma_s)
-    assert any(f.code == "BP-S05" for f in outcome.findings)
+    assert any(f.code == "BP-W05" for f in outcome.findings)
 
 
 def test_markers_that_are_not_where_run_yaml_says_are_reported(drogue, tmp_path):
