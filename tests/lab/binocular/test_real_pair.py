@@ -34,7 +34,9 @@ def corners():
     board = load_board_or_text("chessboard:9x6:25mm")
     out = []
     for number in range(1, 8):
-        views = [find_board(read_picture(PHOTOS / f"{side}{number:02d}.jpg", None), board) for side in ("left", "right")]
+        views = [
+            find_board(read_picture(PHOTOS / f"{side}{number:02d}.jpg", None), board) for side in ("left", "right")
+        ]
         if all(hasattr(v, "pixels") and len(v.pixels) == 54 for v in views):
             out.append(np.stack([v.pixels for v in views]))
     return out
@@ -64,7 +66,9 @@ def test_triangulated_corners_are_on_the_squares_of_the_board(outcome, corners):
         points = grid.reshape(-1, 3) - grid.reshape(-1, 3).mean(axis=0)
         flat.append(np.linalg.svd(points, compute_uv=False)[2] / np.sqrt(len(points)))
     sides = np.concatenate(sides)
-    print(f"sides: mean {1e6 * sides.mean():.1f} um, RMS {1e6 * sides.std():.1f} um; flat to {1e6 * np.mean(flat):.0f} um")
+    print(
+        f"sides: mean {1e6 * sides.mean():.1f} um, RMS {1e6 * sides.std():.1f} um; flat to {1e6 * np.mean(flat):.0f} um"
+    )
     assert abs(sides.mean()) < 1e-4  # 0.4 % of a square
     assert sides.std() < 5e-4
     assert np.mean(flat) < 1e-3
