@@ -66,9 +66,6 @@ def test_triangulated_corners_are_on_the_squares_of_the_board(outcome, corners):
         points = grid.reshape(-1, 3) - grid.reshape(-1, 3).mean(axis=0)
         flat.append(np.linalg.svd(points, compute_uv=False)[2] / np.sqrt(len(points)))
     sides = np.concatenate(sides)
-    print(
-        f"sides: mean {1e6 * sides.mean():.1f} um, RMS {1e6 * sides.std():.1f} um; flat to {1e6 * np.mean(flat):.0f} um"
-    )
     assert abs(sides.mean()) < 1e-4  # 0.4 % of a square
     assert sides.std() < 5e-4
     assert np.mean(flat) < 1e-3
