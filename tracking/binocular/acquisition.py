@@ -7,6 +7,7 @@ other picture come first. Source: ours, with the compiled solver geometry/pose_s
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import combinations, permutations
 
 import numpy as np
@@ -16,9 +17,9 @@ from geometry.pose import Pose
 from geometry.pose_solver.three_spots import poses_from_three_spots
 from geometry.rotations import angle
 from tracking.binocular.labelling import Images, LabelledPose, labelled_pose
-from tracking.binocular.marker_model import MarkerImages, MarkerModel, StereoPair, project
+from tracking.binocular.marker_model import MarkerImages, MarkerModel, StereoPair
 from tracking.binocular.parameters import MatchParameters
-from tracking.binocular.triangulation import triangulate
+from tracking.binocular.triangulation import triangulate, undistorted_pixels
 
 _MOST_CANDIDATES = 12  # of a picture, in triples: 1,320 ordered ones
 _MOST_TRIPLES = 8  # of markers
@@ -169,8 +170,9 @@ def _best(pair: StereoPair, model: MarkerModel, images: Images, poses: Pose) -> 
     """The hypotheses that explain most candidates in both pictures, different ones."""
     if not len(poses.translation):
         return []
+    flat = [undistorted_pixels(camera, found.uv_px) for camera, found in zip(pair.cameras, images, strict=True)]
     scores = np.concatenate(
-        [_coarse(pair, model, images, poses[i : i + _CHUNK]) for i in range(0, len(poses.translation), _CHUNK)]
+        [_coarse(pair, model, flat, images, poses[i : i + _CHUNK]) for i in range(0, len(poses.translation), _CHUNK)]
     )
     kept: list[Pose] = []
     for i in np.argsort(-scores)[: 20 * _REFINED].tolist():
@@ -181,23 +183,28 @@ def _best(pair: StereoPair, model: MarkerModel, images: Images, poses: Pose) -> 
     return kept
 
 
-def _coarse(pair: StereoPair, model: MarkerModel, images: Images, poses: Pose) -> Array:
-    """Scores (h): the number of markers with a candidate of their colour near their projection, near ones more."""
+def _coarse(pair: StereoPair, model: MarkerModel, flat: Sequence[Array], images: Images, poses: Pose) -> Array:
+    """Scores (h): the number of markers with a candidate of their colour near their projection, near ones more.
+
+    flat: the candidates' pixels without distortion, so that thousands of poses are projected by pinhole cameras.
+    """
+    n = pair.numbers
     world = model.positions @ np.swapaxes(poses.rotation, -1, -2) + poses.translation[:, None]
-    pixels = project(pair, world)[0]
-    score = np.zeros(len(pixels))
-    for c, found in enumerate(images):
+    score = np.zeros(len(world))
+    for c, (found, at) in enumerate(zip(images, flat, strict=True)):
         if not len(found):
             continue
-        uv = pixels[:, c]
-        with np.errstate(invalid="ignore"):
-            size = np.max(np.ptp(uv, axis=1), axis=1)
-        gate2 = (_COARSE_PX + _COARSE_SHARE * np.nan_to_num(size))[:, None] ** 2
+        seen = world @ n.rotation[c].T + n.translation[c]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            uv = np.where(seen[..., 2:] > 0, seen[..., :2] / seen[..., 2:], np.nan) * n.pinhole[c, 0, :2]
+        uv += n.pinhole[c, 0, 2:]
+        size = np.nan_to_num(np.ptp(uv, axis=1).max(axis=1))
+        gate2 = (_COARSE_PX + _COARSE_SHARE * size)[:, None] ** 2
         nearest = np.full(uv.shape[:2], np.inf)
-        for k in range(len(model)):
-            same = found.uv_px[found.colour == model.colour[k]]
+        for colour in np.unique(model.colour):
+            own, same = np.flatnonzero(model.colour == colour), at[found.colour == colour]
             if len(same):
-                apart = uv[:, k, None] - same[None]
-                nearest[:, k] = np.nan_to_num(np.sum(apart**2, axis=-1).min(axis=1), nan=np.inf)
+                apart = uv[:, own, None] - same
+                nearest[:, own] = np.nan_to_num((apart * apart).sum(axis=-1).min(axis=2), nan=np.inf)
         score += np.maximum(0.0, 1 - nearest / gate2).sum(axis=1)
     return score

@@ -98,11 +98,11 @@ def test_pictures_are_segmented_and_hidden_markers_do_not_disturb(tmp_path):
 
 
 def test_unsynchronised_pictures_fail_the_run_and_say_by_how_much(tmp_path):
-    run = write_stereo_recording(tmp_path / "run", seed=5, frames=25, points=True, noise_px=0.03, right_delay_s=0.003)
+    run = write_stereo_recording(tmp_path / "run", seed=5, frames=25, points=True, noise_px=0.03, right_delay_s=0.0015)
     outcome = process_stereo_run(run, tmp_path / "out")
     assert outcome.exit_status == 4
     clock = outcome.results.clock
-    assert clock.offset_s == pytest.approx(0.003, abs=5 * clock.sigma_s)
+    assert clock.offset_s == pytest.approx(0.0015, abs=5 * clock.sigma_s)
     assert any(f.code == "BP-W05" for f in outcome.findings)
 
 
