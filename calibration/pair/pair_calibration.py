@@ -120,7 +120,7 @@ class _Problem:
             "boards": Poses.of(boards),
             "warp": Vectors(warp[None]),
             "stretch": Vectors(left.stretch[None]),
-            "print": Vectors(left.printed),
+            "print": Vectors(_printed(single)),
             "radius": Vectors(np.array([[np.mean([s.fit.radius_m for s in single])]])),
         }
         return _Problem(values, _term(single, rows), tuple(place), single)
@@ -145,6 +145,12 @@ class _Problem:
                 own = self.term.placement == self.placement_keys.index((number, 0))
                 out[i] = np.sqrt(np.mean(r[own] ** 2))
         return out
+
+
+def _printed(single: tuple[Intrinsics, Intrinsics]) -> Array:
+    """Displacements (P, 3), m, of the board's points: the mean of the cameras that found them significant."""
+    solved = [s.fit.printed for s in single if s.board is not None and s.board.points.corrected]
+    return np.mean(solved, axis=0) if solved else np.zeros_like(single[0].fit.printed)
 
 
 def _term(single: tuple[Intrinsics, Intrinsics], placements: Sequence[Ints]) -> CornerTerm:
