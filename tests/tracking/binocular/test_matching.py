@@ -131,3 +131,24 @@ def test_an_offset_of_the_clocks_is_measured_from_residuals_that_grow_with_veloc
     none = clock_offset(PAIR, MODEL, recording(0.0))
     assert not none.significant
     assert abs(none.offset_s) < 5 * none.sigma_s
+
+
+def test_two_equal_targets_are_ambiguous_until_one_is_followed():
+    rng = np.random.default_rng(8)
+    one = Pose.from_ypr(np.array([0.2, 0.1, 0.0]), np.array([-1.2, 0.0, 9.0]))
+    two = Pose.from_ypr(np.array([-0.1, 0.0, 0.1]), np.array([1.5, 0.2, 9.5]))
+
+    def both():
+        pairs = zip(images(one, rng), images(two, rng), strict=True)
+        return tuple(
+            MarkerImages(*(np.concatenate([getattr(a, n), getattr(b, n)]) for n in MarkerImages.__slots__))
+            for a, b in pairs
+        )
+
+    frame = BinocularTracker(PAIR, MODEL, P).step(0.0, both())
+    assert frame.status is not PoseStatus.MEASURED
+    tracker = BinocularTracker(PAIR, MODEL, P)
+    tracker.step(0.0, images(one, rng))
+    followed = tracker.step(0.04, both())
+    assert followed.status is PoseStatus.MEASURED, followed.reason
+    assert consistent(one, followed)
