@@ -13,6 +13,7 @@ from lab.commands import (
     results,
     run,
     show,
+    stereo,
     study,
     track_point,
     view,
@@ -40,6 +41,7 @@ for command in (
     results.report,
     study.study,
     track_point.track,
+    stereo.stereo,
     compare.compare,
     view.view,
     show.show,
@@ -52,6 +54,7 @@ for command in (
     maintenance.explain,
 ):
     main.add_command(command)
+calibrate.calibrate.add_command(stereo.pair)
 
 if __name__ == "__main__":
     main()

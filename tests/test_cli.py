@@ -127,6 +127,7 @@ def test_the_commands_are_those_of_the_contract():
         "report",
         "study",
         "track",
+        "stereo",
         "compare",
         "view",
         "show",
@@ -138,7 +139,7 @@ def test_the_commands_are_those_of_the_contract():
         "verify",
         "schema",
     }
-    steps = {"board", "camera", "screen", "beams", "rig", "check", "convert", "simulate"}
+    steps = {"board", "camera", "pair", "screen", "beams", "rig", "check", "convert", "simulate"}
     assert {name for name in COMMANDS if name.startswith("calibrate ")} == {f"calibrate {step}" for step in steps}
 
 

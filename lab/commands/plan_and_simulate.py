@@ -55,16 +55,29 @@ def simulate(
     Example:
         beampose simulate sharp-turns --frames 50 --out runs/sharp-turns
     """
+    from lab.binocular.simulated_recording import SCENARIO as STEREO
+    from lab.binocular.simulated_recording import SUMMARY as STEREO_SUMMARY
     from lab.simulate.scenarios import LIGHTS, SCENARIOS
     from lab.simulate.write import simulate as write_run
 
     if scenario == "list":
         for listed in SCENARIOS.values():
             show_line(f"{listed.name:24s}{listed.summary}")
+        show_line(f"{STEREO:24s}{STEREO_SUMMARY}")
         show_line(f"{'lights:':24s}{', '.join(LIGHTS)}")
         return
     if out is None:
         raise click.UsageError("Missing option '--out'.")
+    if scenario == STEREO:
+        from lab.binocular.simulated_recording import write_stereo_recording
+
+        unused = {"--video": video, "--clutter": clutter, "--light": light, "--rig": rig, "--known-rig": known_rig}
+        for option, value in unused.items():
+            if value not in (None, False):
+                raise click.UsageError(f"{option}: scenario {STEREO} does not have this option.")
+        folder = write_stereo_recording(out, seed=seed, frames=frames, points=points, noise_px=noise_px, scale=scale)
+        show_line(f"run: {folder}")
+        return
     with progress_bar(scenario) as progress:
         folder = write_run(
             scenario,

@@ -32,10 +32,17 @@ def _duan2020(seed: int) -> Comparison:
     return compare_duan2020(seed)
 
 
+def _zhou2020(seed: int) -> Comparison:
+    from lab.binocular.zhou2020 import compare_zhou2020
+
+    return compare_zhou2020(seed)
+
+
 STUDIES: dict[str, Callable[[int], Comparison]] = {  # name: seed -> table and figures
     "huo2015": _huo2015,
     "fu2016": _fu2016,
     "duan2020": _duan2020,
+    "zhou2020": _zhou2020,
 }
 
 

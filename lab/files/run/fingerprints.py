@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -45,6 +46,16 @@ def fingerprint(path: Path) -> dict[str, Any]:
         OSError: a file cannot be read.
     """
     return _of_folder(path, full=False) if path.is_dir() else _of_file(path, full=False)
+
+
+def fingerprints_of(files: Iterable[Path], sources: Iterable[Path], full: bool = False) -> list[dict[str, Any]]:
+    """Path, SHA-256 and size of files and of sources, each a file or a folder of pictures; each path once.
+
+    Raises:
+        OSError: a file cannot be read.
+    """
+    paths = dict.fromkeys((*files, *sources))
+    return [_of_folder(p, full) if p.is_dir() else _of_file(p, full) for p in paths]
 
 
 def _of_file(path: Path, full: bool) -> dict[str, Any]:

@@ -23,7 +23,7 @@ from lab.number_format import format_number
 from lab.report.html import environment
 
 FILE_NAME = "report.html"
-KINDS = ("Camera", "Board", "Screens", "Beams", "Rig", "Drift check", "Plan")
+KINDS = ("Camera", "Pair", "Board", "Screens", "Beams", "Rig", "Drift check", "Plan")
 LARGEST_BYTES = 5_000_000  # limit for e-mail, and for a browser to open the report without delay
 _LONG_TABLE = 40  # number of rows above which a table is collapsed
 _CSS = {Level.PASS: "pass", Level.WARN: "check", Level.FAIL: "fail"}  # the classes of style.css

@@ -1,0 +1,1 @@
+"""Calibration of a pair of cameras from photographs of a board that both see."""

@@ -1,0 +1,1 @@
+"""`beampose stereo`: files, processing, report and study of the binocular measurement."""

@@ -1,0 +1,116 @@
+"""Annotated pairs of pictures for the report of a stereo run."""
+
+from __future__ import annotations
+
+from html import escape
+from typing import Any
+
+import cv2
+import numpy as np
+
+from geometry.arrays import Array
+from lab.binocular.stereo_frames import Content, frames_at
+from lab.binocular.stereo_record import StereoRecord, StereoResults
+from lab.report.plot.image import image_uri
+from lab.report.plot.svg import GREEN, ORANGE
+from tracking.binocular.marker_model import project_markers
+
+_MOST = 4  # pairs shown
+_SIDE = 520.0  # width of one picture in the drawing
+_LEAST_PX = 120  # smallest cut-out, px
+
+
+def annotated_pictures(results: StereoResults) -> list[tuple[str, str]]:
+    """Drawings of some frames with their captions: evenly spaced, and the first ones that are not measured."""
+    chosen = _chosen(results)
+    pictures = frames_at(results.run, [r.frame for r in chosen])
+    out = []
+    for record in chosen:
+        content = pictures[record.frame].content
+        if any(isinstance(c, np.ndarray) for c in content):
+            state = record.tracked.status.value + (f": {record.tracked.reason}" if record.tracked.reason else "")
+            out.append((_pair_drawing(results, record, content), f"frame {record.frame}, {state}"))
+    return out
+
+
+def _chosen(results: StereoResults) -> list[StereoRecord]:
+    measured, other = results.measured, [r for r in results.records if not r.measured]
+    few = [measured[int(i)] for i in np.unique(np.linspace(0, len(measured) - 1, 3).astype(int))] if measured else []
+    few += other[: _MOST - len(few)]
+    return sorted(few, key=lambda r: r.frame)
+
+
+def _pair_drawing(results: StereoResults, record: StereoRecord, content: tuple[Content, Content]) -> str:
+    sides = [_side(results, record, content[c], c) for c in range(2)]
+    height = max(h for _, h in sides)
+    title = f"frame {record.frame}: left and right picture"
+    parts = "".join(
+        f'<g transform="translate({c * (_SIDE + 20):.0f} 0)">{text}</g>' for c, (text, _) in enumerate(sides)
+    )
+    return (
+        f'<svg class="plot" viewBox="0 0 {2 * _SIDE + 20:.0f} {height:.0f}" role="img" aria-label="{escape(title)}">'
+        f"<title>{escape(title)}</title>{parts}</svg>"
+    )
+
+
+def _side(results: StereoResults, record: StereoRecord, content: Content, c: int) -> tuple[str, float]:
+    """One camera's cut-out as SVG, _SIDE wide, and its height."""
+    camera = results.run.pair.cameras[c]
+    name = f'<text x="2" y="14" class="title">{escape(camera.name)}</text>'
+    if not isinstance(content, np.ndarray):
+        return f'{name}<text x="2" y="40">no picture</text>', 60.0
+    found, t = record.candidates[c], record.tracked
+    at = np.zeros((0, 2)) if found is None else found.uv_px
+    used = t.index[c]
+    expected = np.full((len(used), 2), np.nan)
+    if t.pose is not None:
+        expected = project_markers(results.run.pair, results.run.target.model, t.pose)[0][c]
+    x0, y0, x1, y1 = _cut(expected if np.isfinite(expected).any() else at, camera.image_size_px)
+    scale = _SIDE / (x1 - x0)
+    patch: Any = content[y0:y1, x0:x1]
+    grown = max(1, min(6, round(scale)))
+    patch = cv2.resize(patch, None, fx=grown, fy=grown, interpolation=cv2.INTER_NEAREST)
+    wide = 2 * _SIDE  # for screens of high resolution
+    if patch.shape[1] > wide:
+        share = wide / patch.shape[1]
+        patch = cv2.resize(patch, None, fx=share, fy=share, interpolation=cv2.INTER_AREA)
+    high = (y1 - y0) * scale
+    uri = image_uri(np.asarray(patch, dtype=np.uint8), "jpeg")
+    out = [name, f'<image href="{uri}" x="0" y="20" width="{_SIDE:.0f}" height="{high:.1f}"/>']
+
+    def place(uv: Array) -> tuple[float, float]:
+        return float((uv[0] - x0 + 0.5) * scale), float((uv[1] - y0 + 0.5) * scale + 20)
+
+    for i, uv in enumerate(at):
+        inside = x0 <= uv[0] <= x1 and y0 <= uv[1] <= y1
+        if inside and i not in used:
+            out.append(_ring(*place(uv), ORANGE))
+    for k, label in enumerate(results.run.target.model.names):
+        if used[k] >= 0:
+            u, v = place(at[used[k]])
+            out.append(_ring(u, v, GREEN))
+            style = "fill:#7dffce;font-weight:700;font-size:13px"
+            out.append(f'<text x="{u + 9:.1f}" y="{v - 7:.1f}" style="{style}">{escape(label)}</text>')
+        elif np.isfinite(expected[k]).all() and x0 <= expected[k, 0] <= x1 and y0 <= expected[k, 1] <= y1:
+            u, v = place(expected[k])
+            out.append(f'<path d="M{u - 5:.1f} {v:.1f}h10M{u:.1f} {v - 5:.1f}v10" stroke="#fff" stroke-width="1.5"/>')
+    return "".join(out), high + 22
+
+
+def _ring(u: float, v: float, colour: str) -> str:
+    return f'<circle cx="{u:.1f}" cy="{v:.1f}" r="9" fill="none" stroke="{colour}" stroke-width="2"/>'
+
+
+def _cut(uv: Array, size_px: tuple[int, int]) -> tuple[int, int, int, int]:
+    """The cut-out (x0, y0, x1, y1) around points (n, 2): 4 to 3, with a margin; the whole picture without points."""
+    good = uv[np.isfinite(uv).all(axis=1)] if len(uv) else uv
+    size = np.array(size_px)
+    if len(good):
+        good = good[np.all((good > -0.5) & (good < size - 0.5), axis=1)]
+    if not len(good):
+        return 0, 0, size_px[0], size_px[1]
+    middle, extent = (good.min(axis=0) + good.max(axis=0)) / 2, np.ptp(good, axis=0)
+    half = max(float(extent[0]), 4 / 3 * float(extent[1]), _LEAST_PX) * 0.75
+    low = np.clip(np.floor(middle - np.array([half, 0.75 * half])), 0, size - 2).astype(int)
+    high = np.clip(np.ceil(middle + np.array([half, 0.75 * half])), low + 2, size).astype(int)
+    return int(low[0]), int(low[1]), int(high[0]), int(high[1])

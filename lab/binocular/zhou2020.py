@@ -1,0 +1,154 @@
+"""Zhou, Xu & Jia (2020), section 5: table 3 (distances) and the pose, beside ours."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from geometry.arrays import Array
+from geometry.rotations import ypr_from_matrix
+from lab.binocular.distance_experiment import (
+    BASELINE_M,
+    FOCAL_PX,
+    METHODS,
+    DistanceErrors,
+    PoseErrors,
+    distance_errors,
+    pose_errors,
+)
+from lab.binocular.simulated_recording import drogue_markers, occluded, render, scene, true_pixels
+from lab.report.plot.axes import axes, frame, note, plot_area, svg_of
+from lab.report.plot.svg import BLUE, GREEN, ORANGE, VERMILLION, dots, line_path, text
+from lab.study.comparison import Comparison, ComparisonRow, Figure
+from tracking.binocular.parameters import SegmentationParameters
+from tracking.binocular.segmentation import ColourRange, marker_candidates, prepared
+
+NOISE_PX, TRIALS, PICTURES = 0.1, 40, 6
+# Table 3: true and measured distances of two markers, m.
+TABLE_3 = (
+    (5.0, 5.04, 5.03), (10.0, 10.07, 10.08), (15.0, 15.13, 15.10), (20.0, 20.18, 20.17), (25.0, 25.23, 25.22),
+    (30.0, 30.31, 30.31),
+)  # fmt: skip
+# The rotation matrix below table 2. Its entry (2, 3) is printed as 0; -0.17 makes the matrix orthogonal to 0.005.
+PRINTED_ROTATION = np.array([[0.92, -0.13, -0.38], [-0.21, -0.96, -0.17], [-0.34, 0.23, -0.91]])
+PRINTED_ANGLES = (-12.63, 20.18, -14.20)  # deg: about z, y, x, the last one folded into -90 to 90 by an arc tangent
+
+
+def compare_zhou2020(seed: int = 1, trials: int = TRIALS) -> Comparison:
+    """Distances, pose, centroids and the printed angles."""
+    rng = np.random.default_rng([seed, 2020])
+    distances = [distance_errors(row[0], trials, NOISE_PX, rng) for row in TABLE_3]
+    poses = pose_errors(4 * trials, NOISE_PX, rng)
+    rows = [*_distance_rows(distances), *_pose_rows(poses), *_centroid_rows(seed), *_angle_rows()]
+    return Comparison(
+        title="Zhou, Xu & Jia (2020), section 5: binocular drogue pose",
+        setting=f"f {FOCAL_PX:g} px (from the printed field of view) · baseline {BASELINE_M:g} m (not printed) ·"
+        f" {NOISE_PX:g} px noise of a centroid · {trials} trials at each distance · seed {seed}",
+        methods=METHODS,
+        rows=tuple(rows),
+        explanation="Paper's method: equations (7) to (9) with the rows of v corrected, Horn's quaternion, centroids of"
+        " contours. Single points: the most likely place of each marker. Joint fit: the pose that explains all markers"
+        " in both pictures. The paper's column is the mean error of its two markers in table 3, which grows by 0.6 to"
+        " 1.0 % of the distance: an error of its calibration, not noise.",
+        figures=(Figure(*_figure(distances)),),
+        source="Zhou Q., Xu Y., Jia E., Navigation Positioning and Timing 7(1), 40 (2020),"
+        " doi 10.19306/j.cnki.2095-8110.2020.01.006.",
+    )
+
+
+def _distance_rows(distances: list[DistanceErrors]) -> list[ComparisonRow]:
+    rows = []
+    for (true, one, two), e in zip(TABLE_3, distances, strict=True):
+        paper = (one + two) / 2 - true
+        bias, rms, ratio = (tuple(float(v) for v in a) for a in (100 * e.bias / true, e.rms, e.rms / e.bound))
+        name, mean_of_two = f"distance error at {true:g} m", "paper: mean of two markers"
+        rows.append(ComparisonRow(f"{name}, RMS", "m", paper, rms, mean_of_two))
+        rows.append(ComparisonRow(f"{name}, mean", "%", 100 * paper / true, bias, "of the distance"))
+        rows.append(ComparisonRow(f"{name}, RMS over bound", "", None, ratio, "bound: Cramer-Rao"))
+    return rows
+
+
+def _pose_rows(p: PoseErrors) -> list[ComparisonRow]:
+    horn, joint = (np.sqrt((d**2).mean(axis=0)) for d in (p.horn, p.joint))
+    shift = [1000 * float(np.linalg.norm(d[:3])) for d in (horn, joint)]
+    turn = [float(np.rad2deg(np.linalg.norm(d[3:]))) for d in (horn, joint)]
+    where = "10 m, f 1500 px, rim of 0.3 m"
+    return [
+        ComparisonRow("seven markers: position, RMS", "mm", None, (shift[0], None, shift[1]), where),
+        ComparisonRow("seven markers: rotation, RMS", "deg", None, (turn[0], None, turn[1]), where),
+        ComparisonRow("seven markers: position over bound", "", None, (None, None, float(p.ratios()[0])), where),
+        ComparisonRow("seven markers: rotation over bound", "", None, (None, None, float(p.ratios()[1])), where),
+        ComparisonRow("seven markers: NEES / 6", "", None, (None, None, float(p.nees.mean() / 6)), "1 expected"),
+    ]
+
+
+def _centroid_rows(seed: int) -> list[ComparisonRow]:
+    """Errors of the paper's contour centroids and of ours in simulated pictures of the drogue."""
+    contour, coverage = centroid_errors(seed)
+    note_ = "simulated pictures, markers of about 3 px radius"
+    return [ComparisonRow("centroid of a marker, RMS", "px", None, (contour, None, coverage), note_)]
+
+
+def centroid_errors(seed: int, pictures: int = PICTURES) -> tuple[float, float]:
+    """RMS per coordinate, px, of contour and coverage centroids of the markers in simulated pictures."""
+    view = scene(seed, 60, (640, 480), 1100.0)
+    rng = np.random.default_rng([seed, 3])
+    true, hidden, red = true_pixels(view), occluded(view), ColourRange("red", (340.0, 20.0))
+    errors: tuple[list[Array], list[Array]] = ([], [])
+    for i in np.linspace(0, len(view.t_s) - 1, pictures).astype(int).tolist():
+        pictures_ = [render(view, i, c, rng) for c in (0, 1)]
+        seen = prepared(pictures_[0], pictures_[1], SegmentationParameters())
+        for kind, out in zip(("contour", "coverage"), errors, strict=True):
+            p = SegmentationParameters(centroid="contour" if kind == "contour" else "coverage")
+            for c, picture in enumerate(pictures_):
+                ready = seen[c]
+                assert ready is not None
+                found = marker_candidates(picture, ready, (red,), p).uv_px
+                apart = found[:, None] - true[i, c][None]
+                far = np.linalg.norm(apart, axis=-1)
+                out += [apart[far[:, k].argmin(), k] for k in range(7)
+                        if len(found) and not hidden[i, c, k] and far[:, k].min() < 2]  # fmt: skip
+    contour, coverage = (float(np.sqrt(np.mean(np.array(e) ** 2))) for e in errors)
+    return contour, coverage
+
+
+def _angle_rows() -> list[ComparisonRow]:
+    """The printed rotation matrix as angles: the third one is an arc tangent without its quadrant."""
+    angles = np.rad2deg(ypr_from_matrix(PRINTED_ROTATION)).tolist()
+    names = ("roll (about z)", "pitch (about y)", "yaw (about x)")
+    return [
+        ComparisonRow(
+            f"printed rotation matrix: {name}", "deg", paper, (None, None, ours), "R23 as -0.17; ours by atan2"
+        )
+        for name, paper, ours in zip(names, PRINTED_ANGLES, angles, strict=True)
+    ]
+
+
+def _figure(distances: list[DistanceErrors]) -> tuple[str, str, str]:
+    d = np.array([e.distance_m for e in distances])
+    paper = np.array([(one + two) / 2 - true for true, one, two in TABLE_3])
+    rms, bound = np.array([e.rms for e in distances]), np.array([e.bound for e in distances])
+    curves = (
+        ("paper, table 3", paper, VERMILLION, ""),
+        ("single points", rms[:, 1], ORANGE, ""),
+        ("their bound", bound[:, 1], ORANGE, "5 4"),
+        ("joint fit", rms[:, 2], BLUE, ""),
+        ("its bound", bound[:, 2], GREEN, "5 4"),
+    )
+    p = plot_area((0.0, 32.0), (0.0, 1.08 * float(max(c[1].max() for c in curves))), height=300)
+    out = axes(p, "Error of a distance", "distance (m)", "error (m)")
+    for i, (name, y, colour, dash) in enumerate(curves):
+        at = p.at(np.stack([d, y], axis=1))
+        style = f' stroke-dasharray="{dash}"' if dash else ""
+        out.append(
+            f'<path d="{line_path(at[:, 0], at[:, 1])}" fill="none" stroke="{colour}" stroke-width="1.6"{style}/>'
+        )
+        if not dash:
+            out.append(f'<path d="{dots(at, 3.0)}" fill="{colour}"/>')
+        out.append(text(p.box[0] + 10, p.box[1] + 16 + 15 * i, name, "", f"fill:{colour};font-weight:600"))
+    out.append(note(p, f"{len(drogue_markers())} markers, {NOISE_PX:g} px noise"))
+    drawing = svg_of(p, "Error of a distance", [*out, frame(p)])
+    words = (
+        "The paper's errors (mean of two markers), the RMS errors of single points and of the joint fit, and the"
+        " smallest possible RMS from the same information."
+    )
+    return "Distances (table 3)", words, drawing

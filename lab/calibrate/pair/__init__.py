@@ -1,0 +1,1 @@
+"""`calibrate pair`: calibrates two cameras and their relative pose from photographs of a board."""

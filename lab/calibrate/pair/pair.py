@@ -1,0 +1,236 @@
+"""`calibrate pair`: calibrates two cameras together; writes pair.yaml and a report."""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from calibration.boards.board_types import Board
+from calibration.findings import Finding, Level, verdict
+from calibration.lens.fit.lens_models import named
+from calibration.lens.intrinsics import FEWEST_VIEWS, IntrinsicsError, IntrinsicsOptions, calibrate_intrinsics
+from calibration.lens.intrinsics_result import Intrinsics
+from calibration.pair.pair_calibration import CalibratedPair, PairError, calibrate_pair
+from lab.calibrate.camera.camera import LENSES, corner_table
+from lab.calibrate.camera.photos import PhotoSet, Progress, find_in_photos
+from lab.calibrate.pair.pair_findings import findings_of, range_sigmas
+from lab.errors import CalibrationError, InputError
+from lab.files.rig.board_file import load_board_or_text
+from lab.files.rig.calibration_state import CalibrationState
+from lab.files.rig.pair_file import PairFile, save_pair_file
+from lab.files.text.atomic_write import atomic_folder, check_output_folder, keep_good_results
+from lab.files.text.csv_text import write_table
+from lab.files.text.error_text import suggest_name
+from lab.number_format import format_length, format_number
+from lab.report.calibration.calibration_page import (
+    CalibrationReport,
+    PageTable,
+    Section,
+    provenance,
+    write_calibration_report,
+)
+from lab.runs.frames.frame_sources import number_of
+
+PAIR, FAILED, PAIRS = "pair.yaml", "pair.failed.yaml", "pairs.csv"
+PAIR_COLUMNS = ("number", "rms_px", "separated")
+
+
+@dataclass(frozen=True, slots=True)
+class PairOptions:
+    """Options of a pair's calibration."""
+
+    names: tuple[str, str] = ("left", "right")
+    lens: str = "auto"
+    valid_days: int = 365
+
+    def __post_init__(self) -> None:
+        if self.lens not in LENSES:
+            raise InputError(f"lens: expected {', '.join(LENSES)}, got {self.lens!r}{suggest_name(self.lens, LENSES)}")
+        if self.names[0] == self.names[1]:
+            raise InputError(f"names: expected two different names, got {self.names[0]!r} twice")
+
+
+@dataclass(frozen=True, slots=True)
+class PairOutcome:
+    """Result of a pair's calibration."""
+
+    pair: CalibratedPair
+    findings: tuple[Finding, ...]
+    names: tuple[str, str]
+    out: Path
+
+    @property
+    def level(self) -> Level:
+        """The verdict."""
+        return verdict(self.findings)
+
+    @property
+    def exit_status(self) -> int:
+        """0, or 3 if the calibration must not be used."""
+        return CalibrationError.exit_status if self.level == Level.FAIL else 0
+
+    def line(self) -> str:
+        """One line for the terminal."""
+        worst = max(self.findings, key=lambda f: f.level)
+        reason = "" if self.level == Level.PASS else f": {worst.what}"
+        left, right = (f"{v:.3f}" for v in self.pair.rms_px)
+        return (
+            f"{self.names[0]} and {self.names[1]}: {self.level.name}: baseline {format_length(self.pair.baseline_m)} ±"
+            f" {format_length(baseline_sigma(self.pair))}, RMS {left} and {right} px{reason} -> {self.out}"
+        )
+
+
+def calibrate_pair_folder(
+    left: Path | str,
+    right: Path | str,
+    board: Board | str | Path,
+    out: Path,
+    options: PairOptions = PairOptions(),
+    today: datetime.date | None = None,
+    progress: Progress | None = None,
+) -> PairOutcome:
+    """Calibrate a pair from photographs of a board by both cameras; equal numbers in file names are one instant.
+
+    left, right: a folder or a pattern. Writes pair.yaml, pairs.csv and report.html into the folder `out`. If the
+    verdict is FAIL, the file is called pair.failed.yaml, and earlier good results are kept.
+
+    Raises:
+        InputError: for pictures or a board that cannot be used.
+        CalibrationError: if the photographs do not determine a camera or the pair.
+    """
+    check_output_folder(out, _is_ours)
+    day = today or datetime.date.today()
+    known = load_board_or_text(board) if isinstance(board, str | Path) else board
+    sets, single = [], []
+    for name, photos in zip(options.names, (left, right), strict=True):
+        found = find_in_photos([photos], known, progress, fewest=FEWEST_VIEWS)
+        sets.append(found)
+        single.append(_calibrated(name, found, options))
+    numbers = (_numbers(sets[0], options.names[0]), _numbers(sets[1], options.names[1]))
+    try:
+        pair = calibrate_pair(options.names, (single[0], single[1]), numbers)
+    except PairError as error:
+        raise CalibrationError(f"{options.names[0]} and {options.names[1]}: {error}") from None
+    findings = findings_of(pair, options.names)
+    failed = verdict(findings) is Level.FAIL
+    folder = keep_good_results(out, failed, PAIR)
+    outcome = PairOutcome(pair, findings, options.names, folder)
+    with atomic_folder(folder, may_replace=_is_ours) as work:
+        save_pair_file(_file_of(outcome, day, options), work / (FAILED if failed else PAIR))
+        rows = zip(pair.keys, pair.pair_rms_px.tolist(), strict=True)
+        write_table(
+            work / PAIRS,
+            PAIR_COLUMNS,
+            [[k, "" if np.isnan(r) else f"{r:.4f}", int(k in pair.separated)] for k, r in rows],
+        )
+        paths = [s.paths[name] for s in sets for name, _ in s.views]
+        write_calibration_report(_report(outcome, day, paths), work)
+    return outcome
+
+
+def baseline_sigma(pair: CalibratedPair) -> float:
+    """1 sigma of the baseline, m: the length of the right camera's translation."""
+    t = pair.cameras[1].camera_from_world.translation
+    along = t / np.linalg.norm(t)
+    C = pair.covariance.matrix[-6:-3, -6:-3]
+    return float(np.sqrt(along @ C @ along))
+
+
+def _is_ours(folder: Path) -> bool:
+    return (folder / PAIRS).is_file()
+
+
+def _calibrated(name: str, found: PhotoSet, options: PairOptions) -> Intrinsics:
+    lens = None if options.lens == "auto" else named(options.lens)
+    try:
+        return calibrate_intrinsics(corner_table(found), IntrinsicsOptions(lens=lens))
+    except IntrinsicsError as error:
+        raise CalibrationError(f"{name} ({found.line()}): {error}") from None
+
+
+def _numbers(photos: PhotoSet, name: str) -> list[int]:
+    """The number in the name of each view's picture. Raises InputError where one has none, or two have the same."""
+    out: list[int] = []
+    for view, _ in photos.views:
+        number = number_of(f"{Path(view).stem}.png")
+        if number is None:
+            raise InputError(f"{name}: {view}: expected a number in the name, which says to which picture of the other"
+                             " camera it belongs")  # fmt: skip
+        if number in out:
+            raise InputError(f"{name}: {view}: expected one picture of number {number}, got two; rename or remove one")
+        out.append(number)
+    return out
+
+
+def _file_of(outcome: PairOutcome, day: datetime.date, options: PairOptions) -> PairFile:
+    until = None if outcome.level is Level.FAIL else day + datetime.timedelta(options.valid_days)
+    reasons = tuple(f"{f.level.name}: {f.what}" for f in outcome.findings if f.level > Level.PASS)
+    state = CalibrationState(day, outcome.level.name, until, reasons)
+    return PairFile(dict(zip(outcome.names, outcome.pair.cameras, strict=True)), outcome.pair.covariance, state)
+
+
+def _report(outcome: PairOutcome, day: datetime.date, paths: Sequence[Path]) -> CalibrationReport:
+    pair = outcome.pair
+    sigma = np.sqrt(np.diagonal(pair.covariance.matrix))
+    table = range_sigmas(pair)
+    right = pair.cameras[1].camera_from_world
+    angles = np.rad2deg(right.ypr)
+    parameters = [
+        [name, _value(outcome, name), float(s)] for name, s in zip(pair.covariance.names, sigma, strict=True)
+    ]  # fmt: skip
+    return CalibrationReport(
+        "Pair",
+        f"{outcome.names[0]} and {outcome.names[1]}",
+        outcome.level,
+        outcome.findings,
+        [
+            ("baseline", format_length(pair.baseline_m), f"± {format_length(baseline_sigma(pair))}"),
+            ("pairs", str(len(pair.keys) - len(pair.separated)), "photographs with the board in both cameras"),
+            ("residual", f"{pair.rms_px[0]:.3f} / {pair.rms_px[1]:.3f} px", "RMS per coordinate, left / right"),
+            ("misfit", format_number(pair.misfit), "joint residuals over single ones; 1 expected"),
+            ("right camera turned", f"{format_number(float(np.linalg.norm(angles)))} deg", "against the left one"),
+        ],
+        [
+            Section(
+                "Distances",
+                "Sigma of a distance due to this calibration alone, for a point straight ahead. It is the same in all"
+                " frames: averaging does not reduce it.",
+                table=PageTable(
+                    ("distance (m)", "sigma (mm)", "share (%)"),
+                    [[float(d), 1000 * float(s), 100 * float(s / d)] for d, s in table],
+                ),
+            ),
+            Section(
+                "Pairs",
+                "RMS of the residuals of each pair of photographs, both cameras together.",
+                table=PageTable(
+                    ("number", "RMS (px)", "used as a pair"),
+                    [[k, float(r), k not in pair.separated] for k, r in zip(pair.keys, pair.pair_rms_px, strict=True)],
+                ),
+            ),
+            Section(
+                "Parameters",
+                "The world is the frame of the left camera. The errors of the right camera's pose are [dt in the"
+                " camera, dtheta in world]; pair.yaml has the joint covariance.",
+                table=PageTable(("parameter", "value", "sigma"), parameters),
+            ),
+        ],
+        provenance(dict.fromkeys(paths), day),
+    )
+
+
+def _value(outcome: PairOutcome, name: str) -> float:
+    """The value of a parameter; of rotations those of the rotation vector of camera_from_world."""
+    from geometry.rotations import log
+    from geometry.uncertainty.rig_parameters import PINHOLE, POSE, distortion_names, split_name
+
+    _, item, parameter = split_name(name)
+    camera = outcome.pair.cameras[outcome.names.index(item)]
+    pinhole = [camera.matrix[0, 0], camera.matrix[1, 1], camera.matrix[0, 2], camera.matrix[1, 2]]
+    pose = [*camera.camera_from_world.translation, *log(camera.camera_from_world.rotation)]
+    values = dict(zip((*PINHOLE, *distortion_names(camera), *POSE), (*pinhole, *camera.distortion, *pose), strict=True))
+    return float(values[parameter])

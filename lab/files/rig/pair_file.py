@@ -1,0 +1,148 @@
+"""pair.yaml: two cameras with their relative pose; rig.yaml and foreign files with poses are read as pairs too."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import pydantic
+
+from geometry.arrays import symmetric
+from geometry.camera import Camera
+from geometry.pose import Pose
+from geometry.uncertainty.rig_parameters import RigCovariance, camera_names
+from lab.errors import InputError
+from lab.files.rig.calibration_state import CalibrationState, CalibrationStateBlock, state_mapping
+from lab.files.rig.camera_block import (
+    Covariance,
+    CovarianceBlock,
+    LensBlock,
+    covariance_error,
+    covariance_mapping,
+    lens_mapping,
+)
+from lab.files.rig.interchange import BEAMPOSE, RIG, read_cameras, recognised_format
+from lab.files.rig.rig_covariance import joint_covariance
+from lab.files.rig.rig_file import PoseBlock, load_rig_file, pose_mapping
+from lab.files.text.error_text import suggest_name
+from lab.files.text.fields import Block, Name, one_of, validated
+from lab.files.text.yaml_text import parse_mapping, read_text, write_mapping
+
+SCHEMA = "beampose/pair/1"
+REMEDY = "calibrate the pair with `beampose calibrate pair LEFT RIGHT --board BOARD --out DIR`"
+
+
+@dataclass(frozen=True, slots=True)
+class PairFile:
+    """Calibrated cameras of a file, at least two, in a common frame."""
+
+    cameras: Mapping[str, Camera]
+    covariance: RigCovariance | None = None
+    calibration: CalibrationState | None = None
+
+
+class _CameraBlock(LensBlock):
+    camera_from_world: PoseBlock
+
+
+class _PairBlock(Block):
+    schema_: Annotated[str, pydantic.PlainValidator(one_of((SCHEMA,)))] = pydantic.Field(alias="schema")
+    cameras: dict[Name, _CameraBlock]
+    covariance: CovarianceBlock | None = None
+    calibration: CalibrationStateBlock | None = None
+
+
+def load_pair_file(path: Path) -> PairFile:
+    """The cameras of a pair.yaml, a rig.yaml or a foreign file (Kalibr, OpenCV, mrcal ...) with poses.
+
+    Raises:
+        InputError: with file and field; a file without poses or with one camera is not a calibrated pair.
+    """
+    path = Path(path)
+    if not path.is_file():
+        found = "a folder" if path.is_dir() else "nothing"
+        raise InputError(f"{path}: expected a calibrated pair of cameras, found {found}; {REMEDY}")
+    text = read_text(path)
+    if SCHEMA in text:
+        return _own(validated(_PairBlock, parse_mapping(text, path), path), path)
+    kind = recognised_format(text, path)
+    if kind == RIG:
+        rig = load_rig_file(path)
+        return PairFile(rig.rig.cameras, joint_covariance(rig.rig, rig.covariances, path), rig.calibration)
+    models = read_cameras(path)
+    if len(models) < 2:
+        raise InputError(
+            f"{path}: expected two cameras with their poses, got the single camera {models[0].name}; {REMEDY}"
+        )
+    lost = [m.name for m in models if m.camera_from_reference is None]
+    if lost or kind == BEAMPOSE:
+        raise InputError(
+            f"{path}: expected cameras with their poses, got no pose of {', '.join(lost)}: the pair is not calibrated;"
+            f" {REMEDY}"
+        )
+    cameras = {}
+    for m in models:
+        fx, fy, cx, cy = m.pinhole
+        K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+        pose = m.camera_from_reference or Pose.identity()
+        cameras[m.name] = Camera(m.name, "", m.image_size_px, K, m.distortion, pose, lens=m.lens)
+    return PairFile(cameras)
+
+
+def _own(content: _PairBlock, path: Path) -> PairFile:
+    cameras = {
+        name: Camera(name, "", b.size(), b.matrix(), tuple(b.distortion), b.camera_from_world.pose(), lens=b.lens)
+        for name, b in content.cameras.items()
+    }
+    if len(cameras) < 2:
+        raise InputError(f"{path}: cameras: expected two, got {len(cameras)}; {REMEDY}")
+    covariance = None
+    if content.covariance is not None:
+        block = content.covariance.value()
+        known = [f"cameras.{name}.{p}" for name, camera in cameras.items() for p in camera_names(camera)]
+        for name in block.parameters:
+            if name not in known:
+                raise InputError(
+                    f"{path}: covariance.parameters: unknown parameter {name!r}{suggest_name(name, known)}"
+                )
+        mistake = covariance_error(block)
+        if mistake:
+            raise InputError(f"{path}: covariance.matrix: {mistake}")
+        covariance = RigCovariance(block.parameters, symmetric(block.matrix))
+    return PairFile(cameras, covariance, None if content.calibration is None else content.calibration.value())
+
+
+def save_pair_file(file: PairFile, path: Path) -> None:
+    """Write a pair.yaml, complete or not at all. Raises InputError."""
+    content: dict[str, Any] = {
+        "schema": SCHEMA,
+        "cameras": {
+            name: {
+                **lens_mapping(c.image_size_px, c.matrix, c.distortion, c.lens),
+                "camera_from_world": pose_mapping(c.camera_from_world),
+            }
+            for name, c in file.cameras.items()
+        },
+    }
+    if file.covariance is not None:
+        content["covariance"] = covariance_mapping(Covariance(file.covariance.names, file.covariance.matrix))
+    if file.calibration is not None:
+        content["calibration"] = state_mapping(file.calibration)
+    validated(_PairBlock, content, path)
+    write_mapping(content, Path(path))
+
+
+def of_two_cameras(file: PairFile, names: Sequence[str]) -> tuple[tuple[Camera, Camera], RigCovariance | None]:
+    """Two cameras of a file with their part of its covariance. Raises KeyError for an unknown name."""
+    chosen = (file.cameras[names[0]], file.cameras[names[1]])
+    if file.covariance is None:
+        return chosen, None
+    known = {f"cameras.{c.name}.{p}" for c in chosen for p in camera_names(c)}
+    rows = [i for i, name in enumerate(file.covariance.names) if name in known]
+    if not rows:
+        return chosen, None
+    matrix = file.covariance.matrix[np.ix_(rows, rows)]
+    return chosen, RigCovariance(tuple(file.covariance.names[i] for i in rows), matrix)

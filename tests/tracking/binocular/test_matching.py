@@ -1,0 +1,154 @@
+"""Markers are labelled by geometry, not by their order; what cannot be decided is not reported as measured."""
+
+import numpy as np
+import pytest
+
+from geometry.pose import Pose
+from lab.binocular.distance_experiment import random_pose
+from tests.tracking.binocular.scenes import MODEL, PAIR, images, pose_at
+from tracking.binocular.acquisition import matching_pairs, mirrored
+from tracking.binocular.clock_offset import FittedFrame, clock_offset
+from tracking.binocular.marker_model import MarkerImages, MarkerModel, project_markers
+from tracking.binocular.parameters import MatchParameters
+from tracking.binocular.pose_tracker import AMBIGUOUS, NO_PICTURES, TOO_FEW, BinocularTracker
+from tracking.statuses import PoseStatus
+
+P = MatchParameters()
+
+
+def consistent(pose, frame):
+    delta = pose.minus(frame.pose)
+    return delta @ np.linalg.solve(frame.covariance, delta) < 40  # chi-square with 6 dof: p = 5e-7
+
+
+@pytest.mark.parametrize("case", [((), ()), ((0,), ()), ((2,), (5,)), ((1, 4), (1, 4))])
+def test_hidden_and_false_markers_do_not_mislabel_the_others(case):
+    rng = np.random.default_rng(1)
+    pose = pose_at(9, 1)
+    frame = BinocularTracker(PAIR, MODEL, P).step(0.0, images(pose, rng, case, false=3))
+    assert frame.status is PoseStatus.MEASURED, frame.reason
+    assert consistent(pose, frame)
+    assert all((frame.index[c, list(case[c])] == -1).all() for c in (0, 1))
+
+
+def test_candidates_match_along_the_epipolar_line_only():
+    rng = np.random.default_rng(2)
+    left, right = images(pose_at(9, 2), rng)
+    pairs = matching_pairs(PAIR, (left, right), P)
+    assert (pairs.sum(axis=1) >= 1).all()
+    moved = MarkerImages(right.uv_px + np.array([0.0, 8.0]), right.cov_px2, right.area_px2, right.colour)
+    assert matching_pairs(PAIR, (left, moved), P).sum() < pairs.sum()
+    other = MarkerImages(right.uv_px, right.cov_px2, right.area_px2, right.colour + 1)
+    assert not matching_pairs(PAIR, (left, other), P).any()
+
+
+def test_a_recording_is_followed_through_frames_without_markers():
+    rng, tracker = np.random.default_rng(3), BinocularTracker(PAIR, MODEL, P)
+    poses = Pose.from_ypr(np.linspace([0, 0, 0], [0.3, 0.1, 0.2], 12), np.linspace([0.2, 0, 10], [0.4, 0.1, 9.5], 12))
+    none = MarkerImages.none()
+    for i in range(12):
+        pictures = (none, none) if i in (6, 7) else images(poses[i], rng, false=1)
+        frame = tracker.step(i / 25, pictures)
+        assert frame.status is (PoseStatus.PREDICTED if i in (6, 7) else PoseStatus.MEASURED)
+        assert consistent(poses[i], frame)
+    assert frame.predicted_px.shape == (2, 7, 2)
+
+
+def test_one_blind_camera_still_measures_with_a_larger_covariance():
+    rng, pose = np.random.default_rng(4), pose_at(6, 4)
+    both = BinocularTracker(PAIR, MODEL, P).step(0.0, images(pose, rng))
+    one = BinocularTracker(PAIR, MODEL, P).step(0.0, (images(pose, rng)[0], None))
+    assert one.status is PoseStatus.MEASURED, one.reason
+    assert consistent(pose, one)
+    assert np.trace(one.covariance[:3, :3]) > 4 * np.trace(both.covariance[:3, :3])
+
+
+def test_too_few_markers_and_no_pictures_are_lost_with_their_reason():
+    rng, pose = np.random.default_rng(5), pose_at(9, 5)
+    two = images(pose, rng, hidden=((0, 1, 2, 3, 4), (0, 1, 2, 3, 4)))
+    frame = BinocularTracker(PAIR, MODEL, P).step(0.0, two)
+    assert (frame.status, frame.reason, frame.pose) == (PoseStatus.LOST, TOO_FEW, None)
+    assert BinocularTracker(PAIR, MODEL, P).step(0.0, (None, None)).reason == NO_PICTURES
+
+
+@pytest.mark.parametrize("seeds", [(0,), pytest.param(range(1, 40), marks=pytest.mark.slow)])
+def test_points_without_a_target_give_no_measured_pose(seeds):
+    for seed in seeds:
+        rng = np.random.default_rng(seed)
+        left, right = (rng.uniform(300, 700, (9, 2)) for _ in range(2))
+        cov = np.broadcast_to(0.01 * np.eye(2), (9, 2, 2))
+        pictures = tuple(MarkerImages(u, cov, np.full(9, np.nan), np.zeros(9, dtype=np.int64)) for u in (left, right))
+        frame = BinocularTracker(PAIR, MODEL, P).step(0.0, pictures)
+        assert frame.status is not PoseStatus.MEASURED
+
+
+def test_a_flat_far_target_has_two_attitudes_and_the_covariance_covers_both():
+    flat = MarkerModel(MODEL.names, MODEL.positions * [1, 1, 0], MODEL.colour, MODEL.radius_m)
+    rng, seen = np.random.default_rng(6), 0
+    for i in range(2):
+        pose = random_pose(60.0, np.random.default_rng(i))
+        uv = project_markers(PAIR, flat, pose)[0] + rng.normal(0, 0.1, (2, 7, 2))
+        cov = np.broadcast_to(0.01 * np.eye(2), (7, 2, 2))
+        pictures = tuple(MarkerImages(u, cov, np.full(7, np.nan), np.zeros(7, dtype=np.int64)) for u in uv)
+        frame = BinocularTracker(PAIR, flat, P).step(0.0, pictures)
+        if frame.status is PoseStatus.MEASURED or frame.reason == AMBIGUOUS:
+            assert consistent(pose, frame)
+        seen += frame.reason == AMBIGUOUS
+    assert seen >= 1
+
+
+def test_the_mirrored_pose_has_nearly_the_same_images_of_a_flat_target_and_twice_mirrored_is_the_start():
+    flat = MarkerModel(MODEL.names, MODEL.positions * [1, 1, 0], MODEL.colour, MODEL.radius_m)
+    pose = random_pose(60.0, np.random.default_rng(3))
+    other = mirrored(PAIR, flat, pose)
+    assert np.linalg.det(other.rotation) == pytest.approx(1)
+    apart = project_markers(PAIR, flat, pose)[0] - project_markers(PAIR, flat, other)[0]
+    assert np.abs(apart).max() < 0.6  # px; the target is 11 px wide
+    np.testing.assert_allclose(mirrored(PAIR, flat, other).rotation, pose.rotation, atol=1e-9)
+
+
+def recording(delay_s, seed=7):
+    """Fitted frames of a target that moves up and sideways at about 1 m/s, 25 Hz; right picture late."""
+    rng, tracker, out = np.random.default_rng(seed), BinocularTracker(PAIR, MODEL, P), []
+    for i in range(14):
+        t = i / 25
+        pose, later = (
+            Pose.from_ypr(
+                np.array([0.3 * np.sin(2 * s), 0.1, 0.2]), np.array([0.2 + 0.5 * np.sin(3 * s), 0.9 * s - 0.2, 8.0])
+            )
+            for s in (t, t + delay_s)
+        )
+        frame = tracker.step(t, images(pose, rng, delay=later))
+        if frame.fit is not None:
+            out.append(FittedFrame(t, frame.fit, frame.observed))
+    return out
+
+
+def test_an_offset_of_the_clocks_is_measured_from_residuals_that_grow_with_velocity():
+    late = clock_offset(PAIR, MODEL, recording(0.003))
+    assert late.significant
+    assert late.offset_s == pytest.approx(0.003, abs=4 * late.sigma_s)
+    none = clock_offset(PAIR, MODEL, recording(0.0))
+    assert not none.significant
+    assert abs(none.offset_s) < 5 * none.sigma_s
+
+
+def test_two_equal_targets_are_ambiguous_until_one_is_followed():
+    rng = np.random.default_rng(8)
+    one = Pose.from_ypr(np.array([0.2, 0.1, 0.0]), np.array([-1.2, 0.0, 9.0]))
+    two = Pose.from_ypr(np.array([-0.1, 0.0, 0.1]), np.array([1.5, 0.2, 9.5]))
+
+    def both():
+        pairs = zip(images(one, rng), images(two, rng), strict=True)
+        return tuple(
+            MarkerImages(*(np.concatenate([getattr(a, n), getattr(b, n)]) for n in MarkerImages.__slots__))
+            for a, b in pairs
+        )
+
+    frame = BinocularTracker(PAIR, MODEL, P).step(0.0, both())
+    assert frame.status is not PoseStatus.MEASURED
+    tracker = BinocularTracker(PAIR, MODEL, P)
+    tracker.step(0.0, images(one, rng))
+    followed = tracker.step(0.04, both())
+    assert followed.status is PoseStatus.MEASURED, followed.reason
+    assert consistent(one, followed)

@@ -1,0 +1,197 @@
+"""The pose of the target in each frame of a sequence; the previous frames help to label, not to measure.
+
+A measured pose rests on the images of its own frame alone: poses of different frames have independent noise. The motion
+gives the search regions, excludes one of two attitudes of a distant flat target, and bridges frames without a
+measurement. Source: ours.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from geometry.arrays import Array, Ints, symmetric
+from geometry.camera import in_picture
+from geometry.pose import Pose
+from geometry.uncertainty.chi_square import chi2_tail
+from tracking.binocular.acquisition import acquire, distinct, mirrored
+from tracking.binocular.joint_fit import JointFit, MarkerObservations
+from tracking.binocular.labelling import Images, LabelledPose, labelled_pose, observations
+from tracking.binocular.marker_model import MarkerImages, MarkerModel, StereoPair, project_markers
+from tracking.binocular.motion import Motion
+from tracking.binocular.parameters import MatchParameters
+from tracking.statuses import LOST_SIGMA_M, LOST_SIGMA_RAD, PoseStatus
+
+_MOST_PRIOR_NATS = 20.0  # a target that jumps is found: the motion never outweighs two images
+_TRUSTED_P, _TRUSTED_SHARE = 1e-3, 0.75  # misfit and share of explained images without a search from scratch
+
+# A camera with this many candidates must confirm this share of the markers that the pose puts into its picture.
+_ENOUGH_CANDIDATES, _LEAST_CONFIRMED = 3, 0.3
+
+NO_PICTURES = "no picture of either camera"
+TOO_FEW = "fewer than three markers found"
+NO_POSE = "no pose explains the candidates"
+AMBIGUOUS = "several poses explain the markers"
+MISFIT = "the markers do not fit together: calibration, synchronisation or marker model"
+CONTRADICTED = "the two pictures contradict each other: calibration, exchanged cameras or synchronisation"
+WEAK = "the markers found do not determine the pose"
+
+
+@dataclass(frozen=True, slots=True)
+class BinocularFrame:
+    """The result of one frame."""
+
+    status: PoseStatus
+    reason: str  # why it is not measured; empty if it is
+    pose: Pose | None  # world_from_body
+    covariance: Array | None  # (6, 6)
+    fit: JointFit | None  # of the images of this frame, also where it is no measurement
+    observed: MarkerObservations | None  # the images of that fit
+    index: Ints  # (2, K) candidates of the markers, -1: none
+    predicted_px: Array  # (2, K, 2), before the pictures were used; nan without a prediction
+    predicted_cov_px2: Array  # (2, K, 2, 2)
+
+    @property
+    def markers(self) -> int:
+        """Number of different markers that the pose rests on."""
+        return int((self.index >= 0).any(axis=0).sum())
+
+
+class BinocularTracker:
+    """Labels and poses, frame by frame."""
+
+    def __init__(self, pair: StereoPair, model: MarkerModel, parameters: MatchParameters) -> None:
+        self._pair, self._model, self._p = pair, model, parameters
+        self._motion: Motion | None = None
+        self._images: Images = (MarkerImages.none(), MarkerImages.none())  # of the current frame
+        self._last_measured: int = -1
+        self._count = -1
+
+    def step(self, t_s: float, pictures: tuple[MarkerImages | None, MarkerImages | None]) -> BinocularFrame:
+        """The next frame; None for a camera without a picture."""
+        self._count += 1
+        ahead = self._prediction(t_s)
+        images = (pictures[0] or MarkerImages.none(), pictures[1] or MarkerImages.none())
+        if pictures[0] is None and pictures[1] is None:
+            return self._unmeasured(NO_PICTURES, ahead)
+        if max(len(found) for found in images) < self._p.min_markers:
+            return self._unmeasured(TOO_FEW, ahead)
+        self._images = images
+        candidates = self._candidates(images, ahead)
+        if not candidates:
+            return self._unmeasured(NO_POSE, ahead)
+        scores = [c.score + self._prior_nats(c, ahead) for c in candidates]
+        order = np.argsort(scores)[::-1]
+        best = candidates[order[0]]
+        rivals = [candidates[i] for i in order[1:] if scores[i] > scores[order[0]] - self._p.lead_nats]
+        reason = self._doubt(best, rivals)
+        if reason == AMBIGUOUS:
+            weights = np.exp(np.array([scores[i] for i in order[: 1 + len(rivals)]]) - scores[order[0]])
+            return self._both(best, rivals, weights, ahead)
+        if reason:
+            return self._unmeasured(reason, ahead, best)
+        self._last_measured = self._count
+        pose, covariance = best.fit.pose, best.fit.covariance
+        self._motion = Motion.at_rest(t_s, pose, covariance) if ahead is None else ahead.updated(pose, covariance)
+        return self._result(PoseStatus.MEASURED, "", pose, covariance, best, ahead)
+
+    def _prediction(self, t_s: float) -> Motion | None:
+        if self._motion is None or self._count - self._last_measured > self._p.max_predicted_frames:
+            return None
+        ahead = self._motion.predicted(t_s, self._p.acceleration_m_s2, self._p.turn_rad_s2)
+        worst = np.sqrt([np.linalg.eigvalsh(ahead.pose_covariance[s, s])[-1] for s in (slice(0, 3), slice(3, 6))])
+        return ahead if worst[0] <= LOST_SIGMA_M and worst[1] <= LOST_SIGMA_RAD else None
+
+    def _candidates(self, images: Images, ahead: Motion | None) -> list[LabelledPose]:
+        """Poses that explain the images: near the prediction, and from scratch where that is not convincing."""
+        found: list[LabelledPose] = []
+        if ahead is not None:
+            near = labelled_pose(self._pair, self._model, images, ahead.pose, ahead.pose_covariance, self._p)
+            found = [] if near is None else [near]
+        if not found or not self._convincing(found[0], images):
+            found += acquire(self._pair, self._model, images, self._p)
+        for candidate in found[:2]:
+            start = mirrored(self._pair, self._model, candidate.fit.pose)
+            other = labelled_pose(self._pair, self._model, images, start, candidate.fit.covariance, self._p)
+            found = found if other is None else [*found, other]
+        return distinct(found)
+
+    def _convincing(self, found: LabelledPose, images: Images) -> bool:
+        explained = int((found.index >= 0).sum())
+        expected = min(2 * len(self._model), len(images[0]) + len(images[1]))
+        return chi2_tail(found.fit.chi2, max(found.fit.dof, 1)) > _TRUSTED_P and explained >= _TRUSTED_SHARE * expected
+
+    def _prior_nats(self, candidate: LabelledPose, ahead: Motion | None) -> float:
+        """Log density of a candidate under the prediction, up to a constant and limited."""
+        if ahead is None:
+            return 0.0
+        apart = candidate.fit.pose.minus(ahead.pose)
+        d2 = float(apart @ np.linalg.solve(ahead.pose_covariance + candidate.fit.covariance, apart))
+        return -min(0.5 * d2, _MOST_PRIOR_NATS)
+
+    def _doubt(self, best: LabelledPose, rivals: list[LabelledPose]) -> str:
+        """Why the best pose is not a measurement; empty if it is one."""
+        if best.markers < self._p.min_markers:
+            return TOO_FEW
+        if best.fit.dof < 2:
+            return WEAK
+        if chi2_tail(best.fit.chi2, best.fit.dof) < self._p.max_pose_chi2_p:
+            return MISFIT
+        if best.evidence < self._p.lead_nats:
+            return NO_POSE
+        if self._contradicted(best):
+            return CONTRADICTED
+        worst = np.sqrt([np.linalg.eigvalsh(best.fit.covariance[s, s])[-1] for s in (slice(0, 3), slice(3, 6))])
+        if worst[0] > LOST_SIGMA_M or worst[1] > LOST_SIGMA_RAD:
+            return WEAK
+        return AMBIGUOUS if rivals else ""
+
+    def _contradicted(self, best: LabelledPose) -> bool:
+        """Whether a camera sees candidates, but hardly one where the pose puts markers: cameras exchanged, or moved."""
+        pixels = project_markers(self._pair, self._model, best.fit.pose)[0]
+        for c, (camera, found) in enumerate(zip(self._pair.cameras, self._images, strict=True)):
+            expected = int(in_picture(pixels[c], np.array(camera.image_size_px)).sum())
+            confirmed = int((best.index[c] >= 0).sum())
+            if len(found) >= _ENOUGH_CANDIDATES and confirmed < min(_LEAST_CONFIRMED * expected, expected - 1):
+                return True
+        return False
+
+    def _both(
+        self, best: LabelledPose, rivals: list[LabelledPose], weights: Array, ahead: Motion | None
+    ) -> BinocularFrame:
+        """The best of several poses with a covariance that covers all of them."""
+        w = weights / weights.sum()
+        pose = best.fit.pose
+        covariance = np.zeros((6, 6))
+        for weight, one in zip(w, [best, *rivals], strict=True):
+            apart = one.fit.pose.minus(pose)
+            covariance += weight * (one.fit.covariance + np.outer(apart, apart))
+        if np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]) > LOST_SIGMA_M:
+            return self._unmeasured(AMBIGUOUS, ahead, best)
+        return self._result(PoseStatus.PREDICTED, AMBIGUOUS, pose, symmetric(covariance), best, ahead)
+
+    def _unmeasured(self, reason: str, ahead: Motion | None, found: LabelledPose | None = None) -> BinocularFrame:
+        if ahead is None:
+            return self._result(PoseStatus.LOST, reason, None, None, found, ahead)
+        return self._result(PoseStatus.PREDICTED, reason, ahead.pose, ahead.pose_covariance, found, ahead)
+
+    def _result(
+        self,
+        status: PoseStatus,
+        reason: str,
+        pose: Pose | None,
+        covariance: Array | None,
+        found: LabelledPose | None,
+        ahead: Motion | None,
+    ) -> BinocularFrame:
+        count = len(self._model)
+        pixels, cov = np.full((2, count, 2), np.nan), np.full((2, count, 2, 2), np.nan)
+        if ahead is not None:
+            pixels, J = project_markers(self._pair, self._model, ahead.pose)
+            cov = J @ ahead.pose_covariance @ np.swapaxes(J, -1, -2)
+        used = found is not None and (status is PoseStatus.MEASURED or reason == AMBIGUOUS)
+        index = found.index if found is not None and used else np.full((2, count), -1, dtype=np.int64)
+        fit = None if found is None else found.fit
+        observed = None if found is None else observations(self._images, found.index)
+        return BinocularFrame(status, reason, pose, covariance, fit, observed, index, pixels, cov)

@@ -1,0 +1,195 @@
+"""Marker candidates in a colour picture: Zhou (2020), section 2, with centroids to a few hundredths of a pixel.
+
+The paper brightens the left picture by gamma 0.8, gives the right one the histogram of the left, segments in HSV,
+cleans the mask by a median filter, an opening and a closing, and takes the centroid of each contour. Such a centroid
+carries the errors of its pixels' edges. Ours (`coverage`) weights each pixel of the unchanged picture with the share of
+the marker's colour in it, which is linear in the light: partly covered pixels and defocus do not shift it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from geometry.arrays import Array, Bools
+from tracking.binocular.marker_model import MarkerImages
+from tracking.binocular.parameters import SegmentationParameters
+
+Bytes = NDArray[np.uint8]
+_MARGIN_PX = 3  # around a region: partly covered pixels, with defocus up to a sigma of 1.5 px
+_RING_PX = 4  # around that: background
+_FEWEST_RING = 12  # pixels of background for its colour and its covariance
+_FEWEST_INNER = 9  # pixels inside a marker for the variance of its shading
+_LEAST_VARIANCE_DN2 = 1.0  # of a pixel of the background: rounding and a little noise
+_LEAST_CONTRAST2 = 25.0  # squared distance of marker and background in sigmas of the background
+_CONTOUR_SIGMA = 0.29  # of the place of an edge that is rounded to whole pixels, px
+
+
+@dataclass(frozen=True, slots=True)
+class ColourRange:
+    """A colour in HSV.
+
+    Raises:
+        ValueError: a range is empty or beyond its scale.
+    """
+
+    name: str
+    hue_deg: tuple[float, float]  # 0 to 360; from the first to the second, through 0 if the first is larger
+    saturation: tuple[float, float] = (0.35, 1.0)  # 0 to 1
+    value: tuple[float, float] = (0.2, 1.0)  # 0 to 1
+
+    def __post_init__(self) -> None:
+        if not all(0 <= h <= 360 for h in self.hue_deg):
+            raise ValueError(f"hue_deg: expected 0 to 360, got {list(self.hue_deg)}")
+        for name in ("saturation", "value"):
+            low, high = getattr(self, name)
+            if not 0 <= low < high <= 1:
+                raise ValueError(f"{name}: expected two rising numbers from 0 to 1, got {[low, high]}")
+
+    def mask(self, hsv: Bytes) -> Bytes:
+        """255 where a picture (h, w, 3) in OpenCV's HSV (hue 0 to 179) has the colour, else 0."""
+        low, high = (self.hue_deg[0] / 2, self.hue_deg[1] / 2)
+        parts = [(low, high)] if low <= high else [(low, 180.0), (0.0, high)]
+        s, v = (np.array(r) * 255 for r in (self.saturation, self.value))
+        out = np.zeros(hsv.shape[:2], np.uint8)
+        for first, last in parts:
+            bottom, top = np.floor([first, s[0], v[0]]), np.ceil([last, s[1], v[1]])
+            out |= cv2.inRange(hsv, bottom, top).astype(np.uint8)
+        return out
+
+
+def brightened(picture: Bytes, gamma: float) -> Bytes:
+    """A picture (h, w, 3) after 255 (g / 255)^gamma."""
+    table = np.round(255 * (np.arange(256) / 255) ** gamma).astype(np.uint8)
+    return np.asarray(cv2.LUT(picture, table), dtype=np.uint8)
+
+
+def specified(picture: Bytes, reference: Bytes) -> Bytes:
+    """A picture (h, w, 3), BGR, whose value channel (HSV) gets the histogram of the reference's.
+
+    The printed method does not name the channel. With the value alone, hue and saturation stay, on which the
+    segmentation rests.
+    """
+    hsv = cv2.cvtColor(picture, cv2.COLOR_BGR2HSV)
+    own, wanted = (np.cumsum(np.bincount(p.max(axis=2).ravel(), minlength=256)) for p in (picture, reference))
+    levels = np.searchsorted(wanted / wanted[-1], own / own[-1] - 1e-12)
+    hsv[..., 2] = cv2.LUT(hsv[..., 2], np.minimum(levels, 255).astype(np.uint8))
+    return np.asarray(cv2.cvtColor(hsv, cv2.COLOR_HSV2BGR), dtype=np.uint8)
+
+
+def prepared(left: Bytes | None, right: Bytes | None, p: SegmentationParameters) -> tuple[Bytes | None, Bytes | None]:
+    """Both pictures as the segmentation sees them: the left one brightened, the right one with its histogram."""
+    bright = None if left is None else brightened(left, p.gamma)
+    if right is None:
+        return bright, None
+    if bright is None or not p.specify_histogram:
+        return bright, brightened(right, p.gamma)
+    return bright, specified(right, bright)
+
+
+def colour_mask(picture: Bytes, colour: ColourRange, p: SegmentationParameters) -> Bytes:
+    """The cleaned mask (h, w) of a colour in a prepared picture, 0 or 255."""
+    mask = colour.mask(np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2HSV), dtype=np.uint8))
+    if p.median_px > 1:
+        mask = np.asarray(cv2.medianBlur(mask, p.median_px), dtype=np.uint8)
+    for size, operation in ((p.opening_px, cv2.MORPH_OPEN), (p.closing_px, cv2.MORPH_CLOSE)):
+        if size > 1:
+            kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
+            mask = np.asarray(cv2.morphologyEx(mask, operation, kernel), dtype=np.uint8)
+    return mask
+
+
+def marker_candidates(
+    picture: Bytes, as_seen: Bytes, colours: Sequence[ColourRange], p: SegmentationParameters
+) -> MarkerImages:
+    """The regions of the colours in a picture (h, w, 3), BGR, with centroids, covariances and areas.
+
+    as_seen: the prepared picture, for the segmentation; centroids are measured in the unchanged one. Regions at the
+    edge of the picture are left out: their centroids are not those of the markers.
+    """
+    masks = [colour_mask(as_seen, colour, p) for colour in colours]
+    anywhere = np.max(masks, axis=0) > 0
+    rows: list[tuple[float, Array, Array, int]] = []
+    height, width = anywhere.shape
+    for index, mask in enumerate(masks):
+        _, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
+        for i in range(1, len(stats)):
+            x, y, w, h, area = (int(v) for v in stats[i])
+            inside = x > 0 and y > 0 and x + w < width and y + h < height
+            if not inside or not p.min_area_px2 <= area <= p.max_area_px2:
+                continue
+            margin = _MARGIN_PX + _RING_PX
+            box = (slice(max(y - margin, 0), y + h + margin), slice(max(x - margin, 0), x + w + margin))
+            own = labels[box] == i
+            measured = None
+            if p.centroid == "coverage":
+                measured = _coverage_centroid(picture[box].astype(float), own, anywhere[box] & ~own)
+            uv, cov, size = _contour_centroid(own) if measured is None else measured
+            uv = uv + np.array([box[1].start, box[0].start])
+            rows.append((size, uv, cov + p.sigma_floor_px**2 * np.eye(2), index))
+    rows.sort(key=lambda row: -row[0])
+    rows = rows[: p.max_markers]
+    if not rows:
+        return MarkerImages.none()
+    areas, uv_px, covariances, colour = zip(*rows, strict=True)
+    return MarkerImages(np.array(uv_px), np.array(covariances), np.array(areas), np.array(colour, dtype=np.int64))
+
+
+def _contour_centroid(own: Bools) -> tuple[Array, Array, float]:
+    """Centroid (2,), covariance (2, 2) and area of a region by its outer contour: the paper's.
+
+    An edge is known to a whole pixel, uniformly: its n pixels shift the centroid by 0.29 px over the root of n.
+    """
+    contours, _ = cv2.findContours(own.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    contour = max(contours, key=len)
+    filled = np.zeros(own.shape, np.uint8)
+    cv2.drawContours(filled, [contour], -1, 1, cv2.FILLED)
+    v, u = np.nonzero(filled)
+    sigma = _CONTOUR_SIGMA * np.sqrt(2.0 / max(len(contour), 1))
+    return np.array([u.mean(), v.mean()]), sigma**2 * np.eye(2), float(len(u))
+
+
+def _coverage_centroid(patch: Array, own: Bools, others: Bools) -> tuple[Array, Array, float] | None:
+    """Centroid (2,), covariance (2, 2) and area, px^2, of a region by the share of its colour in each pixel.
+
+    patch (h, w, 3): DN. The share is the linear discriminant (Fisher 1936) between the core of the region and a ring of
+    background around it: it ignores those changes of colour that occur in the background itself, such as the edge of
+    the target against the sky. None where another region is so close that there is no ring. Source: ours.
+    """
+    near = _dilated(own, _MARGIN_PX)
+    ring = ~near & ~_dilated(others, _MARGIN_PX)
+    if ring.sum() < _FEWEST_RING or (near & others).any():
+        return None
+    core = cv2.erode(own.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    core = own if not core.any() else core
+    background = patch[ring].mean(axis=0)
+    apart = patch[core].mean(axis=0) - background
+    spread = np.cov(patch[ring].T) + _LEAST_VARIANCE_DN2 * np.eye(3)
+    direction: Array = np.linalg.solve(spread, apart).astype(float)
+    contrast = float(direction @ apart)
+    if contrast < _LEAST_CONTRAST2:
+        return None
+    share: Array = (patch - background) @ direction / contrast
+    weight = float(share[near].sum())
+    if weight < 1.0:
+        return None
+    v, u = np.mgrid[: own.shape[0], : own.shape[1]]
+    at = np.stack([u[near], v[near]], axis=1)
+    centre = share[near] @ at / weight
+    arm = at - centre
+    # Shading inside the marker is no noise of the sensor: its variance counts where it is larger than the ring's.
+    inner = cv2.erode(own.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0  # without partly covered pixels
+    shading = float(share[inner].var()) if inner.sum() >= _FEWEST_INNER else 0.0
+    variance = max(float(share[ring].var()), shading, 1e-8)
+    cov = variance * (arm.T @ arm) / weight**2
+    return centre, cov, weight
+
+
+def _dilated(mask: Bools, pixels: int) -> Bools:
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * pixels + 1, 2 * pixels + 1))
+    out: Bools = cv2.dilate(mask.astype(np.uint8), kernel) > 0
+    return out
