@@ -1,0 +1,97 @@
+"""The occlusion coefficient: the area of the target that is seen, against the expected one.
+
+Zhou (2014), eq. (4), divides the area by that of the previous frame. Then the coefficient returns to zero one frame
+after an occlusion has begun, and an approach counts as one. Here gamma = clip(1 - N_t / N_exp), where N_exp is a share
+of the disc's area pi r^2 that is estimated while the target is clear.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from geometry.arrays import Array, Bools
+from tracking.drogue_circle.candidates import Picture
+
+_RINGS, _SECTORS = 10, 32
+_MATCH = 3.0  # mean absolute deviations within which a cell looks as before
+_LEAST_SHARE = 0.06  # least deviation, as a share of the contrast of the target
+_RATE, _FIRST = 0.1, 8  # of the running means; the first frames are averaged
+_CLEAR = 0.2  # coefficient below which a frame updates the appearance
+_RHO = np.sqrt((np.arange(_RINGS) + 0.5) / _RINGS)  # cells of equal area
+_THETA = 2 * np.pi * (np.arange(_SECTORS) + 0.5) / _SECTORS
+_X, _Y = np.outer(_RHO, np.cos(_THETA)), np.outer(_RHO, np.sin(_THETA))
+
+
+@dataclass(frozen=True, slots=True)
+class Appearance:
+    """Grey values of the disc in cells of equal area, averaged over clear frames."""
+
+    mean_dn: Array  # (rings, sectors)
+    deviation_dn: Array  # (rings, sectors) mean absolute difference from the mean
+    fill: float  # share of the disc that looks as before in clear frames: N_exp / (pi r^2)
+    frames: int
+
+    def coefficient(self, cells_dn: Array, inside: Bools) -> float:
+        """gamma of the cells (rings, sectors) of a frame, 0 to 1. Cells outside the picture count as not seen."""
+        return float(np.clip(1 - self._filled(cells_dn, inside) / max(self.fill, 0.05), 0.0, 1.0))
+
+    def updated(self, cells_dn: Array, inside: Bools) -> Appearance:
+        """The appearance with one more clear frame."""
+        rate = max(_RATE, 1 / (self.frames + 1)) if self.frames < _FIRST else _RATE
+        away = cells_dn - self.mean_dn
+        away = away - np.median(away[inside])
+        step = np.where(inside, rate, 0.0)
+        fill = self.fill if self.frames < 2 else self.fill + rate * (self._filled(cells_dn, inside) - self.fill)
+        return Appearance(
+            self.mean_dn + step * (cells_dn - self.mean_dn),
+            self.deviation_dn + step * (np.abs(away) - self.deviation_dn),
+            float(np.clip(fill, 0.3, 1.0)),
+            self.frames + 1,
+        )
+
+    def _filled(self, cells_dn: Array, inside: Bools) -> float:
+        """Share of the cells that look as before, apart from a change of the light, which is common to all."""
+        if inside.mean() < 0.2:
+            return 0.0
+        low, high = np.percentile(self.mean_dn, [5, 95])
+        least = max(_LEAST_SHARE * float(high - low), 2.0)
+        tolerance = _MATCH * np.maximum(self.deviation_dn, least)
+        away = cells_dn - self.mean_dn
+        # The common change is limited: an occluder over the whole target is not a change of the light.
+        common = float(np.clip(np.median(away[inside]), -0.35 * (high - low), 0.35 * (high - low)))
+        return float(np.mean(inside & (np.abs(away - common) < tolerance)))
+
+
+def first_appearance(cells_dn: Array, inside: Bools) -> Appearance:
+    """The appearance after the first frame, with a broad deviation."""
+    low, high = np.percentile(cells_dn[inside], [5, 95]) if inside.any() else (0.0, 1.0)
+    return Appearance(cells_dn, np.full(cells_dn.shape, 0.12 * max(float(high - low), 20.0)), 0.95, 1)
+
+
+def is_clear(coefficient: float) -> bool:
+    """Whether a frame with this coefficient updates the appearance."""
+    return coefficient < _CLEAR
+
+
+def disc_cells(picture: Picture, u_px: float, v_px: float, radius_px: float) -> tuple[Array, Bools]:
+    """Grey values of the disc in cells of equal area, and which of them lie in the picture, both (rings, sectors).
+
+    Each value is a bilinear sample; discs much larger than the cells are first reduced, so that a cell is a mean.
+    """
+    height, width = picture.shape[:2]
+    x, y = u_px + radius_px * _X, v_px + radius_px * _Y
+    inside: Bools = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
+    left, top = max(int(np.floor(u_px - radius_px)) - 2, 0), max(int(np.floor(v_px - radius_px)) - 2, 0)
+    right, bottom = int(np.ceil(u_px + radius_px)) + 3, int(np.ceil(v_px + radius_px)) + 3
+    crop = picture[top : max(bottom, top), left : max(right, left)].astype(np.float32)
+    if min(crop.shape) < 3:
+        return np.zeros(x.shape), np.zeros(x.shape, dtype=bool)
+    side = int(max(round(radius_px / _RINGS), 1))
+    if side > 1:
+        crop = cv2.blur(crop, (side, side))
+    cells = cv2.remap(crop, (x - left).astype(np.float32), (y - top).astype(np.float32), cv2.INTER_LINEAR)
+    return np.where(inside, cells, 0.0).astype(float), inside
+
