@@ -13,7 +13,11 @@ from tracking.drogue_circle.rim import smooth_crop
 from tracking.drogue_circle.rim_fit import RimFit, fit_rim
 
 _MOST_FITTED = 24  # of the whole picture
-_SAME_CENTRE = 0.5  # distance of two centres, as a share of the larger radius, below which they are one target
+_SAME_CENTRE = 0.6  # distance of two centres, as a share of the larger radius, below which they are one target
+_RIM_SHARE = 0.92  # score of the outermost circle of a target, as a share of the best one's, that makes it the rim
+_LEAST_POINTS = 12  # independent edge points: texture often gives a short arc of a small circle
+_CORRELATED_PX = 3.5  # length of rim that counts as one point, see `rim_fit`
+_LARGEST_RMS = 0.05, 0.35  # of the rim points: share of the radius, and px
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,12 +40,14 @@ class Acquisition:
 
 
 def acquire(picture: Picture, detector: CircleDetector, p: CircleParameters, wanted: Wanted) -> Acquisition:
-    """Search the whole picture for the circle. Concentric circles are one target: the best of its rims is returned."""
-    fits = _fitted(picture, detector(picture, None), p, wanted)
+    """Search the whole picture for the circle. Circles about one centre are one target: its outermost is returned."""
+    fits = sorted(_fitted(picture, detector(picture, None), p, wanted), key=lambda f: -f.score)
     targets: list[RimFit] = []
-    for fit in sorted(fits, key=lambda f: -f.score):
-        if not any(_is_same(fit, other) for other in targets):
-            targets.append(fit)
+    while fits:
+        own = [f for f in fits if _is_same(f, fits[0])]
+        # The inner circles of a target may be off its centre: those of a drogue lie deeper.
+        targets.append(max((f for f in own if f.score >= _RIM_SHARE * own[0].score), key=lambda f: f.rim.radius_px))
+        fits = [f for f in fits if not any(f is o for o in own) and not _is_same(f, targets[-1])]
     clear = len(targets) == 1 or (len(targets) > 1 and targets[1].score < p.ambiguous_share * targets[0].score)
     return Acquisition(targets[0] if clear else None, tuple(targets))
 
@@ -62,9 +68,15 @@ def _fitted(
         window = Window(c.u_px, c.v_px, half, p.gate_px, p.min_radius_px, 2 * c.radius_px)
         fit = fit_rim(smooth_crop(picture, window, p.blur_px), c, p.acquire_coverage)
         largest = p.max_radius_px or 0.5 * max(picture.shape[:2])
-        if fit is not None and p.min_radius_px <= fit.rim.radius_px <= largest and _fits(fit, wanted):
+        if fit is not None and p.min_radius_px <= fit.rim.radius_px <= largest and is_certain(fit) and _fits(fit, wanted):
             fits.append(fit)
     return fits
+
+
+def is_certain(fit: RimFit) -> bool:
+    """Whether a rim has enough precise edge points that texture does not imitate it."""
+    points = fit.coverage * 2 * np.pi * fit.rim.radius_px / _CORRELATED_PX
+    return bool(points >= _LEAST_POINTS and fit.rms_px <= _LARGEST_RMS[0] * fit.rim.radius_px + _LARGEST_RMS[1])
 
 
 def _may_be(c: CircleCandidate, wanted: Wanted) -> bool:

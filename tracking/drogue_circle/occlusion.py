@@ -14,11 +14,13 @@ import numpy as np
 
 from geometry.arrays import Array, Bools
 from tracking.drogue_circle.candidates import Picture
+from tracking.drogue_circle.rim import median
 
 _RINGS, _SECTORS = 10, 32
 _MATCH = 3.0  # mean absolute deviations within which a cell looks as before
 _LEAST_SHARE = 0.06  # least deviation, as a share of the contrast of the target
 _RATE, _FIRST = 0.1, 8  # of the running means; the first frames are averaged
+_NEXT_TO_RIM, _SECTOR_SHARE = 0.75, 0.5  # part of the radius, and least share of its cells in a sector that match
 _CLEAR = 0.2  # coefficient below which a frame updates the appearance
 _RHO = np.sqrt((np.arange(_RINGS) + 0.5) / _RINGS)  # cells of equal area
 _THETA = 2 * np.pi * (np.arange(_SECTORS) + 0.5) / _SECTORS
@@ -38,11 +40,16 @@ class Appearance:
         """gamma of the cells (rings, sectors) of a frame, 0 to 1. Cells outside the picture count as not seen."""
         return float(np.clip(1 - self._filled(cells_dn, inside) / max(self.fill, 0.05), 0.0, 1.0))
 
+    def hidden_sectors(self, cells_dn: Array, inside: Bools) -> Bools:
+        """Sectors (sectors,) that look different next to the rim: an occluder is there, and its edges are not the rim."""
+        outer = _RHO > _NEXT_TO_RIM
+        return np.asarray(np.mean(self._matching(cells_dn, inside)[outer], axis=0) < _SECTOR_SHARE)
+
     def updated(self, cells_dn: Array, inside: Bools) -> Appearance:
         """The appearance with one more clear frame."""
         rate = max(_RATE, 1 / (self.frames + 1)) if self.frames < _FIRST else _RATE
         away = cells_dn - self.mean_dn
-        away = away - np.median(away[inside])
+        away = away - median(away[inside])
         step = np.where(inside, rate, 0.0)
         fill = self.fill if self.frames < 2 else self.fill + rate * (self._filled(cells_dn, inside) - self.fill)
         return Appearance(
@@ -53,22 +60,33 @@ class Appearance:
         )
 
     def _filled(self, cells_dn: Array, inside: Bools) -> float:
-        """Share of the cells that look as before, apart from a change of the light, which is common to all."""
+        """Share of the cells that look as before."""
+        return float(np.mean(self._matching(cells_dn, inside)))
+
+    def _matching(self, cells_dn: Array, inside: Bools) -> Bools:
+        """Which cells look as before, apart from a change of the light, which is common to all."""
         if inside.mean() < 0.2:
-            return 0.0
-        low, high = np.percentile(self.mean_dn, [5, 95])
-        least = max(_LEAST_SHARE * float(high - low), 2.0)
-        tolerance = _MATCH * np.maximum(self.deviation_dn, least)
+            return np.zeros(inside.shape, dtype=bool)
+        low, high = _contrast(self.mean_dn)
+        tolerance = _MATCH * np.maximum(self.deviation_dn, max(_LEAST_SHARE * (high - low), 2.0))
         away = cells_dn - self.mean_dn
         # The common change is limited: an occluder over the whole target is not a change of the light.
-        common = float(np.clip(np.median(away[inside]), -0.35 * (high - low), 0.35 * (high - low)))
-        return float(np.mean(inside & (np.abs(away - common) < tolerance)))
+        common = float(np.clip(median(away[inside]), -0.35 * (high - low), 0.35 * (high - low)))
+        return np.asarray(inside & (np.abs(away - common) < tolerance))
 
 
 def first_appearance(cells_dn: Array, inside: Bools) -> Appearance:
     """The appearance after the first frame, with a broad deviation."""
-    low, high = np.percentile(cells_dn[inside], [5, 95]) if inside.any() else (0.0, 1.0)
+    low, high = _contrast(cells_dn[inside]) if inside.any() else (0.0, 1.0)
     return Appearance(cells_dn, np.full(cells_dn.shape, 0.12 * max(float(high - low), 20.0)), 0.95, 1)
+
+
+def _contrast(values_dn: Array) -> tuple[float, float]:
+    """The 5th and 95th percentile of grey values, n > 0."""
+    flat = values_dn.ravel()
+    low, high = int(0.05 * (len(flat) - 1)), int(0.95 * (len(flat) - 1))
+    ordered = np.partition(flat, (low, high))
+    return float(ordered[low]), float(ordered[high])
 
 
 def is_clear(coefficient: float) -> bool:

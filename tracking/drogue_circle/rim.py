@@ -57,6 +57,12 @@ class SmoothCrop:
     blur_px: float
 
 
+def median(values: Array | NDArray[np.float32]) -> float:
+    """The upper median of values (n,), n > 0: np.median, at a fifth of its cost on the small arrays of one frame."""
+    half = len(values) // 2
+    return float(np.partition(values, half)[half])
+
+
 def smooth_crop(picture: Picture, window: Window, blur_px: float) -> SmoothCrop:
     """The part of a picture in a window, filtered by a Gaussian."""
     top, bottom, left, right = crop_bounds(picture.shape, window)
@@ -65,15 +71,17 @@ def smooth_crop(picture: Picture, window: Window, blur_px: float) -> SmoothCrop:
         return SmoothCrop(np.zeros((0, 0), np.float32), left, top, 0.0, blur_px)
     # Noise: median of the second difference along rows, which cancels gradients (Immerkaer 1996, one dimension).
     second = np.abs(raw[::2, 2:] - 2 * raw[::2, 1:-1] + raw[::2, :-2])
-    noise = max(float(np.median(second)) / 0.6745 / np.sqrt(6.0), 0.3)
+    noise = max(median(second.ravel()) / 0.6745 / np.sqrt(6.0), 0.3)
     filtered = noise / (2 * np.sqrt(np.pi) * blur_px)  # white noise behind a Gaussian filter
     return SmoothCrop(cv2.GaussianBlur(raw, (0, 0), blur_px), left, top, float(filtered), blur_px)
 
 
-def rim_points(crop: SmoothCrop, rim: Rim, half_px: float, polarity: int) -> RimPoints:
+def rim_points(
+    crop: SmoothCrop, rim: Rim, half_px: float, polarity: int, hidden: Bools | None = None
+) -> RimPoints:
     """The best edge on each ray within +- half_px of a rim.
 
-    polarity: +1 brighter outside, -1 brighter inside. Maxima near the rim are preferred (Gaussian weight of half_px).
+    polarity: +1 brighter outside, -1 brighter inside. hidden: sectors (k,) of equal angles without edges of the rim. Maxima near the rim are preferred (Gaussian weight of half_px).
     """
     n = int(np.clip(round(2 * np.pi * rim.radius_px), _LEAST_RAYS, _MOST_RAYS))
     theta = 2 * np.pi * np.arange(n) / n
@@ -100,8 +108,10 @@ def rim_points(crop: SmoothCrop, rim: Rim, half_px: float, polarity: int) -> Rim
     rows = np.arange(n)
     strength = middle[rows, best]
     good = inside & (score[rows, best] > 0)
+    if hidden is not None:
+        good &= ~hidden[(rows * len(hidden)) // n]
     if good.any():
-        good &= strength > _LEAST_SHARE * np.median(strength[good])
+        good &= strength > _LEAST_SHARE * median(strength[good])
     a, b, c = slope[rows, best], strength, slope[rows, best + 2]
     bend = np.where(good, a - 2 * b + c, -1.0)
     vertex = np.clip(0.5 * (a - c) / np.minimum(bend, -1e-12), -0.5, 0.5)  # of a parabola through three slopes

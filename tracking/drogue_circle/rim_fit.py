@@ -8,7 +8,7 @@ import numpy as np
 
 from geometry.arrays import Array, Bools, symmetric
 from tracking.drogue_circle.candidates import CircleCandidate
-from tracking.drogue_circle.rim import Rim, RimPoints, SmoothCrop, rim_points
+from tracking.drogue_circle.rim import Rim, RimPoints, SmoothCrop, median, rim_points
 
 _TUKEY = 4.685  # Tukey's biweight, 95 % efficiency for normal errors
 _LEAST_SIGMA_PX = 0.03  # of an edge point: interpolation, and pixels that are not points
@@ -38,18 +38,21 @@ class RimFit:
         return np.array([self.rim.u_px, self.rim.v_px, self.rim.radius_px])
 
 
-def fit_rim(crop: SmoothCrop, coarse: CircleCandidate, min_coverage: float) -> RimFit | None:
+def fit_rim(
+    crop: SmoothCrop, coarse: CircleCandidate, min_coverage: float, hidden: Bools | None = None
+) -> RimFit | None:
     """Fit a coarse circle to the rim near it. None: too little of a rim is there.
 
-    A candidate of unknown polarity is fitted with both, and the better one is returned.
+    A candidate of unknown polarity is fitted with both, and the better one is returned. hidden: sectors (k,) of equal
+    angles, from +u towards +v, whose edges belong to an occluder.
     """
     if coarse.polarity == 0:
-        both = [fit_rim(crop, _with_polarity(coarse, p), min_coverage) for p in (1, -1)]
+        both = [fit_rim(crop, _with_polarity(coarse, p), min_coverage, hidden) for p in (1, -1)]
         return max((f for f in both if f is not None), key=lambda f: f.score, default=None)
     rim = Rim(coarse.u_px, coarse.v_px, coarse.radius_px)
     least = 0.7 * min_coverage
     for half_px, scale_px in _PASSES[:-1]:
-        points = rim_points(crop, rim, min(half_px, 0.4 * rim.radius_px), coarse.polarity)
+        points = rim_points(crop, rim, min(half_px, 0.4 * rim.radius_px), coarse.polarity, hidden)
         fitted = _solve(rim, points, scale_px, oblique=False)
         if fitted is None or np.mean(fitted[1] > 0) < least or not _is_near(fitted[0], coarse):
             return None
@@ -57,13 +60,13 @@ def fit_rim(crop: SmoothCrop, coarse: CircleCandidate, min_coverage: float) -> R
         rim = fitted[0]
         if moved < _ENOUGH_PX:
             break
-    points = rim_points(crop, rim, _PASSES[-1][0], coarse.polarity)
+    points = rim_points(crop, rim, _PASSES[-1][0], coarse.polarity, hidden)
     circle = _solve(rim, points, _PASSES[-1][1], oblique=False)
     if circle is None:
         return None
     rim, weight = circle
     if _looks_oblique(points, rim):
-        oblique = _oblique_fit(crop, rim, points, weight, coarse.polarity)
+        oblique = _oblique_fit(crop, rim, points, weight, coarse.polarity, hidden)
         if oblique is not None:
             rim, points, weight = oblique
     return _described(rim, points, weight, coarse, min_coverage)
@@ -104,7 +107,7 @@ def _solve(rim: Rim, points: RimPoints, least_scale_px: float, oblique: bool) ->
     for _ in range(12):
         bend = (x[0] * sine - x[1] * cosine) ** 2 / (2 * max(x[2], 1.0))
         residual = observed - A @ x + bend
-        scale = max(1.4826 * float(np.median(np.abs(residual))), least_scale_px / _TUKEY, _LEAST_SIGMA_PX)
+        scale = max(1.4826 * median(np.abs(residual)), least_scale_px / _TUKEY, _LEAST_SIGMA_PX)
         weight = np.maximum(1 - (residual / (_TUKEY * scale)) ** 2, 0.0) ** 2
         normal = (A * weight[:, None]).T @ A
         # The columns have entries of the size of 1: a small determinant means an arc too short for the parameters.
@@ -122,14 +125,14 @@ def _solve(rim: Rim, points: RimPoints, least_scale_px: float, oblique: bool) ->
 
 
 def _oblique_fit(
-    crop: SmoothCrop, rim: Rim, points: RimPoints, weight: Array, polarity: int
+    crop: SmoothCrop, rim: Rim, points: RimPoints, weight: Array, polarity: int, hidden: Bools | None
 ) -> tuple[Rim, RimPoints, Array] | None:
     """The fit with the two parameters of an ellipse, if they explain the residuals better than chance does."""
     before = _sum_of_squares(rim, points, weight)
     once = _solve(rim, points, 1.0, oblique=True)
     if once is None or np.hypot(once[0].cos2_px, once[0].sin2_px) > 0.25 * rim.radius_px:
         return None
-    again = rim_points(crop, once[0], 2.0, polarity)
+    again = rim_points(crop, once[0], 2.0, polarity, hidden)
     final = _solve(once[0], again, 0.0, oblique=True)
     if final is None or np.mean(final[1] > 0) < _ELLIPSE_COVERAGE:
         return None
@@ -183,7 +186,7 @@ def _described(
     covariance = variance * correlated * np.linalg.inv(A.T @ A)
     covariance = symmetric(covariance[:3, :3]) + _MODEL_SIGMA_PX**2 * np.eye(3)
     rms = float(np.sqrt(np.mean(residual**2)))
-    slope = float(np.median(points.slope[good]))
+    slope = median(points.slope[good])
     return RimFit(rim, covariance, coverage, rms, slope, coarse.polarity, coverage / (1 + rms))
 
 

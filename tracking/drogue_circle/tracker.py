@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
 import numpy as np
 
-from geometry.arrays import Array
+from geometry.arrays import Array, Bools
 from tracking.drogue_circle.acquisition import Acquisition, Wanted, acquire
-from tracking.drogue_circle.candidates import CircleDetector, Picture, Window
+from tracking.drogue_circle.candidates import CircleCandidate, CircleDetector, Picture, Window
 from tracking.drogue_circle.kalman import FilterBank, distance2
 from tracking.drogue_circle.occlusion import Appearance, disc_cells, first_appearance, is_clear
 from tracking.drogue_circle.parameters import CircleParameters
-from tracking.drogue_circle.rim import smooth_crop
+from tracking.drogue_circle.rim import SmoothCrop, smooth_crop
 from tracking.drogue_circle.rim_fit import RimFit, fit_rim
 from tracking.statuses import PoseStatus
 
 _START_RATE_RADII = 0.25  # 1 sigma of the rate of a new circle, in radii per frame
+_WHOLE, _WHOLE_GATE = 0.85, 10.0  # coverage of a rim that is seen whole, and the factor of its gate
+_REFITS = 2  # without the sectors of an occluder
+_LEAST_RADIUS = 0.7  # of the smallest radius of an acquisition, below which a circle is not tracked
 _CONFIRMED = 3  # measurements after which an acquisition is confirmed
+_COVERAGE_COST, _POLARITY_COST = 40.0, 15.0  # against distance^2, of a whole rim and of the other polarity
 _AS_PREDICTED, _WELL_SEEN = 16.0, 0.75  # distance^2 and coverage of a fit that needs no comparison with others
 
 
@@ -72,6 +77,7 @@ class CircleTracker:
     near_px: tuple[float, float] | None = None  # of the first circle, if the user knows it
     _bank: FilterBank | None = None
     _appearance: Appearance | None = None
+    _cells: tuple[Array, Bools] = field(default_factory=lambda: (np.zeros((0, 0)), np.zeros((0, 0), dtype=bool)))
     _fit: RimFit | None = None  # the last one
     _misses: int = 0
     _measured: int = 0  # since the acquisition
@@ -122,41 +128,70 @@ class CircleTracker:
         assert self._bank is not None
         p, window = self.parameters, self._window()
         crop = smooth_crop(picture, window, p.blur_px)
-        best, best_cost = None, np.inf
         x, P = self._bank.state()
+        best, best_cost = None, np.inf
         fitted: list[RimFit] = []
-        for c in self._preferred(self.detector(picture, window))[: p.candidates]:
+        for c in self._candidates(picture, window, x):
             fit = fit_rim(crop, c, p.min_coverage)
             if fit is None or any(_is_equal(fit, f) for f in fitted):
                 continue
             fitted.append(fit)
-            # The prediction of a long gap says little about the radius, the fit of another rim says it is exact.
-            d2 = float(distance2(x, P, fit.centre_and_radius, self._noise(fit, 0.0))[0])
+            d2 = float(distance2(x, P, fit.centre_and_radius, fit.covariance_px2)[0])
             near = np.hypot(fit.rim.u_px - window.u_px, fit.rim.v_px - window.v_px) < window.gate_px
-            cost = d2 - 40 * fit.coverage + (15 if self._fit is not None and fit.polarity != self._fit.polarity else 0)
-            if near and d2 < self._gate(fit) and cost < best_cost:
+            if not near or d2 > self._gate(fit) or fit.rim.radius_px < _LEAST_RADIUS * p.min_radius_px:
+                continue
+            cost = d2 - _COVERAGE_COST * fit.coverage + (_POLARITY_COST if fit.polarity != self._polarity else 0)
+            if cost < best_cost:
                 best, best_cost = fit, cost
-                if d2 < _AS_PREDICTED and fit.coverage > _WELL_SEEN:
-                    break
-        centre = (window.u_px, window.v_px, float(x[2])) if best is None else best.centre_and_radius
-        return best, self._coefficient(picture, *map(float, centre))
+            if d2 < _AS_PREDICTED and fit.coverage > _WELL_SEEN:
+                break  # before the detector is called, where the prediction itself fits
+        if best is None:
+            return None, self._coefficient(picture, window.u_px, window.v_px, float(x[2]))
+        gamma = self._coefficient(picture, *map(float, best.centre_and_radius))
+        return self._without_occluder(picture, crop, best, gamma)
 
-    def _preferred(self, candidates: object) -> list:  # type: ignore[type-arg]
-        """Candidates with the polarity of the last fit come first."""
-        given = list(candidates)  # type: ignore[call-overload]
-        if self._fit is None:
-            return given
-        own = self._fit.polarity
-        return sorted(given, key=lambda c: -c.score * (1.0 if c.polarity in (0, own) else 0.5))
+    def _without_occluder(
+        self, picture: Picture, crop: SmoothCrop, fit: RimFit, gamma: float
+    ) -> tuple[RimFit | None, float]:
+        """The fit without the edges in sectors that an occluder hides: they pull the circle to one side."""
+        for _ in range(_REFITS):
+            hidden = None if self._appearance is None else self._appearance.hidden_sectors(*self._cells)
+            if hidden is None or not hidden.any():
+                break
+            coarse = CircleCandidate(*map(float, fit.centre_and_radius), 0.0, fit.polarity)
+            again = fit_rim(crop, coarse, self.parameters.min_coverage, hidden)
+            if again is None:
+                return None, gamma
+            still = _is_equal(again, fit)
+            fit = again
+            if still:
+                break
+            gamma = self._coefficient(picture, *map(float, fit.centre_and_radius))
+        return fit, gamma
+
+    def _candidates(self, picture: Picture, window: Window, x: Array) -> Iterator[CircleCandidate]:
+        """The predicted circle, then those of the detector: which is called only if it is needed."""
+        yield CircleCandidate(window.u_px, window.v_px, max(float(x[2]), 3.0), np.inf, self._polarity)
+        found = sorted(self.detector(picture, window), key=self._preference, reverse=True)
+        yield from found[: self.parameters.candidates]
+
+    def _preference(self, c: CircleCandidate) -> float:
+        """The score of a candidate, halved if its polarity is not that of the tracked rim."""
+        return c.score * (1.0 if c.polarity in (0, self._polarity) else 0.5)
+
+    @property
+    def _polarity(self) -> int:
+        return 0 if self._fit is None else self._fit.polarity
 
     def _gate(self, fit: RimFit) -> float:
-        """The innovation gate. An unmodelled turn of a fully seen circle passes; a partly hidden one must be near."""
-        return self.parameters.gate_chi2 * (1.0 if fit.coverage < self.parameters.acquire_coverage else 10.0)
+        """The innovation gate: wide for a rim that is seen whole, since the target may turn faster than modelled."""
+        return self.parameters.gate_chi2 * (_WHOLE_GATE if fit.coverage > _WHOLE else 1.0)
 
     def _coefficient(self, picture: Picture, u_px: float, v_px: float, radius_px: float) -> float:
         if self._appearance is None or radius_px < 2:
             return np.nan
-        return self._appearance.coefficient(*disc_cells(picture, u_px, v_px, radius_px))
+        self._cells = disc_cells(picture, u_px, v_px, radius_px)
+        return self._appearance.coefficient(*self._cells)
 
     def _noise(self, fit: RimFit, gamma: float) -> Array:
         """R = R0 / (1 - gamma)^2 with the covariance of the fit as R0."""
@@ -167,7 +202,7 @@ class CircleTracker:
         z, R = fit.centre_and_radius, self._noise(fit, gamma)
         self._bank = self._bank.updated(z, R, self.parameters.forgetting)
         if is_clear(gamma):
-            self._appearance = self._appearance.updated(*disc_cells(picture, *map(float, z)))
+            self._appearance = self._appearance.updated(*self._cells)
         self._fit, self._misses, self._measured = fit, 0, self._measured + 1
         x, P = self._bank.state()
         return CircleFrame(PoseStatus.MEASURED, Cause.NONE, x, P, predicted, fit, gamma)
