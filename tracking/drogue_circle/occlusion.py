@@ -15,12 +15,15 @@ import numpy as np
 from geometry.arrays import Array, Bools
 from tracking.drogue_circle.candidates import Picture
 from tracking.drogue_circle.rim import median
+from tracking.drogue_circle.rim_fit import SECTORS, RimFit
 
-_RINGS, _SECTORS = 10, 32
+_RINGS, _SECTORS = 10, SECTORS
 _MATCH = 3.0  # mean absolute deviations within which a cell looks as before
 _LEAST_SHARE = 0.06  # least deviation, as a share of the contrast of the target
 _RATE, _FIRST = 0.1, 8  # of the running means; the first frames are averaged
 _NEXT_TO_RIM, _SECTOR_SHARE = 0.75, 0.5  # part of the radius, and least share of its cells in a sector that match
+_USUAL = 0.35  # share of the rays of a sector, below which its edges are left out
+_USUAL_RMS, _LEAST_RMS_PX = 2.0, 0.3
 _CLEAR = 0.2  # coefficient below which a frame updates the appearance
 _RHO = np.sqrt((np.arange(_RINGS) + 0.5) / _RINGS)  # cells of equal area
 _THETA = 2 * np.pi * (np.arange(_SECTORS) + 0.5) / _SECTORS
@@ -87,6 +90,30 @@ def _contrast(values_dn: Array) -> tuple[float, float]:
     low, high = int(0.05 * (len(flat) - 1)), int(0.95 * (len(flat) - 1))
     ordered = np.partition(flat, (low, high))
     return float(ordered[low]), float(ordered[high])
+
+
+@dataclass(frozen=True, slots=True)
+class RimHabit:
+    """Where and how precisely the rim shows in clear frames: a rim may have no edge against a part of the background."""
+
+    sectors: Array  # (sectors,) mean share of the rays with an edge on the rim
+    rms_px: float  # mean residual of the edge points
+    frames: int
+
+    @property
+    def without_edge(self) -> Bools:
+        """Sectors (sectors,) whose edges are usually not those of the rim."""
+        return np.asarray(self.sectors < _USUAL) if self.frames >= _FIRST else np.zeros(_SECTORS, dtype=bool)
+
+    def is_usual(self, fit: RimFit) -> bool:
+        """Whether the residuals of a fit are those of the rim; a mixture of two edges has larger ones."""
+        return fit.rms_px <= max(_USUAL_RMS * self.rms_px, _LEAST_RMS_PX)
+
+    def updated(self, fit: RimFit) -> RimHabit:
+        """With one more clear frame."""
+        rate = max(_RATE, 1 / (self.frames + 1))
+        sectors = self.sectors + rate * (fit.sectors - self.sectors)
+        return RimHabit(sectors, self.rms_px + rate * (fit.rms_px - self.rms_px), self.frames + 1)
 
 
 def is_clear(coefficient: float) -> bool:

@@ -42,6 +42,7 @@ class RimPoints:
     theta: Array  # (n,) rad
     radius_px: Array  # (n,) distance from the centre; nan where no edge is found
     slope: Array  # (n,) DN/px along the ray, positive in the direction of the polarity; nan there, too
+    any_radius_px: Array  # (n,) as radius_px, but also in hidden sectors
     inside: Bools  # (n,) the ray lies inside the picture
     spacing_px: float  # between neighbouring rays at the rim
 
@@ -89,7 +90,7 @@ def rim_points(
     none = np.full(n, np.nan)
     height, width = crop.values.shape
     if not height:
-        return RimPoints(theta, none, none, np.zeros(n, dtype=bool), spacing)
+        return RimPoints(theta, none, none, none, np.zeros(n, dtype=bool), spacing)
     offset = np.arange(-half_px - _STEP_PX, half_px + 1.5 * _STEP_PX, _STEP_PX)
     base = rim.radius_at(theta)
     distance = base[:, None] + offset
@@ -108,8 +109,6 @@ def rim_points(
     rows = np.arange(n)
     strength = middle[rows, best]
     good = inside & (score[rows, best] > 0)
-    if hidden is not None:
-        good &= ~hidden[(rows * len(hidden)) // n]
     if good.any():
         good &= strength > _LEAST_SHARE * median(strength[good])
     a, b, c = slope[rows, best], strength, slope[rows, best + 2]
@@ -118,4 +117,9 @@ def rim_points(
     radius = base + offset[2:-2][best] + _STEP_PX * vertex
     # A Gaussian filter moves the steepest place of a curved edge inwards by blur^2 / (2 r) (Bouma et al. 2005).
     radius += crop.blur_px**2 / (2 * np.maximum(radius, 1.0))
-    return RimPoints(theta, np.where(good, radius, np.nan), np.where(good, strength, np.nan), inside, spacing)
+    radius = np.where(good, radius, np.nan)
+    strength = np.where(good, strength, np.nan)
+    if hidden is None:
+        return RimPoints(theta, radius, strength, radius, inside, spacing)
+    own = ~hidden[(rows * len(hidden)) // n]
+    return RimPoints(theta, np.where(own, radius, np.nan), np.where(own, strength, np.nan), radius, inside, spacing)

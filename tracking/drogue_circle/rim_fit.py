@@ -16,6 +16,8 @@ _MODEL_SIGMA_PX = 0.015  # of the fit: rims are not exact circles
 _ELLIPSE_COVERAGE = 0.7  # share of the rim that determines an ellipse
 _ELLIPSE_F = 8.0  # F value of its two parameters, above which they are kept
 _LEAST_DETERMINANT = 1e-6
+_ON_RIM_PX = 0.5  # least distance from the rim at which an edge counts as on it
+SECTORS = 32
 _ENOUGH_PX = 0.3  # a pass that moves the rim by less is not repeated
 _PASSES = ((4.0, 2.0), (2.5, 1.0), (2.0, 0.0))  # half width of the rays and least scale of the residuals, px
 
@@ -31,6 +33,7 @@ class RimFit:
     slope_dn: float  # median slope of the rim, DN/px
     polarity: int
     score: float  # coverage, reduced by residuals
+    sectors: Array  # (SECTORS,) share of the rays of a sector whose edge lies on the rim, hidden ones too
 
     @property
     def centre_and_radius(self) -> Array:
@@ -187,7 +190,10 @@ def _described(
     covariance = symmetric(covariance[:3, :3]) + _MODEL_SIGMA_PX**2 * np.eye(3)
     rms = float(np.sqrt(np.mean(residual**2)))
     slope = median(points.slope[good])
-    return RimFit(rim, covariance, coverage, rms, slope, coarse.polarity, coverage / (1 + rms))
+    on_rim = np.abs(points.any_radius_px - rim.radius_at(points.theta)) < max(3 * rms, _ON_RIM_PX)
+    sector = np.arange(len(on_rim)) * SECTORS // len(on_rim)
+    sectors = np.bincount(sector, on_rim, SECTORS) / np.maximum(np.bincount(sector, minlength=SECTORS), 1)
+    return RimFit(rim, covariance, coverage, rms, slope, coarse.polarity, coverage / (1 + rms), sectors)
 
 
 def _correlation_length(away: Array, good: Bools, spacing_px: float) -> float:

@@ -12,7 +12,7 @@ from geometry.arrays import Array, Bools
 from tracking.drogue_circle.acquisition import Acquisition, Wanted, acquire
 from tracking.drogue_circle.candidates import CircleCandidate, CircleDetector, Picture, Window
 from tracking.drogue_circle.kalman import FilterBank, distance2
-from tracking.drogue_circle.occlusion import Appearance, disc_cells, first_appearance, is_clear
+from tracking.drogue_circle.occlusion import Appearance, RimHabit, disc_cells, first_appearance, is_clear
 from tracking.drogue_circle.parameters import CircleParameters
 from tracking.drogue_circle.rim import SmoothCrop, smooth_crop
 from tracking.drogue_circle.rim_fit import RimFit, fit_rim
@@ -20,6 +20,8 @@ from tracking.statuses import PoseStatus
 
 _START_RATE_RADII = 0.25  # 1 sigma of the rate of a new circle, in radii per frame
 _WHOLE, _WHOLE_GATE = 0.85, 10.0  # coverage of a rim that is seen whole, and the factor of its gate
+_CHANGED = 4  # searches of the whole picture after which a circle of another appearance is accepted
+_FORGOTTEN = 50  # searches for a circle like the lost one, after which any circle is accepted
 _REFITS = 2  # without the sectors of an occluder
 _LEAST_RADIUS = 0.7  # of the smallest radius of an acquisition, below which a circle is not tracked
 _CONFIRMED = 3  # measurements after which an acquisition is confirmed
@@ -79,6 +81,9 @@ class CircleTracker:
     _appearance: Appearance | None = None
     _cells: tuple[Array, Bools] = field(default_factory=lambda: (np.zeros((0, 0)), np.zeros((0, 0), dtype=bool)))
     _fit: RimFit | None = None  # the last one
+    _habit: RimHabit | None = None
+    _trusted: RimFit | None = None  # the last clear one of a confirmed circle
+    _searches: int = 0  # of the whole picture since the circle was lost
     _misses: int = 0
     _measured: int = 0  # since the acquisition
     _ambiguous: bool = False
@@ -154,10 +159,12 @@ class CircleTracker:
         self, picture: Picture, crop: SmoothCrop, fit: RimFit, gamma: float
     ) -> tuple[RimFit | None, float]:
         """The fit without the edges in sectors that an occluder hides: they pull the circle to one side."""
+        assert self._appearance is not None and self._habit is not None
         for _ in range(_REFITS):
-            hidden = None if self._appearance is None else self._appearance.hidden_sectors(*self._cells)
-            if hidden is None or not hidden.any():
+            hidden = self._appearance.hidden_sectors(*self._cells)
+            if not hidden.any():
                 break
+            hidden |= self._habit.without_edge
             coarse = CircleCandidate(*map(float, fit.centre_and_radius), 0.0, fit.polarity)
             again = fit_rim(crop, coarse, self.parameters.min_coverage, hidden)
             if again is None:
@@ -167,7 +174,8 @@ class CircleTracker:
             if still:
                 break
             gamma = self._coefficient(picture, *map(float, fit.centre_and_radius))
-        return fit, gamma
+        usual = is_clear(gamma) or self._habit.is_usual(fit)
+        return (fit if usual else None), gamma
 
     def _candidates(self, picture: Picture, window: Window, x: Array) -> Iterator[CircleCandidate]:
         """The predicted circle, then those of the detector: which is called only if it is needed."""
@@ -198,20 +206,24 @@ class CircleTracker:
         return fit.covariance_px2 / (1 - gamma) ** 2
 
     def _updated(self, picture: Picture, fit: RimFit, gamma: float, predicted: Array) -> CircleFrame:
-        assert self._bank is not None and self._appearance is not None
+        assert self._bank is not None and self._appearance is not None and self._habit is not None
         z, R = fit.centre_and_radius, self._noise(fit, gamma)
         self._bank = self._bank.updated(z, R, self.parameters.forgetting)
         if is_clear(gamma):
             self._appearance = self._appearance.updated(*self._cells)
+            self._habit = self._habit.updated(fit)
+            if self._measured >= _CONFIRMED:
+                self._trusted = fit
         self._fit, self._misses, self._measured = fit, 0, self._measured + 1
         x, P = self._bank.state()
         return CircleFrame(PoseStatus.MEASURED, Cause.NONE, x, P, predicted, fit, gamma)
 
     def _acquired(self, picture: Picture, predicted: Array) -> CircleFrame:
         """Search the whole picture: for any circle, or for one like that which was lost."""
-        before = self._fit if self._measured >= _CONFIRMED else None
+        self._searches += 1
+        before = self._trusted if self._searches <= _FORGOTTEN else None
         wanted = Wanted(
-            near_px=self.near_px if before is None else None,
+            near_px=self.near_px if self._trusted is None else None,
             within_px=20.0,
             radius_px=None if before is None else before.rim.radius_px,
             polarity=0 if before is None else before.polarity,
@@ -223,17 +235,21 @@ class CircleTracker:
             self._ambiguous = ambiguous
             cause = Cause.AMBIGUOUS if ambiguous else Cause.NOT_FOUND
             return replace(self._without(cause, predicted, np.nan, event=event), circles=len(found.circles))
-        return self._started(picture, found, predicted, "acquired" if before is None else "reacquired")
+        return self._started(picture, found, predicted, "acquired" if self._trusted is None else "reacquired")
 
-    def _started(self, picture: Picture, found: Acquisition, predicted: Array, event: str) -> CircleFrame:
-        """Begin to track a circle."""
+    def _started(
+        self, picture: Picture, found: Acquisition, predicted: Array, event: str, keep: bool = False
+    ) -> CircleFrame:
+        """Begin to track a circle. keep: it looks as before, so that its appearance stays known."""
         assert found.found is not None
         fit, p = found.found, self.parameters
         z, R = fit.centre_and_radius, fit.covariance_px2
         rate = _START_RATE_RADII * fit.rim.radius_px
         self._bank = FilterBank.started(z, R, rate, p.accelerations_px, p.radius_share)
-        self._appearance = first_appearance(*disc_cells(picture, *map(float, z)))
-        self._fit, self._misses, self._measured, self._ambiguous = fit, 0, 1, False
+        if not keep:
+            self._appearance = first_appearance(*disc_cells(picture, *map(float, z)))
+            self._habit = RimHabit(fit.sectors, fit.rms_px, 1)
+        self._fit, self._misses, self._measured, self._ambiguous, self._searches = fit, 0, 1, False, 0
         x, P = self._bank.state()
         gamma = float(np.clip(1 - fit.coverage, 0.0, 1.0))  # no appearance is known yet: the share of the rim
         return CircleFrame(PoseStatus.MEASURED, Cause.NONE, x, P, predicted, fit, gamma, len(found.circles), event)
@@ -241,16 +257,18 @@ class CircleTracker:
     def _found_elsewhere(self, picture: Picture, predicted: Array) -> CircleFrame | None:
         """The circle outside the window, or with a changed appearance: one that is well seen and has its radius."""
         assert self._fit is not None and self._bank is not None
-        radius = float(np.clip(self._bank.state()[0][2], 0.5 * self._fit.rim.radius_px, 2 * self._fit.rim.radius_px))
-        wanted = Wanted(radius_px=radius, radius_factor=1.3, polarity=self._fit.polarity)
+        like = self._fit if self._trusted is None else self._trusted
+        radius = float(np.clip(self._bank.state()[0][2], 0.7 * like.rim.radius_px, 1.4 * like.rim.radius_px))
+        wanted = Wanted(radius_px=radius, radius_factor=1.3, polarity=like.polarity)
         found = acquire(picture, self.detector, self.parameters, wanted)
         if found.found is None:
             return None
         cells = disc_cells(picture, *map(float, found.found.centre_and_radius))
-        own = self._appearance is not None and self._appearance.coefficient(*cells) < self.parameters.occluded
-        if not own and self._misses < 4 * self.parameters.search_after:
-            return None  # another circle; after a longer gap the appearance of the own one may have changed
-        return self._started(picture, found, predicted, "reacquired")
+        if self._appearance is not None and is_clear(self._appearance.coefficient(*cells)):
+            return self._started(picture, found, predicted, "reacquired", keep=True)
+        # After a longer gap the appearance of the own circle may have changed; a partly hidden one is not believed.
+        late = self._misses >= _CHANGED * self.parameters.search_after
+        return self._started(picture, found, predicted, "reacquired") if late and found.found.coverage > _WHOLE else None
 
     def _without(self, cause: Cause, predicted: Array, gamma: float, event: str = "") -> CircleFrame:
         """A frame without a measurement: predicted, or lost."""
