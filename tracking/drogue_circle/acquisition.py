@@ -68,7 +68,12 @@ def _fitted(
         window = Window(c.u_px, c.v_px, half, p.gate_px, p.min_radius_px, 2 * c.radius_px)
         fit = fit_rim(smooth_crop(picture, window, p.blur_px), c, p.acquire_coverage)
         largest = p.max_radius_px or 0.5 * max(picture.shape[:2])
-        if fit is not None and p.min_radius_px <= fit.rim.radius_px <= largest and is_certain(fit) and _fits(fit, wanted):
+        if (
+            fit is not None
+            and p.min_radius_px <= fit.rim.radius_px <= largest
+            and is_certain(fit)
+            and _fits(fit, wanted)
+        ):
             fits.append(fit)
     return fits
 

@@ -34,7 +34,8 @@ def in_window(picture: Picture, window: Window, p: CircleParameters) -> list[Cir
     if not len(edges):
         return []
     u, v, gate = window.u_px - left, window.v_px - top, window.gate_px
-    area = (int(np.floor(v - gate)) - 1, int(np.ceil(v + gate)) + 2, int(np.floor(u - gate)) - 1, int(np.ceil(u + gate)) + 2)
+    low, high = np.floor([v - gate, u - gate]).astype(int) - 1, np.ceil([v + gate, u + gate]).astype(int) + 2
+    area = (int(low[0]), int(high[0]), int(low[1]), int(high[1]))
     radii = (window.min_radius_px, window.max_radius_px)
     rows, columns = centres(centre_votes(edges, radii, area), 4 * _CENTRES_OF_WINDOW)
     out: list[CircleCandidate] = []
@@ -73,5 +74,7 @@ def whole_picture(picture: Picture, p: CircleParameters) -> list[CircleCandidate
                         )
                     )
         scale *= 2
-        level = cv2.resize(picture, None, fx=1 / scale, fy=1 / scale, interpolation=cv2.INTER_AREA)
+        level = np.asarray(
+            cv2.resize(picture, None, fx=1 / scale, fy=1 / scale, interpolation=cv2.INTER_AREA), picture.dtype
+        )
     return sorted(out, key=lambda c: -c.score)

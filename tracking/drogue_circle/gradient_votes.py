@@ -60,11 +60,12 @@ def edge_pixels(picture: Picture, blur_px: float) -> EdgePixels:
 
 
 def centre_votes(
-    edges: EdgePixels, radii_px: tuple[float, float], area: tuple[int, int, int, int]
+    edges: EdgePixels, radii_px: tuple[float, float], area: tuple[int, int, int, int], smooth: bool = True
 ) -> NDArray[np.float32]:
     """Votes (height, width) for centres along the gradients, in both directions.
 
     radii_px: smallest and largest distance of a centre from its edge. area: top, bottom, left, right of the cells, px.
+    smooth: sums over 3 x 3 cells, since rounding distributes the votes for one centre over neighbours.
     """
     top, bottom, left, right = area
     height, width = bottom - top, right - left
@@ -74,17 +75,16 @@ def centre_votes(
     y = np.rint(edges.y.astype(np.float32) + radii * edges.along_y.astype(np.float32)).astype(np.int32) - top
     inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
     votes = np.bincount(y[inside] * width + x[inside], minlength=height * width)
-    return votes.reshape(height, width).astype(np.float32)
+    cells = votes.reshape(height, width).astype(np.float32)
+    if not smooth:
+        return cells
+    return np.asarray(cv2.boxFilter(cells, -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT), np.float32)
 
 
 def centres(votes: NDArray[np.float32], most: int) -> tuple[Ints, Ints]:
-    """Rows and columns of the best local maxima among eight neighbours, eq. (5), at most `most`, best first.
-
-    The votes are first summed over 3 x 3 cells: rounding distributes the votes for one centre over neighbours.
-    """
-    summed = cv2.boxFilter(votes, -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)
-    peaks = np.flatnonzero((summed >= cv2.dilate(summed, np.ones((3, 3), np.uint8))) & (summed > 0))
-    values = summed.ravel()[peaks]
+    """Rows and columns of the best local maxima among eight neighbours, eq. (5), at most `most`, best first."""
+    peaks = np.flatnonzero((votes >= cv2.dilate(votes, np.ones((3, 3), np.uint8))) & (votes > 0))
+    values = votes.ravel()[peaks]
     if len(peaks) > 4 * most:
         keep = np.argpartition(-values, 4 * most)[: 4 * most]
         peaks, values = peaks[keep], values[keep]

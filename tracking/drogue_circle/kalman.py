@@ -25,7 +25,7 @@ def transition(dt: float) -> Array:
 
 
 def process_noise(dt: float, acceleration_px: Array) -> Array:
-    """Gamma Q Gamma' (..., 6, 6) of accelerations with these 1-sigma values (..., 3), px/frame^2, constant in a step."""
+    """Gamma Q Gamma' (..., 6, 6) of accelerations (..., 3), px/frame^2, 1 sigma, constant within a step."""
     gamma = np.concatenate([0.5 * dt**2 * np.eye(3), dt * np.eye(3)])
     q = np.asarray(acceleration_px, dtype=float)[..., None, :] ** 2 * np.eye(3)
     return np.asarray(gamma @ q @ gamma.T)
@@ -58,8 +58,8 @@ def distance2(x: Array, P: Array, z: Array, R: Array) -> tuple[Array, Array]:
 class FilterBank:
     """Kalman filters with different accelerations, weighted by their likelihood (Magill 1965, IEEE Trans. AC-10).
 
-    The acceleration of the target is unknown: a filter with too much of it has noisy rates, which matter when the target
-    is occluded; one with too little follows late.
+    The acceleration of the target is unknown. A filter with too much of it has noisy rates, which matter when the
+    target is occluded; one with too little follows late.
     """
 
     x: Array  # (n, 6)

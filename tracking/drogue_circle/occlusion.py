@@ -44,7 +44,7 @@ class Appearance:
         return float(np.clip(1 - self._filled(cells_dn, inside) / max(self.fill, 0.05), 0.0, 1.0))
 
     def hidden_sectors(self, cells_dn: Array, inside: Bools) -> Bools:
-        """Sectors (sectors,) that look different next to the rim: an occluder is there, and its edges are not the rim."""
+        """Sectors (sectors,) that look different next to the rim: the edges there are those of an occluder."""
         outer = _RHO > _NEXT_TO_RIM
         return np.asarray(np.mean(self._matching(cells_dn, inside)[outer], axis=0) < _SECTOR_SHARE)
 
@@ -94,11 +94,16 @@ def _contrast(values_dn: Array) -> tuple[float, float]:
 
 @dataclass(frozen=True, slots=True)
 class RimHabit:
-    """Where and how precisely the rim shows in clear frames: a rim may have no edge against a part of the background."""
+    """Where and how precisely the rim shows in clear frames: it may have no edge against a part of its background."""
 
     sectors: Array  # (sectors,) mean share of the rays with an edge on the rim
     rms_px: float  # mean residual of the edge points
     frames: int
+
+    @property
+    def coverage(self) -> float:
+        """Usual share of the rim with edge points."""
+        return float(np.mean(self.sectors))
 
     @property
     def without_edge(self) -> Bools:
@@ -136,7 +141,6 @@ def disc_cells(picture: Picture, u_px: float, v_px: float, radius_px: float) -> 
         return np.zeros(x.shape), np.zeros(x.shape, dtype=bool)
     side = int(max(round(radius_px / _RINGS), 1))
     if side > 1:
-        crop = cv2.blur(crop, (side, side))
+        crop = np.asarray(cv2.blur(crop, (side, side)), np.float32)
     cells = cv2.remap(crop, (x - left).astype(np.float32), (y - top).astype(np.float32), cv2.INTER_LINEAR)
     return np.where(inside, cells, 0.0).astype(float), inside
-

@@ -74,15 +74,15 @@ def smooth_crop(picture: Picture, window: Window, blur_px: float) -> SmoothCrop:
     second = np.abs(raw[::2, 2:] - 2 * raw[::2, 1:-1] + raw[::2, :-2])
     noise = max(median(second.ravel()) / 0.6745 / np.sqrt(6.0), 0.3)
     filtered = noise / (2 * np.sqrt(np.pi) * blur_px)  # white noise behind a Gaussian filter
-    return SmoothCrop(cv2.GaussianBlur(raw, (0, 0), blur_px), left, top, float(filtered), blur_px)
+    smooth = np.asarray(cv2.GaussianBlur(raw, (0, 0), blur_px), np.float32)
+    return SmoothCrop(smooth, left, top, float(filtered), blur_px)
 
 
-def rim_points(
-    crop: SmoothCrop, rim: Rim, half_px: float, polarity: int, hidden: Bools | None = None
-) -> RimPoints:
+def rim_points(crop: SmoothCrop, rim: Rim, half_px: float, polarity: int, hidden: Bools | None = None) -> RimPoints:
     """The best edge on each ray within +- half_px of a rim.
 
-    polarity: +1 brighter outside, -1 brighter inside. hidden: sectors (k,) of equal angles without edges of the rim. Maxima near the rim are preferred (Gaussian weight of half_px).
+    polarity: +1 brighter outside, -1 brighter inside. hidden: sectors (k,) of equal angles without edges of the rim.
+    Maxima near the rim are preferred (Gaussian weight of half_px).
     """
     n = int(np.clip(round(2 * np.pi * rim.radius_px), _LEAST_RAYS, _MOST_RAYS))
     theta = 2 * np.pi * np.arange(n) / n

@@ -38,7 +38,17 @@ class RimFit:
     @property
     def centre_and_radius(self) -> Array:
         """(3,) u, v, radius, px."""
-        return np.array([self.rim.u_px, self.rim.v_px, self.rim.radius_px])
+        return np.array(self.circle)
+
+    @property
+    def circle(self) -> tuple[float, float, float]:
+        """u, v, radius, px."""
+        return self.rim.u_px, self.rim.v_px, self.rim.radius_px
+
+    def is_equal(self, other: RimFit) -> bool:
+        """Whether two fits are the same circle, to a twentieth of a pixel."""
+        away = np.abs(self.centre_and_radius - other.centre_and_radius)
+        return bool(self.polarity == other.polarity and away.max() < 0.05)
 
 
 def fit_rim(
@@ -124,7 +134,7 @@ def _solve(rim: Rim, points: RimPoints, least_scale_px: float, oblique: bool) ->
         return None
     full = np.zeros(len(points.theta))
     full[found] = weight
-    return Rim(rim.u_px + x[0], rim.v_px + x[1], x[2], *(x[3:] if oblique else ())), full
+    return Rim(rim.u_px + float(x[0]), rim.v_px + float(x[1]), *map(float, x[2:])), full
 
 
 def _oblique_fit(
