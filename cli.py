@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import click
 
-from lab.commands import batch, calibrate, compare, maintenance, plan_and_simulate, results, run, study, view
+from lab.commands import batch, calibrate, compare, maintenance, plan_and_simulate, results, run, study, track, view
 from lab.commands.common import Commands
 
 
@@ -27,6 +27,7 @@ for command in (
     results.check,
     results.report,
     study.study,
+    track.track,
     compare.compare,
     view.view,
     calibrate.calibrate,

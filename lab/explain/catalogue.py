@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from lab.errors import InputError
-from lab.explain import calibrations, lenses, program, runs
+from lab.explain import calibrations, circles, lenses, program, runs
 from lab.explain.explanation import Explanations, as_text
 from lab.files.text.error_text import suggest_name
 
@@ -19,6 +19,7 @@ SECTIONS: dict[str, Explanations] = {
     "Joint calibration of the rig": calibrations.RIG,
     "Drift check of a calibration": calibrations.DRIFT,
     "Plan of a rig": program.PLAN,
+    "Tracked circle": circles.CIRCLES,
 }
 EXPLANATIONS: Explanations = {code: text for section in SECTIONS.values() for code, text in section.items()}
 

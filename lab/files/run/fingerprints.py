@@ -38,6 +38,11 @@ def fingerprints(run: Run, full: bool = False) -> list[dict[str, Any]]:
     return out
 
 
+def fingerprint(path: Path, full: bool = False) -> dict[str, Any]:
+    """The entry of one input that belongs to no run folder: a file, or a folder of pictures. Raises OSError."""
+    return _of_folder(path, full) if path.is_dir() else _of_file(path, full)
+
+
 def _of_file(path: Path, full: bool) -> dict[str, Any]:
     size = path.stat().st_size
     digest = hashlib.sha256()
