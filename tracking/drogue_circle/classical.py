@@ -55,7 +55,8 @@ def whole_picture(picture: Picture, p: CircleParameters) -> list[CircleCandidate
     4/3 of that of the first level. Centres outside the picture are not searched.
     """
     largest = p.max_radius_px or 0.5 * min(picture.shape[:2])
-    scale, level = 1, picture
+    scale = 1
+    level: Picture = picture
     out: list[CircleCandidate] = []
     band = p.min_radius_px
     while band * scale <= largest and min(level.shape[:2]) >= _LEAST_SIDE:
@@ -83,5 +84,5 @@ def whole_picture(picture: Picture, p: CircleParameters) -> list[CircleCandidate
 
 def _reduced(picture: Picture, scale: int) -> Picture:
     """The picture with a side of 1 / scale, means of blocks."""
-    smaller = cv2.resize(picture, None, fx=1 / scale, fy=1 / scale, interpolation=cv2.INTER_AREA)
+    smaller = np.asarray(cv2.resize(picture, None, fx=1 / scale, fy=1 / scale, interpolation=cv2.INTER_AREA))
     return smaller.astype(np.uint8) if picture.dtype == np.uint8 else smaller.astype(np.uint16)
