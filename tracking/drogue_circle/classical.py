@@ -76,9 +76,7 @@ def whole_picture(picture: Picture, p: CircleParameters) -> list[CircleCandidate
                         )
                     )
         scale *= 2
-        level = np.asarray(
-            cv2.resize(picture, None, fx=1 / scale, fy=1 / scale, interpolation=cv2.INTER_AREA), picture.dtype
-        )
+        level = _reduced(picture, scale)
     return sorted(out, key=lambda c: -c.score)
 
 

@@ -8,6 +8,7 @@ is 3 x 3.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -32,8 +33,8 @@ def process_noise(dt: float, acceleration_px: Array) -> Array:
 
 
 def predict(x: Array, P: Array, phi: Array, Q: Array) -> tuple[Array, Array]:
-    """Prediction of states (..., 6) and covariances (..., 6, 6)."""
-    return (phi @ x[..., None])[..., 0], symmetric(phi @ P @ phi.T + Q)
+    """Prediction of states (..., n) and covariances (..., n, n)."""
+    return (phi @ x[..., None])[..., 0], symmetric(phi @ P @ np.swapaxes(phi, -1, -2) + Q)
 
 
 def update(x: Array, P: Array, z: Array, R: Array) -> tuple[Array, Array]:
@@ -41,7 +42,8 @@ def update(x: Array, P: Array, z: Array, R: Array) -> tuple[Array, Array]:
     S = P[..., :3, :3] + R
     K = np.swapaxes(np.linalg.solve(S, np.swapaxes(P[..., :, :3], -1, -2)), -1, -2)
     x = x + (K @ (z - x[..., :3])[..., None])[..., 0]
-    keep = np.eye(6) - np.concatenate([K, np.zeros_like(K)], axis=-1)
+    keep = np.broadcast_to(np.eye(x.shape[-1]), P.shape).copy()
+    keep[..., :, :3] -= K
     P = keep @ P @ np.swapaxes(keep, -1, -2) + K @ R @ np.swapaxes(K, -1, -2)
     return x, symmetric(P)
 
@@ -55,49 +57,104 @@ def distance2(x: Array, P: Array, z: Array, R: Array) -> tuple[Array, Array]:
 
 
 @dataclass(frozen=True, slots=True)
+class MotionModel:
+    """How one filter of the bank expects the circle to move; states with accelerations (9,)."""
+
+    acceleration_px: Array  # (3,) px/frame^2, 1 sigma, white; zero where the acceleration is a state
+    jerk_px: Array  # (3,) px/frame^3, 1 sigma, white; zero where the acceleration is white
+
+    def transition(self, dt: float) -> Array:
+        """Phi (9, 9). Where the acceleration is white, its state stays zero."""
+        phi = np.zeros((9, 9))
+        phi[:6, :6] = transition(dt)
+        if self.jerk_px.any():
+            phi[:3, 6:], phi[3:6, 6:], phi[6:, 6:] = 0.5 * dt**2 * np.eye(3), dt * np.eye(3), np.eye(3)
+        return phi
+
+    def noise(self, dt: float) -> Array:
+        """Q (9, 9), of values that are constant within a step."""
+        Q = np.zeros((9, 9))
+        Q[:6, :6] = process_noise(dt, self.acceleration_px)
+        gamma = np.concatenate([dt**3 / 6 * np.eye(3), 0.5 * dt**2 * np.eye(3), dt * np.eye(3)])
+        return Q + gamma @ np.diag(self.jerk_px**2) @ gamma.T
+
+
+@dataclass(frozen=True, slots=True)
 class FilterBank:
-    """Kalman filters with different accelerations, weighted by their likelihood (Magill 1965, IEEE Trans. AC-10).
+    """Kalman filters with different motions, weighted by their likelihood (Magill 1965, IEEE Trans. AC-10).
 
     The acceleration of the target is unknown. A filter with too much of it has noisy rates, which matter when the
-    target is occluded; one with too little follows late.
+    target is occluded; one with too little follows late. A steady acceleration, as of a pendulum, is followed by the
+    filters that have it as a state: in eight hidden frames constant rates miss a pendulum by several pixels.
     """
 
-    x: Array  # (n, 6)
-    P: Array  # (n, 6, 6)
+    x: Array  # (n, 9): u, v, r, rates, accelerations
+    P: Array  # (n, 9, 9)
     log_weight: Array  # (n,) natural logarithms, largest 0
-    acceleration_px: Array  # (n, 3) px/frame^2
+    models: tuple[MotionModel, ...]
 
     @classmethod
-    def started(
-        cls, z: Array, R: Array, rate_sigma_px: float, accelerations_px: tuple[float, ...], radius_share: float
-    ) -> FilterBank:
+    def started(cls, z: Array, R: Array, rate_sigma_px: float, models: tuple[MotionModel, ...]) -> FilterBank:
         """A bank at a first circle z (3,) with covariance R, at rest within rate_sigma_px (px/frame)."""
-        n = len(accelerations_px)
-        P = np.zeros((6, 6))
-        P[:3, :3] = R
-        P[3:, 3:] = np.diag([rate_sigma_px, rate_sigma_px, max(radius_share, 0.1) * rate_sigma_px]) ** 2
-        q = np.outer(accelerations_px, [1.0, 1.0, radius_share])
-        return cls(np.tile(np.concatenate([z, np.zeros(3)]), (n, 1)), np.tile(P, (n, 1, 1)), np.zeros(n), q)
+        n, third = len(models), np.array([1.0, 1.0, 0.15])
+        P = np.zeros((n, 9, 9))
+        P[:, :3, :3] = R
+        P[:, 3:6, 3:6] = np.diag((rate_sigma_px * third) ** 2)
+        for i, model in enumerate(models):
+            if model.jerk_px.any():
+                P[i, 6:, 6:] = np.diag((0.1 * rate_sigma_px * third) ** 2)
+        return cls(np.tile(np.concatenate([z, np.zeros(6)]), (n, 1)), P, np.zeros(n), models)
 
     def predicted(self, dt: float) -> FilterBank:
         """The bank dt frames later."""
-        x, P = predict(self.x, self.P, transition(dt), process_noise(dt, self.acceleration_px))
-        return FilterBank(x, P, self.log_weight, self.acceleration_px)
+        phi, Q = _stacked(self.models, dt)
+        x, P = predict(self.x, self.P, phi, Q)
+        return FilterBank(x, P, self.log_weight, self.models)
 
     def updated(self, z: Array, R: Array, forgetting: float) -> FilterBank:
         """The bank after a measured circle. forgetting: factor of the earlier log likelihoods."""
         log_weight = forgetting * self.log_weight - distance2(self.x, self.P, z, R)[1]
         x, P = update(self.x, self.P, z, R)
-        return FilterBank(x, P, log_weight - log_weight.max(), self.acceleration_px)
+        return FilterBank(x, P, log_weight - log_weight.max(), self.models)
 
     def state(self) -> tuple[Array, Array]:
-        """Mean (6,) and covariance (6, 6) of the mixture."""
+        """Mean (6,) and covariance (6, 6) of the mixture: centre, radius and rates."""
         share = np.exp(self.log_weight)
         share = share / share.sum()
-        mean = share @ self.x
-        away = self.x - mean
-        spread = np.einsum("n,ni,nj->ij", share, away, away)
-        return mean, symmetric(np.einsum("n,nij->ij", share, self.P) + spread)
+        x = self.x[:, :6]
+        mean = share @ x
+        away = x - mean
+        P = np.tensordot(share, self.P[:, :6, :6], 1) + (share[:, None] * away).T @ away
+        return mean, symmetric(P)
+
+    def distance2(self, z: Array, R: Array, any_model: bool = False) -> float:
+        """Squared Mahalanobis distance of a circle from the prediction; any_model: from the nearest filter's."""
+        if any_model:
+            return float(distance2(self.x, self.P, z, R)[0].min())
+        x, P = self.state()
+        return float(distance2(x, P, z, R)[0])
+
+
+def motion_models(
+    accelerations_px: tuple[float, ...], jerks_px: tuple[float, ...], radius_share: float
+) -> tuple[MotionModel, ...]:
+    """One model for each acceleration and each jerk of the centre; those of the radius are a share of them."""
+    shares, none = np.array([1.0, 1.0, radius_share]), np.zeros(3)
+    white = [MotionModel(a * shares, none) for a in accelerations_px]
+    return (*white, *(MotionModel(none, j * shares) for j in jerks_px))
+
+
+@lru_cache(maxsize=16)
+def _stacked_of(key: tuple[float, ...], dt: float) -> tuple[Array, Array]:
+    rows = np.array(key).reshape(-1, 6)
+    models = [MotionModel(row[:3], row[3:]) for row in rows]
+    return np.array([m.transition(dt) for m in models]), np.array([m.noise(dt) for m in models])
+
+
+def _stacked(models: tuple[MotionModel, ...], dt: float) -> tuple[Array, Array]:
+    """Phi and Q (n, 9, 9) of all models; they are the same in most frames."""
+    key = tuple(float(v) for m in models for v in (*m.acceleration_px, *m.jerk_px))
+    return _stacked_of(key, dt)
 
 
 def printed_coefficient(area: float, previous_area: float) -> float:

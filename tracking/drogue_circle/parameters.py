@@ -21,6 +21,7 @@ class CircleParameters:
     ambiguous_share: float = 0.8  # a second circle with this share of the best one's score makes the choice ambiguous
     occluded: float = 0.5  # beta: with an occlusion coefficient from here on the state is only predicted
     accelerations_px: tuple[float, ...] = (0.02, 0.08, 0.3, 1.2)  # px/frame^2, 1 sigma, of the filters of the bank
+    jerks_px: tuple[float, ...] = (0.003, 0.012, 0.05)  # px/frame^3, of the filters with a steady acceleration
     radius_share: float = 0.15  # acceleration of the radius as a share of that of the centre
     forgetting: float = 0.95  # of the likelihoods of the bank, per frame
     gate_chi2: float = 21.1  # innovation gate, 3 degrees of freedom, p = 1e-4

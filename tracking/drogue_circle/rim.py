@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import erf
 
 import cv2
 import numpy as np
@@ -14,6 +15,7 @@ from tracking.drogue_circle.candidates import Picture, Window, crop_bounds
 _STEP_PX = 0.5  # sampling along a ray
 _LEAST_RAYS, _MOST_RAYS = 40, 256
 _OBLIQUE = 0.6  # largest tangential slope, as a share of the radial one: the edge crosses the rim at up to 31 degrees
+_MOST_BLUR = 1.2  # of the half width of the rays: a wider edge has no known height
 _LEAST_SHARE = 0.25  # of the median slope of the rim: weaker maxima are not the rim
 _LEAST_SLOPE = 3.0  # standard deviations of the slope's noise
 
@@ -45,6 +47,7 @@ class RimPoints:
     any_radius_px: Array  # (n,) as radius_px, but also in hidden sectors
     inside: Bools  # (n,) the ray lies inside the picture
     spacing_px: float  # between neighbouring rays at the rim
+    shift_px: float = 0.0  # by which the radii are corrected for blur
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,11 +118,27 @@ def rim_points(crop: SmoothCrop, rim: Rim, half_px: float, polarity: int, hidden
     bend = np.where(good, a - 2 * b + c, -1.0)
     vertex = np.clip(0.5 * (a - c) / np.minimum(bend, -1e-12), -0.5, 0.5)  # of a parabola through three slopes
     radius = base + offset[2:-2][best] + _STEP_PX * vertex
-    # A Gaussian filter moves the steepest place of a curved edge inwards by blur^2 / (2 r) (Bouma et al. 2005).
-    radius += crop.blur_px**2 / (2 * np.maximum(radius, 1.0))
+    # Blur moves the steepest place of a curved edge inwards by sigma^2 / (2 r) (Bouma et al. 2005).
+    height_dn = polarity * (values[:, -1] - values[:, 0])[good]
+    sigma = _edge_width(height_dn / strength[good], float(offset[-1]), crop.blur_px) if good.any() else crop.blur_px
+    shift = sigma**2 / (2 * max(rim.radius_px, 1.0))
+    radius += shift
     radius = np.where(good, radius, np.nan)
     strength = np.where(good, strength, np.nan)
     if hidden is None:
-        return RimPoints(theta, radius, strength, radius, inside, spacing)
+        return RimPoints(theta, radius, strength, radius, inside, spacing, shift)
     own = ~hidden[(rows * len(hidden)) // n]
-    return RimPoints(theta, np.where(own, radius, np.nan), np.where(own, strength, np.nan), radius, inside, spacing)
+    seen = np.where(own, radius, np.nan)
+    return RimPoints(theta, seen, np.where(own, strength, np.nan), radius, inside, spacing, shift)
+
+
+def _edge_width(ratios_px: Array, half_px: float, least_px: float) -> float:
+    """Sigma of a blurred step, px, from its height within +- half_px over its largest slope, on n rays.
+
+    The height is A erf(half / (sqrt(2) sigma)) and the slope A / (sqrt(2 pi) sigma); least_px: the filter's own sigma.
+    """
+    ratio = median(ratios_px) / np.sqrt(2 * np.pi)
+    sigma = max(ratio, least_px)
+    for _ in range(4):
+        sigma = float(np.clip(ratio / erf(half_px / (np.sqrt(2) * sigma)), least_px, _MOST_BLUR * half_px))
+    return sigma

@@ -11,8 +11,9 @@ from tracking.drogue_circle.candidates import CircleCandidate
 from tracking.drogue_circle.rim import Rim, RimPoints, SmoothCrop, median, rim_points
 
 _TUKEY = 4.685  # Tukey's biweight, 95 % efficiency for normal errors
-_LEAST_SIGMA_PX = 0.03  # of an edge point: interpolation, and pixels that are not points
-_MODEL_SIGMA_PX = 0.015  # of the fit: rims are not exact circles
+_LEAST_SIGMA_PX = 0.02  # of an edge point: interpolation, and pixels that are not points
+_MODEL_SIGMA_PX = 0.005  # of the fit: rims are not exact circles
+_BLUR_SIGMA = 0.5  # 1 sigma of the correction for blur, as a share of it
 _ELLIPSE_COVERAGE = 0.7  # share of the rim that determines an ellipse
 _ELLIPSE_F = 8.0  # F value of its two parameters, above which they are kept
 _LEAST_DETERMINANT = 1e-6
@@ -198,6 +199,7 @@ def _described(
     variance = max(float(np.mean(residual**2)), _LEAST_SIGMA_PX**2) * independent / (independent - count)
     covariance = variance * correlated * np.linalg.inv(A.T @ A)
     covariance = symmetric(covariance[:3, :3]) + _MODEL_SIGMA_PX**2 * np.eye(3)
+    covariance[2, 2] += (_BLUR_SIGMA * points.shift_px) ** 2
     rms = float(np.sqrt(np.mean(residual**2)))
     slope = median(points.slope[good])
     on_rim = np.abs(points.any_radius_px - rim.radius_at(points.theta)) < max(3 * rms, _ON_RIM_PX)
@@ -209,10 +211,10 @@ def _described(
 def _correlation_length(away: Array, good: Bools, spacing_px: float) -> float:
     """Number of neighbouring edge points that count as one: 1 + 2 sum of the correlations (Bartlett's weights).
 
-    At least that of the Gaussian filter: white noise behind it has the correlation exp(-d^2 / 4 sigma^2), whose sum
-    over points 1 px apart is 3.5.
+    At least 1.8 points 1 px apart, measured: white noise behind the Gaussian filter has the correlation
+    exp(-d^2 / 4 sigma^2), whose sum is 3.5, but the errors of pixels and interpolation are less correlated.
     """
-    least = max(3.5 / spacing_px, 1.0)
+    least = max(1.8 / spacing_px, 1.0)
     values = np.where(good, away, 0.0) - np.where(good, np.mean(away[good]), 0.0)
     power = float(np.sum(values**2))
     if power <= 0:

@@ -9,7 +9,7 @@ import numpy as np
 
 from geometry.arrays import Array, Bools
 from tracking.drogue_circle.candidates import CircleCandidate, CircleDetector, Picture, Window
-from tracking.drogue_circle.kalman import FilterBank, distance2
+from tracking.drogue_circle.kalman import FilterBank, motion_models
 from tracking.drogue_circle.occlusion import Appearance, RimHabit, disc_cells, first_appearance, is_clear
 from tracking.drogue_circle.parameters import CircleParameters
 from tracking.drogue_circle.rim import SmoothCrop, smooth_crop
@@ -20,6 +20,7 @@ _COVERAGE_COST, _POLARITY_COST = 40.0, 15.0  # against distance^2, of a whole ri
 _AS_PREDICTED, _WELL_SEEN = 16.0, 0.75  # distance^2 and coverage of a fit that needs no comparison with others
 _USUAL = 0.9  # of the usual coverage, the same
 WHOLE = 0.85  # coverage of a rim that is seen whole
+_GATE_PX2 = 0.1**2 * np.eye(3)  # of the gate: a rim is not a perfect circle
 _WHOLE_GATE = 10.0  # factor of the innovation gate of such a rim
 _REFITS = 2  # without the sectors of an occluder
 _LEAST_RADIUS = 0.7  # of the smallest radius of an acquisition, below which a circle is not tracked
@@ -62,7 +63,7 @@ class Track:
         """The best rim in the window, and the occlusion coefficient there or, without a rim, at the prediction."""
         window = self.window(p)
         crop = smooth_crop(picture, window, p.blur_px)
-        x, P = self.bank.state()
+        x = self.bank.state()[0]
         best, best_cost = None, np.inf
         fitted: list[RimFit] = []
         for c in self._candidates(picture, window, detector, p):
@@ -70,9 +71,9 @@ class Track:
             if fit is None or any(fit.is_equal(f) for f in fitted):
                 continue
             fitted.append(fit)
-            d2 = float(distance2(x, P, fit.centre_and_radius, fit.covariance_px2)[0])
+            # A rim that is seen whole may be where any of the filters expects it, since the target may turn.
+            d2 = self.bank.distance2(fit.centre_and_radius, fit.covariance_px2 + _GATE_PX2, fit.coverage > WHOLE)
             near = np.hypot(fit.rim.u_px - window.u_px, fit.rim.v_px - window.v_px) < window.gate_px
-            # The gate is wide for a rim that is seen whole, since the target may turn faster than modelled.
             gate = p.gate_chi2 * (_WHOLE_GATE if fit.coverage > WHOLE else 1.0)
             if not near or d2 > gate or fit.rim.radius_px < _LEAST_RADIUS * p.min_radius_px:
                 continue
@@ -133,4 +134,5 @@ class Track:
 
 def _bank_at(fit: RimFit, p: CircleParameters) -> FilterBank:
     rate = _START_RATE_RADII * fit.rim.radius_px
-    return FilterBank.started(fit.centre_and_radius, fit.covariance_px2, rate, p.accelerations_px, p.radius_share)
+    models = motion_models(p.accelerations_px, p.jerks_px, p.radius_share)
+    return FilterBank.started(fit.centre_and_radius, fit.covariance_px2, rate, models)
