@@ -20,6 +20,7 @@ from tracking.drogue_circle.rim_fit import SECTORS, RimFit
 _RINGS, _SECTORS = 10, SECTORS
 _MATCH = 3.0  # mean absolute deviations within which a cell looks as before
 _LEAST_SHARE = 0.06  # least deviation, as a share of the contrast of the target
+_LIGHT = 0.15  # largest change of the light from the mean appearance, as a share of the grey level
 _RATE, _FIRST = 0.1, 8  # of the running means; the first frames are averaged
 _NEXT_TO_RIM, _SECTOR_SHARE = 0.75, 0.5  # part of the radius, and least share of its cells in a sector that match
 _USUAL = 0.35  # share of the rays of a sector, below which its edges are left out
@@ -73,9 +74,12 @@ class Appearance:
         low, high = _contrast(self.mean_dn)
         tolerance = _MATCH * np.maximum(self.deviation_dn, max(_LEAST_SHARE * (high - low), 2.0))
         away = cells_dn - self.mean_dn
-        # The common change is limited: an occluder over the whole target is not a change of the light.
-        common = float(np.clip(median(away[inside]), -0.35 * (high - low), 0.35 * (high - low)))
-        return np.asarray(inside & (np.abs(away - common) < tolerance))
+        # The common change is limited: an occluder over the whole target is not a change of the light. Where half of
+        # the target is hidden, the median may be that of the occluder: no change is tried, too.
+        most = _LIGHT * max(abs(median(self.mean_dn.ravel())), 1.0)
+        common = float(np.clip(median(away[inside]), -most, most))
+        plain, corrected = (inside & (np.abs(away - change) < tolerance) for change in (0.0, common))
+        return np.asarray(corrected if corrected.sum() > plain.sum() else plain)
 
 
 def first_appearance(cells_dn: Array, inside: Bools) -> Appearance:

@@ -26,6 +26,7 @@ class CircleParameters:
     forgetting: float = 0.95  # of the likelihoods of the bank, per frame
     gate_chi2: float = 21.1  # innovation gate, 3 degrees of freedom, p = 1e-4
     search_after: int = 3  # frames without a measurement after which the whole picture is searched, too
+    most_predicted: int = 50  # frames without a measurement after which the circle is lost
     lost_sigma_radii: float = 1.0  # standard deviation of the centre, in radii, above which the circle is lost
 
     def __post_init__(self) -> None:

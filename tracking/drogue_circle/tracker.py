@@ -113,7 +113,8 @@ class CircleTracker:
         """A frame without a measurement: predicted, or lost."""
         x, P = track.bank.state()
         sigma = float(np.sqrt(max(P[0, 0], P[1, 1])))
-        if sigma <= self.parameters.lost_sigma_radii * max(float(x[2]), 1.0) and x[2] > 2:
+        certain = sigma <= self.parameters.lost_sigma_radii * max(float(x[2]), 1.0)
+        if certain and x[2] > 2 and track.misses <= self.parameters.most_predicted:
             return CircleFrame(PoseStatus.PREDICTED, cause, x, P, predicted, None, gamma)
         self._track = None
         return replace(nothing_known(cause, "lost"), predicted=predicted, occlusion=gamma)
