@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -61,7 +63,7 @@ def test_a_steady_acceleration_is_extrapolated():
 
 def test_the_printed_coefficient_is_zero_one_frame_after_an_occlusion_begins():
     areas = [1000.0, 1000.0, 500.0, 500.0, 1000.0]
-    gamma = [printed_coefficient(now, before) for before, now in zip(areas, areas[1:], strict=False)]
+    gamma = [printed_coefficient(now, before) for before, now in pairwise(areas)]
     assert gamma == [0.0, 0.5, 0.0, 1.0]
     assert printed_coefficient(0.0, 0.0) == 1.0
 
