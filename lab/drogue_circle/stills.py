@@ -42,7 +42,7 @@ def ring_still(
     blur_px: float = 1.0,
     noise_dn: float = 2.0,
 ) -> Still:
-    """A bright ring with dark inside, ribs and a textured background; `hidden` is the covered share of the inner rim.
+    """A bright ring with a black inside on a textured background; `hidden` is the covered share of the inner rim.
 
     The occluder is a plain rectangle on one side: the hardest case for the centre, since all that is left of the rim
     lies on the other side.
