@@ -20,7 +20,16 @@ def _huo2015(seed: int) -> Comparison:
     return compare_huo2015(seed)
 
 
-STUDIES: dict[str, Callable[[int], Comparison]] = {"huo2015": _huo2015}  # name: seed -> table and figures
+def _zhou2014(seed: int) -> Comparison:
+    from lab.drogue_circle.study import compare_zhou2014
+
+    return compare_zhou2014(seed)
+
+
+STUDIES: dict[str, Callable[[int], Comparison]] = {
+    "huo2015": _huo2015,
+    "zhou2014": _zhou2014,
+}  # name: seed -> table and figures
 
 
 @click.command()

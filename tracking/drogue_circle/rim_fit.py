@@ -53,19 +53,20 @@ class RimFit:
 
 
 def fit_rim(
-    crop: SmoothCrop, coarse: CircleCandidate, min_coverage: float, hidden: Bools | None = None
+    crop: SmoothCrop, coarse: CircleCandidate, min_coverage: float, hidden: Bools | None = None, sure: bool = False
 ) -> RimFit | None:
     """Fit a coarse circle to the rim near it. None: too little of a rim is there.
 
     A candidate of unknown polarity is fitted with both, and the better one is returned. hidden: sectors (k,) of equal
-    angles, from +u towards +v, whose edges belong to an occluder.
+    angles, from +u towards +v, whose edges belong to an occluder. sure: the coarse circle is accurate to half a pixel,
+    so that the wider passes are left out.
     """
     if coarse.polarity == 0:
         both = [fit_rim(crop, _with_polarity(coarse, p), min_coverage, hidden) for p in (1, -1)]
         return max((f for f in both if f is not None), key=lambda f: f.score, default=None)
     rim = Rim(coarse.u_px, coarse.v_px, coarse.radius_px)
     least = 0.7 * min_coverage
-    for half_px, scale_px in _PASSES[:-1]:
+    for half_px, scale_px in () if sure else _PASSES[:-1]:
         points = rim_points(crop, rim, min(half_px, 0.4 * rim.radius_px), coarse.polarity, hidden)
         fitted = _solve(rim, points, scale_px, oblique=False)
         if fitted is None or np.mean(fitted[1] > 0) < least or not _is_near(fitted[0], coarse):
@@ -220,8 +221,7 @@ def _correlation_length(away: Array, good: Bools, spacing_px: float) -> float:
     if power <= 0:
         return least
     lags = int(min(max(12 / spacing_px, 4), len(away) // 6))
-    total = 1.0
-    for k in range(1, lags + 1):
-        share = float(np.sum(values * np.roll(values, k))) / power
-        total += 2 * (1 - k / (lags + 1)) * share
+    # The products of all pairs at one distance, around the rim: the inverse transform of the power spectrum.
+    products = np.fft.irfft(np.abs(np.fft.rfft(values)) ** 2, len(values))[1 : lags + 1]
+    total = 1 + 2 * float(np.sum((1 - np.arange(1, lags + 1) / (lags + 1)) * products)) / power
     return max(total, least)
