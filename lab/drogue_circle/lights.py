@@ -59,12 +59,16 @@ class LightResult:
         return 100 * self.tracked / self.frames
 
 
-def approach(seed: int, light: str, frames: int) -> Iterator[DrogueFrame]:
-    """A drogue that comes nearer, sways and tilts, before moving clouds; a probe covers a part of it at times."""
+def approach(seed: int, light: str, frames: int, scale: int = 1) -> Iterator[DrogueFrame]:
+    """A drogue that comes nearer, sways and tilts, before moving clouds; a probe covers a part of it at times.
+
+    scale: 2 renders pictures of twice the width, with twice the focal length.
+    """
+    width, height, focal = scale * SIZE[0], scale * SIZE[1], scale * FOCAL_PX
     rng = np.random.default_rng([seed, 4, sorted(LIGHTS).index(light)])
     camera = Camera(
-        name="camera", screen="", image_size_px=SIZE,
-        matrix=np.array([[FOCAL_PX, 0, (SIZE[0] - 1) / 2], [0, FOCAL_PX, (SIZE[1] - 1) / 2], [0, 0, 1]]),
+        name="camera", screen="", image_size_px=(width, height),
+        matrix=np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]]),
         distortion=(), camera_from_world=Pose(np.eye(3), np.zeros(3)),
     )  # fmt: skip
     phase = rng.uniform(0, 2 * np.pi, 7)
@@ -75,7 +79,7 @@ def approach(seed: int, light: str, frames: int) -> Iterator[DrogueFrame]:
     for k in range(frames):
         pose, rate = _pose(k / RATE_HZ, k / max(frames, _LEAST_FRAMES), phase)
         distance = float(pose.translation[2])
-        moved = FOCAL_PX / distance * rate[:2] * EXPOSURE_S
+        moved = focal / distance * rate[:2] * EXPOSURE_S
         # The texture is mirrored at its edges: the background moves to and fro.
         shift = 60 * np.sin(drift * k / 60)
         scene = DrogueScene(
@@ -108,7 +112,7 @@ def _probe(camera: Camera, pose: Pose, k: int, side_rad: float) -> tuple[Occlude
     if into < 0:
         return ()
     u, v = camera.project(pose.translation)
-    radius = FOCAL_PX * RADIUS_M / float(pose.translation[2])
+    radius = float(camera.matrix[0, 0]) * RADIUS_M / float(pose.translation[2])
     depth = np.sin(np.pi * (into + 0.5) / _PROBE)  # how far it reaches in: to half of the radius
     along = np.array([np.cos(side_rad), np.sin(side_rad)])
     end, start = [u, v] + (1.3 - 0.8 * depth) * radius * along, [u, v] + 900 * along

@@ -19,6 +19,7 @@ _ELLIPSE_F = 8.0  # F value of its two parameters, above which they are kept
 _LEAST_DETERMINANT = 1e-6
 _ON_RIM_PX = 0.5  # least distance from the rim at which an edge counts as on it
 SECTORS = 32
+_FAR_PX = 0.7  # a last pass that moves the rim by more is repeated
 _ENOUGH_PX = 0.3  # a pass that moves the rim by less is not repeated
 _PASSES = ((4.0, 2.0), (2.5, 1.0), (2.0, 0.0))  # half width of the rays and least scale of the residuals, px
 
@@ -58,7 +59,7 @@ def fit_rim(
     """Fit a coarse circle to the rim near it. None: too little of a rim is there.
 
     A candidate of unknown polarity is fitted with both, and the better one is returned. hidden: sectors (k,) of equal
-    angles, from +u towards +v, whose edges belong to an occluder. sure: the coarse circle is accurate to half a pixel,
+    angles, from +u towards +v, whose edges belong to an occluder. sure: the coarse circle is accurate to a pixel,
     so that the wider passes are left out.
     """
     if coarse.polarity == 0:
@@ -77,6 +78,10 @@ def fit_rim(
             break
     points = rim_points(crop, rim, _PASSES[-1][0], coarse.polarity, hidden)
     circle = _solve(rim, points, _PASSES[-1][1], oblique=False)
+    if circle is not None and np.hypot(circle[0].u_px - rim.u_px, circle[0].v_px - rim.v_px) > _FAR_PX:
+        rim = circle[0]
+        points = rim_points(crop, rim, _PASSES[-1][0], coarse.polarity, hidden)
+        circle = _solve(rim, points, _PASSES[-1][1], oblique=False)
     if circle is None:
         return None
     rim, weight = circle

@@ -18,7 +18,7 @@ from tracking.drogue_circle.rim_fit import RimFit, fit_rim
 _START_RATE_RADII = 0.25  # 1 sigma of the rate of a new circle, in radii per frame
 _COVERAGE_COST, _POLARITY_COST = 40.0, 15.0  # against distance^2, of a whole rim and of the other polarity
 _AS_PREDICTED, _WELL_SEEN = 16.0, 0.75  # distance^2 and coverage of a fit that needs no comparison with others
-_SURE_PX, _SETTLED = 0.3, 5  # sigma of a prediction, and measurements before it, from which the fit may start
+_SURE_PX, _SETTLED = 0.7, 5  # sigma of a prediction, and measurements before it, from which the fit may start
 _USUAL = 0.9  # of the usual coverage, the same
 WHOLE = 0.85  # coverage of a rim that is seen whole
 _GATE_PX2 = 0.1**2 * np.eye(3)  # of the gate: a rim is not a perfect circle
