@@ -52,8 +52,8 @@ def compare_zhou2014(seed: int = 1, stills: int = STILLS, runs: int = RUNS, fram
             ),
             Figure(
                 "Eight fully hidden frames",
-                "Error of the reported centre. Shaded: the target is hidden. As printed, eq. (4) returns to zero one"
-                " frame after the occlusion begins, so that a false circle is measured.",
+                "Error of the reported centre. Shaded: the target is hidden. As printed, a clear target is not filtered"
+                " (R = 0), so that the rates have the noise of whole pixels and the prediction leaves the target.",
                 "".join(_hidden_panel(run, k) for k, run in enumerate(hidden[:2])),
             ),
         ),

@@ -41,12 +41,12 @@ class DrogueLook:
 
     canopy_bgr: tuple[float, float, float] = (225.0, 228.0, 230.0)
     canopy_inner: float = 0.84  # inner radius of the bright ring
-    gores: int = 24  # panels of the canopy, alternately bright and dark
+    gores: int = 24  # panels of the canopy, alternately brighter and darker
     gore_contrast: float = 0.12
     ribs: int = 16  # struts of the basket
     rib_share: float = 0.4  # of the circumference that struts cover
     rib_bgr: tuple[float, float, float] = (120.0, 122.0, 125.0)
-    lining_from: float = 0.45  # depth behind which a dark lining closes the gaps, in depths of the basket
+    lining_from: float = 0.45  # depth behind which a black lining closes the gaps, in depths of the basket
     lining_bgr: tuple[float, float, float] = (38.0, 36.0, 36.0)
     depth: float = 0.9  # of the basket
     rear: float = 0.3  # radius of its end
