@@ -4,21 +4,9 @@ from __future__ import annotations
 
 import click
 
-from lab.commands import (
-    batch,
-    calibrate,
-    compare,
-    maintenance,
-    plan_and_simulate,
-    results,
-    run,
-    show,
-    stereo,
-    study,
-    track_point,
-    view,
-)
+from lab.commands import batch, calibrate, compare, maintenance, plan_and_simulate, results, run, show, view
 from lab.commands.common import Commands
+from lab.commands.measurements import stereo, study, track
 
 
 @click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
@@ -40,7 +28,7 @@ for command in (
     results.check,
     results.report,
     study.study,
-    track_point.track,
+    track.track,
     stereo.stereo,
     compare.compare,
     view.view,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from lab.errors import InputError
-from lab.explain import calibrations, lenses, program, runs, stereo, tracks
+from lab.explain import calibrations, circles, lenses, program, runs, stereo, tracks
 from lab.explain.explanation import Explanations, as_text
 from lab.files.text.error_text import suggest_name
 
@@ -22,6 +22,7 @@ SECTIONS: dict[str, Explanations] = {
     "Plan of a rig": program.PLAN,
     "Stereo pose (`beampose stereo`)": stereo.STEREO,
     "Calibration of a stereo pair": stereo.PAIR,
+    "Tracked circle": circles.CIRCLES,
 }
 EXPLANATIONS: Explanations = {code: text for section in SECTIONS.values() for code, text in section.items()}
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from lab.errors import InputError
-from lab.files.run.fingerprints import fingerprint
+from lab.files.run.fingerprints import fingerprints_of
 from lab.files.run.parameter_overrides import with_overrides
 from lab.files.text.atomic_write import atomic_folder
 from lab.files.text.json_text import write_json
@@ -137,7 +137,7 @@ def _summary(outcome: PointOutcome, settings: PointSettings, options: PointOptio
         },
         "timings": {"wall_s": wall_s},
         "versions": versions(),
-        "inputs": [fingerprint(recording.path)],
+        "inputs": fingerprints_of((), (recording.path,)),
         "notes": recording.notes,
         "events": list(statistics.events),
     }

@@ -39,15 +39,6 @@ def fingerprints(run: Run, full: bool = False) -> list[dict[str, Any]]:
     return out
 
 
-def fingerprint(path: Path) -> dict[str, Any]:
-    """The entry of one input: a file, or a folder of pictures.
-
-    Raises:
-        OSError: a file cannot be read.
-    """
-    return _of_folder(path, full=False) if path.is_dir() else _of_file(path, full=False)
-
-
 def fingerprints_of(files: Iterable[Path], sources: Iterable[Path], full: bool = False) -> list[dict[str, Any]]:
     """Path, SHA-256 and size of files and of sources, each a file or a folder of pictures; each path once.
 

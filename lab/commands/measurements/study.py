@@ -38,8 +38,15 @@ def _zhou2020(seed: int) -> Comparison:
     return compare_zhou2020(seed)
 
 
+def _zhou2014(seed: int) -> Comparison:
+    from lab.drogue_circle.study import compare_zhou2014
+
+    return compare_zhou2014(seed)
+
+
 STUDIES: dict[str, Callable[[int], Comparison]] = {  # name: seed -> table and figures
     "huo2015": _huo2015,
+    "zhou2014": _zhou2014,
     "fu2016": _fu2016,
     "duan2020": _duan2020,
     "zhou2020": _zhou2020,

@@ -1,4 +1,4 @@
-"""`beampose track`: related measurements that follow one target; `beampose track point`: its centre."""
+"""`beampose track point`: the centre of one target."""
 
 from __future__ import annotations
 
@@ -7,17 +7,7 @@ from typing import Any
 
 import click
 
-from lab.commands.common import ANY_PATH, FOLDER, Commands, NumberRange, conclude, progress_bar, read_settings
-
-
-@click.group(cls=Commands)
-def track() -> None:
-    """Follow one target in the pictures of one camera, without a rig.
-
-    \b
-    Example:
-        beampose track point sample_runs/huo2015/frames/left --out results/point
-    """
+from lab.commands.common import ANY_PATH, FOLDER, NumberRange, conclude, progress_bar, read_settings
 
 
 def _place(ctx: click.Context, parameter: click.Parameter, value: str | None) -> tuple[float, float] | None:
@@ -33,7 +23,7 @@ def _place(ctx: click.Context, parameter: click.Parameter, value: str | None) ->
     return u, v
 
 
-@track.command()
+@click.command()
 @click.argument("source", metavar="VIDEO_OR_FOLDER_OR_CSV", type=ANY_PATH)
 @click.option("--out", required=True, type=FOLDER, help="Gets track.csv, summary.json and report.html.")
 @click.option(

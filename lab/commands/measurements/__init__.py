@@ -1,0 +1,1 @@
+"""Commands of the related measurements and of the published experiments."""

@@ -1,0 +1,42 @@
+"""Pictures of discs from a formula: a disc behind a Gaussian blur has, to first order, the profile of a normal law."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import norm
+
+BRIGHT, GREY, BLUR_PX = 180.0, 90.0, 1.2
+
+
+def discs(
+    circles: Sequence[tuple[float, float, float]],
+    size: tuple[int, int] = (160, 120),
+    *,
+    noise: float = 1.5,
+    seed: int = 0,
+    squeeze: float = 1.0,
+) -> NDArray[np.uint8]:
+    """Bright discs (u, v, radius) on grey, 8 bits. squeeze: height over width, which makes ellipses."""
+    x, y = np.meshgrid(np.arange(size[0], dtype=float), np.arange(size[1], dtype=float))
+    light = np.full(x.shape, GREY)
+    for u, v, radius in circles:
+        distance = np.hypot(x - u, (y - v) / squeeze)
+        light += (BRIGHT - GREY) * norm.cdf((radius - distance) / BLUR_PX)
+    return rounded(light + np.random.default_rng(seed).normal(0, noise, x.shape))
+
+
+def rounded(light: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """Eight bits."""
+    return np.clip(np.rint(light), 0, 255).astype(np.uint8)
+
+
+def covered(
+    picture: NDArray[np.uint8], columns: tuple[int, int], rows: tuple[int, int], grey: float = 60.0
+) -> NDArray[np.uint8]:
+    """The picture behind a plain plate."""
+    out = picture.copy()
+    out[max(rows[0], 0) : rows[1], max(columns[0], 0) : columns[1]] = int(grey)
+    return out

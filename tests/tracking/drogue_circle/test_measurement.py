@@ -1,0 +1,112 @@
+"""A circle is measured to a few hundredths of a pixel, also if a part of it is hidden."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.tracking.drogue_circle.discs import covered, discs
+from tracking.drogue_circle.acquisition import Wanted, acquire
+from tracking.drogue_circle.candidates import CircleCandidate, Window
+from tracking.drogue_circle.classical import classical_detector
+from tracking.drogue_circle.gradient_votes import edge_pixels, radii_of
+from tracking.drogue_circle.parameters import CircleParameters
+from tracking.drogue_circle.rim import smooth_crop
+from tracking.drogue_circle.rim_fit import fit_rim
+
+P = CircleParameters()
+DETECT = classical_detector(P)
+
+
+def fitted(picture, u, v, radius, polarity=0, hidden=None):
+    window = Window(u, v, 2 * radius + 8, 8.0, 0.75 * radius, 1.25 * radius)
+    return fit_rim(smooth_crop(picture, window, P.blur_px), CircleCandidate(u, v, radius, 1.0, polarity), 0.4, hidden)
+
+
+@pytest.mark.parametrize(("radius", "tolerance"), [(12.4, 0.05), (30.7, 0.03), (44.2, 0.03)])
+def test_the_centre_of_a_disc_is_found_to_a_few_hundredths_of_a_pixel(radius, tolerance):
+    fit = fitted(discs([(80.3, 60.6, radius)]), 81.5, 59.4, radius + 1.5)
+    assert fit is not None
+    assert fit.polarity == -1  # brighter inside
+    assert np.hypot(fit.rim.u_px - 80.3, fit.rim.v_px - 60.6) < tolerance
+    assert fit.rim.radius_px == pytest.approx(radius, abs=0.1)
+
+
+def test_a_plate_over_one_side_does_not_pull_the_centre():
+    picture = covered(discs([(80.3, 60.6, 25.0)]), (0, 76), (0, 120))  # 44 % of the rim
+    fit = fitted(picture, 81.5, 59.4, 25.5)
+    assert fit is not None
+    assert 0.4 < fit.coverage < 0.65
+    assert np.hypot(fit.rim.u_px - 80.3, fit.rim.v_px - 60.6) < 0.15
+
+
+def test_the_edges_of_a_hidden_sector_are_not_used():
+    hidden = np.zeros(32, dtype=bool)
+    hidden[:8] = True
+    fit = fitted(discs([(80.3, 60.6, 25.0)]), 80.0, 60.0, 25.0, -1, hidden)
+    assert fit is not None
+    assert fit.coverage == pytest.approx(0.75, abs=0.02)
+    assert fit.sectors[:8].min() > 0.9  # they would fit
+
+
+def test_an_oblique_disc_has_the_axes_of_its_ellipse():
+    fit = fitted(discs([(80.3, 60.6, 30.0)], squeeze=0.92), 80.3, 60.6, 29.0)
+    assert fit is not None
+    away = np.hypot(fit.rim.cos2_px, fit.rim.sin2_px)
+    assert fit.rim.radius_px + away == pytest.approx(30.0, abs=0.2)
+    assert fit.rim.radius_px - away == pytest.approx(27.6, abs=0.2)
+    assert np.hypot(fit.rim.u_px - 80.3, fit.rim.v_px - 60.6) < 0.05
+
+
+def test_the_bit_depth_does_not_matter():
+    eight = discs([(80.3, 60.6, 25.0)])
+    sixteen = eight.astype(np.uint16) * 200
+    one, other = (acquire(p, DETECT, P, Wanted()).found for p in (eight, sixteen))
+    assert one is not None
+    assert other is not None
+    np.testing.assert_allclose(one.centre_and_radius, other.centre_and_radius, atol=0.02)
+
+
+def test_noise_is_no_circle():
+    noise = np.random.default_rng(1).normal(120, 30, (200, 260)).clip(0, 255).astype(np.uint8)
+    assert acquire(noise, DETECT, P, Wanted()).circles == ()
+    assert fitted(noise, 130.0, 100.0, 20.0) is None
+
+
+def test_a_flat_picture_is_no_circle():
+    assert acquire(np.full((120, 160), 50, np.uint8), DETECT, P, Wanted()).circles == ()
+
+
+def test_votes_of_a_radius_are_divided_by_the_circumference():
+    # A whole circle of radius 12 wins against a third of one of radius 40, which has more edge pixels.
+    picture = discs([(80.0, 60.0, 40.0), (80.0, 60.0, 12.0)], noise=0.0)
+    picture = covered(picture, (0, 66), (0, 120))
+    picture[:, 66:] = np.where(np.abs(np.arange(120) - 60)[:, None] > 30, 90, picture[:, 66:])
+    best = radii_of(edge_pixels(picture, 1.0), 80.0, 60.0, (8.0, 50.0), 1)
+    assert best[0].radius_px == pytest.approx(12.0, abs=1.0)
+
+
+def test_circles_far_from_each_other_make_the_choice_ambiguous_and_a_place_resolves_it():
+    picture = discs([(45.0, 60.0, 18.0), (115.0, 60.0, 18.0)])
+    search = acquire(picture, DETECT, P, Wanted())
+    assert search.found is None
+    assert len(search.circles) == 2
+    near = acquire(picture, DETECT, P, Wanted(near_px=(110.0, 60.0), within_px=20.0)).found
+    assert near is not None
+    assert near.rim.u_px == pytest.approx(115.0, abs=0.1)
+
+
+def test_circles_about_one_centre_are_one_target():
+    search = acquire(discs([(80.0, 60.0, 40.0), (80.0, 60.0, 20.0)]), DETECT, P, Wanted())
+    assert len(search.circles) == 1
+    assert search.found is not None
+
+
+@pytest.mark.slow
+def test_the_covariance_is_that_of_the_errors():
+    from lab.drogue_circle.experiment import still_errors
+
+    errors = still_errors(77, 150)
+    for hidden in (0.0, 0.2, 0.4):
+        assert 0.6 < np.mean(errors.nees_centre[errors.hidden == hidden]) / 2 < 1.7
+    assert errors.median("ours") < 0.2 < min(errors.median("opencv"), errors.median("printed"))

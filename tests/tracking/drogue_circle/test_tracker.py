@@ -1,0 +1,135 @@
+"""The tracker follows its circle, predicts it while it is hidden, and reports nothing where nothing is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.tracking.drogue_circle.discs import covered, discs
+from tracking.drogue_circle.candidates import CircleCandidate
+from tracking.drogue_circle.classical import classical_detector
+from tracking.drogue_circle.frames import Cause
+from tracking.drogue_circle.parameters import CircleParameters
+from tracking.drogue_circle.printed import PrintedTracker
+from tracking.drogue_circle.tracker import CircleTracker
+from tracking.statuses import PoseStatus
+
+P = CircleParameters()
+
+
+def new_tracker(**options):
+    return CircleTracker(classical_detector(P), P, **options)
+
+
+def place(k):
+    """u, v, radius of frame k: steady motion and a slow approach."""
+    return 60.0 + 1.3 * k, 50.0 + 0.6 * k, 16.0 + 0.1 * k
+
+
+def test_a_moving_disc_is_followed_with_its_rates():
+    tracker = new_tracker()
+    for k in range(15):
+        frame = tracker.step(discs([place(k)], seed=k))
+        assert frame.status is PoseStatus.MEASURED
+        assert np.hypot(*(frame.state[:2] - place(k)[:2])) < 0.1
+    np.testing.assert_allclose(frame.state[3:], [1.3, 0.6, 0.1], atol=0.05)
+    assert frame.occlusion < 0.1
+
+
+def test_a_disc_that_is_fully_hidden_for_eight_frames_is_predicted_within_two_pixels():
+    tracker = new_tracker()
+    for k in range(30):
+        u, v, radius = place(k)
+        picture = discs([(u, v, radius)], seed=k)
+        hidden = 14 <= k < 22
+        if hidden:
+            picture = covered(picture, (int(u - 30), int(u + 30)), (int(v - 30), int(v + 30)))
+        frame = tracker.step(picture)
+        assert frame.status is (PoseStatus.PREDICTED if hidden else PoseStatus.MEASURED)
+        assert np.hypot(frame.state[0] - u, frame.state[1] - v) < 2.0
+        if hidden:
+            assert frame.cause is Cause.OCCLUDED
+            assert frame.occlusion > 0.5
+
+
+def test_a_second_equal_disc_does_not_take_over():
+    tracker = new_tracker()
+    for k in range(4, 22):
+        u, v, radius = place(k)
+        other = (160.0 - 2.0 * k, 30.0 + v, radius)  # passes below
+        frame = tracker.step(discs([(u, v, radius), other] if k > 6 else [(u, v, radius)], size=(220, 160), seed=k))
+        assert np.hypot(frame.state[0] - u, frame.state[1] - v) < 0.5
+
+
+def test_two_equal_discs_at_the_start_are_not_guessed():
+    frame = new_tracker().step(discs([(45.0, 60.0, 18.0), (115.0, 60.0, 18.0)]))
+    assert (frame.status, frame.cause, frame.circles) == (PoseStatus.LOST, Cause.AMBIGUOUS, 2)
+    assert np.isnan(frame.state).all()
+    frame = new_tracker(near_px=(45.0, 60.0)).step(discs([(45.0, 60.0, 18.0), (115.0, 60.0, 18.0)]))
+    assert frame.state[0] == pytest.approx(45.0, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    "picture",
+    [
+        np.full((120, 160), 90, np.uint8),
+        np.random.default_rng(2).normal(120, 25, (120, 160)).clip(0, 255).astype(np.uint8),
+        discs([(80.0, 60.0, 120.0)]),  # larger than the picture
+        discs([(80.0, -40.0, 70.0)]),  # an arc at the edge
+        np.tile(np.arange(160, dtype=np.uint8), (120, 1)),
+    ],
+)
+def test_without_a_circle_in_view_nothing_is_reported(picture):
+    tracker = new_tracker()
+    for _ in range(3):
+        frame = tracker.step(picture)
+        assert (frame.status, frame.cause) == (PoseStatus.LOST, Cause.NOT_FOUND)
+
+
+def test_a_disc_that_leaves_the_picture_is_lost_and_found_again():
+    tracker = new_tracker()
+    frames = [tracker.step(discs([(80.0 + 6 * k, 60.0, 16.0)], seed=k)) for k in range(16)]
+    assert frames[5].status is PoseStatus.MEASURED
+    assert not any(f.status is PoseStatus.MEASURED for f in frames[14:])  # less than half of it is in view
+    for k in range(6):
+        frame = tracker.step(discs([(90.0, 60.0, 16.0)], seed=100 + k))
+    assert frame.status is PoseStatus.MEASURED
+    assert frame.state[0] == pytest.approx(90.0, abs=0.1)
+
+
+def test_a_sudden_jump_is_found_by_the_search_of_the_whole_picture():
+    tracker = new_tracker()
+    for k in range(10):
+        tracker.step(discs([(50.0, 50.0, 16.0)], seed=k))
+    events = []
+    for k in range(8):
+        frame = tracker.step(discs([(110.0, 80.0, 16.0)], seed=50 + k))
+        events.append(frame.event)
+    assert "reacquired" in events
+    assert frame.state[0] == pytest.approx(110.0, abs=0.1)
+
+
+def test_missing_pictures_are_predicted_and_then_lost():
+    tracker = new_tracker()
+    for k in range(8):
+        tracker.step(discs([place(k)], seed=k))
+    frames = [tracker.step(None) for _ in range(P.most_predicted + 1)]
+    assert (frames[0].status, frames[0].cause) == (PoseStatus.PREDICTED, Cause.NO_IMAGE)
+    assert frames[0].state[0] == pytest.approx(place(8)[0], abs=0.3)
+    assert frames[-1].status is PoseStatus.LOST
+    assert new_tracker().step(None).cause is Cause.NO_IMAGE
+
+
+def test_any_detector_that_proposes_coarse_circles_can_be_used():
+    def rough(picture, window):
+        return [CircleCandidate(82.0, 58.5, 21.0, 1.0)]  # polarity unknown
+
+    frame = CircleTracker(rough, P).step(discs([(80.3, 60.2, 20.0)]))
+    assert np.hypot(frame.state[0] - 80.3, frame.state[1] - 60.2) < 0.05
+
+
+def test_the_printed_form_follows_a_clear_disc_to_a_pixel_or_two():
+    tracker = PrintedTracker(classical_detector(P), P)
+    for k in range(15):
+        frame = tracker.step(discs([place(k)], seed=k))
+        assert np.hypot(*(frame.state[:2] - place(k)[:2])) < 3.0

@@ -1,0 +1,120 @@
+"""A circle found in the whole picture, without a prediction; several circles make the choice ambiguous."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from tracking.drogue_circle.candidates import CircleCandidate, CircleDetector, Picture, Window
+from tracking.drogue_circle.parameters import CircleParameters
+from tracking.drogue_circle.rim import smooth_crop
+from tracking.drogue_circle.rim_fit import RimFit, fit_rim
+
+_MOST_FITTED = 24  # of the whole picture
+_SAME_CENTRE = 0.6  # distance of two centres, as a share of the larger radius, below which they are one target
+_RIM_SHARE = 0.92  # score of the outermost circle of a target, as a share of the best one's, that makes it the rim
+_LEAST_POINTS = 12  # independent edge points: texture often gives a short arc of a small circle
+_CORRELATED_PX = 3.5  # length of rim that counts as one point, see `rim_fit`
+_LARGEST_RMS = 0.05, 0.35  # of the rim points: share of the radius, and px
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """What is known about the circle before it is found; None: unknown."""
+
+    near_px: tuple[float, float] | None = None  # its centre, within `within_px`
+    within_px: float = 0.0
+    radius_px: float | None = None  # within a factor of `radius_factor`
+    radius_factor: float = 1.5
+    polarity: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Acquisition:
+    """The outcome of a search of the whole picture."""
+
+    found: RimFit | None  # None: no circle, or the choice is ambiguous
+    circles: tuple[RimFit, ...]  # all separate circles, the best first
+
+
+def acquire(picture: Picture, detector: CircleDetector, p: CircleParameters, wanted: Wanted) -> Acquisition:
+    """Search the whole picture for the circle. Circles about one centre are one target: its outermost is returned."""
+    fits = sorted(_fitted(picture, detector(picture, None), p, wanted), key=lambda f: -f.score)
+    targets: list[RimFit] = []
+    while fits:
+        own = [f for f in fits if _is_same(f, fits[0])]
+        # The inner circles of a target may be off its centre: those of a drogue lie deeper.
+        targets.append(max((f for f in own if f.score >= _RIM_SHARE * own[0].score), key=lambda f: f.rim.radius_px))
+        fits = [f for f in fits if not any(f is o for o in own) and not _is_same(f, targets[-1])]
+    clear = len(targets) == 1 or (len(targets) > 1 and targets[1].score < p.ambiguous_share * targets[0].score)
+    return Acquisition(targets[0] if clear else None, tuple(targets))
+
+
+def _fitted(
+    picture: Picture, candidates: Sequence[CircleCandidate], p: CircleParameters, wanted: Wanted
+) -> list[RimFit]:
+    """The candidates that fit a rim and what is wanted."""
+    fits: list[RimFit] = []
+    tried: list[CircleCandidate] = []
+    for c in candidates:
+        if len(tried) >= _MOST_FITTED:
+            break
+        if not _may_be(c, wanted) or any(_is_near(c, t) for t in tried):
+            continue
+        tried.append(c)
+        half = 1.3 * c.radius_px + 10
+        window = Window(c.u_px, c.v_px, half, p.gate_px, p.min_radius_px, 2 * c.radius_px)
+        fit = fit_rim(smooth_crop(picture, window, p.blur_px), c, p.acquire_coverage)
+        largest = p.max_radius_px or 0.5 * max(picture.shape[:2])
+        if (
+            fit is not None
+            and p.min_radius_px <= fit.rim.radius_px <= largest
+            and is_certain(fit)
+            and _fits(fit, wanted)
+        ):
+            fits.append(fit)
+    return fits
+
+
+def is_certain(fit: RimFit) -> bool:
+    """Whether a rim has enough precise edge points that texture does not imitate it."""
+    points = fit.coverage * 2 * np.pi * fit.rim.radius_px / _CORRELATED_PX
+    return bool(points >= _LEAST_POINTS and fit.rms_px <= _LARGEST_RMS[0] * fit.rim.radius_px + _LARGEST_RMS[1])
+
+
+def _may_be(c: CircleCandidate, wanted: Wanted) -> bool:
+    """Whether a coarse circle may be the wanted one, with a margin for its errors."""
+    if wanted.near_px is not None:
+        away = np.hypot(c.u_px - wanted.near_px[0], c.v_px - wanted.near_px[1])
+        if away > wanted.within_px + 0.3 * c.radius_px + 4:
+            return False
+    if wanted.radius_px is not None and not _within(c.radius_px / wanted.radius_px, 1.3 * wanted.radius_factor):
+        return False
+    return not (wanted.polarity and c.polarity and c.polarity != wanted.polarity)
+
+
+def _fits(fit: RimFit, wanted: Wanted) -> bool:
+    if wanted.near_px is not None:
+        away = np.hypot(fit.rim.u_px - wanted.near_px[0], fit.rim.v_px - wanted.near_px[1])
+        if away > wanted.within_px:
+            return False
+    if wanted.radius_px is not None and not _within(fit.rim.radius_px / wanted.radius_px, wanted.radius_factor):
+        return False
+    return not wanted.polarity or fit.polarity == wanted.polarity
+
+
+def _within(ratio: float, factor: float) -> bool:
+    return 1 / factor <= ratio <= factor
+
+
+def _is_near(c: CircleCandidate, other: CircleCandidate) -> bool:
+    """Whether two coarse circles are the same."""
+    close = np.hypot(c.u_px - other.u_px, c.v_px - other.v_px) < max(2.0, 0.15 * c.radius_px)
+    return bool(close and abs(c.radius_px - other.radius_px) < 2.5 and c.polarity == other.polarity)
+
+
+def _is_same(fit: RimFit, other: RimFit) -> bool:
+    away = np.hypot(fit.rim.u_px - other.rim.u_px, fit.rim.v_px - other.rim.v_px)
+    return bool(away < _SAME_CENTRE * max(fit.rim.radius_px, other.rim.radius_px))

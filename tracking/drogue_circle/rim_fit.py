@@ -1,0 +1,232 @@
+"""Robust geometric fit of a circle, or of a slightly oblique one, to the edge points of a rim, with covariance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from geometry.arrays import Array, Bools, symmetric
+from tracking.drogue_circle.candidates import CircleCandidate
+from tracking.drogue_circle.rim import Rim, RimPoints, SmoothCrop, median, rim_points
+
+_TUKEY = 4.685  # Tukey's biweight, 95 % efficiency for normal errors
+_LEAST_SIGMA_PX = 0.02  # of an edge point: interpolation, and pixels that are not points
+_MODEL_SIGMA_PX = 0.005  # of the fit: rims are not exact circles
+_BLUR_SIGMA = 0.5  # 1 sigma of the correction for blur, as a share of it
+_ELLIPSE_COVERAGE = 0.7  # share of the rim that determines an ellipse
+_ELLIPSE_F = 8.0  # F value of its two parameters, above which they are kept
+_LEAST_DETERMINANT = 1e-6
+_ON_RIM_PX = 0.5  # least distance from the rim at which an edge counts as on it
+SECTORS = 32
+_FAR_PX = 0.7  # a last pass that moves the rim by more is repeated
+_ENOUGH_PX = 0.3  # a pass that moves the rim by less is not repeated
+_PASSES = ((4.0, 2.0), (2.5, 1.0), (2.0, 0.0))  # half width of the rays and least scale of the residuals, px
+
+
+@dataclass(frozen=True, slots=True)
+class RimFit:
+    """A circle fitted to the rim."""
+
+    rim: Rim
+    covariance_px2: Array  # (3, 3) of u, v, radius
+    coverage: float  # share of the whole rim with edge points that fit
+    rms_px: float  # of these points
+    slope_dn: float  # median slope of the rim, DN/px
+    polarity: int
+    score: float  # coverage, reduced by residuals
+    sectors: Array  # (SECTORS,) share of the rays of a sector whose edge lies on the rim, hidden ones too
+
+    @property
+    def centre_and_radius(self) -> Array:
+        """(3,) u, v, radius, px."""
+        return np.array(self.circle)
+
+    @property
+    def circle(self) -> tuple[float, float, float]:
+        """u, v, radius, px."""
+        return self.rim.u_px, self.rim.v_px, self.rim.radius_px
+
+    def is_equal(self, other: RimFit) -> bool:
+        """Whether two fits are the same circle, to a twentieth of a pixel."""
+        away = np.abs(self.centre_and_radius - other.centre_and_radius)
+        return bool(self.polarity == other.polarity and away.max() < 0.05)
+
+
+def fit_rim(
+    crop: SmoothCrop, coarse: CircleCandidate, min_coverage: float, hidden: Bools | None = None, sure: bool = False
+) -> RimFit | None:
+    """Fit a coarse circle to the rim near it. None: too little of a rim is there.
+
+    A candidate of unknown polarity is fitted with both, and the better one is returned. hidden: sectors (k,) of equal
+    angles, from +u towards +v, whose edges belong to an occluder. sure: the coarse circle is accurate to a pixel,
+    so that the wider passes are left out.
+    """
+    if coarse.polarity == 0:
+        both = [fit_rim(crop, _with_polarity(coarse, p), min_coverage, hidden) for p in (1, -1)]
+        return max((f for f in both if f is not None), key=lambda f: f.score, default=None)
+    rim = Rim(coarse.u_px, coarse.v_px, coarse.radius_px)
+    least = 0.7 * min_coverage
+    for half_px, scale_px in () if sure else _PASSES[:-1]:
+        points = rim_points(crop, rim, min(half_px, 0.4 * rim.radius_px), coarse.polarity, hidden)
+        fitted = _solve(rim, points, scale_px, oblique=False)
+        if fitted is None or np.mean(fitted[1] > 0) < least or not _is_near(fitted[0], coarse):
+            return None
+        moved = np.hypot(fitted[0].u_px - rim.u_px, fitted[0].v_px - rim.v_px)
+        rim = fitted[0]
+        if moved < _ENOUGH_PX:
+            break
+    points = rim_points(crop, rim, _PASSES[-1][0], coarse.polarity, hidden)
+    circle = _solve(rim, points, _PASSES[-1][1], oblique=False)
+    if circle is not None and np.hypot(circle[0].u_px - rim.u_px, circle[0].v_px - rim.v_px) > _FAR_PX:
+        rim = circle[0]
+        points = rim_points(crop, rim, _PASSES[-1][0], coarse.polarity, hidden)
+        circle = _solve(rim, points, _PASSES[-1][1], oblique=False)
+    if circle is None:
+        return None
+    rim, weight = circle
+    if _looks_oblique(points, rim):
+        oblique = _oblique_fit(crop, rim, points, weight, coarse.polarity, hidden)
+        if oblique is not None:
+            rim, points, weight = oblique
+    return _described(rim, points, weight, coarse, min_coverage)
+
+
+def _with_polarity(coarse: CircleCandidate, polarity: int) -> CircleCandidate:
+    return CircleCandidate(coarse.u_px, coarse.v_px, coarse.radius_px, coarse.score, polarity)
+
+
+def _is_near(rim: Rim, coarse: CircleCandidate) -> bool:
+    moved = float(np.hypot(rim.u_px - coarse.u_px, rim.v_px - coarse.v_px))
+    return moved < max(6.0, 0.3 * coarse.radius_px) and abs(rim.radius_px / coarse.radius_px - 1) < 0.35
+
+
+def _design(theta: Array, oblique: bool) -> Array:
+    """Derivatives (n, 3 or 5) of the distance of a rim along the rays by u, v, radius, cos2 and sin2."""
+    columns = [np.cos(theta), np.sin(theta), np.ones_like(theta)]
+    return np.stack(columns + ([np.cos(2 * theta), np.sin(2 * theta)] if oblique else []), axis=-1)
+
+
+def _solve(rim: Rim, points: RimPoints, least_scale_px: float, oblique: bool) -> tuple[Rim, Array] | None:
+    """Iteratively reweighted least squares with Tukey's weights. Returns the rim and the weights (n,) of the points.
+
+    The points are distances from the old centre along rays; to first order the shift of the centre is linear in them,
+    and the second-order term, the square of the tangential shift over twice the radius, is subtracted.
+    """
+    found = np.flatnonzero(np.isfinite(points.radius_px))
+    A = _design(points.theta[found], oblique)
+    count = A.shape[1]
+    if len(found) < 3 * count:
+        return None
+    cosine, sine = A[:, 0], A[:, 1]
+    observed = points.radius_px[found]
+    start = np.array([0.0, 0.0, rim.radius_px, rim.cos2_px, rim.sin2_px])[:count]
+    if not oblique:  # a robust start: median radius
+        start[2] = rim.radius_px + float(np.clip(np.median(observed - rim.radius_px), -2.0, 2.0))
+    x, weight = start, np.ones(len(found))
+    for _ in range(12):
+        bend = (x[0] * sine - x[1] * cosine) ** 2 / (2 * max(x[2], 1.0))
+        residual = observed - A @ x + bend
+        scale = max(1.4826 * median(np.abs(residual)), least_scale_px / _TUKEY, _LEAST_SIGMA_PX)
+        weight = np.maximum(1 - (residual / (_TUKEY * scale)) ** 2, 0.0) ** 2
+        normal = (A * weight[:, None]).T @ A
+        # The columns have entries of the size of 1: a small determinant means an arc too short for the parameters.
+        if np.linalg.det(normal) < _LEAST_DETERMINANT * max(float(weight.sum()), 1e-9) ** count:
+            return None
+        step = np.linalg.solve(normal, A.T @ (weight * residual))
+        x = x + step
+        if np.abs(step).max() < (1e-3 if least_scale_px == 0 else 0.03):
+            break
+    if not 1.0 < x[2] < 2 * rim.radius_px:
+        return None
+    full = np.zeros(len(points.theta))
+    full[found] = weight
+    return Rim(rim.u_px + float(x[0]), rim.v_px + float(x[1]), *map(float, x[2:])), full
+
+
+def _oblique_fit(
+    crop: SmoothCrop, rim: Rim, points: RimPoints, weight: Array, polarity: int, hidden: Bools | None
+) -> tuple[Rim, RimPoints, Array] | None:
+    """The fit with the two parameters of an ellipse, if they explain the residuals better than chance does."""
+    before = _sum_of_squares(rim, points, weight)
+    once = _solve(rim, points, 1.0, oblique=True)
+    if once is None or np.hypot(once[0].cos2_px, once[0].sin2_px) > 0.25 * rim.radius_px:
+        return None
+    again = rim_points(crop, once[0], 2.0, polarity, hidden)
+    final = _solve(once[0], again, 0.0, oblique=True)
+    if final is None or np.mean(final[1] > 0) < _ELLIPSE_COVERAGE:
+        return None
+    independent = max(_independent(again, final[1]) - 5, 1.0)
+    gained = before / max(_sum_of_squares(final[0], again, final[1]), 1e-12) - 1
+    return (final[0], again, final[1]) if 0.5 * gained * independent > _ELLIPSE_F else None
+
+
+def _looks_oblique(points: RimPoints, rim: Rim) -> bool:
+    """Whether the distances of all edge points, the rejected ones too, follow an ellipse."""
+    found = np.isfinite(points.radius_px)
+    if found.mean() < _ELLIPSE_COVERAGE:
+        return False
+    away = points.radius_px[found] - rim.radius_at(points.theta[found])
+    both = np.array([np.mean(away * np.cos(2 * points.theta[found])), np.mean(away * np.sin(2 * points.theta[found]))])
+    return bool(2 * np.hypot(*both) > 0.7 * np.std(away))
+
+
+def _sum_of_squares(rim: Rim, points: RimPoints, weight: Array) -> float:
+    """Mean square of the residuals of the points with weight, px^2."""
+    away = _residuals(rim, points)[weight > 0]
+    return float(np.mean(away**2)) if away.size else np.inf
+
+
+def _residuals(rim: Rim, points: RimPoints) -> Array:
+    """Residuals (n,) of the last step; nan without an edge. The rays start at the rim's old centre, at most 1e-2 px
+    from the new one after three passes."""
+    return points.radius_px - rim.radius_at(points.theta)
+
+
+def _independent(points: RimPoints, weight: Array) -> float:
+    return float(np.count_nonzero(weight)) / max(3.5 / max(points.spacing_px, 0.3), 1.0)
+
+
+def _described(
+    rim: Rim, points: RimPoints, weight: Array, coarse: CircleCandidate, min_coverage: float
+) -> RimFit | None:
+    """The fit with its covariance; None where it covers too little of the rim."""
+    good = weight > 0
+    coverage = float(np.mean(good))
+    if coverage < min_coverage:
+        return None
+    oblique = bool(rim.cos2_px or rim.sin2_px)
+    A = _design(points.theta[good], oblique)
+    count = A.shape[1]
+    away = _residuals(rim, points)
+    residual = away[good] - A @ np.linalg.lstsq(A, away[good], rcond=None)[0]
+    correlated = _correlation_length(away, good, points.spacing_px)
+    independent = max(len(residual) / correlated, count + 3.0)
+    variance = max(float(np.mean(residual**2)), _LEAST_SIGMA_PX**2) * independent / (independent - count)
+    covariance = variance * correlated * np.linalg.inv(A.T @ A)
+    covariance = symmetric(covariance[:3, :3]) + _MODEL_SIGMA_PX**2 * np.eye(3)
+    covariance[2, 2] += (_BLUR_SIGMA * points.shift_px) ** 2
+    rms = float(np.sqrt(np.mean(residual**2)))
+    slope = median(points.slope[good])
+    on_rim = np.abs(points.any_radius_px - rim.radius_at(points.theta)) < max(3 * rms, _ON_RIM_PX)
+    sector = np.arange(len(on_rim)) * SECTORS // len(on_rim)
+    sectors = np.bincount(sector, on_rim, SECTORS) / np.maximum(np.bincount(sector, minlength=SECTORS), 1)
+    return RimFit(rim, covariance, coverage, rms, slope, coarse.polarity, coverage / (1 + rms), sectors)
+
+
+def _correlation_length(away: Array, good: Bools, spacing_px: float) -> float:
+    """Number of neighbouring edge points that count as one: 1 + 2 sum of the correlations (Bartlett's weights).
+
+    At least 1.8 points 1 px apart, measured: white noise behind the Gaussian filter has the correlation
+    exp(-d^2 / 4 sigma^2), whose sum is 3.5, but the errors of pixels and interpolation are less correlated.
+    """
+    least = max(1.8 / spacing_px, 1.0)
+    values = np.where(good, away, 0.0) - np.where(good, np.mean(away[good]), 0.0)
+    power = float(np.sum(values**2))
+    if power <= 0:
+        return least
+    lags = int(min(max(12 / spacing_px, 4), len(away) // 6))
+    # The products of all pairs at one distance, around the rim: the inverse transform of the power spectrum.
+    products = np.fft.irfft(np.abs(np.fft.rfft(values)) ** 2, len(values))[1 : lags + 1]
+    total = 1 + 2 * float(np.sum((1 - np.arange(1, lags + 1) / (lags + 1)) * products)) / power
+    return max(total, least)
