@@ -27,7 +27,8 @@ _HOSTILE_OPTIONS = ("--set", "plan options", "simulate options", "names", "compa
 
 @pytest.mark.parametrize("kind", [k for k in KINDS if k not in _HOSTILE_OPTIONS])
 def test_the_inputs_are_valid_before_they_are_damaged(kind, base, tmp_path, monkeypatch):
-    monkeypatch.setattr("bench.fuzz.cases.damage_file", lambda path, rng: None)
+    for module in ("cases", "result_cases"):
+        monkeypatch.setattr(f"bench.fuzz.{module}.damage_file", lambda path, rng: None)
     (tmp_path / "work").mkdir()
     command = next(c for k, c in (_case(n, base, tmp_path) for n in range(500)) if k == kind)
     status, out, err, fault = run_command(command)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from lab.commands.common import ANY_PATH, FOLDER, NumberRange, progress_bar, show_line
+from lab.commands.common import ANY_PATH, FOLDER, NumberRange, complain, progress_bar, show_line
 from lab.errors import InputError
 
 
@@ -70,4 +70,4 @@ def report(
             )
         show_line(f"video: {done.path} ({done.frames} frames)")
         for note in done.notes:
-            click.echo(f"beampose: {note}", err=True)
+            complain(note)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from lab.commands.common import FOLDER, progress_bar, show_line
+from lab.commands.common import FOLDER, complain, progress_bar, show_line
 
 
 @click.command()
@@ -34,4 +34,4 @@ def show(path: Path, frame: int, camera: str | None, out: Path | None, run_folde
     write_picture(shown.image, file)
     show_line(f"picture: {file}")
     for note in shown.notes:
-        click.echo(f"beampose: {note}", err=True)
+        complain(note)

@@ -56,7 +56,8 @@ def test_unforeseen_errors_are_rows_with_the_places_of_their_tracebacks(tmp_path
     first, *others = bad
     monkeypatch.setattr(task, "process_run", original)
     for folder in others:
-        (tmp_path / "out/errors" / f"{folder.name}.txt").unlink()
+        for suffix in (".txt", ".html"):
+            (tmp_path / "out/errors" / f"{folder.name}{suffix}").unlink()
     assert process_batch([first], tmp_path / "out").exit_status == 0
     assert not (tmp_path / "out/errors").exists()
 
