@@ -113,7 +113,7 @@ def _model(fit: ModelFit | None) -> Evidence:
 
 
 def _residuals(m: ReportData) -> list[Evidence]:
-    """The residuals by camera and by beam, px RMS, and over the size expected from the stated sigmas."""
+    """The residuals by camera and by beam: median, px, and RMS over the size expected from the stated sigmas."""
     if m.residual_px is None or m.run is None or not m.residual_share:
         return [Evidence(UNKNOWN, "Residuals", "not known without the run folder's rig, or without a measured pose")]
     beams = {name: spot.beam for name, spot in m.run.rig.spots.items()}
@@ -128,17 +128,16 @@ def _residuals(m: ReportData) -> list[Evidence]:
             r, sigma = m.residual_px[:, own], m.spots.sigma_px[:, own]
             if np.isfinite(r).any():
                 ratio = float(np.sqrt(np.nanmean((r / sigma) ** 2) / m.residual_share))
-                parts.append(f"{group} {format_number(_rms(r), 2)} px ({format_number(ratio, 2)} × expected)")
+                parts.append(f"{group} {format_number(_median(r), 2)} px ({format_number(ratio, 2)} × expected)")
                 largest = max(largest, ratio)
         if parts:
             out.append(Evidence(LOOK if largest > _LARGE else GOOD, name, ", ".join(parts)))
     return out or [Evidence(UNKNOWN, "Residuals", "no frame has a measured pose")]
 
 
-def _rms(r: Array) -> float:
-    """The RMS length of vectors (..., 2) with nan."""
-    lengths = np.linalg.norm(r, axis=-1)
-    return float(np.sqrt(np.nanmean(lengths**2)))
+def _median(r: Array) -> float:
+    """The median length of vectors (..., 2) with nan: a few spots that merge with false ones do not change it."""
+    return float(np.nanmedian(np.linalg.norm(r, axis=-1)))
 
 
 def _labels(m: ReportData) -> Evidence:
