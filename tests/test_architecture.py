@@ -216,9 +216,14 @@ def test_formulas_use_only_numerical_packages(floor):
 def test_what_the_program_imports_is_declared_in_pyproject():
     declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     extras = declared["optional-dependencies"]
-    required = [*declared["dependencies"], *extras["parquet"], *extras["cluster"]]
+    required = [*declared["dependencies"], *extras["parquet"], *extras["cluster"], *extras["training"]]
     names = {canonicalize_name(Requirement(requirement).name) for requirement in required}
-    not_everywhere = {"open3d": ["open3d"], "libusb_package": ["libusb-package"], "pyarrow": ["pyarrow"]}
+    not_everywhere = {
+        "open3d": ["open3d"],
+        "libusb_package": ["libusb-package"],
+        "pyarrow": ["pyarrow"],
+        "torch": ["torch"],
+    }
     distributions = not_everywhere | packages_distributions()
     used = set().union(*(foreign_packages(ROOT, floor) for floor in FLOORS))
     assert {"numpy", "scipy"} <= used

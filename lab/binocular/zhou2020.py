@@ -16,6 +16,7 @@ from lab.binocular.distance_experiment import (
     pose_errors,
 )
 from lab.binocular.simulated_recording import drogue_markers, occluded, render, scene, true_pixels
+from lab.learned_detector.study import detector_rows
 from lab.report.plot.axes import axes, frame, note, plot_area, svg_of
 from lab.report.plot.svg import BLUE, GREEN, ORANGE, VERMILLION, dots, line_path, text
 from lab.study.comparison import Comparison, ComparisonRow, Figure
@@ -39,6 +40,7 @@ def compare_zhou2020(seed: int = 1, trials: int = TRIALS) -> Comparison:
     distances = [distance_errors(row[0], trials, NOISE_PX, rng) for row in TABLE_3]
     poses = pose_errors(4 * trials, NOISE_PX, rng)
     rows = [*_distance_rows(distances), *_pose_rows(poses), *_centroid_rows(seed), *_angle_rows()]
+    rows += detector_rows(seed, len(METHODS))
     return Comparison(
         title="Zhou, Xu & Jia (2020), section 5: binocular drogue pose",
         setting=f"f {FOCAL_PX:g} px (from the printed field of view) · baseline {BASELINE_M:g} m (not printed) ·"

@@ -12,11 +12,15 @@ from tracking.drogue_circle.classical import classical_detector
 from tracking.drogue_circle.parameters import CircleParameters
 from tracking.drogue_circle.printed import PrintedTracker
 from tracking.drogue_circle.tracker import CircleTracker
+from tracking.learned_detector.detector import learned_detector
 
 Tracker: TypeAlias = CircleTracker | PrintedTracker
 
 # Name for --detector: its maker. Another detector needs its line here; the rim fit after it is the same for all.
-DETECTORS: Mapping[str, Callable[[CircleParameters], CircleDetector]] = {"classical": classical_detector}
+DETECTORS: Mapping[str, Callable[[CircleParameters], CircleDetector]] = {
+    "classical": classical_detector,
+    "learned": lambda p: learned_detector(p.min_radius_px, p.max_radius_px),
+}
 SOUND, PRINTED = "sound", "printed"
 FORMS = (SOUND, PRINTED)
 DEFAULT_RATE_HZ = 25.0  # of a folder of pictures, whose rate is not known

@@ -13,7 +13,7 @@ from tests.test_architecture import FLOORS, foreign_packages
 # Libraries without influence on numbers: the command line, reports, and reading of settings.
 WITHOUT_NUMBERS = {
     *("click", "contourpy", "distributed", "filelock", "fpdf", "jinja2", "libusb_package", "markupsafe"),
-    *("pyarrow", "pydantic", "pydantic_core", "rich", "yaml"),
+    *("pyarrow", "pydantic", "pydantic_core", "rich", "torch", "yaml"),
 }
 
 

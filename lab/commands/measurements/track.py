@@ -45,8 +45,8 @@ track.add_command(point)
     "--detector",
     default="classical",
     show_default=True,
-    type=click.Choice(["classical"]),
-    help="What proposes circles.",
+    type=click.Choice(["classical", "learned"]),
+    help="What proposes circles: votes of gradients, or a network that was trained on rendered drogues.",
 )
 @click.option("--limit", type=click.IntRange(min=1), help="Use at most this many pictures.")
 @click.option("--video", is_flag=True, help="Also write overlay.avi: the pictures with the circle drawn into them.")

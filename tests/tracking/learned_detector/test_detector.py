@@ -1,0 +1,73 @@
+"""The learned detector finds drogues of all sizes before backgrounds that training does not show."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from bench.related_measurements.learned_detector import calibration, is_right, recall_at, reliability
+from lab.learned_detector.samples import draw_sample
+from tracking.drogue_circle.candidates import Window
+from tracking.learned_detector import detector
+from tracking.learned_detector.detector import DrogueCandidate, find_drogues, learned_detector
+
+
+@pytest.fixture(scope="module")
+def samples():
+    rng = np.random.default_rng(31)
+    return [draw_sample(rng, (320, 240), (12.0, 120.0), unseen=True, empty=False) for _ in range(24)]
+
+
+def test_most_drogues_are_the_most_confident_candidate(samples):
+    found = [find_drogues(s.image, 10.0) for s in samples]
+    assert np.mean([bool(f) and is_right(s, f[0]) for s, f in zip(samples, found, strict=True)]) >= 0.9
+
+
+def test_pictures_without_a_drogue_have_no_confident_candidate():
+    rng = np.random.default_rng(32)
+    empty = [draw_sample(rng, (320, 240), (12.0, 120.0), empty=True).image for _ in range(12)]
+    assert np.mean([any(c.confidence > 0.7 for c in find_drogues(e, 10.0)) for e in empty]) <= 0.1
+
+
+def test_a_window_gives_the_drogue_at_its_place_and_nothing_outside_its_gate(samples):
+    sample = next(s for s in samples if 16 < s.diameter_px < 90 and is_right(s, find_drogues(s.image, 10.0)[0]))
+    (u, v), radius = sample.centre_px, sample.diameter_px / 2
+    detect = learned_detector(5.0)
+    near = detect(sample.image, Window(u + 2, v - 2, 2 * radius, 8.0 + 0.2 * radius, 0.7 * radius, 1.4 * radius))
+    assert near
+    assert np.hypot(near[0].u_px - u, near[0].v_px - v) < 0.2 * sample.diameter_px
+    away = detect(sample.image, Window(u + 40, v, 2 * radius, 8.0, 0.7 * radius, 1.4 * radius))
+    assert all(np.hypot(c.u_px - u - 40, c.v_px - v) <= 8.0 for c in away)
+
+
+def test_sixteen_bits_and_odd_sizes_give_the_same_drogue(samples):
+    sample = samples[0]
+    best = find_drogues(sample.image, 10.0)[0]
+    cut = (sample.image[: 240 - 3, : 320 - 5].astype(np.uint16)) * 257
+    same = find_drogues(cut, 10.0)[0]
+    assert abs(same.u_px - best.u_px) < 0.1 * best.diameter_px
+
+
+def test_colour_pictures_and_damaged_weights_are_errors_with_a_remedy(tmp_path, monkeypatch):
+    with pytest.raises(ValueError, match="grey picture"):
+        find_drogues(np.zeros((10, 10, 3), np.uint8))
+    (tmp_path / "weights.onnx").write_bytes(b"\x08\x07damaged")
+    monkeypatch.setattr(detector, "WEIGHTS", tmp_path / "weights.onnx")
+    detector._network.cache_clear()
+    with pytest.raises(ValueError, match="install beampose again"):
+        find_drogues(np.zeros((64, 64), np.uint8))
+    monkeypatch.undo()
+    detector._network.cache_clear()
+
+
+def test_the_figures_of_the_bench_follow_from_the_candidates(samples):
+    score, right = np.array([0.9, 0.8, 0.7, 0.6]), np.array([True, False, True, False])
+    recall, threshold = recall_at(samples[:4], score, right, 0.25)
+    assert (recall, threshold) == (0.5, 0.7)
+    assert reliability(score, right)[-1][2] == 1
+    rng = np.random.default_rng(1)
+    p = rng.uniform(0.02, 0.98, 20000)
+    slope, offset = calibration(p, rng.random(20000) < p)
+    assert abs(slope - 1) < 0.05
+    assert abs(offset) < 0.05
+    assert not is_right(samples[0], DrogueCandidate(*samples[0].centre_px, 3 * samples[0].diameter_px, 1.0))

@@ -1,0 +1,1 @@
+"""Learned detector of drogues: a small network on an image pyramid, run by OpenCV."""
