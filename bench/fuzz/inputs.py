@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from importlib.util import find_spec
 from pathlib import Path
 
 import cv2
@@ -16,6 +17,7 @@ from lab.runs.process import process_run
 from lab.simulate.write import simulate
 
 ROOT = Path(__file__).resolve().parents[2]
+HAS_PYARROW = find_spec("pyarrow") is not None  # an extra: without it no Parquet
 PICTURE_SUFFIXES = (".png", ".tif", ".bmp", ".jpg", ".pgm")
 
 
@@ -46,7 +48,7 @@ def write_inputs(folder: Path) -> Path:
 def _write_results(folder: Path) -> None:
     """Results of the run with points, a batch of it, and its truth as references in both formats."""
     process_run(folder / "points", folder / "results")
-    process_batch([folder / "points"], folder / "batch", BatchOptions(parquet=True))
+    process_batch([folder / "points"], folder / "batch", BatchOptions(parquet=HAS_PYARROW))
     shutil.copy(folder / "points" / "truth" / "pose.csv", folder / "reference.csv")
     truth = read_reference(folder / "reference.csv").motion
     assert truth.position_m is not None

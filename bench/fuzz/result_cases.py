@@ -7,6 +7,7 @@ import shutil
 from pathlib import Path
 
 from bench.fuzz.hostile import OPTION_VALUES
+from bench.fuzz.inputs import HAS_PYARROW
 from bench.fuzz.mutations import damage_file
 
 _TABLES = ("attitude.csv", "spots.csv", "covariance.csv", "frames.csv", "summary.json", "rig.yaml")
@@ -56,7 +57,8 @@ def continued_batch(work: Path, base: Path, rng: random.Random) -> list[str]:
         return ["batch", "--list", str(work / "runs.txt"), "--out", str(work / "out")]
     files = [p for p in sorted((work / "out").rglob("*")) if p.is_file() and not p.is_symlink()]
     damage_file(rng.choice([*files, work / "out" / "batch.csv"]), rng)
-    return ["batch", str(base / "points"), "--out", str(work / "out"), *rng.choice(([], ["--parquet"]))]
+    options = rng.choice(([], ["--parquet"] if HAS_PYARROW else []))
+    return ["batch", str(base / "points"), "--out", str(work / "out"), *options]
 
 
 def init_answers(work: Path, base: Path, rng: random.Random) -> list[str]:
