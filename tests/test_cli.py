@@ -435,6 +435,24 @@ def test_a_run_that_is_stopped_by_a_signal_leaves_nothing_and_says_so(tmp_path, 
     assert [p.name for p in tmp_path.iterdir()] == ["run"]
 
 
+@pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="signals of POSIX")
+def test_a_signal_within_a_compiled_function_is_no_unexpected_error(tmp_path):
+    """numba turns an exception that a signal raises within its code into a SystemError."""
+    program = (
+        "import os, signal, lab.runs.input_check.check as check\n"
+        "def fails(*_):\n"
+        "    try:\n"
+        "        os.kill(os.getpid(), signal.SIGHUP)\n"
+        "    except BaseException as error:\n"
+        "        raise SystemError('returned a result with an exception set') from error\n"
+        "check.check = fails\n" + PROGRAM
+    )
+    (tmp_path / "rig.yaml").write_text("")
+    command = [sys.executable, "-P", "-c", program, "check", "rig.yaml"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (129, "beampose: stopped by SIGHUP\n")
+
+
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="a device of Linux")
 def test_an_error_message_that_cannot_be_written_keeps_its_exit_status(tmp_path):
     program = shlex.join([sys.executable, "-P", "-c", PROGRAM, "check", "nowhere"])

@@ -13,7 +13,7 @@ from typing import Any, TextIO
 
 import click
 
-from lab.commands.stop_signals import StoppedBySignal, stopped_by_signals
+from lab.commands.stop_signals import StoppedBySignal, stopped_by_signals, stops_are_no_errors
 from lab.errors import BeamposeError
 from lab.files.text.error_text import printable
 
@@ -120,7 +120,7 @@ class Commands(click.Group):
                 formatter.write_dl(rows)
 
     def invoke(self, ctx: click.Context) -> Any:
-        with _quiet_when_the_reader_has_gone(), _errors_are_lines():
+        with _quiet_when_the_reader_has_gone(), _errors_are_lines(), stops_are_no_errors():
             return super().invoke(ctx)
 
 

@@ -16,6 +16,9 @@ _GRACE_S = 5.0  # for the regular end; Docker kills after 10 s, Slurm after 30 s
 _SIGNALS = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]  # Windows: no SIGHUP
 
 
+_received: list[int] = []  # number of the signal that came
+
+
 class StoppedBySignal(SystemExit):
     """Ends the program with the status that a shell reports for a signal: 128 + its number."""
 
@@ -42,13 +45,29 @@ def stopped_by_signals() -> Iterator[None]:
         remove_unfinished()  # what a signal at the entry of a block's end has left
         raise
     finally:
+        _received.clear()
         for number in ours:
             if signal.getsignal(number) == _first:  # no signal came
                 signal.signal(number, signal.SIG_DFL)
 
 
+@contextmanager
+def stops_are_no_errors() -> Iterator[None]:
+    """Raises StoppedBySignal in place of an error to which a library has turned it.
+
+    A compiled function in which the signal arrives ends with SystemError ("returned a result with an exception set").
+    """
+    try:
+        yield
+    except Exception as error:
+        if _received:
+            raise StoppedBySignal(_received[0]) from error
+        raise
+
+
 def _first(number: int, _frame: FrameType | None) -> None:
     """Raises StoppedBySignal, and prepares for the case that it does not arrive."""
+    _received.append(number)
     for each in _SIGNALS:
         if signal.getsignal(each) == _first:
             signal.signal(each, _last)
