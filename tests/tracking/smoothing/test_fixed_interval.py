@@ -163,8 +163,12 @@ def test_means_and_covariances_are_those_of_one_dense_gaussian(kind):
     "kind", ["steady", "jumps that are allowed for", "no spots in the middle", "no spots at the end"]
 )
 def test_energy_and_gamma_of_the_process_noise_agree_with_the_dense_gaussian(kind):
-    """Energy w^T Q^-1 w of the noise's mean w, and 3 - tr(Q^-1 cov w), the number of determined components."""
+    """Of the jerk's share J of the noise covariance Q: energy r^T J r of the score r = Q^-1 w, w the noise's mean, and
+    its expectation tr(J (Q^-1 - Q^-1 cov(w) Q^-1)), the number of components of the jerk that the data determine."""
     run = RUNS[kind]()
+    without_jumps = run.info._replace(
+        velocity_jump=np.zeros_like(run.info.velocity_jump), acceleration_jump=np.zeros_like(run.info.velocity_jump)
+    )
     frames = len(run.info.dt)
     out = smoothed(run.ref, run.info, run.jerk)
     mean, P = dense(run)
@@ -172,15 +176,17 @@ def test_energy_and_gamma_of_the_process_noise_agree_with_the_dense_gaussian(kin
     assert np.all(out.gamma[0] == 0)
     for k in range(1, frames):
         F, Q, away = transition(run.ref, run.info, run.jerk, k)
+        jerk_share = transition(run.ref, without_jumps, run.jerk, k)[1]
         w = mean[k] - F @ mean[k - 1] - away
         step = np.hstack([-F, np.eye(STATE)])
         both = slice(STATE * (k - 1), STATE * (k + 1))
         C = step @ P[both, both] @ step.T
         for axis in range(6):
             rows = [axis, axis + 6, axis + 12]
-            inverse = np.linalg.inv(Q[np.ix_(rows, rows)])
-            assert out.energy[k, axis] == pytest.approx(w[rows] @ inverse @ w[rows], rel=1e-4, abs=1e-4)
-            assert out.gamma[k, axis] == pytest.approx(3 - np.trace(inverse @ C[np.ix_(rows, rows)]), abs=1e-4)
+            inverse, share = np.linalg.inv(Q[np.ix_(rows, rows)]), jerk_share[np.ix_(rows, rows)]
+            r, N = inverse @ w[rows], inverse - inverse @ C[np.ix_(rows, rows)] @ inverse
+            assert out.energy[k, axis] == pytest.approx(r @ share @ r, rel=1e-4, abs=1e-4)
+            assert out.gamma[k, axis] == pytest.approx(np.trace(share @ N), abs=1e-4)
 
 
 def test_the_mean_energy_of_the_process_noise_is_the_number_of_determined_components():

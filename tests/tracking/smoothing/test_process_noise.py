@@ -73,6 +73,18 @@ def test_in_uniform_motion_the_jerk_falls_until_the_data_no_longer_determine_it(
     assert np.mean(chi2) < 2.5
 
 
+def test_velocity_jumps_that_are_allowed_for_say_nothing_about_the_jerk():
+    """Steps where a jump is possible but none happens, as about a gap, once pulled the strength down to its floor."""
+    ratios = []
+    for seed in range(3):
+        run = drawn(seed, FRAMES, jerk=np.repeat([5.0, 15.0], 3) ** 2)
+        variances = np.array(run.info.velocity_jump)
+        variances[np.arange(FRAMES) % 60 < 20] = 1.0
+        possible = replace(run, info=run.info._replace(velocity_jump=variances, acceleration_jump=100 * variances))
+        ratios.append(np.median(estimated(possible)[0], axis=0) - np.log(run.jerk[0]))
+    np.testing.assert_allclose(np.mean(ratios, axis=0), 0, atol=0.8)
+
+
 def test_a_run_without_spots_keeps_its_jerk():
     run = drawn(6, FRAMES, without_spots=slice(0, FRAMES))
     np.testing.assert_array_equal(estimated(run, 8)[0], START)

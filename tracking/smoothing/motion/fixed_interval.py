@@ -53,8 +53,10 @@ class Interval(NamedTuple):
     pose_P: Array  # (T, 6, 6)
     motion_P: Array  # (T, 6, 6) covariances of the velocities
     shock: Array  # (T,) chi-square (6 degrees) of a velocity jump in the step before, beyond the allowed noise
-    energy: Array  # (T, 6) by axis, of the step before: r^T Q r, where r is the score of the process noise ...
-    gamma: Array  # (T, 6) ... and its expectation tr(Q N): the number of noise components that the data determine
+    energy: (
+        Array  # (T, 6) by axis, of the step before: r^T Q r, where r is the score of the process noise, Q the jerk's
+    )
+    gamma: Array  # (T, 6) and its expectation tr(Q N): the number of noise components that the data determine
     ends_P: Array  # (2, 18, 18) covariance of the whole state at the first and at the last frame
 
 
@@ -309,9 +311,8 @@ def _test_process_noise(info: RunInformation, jerk: Array, k: int, Y: Array, y: 
     B, b = np.empty((6, 6)), np.empty(6)
     h = 0.5 * dt
     for i in range(6):
-        pp, pv, pa, vv, va, aa = process_noise(
-            dt, jerk[k, i], info.velocity_jump[k, i // 3], info.acceleration_jump[k, i // 3]
-        )
+        # Of the jerk alone: the variances of an allowed jump say nothing about the jerk's strength.
+        pp, pv, pa, vv, va, aa = process_noise(dt, jerk[k, i], 0.0, 0.0)
         p, v, a = r[i], r[6 + i], r[12 + i]
         out.energy[k, i] = pp * p * p + vv * v * v + aa * a * a + 2 * (pv * p * v + pa * p * a + va * v * a)
         out.gamma[k, i] = max(
