@@ -260,7 +260,7 @@ def _try_assignments(case: _Case, prior: State, log_prior: float, tried: _Tried,
         tried.score[count] = score + (_bonus(case) if same else 0.0)
         if j == 0:
             limit = 2 * result.spots + EXPECTED_SIGMAS * np.sqrt(4.0 * max(result.spots, 1))
-            expected = same and result.chi2 <= limit
+            expected = same and result.spots > 0 and result.chi2 <= limit
         count += 1
     return count, expected
 

@@ -1,0 +1,50 @@
+"""A frame's detections are assigned again from the motion that the other frames give."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from geometry.pose import Pose
+from lab.simulate.points import simulate_points
+from tests.tracking.rigid_runs import RIGID, dt_of, found_in, tracked
+from tracking.rigid_body.association.frame_detections import DetectionModel, ViewTable
+from tracking.smoothing.labels.reassociation import RunObservation, reassociated
+from tracking.smoothing.motion.reference import Reference
+from tracking.smoothing.recording import TrackedRecording
+
+SIGMA = np.repeat([1e-5, 1e-4], 3)  # m, rad: of the prediction from the other frames
+JUMP_SIGMA = np.repeat([1e-3, 1e-2], 3)  # of what a velocity jump at the frame adds
+AT = 60
+
+
+def test_points_of_a_frame_without_labels_are_labelled_where_a_corner_explains_them():
+    """The motion of the other frames does not lead to them. That nothing is there to contradict it confirms nothing."""
+    run = simulate_points("sharp-turns", 1, frames=90)
+    recording = TrackedRecording(run.rig, RIGID, None)
+    for k, frame in enumerate(tracked(run)):
+        recording.append(dt_of(run, k), found_in(run, k), frame)
+    detections, right = recording.run_detections(), recording.assigned
+    labelled = np.flatnonzero(right[AT] >= 0)
+    assigned = right.copy()
+    assigned[AT] = -1
+
+    poses = run.poses.plus(np.zeros(6))
+    poses = Pose(poses.rotation.copy(), poses.translation.copy())
+    off = poses[AT].plus(np.array([0.0, 0.0, 0.0, 0.0, 8e-3, -6e-3]))  # 10 px
+    poses.rotation[AT], poses.translation[AT] = off.rotation, off.translation
+    frames, n = right.shape
+    views = run.model.numbers
+    observation = RunObservation(
+        views, ViewTable.of(run.rig, run.model), DetectionModel(0.98, 0.0), np.zeros((n, 2, 2)), detections
+    )
+    found, probability, _ = reassociated(
+        observation,
+        assigned,
+        Reference(poses.rotation, poses.translation, np.zeros((frames, 12))),
+        np.tile(np.diag(SIGMA**2), (frames, 1, 1)),
+        np.full((frames, n), np.log(1e-6)),
+        np.tile(JUMP_SIGMA, (frames, 1)),
+    )
+    assert len(labelled) >= 3
+    np.testing.assert_array_equal(found[AT][labelled], right[AT][labelled])
+    assert probability[AT][labelled].min() > 0.99
