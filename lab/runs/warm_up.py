@@ -1,14 +1,17 @@
 """Compiles the code that runs need, so that the first run does not wait: `python -m lab.runs.warm_up`.
 
 `make setup` calls it last. It processes two short simulated recordings in a temporary folder, one of points and one of
-small pictures. Code that is compiled already is only loaded.
+small pictures. A second process meanwhile compiles the detection in pictures. Code that is compiled already is only
+loaded.
 """
 
 from __future__ import annotations
 
+import multiprocessing
 import sys
 import tempfile
 import time
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 from lab.runs.process import process_run
@@ -24,9 +27,13 @@ def warm_up() -> float:
     begun = time.perf_counter()
     with tempfile.TemporaryDirectory(prefix="beampose-") as name:
         folder = Path(name)
-        points = simulate(SCENARIO, folder / "points", frames=FRAMES, detections_only=True)
-        process_run(points, folder / "out")
         pictures = simulate(SCENARIO, folder / "pictures", frames=PICTURES, picture_scale=0.5)
+        with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as other:
+            # The spots' own tracker: it shares only detection and smoothing with the one that this process compiles.
+            detecting = other.submit(process_run, pictures, folder / "out-of-other", overrides={"method": "spots"})
+            points = simulate(SCENARIO, folder / "points", frames=FRAMES, detections_only=True)
+            process_run(points, folder / "out")
+            detecting.result()
         process_run(pictures, folder / "out")
     return time.perf_counter() - begun
 

@@ -21,6 +21,7 @@ from tracking.rigid_body.rigid_tracker import RigidTracker
 from tracking.smoothing.recording import TrackedRecording
 from tracking.smoothing.smoothed import Smoothed
 from tracking.smoothing.smoother import smooth
+from tracking.statuses import PoseStatus
 from tracking.tracked_frame import TrackedFrame
 
 START = 10  # number of frames until the velocities are known
@@ -81,6 +82,7 @@ class Assessment:
     nees: Array  # (T,) e^T P^-1 e of the poses (normalised estimation error squared); nan without
     bound: Array  # (T, 6) Cramer-Rao variances from the frame's own spots; nan where they do not determine the pose
     prediction: Array  # (T, n, 2) px: errors of the predicted pixels
+    measured: Bools  # (T,) the pose is measured, not predicted
 
     @property
     def identity(self) -> float:
@@ -119,7 +121,8 @@ def assess(run: PointRun, frames: list[TrackedFrame]) -> Assessment:
             nees[k] = errors[k] @ np.linalg.solve(f.pose_covariance, errors[k])
     prediction = np.array([f.predicted_px for f in frames]) - run.uv_px
     views = np.arange(shape[1])
-    return Assessment(labelled, labelled & (origin == views), visible, errors, nees, bound, prediction)
+    measured = np.array([f.pose_status is PoseStatus.MEASURED for f in frames])
+    return Assessment(labelled, labelled & (origin == views), visible, errors, nees, bound, prediction, measured)
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,10 +145,16 @@ class Pooled:
         return float(np.nanmean(values) / 6)
 
     def over_bound(self, rotation: bool = True) -> float:
-        """Ratio of the root mean square error of attitude or position to that of the single-frame bound."""
+        """Ratio of the root mean square error of attitude or position to that of the single-frame bound.
+
+        Of measured poses: one that is predicted across a corner may be far from the bound of spots that it leaves out.
+        """
         part = slice(3, 6) if rotation else slice(0, 3)
-        squares = sum((np.sum(j.errors[j.observable][:, part] ** 2, axis=0) for j in self.some), np.zeros(3))
-        bounds = sum((np.sum(j.bound[j.observable][:, part], axis=0) for j in self.some), np.zeros(3))
+        use = [j.observable & j.measured for j in self.some]
+        squares = sum(
+            (np.sum(j.errors[u][:, part] ** 2, axis=0) for j, u in zip(self.some, use, strict=True)), np.zeros(3)
+        )
+        bounds = sum((np.sum(j.bound[u][:, part], axis=0) for j, u in zip(self.some, use, strict=True)), np.zeros(3))
         return float(np.sqrt(np.mean(squares / bounds)))
 
     def prediction_px(self) -> Array:

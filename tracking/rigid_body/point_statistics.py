@@ -41,7 +41,8 @@ class PointStatistics:
         if some:
             uv = np.concatenate([f.uv_px for f in some])
             major = np.concatenate([f.major_px for f in some])
-            cov = np.concatenate([f.cov_px2 for f in some]) * noise_scale**2
+            # Contiguous in any case: numba compiles each function once per memory layout.
+            cov = np.ascontiguousarray(np.concatenate([f.cov_px2 for f in some]) * noise_scale**2)
             cov[:, [0, 1], [0, 1]] += self._parameters.sigma_model_px**2
             blend = np.where(np.isnan(major), 0.0, self._parameters.blend_px)
         else:

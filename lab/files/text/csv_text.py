@@ -258,6 +258,11 @@ def _not_a_formula(field: object) -> object:
     return f"'{field}" if isinstance(field, str) and is_formula(field) else field
 
 
+def text_of_field(field: str) -> str:
+    """What `csv_text` was given for a field: without the apostrophe that it puts in front of a formula."""
+    return field[1:] if field.startswith("'") and is_formula(field[1:]) else field
+
+
 def write_table(path: Path, header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
     """Write a CSV file, complete or not at all. Raises InputError."""
     atomic_write_text(csv_text(header, rows), path)

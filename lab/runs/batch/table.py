@@ -12,7 +12,7 @@ from typing import Any
 import filelock
 
 from lab.errors import InputError
-from lab.files.text.csv_text import write_table
+from lab.files.text.csv_text import text_of_field, write_table
 from lab.runs.batch.task import COLUMNS
 
 LOCK_SECONDS = 120.0  # the lock is held for milliseconds: longer waiting means a broken file system
@@ -118,5 +118,6 @@ def read_rows(path: Path) -> list[dict[str, str]]:
             raise InputError(
                 f"{path}: expected the table of a batch, found another file; move it or choose another --out"
             )
+        row.update({name: text_of_field(field) for name, field in row.items() if isinstance(field, str)})
         row["folder"] = row.get("folder") or str(Path(row["run"]).absolute())
     return rows

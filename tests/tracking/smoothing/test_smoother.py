@@ -309,25 +309,27 @@ SEEDS = range(8200, 8208)  # no parameter was chosen on them
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("scenario", "hide"),
+    ("scenario", "hide", "identity"),
     [
-        ("smooth", None),
-        ("sharp-turns", None),
-        ("sharp-turns", ("one", 10)),
-        ("sharp-turns", ("screen", 10)),
-        ("sharp-turns", ("all", 3)),
-        ("sharp-turns", ("all", 10)),
-        ("very-fast", None),
+        ("smooth", None, 0.9995),
+        ("sharp-turns", None, 0.9995),
+        ("sharp-turns", ("one", 10), 0.9995),
+        ("sharp-turns", ("two", 3), 0.9995),
+        ("sharp-turns", ("two", 10), 0.9995),
+        ("sharp-turns", ("screen", 10), 0.999),
+        ("sharp-turns", ("all", 3), 0.9995),
+        ("sharp-turns", ("all", 10), 0.9995),
+        ("very-fast", None, 0.999),
     ],
 )
-def test_over_eight_runs_of_600_frames_the_smoothing_pass_is_better_with_correct_covariances(scenario, hide):
+def test_over_eight_runs_of_600_frames_the_smoothing_pass_is_better_with_correct_covariances(scenario, hide, identity):
     causal, again = [], []
     for seed in SEEDS:
         passes = both_passes(scenario, seed, 600, hide)
         for into, j in zip((causal, again), judged_both(passes), strict=True):
             into.append(j)
     first, second = Pooled(causal), Pooled(again)
-    assert second.identity >= first.identity - 1e-4
+    assert second.identity >= max(identity, first.identity - 1e-4)
     assert second.wrong_share <= 2e-4
     assert 0.85 < second.nees(observable=True) < 1.15
     assert second.nees() <= 1.5

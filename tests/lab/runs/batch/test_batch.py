@@ -15,9 +15,11 @@ from cli import main
 from lab.commands.command_line import command_line
 from lab.errors import CalibrationError, InputError, RunError
 from lab.explain.catalogue import EXPLANATIONS
+from lab.files.text.csv_text import write_table
 from lab.runs import process
 from lab.runs.batch import task as module
 from lab.runs.batch.batch import BatchOptions, process_batch
+from lab.runs.batch.table import read_rows
 from lab.runs.batch.task import COLUMNS
 from lab.simulate.write import simulate
 from tests.lab.run_folders import write_run
@@ -250,3 +252,12 @@ def test_a_summary_depends_on_the_number_of_processes_only_in_times_and_the_comm
     assert ".command" in differ
     times = {".command", ".rates.processed_frames_per_s", ".smoother.seconds"}
     assert {place for place in differ if not place.startswith(".timings.")} <= times
+
+
+def test_results_whose_names_look_like_formulas_are_found_again_in_the_table(tmp_path):
+    """A spreadsheet sees an apostrophe in front; the program, and its index with links to them, the name."""
+    rows = [{"run": "=a", "folder": "/runs/=a", "status": "PASS", "results": "=a"}]
+    path = tmp_path / "batch.csv"
+    write_table(path, list(rows[0]), [list(rows[0].values())])
+    assert "'=a" in path.read_text("utf-8")
+    assert read_rows(path) == rows
