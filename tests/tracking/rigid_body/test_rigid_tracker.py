@@ -503,7 +503,7 @@ def test_over_eight_runs_of_600_frames_few_labels_are_open_none_wrong_and_the_si
     assert pooled.identity >= identity
     assert pooled.wrong_share <= 2e-4
     assert 0.85 < pooled.nees(observable=True) < 1.15
-    # A corner in the dark, which the causal pass cannot know, has rare errors beyond the sigmas.
+    # A corner while all spots are occluded, which the causal pass cannot know, has rare errors beyond the sigmas.
     assert pooled.nees() <= (2.0 if hide is not None and hide[0] == "all" else 1.5)
     if hide is not None and hide[0] == "all":
         assert max(d for run, j in zip(runs, of, strict=True) for d in found_again(run, j)) <= 3
