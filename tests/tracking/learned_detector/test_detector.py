@@ -8,7 +8,7 @@ import pytest
 from bench.related_measurements.learned_detector import calibration, is_right, recall_at, reliability
 from lab.learned_detector.samples import draw_sample
 from tracking.drogue_circle.candidates import Window
-from tracking.learned_detector import detector
+from tracking.learned_detector import detector, pyramid
 from tracking.learned_detector.detector import DrogueCandidate, find_drogues, learned_detector
 
 
@@ -48,16 +48,32 @@ def test_sixteen_bits_and_odd_sizes_give_the_same_drogue(samples):
     assert abs(same.u_px - best.u_px) < 0.1 * best.diameter_px
 
 
-def test_colour_pictures_and_damaged_weights_are_errors_with_a_remedy(tmp_path, monkeypatch):
+def test_colour_pictures_and_damaged_weights_are_errors_with_a_remedy(tmp_path, monkeypatch, samples):
     with pytest.raises(ValueError, match="grey picture"):
         find_drogues(np.zeros((10, 10, 3), np.uint8))
     (tmp_path / "weights.onnx").write_bytes(b"\x08\x07damaged")
     monkeypatch.setattr(detector, "WEIGHTS", tmp_path / "weights.onnx")
     detector._network.cache_clear()
     with pytest.raises(ValueError, match="install beampose again"):
-        find_drogues(np.zeros((64, 64), np.uint8))
+        find_drogues(samples[0].image)
     monkeypatch.undo()
     detector._network.cache_clear()
+
+
+def test_the_levels_of_the_pyramid_know_their_exact_scales():
+    for shape in ((97, 131), (480, 640), (5, 300)):
+        grey = np.zeros(shape, np.float32)
+        levels = pyramid.pyramid(grey, 7 / 9, 40.0, 180.0)
+        assert len(levels) == 3
+        for level in levels:
+            corner = level.to_level(shape[1] - 0.5, shape[0] - 0.5)
+            assert corner == pytest.approx((level.grey.shape[1] - 0.5, level.grey.shape[0] - 0.5))
+
+
+def test_of_candidates_on_each_other_the_best_stays():
+    rows = np.array([[1.0, 50, 50, 20], [3.0, 52, 50, 22], [2.0, 51, 50, 60], [0.0, 90, 50, 20]])
+    np.testing.assert_array_equal(detector._distinct(rows, 9)[:, 0], [3, 0])
+    np.testing.assert_array_equal(detector._distinct(rows, 1)[:, 0], [3])
 
 
 def test_the_figures_of_the_bench_follow_from_the_candidates(samples):
