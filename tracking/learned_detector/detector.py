@@ -22,9 +22,12 @@ WEIGHTS = Path(__file__).with_name("weights.onnx")
 STRIDE = 4
 SMALLEST_PX, LARGEST_PX = 7.0, 40.0  # diameters that one level of the pyramid finds
 MIN_CONFIDENCE = 0.05  # of a candidate
-MIN_LOGIT = -6.0  # of a candidate
+MIN_LOGIT = -3.0  # of a candidate
 MAX_CANDIDATES = 20
 SAME_SHARE = 0.5  # of the larger diameter: two centres nearer than this are one drogue
+# What is smaller than a drogue by PART_RATIO and within PART_SHARE of its diameter from its centre is a part of it, if
+# the larger one has this confidence. Ratios of 2 to 3 and confidences of 0.05 to 0.3 give the same recall to 0.5 %.
+PART_RATIO, PART_SHARE, WHOLE_CONFIDENCE = 2.5, 0.6, 0.2
 _MARGIN_PX = 48  # around a window: the network sees 50 px on each side of a cell
 _LEAST_SIDE_PX, _MULTIPLE = 64, 8
 
@@ -74,50 +77,60 @@ def find_drogues(
     top = float(min(picture.shape)) if largest_px is None else largest_px
     levels = pyramid(grey, SMALLEST_PX / max(smallest_px, SMALLEST_PX), LARGEST_PX, top)
     found = np.concatenate([_of_level(level) for level in levels])
-    found = _distinct(found, MAX_CANDIDATES)
-    confidence = 1 / (1 + np.exp(-(CALIBRATION_SLOPE * found[:, 0] + CALIBRATION_OFFSET)))
-    return [
-        DrogueCandidate(u, v, diameter, c)
-        for (_, u, v, diameter), c in zip(found.tolist(), confidence.tolist(), strict=True)
-        if c >= min_confidence
-    ]
+    found[:, 0] = 1 / (1 + np.exp(-(CALIBRATION_SLOPE * found[:, 0] + CALIBRATION_OFFSET)))
+    found = _distinct(_without_parts(found[found[:, 0] >= min(min_confidence, WHOLE_CONFIDENCE)]))
+    return [DrogueCandidate(u, v, diameter, c) for c, u, v, diameter in found.tolist() if c >= min_confidence]
 
 
 def _of_level(level: Level) -> Array:
     """Logit, u, v, diameter (n, 4) of the candidates of a level, in pixels of the picture."""
-    found = candidates_of_level(_network(), level.grey, MIN_LOGIT)
+    found = _candidates(level.grey)
     scales = np.array([level.scale_u, level.scale_v])
     found[:, 1:3] = (found[:, 1:3] + 0.5) / scales - 0.5
     found[:, 3] /= level.scale
     return found
 
 
-def candidates_of_level(network: cv2.dnn.Net, grey: Floats, min_logit: float) -> Array:
-    """Logit, u, v, diameter (n, 4), px, of the candidates of a network in a picture (h, w) of 0 to 1."""
+def _candidates(grey: Floats) -> Array:
+    """Logit, u, v, diameter (n, 4), px, of the candidates in a picture (h, w) of 0 to 1."""
     height, width = grey.shape
     below, beside = -height % _MULTIPLE, -width % _MULTIPLE
     below, beside = max(below, _LEAST_SIDE_PX - height), max(beside, _LEAST_SIDE_PX - width)
     if below or beside:
         grey = np.asarray(cv2.copyMakeBorder(grey, 0, below, 0, beside, cv2.BORDER_REPLICATE), np.float32)
+    network = _network()
     network.setInput(np.ascontiguousarray(grey, dtype=np.float32)[None, None])
     cells = network.forward()[0].astype(float)
     logit = cells[0]
     peak = logit >= cv2.dilate(logit, np.ones((3, 3), np.uint8))
-    rows, columns = np.nonzero(peak & (logit >= min_logit))
+    rows, columns = np.nonzero(peak & (logit >= MIN_LOGIT))
     answer = cells[:, rows, columns]
     u, v = (STRIDE * (k + 0.5 + answer[1 + i]) - 0.5 for i, k in enumerate((columns, rows)))
     out = np.column_stack([answer[0], u, v, np.exp(answer[3])])
     return out[(out[:, 3] >= SMALLEST_PX * 0.7) & (out[:, 3] <= LARGEST_PX * 1.25)]
 
 
-def _distinct(found: Array, most: int) -> Array:
-    """Rows (n, 4) of candidates, the best first, that lie on no better one; at most a number of them."""
+def _without_parts(found: Array) -> Array:
+    """Rows (n, 4) (confidence, u, v, diameter) that are no part of a much larger drogue.
+
+    The coupling in the middle of a drogue and the markers on its rim look like small drogues on the fine levels, with
+    a higher confidence than the whole has on the coarse ones.
+    """
+    confidence, u, v, diameter = found.T
+    away = np.hypot(u[:, None] - u, v[:, None] - v)
+    inside = (diameter > PART_RATIO * diameter[:, None]) & (away < PART_SHARE * diameter)
+    part = inside & (confidence >= WHOLE_CONFIDENCE)
+    return found[~part.any(axis=1)]
+
+
+def _distinct(found: Array) -> Array:
+    """Rows (n, 4) (confidence, u, v, diameter), the best first, that lie on no better one; at most MAX_CANDIDATES."""
     kept: list[list[float]] = []
-    for row in found[np.argsort(-found[:, 0])].tolist():
+    for row in found[np.argsort(-found[:, 0], kind="stable")].tolist():
         _, u, v, diameter = row
         if not any(np.hypot(u - k[1], v - k[2]) < SAME_SHARE * max(diameter, k[3]) for k in kept):
             kept.append(row)
-        if len(kept) == most:
+        if len(kept) == MAX_CANDIDATES:
             break
     return np.array(kept).reshape(-1, 4)
 

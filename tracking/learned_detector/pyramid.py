@@ -25,10 +25,6 @@ class Level:
         """Of lengths."""
         return float(np.sqrt(self.scale_u * self.scale_v))
 
-    def to_level(self, u: float, v: float) -> tuple[float, float]:
-        """A point of the picture."""
-        return self.scale_u * (u + 0.5) - 0.5, self.scale_v * (v + 0.5) - 0.5
-
 
 def pyramid(grey: Floats, scale: float, reaches_px: float, largest_px: float) -> list[Level]:
     """A picture (h, w) reduced to a scale, then by further factors of 2, the last one such that the largest drogue of

@@ -66,14 +66,29 @@ def test_the_levels_of_the_pyramid_know_their_exact_scales():
         levels = pyramid.pyramid(grey, 7 / 9, 40.0, 180.0)
         assert len(levels) == 3
         for level in levels:
-            corner = level.to_level(shape[1] - 0.5, shape[0] - 0.5)
-            assert corner == pytest.approx((level.grey.shape[1] - 0.5, level.grey.shape[0] - 0.5))
+            assert level.grey.shape == (round(level.scale_v * shape[0]), round(level.scale_u * shape[1]))
+            assert level.grey.shape == pytest.approx((level.scale_v * shape[0], level.scale_u * shape[1]), abs=1e-9)
 
 
 def test_of_candidates_on_each_other_the_best_stays():
-    rows = np.array([[1.0, 50, 50, 20], [3.0, 52, 50, 22], [2.0, 51, 50, 60], [0.0, 90, 50, 20]])
-    np.testing.assert_array_equal(detector._distinct(rows, 9)[:, 0], [3, 0])
-    np.testing.assert_array_equal(detector._distinct(rows, 1)[:, 0], [3])
+    rows = np.array([[0.2, 50, 50, 20], [0.9, 52, 50, 22], [0.7, 51, 50, 30], [0.1, 90, 50, 20]])
+    np.testing.assert_array_equal(detector._distinct(rows)[:, 0], [0.9, 0.1])
+
+
+def test_the_coupling_and_a_marker_are_parts_of_their_drogue():
+    drogue, coupling, marker = [0.6, 100, 100, 160], [0.99, 102, 100, 40], [0.9, 172, 100, 14]
+    beside, doubtful = [0.9, 250, 100, 14], [0.1, 400, 100, 160]
+    rows = np.array([drogue, coupling, marker, beside, doubtful, [0.5, 400, 100, 40]])
+    np.testing.assert_array_equal(detector._without_parts(rows), rows[[0, 3, 4, 5]])
+
+
+def test_a_large_drogue_is_found_whole():
+    rng, right = np.random.default_rng(8), 0
+    for _ in range(8):
+        sample = draw_sample(rng, (320, 240), (150.0, 200.0), empty=False)
+        found = find_drogues(sample.image, 10.0)
+        right += bool(found) and is_right(sample, found[0])
+    assert right >= 7
 
 
 def test_the_figures_of_the_bench_follow_from_the_candidates(samples):
