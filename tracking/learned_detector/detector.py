@@ -26,14 +26,14 @@ MIN_LOGIT = -3.0  # of a candidate
 MAX_CANDIDATES = 20
 SAME_SHARE = 0.5  # of the larger diameter: two centres nearer than this are one drogue
 # What is smaller than a drogue by PART_RATIO and within PART_SHARE of its diameter from its centre is a part of it, if
-# the larger one has this confidence. Ratios of 2 to 3 and confidences of 0.05 to 0.3 give the same recall to 0.5 %.
-PART_RATIO, PART_SHARE, WHOLE_CONFIDENCE = 2.5, 0.6, 0.2
+# the larger one has this confidence. Ratios of 2 to 3 and confidences of 0.1 to 0.8 give the same recall to 0.5 %.
+PART_RATIO, PART_SHARE, WHOLE_CONFIDENCE = 2.5, 0.6, 0.5
 _MARGIN_PX = 48  # around a window: the network sees 50 px on each side of a cell
 _LEAST_SIDE_PX, _MULTIPLE = 64, 8
 
 # Confidence by calibration: share of right candidates among those of a logit, a logistic curve fitted on validation
 # pictures (bench/related_measurements/learned_detector.py --calibrate, seed 5).
-CALIBRATION_SLOPE, CALIBRATION_OFFSET = 3.544, -1.823
+CALIBRATION_SLOPE, CALIBRATION_OFFSET = 4.416, -1.840
 
 
 @dataclass(frozen=True, slots=True)

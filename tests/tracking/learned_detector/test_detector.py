@@ -82,13 +82,11 @@ def test_the_coupling_and_a_marker_are_parts_of_their_drogue():
     np.testing.assert_array_equal(detector._without_parts(rows), rows[[0, 3, 4, 5]])
 
 
-def test_a_large_drogue_is_found_whole():
-    rng, right = np.random.default_rng(8), 0
-    for _ in range(8):
-        sample = draw_sample(rng, (320, 240), (150.0, 200.0), empty=False)
-        found = find_drogues(sample.image, 10.0)
-        right += bool(found) and is_right(sample, found[0])
-    assert right >= 7
+def test_a_drogue_whose_coupling_is_more_confident_is_found_whole(monkeypatch):
+    rows = np.array([[0.6, 100, 100, 160], [3.0, 102, 100, 40]])  # logit, centre and diameter
+    monkeypatch.setattr(detector, "_of_level", lambda level: rows)
+    found = find_drogues(np.zeros((240, 320), np.uint8))
+    assert [c.diameter_px for c in found] == [160]
 
 
 def test_the_figures_of_the_bench_follow_from_the_candidates(samples):
