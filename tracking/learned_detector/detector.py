@@ -21,13 +21,15 @@ from tracking.learned_detector.pyramid import Floats, Level, pyramid
 WEIGHTS = Path(__file__).with_name("weights.onnx")
 STRIDE = 4
 SMALLEST_PX, LARGEST_PX = 7.0, 40.0  # diameters that one level of the pyramid finds
+COARSEST_PX = 28.0  # the coarsest level shows the largest drogue no larger: there, its parts are no candidates
 MIN_CONFIDENCE = 0.05  # of a candidate
 MIN_LOGIT = -3.0  # of a candidate
 MAX_CANDIDATES = 20
 SAME_SHARE = 0.5  # of the larger diameter: two centres nearer than this are one drogue
+ALIKE_RATIO, ALIKE_CONFIDENCE = 2.0, 0.5  # of the diameters and confidences of candidates whose mean is taken
 # What is smaller than a drogue by PART_RATIO and within PART_SHARE of its diameter from its centre is a part of it, if
 # the larger one has this confidence. Ratios of 2 to 3 and confidences of 0.1 to 0.8 give the same recall to 0.5 %.
-PART_RATIO, PART_SHARE, WHOLE_CONFIDENCE = 2.5, 0.6, 0.5
+PART_RATIO, PART_SHARE, WHOLE_CONFIDENCE = 2.5, 0.6, 0.7
 _MARGIN_PX = 48  # around a window: the network sees 50 px on each side of a cell
 _LEAST_SIDE_PX, _MULTIPLE = 64, 8
 
@@ -75,7 +77,7 @@ def find_drogues(
     full = 255 if picture.dtype == np.uint8 else max(int(picture.max()), 1)
     grey = np.asarray(picture, dtype=np.float32) / np.float32(full)
     top = float(min(picture.shape)) if largest_px is None else largest_px
-    levels = pyramid(grey, SMALLEST_PX / max(smallest_px, SMALLEST_PX), LARGEST_PX, top)
+    levels = pyramid(grey, SMALLEST_PX / max(smallest_px, SMALLEST_PX), COARSEST_PX, top)
     found = np.concatenate([_of_level(level) for level in levels])
     found[:, 0] = 1 / (1 + np.exp(-(CALIBRATION_SLOPE * found[:, 0] + CALIBRATION_OFFSET)))
     found = _distinct(_without_parts(found[found[:, 0] >= min(min_confidence, WHOLE_CONFIDENCE)]))
@@ -124,15 +126,28 @@ def _without_parts(found: Array) -> Array:
 
 
 def _distinct(found: Array) -> Array:
-    """Rows (n, 4) (confidence, u, v, diameter), the best first, that lie on no better one; at most MAX_CANDIDATES."""
-    kept: list[list[float]] = []
-    for row in found[np.argsort(-found[:, 0], kind="stable")].tolist():
-        _, u, v, diameter = row
-        if not any(np.hypot(u - k[1], v - k[2]) < SAME_SHARE * max(diameter, k[3]) for k in kept):
-            kept.append(row)
-        if len(kept) == MAX_CANDIDATES:
+    """Drogues (n, 4) (confidence, u, v, diameter), the best first, of candidates (m, 4); at most MAX_CANDIDATES.
+
+    Candidates on a better one are the same drogue, often seen on another level. Centre and log diameter are the means
+    of those of alike size and confidence, weighted by the confidence: a coarse level can give a diameter that is too
+    large with a slightly higher confidence.
+    """
+    ordered = found[np.argsort(-found[:, 0], kind="stable")]
+    confidence, u, v, diameter = ordered.T
+    free, out = np.ones(len(ordered), dtype=bool), []
+    for i in range(len(ordered)):
+        if not free[i]:
+            continue
+        same = np.hypot(u - u[i], v - v[i]) < SAME_SHARE * np.maximum(diameter, diameter[i])
+        free &= ~same
+        ratio = np.exp(np.abs(np.log(diameter / diameter[i])))
+        alike = same & (ratio < ALIKE_RATIO) & (confidence >= ALIKE_CONFIDENCE * confidence[i])
+        weight = confidence[alike] / confidence[alike].sum()
+        centre = weight @ ordered[alike, 1:3]
+        out.append([confidence[i], *centre, np.exp(weight @ np.log(diameter[alike]))])
+        if len(out) == MAX_CANDIDATES:
             break
-    return np.array(kept).reshape(-1, 4)
+    return np.array(out).reshape(-1, 4)
 
 
 def learned_detector(min_radius_px: float, max_radius_px: float | None = None) -> CircleDetector:

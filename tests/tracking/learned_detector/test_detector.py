@@ -70,23 +70,27 @@ def test_the_levels_of_the_pyramid_know_their_exact_scales():
             assert level.grey.shape == pytest.approx((level.scale_v * shape[0], level.scale_u * shape[1]), abs=1e-9)
 
 
-def test_of_candidates_on_each_other_the_best_stays():
-    rows = np.array([[0.2, 50, 50, 20], [0.9, 52, 50, 22], [0.7, 51, 50, 30], [0.1, 90, 50, 20]])
-    np.testing.assert_array_equal(detector._distinct(rows)[:, 0], [0.9, 0.1])
+def test_candidates_of_alike_size_on_each_other_give_their_weighted_mean():
+    best, alike = [0.9, 52, 50, 36], [0.6, 50, 50, 20]
+    unlike, doubtful, beside = [0.8, 50, 50, 80], [0.2, 47, 50, 20], [0.1, 120, 50, 20]
+    found = detector._distinct(np.array([alike, best, unlike, doubtful, beside]))
+    np.testing.assert_allclose(found[0], [0.9, 51.2, 50, 36**0.6 * 20**0.4])
+    np.testing.assert_allclose(found[1:], [beside])
+    assert detector._distinct(np.empty((0, 4))).shape == (0, 4)
 
 
 def test_the_coupling_and_a_marker_are_parts_of_their_drogue():
-    drogue, coupling, marker = [0.6, 100, 100, 160], [0.99, 102, 100, 40], [0.9, 172, 100, 14]
+    drogue, coupling, marker = [0.8, 100, 100, 160], [0.99, 102, 100, 40], [0.9, 172, 100, 14]
     beside, doubtful = [0.9, 250, 100, 14], [0.1, 400, 100, 160]
     rows = np.array([drogue, coupling, marker, beside, doubtful, [0.5, 400, 100, 40]])
     np.testing.assert_array_equal(detector._without_parts(rows), rows[[0, 3, 4, 5]])
 
 
 def test_a_drogue_whose_coupling_is_more_confident_is_found_whole(monkeypatch):
-    rows = np.array([[0.6, 100, 100, 160], [3.0, 102, 100, 40]])  # logit, centre and diameter
+    rows = np.array([[1.0, 100, 100, 160], [3.0, 102, 100, 40]])  # logit, centre and diameter
     monkeypatch.setattr(detector, "_of_level", lambda level: rows)
     found = find_drogues(np.zeros((240, 320), np.uint8))
-    assert [c.diameter_px for c in found] == [160]
+    assert [c.diameter_px for c in found] == pytest.approx([160])
 
 
 def test_the_figures_of_the_bench_follow_from_the_candidates(samples):
