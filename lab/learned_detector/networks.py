@@ -34,9 +34,9 @@ def _layer(before: int, after: int, stride: int = 1) -> Any:
 
 
 def _small() -> Any:
-    """Some 175,000 parameters: layers at 1/2 and 1/4 of the picture; five at 1/8, whose output is enlarged and added.
+    """Some 177,000 parameters: layers at 1/2 and 1/4 of the picture; five at 1/8, whose output is enlarged and added.
 
-    A cell sees some 75 px on each side. The sides of the picture are multiples of 8. Source: ours, after Ronneberger
+    A cell sees 47 px on each side. The sides of the picture are multiples of 8. Source: ours, after Ronneberger
     (2015), U-Net.
     """
     from torch import nn

@@ -2,7 +2,7 @@
 
 The network was trained by lab/learned_detector/train.py on rendered drogues; no deep-learning library is needed to run
 it. Per cell of STRIDE pixels it gives the logit of a centre, the offset of the centre and the log of the diameter.
-Source: after Zhou (2020), section 1, whose network has 42 layers; ours has nine.
+Source: after Zhou (2020), section 1, whose network has 42 layers; ours has eleven.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ ALIKE_RATIO, ALIKE_CONFIDENCE = 2.0, 0.5  # of the diameters and confidences of 
 # What is smaller than a drogue by PART_RATIO and within PART_SHARE of its diameter from its centre is a part of it, if
 # the larger one has this confidence. Ratios of 2 to 3 and confidences of 0.1 to 0.8 give the same recall to 0.5 %.
 PART_RATIO, PART_SHARE, WHOLE_CONFIDENCE = 2.5, 0.6, 0.7
-_MARGIN_PX = 48  # around a window: the network sees 50 px on each side of a cell
+_MARGIN_PX = 48  # around a window: the network sees 47 px on each side of a cell
 _LEAST_SIDE_PX, _MULTIPLE = 64, 8
 
 # Confidence by calibration: share of right candidates among those of a logit, a logistic curve fitted on validation
