@@ -23,6 +23,7 @@ DIAMETERS_PX = (9.0, 200.0)
 FALSE_PER_FRAME = 0.1
 RIGHT_SHARE = 0.25  # of the diameter: largest error of the centre of a right detection
 BINS = 8
+LEAST_CONFIDENCE = 0.005  # of the candidates that the threshold is chosen from
 
 
 def is_right(sample: Sample, found: DrogueCandidate) -> bool:
@@ -106,7 +107,7 @@ def main() -> None:
         for _ in range(a.frames)
     ]
     start = time.process_time()
-    found = [find_drogues(s.image, DIAMETERS_PX[0], DIAMETERS_PX[1], 0.02) for s in samples]
+    found = [find_drogues(s.image, DIAMETERS_PX[0], DIAMETERS_PX[1], LEAST_CONFIDENCE) for s in samples]
     learned_s = time.process_time() - start
     confidence, right, error = scored(samples, found)
     if a.calibrate:

@@ -1,7 +1,8 @@
 """Rendered pictures of drogues with everything drawn at random, for training, validation and test.
 
-Training and validation have the backgrounds sky, clouds and ground; the test has backgrounds of its own kind, made of
-stripes, checks, blobs and walls of random polygons, which no training picture shows.
+Training and validation have the backgrounds sky, clouds and ground, and roads, arcs, letters and ridges
+(structured.py); the test has backgrounds of its own kind, made of stripes, checks, blobs and walls of random polygons,
+which no training picture shows.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from geometry.camera import Camera
 from geometry.pose import Pose
+from lab.learned_detector.structured import structured_picture
 from lab.simulate.drogue.background import fractal_noise
 from lab.simulate.drogue.render import render_drogue
 from lab.simulate.drogue.scene import PICTURE, DrogueBackground, DrogueLight, DrogueLook, DrogueScene, Occluder
@@ -22,6 +24,7 @@ from lab.simulate.drogue.scene import PICTURE, DrogueBackground, DrogueLight, Dr
 Grey = NDArray[np.uint8]
 
 EMPTY_SHARE = 0.3  # of the samples that show no drogue
+STRUCTURED_SHARE = 0.5  # of the backgrounds of training
 RADIUS_M = 0.3
 
 
@@ -132,6 +135,9 @@ def _background(rng: np.random.Generator, size_px: tuple[int, int], unseen: bool
     seed = int(rng.integers(2**31))
     if unseen:
         return DrogueBackground(PICTURE, seed, picture=_unseen_picture(rng, size_px))
+    if rng.random() < STRUCTURED_SHARE:
+        clutter = int(rng.integers(0, 4))
+        return DrogueBackground(PICTURE, seed, picture=structured_picture(rng, size_px), clutter=clutter)
     kind = ("sky", "clouds", "ground")[int(rng.integers(3))]
     return DrogueBackground(
         kind,

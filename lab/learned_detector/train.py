@@ -2,40 +2,28 @@
 
 Needs the extra `training` (torch, onnx). The weights of the package were made by
 
-    python -m lab.learned_detector.train --out build/detector --samples 8000 --epochs 12 --seed 2020
+    python -m lab.learned_detector.train --out build/detector --samples 28000 --epochs 28 --seed 2020 --bf16
 
 and copied to tracking/learned_detector/. The same seed gives the same samples; sums in another order change the weights
-in their last digits on another machine.
+in their last digits on another machine. A run that was interrupted continues from the files of its folder.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from geometry.arrays import Array
+from lab.learned_detector.dataset import SIZE_PX, augmented, middle, rendered
+from lab.learned_detector.fitting import Plan, export, fit, tensor
 from lab.learned_detector.networks import NETWORKS, SMALL, STRIDE, make_network
-from lab.learned_detector.samples import draw_sample
 
-SIZE_PX = 112
-DIAMETERS_PX = (7.0, 44.0)  # one level of the pyramid; the detector uses 8 to 40
-VALIDATION = 1500  # samples
-
-
-def drawn_samples(number: int, seed: int) -> tuple[np.ndarray, Array]:
-    """Pictures (number, SIZE_PX, SIZE_PX) and truths (number, 3): centre u, v and diameter, px; nan without one."""
-    rng = np.random.default_rng([seed, number])
-    images, truth = np.empty((number, SIZE_PX, SIZE_PX), np.uint8), np.empty((number, 3))
-    for i in range(number):
-        sample = draw_sample(rng, (SIZE_PX, SIZE_PX), DIAMETERS_PX)
-        images[i], truth[i] = sample.image, (*sample.centre_px, sample.diameter_px)
-    return images, truth
+BATCH = 32
+VALIDATION = 1000  # samples
 
 
 def targets(truth: Array) -> tuple[Array, Array, Array]:
@@ -51,7 +39,7 @@ def targets(truth: Array) -> tuple[Array, Array, Array]:
     heat = np.where(inside, 1.0, heat)
     size = np.broadcast_to(np.log(diameter), heat.shape)
     values = np.nan_to_num(np.stack([du / STRIDE + 0 * dv, dv / STRIDE + 0 * du, size], axis=1))
-    return heat, values, (heat > 0.5).astype(float)
+    return heat, values, (heat > 0.3).astype(float)
 
 
 def loss(out: Any, heat: Any, values: Any, weight: Any) -> Any:
@@ -59,6 +47,7 @@ def loss(out: Any, heat: Any, values: Any, weight: Any) -> Any:
     import torch
     from torch.nn import functional
 
+    out = out.float()
     p = torch.sigmoid(out[:, 0]).clamp(1e-5, 1 - 1e-5)
     positive = (heat >= 1.0).float()
     gain = positive * (1 - p) ** 2 * torch.log(p) + (1 - positive) * (1 - heat) ** 4 * p**2 * torch.log(1 - p)
@@ -68,85 +57,27 @@ def loss(out: Any, heat: Any, values: Any, weight: Any) -> Any:
     return -gain.sum() / count + scaled.sum() / weight.sum().clamp(min=1.0)
 
 
-def train(network: str, samples: int, epochs: int, seed: int, out: Path) -> None:
+def train(plan: Plan, out: Path) -> None:
     """Train, write weights.onnx and training.json into a folder, print a line per epoch."""
     import torch
 
-    torch.manual_seed(seed)
-    torch.set_num_threads(1)
-    images, truth = drawn_samples(samples, seed)
-    held_images, held_truth = drawn_samples(VALIDATION, seed + 1)
-    model = make_network(network)
-    batch, rng, log = 32, np.random.default_rng(seed), []
-    steps = epochs * (samples // batch)
-    optimiser = torch.optim.AdamW(model.parameters(), lr=3e-3, weight_decay=1e-4)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, max_lr=6e-3, total_steps=steps)
-    start = time.process_time()
-    for epoch in range(epochs):
-        model.train()
-        total = 0.0
-        for rows in np.array_split(rng.permutation(samples)[: samples // batch * batch], samples // batch):
-            pictures, wanted = _augmented(images[rows], truth[rows], rng)
-            value = loss(model(_tensor(pictures[:, None] / 255.0)), *map(_tensor, targets(wanted)))
-            optimiser.zero_grad()
-            value.backward()
-            optimiser.step()
-            schedule.step()
-            total += float(value.detach())
-        held = _validated(model, held_images, held_truth)
-        log.append({"epoch": epoch + 1, "loss": total / (samples // batch), "validation_loss": held})
-        print(f"epoch {epoch + 1}: loss {log[-1]['loss']:.4f}, validation {held:.4f}", flush=True)
-    out.mkdir(parents=True, exist_ok=True)
-    _export(model, out / "weights.onnx")
-    record = {
-        "network": network,
-        "samples": samples,
-        "epochs": epochs,
-        "seed": seed,
-        "parameters": sum(p.numel() for p in model.parameters()),
-        "process_s": round(time.process_time() - start),
-        "torch": torch.__version__,
-        "log": log,
-    }
-    (out / "training.json").write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+    images, truth = rendered(plan.samples, plan.seed, out / "samples")
+    held_images, held_truth = middle(*rendered(VALIDATION, plan.seed + 1, out / "samples"))
+    held_targets = [tensor(t) for t in targets(held_truth)]
 
+    def batch_loss(model: Any, rng: np.random.Generator) -> Any:
+        rows = rng.integers(0, len(images), BATCH)
+        pictures, wanted = augmented(images[rows], truth[rows], rng)
+        shown = tensor(pictures[:, None]).to(memory_format=torch.channels_last)
+        return loss(model(shown), *map(tensor, targets(wanted)))
 
-def _augmented(images: np.ndarray, truth: Array, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Mirrored and turned by quarters, with another contrast."""
-    pictures, wanted = images.astype(np.float32), truth.copy()
-    if rng.random() < 0.5:
-        pictures, wanted = pictures[:, :, ::-1], wanted * [-1, 1, 1] + [SIZE_PX - 1, 0, 0]
-    if rng.random() < 0.5:
-        pictures, wanted = pictures.swapaxes(1, 2), wanted[:, [1, 0, 2]]
-    gain = rng.uniform(0.5, 1.3, (len(pictures), 1, 1)).astype(np.float32)
-    offset = rng.uniform(-25, 40, (len(pictures), 1, 1)).astype(np.float32)
-    return np.clip(gain * pictures + offset, 0, 255), wanted
+    def validate(model: Any) -> float:
+        return float(loss(model(tensor(held_images[:, None])), *held_targets))
 
-
-def _tensor(values: np.ndarray) -> Any:
-    import torch
-
-    return torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
-
-
-def _validated(model: Any, images: np.ndarray, truth: Array) -> float:
-    import torch
-
-    model.eval()
-    with torch.no_grad():
-        return float(loss(model(_tensor(images[:, None] / 255.0)), *map(_tensor, targets(truth))))
-
-
-def _export(model: Any, path: Path) -> None:
-    """Write the network as ONNX for pictures of any size."""
-    import torch
-
-    model.eval()
+    torch.manual_seed(plan.seed)
+    model = fit(make_network(plan.network), batch_loss, validate, plan, out)
     axes = {"picture": {2: "height", 3: "width"}, "cells": {2: "rows", 3: "columns"}}
-    torch.onnx.export(
-        model, (torch.zeros(1, 1, SIZE_PX, SIZE_PX),), str(path), input_names=["picture"], output_names=["cells"],
-        dynamic_axes=axes, opset_version=13, dynamo=False,
-    )  # fmt: skip
+    export(model, torch.zeros(1, 1, SIZE_PX, SIZE_PX), out / "weights.onnx", ("picture", "cells"), axes)
 
 
 def main() -> int:
@@ -154,12 +85,14 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="lab.learned_detector.train", description=__doc__)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--network", choices=NETWORKS, default=SMALL)
-    parser.add_argument("--samples", type=int, default=8000)
-    parser.add_argument("--epochs", type=int, default=12)
+    parser.add_argument("--samples", type=int, default=28000)
+    parser.add_argument("--epochs", type=int, default=28)
     parser.add_argument("--seed", type=int, default=2020)
+    parser.add_argument("--bf16", action="store_true", help="layers in bfloat16, for processors that have it")
     a = parser.parse_args()
+    steps = max(a.samples // BATCH, 1)
     try:
-        train(a.network, a.samples, a.epochs, a.seed, a.out)
+        train(Plan(a.network, a.samples, a.epochs, a.seed, steps, bf16=a.bf16), a.out)
     except ImportError as error:
         remedy = "pip install 'beampose[training]'"
         print(f"beampose: training needs the extra `training`: {remedy} ({error})", file=sys.stderr)

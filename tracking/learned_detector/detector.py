@@ -2,37 +2,40 @@
 
 The network was trained by lab/learned_detector/train.py on rendered drogues; no deep-learning library is needed to run
 it. Per cell of STRIDE pixels it gives the logit of a centre, the offset of the centre and the log of the diameter.
-Source: after Zhou (2020), section 1, whose network has 42 layers; ours has eight.
+Source: after Zhou (2020), section 1, whose network has 42 layers; ours has eleven.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import TypeAlias
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from geometry.arrays import Array
 from tracking.drogue_circle.candidates import CircleCandidate, CircleDetector, Picture, Window, crop_bounds
-
-Floats: TypeAlias = NDArray[np.float32]
+from tracking.learned_detector.pyramid import Floats, Level, pyramid
 
 WEIGHTS = Path(__file__).with_name("weights.onnx")
 STRIDE = 4
-SMALLEST_PX, LARGEST_PX = 8.0, 40.0  # diameters that one level of the pyramid finds
+SMALLEST_PX, LARGEST_PX = 7.0, 40.0  # diameters that one level of the pyramid finds
+COARSEST_PX = 28.0  # the coarsest level shows the largest drogue no larger: there, its parts are no candidates
 MIN_CONFIDENCE = 0.05  # of a candidate
+MIN_LOGIT = -3.0  # of a candidate
 MAX_CANDIDATES = 20
 SAME_SHARE = 0.5  # of the larger diameter: two centres nearer than this are one drogue
-_MARGIN_PX = 48  # around a window: the network sees 50 px on each side of a cell
-_LEAST_SIDE_PX = 64
+ALIKE_RATIO, ALIKE_CONFIDENCE = 2.0, 0.5  # of the diameters and confidences of candidates whose mean is taken
+# What is smaller than a drogue by PART_RATIO and within PART_SHARE of its diameter from its centre is a part of it, if
+# the larger one has this confidence. Ratios of 2 to 3 and confidences of 0.1 to 0.8 give the same recall to 0.5 %.
+PART_RATIO, PART_SHARE, WHOLE_CONFIDENCE = 2.5, 0.6, 0.7
+_MARGIN_PX = 48  # around a window: the network sees 47 px on each side of a cell
+_LEAST_SIDE_PX, _MULTIPLE = 64, 8
 
 # Confidence by calibration: share of right candidates among those of a logit, a logistic curve fitted on validation
 # pictures (bench/related_measurements/learned_detector.py --calibrate, seed 5).
-CALIBRATION_SLOPE, CALIBRATION_OFFSET = 5.328, -2.623
+CALIBRATION_SLOPE, CALIBRATION_OFFSET = 4.557, -2.074
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,52 +77,77 @@ def find_drogues(
     full = 255 if picture.dtype == np.uint8 else max(int(picture.max()), 1)
     grey = np.asarray(picture, dtype=np.float32) / np.float32(full)
     top = float(min(picture.shape)) if largest_px is None else largest_px
-    found: list[tuple[float, float, float, float]] = []
-    scale = SMALLEST_PX / max(smallest_px, SMALLEST_PX)
-    while True:
-        found += _of_level(grey, scale, min_confidence)
-        if LARGEST_PX / scale >= top:
-            break
-        scale /= 2
-    return _distinct(found)
+    levels = pyramid(grey, SMALLEST_PX / max(smallest_px, SMALLEST_PX), COARSEST_PX, top)
+    found = np.concatenate([_of_level(level) for level in levels])
+    found[:, 0] = 1 / (1 + np.exp(-(CALIBRATION_SLOPE * found[:, 0] + CALIBRATION_OFFSET)))
+    found = _distinct(_without_parts(found[found[:, 0] >= min(min_confidence, WHOLE_CONFIDENCE)]))
+    return [DrogueCandidate(u, v, diameter, c) for c, u, v, diameter in found.tolist() if c >= min_confidence]
 
 
-def _of_level(grey: Floats, scale: float, min_confidence: float) -> list[tuple[float, float, float, float]]:
-    """Confidence, u, v, diameter of the candidates of one level, in pixels of the picture."""
-    height, width = (max(round(s * scale), 1) for s in grey.shape)
-    level = grey if scale == 1 else cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA)
-    below, beside = -height % STRIDE, -width % STRIDE
+def _of_level(level: Level) -> Array:
+    """Logit, u, v, diameter (n, 4) of the candidates of a level, in pixels of the picture."""
+    found = _candidates(level.grey)
+    scales = np.array([level.scale_u, level.scale_v])
+    found[:, 1:3] = (found[:, 1:3] + 0.5) / scales - 0.5
+    found[:, 3] /= level.scale
+    return found
+
+
+def _candidates(grey: Floats) -> Array:
+    """Logit, u, v, diameter (n, 4), px, of the candidates in a picture (h, w) of 0 to 1."""
+    height, width = grey.shape
+    below, beside = -height % _MULTIPLE, -width % _MULTIPLE
     below, beside = max(below, _LEAST_SIDE_PX - height), max(beside, _LEAST_SIDE_PX - width)
     if below or beside:
-        level = cv2.copyMakeBorder(level, 0, below, 0, beside, cv2.BORDER_REPLICATE)
-    net = _network()
-    net.setInput(np.ascontiguousarray(level, dtype=np.float32)[None, None])
-    cells = net.forward()[0]
+        grey = np.asarray(cv2.copyMakeBorder(grey, 0, below, 0, beside, cv2.BORDER_REPLICATE), np.float32)
+    network = _network()
+    network.setInput(np.ascontiguousarray(grey, dtype=np.float32)[None, None])
+    cells = network.forward()[0].astype(float)
     logit = cells[0]
     peak = logit >= cv2.dilate(logit, np.ones((3, 3), np.uint8))
-    confidence = 1 / (1 + np.exp(-(CALIBRATION_SLOPE * logit + CALIBRATION_OFFSET)))
-    rows, columns = np.nonzero(peak & (confidence >= min_confidence))
-    out = []
-    for r, c in zip(rows.tolist(), columns.tolist(), strict=True):
-        diameter = float(np.exp(cells[3, r, c]))
-        if not SMALLEST_PX * 0.8 <= diameter <= LARGEST_PX * 1.25:
+    rows, columns = np.nonzero(peak & (logit >= MIN_LOGIT))
+    answer = cells[:, rows, columns]
+    u, v = (STRIDE * (k + 0.5 + answer[1 + i]) - 0.5 for i, k in enumerate((columns, rows)))
+    out = np.column_stack([answer[0], u, v, np.exp(answer[3])])
+    return out[(out[:, 3] >= SMALLEST_PX * 0.7) & (out[:, 3] <= LARGEST_PX * 1.25)]
+
+
+def _without_parts(found: Array) -> Array:
+    """Rows (n, 4) (confidence, u, v, diameter) that are no part of a much larger drogue.
+
+    The coupling in the middle of a drogue and the markers on its rim look like small drogues on the fine levels, with
+    a higher confidence than the whole has on the coarse ones.
+    """
+    confidence, u, v, diameter = found.T
+    away = np.hypot(u[:, None] - u, v[:, None] - v)
+    inside = (diameter > PART_RATIO * diameter[:, None]) & (away < PART_SHARE * diameter)
+    part = inside & (confidence >= WHOLE_CONFIDENCE)
+    return found[~part.any(axis=1)]
+
+
+def _distinct(found: Array) -> Array:
+    """Drogues (n, 4) (confidence, u, v, diameter), the best first, of candidates (m, 4); at most MAX_CANDIDATES.
+
+    Candidates on a better one are the same drogue, often seen on another level. Centre and log diameter are the means
+    of those of alike size and confidence, weighted by the confidence: a coarse level can give a diameter that is too
+    large with a slightly higher confidence.
+    """
+    ordered = found[np.argsort(-found[:, 0], kind="stable")]
+    confidence, u, v, diameter = ordered.T
+    free, out = np.ones(len(ordered), dtype=bool), []
+    for i in range(len(ordered)):
+        if not free[i]:
             continue
-        u, v = (STRIDE * (k + 0.5 + float(cells[1 + i, r, c])) - 0.5 for i, k in enumerate((c, r)))
-        at = [(x + 0.5) / scale - 0.5 for x in (u, v)]
-        out.append((float(confidence[r, c]), at[0], at[1], diameter / scale))
-    return out
-
-
-def _distinct(found: Sequence[tuple[float, float, float, float]]) -> list[DrogueCandidate]:
-    """The best of candidates that lie on each other, at most MAX_CANDIDATES."""
-    kept: list[DrogueCandidate] = []
-    for confidence, u, v, diameter in sorted(found, reverse=True):
-        near = (np.hypot(u - k.u_px, v - k.v_px) < SAME_SHARE * max(diameter, k.diameter_px) for k in kept)
-        if not any(near):
-            kept.append(DrogueCandidate(u, v, diameter, confidence))
-        if len(kept) == MAX_CANDIDATES:
+        same = np.hypot(u - u[i], v - v[i]) < SAME_SHARE * np.maximum(diameter, diameter[i])
+        free &= ~same
+        ratio = np.exp(np.abs(np.log(diameter / diameter[i])))
+        alike = same & (ratio < ALIKE_RATIO) & (confidence >= ALIKE_CONFIDENCE * confidence[i])
+        weight = confidence[alike] / confidence[alike].sum()
+        centre = weight @ ordered[alike, 1:3]
+        out.append([confidence[i], *centre, np.exp(weight @ np.log(diameter[alike]))])
+        if len(out) == MAX_CANDIDATES:
             break
-    return kept
+    return np.array(out).reshape(-1, 4)
 
 
 def learned_detector(min_radius_px: float, max_radius_px: float | None = None) -> CircleDetector:

@@ -8,7 +8,7 @@ import pytest
 from bench.related_measurements.learned_detector import calibration, is_right, recall_at, reliability
 from lab.learned_detector.samples import draw_sample
 from tracking.drogue_circle.candidates import Window
-from tracking.learned_detector import detector
+from tracking.learned_detector import detector, pyramid
 from tracking.learned_detector.detector import DrogueCandidate, find_drogues, learned_detector
 
 
@@ -48,16 +48,49 @@ def test_sixteen_bits_and_odd_sizes_give_the_same_drogue(samples):
     assert abs(same.u_px - best.u_px) < 0.1 * best.diameter_px
 
 
-def test_colour_pictures_and_damaged_weights_are_errors_with_a_remedy(tmp_path, monkeypatch):
+def test_colour_pictures_and_damaged_weights_are_errors_with_a_remedy(tmp_path, monkeypatch, samples):
     with pytest.raises(ValueError, match="grey picture"):
         find_drogues(np.zeros((10, 10, 3), np.uint8))
     (tmp_path / "weights.onnx").write_bytes(b"\x08\x07damaged")
     monkeypatch.setattr(detector, "WEIGHTS", tmp_path / "weights.onnx")
     detector._network.cache_clear()
     with pytest.raises(ValueError, match="install beampose again"):
-        find_drogues(np.zeros((64, 64), np.uint8))
+        find_drogues(samples[0].image)
     monkeypatch.undo()
     detector._network.cache_clear()
+
+
+def test_the_levels_of_the_pyramid_know_their_exact_scales():
+    for shape in ((97, 131), (480, 640), (5, 300)):
+        grey = np.zeros(shape, np.float32)
+        levels = pyramid.pyramid(grey, 7 / 9, 40.0, 180.0)
+        assert len(levels) == 3
+        for level in levels:
+            assert level.grey.shape == (round(level.scale_v * shape[0]), round(level.scale_u * shape[1]))
+            assert level.grey.shape == pytest.approx((level.scale_v * shape[0], level.scale_u * shape[1]), abs=1e-9)
+
+
+def test_candidates_of_alike_size_on_each_other_give_their_weighted_mean():
+    best, alike = [0.9, 52, 50, 36], [0.6, 50, 50, 20]
+    unlike, doubtful, beside = [0.8, 50, 50, 80], [0.2, 47, 50, 20], [0.1, 120, 50, 20]
+    found = detector._distinct(np.array([alike, best, unlike, doubtful, beside]))
+    np.testing.assert_allclose(found[0], [0.9, 51.2, 50, 36**0.6 * 20**0.4])
+    np.testing.assert_allclose(found[1:], [beside])
+    assert detector._distinct(np.empty((0, 4))).shape == (0, 4)
+
+
+def test_the_coupling_and_a_marker_are_parts_of_their_drogue():
+    drogue, coupling, marker = [0.8, 100, 100, 160], [0.99, 102, 100, 40], [0.9, 172, 100, 14]
+    beside, doubtful = [0.9, 250, 100, 14], [0.1, 400, 100, 160]
+    rows = np.array([drogue, coupling, marker, beside, doubtful, [0.5, 400, 100, 40]])
+    np.testing.assert_array_equal(detector._without_parts(rows), rows[[0, 3, 4, 5]])
+
+
+def test_a_drogue_whose_coupling_is_more_confident_is_found_whole(monkeypatch):
+    rows = np.array([[1.0, 100, 100, 160], [3.0, 102, 100, 40]])  # logit, centre and diameter
+    monkeypatch.setattr(detector, "_of_level", lambda level: rows)
+    found = find_drogues(np.zeros((240, 320), np.uint8))
+    assert [c.diameter_px for c in found] == pytest.approx([160])
 
 
 def test_the_figures_of_the_bench_follow_from_the_candidates(samples):
