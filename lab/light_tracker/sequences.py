@@ -27,6 +27,9 @@ HIDDEN_FRAMES = (3, 8)  # range of the frames in which all of the drogue is hidd
 _BLUR_SHARE = 0.4  # of the motion between two frames that the exposure covers
 
 
+_BESIDE = Pose(np.eye(3), np.array([60.0, 0.0, 20.0]))  # outside the picture
+
+
 @dataclass(frozen=True, slots=True)
 class SequenceFrame:
     """One picture and its drogue."""
@@ -50,11 +53,11 @@ class _Course:
 
 
 def moving_drogue(
-    seed: int, frames: int, diameters_px: tuple[float, float] = (9.0, 9.0), hiding: bool = True
+    seed: int, frames: int, diameters_px: tuple[float, float] = (9.0, 9.0), hiding: bool = True, empty: bool = False
 ) -> Iterator[SequenceFrame]:
     """A drogue whose diameter goes from one random value of a range to another one.
 
-    hiding: something passes in front of it once in each PERIOD.
+    hiding: something passes in front of it once in each PERIOD. empty: without a drogue; its centre is nan.
     """
     rng = np.random.default_rng([seed, 31])
     course = _course(rng, frames, diameters_px)
@@ -66,7 +69,7 @@ def moving_drogue(
         ambient, diffuse = course.light[k].tolist()
         scene = replace(
             course.scene,
-            world_from_drogue=_pose(centre, diameter, course.tilt_rad[k]),
+            world_from_drogue=_BESIDE if empty else _pose(centre, diameter, course.tilt_rad[k]),
             light=replace(course.scene.light, ambient=ambient, diffuse=diffuse),
             background=replace(course.scene.background, offset_px=(float(course.drift_px[k, 0]), float(course.drift_px[k, 1]))),
             motion_px=(float(motion[0]), float(motion[1])),
@@ -74,6 +77,9 @@ def moving_drogue(
         )  # fmt: skip
         drawn = render_drogue(scene, rng)
         grey = np.asarray(cv2.cvtColor(drawn.image, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
+        if empty:
+            yield SequenceFrame(grey, np.full(2, np.nan), float("nan"), 1.0)
+            continue
         yield SequenceFrame(grey, drawn.ellipse.centre_px, 2 * drawn.ellipse.major_px, drawn.hidden)
 
 

@@ -25,6 +25,10 @@ _ITERATIONS = 6
 _CONVERGED_PX = 0.01
 _MOST_SHIFT = 0.35  # of the diameter, away from the peak of the correlation
 _MOST_GROWTH = 0.25  # relative change of the diameter in one frame
+_HIDDEN_FACTOR = 3.0  # times the usual unexplained variance: from here on a part of the pattern is left out
+_ROBUST_ROUNDS = 2
+_LEAST_VISIBLE = 0.35  # share of the pattern; with less there is no match
+_TUKEY, _LEAST_SCALE = 4.7, 0.05  # residuals in usual sigmas of which the weight is zero; least sigma
 _LEAST_CONTRAST = 0.5  # DN: a window without any contrast matches nothing
 
 
@@ -37,6 +41,7 @@ class Match:
     diameter_px: float
     covariance: Array  # (3, 3) of u, v (px) and of the logarithm of the diameter
     correlation: float  # weighted correlation coefficient, at most 1
+    visible: float  # share of the pattern that agrees with the picture
     second: float  # of the next best place of the window; -1 where there is none
     patch: Floats  # (n, n) the picture there, of mean 0 and sigma 1 under the weights
 
@@ -83,8 +88,13 @@ class Pattern:
         mixed = _normalised((1 - rate) * self.values + rate * match.patch, self.weights, 1e-6)
         return self if mixed is None else Pattern.of(mixed, self.weights, self.diameter)
 
-    def find(self, picture: Picture, u_px: float, v_px: float, diameter_px: float, reach_px: float) -> Match | None:
-        """The best match with a centre within `reach_px` of a place, of about the given diameter; None without one."""
+    def find(
+        self, picture: Picture, u_px: float, v_px: float, diameter_px: float, reach_px: float, usual: float = np.inf
+    ) -> Match | None:
+        """The best match with a centre within `reach_px` of a place, of about the given diameter; None without one.
+
+        usual: `unexplained` of good matches. With clearly more, a part is hidden: what disagrees is left out.
+        """
         scale = self.diameter / diameter_px
         half = self.values.shape[0] // 2
         # Two diameters are the largest window: it costs as much as the drogue itself four times.
@@ -102,39 +112,94 @@ class Pattern:
         scores = np.nan_to_num(scores, nan=-1.0, posinf=-1.0, neginf=-1.0)
         _, _, _, (x, y) = cv2.minMaxLoc(scores)
         second = _second(scores, x, y, 0.5 * self.diameter)
-        return self._refined(window, float(left + x), float(top + y), window.scale / scale, second)
+        return self._refined(window, float(left + x), float(top + y), window.scale / scale, second, usual)
 
-    def _refined(self, window: _Window, x: float, y: float, growth: float, second: float) -> Match | None:
+    def _refined(
+        self, window: _Window, x: float, y: float, growth: float, second: float, usual: float
+    ) -> Match | None:
         """Gauss-Newton for shift and growth; x, y: the peak of the correlation in the window."""
         half = self.values.shape[0] // 2
-        x0, y0, start = x, y, growth
+        place = self._aligned(window, (x, y, growth))
+        if place is None:
+            return None
+        patch = _normalised(window.patch(*place, half), self.weights, _LEAST_CONTRAST)
+        if patch is None:
+            return None
+        correlation = float((self.weights * self.values * patch).sum())
+        visible, left = 1.0, unexplained(correlation)
+        part = self
+        if left > _HIDDEN_FACTOR * usual:
+            for _ in range(_ROBUST_ROUNDS):
+                weights = self._agreeing(window.patch(*place, half), usual)
+                visible = float((weights * self.weights).sum())
+                if visible < _LEAST_VISIBLE:
+                    return None
+                part = Pattern.of(self.values, (weights * self.weights / visible).astype(np.float32), self.diameter)
+                better = part._aligned(window, place, (x, y, growth))
+                if better is None:
+                    return None
+                place = better
+            patch = _normalised(window.patch(*place, half), self.weights, _LEAST_CONTRAST)
+            if patch is None:
+                return None
+            correlation = float((self.weights * self.values * patch).sum())
+        # Of unit variance, the part that the pattern does not explain, over its degrees of freedom; `normal` belongs to
+        # weights of sum 1, so it is divided by the effective number of pixels.
+        pixels = visible / float((self.weights**2).sum())
+        covariance = min(left, 2 * usual / visible) / max(pixels - 5, 1) * part.normal[:3, :3]
+        to_px = np.array([place[2] / window.scale] * 2 + [1.0])
+        covariance = covariance * to_px[:, None] * to_px
+        u, v = window.outside(*place[:2])
+        diameter = place[2] * self.diameter / window.scale
+        return Match(u, v, diameter, covariance, correlation, visible, second, patch)
+
+    def _aligned(
+        self, window: _Window, place: tuple[float, float, float], start: tuple[float, float, float] | None = None
+    ) -> tuple[float, float, float] | None:
+        """Gauss-Newton for shift and growth from a place; None where it leaves the surroundings of `start`."""
+        half = self.values.shape[0] // 2
+        x, y, growth = place
+        x0, y0, growth0 = place if start is None else start
+        limit = _MOST_SHIFT * self.diameter
         for _ in range(_ITERATIONS):
-            patch = window.patch(x, y, growth, half)
-            du, dv, dg, gain, _ = (self.solver @ patch.ravel()).tolist()
+            du, dv, dg, gain, _ = (self.solver @ window.patch(x, y, growth, half).ravel()).tolist()
             if not gain > 0:
                 return None
             du, dv, dg = du / gain, dv / gain, float(np.clip(dg / gain, -0.1, 0.1))
             x, y = x - growth * du / (1 + dg), y - growth * dv / (1 + dg)
             growth /= 1 + dg
-            limit = _MOST_SHIFT * self.diameter
-            if abs(x - x0) > limit or abs(y - y0) > limit or abs(np.log(growth / start)) > _MOST_GROWTH:
+            if abs(x - x0) > limit or abs(y - y0) > limit or abs(np.log(growth / growth0)) > _MOST_GROWTH:
                 return None
             if abs(du) + abs(dv) + self.diameter / 2 * abs(dg) < _CONVERGED_PX:
                 break
-        raw = window.patch(x, y, growth, half)
-        patch = _normalised(raw, self.weights, _LEAST_CONTRAST)
-        if patch is None:
-            return None
-        correlation = float((self.weights * self.values * patch).sum())
-        # Of unit variance, the part that the pattern does not explain, over its degrees of freedom; `normal` belongs to
-        # weights of sum 1, so it is divided by the effective number of pixels.
-        pixels = 1 / float((self.weights**2).sum())
-        unexplained = max(1 - correlation**2, 1e-6) / max(correlation**2, 1e-6)
-        covariance = unexplained / max(pixels - 5, 1) * self.normal[:3, :3]
-        to_px = np.array([growth / window.scale] * 2 + [1.0])
-        covariance = covariance * to_px[:, None] * to_px
-        u, v = window.outside(x, y)
-        return Match(u, v, growth * self.diameter / window.scale, covariance, correlation, second, patch)
+        return x, y, growth
+
+    def _agreeing(self, patch: Floats, usual: float) -> Floats:
+        """Weights (n, n), 0 to 1, of the pixels that agree with the pattern up to gain and offset (Tukey's biweight).
+
+        Gain and offset come from the half of the pixels that agrees best, starting with all.
+        """
+        own = self.weights > 0
+        values, seen = self.values[own].astype(float), patch[own].astype(float)
+        keep = np.ones(len(values), bool)
+        away = np.zeros(len(values))
+        for _ in range(4):
+            A = np.stack([values[keep], np.ones(int(keep.sum()))], axis=1)
+            gain, offset = np.linalg.lstsq(A, seen[keep], rcond=None)[0]
+            if not gain > 0:
+                return np.zeros_like(patch)
+            away = np.abs((seen - offset) / gain - values)
+            keep = away <= np.median(away)
+        scale = np.sqrt(usual) + _LEAST_SCALE
+        out = np.zeros_like(patch)
+        out[own] = np.clip(1 - (away / (_TUKEY * scale)) ** 2, 0, 1) ** 2
+        return out
+
+
+def unexplained(correlation: float) -> float:
+    """Variance that the pattern does not explain, over the one that it explains."""
+    square = float(np.clip(correlation, 1e-3, 1 - 1e-6)) ** 2
+    return (1 - square) / square
 
 
 @dataclass(frozen=True, slots=True)

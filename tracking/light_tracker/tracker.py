@@ -1,0 +1,279 @@
+"""Tracks one drogue: the detector acquires it and checks every few frames, the light tracker follows it in between.
+
+Rules of the hand-over (ours; Zhou (2020) only states that a light tracker follows the network):
+- The detector searches the whole picture until it finds one drogue that it is confident of.
+- In each frame the light tracker finds the pattern near its prediction. Every `check_every` frames, or as soon as the
+  confidence is low, the detector searches a window around it. A detection there confirms the track and corrects it.
+- After frames without a match, or checks in a row without a detection, the detector searches the whole picture.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from tracking.drogue_circle.candidates import CircleCandidate, CircleDetector, Picture, Window
+from tracking.light_tracker.confidence import ABSENT_LOGIT, features, fisher, logit, probability, within
+from tracking.light_tracker.frames import Cause, DrogueFrame, Source, nothing_known
+from tracking.light_tracker.motion import Motion
+from tracking.light_tracker.parameters import USUAL, LightParameters
+from tracking.light_tracker.pattern import Match, Pattern, unexplained
+from tracking.statuses import PoseStatus
+
+_NEAR_PX = 20.0  # distance of the first drogue from the place that the user states
+_SUPPORT_RATE = 0.25  # of the running mean of the log odds of the checks
+_USUAL_RATE = 0.1  # of the running mean of the correlation
+_OFF_CENTRE, _OFF_SIZE = 0.12, 0.2  # offset of the pattern, in diameters and as a logarithm, that cuts it out again
+_WHOLE = 0.9  # visible share of a pattern of which nothing is hidden
+_MORE_PX = 2.0  # radius of a window beyond 3 sigma
+
+
+@dataclass(slots=True)
+class _Track:
+    """What is known of the drogue while it is followed."""
+
+    motion: Motion
+    pattern: Pattern
+    support: float  # running mean of the log odds of the checks
+    usual: float = float("nan")  # running mean of Fisher's z of the matches' correlation
+    confirmed: int = 1  # detections
+    unconfirmed: int = 0  # checks in a row without a detection
+    age: float = 0.0  # frames since the last confirmation
+    since_check: int = 0  # frames since the detector searched
+    trusted: float = 1.0  # confidence of the last measured frame
+    misses: int = 0  # frames in a row without a measurement
+
+
+@dataclass(slots=True)
+class DrogueTracker:
+    """The state between frames. `detector`: of drogues; the score of its candidates is a probability."""
+
+    detector: CircleDetector
+    parameters: LightParameters = USUAL
+    near_px: tuple[float, float] | None = None  # of the first drogue, if the user knows it
+    _track: _Track | None = None
+    _last: Motion | None = None  # of the drogue that was lost
+    _ambiguous: bool = False
+    trace: list[np.ndarray] | None = field(default=None)  # if a list: gets the inputs of the confidence
+
+    def step(self, picture: Picture | None, dt: float = 1.0) -> DrogueFrame:
+        """The next frame. picture None: there is none. dt: frames since the last step."""
+        track = self._track
+        if track is None:
+            return nothing_known(Cause.NO_IMAGE) if picture is None else self._acquired(picture)
+        track.motion = track.motion.predicted(dt, self.parameters)
+        track.age += dt
+        if picture is None:
+            return self._unmeasured(track, Cause.NO_IMAGE)
+        height, width = picture.shape
+        u, v = track.motion.x[:2].tolist()
+        if not (-0.5 <= u < width - 0.5 and -0.5 <= v < height - 0.5):
+            return self._missed(track, picture, Cause.OUT_OF_VIEW, None, "", 0)
+        match = self._matched(track, picture)
+        if match is not None:
+            track.motion = track.motion.matched(match)
+        track.since_check += 1
+        searched, found, source = "", 0, Source.LIGHT
+        confidence = self._confidence(track, match)
+        p = self.parameters
+        if match is None or track.since_check >= p.check_every or confidence < p.hand_back_confidence:
+            seen = self._seen(track, picture)
+            searched, found, track.since_check = "window", len(seen), 0
+            best = self._confirming(track, seen, match)
+            if best is not None:
+                match = self._confirm(track, picture, best, match)
+                source = Source.BOTH
+            elif match is not None:
+                track.unconfirmed += 1
+                track.support += _SUPPORT_RATE * (ABSENT_LOGIT - track.support)
+            confidence = self._confidence(track, match)
+        if match is None or confidence < p.measured_confidence:
+            cause = Cause.NO_MATCH if match is None else Cause.UNCERTAIN
+            return self._missed(track, picture, cause, match, searched, found)
+        if track.unconfirmed >= p.most_unconfirmed and track.since_check == 0:
+            again = self._found_elsewhere(track, picture)
+            if again is not None:
+                return again
+            searched = "both"
+        track.misses, track.trusted = 0, confidence
+        self._learn(track, picture, match)
+        return self._frame(
+            track, PoseStatus.MEASURED, Cause.NONE, source, confidence, match.correlation, searched, found
+        )
+
+    def _matched(self, track: _Track, picture: Picture) -> Match | None:
+        """The pattern near the prediction."""
+        motion = track.motion
+        reach = 3 * motion.sigma_px + _MORE_PX
+        usual = unexplained(float(np.tanh(track.usual))) if np.isfinite(track.usual) else np.inf
+        match = track.pattern.find(picture, *motion.x[:2].tolist(), motion.diameter_px, reach, usual)
+        if match is None or match.correlation < self.parameters.least_correlation:
+            return None
+        limit = np.log(self.parameters.size_ratio)
+        return match if abs(np.log(match.diameter_px) - motion.log_diameter) < limit else None
+
+    def _seen(self, track: _Track, picture: Picture) -> list[CircleCandidate]:
+        """What the detector finds around the track, of about its size."""
+        motion, p = track.motion, self.parameters
+        diameter = motion.rim_diameter_px
+        gate = p.window_diameters * diameter + 3 * motion.sigma_px
+        u, v = motion.centre_px.tolist()
+        low, high = diameter / 2 / p.size_ratio, diameter / 2 * p.size_ratio
+        window = Window(u, v, gate + 0.6 * diameter, gate, low, high)
+        return [
+            c for c in self.detector(picture, window)
+            if c.score >= p.confirm_confidence and low <= c.radius_px <= high
+        ]  # fmt: skip
+
+    def _confirming(
+        self, track: _Track, seen: Sequence[CircleCandidate], match: Match | None
+    ) -> CircleCandidate | None:
+        """The detection of the tracked drogue: at the match, or, without one, where the drogue can be."""
+        motion, p = track.motion, self.parameters
+        near = p.agree_diameters * motion.rim_diameter_px + (3 * motion.sigma_px if match is None else 1.0)
+        u, v = motion.centre_px.tolist()
+        own = [c for c in seen if np.hypot(c.u_px - u, c.v_px - v) <= near]
+        if match is None:
+            own = [c for c in own if c.score >= p.acquire_confidence]
+        return max(own, key=lambda c: c.score, default=None)
+
+    def _confirm(
+        self, track: _Track, picture: Picture, seen: CircleCandidate, match: Match | None
+    ) -> Match | None:
+        """Take a detection into the track. Returns the match, found again at the detection where there was none."""
+        p = self.parameters
+        if match is None:
+            track_at = track.motion
+            u, v = (np.array([seen.u_px, seen.v_px]) - track_at.diameter_px * track_at.offset[:2]).tolist()
+            diameter = 2 * seen.radius_px / float(np.exp(track_at.offset[2]))
+            match = track.pattern.find(picture, u, v, diameter, 0.2 * diameter + 1)
+            if match is None or match.correlation < p.least_correlation:
+                return None
+            track.motion = track.motion.matched(match)
+        track.motion = track.motion.detected(seen.u_px, seen.v_px, 2 * seen.radius_px, p)
+        track.support += _SUPPORT_RATE * (logit(seen.score) - track.support)
+        track.confirmed, track.unconfirmed, track.age = track.confirmed + 1, 0, 0.0
+        return match
+
+    def _learn(self, track: _Track, picture: Picture, match: Match) -> None:
+        """Update the pattern with a good match."""
+        z, p = fisher(match.correlation), self.parameters
+        whole = match.visible > _WHOLE
+        if match.correlation >= p.update_correlation and whole:
+            track.pattern = track.pattern.updated(match, p.update_rate)
+        offset = np.abs(track.motion.offset)
+        if whole and track.age == 0 and (offset[:2].max() > _OFF_CENTRE or offset[2] > _OFF_SIZE):
+            motion = track.motion.centred()
+            pattern = Pattern.started(picture, *motion.x[:2].tolist(), motion.diameter_px)
+            if pattern is not None:
+                track.motion, track.pattern = motion, pattern
+        rate = _USUAL_RATE if whole else _USUAL_RATE / 5
+        track.usual = z if np.isnan(track.usual) else track.usual + rate * (z - track.usual)
+
+    def _confidence(self, track: _Track, match: Match | None) -> float:
+        if match is None:
+            return 0.0
+        usual = fisher(match.correlation) if np.isnan(track.usual) else track.usual
+        inputs = features(
+            match.correlation, usual, match.second, track.support, track.confirmed, track.unconfirmed, track.age
+        )
+        if self.trace is not None:
+            self.trace.append(inputs)
+        return probability(inputs)
+
+    def _acquired(self, picture: Picture) -> DrogueFrame:
+        """Search the whole picture."""
+        found = self._in_picture(picture)
+        best, ambiguous = self._chosen(found)
+        event = "ambiguous" if ambiguous and not self._ambiguous else ""
+        self._ambiguous = ambiguous
+        pattern = None if best is None else Pattern.started(picture, best.u_px, best.v_px, 2 * best.radius_px)
+        if best is None or pattern is None:
+            cause = Cause.AMBIGUOUS if ambiguous else Cause.NOT_FOUND
+            return nothing_known(cause, event, "picture", len(found))
+        event = "acquired" if self._last is None else "reacquired"
+        return self._start(best, pattern, "picture", len(found), event)
+
+    def _start(
+        self, seen: CircleCandidate, pattern: Pattern, searched: str, found: int, event: str
+    ) -> DrogueFrame:
+        motion = Motion.started(seen.u_px, seen.v_px, 2 * seen.radius_px, self.parameters)
+        self._track = track = _Track(motion, pattern, logit(seen.score), trusted=seen.score)
+        return self._frame(
+            track, PoseStatus.MEASURED, Cause.NONE, Source.DETECTOR, seen.score, float("nan"), searched, found, event
+        )
+
+    def _in_picture(self, picture: Picture) -> list[CircleCandidate]:
+        return [c for c in self.detector(picture, None) if c.score >= self.parameters.confirm_confidence]
+
+    def _chosen(self, found: Sequence[CircleCandidate]) -> tuple[CircleCandidate | None, bool]:
+        """The drogue among the detections of a picture, and whether several can be it."""
+        p = self.parameters
+        good = [c for c in found if c.score >= p.acquire_confidence]
+        if self.near_px is not None and self._last is None:
+            u, v = self.near_px
+            good = [c for c in good if np.hypot(c.u_px - u, c.v_px - v) <= max(_NEAR_PX, c.radius_px)]
+        good.sort(key=lambda c: -c.score)
+        if len(good) > 1 and logit(good[0].score) - logit(good[1].score) < p.ambiguous_logit:
+            return None, True
+        return (good[0], False) if good else (None, False)
+
+    def _missed(
+        self, track: _Track, picture: Picture, cause: Cause, match: Match | None, searched: str, found: int
+    ) -> DrogueFrame:
+        """No measurement: at times the detector searches the whole picture; else the frame is predicted or lost."""
+        if (track.misses + 1) % self.parameters.search_after == 0:
+            again = self._found_elsewhere(track, picture)
+            if again is not None:
+                return again
+            searched = "both" if searched else "picture"
+        out = self._unmeasured(track, cause, 1.0 if match is None else self._confidence(track, match))
+        correlation = float("nan") if match is None else match.correlation
+        return replace(out, correlation=correlation, searched=searched, candidates=found)
+
+    def _found_elsewhere(self, track: _Track, picture: Picture) -> DrogueFrame | None:
+        """One drogue in the whole picture, of about the same size, away from where the track is."""
+        motion, p = track.motion, self.parameters
+        found = self._in_picture(picture)
+        limit = p.size_ratio
+        alike = [c for c in found if 1 / limit < 2 * c.radius_px / motion.rim_diameter_px < limit]
+        best, _ = self._chosen(alike)
+        if best is None:
+            return None
+        u, v = motion.centre_px.tolist()
+        if track.misses == 0 and np.hypot(best.u_px - u, best.v_px - v) < motion.rim_diameter_px / 2:
+            return None
+        pattern = Pattern.started(picture, best.u_px, best.v_px, 2 * best.radius_px)
+        return None if pattern is None else self._start(best, pattern, "both", len(found), "reacquired")
+
+    def _unmeasured(self, track: _Track, cause: Cause, share: float = 1.0) -> DrogueFrame:
+        """A frame without a measurement: predicted, or lost."""
+        track.misses += 1
+        motion, p = track.motion, self.parameters
+        certain = motion.sigma_px <= p.lost_sigma_diameters * motion.rim_diameter_px
+        if certain and track.misses <= p.most_predicted:
+            sigma = float(np.sqrt(np.trace(motion.covariance) / 2))
+            confidence = share * track.trusted * within(sigma, motion.rim_diameter_px)
+            return self._frame(track, PoseStatus.PREDICTED, cause, Source.NONE, confidence, float("nan"), "", 0)
+        self._last, self._track = motion, None
+        return nothing_known(cause, "lost")
+
+    @staticmethod
+    def _frame(
+        track: _Track,
+        status: PoseStatus,
+        cause: Cause,
+        source: Source,
+        confidence: float,
+        correlation: float,
+        searched: str,
+        found: int,
+        event: str = "",
+    ) -> DrogueFrame:
+        m = track.motion
+        return DrogueFrame(
+            status, cause, source, m.centre_px, m.x[2:].copy(), m.rim_diameter_px, m.covariance, m.sigma_diameter_px,
+            confidence, correlation, searched, found, event,
+        )  # fmt: skip
