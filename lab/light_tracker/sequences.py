@@ -162,7 +162,11 @@ def _passing(rng: np.random.Generator, frames: int) -> dict[int, _Passing]:
         middle = n * PERIOD + rng.uniform(0.5, 0.8) * PERIOD
         kind = (BAR, DISC)[int(rng.integers(2))]
         out[n] = _Passing(
-            middle, float(rng.uniform(*HIDDEN_FRAMES)), float(rng.uniform(0, 2 * np.pi)), kind, float(rng.uniform(30, 160))
+            middle,
+            float(rng.uniform(*HIDDEN_FRAMES)),
+            float(rng.uniform(0, 2 * np.pi)),
+            kind,
+            float(rng.uniform(30, 160)),
         )
     return out
 
@@ -183,5 +187,7 @@ def _in_front(passing: dict[int, _Passing], k: int, centre_px: Array, diameter_p
     start = end - 900 * side
     grey = (p.grey,) * 3
     return (
-        Occluder((float(end[0]), float(end[1])), _WIDTH * diameter_px, (float(start[0]), float(start[1])), p.kind, grey),
+        Occluder(
+            (float(end[0]), float(end[1])), _WIDTH * diameter_px, (float(start[0]), float(start[1])), p.kind, grey
+        ),
     )

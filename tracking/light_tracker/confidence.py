@@ -12,8 +12,8 @@ import numpy as np
 from geometry.arrays import Array
 
 RIGHT_SHARE = 0.25  # of the diameter
-FEATURES = ("1", "correlation", "drop", "lead", "support", "confirmed", "unconfirmed", "age")
-COEFFICIENTS = (-1.0, 1.2, -1.0, 0.3, 0.7, 0.5, -0.3, -0.2)
+FEATURES = ("1", "correlation", "drop", "lead", "support", "confirmed", "unconfirmed", "age", "misses")
+COEFFICIENTS = (0.44, -0.92, 0.44, 1.29, 0.69, 1.2, 0.0, -0.69, 0.32)
 ABSENT_LOGIT = -2.0  # of a check without a detection, in the running mean of the checks
 _CAP = 0.995  # of correlations: above it, noise decides
 _OLDEST = 30.0  # frames
@@ -26,18 +26,27 @@ def fisher(correlation: float) -> float:
 
 
 def features(
-    correlation: float, usual: float, second: float, support: float, confirmed: int, unconfirmed: int, age: float
+    correlation: float,
+    usual: float,
+    second: float,
+    support: float,
+    confirmed: int,
+    unconfirmed: int,
+    age: float,
+    misses: int,
 ) -> Array:
-    """The inputs (8,) of the curve.
+    """The inputs (9,) of the curve.
 
     correlation: of the match; usual: `fisher` of the matches before, running mean; second: correlation of the next best
     place of the window. support: running mean of the log odds of the checks. confirmed: detections of this track;
     unconfirmed: checks in a row without one; age: frames since the last one.
+    misses: frames without a measurement before this one.
     """
     best = fisher(correlation)
     return np.array(
         [1.0, best, max(usual - best, 0.0), max(best - fisher(second), 0.0), support,
-         np.log(min(max(confirmed, 1), _MOST_CONFIRMED)), np.log1p(unconfirmed), np.log1p(min(age, _OLDEST))]
+         np.log(min(max(confirmed, 1), _MOST_CONFIRMED)), np.log1p(unconfirmed), np.log1p(min(age, _OLDEST)),
+         np.log1p(misses)]
     )  # fmt: skip
 
 

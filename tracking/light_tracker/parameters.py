@@ -13,6 +13,7 @@ class LightParameters:
     smallest_px: float = 8.0  # px: diameters that the detector looks for; it knows no smaller ones
     largest_px: float | None = None  # px; None: the picture's smaller side
     acquire_confidence: float = 0.5  # of a detection that starts a track by itself
+    elsewhere_confidence: float = 0.8  # of a detection that replaces a track elsewhere in the picture
     confirm_confidence: float = 0.15  # of a detection where the tracker is: two independent ones agree
     ambiguous_logit: float = 2.5  # a second detection whose log odds are less than this below the best: ambiguous
     measured_confidence: float = 0.5  # with less, the frame is predicted
@@ -30,8 +31,9 @@ class LightParameters:
     detection_size_sigma: float = 0.15  # of the logarithm of a detected diameter
     offset_drift: float = 0.004  # per frame, in diameters: motion of the rim's centre in the pattern
     search_after: int = 3  # frames without a measurement after which the detector searches the whole picture
-    most_predicted: int = 25  # frames without a measurement after which the drogue is lost
-    lost_sigma_diameters: float = 1.5  # 1 sigma of the centre above which the drogue is lost
+    most_predicted: int = 50  # frames without a measurement after which the drogue is lost
+    most_unseen: int = 100  # frames without a detection after which a drogue that is not measured is lost, too
+    lost_sigma_diameters: float = 1.0  # 1 sigma of the centre above which the status is lost
     most_unconfirmed: int = 6  # checks in a row without a detection after which the whole picture is searched
 
     def __post_init__(self) -> None:

@@ -21,13 +21,14 @@ Floats: TypeAlias = NDArray[np.float32]
 
 SMALLEST_PX, LARGEST_PX = 9.0, 24.0  # diameter of the drogue in the pattern
 _REACH = 0.62  # of the pattern, in diameters: the rim and a little of what is around it
+_LARGEST_REACH = 4.0  # diameters: half of the side of the largest window
 _ITERATIONS = 6
 _CONVERGED_PX = 0.01
 _MOST_SHIFT = 0.35  # of the diameter, away from the peak of the correlation
 _MOST_GROWTH = 0.25  # relative change of the diameter in one frame
-_HIDDEN_FACTOR = 3.0  # times the usual unexplained variance: from here on a part of the pattern is left out
+_HIDDEN_FACTOR = 2.0  # times the usual unexplained variance: from here on a part of the pattern is left out
 _ROBUST_ROUNDS = 2
-_LEAST_VISIBLE = 0.35  # share of the pattern; with less there is no match
+_LEAST_VISIBLE = 0.3  # share of the pattern; with less there is no match
 _TUKEY, _LEAST_SCALE = 4.7, 0.05  # residuals in usual sigmas of which the weight is zero; least sigma
 _LEAST_CONTRAST = 0.5  # DN: a window without any contrast matches nothing
 
@@ -97,8 +98,7 @@ class Pattern:
         """
         scale = self.diameter / diameter_px
         half = self.values.shape[0] // 2
-        # Two diameters are the largest window: it costs as much as the drogue itself four times.
-        reach = float(np.clip(np.ceil(reach_px * scale), 2, 2.5 * self.diameter))
+        reach = float(np.clip(np.ceil(reach_px * scale), 2, _LARGEST_REACH * self.diameter))
         window = _Window.around(picture, u_px, v_px, (reach + half + 2) / scale, scale)
         if window is None:
             return None
@@ -114,9 +114,7 @@ class Pattern:
         second = _second(scores, x, y, 0.5 * self.diameter)
         return self._refined(window, float(left + x), float(top + y), window.scale / scale, second, usual)
 
-    def _refined(
-        self, window: _Window, x: float, y: float, growth: float, second: float, usual: float
-    ) -> Match | None:
+    def _refined(self, window: _Window, x: float, y: float, growth: float, second: float, usual: float) -> Match | None:
         """Gauss-Newton for shift and growth; x, y: the peak of the correlation in the window."""
         half = self.values.shape[0] // 2
         place = self._aligned(window, (x, y, growth))

@@ -10,23 +10,25 @@ Rules of the hand-over (ours; Zhou (2020) only states that a light tracker follo
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from geometry.arrays import Array
 from tracking.drogue_circle.candidates import CircleCandidate, CircleDetector, Picture, Window
 from tracking.light_tracker.confidence import ABSENT_LOGIT, features, fisher, logit, probability, within
 from tracking.light_tracker.frames import Cause, DrogueFrame, Source, nothing_known
-from tracking.light_tracker.motion import Motion
+from tracking.light_tracker.motion import WHOLE, Motion
 from tracking.light_tracker.parameters import USUAL, LightParameters
 from tracking.light_tracker.pattern import Match, Pattern, unexplained
 from tracking.statuses import PoseStatus
 
+_SIMILAR = 0.7  # fall of Fisher's z of the correlation below its usual value, of a match that may be the drogue
+_LONGEST_GAP = 20  # frames
 _NEAR_PX = 20.0  # distance of the first drogue from the place that the user states
 _SUPPORT_RATE = 0.25  # of the running mean of the log odds of the checks
 _USUAL_RATE = 0.1  # of the running mean of the correlation
 _OFF_CENTRE, _OFF_SIZE = 0.12, 0.2  # offset of the pattern, in diameters and as a logarithm, that cuts it out again
-_WHOLE = 0.9  # visible share of a pattern of which nothing is hidden
 _MORE_PX = 2.0  # radius of a window beyond 3 sigma
 
 
@@ -42,8 +44,11 @@ class _Track:
     unconfirmed: int = 0  # checks in a row without a detection
     age: float = 0.0  # frames since the last confirmation
     since_check: int = 0  # frames since the detector searched
+    lost: bool = False  # reported as lost
     trusted: float = 1.0  # confidence of the last measured frame
     misses: int = 0  # frames in a row without a measurement
+    blind: int = 0  # frames in a row without a match that resembles the pattern
+    gap: int = 0  # the same, and falling by one with each match afterwards: how far the drogue can have moved away
 
 
 @dataclass(slots=True)
@@ -56,24 +61,25 @@ class DrogueTracker:
     _track: _Track | None = None
     _last: Motion | None = None  # of the drogue that was lost
     _ambiguous: bool = False
-    trace: list[np.ndarray] | None = field(default=None)  # if a list: gets the inputs of the confidence
+    trace: list[tuple[Array, Array]] | None = None  # if a list: gets inputs of the confidence, and the centre, px
 
     def step(self, picture: Picture | None, dt: float = 1.0) -> DrogueFrame:
         """The next frame. picture None: there is none. dt: frames since the last step."""
         track = self._track
         if track is None:
             return nothing_known(Cause.NO_IMAGE) if picture is None else self._acquired(picture)
-        track.motion = track.motion.predicted(dt, self.parameters)
+        track.motion = track.motion.predicted(dt, track.blind, self.parameters)
+        predicted = track.motion
         track.age += dt
         if picture is None:
             return self._unmeasured(track, Cause.NO_IMAGE)
         height, width = picture.shape
         u, v = track.motion.x[:2].tolist()
         if not (-0.5 <= u < width - 0.5 and -0.5 <= v < height - 0.5):
-            return self._missed(track, picture, Cause.OUT_OF_VIEW, None, "", 0)
+            return self._missed(track, picture, Cause.OUT_OF_VIEW)
         match = self._matched(track, picture)
         if match is not None:
-            track.motion = track.motion.matched(match)
+            track.motion = track.motion.matched(match, self.parameters, track.blind == 0)
         track.since_check += 1
         searched, found, source = "", 0, Source.LIGHT
         confidence = self._confidence(track, match)
@@ -91,16 +97,24 @@ class DrogueTracker:
             confidence = self._confidence(track, match)
         if match is None or confidence < p.measured_confidence:
             cause = Cause.NO_MATCH if match is None else Cause.UNCERTAIN
-            return self._missed(track, picture, cause, match, searched, found)
+            if match is not None and track.usual - fisher(match.correlation) < _SIMILAR:
+                track.blind, track.gap = 0, max(track.gap - 1, 0)  # it may be the drogue: later frames decide
+            else:
+                track.blind, track.gap = track.blind + 1, min(track.gap + 1, _LONGEST_GAP)
+                track.motion = replace(
+                    predicted, offset=track.motion.offset, offset_variance=track.motion.offset_variance
+                )
+            return self._missed(track, picture, cause, match, searched, found, confidence)
         if track.unconfirmed >= p.most_unconfirmed and track.since_check == 0:
             again = self._found_elsewhere(track, picture)
             if again is not None:
                 return again
             searched = "both"
-        track.misses, track.trusted = 0, confidence
+        event, track.lost = "reacquired" if track.lost else "", False
+        track.misses, track.blind, track.gap, track.trusted = 0, 0, max(track.gap - 1, 0), confidence
         self._learn(track, picture, match)
         return self._frame(
-            track, PoseStatus.MEASURED, Cause.NONE, source, confidence, match.correlation, searched, found
+            track, PoseStatus.MEASURED, Cause.NONE, source, confidence, match.correlation, searched, found, event
         )
 
     def _matched(self, track: _Track, picture: Picture) -> Match | None:
@@ -139,9 +153,7 @@ class DrogueTracker:
             own = [c for c in own if c.score >= p.acquire_confidence]
         return max(own, key=lambda c: c.score, default=None)
 
-    def _confirm(
-        self, track: _Track, picture: Picture, seen: CircleCandidate, match: Match | None
-    ) -> Match | None:
+    def _confirm(self, track: _Track, picture: Picture, seen: CircleCandidate, match: Match | None) -> Match | None:
         """Take a detection into the track. Returns the match, found again at the detection where there was none."""
         p = self.parameters
         if match is None:
@@ -151,7 +163,7 @@ class DrogueTracker:
             match = track.pattern.find(picture, u, v, diameter, 0.2 * diameter + 1)
             if match is None or match.correlation < p.least_correlation:
                 return None
-            track.motion = track.motion.matched(match)
+            track.motion = track.motion.matched(match, p, learn=False)
         track.motion = track.motion.detected(seen.u_px, seen.v_px, 2 * seen.radius_px, p)
         track.support += _SUPPORT_RATE * (logit(seen.score) - track.support)
         track.confirmed, track.unconfirmed, track.age = track.confirmed + 1, 0, 0.0
@@ -160,7 +172,7 @@ class DrogueTracker:
     def _learn(self, track: _Track, picture: Picture, match: Match) -> None:
         """Update the pattern with a good match."""
         z, p = fisher(match.correlation), self.parameters
-        whole = match.visible > _WHOLE
+        whole = match.visible > WHOLE
         if match.correlation >= p.update_correlation and whole:
             track.pattern = track.pattern.updated(match, p.update_rate)
         offset = np.abs(track.motion.offset)
@@ -177,10 +189,11 @@ class DrogueTracker:
             return 0.0
         usual = fisher(match.correlation) if np.isnan(track.usual) else track.usual
         inputs = features(
-            match.correlation, usual, match.second, track.support, track.confirmed, track.unconfirmed, track.age
-        )
+            match.correlation, usual, match.second, track.support, track.confirmed, track.unconfirmed, track.age,
+            track.gap,
+        )  # fmt: skip
         if self.trace is not None:
-            self.trace.append(inputs)
+            self.trace.append((inputs, track.motion.centre_px))
         return probability(inputs)
 
     def _acquired(self, picture: Picture) -> DrogueFrame:
@@ -196,9 +209,7 @@ class DrogueTracker:
         event = "acquired" if self._last is None else "reacquired"
         return self._start(best, pattern, "picture", len(found), event)
 
-    def _start(
-        self, seen: CircleCandidate, pattern: Pattern, searched: str, found: int, event: str
-    ) -> DrogueFrame:
+    def _start(self, seen: CircleCandidate, pattern: Pattern, searched: str, found: int, event: str) -> DrogueFrame:
         motion = Motion.started(seen.u_px, seen.v_px, 2 * seen.radius_px, self.parameters)
         self._track = track = _Track(motion, pattern, logit(seen.score), trusted=seen.score)
         return self._frame(
@@ -221,7 +232,14 @@ class DrogueTracker:
         return (good[0], False) if good else (None, False)
 
     def _missed(
-        self, track: _Track, picture: Picture, cause: Cause, match: Match | None, searched: str, found: int
+        self,
+        track: _Track,
+        picture: Picture,
+        cause: Cause,
+        match: Match | None = None,
+        searched: str = "",
+        found: int = 0,
+        confidence: float = 1.0,
     ) -> DrogueFrame:
         """No measurement: at times the detector searches the whole picture; else the frame is predicted or lost."""
         if (track.misses + 1) % self.parameters.search_after == 0:
@@ -229,7 +247,7 @@ class DrogueTracker:
             if again is not None:
                 return again
             searched = "both" if searched else "picture"
-        out = self._unmeasured(track, cause, 1.0 if match is None else self._confidence(track, match))
+        out = self._unmeasured(track, cause, 1.0 if match is None else confidence)
         correlation = float("nan") if match is None else match.correlation
         return replace(out, correlation=correlation, searched=searched, candidates=found)
 
@@ -240,7 +258,7 @@ class DrogueTracker:
         limit = p.size_ratio
         alike = [c for c in found if 1 / limit < 2 * c.radius_px / motion.rim_diameter_px < limit]
         best, _ = self._chosen(alike)
-        if best is None:
+        if best is None or best.score < p.elsewhere_confidence:
             return None
         u, v = motion.centre_px.tolist()
         if track.misses == 0 and np.hypot(best.u_px - u, best.v_px - v) < motion.rim_diameter_px / 2:
@@ -252,13 +270,17 @@ class DrogueTracker:
         """A frame without a measurement: predicted, or lost."""
         track.misses += 1
         motion, p = track.motion, self.parameters
-        certain = motion.sigma_px <= p.lost_sigma_diameters * motion.rim_diameter_px
-        if certain and track.misses <= p.most_predicted:
-            sigma = float(np.sqrt(np.trace(motion.covariance) / 2))
-            confidence = share * track.trusted * within(sigma, motion.rim_diameter_px)
-            return self._frame(track, PoseStatus.PREDICTED, cause, Source.NONE, confidence, float("nan"), "", 0)
-        self._last, self._track = motion, None
-        return nothing_known(cause, "lost")
+        if track.misses > p.most_predicted or track.age > p.most_unseen:
+            self._last, self._track = motion, None
+            return nothing_known(cause, "lost")
+        if motion.sigma_px > p.lost_sigma_diameters * motion.rim_diameter_px:
+            # The track is kept: its pattern may be found again before the detector finds the drogue.
+            event = "" if track.lost else "lost"
+            track.lost = True
+            return nothing_known(cause, event)
+        sigma = float(np.sqrt(np.trace(motion.covariance) / 2))
+        confidence = share * track.trusted * within(sigma, motion.rim_diameter_px)
+        return self._frame(track, PoseStatus.PREDICTED, cause, Source.NONE, confidence, float("nan"), "", 0)
 
     @staticmethod
     def _frame(
