@@ -24,6 +24,8 @@ from tracking.light_tracker.pattern import Match, Pattern, unexplained
 from tracking.statuses import PoseStatus
 
 _SIMILAR = 0.7  # fall of Fisher's z of the correlation below its usual value, of a match that may be the drogue
+_TRUSTED = 4  # detections that confirmed a track
+_GOOD = 1.5  # Fisher's z that is similar in any case: a correlation of 0.905
 _LONGEST_GAP = 20  # frames
 _NEAR_PX = 20.0  # distance of the first drogue from the place that the user states
 _SUPPORT_RATE = 0.25  # of the running mean of the log odds of the checks
@@ -97,7 +99,9 @@ class DrogueTracker:
             confidence = self._confidence(track, match)
         if match is None or confidence < p.measured_confidence:
             cause = Cause.NO_MATCH if match is None else Cause.UNCERTAIN
-            if match is not None and track.usual - fisher(match.correlation) < _SIMILAR:
+            if match is not None and (
+                track.usual - fisher(match.correlation) < _SIMILAR or fisher(match.correlation) > _GOOD
+            ):
                 track.blind, track.gap = 0, max(track.gap - 1, 0)  # it may be the drogue: later frames decide
             else:
                 track.blind, track.gap = track.blind + 1, min(track.gap + 1, _LONGEST_GAP)
@@ -125,6 +129,9 @@ class DrogueTracker:
         match = track.pattern.find(picture, *motion.x[:2].tolist(), motion.diameter_px, reach, usual)
         if match is None or match.correlation < self.parameters.least_correlation:
             return None
+        z = fisher(match.correlation)
+        if track.gap and track.usual - z > _SIMILAR and z < _GOOD:
+            return None  # after a gap, what is in front of the drogue has a weak correlation too
         limit = np.log(self.parameters.size_ratio)
         return match if abs(np.log(match.diameter_px) - motion.log_diameter) < limit else None
 
@@ -161,12 +168,27 @@ class DrogueTracker:
             u, v = (np.array([seen.u_px, seen.v_px]) - track_at.diameter_px * track_at.offset[:2]).tolist()
             diameter = 2 * seen.radius_px / float(np.exp(track_at.offset[2]))
             match = track.pattern.find(picture, u, v, diameter, 0.2 * diameter + 1)
-            if match is None or match.correlation < p.least_correlation:
+            if match is not None and match.correlation >= p.least_correlation:
+                track.motion = track.motion.matched(match, p, learn=False)
+            elif seen.score >= p.elsewhere_confidence and track.misses >= p.search_after:
+                return self._cut_again(track, picture, seen)
+            else:
                 return None
-            track.motion = track.motion.matched(match, p, learn=False)
         track.motion = track.motion.detected(seen.u_px, seen.v_px, 2 * seen.radius_px, p)
         track.support += _SUPPORT_RATE * (logit(seen.score) - track.support)
         track.confirmed, track.unconfirmed, track.age = track.confirmed + 1, 0, 0.0
+        return match
+
+    def _cut_again(self, track: _Track, picture: Picture, seen: CircleCandidate) -> Match | None:
+        """A new pattern at a detection: the drogue does not look as before."""
+        diameter = 2 * seen.radius_px
+        pattern = Pattern.started(picture, seen.u_px, seen.v_px, diameter)
+        match = None if pattern is None else pattern.find(picture, seen.u_px, seen.v_px, diameter, 0.0)
+        if pattern is None or match is None:
+            return None
+        track.motion = Motion.started(seen.u_px, seen.v_px, diameter, self.parameters)
+        track.pattern, track.usual, track.confirmed = pattern, float("nan"), 1
+        track.unconfirmed, track.age = 0, 0.0
         return match
 
     def _learn(self, track: _Track, picture: Picture, match: Match) -> None:
@@ -255,10 +277,11 @@ class DrogueTracker:
         """One drogue in the whole picture, of about the same size, away from where the track is."""
         motion, p = track.motion, self.parameters
         found = self._in_picture(picture)
-        limit = p.size_ratio
+        # A track that few detections confirmed may have a wrong size, and be none.
+        limit = p.size_ratio if track.confirmed >= _TRUSTED else np.inf
         alike = [c for c in found if 1 / limit < 2 * c.radius_px / motion.rim_diameter_px < limit]
         best, _ = self._chosen(alike)
-        if best is None or best.score < p.elsewhere_confidence:
+        if best is None or (best.score < p.elsewhere_confidence and not track.lost):
             return None
         u, v = motion.centre_px.tolist()
         if track.misses == 0 and np.hypot(best.u_px - u, best.v_px - v) < motion.rim_diameter_px / 2:
