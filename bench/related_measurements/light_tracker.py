@@ -18,12 +18,13 @@ from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
+from scipy.optimize import minimize
 
 from bench.related_measurements.learned_detector import reliability
-from geometry.arrays import Array
+from geometry.arrays import Array, Bools
 from lab.light_tracker.sequences import SequenceFrame, moving_drogue
 from tracking.learned_detector.detector import find_drogues, learned_detector
-from tracking.light_tracker.confidence import FEATURES, RIGHT_SHARE
+from tracking.light_tracker.confidence import FEATURES, RIGHT_SHARE, SIGNS
 from tracking.light_tracker.parameters import LightParameters
 from tracking.light_tracker.tracker import DrogueTracker
 from tracking.statuses import PoseStatus
@@ -177,21 +178,27 @@ def calibrated(seed: int, count: int, frames: int) -> None:
                 right.append(away <= RIGHT_SHARE)
     x, y = np.array(inputs), np.array(right)
     print(f"{len(y)} matches, {y.mean():.4f} right")
-    coefficients = logistic(x, y)
+    coefficients = logistic(x, y, SIGNS)
     print(dict(zip(FEATURES, coefficients.round(2).tolist(), strict=True)))
     p = 1 / (1 + np.exp(-x @ coefficients))
     for mean, share, number in reliability(p, y):
         print(f"  {mean:.3f} {share:.3f} {number}")
 
 
-def logistic(x: Array, y: Array, ridge: float = 1.0) -> Array:
-    """Coefficients (n,) of the logistic curve of inputs (m, n) and answers (m,), by Newton's method."""
-    c = np.zeros(x.shape[1])
-    for _ in range(50):
-        p = 1 / (1 + np.exp(-(x @ c)))
-        hessian = (x * (p * (1 - p))[:, None]).T @ x + ridge * np.eye(len(c))
-        c = c + np.linalg.solve(hessian, x.T @ (y - p) - ridge * c)
-    return c
+def logistic(x: Array, y: Bools, signs: tuple[int, ...], ridge: float = 1.0) -> Array:
+    """Coefficients (n,) of the logistic curve of inputs (m, n) and answers (m,), by maximum likelihood.
+
+    signs (n,): 1 or -1 where a coefficient may not have the other sign, else 0.
+    """
+
+    def cost(c: Array) -> tuple[float, Array]:
+        z = x @ c
+        p = 1 / (1 + np.exp(-z))
+        loss = np.logaddexp(0, z).sum() - z[y].sum() + 0.5 * ridge * c @ c
+        return float(loss), x.T @ (p - y) + ridge * c
+
+    bounds = [(0.0 if s > 0 else None, 0.0 if s < 0 else None) for s in signs]
+    return np.asarray(minimize(cost, np.zeros(x.shape[1]), jac=True, bounds=bounds, method="L-BFGS-B").x)
 
 
 def main() -> None:

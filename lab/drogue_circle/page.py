@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from calibration.findings import Finding, Level, verdict
+from geometry.arrays import Array, Bools
 from lab.drogue_circle.options import CircleOptions
 from lab.drogue_circle.series import CircleSeries
 from lab.drogue_circle.verdict import WORDS
@@ -22,6 +23,14 @@ from lab.report.plot.svg import BLUE, SKY, VERMILLION, dots, line_path
 from lab.versions import versions
 from tracking.drogue_circle.frames import Cause
 from tracking.statuses import PoseStatus
+
+
+class StatusSeries(Protocol):
+    """Frames with a status."""
+
+    def has_status(self, status: PoseStatus) -> Bools:
+        """Which frames (n,) have a status."""
+
 
 _SENTENCES = {
     Level.PASS: "The circle was followed.",
@@ -42,6 +51,7 @@ def write_circle_page(series: CircleSeries, findings: Sequence[Finding], options
     level = verdict(findings)
     sections = [_motion(series), _quality(series), _path(series), *_events(series)]
     context: dict[str, Any] = {
+        "subject": "circle",
         "name": series.name,
         "source": series.source,
         "word": WORDS[level].upper(),
@@ -91,7 +101,7 @@ def _motion(series: CircleSeries) -> Section:
             time_panel(
                 t, title, "px", lines=(Line(x[:, i], colour, title),),
                 bands=(Band.about(x[:, i], sigma[:, i], 3.0, SKY, "3 sigma", 0.5),),
-                shades=_shades(series), width=1100, height=150, time_name="s",
+                shades=status_shades(series), width=1100, height=150, time_name="s",
             )
         )  # fmt: skip
     words = (
@@ -103,7 +113,7 @@ def _motion(series: CircleSeries) -> Section:
 
 def _quality(series: CircleSeries) -> Section:
     t, quality = series.t_s, series.quality()
-    shades = _shades(series)
+    shades = status_shades(series)
     away = series.fits - np.array([f.predicted for f in series.frames])
     top = float(np.nanmax(quality[:, 2])) if np.isfinite(quality[:, 2]).any() else 1.0
     panels = [
@@ -130,16 +140,18 @@ def _quality(series: CircleSeries) -> Section:
 
 
 def _path(series: CircleSeries) -> Section:
-    size = series.size_px
-    assert size is not None  # there is a usable picture
-    p = image_area(size)
+    assert series.size_px is not None  # there is a usable picture
+    return path_section(series.size_px, series.states[:, :2], series.has_status(PoseStatus.PREDICTED))
+
+
+def path_section(size_px: tuple[int, int], uv_px: Array, predicted: Bools) -> Section:
+    """The path (n, 2) of a centre in the picture, with the predicted frames (n,) as dots."""
+    p = image_area(size_px)
     out = axes(p, "Path of the centre", "u (px)", "v (px)", grid=False)
-    uv = series.states[:, :2]
-    at = p.at(uv)
+    at = p.at(uv_px)
     out.append(f'<path d="{line_path(at[:, 0], at[:, 1])}" fill="none" stroke="{BLUE}" stroke-width="1.1"/>')
-    guessed = series.has_status(PoseStatus.PREDICTED)
-    if guessed.any():
-        out.append(f'<path d="{dots(p.at(uv[guessed]), 1.8)}" fill="{VERMILLION}"/>')
+    if predicted.any():
+        out.append(f'<path d="{dots(p.at(uv_px[predicted]), 1.8)}" fill="{VERMILLION}"/>')
     out.append(note(p, "line: all frames; dots: predicted ones"))
     return Section("Path", (), [PageDrawing(svg_of(p, "Path of the centre", [*out, frame(p)]))])
 
@@ -159,7 +171,8 @@ def _events(series: CircleSeries) -> list[Section]:
     return sections
 
 
-def _shades(series: CircleSeries) -> tuple[Shade, ...]:
+def status_shades(series: StatusSeries) -> tuple[Shade, ...]:
+    """Shades of the frames that are not measured."""
     return tuple(
         Shade(series.has_status(status), status.value, status.value)
         for status in (PoseStatus.PREDICTED, PoseStatus.LOST)

@@ -8,36 +8,22 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from geometry.arrays import Array, Bools
+from lab.detect.frame_series import FrameSeries
 from tracking.drogue_circle.frames import Cause, CircleFrame
 from tracking.statuses import PoseStatus
 
-MOST_EVENTS = 500  # listed; of the others the number is reported
 
-
-@dataclass(slots=True)
-class CircleSeries:
+@dataclass(slots=True, kw_only=True)
+class CircleSeries(FrameSeries):
     """All frames so far."""
 
-    name: str
-    source: str
-    rate_hz: float
     form: str
-    notes: list[str] = field(default_factory=list)
-    numbers: list[int] = field(default_factory=list)
     frames: list[CircleFrame] = field(default_factory=list)
-    missing: Counter[str] = field(default_factory=Counter)  # reasons of frames without a picture
-    pictures: int = 0  # usable ones
-    size_px: tuple[int, int] | None = None  # width, height of the first picture
 
     def add(self, number: int, frame: CircleFrame) -> None:
         """Add the next frame."""
         self.numbers.append(number)
         self.frames.append(frame)
-
-    @property
-    def t_s(self) -> Array:
-        """Times (n,)."""
-        return np.array(self.numbers, dtype=float) / self.rate_hz
 
     def has_status(self, status: PoseStatus) -> Bools:
         """Which frames (n,) have a status."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -14,25 +14,22 @@ from typing import Any
 import numpy as np
 
 from calibration.findings import Finding, Level, verdict
-from lab.detect.inputs import PictureFiles, Video, open_inputs
+from lab.detect.frame_series import MOST_EVENTS, every_frame, frame_rate
+from lab.detect.inputs import open_inputs
 from lab.drogue_circle.circle_table import CIRCLE, circle_row
-from lab.drogue_circle.options import DEFAULT_RATE_HZ, CircleOptions
-from lab.drogue_circle.overlay import OverlayVideo
-from lab.drogue_circle.series import MOST_EVENTS, CircleSeries
+from lab.drogue_circle.options import CircleOptions
+from lab.drogue_circle.overlay import OverlayVideo, label_of
+from lab.drogue_circle.series import CircleSeries
 from lab.drogue_circle.verdict import WORDS, exit_status, findings_of
-from lab.errors import InputError
 from lab.files.run.fingerprints import fingerprints_of
 from lab.files.text.atomic_write import atomic_folder
 from lab.files.text.csv_text import write_table
 from lab.files.text.json_text import write_json
-from lab.pictures.opencv import load_cv2
-from lab.pictures.picture_file import DROPPED, GreyPicture, MissingPicture
-from lab.runs.frames.frame_sources import open_video
+from lab.pictures.picture_file import MissingPicture
 from lab.versions import versions
 
 SCHEMA = "beampose/circle/1"
 DEFAULTS = CircleOptions()
-_MOST_GAP = 10_000  # frame numbers without a picture between two pictures
 
 Progress = Callable[[int, int | None], None]  # frames done, total number where known
 
@@ -79,24 +76,27 @@ def track_circle(
     started = time.perf_counter()
     tracker = options.tracker()
     inputs = open_inputs([given])
-    rate_hz, notes = _rate(inputs, options)
-    series = CircleSeries(inputs.camera, str(given), rate_hz, options.form, [*inputs.notes, *notes])
+    rate_hz, notes = frame_rate(inputs, options.rate_hz)
+    series = CircleSeries(
+        name=inputs.camera, source=str(given), rate_hz=rate_hz, form=options.form, notes=[*inputs.notes, *notes]
+    )
     with atomic_folder(out, may_replace=are_circle_results) as folder:
         tracking_s = 0.0
         with OverlayVideo(folder, rate_hz) if options.overlay else contextlib.nullcontext() as overlay:
             total = inputs.count(1)
-            for number, picture in islice(_frames(inputs), options.limit):
+            for number, picture in islice(every_frame(inputs), options.limit):
                 usable = None if isinstance(picture, MissingPicture) else picture
                 begun = time.process_time()
                 frame = tracker.step(usable)
                 tracking_s += time.process_time() - begun
                 series.add(number, frame)
-                _count(series, picture)
+                series.count(picture)
                 if overlay is not None:
-                    overlay.add(usable, number, frame)
+                    label = label_of(number, frame.status, frame.cause.value)
+                    overlay.add(usable, label, frame.status, frame.state[:3])
                 if progress is not None:
                     progress(len(series.frames), total)
-        _require_pictures(series, given, total, options.limit)
+        series.require_pictures(given, total, options.limit)
         findings = findings_of(series)
         rows = (circle_row(n, rate_hz, f) for n, f in zip(series.numbers, series.frames, strict=True))
         write_table(folder / "circle.csv", CIRCLE, rows)
@@ -116,66 +116,6 @@ def are_circle_results(folder: Path) -> bool:
         return bool(json.loads((folder / "summary.json").read_text("utf-8")).get("schema") == SCHEMA)
     except (OSError, ValueError, AttributeError):
         return False
-
-
-def _rate(inputs: PictureFiles | Video, options: CircleOptions) -> tuple[float, list[str]]:
-    """Frames per second, and a note where they are assumed."""
-    if options.rate_hz is not None:
-        return options.rate_hz, []
-    if isinstance(inputs, Video):
-        capture = open_video(inputs.path)
-        rate = float(capture.get(load_cv2().CAP_PROP_FPS))
-        capture.release()
-        if np.isfinite(rate) and 0.01 <= rate <= 1e6:
-            return rate, []
-    return DEFAULT_RATE_HZ, [f"the frame rate is not stated: {DEFAULT_RATE_HZ:g} Hz assumed (--rate)"]
-
-
-def _frames(inputs: PictureFiles | Video) -> Iterator[tuple[int, GreyPicture | MissingPicture]]:
-    """All frame numbers from the first to the last with their pictures; a gap in the numbers is dropped frames.
-
-    Raises:
-        InputError: the numbers in the names of the pictures are not those of frames.
-    """
-    last: int | None = None
-    for number, picture in inputs.pictures(1):
-        if last is not None:
-            if number - last > _MOST_GAP:
-                raise InputError(
-                    f"{inputs.camera}: expected pictures numbered by frame, got {last} and then {number}; rename them"
-                )
-            for dropped in range(last + 1, number):
-                yield dropped, MissingPicture(DROPPED)
-        yield number, picture
-        last = number
-
-
-def _count(series: CircleSeries, picture: GreyPicture | MissingPicture) -> None:
-    if isinstance(picture, MissingPicture):
-        series.missing[picture.reason] += 1
-        return
-    series.pictures += 1
-    size = (picture.shape[1], picture.shape[0])
-    if series.size_px is None:
-        series.size_px = size
-    elif size != series.size_px and not any("different sizes" in note for note in series.notes):
-        series.notes.append("the pictures have different sizes")
-
-
-def _require_pictures(series: CircleSeries, given: Path, stated: int | None, limit: int | None) -> None:
-    """Raises InputError if no picture could be read; adds a note where a video ends early."""
-    if not series.pictures:
-        reason = series.missing.most_common(1)[0][0] if series.missing else "the file ends before its first picture"
-        raise InputError(f"{given}: expected pictures, got none that can be read: {reason}")
-    if series.size_px is not None and min(series.size_px) < 32:
-        raise InputError(
-            f"{given}: expected pictures of 32 x 32 px or more, got {series.size_px[0]} x {series.size_px[1]}"
-        )
-    ended = given.is_file() and series.numbers[0] == 0 and limit is None
-    if ended and stated is not None and len(series.frames) < 0.98 * stated:
-        series.notes.append(
-            f"the video ends after {len(series.frames)} of the {stated} pictures that its header states"
-        )
 
 
 def _summary(

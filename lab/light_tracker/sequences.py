@@ -67,11 +67,12 @@ def moving_drogue(
         last = course.uv_px[max(k - 1, 0)]
         motion = _BLUR_SHARE * (centre - last)
         ambient, diffuse = course.light[k].tolist()
+        drift = course.drift_px[k].tolist()
         scene = replace(
             course.scene,
             world_from_drogue=_BESIDE if empty else _pose(centre, diameter, course.tilt_rad[k]),
             light=replace(course.scene.light, ambient=ambient, diffuse=diffuse),
-            background=replace(course.scene.background, offset_px=(float(course.drift_px[k, 0]), float(course.drift_px[k, 1]))),
+            background=replace(course.scene.background, offset_px=(drift[0], drift[1])),
             motion_px=(float(motion[0]), float(motion[1])),
             occluders=_in_front(passing, k, centre, diameter),
         )  # fmt: skip
@@ -84,8 +85,8 @@ def moving_drogue(
 
 
 def _course(rng: np.random.Generator, frames: int, diameters_px: tuple[float, float]) -> _Course:
-    ends = np.exp(rng.uniform(*np.log(diameters_px), 2))
-    diameter = np.exp(np.linspace(*np.log(ends), frames))
+    first, last = rng.uniform(*np.log(diameters_px), 2).tolist()
+    diameter = np.exp(np.linspace(first, last, frames))
     t = np.arange(frames, dtype=float)
     largest = float(diameter.max())
     room = np.maximum(np.array(SIZE_PX) / 2 - 0.6 * largest - 10, 10)
