@@ -85,7 +85,7 @@ def moving_drogue(
 
 
 def _course(rng: np.random.Generator, frames: int, diameters_px: tuple[float, float]) -> _Course:
-    first, last = rng.uniform(*np.log(diameters_px), 2).tolist()
+    first, last = rng.uniform(np.log(diameters_px[0]), np.log(diameters_px[1]), 2).tolist()
     diameter = np.exp(np.linspace(first, last, frames))
     t = np.arange(frames, dtype=float)
     largest = float(diameter.max())

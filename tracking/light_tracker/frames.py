@@ -76,7 +76,7 @@ class DrogueFrame:
     confidence: float  # probability that the centre is within a quarter of the diameter of the drogue's
     correlation: float  # of the match; nan without one
     searched: str = ""  # what the detector searched in this frame: window, picture, or both
-    candidates: int = 0  # drogues that it found
+    found: int = 0  # drogues that it found
     event: str = ""  # acquired, reacquired, lost, ambiguous
 
     @property
@@ -85,10 +85,10 @@ class DrogueFrame:
         return self.status is not PoseStatus.LOST
 
 
-def nothing_known(cause: Cause, event: str = "", searched: str = "", candidates: int = 0) -> DrogueFrame:
+def nothing_known(cause: Cause, event: str = "", searched: str = "", found: int = 0) -> DrogueFrame:
     """A lost frame."""
     nan = float("nan")
     return DrogueFrame(
         PoseStatus.LOST, cause, Source.NONE, np.full(2, nan), np.full(2, nan), nan, np.full((2, 2), nan), nan, 0.0,
-        nan, searched, candidates, event,
+        nan, searched, found, event,
     )  # fmt: skip

@@ -109,7 +109,7 @@ class Pattern:
         if min(field.shape) < 2 * half + 1 or top < half or left < half:
             return None
         scores = cv2.matchTemplate(field, self.values, cv2.TM_CCOEFF_NORMED, mask=self.weights)
-        scores = np.nan_to_num(scores, nan=-1.0, posinf=-1.0, neginf=-1.0)
+        scores = np.nan_to_num(np.asarray(scores, np.float32), nan=-1.0, posinf=-1.0, neginf=-1.0)
         _, _, _, (x, y) = cv2.minMaxLoc(scores)
         second = _second(scores, x, y, 0.5 * self.diameter)
         return self._refined(window, float(left + x), float(top + y), window.scale / scale, second, usual)
@@ -219,10 +219,10 @@ class _Window:
         left, top = round(u_px) - reach, round(v_px) - reach
         right, bottom = round(u_px) + reach + 1, round(v_px) + reach + 1
         inner = picture[max(top, 0) : min(bottom, height), max(left, 0) : min(right, width)]
+        field = inner.astype(np.float32)
         borders = max(-top, 0), max(bottom - height, 0), max(-left, 0), max(right - width, 0)
         if any(borders):
-            inner = np.asarray(cv2.copyMakeBorder(inner, *borders, cv2.BORDER_REPLICATE), dtype=picture.dtype)
-        field = inner.astype(np.float32)
+            field = np.asarray(cv2.copyMakeBorder(field, *borders, cv2.BORDER_REPLICATE), np.float32)
         side = max(round(scale * field.shape[0]), 3)
         exact = side / field.shape[0]
         if side != field.shape[0]:

@@ -126,7 +126,7 @@ class DrogueTracker:
         motion = track.motion
         reach = 3 * motion.sigma_px + _MORE_PX
         usual = unexplained(float(np.tanh(track.usual))) if np.isfinite(track.usual) else np.inf
-        match = track.pattern.find(picture, *motion.x[:2].tolist(), motion.diameter_px, reach, usual)
+        match = track.pattern.find(picture, float(motion.x[0]), float(motion.x[1]), motion.diameter_px, reach, usual)
         if match is None or match.correlation < self.parameters.least_correlation:
             return None
         z = fisher(match.correlation)
@@ -200,7 +200,7 @@ class DrogueTracker:
         offset = np.abs(track.motion.offset)
         if whole and track.age == 0 and (offset[:2].max() > _OFF_CENTRE or offset[2] > _OFF_SIZE):
             motion = track.motion.centred()
-            pattern = Pattern.started(picture, *motion.x[:2].tolist(), motion.diameter_px)
+            pattern = Pattern.started(picture, float(motion.x[0]), float(motion.x[1]), motion.diameter_px)
             if pattern is not None:
                 track.motion, track.pattern = motion, pattern
         rate = _USUAL_RATE if whole else _USUAL_RATE / 5
@@ -271,7 +271,7 @@ class DrogueTracker:
             searched = "both" if searched else "picture"
         out = self._unmeasured(track, cause, 1.0 if match is None else confidence)
         correlation = float("nan") if match is None else match.correlation
-        return replace(out, correlation=correlation, searched=searched, candidates=found)
+        return replace(out, correlation=correlation, searched=searched, found=found)
 
     def _found_elsewhere(self, track: _Track, picture: Picture) -> DrogueFrame | None:
         """One drogue in the whole picture, of about the same size, away from where the track is."""

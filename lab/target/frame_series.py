@@ -5,16 +5,19 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from enum import StrEnum
 from pathlib import Path
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 
-from geometry.arrays import Array
+from geometry.arrays import Array, Bools
 from lab.detect.inputs import PictureFiles, Video
 from lab.errors import InputError
 from lab.pictures.opencv import load_cv2
 from lab.pictures.picture_file import DROPPED, GreyPicture, MissingPicture
 from lab.runs.frames.frame_sources import open_video
+from tracking.statuses import PoseStatus
 
 DEFAULT_RATE_HZ = 25.0  # of a folder of pictures, whose rate is not known
 MOST_EVENTS = 500  # listed in summary.json; of the others the number is reported
@@ -23,8 +26,31 @@ _SMALLEST_SIDE_PX = 32
 _COMPLETE_SHARE = 0.98  # of the pictures that a video's header states
 
 
+class TargetFrame(Protocol):
+    """One frame of a tracker."""
+
+    @property
+    def status(self) -> PoseStatus:
+        """Measured, predicted or lost."""
+
+    @property
+    def cause(self) -> StrEnum:
+        """Why it is not measured; the empty word where it is."""
+
+    @property
+    def event(self) -> str:
+        """What happened to the track; the empty word without an event."""
+
+    @property
+    def found(self) -> int:
+        """Targets that the detector found in this frame."""
+
+
+F = TypeVar("F", bound=TargetFrame)
+
+
 @dataclass(slots=True, kw_only=True)
-class FrameSeries:
+class FrameSeries(Generic[F]):
     """The frames of a recording so far. The trackers' own series add what they measure."""
 
     name: str
@@ -32,6 +58,7 @@ class FrameSeries:
     rate_hz: float
     notes: list[str] = field(default_factory=list)
     numbers: list[int] = field(default_factory=list)
+    frames: list[F] = field(default_factory=list)
     missing: Counter[str] = field(default_factory=Counter)  # reasons of frames without a picture
     pictures: int = 0  # usable ones
     size_px: tuple[int, int] | None = None  # width, height of the first picture
@@ -40,6 +67,31 @@ class FrameSeries:
     def t_s(self) -> Array:
         """Times (n,)."""
         return np.array(self.numbers, dtype=float) / self.rate_hz
+
+    def add(self, number: int, frame: F) -> None:
+        """Add the next frame."""
+        self.numbers.append(number)
+        self.frames.append(frame)
+
+    def has_status(self, status: PoseStatus) -> Bools:
+        """Which frames (n,) have a status."""
+        return np.array([f.status is status for f in self.frames], dtype=bool)
+
+    def statuses(self) -> dict[str, int]:
+        """Number of frames by status, all statuses."""
+        return {status.value: int(self.has_status(status).sum()) for status in PoseStatus}
+
+    def causes(self) -> dict[str, int]:
+        """Number of frames without a measurement by cause, the most frequent first."""
+        return dict(Counter(f.cause.value for f in self.frames if f.cause.value).most_common())
+
+    def events(self, targets: str) -> list[dict[str, object]]:
+        """Frame, kind and number of targets of every event. targets: the name of the number."""
+        return [
+            {"frame": number, "kind": f.event, targets: f.found}
+            for number, f in zip(self.numbers, self.frames, strict=True)
+            if f.event
+        ]
 
     def count(self, picture: GreyPicture | MissingPicture) -> None:
         """Count a picture; a note where the sizes differ."""
