@@ -95,7 +95,8 @@ def _jumps(series: DrogueSeries) -> list[Finding]:
     return [
         Finding(
             Level.WARN,
-            f"{len(far)} reacquisitions lie more than a diameter from the last known place (frame {some})",
+            f"{len(far)} reacquisition{' lies' if len(far) == 1 else 's lie'} more than a diameter from the last known"
+            f" place (frame {some})",
             "What was found there, or what was followed before, may be another object.",
             "Compare these frames in the overlay (--video).",
             code="BP-G05",

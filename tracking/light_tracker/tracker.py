@@ -281,7 +281,8 @@ class DrogueTracker:
         limit = p.size_ratio if track.confirmed >= _TRUSTED else np.inf
         alike = [c for c in found if 1 / limit < 2 * c.radius_px / motion.rim_diameter_px < limit]
         best, _ = self._chosen(alike)
-        if best is None or (best.score < p.elsewhere_confidence and not track.lost):
+        doubtful = track.lost and (track.confirmed < _TRUSTED or track.misses > _LONGEST_GAP)
+        if best is None or (best.score < p.elsewhere_confidence and not doubtful):
             return None
         u, v = motion.centre_px.tolist()
         if track.misses == 0 and np.hypot(best.u_px - u, best.v_px - v) < motion.rim_diameter_px / 2:
