@@ -14,7 +14,7 @@ from geometry.arrays import Array
 RIGHT_SHARE = 0.25  # of the diameter
 FEATURES = ("1", "correlation", "drop", "lead", "support", "confirmed", "unconfirmed", "age", "misses")
 SIGNS = (0, 1, -1, 1, 1, 1, -1, -1, -1)  # of the coefficients: more of a good sign never lowers the confidence
-COEFFICIENTS = (0.44, -0.92, 0.44, 1.29, 0.69, 1.2, 0.0, -0.69, 0.32)
+COEFFICIENTS = (-0.38, 0.0, 0.0, 0.0, 0.57, 1.3, -0.19, 0.0, 0.0)
 ABSENT_LOGIT = -2.0  # of a check without a detection, in the running mean of the checks
 _CAP = 0.995  # of correlations: above it, noise decides
 _OLDEST = 30.0  # frames

@@ -16,7 +16,7 @@ def confidence(**changed: float) -> float:
 
 
 def test_a_good_match_that_the_detector_confirmed_is_almost_sure():
-    assert confidence() > 0.95
+    assert confidence() > 0.9
 
 
 @pytest.mark.parametrize(
