@@ -34,7 +34,7 @@ class LightParameters:
     most_predicted: int = 50  # frames without a measurement after which the drogue is lost
     most_unseen: int = 100  # frames without a detection after which a drogue that is not measured is lost, too
     lost_sigma_diameters: float = 1.0  # 1 sigma of the centre above which the status is lost
-    most_unconfirmed: int = 6  # checks in a row without a detection after which the whole picture is searched
+    most_unconfirmed: int = 6  # checks in a row without a detection, after each of which the whole picture is searched
 
     def __post_init__(self) -> None:
         if self.check_every < 1:

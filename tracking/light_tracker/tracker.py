@@ -109,7 +109,7 @@ class DrogueTracker:
                     predicted, offset=track.motion.offset, offset_variance=track.motion.offset_variance
                 )
             return self._missed(track, picture, cause, match, searched, found, confidence)
-        if track.unconfirmed >= p.most_unconfirmed and track.since_check == 0:
+        if track.since_check == 0 and track.unconfirmed and track.unconfirmed % p.most_unconfirmed == 0:
             again = self._found_elsewhere(track, picture)
             if again is not None:
                 return again

@@ -37,9 +37,7 @@ def picture(
     return np.clip(np.rint(gain * mean + noise * rng.standard_normal(mean.shape)), 0, 255).astype(np.uint8)
 
 
-def _draw(
-    mean: np.ndarray, u: float, v: float, diameter: float, discs: tuple[tuple[float, float, float], ...]
-) -> None:
+def _draw(mean: np.ndarray, u: float, v: float, diameter: float, discs: tuple[tuple[float, float, float], ...]) -> None:
     """Draw discs (shift to the right and radius in diameters, grey value) into the pixels around a target."""
     reach = diameter / 2 + 2
     left, right = max(int(u - reach), 0), min(int(u + reach) + 1, SIZE[0])
