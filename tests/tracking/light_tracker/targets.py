@@ -1,4 +1,4 @@
-"""Pictures of a synthetic target: a bright ring with a spot beside its middle, before a smooth texture, sampled 4 x 4."""
+"""Pictures of a synthetic target: a bright ring with a spot beside its middle, before a smooth texture."""
 
 from __future__ import annotations
 

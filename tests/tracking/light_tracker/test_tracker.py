@@ -10,7 +10,7 @@ import pytest
 from tests.tracking.light_tracker.targets import SIZE, picture
 from tracking.drogue_circle.candidates import CircleCandidate, Picture, Window
 from tracking.light_tracker.frames import Cause, DrogueFrame, Source
-from tracking.light_tracker.parameters import LightParameters
+from tracking.light_tracker.parameters import USUAL, LightParameters
 from tracking.light_tracker.tracker import DrogueTracker
 from tracking.statuses import PoseStatus
 
@@ -46,7 +46,7 @@ def followed(
     detector: Detector,
     hidden: Callable[[int], bool] = lambda k: False,
     diameter: float = 14.0,
-    parameters: LightParameters = LightParameters(),
+    parameters: LightParameters = USUAL,
 ) -> tuple[list[DrogueFrame], np.ndarray]:
     """The frames, and the errors of the centre in diameters; inf where nothing is known."""
     tracker = DrogueTracker(detector, parameters)
