@@ -108,8 +108,8 @@ class Pattern:
         field = window.field[top - half : top + half + side, left - half : left + half + side]
         if min(field.shape) < 2 * half + 1 or top < half or left < half:
             return None
-        scores = cv2.matchTemplate(field, self.values, cv2.TM_CCOEFF_NORMED, mask=self.weights)
-        scores = np.asarray(np.nan_to_num(scores, nan=-1.0, posinf=-1.0, neginf=-1.0), np.float32)
+        raw = cv2.matchTemplate(field, self.values, cv2.TM_CCOEFF_NORMED, mask=self.weights)
+        scores: Floats = np.nan_to_num(raw, nan=-1.0, posinf=-1.0, neginf=-1.0).astype(np.float32)
         _, _, _, (x, y) = cv2.minMaxLoc(scores)
         second = _second(scores, x, y, 0.5 * self.diameter)
         return self._refined(window, float(left + x), float(top + y), window.scale / scale, second, usual)
