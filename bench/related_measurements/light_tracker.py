@@ -5,7 +5,9 @@ time is measured without the rendering. The detector in every frame takes its be
 OpenCV's trackers, those that the installed OpenCV has, start with the true box of the first frame.
 
 A frame is right with a centre within a quarter of the drogue's diameter, and held with one within half of it: on the
-drogue. Figures are counted over the frames in which less than half of the rim is hidden, and over all frames.
+drogue. `right` and `held` are shares of the frames in which less than half of the rim is hidden. The next three are
+shares of the frames that are held, from the first right one of the sequence on: where nothing is hidden, less than half,
+and all frames.
 `--calibrate` fits the coefficients of the confidence on other sequences.
 """
 
@@ -67,15 +69,13 @@ class Record:
     def line(self) -> str:
         """Figures of the method."""
         error, hidden = np.array(self.errors), np.array(self.hidden)
-        seen, followed = hidden < 0.5, np.array(self.followed)
-        right = error <= RIGHT_SHARE
+        right, held, followed = error <= RIGHT_SHARE, error <= HELD_SHARE, np.array(self.followed)
+        seen = hidden < 0.5
         best = error[right & seen]
         median, most = (100 * np.quantile(best, (0.5, 0.95))).tolist() if len(best) else (np.nan, np.nan)
-        return (
-            f"{right[seen].mean():.4f}  {(error <= HELD_SHARE)[seen].mean():.4f}  {(error <= HELD_SHARE).mean():.4f}  "
-            f"{(error <= HELD_SHARE)[seen & followed].mean():.4f}  {(error <= HELD_SHARE)[followed].mean():.4f}  "
-            f"{median:6.2f} {most:6.2f}  {1e3 * self.process_s / len(error):7.2f}"
-        )
+        shares = [right[seen], held[seen], *(held[followed & which] for which in (hidden == 0, seen, hidden <= 1))]
+        texts = [f"{s.mean():7.4f}" if len(s) else "      -" for s in shares]
+        return f"{' '.join(texts)}  {median:6.2f} {most:6.2f}  {1e3 * self.process_s / len(error):7.2f}"
 
 
 def tracked(parameters: LightParameters) -> Step:
@@ -140,7 +140,7 @@ def compare(seed: int, count: int, frames: int, diameters_px: tuple[float, float
                 records.setdefault(name, Record()).add(step, pictures)
     low, high = diameters_px
     print(f"{count} sequences of {frames} frames, seed {seed}, diameters {low:g} to {high:g} px, checks every {every}:")
-    print(f"{'':17} right  held    all     held*   all*    centre: median, 95 %, process time")
+    print(f"{'':17}   right    held   clear    seen     all  centre, % of diameter: median, 95 %; ms")
     for name, record in records.items():
         print(f"{name:17} {record.line()}")
     ratio = records["detector"].process_s / records["detector + light"].process_s

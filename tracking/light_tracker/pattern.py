@@ -21,7 +21,7 @@ Floats: TypeAlias = NDArray[np.float32]
 
 SMALLEST_PX, LARGEST_PX = 9.0, 24.0  # diameter of the drogue in the pattern
 _REACH = 0.62  # of the pattern, in diameters: the rim and a little of what is around it
-_LARGEST_REACH = 4.0  # diameters: half of the side of the largest window
+_LARGEST_REACH = 4.0  # diameters of the largest pattern: half of the side of the largest window
 _ITERATIONS = 6
 _CONVERGED_PX = 0.01
 _MOST_SHIFT = 0.35  # of the diameter, away from the peak of the correlation
@@ -43,6 +43,7 @@ class Match:
     covariance: Array  # (3, 3) of u, v (px) and of the logarithm of the diameter
     correlation: float  # weighted correlation coefficient, at most 1
     visible: float  # share of the pattern that agrees with the picture
+    agreement: float  # correlation of this share
     second: float  # of the next best place of the window; -1 where there is none
     patch: Floats  # (n, n) the picture there, of mean 0 and sigma 1 under the weights
 
@@ -98,7 +99,7 @@ class Pattern:
         """
         scale = self.diameter / diameter_px
         half = self.values.shape[0] // 2
-        reach = float(np.clip(np.ceil(reach_px * scale), 2, _LARGEST_REACH * self.diameter))
+        reach = float(np.clip(np.ceil(reach_px * scale), 2, _LARGEST_REACH * LARGEST_PX))
         window = _Window.around(picture, u_px, v_px, (reach + half + 2) / scale, scale)
         if window is None:
             return None
@@ -124,7 +125,7 @@ class Pattern:
         if patch is None:
             return None
         correlation = float((self.weights * self.values * patch).sum())
-        visible, left = 1.0, unexplained(correlation)
+        visible, agreement, left = 1.0, correlation, unexplained(correlation)
         part = self
         if left > _HIDDEN_FACTOR * usual:
             for _ in range(_ROBUST_ROUNDS):
@@ -141,6 +142,7 @@ class Pattern:
             if patch is None:
                 return None
             correlation = float((self.weights * self.values * patch).sum())
+            agreement = part._correlation(patch)
         # Of unit variance, the part that the pattern does not explain, over its degrees of freedom; `normal` belongs to
         # weights of sum 1, so it is divided by the effective number of pixels.
         pixels = visible / float((self.weights**2).sum())
@@ -149,7 +151,12 @@ class Pattern:
         covariance = covariance * to_px[:, None] * to_px
         u, v = window.outside(*place[:2])
         diameter = place[2] * self.diameter / window.scale
-        return Match(u, v, diameter, covariance, correlation, visible, second, patch)
+        return Match(u, v, diameter, covariance, correlation, visible, agreement, second, patch)
+
+    def _correlation(self, patch: Floats) -> float:
+        """The weighted correlation coefficient with a patch; 0 without contrast."""
+        values, seen = _normalised(self.values, self.weights, 1e-6), _normalised(patch, self.weights, 1e-6)
+        return 0.0 if values is None or seen is None else float((self.weights * values * seen).sum())
 
     def _aligned(
         self, window: _Window, place: tuple[float, float, float], start: tuple[float, float, float] | None = None

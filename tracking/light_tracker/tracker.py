@@ -26,6 +26,8 @@ from tracking.statuses import PoseStatus
 _SIMILAR = 0.7  # fall of Fisher's z of the correlation below its usual value, of a match that may be the drogue
 _TRUSTED = 4  # detections that confirmed a track
 _GOOD = 1.5  # Fisher's z that is similar in any case: a correlation of 0.905
+_MOSTLY = 0.6  # visible share from which the agreement of this share counts
+_LEAD = 0.3  # of Fisher's z over the next best place of the window, after a gap
 _LONGEST_GAP = 20  # frames
 _NEAR_PX = 20.0  # distance of the first drogue from the place that the user states
 _SUPPORT_RATE = 0.25  # of the running mean of the log odds of the checks
@@ -99,9 +101,7 @@ class DrogueTracker:
             confidence = self._confidence(track, match)
         if match is None or confidence < p.measured_confidence:
             cause = Cause.NO_MATCH if match is None else Cause.UNCERTAIN
-            if match is not None and (
-                track.usual - fisher(match.correlation) < _SIMILAR or fisher(match.correlation) > _GOOD
-            ):
+            if match is not None and self._similar(track, match):
                 track.blind, track.gap = 0, max(track.gap - 1, 0)  # it may be the drogue: later frames decide
             else:
                 track.blind, track.gap = track.blind + 1, min(track.gap + 1, _LONGEST_GAP)
@@ -129,11 +129,17 @@ class DrogueTracker:
         match = track.pattern.find(picture, float(motion.x[0]), float(motion.x[1]), motion.diameter_px, reach, usual)
         if match is None or match.correlation < self.parameters.least_correlation:
             return None
-        z = fisher(match.correlation)
-        if track.gap and track.usual - z > _SIMILAR and z < _GOOD:
-            return None  # after a gap, what is in front of the drogue has a weak correlation too
+        # After a gap, what is in front of the drogue has a weak correlation too, as have many places of a wide window.
+        if track.gap and not (self._similar(track, match) and fisher(match.correlation) > fisher(match.second) + _LEAD):
+            return None
         limit = np.log(self.parameters.size_ratio)
         return match if abs(np.log(match.diameter_px) - motion.log_diameter) < limit else None
+
+    @staticmethod
+    def _similar(track: _Track, match: Match) -> bool:
+        """Whether a match is about as good as the ones before."""
+        z = fisher(match.agreement if match.visible > _MOSTLY else match.correlation)
+        return track.usual - z < _SIMILAR or z > _GOOD
 
     def _seen(self, track: _Track, picture: Picture) -> list[CircleCandidate]:
         """What the detector finds around the track, of about its size."""
