@@ -6,7 +6,7 @@ OpenCV's trackers, those that the installed OpenCV has, start with the true box 
 
 A frame is right with a centre within a quarter of the drogue's diameter, and held with one within half of it: on the
 drogue. `right` and `held` are shares of the frames in which less than half of the rim is hidden. The next three are
-shares of the frames that are held, from the first right one of the sequence on: where nothing is hidden, less than half,
+shares of the frames that are held, from the first right one of the sequence on: with nothing hidden, less than half,
 and all frames.
 `--calibrate` fits the coefficients of the confidence on other sequences.
 """

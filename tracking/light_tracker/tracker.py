@@ -2,8 +2,9 @@
 
 Rules of the hand-over (ours; Zhou (2020) only states that a light tracker follows the network):
 - The detector searches the whole picture until it finds one drogue that it is confident of.
-- In each frame the light tracker finds the pattern near its prediction. Every `check_every` frames, or as soon as the
-  confidence is low, the detector searches a window around it. A detection there confirms the track and corrects it.
+- In each frame the light tracker finds the pattern near its prediction. Every `check_every` frames, after a frame without
+  a match, or as soon as the confidence is low, the detector searches a window around it. A detection there confirms the
+  track and corrects it.
 - After frames without a match, or checks in a row without a detection, the detector searches the whole picture.
 """
 
@@ -88,7 +89,8 @@ class DrogueTracker:
         searched, found, source = "", 0, Source.LIGHT
         confidence = self._confidence(track, match)
         p = self.parameters
-        if match is None or track.since_check >= p.check_every or confidence < p.hand_back_confidence:
+        due = track.since_check >= p.check_every or track.gap > 0
+        if match is None or due or confidence < p.hand_back_confidence:
             seen = self._seen(track, picture)
             searched, found, track.since_check = "window", len(seen), 0
             best = self._confirming(track, seen, match)
@@ -182,7 +184,7 @@ class DrogueTracker:
                 return None
         track.motion = track.motion.detected(seen.u_px, seen.v_px, 2 * seen.radius_px, p)
         track.support += _SUPPORT_RATE * (logit(seen.score) - track.support)
-        track.confirmed, track.unconfirmed, track.age = track.confirmed + 1, 0, 0.0
+        track.confirmed, track.unconfirmed, track.age, track.gap = track.confirmed + 1, 0, 0.0, 0
         return match
 
     def _cut_again(self, track: _Track, picture: Picture, seen: CircleCandidate) -> Match | None:

@@ -26,11 +26,17 @@ def picture(
     gain: float = 1.0,
     hidden: tuple[float, float, float] | None = None,
     background: np.ndarray | None = None,
+    alike: tuple[float, float, float] | None = None,
 ) -> np.ndarray:
-    """(h, w) 8 bit. targets: u, v, diameter; hidden: u, v, diameter of a grey disc in front."""
+    """(h, w) 8 bit. targets, hidden, alike: u, v, diameter.
+
+    hidden: a grey disc in front; alike: a ring whose middle is only a little darker than its surroundings.
+    """
     mean = (texture(1) if background is None else background).copy()
     for u, v, diameter in targets:
         _draw(mean, u, v, diameter, ((0, 0.5, 200.0), (0, 0.34, 45.0), (0.12, 0.1, 150.0)))
+    if alike is not None:
+        _draw(mean, *alike, ((0, 0.5, 200.0), (0, 0.34, 140.0)))
     if hidden is not None:
         _draw(mean, *hidden, ((0, 0.5, 130.0),))
     rng = np.random.default_rng([seed, 6])

@@ -100,6 +100,19 @@ def test_a_hidden_target_is_predicted_and_found_again():
     assert errors[28:].max() < 0.12
 
 
+def test_while_the_target_is_hidden_nothing_that_resembles_it_a_little_is_followed():
+    detector = Detector()
+    tracker = DrogueTracker(detector)
+    for k in range(32):
+        circle = path(k)
+        gone = k >= 16
+        detector.circles = [] if gone else [circle]
+        # The other ring correlates with the pattern by about 0.8.
+        image = picture([] if gone else [circle], seed=k, alike=(circle[0] + 22, circle[1] + 6, circle[2]))
+        frame = tracker.step(image)
+        assert gone == (frame.status is not PoseStatus.MEASURED), k
+
+
 def test_frames_without_a_picture_are_predicted():
     tracker, detector = DrogueTracker(detector := Detector()), detector
     for k in range(20):
