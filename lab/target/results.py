@@ -42,7 +42,7 @@ class TargetOutcome:
         reasons = "; ".join(f.what for f in self.findings if f.level is level)
         if level is Level.WARN:
             reasons = f"{self.measured} of {self.frames} frames measured; {reasons}"
-        remedy = f" {self.findings[0].remedy}" if level is Level.FAIL else ""
+        remedy = f". {self.findings[0].remedy}" if level is Level.FAIL else ""
         return f"{self.name}: {WORDS[level].upper()}: {reasons}{remedy} -> {self.out}"
 
 

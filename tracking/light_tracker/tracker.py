@@ -2,9 +2,9 @@
 
 Rules of the hand-over (ours; Zhou (2020) only states that a light tracker follows the network):
 - The detector searches the whole picture until it finds one drogue that it is confident of.
-- In each frame the light tracker finds the pattern near its prediction. Every `check_every` frames, after a frame without
-  a match, or as soon as the confidence is low, the detector searches a window around it. A detection there confirms the
-  track and corrects it.
+- In each frame the light tracker finds the pattern near its prediction. Every `check_every` frames, after a frame
+  without a match, or as soon as the confidence is low, the detector searches a window around it. A detection there
+  confirms the track and corrects it.
 - After frames without a match, or checks in a row without a detection, the detector searches the whole picture.
 """
 
