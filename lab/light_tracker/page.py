@@ -77,7 +77,8 @@ def _confidence(series: DrogueSeries) -> Section:
     )  # fmt: skip
     words = (
         "The confidence is the probability that the centre is right to a quarter of the diameter. It comes from the"
-        " correlation, the detector's checks and the time since the last one, and was fitted on rendered drogues."
+        " detector's checks of the drogue and was fitted on rendered drogues. Of a predicted frame it falls with the"
+        " growing sigma."
     )
     return Section("Confidence", words, [PageDrawing(panel, wide=True)])
 

@@ -1,8 +1,9 @@
-"""The probability that the tracked place is right, from the match and the checks by the detector.
+"""The probability that the tracked place is right, from the checks by the detector.
 
-Logistic curves whose coefficients were fitted on rendered sequences with `python -m
+A logistic curve whose coefficients were fitted on rendered sequences with `python -m
 bench.related_measurements.light_tracker --calibrate` (maximum likelihood; Platt 1999). "Right" is a centre within
-RIGHT_SHARE of the diameter of the drogue's.
+RIGHT_SHARE of the diameter of the drogue's. The correlation of the match, its lead over the next best place and the
+time since the last check were inputs too; their coefficients were zero, since a match with a low correlation is none.
 """
 
 from __future__ import annotations
@@ -12,12 +13,11 @@ import numpy as np
 from geometry.arrays import Array
 
 RIGHT_SHARE = 0.25  # of the diameter
-FEATURES = ("1", "correlation", "drop", "lead", "support", "confirmed", "unconfirmed", "age", "misses")
-SIGNS = (0, 1, -1, 1, 1, 1, -1, -1, -1)  # of the coefficients: more of a good sign never lowers the confidence
-COEFFICIENTS = (-0.38, 0.0, 0.0, 0.0, 0.57, 1.3, -0.19, 0.0, 0.0)
+FEATURES = ("1", "support", "confirmed", "unconfirmed")
+SIGNS = (0, 1, 1, -1)  # of the coefficients: more of a good sign never lowers the confidence
+COEFFICIENTS = (-0.38, 0.57, 1.3, -0.19)
 ABSENT_LOGIT = -2.0  # of a check without a detection, in the running mean of the checks
 _CAP = 0.995  # of correlations: above it, noise decides
-_OLDEST = 30.0  # frames
 _MOST_CONFIRMED = 10
 
 
@@ -26,29 +26,13 @@ def fisher(correlation: float) -> float:
     return float(np.arctanh(np.clip(correlation, 0.0, _CAP)))
 
 
-def features(
-    correlation: float,
-    usual: float,
-    second: float,
-    support: float,
-    confirmed: int,
-    unconfirmed: int,
-    age: float,
-    misses: int,
-) -> Array:
-    """The inputs (9,) of the curve.
+def features(support: float, confirmed: int, unconfirmed: int) -> Array:
+    """The inputs (4,) of the curve.
 
-    correlation: of the match; usual: `fisher` of the matches before, running mean; second: correlation of the next best
-    place of the window. support: running mean of the log odds of the checks. confirmed: detections of this track;
-    unconfirmed: checks in a row without one; age: frames since the last one.
-    misses: frames without a measurement before this one.
+    support: running mean of the log odds of the checks. confirmed: detections of this track; unconfirmed: checks in a
+    row without one.
     """
-    best = fisher(correlation)
-    return np.array(
-        [1.0, best, max(usual - best, 0.0), max(best - fisher(second), 0.0), support,
-         np.log(min(max(confirmed, 1), _MOST_CONFIRMED)), np.log1p(unconfirmed), np.log1p(min(age, _OLDEST)),
-         np.log1p(misses)]
-    )  # fmt: skip
+    return np.array([1.0, support, np.log(min(max(confirmed, 1), _MOST_CONFIRMED)), np.log1p(unconfirmed)])
 
 
 def probability(inputs: Array) -> float:

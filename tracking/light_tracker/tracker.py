@@ -217,11 +217,7 @@ class DrogueTracker:
     def _confidence(self, track: _Track, match: Match | None) -> float:
         if match is None:
             return 0.0
-        usual = fisher(match.correlation) if np.isnan(track.usual) else track.usual
-        inputs = features(
-            match.correlation, usual, match.second, track.support, track.confirmed, track.unconfirmed, track.age,
-            track.gap,
-        )  # fmt: skip
+        inputs = features(track.support, track.confirmed, track.unconfirmed)
         if self.trace is not None:
             self.trace.append((inputs, track.motion.centre_px))
         return probability(inputs)
@@ -304,7 +300,7 @@ class DrogueTracker:
         motion, p = track.motion, self.parameters
         if track.misses > p.most_predicted or track.age > p.most_unseen:
             self._last, self._track = motion, None
-            return nothing_known(cause, "lost")
+            return nothing_known(cause, "" if track.lost else "lost")
         if motion.sigma_px > p.lost_sigma_diameters * motion.rim_diameter_px:
             # The track is kept: its pattern may be found again before the detector finds the drogue.
             event = "" if track.lost else "lost"
