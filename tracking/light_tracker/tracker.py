@@ -55,6 +55,10 @@ class _Track:
     blind: int = 0  # frames in a row without a match that resembles the pattern
     gap: int = 0  # the same, and falling by one with each match afterwards: how far the drogue can have moved away
 
+    def count_blind(self) -> None:
+        """One more frame without a match."""
+        self.blind, self.gap = self.blind + 1, min(self.gap + 1, _LONGEST_GAP)
+
 
 @dataclass(slots=True)
 class DrogueTracker:
@@ -77,10 +81,12 @@ class DrogueTracker:
         predicted = track.motion
         track.age += dt
         if picture is None:
+            track.count_blind()
             return self._unmeasured(track, Cause.NO_IMAGE)
         height, width = picture.shape
         u, v = track.motion.x[:2].tolist()
         if not (-0.5 <= u < width - 0.5 and -0.5 <= v < height - 0.5):
+            track.count_blind()
             return self._missed(track, picture, Cause.OUT_OF_VIEW)
         match = self._matched(track, picture)
         if match is not None:
@@ -106,7 +112,7 @@ class DrogueTracker:
             if match is not None and self._similar(track, match):
                 track.blind, track.gap = 0, max(track.gap - 1, 0)  # it may be the drogue: later frames decide
             else:
-                track.blind, track.gap = track.blind + 1, min(track.gap + 1, _LONGEST_GAP)
+                track.count_blind()
                 track.motion = replace(
                     predicted, offset=track.motion.offset, offset_variance=track.motion.offset_variance
                 )
@@ -141,7 +147,8 @@ class DrogueTracker:
     def _similar(track: _Track, match: Match) -> bool:
         """Whether a match is about as good as the ones before."""
         z = fisher(match.agreement if match.visible > _MOSTLY else match.correlation)
-        return track.usual - z < _SIMILAR or z > _GOOD
+        new = bool(np.isnan(track.usual))  # a pattern that has no usual correlation yet
+        return new or track.usual - z < _SIMILAR or z > _GOOD
 
     def _seen(self, track: _Track, picture: Picture) -> list[CircleCandidate]:
         """What the detector finds around the track, of about its size."""

@@ -114,13 +114,16 @@ def test_while_the_target_is_hidden_nothing_that_resembles_it_a_little_is_follow
 
 
 def test_frames_without_a_picture_are_predicted():
-    tracker, detector = DrogueTracker(detector := Detector()), detector
+    detector, sigmas = Detector(), []
+    tracker = DrogueTracker(detector)
     for k in range(20):
         detector.circles = [path(k)]
         frame = tracker.step(None if k in (10, 11) else picture([path(k)], seed=k))
         if k in (10, 11):
             assert (frame.status, frame.cause) == (PoseStatus.PREDICTED, Cause.NO_IMAGE)
             assert np.hypot(*(frame.centre_px - path(k)[:2])) < 2.0
+            sigmas.append(float(np.sqrt(frame.covariance[0, 0])))
+    assert sigmas[1] > 1.2 * sigmas[0]
     assert frame.status is PoseStatus.MEASURED
     assert DrogueTracker(detector).step(None).cause is Cause.NO_IMAGE
 
