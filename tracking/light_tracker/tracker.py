@@ -157,7 +157,8 @@ class DrogueTracker:
         gate = p.window_diameters * diameter + 3 * motion.sigma_px
         u, v = motion.centre_px.tolist()
         low, high = diameter / 2 / p.size_ratio, diameter / 2 * p.size_ratio
-        window = Window(u, v, gate + 0.6 * diameter, gate, low, high)
+        # From an eighth of the diameter on: the network sees large drogues at a finer scale, and places them better.
+        window = Window(u, v, gate + 0.6 * diameter, gate, diameter / 8, high)
         return [
             c for c in self.detector(picture, window)
             if c.score >= p.confirm_confidence and low <= c.radius_px <= high
