@@ -23,7 +23,6 @@ DETECTORS: Mapping[str, Callable[[CircleParameters], CircleDetector]] = {
 }
 SOUND, PRINTED = "sound", "printed"
 FORMS = (SOUND, PRINTED)
-DEFAULT_RATE_HZ = 25.0  # of a folder of pictures, whose rate is not known
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,46 +2,20 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
-from geometry.arrays import Array, Bools
-from tracking.drogue_circle.frames import Cause, CircleFrame
-from tracking.statuses import PoseStatus
-
-MOST_EVENTS = 500  # listed; of the others the number is reported
+from geometry.arrays import Array
+from lab.target.frame_series import FrameSeries
+from tracking.drogue_circle.frames import CircleFrame
 
 
-@dataclass(slots=True)
-class CircleSeries:
+@dataclass(slots=True, kw_only=True)
+class CircleSeries(FrameSeries[CircleFrame]):
     """All frames so far."""
 
-    name: str
-    source: str
-    rate_hz: float
     form: str
-    notes: list[str] = field(default_factory=list)
-    numbers: list[int] = field(default_factory=list)
-    frames: list[CircleFrame] = field(default_factory=list)
-    missing: Counter[str] = field(default_factory=Counter)  # reasons of frames without a picture
-    pictures: int = 0  # usable ones
-    size_px: tuple[int, int] | None = None  # width, height of the first picture
-
-    def add(self, number: int, frame: CircleFrame) -> None:
-        """Add the next frame."""
-        self.numbers.append(number)
-        self.frames.append(frame)
-
-    @property
-    def t_s(self) -> Array:
-        """Times (n,)."""
-        return np.array(self.numbers, dtype=float) / self.rate_hz
-
-    def has_status(self, status: PoseStatus) -> Bools:
-        """Which frames (n,) have a status."""
-        return np.array([f.status is status for f in self.frames], dtype=bool)
 
     @property
     def states(self) -> Array:
@@ -68,20 +42,3 @@ class CircleSeries:
             for f in self.frames
         ]
         return np.array(rows, dtype=float).reshape(-1, 3)
-
-    def statuses(self) -> dict[str, int]:
-        """Number of frames by status, all statuses."""
-        return {status.value: int(self.has_status(status).sum()) for status in PoseStatus}
-
-    def causes(self) -> dict[str, int]:
-        """Number of frames without a measurement by cause, the most frequent first."""
-        counts = Counter(f.cause.value for f in self.frames if f.cause is not Cause.NONE)
-        return dict(counts.most_common())
-
-    def events(self) -> list[dict[str, object]]:
-        """Frame, kind and number of circles of every event."""
-        return [
-            {"frame": number, "kind": f.event, "circles": f.circles}
-            for number, f in zip(self.numbers, self.frames, strict=True)
-            if f.event
-        ]

@@ -2,64 +2,27 @@
 
 from __future__ import annotations
 
-import contextlib
-import json
 import time
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
-from itertools import islice
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from calibration.findings import Finding, Level, verdict
-from lab.detect.inputs import PictureFiles, Video, open_inputs
+from lab.detect.inputs import open_inputs
 from lab.drogue_circle.circle_table import CIRCLE, circle_row
-from lab.drogue_circle.options import DEFAULT_RATE_HZ, CircleOptions
-from lab.drogue_circle.overlay import OverlayVideo
-from lab.drogue_circle.series import MOST_EVENTS, CircleSeries
-from lab.drogue_circle.verdict import WORDS, exit_status, findings_of
-from lab.errors import InputError
-from lab.files.run.fingerprints import fingerprints_of
+from lab.drogue_circle.options import CircleOptions
+from lab.drogue_circle.series import CircleSeries
+from lab.drogue_circle.verdict import findings_of
 from lab.files.text.atomic_write import atomic_folder
 from lab.files.text.csv_text import write_table
 from lab.files.text.json_text import write_json
-from lab.pictures.opencv import load_cv2
-from lab.pictures.picture_file import DROPPED, GreyPicture, MissingPicture
-from lab.runs.frames.frame_sources import open_video
-from lab.versions import versions
+from lab.target.follow import follow
+from lab.target.frame_series import frame_rate
+from lab.target.results import Content, Progress, TargetOutcome, quantiles, results_of, summary_of
 
 SCHEMA = "beampose/circle/1"
 DEFAULTS = CircleOptions()
-_MOST_GAP = 10_000  # frame numbers without a picture between two pictures
-
-Progress = Callable[[int, int | None], None]  # frames done, total number where known
-
-
-@dataclass(frozen=True, slots=True)
-class CircleOutcome:
-    """The outcome of one call."""
-
-    name: str
-    out: Path
-    frames: int
-    measured: int
-    findings: tuple[Finding, ...]  # failures first
-
-    @property
-    def exit_status(self) -> int:
-        """0, or 4 where a quality gate failed."""
-        return exit_status(verdict(self.findings))
-
-    def line(self) -> str:
-        """One line for the command line; where a gate failed, with the remedy."""
-        level = verdict(self.findings)
-        reasons = "; ".join(f.what for f in self.findings if f.level is level)
-        if level is Level.WARN:
-            reasons = f"{self.measured} of {self.frames} frames measured; {reasons}"
-        remedy = f" {self.findings[0].remedy}" if level is Level.FAIL else ""
-        return f"{self.name}: {WORDS[level].upper()}: {reasons}{remedy} -> {self.out}"
 
 
 def track_circle(
@@ -68,7 +31,7 @@ def track_circle(
     options: CircleOptions = DEFAULTS,
     progress: Progress | None = None,
     more: Mapping[str, Any] | None = None,
-) -> CircleOutcome:
+) -> TargetOutcome:
     """Track one circle through the pictures of a folder or a video, and write the results into the folder `out`.
 
     more: additional content of summary.json.
@@ -79,161 +42,39 @@ def track_circle(
     started = time.perf_counter()
     tracker = options.tracker()
     inputs = open_inputs([given])
-    rate_hz, notes = _rate(inputs, options)
-    series = CircleSeries(inputs.camera, str(given), rate_hz, options.form, [*inputs.notes, *notes])
-    with atomic_folder(out, may_replace=are_circle_results) as folder:
-        tracking_s = 0.0
-        with OverlayVideo(folder, rate_hz) if options.overlay else contextlib.nullcontext() as overlay:
-            total = inputs.count(1)
-            for number, picture in islice(_frames(inputs), options.limit):
-                usable = None if isinstance(picture, MissingPicture) else picture
-                begun = time.process_time()
-                frame = tracker.step(usable)
-                tracking_s += time.process_time() - begun
-                series.add(number, frame)
-                _count(series, picture)
-                if overlay is not None:
-                    overlay.add(usable, number, frame)
-                if progress is not None:
-                    progress(len(series.frames), total)
-        _require_pictures(series, given, total, options.limit)
+    rate_hz, notes = frame_rate(inputs, options.rate_hz)
+    series = CircleSeries(
+        name=inputs.camera, source=str(given), rate_hz=rate_hz, form=options.form, notes=[*inputs.notes, *notes]
+    )
+    with atomic_folder(out, may_replace=results_of(SCHEMA)) as folder:
+        overlay = folder if options.overlay else None
+        tracking_s = follow(
+            series, inputs, given, tracker.step, lambda frame: frame.state[:3], overlay, options.limit, progress
+        )
         findings = findings_of(series)
         rows = (circle_row(n, rate_hz, f) for n, f in zip(series.numbers, series.frames, strict=True))
         write_table(folder / "circle.csv", CIRCLE, rows)
-        summary = _summary(series, options, findings, given, tracking_s, time.perf_counter() - started)
+        summary = summary_of(
+            series, findings, given,
+            Content(SCHEMA, "circle", _summary_block(series), options.as_mapping(), "circles"),
+            (tracking_s, time.perf_counter() - started),
+        )  # fmt: skip
         write_json({**summary, **(more or {})}, folder / "summary.json")
         from lab.drogue_circle.page import write_circle_page  # imports the template engine, needed only here
 
         write_circle_page(series, findings, options, folder)
-    return CircleOutcome(
+    return TargetOutcome(
         series.name, Path(out), len(series.frames), summary["counts"]["status"]["measured"], tuple(findings)
     )
 
 
-def are_circle_results(folder: Path) -> bool:
-    """Whether a folder holds the results of an earlier call."""
-    try:
-        return bool(json.loads((folder / "summary.json").read_text("utf-8")).get("schema") == SCHEMA)
-    except (OSError, ValueError, AttributeError):
-        return False
-
-
-def _rate(inputs: PictureFiles | Video, options: CircleOptions) -> tuple[float, list[str]]:
-    """Frames per second, and a note where they are assumed."""
-    if options.rate_hz is not None:
-        return options.rate_hz, []
-    if isinstance(inputs, Video):
-        capture = open_video(inputs.path)
-        rate = float(capture.get(load_cv2().CAP_PROP_FPS))
-        capture.release()
-        if np.isfinite(rate) and 0.01 <= rate <= 1e6:
-            return rate, []
-    return DEFAULT_RATE_HZ, [f"the frame rate is not stated: {DEFAULT_RATE_HZ:g} Hz assumed (--rate)"]
-
-
-def _frames(inputs: PictureFiles | Video) -> Iterator[tuple[int, GreyPicture | MissingPicture]]:
-    """All frame numbers from the first to the last with their pictures; a gap in the numbers is dropped frames.
-
-    Raises:
-        InputError: the numbers in the names of the pictures are not those of frames.
-    """
-    last: int | None = None
-    for number, picture in inputs.pictures(1):
-        if last is not None:
-            if number - last > _MOST_GAP:
-                raise InputError(
-                    f"{inputs.camera}: expected pictures numbered by frame, got {last} and then {number}; rename them"
-                )
-            for dropped in range(last + 1, number):
-                yield dropped, MissingPicture(DROPPED)
-        yield number, picture
-        last = number
-
-
-def _count(series: CircleSeries, picture: GreyPicture | MissingPicture) -> None:
-    if isinstance(picture, MissingPicture):
-        series.missing[picture.reason] += 1
-        return
-    series.pictures += 1
-    size = (picture.shape[1], picture.shape[0])
-    if series.size_px is None:
-        series.size_px = size
-    elif size != series.size_px and not any("different sizes" in note for note in series.notes):
-        series.notes.append("the pictures have different sizes")
-
-
-def _require_pictures(series: CircleSeries, given: Path, stated: int | None, limit: int | None) -> None:
-    """Raises InputError if no picture could be read; adds a note where a video ends early."""
-    if not series.pictures:
-        reason = series.missing.most_common(1)[0][0] if series.missing else "the file ends before its first picture"
-        raise InputError(f"{given}: expected pictures, got none that can be read: {reason}")
-    if series.size_px is not None and min(series.size_px) < 32:
-        raise InputError(
-            f"{given}: expected pictures of 32 x 32 px or more, got {series.size_px[0]} x {series.size_px[1]}"
-        )
-    ended = given.is_file() and series.numbers[0] == 0 and limit is None
-    if ended and stated is not None and len(series.frames) < 0.98 * stated:
-        series.notes.append(
-            f"the video ends after {len(series.frames)} of the {stated} pictures that its header states"
-        )
-
-
-def _summary(
-    series: CircleSeries,
-    options: CircleOptions,
-    findings: list[Finding],
-    given: Path,
-    tracking_s: float,
-    wall_s: float,
-) -> dict[str, Any]:
+def _summary_block(series: CircleSeries) -> dict[str, Any]:
     measured = np.isfinite(series.fits[:, 0])
     quality = series.quality()
-    events = series.events()
-    level = verdict(findings)
-
-    def quantiles(values: np.ndarray) -> dict[str, float] | None:
-        values = values[np.isfinite(values)]
-        if not len(values):
-            return None
-        return dict(zip(("p5", "median", "p95"), np.percentile(values, [5, 50, 95]).tolist(), strict=True))
-
     return {
-        "schema": SCHEMA,
-        "name": series.name,
-        "source": str(given.resolve()),
-        "verdict": {
-            "status": WORDS[level],
-            "reasons": [f.what for f in findings],
-            "exit_status": exit_status(level),
-            "evidence": [
-                {"level": WORDS[f.level], "what": f.what, "why": f.why, "remedy": f.remedy, "code": f.code}
-                for f in findings
-            ],
-        },
-        "counts": {
-            "frames": len(series.frames),
-            "pictures": series.pictures,
-            "status": series.statuses(),
-            "not_measured": series.causes(),
-            "no_image_reasons": dict(series.missing),
-            "events": len(events),
-        },
-        "rates": {
-            "measured_share": series.statuses()["measured"] / len(series.frames),
-            "frame_rate_hz": series.rate_hz,
-            "processed_frames_per_s": len(series.frames) / wall_s if wall_s > 0 else None,
-        },
-        "circle": {
-            "radius_px": quantiles(series.states[:, 2]),
-            "sigma_centre_px": quantiles(np.hypot(*series.sigmas[:, :2].T)[measured]),
-            "occlusion": quantiles(quality[:, 0]),
-            "coverage": quantiles(quality[:, 1]),
-            "rms_px": quantiles(quality[:, 2]),
-        },
-        "timings": {"tracking_process_s": tracking_s, "wall_s": wall_s},
-        "versions": versions(),
-        "parameters": options.as_mapping(),
-        "inputs": fingerprints_of((), (given,)),
-        "notes": series.notes,
-        "events": events[:MOST_EVENTS],
+        "radius_px": quantiles(series.states[:, 2]),
+        "sigma_centre_px": quantiles(np.hypot(*series.sigmas[:, :2].T)[measured]),
+        "occlusion": quantiles(quality[:, 0]),
+        "coverage": quantiles(quality[:, 1]),
+        "rms_px": quantiles(quality[:, 2]),
     }

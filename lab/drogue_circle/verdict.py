@@ -6,7 +6,6 @@ import numpy as np
 
 from calibration.findings import Finding, Level
 from lab.drogue_circle.series import CircleSeries
-from lab.errors import QUALITY_GATE_FAILED
 from tracking.drogue_circle.frames import Cause
 from tracking.statuses import PoseStatus
 
@@ -14,7 +13,6 @@ from tracking.statuses import PoseStatus
 LEAST_MEASURED = 0.5
 GOOD_MEASURED = 0.95  # a smaller share is reported with its causes
 _LARGEST_STEP = 0.5  # of the radius: a reacquisition farther from the prediction is reported
-WORDS = {Level.PASS: "pass", Level.WARN: "check", Level.FAIL: "fail"}
 _REMEDIES = {
     Cause.NO_IMAGE.value: "Check the camera and the file: pictures are missing or damaged.",
     Cause.OCCLUDED.value: "Keep the target free, or use the predicted positions with their sigmas.",
@@ -41,11 +39,6 @@ def findings_of(series: CircleSeries) -> list[Finding]:
             )
         )
     return sorted(found, key=lambda f: -f.level)
-
-
-def exit_status(level: Level) -> int:
-    """0, or 4 where a quality gate failed."""
-    return QUALITY_GATE_FAILED if level is Level.FAIL else 0
 
 
 def _measured(series: CircleSeries) -> list[Finding]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from lab.errors import InputError
-from lab.explain import calibrations, circles, lenses, program, runs, stereo, tracks
+from lab.explain import calibrations, circles, drogues, lenses, program, runs, stereo, tracks
 from lab.explain.explanation import Explanations, as_text
 from lab.files.text.error_text import suggest_name
 
@@ -23,6 +23,7 @@ SECTIONS: dict[str, Explanations] = {
     "Stereo pose (`beampose stereo`)": stereo.STEREO,
     "Calibration of a stereo pair": stereo.PAIR,
     "Tracked circle": circles.CIRCLES,
+    "Tracked drogue (`beampose track drogue`)": drogues.DROGUES,
 }
 EXPLANATIONS: Explanations = {code: text for section in SECTIONS.values() for code, text in section.items()}
 

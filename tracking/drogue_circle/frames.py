@@ -52,6 +52,11 @@ class CircleFrame:
     circles: int = 0  # separate circles, where the whole picture was searched
     event: str = ""  # acquired, reacquired, lost, ambiguous
 
+    @property
+    def found(self) -> int:
+        """The same as `circles`, by the name that all trackers share."""
+        return self.circles
+
 
 def nothing_known(cause: Cause, event: str = "") -> CircleFrame:
     """A lost frame."""

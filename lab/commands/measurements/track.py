@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from lab.commands.common import ANY_PATH, FOLDER, Commands, NumberRange, conclude, progress_bar
+from lab.commands.measurements.track_drogue import drogue
 from lab.commands.measurements.track_point import point
 
 _PIXEL = NumberRange(-1e6, 1e6)
@@ -22,6 +23,7 @@ def track() -> None:
     """
 
 
+track.add_command(drogue)
 track.add_command(point)
 
 

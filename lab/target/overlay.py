@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from geometry.arrays import Array
 from lab.errors import RunError
 from lab.pictures.picture_file import GreyPicture
-from tracking.drogue_circle.frames import CircleFrame
 from tracking.statuses import PoseStatus
 
 FILE_NAME = "overlay.avi"
@@ -21,8 +21,13 @@ _COLOURS = {PoseStatus.MEASURED: (60, 220, 60), PoseStatus.PREDICTED: (30, 160, 
 _LEAST_RATE_HZ, _MOST_RATE_HZ = 1.0, 60.0  # of the video: players do not show others well
 
 
-def drawn(picture: GreyPicture | None, size_px: tuple[int, int], number: int, frame: CircleFrame) -> NDArray[np.uint8]:
-    """One picture (h, w, 3), BGR, of size_px (width, height); black where there is none."""
+def drawn(
+    picture: GreyPicture | None, size_px: tuple[int, int], label: str, status: PoseStatus, circle: Array
+) -> NDArray[np.uint8]:
+    """One picture (h, w, 3), BGR, of size_px (width, height); black where there is none.
+
+    circle: u, v, radius, px; nan where nothing is known. label: words in the corner.
+    """
     width, height = size_px
     grey = np.zeros((height, width), np.uint8)
     if picture is not None:
@@ -30,18 +35,22 @@ def drawn(picture: GreyPicture | None, size_px: tuple[int, int], number: int, fr
         h, w = min(height, eight.shape[0]), min(width, eight.shape[1])
         grey[:h, :w] = eight[:h, :w]
     image = cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR)
-    colour = _COLOURS[frame.status]
+    colour = _COLOURS[status]
     line = max(1, round(min(size_px) / 500))
-    if np.isfinite(frame.state[:3]).all() and np.abs(frame.state[:3]).max() < 1e5:
-        u, v, radius = frame.state[:3]
+    if np.isfinite(circle).all() and np.abs(circle).max() < 1e5:
+        u, v, radius = circle
         at = (round(float(u) * 2**_SHIFT), round(float(v) * 2**_SHIFT))
         size = max(round(float(radius) * 2**_SHIFT), 1)
         cv2.circle(image, at, size, colour, line, cv2.LINE_AA, _SHIFT)
         cv2.drawMarker(image, (round(float(u)), round(float(v))), colour, cv2.MARKER_CROSS, 9 * line, line)
-    words = f"{number}  {frame.status.value}" + (f" ({frame.cause.value})" if frame.cause.value else "")
     scale = 0.45 * line
-    cv2.putText(image, words, (6, 8 + round(14 * scale / 0.45)), cv2.FONT_HERSHEY_SIMPLEX, scale, colour, line)
+    cv2.putText(image, label, (6, 8 + round(14 * scale / 0.45)), cv2.FONT_HERSHEY_SIMPLEX, scale, colour, line)
     return np.asarray(image, np.uint8)
+
+
+def label_of(number: int, status: PoseStatus, cause: str) -> str:
+    """Frame number, status and cause as words."""
+    return f"{number}  {status.value}" + (f" ({cause})" if cause else "")
 
 
 class OverlayVideo:
@@ -62,7 +71,7 @@ class OverlayVideo:
         if self._writer is not None:
             self._writer.release()
 
-    def add(self, picture: GreyPicture | None, number: int, frame: CircleFrame) -> None:
+    def add(self, picture: GreyPicture | None, label: str, status: PoseStatus, circle: Array) -> None:
         """Add a frame; the first picture decides the size. Raises RunError where OpenCV cannot write the video."""
         if self._writer is None:
             if picture is None:
@@ -72,4 +81,4 @@ class OverlayVideo:
             self._writer = cv2.VideoWriter(str(self._path), code, self._rate_hz, self._size_px)
             if not self._writer.isOpened():
                 raise RunError(f"{FILE_NAME}: OpenCV cannot write a Motion JPEG video here; leave out --video")
-        self._writer.write(drawn(picture, self._size_px, number, frame))
+        self._writer.write(drawn(picture, self._size_px, label, status, circle))

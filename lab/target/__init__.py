@@ -1,0 +1,1 @@
+"""What the trackers of one target share: frames of a recording, verdict, summary, overlay video, parts of a page."""

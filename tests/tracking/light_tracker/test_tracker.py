@@ -1,0 +1,203 @@
+"""Detector and light tracker: hand-over, hidden targets, several targets, and pictures without one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from tests.tracking.light_tracker.targets import SIZE, picture
+from tracking.drogue_circle.candidates import CircleCandidate, Picture, Window
+from tracking.light_tracker.frames import Cause, DrogueFrame, Source
+from tracking.light_tracker.parameters import USUAL, LightParameters
+from tracking.light_tracker.tracker import DrogueTracker
+from tracking.statuses import PoseStatus
+
+Circle = tuple[float, float, float]
+
+
+class Detector:
+    """A detector that knows the truth: with noise on the centre, and a count of its calls."""
+
+    def __init__(self, share: float = 0.03, confidence: float = 0.9) -> None:
+        self.circles: list[Circle] = []
+        self.share, self.confidence = share, confidence
+        self.whole = self.windows = 0
+        self._rng = np.random.default_rng(8)
+
+    def __call__(self, image: Picture, window: Window | None) -> list[CircleCandidate]:
+        self.whole += window is None
+        self.windows += window is not None
+        found = []
+        for u, v, d in self.circles:
+            du, dv = self.share * d * self._rng.standard_normal(2)
+            if window is None or np.hypot(u + du - window.u_px, v + dv - window.v_px) <= window.gate_px:
+                found.append(CircleCandidate(u + du, v + dv, d / 2, self.confidence))
+        return found
+
+
+def path(k: int, diameter: float = 14.0) -> Circle:
+    return 40.0 + 1.7 * k, 80 + 12 * np.sin(k / 9), diameter
+
+
+def followed(
+    frames: int,
+    detector: Detector,
+    hidden: Callable[[int], bool] = lambda k: False,
+    diameter: float = 14.0,
+    parameters: LightParameters = USUAL,
+) -> tuple[list[DrogueFrame], np.ndarray]:
+    """The frames, and the errors of the centre in diameters; inf where nothing is known."""
+    tracker = DrogueTracker(detector, parameters)
+    out, errors = [], []
+    for k in range(frames):
+        truth = path(k, diameter)
+        gone = hidden(k)
+        detector.circles = [] if gone else [truth]
+        image = picture([truth], seed=k, hidden=(truth[0], truth[1], 2 * diameter) if gone else None)
+        frame = tracker.step(image)
+        out.append(frame)
+        away = np.hypot(*(frame.centre_px - truth[:2])) / diameter
+        errors.append(away if np.isfinite(away) else np.inf)
+    return out, np.array(errors)
+
+
+@pytest.mark.parametrize("diameter", [9.0, 30.0])
+def test_the_detector_is_asked_in_few_frames_and_the_target_is_never_lost(diameter):
+    detector = Detector()
+    frames, errors = followed(40, detector, diameter=diameter)
+    assert all(f.status is PoseStatus.MEASURED for f in frames)
+    assert errors.max() < 0.12
+    assert detector.whole == 1
+    # Every fifth frame; more often in the first ones, until some checks have confirmed the target.
+    assert 7 <= detector.windows <= 16
+    assert {f.source for f in frames} == {Source.DETECTOR, Source.BOTH, Source.LIGHT}
+    assert frames[0].event == "acquired"
+    assert frames[-1].diameter_px == pytest.approx(diameter, rel=0.1)
+    assert frames[-1].rate_px[0] == pytest.approx(1.7, abs=0.4)
+
+
+def test_the_errors_of_the_detections_average_out():
+    frames, errors = followed(60, Detector(share=0.06))
+    # A detection alone is wrong by 0.06 per axis: 0.075 in the mean of its length.
+    assert errors[20:].mean() < 0.05
+    assert np.sqrt(np.diag(frames[-1].covariance)).max() < 0.06 * 14
+
+
+def test_a_hidden_target_is_predicted_and_found_again():
+    def hidden(k: int) -> bool:
+        return 20 <= k < 25
+
+    frames, errors = followed(40, Detector(), hidden)
+    assert all(f.status is not PoseStatus.MEASURED for f in frames[20:25])
+    assert {f.cause for f in frames[20:25]} <= {Cause.NO_MATCH, Cause.UNCERTAIN}
+    known = [k for k in range(20, 25) if frames[k].known]
+    assert np.all(errors[known] < 0.5)
+    confidence = [f.confidence for f in frames[19:25]]
+    assert confidence == sorted(confidence, reverse=True)
+    assert all(f.status is PoseStatus.MEASURED for f in frames[28:])
+    assert errors[28:].max() < 0.12
+
+
+def test_while_the_target_is_hidden_nothing_that_resembles_it_a_little_is_followed():
+    detector = Detector()
+    tracker = DrogueTracker(detector)
+    for k in range(32):
+        circle = path(k)
+        gone = k >= 16
+        detector.circles = [] if gone else [circle]
+        # The other ring correlates with the pattern by about 0.8.
+        image = picture([] if gone else [circle], seed=k, alike=(circle[0] + 22, circle[1] + 6, circle[2]))
+        frame = tracker.step(image)
+        assert gone == (frame.status is not PoseStatus.MEASURED), k
+
+
+def test_frames_without_a_picture_are_predicted():
+    detector, sigmas = Detector(), []
+    tracker = DrogueTracker(detector)
+    for k in range(20):
+        detector.circles = [path(k)]
+        frame = tracker.step(None if k in (10, 11) else picture([path(k)], seed=k))
+        if k in (10, 11):
+            assert (frame.status, frame.cause) == (PoseStatus.PREDICTED, Cause.NO_IMAGE)
+            assert np.hypot(*(frame.centre_px - path(k)[:2])) < 2.0
+            sigmas.append(float(np.sqrt(frame.covariance[0, 0])))
+    assert sigmas[1] > 1.2 * sigmas[0]
+    assert frame.status is PoseStatus.MEASURED
+    assert DrogueTracker(detector).step(None).cause is Cause.NO_IMAGE
+
+
+def test_of_two_targets_none_is_chosen_unless_the_place_is_stated():
+    circles = [(50.0, 60.0, 14.0), (140.0, 90.0, 14.0)]
+    detector = Detector()
+    detector.circles = circles
+    image = picture(circles)
+    frame = DrogueTracker(detector).step(image)
+    assert (frame.status, frame.cause, frame.event) == (PoseStatus.LOST, Cause.AMBIGUOUS, "ambiguous")
+    assert np.isnan(frame.centre_px).all()
+    assert frame.confidence == 0
+    stated = DrogueTracker(detector, near_px=(138.0, 92.0)).step(image)
+    assert stated.status is PoseStatus.MEASURED
+    assert np.hypot(*(stated.centre_px - circles[1][:2])) < 3
+
+
+def test_a_second_target_that_appears_later_does_not_matter():
+    detector = Detector()
+    tracker = DrogueTracker(detector)
+    for k in range(25):
+        detector.circles = [path(k), (150.0, 20.0, 14.0)][: 1 + (k > 8)]
+        frame = tracker.step(picture(detector.circles, seed=k))
+    assert np.hypot(*(frame.centre_px - path(24)[:2])) < 2.0
+
+
+def test_without_a_target_nothing_is_reported():
+    detector = Detector()
+    tracker = DrogueTracker(detector)
+    for k in range(3):
+        frame = tracker.step(picture([], seed=k))
+        assert (frame.status, frame.cause, frame.event) == (PoseStatus.LOST, Cause.NOT_FOUND, "")
+
+
+def test_a_false_acquisition_that_no_check_confirms_loses_its_confidence():
+    detector = Detector(confidence=0.6)
+    tracker = DrogueTracker(detector)
+    detector.circles = [(120.0, 60.0, 14.0)]  # there is only texture
+    frames = [tracker.step(picture([(40.0, 110.0, 14.0)], seed=0))]
+    detector.circles = []
+    frames += [tracker.step(picture([(40.0, 110.0, 14.0)], seed=k)) for k in range(1, 15)]
+    assert frames[0].status is PoseStatus.MEASURED
+    assert all(f.status is not PoseStatus.MEASURED for f in frames[8:])
+    assert max(f.confidence for f in frames[8:]) < 0.5
+
+
+def test_a_target_found_elsewhere_replaces_one_that_is_gone():
+    detector = Detector()
+    tracker = DrogueTracker(detector)
+    for k in range(12):
+        detector.circles = [path(k)]
+        tracker.step(picture([path(k)], seed=k))
+    detector.circles = [(150.0, 130.0, 14.0)]
+    frames = [tracker.step(picture(detector.circles, seed=k)) for k in range(6)]
+    assert "reacquired" in [f.event for f in frames]
+    assert np.hypot(*(frames[-1].centre_px - (150.0, 130.0))) < 2.0
+
+
+def test_a_target_that_leaves_the_picture_is_out_of_view_then_lost():
+    detector = Detector()
+    tracker = DrogueTracker(detector)
+    causes, last = [], None
+    for k in range(60):
+        circle = (120.0 + 4.0 * k, 80.0, 14.0)
+        detector.circles = [circle] if circle[0] < SIZE[0] else []
+        last = tracker.step(picture([circle], seed=k))
+        causes.append(last.cause)
+    assert Cause.OUT_OF_VIEW in causes
+    assert last is not None
+    assert last.status is PoseStatus.LOST
+
+
+@pytest.mark.parametrize("wrong", [{"check_every": 0}, {"smallest_px": 4.0}, {"largest_px": 5.0}])
+def test_parameters_without_a_meaning_are_refused(wrong):
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        LightParameters(**wrong)

@@ -1,0 +1,268 @@
+"""The pattern of a drogue: found again by correlation in a window, then refined to a fraction of a pixel with its size.
+
+The pattern has a fixed number of pixels; the window is reduced so that the drogue has the pattern's size, so a large
+drogue costs no more than a small one. Source of the refinement: Lucas & Kanade (1981) in the inverse form of Baker &
+Matthews (2004), with gain and offset of the brightness; the correlation is that of cv2.matchTemplate.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from geometry.arrays import Array
+from tracking.drogue_circle.candidates import Picture
+
+Floats: TypeAlias = NDArray[np.float32]
+
+SMALLEST_PX, LARGEST_PX = 9.0, 24.0  # diameter of the drogue in the pattern
+_REACH = 0.62  # of the pattern, in diameters: the rim and a little of what is around it
+_LARGEST_REACH = 4.0  # diameters of the largest pattern: half of the side of the largest window
+_ITERATIONS = 6
+_CONVERGED_PX = 0.01
+_MOST_SHIFT = 0.35  # of the diameter, away from the peak of the correlation
+_MOST_GROWTH = 0.25  # relative change of the diameter in one frame
+_HIDDEN_FACTOR = 2.0  # times the usual unexplained variance: from here on a part of the pattern is left out
+_ROBUST_ROUNDS = 2
+_LEAST_VISIBLE = 0.3  # share of the pattern; with less there is no match
+_TUKEY, _LEAST_SCALE = 4.7, 0.05  # residuals in usual sigmas of which the weight is zero; least sigma
+_LEAST_CONTRAST = 0.5  # DN: a window without any contrast matches nothing
+
+
+@dataclass(frozen=True, slots=True)
+class Match:
+    """The pattern in a picture."""
+
+    u_px: float  # of the pattern's centre
+    v_px: float
+    diameter_px: float
+    covariance: Array  # (3, 3) of u, v (px) and of the logarithm of the diameter
+    correlation: float  # weighted correlation coefficient, at most 1
+    visible: float  # share of the pattern that agrees with the picture
+    agreement: float  # correlation of this share
+    second: float  # of the next best place of the window; -1 where there is none
+    patch: Floats  # (n, n) the picture there, of mean 0 and sigma 1 under the weights
+
+
+@dataclass(frozen=True, slots=True)
+class Pattern:
+    """A drogue's appearance. `values` have the mean 0 and the sigma 1 under the weights."""
+
+    values: Floats  # (n, n)
+    weights: Floats  # (n, n), sum 1
+    diameter: float  # of the drogue, in pixels of the pattern
+    solver: Floats  # (5, n n): shift (2), growth, gain and offset from a patch, times the gain
+    normal: Array  # (5, 5) inverse of the normal matrix
+
+    @classmethod
+    def started(cls, picture: Picture, u_px: float, v_px: float, diameter_px: float) -> Pattern | None:
+        """The pattern at a place; None where the picture has no contrast there."""
+        diameter = float(np.clip(diameter_px, SMALLEST_PX, LARGEST_PX))
+        half = int(np.ceil(_REACH * diameter))
+        y, x = np.mgrid[-half : half + 1, -half : half + 1].astype(np.float32)
+        # Full weight up to the rim, falling to zero over a twentieth of the diameter at least and one pixel.
+        away = (np.hypot(x, y) / diameter - 0.5 - 0.5 / diameter) / max(_REACH - 0.5, 0.05)
+        weights = np.clip(1 - away, 0, 1).astype(np.float32)
+        weights /= weights.sum()
+        window = _Window.around(picture, u_px, v_px, half * diameter_px / diameter, diameter / diameter_px)
+        if window is None:
+            return None
+        growth = window.scale * diameter_px / diameter
+        patch = _normalised(window.patch(*window.inside(u_px, v_px), growth, half), weights, _LEAST_CONTRAST)
+        return None if patch is None else cls.of(patch, weights, diameter)
+
+    @classmethod
+    def of(cls, values: Floats, weights: Floats, diameter: float) -> Pattern:
+        """The pattern with its solver."""
+        half = values.shape[0] // 2
+        y, x = np.mgrid[-half : half + 1, -half : half + 1].astype(np.float32)
+        dy, dx = np.gradient(values)
+        J = np.stack([dx, dy, dx * x + dy * y, values, np.ones_like(values)]).reshape(5, -1)
+        normal = np.linalg.inv((J * weights.ravel()) @ J.T.astype(float) + 1e-9 * np.eye(5))
+        return cls(values, weights, diameter, (normal @ (J * weights.ravel())).astype(np.float32), normal)
+
+    def updated(self, match: Match, rate: float) -> Pattern:
+        """The pattern after a match: a running mean."""
+        mixed = _normalised((1 - rate) * self.values + rate * match.patch, self.weights, 1e-6)
+        return self if mixed is None else Pattern.of(mixed, self.weights, self.diameter)
+
+    def find(
+        self, picture: Picture, u_px: float, v_px: float, diameter_px: float, reach_px: float, usual: float = np.inf
+    ) -> Match | None:
+        """The best match with a centre within `reach_px` of a place, of about the given diameter; None without one.
+
+        usual: `unexplained` of good matches. With clearly more, a part is hidden: what disagrees is left out.
+        """
+        scale = self.diameter / diameter_px
+        half = self.values.shape[0] // 2
+        reach = float(np.clip(np.ceil(reach_px * scale), 2, _LARGEST_REACH * LARGEST_PX))
+        window = _Window.around(picture, u_px, v_px, (reach + half + 2) / scale, scale)
+        if window is None:
+            return None
+        x0, y0 = window.inside(u_px, v_px)
+        left, top = round(x0 - reach), round(y0 - reach)
+        side = 2 * int(reach) + 1
+        field = window.field[top - half : top + half + side, left - half : left + half + side]
+        if min(field.shape) < 2 * half + 1 or top < half or left < half:
+            return None
+        raw = cv2.matchTemplate(field, self.values, cv2.TM_CCOEFF_NORMED, mask=self.weights)
+        scores: Floats = np.nan_to_num(raw, nan=-1.0, posinf=-1.0, neginf=-1.0).astype(np.float32)
+        _, _, _, (x, y) = cv2.minMaxLoc(scores)
+        second = _second(scores, x, y, 0.5 * self.diameter)
+        return self._refined(window, float(left + x), float(top + y), window.scale / scale, second, usual)
+
+    def _refined(self, window: _Window, x: float, y: float, growth: float, second: float, usual: float) -> Match | None:
+        """Gauss-Newton for shift and growth; x, y: the peak of the correlation in the window."""
+        half = self.values.shape[0] // 2
+        place = self._aligned(window, (x, y, growth))
+        if place is None:
+            return None
+        patch = _normalised(window.patch(*place, half), self.weights, _LEAST_CONTRAST)
+        if patch is None:
+            return None
+        correlation = float((self.weights * self.values * patch).sum())
+        visible, agreement, left = 1.0, correlation, unexplained(correlation)
+        part = self
+        if left > _HIDDEN_FACTOR * usual:
+            for _ in range(_ROBUST_ROUNDS):
+                weights = self._agreeing(window.patch(*place, half), usual)
+                visible = float((weights * self.weights).sum())
+                if visible < _LEAST_VISIBLE:
+                    return None
+                part = Pattern.of(self.values, (weights * self.weights / visible).astype(np.float32), self.diameter)
+                better = part._aligned(window, place, (x, y, growth))
+                if better is None:
+                    return None
+                place = better
+            patch = _normalised(window.patch(*place, half), self.weights, _LEAST_CONTRAST)
+            if patch is None:
+                return None
+            correlation = float((self.weights * self.values * patch).sum())
+            agreement = part._correlation(patch)
+        # Of unit variance, the part that the pattern does not explain, over its degrees of freedom; `normal` belongs to
+        # weights of sum 1, so it is divided by the effective number of pixels.
+        pixels = visible / float((self.weights**2).sum())
+        covariance = min(left, 2 * usual / visible) / max(pixels - 5, 1) * part.normal[:3, :3]
+        to_px = np.array([place[2] / window.scale] * 2 + [1.0])
+        covariance = covariance * to_px[:, None] * to_px
+        u, v = window.outside(*place[:2])
+        diameter = place[2] * self.diameter / window.scale
+        return Match(u, v, diameter, covariance, correlation, visible, agreement, second, patch)
+
+    def _correlation(self, patch: Floats) -> float:
+        """The weighted correlation coefficient with a patch; 0 without contrast."""
+        values, seen = _normalised(self.values, self.weights, 1e-6), _normalised(patch, self.weights, 1e-6)
+        return 0.0 if values is None or seen is None else float((self.weights * values * seen).sum())
+
+    def _aligned(
+        self, window: _Window, place: tuple[float, float, float], start: tuple[float, float, float] | None = None
+    ) -> tuple[float, float, float] | None:
+        """Gauss-Newton for shift and growth from a place; None where it leaves the surroundings of `start`."""
+        half = self.values.shape[0] // 2
+        x, y, growth = place
+        x0, y0, growth0 = place if start is None else start
+        limit = _MOST_SHIFT * self.diameter
+        for _ in range(_ITERATIONS):
+            du, dv, dg, gain, _ = (self.solver @ window.patch(x, y, growth, half).ravel()).tolist()
+            if not gain > 0:
+                return None
+            du, dv, dg = du / gain, dv / gain, float(np.clip(dg / gain, -0.1, 0.1))
+            x, y = x - growth * du / (1 + dg), y - growth * dv / (1 + dg)
+            growth /= 1 + dg
+            if abs(x - x0) > limit or abs(y - y0) > limit or abs(np.log(growth / growth0)) > _MOST_GROWTH:
+                return None
+            if abs(du) + abs(dv) + self.diameter / 2 * abs(dg) < _CONVERGED_PX:
+                break
+        return x, y, growth
+
+    def _agreeing(self, patch: Floats, usual: float) -> Floats:
+        """Weights (n, n), 0 to 1, of the pixels that agree with the pattern up to gain and offset (Tukey's biweight).
+
+        Gain and offset come from the half of the pixels that agrees best, starting with all.
+        """
+        own = self.weights > 0
+        values, seen = self.values[own].astype(float), patch[own].astype(float)
+        keep = np.ones(len(values), bool)
+        away = np.zeros(len(values))
+        for _ in range(4):
+            A = np.stack([values[keep], np.ones(int(keep.sum()))], axis=1)
+            gain, offset = np.linalg.lstsq(A, seen[keep], rcond=None)[0]
+            if not gain > 0:
+                return np.zeros_like(patch)
+            away = np.abs((seen - offset) / gain - values)
+            keep = away <= np.median(away)
+        scale = np.sqrt(usual) + _LEAST_SCALE
+        out = np.zeros_like(patch)
+        out[own] = np.clip(1 - (away / (_TUKEY * scale)) ** 2, 0, 1) ** 2
+        return out
+
+
+def unexplained(correlation: float) -> float:
+    """Variance that the pattern does not explain, over the one that it explains."""
+    square = float(np.clip(correlation, 1e-3, 1 - 1e-6)) ** 2
+    return (1 - square) / square
+
+
+@dataclass(frozen=True, slots=True)
+class _Window:
+    """A part of the picture, reduced. Its border repeats the outermost pixels where it reaches beyond the picture."""
+
+    field: Floats
+    left: int  # of its first column, px of the picture
+    top: int
+    scale: float  # pixels of the window per pixel of the picture
+
+    @classmethod
+    def around(cls, picture: Picture, u_px: float, v_px: float, half_px: float, scale: float) -> _Window | None:
+        """The part within `half_px` of a place; None where the place is outside the picture."""
+        height, width = picture.shape
+        if not (-0.5 <= u_px < width - 0.5 and -0.5 <= v_px < height - 0.5):
+            return None
+        reach = int(np.ceil(half_px)) + 3
+        left, top = round(u_px) - reach, round(v_px) - reach
+        right, bottom = round(u_px) + reach + 1, round(v_px) + reach + 1
+        inner = picture[max(top, 0) : min(bottom, height), max(left, 0) : min(right, width)]
+        field = inner.astype(np.float32)
+        borders = max(-top, 0), max(bottom - height, 0), max(-left, 0), max(right - width, 0)
+        if any(borders):
+            field = np.asarray(cv2.copyMakeBorder(field, *borders, cv2.BORDER_REPLICATE), np.float32)
+        side = max(round(scale * field.shape[0]), 3)
+        exact = side / field.shape[0]
+        if side != field.shape[0]:
+            how = cv2.INTER_AREA if side < field.shape[0] else cv2.INTER_CUBIC
+            field = np.asarray(cv2.resize(field, (side, side), interpolation=how), np.float32)
+        return cls(field, left, top, exact)
+
+    def inside(self, u_px: float, v_px: float) -> tuple[float, float]:
+        """Place in the window."""
+        return (u_px - self.left + 0.5) * self.scale - 0.5, (v_px - self.top + 0.5) * self.scale - 0.5
+
+    def outside(self, x: float, y: float) -> tuple[float, float]:
+        """Place in the picture."""
+        return (x + 0.5) / self.scale - 0.5 + self.left, (y + 0.5) / self.scale - 0.5 + self.top
+
+    def patch(self, x: float, y: float, growth: float, half: int) -> Floats:
+        """(n, n) values around a place, `growth` pixels of the window apart."""
+        n = 2 * half + 1
+        matrix = np.array([[growth, 0, x - growth * half], [0, growth, y - growth * half]])
+        flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
+        out = cv2.warpAffine(self.field, matrix, (n, n), flags=flags, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(out, np.float32)
+
+
+def _normalised(patch: Floats, weights: Floats, least_sigma: float) -> Floats | None:
+    """With the mean 0 and the sigma 1 under the weights; None with a sigma of `least_sigma` or less."""
+    away = patch - np.float32((weights * patch).sum())
+    sigma = float(np.sqrt((weights * away**2).sum()))
+    return (away / np.float32(sigma)).astype(np.float32) if sigma > least_sigma else None
+
+
+def _second(scores: Floats, x: int, y: int, apart: float) -> float:
+    """The largest score at least `apart` from the peak; -1 where the window has no such place."""
+    v, u = np.mgrid[: scores.shape[0], : scores.shape[1]]
+    others = scores[(u - x) ** 2 + (v - y) ** 2 > apart**2]
+    return float(others.max()) if others.size else -1.0

@@ -1,0 +1,337 @@
+"""Tracks one drogue: the detector acquires it and checks every few frames, the light tracker follows it in between.
+
+Rules of the hand-over (ours; Zhou (2020) only states that a light tracker follows the network):
+- The detector searches the whole picture until it finds one drogue that it is confident of.
+- In each frame the light tracker finds the pattern near its prediction. Every `check_every` frames, after a frame
+  without a match, or as soon as the confidence is low, the detector searches a window around it. A detection there
+  confirms the track and corrects it.
+- After frames without a match, or checks in a row without a detection, the detector searches the whole picture.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from geometry.arrays import Array
+from tracking.drogue_circle.candidates import CircleCandidate, CircleDetector, Picture, Window
+from tracking.light_tracker.confidence import ABSENT_LOGIT, features, fisher, logit, probability, within
+from tracking.light_tracker.frames import Cause, DrogueFrame, Source, nothing_known
+from tracking.light_tracker.motion import WHOLE, Motion
+from tracking.light_tracker.parameters import USUAL, LightParameters
+from tracking.light_tracker.pattern import Match, Pattern, unexplained
+from tracking.statuses import PoseStatus
+
+_SIMILAR = 0.7  # fall of Fisher's z of the correlation below its usual value, of a match that may be the drogue
+_TRUSTED = 4  # detections that confirmed a track
+_GOOD = 1.5  # Fisher's z that is similar in any case: a correlation of 0.905
+_MOSTLY = 0.6  # visible share from which the agreement of this share counts
+_LEAD = 0.3  # of Fisher's z over the next best place of the window, after a gap
+_LONGEST_GAP = 20  # frames
+_NEAR_PX = 20.0  # distance of the first drogue from the place that the user states
+_SUPPORT_RATE = 0.25  # of the running mean of the log odds of the checks
+_USUAL_RATE = 0.1  # of the running mean of the correlation
+_OFF_CENTRE, _OFF_SIZE = 0.12, 0.2  # offset of the pattern, in diameters and as a logarithm, that cuts it out again
+_MORE_PX = 2.0  # radius of a window beyond 3 sigma
+
+
+@dataclass(slots=True)
+class _Track:
+    """What is known of the drogue while it is followed."""
+
+    motion: Motion
+    pattern: Pattern
+    support: float  # running mean of the log odds of the checks
+    usual: float = float("nan")  # running mean of Fisher's z of the matches' correlation
+    confirmed: int = 1  # detections
+    unconfirmed: int = 0  # checks in a row without a detection
+    age: float = 0.0  # frames since the last confirmation
+    since_check: int = 0  # frames since the detector searched
+    lost: bool = False  # reported as lost
+    trusted: float = 1.0  # confidence of the last measured frame
+    misses: int = 0  # frames in a row without a measurement
+    blind: int = 0  # frames in a row without a match that resembles the pattern
+    gap: int = 0  # the same, and falling by one with each match afterwards: how far the drogue can have moved away
+
+    def count_blind(self) -> None:
+        """One more frame without a match."""
+        self.blind, self.gap = self.blind + 1, min(self.gap + 1, _LONGEST_GAP)
+
+
+@dataclass(slots=True)
+class DrogueTracker:
+    """The state between frames. `detector`: of drogues; the score of its candidates is a probability."""
+
+    detector: CircleDetector
+    parameters: LightParameters = USUAL
+    near_px: tuple[float, float] | None = None  # of the first drogue, if the user knows it
+    _track: _Track | None = None
+    _last: Motion | None = None  # of the drogue that was lost
+    _ambiguous: bool = False
+    trace: list[tuple[Array, Array]] | None = None  # if a list: gets inputs of the confidence, and the centre, px
+
+    def step(self, picture: Picture | None, dt: float = 1.0) -> DrogueFrame:
+        """The next frame. picture None: there is none. dt: frames since the last step."""
+        track = self._track
+        if track is None:
+            return nothing_known(Cause.NO_IMAGE) if picture is None else self._acquired(picture)
+        track.motion = track.motion.predicted(dt, track.blind, self.parameters)
+        predicted = track.motion
+        track.age += dt
+        if picture is None:
+            track.count_blind()
+            return self._unmeasured(track, Cause.NO_IMAGE)
+        height, width = picture.shape
+        u, v = track.motion.x[:2].tolist()
+        if not (-0.5 <= u < width - 0.5 and -0.5 <= v < height - 0.5):
+            track.count_blind()
+            return self._missed(track, picture, Cause.OUT_OF_VIEW)
+        match = self._matched(track, picture)
+        if match is not None:
+            track.motion = track.motion.matched(match, self.parameters, track.blind == 0)
+        track.since_check += 1
+        searched, found, source = "", 0, Source.LIGHT
+        confidence = self._confidence(track, match)
+        p = self.parameters
+        due = track.since_check >= p.check_every or track.gap > 0
+        if match is None or due or confidence < p.hand_back_confidence:
+            seen = self._seen(track, picture)
+            searched, found, track.since_check = "window", len(seen), 0
+            best = self._confirming(track, seen, match)
+            if best is not None:
+                match = self._confirm(track, picture, best, match)
+                source = Source.BOTH
+            elif match is not None:
+                track.unconfirmed += 1
+                track.support += _SUPPORT_RATE * (ABSENT_LOGIT - track.support)
+            confidence = self._confidence(track, match)
+        if match is None or confidence < p.measured_confidence:
+            cause = Cause.NO_MATCH if match is None else Cause.UNCERTAIN
+            if match is not None and self._similar(track, match):
+                track.blind, track.gap = 0, max(track.gap - 1, 0)  # it may be the drogue: later frames decide
+            else:
+                track.count_blind()
+                track.motion = replace(
+                    predicted, offset=track.motion.offset, offset_variance=track.motion.offset_variance
+                )
+            return self._missed(track, picture, cause, match, searched, found, confidence)
+        if track.since_check == 0 and track.unconfirmed and track.unconfirmed % p.most_unconfirmed == 0:
+            again = self._found_elsewhere(track, picture)
+            if again is not None:
+                return again
+            searched = "both"
+        event, track.lost = "reacquired" if track.lost else "", False
+        track.misses, track.blind, track.gap, track.trusted = 0, 0, max(track.gap - 1, 0), confidence
+        self._learn(track, picture, match)
+        return self._frame(
+            track, PoseStatus.MEASURED, Cause.NONE, source, confidence, match.correlation, searched, found, event
+        )
+
+    def _matched(self, track: _Track, picture: Picture) -> Match | None:
+        """The pattern near the prediction."""
+        motion = track.motion
+        reach = 3 * motion.sigma_px + _MORE_PX
+        usual = unexplained(float(np.tanh(track.usual))) if np.isfinite(track.usual) else np.inf
+        match = track.pattern.find(picture, float(motion.x[0]), float(motion.x[1]), motion.diameter_px, reach, usual)
+        if match is None or match.correlation < self.parameters.least_correlation:
+            return None
+        # After a gap, what is in front of the drogue has a weak correlation too, as have many places of a wide window.
+        if track.gap and not (self._similar(track, match) and fisher(match.correlation) > fisher(match.second) + _LEAD):
+            return None
+        limit = np.log(self.parameters.size_ratio)
+        return match if abs(np.log(match.diameter_px) - motion.log_diameter) < limit else None
+
+    @staticmethod
+    def _similar(track: _Track, match: Match) -> bool:
+        """Whether a match is about as good as the ones before."""
+        z = fisher(match.agreement if match.visible > _MOSTLY else match.correlation)
+        new = bool(np.isnan(track.usual))  # a pattern that has no usual correlation yet
+        return new or track.usual - z < _SIMILAR or z > _GOOD
+
+    def _seen(self, track: _Track, picture: Picture) -> list[CircleCandidate]:
+        """What the detector finds around the track, of about its size."""
+        motion, p = track.motion, self.parameters
+        diameter = motion.rim_diameter_px
+        gate = p.window_diameters * diameter + 3 * motion.sigma_px
+        u, v = motion.centre_px.tolist()
+        low, high = diameter / 2 / p.size_ratio, diameter / 2 * p.size_ratio
+        # From an eighth of the diameter on: the network sees large drogues at a finer scale, and places them better.
+        window = Window(u, v, gate + 0.6 * diameter, gate, diameter / 8, high)
+        return [
+            c for c in self.detector(picture, window)
+            if c.score >= p.confirm_confidence and low <= c.radius_px <= high
+        ]  # fmt: skip
+
+    def _confirming(
+        self, track: _Track, seen: Sequence[CircleCandidate], match: Match | None
+    ) -> CircleCandidate | None:
+        """The detection of the tracked drogue: at the match, or, without one, where the drogue can be."""
+        motion, p = track.motion, self.parameters
+        near = p.agree_diameters * motion.rim_diameter_px + (3 * motion.sigma_px if match is None else 1.0)
+        u, v = motion.centre_px.tolist()
+        own = [c for c in seen if np.hypot(c.u_px - u, c.v_px - v) <= near]
+        if match is None:
+            own = [c for c in own if c.score >= p.acquire_confidence]
+        return max(own, key=lambda c: c.score, default=None)
+
+    def _confirm(self, track: _Track, picture: Picture, seen: CircleCandidate, match: Match | None) -> Match | None:
+        """Take a detection into the track. Returns the match, found again at the detection where there was none."""
+        p = self.parameters
+        if match is None:
+            track_at = track.motion
+            u, v = (np.array([seen.u_px, seen.v_px]) - track_at.diameter_px * track_at.offset[:2]).tolist()
+            diameter = 2 * seen.radius_px / float(np.exp(track_at.offset[2]))
+            match = track.pattern.find(picture, u, v, diameter, 0.2 * diameter + 1)
+            if match is not None and match.correlation >= p.least_correlation:
+                track.motion = track.motion.matched(match, p, learn=False)
+            elif seen.score >= p.elsewhere_confidence and track.misses >= p.search_after:
+                return self._cut_again(track, picture, seen)
+            else:
+                return None
+        track.motion = track.motion.detected(seen.u_px, seen.v_px, 2 * seen.radius_px, p)
+        track.support += _SUPPORT_RATE * (logit(seen.score) - track.support)
+        track.confirmed, track.unconfirmed, track.age, track.gap = track.confirmed + 1, 0, 0.0, 0
+        return match
+
+    def _cut_again(self, track: _Track, picture: Picture, seen: CircleCandidate) -> Match | None:
+        """A new pattern at a detection: the drogue does not look as before."""
+        diameter = 2 * seen.radius_px
+        pattern = Pattern.started(picture, seen.u_px, seen.v_px, diameter)
+        match = None if pattern is None else pattern.find(picture, seen.u_px, seen.v_px, diameter, 0.0)
+        if pattern is None or match is None:
+            return None
+        track.motion = Motion.started(seen.u_px, seen.v_px, diameter, self.parameters)
+        track.pattern, track.usual, track.confirmed = pattern, float("nan"), 1
+        track.unconfirmed, track.age = 0, 0.0
+        return match
+
+    def _learn(self, track: _Track, picture: Picture, match: Match) -> None:
+        """Update the pattern with a good match."""
+        z, p = fisher(match.correlation), self.parameters
+        whole = match.visible > WHOLE
+        if match.correlation >= p.update_correlation and whole:
+            track.pattern = track.pattern.updated(match, p.update_rate)
+        offset = np.abs(track.motion.offset)
+        if whole and track.age == 0 and (offset[:2].max() > _OFF_CENTRE or offset[2] > _OFF_SIZE):
+            motion = track.motion.centred()
+            pattern = Pattern.started(picture, float(motion.x[0]), float(motion.x[1]), motion.diameter_px)
+            if pattern is not None:
+                track.motion, track.pattern = motion, pattern
+        rate = _USUAL_RATE if whole else _USUAL_RATE / 5
+        track.usual = z if np.isnan(track.usual) else track.usual + rate * (z - track.usual)
+
+    def _confidence(self, track: _Track, match: Match | None) -> float:
+        if match is None:
+            return 0.0
+        inputs = features(track.support, track.confirmed, track.unconfirmed)
+        if self.trace is not None:
+            self.trace.append((inputs, track.motion.centre_px))
+        return probability(inputs)
+
+    def _acquired(self, picture: Picture) -> DrogueFrame:
+        """Search the whole picture."""
+        found = self._in_picture(picture)
+        best, ambiguous = self._chosen(found)
+        event = "ambiguous" if ambiguous and not self._ambiguous else ""
+        self._ambiguous = ambiguous
+        pattern = None if best is None else Pattern.started(picture, best.u_px, best.v_px, 2 * best.radius_px)
+        if best is None or pattern is None:
+            cause = Cause.AMBIGUOUS if ambiguous else Cause.NOT_FOUND
+            return nothing_known(cause, event, "picture", len(found))
+        event = "acquired" if self._last is None else "reacquired"
+        return self._start(best, pattern, "picture", len(found), event)
+
+    def _start(self, seen: CircleCandidate, pattern: Pattern, searched: str, found: int, event: str) -> DrogueFrame:
+        motion = Motion.started(seen.u_px, seen.v_px, 2 * seen.radius_px, self.parameters)
+        self._track = track = _Track(motion, pattern, logit(seen.score), trusted=seen.score)
+        return self._frame(
+            track, PoseStatus.MEASURED, Cause.NONE, Source.DETECTOR, seen.score, float("nan"), searched, found, event
+        )
+
+    def _in_picture(self, picture: Picture) -> list[CircleCandidate]:
+        return [c for c in self.detector(picture, None) if c.score >= self.parameters.confirm_confidence]
+
+    def _chosen(self, found: Sequence[CircleCandidate]) -> tuple[CircleCandidate | None, bool]:
+        """The drogue among the detections of a picture, and whether several can be it."""
+        p = self.parameters
+        good = [c for c in found if c.score >= p.acquire_confidence]
+        if self.near_px is not None and self._last is None:
+            u, v = self.near_px
+            good = [c for c in good if np.hypot(c.u_px - u, c.v_px - v) <= max(_NEAR_PX, c.radius_px)]
+        good.sort(key=lambda c: -c.score)
+        if len(good) > 1 and logit(good[0].score) - logit(good[1].score) < p.ambiguous_logit:
+            return None, True
+        return (good[0], False) if good else (None, False)
+
+    def _missed(
+        self,
+        track: _Track,
+        picture: Picture,
+        cause: Cause,
+        match: Match | None = None,
+        searched: str = "",
+        found: int = 0,
+        confidence: float = 1.0,
+    ) -> DrogueFrame:
+        """No measurement: at times the detector searches the whole picture; else the frame is predicted or lost."""
+        if (track.misses + 1) % self.parameters.search_after == 0:
+            again = self._found_elsewhere(track, picture)
+            if again is not None:
+                return again
+            searched = "both" if searched else "picture"
+        out = self._unmeasured(track, cause, 1.0 if match is None else confidence)
+        correlation = float("nan") if match is None else match.correlation
+        return replace(out, correlation=correlation, searched=searched, found=found)
+
+    def _found_elsewhere(self, track: _Track, picture: Picture) -> DrogueFrame | None:
+        """One drogue in the whole picture, of about the same size, away from where the track is."""
+        motion, p = track.motion, self.parameters
+        found = self._in_picture(picture)
+        # A track that few detections confirmed may have a wrong size, and be none.
+        limit = p.size_ratio if track.confirmed >= _TRUSTED else np.inf
+        alike = [c for c in found if 1 / limit < 2 * c.radius_px / motion.rim_diameter_px < limit]
+        best, _ = self._chosen(alike)
+        doubtful = track.lost and (track.confirmed < _TRUSTED or track.misses > _LONGEST_GAP)
+        if best is None or (best.score < p.elsewhere_confidence and not doubtful):
+            return None
+        u, v = motion.centre_px.tolist()
+        if track.misses == 0 and np.hypot(best.u_px - u, best.v_px - v) < motion.rim_diameter_px / 2:
+            return None
+        pattern = Pattern.started(picture, best.u_px, best.v_px, 2 * best.radius_px)
+        return None if pattern is None else self._start(best, pattern, "both", len(found), "reacquired")
+
+    def _unmeasured(self, track: _Track, cause: Cause, share: float = 1.0) -> DrogueFrame:
+        """A frame without a measurement: predicted, or lost."""
+        track.misses += 1
+        motion, p = track.motion, self.parameters
+        if track.misses > p.most_predicted or track.age > p.most_unseen:
+            self._last, self._track = motion, None
+            return nothing_known(cause, "" if track.lost else "lost")
+        if motion.sigma_px > p.lost_sigma_diameters * motion.rim_diameter_px:
+            # The track is kept: its pattern may be found again before the detector finds the drogue.
+            event = "" if track.lost else "lost"
+            track.lost = True
+            return nothing_known(cause, event)
+        sigma = float(np.sqrt(np.trace(motion.covariance) / 2))
+        confidence = share * track.trusted * within(sigma, motion.rim_diameter_px)
+        return self._frame(track, PoseStatus.PREDICTED, cause, Source.NONE, confidence, float("nan"), "", 0)
+
+    @staticmethod
+    def _frame(
+        track: _Track,
+        status: PoseStatus,
+        cause: Cause,
+        source: Source,
+        confidence: float,
+        correlation: float,
+        searched: str,
+        found: int,
+        event: str = "",
+    ) -> DrogueFrame:
+        m = track.motion
+        return DrogueFrame(
+            status, cause, source, m.centre_px, m.x[2:].copy(), m.rim_diameter_px, m.covariance, m.sigma_diameter_px,
+            confidence, correlation, searched, found, event,
+        )  # fmt: skip
