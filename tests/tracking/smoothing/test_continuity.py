@@ -124,6 +124,34 @@ def test_a_path_is_followed_through_a_velocity_jump_if_no_other_point_is_near():
     assert given.mean() > 0.9
 
 
+def zig_zag(*corners: int) -> Array:
+    """Straight paths (T, 2, 2), px, of two spots 200 px apart that turn together at these frames."""
+    velocities = np.array([[3.0, 1.0], [-2.0, 3.5], [4.0, -2.0]])
+    leg = np.searchsorted(corners, np.arange(FRAMES), side="right")
+    one = np.array([300.0, 400.0]) + np.cumsum(velocities[leg], axis=0)
+    return np.stack([one, one + np.array([200.0, 0.0])], axis=1)
+
+
+@pytest.mark.parametrize("false_points", [0.0, 1.0])
+def test_a_straight_path_is_followed_across_two_corners_without_labels_between_them(false_points):
+    uv = zig_zag(56, 68)
+    for seed in range(6):
+        every, rows = filmed(uv, np.ones((FRAMES, 2), dtype=bool), false_points, seed)
+        out, _ = continued(every, without(rows, GAP), context(uv, false_points=false_points))
+        given = out[GAP] >= 0
+        assert np.array_equal(out[GAP][given], rows[GAP][given])
+        assert given.mean() > 0.95
+
+
+def test_a_path_is_followed_where_the_uncertain_pose_leads_to_no_point_of_the_screen():
+    uv = paths()
+    every, rows = filmed(uv, np.ones((FRAMES, 2), dtype=bool), 0.0, 7)
+    nowhere = context(uv)
+    nowhere.expected[GAP], nowhere.expected_cov[GAP] = np.nan, 0.0
+    out, _ = continued(every, without(rows, GAP), nowhere)
+    np.testing.assert_array_equal(out[GAP], rows[GAP])
+
+
 def test_a_path_is_followed_over_missed_detections():
     uv = paths()
     visible = np.ones((FRAMES, 2), dtype=bool)

@@ -2,7 +2,8 @@
 
 If only two or three spots are visible for long, the pose becomes uncertain, and with it the predicted places of the
 spots, although each spot's own path in the picture continues. Each view's labelled path is extrapolated into such
-frames from both of its ends, as a tracker of single spots does. These labels do not contribute to the pose.
+frames from both of its ends, as a tracker of single spots does, also across corners (path_corners.py). These labels do
+not contribute to the pose.
 
 Source: ours; the prediction from a spot's own last places is that of Huo, Yang & Yang (2015) in its simplest form. Its
 accuracy is measured on the labelled part of the same path.
@@ -11,12 +12,14 @@ accuracy is measured on the labelled part of the same path.
 from __future__ import annotations
 
 from functools import cache
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 
 from geometry.arrays import Array, Bools, Ints
 from tracking.rigid_body.association.frame_detections import BLENDED
+from tracking.smoothing.labels.path_corners import FASTER, MIN_SPEED_LIMIT_PX, Limits, Line, after_corner
 from tracking.smoothing.motion.run_detections import RunDetections
 
 POLYNOMIALS = ((1, 2), (1, 4), (2, 3), (2, 5))  # in time: degree, number of points that they are fitted to
@@ -30,6 +33,8 @@ P_GONE = 0.1  # probability per frame that the spot is not visible any more
 POSE_GATE_CHI2 = 25.0  # squared Mahalanobis distance from the place that the pose predicts
 MIN_PROBABILITY = 0.99  # of a label; and where the path from the other side does not lead to the point:
 MIN_ONE_SIDED_PROBABILITY = 0.995
+CORNER_PROBABILITY = 0.998  # of the labels of a row of points that continues a path across a corner
+MIN_ROW_SIGMA_PX = 0.1  # least error of the extrapolation along a row, for slight curvature
 MIN_SINGLE_CHAIN = 5  # frames in a row in which a single spot is followed; shorter chains are dropped
 
 
@@ -111,6 +116,8 @@ class _Path:
         k = np.flatnonzero((assigned[:, view] >= 0) & (assigned[:, view] < BLENDED))
         self.uv = np.full((len(assigned), 2), np.nan)
         self.uv[k] = detections.uv[detections.begin[k] + assigned[k, view]]
+        steps = np.linalg.norm(np.diff(self.uv, axis=0), axis=1)
+        self.speed_px = max(FASTER * float(np.nanmax(steps, initial=0.0)), MIN_SPEED_LIMIT_PX)
         self.sigmas = [[_error_sigmas(self.uv, *form, h) for h in range(1, MAX_AHEAD + 1)] for form in POLYNOMIALS]
 
     @staticmethod
@@ -129,6 +136,7 @@ class _Path:
         """
         out: dict[int, tuple[int, float] | None] = {}
         uv, latest = self.uv.copy(), -1
+        beyond: dict[int, int] = {}  # rows of points after a corner
         frames = range(len(uv)) if direction == 1 else range(len(uv) - 1, -1, -1)
         for k in frames:
             if np.isfinite(self.uv[k, 0]):
@@ -137,7 +145,10 @@ class _Path:
             if self.assigned[k, self.view] < 0 and self.context.open[k]:
                 predicted = self._predicted(k, uv, direction)
                 if predicted:
-                    out[k] = found = self._found(k, predicted)
+                    found = (beyond[k], CORNER_PROBABILITY) if k in beyond else self._found(k, predicted)
+                    if found is None and (beyond := self._beyond_corner(k, uv, direction)):
+                        found = beyond[k], CORNER_PROBABILITY
+                    out[k] = found
                     if found is not None:
                         uv[k] = self.detections.uv[self.detections.begin[k] + found[0]]
                         latest = k
@@ -152,21 +163,64 @@ class _Path:
     def _found(self, k: int, predicted: list[_Prediction]) -> tuple[int, float] | None:
         """Row of the point of frame k that continues a path, and its probability; None: there is none."""
         detections, context, view = self.detections, self.context, self.view
-        rows = np.arange(detections.first[k, self.camera], detections.first[k, self.camera + 1])
-        rows = rows[~np.isin(rows, self.assigned[k][self.assigned[k] >= 0] % BLENDED)]
+        rows, place = self._points(k)
         if not len(rows):
             return None
-        place, cov = detections.uv[detections.begin[k] + rows], detections.cov[detections.begin[k] + rows]
+        cov = detections.cov[detections.begin[k] + rows]
         likelihood = np.mean([p.density(place, cov) for p in predicted], axis=0)
         false = np.exp(np.maximum(context.log_clutter[k, view], detections.log_static[detections.begin[k] + rows]))
         odds = likelihood * (1 - P_GONE) / false
         best = int(np.argmax(odds))
         p = float(odds[best] / (odds.sum() + P_GONE))
-        y = place[best] - context.expected[k, view]
-        chi2 = y @ np.linalg.solve(context.expected_cov[k, view] + cov[best], y)
-        if p < MIN_PROBABILITY or not chi2 < POSE_GATE_CHI2:
+        if p < MIN_PROBABILITY or not self._allowed(k, int(rows[best])):
             return None
         return int(rows[best]), p
+
+    def _points(self, k: int) -> tuple[Ints, Array]:
+        """Rows (m,) and places (m, 2), px, of the points of a frame that are no labelled spots."""
+        detections = self.detections
+        if not 0 <= k < len(self.uv):
+            return np.zeros(0, dtype=np.int64), np.zeros((0, 2))
+        rows = np.arange(detections.first[k, self.camera], detections.first[k, self.camera + 1])
+        rows = rows[~np.isin(rows, self.assigned[k][self.assigned[k] >= 0] % BLENDED)]
+        return rows, detections.uv[detections.begin[k] + rows]
+
+    def _allowed(self, k: int, row: int) -> bool:
+        """Whether the uncertain pose allows the spot at a point. One that does not lead to the screen says nothing."""
+        at = self.detections.begin[k] + row
+        y = self.detections.uv[at] - self.context.expected[k, self.view]
+        if not np.isfinite(y).all():
+            return True
+        chi2 = y @ np.linalg.solve(self.context.expected_cov[k, self.view] + self.detections.cov[at], y)
+        return bool(chi2 < POSE_GATE_CHI2)
+
+    def _beyond_corner(self, k: int, uv: Array, direction: int) -> dict[int, int]:
+        """Rows of the path's points by frame from frame k on, across a corner shortly before; {}: none are sure."""
+        sigma = self.sigmas[0][0]
+        if sigma is None or not len(self._points(k)[0]):
+            return {}
+        limits = Limits(float(np.hypot(sigma[0], MIN_ROW_SIGMA_PX)), self.speed_px)
+        near = k - direction * np.arange(1, REACH)
+        near = near[(near >= 0) & (near < len(uv))]
+        near = near[np.isfinite(uv[near, 0])]
+        # The last point may lie beyond the corner itself, found by chance of its small distance.
+        for last, before in pairwise(near[:3]):
+            if abs(k - last) > MAX_AHEAD:
+                break
+            velocity = (uv[last] - uv[before]) / abs(last - before)
+            found = after_corner(self._points_or_label, k, direction, Line(int(last), uv[last], velocity), limits)
+            found = {frame: row for frame, row in found.items() if not np.isfinite(self.uv[frame, 0])}
+            if found and all(self._allowed(frame, row) for frame, row in found.items()):
+                return found
+        return {}
+
+    def _points_or_label(self, k: int) -> tuple[Ints, Array]:
+        """Rows and places of the points of a frame that may be the spot: its label alone where it has one."""
+        if not 0 <= k < len(self.uv) or (np.isnan(self.uv[k, 0]) and not self.context.open[k]):
+            return np.zeros(0, dtype=np.int64), np.zeros((0, 2))
+        if np.isfinite(self.uv[k, 0]):
+            return self.assigned[k, [self.view]], self.uv[[k]]
+        return self._points(k)
 
     def _predicted(self, k: int, uv: Array, direction: int) -> list[_Prediction]:
         """Predictions for frame k: short polynomials suit the time after a velocity jump, long ones a smooth path."""
