@@ -33,6 +33,7 @@ P_GONE = 0.1  # probability per frame that the spot is not visible any more
 POSE_GATE_CHI2 = 25.0  # squared Mahalanobis distance from the place that the pose predicts
 MIN_PROBABILITY = 0.99  # of a label; and where the path from the other side does not lead to the point:
 MIN_ONE_SIDED_PROBABILITY = 0.995
+MIN_LAST_PROBABILITY = 0.9999  # of the last label of a path that ends, just where a false point is not rare
 CORNER_PROBABILITY = 0.998  # of the labels of a row of points that continues a path across a corner
 MIN_ROW_SIGMA_PX = 0.1  # least error of the extrapolation along a row, for slight curvature
 MIN_SINGLE_CHAIN = 5  # frames in a row in which a single spot is followed; shorter chains are dropped
@@ -92,6 +93,13 @@ def _drop_shared(out: Ints, probability: Array, before: Ints) -> None:
                 out[k, i], probability[k, i] = before[k, i], np.nan
 
 
+def _drop_unsure(labels: dict[int, tuple[int, float] | None], last: int) -> None:
+    """Drop the last label of a path that ends, in place, unless it is very probable."""
+    found = labels[last]
+    if found is not None and found[1] < MIN_LAST_PROBABILITY:
+        labels[last] = None
+
+
 class _Prediction(NamedTuple):
     """Prediction of a spot by one polynomial."""
 
@@ -132,7 +140,7 @@ class _Path:
         """Row and probability of new labels by frame, along the direction of time (1) or against it (-1).
 
         None where the path leads through a frame but no point lies on it. The last label of a path that ends is
-        dropped: a point found just where a spot vanished may be false.
+        dropped unless it is very probable: a point found just where a spot vanished may be false.
         """
         out: dict[int, tuple[int, float] | None] = {}
         uv, latest = self.uv.copy(), -1
@@ -154,10 +162,10 @@ class _Path:
                         latest = k
                         continue
             if latest >= 0 and abs(k - latest) >= MAX_AHEAD:
-                out[latest] = None
+                _drop_unsure(out, latest)
                 latest = -1
         if latest >= 0:
-            out[latest] = None
+            _drop_unsure(out, latest)
         return out
 
     def _found(self, k: int, predicted: list[_Prediction]) -> tuple[int, float] | None:
