@@ -160,8 +160,9 @@ class _Smoother:
         detection_model = DetectionModel(self.parameters.p_detect, self.parameters.p_blend)
         run = RunObservation(self.views, self.view_table, detection_model, self.calibration_cov, self.detections)
         found, probability, sigma_px = reassociated(
-            run, self.assigned, ref, self.motion.pose_P, self._log_clutter(known), _jump_sigmas(ref, self.rec.dt_s)
-        )
+            run, self.assigned, ref, self.motion.pose_P, self.motion.weight, self._log_clutter(known),
+            _jump_sigmas(ref, self.rec.dt_s),
+        )  # fmt: skip
         before = self.assigned
         new = np.where((probability >= self.parameters.min_label_probability) & known[:, None], found, -1)
         self.assigned = new

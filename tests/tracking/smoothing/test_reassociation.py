@@ -42,6 +42,7 @@ def test_points_of_a_frame_without_labels_are_labelled_where_a_corner_explains_t
         assigned,
         Reference(poses.rotation, poses.translation, np.zeros((frames, 12))),
         np.tile(np.diag(SIGMA**2), (frames, 1, 1)),
+        np.ones(frames),
         np.full((frames, n), np.log(1e-6)),
         np.tile(JUMP_SIGMA, (frames, 1)),
     )

@@ -80,12 +80,18 @@ class _Tried(NamedTuple):
 
 @compiled
 def reassociated(
-    run: RunObservation, assigned: Ints, ref: Reference, pose_P: Array, log_clutter: Array, jump_sigma: Array
+    run: RunObservation,
+    assigned: Ints,
+    ref: Reference,
+    pose_P: Array,
+    weight: Array,
+    log_clutter: Array,
+    jump_sigma: Array,
 ) -> tuple[Ints, Array, Array]:
     """Assignments (T, n), their probabilities (T, n), and how well the other frames predict the spots of each (T,).
 
-    assigned (T, n): the current labels, which ref and pose_P (T, 6, 6), the smoothed motion, are based on. log_clutter
-    (T, n), 1/px^2. jump_sigma (T, 6): sigmas of the pose, m and rad, that a velocity jump at the frame would add. The
+    assigned (T, n): the current labels, which ref and pose_P (T, 6, 6), the smoothed motion, are based on: those
+    of each frame with a weight (T,), 0 where they are not used. log_clutter (T, n), 1/px^2. jump_sigma (T, 6): sigmas of the pose, m and rad, that a velocity jump at the frame would add. The
     third result is the largest sigma of a spot, px. A frame that the others predict too badly keeps its labels.
     """
     frames, n = assigned.shape
@@ -97,7 +103,7 @@ def reassociated(
         groups = max(groups, run.view_table.group[i] + 1)
     no_excess = np.zeros(n)
     for k in range(frames):
-        P, R, t, sigma_px[k] = _prediction_without(run, assigned, ref, pose_P, k)
+        P, R, t, sigma_px[k] = _prediction_without(run, assigned, ref, pose_P, weight[k], k)
         if not sigma_px[k] < MAX_PREDICTION_SIGMA_PX:
             continue
         a, b = detections.begin[k], detections.begin[k + 1]
@@ -149,7 +155,7 @@ def _same_point(a: int, b: int) -> bool:
 
 @compiled
 def _prediction_without(
-    run: RunObservation, assigned: Ints, ref: Reference, pose_P: Array, k: int
+    run: RunObservation, assigned: Ints, ref: Reference, pose_P: Array, weight: float, k: int
 ) -> tuple[Array, Array, Array, float]:
     """Prediction of frame k from all others: covariance (6, 6), R, t; and the largest sigma of a spot, px."""
     use, uv, cov = labelled_points(run.detections, k, assigned[k], run.calibration_cov)
@@ -157,9 +163,9 @@ def _prediction_without(
     P = pose_P[k]
     A, step = multiply(P, L), apply(P, g)
     for i in range(6):
-        step[i] = -step[i]
+        step[i] = -weight * step[i]
         for j in range(6):
-            A[i, j] = -A[i, j]
+            A[i, j] = -weight * A[i, j]
         A[i, i] += 1.0
     x, _ = solve(A, hstack(P, step))
     P_without = block(x, 6)

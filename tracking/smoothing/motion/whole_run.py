@@ -62,13 +62,15 @@ class SmoothedMotion:
     pose_P: Array  # (T, 6, 6)
     motion_P: Array  # (T, 6, 6) of the velocities
     known: Bools  # (T,) the pose is not lost
+    weight: Array  # (T,) of the information of each frame's spots in the motion; 0: not used
 
     @staticmethod
     def begin(ref: Reference, jumped: Bools, log_density: Array | None) -> SmoothedMotion:
         """The motion before the first estimate."""
         frames = len(ref.t)
         zero = np.zeros((frames, 6, 6))
-        return SmoothedMotion(ref, log_density, 0.0, jumped, zero, zero, np.zeros(frames, dtype=bool))
+        known = np.zeros(frames, dtype=bool)
+        return SmoothedMotion(ref, log_density, 0.0, jumped, zero, zero, known, np.zeros(frames))
 
 
 def estimate(
@@ -86,7 +88,7 @@ def estimate(
     far = ~largest_near(measured, max_distance)
     used = ~far & trusted & (assigned >= 0).any(axis=1)
     if not measured.any():
-        return replace(motion, known=np.zeros(len(run.dt), dtype=bool))
+        return replace(motion, known=np.zeros(len(run.dt), dtype=bool), weight=np.zeros(len(run.dt)))
     at = np.flatnonzero(used)
     core = slice(int(at[0]), int(at[-1]) + 1)
     return _Estimator(run, assigned, measured, used, core, motion).run_passes()
@@ -99,6 +101,7 @@ class _Estimator:
         self, run: WholeRun, assigned: Ints, measured: Bools, used: Bools, core: slice, motion: SmoothedMotion
     ) -> None:
         self.run, self.assigned, self.used, self.core, self.motion = run, assigned, used, core, motion
+        self.weight = np.where(used, np.where(measured, 1.0, PARTIAL_WEIGHT), 0.0)
         self.measured = measured[core]
         self.ref = Reference(*(np.ascontiguousarray(a[core]) for a in motion.ref))
         self.jumped = motion.jumped[core].copy()
@@ -313,7 +316,7 @@ class _Estimator:
         jumped = self.motion.jumped.copy()
         jumped[core] = self.jumped
         return SmoothedMotion(
-            Reference(R, t, m), log_density, self.interpolation_offset, jumped, pose_P, motion_P, known
+            Reference(R, t, m), log_density, self.interpolation_offset, jumped, pose_P, motion_P, known, self.weight
         )
 
 
