@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from geometry.pose import Pose
 from lab.simulate.points import simulate_points
@@ -17,8 +18,13 @@ JUMP_SIGMA = np.repeat([1e-3, 1e-2], 3)  # of what a velocity jump at the frame 
 AT = 60
 
 
-def test_points_of_a_frame_without_labels_are_labelled_where_a_corner_explains_them():
-    """The motion of the other frames does not lead to them. That nothing is there to contradict it confirms nothing."""
+@pytest.mark.parametrize("kept", [0, 3])
+def test_points_of_a_frame_are_labelled_where_a_corner_explains_them(kept):
+    """The motion of the other frames does not lead to them.
+
+    kept: labels that the frame has, but that the motion does not use. Without labels nothing contradicts the motion of
+    the others, which confirms nothing; labels that the motion does not use have no part in the prediction.
+    """
     run = simulate_points("sharp-turns", 1, frames=90)
     recording = TrackedRecording(run.rig, RIGID, None)
     for k, frame in enumerate(tracked(run)):
@@ -26,13 +32,15 @@ def test_points_of_a_frame_without_labels_are_labelled_where_a_corner_explains_t
     detections, right = recording.run_detections(), recording.assigned
     labelled = np.flatnonzero(right[AT] >= 0)
     assigned = right.copy()
-    assigned[AT] = -1
+    assigned[AT, labelled[kept:]] = -1
+    weight = np.ones(frames := len(right))
+    weight[AT] = 0.0
 
     poses = run.poses.plus(np.zeros(6))
     poses = Pose(poses.rotation.copy(), poses.translation.copy())
     off = poses[AT].plus(np.array([0.0, 0.0, 0.0, 0.0, 8e-3, -6e-3]))  # 10 px
     poses.rotation[AT], poses.translation[AT] = off.rotation, off.translation
-    frames, n = right.shape
+    n = right.shape[1]
     views = run.model.numbers
     observation = RunObservation(
         views, ViewTable.of(run.rig, run.model), DetectionModel(0.98, 0.0), np.zeros((n, 2, 2)), detections
@@ -42,7 +50,7 @@ def test_points_of_a_frame_without_labels_are_labelled_where_a_corner_explains_t
         assigned,
         Reference(poses.rotation, poses.translation, np.zeros((frames, 12))),
         np.tile(np.diag(SIGMA**2), (frames, 1, 1)),
-        np.ones(frames),
+        weight,
         np.full((frames, n), np.log(1e-6)),
         np.tile(JUMP_SIGMA, (frames, 1)),
     )
