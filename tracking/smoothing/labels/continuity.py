@@ -29,6 +29,7 @@ MIN_HISTORY = 12  # errors that a polynomial's scale is estimated from
 # The errors' distribution is modelled as a mixture: the weight of each component, and the quantile of the measured
 # errors that gives its sigma. Smooth motion makes the first component, velocity jumps the last.
 COMPONENTS = ((0.6, 0.5), (0.35, 0.95), (0.05, 0.995))
+REST_CHI2 = 9.0  # of the distance between two points of one spot at rest (2 degrees of freedom)
 P_GONE = 0.1  # probability per frame that the spot is not visible any more
 POSE_GATE_CHI2 = 25.0  # squared Mahalanobis distance from the place that the pose predicts
 MIN_PROBABILITY = 0.99  # of a label; and where the path from the other side does not lead to the point:
@@ -93,6 +94,14 @@ def _drop_shared(out: Ints, probability: Array, before: Ints) -> None:
                 out[k, i], probability[k, i] = before[k, i], np.nan
 
 
+def _last_place(uv: Array, k: int, direction: int) -> Array:
+    """The last place (2,) of a path uv (T, 2) before frame k; nan if it has none in MAX_AHEAD frames."""
+    stop = k - direction * (MAX_AHEAD + 1)
+    before = uv[k - direction : stop if stop >= 0 else None : -direction]
+    known = np.flatnonzero(np.isfinite(before[:, 0]))
+    return before[known[0]] if len(known) else np.full(2, np.nan)
+
+
 def _drop_unsure(labels: dict[int, tuple[int, float] | None], last: int) -> None:
     """Drop the last label of a path that ends, in place, unless it is very probable."""
     found = labels[last]
@@ -153,7 +162,11 @@ class _Path:
             if self.assigned[k, self.view] < 0 and self.context.open[k]:
                 predicted = self._predicted(k, uv, direction)
                 if predicted:
-                    found = (beyond[k], CORNER_PROBABILITY) if k in beyond else self._found(k, predicted)
+                    found = (
+                        (beyond[k], CORNER_PROBABILITY)
+                        if k in beyond
+                        else self._found(k, predicted, _last_place(uv, k, direction))
+                    )
                     if found is None and (beyond := self._beyond_corner(k, uv, direction)):
                         found = beyond[k], CORNER_PROBABILITY
                     out[k] = found
@@ -168,15 +181,23 @@ class _Path:
             _drop_unsure(out, latest)
         return out
 
-    def _found(self, k: int, predicted: list[_Prediction]) -> tuple[int, float] | None:
-        """Row of the point of frame k that continues a path, and its probability; None: there is none."""
+    def _found(self, k: int, predicted: list[_Prediction], before: Array) -> tuple[int, float] | None:
+        """Row of the point of frame k that continues a path, and its probability; None: there is none.
+
+        before: last place (2,) of the path.
+        """
         detections, context, view = self.detections, self.context, self.view
         rows, place = self._points(k)
         if not len(rows):
             return None
         cov = detections.cov[detections.begin[k] + rows]
         likelihood = np.mean([p.density(place, cov) for p in predicted], axis=0)
-        false = np.exp(np.maximum(context.log_clutter[k, view], detections.log_static[detections.begin[k] + rows]))
+        # A spot at rest looks like a static reflection while it has no label. One just where the spot has been is none:
+        # the two would have been one point.
+        away = place - before
+        rests = np.einsum("mi,mij,mj->m", away, np.linalg.inv(2 * cov), away) < REST_CHI2
+        static = np.where(rests, -np.inf, detections.log_static[detections.begin[k] + rows])
+        false = np.exp(np.maximum(context.log_clutter[k, view], static))
         odds = likelihood * (1 - P_GONE) / false
         best = int(np.argmax(odds))
         p = float(odds[best] / (odds.sum() + P_GONE))

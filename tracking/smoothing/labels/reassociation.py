@@ -91,8 +91,9 @@ def reassociated(
     """Assignments (T, n), their probabilities (T, n), and how well the other frames predict the spots of each (T,).
 
     assigned (T, n): the current labels, which ref and pose_P (T, 6, 6), the smoothed motion, are based on: those
-    of each frame with a weight (T,), 0 where they are not used. log_clutter (T, n), 1/px^2. jump_sigma (T, 6): sigmas of the pose, m and rad, that a velocity jump at the frame would add. The
-    third result is the largest sigma of a spot, px. A frame that the others predict too badly keeps its labels.
+    of each frame with a weight (T,), 0 where they are not used. log_clutter (T, n), 1/px^2. jump_sigma (T, 6): sigmas
+    of the pose, m and rad, that a velocity jump at the frame would add. The third result is the largest sigma of a
+    spot, px. A frame that the others predict too badly keeps its labels.
     """
     frames, n = assigned.shape
     detections = run.detections
