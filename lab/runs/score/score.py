@@ -30,6 +30,7 @@ from tracking.statuses import PoseStatus, SpotStatus
 # A measured position within this distance of the true spot counts as that spot: several times the noise of a poor
 # centroid, and a fraction of the usual distance to clutter or to another spot.
 SAME_SPOT_PX = 3.0
+LARGEST_SIGMA_PX = 1e6  # beyond any picture; a damaged table may hold numbers whose products overflow
 SAME_SPOT_SIGMAS = 5.0
 # A spot that returns must be found again within this number of frames with a picture.
 RETURN_FRAMES = 5
@@ -107,7 +108,8 @@ def right_spot(spots: SpotGrid, true_uv: Array) -> Bools:
     It lies within SAME_SPOT_PX, or SAME_SPOT_SIGMAS of its own sigma if that is more, and no other true spot of the
     camera is nearer by more than SAME_SPOT_SIGMAS. (Two spots that cross closer than the noise are indistinguishable.)
     """
-    sigma = np.nan_to_num(np.hypot(spots.sigma_px[..., 0], spots.sigma_px[..., 1]) / np.sqrt(2))
+    sigma_px = np.minimum(spots.sigma_px, LARGEST_SIGMA_PX)
+    sigma = np.nan_to_num(np.hypot(sigma_px[..., 0], sigma_px[..., 1]) / np.sqrt(2))
     own = np.linalg.norm(spots.uv_px - true_uv, axis=-1)
     near = own <= np.maximum(SAME_SPOT_PX, SAME_SPOT_SIGMAS * sigma)  # nan is not near
     camera_of = np.array([spots.cameras.index(c) for c, _ in spots.views], dtype=np.int64)

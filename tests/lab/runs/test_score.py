@@ -132,6 +132,9 @@ def test_spots_that_cross_closer_than_the_noise_do_not_count_as_swapped():
     assert right_spot(measured, true_uv).all()
     apart = true_uv + np.array([[[0.0, 0.0], [2.0, 0.0]]])  # 2.3 px: above the noise, below the tolerance
     assert not right_spot(replace(measured, uv_px=apart[:, ::-1]), apart).any()
+    damaged = replace(measured, sigma_px=np.full((1, 2, 2), 1.7e308))
+    with np.errstate(all="raise"):
+        assert right_spot(damaged, true_uv).all()
 
 
 def test_a_visible_spot_that_is_not_found_lowers_the_identity_but_is_no_wrong_label(quiet, tmp_path):
