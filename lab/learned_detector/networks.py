@@ -42,7 +42,7 @@ def _small() -> Any:
     from torch import nn
     from torch.nn import functional
 
-    class Small(nn.Module):  # type: ignore[misc]
+    class Small(nn.Module):  # type: ignore[misc]  # no types without torch, an extra
         def __init__(self) -> None:
             super().__init__()
             self.fine = nn.Sequential(_layer(1, 12, 2), _layer(12, 24, 2), _layer(24, 24))
@@ -75,7 +75,7 @@ def _zhou2020() -> Any:
             nn.Conv2d(before, after, size, stride, size // 2, bias=False), nn.BatchNorm2d(after), nn.LeakyReLU(0.1)
         )
 
-    class Residual(nn.Module):  # type: ignore[misc]
+    class Residual(nn.Module):  # type: ignore[misc]  # no types without torch, an extra
         def __init__(self, channels: int) -> None:
             super().__init__()
             self.body = nn.Sequential(layer(channels, channels // 2, 1), layer(channels // 2, channels, 3))
@@ -83,7 +83,7 @@ def _zhou2020() -> Any:
         def forward(self, x: Any) -> Any:
             return x + self.body(x)
 
-    class Zhou2020(nn.Module):  # type: ignore[misc]
+    class Zhou2020(nn.Module):  # type: ignore[misc]  # no types without torch, an extra
         def __init__(self) -> None:
             super().__init__()
             self.first = layer(1, 16, 3)

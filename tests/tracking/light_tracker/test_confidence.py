@@ -11,7 +11,7 @@ GOOD = {"support": 2.0, "confirmed": 5, "unconfirmed": 0}
 
 
 def confidence(**changed: float) -> float:
-    return probability(features(**{**GOOD, **changed}))  # type: ignore[arg-type]
+    return probability(features(**{**GOOD, **changed}))  # type: ignore[arg-type]  # some are counts
 
 
 def test_a_good_match_that_the_detector_confirmed_is_almost_sure():

@@ -36,8 +36,7 @@ def test_points_of_a_frame_are_labelled_where_a_corner_explains_them(kept):
     weight = np.ones(frames := len(right))
     weight[AT] = 0.0
 
-    poses = run.poses.plus(np.zeros(6))
-    poses = Pose(poses.rotation.copy(), poses.translation.copy())
+    poses = Pose(run.poses.rotation.copy(), run.poses.translation.copy())
     off = poses[AT].plus(np.array([0.0, 0.0, 0.0, 0.0, 8e-3, -6e-3]))  # 10 px
     poses.rotation[AT], poses.translation[AT] = off.rotation, off.translation
     n = right.shape[1]

@@ -94,12 +94,11 @@ def _drop_shared(out: Ints, probability: Array, before: Ints) -> None:
                 out[k, i], probability[k, i] = before[k, i], np.nan
 
 
-def _last_place(uv: Array, k: int, direction: int) -> Array:
-    """The last place (2,) of a path uv (T, 2) before frame k; nan if it has none in MAX_AHEAD frames."""
-    stop = k - direction * (MAX_AHEAD + 1)
-    before = uv[k - direction : stop if stop >= 0 else None : -direction]
-    known = np.flatnonzero(np.isfinite(before[:, 0]))
-    return before[known[0]] if len(known) else np.full(2, np.nan)
+def _known_before(uv: Array, k: int, direction: int, reach: int) -> Ints:
+    """Frames, the nearest first, in which a path uv (T, 2) is known, fewer than `reach` frames before frame k."""
+    near = k - direction * np.arange(1, reach)
+    near = near[(near >= 0) & (near < len(uv))]
+    return np.asarray(near[np.isfinite(uv[near, 0])])
 
 
 def _drop_unsure(labels: dict[int, tuple[int, float] | None], last: int) -> None:
@@ -165,7 +164,7 @@ class _Path:
                     found = (
                         (beyond[k], CORNER_PROBABILITY)
                         if k in beyond
-                        else self._found(k, predicted, _last_place(uv, k, direction))
+                        else self._found(k, predicted, uv[_known_before(uv, k, direction, REACH)[0]])
                     )
                     if found is None and (beyond := self._beyond_corner(k, uv, direction)):
                         found = beyond[k], CORNER_PROBABILITY
@@ -229,9 +228,7 @@ class _Path:
         if sigma is None or not len(self._points(k)[0]):
             return {}
         limits = Limits(float(np.hypot(sigma[0], MIN_ROW_SIGMA_PX)), self.speed_px)
-        near = k - direction * np.arange(1, REACH)
-        near = near[(near >= 0) & (near < len(uv))]
-        near = near[np.isfinite(uv[near, 0])]
+        near = _known_before(uv, k, direction, REACH)
         # The last point may lie beyond the corner itself, found by chance of its small distance.
         for last, before in pairwise(near[:3]):
             if abs(k - last) > MAX_AHEAD:
@@ -253,9 +250,7 @@ class _Path:
 
     def _predicted(self, k: int, uv: Array, direction: int) -> list[_Prediction]:
         """Predictions for frame k: short polynomials suit the time after a velocity jump, long ones a smooth path."""
-        near = k - direction * np.arange(1, REACH + MAX_AHEAD)
-        near = near[(near >= 0) & (near < len(uv))]
-        near = near[np.isfinite(uv[near, 0])]
+        near = _known_before(uv, k, direction, REACH + MAX_AHEAD)
         if not len(near) or abs(k - near[0]) > MAX_AHEAD:
             return []
         ahead = int(abs(k - near[0]))
