@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from calibration.findings import Finding, Level
+from calibration.findings import Finding, Level, unless_pass
 from lab.drogue_circle.series import CircleSeries
-from lab.target.verdict import far_reacquisitions, measured_finding, missing_pictures, some_frames
+from lab.target.verdict import WHY_MEASURED_MATTERS, far_reacquisitions, measured_share, missing_pictures, some_frames
 from tracking.drogue_circle.frames import Cause
 
 _LARGEST_STEP = 0.5  # of the radius: a reacquisition farther from the prediction is reported
@@ -22,12 +22,19 @@ _REMEDIES = {
 def findings_of(series: CircleSeries) -> list[Finding]:
     """The findings, failures first."""
     found = [
-        measured_finding(series, "circle", _NONE_FOUND, _REMEDIES, ("BP-T01", "BP-T02")),
+        _measured(series),
         *_ambiguous(series),
         *_jumps(series),
-        *missing_pictures(series, "circle", _REMEDIES[Cause.NO_IMAGE.value], "BP-T03"),
+        *_missing(series),
     ]
     return sorted(found, key=lambda f: -f.level)
+
+
+def _measured(series: CircleSeries) -> Finding:
+    share = measured_share(series, "circle", _REMEDIES)
+    if share.none:
+        return Finding(Level.FAIL, share.what, _NONE_FOUND, share.remedy, code="BP-T01")
+    return unless_pass(share.level, share.what, WHY_MEASURED_MATTERS, share.remedy, code="BP-T02")
 
 
 def _ambiguous(series: CircleSeries) -> list[Finding]:
@@ -62,3 +69,10 @@ def _jumps(series: CircleSeries) -> list[Finding]:
             code="BP-T05",
         )
     ]
+
+
+def _missing(series: CircleSeries) -> list[Finding]:
+    if not (what := missing_pictures(series)):
+        return []
+    why = "The circle is predicted there."
+    return [Finding(Level.WARN, what, why, _REMEDIES[Cause.NO_IMAGE.value], code="BP-T03")]

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from calibration.findings import Finding, Level
+from calibration.findings import Finding, Level, unless_pass
 from lab.light_tracker.series import DrogueSeries
 from lab.number_format import format_percent
-from lab.target.verdict import far_reacquisitions, measured_finding, missing_pictures, some_frames
+from lab.target.verdict import WHY_MEASURED_MATTERS, far_reacquisitions, measured_share, missing_pictures, some_frames
 from tracking.light_tracker.frames import Cause
 from tracking.statuses import PoseStatus
 
@@ -28,13 +28,20 @@ _REMEDIES = {
 def findings_of(series: DrogueSeries) -> list[Finding]:
     """The findings, failures first."""
     found = [
-        measured_finding(series, "drogue", _NONE_FOUND, _REMEDIES, ("BP-G01", "BP-G02")),
+        _measured(series),
         *_ambiguous(series),
         *_jumps(series),
         *_doubts(series),
-        *missing_pictures(series, "drogue", _REMEDIES[Cause.NO_IMAGE.value], "BP-G03"),
+        *_missing(series),
     ]
     return sorted(found, key=lambda f: -f.level)
+
+
+def _measured(series: DrogueSeries) -> Finding:
+    share = measured_share(series, "drogue", _REMEDIES)
+    if share.none:
+        return Finding(Level.FAIL, share.what, _NONE_FOUND, share.remedy, code="BP-G01")
+    return unless_pass(share.level, share.what, WHY_MEASURED_MATTERS, share.remedy, code="BP-G02")
 
 
 def _ambiguous(series: DrogueSeries) -> list[Finding]:
@@ -96,3 +103,10 @@ def _doubts(series: DrogueSeries) -> list[Finding]:
             )
         )
     return out
+
+
+def _missing(series: DrogueSeries) -> list[Finding]:
+    if not (what := missing_pictures(series)):
+        return []
+    why = "The drogue is predicted there."
+    return [Finding(Level.WARN, what, why, _REMEDIES[Cause.NO_IMAGE.value], code="BP-G03")]

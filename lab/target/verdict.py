@@ -1,12 +1,13 @@
-"""Findings that the verdicts of all trackers of one target share; their words and codes are the tracker's own."""
+"""What the verdicts of all trackers of one target judge alike; the findings and their codes are the tracker's own."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from typing import NamedTuple
 
 import numpy as np
 
-from calibration.findings import Finding, Level
+from calibration.findings import Level
 from geometry.arrays import Array
 from lab.target.frame_series import F, FrameSeries
 from tracking.statuses import PoseStatus
@@ -14,15 +15,20 @@ from tracking.statuses import PoseStatus
 # With a smaller measured share, the tracker may have followed something else in the other frames.
 LEAST_MEASURED = 0.5
 GOOD_MEASURED = 0.95  # a smaller share is reported with its causes
+WHY_MEASURED_MATTERS = "Predicted positions have growing sigmas; lost frames have none."
 
 
-def measured_finding(
-    series: FrameSeries[F], subject: str, why_none: str, remedies: Mapping[str, str], codes: tuple[str, str]
-) -> Finding:
-    """The measured share.
+class MeasuredShare(NamedTuple):
+    """What the measured frames say."""
 
-    why_none: why no frame may be measured. remedies: by cause. codes: where no frame is measured, where few are.
-    """
+    level: Level
+    what: str
+    remedy: str  # of the most frequent cause
+    none: bool  # no frame is measured
+
+
+def measured_share(series: FrameSeries[F], subject: str, remedies: Mapping[str, str]) -> MeasuredShare:
+    """The share of measured frames against its limits. remedies: by cause."""
     measured = int(series.has_status(PoseStatus.MEASURED).sum())
     causes = series.causes()
     share = measured / max(len(series.frames), 1)
@@ -30,22 +36,20 @@ def measured_finding(
     of_others = ", ".join(f"{count} {cause}" for cause, count in list(causes.items())[:3])
     if measured == 0:
         what = f"no {subject} was found in {len(series.frames)} frames ({of_others})"
-        return Finding(Level.FAIL, what, why_none, remedy, code=codes[0])
+        return MeasuredShare(Level.FAIL, what, remedy, none=True)
     what = f"{measured} of {len(series.frames)} frames ({share:.1%}) have a measured {subject}"
     if share >= GOOD_MEASURED:
-        return Finding(Level.PASS, what)
+        return MeasuredShare(Level.PASS, what, remedy, none=False)
     what += f" (gate: {LEAST_MEASURED:.0%}; usual: {GOOD_MEASURED:.0%} and more); of the others {of_others}"
-    why = "Predicted positions have growing sigmas; lost frames have none."
-    return Finding(Level.FAIL if share < LEAST_MEASURED else Level.WARN, what, why, remedy, code=codes[1])
+    return MeasuredShare(Level.FAIL if share < LEAST_MEASURED else Level.WARN, what, remedy, none=False)
 
 
-def missing_pictures(series: FrameSeries[F], subject: str, remedy: str, code: str) -> list[Finding]:
-    """A finding where frames have no usable picture."""
+def missing_pictures(series: FrameSeries[F]) -> str:
+    """Frames without a usable picture, in words; empty where each frame has one."""
     if not series.missing:
-        return []
+        return ""
     reason, _ = series.missing.most_common(1)[0]
-    what = f"{series.missing.total()} of {len(series.frames)} frames have no usable picture (most frequent: {reason})"
-    return [Finding(Level.WARN, what, f"The {subject} is predicted there.", remedy, code=code)]
+    return f"{series.missing.total()} of {len(series.frames)} frames have no usable picture (most frequent: {reason})"
 
 
 def far_reacquisitions(series: FrameSeries[F], circles: Iterable[Array], limit: float) -> list[int]:
