@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from geometry.arrays import Array
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.pose_prior import PosePrior
+from geometry.pose_solver.symmetry import symmetries
 from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import RigUncertainty
 from tracking.detections import Detections
@@ -24,6 +26,8 @@ FIRST_SPEED, FIRST_RATE = 4.0, 6.0  # m/s, rad/s
 FIRST_ACCELERATION, FIRST_ANGULAR_ACCELERATION = 30.0, 100.0  # m/s^2, rad/s^2
 # Limits of the search around the last pose; beyond the second one a fan of beams looks like itself, turned.
 MAX_DISTANCE_M, MAX_TURN_RAD = 1.5, np.deg2rad(60.0)
+# Spots of two poses nearer than this are the same. A vehicle that is symmetric up to more than this can be measured.
+SAME_SPOT_PX = 0.1
 MAX_CANDIDATES = 4  # labellings of one search
 STATIC_LOG_DENSITY = -4.0  # 1/px^2: points where static ones are denser are left out of most searches
 
@@ -48,13 +52,18 @@ class Acquisition:
         """The vehicle has been measured; the next tie is reported again."""
         self._tie_reported = False
 
-    def search_prior(self, last: Pose | None, age_s: float, fastest: Array, just_found: bool) -> PosePrior:
+    def search_prior(
+        self, last: Pose | None, age_s: float, fastest: Array, just_found: bool, doubted: bool = False
+    ) -> PosePrior:
         """Region to search: around the last measured pose, as far as the vehicle may have moved since.
 
         Before there is one: the run's prior, widened likewise. age_s: time since the last measured pose, or since the
         first frame. fastest (2,): largest measured speeds, m/s and rad/s. just_found: these are hardly known yet.
+        doubted: the last measured pose may be wrong.
         """
         p = self._parameters
+        if last is not None and doubted:
+            return PosePrior(last, max(MAX_DISTANCE_M, self._prior.within_m), max(MAX_TURN_RAD, self._prior.within_rad))
         if last is None:
             if age_s == 0.0 or self._prior.within_rad >= np.pi:
                 return self._prior
@@ -70,6 +79,28 @@ class Acquisition:
             min(0.05 + speed * age_s, max(MAX_DISTANCE_M, self._prior.within_m)),
             min(np.deg2rad(3.0) + rate * age_s, max(MAX_TURN_RAD, self._prior.within_rad)),
         )
+
+    def is_ambiguous(self, pose: Pose, age_s: float) -> bool:
+        """Whether the prior allows another pose of a symmetric vehicle, which shows the same spots.
+
+        No observation decides between the two. The tracker's weights of the two may drift apart nevertheless, since it
+        enumerates assignments and motions of each only in part. age_s: time since the first frame.
+        """
+        prior = self.search_prior(None, age_s, np.zeros(2), False)
+        here = self._model.project(pose)[0]
+        twins = [twin for turn in self._symmetries if prior.contains(twin := pose @ turn)]
+        return any(self._same_spots(here, self._model.project(twin)[0]) for twin in twins)
+
+    @cached_property
+    def _symmetries(self) -> list[Pose]:
+        return symmetries(self._model)
+
+    def _same_spots(self, here: Array, there: Array) -> bool:
+        """Whether each spot of one pose, (n, 2) px, has a spot of the other one at its place in the same picture."""
+        camera = self._model.camera_of
+        gap = np.linalg.norm(here[:, None] - there, axis=-1)
+        nearest = np.where(camera[:, None] == camera, gap, np.inf)[np.isfinite(here).all(axis=1)].min(axis=1)
+        return bool(nearest.max() < SAME_SPOT_PX)
 
     def labellings(
         self,

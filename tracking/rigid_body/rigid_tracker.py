@@ -31,15 +31,9 @@ from geometry.uncertainty.rig_parameters import RigCovariance
 from geometry.uncertainty.rig_uncertainty import RigUncertainty
 from tracking.detections import Detections
 from tracking.input_validation import UsablePoints, check_step
-from tracking.labelling.first_labels import NO_POINT, Labelling
+from tracking.labelling.first_labels import MIN_EVIDENCE_NATS, NO_POINT, Labelling
 from tracking.parameters import TrackerParameters
-from tracking.rigid_body.acquisition import (
-    FIRST_ACCELERATION,
-    FIRST_ANGULAR_ACCELERATION,
-    FIRST_RATE,
-    FIRST_SPEED,
-    Acquisition,
-)
+from tracking.rigid_body.acquisition import Acquisition
 from tracking.rigid_body.adaptive_process_noise import AdaptiveProcessNoise
 from tracking.rigid_body.association.frame_detections import (
     DetectionModel,
@@ -51,7 +45,7 @@ from tracking.rigid_body.association.frame_detections import (
 from tracking.rigid_body.frame_result import FrameDecision, is_lost, lost_frame, tracked_frame, undecided_events
 from tracking.rigid_body.frame_summary import FrameSummary, innovation_score, predicted_pixels, summarise
 from tracking.rigid_body.hypotheses.branching import branch
-from tracking.rigid_body.hypotheses.hypothesis_set import Children, Hypotheses, State, empty_children
+from tracking.rigid_body.hypotheses.hypothesis_set import Children, Hypotheses, empty_children
 from tracking.rigid_body.hypotheses.iterated_update import chosen_points
 from tracking.rigid_body.hypotheses.prediction_checks import (
     MIN_CONFIRMING_SPOTS,
@@ -63,17 +57,19 @@ from tracking.rigid_body.models.information import single_frame_pose
 from tracking.rigid_body.models.occlusion import MISSED
 from tracking.rigid_body.point_statistics import PointStatistics
 from tracking.rigid_body.pose_candidates import (
-    Start,
+    P_VISIBLE_AT_START,
     add_mirror_solutions,
     add_pose,
     continued_hypotheses,
+    continues,
+    unknown_vehicle,
+    without_history,
 )
-from tracking.rigid_body.search_schedule import SearchSchedule, is_vague
+from tracking.rigid_body.search_schedule import MISSING_TO_DOUBT, SearchSchedule, is_vague
 from tracking.rigid_body.variance_factor import VarianceFactor
 from tracking.tracked_frame import Event, TrackedFrame
 
 P_NEW = 1e-3  # probability per frame that the vehicle is not where any hypothesis predicts it
-P_VISIBLE_AT_START = 0.95  # of each spot and each screen
 MAX_EVIDENCE, MIN_EVIDENCE = 50.0, -5.0  # nats; a first hypothesis with less evidence is dropped
 # Other hypotheses make a pose of few spots a prediction if they add more than this share of the frame's own variance.
 AMBIGUOUS_SHARE = 9.0
@@ -198,40 +194,44 @@ class RigidTracker:
         """
         first = self._last_pose is None
         prior = self._acquisition.search_prior(
-            self._last_pose, self._last_pose_age_s, self.process_noise.fastest, self._schedule.just_found
-        )
+            self._last_pose, self._last_pose_age_s, self.process_noise.fastest, self._schedule.just_found,
+            self._schedule.doubted,
+        )  # fmt: skip
         static_too = self._schedule.searches % STATIC_SEARCH_INTERVAL == 0
         candidates = self._acquisition.labellings(obs.frame, found, prior, first, static_too, events)
-        if first and len(candidates) == 1 and candidates[0].fit.dof > 0:
+        if first and len(candidates) == 1 and candidates[0].fit.dof > 0 and candidates[0].score >= MIN_EVIDENCE_NATS:
             # Later the scale is known, and a misfit shows a wrong answer (a scale of 3 after a screen was occluded).
             self._raise_variance_factor(obs, candidates[0])
             obs = self._observation(found)
-        starts = [self._unknown_vehicle(prior)]
+        # A vehicle that was never measured may as well appear now; else it is rarely off all predictions.
+        log_weight = 0.0 if self._hypotheses is None else -self._evidence if first else float(np.log(P_NEW))
+        starts = [unknown_vehicle(prior, log_weight, len(self.model) + self._groups)]
         if self._hypotheses is not None and dt_s > 0:
-            starts += continued_hypotheses(self._hypotheses, dt_s, self.process_noise.dynamics, len(self.model))
+            dynamics = self.process_noise.dynamics
+            starts += continued_hypotheses(self._hypotheses, dt_s, dynamics, len(self.model), manoeuvre=True)
+            if first:
+                # The assignment of spots whose velocities are unknown may miss an answer for one hypothesis and find
+                # its twin for another, which would then win by that alone.
+                starts += continued_hypotheses(self._hypotheses, dt_s, dynamics, len(self.model), manoeuvre=False)
         known = {tuple(np.maximum(children.assigned[k], MISSED)) for k in range(count)}
+        branched = count
+        if self._schedule.doubted:
+            best = children.assigned[int(np.argmax(children.hypotheses.log_weight[:count]))]
+            least = distinct_spots(best >= 0, self.model.spot_of) + MISSING_TO_DOUBT
+            candidates = [c for c in candidates if distinct_spots(c.point_of != NO_POINT, self.model.spot_of) >= least]
+            count, starts[0] = without_history(children, count, obs, self.model, starts[0])
         for one in candidates:
             pose = one.fit.world_from_body
             assigned = self._assigned(obs.frame, one)
             for start in starts:
+                if not start.manoeuvre and continues(children, branched, start.parent, assigned):
+                    continue
                 count, place = add_pose(children, count, obs, self.model, start, assigned, pose)
                 if place >= 0:
                     searched.pop(place, None)
                     if tuple(np.maximum(children.assigned[place], MISSED)) not in known:
                         searched[place] = ", ".join(self.model.views[v][1] for v in np.flatnonzero(assigned >= 0))
         return count
-
-    def _unknown_vehicle(self, prior: PosePrior) -> Start:
-        """State of a vehicle that is somewhere in the search region and of whose motion nothing is known."""
-        log_weight = 0.0
-        if self._hypotheses is not None:
-            # A vehicle that was never measured may as well appear now; else it is rarely off all predictions.
-            log_weight = -self._evidence if self._last_pose is None else float(np.log(P_NEW))
-        where = (min(prior.within_m, 10.0) / np.sqrt(3), prior.within_rad / np.sqrt(3))
-        sigmas = [*where, FIRST_SPEED, FIRST_RATE, FIRST_ACCELERATION, FIRST_ANGULAR_ACCELERATION]
-        R, t = np.ascontiguousarray(prior.centre.rotation), np.array(prior.centre.translation)
-        state = State(R, t, np.zeros(12), np.diag(np.repeat(sigmas, 3) ** 2))
-        return Start(state, np.full(len(self.model) + self._groups, P_VISIBLE_AT_START), log_weight, -1)
 
     def _assigned(self, frame: FrameDetections, one: Labelling) -> Ints:
         """A labelling as an assignment (n,)."""
@@ -264,6 +264,8 @@ class RigidTracker:
         )
         count = int(np.count_nonzero(s.use))
         measured = count >= 3 and checks.confirmed and not ambiguous and self._observable(s.single_frame_cov)
+        if measured and h.first:
+            measured = not self._acquisition.is_ambiguous(Pose(now.R[0], now.t[0]), self._last_pose_age_s)
         if measured:
             self._update_errors(s, now, count)
         covariance = now.P[0, :6, :6] + checks.spread + self._systematic

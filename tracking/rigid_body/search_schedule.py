@@ -23,6 +23,7 @@ from tracking.rigid_body.pose_candidates import predicted_hypothesis
 
 LONG_UNMEASURED = 10  # frames without a measured pose, after which two missing spots are enough to contradict
 SEARCH_AT = (2, 4, 8, 14)  # frames in a row that contradict the best hypothesis, at which a search is made
+MISSING_TO_DOUBT = 2  # spots of one camera; an answer must explain so many more than the doubted track
 CONTRADICTED_INTERVAL = 20  # frames: and after that at each multiple of it
 FEW_SPOTS_INTERVAL = 50  # frames in a row with few, uncontradicted labels between two searches
 JUST_FOUND = 5  # frames after a successful search: until then the velocities may be almost unknown
@@ -42,6 +43,11 @@ def is_vague(model: SpotModel, h: Hypotheses | None, dt_s: float, dynamics: Dyna
     return bool(np.sqrt(np.max(cov[projected][:, [0, 1], [0, 1]])) > MAX_TRACKING_SIGMA_PX)
 
 
+def _due(frames: int) -> bool:
+    """Whether to search after so many frames in a row that give a reason for it."""
+    return frames in SEARCH_AT or frames % CONTRADICTED_INTERVAL == 0
+
+
 class SearchSchedule:
     """Counters over the frames that decide about searches."""
 
@@ -52,6 +58,7 @@ class SearchSchedule:
         self._since_found = 0  # frames since a search found the vehicle
         self._unmeasured = 0  # frames in a row without a measured pose
         self._contradicted = 0  # frames in a row that contradict the best hypothesis
+        self._doubted = 0  # frames in a row whose labels explain the pose, but few of a camera's points
         self._few_spots = 0  # frames in a row that label fewer than MIN_REDUNDANT_SPOTS
         self._points_before = 0  # of all cameras, in the frame before
 
@@ -59,6 +66,11 @@ class SearchSchedule:
     def just_found(self) -> bool:
         """Whether a search has found the vehicle a few frames ago."""
         return self._since_found <= JUST_FOUND
+
+    @property
+    def doubted(self) -> bool:
+        """Whether the last measured pose may be wrong."""
+        return self._doubted > 0
 
     def next_frame(self) -> None:
         """Count a frame."""
@@ -84,6 +96,7 @@ class SearchSchedule:
         """
         points, before = sum(len(f) for f in found if f is not None), self._points_before
         self._points_before = points
+        doubted, self._doubted = self._doubted, 0
         if points < self._min_spots:
             return False
         if best is not None:
@@ -91,11 +104,12 @@ class SearchSchedule:
             vague = (self.just_found or not explained) and prediction_is_vague()
             if explained and not vague:
                 self._few_spots = 0
-                return False
+                self._doubted = doubted + 1 if self._doubtful(best, found) else 0
+                return self._doubted > 0 and _due(self._doubted)
             if not vague:
                 self._few_spots += 1
                 if self._contradicts(best, found):
-                    return self._contradicted in SEARCH_AT or self._contradicted % CONTRADICTED_INTERVAL == 0
+                    return _due(self._contradicted)
                 # Few spots of a well predicted vehicle mean that the others are occluded; rarely that they are false.
                 return self._few_spots % FEW_SPOTS_INTERVAL == 0
         # At once when spots reappear, then less and less often: a search that keeps failing will fail again.
@@ -103,6 +117,18 @@ class SearchSchedule:
         more = points > before + 1
         interval = 2 if self.searches < MANY_SEARCHES else 5
         return more or self.searches <= DENSE_SEARCHES or self.searches % interval == 0
+
+    def _doubtful(self, best: Ints, found: Sequence[Detections | None]) -> bool:
+        """Whether most spots of a camera are missing although it has as many other points.
+
+        A reflection may pass for the only spot of a screen: with the spots of another one, it determines a wrong pose.
+        """
+        for c, f in enumerate(found):
+            mine = best[self._model.camera_of == c]
+            missing, labelled = int(np.count_nonzero(mine == MISSED)), int(np.count_nonzero(mine >= 0))
+            if f is not None and missing >= max(MISSING_TO_DOUBT, labelled + 1) and len(f) >= missing + labelled:
+                return True
+        return False
 
     def _contradicts(self, best: Ints, found: Sequence[Detections | None]) -> bool:
         """Whether a camera has enough points, but none where several spots are expected; counts such frames."""

@@ -73,3 +73,16 @@ def test_frames_that_contradict_the_hypothesis_are_searched_at_increasing_interv
 def test_few_spots_that_nothing_contradicts_are_searched_seldom():
     one_camera = np.where(MODEL.camera_of == 0, FOUND_ALL, -2)
     assert searched(tracking(), one_camera, False, 110) == [50, 100]
+
+
+def test_labels_that_leave_most_spots_of_a_camera_missing_among_as_many_points_are_searched():
+    one_of_the_first_camera = FOUND_ALL.copy()
+    one_of_the_first_camera[np.flatnonzero(MODEL.camera_of == 0)[1:]] = MISSED
+    schedule = tracking()
+    assert searched(schedule, one_of_the_first_camera, False, 45) == [*SEARCH_AT, 20, 40]
+    assert schedule.doubted
+    assert searched(tracking(), one_of_the_first_camera, False, 45, counts=(2, 3)) == []  # occluded
+    two_of_it = FOUND_ALL.copy()
+    two_of_it[np.flatnonzero(MODEL.camera_of == 0)[-1]] = MISSED
+    assert searched(schedule, two_of_it, False, 45) == []
+    assert not schedule.doubted
