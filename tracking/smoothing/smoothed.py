@@ -58,7 +58,7 @@ class Smoothed:
         """
         model = self.model
         known = bool(self.known[k])
-        assigned = np.where(known, self.assigned[k], -1)
+        assigned = self.assigned[k]
         labelled = assigned >= 0
         pose = self.poses[k]
         systematic = self.systematic[min(k, len(self.systematic) - 1)]
@@ -100,7 +100,7 @@ class Smoothed:
             rms_px=float(self.rms_px[k]) if measured else float("nan"),
             events=self._events(k, causal, point, known),
             label_probability=self._label_probability(k, causal, known),
-            used_in_pose=labelled & (assigned < BLENDED),
+            used_in_pose=labelled & (assigned < BLENDED) & known,
             motion=MotionEstimate(self.velocities[k, :3], self.velocities[k, 3:], self.motion_covariance[k])
             if known
             else None,
@@ -114,7 +114,7 @@ class Smoothed:
         """
         if self.parameters.method != "rigid":
             return causal.label_probability
-        return self.probability[k] if known else np.full(len(self.model), np.nan)
+        return self.probability[k] if known else np.where(self.assigned[k] >= 0, self.probability[k], np.nan)
 
     def _events(self, k: int, causal: TrackedFrame, point: Ints, known: bool) -> tuple[Event, ...]:
         events = [e for e in causal.events if e.kind != "undecided"]

@@ -36,9 +36,11 @@ from tracking.smoothing.calibration_errors import calibration_errors
 from tracking.smoothing.error_scale import noise_scale, width_covariance, width_share
 from tracking.smoothing.exposure import exposure_offsets, pose_shift
 from tracking.smoothing.labels.clutter import run_log_clutter, run_log_static
-from tracking.smoothing.labels.continuity import PathContext, continued
+from tracking.smoothing.labels.continuity import continued
 from tracking.smoothing.labels.neighbouring_frames import connected, isolated, next_to
+from tracking.smoothing.labels.path_pairs import transfers_between_cameras
 from tracking.smoothing.labels.reassociation import RunObservation, reassociated
+from tracking.smoothing.labels.view_path import PathContext
 from tracking.smoothing.motion.reference import Reference, speeds, straight_between
 from tracking.smoothing.motion.run_detections import RunDetections, labelled_points
 from tracking.smoothing.motion.whole_run import MAX_DISTANCE, SmoothedMotion, WholeRun, estimate
@@ -80,6 +82,7 @@ def smooth(recording: TrackedRecording) -> Smoothed:
         elif not gapless:
             smoother.estimate(max_distance=MAX_DISTANCE)
         smoother.add_jumps_at_contradictions()
+        smoother.drop_labels_of_lost_frames()
         if parameters.method == "rigid":
             smoother.continue_paths()
     return smoother.result(rounds)
@@ -235,15 +238,22 @@ class _Smoother:
             self.parameters.labels.clutter_per_px2,
         )  # fmt: skip
 
+    def drop_labels_of_lost_frames(self) -> None:
+        """Labels need a pose, except where the paths of spots continue."""
+        self.assigned = np.where(self.motion.known[:, None], self.assigned, -1)
+
     def continue_paths(self) -> None:
-        """Label frames whose spots do not determine the pose by the continuity of each spot's path."""
+        """Label spots by the continuity of their paths where the pose does not predict them well."""
         motion = self.motion
         uv, J = project_all(self.views, motion.ref.R, motion.ref.t)
         cov = J @ motion.pose_P[:, None] @ np.swapaxes(J, -1, -2) + self.calibration_cov
         log_clutter = self._log_clutter(self.own.measured)
-        may_label = motion.known & ~(self.own.measured & self.trusted)
-        context = PathContext(self.view_table.camera, uv, cov, log_clutter, may_label)
-        self.assigned, probability = continued(self.detections, self.assigned, context)
+        known, sure = motion.known[:, None], (self.own.measured & self.trusted)[:, None]
+        vague = np.trace(cov, axis1=2, axis2=3) > MAX_CHECKING_SIGMA_PX**2
+        uv = np.where(known[..., None], uv, np.nan)
+        context = PathContext(self.view_table.camera, uv, cov, log_clutter, ~known | ~sure | vague)
+        transfers = transfers_between_cameras(self.rec.rig, self.model.views)
+        self.assigned, probability = continued(self.detections, self.assigned, context, transfers)
         self.probability = np.where(np.isnan(probability), self.probability, probability)
 
     def result(self, rounds: int) -> Smoothed:

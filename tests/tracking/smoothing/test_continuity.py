@@ -7,7 +7,9 @@ import pytest
 
 from geometry.arrays import Array, Bools, Ints
 from tracking.rigid_body.association.frame_detections import BLENDED
-from tracking.smoothing.labels.continuity import MAX_AHEAD, MIN_SINGLE_CHAIN, PathContext, continued
+from tracking.smoothing.labels.continuity import MIN_SINGLE_CHAIN, continued
+from tracking.smoothing.labels.path_prediction import MAX_AHEAD
+from tracking.smoothing.labels.view_path import PathContext
 from tracking.smoothing.motion.run_detections import RunDetections
 
 FRAMES, SIGMA_PX, SIDE_PX = 120, 0.05, 1000.0
@@ -50,12 +52,12 @@ def filmed(uv: Array, visible: Bools, false_points: float, seed: int) -> tuple[R
 
 def context(uv: Array, sigma_px: float = 300.0, false_points: float = 0.0) -> PathContext:
     """A very uncertain pose in all frames of the gap."""
-    open_frames = np.zeros(FRAMES, dtype=bool)
-    open_frames[GAP] = True
+    open_views = np.zeros(uv.shape[:2], dtype=bool)
+    open_views[GAP] = True
     density = max(false_points / 120.0**2, 1e-6)
     spread = np.tile(sigma_px**2 * np.eye(2), (*uv.shape[:2], 1, 1))
     camera = np.zeros(uv.shape[1], dtype=np.int64)
-    return PathContext(camera, uv + 50.0, spread, np.full(uv.shape[:2], np.log(density)), open_frames)
+    return PathContext(camera, uv + 50.0, spread, np.full(uv.shape[:2], np.log(density)), open_views)
 
 
 def without(rows: Ints, *frames: slice) -> Ints:
@@ -70,7 +72,7 @@ def test_paths_are_followed_through_frames_with_an_uncertain_pose(false_points):
     uv = paths()
     for seed in range(6):
         every, rows = filmed(uv, np.ones((FRAMES, 2), dtype=bool), false_points, seed)
-        out, probability = continued(every, without(rows, GAP), context(uv, false_points=false_points))
+        out, probability = continued(every, without(rows, GAP), context(uv, false_points=false_points), {})
         given = out[GAP] >= 0
         assert np.array_equal(out[GAP][given], rows[GAP][given])
         assert given.mean() > 0.97
@@ -82,7 +84,7 @@ def test_other_frames_are_not_changed():
     uv = paths()
     every, rows = filmed(uv, np.ones((FRAMES, 2), dtype=bool), 0.5, 1)
     before = without(rows, slice(20, 30), GAP)
-    out, _ = continued(every, before, context(uv, false_points=0.5))
+    out, _ = continued(every, before, context(uv, false_points=0.5), {})
     outside = np.ones(FRAMES, dtype=bool)
     outside[GAP] = False
     np.testing.assert_array_equal(out[outside], before[outside])
@@ -97,7 +99,7 @@ def test_false_points_are_not_labelled_while_no_spot_is_visible(length):
         visible = np.ones((FRAMES, 2), dtype=bool)
         visible[hidden] = False
         every, rows = filmed(uv, visible, 1.0, seed)
-        out, _ = continued(every, without(rows, hidden), context(uv, false_points=1.0))
+        out, _ = continued(every, without(rows, hidden), context(uv, false_points=1.0), {})
         labels += int(np.count_nonzero(out[hidden] >= 0))
     assert labels == 0
 
@@ -110,7 +112,7 @@ def test_a_path_that_vanishes_is_not_continued_by_false_points():
         visible = np.ones((FRAMES, 2), dtype=bool)
         visible[60:, 0] = False
         every, rows = filmed(uv, visible, 1.0, seed)
-        out, _ = continued(every, without(rows, GAP), context(uv, false_points=1.0))
+        out, _ = continued(every, without(rows, GAP), context(uv, false_points=1.0), {})
         wrong += int(np.count_nonzero(out[60:, 0] >= 0))
     assert wrong <= 1
 
@@ -118,7 +120,7 @@ def test_a_path_that_vanishes_is_not_continued_by_false_points():
 def test_a_path_is_followed_through_a_velocity_jump_if_no_other_point_is_near():
     uv = paths(jump_at=62)
     every, rows = filmed(uv, np.ones((FRAMES, 2), dtype=bool), 0.0, 3)
-    out, _ = continued(every, without(rows, GAP), context(uv))
+    out, _ = continued(every, without(rows, GAP), context(uv), {})
     given = out[GAP] >= 0
     assert np.array_equal(out[GAP][given], rows[GAP][given])
     assert given.mean() > 0.9
@@ -137,7 +139,7 @@ def test_a_straight_path_is_followed_across_two_corners_without_labels_between_t
     uv = zig_zag(56, 68)
     for seed in range(6):
         every, rows = filmed(uv, np.ones((FRAMES, 2), dtype=bool), false_points, seed)
-        out, _ = continued(every, without(rows, GAP), context(uv, false_points=false_points))
+        out, _ = continued(every, without(rows, GAP), context(uv, false_points=false_points), {})
         given = out[GAP] >= 0
         assert np.array_equal(out[GAP][given], rows[GAP][given])
         assert given.mean() > 0.95
@@ -150,7 +152,7 @@ def test_a_spot_at_rest_is_no_static_reflection():
     visible[[55, 60, 61], 0] = False
     every, rows = filmed(uv, visible, 0.0, 8)
     static = every._replace(log_static=np.full(len(every.uv), 5.0))
-    out, _ = continued(static, without(rows, GAP), context(uv))
+    out, _ = continued(static, without(rows, GAP), context(uv), {})
     np.testing.assert_array_equal(out[GAP], rows[GAP])
 
 
@@ -159,7 +161,7 @@ def test_a_path_is_followed_where_the_uncertain_pose_leads_to_no_point_of_the_sc
     every, rows = filmed(uv, np.ones((FRAMES, 2), dtype=bool), 0.0, 7)
     nowhere = context(uv)
     nowhere.expected[GAP], nowhere.expected_cov[GAP] = np.nan, 0.0
-    out, _ = continued(every, without(rows, GAP), nowhere)
+    out, _ = continued(every, without(rows, GAP), nowhere, {})
     np.testing.assert_array_equal(out[GAP], rows[GAP])
 
 
@@ -168,7 +170,7 @@ def test_a_path_is_followed_over_missed_detections():
     visible = np.ones((FRAMES, 2), dtype=bool)
     visible[[55, 60, 61, 66], 0] = False
     every, rows = filmed(uv, visible, 0.0, 4)
-    out, _ = continued(every, without(rows, GAP), context(uv))
+    out, _ = continued(every, without(rows, GAP), context(uv), {})
     np.testing.assert_array_equal(out[GAP], rows[GAP])
 
 
@@ -176,7 +178,7 @@ def test_a_point_that_the_pose_excludes_is_not_labelled():
     """A point on the path that the pose excludes is another point of light."""
     uv = paths()
     every, rows = filmed(uv, np.ones((FRAMES, 2), dtype=bool), 0.0, 5)
-    out, _ = continued(every, without(rows, GAP), context(uv, sigma_px=2.0))
+    out, _ = continued(every, without(rows, GAP), context(uv, sigma_px=2.0), {})
     assert np.all(out[GAP] < 0)
 
 
@@ -188,7 +190,7 @@ def test_no_point_is_labelled_as_two_spots():
     visible = np.ones((FRAMES, 2), dtype=bool)
     visible[60:65, 1] = False
     every, rows = filmed(uv, visible, 0.0, 6)
-    out, _ = continued(every, without(rows, GAP), context(uv))
+    out, _ = continued(every, without(rows, GAP), context(uv), {})
     for k in range(FRAMES):
         used = out[k][out[k] >= 0] % BLENDED
         assert len(set(used.tolist())) == len(used)
@@ -200,7 +202,7 @@ def test_a_single_spot_is_followed_for_long_or_not_at_all():
     for length in (MIN_SINGLE_CHAIN - 2, MIN_SINGLE_CHAIN + 5):
         every, rows = filmed(uv, np.ones((FRAMES, 1), dtype=bool), 0.0, 7)
         gap = slice(GAP.start, GAP.start + length)
-        out, _ = continued(every, without(rows, gap), context(uv))
+        out, _ = continued(every, without(rows, gap), context(uv), {})
         assert np.all((out[gap] >= 0) == (length >= MIN_SINGLE_CHAIN))
 
 
@@ -210,6 +212,6 @@ def test_a_path_with_few_labels_is_not_continued():
     every, rows = filmed(uv, np.ones((FRAMES, 2), dtype=bool), 0.0, 8)
     few = np.full_like(rows, -1)
     few[GAP.start - 2 * MAX_AHEAD : GAP.start] = rows[GAP.start - 2 * MAX_AHEAD : GAP.start]
-    out, probability = continued(every, few, context(uv))
+    out, probability = continued(every, few, context(uv), {})
     np.testing.assert_array_equal(out, few)
     assert np.isnan(probability).all()

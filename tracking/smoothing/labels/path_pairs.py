@@ -1,0 +1,177 @@
+"""Labels by continuity of two spots' paths together: where they lie relative to each other changes slowly.
+
+A jerking vehicle moves its spots by many pixels from one frame to the next, and no path can be extrapolated well by
+itself. But two spots in one picture move nearly alike, and two cameras that see one spot see the same place of the
+screen. A pair of points that lies right relative to each other is then the two spots, although the pair as a whole is
+predicted badly; false points seldom form such a pair. Source: ours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+
+from geometry.arrays import Array, Ints
+from geometry.camera import Camera
+from geometry.rig import Rig
+from geometry.surfaces import intersect_surface
+from tracking.smoothing.labels.path_prediction import (
+    MAX_AHEAD,
+    error_sigmas,
+    known_before,
+    mean_density,
+    predictions,
+)
+from tracking.smoothing.labels.view_path import PathContext, ViewPath
+from tracking.smoothing.motion.run_detections import RunDetections
+
+P_JUMP = 0.02  # probability per frame that the pair has moved by any distance that its speed allows
+P_GONE = 0.1  # probability per frame that one of the two is not visible any more
+MIN_PROBABILITY = 0.999  # of the two labels; and where the pair's path from the other side does not lead there:
+MIN_ONE_SIDED_PROBABILITY = 0.9999
+
+Transfer = Callable[[Array], Array]
+"""Where the second view sees points (m, 2), px, of the first view: (m, 2), px; nan where it cannot see them."""
+
+
+def transfers_between_cameras(rig: Rig, views: Sequence[tuple[str, str]]) -> dict[tuple[int, int], Transfer]:
+    """The transfers between the cameras that see one spot, by pairs of views; views: camera and spot of each."""
+    return {
+        (a, b): partial(_over_screen, rig, rig.cameras[views[a][0]], rig.cameras[views[b][0]])
+        for a, b in combinations(range(len(views)), 2)
+        if views[a][1] == views[b][1]
+    }
+
+
+def _over_screen(rig: Rig, camera: Camera, other: Camera, uv: Array) -> Array:
+    """Pixels (m, 2) of one camera, seen by another one as the places of the screen that they show."""
+    out, known = np.full(uv.shape, np.nan), np.isfinite(uv).all(axis=1)
+    if known.any():
+        screen = rig.screens[camera.screen]
+        out[known] = other.project(intersect_surface(*camera.rays(uv[known]), screen.world_from_screen, screen.bow))
+    return out
+
+
+class PairLabels(NamedTuple):
+    """Rows of both views' points in one frame."""
+
+    rows: tuple[int, int]
+    probability: float
+
+
+Chain = dict[int, PairLabels | None]
+"""New labels by frame; None where the pair's path leads through a frame but no points lie on it."""
+
+
+def pair_labels(
+    detections: RunDetections, assigned: Ints, context: PathContext, transfers: Mapping[tuple[int, int], Transfer]
+) -> tuple[Ints, Array]:
+    """Assignments (T, n) with the labels that pairs add, and the probabilities (T, n) of these; nan of others.
+
+    transfers: by pairs of views that see one spot.
+    """
+    out, probability = assigned.copy(), np.full(assigned.shape, np.nan)
+    refused = np.zeros(assigned.shape, dtype=bool)
+    for first, second, transfer in _pairs(detections, assigned, context, transfers):
+        pair = _Pair(first, second, transfer)
+        ahead, back = pair.chain(1), pair.chain(-1)
+        for k in ahead.keys() | back.keys():
+            found = _agreed([side[k] for side in (ahead, back) if k in side])
+            if found is None:
+                continue
+            for view, row in zip((first.view, second.view), found.rows, strict=True):
+                refused[k, view] |= assigned[k, view] != out[k, view] != row
+                out[k, view] = row
+                probability[k, view] = np.fmax(probability[k, view], found.probability)
+    out[refused], probability[refused] = assigned[refused], np.nan
+    return out, probability
+
+
+def _pairs(
+    detections: RunDetections, assigned: Ints, context: PathContext, transfers: Mapping[tuple[int, int], Transfer]
+) -> Iterator[tuple[ViewPath, ViewPath, Transfer]]:
+    """The pairs of views that have frames without a label of either."""
+    paths = [ViewPath(detections, assigned, context, view) for view in range(assigned.shape[1])]
+    for first, second in combinations(paths, 2):
+        together = (first.view, second.view)
+        transfer = transfers.get(together, _same if first.camera == second.camera else None)
+        if transfer is not None and first.continuable and second.continuable and np.any(first.open & second.open):
+            yield first, second, transfer
+
+
+def _same(uv: Array) -> Array:
+    return uv
+
+
+def _agreed(sides: list[PairLabels | None]) -> PairLabels | None:
+    """The answer of both directions of time, or the very probable one of one direction alone."""
+    found = [s for s in sides if s is not None]
+    if len({s.rows for s in found}) != 1:
+        return None
+    best = max(found, key=lambda s: s.probability)
+    return best if len(found) == len(sides) or best.probability >= MIN_ONE_SIDED_PROBABILITY else None
+
+
+class _Pair:
+    """The path of the first view's spot, and where the second one lies relative to it."""
+
+    def __init__(self, first: ViewPath, second: ViewPath, transfer: Transfer) -> None:
+        self.first, self.second, self.transfer = first, second, transfer
+        self.open = first.open & second.open
+        self.relative = second.uv - transfer(first.uv)  # (T, 2) px
+        self.sigmas = error_sigmas(first.uv), error_sigmas(self.relative)
+
+    def chain(self, direction: int) -> Chain:
+        """New labels along the direction of time (1) or against it (-1)."""
+        out: Chain = {}
+        uv, relative = self.first.uv.copy(), self.relative.copy()
+        frames = range(len(uv)) if direction == 1 else range(len(uv) - 1, -1, -1)
+        for k in frames:
+            if not self.open[k]:
+                continue
+            found = self._found(k, uv, relative, direction)
+            if found is not None:
+                one, two = self._places(k, found.rows)
+                uv[k], relative[k] = one, two - self.transfer(one[None])[0]
+            if found is not None or len(known_before(relative, k, direction, MAX_AHEAD + 1)):
+                out[k] = found
+        return out
+
+    def _places(self, k: int, rows: tuple[int, int]) -> tuple[Array, Array]:
+        begin, uv = self.first.detections.begin[k], self.first.detections.uv
+        return uv[begin + rows[0]], uv[begin + rows[1]]
+
+    def _found(self, k: int, uv: Array, relative: Array, direction: int) -> PairLabels | None:
+        """The two points of frame k that continue the pair; None: there are none."""
+        (rows, place), (other_rows, other) = self.first.points(k), self.second.points(k)
+        if not len(rows) or not len(other_rows):
+            return None
+        of_pair = predictions(uv, self.sigmas[0], k, direction)
+        of_relative = predictions(relative, self.sigmas[1], k, direction)
+        if not of_pair or not of_relative:
+            return None
+        cov, other_cov = self.first.covariances(k, rows), self.second.covariances(k, other_rows)
+        last = int(known_before(uv, k, direction, len(uv))[0])
+        reach = self.first.speed_px * abs(k - last)
+        jump = np.exp(-0.5 * np.sum((place - uv[last]) ** 2, axis=1) / reach**2) / (2 * np.pi * reach**2)
+        anywhere = (1 - P_JUMP) * mean_density(of_pair, place, cov) + P_JUMP * jump
+        apart = other - self.transfer(place)[:, None]  # (m, l, 2)
+        right = np.nan_to_num(mean_density(of_relative, apart, cov[:, None] + other_cov))
+        if self.first.camera == self.second.camera:
+            right[rows[:, None] == other_rows] = 0.0  # one point is not two spots
+        false = self.first.false_density(k, rows, place, uv[last])
+        other_false = self.second.false_density(k, other_rows, other, relative[last] + self.transfer(uv[last][None])[0])
+        # A reflection explains one of the points. That a second one lies right relative to it is a coincidence.
+        alone, other_alone = np.exp(self.first.log_clutter(k)), np.exp(self.second.log_clutter(k))
+        both_false = np.maximum(false[:, None] * other_alone, alone * other_false)
+        odds = anywhere[:, None] * right * (1 - P_GONE) / both_false
+        i, j = np.unravel_index(int(np.argmax(odds)), odds.shape)
+        p = float(odds[i, j] / (odds.sum() + P_GONE))
+        chosen = int(rows[i]), int(other_rows[j])
+        if p < MIN_PROBABILITY or not self.first.allowed(k, chosen[0]) or not self.second.allowed(k, chosen[1]):
+            return None
+        return PairLabels(chosen, p)
