@@ -6,6 +6,7 @@ import numpy as np
 
 from geometry.arrays import Array, Bools, Ints
 from geometry.compiled_projection import Views
+from tracking.rigid_body.association.frame_detections import BLENDED
 from tracking.rigid_body.models.information import single_frame_pose
 from tracking.rigid_body.variance_factor import DEADBAND
 from tracking.smoothing.motion.reference import Reference
@@ -73,3 +74,14 @@ def _mean_variance_factor(
         if count > 3:
             shares.append(chi2 / (2 * count - 6))
     return float(np.mean(np.minimum(shares, 3 * np.median(shares)))) if shares else 1.0
+
+
+def usual_sizes(detections: RunDetections, assigned: Ints) -> Array:
+    """Median larger half axis (n,) of each view's labelled points, px; nan where none is known."""
+    out = np.full(assigned.shape[1], np.nan)
+    for i in range(assigned.shape[1]):
+        k = np.flatnonzero(assigned[:, i] >= 0)
+        sizes = detections.size_px[detections.begin[k] + assigned[k, i] % BLENDED]
+        if np.isfinite(sizes).any():
+            out[i] = np.nanmedian(sizes)
+    return out

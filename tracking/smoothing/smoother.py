@@ -33,7 +33,7 @@ from tracking.rigid_body.models.information import well_controlled
 from tracking.rigid_body.models.motion import process_noise
 from tracking.smoothing.backward import merged, track_backward
 from tracking.smoothing.calibration_errors import calibration_errors
-from tracking.smoothing.error_scale import noise_scale, width_covariance, width_share
+from tracking.smoothing.error_scale import noise_scale, usual_sizes, width_covariance, width_share
 from tracking.smoothing.exposure import exposure_offsets, pose_shift
 from tracking.smoothing.labels.clutter import run_log_clutter, run_log_static
 from tracking.smoothing.labels.continuity import continued
@@ -42,7 +42,7 @@ from tracking.smoothing.labels.path_pairs import transfers_between_cameras
 from tracking.smoothing.labels.reassociation import RunObservation, reassociated
 from tracking.smoothing.labels.view_path import PathContext
 from tracking.smoothing.motion.reference import Reference, speeds, straight_between
-from tracking.smoothing.motion.run_detections import RunDetections, labelled_points
+from tracking.smoothing.motion.run_detections import labelled_points
 from tracking.smoothing.motion.whole_run import MAX_DISTANCE, SmoothedMotion, WholeRun, estimate
 from tracking.smoothing.place_errors import place_errors
 from tracking.smoothing.recording import TrackedRecording
@@ -109,7 +109,7 @@ class _Smoother:
         self.scale = noise_scale(self.views, every, self.assigned, self.calibration_cov, ref, self.measured)
         self.detections = every._replace(
             cov=every.cov * self.scale**2 + parameters.sigma_model_px**2 * np.eye(2),
-            usual_size_px=_usual_sizes(every, self.assigned),
+            usual_size_px=usual_sizes(every, self.assigned),
         )
         log_density: Array | None = None
         if not parameters.learn_jerk:
@@ -341,15 +341,4 @@ def _jump_sigmas(ref: Reference, dt: Array) -> Array:
         for i in range(2):
             variance = process_noise(float(max(step[k], 1e-9)), 0.0, float(size[k, i]), 0.0)[0]
             out[k, 3 * i : 3 * i + 3] = np.sqrt(variance)
-    return out
-
-
-def _usual_sizes(detections: RunDetections, assigned: Ints) -> Array:
-    """Median larger half axis (n,) of each view's labelled points, px; nan where none is known."""
-    out = np.full(assigned.shape[1], np.nan)
-    for i in range(assigned.shape[1]):
-        k = np.flatnonzero(assigned[:, i] >= 0)
-        sizes = detections.size_px[detections.begin[k] + assigned[k, i] % BLENDED]
-        if np.isfinite(sizes).any():
-            out[i] = np.nanmedian(sizes)
     return out

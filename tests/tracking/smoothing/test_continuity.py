@@ -5,15 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from geometry.arrays import Array, Bools, Ints
+from geometry.arrays import Array
+from tests.tracking.smoothing.path_recordings import FRAMES, GAP, context, filmed, without
 from tracking.rigid_body.association.frame_detections import BLENDED
 from tracking.smoothing.labels.continuity import MIN_SINGLE_CHAIN, continued
 from tracking.smoothing.labels.path_prediction import MAX_AHEAD
-from tracking.smoothing.labels.view_path import PathContext
-from tracking.smoothing.motion.run_detections import RunDetections
-
-FRAMES, SIGMA_PX, SIDE_PX = 120, 0.05, 1000.0
-GAP = slice(50, 75)
 
 
 def paths(jump_at: int | None = None) -> Array:
@@ -25,46 +21,6 @@ def paths(jump_at: int | None = None) -> Array:
         y += 3.0 * np.maximum(k - jump_at, 0)
     one = np.stack([x, y], axis=1)
     return np.stack([one, one + np.array([200.0, 0.0])], axis=1)
-
-
-def filmed(uv: Array, visible: Bools, false_points: float, seed: int) -> tuple[RunDetections, Ints]:
-    """One camera's detections in random order, with false points within 60 px of the spots; the spots' rows (T, n)."""
-    rng = np.random.default_rng(seed)
-    rows, places = np.full(uv.shape[:2], -1), []
-    for k in range(FRAMES):
-        seen = np.flatnonzero(visible[k])
-        points = uv[k, seen] + SIGMA_PX * rng.normal(size=(len(seen), 2))
-        near = uv[k] + rng.uniform(-60, 60, (uv.shape[1], 2))
-        points = np.concatenate([points, near[rng.random(uv.shape[1]) < false_points]])
-        order = rng.permutation(len(points))
-        places.append(points[order])
-        rows[k, seen] = np.argsort(order)[: len(seen)]
-    counts = [len(p) for p in places]
-    m = sum(counts)
-    every = RunDetections(
-        np.concatenate(places), np.tile(SIGMA_PX**2 * np.eye(2), (m, 1, 1)), np.zeros(m),
-        np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
-        np.stack([np.zeros(FRAMES), counts], axis=1).astype(np.int64), np.ones((FRAMES, 1), dtype=bool),
-        np.full(m, -np.inf), np.full(m, np.nan), np.full(uv.shape[1], np.nan),
-    )  # fmt: skip
-    return every, rows
-
-
-def context(uv: Array, sigma_px: float = 300.0, false_points: float = 0.0) -> PathContext:
-    """A very uncertain pose in all frames of the gap."""
-    open_views = np.zeros(uv.shape[:2], dtype=bool)
-    open_views[GAP] = True
-    density = max(false_points / 120.0**2, 1e-6)
-    spread = np.tile(sigma_px**2 * np.eye(2), (*uv.shape[:2], 1, 1))
-    camera = np.zeros(uv.shape[1], dtype=np.int64)
-    return PathContext(camera, uv + 50.0, spread, np.full(uv.shape[:2], np.log(density)), open_views)
-
-
-def without(rows: Ints, *frames: slice) -> Ints:
-    out = rows.copy()
-    for f in frames:
-        out[f] = -1
-    return out
 
 
 @pytest.mark.parametrize("false_points", [0.0, 0.5, 1.0])
