@@ -22,7 +22,6 @@ from geometry.arrays import Array, Bools, Ints
 from geometry.compiled_projection import project_all
 from geometry.pose import Pose
 from geometry.pose_solver.gauss_newton import SolveLimits
-from tracking.rigid_body.adaptive_process_noise import jump_variance
 from tracking.rigid_body.association.frame_detections import BLENDED, DetectionModel, ViewTable, distinct_spots
 from tracking.rigid_body.hypotheses.prediction_checks import (
     MAX_CHECKING_SIGMA_PX,
@@ -30,19 +29,19 @@ from tracking.rigid_body.hypotheses.prediction_checks import (
     SURE_PROBABILITY,
 )
 from tracking.rigid_body.models.information import well_controlled
-from tracking.rigid_body.models.motion import process_noise
 from tracking.smoothing.backward import merged, track_backward
 from tracking.smoothing.calibration_errors import calibration_errors
 from tracking.smoothing.error_scale import noise_scale, usual_sizes, width_covariance, width_share
 from tracking.smoothing.exposure import exposure_offsets, pose_shift
 from tracking.smoothing.labels.clutter import run_log_clutter, run_log_static
 from tracking.smoothing.labels.continuity import continued
-from tracking.smoothing.labels.neighbouring_frames import connected, isolated, next_to
+from tracking.smoothing.labels.neighbouring_frames import brief, connected, isolated, next_to
 from tracking.smoothing.labels.path_pairs import transfers_between_cameras
 from tracking.smoothing.labels.reassociation import RunObservation, reassociated
 from tracking.smoothing.labels.view_path import PathContext
-from tracking.smoothing.motion.reference import Reference, speeds, straight_between
+from tracking.smoothing.motion.reference import Reference, straight_between
 from tracking.smoothing.motion.run_detections import labelled_points
+from tracking.smoothing.motion.velocity_jumps import jump_sigmas
 from tracking.smoothing.motion.whole_run import MAX_DISTANCE, SmoothedMotion, WholeRun, estimate
 from tracking.smoothing.place_errors import place_errors
 from tracking.smoothing.recording import TrackedRecording
@@ -50,6 +49,7 @@ from tracking.smoothing.single_frame_poses import SingleFramePoses, rms_residual
 from tracking.smoothing.smoothed import Smoothed
 
 MAX_ROUNDS = 4  # of motion and labels
+BRIEF_PROBABILITY = 0.9999  # least one of a label of a spot that is occluded before and after
 MAX_REPAIRS = 3  # times that velocity jumps are added where poses contradict their spots
 # Excess chi-square (6 degrees of freedom) of a frame's spots at the smoothed pose over that at their own pose, above
 # which the two contradict each other (p = 5e-11). The second limit, which half of all frames exceed by chance, holds
@@ -164,11 +164,12 @@ class _Smoother:
         run = RunObservation(self.views, self.view_table, detection_model, self.calibration_cov, self.detections)
         found, probability, sigma_px = reassociated(
             run, self.assigned, ref, self.motion.pose_P, self.motion.weight, self._log_clutter(known),
-            _jump_sigmas(ref, self.rec.dt_s),
+            jump_sigmas(ref, self.rec.dt_s),
         )  # fmt: skip
         before = self.assigned
         new = np.where((probability >= self.parameters.min_label_probability) & known[:, None], found, -1)
         self.assigned = new
+        new[self._brief(new >= 0) & (probability < BRIEF_PROBABILITY)] = -1
         self.measured = self._single_frame_poses(new).measured
         # Where the other frames do not check a label, those of its frame must, or a tracker that was sure of it.
         vague = sigma_px > MAX_CHECKING_SIGMA_PX
@@ -187,6 +188,12 @@ class _Smoother:
         self.trusted = ~unchecked & ~self.conflicting
         self.measured = measured & ~dropped & ~self.conflicting
         return changed
+
+    def _brief(self, labelled: Bools) -> Bools:
+        """Labels (T, n) of spots that are occluded just before and after."""
+        expected, _ = project_all(self.views, self.motion.ref.R, self.motion.ref.t)
+        visible = self.model.in_picture(expected) & self.detections.has_image[:, self.view_table.camera]
+        return brief(labelled, visible & ~labelled)
 
     def label_backward(self) -> bool:
         """Label frames that the causal tracker did not measure with certainty from later ones; whether any changed."""
@@ -254,6 +261,8 @@ class _Smoother:
         context = PathContext(self.view_table.camera, uv, cov, log_clutter, ~known | ~sure | vague)
         transfers = transfers_between_cameras(self.rec.rig, self.model.views)
         self.assigned, probability = continued(self.detections, self.assigned, context, transfers)
+        unsure = self._brief(self.assigned >= 0) & (probability < BRIEF_PROBABILITY)
+        self.assigned[unsure], probability[unsure] = -1, np.nan
         self.probability = np.where(np.isnan(probability), self.probability, probability)
 
     def result(self, rounds: int) -> Smoothed:
@@ -330,15 +339,3 @@ class _Smoother:
             explained[use] = 0.5 * np.trace(self.calibration_cov[use], axis1=1, axis2=2) / size**2
         found = place_errors(residual, uv_px, self.detections.usual_size_px, averaged, explained)
         return found.share, found.factor(averaged)
-
-
-def _jump_sigmas(ref: Reference, dt: Array) -> Array:
-    """Sigmas (T, 6) of the pose, m and rad, that a velocity jump in the step before a frame adds."""
-    size = jump_variance(speeds(ref.m))
-    step = np.maximum(dt, np.concatenate([dt[1:], dt[-1:]]))
-    out = np.empty((len(dt), 6))
-    for k in range(len(dt)):
-        for i in range(2):
-            variance = process_noise(float(max(step[k], 1e-9)), 0.0, float(size[k, i]), 0.0)[0]
-            out[k, 3 * i : 3 * i + 3] = np.sqrt(variance)
-    return out

@@ -6,6 +6,7 @@ import numpy as np
 
 from geometry.arrays import Array, Bools
 from tracking.rigid_body.adaptive_process_noise import jump_variance
+from tracking.rigid_body.models.motion import process_noise
 from tracking.smoothing.motion.reference import Reference, speeds
 from tracking.smoothing.motion.windows import largest_near
 
@@ -60,3 +61,15 @@ def _weak(information: Array, measured: Bools) -> Bools:
     log_det = np.where(sign > 0, log_det, -np.inf)
     usual = float(np.median(log_det[measured])) if measured.any() else 0.0
     return np.asarray(log_det < usual - WEAK_LOG_DET)
+
+
+def jump_sigmas(ref: Reference, dt: Array) -> Array:
+    """Sigmas (T, 6) of the pose, m and rad, that a velocity jump in the step before a frame adds."""
+    size = jump_variance(speeds(ref.m))
+    step = np.maximum(dt, np.concatenate([dt[1:], dt[-1:]]))
+    out = np.empty((len(dt), 6))
+    for k in range(len(dt)):
+        for i in range(2):
+            variance = process_noise(float(max(step[k], 1e-9)), 0.0, float(size[k, i]), 0.0)[0]
+            out[k, 3 * i : 3 * i + 3] = np.sqrt(variance)
+    return out
