@@ -21,6 +21,7 @@ from geometry.rig import Rig
 from geometry.surfaces import intersect_surface
 from tracking.smoothing.labels.path_prediction import (
     MAX_AHEAD,
+    Prediction,
     error_sigmas,
     known_before,
     mean_density,
@@ -29,7 +30,7 @@ from tracking.smoothing.labels.path_prediction import (
 from tracking.smoothing.labels.view_path import PathContext, ViewPath
 from tracking.smoothing.motion.run_detections import RunDetections
 
-P_JUMP = 0.02  # probability per frame that the pair has moved by any distance that its speed allows
+P_JUMP = 0.02  # probability per frame that a spot has moved by any distance that its speed allows
 P_GONE = 0.1  # probability per frame that one of the two is not visible any more
 MIN_PROBABILITY = 0.999  # of the two labels; and where the pair's path from the other side does not lead there:
 MIN_ONE_SIDED_PROBABILITY = 0.9999
@@ -123,20 +124,21 @@ class _Pair:
         self.first, self.second, self.transfer = first, second, transfer
         self.open = first.open & second.open
         self.relative = second.uv - transfer(first.uv)  # (T, 2) px
-        self.sigmas = error_sigmas(first.uv), error_sigmas(self.relative)
+        self.sigmas, self.second_sigmas = error_sigmas(first.uv), error_sigmas(second.uv)
+        self.relative_sigmas = error_sigmas(self.relative)
 
     def chain(self, direction: int) -> Chain:
         """New labels along the direction of time (1) or against it (-1)."""
         out: Chain = {}
-        uv, relative = self.first.uv.copy(), self.relative.copy()
+        uv, second_uv, relative = self.first.uv.copy(), self.second.uv.copy(), self.relative.copy()
         frames = range(len(uv)) if direction == 1 else range(len(uv) - 1, -1, -1)
         for k in frames:
             if not self.open[k]:
                 continue
-            found = self._found(k, uv, relative, direction)
+            found = self._found(k, uv, second_uv, relative, direction)
             if found is not None:
-                one, two = self._places(k, found.rows)
-                uv[k], relative[k] = one, two - self.transfer(one[None])[0]
+                uv[k], second_uv[k] = self._places(k, found.rows)
+                relative[k] = second_uv[k] - self.transfer(uv[[k]])[0]
             if found is not None or len(known_before(relative, k, direction, MAX_AHEAD + 1)):
                 out[k] = found
         return out
@@ -145,33 +147,41 @@ class _Pair:
         begin, uv = self.first.detections.begin[k], self.first.detections.uv
         return uv[begin + rows[0]], uv[begin + rows[1]]
 
-    def _found(self, k: int, uv: Array, relative: Array, direction: int) -> PairLabels | None:
-        """The two points of frame k that continue the pair; None: there are none."""
+    def _found(self, k: int, uv: Array, second_uv: Array, relative: Array, direction: int) -> PairLabels | None:
+        """The two points of frame k that continue the pair; None: there are none.
+
+        uv, second_uv, relative (T, 2), px: the paths so far.
+        """
         (rows, place), (other_rows, other) = self.first.points(k), self.second.points(k)
-        if not len(rows) or not len(other_rows):
+        of_first = predictions(uv, self.sigmas, k, direction)
+        of_second = predictions(second_uv, self.second_sigmas, k, direction)
+        of_relative = predictions(relative, self.relative_sigmas, k, direction)
+        if not (len(rows) and len(other_rows) and of_first and of_second and of_relative):
             return None
-        of_pair = predictions(uv, self.sigmas[0], k, direction)
-        of_relative = predictions(relative, self.sigmas[1], k, direction)
-        if not of_pair or not of_relative:
-            return None
+        last = int(known_before(relative, k, direction, len(uv))[0])
         cov, other_cov = self.first.covariances(k, rows), self.second.covariances(k, other_rows)
-        last = int(known_before(uv, k, direction, len(uv))[0])
-        reach = self.first.speed_px * abs(k - last)
-        jump = np.exp(-0.5 * np.sum((place - uv[last]) ** 2, axis=1) / reach**2) / (2 * np.pi * reach**2)
-        anywhere = (1 - P_JUMP) * mean_density(of_pair, place, cov) + P_JUMP * jump
         apart = other - self.transfer(place)[:, None]  # (m, l, 2)
         right = np.nan_to_num(mean_density(of_relative, apart, cov[:, None] + other_cov))
         if self.first.camera == self.second.camera:
             right[rows[:, None] == other_rows] = 0.0  # one point is not two spots
         false = self.first.false_density(k, rows, place, uv[last])
-        other_false = self.second.false_density(k, other_rows, other, relative[last] + self.transfer(uv[last][None])[0])
+        other_false = self.second.false_density(k, other_rows, other, second_uv[last])
         # A reflection explains one of the points. That a second one lies right relative to it is a coincidence.
         alone, other_alone = np.exp(self.first.log_clutter(k)), np.exp(self.second.log_clutter(k))
         both_false = np.maximum(false[:, None] * other_alone, alone * other_false)
-        odds = anywhere[:, None] * right * (1 - P_GONE) / both_false
-        i, j = np.unravel_index(int(np.argmax(odds)), odds.shape)
-        p = float(odds[i, j] / (odds.sum() + P_GONE))
+        here = _anywhere(of_first, place, cov, uv[last], self.first.speed_px * abs(k - last))
+        there = _anywhere(of_second, other, other_cov, second_uv[last], self.second.speed_px * abs(k - last))
+        both = here[:, None] * right / both_false * (1 - P_GONE) ** 2
+        only_one = ((here / false).sum() + (there / other_false).sum()) * P_GONE * (1 - P_GONE)
+        i, j = np.unravel_index(int(np.argmax(both)), both.shape)
+        p = float(both[i, j] / (both.sum() + only_one + P_GONE**2))
         chosen = int(rows[i]), int(other_rows[j])
         if p < MIN_PROBABILITY or not self.first.allowed(k, chosen[0]) or not self.second.allowed(k, chosen[1]):
             return None
         return PairLabels(chosen, p)
+
+
+def _anywhere(of: list[Prediction], place: Array, cov: Array, last: Array, reach_px: float) -> Array:
+    """Density (m,), 1/px^2, of a spot at places (m, 2) that has moved as predicted or, rarely, by any distance."""
+    jump = np.exp(-0.5 * np.sum((place - last) ** 2, axis=1) / reach_px**2) / (2 * np.pi * reach_px**2)
+    return (1 - P_JUMP) * mean_density(of, place, cov) + P_JUMP * jump
