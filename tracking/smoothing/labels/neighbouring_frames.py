@@ -7,7 +7,7 @@ import numpy as np
 from geometry.arrays import Bools, Ints
 from tracking.rigid_body.hypotheses.prediction_checks import MIN_CONFIRMING_SPOTS
 
-BRIEF_FRAMES, ABSENT_FRAMES = 2, 3  # a spot is seen for so many frames at most, and missed for so many on both sides
+BRIEF_FRAMES, ABSENT_FRAMES = 2, 2  # a spot is seen for so many frames at most, and missed for so many on both sides
 
 
 def connected(measured: Bools, confirmed: Bools) -> Bools:
