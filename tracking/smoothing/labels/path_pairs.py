@@ -8,7 +8,7 @@ predicted badly; false points seldom form such a pair. Source: ours.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from itertools import combinations
 from typing import NamedTuple
@@ -76,32 +76,34 @@ def pair_labels(
     transfers: by pairs of views that see one spot.
     """
     out, probability = assigned.copy(), np.full(assigned.shape, np.nan)
-    refused = np.zeros(assigned.shape, dtype=bool)
-    for first, second, transfer in _pairs(detections, assigned, context, transfers):
-        pair = _Pair(first, second, transfer)
+    for a, b in _nearest_first(detections, assigned, context, transfers):
+        first, second = (ViewPath(detections, out, context, view) for view in (a, b))
+        if not np.any(first.open & second.open):
+            continue  # another pair has labelled one of them
+        pair = _Pair(first, second, transfers.get((a, b), _same))
         ahead, back = pair.chain(1), pair.chain(-1)
         for k in ahead.keys() | back.keys():
             found = _agreed([side[k] for side in (ahead, back) if k in side])
-            if found is None:
-                continue
-            for view, row in zip((first.view, second.view), found.rows, strict=True):
-                refused[k, view] |= assigned[k, view] != out[k, view] != row
-                out[k, view] = row
-                probability[k, view] = np.fmax(probability[k, view], found.probability)
-    out[refused], probability[refused] = assigned[refused], np.nan
+            if found is not None:
+                out[k, [a, b]], probability[k, [a, b]] = found.rows, found.probability
     return out, probability
 
 
-def _pairs(
+def _nearest_first(
     detections: RunDetections, assigned: Ints, context: PathContext, transfers: Mapping[tuple[int, int], Transfer]
-) -> Iterator[tuple[ViewPath, ViewPath, Transfer]]:
-    """The pairs of views that have frames without a label of either."""
+) -> list[tuple[int, int]]:
+    """Pairs of views with unlabelled frames: those of one spot, then those of one picture, the nearest spots first."""
     paths = [ViewPath(detections, assigned, context, view) for view in range(assigned.shape[1])]
-    for first, second in combinations(paths, 2):
-        together = (first.view, second.view)
-        transfer = transfers.get(together, _same if first.camera == second.camera else None)
-        if transfer is not None and first.continuable and second.continuable and np.any(first.open & second.open):
-            yield first, second, transfer
+    paths = [path for path in paths if path.continuable]
+    apart: dict[tuple[int, int], float] = {}
+    for one, other in combinations(paths, 2):
+        together = (one.view, other.view)
+        if together in transfers:
+            apart[together] = 0.0
+        elif one.camera == other.camera:
+            distance = np.linalg.norm(one.uv - other.uv, axis=1)
+            apart[together] = float(np.nanmedian(distance)) if np.isfinite(distance).any() else np.inf
+    return sorted(apart, key=lambda pair: apart[pair])
 
 
 def _same(uv: Array) -> Array:
