@@ -27,7 +27,9 @@ MISSING_TO_DOUBT = 2  # spots of one camera; an answer must explain so many more
 CONTRADICTED_INTERVAL = 20  # frames: and after that at each multiple of it
 FEW_SPOTS_INTERVAL = 50  # frames in a row with few, uncontradicted labels between two searches
 JUST_FOUND = 5  # frames after a successful search: until then the velocities may be almost unknown
-DENSE_SEARCHES, MANY_SEARCHES = 20, 100  # in a row without success: then every 2nd, and every 5th, is made
+# Searches in a row without success, from which on only every so many frames are searched. A failing search of twelve
+# spots costs 0.4 s, and an occluded screen may stay so for minutes. More points than before are searched at once.
+INTERVALS = ((0, 1), (20, 2), (100, 5), (300, 10), (1000, 20))
 
 
 def is_vague(model: SpotModel, h: Hypotheses | None, dt_s: float, dynamics: Dynamics) -> bool:
@@ -115,8 +117,8 @@ class SearchSchedule:
         # At once when spots reappear, then less and less often: a search that keeps failing will fail again.
         self.searches += 1
         more = points > before + 1
-        interval = 2 if self.searches < MANY_SEARCHES else 5
-        return more or self.searches <= DENSE_SEARCHES or self.searches % interval == 0
+        interval = next(frames for least, frames in reversed(INTERVALS) if self.searches > least)
+        return more or self.searches % interval == 0
 
     def _doubtful(self, best: Ints, found: Sequence[Detections | None]) -> bool:
         """Whether most spots of a camera are missing although it has as many other points.

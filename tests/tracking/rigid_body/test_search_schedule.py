@@ -43,6 +43,7 @@ def test_without_a_hypothesis_searches_become_less_frequent():
     assert frames[:20] == list(range(1, 21))
     assert frames[20:22] == [22, 24]
     assert frames[-3:] == [120, 125, 130]
+    assert searched(SearchSchedule(MODEL, MIN_SPOTS), None, False, 1100)[-3:] == [1060, 1080, 1100]
 
 
 def test_more_points_than_before_are_searched_at_once():
