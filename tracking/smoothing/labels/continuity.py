@@ -37,7 +37,8 @@ MIN_ONE_SIDED_PROBABILITY = 0.995
 MIN_LAST_PROBABILITY = 0.9999  # of the last label of a path that ends, just where a false point is not rare
 CORNER_PROBABILITY = 0.998  # of the labels of a row of points that continues a path across a corner
 MIN_ROW_SIGMA_PX = 0.1  # least error of the extrapolation along a row, for slight curvature
-MIN_SINGLE_CHAIN = 5  # frames in a row in which a single spot is followed; shorter chains are dropped
+# Frames in a row in which a single spot, or two alone, are followed; shorter chains are dropped.
+MIN_SINGLE_CHAIN, MIN_PAIR_CHAIN = 5, 3
 
 
 def continued(
@@ -68,15 +69,16 @@ def continued(
 
 
 def _isolated(out: Ints, before: Ints) -> Bools:
-    """(T, n): new labels that are the only one of their frame, except in chains of MIN_SINGLE_CHAIN frames.
+    """(T, n): new labels that are the only one or two of their frame, except in chains of enough frames.
 
-    If all spots are occluded for a frame or two, a false point near one of the paths is not rare.
+    If all spots are occluded for a frame or two, a false point near one of the paths is not rare, nor are two.
     """
     new = out != before
-    alone = new & (np.count_nonzero(out >= 0, axis=1) == 1)[:, None]
+    count = np.count_nonzero(out >= 0, axis=1)
+    alone = new & (count <= 2)[:, None]
     for view in range(new.shape[1]):
         for run in np.split(np.arange(len(new)), np.flatnonzero(np.diff(new[:, view].astype(np.int8))) + 1):
-            if len(run) >= MIN_SINGLE_CHAIN:
+            if len(run) >= (MIN_SINGLE_CHAIN if np.any(count[run] == 1) else MIN_PAIR_CHAIN):
                 alone[run, view] = False
     return np.asarray(alone)
 

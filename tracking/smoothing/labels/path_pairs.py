@@ -31,7 +31,7 @@ from tracking.smoothing.labels.view_path import PathContext, ViewPath
 from tracking.smoothing.motion.run_detections import RunDetections
 
 P_JUMP = 0.02  # probability per frame that a spot has moved by any distance that its speed allows
-P_GONE = 0.1  # probability per frame that one of the two is not visible any more
+P_GONE = 0.1  # probability per frame that one of the two is not visible any more, and that neither is
 MIN_PROBABILITY = 0.999  # of the two labels; and where the pair's path from the other side does not lead there:
 MIN_ONE_SIDED_PROBABILITY = 0.9999
 
@@ -176,7 +176,7 @@ class _Pair:
         both = here[:, None] * right / both_false * (1 - P_GONE) ** 2
         only_one = ((here / false).sum() + (there / other_false).sum()) * P_GONE * (1 - P_GONE)
         i, j = np.unravel_index(int(np.argmax(both)), both.shape)
-        p = float(both[i, j] / (both.sum() + only_one + P_GONE**2))
+        p = float(both[i, j] / (both.sum() + only_one + P_GONE))
         chosen = int(rows[i]), int(other_rows[j])
         if p < MIN_PROBABILITY or not self.first.allowed(k, chosen[0]) or not self.second.allowed(k, chosen[1]):
             return None
