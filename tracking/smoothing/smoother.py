@@ -50,6 +50,7 @@ from tracking.smoothing.smoothed import Smoothed
 
 MAX_ROUNDS = 4  # of motion and labels
 BRIEF_PROBABILITY = 0.9999  # least one of a label of a spot that is occluded before and after
+VAGUE_SIGMA_PX = 1.0  # a spot predicted worse than this may be labelled by its path although the pose is measured
 MAX_REPAIRS = 3  # times that velocity jumps are added where poses contradict their spots
 # Excess chi-square (6 degrees of freedom) of a frame's spots at the smoothed pose over that at their own pose, above
 # which the two contradict each other (p = 5e-11). The second limit, which half of all frames exceed by chance, holds
@@ -256,7 +257,7 @@ class _Smoother:
         cov = J @ motion.pose_P[:, None] @ np.swapaxes(J, -1, -2) + self.calibration_cov
         log_clutter = self._log_clutter(self.own.measured)
         known, sure = motion.known[:, None], (self.own.measured & self.trusted)[:, None]
-        vague = np.trace(cov, axis1=2, axis2=3) > MAX_CHECKING_SIGMA_PX**2
+        vague = np.trace(cov, axis1=2, axis2=3) > VAGUE_SIGMA_PX**2
         uv = np.where(known[..., None], uv, np.nan)
         context = PathContext(self.view_table.camera, uv, cov, log_clutter, ~known | ~sure | vague)
         transfers = transfers_between_cameras(self.rec.rig, self.model.views)
