@@ -11,7 +11,7 @@ from geometry.arrays import Array, Ints
 from geometry.compilation.jit import compiled, compiled_for_threads
 from tracking.detection import candidates, ellipse
 from tracking.detection.gaussian_fit import fit_all
-from tracking.detection.moments import find_moments
+from tracking.detection.moments import find_moments, start_variance
 from tracking.detection.pixels import Noise, Pixels, texture_variance
 from tracking.detection.regions import in_a_region
 from tracking.detection.saturated_spots import CENTRE_SHARE, compact_height
@@ -32,6 +32,7 @@ from tracking.detection.table import (
     PEAK,
     SCRATCH,
     SIGMA_FLUX,
+    START,
     UU,
     UV,
     VAR_U,
@@ -42,7 +43,13 @@ from tracking.detection.table import (
     V,
 )
 
-AT_U, AT_V, LEVEL, WIDE_PEAK = candidates.AT_U, candidates.AT_V, candidates.LEVEL, candidates.WIDE
+AT_U, AT_V, LEVEL, WIDE_PEAK, SCALE = (
+    candidates.AT_U,
+    candidates.AT_V,
+    candidates.LEVEL,
+    candidates.WIDE,
+    candidates.SCALE,
+)
 # Least decrease of chi-square by a spot, relative to threshold^2. The maximum of noise over positions and shapes is
 # higher than at one position: with 1.0 a picture of 1280x1024 has 0.04 false points, with 1.1 fewer than 0.01.
 _SPOT_GAIN = 1.1
@@ -80,7 +87,7 @@ def measure(
     for k in range(chosen.shape[0]):
         peak, spot = peaks[chosen[k]], table[k]
         spot[MOMENT_U], spot[MOMENT_V], spot[BACKGROUND] = peak[AT_U], peak[AT_V], peak[LEVEL]
-        spot[WIDE] = peak[WIDE_PEAK]
+        spot[WIDE], spot[START] = peak[WIDE_PEAK], start_variance(peak[SCALE])
     find_moments(image, table, cells)
     least = _LEAST_GAIN * limits.threshold_sigma**2
     fit_all(image, table, noise, limits.saturation, limits.max_sigma, least, cells, algebra)
