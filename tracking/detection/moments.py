@@ -36,7 +36,7 @@ _START_SHARE = 0.7  # variance of the first window over the square of the light'
 @compiled
 def start_variance(half_side: float) -> float:
     """Variance, px^2, of the first window for light that fills a square of this half side, px."""
-    return max(_START, _START_SHARE * half_side * half_side)
+    return _START_SHARE * half_side * half_side
 
 
 @compiled
@@ -47,7 +47,7 @@ def find_moments(image: Pixels, table: Array, cells: Array) -> None:
     Source: Bernstein & Jarvis (2002), "Shapes and shears, stars and smears", Astron. J. 123, section 3.
     """
     for i in range(table.shape[0]):
-        start = _START_WIDE if table[i, WIDE] else table[i, START]
+        start = _START_WIDE if table[i, WIDE] else max(table[i, START], _START)
         table[i, MOMENT_UU], table[i, MOMENT_UV], table[i, MOMENT_VV] = start, 0.0, start
     largest = 0.0
     for step in range(3):

@@ -41,8 +41,10 @@ DIP = 0.12  # share of the fainter peak by which the light must fall between two
 HALO_SHARE = 0.012  # ... and of the brighter peak: rings and halos of real beams have up to 0.009
 # Half sides, px, of the squares that are tried for the scale of a light, each with the one of half its size.
 _HALF_SIDES, _HALVED = (3, 4, 6, 8, 12, 16, 24), (2, 2, 3, 4, 6, 8, 12)
-_FILLED = 0.85  # least ratio of the two means: that of a Gaussian with a square of 0.83 sigmas to each side
+# Least ratio of the two means: that of a Gaussian with a square of 0.83 sigmas to each side.
+_FILLED = (0.88, 0.85, 0.85, 0.85, 0.85, 0.85, 0.85)
 _LEAST_FILLED = 0.5  # least ratio of the mean of the square to the peak: the square of a narrow spot is mostly dark
+_OUTLIER = 4.0  # sigmas of the means of 3x3 pixels in a square above which the peak is a narrow spot on other light
 _FIRST_SURROUNDINGS = 40  # px: distance of the background from a peak; of a wide one ...
 _SURROUNDINGS = 4  # ... this many half sides, 3.3 sigmas
 _LEVEL_HALF_SIDE = 4  # px: half side of the squares of the background
@@ -99,20 +101,21 @@ def find_separate_peaks(
         else:
             alone = True
             needed = max(DIP * peaks[i, HEIGHT], 4.0 / 3.0 * sqrt(2.0) * sqrt(variance(noise, peaks[i, LEVEL])))
-            found = _nearest_brighter(peaks, order, place, near, gaps)
-            for k in range(found):
+            for k in range(_nearest(peaks, i, order, place, near, gaps)):
                 lowest = _lowest_between(image, peaks, i, near[k], 1) - peaks[i, LEVEL]
                 least = max(needed, HALO_SHARE * peaks[near[k], HEIGHT])
                 alone = alone and peaks[i, HEIGHT] - lowest >= least
             if alone:
                 level = _find_scale(image, peaks[i], border)
-                half = int(peaks[i, SCALE])
-                for k in range(found if half > _NARROW else 0):
+                for k in range(_nearest(peaks, i, separate, count, near, gaps)):
+                    half = int(min(peaks[i, SCALE], peaks[near[k], SCALE]))
+                    if half < _NARROW:
+                        continue
                     if not alone:
                         break
                     height = _mean_of_square(image, peaks[i, AT_U], peaks[i, AT_V], half) - level
                     lowest = _lowest_between(image, peaks, i, near[k], half) - level
-                    alone = alone and height - lowest >= DIP * height
+                    alone = height - lowest >= DIP * height
         if alone:
             separate[count] = i
             count += 1
@@ -132,13 +135,16 @@ def _find_scale(image: Pixels, peak: Array, border: Array) -> float:
     u, v = peak[AT_U], peak[AT_V]
     for _ in range(2):
         level = min(level, _level_around(image, u, v, away, border))
-        scale, u, v = 1, peak[AT_U], peak[AT_V]
+        scale = 1
         for k in range(len(_HALF_SIDES)):
-            halved, u, v = _highest_square(image, u, v, _HALVED[k])
-            mean, u, v = _highest_square(image, u, v, _HALF_SIDES[k])
+            mean, u, v = _highest_square(image, peak[AT_U], peak[AT_V], _HALF_SIDES[k])
             if mean - level < _LEAST_FILLED * (top - level):
                 break
-            if mean - level >= _FILLED * (halved - level):
+            if top - mean > _OUTLIER * _scatter_of_means(image, u, v, _HALF_SIDES[k]):
+                scale = 1
+                break
+            halved, _, _ = _highest_square(image, u, v, _HALVED[k])
+            if mean - level >= _FILLED[k] * (halved - level):
                 scale = _HALF_SIDES[k]
         peak[SCALE], away = scale, _SURROUNDINGS * scale
         if away <= _FIRST_SURROUNDINGS:
@@ -173,6 +179,18 @@ def _highest_square(image: Pixels, u: float, v: float, half: int) -> tuple[float
 
 
 @compiled
+def _scatter_of_means(image: Pixels, u: float, v: float, half: int) -> float:
+    """The standard deviation, DN, of the means of 3x3 pixels in the square of (2 half + 1)^2 pixels about a point."""
+    total, squares, n = 0.0, 0.0, 0
+    column, row, step = int(np.rint(u)), int(np.rint(v)), max(half // 4, 1)
+    for i in range(row - half, row + half + 1, step):
+        for j in range(column - half, column + half + 1, step):
+            mean = mean3(image, clamped(j, image.width), clamped(i, image.height))
+            total, squares, n = total + mean, squares + mean * mean, n + 1
+    return sqrt(max(squares / n - (total / n) ** 2, 0.0))
+
+
+@compiled
 def _mean_of_square(image: Pixels, u: float, v: float, half: int) -> float:
     """The mean of about 9x9 evenly spaced pixels, at most, of the square of (2 half + 1)^2 pixels about a point, DN.
 
@@ -201,11 +219,11 @@ def _has_neighbour(peaks: Array, order: Ints, i: int) -> bool:
 
 
 @compiled
-def _nearest_brighter(peaks: Array, order: Ints, place: int, near: Ints, gaps: Array) -> int:
-    """The nearest of the peaks before `place` in `order`, at most MAX_COMPARED, into `near`; returns their number."""
-    i, filled = order[place], 0
-    for before in range(place):
-        j = order[before]
+def _nearest(peaks: Array, i: int, rows: Ints, count: int, near: Ints, gaps: Array) -> int:
+    """The peaks nearest to peak i among the first `count` rows, at most MAX_COMPARED, into `near`; their number."""
+    filled = 0
+    for k in range(count):
+        j = rows[k]
         du, dv = peaks[i, AT_U] - peaks[j, AT_U], peaks[i, AT_V] - peaks[j, AT_V]
         gap = du * du + dv * dv
         if not peaks[j, WIDE] and gap < RADIUS**2:
