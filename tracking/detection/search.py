@@ -44,8 +44,8 @@ _HALF_SIDES, _HALVED = (3, 4, 6, 8, 12, 16, 24), (2, 2, 3, 4, 6, 8, 12)
 # Least ratio of the two means: that of a Gaussian with a square of 0.83 sigmas to each side.
 _FILLED = (0.88, 0.85, 0.85, 0.85, 0.85, 0.85, 0.85)
 _LEAST_FILLED = 0.5  # least ratio of the mean of the square to the peak: the square of a narrow spot is mostly dark
-# A narrow spot on the light of a reflection: its height in sigmas of the means of 3x3 pixels in the square; and light of
-# this square above the background from the search, which contains the reflection, relative to the peak's.
+# A narrow spot on the light of a reflection: its height in sigmas of the means of 3x3 pixels in the square; and the
+# light of this square above the background from the search, which contains the reflection, relative to the peak's.
 _OUTLIER, _BESIDE, _LEAST_BESIDE = 4.0, 8, 0.2
 _FIRST_SURROUNDINGS = 40  # px: distance of the background from a peak; of a wide one ...
 _SURROUNDINGS = 4  # ... this many half sides, 3.3 sigmas
