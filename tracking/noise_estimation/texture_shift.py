@@ -22,6 +22,7 @@ _BLOCK = 8  # px: as in texture.py, so that the background is the same
 _WIDTHS_PX = (0.8, 1.6, 3.2, 6.4, 12.8)  # of spots; in between the errors are interpolated
 _LARGEST_CONTRAST = 0.3  # more is an edge or an object
 _REACH = 3.0  # sigmas of the kernel to each side
+_FEWER_PIXELS = 1.6  # pixels per sigma of a spot above which pixels are averaged in pairs
 _SAMPLED = 3  # px: step of the sample of the filters' outputs
 LARGEST_SHARE = 0.1  # of the spot's width: a larger error is not assumed
 
@@ -62,9 +63,16 @@ def texture_shift(pictures: Sequence[Picture], noise: NoiseModel) -> TextureShif
     level = np.maximum(background, 1.0)
     texture = np.clip((mean - background) / level, -_LARGEST_CONTRAST, _LARGEST_CONTRAST)
     sample = level[::_BLOCK, ::_BLOCK].astype(float)
+    cell = 1
     white = float(np.median(noise.variance(sample) / sample**2)) / len(pictures)
-    light = tuple(_shift(texture, s, 2, white) for s in _WIDTHS_PX)
-    return TextureShift(_WIDTHS_PX, light, tuple(_shift(texture, s, 1, white) for s in _WIDTHS_PX))
+    light, around = [], []
+    for sigma_px in _WIDTHS_PX:
+        if sigma_px > _FEWER_PIXELS * cell:
+            cell *= 2
+            texture = cv2.resize(texture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+        light.append(cell * _shift(texture, sigma_px / cell, 2, white / cell**2))
+        around.append(cell * _shift(texture, sigma_px / cell, 1, white / cell**2))
+    return TextureShift(_WIDTHS_PX, tuple(light), tuple(around))
 
 
 def _shift(texture: Array, sigma_px: float, power: int, white: float) -> float:
