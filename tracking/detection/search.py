@@ -43,7 +43,9 @@ HALO_SHARE = 0.012  # ... and of the brighter peak: rings and halos of real beam
 _HALF_SIDES, _HALVED = (3, 4, 6, 8, 12, 16, 24), (2, 2, 3, 4, 6, 8, 12)
 # Least ratio of the two means: that of a Gaussian with a square of 0.83 sigmas to each side.
 _FILLED = (0.88, 0.85, 0.85, 0.85, 0.85, 0.85, 0.85)
-_LEAST_FILLED = 0.5  # least ratio of the mean of the square to the peak: the square of a narrow spot is mostly dark
+_LEAST_FILLED = (
+    0.5  # least ratio of the mean of the square to the peak: that of a narrow spot is mostly empty
+)
 # A narrow spot on the light of a reflection: its height in sigmas of the means of 3x3 pixels in the square; and the
 # light of this square above the background from the search, which contains the reflection, relative to the peak's.
 _OUTLIER, _BESIDE, _LEAST_BESIDE = 4.0, 8, 0.2

@@ -11,9 +11,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from geometry.arrays import Array
 from tracking.noise import NoiseModel, Picture, quantile_variance
@@ -61,7 +63,7 @@ def texture_shift(pictures: Sequence[Picture], noise: NoiseModel) -> TextureShif
     coarse = cv2.resize(mean, (width // _BLOCK, height // _BLOCK), interpolation=cv2.INTER_AREA)
     background = cv2.resize(cv2.medianBlur(coarse, 5), (width, height), interpolation=cv2.INTER_LINEAR)
     level = np.maximum(background, 1.0)
-    texture = np.clip((mean - background) / level, -_LARGEST_CONTRAST, _LARGEST_CONTRAST)
+    texture: NDArray[Any] = np.clip((mean - background) / level, -_LARGEST_CONTRAST, _LARGEST_CONTRAST)
     sample = level[::_BLOCK, ::_BLOCK].astype(float)
     cell = 1
     white = float(np.median(noise.variance(sample) / sample**2)) / len(pictures)
@@ -69,13 +71,13 @@ def texture_shift(pictures: Sequence[Picture], noise: NoiseModel) -> TextureShif
     for sigma_px in _WIDTHS_PX:
         if sigma_px > _FEWER_PIXELS * cell:
             cell *= 2
-            texture = cv2.resize(texture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+            texture = np.asarray(cv2.resize(texture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
         light.append(cell * _shift(texture, sigma_px / cell, 2, white / cell**2))
         around.append(cell * _shift(texture, sigma_px / cell, 1, white / cell**2))
     return TextureShift(_WIDTHS_PX, tuple(light), tuple(around))
 
 
-def _shift(texture: Array, sigma_px: float, power: int, white: float) -> float:
+def _shift(texture: NDArray[Any], sigma_px: float, power: int, white: float) -> float:
     """Sigma, px, of the filter with G^power of a texture (h, w), less the part of white noise of this variance."""
     reach = int(np.ceil(_REACH * sigma_px / np.sqrt(power)))
     inner = reach + 2 * _BLOCK
