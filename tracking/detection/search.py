@@ -43,12 +43,10 @@ HALO_SHARE = 0.012  # ... and of the brighter peak: rings and halos of real beam
 _HALF_SIDES, _HALVED = (3, 4, 6, 8, 12, 16, 24), (2, 2, 3, 4, 6, 8, 12)
 # Least ratio of the two means: that of a Gaussian with a square of 0.83 sigmas to each side.
 _FILLED = (0.88, 0.85, 0.85, 0.85, 0.85, 0.85, 0.85)
-_LEAST_FILLED = (
-    0.5  # least ratio of the mean of the square to the peak: that of a narrow spot is mostly empty
-)
+_LEAST_FILLED = 0.5  # least ratio of the mean of the square to the peak: that of a narrow spot is mostly empty
 # A narrow spot on the light of a reflection: its height in sigmas of the means of 3x3 pixels in the square; and the
-# light of this square above the background from the search, which contains the reflection, relative to the peak's.
-_OUTLIER, _BESIDE, _LEAST_BESIDE = 4.0, 8, 0.2
+# light of small squares above the background from the search, which contains the reflection, relative to the peak's.
+_OUTLIER, _LEAST_BESIDE = 4.0, 0.2
 _FIRST_SURROUNDINGS = 40  # px: distance of the background from a peak; of a wide one ...
 _SURROUNDINGS = 4  # ... this many half sides, 3.3 sigmas
 _LEVEL_HALF_SIDE = 4  # px: half side of the squares of the background
@@ -147,7 +145,7 @@ def _find_scale(image: Pixels, peak: Array, border: Array) -> float:
             mean, u, v = _highest_square(image, peak[AT_U], peak[AT_V], _HALF_SIDES[k])
             if mean - level < _LEAST_FILLED * (top - level):
                 break
-            beside = _HALF_SIDES[k] == _BESIDE and mean - peak[LEVEL] < _LEAST_BESIDE * peak[HEIGHT]
+            beside = 4 <= _HALF_SIDES[k] <= 8 and mean - peak[LEVEL] < _LEAST_BESIDE * peak[HEIGHT]
             if beside or top - mean > _OUTLIER * _scatter_of_means(image, u, v, _HALF_SIDES[k]):
                 scale = 1
                 break
