@@ -21,7 +21,7 @@ from geometry.arrays import Array
 from tracking.noise import NoiseModel, Picture, quantile_variance
 
 _BLOCK = 8  # px: as in texture.py, so that the background is the same
-_WIDTHS_PX = (0.8, 1.6, 3.2, 6.4, 12.8)  # of spots; in between the errors are interpolated
+_WIDTHS_PX = (0.8, 1.6, 3.2)  # of spots; wider ones have the last error: that of a grain finer than the spot
 _LARGEST_CONTRAST = 0.3  # more is an edge or an object
 _REACH = 3.0  # sigmas of the kernel to each side
 _FEWER_PIXELS = 1.6  # pixels per sigma of a spot above which pixels are averaged in pairs
