@@ -16,12 +16,8 @@ from numpy.typing import NDArray
 from geometry.arrays import Array, Ints
 from geometry.compilation.jit import compiled
 from tracking.detection.block_search import BACKGROUND, BLOCK, HIGHEST8, Blocks
-from tracking.detection.pixels import Noise, Pixels, clamped, mean3, mirrored, pixel, texture_variance, variance
+from tracking.detection.pixels import Noise, Pixels, clamped, mirrored, pixel, texture_variance, variance
 
-RADIUS = 48  # px: peaks farther apart than this are never parts of one spot of the largest size
-MAX_COMPARED = 4  # number of brighter peaks that a peak is compared with
-DIP = 0.12  # share of the fainter peak by which the light must fall between two spots: speckle falls by less
-HALO_SHARE = 0.012  # ... and of the brighter peak: rings and halos of real beams have up to 0.009
 # Mean light of the four neighbours relative to the pixel's: 0.15 for the sharpest spot (1 px wide), 0 for a hot pixel.
 HOT_SHARE = 0.08
 HOT_SIGMAS = 4.0  # least excess of a hot pixel over its surroundings
@@ -33,9 +29,11 @@ _WEAK_SHARE = 0.7  # ... by this share of the threshold
 _WIDE_CLIP = 4.0  # sigmas above the background at which pixels are clipped in the search for wide faint spots
 
 
-# Columns of peaks (most, 5): position, px; mean of 3x3 pixels above the background, and the background, DN; 1 if only
-# the mean of 8x8 pixels detects the peak.
-AT_U, AT_V, HEIGHT, LEVEL, WIDE = range(5)
+# Columns of peaks (most, PEAK_COLUMNS): position, px; mean of 3x3 pixels above the background, and the background, DN;
+# 1 if only the mean of 8x8 pixels detects the peak; half side, px, of the square that the light around it fills, 1 for
+# a narrow spot (found by search.find_separate_peaks).
+AT_U, AT_V, HEIGHT, LEVEL, WIDE, SCALE = range(6)
+PEAK_COLUMNS = 6
 
 
 def block_workspace() -> Array:
@@ -50,7 +48,7 @@ class PeakSearch(NamedTuple):
     noise: Noise
     blocks: Blocks
     workspace: Array  # see `block_workspace`
-    peaks: Array  # (most, 5), the peaks found
+    peaks: Array  # (most, PEAK_COLUMNS), the peaks found
 
 
 @compiled
@@ -237,7 +235,7 @@ def _wide_peak(search: PeakSearch, row: int, column: int, min_sigmas: float, cou
 @compiled
 def _store_peak(peaks: Array, row: int, u: int, v: int, height: float, level: float, wide: float) -> None:
     peak = peaks[row]
-    peak[AT_U], peak[AT_V], peak[HEIGHT], peak[LEVEL], peak[WIDE] = u, v, height, level, wide
+    peak[AT_U], peak[AT_V], peak[HEIGHT], peak[LEVEL], peak[WIDE], peak[SCALE] = u, v, height, level, wide, 1.0
 
 
 @compiled
@@ -268,69 +266,3 @@ def _mean8(image: Pixels, u: int, v: int, top: float) -> float:
         for j in range(u - 4, u + 4):
             total += min(pixel(image, clamped(j, image.width), clamped(i, image.height)), top)
     return total / 64.0
-
-
-@compiled
-def find_separate_peaks(
-    image: Pixels, peaks: Array, order: Ints, noise: Noise, separate: Ints, near: Ints, gaps: Array
-) -> int:
-    """The rows of separate spots among the peaks, into `separate`; returns their number. order: brightest peak first.
-
-    Between a peak and each of the nearest brighter ones the light must fall by `DIP` of the fainter peak, and by four
-    sigmas of the difference of two means of nine pixels. A wide faint peak must have no other peak within 16 px.
-    `near`, `gaps` (MAX_COMPARED,) are workspace.
-    """
-    count = 0
-    for place in range(order.shape[0]):
-        i = order[place]
-        if peaks[i, WIDE]:
-            alone = not _has_neighbour(peaks, order, i)
-        else:
-            alone = True
-            needed = max(DIP * peaks[i, HEIGHT], 4.0 / 3.0 * sqrt(2.0) * sqrt(variance(noise, peaks[i, LEVEL])))
-            for k in range(_nearest_brighter(peaks, order, place, near, gaps)):
-                lowest = _lowest_between(image, peaks, i, near[k]) - peaks[i, LEVEL]
-                least = max(needed, HALO_SHARE * peaks[near[k], HEIGHT])
-                alone = alone and peaks[i, HEIGHT] - lowest >= least
-        if alone:
-            separate[count] = i
-            count += 1
-    return count
-
-
-@compiled
-def _has_neighbour(peaks: Array, order: Ints, i: int) -> bool:
-    for place in range(order.shape[0]):
-        j = order[place]
-        if (
-            not peaks[j, WIDE]
-            and abs(peaks[i, AT_U] - peaks[j, AT_U]) < 16
-            and abs(peaks[i, AT_V] - peaks[j, AT_V]) < 16
-        ):
-            return True
-    return False
-
-
-@compiled
-def _nearest_brighter(peaks: Array, order: Ints, place: int, near: Ints, gaps: Array) -> int:
-    """The nearest of the peaks before `place` in `order`, at most MAX_COMPARED, into `near`; returns their number."""
-    i, filled = order[place], 0
-    for before in range(place):
-        j = order[before]
-        du, dv = peaks[i, AT_U] - peaks[j, AT_U], peaks[i, AT_V] - peaks[j, AT_V]
-        gap = du * du + dv * dv
-        if not peaks[j, WIDE] and gap < RADIUS**2:
-            filled = insert_nearest(near, gaps, filled, MAX_COMPARED, gap, j)
-    return filled
-
-
-@compiled
-def _lowest_between(image: Pixels, peaks: Array, i: int, j: int) -> float:
-    """The lowest mean of 3x3 pixels at eleven points on the line between two peaks."""
-    lowest = np.inf
-    for k in range(1, 12):
-        share = k / 12.0
-        u = peaks[i, AT_U] * (1 - share) + peaks[j, AT_U] * share
-        v = peaks[i, AT_V] * (1 - share) + peaks[j, AT_V] * share
-        lowest = min(lowest, mean3(image, int(np.rint(u)), int(np.rint(v))))
-    return lowest

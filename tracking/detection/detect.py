@@ -15,16 +15,15 @@ from tracking.detection.candidates import (
     AT_U,
     AT_V,
     HEIGHT,
-    MAX_COMPARED,
+    PEAK_COLUMNS,
     PeakSearch,
     block_workspace,
-    find_separate_peaks,
 )
 from tracking.detection.gaussian_fit import reach_of
 from tracking.detection.measuring import DetectionLimits, measure, write_detections
 from tracking.detection.pixels import Noise, Pixels
 from tracking.detection.regions import INITIAL_REACH, MARGIN, boxes_of, find_relevant
-from tracking.detection.search import BORDER_BLOCKS, find_peaks_in
+from tracking.detection.search import BORDER_BLOCKS, MAX_COMPARED, find_peaks_in, find_separate_peaks
 from tracking.detection.table import ALGEBRA, CELL_ROWS, CELL_SIZE, COLUMNS, MOST_CELLS
 from tracking.detections import Detections
 from tracking.noise import NoiseModel, Picture, guess_noise
@@ -74,7 +73,7 @@ class SpotFinder:
         self._runs = np.zeros((rows + 4, 3), np.int64)
         self._searched = np.zeros((rows, columns), np.uint8)
         self._bright_blocks = np.zeros((rows * columns, 3), np.int64)
-        self._workspace, self._peaks = block_workspace(), np.zeros((4 * rows * columns, 5))
+        self._workspace, self._peaks = block_workspace(), np.zeros((4 * rows * columns, PEAK_COLUMNS))
         self._separate, self._near, self._gaps = (
             np.zeros(4 * most, np.int64),
             np.zeros(MAX_COMPARED, np.int64),

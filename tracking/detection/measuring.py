@@ -11,7 +11,7 @@ from geometry.arrays import Array, Ints
 from geometry.compilation.jit import compiled, compiled_for_threads
 from tracking.detection import candidates, ellipse
 from tracking.detection.gaussian_fit import fit_all
-from tracking.detection.moments import find_moments
+from tracking.detection.moments import find_moments, start_variance
 from tracking.detection.pixels import Noise, Pixels, texture_variance
 from tracking.detection.regions import in_a_region
 from tracking.detection.saturated_spots import CENTRE_SHARE, compact_height
@@ -32,6 +32,7 @@ from tracking.detection.table import (
     PEAK,
     SCRATCH,
     SIGMA_FLUX,
+    START,
     UU,
     UV,
     VAR_U,
@@ -42,7 +43,13 @@ from tracking.detection.table import (
     V,
 )
 
-AT_U, AT_V, LEVEL, WIDE_PEAK = candidates.AT_U, candidates.AT_V, candidates.LEVEL, candidates.WIDE
+AT_U, AT_V, LEVEL, WIDE_PEAK, SCALE = (
+    candidates.AT_U,
+    candidates.AT_V,
+    candidates.LEVEL,
+    candidates.WIDE,
+    candidates.SCALE,
+)
 # Least decrease of chi-square by a spot, relative to threshold^2. The maximum of noise over positions and shapes is
 # higher than at one position: with 1.0 a picture of 1280x1024 has 0.04 false points, with 1.1 fewer than 0.01.
 _SPOT_GAIN = 1.1
@@ -52,6 +59,9 @@ _SPOT_FLUX = (
 )
 _LEAST_GAIN = 0.7  # decrease of chi-square relative to threshold^2 below which the fit stops early
 NARROWER = 0.5  # a spot narrower than this share of another spot is not a duplicate of it
+_PART_APART = 2.0  # sigmas: fits that are nearer to each other are parts of one light
+_MERGES = 3  # fits of a picture at most, with parts joined in between
+_NOTHING = 1e12  # px^2: variance of the start of a candidate that has been joined to another one; the fit leaves it out
 _SAME_SPOT = 1.5  # sigmas of a brighter spot: a second spot nearer to its centre is a duplicate
 
 
@@ -80,10 +90,13 @@ def measure(
     for k in range(chosen.shape[0]):
         peak, spot = peaks[chosen[k]], table[k]
         spot[MOMENT_U], spot[MOMENT_V], spot[BACKGROUND] = peak[AT_U], peak[AT_V], peak[LEVEL]
-        spot[WIDE] = peak[WIDE_PEAK]
+        spot[WIDE], spot[START] = peak[WIDE_PEAK], start_variance(peak[SCALE])
     find_moments(image, table, cells)
     least = _LEAST_GAIN * limits.threshold_sigma**2
-    fit_all(image, table, noise, limits.saturation, limits.max_sigma, least, cells, algebra)
+    for _ in range(_MERGES):
+        fit_all(image, table, noise, limits.saturation, limits.max_sigma, least, cells, algebra)
+        if not _merge_parts(table):
+            break
     for k in range(chosen.shape[0]):
         spot = table[k]
         spot[ACCEPTED] = (
@@ -92,6 +105,41 @@ def measure(
             else 0.0
         )
     _drop_duplicates(table)
+
+
+@compiled
+def _merge_parts(table: Array) -> bool:
+    """Join fits that are parts of one light into one start of another fit; whether there are any.
+
+    The sum of two equal Gaussians has two maxima only if they are more than two sigmas apart. Two fits that are nearer
+    to each other and about equally wide were therefore not two lights, but speckle of one.
+    """
+    found = False
+    for i in range(table.shape[0]):
+        spot = table[i]
+        for j in range(i + 1, table.shape[0]):
+            other = table[j]
+            if not (spot[FLUX] > 0.0 and other[FLUX] > 0.0):
+                continue
+            own = (spot[UU] + 1 / 12) * (spot[VV] + 1 / 12) - spot[UV] ** 2
+            its = (other[UU] + 1 / 12) * (other[VV] + 1 / 12) - other[UV] ** 2
+            du, dv = other[U] - spot[U], other[V] - spot[V]
+            if min(own, its) < NARROWER**4 * max(own, its):
+                continue
+            uu, uv, vv = 0.5 * (spot[UU] + other[UU]), 0.5 * (spot[UV] + other[UV]), 0.5 * (spot[VV] + other[VV])
+            if ellipse.mahalanobis(du, dv, uu + 1 / 12, uv, vv + 1 / 12) < _PART_APART:
+                share = other[FLUX] / (spot[FLUX] + other[FLUX])
+                between = share * (1.0 - share)
+                spot[MOMENT_U], spot[MOMENT_V] = spot[U] + share * du, spot[V] + share * dv
+                spot[MOMENT_UU] = (1.0 - share) * spot[UU] + share * other[UU] + between * du * du
+                spot[MOMENT_UV] = (1.0 - share) * spot[UV] + share * other[UV] + between * du * dv
+                spot[MOMENT_VV] = (1.0 - share) * spot[VV] + share * other[VV] + between * dv * dv
+                spot[U], spot[V] = spot[MOMENT_U], spot[MOMENT_V]
+                spot[UU], spot[UV], spot[VV] = spot[MOMENT_UU], spot[MOMENT_UV], spot[MOMENT_VV]
+                spot[FLUX], other[FLUX] = spot[FLUX] + other[FLUX], 0.0
+                other[MOMENT_UU], other[MOMENT_UV], other[MOMENT_VV] = _NOTHING, 0.0, _NOTHING
+                found = True
+    return found
 
 
 @compiled

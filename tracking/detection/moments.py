@@ -21,6 +21,7 @@ from tracking.detection.table import (
     MOMENT_VV,
     ROW,
     SCRATCH,
+    START,
     STATE,
     VALUES,
     WIDE,
@@ -28,18 +29,25 @@ from tracking.detection.table import (
 
 # Growing windows: half the number of cells, cell size, iterations, and the largest 1-sigma half axis (px) for each.
 _WINDOWS = ((9, 1, 3, 3.5), (18, 2, 5, 9.0), (18, 4, 5, np.inf))
-_START, _START_WIDE = 2.0, 16.0  # px^2: variance of the first window; of wide faint peaks
+_START, _START_WIDE = 2.0, 16.0  # px^2: least variance of the first window; that of wide faint peaks
+_START_SHARE = 0.7  # variance of the first window over the square of the light's half side: half the light's variance
+
+
+@compiled
+def start_variance(half_side: float) -> float:
+    """Variance, px^2, of the first window for light that fills a square of this half side, px."""
+    return _START_SHARE * half_side * half_side
 
 
 @compiled
 def find_moments(image: Pixels, table: Array, cells: Array) -> None:
-    """Moments and flux of candidates (n, COLUMNS), starting from MOMENT_U, MOMENT_V, above the BACKGROUND.
+    """Moments and flux of candidates (n, COLUMNS), starting from MOMENT_U, MOMENT_V, START, above the BACKGROUND.
 
     Accurate to about a tenth of a pixel, which is enough to start a fit.
     Source: Bernstein & Jarvis (2002), "Shapes and shears, stars and smears", Astron. J. 123, section 3.
     """
     for i in range(table.shape[0]):
-        start = _START_WIDE if table[i, WIDE] else _START
+        start = _START_WIDE if table[i, WIDE] else max(table[i, START], _START)
         table[i, MOMENT_UU], table[i, MOMENT_UV], table[i, MOMENT_VV] = start, 0.0, start
     largest = 0.0
     for step in range(3):
@@ -48,7 +56,7 @@ def find_moments(image: Pixels, table: Array, cells: Array) -> None:
             spot = table[i]
             # Only candidates that have outgrown the previous window are measured in the next one.
             high = ellipse.eigenvalues(spot[MOMENT_UU], spot[MOMENT_UV], spot[MOMENT_VV])[1]
-            if (step > 0 and high <= largest) or (step == 0 and spot[WIDE]):
+            if (step > 0 and high <= largest) or (step == 0 and (spot[WIDE] or high > limit**2)):
                 continue
             spot[CELL_SIZE] = cell
             window = window_around(spot[MOMENT_U], spot[MOMENT_V], half, half, cell)

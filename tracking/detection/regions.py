@@ -1,7 +1,7 @@
 """Search in parts of a picture, with the same results as from the whole picture.
 
 The measurement of a spot depends on its neighbours: separate peaks are decided with the brighter peaks within
-candidates.RADIUS, and the light of other spots within gaussian_fit.reach_of is subtracted. The search is therefore
+search.RADIUS, and the light of other spots within gaussian_fit.reach_of is subtracted. The search is therefore
 extended around each peak of a region, and around the peaks found in this way, until there are no more.
 """
 
@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from geometry.arrays import Array, Ints
 from geometry.compilation.jit import compiled
 from tracking.detection.block_search import BLOCK
-from tracking.detection.candidates import AT_U, AT_V, RADIUS
+from tracking.detection.candidates import AT_U, AT_V
+from tracking.detection.search import RADIUS
 
 MARGIN = 16  # px: largest distance of a peak from its spot's centre
 
@@ -55,7 +56,7 @@ def find_relevant(
     peaks: Array, regions: Array, reach: Array, searched: NDArray[np.uint8], width: int, height: int, relevant: Ints,
     boxes: Ints,
 ) -> int:  # fmt: skip
-    """Find the peaks (n, 5) that affect the regions (n, 3), and the boxes of blocks still to be searched for others.
+    """Find the peaks (n, PEAK_COLUMNS) that affect the regions (n, 3), and the boxes of blocks still to be searched.
 
     reach (n,), px: largest distance of other peaks that affect each peak. relevant (n,) becomes positive for the peaks
     that affect the regions; returns the number of boxes.

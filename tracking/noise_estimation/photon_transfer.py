@@ -10,7 +10,7 @@ pixels can lead to an impossible sensor. The combination is ours.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from tracking.noise_estimation.levels import LEAST_PIXELS, LEVELS, SIDE, LevelVa
 from tracking.noise_estimation.rounding import banding
 from tracking.noise_estimation.spot_residuals import SpotResiduals, residuals_of_spots
 from tracking.noise_estimation.texture import texture_of
+from tracking.noise_estimation.texture_shift import TextureShift, texture_shift
 from tracking.parameters import DetectParameters
 
 _WELL_E = (1_000.0, 200_000.0)  # electrons at full scale: range from the smallest to the largest sensors
@@ -33,6 +34,7 @@ _SURE = 0.25  # sigma of the slope's logarithm up to which photon transfer alone
 _MOST_SPOTS = 40  # per picture: the brightest
 _LEAST_OF_SPOTS, _MOST_OF_SPOTS = 30, 300  # pixels per brightness class; residuals of one spot are not independent
 _CONTRASTS = (0.0, 0.005, 0.01, 0.02, 0.04, 0.08, 0.16, 0.32)  # contrasts of the light's grain that are tried
+_FEW_STEPS = 20  # grey values of a background below which one step is more than its texture
 _GRAIN_SIGMA = 0.5  # relative uncertainty of the grain's variance
 
 
@@ -47,6 +49,7 @@ class NoiseEstimate:
     step_dn: float  # grey values are multiples of this: 16 for 12 bits stored in the upper bits of 16
     pictures: int  # number of pictures used
     temporal: bool  # from differences in time; False: within pictures, where structure counts as noise
+    texture_shift: TextureShift = field(default_factory=TextureShift.none)  # errors of spots due to texture
 
 
 def estimate_noise(pictures: Sequence[Picture]) -> NoiseEstimate:
@@ -83,7 +86,10 @@ def estimate_noise(pictures: Sequence[Picture]) -> NoiseEstimate:
         slope, slope_sigma = lines.slope(rounding)
     model = replace(first, slope_dn=slope, floor_dn2=lines.model(slope, rounding).floor_dn2)
     floor_sigma = float(np.interp(slope, lines.slopes, lines.floor_sigma)) / model.floor_dn2
-    return NoiseEstimate(model, floor_sigma, slope_sigma, saturation, step, len(usable), levels.temporal)
+    # With little noise on a background of few grey values their steps look like texture.
+    stepped = background < _FEW_STEPS * step and model.floor_dn2 < step**2
+    shift = TextureShift.none() if stepped else texture_shift(usable, model)
+    return NoiseEstimate(model, floor_sigma, slope_sigma, saturation, step, len(usable), levels.temporal, shift)
 
 
 def _small_picture_variance(pictures: Sequence[Picture]) -> float:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from geometry.arrays import Array, Bools, Ints
@@ -16,6 +18,9 @@ from tracking.smoothing.motion.run_detections import RunDetections, labelled_poi
 # makes 0.04, speckle of contrast 0.3 makes 0.1.
 LARGEST_WIDTH_SHARE = 0.1
 _FRAMES = 300  # from which the width share is estimated
+_LEAST_CHANGES = 20  # changes of a width from which its scatter is estimated
+_MEDIAN_CHI2 = 0.4549364  # median of chi-square with one degree of freedom
+_CLEAR_SCATTER = 2.0  # ratio of the widths' variance to the stated one from which it is used
 
 
 def width_covariance(width_px: Array, share: float) -> Array:
@@ -41,6 +46,42 @@ def width_share(
 
     if variance_factor(0.0) <= DEADBAND:
         return 0.0
+    return _share_with(variance_factor)
+
+
+def scattered_width_share(detections: RunDetections, assigned: Ints) -> float:
+    """Errors beyond the stated ones as a share of the spots' widths, from the scatter of the widths; 0 if none show.
+
+    Whatever changes the light from place to place (noise, texture, speckle) shifts a fitted Gaussian and changes its
+    width by the same amount: the derivatives with respect to both have the same norm once that of the amplitude is
+    projected out. A width's second difference over three frames therefore has six times the variance of a coordinate of
+    the centre. It needs no other spot, and motion that is steady in the picture cancels. Errors that last for three
+    frames do not show: a lower bound. Source: ours; measured on 60 random recordings, where both scatters have a
+    correlation of 0.96 and agree within 20 % (1 sigma).
+    """
+    labelled = (assigned >= 0) & (assigned < BLENDED)
+    row = np.where(labelled, detections.begin[: len(assigned), None] + assigned, 0)
+    size = (
+        np.where(labelled, detections.size_px[row], np.nan) if len(detections.size_px) else np.full(row.shape, np.nan)
+    )
+    change = size[2:] - 2 * size[1:-1] + size[:-2]
+    known = np.isfinite(change)
+    if np.count_nonzero(known) < _LEAST_CHANGES:
+        return 0.0
+    square = change[known] ** 2 / 6
+    stated = np.linalg.eigvalsh(detections.cov[row[1:-1][known]])[:, 1]
+    width2 = size[1:-1][known] ** 2
+
+    def ratio(share: float) -> float:
+        return float(np.median(square / (stated + share**2 * width2))) / _MEDIAN_CHI2
+
+    if ratio(0.0) <= _CLEAR_SCATTER:
+        return 0.0
+    return _share_with(ratio)
+
+
+def _share_with(variance_factor: Callable[[float], float]) -> float:
+    """The share of the widths, at most LARGEST_WIDTH_SHARE, with which a decreasing variance factor is 1."""
     low, high = 0.0, LARGEST_WIDTH_SHARE
     if variance_factor(high) > 1.0:
         return high

@@ -93,7 +93,7 @@ class _Products:
     same_error_frames: Array  # (T, n) number of frames with the same errors
     near: float  # weighted with the correlation of their places, less what the calibration explains
     expected: float  # the same if all errors belonged to places
-    elsewhere: float  # mean over pairs in different places
+    elsewhere: float  # mean over pairs in different places, as far as significant
 
     @property
     def significance(self) -> float:
@@ -103,7 +103,7 @@ class _Products:
 
 def _products(residual: Array, uv_px: Array, reach_px: Array, explained: Array) -> _Products:
     same_error_frames = np.ones(residual.shape[:2])
-    near = expected = far = far_pairs = 0.0
+    near = expected = far = far_pairs = independent = 0.0
     for view in range(residual.shape[1]):
         rows = np.flatnonzero(np.isfinite(residual[:, view]).all(axis=-1))
         mean_square = float(np.mean(np.sum(residual[rows, view] ** 2, axis=-1))) if len(rows) > 1 else 0.0
@@ -115,10 +115,14 @@ def _products(residual: Array, uv_px: Array, reach_px: Array, explained: Array) 
             products = r @ r.T / mean_square
             rho = correlation(np.linalg.norm(at[:, None] - at[None], axis=-1), reach_px[view])
             far += float(np.sum(products[rho == 0]))
-            far_pairs += float(np.count_nonzero(rho == 0))
+            pairs = float(np.count_nonzero(rho == 0))
+            far_pairs += pairs
             np.fill_diagonal(rho, 0.0)
             same_error_frames[some, view] = 1 + rho.sum(axis=1)
+            independent += 0.5 * pairs / float(np.mean(same_error_frames[some, view])) ** 2
             # Each pair is counted twice.
             near += 0.5 * float(np.sum(rho * products) - explained[view] * np.sum(rho**2))
             expected += 0.5 * float(np.sum(rho**2))
-    return _Products(reach_px, same_error_frames, near, expected, max(far / far_pairs, 0.0) if far_pairs else 0.0)
+    # Less one sigma: a spot that hardly moves shows few places that differ, and their errors may agree by chance.
+    elsewhere = far / far_pairs - np.sqrt(0.5 / independent) if far_pairs else 0.0
+    return _Products(reach_px, same_error_frames, near, expected, max(elsewhere, 0.0))

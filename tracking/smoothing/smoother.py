@@ -31,7 +31,13 @@ from tracking.rigid_body.hypotheses.prediction_checks import (
 from tracking.rigid_body.models.information import well_controlled
 from tracking.smoothing.backward import merged, track_backward
 from tracking.smoothing.calibration_errors import calibration_errors
-from tracking.smoothing.error_scale import noise_scale, usual_sizes, width_covariance, width_share
+from tracking.smoothing.error_scale import (
+    noise_scale,
+    scattered_width_share,
+    usual_sizes,
+    width_covariance,
+    width_share,
+)
 from tracking.smoothing.exposure import exposure_offsets, pose_shift
 from tracking.smoothing.labels.clutter import run_log_clutter, run_log_static
 from tracking.smoothing.labels.continuity import continued
@@ -105,7 +111,10 @@ class _Smoother:
         ref = straight_between(rec.poses, self.measured, np.cumsum(rec.dt_s))
         every = rec.run_detections()
         self.calibration_cov, self.systematic = calibration_errors(rec, every, self.assigned, ref)
-        self.width_share = width_share(self.views, every, self.assigned, self.calibration_cov, ref, self.measured)
+        self.width_share = max(
+            width_share(self.views, every, self.assigned, self.calibration_cov, ref, self.measured),
+            scattered_width_share(every, self.assigned),
+        )
         every = every._replace(cov=every.cov + width_covariance(every.size_px, self.width_share))
         self.scale = noise_scale(self.views, every, self.assigned, self.calibration_cov, ref, self.measured)
         self.detections = every._replace(

@@ -67,11 +67,11 @@ class CameraNoise:
         if len(found):
             self._blank = 0
             self._recent.clear()
-            return found
+            return self._with_texture(found)
         self._recent.append(picture)
         self._blank += 1
         if self._blank % _BLANK_AGAIN == _BLANK and len(self._search(picture, parameters, guess_noise(picture))):
-            return self._estimate_again(picture, parameters)
+            return self._with_texture(self._estimate_again(picture, parameters))
         return found
 
     def as_mapping(self) -> dict[str, Any]:
@@ -90,6 +90,15 @@ class CameraNoise:
         if known is None and self.estimate is not None:
             parameters = replace(parameters, saturation_dn=self.estimate.saturation_dn)
         return find_spots(picture, parameters, model)
+
+    def _with_texture(self, found: Detections) -> Detections:
+        """The points with covariances that include the errors due to the screen's texture."""
+        if self.estimate is None or not len(found):
+            return found
+        level = max(self.estimate.model.black_dn, 1.0)
+        width = np.sqrt(found.major_px * found.minor_px)
+        added = self.estimate.texture_shift.sigma_px(width, found.peak / level)
+        return replace(found, cov_px2=found.cov_px2 + (np.nan_to_num(added) ** 2)[:, None, None] * np.eye(2))
 
     def _update_model(self) -> None:
         """Stated values take precedence; texture and banding are always estimated, since a data sheet has none."""

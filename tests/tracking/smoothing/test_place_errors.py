@@ -91,3 +91,27 @@ def test_a_pose_of_one_frame_keeps_its_covariance():
     errors = PlaceErrors(0.7, np.full(3, 50.0), np.full(6, 2.0))
     assert errors.factor(np.ones(3)) == pytest.approx(1.0)
     assert errors.factor(np.full(3, 1e6)) == pytest.approx(1 + 0.7 * 49)
+
+
+def test_a_spot_that_shows_hardly_two_places_does_not_say_that_errors_are_the_same_everywhere():
+    """Errors of places, drawn with their correlation, along a path of 3.5 widths; their ends agree by chance."""
+    frames, width = 60, 10.0
+    uv_px = np.zeros((frames, 1, 2))
+    uv_px[:, 0, 0] = np.linspace(0, 3.5 * width, frames)
+    distance = np.abs(uv_px[:, None, 0, 0] - uv_px[None, :, 0, 0])
+    root = np.linalg.cholesky(np.exp(-0.25 * (distance / width) ** 2) + 1e-6 * np.eye(frames))
+    seen = []
+    for seed in range(40):
+        residual = (root @ np.random.default_rng(seed).normal(size=(frames, 2)))[:, None]
+        found = place_errors(residual, uv_px, np.array([width]), np.ones(frames), np.zeros(1))
+        seen.append(found.elsewhere)
+    assert np.mean(np.array(seen) > 0.1) < 0.05
+
+
+def test_errors_that_are_the_same_at_many_places_of_a_spot_are_errors_of_the_rig():
+    frames = 60
+    uv_px = np.zeros((frames, 1, 2))
+    uv_px[:, 0, 0] = np.linspace(0, 2000, frames)
+    residual = np.array([1.5, -1.0]) + 0.3 * np.random.default_rng(3).normal(size=(frames, 1, 2))
+    found = place_errors(residual, uv_px, np.array([10.0]), np.ones(frames), np.zeros(1))
+    assert 0.7 < found.elsewhere < 1.2

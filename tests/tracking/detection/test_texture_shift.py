@@ -1,0 +1,69 @@
+"""Errors of spots by the texture of the screen, predicted from the background alone."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from geometry.arrays import Array
+from tracking.detection.detect import find_spots
+from tracking.noise import NoiseModel, Picture
+from tracking.noise_estimation.photon_transfer import estimate_noise
+from tracking.noise_estimation.texture_shift import LARGEST_SHARE, TextureShift
+
+SIZE = (400, 500)
+BACKGROUND, NOISE = 600.0, 3.0  # DN
+
+
+def screen(contrast: float, grain_px: float, seed: int) -> Array:
+    """The reflectance (h, w) of a textured screen."""
+    smooth = cv2.GaussianBlur(np.random.default_rng(seed).standard_normal(SIZE), (0, 0), grain_px)
+    return np.asarray(1 + contrast * smooth / smooth.std())
+
+
+def pictures(reflectance: Array, light: Array | float, count: int) -> list[Picture]:
+    rng = np.random.default_rng(7)
+    expected = reflectance * (BACKGROUND + light)
+    return [np.rint(expected + NOISE * rng.standard_normal(SIZE)).astype(np.uint16) for _ in range(count)]
+
+
+def spots(sigma_px: float, peak: float, seed: int) -> tuple[Array, Array]:
+    """Centres (n, 2) of Gaussian spots far apart, and their light (h, w)."""
+    rng = np.random.default_rng(seed)
+    u, v = np.meshgrid(np.arange(50.0, 460, 80), np.arange(50.0, 360, 80))
+    centres = np.stack([u.ravel(), v.ravel()], axis=-1) + rng.uniform(-0.5, 0.5, (u.size, 2))
+    y, x = np.mgrid[: SIZE[0], : SIZE[1]]
+    light = sum(np.exp(-0.5 * ((x - a) ** 2 + (y - b) ** 2) / sigma_px**2) for a, b in centres)
+    return centres, peak * np.asarray(light)
+
+
+@pytest.mark.parametrize(("sigma_px", "grain_px"), [(1.5, 1.0), (3.0, 1.5), (6.0, 1.0)])
+@pytest.mark.parametrize("peak", [6000.0, 300.0])
+def test_the_background_predicts_the_errors_of_bright_and_of_faint_spots(sigma_px, grain_px, peak):
+    errors, expected = [], []
+    for seed in range(4):
+        reflectance = screen(0.04, grain_px, seed)
+        estimate = estimate_noise(pictures(reflectance, 0.0, 4))
+        centres, light = spots(sigma_px, peak, seed)
+        found = find_spots(pictures(reflectance, light, 1)[0], noise=NoiseModel(NOISE**2, 0.0, BACKGROUND))
+        for centre in centres:
+            gap = found.uv_px - centre
+            nearest = int(np.argmin(np.hypot(*gap.T)))
+            errors.append(gap[nearest])
+        sigma = estimate.texture_shift.sigma_px(np.array([sigma_px]), np.array([peak / BACKGROUND]))
+        expected.append(float(sigma[0]))
+    assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(np.mean(expected), rel=0.4)
+
+
+def test_noise_alone_predicts_next_to_nothing():
+    shift = estimate_noise(pictures(np.ones(SIZE), 0.0, 4)).texture_shift
+    assert max(shift.light_px) < 0.002
+    assert max(shift.background_px) < 0.004
+
+
+def test_a_prediction_is_limited_and_pictures_without_room_have_none():
+    rough = TextureShift((1.0, 10.0), (0.5, 5.0), (1.0, 10.0))
+    assert rough.sigma_px(np.array([2.0]), np.array([0.1]))[0] == pytest.approx(2.0 * LARGEST_SHARE)
+    small = [np.full((60, 60), 20, np.uint8) + np.eye(60, dtype=np.uint8) * k for k in (0, 1)]
+    assert estimate_noise(small).texture_shift.sigma_px(np.array([3.0]), np.array([1.0]))[0] == 0.0

@@ -1,0 +1,68 @@
+"""Wide spots with speckle and texture: one light is one detection, however ragged it is."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from geometry.arrays import Array
+from tracking.detection.detect import find_spots
+from tracking.detections import Detections
+from tracking.noise import NoiseModel
+
+WIDTH, HEIGHT = 240, 200
+BACKGROUND, FLOOR, SLOPE = 60.0, 1.5, 0.027  # DN, DN^2, DN
+
+
+def grain(rng: np.random.Generator, contrast: float, px: float) -> Array:
+    """A pattern (h, w) of mean 1 with this contrast and this correlation length."""
+    smooth = cv2.GaussianBlur(rng.standard_normal((HEIGHT, WIDTH)), (0, 0), px)
+    return np.asarray(1 + contrast * smooth / smooth.std())
+
+
+def light(u: float, v: float, sigma: tuple[float, float], power: int = 1) -> Array:
+    """A spot (h, w) of peak 1; power 1: a Gaussian, 2 and more: with a flat top."""
+    x, y = np.meshgrid(np.arange(WIDTH) - u, np.arange(HEIGHT) - v)
+    return np.asarray(np.exp(-0.5 * ((x / sigma[0]) ** 2 + (y / sigma[1]) ** 2) ** power))
+
+
+def seen(bright: Array, contrast: float, seed: int, background: float | Array = BACKGROUND) -> Detections:
+    """The detections in a picture of these lights, DN, on a screen that makes speckle of this contrast."""
+    rng = np.random.default_rng(seed)
+    screen = cv2.GaussianBlur(bright * grain(rng, contrast, 0.6), (0, 0), 0.6) + background * grain(rng, 0.03, 0.7)
+    noisy = screen + rng.standard_normal(screen.shape) * np.sqrt(FLOOR + SLOPE * np.maximum(screen - BACKGROUND, 0))
+    return find_spots(np.rint(noisy).clip(0, 255).astype(np.uint8), noise=NoiseModel(FLOOR, SLOPE, BACKGROUND, 0.02))
+
+
+def near(found: Detections, u: float, v: float, px: float) -> int:
+    return int(np.count_nonzero(np.linalg.norm(found.uv_px - [u, v], axis=1) < px))
+
+
+@pytest.mark.parametrize(
+    ("sigma", "contrast", "power"),
+    [((5.0, 4.0), 0.3, 1), ((9.0, 6.0), 0.27, 1), ((13.0, 13.0), 0.3, 1), ((12.0, 9.0), 0.1, 2)],
+)
+def test_a_wide_spot_with_speckle_is_one_detection_at_its_centre(sigma, contrast, power):
+    for seed in range(15):
+        found = seen(60.0 * light(120.3, 100.6, sigma, power), contrast, seed)
+        assert near(found, 120.3, 100.6, 0.2 * sigma[0]) == 1
+        assert near(found, 120.3, 100.6, 3 * sigma[0]) == 1
+
+
+@pytest.mark.parametrize("ratio", [1.0, 0.6])
+def test_two_wide_spots_beside_each_other_stay_two(ratio):
+    for seed in range(6):
+        both = 60.0 * light(105.0, 100.0, (7.0, 7.0)) + 60.0 * ratio * light(133.0, 104.0, (7.0, 7.0))
+        found = seen(both, 0.15, seed)
+        assert near(found, 105.0, 100.0, 1.5) == 1
+        assert near(found, 133.0, 104.0, 1.5) == 1
+
+
+def test_a_narrow_spot_on_the_light_of_a_reflection_keeps_its_width():
+    reflection = BACKGROUND + 30.0 * light(110.0, 95.0, (30.0, 25.0))
+    for seed in range(6):
+        found = seen(25.0 * light(125.2, 104.4, (2.3, 2.3)), 0.0, seed, reflection)
+        spot = np.argmin(np.linalg.norm(found.uv_px - [125.2, 104.4], axis=1))
+        assert np.linalg.norm(found.uv_px[spot] - [125.2, 104.4]) < 0.4
+        assert found.major_px[spot] < 4.0

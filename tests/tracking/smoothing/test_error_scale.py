@@ -1,0 +1,50 @@
+"""The ratio of the spots' errors to their stated sigmas, where no redundant spots show it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tracking.rigid_body.association.frame_detections import BLENDED
+from tracking.smoothing.error_scale import scattered_width_share
+from tracking.smoothing.motion.run_detections import RunDetections
+
+FRAMES, VIEWS, WIDTH = 60, 3, 2.0
+
+
+def detections(sizes: np.ndarray, sigma_px: float) -> RunDetections:
+    """One detection per view and frame with these larger half axes (T, n), px."""
+    count = sizes.size
+    return RunDetections(
+        uv=np.zeros((count, 2)), cov=np.tile(sigma_px**2 * np.eye(2), (count, 1, 1)), blend_px=np.zeros(count),
+        begin=np.arange(len(sizes) + 1) * sizes.shape[1], first=np.zeros((len(sizes), 2), dtype=np.int64),
+        has_image=np.ones((len(sizes), 1), dtype=bool), log_static=np.full(count, -np.inf), size_px=sizes.ravel(),
+        usual_size_px=np.full(sizes.shape[1], np.nan),
+    )  # fmt: skip
+
+
+def sizes(error_px: float) -> np.ndarray:
+    """Widths (T, n), px, that change steadily while the vehicle moves, with errors of this sigma."""
+    trend = WIDTH * (1 + 0.3 * np.linspace(0, 1, FRAMES)[:, None] * np.arange(VIEWS))
+    return trend + error_px * np.random.default_rng(1).normal(size=(FRAMES, VIEWS))
+
+
+LABELS = np.tile(np.arange(VIEWS), (FRAMES, 1))
+
+
+def test_widths_that_scatter_as_their_stated_sigmas_say_add_nothing():
+    assert scattered_width_share(detections(sizes(0.02), 0.02), LABELS) == 0.0
+
+
+def test_widths_that_scatter_more_show_errors_of_this_share_of_the_width():
+    errors = 0.06 * sizes(0.0)
+    rng = np.random.default_rng(2)
+    share = scattered_width_share(detections(sizes(0.0) + errors * rng.normal(size=errors.shape), 0.02), LABELS)
+    assert share == pytest.approx(0.06, rel=0.2)
+
+
+def test_unlabelled_and_blended_points_and_unknown_widths_do_not_count():
+    wild = detections(sizes(0.5), 0.02)
+    assert scattered_width_share(wild, np.full_like(LABELS, -1)) == 0.0
+    assert scattered_width_share(wild, LABELS + BLENDED) == 0.0
+    assert scattered_width_share(wild._replace(size_px=np.full(LABELS.size, np.nan)), LABELS) == 0.0
