@@ -89,7 +89,8 @@ def smooth(recording: TrackedRecording) -> Smoothed:
         elif not gapless:
             smoother.estimate(max_distance=MAX_DISTANCE)
         smoother.add_jumps_at_contradictions()
-        smoother.drop_labels_of_lost_frames()
+        # Labels need a pose, except where the paths of spots continue.
+        smoother.assigned = np.where(smoother.motion.known[:, None], smoother.assigned, -1)
         if parameters.method == "rigid":
             smoother.continue_paths()
     return smoother.result(rounds)
@@ -254,10 +255,6 @@ class _Smoother:
             self.model, self.view_table, self.detections, self.assigned, self.motion.ref, known,
             self.parameters.labels.clutter_per_px2,
         )  # fmt: skip
-
-    def drop_labels_of_lost_frames(self) -> None:
-        """Labels need a pose, except where the paths of spots continue."""
-        self.assigned = np.where(self.motion.known[:, None], self.assigned, -1)
 
     def continue_paths(self) -> None:
         """Label spots by the continuity of their paths where the pose does not predict them well."""

@@ -63,19 +63,20 @@ def continued(
             if len({row for row, _ in found}) == 1 and (len(found) == len(sides) or p >= MIN_ONE_SIDED_PROBABILITY):
                 out[k, view], probability[k, view] = found[0][0], p
     _drop_shared(out, probability, assigned)
-    isolated = _isolated(out, assigned)
+    isolated = _isolated(out, assigned, paired != assigned)
     out[isolated], probability[isolated] = assigned[isolated], np.nan
     return out, probability
 
 
-def _isolated(out: Ints, before: Ints) -> Bools:
-    """(T, n): new labels that are the only one or two of their frame, except in chains of enough frames.
+def _isolated(out: Ints, before: Ints, paired: Bools) -> Bools:
+    """(T, n): new labels that are the only one, or the only pair, of their frame, except in chains of enough frames.
 
-    If all spots are occluded for a frame or two, a false point near one of the paths is not rare, nor are two.
+    If all spots are occluded for a frame or two, a false point near one of the paths is not rare, nor are two that lie
+    right for a pair. paired (T, n): labels by pairs.
     """
     new = out != before
     count = np.count_nonzero(out >= 0, axis=1)
-    alone = new & (count <= 2)[:, None]
+    alone = new & ((count == 1)[:, None] | (paired & (count == 2)[:, None]))
     for view in range(new.shape[1]):
         for run in np.split(np.arange(len(new)), np.flatnonzero(np.diff(new[:, view].astype(np.int8))) + 1):
             if len(run) >= (MIN_SINGLE_CHAIN if np.any(count[run] == 1) else MIN_PAIR_CHAIN):
