@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import io
+import json
 import os
-import re
 import resource
 import shutil
 import sys
@@ -20,7 +20,6 @@ STATUSES = (0, 1, 2, 3, 4)
 LIMIT_S = 20.0
 LIMIT_MEMORY_MB = 3000
 _NOT_FINITE = ("nan", "inf", "-inf", "+inf", "infinity", "-infinity")
-_NOT_FINITE_JSON = re.compile(r"[:\[,]\s*(NaN|-?Infinity)\b")
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,6 +120,11 @@ def not_finite_in(folder: Path, before: Mapping[Path, tuple[int, int]] | None = 
             if any(field.strip().lower() in _NOT_FINITE for field in line.split(",")):
                 return f"{path.name} line {n}: {line[:200]}"
     for path in sorted(path for path in written if path.suffix == ".json"):
-        if found := _NOT_FINITE_JSON.search(path.read_text(encoding="utf-8", errors="replace")):
+        found: list[str] = []
+        try:
+            json.loads(path.read_text(encoding="utf-8", errors="replace"), parse_constant=found.append)
+        except ValueError as error:
+            return f"{path.name}: {error}"
+        if found:
             return f"{path.name}: {found[0]}"
     return ""

@@ -42,6 +42,7 @@ from lab.files.rig.camera_file import CameraFile, load_camera
 from lab.files.rig.interchange import read_cameras
 from lab.files.text.error_text import FileError, name_of_path, suggest_name
 from lab.files.text.fields import validated
+from lab.files.text.regular_file import text_of_file
 from lab.files.text.yaml_text import read_mapping
 
 
@@ -229,4 +230,4 @@ def load_lens(path: Path, name: str | None = None) -> CameraFile:
 
 
 def _is_camera_yaml(path: Path) -> bool:
-    return re.search(r"^schema:\s*['\"]?beampose/camera/", path.read_text(encoding="utf-8"), re.MULTILINE) is not None
+    return re.search(r"^schema:\s*['\"]?beampose/camera/", text_of_file(path), re.MULTILINE) is not None
