@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import json
+import re
+import shutil
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -253,3 +256,29 @@ def test_wrong_timestamps_are_reported_with_their_line(text, words, tmp_path):
     with pytest.raises(InputError) as caught:
         load_run(folder)
     assert words in str(caught.value)
+
+
+def test_a_folder_that_is_no_run_is_named_for_what_it_is(tmp_path):
+    run = write_run(tmp_path / "lab" / "day-1")
+    for name in ("day-2", "day-3", "day-4"):
+        shutil.copytree(run, run.parent / name)
+    results = tmp_path / "results"
+    results.mkdir()
+    (results / "summary.json").write_text(json.dumps({"run_folder": str(run)}), "utf-8")
+    pictures = tmp_path / "pictures"
+    pictures.mkdir()
+    (pictures / "0001.png").touch()
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    for folder, words in (
+        (
+            run.parent,
+            "found run folders in it: day-1, day-2, day-3 and 1 more; name one, or give all to",
+        ),
+        (results, f"found results; they are of the run {run}"),
+        (next(p for p in run.iterdir() if p.is_dir()), "found a part of one; name the run folder day-1"),
+        (pictures, "found pictures; `beampose detect` needs no run.yaml"),
+        (empty, "found none; check the path, or write one with `beampose init`"),
+    ):
+        with pytest.raises(InputError, match=re.escape(words)):
+            load_run(folder)
