@@ -7,6 +7,7 @@ import pytest
 from bench.fuzz.cases import KINDS, write_case
 from bench.fuzz.inputs import write_inputs
 from bench.fuzz.judge import fault_of_lines, not_finite_in, run_case, run_command
+from lab.runs.batch.task import COLUMNS
 
 INPUTS = 40
 
@@ -47,11 +48,22 @@ def test_the_judge_knows_a_wrong_ending(tmp_path):
     assert fault_of_lines(0, "fine\n", "") == fault_of_lines(2, "", "beampose: a line\n") == ""
     assert all(map(fault_of_lines, (7, 2, 1), ("", "", ""), ("x\n", "", "Traceback ...\n")))
     assert all(map(fault_of_lines, (2, 2), ("", ""), ("a\n" * 9, "\x1b[2J\n")))
-    (tmp_path / "out").mkdir()
+    out = tmp_path / "out"
+    out.mkdir()
     (tmp_path / "out" / "a.csv").write_text("x\n1\n")
     assert not_finite_in(tmp_path) == ""
     (tmp_path / "out" / "a.csv").write_text("x\n1\ninf\n")
     assert not_finite_in(tmp_path).startswith("a.csv line 3")
+    (out / "a.csv").unlink()
+    (out / "batch.csv").write_text(",".join(COLUMNS) + ",mine\n" + "1," * len(COLUMNS) + "-inf\n")
+    assert not_finite_in(tmp_path) == ""  # a column of the user
+    (out / "batch.csv").write_text(",".join(COLUMNS) + "\n" + "inf," + "1," * (len(COLUMNS) - 1) + "\n")
+    assert not_finite_in(tmp_path).startswith("batch.csv line 2")
+    (out / "batch.csv").unlink()
+    (out / "summary.json").write_text('{"note": ": NaN"}')
+    assert not_finite_in(tmp_path) == ""
+    (out / "summary.json").write_text('{"value": NaN}')
+    assert not_finite_in(tmp_path) == "summary.json: NaN"
 
 
 def test_an_exception_that_leaves_the_program_is_a_fault(monkeypatch):
