@@ -96,10 +96,10 @@ def open_slider_window(view: View, index: int | None) -> bool:
     view: what is shown; index: of the pose shown first; None: the first known one.
     """
     context = multiprocessing.get_context("spawn")
-    answer, told = context.Pipe(duplex=False)
-    worker = context.Process(target=_show, args=(view, index, told), daemon=True)
+    answer, opened = context.Pipe(duplex=False)
+    worker = context.Process(target=_show, args=(view, index, opened), daemon=True)
     worker.start()
-    told.close()  # of the worker alone, so that its end is seen here
+    opened.close()  # of the worker alone, so that its end is seen here
     try:
         answer.recv()  # the window is open
     except EOFError:
@@ -109,7 +109,7 @@ def open_slider_window(view: View, index: int | None) -> bool:
     return True
 
 
-def _show(view: View, index: int | None, told: Connection) -> None:
+def _show(view: View, index: int | None, opened: Connection) -> None:
     """The work of the process. What libraries print goes nowhere."""
     null = os.open(os.devnull, os.O_WRONLY)
     os.dup2(null, 1)
@@ -119,7 +119,7 @@ def _show(view: View, index: int | None, told: Connection) -> None:
     app.initialize()
     window = app.create_window(f"beampose: {view.content.name}", *SIZE_PX)
     fill(o3d, window, Player(view, index))
-    told.send(True)
+    opened.send(True)
     app.run()
 
 

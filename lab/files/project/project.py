@@ -56,6 +56,11 @@ def load_project(path: Path, lab_known: bool = False) -> Project:
     """
     path = Path(path)
     if path.is_dir():
+        if not (path / "calibration.yaml").exists():
+            raise InputError(
+                f"{path}: expected a folder with a calibration.yaml, found none in it; `beampose calibrate simulate`"
+                " writes an example"
+            )
         path = path / "calibration.yaml"
     content = validated(ProjectBlock, read_mapping(path), path)
     mistakes: list[str] = []

@@ -16,7 +16,7 @@ import pytest
 from geometry import rotations
 from lab.errors import InputError
 from lab.files.run.run_file import DetectionsTable, FramesFolder, VideoFile, load_run, save_run
-from lab.files.run.times import Times
+from lab.files.run.times import Times, load_times
 from lab.files.text.dataclass_fields import dataclass_from_yaml
 from tests.lab.run_folders import RUN, edit, write_run
 from tracking.parameters import DetectParameters, TrackerParameters
@@ -282,3 +282,18 @@ def test_a_folder_that_is_no_run_is_named_for_what_it_is(tmp_path):
     ):
         with pytest.raises(InputError, match=re.escape(words)):
             load_run(folder)
+
+
+@pytest.mark.parametrize(("step", "fits"), [(0.01, True), (0.1, True), (10.0, False), (10_000.0, False), (1e-5, False)])
+def test_timestamps_in_another_unit_than_the_frame_rate_are_refused(tmp_path, step, fits):
+    """0.1 s at 100 Hz is accepted: a camera that an instrument triggers may be slower than it can be."""
+    (tmp_path / "times.csv").write_text(
+        "frame,t_s\n" + "".join(f"{f},{f * step!r}\n" for f in range(0, 20, 2)), "utf-8"
+    )
+    if fits:
+        assert load_times(tmp_path / "times.csv", 100.0).t_s(5) == pytest.approx(5 * step)
+    else:
+        with pytest.raises(
+            InputError, match=r"times.csv: line 3: t_s: expected steps of about 0.01 s .* not milliseconds"
+        ):
+            load_times(tmp_path / "times.csv", 100.0)

@@ -192,12 +192,12 @@ def test_a_rig_without_poses_has_nothing_to_play(content, tmp_path):
     assert (player.index, player.playing, player.advance(9.0)) == (None, False, False)
 
 
-def _ends(view, index, told):
+def _ends(view, index, opened):
     os._exit(139)
 
 
-def _opens_and_ends(view, index, told):
-    told.send(True)
+def _opens_and_ends(view, index, opened):
+    opened.send(True)
     os._exit(139)
 
 
