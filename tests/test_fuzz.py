@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import random
+
 import pytest
 
-from bench.fuzz.cases import KINDS, write_case
+from bench.fuzz.cases import KINDS
 from bench.fuzz.inputs import write_inputs
 from bench.fuzz.judge import fault_of_lines, not_finite_in, run_case, run_command
 from lab.runs.batch.task import COLUMNS
@@ -30,18 +32,9 @@ _HOSTILE_OPTIONS = ("--set", "plan options", "simulate options", "names", "compa
 def test_the_inputs_are_valid_before_they_are_damaged(kind, base, tmp_path, monkeypatch):
     for module in ("cases", "result_cases"):
         monkeypatch.setattr(f"bench.fuzz.{module}.damage_file", lambda path, rng: None)
-    (tmp_path / "work").mkdir()
-    command = next(c for k, c in (_case(n, base, tmp_path) for n in range(500)) if k == kind)
+    command = KINDS[kind][0](tmp_path, base, random.Random(1))
     status, out, err, fault = run_command(command)
     assert (status, fault) == (0, ""), out + err
-
-
-def _case(number, base, tmp_path):
-    import shutil
-
-    shutil.rmtree(tmp_path / "work")
-    (tmp_path / "work").mkdir()
-    return write_case(3, number, base, tmp_path / "work")
 
 
 def test_the_judge_knows_a_wrong_ending(tmp_path):
