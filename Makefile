@@ -20,7 +20,7 @@ DEMO := results/demo
 DEMO_FIRST := $(patsubst %,$(DEMO)/%/report.html,huo2015 sharp-turns calibration)
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all check format docs bench-tracking bench-random bench-detection bench-throughput bench-live bench-calibration peers bench-peers lock lock-docs wheel clean
+.PHONY: help setup demo test test-all check format docs bench-tracking bench-random bench-detection bench-throughput bench-live bench-calibration peers bench-peers lock wheel clean
 
 help:  ## List the chores
 	@sed -n 's/^\([a-z-]*\):.*##  */\1|/p' $(MAKEFILE_LIST) | while IFS='|' read -r name what; do \
@@ -39,7 +39,7 @@ $(READY): requirements.lock pyproject.toml
 		echo "On Debian or Ubuntu: apt-get install python3-venv" >&2; exit 2; }
 	@rm -f $(READY)
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --require-virtualenv --requirement requirements.lock
+	$(BIN)/python -m pip install --quiet --require-virtualenv --require-hashes --requirement requirements.lock
 	$(BIN)/python -m pip install --quiet --require-virtualenv --no-deps --no-build-isolation --editable .
 	@echo "Compiling for this machine, once (about a minute)."
 	$(BIN)/python -m lab.runs.warm_up
@@ -76,10 +76,11 @@ docs: $(READY_DOCS)  ## Build the documentation site (build/docs/index.html); it
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 	@echo "Open build/docs/index.html"
 
-# In the project's environment, since pages are generated from the code; the versions shared with requirements.lock are its.
+# In the project's environment, since pages are generated from the code. The list lacks what that environment has in any case.
 $(READY_DOCS): $(READY) requirements-docs.lock
 	@rm -f $(READY_DOCS)
-	$(BIN)/python -m pip install --quiet --require-virtualenv --requirement requirements-docs.lock
+	$(BIN)/python -m pip install --quiet --require-virtualenv --require-hashes --no-deps --requirement requirements-docs.lock
+	$(BIN)/python -m pip check
 	@touch $(READY_DOCS)
 
 bench-tracking: setup  ## The tracking figures on fresh seeds, peers if installed
@@ -118,24 +119,24 @@ $(READY_PEERS): pyproject.toml
 bench-peers: peers  ## Other people's trackers and ours on the same points (half an hour)
 	$(VENV_PEERS)/bin/python -m bench.peers
 
-# In an environment of its own, so that the lock file depends on pyproject.toml alone. Versions that are already
-# locked stay, unless pyproject.toml forbids them; `make lock LOCK_FLAGS=--upgrade` takes the newest. With the
-# oldest Python that we support the list also serves the newer ones.
-lock:  ## Write requirements.lock again from pyproject.toml
-	$(PYTHON) -m venv --clear build/lock
-	build/lock/bin/python -m pip install --quiet pip-tools
-	build/lock/bin/pip-compile --quiet --extra dev --strip-extras --no-header --no-emit-options \
-		--no-emit-index-url --no-emit-find-links --no-emit-trusted-host $(LOCK_FLAGS) \
-		--output-file requirements.lock pyproject.toml
+# In an environment of its own, so that the lock file depends on pyproject.toml alone. One list serves all systems and
+# Pythons: `--universal` writes markers, `fewest` takes one version of each package. uv reads the hashes of all files of a
+# version from the package index and downloads none. Versions that are already locked stay, unless pyproject.toml forbids
+# them; `make lock LOCK_FLAGS=--upgrade` takes the newest. requirements-docs.lock adds to the environment that
+# requirements.lock makes, so it lacks what that one installs on every system.
+COMPILE := build/lock/bin/uv pip compile --quiet --universal --python-version 3.11 --fork-strategy fewest --generate-hashes \
+	--strip-extras --no-header --no-emit-index-url --no-emit-find-links
 
-# Without the packages that requirements.lock has: the environment has them already.
-lock-docs:  ## Write requirements-docs.lock again from pyproject.toml and requirements.lock
+lock:  ## Write requirements.lock and requirements-docs.lock again from pyproject.toml, with hashes
 	$(PYTHON) -m venv --clear build/lock
-	build/lock/bin/python -m pip install --quiet pip-tools
-	build/lock/bin/pip-compile --quiet --extra docs --constraint requirements.lock --strip-extras --no-header \
-		--no-annotate --no-emit-options --no-emit-index-url --no-emit-find-links --no-emit-trusted-host $(LOCK_FLAGS) \
-		--output-file build/requirements-docs.txt pyproject.toml
-	grep -v -x -F -f requirements.lock build/requirements-docs.txt > requirements-docs.lock
+	build/lock/bin/python -m pip install --quiet uv
+	$(COMPILE) --extra dev $(LOCK_FLAGS) --output-file requirements.lock pyproject.toml
+	sed -n 's/^\([A-Za-z0-9._-]*==[^ ]*\).*/\1/p' requirements.lock > build/lock/versions.txt
+	$(PYTHON) -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"]["docs"], sep="\n")' \
+		> build/lock/docs.txt
+	$(COMPILE) --constraint build/lock/versions.txt --no-annotate $(LOCK_FLAGS) \
+		$$(sed -n 's/^\([A-Za-z0-9._-]*\)==[^ ]* \\$$/--no-emit-package \1/p' requirements.lock) \
+		--output-file requirements-docs.lock build/lock/docs.txt
 
 wheel: setup  ## Build dist/beampose-*.whl
 	$(BIN)/python -m build --no-isolation --outdir dist .

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import random
+
 import pytest
 
-from bench.fuzz.cases import KINDS, write_case
+from bench.fuzz.cases import KINDS
 from bench.fuzz.inputs import write_inputs
 from bench.fuzz.judge import fault_of_lines, not_finite_in, run_case, run_command
+from lab.runs.batch.task import COLUMNS
 
 INPUTS = 40
 
@@ -29,29 +32,31 @@ _HOSTILE_OPTIONS = ("--set", "plan options", "simulate options", "names", "compa
 def test_the_inputs_are_valid_before_they_are_damaged(kind, base, tmp_path, monkeypatch):
     for module in ("cases", "result_cases"):
         monkeypatch.setattr(f"bench.fuzz.{module}.damage_file", lambda path, rng: None)
-    (tmp_path / "work").mkdir()
-    command = next(c for k, c in (_case(n, base, tmp_path) for n in range(500)) if k == kind)
+    command = KINDS[kind][0](tmp_path, base, random.Random(1))
     status, out, err, fault = run_command(command)
     assert (status, fault) == (0, ""), out + err
-
-
-def _case(number, base, tmp_path):
-    import shutil
-
-    shutil.rmtree(tmp_path / "work")
-    (tmp_path / "work").mkdir()
-    return write_case(3, number, base, tmp_path / "work")
 
 
 def test_the_judge_knows_a_wrong_ending(tmp_path):
     assert fault_of_lines(0, "fine\n", "") == fault_of_lines(2, "", "beampose: a line\n") == ""
     assert all(map(fault_of_lines, (7, 2, 1), ("", "", ""), ("x\n", "", "Traceback ...\n")))
     assert all(map(fault_of_lines, (2, 2), ("", ""), ("a\n" * 9, "\x1b[2J\n")))
-    (tmp_path / "out").mkdir()
+    out = tmp_path / "out"
+    out.mkdir()
     (tmp_path / "out" / "a.csv").write_text("x\n1\n")
     assert not_finite_in(tmp_path) == ""
     (tmp_path / "out" / "a.csv").write_text("x\n1\ninf\n")
     assert not_finite_in(tmp_path).startswith("a.csv line 3")
+    (out / "a.csv").unlink()
+    (out / "batch.csv").write_text(",".join(COLUMNS) + ",mine\n" + "1," * len(COLUMNS) + "-inf\n")
+    assert not_finite_in(tmp_path) == ""  # a column of the user
+    (out / "batch.csv").write_text(",".join(COLUMNS) + "\n" + "inf," + "1," * (len(COLUMNS) - 1) + "\n")
+    assert not_finite_in(tmp_path).startswith("batch.csv line 2")
+    (out / "batch.csv").unlink()
+    (out / "summary.json").write_text('{"note": ": NaN"}')
+    assert not_finite_in(tmp_path) == ""
+    (out / "summary.json").write_text('{"value": NaN}')
+    assert not_finite_in(tmp_path) == "summary.json: NaN"
 
 
 def test_an_exception_that_leaves_the_program_is_a_fault(monkeypatch):

@@ -18,6 +18,7 @@ from pathlib import Path
 from bench.fuzz.inputs import write_inputs
 from bench.fuzz.judge import run_case
 from bench.fuzz.workers import endings
+from lab.runs.warm_up import warm_up
 
 
 def main() -> None:
@@ -29,6 +30,7 @@ def main() -> None:
     parser.add_argument("--only", type=int, help="the number of one case")
     a = parser.parse_args()
     folder = Path(tempfile.mkdtemp(prefix="fuzz-"))
+    warm_up()  # compiling, once for a machine, is no fault of a case
     base = write_inputs(folder / "base")
     if a.only is not None:
         print(run_case(a.seed, a.only, base, folder / "work-0"), f"\ninput: {folder}")

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import csv
 import io
+import json
 import os
-import re
 import resource
 import shutil
 import sys
@@ -15,12 +16,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from bench.fuzz.cases import write_case
+from lab.runs.batch.task import COLUMNS
 
 STATUSES = (0, 1, 2, 3, 4)
 LIMIT_S = 20.0
 LIMIT_MEMORY_MB = 3000
 _NOT_FINITE = ("nan", "inf", "-inf", "+inf", "infinity", "-infinity")
-_NOT_FINITE_JSON = re.compile(r"[:\[,]\s*(NaN|-?Infinity)\b")
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,10 +118,18 @@ def not_finite_in(folder: Path, before: Mapping[Path, tuple[int, int]] | None = 
     """
     written = dict(_identities(folder).items() - (before or {}).items())
     for path in sorted(path for path in written if path.suffix == ".csv"):
-        for n, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines()[1:], 2):
-            if any(field.strip().lower() in _NOT_FINITE for field in line.split(",")):
-                return f"{path.name} line {n}: {line[:200]}"
+        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+        # batch.csv keeps columns that a user has added as they are.
+        own = len(COLUMNS) if path.name == "batch.csv" else None
+        for n, fields in enumerate(list(csv.reader(lines))[1:], 2):
+            if any(field.strip().lower() in _NOT_FINITE for field in fields[:own]):
+                return f"{path.name} line {n}: {','.join(fields)[:200]}"
     for path in sorted(path for path in written if path.suffix == ".json"):
-        if found := _NOT_FINITE_JSON.search(path.read_text(encoding="utf-8", errors="replace")):
+        found: list[str] = []
+        try:
+            json.loads(path.read_text(encoding="utf-8", errors="replace"), parse_constant=found.append)
+        except ValueError as error:
+            return f"{path.name}: {error}"
+        if found:
             return f"{path.name}: {found[0]}"
     return ""

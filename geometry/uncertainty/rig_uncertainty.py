@@ -38,7 +38,8 @@ class RigUncertainty:
         derivatives = self._model.derivatives(world_from_body)
         moves = self._sensitivity.of(derivatives)
         moves = np.where(np.isnan(derivatives.pixels)[..., None], 0.0, moves)
-        spread = moves.reshape(*moves.shape[:-3], -1, moves.shape[-1]) @ self._root
+        *stack, n, two, p = moves.shape
+        spread = moves.reshape(*stack, n * two, p) @ self._root  # the stack may be empty
         return np.asarray(spread @ np.swapaxes(spread, -1, -2))
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
-import json
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -26,7 +25,7 @@ from lab.files.rig.calibration_state import require_valid_calibration, state_map
 from lab.files.run.fingerprints import fingerprints_of
 from lab.files.run.truth import TruePoses, read_true_poses
 from lab.files.text.atomic_write import atomic_folder
-from lab.files.text.json_text import write_json
+from lab.files.text.json_text import has_schema, write_json
 from lab.number_format import format_length
 from lab.pictures.picture_file import MissingPicture
 from lab.versions import versions
@@ -98,10 +97,7 @@ def process_stereo_run(run_folder: Path, out: Path, progress: Progress | None = 
 
 def are_stereo_results(folder: Path) -> bool:
     """Whether a folder holds the results of an earlier stereo run."""
-    try:
-        return bool(json.loads((folder / "summary.json").read_text("utf-8")).get("schema") == SUMMARY_SCHEMA)
-    except (OSError, ValueError, AttributeError):
-        return False
+    return has_schema(folder, SUMMARY_SCHEMA)
 
 
 def measure(run: StereoRun, progress: Progress | None = None) -> StereoResults:

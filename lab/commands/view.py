@@ -23,8 +23,8 @@ def view(path: Path, out: Path | None, frame: int | None, rig: Path | None, sigm
     """Show a rig.yaml, a run folder or results in three dimensions.
 
     Screens, cameras with their fields of view, beams, spots and the trajectory with sigma ellipsoids. Opens a window
-    (space plays, arrow keys step) where there is a display. Otherwise, or with --out, it writes view.html to turn and
-    play in a browser, scene.glb, scene.ply and pictures.
+    where there is a display: space plays, arrow keys step, and with a driver of Vulkan it has a slider. Otherwise, or
+    with --out, it writes view.html to turn and play in a browser, scene.glb, scene.ply and pictures.
 
     \b
     Example:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -12,7 +13,8 @@ from geometry import rotations
 from geometry.arrays import Array, Bools, Ints
 from lab.compare.reference_file import FARTHEST, LATEST_S, read_reference
 from lab.errors import InputError
-from lab.files.run.results import PoseTrack, read_poses
+from lab.files.run.results import PoseTrack, read_poses, read_summary
+from lab.files.text.error_text import name_of_path
 from lab.runs.process import are_results
 from tracking.comparison.allan import LEAST_READINGS, AllanDeviation, allan_deviation
 from tracking.comparison.differences import (
@@ -111,7 +113,7 @@ def compare(
             if len(common) < 4:
                 raise InputError(f"{other}: expected frames of {result}, found {len(common)} measured in both")
             frames, mine, total, theirs = common, mine.select(i), total.select(i), theirs.select(j)
-        notes = ("Both results may rest on the same pictures: their errors are then not independent.",)
+        notes = (_of_the_same_run(result, other),)
     wanted = (ALIGN if reference is not None else ()) if align is None else tuple(align)
     free = Free(*(name in wanted for name in ALIGN))
     estimate, alignment = None, Alignment.identity(offset_s or 0.0, float(0.5 * (mine.t_s[0] + mine.t_s[-1])))
@@ -217,3 +219,23 @@ def _still(motion: Motion) -> StillStand | None:
         (name, allan_deviation(angles[:, k], motion.step_s)) for k, name in enumerate(("yaw", "pitch", "roll"))
     )
     return StillStand(float(motion.t_s[where][0]), float(motion.t_s[where][-1]), len(angles), of_result)
+
+
+def _of_the_same_run(first: Path, second: Path) -> str:
+    """A note on the recordings of two results. Raises InputError where a summary.json is damaged."""
+    summaries = [read_summary(folder) for folder in (first, second)]
+    recorded = [_recorded(summary) for summary in summaries]
+    if not all(recorded):
+        return "Both results may rest on the same pictures: their errors are then not independent."
+    if recorded[0] & recorded[1]:
+        return "Both results rest on the same pictures or points: their errors are not independent."
+    names = " and ".join(name_of_path(Path(str(summary.get("run_folder") or "?"))) for summary in summaries)
+    return f"The results are of different recordings, {names}: the differences are errors only of equal motions."
+
+
+def _recorded(summary: Mapping[str, Any]) -> set[str]:
+    """Digests of the pictures and tables that a result rests on; empty where summary.json has none."""
+    inputs = summary.get("inputs")
+    listed = [entry for entry in inputs if isinstance(entry, Mapping)] if isinstance(inputs, list) else []
+    paths = [(Path(str(entry.get("path"))), str(entry.get("sha256"))) for entry in listed]
+    return {digest for path, digest in paths if path.suffix != ".yaml" and path.parent.name != "truth"}

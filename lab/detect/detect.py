@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
@@ -20,7 +19,7 @@ from lab.files.run.parameter_overrides import with_overrides
 from lab.files.text import columns
 from lab.files.text.atomic_write import atomic_folder
 from lab.files.text.csv_text import csv_word
-from lab.files.text.json_text import write_json
+from lab.files.text.json_text import has_schema, write_json
 from lab.pictures.picture_file import MissingPicture
 from lab.runs.tables import detection_rows
 from lab.versions import versions
@@ -106,10 +105,7 @@ def detect_pictures(
 
 def are_detections(folder: Path) -> bool:
     """Whether a folder holds the results of an earlier call."""
-    try:
-        return bool(json.loads((folder / "summary.json").read_text("utf-8")).get("schema") == SCHEMA)
-    except (OSError, ValueError, AttributeError):
-        return False
+    return has_schema(folder, SCHEMA)
 
 
 def _search_all(

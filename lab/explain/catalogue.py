@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 from lab.errors import InputError
 from lab.explain import calibrations, circles, drogues, lenses, program, runs, stereo, tracks
 from lab.explain.explanation import Explanations, as_text
@@ -29,13 +31,15 @@ EXPLANATIONS: Explanations = {code: text for section in SECTIONS.values() for co
 
 
 def explain(code: str) -> str:
-    """The explanation of a code, as lines; `V03` and `bp-v03` are read as BP-V03.
+    """The explanation of a code, as lines; `V03`, `v3` and `bp-v03` are read as BP-V03.
 
     Raises:
         InputError: there is no such code.
     """
     name = code.strip().upper()
     name = name if name.startswith("BP-") else f"BP-{name}"
+    if parts := re.fullmatch(r"BP-([A-Z])(\d)", name):
+        name = f"BP-{parts[1]}0{parts[2]}"
     if name not in EXPLANATIONS:
         near = suggest_name(name, EXPLANATIONS)
         hint = near if "did you mean" in near else ""

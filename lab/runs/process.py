@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import datetime
-import json
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -18,7 +17,7 @@ from lab.files.run.parameter_overrides import with_overrides
 from lab.files.run.run_file import Run, load_run
 from lab.files.run.truth import load_run_truth
 from lab.files.text.atomic_write import atomic_folder
-from lab.files.text.json_text import write_json
+from lab.files.text.json_text import has_schema, write_json
 from lab.runs.frames.pipeline import FrameRecord, Pipeline
 from lab.runs.model_check.frame_sampler import FrameSampler, stated_covariances, widths
 from lab.runs.run_log import RunLog, listening
@@ -203,7 +202,4 @@ def write_tables(
 
 def are_results(folder: Path) -> bool:
     """Whether a folder holds a run's results, which a new run may replace."""
-    try:
-        return bool(json.loads((folder / "summary.json").read_text("utf-8")).get("schema") == SUMMARY_SCHEMA)
-    except (OSError, ValueError, AttributeError):
-        return False
+    return has_schema(folder, SUMMARY_SCHEMA)

@@ -7,7 +7,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from geometry.pose import Pose
 from lab.runs.frames.pipeline import FrameRecord
+from tracking.statuses import PoseStatus
 from tracking.tracked_frame import Event
 
 MOST_EVENTS = 500  # listed one by one; of the others the number is reported
@@ -40,10 +42,15 @@ class RunTally:
     event_kinds: Counter[str] = field(default_factory=Counter)
     unlisted: int = 0  # events beyond MOST_EVENTS
     labels_left_open: int = 0  # rows of spots.csv with a detection whose label is too uncertain
+    frames: int = 0
+    first_pose: Pose | None = None  # of the first frame, if it is measured
     _lasting: dict[tuple[str, int | None], ListedEvent] = field(default_factory=dict)  # the latest, by kind and view
 
     def add(self, record: FrameRecord) -> None:
         """Count the next frame."""
+        if self.frames == 0 and record.tracked.pose_status is PoseStatus.MEASURED:
+            self.first_pose = record.tracked.pose
+        self.frames += 1
         if not self.spot_status:
             self.spot_status = [Counter() for _ in self.views]
         for counter, status in zip(self.spot_status, record.tracked.status, strict=True):

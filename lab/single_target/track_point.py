@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -14,7 +13,7 @@ from lab.errors import InputError
 from lab.files.run.fingerprints import fingerprints_of
 from lab.files.run.parameter_overrides import with_overrides
 from lab.files.text.atomic_write import atomic_folder
-from lab.files.text.json_text import write_json
+from lab.files.text.json_text import has_schema, write_json
 from lab.single_target.outcome import PointOutcome
 from lab.single_target.recording import DETECTORS, TABLE, Progress, read_recording
 from lab.single_target.track_table import write_track
@@ -96,10 +95,7 @@ def track_target(
 
 def is_a_track(folder: Path) -> bool:
     """Whether a folder holds the results of an earlier call."""
-    try:
-        return bool(json.loads((folder / "summary.json").read_text("utf-8")).get("schema") == SCHEMA)
-    except (OSError, ValueError, AttributeError):
-        return False
+    return has_schema(folder, SCHEMA)
 
 
 def _summary(outcome: PointOutcome, settings: PointSettings, options: PointOptions, wall_s: float) -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +13,7 @@ from calibration.findings import Finding, Level, verdict
 from geometry.arrays import Array
 from lab.errors import QUALITY_GATE_FAILED
 from lab.files.run.fingerprints import fingerprints_of
+from lab.files.text.json_text import has_schema
 from lab.target.frame_series import MOST_EVENTS, F, FrameSeries
 from lab.versions import versions
 
@@ -66,10 +66,7 @@ def results_of(schema: str) -> Callable[[Path], bool]:
     """Whether a folder holds the results of an earlier call, by the schema of its summary."""
 
     def are_results(folder: Path) -> bool:
-        try:
-            return bool(json.loads((folder / "summary.json").read_text("utf-8")).get("schema") == schema)
-        except (OSError, ValueError, AttributeError):
-            return False
+        return has_schema(folder, schema)
 
     return are_results
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +13,7 @@ from lab.errors import InputError
 from lab.files.run.fingerprints import fingerprints
 from lab.files.run.run_file import Run
 from lab.files.text.dataclass_fields import dataclass_from_yaml
+from lab.files.text.json_text import read_json
 from lab.runs.summary import SUMMARY_SCHEMA
 from lab.versions import versions
 from tracking.parameters import TrackerParameters
@@ -66,7 +66,7 @@ def read_recorded(results: Path) -> Recorded:
     """
     path = Path(results) / "summary.json"
     try:
-        content = json.loads(path.read_text("utf-8"))
+        content = read_json(path)
     except FileNotFoundError:
         raise InputError(
             f"{results}: expected a folder that `beampose run` wrote, found no summary.json in it"

@@ -1,16 +1,19 @@
-"""An Open3D window: the scene, with the vehicle, its beams and spots at a moment that keys change."""
+"""A window of Open3D with keys alone, for systems on which the one with a slider cannot open.
+
+It shows the scene, with the vehicle, its beams and spots at a moment that keys change.
+"""
 
 from __future__ import annotations
 
 import time
 from typing import Any
 
-import numpy as np
-
 from calibration.open3d_loader import open3d
 from lab.report.calibration.calibration_scene import VIEWS
+from lab.view.player import Player
 from lab.view.render import as_open3d, look_along
 from lab.view.scene import View
+from lab.view.slider_window import open_slider_window
 from lab.view.solids import mesh_of
 
 KEYS = (
@@ -20,61 +23,10 @@ KEYS = (
 _SPACE, _LEFT, _RIGHT, _DOWN, _UP, _HOME, _END = 32, 263, 262, 264, 265, 268, 269  # GLFW's numbers
 
 
-class Player:
-    """The moment that is shown, of the known poses of a view."""
-
-    def __init__(self, view: View, index: int | None) -> None:
-        self.view = view
-        self.known = np.flatnonzero(view.content.known)
-        self.at = 0 if index is None else int(np.searchsorted(self.known, index))
-        self._started: tuple[float, float] | None = None  # while playing: clock, s, and time of the run, s
-
-    @property
-    def index(self) -> int | None:
-        """Of the pose shown; None without poses."""
-        return int(self.known[self.at]) if len(self.known) else None
-
-    @property
-    def playing(self) -> bool:
-        """Whether time runs."""
-        return self._started is not None
-
-    def step(self, frames: int) -> None:
-        """Go some known poses on or back, at most to the ends; playing stops."""
-        self._started = None
-        self.at = int(np.clip(self.at + frames, 0, max(len(self.known) - 1, 0)))
-
-    def leap(self, share: float) -> None:
-        """Go a share of the run on or back."""
-        self.step(round(share * len(self.known)) or int(np.sign(share)))
-
-    def toggle(self, now_s: float) -> None:
-        """Play from here, from the start if this is the end; or pause."""
-        if self.playing or len(self.known) < 2:
-            self._started = None
-            return
-        if self.at == len(self.known) - 1:
-            self.at = 0
-        self._started = (now_s, float(self._times()[self.at]))
-
-    def advance(self, now_s: float) -> bool:
-        """Move to the pose of this moment while playing, at the speed of the recording. Whether the pose changed."""
-        if self._started is None:
-            return False
-        before = self.at
-        clock, begun = self._started
-        self.at = int(np.searchsorted(self._times(), begun + now_s - clock, side="right")) - 1
-        self.at = max(self.at, before)
-        if self.at >= len(self.known) - 1:
-            self._started = None
-        return self.at != before
-
-    def _times(self) -> Any:
-        return self.view.content.t_s[self.known]
-
-
 def open_window(view: View, index: int | None) -> bool:
-    """Show the view until the window is closed. False: no window could be opened."""
+    """Show the view until the window is closed, with a slider if possible. False: no window could be opened."""
+    if open_slider_window(view, index):
+        return True
     o3d = open3d()
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         window = o3d.visualization.VisualizerWithKeyCallback()

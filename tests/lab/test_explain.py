@@ -100,7 +100,7 @@ def test_a_code_belongs_to_one_section_and_has_all_texts():
         assert text.remedy.endswith(".")
 
 
-@pytest.mark.parametrize("typed", ["BP-V03", "bp-v03", "V03"])
+@pytest.mark.parametrize("typed", ["BP-V03", "bp-v03", "V03", "v3"])
 def test_a_code_is_explained_however_it_is_typed(typed):
     assert catalogue.explain(typed).startswith("BP-V03  Few frames with a measured pose\n")
 

@@ -10,6 +10,7 @@ import numpy as np
 from calibration.open3d_loader import MissingOpen3DError, open3d
 from geometry.arrays import Array
 from lab.errors import InputError
+from lab.files.text.regular_file import require_regular_file
 
 BY_OPEN3D = (".ply", ".pcd", ".pts", ".xyzn", ".xyzrgb")
 AS_TEXT = (".xyz", ".txt", ".csv", ".asc")
@@ -26,6 +27,7 @@ def read_point_cloud(path: Path, unit_m: float) -> tuple[Array, tuple[str, ...]]
     if kind not in (*BY_OPEN3D, *AS_TEXT):
         known = ", ".join(k[1:] for k in (*BY_OPEN3D, *AS_TEXT))
         raise InputError(f"{path}: expected a point cloud ({known}), got {kind or 'no ending'}; export it as PLY")
+    require_regular_file(path)
     try:
         if path.stat().st_size == 0:
             raise InputError(f"{path}: expected points, got an empty file; export the scan again")
@@ -55,7 +57,7 @@ def _by_open3d(path: Path) -> Array:
 
 def _as_text(path: Path) -> Array:
     try:
-        lines = path.read_text(encoding="utf-8-sig", errors="replace").splitlines()
+        lines = path.read_text("utf-8-sig", "replace").splitlines()
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from None
     first = next((i for i, line in enumerate(lines) if _numbers(line) is not None), None)

@@ -42,6 +42,7 @@ from lab.files.rig.camera_file import CameraFile, load_camera
 from lab.files.rig.interchange import read_cameras
 from lab.files.text.error_text import FileError, name_of_path, suggest_name
 from lab.files.text.fields import validated
+from lab.files.text.regular_file import text_of_file
 from lab.files.text.yaml_text import read_mapping
 
 
@@ -55,6 +56,11 @@ def load_project(path: Path, lab_known: bool = False) -> Project:
     """
     path = Path(path)
     if path.is_dir():
+        if not (path / "calibration.yaml").exists():
+            raise InputError(
+                f"{path}: expected a folder with a calibration.yaml, found none in it; `beampose calibrate simulate`"
+                " writes an example"
+            )
         path = path / "calibration.yaml"
     content = validated(ProjectBlock, read_mapping(path), path)
     mistakes: list[str] = []
@@ -229,4 +235,4 @@ def load_lens(path: Path, name: str | None = None) -> CameraFile:
 
 
 def _is_camera_yaml(path: Path) -> bool:
-    return re.search(r"^schema:\s*['\"]?beampose/camera/", path.read_text(encoding="utf-8"), re.MULTILINE) is not None
+    return re.search(r"^schema:\s*['\"]?beampose/camera/", text_of_file(path), re.MULTILINE) is not None

@@ -99,7 +99,8 @@ def read_detections(path: Path, named: str | None = None) -> DetectionsFile:
     rows.leave_out_repeated(frame, uv, sigma)
     if table.long_lines:
         count = len(table.long_lines)
-        rows.notes.append(f"{path}: {count} line{'s' if count > 1 else ''} left out: more fields than the header has")
+        why = "more fields than the header has (a comma too many, or a decimal comma)"
+        rows.notes.append(f"{path}: {count} line{'s' if count > 1 else ''} left out: {why}")
     if not rows.good.any():
         because = "".join(f"; {note.removeprefix(f'{path}: ')}" for note in rows.notes[len(missing) > 0 :])
         raise InputError(f"{path}: expected rows with {', '.join(required)}, got none that can be used{because}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +16,8 @@ from lab.files.text import columns
 from lab.files.text.columns import CAUSAL
 from lab.files.text.csv_table import Categorical, Table
 from lab.files.text.csv_text import read_table
+from lab.files.text.json_text import read_json
+from lab.files.text.range_checks import MAX_TIME_S
 from tracking.statuses import PoseStatus, SpotStatus
 
 SPOT_STATUSES = tuple(SpotStatus)
@@ -33,7 +34,20 @@ def read_result_table(path: Path, required: Iterable[str], optional: Iterable[st
             f"{path}: line {min(damaged)}: expected {len(table.header)} fields as in the header, and numbers in number"
             " columns; process the run again"
         )
+    _check_frames(table)
     return table
+
+
+def _check_frames(table: Table) -> None:
+    """Raises InputError at a frame that is no whole number or less than the one before, and at a time out of range."""
+    if "frame" in table.numbers:
+        for i in np.flatnonzero(np.diff(table.whole("frame")) < 0)[:1]:
+            frame, before = table.found("frame", i + 1), table.found("frame", i)
+            mistake = f"frame: expected frames in rising order, got {frame} after {before}; process the run again"
+            raise table.error(i + 1, mistake)
+    if "t_s" in table.numbers:
+        for i in np.flatnonzero(np.abs(table.numbers["t_s"]) > MAX_TIME_S)[:1]:
+            raise table.error(i, f"t_s: expected seconds, got {table.found('t_s', i)}; process the run again")
 
 
 @dataclass(frozen=True, slots=True)
@@ -208,7 +222,7 @@ def read_summary(results: Path) -> dict[str, Any]:
     if not path.exists():
         return {}
     try:
-        summary = json.loads(path.read_text(encoding="utf-8"))
+        summary = read_json(path)
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: expected a JSON object ({error})") from error
     if not isinstance(summary, dict):

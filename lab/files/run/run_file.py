@@ -20,6 +20,7 @@ from lab.errors import InputError
 from lab.files.rig.calibration_state import CalibrationState, OptionalDay
 from lab.files.rig.rig_covariance import joint_covariance
 from lab.files.rig.rig_file import load_rig_file
+from lab.files.run.not_a_run import no_run_error
 from lab.files.run.times import Times, load_times
 from lab.files.text.dataclass_fields import dataclass_from_yaml
 from lab.files.text.error_text import FileError, name_of_path, suggest_name
@@ -129,6 +130,8 @@ def load_run(run_folder: Path) -> Run:
     if not folder.is_dir():
         raise InputError(f"{folder}: expected a run folder, found {'a file' if folder.exists() else 'nothing'}")
     path = folder / "run.yaml"
+    if not path.exists():
+        raise no_run_error(folder)
     content = validated(_RunBlock, read_mapping(path), path)
     tracker = dataclass_from_yaml(TrackerParameters, content.tracker, path, "tracker")
 

@@ -10,7 +10,10 @@ import numpy as np
 from geometry.arrays import Array, Ints
 from lab.errors import InputError
 from lab.files.text import columns
+from lab.files.text.csv_table import Table
 from lab.files.text.csv_text import read_table
+
+UNIT_FACTOR = 50.0  # between the steps of the timestamps and of the frame rate, from which one of them is a mistake
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,4 +60,18 @@ def load_times(path: Path, frame_rate_hz: float) -> Times:
             f"t_s: expected increasing times, got {times_s[i]:g} s of frame {frames[i]} after {times_s[i - 1]:g} s of"
             f" frame {frames[i - 1]}",
         )
+    _check_unit(table, frames, times_s, frame_rate_hz)
     return Times(frame_rate_hz, frames, times_s)
+
+
+def _check_unit(table: Table, frames: Ints, times_s: Array, frame_rate_hz: float) -> None:
+    """Raises InputError where the usual step is far from that of the frame rate: milliseconds, or a wrong rate."""
+    if len(frames) < 2:
+        return
+    step_s = float(np.median(np.diff(times_s) / np.diff(frames)))
+    if not 1 / UNIT_FACTOR < step_s * frame_rate_hz < UNIT_FACTOR:
+        raise table.error(
+            1,
+            f"t_s: expected steps of about {1 / frame_rate_hz:.3g} s (frame_rate_hz: {frame_rate_hz:g}), got"
+            f" {step_s:.3g} s for each frame; give seconds, not milliseconds, or correct frame_rate_hz in run.yaml",
+        )

@@ -99,7 +99,7 @@ def _checked_header(path: Path, data: bytes, required: Sequence[str]) -> tuple[s
     found = printable_line(",".join(header)) if len(header) > 1 or header[0] in required else "a line without commas"
     for name in required:
         if name not in header:
-            near = suggest_name(name, header)
+            near = suggest_name(name, [h for h in header if h not in required])
             meant = f"{near.removesuffix('?')} in the header?" if "did you mean" in near else ""
             raise InputError(f"{path}: expected a column {name!r}, got {found}{meant}")
     twice = [name for i, name in enumerate(header) if name and name in header[:i]]

@@ -1,4 +1,4 @@
-"""Writes JSON from values of Python and numpy."""
+"""Reads JSON, and writes it from values of Python and numpy."""
 
 from __future__ import annotations
 
@@ -9,11 +9,36 @@ from typing import Any
 
 import numpy as np
 
+from lab.files.text.regular_file import text_of_file
+
 
 def write_json(content: Any, path: Path) -> None:
     """Write a value as a JSON file, indented."""
     text = json.dumps(plain_value(content), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
     path.write_bytes(text.encode("utf-8", "backslashreplace"))  # of names that are not UTF-8; JSON has these escapes
+
+
+def read_json(path: Path) -> Any:
+    """The content of a JSON file.
+
+    Raises:
+        InputError: it is a named pipe, a socket or a device.
+        OSError: it cannot be read.
+        ValueError: it is not JSON in UTF-8.
+    """
+    return json.loads(text_of_file(path))
+
+
+def has_schema(folder: Path, schema: str) -> bool:
+    """Whether a folder holds results with this schema in their summary.json.
+
+    Raises:
+        InputError: summary.json is a named pipe, a socket or a device.
+    """
+    try:
+        return bool(read_json(folder / "summary.json").get("schema") == schema)
+    except (OSError, ValueError, AttributeError):
+        return False
 
 
 def plain_value(value: Any) -> Any:

@@ -13,6 +13,7 @@ MAX_COORDINATE_M = (
 )
 MAX_SCAN_COORDINATE = 1e8  # units of a scanned cloud, which may be millimetres and in a national grid
 MARGIN_PICTURES = 1.0  # how far outside the picture, in picture widths, a pixel is accepted: predictions lie there
+MAX_TIME_S = 1e12  # s, thirty thousand years
 SIGMA_RANGE_M = (1e-9, MAX_COORDINATE_M)
 SIGMA_RANGE_PX = (1e-6, 1e5)
 SIGMA_RANGE_DEG = (0.0, 360.0)

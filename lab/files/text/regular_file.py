@@ -28,3 +28,26 @@ def require_regular_file(path: Path) -> None:
     for is_kind, words in _KINDS:
         if is_kind(mode):
             raise InputError(f"{path}: expected a file, found {words}; write its content to a file")
+
+
+def text_of_file(path: Path, encoding: str = "utf-8", errors: str = "strict") -> str:
+    """The text of a file.
+
+    Raises:
+        InputError: it is a named pipe, a socket or a device.
+        OSError: it cannot be read.
+        ValueError: it has another encoding.
+    """
+    require_regular_file(path)
+    return path.read_text(encoding, errors)
+
+
+def bytes_of_file(path: Path) -> bytes:
+    """The bytes of a file.
+
+    Raises:
+        InputError: it is a named pipe, a socket or a device.
+        OSError: it cannot be read.
+    """
+    require_regular_file(path)
+    return path.read_bytes()

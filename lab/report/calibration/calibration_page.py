@@ -19,6 +19,7 @@ from calibration.findings import Finding, Level
 from geometry.arrays import Array
 from lab.errors import InputError
 from lab.files.text.atomic_write import atomic_write_text
+from lab.files.text.regular_file import bytes_of_file
 from lab.number_format import format_number
 from lab.report.html import environment
 
@@ -110,7 +111,7 @@ def provenance(inputs: Iterable[Path] = (), made: date | None = None) -> Provena
     lines = []
     for path in inputs:
         try:
-            digest = hashlib.sha256(Path(path).read_bytes()).hexdigest()
+            digest = hashlib.sha256(bytes_of_file(Path(path))).hexdigest()
         except OSError as error:
             raise InputError(f"{path}: cannot be read: {error.strerror}") from None
         lines.append(f"{Path(path).name}  sha256 {digest[:16]}")

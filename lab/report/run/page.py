@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from markupsafe import Markup
 
 from lab.errors import InputError
@@ -151,6 +152,8 @@ def _missing(m: ReportData) -> list[str]:
     out = []
     if not m.summary.present:
         out.append("summary.json is missing: no verdict, parameters, versions or fingerprints.")
+    if not np.array_equal(m.spots.frames, m.poses.frames):
+        out.append("spots.csv and attitude.csv have different frames: a file was changed; process the run again.")
     if m.run_folder is None:
         out.append("The run folder could not be read: no pictures, no residuals per spot, no errors against truth.")
     elif m.run is None:

@@ -88,7 +88,7 @@ def read_report_data(results: Path, run_folder: Path | None) -> ReportData:
         except BeamposeError:
             truth = None
     score = score_against(spots, poses, truth, causal) if truth is not None else summary.errors
-    times_known = bool(len(spots.t_s)) and bool(np.isfinite(spots.t_s).all())
+    times_known = bool(len(spots.t_s)) and bool(np.isfinite([*spots.t_s, *poses.t_s]).all())
     residual_px, residual_share = (None, None) if run is None else _residuals(spots, poses, run)
     return ReportData(
         name=summary.name or name_of_path(results),

@@ -19,24 +19,29 @@
   const shown = document.getElementById("scene-moment"), moments = data.moments;
   const box = canvas.closest("[data-scene]"); // in a report: the drawings are shown until the scene is
   if (box) box.classList.add("live-scene");
-  let turn = -0.6, tilt = 0.5, zoom = document.querySelector("[data-scene]") ? 0.8 : 1, playing = null;
+  let turn = -0.6, tilt = 0.5, zoom = 1, playing = null;
 
-  // The box of the scene: its centre and half its diagonal.
+  // The box of the scene and its centre.
   const low = [1e9, 1e9, 1e9], high = [-1e9, -1e9, -1e9];
   for (const line of data.lines) for (const p of line.p) if (p) for (let i = 0; i < 3; i++) {
     low[i] = Math.min(low[i], p[i]);
     high[i] = Math.max(high[i], p[i]);
   }
   const centre = low.map((v, i) => (v + high[i]) / 2);
-  const radius = Math.max(Math.hypot(...high.map((v, i) => v - low[i])) / 2, 1e-3);
 
-  // World to canvas: turned about z, then tilted; a parallel projection.
-  const place = p => {
+  // World to the plane of the drawing, m: turned about z, then tilted; a parallel projection.
+  const seen = p => {
     const x = p[0] - centre[0], y = p[1] - centre[1], z = p[2] - centre[2];
     const right = Math.cos(turn) * x - Math.sin(turn) * y, away = Math.sin(turn) * x + Math.cos(turn) * y;
-    const scale = zoom * 0.5 * Math.min(canvas.clientWidth, canvas.clientHeight * 1.6) / radius;
-    return [canvas.clientWidth / 2 + scale * right,
-      canvas.clientHeight / 2 - scale * (Math.cos(tilt) * z + Math.sin(tilt) * away)];
+    return [right, Math.cos(tilt) * z + Math.sin(tilt) * away];
+  };
+  // Half the width and height of the scene as it is seen first: it then fills nine tenths of the canvas.
+  const half = [1e-3, 1e-3];
+  for (const line of data.lines) for (const p of line.p) if (p) seen(p).forEach((v, i) => { half[i] = Math.max(half[i], Math.abs(v)); });
+  const place = p => {
+    const [right, up] = seen(p);
+    const scale = zoom * 0.45 * Math.min(canvas.clientWidth / half[0], canvas.clientHeight / half[1]);
+    return [canvas.clientWidth / 2 + scale * right, canvas.clientHeight / 2 - scale * up];
   };
   const trace = points => {
     pen.beginPath();
@@ -51,7 +56,7 @@
   const label = (words, p) => {
     const [x, y] = place(p);
     pen.fillStyle = getComputedStyle(document.body).color;
-    pen.fillText(words, x + 6, y - 5);
+    pen.fillText(words, Math.min(x + 6, canvas.clientWidth - pen.measureText(words).width - 4), y - 5);
   };
 
   function draw() {

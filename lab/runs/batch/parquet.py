@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import tempfile
 from collections.abc import Iterable, Mapping
@@ -11,6 +10,8 @@ from typing import Any
 
 from lab.errors import InputError
 from lab.files.text.csv_text import WORD_COLUMNS
+from lab.files.text.json_text import read_json
+from lab.files.text.regular_file import require_regular_file
 
 FOLDER = "parquet"
 TABLES = ("attitude", "spots")
@@ -68,6 +69,7 @@ def _update(results: Path, name: str, file: Path) -> None:
                 return
         except (pa.ArrowException, OSError):
             pass  # a damaged file is written again
+    require_regular_file(source)
     try:
         with source.open(encoding="utf-8") as text:
             header = text.readline().strip().split(",")
@@ -93,7 +95,7 @@ def _update(results: Path, name: str, file: Path) -> None:
 def _identity(results: Path, source: Path) -> bytes:
     """Identifies the contents of a table: the fingerprint of its run, its size and time."""
     try:
-        fingerprint = json.loads((results / "summary.json").read_text("utf-8")).get("fingerprint")
+        fingerprint = read_json(results / "summary.json").get("fingerprint")
     except (ValueError, AttributeError):
         fingerprint = None
     state = source.stat()

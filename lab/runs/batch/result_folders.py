@@ -10,6 +10,7 @@ from pathlib import Path
 
 from lab.errors import InputError
 from lab.files.text.atomic_write import atomic_write_text
+from lab.files.text.json_text import read_json
 
 FILE_NAME = ".batch-folders.json"
 SCHEMA = "beampose/batch-folders/1"
@@ -78,7 +79,7 @@ def _simple(folder: Path) -> str:
 
 def _read(path: Path) -> dict[str, str]:
     try:
-        content = json.loads(path.read_text("utf-8"))
+        content = read_json(path)
         folders = content["folders"]
         if content["schema"] != SCHEMA or not all(isinstance(v, str) for v in folders.values()):
             raise ValueError

@@ -12,7 +12,7 @@ from typing import Any
 from lab.files.rig.calibration_state import state_mapping
 from lab.files.run.fingerprints import fingerprints
 from lab.files.run.run_file import Run
-from lab.files.text.json_text import plain_value
+from lab.files.text.json_text import plain_value, read_json
 from lab.versions import versions
 
 _RESULTS = ("attitude.csv", "spots.csv", "report.html")  # beside summary.json
@@ -54,7 +54,7 @@ def program_digest() -> str:
 def finished_summary(results: Path, fingerprint: str) -> dict[str, Any] | None:
     """summary.json of complete results that have this fingerprint; None where there are none."""
     try:
-        summary = json.loads((results / "summary.json").read_text("utf-8"))
+        summary = read_json(results / "summary.json")
     except (OSError, ValueError):
         return None
     if not isinstance(summary, dict) or summary.get("fingerprint") != fingerprint:

@@ -9,6 +9,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from lab.errors import InputError
+from lab.files.text.regular_file import bytes_of_file
 
 
 def listed_runs(given: Sequence[str | os.PathLike[str]], lists: Sequence[str | os.PathLike[str]] = ()) -> list[Path]:
@@ -43,7 +44,7 @@ def listed_runs(given: Sequence[str | os.PathLike[str]], lists: Sequence[str | o
 
 def _of_file(path: str) -> Iterator[Path]:
     try:
-        data = sys.stdin.buffer.read() if path == "-" else Path(path).read_bytes()
+        data = sys.stdin.buffer.read() if path == "-" else bytes_of_file(Path(path))
     except OSError as error:
         raise InputError(f"{path}: expected a text file with a run folder per line: {error.strerror}") from None
     for number, line in enumerate(data.removeprefix(b"\xef\xbb\xbf").splitlines(), start=1):

@@ -13,6 +13,7 @@ import filelock
 
 from lab.errors import InputError
 from lab.files.text.csv_text import text_of_field, write_table
+from lab.files.text.regular_file import text_of_file
 from lab.runs.batch.task import COLUMNS
 
 LOCK_SECONDS = 120.0  # the lock is held for milliseconds: longer waiting means a broken file system
@@ -104,7 +105,7 @@ def read_rows(path: Path) -> list[dict[str, str]]:
         InputError: the file is not a table of a batch.
     """
     try:
-        text = path.read_text("utf-8")
+        text = text_of_file(path)
         rows = list(csv.DictReader(io.StringIO(text, newline=""), restval="", strict=True))
     except FileNotFoundError:
         return []

@@ -224,3 +224,25 @@ def test_what_cannot_be_compared_is_named(folder, result, motions):
         compare(result, reference=far, align=("world", "body"))
     with pytest.raises(InputError, match="something other than earlier results"):
         compare_and_write(result, result, None, result)
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "words"),
+    [
+        ("a1", "a1", "Both results rest on the same pictures or points"),
+        ("a1", "b2", "The results are of different recordings, run-a1 and run-b2"),
+        ("", "b2", "Both results may rest on the same pictures"),
+    ],
+)
+def test_two_results_of_different_recordings_are_said_to_be_so(folder, result, motions, first, second, words):
+    """The rig and the truth may be the same for both."""
+    pair = []
+    for name, digest in zip(("left", "right"), (first, second), strict=True):
+        path = write_results(folder / "results" / f"{name}-{first}-{second}", motions[0])
+        listed = [("r/rig.yaml", "0"), ("r/truth/pose.csv", "1"), ("r/frames/left", digest)]
+        inputs = [{"path": where, "sha256": sha} for where, sha in listed] if digest else None
+        content = {"schema": SUMMARY_SCHEMA, "run_folder": f"/d/run-{digest}", "inputs": inputs}
+        (path / "summary.json").write_text(json.dumps(content))
+        pair.append(path)
+    (note,) = compare(pair[0], other=pair[1]).notes
+    assert note.startswith(words)

@@ -177,3 +177,12 @@ def test_a_note_about_detections_names_the_right_line_after_blank_lines(tmp_path
     path = tmp_path / "detections.csv"
     path.write_text("frame,camera,u_px,v_px\n\n0,left,1,2\n\n0.5,left,1,2\n")
     assert any("the first in line 5, with frame 0.5" in note for note in read_detections(path).notes)
+
+
+def test_a_missing_column_is_not_said_to_be_one_that_is_needed_itself(tmp_path):
+    (tmp_path / "points.csv").write_text("frame,x,v_px\n0,1,2\n", "utf-8")
+    with pytest.raises(InputError, match=r"expected a column 'u_px', got frame,x,v_px$"):
+        read_table(tmp_path / "points.csv", ("frame", "u_px", "v_px"))
+    (tmp_path / "points.csv").write_text("frame,U_px,v_px\n0,1,2\n", "utf-8")
+    with pytest.raises(InputError, match="did you mean 'U_px' in the header"):
+        read_table(tmp_path / "points.csv", ("frame", "u_px", "v_px"))

@@ -109,7 +109,9 @@ def test_an_unusable_row_is_left_out_and_noted(bad, why, found, tmp_path):
 def test_a_line_with_too_many_fields_is_left_out_and_noted(tmp_path):
     file = read_detections(table(tmp_path, row(0, "left", 5, 6), row(1, "left", 5, 6) + ",7,8", row(2, "left", 5, 6)))
     assert list(file.cameras["left"].frames) == [0, 2]
-    assert file.notes[0].endswith("1 line left out: more fields than the header has")
+    assert file.notes[0].endswith(
+        "1 line left out: more fields than the header has (a comma too many, or a decimal comma)"
+    )
 
 
 @pytest.mark.parametrize(

@@ -3,18 +3,25 @@
 from __future__ import annotations
 
 import os
+import re
 import time
 
 import pytest
 
 from lab.errors import InputError
+from lab.files.project.cloud_file import read_point_cloud
 from lab.files.rig.rig_file import load_rig
+from lab.files.run.results import read_summary
 from lab.files.run.run_file import load_run
 from lab.files.run.truth import load_truth
 from lab.files.text.csv_text import csv_text, read_table
 from lab.files.text.error_text import is_formula, name_of_path, printable
+from lab.files.text.json_text import has_schema
 from lab.files.text.yaml_text import parse_mapping, parse_value, read_mapping
 from lab.plan.plan_options import options_of
+from lab.runs.batch.result_folders import allotted
+from lab.runs.batch.run_list import listed_runs
+from lab.runs.batch.table import read_rows
 from lab.runs.frames.frame_sources import open_video
 from tests.paths import ROOT
 
@@ -70,6 +77,40 @@ def test_a_pipe_in_place_of_a_file_is_refused_and_not_waited_for(tmp_path):
         read_table(tmp_path / "pipe", ("frame",))
     with pytest.raises(InputError, match="found a named pipe"):
         open_video(tmp_path / "pipe")
+
+
+@pytest.mark.parametrize("name", ["batch.csv", "summary.json", ".batch-folders.json", "runs.txt", "scan.xyz"])
+def test_a_pipe_in_place_of_a_file_that_the_program_wrote_or_lists_is_refused_too(tmp_path, name):
+    os.mkfifo(tmp_path / name)
+    readers = {
+        "batch.csv": lambda: read_rows(tmp_path / name),
+        "summary.json": lambda: (has_schema(tmp_path, "any"), read_summary(tmp_path)),
+        ".batch-folders.json": lambda: allotted(tmp_path, [tmp_path], {}),
+        "runs.txt": lambda: listed_runs((), [tmp_path / name]),
+        "scan.xyz": lambda: read_point_cloud(tmp_path / name, 1.0),
+    }
+    with pytest.raises(InputError, match="found a named pipe"):
+        readers[name]()
+
+
+def test_files_of_users_are_read_through_the_helpers_that_refuse_pipes():
+    """Reading a pipe waits for ever. The others read what the program itself holds, or have asked for a file before."""
+    asked = {
+        "calibrate/camera/camera_page.py",
+        "compare/reference_file.py",
+        "doctor/places.py",
+        "files/project/cloud_file.py",
+        "init/files.py",
+        "pictures/colour.py",
+        "runs/batch/cluster.py",
+        "runs/batch/resumption.py",
+    }
+    found = {
+        path.relative_to(ROOT / "lab").as_posix()
+        for path in (ROOT / "lab").rglob("*.py")
+        if re.search(r"\.read_(text|bytes)\(", path.read_text("utf-8")) and path.parent.name != "text"
+    }
+    assert found == asked
 
 
 @pytest.mark.parametrize(

@@ -271,3 +271,8 @@ def test_invalid_poses_are_refused(tmp_path, rows, words):
     path.write_text(f"{POSES}\n{rows}")
     with pytest.raises(InputError, match=words):
         read_poses(path)
+
+
+def test_a_folder_that_is_no_project_is_said_to_be_none(tmp_path):
+    with pytest.raises(InputError, match=r"expected a folder with a calibration.yaml, found none in it; `beampose cal"):
+        load_project(tmp_path)

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import json
+import re
+import shutil
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -13,7 +16,7 @@ import pytest
 from geometry import rotations
 from lab.errors import InputError
 from lab.files.run.run_file import DetectionsTable, FramesFolder, VideoFile, load_run, save_run
-from lab.files.run.times import Times
+from lab.files.run.times import Times, load_times
 from lab.files.text.dataclass_fields import dataclass_from_yaml
 from tests.lab.run_folders import RUN, edit, write_run
 from tracking.parameters import DetectParameters, TrackerParameters
@@ -253,3 +256,44 @@ def test_wrong_timestamps_are_reported_with_their_line(text, words, tmp_path):
     with pytest.raises(InputError) as caught:
         load_run(folder)
     assert words in str(caught.value)
+
+
+def test_a_folder_that_is_no_run_is_named_for_what_it_is(tmp_path):
+    run = write_run(tmp_path / "lab" / "day-1")
+    for name in ("day-2", "day-3", "day-4"):
+        shutil.copytree(run, run.parent / name)
+    results = tmp_path / "results"
+    results.mkdir()
+    (results / "summary.json").write_text(json.dumps({"run_folder": str(run)}), "utf-8")
+    pictures = tmp_path / "pictures"
+    pictures.mkdir()
+    (pictures / "0001.png").touch()
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    for folder, words in (
+        (
+            run.parent,
+            "found run folders in it: day-1, day-2, day-3 and 1 more; name one, or give all to",
+        ),
+        (results, f"found results; they are of the run {run}"),
+        (next(p for p in run.iterdir() if p.is_dir()), "found a part of one; name the run folder day-1"),
+        (pictures, "found pictures; `beampose detect` needs no run.yaml"),
+        (empty, "found none; check the path, or write one with `beampose init`"),
+    ):
+        with pytest.raises(InputError, match=re.escape(words)):
+            load_run(folder)
+
+
+@pytest.mark.parametrize(("step", "fits"), [(0.01, True), (0.1, True), (10.0, False), (10_000.0, False), (1e-5, False)])
+def test_timestamps_in_another_unit_than_the_frame_rate_are_refused(tmp_path, step, fits):
+    """0.1 s at 100 Hz is accepted: a camera that an instrument triggers may be slower than it can be."""
+    (tmp_path / "times.csv").write_text(
+        "frame,t_s\n" + "".join(f"{f},{f * step!r}\n" for f in range(0, 20, 2)), "utf-8"
+    )
+    if fits:
+        assert load_times(tmp_path / "times.csv", 100.0).t_s(5) == pytest.approx(5 * step)
+    else:
+        with pytest.raises(
+            InputError, match=r"times.csv: line 3: t_s: expected steps of about 0.01 s .* not milliseconds"
+        ):
+            load_times(tmp_path / "times.csv", 100.0)

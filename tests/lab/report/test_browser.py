@@ -12,6 +12,9 @@ import pytest
 
 from lab.report.index.index import write_index
 from lab.report.run.page import write_report
+from lab.view.content import read_content
+from lab.view.scene import View, view_of
+from lab.view.view import write_files
 from tests.lab.report.test_report import make
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -101,3 +104,33 @@ def test_the_index_fits_into_the_window(index, width):
 
 def test_the_report_of_a_run_has_no_console_errors(tmp_path):
     assert browse(write_report(make(tmp_path, 300).results))[1] == []
+
+
+INK = """
+<script>
+const c = document.getElementById("scene"), p = c.getContext("2d").getImageData(0, 0, c.width, c.height).data;
+let rows = 0, edge = 0;
+for (let y = 0; y < c.height; y++) for (let x = 0; x < c.width; x++) if (p[4 * (y * c.width + x) + 3]) {
+  rows++;
+  if (x < 2 || y < 2 || x > c.width - 3 || y > c.height - 3) edge++;
+}
+document.title = JSON.stringify({ rows, edge });
+</script>
+"""
+
+
+@pytest.mark.parametrize("width", [500, 1300])
+def test_the_scene_is_seen_whole_at_first(tmp_path, width):
+    write_files(*_scene(make(tmp_path).results), tmp_path / "view")
+    page = tmp_path / "view" / "view.html"
+    text = re.sub(r"<meta http-equiv.*?>", "", page.read_text("utf-8"), count=1)
+    page.write_text(text.replace("</body>", INK + "</body>"), "utf-8")
+    ink = json.loads(browse(page, width)[0])
+    assert ink["rows"] > 1000
+    assert ink["edge"] == 0
+
+
+def _scene(results: Path) -> tuple[View, int | None]:
+    content = read_content(results, None)
+    index = content.at_frame(None)
+    return view_of(content, index), index

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import re
 import shutil
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 
 from lab import number_format
+from lab.errors import InputError
 from lab.files.run.results import read_poses
 from lab.report.index.index import write_index
 from lab.report.plot import thinning
@@ -483,3 +485,31 @@ def test_a_report_without_the_rig_has_no_scene(tmp_path):
     fake = make(tmp_path, 20)
     (fake.run_folder / "rig.yaml").unlink()
     assert "In three dimensions" not in write_report(fake.results).read_text()
+
+
+@pytest.mark.parametrize(
+    ("column", "value", "words"),
+    [
+        ("frame", "", "frame: expected a whole number, got nothing"),
+        ("frame", "3.5", "frame: expected a whole number, got 3.5"),
+        ("frame", "-5", "frame: expected frames in rising order, got -5 after"),
+        ("t_s", "1e308", "t_s: expected seconds, got 1e+308"),
+    ],
+)
+@pytest.mark.parametrize("name", ["attitude.csv", "spots.csv"])
+def test_results_whose_frames_or_times_are_damaged_are_refused_with_the_line(name, column, value, words, tmp_path):
+    results = make(tmp_path).results
+    rows = list(csv.reader((results / name).read_text("utf-8").splitlines()))
+    rows[5][rows[0].index(column)] = value
+    (results / name).write_text("\n".join(map(",".join, rows)) + "\n", "utf-8")
+    with pytest.raises(InputError, match=re.escape(f"{name}: line 6: {words}")):
+        write_report(results)
+
+
+@pytest.mark.filterwarnings("error")
+def test_results_with_a_time_missing_are_shown_over_frame_numbers(tmp_path):
+    results = make(tmp_path).results
+    rows = list(csv.reader((results / "attitude.csv").read_text("utf-8").splitlines()))
+    rows[5][rows[0].index("t_s")] = ""
+    (results / "attitude.csv").write_text("\n".join(map(",".join, rows)) + "\n", "utf-8")
+    assert ">frame<" in write_report(results).read_text("utf-8")

@@ -149,6 +149,7 @@ def test_results_whose_tables_disagree_give_a_report_without_enlarging(fake, tmp
     html = write_report(results).read_text(encoding="utf-8")
     assert 'id="zoom-data"' not in html
     assert "Attitude and position" in html
+    assert "spots.csv and attitude.csv have different frames" in html
 
 
 def test_damaged_tables_give_a_report_that_says_so(tmp_path):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import datetime
+import json
 
 import numpy as np
 import pytest
@@ -94,3 +95,31 @@ def test_the_calibration_of_unused_cameras_is_ignored(run_folder, tmp_path):
     rig = dataclasses.replace(file.rig, cameras={**file.rig.cameras, "spare": extra})
     save_rig(RigFile(rig, covariance(rig)), run_folder / "rig.yaml")
     assert process_run(run_folder, tmp_path / "out").exit_status == 0
+
+
+def test_a_calibrated_run_whose_vehicle_is_never_found_fails_and_has_its_tables(run_folder, tmp_path):
+    """A lens cap on one camera: no pose in any frame, and so none at which the calibration's errors are asked for."""
+    change_rig(run_folder, covariances=covariance(load_rig_file(run_folder / "rig.yaml").rig))
+    points = run_folder / "detections.csv"
+    lines = points.read_text("utf-8").splitlines(keepends=True)
+    points.write_text("".join(line for line in lines if ",left," not in line), "utf-8")
+    outcome = process_run(run_folder, tmp_path / "out")
+    assert (outcome.verdict.exit_status, outcome.measured) == (4, 0)
+    assert np.isnan(read_poses(tmp_path / "out").systematic).all()
+
+
+def test_a_prior_that_the_first_pose_contradicts_is_a_note(tmp_path):
+    """The vehicle is found later, among all poses, and the smoothing pass goes back to the first frame."""
+    run_folder = simulate("smooth", tmp_path / "run", seed=5, frames=60, detections_only=True)
+    process_run(run_folder, tmp_path / "right")
+    notes = json.loads((tmp_path / "right" / "summary.json").read_text("utf-8"))["notes"]
+    assert not any("prior" in note for note in notes)
+    content = yaml.safe_load((run_folder / "run.yaml").read_text("utf-8"))
+    at = content["prior"]["position_m"]
+    content["prior"] |= {"position_m": [at[0] + 1.0, at[1], at[2]], "within_m": 0.001}
+    (run_folder / "run.yaml").write_text(yaml.safe_dump(content), "utf-8")
+    process_run(run_folder, tmp_path / "wrong")
+    notes = json.loads((tmp_path / "wrong" / "summary.json").read_text("utf-8"))["notes"]
+    (note,) = [note for note in notes if "prior" in note]
+    assert note.startswith("the first frame's pose is outside the prior of run.yaml: a coordinate is ")
+    assert "(within_m: 0.001)" in note

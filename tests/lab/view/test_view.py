@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import sys
+import time
 
 import cv2
 import numpy as np
@@ -14,14 +16,16 @@ from calibration.open3d_loader import open3d
 from geometry.forward_model import SpotModel
 from lab.errors import InputError
 from lab.files.rig.rig_file import save_rig
-from lab.view import render, solids
+from lab.view import render, slider_window, solids
 from lab.view import view as view_module
 from lab.view.content import read_content
 from lab.view.gltf import write_glb
 from lab.view.page import scene_data
+from lab.view.player import Player
 from lab.view.scene import view_of
+from lab.view.slider_window import Controls
 from lab.view.view import show
-from lab.view.window import Player, fill
+from lab.view.window import fill
 from tests.lab.fake_results import make
 from tests.open3d_marker import needs_open3d
 
@@ -188,6 +192,15 @@ def test_a_rig_without_poses_has_nothing_to_play(content, tmp_path):
     assert (player.index, player.playing, player.advance(9.0)) == (None, False, False)
 
 
+def _ends(view, index, opened):
+    os._exit(139)
+
+
+def _opens_and_ends(view, index, opened):
+    opened.send(True)
+    os._exit(139)
+
+
 class Window:
     """Notes what is added to a window, and its keys."""
 
@@ -227,6 +240,43 @@ def test_a_key_moves_the_beams_of_the_window(content):
     assert len(window.shown) == 2
     assert np.abs(np.asarray(window.shown[1].vertices) - before).max() > 1e-3
     assert not window.tick(window)  # nothing plays
+
+
+@needs_open3d
+def test_the_slider_the_button_the_keys_and_the_clock_move_one_and_the_same_player(content):
+    """With Open3D's own widgets, which work without a window."""
+    gui, drawn = open3d().visualization.gui, []
+    player = Player(view_of(content, None), None)
+    controls = Controls(gui, player, lambda: drawn.append(player.at))
+    last = len(player.known) - 1
+    assert (controls.slider.get_minimum_value, controls.slider.get_maximum_value) == (0, last)
+    controls.slid(3.0)
+    assert (player.at, drawn, controls.slider.int_value) == (3, [3], 3)
+    frame, t_s = content.frames[player.known[3]], content.t_s[player.known[3]]
+    assert controls.caption.text == f"frame {frame}, {t_s:.3f} s"
+    assert controls.press(gui.KeyName.END)
+    assert (controls.slider.int_value, drawn[-1]) == (last, last)
+    assert not controls.press(gui.KeyName.Q)
+    assert controls.press(gui.KeyName.SPACE)  # plays from the start again
+    assert (controls.button.text, player.at) == ("Pause", 0)
+    assert controls.tick(time.monotonic() + 1e6)
+    assert (controls.slider.int_value, controls.button.text, drawn[-1]) == (last, "Play", last)
+    assert not controls.tick(time.monotonic() + 2e6)
+    controls.slid(float(last + 10))  # beyond the end
+    assert player.at == last
+
+
+@needs_open3d
+def test_where_the_window_with_a_slider_cannot_open_the_other_one_is_tried(content, monkeypatch):
+    """Its process ends without a window, whatever the reason: no Vulkan, or a driver that ends the process."""
+    monkeypatch.setattr(slider_window, "_show", _ends)
+    assert not slider_window.open_slider_window(view_of(content, None), None)
+
+
+@needs_open3d
+def test_a_window_that_was_open_is_not_followed_by_another(content, monkeypatch):
+    monkeypatch.setattr(slider_window, "_show", _opens_and_ends)
+    assert slider_window.open_slider_window(view_of(content, None), None)
 
 
 @needs_open3d
