@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from geometry.arrays import Array
-from tests.tracking.smoothing.path_recordings import FRAMES, GAP, context, filmed, without
+from tests.tracking.smoothing.labels.path_recordings import FRAMES, GAP, context, filmed, without
 from tracking.rigid_body.association.frame_detections import BLENDED
 from tracking.smoothing.labels.continuity import MIN_SINGLE_CHAIN, continued
 from tracking.smoothing.labels.path_prediction import MAX_AHEAD
