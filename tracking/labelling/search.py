@@ -142,16 +142,16 @@ def candidate_labellings(
     sigma_px = LARGEST_MODEL_ERROR * parameters.model_sigma_px
     best = BestCandidates.none(parameters.max_refined, len(model))
     brightness_known = all(np.isfinite(found.flux).any() for found in detections.values() if len(found))
-    screens, most_triples = _within_budget(plan, problem, reached, parameters, brightness_known, sigma_px)
-    done = 0
-    for size, end in plan.stages.items():
-        stage = plan.triples[done : min(end, most_triples)]
-        stage = np.ascontiguousarray(stage[(spots.spot_screen[stage] >= 0).all(axis=1)])
-        done = end
-        generate(problem, screens, reached, stage, best)
-        # Labellings that are not covered yet explain at least two spots fewer, so they cannot compete.
-        if done >= most_triples or _spots_of_best(plan, problem, best) > size:
-            break
+    for screens, most_triples in _within_budget(plan, problem, reached, parameters, brightness_known, sigma_px):
+        done = 0
+        for size, end in plan.stages.items():
+            stage = plan.triples[done : min(end, most_triples)]
+            stage = np.ascontiguousarray(stage[(spots.spot_screen[stage] >= 0).all(axis=1)])
+            done = end
+            generate(problem, screens, reached, stage, best)
+            # Labellings that are not covered yet explain at least two spots fewer, so they cannot compete.
+            if done >= most_triples or _spots_of_best(plan, problem, best) > size:
+                break
     return _completed(plan, problem, prior, log_volume, best, calibration, most, sigma_px)
 
 
@@ -206,15 +206,17 @@ def _within_budget(
     parameters: LabelParameters,
     brightness_known: bool,
     sigma_px: float,
-) -> tuple[PointsOnScreens, int]:
-    """The points and the number of the plan's triples to be used: at most `max_triples` sets of three points.
+) -> list[tuple[PointsOnScreens, int]]:
+    """The points and the number of the plan's triples to be used, in one or two passes: `max_triples` sets of points.
 
-    In a crowd only the brightest points are used, because spots are brighter than most false points. If the brightness
-    is unknown, all points are used with fewer triples of spots: those that cover most sets of visible spots.
+    In a crowd the sets are divided among all points with few triples of spots, which are enough if most spots are
+    visible, and the brightest points with all triples. Spots are brighter than most false points, but reflections
+    may be brighter than they are. If the brightness is unknown, the first pass has all sets.
     """
     points, spot_geometry = problem.points, problem.spots
-    most = parameters.max_points
+    most, budget = parameters.max_points, parameters.max_triples
     screen_count = int(plan.screen_of_camera.max()) + 1
+    passes: list[tuple[PointsOnScreens, int]] = []
     while True:
         screens = on_screens(points, plan.screen_of_camera, screen_count, sigma_px, most)
         options = np.zeros(len(plan.spot_screen))
@@ -222,10 +224,13 @@ def _within_budget(
             if k >= 0:
                 options[spot] = np.count_nonzero(reached[spot, screens.point[screens.first[k] : screens.first[k + 1]]])
         sets = np.cumsum(np.prod(options[plan.triples], axis=1))
-        if not len(sets) or sets[-1] <= parameters.max_triples:
-            return screens, len(sets)
+        if not len(sets) or sets[-1] <= budget:
+            return [*passes, (screens, len(sets))]
         if not brightness_known or most <= FEWEST_POINTS:
-            return screens, max(1, int(np.count_nonzero(sets <= parameters.max_triples)))
+            return [*passes, (screens, max(1, int(np.count_nonzero(sets <= budget))))]
+        if not passes:
+            budget = budget // 2
+            passes.append((screens, max(1, int(np.count_nonzero(sets <= budget)))))
         most = max(int(0.8 * most), FEWEST_POINTS)
 
 

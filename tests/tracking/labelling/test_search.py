@@ -392,3 +392,21 @@ def test_a_narrow_prior_finds_the_vehicle_among_hundreds_of_points_of_unknown_br
     result = find_labels(rig, model, picture.detections, WIDE)
     assert result.chosen is None
     assert "without a flux that shows which may be spots" in result.reason
+
+
+def test_spots_that_are_fainter_than_all_false_points_are_found():
+    """Bright reflections in number: the brightest points alone contain no spot of the vehicle."""
+    rig = RIGS["four-skew-beams"]()
+    model, rng = SpotModel.of(rig), np.random.default_rng(21)
+    for _ in range(6):
+        picture = photograph(model, pose_within(WIDE, rng), rng, false_points=18)
+        detections = {
+            name: replace(found, flux=np.where(picture.origin[name] >= 0, 1e3, rng.uniform(1e4, 1e6, len(found))))
+            for name, found in picture.detections.items()
+        }
+        if sum(np.count_nonzero(of >= 0) for of in picture.origin.values()) < 6:
+            continue
+        result = find_labels(rig, model, detections, WIDE)
+        assert result.chosen is not None
+        assert wrong_labels(result, model, picture) == []
+        assert np.count_nonzero(result.chosen.point_of != NO_POINT) >= 6
