@@ -7,7 +7,8 @@ import numpy as np
 from geometry.arrays import Bools, Ints
 from tracking.rigid_body.hypotheses.prediction_checks import MIN_CONFIRMING_SPOTS
 
-BRIEF_FRAMES, ABSENT_FRAMES = 2, 2  # a spot is seen for so many frames at most, and missed for so many on both sides
+# Of the frames at most AROUND away from a label: in so many at most the spot is seen, in so many at least missed.
+AROUND, BRIEF_FRAMES, ABSENT_FRAMES = 3, 2, 4
 
 
 def connected(measured: Bools, confirmed: Bools) -> Bools:
@@ -28,19 +29,20 @@ def next_to(mask: Bools) -> Bools:
 
 
 def brief(labelled: Bools, missed: Bools) -> Bools:
-    """(T, n): labels of a spot that is seen in at most BRIEF_FRAMES frames between two stretches of being missed.
+    """(T, n): labels of a spot that is seen in at most BRIEF_FRAMES frames around, and missed in ABSENT_FRAMES or more.
 
     labelled, missed (T, n): the spot has a label; it should be in the picture and has none. An occluded spot seldom
     reappears for so short a time, and a false point at its place is not rare in a long occlusion.
     """
-    out = np.zeros_like(labelled)
-    for view in range(labelled.shape[1]):
-        edges = np.diff(np.concatenate([[0], labelled[:, view].astype(np.int8), [0]]))
-        for first, end in zip(np.flatnonzero(edges > 0), np.flatnonzero(edges < 0), strict=True):
-            before, after = missed[max(first - ABSENT_FRAMES, 0) : first, view], missed[end : end + ABSENT_FRAMES, view]
-            if end - first <= BRIEF_FRAMES and min(before.sum(), after.sum()) == ABSENT_FRAMES:
-                out[first:end, view] = True
-    return out
+    seen, absent = (_count_around(mask) for mask in (labelled, missed))
+    return labelled & (seen <= BRIEF_FRAMES) & (absent >= ABSENT_FRAMES)
+
+
+def _count_around(mask: Bools) -> Ints:
+    """(T, n): frames of a mask (T, n) at most AROUND frames away, the frame itself included."""
+    total = np.concatenate([np.zeros((1, mask.shape[1]), dtype=np.int64), np.cumsum(mask, axis=0)])
+    k = np.arange(len(mask))
+    return total[np.minimum(k + AROUND + 1, len(mask))] - total[np.maximum(k - AROUND, 0)]
 
 
 def isolated(count: Ints) -> Bools:

@@ -34,6 +34,7 @@ P_JUMP = 0.02  # probability per frame that a spot has moved by any distance tha
 P_GONE = 0.1  # probability per frame that one of the two is not visible any more, and that neither is
 MIN_PROBABILITY = 0.999  # of the two labels; and where the pair's path from the other side does not lead there:
 MIN_ONE_SIDED_PROBABILITY = 0.9999
+MIN_LAST_PROBABILITY = 0.9999  # of the last labels of a pair's path that ends
 
 Transfer = Callable[[Array], Array]
 """Where the second view sees points (m, 2), px, of the first view: (m, 2), px; nan where it cannot see them."""
@@ -119,6 +120,14 @@ def _agreed(sides: list[PairLabels | None]) -> PairLabels | None:
     return best if len(found) == len(sides) or best.probability >= MIN_ONE_SIDED_PROBABILITY else None
 
 
+def _drop_unsure(labels: Chain, loose: list[int]) -> None:
+    """Drop, in place, what the end of a path may have labelled by chance: a single frame, or an unsure last one."""
+    if loose:
+        last = labels[loose[-1]]
+        if len(loose) == 1 or (last is not None and last.probability < MIN_LAST_PROBABILITY):
+            labels[loose[-1]] = None
+
+
 class _Pair:
     """The path of the first view's spot, and where the second one lies relative to it."""
 
@@ -133,16 +142,24 @@ class _Pair:
         """New labels along the direction of time (1) or against it (-1)."""
         out: Chain = {}
         uv, second_uv, relative = self.first.uv.copy(), self.second.uv.copy(), self.relative.copy()
+        loose: list[int] = []  # frames labelled since the last known place of the pair
         frames = range(len(uv)) if direction == 1 else range(len(uv) - 1, -1, -1)
         for k in frames:
+            if np.isfinite(self.relative[k, 0]):
+                loose = []  # the path has come to known labels, which confirm it
             if not self.open[k]:
                 continue
             found = self._found(k, uv, second_uv, relative, direction)
             if found is not None:
                 uv[k], second_uv[k] = self._places(k, found.rows)
                 relative[k] = second_uv[k] - self.transfer(uv[[k]])[0]
+                loose.append(k)
             if found is not None or len(known_before(relative, k, direction, MAX_AHEAD + 1)):
                 out[k] = found
+            elif loose:
+                _drop_unsure(out, loose)
+                loose = []
+        _drop_unsure(out, loose)
         return out
 
     def _places(self, k: int, rows: tuple[int, int]) -> tuple[Array, Array]:

@@ -35,8 +35,9 @@ def test_a_spot_that_is_occluded_before_and_after_reappears_briefly():
     def of(labelled: str, missed: str) -> np.ndarray:
         return brief(frames(labelled)[:, None], frames(missed)[:, None])[:, 0]
 
-    np.testing.assert_array_equal(of("..xx..", "xx..xx"), frames("..xx.."))
-    np.testing.assert_array_equal(of("x.xx...", ".x..xxx"), frames("......."))  # missed for one frame only
-    np.testing.assert_array_equal(of("..xxx.x", "xx...x."), frames("......."))  # seen for three
-    np.testing.assert_array_equal(of("..xx...", ".x..xxx"), frames("......."))  # out of the picture before
-    np.testing.assert_array_equal(of(".x...", "x.xxx"), frames("....."))  # little is known before
+    np.testing.assert_array_equal(of("...xx...", "xxx..xxx"), frames("...xx..."))
+    np.testing.assert_array_equal(of("...x.x...", "xxx.x.xxx"), frames("...x.x..."))
+    np.testing.assert_array_equal(of("xx.xx.xx", "..x..x.."), frames("........"))  # seldom missed
+    np.testing.assert_array_equal(of("...xxx...", "xxx...xxx"), frames("........."))  # seen for three
+    np.testing.assert_array_equal(of("...xx...", "......xx"), frames("........"))  # out of the picture before
+    np.testing.assert_array_equal(of("x...", ".xxx"), frames("...."))  # little is known before
