@@ -49,6 +49,7 @@ def continued(
     transfers: as of `pair_labels`.
     """
     paired, probability = pair_labels(detections, assigned, context, transfers)
+    _drop(_isolated(paired, assigned, 2, MIN_PAIR_CHAIN), paired, probability, assigned)
     out = paired.copy()
     for view in range(assigned.shape[1]):
         path = _Path(detections, paired, context, view)
@@ -63,23 +64,26 @@ def continued(
             if len({row for row, _ in found}) == 1 and (len(found) == len(sides) or p >= MIN_ONE_SIDED_PROBABILITY):
                 out[k, view], probability[k, view] = found[0][0], p
     _drop_shared(out, probability, assigned)
-    isolated = _isolated(out, assigned, paired != assigned)
-    out[isolated], probability[isolated] = assigned[isolated], np.nan
+    _drop(_isolated(out, assigned, 1, MIN_SINGLE_CHAIN), out, probability, assigned)
     return out, probability
 
 
-def _isolated(out: Ints, before: Ints, paired: Bools) -> Bools:
-    """(T, n): new labels that are the only one, or the only pair, of their frame, except in chains of enough frames.
+def _drop(mask: Bools, out: Ints, probability: Array, before: Ints) -> None:
+    """Take new labels back, in place; mask (T, n)."""
+    out[mask], probability[mask] = before[mask], np.nan
+
+
+def _isolated(out: Ints, before: Ints, most: int, least_frames: int) -> Bools:
+    """(T, n): new labels that are the only `most` ones of their frame or fewer, except in chains of enough frames.
 
     If all spots are occluded for a frame or two, a false point near one of the paths is not rare, nor are two that lie
-    right for a pair. paired (T, n): labels by pairs.
+    right for a pair.
     """
     new = out != before
-    count = np.count_nonzero(out >= 0, axis=1)
-    alone = new & ((count == 1)[:, None] | (paired & (count == 2)[:, None]))
+    alone = new & (np.count_nonzero(out >= 0, axis=1) <= most)[:, None]
     for view in range(new.shape[1]):
         for run in np.split(np.arange(len(new)), np.flatnonzero(np.diff(new[:, view].astype(np.int8))) + 1):
-            if len(run) >= (MIN_SINGLE_CHAIN if np.any(count[run] == 1) else MIN_PAIR_CHAIN):
+            if len(run) >= least_frames:
                 alone[run, view] = False
     return np.asarray(alone)
 
