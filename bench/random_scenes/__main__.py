@@ -1,6 +1,7 @@
 """`python -m bench.random_scenes --seeds 1:301`: process random scenes and count the clean ones.
 
-One scene in detail: `--seeds N -v`; `--keep DIR` writes its run folder. `--family NAME`: see families.py.
+One scene in detail: `--seeds N -v`; `--keep DIR` writes its run folder. `--family NAME`: see families.py; `--variant
+NAME`: see variants.py.
 
 `--pictures`: scenes as pictures, including detection (bench/random_pictures; its families are in looks.py).
 """
@@ -24,6 +25,7 @@ from bench.random_scenes.judge import Judgement, judge
 from bench.random_scenes.oracle import ask_oracle
 from bench.random_scenes.report import crashed, details, summary, write_rows
 from bench.random_scenes.scene import Scene, random_scene
+from bench.random_scenes.variants import CHANGES, varied
 from bench.random_scenes.write_folder import write_run_folder
 
 
@@ -36,13 +38,15 @@ class Job:
     family: str | None
     through_files: bool
     keep: Path | None
+    variant: str | None = None
 
 
 def make_scene(job: Job) -> Scene:
     """The scene of a job."""
     if job.family is not None:
         return family_scene(job.family, job.seed, job.frames)
-    return random_scene(job.seed) if job.frames is None else random_scene(job.seed, job.frames)
+    scene = random_scene(job.seed) if job.frames is None else random_scene(job.seed, job.frames)
+    return scene if job.variant is None else varied(scene, job.variant)
 
 
 def judged(job: Job) -> Judgement:
@@ -82,6 +86,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="bench.random_scenes", description=__doc__)
     parser.add_argument("--seeds", type=seed_range, metavar="A:B", help="default 1:301, of pictures 1:61")
     parser.add_argument("--family", metavar="NAME", help="one difficulty instead of all at random")
+    parser.add_argument("--variant", choices=list(CHANGES), help="a property that random scenes do not have")
     parser.add_argument("--pictures", action="store_true", help="render pictures; --family all: one of each per seed")
     parser.add_argument("--state-noise", action="store_true", help="of pictures: rig.yaml states the true noise")
     parser.add_argument("--frames", type=int, help="default 200, in pictures 48; each family has its own")
@@ -100,7 +105,7 @@ def main() -> None:
         picture = picture_jobs(a.seeds, a.family, a.frames, a.keep, a.state_noise)
         run_pictures(picture, a.jobs, a.out, a.verbose)
         return
-    jobs = [Job(s, a.frames, a.family, a.through_files, a.keep) for s in a.seeds]
+    jobs = [Job(s, a.frames, a.family, a.through_files, a.keep, a.variant) for s in a.seeds]
     rows: list[Judgement] = []
     for row in run_all(jobs, a.jobs):
         rows.append(row)

@@ -11,6 +11,7 @@ from geometry.arrays import Array, Bools
 from geometry.forward_model import SpotModel
 from geometry.pose_prior import PosePrior
 from geometry.pose_solver.gauss_newton import SolveLimits, fit_pose, is_measurement
+from geometry.pose_solver.symmetry import symmetries
 from tracking.detections import Detections
 from tracking.labelling.first_labels import find_labels
 
@@ -77,9 +78,12 @@ def measured_pixels(scene: Scene, k: int) -> Array:
 
 
 def _ties(scene: Scene, model: SpotModel) -> bool:
-    """The noise-free first frame without false points has another solution that its noise cannot exclude."""
+    """The noise-free first frame without false points has another solution that its noise cannot exclude.
+
+    Without a prior: the vehicle is symmetric.
+    """
     if scene.prior is None:
-        return False
+        return bool(symmetries(model))
     return another_pose(scene, model, scene.prior)
 
 
