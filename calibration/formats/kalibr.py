@@ -22,6 +22,7 @@ from calibration.formats.model import (
     fitted,
     mapping,
     numbers,
+    one_of,
     picture_size,
     quoted,
     shown,
@@ -80,9 +81,7 @@ def _camera(key: str, name: str, block: Mapping[str, Any], pose: Pose | None) ->
         raise FormatError(
             f"{key}.camera_model: expected 'pinhole', got {shown(kind)}; calibrate with pinhole-radtan or pinhole-equi"
         )
-    lens = block.get("distortion_model")
-    if lens not in _LENS:
-        raise FormatError(f"{key}.distortion_model: expected 'radtan', 'equidistant' or 'none', got {shown(lens)}")
+    lens = one_of(block.get("distortion_model"), _LENS, f"{key}.distortion_model")
     coefficients = block.get("distortion_coeffs", [] if lens == "none" else None)
     fx, fy, cx, cy = numbers(block.get("intrinsics"), f"{key}.intrinsics", 4)
     size = numbers(block.get("resolution"), f"{key}.resolution", 2)
@@ -91,7 +90,7 @@ def _camera(key: str, name: str, block: Mapping[str, Any], pose: Pose | None) ->
         image_size_px=picture_size(size[0], size[1], f"{key}.resolution"),
         pinhole=(fx, fy, cx, cy),
         distortion=numbers(coefficients, f"{key}.distortion_coeffs", 0 if lens == "none" else 4),
-        lens=_LENS[str(lens)],
+        lens=_LENS[lens],
         camera_from_reference=pose,
     )
 

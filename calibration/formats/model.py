@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -142,6 +142,14 @@ def picture_size(width: object, height: object, where: str) -> tuple[int, int]:
     if any(v != int(v) or v < 1 for v in sizes):
         raise FormatError(f"{where}: expected a width and a height in whole pixels, got {sizes}")
     return int(sizes[0]), int(sizes[1])
+
+
+def one_of(value: object, options: Iterable[str], where: str) -> str:
+    """One of the words."""
+    known = list(options)
+    if not isinstance(value, str) or value not in known:
+        raise FormatError(f"{where}: expected {', '.join(known)}, got {shown(value)}")
+    return value
 
 
 def mapping(value: object, where: str) -> Mapping[str, Any]:

@@ -21,10 +21,10 @@ from calibration.formats.model import (
     lost_poses,
     matrix,
     number,
+    one_of,
     picture_size,
     pinhole_of,
     quoted,
-    shown,
 )
 from geometry.camera import FISHEYE, PERSPECTIVE
 
@@ -63,10 +63,7 @@ def _lens(content: Mapping[str, Any]) -> str:
     """The lens model, from OpenCV's flag, or from ROS's key in a file that mixes both styles."""
     if number(content.get("fisheye_model", 0), "fisheye_model"):
         return FISHEYE
-    word = content.get("distortion_model", "plumb_bob")
-    if word not in _LENS_WORDS:
-        raise FormatError(f"distortion_model: expected {', '.join(_LENS_WORDS)}, got {shown(word)}")
-    return _LENS_WORDS[word]
+    return _LENS_WORDS[one_of(content.get("distortion_model", "plumb_bob"), _LENS_WORDS, "distortion_model")]
 
 
 def _first(content: Mapping[str, Any], keys: Sequence[str]) -> Any:

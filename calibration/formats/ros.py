@@ -21,10 +21,10 @@ from calibration.formats.model import (
     fitted,
     lost_poses,
     matrix,
+    one_of,
     picture_size,
     pinhole_of,
     quoted,
-    shown,
 )
 from geometry.camera import FISHEYE, PERSPECTIVE
 
@@ -56,8 +56,7 @@ def read(content: Mapping[str, Any], name: str) -> Read:
     if model is None:
         model = "plumb_bob"
         notes.append("distortion_model is missing: plumb_bob is assumed, as in ROS")
-    if model not in _LENGTHS:
-        raise FormatError(f"distortion_model: expected {', '.join(_LENGTHS)}, got {shown(model)}")
+    model = one_of(model, _LENGTHS, "distortion_model")
     distortion = tuple(matrix(found["distortion_coefficients"], "distortion_coefficients").ravel().tolist())
     if len(distortion) not in _LENGTHS[model]:
         words = " or ".join(map(str, _LENGTHS[model]))
