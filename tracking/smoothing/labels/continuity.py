@@ -23,6 +23,7 @@ from tracking.smoothing.labels.path_prediction import (
     MAX_AHEAD,
     REACH,
     Prediction,
+    agreed,
     error_sigmas,
     known_before,
     mean_density,
@@ -57,12 +58,9 @@ def continued(
             continue
         ahead, back = path.chain(1), path.chain(-1)
         for k in ahead.keys() | back.keys():
-            # Where both ends reach, they must agree, or one must be more certain; None: searched without success.
-            sides = [side[k] for side in (ahead, back) if k in side]
-            found = [s for s in sides if s is not None]
-            p = max((p for _, p in found), default=0.0)
-            if len({row for row, _ in found}) == 1 and (len(found) == len(sides) or p >= MIN_ONE_SIDED_PROBABILITY):
-                out[k, view], probability[k, view] = found[0][0], p
+            found = agreed([side[k] for side in (ahead, back) if k in side], MIN_ONE_SIDED_PROBABILITY)
+            if found is not None:
+                out[k, view], probability[k, view] = found
     _drop_shared(out, probability, assigned)
     _drop(_isolated(out, assigned, 1, MIN_SINGLE_CHAIN), out, probability, assigned)
     return out, probability

@@ -22,6 +22,7 @@ from geometry.surfaces import intersect_surface
 from tracking.smoothing.labels.path_prediction import (
     MAX_AHEAD,
     Prediction,
+    agreed,
     error_sigmas,
     known_before,
     mean_density,
@@ -84,9 +85,9 @@ def pair_labels(
         pair = _Pair(first, second, transfers.get((a, b), _same))
         ahead, back = pair.chain(1), pair.chain(-1)
         for k in ahead.keys() | back.keys():
-            found = _agreed([side[k] for side in (ahead, back) if k in side])
+            found = agreed([side[k] for side in (ahead, back) if k in side], MIN_ONE_SIDED_PROBABILITY)
             if found is not None:
-                out[k, [a, b]], probability[k, [a, b]] = found.rows, found.probability
+                out[k, [a, b]], probability[k, [a, b]] = found
     return out, probability
 
 
@@ -109,15 +110,6 @@ def _nearest_first(
 
 def _same(uv: Array) -> Array:
     return uv
-
-
-def _agreed(sides: list[PairLabels | None]) -> PairLabels | None:
-    """The answer of both directions of time, or the very probable one of one direction alone."""
-    found = [s for s in sides if s is not None]
-    if len({s.rows for s in found}) != 1:
-        return None
-    best = max(found, key=lambda s: s.probability)
-    return best if len(found) == len(sides) or best.probability >= MIN_ONE_SIDED_PROBABILITY else None
 
 
 def _drop_unsure(labels: Chain, loose: list[int]) -> None:

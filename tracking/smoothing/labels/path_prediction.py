@@ -6,7 +6,7 @@ Source: ours; the prediction from a spot's own last places is that of Huo, Yang 
 from __future__ import annotations
 
 from functools import cache
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -22,6 +22,9 @@ COMPONENTS = ((0.6, 0.5), (0.35, 0.95), (0.05, 0.995))
 
 ErrorSigmas = list[list[Array | None]]
 """By polynomial and number of frames ahead: sigmas (components,) px per axis; None if there are too few errors."""
+
+
+Row = TypeVar("Row")  # of a point of a frame, or those of several points
 
 
 class Prediction(NamedTuple):
@@ -76,6 +79,19 @@ def predictions(uv: Array, sigmas: ErrorSigmas, k: int, direction: int) -> list[
 def mean_density(of: list[Prediction], place: Array, cov: Array) -> Array:
     """Density (...), 1/px^2, of a path by all its predictions; arguments as of `Prediction.density`."""
     return np.asarray(np.mean([p.density(place, cov) for p in of], axis=0))
+
+
+def agreed(sides: list[tuple[Row, float] | None], least: float) -> tuple[Row, float] | None:
+    """The answer of a path from both of its ends, with the larger of the two probabilities; None: there is none.
+
+    sides: points and their probability from each end that reaches a frame; None: searched without success. Where both
+    ends reach, they must agree, or the probability of the one that found points must be at least `least`.
+    """
+    found = [s for s in sides if s is not None]
+    if len({row for row, _ in found}) != 1:
+        return None
+    p = max(p for _, p in found)
+    return (found[0][0], p) if len(found) == len(sides) or p >= least else None
 
 
 @cache
