@@ -100,10 +100,10 @@ class LabelConfirmation:
         spots = int(distinct_spots(assigned >= 0, model.spot_of))
         if spots and h.before is not None and h.dt_s > 0 and h.parent >= 0:
             out = self._check_by_motion(obs, h, dynamics, out, spots, sure, doubtful)
-        elif h.best in h.searched and not h.first:
+        elif h.best in h.searched:
             use, _, cov = chosen_points(obs.frame, assigned, obs.calibration_cov)
             controlled = well_controlled(model.numbers, h.now.R[0], h.now.t[0], use, cov)
-            few = distinct_spots(controlled, model.spot_of) < MIN_REDUNDANT_SPOTS
+            few = not h.first and distinct_spots(controlled, model.spot_of) < MIN_REDUNDANT_SPOTS
             if few or decisive(model, h.now.R[0], h.now.t[0], use, cov).any():
                 # If the others leave a direction of the pose open, some false point fits: the next frame must agree.
                 out = self._postpone(h, out.min_probability)

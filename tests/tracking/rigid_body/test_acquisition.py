@@ -193,3 +193,16 @@ def test_a_reflection_taken_for_the_only_spot_of_a_screen_is_given_up_when_its_s
 def test_a_misfit_of_many_sigmas_in_the_first_frame_is_not_taken_for_the_noise():
     """With this reflection the four points misfit by 14 sigmas, and false points explain them nearly as well."""
     assert len(measured_errors_deg(seen_late((40, 0), 14, 14))) == 0
+
+
+def test_false_points_do_not_find_a_vehicle_whose_spots_of_one_screen_leave_its_pose_open():
+    """The spots of a fan lie on one line: a false point anywhere on a line of the other screen would fit them."""
+    rig = RIGS["fan"]()
+    model, prior = SpotModel.of(rig), PosePrior(Pose.identity(), 0.5, np.deg2rad(15))
+    pose = Pose.from_ypr(np.deg2rad([2.0, 1.0, 3.0]), np.array([0.02, 0.01, 0.0]))
+    right = model.project(pose)[0][model.camera_of == 1]
+    for seed in range(20):
+        tracker, rng = RigidTracker(rig, RIGID, prior), np.random.default_rng(seed)
+        for k in range(10):
+            frame = step_with_points(tracker, rng, 0.01 if k else 0.0, [rng.uniform(0, 1000, (5, 2)), right])
+            assert frame.pose_status is not PoseStatus.MEASURED
