@@ -99,6 +99,14 @@ VERDICT: Explanations = {
         " says which kind.",
         "Act on the finding: the report names the component.",
     ),
+    "BP-V18": Explanation(
+        "Raw pictures of a colour camera",
+        "Neighbouring pixels of the pictures lie behind different colour filters. A laser spot lights one or two of"
+        " four pixels, and its centroid follows the mosaic by up to some tenths of a pixel. The residuals hardly show"
+        " it, and the sigmas do not include it.",
+        "Convert the pictures to colour or grey before the run (demosaicing), or let the camera do so; a camera"
+        " without colour filters is more accurate.",
+    ),
 }
 
 MODEL_CHECK: Explanations = {

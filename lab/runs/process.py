@@ -197,7 +197,8 @@ def write_tables(
     model_check = check_sampled_frames(run.rig, sampler, run.covariance)
     # Where the model check has tested the residuals, it has separated noise from faults.
     noise_scale = None if model_check.result.diagnosis is not None else pipeline.tracker.noise_scale
-    return statistics, model_check, quality.judge(statistics, model_check.findings, noise_scale)
+    mosaics = {name: noise.mosaic for name, noise in pipeline.noise.items() if noise.mosaic}
+    return statistics, model_check, quality.judge(statistics, model_check.findings, noise_scale, mosaics)
 
 
 def are_results(folder: Path) -> bool:

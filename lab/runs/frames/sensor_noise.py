@@ -15,6 +15,7 @@ from lab.runs.frames.frames import FrameReader, pictures_at
 from tracking.detection.detect import find_spots
 from tracking.detections import Detections
 from tracking.noise import NoiseModel, Picture, guess_noise
+from tracking.noise_estimation.colour_mosaic import mosaic_contrast
 from tracking.noise_estimation.photon_transfer import NoiseEstimate, estimate_noise
 from tracking.parameters import DetectParameters
 
@@ -32,6 +33,7 @@ class CameraNoise:
     stated: SensorNoise | None = None
     notes: list[str] = field(default_factory=list)
     estimate: NoiseEstimate | None = field(default=None, init=False)
+    mosaic: float = field(default=0.0, init=False)  # contrast of a colour mosaic in the pictures; 0: there is none
     model: NoiseModel | None = field(
         default=None, init=False
     )  # in use; None before the first estimate if none is stated
@@ -47,6 +49,7 @@ class CameraNoise:
         if not pictures:
             return
         self.estimate = estimate_noise(pictures)
+        self.mosaic = mosaic_contrast(pictures[0])
         self._update_model()
         if self.stated is not None:
             level = self.estimate.model.black_dn

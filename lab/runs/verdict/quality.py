@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any, Literal
 
 from calibration.findings import Finding, Level
@@ -56,11 +57,17 @@ class Verdict:
         return remedies[0] if remedies else ""
 
 
-def judge(statistics: RunStatistics, findings: Sequence[Finding] = (), noise_scale: float | None = None) -> Verdict:
+def judge(
+    statistics: RunStatistics,
+    findings: Sequence[Finding] = (),
+    noise_scale: float | None = None,
+    mosaics: Mapping[str, float] = MappingProxyType({}),
+) -> Verdict:
     """The verdict on a run.
 
     findings: of the model check (lab.runs.model_check.check.check_model): a warning leads to "check", a failure to
     "fail". noise_scale: ratio of the residuals to the detections' sigmas; None where the model check has tested that.
+    mosaics: contrast of the colour mosaic by camera, of cameras whose pictures show one.
     """
     if statistics.frames == 0:
         nothing = VerdictReason(ReasonKind.NO_FRAMES, True, "there is no frame at all", REMEDIES[ReasonKind.NO_FRAMES])
@@ -75,6 +82,7 @@ def judge(statistics: RunStatistics, findings: Sequence[Finding] = (), noise_sca
             fails = finding.level == Level.FAIL
             what = f"{finding.what}; {finding.why}"
             found.append(VerdictReason(ReasonKind.MODEL, fails, what, finding.remedy, code=finding.code))
+    found += _mosaics(mosaics)
     found += _interruptions(statistics)
     found.sort(key=lambda e: not e.fails)  # stable: failures first
     if found:
@@ -84,6 +92,19 @@ def judge(statistics: RunStatistics, findings: Sequence[Finding] = (), noise_sca
     return Verdict(
         "pass", (f"{share:.1%} of the frames have a measured pose, and the residuals agree with the stated sigmas",)
     )
+
+
+def _mosaics(mosaics: Mapping[str, float]) -> list[VerdictReason]:
+    """Cameras with raw pictures of a colour sensor. No residual shows their errors, since all spots have them."""
+    return [
+        VerdictReason(
+            ReasonKind.COLOUR_MOSAIC, False,
+            f"camera {camera} shows a colour mosaic (neighbouring pixels differ by {contrast:.0%}): raw pictures of a"
+            " colour camera move a spot's centroid by up to some tenths of a pixel",
+            REMEDIES[ReasonKind.COLOUR_MOSAIC], {"camera": camera, "contrast": contrast},
+        )
+        for camera, contrast in mosaics.items()
+    ]  # fmt: skip
 
 
 def _measured(statistics: RunStatistics) -> list[VerdictReason]:

@@ -30,6 +30,7 @@ class ReasonKind(StrEnum):
     INTERNAL = "internal"
     NOISE_SCALE = "noise_scale"
     MODEL = "model"  # a finding of the model check
+    COLOUR_MOSAIC = "colour_mosaic"
 
 
 # For `beampose explain`; stable: new kinds get new codes.
@@ -51,6 +52,7 @@ CODES = {
     ReasonKind.INTERNAL: "BP-V15",
     ReasonKind.NOISE_SCALE: "BP-V16",
     ReasonKind.MODEL: "BP-V17",
+    ReasonKind.COLOUR_MOSAIC: "BP-V18",
 }
 REMEDIES = {
     ReasonKind.NO_FRAMES: "Check the folders of pictures, or the detections, that run.yaml names (`beampose check`).",
@@ -73,6 +75,8 @@ REMEDIES = {
     ReasonKind.CONTRADICTION: "Check these frames for reflections near the spots and for a rig that has moved. Their"
     " sigmas cover the difference.",
     ReasonKind.INTERNAL: "These values are omitted. Please report this run as an error of the program.",
+    ReasonKind.COLOUR_MOSAIC: "Convert the pictures to colour or grey before the run (demosaicing), or let the camera do"
+    " so; a camera without colour filters is more accurate.",
     ReasonKind.NOISE_SCALE: "Check the calibration (`beampose calibrate check`) and the light (speckle).",
 }
 REMEDIES_BY_CAUSE = {

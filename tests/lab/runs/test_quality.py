@@ -270,3 +270,11 @@ def test_a_reason_is_written_as_plain_values():
 
 def test_the_exit_status_is_4_exactly_for_failures():
     assert [Verdict(s, ()).exit_status for s in ("pass", "check", "fail")] == [0, 0, 4]
+
+
+def test_raw_pictures_of_a_colour_camera_are_a_point_to_check():
+    verdict = judge(statistics_of(), mosaics={"left": 0.2})
+    assert (verdict.status, verdict.reasons[0].kind) == ("check", ReasonKind.COLOUR_MOSAIC)
+    assert "camera left" in verdict.texts[0]
+    assert "20%" in verdict.texts[0]
+    assert verdict.exit_status == 0

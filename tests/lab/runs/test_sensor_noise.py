@@ -77,3 +77,13 @@ def test_the_noise_is_estimated_from_pairs_of_neighbours(count):
     assert chosen[-1] == count - 1
     if count > 6:
         assert all(b - a == 1 for a, b in zip(chosen[::2], chosen[1::2], strict=True))
+
+
+@pytest.mark.parametrize("stated", [TRUE, None])
+def test_a_colour_mosaic_is_found_whether_or_not_the_noise_is_stated(stated):
+    filters = np.tile([[0.8, 1.0], [1.0, 0.6]], (150, 200))
+    noise = CameraNoise("left", stated)
+    noise.estimate_from([np.rint(10 * p * filters).astype(np.uint16) for p in pictures(2)])
+    assert noise.mosaic > 0.1
+    noise.estimate_from(pictures(2))
+    assert noise.mosaic == 0.0
