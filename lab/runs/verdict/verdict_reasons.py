@@ -75,8 +75,8 @@ REMEDIES = {
     ReasonKind.CONTRADICTION: "Check these frames for reflections near the spots and for a rig that has moved. Their"
     " sigmas cover the difference.",
     ReasonKind.INTERNAL: "These values are omitted. Please report this run as an error of the program.",
-    ReasonKind.COLOUR_MOSAIC: "Convert the pictures to colour or grey before the run (demosaicing), or let the camera do"
-    " so; a camera without colour filters is more accurate.",
+    ReasonKind.COLOUR_MOSAIC: "Convert the pictures to colour or grey before the run (demosaicing), or let the camera"
+    " do so; a camera without colour filters is more accurate.",
     ReasonKind.NOISE_SCALE: "Check the calibration (`beampose calibrate check`) and the light (speckle).",
 }
 REMEDIES_BY_CAUSE = {
