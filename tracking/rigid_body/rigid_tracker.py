@@ -219,7 +219,8 @@ class RigidTracker:
             best = children.assigned[int(np.argmax(children.hypotheses.log_weight[:count]))]
             least = distinct_spots(best >= 0, self.model.spot_of) + MISSING_TO_DOUBT
             candidates = [c for c in candidates if distinct_spots(c.point_of != NO_POINT, self.model.spot_of) >= least]
-            count, starts[0] = without_history(children, count, obs, self.model, starts[0])
+            if candidates:
+                count, starts[0] = without_history(children, count, obs, self.model, starts[0])
         for one in candidates:
             pose = one.fit.world_from_body
             assigned = self._assigned(obs.frame, one)
