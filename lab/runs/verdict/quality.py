@@ -96,15 +96,15 @@ def judge(
 
 def _mosaics(mosaics: Mapping[str, float]) -> list[VerdictReason]:
     """Cameras with raw pictures of a colour sensor. No residual shows their errors, since all spots have them."""
-    return [
-        VerdictReason(
-            ReasonKind.COLOUR_MOSAIC, False,
-            f"camera {camera} shows a colour mosaic (neighbouring pixels differ by {contrast:.0%}): raw pictures of a"
-            " colour camera move a spot's centroid by up to some tenths of a pixel",
-            REMEDIES[ReasonKind.COLOUR_MOSAIC], {"camera": camera, "contrast": contrast},
-        )
-        for camera, contrast in mosaics.items()
-    ]  # fmt: skip
+    if not mosaics:
+        return []
+    names = " and ".join(mosaics)
+    shown = f"camera {names} shows" if len(mosaics) == 1 else f"cameras {names} show"
+    what = (
+        f"{shown} a colour mosaic (neighbouring pixels differ by {max(mosaics.values()):.0%}): raw pictures of a colour"
+        " camera move a spot's centroid by up to some tenths of a pixel"
+    )
+    return [VerdictReason(ReasonKind.COLOUR_MOSAIC, False, what, REMEDIES[ReasonKind.COLOUR_MOSAIC], dict(mosaics))]
 
 
 def _measured(statistics: RunStatistics) -> list[VerdictReason]:
