@@ -111,7 +111,7 @@ class _Smoother:
         self.probability = np.where(self.causal >= 0, 1.0, np.nan)
         ref = straight_between(rec.poses, self.measured, np.cumsum(rec.dt_s))
         every = rec.run_detections()
-        self.calibration_cov, self.systematic = calibration_errors(rec, every, self.assigned, ref)
+        self.calibration_cov, self.systematic, self.noise_share = calibration_errors(rec, every, self.assigned, ref)
         self.width_share = max(
             width_share(self.views, every, self.assigned, self.calibration_cov, ref, self.measured),
             scattered_width_share(every, self.assigned),
@@ -292,7 +292,7 @@ class _Smoother:
             poses=Pose(final.R, final.t).plus(-pose_shift(self.views, final, offsets)),
             exposure_px=offsets,
             velocities=final.m[:, :6],
-            covariance=pose_P * place_factor[:, None, None],
+            covariance=pose_P * (place_factor * self.noise_share)[:, None, None],
             place_share=place_share,
             systematic=self.systematic,
             motion_covariance=motion_P,
