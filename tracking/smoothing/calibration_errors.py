@@ -8,11 +8,10 @@ from geometry.arrays import Array, Ints
 from geometry.compiled_projection import project_all
 from geometry.pose import Pose
 from geometry.pose_solver.gauss_newton import covariance_of
+from geometry.uncertainty.noise_share import share_without_calibration
 from tracking.smoothing.motion.reference import Reference
 from tracking.smoothing.motion.run_detections import RunDetections, labelled_points
 from tracking.smoothing.recording import TrackedRecording
-
-NOISE_OF_SMOOTHED = 5 / 6  # share of the measurements' noise in the variance of a smoothed motion with white jerk
 
 
 def calibration_errors(
@@ -20,16 +19,11 @@ def calibration_errors(
 ) -> tuple[Array, Array, Array]:
     """Covariances of the expected pixels (n, 2, 2), px^2, mean over the run, and of the poses (T or 1, 6, 6).
 
-    Third: the share (T,) of the smoother's covariance that is left where it treats the first of these as noise.
+    Third: the share (T,) of the smoother's own covariance that is left, since its weights include the first of these.
 
     The smoother weights each spot with its noise and the first of these. The pose that follows from such weights moves
     with the calibration's errors by (J^T W J)^-1 J^T W: the same in every frame with these spots, so that no averaging
     reduces it. A frame without such a pose has the covariance of the frame before.
-
-    Weighted with it, the smoother's own covariance contains the calibration's errors once more, as noise. Of an optimal
-    smoother's variance 5/6 come from the noise and 1/6 from the motion, if the motion's third derivative is white: with
-    spectra S_x ~ w^-6 of the motion and S_n of the noise, the integrals of S_x^2 S_n / (S_x + S_n)^2 and
-    S_n^2 S_x / (S_x + S_n)^2 have this ratio. Source: ours.
     """
     n, frames = len(rec.model), len(rec)
     calibration_cov = np.zeros((n, 2, 2))
@@ -60,22 +54,10 @@ def calibration_errors(
             rows, G = gain
             both = _coordinates(rows)
             latest = G @ C[np.ix_(both, both)] @ G.T
-            share[k] = 1 - NOISE_OF_SMOOTHED * (
-                1 - _share_of_noise(detections, k, assigned[k], rows, G, calibration_cov)
-            )
+            _, _, cov = labelled_points(detections, k, assigned[k], np.zeros_like(calibration_cov))
+            share[k] = share_without_calibration(J[k][rows], cov[rows], calibration_cov[rows])
         systematic[k] = latest
     return calibration_cov, systematic, share
-
-
-def _share_of_noise(
-    detections: RunDetections, k: int, assigned: Ints, rows: Ints, G: Array, calibration_cov: Array
-) -> float:
-    """Share of the points' own noise in a single frame's pose covariance; G (6, 2 m): derivative by the views (m,)."""
-    _, _, cov = labelled_points(detections, k, assigned, np.zeros_like(calibration_cov))
-    by_view = G.reshape(6, len(rows), 2)
-    noise = np.einsum("ami,mij,bmj->ab", by_view, cov[rows], by_view)
-    both = noise + np.einsum("ami,mij,bmj->ab", by_view, calibration_cov[rows], by_view)
-    return float(np.trace(np.linalg.solve(both, noise))) / 6
 
 
 def _coordinates(rows: Ints) -> Ints:
