@@ -243,7 +243,7 @@ def test_centres_reach_the_cramer_rao_bound_and_their_sigmas_are_correct(kind, l
 
     row = measured(kind, 60, 11)
     assert row.of_bound < limit
-    assert 0.9 < row.honesty < 1.1
+    assert 0.9 < row.of_sigma < 1.1
     assert row.recall > (0.93 if kind == "faint" else 0.999)
     assert row.false_per_frame <= 0.02
 
