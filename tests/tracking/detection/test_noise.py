@@ -1,7 +1,7 @@
 """The noise model: from a sensor's data sheet and estimated from pictures."""
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from statistics import NormalDist
 
 import cv2
@@ -244,10 +244,11 @@ def test_the_noise_of_pictures_too_small_for_levels_is_estimated(size):
 
 def test_steps_of_compressed_blocks_are_not_spots():
     """Noise below the quantisation of JPEG: whole blocks of 8x8 pixels are one grey value brighter in some pictures."""
-    lab = Lab(gain=160.0, read_e=8.0, texture=0.0, details=0, background=17.6, speed_px=0.0, spot_peak=0.0, quality=80)
+    lab = Lab(gain=27.0, read_e=7.6, texture=0.0, details=0, background=8.0, speed_px=0.0, spot_peak=0.0, quality=80)
     pictures = lab.pictures(5)
     assert block_step(pictures) == 1.0
     model = estimate_noise(pictures).model
+    assert sum(len(find_spots(p, noise=replace(model, banding_dn=0.0))) for p in pictures) > 5
     assert sum(len(find_spots(p, noise=model)) for p in pictures) == 0
 
 
