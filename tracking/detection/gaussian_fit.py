@@ -74,7 +74,7 @@ def fit_all(
     Gauss-Newton steps until the centres converge; clipped pixels, pixels outside and hot pixels are excluded, and the
     light of the neighbours is subtracted. A candidate that grows beyond `max_sigma`, px, diverges, or lowers chi-square
     by less than `min_gain` is rejected: its flux becomes 0. again: only those with ACTIVE start from their moments; the
-    others have been fitted and follow changes of their neighbours.
+    others have been fitted and stay as they are.
     """
     n = table.shape[0]
     for i in range(n):
@@ -102,8 +102,8 @@ def fit_all(
                 moved = True
             elif moved:
                 spot[ACTIVE] = 1.0
-            if moved:
-                changed = True
+            changed = changed or moved
+            if moved and not again:
                 _reactivate_neighbours(table, i)
         if not changed:
             break

@@ -10,8 +10,10 @@ from numpy.typing import NDArray
 from tracking.noise import Picture
 
 _SIDE = 8  # px: blocks of JPEG (ITU-T T.81, A.3)
-_SHARES = (0.95, 0.99, 0.997)  # quantiles of the blocks' changes that are compared: the mean of few or of many jumps
-_BLOCKWISE = 1.3  # ratio of the changes of JPEG's blocks to those of other squares of this size from which they are steps
+_SHARES = (0.95, 0.99, 0.997)  # quantiles of the blocks' changes that are compared: many blocks jump, or few
+_BLOCKWISE = (
+    1.3  # ratio of the changes of JPEG's blocks to those of other squares of this size from which they are steps
+)
 _QUIET = 4.0  # ratio to the median of the variance within a block up to which nothing moves in it
 _LEAST_VARIANCE = 0.02  # DN^2
 _FEWEST_BLOCKS, _MOST_ROWS = 400, 64  # of blocks
@@ -34,8 +36,8 @@ def block_step(pictures: Sequence[Picture]) -> float:
     steps, others = (np.concatenate(x) if x else np.zeros(0) for x in (own, shifted))
     if min(len(steps), len(others)) < _FEWEST_BLOCKS:
         return 0.0
-    step, other = np.quantile(steps, _SHARES), np.quantile(others, _SHARES)
-    return float(np.max(np.where(step > _BLOCKWISE * other, step, 0.0)))
+    pairs = [(float(np.quantile(steps, s)), float(np.quantile(others, s))) for s in _SHARES]
+    return max(step if step > _BLOCKWISE * other else 0.0 for step, other in pairs)
 
 
 def _changes(change: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -89,3 +89,14 @@ def test_grains_of_a_textured_screen_are_not_compact_lights():
         picture = np.rint(screen).clip(0, 255).astype(np.uint8)
         count += len(find_spots(picture, noise=NoiseModel(FLOOR, SLOPE, BACKGROUND, 0.066)))
     assert count <= 1
+
+
+def test_grain_of_the_light_widens_the_sigmas_also_where_it_is_in_a_few_cells_only():
+    """The mean over all cells of the window hardly shows the speckle of a spot's core; the centre moves by it."""
+    errors = []
+    for seed in range(60):
+        found = seen(100.0 * light(120.3, 100.6, (4.0, 4.0)), 0.04, seed, background=6.0)
+        row = int(np.argmin(np.linalg.norm(found.uv_px - [120.3, 100.6], axis=1)))
+        error = found.uv_px[row] - [120.3, 100.6]
+        errors.append(error @ np.linalg.solve(found.cov_px2[row], error) / 2)
+    assert np.mean(errors) < 3.3

@@ -259,7 +259,8 @@ class _Estimator:
         self.beside = corner_offsets(ref, jumped, self.run.exposure_s, self.dt)
         L, g, chi2 = self._spot_information(ref)
         if self.run.exposure_s > 0:
-            for k in np.flatnonzero(jumped[1:] & measured[1:] & measured[:-1] & ~self.beside.any(axis=1)[:-1]):
+            short = ~np.any(self.beside[:-1] != 0, axis=1)
+            for k in np.flatnonzero(jumped[1:] & measured[1:] & measured[:-1] & short):
                 # As `corner_offsets`, for a short exposure.
                 b = (ref.m[k + 1, :6] - ref.m[k, :6]) * self.run.exposure_s / 8
                 Lb = L[k] @ b
