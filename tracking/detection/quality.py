@@ -28,6 +28,9 @@ from tracking.detection.table import (
 
 _CORE = 0.2  # share of the brightest cell's light that limits the core: the peak is searched in the core, with clipped
 # cells but without hot pixels in the wings
+# Sum of the squared shares of the cells above which they are too few for a test of their own: of one narrow spot it
+# would show the grain in some pictures and not in others.
+_CROWDED = 1 / 40
 _LAGS = 2  # cells: largest lag of the autocorrelation of the residuals
 
 
@@ -134,7 +137,7 @@ def _odd_misfit_factor(
         square += odd[k] * odd[k] * part / doubled
         crowd += part * part
         odd[k] *= sqrt(part)
-    if not anywhere and square <= 1.0 + 3.0 * sqrt(4.0 / doubled * crowd):
+    if not anywhere and (crowd > _CROWDED or square <= 1.0 + 3.0 * sqrt(4.0 / doubled * crowd)):
         return 1.0
     grain = _correlated_cells(window, odd)
     grains = 1.0 / max(crowd * grain, 1e-12)  # number of independent samples in the slopes
